@@ -1,0 +1,42 @@
+"""qpavoid: follow a planned motion and stay clear of obstacles, other arms and yourself."""
+
+from qpavoid.config import Avoidance, Limits, ScenarioConfig
+from qpavoid.controller import Controller, Tick
+from qpavoid.errors import ConfigError, NumericalError, QpavoidError, SolverNotInstalled, UnknownName
+from qpavoid.loading import load_scenario
+from qpavoid.log import Log
+from qpavoid.motion import Sample
+from qpavoid.problem import Problem, Solution, Status
+from qpavoid.robot import Robot
+from qpavoid.scene import Obstacle, Scene, build_scene
+from qpavoid.simulate import simulate
+from qpavoid.solvers import SOLVERS, Solver, make_solver
+from qpavoid.tasks import build_tasks
+
+__all__ = [
+    "SOLVERS",
+    "Avoidance",
+    "ConfigError",
+    "Controller",
+    "Limits",
+    "Log",
+    "NumericalError",
+    "Obstacle",
+    "Problem",
+    "QpavoidError",
+    "Robot",
+    "Sample",
+    "ScenarioConfig",
+    "Scene",
+    "Solution",
+    "Solver",
+    "SolverNotInstalled",
+    "Status",
+    "Tick",
+    "UnknownName",
+    "build_scene",
+    "build_tasks",
+    "load_scenario",
+    "make_solver",
+    "simulate",
+]

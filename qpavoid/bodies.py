@@ -1,0 +1,150 @@
+"""Collision shapes: from the config's primitives, and from the meshes of a URDF."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import coal
+import numpy as np
+import pinocchio as pin
+
+from qpavoid.config import Box, Capsule, Cylinder, Shape, Sphere
+from qpavoid.problem import Array
+
+
+@dataclass(frozen=True, slots=True)
+class CapsuleFit:
+    """An enclosing capsule: axis along z of `rotation`, centred on `center`; length 0 is a sphere."""
+
+    center: Array
+    """(3,) [m]."""
+    rotation: Array
+    """(3, 3)."""
+    radius: float
+    """[m]."""
+    length: float
+    """Between the centres of the caps [m]."""
+
+    @property
+    def volume(self) -> float:
+        """[m³]."""
+        return float(np.pi * self.radius**2 * (self.length + 4.0 / 3.0 * self.radius))
+
+
+def make_shape(shape: Shape) -> Any:
+    """coal geometry of a configured primitive."""
+    if isinstance(shape, Sphere):
+        return coal.Sphere(shape.radius)
+    if isinstance(shape, Capsule):
+        return coal.Capsule(shape.radius, shape.length)
+    if isinstance(shape, Box):
+        return coal.Box(*shape.size)
+    assert isinstance(shape, Cylinder)
+    return coal.Cylinder(shape.radius, shape.length)
+
+
+def convert_bodies(bodies: Any, kind: str) -> Any:
+    """A geometry model whose triangle meshes are replaced.
+
+    Args:
+        bodies: pinocchio geometry model as read from a URDF.
+        kind: `convex`: hull of each mesh, primitives as they are; `capsule`: one capsule around each piece;
+            `mesh`: everything as it is.
+    """
+    converted = pin.GeometryModel()
+    for body in bodies.geometryObjects:
+        geometry, placement = body.geometry, body.placement
+        if kind == "convex" and isinstance(geometry, coal.BVHModelBase):
+            geometry = _convex_hull(geometry)
+        elif kind == "capsule":
+            fit = enclosing_capsule(geometry)
+            geometry = coal.Capsule(fit.radius, fit.length) if fit.length > 0 else coal.Sphere(fit.radius)
+            placement = placement * pin.SE3(fit.rotation, fit.center)
+        converted.addGeometryObject(
+            pin.GeometryObject(body.name, body.parentJoint, body.parentFrame, placement, geometry)
+        )
+    return converted
+
+
+def enclosing_capsule(geometry: Any) -> CapsuleFit:
+    """The capsule around a coal shape, in the shape's own frame; spheres and capsules are their own."""
+    if isinstance(geometry, coal.Sphere):
+        return CapsuleFit(np.zeros(3), np.eye(3), geometry.radius, 0.0)
+    if isinstance(geometry, coal.Capsule):
+        return CapsuleFit(np.zeros(3), np.eye(3), geometry.radius, 2.0 * geometry.halfLength)
+    return fit_capsule(_vertices(geometry))
+
+
+def _convex_hull(mesh: Any) -> Any:
+    mesh.buildConvexHull(True, "Qt")
+    return mesh.convex
+
+
+def _vertices(geometry: Any) -> Array:
+    """Points whose hull encloses the shape (n, 3)."""
+    if isinstance(geometry, coal.BVHModelBase):
+        return np.array(geometry.vertices())
+    if isinstance(geometry, coal.ConvexBase):
+        return np.array(geometry.points())
+    geometry.computeLocalAABB()
+    half, center = 0.5 * (geometry.aabb_local.max_ - geometry.aabb_local.min_), geometry.aabb_center
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
+    return center + corners * half
+
+
+def fit_capsule(points: Array, directions: int = 400) -> CapsuleFit:
+    """A small capsule that encloses all points.
+
+    Tries the points' principal axes and a spiral of directions over the half sphere; for each, the axis runs through
+    the centre of the smallest circle around the projected points, and the caps are drawn in as far as the
+    points allow.
+
+    Args:
+        points: (n, 3) [m], at least one.
+        directions: how many directions are tried.
+
+    Returns:
+        The fit of smallest volume; every point is inside to 1e-9.
+    """
+    points = np.unique(np.asarray(points, dtype=np.float64), axis=0)
+    principal = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
+    fits = [_fit_along(points, axis) for axis in (*principal, *_half_sphere(directions))]
+    return min(fits, key=lambda fit: fit.volume)
+
+
+def _half_sphere(count: int) -> Array:
+    """Evenly spread unit vectors with z >= 0 (count, 3): a golden-angle spiral."""
+    i = np.arange(count) + 0.5
+    z, angle = i / count, np.pi * (1.0 + np.sqrt(5.0)) * i
+    r = np.sqrt(1.0 - z * z)
+    return np.column_stack((r * np.cos(angle), r * np.sin(angle), z))
+
+
+def _fit_along(points: Array, axis: Array) -> CapsuleFit:
+    """The capsule around `points` whose axis points along `axis`."""
+    helper = np.eye(3)[np.argmin(np.abs(axis))]
+    x = np.cross(helper, axis)
+    x /= np.linalg.norm(x)
+    rotation = np.column_stack((x, np.cross(axis, x), axis))
+    local = points @ rotation
+    center, radius = _enclosing_circle(local[:, :2])
+    # each point lets the caps' centres come no nearer than this to the far side
+    reach = np.sqrt(np.maximum(radius**2 - np.sum((local[:, :2] - center) ** 2, axis=1), 0.0))
+    low, high = np.min(local[:, 2] + reach), np.max(local[:, 2] - reach)
+    if high < low:
+        # a sphere would do along this axis; the middle needs a radius that reaches every point
+        middle = 0.5 * (low + high)
+        low = high = middle
+        radius = float(np.max(np.linalg.norm(local - np.array([*center, middle]), axis=1)))
+    origin = rotation @ np.array([*center, 0.5 * (low + high)])
+    return CapsuleFit(origin, rotation, radius + 1e-10, float(high - low))
+
+
+def _enclosing_circle(points: Array) -> tuple[Array, float]:
+    """Nearly smallest circle around 2-D points: Badoiu and Clarkson's iteration, radius taken at its centre."""
+    center = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    for step in range(1, 60):
+        offset = points - center
+        center = center + offset[np.argmax(np.sum(offset * offset, axis=1))] / (step + 1)
+    return center, float(np.sqrt(np.max(np.sum((points - center) ** 2, axis=1))))

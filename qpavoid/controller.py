@@ -1,0 +1,178 @@
+"""The tick: state in, joint velocity out. Embed this in your own loop."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from time import perf_counter
+
+from qpavoid.avoidance import avoidance_rows
+from qpavoid.config import Avoidance, Limits, ScenarioConfig
+from qpavoid.errors import UnknownName
+from qpavoid.kinematics import Kinematics, compute_kinematics, support_masks
+from qpavoid.limits import saturate, velocity_bounds
+from qpavoid.loading import nearest
+from qpavoid.motion import Sample
+from qpavoid.problem import Array, Problem, Proximity, Solution, State, require_finite
+from qpavoid.proximity import DistanceQuery
+from qpavoid.robot import Robot
+from qpavoid.scene import Scene, build_obstacles, build_scene
+from qpavoid.solvers import Solver, make_solver
+from qpavoid.tasks import FrameTask, TaskRows, build_tasks
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """Everything that one tick computed."""
+
+    state: State
+    targets: tuple[Sample, ...]
+    kinematics: Kinematics
+    proximity: Proximity
+    problem: Problem
+    solution: Solution
+
+
+class Controller:
+    """Follows its tasks and keeps clear of everything in its scene."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        tasks: Sequence[FrameTask],
+        solver: Solver | str = "qp",
+        dt: float = 0.01,
+        avoidance: Avoidance | None = None,
+        limits: Limits | None = None,
+        tracking_damping: float = 0.01,
+    ) -> None:
+        """Lays out the memory of the tick.
+
+        Args:
+            scene: robot and obstacles.
+            tasks: what to follow; see `build_tasks`.
+            solver: anything with `solve`, or a name such as `eq10` or `qp:proxqp`.
+            dt: control period [s]: each velocity is meant to be held that long.
+            avoidance: distances and rows; the defaults of a scenario if left out.
+            limits: use of the joint limits; the defaults of a scenario if left out.
+            tracking_damping: λ of the damped J⁺ [-].
+
+        Raises:
+            UnknownName, SolverNotInstalled: of the solver.
+        """
+        self.scene, self.tasks, self.dt = scene, tuple(tasks), dt
+        self.solver: Solver = make_solver(solver) if isinstance(solver, str) else solver
+        self.avoidance, self.limits = avoidance or Avoidance(), limits or Limits()
+        model = scene.robot.model
+        self._data = model.createData()
+        self._frame_ids = [task.frame_id for task in tasks]
+        self._frame_index = {task.settings.frame: i for i, task in enumerate(tasks)}
+        self._obstacle_index = {name: i for i, name in enumerate(scene.obstacle_names)}
+        self._moving = [i for i, obstacle in enumerate(scene.obstacles) if obstacle.moves]
+        joints = [model.frames[frame_id].parentJoint for frame_id in self._frame_ids]
+        self._task_rows = TaskRows(tasks, support_masks(model), joints, tracking_damping)
+        self._query = DistanceQuery(scene)
+        self._bounds = scene.robot.bounds()
+
+    @classmethod
+    def from_scenario(cls, scenario: ScenarioConfig) -> tuple[Controller, Array]:
+        """Controller and initial configuration of a scenario.
+
+        Raises:
+            ConfigError, UnknownName, SolverNotInstalled: naming file, field and remedy.
+        """
+        source = scenario.source
+        robot = Robot.load(scenario.robot, source.parent)
+        q0 = robot.configuration(scenario.q0, f"{source}: q0")
+        robot, q0 = robot.lock(scenario.lock, q0, f"{source}: lock")
+        controller = cls(
+            build_scene(robot, build_obstacles(scenario.obstacles, source)),
+            build_tasks(scenario.tasks, robot, q0, source),
+            make_solver(scenario.solver),
+            scenario.dt,
+            scenario.avoidance,
+            scenario.limits,
+            scenario.tracking_damping,
+        )
+        return controller, q0
+
+    def step(
+        self,
+        q: Array,
+        t: float = 0.0,
+        targets: Mapping[str, Sample] | None = None,
+        obstacles: Mapping[str, Sample] | None = None,
+    ) -> Solution:
+        """Velocity for the next dt.
+
+        Args:
+            q: configuration (nq,) as measured.
+            t: time [s] at which motions are evaluated.
+            targets: where frames should be now, by frame name, in place of their motion.
+            obstacles: where obstacles are now and how they move, by name, in place of their motion.
+
+        Raises:
+            NumericalError: q of the wrong shape, NaN or infinity.
+            UnknownName: of a target or obstacle.
+        """
+        return self.tick(q, t, targets, obstacles).solution
+
+    def tick(
+        self,
+        q: Array,
+        t: float = 0.0,
+        targets: Mapping[str, Sample] | None = None,
+        obstacles: Mapping[str, Sample] | None = None,
+    ) -> Tick:
+        """Like `step`, with everything that led to the velocity."""
+        begin = perf_counter()
+        robot = self.scene.robot
+        q = require_finite("q", q, (robot.model.nq,))
+        samples = self._targets(t, targets)
+        self._place_obstacles(t, obstacles)
+        kinematics = compute_kinematics(robot.model, self._data, self._frame_ids, q)
+        reach = self.avoidance.d2 - self.avoidance.offset
+        proximity = self._query.compute(self._data, kinematics, reach)
+        limits = self.limits
+        lower, upper = velocity_bounds(self._bounds, q, self.dt, limits.position_gain, limits.velocity_scale)
+        problem = Problem(
+            tracking=self._task_rows.compute(kinematics, samples),
+            avoidance=avoidance_rows(proximity, self.avoidance),
+            lower=lower,
+            upper=upper,
+            pair_names=self.scene.pair_names,
+        )
+        built = perf_counter()
+        solution = self.solver.solve(problem)
+        v, saturation = solution.v, 0.0
+        if limits.saturate and not self.solver.bounded:
+            v, saturation = saturate(v, lower, upper, self._bounds.velocity * limits.velocity_scale)
+        solution = replace(
+            solution,
+            v=v,
+            saturation=saturation,
+            build_time=built - begin,
+            solve_time=perf_counter() - built,
+        )
+        return Tick(State(q, solution.v, t), samples, kinematics, proximity, problem, solution)
+
+    def _targets(self, t: float, given: Mapping[str, Sample] | None) -> tuple[Sample, ...]:
+        samples = [task.motion.sample(t) for task in self.tasks]
+        for frame, sample in (given or {}).items():
+            samples[_index(self._frame_index, frame, "target")] = sample
+        return tuple(samples)
+
+    def _place_obstacles(self, t: float, given: Mapping[str, Sample] | None) -> None:
+        given = given or {}
+        for i in self._moving:
+            if self.scene.obstacles[i].name not in given:
+                self._query.place_obstacle(i, self.scene.obstacles[i].motion.sample(t))
+        for name, sample in given.items():
+            self._query.place_obstacle(_index(self._obstacle_index, name, "obstacle"), sample)
+
+
+def _index(names: Mapping[str, int], name: str, what: str) -> int:
+    if name not in names:
+        raise UnknownName(f"no {what} {name!r}{nearest(name, names)}")
+    return names[name]
+

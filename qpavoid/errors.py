@@ -1,0 +1,24 @@
+"""Errors that a user can act on: each message names the place, the field and the remedy.
+
+An infeasible tick is not an error (it is a `Solution` with a status); these are for input that cannot be used.
+"""
+
+
+class QpavoidError(Exception):
+    """Base of every error that qpavoid raises on purpose."""
+
+
+class ConfigError(QpavoidError):
+    """A file or a field of it cannot be used: missing, mistyped, out of range, wrong shape."""
+
+
+class UnknownName(ConfigError):
+    """A robot, scenario, frame, joint, body, solver or back end that does not exist."""
+
+
+class SolverNotInstalled(QpavoidError):
+    """A known QP back end whose package is missing."""
+
+
+class NumericalError(QpavoidError):
+    """NaN or infinity in a state or in a command: the tick's input is malformed."""

@@ -1,0 +1,72 @@
+"""Forward kinematics and Jacobians of one configuration, by Pinocchio."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from qpavoid.problem import Array
+
+
+@dataclass(frozen=True, slots=True)
+class Kinematics:
+    """Where the tracked frames are, and how everything moves with v. Valid until the next call on the same data."""
+
+    J: Array
+    """(6, nv) world Jacobian: column j is the twist of joint j [linear velocity of the body point at the world
+    origin; angular velocity], for every joint of the robot."""
+    position: Array
+    """(f, 3) world positions of the tracked frames [m]."""
+    rotation: Array
+    """(f, 3, 3) world orientations of the tracked frames."""
+
+
+def compute_kinematics(model: Any, data: Any, frame_ids: Sequence[int], q: Array) -> Kinematics:
+    """Joint placements, world Jacobian and the placements of some frames.
+
+    Args:
+        model: pinocchio model.
+        data: its pinocchio data, overwritten.
+        frame_ids: the f frames to report.
+        q: configuration (nq,).
+    """
+    pin.computeJointJacobians(model, data, q)
+    position = np.empty((len(frame_ids), 3))
+    rotation = np.empty((len(frame_ids), 3, 3))
+    for i, frame_id in enumerate(frame_ids):
+        placement = pin.updateFramePlacement(model, data, frame_id)
+        position[i] = placement.translation
+        rotation[i] = placement.rotation
+    return Kinematics(J=data.J, position=position, rotation=rotation)
+
+
+def support_masks(model: Any) -> Array:
+    """Which velocity coordinates move which joint: (njoints, nv) of 0 and 1, row 0 (the world) all 0."""
+    mask = np.zeros((model.njoints, model.nv))
+    for joint in range(1, model.njoints):
+        for ancestor in model.supports[joint]:
+            start, width = model.joints[ancestor].idx_v, model.joints[ancestor].nv
+            mask[joint, max(start, 0) : max(start, 0) + width] = 1.0
+    return mask
+
+
+def point_rows(directions: Array, points: Array) -> Array:
+    """Screws [e, p × e] whose product with `Kinematics.J` is the velocity of body points p along directions e.
+
+    Args:
+        directions: unit vectors (m, 3), world axes.
+        points: points (m, 3), world [m].
+
+    Returns:
+        (m, 6).
+    """
+    rows = np.empty((len(directions), 6))
+    rows[:, :3] = directions
+    rows[:, 3] = points[:, 1] * directions[:, 2] - points[:, 2] * directions[:, 1]
+    rows[:, 4] = points[:, 2] * directions[:, 0] - points[:, 0] * directions[:, 2]
+    rows[:, 5] = points[:, 0] * directions[:, 1] - points[:, 1] * directions[:, 0]
+    return rows

@@ -1,0 +1,72 @@
+"""Joint limits as bounds on the joint velocity of one tick."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from qpavoid.problem import Array, IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class JointBounds:
+    """Limits of a robot in tangent space; joints without a position limit have none listed."""
+
+    velocity: Array
+    """(nv,) largest speed [rad/s or m/s], infinite where there is none."""
+    q_index: IntArray
+    """(nb,) index in q of each joint coordinate with a position limit."""
+    v_index: IntArray
+    """(nb,) index in v of the same coordinates."""
+    lower: Array
+    """(nb,) lower position limits [rad or m]."""
+    upper: Array
+    """(nb,) upper position limits [rad or m]."""
+
+
+def velocity_bounds(
+    joints: JointBounds, q: Array, dt: float, position_gain: float, velocity_scale: float
+) -> tuple[Array, Array]:
+    """Bounds lower <= v <= upper that keep the next configuration inside its limits.
+
+    At most `position_gain` of what is left to a position limit is used in one tick; a joint outside its limits is
+    sent back at no more than its largest speed. The bounds never cross.
+
+    Args:
+        joints: the robot's limits.
+        q: configuration (nq,).
+        dt: control period [s].
+        position_gain: share of the remaining range that a tick may use, in (0, 1].
+        velocity_scale: share of the velocity limits that may be used, in (0, 1].
+
+    Returns:
+        lower (nv,), upper (nv,) [rad/s or m/s].
+    """
+    upper = joints.velocity * velocity_scale
+    lower = -upper
+    i, v_max = joints.v_index, upper[joints.v_index]
+    here = q[joints.q_index]
+    rate = position_gain / dt
+    lower[i] = np.clip(rate * (joints.lower - here), -v_max, v_max)
+    upper[i] = np.clip(rate * (joints.upper - here), -v_max, v_max)
+    return lower, upper
+
+
+def saturate(v: Array, lower: Array, upper: Array, v_max: Array) -> tuple[Array, float]:
+    """Brings a raw velocity within the limits.
+
+    First one factor for all joints, so that the direction is kept while only speeds are exceeded; then each joint
+    is clipped to what its position limit leaves.
+
+    Args:
+        v: raw velocity (nv,).
+        lower, upper: bounds (nv,).
+        v_max: largest speeds (nv,).
+
+    Returns:
+        The velocity within the bounds, and the largest change that was made to a joint.
+    """
+    excess = float(np.max(np.abs(v) / v_max, initial=0.0))
+    within = np.clip(v / max(excess, 1.0), lower, upper)
+    return within, float(np.max(np.abs(within - v), initial=0.0))

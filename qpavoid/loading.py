@@ -1,0 +1,242 @@
+"""Finds and reads robot and scenario files, applies `--set` overrides, and says what is wrong in one line."""
+
+from __future__ import annotations
+
+import difflib
+import types
+import typing
+from collections.abc import Iterable, Sequence
+from importlib.metadata import PackageNotFoundError, distribution
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ValidationError
+
+from qpavoid.config import RobotConfig, ScenarioConfig, expand_solver
+from qpavoid.errors import ConfigError, UnknownName
+
+Config = TypeVar("Config", RobotConfig, ScenarioConfig)
+_PACKAGE = Path(__file__).parent
+
+
+def data_folder(kind: str) -> Path:
+    """The folder `robots` or `tasks`: packaged in a wheel, beside the package in a checkout."""
+    packaged = _PACKAGE / "_data" / kind
+    return packaged if packaged.is_dir() else _PACKAGE.parent / kind
+
+
+def robot_names() -> list[str]:
+    """Names of the robots that ship."""
+    return sorted(p.parent.name for p in data_folder("robots").glob("*/robot.yaml"))
+
+
+def scenario_names() -> list[str]:
+    """Names of the scenarios that ship."""
+    return sorted(p.stem for p in data_folder("tasks").glob("*.yaml"))
+
+
+def example_robot_data() -> Path:
+    """Share folder of example-robot-data (a package of files without a Python module).
+
+    Raises:
+        ConfigError: the package is not installed.
+    """
+    try:
+        share = distribution("example-robot-data").locate_file("cmeel.prefix/share")
+    except PackageNotFoundError:
+        raise ConfigError("example-robot-data is not installed: pip install example-robot-data") from None
+    return Path(str(share))
+
+
+def nearest(name: str, valid: Iterable[str]) -> str:
+    """`; did you mean 'x'?` with the nearest valid name, or the list of the valid ones."""
+    names = sorted(valid)
+    close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+    if close:
+        return f"; did you mean {close[0]!r}?"
+    return f"; valid are {', '.join(names)}" if names else ""
+
+
+def find_scenario(name_or_path: str | Path) -> Path:
+    """Path of a scenario file, given by shipped name or by path.
+
+    Raises:
+        ConfigError, UnknownName: there is none.
+    """
+    return _find(str(name_or_path), "scenario", data_folder("tasks"), "{}.yaml", scenario_names())
+
+
+def find_robot(name_or_path: str, folder: Path | None = None) -> Path:
+    """Path of a robot.yaml or URDF, given by shipped name or by path (relative paths: from `folder` first).
+
+    Raises:
+        ConfigError, UnknownName: there is none.
+    """
+    if folder is not None and _looks_like_path(name_or_path) and (folder / name_or_path).is_file():
+        return folder / name_or_path
+    return _find(name_or_path, "robot", data_folder("robots"), "{}/robot.yaml", robot_names())
+
+
+def _looks_like_path(name: str) -> bool:
+    return "/" in name or "\\" in name or name.endswith((".yaml", ".yml", ".urdf"))
+
+
+def _find(name: str, kind: str, folder: Path, pattern: str, names: list[str]) -> Path:
+    if name in names:
+        return folder / pattern.format(name)
+    if _looks_like_path(name):
+        path = Path(name)
+        if path.is_file():
+            return path
+        reason = "is a folder" if path.is_dir() else "no such file"
+        raise ConfigError(f"{name}: {reason}; give a {kind} file, or one of {', '.join(names)}")
+    raise UnknownName(f"unknown {kind} {name!r}{nearest(name, names)}")
+
+
+def load_scenario(
+    name_or_path: str | Path, overrides: Sequence[str] = (), solver: str | None = None
+) -> ScenarioConfig:
+    """Reads a scenario.
+
+    Args:
+        name_or_path: shipped name or path of a YAML file.
+        overrides: `path=value` strings such as `avoidance.d2=0.30`; the value is YAML, `tasks.0.gain=3` indexes a
+            list.
+        solver: replaces the scenario's solver, as in `eq10` or `qp:proxqp`; settings of the file stay where the
+            name is the same.
+
+    Raises:
+        ConfigError, UnknownName: naming file, field and remedy.
+    """
+    path = find_scenario(name_or_path)
+    return read_config(path, ScenarioConfig, overrides, solver).read_from(path)
+
+
+def read_config(
+    path: Path, model: type[Config], overrides: Sequence[str] = (), solver: str | None = None
+) -> Config:
+    """Reads a YAML file into `model`.
+
+    Raises:
+        ConfigError: unreadable file, bad YAML, unknown key (with the nearest valid one) or bad value.
+    """
+    data = _read_yaml(path)
+    if solver is not None:
+        name, _, backend = solver.partition(":")
+        kept = _solver_mapping(data.get("solver"))
+        data["solver"] = {**(kept if kept.get("name") == name else {"name": name}),
+                          **({"backend": backend} if backend else {})}
+    for override in overrides:
+        _set(data, override, path)
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        raise ConfigError(_explain(error, model, path)) from None
+
+
+def _solver_mapping(value: Any) -> dict[str, Any]:
+    """The mapping that a solver's short form stands for."""
+    expanded = expand_solver("qp" if value is None else value)
+    return dict(expanded) if isinstance(expanded, dict) else {}
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read: {error}") from None
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
+    if not isinstance(data, dict):
+        raise ConfigError(f"{path}: must be a mapping of fields, got {type(data).__name__}")
+    return data
+
+
+def _set(data: dict[str, Any], override: str, path: Path) -> None:
+    """Applies `a.b.0.c=value` in place; missing mappings on the way are made, so that defaults can be set."""
+    where, equals, text = override.partition("=")
+    if not equals or not where:
+        raise ConfigError(f"--set {override!r}: expected path=value, as in avoidance.d2=0.30")
+    try:
+        value = yaml.safe_load(text)
+    except yaml.YAMLError:
+        raise ConfigError(f"--set {override!r}: {text!r} is not a YAML value") from None
+    node: Any = data
+    keys = where.split(".")
+    for depth, key in enumerate(keys):
+        last = depth == len(keys) - 1
+        if isinstance(node, list):
+            if not key.isdecimal() or int(key) >= len(node):
+                raise ConfigError(f"{path}: --set {where}: {key!r} is not an index below {len(node)}")
+            index: Any = int(key)
+        elif isinstance(node, dict):
+            index = key
+            if not last and not isinstance(node.get(key), dict | list):
+                node[key] = _solver_mapping(node.get(key)) if key == "solver" else {}
+        else:
+            raise ConfigError(f"{path}: --set {where}: there is nothing below {'.'.join(keys[:depth])}")
+        if last:
+            node[index] = value
+        else:
+            node = node[index]
+
+
+def _explain(error: ValidationError, model: type[BaseModel], path: Path) -> str:
+    """All faults of a file in one line: file, field, what is wrong, nearest valid key."""
+    faults = []
+    for fault in error.errors():
+        loc = [part for part in fault["loc"] if not (isinstance(part, str) and _is_union_tag(part, fault["loc"]))]
+        field = ".".join(str(part) for part in loc)
+        message = fault["msg"].removeprefix("Value error, ")
+        if fault["type"] == "extra_forbidden":
+            message = f"unknown key{nearest(str(loc[-1]), _fields_at(model, fault['loc'][:-1]))}"
+        elif fault["type"] == "union_tag_invalid":
+            context = fault.get("ctx", {})
+            tag, expected = str(context.get("tag")), str(context.get("expected_tags")).replace("'", "").split(", ")
+            message = f"unknown {str(context.get('discriminator')).strip(chr(39))} {tag!r}{nearest(tag, expected)}"
+        elif fault["type"] == "missing":
+            message = "is missing"
+        elif fault["type"] not in ("value_error", "union_tag_not_found"):
+            message = f"{message}, got {fault['input']!r:.60}"
+        faults.append(f"{field}: {message}" if field else message)
+    return f"{path}: " + "; ".join(faults)
+
+
+def _tags() -> frozenset[str]:
+    from qpavoid import config
+
+    blocks = [b for b in vars(config).values() if isinstance(b, type) and issubclass(b, config.Block)]
+    tags = {v for b in blocks for key in ("type", "name") if key in b.model_fields
+            for v in typing.get_args(b.model_fields[key].annotation)}
+    return frozenset(v for v in tags if isinstance(v, str))
+
+
+def _is_union_tag(part: str, loc: tuple[int | str, ...]) -> bool:
+    """pydantic puts the chosen member of a union into the location; a reader of the file never wrote it there."""
+    return loc[0] != part and (part in _tags() or part in _PYDANTIC_PARTS)
+
+
+_PYDANTIC_PARTS = frozenset({"list[float]", "dict[str,float]", "list[Body]", "list", "dict"})
+
+
+def _fields_at(model: Any, loc: tuple[int | str, ...]) -> list[str]:
+    """Field names of the block that `loc` leads to, through lists and unions."""
+    blocks = _blocks(model)
+    for part in loc:
+        if isinstance(part, int):
+            continue
+        tagged = [b for b in blocks for key in ("type", "name")
+                  if key in b.model_fields and part in typing.get_args(b.model_fields[key].annotation)]
+        below = [inner for b in blocks if part in b.model_fields for inner in _blocks(b.model_fields[part].annotation)]
+        blocks = tagged or below or blocks
+    return sorted({name for b in blocks for name in b.model_fields})
+
+
+def _blocks(annotation: Any) -> list[type[BaseModel]]:
+    """Every block inside an annotation."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    if isinstance(annotation, types.UnionType) or typing.get_origin(annotation) is not None:
+        return [block for inner in typing.get_args(annotation) for block in _blocks(inner)]
+    return []

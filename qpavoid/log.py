@@ -1,0 +1,129 @@
+"""Record of a run: one row a tick, saved as .npz together with the configuration and the versions that made it."""
+
+from __future__ import annotations
+
+import json
+import platform
+from dataclasses import dataclass, field, fields
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from qpavoid.errors import ConfigError
+from qpavoid.metrics import run_metrics
+from qpavoid.problem import Array, IntArray, Status
+
+STATUSES = tuple(Status)
+"""Status of each code in `Log.status`."""
+_FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Log:
+    """Arrays of a run with N ticks; n joints, k tasks, b bodies, o obstacles.
+
+    Distances are between surfaces [m]. Everything is in world axes and SI units.
+    """
+
+    t: Array
+    """(N,) time [s]."""
+    q: Array
+    """(N, nq) configuration at the start of the tick [rad or m]."""
+    v: Array
+    """(N, nv) commanded velocity [rad/s or m/s]."""
+    target: Array
+    """(N, k, 3) where each task's frame should be [m]."""
+    tool: Array
+    """(N, k, 3) where it is [m]."""
+    tool_rotation: Array
+    """(N, k, 3, 3) orientation of each task's frame."""
+    turn_error: Array
+    """(N, k) angle between target and frame [rad]; 0 for position tasks."""
+    body_distance: Array
+    """(N, b) distance of each body to the nearest thing that it is paired with [m]; inf where there is none."""
+    closest_pair: IntArray
+    """(N,) index of the closest pair in `meta["pairs"]`; -1 where there are none."""
+    alpha: Array
+    """(N,) eq. 11 for the closest pair; 0 out of range."""
+    beta: Array
+    """(N,) eq. 12 for the closest pair; 0 out of range."""
+    status: npt.NDArray[np.int8]
+    """(N,) index in STATUSES."""
+    slack: Array
+    """(N,) largest slack of an avoidance row [m/s]."""
+    saturation: Array
+    """(N,) largest change that the limits made to the raw law [rad/s or m/s]."""
+    build_time: Array
+    """(N,) time to set up the problem [s]."""
+    solve_time: Array
+    """(N,) time to solve it [s]."""
+    body_ends: Array
+    """(N, b, 2, 3) ends of the axis of each body, or of the capsule around it, for drawing [m]."""
+    obstacle_position: Array
+    """(N, o, 3) origin of each obstacle [m]."""
+    obstacle_rotation: Array
+    """(N, o, 3, 3) its orientation."""
+    meta: dict[str, Any] = field(default_factory=dict)
+    """Names, shapes, limits, the scenario's configuration, versions, and how the run ended."""
+
+    @property
+    def min_distance(self) -> Array:
+        """(N,) smallest distance of any body at each tick [m]."""
+        return np.min(self.body_distance, axis=1, initial=np.inf)
+
+    def until(self, t: float) -> Log:
+        """The part of the run before time t [s]."""
+        count = int(np.searchsorted(self.t, t - 1e-9))
+        return Log(**{name: array[:count] for name, array in self._arrays().items()}, meta=self.meta)
+
+    def metrics(self) -> dict[str, Any]:
+        """Key figures of the run; see `qpavoid.metrics.run_metrics`."""
+        return run_metrics(self)
+
+    def save(self, path: str | Path) -> Path:
+        """Writes the log; the parent folder is made where it is missing.
+
+        Returns:
+            The file written, ending in .npz.
+        """
+        path = Path(path).with_suffix(".npz")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        meta: Any = np.array(json.dumps({"format": _FORMAT, **self.meta}))
+        with path.open("wb") as file:
+            np.savez_compressed(file, meta=meta, **self._arrays())
+        return path
+
+    @classmethod
+    def load(cls, path: str | Path) -> Log:
+        """Reads a log back.
+
+        Raises:
+            ConfigError: no such file, or not a log of this format.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                meta = json.loads(str(file["meta"]))
+                if meta.pop("format") != _FORMAT:
+                    raise ConfigError(f"{path}: written by another version of qpavoid; run the scenario again")
+                return cls(**{name: file[name] for name in file.files if name != "meta"}, meta=meta)
+        except FileNotFoundError:
+            raise ConfigError(f"{path}: no such file; give a log written by `qpavoid run`") from None
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ConfigError(f"{path}: not a qpavoid log: {error}") from None
+
+    def _arrays(self) -> dict[str, Array]:
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "meta"}
+
+
+def versions() -> dict[str, str]:
+    """Versions of everything that shapes a result."""
+    found = {"python": platform.python_version(), "machine": platform.machine()}
+    for package in ("qpavoid", "pin", "coal", "numpy", "qpsolvers", "daqp", "proxsuite", "osqp", "quadprog"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found

@@ -1,0 +1,82 @@
+"""Key figures of a run, computed from its log by the same code for every solver."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from qpavoid.problem import Array, Status
+from qpavoid.segments import point_segment
+
+if TYPE_CHECKING:
+    from qpavoid.log import Log
+
+
+def run_metrics(log: Log) -> dict[str, Any]:
+    """The figures by which runs are compared.
+
+    Returns:
+        scenario, solver; completed: ran for its whole duration; arrived: every task ended within the goal tolerance;
+        collided; min_distance: surface to surface [m], None where nothing is paired; min_pair: names of that pair;
+        time_in_collision [s]; time_below: threshold -> [s]; final_error [m]; max_deviation: largest distance of a tool
+        from its planned path [m]; tracking_rmse: of the distance to the moving target [m]; peak_velocity: fastest
+        joint [rad/s or m/s]; jitter: Σ|Δq̇| over joints and ticks [rad/s]; status_counts; relaxed_ticks; tick_us: p50,
+        p99 and max of the tick's time [µs].
+    """
+    config, dt = log.meta["config"], log.meta["config"]["dt"]
+    distance = log.min_distance
+    closest = int(np.argmin(distance)) if np.isfinite(distance).any() else None
+    error = np.linalg.norm(log.target - log.tool, axis=2)
+    statuses = [status.value for status in Status]
+    counts = {name: int(np.sum(log.status == code)) for code, name in enumerate(statuses)}
+    tick_us = 1e6 * (log.build_time + log.solve_time)
+    final_error = float(np.max(error[-1])) if len(error) else float("nan")
+    return {
+        "scenario": log.meta["scenario"],
+        "solver": log.meta["solver"],
+        "completed": log.meta["completed"],
+        "arrived": bool(final_error <= config["goal_tolerance"]),
+        "collided": bool(np.any(distance < 0.0)),
+        "min_distance": None if closest is None else float(distance[closest]),
+        "min_pair": None if closest is None else log.meta["pairs"][log.closest_pair[closest]],
+        "time_in_collision": dt * float(np.sum(distance < 0.0)),
+        "time_below": {str(limit): dt * float(np.sum(distance < limit)) for limit in config["thresholds"]},
+        "final_error": final_error,
+        "max_deviation": float(np.max(path_deviation(log), initial=0.0)),
+        "tracking_rmse": float(np.sqrt(np.mean(error**2))) if error.size else float("nan"),
+        "peak_velocity": float(np.max(np.abs(log.v), initial=0.0)),
+        "jitter": float(np.sum(np.abs(np.diff(log.v, axis=0)))),
+        "status_counts": counts,
+        "relaxed_ticks": counts[Status.RELAXED.value],
+        "tick_us": {
+            "p50": float(np.median(tick_us)) if len(tick_us) else float("nan"),
+            "p99": float(np.quantile(tick_us, 0.99)) if len(tick_us) else float("nan"),
+            "max": float(np.max(tick_us, initial=0.0)),
+        },
+    }
+
+
+def path_deviation(log: Log, corners: int = 500) -> Array:
+    """Distance of each tool from the path that its target draws, at whatever time.
+
+    Args:
+        log: the run.
+        corners: the path is taken as a polyline with at most so many corners.
+
+    Returns:
+        (N, k) [m].
+    """
+    deviation = np.zeros(log.tool.shape[:2])
+    for task in range(log.tool.shape[1]):
+        path = log.target[:, task]
+        moved = np.r_[True, np.any(np.diff(path, axis=0) != 0.0, axis=1)] if len(path) else np.zeros(0, bool)
+        path = path[moved]
+        keep = np.unique(np.linspace(0, len(path) - 1, min(len(path), corners)).astype(int)) if len(path) else []
+        path = path[keep]
+        best = np.full(len(log.t), np.inf)
+        starts, ends = (path[:-1], path[1:]) if len(path) > 1 else (path, path)
+        for start, end in zip(starts, ends, strict=True):
+            best = np.minimum(best, point_segment(log.tool[:, task], start, end).distance)
+        deviation[:, task] = best
+    return deviation

@@ -1,0 +1,151 @@
+"""Value types of one tick. numpy only: a problem can be recorded, replayed and benchmarked without a robot.
+
+Everything is expressed in the joint velocity v, shape (nv,) [rad/s or m/s].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from qpavoid.errors import NumericalError
+
+Array = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.intp]
+
+
+class Status(str, Enum):
+    """How a tick ended."""
+
+    SOLVED = "SOLVED"
+    """Every row and bound is met."""
+    RELAXED = "RELAXED"
+    """The rows contradict each other or the limits; `reasons` says which gave way and by how much."""
+    STOPPED = "STOPPED"
+    """No usable velocity was found: the robot is told to stand still."""
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """What is read from the robot: configuration q (nq,), velocity v (nv,), time t [s]."""
+
+    q: Array
+    v: Array
+    t: float
+
+
+@dataclass(frozen=True, slots=True)
+class Proximity:
+    """Closest points of all m pairs, and the rate of the distance for the k pairs within reach.
+
+    For pair i of bodies (a, b) the distance changes at
+    ḋ = n·(ṗ_b - ṗ_a) = J v + drift, n the unit normal from a to b, also in penetration.
+    """
+
+    distance: Array
+    """(m,) signed distance between surfaces [m], negative in penetration."""
+    normal: Array
+    """(m, 3) unit normal from body a to body b, world axes."""
+    point_a: Array
+    """(m, 3) witness point on body a, world [m]."""
+    point_b: Array
+    """(m, 3) witness point on body b, world [m]."""
+    near: IntArray
+    """(k,) indices of the pairs within reach, in increasing order."""
+    J: Array
+    """(k, nv) velocity Jacobian of the distances of the near pairs [m/rad or 1]."""
+    drift: Array
+    """(k,) rate of these distances due to the obstacles' own motion [m/s]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Tracking:
+    """Rows A v = b of the tracking tasks."""
+
+    A: Array
+    """(r, nv) task Jacobian."""
+    b: Array
+    """(r,) task velocity: feed-forward plus feedback [m/s, rad/s]."""
+    weight: Array
+    """(r,) cost of each row."""
+    damping: float
+    """λ of the damped J⁺, the same for every solver [-]."""
+
+
+@dataclass(frozen=True, slots=True)
+class AvoidanceRows:
+    """Rows J v + drift >= bound for the k pairs within the influence distance.
+
+    `d` is the distance that the gains take: between surfaces plus the scenario's offset.
+    """
+
+    pair: IntArray
+    """(k,) index of the pair in `Problem.pair_names`."""
+    d: Array
+    """(k,) [m]."""
+    J: Array
+    """(k, nv)."""
+    drift: Array
+    """(k,) [m/s]."""
+    bound: Array
+    """(k,) lower bound on ḋ [m/s]."""
+    alpha: Array
+    """(k,) eq. 11, not capped [-]."""
+    beta: Array
+    """(k,) eq. 12 [-]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """Everything that a solver may know about a tick."""
+
+    tracking: Tracking
+    avoidance: AvoidanceRows
+    lower: Array
+    """(nv,) lower bound on v from the joint limits; never above `upper`."""
+    upper: Array
+    """(nv,) upper bound on v."""
+    pair_names: Sequence[tuple[str, str]]
+    """Names of the bodies of all m pairs."""
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """What a solver commands, and what it had to give up for it."""
+
+    v: Array
+    """(nv,) joint velocity [rad/s or m/s]."""
+    status: Status = Status.SOLVED
+    reasons: tuple[str, ...] = ()
+    """What gave way, by name and amount; empty when nothing did."""
+    slack: Array | None = None
+    """(k,) what each avoidance row gave way [m/s]; None when none did."""
+    saturation: float = 0.0
+    """Largest change that the limits made to the law's raw velocity [rad/s or m/s]; 0 for laws that know limits."""
+    build_time: float = 0.0
+    """Time to read the state and set up the problem [s]."""
+    solve_time: float = 0.0
+    """Time to solve it [s]."""
+
+
+def require_finite(name: str, value: Any, shape: tuple[int, ...]) -> Array:
+    """`value` as a float array of `shape`.
+
+    Raises:
+        NumericalError: wrong shape, NaN or infinity; names the argument.
+    """
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise NumericalError(f"{name}: not an array of numbers: {value!r:.60}") from None
+    if array.shape != shape:
+        raise NumericalError(f"{name}: shape {array.shape}, expected {shape}")
+    if not np.isfinite(array).all():
+        bad = ", ".join(str(i) for i in np.argwhere(~np.isfinite(array)).ravel()[:5])
+        raise NumericalError(f"{name}: NaN or infinity at index {bad}")
+    return array

@@ -1,0 +1,333 @@
+"""A robot: model, collision bodies with their pairs, joint limits, home pose; from a robot.yaml or a bare URDF."""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from qpavoid.bodies import convert_bodies, make_shape
+from qpavoid.config import RobotConfig
+from qpavoid.errors import ConfigError, UnknownName
+from qpavoid.limits import JointBounds
+from qpavoid.loading import example_robot_data, find_robot, nearest, read_config
+from qpavoid.motion import rpy_to_matrix
+from qpavoid.pairs import add_self_pairs, drop_colliding_pairs
+from qpavoid.problem import Array
+
+_ROOT_JOINTS = {
+    "fixed": lambda: None,
+    "planar": pin.JointModelPlanar,
+    "free_flyer": pin.JointModelFreeFlyer,
+}
+
+
+@dataclass(frozen=True)
+class Robot:
+    """What qpavoid knows of a robot; nothing in it changes while it runs."""
+
+    name: str
+    model: Any
+    """pinocchio model."""
+    bodies: Any
+    """pinocchio geometry model: collision bodies and the pairs among them."""
+    home: Array
+    """(nq,) home pose."""
+    end_effectors: tuple[str, ...]
+    """Frames that are meant as tools."""
+    source: str
+    """File that it was read from, for messages."""
+    notes: tuple[str, ...] = ()
+    """What was decided at loading, such as pairs switched off."""
+
+    @classmethod
+    def load(cls, name_or_path: str, folder: Path | None = None) -> Robot:
+        """The robot of a shipped name, a robot.yaml or a URDF.
+
+        Args:
+            name_or_path: what a scenario's `robot:` field says.
+            folder: where relative paths are looked up first.
+
+        Raises:
+            ConfigError, UnknownName: naming file, field and remedy.
+        """
+        path = find_robot(name_or_path, folder)
+        if path.suffix in (".yaml", ".yml"):
+            return _build(read_config(path, RobotConfig), path)
+        return cls.from_urdf(path)
+
+    @classmethod
+    def from_urdf(cls, path: str | Path, **fields: Any) -> Robot:
+        """A robot from a bare URDF.
+
+        Args:
+            path: the URDF.
+            fields: any other field of a robot.yaml, such as `bodies="capsule"` or `root_joint="free_flyer"`.
+
+        Raises:
+            ConfigError, UnknownName: naming file, field and remedy.
+        """
+        path = Path(path)
+        config = RobotConfig(**{"name": path.stem, "urdf": path.name, **fields})
+        return _build(config, path)
+
+    @property
+    def joint_names(self) -> list[str]:
+        """Names of the joints that move, in the order of q."""
+        return list(self.model.names)[1:]
+
+    @property
+    def coordinate_names(self) -> list[str]:
+        """Name of each of the nv velocity coordinates: the joint's, numbered where it has several."""
+        names = []
+        for name, joint in zip(self.joint_names, list(self.model.joints)[1:], strict=True):
+            names += [name] if joint.nv == 1 else [f"{name}.{i}" for i in range(joint.nv)]
+        return names
+
+    def bounds(self) -> JointBounds:
+        """Joint limits in tangent space; only joints with one coordinate in q and v have position limits."""
+        q_index, v_index = [], []
+        for joint in list(self.model.joints)[1:]:
+            lower, upper = self.model.lowerPositionLimit[joint.idx_q], self.model.upperPositionLimit[joint.idx_q]
+            if joint.nq == joint.nv == 1 and np.isfinite([lower, upper]).any() and lower < upper:
+                q_index.append(joint.idx_q)
+                v_index.append(joint.idx_v)
+        q_indices = np.array(q_index, dtype=np.intp)
+        return JointBounds(
+            velocity=_unlimited_if_absurd(np.array(self.model.velocityLimit)),
+            q_index=q_indices,
+            v_index=np.array(v_index, dtype=np.intp),
+            lower=np.array(self.model.lowerPositionLimit)[q_indices],
+            upper=np.array(self.model.upperPositionLimit)[q_indices],
+        )
+
+    def configuration(self, values: Sequence[float] | Mapping[str, float], where: str) -> Array:
+        """A full configuration from a scenario's `q0`.
+
+        Args:
+            values: all nq numbers, or joint: value over the home pose.
+            where: file and field to name in errors.
+
+        Returns:
+            (nq,).
+
+        Raises:
+            ConfigError, UnknownName: wrong number of values, unknown joint.
+        """
+        if isinstance(values, Mapping):
+            return _set_joints(self.model, self.home, values, where)
+        if len(values) != self.model.nq:
+            raise ConfigError(
+                f"{where}: {len(values)} values for {self.model.nq} coordinates; the order is "
+                f"{', '.join(self.joint_names)}"
+            )
+        return np.array(values, dtype=np.float64)
+
+    def frame_id(self, name: str, where: str) -> int:
+        """Index of a frame.
+
+        Raises:
+            UnknownName: with the nearest frame.
+        """
+        if not self.model.existFrame(name):
+            frames = [f.name for f in self.model.frames if f.type in (pin.BODY, pin.OP_FRAME)]
+            raise UnknownName(f"{where}: {self.name} has no frame {name!r}{nearest(name, frames)}")
+        return int(self.model.getFrameId(name))
+
+    def lock(self, patterns: Sequence[str], q: Array, where: str) -> tuple[Robot, Array]:
+        """The robot with some joints held where they are, as if they were fixed.
+
+        Args:
+            patterns: joint names; `*` and `?` match as in file names.
+            q: configuration (nq,) at which they are held.
+            where: file and field to name in errors.
+
+        Returns:
+            The smaller robot and its part of q.
+
+        Raises:
+            UnknownName: a pattern without a joint.
+        """
+        locked = []
+        for pattern in patterns:
+            found = [name for name in self.joint_names if fnmatchcase(name, pattern)]
+            if not found:
+                raise UnknownName(f"{where}: {self.name} has no joint {pattern!r}{nearest(pattern, self.joint_names)}")
+            locked += found
+        if not locked:
+            return self, q
+        model, bodies = _reduce(self.model, self.bodies, locked, q)
+        kept = [joint for name, joint in self._joints() if name not in locked]
+        index = np.array([i for joint in kept for i in range(joint.idx_q, joint.idx_q + joint.nq)], dtype=np.intp)
+        return replace(self, model=model, bodies=bodies, home=self.home[index]), q[index]
+
+    def _joints(self) -> Iterator[tuple[str, Any]]:
+        return zip(self.joint_names, list(self.model.joints)[1:], strict=True)
+
+
+def _unlimited_if_absurd(velocity: Array) -> Array:
+    """A limit of 0 means that the URDF gives none."""
+    return np.where(velocity > 0.0, velocity, np.inf)
+
+
+def _build(config: RobotConfig, path: Path) -> Robot:
+    urdf = _resource(config.urdf, path, "urdf")
+    model = _read_urdf(urdf, config.root_joint)
+    geometry_kind = config.bodies if isinstance(config.bodies, str) else None
+    if geometry_kind is not None:
+        package_dirs = [str(path.parent / folder) for folder in config.package_dirs]
+        bodies = convert_bodies(_read_collision(urdf, model, package_dirs, path), geometry_kind)
+    else:
+        bodies = _listed_bodies(config, model, path)
+    _apply_limits(config, model, path)
+    home = _set_joints(model, _middle(model), {**config.home, **config.lock}, f"{path}: home")
+    if config.lock:
+        model, bodies = _reduce(model, bodies, list(config.lock), home)
+        home = _set_joints(model, _middle(model), config.home, f"{path}: home", ignore=frozenset(config.lock))
+    add_self_pairs(model, bodies, config.disabled_pairs, str(path))
+    if config.srdf is not None:
+        pin.removeCollisionPairs(model, bodies, str(_resource(config.srdf, path, "srdf")), False)
+    notes = [f"pair {a} - {b} is off: in contact at the home pose" for a, b in drop_colliding_pairs(model, bodies, home)]
+    for name in config.end_effectors:
+        if not model.existFrame(name):
+            frames = [f.name for f in model.frames]
+            raise UnknownName(f"{path}: end_effectors: no frame {name!r}{nearest(name, frames)}")
+    return Robot(config.name, model, bodies, home, tuple(config.end_effectors), str(path), tuple(notes))
+
+
+def _resource(value: str, path: Path, field: str) -> Path:
+    """A URDF or SRDF named in a robot.yaml."""
+    prefix = "example-robot-data:"
+    if value.startswith(prefix):
+        found = example_robot_data() / "example-robot-data" / "robots" / value.removeprefix(prefix)
+    else:
+        found = path.parent / value
+    if not found.is_file():
+        raise ConfigError(f"{path}: {field}: no such file {value!r}; give a path relative to this file or {prefix}PATH")
+    return found
+
+
+@contextmanager
+def _quiet_stderr() -> Iterator[list[str]]:
+    """Catches what C++ parsers print on the process's error stream, so that one line can say it instead."""
+    lines: list[str] = []
+    sys.stderr.flush()
+    saved = os.dup(2)
+    with tempfile.TemporaryFile() as file:
+        os.dup2(file.fileno(), 2)
+        try:
+            yield lines
+        finally:
+            os.dup2(saved, 2)
+            os.close(saved)
+            file.seek(0)
+            lines += file.read().decode(errors="replace").splitlines()
+
+
+def _read_urdf(urdf: Path, root_joint: str) -> Any:
+    root = _ROOT_JOINTS[root_joint]()
+    with _quiet_stderr() as printed:
+        try:
+            arguments = (str(urdf),) if root is None else (str(urdf), root)
+            return pin.buildModelFromUrdf(*arguments)
+        except (ValueError, RuntimeError) as error:
+            reason = " ".join(str(error).split())
+    first = next((line.split(":", 1)[1].strip() for line in printed if line.startswith("Error:")), "")
+    raise ConfigError(f"{urdf}: not a usable URDF: {first or reason}")
+
+
+def _read_collision(urdf: Path, model: Any, package_dirs: list[str], path: Path) -> Any:
+    """Collision geometry of a URDF; `package://` is looked up in the given folders, above the URDF, in
+    example-robot-data and along ROS_PACKAGE_PATH."""
+    ros = [folder for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if folder]
+    above = [str(parent) for parent in urdf.resolve().parents]
+    with _quiet_stderr():
+        try:
+            return pin.buildGeomFromUrdf(
+                model, str(urdf), pin.COLLISION, package_dirs=[*package_dirs, *above, str(example_robot_data()), *ros]
+            )
+        except (ValueError, RuntimeError) as error:
+            reason = " ".join(str(error).split()).rstrip(".")
+    raise ConfigError(
+        f"{path}: {urdf.name}: {reason}; name the folder that holds the package in `package_dirs` of a robot.yaml, "
+        "or set ROS_PACKAGE_PATH"
+    )
+
+
+def _listed_bodies(config: RobotConfig, model: Any, path: Path) -> Any:
+    assert not isinstance(config.bodies, str)
+    bodies = pin.GeometryModel()
+    for index, body in enumerate(config.bodies):
+        if not model.existFrame(body.frame):
+            frames = [f.name for f in model.frames if f.type == pin.BODY]
+            raise UnknownName(f"{path}: bodies.{index}.frame: no frame {body.frame!r}{nearest(body.frame, frames)}")
+        if bodies.existGeometryName(body.name):
+            raise ConfigError(f"{path}: bodies.{index}.name: {body.name!r} is given twice: names must differ")
+        frame_id = model.getFrameId(body.frame)
+        frame = model.frames[frame_id]
+        placement = frame.placement * pin.SE3(rpy_to_matrix(body.rpy), np.array(body.position))
+        bodies.addGeometryObject(
+            pin.GeometryObject(body.name, frame.parentJoint, frame_id, placement, make_shape(body.shape))
+        )
+    return bodies
+
+
+def _apply_limits(config: RobotConfig, model: Any, path: Path) -> None:
+    lower, upper = np.array(model.lowerPositionLimit), np.array(model.upperPositionLimit)
+    velocity = np.array(model.velocityLimit)
+    for name, (low, high) in config.limits.position.items():
+        joint = _joint(model, name, f"{path}: limits.position")
+        lower[joint.idx_q], upper[joint.idx_q] = low, high
+    for name, speed in config.limits.velocity.items():
+        joint = _joint(model, name, f"{path}: limits.velocity")
+        velocity[joint.idx_v : joint.idx_v + joint.nv] = speed
+    model.lowerPositionLimit, model.upperPositionLimit, model.velocityLimit = lower, upper, velocity
+
+
+def _joint(model: Any, name: str, where: str) -> Any:
+    if not model.existJointName(name):
+        names = list(model.names)[1:]
+        raise UnknownName(f"{where}: no joint {name!r}{nearest(name, names)}")
+    return model.joints[model.getJointId(name)]
+
+
+def _middle(model: Any) -> Array:
+    """Neutral configuration, with bounded joints at the middle of their range where 0 is outside it."""
+    q = pin.neutral(model)
+    for joint in list(model.joints)[1:]:
+        lower, upper = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
+        if joint.nq == 1 and not lower <= q[joint.idx_q] <= upper:
+            q[joint.idx_q] = 0.5 * (lower + upper)
+    return np.asarray(q)
+
+
+def _set_joints(
+    model: Any, q: Array, values: Mapping[str, float], where: str, ignore: frozenset[str] = frozenset()
+) -> Array:
+    q = q.copy()
+    for name, value in values.items():
+        if name in ignore:
+            continue
+        joint = _joint(model, name, where)
+        if joint.nq == 1:
+            q[joint.idx_q] = value
+        elif joint.nq == 2 and joint.nv == 1:
+            q[joint.idx_q : joint.idx_q + 2] = np.cos(value), np.sin(value)
+        else:
+            raise ConfigError(f"{where}: joint {name!r} has {joint.nq} coordinates; give q0 as a list of all of q")
+    return q
+
+
+def _reduce(model: Any, bodies: Any, locked: Sequence[str], q: Array) -> tuple[Any, Any]:
+    ids = [_joint(model, name, "lock").id for name in locked]
+    model, bodies = pin.buildReducedModel(model, bodies, ids, q)
+    return model, bodies

@@ -1,0 +1,197 @@
+"""Closed loop: runs a scenario tick by tick and records it."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from qpavoid.bodies import enclosing_capsule
+from qpavoid.config import ScenarioConfig
+from qpavoid.controller import Controller, Tick
+from qpavoid.errors import NumericalError
+from qpavoid.loading import load_scenario
+from qpavoid.log import STATUSES, Log, versions
+from qpavoid.problem import Array
+from qpavoid.solvers import parse_solver
+
+
+class StartWarning(UserWarning):
+    """The initial configuration is in collision or outside its limits; the run goes on from there."""
+
+
+def simulate(
+    scenario: ScenarioConfig | str,
+    solver: str | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Log:
+    """Runs a scenario with velocities that are followed exactly: q ⊕ v dt.
+
+    A run that is interrupted from the keyboard, or in which the loop itself fails, gives the log of what it did;
+    `meta["completed"]` is then false and `meta["stopped_by"]` says why.
+
+    Args:
+        scenario: configuration, shipped name or path.
+        solver: replaces the scenario's solver, as in `eq10` or `qp:proxqp`.
+        progress: called after each tick with the number done and the number in all.
+
+    Raises:
+        ConfigError, UnknownName, SolverNotInstalled: the scenario cannot be built.
+    """
+    if isinstance(scenario, str):
+        scenario = load_scenario(scenario, solver=solver)
+    elif solver is not None:
+        settings = parse_solver(solver, scenario.solver)
+        scenario = scenario.model_copy(update={"solver": settings})
+    controller, q = Controller.from_scenario(scenario)
+    _check_start(controller, q, scenario)
+    model, ticks = controller.scene.robot.model, round(scenario.duration / scenario.dt) + 1
+    recorder = Recorder(controller, scenario, ticks)
+    stopped_by = None
+    try:
+        for k in range(ticks):
+            tick = controller.tick(q, k * scenario.dt)
+            recorder.add(tick)
+            q = pin.integrate(model, q, tick.solution.v * scenario.dt)
+            if progress is not None:
+                progress(k + 1, ticks)
+    except KeyboardInterrupt:
+        stopped_by = "interrupted from the keyboard"
+    except NumericalError as error:
+        stopped_by = str(error)
+    return recorder.log(stopped_by)
+
+
+def _check_start(controller: Controller, q: Array, scenario: ScenarioConfig) -> None:
+    robot, source = controller.scene.robot, scenario.source
+    bounds, here = robot.bounds(), q[robot.bounds().q_index]
+    for i in np.flatnonzero((here < bounds.lower) | (here > bounds.upper)):
+        joint = robot.coordinate_names[bounds.v_index[i]]
+        warnings.warn(
+            f"{source}: q0: {joint} = {here[i]:g} lies outside its limits [{bounds.lower[i]:g}, {bounds.upper[i]:g}]",
+            StartWarning,
+            stacklevel=3,
+        )
+    proximity = controller.tick(q, 0.0).proximity
+    for pair in np.flatnonzero(proximity.distance < 0.0):
+        a, b = controller.scene.pair_names[pair]
+        depth = -1e3 * proximity.distance[pair]
+        warnings.warn(
+            f"{source}: q0: {a} and {b} overlap by {depth:.1f} mm at the start", StartWarning, stacklevel=3
+        )
+
+
+class Recorder:
+    """Writes ticks into arrays laid out beforehand; whatever was written can be taken as a log at any time."""
+
+    def __init__(self, controller: Controller, scenario: ScenarioConfig, ticks: int) -> None:
+        """Lays the arrays out for at most `ticks` ticks."""
+        scene, model = controller.scene, controller.scene.robot.model
+        self._scene, self._scenario, self._tasks = scene, scenario, controller.tasks
+        self._data = model.createData()
+        self._ends, self._radii = _drawing_axes(scene.robot.bodies)
+        tasks, bodies, obstacles = len(controller.tasks), len(scene.body_names), len(scene.obstacles)
+        shapes: dict[str, tuple[int, ...]] = {
+            "t": (), "q": (model.nq,), "v": (model.nv,),
+            "target": (tasks, 3), "tool": (tasks, 3), "tool_rotation": (tasks, 3, 3), "turn_error": (tasks,),
+            "body_distance": (bodies,), "alpha": (), "beta": (), "slack": (), "saturation": (),
+            "build_time": (), "solve_time": (),
+            "body_ends": (bodies, 2, 3), "obstacle_position": (obstacles, 3), "obstacle_rotation": (obstacles, 3, 3),
+        }  # fmt: skip
+        self._arrays: dict[str, Any] = {name: np.zeros((ticks, *shape)) for name, shape in shapes.items()}
+        self._arrays["closest_pair"] = np.full(ticks, -1, dtype=np.intp)
+        self._arrays["status"] = np.zeros(ticks, dtype=np.int8)
+        self._count = 0
+
+    def add(self, tick: Tick) -> None:
+        """Writes one tick."""
+        rows = {name: array[self._count] for name, array in self._arrays.items() if array.ndim > 1}
+        scalars = {name: array for name, array in self._arrays.items() if array.ndim == 1}
+        state, solution, rows_avoid = tick.state, tick.solution, tick.problem.avoidance
+        rows["q"][:], rows["v"][:] = state.q, solution.v
+        rows["target"][:] = [target.position for target in tick.targets]
+        rows["tool"][:], rows["tool_rotation"][:] = tick.kinematics.position, tick.kinematics.rotation
+        for i, (task, target) in enumerate(zip(self._tasks, tick.targets, strict=True)):
+            if task.settings.type == "pose":
+                error = pin.log3(target.rotation @ tick.kinematics.rotation[i].T)
+                rows["turn_error"][i] = np.linalg.norm(error)
+        self._write_bodies(tick, rows)
+        values = {
+            "t": state.t,
+            "slack": 0.0 if solution.slack is None else float(np.max(solution.slack, initial=0.0)),
+            "saturation": solution.saturation,
+            "build_time": solution.build_time,
+            "solve_time": solution.solve_time,
+            "status": STATUSES.index(solution.status),
+        }
+        if len(tick.proximity.distance):
+            values["closest_pair"] = int(np.argmin(tick.proximity.distance))
+        if len(rows_avoid.d):
+            closest = int(np.argmin(rows_avoid.d))
+            values["alpha"], values["beta"] = rows_avoid.alpha[closest], rows_avoid.beta[closest]
+        for name, value in values.items():
+            scalars[name][self._count] = value
+        self._count += 1
+
+    def _write_bodies(self, tick: Tick, rows: dict[str, Array]) -> None:
+        scene, distance = self._scene, tick.proximity.distance
+        nearest = np.full(len(scene.geometry.geometryObjects), np.inf)
+        np.minimum.at(nearest, scene.pairs[:, 0], distance)
+        np.minimum.at(nearest, scene.pairs[:, 1], distance)
+        rows["body_distance"][:] = nearest[: rows["body_distance"].shape[0]]
+        pin.forwardKinematics(scene.robot.model, self._data, tick.state.q)
+        for i, body in enumerate(scene.robot.bodies.geometryObjects):
+            joint = self._data.oMi[body.parentJoint]
+            rows["body_ends"][i] = self._ends[i] @ joint.rotation.T + joint.translation
+        for i, obstacle in enumerate(scene.obstacles):
+            sample = obstacle.motion.sample(tick.state.t)
+            rows["obstacle_position"][i], rows["obstacle_rotation"][i] = sample.position, sample.rotation
+
+    def log(self, stopped_by: str | None = None) -> Log:
+        """What was written so far.
+
+        Args:
+            stopped_by: why the run ended before its time, if it did.
+        """
+        scene, robot = self._scene, self._scene.robot
+        bounds = robot.bounds()
+        meta = {
+            "scenario": self._scenario.source.stem,
+            "title": self._scenario.title,
+            "solver": self._scenario.solver.label,
+            "config": self._scenario.model_dump(mode="json"),
+            "source": self._scenario.source.name,
+            "completed": stopped_by is None and self._count == len(self._arrays["t"]),
+            "stopped_by": stopped_by,
+            "robot": robot.name,
+            "notes": list(robot.notes),
+            "coordinates": robot.coordinate_names,
+            "velocity_limit": [v if np.isfinite(v) else None for v in bounds.velocity],
+            "position_limits": [
+                [robot.coordinate_names[v], lower, upper]
+                for v, lower, upper in zip(bounds.v_index, bounds.lower.tolist(), bounds.upper.tolist(), strict=True)
+            ],
+            "frames": [task.settings.frame for task in self._tasks],
+            "bodies": scene.body_names,
+            "body_radii": self._radii,
+            "obstacles": [{"name": o.name, "shape": o.shape.model_dump()} for o in scene.obstacles],
+            "pairs": [list(pair) for pair in scene.pair_names],
+            "versions": versions(),
+        }
+        arrays = {name: array[: self._count].copy() for name, array in self._arrays.items()}
+        return Log(**arrays, meta=meta)
+
+
+def _drawing_axes(bodies: Any) -> tuple[Array, list[float]]:
+    """Axis ends in the parent joint's frame (b, 2, 3) and radius of each body, or of the capsule around it."""
+    ends, radii = np.empty((len(bodies.geometryObjects), 2, 3)), []
+    for i, body in enumerate(bodies.geometryObjects):
+        fit = enclosing_capsule(body.geometry)
+        half = 0.5 * fit.length * fit.rotation[:, 2]
+        local = np.array([fit.center - half, fit.center + half])
+        ends[i] = local @ body.placement.rotation.T + body.placement.translation
+        radii.append(fit.radius)
+    return ends, radii

@@ -1,0 +1,70 @@
+"""The exchangeable part of a tick: Problem in, Solution out.
+
+A solver is anything with `solve`; those that ship are listed in SOLVERS and chosen by name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from pydantic import TypeAdapter, ValidationError
+
+from qpavoid.config import SolverConfig, expand_solver
+from qpavoid.errors import UnknownName
+from qpavoid.loading import nearest
+from qpavoid.problem import Problem, Solution
+from qpavoid.solvers.analytic import Eq10, TrackingOnly
+from qpavoid.solvers.backends import backend_names
+from qpavoid.solvers.qp import Qp
+
+
+class Solver(Protocol):
+    """One law of control."""
+
+    bounded: bool
+    """Whether its velocity is within the problem's bounds by construction."""
+
+    def solve(self, problem: Problem) -> Solution:
+        """Velocity for one tick; never raises on a well-formed problem."""
+        ...
+
+
+SOLVERS: dict[str, Callable[[Any], Solver]] = {
+    "tracking": TrackingOnly,
+    "eq10": Eq10,
+    "eq10-literal": Eq10,
+    "qp": Qp,
+}
+
+
+def parse_solver(name: str, settings: SolverConfig | None = None) -> SolverConfig:
+    """Configuration of a short form such as `eq10` or `qp:proxqp`.
+
+    Args:
+        name: the short form.
+        settings: kept where they are of the same solver.
+
+    Raises:
+        UnknownName: there is no such solver.
+    """
+    wanted = expand_solver(name)
+    if settings is not None and settings.name == wanted["name"]:
+        wanted = {**settings.model_dump(), **wanted}
+    try:
+        return TypeAdapter[SolverConfig](SolverConfig).validate_python(wanted)
+    except ValidationError:
+        raise UnknownName(f"unknown solver {name!r}{nearest(wanted['name'], SOLVERS)}") from None
+
+
+def make_solver(config: SolverConfig | str) -> Solver:
+    """The solver that a configuration block or a short form asks for.
+
+    Raises:
+        UnknownName, SolverNotInstalled: of the solver or the QP's back end.
+    """
+    config = parse_solver(config) if isinstance(config, str) else config
+    return SOLVERS[config.name](config)
+
+
+__all__ = ["SOLVERS", "Solver", "backend_names", "make_solver", "parse_solver"]

@@ -1,0 +1,97 @@
+"""Closed-form laws: tracking alone, and the task-switching law of eq. 10 in its two readings."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from qpavoid.config import Eq10Solver, TrackingSolver
+from qpavoid.problem import Array, Problem, Solution, Tracking
+
+_VANISHING = 1e-12
+"""Squared length below which a projected row counts as zero: an absolute cut-off, since a relative one inverts
+round-off (J_d N is zero exactly when the tool tip is the key point of a 3-D task)."""
+
+
+def pseudo_inverse(A: Array, damping: float) -> Array:
+    """Damped right inverse Aᵀ (A Aᵀ + λ²)⁻¹; for λ = 0 the Moore-Penrose inverse.
+
+    Args:
+        A: matrix (r, nv).
+        damping: λ [-].
+
+    Returns:
+        (nv, r).
+    """
+    if damping == 0.0:
+        return np.asarray(np.linalg.pinv(A, rcond=1e-10))
+    gram = A @ A.T
+    gram[np.diag_indices_from(gram)] += damping**2
+    return np.asarray(np.linalg.solve(gram, A).T)
+
+
+def tracking_velocity(tracking: Tracking) -> tuple[Array, Array, Array]:
+    """Velocity that tracks as if nothing else mattered: J⁺ẋ of the weighted rows.
+
+    Returns:
+        J⁺ẋ (nv,), the weighted J (r, nv) and its damped inverse J⁺ (nv, r).
+    """
+    root = np.sqrt(tracking.weight)
+    J = root[:, None] * tracking.A
+    J_inv = pseudo_inverse(J, tracking.damping)
+    return J_inv @ (root * tracking.b), J, J_inv
+
+
+class TrackingOnly:
+    """q̇ = J⁺ẋ, damped least squares (Nakamura and Hanafusa 1986; Wampler 1986). The baseline: avoids nothing."""
+
+    bounded = False
+
+    def __init__(self, config: TrackingSolver) -> None:
+        self.config = config
+
+    def solve(self, problem: Problem) -> Solution:
+        """J⁺ẋ."""
+        return Solution(tracking_velocity(problem.tracking)[0])
+
+
+class Eq10:
+    """Eq. 10 of the task-switching paper, for the closest pair:
+
+        q̇ = (I - α J_d⁺J_d) J⁺ẋ + β (J_d N)⁺ (ẋ0 - w),  N = I - J⁺J.
+
+    `eq10-literal` takes w = J_d J⁺ẋ as printed, which takes the primary motion away twice. `eq10` takes
+    w = J_d (I - α J_d⁺J_d) J⁺ẋ, what is left of it, and lets α act only while the primary motion closes in; α as
+    printed would pull an arm back that is already leaving. The projector is bounded and not damped, (J_d N)⁺ is.
+    """
+
+    bounded = False
+
+    def __init__(self, config: Eq10Solver) -> None:
+        self.config = config
+
+    def solve(self, problem: Problem) -> Solution:
+        """Eq. 10, or J⁺ẋ when nothing is in range."""
+        primary, J, J_inv = tracking_velocity(problem.tracking)
+        rows = problem.avoidance
+        if rows.d.size == 0:
+            return Solution(primary)
+        closest = int(np.argmin(rows.d))
+        J_d = rows.J[closest]
+        approach = float(J_d @ primary)
+        literal = self.config.name == "eq10-literal"
+        alpha = min(float(rows.alpha[closest]), self.config.alpha_cap)
+        if not literal and approach >= 0.0:
+            alpha = 0.0
+        switched = primary - alpha * approach * _row_inverse(J_d, damping=0.0)
+        J_dN = J_d - (J_d @ J_inv) @ J
+        wanted = self.config.retreat_speed - (approach if literal else float(J_d @ switched))
+        retreat = float(rows.beta[closest]) * wanted * _row_inverse(J_dN, self.config.damping)
+        return Solution(switched + retreat)
+
+
+def _row_inverse(row: Array, damping: float) -> Array:
+    """Damped inverse rowᵀ/(row·row + λ²) of a 1 x nv matrix; zero for a vanishing row."""
+    square = float(row @ row)
+    if square < _VANISHING:
+        return np.zeros_like(row)
+    return row / (square + damping**2)
