@@ -90,7 +90,7 @@ def _vertices(geometry: Any) -> Array:
     geometry.computeLocalAABB()
     half, center = 0.5 * (geometry.aabb_local.max_ - geometry.aabb_local.min_), geometry.aabb_center
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
-    return center + corners * half
+    return np.asarray(center + corners * half)
 
 
 def fit_capsule(points: Array, directions: int = 400) -> CapsuleFit:

@@ -8,7 +8,7 @@ from time import perf_counter
 
 from qpavoid.avoidance import avoidance_rows
 from qpavoid.config import Avoidance, Limits, ScenarioConfig
-from qpavoid.errors import UnknownName
+from qpavoid.errors import UnknownName, located
 from qpavoid.kinematics import Kinematics, compute_kinematics, support_masks
 from qpavoid.limits import saturate, velocity_bounds
 from qpavoid.loading import nearest
@@ -82,13 +82,16 @@ class Controller:
             ConfigError, UnknownName, SolverNotInstalled: naming file, field and remedy.
         """
         source = scenario.source
-        robot = Robot.load(scenario.robot, source.parent)
+        with located(f"{source}: robot"):
+            robot = Robot.load(scenario.robot, source.parent)
+        with located(f"{source}: solver"):
+            solver = make_solver(scenario.solver)
         q0 = robot.configuration(scenario.q0, f"{source}: q0")
         robot, q0 = robot.lock(scenario.lock, q0, f"{source}: lock")
         controller = cls(
             build_scene(robot, build_obstacles(scenario.obstacles, source)),
             build_tasks(scenario.tasks, robot, q0, source),
-            make_solver(scenario.solver),
+            solver,
             scenario.dt,
             scenario.avoidance,
             scenario.limits,
@@ -175,4 +178,3 @@ def _index(names: Mapping[str, int], name: str, what: str) -> int:
     if name not in names:
         raise UnknownName(f"no {what} {name!r}{nearest(name, names)}")
     return names[name]
-

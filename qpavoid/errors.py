@@ -3,6 +3,9 @@
 An infeasible tick is not an error (it is a `Solution` with a status); these are for input that cannot be used.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class QpavoidError(Exception):
     """Base of every error that qpavoid raises on purpose."""
@@ -22,3 +25,12 @@ class SolverNotInstalled(QpavoidError):
 
 class NumericalError(QpavoidError):
     """NaN or infinity in a state or in a command: the tick's input is malformed."""
+
+
+@contextmanager
+def located(where: str) -> Iterator[None]:
+    """Puts the file and field that an error is about in front of its message."""
+    try:
+        yield
+    except (ConfigError, SolverNotInstalled) as error:
+        raise type(error)(f"{where}: {error}") from None

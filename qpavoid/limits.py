@@ -61,7 +61,8 @@ def saturate(v: Array, lower: Array, upper: Array, v_max: Array) -> tuple[Array,
 
     Args:
         v: raw velocity (nv,).
-        lower, upper: bounds (nv,).
+        lower: lower bounds (nv,).
+        upper: upper bounds (nv,).
         v_max: largest speeds (nv,).
 
     Returns:

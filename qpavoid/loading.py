@@ -94,9 +94,7 @@ def _find(name: str, kind: str, folder: Path, pattern: str, names: list[str]) ->
     raise UnknownName(f"unknown {kind} {name!r}{nearest(name, names)}")
 
 
-def load_scenario(
-    name_or_path: str | Path, overrides: Sequence[str] = (), solver: str | None = None
-) -> ScenarioConfig:
+def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), solver: str | None = None) -> ScenarioConfig:
     """Reads a scenario.
 
     Args:
@@ -113,9 +111,7 @@ def load_scenario(
     return read_config(path, ScenarioConfig, overrides, solver).read_from(path)
 
 
-def read_config(
-    path: Path, model: type[Config], overrides: Sequence[str] = (), solver: str | None = None
-) -> Config:
+def read_config(path: Path, model: type[Config], overrides: Sequence[str] = (), solver: str | None = None) -> Config:
     """Reads a YAML file into `model`.
 
     Raises:
@@ -125,8 +121,10 @@ def read_config(
     if solver is not None:
         name, _, backend = solver.partition(":")
         kept = _solver_mapping(data.get("solver"))
-        data["solver"] = {**(kept if kept.get("name") == name else {"name": name}),
-                          **({"backend": backend} if backend else {})}
+        data["solver"] = {
+            **(kept if kept.get("name") == name else {"name": name}),
+            **({"backend": backend} if backend else {}),
+        }
     for override in overrides:
         _set(data, override, path)
     try:
@@ -207,8 +205,13 @@ def _tags() -> frozenset[str]:
     from qpavoid import config
 
     blocks = [b for b in vars(config).values() if isinstance(b, type) and issubclass(b, config.Block)]
-    tags = {v for b in blocks for key in ("type", "name") if key in b.model_fields
-            for v in typing.get_args(b.model_fields[key].annotation)}
+    tags = {
+        v
+        for b in blocks
+        for key in ("type", "name")
+        if key in b.model_fields
+        for v in typing.get_args(b.model_fields[key].annotation)
+    }
     return frozenset(v for v in tags if isinstance(v, str))
 
 
@@ -226,8 +229,12 @@ def _fields_at(model: Any, loc: tuple[int | str, ...]) -> list[str]:
     for part in loc:
         if isinstance(part, int):
             continue
-        tagged = [b for b in blocks for key in ("type", "name")
-                  if key in b.model_fields and part in typing.get_args(b.model_fields[key].annotation)]
+        tagged = [
+            b
+            for b in blocks
+            for key in ("type", "name")
+            if key in b.model_fields and part in typing.get_args(b.model_fields[key].annotation)
+        ]
         below = [inner for b in blocks if part in b.model_fields for inner in _blocks(b.model_fields[part].annotation)]
         blocks = tagged or below or blocks
     return sorted({name for b in blocks for name in b.model_fields})

@@ -72,7 +72,7 @@ class Log:
     @property
     def min_distance(self) -> Array:
         """(N,) smallest distance of any body at each tick [m]."""
-        return np.min(self.body_distance, axis=1, initial=np.inf)
+        return np.asarray(np.min(self.body_distance, axis=1, initial=np.inf))
 
     def until(self, t: float) -> Log:
         """The part of the run before time t [s]."""
@@ -93,7 +93,7 @@ class Log:
         path.parent.mkdir(parents=True, exist_ok=True)
         meta: Any = np.array(json.dumps({"format": _FORMAT, **self.meta}))
         with path.open("wb") as file:
-            np.savez_compressed(file, meta=meta, **self._arrays())
+            np.savez_compressed(file, allow_pickle=False, meta=meta, **self._arrays())
         return path
 
     @classmethod
@@ -114,7 +114,7 @@ class Log:
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ConfigError(f"{path}: not a qpavoid log: {error}") from None
 
-    def _arrays(self) -> dict[str, Array]:
+    def _arrays(self) -> dict[str, Any]:
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "meta"}
 
 

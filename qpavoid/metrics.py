@@ -67,16 +67,11 @@ def path_deviation(log: Log, corners: int = 500) -> Array:
     Returns:
         (N, k) [m].
     """
-    deviation = np.zeros(log.tool.shape[:2])
-    for task in range(log.tool.shape[1]):
-        path = log.target[:, task]
-        moved = np.r_[True, np.any(np.diff(path, axis=0) != 0.0, axis=1)] if len(path) else np.zeros(0, bool)
-        path = path[moved]
-        keep = np.unique(np.linspace(0, len(path) - 1, min(len(path), corners)).astype(int)) if len(path) else []
-        path = path[keep]
-        best = np.full(len(log.t), np.inf)
-        starts, ends = (path[:-1], path[1:]) if len(path) > 1 else (path, path)
-        for start, end in zip(starts, ends, strict=True):
-            best = np.minimum(best, point_segment(log.tool[:, task], start, end).distance)
-        deviation[:, task] = best
+    count, tasks = log.tool.shape[:2]
+    deviation = np.full((count, tasks), np.inf)
+    every = np.unique(np.linspace(0, max(count - 1, 0), min(count, corners)).astype(int))
+    for task in range(tasks):
+        path, tool = log.target[every, task], log.tool[:, task]
+        for start, end in zip(path, np.roll(path, -1, axis=0)[:-1], strict=False):
+            deviation[:, task] = np.minimum(deviation[:, task], point_segment(tool, start, end).distance)
     return deviation

@@ -137,7 +137,7 @@ class Orbit:
         return Sample(center.position + cos * self.u + sin * self.w, center.rotation, linear, center.angular)
 
 
-def build_motion(config: MotionConfig, start: Sample | None, folder: Path, where: str = "") -> Motion:
+def build_motion(config: MotionConfig, start: Sample | None, folder: Path) -> Motion:
     """Turn a motion block into a trajectory.
 
     Args:
@@ -145,18 +145,10 @@ def build_motion(config: MotionConfig, start: Sample | None, folder: Path, where
         start: pose from which a task takes what the block leaves out; None for obstacles, which must give
             their position and have the identity as orientation unless they give one.
         folder: where the path of a CSV file begins.
-        where: file and field to name in errors.
 
     Raises:
         ConfigError: a position is missing, a line has no length, a circle no plane, or a CSV file is no good.
     """
-    try:
-        return _build(config, start, folder)
-    except ConfigError as error:
-        raise ConfigError(f"{where}: {error}" if where else str(error)) from None
-
-
-def _build(config: MotionConfig, start: Sample | None, folder: Path) -> Motion:
     initial = np.eye(3) if start is None else start.rotation
     match config:
         case Fixed():

@@ -48,8 +48,7 @@ class DistanceQuery:
     def placements(self) -> Mapping[str, Any]:
         """World placements of all bodies at the last call, by name; for drawing."""
         return {
-            body.name: placement
-            for body, placement in zip(self._geometry.geometryObjects, self._data.oMg, strict=True)
+            body.name: placement for body, placement in zip(self._geometry.geometryObjects, self._data.oMg, strict=True)
         }
 
     def compute(self, data: Any, kinematics: Kinematics, reach: float) -> Proximity:

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import sys
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -19,16 +15,11 @@ from qpavoid.bodies import convert_bodies, make_shape
 from qpavoid.config import RobotConfig
 from qpavoid.errors import ConfigError, UnknownName
 from qpavoid.limits import JointBounds
-from qpavoid.loading import example_robot_data, find_robot, nearest, read_config
+from qpavoid.loading import find_robot, nearest, read_config
 from qpavoid.motion import rpy_to_matrix
 from qpavoid.pairs import add_self_pairs, drop_colliding_pairs
 from qpavoid.problem import Array
-
-_ROOT_JOINTS = {
-    "fixed": lambda: None,
-    "planar": pin.JointModelPlanar,
-    "free_flyer": pin.JointModelFreeFlyer,
-}
+from qpavoid.urdf import find_resource, read_collision, read_model
 
 
 @dataclass(frozen=True)
@@ -180,12 +171,12 @@ def _unlimited_if_absurd(velocity: Array) -> Array:
 
 
 def _build(config: RobotConfig, path: Path) -> Robot:
-    urdf = _resource(config.urdf, path, "urdf")
-    model = _read_urdf(urdf, config.root_joint)
+    urdf = find_resource(config.urdf, path, "urdf")
+    model = read_model(urdf, config.root_joint)
     geometry_kind = config.bodies if isinstance(config.bodies, str) else None
     if geometry_kind is not None:
         package_dirs = [str(path.parent / folder) for folder in config.package_dirs]
-        bodies = convert_bodies(_read_collision(urdf, model, package_dirs, path), geometry_kind)
+        bodies = convert_bodies(read_collision(urdf, model, package_dirs, path), geometry_kind)
     else:
         bodies = _listed_bodies(config, model, path)
     _apply_limits(config, model, path)
@@ -195,72 +186,15 @@ def _build(config: RobotConfig, path: Path) -> Robot:
         home = _set_joints(model, _middle(model), config.home, f"{path}: home", ignore=frozenset(config.lock))
     add_self_pairs(model, bodies, config.disabled_pairs, str(path))
     if config.srdf is not None:
-        pin.removeCollisionPairs(model, bodies, str(_resource(config.srdf, path, "srdf")), False)
-    notes = [f"pair {a} - {b} is off: in contact at the home pose" for a, b in drop_colliding_pairs(model, bodies, home)]
+        pin.removeCollisionPairs(model, bodies, str(find_resource(config.srdf, path, "srdf")), False)
+    notes = [
+        f"pair {a} - {b} is off: in contact at the home pose" for a, b in drop_colliding_pairs(model, bodies, home)
+    ]
     for name in config.end_effectors:
         if not model.existFrame(name):
             frames = [f.name for f in model.frames]
             raise UnknownName(f"{path}: end_effectors: no frame {name!r}{nearest(name, frames)}")
     return Robot(config.name, model, bodies, home, tuple(config.end_effectors), str(path), tuple(notes))
-
-
-def _resource(value: str, path: Path, field: str) -> Path:
-    """A URDF or SRDF named in a robot.yaml."""
-    prefix = "example-robot-data:"
-    if value.startswith(prefix):
-        found = example_robot_data() / "example-robot-data" / "robots" / value.removeprefix(prefix)
-    else:
-        found = path.parent / value
-    if not found.is_file():
-        raise ConfigError(f"{path}: {field}: no such file {value!r}; give a path relative to this file or {prefix}PATH")
-    return found
-
-
-@contextmanager
-def _quiet_stderr() -> Iterator[list[str]]:
-    """Catches what C++ parsers print on the process's error stream, so that one line can say it instead."""
-    lines: list[str] = []
-    sys.stderr.flush()
-    saved = os.dup(2)
-    with tempfile.TemporaryFile() as file:
-        os.dup2(file.fileno(), 2)
-        try:
-            yield lines
-        finally:
-            os.dup2(saved, 2)
-            os.close(saved)
-            file.seek(0)
-            lines += file.read().decode(errors="replace").splitlines()
-
-
-def _read_urdf(urdf: Path, root_joint: str) -> Any:
-    root = _ROOT_JOINTS[root_joint]()
-    with _quiet_stderr() as printed:
-        try:
-            arguments = (str(urdf),) if root is None else (str(urdf), root)
-            return pin.buildModelFromUrdf(*arguments)
-        except (ValueError, RuntimeError) as error:
-            reason = " ".join(str(error).split())
-    first = next((line.split(":", 1)[1].strip() for line in printed if line.startswith("Error:")), "")
-    raise ConfigError(f"{urdf}: not a usable URDF: {first or reason}")
-
-
-def _read_collision(urdf: Path, model: Any, package_dirs: list[str], path: Path) -> Any:
-    """Collision geometry of a URDF; `package://` is looked up in the given folders, above the URDF, in
-    example-robot-data and along ROS_PACKAGE_PATH."""
-    ros = [folder for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if folder]
-    above = [str(parent) for parent in urdf.resolve().parents]
-    with _quiet_stderr():
-        try:
-            return pin.buildGeomFromUrdf(
-                model, str(urdf), pin.COLLISION, package_dirs=[*package_dirs, *above, str(example_robot_data()), *ros]
-            )
-        except (ValueError, RuntimeError) as error:
-            reason = " ".join(str(error).split()).rstrip(".")
-    raise ConfigError(
-        f"{path}: {urdf.name}: {reason}; name the folder that holds the package in `package_dirs` of a robot.yaml, "
-        "or set ROS_PACKAGE_PATH"
-    )
 
 
 def _listed_bodies(config: RobotConfig, model: Any, path: Path) -> Any:

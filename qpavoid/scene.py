@@ -12,7 +12,7 @@ import pinocchio as pin
 
 from qpavoid import config
 from qpavoid.bodies import make_shape
-from qpavoid.errors import ConfigError
+from qpavoid.errors import ConfigError, located
 from qpavoid.kinematics import support_masks
 from qpavoid.motion import Motion, build_motion
 from qpavoid.pairs import pair_array
@@ -105,6 +105,7 @@ def build_obstacles(configs: Sequence[config.Obstacle], source: Path) -> list[Ob
     """
     obstacles = []
     for index, c in enumerate(configs):
-        motion = build_motion(c.motion, None, source.parent, f"{source}: obstacles.{index}")
+        with located(f"{source}: obstacles.{index}"):
+            motion = build_motion(c.motion, None, source.parent)
         obstacles.append(Obstacle(c.name, c.shape, motion, moves=not isinstance(c.motion, config.Fixed)))
     return obstacles

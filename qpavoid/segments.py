@@ -97,8 +97,8 @@ def segment_segment(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) 
 
     Takes points [m] of shape (..., 3). Where m and n both lie in [0, 1] they give the minimum; where one does
     not, or the axes are parallel or of zero length, it is the best of the four cases end point to segment.
-    For parallel axes side by side the witnesses are not unique: they are those at one of the ends. The distance
-    is right to rounding; the vector between the witnesses, where two cases tie, to the root of it (1e-8).
+    For parallel axes side by side the witnesses are not unique: they are those at one of the ends. The
+    distance is right to rounding; the vector between the witnesses, where cases tie, to its root (1e-8).
     """
     a, b, c, d = np.broadcast_arrays(a, b, c, d)
     m, n = line_parameters(a, b, c, d)

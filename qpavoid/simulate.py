@@ -79,9 +79,7 @@ def _check_start(controller: Controller, q: Array, scenario: ScenarioConfig) -> 
     for pair in np.flatnonzero(proximity.distance < 0.0):
         a, b = controller.scene.pair_names[pair]
         depth = -1e3 * proximity.distance[pair]
-        warnings.warn(
-            f"{source}: q0: {a} and {b} overlap by {depth:.1f} mm at the start", StartWarning, stacklevel=3
-        )
+        warnings.warn(f"{source}: q0: {a} and {b} overlap by {depth:.1f} mm at the start", StartWarning, stacklevel=3)
 
 
 class Recorder:

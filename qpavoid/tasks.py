@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid import config
+from qpavoid.errors import located
 from qpavoid.kinematics import Kinematics
 from qpavoid.motion import Motion, Sample, build_motion
 from qpavoid.problem import Array, Tracking
@@ -49,7 +50,9 @@ def build_tasks(configs: Sequence[config.Task], robot: Robot, q0: Array, source:
         where = f"{source}: tasks.{index}"
         frame_id = robot.frame_id(settings.frame, f"{where}.frame")
         start = Sample.at(data.oMf[frame_id].translation, data.oMf[frame_id].rotation)
-        tasks.append(FrameTask(frame_id, build_motion(settings.motion, start, source.parent, where), settings))
+        with located(where):
+            motion = build_motion(settings.motion, start, source.parent)
+        tasks.append(FrameTask(frame_id, motion, settings))
     return tasks
 
 

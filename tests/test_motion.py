@@ -134,9 +134,7 @@ def test_circle_runs_counter_clockwise_and_rests_after_its_turns() -> None:
 
 
 @given(normal=direction, towards=direction, radius=st.floats(0.01, 2), t=st.floats(0, 100))
-def test_circle_without_centre_starts_at_the_frame(
-    normal: Any, towards: Any, radius: float, t: float
-) -> None:
+def test_circle_without_centre_starts_at_the_frame(normal: Any, towards: Any, radius: float, t: float) -> None:
     if np.linalg.norm(np.cross(normal, towards)) < 1e-3:
         return
     circle = build(START, type="circle", radius=radius, normal=normal, start_direction=towards, period=3.0)
@@ -177,9 +175,7 @@ def test_orientation_that_stays_is_exactly_constant() -> None:
 def test_two_roundings_of_one_orientation_are_no_turn(tmp_path: Path) -> None:
     for k in range(1, 20):
         q = np.array([0.1 * k, 0.2, -0.3, 0.7])
-        rows = [
-            f"{t},0,0,0," + ",".join(repr(float(x)) for x in scale * q) for t, scale in ((0, 1), (1, 0.7))
-        ]
+        rows = [f"{t},0,0,0," + ",".join(repr(float(x)) for x in scale * q) for t, scale in ((0, 1), (1, 0.7))]
         motion = build(None, tmp_path, type="csv", path=write(tmp_path, POSES, *rows))
         assert not motion.sample(0.5).angular.any()
 

@@ -23,8 +23,8 @@ def vec(*x: float) -> FloatArray:
 coordinate = st.one_of(st.integers(-3, 3).map(float), st.floats(-3.0, 3.0, allow_subnormal=False))
 point = st.tuples(coordinate, coordinate, coordinate).map(lambda x: np.array(x, dtype=np.float64))
 segments = st.tuples(point, point, point, point)
-# Two cases whose distances agree to rounding differ by up to its root, 1e-8, in direction. Where directions are
-# compared to 1e-9, the ends lie on a lattice of 1/8 m: there two cases are either equal or well apart.
+# Two cases whose distances agree to rounding differ by up to its root, 1e-8, in direction. Where directions
+# are compared to 1e-9, the ends lie on a lattice of 1/8 m: there two cases are either equal or well apart.
 lattice_point = st.tuples(*[st.integers(-24, 24)] * 3).map(lambda x: np.array(x, dtype=np.float64) / 8)
 lattice_segments = st.tuples(lattice_point, lattice_point, lattice_point, lattice_point)
 rotation = st.tuples(*[st.floats(-3.0, 3.0)] * 3).map(lambda r: Rotation.from_rotvec(r).as_matrix())
@@ -118,6 +118,13 @@ def test_line_parameters_are_nan_when_not_unique(v: FloatArray) -> None:
     assert np.isnan(line_parameters(c, c + v, a, vec(1, 2, 3))).all()
 
 
+def test_line_parameters_are_nan_when_parallel_to_rounding() -> None:
+    u, c = np.random.default_rng(0).uniform(-1.0, 1.0, (2, 1000, 3))
+    a = np.zeros_like(u)
+    assert np.any(np.cross(u, (c + u / 3) - c) != 0.0)  # the directions do differ in their last digits
+    assert np.isnan(line_parameters(a, u, c, c + u / 3)).all()
+
+
 # ---------------------------------------------------------------------------------------- segment to segment
 
 KNOWN = {
@@ -132,17 +139,17 @@ KNOWN = {
     "parallel past each other": (vec(0, 0, 0), vec(1, 0, 0), vec(4, 4, 0), vec(7, 4, 0), 5.0),
     "collinear apart": (vec(0, 0, 0), vec(1, 1, 1), vec(2, 2, 2), vec(3, 3, 3), np.sqrt(3)),
     "collinear overlapping": (vec(0, 0, 0), vec(2, 2, 2), vec(1, 1, 1), vec(3, 3, 3), 0.0),
+    "collinear overlapping, along x": (vec(0, 0, 0), vec(2, 0, 0), vec(1, 0, 0), vec(3, 0, 0), 0.0),
     "identical": (vec(0, 1, 2), vec(2, 3, 5), vec(0, 1, 2), vec(2, 3, 5), 0.0),
     "point and segment": (vec(0.5, 2, 0), vec(0.5, 2, 0), vec(0, 0, 0), vec(1, 0, 0), 2.0),
+    "point on the segment": (vec(1, 2, 3), vec(1, 2, 3), vec(0, 1, 2), vec(3, 4, 5), 0.0),
     "two points": (vec(0, 0, 0), vec(0, 0, 0), vec(2, 3, 6), vec(2, 3, 6), 7.0),
     "same point": (vec(1, 2, 3), vec(1, 2, 3), vec(1, 2, 3), vec(1, 2, 3), 0.0),
 }
 
 
 @pytest.mark.parametrize(("a", "b", "c", "d", "distance"), KNOWN.values(), ids=KNOWN.keys())
-def test_segment_segment_known(
-    a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, distance: float
-) -> None:
+def test_segment_segment_known(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, distance: float) -> None:
     for ab in ((a, b), (b, a)):
         for cd in ((c, d), (d, c)):
             assert segment_segment(*ab, *cd).distance == pytest.approx(distance, abs=TOL)
@@ -218,9 +225,7 @@ def test_distance_is_symmetric_and_invariant(
 
 
 @given(lattice_segments, rotation, lattice_point)
-def test_gap_turns_with_the_segments(
-    points: tuple[FloatArray, ...], turn: FloatArray, shift: FloatArray
-) -> None:
+def test_gap_turns_with_the_segments(points: tuple[FloatArray, ...], turn: FloatArray, shift: FloatArray) -> None:
     """The witnesses of parallel axes may jump, the vector between them may not: it is unique."""
     a, b, c, d = points
     here, swapped = segment_segment(a, b, c, d), segment_segment(c, d, a, b)

@@ -79,10 +79,9 @@ def _through_qpsolvers(name: str) -> Backend:
     sparse = name in qpsolvers.sparse_solvers and name not in qpsolvers.dense_solvers
 
     def solve(P: Array, q: Array, G: Array, h: Array, lower: Array, upper: Array) -> Array | None:
-        if sparse:
-            P, G = csc_matrix(P), csc_matrix(G)
-        with_rows = {"G": G, "h": h} if len(h) else {}
-        problem = qpsolvers.Problem(P, q, **with_rows, lb=lower, ub=upper)
+        as_given = csc_matrix if sparse else np.asarray
+        rows = {"G": as_given(G), "h": h} if len(h) else {}
+        problem = qpsolvers.Problem(as_given(P), q, **rows, lb=lower, ub=upper)
         try:
             solution = qpsolvers.solve_problem(problem, solver=name, **options)
         except qpsolvers.exceptions.QPError:

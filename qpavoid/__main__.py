@@ -1,0 +1,203 @@
+"""Command line: `qpavoid list | run | compare`.
+
+Exit status: 0 done, 1 a run ended in a defined failure (collision, safe stop, broken off), 2 bad input.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import Enum
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+
+from qpavoid.config import ScenarioConfig
+from qpavoid.controller import Controller
+from qpavoid.errors import ConfigError, QpavoidError
+from qpavoid.loading import load_scenario, robot_names, scenario_names
+from qpavoid.log import Log
+from qpavoid.report import failed, metrics_table, to_json
+from qpavoid.simulate import simulate
+from qpavoid.solvers import SOLVERS, backend_names
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="Follow a planned motion and stay clear of obstacles, other arms and yourself.",
+)
+_out = Console()
+_err = Console(stderr=True)
+
+Sets = Annotated[
+    list[str] | None, typer.Option("--set", metavar="PATH=VALUE", help="Override a field: avoidance.d2=0.30")
+]
+Out = Annotated[Path, typer.Option(help="Folder for logs and figures.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else on stdout.")]
+Figures = Annotated[bool, typer.Option("--figures/--no-figures", help="Draw the figures.")]
+
+
+class Kind(str, Enum):
+    """What `list` can list."""
+
+    robots = "robots"
+    scenarios = "scenarios"
+    solvers = "solvers"
+
+
+@app.command("list")
+def list_(kind: Annotated[Kind | None, typer.Argument(help="Only these.")] = None) -> None:
+    """List what ships: robots, scenarios, solvers."""
+    names = {
+        Kind.robots: robot_names(),
+        Kind.scenarios: scenario_names(),
+        Kind.solvers: [*SOLVERS, *(f"qp:{name}" for name in backend_names())],
+    }
+    if kind is not None:
+        for name in names[kind]:
+            print(name)
+        return
+    for heading, entries in names.items():
+        _out.print(f"[bold]{heading.value}[/]  {'  '.join(entries)}", highlight=False)
+
+
+@app.command()
+def run(
+    scenario: Annotated[str, typer.Argument(help="Shipped name or path of a YAML file.")],
+    solver: Annotated[str | None, typer.Option(help="Such as eq10 or qp:proxqp; as in the file if left out.")] = None,
+    set_: Sets = None,
+    out: Out = Path("out"),
+    json: Json = False,
+    figures: Figures = True,
+) -> None:
+    """Run one scenario; write its log and figures."""
+    logs, files = _run_all([load_scenario(scenario, set_ or (), solver)], out)
+    if figures:
+        files += _draw(logs, out, compare=False)
+    metrics = [log.metrics() for log in logs]
+    _print(metrics, files, {**metrics[0], "files": [str(f) for f in files]} if json else None)
+    raise typer.Exit(1 if failed(metrics[0]) else 0)
+
+
+@app.command()
+def compare(
+    scenarios: Annotated[list[str], typer.Argument(help="Shipped names or paths of YAML files.")],
+    solvers: Annotated[str, typer.Option(help="Comma-separated.")] = "tracking,eq10-literal,eq10,qp",
+    set_: Sets = None,
+    out: Out = Path("out"),
+    json: Json = False,
+    figures: Figures = True,
+) -> None:
+    """Run scenarios with several solvers, side by side.
+
+    A collision is a result here, not a failure: the exit status is 1 only when a run was broken off.
+    """
+    names = [name.strip() for name in solvers.split(",") if name.strip()]
+    if not names:
+        raise ConfigError("--solvers: names none; give some, as in tracking,eq10,qp")
+    configs = [load_scenario(scenario, set_ or (), name) for scenario in scenarios for name in names]
+    logs, files = _run_all(configs, out)
+    if figures:
+        files += _draw(logs, out, compare=True)
+    metrics = [log.metrics() for log in logs]
+    _print(metrics, files, {"runs": metrics, "files": [str(f) for f in files]} if json else None)
+    raise typer.Exit(0 if all(run["completed"] for run in metrics) and len(logs) == len(configs) else 1)
+
+
+def _run_all(configs: list[ScenarioConfig], out: Path) -> tuple[list[Log], list[Path]]:
+    """Runs and saves one after the other; an interrupted run is saved as far as it came and is the last."""
+    logs: list[Log] = []
+    files = []
+    for config in configs:  # faults of the last scenario show before the first one runs
+        Controller.from_scenario(config)
+    with _progress() as bar, _terminate_like_interrupt():
+        for config in configs:
+            label = f"{config.source.stem} {config.solver.label}"
+            update = partial(_update, bar, bar.add_task(label, total=None))
+            logs.append(simulate(config, progress=update))
+            files.append(logs[-1].save(out / f"{label.replace(' ', '_').replace(':', '-')}.npz"))
+            if logs[-1].meta["stopped_by"]:
+                _err.print(f"[red]{label}: broken off: {escape(logs[-1].meta['stopped_by'])}[/]", highlight=False)
+                break
+    return logs, files
+
+
+def _update(bar: Progress, job: TaskID, done: int, total: int) -> None:
+    bar.update(job, completed=done, total=total)
+
+
+def _draw(logs: list[Log], out: Path, compare: bool) -> list[Path]:
+    try:
+        from qpavoid import plot
+    except ModuleNotFoundError as missing:
+        if missing.name is None or missing.name.split(".")[0] != "matplotlib":
+            raise
+        _err.print("no figures: matplotlib is missing; pip install 'qpavoid\\[plots]'", highlight=False)
+        return []
+    with _progress() as bar:
+        job = bar.add_task("figures", total=len(logs))
+        files = []
+        for log in logs:
+            files += plot.plot_run(log, out)
+            bar.advance(job)
+        if compare:
+            for scenario in dict.fromkeys(log.meta["scenario"] for log in logs):
+                files += plot.plot_compare([log for log in logs if log.meta["scenario"] == scenario], out)
+    return files
+
+
+def _print(metrics: list[dict[str, Any]], files: list[Path], document: dict[str, Any] | None) -> None:
+    if document is not None:
+        print(to_json(document))
+        return
+    for scenario in dict.fromkeys(run["scenario"] for run in metrics):
+        _out.print(metrics_table([run for run in metrics if run["scenario"] == scenario]))
+    for file in files:
+        _out.print(str(file), highlight=False, soft_wrap=True)
+
+
+def _progress() -> Progress:
+    return Progress(
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), console=_err
+    )
+
+
+@contextmanager
+def _terminate_like_interrupt() -> Iterator[None]:
+    """A polite kill ends a run as Ctrl-C does: what was recorded is kept."""
+
+    def interrupt(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _show_warning(message: Warning | str, *_: Any) -> None:
+    _err.print(f"[yellow]warning:[/] {escape(str(message))}", highlight=False, soft_wrap=True)
+
+
+def main() -> None:
+    """Entry point: turns every expected error into one line and exit status 2."""
+    warnings.showwarning = _show_warning  # type: ignore[assignment]
+    try:
+        app()
+    except QpavoidError as error:
+        _err.print(f"[red]error:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

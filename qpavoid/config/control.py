@@ -1,0 +1,99 @@
+"""Tasks, avoidance and joint limits."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from qpavoid.config.base import Block, NonNegative, Positive
+from qpavoid.config.motion import Motion
+
+
+class Task(Block):
+    """One frame that follows a motion: v_frame = v_ref(t) + gain (x_ref(t) - x)."""
+
+    frame: str
+    """Frame of the robot that is to follow."""
+    type: Literal["position", "pose"] = "position"
+    """`position`: 3 rows; `pose`: position and orientation, 6 rows."""
+    motion: Motion
+    gain: NonNegative = 2.0
+    """Feedback gain K [1/s]."""
+    weight: Positive = 1.0
+    """Cost of the position rows [(m/s)⁻²]."""
+    orientation_weight: Positive = 1.0
+    """Cost of the orientation rows [(rad/s)⁻²]."""
+    max_speed: Positive | None = None
+    """Cap on the commanded linear speed [m/s]; left out: no cap."""
+    max_turn_rate: Positive | None = None
+    """Cap on the commanded angular speed [rad/s]; left out: no cap."""
+
+
+class Switching(Block):
+    """Row of the task-switching QP: ḋ >= -(1 - β(d)) ξ (d - d1); below d1 it backs away."""
+
+    type: Literal["switching"]
+    gain: Positive = 5.0
+    """ξ [1/s]."""
+
+
+class Damper(Block):
+    """Velocity damper: ḋ >= -ξ (d - d_safe); below d_safe it backs away, at most at `recovery_speed`."""
+
+    type: Literal["damper"]
+    gain: Positive = 5.0
+    """ξ [1/s]."""
+    d_safe: Positive | None = None
+    """Distance that is held [m], measured as d1 is; left out: d1."""
+
+
+class Cbf(Block):
+    """Control barrier function h = d - d_safe with linear class-K gain: ḋ >= -γ h, recovery speed not capped."""
+
+    type: Literal["cbf"]
+    gain: Positive = 5.0
+    """γ [1/s]."""
+    d_safe: Positive | None = None
+    """Distance that is held [m], measured as d1 is; left out: d1."""
+
+
+AvoidanceRow = Annotated[Switching | Damper | Cbf, Field(discriminator="type")]
+
+
+class Avoidance(Block):
+    """When and how the robot keeps clear."""
+
+    d1: float = 0.03
+    """Distance below which avoiding has taken over entirely (eq. 12) [m]."""
+    d2: float = 0.10
+    """Influence distance: farther pairs are ignored (eqs. 11, 12) [m]."""
+    offset: NonNegative = 0.0
+    """Added to the distance between surfaces before d1, d2 and d_safe are compared with it [m]. The paper measures
+    between axes: its figures want the sum of the two radii here."""
+    row: AvoidanceRow = Switching(type="switching")
+    """Form of the QP's avoidance rows."""
+    recovery_speed: Positive = 0.2
+    """Cap on the speed at which rows ask a pair that is too close to part [m/s]."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Avoidance:
+        if not 0 < self.d1 < self.d2:
+            raise ValueError(f"needs 0 < d1 < d2, got d1 = {self.d1}, d2 = {self.d2}")
+        if self.d1 <= self.offset:
+            raise ValueError(f"d1 = {self.d1} must exceed offset = {self.offset}, else it lies inside the bodies")
+        d_safe = getattr(self.row, "d_safe", None)
+        if d_safe is not None and not self.offset <= d_safe < self.d2:
+            raise ValueError(f"needs offset <= row.d_safe < d2, got {self.offset}, {d_safe}, {self.d2}")
+        return self
+
+
+class Limits(Block):
+    """Joint limits as bounds on the velocity."""
+
+    position_gain: Annotated[float, Field(gt=0, le=1)] = 0.5
+    """Share of the range left to a position limit that one tick may use [-]."""
+    velocity_scale: Annotated[float, Field(gt=0, le=1)] = 1.0
+    """Share of the velocity limits that may be used [-]."""
+    saturate: bool = True
+    """Whether the laws that know no limits (all but the QP) are scaled and clipped to them afterwards."""

@@ -1,0 +1,68 @@
+"""A robot.yaml: everything that a URDF alone does not say."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import model_validator
+
+from qpavoid.config.base import Block, Positive, Vec3
+from qpavoid.config.shapes import Shape
+
+
+class Body(Block):
+    """A collision body given by hand."""
+
+    name: str
+    """Name by which pairs, logs and messages know it."""
+    frame: str
+    """Link or frame of the URDF that carries it."""
+    shape: Shape
+    position: Vec3 = (0.0, 0.0, 0.0)
+    """Position of the shape's origin in `frame` [m]."""
+    rpy: Vec3 = (0.0, 0.0, 0.0)
+    """Orientation of the shape in `frame`: roll, pitch, yaw about its fixed axes [rad]."""
+
+
+class JointLimits(Block):
+    """Limits that replace those of the URDF, by joint name."""
+
+    position: dict[str, tuple[float, float]] = {}
+    """Joint: [lower, upper] [rad or m]."""
+    velocity: dict[str, Positive] = {}
+    """Joint: largest speed [rad/s or m/s]."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> JointLimits:
+        for joint, (lower, upper) in self.position.items():
+            if lower > upper:
+                raise ValueError(f"position of {joint!r}: lower limit {lower} lies above upper limit {upper}")
+        return self
+
+
+class RobotConfig(Block):
+    """A robot.yaml: everything that a URDF alone does not say."""
+
+    name: str
+    """Name for tables and figures."""
+    urdf: str
+    """URDF: a path relative to this file, an absolute path, or `example-robot-data:PATH` below its robots folder."""
+    srdf: str | None = None
+    """SRDF whose `disable_collisions` are honoured; found like `urdf`."""
+    package_dirs: list[str] = []
+    """Folders in which `package://NAME/…` mesh paths are looked up, relative to this file."""
+    root_joint: Literal["fixed", "planar", "free_flyer"] = "fixed"
+    """How the root link is attached to the world."""
+    end_effectors: list[str] = []
+    """Frames that are meant as tools."""
+    bodies: Literal["convex", "capsule", "mesh"] | list[Body] = "convex"
+    """Collision bodies: `convex` hulls of the URDF's collision geometry, one enclosing `capsule` for each piece of
+    it, the triangle `mesh` as it is (slow: 50 to 200 µs a pair), or a list of bodies."""
+    disabled_pairs: list[tuple[str, str]] = []
+    """Pairs of bodies never checked; `*` and `?` match as in file names."""
+    limits: JointLimits = JointLimits()
+    home: dict[str, float] = {}
+    """Joint: position of the home pose [rad or m]; joints left out are at 0, or at the middle
+    of their range where 0 is outside it."""
+    lock: dict[str, float] = {}
+    """Joint: position [rad or m] at which it is fixed for good, as if the joint were not there."""

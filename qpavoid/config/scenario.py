@@ -1,0 +1,84 @@
+"""A file of tasks/: one closed-loop run from start to end."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field, PrivateAttr, model_validator
+
+from qpavoid.config.base import Block, NonNegative, Positive
+from qpavoid.config.control import Avoidance, Limits, Task
+from qpavoid.config.motion import Circle, Fixed, Line, Motion
+from qpavoid.config.shapes import Shape
+from qpavoid.config.solver import QpSolver, SolverConfig
+
+
+class Obstacle(Block):
+    """A body that the robot must stay clear of."""
+
+    name: str
+    shape: Shape
+    motion: Motion
+    """Where its origin is; what a task could take from its frame must be given here."""
+
+
+class ScenarioConfig(Block):
+    """A file of tasks/: one closed-loop run from start to end."""
+
+    title: str = ""
+    """One line for tables and figures."""
+    tags: list[str] = []
+    """Free labels."""
+    robot: str
+    """Shipped name, robot.yaml, or URDF; a path is relative to the scenario file."""
+    q0: list[float] | dict[str, float] = {}
+    """Initial configuration [rad or m]: all of q, or by joint name over the home pose."""
+    lock: list[str] = []
+    """Joints held at q0 for the whole run; `*` and `?` match as in file names."""
+    tasks: Annotated[list[Task], Field(min_length=1)]
+    obstacles: list[Obstacle] = []
+    tracking_damping: NonNegative = 0.01
+    """λ of the damped J⁺ of the tracking task, the same for every solver [-]; 0 gives the plain pseudo-inverse."""
+    avoidance: Avoidance = Avoidance()
+    limits: Limits = Limits()
+    solver: SolverConfig = QpSolver(name="qp")
+    """A name (`eq10`, `qp:osqp`) or a mapping with that solver's settings."""
+    dt: Annotated[float, Field(gt=0, le=0.1)] = 0.01
+    """Control period [s]."""
+    duration: Positive
+    """Length of the run [s]."""
+    goal_tolerance: Positive = 0.005
+    """A run has arrived when every task ends this close to its target [m]."""
+    thresholds: list[float] = [0.0]
+    """Surface distances [m] for which the time spent below is reported."""
+    _source: Path = PrivateAttr(default=Path("scenario"))
+
+    @property
+    def source(self) -> Path:
+        """The file that it was read from: named in messages, and the folder that relative paths start from."""
+        return self._source
+
+    def read_from(self, source: Path) -> ScenarioConfig:
+        """The same scenario, as if it had been read from `source`."""
+        copy = self.model_copy()
+        copy._source = source
+        return copy
+
+    @model_validator(mode="after")
+    def _unique(self) -> ScenarioConfig:
+        for what, names in (
+            ("obstacle", [o.name for o in self.obstacles]),
+            ("task frame", [t.frame for t in self.tasks]),
+        ):
+            twice = sorted({n for n in names if names.count(n) > 1})
+            if twice:
+                raise ValueError(f"{what} {twice[0]!r} is given twice: names must differ")
+        for obstacle in self.obstacles:
+            if isinstance(obstacle.motion, Fixed) and obstacle.motion.position is None:
+                raise ValueError(f"obstacle {obstacle.name!r}: motion.position is missing")
+            if isinstance(obstacle.motion, Line) and obstacle.motion.start is None:
+                raise ValueError(f"obstacle {obstacle.name!r}: motion.start is missing")
+            if isinstance(obstacle.motion, Circle) and obstacle.motion.center is None:
+                raise ValueError(f"obstacle {obstacle.name!r}: motion.center is missing")
+        return self

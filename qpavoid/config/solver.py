@@ -1,0 +1,65 @@
+"""Solvers and their settings."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field
+
+from qpavoid.config.base import Block, NonNegative, Positive
+
+
+class TrackingSolver(Block):
+    """Damped least squares on the tracking task; does not avoid."""
+
+    name: Literal["tracking"]
+
+    @property
+    def label(self) -> str:
+        """Short form that names it."""
+        return self.name
+
+
+class Eq10Solver(Block):
+    """Eq. 10: `eq10` with the consistent bracket and α while approaching only, `eq10-literal` as printed."""
+
+    name: Literal["eq10", "eq10-literal"]
+    damping: NonNegative = 0.05
+    """λ of the damped (J_d N)⁺ [-]."""
+    retreat_speed: NonNegative = 0.1
+    """ẋ0: speed of backing away along the shortest distance [m/s]."""
+    alpha_cap: Positive = 1e6
+    """Largest α; eq. 11 grows without bound as d goes to 0 [-]."""
+
+    @property
+    def label(self) -> str:
+        """Short form that names it."""
+        return self.name
+
+
+class QpSolver(Block):
+    """QP: tracking as cost, avoidance rows as inequalities, joint limits as bounds."""
+
+    name: Literal["qp"]
+    backend: str = "daqp"
+    """`daqp`, `proxqp`, `osqp`, `quadprog`, or whatever else qpsolvers finds installed."""
+    regularization: Positive = 1e-3
+    """λ: cost of leaving the tracking law's velocity [(rad/s)⁻²]."""
+
+    @property
+    def label(self) -> str:
+        """Short form that names it."""
+        return self.name if self.backend == "daqp" else f"{self.name}:{self.backend}"
+
+
+def expand_solver(value: Any) -> Any:
+    """`qp:proxqp` -> {name: qp, backend: proxqp}; `eq10` -> {name: eq10}."""
+    if not isinstance(value, str):
+        return value
+    name, _, backend = value.partition(":")
+    return {"name": name, "backend": backend} if backend else {"name": name}
+
+
+SolverConfig = Annotated[
+    Annotated[TrackingSolver | Eq10Solver | QpSolver, Field(discriminator="name")], BeforeValidator(expand_solver)
+]

@@ -1,0 +1,110 @@
+"""Reads URDF files: the model, and the collision geometry with its meshes."""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pinocchio as pin
+
+from qpavoid.errors import ConfigError
+from qpavoid.loading import example_robot_data
+
+_ROOT_JOINTS = {
+    "fixed": lambda: None,
+    "planar": pin.JointModelPlanar,
+    "free_flyer": pin.JointModelFreeFlyer,
+}
+
+
+def find_resource(value: str, path: Path, field: str) -> Path:
+    """A URDF or SRDF named in a robot.yaml.
+
+    Args:
+        value: path relative to the robot.yaml, or `example-robot-data:PATH`.
+        path: the robot.yaml.
+        field: which of its fields, for messages.
+
+    Raises:
+        ConfigError: there is no such file.
+    """
+    prefix = "example-robot-data:"
+    if value.startswith(prefix):
+        found = example_robot_data() / "example-robot-data" / "robots" / value.removeprefix(prefix)
+    else:
+        found = path.parent / value
+    if not found.is_file():
+        raise ConfigError(f"{path}: {field}: no such file {value!r}; give a path relative to this file or {prefix}PATH")
+    return found
+
+
+@contextmanager
+def _quiet_stderr() -> Iterator[list[str]]:
+    """Catches what C++ parsers print on the process's error stream, so that one line can say it instead."""
+    lines: list[str] = []
+    sys.stderr.flush()
+    saved = os.dup(2)
+    with tempfile.TemporaryFile() as file:
+        os.dup2(file.fileno(), 2)
+        try:
+            yield lines
+        finally:
+            os.dup2(saved, 2)
+            os.close(saved)
+            file.seek(0)
+            lines += file.read().decode(errors="replace").splitlines()
+
+
+def read_model(urdf: Path, root_joint: str) -> Any:
+    """Pinocchio model of a URDF.
+
+    Args:
+        urdf: the file.
+        root_joint: `fixed`, `planar` or `free_flyer`.
+
+    Raises:
+        ConfigError: not a usable URDF, with the parser's own reason.
+    """
+    root = _ROOT_JOINTS[root_joint]()
+    with _quiet_stderr() as printed:
+        try:
+            arguments = (str(urdf),) if root is None else (str(urdf), root)
+            return pin.buildModelFromUrdf(*arguments)
+        except (ValueError, RuntimeError) as error:
+            reason = " ".join(str(error).split())
+    first = next((line.split(":", 1)[1].strip() for line in printed if line.startswith("Error:")), "")
+    raise ConfigError(f"{urdf}: not a usable URDF: {first or reason}")
+
+
+def read_collision(urdf: Path, model: Any, package_dirs: list[str], path: Path) -> Any:
+    """Collision geometry of a URDF, meshes as they are.
+
+    `package://` is looked up in the given folders, above the URDF, in example-robot-data and along ROS_PACKAGE_PATH.
+
+    Args:
+        urdf: the file.
+        model: its model.
+        package_dirs: folders to look in first.
+        path: file to name in errors.
+
+    Raises:
+        ConfigError: a mesh that cannot be found or read.
+    """
+    ros = [folder for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if folder]
+    above = [str(parent) for parent in urdf.resolve().parents]
+    with _quiet_stderr():
+        try:
+            return pin.buildGeomFromUrdf(
+                model, str(urdf), pin.COLLISION, package_dirs=[*package_dirs, *above, str(example_robot_data()), *ros]
+            )
+        except (ValueError, RuntimeError) as error:
+            reason = " ".join(str(error).split()).rstrip(".")
+    raise ConfigError(
+        f"{path}: {urdf.name}: {reason}; name the folder that holds the package in `package_dirs` of a robot.yaml, "
+        "or set ROS_PACKAGE_PATH"
+    )
