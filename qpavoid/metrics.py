@@ -72,6 +72,6 @@ def path_deviation(log: Log, corners: int = 500) -> Array:
     every = np.unique(np.linspace(0, max(count - 1, 0), min(count, corners)).astype(int))
     for task in range(tasks):
         path, tool = log.target[every, task], log.tool[:, task]
-        for start, end in zip(path, np.roll(path, -1, axis=0)[:-1], strict=False):
+        for start, end in zip(path, np.concatenate((path[1:], path[-1:])), strict=True):
             deviation[:, task] = np.minimum(deviation[:, task], point_segment(tool, start, end).distance)
     return deviation

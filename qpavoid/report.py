@@ -21,12 +21,18 @@ def metrics_table(runs: Sequence[dict[str, Any]]) -> Table:
     Args:
         runs: results of `Log.metrics`.
     """
-    table = Table(title=f"[bold]{runs[0]['scenario']}[/] (distances between surfaces)", box=box.SIMPLE_HEAD,  collapse_padding=True,
-                  title_justify="left", title_style="", padding=(0, 1, 0, 0), pad_edge=False)  # fmt: skip
+    table = Table(
+        title=f"[bold]{runs[0]['scenario']}[/] (distances between surfaces)",
+        title_justify="left",
+        title_style="",
+        box=box.SIMPLE_HEAD,
+        pad_edge=False,
+        collapse_padding=True,
+    )
     table.add_column("solver", no_wrap=True)
     for heading in _COLUMNS:
         table.add_column(heading, justify="right", no_wrap=True)
-    table.add_column("outcome")
+    table.add_column("outcome", min_width=14)
     for run in runs:
         table.add_row(
             run["solver"],
