@@ -93,24 +93,34 @@ def _vertices(geometry: Any) -> Array:
     return np.asarray(center + corners * half)
 
 
-def fit_capsule(points: Array, directions: int = 400) -> CapsuleFit:
+def fit_capsule(points: Array, directions: int = 250) -> CapsuleFit:
     """A small capsule that encloses all points.
 
-    Tries the points' principal axes and a spiral of directions over the half sphere; for each, the axis runs through
-    the centre of the smallest circle around the projected points, and the caps are drawn in as far as the
-    points allow.
+    Tries the points' principal axes and a spiral of directions over the half sphere, all at once; for each, the axis
+    runs through the centre of the smallest circle around the projected points, and the caps are drawn in as far as
+    the points allow.
 
     Args:
         points: (n, 3) [m], at least one.
         directions: how many directions are tried.
 
     Returns:
-        The fit of smallest volume; every point is inside to 1e-9.
+        The fit of smallest volume; every point is inside.
     """
     points = np.unique(np.asarray(points, dtype=np.float64), axis=0)
     principal = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
-    fits = [_fit_along(points, axis) for axis in (*principal, *_half_sphere(directions))]
-    return min(fits, key=lambda fit: fit.volume)
+    rotations = _rotations_to(np.concatenate((principal, _half_sphere(directions))))
+    local = points @ rotations
+    center, radius = _enclosing_circles(local[..., :2])
+    # each point lets the caps' centres come no nearer than this to the far side
+    off_axis = np.sum((local[..., :2] - center[:, None]) ** 2, axis=2)
+    reach = np.sqrt(np.maximum(radius[:, None] ** 2 - off_axis, 0.0))
+    low, high = np.min(local[..., 2] + reach, axis=1), np.max(local[..., 2] - reach, axis=1)
+    length = np.maximum(high - low, 0.0)  # where the caps' centres cross, a ball about their middle does
+    best = int(np.argmin(np.pi * radius**2 * (length + 4.0 / 3.0 * radius)))
+    origin = rotations[best] @ np.array([*center[best], 0.5 * (low[best] + high[best])])
+    margin = 1e-10  # against rounding, so that the points on the surface count as inside
+    return CapsuleFit(origin, rotations[best], float(radius[best]) + margin, float(length[best]))
 
 
 def _half_sphere(count: int) -> Array:
@@ -121,30 +131,21 @@ def _half_sphere(count: int) -> Array:
     return np.column_stack((r * np.cos(angle), r * np.sin(angle), z))
 
 
-def _fit_along(points: Array, axis: Array) -> CapsuleFit:
-    """The capsule around `points` whose axis points along `axis`."""
-    helper = np.eye(3)[np.argmin(np.abs(axis))]
-    x = np.cross(helper, axis)
-    x /= np.linalg.norm(x)
-    rotation = np.column_stack((x, np.cross(axis, x), axis))
-    local = points @ rotation
-    center, radius = _enclosing_circle(local[:, :2])
-    # each point lets the caps' centres come no nearer than this to the far side
-    reach = np.sqrt(np.maximum(radius**2 - np.sum((local[:, :2] - center) ** 2, axis=1), 0.0))
-    low, high = np.min(local[:, 2] + reach), np.max(local[:, 2] - reach)
-    if high < low:
-        # a sphere would do along this axis; the middle needs a radius that reaches every point
-        middle = 0.5 * (low + high)
-        low = high = middle
-        radius = float(np.max(np.linalg.norm(local - np.array([*center, middle]), axis=1)))
-    origin = rotation @ np.array([*center, 0.5 * (low + high)])
-    return CapsuleFit(origin, rotation, radius + 1e-10, float(high - low))
+def _rotations_to(axes: Array) -> Array:
+    """Rotations (k, 3, 3) whose z columns are the unit vectors `axes` (k, 3)."""
+    x = np.cross(np.eye(3)[np.argmin(np.abs(axes), axis=1)], axes)
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    return np.stack((x, np.cross(axes, x), axes), axis=2)
 
 
-def _enclosing_circle(points: Array) -> tuple[Array, float]:
-    """Nearly smallest circle around 2-D points: Badoiu and Clarkson's iteration, radius taken at its centre."""
-    center = 0.5 * (points.min(axis=0) + points.max(axis=0))
+def _enclosing_circles(points: Array) -> tuple[Array, Array]:
+    """Nearly smallest circle around each set of 2-D points (k, n, 2): centres (k, 2) and radii (k,).
+
+    Badoiu and Clarkson's iteration for the centre; the radius is then exact for that centre.
+    """
+    center = 0.5 * (points.min(axis=1) + points.max(axis=1))
+    every = np.arange(len(points))
     for step in range(1, 60):
-        offset = points - center
-        center = center + offset[np.argmax(np.sum(offset * offset, axis=1))] / (step + 1)
-    return center, float(np.sqrt(np.max(np.sum((points - center) ** 2, axis=1))))
+        farthest = np.argmax(np.sum((points - center[:, None]) ** 2, axis=2), axis=1)
+        center = center + (points[every, farthest] - center) / (step + 1)
+    return center, np.sqrt(np.max(np.sum((points - center[:, None]) ** 2, axis=2), axis=1))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import types
 import typing
 from collections.abc import Iterable, Sequence
 from importlib.metadata import PackageNotFoundError, distribution
@@ -12,6 +11,7 @@ from typing import Any, TypeVar
 
 import yaml
 from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
 
 from qpavoid.config import RobotConfig, ScenarioConfig, expand_solver
 from qpavoid.errors import ConfigError, UnknownName
@@ -130,7 +130,7 @@ def read_config(path: Path, model: type[Config], overrides: Sequence[str] = (), 
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        raise ConfigError(_explain(error, model, path)) from None
+        raise ConfigError(f"{path}: {_explain(error, model, data)}") from None
 
 
 def _solver_mapping(value: Any) -> dict[str, Any]:
@@ -144,7 +144,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
         data = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read: {error}") from None
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError) as error:  # ValueError: a date such as 2024-13-45
         raise ConfigError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
     if not isinstance(data, dict):
         raise ConfigError(f"{path}: must be a mapping of fields, got {type(data).__name__}")
@@ -158,7 +158,7 @@ def _set(data: dict[str, Any], override: str, path: Path) -> None:
         raise ConfigError(f"--set {override!r}: expected path=value, as in avoidance.d2=0.30")
     try:
         value = yaml.safe_load(text)
-    except yaml.YAMLError:
+    except (yaml.YAMLError, ValueError):
         raise ConfigError(f"--set {override!r}: {text!r} is not a YAML value") from None
     node: Any = data
     keys = where.split(".")
@@ -180,70 +180,75 @@ def _set(data: dict[str, Any], override: str, path: Path) -> None:
             node = node[index]
 
 
-def _explain(error: ValidationError, model: type[BaseModel], path: Path) -> str:
-    """All faults of a file in one line: file, field, what is wrong, nearest valid key."""
-    faults = []
-    for fault in error.errors():
-        loc = [part for part in fault["loc"] if not (isinstance(part, str) and _is_union_tag(part, fault["loc"]))]
-        field = ".".join(str(part) for part in loc)
-        message = fault["msg"].removeprefix("Value error, ")
-        if fault["type"] == "extra_forbidden":
-            message = f"unknown key{nearest(str(loc[-1]), _fields_at(model, fault['loc'][:-1]))}"
-        elif fault["type"] == "union_tag_invalid":
-            context = fault.get("ctx", {})
-            tag, expected = str(context.get("tag")), str(context.get("expected_tags")).replace("'", "").split(", ")
-            message = f"unknown {str(context.get('discriminator')).strip(chr(39))} {tag!r}{nearest(tag, expected)}"
-        elif fault["type"] == "missing":
-            message = "is missing"
-        elif fault["type"] not in ("value_error", "union_tag_not_found"):
-            message = f"{message}, got {fault['input']!r:.60}"
-        faults.append(f"{field}: {message}" if field else message)
-    return f"{path}: " + "; ".join(faults)
+def _explain(error: ValidationError, model: type[BaseModel], data: dict[str, Any]) -> str:
+    """All faults of a file in one line: field, what is wrong, nearest valid key."""
+    faults = [(_field(fault["loc"], fault["type"], data), _fault(fault, model)) for fault in error.errors()]
+    # Of a field that may be a list or a mapping, pydantic reports both; the one that was meant got deeper.
+    fields = [field for field, _ in faults]
+    told = [
+        f"{'.'.join(field)}: {what}" if field else what
+        for field, what in faults
+        if not any(len(other) > len(field) and other[: len(field)] == field for other in fields)
+    ]
+    more = f"; and {len(told) - _FAULTS_TOLD} more" if len(told) > _FAULTS_TOLD else ""
+    return "; ".join(told[:_FAULTS_TOLD]) + more
 
 
-def _tags() -> frozenset[str]:
-    from qpavoid import config
-
-    blocks = [b for b in vars(config).values() if isinstance(b, type) and issubclass(b, config.Block)]
-    tags = {
-        v
-        for b in blocks
-        for key in ("type", "name")
-        if key in b.model_fields
-        for v in typing.get_args(b.model_fields[key].annotation)
-    }
-    return frozenset(v for v in tags if isinstance(v, str))
+_FAULTS_TOLD = 5
 
 
-def _is_union_tag(part: str, loc: tuple[int | str, ...]) -> bool:
-    """pydantic puts the chosen member of a union into the location; a reader of the file never wrote it there."""
-    return loc[0] != part and (part in _tags() or part in _PYDANTIC_PARTS)
-
-
-_PYDANTIC_PARTS = frozenset({"list[float]", "dict[str,float]", "list[Body]", "list", "dict"})
-
-
-def _fields_at(model: Any, loc: tuple[int | str, ...]) -> list[str]:
-    """Field names of the block that `loc` leads to, through lists and unions."""
-    blocks = _blocks(model)
+def _field(loc: tuple[int | str, ...], kind: str, data: Any) -> list[str]:
+    """The keys and indices of the file among a location's parts; pydantic also names the members of unions."""
+    field = []
     for part in loc:
-        if isinstance(part, int):
+        try:
+            data = data[part]
+        except (LookupError, TypeError):
             continue
-        tagged = [
-            b
-            for b in blocks
-            for key in ("type", "name")
-            if key in b.model_fields and part in typing.get_args(b.model_fields[key].annotation)
-        ]
-        below = [inner for b in blocks if part in b.model_fields for inner in _blocks(b.model_fields[part].annotation)]
-        blocks = tagged or below or blocks
-    return sorted({name for b in blocks for name in b.model_fields})
+        field.append(str(part))
+    absent = kind == "missing" or (kind == "extra_forbidden" and field[-1] != loc[-1])  # the latter: `eq10:daqp`
+    return [*field, str(loc[-1])] if absent else field
+
+
+def _fault(fault: ErrorDetails, model: type[BaseModel]) -> str:
+    """What is wrong, in words."""
+    kind, loc, context = fault["type"], fault["loc"], fault.get("ctx", {})
+    if kind == "extra_forbidden":
+        keys = {key for block in _blocks_at(model, loc[:-1]) for key in block.model_fields}
+        return f"unknown key{nearest(str(loc[-1]), keys)}"
+    if kind == "missing":
+        return "is missing"
+    if kind in ("model_type", "model_attributes_type"):
+        return f"must be a mapping of fields, got {fault['input']!r:.60}"
+    if kind in ("union_tag_invalid", "union_tag_not_found"):
+        key = str(context["discriminator"]).strip("'")
+        tags = sorted(tag for block in _blocks_at(model, loc) for tag in _tags(block))
+        if kind == "union_tag_not_found":
+            return f"`{key}` is missing; valid are {', '.join(tags)}"
+        return f"unknown {key} {context['tag']!r}{nearest(str(context['tag']), tags)}"
+    if kind == "value_error":
+        return fault["msg"].removeprefix("Value error, ")
+    return f"{fault['msg']}, got {fault['input']!r:.60}"
+
+
+def _blocks_at(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[type[BaseModel]]:
+    """The blocks that may stand at a location, in which the chosen member of a union is named by its tag."""
+    blocks = [model]
+    for part in loc:
+        fields = [block.model_fields[str(part)] for block in blocks if part in block.model_fields]
+        below = [inner for field in fields for inner in _blocks(field.annotation)]
+        blocks = below or [block for block in blocks if part in _tags(block)] or blocks
+    return blocks
 
 
 def _blocks(annotation: Any) -> list[type[BaseModel]]:
     """Every block inside an annotation."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
-    if isinstance(annotation, types.UnionType) or typing.get_origin(annotation) is not None:
-        return [block for inner in typing.get_args(annotation) for block in _blocks(inner)]
-    return []
+    return [block for inner in typing.get_args(annotation) for block in _blocks(inner)]
+
+
+def _tags(block: type[BaseModel]) -> set[str]:
+    """Names by which a block is chosen from a union: its literal `type` or `name`."""
+    fields = [block.model_fields[key] for key in ("type", "name") if key in block.model_fields]
+    return {tag for field in fields for tag in typing.get_args(field.annotation)}

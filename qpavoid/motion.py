@@ -1,6 +1,6 @@
 """Off-line trajectories of targets and obstacles: pose and velocity of a body origin as functions of time.
 
-Two kinds cover every block: `Polyline` (fixed pose, line, waypoints, CSV) and `Orbit` (circle). All that can
+Three kinds cover every block: `Still` (fixed pose), `Polyline` (line, waypoints, CSV) and `Orbit` (circle). All that can
 be worked out beforehand is, because `sample` runs in the control loop.
 """
 
@@ -73,6 +73,17 @@ class Motion(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
+class Still:
+    """A pose that never changes."""
+
+    pose: Sample
+
+    def sample(self, t: float) -> Sample:
+        """See `Motion.sample`."""
+        return self.pose
+
+
+@dataclass(frozen=True, slots=True)
 class Piece:
     """Stretch from one waypoint to the next: x = x0 + s Δx, R = exp(s φ [a]) R0, s from 0 to 1."""
 
@@ -137,7 +148,7 @@ class Orbit:
         return Sample(center.position + cos * self.u + sin * self.w, center.rotation, linear, center.angular)
 
 
-def build_motion(config: MotionConfig, start: Sample | None, folder: Path) -> Motion:
+def build_motion(config: MotionConfig, start: Sample | None = None, folder: Path = Path()) -> Motion:
     """Turn a motion block into a trajectory.
 
     Args:
@@ -153,7 +164,7 @@ def build_motion(config: MotionConfig, start: Sample | None, folder: Path) -> Mo
     match config:
         case Fixed():
             position = _position(config.position, start, "position")
-            return _polyline([0.0], [position], [_rotation(config.rpy, initial)])
+            return Still(Sample.at(position, _rotation(config.rpy, initial)))
         case Line():
             return _line(config, start, _rotation(config.rpy, initial))
         case Waypoints():

@@ -10,8 +10,9 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid.errors import UnknownName
+from qpavoid.limits import JointBounds
 from qpavoid.loading import nearest
-from qpavoid.problem import Array
+from qpavoid.problem import IntArray
 
 
 def add_self_pairs(model: Any, bodies: Any, disabled: Iterable[tuple[str, str]], origin: str) -> None:
@@ -47,33 +48,36 @@ def _matching(pattern: str, names: list[str], origin: str) -> list[int]:
     return found
 
 
-def drop_colliding_pairs(model: Any, bodies: Any, q: Array) -> list[tuple[str, str]]:
-    """Removes the pairs that touch at a configuration which is known to be free of collision.
+def drop_always_touching(model: Any, bodies: Any, joints: JointBounds, samples: int = 200) -> list[tuple[str, str]]:
+    """Removes the pairs that touch in every one of many random configurations.
 
-    What touches there are neighbours whose shapes overlap at the joint, not a threat.
+    Those are neighbours whose shapes overlap at the joint, not a threat.
 
     Args:
         model: pinocchio model.
         bodies: its collision bodies with their pairs, changed in place.
-        q: configuration (nq,), as a rule the home pose.
+        joints: position limits, within which configurations are drawn; joints without are turned all the way round.
+        samples: how many configurations are drawn, always the same ones.
 
     Returns:
         Names of the pairs that were removed.
     """
-    data = bodies.createData()
-    pin.updateGeometryPlacements(model, model.createData(), bodies, data, q)
-    pin.computeDistances(bodies, data)
-    touching = [
-        pair
-        for pair, result in zip(list(bodies.collisionPairs), data.distanceResults, strict=True)
-        if result.min_distance <= 0.0
-    ]
+    model_data, data, random = model.createData(), bodies.createData(), np.random.default_rng(0)
+    touching = np.ones(len(bodies.collisionPairs), dtype=bool)
+    for _ in range(samples if touching.any() else 0):
+        q = pin.integrate(model, pin.neutral(model), random.uniform(-np.pi, np.pi, model.nv))
+        finite = np.isfinite(joints.lower) & np.isfinite(joints.upper)
+        q[joints.q_index[finite]] = random.uniform(joints.lower[finite], joints.upper[finite])
+        pin.updateGeometryPlacements(model, model_data, bodies, data, q)
+        pin.computeDistances(bodies, data)
+        touching &= np.array([result.min_distance <= 0.0 for result in data.distanceResults], dtype=bool)
+    removed = pair_array(bodies)[touching].tolist()
+    for a, b in removed:
+        bodies.removeCollisionPair(pin.CollisionPair(a, b))
     names = [body.name for body in bodies.geometryObjects]
-    for pair in touching:
-        bodies.removeCollisionPair(pair)
-    return [(names[p.first], names[p.second]) for p in touching]
+    return [(names[a], names[b]) for a, b in removed]
 
 
-def pair_array(bodies: Any) -> np.ndarray[Any, np.dtype[np.intp]]:
+def pair_array(bodies: Any) -> IntArray:
     """(m, 2) indices of the bodies of each pair."""
     return np.array([(p.first, p.second) for p in bodies.collisionPairs], dtype=np.intp).reshape(-1, 2)

@@ -17,7 +17,7 @@ from qpavoid.errors import ConfigError, UnknownName
 from qpavoid.limits import JointBounds
 from qpavoid.loading import find_robot, nearest, read_config
 from qpavoid.motion import rpy_to_matrix
-from qpavoid.pairs import add_self_pairs, drop_colliding_pairs
+from qpavoid.pairs import add_self_pairs, drop_always_touching
 from qpavoid.problem import Array
 from qpavoid.urdf import find_resource, read_collision, read_model
 
@@ -85,21 +85,8 @@ class Robot:
         return names
 
     def bounds(self) -> JointBounds:
-        """Joint limits in tangent space; only joints with one coordinate in q and v have position limits."""
-        q_index, v_index = [], []
-        for joint in list(self.model.joints)[1:]:
-            lower, upper = self.model.lowerPositionLimit[joint.idx_q], self.model.upperPositionLimit[joint.idx_q]
-            if joint.nq == joint.nv == 1 and np.isfinite([lower, upper]).any() and lower < upper:
-                q_index.append(joint.idx_q)
-                v_index.append(joint.idx_v)
-        q_indices = np.array(q_index, dtype=np.intp)
-        return JointBounds(
-            velocity=_unlimited_if_absurd(np.array(self.model.velocityLimit)),
-            q_index=q_indices,
-            v_index=np.array(v_index, dtype=np.intp),
-            lower=np.array(self.model.lowerPositionLimit)[q_indices],
-            upper=np.array(self.model.upperPositionLimit)[q_indices],
-        )
+        """Joint limits in tangent space; see `joint_bounds`."""
+        return joint_bounds(self.model)
 
     def configuration(self, values: Sequence[float] | Mapping[str, float], where: str) -> Array:
         """A full configuration from a scenario's `q0`.
@@ -165,9 +152,27 @@ class Robot:
         return zip(self.joint_names, list(self.model.joints)[1:], strict=True)
 
 
-def _unlimited_if_absurd(velocity: Array) -> Array:
-    """A limit of 0 means that the URDF gives none."""
-    return np.where(velocity > 0.0, velocity, np.inf)
+def joint_bounds(model: Any) -> JointBounds:
+    """Joint limits of a model in tangent space.
+
+    Only joints with one coordinate in q and v have position limits. A velocity limit of 0 means that the URDF gives
+    none.
+    """
+    q_index, v_index = [], []
+    for joint in list(model.joints)[1:]:
+        lower, upper = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
+        if joint.nq == joint.nv == 1 and np.isfinite([lower, upper]).any() and lower < upper:
+            q_index.append(joint.idx_q)
+            v_index.append(joint.idx_v)
+    q_indices = np.array(q_index, dtype=np.intp)
+    velocity = np.array(model.velocityLimit)
+    return JointBounds(
+        velocity=np.where(velocity > 0.0, velocity, np.inf),
+        q_index=q_indices,
+        v_index=np.array(v_index, dtype=np.intp),
+        lower=np.array(model.lowerPositionLimit)[q_indices],
+        upper=np.array(model.upperPositionLimit)[q_indices],
+    )
 
 
 def _build(config: RobotConfig, path: Path) -> Robot:
@@ -188,7 +193,8 @@ def _build(config: RobotConfig, path: Path) -> Robot:
     if config.srdf is not None:
         pin.removeCollisionPairs(model, bodies, str(find_resource(config.srdf, path, "srdf")), False)
     notes = [
-        f"pair {a} - {b} is off: in contact at the home pose" for a, b in drop_colliding_pairs(model, bodies, home)
+        f"pair {a} - {b} is off: it touches in every configuration"
+        for a, b in drop_always_touching(model, bodies, joint_bounds(model))
     ]
     for name in config.end_effectors:
         if not model.existFrame(name):

@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import ArrayLike
 
 from qpavoid import config
 from qpavoid.bodies import make_shape
 from qpavoid.errors import ConfigError, located
 from qpavoid.kinematics import support_masks
-from qpavoid.motion import Motion, build_motion
+from qpavoid.motion import Motion, Sample, Still, build_motion
 from qpavoid.pairs import pair_array
 from qpavoid.problem import Array, IntArray
 from qpavoid.robot import Robot
@@ -29,6 +30,21 @@ class Obstacle:
     motion: Motion
     moves: bool = True
     """Whether its motion has to be evaluated at every tick."""
+
+    @classmethod
+    def at(cls, name: str, shape: config.Shape, position: ArrayLike, rotation: ArrayLike | None = None) -> Obstacle:
+        """An obstacle that stays, unless the program that steps the controller says where it is.
+
+        Args:
+            name: by which pairs, logs and `Controller.step(obstacles=…)` know it.
+            shape: its shape.
+            position: world position of the shape's origin (3,) [m].
+            rotation: its orientation (3, 3); along the world axes if left out.
+
+        Raises:
+            ConfigError: wrong shape, NaN or infinity.
+        """
+        return cls(name, shape, Still(Sample.at(position, rotation)), moves=False)
 
 
 @dataclass(frozen=True)

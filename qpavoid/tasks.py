@@ -31,7 +31,9 @@ class FrameTask:
         return 3 if self.settings.type == "position" else 6
 
 
-def build_tasks(configs: Sequence[config.Task], robot: Robot, q0: Array, source: Path) -> list[FrameTask]:
+def build_tasks(
+    configs: Sequence[config.Task], robot: Robot, q0: Array, source: Path = Path("tasks")
+) -> list[FrameTask]:
     """Tasks of a scenario; motions that leave their start out begin where the frame is at q0.
 
     Args:

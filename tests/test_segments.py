@@ -139,7 +139,7 @@ KNOWN = {
     "parallel past each other": (vec(0, 0, 0), vec(1, 0, 0), vec(4, 4, 0), vec(7, 4, 0), 5.0),
     "collinear apart": (vec(0, 0, 0), vec(1, 1, 1), vec(2, 2, 2), vec(3, 3, 3), np.sqrt(3)),
     "collinear overlapping": (vec(0, 0, 0), vec(2, 2, 2), vec(1, 1, 1), vec(3, 3, 3), 0.0),
-    "collinear overlapping, along x": (vec(0, 0, 0), vec(2, 0, 0), vec(1, 0, 0), vec(3, 0, 0), 0.0),
+    "collinear overlapping, along z": (vec(0, 0, 0), vec(0, 0, 2), vec(0, 0, 1), vec(0, 0, 3), 0.0),
     "identical": (vec(0, 1, 2), vec(2, 3, 5), vec(0, 1, 2), vec(2, 3, 5), 0.0),
     "point and segment": (vec(0.5, 2, 0), vec(0.5, 2, 0), vec(0, 0, 0), vec(1, 0, 0), 2.0),
     "point on the segment": (vec(1, 2, 3), vec(1, 2, 3), vec(0, 1, 2), vec(3, 4, 5), 0.0),

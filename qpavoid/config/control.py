@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from qpavoid.config.base import Block, NonNegative, Positive
-from qpavoid.config.motion import Motion
+from qpavoid.config.motion import Fixed, Motion
 
 
 class Task(Block):
@@ -17,7 +17,8 @@ class Task(Block):
     """Frame of the robot that is to follow."""
     type: Literal["position", "pose"] = "position"
     """`position`: 3 rows; `pose`: position and orientation, 6 rows."""
-    motion: Motion
+    motion: Motion = Fixed()
+    """What it follows; left out, it stays where it is at the start."""
     gain: NonNegative = 2.0
     """Feedback gain K [1/s]."""
     weight: Positive = 1.0
@@ -33,7 +34,7 @@ class Task(Block):
 class Switching(Block):
     """Row of the task-switching QP: ḋ >= -(1 - β(d)) ξ (d - d1); below d1 it backs away."""
 
-    type: Literal["switching"]
+    type: Literal["switching"] = "switching"
     gain: Positive = 5.0
     """ξ [1/s]."""
 
@@ -41,7 +42,7 @@ class Switching(Block):
 class Damper(Block):
     """Velocity damper: ḋ >= -ξ (d - d_safe); below d_safe it backs away, at most at `recovery_speed`."""
 
-    type: Literal["damper"]
+    type: Literal["damper"] = "damper"
     gain: Positive = 5.0
     """ξ [1/s]."""
     d_safe: Positive | None = None
@@ -51,7 +52,7 @@ class Damper(Block):
 class Cbf(Block):
     """Control barrier function h = d - d_safe with linear class-K gain: ḋ >= -γ h, recovery speed not capped."""
 
-    type: Literal["cbf"]
+    type: Literal["cbf"] = "cbf"
     gain: Positive = 5.0
     """γ [1/s]."""
     d_safe: Positive | None = None
@@ -71,7 +72,7 @@ class Avoidance(Block):
     offset: NonNegative = 0.0
     """Added to the distance between surfaces before d1, d2 and d_safe are compared with it [m]. The paper measures
     between axes: its figures want the sum of the two radii here."""
-    row: AvoidanceRow = Switching(type="switching")
+    row: AvoidanceRow = Switching()
     """Form of the QP's avoidance rows."""
     recovery_speed: Positive = 0.2
     """Cap on the speed at which rows ask a pair that is too close to part [m/s]."""

@@ -12,7 +12,7 @@ from qpavoid.config.base import Block, NonNegative, Positive, Vec3
 class Fixed(Block):
     """A pose that does not change. For a task, what is left out is taken from the frame's pose at the start."""
 
-    type: Literal["fixed"]
+    type: Literal["fixed"] = "fixed"
     position: Vec3 | None = None
     """World position [m]."""
     rpy: Vec3 | None = None
@@ -22,7 +22,7 @@ class Fixed(Block):
 class Line(Block):
     """Straight line, then rest at its end."""
 
-    type: Literal["line"]
+    type: Literal["line"] = "line"
     start: Vec3 | None = None
     """World position of the start [m]; a task that leaves it out starts where its frame is."""
     end: Vec3 | None = None
@@ -48,7 +48,7 @@ class Line(Block):
 class Waypoints(Block):
     """Piecewise motion through timed positions (and orientations); rests before the first and after the last."""
 
-    type: Literal["waypoints"]
+    type: Literal["waypoints"] = "waypoints"
     times: Annotated[list[float], Field(min_length=2)]
     """Times of the waypoints [s], increasing."""
     positions: Annotated[list[Vec3], Field(min_length=2)]
@@ -72,7 +72,7 @@ class Waypoints(Block):
 class Circle(Block):
     """Circle at constant speed, for ever or for a number of turns."""
 
-    type: Literal["circle"]
+    type: Literal["circle"] = "circle"
     center: Vec3 | None = None
     """World position of the centre [m]; a task that leaves it out starts on the circle, where its frame is."""
     radius: Positive
@@ -95,7 +95,7 @@ class Csv(Block):
     Times in s and increasing, positions in m and quaternions in world axes; linear and shortest turn between.
     """
 
-    type: Literal["csv"]
+    type: Literal["csv"] = "csv"
     path: str
     """The file, relative to the scenario file."""
 

@@ -42,7 +42,7 @@ class ScenarioConfig(Block):
     """λ of the damped J⁺ of the tracking task, the same for every solver [-]; 0 gives the plain pseudo-inverse."""
     avoidance: Avoidance = Avoidance()
     limits: Limits = Limits()
-    solver: SolverConfig = QpSolver(name="qp")
+    solver: SolverConfig = QpSolver()
     """A name (`eq10`, `qp:osqp`) or a mapping with that solver's settings."""
     dt: Annotated[float, Field(gt=0, le=0.1)] = 0.01
     """Control period [s]."""

@@ -12,7 +12,7 @@ from qpavoid.config.base import Block, Positive
 class Sphere(Block):
     """Ball about the origin."""
 
-    type: Literal["sphere"]
+    type: Literal["sphere"] = "sphere"
     radius: Positive
     """Radius [m]."""
 
@@ -20,7 +20,7 @@ class Sphere(Block):
 class Capsule(Block):
     """Segment along z, centred on the origin, swept by a ball."""
 
-    type: Literal["capsule"]
+    type: Literal["capsule"] = "capsule"
     radius: Positive
     """Radius [m]."""
     length: Positive
@@ -30,7 +30,7 @@ class Capsule(Block):
 class Box(Block):
     """Cuboid centred on the origin."""
 
-    type: Literal["box"]
+    type: Literal["box"] = "box"
     size: tuple[Positive, Positive, Positive]
     """Full side lengths along x, y, z [m]."""
 
@@ -38,7 +38,7 @@ class Box(Block):
 class Cylinder(Block):
     """Cylinder along z, centred on the origin."""
 
-    type: Literal["cylinder"]
+    type: Literal["cylinder"] = "cylinder"
     radius: Positive
     """Radius [m]."""
     length: Positive

@@ -12,7 +12,7 @@ from qpavoid.config.base import Block, NonNegative, Positive
 class TrackingSolver(Block):
     """Damped least squares on the tracking task; does not avoid."""
 
-    name: Literal["tracking"]
+    name: Literal["tracking"] = "tracking"
 
     @property
     def label(self) -> str:
@@ -23,7 +23,7 @@ class TrackingSolver(Block):
 class Eq10Solver(Block):
     """Eq. 10: `eq10` with the consistent bracket and α while approaching only, `eq10-literal` as printed."""
 
-    name: Literal["eq10", "eq10-literal"]
+    name: Literal["eq10", "eq10-literal"] = "eq10"
     damping: NonNegative = 0.05
     """λ of the damped (J_d N)⁺ [-]."""
     retreat_speed: NonNegative = 0.1
@@ -40,7 +40,7 @@ class Eq10Solver(Block):
 class QpSolver(Block):
     """QP: tracking as cost, avoidance rows as inequalities, joint limits as bounds."""
 
-    name: Literal["qp"]
+    name: Literal["qp"] = "qp"
     backend: str = "daqp"
     """`daqp`, `proxqp`, `osqp`, `quadprog`, or whatever else qpsolvers finds installed."""
     regularization: Positive = 1e-3

@@ -7,6 +7,7 @@ is a velocity, and a velocity that is off by 1e-2 rad/s is a fault even where th
 from __future__ import annotations
 
 import ctypes
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -23,7 +24,7 @@ Backend = Callable[[Array, Array, Array, Array, Array, Array], "Array | None"]
 
 _TIGHT: dict[str, dict[str, Any]] = {
     "proxqp": {"eps_abs": 1e-10, "eps_rel": 0.0},
-    "osqp": {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 20000, "polishing": True, "scaled_termination": False},
+    "osqp": {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 20000, "polishing": True, "raise_error": False},
     "piqp": {"eps_abs": 1e-9, "eps_rel": 1e-10},
     "clarabel": {"tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-10},
     "scs": {"eps_abs": 1e-9, "eps_rel": 1e-10},
@@ -82,10 +83,12 @@ def _through_qpsolvers(name: str) -> Backend:
         as_given = csc_matrix if sparse else np.asarray
         rows = {"G": as_given(G), "h": h} if len(h) else {}
         problem = qpsolvers.Problem(as_given(P), q, **rows, lb=lower, ub=upper)
-        try:
-            solution = qpsolvers.solve_problem(problem, solver=name, **options)
-        except qpsolvers.exceptions.QPError:
-            return None
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # "no solution" is an answer here, not news for the terminal
+            try:
+                solution = qpsolvers.solve_problem(problem, solver=name, **options)
+            except qpsolvers.exceptions.QPError:
+                return None
         return solution.x if solution.found else None
 
     return solve

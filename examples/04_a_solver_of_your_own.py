@@ -1,0 +1,31 @@
+"""A law of your own: anything with `solve` runs on every scenario, against the laws that ship."""
+
+import numpy as np
+import pinocchio as pin
+
+from qpavoid import Controller, Problem, Solution, load_scenario
+from qpavoid.solvers.analytic import tracking_velocity
+
+
+class SlowDown:
+    """Tracks, and slows down in proportion to the distance that is left; never leaves its path."""
+
+    bounded = False
+
+    def solve(self, problem: Problem) -> Solution:
+        """J⁺ẋ, scaled."""
+        v, _, _ = tracking_velocity(problem.tracking)
+        d = problem.avoidance.d
+        return Solution(v * np.clip((d.min() - 0.12) / 0.12, 0.0, 1.0) if d.size else v)
+
+
+controller, q = Controller.from_scenario(load_scenario("situation1"))
+controller.solver = SlowDown()
+closest = np.inf
+for k in range(1300):
+    tick = controller.tick(q, k * controller.dt)
+    closest = min(closest, tick.proximity.distance.min())
+    q = pin.integrate(controller.scene.robot.model, q, tick.solution.v * controller.dt)
+
+left = np.linalg.norm(tick.targets[0].position - tick.kinematics.position[0])
+print(f"closest {1e3 * closest:.1f} mm, but {1e3 * left:.0f} mm short of the goal: it never goes round")

@@ -1,0 +1,340 @@
+"""Robots among obstacles: 3-D at several instants (Figs. 6, 9, 10, 12, 15 of the paper), and tool paths in two views."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Polygon
+from matplotlib.ticker import MaxNLocator
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+from scipy.spatial import ConvexHull
+
+from qpavoid.log import Log
+from qpavoid.problem import Array, IntArray
+from qpavoid.segments import point_segment, segment_segment
+
+MOVING, RESTING, HIT, OBSTACLE, TOOL_PATH = "#6BA3D6", "#C4C4C4", "#C62F2F", "#E69F00", "#007A56"
+PLANNED = "#B9A6D3"
+PANELS = 6
+_PANEL = np.array([3.0, 2.9])  # largest width and height of a panel on paper [in]
+_AROUND, _ARC = 28, 8
+
+
+def motion_figure(log: Log) -> Figure:
+    """Bodies, obstacles, planned path and the tool's path so far, at up to six instants with one view and scale.
+
+    Bodies are drawn as the capsules of the log, which enclose whatever shape the robot's bodies have.
+    """
+    ticks = instants(log)
+    if not len(ticks):
+        figure = Figure(figsize=(6, 2))
+        figure.text(0.5, 0.5, "no ticks in this run", ha="center", va="center")
+        return figure
+    closest = int(np.argmin(log.min_distance)) if np.isfinite(log.min_distance).any() else -1
+    lower, upper = _limits(log, ticks)
+    size = upper - lower
+    elevation, azimuth = view_angles(log, ticks)
+    towards = _towards_viewer(elevation, azimuth)
+    # Size of the drawn box on paper. An Axes3D is a square of 0.97 times the box's diagonal, mostly empty: the squares
+    # overlap, so that the boxes lie side by side.
+    right = np.array([-np.sin(np.radians(azimuth)), np.cos(np.radians(azimuth)), 0.0])
+    seen = np.array([np.abs(right) @ size, np.abs(np.cross(towards, right)) @ size])
+    scale = min(_PANEL / seen)
+    cell_width, cell_height = scale * seen + (1.0, 0.95)
+    square = 0.97 * scale * float(np.linalg.norm(size))
+    columns = min(len(ticks), 3)
+    rows = -(-len(ticks) // columns)
+    width, height = max(columns * cell_width, 7.5), rows * cell_height + 0.75
+    figure = Figure(figsize=(width, height))
+    for i, tick in enumerate(ticks):
+        row, column = divmod(i, columns)
+        x = 0.5 * (width - columns * cell_width) + (column + 0.5) * cell_width
+        y = 0.35 + (rows - row - 0.55) * cell_height
+        box = ((x - square / 2) / width, (y - square / 2) / height, square / width, square / height)
+        ax: Any = figure.add_axes(box, projection="3d", proj_type="ortho", computed_zorder=False)
+        ax.patch.set_visible(False)
+        ax.view_init(elevation, azimuth)
+        _draw(ax, log, int(tick), towards)
+        ax.set(xlim=(lower[0], upper[0]), ylim=(lower[1], upper[1]), zlim=(lower[2], upper[2]))
+        ax.set_box_aspect(size)
+        title = f"t = {log.t[tick]:.2f} s" + (" (closest)" if tick == closest else "")
+        ax.set_title(title, fontsize=10, y=0.5 + (0.5 * scale * seen[1] + 0.36) / square, pad=0)
+        for name, axis in zip("xyz", (ax.xaxis, ax.yaxis, ax.zaxis), strict=True):
+            axis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
+            axis.set_tick_params(labelsize=7, pad=-1)
+            axis.set_label_text(f"{name} [m]", fontsize=8)
+            axis.labelpad = -4
+            axis.set_pane_color((0.97, 0.97, 0.97, 1.0))
+    figure.legend(handles=_legend(log, ticks), loc="lower center", ncols=6, fontsize=8, frameon=False)
+    return figure
+
+
+def instants(log: Log) -> IntArray:
+    """Ticks to draw: the first, the last, the closest approach, and others spread evenly over time and motion.
+
+    Returns:
+        (m,) increasing, m <= PANELS.
+    """
+    if not len(log.t):
+        return np.zeros(0, dtype=np.intp)
+    moved = np.abs(np.diff(log.q, axis=0)).sum(axis=1) + np.abs(np.diff(log.obstacle_position, axis=0)).sum((1, 2))
+    # Half time, half motion: neither a long rest at the end nor a quick dodge takes all the panels.
+    progress = np.cumsum(np.r_[0.0, moved / max(moved.sum(), 1e-12) + 1.0 / max(len(moved), 1)])
+    ticks = np.searchsorted(progress, np.linspace(0.0, progress[-1], PANELS) - 1e-9)
+    ticks = np.minimum(ticks, len(log.t) - 1)
+    closest = int(np.argmin(log.min_distance))
+    if np.isfinite(log.min_distance[closest]) and closest not in ticks:
+        ticks[1 + np.argmin(np.abs(ticks[1:-1] - closest))] = closest
+    return np.unique(ticks).astype(np.intp)
+
+
+def moving_bodies(log: Log) -> Any:
+    """(b,) whether each body moves by more than 1 mm in the run."""
+    return np.any(np.ptp(log.body_ends, axis=0) > 1e-3, axis=(1, 2)) if len(log.t) else np.zeros(0, bool)
+
+
+# --- surfaces -----------------------------------------------------------------------------------------------
+
+
+def shape_faces(shape: dict[str, Any]) -> Array:
+    """Outward quadrilaterals (m, 4, 3) of a shape of the log in its own frame [m]."""
+    if shape["type"] == "box":
+        return _box_faces(np.array(shape["size"]))
+    radius, half = shape["radius"], 0.5 * shape.get("length", 0.0)
+    if shape["type"] == "cylinder":
+        side = np.linspace(-half, half, _ARC)
+        profile_r, profile_z = np.r_[0.0, np.full(_ARC, radius), 0.0], np.r_[-half, side, half]
+    else:
+        angle = np.linspace(-0.5 * np.pi, 0.0, _ARC)
+        profile_r = radius * np.r_[np.cos(angle), np.cos(angle[::-1])]
+        profile_z = np.r_[radius * np.sin(angle) - half, half - radius * np.sin(angle[::-1])]
+    return _revolve(profile_r, profile_z)
+
+
+def capsule_faces(ends: Array, radius: float) -> Array:
+    """Outward quadrilaterals (m, 4, 3) of the capsule about a segment (2, 3) in world axes [m]."""
+    axis = ends[1] - ends[0]
+    length = float(np.linalg.norm(axis))
+    z = axis / length if length > 1e-9 else np.array([0.0, 0.0, 1.0])
+    x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
+    x /= np.linalg.norm(x)
+    rotation = np.column_stack([x, np.cross(z, x), z])
+    faces = shape_faces({"type": "capsule", "radius": radius, "length": length})
+    return np.asarray(faces @ rotation.T + ends.mean(axis=0))
+
+
+def _revolve(radius: Array, height: Array) -> Array:
+    angle = np.linspace(0.0, 2.0 * np.pi, _AROUND + 1)
+    grid = np.stack(
+        [np.outer(radius, np.cos(angle)), np.outer(radius, np.sin(angle)), np.outer(height, np.ones_like(angle))], -1
+    )
+    corners = [grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]]
+    return np.stack(corners, axis=2).reshape(-1, 4, 3)
+
+
+def _box_faces(size: Array, cuts: int = 6) -> Array:
+    # Cut up, because faces are painted from back to front by their middle.
+    u, v = np.meshgrid(np.linspace(-1, 1, cuts + 1), np.linspace(-1, 1, cuts + 1), indexing="ij")
+    faces = []
+    for axis in range(3):
+        for sign in (-1.0, 1.0):
+            grid = np.empty((cuts + 1, cuts + 1, 3))
+            grid[..., axis], grid[..., (axis + 1) % 3], grid[..., (axis + 2) % 3] = sign, sign * u, v
+            corners = [grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]]
+            faces.append(np.stack(corners, axis=2).reshape(-1, 4, 3))
+    return np.concatenate(faces) * 0.5 * size
+
+
+def obstacle_faces(log: Log, index: int, tick: int) -> Array:
+    """Outward quadrilaterals (m, 4, 3) of an obstacle at a tick, in world axes [m]."""
+    faces = shape_faces(log.meta["obstacles"][index]["shape"])
+    return np.asarray(faces @ log.obstacle_rotation[tick, index].T + log.obstacle_position[tick, index])
+
+
+# --- view ---------------------------------------------------------------------------------------------------
+
+
+def _towards_viewer(elevation: float, azimuth: float) -> Array:
+    e, a = np.radians([elevation, azimuth])
+    return np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+
+
+def view_angles(log: Log, ticks: IntArray) -> tuple[float, float]:
+    """Elevation and azimuth [deg] from which the paths look long and tools, arms and obstacles are seen best.
+
+    Each candidate is scored by the share of points of interest that no other body hides, times how much of the paths'
+    extent is not foreshortened. None looks straight along an axis, which would take the depth away.
+    """
+    paths = np.concatenate([log.target, log.tool]).reshape(-1, 3)
+    spread = paths - paths.mean(axis=0) if len(paths) else np.zeros((1, 3))
+    size = np.linalg.norm(spread)
+    radii, moving = np.array(log.meta["body_radii"]), moving_bodies(log)
+    best, best_score = (25.0, -60.0), -1.0
+    for elevation in (20.0, 35.0):
+        for azimuth in (-25.0, 25.0, -45.0, 45.0, -65.0, 65.0, -115.0, 115.0, -135.0, 135.0, -155.0, 155.0):
+            towards = _towards_viewer(elevation, azimuth)
+            seen = np.mean([_visible(log, int(tick), towards, radii, moving) for tick in ticks])
+            length = np.linalg.norm(spread - np.outer(spread @ towards, towards)) / size if size > 1e-6 else 1.0
+            if seen**2 * length > best_score + 1e-9:
+                best, best_score = (elevation, azimuth), float(seen**2 * length)
+    return best
+
+
+def _visible(log: Log, tick: int, towards: Array, radii: Array, moving: Any) -> float:
+    ends = log.body_ends[tick]
+    centres = log.obstacle_position[tick]
+    middles = np.concatenate([ends[moving].mean(axis=1), ends[moving][:, 1]])
+    points = np.concatenate([log.tool[tick], centres, middles])
+    half_sizes = [np.ptp(shape_faces(o["shape"]).reshape(-1, 3), axis=0).mean() / 2 for o in log.meta["obstacles"]]
+    start = np.concatenate([ends[:, 0], centres])
+    end = np.concatenate([ends[:, 1], centres])
+    thickness = np.concatenate([radii, half_sizes])
+    if not len(points) or not len(start):
+        return 1.0
+    own = point_segment(points[:, None], start, end).distance < 1.3 * thickness
+    ray = points[:, None] + 10.0 * towards
+    hidden = segment_segment(points[:, None], ray, start[None], end[None]).distance < thickness
+    return 1.0 - float(np.mean(np.any(hidden & ~own, axis=1)))
+
+
+def _limits(log: Log, ticks: IntArray) -> tuple[Array, Array]:
+    radii = np.array(log.meta["body_radii"]).reshape(-1, 1, 1)
+    points = [log.target.reshape(-1, 3), log.tool.reshape(-1, 3)]
+    points += [(log.body_ends[ticks] + sign * radii).reshape(-1, 3) for sign in (-1.0, 1.0)]
+    points += [obstacle_faces(log, i, t).reshape(-1, 3) for i in range(len(log.meta["obstacles"])) for t in ticks]
+    cloud = np.concatenate(points)
+    cloud = cloud[np.isfinite(cloud).all(axis=1)]
+    lower, upper = (cloud.min(axis=0), cloud.max(axis=0)) if len(cloud) else (-np.ones(3), np.ones(3))
+    middle, half = 0.5 * (lower + upper), 0.5 * (upper - lower)
+    half = np.maximum(1.02 * half, 0.25 * max(half.max(), 0.05))
+    return middle - half, middle + half
+
+
+# --- drawing ------------------------------------------------------------------------------------------------
+
+
+def _draw(ax: Any, log: Log, tick: int, towards: Array) -> None:
+    moving, touching = moving_bodies(log), log.body_distance[tick] < 0.0
+    surfaces = []
+    for i, radius in enumerate(log.meta["body_radii"]):
+        # A little thicker when hit: neighbours share the ball at their joint, and its colour would be patchy.
+        faces = capsule_faces(log.body_ends[tick, i], 1.06 * radius if touching[i] else radius)
+        surfaces.append((faces, HIT if touching[i] else MOVING if moving[i] else RESTING))
+    surfaces += [(obstacle_faces(log, i, tick), OBSTACLE) for i in range(len(log.meta["obstacles"]))]
+    if surfaces:
+        # One collection for all: matplotlib sorts faces by depth within a collection only.
+        faces = np.concatenate([faces for faces, _ in surfaces])
+        colours = np.concatenate([_shade(faces, colour, towards) for faces, colour in surfaces])
+        front = _normals(faces) @ towards > -0.02
+        faces, colours = faces[front], colours[front]
+        ax.add_collection3d(Poly3DCollection(faces, facecolors=colours, edgecolors=colours, linewidths=0.3, zorder=1))
+    # Paths lie on top of the bodies, so that no part of them is hidden.
+    for k in range(log.tool.shape[1]):
+        ax.plot(*log.target[:, k].T, color="black", linestyle=(0, (4, 2)), linewidth=1.0, zorder=2)
+        ax.plot(*log.tool[: tick + 1, k].T, color=TOOL_PATH, linewidth=1.8, zorder=3)
+        ax.plot(*log.tool[tick, k, :, None], color=TOOL_PATH, marker="o", markersize=4, zorder=4)
+
+
+def _normals(faces: Array) -> Array:
+    normals = np.cross(faces[:, 2] - faces[:, 0], faces[:, 3] - faces[:, 1])
+    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-15))
+
+
+def _shade(faces: Array, colour: str, towards: Array) -> Array:
+    light = towards + np.array([0.0, 0.0, 0.7])
+    brightness = 0.55 + 0.5 * np.clip(_normals(faces) @ (light / np.linalg.norm(light)), 0.0, 1.0)
+    return np.clip(brightness[:, None] * to_rgb(colour), 0.0, 1.0)
+
+
+def _legend(log: Log, ticks: IntArray) -> list[Any]:
+    moving = moving_bodies(log)
+    entries = [
+        (moving.any(), Patch(color=MOVING, label="moving bodies")),
+        ((~moving).any(), Patch(color=RESTING, label="bodies at rest")),
+        ((log.body_distance[ticks] < 0.0).any(), Patch(color=HIT, label="bodies in collision")),
+        (log.meta["obstacles"], Patch(color=OBSTACLE, label="obstacle")),
+        (True, Line2D([], [], color="black", linestyle=(0, (4, 2)), linewidth=1.0, label="planned path")),
+        (True, Line2D([], [], color=TOOL_PATH, marker="o", markersize=4, label="tool and its path so far")),
+    ]
+    return [handle for shown, handle in entries if shown]
+
+
+# --- tool paths ---------------------------------------------------------------------------------------------
+
+
+def path_figure(logs: Sequence[Log], styles: Sequence[dict[str, Any]]) -> Figure:
+    """Tool paths of several runs in two views along world axes, with the planned path and what stood in the way.
+
+    Args:
+        logs: runs of one scenario.
+        styles: label, colour and line style of each.
+    """
+    longest = max(logs, key=lambda log: len(log.t))
+    outlines = _outlines(logs, longest)
+    paths = np.concatenate([longest.target.reshape(-1, 3), *(log.tool.reshape(-1, 3) for log in logs)])
+    seen = np.concatenate([paths, *(faces.reshape(-1, 3) for faces, _, _ in outlines)])
+    lower, upper = (seen.min(axis=0), seen.max(axis=0)) if len(seen) else (-np.ones(3), np.ones(3))
+    pad = 0.04 * max(float(np.max(upper - lower)), 0.1)
+    lower, upper = lower - pad, upper + pad
+    across = int(np.argmax(np.ptp(paths, axis=0))) if len(paths) else 0
+    views = [axis for axis in (2, 1, 0) if axis != across]
+    # Laid out by hand [in]: both views at one scale, one above the other.
+    extent = (upper - lower) * min(6.0 / (upper - lower)[across], 7.0 / np.sum((upper - lower)[views]))
+    width, height = extent[across] + 2.7, float(np.sum(extent[views])) + 1.4
+    figure = Figure(figsize=(width, height))
+    for up, bottom in zip(views, (0.85 + extent[views[1]], 0.6), strict=True):
+        box = (0.75 / width, bottom / height, extent[across] / width, extent[up] / height)
+        ax = figure.add_axes(box, xlim=(lower[across], upper[across]), ylim=(lower[up], upper[up]))
+        for faces, colour, alpha in outlines:
+            flat = faces.reshape(-1, 3)[:, [across, up]]
+            hull = flat[ConvexHull(flat).vertices]
+            ax.add_patch(Polygon(hull, facecolor=(colour, alpha), edgecolor=colour, linewidth=0.8, zorder=1))
+        for k in range(longest.tool.shape[1]):
+            path = longest.target[:, k]
+            ax.plot(path[:, across], path[:, up], color=PLANNED, linewidth=4.0, zorder=2, label="planned path")
+            ax.plot(path[-1:, across], path[-1:, up], "k*", markersize=9, zorder=4, label="goal")
+            for log, style in zip(logs, styles, strict=True):
+                ax.plot(log.tool[:, k, across], log.tool[:, k, up], linewidth=1.7, zorder=3, **style)
+        ax.grid(True, color="#E4E4E4", linewidth=0.6)
+        ax.set_axisbelow(True)
+        ax.set_ylabel(f"{'xyz'[up]} [m]")
+        if up == views[0]:
+            ax.tick_params(labelbottom=False)
+            lines: dict[str, Any] = {str(line.get_label()): line for line in ax.get_lines()}
+    ax.set_xlabel(f"{'xyz'[across]} [m]")
+    shown = {colour for _, colour, _ in outlines}
+    moved = " (paler: earlier)" if len({alpha for _, _, alpha in outlines}) > 1 else ""
+    for colour, name in ((OBSTACLE, f"obstacle{moved}"), (RESTING, "robot body at rest")):
+        if colour in shown:
+            lines[name] = Patch(facecolor=(colour, 0.5), edgecolor=colour, label=name)
+    corner = ((0.85 + extent[across]) / width, 1.0 - 0.5 / height)
+    figure.legend(handles=list(lines.values()), loc="upper left", bbox_to_anchor=corner, fontsize=8, frameon=False)
+    figure.suptitle(
+        f"{longest.meta['title'] or longest.meta['scenario']}  —  tool path", fontsize=11, y=1 - 0.12 / height
+    )
+    return figure
+
+
+def _outlines(logs: Sequence[Log], log: Log) -> list[tuple[Array, str, float]]:
+    """Faces, colour and opacity of obstacles at up to four places, and of bodies at rest that came near."""
+    outlines = []
+    for i in range(len(log.meta["obstacles"]) if len(log.t) else 0):
+        way = np.cumsum(np.r_[0.0, np.linalg.norm(np.diff(log.obstacle_position[:, i], axis=0), axis=1)])
+        ticks = np.unique(np.searchsorted(way, np.linspace(0.0, way[-1], 4))) if way[-1] > 1e-3 else np.zeros(1, int)
+        for rank, tick in enumerate(ticks.tolist()):
+            outlines.append((obstacle_faces(log, i, tick), OBSTACLE, 0.5 * (rank + 1) / len(ticks)))
+    near: set[str] = set()
+    for run in logs:
+        avoidance = run.meta["config"]["avoidance"]
+        within = run.min_distance + avoidance["offset"] < avoidance["d2"]
+        near |= {name for pair in set(run.closest_pair[within].tolist()) for name in run.meta["pairs"][pair]}
+    resting = ~np.any([moving_bodies(run) for run in logs if len(run.t)], axis=0) & bool(len(log.t))
+    for i, body in enumerate(log.meta["bodies"]):
+        if body in near and resting[i]:
+            outlines.append((capsule_faces(log.body_ends[0, i], log.meta["body_radii"][i]), RESTING, 0.5))
+    return outlines

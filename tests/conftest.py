@@ -1,0 +1,101 @@
+"""Robots, random scenes and finite differences shared by the tests."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from qpavoid import Obstacle, Robot, Sample, build_scene, config
+from qpavoid.kinematics import compute_kinematics
+from qpavoid.loading import example_robot_data
+from qpavoid.motion import build_motion
+from qpavoid.proximity import DistanceQuery
+
+EXAMPLES = example_robot_data() / "example-robot-data" / "robots"
+SPHERE = config.Sphere(type="sphere", radius=0.06)
+CAPSULE = config.Capsule(type="capsule", radius=0.04, length=0.3)
+BOX = config.Box(type="box", size=(0.2, 0.3, 0.1))
+CYLINDER = config.Cylinder(type="cylinder", radius=0.07, length=0.25)
+
+
+@pytest.fixture(scope="session")
+def paper():
+    return Robot.load("paper-dual-arm")
+
+
+@pytest.fixture(scope="session")
+def panda():
+    return Robot.load("panda")
+
+
+@pytest.fixture(scope="session")
+def panda_convex():
+    return Robot.from_urdf(EXAMPLES / "panda_description/urdf/panda.urdf", bodies="convex")
+
+
+@pytest.fixture(scope="session")
+def solo():
+    """A quadruped on a floating base, with a capsule for the trunk and one for each shank."""
+    trunk = {"name": "trunk", "frame": "base_link", "shape": CAPSULE, "rpy": (0.0, np.pi / 2, 0.0)}
+    shank = {"shape": {"type": "capsule", "radius": 0.015, "length": 0.16}, "position": (0.0, 0.0, -0.08)}
+    shanks = [{"name": leg, "frame": f"{leg}_LOWER_LEG", **shank} for leg in ("FL", "FR", "HL", "HR")]
+    urdf = EXAMPLES / "solo_description/robots/solo12.urdf"
+    return Robot.from_urdf(urdf, root_joint="free_flyer", bodies=[trunk, *shanks])
+
+
+def random_q(robot, rng, spread=1.0):
+    """A configuration around the home pose, on the manifold."""
+    return pin.integrate(robot.model, robot.home, rng.uniform(-spread, spread, robot.model.nv))
+
+
+def obstacle(name, shape, position, rpy=(0.0, 0.0, 0.0)):
+    fixed = config.Fixed(type="fixed", position=tuple(position), rpy=tuple(rpy))
+    return Obstacle(name, shape, build_motion(fixed, None, None))
+
+
+def random_scene(robot, rng, shapes):
+    """The robot among obstacles at random poses within 0.8 m of the origin."""
+    return build_scene(
+        robot,
+        [
+            obstacle(f"o{i}", shape, rng.uniform(-0.8, 0.8, 3), rng.uniform(-3.0, 3.0, 3))
+            for i, shape in enumerate(shapes)
+        ],
+    )
+
+
+def look(scene, q, samples=None, reach=np.inf, query=None):
+    """Proximity of a scene at q, with obstacles (by index) moved to `samples`."""
+    query = query or DistanceQuery(scene)
+    for index, sample in (samples or {}).items():
+        query.place_obstacle(index, sample)
+    data = scene.robot.model.createData()
+    return query.compute(data, compute_kinematics(scene.robot.model, data, [], q), reach)
+
+
+def moved(sample, t):
+    """Where a body is after t seconds at the sample's constant twist about its origin."""
+    return Sample.at(sample.position + t * sample.linear, pin.exp3(t * sample.angular) @ sample.rotation)
+
+
+def differences(f, robot, q, step=1e-6):
+    """Central differences of f (m,) along every velocity coordinate: (m, nv)."""
+    eye = np.eye(robot.model.nv)
+    ahead, behind = ([f(pin.integrate(robot.model, q, s * step * e)) for e in eye] for s in (1.0, -1.0))
+    return (np.array(ahead) - np.array(behind)).T / (2.0 * step)
+
+
+def write_chain(folder, joints=3, joint_type="revolute", shape='<cylinder radius="0.03" length="0.2"/>'):
+    """A URDF of links 0.3 m long in a row along z, that turn about x; each carries one collision shape."""
+    parts = []
+    for i in range(joints + 1):
+        collision = f'<collision><origin xyz="0 0 0.15"/><geometry>{shape}</geometry></collision>'
+        parts.append(f'<link name="link{i}">{collision}</link>')
+        if i:
+            parts.append(
+                f'<joint name="joint{i}" type="{joint_type}"><parent link="link{i - 1}"/><child link="link{i}"/>'
+                f'<origin xyz="0 0 0.3"/><axis xyz="1 0 0"/>'
+                '<limit lower="-2" upper="2" velocity="1.5" effort="1"/></joint>'
+            )
+    path = folder / "chain.urdf"
+    path.write_text(f'<robot name="chain">{"".join(parts)}</robot>')
+    return path

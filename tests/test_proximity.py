@@ -1,0 +1,325 @@
+"""Distances against closed forms, their rates against finite differences, and the cost of a tick's Python."""
+
+import sys
+from dataclasses import fields, replace
+
+import coal
+import numpy as np
+import pinocchio as pin
+import pytest
+from conftest import (
+    BOX,
+    CAPSULE,
+    CYLINDER,
+    SPHERE,
+    differences,
+    look,
+    moved,
+    obstacle,
+    random_q,
+    random_scene,
+)
+
+from qpavoid import Sample, build_scene, proximity
+from qpavoid.kinematics import compute_kinematics, support_masks
+from qpavoid.proximity import DistanceQuery
+from qpavoid.segments import capsule_distances
+
+TICKS = 10
+
+
+def world_placements(scene, q):
+    """Pose of every body of the scene at q, by Pinocchio alone."""
+    data = scene.robot.model.createData()
+    pin.forwardKinematics(scene.robot.model, data, q)
+    return [data.oMi[body.parentJoint] * body.placement for body in scene.geometry.geometryObjects]
+
+
+def axes(scene, q):
+    """Ends (n, 2, 3) and radii (n,) of the capsules and spheres of a scene."""
+    ends, radii = [], []
+    for body, placement in zip(scene.geometry.geometryObjects, world_placements(scene, q), strict=True):
+        half = body.geometry.halfLength if isinstance(body.geometry, coal.Capsule) else 0.0
+        ends.append([placement.act(np.array([0.0, 0.0, z])) for z in (-half, half)])
+        radii.append(body.geometry.radius)
+    return np.array(ends), np.array(radii)
+
+
+# --- distances, normals, witness points --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["paper", "panda"])
+def test_capsules_and_spheres_agree_with_the_closed_form(name, request):
+    robot = request.getfixturevalue(name)
+    rng = np.random.default_rng(1)
+    scene = random_scene(robot, rng, [SPHERE, CAPSULE] * 4)
+    for _ in range(TICKS):
+        q = random_q(robot, rng, spread=2.0)
+        ends, radii = axes(scene, q)
+        a, b = scene.pairs.T
+        expected = capsule_distances(ends[a], radii[a], ends[b], radii[b])
+        found = look(scene, q)
+        np.testing.assert_allclose(found.distance, expected.distance, atol=1e-9)
+        distinct = expected.distance + radii[a] + radii[b] > 1e-3  # elsewhere the normal has no definite direction
+        assert distinct.mean() > 0.9
+        np.testing.assert_allclose(found.normal[distinct], expected.normal[distinct], atol=1e-7)
+        np.testing.assert_allclose(found.point_a[distinct], expected.point_a[distinct], atol=1e-7)
+        np.testing.assert_allclose(found.point_b[distinct], expected.point_b[distinct], atol=1e-7)
+
+
+def distance_to_box(points, box, size):
+    """Distance of points (n, 3) outside a box of full side lengths `size` at placement `box`."""
+    local = (points - box.translation) @ box.rotation
+    return np.linalg.norm(np.maximum(np.abs(local) - np.array(size) / 2, 0.0), axis=1)
+
+
+def test_boxes_agree_with_a_search_along_the_capsule(panda):
+    rng = np.random.default_rng(2)
+    scene = random_scene(panda, rng, [BOX] * 3)
+    count, boxes = len(scene.body_names), len(scene.obstacles)
+    for _ in range(TICKS):
+        q = random_q(panda, rng)
+        placements = world_placements(scene, q)
+        bodies = scene.geometry.geometryObjects[:count].tolist()
+        half = np.array([b.geometry.halfLength if isinstance(b.geometry, coal.Capsule) else 0.0 for b in bodies])
+        radius = np.array([b.geometry.radius for b in bodies])
+        center = np.array([p.translation for p in placements[:count]])
+        axis = np.array([p.rotation[:, 2] for p in placements[:count]])
+        found = look(scene, q).distance[-count * boxes :].reshape(boxes, count)
+        for i in range(boxes):
+
+            def at(z, box=placements[count + i], center=center, axis=axis):
+                return distance_to_box(center + z[:, None] * axis, box, BOX.size)
+
+            low, high = -half, half.copy()  # the distance is convex along the axis: ternary search
+            for _ in range(80):
+                third = (high - low) / 3
+                left = at(low + third) < at(high - third)
+                low, high = np.where(left, low, low + third), np.where(left, high - third, high)
+            axis_distance = at((low + high) / 2)
+            outside = axis_distance > 0.0
+            np.testing.assert_allclose(found[i, outside], (axis_distance - radius)[outside], atol=1e-6)
+
+
+@pytest.mark.parametrize("shapes", [[SPHERE, CAPSULE], [BOX, CYLINDER]])
+def test_normal_is_a_unit_vector_from_a_to_b_that_spans_the_witness_points(panda, shapes):
+    rng = np.random.default_rng(3)
+    scene = random_scene(panda, rng, shapes * 3)
+    found = look(scene, random_q(panda, rng))
+    np.testing.assert_allclose(np.linalg.norm(found.normal, axis=1), 1.0, atol=1e-9)
+    np.testing.assert_allclose(found.point_b - found.point_a, found.distance[:, None] * found.normal, atol=1e-6)
+
+
+# --- rates -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["paper", "panda", "solo"])
+def test_distance_jacobian_of_capsules_and_spheres(name, request):
+    """Includes pairs of the two arms, or of two legs, in which both bodies move; and a floating base."""
+    robot = request.getfixturevalue(name)
+    rng = np.random.default_rng(4)
+    scene = random_scene(robot, rng, [SPHERE, CAPSULE] * 2)
+    masks = support_masks(robot.model)
+    joints = [body.parentJoint for body in scene.geometry.geometryObjects]
+    assert any(masks[joints[a]].any() and masks[joints[b]].any() for a, b in scene.pairs)
+    for _ in range(TICKS):
+        q = random_q(robot, rng)
+        ends, radii = axes(scene, q)
+        a, b = scene.pairs.T
+        found = look(scene, q)
+        smooth = found.distance + radii[a] + radii[b] > 1e-3  # crossing axes are a kink of the distance
+        expected = differences(lambda q: look(scene, q).distance, robot, q)
+        np.testing.assert_allclose(found.J[smooth], expected[smooth], atol=1e-6)
+
+
+def test_distance_jacobian_of_boxes_and_cylinders(panda):
+    rng = np.random.default_rng(5)
+    scene = random_scene(panda, rng, [BOX, CYLINDER] * 2)
+    count = len(scene.obstacles) * len(scene.body_names)
+    for _ in range(TICKS):
+        q = random_q(panda, rng)
+        found = look(scene, q)
+        expected = differences(lambda q: look(scene, q).distance, panda, q, step=1e-5)
+        apart = found.distance[-count:] > 1e-3
+        # a capsule parallel to a face or edge has no single witness point: a kink for the few pairs near it
+        error = np.abs(found.J - expected)[-count:][apart].max(axis=1)
+        assert np.mean(error < 1e-4) > 0.97
+
+
+def test_distance_jacobian_of_convex_hulls(panda_convex):
+    rng = np.random.default_rng(6)
+    scene = random_scene(panda_convex, rng, [SPHERE] * 4)
+    count = len(scene.obstacles) * len(scene.body_names)
+    for _ in range(TICKS):
+        q = random_q(panda_convex, rng)
+        found = look(scene, q)
+        expected = differences(lambda q: look(scene, q).distance, panda_convex, q, step=1e-5)
+        apart = found.distance[-count:] > 1e-3
+        np.testing.assert_allclose(found.J[-count:][apart], expected[-count:][apart], atol=1e-4)
+
+
+@pytest.mark.parametrize(("shapes", "tolerance"), [([SPHERE, CAPSULE], 1e-6), ([BOX, CYLINDER], 1e-4)])
+def test_drift_is_the_rate_when_only_obstacles_move(panda, shapes, tolerance):
+    rng = np.random.default_rng(7)
+    scene = random_scene(panda, rng, shapes * 2)
+    q = random_q(panda, rng)
+    starts = [o.motion.sample(0.0) for o in scene.obstacles]
+    samples = {
+        i: replace(start, linear=rng.uniform(-1, 1, 3), angular=rng.uniform(-2, 2, 3)) for i, start in enumerate(starts)
+    }
+    step = 1e-6 if tolerance < 1e-5 else 1e-5
+    ahead, behind = (look(scene, q, {i: moved(s, t) for i, s in samples.items()}) for t in (step, -step))
+    found = look(scene, q, samples)
+    expected = (ahead.distance - behind.distance) / (2.0 * step)
+    obstacles = scene.pairs[:, 1] >= len(scene.body_names)
+    assert np.abs(expected[obstacles]).max() > 0.1
+    apart = found.distance > -0.02
+    np.testing.assert_allclose(found.drift[apart], expected[apart], atol=tolerance)
+    np.testing.assert_array_equal(found.drift[~obstacles], 0.0)
+
+
+def test_columns_of_joints_beyond_the_body_are_exactly_zero(paper):
+    """`left_forearm` hangs on link 5: it moves with joints 1 to 5 of the left arm, and with nothing else."""
+    rng = np.random.default_rng(8)
+    scene = build_scene(paper, [obstacle("ball", SPHERE, (0.3, 0.1, 0.8))])
+    found = look(scene, random_q(paper, rng))
+    moving = {"upper_arm": 3, "forearm": 5, "hand": 7}
+    for (a, b), row in zip(scene.pair_names, found.J, strict=True):
+        columns = set()
+        for body in {a, b} - {"ball"}:
+            side, _, part = body.partition("_")
+            columns |= {i + 7 * (side == "right") for i in range(moving[part])}
+        assert set(np.flatnonzero(row)) == columns
+
+
+# --- penetration -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", [SPHERE, CAPSULE, BOX])
+def test_in_penetration_the_normal_still_points_the_way_out(paper, shape):
+    """Moving the obstacle along the normal raises the signed distance one to one; J and drift agree with that."""
+    rng = np.random.default_rng(9)
+    q = random_q(paper, rng)
+    bare = build_scene(paper)
+    hand = bare.body_names.index("left_hand")
+    center = world_placements(bare, q)[hand]
+    place = center.translation + center.rotation @ np.array([0.02, 0.03, 0.01])
+    scene = build_scene(paper, [obstacle("o", shape, place, (0.3, 0.4, 0.5))])
+    pair = scene.pair_names.index(("left_hand", "o"))
+    start = scene.obstacles[0].motion.sample(0.0)
+    step, tolerance = (1e-5, 1e-4) if shape is BOX else (1e-6, 1e-6)
+    found = look(scene, q, {0: replace(start, linear=np.array([1.0, 0, 0]), angular=np.array([0, 1.0, 0]))})
+    assert found.distance[pair] < -0.01
+    normal = found.normal[pair]
+    out, into = (look(scene, q, {0: replace(start, position=start.position + s * normal)}) for s in (step, -step))
+    assert (out.distance[pair] - into.distance[pair]) / (2 * step) == pytest.approx(1.0, abs=tolerance)
+    expected = differences(lambda q: look(scene, q).distance, paper, q, step)
+    np.testing.assert_allclose(found.J[pair], expected[pair], atol=tolerance)
+    twist = replace(start, linear=np.array([1.0, 0, 0]), angular=np.array([0, 1.0, 0]))
+    ahead, behind = (look(scene, q, {0: moved(twist, t)}) for t in (step, -step))
+    rate = (ahead.distance[pair] - behind.distance[pair]) / (2 * step)
+    assert found.drift[pair] == pytest.approx(rate, abs=tolerance)
+
+
+# --- how it is read ----------------------------------------------------------------------------------------------
+
+
+def same(a, b):
+    return all(np.array_equal(getattr(a, f.name), getattr(b, f.name)) for f in fields(a))
+
+
+def test_the_view_of_coals_memory_equals_the_accessors(panda):
+    rng = np.random.default_rng(10)
+    scene = random_scene(panda, rng, [SPHERE, CAPSULE, BOX])
+    query = DistanceQuery(scene)
+    assert query._view is not None, "coal's layout has changed: the slow path is in use"
+    for _ in range(3):
+        look(scene, random_q(panda, rng), query=query)
+        np.testing.assert_array_equal(query._view, proximity._read_results(query._data.distanceResults))
+
+
+def test_without_the_view_the_result_is_the_same(panda, monkeypatch):
+    rng = np.random.default_rng(11)
+    scene = random_scene(panda, rng, [SPHERE, CAPSULE, BOX])
+    qs = [random_q(panda, rng) for _ in range(3)]
+    fast = [look(scene, q, reach=0.3) for q in qs]
+    monkeypatch.setattr(proximity, "_view_results", lambda *_: None)
+    assert all(same(look(scene, q, reach=0.3), expected) for q, expected in zip(qs, fast, strict=True))
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_few_pairs(paper, count):
+    left, q = paper.lock(["right_*"], paper.home, "test")
+    obstacles = [obstacle(f"o{i}", SPHERE, (0.0, 0.3 + 0.2 * i, -0.3)) for i in range(count)]
+    bodies = left.bodies.copy()
+    left = replace(left, bodies=bodies)
+    bodies.removeAllCollisionPairs()
+    scene = build_scene(left, obstacles)
+    keep = [i for i, (a, _) in enumerate(scene.pair_names) if a == "left_hand"]
+    for i in reversed(range(len(scene.pairs))):
+        if i not in keep:
+            scene.geometry.removeCollisionPair(scene.geometry.collisionPairs[i])
+    scene = replace(scene, pairs=scene.pairs[keep], support=scene.support[keep])
+    found = look(scene, q)
+    assert found.distance.shape == found.drift.shape == (count,)
+    assert found.J.shape == (count, 7) and found.normal.shape == (count, 3)
+    tip = np.array([0.0, 0.3, 0.3])  # the hand's axis ends there at the zero pose; radii 0.05 and 0.06
+    for i in range(count):
+        gap = np.linalg.norm(np.array([0.0, 0.3 + 0.2 * i, -0.3]) - tip) - 0.11
+        assert found.distance[i] == pytest.approx(gap, abs=1e-9)
+
+
+def test_only_pairs_within_reach_have_rows(panda):
+    rng = np.random.default_rng(12)
+    scene = random_scene(panda, rng, [SPHERE] * 5)
+    q = random_q(panda, rng)
+    everything, some = look(scene, q), look(scene, q, reach=0.2)
+    np.testing.assert_array_equal(some.near, np.flatnonzero(everything.distance < 0.2))
+    assert 0 < len(some.near) < len(scene.pairs)
+    np.testing.assert_array_equal(some.distance, everything.distance)
+    np.testing.assert_allclose(some.J, everything.J[some.near], rtol=0, atol=1e-15)
+
+
+def test_a_kept_result_is_not_overwritten_by_the_next_tick(panda):
+    rng = np.random.default_rng(13)
+    scene = random_scene(panda, rng, [SPHERE, CAPSULE])
+    query = DistanceQuery(scene)
+    first = look(scene, random_q(panda, rng), query=query)
+    kept = {f.name: getattr(first, f.name).copy() for f in fields(first)}
+    second = look(scene, random_q(panda, rng), query=query)
+    assert not same(first, second)
+    for name, value in kept.items():
+        np.testing.assert_array_equal(getattr(first, name), value)
+
+
+def test_an_obstacle_is_seen_to_move_while_the_robot_rests(panda):
+    scene = build_scene(panda, [obstacle("ball", SPHERE, (0.6, 0.0, 0.5))])
+    query = DistanceQuery(scene)
+    first = look(scene, panda.home, query=query)
+    later = look(scene, panda.home, {0: Sample.at((2.6, 0.0, 0.5))}, query=query)
+    assert later.distance[-1] > first.distance[-1] + 1.0
+
+
+def calls_of_a_tick(scene, q):
+    """How many functions, in Python or in C, one tick calls from Python."""
+    query, model = DistanceQuery(scene), scene.robot.model
+    data = model.createData()
+    kinematics = compute_kinematics(model, data, [], q)
+    calls = 0
+
+    def count(frame, event, arg):
+        nonlocal calls
+        calls += event in ("call", "c_call")
+
+    sys.setprofile(count)
+    try:
+        query.compute(data, kinematics, 10.0)
+    finally:
+        sys.setprofile(None)
+    return calls
+
+
+def test_python_work_does_not_grow_with_the_number_of_pairs(panda):
+    rng = np.random.default_rng(14)
+    few, many = (calls_of_a_tick(random_scene(panda, rng, [SPHERE] * n), panda.home) for n in (10, 300))
+    assert few == many < 60
