@@ -24,14 +24,22 @@ from qpavoid.problem import Array, Status
 DPI = 130
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#333333")
 """Colour-blind-safe (Okabe and Ito), without the yellow that fades on white."""
-DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1, 1.2)), (0, (6, 2, 1, 2)), (0, (3, 1, 1, 1, 1, 1)))
+DASHES: tuple[Any, ...] = (
+    "-",
+    (0, (5, 2)),
+    (0, (1, 1.2)),
+    (0, (6, 2, 1, 2)),
+    (0, (3, 1, 1, 1, 1, 1)),
+    (0, (10, 3)),
+    (0, (2, 2)),
+)
 SOLVER_STYLES: dict[str, tuple[str, Any]] = {
     "tracking": ("#333333", DASHES[2]),
     "eq10-literal": ("#E69F00", DASHES[3]),
     "eq10": ("#D55E00", DASHES[1]),
     "gradient-projection": ("#CC79A7", DASHES[4]),
-    "potential-field": ("#56B4E9", DASHES[2]),
-    "hqp": ("#009E73", DASHES[1]),
+    "potential-field": ("#56B4E9", DASHES[6]),
+    "hqp": ("#009E73", DASHES[5]),
     "qp": ("#0072B2", DASHES[0]),
 }
 ALPHA_SHOWN = 100.0
@@ -97,7 +105,9 @@ def position_names(log: Log) -> list[str]:
     cosine of a planar joint), and, if the count asks for it, joints without limits to be cosine and sine; whatever
     does not add up is numbered.
     """
-    names = log.meta["coordinates"]
+    names: list[str] = log.meta["coordinates"]
+    if len(names) == log.q.shape[1]:
+        return names
     limited = {name for name, _, _ in log.meta["position_limits"]}
     counts = Counter(name if name in limited else name.rpartition(".")[0] or name for name in names)
     for circle in (("",), (".cos", ".sin")):
@@ -135,13 +145,11 @@ def joints_figure(log: Log) -> Figure:
         if i + columns >= len(names):
             ax.set_xlabel("time [s]", fontsize=9)
     figure.supylabel("joint position [rad or m]", fontsize=10)
-    figure.legend(
-        handles=[
-            Line2D([], [], color=COLOURS[0], label="position"),
-            Patch(facecolor=COLLISION, alpha=0.3, label="beyond the position limits"),
-        ],
-        loc="outside lower center", ncols=2, fontsize=9, frameon=False,
-    )  # fmt: skip
+    handles = [
+        Line2D([], [], color=COLOURS[0], label="position"),
+        Patch(color=COLLISION, alpha=0.3, label="beyond limits"),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=9, frameon=False)
     return figure
 
 
@@ -176,7 +184,7 @@ def _plot_gains(ax: Any, log: Log) -> None:
     ax.plot(log.t, alpha, color="#333333", label="α of the closest pair (eq. 11)")
     ax.plot(log.t, log.beta, color="#8A8A8A", linestyle=DASHES[1], label="β of the closest pair (eq. 12)")
     ax.set_yscale("symlog", linthresh=1.0)
-    top = next(top for top in (1.0, 10.0, ALPHA_SHOWN) if np.max(alpha, initial=0.0) <= top)
+    top = next(top for top in (1.0, 10.0, ALPHA_SHOWN) if np.nanmax(alpha, initial=0.0) <= top)
     ticks = [tick for tick in (0.0, 0.5, 1.0, 10.0, ALPHA_SHOWN) if tick <= top]
     ax.set_ylim(-0.1, 1.15 * top)
     ax.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
@@ -219,11 +227,13 @@ def speeds_figure(log: Log) -> Figure:
 
 def solver_styles(logs: Sequence[Log]) -> list[dict[str, Any]]:
     """Label, colour and line style of each run, the same in every panel and, for known solvers, in every figure."""
-    spare = [(colour, dash) for dash in DASHES for colour in COLOURS]
-    spare = [style for style in spare if style not in SOLVER_STYLES.values()]
+    solvers = [log.meta["solver"] for log in logs]
+    known = [SOLVER_STYLES[solver] for solver in solvers if solver in SOLVER_STYLES]
+    spare = [(colour, dash) for dash in DASHES for colour in COLOURS if (colour, dash) not in known]
+    spare.sort(key=lambda style: style[0] in [colour for colour, _ in known])  # colours of their own first
     taken: list[str] = []
     styles = []
-    for solver in (log.meta["solver"] for log in logs):
+    for solver in solvers:
         colour, dash = SOLVER_STYLES[solver] if solver in SOLVER_STYLES and solver not in taken else spare.pop(0)
         label = f"{solver} ({taken.count(solver) + 1})" if solver in taken else solver
         taken.append(solver)

@@ -1,4 +1,4 @@
-"""Robots among obstacles: 3-D at several instants (Figs. 6, 9, 10, 12, 15 of the paper), and tool paths in two views."""
+"""Robots among obstacles: in 3-D at several instants (the paper's Figs. 6, 9, 10, 12, 15), and tool paths in two views."""
 
 from __future__ import annotations
 
@@ -248,7 +248,7 @@ def _normals(faces: Array) -> Array:
 def _shade(faces: Array, colour: str, towards: Array) -> Array:
     light = towards + np.array([0.0, 0.0, 0.7])
     brightness = 0.55 + 0.5 * np.clip(_normals(faces) @ (light / np.linalg.norm(light)), 0.0, 1.0)
-    return np.clip(brightness[:, None] * to_rgb(colour), 0.0, 1.0)
+    return np.asarray(np.clip(brightness[:, None] * to_rgb(colour), 0.0, 1.0))
 
 
 def _legend(log: Log, ticks: IntArray) -> list[Any]:

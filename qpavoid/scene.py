@@ -109,7 +109,7 @@ def build_scene(robot: Robot, obstacles: Sequence[Obstacle] = ()) -> Scene:
     )
 
 
-def build_obstacles(configs: Sequence[config.Obstacle], source: Path) -> list[Obstacle]:
+def build_obstacles(configs: Sequence[config.ObstacleConfig], source: Path) -> list[Obstacle]:
     """Obstacles of a scenario.
 
     Args:

@@ -26,6 +26,9 @@ from qpavoid.proximity import DistanceQuery
 from qpavoid.segments import capsule_distances
 
 TICKS = 10
+ROUND = 1e-3
+"""Tolerance on rates [m/rad] where coal iterates to a curved surface: its stopping criterion leaves the normal
+uncertain by the root of 1e-6."""
 
 
 def world_placements(scene, q):
@@ -132,18 +135,18 @@ def test_distance_jacobian_of_capsules_and_spheres(name, request):
         np.testing.assert_allclose(found.J[smooth], expected[smooth], atol=1e-6)
 
 
-def test_distance_jacobian_of_boxes_and_cylinders(panda):
+@pytest.mark.parametrize(("shape", "tolerance"), [(BOX, 1e-5), (CYLINDER, ROUND)])
+def test_distance_jacobian_of_boxes_and_cylinders(panda, shape, tolerance):
     rng = np.random.default_rng(5)
-    scene = random_scene(panda, rng, [BOX, CYLINDER] * 2)
+    scene = random_scene(panda, rng, [shape] * 4)
     count = len(scene.obstacles) * len(scene.body_names)
     for _ in range(TICKS):
         q = random_q(panda, rng)
         found = look(scene, q)
         expected = differences(lambda q: look(scene, q).distance, panda, q, step=1e-5)
         apart = found.distance[-count:] > 1e-3
-        # a capsule parallel to a face or edge has no single witness point: a kink for the few pairs near it
-        error = np.abs(found.J - expected)[-count:][apart].max(axis=1)
-        assert np.mean(error < 1e-4) > 0.97
+        assert apart.sum() > 0.8 * count
+        np.testing.assert_allclose(found.J[-count:][apart], expected[-count:][apart], atol=tolerance)
 
 
 def test_distance_jacobian_of_convex_hulls(panda_convex):
@@ -158,16 +161,16 @@ def test_distance_jacobian_of_convex_hulls(panda_convex):
         np.testing.assert_allclose(found.J[-count:][apart], expected[-count:][apart], atol=1e-4)
 
 
-@pytest.mark.parametrize(("shapes", "tolerance"), [([SPHERE, CAPSULE], 1e-6), ([BOX, CYLINDER], 1e-4)])
+@pytest.mark.parametrize(("shapes", "tolerance"), [([SPHERE, CAPSULE], 1e-6), ([BOX], 1e-5), ([CYLINDER], ROUND)])
 def test_drift_is_the_rate_when_only_obstacles_move(panda, shapes, tolerance):
     rng = np.random.default_rng(7)
-    scene = random_scene(panda, rng, shapes * 2)
+    scene = random_scene(panda, rng, shapes * 3)
     q = random_q(panda, rng)
     starts = [o.motion.sample(0.0) for o in scene.obstacles]
     samples = {
         i: replace(start, linear=rng.uniform(-1, 1, 3), angular=rng.uniform(-2, 2, 3)) for i, start in enumerate(starts)
     }
-    step = 1e-6 if tolerance < 1e-5 else 1e-5
+    step = 1e-6 if tolerance == 1e-6 else 1e-5
     ahead, behind = (look(scene, q, {i: moved(s, t) for i, s in samples.items()}) for t in (step, -step))
     found = look(scene, q, samples)
     expected = (ahead.distance - behind.distance) / (2.0 * step)
@@ -189,7 +192,7 @@ def test_columns_of_joints_beyond_the_body_are_exactly_zero(paper):
         for body in {a, b} - {"ball"}:
             side, _, part = body.partition("_")
             columns |= {i + 7 * (side == "right") for i in range(moving[part])}
-        assert set(np.flatnonzero(row)) == columns
+        assert set() < set(np.flatnonzero(row)) <= columns
 
 
 # --- penetration -------------------------------------------------------------------------------------------------
@@ -244,7 +247,10 @@ def test_without_the_view_the_result_is_the_same(panda, monkeypatch):
     qs = [random_q(panda, rng) for _ in range(3)]
     fast = [look(scene, q, reach=0.3) for q in qs]
     monkeypatch.setattr(proximity, "_view_results", lambda *_: None)
-    assert all(same(look(scene, q, reach=0.3), expected) for q, expected in zip(qs, fast, strict=True))
+    for q, expected in zip(qs, fast, strict=True):
+        slow = look(scene, q, reach=0.3)
+        for f in fields(slow):  # GJK starts elsewhere in a fresh query: equal to rounding
+            np.testing.assert_allclose(getattr(slow, f.name), getattr(expected, f.name), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])

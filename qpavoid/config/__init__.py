@@ -8,12 +8,12 @@ from qpavoid.config.base import Block
 from qpavoid.config.control import Avoidance, Cbf, Damper, Limits, Switching, Task
 from qpavoid.config.motion import Circle, Csv, Fixed, Line, Motion, Waypoints
 from qpavoid.config.robot import Body, JointLimits, RobotConfig
-from qpavoid.config.scenario import Obstacle, ScenarioConfig
+from qpavoid.config.scenario import ObstacleConfig, ScenarioConfig
 from qpavoid.config.shapes import Box, Capsule, Cylinder, Shape, Sphere
 from qpavoid.config.solver import Eq10Solver, QpSolver, SolverConfig, TrackingSolver, expand_solver
 
 __all__ = [
     "Avoidance", "Block", "Body", "Box", "Capsule", "Cbf", "Circle", "Csv", "Cylinder", "Damper", "Eq10Solver",
-    "Fixed", "JointLimits", "Limits", "Line", "Motion", "Obstacle", "QpSolver", "RobotConfig", "ScenarioConfig",
+    "Fixed", "JointLimits", "Limits", "Line", "Motion", "ObstacleConfig", "QpSolver", "RobotConfig", "ScenarioConfig",
     "Shape", "SolverConfig", "Sphere", "Switching", "Task", "TrackingSolver", "Waypoints", "expand_solver",
 ]  # fmt: skip

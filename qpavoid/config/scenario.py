@@ -14,7 +14,7 @@ from qpavoid.config.shapes import Shape
 from qpavoid.config.solver import QpSolver, SolverConfig
 
 
-class Obstacle(Block):
+class ObstacleConfig(Block):
     """A body that the robot must stay clear of."""
 
     name: str
@@ -37,7 +37,7 @@ class ScenarioConfig(Block):
     lock: list[str] = []
     """Joints held at q0 for the whole run; `*` and `?` match as in file names."""
     tasks: Annotated[list[Task], Field(min_length=1)]
-    obstacles: list[Obstacle] = []
+    obstacles: list[ObstacleConfig] = []
     tracking_damping: NonNegative = 0.01
     """λ of the damped J⁺ of the tracking task, the same for every solver [-]; 0 gives the plain pseudo-inverse."""
     avoidance: Avoidance = Avoidance()
