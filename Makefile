@@ -2,10 +2,13 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: run test lint types clean
+.PHONY: run figures test lint types clean
 
 run: .venv/run
 	$(BIN)/qpavoid compare situation1 situation2 --solvers tracking,eq10-literal,eq10,qp --out out
+
+figures: run
+	cp out/situation1_compare_path.png out/situation1_qp_motion.png docs/figures/
 
 test: .venv/dev
 	$(BIN)/pytest -n auto

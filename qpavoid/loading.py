@@ -127,6 +127,20 @@ def read_config(path: Path, model: type[Config], overrides: Sequence[str] = (), 
         }
     for override in overrides:
         _set(data, override, path)
+    return validate(data, model, path)
+
+
+def validate(data: dict[str, Any], model: type[Config], path: Path) -> Config:
+    """`data` as a configuration.
+
+    Args:
+        data: fields of a file, or what stands for one.
+        model: the configuration.
+        path: file to name in errors.
+
+    Raises:
+        ConfigError: unknown key (with the nearest valid one) or bad value.
+    """
     try:
         return model.model_validate(data)
     except ValidationError as error:

@@ -166,8 +166,9 @@ def distances_figure(log: Log) -> Figure:
     far = [i for i in drawn if i not in near]
     for i in far:
         ax.plot(log.t, distance[:, i], color=_GREY, linewidth=0.7, zorder=1)
-    for rank, i in enumerate(near):
-        ax.plot(log.t, distance[:, i], label=log.meta["bodies"][i], linewidth=1.6, zorder=3, **_style(rank))
+    # Thinner and thinner: the two bodies of a pair share their distance, and neither line may hide the other.
+    for rank, (i, width) in enumerate(zip(near, np.linspace(3.8, 1.2, len(near)), strict=True)):
+        ax.plot(log.t, distance[:, i], label=log.meta["bodies"][i], linewidth=width, zorder=3, **_style(rank))
     handles = ax.get_legend_handles_labels()[0]
     if far:
         handles.append(Line2D([], [], color=_GREY, linewidth=0.7, label=f"{len(far)} bodies never within {reach:g} m"))
@@ -252,7 +253,7 @@ def compare_time_figure(logs: Sequence[Log]) -> Figure:
         to_target = np.linalg.norm(log.target - log.tool, axis=2)
         distance.plot(log.t, log.min_distance + offset, **line)
         deviation.plot(log.t, np.max(path_deviation(log), axis=1, initial=0.0), **line)
-        error.plot(log.t, np.max(to_target, axis=1, initial=0.0), **line)
+        error.plot(log.t, np.max(to_target, axis=1, initial=1e-3 * ERROR_FLOOR), **line)
         speed.plot(log.t, np.max(np.abs(log.v), axis=1, initial=0.0), **line)
     solvers = distance.get_legend_handles_labels()[0]
     levels = _levels(distance, logs[0], qp=any(map(_is_qp, logs)))

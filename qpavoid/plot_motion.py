@@ -1,4 +1,4 @@
-"""Robots among obstacles: in 3-D at several instants (the paper's Figs. 6, 9, 10, 12, 15), and tool paths in two views."""
+"""Robots among obstacles: 3-D at several instants (the paper's Figs. 6, 9, 10, 12, 15), and tool paths in two views."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def motion_figure(log: Log) -> Figure:
     closest = int(np.argmin(log.min_distance)) if np.isfinite(log.min_distance).any() else -1
     lower, upper = _limits(log, ticks)
     size = upper - lower
-    elevation, azimuth = view_angles(log, ticks)
+    elevation, azimuth = view_angles(log)
     towards = _towards_viewer(elevation, azimuth)
     # Size of the drawn box on paper. An Axes3D is a square of 0.97 times the box's diagonal, mostly empty: the squares
     # overlap, so that the boxes lie side by side.
@@ -164,42 +164,33 @@ def _towards_viewer(elevation: float, azimuth: float) -> Array:
     return np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
 
 
-def view_angles(log: Log, ticks: IntArray) -> tuple[float, float]:
-    """Elevation and azimuth [deg] from which the paths look long and tools, arms and obstacles are seen best.
+def view_angles(log: Log) -> tuple[float, float]:
+    """Elevation and azimuth [deg] from which the planned path looks long, and path, robot and obstacles are seen best.
 
-    Each candidate is scored by the share of points of interest that no other body hides, times how much of the paths'
-    extent is not foreshortened. None looks straight along an axis, which would take the depth away.
+    Each candidate is scored by the share of points of interest that nothing else hides, times how much of the path's
+    extent is not foreshortened. None looks straight along an axis, which would take the depth away. Only what all
+    solvers share goes in (the robot at the start, the plan and the obstacles), so that their figures have one view.
     """
-    paths = np.concatenate([log.target, log.tool]).reshape(-1, 3)
-    spread = paths - paths.mean(axis=0) if len(paths) else np.zeros((1, 3))
+    path = log.target[np.linspace(0, len(log.t) - 1, 2 * PANELS).astype(int)].reshape(-1, 3)
+    spread = path - path.mean(axis=0)
     size = np.linalg.norm(spread)
-    radii, moving = np.array(log.meta["body_radii"]), moving_bodies(log)
-    best, best_score = (25.0, -60.0), -1.0
+    centres = log.obstacle_position[np.linspace(0, len(log.t) - 1, PANELS).astype(int)].reshape(-1, 3)
+    half_sizes = [np.ptp(shape_faces(o["shape"]).reshape(-1, 3), axis=0).mean() / 2 for o in log.meta["obstacles"]]
+    points = np.concatenate([path, log.body_ends[0].mean(axis=1), log.body_ends[0, :, 1], centres])[:, None]
+    start = np.concatenate([log.body_ends[0, :, 0], centres])
+    end = np.concatenate([log.body_ends[0, :, 1], centres])
+    thickness = np.array([*log.meta["body_radii"], *np.tile(half_sizes, PANELS)])
+    own = point_segment(points, start, end).distance < 1.3 * thickness
+    best, best_score = (20.0, -45.0), -1.0
     for elevation in (20.0, 35.0):
         for azimuth in (-25.0, 25.0, -45.0, 45.0, -65.0, 65.0, -115.0, 115.0, -135.0, 135.0, -155.0, 155.0):
             towards = _towards_viewer(elevation, azimuth)
-            seen = np.mean([_visible(log, int(tick), towards, radii, moving) for tick in ticks])
-            length = np.linalg.norm(spread - np.outer(spread @ towards, towards)) / size if size > 1e-6 else 1.0
+            hidden = segment_segment(points, points + 10.0 * towards, start, end).distance < thickness
+            seen = 1.0 - float(np.mean(np.any(hidden & ~own, axis=1)))
+            length = float(np.linalg.norm(spread - np.outer(spread @ towards, towards)) / size) if size > 1e-6 else 1.0
             if seen**2 * length > best_score + 1e-9:
-                best, best_score = (elevation, azimuth), float(seen**2 * length)
+                best, best_score = (elevation, azimuth), seen**2 * length
     return best
-
-
-def _visible(log: Log, tick: int, towards: Array, radii: Array, moving: Any) -> float:
-    ends = log.body_ends[tick]
-    centres = log.obstacle_position[tick]
-    middles = np.concatenate([ends[moving].mean(axis=1), ends[moving][:, 1]])
-    points = np.concatenate([log.tool[tick], centres, middles])
-    half_sizes = [np.ptp(shape_faces(o["shape"]).reshape(-1, 3), axis=0).mean() / 2 for o in log.meta["obstacles"]]
-    start = np.concatenate([ends[:, 0], centres])
-    end = np.concatenate([ends[:, 1], centres])
-    thickness = np.concatenate([radii, half_sizes])
-    if not len(points) or not len(start):
-        return 1.0
-    own = point_segment(points[:, None], start, end).distance < 1.3 * thickness
-    ray = points[:, None] + 10.0 * towards
-    hidden = segment_segment(points[:, None], ray, start[None], end[None]).distance < thickness
-    return 1.0 - float(np.mean(np.any(hidden & ~own, axis=1)))
 
 
 def _limits(log: Log, ticks: IntArray) -> tuple[Array, Array]:
@@ -333,8 +324,7 @@ def _outlines(logs: Sequence[Log], log: Log) -> list[tuple[Array, str, float]]:
         avoidance = run.meta["config"]["avoidance"]
         within = run.min_distance + avoidance["offset"] < avoidance["d2"]
         near |= {name for pair in set(run.closest_pair[within].tolist()) for name in run.meta["pairs"][pair]}
-    resting = ~np.any([moving_bodies(run) for run in logs if len(run.t)], axis=0) & bool(len(log.t))
-    for i, body in enumerate(log.meta["bodies"]):
-        if body in near and resting[i]:
+    for i in np.flatnonzero(~moving_bodies(log)):
+        if log.meta["bodies"][i] in near:
             outlines.append((capsule_faces(log.body_ends[0, i], log.meta["body_radii"][i]), RESTING, 0.5))
     return outlines
