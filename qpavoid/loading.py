@@ -119,12 +119,8 @@ def read_config(path: Path, model: type[Config], overrides: Sequence[str] = (), 
     """
     data = _read_yaml(path)
     if solver is not None:
-        name, _, backend = solver.partition(":")
-        kept = _solver_mapping(data.get("solver"))
-        data["solver"] = {
-            **(kept if kept.get("name") == name else {"name": name}),
-            **({"backend": backend} if backend else {}),
-        }
+        wanted, kept = _solver_mapping(solver), _solver_mapping(data.get("solver"))
+        data["solver"] = {**kept, **wanted} if kept.get("name") == wanted["name"] else wanted
     for override in overrides:
         _set(data, override, path)
     return validate(data, model, path)

@@ -167,7 +167,7 @@ def distances_figure(log: Log) -> Figure:
     for i in far:
         ax.plot(log.t, distance[:, i], color=_GREY, linewidth=0.7, zorder=1)
     # Thinner and thinner: the two bodies of a pair share their distance, and neither line may hide the other.
-    for rank, (i, width) in enumerate(zip(near, np.linspace(3.8, 1.2, len(near)), strict=True)):
+    for rank, (i, width) in enumerate(zip(near, np.linspace(3.0, 1.2, len(near)), strict=True)):
         ax.plot(log.t, distance[:, i], label=log.meta["bodies"][i], linewidth=width, zorder=3, **_style(rank))
     handles = ax.get_legend_handles_labels()[0]
     if far:

@@ -324,7 +324,6 @@ def _outlines(logs: Sequence[Log], log: Log) -> list[tuple[Array, str, float]]:
         avoidance = run.meta["config"]["avoidance"]
         within = run.min_distance + avoidance["offset"] < avoidance["d2"]
         near |= {name for pair in set(run.closest_pair[within].tolist()) for name in run.meta["pairs"][pair]}
-    for i in np.flatnonzero(~moving_bodies(log)):
-        if log.meta["bodies"][i] in near:
-            outlines.append((capsule_faces(log.body_ends[0, i], log.meta["body_radii"][i]), RESTING, 0.5))
+    resting = [i for i in np.flatnonzero(~moving_bodies(log)).tolist() if log.meta["bodies"][i] in near]
+    outlines += [(capsule_faces(log.body_ends[0, i], log.meta["body_radii"][i]), RESTING, 0.5) for i in resting]
     return outlines

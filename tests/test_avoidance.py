@@ -1,0 +1,139 @@
+"""Gains (eqs. 11, 12) and avoidance rows by hand-computed numbers, limits and monotony."""
+
+import numpy as np
+import pytest
+
+from qpavoid import Avoidance
+from qpavoid.avoidance import avoidance_rows, closing_speed_bound
+from qpavoid.gains import alpha, beta
+from qpavoid.problem import Proximity
+
+D1, D2, XI = 0.12, 0.24, 5.0
+TINY = 1e-9
+
+
+def bound(d, **row):
+    settings = Avoidance(d1=D1, d2=D2, recovery_speed=0.2, row={"gain": XI, **row})
+    d = np.array(d, dtype=float)
+    return closing_speed_bound(d, beta(d, D1, D2), settings)
+
+
+# --- eq. 11 --------------------------------------------------------------------------------------------------
+
+
+def test_alpha_by_hand():
+    """((0.24 - d) / d)²: 1 at half the influence distance, where approaching is cancelled altogether."""
+    np.testing.assert_allclose(alpha(np.array([0.06, 0.08, 0.12, 0.16, 0.24, 0.5]), D2), [9, 4, 1, 0.25, 0, 0])
+
+
+def test_alpha_is_continuous_and_smooth_at_d2():
+    below, above = alpha(np.array([D2 - 1e-6, D2 + 1e-6]), D2)
+    assert 0.0 < below < 1e-10 and above == 0.0
+
+
+def test_alpha_falls_with_the_distance():
+    assert (np.diff(alpha(np.linspace(1e-3, D2, 500), D2)) < 0.0).all()
+
+
+def test_alpha_is_infinite_in_contact():
+    assert np.isposinf(alpha(np.array([0.0, -0.01, -1.0]), D2)).all()
+
+
+# --- eq. 12 --------------------------------------------------------------------------------------------------
+
+
+def test_beta_by_hand():
+    quarter = 0.5 + 0.25 * np.sqrt(2.0)
+    d = np.array([-1.0, 0.0, D1, 0.15, 0.16, 0.18, 0.20, D2, 1.0])
+    np.testing.assert_allclose(beta(d, D1, D2), [1, 1, 1, quarter, 0.75, 0.5, 0.25, 0, 0], atol=1e-15)
+
+
+@pytest.mark.parametrize("edge", [D1, D2])
+def test_beta_and_its_slope_are_continuous_at_both_ends(edge):
+    values = beta(edge + np.array([-1e-6, 0.0, 1e-6]), D1, D2)
+    np.testing.assert_allclose(np.diff(values), 0.0, atol=1e-9)  # a kink would show as 1e-6 / (d2 - d1)
+
+
+def test_beta_falls_with_the_distance():
+    assert (np.diff(beta(np.linspace(D1, D2, 500), D1, D2)) < 0.0).all()
+
+
+# --- rows ----------------------------------------------------------------------------------------------------
+
+
+def test_switching_row_by_hand():
+    """-(1 - β) ξ (d - d1) outside d1: at 0.18 half of -0.3, at 0.16 a quarter of -0.2; inside it ξ (d1 - d)."""
+    found = bound([0.24, 0.18, 0.16, 0.12, 0.11, 0.09], type="switching")
+    np.testing.assert_allclose(found, [-0.6, -0.15, -0.05, 0.0, 0.05, 0.15], atol=1e-12)
+
+
+def test_damper_row_by_hand():
+    np.testing.assert_allclose(bound([0.24, 0.18, 0.12, 0.09], type="damper"), [-0.6, -0.3, 0.0, 0.15], atol=1e-12)
+    held = bound([0.24, 0.18, 0.15, 0.13], type="damper", d_safe=0.15)
+    np.testing.assert_allclose(held, [-0.45, -0.15, 0.0, 0.1], atol=1e-12)
+
+
+def test_cbf_row_by_hand():
+    np.testing.assert_allclose(bound([0.24, 0.12, 0.0], type="cbf"), [-0.6, 0.0, 0.6], atol=1e-12)
+    np.testing.assert_allclose(bound([0.15, 0.0], type="cbf", d_safe=0.15), [0.0, 0.75], atol=1e-12)
+
+
+@pytest.mark.parametrize(("kind", "capped"), [("switching", True), ("damper", True), ("cbf", False)])
+def test_recovery_speed_is_capped(kind, capped):
+    """5 · (0.12 - d) reaches the cap of 0.2 m/s at d = 0.08, deep in penetration it is still 0.2."""
+    found = bound([0.08, 0.05, -1.0], type=kind)
+    np.testing.assert_allclose(found, [0.2] * 3 if capped else [0.2, 0.35, 5.6], atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["switching", "damper", "cbf"])
+def test_bound_is_continuous_and_falls_with_the_distance(kind):
+    d = np.linspace(-0.1, D2, 34001)  # steps of 1e-5 m
+    found = bound(d, type=kind)
+    steps = np.diff(found)
+    assert (steps <= 0.0).all()
+    slope = XI * (1.0 + np.pi) if kind == "switching" else XI  # of (1 - β) ξ h at most ξ + ξ π h / 2 (d2 - d1)
+    assert steps.min() >= -slope * 1e-5 - 1e-12
+
+
+@pytest.mark.parametrize("edge", [D1, D2])
+def test_switching_bound_is_continuous_where_its_branches_meet(edge):
+    """At d1 the branch changes; at d2 β runs out and the row goes over into the plain damper."""
+    inside, outside = bound([edge - TINY, edge + TINY], type="switching")
+    assert inside == pytest.approx(outside, abs=4 * XI * TINY)
+    assert bound([D2], type="switching") == pytest.approx(bound([D2], type="damper"))
+
+
+def test_a_row_that_is_met_exactly_never_passes_what_it_holds():
+    """ḋ = bound from either side: the distance settles at d1 and is not crossed."""
+    dt = 0.01
+    for kind in ("switching", "damper", "cbf"):
+        d = np.array([0.23, 0.05])
+        for _ in range(2000):
+            d = d + dt * bound(d, type=kind)
+            assert d[0] >= D1 - 1e-12 and d[1] <= D1 + 1e-12
+        assert d[1] == pytest.approx(D1, abs=1e-9)
+
+
+def test_offset_is_added_and_near_pairs_keep_their_order():
+    rng = np.random.default_rng(0)
+    near = np.array([1, 4])
+    J, drift = rng.normal(size=(2, 3)), rng.normal(size=2)
+    distance = np.array([9.0, 0.08, 9.0, 9.0, 0.02])
+    vectors = np.zeros((5, 3))
+    proximity = Proximity(distance, vectors, vectors, vectors, near, J, drift)
+    settings = Avoidance(d1=D1, d2=D2, offset=0.1, row={"type": "switching", "gain": XI})
+    rows = avoidance_rows(proximity, settings)
+    np.testing.assert_array_equal(rows.pair, near)
+    np.testing.assert_allclose(rows.d, [0.18, 0.12])
+    np.testing.assert_allclose(rows.beta, [0.5, 1.0], atol=1e-15)
+    np.testing.assert_allclose(rows.alpha, [1 / 9, 1.0])
+    np.testing.assert_allclose(rows.bound, [-0.15, 0.0], atol=1e-12)
+    np.testing.assert_array_equal(rows.J, J)
+    np.testing.assert_array_equal(rows.drift, drift)
+
+
+def test_no_pair_gives_no_row():
+    none, vectors = np.zeros(0), np.zeros((0, 3))
+    proximity = Proximity(none, vectors, vectors, vectors, np.zeros(0, dtype=np.intp), np.zeros((0, 7)), none)
+    rows = avoidance_rows(proximity, Avoidance())
+    assert rows.J.shape == (0, 7) and rows.bound.shape == rows.alpha.shape == rows.beta.shape == (0,)

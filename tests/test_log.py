@@ -1,0 +1,252 @@
+"""Records of runs: what is written, read back, cut short and run again."""
+
+import json
+from dataclasses import FrozenInstanceError, fields, replace
+
+import numpy as np
+import pytest
+
+from qpavoid import ConfigError, Controller, Log, ScenarioConfig, load_scenario, simulate
+from qpavoid.solvers.analytic import TrackingOnly
+
+ARRAYS = [f.name for f in fields(Log) if f.name != "meta"]
+SHORT = ("duration=0.2", "tasks.0.motion={type: circle, radius: 0.1, period: 2}")
+
+
+@pytest.fixture(scope="module")
+def log():
+    """A run with a box among its obstacles and all kinds of metadata."""
+    return simulate(load_scenario("panda_line", SHORT))
+
+
+def assert_equal(a: Log, b: Log) -> None:
+    for name in ARRAYS:
+        assert np.array_equal(getattr(a, name), getattr(b, name)), name
+        assert getattr(a, name).dtype == getattr(b, name).dtype, name
+
+
+def test_arrays_have_the_documented_shapes(log):
+    n, tasks, bodies, obstacles = 21, 1, len(log.meta["bodies"]), 2
+    assert np.allclose(log.t, 0.01 * np.arange(n))
+    assert log.q.shape == (n, 7)
+    assert log.v.shape == (n, 7)
+    assert log.target.shape == log.tool.shape == (n, tasks, 3)
+    assert log.tool_rotation.shape == (n, tasks, 3, 3)
+    assert log.body_distance.shape == (n, bodies)
+    assert log.body_ends.shape == (n, bodies, 2, 3)
+    assert log.obstacle_position.shape == (n, obstacles, 3)
+    assert log.obstacle_rotation.shape == (n, obstacles, 3, 3)
+    assert all(len(getattr(log, name)) == n for name in ARRAYS)
+
+
+def test_each_tick_follows_from_the_one_before(log):
+    assert np.allclose(np.diff(log.q, axis=0), 0.01 * log.v[:-1], atol=1e-12)
+
+
+def test_closest_pair_holds_the_smallest_distance(log):
+    bodies = log.meta["bodies"]
+    for k in range(len(log.t)):
+        near = [name for name in log.meta["pairs"][log.closest_pair[k]] if name in bodies]
+        assert near
+        assert {log.body_distance[k, bodies.index(name)] for name in near} == {log.min_distance[k]}
+
+
+def test_saved_and_loaded_log_is_the_same(log, tmp_path):
+    path = log.save(tmp_path / "new" / "folder" / "run")
+    assert path == tmp_path / "new" / "folder" / "run.npz"
+    loaded = Log.load(path)
+    assert_equal(loaded, log)
+    assert loaded.meta == log.meta
+    assert loaded.metrics() == log.metrics()
+
+
+@pytest.mark.parametrize("name", ["run", "run.npz", "v1.2_qp", "v1.2_qp.npz"])
+def test_file_is_named_as_asked(log, tmp_path, name):
+    assert log.save(tmp_path / name).name == name.removesuffix(".npz") + ".npz"
+
+
+def test_log_knows_what_made_it(log):
+    scenario = load_scenario("panda_line", SHORT)
+    assert log.meta["config"] == scenario.model_dump(mode="json")
+    assert log.meta["scenario"] == "panda_line"
+    assert log.meta["solver"] == "qp"
+    assert log.meta["robot"] == "panda"
+    assert log.meta["frames"] == ["panda_hand_tcp"]
+    assert [obstacle["name"] for obstacle in log.meta["obstacles"]] == ["box", "ball"]
+    assert {"python", "qpavoid", "pin", "coal", "numpy", "daqp"} <= log.meta["versions"].keys()
+    assert log.meta["completed"] is True
+    assert log.meta["stopped_by"] is None
+
+
+@pytest.mark.parametrize(
+    ("scenario", "solver"),
+    [("situation1", s) for s in ("tracking", "eq10-literal", "eq10", "qp", "qp:proxqp")] + [("panda_line", "qp")],
+)
+def test_saved_configuration_runs_again_to_the_same_bits(tmp_path, scenario, solver):
+    first = simulate(load_scenario(scenario, SHORT, solver))
+    saved = Log.load(first.save(tmp_path / "run"))
+    again = simulate(ScenarioConfig.model_validate(saved.meta["config"]))
+    assert np.abs(again.v).max() > 0.01
+    for name in sorted(set(ARRAYS) - {"build_time", "solve_time"}):
+        assert np.array_equal(getattr(again, name), getattr(first, name)), name
+
+
+def test_until_keeps_the_ticks_before(log):
+    for count in range(22):
+        assert len(log.until(0.01 * count).t) == count
+    part = log.until(0.1)
+    assert all(np.array_equal(getattr(part, name), getattr(log, name)[:10]) for name in ARRAYS)
+    assert part.meta == log.meta
+    assert_equal(log.until(99.0), log)
+
+
+def test_fields_cannot_be_exchanged(log):
+    with pytest.raises(FrozenInstanceError):
+        log.t = np.zeros(3)
+
+
+# Runs that end early
+
+
+def assert_partial(log: Log, ticks: int, whole: Log, tmp_path) -> None:
+    assert np.array_equal(log.v, whole.v[:ticks])
+    loaded = Log.load(log.save(tmp_path / "partial"))
+    assert_equal(loaded, log)
+    assert loaded.meta["completed"] is False
+    assert loaded.metrics()["completed"] is False
+
+
+def test_interrupt_keeps_what_was_done(log, tmp_path):
+    def interrupt(done: int, total: int) -> None:
+        assert total == 21
+        if done == 7:
+            raise KeyboardInterrupt
+
+    partial = simulate(load_scenario("panda_line", SHORT), progress=interrupt)
+    assert_partial(partial, 7, log, tmp_path)
+    assert "keyboard" in partial.meta["stopped_by"]
+
+
+def test_interrupt_before_the_first_tick_is_over(monkeypatch, tmp_path):
+    tick, calls = Controller.tick, []
+
+    def interrupted(self, *args):
+        calls.append(args)
+        if len(calls) == 2:  # the first is the check of the start
+            raise KeyboardInterrupt
+        return tick(self, *args)
+
+    monkeypatch.setattr(Controller, "tick", interrupted)
+    log = simulate(load_scenario("situation1", SHORT))
+    assert len(log.t) == 0
+    assert Log.load(log.save(tmp_path / "none")).metrics()["completed"] is False
+
+
+def test_malformed_state_ends_the_run_and_says_why(log, monkeypatch, tmp_path):
+    tick = Controller.tick
+
+    def lose_the_encoder(self, q, t=0.0):
+        return tick(self, np.full_like(q, np.nan) if t > 0.045 else q, t)
+
+    monkeypatch.setattr(Controller, "tick", lose_the_encoder)
+    partial = simulate(load_scenario("panda_line", SHORT))
+    assert_partial(partial, 5, log, tmp_path)
+    assert "q: NaN or infinity" in partial.meta["stopped_by"]
+
+
+def test_solver_that_returns_nan_ends_the_run_and_is_seen(monkeypatch):
+    solve = TrackingOnly.solve
+
+    def fail(self, problem):
+        solution = solve(self, problem)
+        return replace(solution, v=np.full_like(solution.v, np.nan))
+
+    monkeypatch.setattr(TrackingOnly, "solve", fail)
+    log = simulate(load_scenario("situation1", SHORT, "tracking"))
+    assert "NaN" in log.meta["stopped_by"]
+    assert len(log.t) == 1
+    assert np.isnan(log.v).all()
+
+
+# Files that are no logs
+
+
+def write_text(path):
+    path.write_text("not a log")
+
+
+def write_nothing(path):
+    path.write_bytes(b"")
+
+
+def write_array(path):
+    with path.open("wb") as file:
+        np.save(file, np.zeros(3))
+
+
+def write_other_archive(path):
+    np.savez(path, a=np.zeros(3))
+
+
+def write_other_format(path):
+    np.savez(path, meta=np.array(json.dumps({"format": 0})))
+
+
+def write_list_as_meta(path):
+    np.savez(path, meta=np.array("[1, 2]"))
+
+
+def write_broken_meta(path):
+    np.savez(path, meta=np.array("{"))
+
+
+def write_too_little(path):
+    np.savez(path, meta=np.array(json.dumps({"format": 1})), t=np.zeros(3))
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        write_text,
+        write_nothing,
+        write_array,
+        write_other_archive,
+        write_other_format,
+        write_list_as_meta,
+        write_broken_meta,
+        write_too_little,
+    ],
+)
+def test_file_that_is_no_log(tmp_path, write):
+    path = tmp_path / "run.npz"
+    write(path)
+    with pytest.raises(ConfigError) as error:
+        Log.load(path)
+    assert str(error.value).startswith(f"{path}: ")
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("kept", [0.3, 0.999])
+def test_log_that_was_cut_off_while_copied(log, tmp_path, kept):
+    path = log.save(tmp_path / "run")
+    content = path.read_bytes()
+    path.write_bytes(content[: int(kept * len(content))])
+    with pytest.raises(ConfigError, match=r"run\.npz"):
+        Log.load(path)
+
+
+def test_log_with_damaged_content(log, tmp_path):
+    path = log.save(tmp_path / "run")
+    content = bytearray(path.read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + 200] = bytes(200)
+    path.write_bytes(content)
+    with pytest.raises(ConfigError, match=r"run\.npz"):
+        Log.load(path)
+
+
+def test_missing_log(tmp_path):
+    with pytest.raises(ConfigError, match=r"absent\.npz: no such file"):
+        Log.load(tmp_path / "absent.npz")
+    with pytest.raises(ConfigError):
+        Log.load(tmp_path)

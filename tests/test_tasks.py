@@ -1,0 +1,158 @@
+"""Task rows against finite differences, and what their feedback does in closed loop."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from conftest import differences, random_q
+
+from qpavoid import Sample, UnknownName, config
+from qpavoid.kinematics import compute_kinematics, support_masks
+from qpavoid.tasks import TaskRows, build_tasks
+
+FIXED = config.Fixed(type="fixed")
+FRAMES = {
+    "paper": ("left_tool", "right_tool"),
+    "panda": ("panda_hand_tcp",),
+    "solo": ("FL_FOOT", "base_link", "HR_LOWER_LEG"),
+}
+
+
+class Bench:
+    """Tasks of a robot without anything else around them."""
+
+    def __init__(self, robot, frames, damping=0.0, **settings):
+        configs = [config.Task(**{"frame": f, "type": "pose", "motion": FIXED, **settings}) for f in frames]
+        self.robot, self.data = robot, robot.model.createData()
+        self.tasks = build_tasks(configs, robot, robot.home, Path("bench.yaml"))
+        self.ids = [task.frame_id for task in self.tasks]
+        joints = [robot.model.frames[i].parentJoint for i in self.ids]
+        self.rows = TaskRows(self.tasks, support_masks(robot.model), joints, damping)
+
+    def poses(self, q):
+        """Samples at rest of all frames, on data of their own."""
+        data = self.robot.model.createData()
+        pin.framesForwardKinematics(self.robot.model, data, q)
+        return [Sample.at(data.oMf[i].translation, data.oMf[i].rotation) for i in self.ids]
+
+    def compute(self, q, targets=None):
+        kinematics = compute_kinematics(self.robot.model, self.data, self.ids, q)
+        return self.rows.compute(kinematics, targets or [task.motion.sample(0.0) for task in self.tasks])
+
+
+@pytest.mark.parametrize("name", FRAMES)
+def test_jacobian_against_finite_differences(name, request):
+    """Position and orientation, of two arms, of a locked robot and of a floating base."""
+    robot = request.getfixturevalue(name)
+    bench, rng = Bench(robot, FRAMES[name]), np.random.default_rng(1)
+    for _ in range(5):
+        q = random_q(robot, rng)
+        here = bench.poses(q)
+
+        def displacement(q, here=here):
+            moves = [
+                (to.position - at.position, pin.log3(to.rotation @ at.rotation.T))
+                for at, to in zip(here, bench.poses(q), strict=True)
+            ]
+            return np.concatenate([part for move in moves for part in move])
+
+        np.testing.assert_allclose(bench.compute(q).A, differences(displacement, robot, q), atol=1e-6)
+
+
+def test_position_and_pose_tasks_share_one_layout(paper):
+    both = [
+        config.Task(frame="left_tool", type="position", motion=FIXED, weight=3.0),
+        config.Task(frame="right_tool", type="pose", motion=FIXED, weight=5.0, orientation_weight=0.5),
+    ]
+    tasks = build_tasks(both, paper, paper.home, Path("bench.yaml"))
+    joints = [paper.model.frames[task.frame_id].parentJoint for task in tasks]
+    rows = TaskRows(tasks, support_masks(paper.model), joints, 0.02)
+    q = random_q(paper, np.random.default_rng(2))
+    data = paper.model.createData()
+    targets = [task.motion.sample(0.0) for task in tasks]
+    found = rows.compute(compute_kinematics(paper.model, data, [t.frame_id for t in tasks], q), targets)
+    separate = [Bench(paper, [t.settings.frame], type=t.settings.type).compute(q) for t in tasks]
+    np.testing.assert_allclose(found.A, np.concatenate([s.A for s in separate]), atol=1e-15)
+    np.testing.assert_allclose(found.b, np.concatenate([s.b for s in separate]), atol=1e-15)
+    np.testing.assert_array_equal(found.weight, [3.0] * 3 + [5.0] * 3 + [0.5] * 3)
+    assert found.damping == 0.02
+
+
+def test_at_the_target_only_the_feed_forward_is_left(panda):
+    bench = Bench(panda, ["panda_hand_tcp"], gain=7.0)
+    q = random_q(panda, np.random.default_rng(3))
+    linear, angular = np.array([0.1, -0.2, 0.3]), np.array([0.4, 0.5, -0.6])
+    target = replace(bench.poses(q)[0], linear=linear, angular=angular)
+    np.testing.assert_allclose(bench.compute(q, [target]).b, [*linear, *angular], atol=1e-12)
+
+
+def test_a_frame_that_obeys_keeps_up_with_a_target_that_moves(panda):
+    """A v = b moves the frame with the target's own twist: the error between the two does not grow."""
+    bench, rng = Bench(panda, ["panda_hand_tcp"], gain=0.0), np.random.default_rng(4)
+    q, step = panda.home, 1e-6
+    target = replace(bench.poses(q)[0], linear=rng.uniform(-1, 1, 3), angular=rng.uniform(-1, 1, 3))
+    rows = bench.compute(q, [target])
+    later = bench.poses(pin.integrate(panda.model, q, step * np.linalg.pinv(rows.A) @ rows.b))[0]
+    np.testing.assert_allclose(later.position - target.position, step * target.linear, atol=1e-11)
+    turned = pin.exp3(step * target.angular) @ target.rotation
+    np.testing.assert_allclose(pin.log3(later.rotation @ turned.T), 0.0, atol=1e-11)
+
+
+def test_pose_error_decays_exponentially(panda):
+    gain, dt = 2.0, 1e-3
+    bench = Bench(panda, ["panda_hand_tcp"], gain=gain)
+    q, start = panda.home, bench.poses(panda.home)[0]
+    turn = np.array([0.3, -0.2, 0.4])
+    target = Sample.at(start.position + np.array([0.05, 0.08, -0.06]), pin.exp3(turn) @ start.rotation)
+    for tick in range(501):
+        if tick % 100 == 0:
+            here = bench.poses(q)[0]
+            left = np.exp(-gain * tick * dt)
+            np.testing.assert_allclose(
+                target.position - here.position, left * (target.position - start.position), atol=2e-4
+            )
+            np.testing.assert_allclose(pin.log3(target.rotation @ here.rotation.T), left * turn, atol=1e-3)
+        rows = bench.compute(q, [target])
+        q = pin.integrate(panda.model, q, dt * np.linalg.pinv(rows.A) @ rows.b)
+
+
+def test_caps_shorten_the_command_and_keep_its_direction(panda):
+    q = panda.home
+    start = Bench(panda, ["panda_hand_tcp"]).poses(q)[0]
+    shift, turn = np.array([3.0, 4.0, 0.0]), np.array([0.0, 0.6, 0.8])
+    far = Sample.at(start.position + shift, pin.exp3(turn) @ start.rotation)
+
+    def b(target, **caps):
+        return Bench(panda, ["panda_hand_tcp"], gain=2.0, **caps).compute(q, [target]).b
+
+    np.testing.assert_allclose(b(far), [*2 * shift, *2 * turn], atol=1e-9)
+    np.testing.assert_allclose(b(far, max_speed=0.5), [0.3, 0.4, 0.0, *2 * turn], atol=1e-9)
+    np.testing.assert_allclose(b(far, max_turn_rate=0.5), [*2 * shift, 0.0, 0.3, 0.4], atol=1e-9)
+    near = Sample.at(start.position + 1e-3 * shift, start.rotation)
+    np.testing.assert_allclose(b(near, max_speed=0.5, max_turn_rate=0.5), [*2e-3 * shift, 0, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(b(start, max_speed=0.5, max_turn_rate=0.5), 0.0, atol=1e-9)
+
+
+def test_a_motion_without_a_start_begins_where_the_frame_is(panda):
+    bench = Bench(panda, ["panda_hand_tcp"])
+    start, here = bench.tasks[0].motion.sample(0.0), bench.poses(panda.home)[0]
+    np.testing.assert_allclose(start.position, here.position, atol=1e-12)
+    np.testing.assert_allclose(start.rotation, here.rotation, atol=1e-12)
+
+
+def test_frames_of_locked_joints_can_still_be_followed(paper):
+    """Locking the wrist leaves the tool where it was, and its rows are those of the joints that still move."""
+    q = random_q(paper, np.random.default_rng(5))
+    locked, q_left = paper.lock(["left_joint[67]", "right_*"], q, "test")
+    assert locked.model.nv == 5
+    whole, part = Bench(paper, ["left_tool"]), Bench(locked, ["left_tool"])
+    np.testing.assert_allclose(part.poses(q_left)[0].position, whole.poses(q)[0].position, atol=1e-12)
+    np.testing.assert_allclose(part.poses(q_left)[0].rotation, whole.poses(q)[0].rotation, atol=1e-12)
+    np.testing.assert_allclose(part.compute(q_left).A, whole.compute(q).A[:, :5], atol=1e-12)
+
+
+def test_unknown_frame(panda):
+    with pytest.raises(UnknownName, match=r"bench\.yaml: tasks\.0\.frame: panda has no frame 'panda_hand_tpc'.*tcp"):
+        Bench(panda, ["panda_hand_tpc"])
