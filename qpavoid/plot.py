@@ -1,4 +1,4 @@
-"""Figures of one run and of several solvers on one scenario. Needs matplotlib: `pip install qpavoid[plots]`.
+"""Writes the figures of runs, and draws those of one run over time. Needs matplotlib: `pip install qpavoid[plots]`.
 
 Every `*_figure` function returns a `matplotlib.figure.Figure` of its own: no display and no global state is used, so
 they work headless and in threads.
@@ -17,36 +17,24 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from qpavoid.log import STATUSES, Log
-from qpavoid.metrics import path_deviation
-from qpavoid.plot_motion import motion_figure, path_figure
-from qpavoid.problem import Array, Status
+from qpavoid.plot_compare import compare_time_figure, path_figure, solver_styles
+from qpavoid.plot_motion import motion_figure
+from qpavoid.plot_style import (
+    COLLISION,
+    COLOURS,
+    DASHES,
+    add_grid,
+    add_legend,
+    draw_levels,
+    is_qp,
+    label_distances,
+    units,
+)
+from qpavoid.problem import Status
 
 DPI = 130
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#333333")
-"""Colour-blind-safe (Okabe and Ito), without the yellow that fades on white."""
-DASHES: tuple[Any, ...] = (
-    "-",
-    (0, (5, 2)),
-    (0, (1, 1.2)),
-    (0, (6, 2, 1, 2)),
-    (0, (3, 1, 1, 1, 1, 1)),
-    (0, (10, 3)),
-    (0, (2, 2)),
-)
-SOLVER_STYLES: dict[str, tuple[str, Any]] = {
-    "tracking": ("#333333", DASHES[2]),
-    "eq10-literal": ("#E69F00", DASHES[3]),
-    "eq10": ("#D55E00", DASHES[1]),
-    "gradient-projection": ("#CC79A7", DASHES[4]),
-    "potential-field": ("#56B4E9", DASHES[6]),
-    "hqp": ("#009E73", DASHES[5]),
-    "qp": ("#0072B2", DASHES[0]),
-}
 ALPHA_SHOWN = 100.0
 """α is drawn up to here: it grows without bound as the distance goes to 0."""
-ERROR_FLOOR = 1e-5
-"""The axis of distances to the target begins here [m]."""
-COLLISION, D1, D2, D_SAFE = "#C62F2F", "#7A4B9A", "#8A8A8A", "#00695C"
 _STATUS_COLOUR = {Status.RELAXED: "#F5C242", Status.STOPPED: "#C62F2F"}
 _GREY = "#B8B8B8"
 
@@ -133,7 +121,7 @@ def joints_figure(log: Log) -> Figure:
         ax.plot(log.t, log.q[:, i], color=COLOURS[0], linewidth=1.4)
         ax.set_title(name, fontsize=9)
         ax.tick_params(labelsize=8)
-        _grid(ax)
+        add_grid(ax)
         if name in limits:
             for limit in filter(np.isfinite, limits[name]):
                 ax.axhline(limit, color=COLLISION, linewidth=0.8)
@@ -144,7 +132,7 @@ def joints_figure(log: Log) -> Figure:
                     ax.axhspan(limit, outer, color=COLLISION, alpha=0.15, linewidth=0)
         if i + columns >= len(names):
             ax.set_xlabel("time [s]", fontsize=9)
-    figure.supylabel("joint position [rad or m]", fontsize=10)
+    figure.supylabel(f"joint position [{units(log)}]", fontsize=10)
     handles = [
         Line2D([], [], color=COLOURS[0], label="position"),
         Patch(color=COLLISION, alpha=0.3, label="beyond limits"),
@@ -172,11 +160,11 @@ def distances_figure(log: Log) -> Figure:
     handles = ax.get_legend_handles_labels()[0]
     if far:
         handles.append(Line2D([], [], color=_GREY, linewidth=0.7, label=f"{len(far)} bodies never within {reach:g} m"))
-    handles += _levels(ax, log, qp=_is_qp(log))
+    handles += draw_levels(ax, log, qp=is_qp(log))
     handles += _shade_status(ax, log)
     _plot_gains(gains, log)
-    _distance_axis(ax, offset, distance[:, near])
-    _legend(ax, handles)
+    label_distances(ax, offset, distance[:, near])
+    add_legend(ax, handles)
     return figure
 
 
@@ -192,8 +180,8 @@ def _plot_gains(ax: Any, log: Log) -> None:
     ax.set_yticks([], minor=True)
     ax.set_ylabel(f"gains [-]\n(α up to {ALPHA_SHOWN:g})" if np.any(log.alpha > ALPHA_SHOWN) else "gains [-]")
     ax.set_xlabel("time [s]")
-    _grid(ax)
-    _legend(ax, ax.get_lines())
+    add_grid(ax)
+    add_legend(ax, ax.get_lines())
 
 
 def speeds_figure(log: Log) -> Figure:
@@ -217,111 +205,14 @@ def speeds_figure(log: Log) -> Figure:
         handles.append(ax.axhline(limit, label=f"velocity limit ±{limit:g}", **style))
     handles += _shade_status(ax, log)
     ax.set_xlabel("time [s]")
-    ax.set_ylabel("joint velocity [rad/s or m/s]")
-    _grid(ax)
-    _legend(ax, handles)
+    ax.set_ylabel(f"joint velocity [{units(log, '/s')}]")
+    add_grid(ax)
+    add_legend(ax, handles)
     return figure
-
-
-# --- several solvers ----------------------------------------------------------------------------------------
-
-
-def solver_styles(logs: Sequence[Log]) -> list[dict[str, Any]]:
-    """Label, colour and line style of each run, the same in every panel and, for known solvers, in every figure."""
-    solvers = [log.meta["solver"] for log in logs]
-    known = [SOLVER_STYLES[solver] for solver in solvers if solver in SOLVER_STYLES]
-    spare = [(colour, dash) for dash in DASHES for colour in COLOURS if (colour, dash) not in known]
-    spare.sort(key=lambda style: style[0] in [colour for colour, _ in known])  # colours of their own first
-    taken: list[str] = []
-    styles = []
-    for solver in solvers:
-        colour, dash = SOLVER_STYLES[solver] if solver in SOLVER_STYLES and solver not in taken else spare.pop(0)
-        label = f"{solver} ({taken.count(solver) + 1})" if solver in taken else solver
-        taken.append(solver)
-        styles.append({"label": label, "color": colour, "linestyle": dash})
-    return styles
-
-
-def compare_time_figure(logs: Sequence[Log]) -> Figure:
-    """Smallest distance, deviation from the planned path, distance to the target and fastest joint over time."""
-    meta = logs[0].meta
-    offset = meta["config"]["avoidance"]["offset"]
-    figure = Figure(figsize=(9.0, 10.0), layout="constrained")
-    distance, deviation, error, speed = figure.subplots(4, 1, sharex=True, height_ratios=(1.5, 1, 1, 1))
-    for log, style in zip(logs, solver_styles(logs), strict=True):
-        line = {**style, "linewidth": 1.7}
-        to_target = np.linalg.norm(log.target - log.tool, axis=2)
-        distance.plot(log.t, log.min_distance + offset, **line)
-        deviation.plot(log.t, np.max(path_deviation(log), axis=1, initial=0.0), **line)
-        error.plot(log.t, np.max(to_target, axis=1, initial=1e-3 * ERROR_FLOOR), **line)
-        speed.plot(log.t, np.max(np.abs(log.v), axis=1, initial=0.0), **line)
-    solvers = distance.get_legend_handles_labels()[0]
-    levels = _levels(distance, logs[0], qp=any(map(_is_qp, logs)))
-    _distance_axis(distance, offset, *(log.min_distance + offset for log in logs), name="smallest distance\n")
-    deviation.set_ylabel("deviation from the\nplanned path [m]")
-    error.set_yscale("log")
-    tolerance = meta["config"]["goal_tolerance"]
-    levels.append(
-        error.axhline(tolerance, color=D2, linewidth=1.0, linestyle=":", label=f"goal tolerance: {tolerance:g} m")
-    )
-    error.set_ylim(bottom=ERROR_FLOOR)
-    error.set_ylabel("distance to the\ntarget [m]")
-    speed.set_ylabel("fastest joint\n[rad/s or m/s]")
-    speed.set_xlabel("time [s]")
-    for ax in (deviation, error, speed):
-        _grid(ax)
-    figure.suptitle(meta["title"] or meta["scenario"], fontsize=11)
-    _legend(distance, [*solvers, *levels[:-1]])
-    _legend(error, levels[-1:])
-    return figure
-
-
-# --- parts --------------------------------------------------------------------------------------------------
 
 
 def _style(rank: int) -> dict[str, Any]:
     return {"color": COLOURS[rank % len(COLOURS)], "linestyle": DASHES[rank // len(COLOURS) % len(DASHES)]}
-
-
-def _is_qp(log: Log) -> bool:
-    return str(log.meta["solver"]).partition(":")[0] in ("qp", "hqp")
-
-
-def _grid(ax: Any) -> None:
-    ax.grid(True, color="#E4E4E4", linewidth=0.6)
-    ax.set_axisbelow(True)
-    ax.margins(x=0.0)
-
-
-def _legend(ax: Any, handles: Sequence[Any]) -> None:
-    """Legend beside the panel, where it hides nothing."""
-    style = {"fontsize": 8, "frameon": False, "borderaxespad": 0.0}
-    ax.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.01, 1.0), **style)
-
-
-def _levels(ax: Any, log: Log, qp: bool) -> list[Any]:
-    """Draws d2, d1, the distance that QP rows hold, and collision."""
-    avoidance = log.meta["config"]["avoidance"]
-    levels = [("$d_2$ = {:g} m", avoidance["d2"], D2, DASHES[1]), ("$d_1$ = {:g} m", avoidance["d1"], D1, DASHES[3])]
-    d_safe = avoidance["row"].get("d_safe")
-    if qp and d_safe is not None:
-        levels.append(("$d_{{safe}}$ = {:g} m (QP rows)", d_safe, D_SAFE, DASHES[2]))
-    levels.append(("collision: {:g} m", avoidance["offset"], COLLISION, DASHES[0]))
-    return [
-        ax.axhline(d, color=colour, linestyle=dash, linewidth=1.1, zorder=2, label=label.format(d))
-        for label, d, colour, dash in levels
-    ]
-
-
-def _distance_axis(ax: Any, offset: float, *drawn: Array, name: str = "distance ") -> None:
-    ax.set_ylabel(f"{name}between axes [m]" if offset > 0.0 else f"{name}between surfaces [m]")
-    _grid(ax)
-    finite = [d[np.isfinite(d)] for d in drawn]
-    lowest = min((float(d.min()) for d in finite if d.size), default=offset)
-    bottom, top = ax.get_ylim()
-    bottom = min(lowest, offset) - 0.04 * (top - offset)
-    ax.axhspan(bottom, offset, color=COLLISION, alpha=0.08, linewidth=0, zorder=0)
-    ax.set_ylim(bottom, top)
 
 
 def _shade_status(ax: Any, log: Log) -> list[Any]:

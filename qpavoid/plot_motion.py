@@ -1,25 +1,22 @@
-"""Robots among obstacles: 3-D at several instants (the paper's Figs. 6, 9, 10, 12, 15), and tool paths in two views."""
+"""Robots among obstacles, in 3-D at several instants (the paper's Figs. 6, 9, 10, 12, 15)."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch, Polygon
+from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
-from scipy.spatial import ConvexHull
 
 from qpavoid.log import Log
 from qpavoid.problem import Array, IntArray
 from qpavoid.segments import point_segment, segment_segment
 
 MOVING, RESTING, HIT, OBSTACLE, TOOL_PATH = "#6BA3D6", "#C4C4C4", "#C62F2F", "#E69F00", "#007A56"
-PLANNED = "#B9A6D3"
 PANELS = 6
 _PANEL = np.array([3.0, 2.9])  # largest width and height of a panel on paper [in]
 _AROUND, _ARC = 28, 8
@@ -253,77 +250,3 @@ def _legend(log: Log, ticks: IntArray) -> list[Any]:
         (True, Line2D([], [], color=TOOL_PATH, marker="o", markersize=4, label="tool and its path so far")),
     ]
     return [handle for shown, handle in entries if shown]
-
-
-# --- tool paths ---------------------------------------------------------------------------------------------
-
-
-def path_figure(logs: Sequence[Log], styles: Sequence[dict[str, Any]]) -> Figure:
-    """Tool paths of several runs in two views along world axes, with the planned path and what stood in the way.
-
-    Args:
-        logs: runs of one scenario.
-        styles: label, colour and line style of each.
-    """
-    longest = max(logs, key=lambda log: len(log.t))
-    outlines = _outlines(logs, longest)
-    paths = np.concatenate([longest.target.reshape(-1, 3), *(log.tool.reshape(-1, 3) for log in logs)])
-    seen = np.concatenate([paths, *(faces.reshape(-1, 3) for faces, _, _ in outlines)])
-    lower, upper = (seen.min(axis=0), seen.max(axis=0)) if len(seen) else (-np.ones(3), np.ones(3))
-    pad = 0.04 * max(float(np.max(upper - lower)), 0.1)
-    lower, upper = lower - pad, upper + pad
-    across = int(np.argmax(np.ptp(paths, axis=0))) if len(paths) else 0
-    views = [axis for axis in (2, 1, 0) if axis != across]
-    # Laid out by hand [in]: both views at one scale, one above the other.
-    extent = (upper - lower) * min(6.0 / (upper - lower)[across], 7.0 / np.sum((upper - lower)[views]))
-    width, height = extent[across] + 2.7, float(np.sum(extent[views])) + 1.4
-    figure = Figure(figsize=(width, height))
-    for up, bottom in zip(views, (0.85 + extent[views[1]], 0.6), strict=True):
-        box = (0.75 / width, bottom / height, extent[across] / width, extent[up] / height)
-        ax = figure.add_axes(box, xlim=(lower[across], upper[across]), ylim=(lower[up], upper[up]))
-        for faces, colour, alpha in outlines:
-            flat = faces.reshape(-1, 3)[:, [across, up]]
-            hull = flat[ConvexHull(flat).vertices]
-            ax.add_patch(Polygon(hull, facecolor=(colour, alpha), edgecolor=colour, linewidth=0.8, zorder=1))
-        for k in range(longest.tool.shape[1]):
-            path = longest.target[:, k]
-            ax.plot(path[:, across], path[:, up], color=PLANNED, linewidth=4.0, zorder=2, label="planned path")
-            ax.plot(path[-1:, across], path[-1:, up], "k*", markersize=9, zorder=4, label="goal")
-            for log, style in zip(logs, styles, strict=True):
-                ax.plot(log.tool[:, k, across], log.tool[:, k, up], linewidth=1.7, zorder=3, **style)
-        ax.grid(True, color="#E4E4E4", linewidth=0.6)
-        ax.set_axisbelow(True)
-        ax.set_ylabel(f"{'xyz'[up]} [m]")
-        if up == views[0]:
-            ax.tick_params(labelbottom=False)
-            lines: dict[str, Any] = {str(line.get_label()): line for line in ax.get_lines()}
-    ax.set_xlabel(f"{'xyz'[across]} [m]")
-    shown = {colour for _, colour, _ in outlines}
-    moved = " (paler: earlier)" if len({alpha for _, _, alpha in outlines}) > 1 else ""
-    for colour, name in ((OBSTACLE, f"obstacle{moved}"), (RESTING, "robot body at rest")):
-        if colour in shown:
-            lines[name] = Patch(facecolor=(colour, 0.5), edgecolor=colour, label=name)
-    corner = ((0.85 + extent[across]) / width, 1.0 - 0.5 / height)
-    figure.legend(handles=list(lines.values()), loc="upper left", bbox_to_anchor=corner, fontsize=8, frameon=False)
-    figure.suptitle(
-        f"{longest.meta['title'] or longest.meta['scenario']}  —  tool path", fontsize=11, y=1 - 0.12 / height
-    )
-    return figure
-
-
-def _outlines(logs: Sequence[Log], log: Log) -> list[tuple[Array, str, float]]:
-    """Faces, colour and opacity of obstacles at up to four places, and of bodies at rest that came near."""
-    outlines = []
-    for i in range(len(log.meta["obstacles"]) if len(log.t) else 0):
-        way = np.cumsum(np.r_[0.0, np.linalg.norm(np.diff(log.obstacle_position[:, i], axis=0), axis=1)])
-        ticks = np.unique(np.searchsorted(way, np.linspace(0.0, way[-1], 4))) if way[-1] > 1e-3 else np.zeros(1, int)
-        for rank, tick in enumerate(ticks.tolist()):
-            outlines.append((obstacle_faces(log, i, tick), OBSTACLE, 0.5 * (rank + 1) / len(ticks)))
-    near: set[str] = set()
-    for run in logs:
-        avoidance = run.meta["config"]["avoidance"]
-        within = run.min_distance + avoidance["offset"] < avoidance["d2"]
-        near |= {name for pair in set(run.closest_pair[within].tolist()) for name in run.meta["pairs"][pair]}
-    resting = [i for i in np.flatnonzero(~moving_bodies(log)).tolist() if log.meta["bodies"][i] in near]
-    outlines += [(capsule_faces(log.body_ends[0, i], log.meta["body_radii"][i]), RESTING, 0.5) for i in resting]
-    return outlines

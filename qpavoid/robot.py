@@ -21,6 +21,17 @@ from qpavoid.pairs import add_self_pairs, drop_always_touching
 from qpavoid.problem import Array
 from qpavoid.urdf import find_resource, read_collision, read_model
 
+_TRANSLATIONS = {
+    "JointModelPX": 1,
+    "JointModelPY": 1,
+    "JointModelPZ": 1,
+    "JointModelPrismaticUnaligned": 1,
+    "JointModelPlanar": 2,
+    "JointModelTranslation": 3,
+    "JointModelFreeFlyer": 3,
+}
+"""How many velocity coordinates of a joint are lengths; they come before its angles."""
+
 
 @dataclass(frozen=True)
 class Robot:
@@ -83,6 +94,15 @@ class Robot:
         for name, joint in zip(self.joint_names, list(self.model.joints)[1:], strict=True):
             names += [name] if joint.nv == 1 else [f"{name}.{i}" for i in range(joint.nv)]
         return names
+
+    @property
+    def coordinate_units(self) -> list[str]:
+        """What each of the nv velocity coordinates changes per second: `m` or `rad`."""
+        units = []
+        for _, joint in self._joints():
+            metres = _TRANSLATIONS.get(joint.shortname(), 0)
+            units += ["m"] * metres + ["rad"] * (joint.nv - metres)
+        return units
 
     def bounds(self) -> JointBounds:
         """Joint limits in tangent space; see `joint_bounds`."""

@@ -167,6 +167,7 @@ class Recorder:
             "robot": robot.name,
             "notes": list(robot.notes),
             "coordinates": robot.coordinate_names,
+            "units": robot.coordinate_units,
             "velocity_limit": [v if np.isfinite(v) else None for v in bounds.velocity],
             "position_limits": [
                 [robot.coordinate_names[v], lower, upper]

@@ -14,16 +14,14 @@ pytest.importorskip("matplotlib")
 
 from qpavoid.plot import (
     ALPHA_SHOWN,
-    compare_time_figure,
     distances_figure,
     joints_figure,
-    path_figure,
     plot_compare,
     plot_run,
     position_names,
-    solver_styles,
     speeds_figure,
 )
+from qpavoid.plot_compare import SOLVER_STYLES, compare_time_figure, path_figure, solver_styles
 from qpavoid.plot_motion import (
     capsule_faces,
     instants,
@@ -281,8 +279,6 @@ def test_each_solver_keeps_its_own_colour_and_dash_in_all_panels(sphere):
 
 
 def test_known_solvers_differ_in_colour_and_dash():
-    from qpavoid.plot import SOLVER_STYLES
-
     assert len({colour for colour, _ in SOLVER_STYLES.values()}) == len(SOLVER_STYLES)
     assert len({str(dash) for _, dash in SOLVER_STYLES.values()}) == len(SOLVER_STYLES)
 

@@ -1,0 +1,245 @@
+"""Collision shapes made from meshes: they enclose what they stand for, and not much more."""
+
+import subprocess
+import sys
+
+import coal
+import numpy as np
+import pinocchio as pin
+import pytest
+from conftest import EXAMPLES, write_chain
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.optimize import minimize
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+
+from qpavoid import Robot, config
+from qpavoid.bodies import convert_bodies, enclosing_capsule, fit_capsule, make_shape
+from qpavoid.segments import point_segment
+from qpavoid.urdf import read_collision, read_model
+
+PANDA = EXAMPLES / "panda_description/urdf/panda.urdf"
+STL_FACET = "facet normal 0 0 1\nouter loop\nvertex {}\nvertex {}\nvertex {}\nendloop\nendfacet\n"
+
+
+@pytest.fixture(scope="module")
+def meshes():
+    """Vertices of the Panda's collision meshes, by name."""
+    bodies = read_collision(PANDA, read_model(PANDA, "fixed"), [], PANDA).geometryObjects
+    return {b.name: np.array(b.geometry.vertices()) for b in bodies if isinstance(b.geometry, coal.BVHModelBase)}
+
+
+def overlap(fit, points):
+    """How far the outermost point sticks out of the capsule [m]; negative when all are inside."""
+    half = 0.5 * fit.length * fit.rotation[:, 2]
+    return float(np.max(point_segment(points, fit.center - half, fit.center + half).distance) - fit.radius)
+
+
+def capsule_volume(ends, points):
+    """Volume of the smallest capsule around `points` with the given ends of its axis, flattened (6,)."""
+    a, b = ends.reshape(2, 3)
+    r = np.max(point_segment(points, a, b).distance)
+    return np.pi * r**2 * (np.linalg.norm(b - a) + 4.0 / 3.0 * r)
+
+
+# --- fit_capsule ---------------------------------------------------------------------------------------------
+
+
+clouds = st.integers(1, 30).flatmap(lambda n: arrays(np.float64, (n, 3), elements=st.floats(-1.0, 1.0)))
+flattened = st.sampled_from([(1, 1, 1), (1, 1, 0), (0, 1, 0), (0, 0, 0), (1, 1, 1e-9)])
+turned = st.tuples(*[st.floats(-3.0, 3.0)] * 3).map(lambda r: Rotation.from_rotvec(r).as_matrix())
+shifted = st.tuples(*[st.floats(-5.0, 5.0)] * 3).map(np.array)
+
+
+@settings(max_examples=60, deadline=None)
+@given(clouds, flattened, turned, shifted)
+def test_every_point_is_inside(cloud, scale, rotation, shift):
+    """Of a cloud in space, in a plane, on a line, and of a single point."""
+    points = cloud * np.array(scale) @ rotation.T + shift
+    fit = fit_capsule(points, directions=40)
+    assert overlap(fit, points) < 1e-9
+    assert fit.radius > 0.0 and fit.length >= 0.0
+    np.testing.assert_allclose(fit.rotation.T @ fit.rotation, np.eye(3), atol=1e-12)
+    assert np.linalg.det(fit.rotation) == pytest.approx(1.0)
+
+
+def smallest_volume(points, guess):
+    """Volume that a local search over the ends of the axis comes to, from a fit and from a short axis."""
+    half = 0.5 * guess.length * guess.rotation[:, 2]
+    center = points.mean(axis=0)
+    principal = np.linalg.svd(points - center)[2][0] * 0.05
+    starts = ((guess.center - half, guess.center + half), (center - principal, center + principal))
+    options = {"maxfev": 800, "xatol": 1e-6, "fatol": 1e-10}
+    return min(
+        minimize(capsule_volume, np.concatenate(ends), (points,), "Nelder-Mead", options=options).fun for ends in starts
+    )
+
+
+def test_every_vertex_of_the_panda_is_inside_and_little_else(meshes):
+    for name, points in meshes.items():
+        fit = fit_capsule(points)
+        assert overlap(fit, points) < 1e-9, name
+        hull = ConvexHull(points)
+        assert hull.volume < fit.volume < 1.2 * smallest_volume(points[hull.vertices], fit), name
+
+
+@pytest.mark.parametrize(("radius", "length"), [(0.05, 0.4), (0.1, 0.1), (0.08, 0.0)])
+def test_points_on_a_capsule_give_it_back(radius, length):
+    polar, around = np.meshgrid(np.linspace(0.0, np.pi, 26), np.linspace(0.0, 2.0 * np.pi, 33))
+    ball = np.stack((np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar)), axis=-1)
+    caps = radius * ball.reshape(-1, 3)
+    caps[:, 2] += np.copysign(length / 2, caps[:, 2])
+    rotation, center = Rotation.from_rotvec([0.5, -1.0, 0.7]).as_matrix(), np.array([1.0, 2.0, 3.0])
+    points = caps @ rotation.T + center
+    fit = fit_capsule(points)
+    assert fit.radius == pytest.approx(radius, rel=0.03)
+    assert fit.length + 2 * fit.radius == pytest.approx(length + 2 * radius, rel=0.03)
+    np.testing.assert_allclose(fit.center, center, atol=0.05 * radius)
+    if length > 2 * radius:
+        assert abs(fit.rotation[:, 2] @ rotation[:, 2]) > np.cos(0.06)
+
+
+def test_volume_of_a_fit():
+    """Two points: a capsule of no radius, whose volume vanishes but for the margin."""
+    fit = fit_capsule(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 2.0]]))
+    assert fit.length + 2 * fit.radius == pytest.approx(2.0, abs=1e-8)
+    assert fit.volume == pytest.approx(0.0, abs=1e-8)
+
+
+# --- whole shapes ----------------------------------------------------------------------------------------------
+
+
+def test_spheres_and_capsules_are_their_own():
+    assert enclosing_capsule(coal.Sphere(0.2)).radius == 0.2
+    assert enclosing_capsule(coal.Sphere(0.2)).length == 0.0
+    fit = enclosing_capsule(coal.Capsule(0.1, 0.5))
+    assert (fit.radius, fit.length) == (0.1, 0.5)
+
+
+def test_box_is_enclosed():
+    size = np.array([0.2, 0.3, 0.7])
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * size / 2
+    fit = enclosing_capsule(coal.Box(*size))
+    assert overlap(fit, corners) < 1e-9
+    assert fit.volume < 1.2 * smallest_volume(corners, fit)
+
+
+@pytest.mark.parametrize(("radius", "length"), [(0.03, 0.2), (0.1, 0.1)])
+def test_cylinder_is_enclosed_tightly(radius, length):
+    angle = np.linspace(0.0, 2.0 * np.pi, 360)
+    rim = np.column_stack((radius * np.cos(angle), radius * np.sin(angle), np.full(360, length / 2)))
+    points = np.concatenate((rim, rim * (1, 1, -1)))
+    fit = enclosing_capsule(coal.Cylinder(radius, length))
+    assert overlap(fit, points) < 1e-9
+    # coaxial capsules: a radius R lets the ends of the axis come in by √(R² - r²)
+    R = np.linspace(radius, np.hypot(radius, length / 2), 1000)
+    axis = np.maximum(length - 2.0 * np.sqrt(R**2 - radius**2), 0.0)
+    assert fit.volume < 1.1 * np.min(np.pi * R**2 * (axis + 4.0 / 3.0 * R))
+
+
+def test_configured_primitives_have_the_size_they_say():
+    assert make_shape(config.Sphere(type="sphere", radius=0.1)).radius == 0.1
+    capsule = make_shape(config.Capsule(type="capsule", radius=0.1, length=0.5))
+    assert (capsule.radius, capsule.halfLength) == (0.1, 0.25)
+    np.testing.assert_allclose(make_shape(config.Box(type="box", size=(0.1, 0.2, 0.3))).halfSide, [0.05, 0.1, 0.15])
+    cylinder = make_shape(config.Cylinder(type="cylinder", radius=0.1, length=0.5))
+    assert (cylinder.radius, cylinder.halfLength) == (0.1, 0.25)
+
+
+# --- convert_bodies --------------------------------------------------------------------------------------------
+
+
+def read_panda():
+    return read_collision(PANDA, read_model(PANDA, "fixed"), [], PANDA)
+
+
+@pytest.mark.parametrize(
+    ("kind", "kinds"),
+    [
+        ("mesh", {coal.BVHModelOBBRSS, coal.Box}),
+        ("convex", {coal.Convex, coal.Box}),
+        ("capsule", {coal.Capsule, coal.Sphere}),
+    ],
+)
+def test_what_becomes_of_meshes_and_primitives(kind, kinds):
+    before, after = read_panda(), convert_bodies(read_panda(), kind)
+    assert {type(b.geometry) for b in after.geometryObjects} <= kinds
+    for old, new in zip(before.geometryObjects, after.geometryObjects, strict=True):
+        assert (new.name, new.parentJoint, new.parentFrame) == (old.name, old.parentJoint, old.parentFrame)
+        if kind != "capsule":
+            assert new.placement == old.placement
+
+
+def test_convex_hull_is_the_hull_of_the_mesh(meshes):
+    for body in convert_bodies(read_panda(), "convex").geometryObjects:
+        if body.name in meshes:
+            hull = ConvexHull(np.array(body.geometry.points()))
+            assert hull.volume == pytest.approx(ConvexHull(meshes[body.name]).volume, rel=1e-9)
+
+
+def test_capsules_sit_around_the_meshes_in_the_link_frame(meshes):
+    before = {b.name: b for b in read_panda().geometryObjects}
+    for body in convert_bodies(read_panda(), "capsule").geometryObjects:
+        if body.name not in meshes:
+            continue
+        half = getattr(body.geometry, "halfLength", 0.0)
+        a, b = (body.placement.act(np.array([0.0, 0.0, z])) for z in (-half, half))
+        placement = before[body.name].placement
+        points = meshes[body.name] @ placement.rotation.T + placement.translation
+        assert np.max(point_segment(points, a, b).distance) < body.geometry.radius + 1e-9
+
+
+def test_scaled_mesh_of_a_urdf_keeps_its_size(tmp_path):
+    """A tetrahedron in mm with a scale of 0.001."""
+    o, x, y, z = "0 0 0", "100 0 0", "0 100 0", "0 0 100"
+    facets = "".join(STL_FACET.format(*f) for f in ((o, y, x), (o, x, z), (o, z, y), (x, y, z)))
+    (tmp_path / "part.stl").write_text(f"solid a\n{facets}endsolid a\n")
+    urdf = write_chain(tmp_path, shape='<mesh filename="part.stl" scale="0.001 0.001 0.001"/>')
+    for kind in ("convex", "mesh"):
+        geometry = Robot.from_urdf(urdf, bodies=kind).bodies.geometryObjects[0].geometry
+        geometry.computeLocalAABB()
+        np.testing.assert_allclose(geometry.aabb_local.max_, 0.1, atol=1e-9)
+    capsule = Robot.from_urdf(urdf, bodies="capsule").bodies.geometryObjects[0].geometry
+    assert 0.05 < capsule.radius < 0.1
+
+
+@pytest.mark.parametrize("kind", ["convex", "capsule"])
+def test_flat_mesh_does_not_take_the_process_down(tmp_path, kind):
+    """A plate without thickness has no hull of its own; in a process apart, because it once was a segfault."""
+    o, x, y, z = "0 0 0", "1 0 0", "0 1 0", "1 1 0"
+    facets = "".join(STL_FACET.format(*f) for f in ((o, x, y), (x, z, y)))
+    (tmp_path / "plate.stl").write_text(f"solid a\n{facets}endsolid a\n")
+    urdf = write_chain(tmp_path, shape='<mesh filename="plate.stl"/>')
+    script = (
+        "import sys\nfrom qpavoid import ConfigError, Robot\n"
+        f"try: Robot.from_urdf(sys.argv[1], bodies={kind!r})\n"
+        "except ConfigError as error: print(error)"
+    )
+    run = subprocess.run([sys.executable, "-c", script, str(urdf)], check=False)
+    assert run.returncode == 0
+
+
+def test_robots_of_capsules_enclose_their_convex_hulls(panda, panda_convex):
+    """Distances between capsules are never above those of the hulls inside them, at the home pose."""
+
+    def distances(robot):
+        model, bodies = robot.model, robot.bodies.copy()
+        bodies.removeAllCollisionPairs()
+        bodies.addAllCollisionPairs()
+        data = bodies.createData()
+        q = pin.neutral(model)
+        q[:7] = panda.home
+        if model.nq == 9:
+            q[7:] = 0.04  # the fingers are locked there in the other model
+        pin.updateGeometryPlacements(model, model.createData(), bodies, data, q)
+        pin.computeDistances(bodies, data)
+        names = [b.name for b in bodies.geometryObjects]
+        results = zip(bodies.collisionPairs, data.distanceResults, strict=True)
+        return {(names[p.first], names[p.second]): r.min_distance for p, r in results}
+
+    capsules, hulls = distances(panda), distances(panda_convex)
+    common = [pair for pair in hulls if pair in capsules and hulls[pair] > 0.0]
+    assert len(common) > 30
+    assert all(capsules[pair] < hulls[pair] + 1e-6 for pair in common)
