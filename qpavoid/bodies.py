@@ -56,7 +56,8 @@ def convert_bodies(bodies: Any, kind: str) -> Any:
     for body in bodies.geometryObjects:
         geometry, placement = body.geometry, body.placement
         if kind == "convex" and isinstance(geometry, coal.BVHModelBase):
-            geometry = _convex_hull(geometry)
+            geometry, inside = _convex_hull(geometry)
+            placement = placement * inside
         elif kind == "capsule":
             fit = enclosing_capsule(geometry)
             geometry = coal.Capsule(fit.radius, fit.length) if fit.length > 0 else coal.Sphere(fit.radius)
@@ -76,9 +77,27 @@ def enclosing_capsule(geometry: Any) -> CapsuleFit:
     return fit_capsule(_vertices(geometry))
 
 
-def _convex_hull(mesh: Any) -> Any:
-    mesh.buildConvexHull(True, "Qt")
-    return mesh.convex
+def _convex_hull(mesh: Any) -> tuple[Any, Any]:
+    """Hull of a mesh and its placement in the mesh's frame; a thin box where the mesh is flat.
+
+    A flat point set has no hull with an inside, and qhull ends the process over it.
+    """
+    points = np.array(mesh.vertices())
+    center = points.mean(axis=0)
+    axes = np.linalg.svd(points - center, full_matrices=False)[2]
+    axes[2] *= np.sign(np.linalg.det(axes))
+    local = (points - center) @ axes.T
+    low, high = local.min(axis=0), local.max(axis=0)
+    size = high - low
+    if size.min() > 1e-6 * size.max():
+        mesh.buildConvexHull(True, "Qt")
+        return mesh.convex, pin.SE3.Identity()
+    middle = center + axes.T @ (0.5 * (low + high))
+    return coal.Box(*np.maximum(size, _THINNEST)), pin.SE3(np.ascontiguousarray(axes.T), middle)
+
+
+_THINNEST = 1e-4
+"""Side of the box that stands for a flat mesh, across its plane [m]."""
 
 
 def _vertices(geometry: Any) -> Array:
@@ -87,6 +106,12 @@ def _vertices(geometry: Any) -> Array:
         return np.array(geometry.vertices())
     if isinstance(geometry, coal.ConvexBase):
         return np.array(geometry.points())
+    if isinstance(geometry, coal.Cylinder):
+        # corners of the prism around it
+        angle = np.linspace(0.0, 2.0 * np.pi, 48, endpoint=False)
+        rim = geometry.radius / np.cos(np.pi / 48) * np.column_stack((np.cos(angle), np.sin(angle), 0.0 * angle))
+        top = np.array([0.0, 0.0, geometry.halfLength])
+        return np.concatenate((rim + top, rim - top))
     geometry.computeLocalAABB()
     half, center = 0.5 * (geometry.aabb_local.max_ - geometry.aabb_local.min_), geometry.aabb_center
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
@@ -111,16 +136,36 @@ def fit_capsule(points: Array, directions: int = 250) -> CapsuleFit:
     principal = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
     rotations = _rotations_to(np.concatenate((principal, _half_sphere(directions))))
     local = points @ rotations
-    center, radius = _enclosing_circles(local[..., :2])
-    # each point lets the caps' centres come no nearer than this to the far side
+    center, narrowest = _enclosing_circles(local[..., :2])
     off_axis = np.sum((local[..., :2] - center[:, None]) ** 2, axis=2)
-    reach = np.sqrt(np.maximum(radius[:, None] ** 2 - off_axis, 0.0))
-    low, high = np.min(local[..., 2] + reach, axis=1), np.max(local[..., 2] - reach, axis=1)
-    length = np.maximum(high - low, 0.0)  # where the caps' centres cross, a ball about their middle does
-    best = int(np.argmin(np.pi * radius**2 * (length + 4.0 / 3.0 * radius)))
-    origin = rotations[best] @ np.array([*center[best], 0.5 * (low[best] + high[best])])
+    # wider than needed is worth it where it lets flat ends sink into the caps
+    tried = np.concatenate([_fit_along(local[..., 2], off_axis, narrowest * wider) for wider in _WIDER])
+    best = int(np.argmin(np.pi * tried[:, 0] ** 2 * (tried[:, 1] + 4.0 / 3.0 * tried[:, 0])))
+    radius, length, middle = tried[best]
+    axis = best % len(rotations)
+    origin = rotations[axis] @ np.array([*center[axis], middle])
     margin = 1e-10  # against rounding, so that the points on the surface count as inside
-    return CapsuleFit(origin, rotations[best], float(radius[best]) + margin, float(length[best]))
+    return CapsuleFit(origin, rotations[axis], float(radius) + margin, float(length))
+
+
+_WIDER = (1.0, 1.02, 1.05, 1.1, 1.2, 1.4)
+"""Radii that are tried, in units of the smallest one that encloses the projected points."""
+
+
+def _fit_along(height: Array, off_axis: Array, radius: Array) -> Array:
+    """Shortest capsules of given radii around points along given axes: rows [radius, length, height of the middle].
+
+    Each point lets the caps' centres come no nearer to the far side than its reach; where they would cross, a ball
+    about their middle encloses everything.
+
+    Args:
+        height: of the points along each axis (k, n).
+        off_axis: their squared distances from it (k, n).
+        radius: of the capsules (k,).
+    """
+    reach = np.sqrt(np.maximum(radius[:, None] ** 2 - off_axis, 0.0))
+    low, high = np.min(height + reach, axis=1), np.max(height - reach, axis=1)
+    return np.column_stack((radius, np.maximum(high - low, 0.0), 0.5 * (low + high)))
 
 
 def _half_sphere(count: int) -> Array:

@@ -1,6 +1,6 @@
 """Off-line trajectories of targets and obstacles: pose and velocity of a body origin as functions of time.
 
-Three kinds cover every block: `Still` (fixed pose), `Polyline` (line, waypoints, CSV) and `Orbit` (circle). All that can
+Three kinds cover all: `Still` (fixed pose), `Polyline` (line, waypoints, CSV) and `Orbit` (circle). All that can
 be worked out beforehand is, because `sample` runs in the control loop.
 """
 

@@ -36,7 +36,7 @@ class Result:
 
 
 @pytest.fixture
-def cli(monkeypatch, capsys, tmp_path):
+def cli(monkeypatch, capfd, tmp_path):
     """Runs a command in this process, in a folder of its own, and lets every other exception through."""
     monkeypatch.chdir(tmp_path)
 
@@ -45,7 +45,7 @@ def cli(monkeypatch, capsys, tmp_path):
         with warnings.catch_warnings(), pytest.raises(SystemExit) as exit_:
             warnings.simplefilter("default")
             main()
-        captured = capsys.readouterr()
+        captured = capfd.readouterr()  # what C++ prints counts as well
         return Result(exit_.value.code, captured.out, captured.err)
 
     return cli

@@ -76,17 +76,21 @@ def test_broken_srdf(tmp_path, text):
         Robot.from_urdf(write_chain(tmp_path), srdf="broken.srdf")
 
 
-def test_pairs_that_always_touch_are_dropped_and_noted(tmp_path):
-    """Balls of 0.31 m in the middle of links of 0.3 m: every second one is never farther than 0.6 m away."""
+@pytest.mark.parametrize("radius", [0.31, 0.34, 0.37, 0.40])
+def test_pairs_that_always_touch_are_dropped_and_noted(tmp_path, radius):
+    """Balls of more than 0.3 m in the middle of links of 0.3 m: every second one is never farther than 0.6 m away.
+
+    The first and the last are 0.9 m apart when stretched and touch when folded: however seldom they part, and though
+    they touch at the home pose, they are watched.
+    """
     bodies = [
-        {"name": f"b{i}", "frame": f"link{i}", "shape": {"type": "sphere", "radius": 0.31}, "position": [0, 0, 0.15]}
+        {"name": f"b{i}", "frame": f"link{i}", "shape": {"type": "sphere", "radius": radius}, "position": [0, 0, 0.15]}
         for i in range(4)
     ]
-    folded = {"joint1": 1.9, "joint2": 1.9, "joint3": 1.9}
+    folded = {f"joint{i}": 2.0 for i in (1, 2, 3)}
     robot = Robot.from_urdf(write_chain(tmp_path), bodies=bodies, home=folded)
     assert pairs_of(robot) == {frozenset(("b0", "b3"))}
     assert [note.split()[1:4] for note in robot.notes] == [["b0", "-", "b2"], ["b1", "-", "b3"]]
-    # what touches at the home pose only is a collision, not a neighbour: it is still watched
     assert look(build_scene(robot), robot.home).distance[0] < 0.0
 
 

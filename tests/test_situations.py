@@ -1,6 +1,6 @@
 """The paper's two situations: every figure of the table in the method's description, in axis distances."""
 
-from functools import lru_cache
+from functools import cache
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ OFFSET = 0.10
 SOLVERS = ("tracking", "eq10-literal", "eq10", "qp")
 
 
-@lru_cache(maxsize=None)
+@cache
 def run(scenario: str, solver: str, *overrides: str) -> Log:
     return simulate(load_scenario(scenario, overrides, solver))
 
@@ -112,7 +112,9 @@ def test_back_ends_agree_with_daqp(scenario, backend, tolerance):
     assert np.abs(other.v - reference.v).max() < tolerance
 
 
-SHIFTS = [(dx, 0.0) for dx in (-0.05, -0.03, -0.01, 0.02, 0.04)] + [(0.0, dz) for dz in (-0.04, -0.02, 0.01, 0.03, 0.05)]
+SHIFTS = [(dx, 0.0) for dx in (-0.05, -0.03, -0.01, 0.02, 0.04)] + [
+    (0.0, dz) for dz in (-0.04, -0.02, 0.01, 0.03, 0.05)
+]
 
 
 @pytest.mark.parametrize("solver", ["eq10", "qp"])
