@@ -48,9 +48,9 @@ def support_masks(model: Any) -> Array:
     """Which velocity coordinates move which joint: (njoints, nv) of 0 and 1, row 0 (the world) all 0."""
     mask = np.zeros((model.njoints, model.nv))
     for joint in range(1, model.njoints):
-        for ancestor in model.supports[joint]:
+        for ancestor in list(model.supports[joint])[1:]:  # without the world, which supports everything
             start, width = model.joints[ancestor].idx_v, model.joints[ancestor].nv
-            mask[joint, max(start, 0) : max(start, 0) + width] = 1.0
+            mask[joint, start : start + width] = 1.0
     return mask
 
 

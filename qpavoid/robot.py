@@ -79,7 +79,7 @@ class Robot:
             ConfigError, UnknownName: naming file, field and remedy.
         """
         path = Path(path)
-        config = RobotConfig(**{"name": path.stem, "urdf": path.name, **fields})
+        config = validate({"name": path.stem, "urdf": path.name, **fields}, RobotConfig, path)
         return _build(config, path)
 
     @property
@@ -160,7 +160,7 @@ class Robot:
             found = [name for name in self.joint_names if fnmatchcase(name, pattern)]
             if not found:
                 raise UnknownName(f"{where}: {self.name} has no joint {pattern!r}{nearest(pattern, self.joint_names)}")
-            locked += found
+            locked += [name for name in found if name not in locked]
         if not locked:
             return self, q
         model, bodies = _reduce(self.model, self.bodies, locked, q)
@@ -172,22 +172,26 @@ class Robot:
         return zip(self.joint_names, list(self.model.joints)[1:], strict=True)
 
 
+_ABSURD = 1e9
+"""Speed [rad/s or m/s] from which a limit is a way of saying that there is none."""
+
+
 def joint_bounds(model: Any) -> JointBounds:
     """Joint limits of a model in tangent space.
 
-    Only joints with one coordinate in q and v have position limits. A velocity limit of 0 means that the URDF gives
-    none.
+    Only joints with one coordinate in q and v have position limits. A velocity limit of 0, and a range from 0 to 0,
+    mean that the URDF gives none.
     """
     q_index, v_index = [], []
     for joint in list(model.joints)[1:]:
         lower, upper = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
-        if joint.nq == joint.nv == 1 and np.isfinite([lower, upper]).any() and lower < upper:
+        if joint.nq == joint.nv == 1 and np.isfinite([lower, upper]).any() and (lower < upper or lower != 0.0):
             q_index.append(joint.idx_q)
             v_index.append(joint.idx_v)
     q_indices = np.array(q_index, dtype=np.intp)
     velocity = np.array(model.velocityLimit)
     return JointBounds(
-        velocity=np.where(velocity > 0.0, velocity, np.inf),
+        velocity=np.where((velocity > 0.0) & (velocity < _ABSURD), velocity, np.inf),
         q_index=q_indices,
         v_index=np.array(v_index, dtype=np.intp),
         lower=np.array(model.lowerPositionLimit)[q_indices],
@@ -205,7 +209,8 @@ def _build(config: RobotConfig, path: Path) -> Robot:
     else:
         bodies = _listed_bodies(config, model, path)
     _apply_limits(config, model, path)
-    home = _set_joints(model, _middle(model), {**config.home, **config.lock}, f"{path}: home")
+    home = _set_joints(model, _middle(model), config.home, f"{path}: home")
+    home = _set_joints(model, home, config.lock, f"{path}: lock")
     if config.lock:
         model, bodies = _reduce(model, bodies, list(config.lock), home)
         home = _set_joints(model, _middle(model), config.home, f"{path}: home", ignore=frozenset(config.lock))
@@ -290,4 +295,8 @@ def _set_joints(
 def _reduce(model: Any, bodies: Any, locked: Sequence[str], q: Array) -> tuple[Any, Any]:
     ids = [_joint(model, name, "lock").id for name in locked]
     model, bodies = pin.buildReducedModel(model, bodies, ids, q)
+    joints = [body.parentJoint for body in bodies.geometryObjects]
+    for a, b in pair_array(bodies).tolist():
+        if joints[a] == joints[b]:
+            bodies.removeCollisionPair(pin.CollisionPair(a, b))
     return model, bodies

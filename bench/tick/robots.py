@@ -1,6 +1,6 @@
 """The robots of the benchmark: which model, pose, joints and links, and capsules fitted once to their collision meshes.
 
-The capsules are kept in robots/*.json, so that a change of the fitting does not change the workloads; run
+The capsules are kept in capsules/*.json, so that a change of the fitting does not change the workloads; run
 `python -m bench.tick.robots` to fit them again.
 """
 
@@ -23,7 +23,7 @@ from qpavoid import Robot
 from qpavoid.bodies import fit_capsule
 from qpavoid.config import Body, Capsule, Sphere
 
-FITTED = Path(__file__).parent / "robots"
+FITTED = Path(__file__).parent / "capsules"
 SHARE = Path(str(distribution("example-robot-data").locate_file("cmeel.prefix/share/example-robot-data/robots")))
 
 
