@@ -119,14 +119,22 @@ def _run_all(configs: list[ScenarioConfig], out: Path) -> tuple[list[Log], list[
     files = []
     for config in configs:  # faults of the last scenario show before the first one runs
         Controller.from_scenario(config)
+    labels = [f"{config.source.stem} {config.solver.label}" for config in configs]
+    for label in labels:
+        if labels.count(label) > 1:
+            raise ConfigError(f"{label} would be written twice: leave one out, or rename one scenario file")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"--out {out}: {error.strerror}; give a folder that can be written") from None
     with _progress() as bar, _terminate_like_interrupt():
-        for config in configs:
-            label = f"{config.source.stem} {config.solver.label}"
+        for label, config in zip(labels, configs, strict=True):
             update = partial(_update, bar, bar.add_task(label, total=None))
             logs.append(simulate(config, progress=update))
             files.append(logs[-1].save(out / f"{label.replace(' ', '_').replace(':', '-')}.npz"))
             if logs[-1].meta["stopped_by"]:
-                _err.print(f"[red]{label}: broken off: {escape(logs[-1].meta['stopped_by'])}[/]", highlight=False)
+                why = escape(f"{label}: broken off: {logs[-1].meta['stopped_by']}")
+                _err.print(f"[red]{why}[/]", highlight=False)
                 break
     return logs, files
 

@@ -88,8 +88,11 @@ class Controller:
             solver = make_solver(scenario.solver)
         q0 = robot.configuration(scenario.q0, f"{source}: q0")
         robot, q0 = robot.lock(scenario.lock, q0, f"{source}: lock")
+        obstacles = build_obstacles(scenario.obstacles, source)
+        with located(str(source)):
+            scene = build_scene(robot, obstacles)
         controller = cls(
-            build_scene(robot, build_obstacles(scenario.obstacles, source)),
+            scene,
             build_tasks(scenario.tasks, robot, q0, source),
             solver,
             scenario.dt,

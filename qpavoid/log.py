@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import platform
+import zlib
 from dataclasses import dataclass, field, fields
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 import numpy.typing as npt
@@ -89,7 +91,8 @@ class Log:
         Returns:
             The file written, ending in .npz.
         """
-        path = Path(path).with_suffix(".npz")
+        path = Path(path)
+        path = path.with_name(path.name.removesuffix(".npz") + ".npz")
         path.parent.mkdir(parents=True, exist_ok=True)
         meta: Any = np.array(json.dumps({"format": _FORMAT, **self.meta}))
         with path.open("wb") as file:
@@ -104,14 +107,14 @@ class Log:
             ConfigError: no such file, or not a log of this format.
         """
         try:
-            with np.load(path, allow_pickle=False) as file:
+            with Path(path).open("rb") as raw, np.load(raw, allow_pickle=False) as file:
                 meta = json.loads(str(file["meta"]))
                 if meta.pop("format") != _FORMAT:
                     raise ConfigError(f"{path}: written by another version of qpavoid; run the scenario again")
                 return cls(**{name: file[name] for name in file.files if name != "meta"}, meta=meta)
         except FileNotFoundError:
             raise ConfigError(f"{path}: no such file; give a log written by `qpavoid run`") from None
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, EOFError, BadZipFile, zlib.error, AttributeError, ValueError, KeyError, TypeError) as error:
             raise ConfigError(f"{path}: not a qpavoid log: {error}") from None
 
     def _arrays(self) -> dict[str, Any]:

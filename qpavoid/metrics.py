@@ -17,7 +17,7 @@ def run_metrics(log: Log) -> dict[str, Any]:
     """The figures by which runs are compared.
 
     Returns:
-        scenario, solver; completed: ran for its whole duration; arrived: every task ended within the goal tolerance;
+        scenario, solver; completed: ran for its whole duration; arrived: it did, and every task ended within the goal tolerance;
         collided; min_distance: surface to surface [m], None where nothing is paired; min_pair: names of that pair;
         time_in_collision [s]; time_below: threshold -> [s]; final_error [m]; max_deviation: largest distance of a tool
         from its planned path [m]; tracking_rmse: of the distance to the moving target [m]; peak_velocity: fastest
@@ -36,7 +36,7 @@ def run_metrics(log: Log) -> dict[str, Any]:
         "scenario": log.meta["scenario"],
         "solver": log.meta["solver"],
         "completed": log.meta["completed"],
-        "arrived": bool(final_error <= config["goal_tolerance"]),
+        "arrived": log.meta["completed"] and bool(final_error <= config["goal_tolerance"]),
         "collided": bool(np.any(distance < 0.0)),
         "min_distance": None if closest is None else float(distance[closest]),
         "min_pair": None if closest is None else log.meta["pairs"][log.closest_pair[closest]],

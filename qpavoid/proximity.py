@@ -30,6 +30,8 @@ class DistanceQuery:
         self._scene = scene
         self._geometry = pin.GeometryModel(scene.geometry)
         self._data = self._geometry.createData()
+        for request in self._data.distanceRequests:
+            request.gjk_tolerance = 1e-10  # the default 1e-6 leaves errors of 7e-3 in normals of boxes and hulls
         self._first_obstacle = len(scene.body_names)
         obstacles = len(scene.obstacles)
         # the row after the obstacles' twists stays zero: it stands for the robot's own bodies

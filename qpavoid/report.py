@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from rich import box
+from rich.markup import escape
 from rich.table import Table
 
 _COLUMNS = (
@@ -22,7 +23,7 @@ def metrics_table(runs: Sequence[dict[str, Any]]) -> Table:
         runs: results of `Log.metrics`.
     """
     table = Table(
-        title=f"[bold]{runs[0]['scenario']}[/] (distances between surfaces)",
+        title=f"[bold]{escape(runs[0]['scenario'])}[/] (distances between surfaces)",
         title_justify="left",
         title_style="",
         box=box.SIMPLE_HEAD,
@@ -31,7 +32,7 @@ def metrics_table(runs: Sequence[dict[str, Any]]) -> Table:
     )
     table.add_column("solver", no_wrap=True)
     for heading in _COLUMNS:
-        table.add_column(heading, justify="right", no_wrap=True)
+        table.add_column(escape(heading), justify="right", no_wrap=True)
     table.add_column("outcome", min_width=14)
     for run in runs:
         table.add_row(

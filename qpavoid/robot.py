@@ -15,11 +15,11 @@ from qpavoid.bodies import convert_bodies, make_shape
 from qpavoid.config import RobotConfig
 from qpavoid.errors import ConfigError, UnknownName
 from qpavoid.limits import JointBounds
-from qpavoid.loading import find_robot, nearest, read_config
+from qpavoid.loading import find_robot, nearest, read_config, validate
 from qpavoid.motion import rpy_to_matrix
-from qpavoid.pairs import add_self_pairs, drop_always_touching
+from qpavoid.pairs import add_self_pairs, drop_always_touching, pair_array
 from qpavoid.problem import Array
-from qpavoid.urdf import find_resource, read_collision, read_model
+from qpavoid.urdf import find_resource, honour_srdf, read_collision, read_model
 
 _TRANSLATIONS = {
     "JointModelPX": 1,
@@ -185,7 +185,7 @@ def joint_bounds(model: Any) -> JointBounds:
     q_index, v_index = [], []
     for joint in list(model.joints)[1:]:
         lower, upper = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
-        if joint.nq == joint.nv == 1 and np.isfinite([lower, upper]).any() and (lower < upper or lower != 0.0):
+        if joint.nq == joint.nv == 1 and np.isfinite([lower, upper]).any() and lower < upper:
             q_index.append(joint.idx_q)
             v_index.append(joint.idx_v)
     q_indices = np.array(q_index, dtype=np.intp)
@@ -216,7 +216,7 @@ def _build(config: RobotConfig, path: Path) -> Robot:
         home = _set_joints(model, _middle(model), config.home, f"{path}: home", ignore=frozenset(config.lock))
     add_self_pairs(model, bodies, config.disabled_pairs, str(path))
     if config.srdf is not None:
-        pin.removeCollisionPairs(model, bodies, str(find_resource(config.srdf, path, "srdf")), False)
+        honour_srdf(model, bodies, find_resource(config.srdf, path, "srdf"))
     notes = [
         f"pair {a} - {b} is off: it touches in every configuration"
         for a, b in drop_always_touching(model, bodies, joint_bounds(model))
@@ -251,6 +251,8 @@ def _apply_limits(config: RobotConfig, model: Any, path: Path) -> None:
     velocity = np.array(model.velocityLimit)
     for name, (low, high) in config.limits.position.items():
         joint = _joint(model, name, f"{path}: limits.position")
+        if joint.nq != 1:
+            raise ConfigError(f"{path}: limits.position: joint {name!r} turns all the way round; leave it out")
         lower[joint.idx_q], upper[joint.idx_q] = low, high
     for name, speed in config.limits.velocity.items():
         joint = _joint(model, name, f"{path}: limits.velocity")

@@ -12,7 +12,7 @@ import pinocchio as pin
 from qpavoid.bodies import enclosing_capsule
 from qpavoid.config import ScenarioConfig
 from qpavoid.controller import Controller, Tick
-from qpavoid.errors import NumericalError
+from qpavoid.errors import ConfigError, NumericalError
 from qpavoid.loading import load_scenario
 from qpavoid.log import STATUSES, Log, versions
 from qpavoid.problem import Array
@@ -49,7 +49,12 @@ def simulate(
     controller, q = Controller.from_scenario(scenario)
     _check_start(controller, q, scenario)
     model, ticks = controller.scene.robot.model, round(scenario.duration / scenario.dt) + 1
-    recorder = Recorder(controller, scenario, ticks)
+    try:
+        recorder = Recorder(controller, scenario, ticks)
+    except MemoryError:
+        raise ConfigError(
+            f"{scenario.source}: duration: {ticks} ticks do not fit into memory; shorten it, or lengthen dt"
+        ) from None
     stopped_by = None
     try:
         for k in range(ticks):
@@ -176,7 +181,7 @@ class Recorder:
             "frames": [task.settings.frame for task in self._tasks],
             "bodies": scene.body_names,
             "body_radii": self._radii,
-            "obstacles": [{"name": o.name, "shape": o.shape.model_dump()} for o in scene.obstacles],
+            "obstacles": [{"name": o.name, "shape": o.shape.model_dump(mode="json")} for o in scene.obstacles],
             "pairs": [list(pair) for pair in scene.pair_names],
             "versions": versions(),
         }

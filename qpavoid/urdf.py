@@ -108,3 +108,23 @@ def read_collision(urdf: Path, model: Any, package_dirs: list[str], path: Path) 
         f"{path}: {urdf.name}: {reason}; name the folder that holds the package in `package_dirs` of a robot.yaml, "
         "or set ROS_PACKAGE_PATH"
     )
+
+
+def honour_srdf(model: Any, bodies: Any, srdf: Path) -> None:
+    """Removes the pairs that an SRDF disables.
+
+    Args:
+        model: pinocchio model.
+        bodies: its collision bodies with their pairs, changed in place.
+        srdf: the file.
+
+    Raises:
+        ConfigError: not a usable SRDF.
+    """
+    with _quiet_stderr():
+        try:
+            pin.removeCollisionPairs(model, bodies, str(srdf), False)
+            return
+        except (ValueError, RuntimeError) as error:
+            reason = " ".join(str(error).split())
+    raise ConfigError(f"{srdf}: not a usable SRDF: {reason}")

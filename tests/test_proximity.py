@@ -26,7 +26,7 @@ from qpavoid.proximity import DistanceQuery
 from qpavoid.segments import capsule_distances
 
 TICKS = 10
-ROUND = 3e-3
+ROUND = 3e-5
 """Tolerance on rates [m/rad] where coal iterates to a curved surface: its stopping criterion leaves the normal
 uncertain by the root of 1e-6."""
 

@@ -127,11 +127,10 @@ def test_limits_override_those_of_the_urdf(tmp_path):
     np.testing.assert_array_equal(bounds.velocity, [1.5, 1.5, 0.1])
 
 
-def test_a_range_of_one_point_is_a_limit_too(tmp_path):
-    """[0.3, 0.3] holds the joint there; it must not come out as no limit at all."""
-    bounds = Robot.from_urdf(write_chain(tmp_path), limits={"position": {"joint1": [0.3, 0.3]}}).bounds()
-    np.testing.assert_array_equal(bounds.q_index, [0, 1, 2])
-    assert bounds.lower[0] == bounds.upper[0] == 0.3
+def test_a_range_of_one_point_is_refused(tmp_path):
+    """[0.3, 0.3] would hold the joint there, which `lock` says better; it must not come out as no limit at all."""
+    with pytest.raises(ConfigError, match="needs lower < upper, got 0.3, 0.3; see `lock`"):
+        Robot.from_urdf(write_chain(tmp_path), limits={"position": {"joint1": [0.3, 0.3]}})
 
 
 def test_continuous_joints_have_two_numbers_in_q_and_no_position_limit(tmp_path):
@@ -296,7 +295,9 @@ def test_robot_file_names_file_and_field(tmp_path):
     with pytest.raises(ConfigError, match=r"robot\.yaml: bodie: unknown key; did you mean 'bodies'\?"):
         Robot.load(str(path))
     path.write_text("name: x\nurdf: chain.urdf\nlimits: {position: {joint1: [1, -1]}}\n")
-    with pytest.raises(ConfigError, match=r"robot\.yaml: limits: position of 'joint1': lower limit 1\.0 lies above"):
+    with pytest.raises(
+        ConfigError, match=r"robot\.yaml: limits: position of 'joint1': needs lower < upper, got 1\.0, -1\.0"
+    ):
         Robot.load(str(path))
 
 

@@ -78,13 +78,13 @@ class Circle(Block):
     radius: Positive
     """Radius [m]."""
     normal: Vec3 = (0.0, 0.0, 1.0)
-    """Axis of the turn, in world axes; the motion is counter-clockwise about it."""
+    """Axis of the turn, in world axes [-]; the motion is counter-clockwise about it."""
     start_direction: Vec3 = (1.0, 0.0, 0.0)
-    """Direction from the centre to the start, in world axes; only its part in the circle's plane counts."""
+    """Direction from the centre to the start, in world axes [-]; only its part in the circle's plane counts."""
     period: Positive
     """Time of one turn [s]."""
     turns: Positive | None = None
-    """Number of turns after which it rests; left out, it goes on."""
+    """Number of turns after which it rests [-]; left out, it goes on."""
     rpy: Vec3 | None = None
     """Constant orientation: roll, pitch, yaw about the fixed world axes [rad]."""
 

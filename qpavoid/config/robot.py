@@ -35,8 +35,8 @@ class JointLimits(Block):
     @model_validator(mode="after")
     def _ordered(self) -> JointLimits:
         for joint, (lower, upper) in self.position.items():
-            if lower > upper:
-                raise ValueError(f"position of {joint!r}: lower limit {lower} lies above upper limit {upper}")
+            if lower >= upper:
+                raise ValueError(f"position of {joint!r}: needs lower < upper, got {lower}, {upper}; see `lock`")
         return self
 
 

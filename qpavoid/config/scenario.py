@@ -18,6 +18,7 @@ class ObstacleConfig(Block):
     """A body that the robot must stay clear of."""
 
     name: str
+    """Name by which pairs, logs and messages know it."""
     shape: Shape
     motion: Motion
     """Where its origin is; what a task could take from its frame must be given here."""

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 from pydantic import TypeAdapter, ValidationError
 
 from qpavoid.config import SolverConfig, expand_solver
-from qpavoid.errors import UnknownName
+from qpavoid.errors import ConfigError, UnknownName
 from qpavoid.loading import nearest
 from qpavoid.problem import Problem, Solution
 from qpavoid.solvers.analytic import Eq10, TrackingOnly
@@ -46,7 +46,7 @@ def parse_solver(name: str, settings: SolverConfig | None = None) -> SolverConfi
         settings: kept where they are of the same solver.
 
     Raises:
-        UnknownName: there is no such solver.
+        ConfigError, UnknownName: there is no such solver, or it takes no back end.
     """
     wanted = expand_solver(name)
     if settings is not None and settings.name == wanted["name"]:
@@ -54,6 +54,8 @@ def parse_solver(name: str, settings: SolverConfig | None = None) -> SolverConfi
     try:
         return TypeAdapter[SolverConfig](SolverConfig).validate_python(wanted)
     except ValidationError:
+        if wanted["name"] in SOLVERS:
+            raise ConfigError(f"solver {name!r}: {wanted['name']} takes no backend; only qp does") from None
         raise UnknownName(f"unknown solver {name!r}{nearest(wanted['name'], SOLVERS)}") from None
 
 

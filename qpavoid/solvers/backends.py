@@ -50,13 +50,19 @@ def make_backend(name: str) -> Backend:
         return _through_qpsolvers(name)
     usable = ", ".join(backend_names())
     if name in _KNOWN:
-        raise SolverNotInstalled(f"QP back end {name!r} is not installed: pip install {name}; usable now: {usable}")
+        raise SolverNotInstalled(
+            f"QP back end {name!r} is not installed: pip install {_PACKAGES.get(name, name)}; usable now: {usable}"
+        )
     raise UnknownName(f"unknown QP back end {name!r}; usable are {usable}")
 
 
-_KNOWN = frozenset({"clarabel", "cvxopt", "ecos", "gurobi", "highs", "hpipm", "jaxopt_osqp", "kvxopt", "mosek", "nppro",
-                    "osqp", "pdlp", "piqp", "pyqpmad", "proxqp", "qpalm", "qpax", "qpoases", "qpswift", "quadprog",
-                    "scs", "sip"})  # fmt: skip
+_PACKAGES = {"jaxopt_osqp": "jaxopt", "mosek": "Mosek", "highs": "highspy", "gurobi": "gurobipy", "proxqp": "proxsuite",
+             "qpoases": "qpoases", "hpipm": "hpipm-python"}  # fmt: skip
+"""Packages to install, where their name is not that of the back end."""
+_KNOWN = frozenset(
+    "clarabel cvxopt ecos gurobi highs hpipm jaxopt_osqp kvxopt mosek nppro osqp pdlp piqp proxqp pyqpmad qpalm qpax "
+    "qpoases qpswift quadprog scs sip".split()
+)
 """Names that qpsolvers gives to back ends which may not be installed."""
 
 _DAQP_INFINITY = 1e30
