@@ -17,7 +17,8 @@ def run_metrics(log: Log) -> dict[str, Any]:
     """The figures by which runs are compared.
 
     Returns:
-        scenario, solver; completed: ran for its whole duration; arrived: it did, and every task ended within the goal tolerance;
+        scenario, solver; completed: ran for its whole duration; arrived: so it did, and every task
+        ended within the goal tolerance;
         collided; min_distance: surface to surface [m], None where nothing is paired; min_pair: names of that pair;
         time_in_collision [s]; time_below: threshold -> [s]; final_error [m]; max_deviation: largest distance of a tool
         from its planned path [m]; tracking_rmse: of the distance to the moving target [m]; peak_velocity: fastest

@@ -330,6 +330,7 @@ def test_several_faults_are_told_at_once_but_not_without_end(load):
         (b"- 1\n- 2\n", "must be a mapping of fields, got list"),
         (b"hello", "must be a mapping of fields, got str"),
         (b"tasks: [", "not valid YAML"),
+        (b"dt: 1\ndt: 2", "key 'dt' is given twice"),
         (b"title: 2024-13-45", "not valid YAML"),
         (b"!!python/object:os.system x", "not valid YAML"),
         (bytes(range(256)), "cannot be read"),

@@ -129,7 +129,7 @@ def test_limits_override_those_of_the_urdf(tmp_path):
 
 def test_a_range_of_one_point_is_refused(tmp_path):
     """[0.3, 0.3] would hold the joint there, which `lock` says better; it must not come out as no limit at all."""
-    with pytest.raises(ConfigError, match="needs lower < upper, got 0.3, 0.3; see `lock`"):
+    with pytest.raises(ConfigError, match=r"needs lower < upper, got 0\.3, 0\.3; see `lock`"):
         Robot.from_urdf(write_chain(tmp_path), limits={"position": {"joint1": [0.3, 0.3]}})
 
 

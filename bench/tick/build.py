@@ -42,7 +42,9 @@ def build(name: str) -> Workload:
 def make_scene(workload: Workload) -> Scene:
     """The live scene of a workload."""
     robot = load(ROBOTS[workload.robot], workload.disabled_pairs)
-    return build_scene(robot, [_obstacle(body) for body in workload.bodies[len(workload.bodies) - workload.obstacles :]])
+    return build_scene(
+        robot, [_obstacle(body) for body in workload.bodies[len(workload.bodies) - workload.obstacles :]]
+    )
 
 
 def reference(scene: Scene, workload: Workload, ticks: Any) -> tuple[Array, Array]:

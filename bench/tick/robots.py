@@ -126,11 +126,15 @@ def fit(spec: RobotSpec) -> list[dict[str, Any]]:
         if len(group) == 1:
             shape, placement = group[0].geometry, to_link * group[0].placement
         else:
-            fitted = fit_capsule(np.concatenate([_surface(piece.geometry, to_link * piece.placement) for piece in group]))
+            fitted = fit_capsule(
+                np.concatenate([_surface(piece.geometry, to_link * piece.placement) for piece in group])
+            )
             shape = coal.Capsule(fitted.radius, fitted.length) if fitted.length > 0 else coal.Sphere(fitted.radius)
             placement = pin.SE3(fitted.rotation, fitted.center)
         round_ball = isinstance(shape, coal.Sphere)
-        config = Sphere(radius=shape.radius) if round_ball else Capsule(radius=shape.radius, length=2 * shape.halfLength)
+        config = (
+            Sphere(radius=shape.radius) if round_ball else Capsule(radius=shape.radius, length=2 * shape.halfLength)
+        )
         bodies.append(
             Body(
                 name=name,

@@ -60,8 +60,30 @@ _PACKAGES = {"jaxopt_osqp": "jaxopt", "mosek": "Mosek", "highs": "highspy", "gur
              "qpoases": "qpoases", "hpipm": "hpipm-python"}  # fmt: skip
 """Packages to install, where their name is not that of the back end."""
 _KNOWN = frozenset(
-    "clarabel cvxopt ecos gurobi highs hpipm jaxopt_osqp kvxopt mosek nppro osqp pdlp piqp proxqp pyqpmad qpalm qpax "
-    "qpoases qpswift quadprog scs sip".split()
+    [
+        "clarabel",
+        "cvxopt",
+        "ecos",
+        "gurobi",
+        "highs",
+        "hpipm",
+        "jaxopt_osqp",
+        "kvxopt",
+        "mosek",
+        "nppro",
+        "osqp",
+        "pdlp",
+        "piqp",
+        "proxqp",
+        "pyqpmad",
+        "qpalm",
+        "qpax",
+        "qpoases",
+        "qpswift",
+        "quadprog",
+        "scs",
+        "sip",
+    ]
 )
 """Names that qpsolvers gives to back ends which may not be installed."""
 
