@@ -22,7 +22,7 @@ CLEARANCE = 0.045
 NEAR = 0.08
 """Obstacles that are put near a tool come at least this close to it."""
 INFLUENCES = (0.10, 0.30)
-SIZES = {"panda": (0, 5, 50, 500), "baxter": (0, 50), "g1": (5,)}
+SIZES = {"panda": (0, 5, 50, 500), "baxter": (0, 50), "g1": (8,)}
 """Numbers of obstacles."""
 
 

@@ -59,32 +59,10 @@ def make_backend(name: str) -> Backend:
 _PACKAGES = {"jaxopt_osqp": "jaxopt", "mosek": "Mosek", "highs": "highspy", "gurobi": "gurobipy", "proxqp": "proxsuite",
              "qpoases": "qpoases", "hpipm": "hpipm-python"}  # fmt: skip
 """Packages to install, where their name is not that of the back end."""
-_KNOWN = frozenset(
-    [
-        "clarabel",
-        "cvxopt",
-        "ecos",
-        "gurobi",
-        "highs",
-        "hpipm",
-        "jaxopt_osqp",
-        "kvxopt",
-        "mosek",
-        "nppro",
-        "osqp",
-        "pdlp",
-        "piqp",
-        "proxqp",
-        "pyqpmad",
-        "qpalm",
-        "qpax",
-        "qpoases",
-        "qpswift",
-        "quadprog",
-        "scs",
-        "sip",
-    ]
-)
+_KNOWN = {
+    *("clarabel", "cvxopt", "ecos", "gurobi", "highs", "hpipm", "jaxopt_osqp", "kvxopt", "mosek", "nppro", "osqp"),
+    *("pdlp", "piqp", "proxqp", "pyqpmad", "qpalm", "qpax", "qpoases", "qpswift", "quadprog", "scs", "sip"),
+}
 """Names that qpsolvers gives to back ends which may not be installed."""
 
 _DAQP_INFINITY = 1e30
