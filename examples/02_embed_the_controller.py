@@ -19,7 +19,7 @@ for k in range(1600):
     target = Sample.at(start + np.array([0.1 * np.sin(t), 0.15 * np.sin(2 * t), 0.0]))
     ball_now = Sample.at([0.75 - 0.06 * t, 0.0, 0.5], linear=[-0.06, 0.0, 0.0])
     tick = controller.tick(q, targets={"panda_hand_tcp": target}, obstacles={"ball": ball_now})
-    closest = min(closest, tick.proximity.distance.min())
+    closest = tick.proximity.distance.min(initial=closest)
     q = pin.integrate(robot.model, q, tick.solution.v * controller.dt)  # your robot goes here
 
 print(f"closest {1e3 * closest:.1f} mm, {tick.solution.status.value}")

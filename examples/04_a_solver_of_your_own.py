@@ -24,7 +24,7 @@ controller.solver = SlowDown()
 closest = np.inf
 for k in range(1300):
     tick = controller.tick(q, k * controller.dt)
-    closest = min(closest, tick.proximity.distance.min())
+    closest = tick.proximity.distance.min(initial=closest)
     q = pin.integrate(controller.scene.robot.model, q, tick.solution.v * controller.dt)
 
 left = np.linalg.norm(tick.targets[0].position - tick.kinematics.position[0])

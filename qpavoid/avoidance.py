@@ -10,29 +10,21 @@ from qpavoid.problem import Array, AvoidanceRows, Proximity
 
 
 def avoidance_rows(proximity: Proximity, config: Avoidance) -> AvoidanceRows:
-    """Rows J v + drift >= bound of all near pairs at once.
+    """Rows J v >= b of all near pairs at once: ḋ = J v + drift stays above `closing_speed_bound`.
 
     Args:
-        proximity: closest points; its near pairs are those within d2.
+        proximity: closest points of the pairs within d2.
         config: distances, offset and form of the row.
 
     Returns:
-        The rows, in the order of `proximity.near`.
+        The rows, in the order of `proximity`.
     """
-    d = proximity.distance[proximity.near] + config.offset
-    beta = gains.beta(d, config.d1, config.d2)
-    return AvoidanceRows(
-        pair=proximity.near,
-        d=d,
-        J=proximity.J,
-        drift=proximity.drift,
-        bound=closing_speed_bound(d, beta, config),
-        alpha=gains.alpha(d, config.d2),
-        beta=beta,
-    )
+    d = proximity.distance + config.offset
+    b = closing_speed_bound(d, config) - proximity.drift
+    return AvoidanceRows(proximity.pair, d, proximity.J, b, config.d1, config.d2)
 
 
-def closing_speed_bound(d: Array, beta: Array, config: Avoidance) -> Array:
+def closing_speed_bound(d: Array, config: Avoidance) -> Array:
     """Lower bound on ḋ for each pair.
 
     With h = d - d_hold and gain ξ (d_hold is d1 for the switching row):
@@ -43,7 +35,6 @@ def closing_speed_bound(d: Array, beta: Array, config: Avoidance) -> Array:
 
     Args:
         d: distances (k,) [m].
-        beta: eq. 12 at these distances (k,).
         config: which row, with which gain.
 
     Returns:
@@ -52,8 +43,7 @@ def closing_speed_bound(d: Array, beta: Array, config: Avoidance) -> Array:
     row = config.row
     hold = config.d1 if isinstance(row, Switching) or row.d_safe is None else row.d_safe
     bound = -row.gain * (d - hold)
-    if isinstance(row, Cbf):
-        return bound
-    if isinstance(row, Switching):
-        bound = np.where(d >= hold, (1.0 - beta) * bound, bound)
-    return np.minimum(bound, config.recovery_speed)
+    if isinstance(row, Switching) and len(d):
+        # below d1, where β = 1, the row asks for recovery, which β does not weaken
+        bound = np.where(bound > 0.0, bound, (1.0 - gains.beta(d, config.d1, config.d2)) * bound)
+    return bound if isinstance(row, Cbf) else np.minimum(bound, config.recovery_speed)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from time import perf_counter
+from typing import NamedTuple
 
 from qpavoid.avoidance import avoidance_rows
 from qpavoid.config import Avoidance, Limits, ScenarioConfig
@@ -21,8 +21,7 @@ from qpavoid.solvers import Solver, make_solver
 from qpavoid.tasks import FrameTask, TaskRows, build_tasks
 
 
-@dataclass(frozen=True, slots=True)
-class Tick:
+class Tick(NamedTuple):
     """Everything that one tick computed."""
 
     state: State
@@ -63,8 +62,8 @@ class Controller:
         self.scene, self.tasks, self.dt = scene, tuple(tasks), dt
         self.solver: Solver = make_solver(solver) if isinstance(solver, str) else solver
         self.avoidance, self.limits = avoidance or Avoidance(), limits or Limits()
-        model = scene.robot.model
-        self._data = model.createData()
+        self._model = model = scene.robot.model
+        self._data, self._q_shape = model.createData(), (model.nq,)
         self._frame_ids = [task.frame_id for task in tasks]
         self._frame_index = {task.settings.frame: i for i, task in enumerate(tasks)}
         self._obstacle_index = {name: i for i, name in enumerate(scene.obstacle_names)}
@@ -132,35 +131,22 @@ class Controller:
     ) -> Tick:
         """Like `step`, with everything that led to the velocity."""
         begin = perf_counter()
-        robot = self.scene.robot
-        q = require_finite("q", q, (robot.model.nq,))
+        q = require_finite("q", q, self._q_shape)
         samples = self._targets(t, targets)
         self._place_obstacles(t, obstacles)
-        kinematics = compute_kinematics(robot.model, self._data, self._frame_ids, q)
-        reach = self.avoidance.d2 - self.avoidance.offset
-        proximity = self._query.compute(self._data, kinematics, reach)
-        limits = self.limits
+        kinematics = compute_kinematics(self._model, self._data, self._frame_ids, q)
+        avoidance, limits = self.avoidance, self.limits
+        proximity = self._query.compute(self._data, kinematics, avoidance.d2 - avoidance.offset)
         lower, upper = velocity_bounds(self._bounds, q, self.dt, limits.position_gain, limits.velocity_scale)
-        problem = Problem(
-            tracking=self._task_rows.compute(kinematics, samples),
-            avoidance=avoidance_rows(proximity, self.avoidance),
-            lower=lower,
-            upper=upper,
-            pair_names=self.scene.pair_names,
-        )
+        tracking = self._task_rows.compute(kinematics, samples)
+        problem = Problem(tracking, avoidance_rows(proximity, avoidance), lower, upper, self.scene.pair_names)
         built = perf_counter()
-        solution = self.solver.solve(problem)
-        v, saturation = solution.v, 0.0
+        v, status, reasons, slack, *_ = self.solver.solve(problem)
+        saturation = 0.0
         if limits.saturate and not self.solver.bounded:
             v, saturation = saturate(v, lower, upper, self._bounds.velocity * limits.velocity_scale)
-        solution = replace(
-            solution,
-            v=v,
-            saturation=saturation,
-            build_time=built - begin,
-            solve_time=perf_counter() - built,
-        )
-        return Tick(State(q, solution.v, t), samples, kinematics, proximity, problem, solution)
+        solution = Solution(v, status, reasons, slack, saturation, built - begin, perf_counter() - built)
+        return Tick(State(q, v, t), samples, kinematics, proximity, problem, solution)
 
     def _targets(self, t: float, given: Mapping[str, Sample] | None) -> tuple[Sample, ...]:
         samples = [task.motion.sample(t) for task in self.tasks]

@@ -33,5 +33,5 @@ def beta(d: Array, d1: float, d2: float) -> Array:
     Returns:
         (k,) cosine blend from 1 at d1 to 0 at d2.
     """
-    share = np.clip((d - d1) / (d2 - d1), 0.0, 1.0)
-    return np.asarray(0.5 * (1.0 + np.cos(np.pi * share)))
+    share = np.minimum(np.maximum((d - d1) / (d2 - d1), 0.0), 1.0)
+    return np.asarray(0.5 + 0.5 * np.cos(np.pi * share))

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -12,8 +11,7 @@ import pinocchio as pin
 from qpavoid.problem import Array
 
 
-@dataclass(frozen=True, slots=True)
-class Kinematics:
+class Kinematics(NamedTuple):
     """Where the tracked frames are, and how everything moves with v. Valid until the next call on the same data."""
 
     J: Array
@@ -41,7 +39,7 @@ def compute_kinematics(model: Any, data: Any, frame_ids: Sequence[int], q: Array
         placement = pin.updateFramePlacement(model, data, frame_id)
         position[i] = placement.translation
         rotation[i] = placement.rotation
-    return Kinematics(J=data.J, position=position, rotation=rotation)
+    return Kinematics(data.J, position, rotation)
 
 
 def support_masks(model: Any) -> Array:
@@ -52,21 +50,3 @@ def support_masks(model: Any) -> Array:
             start, width = model.joints[ancestor].idx_v, model.joints[ancestor].nv
             mask[joint, start : start + width] = 1.0
     return mask
-
-
-def point_rows(directions: Array, points: Array) -> Array:
-    """Screws [e, p × e] whose product with `Kinematics.J` is the velocity of body points p along directions e.
-
-    Args:
-        directions: unit vectors (m, 3), world axes.
-        points: points (m, 3), world [m].
-
-    Returns:
-        (m, 6).
-    """
-    rows = np.empty((len(directions), 6))
-    rows[:, :3] = directions
-    rows[:, 3] = points[:, 1] * directions[:, 2] - points[:, 2] * directions[:, 1]
-    rows[:, 4] = points[:, 2] * directions[:, 0] - points[:, 0] * directions[:, 2]
-    rows[:, 5] = points[:, 0] * directions[:, 1] - points[:, 1] * directions[:, 0]
-    return rows

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from qpavoid import kernels
 from qpavoid.problem import Array, IntArray
 
 
@@ -43,14 +44,15 @@ def velocity_bounds(
     Returns:
         lower (nv,), upper (nv,) [rad/s or m/s].
     """
-    upper = joints.velocity * velocity_scale
-    lower = -upper
-    i, v_max = joints.v_index, upper[joints.v_index]
-    here = q[joints.q_index]
-    rate = position_gain / dt
-    lower[i] = np.clip(rate * (joints.lower - here), -v_max, v_max)
-    upper[i] = np.clip(rate * (joints.upper - here), -v_max, v_max)
-    return lower, upper
+    return kernels.velocity_bounds(
+        q,
+        joints.q_index,
+        joints.v_index,
+        joints.lower,
+        joints.upper,
+        joints.velocity * velocity_scale,
+        position_gain / dt,
+    )
 
 
 def saturate(v: Array, lower: Array, upper: Array, v_max: Array) -> tuple[Array, float]:

@@ -1,14 +1,16 @@
 """Value types of one tick. numpy only: a problem can be recorded, replayed and benchmarked without a robot.
 
+They are named tuples, frozen and three times as quick to make as frozen dataclasses: a tick makes seven of them.
+
 Everything is expressed in the joint velocity v, shape (nv,) [rad/s or m/s].
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from enum import Enum
-from typing import Any
+from math import isfinite
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -30,8 +32,7 @@ class Status(str, Enum):
     """No usable velocity was found: the robot is told to stand still."""
 
 
-@dataclass(frozen=True, slots=True)
-class State:
+class State(NamedTuple):
     """What is read from the robot: configuration q (nq,), velocity v (nv,), time t [s]."""
 
     q: Array
@@ -39,32 +40,30 @@ class State:
     t: float
 
 
-@dataclass(frozen=True, slots=True)
-class Proximity:
-    """Closest points of all m pairs, and the rate of the distance for the k pairs within reach.
+class Proximity(NamedTuple):
+    """Closest points of the k pairs within reach, and the rate of their distance.
 
-    For pair i of bodies (a, b) the distance changes at
-    ḋ = n·(ṗ_b - ṗ_a) = J v + drift, n the unit normal from a to b, also in penetration.
+    For bodies (a, b) the distance changes at ḋ = n·(ṗ_b - ṗ_a) = J v + drift, n the unit normal from a to b, also in
+    penetration.
     """
 
+    pair: IntArray
+    """(k,) which of the scene's pairs, in increasing order."""
     distance: Array
-    """(m,) signed distance between surfaces [m], negative in penetration."""
+    """(k,) signed distance between surfaces [m], negative in penetration."""
     normal: Array
-    """(m, 3) unit normal from body a to body b, world axes."""
+    """(k, 3) unit normal from body a to body b, world axes."""
     point_a: Array
-    """(m, 3) witness point on body a, world [m]."""
+    """(k, 3) witness point on body a, world [m]."""
     point_b: Array
-    """(m, 3) witness point on body b, world [m]."""
-    near: IntArray
-    """(k,) indices of the pairs within reach, in increasing order."""
+    """(k, 3) witness point on body b, world [m]."""
     J: Array
-    """(k, nv) velocity Jacobian of the distances of the near pairs [m/rad or 1]."""
+    """(k, nv) velocity Jacobian of the distances [m/rad or 1]."""
     drift: Array
     """(k,) rate of these distances due to the obstacles' own motion [m/s]."""
 
 
-@dataclass(frozen=True, slots=True)
-class Tracking:
+class Tracking(NamedTuple):
     """Rows A v = b of the tracking tasks."""
 
     A: Array
@@ -77,31 +76,27 @@ class Tracking:
     """λ of the damped J⁺, the same for every solver [-]."""
 
 
-@dataclass(frozen=True, slots=True)
-class AvoidanceRows:
-    """Rows J v + drift >= bound for the k pairs within the influence distance.
+class AvoidanceRows(NamedTuple):
+    """Rows J v >= b for the k pairs within the influence distance.
 
     `d` is the distance that the gains take: between surfaces plus the scenario's offset.
     """
 
     pair: IntArray
-    """(k,) index of the pair in `Problem.pair_names`."""
+    """(k,) index of the pair in `Problem.pair_names`, in increasing order."""
     d: Array
     """(k,) [m]."""
     J: Array
     """(k, nv)."""
-    drift: Array
-    """(k,) [m/s]."""
-    bound: Array
-    """(k,) lower bound on ḋ [m/s]."""
-    alpha: Array
-    """(k,) eq. 11, not capped [-]."""
-    beta: Array
-    """(k,) eq. 12 [-]."""
+    b: Array
+    """(k,) lower bound on ḋ less the drift [m/s]."""
+    d1: float
+    """Distance below which β is 1 [m]."""
+    d2: float
+    """Influence distance: α and β are 0 beyond it [m]."""
 
 
-@dataclass(frozen=True, slots=True)
-class Problem:
+class Problem(NamedTuple):
     """Everything that a solver may know about a tick."""
 
     tracking: Tracking
@@ -114,8 +109,7 @@ class Problem:
     """Names of the bodies of all m pairs."""
 
 
-@dataclass(frozen=True, slots=True)
-class Solution:
+class Solution(NamedTuple):
     """What a solver commands, and what it had to give up for it."""
 
     v: Array
@@ -145,7 +139,7 @@ def require_finite(name: str, value: Any, shape: tuple[int, ...]) -> Array:
         raise NumericalError(f"{name}: not an array of numbers: {value!r:.60}") from None
     if array.shape != shape:
         raise NumericalError(f"{name}: shape {array.shape}, expected {shape}")
-    if not np.isfinite(array).all():
+    if not isfinite(np.vdot(array, array)) and not np.isfinite(array).all():  # the first is quicker, and may overflow
         bad = ", ".join(str(i) for i in np.argwhere(~np.isfinite(array)).ravel()[:5])
         raise NumericalError(f"{name}: NaN or infinity at index {bad}")
     return array

@@ -1,26 +1,30 @@
-"""Closest points of every pair, and the rate of the distance of those within reach; by coal, without a Python loop.
+"""Closest points of the pairs within reach, and the rate of their distance; by coal, without a Python loop.
 
-coal leaves its results in one contiguous C++ vector. Reading it pair by pair through the bindings would cost more
-than computing it, so it is viewed as one array. That layout is not part of coal's interface: it is checked against
-the accessors when a query is built, and where it differs the accessors are used.
+Two things keep the cost of many pairs down. Bounding spheres tell which pairs can be within reach at all; the others
+are switched off, so that one call into C++ does the rest. And coal leaves its results in one contiguous vector:
+reading it pair by pair through the bindings would cost more than computing it, so it is viewed as one array. That
+layout is not part of coal's interface: it is checked against the accessors when a query is built, and where it
+differs the accessors are used.
 """
 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
-from qpavoid.kinematics import Kinematics, point_rows
+from qpavoid import kernels
+from qpavoid.kinematics import Kinematics
 from qpavoid.motion import Sample
-from qpavoid.problem import Array, Proximity
+from qpavoid.problem import Array, IntArray, Proximity
 from qpavoid.scene import Scene
 
 _FIELDS = 10
 """min_distance, normal, nearest point 1, nearest point 2: neighbours in coal's DistanceResult."""
+_CULL_FROM = 48
+"""Number of pairs from which looking at bounding spheres first pays."""
 
 
 class DistanceQuery:
@@ -38,26 +42,23 @@ class DistanceQuery:
         self._twists = np.zeros((obstacles + 1, 6))
         second = scene.pairs[:, 1] - self._first_obstacle
         self._twist_row = np.where(second >= 0, second, obstacles)
-        self._view = _view_results(self._geometry, self._data, scene.robot.model)
+        self._results = _view_results(self._geometry, self._data, scene.robot.model)
+        self._every_pair = np.arange(len(scene.pairs))
+        self._cull = _Cull(scene, self._geometry, self._data) if len(scene.pairs) >= _CULL_FROM else None
 
     def place_obstacle(self, index: int, sample: Sample) -> None:
         """Puts obstacle number `index` to a pose, with a velocity."""
         placement = pin.SE3(sample.rotation, sample.position)
-        self._geometry.geometryObjects[self._first_obstacle + index].placement = placement
-        self._twists[index, :3] = sample.linear - np.cross(sample.angular, sample.position)
-        self._twists[index, 3:] = sample.angular
-
-    def placements(self) -> Mapping[str, Any]:
-        """World placements of all bodies at the last call, by name; for drawing."""
-        return {
-            body.name: placement for body, placement in zip(self._geometry.geometryObjects, self._data.oMg, strict=True)
-        }
+        geometry = self._first_obstacle + index
+        self._geometry.geometryObjects[geometry].placement = placement
+        linear, angular, position = sample.linear, sample.angular, sample.position
+        self._twists[index, :3] = linear - _cross(angular, position)
+        self._twists[index, 3:] = angular
+        if self._cull is not None:
+            self._cull.place(geometry, placement)
 
     def compute(self, data: Any, kinematics: Kinematics, reach: float) -> Proximity:
-        """Distances of all pairs, and the Jacobian rows of those nearer than `reach`.
-
-        The normal is parallel to the line between the witness points, so p × n is the same at both, and every row is
-        J = [n, p × n]ᵀ J_world, masked with the difference of the supports of the two bodies.
+        """Closest points and rates of the pairs nearer than `reach`.
 
         Args:
             data: pinocchio data that holds the joint placements of this tick.
@@ -65,46 +66,111 @@ class DistanceQuery:
             reach: surface distance below which a pair is near [m].
         """
         pin.updateGeometryPlacements(self._scene.robot.model, data, self._geometry, self._data)
+        pairs = self._every_pair if self._cull is None else self._cull.switch(reach)
         pin.computeDistances(self._geometry, self._data)
-        results = _read_results(self._data.distanceResults) if self._view is None else self._view.copy()
-        distance, normal, point_a = results[:, 0], results[:, 1:4], results[:, 4:7]
-        near = np.flatnonzero(distance < reach)
-        rows = point_rows(normal[near], point_a[near])
-        return Proximity(
-            distance=distance,
-            normal=normal,
-            point_a=point_a,
-            point_b=results[:, 7:10],
-            near=near,
-            J=(rows @ kinematics.J) * self._scene.support[near],
-            drift=np.einsum("ij,ij->i", rows, self._twists[self._twist_row[near]]),
+        near, closest, J, drift = kernels.distance_rows(
+            _read_results(self._data.distanceResults) if self._results is None else self._results,
+            pairs,
+            reach,
+            kinematics.J,
+            self._scene.support,
+            self._twists,
+            self._twist_row,
         )
+        return Proximity(near, closest[:, 0], closest[:, 1:4], closest[:, 4:7], closest[:, 7:10], J, drift)
+
+
+class _Cull:
+    """Switches pairs off in coal's data whose bounding spheres are out of reach."""
+
+    def __init__(self, scene: Scene, geometry: Any, data: Any) -> None:
+        self._data = data
+        self._bodies = len(scene.body_names)
+        shapes = [body.geometry for body in geometry.geometryObjects]
+        for shape in shapes:
+            shape.computeLocalAABB()
+        self._local = np.array([shape.aabb_center for shape in shapes])
+        self._radius = np.array([shape.aabb_radius for shape in shapes])
+        self._centers = np.empty((len(shapes), 3))
+        for i, body in enumerate(geometry.geometryObjects):
+            self.place(i, body.placement)
+        self._pair_of = np.full((self._bodies, len(shapes)), -1, dtype=np.intp)
+        self._pair_of[scene.pairs[:, 0], scene.pairs[:, 1]] = np.arange(len(scene.pairs))
+        self._reach = -1.0
+        self._within = np.empty(self._pair_of.shape)
+        self._active = np.ones(len(scene.pairs), dtype=bool)
+        self._last = b""
+        self._poses = _view_poses(data)
+
+    def place(self, index: int, placement: Any) -> None:
+        """Moves the bounding sphere of one geometry."""
+        self._centers[index] = placement.act(self._local[index])
+
+    def switch(self, reach: float) -> IntArray:
+        """Switches pairs on and off; gives those that are on, in increasing order."""
+        if reach != self._reach:
+            touching = self._radius[: self._bodies, None] + self._radius + reach
+            self._within = np.where(self._pair_of >= 0, touching**2 * (1.0 + 1e-9), -1.0)
+            self._reach = reach
+        poses = _read_poses(self._data) if self._poses is None else self._poses
+        pairs = kernels.candidates(poses, self._local, self._centers, self._within, self._pair_of)
+        if pairs.tobytes() != self._last:
+            self._last = pairs.tobytes()
+            wanted = np.zeros_like(self._active)
+            wanted[pairs] = True
+            for pair in np.flatnonzero(wanted & ~self._active).tolist():
+                self._data.activateCollisionPair(pair)
+            for pair in np.flatnonzero(self._active & ~wanted).tolist():
+                self._data.deactivateCollisionPair(pair)
+            self._active = wanted
+        return pairs
+
+
+def _cross(a: Array, b: Array) -> tuple[float, float, float]:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def _view(addresses: list[int], fields: int) -> Array | None:
+    """Rows of `fields` doubles that begin at equally spaced addresses (n, fields), without a copy.
+
+    The view is valid as long as the C++ vector that it looks into lives and is not resized.
+    """
+    strides = np.diff(addresses)
+    if len(strides) == 0 or not (strides == strides[0]).all() or strides[0] < 8 * fields or strides[0] % 8:
+        return None
+    stride = int(strides[0])
+    doubles = (len(addresses) - 1) * stride // 8 + fields  # the last row must not be read past its own end
+    memory = np.ctypeslib.as_array((ctypes.c_double * doubles).from_address(addresses[0]))
+    return np.lib.stride_tricks.as_strided(memory, (len(addresses), fields), (stride, 8), writeable=False)
+
+
+def _address(array: Array) -> int:
+    return int(array.__array_interface__["data"][0])
+
+
+def _read_poses(data: Any) -> Array:
+    """World poses of all geometries through the accessors: rotation by columns, then translation (g, 12)."""
+    poses = [np.concatenate((pose.rotation.ravel(order="F"), pose.translation)) for pose in data.oMg]
+    return np.array(poses).reshape(-1, 12)
+
+
+def _view_poses(data: Any) -> Array | None:
+    """The same as a view of Pinocchio's memory, or None where it does not agree with the accessors."""
+    view = _view([_address(pose.rotation) for pose in data.oMg], 12)
+    return view if view is not None and np.array_equal(view, _read_poses(data)) else None
 
 
 def _read_results(results: Any) -> Array:
-    """All results through the accessors: (m, 10)."""
+    """All results through the accessors: distance, normal, nearest points (m, 10)."""
     rows = [(r.min_distance, *r.normal, *r.getNearestPoint1(), *r.getNearestPoint2()) for r in results]
     return np.array(rows, dtype=np.float64).reshape(-1, _FIELDS)
 
 
 def _view_results(geometry: Any, data: Any, model: Any) -> Array | None:
-    """The same as a view of coal's memory, or None where it does not agree with the accessors.
-
-    The view stays valid as long as `data` lives: its results are never resized.
-    """
+    """The same as a view of coal's memory, or None where it does not agree with the accessors."""
     pin.updateGeometryPlacements(model, model.createData(), geometry, data, pin.neutral(model))
     pin.computeDistances(geometry, data)
-    results = data.distanceResults
-    count = len(results)
-    if count < 2:
-        return None
-    addresses = [r.normal.__array_interface__["data"][0] for r in results]
-    strides = np.diff(addresses)
-    stride = int(strides[0])
-    if not (strides == stride).all() or stride < 8 * _FIELDS or stride % 8:
-        return None
-    # the distance stands before the normal; the last row must not be read past its own end
-    doubles = (count - 1) * stride // 8 + _FIELDS
-    memory = np.ctypeslib.as_array((ctypes.c_double * doubles).from_address(addresses[0] - 8))
-    view = np.lib.stride_tricks.as_strided(memory, shape=(count, _FIELDS), strides=(stride, 8), writeable=False)
-    return view if np.array_equal(view, _read_results(results), equal_nan=True) else None
+    # the distance stands before the normal
+    view = _view([_address(result.normal) - 8 for result in data.distanceResults], _FIELDS)
+    agrees = view is not None and np.array_equal(view, _read_results(data.distanceResults), equal_nan=True)
+    return view if agrees else None

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from qpavoid import gains
 from qpavoid.bodies import enclosing_capsule
 from qpavoid.config import ScenarioConfig
 from qpavoid.controller import Controller, Tick
@@ -16,6 +17,7 @@ from qpavoid.errors import ConfigError, NumericalError
 from qpavoid.loading import load_scenario
 from qpavoid.log import STATUSES, Log, versions
 from qpavoid.problem import Array
+from qpavoid.proximity import DistanceQuery
 from qpavoid.solvers import parse_solver
 
 
@@ -81,9 +83,9 @@ def _check_start(controller: Controller, q: Array, scenario: ScenarioConfig) -> 
             stacklevel=3,
         )
     proximity = controller.tick(q, 0.0).proximity
-    for pair in np.flatnonzero(proximity.distance < 0.0):
-        a, b = controller.scene.pair_names[pair]
-        depth = -1e3 * proximity.distance[pair]
+    for i in np.flatnonzero(proximity.distance < 0.0):
+        a, b = controller.scene.pair_names[proximity.pair[i]]
+        depth = -1e3 * proximity.distance[i]
         warnings.warn(f"{source}: q0: {a} and {b} overlap by {depth:.1f} mm at the start", StartWarning, stacklevel=3)
 
 
@@ -94,7 +96,7 @@ class Recorder:
         """Lays the arrays out for at most `ticks` ticks."""
         scene, model = controller.scene, controller.scene.robot.model
         self._scene, self._scenario, self._tasks = scene, scenario, controller.tasks
-        self._data = model.createData()
+        self._data, self._query = model.createData(), DistanceQuery(scene)  # distances of all pairs, near or not
         self._ends, self._radii = _drawing_axes(scene.robot.bodies)
         tasks, bodies, obstacles = len(controller.tasks), len(scene.body_names), len(scene.obstacles)
         shapes: dict[str, tuple[int, ...]] = {
@@ -130,28 +132,32 @@ class Recorder:
             "solve_time": solution.solve_time,
             "status": STATUSES.index(solution.status),
         }
-        if len(tick.proximity.distance):
-            values["closest_pair"] = int(np.argmin(tick.proximity.distance))
         if len(rows_avoid.d):
-            closest = int(np.argmin(rows_avoid.d))
-            values["alpha"], values["beta"] = rows_avoid.alpha[closest], rows_avoid.beta[closest]
+            d = rows_avoid.d.min(keepdims=True)
+            values["alpha"] = gains.alpha(d, rows_avoid.d2)[0]
+            values["beta"] = gains.beta(d, rows_avoid.d1, rows_avoid.d2)[0]
         for name, value in values.items():
             scalars[name][self._count] = value
         self._count += 1
 
     def _write_bodies(self, tick: Tick, rows: dict[str, Array]) -> None:
-        scene, distance = self._scene, tick.proximity.distance
+        scene = self._scene
+        pin.forwardKinematics(scene.robot.model, self._data, tick.state.q)
+        for i, obstacle in enumerate(scene.obstacles):
+            sample = obstacle.motion.sample(tick.state.t)
+            rows["obstacle_position"][i], rows["obstacle_rotation"][i] = sample.position, sample.rotation
+            if obstacle.moves:
+                self._query.place_obstacle(i, sample)
+        distance = self._query.compute(self._data, tick.kinematics, np.inf).distance
+        if len(distance):
+            self._arrays["closest_pair"][self._count] = np.argmin(distance)
         nearest = np.full(len(scene.geometry.geometryObjects), np.inf)
         np.minimum.at(nearest, scene.pairs[:, 0], distance)
         np.minimum.at(nearest, scene.pairs[:, 1], distance)
         rows["body_distance"][:] = nearest[: rows["body_distance"].shape[0]]
-        pin.forwardKinematics(scene.robot.model, self._data, tick.state.q)
         for i, body in enumerate(scene.robot.bodies.geometryObjects):
             joint = self._data.oMi[body.parentJoint]
             rows["body_ends"][i] = self._ends[i] @ joint.rotation.T + joint.translation
-        for i, obstacle in enumerate(scene.obstacles):
-            sample = obstacle.motion.sample(tick.state.t)
-            rows["obstacle_position"][i], rows["obstacle_rotation"][i] = sample.position, sample.rotation
 
     def log(self, stopped_by: str | None = None) -> Log:
         """What was written so far.

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from qpavoid import config
+from qpavoid import config, kernels
 from qpavoid.errors import located
 from qpavoid.kinematics import Kinematics
 from qpavoid.motion import Motion, Sample, build_motion
@@ -72,18 +72,25 @@ class TaskRows:
         """
         self._tasks = tuple(tasks)
         sizes = [task.rows for task in tasks]
-        starts = np.cumsum([0, *sizes[:-1]])
-        self._slices = [slice(start, start + size) for start, size in zip(starts, sizes, strict=True)]
-        self._mask = np.repeat(support[np.array(joints, dtype=np.intp)], sizes, axis=0)
-        self._screws = np.zeros((sum(sizes), 6))
-        weights = []
-        for task, rows in zip(tasks, self._slices, strict=True):
-            self._screws[rows.start : rows.start + 3, :3] = np.eye(3)
-            self._screws[rows.start + 3 : rows.stop, 3:] = np.eye(3)[: task.rows - 3]
-            orientation = [task.settings.orientation_weight] * (task.rows - 3)
-            weights += [task.settings.weight] * 3 + orientation
-        self._weight = np.array(weights)
-        self._damping = damping
+        total = sum(sizes)
+        self._first = np.cumsum([0, *sizes[:-1]])
+        self._support = np.repeat(support[np.array(joints, dtype=np.intp)], sizes, axis=0)
+        self._screws, self._error, self._velocity = np.zeros((total, 6)), np.empty(total), np.empty(total)
+        self._gain = np.repeat([task.settings.gain for task in tasks], sizes)
+        weights: list[float] = []
+        for task, first in zip(tasks, self._first, strict=True):
+            self._screws[first : first + 3, :3] = np.eye(3)
+            self._screws[first + 3 : first + task.rows, 3:] = np.eye(3)[: task.rows - 3]
+            weights += [task.settings.weight] * 3 + [task.settings.orientation_weight] * (task.rows - 3)
+        self._weight, self._damping = np.array(weights), damping
+        # (slice of rows, cap) of every velocity that is capped
+        caps = [(f, 3, task.settings.max_speed) for task, f in zip(tasks, self._first, strict=True)]
+        caps += [
+            (f + 3, 3, task.settings.max_turn_rate)
+            for task, f in zip(tasks, self._first, strict=True)
+            if task.rows == 6
+        ]
+        self._caps = [(slice(f, f + n), cap) for f, n, cap in caps if cap is not None]
 
     def compute(self, kinematics: Kinematics, targets: Sequence[Sample]) -> Tracking:
         """Rows v_frame = v_ref + K (x_ref - x), in world axes; the orientation error is the rotation vector of
@@ -93,24 +100,18 @@ class TaskRows:
             kinematics: of this tick, its frames in the order of the tasks.
             targets: where each task's frame should be now, and how fast.
         """
-        b = np.empty(len(self._weight))
-        for i, (task, rows, target) in enumerate(zip(self._tasks, self._slices, targets, strict=True)):
-            settings, x = task.settings, kinematics.position[i]
-            velocity = target.linear + settings.gain * (target.position - x)
-            b[rows.start : rows.start + 3] = _capped(velocity, settings.max_speed)
-            # p × e for the three axes e
-            self._screws[rows.start, 4:] = x[2], -x[1]
-            self._screws[rows.start + 1, 3::2] = -x[2], x[0]
-            self._screws[rows.start + 2, 3:5] = x[1], -x[0]
+        error, velocity, row = self._error, self._velocity, 0
+        for task, target, x, R in zip(self._tasks, targets, kinematics.position, kinematics.rotation, strict=True):
+            error[row : row + 3] = target.position - x
+            velocity[row : row + 3] = target.linear
+            row += 3
             if task.rows == 6:
-                error = pin.log3(target.rotation @ kinematics.rotation[i].T)
-                turn = target.angular + settings.gain * error
-                b[rows.start + 3 : rows.stop] = _capped(turn, settings.max_turn_rate)
-        A = (self._screws @ kinematics.J) * self._mask
-        return Tracking(A=A, b=b, weight=self._weight, damping=self._damping)
-
-
-def _capped(vector: Array, cap: float | None) -> Array:
-    if cap is None:
-        return vector
-    return vector * min(1.0, cap / max(float(np.linalg.norm(vector)), 1e-12))
+                error[row : row + 3] = pin.log3(target.rotation @ R.T)
+                velocity[row : row + 3] = target.angular
+                row += 3
+        A, b = kernels.frame_rows(
+            self._screws, self._first, kinematics.position, error, velocity, self._gain, kinematics.J, self._support
+        )
+        for rows, cap in self._caps:
+            b[rows] *= min(1.0, cap / max(float(np.linalg.norm(b[rows])), 1e-12))
+        return Tracking(A, b, self._weight, self._damping)

@@ -10,25 +10,39 @@ from scipy.linalg.lapack import dposv
 
 from qpavoid.problem import Array, IntArray
 
+WELL_CONDITIONED = 1e-6
+"""Ratio of the smallest to the largest pivot of J Jᵀ down to which J⁺ is taken from it without damping."""
+
 _CYCLE = np.array([1, 2, 0, 2, 0, 1])
 _ANTICYCLE = np.array([2, 0, 1, 1, 2, 0])
+_SKEW = np.zeros((3, 9))
+_SKEW[2, [1, 3]] = 1.0, -1.0
+_SKEW[1, [2, 6]] = -1.0, 1.0
+_SKEW[0, [5, 7]] = 1.0, -1.0
 
 
-def candidates(spheres: Array, others: Array, within: Array, pair_of: IntArray) -> IntArray:
+def candidates(poses: Array, local: Array, centers: Array, within: Array, pair_of: IntArray) -> IntArray:
     """Pairs whose bounding spheres are within reach of each other.
 
-    One matrix product gives all squared distances |a|² + |b|² - 2 a·b.
-
     Args:
-        spheres: rows [a, 1, |a|²] of the b bodies' centres a (b, 5).
-        others: columns [-2 c; |c|²; 1] of all g centres c (5, g).
+        poses: world poses of all geometries, rotation by columns and translation (g, 12).
+        local: centres of their bounding spheres in their own frames (g, 3) [m].
+        centers: the same in the world (g, 3) [m]; those of the b bodies of the robot, which come first, are
+            overwritten.
         within: squared distance up to which each combination counts (b, g) [m²]; negative where there is no pair.
-        pair_of: index of the pair of each combination (b * g,).
+        pair_of: index of the pair of each combination (b, g).
 
     Returns:
         (c,) indices of pairs, increasing.
     """
-    return pair_of[np.flatnonzero(spheres @ others <= within)]
+    bodies = len(within)
+    rotations = poses[:bodies, :9].reshape(-1, 3, 3)
+    centers[:bodies] = np.matmul(local[:bodies, None], rotations)[:, 0] + poses[:bodies, 9:]
+    square = np.einsum("ij,ij->i", centers, centers)
+    # |a|² + |b|² - 2 a·b <= within
+    products = centers[:bodies] @ centers.T
+    near = np.flatnonzero(2.0 * products >= (square[:bodies, None] + square) - within)
+    return np.sort(pair_of.ravel()[near])
 
 
 def distance_rows(
@@ -64,6 +78,29 @@ def distance_rows(
     return near, closest, J, np.einsum("ij,ji->i", twists[twist_row[near]], screws)
 
 
+def frame_rows(
+    screws: Array, first: IntArray, position: Array, error: Array, velocity: Array, gain: Array, J_world: Array,
+    support: Array,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Rows A v = b of frames that follow targets.
+
+    Args:
+        screws: directions of the rows (r, 6), overwritten: the moments p × e of each frame's three linear rows.
+        first: first row of each frame (f,); its linear rows are this one and the next two.
+        position: world positions of the frames (f, 3) [m].
+        error: target less present of each row (r,) [m, rad].
+        velocity: feed-forward of each row (r,) [m/s, rad/s].
+        gain: feedback gain of each row (r,) [1/s].
+        J_world: world Jacobian of all joints (6, nv).
+        support: which coordinates move each row's frame (r, nv).
+
+    Returns:
+        A (r, nv), b (r,).
+    """
+    screws[first[:, None] + np.arange(3), 3:] = (position @ _SKEW).reshape(-1, 3, 3)
+    return (screws @ J_world) * support, velocity + gain * error
+
+
 def velocity_bounds(
     q: Array, q_index: IntArray, v_index: IntArray, q_lower: Array, q_upper: Array, v_max: Array, rate: float
 ) -> tuple[Array, Array]:
@@ -71,22 +108,43 @@ def velocity_bounds(
     upper = v_max.copy()
     lower = -upper
     here, fastest = q[q_index], v_max[v_index]
-    lower[v_index] = np.maximum(np.minimum(rate * (q_lower - here), fastest), -fastest)
-    upper[v_index] = np.maximum(np.minimum(rate * (q_upper - here), fastest), -fastest)
+    slowest = -fastest
+    lower[v_index] = np.maximum(np.minimum(rate * (q_lower - here), fastest), slowest)
+    upper[v_index] = np.maximum(np.minimum(rate * (q_upper - here), fastest), slowest)
     return lower, upper
 
 
-def tracking_velocity(A: Array, b: Array, weight: Array, damping: float) -> Array:
-    """J⁺ẋ with J = W½ A, ẋ = W½ b and J⁺ = Jᵀ (J Jᵀ + λ²)⁻¹; NaN where the Gram matrix is singular."""
+def damped_solution(A: Array, b: Array, weight: Array, damping: float) -> Array:
+    """J⁺ẋ with J = W½ A, ẋ = W½ b and J⁺ = Jᵀ (J Jᵀ + λ²)⁻¹.
+
+    Args:
+        A: rows (r, nv).
+        b: right-hand sides (r,).
+        weight: of the rows (r,).
+        damping: λ [-].
+
+    Returns:
+        (nv,); NaN where there is no damping and J Jᵀ is close to singular.
+    """
     root = np.sqrt(weight)
     J = root[:, None] * A
     gram = J @ J.T
     gram.ravel()[:: len(gram) + 1] += damping * damping
-    _, x, info = dposv(gram, root * b)
+    factor, x, info = dposv(gram, root * b)
+    if damping == 0.0 and info == 0:
+        pivots = factor.diagonal() ** 2
+        info = int(pivots.min() < WELL_CONDITIONED * pivots.max())
     return J.T @ x if info == 0 else np.full(A.shape[1], np.nan)
 
 
-def shortfall(v: Array, J: Array, least: Array, lower: Array, upper: Array) -> float:
-    """Largest violation of J v >= least and lower <= v <= upper; negative inside, NaN stays NaN."""
-    over = float(np.maximum(v - upper, lower - v).max())
-    return max(over, float((least - J @ v).max())) if len(least) else over
+def shortfall(v: Array, J: Array, b: Array, lower: Array, upper: Array) -> float:
+    """Largest violation of J v >= b and lower <= v <= upper; negative inside, NaN where there is one."""
+    over = np.maximum(v - upper, lower - v).max()
+    return float(np.maximum(over, (b - J @ v).max()) if len(b) else over)
+
+
+def projection_cost(A: Array, weight: Array, regularization: float, v0: Array) -> tuple[Array, Array]:
+    """P = Aᵀ W A + λ (nv, nv) and q = -P v0 (nv,): ½ vᵀP v + qᵀv is smallest at v0."""
+    P = A.T @ (weight[:, None] * A)
+    P.ravel()[:: len(P) + 1] += regularization
+    return P, -(P @ v0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from qpavoid import gains, kernels
 from qpavoid.config import Eq10Solver, TrackingSolver
 from qpavoid.problem import Array, Problem, Solution, Tracking
 
@@ -29,16 +30,14 @@ def pseudo_inverse(A: Array, damping: float) -> Array:
     return np.asarray(np.linalg.solve(gram, A).T)
 
 
-def tracking_velocity(tracking: Tracking) -> tuple[Array, Array, Array]:
-    """Velocity that tracks as if nothing else mattered: J⁺ẋ of the weighted rows.
-
-    Returns:
-        J⁺ẋ (nv,), the weighted J (r, nv) and its damped inverse J⁺ (nv, r).
-    """
+def tracking_velocity(tracking: Tracking) -> Array:
+    """Velocity (nv,) that tracks as if nothing else mattered: J⁺ẋ of the weighted rows."""
+    v = kernels.damped_solution(tracking.A, tracking.b, tracking.weight, tracking.damping)
+    if v[0] == v[0]:
+        return v
+    # the rows contradict or repeat each other and no damping is asked for
     root = np.sqrt(tracking.weight)
-    J = root[:, None] * tracking.A
-    J_inv = pseudo_inverse(J, tracking.damping)
-    return J_inv @ (root * tracking.b), J, J_inv
+    return np.asarray(pseudo_inverse(root[:, None] * tracking.A, 0.0) @ (root * tracking.b))
 
 
 class TrackingOnly:
@@ -51,7 +50,7 @@ class TrackingOnly:
 
     def solve(self, problem: Problem) -> Solution:
         """J⁺ẋ."""
-        return Solution(tracking_velocity(problem.tracking)[0])
+        return Solution(tracking_velocity(problem.tracking))
 
 
 class Eq10:
@@ -71,21 +70,24 @@ class Eq10:
 
     def solve(self, problem: Problem) -> Solution:
         """Eq. 10, or J⁺ẋ when nothing is in range."""
-        primary, J, J_inv = tracking_velocity(problem.tracking)
-        rows = problem.avoidance
+        tracking, rows = problem.tracking, problem.avoidance
+        primary = tracking_velocity(tracking)
         if rows.d.size == 0:
             return Solution(primary)
+        J = np.sqrt(tracking.weight)[:, None] * tracking.A
+        J_inv = pseudo_inverse(J, tracking.damping)
         closest = int(np.argmin(rows.d))
         J_d = rows.J[closest]
         approach = float(J_d @ primary)
         literal = self.config.name == "eq10-literal"
-        alpha = min(float(rows.alpha[closest]), self.config.alpha_cap)
+        d = rows.d[closest : closest + 1]
+        alpha = min(float(gains.alpha(d, rows.d2)[0]), self.config.alpha_cap)
         if not literal and approach >= 0.0:
             alpha = 0.0
         switched = primary - alpha * approach * _row_inverse(J_d, damping=0.0)
         J_dN = J_d - (J_d @ J_inv) @ J
         wanted = self.config.retreat_speed - (approach if literal else float(J_d @ switched))
-        retreat = float(rows.beta[closest]) * wanted * _row_inverse(J_dN, self.config.damping)
+        retreat = float(gains.beta(d, rows.d1, rows.d2)[0]) * wanted * _row_inverse(J_dN, self.config.damping)
         return Solution(switched + retreat)
 
 

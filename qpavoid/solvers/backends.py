@@ -1,4 +1,4 @@
-"""QP back ends behind one call: min ½ xᵀP x + qᵀx subject to G x <= h, lower <= x <= upper.
+"""QP back ends behind one call: min ½ xᵀP x + qᵀx subject to G x >= h, lower <= x <= upper.
 
 daqp is called directly; every other one goes through qpsolvers. All are asked for tight tolerances: what they return
 is a velocity, and a velocity that is off by 1e-2 rad/s is a fault even where the solver reports success.
@@ -70,14 +70,11 @@ _DAQP_INFINITY = 1e30
 
 def solve_daqp(P: Array, q: Array, G: Array, h: Array, lower: Array, upper: Array) -> Array | None:
     """Dual active-set method (Arnström et al. 2022), called without a wrapper; bounds stay bounds."""
-    n, m = len(q), len(h)
-    above = np.minimum(np.concatenate((upper, h)), _DAQP_INFINITY)
-    below = np.full(n + m, -_DAQP_INFINITY)
-    below[:n] = np.maximum(lower, -_DAQP_INFINITY)
-    sense = np.zeros(n + m, dtype=ctypes.c_int)
-    x, _, flag, _ = daqp.solve(
-        np.ascontiguousarray(P), q, np.ascontiguousarray(G), above, below, sense, primal_tol=1e-9, dual_tol=1e-12
-    )
+    above = np.full(len(q) + len(h), _DAQP_INFINITY)
+    below = np.concatenate((lower, h))
+    above[: len(q)] = upper
+    sense = np.zeros(len(above), dtype=ctypes.c_int)
+    x, _, flag, _ = daqp.solve(P, q, G, above, below, sense, primal_tol=1e-9, dual_tol=1e-12)
     return np.asarray(x) if flag == 1 else None
 
 
@@ -87,7 +84,7 @@ def _through_qpsolvers(name: str) -> Backend:
 
     def solve(P: Array, q: Array, G: Array, h: Array, lower: Array, upper: Array) -> Array | None:
         as_given = csc_matrix if sparse else np.asarray
-        rows = {"G": as_given(G), "h": h} if len(h) else {}
+        rows = {"G": as_given(-G), "h": -h} if len(h) else {}
         problem = qpsolvers.Problem(as_given(P), q, **rows, lb=lower, ub=upper)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # "no solution" is an answer here, not news for the terminal

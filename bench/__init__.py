@@ -1,0 +1,1 @@
+"""Benchmarks of qpavoid; never part of the wheel."""

@@ -1,0 +1,220 @@
+"""Builds the workloads: a smooth recorded swing of a robot among seeded obstacles, with a target one period ahead."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from bench.tick.robots import ROBOTS, RobotSpec, load
+from bench.tick.workloads import Array, Body, Frame, Joint, Workload, pose
+from qpavoid import Obstacle, Robot, Scene, build_scene
+from qpavoid.config import Box, Sphere
+
+DT = 0.01
+TICKS = 1000
+D_MIN = 0.03
+CLEARANCE = 0.035
+"""Nothing comes closer than this on the recorded swing, so that no library has to get out of a violation."""
+NEAR = 0.05
+"""Obstacles that are put near a tool come at least this close to it."""
+INFLUENCES = (0.10, 0.30)
+SIZES = {"panda": (0, 5, 50, 500), "baxter": (0, 50), "g1": (8,)}
+"""Numbers of obstacles."""
+
+
+def names() -> list[str]:
+    """All workloads: ROBOT-OBSTACLES@INFLUENCE."""
+    return [f"{robot}-{n}@{d:.2f}" for robot, sizes in SIZES.items() for n in sizes for d in INFLUENCES]
+
+
+def build(name: str) -> Workload:
+    """The workload of that name; the same at every call."""
+    scenery, influence = name.split("@")
+    robot, obstacles = scenery.split("-")
+    workload = _build(robot, int(obstacles))
+    return replace(workload, name=name, influence=float(influence))
+
+
+def make_scene(workload: Workload) -> Scene:
+    """The live scene of a workload."""
+    robot = load(ROBOTS[workload.robot], workload.disabled_pairs)
+    return build_scene(
+        robot, [_obstacle(body) for body in workload.bodies[len(workload.bodies) - workload.obstacles :]]
+    )
+
+
+def reference(scene: Scene, workload: Workload, ticks: Any) -> tuple[Array, Array]:
+    """Frames (k, f, 4, 4) and distances (k, m) at some ticks, by Pinocchio and coal."""
+    model, geometry = scene.robot.model, scene.geometry
+    data, bodies = model.createData(), geometry.createData()
+    ids = [model.getFrameId(frame.name) for frame in workload.frames]
+    frames, distances = [], []
+    for tick in ticks:
+        pin.updateGeometryPlacements(model, data, geometry, bodies, workload.q[tick])
+        pin.updateFramePlacements(model, data)
+        frames.append([data.oMf[i].homogeneous for i in ids])
+        pin.computeDistances(geometry, bodies)
+        distances.append([result.min_distance for result in bodies.distanceResults])
+    return np.array(frames), np.array(distances).reshape(len(frames), -1)
+
+
+@cache
+def _build(name: str, count: int) -> Workload:
+    spec = ROBOTS[name]
+    robot = load(spec)
+    q = _swing(robot, spec)
+    disabled = _too_close(robot, q)
+    robot = load(spec, disabled)
+    obstacles = _scatter(robot, spec, q, count)
+    scene = build_scene(robot, [_obstacle(body) for body in obstacles])
+    model = robot.model
+    frames = tuple(
+        Frame(frame, model.frames[i].parentJoint, model.frames[i].placement.homogeneous)
+        for frame in spec.frames
+        for i in [model.getFrameId(frame)]
+    )
+    workload = Workload(
+        name="",
+        robot=name,
+        influence=0.0,
+        d_min=D_MIN,
+        dt=DT,
+        nv=model.nv,
+        joints=_joints(robot),
+        bodies=tuple(_body(body) for body in robot.bodies.geometryObjects) + tuple(obstacles),
+        obstacles=count,
+        pairs=np.array(scene.pairs),
+        disabled_pairs=disabled,
+        frames=frames,
+        q=q,
+        targets=np.empty(0),
+    )
+    poses, distances = reference(scene, workload, range(TICKS))
+    if distances.size and distances.min() < D_MIN:
+        raise AssertionError(f"{name}-{count}: the swing comes to {distances.min():.3f} m")
+    return replace(workload, targets=np.roll(poses, -1, axis=0))
+
+
+def _swing(robot: Robot, spec: RobotSpec) -> Array:
+    """(T, nq): every joint swings about the home pose at 0.2 to 0.5 Hz, each with a phase of its own."""
+    model, random = robot.model, np.random.default_rng(1)
+    cycles, phase = random.integers(2, 6, model.nv), random.uniform(0.0, 2.0 * np.pi, model.nv)
+    amplitude = np.full(model.nv, spec.swing)
+    home = np.array(robot.home)
+    if spec.root_joint == "free_flyer":
+        home[2] = spec.base_height
+        amplitude[:6] = 0.05
+    scalar = [joint for joint in list(model.joints)[1:] if joint.nq == joint.nv == 1]
+    for joint in scalar:
+        low, high = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
+        amplitude[joint.idx_v] = min(amplitude[joint.idx_v], 0.3 * (high - low))
+        room = amplitude[joint.idx_v] + 0.02
+        home[joint.idx_q] = np.clip(home[joint.idx_q], low + room, high - room)
+    angle = 2.0 * np.pi * np.arange(TICKS)[:, None] / TICKS * cycles + phase
+    return np.array([pin.integrate(model, home, step) for step in amplitude * np.sin(angle)])
+
+
+def _too_close(robot: Robot, q: Array) -> tuple[tuple[str, str], ...]:
+    """Pairs of the robot's own bodies that come nearer than the clearance: enclosing capsules of neighbours."""
+    geometry = robot.bodies
+    data, bodies = robot.model.createData(), geometry.createData()
+    closest = np.full(len(geometry.collisionPairs), np.inf)
+    for configuration in q[::5]:
+        pin.updateGeometryPlacements(robot.model, data, geometry, bodies, configuration)
+        pin.computeDistances(geometry, bodies)
+        closest = np.minimum(closest, [result.min_distance for result in bodies.distanceResults])
+    names = [body.name for body in geometry.geometryObjects]
+    pairs = list(geometry.collisionPairs)
+    return tuple((names[pairs[i].first], names[pairs[i].second]) for i in np.flatnonzero(closest < CLEARANCE))
+
+
+def _scatter(robot: Robot, spec: RobotSpec, q: Array, count: int) -> list[Body]:
+    """Spheres and boxes by turns, clear of the whole swing; a tenth (at least 3) beside a tool, the rest all around."""
+    random = np.random.default_rng(2)
+    points, radius, link = _samples(robot, q[::10])
+    tools = np.isin(link, spec.tools)
+    center, spread = points.mean(axis=0), 1.3
+    bodies: list[Body] = []
+    while len(bodies) < count:
+        near = len(bodies) < max(3, count // 10)
+        size = random.uniform(0.03, 0.08) if len(bodies) % 2 == 0 else random.uniform(0.05, 0.15, 3)
+        half = np.zeros(3) if np.ndim(size) == 0 else size / 2.0
+        inflate = float(size) if np.ndim(size) == 0 else 0.0
+        rotation = np.eye(3) if np.ndim(size) == 0 else _random_rotation(random)
+        if near:
+            direction = random.normal(size=3)
+            reach = random.uniform(0.05, 0.4)
+            position = points[tools][random.integers(tools.sum())] + reach * direction / np.linalg.norm(direction)
+        else:
+            position = center + spread * random.uniform(-1.0, 1.0, 3)
+        local = np.abs((points - position) @ rotation)
+        gap = np.linalg.norm(np.maximum(local - half, 0.0), axis=1) - inflate - radius
+        if gap.min() < CLEARANCE or (near and gap[tools].min() > NEAR):
+            continue
+        shape, sides = ("sphere", (float(size),)) if np.ndim(size) == 0 else ("box", tuple(map(float, size)))
+        bodies.append(Body(f"obstacle{len(bodies)}", 0, shape, sides, pose(rotation, position)))
+    return bodies
+
+
+def _samples(robot: Robot, q: Array) -> tuple[Array, Array, Any]:
+    """Points on the axes of all capsules along the swing (n, 3), their radii (n,) and their bodies' names (n,)."""
+    geometry = robot.bodies
+    data, bodies = robot.model.createData(), geometry.createData()
+    axis = np.linspace(-1.0, 1.0, 9)[:, None] * np.array([0.0, 0.0, 1.0])
+    points, radius, names = [], [], []
+    for configuration in q:
+        pin.updateGeometryPlacements(robot.model, data, geometry, bodies, configuration)
+        for body, placement in zip(geometry.geometryObjects, bodies.oMg, strict=True):
+            half = getattr(body.geometry, "halfLength", 0.0)
+            points.append(half * axis @ placement.rotation.T + placement.translation)
+            radius += [body.geometry.radius] * 9
+            names += [body.name] * 9
+    return np.concatenate(points), np.array(radius), np.array(names)
+
+
+def _random_rotation(random: np.random.Generator) -> Array:
+    q = random.normal(size=4)
+    return np.asarray(pin.Quaternion(q / np.linalg.norm(q)).toRotationMatrix())
+
+
+def _obstacle(body: Body) -> Obstacle:
+    shape = Sphere(radius=body.size[0]) if body.shape == "sphere" else Box(size=body.size)
+    return Obstacle.at(body.name, shape, body.placement[:3, 3], body.placement[:3, :3])
+
+
+def _body(body: Any) -> Body:
+    half = getattr(body.geometry, "halfLength", None)
+    size = (body.geometry.radius,) if half is None else (body.geometry.radius, 2.0 * half)
+    return Body(body.name, body.parentJoint, "sphere" if half is None else "capsule", size, body.placement.homogeneous)
+
+
+def _joints(robot: Robot) -> tuple[Joint, ...]:
+    """The kinematic tree of a Pinocchio model."""
+    model = robot.model
+    data = model.createData()
+    pin.computeJointJacobians(model, data, pin.neutral(model))
+    tree = [Joint("world", 0, "world", (0.0, 0.0, 0.0), np.eye(4), 0, 0, -np.inf, np.inf, np.inf)]
+    for i in range(1, model.njoints):
+        joint = model.joints[i]
+        screw = np.asarray(data.joints[i].S).reshape(6, -1)[:, 0]
+        kind = "free" if joint.nv == 6 else "slide" if np.any(screw[:3]) else "hinge"
+        free = kind == "free"
+        tree.append(
+            Joint(
+                name=model.names[i],
+                parent=model.parents[i],
+                kind=kind,
+                axis=tuple(screw[:3] if kind == "slide" else screw[3:]),
+                placement=model.jointPlacements[i].homogeneous,
+                q_index=joint.idx_q,
+                v_index=joint.idx_v,
+                lower=-np.inf if free else float(model.lowerPositionLimit[joint.idx_q]),
+                upper=np.inf if free else float(model.upperPositionLimit[joint.idx_q]),
+                velocity=np.inf if free else float(model.velocityLimit[joint.idx_v]),
+            )
+        )
+    return tuple(tree)

@@ -1,0 +1,69 @@
+"""Pink, on the same Pinocchio model and geometry."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pink
+import pinocchio as pin
+from pink.barriers import SelfCollisionBarrier
+from pink.tasks import FrameTask
+
+from bench.tick.build import make_scene
+from bench.tick.workloads import Array, Workload
+
+
+class AllPairs:
+    """A row for every pair."""
+
+    count: int | None = None
+    """How many of the closest pairs get a row; None: all."""
+    settings = (
+        "SelfCollisionBarrier(d_min, gain 1.0, safe_displacement_gain 1.0) of all pairs or of the 20 closest; it has "
+        "no influence distance; FrameTask(cost 1, gain 1.0, lm_damping 0); limits None: position and velocity; "
+        "damping 1e-12; solver daqp"
+    )
+    packages = ("pin-pink", "pin", "coal", "qpsolvers", "daqp", "numpy")
+
+    def __init__(self, workload: Workload) -> None:
+        self.workload = workload
+        scene = make_scene(workload)
+        self._q = list(workload.q)
+        model = scene.robot.model
+        self.configuration = pink.Configuration(
+            model, model.createData(), workload.q[0], collision_model=scene.geometry
+        )
+        pairs = len(workload.pairs)
+        count = pairs if self.count is None else min(self.count, pairs)
+        self.barriers = [SelfCollisionBarrier(count, d_min=workload.d_min)] if count else []
+        self.tasks = [FrameTask(frame.name, position_cost=1.0, orientation_cost=1.0) for frame in workload.frames]
+        self._targets = [[pin.SE3(target) for target in targets] for targets in workload.targets]
+
+    def step(self, tick: int) -> Array:
+        """One control step."""
+        for task, target in zip(self.tasks, self._targets[tick], strict=True):
+            task.set_target(target)
+        self.configuration.update(self._q[tick])
+        return pink.solve_ik(self.configuration, self.tasks, self.workload.dt, solver="daqp", barriers=self.barriers)
+
+    def velocity(self, v: Any) -> Array:
+        """As it is."""
+        return np.asarray(v)
+
+    def frames(self, tick: int) -> Array:
+        """Of Pink's configuration."""
+        self.configuration.update(self._q[tick])
+        frames = self.workload.frames
+        return np.array([self.configuration.get_transform_frame_to_world(f.name).homogeneous for f in frames])
+
+    def distances(self, tick: int) -> Array:
+        """Of Pink's configuration."""
+        self.configuration.update(self._q[tick])
+        return np.array([result.min_distance for result in self.configuration.collision_data.distanceResults])
+
+
+class Closest20(AllPairs):
+    """A row for each of the 20 closest pairs."""
+
+    count = 20
