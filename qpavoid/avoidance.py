@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from qpavoid import gains
+from qpavoid import kernels
 from qpavoid.config import Avoidance, Cbf, Switching
 from qpavoid.problem import Array, AvoidanceRows, Proximity
 
@@ -42,8 +42,5 @@ def closing_speed_bound(d: Array, config: Avoidance) -> Array:
     """
     row = config.row
     hold = config.d1 if isinstance(row, Switching) or row.d_safe is None else row.d_safe
-    bound = -row.gain * (d - hold)
-    if isinstance(row, Switching) and len(d):
-        # below d1, where β = 1, the row asks for recovery, which β does not weaken
-        bound = np.where(bound > 0.0, bound, (1.0 - gains.beta(d, config.d1, config.d2)) * bound)
-    return bound if isinstance(row, Cbf) else np.minimum(bound, config.recovery_speed)
+    cap = np.inf if isinstance(row, Cbf) else config.recovery_speed
+    return kernels.closing_speed_bound(d, hold, row.gain, cap, isinstance(row, Switching), config.d1, config.d2)

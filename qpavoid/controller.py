@@ -9,7 +9,7 @@ from typing import NamedTuple
 from qpavoid.avoidance import avoidance_rows
 from qpavoid.config import Avoidance, Limits, ScenarioConfig
 from qpavoid.errors import UnknownName, located
-from qpavoid.kinematics import Kinematics, compute_kinematics, support_masks
+from qpavoid.kinematics import ForwardKinematics, Kinematics, support_masks
 from qpavoid.limits import saturate, velocity_bounds
 from qpavoid.loading import nearest
 from qpavoid.motion import Sample
@@ -62,13 +62,13 @@ class Controller:
         self.scene, self.tasks, self.dt = scene, tuple(tasks), dt
         self.solver: Solver = make_solver(solver) if isinstance(solver, str) else solver
         self.avoidance, self.limits = avoidance or Avoidance(), limits or Limits()
-        self._model = model = scene.robot.model
-        self._data, self._q_shape = model.createData(), (model.nq,)
-        self._frame_ids = [task.frame_id for task in tasks]
+        model = scene.robot.model
+        self._kinematics = ForwardKinematics(model, [task.frame_id for task in tasks])
+        self._q_shape = (model.nq,)
         self._frame_index = {task.settings.frame: i for i, task in enumerate(tasks)}
         self._obstacle_index = {name: i for i, name in enumerate(scene.obstacle_names)}
         self._moving = [i for i, obstacle in enumerate(scene.obstacles) if obstacle.moves]
-        joints = [model.frames[frame_id].parentJoint for frame_id in self._frame_ids]
+        joints = [model.frames[task.frame_id].parentJoint for task in tasks]
         self._task_rows = TaskRows(tasks, support_masks(model), joints, tracking_damping)
         self._query = DistanceQuery(scene)
         self._bounds = scene.robot.bounds()
@@ -134,9 +134,9 @@ class Controller:
         q = require_finite("q", q, self._q_shape)
         samples = self._targets(t, targets)
         self._place_obstacles(t, obstacles)
-        kinematics = compute_kinematics(self._model, self._data, self._frame_ids, q)
+        kinematics = self._kinematics.compute(q)
         avoidance, limits = self.avoidance, self.limits
-        proximity = self._query.compute(self._data, kinematics, avoidance.d2 - avoidance.offset)
+        proximity = self._query.compute(self._kinematics.data, kinematics, avoidance.d2 - avoidance.offset)
         lower, upper = velocity_bounds(self._bounds, q, self.dt, limits.position_gain, limits.velocity_scale)
         tracking = self._task_rows.compute(kinematics, samples)
         problem = Problem(tracking, avoidance_rows(proximity, avoidance), lower, upper, self.scene.pair_names)
@@ -155,6 +155,8 @@ class Controller:
         return tuple(samples)
 
     def _place_obstacles(self, t: float, given: Mapping[str, Sample] | None) -> None:
+        if not given and not self._moving:
+            return
         given = given or {}
         for i in self._moving:
             if self.scene.obstacles[i].name not in given:

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import pinocchio as pin
@@ -31,8 +31,7 @@ END_TOLERANCE = 1e-9
 CSV_HEADERS = ("t,x,y,z", "t,x,y,z,qx,qy,qz,qw")
 
 
-@dataclass(frozen=True, slots=True)
-class Sample:
+class Sample(NamedTuple):
     """Pose of a body origin and its velocity, all in world axes."""
 
     position: Array

@@ -1,15 +1,11 @@
 """Closest points of the pairs within reach, and the rate of their distance; by coal, without a Python loop.
 
-Two things keep the cost of many pairs down. Bounding spheres tell which pairs can be within reach at all; the others
-are switched off, so that one call into C++ does the rest. And coal leaves its results in one contiguous vector:
-reading it pair by pair through the bindings would cost more than computing it, so it is viewed as one array. That
-layout is not part of coal's interface: it is checked against the accessors when a query is built, and where it
-differs the accessors are used.
+Bounding spheres tell which pairs can be within reach at all; the others are switched off, so that one call into C++
+does the rest, and its results are viewed as one array.
 """
 
 from __future__ import annotations
 
-import ctypes
 from typing import Any
 
 import numpy as np
@@ -17,12 +13,11 @@ import pinocchio as pin
 
 from qpavoid import kernels
 from qpavoid.kinematics import Kinematics
+from qpavoid.memory import read_poses, read_results, view_poses, view_results
 from qpavoid.motion import Sample
 from qpavoid.problem import Array, IntArray, Proximity
 from qpavoid.scene import Scene
 
-_FIELDS = 10
-"""min_distance, normal, nearest point 1, nearest point 2: neighbours in coal's DistanceResult."""
 _CULL_FROM = 48
 """Number of pairs from which looking at bounding spheres first pays."""
 
@@ -42,7 +37,10 @@ class DistanceQuery:
         self._twists = np.zeros((obstacles + 1, 6))
         second = scene.pairs[:, 1] - self._first_obstacle
         self._twist_row = np.where(second >= 0, second, obstacles)
-        self._results = _view_results(self._geometry, self._data, scene.robot.model)
+        model = scene.robot.model
+        pin.updateGeometryPlacements(model, model.createData(), self._geometry, self._data, pin.neutral(model))
+        pin.computeDistances(self._geometry, self._data)  # so that there is something to compare the view with
+        self._results = view_results(self._data.distanceResults)
         self._every_pair = np.arange(len(scene.pairs))
         self._cull = _Cull(scene, self._geometry, self._data) if len(scene.pairs) >= _CULL_FROM else None
 
@@ -69,7 +67,7 @@ class DistanceQuery:
         pairs = self._every_pair if self._cull is None else self._cull.switch(reach)
         pin.computeDistances(self._geometry, self._data)
         near, closest, J, drift = kernels.distance_rows(
-            _read_results(self._data.distanceResults) if self._results is None else self._results,
+            read_results(self._data.distanceResults) if self._results is None else self._results,
             pairs,
             reach,
             kinematics.J,
@@ -91,7 +89,7 @@ class _Cull:
             shape.computeLocalAABB()
         self._local = np.array([shape.aabb_center for shape in shapes])
         self._radius = np.array([shape.aabb_radius for shape in shapes])
-        self._centers = np.empty((len(shapes), 3))
+        self._centers = np.ones((len(shapes), 5))
         for i, body in enumerate(geometry.geometryObjects):
             self.place(i, body.placement)
         self._pair_of = np.full((self._bodies, len(shapes)), -1, dtype=np.intp)
@@ -100,11 +98,12 @@ class _Cull:
         self._within = np.empty(self._pair_of.shape)
         self._active = np.ones(len(scene.pairs), dtype=bool)
         self._last = b""
-        self._poses = _view_poses(data)
+        self._poses = view_poses(data.oMg)
 
     def place(self, index: int, placement: Any) -> None:
         """Moves the bounding sphere of one geometry."""
-        self._centers[index] = placement.act(self._local[index])
+        center = placement.act(self._local[index])
+        self._centers[index, :3], self._centers[index, 4] = center, -(center @ center)
 
     def switch(self, reach: float) -> IntArray:
         """Switches pairs on and off; gives those that are on, in increasing order."""
@@ -112,7 +111,7 @@ class _Cull:
             touching = self._radius[: self._bodies, None] + self._radius + reach
             self._within = np.where(self._pair_of >= 0, touching**2 * (1.0 + 1e-9), -1.0)
             self._reach = reach
-        poses = _read_poses(self._data) if self._poses is None else self._poses
+        poses = read_poses(self._data.oMg) if self._poses is None else self._poses
         pairs = kernels.candidates(poses, self._local, self._centers, self._within, self._pair_of)
         if pairs.tobytes() != self._last:
             self._last = pairs.tobytes()
@@ -128,49 +127,3 @@ class _Cull:
 
 def _cross(a: Array, b: Array) -> tuple[float, float, float]:
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-def _view(addresses: list[int], fields: int) -> Array | None:
-    """Rows of `fields` doubles that begin at equally spaced addresses (n, fields), without a copy.
-
-    The view is valid as long as the C++ vector that it looks into lives and is not resized.
-    """
-    strides = np.diff(addresses)
-    if len(strides) == 0 or not (strides == strides[0]).all() or strides[0] < 8 * fields or strides[0] % 8:
-        return None
-    stride = int(strides[0])
-    doubles = (len(addresses) - 1) * stride // 8 + fields  # the last row must not be read past its own end
-    memory = np.ctypeslib.as_array((ctypes.c_double * doubles).from_address(addresses[0]))
-    return np.lib.stride_tricks.as_strided(memory, (len(addresses), fields), (stride, 8), writeable=False)
-
-
-def _address(array: Array) -> int:
-    return int(array.__array_interface__["data"][0])
-
-
-def _read_poses(data: Any) -> Array:
-    """World poses of all geometries through the accessors: rotation by columns, then translation (g, 12)."""
-    poses = [np.concatenate((pose.rotation.ravel(order="F"), pose.translation)) for pose in data.oMg]
-    return np.array(poses).reshape(-1, 12)
-
-
-def _view_poses(data: Any) -> Array | None:
-    """The same as a view of Pinocchio's memory, or None where it does not agree with the accessors."""
-    view = _view([_address(pose.rotation) for pose in data.oMg], 12)
-    return view if view is not None and np.array_equal(view, _read_poses(data)) else None
-
-
-def _read_results(results: Any) -> Array:
-    """All results through the accessors: distance, normal, nearest points (m, 10)."""
-    rows = [(r.min_distance, *r.normal, *r.getNearestPoint1(), *r.getNearestPoint2()) for r in results]
-    return np.array(rows, dtype=np.float64).reshape(-1, _FIELDS)
-
-
-def _view_results(geometry: Any, data: Any, model: Any) -> Array | None:
-    """The same as a view of coal's memory, or None where it does not agree with the accessors."""
-    pin.updateGeometryPlacements(model, model.createData(), geometry, data, pin.neutral(model))
-    pin.computeDistances(geometry, data)
-    # the distance stands before the normal
-    view = _view([_address(result.normal) - 8 for result in data.distanceResults], _FIELDS)
-    agrees = view is not None and np.array_equal(view, _read_results(data.distanceResults), equal_nan=True)
-    return view if agrees else None

@@ -75,8 +75,12 @@ class TaskRows:
         total = sum(sizes)
         self._first = np.cumsum([0, *sizes[:-1]])
         self._support = np.repeat(support[np.array(joints, dtype=np.intp)], sizes, axis=0)
-        self._screws, self._error, self._velocity = np.zeros((total, 6)), np.empty(total), np.empty(total)
-        self._gain = np.repeat([task.settings.gain for task in tasks], sizes)
+        self._screws = np.zeros((total, 6))
+        self._turns = np.array([i for i, task in enumerate(tasks) if task.rows == 6], dtype=np.intp)
+        self._gain = np.array([task.settings.gain for task in tasks])
+        count = len(self._tasks)
+        self._position, self._rotation = np.empty((count, 3)), np.empty((count, 3, 3))
+        self._linear, self._angular = np.empty((count, 3)), np.empty((count, 3))
         weights: list[float] = []
         for task, first in zip(tasks, self._first, strict=True):
             self._screws[first : first + 3, :3] = np.eye(3)
@@ -100,18 +104,13 @@ class TaskRows:
             kinematics: of this tick, its frames in the order of the tasks.
             targets: where each task's frame should be now, and how fast.
         """
-        error, velocity, row = self._error, self._velocity, 0
-        for task, target, x, R in zip(self._tasks, targets, kinematics.position, kinematics.rotation, strict=True):
-            error[row : row + 3] = target.position - x
-            velocity[row : row + 3] = target.linear
-            row += 3
-            if task.rows == 6:
-                error[row : row + 3] = pin.log3(target.rotation @ R.T)
-                velocity[row : row + 3] = target.angular
-                row += 3
+        position, rotation, linear, angular = self._position, self._rotation, self._linear, self._angular
+        for i, target in enumerate(targets):
+            position[i], rotation[i], linear[i], angular[i] = target
         A, b = kernels.frame_rows(
-            self._screws, self._first, kinematics.position, error, velocity, self._gain, kinematics.J, self._support
-        )
+            self._screws, self._first, self._turns, kinematics.poses, position, rotation, linear, angular, self._gain,
+            kinematics.J, self._support,
+        )  # fmt: skip
         for rows, cap in self._caps:
             b[rows] *= min(1.0, cap / max(float(np.linalg.norm(b[rows])), 1e-12))
         return Tracking(A, b, self._weight, self._damping)

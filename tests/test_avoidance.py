@@ -14,8 +14,7 @@ TINY = 1e-9
 
 def bound(d, **row):
     settings = Avoidance(d1=D1, d2=D2, recovery_speed=0.2, row={"gain": XI, **row})
-    d = np.array(d, dtype=float)
-    return closing_speed_bound(d, beta(d, D1, D2), settings)
+    return closing_speed_bound(np.array(d, dtype=float), settings)
 
 
 # --- eq. 11 --------------------------------------------------------------------------------------------------
@@ -115,25 +114,27 @@ def test_a_row_that_is_met_exactly_never_passes_what_it_holds():
 
 
 def test_offset_is_added_and_near_pairs_keep_their_order():
+    """ḋ = J v + drift >= bound becomes J v >= bound - drift."""
     rng = np.random.default_rng(0)
     near = np.array([1, 4])
     J, drift = rng.normal(size=(2, 3)), rng.normal(size=2)
-    distance = np.array([9.0, 0.08, 9.0, 9.0, 0.02])
-    vectors = np.zeros((5, 3))
-    proximity = Proximity(distance, vectors, vectors, vectors, near, J, drift)
+    vectors = np.zeros((2, 3))
+    proximity = Proximity(near, np.array([0.08, 0.02]), vectors, vectors, vectors, J, drift)
     settings = Avoidance(d1=D1, d2=D2, offset=0.1, row={"type": "switching", "gain": XI})
     rows = avoidance_rows(proximity, settings)
     np.testing.assert_array_equal(rows.pair, near)
     np.testing.assert_allclose(rows.d, [0.18, 0.12])
-    np.testing.assert_allclose(rows.beta, [0.5, 1.0], atol=1e-15)
-    np.testing.assert_allclose(rows.alpha, [1 / 9, 1.0])
-    np.testing.assert_allclose(rows.bound, [-0.15, 0.0], atol=1e-12)
+    np.testing.assert_allclose(beta(rows.d, rows.d1, rows.d2), [0.5, 1.0], atol=1e-15)
+    np.testing.assert_allclose(alpha(rows.d, rows.d2), [1 / 9, 1.0])
+    np.testing.assert_allclose(rows.b, [-0.15, 0.0] - drift, rtol=0, atol=1e-12)
     np.testing.assert_array_equal(rows.J, J)
-    np.testing.assert_array_equal(rows.drift, drift)
+    np.testing.assert_array_equal(proximity.drift, drift)
 
 
-def test_no_pair_gives_no_row():
+@pytest.mark.parametrize("kind", ["switching", "damper", "cbf"])
+def test_no_pair_gives_no_row(kind):
     none, vectors = np.zeros(0), np.zeros((0, 3))
-    proximity = Proximity(none, vectors, vectors, vectors, np.zeros(0, dtype=np.intp), np.zeros((0, 7)), none)
-    rows = avoidance_rows(proximity, Avoidance())
-    assert rows.J.shape == (0, 7) and rows.bound.shape == rows.alpha.shape == rows.beta.shape == (0,)
+    proximity = Proximity(np.zeros(0, dtype=np.intp), none, vectors, vectors, vectors, np.zeros((0, 7)), none)
+    rows = avoidance_rows(proximity, Avoidance(row={"type": kind}))
+    assert rows.J.shape == (0, 7) and rows.pair.shape == rows.d.shape == rows.b.shape == (0,)
+    assert alpha(rows.d, rows.d2).shape == beta(rows.d, rows.d1, rows.d2).shape == (0,)

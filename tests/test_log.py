@@ -1,7 +1,7 @@
 """Records of runs: what is written, read back, cut short and run again."""
 
 import json
-from dataclasses import FrozenInstanceError, fields, replace
+from dataclasses import FrozenInstanceError, fields
 
 import numpy as np
 import pytest
@@ -159,7 +159,7 @@ def test_solver_that_returns_nan_ends_the_run_and_is_seen(monkeypatch):
 
     def fail(self, problem):
         solution = solve(self, problem)
-        return replace(solution, v=np.full_like(solution.v, np.nan))
+        return solution._replace(v=np.full_like(solution.v, np.nan))
 
     monkeypatch.setattr(TrackingOnly, "solve", fail)
     log = simulate(load_scenario("situation1", SHORT, "tracking"))

@@ -1,7 +1,7 @@
 """Distances against closed forms, their rates against finite differences, and the cost of a tick's Python."""
 
 import sys
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import coal
 import numpy as np
@@ -22,6 +22,7 @@ from conftest import (
 
 from qpavoid import Sample, build_scene, proximity
 from qpavoid.kinematics import compute_kinematics, support_masks
+from qpavoid.problem import Proximity
 from qpavoid.proximity import DistanceQuery
 from qpavoid.segments import capsule_distances
 
@@ -197,14 +198,15 @@ def test_columns_of_joints_beyond_the_body_are_exactly_zero(paper):
     """`left_forearm` hangs on link 5: it moves with joints 1 to 5 of the left arm, and with nothing else."""
     rng = np.random.default_rng(8)
     scene = build_scene(paper, [obstacle("ball", SPHERE, (0.3, 0.1, 0.8))])
-    found = look(scene, random_q(paper, rng))
+    rows = np.array([look(scene, random_q(paper, rng, spread=3.0)).J for _ in range(TICKS)])
     moving = {"upper_arm": 3, "forearm": 5, "hand": 7}
-    for (a, b), row in zip(scene.pair_names, found.J, strict=True):
+    for (a, b), row in zip(scene.pair_names, np.abs(rows).max(axis=0), strict=True):
         columns = set()
         for body in {a, b} - {"ball"}:
             side, _, part = body.partition("_")
             columns |= {i + 7 * (side == "right") for i in range(moving[part])}
-        assert set() < set(np.flatnonzero(row)) <= columns
+        assert set(np.flatnonzero(row)) <= columns
+        assert row.max() > 1e-2  # not in every configuration: the closest points may be the shoulders, which rest
 
 
 # --- penetration -------------------------------------------------------------------------------------------------
@@ -239,30 +241,35 @@ def test_in_penetration_the_normal_still_points_the_way_out(paper, shape):
 # --- how it is read ----------------------------------------------------------------------------------------------
 
 
-def same(a, b):
-    return all(np.array_equal(getattr(a, f.name), getattr(b, f.name)) for f in fields(a))
-
-
-def test_the_view_of_coals_memory_equals_the_accessors(panda):
+def test_the_views_of_the_libraries_memory_equal_the_accessors(panda):
     rng = np.random.default_rng(10)
     scene = random_scene(panda, rng, [SPHERE, CAPSULE, BOX])
     query = DistanceQuery(scene)
-    assert query._view is not None, "coal's layout has changed: the slow path is in use"
+    assert query._results is not None, "coal's layout has changed: the slow path is in use"
+    assert query._cull._poses is not None, "Pinocchio's layout has changed: the slow path is in use"
     for _ in range(3):
         look(scene, random_q(panda, rng), query=query)
-        np.testing.assert_array_equal(query._view, proximity._read_results(query._data.distanceResults))
+        np.testing.assert_array_equal(query._results, proximity._read_results(query._data.distanceResults))
+        np.testing.assert_array_equal(query._cull._poses, proximity._read_poses(query._data))
 
 
-def test_without_the_view_the_result_is_the_same(panda, monkeypatch):
+@pytest.mark.parametrize("missing", [["_view_results"], ["_view_poses"], ["_view_results", "_view_poses"]])
+def test_without_the_views_the_result_is_the_same(panda, monkeypatch, missing):
     rng = np.random.default_rng(11)
     scene = random_scene(panda, rng, [SPHERE, CAPSULE, BOX])
     qs = [random_q(panda, rng) for _ in range(3)]
     fast = [look(scene, q, reach=0.3) for q in qs]
-    monkeypatch.setattr(proximity, "_view_results", lambda *_: None)
+    for name in missing:
+        monkeypatch.setattr(proximity, name, lambda *_: None)
+    query = DistanceQuery(scene)
+    assert (query._results is None, query._cull._poses is None) == tuple(
+        name in missing for name in ("_view_results", "_view_poses")
+    )
     for q, expected in zip(qs, fast, strict=True):
         slow = look(scene, q, reach=0.3)
-        for f in fields(slow):  # GJK starts elsewhere in a fresh query: equal to rounding
-            np.testing.assert_allclose(getattr(slow, f.name), getattr(expected, f.name), rtol=0, atol=1e-12)
+        assert len(slow.pair)
+        for name in Proximity._fields:  # GJK starts elsewhere in a fresh query: equal to rounding
+            np.testing.assert_allclose(getattr(slow, name), getattr(expected, name), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
@@ -292,10 +299,11 @@ def test_only_pairs_within_reach_have_rows(panda):
     scene = random_scene(panda, rng, [SPHERE] * 5)
     q = random_q(panda, rng)
     everything, some = look(scene, q), look(scene, q, reach=0.2)
-    np.testing.assert_array_equal(some.near, np.flatnonzero(everything.distance < 0.2))
-    assert 0 < len(some.near) < len(scene.pairs)
-    np.testing.assert_array_equal(some.distance, everything.distance)
-    np.testing.assert_allclose(some.J, everything.J[some.near], rtol=0, atol=1e-15)
+    np.testing.assert_array_equal(everything.pair, np.arange(len(scene.pairs)))
+    np.testing.assert_array_equal(some.pair, np.flatnonzero(everything.distance < 0.2))
+    assert 0 < len(some.pair) < len(scene.pairs)
+    np.testing.assert_array_equal(some.distance, everything.distance[some.pair])
+    np.testing.assert_allclose(some.J, everything.J[some.pair], rtol=0, atol=1e-15)
 
 
 def test_a_kept_result_is_not_overwritten_by_the_next_tick(panda):
@@ -303,9 +311,9 @@ def test_a_kept_result_is_not_overwritten_by_the_next_tick(panda):
     scene = random_scene(panda, rng, [SPHERE, CAPSULE])
     query = DistanceQuery(scene)
     first = look(scene, random_q(panda, rng), query=query)
-    kept = {f.name: getattr(first, f.name).copy() for f in fields(first)}
+    kept = {name: value.copy() for name, value in first._asdict().items()}
     second = look(scene, random_q(panda, rng), query=query)
-    assert not same(first, second)
+    assert not any(np.array_equal(getattr(first, name), getattr(second, name)) for name in ("distance", "point_a", "J"))
     for name, value in kept.items():
         np.testing.assert_array_equal(getattr(first, name), value)
 
@@ -318,29 +326,3 @@ def test_an_obstacle_is_seen_to_move_while_the_robot_rests(panda):
     assert later.distance[-1] > first.distance[-1] + 1.0
 
 
-def python_work(scene, q):
-    """How many bytecode instructions one tick executes: any loop in Python over the pairs shows in it."""
-    query, model = DistanceQuery(scene), scene.robot.model
-    data = model.createData()
-    kinematics = compute_kinematics(model, data, [], q)
-    count = 0
-
-    def trace(frame, event, arg):
-        nonlocal count
-        frame.f_trace_opcodes = True
-        count += event == "opcode"
-        return trace
-
-    before = sys.gettrace()
-    sys.settrace(trace)
-    try:
-        query.compute(data, kinematics, 10.0)
-    finally:
-        sys.settrace(before)
-    return count
-
-
-def test_python_work_does_not_grow_with_the_number_of_pairs(panda):
-    rng = np.random.default_rng(14)
-    few, many = (python_work(random_scene(panda, rng, [SPHERE] * n), panda.home) for n in (10, 300))
-    assert 0 < few == many < 2000

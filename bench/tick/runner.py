@@ -7,7 +7,7 @@ import pickle
 import subprocess
 import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,9 @@ DISTANCE_TOLERANCE = 1e-6
 """For spheres and capsules, which every library computes in closed form."""
 BOX_TOLERANCE = 1e-5
 """For pairs with a box, which the libraries compute by different iterative algorithms [m]."""
+
+RATE_TOLERANCE = 2e-3
+"""How much faster than its row allows a pair may close: what a difference of distances can tell [m/s]."""
 
 
 class LibraryError(Exception):
@@ -90,6 +93,8 @@ class Cell:
     """Median distance of the frames to their targets after one step [m]."""
     stages: dict[str, float] = field(default_factory=dict)
     """Median time of each stage [µs], for qpavoid."""
+    velocities: Array | None = None
+    """(k, nv) its answers at the checked ticks."""
     refused: str = ""
     """Why it was not timed."""
 
@@ -151,9 +156,10 @@ def run(workloads: Sequence[str], libraries: Sequence[str], rounds: int, ticks: 
                 results.missing[name] = str(error)
                 if process is not None:
                     process.close()
+        gains = {name: info["closing_gain"] for name, info in results.libraries.items()}
         for name in workloads:
             print(f"{name} ", end="", file=sys.stderr, flush=True)
-            results.rows.append(_measure(build.build(name), processes, rounds, ticks, budget))
+            results.rows.append(_measure(build.build(name), processes, gains, rounds, ticks, budget))
             print(file=sys.stderr)
     finally:
         for process in processes.values():
@@ -162,7 +168,14 @@ def run(workloads: Sequence[str], libraries: Sequence[str], rounds: int, ticks: 
     return results
 
 
-def _measure(workload: Workload, processes: dict[str, Process], rounds: int, ticks: int, budget: float) -> Row:
+def _measure(
+    workload: Workload,
+    processes: dict[str, Process],
+    gains: dict[str, float | None],
+    rounds: int,
+    ticks: int,
+    budget: float,
+) -> Row:
     scene = build.make_scene(workload)
     frames, distances = build.reference(scene, workload, CHECK_TICKS)
     cells = {name: Cell() for name in processes}
@@ -170,7 +183,10 @@ def _measure(workload: Workload, processes: dict[str, Process], rounds: int, tic
     for name, process in processes.items():
         try:
             process.ask("setup", workload=workload)
-            _check(cells[name], process.ask("check", ticks=CHECK_TICKS), frames, distances, workload, scene)
+            answer = process.ask("check", ticks=CHECK_TICKS)
+            _check(cells[name], answer, frames, distances, workload, scene)
+            if gains.get(name) is not None:
+                _check_rows(answer["velocities"], gains[name], distances, workload, scene)
             sample = process.ask("round", ticks=CHECK_TICKS[:3], warmup=CHECK_TICKS[:1])["ns"]
             pace[name] = 1e-9 * float(np.median(sample))
         except LibraryError as error:
@@ -221,6 +237,7 @@ def _check(cell: Cell, answer: dict[str, Any], frames: Array, distances: Array, 
     cell.distance_error = float(np.max(error[:, ~box], initial=0.0))
     cell.box_error = float(np.max(np.where(relevant, error, 0.0)[:, box], initial=0.0))
     cell.tracking_error = _tracking_error(answer["velocities"], workload, scene)
+    cell.velocities = answer["velocities"]
     if not cell.frame_error <= FRAME_TOLERANCE:
         raise LibraryError(f"its frames differ by {cell.frame_error:.1e}")
     if not (cell.distance_error <= DISTANCE_TOLERANCE and cell.box_error <= BOX_TOLERANCE):
@@ -231,6 +248,21 @@ def _check(cell: Cell, answer: dict[str, Any], frames: Array, distances: Array, 
         raise LibraryError(f"{int(different.sum())} pairs are in range for one and not for the other")
     if not np.isfinite(answer["velocities"]).all():
         raise LibraryError("its velocities are not finite")
+
+
+def _check_rows(velocities: Array, gain: float, distances: Array, workload: Workload, scene: Any) -> None:
+    """Whether a library's velocities respect its avoidance rows: the rate of every distance, by a difference.
+
+    Raises:
+        LibraryError: a pair in range closes too fast, so that its row must be missing or wrong.
+    """
+    model, step = scene.robot.model, 1e-5
+    moved = [pin.integrate(model, workload.q[tick], v * step) for tick, v in zip(CHECK_TICKS, velocities, strict=True)]
+    rate = (build.reference(scene, replace(workload, q=np.array(moved)), range(len(moved)))[1] - distances) / step
+    short = -gain * (distances - workload.d_min) - rate
+    worst = float(np.max(short, initial=-np.inf, where=distances < workload.influence))
+    if worst > RATE_TOLERANCE:
+        raise LibraryError(f"a pair in range closes {1e3 * worst:.1f} mm/s too fast")
 
 
 def _tracking_error(velocities: Iterable[Array], workload: Workload, scene: Any) -> float:

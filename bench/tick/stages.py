@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 STAGES = {
-    "kinematics": ("qpavoid.controller:compute_kinematics",),
+    "kinematics": ("qpavoid.kinematics:ForwardKinematics.compute",),
     "proximity": ("qpavoid.proximity:DistanceQuery.compute",),
     "rows": ("qpavoid.controller:avoidance_rows", "qpavoid.tasks:TaskRows.compute"),
     "limits": ("qpavoid.controller:velocity_bounds",),

@@ -34,7 +34,11 @@ class Worker:
                 versions[package] = version(package)
             except PackageNotFoundError:
                 versions[package] = "?"
-        return {"versions": versions, "settings": self._adapter.settings, "python": sys.version.split()[0]}
+        return {
+            "versions": versions,
+            "settings": self._adapter.settings,
+            "closing_gain": getattr(self._adapter, "closing_gain", None),
+        }
 
     def setup(self, workload: Any) -> dict[str, Any]:
         """Builds the library's own model of a workload."""

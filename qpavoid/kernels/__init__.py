@@ -15,6 +15,7 @@ ACCELERATED = os.environ.get("QPAVOID_NUMBA", "1") != "0" and find_spec("numba")
 if TYPE_CHECKING or not ACCELERATED:
     from qpavoid.kernels.vectorised import (
         candidates,
+        closing_speed_bound,
         damped_solution,
         distance_rows,
         frame_rows,
@@ -25,6 +26,7 @@ if TYPE_CHECKING or not ACCELERATED:
 else:
     from qpavoid.kernels.compiled import (
         candidates,
+        closing_speed_bound,
         damped_solution,
         distance_rows,
         frame_rows,
@@ -36,6 +38,7 @@ else:
 __all__ = [
     "ACCELERATED",
     "candidates",
+    "closing_speed_bound",
     "damped_solution",
     "distance_rows",
     "frame_rows",

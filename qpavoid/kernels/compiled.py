@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from qpavoid.kernels.vectorised import WELL_CONDITIONED
+from qpavoid.kernels.vectorised import WELL_CONDITIONED, rotation_vector
 from qpavoid.problem import Array, IntArray
 
 
@@ -20,6 +20,7 @@ def candidates(poses: Array, local: Array, centers: Array, within: Array, pair_o
         for r in range(3):
             turned = poses[i, r] * local[i, 0] + poses[i, 3 + r] * local[i, 1] + poses[i, 6 + r] * local[i, 2]
             centers[i, r] = turned + poses[i, 9 + r]
+        centers[i, 4] = -(centers[i, 0] ** 2 + centers[i, 1] ** 2 + centers[i, 2] ** 2)
     x, y, z = centers[:, 0].copy(), centers[:, 1].copy(), centers[:, 2].copy()
     found = np.empty(bodies * geometries, np.intp)
     near = np.empty(geometries, np.bool_)
@@ -69,21 +70,47 @@ def distance_rows(
 
 
 @njit(cache=True)
+def closing_speed_bound(d: Array, hold: float, gain: float, cap: float, switching: bool, d1: float, d2: float) -> Array:
+    """See `vectorised.closing_speed_bound`."""
+    bound = np.empty(len(d))
+    for k in range(len(d)):
+        value = gain * (hold - d[k])
+        if switching and not value > 0.0:
+            share = min(max((d[k] - d1) / (d2 - d1), 0.0), 1.0)
+            value *= 0.5 - 0.5 * np.cos(np.pi * share)
+        bound[k] = min(value, cap)
+    return bound
+
+
+_rotation_vector = njit(cache=True)(rotation_vector)
+
+
+@njit(cache=True)
 def frame_rows(
-    screws: Array, first: IntArray, position: Array, error: Array, velocity: Array, gain: Array, J_world: Array,
-    support: Array,
+    screws: Array, first: IntArray, turns: IntArray, poses: Array, position: Array, rotation: Array, linear: Array,
+    angular: Array, gain: Array, J_world: Array, support: Array,
 ) -> tuple[Array, Array]:  # fmt: skip
     """See `vectorised.frame_rows`."""
-    for f in range(len(first)):
-        r, x, y, z = first[f], position[f, 0], position[f, 1], position[f, 2]
-        screws[r, 4], screws[r, 5] = z, -y
-        screws[r + 1, 3], screws[r + 1, 5] = -z, x
-        screws[r + 2, 3], screws[r + 2, 4] = y, -x
     rows, nv = support.shape
     A = np.zeros((rows, nv))
     b = np.empty(rows)
+    for f in range(len(first)):
+        r, x, y, z = first[f], poses[f, 9], poses[f, 10], poses[f, 11]
+        screws[r, 4], screws[r, 5] = z, -y
+        screws[r + 1, 3], screws[r + 1, 5] = -z, x
+        screws[r + 2, 3], screws[r + 2, 4] = y, -x
+        for i in range(3):
+            b[r + i] = linear[f, i] + gain[f] * (position[f, i] - poses[f, 9 + i])
+    for f in turns:
+        missing = np.zeros((3, 3))
+        for i in range(3):
+            for j in range(3):
+                for c in range(3):
+                    missing[i, j] += rotation[f, i, c] * poses[f, 3 * c + j]
+        errors = _rotation_vector(missing)
+        for i in range(3):
+            b[first[f] + 3 + i] = angular[f, i] + gain[f] * errors[i]
     for r in range(rows):
-        b[r] = velocity[r] + gain[r] * error[r]
         for s in range(6):
             e = screws[r, s]
             if e != 0.0:

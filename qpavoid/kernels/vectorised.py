@@ -5,14 +5,20 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import numpy as np
 from scipy.linalg.lapack import dposv
 
+from qpavoid import gains
 from qpavoid.problem import Array, IntArray
 
 WELL_CONDITIONED = 1e-6
 """Ratio of the smallest to the largest pivot of J Jᵀ down to which J⁺ is taken from it without damping."""
 
+_SWAPPED, _DOUBLED = np.array([0, 1, 2, 4, 3]), np.array([2.0, 2.0, 2.0, 1.0, 1.0])
+_THREE = np.arange(3)
 _CYCLE = np.array([1, 2, 0, 2, 0, 1])
 _ANTICYCLE = np.array([2, 0, 1, 1, 2, 0])
 _SKEW = np.zeros((3, 9))
@@ -27,8 +33,8 @@ def candidates(poses: Array, local: Array, centers: Array, within: Array, pair_o
     Args:
         poses: world poses of all geometries, rotation by columns and translation (g, 12).
         local: centres of their bounding spheres in their own frames (g, 3) [m].
-        centers: the same in the world (g, 3) [m]; those of the b bodies of the robot, which come first, are
-            overwritten.
+        centers: the same in the world, as rows [c, 1, -|c|²] (g, 5) [m]; those of the b bodies of the robot, which
+            come first, are overwritten.
         within: squared distance up to which each combination counts (b, g) [m²]; negative where there is no pair.
         pair_of: index of the pair of each combination (b, g).
 
@@ -36,12 +42,11 @@ def candidates(poses: Array, local: Array, centers: Array, within: Array, pair_o
         (c,) indices of pairs, increasing.
     """
     bodies = len(within)
-    rotations = poses[:bodies, :9].reshape(-1, 3, 3)
-    centers[:bodies] = np.matmul(local[:bodies, None], rotations)[:, 0] + poses[:bodies, 9:]
-    square = np.einsum("ij,ij->i", centers, centers)
-    # |a|² + |b|² - 2 a·b <= within
-    products = centers[:bodies] @ centers.T
-    near = np.flatnonzero(2.0 * products >= (square[:bodies, None] + square) - within)
+    body = centers[:bodies]
+    body[:, :3] = np.matmul(local[:bodies, None], poses[:bodies, :9].reshape(-1, 3, 3))[:, 0] + poses[:bodies, 9:]
+    np.einsum("ij,ij->i", body[:, :3], -body[:, :3], out=body[:, 4])
+    # 2 a·c - |a|² - |c|² >= -within, the left side as one matrix product
+    near = np.flatnonzero(body[:, _SWAPPED] * _DOUBLED @ centers.T >= -within)
     return np.sort(pair_of.ravel()[near])
 
 
@@ -65,9 +70,8 @@ def distance_rows(
     Returns:
         near (k,), closest points (k, 10), J (k, nv), drift (k,).
     """
-    closest = results[pairs]
-    keep = np.flatnonzero(closest[:, 0] < reach)
-    near, closest = pairs[keep], closest[keep]
+    near = pairs[results[pairs, 0] < reach]
+    closest = results[near]
     screws = np.empty((6, len(near)))
     columns = closest.T
     normal, point = columns[1:4], columns[4:7]
@@ -75,30 +79,71 @@ def distance_rows(
     products = point[_CYCLE] * normal[_ANTICYCLE]
     np.subtract(products[:3], products[3:], out=screws[3:])
     J = (screws.T @ J_world) * support[near]
-    return near, closest, J, np.einsum("ij,ji->i", twists[twist_row[near]], screws)
+    drift = np.einsum("ij,ji->i", twists[twist_row[near]], screws) if twists.any() else np.zeros(len(near))
+    return near, closest, J, drift
+
+
+def closing_speed_bound(d: Array, hold: float, gain: float, cap: float, switching: bool, d1: float, d2: float) -> Array:
+    """See `qpavoid.avoidance.closing_speed_bound`."""
+    bound = gain * (hold - d)
+    if switching:
+        # below d1, where β = 1, the row asks for recovery, which β does not weaken
+        bound = np.where(bound > 0.0, bound, (1.0 - gains.beta(d, d1, d2)) * bound)
+    return np.minimum(bound, cap)
+
+
+def rotation_vector(R: Any) -> tuple[float, float, float]:
+    """Rotation vector [rad] of a rotation R[i][j], with an angle up to and including π.
+
+    By way of the quaternion, whose largest component is taken first, so that nothing is lost near half a turn.
+    """
+    trace = R[0][0] + R[1][1] + R[2][2]
+    if trace >= max(R[0][0], R[1][1], R[2][2]):
+        w, x, y, z = 1.0 + trace, R[2][1] - R[1][2], R[0][2] - R[2][0], R[1][0] - R[0][1]
+    elif R[0][0] >= max(R[1][1], R[2][2]):
+        w, x, y, z = R[2][1] - R[1][2], 1.0 + 2.0 * R[0][0] - trace, R[0][1] + R[1][0], R[0][2] + R[2][0]
+    elif R[1][1] >= R[2][2]:
+        w, x, y, z = R[0][2] - R[2][0], R[0][1] + R[1][0], 1.0 + 2.0 * R[1][1] - trace, R[1][2] + R[2][1]
+    else:
+        w, x, y, z = R[1][0] - R[0][1], R[0][2] + R[2][0], R[1][2] + R[2][1], 1.0 + 2.0 * R[2][2] - trace
+    length = math.sqrt(x * x + y * y + z * z)
+    if length < 1e-12:
+        return 0.5 * x, 0.5 * y, 0.5 * z
+    scale = (2.0 if w >= 0.0 else -2.0) * math.atan2(length, abs(w)) / length
+    return scale * x, scale * y, scale * z
 
 
 def frame_rows(
-    screws: Array, first: IntArray, position: Array, error: Array, velocity: Array, gain: Array, J_world: Array,
-    support: Array,
+    screws: Array, first: IntArray, turns: IntArray, poses: Array, position: Array, rotation: Array, linear: Array,
+    angular: Array, gain: Array, J_world: Array, support: Array,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Rows A v = b of frames that follow targets.
+    """Rows A v = b of frames that follow targets: feed-forward plus gain times what is missing.
 
     Args:
         screws: directions of the rows (r, 6), overwritten: the moments p × e of each frame's three linear rows.
         first: first row of each frame (f,); its linear rows are this one and the next two.
-        position: world positions of the frames (f, 3) [m].
-        error: target less present of each row (r,) [m, rad].
-        velocity: feed-forward of each row (r,) [m/s, rad/s].
-        gain: feedback gain of each row (r,) [1/s].
+        turns: those of the frames whose orientation counts as well, in the next three rows.
+        poses: of the frames (f, 12), rotation by columns and position.
+        position: of the targets (f, 3) [m].
+        rotation: of the targets (f, 3, 3).
+        linear: velocities of the targets (f, 3) [m/s].
+        angular: their angular velocities (f, 3) [rad/s].
+        gain: feedback gain of each frame (f,) [1/s].
         J_world: world Jacobian of all joints (6, nv).
         support: which coordinates move each row's frame (r, nv).
 
     Returns:
         A (r, nv), b (r,).
     """
-    screws[first[:, None] + np.arange(3), 3:] = (position @ _SKEW).reshape(-1, 3, 3)
-    return (screws @ J_world) * support, velocity + gain * error
+    here, rows = poses[:, 9:], first[:, None] + _THREE
+    screws[rows, 3:] = (here @ _SKEW).reshape(-1, 3, 3)
+    b = np.empty(len(screws))
+    b[rows] = linear + gain[:, None] * (position - here)
+    if len(turns):
+        # poses hold rotations by columns, so these are their transposes
+        missing = (rotation[turns] @ poses[turns, :9].reshape(-1, 3, 3)).tolist()
+        b[rows[turns] + 3] = angular[turns] + gain[turns, None] * [rotation_vector(R) for R in missing]
+    return (screws @ J_world) * support, b
 
 
 def velocity_bounds(

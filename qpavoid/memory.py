@@ -1,0 +1,62 @@
+"""Views of C++ vectors as arrays.
+
+Reading a vector of poses or distances element by element through the bindings costs more than computing it. A view
+of the whole costs nothing, but rests on the layout of the elements, which is not part of the libraries' interfaces:
+each view is checked against the accessors when it is made, and is None where it does not agree.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import numpy as np
+
+from qpavoid.problem import Array
+
+RESULT = 10
+"""Doubles of a distance result: distance, normal, nearest point 1, nearest point 2."""
+
+
+def _view(addresses: list[int], fields: int) -> Array | None:
+    """Rows of `fields` doubles that begin at equally spaced addresses (n, fields), without a copy.
+
+    The view is valid as long as the C++ vector that it looks into lives and is not resized.
+    """
+    strides = np.diff(addresses)
+    if len(strides) == 0 or not (strides == strides[0]).all() or strides[0] < 8 * fields or strides[0] % 8:
+        return None
+    stride = int(strides[0])
+    doubles = (len(addresses) - 1) * stride // 8 + fields  # the last row must not be read past its own end
+    memory = np.ctypeslib.as_array((ctypes.c_double * doubles).from_address(addresses[0]))
+    return np.lib.stride_tricks.as_strided(memory, (len(addresses), fields), (stride, 8), writeable=False)
+
+
+def _address(array: Array) -> int:
+    return int(array.__array_interface__["data"][0])
+
+
+def read_poses(poses: Any) -> Array:
+    """World poses through the accessors: rotation by columns, then translation (n, 12)."""
+    rows = [np.concatenate((pose.rotation.ravel(order="F"), pose.translation)) for pose in poses]
+    return np.array(rows).reshape(-1, 12)
+
+
+def view_poses(poses: Any) -> Array | None:
+    """The same as a view, or None where it does not agree with the accessors."""
+    view = _view([_address(pose.rotation) for pose in poses], 12)
+    return view if view is not None and np.array_equal(view, read_poses(poses)) else None
+
+
+def read_results(results: Any) -> Array:
+    """Distance results through the accessors (m, RESULT)."""
+    rows = [(r.min_distance, *r.normal, *r.getNearestPoint1(), *r.getNearestPoint2()) for r in results]
+    return np.array(rows, dtype=np.float64).reshape(-1, RESULT)
+
+
+def view_results(results: Any) -> Array | None:
+    """The same as a view, or None where it does not agree with the accessors."""
+    # the distance stands before the normal
+    view = _view([_address(result.normal) - 8 for result in results], RESULT)
+    agrees = view is not None and np.array_equal(view, read_results(results), equal_nan=True)
+    return view if agrees else None
