@@ -64,14 +64,12 @@ class Proximity(NamedTuple):
 
 
 class Tracking(NamedTuple):
-    """Rows A v = b of the tracking tasks."""
+    """Rows A v = b of the tracking tasks, each scaled with the root of its weight: the cost is ‖A v - b‖²."""
 
     A: Array
-    """(r, nv) task Jacobian."""
+    """(r, nv) task Jacobian W½ J."""
     b: Array
-    """(r,) task velocity: feed-forward plus feedback [m/s, rad/s]."""
-    weight: Array
-    """(r,) cost of each row."""
+    """(r,) task velocity W½ ẋ: feed-forward plus feedback [m/s, rad/s]."""
     damping: float
     """λ of the damped J⁺, the same for every solver [-]."""
 

@@ -18,7 +18,7 @@ from qpavoid.motion import Sample
 from qpavoid.problem import Array, IntArray, Proximity
 from qpavoid.scene import Scene
 
-_CULL_FROM = 48
+_CULL_FROM = 48 if kernels.ACCELERATED else 192
 """Number of pairs from which looking at bounding spheres first pays."""
 
 
@@ -34,7 +34,7 @@ class DistanceQuery:
         self._first_obstacle = len(scene.body_names)
         obstacles = len(scene.obstacles)
         # the row after the obstacles' twists stays zero: it stands for the robot's own bodies
-        self._twists = np.zeros((obstacles + 1, 6))
+        self._twists, self._moving = np.zeros((obstacles + 1, 6)), False
         second = scene.pairs[:, 1] - self._first_obstacle
         self._twist_row = np.where(second >= 0, second, obstacles)
         model = scene.robot.model
@@ -52,6 +52,7 @@ class DistanceQuery:
         linear, angular, position = sample.linear, sample.angular, sample.position
         self._twists[index, :3] = linear - _cross(angular, position)
         self._twists[index, 3:] = angular
+        self._moving = bool(self._twists.any())
         if self._cull is not None:
             self._cull.place(geometry, placement)
 
@@ -74,6 +75,7 @@ class DistanceQuery:
             self._scene.support,
             self._twists,
             self._twist_row,
+            self._moving,
         )
         return Proximity(near, closest[:, 0], closest[:, 1:4], closest[:, 4:7], closest[:, 7:10], J, drift)
 

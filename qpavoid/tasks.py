@@ -70,35 +70,29 @@ class TaskRows:
             joints: joint that carries each task's frame.
             damping: λ of the damped J⁺ [-].
         """
-        self._tasks = tuple(tasks)
-        sizes = [task.rows for task in tasks]
-        total = sum(sizes)
-        self._first = np.cumsum([0, *sizes[:-1]])
-        self._support = np.repeat(support[np.array(joints, dtype=np.intp)], sizes, axis=0)
-        self._screws = np.zeros((total, 6))
         self._turns = np.array([i for i, task in enumerate(tasks) if task.rows == 6], dtype=np.intp)
-        self._gain = np.array([task.settings.gain for task in tasks])
-        count = len(self._tasks)
-        self._position, self._rotation = np.empty((count, 3)), np.empty((count, 3, 3))
-        self._linear, self._angular = np.empty((count, 3)), np.empty((count, 3))
-        weights: list[float] = []
-        for task, first in zip(tasks, self._first, strict=True):
-            self._screws[first : first + 3, :3] = np.eye(3)
-            self._screws[first + 3 : first + task.rows, 3:] = np.eye(3)[: task.rows - 3]
-            weights += [task.settings.weight] * 3 + [task.settings.orientation_weight] * (task.rows - 3)
-        self._weight, self._damping = np.array(weights), damping
-        # (slice of rows, cap) of every velocity that is capped
-        caps = [(f, 3, task.settings.max_speed) for task, f in zip(tasks, self._first, strict=True)]
-        caps += [
-            (f + 3, 3, task.settings.max_turn_rate)
-            for task, f in zip(tasks, self._first, strict=True)
-            if task.rows == 6
+        frames, turning = len(tasks), [tasks[i] for i in self._turns]
+        split, total = 3 * frames, 3 * (frames + len(turning))
+        self._screws = np.zeros((total, 6))
+        self._screws[:split, :3] = np.tile(np.eye(3), (frames, 1))
+        self._screws[split:, 3:] = np.tile(np.eye(3), (len(turning), 1))
+        carriers = support[np.array(joints, dtype=np.intp)]
+        weights = [task.settings.weight for task in tasks] + [task.settings.orientation_weight for task in turning]
+        self._scale, self._damping = np.sqrt(np.repeat(np.array(weights), 3)), damping
+        moved = np.repeat(np.concatenate((carriers, carriers[self._turns])), 3, axis=0)
+        self._support = moved * self._scale[:, None]
+        self._gain = np.array([[task.settings.gain] for task in tasks])
+        self._position, self._rotation = np.empty((frames, 3)), np.empty((frames, 3, 3))
+        self._linear, self._angular = np.empty((frames, 3)), np.empty((frames, 3))
+        caps = [task.settings.max_speed for task in tasks] + [task.settings.max_turn_rate for task in turning]
+        self._caps = [
+            (slice(3 * i, 3 * i + 3), cap * self._scale[3 * i]) for i, cap in enumerate(caps) if cap is not None
         ]
-        self._caps = [(slice(f, f + n), cap) for f, n, cap in caps if cap is not None]
 
     def compute(self, kinematics: Kinematics, targets: Sequence[Sample]) -> Tracking:
-        """Rows v_frame = v_ref + K (x_ref - x), in world axes; the orientation error is the rotation vector of
-        R_ref Rᵀ.
+        """Rows v_frame = v_ref + K (x_ref - x), in world axes, scaled with the roots of their weights.
+
+        The orientation error is the rotation vector of R_ref Rᵀ. Linear rows of all frames come before angular ones.
 
         Args:
             kinematics: of this tick, its frames in the order of the tasks.
@@ -108,9 +102,9 @@ class TaskRows:
         for i, target in enumerate(targets):
             position[i], rotation[i], linear[i], angular[i] = target
         A, b = kernels.frame_rows(
-            self._screws, self._first, self._turns, kinematics.poses, position, rotation, linear, angular, self._gain,
-            kinematics.J, self._support,
+            self._screws, self._turns, kinematics.poses, position, rotation, linear, angular, self._gain,
+            self._scale, kinematics.J, self._support,
         )  # fmt: skip
         for rows, cap in self._caps:
             b[rows] *= min(1.0, cap / max(float(np.linalg.norm(b[rows])), 1e-12))
-        return Tracking(A, b, self._weight, self._damping)
+        return Tracking(A, b, self._damping)

@@ -5,7 +5,7 @@ import pinocchio as pin
 import pytest
 
 from qpavoid import Obstacle, Robot, Sample, build_scene, config
-from qpavoid.kinematics import compute_kinematics
+from qpavoid.kinematics import ForwardKinematics
 from qpavoid.loading import example_robot_data
 from qpavoid.motion import build_motion
 from qpavoid.proximity import DistanceQuery
@@ -68,8 +68,8 @@ def look(scene, q, samples=None, reach=np.inf, query=None):
     query = query or DistanceQuery(scene)
     for index, sample in (samples or {}).items():
         query.place_obstacle(index, sample)
-    data = scene.robot.model.createData()
-    return query.compute(data, compute_kinematics(scene.robot.model, data, [], q), reach)
+    kinematics = ForwardKinematics(scene.robot.model)
+    return query.compute(kinematics.data, kinematics.compute(q), reach)
 
 
 def moved(sample, t):

@@ -1,6 +1,8 @@
-"""Distances against closed forms, their rates against finite differences, and the cost of a tick's Python."""
+"""Distances against closed forms, rates against finite differences, culling against none, the cost of a tick's Python."""
 
+import gc
 import sys
+import tracemalloc
 from dataclasses import replace
 
 import coal
@@ -20,11 +22,13 @@ from conftest import (
     random_scene,
 )
 
-from qpavoid import Sample, build_scene, proximity
-from qpavoid.kinematics import compute_kinematics, support_masks
+from qpavoid import Avoidance, Controller, Obstacle, Sample, build_scene, config, load_scenario, memory, proximity
+from qpavoid.kinematics import ForwardKinematics, support_masks
 from qpavoid.problem import Proximity
 from qpavoid.proximity import DistanceQuery
 from qpavoid.segments import capsule_distances
+from qpavoid.solvers.analytic import tracking_velocity
+from qpavoid.tasks import build_tasks
 
 TICKS = 10
 ROUND = 3e-5
@@ -47,6 +51,12 @@ def axes(scene, q):
         ends.append([placement.act(np.array([0.0, 0.0, z])) for z in (-half, half)])
         radii.append(body.geometry.radius)
     return np.array(ends), np.array(radii)
+
+
+@pytest.fixture
+def culling(monkeypatch):
+    """Bounding spheres are looked at however few pairs there are."""
+    monkeypatch.setattr(proximity, "_CULL_FROM", 0)
 
 
 # --- distances, normals, witness points --------------------------------------------------------------------------
@@ -169,7 +179,7 @@ def test_drift_is_the_rate_when_only_obstacles_move(panda, shapes, tolerance):
     q = random_q(panda, rng)
     starts = [o.motion.sample(0.0) for o in scene.obstacles]
     samples = {
-        i: replace(start, linear=rng.uniform(-1, 1, 3), angular=rng.uniform(-2, 2, 3)) for i, start in enumerate(starts)
+        i: start._replace(linear=rng.uniform(-1, 1, 3), angular=rng.uniform(-2, 2, 3)) for i, start in enumerate(starts)
     }
     step = 1e-6 if tolerance == 1e-6 else 1e-5
     ahead, behind = (look(scene, q, {i: moved(s, t) for i, s in samples.items()}) for t in (step, -step))
@@ -225,14 +235,14 @@ def test_in_penetration_the_normal_still_points_the_way_out(paper, shape):
     pair = scene.pair_names.index(("left_hand", "o"))
     start = scene.obstacles[0].motion.sample(0.0)
     step, tolerance = (1e-5, 1e-4) if shape is BOX else (1e-6, 1e-6)
-    found = look(scene, q, {0: replace(start, linear=np.array([1.0, 0, 0]), angular=np.array([0, 1.0, 0]))})
+    found = look(scene, q, {0: start._replace(linear=np.array([1.0, 0, 0]), angular=np.array([0, 1.0, 0]))})
     assert found.distance[pair] < -0.01
     normal = found.normal[pair]
-    out, into = (look(scene, q, {0: replace(start, position=start.position + s * normal)}) for s in (step, -step))
+    out, into = (look(scene, q, {0: start._replace(position=start.position + s * normal)}) for s in (step, -step))
     assert (out.distance[pair] - into.distance[pair]) / (2 * step) == pytest.approx(1.0, abs=tolerance)
     expected = differences(lambda q: look(scene, q).distance, paper, q, step)
     np.testing.assert_allclose(found.J[pair], expected[pair], atol=tolerance)
-    twist = replace(start, linear=np.array([1.0, 0, 0]), angular=np.array([0, 1.0, 0]))
+    twist = start._replace(linear=np.array([1.0, 0, 0]), angular=np.array([0, 1.0, 0]))
     ahead, behind = (look(scene, q, {0: moved(twist, t)}) for t in (step, -step))
     rate = (ahead.distance[pair] - behind.distance[pair]) / (2 * step)
     assert found.drift[pair] == pytest.approx(rate, abs=tolerance)
@@ -241,6 +251,7 @@ def test_in_penetration_the_normal_still_points_the_way_out(paper, shape):
 # --- how it is read ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("culling")
 def test_the_views_of_the_libraries_memory_equal_the_accessors(panda):
     rng = np.random.default_rng(10)
     scene = random_scene(panda, rng, [SPHERE, CAPSULE, BOX])
@@ -249,11 +260,12 @@ def test_the_views_of_the_libraries_memory_equal_the_accessors(panda):
     assert query._cull._poses is not None, "Pinocchio's layout has changed: the slow path is in use"
     for _ in range(3):
         look(scene, random_q(panda, rng), query=query)
-        np.testing.assert_array_equal(query._results, proximity._read_results(query._data.distanceResults))
-        np.testing.assert_array_equal(query._cull._poses, proximity._read_poses(query._data))
+        np.testing.assert_array_equal(query._results, memory.read_results(query._data.distanceResults))
+        np.testing.assert_array_equal(query._cull._poses, memory.read_poses(query._data.oMg))
 
 
-@pytest.mark.parametrize("missing", [["_view_results"], ["_view_poses"], ["_view_results", "_view_poses"]])
+@pytest.mark.usefixtures("culling")
+@pytest.mark.parametrize("missing", [["view_results"], ["view_poses"], ["view_results", "view_poses"]])
 def test_without_the_views_the_result_is_the_same(panda, monkeypatch, missing):
     rng = np.random.default_rng(11)
     scene = random_scene(panda, rng, [SPHERE, CAPSULE, BOX])
@@ -263,7 +275,7 @@ def test_without_the_views_the_result_is_the_same(panda, monkeypatch, missing):
         monkeypatch.setattr(proximity, name, lambda *_: None)
     query = DistanceQuery(scene)
     assert (query._results is None, query._cull._poses is None) == tuple(
-        name in missing for name in ("_view_results", "_view_poses")
+        name in missing for name in ("view_results", "view_poses")
     )
     for q, expected in zip(qs, fast, strict=True):
         slow = look(scene, q, reach=0.3)
@@ -326,3 +338,229 @@ def test_an_obstacle_is_seen_to_move_while_the_robot_rests(panda):
     assert later.distance[-1] > first.distance[-1] + 1.0
 
 
+# --- culling -----------------------------------------------------------------------------------------------------
+
+
+def pair_of_queries(scene):
+    """A query with bounding spheres and one without."""
+    culled, whole = DistanceQuery(scene), DistanceQuery(scene)
+    assert culled._cull is not None
+    whole._cull = None
+    return culled, whole
+
+
+def next_sample(rng, sample):
+    """Most obstacles move on a little and turn, some jump, some of these far away."""
+    twist = {"linear": rng.uniform(-1, 1, 3), "angular": rng.uniform(-2, 2, 3)}
+    if rng.random() < 0.7:
+        return moved(sample._replace(**twist), 0.02)._replace(**twist)
+    place = rng.uniform(-0.8, 0.8, 3) * (50.0 if rng.random() < 0.3 else 1.0)
+    return Sample.at(place, pin.exp3(rng.uniform(-2, 2, 3)), **twist)
+
+
+@pytest.mark.usefixtures("culling")
+@pytest.mark.parametrize("name", ["panda", "panda_convex"])
+def test_culling_changes_nothing(name, request):
+    robot = request.getfixturevalue(name)
+    rng = np.random.default_rng(15)
+    scene = random_scene(robot, rng, [SPHERE, CAPSULE, BOX, CYLINDER] * 2)
+    culled, whole = pair_of_queries(scene)
+    samples = {i: o.motion.sample(0.0) for i, o in enumerate(scene.obstacles)}
+    counts, looked_at = [], []
+    for _ in range(40):
+        q = random_q(robot, rng, spread=1.5)
+        samples = {i: next_sample(rng, sample) for i, sample in samples.items()}
+        reach = rng.choice([-0.02, 0.0, 0.05, 0.1, 0.3, 2.0, np.inf])
+        found, expected = (look(scene, q, samples, reach, query) for query in (culled, whole))
+        np.testing.assert_array_equal(found.pair, expected.pair)
+        # coal starts from where it ended the last time, which shows within its stopping criteria
+        error = np.abs(found.distance - expected.distance)
+        assert (error <= np.where(expected.distance > 0.0, 1e-9 * np.maximum(expected.distance, 1.0), 1e-6)).all()
+        close = (expected.distance > 0.0) & (expected.distance < 3.0)
+        for field in ("point_a", "point_b", "normal", "J", "drift"):
+            np.testing.assert_allclose(getattr(found, field)[close], getattr(expected, field)[close], rtol=0, atol=ROUND)
+        counts.append(len(found.pair))
+        looked_at.append(sum(culled._data.activeCollisionPairs))
+    assert len(set(counts)) > 20
+    assert min(looked_at) < 0.3 * len(scene.pairs) < len(scene.pairs) == max(looked_at)
+
+
+CORNERS = [
+    (SPHERE, (1.0, 0.0, 0.0), SPHERE.radius),
+    (CAPSULE, (0.0, 0.0, 1.0), CAPSULE.radius + CAPSULE.length / 2),
+    (BOX, BOX.size, np.linalg.norm(BOX.size) / 2),
+    (CYLINDER, (CYLINDER.radius, 0.0, CYLINDER.length / 2), np.hypot(CYLINDER.radius, CYLINDER.length / 2)),
+]
+
+
+@pytest.mark.usefixtures("culling")
+@pytest.mark.parametrize(("shape", "corner", "size"), CORNERS, ids=lambda value: getattr(value, "type", ""))
+def test_bounding_spheres_lose_nothing_where_they_are_tight(panda, shape, corner, size):
+    """Each capsule of the robot points with its cap at the outermost point of an obstacle, 0.1 m away."""
+    rng = np.random.default_rng(16)
+    scene = random_scene(panda, rng, [shape] * len(panda.bodies.geometryObjects))
+    q, count, gap = random_q(panda, rng), len(scene.body_names), 0.1
+    samples = {}
+    for i, placement in enumerate(world_placements(scene, q)[:count]):
+        body, axis = scene.geometry.geometryObjects[i].geometry, placement.rotation[:, 2]
+        tip = body.halfLength + body.radius
+        turn = pin.Quaternion.FromTwoVectors(np.array(corner) / np.linalg.norm(corner), -axis).matrix()
+        samples[i] = Sample.at(placement.translation + (tip + gap + size) * axis, turn)
+    query = DistanceQuery(scene)
+    facing = [scene.pair_names.index((scene.body_names[i], f"o{i}")) for i in range(count)]
+    everything = look(scene, q, samples, query=query)
+    np.testing.assert_allclose(everything.distance[facing], gap, rtol=0, atol=1e-8)
+    for reach, expected in ((gap + 1e-7, facing), (gap - 1e-7, [])):
+        found = look(scene, q, reach=reach, query=query)
+        assert sorted(set(facing) & set(found.pair)) == sorted(expected)
+        np.testing.assert_array_equal(found.pair, np.flatnonzero(everything.distance < reach))
+
+
+class Switches:
+    """Geometry data that notes which pairs are switched on and off."""
+
+    def __init__(self, query):
+        self.data, self.calls = query._data, []
+        query._cull._data = self
+
+    def __getattr__(self, name):
+        return getattr(self.data, name)
+
+    def activateCollisionPair(self, pair):  # noqa: N802
+        self.calls.append(("on", pair))
+        self.data.activateCollisionPair(pair)
+
+    def deactivateCollisionPair(self, pair):  # noqa: N802
+        self.calls.append(("off", pair))
+        self.data.deactivateCollisionPair(pair)
+
+
+@pytest.mark.usefixtures("culling")
+def test_pairs_are_switched_only_when_something_changed(panda):
+    rng = np.random.default_rng(17)
+    scene, q = random_scene(panda, rng, [SPHERE, BOX, CAPSULE]), random_q(panda, rng)
+    query = DistanceQuery(scene)
+    switches = Switches(query)
+    near = Sample.at(world_placements(scene, q)[-4].translation + [0.0, 0.0, 0.1])  # of the last of the robot's bodies
+
+    def switched(**change):
+        before = list(query._data.activeCollisionPairs)
+        switches.calls.clear()
+        look(scene, q, query=query, **{"reach": 0.1, **change})
+        after = list(query._data.activeCollisionPairs)
+        changes = [("on" if after[i] else "off", i) for i in range(len(after)) if before[i] != after[i]]
+        assert sorted(switches.calls) == sorted(changes)
+        return len(changes)
+
+    assert switched(samples={0: near}) > 0
+    assert switched() == switched() == 0
+    assert switched(samples={0: Sample.at((30.0, 0.0, 0.0))}) > 0
+    assert switched() == switched(samples={0: Sample.at((31.0, 0.0, 0.0))}) == 0
+    assert switched(samples={0: near}) > 0
+    assert switched() == 0
+    assert switched(reach=np.inf) > 0
+    assert all(query._data.activeCollisionPairs)
+    assert switched(reach=np.inf) == 0
+    assert switched() > 0
+
+
+# --- cost of a tick ----------------------------------------------------------------------------------------------
+
+
+def instructions(call):
+    """How many bytecode instructions a call executes: any loop in Python over the pairs shows in it."""
+    count = 0
+
+    def trace(frame, event, arg):
+        nonlocal count
+        frame.f_trace_opcodes = True
+        count += event == "opcode"
+        return trace
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        call()
+    finally:
+        sys.settrace(before)
+    return count
+
+
+def balls(rng, count, radius):
+    """Small spheres in all directions, at `radius` [m] from the origin, give or take a tenth."""
+    directions = rng.normal(size=(count, 3))
+    places = radius * rng.uniform(0.9, 1.1, (count, 1)) * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    shape = config.Sphere(type="sphere", radius=0.01)
+    return [Obstacle.at(f"o{i}", shape, place) for i, place in enumerate(places)]
+
+
+@pytest.mark.usefixtures("culling")
+@pytest.mark.parametrize(("radius", "reach"), [(50.0, 0.1), (0.6, 0.1), (0.6, 10.0)])
+def test_python_work_does_not_grow_with_the_number_of_pairs(panda, radius, reach):
+    rng = np.random.default_rng(14)
+    forward = ForwardKinematics(panda.model)
+    kinematics = forward.compute(panda.home)
+    work, near = [], []
+    for count in (10, 500):
+        query = DistanceQuery(build_scene(panda, balls(rng, count, radius)))
+        switches = Switches(query)
+        query.compute(forward.data, kinematics, reach)
+        switches.calls.clear()
+        near.append(len(query.compute(forward.data, kinematics, reach).pair))
+        work.append(instructions(lambda query=query: query.compute(forward.data, kinematics, reach)))
+        assert not switches.calls
+    assert 0 < work[0] == work[1] < 2000
+    assert near[0] == near[1] if radius == 50.0 else 0 < 10 * near[0] < near[1]
+
+
+CASES = {
+    # (distance of the obstacles, avoidance, way that the tool has to go)
+    "far": (50.0, Avoidance(), 0.0),
+    "near": (2.0, Avoidance(d1=1e-3, d2=5.0), 0.0),
+    "near, solving": (2.0, Avoidance(d1=1e-3, d2=5.0, row={"type": "damper", "gain": 0.02}), 0.3),
+}
+
+
+@pytest.mark.usefixtures("culling")
+@pytest.mark.parametrize("case", CASES)
+def test_python_work_of_a_tick_does_not_grow_with_the_number_of_pairs(panda, case):
+    radius, avoidance, way = CASES[case]
+    rng = np.random.default_rng(18)
+    data = panda.model.createData()
+    pin.framesForwardKinematics(panda.model, data, panda.home)
+    place = data.oMf[panda.model.getFrameId("panda_hand_tcp")].translation + way * np.array([0.6, 0.0, 0.8])
+    task = config.Task(frame="panda_hand_tcp", motion={"type": "fixed", "position": place.tolist()})
+    work = []
+    for count in (10, 500):
+        scene = build_scene(panda, balls(rng, count, radius))
+        controller = Controller(scene, build_tasks([task], panda, panda.home), avoidance=avoidance)
+        tick = controller.tick(panda.home)
+        assert len(tick.proximity.pair) == (len(scene.pairs) if radius < 5.0 else len(tick.problem.avoidance.d))
+        assert tick.solution.status == "SOLVED"
+        unconstrained = tracking_velocity(tick.problem.tracking)
+        assert np.allclose(tick.solution.v, unconstrained, atol=1e-6) == (way == 0.0)
+        switches = Switches(controller._query)
+        work.append(instructions(lambda controller=controller: controller.step(panda.home)))
+        assert not switches.calls
+    assert 0 < work[0] == work[1] < 4000
+
+
+@pytest.mark.usefixtures("culling")
+def test_memory_does_not_grow():
+    """20 000 ticks of a scene in which pairs come within reach and leave it, and the QP is solved."""
+    controller, q = Controller.from_scenario(load_scenario("panda_line"))
+    model, dt = controller.scene.robot.model, controller.dt
+    switches = Switches(controller._query)
+    used = []
+    tracemalloc.start()
+    try:
+        for k in range(22_000):
+            q = pin.integrate(model, q, dt * controller.step(q, (k * dt) % 12.0).v)
+            if k in (2_000 - 1, 22_000 - 1):
+                assert switches.calls
+                switches.calls.clear()
+                gc.collect()
+                used.append(tracemalloc.get_traced_memory()[0])
+    finally:
+        tracemalloc.stop()
+    assert used[1] - used[0] < 20_000

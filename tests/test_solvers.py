@@ -26,7 +26,7 @@ def make_problem(seed: int, pairs: int = 3, damping: float = 0.0, rows: int = 3,
     d = rng.uniform(0.12, D2, pairs)
     b = -5.0 * (d - 0.12) * rng.uniform(0, 1, pairs) + 0.05 * rng.normal(size=pairs)
     avoidance = AvoidanceRows(np.arange(pairs), d, rng.normal(size=(pairs, NV)), b, D1, D2)
-    tracking = Tracking(rng.normal(size=(rows, NV)), 0.3 * rng.normal(size=rows), rng.uniform(0.5, 2.0, rows), damping)
+    tracking = Tracking(rng.normal(size=(rows, NV)), 0.3 * rng.normal(size=rows), damping)
     names = [(f"body{i}", f"obstacle{i}") for i in range(pairs)]
     return Problem(tracking, avoidance, np.full(NV, -limit), np.full(NV, limit), names)
 
@@ -103,10 +103,10 @@ def test_alpha_is_capped_in_contact():
 
 @given(seeds, st.floats(0.001, 0.5))
 def test_tracking_minimises_the_damped_cost(seed, damping):
-    """The gradient of ‖W½(A v - b)‖² + λ²‖v‖² vanishes."""
+    """The gradient of ‖A v - b‖² + λ²‖v‖² vanishes."""
     tracking = make_problem(seed, damping=damping, rows=6).tracking
     v = tracking_velocity(tracking)
-    gradient = tracking.A.T @ (tracking.weight * (tracking.A @ v - tracking.b)) + damping**2 * v
+    gradient = tracking.A.T @ (tracking.A @ v - tracking.b) + damping**2 * v
     np.testing.assert_allclose(gradient, 0.0, atol=1e-10)
 
 
@@ -142,7 +142,7 @@ def test_qp_meets_rows_and_bounds_and_is_optimal(seed, backend, pairs):
     assert np.all(slackness > -1e-6)
     assert np.all((solution.v >= problem.lower) & (solution.v <= problem.upper))
     v0, tracking = tracking_velocity(problem.tracking), problem.tracking
-    P = tracking.A.T @ np.diag(tracking.weight) @ tracking.A + 1e-3 * np.eye(NV)
+    P = tracking.A.T @ tracking.A + 1e-3 * np.eye(NV)
     reference = qpsolvers.solve_qp(
         P, -P @ v0, -rows.J if pairs else None, -rows.b if pairs else None,
         lb=problem.lower, ub=problem.upper, solver="quadprog",

@@ -251,7 +251,7 @@ def _check(cell: Cell, answer: dict[str, Any], frames: Array, distances: Array, 
 
 
 def _check_rows(velocities: Array, gain: float, distances: Array, workload: Workload, scene: Any) -> None:
-    """Whether a library's velocities respect its avoidance rows: the rate of every distance, by a difference.
+    """Whether a library's velocities respect its rows ḋ >= -(1 - β(d)) ξ (d - d_min): ḋ by a difference, β by eq. 12.
 
     Raises:
         LibraryError: a pair in range closes too fast, so that its row must be missing or wrong.
@@ -259,7 +259,9 @@ def _check_rows(velocities: Array, gain: float, distances: Array, workload: Work
     model, step = scene.robot.model, 1e-5
     moved = [pin.integrate(model, workload.q[tick], v * step) for tick, v in zip(CHECK_TICKS, velocities, strict=True)]
     rate = (build.reference(scene, replace(workload, q=np.array(moved)), range(len(moved)))[1] - distances) / step
-    short = -gain * (distances - workload.d_min) - rate
+    left = distances - workload.d_min
+    beta = 0.5 + 0.5 * np.cos(np.pi * np.clip(left / (workload.influence - workload.d_min), 0.0, 1.0))
+    short = -(1.0 - beta) * gain * left - rate
     worst = float(np.max(short, initial=-np.inf, where=distances < workload.influence))
     if worst > RATE_TOLERANCE:
         raise LibraryError(f"a pair in range closes {1e3 * worst:.1f} mm/s too fast")

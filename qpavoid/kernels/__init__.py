@@ -21,6 +21,7 @@ if TYPE_CHECKING or not ACCELERATED:
         frame_rows,
         projection_cost,
         shortfall,
+        tracking_shortfall,
         velocity_bounds,
     )
 else:
@@ -32,6 +33,7 @@ else:
         frame_rows,
         projection_cost,
         shortfall,
+        tracking_shortfall,
         velocity_bounds,
     )
 
@@ -44,5 +46,6 @@ __all__ = [
     "frame_rows",
     "projection_cost",
     "shortfall",
+    "tracking_shortfall",
     "velocity_bounds",
 ]

@@ -38,8 +38,9 @@ def candidates(poses: Array, local: Array, centers: Array, within: Array, pair_o
 
 @njit(cache=True)
 def distance_rows(
-    results: Array, pairs: IntArray, reach: float, J_world: Array, support: Array, twists: Array, twist_row: IntArray
-) -> tuple[IntArray, Array, Array, Array]:
+    results: Array, pairs: IntArray, reach: float, J_world: Array, support: Array, twists: Array, twist_row: IntArray,
+    moving: bool,
+) -> tuple[IntArray, Array, Array, Array]:  # fmt: skip
     """See `vectorised.distance_rows`."""
     count = 0
     for i in pairs:
@@ -49,7 +50,7 @@ def distance_rows(
     near = np.empty(count, np.intp)
     closest = np.empty((count, 10))
     J = np.empty((count, nv))
-    drift = np.empty(count)
+    drift = np.zeros(count)
     k = 0
     for i in pairs:
         if results[i, 0] < reach:
@@ -63,8 +64,9 @@ def distance_rows(
                 linear = nx * J_world[0, c] + ny * J_world[1, c] + nz * J_world[2, c]
                 angular = mx * J_world[3, c] + my * J_world[4, c] + mz * J_world[5, c]
                 J[k, c] = (linear + angular) * support[i, c]
-            t = twists[twist_row[i]]
-            drift[k] = nx * t[0] + ny * t[1] + nz * t[2] + mx * t[3] + my * t[4] + mz * t[5]
+            if moving:
+                t = twists[twist_row[i]]
+                drift[k] = nx * t[0] + ny * t[1] + nz * t[2] + mx * t[3] + my * t[4] + mz * t[5]
             k += 1
     return near, closest, J, drift
 
@@ -87,30 +89,33 @@ _rotation_vector = njit(cache=True)(rotation_vector)
 
 @njit(cache=True)
 def frame_rows(
-    screws: Array, first: IntArray, turns: IntArray, poses: Array, position: Array, rotation: Array, linear: Array,
-    angular: Array, gain: Array, J_world: Array, support: Array,
+    screws: Array, turns: IntArray, poses: Array, position: Array, rotation: Array, linear: Array, angular: Array,
+    gain: Array, scale: Array, J_world: Array, support: Array,
 ) -> tuple[Array, Array]:  # fmt: skip
     """See `vectorised.frame_rows`."""
     rows, nv = support.shape
     A = np.zeros((rows, nv))
     b = np.empty(rows)
-    for f in range(len(first)):
-        r, x, y, z = first[f], poses[f, 9], poses[f, 10], poses[f, 11]
+    for f in range(len(poses)):
+        r, x, y, z = 3 * f, poses[f, 9], poses[f, 10], poses[f, 11]
         screws[r, 4], screws[r, 5] = z, -y
         screws[r + 1, 3], screws[r + 1, 5] = -z, x
         screws[r + 2, 3], screws[r + 2, 4] = y, -x
         for i in range(3):
-            b[r + i] = linear[f, i] + gain[f] * (position[f, i] - poses[f, 9 + i])
-    for f in turns:
-        missing = np.zeros((3, 3))
+            b[r + i] = linear[f, i] + gain[f, 0] * (position[f, i] - poses[f, 9 + i])
+    missing = np.empty((3, 3))
+    for n in range(len(turns)):
+        f = turns[n]
         for i in range(3):
             for j in range(3):
+                missing[i, j] = 0.0
                 for c in range(3):
                     missing[i, j] += rotation[f, i, c] * poses[f, 3 * c + j]
         errors = _rotation_vector(missing)
         for i in range(3):
-            b[first[f] + 3 + i] = angular[f, i] + gain[f] * errors[i]
+            b[3 * (len(poses) + n) + i] = angular[f, i] + gain[f, 0] * errors[i]
     for r in range(rows):
+        b[r] *= scale[r]
         for s in range(6):
             e = screws[r, s]
             if e != 0.0:
@@ -137,7 +142,7 @@ def velocity_bounds(
 
 
 @njit(cache=True)
-def damped_solution(A: Array, b: Array, weight: Array, damping: float) -> Array:
+def damped_solution(A: Array, b: Array, damping: float) -> Array:
     """See `vectorised.damped_solution`: Cholesky factorisation of the Gram matrix, row by row."""
     rows, nv = A.shape
     L = np.empty((rows, rows))
@@ -149,7 +154,6 @@ def damped_solution(A: Array, b: Array, weight: Array, damping: float) -> Array:
             dot = 0.0
             for c in range(nv):
                 dot += A[i, c] * A[j, c]
-            dot *= np.sqrt(weight[i] * weight[j])
             if i == j:
                 dot += damping * damping
             for c in range(j):
@@ -162,7 +166,7 @@ def damped_solution(A: Array, b: Array, weight: Array, damping: float) -> Array:
                 L[i, i] = np.sqrt(dot)
             else:
                 L[i, j] = dot / L[j, j]
-        total = np.sqrt(weight[i]) * b[i]
+        total = b[i]
         for c in range(i):
             total -= L[i, c] * x[c]
         x[i] = total / L[i, i]
@@ -171,9 +175,8 @@ def damped_solution(A: Array, b: Array, weight: Array, damping: float) -> Array:
         for c in range(i + 1, rows):
             total -= L[c, i] * x[c]
         x[i] = total / L[i, i]
-        scaled = np.sqrt(weight[i]) * x[i]
         for c in range(nv):
-            v[c] += A[i, c] * scaled
+            v[c] += A[i, c] * x[i]
     return v
 
 
@@ -195,7 +198,16 @@ def shortfall(v: Array, J: Array, b: Array, lower: Array, upper: Array) -> float
 
 
 @njit(cache=True)
-def projection_cost(A: Array, weight: Array, regularization: float, v0: Array) -> tuple[Array, Array]:
+def tracking_shortfall(
+    A: Array, b: Array, damping: float, J: Array, least: Array, lower: Array, upper: Array
+) -> tuple[Array, float]:
+    """See `vectorised.tracking_shortfall`."""
+    v = damped_solution(A, b, damping)
+    return v, shortfall(v, J, least, lower, upper)
+
+
+@njit(cache=True)
+def projection_cost(A: Array, regularization: float, v0: Array) -> tuple[Array, Array]:
     """See `vectorised.projection_cost`."""
     rows, nv = A.shape
     P = np.empty((nv, nv))
@@ -204,7 +216,7 @@ def projection_cost(A: Array, weight: Array, regularization: float, v0: Array) -
         for j in range(i + 1):
             dot = 0.0
             for r in range(rows):
-                dot += weight[r] * A[r, i] * A[r, j]
+                dot += A[r, i] * A[r, j]
             P[i, j] = dot
             P[j, i] = dot
         P[i, i] += regularization

@@ -11,14 +11,12 @@ from typing import Any
 import numpy as np
 from scipy.linalg.lapack import dposv
 
-from qpavoid import gains
 from qpavoid.problem import Array, IntArray
 
 WELL_CONDITIONED = 1e-6
 """Ratio of the smallest to the largest pivot of J Jᵀ down to which J⁺ is taken from it without damping."""
 
 _SWAPPED, _DOUBLED = np.array([0, 1, 2, 4, 3]), np.array([2.0, 2.0, 2.0, 1.0, 1.0])
-_THREE = np.arange(3)
 _CYCLE = np.array([1, 2, 0, 2, 0, 1])
 _ANTICYCLE = np.array([2, 0, 1, 1, 2, 0])
 _SKEW = np.zeros((3, 9))
@@ -51,8 +49,9 @@ def candidates(poses: Array, local: Array, centers: Array, within: Array, pair_o
 
 
 def distance_rows(
-    results: Array, pairs: IntArray, reach: float, J_world: Array, support: Array, twists: Array, twist_row: IntArray
-) -> tuple[IntArray, Array, Array, Array]:
+    results: Array, pairs: IntArray, reach: float, J_world: Array, support: Array, twists: Array, twist_row: IntArray,
+    moving: bool,
+) -> tuple[IntArray, Array, Array, Array]:  # fmt: skip
     """Closest points and rates of the pairs that are nearer than `reach`.
 
     The normal n is parallel to the line between the witness points, so p × n is the same at both, and every row is
@@ -60,17 +59,19 @@ def distance_rows(
 
     Args:
         results: [distance, normal, point a, point b] of all pairs (m, 10).
-        pairs: which of them to look at (c,).
+        pairs: which of them to look at (c,), increasing.
         reach: distance below which a pair is near [m].
         J_world: world Jacobian of all joints (6, nv).
         support: difference of the supports of each pair's bodies (m, nv).
         twists: velocity of each obstacle at the world's origin, [linear, angular] (o + 1, 6); the last row is zero.
         twist_row: row of `twists` that moves each pair's second body (m,).
+        moving: whether any of the twists is not zero.
 
     Returns:
         near (k,), closest points (k, 10), J (k, nv), drift (k,).
     """
-    near = pairs[results[pairs, 0] < reach]
+    distance = results[:, 0] if len(pairs) == len(results) else results[pairs, 0]
+    near = pairs[distance < reach]
     closest = results[near]
     screws = np.empty((6, len(near)))
     columns = closest.T
@@ -78,8 +79,9 @@ def distance_rows(
     screws[:3] = normal
     products = point[_CYCLE] * normal[_ANTICYCLE]
     np.subtract(products[:3], products[3:], out=screws[3:])
-    J = (screws.T @ J_world) * support[near]
-    drift = np.einsum("ij,ji->i", twists[twist_row[near]], screws) if twists.any() else np.zeros(len(near))
+    J = screws.T @ J_world
+    J *= support[near]
+    drift = np.einsum("ij,ji->i", twists[twist_row[near]], screws) if moving else np.zeros(len(near))
     return near, closest, J, drift
 
 
@@ -87,8 +89,9 @@ def closing_speed_bound(d: Array, hold: float, gain: float, cap: float, switchin
     """See `qpavoid.avoidance.closing_speed_bound`."""
     bound = gain * (hold - d)
     if switching:
-        # below d1, where β = 1, the row asks for recovery, which β does not weaken
-        bound = np.where(bound > 0.0, bound, (1.0 - gains.beta(d, d1, d2)) * bound)
+        share = np.minimum(np.maximum((d - d1) * (np.pi / (d2 - d1)), 0.0), np.pi)
+        # 1 - β is 0 below d1, where the row asks for recovery instead, which β does not weaken
+        bound = np.maximum(bound, 0.0) + (0.5 - 0.5 * np.cos(share)) * bound
     return np.minimum(bound, cap)
 
 
@@ -114,36 +117,43 @@ def rotation_vector(R: Any) -> tuple[float, float, float]:
 
 
 def frame_rows(
-    screws: Array, first: IntArray, turns: IntArray, poses: Array, position: Array, rotation: Array, linear: Array,
-    angular: Array, gain: Array, J_world: Array, support: Array,
+    screws: Array, turns: IntArray, poses: Array, position: Array, rotation: Array, linear: Array, angular: Array,
+    gain: Array, scale: Array, J_world: Array, support: Array,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Rows A v = b of frames that follow targets: feed-forward plus gain times what is missing.
+    """Rows A v = b of f frames that follow targets: feed-forward plus gain times what is missing, scaled.
+
+    Three linear rows for each frame come first, then three angular rows for each frame whose orientation counts.
 
     Args:
-        screws: directions of the rows (r, 6), overwritten: the moments p × e of each frame's three linear rows.
-        first: first row of each frame (f,); its linear rows are this one and the next two.
-        turns: those of the frames whose orientation counts as well, in the next three rows.
+        screws: directions of the rows (r, 6), overwritten: the moments p × e of the linear rows.
+        turns: which frames have angular rows (t,).
         poses: of the frames (f, 12), rotation by columns and position.
         position: of the targets (f, 3) [m].
         rotation: of the targets (f, 3, 3).
         linear: velocities of the targets (f, 3) [m/s].
         angular: their angular velocities (f, 3) [rad/s].
-        gain: feedback gain of each frame (f,) [1/s].
+        gain: feedback gain of each frame (f, 1) [1/s].
+        scale: of b (r,).
         J_world: world Jacobian of all joints (6, nv).
-        support: which coordinates move each row's frame (r, nv).
+        support: scale of the coordinates that move each row's frame, 0 for the others (r, nv).
 
     Returns:
         A (r, nv), b (r,).
     """
-    here, rows = poses[:, 9:], first[:, None] + _THREE
-    screws[rows, 3:] = (here @ _SKEW).reshape(-1, 3, 3)
+    here = poses[:, 9:]
+    split = 3 * len(here)
+    screws[:split, 3:] = (here @ _SKEW).reshape(split, 3)
     b = np.empty(len(screws))
-    b[rows] = linear + gain[:, None] * (position - here)
+    b[:split] = (linear + gain * (position - here)).ravel()
     if len(turns):
         # poses hold rotations by columns, so these are their transposes
-        missing = (rotation[turns] @ poses[turns, :9].reshape(-1, 3, 3)).tolist()
-        b[rows[turns] + 3] = angular[turns] + gain[turns, None] * [rotation_vector(R) for R in missing]
-    return (screws @ J_world) * support, b
+        missing = (rotation @ poses[:, :9].reshape(-1, 3, 3)).tolist()
+        errors = np.array([rotation_vector(missing[f]) for f in turns])
+        b[split:] = (angular[turns] + gain[turns] * errors).ravel()
+    A = screws @ J_world
+    A *= support
+    b *= scale
+    return A, b
 
 
 def velocity_bounds(
@@ -159,27 +169,24 @@ def velocity_bounds(
     return lower, upper
 
 
-def damped_solution(A: Array, b: Array, weight: Array, damping: float) -> Array:
-    """J⁺ẋ with J = W½ A, ẋ = W½ b and J⁺ = Jᵀ (J Jᵀ + λ²)⁻¹.
+def damped_solution(A: Array, b: Array, damping: float) -> Array:
+    """A⁺b with A⁺ = Aᵀ (A Aᵀ + λ²)⁻¹.
 
     Args:
         A: rows (r, nv).
         b: right-hand sides (r,).
-        weight: of the rows (r,).
         damping: λ [-].
 
     Returns:
-        (nv,); NaN where there is no damping and J Jᵀ is close to singular.
+        (nv,); NaN where there is no damping and A Aᵀ is close to singular.
     """
-    root = np.sqrt(weight)
-    J = root[:, None] * A
-    gram = J @ J.T
+    gram = A @ A.T
     gram.ravel()[:: len(gram) + 1] += damping * damping
-    factor, x, info = dposv(gram, root * b)
+    factor, x, info = dposv(gram, b)
     if damping == 0.0 and info == 0:
         pivots = factor.diagonal() ** 2
         info = int(pivots.min() < WELL_CONDITIONED * pivots.max())
-    return J.T @ x if info == 0 else np.full(A.shape[1], np.nan)
+    return x @ A if info == 0 else np.full(A.shape[1], np.nan)
 
 
 def shortfall(v: Array, J: Array, b: Array, lower: Array, upper: Array) -> float:
@@ -188,8 +195,16 @@ def shortfall(v: Array, J: Array, b: Array, lower: Array, upper: Array) -> float
     return float(np.maximum(over, (b - J @ v).max()) if len(b) else over)
 
 
-def projection_cost(A: Array, weight: Array, regularization: float, v0: Array) -> tuple[Array, Array]:
-    """P = Aᵀ W A + λ (nv, nv) and q = -P v0 (nv,): ½ vᵀP v + qᵀv is smallest at v0."""
-    P = A.T @ (weight[:, None] * A)
+def tracking_shortfall(
+    A: Array, b: Array, damping: float, J: Array, least: Array, lower: Array, upper: Array
+) -> tuple[Array, float]:
+    """`damped_solution`, and its `shortfall` of the rows J v >= least and the bounds."""
+    v = damped_solution(A, b, damping)
+    return v, shortfall(v, J, least, lower, upper)
+
+
+def projection_cost(A: Array, regularization: float, v0: Array) -> tuple[Array, Array]:
+    """P = AᵀA + λ (nv, nv) and q = -P v0 (nv,): ½ vᵀP v + qᵀv is smallest at v0."""
+    P = A.T @ A
     P.ravel()[:: len(P) + 1] += regularization
     return P, -(P @ v0)

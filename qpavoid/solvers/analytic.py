@@ -32,12 +32,15 @@ def pseudo_inverse(A: Array, damping: float) -> Array:
 
 def tracking_velocity(tracking: Tracking) -> Array:
     """Velocity (nv,) that tracks as if nothing else mattered: J⁺ẋ of the weighted rows."""
-    v = kernels.damped_solution(tracking.A, tracking.b, tracking.weight, tracking.damping)
-    if v[0] == v[0]:
-        return v
-    # the rows contradict or repeat each other and no damping is asked for
-    root = np.sqrt(tracking.weight)
-    return np.asarray(pseudo_inverse(root[:, None] * tracking.A, 0.0) @ (root * tracking.b))
+    v = kernels.damped_solution(tracking.A, tracking.b, tracking.damping)
+    return v if v[0] == v[0] else undamped_velocity(tracking)
+
+
+def undamped_velocity(tracking: Tracking) -> Array:
+    """The same where rows repeat each other and no damping is asked for: NaN in `tracking` stays NaN."""
+    if not np.isfinite(tracking.A).all():
+        return np.full(tracking.A.shape[1], np.nan)
+    return np.asarray(pseudo_inverse(tracking.A, 0.0) @ tracking.b)
 
 
 class TrackingOnly:
@@ -74,7 +77,7 @@ class Eq10:
         primary = tracking_velocity(tracking)
         if rows.d.size == 0:
             return Solution(primary)
-        J = np.sqrt(tracking.weight)[:, None] * tracking.A
+        J = tracking.A
         J_inv = pseudo_inverse(J, tracking.damping)
         closest = int(np.argmin(rows.d))
         J_d = rows.J[closest]

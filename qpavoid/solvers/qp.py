@@ -7,7 +7,7 @@ import numpy as np
 from qpavoid import gains, kernels
 from qpavoid.config import QpSolver
 from qpavoid.problem import Array, AvoidanceRows, Problem, Solution, Status
-from qpavoid.solvers.analytic import tracking_velocity
+from qpavoid.solvers.analytic import undamped_velocity
 from qpavoid.solvers.backends import make_backend
 
 _TOLERANCE = 1e-6
@@ -17,10 +17,10 @@ _ALPHA_CAP = 1e4
 
 
 class Qp:
-    """min ‖A (v - v0)‖²_W + λ ‖v - v0‖²  s.t.  J v >= b,  lower <= v <= upper.
+    """min ‖A (v - v0)‖² + λ ‖v - v0‖²  s.t.  J v >= b,  lower <= v <= upper.
 
     v0 = J⁺ẋ is the tracking law's velocity, so the answer is the safe velocity closest to it, and v0 itself whenever
-    that is safe. As A v0 = b wherever the task can be met, the first term is the tracking cost ‖A v - b‖²_W;
+    that is safe. As A v0 = b wherever the task can be met, the first term is the tracking cost ‖A v - b‖²;
     measuring λ from v0 rather than from 0 leaves tracking free of bias.
 
     Where the rows contradict each other or the bounds, a second QP finds the least slack that lets them be met,
@@ -35,13 +35,16 @@ class Qp:
 
     def solve(self, problem: Problem) -> Solution:
         """The closest safe velocity; relaxed where there is none; a stop where that fails too."""
-        v0 = tracking_velocity(problem.tracking)
-        b = problem.avoidance.b
-        if kernels.shortfall(v0, problem.avoidance.J, b, problem.lower, problem.upper) <= 0.0:
+        (A, b_tracking, damping), rows, lower, upper, _ = problem
+        v0, worst = kernels.tracking_shortfall(A, b_tracking, damping, rows.J, rows.b, lower, upper)
+        if worst <= 0.0:
             return Solution(v0)
-        tracking = problem.tracking
-        P, q = kernels.projection_cost(tracking.A, tracking.weight, self.config.regularization, v0)
-        v = self._closest(P, q, b, problem)
+        if v0[0] != v0[0]:
+            v0 = undamped_velocity(problem.tracking)
+            if kernels.shortfall(v0, rows.J, rows.b, lower, upper) <= 0.0:
+                return Solution(v0)
+        P, q = kernels.projection_cost(A, self.config.regularization, v0)
+        v = self._closest(P, q, rows.b, problem)
         if v is not None:
             return Solution(v)
         return self._relaxed(P, q, problem)

@@ -6,8 +6,7 @@ An adapter is a class whose constructor takes a Workload (that is the set-up, no
 - `velocity(v) -> (nv,)`: the same velocity in Pinocchio's convention;
 - `frames(tick) -> (f, 4, 4)` and `distances(tick) -> (m,)`: its own forward kinematics and its own distances;
 - `settings`: what differs from its defaults, for the report;
-- `closing_gain`, optional: its velocities are checked to let no pair in range close faster than this gain times what
-  is left to d_min, by coal's distances before and after a short motion;
+- `closing_gain`, optional: ξ of the rows ḋ >= -(1 - β(d)) ξ (d - d_min), which its velocities are checked to respect;
 - `packages`: whose versions are reported.
 """
 

@@ -26,7 +26,7 @@ class Numpy:
     packages = ("qpavoid", "pin", "coal", "daqp", "numpy")
 
     closing_gain = 5.0
-    """Of its avoidance rows, by default [1/s]: a pair at distance d never closes faster than this times d - d1."""
+    """ξ of its avoidance rows, by default [1/s]."""
 
     def __init__(self, workload: Workload) -> None:
         self.workload, self.scene = workload, make_scene(workload)
