@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from time import perf_counter
 from typing import NamedTuple
 
+from qpavoid import kernels
 from qpavoid.avoidance import avoidance_rows
 from qpavoid.config import Avoidance, Limits, ScenarioConfig
 from qpavoid.errors import UnknownName, located
@@ -19,6 +21,8 @@ from qpavoid.robot import Robot
 from qpavoid.scene import Scene, build_obstacles, build_scene
 from qpavoid.solvers import Solver, make_solver
 from qpavoid.tasks import FrameTask, TaskRows, build_tasks
+
+_log = logging.getLogger(__name__)
 
 
 class Tick(NamedTuple):
@@ -72,6 +76,11 @@ class Controller:
         self._task_rows = TaskRows(tasks, support_masks(model), joints, tracking_damping)
         self._query = DistanceQuery(scene)
         self._bounds = scene.robot.bounds()
+        begin = perf_counter()
+        self.tick(scene.robot.home)
+        self.warm_up_time = perf_counter() - begin
+        """Time that the first tick took, compilation included [s]; no later one waits for the compiler."""
+        _log.info("warmed up in %.3f s, compiled kernels: %s", self.warm_up_time, kernels.ACCELERATED)
 
     @classmethod
     def from_scenario(cls, scenario: ScenarioConfig) -> tuple[Controller, Array]:

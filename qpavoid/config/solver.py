@@ -41,15 +41,16 @@ class QpSolver(Block):
     """QP: tracking as cost, avoidance rows as inequalities, joint limits as bounds."""
 
     name: Literal["qp"] = "qp"
-    backend: str = "daqp"
-    """`daqp`, `proxqp`, `osqp`, `quadprog`, or whatever else qpsolvers finds installed."""
+    backend: str = "auto"
+    """`native` (compiled, wants numba), `daqp`, `proxqp`, `osqp`, `quadprog`, or whatever else qpsolvers finds
+    installed; `auto` is `native` where numba is installed, else `daqp`."""
     regularization: Positive = 1e-3
     """λ: cost of leaving the tracking law's velocity [(rad/s)⁻²]."""
 
     @property
     def label(self) -> str:
         """Short form that names it."""
-        return self.name if self.backend == "daqp" else f"{self.name}:{self.backend}"
+        return self.name if self.backend == "auto" else f"{self.name}:{self.backend}"
 
 
 def expand_solver(value: Any) -> Any:

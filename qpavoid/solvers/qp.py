@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from qpavoid import gains, kernels
 from qpavoid.config import QpSolver
+from qpavoid.errors import SolverNotInstalled
 from qpavoid.problem import Array, AvoidanceRows, Problem, Solution, Status
 from qpavoid.solvers.analytic import undamped_velocity
 from qpavoid.solvers.backends import make_backend
@@ -31,10 +34,20 @@ class Qp:
 
     def __init__(self, config: QpSolver) -> None:
         self.config = config
-        self._backend = make_backend(config.backend)
+        compiled = config.backend == "native" or (config.backend == "auto" and kernels.ACCELERATED)
+        self._project = _compiled_projection() if compiled else None
+        self._backend = make_backend("daqp" if config.backend in ("auto", "native") else config.backend)
 
     def solve(self, problem: Problem) -> Solution:
         """The closest safe velocity; relaxed where there is none; a stop where that fails too."""
+        if self._project is not None:
+            (A, b, damping), rows, lower, upper, _ = problem
+            v, solved = self._project(A, b, damping, self.config.regularization, rows.J, rows.b, lower, upper)
+            if solved:
+                return Solution(v)
+        return self._by_backend(problem)
+
+    def _by_backend(self, problem: Problem) -> Solution:
         (A, b_tracking, damping), rows, lower, upper, _ = problem
         v0, worst = kernels.tracking_shortfall(A, b_tracking, damping, rows.J, rows.b, lower, upper)
         if worst <= 0.0:
@@ -80,6 +93,21 @@ class Qp:
             return None
         v = np.clip(x[:n], problem.lower, problem.upper)
         return np.maximum(rows.b - rows.J @ v, 0.0)
+
+
+def _compiled_projection() -> Callable[..., tuple[Array, bool]]:
+    """The back end `native`, warmed up.
+
+    Raises:
+        SolverNotInstalled: it needs numba.
+    """
+    try:
+        from qpavoid.kernels.active_set import project
+    except ModuleNotFoundError:
+        raise SolverNotInstalled("QP back end 'native' needs numba: pip install 'qpavoid[fast]'") from None
+    one, row = np.ones(1), np.ones((1, 1))
+    project(row, one, 0.1, 1.0, row, 2.0 * one, -3.0 * one, 3.0 * one)
+    return project  # type: ignore[no-any-return]
 
 
 def _shortfalls(slack: Array, rows: AvoidanceRows, problem: Problem) -> tuple[str, ...]:
