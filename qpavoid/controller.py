@@ -75,7 +75,7 @@ class Controller:
         joints = [model.frames[task.frame_id].parentJoint for task in tasks]
         self._task_rows = TaskRows(tasks, support_masks(model), joints, tracking_damping)
         self._query = DistanceQuery(scene)
-        self._bounds = scene.robot.bounds()
+        self._bounds = scene.robot.bounds().slowed(self.limits.velocity_scale)
         begin = perf_counter()
         self.tick(scene.robot.home)
         self.warm_up_time = perf_counter() - begin
@@ -144,16 +144,16 @@ class Controller:
         samples = self._targets(t, targets)
         self._place_obstacles(t, obstacles)
         kinematics = self._kinematics.compute(q)
-        avoidance, limits = self.avoidance, self.limits
+        avoidance = self.avoidance
         proximity = self._query.compute(self._kinematics.data, kinematics, avoidance.d2 - avoidance.offset)
-        lower, upper = velocity_bounds(self._bounds, q, self.dt, limits.position_gain, limits.velocity_scale)
+        lower, upper = velocity_bounds(self._bounds, q, self.limits.position_gain / self.dt)
         tracking = self._task_rows.compute(kinematics, samples)
         problem = Problem(tracking, avoidance_rows(proximity, avoidance), lower, upper, self.scene.pair_names)
         built = perf_counter()
         v, status, reasons, slack, *_ = self.solver.solve(problem)
         saturation = 0.0
-        if limits.saturate and not self.solver.bounded:
-            v, saturation = saturate(v, lower, upper, self._bounds.velocity * limits.velocity_scale)
+        if self.limits.saturate and not self.solver.bounded:
+            v, saturation = saturate(v, lower, upper, self._bounds.velocity)
         solution = Solution(v, status, reasons, slack, saturation, built - begin, perf_counter() - built)
         return Tick(State(q, v, t), samples, kinematics, proximity, problem, solution)
 

@@ -46,6 +46,7 @@ class ForwardKinematics:
         self._model, self._ids = model, list(frame_ids)
         self._index = np.array(self._ids, dtype=np.intp)
         self._view = view_poses(self.data.oMf)
+        self._J = self.data.J
 
     def compute(self, q: Array) -> Kinematics:
         """Kinematics at a configuration q (nq,); `data` then holds the joint placements."""
@@ -54,7 +55,7 @@ class ForwardKinematics:
         for frame_id in self._ids:
             pin.updateFramePlacement(model, data, frame_id)
         poses = read_poses(data.oMf) if self._view is None else self._view
-        return Kinematics(data.J, poses[self._index])
+        return Kinematics(self._J, poses[self._index])
 
 
 def support_masks(model: Any) -> Array:

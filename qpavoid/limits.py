@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,34 +25,26 @@ class JointBounds:
     upper: Array
     """(nb,) upper position limits [rad or m]."""
 
+    def slowed(self, share: float) -> JointBounds:
+        """The same with a share of the speeds."""
+        return replace(self, velocity=share * self.velocity)
 
-def velocity_bounds(
-    joints: JointBounds, q: Array, dt: float, position_gain: float, velocity_scale: float
-) -> tuple[Array, Array]:
+
+def velocity_bounds(joints: JointBounds, q: Array, rate: float) -> tuple[Array, Array]:
     """Bounds lower <= v <= upper that keep the next configuration inside its limits.
 
-    At most `position_gain` of what is left to a position limit is used in one tick; a joint outside its limits is
-    sent back at no more than its largest speed. The bounds never cross.
+    At most a share rate * dt of what is left to a position limit is used in one tick of length dt; a joint outside
+    its limits is sent back at no more than its largest speed. The bounds never cross.
 
     Args:
         joints: the robot's limits.
         q: configuration (nq,).
-        dt: control period [s].
-        position_gain: share of the remaining range that a tick may use, in (0, 1].
-        velocity_scale: share of the velocity limits that may be used, in (0, 1].
+        rate: at most 1 / dt [1/s].
 
     Returns:
         lower (nv,), upper (nv,) [rad/s or m/s].
     """
-    return kernels.velocity_bounds(
-        q,
-        joints.q_index,
-        joints.v_index,
-        joints.lower,
-        joints.upper,
-        joints.velocity * velocity_scale,
-        position_gain / dt,
-    )
+    return kernels.velocity_bounds(q, joints.q_index, joints.v_index, joints.lower, joints.upper, joints.velocity, rate)
 
 
 def saturate(v: Array, lower: Array, upper: Array, v_max: Array) -> tuple[Array, float]:

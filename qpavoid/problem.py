@@ -49,18 +49,32 @@ class Proximity(NamedTuple):
 
     pair: IntArray
     """(k,) which of the scene's pairs, in increasing order."""
-    distance: Array
-    """(k,) signed distance between surfaces [m], negative in penetration."""
-    normal: Array
-    """(k, 3) unit normal from body a to body b, world axes."""
-    point_a: Array
-    """(k, 3) witness point on body a, world [m]."""
-    point_b: Array
-    """(k, 3) witness point on body b, world [m]."""
+    closest: Array
+    """(k, 10) distance, normal and witness points of each pair; see the properties below."""
     J: Array
     """(k, nv) velocity Jacobian of the distances [m/rad or 1]."""
     drift: Array
     """(k,) rate of these distances due to the obstacles' own motion [m/s]."""
+
+    @property
+    def distance(self) -> Array:
+        """(k,) signed distance between surfaces [m], negative in penetration."""
+        return self.closest[:, 0]
+
+    @property
+    def normal(self) -> Array:
+        """(k, 3) unit normal from body a to body b, world axes."""
+        return self.closest[:, 1:4]
+
+    @property
+    def point_a(self) -> Array:
+        """(k, 3) witness point on body a, world [m]."""
+        return self.closest[:, 4:7]
+
+    @property
+    def point_b(self) -> Array:
+        """(k, 3) witness point on body b, world [m]."""
+        return self.closest[:, 7:10]
 
 
 class Tracking(NamedTuple):
@@ -131,13 +145,16 @@ def require_finite(name: str, value: Any, shape: tuple[int, ...]) -> Array:
     Raises:
         NumericalError: wrong shape, NaN or infinity; names the argument.
     """
+    usual = type(value) is np.ndarray and value.dtype == np.float64 and value.shape == shape
+    if usual and isfinite(np.vdot(value, value)):  # quick, but a very large value may overflow: it is looked at below
+        return np.asarray(value)
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
         raise NumericalError(f"{name}: not an array of numbers: {value!r:.60}") from None
     if array.shape != shape:
         raise NumericalError(f"{name}: shape {array.shape}, expected {shape}")
-    if not isfinite(np.vdot(array, array)) and not np.isfinite(array).all():  # the first is quicker, and may overflow
+    if not np.isfinite(array).all():
         bad = ", ".join(str(i) for i in np.argwhere(~np.isfinite(array)).ravel()[:5])
         raise NumericalError(f"{name}: NaN or infinity at index {bad}")
     return array

@@ -77,7 +77,7 @@ class DistanceQuery:
             self._twist_row,
             self._moving,
         )
-        return Proximity(near, closest[:, 0], closest[:, 1:4], closest[:, 4:7], closest[:, 7:10], J, drift)
+        return Proximity(near, closest, J, drift)
 
 
 class _Cull:

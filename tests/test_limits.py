@@ -31,7 +31,7 @@ def bounds(draw):
 @fast
 @given(bounds(), vector(-10.0, 10.0), period, share, share)
 def test_bounds_never_cross_and_keep_to_the_speed(joints, q, dt, gain, scale):
-    lower, upper = velocity_bounds(joints, q, dt, gain, scale)
+    lower, upper = velocity_bounds(joints.slowed(scale), q, gain / dt)
     assert not np.isnan([lower, upper]).any()
     assert (lower <= upper).all()
     assert (np.maximum(np.abs(lower), np.abs(upper)) <= scale * joints.velocity).all()
@@ -41,7 +41,7 @@ def test_bounds_never_cross_and_keep_to_the_speed(joints, q, dt, gain, scale):
 @given(bounds(), vector(0.0, 1.0), vector(0.0, 1.0), period, share, share)
 def test_the_next_configuration_stays_inside(joints, place, choice, dt, gain, scale):
     q = joints.lower + place * (joints.upper - joints.lower)
-    lower, upper = velocity_bounds(joints, q, dt, gain, scale)
+    lower, upper = velocity_bounds(joints.slowed(scale), q, gain / dt)
     for v in (lower, upper, lower + choice * (upper - lower)):
         following = q + dt * v
         assert (following >= joints.lower - 1e-12).all()
@@ -55,7 +55,7 @@ def test_the_next_configuration_stays_inside(joints, place, choice, dt, gain, sc
 def test_outside_its_limits_a_joint_is_sent_back_without_overshoot(joints, beyond, side, dt, gain):
     edge = joints.upper if side > 0 else joints.lower
     q = edge + side * beyond
-    lower, upper = velocity_bounds(joints, q, dt, gain, 1.0)
+    lower, upper = velocity_bounds(joints, q, gain / dt)
     for v in (lower, upper):
         assert (side * v < 0).all()
     back = upper if side > 0 else lower  # the slowest return that is allowed
@@ -66,7 +66,7 @@ def test_outside_its_limits_a_joint_is_sent_back_without_overshoot(joints, beyon
 def test_bounds_by_hand():
     joints = JointBounds(np.array([2.0, 1.0, np.inf]), np.array([0, 3]), np.array([0, 2]), -np.ones(2), np.ones(2))
     q = np.array([0.99, 7.0, 7.0, 0.0])  # the middle joint is continuous: two numbers in q, one in v
-    lower, upper = velocity_bounds(joints, q, dt=0.01, position_gain=0.5, velocity_scale=0.5)
+    lower, upper = velocity_bounds(joints.slowed(0.5), q, 0.5 / 0.01)
     np.testing.assert_allclose(upper, [0.5, 0.5, 50.0])
     np.testing.assert_allclose(lower, [-1.0, -0.5, -50.0])
 
@@ -75,7 +75,7 @@ def test_bounds_by_hand():
 @given(bounds(), vector(0.0, 1.0), velocities, period, share)
 def test_saturated_velocity_is_within_the_bounds_and_its_change_is_reported(joints, place, v, dt, gain):
     q = joints.lower + place * (joints.upper - joints.lower)
-    lower, upper = velocity_bounds(joints, q, dt, gain, 1.0)
+    lower, upper = velocity_bounds(joints, q, gain / dt)
     within, change = saturate(v, lower, upper, joints.velocity)
     assert (within >= lower).all() and (within <= upper).all()
     assert change == pytest.approx(np.abs(within - v).max(), abs=1e-15)
@@ -110,7 +110,7 @@ def test_without_any_limit_nothing_changes():
     infinite = np.full(2, np.inf)
     nothing = np.array([], dtype=np.intp)
     joints = JointBounds(infinite, nothing, nothing, np.array([]), np.array([]))
-    lower, upper = velocity_bounds(joints, np.zeros(2), 0.01, 0.5, 0.5)
+    lower, upper = velocity_bounds(joints.slowed(0.5), np.zeros(2), 0.5 / 0.01)
     v = np.array([1e6, -1e6])
     within, change = saturate(v, lower, upper, infinite)
     np.testing.assert_array_equal(within, v)

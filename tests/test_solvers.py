@@ -1,6 +1,5 @@
 """The laws on random problems: closed forms, optimality conditions, defined outcomes."""
 
-
 import numpy as np
 import pytest
 import qpsolvers
@@ -205,7 +204,7 @@ def test_a_back_end_that_fails_or_lies_ends_in_a_stop():
     rows = problem.avoidance
     problem = with_rows(problem, b=rows.J @ tracking_velocity(problem.tracking) + 1.0)
     for answer in (None, np.full(NV, np.nan), np.full(NV, 1e3)):
-        solver = make_solver("qp")
+        solver = make_solver("qp:daqp")
         solver._backend = lambda *_, answer=answer: answer
         solution = solver.solve(problem)
         assert solution.status is Status.STOPPED and solution.reasons
