@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from time import perf_counter
 from typing import NamedTuple
 
+import numpy as np
+
 from qpavoid import kernels
 from qpavoid.avoidance import avoidance_rows
 from qpavoid.config import Avoidance, Limits, ScenarioConfig
@@ -75,6 +77,7 @@ class Controller:
         joints = [model.frames[task.frame_id].parentJoint for task in tasks]
         self._task_rows = TaskRows(tasks, support_masks(model), joints, tracking_damping)
         self._query = DistanceQuery(scene)
+        self._reach, self._rate = self.avoidance.d2 - self.avoidance.offset, self.limits.position_gain / dt
         self._bounds = scene.robot.bounds().slowed(self.limits.velocity_scale)
         begin = perf_counter()
         self.tick(scene.robot.home)
@@ -129,7 +132,7 @@ class Controller:
             NumericalError: q of the wrong shape, NaN or infinity.
             UnknownName: of a target or obstacle.
         """
-        return self.tick(q, t, targets, obstacles).solution
+        return self._compute(q, t, targets, obstacles)[-1]
 
     def tick(
         self,
@@ -139,23 +142,29 @@ class Controller:
         obstacles: Mapping[str, Sample] | None = None,
     ) -> Tick:
         """Like `step`, with everything that led to the velocity."""
+        samples, kinematics, proximity, problem, solution = self._compute(q, t, targets, obstacles)
+        state = State(np.asarray(q, dtype=np.float64), solution.v, t)
+        return Tick(state, samples, kinematics, proximity, problem, solution)
+
+    def _compute(
+        self, q: Array, t: float, targets: Mapping[str, Sample] | None, obstacles: Mapping[str, Sample] | None
+    ) -> tuple[tuple[Sample, ...], Kinematics, Proximity, Problem, Solution]:
         begin = perf_counter()
         q = require_finite("q", q, self._q_shape)
         samples = self._targets(t, targets)
         self._place_obstacles(t, obstacles)
         kinematics = self._kinematics.compute(q)
-        avoidance = self.avoidance
-        proximity = self._query.compute(self._kinematics.data, kinematics, avoidance.d2 - avoidance.offset)
-        lower, upper = velocity_bounds(self._bounds, q, self.limits.position_gain / self.dt)
+        proximity = self._query.compute(self._kinematics.data, kinematics, self._reach)
+        lower, upper = velocity_bounds(self._bounds, q, self._rate)
         tracking = self._task_rows.compute(kinematics, samples)
-        problem = Problem(tracking, avoidance_rows(proximity, avoidance), lower, upper, self.scene.pair_names)
+        problem = Problem(tracking, avoidance_rows(proximity, self.avoidance), lower, upper, self.scene.pair_names)
         built = perf_counter()
         v, status, reasons, slack, *_ = self.solver.solve(problem)
         saturation = 0.0
         if self.limits.saturate and not self.solver.bounded:
             v, saturation = saturate(v, lower, upper, self._bounds.velocity)
         solution = Solution(v, status, reasons, slack, saturation, built - begin, perf_counter() - built)
-        return Tick(State(q, v, t), samples, kinematics, proximity, problem, solution)
+        return samples, kinematics, proximity, problem, solution
 
     def _targets(self, t: float, given: Mapping[str, Sample] | None) -> tuple[Sample, ...]:
         samples = [task.motion.sample(t) for task in self.tasks]

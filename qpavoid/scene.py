@@ -96,6 +96,10 @@ def build_scene(robot: Robot, obstacles: Sequence[Obstacle] = ()) -> Scene:
         for body in range(bodies):
             geometry.addCollisionPair(pin.CollisionPair(body, index))
     pairs = pair_array(geometry)
+    pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]  # in the order in which bounding spheres are compared
+    geometry.removeAllCollisionPairs()
+    for a, b in pairs.tolist():
+        geometry.addCollisionPair(pin.CollisionPair(a, b))
     joints = np.array([body.parentJoint for body in geometry.geometryObjects], dtype=np.intp)
     masks = support_masks(robot.model)
     names = [body.name for body in geometry.geometryObjects]

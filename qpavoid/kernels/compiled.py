@@ -33,7 +33,7 @@ def candidates(poses: Array, local: Array, centers: Array, within: Array, pair_o
             if near[j]:
                 found[count] = pair_of[i, j]
                 count += 1
-    return np.sort(found[:count])
+    return found[:count].copy()
 
 
 @njit(cache=True)

@@ -34,7 +34,7 @@ def candidates(poses: Array, local: Array, centers: Array, within: Array, pair_o
         centers: the same in the world, as rows [c, 1, -|c|²] (g, 5) [m]; those of the b bodies of the robot, which
             come first, are overwritten.
         within: squared distance up to which each combination counts (b, g) [m²]; negative where there is no pair.
-        pair_of: index of the pair of each combination (b, g).
+        pair_of: index of the pair of each combination (b, g), increasing along the rows, one after the other.
 
     Returns:
         (c,) indices of pairs, increasing.
@@ -44,8 +44,7 @@ def candidates(poses: Array, local: Array, centers: Array, within: Array, pair_o
     body[:, :3] = np.matmul(local[:bodies, None], poses[:bodies, :9].reshape(-1, 3, 3))[:, 0] + poses[:bodies, 9:]
     np.einsum("ij,ij->i", body[:, :3], -body[:, :3], out=body[:, 4])
     # 2 a·c - |a|² - |c|² >= -within, the left side as one matrix product
-    near = np.flatnonzero(body[:, _SWAPPED] * _DOUBLED @ centers.T >= -within)
-    return np.sort(pair_of.ravel()[near])
+    return pair_of[(body[:, _SWAPPED] * _DOUBLED) @ centers.T + within >= 0.0]
 
 
 def distance_rows(
@@ -89,9 +88,10 @@ def closing_speed_bound(d: Array, hold: float, gain: float, cap: float, switchin
     """See `qpavoid.avoidance.closing_speed_bound`."""
     bound = gain * (hold - d)
     if switching:
-        share = np.minimum(np.maximum((d - d1) * (np.pi / (d2 - d1)), 0.0), np.pi)
-        # 1 - β is 0 below d1, where the row asks for recovery instead, which β does not weaken
-        bound = np.maximum(bound, 0.0) + (0.5 - 0.5 * np.cos(share)) * bound
+        quarter = 0.5 * np.pi
+        root = np.sin(np.minimum(np.maximum((d - d1) * (quarter / (d2 - d1)), 0.0), quarter))
+        # 1 - β = root² is 0 below d1, where the row asks for recovery instead, which β does not weaken
+        bound = np.maximum(bound, 0.0) + root * root * bound
     return np.minimum(bound, cap)
 
 
