@@ -12,6 +12,7 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid import kernels
+from qpavoid.bodies import bounding_sphere
 from qpavoid.kinematics import Kinematics
 from qpavoid.memory import read_poses, read_results, view_poses, view_results
 from qpavoid.motion import Sample
@@ -86,17 +87,14 @@ class _Cull:
     def __init__(self, scene: Scene, geometry: Any, data: Any) -> None:
         self._data = data
         self._bodies = len(scene.body_names)
-        shapes = [body.geometry for body in geometry.geometryObjects]
-        for shape in shapes:
-            shape.computeLocalAABB()
-        self._local = np.array([shape.aabb_center for shape in shapes])
-        self._radius = np.array([shape.aabb_radius for shape in shapes])
+        shapes = [bounding_sphere(body.geometry) for body in geometry.geometryObjects]
+        self._local, self._radius = np.array([c for c, _ in shapes]), np.array([r for _, r in shapes])
         self._centers = np.ones((len(shapes), 5))
         for i, body in enumerate(geometry.geometryObjects):
             self.place(i, body.placement)
         self._pair_of = np.full((self._bodies, len(shapes)), -1, dtype=np.intp)
         self._pair_of[scene.pairs[:, 0], scene.pairs[:, 1]] = np.arange(len(scene.pairs))
-        self._reach = -1.0
+        self._reach = np.nan
         self._within = np.empty(self._pair_of.shape)
         self._active = np.ones(len(scene.pairs), dtype=bool)
         self._last = b""

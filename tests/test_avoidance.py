@@ -118,8 +118,9 @@ def test_offset_is_added_and_near_pairs_keep_their_order():
     rng = np.random.default_rng(0)
     near = np.array([1, 4])
     J, drift = rng.normal(size=(2, 3)), rng.normal(size=2)
-    vectors = np.zeros((2, 3))
-    proximity = Proximity(near, np.array([0.08, 0.02]), vectors, vectors, vectors, J, drift)
+    closest = rng.normal(size=(2, 10))
+    closest[:, 0] = 0.08, 0.02
+    proximity = Proximity(near, closest, J, drift)
     settings = Avoidance(d1=D1, d2=D2, offset=0.1, row={"type": "switching", "gain": XI})
     rows = avoidance_rows(proximity, settings)
     np.testing.assert_array_equal(rows.pair, near)
@@ -133,8 +134,7 @@ def test_offset_is_added_and_near_pairs_keep_their_order():
 
 @pytest.mark.parametrize("kind", ["switching", "damper", "cbf"])
 def test_no_pair_gives_no_row(kind):
-    none, vectors = np.zeros(0), np.zeros((0, 3))
-    proximity = Proximity(np.zeros(0, dtype=np.intp), none, vectors, vectors, vectors, np.zeros((0, 7)), none)
+    proximity = Proximity(np.zeros(0, dtype=np.intp), np.zeros((0, 10)), np.zeros((0, 7)), np.zeros(0))
     rows = avoidance_rows(proximity, Avoidance(row={"type": kind}))
     assert rows.J.shape == (0, 7) and rows.pair.shape == rows.d.shape == rows.b.shape == (0,)
     assert alpha(rows.d, rows.d2).shape == beta(rows.d, rows.d1, rows.d2).shape == (0,)

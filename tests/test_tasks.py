@@ -38,7 +38,9 @@ class Bench:
         return [Sample.at(data.oMf[i].translation, data.oMf[i].rotation) for i in self.ids]
 
     def compute(self, q, targets=None):
-        return self.rows.compute(self.kinematics.compute(q), targets or [task.motion.sample(0.0) for task in self.tasks])
+        return self.rows.compute(
+            self.kinematics.compute(q), targets or [task.motion.sample(0.0) for task in self.tasks]
+        )
 
 
 @pytest.mark.parametrize("name", FRAMES)

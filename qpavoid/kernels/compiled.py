@@ -185,15 +185,12 @@ def shortfall(v: Array, J: Array, b: Array, lower: Array, upper: Array) -> float
     """See `vectorised.shortfall`."""
     worst = -np.inf
     for i in range(len(v)):
-        over = max(v[i] - upper[i], lower[i] - v[i])
-        if not over <= worst:  # true for NaN as well, which must not be lost
-            worst = over
+        worst = np.maximum(worst, np.maximum(v[i] - upper[i], lower[i] - v[i]))  # keeps NaN, unlike max
     for k in range(len(b)):
         short = b[k]
         for i in range(len(v)):
             short -= J[k, i] * v[i]
-        if not short <= worst:
-            worst = short
+        worst = np.maximum(worst, short)
     return worst
 
 
