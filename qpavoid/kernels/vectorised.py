@@ -71,6 +71,8 @@ def distance_rows(
     """
     distance = results[:, 0] if len(pairs) == len(results) else results[pairs, 0]
     near = pairs[distance < reach]
+    if not len(near):
+        return near, np.empty((0, 10)), np.empty((0, J_world.shape[1])), np.empty(0)
     closest = results[near]
     screws = np.empty((6, len(near)))
     columns = closest.T
@@ -87,6 +89,8 @@ def distance_rows(
 def closing_speed_bound(d: Array, hold: float, gain: float, cap: float, switching: bool, d1: float, d2: float) -> Array:
     """See `qpavoid.avoidance.closing_speed_bound`."""
     bound = gain * (hold - d)
+    if not len(d):
+        return bound
     if switching:
         quarter = 0.5 * np.pi
         root = np.sin(np.minimum(np.maximum((d - d1) * (quarter / (d2 - d1)), 0.0), quarter))
@@ -149,7 +153,8 @@ def frame_rows(
         # poses hold rotations by columns, so these are their transposes
         missing = (rotation @ poses[:, :9].reshape(-1, 3, 3)).tolist()
         errors = np.array([rotation_vector(missing[f]) for f in turns])
-        b[split:] = (angular[turns] + gain[turns] * errors).ravel()
+        turning = turns if len(turns) < len(here) else slice(None)
+        b[split:] = (angular[turning] + gain[turning] * errors).ravel()
     A = screws @ J_world
     A *= support
     b *= scale
@@ -160,6 +165,10 @@ def velocity_bounds(
     q: Array, q_index: IntArray, v_index: IntArray, q_lower: Array, q_upper: Array, v_max: Array, rate: float
 ) -> tuple[Array, Array]:
     """See `qpavoid.limits.velocity_bounds`; `rate` is position_gain / dt [1/s]."""
+    if len(q_index) == len(q) == len(v_max):  # every joint has one coordinate and position limits
+        slowest = -v_max
+        lower = np.maximum(np.minimum(rate * (q_lower - q), v_max), slowest)
+        return lower, np.maximum(np.minimum(rate * (q_upper - q), v_max), slowest)
     upper = v_max.copy()
     lower = -upper
     here, fastest = q[q_index], v_max[v_index]
