@@ -18,7 +18,7 @@ RESULT = 10
 """Doubles of a distance result: distance, normal, nearest point 1, nearest point 2."""
 
 
-def _view(addresses: list[int], fields: int) -> Array | None:
+def _view(addresses: list[int], fields: int, writeable: bool = False) -> Array | None:
     """Rows of `fields` doubles that begin at equally spaced addresses (n, fields), without a copy.
 
     The view is valid as long as the C++ vector that it looks into lives and is not resized.
@@ -29,7 +29,7 @@ def _view(addresses: list[int], fields: int) -> Array | None:
     stride = int(strides[0])
     doubles = (len(addresses) - 1) * stride // 8 + fields  # the last row must not be read past its own end
     memory = np.ctypeslib.as_array((ctypes.c_double * doubles).from_address(addresses[0]))
-    return np.lib.stride_tricks.as_strided(memory, (len(addresses), fields), (stride, 8), writeable=False)
+    return np.lib.stride_tricks.as_strided(memory, (len(addresses), fields), (stride, 8), writeable=writeable)
 
 
 def _address(array: Array) -> int:
@@ -42,9 +42,9 @@ def read_poses(poses: Any) -> Array:
     return np.array(rows).reshape(-1, 12)
 
 
-def view_poses(poses: Any) -> Array | None:
+def view_poses(poses: Any, writeable: bool = False) -> Array | None:
     """The same as a view, or None where it does not agree with the accessors."""
-    view = _view([_address(pose.rotation) for pose in poses], 12)
+    view = _view([_address(pose.rotation) for pose in poses], 12, writeable)
     return view if view is not None and np.array_equal(view, read_poses(poses)) else None
 
 

@@ -35,7 +35,9 @@ class DistanceQuery:
         self._first_obstacle = len(scene.body_names)
         obstacles = len(scene.obstacles)
         # the row after the obstacles' twists stays zero: it stands for the robot's own bodies
-        self._twists, self._moving = np.zeros((obstacles + 1, 6)), False
+        self._twists = np.zeros((obstacles + 1, 6))
+        self._moving: set[int] = set()
+        self._placements = view_poses([body.placement for body in self._geometry.geometryObjects], writeable=True)
         second = scene.pairs[:, 1] - self._first_obstacle
         self._twist_row = np.where(second >= 0, second, obstacles)
         model = scene.robot.model
@@ -47,15 +49,26 @@ class DistanceQuery:
 
     def place_obstacle(self, index: int, sample: Sample) -> None:
         """Puts obstacle number `index` to a pose, with a velocity."""
-        placement = pin.SE3(sample.rotation, sample.position)
         geometry = self._first_obstacle + index
-        self._geometry.geometryObjects[geometry].placement = placement
-        linear, angular, position = sample.linear, sample.angular, sample.position
-        self._twists[index, :3] = linear - _cross(angular, position)
-        self._twists[index, 3:] = angular
-        self._moving = bool(self._twists.any())
+        if self._placements is None:
+            self._geometry.geometryObjects[geometry].placement = pin.SE3(sample.rotation, sample.position)
+        else:
+            self._placements[geometry, :9] = sample.rotation.T.ravel()
+            self._placements[geometry, 9:] = sample.position
+        # plain floats: numpy's scalars cost more than the arithmetic
+        (x, y, z), (vx, vy, vz), (wx, wy, wz) = (
+            sample.position.tolist(),
+            sample.linear.tolist(),
+            sample.angular.tolist(),
+        )
+        twist = (vx - wy * z + wz * y, vy - wz * x + wx * z, vz - wx * y + wy * x, wx, wy, wz)
+        self._twists[index] = twist
+        if any(twist):
+            self._moving.add(index)
+        else:
+            self._moving.discard(index)
         if self._cull is not None:
-            self._cull.place(geometry, placement)
+            self._cull.place(geometry, sample.rotation, sample.position)
 
     def compute(self, data: Any, kinematics: Kinematics, reach: float) -> Proximity:
         """Closest points and rates of the pairs nearer than `reach`.
@@ -76,7 +89,7 @@ class DistanceQuery:
             self._scene.support,
             self._twists,
             self._twist_row,
-            self._moving,
+            bool(self._moving),
         )
         return Proximity(near, closest, J, drift)
 
@@ -89,9 +102,10 @@ class _Cull:
         self._bodies = len(scene.body_names)
         shapes = [bounding_sphere(body.geometry) for body in geometry.geometryObjects]
         self._local, self._radius = np.array([c for c, _ in shapes]), np.array([r for _, r in shapes])
+        self._centered = (self._local == 0.0).all(axis=1).tolist()
         self._centers = np.ones((len(shapes), 5))
         for i, body in enumerate(geometry.geometryObjects):
-            self.place(i, body.placement)
+            self.place(i, body.placement.rotation, body.placement.translation)
         self._pair_of = np.full((self._bodies, len(shapes)), -1, dtype=np.intp)
         self._pair_of[scene.pairs[:, 0], scene.pairs[:, 1]] = np.arange(len(scene.pairs))
         self._reach = np.nan
@@ -100,9 +114,9 @@ class _Cull:
         self._last = b""
         self._poses = view_poses(data.oMg)
 
-    def place(self, index: int, placement: Any) -> None:
+    def place(self, index: int, rotation: Array, position: Array) -> None:
         """Moves the bounding sphere of one geometry."""
-        center = placement.act(self._local[index])
+        center = position if self._centered[index] else rotation @ self._local[index] + position
         self._centers[index, :3], self._centers[index, 4] = center, -(center @ center)
 
     def switch(self, reach: float) -> IntArray:
@@ -123,7 +137,3 @@ class _Cull:
                 self._data.deactivateCollisionPair(pair)
             self._active = wanted
         return pairs
-
-
-def _cross(a: Array, b: Array) -> tuple[float, float, float]:
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]

@@ -280,9 +280,10 @@ def test_without_the_views_the_result_is_the_same(panda, monkeypatch, missing):
     qs = [random_q(panda, rng) for _ in range(3)]
     fast = [look(scene, q, reach=0.3) for q in qs]
     for name in missing:
-        monkeypatch.setattr(proximity, name, lambda *_: None)
+        monkeypatch.setattr(proximity, name, lambda *_, **__: None)
     query = DistanceQuery(scene)
-    assert (query._results is None, query._cull._poses is None) == tuple(
+    assert (query._placements is None) == (query._cull is not None and query._cull._poses is None)
+    assert (query._results is None, query._placements is None) == tuple(
         name in missing for name in ("view_results", "view_poses")
     )
     for q, expected in zip(qs, fast, strict=True):

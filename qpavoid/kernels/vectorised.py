@@ -44,7 +44,7 @@ def candidates(poses: Array, local: Array, centers: Array, within: Array, pair_o
     body[:, :3] = np.matmul(local[:bodies, None], poses[:bodies, :9].reshape(-1, 3, 3))[:, 0] + poses[:bodies, 9:]
     np.einsum("ij,ij->i", body[:, :3], -body[:, :3], out=body[:, 4])
     # 2 a·c - |a|² - |c|² >= -within, the left side as one matrix product
-    return pair_of[(body[:, _SWAPPED] * _DOUBLED) @ centers.T + within >= 0.0]
+    return np.asarray(pair_of[(body[:, _SWAPPED] * _DOUBLED) @ centers.T + within >= 0.0])
 
 
 def distance_rows(
