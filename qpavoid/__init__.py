@@ -1,5 +1,6 @@
 """qpavoid: follow a planned motion and stay clear of obstacles, other arms and yourself."""
 
+from qpavoid.batch import BatchError, Steps, WorkerDied, Workers, simulate_many, steps
 from qpavoid.config import Avoidance, Limits, ScenarioConfig
 from qpavoid.controller import Controller, Tick
 from qpavoid.errors import ConfigError, NumericalError, QpavoidError, SolverNotInstalled, UnknownName
@@ -16,6 +17,7 @@ from qpavoid.tasks import build_tasks
 __all__ = [
     "SOLVERS",
     "Avoidance",
+    "BatchError",
     "ConfigError",
     "Controller",
     "Limits",
@@ -32,11 +34,16 @@ __all__ = [
     "Solver",
     "SolverNotInstalled",
     "Status",
+    "Steps",
     "Tick",
     "UnknownName",
+    "WorkerDied",
+    "Workers",
     "build_scene",
     "build_tasks",
     "load_scenario",
     "make_solver",
     "simulate",
+    "simulate_many",
+    "steps",
 ]

@@ -23,6 +23,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from qpavoid.config import ScenarioConfig
 from qpavoid.controller import Controller
 from qpavoid.errors import ConfigError, QpavoidError
+from qpavoid.kernels import ACCELERATED
 from qpavoid.loading import load_scenario, robot_names, scenario_names
 from qpavoid.log import Log
 from qpavoid.report import failed, metrics_table, to_json
@@ -60,7 +61,7 @@ def list_(kind: Annotated[Kind | None, typer.Argument(help="Only these.")] = Non
     names = {
         Kind.robots: robot_names(),
         Kind.scenarios: scenario_names(),
-        Kind.solvers: [*SOLVERS, *(f"qp:{name}" for name in backend_names())],
+        Kind.solvers: [*SOLVERS, *["qp:native"] * ACCELERATED, *(f"qp:{name}" for name in backend_names())],
     }
     if kind is not None:
         for name in names[kind]:

@@ -13,6 +13,10 @@ from qpavoid.config import Box, Capsule, Cylinder, Shape, Sphere
 from qpavoid.problem import Array
 
 
+class MeshWarning(UserWarning):
+    """Distances will be slow: a robot is made of triangle meshes."""
+
+
 @dataclass(frozen=True, slots=True)
 class CapsuleFit:
     """An enclosing capsule: axis along z of `rotation`, centred on `center`; length 0 is a sphere."""
@@ -68,6 +72,11 @@ def convert_bodies(bodies: Any, kind: str) -> Any:
     return converted
 
 
+def triangle_meshes(bodies: Any) -> list[str]:
+    """Names of the bodies of a pinocchio geometry model that are triangle meshes."""
+    return [body.name for body in bodies.geometryObjects if isinstance(body.geometry, coal.BVHModelBase)]
+
+
 def enclosing_capsule(geometry: Any) -> CapsuleFit:
     """The capsule around a coal shape, in the shape's own frame; spheres and capsules are their own."""
     if isinstance(geometry, coal.Sphere):
@@ -75,6 +84,16 @@ def enclosing_capsule(geometry: Any) -> CapsuleFit:
     if isinstance(geometry, coal.Capsule):
         return CapsuleFit(np.zeros(3), np.eye(3), geometry.radius, 2.0 * geometry.halfLength)
     return fit_capsule(_vertices(geometry))
+
+
+def bounding_sphere(geometry: Any) -> tuple[Array, float]:
+    """Centre (3,) in the shape's own frame and radius [m] of a ball around a coal shape."""
+    if isinstance(geometry, coal.Sphere | coal.Capsule | coal.Cylinder):
+        half = getattr(geometry, "halfLength", 0.0)
+        wide = isinstance(geometry, coal.Cylinder)
+        return np.zeros(3), float(np.hypot(geometry.radius, half) if wide else geometry.radius + half)
+    geometry.computeLocalAABB()
+    return np.array(geometry.aabb_center), float(geometry.aabb_radius)
 
 
 def _convex_hull(mesh: Any) -> tuple[Any, Any]:

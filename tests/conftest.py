@@ -3,12 +3,16 @@
 import numpy as np
 import pinocchio as pin
 import pytest
+from hypothesis import settings
 
 from qpavoid import Obstacle, Robot, Sample, build_scene, config
 from qpavoid.kinematics import ForwardKinematics
 from qpavoid.loading import example_robot_data
 from qpavoid.motion import build_motion
 from qpavoid.proximity import DistanceQuery
+
+settings.register_profile("patient", deadline=None)  # the first call of a compiled function may wait for the compiler
+settings.load_profile("patient")
 
 EXAMPLES = example_robot_data() / "example-robot-data" / "robots"
 SPHERE = config.Sphere(type="sphere", radius=0.06)

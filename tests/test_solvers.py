@@ -10,14 +10,16 @@ from qpavoid import Problem, Status, UnknownName, make_solver
 from qpavoid.config import Eq10Solver
 from qpavoid.errors import SolverNotInstalled
 from qpavoid.gains import alpha, beta
+from qpavoid.kernels import ACCELERATED
 from qpavoid.problem import AvoidanceRows, Tracking
 from qpavoid.solvers.analytic import tracking_velocity
 from qpavoid.solvers.backends import make_backend
 
 NV, D1, D2 = 7, 0.18, 0.36
 seeds = st.integers(0, 2**32 - 1)
-EXACT = ("daqp", "quadprog")
-BACKENDS = ("daqp", "quadprog", "proxqp", "osqp")
+COMPILED = ("native",) if ACCELERATED else ()
+EXACT = ("daqp", "quadprog", *COMPILED)
+BACKENDS = (*EXACT, "proxqp", "osqp")
 
 
 def make_problem(seed: int, pairs: int = 3, damping: float = 0.0, rows: int = 3, limit: float = 2.0) -> Problem:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from qpavoid.kernels.compiled import damped_solution, projection_cost, shortfall
 from qpavoid.problem import Array
 
 _TOLERANCE = 1e-10
@@ -19,34 +18,34 @@ _TOLERANCE = 1e-10
 
 @njit(cache=True)
 def project(
-    A: Array, b: Array, damping: float, regularization: float, J: Array, least: Array, lower: Array, upper: Array
+    A: Array, regularization: float, v0: Array, J: Array, least: Array, lower: Array, upper: Array
 ) -> tuple[Array, bool]:
-    """The velocity closest to A⁺b that satisfies J v >= least and lower <= v <= upper.
-
-    Closest in the metric P = AᵀA + λ; see `qpavoid.solvers.qp.Qp`.
+    """The velocity closest to v0 in the metric P = AᵀA + λ with J v >= least and lower <= v <= upper.
 
     Args:
         A: tracking rows (r, nv).
-        b: their right-hand sides (r,).
-        damping: of A⁺ [-].
         regularization: λ.
+        v0: wanted velocity (nv,).
         J: avoidance rows (k, nv).
         least: their right-hand sides (k,).
         lower: lower bounds (nv,).
         upper: upper bounds (nv,).
 
     Returns:
-        (nv,), and whether it is the answer; if not, no point meets all constraints, round-off got in the way, or the
-        tracking rows need a pseudo-inverse.
+        (nv,), and whether it is the answer; if not, no point meets all constraints, or round-off got in the way.
     """
-    v = damped_solution(A, b, damping)
-    worst = shortfall(v, J, least, lower, upper)
-    if worst <= 0.0 or np.isnan(worst):
-        return v, worst <= 0.0
-    P, _ = projection_cost(A, regularization, v)
+    rows, nv = A.shape
+    P = np.zeros((nv, nv))
+    for r in range(rows):
+        for i in range(nv):
+            for j in range(nv):
+                P[i, j] += A[r, i] * A[r, j]
+    for i in range(nv):
+        P[i, i] += regularization
+    v = v0.copy()
     if not minimize(P, v, J, least, lower, upper):
         return v, False
-    for i in range(len(v)):
+    for i in range(nv):
         v[i] = min(max(v[i], lower[i]), upper[i])
         if not np.isfinite(v[i]):
             return v, False
@@ -79,6 +78,8 @@ def minimize(P: Array, x: Array, G: Array, h: Array, lower: Array, upper: Array)
         p, violation = _most_violated(x, G, h, lower, upper)
         if violation <= _TOLERANCE:
             return True
+        if np.isnan(violation):
+            return False
         normal[:] = 0.0
         if p < n:
             normal[p] = 1.0
@@ -170,19 +171,22 @@ def _slack(p: int, x: Array, G: Array, h: Array, lower: Array, upper: Array) -> 
 
 @njit(cache=True)
 def _most_violated(x: Array, G: Array, h: Array, lower: Array, upper: Array) -> tuple[int, float]:
+    """Which constraint x violates most, and by how much; NaN in a row shows."""
     n = len(x)
     worst, violation = -1, -np.inf
     for i in range(n):
-        if lower[i] - x[i] > violation:
+        if not lower[i] - x[i] <= violation:
             worst, violation = i, lower[i] - x[i]
-        if x[i] - upper[i] > violation:
+        if not x[i] - upper[i] <= violation:
             worst, violation = n + i, x[i] - upper[i]
     for k in range(len(h)):
         outside = h[k]
         for i in range(n):
             outside -= G[k, i] * x[i]
-        if outside > violation:
+        if not outside <= violation:
             worst, violation = 2 * n + k, outside
+        if np.isnan(outside):
+            break
     return worst, violation
 
 

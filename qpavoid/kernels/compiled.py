@@ -1,6 +1,7 @@
 """The functions of `qpavoid.kernels.vectorised` as loops that numba compiles; documented there.
 
-Compiled code is cached on disk, so that only the first run after an installation waits for the compiler.
+Compiled code is cached on disk, so that only the first run after an installation waits for the compiler. The cache
+follows this file alone: after a change to what it takes from `vectorised`, remove `__pycache__`.
 """
 
 from __future__ import annotations

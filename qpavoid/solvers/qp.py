@@ -40,22 +40,18 @@ class Qp:
 
     def solve(self, problem: Problem) -> Solution:
         """The closest safe velocity; relaxed where there is none; a stop where that fails too."""
-        if self._project is not None:
-            (A, b, damping), rows, lower, upper, _ = problem
-            v, solved = self._project(A, b, damping, self.config.regularization, rows.J, rows.b, lower, upper)
-            if solved:
-                return Solution(v)
-        return self._by_backend(problem)
-
-    def _by_backend(self, problem: Problem) -> Solution:
-        (A, b_tracking, damping), rows, lower, upper, _ = problem
-        v0, worst = kernels.tracking_shortfall(A, b_tracking, damping, rows.J, rows.b, lower, upper)
+        (A, b, damping), rows, lower, upper, _ = problem
+        v0, worst = kernels.tracking_shortfall(A, b, damping, rows.J, rows.b, lower, upper)
         if worst <= 0.0:
             return Solution(v0)
         if v0[0] != v0[0]:
             v0 = undamped_velocity(problem.tracking)
             if kernels.shortfall(v0, rows.J, rows.b, lower, upper) <= 0.0:
                 return Solution(v0)
+        if self._project is not None:
+            answer, solved = self._project(A, self.config.regularization, v0, rows.J, rows.b, lower, upper)
+            if solved:
+                return Solution(answer)
         P, q = kernels.projection_cost(A, self.config.regularization, v0)
         v = self._closest(P, q, rows.b, problem)
         if v is not None:
@@ -106,7 +102,7 @@ def _compiled_projection() -> Callable[..., tuple[Array, bool]]:
     except ModuleNotFoundError:
         raise SolverNotInstalled("QP back end 'native' needs numba: pip install 'qpavoid[fast]'") from None
     one, row = np.ones(1), np.ones((1, 1))
-    project(row, one, 0.1, 1.0, row, 2.0 * one, -3.0 * one, 3.0 * one)
+    project(row, 1.0, one, row, 2.0 * one, -3.0 * one, 3.0 * one)
     return project  # type: ignore[no-any-return]
 
 

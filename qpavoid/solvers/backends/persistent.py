@@ -1,0 +1,153 @@
+"""proxqp and osqp: set up once for each size, updated in place, started from the last solution of that size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import isfinite
+from typing import Any, Protocol
+
+import numpy as np
+from osqp import OSQP  # type: ignore[import-untyped]
+from proxsuite import proxqp  # type: ignore[import-untyped]
+from scipy.sparse import csc_matrix
+
+from qpavoid.problem import Array
+
+_MOST = 64
+"""Number of workspaces that are kept; the one that was not used for longest goes first."""
+_RESIDUAL = 1e-8
+"""Largest residual of the optimality conditions with which a warm-started answer is taken."""
+_INFINITY = 1e20
+"""What both take for no bound."""
+
+Answer = tuple[Array, Array]
+"""x (n,) and the multipliers (m,) of G x >= h, not negative at a minimum."""
+
+
+class Workspace(Protocol):
+    """A solver's memory for one size; made from the first problem, which is then solved cold."""
+
+    def update(self, P: Array, q: Array, G: Array, h: Array, lower: Array, upper: Array) -> None:
+        """Puts another problem of the same size in its place."""
+        ...
+
+    def solve(self) -> Answer | None:
+        """Solves what is in it; None where there is no solution."""
+        ...
+
+
+class Persistent:
+    """A back end made of workspaces.
+
+    What an earlier problem left behind must never show in an answer, but a warm start can end at a point that is no
+    minimum and report success (proxqp 0.8, once in 1500 unrelated problems: a multiplier of the wrong sign, x off by
+    up to 1.8). Hence a warm-started answer has to meet the optimality conditions, which takes about 10 µs to see; else
+    its workspace is dropped and the problem solved cold.
+    """
+
+    def __init__(self, make: Callable[..., Workspace]) -> None:
+        self._make = make
+        self._workspaces: dict[tuple[int, ...], Workspace] = {}
+
+    def __call__(self, P: Array, q: Array, G: Array, h: Array, lower: Array, upper: Array) -> Array | None:
+        """Minimiser of ½ xᵀP x + qᵀx subject to G x >= h, lower <= x <= upper; None where none is found."""
+        if not _well_formed(P, q, G, h, lower, upper):
+            return None
+        workspace = self._workspaces.pop(G.shape, None)
+        answer = None
+        if workspace is not None:
+            workspace.update(P, q, G, h, lower, upper)
+            answer = workspace.solve()
+        if workspace is None or answer is None or not residual(P, q, G, h, lower, upper, *answer) <= _RESIDUAL:
+            workspace = self._make(P, q, G, h, lower, upper)
+            answer = workspace.solve()
+        if answer is None:
+            return None
+        self._workspaces[G.shape] = workspace
+        if len(self._workspaces) > _MOST:
+            del self._workspaces[next(iter(self._workspaces))]
+        return answer[0]
+
+
+def _well_formed(P: Array, q: Array, G: Array, h: Array, lower: Array, upper: Array) -> bool:
+    """Whether there is no NaN, on which both iterate to their limit, and no bound is above the other."""
+    return all(isfinite(np.vdot(a, a)) for a in (P, q, G, h)) and bool((lower <= upper).all())
+
+
+def residual(P: Array, q: Array, G: Array, h: Array, lower: Array, upper: Array, x: Array, y: Array) -> float:
+    """Natural residual of the optimality conditions, 0 at the minimum only.
+
+    max(‖x - clip(x - (P x + q - Gᵀy), lower, upper)‖∞, ‖min(y, G x - h)‖∞)
+    """
+    step = np.minimum(np.maximum(x - (P @ x + q - y @ G), lower), upper)
+    return max(float(np.abs(x - step).max()), float(np.abs(np.minimum(y, G @ x - h)).max(initial=0.0)))
+
+
+class ProxqpWorkspace:
+    """Proximal augmented Lagrangian method (Bambade et al. 2022), dense, with box constraints.
+
+    The duality gap must be checked: without it, x was off by up to 1e-4 at residuals of 1e-9. PrimalDualLDLT is not
+    what `Automatic` picks for these sizes, and up to three times as quick.
+    """
+
+    def __init__(self, P: Array, q: Array, G: Array, h: Array, lower: Array, upper: Array) -> None:
+        self._rows, n = G.shape
+        self._qp = proxqp.dense.QP(n, 0, self._rows, True, dense_backend=proxqp.dense.DenseBackend.PrimalDualLDLT)
+        settings = self._qp.settings
+        settings.initial_guess = proxqp.InitialGuess.WARM_START_WITH_PREVIOUS_RESULT
+        settings.eps_abs, settings.eps_rel = 1e-10, 0.0
+        settings.check_duality_gap, settings.eps_duality_gap_abs, settings.eps_duality_gap_rel = True, 1e-12, 1e-13
+        settings.max_iter, settings.max_iter_in = 100, 100
+        above = np.full(self._rows, _INFINITY)
+        self._qp.init(P, q, None, None, *self._given(G, h, above), lower, upper)
+
+    def _given(self, *rows: Array | None) -> tuple[Array | None, ...]:
+        return rows if self._rows else (None,) * len(rows)
+
+    def update(self, P: Array, q: Array, G: Array, h: Array, lower: Array, upper: Array) -> None:
+        """See `Workspace`."""
+        self._qp.update(P, q, None, None, *self._given(G, h, None), lower, upper, update_preconditioner=False)
+
+    def solve(self) -> Answer | None:
+        """See `Workspace`."""
+        self._qp.solve()
+        results = self._qp.results
+        if results.info.status != proxqp.QPSolverOutput.PROXQP_SOLVED:
+            return None
+        return np.array(results.x), -np.array(results.z[: self._rows])
+
+
+class OsqpWorkspace:
+    """Operator splitting (Stellato et al. 2020); bounds are the first n rows of [I; G]. Polishing makes it exact."""
+
+    def __init__(self, P: Array, q: Array, G: Array, h: Array, lower: Array, upper: Array) -> None:
+        m, n = G.shape
+        self._n = n
+        self._column, self._row = np.tril_indices(n)
+        self._data = np.ones((n, 1 + m))
+        self._above = np.full(n + m, np.inf)
+        in_column = np.concatenate((np.arange(n)[:, None], np.broadcast_to(np.arange(n, n + m), (n, m))), axis=1)
+        starts = np.concatenate(([0], np.cumsum(np.arange(1, n + 1))))
+        vectors = self._vectors(P, q, G, h, lower, upper)
+        cost = csc_matrix((vectors.pop("Px"), self._row, starts), shape=(n, n))
+        rows = csc_matrix((vectors.pop("Ax"), in_column.ravel(), np.arange(n + 1) * (1 + m)), shape=(n + m, n))
+        settings: dict[str, Any] = {"eps_abs": 1e-9, "eps_rel": 1e-12, "max_iter": 20000, "polishing": True}
+        settings["polish_refine_iter"] = 10  # with the default of 3, polished answers were off by up to 6e-5
+        self._qp = OSQP()
+        self._qp.setup(P=cost, A=rows, **vectors, **settings, verbose=False)
+
+    def _vectors(self, P: Array, q: Array, G: Array, h: Array, lower: Array, upper: Array) -> dict[str, Array]:
+        """Every entry that can change: upper triangle of P and all of [I; G], by columns."""
+        self._data[:, 1:] = G.T
+        self._above[: self._n] = upper
+        below = np.concatenate((lower, h))
+        return {"Px": P[self._row, self._column], "Ax": self._data.ravel(), "q": q, "l": below, "u": self._above}
+
+    def update(self, P: Array, q: Array, G: Array, h: Array, lower: Array, upper: Array) -> None:
+        """See `Workspace`."""
+        self._qp.update(**self._vectors(P, q, G, h, lower, upper))
+
+    def solve(self) -> Answer | None:
+        """See `Workspace`."""
+        result = self._qp.solve(raise_error=False)
+        return (np.array(result.x), -result.y[self._n :]) if result.info.status_val == 1 else None

@@ -1,0 +1,75 @@
+"""The compiled active-set method against quadprog, and on what active-set methods stumble over."""
+
+import numpy as np
+import pytest
+import quadprog
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+pytest.importorskip("numba")
+from qpavoid.kernels.active_set import minimize, project
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def random_problem(seed, feasible, repeated):
+    """P, x0, G, h, lower, upper; rows that repeat each other, exactly or nearly; some bounds infinite."""
+    rng = np.random.default_rng(seed)
+    n, m = int(rng.integers(1, 20)), int(rng.integers(0, 40))
+    A = rng.normal(size=(int(rng.integers(1, 7)), n))
+    P = A.T @ A + 1e-3 * np.eye(n)
+    G = rng.normal(size=(m, n))
+    inside = rng.uniform(-0.5, 0.5, n)
+    h = G @ inside - rng.uniform(0, 1, m) * rng.choice([0.0, 0.01, 1.0], m) if feasible else rng.normal(size=m)
+    if repeated and m > 4:
+        G[3], h[3] = G[2], h[2]
+        G[1], h[1] = G[0] * (1.0 + 1e-9), h[0] * (1.0 + 1e-9)
+    lower = np.where(rng.random(n) < 0.3, -np.inf, -1.0)
+    return P, rng.normal(size=n) * rng.choice([0.1, 1.0, 5.0]), G, h, lower, np.ones(n)
+
+
+@settings(deadline=None, max_examples=300)
+@given(seeds, st.booleans())
+def test_feasible_problems_are_solved_as_quadprog_solves_them(seed, repeated):
+    P, x0, G, h, lower, upper = random_problem(seed, True, repeated)
+    x = x0.copy()
+    assert minimize(P, x, G, h, lower, upper)
+    assert np.all(G @ x >= h - 1e-8) and np.all(x >= lower - 1e-9) and np.all(x <= upper + 1e-9)
+    constraints = np.vstack((G, np.eye(len(x)), -np.eye(len(x))))
+    bounds = np.concatenate((h, np.maximum(lower, -1e6), -upper))
+    try:
+        reference = quadprog.solve_qp(P, P @ x0, constraints.T.copy(), bounds)[0]
+    except ValueError:  # quadprog gives up on some problems with rows that repeat each other
+        return
+    np.testing.assert_allclose(x, reference, atol=1e-7)
+
+
+@settings(deadline=None, max_examples=200)
+@given(seeds)
+def test_no_answer_means_that_there_is_none(seed):
+    from scipy.optimize import linprog
+
+    P, x0, G, h, lower, upper = random_problem(seed, False, False)
+    x = x0.copy()
+    if minimize(P, x, G, h, lower, upper):
+        assert np.all(G @ x >= h - 1e-8)
+    else:
+        programme = linprog(np.zeros(len(x)), A_ub=-G, b_ub=-h - 1e-9, bounds=list(zip(lower, upper, strict=True)))
+        assert programme.status == 2
+
+
+def test_without_constraints_in_the_way_nothing_moves():
+    x = np.array([0.1, -0.2])
+    assert minimize(np.eye(2), x, np.ones((1, 2)), np.array([-5.0]), -np.ones(2), np.ones(2))
+    np.testing.assert_array_equal(x, [0.1, -0.2])
+
+
+@pytest.mark.parametrize("place", ["A", "v0", "J", "least"])
+def test_nan_is_no_answer(place):
+    arguments = {
+        "A": np.eye(3), "regularization": 1e-3, "v0": np.ones(3), "J": np.ones((2, 3)),
+        "least": np.array([2.9, 0.0]), "lower": -np.ones(3), "upper": 0.99 * np.ones(3),
+    }  # fmt: skip
+    arguments[place] = arguments[place].copy()
+    arguments[place].flat[0] = np.nan
+    assert not project(*arguments.values())[1]

@@ -1,0 +1,251 @@
+"""QP back ends: the same minimum from all of them, whatever they were asked before."""
+
+from time import perf_counter
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import qpsolvers
+
+from qpavoid.solvers.backends import backend_names, make_backend, solve_daqp
+from qpavoid.solvers.backends.persistent import OsqpWorkspace, Persistent, ProxqpWorkspace, residual
+
+BACKENDS = backend_names()
+NATIVE = ("daqp", "proxqp", "osqp")
+TOLERANCE = {"daqp": 1e-9, "quadprog": 1e-9, "proxqp": 1e-6, "osqp": 1e-6}
+"""Largest error of x [rad/s]; P's smallest eigenvalue is 1e-3."""
+LESS_EXACT = 5e-4
+"""The same for what else may be installed: about the root of twice an interior-point method's gap over 1e-3."""
+
+
+class QP(NamedTuple):
+    P: np.ndarray
+    q: np.ndarray
+    G: np.ndarray
+    h: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+
+
+def make_qp(random: np.random.Generator, n: int, m: int, free: bool = False) -> QP:
+    """A QP as a tick makes it: six tracking rows and a regularised rest, rows and bounds that some point meets."""
+    A = random.normal(size=(6, n))
+    P = A.T @ A + 1e-3 * np.eye(n)
+    lower, upper = -random.uniform(0.1, 2.0, n), random.uniform(0.1, 2.0, n)
+    G, inside = random.normal(size=(m, n)), random.uniform(lower, upper)
+    h = G @ inside - random.uniform(0.0, 0.3, m)
+    if free:
+        lower, upper = np.full(n, -np.inf), np.full(n, np.inf)
+    return QP(P, -P @ random.normal(size=n), G, h, lower, upper)
+
+
+def contradicting(qp: QP) -> QP:
+    """The same, with two rows that exclude each other: g x >= h and -g x >= 1 - h."""
+    G, h = qp.G.copy(), qp.h.copy()
+    G[1], h[1] = -G[0], 1.0 - h[0]
+    return qp._replace(G=G, h=h)
+
+
+def minimum(qp: QP) -> np.ndarray | None:
+    """By quadprog (Goldfarb and Idnani), with finite bounds as rows."""
+    rows = [(-qp.G, -qp.h)] if len(qp.h) else []
+    eye = np.eye(len(qp.q))
+    rows += [(eye[keep], qp.upper[keep]) for keep in [np.isfinite(qp.upper)]]
+    rows += [(-eye[keep], -qp.lower[keep]) for keep in [np.isfinite(qp.lower)]]
+    G, h = np.concatenate([g for g, _ in rows]), np.concatenate([b for _, b in rows])
+    return qpsolvers.solve_qp(qp.P, qp.q, *((G, h) if len(h) else ()), solver="quadprog")
+
+
+def assert_minimum(name: str, answer: np.ndarray | None, qp: QP, reference: np.ndarray | None = None) -> None:
+    assert answer is not None, f"{name} found no solution to a feasible problem of shape {qp.G.shape}"
+    reference = minimum(qp) if reference is None else reference
+    np.testing.assert_allclose(answer, reference, rtol=0.0, atol=TOLERANCE.get(name, LESS_EXACT))
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_the_minimum_whatever_size_came_before(name):
+    random, solve = np.random.default_rng(1), make_backend(name)
+    for _ in range(150):
+        qp = make_qp(random, int(random.choice([7, 14, 35])), int(random.integers(0, 31)))
+        assert_minimum(name, solve(*qp), qp)
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_a_slowly_changing_problem_is_followed(name):
+    """What warm starts are for: the rows turn a little from tick to tick, and change their number at times."""
+    random, solve = np.random.default_rng(2), make_backend(name)
+    before, after = make_qp(random, 7, 9), make_qp(random, 7, 9)
+    for tick in range(200):
+        s, m = tick / 200.0, 9 - tick // 40
+        mixed = QP(*((1.0 - s) * a + s * b for a, b in zip(before, after, strict=True)))
+        qp = mixed._replace(G=np.ascontiguousarray(mixed.G[:m]), h=mixed.h[:m] - 0.5)
+        assert_minimum(name, solve(*qp), qp)
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize("free_first", [False, True])
+def test_nothing_of_a_very_different_problem_shows(name, free_first):
+    """The answer is the one that a fresh back end gives, also where bounds of the old active set are now infinite."""
+    random = np.random.default_rng(3)
+    for _ in range(25):
+        solve = make_backend(name)
+        other, qp = make_qp(random, 7, 5, free_first), make_qp(random, 7, 5, not free_first)
+        solve(*other._replace(q=100.0 * other.q))
+        cold = make_backend(name)(*qp)
+        assert_minimum(name, cold, qp)
+        assert_minimum(name, solve(*qp), qp, cold)
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_an_infeasible_problem_gives_none_and_leaves_nothing_behind(name):
+    random, solve = np.random.default_rng(4), make_backend(name)
+    for _ in range(10):
+        good, bad = make_qp(random, 7, 6), contradicting(make_qp(random, 7, 6))
+        assert minimum(bad) is None
+        assert_minimum(name, solve(*good), good)
+        assert solve(*bad) is None
+        again = make_qp(random, 7, 6)
+        assert_minimum(name, solve(*again), again)
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_a_row_beyond_the_bounds_is_infeasible(name):
+    qp = make_qp(np.random.default_rng(5), 7, 1)
+    beyond = np.abs(qp.G[0]) @ np.maximum(-qp.lower, qp.upper)  # no x within the bounds reaches more
+    assert make_backend(name)(*qp._replace(h=np.array([beyond + 0.1]))) is None
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize("m", [0, 4])
+def test_infinite_bounds(name, m):
+    """Unbounded on some sides, or on all: without rows too, the minimum is then -P⁻¹q."""
+    random, solve = np.random.default_rng(6), make_backend(name)
+    for _ in range(10):
+        qp = make_qp(random, 7, m)
+        lower, upper = qp.lower.copy(), qp.upper.copy()
+        lower[:4], upper[2:6] = -np.inf, np.inf
+        qp = qp._replace(lower=lower, upper=upper)
+        assert_minimum(name, solve(*qp), qp)
+        free = make_qp(random, 7, m, free=True)
+        assert_minimum(name, solve(*free), free, None if m else np.linalg.solve(free.P, -free.q))
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_locked_coordinates_stay(name):
+    qp = make_qp(np.random.default_rng(7), 7, 3)
+    lower, upper = qp.lower.copy(), qp.upper.copy()
+    lower[2] = upper[2] = 0.0
+    qp = qp._replace(G=qp.G, h=qp.h - 5.0, lower=lower, upper=upper)
+    answer = make_backend(name)(*qp)
+    assert answer is not None and answer[2] == pytest.approx(0.0, abs=1e-9)
+    assert_minimum(name, answer, qp)
+
+
+@pytest.mark.parametrize("name", NATIVE)
+@pytest.mark.parametrize("field", ["P", "q", "G", "h"])
+def test_nan_ends_soon_and_is_forgotten(name, field):
+    random, solve = np.random.default_rng(8), make_backend(name)
+    for _ in range(3):
+        good, bad = make_qp(random, 7, 4), make_qp(random, 7, 4)
+        assert_minimum(name, solve(*good), good)
+        broken = getattr(bad, field).copy()
+        broken.flat[0] = np.nan
+        begin = perf_counter()
+        answer = solve(*bad._replace(**{field: broken}))
+        assert perf_counter() - begin < 1.0
+        if answer is not None:  # daqp: x is NaN, or the row that has no number in it was never looked at
+            assert name == "daqp"
+
+
+def test_answers_are_not_memory_of_the_solver():
+    """An answer that was kept must not change when the next problem is solved."""
+    random = np.random.default_rng(9)
+    for name in BACKENDS:
+        solve = make_backend(name)
+        first = solve(*make_qp(random, 7, 4))
+        kept = first.copy()
+        solve(*make_qp(random, 7, 4))
+        np.testing.assert_array_equal(first, kept)
+
+
+def test_problems_are_not_changed():
+    random = np.random.default_rng(10)
+    for name in BACKENDS:
+        solve = make_backend(name)
+        for _ in range(2):
+            qp = make_qp(random, 7, 4)
+            copy = QP(*(array.copy() for array in qp))
+            solve(*qp)
+            for array, before in zip(qp, copy, strict=True):
+                np.testing.assert_array_equal(array, before)
+
+
+# --- workspaces -----------------------------------------------------------------------------------------------
+
+
+def test_the_residual_is_zero_at_the_minimum_only():
+    """Multipliers of x = clip(1, …) in closed form: min ½(x - 1)², x >= h has y = max(h - 1, 0)."""
+    one, bound = np.ones(1), np.full(1, 5.0)
+    for h in (0.3, 1.0, 2.5):
+        x, y = np.array([max(h, 1.0)]), np.array([max(h - 1.0, 0.0)])
+        qp = (np.eye(1), -one, np.eye(1), np.array([h]), -bound, bound)
+        assert residual(*qp, x, y) == pytest.approx(0.0, abs=1e-15)
+        assert residual(*qp, x + 1e-3, y) == pytest.approx(1e-3, rel=1e-6)
+        assert residual(*qp, x, y - 1e-3) == pytest.approx(1e-3, rel=1e-6)
+
+
+@pytest.mark.parametrize("make", [ProxqpWorkspace, OsqpWorkspace])
+def test_workspaces_prove_their_answers(make):
+    random = np.random.default_rng(11)
+    first = make_qp(random, 7, 5)
+    workspace = make(*first)
+    for qp in (first, make_qp(random, 7, 5), make_qp(random, 7, 5)):
+        workspace.update(*qp)
+        x, y = workspace.solve()
+        assert residual(*qp, x, y) < 1e-8
+
+
+class Scripted:
+    """A workspace that gives the right answer when it is new, and a wrong one or none when it is used again."""
+
+    made = 0
+    later: str = "right"
+
+    def __init__(self, *qp: np.ndarray) -> None:
+        Scripted.made += 1
+        self.qp, self.used = qp, False
+
+    def update(self, *qp: np.ndarray) -> None:
+        self.qp, self.used = qp, True
+
+    def solve(self) -> tuple[np.ndarray, np.ndarray] | None:
+        if self.used and Scripted.later == "none":
+            return None
+        x, y = ProxqpWorkspace(*self.qp).solve()
+        return (x + 0.01, y) if self.used and Scripted.later == "wrong" else (x, y)
+
+
+@pytest.mark.parametrize(("later", "made"), [("right", 1), ("wrong", 5), ("none", 5)])
+def test_a_warm_start_that_fails_or_lies_is_solved_again_cold(later, made):
+    Scripted.made, Scripted.later = 0, later
+    random, solve = np.random.default_rng(12), Persistent(Scripted)
+    for _ in range(5):
+        qp = make_qp(random, 7, 4)
+        assert_minimum("proxqp", solve(*qp), qp)
+    assert Scripted.made == made
+
+
+def test_workspaces_do_not_pile_up():
+    solve, random = Persistent(ProxqpWorkspace), np.random.default_rng(13)
+    for m in range(100):
+        solve(*make_qp(random, 7, m % 80 + 1))
+    assert len(solve._workspaces) <= 64
+
+
+def test_daqp_takes_any_number_of_rows():
+    """Its memory grows, and what a larger problem left in it is not read."""
+    random, solve = np.random.default_rng(14), make_backend("daqp")
+    for m in (3, 300, 3, 0, 40):
+        qp = make_qp(random, 7, m)
+        np.testing.assert_array_equal(solve(*qp), solve_daqp(*qp))
+        assert_minimum("daqp", solve(*qp), qp)
