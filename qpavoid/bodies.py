@@ -122,7 +122,8 @@ _THINNEST = 1e-4
 def _vertices(geometry: Any) -> Array:
     """Points whose hull encloses the shape (n, 3)."""
     if isinstance(geometry, coal.BVHModelBase):
-        return np.array(geometry.vertices())
+        hull, _ = _convex_hull(geometry)  # fine meshes have a hundred times the points of their hulls
+        return np.array(hull.points() if isinstance(hull, coal.ConvexBase) else geometry.vertices())
     if isinstance(geometry, coal.ConvexBase):
         return np.array(geometry.points())
     if isinstance(geometry, coal.Cylinder):

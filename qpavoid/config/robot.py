@@ -57,7 +57,7 @@ class RobotConfig(Block):
     """Frames that are meant as tools."""
     bodies: Literal["convex", "capsule", "mesh"] | list[Body] = "convex"
     """Collision bodies: `convex` hulls of the URDF's collision geometry, one enclosing `capsule` for each piece of
-    it, the triangle `mesh` as it is (slow: 50 to 200 µs a pair), or a list of bodies."""
+    it, the triangle `mesh` as it is (slow: 50 to 1000 µs a pair), or a list of bodies."""
     disabled_pairs: list[tuple[str, str]] = []
     """Pairs of bodies never checked; `*` and `?` match as in file names."""
     limits: JointLimits = JointLimits()
