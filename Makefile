@@ -1,6 +1,8 @@
 # `make run` and `make test` set up everything they need in .venv; PYTHON=python3.12 picks another interpreter.
 PYTHON ?= python3
 BIN := .venv/bin
+# what runs a second time without numba: the tick and everything that it is made of
+TICK_TESTS := $(addprefix tests/test_,$(addsuffix .py,avoidance backends examples limits proximity situations solvers tasks))
 
 .PHONY: run figures test lint types clean
 
@@ -12,6 +14,7 @@ figures: run
 
 test: .venv/dev
 	$(BIN)/pytest -n auto
+	QPAVOID_NUMBA=0 $(BIN)/pytest -n auto $(TICK_TESTS)
 
 lint: .venv/dev
 	$(BIN)/ruff check .

@@ -129,7 +129,7 @@ class Controller:
             obstacles: where obstacles are now and how they move, by name, in place of their motion.
 
         Raises:
-            NumericalError: q of the wrong shape, NaN or infinity.
+            NumericalError: q of the wrong shape; NaN or infinity in q or in an obstacle.
             UnknownName: of a target or obstacle.
         """
         return self._compute(q, t, targets, obstacles)[-1]

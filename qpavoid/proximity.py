@@ -6,6 +6,7 @@ does the rest, and its results are viewed as one array.
 
 from __future__ import annotations
 
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ import pinocchio as pin
 
 from qpavoid import kernels
 from qpavoid.bodies import bounding_sphere
+from qpavoid.errors import NumericalError
 from qpavoid.kinematics import Kinematics
 from qpavoid.memory import read_poses, read_results, view_poses, view_results
 from qpavoid.motion import Sample
@@ -48,19 +50,24 @@ class DistanceQuery:
         self._cull = _Cull(scene, self._geometry, self._data) if len(scene.pairs) >= _CULL_FROM else None
 
     def place_obstacle(self, index: int, sample: Sample) -> None:
-        """Puts obstacle number `index` to a pose, with a velocity."""
+        """Puts obstacle number `index` to a pose, with a velocity.
+
+        Raises:
+            NumericalError: NaN or infinity; names the obstacle, which stays where it was.
+        """
+        # plain floats: numpy's scalars cost more than the arithmetic
+        (x, y, z), (vx, vy, vz) = sample.position.tolist(), sample.linear.tolist()
+        wx, wy, wz = sample.angular.tolist()
+        if not isfinite(x + y + z + vx + vy + vz + wx + wy + wz + float(np.vdot(sample.rotation, sample.rotation))):
+            raise NumericalError(
+                f"obstacle {self._scene.obstacles[index].name!r}: NaN or infinity in its pose or twist"
+            )
         geometry = self._first_obstacle + index
         if self._placements is None:
             self._geometry.geometryObjects[geometry].placement = pin.SE3(sample.rotation, sample.position)
         else:
             self._placements[geometry, :9] = sample.rotation.T.ravel()
             self._placements[geometry, 9:] = sample.position
-        # plain floats: numpy's scalars cost more than the arithmetic
-        (x, y, z), (vx, vy, vz), (wx, wy, wz) = (
-            sample.position.tolist(),
-            sample.linear.tolist(),
-            sample.angular.tolist(),
-        )
         twist = (vx - wy * z + wz * y, vy - wz * x + wx * z, vz - wx * y + wy * x, wx, wy, wz)
         self._twists[index] = twist
         if any(twist):

@@ -45,7 +45,7 @@ def distance_rows(
     """See `vectorised.distance_rows`."""
     count = 0
     for i in pairs:
-        if results[i, 0] < reach:
+        if not results[i, 0] >= reach:
             count += 1
     nv = J_world.shape[1]
     near = np.empty(count, np.intp)
@@ -54,7 +54,7 @@ def distance_rows(
     drift = np.zeros(count)
     k = 0
     for i in pairs:
-        if results[i, 0] < reach:
+        if not results[i, 0] >= reach:
             near[k] = i
             for c in range(10):
                 closest[k, c] = results[i, c]

@@ -51,7 +51,7 @@ def distance_rows(
     results: Array, pairs: IntArray, reach: float, J_world: Array, support: Array, twists: Array, twist_row: IntArray,
     moving: bool,
 ) -> tuple[IntArray, Array, Array, Array]:  # fmt: skip
-    """Closest points and rates of the pairs that are nearer than `reach`.
+    """Closest points and rates of the pairs that are nearer than `reach`, or whose distance is NaN.
 
     The normal n is parallel to the line between the witness points, so p × n is the same at both, and every row is
     J = [n, p × n]ᵀ J_world, masked with the difference of the supports of the two bodies.
@@ -70,7 +70,7 @@ def distance_rows(
         near (k,), closest points (k, 10), J (k, nv), drift (k,).
     """
     distance = results[:, 0] if len(pairs) == len(results) else results[pairs, 0]
-    near = pairs[distance < reach]
+    near = pairs[~(distance >= reach)]  # a NaN is near, not hidden
     if not len(near):
         return near, np.empty((0, 10)), np.empty((0, J_world.shape[1])), np.empty(0)
     closest = results[near]
