@@ -105,7 +105,9 @@ def test_solvers_agree_without_anything_in_range(scenario, far_away):
 
 
 @pytest.mark.parametrize("scenario", ["situation1", "situation2"])
-@pytest.mark.parametrize(("backend", "tolerance"), [("quadprog", 1e-8), ("proxqp", 1e-5), ("osqp", 1e-5)])
+@pytest.mark.parametrize(
+    ("backend", "tolerance"), [("daqp", 1e-8), ("quadprog", 1e-8), ("proxqp", 1e-5), ("osqp", 1e-5)]
+)
 def test_back_ends_agree_with_daqp(scenario, backend, tolerance):
     reference, other = run(scenario, "qp"), run(scenario, f"qp:{backend}")
     assert set(other.metrics()["status_counts"].items()) >= {("RELAXED", 0), ("STOPPED", 0)}
