@@ -222,7 +222,7 @@ def _orbit(config: Circle, start: Sample | None, rotation: Array) -> Orbit:
     center = _position(None, start, "center") - u if config.center is None else np.array(config.center)
     omega = 2.0 * math.pi / config.period
     end = math.inf if config.turns is None else config.turns * config.period
-    return Orbit(Sample.at(center, rotation), u, np.cross(normal, u), omega, end)
+    return Orbit(Sample.at(center, rotation), u, np.asarray(np.cross(normal, u), dtype=np.float64), omega, end)
 
 
 def _read_csv(path: Path, initial: Array) -> tuple[list[float], list[Array], list[Array]]:

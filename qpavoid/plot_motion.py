@@ -199,7 +199,7 @@ def _limits(log: Log, ticks: IntArray) -> tuple[Array, Array]:
     cloud = cloud[np.isfinite(cloud).all(axis=1)]
     lower, upper = (cloud.min(axis=0), cloud.max(axis=0)) if len(cloud) else (-np.ones(3), np.ones(3))
     middle, half = 0.5 * (lower + upper), 0.5 * (upper - lower)
-    half = np.maximum(1.02 * half, 0.25 * max(half.max(), 0.05))
+    half = np.maximum(1.02 * half, 0.25 * max(float(np.max(half)), 0.05))
     return middle - half, middle + half
 
 

@@ -82,7 +82,7 @@ def label_distances(ax: Any, offset: float, *drawn: Array, name: str = "distance
     ax.set_ylabel(f"{name}between axes [m]" if offset > 0.0 else f"{name}between surfaces [m]")
     add_grid(ax)
     finite = [d[np.isfinite(d)] for d in drawn]
-    lowest = min((float(d.min()) for d in finite if d.size), default=offset)
+    lowest = min((float(np.min(d)) for d in finite if d.size), default=offset)
     bottom, top = ax.get_ylim()
     bottom = min(lowest, offset) - 0.04 * (top - offset)
     ax.axhspan(bottom, offset, color=COLLISION, alpha=0.08, linewidth=0, zorder=0)

@@ -116,7 +116,7 @@ class _Cull:
         self._pair_of = np.full((self._bodies, len(shapes)), -1, dtype=np.intp)
         self._pair_of[scene.pairs[:, 0], scene.pairs[:, 1]] = np.arange(len(scene.pairs))
         self._reach = np.nan
-        self._within = np.empty(self._pair_of.shape)
+        self._within: Array = np.empty(self._pair_of.shape)
         self._active = np.ones(len(scene.pairs), dtype=bool)
         self._last = b""
         self._poses = view_poses(data.oMg)

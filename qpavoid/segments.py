@@ -81,9 +81,9 @@ def line_parameters(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) 
     segment of zero length.
     """
     u, v = b - a, d - c
-    cross = np.cross(u, v)
+    cross = _cross(u, v)
     # Cross products, not the Gram determinant |u|²|v|² - (u·v)²: that one loses all its digits at 1e-8 rad.
-    numerator = _dot(np.cross(c - a, v), cross)
+    numerator = _dot(_cross(c - a, v), cross)
     skew = ~_parallel(u, v, cross)
     m = np.divide(numerator, _dot(cross, cross), out=np.full(numerator.shape, np.nan), where=skew)
     # n is the foot of the point m: independent rounding of m and n would cost eps / angle in the distance.
@@ -149,10 +149,10 @@ def capsule_distances(
 
 def _common_perpendicular(u: FloatArray, v: FloatArray) -> FloatArray:
     """Unit vectors perpendicular to u and v, (k, 3): some perpendicular of parallel ones, z of two points."""
-    cross = np.cross(u, v)
+    cross = _cross(u, v)
     longer = np.where((_norm(u) >= _norm(v))[:, None], u, v)
     # The coordinate axis furthest from the capsule's own gives the best conditioned perpendicular.
-    other = np.cross(longer, np.eye(3)[np.argmin(np.abs(longer), axis=1)])
+    other = _cross(longer, np.eye(3)[np.argmin(np.abs(longer), axis=1)])
     direction = np.where(_parallel(u, v, cross)[:, None], other, cross)
     direction[_norm(direction) == 0.0] = (0.0, 0.0, 1.0)
     unit: FloatArray = direction / _norm(direction)[:, None]
@@ -163,6 +163,11 @@ def _parallel(u: FloatArray, v: FloatArray, cross: FloatArray) -> NDArray[np.boo
     """Whether the sine of the angle between u and v is at most PARALLEL; true also for a zero vector."""
     parallel: NDArray[np.bool_] = _dot(cross, cross) <= PARALLEL**2 * _dot(u, u) * _dot(v, v)
     return parallel
+
+
+def _cross(x: FloatArray, y: FloatArray) -> FloatArray:
+    """Vector product over the last axis."""
+    return np.asarray(np.cross(x, y), dtype=np.float64)
 
 
 def _dot(x: FloatArray, y: FloatArray) -> FloatArray:

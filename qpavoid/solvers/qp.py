@@ -64,7 +64,7 @@ class Qp:
         v = self._backend(P, q, J, b, lower, upper)
         if v is None or not kernels.shortfall(v, J, b, lower, upper) <= _TOLERANCE:
             return None
-        return np.minimum(np.maximum(v, lower), upper)
+        return np.asarray(np.minimum(np.maximum(v, lower), upper))
 
     def _relaxed(self, P: Array, q: Array, problem: Problem) -> Solution:
         slack = self._least_slack(P, q, problem)
