@@ -201,7 +201,7 @@ def damped_solution(A: Array, b: Array, damping: float) -> Array:
 def shortfall(v: Array, J: Array, b: Array, lower: Array, upper: Array) -> float:
     """Largest violation of J v >= b and lower <= v <= upper; negative inside, NaN where there is one."""
     over = np.maximum(v - upper, lower - v).max()
-    return float(np.maximum(over, np.asarray(b - J @ v).max()) if len(b) else over)
+    return float(np.maximum(over, np.max(b - J @ v)) if len(b) else over)
 
 
 def tracking_shortfall(
