@@ -17,13 +17,12 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from qpavoid.config import Circle, Csv, Fixed, Line, Waypoints
 from qpavoid.config import Motion as MotionConfig
 from qpavoid.errors import ConfigError, NumericalError
-
-Array = NDArray[np.float64]
+from qpavoid.problem import Array
 
 END_TOLERANCE = 1e-9
 """How early a piece ends [s]: k·dt may fall a rounding error short of the time it stands for."""

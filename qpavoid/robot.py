@@ -13,13 +13,13 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid.bodies import MeshWarning, convert_bodies, make_shape, triangle_meshes
-from qpavoid.config import RobotConfig
+from qpavoid.config import Body, RobotConfig
 from qpavoid.errors import ConfigError, UnknownName
 from qpavoid.limits import JointBounds
 from qpavoid.loading import find_robot, nearest, read_config, validate
 from qpavoid.motion import rpy_to_matrix
 from qpavoid.pairs import add_self_pairs, drop_always_touching, pair_array
-from qpavoid.problem import Array
+from qpavoid.problem import Array, IntArray
 from qpavoid.urdf import find_resource, honour_srdf, read_collision, read_model
 
 _TRANSLATIONS = {
@@ -92,7 +92,7 @@ class Robot:
     def coordinate_names(self) -> list[str]:
         """Name of each of the nv velocity coordinates: the joint's, numbered where it has several."""
         names = []
-        for name, joint in zip(self.joint_names, list(self.model.joints)[1:], strict=True):
+        for name, joint in self._joints():
             names += [name] if joint.nv == 1 else [f"{name}.{i}" for i in range(joint.nv)]
         return names
 
@@ -164,9 +164,7 @@ class Robot:
             locked += [name for name in found if name not in locked]
         if not locked:
             return self, q
-        model, bodies = _reduce(self.model, self.bodies, locked, q)
-        kept = [joint for name, joint in self._joints() if name not in locked]
-        index = np.array([i for joint in kept for i in range(joint.idx_q, joint.idx_q + joint.nq)], dtype=np.intp)
+        model, bodies, index = _reduce(self.model, self.bodies, locked, q)
         return replace(self, model=model, bodies=bodies, home=self.home[index]), q[index]
 
     def _joints(self) -> Iterator[tuple[str, Any]]:
@@ -203,12 +201,11 @@ def joint_bounds(model: Any) -> JointBounds:
 def _build(config: RobotConfig, path: Path) -> Robot:
     urdf = find_resource(config.urdf, path, "urdf")
     model = read_model(urdf, config.root_joint)
-    geometry_kind = config.bodies if isinstance(config.bodies, str) else None
-    if geometry_kind is not None:
+    if isinstance(config.bodies, str):
         package_dirs = [str(path.parent / folder) for folder in config.package_dirs]
-        bodies = convert_bodies(read_collision(urdf, model, package_dirs, path), geometry_kind)
+        bodies = convert_bodies(read_collision(urdf, model, package_dirs, path), config.bodies)
     else:
-        bodies = _listed_bodies(config, model, path)
+        bodies = _listed_bodies(config.bodies, model, path)
     if meshes := triangle_meshes(bodies):
         warnings.warn(
             f"{path}: bodies: mesh: {len(meshes)} triangle meshes such as {meshes[0]!r} cost 50 to 1000 µs a pair at "
@@ -220,8 +217,8 @@ def _build(config: RobotConfig, path: Path) -> Robot:
     home = _set_joints(model, _middle(model), config.home, f"{path}: home")
     home = _set_joints(model, home, config.lock, f"{path}: lock")
     if config.lock:
-        model, bodies = _reduce(model, bodies, list(config.lock), home)
-        home = _set_joints(model, _middle(model), config.home, f"{path}: home", ignore=frozenset(config.lock))
+        model, bodies, index = _reduce(model, bodies, list(config.lock), home)
+        home = home[index]
     add_self_pairs(model, bodies, config.disabled_pairs, str(path))
     if config.srdf is not None:
         honour_srdf(model, bodies, find_resource(config.srdf, path, "srdf"))
@@ -236,10 +233,9 @@ def _build(config: RobotConfig, path: Path) -> Robot:
     return Robot(config.name, model, bodies, home, tuple(config.end_effectors), str(path), tuple(notes))
 
 
-def _listed_bodies(config: RobotConfig, model: Any, path: Path) -> Any:
-    assert not isinstance(config.bodies, str)
+def _listed_bodies(configs: Sequence[Body], model: Any, path: Path) -> Any:
     bodies = pin.GeometryModel()
-    for index, body in enumerate(config.bodies):
+    for index, body in enumerate(configs):
         if not model.existFrame(body.frame):
             frames = [f.name for f in model.frames if f.type == pin.BODY]
             raise UnknownName(f"{path}: bodies.{index}.frame: no frame {body.frame!r}{nearest(body.frame, frames)}")
@@ -285,13 +281,9 @@ def _middle(model: Any) -> Array:
     return np.asarray(q)
 
 
-def _set_joints(
-    model: Any, q: Array, values: Mapping[str, float], where: str, ignore: frozenset[str] = frozenset()
-) -> Array:
+def _set_joints(model: Any, q: Array, values: Mapping[str, float], where: str) -> Array:
     q = q.copy()
     for name, value in values.items():
-        if name in ignore:
-            continue
         joint = _joint(model, name, where)
         if joint.nq == 1:
             q[joint.idx_q] = value
@@ -302,11 +294,14 @@ def _set_joints(
     return q
 
 
-def _reduce(model: Any, bodies: Any, locked: Sequence[str], q: Array) -> tuple[Any, Any]:
+def _reduce(model: Any, bodies: Any, locked: Sequence[str], q: Array) -> tuple[Any, Any, IntArray]:
+    """Model and bodies without the locked joints, and which coordinates of q are left."""
     ids = [_joint(model, name, "lock").id for name in locked]
+    kept = [joint for joint in list(model.joints)[1:] if joint.id not in ids]
+    index = np.array([i for joint in kept for i in range(joint.idx_q, joint.idx_q + joint.nq)], dtype=np.intp)
     model, bodies = pin.buildReducedModel(model, bodies, ids, q)
     joints = [body.parentJoint for body in bodies.geometryObjects]
     for a, b in pair_array(bodies).tolist():
         if joints[a] == joints[b]:
             bodies.removeCollisionPair(pin.CollisionPair(a, b))
-    return model, bodies
+    return model, bodies, index

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from qpavoid.problem import Array
 
 PARALLEL = 1e-10
 """Sine of the angle [-] up to which axes count as parallel: the ends are then right to 1e-10 of a length."""
@@ -22,46 +22,46 @@ TOUCHING = 1e-10
 class PointSegment(NamedTuple):
     """Closest point of a segment to a point."""
 
-    distance: FloatArray
+    distance: Array
     """Euclidean distance [m], (...)."""
-    point: FloatArray
+    point: Array
     """Point on the segment [m], (..., 3)."""
 
 
 class LineParameters(NamedTuple):
     """Where two lines come closest: at a + m (b - a) and at c + n (d - c)."""
 
-    m: FloatArray
+    m: Array
     """Parameter on the line ab [-], (...)."""
-    n: FloatArray
+    n: Array
     """Parameter on the line cd [-], (...)."""
 
 
 class SegmentSegment(NamedTuple):
     """Closest points of two segments."""
 
-    distance: FloatArray
+    distance: Array
     """Axis distance [m], (...)."""
-    point_ab: FloatArray
+    point_ab: Array
     """Witness point on ab [m], (..., 3)."""
-    point_cd: FloatArray
+    point_cd: Array
     """Witness point on cd [m], (..., 3)."""
 
 
 class CapsuleDistances(NamedTuple):
     """Signed surface distances of m pairs of capsules; point_b - point_a = distance * normal."""
 
-    distance: FloatArray
+    distance: Array
     """Axis distance less both radii [m], (m,); negative when the capsules overlap."""
-    normal: FloatArray
+    normal: Array
     """Unit vector from body a to body b, the gradient of the distance for a translation of b, (m, 3)."""
-    point_a: FloatArray
+    point_a: Array
     """Witness point on the surface of a [m], (m, 3)."""
-    point_b: FloatArray
+    point_b: Array
     """Witness point on the surface of b [m], (m, 3)."""
 
 
-def point_segment(p: FloatArray, a: FloatArray, b: FloatArray) -> PointSegment:
+def point_segment(p: Array, a: Array, b: Array) -> PointSegment:
     """Closest point of the segment ab to p: eq. 2 with the projection clamped to the segment.
 
     Takes points [m] of shape (..., 3). The distance contains the axial part beyond an end, which eq. 2 leaves
@@ -74,7 +74,7 @@ def point_segment(p: FloatArray, a: FloatArray, b: FloatArray) -> PointSegment:
     return PointSegment(_norm(p - point), point)
 
 
-def line_parameters(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> LineParameters:
+def line_parameters(a: Array, b: Array, c: Array, d: Array) -> LineParameters:
     """Parameters m, n [-] of the closest points of the infinite lines ab and cd (eqs. 6, 7).
 
     Takes points [m] of shape (..., 3). Both are NaN where they are not unique: for parallel lines and for a
@@ -92,7 +92,7 @@ def line_parameters(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) 
     return LineParameters(m, n)
 
 
-def segment_segment(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> SegmentSegment:
+def segment_segment(a: Array, b: Array, c: Array, d: Array) -> SegmentSegment:
     """Axis distance of the segments ab and cd with its witness points (eqs. 3-7, Fig. 4).
 
     Takes points [m] of shape (..., 3). Where m and n both lie in [0, 1] they give the minimum; where one does
@@ -117,9 +117,7 @@ def segment_segment(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) 
     )
 
 
-def capsule_distances(
-    ends_a: FloatArray, radii_a: FloatArray, ends_b: FloatArray, radii_b: FloatArray
-) -> CapsuleDistances:
+def capsule_distances(ends_a: Array, radii_a: Array, ends_b: Array, radii_b: Array) -> CapsuleDistances:
     """Signed surface distances of m pairs of capsules, all at once; a sphere is a capsule with equal ends.
 
     Takes the axes' ends [m], (m, 2, 3), and the radii [m], (m,), of both bodies. The paper's d_m is
@@ -147,7 +145,7 @@ def capsule_distances(
     )
 
 
-def _common_perpendicular(u: FloatArray, v: FloatArray) -> FloatArray:
+def _common_perpendicular(u: Array, v: Array) -> Array:
     """Unit vectors perpendicular to u and v, (k, 3): some perpendicular of parallel ones, z of two points."""
     cross = _cross(u, v)
     longer = np.where((_norm(u) >= _norm(v))[:, None], u, v)
@@ -155,27 +153,27 @@ def _common_perpendicular(u: FloatArray, v: FloatArray) -> FloatArray:
     other = _cross(longer, np.eye(3)[np.argmin(np.abs(longer), axis=1)])
     direction = np.where(_parallel(u, v, cross)[:, None], other, cross)
     direction[_norm(direction) == 0.0] = (0.0, 0.0, 1.0)
-    unit: FloatArray = direction / _norm(direction)[:, None]
+    unit: Array = direction / _norm(direction)[:, None]
     return unit
 
 
-def _parallel(u: FloatArray, v: FloatArray, cross: FloatArray) -> NDArray[np.bool_]:
+def _parallel(u: Array, v: Array, cross: Array) -> NDArray[np.bool_]:
     """Whether the sine of the angle between u and v is at most PARALLEL; true also for a zero vector."""
     parallel: NDArray[np.bool_] = _dot(cross, cross) <= PARALLEL**2 * _dot(u, u) * _dot(v, v)
     return parallel
 
 
-def _cross(x: FloatArray, y: FloatArray) -> FloatArray:
+def _cross(x: Array, y: Array) -> Array:
     """Vector product over the last axis."""
     return np.asarray(np.cross(x, y), dtype=np.float64)
 
 
-def _dot(x: FloatArray, y: FloatArray) -> FloatArray:
+def _dot(x: Array, y: Array) -> Array:
     """Scalar product over the last axis."""
-    product: FloatArray = np.einsum("...i,...i->...", x, y)
+    product: Array = np.einsum("...i,...i->...", x, y)
     return product
 
 
-def _norm(x: FloatArray) -> FloatArray:
+def _norm(x: Array) -> Array:
     """Euclidean length over the last axis."""
     return np.sqrt(_dot(x, x))

@@ -13,29 +13,19 @@ ACCELERATED = os.environ.get("QPAVOID_NUMBA", "1") != "0" and find_spec("numba")
 """Whether the compiled version is used."""
 
 if TYPE_CHECKING or not ACCELERATED:
-    from qpavoid.kernels.vectorised import (
-        candidates,
-        closing_speed_bound,
-        damped_solution,
-        distance_rows,
-        frame_rows,
-        projection_cost,
-        shortfall,
-        tracking_shortfall,
-        velocity_bounds,
-    )
+    from qpavoid.kernels import vectorised as _chosen
 else:
-    from qpavoid.kernels.compiled import (
-        candidates,
-        closing_speed_bound,
-        damped_solution,
-        distance_rows,
-        frame_rows,
-        projection_cost,
-        shortfall,
-        tracking_shortfall,
-        velocity_bounds,
-    )
+    from qpavoid.kernels import compiled as _chosen
+
+candidates = _chosen.candidates
+closing_speed_bound = _chosen.closing_speed_bound
+damped_solution = _chosen.damped_solution
+distance_rows = _chosen.distance_rows
+frame_rows = _chosen.frame_rows
+projection_cost = _chosen.projection_cost
+shortfall = _chosen.shortfall
+tracking_shortfall = _chosen.tracking_shortfall
+velocity_bounds = _chosen.velocity_bounds
 
 __all__ = [
     "ACCELERATED",
