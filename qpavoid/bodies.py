@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import coal
 import numpy as np
 import pinocchio as pin
 
+from qpavoid.cache import cached
 from qpavoid.config import Box, Capsule, Cylinder, Shape, Sphere
 from qpavoid.problem import Array
 
@@ -83,7 +85,8 @@ def enclosing_capsule(geometry: Any) -> CapsuleFit:
         return CapsuleFit(np.zeros(3), np.eye(3), geometry.radius, 0.0)
     if isinstance(geometry, coal.Capsule):
         return CapsuleFit(np.zeros(3), np.eye(3), geometry.radius, 2.0 * geometry.halfLength)
-    return fit_capsule(_vertices(geometry))
+    points = _vertices(geometry)
+    return cached("capsule", points, lambda: fit_capsule(points), _pack_fit, _unpack_fit)
 
 
 def bounding_sphere(geometry: Any) -> tuple[Array, float]:
@@ -109,10 +112,36 @@ def _convex_hull(mesh: Any) -> tuple[Any, Any]:
     low, high = local.min(axis=0), local.max(axis=0)
     size = high - low
     if size.min() > 1e-6 * size.max():
-        mesh.buildConvexHull(True, "Qt")
-        return mesh.convex, pin.SE3.Identity()
+        return cached("hull", points, lambda: _run_qhull(mesh), _pack_hull, _unpack_hull), pin.SE3.Identity()
     middle = center + axes.T @ (0.5 * (low + high))
     return coal.Box(*np.maximum(size, _THINNEST)), pin.SE3(np.ascontiguousarray(axes.T), middle)
+
+
+def _run_qhull(mesh: Any) -> Any:
+    mesh.buildConvexHull(True, "Qt")
+    return mesh.convex
+
+
+def _pack_hull(hull: Any) -> bytes:
+    """In coal's own format: putting a hull together from points and triangles takes as long as finding it."""
+    buffer = pin.serialization.StreamBuffer()
+    hull.saveToBuffer(buffer)
+    return bytes(buffer.tobytes())
+
+
+def _unpack_hull(path: Path) -> Any:
+    hull = coal.Convex()
+    hull.loadFromBinary(str(path))
+    return hull
+
+
+def _pack_fit(fit: CapsuleFit) -> bytes:
+    return np.concatenate((fit.center, fit.rotation.ravel(), (fit.radius, fit.length))).tobytes()
+
+
+def _unpack_fit(path: Path) -> CapsuleFit:
+    numbers = np.fromfile(path, count=14)
+    return CapsuleFit(numbers[:3], numbers[3:12].reshape(3, 3), float(numbers[12]), float(numbers[13]))
 
 
 _THINNEST = 1e-4
