@@ -180,6 +180,21 @@ def test_problems_are_not_changed():
                 np.testing.assert_array_equal(array, before)
 
 
+@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize("m", [0, 4])
+@pytest.mark.parametrize("slack", [1.0, 1e-3, 1e-8, 0.0, -1e-8, -1e-7, -1e-3])
+def test_nothing_is_printed(name, m, slack, capfd):
+    """Not even from C, and not where no row is active, or hardly: `run --json` owns the process's output."""
+    random, solve = np.random.default_rng(15), make_backend(name)
+    for _ in range(5):
+        qp = make_qp(random, 7, m)
+        x = np.linalg.solve(qp.P, -qp.q)
+        lower = np.concatenate((x[:1] - slack, x[1:] - 1.0))
+        qp = qp._replace(h=qp.G @ x - slack, lower=lower, upper=x + 1.0)
+        assert_minimum(name, solve(*qp), qp)
+    assert capfd.readouterr() == ("", "")
+
+
 # --- workspaces -----------------------------------------------------------------------------------------------
 
 

@@ -118,14 +118,21 @@ class ProxqpWorkspace:
 
 
 class OsqpWorkspace:
-    """Operator splitting (Stellato et al. 2020); bounds are the first n rows of [I; G]. Polishing makes it exact."""
+    """Operator splitting (Stellato et al. 2020); bounds are the first rows of [I; G]. Polishing makes it exact.
+
+    There is one variable more, whose cost keeps it at its bound: where no row at all is active, polishing prints a line
+    on the process's output, whatever the settings are (osqp 1.1, osqp/osqp#785).
+    """
 
     def __init__(self, P: Array, q: Array, G: Array, h: Array, lower: Array, upper: Array) -> None:
-        m, n = G.shape
-        self._n = n
+        m, n = G.shape[0], G.shape[1] + 1
+        self._n = n - 1
         self._column, self._row = np.tril_indices(n)
-        self._data = np.ones((n, 1 + m))
-        self._above = np.full(n + m, np.inf)
+        self._P, self._q = np.eye(n), np.full(n, -1.0)
+        self._data = np.zeros((n, 1 + m))
+        self._data[:, 0] = 1.0
+        self._below, self._above = np.full(n + m, -np.inf), np.full(n + m, np.inf)
+        self._above[n - 1] = 0.0
         in_column = np.concatenate((np.arange(n)[:, None], np.broadcast_to(np.arange(n, n + m), (n, m))), axis=1)
         starts = np.concatenate(([0], np.cumsum(np.arange(1, n + 1))))
         vectors = self._vectors(P, q, G, h, lower, upper)
@@ -138,10 +145,11 @@ class OsqpWorkspace:
 
     def _vectors(self, P: Array, q: Array, G: Array, h: Array, lower: Array, upper: Array) -> dict[str, Array]:
         """Every entry that can change: upper triangle of P and all of [I; G], by columns."""
-        self._data[:, 1:] = G.T
-        self._above[: self._n] = upper
-        below = np.concatenate((lower, h))
-        return {"Px": P[self._row, self._column], "Ax": self._data.ravel(), "q": q, "l": below, "u": self._above}
+        n = self._n
+        self._P[:n, :n], self._q[:n], self._data[:n, 1:] = P, q, G.T
+        self._below[:n], self._below[n + 1 :], self._above[:n] = lower, h, upper
+        triangle = self._P[self._row, self._column]
+        return {"Px": triangle, "Ax": self._data.ravel(), "q": self._q, "l": self._below, "u": self._above}
 
     def update(self, P: Array, q: Array, G: Array, h: Array, lower: Array, upper: Array) -> None:
         """See `Workspace`."""
@@ -150,4 +158,5 @@ class OsqpWorkspace:
     def solve(self) -> Answer | None:
         """See `Workspace`."""
         result = self._qp.solve(raise_error=False)
-        return (np.array(result.x), -result.y[self._n :]) if result.info.status_val == 1 else None
+        solved = result.info.status_val == 1
+        return (result.x[: self._n].copy(), -result.y[self._n + 1 :]) if solved else None
