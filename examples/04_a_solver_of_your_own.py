@@ -14,7 +14,7 @@ class SlowDown:
 
     def solve(self, problem: Problem) -> Solution:
         """J⁺ẋ, scaled."""
-        v = tracking_velocity(problem.tracking)
+        v = tracking_velocity(problem)
         d = problem.avoidance.d
         return Solution(v * np.clip((d.min() - 0.12) / 0.12, 0.0, 1.0) if d.size else v)
 

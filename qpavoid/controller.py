@@ -5,16 +5,16 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from time import perf_counter
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from qpavoid import kernels
-from qpavoid.avoidance import avoidance_rows
+from qpavoid.assembly import Assembly
 from qpavoid.config import Avoidance, Limits, ScenarioConfig
 from qpavoid.errors import UnknownName, located
-from qpavoid.kinematics import ForwardKinematics, Kinematics, support_masks
-from qpavoid.limits import saturate, velocity_bounds
+from qpavoid.kinematics import ForwardKinematics, Kinematics
+from qpavoid.limits import saturate
 from qpavoid.loading import nearest
 from qpavoid.motion import Sample
 from qpavoid.problem import Array, Problem, Proximity, Solution, State, require_finite
@@ -22,7 +22,7 @@ from qpavoid.proximity import DistanceQuery
 from qpavoid.robot import Robot
 from qpavoid.scene import Scene, build_obstacles, build_scene
 from qpavoid.solvers import Solver, make_solver
-from qpavoid.tasks import FrameTask, TaskRows, build_tasks
+from qpavoid.tasks import FrameTask, build_tasks
 
 _log = logging.getLogger(__name__)
 
@@ -70,15 +70,17 @@ class Controller:
         self.avoidance, self.limits = avoidance or Avoidance(), limits or Limits()
         model = scene.robot.model
         self._kinematics = ForwardKinematics(model, [task.frame_id for task in tasks])
+        self._query = DistanceQuery(scene)
         self._q_shape = (model.nq,)
         self._frame_index = {task.settings.frame: i for i, task in enumerate(tasks)}
         self._obstacle_index = {name: i for i, name in enumerate(scene.obstacle_names)}
         self._moving = [i for i, obstacle in enumerate(scene.obstacles) if obstacle.moves]
-        joints = [model.frames[task.frame_id].parentJoint for task in tasks]
-        self._task_rows = TaskRows(tasks, support_masks(model), joints, tracking_damping)
-        self._query = DistanceQuery(scene)
-        self._reach, self._rate = self.avoidance.d2 - self.avoidance.offset, self.limits.position_gain / dt
-        self._bounds = scene.robot.bounds().slowed(self.limits.velocity_scale)
+        self._reach = self.avoidance.d2 - self.avoidance.offset
+        self._bounds = scene.robot.bounds().within(self.limits)
+        self._assembly = Assembly(
+            scene, self.tasks, self._bounds, self._kinematics, self._query, self.avoidance,
+            self.limits.position_gain, tracking_damping, dt,
+        )  # fmt: skip
         begin = perf_counter()
         self.tick(scene.robot.home)
         self.warm_up_time = perf_counter() - begin
@@ -142,45 +144,52 @@ class Controller:
         obstacles: Mapping[str, Sample] | None = None,
     ) -> Tick:
         """Like `step`, with everything that led to the velocity."""
-        samples, kinematics, proximity, problem, solution = self._compute(q, t, targets, obstacles)
-        state = State(np.asarray(q, dtype=np.float64), solution.v, t)
-        return Tick(state, samples, kinematics, proximity, problem, solution)
+        samples, proximity, problem, solution = self._compute(q, t, targets, obstacles)
+        state = State(np.array(q, dtype=np.float64), solution.v, t)
+        kinematics = _copied(self._assembly.kinematics)
+        return Tick(state, samples, kinematics, _copied(proximity), _copied(problem), solution)
 
     def _compute(
         self, q: Array, t: float, targets: Mapping[str, Sample] | None, obstacles: Mapping[str, Sample] | None
-    ) -> tuple[tuple[Sample, ...], Kinematics, Proximity, Problem, Solution]:
+    ) -> tuple[tuple[Sample, ...], Proximity, Problem, Solution]:
         begin = perf_counter()
         q = require_finite("q", q, self._q_shape)
         samples = self._targets(t, targets)
-        self._place_obstacles(t, obstacles)
-        kinematics = self._kinematics.compute(q)
-        proximity = self._query.compute(self._kinematics.data, kinematics, self._reach)
-        lower, upper = velocity_bounds(self._bounds, q, self._rate)
-        tracking = self._task_rows.compute(kinematics, samples)
-        problem = Problem(tracking, avoidance_rows(proximity, self.avoidance), lower, upper, self.scene.pair_names)
+        if obstacles or self._moving:
+            self._place_obstacles(t, obstacles or {})
+        self._kinematics.compute(q)
+        self._query.compute(self._kinematics.data, self._reach)
+        proximity, problem = self._assembly.compute(q, samples, self._query, self._reach)
         built = perf_counter()
         v, status, reasons, slack, *_ = self.solver.solve(problem)
         saturation = 0.0
         if self.limits.saturate and not self.solver.bounded:
-            v, saturation = saturate(v, lower, upper, self._bounds.velocity)
+            v, saturation = saturate(v, problem.lower, problem.upper, self._bounds.velocity)
         solution = Solution(v, status, reasons, slack, saturation, built - begin, perf_counter() - built)
-        return samples, kinematics, proximity, problem, solution
+        return samples, proximity, problem, solution
 
     def _targets(self, t: float, given: Mapping[str, Sample] | None) -> tuple[Sample, ...]:
-        samples = [task.motion.sample(t) for task in self.tasks]
-        for frame, sample in (given or {}).items():
-            samples[_index(self._frame_index, frame, "target")] = sample
-        return tuple(samples)
+        if not given:
+            return tuple([task.motion.sample(t) for task in self.tasks])
+        for frame in given:
+            _index(self._frame_index, frame, "target")
+        return tuple([given.get(task.settings.frame) or task.motion.sample(t) for task in self.tasks])
 
-    def _place_obstacles(self, t: float, given: Mapping[str, Sample] | None) -> None:
-        if not given and not self._moving:
-            return
-        given = given or {}
+    def _place_obstacles(self, t: float, given: Mapping[str, Sample]) -> None:
         for i in self._moving:
             if self.scene.obstacles[i].name not in given:
                 self._query.place_obstacle(i, self.scene.obstacles[i].motion.sample(t))
         for name, sample in given.items():
             self._query.place_obstacle(_index(self._obstacle_index, name, "obstacle"), sample)
+
+
+def _copied(value: Any) -> Any:
+    """The same with arrays of its own: what a tick computed stays as it was when the next one comes."""
+    if isinstance(value, np.ndarray):
+        return value.copy()
+    if hasattr(value, "_fields"):
+        return type(value)(*map(_copied, value))
+    return value
 
 
 def _index(names: Mapping[str, int], name: str, what: str) -> int:

@@ -13,7 +13,7 @@ from qpavoid.problem import Array
 
 
 class Kinematics(NamedTuple):
-    """Where the tracked frames are, and how everything moves with v. J is valid until the next call on its data."""
+    """Where the tracked frames are, and how everything moves with v, until the next tick overwrites it."""
 
     J: Array
     """(6, nv) world Jacobian: column j is the twist of joint j [linear velocity of the body point at the world
@@ -40,22 +40,26 @@ class ForwardKinematics:
 
         Args:
             model: pinocchio model.
-            frame_ids: the f frames to report.
+            frame_ids: the f frames to keep up to date.
         """
         self.data = model.createData()
         self._model, self._ids = model, list(frame_ids)
-        self._index = np.array(self._ids, dtype=np.intp)
-        self._view = view_poses(self.data.oMf)
-        self._J = self.data.J
+        pin.framesForwardKinematics(model, self.data, pin.neutral(model))
+        view = view_poses(self.data.oMf)
+        self._copy = view is None
+        self.J: Array = self.data.J
+        """(6, nv) see `Kinematics.J`."""
+        self.frame_poses: Array = read_poses(self.data.oMf) if view is None else view
+        """(frames, 12) world poses of all frames; only those of `frame_ids` are kept up to date."""
 
-    def compute(self, q: Array) -> Kinematics:
-        """Kinematics at a configuration q (nq,); `data` then holds the joint placements."""
+    def compute(self, q: Array) -> None:
+        """Brings everything to a configuration q (nq,); `data` then holds the joint placements."""
         model, data = self._model, self.data
         pin.computeJointJacobians(model, data, q)
         for frame_id in self._ids:
             pin.updateFramePlacement(model, data, frame_id)
-        poses = read_poses(data.oMf) if self._view is None else self._view
-        return Kinematics(self._J, poses[self._index])
+        if self._copy:
+            self.frame_poses[:] = read_poses(data.oMf)
 
 
 def support_masks(model: Any) -> Array:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from qpavoid import kernels
+from qpavoid.config import Limits
 from qpavoid.problem import Array, IntArray
 
 
@@ -24,27 +25,53 @@ class JointBounds:
     """(nb,) lower position limits [rad or m]."""
     upper: Array
     """(nb,) upper position limits [rad or m]."""
+    acceleration: Array
+    """(nv,) largest acceleration [rad/s² or m/s²], infinite where there is none."""
 
-    def slowed(self, share: float) -> JointBounds:
-        """The same with a share of the speeds."""
-        return replace(self, velocity=share * self.velocity)
+    def within(self, config: Limits) -> JointBounds:
+        """The share of the limits that a scenario allows to be used."""
+        given = np.inf if config.acceleration is None else config.acceleration
+        acceleration = np.where(np.isfinite(self.acceleration), self.acceleration, given)
+        return replace(
+            self,
+            velocity=config.velocity_scale * self.velocity,
+            acceleration=config.acceleration_scale * acceleration,
+        )
 
 
-def velocity_bounds(joints: JointBounds, q: Array, rate: float) -> tuple[Array, Array]:
-    """Bounds lower <= v <= upper that keep the next configuration inside its limits.
+def limit_layout(joints: JointBounds, position_gain: float, dt: float) -> dict[str, Any]:
+    """Arrays of the bounds lower <= v <= upper, as `RowLayout` has them.
 
-    At most a share rate * dt of what is left to a position limit is used in one tick of length dt; a joint outside
-    its limits is sent back at no more than its largest speed. The bounds never cross.
+    The bounds keep the next configuration inside its limits. A joint without an acceleration limit uses at most a
+    share `position_gain` of what is left to a position limit in one tick; a joint with one keeps to the speeds from
+    which it can still brake (`kernels.vectorised.speed_to_stop`), so that position, velocity and acceleration limits
+    never contradict each other once they are met. A joint outside its limits is sent back, at no more than its largest
+    speed. Bounds never cross: from a state that no braking can save, the acceleration limit gives way.
 
     Args:
         joints: the robot's limits.
-        q: configuration (nq,).
-        rate: at most 1 / dt [1/s].
-
-    Returns:
-        lower (nv,), upper (nv,) [rad/s or m/s].
+        position_gain: share of the room to a position limit that one tick may use [-].
+        dt: length of a tick [s].
     """
-    return kernels.velocity_bounds(q, joints.q_index, joints.v_index, joints.lower, joints.upper, joints.velocity, rate)
+    nv = len(joints.velocity)
+    accelerated = bool(np.isfinite(joints.acceleration).any())
+    lower, upper = np.zeros(nv), np.zeros(nv)
+    return {
+        "q_index": joints.q_index,
+        "v_index": joints.v_index,
+        "q_lower": joints.lower,
+        "q_upper": joints.upper,
+        "v_max": joints.velocity,
+        "v_step": joints.acceleration * dt,
+        "v_last": np.zeros(nv),
+        "hard_lower": np.zeros(nv) if accelerated else lower,
+        "hard_upper": np.zeros(nv) if accelerated else upper,
+        "lower": lower,
+        "upper": upper,
+        "rate": position_gain / dt,
+        "dt": dt,
+        "accelerated": accelerated,
+    }
 
 
 def saturate(v: Array, lower: Array, upper: Array, v_max: Array) -> tuple[Array, float]:

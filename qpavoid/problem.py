@@ -114,11 +114,47 @@ class Problem(NamedTuple):
     tracking: Tracking
     avoidance: AvoidanceRows
     lower: Array
-    """(nv,) lower bound on v from the joint limits; never above `upper`."""
+    """(nv,) lower bound on v from all joint limits; never above `upper`."""
     upper: Array
     """(nv,) upper bound on v."""
+    hard_lower: Array
+    """(nv,) lower bound from position and velocity limits alone; `lower` lies between these two."""
+    hard_upper: Array
+    """(nv,) upper bound from the same."""
     pair_names: Sequence[tuple[str, str]]
     """Names of the bodies of all m pairs."""
+    v0: Array
+    """(nv,) J⁺ẋ, the tracking law's velocity; NaN where λ is 0 and rows repeat each other."""
+    shortfall: float
+    """By how much v0 violates the worst row or bound [m/s, rad/s]; not positive where it is safe, NaN with v0."""
+
+
+def make_problem(
+    tracking: Tracking,
+    avoidance: AvoidanceRows,
+    lower: Array,
+    upper: Array,
+    pair_names: Sequence[tuple[str, str]],
+    hard: tuple[Array, Array] | None = None,
+) -> Problem:
+    """A problem made by hand, or one whose rows were changed: works out v0 and its shortfall by their definitions.
+
+    Args:
+        tracking: task rows.
+        avoidance: avoidance rows.
+        lower: (nv,) lower bound on v.
+        upper: (nv,) upper bound on v.
+        pair_names: names of the bodies of all pairs.
+        hard: bounds without acceleration limits; `lower` and `upper` if left out.
+    """
+    A, b, damping = tracking
+    gram = A @ A.T + damping**2 * np.eye(len(b))
+    if not np.isfinite(gram).all() or (damping == 0.0 and len(b) and np.linalg.cond(gram) > 1e6):
+        v0 = np.full(len(lower), np.nan)
+    else:
+        v0 = np.linalg.solve(gram, b) @ A
+    outside = np.concatenate((v0 - upper, lower - v0, avoidance.b - avoidance.J @ v0))
+    return Problem(tracking, avoidance, lower, upper, *(hard or (lower, upper)), pair_names, v0, float(outside.max()))
 
 
 class Solution(NamedTuple):

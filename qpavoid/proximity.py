@@ -1,4 +1,4 @@
-"""Closest points of the pairs within reach, and the rate of their distance; by coal, without a Python loop.
+"""Closest points of the pairs within reach; by coal, without a Python loop.
 
 Bounding spheres tell which pairs can be within reach at all; the others are switched off, so that one call into C++
 does the rest, and its results are viewed as one array.
@@ -15,10 +15,9 @@ import pinocchio as pin
 from qpavoid import kernels
 from qpavoid.bodies import bounding_sphere
 from qpavoid.errors import NumericalError
-from qpavoid.kinematics import Kinematics
 from qpavoid.memory import read_poses, read_results, view_poses, view_results
 from qpavoid.motion import Sample
-from qpavoid.problem import Array, IntArray, Proximity
+from qpavoid.problem import Array, IntArray
 from qpavoid.scene import Scene
 
 _CULL_FROM = 48 if kernels.ACCELERATED else 192
@@ -36,18 +35,28 @@ class DistanceQuery:
             request.gjk_tolerance = 1e-10  # the default 1e-6 leaves errors of 7e-3 in normals of boxes and hulls
         self._first_obstacle = len(scene.body_names)
         obstacles = len(scene.obstacles)
-        # the row after the obstacles' twists stays zero: it stands for the robot's own bodies
-        self._twists = np.zeros((obstacles + 1, 6))
+        self.twists = np.zeros((obstacles + 1, 6))
+        """(o + 1, 6) of the obstacles at the world's origin; the last row stays zero: for the robot's own bodies."""
         self._moving: set[int] = set()
         self._placements = view_poses([body.placement for body in self._geometry.geometryObjects], writeable=True)
         second = scene.pairs[:, 1] - self._first_obstacle
-        self._twist_row = np.where(second >= 0, second, obstacles)
+        self.twist_row: IntArray = np.where(second >= 0, second, obstacles)
+        """(m,) row of `twists` that moves each pair's second body."""
         model = scene.robot.model
         pin.updateGeometryPlacements(model, model.createData(), self._geometry, self._data, pin.neutral(model))
         pin.computeDistances(self._geometry, self._data)  # so that there is something to compare the view with
-        self._results = view_results(self._data.distanceResults)
-        self._every_pair = np.arange(len(scene.pairs))
+        view = view_results(self._data.distanceResults)
+        self._copy = view is None
+        self.results: Array = read_results(self._data.distanceResults) if view is None else view
+        """(m, 10) [distance, normal, point a, point b] of all pairs; only those of `pairs` are of this tick."""
         self._cull = _Cull(scene, self._geometry, self._data) if len(scene.pairs) >= _CULL_FROM else None
+        self.pairs: IntArray = np.arange(len(scene.pairs))
+        """(c,) pairs that were computed, increasing."""
+
+    @property
+    def moving(self) -> bool:
+        """Whether any obstacle has a velocity."""
+        return bool(self._moving)
 
     def place_obstacle(self, index: int, sample: Sample) -> None:
         """Puts obstacle number `index` to a pose, with a velocity.
@@ -69,7 +78,7 @@ class DistanceQuery:
             self._placements[geometry, :9] = sample.rotation.T.ravel()
             self._placements[geometry, 9:] = sample.position
         twist = (vx - wy * z + wz * y, vy - wz * x + wx * z, vz - wx * y + wy * x, wx, wy, wz)
-        self._twists[index] = twist
+        self.twists[index] = twist
         if any(twist):
             self._moving.add(index)
         else:
@@ -77,28 +86,19 @@ class DistanceQuery:
         if self._cull is not None:
             self._cull.place(geometry, sample.rotation, sample.position)
 
-    def compute(self, data: Any, kinematics: Kinematics, reach: float) -> Proximity:
-        """Closest points and rates of the pairs nearer than `reach`.
+    def compute(self, data: Any, reach: float) -> None:
+        """Brings `results` up to date for every pair nearer than `reach`, and says in `pairs` which ones it computed.
 
         Args:
             data: pinocchio data that holds the joint placements of this tick.
-            kinematics: of the same tick.
-            reach: surface distance below which a pair is near [m].
+            reach: surface distance [m].
         """
         pin.updateGeometryPlacements(self._scene.robot.model, data, self._geometry, self._data)
-        pairs = self._every_pair if self._cull is None else self._cull.switch(reach)
+        if self._cull is not None:
+            self.pairs = self._cull.switch(reach)
         pin.computeDistances(self._geometry, self._data)
-        near, closest, J, drift = kernels.distance_rows(
-            read_results(self._data.distanceResults) if self._results is None else self._results,
-            pairs,
-            reach,
-            kinematics.J,
-            self._scene.support,
-            self._twists,
-            self._twist_row,
-            bool(self._moving),
-        )
-        return Proximity(near, closest, J, drift)
+        if self._copy:
+            self.results[:] = read_results(self._data.distanceResults)
 
 
 class _Cull:
@@ -115,8 +115,7 @@ class _Cull:
             self.place(i, body.placement.rotation, body.placement.translation)
         self._pair_of = np.full((self._bodies, len(shapes)), -1, dtype=np.intp)
         self._pair_of[scene.pairs[:, 0], scene.pairs[:, 1]] = np.arange(len(scene.pairs))
-        self._reach = np.nan
-        self._within: Array = np.empty(self._pair_of.shape)
+        self._found = np.zeros(len(scene.pairs), dtype=np.intp)
         self._active = np.ones(len(scene.pairs), dtype=bool)
         self._last = b""
         self._poses = view_poses(data.oMg)
@@ -128,12 +127,9 @@ class _Cull:
 
     def switch(self, reach: float) -> IntArray:
         """Switches pairs on and off; gives those that are on, in increasing order."""
-        if reach != self._reach:
-            touching = self._radius[: self._bodies, None] + self._radius + reach
-            self._within = np.where(self._pair_of >= 0, touching**2 * (1.0 + 1e-9), -1.0)
-            self._reach = reach
         poses = read_poses(self._data.oMg) if self._poses is None else self._poses
-        pairs = kernels.candidates(poses, self._local, self._centers, self._within, self._pair_of)
+        count = kernels.candidates(poses, self._local, self._centers, self._radius, self._pair_of, reach, self._found)
+        pairs = self._found[:count]
         if pairs.tobytes() != self._last:
             self._last = pairs.tobytes()
             wanted = np.zeros_like(self._active)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
@@ -51,6 +51,8 @@ class Robot:
     """File that it was read from, for messages."""
     notes: tuple[str, ...] = ()
     """What was decided at loading, such as pairs switched off."""
+    acceleration: Mapping[str, float] = field(default_factory=dict)
+    """Joint: largest acceleration [rad/s² or m/s²]; joints left out have no such limit."""
 
     @classmethod
     def load(cls, name_or_path: str, folder: Path | None = None) -> Robot:
@@ -107,7 +109,8 @@ class Robot:
 
     def bounds(self) -> JointBounds:
         """Joint limits in tangent space; see `joint_bounds`."""
-        return joint_bounds(self.model)
+        limits = [self.acceleration.get(name, np.inf) for name, joint in self._joints() for _ in range(joint.nv)]
+        return replace(joint_bounds(self.model), acceleration=np.array(limits))
 
     def configuration(self, values: Sequence[float] | Mapping[str, float], where: str) -> Array:
         """A full configuration from a scenario's `q0`.
@@ -176,7 +179,7 @@ _ABSURD = 1e9
 
 
 def joint_bounds(model: Any) -> JointBounds:
-    """Joint limits of a model in tangent space.
+    """Joint limits of a model in tangent space; a URDF says nothing of accelerations.
 
     Only joints with one coordinate in q and v have position limits. A velocity limit of 0, and a range from 0 to 0,
     mean that the URDF gives none.
@@ -195,6 +198,7 @@ def joint_bounds(model: Any) -> JointBounds:
         v_index=np.array(v_index, dtype=np.intp),
         lower=np.array(model.lowerPositionLimit)[q_indices],
         upper=np.array(model.upperPositionLimit)[q_indices],
+        acceleration=np.full(model.nv, np.inf),
     )
 
 
@@ -208,8 +212,9 @@ def _build(config: RobotConfig, path: Path) -> Robot:
         bodies = _listed_bodies(config.bodies, model, path)
     if meshes := triangle_meshes(bodies):
         warnings.warn(
-            f"{path}: bodies: mesh: {len(meshes)} triangle meshes such as {meshes[0]!r} cost 50 to 1000 µs a pair at "
-            "every tick, convex hulls 1 to 5 µs, capsules 0.1 µs; set `bodies` to convex or capsule",
+            f"{path}: bodies: mesh: {len(meshes)} triangle meshes such as {meshes[0]!r} cost 100 to 500 µs a pair at "
+            "every tick, some pairs several ms, convex hulls about 1 µs, capsules 0.1 µs; set `bodies` to convex or "
+            "capsule",
             MeshWarning,
             stacklevel=3,
         )
@@ -230,7 +235,16 @@ def _build(config: RobotConfig, path: Path) -> Robot:
         if not model.existFrame(name):
             frames = [f.name for f in model.frames]
             raise UnknownName(f"{path}: end_effectors: no frame {name!r}{nearest(name, frames)}")
-    return Robot(config.name, model, bodies, home, tuple(config.end_effectors), str(path), tuple(notes))
+    return Robot(
+        config.name,
+        model,
+        bodies,
+        home,
+        tuple(config.end_effectors),
+        str(path),
+        tuple(notes),
+        config.limits.acceleration,
+    )
 
 
 def _listed_bodies(configs: Sequence[Body], model: Any, path: Path) -> Any:
@@ -258,6 +272,8 @@ def _apply_limits(config: RobotConfig, model: Any, path: Path) -> None:
         if joint.nq != 1:
             raise ConfigError(f"{path}: limits.position: joint {name!r} turns all the way round; leave it out")
         lower[joint.idx_q], upper[joint.idx_q] = low, high
+    for name in config.limits.acceleration:
+        _joint(model, name, f"{path}: limits.acceleration")
     for name, speed in config.limits.velocity.items():
         joint = _joint(model, name, f"{path}: limits.velocity")
         velocity[joint.idx_v : joint.idx_v + joint.nv] = speed

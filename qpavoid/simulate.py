@@ -148,7 +148,8 @@ class Recorder:
             rows["obstacle_position"][i], rows["obstacle_rotation"][i] = sample.position, sample.rotation
             if obstacle.moves:
                 self._query.place_obstacle(i, sample)
-        distance = self._query.compute(self._data, tick.kinematics, np.inf).distance
+        self._query.compute(self._data, np.inf)
+        distance = self._query.results[:, 0]
         if len(distance):
             self._arrays["closest_pair"][self._count] = np.argmin(distance)
         nearest = np.full(len(scene.geometry.geometryObjects), np.inf)

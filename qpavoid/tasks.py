@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
-from qpavoid import config, kernels
+from qpavoid import config
 from qpavoid.errors import located
-from qpavoid.kinematics import Kinematics
+from qpavoid.kinematics import support_masks
 from qpavoid.motion import Motion, Sample, build_motion
-from qpavoid.problem import Array, Tracking
+from qpavoid.problem import Array
 from qpavoid.robot import Robot
 
 
@@ -58,53 +59,38 @@ def build_tasks(
     return tasks
 
 
-class TaskRows:
-    """Turns tasks into the rows A v = b of a tick; the layout is made once."""
+def task_layout(tasks: Sequence[FrameTask], model: Any) -> dict[str, Any]:
+    """Arrays of the rows A v = b of the tasks, as `RowLayout` has them.
 
-    def __init__(self, tasks: Sequence[FrameTask], support: Array, joints: Sequence[int], damping: float) -> None:
-        """Lays the rows out.
+    Rows are v_frame = v_ref + K (x_ref - x), in world axes, scaled with the roots of their weights; the orientation
+    error is the rotation vector of R_ref Rᵀ. Linear rows of all frames come before angular ones.
 
-        Args:
-            tasks: the tasks, in the order of the rows.
-            support: (njoints, nv) masks of `kinematics.support_masks`.
-            joints: joint that carries each task's frame.
-            damping: λ of the damped J⁺ [-].
-        """
-        self._turns = np.array([i for i, task in enumerate(tasks) if task.rows == 6], dtype=np.intp)
-        frames, turning = len(tasks), [tasks[i] for i in self._turns]
-        split, total = 3 * frames, 3 * (frames + len(turning))
-        self._screws = np.zeros((total, 6))
-        self._screws[:split, :3] = np.tile(np.eye(3), (frames, 1))
-        self._screws[split:, 3:] = np.tile(np.eye(3), (len(turning), 1))
-        carriers = support[np.array(joints, dtype=np.intp)]
-        weights = [task.settings.weight for task in tasks] + [task.settings.orientation_weight for task in turning]
-        self._scale, self._damping = np.sqrt(np.repeat(np.array(weights), 3)), damping
-        moved = np.repeat(np.concatenate((carriers, carriers[self._turns])), 3, axis=0)
-        self._support = moved * self._scale[:, None]
-        self._gain = np.array([[task.settings.gain] for task in tasks])
-        self._position, self._rotation = np.empty((frames, 3)), np.empty((frames, 3, 3))
-        self._linear, self._angular = np.empty((frames, 3)), np.empty((frames, 3))
-        caps = [task.settings.max_speed for task in tasks] + [task.settings.max_turn_rate for task in turning]
-        self._caps = [
-            (slice(3 * i, 3 * i + 3), cap * self._scale[3 * i]) for i, cap in enumerate(caps) if cap is not None
-        ]
-
-    def compute(self, kinematics: Kinematics, targets: Sequence[Sample]) -> Tracking:
-        """Rows v_frame = v_ref + K (x_ref - x), in world axes, scaled with the roots of their weights.
-
-        The orientation error is the rotation vector of R_ref Rᵀ. Linear rows of all frames come before angular ones.
-
-        Args:
-            kinematics: of this tick, its frames in the order of the tasks.
-            targets: where each task's frame should be now, and how fast.
-        """
-        position, rotation, linear, angular = self._position, self._rotation, self._linear, self._angular
-        for i, target in enumerate(targets):
-            position[i], rotation[i], linear[i], angular[i] = target
-        A, b = kernels.frame_rows(
-            self._screws, self._turns, kinematics.poses, position, rotation, linear, angular, self._gain,
-            self._scale, kinematics.J, self._support,
-        )  # fmt: skip
-        for rows, cap in self._caps:
-            b[rows] *= min(1.0, cap / max(float(np.linalg.norm(b[rows])), 1e-12))
-        return Tracking(A, b, self._damping)
+    Args:
+        tasks: the tasks, in the order of the rows.
+        model: pinocchio model.
+    """
+    turns = np.array([i for i, task in enumerate(tasks) if task.rows == 6], dtype=np.intp)
+    frames, turning = len(tasks), [tasks[i] for i in turns]
+    split, total = 3 * frames, 3 * (frames + len(turning))
+    screws = np.zeros((total, 6))
+    screws[:split, :3] = np.tile(np.eye(3), (frames, 1))
+    screws[split:, 3:] = np.tile(np.eye(3), (len(turning), 1))
+    joints = np.array([model.frames[task.frame_id].parentJoint for task in tasks], dtype=np.intp)
+    carriers = support_masks(model)[joints]
+    weights = [task.settings.weight for task in tasks] + [task.settings.orientation_weight for task in turning]
+    caps = [task.settings.max_speed for task in tasks] + [task.settings.max_turn_rate for task in turning]
+    scale = np.sqrt(np.repeat(np.array(weights), 3))
+    moved = np.repeat(np.concatenate((carriers, carriers[turns])), 3, axis=0)
+    return {
+        "frame_ids": np.array([task.frame_id for task in tasks], dtype=np.intp),
+        "targets": np.zeros((frames, 18)),
+        "turns": turns,
+        "gain": np.array([task.settings.gain for task in tasks]),
+        "cap": np.array([np.inf if cap is None else cap for cap in caps]),
+        "scale": scale,
+        "task_support": moved * scale[:, None],
+        "screws": screws,
+        "poses": np.zeros((frames, 12)),
+        "A": np.zeros((total, model.nv)),
+        "b": np.zeros(total),
+    }

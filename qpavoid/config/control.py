@@ -93,8 +93,13 @@ class Limits(Block):
     """Joint limits as bounds on the velocity."""
 
     position_gain: Annotated[float, Field(gt=0, le=1)] = 0.5
-    """Share of the range left to a position limit that one tick may use [-]."""
+    """Share of the range left to a position limit that one tick may use [-]; joints with an acceleration limit keep to
+    the speeds from which they can brake instead."""
     velocity_scale: Annotated[float, Field(gt=0, le=1)] = 1.0
     """Share of the velocity limits that may be used [-]."""
+    acceleration: Positive | None = None
+    """Acceleration limit of the joints to which the robot gives none [rad/s² or m/s²]; left out: they have none."""
+    acceleration_scale: Annotated[float, Field(gt=0, le=1)] = 1.0
+    """Share of the acceleration limits that may be used [-]."""
     saturate: bool = True
     """Whether the laws that know no limits (all but the QP) are scaled and clipped to them afterwards."""

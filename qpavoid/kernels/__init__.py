@@ -17,24 +17,28 @@ if TYPE_CHECKING or not ACCELERATED:
 else:
     from qpavoid.kernels import compiled as _chosen
 
+assemble = _chosen.assemble
 candidates = _chosen.candidates
-closing_speed_bound = _chosen.closing_speed_bound
 damped_solution = _chosen.damped_solution
 distance_rows = _chosen.distance_rows
 frame_rows = _chosen.frame_rows
+pack = _chosen.pack
 projection_cost = _chosen.projection_cost
+row_bounds = _chosen.row_bounds
 shortfall = _chosen.shortfall
 tracking_shortfall = _chosen.tracking_shortfall
 velocity_bounds = _chosen.velocity_bounds
 
 __all__ = [
     "ACCELERATED",
+    "assemble",
     "candidates",
-    "closing_speed_bound",
     "damped_solution",
     "distance_rows",
     "frame_rows",
+    "pack",
     "projection_cost",
+    "row_bounds",
     "shortfall",
     "tracking_shortfall",
     "velocity_bounds",

@@ -1,61 +1,86 @@
 """The functions of `qpavoid.kernels.vectorised` as loops that numba compiles; documented there.
 
 Compiled code is cached on disk, so that only the first run after an installation waits for the compiler. The cache
-follows this file alone: after a change to what it takes from `vectorised`, remove `__pycache__`.
+follows this file alone: after a change to what it takes from other files, remove `__pycache__`.
+
+The layout crosses from Python as one structure: passing its forty arrays one by one would cost more than the work.
 """
 
 from __future__ import annotations
 
-import numpy as np
-from numba import njit
+from typing import Any
 
+import numpy as np
+from numba import njit, types
+from numba.experimental import structref
+
+from qpavoid.kernels.layout import RowLayout
 from qpavoid.kernels.vectorised import WELL_CONDITIONED, rotation_vector
 from qpavoid.problem import Array, IntArray
 
 
+class PackedRows(structref.StructRefProxy):  # type: ignore[misc]
+    """A `RowLayout` as compiled code sees it."""
+
+
+@structref.register
+class PackedRowsType(types.StructRef):  # type: ignore[misc]
+    """Its type, made of those of the fields."""
+
+    def preprocess_fields(self, fields: Any) -> Any:
+        """Types of fields, not of the values that they happen to have."""
+        return tuple((name, types.unliteral(field)) for name, field in fields)
+
+
+structref.define_boxing(PackedRowsType, PackedRows)
+structref.define_constructor(PackedRows, PackedRowsType, list(RowLayout._fields))
+
+
 @njit(cache=True)
-def candidates(poses: Array, local: Array, centers: Array, within: Array, pair_of: IntArray) -> IntArray:
+def _pack(fields: Any) -> Any:
+    return PackedRows(*fields)
+
+
+def pack(layout: RowLayout) -> Any:
+    """See `vectorised.pack`."""
+    return _pack(tuple(layout))
+
+
+@njit(cache=True)
+def candidates(
+    poses: Array, local: Array, centers: Array, radius: Array, pair_of: IntArray, reach: float, found: IntArray
+) -> int:
     """See `vectorised.candidates`."""
-    bodies, geometries = within.shape
+    bodies, geometries = pair_of.shape
     for i in range(bodies):
         for r in range(3):
             turned = poses[i, r] * local[i, 0] + poses[i, 3 + r] * local[i, 1] + poses[i, 6 + r] * local[i, 2]
             centers[i, r] = turned + poses[i, 9 + r]
         centers[i, 4] = -(centers[i, 0] ** 2 + centers[i, 1] ** 2 + centers[i, 2] ** 2)
     x, y, z = centers[:, 0].copy(), centers[:, 1].copy(), centers[:, 2].copy()
-    found = np.empty(bodies * geometries, np.intp)
     near = np.empty(geometries, np.bool_)
     count = 0
     for i in range(bodies):
         for j in range(geometries):  # free of branches, so that it becomes vector instructions
             dx, dy, dz = x[j] - x[i], y[j] - y[i], z[j] - z[i]
-            near[j] = dx * dx + dy * dy + dz * dz <= within[i, j]
+            within = radius[i] + reach + radius[j]
+            near[j] = dx * dx + dy * dy + dz * dz <= within * within * (1.0 + 1e-9)
         for j in range(geometries):
-            if near[j]:
+            if near[j] and pair_of[i, j] >= 0:
                 found[count] = pair_of[i, j]
                 count += 1
-    return found[:count].copy()
+    return count
 
 
 @njit(cache=True)
-def distance_rows(
-    results: Array, pairs: IntArray, reach: float, J_world: Array, support: Array, twists: Array, twist_row: IntArray,
-    moving: bool,
-) -> tuple[IntArray, Array, Array, Array]:  # fmt: skip
+def distance_rows(x: Any, pairs: IntArray, reach: float, moving: bool) -> int:
     """See `vectorised.distance_rows`."""
-    count = 0
-    for i in pairs:
-        if not results[i, 0] >= reach:
-            count += 1
+    results, J_world, closest, J = x.results, x.J_world, x.closest, x.J
     nv = J_world.shape[1]
-    near = np.empty(count, np.intp)
-    closest = np.empty((count, 10))
-    J = np.empty((count, nv))
-    drift = np.zeros(count)
     k = 0
     for i in pairs:
         if not results[i, 0] >= reach:
-            near[k] = i
+            x.near[k] = i
             for c in range(10):
                 closest[k, c] = results[i, c]
             nx, ny, nz = results[i, 1], results[i, 2], results[i, 3]
@@ -64,91 +89,112 @@ def distance_rows(
             for c in range(nv):
                 linear = nx * J_world[0, c] + ny * J_world[1, c] + nz * J_world[2, c]
                 angular = mx * J_world[3, c] + my * J_world[4, c] + mz * J_world[5, c]
-                J[k, c] = (linear + angular) * support[i, c]
+                J[k, c] = (linear + angular) * x.support[i, c]
+            x.drift[k] = 0.0
             if moving:
-                t = twists[twist_row[i]]
-                drift[k] = nx * t[0] + ny * t[1] + nz * t[2] + mx * t[3] + my * t[4] + mz * t[5]
+                t = x.twists[x.twist_row[i]]
+                x.drift[k] = nx * t[0] + ny * t[1] + nz * t[2] + mx * t[3] + my * t[4] + mz * t[5]
             k += 1
-    return near, closest, J, drift
+    return k
 
 
 @njit(cache=True)
-def closing_speed_bound(d: Array, hold: float, gain: float, cap: float, switching: bool, d1: float, d2: float) -> Array:
-    """See `vectorised.closing_speed_bound`."""
-    bound = np.empty(len(d))
-    for k in range(len(d)):
-        value = gain * (hold - d[k])
-        if switching and not value > 0.0:
-            share = min(max((d[k] - d1) / (d2 - d1), 0.0), 1.0)
+def row_bounds(x: Any, k: int, moving: bool) -> None:
+    """See `vectorised.row_bounds`."""
+    for i in range(k):
+        d = x.closest[i, 0] + x.offset
+        value = x.row_gain * (x.hold - d)
+        if x.switching and not value > 0.0:
+            share = min(max((d - x.d1) / (x.d2 - x.d1), 0.0), 1.0)
             value *= 0.5 - 0.5 * np.cos(np.pi * share)
-        bound[k] = min(value, cap)
-    return bound
+        x.d[i] = d
+        x.least[i] = min(value, x.recovery) - x.drift[i]
 
 
 _rotation_vector = njit(cache=True)(rotation_vector)
 
 
 @njit(cache=True)
-def frame_rows(
-    screws: Array, turns: IntArray, poses: Array, position: Array, rotation: Array, linear: Array, angular: Array,
-    gain: Array, scale: Array, J_world: Array, support: Array,
-) -> tuple[Array, Array]:  # fmt: skip
+def frame_rows(x: Any) -> None:
     """See `vectorised.frame_rows`."""
-    rows, nv = support.shape
-    A = np.zeros((rows, nv))
-    b = np.empty(rows)
-    for f in range(len(poses)):
-        r, x, y, z = 3 * f, poses[f, 9], poses[f, 10], poses[f, 11]
-        screws[r, 4], screws[r, 5] = z, -y
-        screws[r + 1, 3], screws[r + 1, 5] = -z, x
-        screws[r + 2, 3], screws[r + 2, 4] = y, -x
+    poses, targets, screws, A, b, J_world = x.poses, x.targets, x.screws, x.A, x.b, x.J_world
+    rows, nv = A.shape
+    frames = len(poses)
+    for f in range(frames):
+        for c in range(12):
+            poses[f, c] = x.frame_poses[x.frame_ids[f], c]
+        r, px, py, pz = 3 * f, poses[f, 9], poses[f, 10], poses[f, 11]
+        screws[r, 4], screws[r, 5] = pz, -py
+        screws[r + 1, 3], screws[r + 1, 5] = -pz, px
+        screws[r + 2, 3], screws[r + 2, 4] = py, -px
         for i in range(3):
-            b[r + i] = linear[f, i] + gain[f, 0] * (position[f, i] - poses[f, 9 + i])
+            b[r + i] = targets[f, 12 + i] + x.gain[f] * (targets[f, i] - poses[f, 9 + i])
     missing = np.empty((3, 3))
-    for n in range(len(turns)):
-        f = turns[n]
+    for n in range(len(x.turns)):
+        f = x.turns[n]
         for i in range(3):
             for j in range(3):
                 missing[i, j] = 0.0
                 for c in range(3):
-                    missing[i, j] += rotation[f, i, c] * poses[f, 3 * c + j]
+                    missing[i, j] += targets[f, 3 + 3 * i + c] * poses[f, 3 * c + j]
         errors = _rotation_vector(missing)
         for i in range(3):
-            b[3 * (len(poses) + n) + i] = angular[f, i] + gain[f, 0] * errors[i]
+            b[3 * (frames + n) + i] = targets[f, 15 + i] + x.gain[f] * errors[i]
+    for part in range(len(x.cap)):
+        r = 3 * part
+        speed = np.sqrt(b[r] * b[r] + b[r + 1] * b[r + 1] + b[r + 2] * b[r + 2])
+        if speed > x.cap[part]:
+            for i in range(3):
+                b[r + i] *= x.cap[part] / speed
     for r in range(rows):
-        b[r] *= scale[r]
+        b[r] *= x.scale[r]
+        for c in range(nv):
+            A[r, c] = 0.0
         for s in range(6):
             e = screws[r, s]
             if e != 0.0:
                 for c in range(nv):
                     A[r, c] += e * J_world[s, c]
         for c in range(nv):
-            A[r, c] *= support[r, c]
-    return A, b
+            A[r, c] *= x.task_support[r, c]
 
 
 @njit(cache=True)
-def velocity_bounds(
-    q: Array, q_index: IntArray, v_index: IntArray, q_lower: Array, q_upper: Array, v_max: Array, rate: float
-) -> tuple[Array, Array]:
+def _speed_to_stop(room: float, step: float, dt: float) -> float:
+    """See `vectorised.speed_to_stop`."""
+    ticks = max(np.ceil(0.5 * np.sqrt(1.0 + 8.0 * room / (step * dt)) - 0.5), 1.0)
+    return (room / dt + 0.5 * step * ticks * (ticks - 1.0)) / ticks
+
+
+@njit(cache=True)
+def velocity_bounds(x: Any, q: Array) -> None:
     """See `vectorised.velocity_bounds`."""
-    upper = v_max.copy()
-    lower = -upper
-    for i in range(len(q_index)):
-        j, here = v_index[i], q[q_index[i]]
-        fastest = v_max[j]
-        lower[j] = max(min(rate * (q_lower[i] - here), fastest), -fastest)
-        upper[j] = max(min(rate * (q_upper[i] - here), fastest), -fastest)
-    return lower, upper
+    lower, upper = x.hard_lower, x.hard_upper
+    for j in range(len(x.v_max)):
+        lower[j], upper[j] = -x.v_max[j], x.v_max[j]
+    for i in range(len(x.q_index)):
+        j, here = x.v_index[i], q[x.q_index[i]]
+        fastest, step, last = x.v_max[j], x.v_step[j], x.v_last[j]
+        below, above = here - x.q_lower[i], x.q_upper[i] - here
+        if step < np.inf:
+            down = _speed_to_stop(below, step, x.dt) if below > 0.0 else max(x.rate * below, -last - step)
+            up = _speed_to_stop(above, step, x.dt) if above > 0.0 else max(x.rate * above, last - step)
+        else:
+            down, up = x.rate * below, x.rate * above
+        lower[j] = max(min(-down, fastest), -fastest)
+        upper[j] = max(min(up, fastest), -fastest)
+    for j in range(len(x.v_max)):
+        x.lower[j] = min(max(x.v_last[j] - x.v_step[j], lower[j]), upper[j])
+        x.upper[j] = max(min(x.v_last[j] + x.v_step[j], upper[j]), lower[j])
 
 
 @njit(cache=True)
-def damped_solution(A: Array, b: Array, damping: float) -> Array:
+def damped_solution(x: Any, v: Array) -> None:
     """See `vectorised.damped_solution`: Cholesky factorisation of the Gram matrix, row by row."""
+    A, b, damping = x.A, x.b, x.damping
     rows, nv = A.shape
     L = np.empty((rows, rows))
-    x = np.empty(rows)
-    v = np.zeros(nv)
+    y = np.empty(rows)
     smallest, largest = np.inf, 0.0
     for i in range(rows):
         for j in range(i + 1):
@@ -163,22 +209,22 @@ def damped_solution(A: Array, b: Array, damping: float) -> Array:
                 smallest, largest = min(smallest, dot), max(largest, dot)
                 if not dot > 0.0 or (damping == 0.0 and smallest < WELL_CONDITIONED * largest):
                     v[:] = np.nan
-                    return v
+                    return
                 L[i, i] = np.sqrt(dot)
             else:
                 L[i, j] = dot / L[j, j]
         total = b[i]
         for c in range(i):
-            total -= L[i, c] * x[c]
-        x[i] = total / L[i, i]
+            total -= L[i, c] * y[c]
+        y[i] = total / L[i, i]
+    v[:] = 0.0
     for i in range(rows - 1, -1, -1):
-        total = x[i]
+        total = y[i]
         for c in range(i + 1, rows):
-            total -= L[c, i] * x[c]
-        x[i] = total / L[i, i]
+            total -= L[c, i] * y[c]
+        y[i] = total / L[i, i]
         for c in range(nv):
-            v[c] += A[i, c] * x[i]
-    return v
+            v[c] += A[i, c] * y[i]
 
 
 @njit(cache=True)
@@ -196,12 +242,20 @@ def shortfall(v: Array, J: Array, b: Array, lower: Array, upper: Array) -> float
 
 
 @njit(cache=True)
-def tracking_shortfall(
-    A: Array, b: Array, damping: float, J: Array, least: Array, lower: Array, upper: Array
-) -> tuple[Array, float]:
+def tracking_shortfall(x: Any, k: int) -> float:
     """See `vectorised.tracking_shortfall`."""
-    v = damped_solution(A, b, damping)
-    return v, shortfall(v, J, least, lower, upper)
+    return shortfall(x.v0, x.J[:k], x.least[:k], x.lower, x.upper)
+
+
+@njit(cache=True)
+def assemble(x: Any, q: Array, pairs: IntArray, reach: float, moving: bool) -> tuple[int, float]:
+    """See `vectorised.assemble`."""
+    frame_rows(x)
+    velocity_bounds(x, q)
+    damped_solution(x, x.v0)
+    k = distance_rows(x, pairs, reach, moving)
+    row_bounds(x, k, moving)
+    return k, tracking_shortfall(x, k)
 
 
 @njit(cache=True)

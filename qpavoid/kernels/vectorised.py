@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg.lapack import dposv
 
+from qpavoid.kernels.layout import RowLayout
 from qpavoid.problem import Array, IntArray
 
 WELL_CONDITIONED = 1e-6
@@ -25,7 +26,60 @@ _SKEW[1, [2, 6]] = -1.0, 1.0
 _SKEW[0, [5, 7]] = 1.0, -1.0
 
 
-def candidates(poses: Array, local: Array, centers: Array, within: Array, pair_of: IntArray) -> IntArray:
+class Workspace:
+    """A layout as attributes, with scratch memory and views: a tick allocates and slices as little as it can."""
+
+    def __init__(self, layout: RowLayout) -> None:
+        for name, value in layout._asdict().items():
+            setattr(self, name, value)
+        (rows, nv), frames, pairs = layout.A.shape, len(layout.targets), len(layout.near)
+        split = 3 * frames
+        # numbers as arrays: a ufunc takes them in half the time
+        self.damping2, self.rate_, self.quarter = (
+            np.array([value]) for value in (layout.damping**2, layout.rate, 0.5 * np.pi)
+        )
+        self.offset_, self.hold_, self.d1_ = (np.array([value]) for value in (layout.offset, layout.hold, layout.d1))
+        self.gain_, self.recovery_, self.zero = (np.array([v]) for v in (layout.row_gain, layout.recovery, 0.0))
+        self.blend = np.array([0.5 * np.pi / (layout.d2 - layout.d1)])
+        self.gain_column = layout.gain[:, None]
+        self.here = layout.poses[:, 9:]
+        self.turned = layout.poses[:, :9].reshape(-1, 3, 3)
+        self.position, self.rotation = layout.targets[:, :3], layout.targets[:, 3:12].reshape(-1, 3, 3)
+        self.linear, self.angular = layout.targets[:, 12:15], layout.targets[:, 15:]
+        self.moments = layout.screws.reshape(-1, 3, 6)[:frames, :, 3:]
+        self.wanted, self.wanted_turns = layout.b[:split].reshape(-1, 3), layout.b[split:].reshape(-1, 3)
+        self.speeds = layout.b.reshape(-1, 3)
+        self.every_turns = len(layout.turns) == frames
+        self.capped = bool(np.isfinite(layout.cap).any())
+        self.gram = np.empty((rows, rows))
+        self.gram_diagonal = self.gram.ravel()[:: rows + 1]
+        self.over = np.empty(2 * nv + pairs)
+        self.over_upper, self.over_lower = self.over[:nv], self.over[nv : 2 * nv]
+        self.was_moving = False
+        self.screw_columns = np.empty((6, pairs))
+        self.scratch = np.empty((3, pairs))
+        # every joint has one coordinate and position limits: bounds are made in place, the lower and upper ones at once
+        self.plain = np.array_equal(layout.q_index, np.arange(nv)) and np.array_equal(layout.v_index, np.arange(nv))
+        self.q_limits = np.stack((layout.q_lower, layout.q_upper))
+        self.room = np.empty_like(self.q_limits)
+        self.signs = np.array([[-1.0], [1.0]])
+        self.limited_step = layout.v_step[layout.v_index]
+        self.finite_step = np.where(np.isfinite(self.limited_step), self.limited_step, 1.0)
+        self.fastest = layout.v_max[layout.v_index]
+        self.slowest, self.v_min = -self.fastest, -layout.v_max
+
+    def __getattr__(self, name: str) -> Any:  # for the type checker: the fields of the layout
+        raise AttributeError(name)
+
+
+def pack(layout: RowLayout) -> Workspace:
+    """The layout in the form that the kernels take."""
+    return Workspace(layout)
+
+
+def candidates(
+    poses: Array, local: Array, centers: Array, radius: Array, pair_of: IntArray, reach: float, found: IntArray
+) -> int:
     """Pairs whose bounding spheres are within reach of each other.
 
     Args:
@@ -33,70 +87,113 @@ def candidates(poses: Array, local: Array, centers: Array, within: Array, pair_o
         local: centres of their bounding spheres in their own frames (g, 3) [m].
         centers: the same in the world, as rows [c, 1, -|c|²] (g, 5) [m]; those of the b bodies of the robot, which
             come first, are overwritten.
-        within: squared distance up to which each combination counts (b, g) [m²]; negative where there is no pair.
-        pair_of: index of the pair of each combination (b, g), increasing along the rows, one after the other.
+        radius: of the spheres (g,) [m].
+        pair_of: index of the pair of each combination (b, g), increasing along the rows, one after the other;
+            negative where there is none.
+        reach: distance between spheres up to which a pair counts [m].
+        found: overwritten with the indices of these pairs, increasing (m,).
 
     Returns:
-        (c,) indices of pairs, increasing.
+        How many there are.
     """
-    bodies = len(within)
+    bodies = len(pair_of)
     body = centers[:bodies]
     body[:, :3] = np.matmul(local[:bodies, None], poses[:bodies, :9].reshape(-1, 3, 3))[:, 0] + poses[:bodies, 9:]
     np.einsum("ij,ij->i", body[:, :3], -body[:, :3], out=body[:, 4])
+    within = (radius[:bodies, None] + reach) + radius
+    within *= within
+    within *= 1.0 + 1e-9
     # 2 a·c - |a|² - |c|² >= -within, the left side as one matrix product
-    return np.asarray(pair_of[(body[:, _SWAPPED] * _DOUBLED) @ centers.T + within >= 0.0])
+    within += (body[:, _SWAPPED] * _DOUBLED) @ centers.T
+    pairs = pair_of[(within >= 0.0) & (pair_of >= 0)]
+    found[: len(pairs)] = pairs
+    return len(pairs)
 
 
-def distance_rows(
-    results: Array, pairs: IntArray, reach: float, J_world: Array, support: Array, twists: Array, twist_row: IntArray,
-    moving: bool,
-) -> tuple[IntArray, Array, Array, Array]:  # fmt: skip
+def assemble(x: Any, q: Array, pairs: IntArray, reach: float, moving: bool) -> tuple[int, float]:
+    """All rows and bounds of a tick, and the tracking law's velocity.
+
+    Args:
+        x: memory of the tick; its outputs are overwritten.
+        q: configuration (nq,).
+        pairs: those whose results are of this tick (c,), increasing.
+        reach: surface distance below which a pair is near [m].
+        moving: whether any obstacle moves.
+
+    Returns:
+        Number k of near pairs; by how much the tracking law's velocity violates the worst of rows and bounds
+        (negative inside, NaN where there is one).
+    """
+    frame_rows(x)
+    velocity_bounds(x, q)
+    damped_solution(x, x.v0)
+    k = distance_rows(x, pairs, reach, moving)
+    if k:
+        row_bounds(x, k, moving)
+    return k, tracking_shortfall(x, k)
+
+
+def distance_rows(x: Any, pairs: IntArray, reach: float, moving: bool) -> int:
     """Closest points and rates of the pairs that are nearer than `reach`, or whose distance is NaN.
 
     The normal n is parallel to the line between the witness points, so p × n is the same at both, and every row is
     J = [n, p × n]ᵀ J_world, masked with the difference of the supports of the two bodies.
 
     Args:
-        results: [distance, normal, point a, point b] of all pairs (m, 10).
-        pairs: which of them to look at (c,), increasing.
+        x: reads results, J_world, support, twists, twist_row; writes near, closest, J, drift.
+        pairs: which pairs to look at (c,), increasing.
         reach: distance below which a pair is near [m].
-        J_world: world Jacobian of all joints (6, nv).
-        support: difference of the supports of each pair's bodies (m, nv).
-        twists: velocity of each obstacle at the world's origin, [linear, angular] (o + 1, 6); the last row is zero.
-        twist_row: row of `twists` that moves each pair's second body (m,).
         moving: whether any of the twists is not zero.
 
     Returns:
-        near (k,), closest points (k, 10), J (k, nv), drift (k,).
+        How many are near.
     """
+    results = x.results
     distance = results[:, 0] if len(pairs) == len(results) else results[pairs, 0]
     near = pairs[~(distance >= reach)]  # a NaN is near, not hidden
-    if not len(near):
-        return near, np.empty((0, 10)), np.empty((0, J_world.shape[1])), np.empty(0)
-    closest = results[near]
-    screws = np.empty((6, len(near)))
+    k = len(near)
+    if not k:
+        return 0
+    x.near[:k] = near
+    closest, J, drift, screws = x.closest[:k], x.J[:k], x.drift[:k], x.screw_columns[:, :k]
+    results.take(near, axis=0, out=closest, mode="clip")
     columns = closest.T
     normal, point = columns[1:4], columns[4:7]
     screws[:3] = normal
-    products = point[_CYCLE] * normal[_ANTICYCLE]
+    products = point[_CYCLE]
+    products *= normal[_ANTICYCLE]
     np.subtract(products[:3], products[3:], out=screws[3:])
-    J = screws.T @ J_world
-    J *= support[near]
-    drift = np.einsum("ij,ji->i", twists[twist_row[near]], screws) if moving else np.zeros(len(near))
-    return near, closest, J, drift
+    np.dot(screws.T, x.J_world, out=J)
+    J *= x.support.take(near, axis=0, mode="clip")
+    if moving:
+        np.einsum("ij,ji->i", x.twists[x.twist_row[near]], screws, out=drift)
+    elif x.was_moving:
+        x.drift.fill(0.0)
+    x.was_moving = moving
+    return k
 
 
-def closing_speed_bound(d: Array, hold: float, gain: float, cap: float, switching: bool, d1: float, d2: float) -> Array:
-    """See `qpavoid.avoidance.closing_speed_bound`."""
-    bound = gain * (hold - d)
-    if not len(d):
-        return bound
-    if switching:
-        quarter = 0.5 * np.pi
-        root = np.sin(np.minimum(np.maximum((d - d1) * (quarter / (d2 - d1)), 0.0), quarter))
-        # 1 - β = root² is 0 below d1, where the row asks for recovery instead, which β does not weaken
-        bound = np.maximum(bound, 0.0) + root * root * bound
-    return np.minimum(bound, cap)
+def row_bounds(x: Any, k: int, moving: bool) -> None:
+    """Right-hand sides of the first k avoidance rows: see `qpavoid.avoidance`; writes d and least."""
+    d, least = x.d[:k], x.least[:k]
+    np.add(x.closest[:k, 0], x.offset_, out=d)
+    np.subtract(x.hold_, d, out=least)
+    if x.switching:
+        beyond, share = x.scratch[0, :k], x.scratch[1, :k]
+        np.subtract(d, x.d1_, out=share)
+        share *= x.blend
+        np.maximum(share, x.zero, out=share)
+        np.minimum(share, x.quarter, out=share)
+        np.sin(share, out=share)
+        share *= share
+        share *= least
+        # 1 - β = sin² is 0 below d1, where the row asks for recovery instead, which β does not weaken
+        np.maximum(least, x.zero, out=beyond)
+        np.add(share, beyond, out=least)
+    least *= x.gain_
+    np.minimum(least, x.recovery_, out=least)
+    if moving:
+        least -= x.drift[:k]
 
 
 def rotation_vector(R: Any) -> tuple[float, float, float]:
@@ -120,100 +217,124 @@ def rotation_vector(R: Any) -> tuple[float, float, float]:
     return scale * x, scale * y, scale * z
 
 
-def frame_rows(
-    screws: Array, turns: IntArray, poses: Array, position: Array, rotation: Array, linear: Array, angular: Array,
-    gain: Array, scale: Array, J_world: Array, support: Array,
-) -> tuple[Array, Array]:  # fmt: skip
-    """Rows A v = b of f frames that follow targets: feed-forward plus gain times what is missing, scaled.
+def frame_rows(x: Any) -> None:
+    """Rows A v = b of f frames that follow targets: feed-forward plus gain times what is missing, capped and scaled.
 
-    Three linear rows for each frame come first, then three angular rows for each frame whose orientation counts.
+    The orientation error is the rotation vector of R_target Rᵀ. Three linear rows for each frame come first, then
+    three angular rows for each frame whose orientation counts.
 
     Args:
-        screws: directions of the rows (r, 6), overwritten: the moments p × e of the linear rows.
-        turns: which frames have angular rows (t,).
-        poses: of the frames (f, 12), rotation by columns and position.
-        position: of the targets (f, 3) [m].
-        rotation: of the targets (f, 3, 3).
-        linear: velocities of the targets (f, 3) [m/s].
-        angular: their angular velocities (f, 3) [rad/s].
-        gain: feedback gain of each frame (f, 1) [1/s].
-        scale: of b (r,).
-        J_world: world Jacobian of all joints (6, nv).
-        support: scale of the coordinates that move each row's frame, 0 for the others (r, nv).
-
-    Returns:
-        A (r, nv), b (r,).
+        x: reads frame_poses, targets and the layout of the tasks; writes poses, A, b.
     """
-    here = poses[:, 9:]
-    split = 3 * len(here)
-    screws[:split, 3:] = (here @ _SKEW).reshape(split, 3)
-    b = np.empty(len(screws))
-    b[:split] = (linear + gain * (position - here)).ravel()
+    x.frame_poses.take(x.frame_ids, axis=0, out=x.poses, mode="clip")
+    here, turns, wanted = x.here, x.turns, x.wanted
+    x.moments[:] = np.dot(here, _SKEW).reshape(-1, 3, 3)
+    np.subtract(x.position, here, out=wanted)
+    wanted *= x.gain_column
+    wanted += x.linear
     if len(turns):
         # poses hold rotations by columns, so these are their transposes
-        missing = (rotation @ poses[:, :9].reshape(-1, 3, 3)).tolist()
-        errors = np.array([rotation_vector(missing[f]) for f in turns])
-        turning = turns if len(turns) < len(here) else slice(None)
-        b[split:] = (angular[turning] + gain[turning] * errors).ravel()
-    A = screws @ J_world
-    A *= support
-    b *= scale
-    return A, b
+        missing = (x.rotation @ x.turned).tolist()
+        if x.every_turns:
+            x.wanted_turns[:] = [rotation_vector(R) for R in missing]
+            x.wanted_turns *= x.gain_column
+            x.wanted_turns += x.angular
+        else:
+            x.wanted_turns[:] = [rotation_vector(missing[f]) for f in turns]
+            x.wanted_turns *= x.gain_column[turns]
+            x.wanted_turns += x.angular[turns]
+    if x.capped:
+        speeds = x.speeds
+        speeds *= np.minimum(x.cap / np.maximum(np.sqrt((speeds * speeds).sum(axis=1)), 1e-12), 1.0)[:, None]
+    np.dot(x.screws, x.J_world, out=x.A)
+    np.multiply(x.A, x.task_support, out=x.A)
+    np.multiply(x.b, x.scale, out=x.b)
 
 
-def velocity_bounds(
-    q: Array, q_index: IntArray, v_index: IntArray, q_lower: Array, q_upper: Array, v_max: Array, rate: float
-) -> tuple[Array, Array]:
-    """See `qpavoid.limits.velocity_bounds`; `rate` is position_gain / dt [1/s]."""
-    if len(q_index) == len(q) == len(v_max):  # every joint has one coordinate and position limits
-        slowest = -v_max
-        lower = np.maximum(np.minimum(rate * (q_lower - q), v_max), slowest)
-        return lower, np.maximum(np.minimum(rate * (q_upper - q), v_max), slowest)
-    upper = v_max.copy()
-    lower = -upper
-    here, fastest = q[q_index], v_max[v_index]
-    slowest = -fastest
-    lower[v_index] = np.maximum(np.minimum(rate * (q_lower - here), fastest), slowest)
-    upper[v_index] = np.maximum(np.minimum(rate * (q_upper - here), fastest), slowest)
-    return lower, upper
+def speed_to_stop(room: Array, step: Array, dt: float) -> Array:
+    """Largest speed from which a coordinate that is slowed by `step` in every tick comes to rest within `room`.
+
+    From v it still goes S(v) = dt Σ max(v - i step, 0), i = 0, 1, …; on (n - 1) step <= v <= n step that is
+    n dt v - dt step n (n - 1) / 2, and S(n step) = dt step n (n + 1) / 2, which gives the number of ticks n. Once it
+    moves at such a speed, slowing down by `step` keeps to it, so that the bounds of the next tick never contradict.
+
+    Args:
+        room: distance left (...), positive [rad or m].
+        step: change of speed in one tick (...), positive [rad/s or m/s].
+        dt: length of a tick [s].
+    """
+    ticks = np.maximum(np.ceil(0.5 * np.sqrt(1.0 + 8.0 * room / (step * dt)) - 0.5), 1.0)
+    return np.asarray((room / dt + 0.5 * step * ticks * (ticks - 1.0)) / ticks)
 
 
-def damped_solution(A: Array, b: Array, damping: float) -> Array:
+def velocity_bounds(x: Any, q: Array) -> None:
+    """Bounds on v from the joint limits: see `qpavoid.limits`; writes hard_lower, hard_upper, lower and upper."""
+    room = x.room  # [lower, upper]: how far the coordinate is above its lower limit, and below the upper one
+    np.subtract(x.q_limits, q if x.plain else q[x.q_index], out=room)
+    if x.accelerated:
+        room[0] *= -1.0
+        slowed = np.maximum(x.rate_ * room, x.signs * x.v_last[x.v_index] - x.limited_step)
+        stop = speed_to_stop(np.maximum(room, 0.0), x.finite_step, x.dt)
+        room[:] = np.where(np.isinf(x.limited_step), x.rate_ * room, np.where(room > 0.0, stop, slowed))
+        room[0] *= -1.0
+    else:
+        room *= x.rate_
+    np.minimum(room, x.fastest, out=room)
+    if x.plain:
+        np.maximum(room[0], x.slowest, out=x.hard_lower)
+        np.maximum(room[1], x.slowest, out=x.hard_upper)
+    else:
+        np.maximum(room, x.slowest, out=room)
+        x.hard_lower[:], x.hard_upper[:] = x.v_min, x.v_max
+        x.hard_lower[x.v_index], x.hard_upper[x.v_index] = room
+    if x.accelerated:
+        np.clip(x.v_last - x.v_step, x.hard_lower, x.hard_upper, out=x.lower)
+        np.clip(x.v_last + x.v_step, x.hard_lower, x.hard_upper, out=x.upper)
+
+
+def damped_solution(x: Any, v: Array) -> None:
     """A⁺b with A⁺ = Aᵀ (A Aᵀ + λ²)⁻¹.
 
     Args:
-        A: rows (r, nv).
-        b: right-hand sides (r,).
-        damping: λ [-].
-
-    Returns:
-        (nv,); NaN where there is no damping and A Aᵀ is close to singular.
+        x: reads A (r, n), b (r,) and the damping λ.
+        v: out (n,); NaN where there is no damping and A Aᵀ is close to singular.
     """
-    gram = A @ A.T
-    gram.ravel()[:: len(gram) + 1] += damping * damping
-    factor, x, info = dposv(gram, b)
-    if damping == 0.0 and info == 0:
+    if not len(x.b):
+        v.fill(0.0)
+        return
+    gram = x.gram
+    np.dot(x.A, x.A.T, out=gram)
+    x.gram_diagonal += x.damping2
+    factor, y, info = dposv(gram, x.b)
+    if x.damping == 0.0 and info == 0:
         pivots = factor.diagonal() ** 2
         info = int(pivots.min() < WELL_CONDITIONED * pivots.max())
-    return x @ A if info == 0 else np.full(A.shape[1], np.nan)
+    if info == 0:
+        np.dot(y, x.A, out=v)
+    else:
+        v.fill(np.nan)
+
+
+def tracking_shortfall(x: Any, k: int) -> float:
+    """`shortfall` of v0, with the first k rows."""
+    v, over = x.v0, x.over[: 2 * len(x.v0) + k]
+    np.subtract(v, x.upper, out=x.over_upper)
+    np.subtract(x.lower, v, out=x.over_lower)
+    if k:
+        outside = over[2 * len(v) :]
+        np.dot(x.J[:k], v, out=outside)
+        np.subtract(x.least[:k], outside, out=outside)
+    return float(over.max())
 
 
 def shortfall(v: Array, J: Array, b: Array, lower: Array, upper: Array) -> float:
     """Largest violation of J v >= b and lower <= v <= upper; negative inside, NaN where there is one."""
     over = np.maximum(v - upper, lower - v).max()
-    return float(np.maximum(over, np.max(b - J @ v)) if len(b) else over)
-
-
-def tracking_shortfall(
-    A: Array, b: Array, damping: float, J: Array, least: Array, lower: Array, upper: Array
-) -> tuple[Array, float]:
-    """`damped_solution`, and its `shortfall` of the rows J v >= least and the bounds."""
-    v = damped_solution(A, b, damping)
-    return v, shortfall(v, J, least, lower, upper)
+    return float(np.maximum(over, (b - J @ v).max()) if len(b) else over)
 
 
 def projection_cost(A: Array, regularization: float, v0: Array) -> tuple[Array, Array]:
-    """P = AᵀA + λ (nv, nv) and q = -P v0 (nv,): ½ vᵀP v + qᵀv is smallest at v0."""
+    """P = AᵀA + λ (n, n) and q = -P v0 (n,): ½ vᵀP v + qᵀv is smallest at v0."""
     P = A.T @ A
     P.ravel()[:: len(P) + 1] += regularization
     return P, -(P @ v0)

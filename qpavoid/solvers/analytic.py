@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from qpavoid import gains, kernels
+from qpavoid import gains
 from qpavoid.config import Eq10Solver, TrackingSolver
-from qpavoid.problem import Array, Problem, Solution, Tracking
+from qpavoid.problem import Array, Problem, Solution
 
 _VANISHING = 1e-12
 """Squared length below which a projected row counts as zero: an absolute cut-off, since a relative one inverts
@@ -30,14 +30,12 @@ def pseudo_inverse(A: Array, damping: float) -> Array:
     return np.asarray(np.linalg.solve(gram, A).T)
 
 
-def tracking_velocity(tracking: Tracking) -> Array:
+def tracking_velocity(problem: Problem) -> Array:
     """Velocity (nv,) that tracks as if nothing else mattered: J⁺ẋ of the weighted rows."""
-    v = kernels.damped_solution(tracking.A, tracking.b, tracking.damping)
-    return v if v[0] == v[0] else undamped_velocity(tracking)
-
-
-def undamped_velocity(tracking: Tracking) -> Array:
-    """The same where rows repeat each other and no damping is asked for: NaN in `tracking` stays NaN."""
+    v0, tracking = problem.v0, problem.tracking
+    if v0[0] == v0[0]:
+        return np.array(v0)
+    # rows repeat each other and no damping was asked for; NaN in `tracking` stays NaN
     if not np.isfinite(tracking.A).all():
         return np.full(tracking.A.shape[1], np.nan)
     return np.asarray(pseudo_inverse(tracking.A, 0.0) @ tracking.b)
@@ -53,7 +51,7 @@ class TrackingOnly:
 
     def solve(self, problem: Problem) -> Solution:
         """J⁺ẋ."""
-        return Solution(tracking_velocity(problem.tracking))
+        return Solution(tracking_velocity(problem))
 
 
 class Eq10:
@@ -74,7 +72,7 @@ class Eq10:
     def solve(self, problem: Problem) -> Solution:
         """Eq. 10, or J⁺ẋ when nothing is in range."""
         tracking, rows = problem.tracking, problem.avoidance
-        primary = tracking_velocity(tracking)
+        primary = tracking_velocity(problem)
         if rows.d.size == 0:
             return Solution(primary)
         J = tracking.A

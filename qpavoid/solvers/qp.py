@@ -10,7 +10,7 @@ from qpavoid import gains, kernels
 from qpavoid.config import QpSolver
 from qpavoid.errors import SolverNotInstalled
 from qpavoid.problem import Array, AvoidanceRows, Problem, Solution, Status
-from qpavoid.solvers.analytic import undamped_velocity
+from qpavoid.solvers.analytic import tracking_velocity
 from qpavoid.solvers.backends import make_backend
 
 _TOLERANCE = 1e-6
@@ -40,12 +40,11 @@ class Qp:
 
     def solve(self, problem: Problem) -> Solution:
         """The closest safe velocity; relaxed where there is none; a stop where that fails too."""
-        (A, b, damping), rows, lower, upper, _ = problem
-        v0, worst = kernels.tracking_shortfall(A, b, damping, rows.J, rows.b, lower, upper)
-        if worst <= 0.0:
-            return Solution(v0)
+        if problem.shortfall <= 0.0:
+            return Solution(problem.v0.copy())
+        A, rows, lower, upper, v0 = problem.tracking.A, problem.avoidance, problem.lower, problem.upper, problem.v0
         if v0[0] != v0[0]:
-            v0 = undamped_velocity(problem.tracking)
+            v0 = tracking_velocity(problem)
             if kernels.shortfall(v0, rows.J, rows.b, lower, upper) <= 0.0:
                 return Solution(v0)
         if self._project is not None:

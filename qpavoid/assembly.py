@@ -1,0 +1,90 @@
+"""From kinematics and distances to a problem: all rows and bounds of a tick in one call, in memory laid out once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from qpavoid import kernels
+from qpavoid.avoidance import row_form
+from qpavoid.config import Avoidance
+from qpavoid.kernels.layout import RowLayout
+from qpavoid.kinematics import ForwardKinematics, Kinematics
+from qpavoid.limits import JointBounds, limit_layout
+from qpavoid.motion import Sample
+from qpavoid.problem import Array, AvoidanceRows, Problem, Proximity, Tracking
+from qpavoid.proximity import DistanceQuery
+from qpavoid.scene import Scene
+from qpavoid.tasks import FrameTask, task_layout
+
+
+class Assembly:
+    """Rows and bounds of a tick. What it returns looks into memory that the next tick overwrites."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        tasks: Sequence[FrameTask],
+        bounds: JointBounds,
+        kinematics: ForwardKinematics,
+        query: DistanceQuery,
+        avoidance: Avoidance,
+        position_gain: float,
+        damping: float,
+        dt: float,
+    ) -> None:
+        """Lays the memory out; see `Controller` for the arguments."""
+        pairs, nv = len(scene.pairs), scene.robot.model.nv
+        self._layout = RowLayout(
+            J_world=kinematics.J,
+            frame_poses=kinematics.frame_poses,
+            **task_layout(tasks, scene.robot.model),
+            results=query.results,
+            support=scene.support,
+            twists=query.twists,
+            twist_row=query.twist_row,
+            near=np.zeros(pairs, dtype=np.intp),
+            closest=np.zeros((pairs, 10)),
+            J=np.zeros((pairs, nv)),
+            drift=np.zeros(pairs),
+            d=np.zeros(pairs),
+            least=np.zeros(pairs),
+            **limit_layout(bounds, position_gain, dt),
+            v0=np.zeros(nv),
+            damping=damping,
+            **row_form(avoidance),
+        )
+        self._packed = kernels.pack(self._layout)
+        self._names = scene.pair_names
+        self._targets = [(row[:3], row[3:12].reshape(3, 3), row[12:15], row[15:]) for row in self._layout.targets]
+        self._views: dict[int, tuple[Proximity, AvoidanceRows]] = {}
+        self._tracking = Tracking(self._layout.A, self._layout.b, damping)
+        self.kinematics = Kinematics(self._layout.J_world, self._layout.poses)
+
+    def compute(
+        self, q: Array, targets: Sequence[Sample], query: DistanceQuery, reach: float
+    ) -> tuple[Proximity, Problem]:
+        """Rows and bounds at a configuration, for which kinematics and distances are up to date.
+
+        Args:
+            q: configuration (nq,).
+            targets: where each task's frame should be now, and how fast.
+            query: distances of this tick.
+            reach: surface distance below which a pair is near [m].
+        """
+        x = self._layout
+        for views, target in zip(self._targets, targets):  # noqa: B905 (strict costs as much as the copying)
+            views[0][:], views[1][:], views[2][:], views[3][:] = target
+        k, worst = kernels.assemble(self._packed, q, query.pairs, reach, query.moving)
+        proximity, rows = self._views.get(k) or self._view(k)
+        return proximity, Problem(
+            self._tracking, rows, x.lower, x.upper, x.hard_lower, x.hard_upper, self._names, x.v0, worst
+        )
+
+    def _view(self, k: int) -> tuple[Proximity, AvoidanceRows]:
+        x = self._layout
+        near = x.near[:k]
+        proximity = Proximity(near, x.closest[:k], x.J[:k], x.drift[:k])
+        self._views[k] = proximity, AvoidanceRows(near, x.d[:k], x.J[:k], x.least[:k], x.d1, x.d2)
+        return self._views[k]

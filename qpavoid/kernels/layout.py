@@ -1,0 +1,118 @@
+"""Memory of a tick: what the kernels read and write, laid out once when a controller is made.
+
+Arrays that look into the memory of Pinocchio and coal are views; outputs are overwritten by every tick.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from qpavoid.problem import Array, IntArray
+
+
+class RowLayout(NamedTuple):
+    """Everything from which the rows and bounds of a tick are made, and where they go.
+
+    n velocity coordinates, f tracked frames of which t with an orientation, r = 3 (f + t) task rows, m pairs,
+    o obstacles, p coordinates with a position limit.
+    """
+
+    J_world: Array
+    """(6, n) world Jacobian of all joints."""
+    # --- tasks
+    frame_poses: Array
+    """(frames, 12) world poses of all frames of the model: rotation by columns, then position [m]."""
+    frame_ids: IntArray
+    """(f,) the tracked ones."""
+    targets: Array
+    """(f, 18) position, rotation by rows, linear and angular velocity of each target [m, -, m/s, rad/s]."""
+    turns: IntArray
+    """(t,) which frames have an orientation to follow."""
+    gain: Array
+    """(f,) feedback gain [1/s]."""
+    cap: Array
+    """(f + t,) largest commanded linear, then angular speed; infinite where there is none [m/s, rad/s]."""
+    scale: Array
+    """(r,) root of each row's weight."""
+    task_support: Array
+    """(r, n) scale of the coordinates that move each row's frame, 0 for the others."""
+    screws: Array
+    """(r, 6) directions of the rows; the moments of the linear ones are filled in by every tick."""
+    poses: Array
+    """(f, 12) out: poses of the tracked frames."""
+    A: Array
+    """(r, n) out: task rows."""
+    b: Array
+    """(r,) out: their right-hand sides."""
+    # --- pairs
+    results: Array
+    """(m, 10) [distance, normal, point a, point b] of all pairs."""
+    support: Array
+    """(m, n) support of the second body minus that of the first."""
+    twists: Array
+    """(o + 1, 6) velocity of each obstacle at the world's origin, [linear, angular]; the last row stays zero."""
+    twist_row: IntArray
+    """(m,) row of `twists` that moves each pair's second body."""
+    near: IntArray
+    """(m,) out: which pairs are near, in increasing order; here as below, as many as there are near ones count."""
+    closest: Array
+    """(m, 10) out: their results."""
+    J: Array
+    """(m, n) out: velocity Jacobian of their distances."""
+    drift: Array
+    """(m,) out: rate of their distances due to the obstacles [m/s]."""
+    d: Array
+    """(m,) out: distance that the gains take [m]."""
+    least: Array
+    """(m,) out: lower bound on J v [m/s]."""
+    # --- limits
+    q_index: IntArray
+    """(p,) index in q of each limited coordinate."""
+    v_index: IntArray
+    """(p,) index in v of the same."""
+    q_lower: Array
+    """(p,) [rad or m]."""
+    q_upper: Array
+    """(p,) [rad or m]."""
+    v_max: Array
+    """(n,) largest speed, infinite where there is none."""
+    v_step: Array
+    """(n,) largest change of v in one tick; infinite where the acceleration has no limit."""
+    v_last: Array
+    """(n,) velocity of the tick before."""
+    hard_lower: Array
+    """(n,) out: lower bound on v from position and velocity limits.
+
+    The same array as `lower` where no acceleration has a limit."""
+    hard_upper: Array
+    """(n,) out: upper bound from the same."""
+    lower: Array
+    """(n,) out: lower bound on v from all limits, acceleration included."""
+    upper: Array
+    """(n,) out: upper bound from the same."""
+    # --- answer of the tracking law
+    v0: Array
+    """(n,) out: J⁺ẋ."""
+    # --- numbers
+    damping: float
+    """λ of the damped J⁺ [-]."""
+    offset: float
+    """Added to surface distances [m]."""
+    hold: float
+    """Distance at which a row allows no more closing [m]."""
+    row_gain: float
+    """ξ [1/s]."""
+    recovery: float
+    """Cap on the speed of parting that a row asks for [m/s]."""
+    switching: bool
+    """Whether rows are weighted with 1 - β."""
+    d1: float
+    """[m]."""
+    d2: float
+    """[m]."""
+    rate: float
+    """Share of the room to a position limit that may be used in a second [1/s]."""
+    dt: float
+    """Length of a tick [s]."""
+    accelerated: bool
+    """Whether any acceleration has a limit."""
