@@ -8,6 +8,7 @@ import pytest
 from hypothesis import settings
 
 from qpavoid import Obstacle, Robot, Sample, build_scene, config
+from qpavoid.assembly import Assembly
 from qpavoid.kinematics import ForwardKinematics
 from qpavoid.loading import example_robot_data
 from qpavoid.motion import build_motion
@@ -79,13 +80,32 @@ def random_scene(robot, rng, shapes):
     )
 
 
+class Bench:
+    """Tasks, rows and limits of a scene, without a solver."""
+
+    def __init__(self, scene, tasks=(), avoidance=None, position_gain=0.5, damping=0.0, dt=0.01, query=None):
+        self.robot, self.tasks = scene.robot, tuple(tasks)
+        self.kinematics = ForwardKinematics(scene.robot.model, [task.frame_id for task in tasks])
+        self.query = query or DistanceQuery(scene)
+        self.assembly = Assembly(
+            scene, tasks, scene.robot.bounds(), self.kinematics, self.query, avoidance or config.Avoidance(),
+            position_gain, damping, dt,
+        )  # fmt: skip
+
+    def compute(self, q, targets=None, reach=np.inf):
+        """Proximity and problem at q, as they are until the next call."""
+        self.kinematics.compute(q)
+        self.query.compute(self.kinematics.data, reach)
+        targets = targets or [task.motion.sample(0.0) for task in self.tasks]
+        return self.assembly.compute(np.asarray(q), targets, self.query, reach)
+
+
 def look(scene, q, samples=None, reach=np.inf, query=None):
     """Proximity of a scene at q, with obstacles (by index) moved to `samples`."""
-    query = query or DistanceQuery(scene)
+    bench = Bench(scene, query=query)
     for index, sample in (samples or {}).items():
-        query.place_obstacle(index, sample)
-    kinematics = ForwardKinematics(scene.robot.model)
-    return query.compute(kinematics.data, kinematics.compute(q), reach)
+        bench.query.place_obstacle(index, sample)
+    return bench.compute(q, reach=reach)[0]
 
 
 def moved(sample, t):
