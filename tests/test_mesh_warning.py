@@ -22,7 +22,7 @@ def urdf(tmp_path):
 
 def test_meshes_warn_with_cost_and_remedy(urdf):
     with pytest.warns(
-        MeshWarning, match=r"4 triangle meshes .* 50 to 1000 µs a pair .* set `bodies` to convex"
+        MeshWarning, match=r"4 triangle meshes .* 100 to 500 µs a pair .* set `bodies` to convex"
     ) as caught:
         Robot.from_urdf(urdf, bodies="mesh")
     assert len(caught) == 1
