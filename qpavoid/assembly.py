@@ -44,6 +44,7 @@ class Assembly:
             support=scene.support,
             twists=query.twists,
             twist_row=query.twist_row,
+            margin=query.margin,
             near=np.zeros(pairs, dtype=np.intp),
             closest=np.zeros((pairs, 10)),
             J=np.zeros((pairs, nv)),

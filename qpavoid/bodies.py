@@ -12,6 +12,8 @@ import pinocchio as pin
 
 from qpavoid.cache import cached
 from qpavoid.config import Box, Capsule, Cylinder, Shape, Sphere
+from qpavoid.config.base import LARGEST
+from qpavoid.errors import ConfigError
 from qpavoid.problem import Array
 
 
@@ -72,6 +74,26 @@ def convert_bodies(bodies: Any, kind: str) -> Any:
             pin.GeometryObject(body.name, body.parentJoint, body.parentFrame, placement, geometry)
         )
     return converted
+
+
+def check_meshes(bodies: Any, origin: str) -> None:
+    """Makes sure that meshes have corners and that all are numbers: hulls and distances need them.
+
+    Args:
+        bodies: pinocchio geometry model as read from a URDF.
+        origin: file to name in errors.
+
+    Raises:
+        ConfigError: naming the mesh.
+    """
+    for body in bodies.geometryObjects:
+        if isinstance(body.geometry, coal.BVHModelBase):
+            points = np.array(body.geometry.vertices())
+            where = f"{origin}: {body.name}: mesh {body.meshPath}"
+            if points.ndim != 2 or len(points) < 3:
+                raise ConfigError(f"{where}: has no triangle; export it again")
+            if not np.all(np.abs(points) <= LARGEST):  # False for NaN too
+                raise ConfigError(f"{where}: a corner is NaN, infinite or beyond {LARGEST:g} m; export it again")
 
 
 def triangle_meshes(bodies: Any) -> list[str]:

@@ -14,6 +14,17 @@ class QpavoidError(Exception):
 class ConfigError(QpavoidError):
     """A file or a field of it cannot be used: missing, mistyped, out of range, wrong shape."""
 
+    def __str__(self) -> str:
+        """One line that a terminal can show, of bounded length, whatever the file at fault holds."""
+        text = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in super().__str__())
+        half = _LONGEST // 2
+        return text if len(text) <= _LONGEST else f"{text[:half]} … {text[-half:]}"
+
+
+_LONGEST = 2000
+"""Characters of a message; what a file holds may be of any length. It begins with the place and ends with the remedy,
+so the middle is left out."""
+
 
 class UnknownName(ConfigError):
     """A robot, scenario, frame, joint, body, solver or back end that does not exist."""

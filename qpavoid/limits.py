@@ -64,6 +64,7 @@ def limit_layout(joints: JointBounds, position_gain: float, dt: float) -> dict[s
         "v_max": joints.velocity,
         "v_step": joints.acceleration * dt,
         "v_last": np.zeros(nv),
+        "v_stop": np.zeros(nv),
         "hard_lower": np.zeros(nv) if accelerated else lower,
         "hard_upper": np.zeros(nv) if accelerated else upper,
         "lower": lower,

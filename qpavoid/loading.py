@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import difflib
+import os.path
 import typing
 from collections.abc import Iterable, Sequence
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any, TypeVar
 
-import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from qpavoid.config import RobotConfig, ScenarioConfig, expand_solver
 from qpavoid.errors import ConfigError, UnknownName
+from qpavoid.files import read_text
+from qpavoid.safe_yaml import parse_yaml
 
 Config = TypeVar("Config", RobotConfig, ScenarioConfig)
 _PACKAGE = Path(__file__).parent
+_LARGEST = 1_000_000
+"""Size of a YAML file [bytes]; those that ship take 3000."""
 
 
 def data_folder(kind: str) -> Path:
@@ -73,7 +77,7 @@ def find_robot(name_or_path: str, folder: Path | None = None) -> Path:
     Raises:
         ConfigError, UnknownName: there is none.
     """
-    if folder is not None and _looks_like_path(name_or_path) and (folder / name_or_path).is_file():
+    if folder is not None and _looks_like_path(name_or_path) and os.path.isfile(folder / name_or_path):
         return folder / name_or_path
     return _find(name_or_path, "robot", data_folder("robots"), "{}/robot.yaml", robot_names())
 
@@ -87,9 +91,9 @@ def _find(name: str, kind: str, folder: Path, pattern: str, names: list[str]) ->
         return folder / pattern.format(name)
     if _looks_like_path(name):
         path = Path(name)
-        if path.is_file():
+        if os.path.isfile(path):  # False where the name is one that no file can have; Path.is_file may raise
             return path
-        reason = "is a folder" if path.is_dir() else "no such file"
+        reason = "is a folder" if os.path.isdir(path) else "no such file"
         raise ConfigError(f"{name}: {reason}; give a {kind} file, or one of {', '.join(names)}")
     raise UnknownName(f"unknown {kind} {name!r}{nearest(name, names)}")
 
@@ -149,24 +153,12 @@ def _solver_mapping(value: Any) -> dict[str, Any]:
     return dict(expanded) if isinstance(expanded, dict) else {}
 
 
-class _UniqueKeys(yaml.SafeLoader):
-    """YAML in which a key that is given twice is a fault, not silently the last one."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        keys = [key.value for key, _ in node.value]
-        for (key, _), name in zip(node.value, keys, strict=True):
-            if keys.count(name) > 1:
-                raise yaml.constructor.ConstructorError(None, None, f"key {name!r} is given twice", key.start_mark)
-        return super().construct_mapping(node, deep)
-
-
 def _read_yaml(path: Path) -> dict[str, Any]:
+    text = read_text(path, _LARGEST)
     try:
-        data = yaml.load(path.read_text(encoding="utf-8"), _UniqueKeys)
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read: {error}") from None
-    except (yaml.YAMLError, ValueError) as error:  # ValueError: a date such as 2024-13-45
-        raise ConfigError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
+        data = parse_yaml(text)
+    except ValueError as error:
+        raise ConfigError(f"{path}: not valid YAML: {error}") from None
     if not isinstance(data, dict):
         raise ConfigError(f"{path}: must be a mapping of fields, got {type(data).__name__}")
     return data
@@ -178,15 +170,15 @@ def _set(data: dict[str, Any], override: str, path: Path) -> None:
     if not equals or not where:
         raise ConfigError(f"--set {override!r}: expected path=value, as in avoidance.d2=0.30")
     try:
-        value = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError):
+        value = parse_yaml(text)
+    except ValueError:
         raise ConfigError(f"--set {override!r}: {text!r} is not a YAML value") from None
     node: Any = data
     keys = where.split(".")
     for depth, key in enumerate(keys):
         last = depth == len(keys) - 1
         if isinstance(node, list):
-            if not key.isdecimal() or int(key) >= len(node):
+            if not key.isdecimal() or len(key) > 9 or int(key) >= len(node):
                 raise ConfigError(f"{path}: --set {where}: {key!r} is not an index below {len(node)}")
             index: Any = int(key)
         elif isinstance(node, dict):

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
+import os.path
 import platform
-import zlib
 from dataclasses import dataclass, field, fields
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
+from zipfile import ZipFile
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +21,17 @@ from qpavoid.problem import Array, IntArray, Status
 STATUSES = tuple(Status)
 """Status of each code in `Log.status`."""
 _FORMAT = 1
+_LARGEST = 2_000_000_000
+"""What a log may take in memory [bytes]; a small file can unpack to a thousand times its size."""
+_SHAPES = {
+    "t": "N", "q": "N nq", "v": "N nv",
+    "target": "N k 3", "tool": "N k 3", "tool_rotation": "N k 3 3", "turn_error": "N k",
+    "body_distance": "N b", "closest_pair": "N", "alpha": "N", "beta": "N", "status": "N",
+    "slack": "N", "saturation": "N", "build_time": "N", "solve_time": "N",
+    "body_ends": "N b 2 3", "obstacle_position": "N o 3", "obstacle_rotation": "N o 3 3",
+}  # fmt: skip
+"""Array: its sides; a letter is the same number wherever it stands."""
+_META = {"scenario": str, "solver": str, "completed": bool, "pairs": list, "config": dict}
 
 
 @dataclass(frozen=True)
@@ -104,18 +115,49 @@ class Log:
         """Reads a log back.
 
         Raises:
-            ConfigError: no such file, or not a log of this format.
+            ConfigError: no such file, or not a whole log of this format.
         """
+        if not os.path.isfile(path):  # reading a pipe or a device may never end
+            raise ConfigError(f"{path}: no such file; give a log written by `qpavoid run`")
         try:
-            with Path(path).open("rb") as raw, np.load(raw, allow_pickle=False) as file:
+            with ZipFile(path) as archive:
+                size = sum(member.file_size for member in archive.infolist())
+            if size > _LARGEST:
+                raise ConfigError(f"{path}: unpacks to {size} bytes; at most {_LARGEST} are read")
+            with np.load(path, allow_pickle=False) as file:
                 meta = json.loads(str(file["meta"]))
                 if meta.pop("format") != _FORMAT:
                     raise ConfigError(f"{path}: written by another version of qpavoid; run the scenario again")
-                return cls(**{name: file[name] for name in file.files if name != "meta"}, meta=meta)
-        except FileNotFoundError:
-            raise ConfigError(f"{path}: no such file; give a log written by `qpavoid run`") from None
-        except (OSError, EOFError, BadZipFile, zlib.error, AttributeError, ValueError, KeyError, TypeError) as error:
-            raise ConfigError(f"{path}: not a qpavoid log: {error}") from None
+                log = cls(**{name: file[name] for name in file.files if name != "meta"}, meta=meta)
+            log._check()
+            return log
+        except ConfigError:
+            raise
+        except Exception as error:  # zipfile, its decompressors, numpy and json raise a dozen kinds on damaged files
+            what = str(error) or type(error).__name__
+            raise ConfigError(f"{path}: not a qpavoid log: {what}; give one written by `qpavoid run`") from None
+
+    def _check(self) -> None:
+        """Raises ValueError where the arrays do not belong together, so that metrics and figures need not look."""
+        sides: dict[str, int] = {"2": 2, "3": 3}
+        for name, wanted in _SHAPES.items():
+            array = getattr(self, name)
+            if array.dtype.kind != ("i" if name in ("closest_pair", "status") else "f"):
+                raise ValueError(f"{name} holds {array.dtype}")
+            letters = wanted.split()
+            if len(letters) != array.ndim or any(
+                sides.setdefault(letter, side) != side for letter, side in zip(letters, array.shape, strict=True)
+            ):
+                raise ValueError(f"{name} has shape {array.shape}; must be ({wanted})")
+        for key, kind in _META.items():
+            if not isinstance(self.meta.get(key), kind):
+                raise ValueError(f"{key} is missing")
+        for key in ("dt", "goal_tolerance", "thresholds"):
+            if key not in self.meta["config"]:
+                raise ValueError(f"config.{key} is missing")
+        for name, count in (("closest_pair", len(self.meta["pairs"])), ("status", len(STATUSES))):
+            if np.any(getattr(self, name) >= count):
+                raise ValueError(f"{name} points past the {count} that there are")
 
     def _arrays(self) -> dict[str, Any]:
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "meta"}

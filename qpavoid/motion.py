@@ -7,6 +7,7 @@ be worked out beforehand is, because `sample` runs in the control loop.
 from __future__ import annotations
 
 import csv
+import io
 import math
 from bisect import bisect_right
 from collections.abc import Sequence
@@ -21,13 +22,17 @@ from numpy.typing import ArrayLike
 
 from qpavoid.config import Circle, Csv, Fixed, Line, Waypoints
 from qpavoid.config import Motion as MotionConfig
+from qpavoid.config.base import LARGEST
 from qpavoid.errors import ConfigError, NumericalError
+from qpavoid.files import read_text
 from qpavoid.problem import Array
 
 END_TOLERANCE = 1e-9
 """How early a piece ends [s]: k·dt may fall a rounding error short of the time it stands for."""
 
 CSV_HEADERS = ("t,x,y,z", "t,x,y,z,qx,qy,qz,qw")
+_LARGEST_CSV, _MOST_ROWS = 20_000_000, 100_000
+"""Of a CSV file [bytes], and rows; each becomes a piece of some kilobytes."""
 
 
 class Sample(NamedTuple):
@@ -190,6 +195,8 @@ def _polyline(
     rests = [Sample.at(p, r) for p, r in zip(positions, rotations, strict=True)]
     pieces = []
     for (t0, a), (t1, b) in pairwise(zip(times, rests, strict=True)):
+        if not np.linalg.norm(b.position - a.position) <= LARGEST * (t1 - t0):
+            raise ConfigError(f"motion: from t = {t0:g} to {t1:g} it moves faster than {LARGEST:g} m/s; give it time")
         turn = pin.AngleAxis(b.rotation @ a.rotation.T)
         # Two roundings of the same orientation are no turn.
         angle = turn.angle if turn.angle > 1e-12 else 0.0
@@ -220,18 +227,24 @@ def _orbit(config: Circle, start: Sample | None, rotation: Array) -> Orbit:
     u = config.radius * in_plane / np.linalg.norm(in_plane)
     center = _position(None, start, "center") - u if config.center is None else np.array(config.center)
     omega = 2.0 * math.pi / config.period
+    if omega * max(1.0, config.radius) > LARGEST:
+        raise ConfigError(f"motion.period = {config.period:g}: faster than {LARGEST:g} m/s or rad/s; give it time")
     end = math.inf if config.turns is None else config.turns * config.period
     return Orbit(Sample.at(center, rotation), u, np.asarray(np.cross(normal, u), dtype=np.float64), omega, end)
 
 
 def _read_csv(path: Path, initial: Array) -> tuple[list[float], list[Array], list[Array]]:
     """Times, positions and rotations of a file; without quaternions, each rotation is `initial` (3, 3)."""
+    reader = csv.reader(io.StringIO(read_text(path, _LARGEST_CSV, f"{path}: motion.path")))
+    rows: list[tuple[int, list[str]]] = []
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file)
-            rows = [(reader.line_num, [cell.strip() for cell in row]) for row in reader if row]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ConfigError(f"{path}: motion.path: cannot be read ({error}); give a CSV file") from error
+        for row in reader:
+            if row:
+                rows.append((reader.line_num, [cell.strip() for cell in row]))
+            if len(rows) > _MOST_ROWS + 1:
+                raise ConfigError(f"{path}: more than {_MOST_ROWS} rows; give fewer poses, it is linear in between")
+    except csv.Error as error:
+        raise ConfigError(f"{path}, line {reader.line_num}: {error}; correct the cell") from None
     header = ",".join(rows[0][1]) if rows else ""
     if header not in CSV_HEADERS:
         expected = "` or `".join(CSV_HEADERS)
@@ -264,8 +277,8 @@ def _number(cell: str, where: str) -> float:
         value = float(cell)
     except ValueError:
         value = math.nan
-    if not math.isfinite(value):
-        raise ConfigError(f"{where}: `{cell}` is not a finite number; correct the cell")
+    if not abs(value) <= LARGEST * 10.0:  # seconds of the calendar are 1.7e9
+        raise ConfigError(f"{where}: `{cell}` is not a finite number of sane size; correct the cell")
     return value
 
 

@@ -37,6 +37,8 @@ class DistanceQuery:
         obstacles = len(scene.obstacles)
         self.twists = np.zeros((obstacles + 1, 6))
         """(o + 1, 6) of the obstacles at the world's origin; the last row stays zero: for the robot's own bodies."""
+        self.margin = np.zeros(obstacles + 1)
+        """(o + 1,) to be taken off the distances to each obstacle [m]; the last one stays zero."""
         self._moving: set[int] = set()
         self._placements = view_poses([body.placement for body in self._geometry.geometryObjects], writeable=True)
         second = scene.pairs[:, 1] - self._first_obstacle

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from qpavoid.bodies import MeshWarning, convert_bodies, make_shape, triangle_meshes
+from qpavoid.bodies import MeshWarning, check_meshes, convert_bodies, make_shape, triangle_meshes
 from qpavoid.config import Body, RobotConfig
 from qpavoid.errors import ConfigError, UnknownName
 from qpavoid.limits import JointBounds
@@ -175,7 +175,7 @@ class Robot:
 
 
 _ABSURD = 1e9
-"""Speed [rad/s or m/s] from which a limit is a way of saying that there is none."""
+"""Speed [rad/s or m/s] or position [rad or m] from which a limit is a way of saying that there is none."""
 
 
 def joint_bounds(model: Any) -> JointBounds:
@@ -184,10 +184,12 @@ def joint_bounds(model: Any) -> JointBounds:
     Only joints with one coordinate in q and v have position limits. A velocity limit of 0, and a range from 0 to 0,
     mean that the URDF gives none.
     """
+    lower, upper = np.array(model.lowerPositionLimit), np.array(model.upperPositionLimit)
+    lower[lower <= -_ABSURD], upper[upper >= _ABSURD] = -np.inf, np.inf
     q_index, v_index = [], []
     for joint in list(model.joints)[1:]:
-        lower, upper = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
-        if joint.nq == joint.nv == 1 and np.isfinite([lower, upper]).any() and lower < upper:
+        low, high = lower[joint.idx_q], upper[joint.idx_q]
+        if joint.nq == joint.nv == 1 and np.isfinite([low, high]).any() and low < high:
             q_index.append(joint.idx_q)
             v_index.append(joint.idx_v)
     q_indices = np.array(q_index, dtype=np.intp)
@@ -196,10 +198,14 @@ def joint_bounds(model: Any) -> JointBounds:
         velocity=np.where((velocity > 0.0) & (velocity < _ABSURD), velocity, np.inf),
         q_index=q_indices,
         v_index=np.array(v_index, dtype=np.intp),
-        lower=np.array(model.lowerPositionLimit)[q_indices],
-        upper=np.array(model.upperPositionLimit)[q_indices],
+        lower=lower[q_indices],
+        upper=upper[q_indices],
         acceleration=np.full(model.nv, np.inf),
     )
+
+
+_MOST_BODIES = 300
+"""Time and memory grow with the square: 45 000 pairs of 300 bodies take ten seconds. Humanoids have 112."""
 
 
 def _build(config: RobotConfig, path: Path) -> Robot:
@@ -207,7 +213,9 @@ def _build(config: RobotConfig, path: Path) -> Robot:
     model = read_model(urdf, config.root_joint)
     if isinstance(config.bodies, str):
         package_dirs = [str(path.parent / folder) for folder in config.package_dirs]
-        bodies = convert_bodies(read_collision(urdf, model, package_dirs, path), config.bodies)
+        collision = read_collision(urdf, model, package_dirs, path)
+        check_meshes(collision, str(path))
+        bodies = convert_bodies(collision, config.bodies)
     else:
         bodies = _listed_bodies(config.bodies, model, path)
     if meshes := triangle_meshes(bodies):
@@ -224,6 +232,12 @@ def _build(config: RobotConfig, path: Path) -> Robot:
     if config.lock:
         model, bodies, index = _reduce(model, bodies, list(config.lock), home)
         home = home[index]
+    if model.nv == 0:
+        raise ConfigError(f"{path}: no joint of {urdf.name} moves; give at least one that is neither fixed nor locked")
+    if len(bodies.geometryObjects) > _MOST_BODIES:
+        raise ConfigError(
+            f"{path}: {len(bodies.geometryObjects)} bodies; at most {_MOST_BODIES} are read: list fewer under `bodies`"
+        )
     add_self_pairs(model, bodies, config.disabled_pairs, str(path))
     if config.srdf is not None:
         honour_srdf(model, bodies, find_resource(config.srdf, path, "srdf"))

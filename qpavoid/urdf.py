@@ -14,6 +14,8 @@ import pinocchio as pin
 
 from qpavoid.errors import ConfigError
 from qpavoid.loading import example_robot_data
+from qpavoid.safe_xml import read_robot_xml
+from qpavoid.urdf_check import check_urdf
 
 _ROOT_JOINTS = {
     "fixed": lambda: None,
@@ -38,7 +40,7 @@ def find_resource(value: str, path: Path, field: str) -> Path:
         found = example_robot_data() / "example-robot-data" / "robots" / value.removeprefix(prefix)
     else:
         found = path.parent / value
-    if not found.is_file():
+    if not os.path.isfile(found):  # False where the name is one that no file can have; Path.is_file may raise
         raise ConfigError(f"{path}: {field}: no such file {value!r}; give a path relative to this file or {prefix}PATH")
     return found
 
@@ -70,6 +72,7 @@ def read_model(urdf: Path, root_joint: str) -> Any:
     Raises:
         ConfigError: not a usable URDF, with the parser's own reason.
     """
+    check_urdf(urdf)
     root = _ROOT_JOINTS[root_joint]()
     with _quiet_stderr() as printed:
         try:
@@ -97,17 +100,32 @@ def read_collision(urdf: Path, model: Any, package_dirs: list[str], path: Path) 
     """
     ros = [folder for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if folder]
     above = [str(parent) for parent in urdf.resolve().parents]
+    folders = [*package_dirs, *above, str(example_robot_data()), *ros]
+    _check_mesh_sizes(urdf, folders, path)
     with _quiet_stderr():
         try:
-            return pin.buildGeomFromUrdf(
-                model, str(urdf), pin.COLLISION, package_dirs=[*package_dirs, *above, str(example_robot_data()), *ros]
-            )
+            return pin.buildGeomFromUrdf(model, str(urdf), pin.COLLISION, package_dirs=folders)
         except (ValueError, RuntimeError) as error:
             reason = " ".join(str(error).split()).rstrip(".")
     raise ConfigError(
         f"{path}: {urdf.name}: {reason}; name the folder that holds the package in `package_dirs` of a robot.yaml, "
         "or set ROS_PACKAGE_PATH"
     )
+
+
+_LARGEST_MESH = 100_000_000
+"""Size of a mesh [bytes]: the reader takes files into memory as a whole before it looks at them."""
+
+
+def _check_mesh_sizes(urdf: Path, folders: list[str], path: Path) -> None:
+    for mesh in read_robot_xml(urdf, "URDF").iter("mesh"):
+        name = mesh.get("filename", "").removeprefix("package://").removeprefix("file://")
+        for found in (os.path.join(folder, name) for folder in folders):
+            if os.path.isfile(found) and os.path.getsize(found) > _LARGEST_MESH:
+                raise ConfigError(
+                    f"{path}: mesh {found}: {os.path.getsize(found)} bytes; at most {_LARGEST_MESH} are read, "
+                    "make it coarser"
+                )
 
 
 def honour_srdf(model: Any, bodies: Any, srdf: Path) -> None:
@@ -121,6 +139,7 @@ def honour_srdf(model: Any, bodies: Any, srdf: Path) -> None:
     Raises:
         ConfigError: not a usable SRDF.
     """
+    read_robot_xml(srdf, "SRDF")
     with _quiet_stderr():
         try:
             pin.removeCollisionPairs(model, bodies, str(srdf), False)

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from qpavoid.config.base import Block, NonNegative, Positive, Vec3
+from qpavoid.config.base import Block, NonNegative, Number, Positive, Vec3
 
 
 class Fixed(Block):
@@ -49,7 +49,7 @@ class Waypoints(Block):
     """Piecewise motion through timed positions (and orientations); rests before the first and after the last."""
 
     type: Literal["waypoints"] = "waypoints"
-    times: Annotated[list[float], Field(min_length=2)]
+    times: Annotated[list[Number], Field(min_length=2)]
     """Times of the waypoints [s], increasing."""
     positions: Annotated[list[Vec3], Field(min_length=2)]
     """World positions [m], one a time."""

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import model_validator
 
-from qpavoid.config.base import Block, Positive, Vec3
+from qpavoid.config.base import Block, Number, Positive, Vec3
 from qpavoid.config.shapes import Shape
 
 
@@ -27,7 +27,7 @@ class Body(Block):
 class JointLimits(Block):
     """Limits that replace those of the URDF, by joint name."""
 
-    position: dict[str, tuple[float, float]] = {}
+    position: dict[str, tuple[Number, Number]] = {}
     """Joint: [lower, upper] [rad or m]."""
     velocity: dict[str, Positive] = {}
     """Joint: largest speed [rad/s or m/s]."""
@@ -64,8 +64,8 @@ class RobotConfig(Block):
     disabled_pairs: list[tuple[str, str]] = []
     """Pairs of bodies never checked; `*` and `?` match as in file names."""
     limits: JointLimits = JointLimits()
-    home: dict[str, float] = {}
+    home: dict[str, Number] = {}
     """Joint: position of the home pose [rad or m]; joints left out are at 0, or at the middle
     of their range where 0 is outside it."""
-    lock: dict[str, float] = {}
+    lock: dict[str, Number] = {}
     """Joint: position [rad or m] at which it is fixed for good, as if the joint were not there."""

@@ -7,11 +7,15 @@ from typing import Annotated
 
 from pydantic import Field, PrivateAttr, model_validator
 
-from qpavoid.config.base import Block, NonNegative, Positive
+from qpavoid.config.base import Block, NonNegative, Number, Positive
 from qpavoid.config.control import Avoidance, Limits, Task
 from qpavoid.config.motion import Circle, Fixed, Line, Motion
 from qpavoid.config.shapes import Shape
 from qpavoid.config.solver import QpSolver, SolverConfig
+
+
+_MOST_TICKS = 1_000_000
+"""The log of so many takes a gigabyte or two of memory; at 10 ms they are 2.8 hours."""
 
 
 class ObstacleConfig(Block):
@@ -33,7 +37,7 @@ class ScenarioConfig(Block):
     """Free labels."""
     robot: str
     """Shipped name, robot.yaml, or URDF; a path is relative to the scenario file."""
-    q0: list[float] | dict[str, float] = {}
+    q0: list[Number] | dict[str, Number] = {}
     """Initial configuration [rad or m]: all of q, or by joint name over the home pose."""
     lock: list[str] = []
     """Joints held at q0 for the whole run; `*` and `?` match as in file names."""
@@ -51,7 +55,7 @@ class ScenarioConfig(Block):
     """Length of the run [s]."""
     goal_tolerance: Positive = 0.005
     """A run has arrived when every task ends this close to its target [m]."""
-    thresholds: list[float] = [0.0]
+    thresholds: list[Number] = [0.0]
     """Surface distances [m] for which the time spent below is reported."""
     _source: Path = PrivateAttr(default=Path("scenario"))
 
@@ -65,6 +69,14 @@ class ScenarioConfig(Block):
         copy = self.model_copy()
         copy._source = source
         return copy
+
+    @model_validator(mode="after")
+    def _ends(self) -> ScenarioConfig:
+        if self.duration / self.dt > _MOST_TICKS:
+            raise ValueError(
+                f"duration / dt is {self.duration / self.dt:.3g} ticks; at most {_MOST_TICKS} are run and logged"
+            )
+        return self
 
     @model_validator(mode="after")
     def _unique(self) -> ScenarioConfig:

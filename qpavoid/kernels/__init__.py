@@ -26,6 +26,7 @@ pack = _chosen.pack
 projection_cost = _chosen.projection_cost
 row_bounds = _chosen.row_bounds
 shortfall = _chosen.shortfall
+stop_velocity = _chosen.stop_velocity
 tracking_shortfall = _chosen.tracking_shortfall
 velocity_bounds = _chosen.velocity_bounds
 
@@ -40,6 +41,7 @@ __all__ = [
     "projection_cost",
     "row_bounds",
     "shortfall",
+    "stop_velocity",
     "tracking_shortfall",
     "velocity_bounds",
 ]

@@ -102,13 +102,27 @@ def distance_rows(x: Any, pairs: IntArray, reach: float, moving: bool) -> int:
 def row_bounds(x: Any, k: int, moving: bool) -> None:
     """See `vectorised.row_bounds`."""
     for i in range(k):
-        d = x.closest[i, 0] + x.offset
+        d = x.closest[i, 0] + x.offset - x.margin[x.twist_row[x.near[i]]]
         value = x.row_gain * (x.hold - d)
         if x.switching and not value > 0.0:
             share = min(max((d - x.d1) / (x.d2 - x.d1), 0.0), 1.0)
             value *= 0.5 - 0.5 * np.cos(np.pi * share)
+        least = min(value, x.recovery) - x.drift[i]
+        if value > 0.0:
+            most = 0.0
+            for c in range(len(x.lower)):
+                if x.J[i, c] > 0.0:
+                    most += max(x.J[i, c] * x.upper[c], 0.0)
+                elif x.J[i, c] < 0.0:
+                    most += max(x.J[i, c] * x.lower[c], 0.0)
+            least = min(least, max(most, -x.drift[i]))
+        elif x.accelerated and x.drift[i] >= 0.0:
+            stop = 0.0
+            for c in range(len(x.lower)):
+                stop += x.J[i, c] * x.v_stop[c]
+            least = min(least, stop)
         x.d[i] = d
-        x.least[i] = min(value, x.recovery) - x.drift[i]
+        x.least[i] = least
 
 
 _rotation_vector = njit(cache=True)(rotation_vector)
@@ -189,6 +203,17 @@ def velocity_bounds(x: Any, q: Array) -> None:
 
 
 @njit(cache=True)
+def stop_velocity(x: Any) -> None:
+    """See `vectorised.stop_velocity`."""
+    slowing = 1.0 if x.accelerated else np.inf
+    for j in range(len(x.v_last)):
+        slowing = max(slowing, abs(x.v_last[j]) / x.v_step[j])
+    share = 1.0 - 1.0 / slowing if x.accelerated else 0.0
+    for j in range(len(x.v_last)):
+        x.v_stop[j] = min(max(share * x.v_last[j], x.lower[j]), x.upper[j])
+
+
+@njit(cache=True)
 def damped_solution(x: Any, v: Array) -> None:
     """See `vectorised.damped_solution`: Cholesky factorisation of the Gram matrix, row by row."""
     A, b, damping = x.A, x.b, x.damping
@@ -252,6 +277,7 @@ def assemble(x: Any, q: Array, pairs: IntArray, reach: float, moving: bool) -> t
     """See `vectorised.assemble`."""
     frame_rows(x)
     velocity_bounds(x, q)
+    stop_velocity(x)
     damped_solution(x, x.v0)
     k = distance_rows(x, pairs, reach, moving)
     row_bounds(x, k, moving)

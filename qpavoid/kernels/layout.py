@@ -53,6 +53,8 @@ class RowLayout(NamedTuple):
     """(o + 1, 6) velocity of each obstacle at the world's origin, [linear, angular]; the last row stays zero."""
     twist_row: IntArray
     """(m,) row of `twists` that moves each pair's second body."""
+    margin: Array
+    """(o + 1,) taken off the distances to each obstacle, for what is not known of it [m]; the last one stays zero."""
     near: IntArray
     """(m,) out: which pairs are near, in increasing order; here as below, as many as there are near ones count."""
     closest: Array
@@ -90,6 +92,8 @@ class RowLayout(NamedTuple):
     """(n,) out: lower bound on v from all limits, acceleration included."""
     upper: Array
     """(n,) out: upper bound from the same."""
+    v_stop: Array
+    """(n,) out: the next velocity of a stop: all coordinates slowed alike, as fast as their accelerations allow."""
     # --- answer of the tracking law
     v0: Array
     """(n,) out: J⁺ẋ."""

@@ -126,6 +126,7 @@ def assemble(x: Any, q: Array, pairs: IntArray, reach: float, moving: bool) -> t
     """
     frame_rows(x)
     velocity_bounds(x, q)
+    stop_velocity(x)
     damped_solution(x, x.v0)
     k = distance_rows(x, pairs, reach, moving)
     if k:
@@ -174,9 +175,16 @@ def distance_rows(x: Any, pairs: IntArray, reach: float, moving: bool) -> int:
 
 
 def row_bounds(x: Any, k: int, moving: bool) -> None:
-    """Right-hand sides of the first k avoidance rows: see `qpavoid.avoidance`; writes d and least."""
+    """Right-hand sides of the first k avoidance rows: see `qpavoid.avoidance`; writes d and least.
+
+    A row never asks for more than can be had: of a pair that may still close, and whose obstacle does not come nearer,
+    no more than a stop gives, so that the stop meets all such rows at once; of one that has to part, no more speed of
+    parting than the bounds allow.
+    """
     d, least = x.d[:k], x.least[:k]
     np.add(x.closest[:k, 0], x.offset_, out=d)
+    if x.margin.any():
+        d -= x.margin[x.twist_row[x.near[:k]]]
     np.subtract(x.hold_, d, out=least)
     if x.switching:
         beyond, share = x.scratch[0, :k], x.scratch[1, :k]
@@ -192,8 +200,15 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
         np.add(share, beyond, out=least)
     least *= x.gain_
     np.minimum(least, x.recovery_, out=least)
+    parting = least > x.zero
     if moving:
         least -= x.drift[:k]
+    if x.accelerated:
+        np.minimum(least, np.dot(x.J[:k], x.v_stop), out=least, where=~parting & (x.drift[:k] >= 0.0))
+    if parting.any():
+        with np.errstate(invalid="ignore"):  # no lever times no limit
+            most = np.fmax(np.fmax(x.J[:k] * x.lower, x.J[:k] * x.upper), 0.0).sum(axis=1)
+        np.minimum(least, np.maximum(most, -x.drift[:k]), out=least, where=parting)
 
 
 def rotation_vector(R: Any) -> tuple[float, float, float]:
@@ -290,6 +305,19 @@ def velocity_bounds(x: Any, q: Array) -> None:
     if x.accelerated:
         np.clip(x.v_last - x.v_step, x.hard_lower, x.hard_upper, out=x.lower)
         np.clip(x.v_last + x.v_step, x.hard_lower, x.hard_upper, out=x.upper)
+
+
+def stop_velocity(x: Any) -> None:
+    """Slows v_last down by one factor for all coordinates, so that no distance closes faster; writes v_stop.
+
+    Bounds of position and velocity come first. Without acceleration limits it is a standstill, if they allow that.
+    """
+    if x.accelerated:
+        slowing = np.max(np.abs(x.v_last) / x.v_step, initial=1.0)  # number of ticks to a standstill
+        np.clip((1.0 - 1.0 / slowing) * x.v_last, x.lower, x.upper, out=x.v_stop)
+    else:
+        np.minimum(x.upper, x.zero, out=x.v_stop)
+        np.maximum(x.v_stop, x.lower, out=x.v_stop)
 
 
 def damped_solution(x: Any, v: Array) -> None:
