@@ -15,7 +15,7 @@ from qpavoid.limits import JointBounds, limit_layout
 from qpavoid.motion import Sample
 from qpavoid.problem import Array, AvoidanceRows, Problem, Proximity, Tracking
 from qpavoid.proximity import DistanceQuery
-from qpavoid.scene import Scene
+from qpavoid.scene import Scene, body_support
 from qpavoid.tasks import FrameTask, task_layout
 
 
@@ -45,6 +45,11 @@ class Assembly:
             twists=query.twists,
             twist_row=query.twist_row,
             margin=query.margin,
+            bodies=scene.pairs,
+            body_poses=query.poses,
+            spheres=query.spheres,
+            body_support=body_support(scene),
+            body_speed=query.body_speed,
             near=np.zeros(pairs, dtype=np.intp),
             closest=np.zeros((pairs, 10)),
             J=np.zeros((pairs, nv)),
@@ -57,7 +62,7 @@ class Assembly:
             **row_form(avoidance),
         )
         self._packed = kernels.pack(self._layout)
-        self._names = scene.pair_names
+        self._names = scene.pair_names, tuple(scene.robot.coordinate_names)
         self._targets = [(row[:3], row[3:12].reshape(3, 3), row[12:15], row[15:]) for row in self._layout.targets]
         self._views: dict[int, tuple[Proximity, AvoidanceRows]] = {}
         self._tracking = Tracking(self._layout.A, self._layout.b, damping)
@@ -80,8 +85,19 @@ class Assembly:
         k, worst = kernels.assemble(self._packed, q, query.pairs, reach, query.moving)
         proximity, rows = self._views.get(k) or self._view(k)
         return proximity, Problem(
-            self._tracking, rows, x.lower, x.upper, x.hard_lower, x.hard_upper, self._names, x.v0, worst
+            self._tracking, rows, x.lower, x.upper, x.hard_lower, x.hard_upper, x.v_stop, *self._names, x.v0, worst
         )
+
+    def closest_call(self, v: Array, near: int, reach: float, horizon: float) -> float:
+        """How much is certainly left of the safe distances if all move at v until `horizon`, wherever to [m].
+
+        See `kernels.vectorised.closest_call`.
+        """
+        return float(kernels.closest_call(self._packed, v, near, reach, horizon))
+
+    def remember(self, v: Array) -> None:
+        """Takes v (nv,) as the velocity at which the robot moves until the next tick."""
+        self._layout.v_last[:] = v
 
     def _view(self, k: int) -> tuple[Proximity, AvoidanceRows]:
         x = self._layout

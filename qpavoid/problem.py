@@ -121,8 +121,12 @@ class Problem(NamedTuple):
     """(nv,) lower bound from position and velocity limits alone; `lower` lies between these two."""
     hard_upper: Array
     """(nv,) upper bound from the same."""
+    v_stop: Array
+    """(nv,) next velocity of a stop: all coordinates slowed alike within their acceleration limits."""
     pair_names: Sequence[tuple[str, str]]
     """Names of the bodies of all m pairs."""
+    joint_names: Sequence[str]
+    """Name of each of the nv coordinates."""
     v0: Array
     """(nv,) J⁺ẋ, the tracking law's velocity; NaN where λ is 0 and rows repeat each other."""
     shortfall: float
@@ -136,6 +140,7 @@ def make_problem(
     upper: Array,
     pair_names: Sequence[tuple[str, str]],
     hard: tuple[Array, Array] | None = None,
+    v_stop: Array | None = None,
 ) -> Problem:
     """A problem made by hand, or one whose rows were changed: works out v0 and its shortfall by their definitions.
 
@@ -146,6 +151,7 @@ def make_problem(
         upper: (nv,) upper bound on v.
         pair_names: names of the bodies of all pairs.
         hard: bounds without acceleration limits; `lower` and `upper` if left out.
+        v_stop: next velocity of a stop; as little as the bounds allow if left out.
     """
     A, b, damping = tracking
     gram = A @ A.T + damping**2 * np.eye(len(b))
@@ -154,7 +160,11 @@ def make_problem(
     else:
         v0 = np.linalg.solve(gram, b) @ A
     outside = np.concatenate((v0 - upper, lower - v0, avoidance.b - avoidance.J @ v0))
-    return Problem(tracking, avoidance, lower, upper, *(hard or (lower, upper)), pair_names, v0, float(outside.max()))
+    stop = np.clip(0.0, lower, upper) if v_stop is None else v_stop
+    names = [f"joint{i + 1}" for i in range(len(lower))]
+    return Problem(
+        tracking, avoidance, lower, upper, *(hard or (lower, upper)), stop, pair_names, names, v0, float(outside.max())
+    )
 
 
 class Solution(NamedTuple):

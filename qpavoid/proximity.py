@@ -6,7 +6,7 @@ does the rest, and its results are viewed as one array.
 
 from __future__ import annotations
 
-from math import isfinite
+from math import hypot, isfinite
 from typing import Any
 
 import numpy as np
@@ -48,10 +48,18 @@ class DistanceQuery:
         pin.updateGeometryPlacements(model, model.createData(), self._geometry, self._data, pin.neutral(model))
         pin.computeDistances(self._geometry, self._data)  # so that there is something to compare the view with
         view = view_results(self._data.distanceResults)
-        self._copy = view is None
         self.results: Array = read_results(self._data.distanceResults) if view is None else view
         """(m, 10) [distance, normal, point a, point b] of all pairs; only those of `pairs` are of this tick."""
-        self._cull = _Cull(scene, self._geometry, self._data) if len(scene.pairs) >= _CULL_FROM else None
+        poses = view_poses(self._data.oMg)
+        self.poses: Array = read_poses(self._data.oMg) if poses is None else poses
+        """(g, 12) world poses of all bodies, the robot's first."""
+        self._copy = view is None or poses is None
+        shapes = [bounding_sphere(body.geometry) for body in self._geometry.geometryObjects]
+        self.spheres = np.array([(*center, radius) for center, radius in shapes]).reshape(-1, 4)
+        """(g, 4) bounding sphere of each body in its own frame: centre and radius [m]."""
+        self.body_speed = np.zeros(len(shapes))
+        """(g,) largest speed of any point of each body [m/s]; here, those of the obstacles."""
+        self._cull = _Cull(scene, self) if len(scene.pairs) >= _CULL_FROM else None
         self.pairs: IntArray = np.arange(len(scene.pairs))
         """(c,) pairs that were computed, increasing."""
 
@@ -83,8 +91,11 @@ class DistanceQuery:
         self.twists[index] = twist
         if any(twist):
             self._moving.add(index)
+            reach = float(np.linalg.norm(self.spheres[geometry, :3]) + self.spheres[geometry, 3])
+            self.body_speed[geometry] = hypot(vx, vy, vz) + hypot(wx, wy, wz) * reach
         else:
             self._moving.discard(index)
+            self.body_speed[geometry] = 0.0
         if self._cull is not None:
             self._cull.place(geometry, sample.rotation, sample.position)
 
@@ -96,31 +107,37 @@ class DistanceQuery:
             reach: surface distance [m].
         """
         pin.updateGeometryPlacements(self._scene.robot.model, data, self._geometry, self._data)
+        if self._copy:
+            self.poses[:] = read_poses(self._data.oMg)
         if self._cull is not None:
             self.pairs = self._cull.switch(reach)
         pin.computeDistances(self._geometry, self._data)
         if self._copy:
             self.results[:] = read_results(self._data.distanceResults)
 
+    def found(self, pairs: IntArray) -> Array:
+        """Distances (k,) of some pairs at the last call; infinite for those that were out of reach [m]."""
+        distance = self.results[pairs, 0]
+        return distance if self._cull is None else np.where(self._cull.active[pairs], distance, np.inf)
+
 
 class _Cull:
     """Switches pairs off in coal's data whose bounding spheres are out of reach."""
 
-    def __init__(self, scene: Scene, geometry: Any, data: Any) -> None:
-        self._data = data
+    def __init__(self, scene: Scene, query: DistanceQuery) -> None:
+        self._query, self._data = query, query._data
         self._bodies = len(scene.body_names)
-        shapes = [bounding_sphere(body.geometry) for body in geometry.geometryObjects]
-        self._local, self._radius = np.array([c for c, _ in shapes]), np.array([r for _, r in shapes])
+        self._local, self._radius = query.spheres[:, :3].copy(), query.spheres[:, 3].copy()
         self._centered = (self._local == 0.0).all(axis=1).tolist()
-        self._centers = np.ones((len(shapes), 5))
-        for i, body in enumerate(geometry.geometryObjects):
+        self._centers = np.ones((len(self._local), 5))
+        for i, body in enumerate(query._geometry.geometryObjects):
             self.place(i, body.placement.rotation, body.placement.translation)
-        self._pair_of = np.full((self._bodies, len(shapes)), -1, dtype=np.intp)
+        self._pair_of = np.full((self._bodies, len(self._local)), -1, dtype=np.intp)
         self._pair_of[scene.pairs[:, 0], scene.pairs[:, 1]] = np.arange(len(scene.pairs))
         self._found = np.zeros(len(scene.pairs), dtype=np.intp)
-        self._active = np.ones(len(scene.pairs), dtype=bool)
+        self.active = np.ones(len(scene.pairs), dtype=bool)
+        """(m,) which pairs are on."""
         self._last = b""
-        self._poses = view_poses(data.oMg)
 
     def place(self, index: int, rotation: Array, position: Array) -> None:
         """Moves the bounding sphere of one geometry."""
@@ -129,16 +146,17 @@ class _Cull:
 
     def switch(self, reach: float) -> IntArray:
         """Switches pairs on and off; gives those that are on, in increasing order."""
-        poses = read_poses(self._data.oMg) if self._poses is None else self._poses
-        count = kernels.candidates(poses, self._local, self._centers, self._radius, self._pair_of, reach, self._found)
+        count = kernels.candidates(
+            self._query.poses, self._local, self._centers, self._radius, self._pair_of, reach, self._found
+        )
         pairs = self._found[:count]
         if pairs.tobytes() != self._last:
             self._last = pairs.tobytes()
-            wanted = np.zeros_like(self._active)
+            wanted = np.zeros_like(self.active)
             wanted[pairs] = True
-            for pair in np.flatnonzero(wanted & ~self._active).tolist():
+            for pair in np.flatnonzero(wanted & ~self.active).tolist():
                 self._data.activateCollisionPair(pair)
-            for pair in np.flatnonzero(self._active & ~wanted).tolist():
+            for pair in np.flatnonzero(self.active & ~wanted).tolist():
                 self._data.deactivateCollisionPair(pair)
-            self._active = wanted
+            self.active = wanted
         return pairs

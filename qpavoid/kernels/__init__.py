@@ -19,6 +19,7 @@ else:
 
 assemble = _chosen.assemble
 candidates = _chosen.candidates
+closest_call = _chosen.closest_call
 damped_solution = _chosen.damped_solution
 distance_rows = _chosen.distance_rows
 frame_rows = _chosen.frame_rows
@@ -34,6 +35,7 @@ __all__ = [
     "ACCELERATED",
     "assemble",
     "candidates",
+    "closest_call",
     "damped_solution",
     "distance_rows",
     "frame_rows",

@@ -125,6 +125,36 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
         x.least[i] = least
 
 
+@njit(cache=True)
+def closest_call(x: Any, v: Array, k: int, reach: float, horizon: float) -> float:
+    """See `vectorised.closest_call`."""
+    speed, J_world = x.body_speed, x.J_world
+    fastest, twist = 0.0, np.empty(6)
+    for i in range(len(x.body_support)):
+        twist[:] = 0.0
+        for c in range(len(v)):
+            if x.body_support[i, c] != 0.0:
+                for s in range(6):
+                    twist[s] += J_world[s, c] * v[c]
+        pose, sphere = x.body_poses[i], x.spheres[i]
+        cx = pose[0] * sphere[0] + pose[3] * sphere[1] + pose[6] * sphere[2] + pose[9]
+        cy = pose[1] * sphere[0] + pose[4] * sphere[1] + pose[7] * sphere[2] + pose[10]
+        cz = pose[2] * sphere[0] + pose[5] * sphere[1] + pose[8] * sphere[2] + pose[11]
+        wx, wy, wz = twist[3], twist[4], twist[5]
+        vx, vy, vz = twist[0] + wy * cz - wz * cy, twist[1] + wz * cx - wx * cz, twist[2] + wx * cy - wy * cx
+        turning = np.sqrt(wx * wx + wy * wy + wz * wz)
+        speed[i] = np.sqrt(vx * vx + vy * vy + vz * vz) + turning * sphere[3]
+        fastest = max(fastest, speed[i])
+    any_fastest = fastest
+    for i in range(len(x.body_support), len(speed)):
+        any_fastest = max(any_fastest, speed[i])
+    least = reach + x.offset - x.hold - (fastest + any_fastest) * horizon
+    for i in range(k):
+        a, b = x.bodies[x.near[i], 0], x.bodies[x.near[i], 1]
+        least = np.minimum(least, x.d[i] - x.hold - (speed[a] + speed[b]) * horizon)  # keeps NaN, unlike min
+    return least
+
+
 _rotation_vector = njit(cache=True)(rotation_vector)
 
 
@@ -176,8 +206,8 @@ def frame_rows(x: Any) -> None:
 @njit(cache=True)
 def _speed_to_stop(room: float, step: float, dt: float) -> float:
     """See `vectorised.speed_to_stop`."""
-    ticks = max(np.ceil(0.5 * np.sqrt(1.0 + 8.0 * room / (step * dt)) - 0.5), 1.0)
-    return (room / dt + 0.5 * step * ticks * (ticks - 1.0)) / ticks
+    ticks = min(max(np.ceil(0.5 * np.sqrt(1.0 + 8.0 * room / (step * dt)) - 0.5), 1.0), 1e15)
+    return room / (dt * ticks) + 0.5 * step * (ticks - 1.0)
 
 
 @njit(cache=True)
@@ -193,6 +223,10 @@ def velocity_bounds(x: Any, q: Array) -> None:
         if step < np.inf:
             down = _speed_to_stop(below, step, x.dt) if below > 0.0 else max(x.rate * below, -last - step)
             up = _speed_to_stop(above, step, x.dt) if above > 0.0 else max(x.rate * above, last - step)
+            if below < 0.0:
+                down = max(down, -up)  # on the way back from outside one limit it can still brake for the other
+            elif above < 0.0:
+                up = max(up, -down)
         else:
             down, up = x.rate * below, x.rate * above
         lower[j] = max(min(-down, fastest), -fastest)

@@ -55,6 +55,16 @@ class RowLayout(NamedTuple):
     """(m,) row of `twists` that moves each pair's second body."""
     margin: Array
     """(o + 1,) taken off the distances to each obstacle, for what is not known of it [m]; the last one stays zero."""
+    bodies: IntArray
+    """(m, 2) the two bodies of each pair; obstacles come after the robot's."""
+    body_poses: Array
+    """(g, 12) world poses of all bodies."""
+    spheres: Array
+    """(g, 4) bounding sphere of each body in its own frame: centre and radius [m]."""
+    body_support: Array
+    """(B, n) which coordinates move each of the robot's B bodies."""
+    body_speed: Array
+    """(g,) largest speed of any point of a body [m/s]; those of the robot's are overwritten, obstacles' are given."""
     near: IntArray
     """(m,) out: which pairs are near, in increasing order; here as below, as many as there are near ones count."""
     closest: Array

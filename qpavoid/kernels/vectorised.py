@@ -55,7 +55,7 @@ class Workspace:
         self.gram_diagonal = self.gram.ravel()[:: rows + 1]
         self.over = np.empty(2 * nv + pairs)
         self.over_upper, self.over_lower = self.over[:nv], self.over[nv : 2 * nv]
-        self.was_moving = False
+        self.was_moving = True
         self.screw_columns = np.empty((6, pairs))
         self.scratch = np.empty((3, pairs))
         # every joint has one coordinate and position limits: bounds are made in place, the lower and upper ones at once
@@ -211,6 +211,35 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
         np.minimum(least, np.maximum(most, -x.drift[:k]), out=least, where=parting)
 
 
+def closest_call(x: Any, v: Array, k: int, reach: float, horizon: float) -> float:
+    """How much is certainly left of the safe distance of every pair, if all move at v until `horizon`, wherever to.
+
+    No distance falls faster than the fastest points of its two bodies move; a point of a body moves at most at
+    |speed of the centre of its bounding sphere| + |angular velocity| times radius.
+
+    Args:
+        x: reads what the tick found; writes the speeds of the robot's bodies.
+        v: velocity (n,).
+        k: number of near pairs.
+        reach: surface distance below which a pair is near; all others are at least so far apart [m].
+        horizon: [s].
+
+    Returns:
+        Least of distance - hold - closing speed × horizon [m]; NaN where there is one.
+    """
+    robot = len(x.body_support)
+    twist = np.dot(x.body_support * v, x.J_world.T)
+    center = np.matmul(x.spheres[:robot, None, :3], x.body_poses[:robot, :9].reshape(-1, 3, 3))[:, 0]
+    center += x.body_poses[:robot, 9:]
+    linear = twist[:, :3] + np.cross(twist[:, 3:], center)
+    turning = np.sqrt(np.einsum("ij,ij->i", twist[:, 3:], twist[:, 3:]))
+    x.body_speed[:robot] = np.sqrt(np.einsum("ij,ij->i", linear, linear)) + turning * x.spheres[:robot, 3]
+    closing = x.body_speed[x.bodies[x.near[:k]]].sum(axis=1)
+    fastest = np.max(x.body_speed[:robot], initial=0.0)
+    others = reach + x.offset - x.hold - (fastest + np.max(x.body_speed)) * horizon
+    return float(np.min(x.d[:k] - x.hold - closing * horizon, initial=others))
+
+
 def rotation_vector(R: Any) -> tuple[float, float, float]:
     """Rotation vector [rad] of a rotation R[i][j], with an angle up to and including π.
 
@@ -274,12 +303,12 @@ def speed_to_stop(room: Array, step: Array, dt: float) -> Array:
     moves at such a speed, slowing down by `step` keeps to it, so that the bounds of the next tick never contradict.
 
     Args:
-        room: distance left (...), positive [rad or m].
+        room: distance left (...), not negative; infinite where there is no limit [rad or m].
         step: change of speed in one tick (...), positive [rad/s or m/s].
         dt: length of a tick [s].
     """
-    ticks = np.maximum(np.ceil(0.5 * np.sqrt(1.0 + 8.0 * room / (step * dt)) - 0.5), 1.0)
-    return np.asarray((room / dt + 0.5 * step * ticks * (ticks - 1.0)) / ticks)
+    ticks = np.clip(np.ceil(0.5 * np.sqrt(1.0 + 8.0 * room / (step * dt)) - 0.5), 1.0, 1e15)
+    return np.asarray(room / (dt * ticks) + 0.5 * step * (ticks - 1.0))
 
 
 def velocity_bounds(x: Any, q: Array) -> None:
@@ -290,7 +319,10 @@ def velocity_bounds(x: Any, q: Array) -> None:
         room[0] *= -1.0
         slowed = np.maximum(x.rate_ * room, x.signs * x.v_last[x.v_index] - x.limited_step)
         stop = speed_to_stop(np.maximum(room, 0.0), x.finite_step, x.dt)
-        room[:] = np.where(np.isinf(x.limited_step), x.rate_ * room, np.where(room > 0.0, stop, slowed))
+        speed = np.where(np.isinf(x.limited_step), x.rate_ * room, np.where(room > 0.0, stop, slowed))
+        # on the way back from outside one limit it can still brake for the other
+        np.maximum(speed, -speed[::-1], out=speed, where=room < 0.0)
+        room[:] = speed
         room[0] *= -1.0
     else:
         room *= x.rate_

@@ -6,17 +6,14 @@ from collections.abc import Callable
 
 import numpy as np
 
-from qpavoid import gains, kernels
+from qpavoid import kernels
 from qpavoid.config import QpSolver
 from qpavoid.errors import SolverNotInstalled
-from qpavoid.problem import Array, AvoidanceRows, Problem, Solution, Status
+from qpavoid.problem import Array, Problem, Solution, Status
 from qpavoid.solvers.analytic import tracking_velocity
-from qpavoid.solvers.backends import make_backend
-
-_TOLERANCE = 1e-6
-"""Largest violation of a row [m/s] or bound [rad/s] with which an answer still counts as a solution."""
-_ALPHA_CAP = 1e4
-"""Largest α in the weight of a row's slack: the Hessian must stay well conditioned in deep penetration."""
+from qpavoid.solvers.backends import make_backend, solve_daqp
+from qpavoid.solvers.reasons import what_gave_way
+from qpavoid.solvers.relaxation import closest, relax
 
 
 class Qp:
@@ -26,8 +23,9 @@ class Qp:
     that is safe. As A v0 = b wherever the task can be met, the first term is the tracking cost ‖A v - b‖²;
     measuring λ from v0 rather than from 0 leaves tracking free of bias.
 
-    Where the rows contradict each other or the bounds, a second QP finds the least slack that lets them be met,
-    each weighted by 1 + α so that the nearer threat gives less, and the first is solved again with that slack.
+    Where no velocity meets everything, acceleration limits give way, then rows, as little as they must and the deepest
+    threat least (`solvers.relaxation`). An answer counts only if it verifies: a back end that fails or lies is
+    replaced by daqp for that tick, and where that fails too, the robot is told to stop.
     """
 
     bounded = True
@@ -52,42 +50,19 @@ class Qp:
             if solved:
                 return Solution(answer)
         P, q = kernels.projection_cost(A, self.config.regularization, v0)
-        v = self._closest(P, q, rows.b, problem)
-        if v is not None:
-            return Solution(v)
+        for backend in (self._backend, solve_daqp):
+            v = closest(backend, P, q, rows.J, rows.b, lower, upper)
+            if v is not None:
+                return Solution(v)
         return self._relaxed(P, q, problem)
 
-    def _closest(self, P: Array, q: Array, b: Array, problem: Problem) -> Array | None:
-        """Minimiser of ½ vᵀP v + qᵀv within rows and bounds; None when the answer does not verify."""
-        J, lower, upper = problem.avoidance.J, problem.lower, problem.upper
-        v = self._backend(P, q, J, b, lower, upper)
-        if v is None or not kernels.shortfall(v, J, b, lower, upper) <= _TOLERANCE:
-            return None
-        return np.asarray(np.minimum(np.maximum(v, lower), upper))
-
     def _relaxed(self, P: Array, q: Array, problem: Problem) -> Solution:
-        slack = self._least_slack(P, q, problem)
-        v = None if slack is None else self._closest(P, q, problem.avoidance.b - slack - 0.5 * _TOLERANCE, problem)
-        if v is None or slack is None:
-            still = np.clip(np.zeros_like(q), problem.lower, problem.upper)
-            return Solution(still, Status.STOPPED, ("the QP back end returned no usable velocity",))
-        return Solution(v, Status.RELAXED, _shortfalls(slack, problem.avoidance, problem), slack)
-
-    def _least_slack(self, P: Array, q: Array, problem: Problem) -> Array | None:
-        """Slack s >= 0 (k,) that minimises Σ (1 + α) s² over all v within the bounds."""
-        rows = problem.avoidance
-        n, k = len(q), len(rows.d)
-        hessian = np.zeros((n + k, n + k))
-        hessian[:n, :n] = 1e-6 * P
-        hessian[n:, n:] = np.diag(1.0 + np.minimum(gains.alpha(rows.d, rows.d2), _ALPHA_CAP))
-        gradient = np.concatenate((1e-6 * q, np.zeros(k)))
-        lower = np.concatenate((problem.lower, np.zeros(k)))
-        upper = np.concatenate((problem.upper, np.full(k, np.inf)))
-        x = self._backend(hessian, gradient, np.hstack((rows.J, np.eye(k))), rows.b, lower, upper)
-        if x is None:
-            return None
-        v = np.clip(x[:n], problem.lower, problem.upper)
-        return np.maximum(rows.b - rows.J @ v, 0.0)
+        for backend in (self._backend, solve_daqp):
+            relaxed = relax(P, q, problem, backend)
+            if relaxed is not None:
+                slack = relaxed.slack if relaxed.slack.any() else None
+                return Solution(relaxed.v, Status.RELAXED, what_gave_way(relaxed, problem), slack)
+        return Solution(problem.v_stop.copy(), Status.STOPPED, ("the QP back end returned no usable velocity",))
 
 
 def _compiled_projection() -> Callable[..., tuple[Array, bool]]:
@@ -103,13 +78,3 @@ def _compiled_projection() -> Callable[..., tuple[Array, bool]]:
     one, row = np.ones(1), np.ones((1, 1))
     project(row, 1.0, one, row, 2.0 * one, -3.0 * one, 3.0 * one)
     return project  # type: ignore[no-any-return]
-
-
-def _shortfalls(slack: Array, rows: AvoidanceRows, problem: Problem) -> tuple[str, ...]:
-    """Which pairs gave way, the largest shortfall first."""
-    order = np.argsort(-slack)
-    return tuple(
-        f"{' - '.join(problem.pair_names[rows.pair[i]])}: {1e3 * slack[i]:.1f} mm/s short of its row"
-        for i in order
-        if slack[i] > _TOLERANCE
-    )
