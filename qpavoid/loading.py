@@ -195,16 +195,13 @@ def _set(data: dict[str, Any], override: str, path: Path) -> None:
 
 def _explain(error: ValidationError, model: type[BaseModel], data: dict[str, Any]) -> str:
     """All faults of a file in one line: field, what is wrong, nearest valid key."""
-    faults = [(_field(fault["loc"], fault["type"], data), _fault(fault, model)) for fault in error.errors()]
+    faults = [(tuple(_field(fault["loc"], fault["type"], data)), fault) for fault in error.errors()]
     # Of a field that may be a list or a mapping, pydantic reports both; the one that was meant got deeper.
-    fields = [field for field, _ in faults]
-    told = [
-        f"{'.'.join(field)}: {what}" if field else what
-        for field, what in faults
-        if not any(len(other) > len(field) and other[: len(field)] == field for other in fields)
-    ]
-    more = f"; and {len(told) - _FAULTS_TOLD} more" if len(told) > _FAULTS_TOLD else ""
-    return "; ".join(told[:_FAULTS_TOLD]) + more
+    above = {field[:depth] for field, _ in faults for depth in range(len(field))}
+    deepest = [(field, fault) for field, fault in faults if field not in above]
+    more = f"; and {len(deepest) - _FAULTS_TOLD} more" if len(deepest) > _FAULTS_TOLD else ""
+    told = [(".".join(field), _fault(fault, model)) for field, fault in deepest[:_FAULTS_TOLD]]
+    return "; ".join(f"{field}: {what}" if field else what for field, what in told) + more
 
 
 _FAULTS_TOLD = 5

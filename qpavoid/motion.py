@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 from qpavoid.config import Circle, Csv, Fixed, Line, Waypoints
 from qpavoid.config import Motion as MotionConfig
 from qpavoid.config.base import LARGEST
-from qpavoid.errors import ConfigError, NumericalError
+from qpavoid.errors import ConfigError, NumericalError, located
 from qpavoid.files import read_text
 from qpavoid.problem import Array
 
@@ -177,7 +177,9 @@ def build_motion(config: MotionConfig, start: Sample | None = None, folder: Path
         case Circle():
             return _orbit(config, start, _rotation(config.rpy, initial))
         case Csv():
-            return _polyline(*_read_csv(folder / config.path, initial))
+            poses = _read_csv(folder / config.path, initial)
+            with located(str(folder / config.path)):
+                return _polyline(*poses)
 
 
 def rpy_to_matrix(rpy: ArrayLike) -> Array:
