@@ -66,6 +66,7 @@ class Assembly:
         self._targets = [(row[:3], row[3:12].reshape(3, 3), row[12:15], row[15:]) for row in self._layout.targets]
         self._views: dict[int, tuple[Proximity, AvoidanceRows]] = {}
         self._tracking = Tracking(self._layout.A, self._layout.b, damping)
+        self._eye = np.eye(nv)
         self.kinematics = Kinematics(self._layout.J_world, self._layout.poses)
 
     def compute(
@@ -95,9 +96,22 @@ class Assembly:
         """
         return float(kernels.closest_call(self._packed, v, near, reach, horizon))
 
+    def follow(self, v: Array, problem: Problem) -> Problem:
+        """The problem of this tick with the velocity v (nv,) to follow in place of the tasks."""
+        x = self._layout
+        x.v0[:] = v
+        worst = float(kernels.tracking_shortfall(self._packed, len(problem.avoidance.d)))
+        return problem._replace(tracking=Tracking(self._eye, x.v0, 0.0), shortfall=worst)
+
     def remember(self, v: Array) -> None:
         """Takes v (nv,) as the velocity at which the robot moves until the next tick."""
         self._layout.v_last[:] = v
+
+    def stop(self) -> Array:
+        """Next velocity of a stop (nv,) for which nothing but the last velocity is known: slowed by one factor."""
+        x = self._layout
+        slowing = float(np.max(np.abs(x.v_last) / x.v_step, initial=1.0))
+        return (1.0 - 1.0 / slowing) * x.v_last
 
     def _view(self, k: int) -> tuple[Proximity, AvoidanceRows]:
         x = self._layout

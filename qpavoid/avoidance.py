@@ -21,7 +21,7 @@ def row_form(config: Avoidance) -> dict[str, Any]:
     row = config.row
     return {
         "offset": config.offset,
-        "hold": config.d1 if isinstance(row, Switching) or row.d_safe is None else row.d_safe,
+        "hold": config.hold,
         "row_gain": row.gain,
         "recovery": np.inf if isinstance(row, Cbf) else config.recovery_speed,
         "switching": isinstance(row, Switching),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from math import isfinite
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -11,16 +12,18 @@ import numpy as np
 
 from qpavoid import kernels
 from qpavoid.assembly import Assembly
-from qpavoid.config import Avoidance, Limits, ScenarioConfig
+from qpavoid.config import Avoidance, Limits, ScenarioConfig, Sensing
 from qpavoid.errors import UnknownName, located
+from qpavoid.guard import TOLERANCE, Guard
 from qpavoid.kinematics import ForwardKinematics, Kinematics
 from qpavoid.limits import saturate
 from qpavoid.loading import nearest
 from qpavoid.motion import Sample
-from qpavoid.problem import Array, Problem, Proximity, Solution, State, require_finite
+from qpavoid.problem import Array, Problem, Proximity, Solution, State, Status, as_vector
 from qpavoid.proximity import DistanceQuery
 from qpavoid.robot import Robot
 from qpavoid.scene import Scene, build_obstacles, build_scene
+from qpavoid.sensing import Obstacles, Pose
 from qpavoid.solvers import Solver, make_solver
 from qpavoid.tasks import FrameTask, build_tasks
 
@@ -50,17 +53,19 @@ class Controller:
         avoidance: Avoidance | None = None,
         limits: Limits | None = None,
         tracking_damping: float = 0.01,
+        sensing: Sensing | None = None,
     ) -> None:
         """Lays out the memory of the tick.
 
         Args:
             scene: robot and obstacles.
-            tasks: what to follow; see `build_tasks`.
+            tasks: what to follow; see `build_tasks`. None are needed for `filter`.
             solver: anything with `solve`, or a name such as `eq10` or `qp:proxqp`.
             dt: control period [s]: each velocity is meant to be held that long.
             avoidance: distances and rows; the defaults of a scenario if left out.
             limits: use of the joint limits; the defaults of a scenario if left out.
             tracking_damping: λ of the damped J⁺ [-].
+            sensing: what is made of obstacles without news; the defaults of a scenario if left out.
 
         Raises:
             UnknownName, SolverNotInstalled: of the solver.
@@ -71,18 +76,25 @@ class Controller:
         model = scene.robot.model
         self._kinematics = ForwardKinematics(model, [task.frame_id for task in tasks])
         self._query = DistanceQuery(scene)
-        self._q_shape = (model.nq,)
+        self._q_shape, self._v_shape = (model.nq,), (model.nv,)
         self._frame_index = {task.settings.frame: i for i, task in enumerate(tasks)}
-        self._obstacle_index = {name: i for i, name in enumerate(scene.obstacle_names)}
-        self._moving = [i for i, obstacle in enumerate(scene.obstacles) if obstacle.moves]
+        self._obstacles = Obstacles(scene.obstacles, sensing or Sensing(), dt)
         self._reach = self.avoidance.d2 - self.avoidance.offset
         self._bounds = scene.robot.bounds().within(self.limits)
         self._assembly = Assembly(
             scene, self.tasks, self._bounds, self._kinematics, self._query, self.avoidance,
             self.limits.position_gain, tracking_damping, dt,
         )  # fmt: skip
+        self._guard = Guard(scene, self._bounds, self.avoidance.hold - self.avoidance.offset, dt)
+        self._warm_up()
+
+    def _warm_up(self) -> None:
         begin = perf_counter()
-        self.tick(scene.robot.home)
+        q, v = self.scene.robot.home, np.zeros(self._v_shape)
+        self.tick(q)
+        self.filter(q, v)
+        self._assembly.closest_call(v, 0, self._reach, self.dt)
+        self.reset()
         self.warm_up_time = perf_counter() - begin
         """Time that the first tick took, compilation included [s]; no later one waits for the compiler."""
         _log.info("warmed up in %.3f s, compiled kernels: %s", self.warm_up_time, kernels.ACCELERATED)
@@ -112,6 +124,7 @@ class Controller:
             scenario.avoidance,
             scenario.limits,
             scenario.tracking_damping,
+            scenario.sensing,
         )
         return controller, q0
 
@@ -120,67 +133,152 @@ class Controller:
         q: Array,
         t: float = 0.0,
         targets: Mapping[str, Sample] | None = None,
-        obstacles: Mapping[str, Sample] | None = None,
+        obstacles: Mapping[str, Sample | Pose] | None = None,
+        v: Array | None = None,
     ) -> Solution:
         """Velocity for the next dt.
+
+        Every call with arguments of the right kind ends in a solution. Numbers that cannot be true (NaN, infinity) end
+        in a stop that says so; of an obstacle, they count as no news.
 
         Args:
             q: configuration (nq,) as measured.
             t: time [s] at which motions are evaluated.
             targets: where frames should be now, by frame name, in place of their motion.
-            obstacles: where obstacles are now and how they move, by name, in place of their motion.
+            obstacles: where obstacles are now, and how they move if that is known, by name, in place of their motion.
+            v: velocity (nv,) as measured, from which acceleration limits count; the last command if left out.
 
         Raises:
-            NumericalError: q of the wrong shape; NaN or infinity in q or in an obstacle.
+            NumericalError: an argument of the wrong shape, or not made of numbers.
             UnknownName: of a target or obstacle.
         """
-        return self._compute(q, t, targets, obstacles)[-1]
+        return self._compute(q, t, targets, obstacles, v)[-1]
 
     def tick(
         self,
         q: Array,
         t: float = 0.0,
         targets: Mapping[str, Sample] | None = None,
-        obstacles: Mapping[str, Sample] | None = None,
+        obstacles: Mapping[str, Sample | Pose] | None = None,
+        v: Array | None = None,
     ) -> Tick:
         """Like `step`, with everything that led to the velocity."""
-        samples, proximity, problem, solution = self._compute(q, t, targets, obstacles)
+        samples, proximity, problem, solution = self._compute(q, t, targets, obstacles, v)
         state = State(np.array(q, dtype=np.float64), solution.v, t)
         kinematics = _copied(self._assembly.kinematics)
         return Tick(state, samples, kinematics, _copied(proximity), _copied(problem), solution)
 
+    def filter(
+        self,
+        q: Array,
+        v_desired: Array,
+        t: float = 0.0,
+        obstacles: Mapping[str, Sample | Pose] | None = None,
+        v: Array | None = None,
+    ) -> Solution:
+        """The safe velocity that is closest to any command: of a teleoperator, a policy, another controller.
+
+        The command comes back unchanged, bit for bit, where it is safe and within the limits. Tasks play no part.
+
+        Args:
+            q: configuration (nq,) as measured.
+            v_desired: the command (nv,) [rad/s or m/s].
+            t: time [s] at which the obstacles' motions are evaluated.
+            obstacles: where obstacles are now; see `step`.
+            v: velocity (nv,) as measured; see `step`.
+
+        Raises:
+            NumericalError, UnknownName: as `step`.
+        """
+        return self._compute(q, t, None, obstacles, v, as_vector("v_desired", v_desired, self._v_shape))[-1]
+
+    def reset(self, v: Array | None = None) -> None:
+        """Forgets the ticks before: the robot moves at v (nv,), or stands still."""
+        self._assembly.remember(np.zeros(self._v_shape) if v is None else as_vector("v", v, self._v_shape))
+        self._obstacles.reset()
+
     def _compute(
-        self, q: Array, t: float, targets: Mapping[str, Sample] | None, obstacles: Mapping[str, Sample] | None
+        self,
+        q: Array,
+        t: float,
+        targets: Mapping[str, Sample] | None,
+        obstacles: Mapping[str, Sample | Pose] | None,
+        v: Array | None,
+        desired: Array | None = None,
     ) -> tuple[tuple[Sample, ...], Proximity, Problem, Solution]:
         begin = perf_counter()
-        q = require_finite("q", q, self._q_shape)
+        q = as_vector("q", q, self._q_shape)
+        if v is not None:
+            self._assembly.remember(as_vector("v", v, self._v_shape))
+        faults: tuple[str, ...] = ()
+        if not isfinite(np.vdot(q, q) + t):
+            faults = _not_finite(q, t)
+            q, t = np.where(np.isfinite(q), q, self.scene.robot.home), 0.0
         samples = self._targets(t, targets)
-        if obstacles or self._moving:
-            self._place_obstacles(t, obstacles or {})
+        observed = self._obstacles.observe(t, obstacles)
+        assumed: tuple[str, ...] = ()
+        if observed is not None:
+            for index, sample, margin in observed.seen:
+                self._query.place_obstacle(index, sample, margin)
+                self._guard.see(index, sample)
+            faults, assumed = faults + observed.stop, observed.assumed
         self._kinematics.compute(q)
         self._query.compute(self._kinematics.data, self._reach)
         proximity, problem = self._assembly.compute(q, samples, self._query, self._reach)
+        if desired is not None:
+            problem = self._assembly.follow(desired, problem)
         built = perf_counter()
-        v, status, reasons, slack, *_ = self.solver.solve(problem)
-        saturation = 0.0
-        if self.limits.saturate and not self.solver.bounded:
-            v, saturation = saturate(v, problem.lower, problem.upper, self._bounds.velocity)
-        solution = Solution(v, status, reasons, slack, saturation, built - begin, perf_counter() - built)
-        return samples, proximity, problem, solution
+        solution = self._stop(faults) if faults else self._solve(q, problem)
+        self._assembly.remember(solution.v)
+        solution = solution._replace(assumed=assumed) if assumed else solution
+        return samples, proximity, problem, solution.timed(built - begin, perf_counter() - built)
+
+    def _solve(self, q: Array, problem: Problem) -> Solution:
+        try:
+            solution = self.solver.solve(problem)
+            usable = solution.v.shape == self._v_shape and isfinite(np.vdot(solution.v, solution.v))
+        except Exception as error:  # a law of the user's own may raise anything; the robot must get a velocity
+            return self._stop((f"the solver raised {type(error).__name__}: {error}",))
+        if not usable:
+            return self._stop(solution.reasons or ("the solver returned no finite velocity of the right shape",))
+        if not self.solver.bounded:
+            if self.limits.saturate:
+                v, change = saturate(solution.v, problem.lower, problem.upper, self._bounds.velocity)
+                return solution._replace(v=v, saturation=change)
+            return solution
+        if self.avoidance.look_ahead:
+            return self._looked_ahead(q, problem, solution)
+        return solution
+
+    def _looked_ahead(self, q: Array, problem: Problem, solution: Solution) -> Solution:
+        near = len(problem.avoidance.d)
+        v, share, short, pair = self._guard.check(
+            q, solution.v, problem.v_stop, self._assembly, near, self._query, self._reach
+        )
+        if share == 1.0 and short <= TOLERANCE:
+            return solution
+        if short <= TOLERANCE:
+            return solution._replace(v=v, share=share)
+        reason = f"{' - '.join(self.scene.pair_names[pair])}: comes {1e3 * short:.1f} mm too near"
+        status = solution.status if solution.status is Status.STOPPED else Status.RELAXED
+        return solution._replace(v=v, share=share, status=status, reasons=(*solution.reasons, reason))
+
+    def _stop(self, reasons: tuple[str, ...]) -> Solution:
+        return Solution(self._assembly.stop(), Status.STOPPED, reasons)
 
     def _targets(self, t: float, given: Mapping[str, Sample] | None) -> tuple[Sample, ...]:
         if not given:
             return tuple([task.motion.sample(t) for task in self.tasks])
         for frame in given:
-            _index(self._frame_index, frame, "target")
+            if frame not in self._frame_index:
+                raise UnknownName(f"no target {frame!r}{nearest(frame, self._frame_index)}")
         return tuple([given.get(task.settings.frame) or task.motion.sample(t) for task in self.tasks])
 
-    def _place_obstacles(self, t: float, given: Mapping[str, Sample]) -> None:
-        for i in self._moving:
-            if self.scene.obstacles[i].name not in given:
-                self._query.place_obstacle(i, self.scene.obstacles[i].motion.sample(t))
-        for name, sample in given.items():
-            self._query.place_obstacle(_index(self._obstacle_index, name, "obstacle"), sample)
+
+def _not_finite(q: Array, t: float) -> tuple[str, ...]:
+    bad = np.flatnonzero(~np.isfinite(q)).tolist()
+    reasons = [f"q: NaN or infinity at index {', '.join(map(str, bad[:5]))}"] if bad else []
+    return (*reasons, *([] if isfinite(t) else [f"t: {t}"]))
 
 
 def _copied(value: Any) -> Any:
@@ -190,9 +288,3 @@ def _copied(value: Any) -> Any:
     if hasattr(value, "_fields"):
         return type(value)(*map(_copied, value))
     return value
-
-
-def _index(names: Mapping[str, int], name: str, what: str) -> int:
-    if name not in names:
-        raise UnknownName(f"no {what} {name!r}{nearest(name, names)}")
-    return names[name]

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import Enum
-from math import isfinite
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,7 +28,7 @@ class Status(str, Enum):
     RELAXED = "RELAXED"
     """The rows contradict each other or the limits; `reasons` says which gave way and by how much."""
     STOPPED = "STOPPED"
-    """No usable velocity was found: the robot is told to stand still."""
+    """No velocity can be answered for: the robot is braked to a standstill within its acceleration limits."""
 
 
 class State(NamedTuple):
@@ -177,12 +176,37 @@ class Solution(NamedTuple):
     """What gave way, by name and amount; empty when nothing did."""
     slack: Array | None = None
     """(k,) what each avoidance row gave way [m/s]; None when none did."""
+    share: float = 1.0
+    """How much of the law's velocity is left after looking ahead; the rest is the velocity of a stop."""
+    assumed: tuple[str, ...] = ()
+    """What the tick took for granted, such as the twist of an obstacle that was given without one."""
     saturation: float = 0.0
     """Largest change that the limits made to the law's raw velocity [rad/s or m/s]; 0 for laws that know limits."""
     build_time: float = 0.0
     """Time to read the state and set up the problem [s]."""
     solve_time: float = 0.0
-    """Time to solve it [s]."""
+    """Time to solve it and to look ahead [s]."""
+
+    def timed(self, build_time: float, solve_time: float) -> Solution:
+        """The same with its times [s]."""
+        return Solution(*self[:-2], build_time, solve_time)
+
+
+def as_vector(name: str, value: Any, shape: tuple[int, ...]) -> Array:
+    """`value` as a float array of `shape`, whatever its numbers are.
+
+    Raises:
+        NumericalError: wrong shape, or not numbers; names the argument.
+    """
+    if type(value) is np.ndarray and value.dtype == np.float64 and value.shape == shape:
+        return value
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise NumericalError(f"{name}: not an array of numbers: {value!r:.60}") from None
+    if array.shape != shape:
+        raise NumericalError(f"{name}: shape {array.shape}, expected {shape}")
+    return array
 
 
 def require_finite(name: str, value: Any, shape: tuple[int, ...]) -> Array:
@@ -191,15 +215,7 @@ def require_finite(name: str, value: Any, shape: tuple[int, ...]) -> Array:
     Raises:
         NumericalError: wrong shape, NaN or infinity; names the argument.
     """
-    usual = type(value) is np.ndarray and value.dtype == np.float64 and value.shape == shape
-    if usual and isfinite(np.vdot(value, value)):  # quick, but a very large value may overflow: it is looked at below
-        return np.asarray(value)
-    try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise NumericalError(f"{name}: not an array of numbers: {value!r:.60}") from None
-    if array.shape != shape:
-        raise NumericalError(f"{name}: shape {array.shape}, expected {shape}")
+    array = as_vector(name, value, shape)
     if not np.isfinite(array).all():
         bad = ", ".join(str(i) for i in np.argwhere(~np.isfinite(array)).ravel()[:5])
         raise NumericalError(f"{name}: NaN or infinity at index {bad}")

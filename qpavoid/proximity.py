@@ -68,8 +68,8 @@ class DistanceQuery:
         """Whether any obstacle has a velocity."""
         return bool(self._moving)
 
-    def place_obstacle(self, index: int, sample: Sample) -> None:
-        """Puts obstacle number `index` to a pose, with a velocity.
+    def place_obstacle(self, index: int, sample: Sample, margin: float = 0.0) -> None:
+        """Puts obstacle number `index` to a pose, with a velocity, and takes a margin [m] off its distances.
 
         Raises:
             NumericalError: NaN or infinity; names the obstacle, which stays where it was.
@@ -82,6 +82,7 @@ class DistanceQuery:
                 f"obstacle {self._scene.obstacles[index].name!r}: NaN or infinity in its pose or twist"
             )
         geometry = self._first_obstacle + index
+        self.margin[index] = margin
         if self._placements is None:
             self._geometry.geometryObjects[geometry].placement = pin.SE3(sample.rotation, sample.position)
         else:

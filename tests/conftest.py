@@ -9,6 +9,7 @@ from hypothesis import settings
 
 from qpavoid import Obstacle, Robot, Sample, build_scene, config
 from qpavoid.assembly import Assembly
+from qpavoid.kernels.layout import RowLayout
 from qpavoid.kinematics import ForwardKinematics
 from qpavoid.loading import example_robot_data
 from qpavoid.motion import build_motion
@@ -98,6 +99,39 @@ class Bench:
         self.query.compute(self.kinematics.data, reach)
         targets = targets or [task.motion.sample(0.0) for task in self.tasks]
         return self.assembly.compute(np.asarray(q), targets, self.query, reach)
+
+
+def make_layout(nv, frames=0, turns=(), pairs=0, obstacles=0, robot=0, **fields):
+    """Memory of a tick in which all inputs but `fields` are zero or without effect, and all outputs NaN."""
+    rows = 3 * (frames + len(turns))
+    screws = np.zeros((rows, 6))
+    screws[: 3 * frames, :3] = np.tile(np.eye(3), (frames, 1))
+    screws[3 * frames :, 3:] = np.tile(np.eye(3), (len(turns), 1))
+    none = np.zeros(0, dtype=np.intp)
+    inputs = {
+        "J_world": np.zeros((6, nv), order="F"), "frame_poses": np.zeros((frames, 12)),
+        "frame_ids": np.arange(frames), "targets": np.zeros((frames, 18)), "turns": np.array(turns, dtype=np.intp),
+        "gain": np.ones(frames), "cap": np.full(frames + len(turns), np.inf), "scale": np.ones(rows),
+        "task_support": np.ones((rows, nv)), "screws": screws, "results": np.zeros((pairs, 10)),
+        "support": np.ones((pairs, nv)), "twists": np.zeros((obstacles + 1, 6)),
+        "twist_row": np.full(pairs, obstacles), "margin": np.zeros(obstacles + 1),
+        "bodies": np.zeros((pairs, 2), dtype=np.intp), "body_poses": np.zeros((robot + obstacles, 12)),
+        "spheres": np.zeros((robot + obstacles, 4)), "body_support": np.ones((robot, nv)),
+        "body_speed": np.zeros(robot + obstacles), "q_index": none, "v_index": none, "q_lower": np.zeros(0),
+        "q_upper": np.zeros(0), "v_max": np.full(nv, np.inf), "v_step": np.full(nv, np.inf), "v_last": np.zeros(nv),
+        "damping": 0.0, "offset": 0.0, "hold": 0.1, "row_gain": 5.0, "recovery": 0.2, "switching": True, "d1": 0.1,
+        "d2": 0.3, "rate": 50.0, "dt": 0.01, "accelerated": False,
+    }  # fmt: skip
+    shapes = {
+        "poses": (frames, 12), "A": (rows, nv), "b": rows, "closest": (pairs, 10), "J": (pairs, nv), "drift": pairs,
+        "d": pairs, "least": pairs, "hard_lower": nv, "hard_upper": nv, "lower": nv, "upper": nv, "v_stop": nv,
+        "v0": nv,
+    }  # fmt: skip
+    outputs = {"near": np.full(pairs, -1), **{name: np.full(shape, np.nan) for name, shape in shapes.items()}}
+    given = {**inputs, **outputs, **fields}
+    if not given["accelerated"]:
+        given["hard_lower"], given["hard_upper"] = given["lower"], given["upper"]
+    return RowLayout(**given)
 
 
 def look(scene, q, samples=None, reach=np.inf, query=None):

@@ -76,6 +76,14 @@ class Avoidance(Block):
     """Form of the QP's avoidance rows."""
     recovery_speed: Positive = 0.2
     """Cap on the speed at which rows ask a pair that is too close to part [m/s]."""
+    look_ahead: bool = True
+    """Whether a velocity of the QP is followed ahead, over its tick and the stop after it, and drawn back where that
+    leads nearer than the safe distance."""
+
+    @property
+    def hold(self) -> float:
+        """Distance at which a row lets a pair come no nearer [m]."""
+        return self.d1 if isinstance(self.row, Switching) or self.row.d_safe is None else self.row.d_safe
 
     @model_validator(mode="after")
     def _ordered(self) -> Avoidance:
@@ -103,3 +111,21 @@ class Limits(Block):
     """Share of the acceleration limits that may be used [-]."""
     saturate: bool = True
     """Whether the laws that know no limits (all but the QP) are scaled and clipped to them afterwards."""
+
+
+class Sensing(Block):
+    """What is made of obstacles that a program gives tick by tick, and then does not."""
+
+    stale_after: Positive | None = None
+    """Time without news after which an obstacle's distances shrink by a growing margin [s]; left out: never, it goes on
+    at its last twist."""
+    margin_growth: NonNegative = 0.1
+    """How fast that margin grows: a bound on how wrong the last twist may be [m/s]."""
+    stop_after: Positive | None = None
+    """Time without news after which the robot stops [s]; left out: never."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Sensing:
+        if self.stop_after is not None and (self.stale_after is None or self.stop_after < self.stale_after):
+            raise ValueError("stop_after needs a stale_after that is not longer")
+        return self

@@ -8,11 +8,10 @@ from typing import Annotated
 from pydantic import Field, PrivateAttr, model_validator
 
 from qpavoid.config.base import Block, NonNegative, Number, Positive
-from qpavoid.config.control import Avoidance, Limits, Task
+from qpavoid.config.control import Avoidance, Limits, Sensing, Task
 from qpavoid.config.motion import Circle, Fixed, Line, Motion
 from qpavoid.config.shapes import Shape
 from qpavoid.config.solver import QpSolver, SolverConfig
-
 
 _MOST_TICKS = 1_000_000
 """The log of so many takes a gigabyte or two of memory; at 10 ms they are 2.8 hours."""
@@ -47,6 +46,7 @@ class ScenarioConfig(Block):
     """λ of the damped J⁺ of the tracking task, the same for every solver [-]; 0 gives the plain pseudo-inverse."""
     avoidance: Avoidance = Avoidance()
     limits: Limits = Limits()
+    sensing: Sensing = Sensing()
     solver: SolverConfig = QpSolver()
     """A name (`eq10`, `qp:osqp`) or a mapping with that solver's settings."""
     dt: Annotated[float, Field(gt=0, le=0.1)] = 0.01

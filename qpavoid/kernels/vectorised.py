@@ -58,6 +58,13 @@ class Workspace:
         self.was_moving = True
         self.screw_columns = np.empty((6, pairs))
         self.scratch = np.empty((3, pairs))
+        robot, poses = len(layout.body_support), layout.body_poses
+        self.sphere_centers, self.sphere_radii = (
+            layout.spheres[:robot, None, :3].copy(),
+            layout.spheres[:robot, 3].copy(),
+        )
+        self.body_turns, self.body_places = poses[:robot, :9].reshape(-1, 3, 3), poses[:robot, 9:]
+        self.robot_speed = layout.body_speed[:robot]
         # every joint has one coordinate and position limits: bounds are made in place, the lower and upper ones at once
         self.plain = np.array_equal(layout.q_index, np.arange(nv)) and np.array_equal(layout.v_index, np.arange(nv))
         self.q_limits = np.stack((layout.q_lower, layout.q_upper))
@@ -227,17 +234,31 @@ def closest_call(x: Any, v: Array, k: int, reach: float, horizon: float) -> floa
     Returns:
         Least of distance - hold - closing speed × horizon [m]; NaN where there is one.
     """
-    robot = len(x.body_support)
-    twist = np.dot(x.body_support * v, x.J_world.T)
-    center = np.matmul(x.spheres[:robot, None, :3], x.body_poses[:robot, :9].reshape(-1, 3, 3))[:, 0]
-    center += x.body_poses[:robot, 9:]
-    linear = twist[:, :3] + np.cross(twist[:, 3:], center)
-    turning = np.sqrt(np.einsum("ij,ij->i", twist[:, 3:], twist[:, 3:]))
-    x.body_speed[:robot] = np.sqrt(np.einsum("ij,ij->i", linear, linear)) + turning * x.spheres[:robot, 3]
-    closing = x.body_speed[x.bodies[x.near[:k]]].sum(axis=1)
-    fastest = np.max(x.body_speed[:robot], initial=0.0)
-    others = reach + x.offset - x.hold - (fastest + np.max(x.body_speed)) * horizon
-    return float(np.min(x.d[:k] - x.hold - closing * horizon, initial=others))
+    twist = np.dot(x.J_world, (x.body_support * v).T)
+    center = np.matmul(x.sphere_centers, x.body_turns)[:, 0]
+    center += x.body_places
+    turning, center = twist[3:], center.T
+    products = turning[_CYCLE]
+    products *= center[_ANTICYCLE]
+    twist[:3] += products[:3]
+    twist[:3] -= products[3:]
+    twist *= twist
+    speed = x.robot_speed
+    np.sqrt(np.add.reduce(turning), out=speed)
+    speed *= x.sphere_radii
+    speed += np.sqrt(np.add.reduce(twist[:3]))
+    fastest = speed.max()
+    others = (
+        reach
+        + x.offset
+        - x.hold
+        - (fastest + (x.body_speed.max() if len(speed) < len(x.body_speed) else fastest)) * horizon
+    )
+    if not k:
+        return float(others)
+    closing = np.add.reduce(x.body_speed[x.bodies[x.near[:k]]], axis=1)
+    closing *= horizon
+    return float(min((x.d[:k] - closing).min() - x.hold, others))
 
 
 def rotation_vector(R: Any) -> tuple[float, float, float]:

@@ -1,0 +1,154 @@
+"""Looks ahead before a velocity is commanded: along its tick, and along the stop that would follow.
+
+The rows of a problem are a linearisation, and they know only what is near. What is commanded must hold for the real
+distances, of all pairs, at q ⊕ v dt with obstacles moved on; and it must leave a way to stop. So every velocity is
+followed for one tick and then slowed down uniformly, as fast as the accelerations allow, and the distances along that
+way are computed anew. Where it comes too near, the velocity is drawn back towards the stop of this tick, whose way was
+looked at one tick ago. By induction a stop that was found clear is always at hand, as long as obstacles do what they
+were last seen to do, for one tick.
+
+Most ticks need none of this: where no body moves fast enough to use up what is left of a distance before the robot
+could stop (`kernels.vectorised.closest_call`), the velocity is clear as it is.
+"""
+
+from __future__ import annotations
+
+from math import ceil
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from qpavoid.assembly import Assembly
+from qpavoid.limits import JointBounds
+from qpavoid.motion import Sample
+from qpavoid.problem import Array
+from qpavoid.proximity import DistanceQuery
+from qpavoid.scene import Scene
+
+TOLERANCE = 2e-4
+"""How much nearer than its safe distance a pair may come along the way [m]."""
+_CREEP = 1e-5
+"""How much nearer a pair that is too near already may come in a tick [m]."""
+_FINEST = 5e-3
+"""Distance between poses that are looked at, at the least [m]."""
+_MOST_POSES = 24
+"""Poses that are looked at along one way."""
+_SHARES = (0.75, 0.5, 0.25, 0.0)
+"""Shares of the velocity, the rest being the stop, that are tried where it leads too near."""
+
+
+class Checked(NamedTuple):
+    """A velocity that was looked at."""
+
+    v: Array
+    """(nv,)."""
+    share: float
+    """How much of the wanted velocity is in it; the rest is the stop."""
+    short: float
+    """How much too near it leads all the same [m]; 0 where it is clear."""
+    pair: int
+    """Which pair comes too near; -1 where none does."""
+
+
+class Guard:
+    """Follows velocities ahead in time, on kinematics and distances of its own."""
+
+    def __init__(self, scene: Scene, bounds: JointBounds, hold: float, dt: float) -> None:
+        """Lays the memory out.
+
+        Args:
+            scene: robot and obstacles.
+            bounds: limits of the joints.
+            hold: safe distance between surfaces [m].
+            dt: how long a velocity is held [s].
+        """
+        self._scene, self._model, self._hold, self._dt = scene, scene.robot.model, hold, dt
+        self._data, self._ahead = scene.robot.model.createData(), DistanceQuery(scene)
+        self._acceleration, self._accelerated = bounds.acceleration, bool(np.isfinite(bounds.acceleration).any())
+        self._samples: dict[int, Sample] = {}
+
+    def see(self, index: int, sample: Sample) -> None:
+        """Where obstacle number `index` is now, and how it moves."""
+        self._samples[index] = sample
+
+    def check(
+        self, q: Array, v: Array, v_stop: Array, assembly: Assembly, near: int, query: DistanceQuery, reach: float
+    ) -> Checked:
+        """The velocity itself where its way is clear, else as much of it as can be had.
+
+        Args:
+            q: configuration (nq,).
+            v: wanted velocity (nv,).
+            v_stop: velocity of the stop (nv,).
+            assembly: of this tick.
+            near: number of near pairs.
+            query: distances of this tick.
+            reach: surface distance up to which they were looked for [m].
+        """
+        horizon = self._dt + 0.5 * self._stopping(v)
+        if assembly.closest_call(v, near, reach, horizon) > 0.0:
+            return Checked(v, 1.0, 0.0, -1)
+        self._place_obstacles(query.margin)
+        travel = float(np.max(query.body_speed)) * horizon
+        worst, pair = self._worst(q, v, query, travel)
+        best = Checked(v, 1.0, max(-worst, 0.0), pair)
+        for share in _SHARES if best.short > 0.0 else ():
+            blend = v_stop + share * (v - v_stop)
+            worst, pair = self._worst(q, blend, query, travel)
+            if worst >= 0.0:
+                return Checked(blend, share, 0.0, -1)
+            if -worst < best.short:
+                best = Checked(blend, share, -worst, pair)
+        return best
+
+    def _place_obstacles(self, margin: Array) -> None:
+        """Puts the obstacles where they will be at the end of the tick."""
+        dt = self._dt
+        for index, sample in self._samples.items():
+            turned = pin.exp3(dt * sample.angular) @ sample.rotation if sample.angular.any() else sample.rotation
+            ahead = sample._replace(position=sample.position + dt * sample.linear, rotation=turned)
+            self._ahead.place_obstacle(index, ahead)
+        still = [i for i, sample in self._samples.items() if not sample.linear.any() and not sample.angular.any()]
+        for index in still:
+            del self._samples[index]
+        self._ahead.margin[:] = margin
+
+    def _worst(self, q: Array, v: Array, now: DistanceQuery, travel: float) -> tuple[float, int]:
+        """Least of distance - what it has to be, along the way of v and its stop [m], and the pair that it is of."""
+        worst, pair = np.inf, -1
+        for t in self._times(v, travel):
+            found, which = self._look(pin.integrate(self._model, q, v * t), now)
+            if not found >= worst:
+                worst, pair = found, which
+        return worst, pair
+
+    def _times(self, v: Array, travel: float) -> list[float]:
+        """When to look: so often that no point moves farther than the safe distance in between, and at the end."""
+        stopping = self._stopping(v)
+        spacing = max(self._hold, _FINEST)
+        if stopping == 0.0 and travel <= spacing:
+            return [self._dt]
+        end = self._dt + 0.5 * stopping
+        count = min(max(ceil(travel / spacing), 1), _MOST_POSES)
+        times = {self._dt, *(end * (i + 1) / count for i in range(count))}
+        return sorted(times)
+
+    def _stopping(self, v: Array) -> float:
+        """Time that the stop from v takes [s]."""
+        return float((np.abs(v) / self._acceleration).max()) if self._accelerated else 0.0
+
+    def _look(self, q: Array, now: DistanceQuery) -> tuple[float, int]:
+        pin.forwardKinematics(self._model, self._data, q)
+        ahead = self._ahead
+        ahead.compute(self._data, self._hold)
+        pairs = ahead.pairs
+        if not len(pairs):
+            return np.inf, -1
+        there, here = ahead.found(pairs), now.found(pairs)
+        if ahead.margin.any():
+            margin = ahead.margin[ahead.twist_row[pairs]]
+            there, here = there - margin, here - margin
+        left = there - np.minimum(self._hold - TOLERANCE, here - _CREEP)
+        worst = int(left.argmin())  # the first NaN, where there is one
+        return float(left[worst]), int(pairs[worst])

@@ -1,0 +1,156 @@
+"""What is known of the obstacles: trajectories, poses and twists that a program gives, tick by tick or late.
+
+An obstacle that is given as a bare pose gets a twist from the difference of its poses. One that was given and is then
+left out goes on at its last twist; after `stale_after` its distances shrink by a margin that grows, and after
+`stop_after` the robot stops. Whatever is assumed is said in `Solution.assumed`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike
+
+from qpavoid.config import Sensing
+from qpavoid.errors import UnknownName
+from qpavoid.loading import nearest
+from qpavoid.motion import Sample
+from qpavoid.problem import Array
+from qpavoid.scene import Obstacle
+
+
+class Pose(NamedTuple):
+    """Where an obstacle was seen, when nothing is known of its velocity."""
+
+    position: Array
+    """(3,) world position [m]."""
+    rotation: Array
+    """(3, 3) body axes to world axes."""
+
+    @classmethod
+    def at(cls, position: ArrayLike, rotation: ArrayLike | None = None) -> Pose:
+        """Copies of what is given, checked; along the world axes where no rotation is given.
+
+        Raises:
+            ConfigError: an entry has the wrong shape, or holds what is not a finite number.
+        """
+        sample = Sample.at(position, rotation)
+        return cls(sample.position, sample.rotation)
+
+
+class Seen(NamedTuple):
+    """What a tick has to know of one obstacle."""
+
+    obstacle: int
+    """Its number in the scene."""
+    sample: Sample
+    margin: float
+    """To be taken off its distances [m]."""
+
+
+class Observation(NamedTuple):
+    """What a tick has to know of all obstacles."""
+
+    seen: tuple[Seen, ...]
+    assumed: tuple[str, ...] = ()
+    """What was not told but taken for granted."""
+    stop: tuple[str, ...] = ()
+    """Why the robot has to stop; empty if it has not."""
+
+
+@dataclass
+class _Track:
+    """One obstacle that is given from outside."""
+
+    sample: Sample
+    """As it was given last, with an estimated twist where none was."""
+    estimated: bool
+    age: int = 0
+    """Ticks since then."""
+
+
+class Obstacles:
+    """Keeps track of the obstacles of a scene."""
+
+    def __init__(self, obstacles: Sequence[Obstacle], config: Sensing, dt: float) -> None:
+        self._obstacles, self._config, self._dt = obstacles, config, dt
+        self._index = {obstacle.name: i for i, obstacle in enumerate(obstacles)}
+        self._moving = [i for i, obstacle in enumerate(obstacles) if obstacle.moves]
+        self._tracks: dict[int, _Track] = {}
+
+    def observe(self, t: float, given: Mapping[str, Sample | Pose] | None) -> Observation | None:
+        """What there is to know at time t [s]; None where nothing has changed.
+
+        Args:
+            t: time at which trajectories are evaluated [s].
+            given: what the program says, by name; one with NaN or infinity counts as not given.
+
+        Raises:
+            UnknownName: there is no such obstacle.
+        """
+        if not given and not self._moving and not self._tracks:
+            return None
+        fresh: dict[int, Sample | Pose] = {}
+        notes: list[str] = []
+        for name, what in (given or {}).items():
+            if name not in self._index:
+                raise UnknownName(f"no obstacle {name!r}{nearest(name, self._index)}")
+            if all(np.isfinite(part).all() for part in what):
+                fresh[self._index[name]] = what
+            else:
+                notes.append(f"{name}: NaN or infinity in its pose or twist, taken as not given")
+                self._tracks.setdefault(self._index[name], self._unseen(self._index[name], t))
+        seen = [
+            Seen(i, self._obstacles[i].motion.sample(t), 0.0)
+            for i in self._moving
+            if i not in fresh and i not in self._tracks
+        ]
+        stop: list[str] = []
+        for index, what in fresh.items():
+            self._tracks[index] = self._track(index, what)
+        for index, track in self._tracks.items():
+            name = self._obstacles[index].name
+            if index in fresh:
+                seen.append(Seen(index, track.sample, 0.0))
+                if track.estimated:
+                    notes.append(f"{name}: twist estimated from its poses")
+            else:
+                track.age += 1
+                seen.append(self._predicted(index, track, notes, stop))
+        return Observation(tuple(seen), tuple(notes), tuple(stop))
+
+    def reset(self) -> None:
+        """Forgets what was given."""
+        self._tracks.clear()
+
+    def _unseen(self, index: int, t: float) -> _Track:
+        return _Track(self._obstacles[index].motion.sample(t), estimated=False)
+
+    def _track(self, index: int, what: Sample | Pose) -> _Track:
+        if isinstance(what, Sample):
+            return _Track(what, estimated=False)
+        before = self._tracks.get(index)
+        linear, angular = np.zeros(3), np.zeros(3)
+        if before is not None:
+            elapsed = (before.age + 1) * self._dt
+            linear = (what.position - before.sample.position) / elapsed
+            angular = pin.log3(what.rotation @ before.sample.rotation.T) / elapsed
+        return _Track(Sample(what.position, what.rotation, linear, angular), estimated=True)
+
+    def _predicted(self, index: int, track: _Track, notes: list[str], stop: list[str]) -> Seen:
+        name, sample, config, age = self._obstacles[index].name, track.sample, self._config, track.age * self._dt
+        moved = sample
+        if sample.linear.any() or sample.angular.any():
+            turned = pin.exp3(age * sample.angular) @ sample.rotation
+            moved = sample._replace(position=sample.position + age * sample.linear, rotation=turned)
+        margin = 0.0
+        if config.stale_after is not None and age > config.stale_after:
+            margin = config.margin_growth * (age - config.stale_after)
+            notes.append(f"{name}: not seen for {age:.3f} s, margin {1e3 * margin:.0f} mm")
+            if config.stop_after is not None and age > config.stop_after:
+                stop.append(f"{name}: not seen for {age:.3f} s")
+        return Seen(index, moved, margin)
