@@ -103,6 +103,37 @@ class Assembly:
         worst = float(kernels.tracking_shortfall(self._packed, len(problem.avoidance.d)))
         return problem._replace(tracking=Tracking(self._eye, x.v0, 0.0), shortfall=worst)
 
+    def redirected(self, problem: Problem, frame: int, velocity: Array) -> Problem:
+        """The problem of this tick with a velocity (3,) added to the linear one that a task asks for [m/s].
+
+        Args:
+            problem: as `compute` gave it.
+            frame: which task.
+            velocity: world [m/s].
+        """
+        x = self._layout
+        rows = slice(3 * frame, 3 * frame + 3)
+        b = x.b.copy()
+        x.b[rows] += x.scale[rows] * velocity
+        v0 = np.empty_like(x.v0)
+        kernels.damped_solution(self._packed, v0)
+        tracking = Tracking(x.A, x.b.copy(), x.damping)
+        x.b[:] = b
+        near = problem.avoidance
+        worst = float(kernels.shortfall(v0, near.J, near.b, x.lower, x.upper))
+        return problem._replace(tracking=tracking, v0=v0, shortfall=worst)
+
+    def fastest_frame(self) -> int:
+        """The task that asks for the largest linear speed."""
+        x = self._layout
+        linear = (x.b / x.scale)[: 3 * len(x.targets)].reshape(-1, 3)
+        return int(np.argmax(np.linalg.norm(linear, axis=1)))
+
+    def frame_velocity(self, frame: int, v: Array) -> Array:
+        """Linear velocity (3,) of a task's frame at v [m/s]."""
+        rows = slice(3 * frame, 3 * frame + 3)
+        return np.asarray(self._layout.A[rows] @ v / self._layout.scale[rows])
+
     def remember(self, v: Array) -> None:
         """Takes v (nv,) as the velocity at which the robot moves until the next tick."""
         self._layout.v_last[:] = v

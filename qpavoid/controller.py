@@ -12,7 +12,7 @@ import numpy as np
 
 from qpavoid import kernels
 from qpavoid.assembly import Assembly
-from qpavoid.config import Avoidance, Limits, ScenarioConfig, Sensing
+from qpavoid.config import Avoidance, Limits, Progress, ScenarioConfig, Sensing
 from qpavoid.errors import UnknownName, located
 from qpavoid.guard import TOLERANCE, Guard
 from qpavoid.kinematics import ForwardKinematics, Kinematics
@@ -20,6 +20,7 @@ from qpavoid.limits import saturate
 from qpavoid.loading import nearest
 from qpavoid.motion import Sample
 from qpavoid.problem import Array, Problem, Proximity, Solution, State, Status, as_vector
+from qpavoid.progress import ProgressWatch
 from qpavoid.proximity import DistanceQuery
 from qpavoid.robot import Robot
 from qpavoid.scene import Scene, build_obstacles, build_scene
@@ -54,6 +55,7 @@ class Controller:
         limits: Limits | None = None,
         tracking_damping: float = 0.01,
         sensing: Sensing | None = None,
+        progress: Progress | None = None,
     ) -> None:
         """Lays out the memory of the tick.
 
@@ -66,6 +68,7 @@ class Controller:
             limits: use of the joint limits; the defaults of a scenario if left out.
             tracking_damping: λ of the damped J⁺ [-].
             sensing: what is made of obstacles without news; the defaults of a scenario if left out.
+            progress: when a task counts as blocked, and whether a way round is tried; likewise.
 
         Raises:
             UnknownName, SolverNotInstalled: of the solver.
@@ -79,6 +82,7 @@ class Controller:
         self._q_shape, self._v_shape = (model.nq,), (model.nv,)
         self._frame_index = {task.settings.frame: i for i, task in enumerate(tasks)}
         self._obstacles = Obstacles(scene.obstacles, sensing or Sensing(), dt)
+        self._progress = ProgressWatch(progress or Progress(), dt, scene.pair_names)
         self._reach = self.avoidance.d2 - self.avoidance.offset
         self._bounds = scene.robot.bounds().within(self.limits)
         self._assembly = Assembly(
@@ -125,6 +129,7 @@ class Controller:
             scenario.limits,
             scenario.tracking_damping,
             scenario.sensing,
+            scenario.progress,
         )
         return controller, q0
 
@@ -196,6 +201,7 @@ class Controller:
         """Forgets the ticks before: the robot moves at v (nv,), or stands still."""
         self._assembly.remember(np.zeros(self._v_shape) if v is None else as_vector("v", v, self._v_shape))
         self._obstacles.reset()
+        self._progress.reset()
 
     def _compute(
         self,
@@ -228,7 +234,14 @@ class Controller:
         if desired is not None:
             problem = self._assembly.follow(desired, problem)
         built = perf_counter()
-        solution = self._stop(faults) if faults else self._solve(q, problem)
+        if faults:
+            solution = self._stop(faults)
+        elif desired is not None:
+            solution = self._solve(q, problem)
+        else:
+            solution = self._solve(q, self._progress.redirect(problem, proximity, self._assembly, self.solver))
+            blocked = self._progress.update(problem, solution)
+            solution = solution._replace(blocked=blocked) if blocked else solution
         self._assembly.remember(solution.v)
         solution = solution._replace(assumed=assumed) if assumed else solution
         return samples, proximity, problem, solution.timed(built - begin, perf_counter() - built)

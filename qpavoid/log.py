@@ -20,7 +20,7 @@ from qpavoid.problem import Array, IntArray, Status
 
 STATUSES = tuple(Status)
 """Status of each code in `Log.status`."""
-_FORMAT = 1
+_FORMAT = 2
 _LARGEST = 2_000_000_000
 """What a log may take in memory [bytes]; a small file can unpack to a thousand times its size."""
 _SHAPES = {
@@ -67,6 +67,10 @@ class Log:
     """(N,) index in STATUSES."""
     slack: Array
     """(N,) largest slack of an avoidance row [m/s]."""
+    share: Array
+    """(N,) share of the law's velocity that was left after looking ahead; the rest was a stop's."""
+    blocked: npt.NDArray[np.bool_]
+    """(N,) whether something kept the tasks from going on."""
     saturation: Array
     """(N,) largest change that the limits made to the raw law [rad/s or m/s]."""
     build_time: Array

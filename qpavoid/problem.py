@@ -178,6 +178,8 @@ class Solution(NamedTuple):
     """(k,) what each avoidance row gave way [m/s]; None when none did."""
     share: float = 1.0
     """How much of the law's velocity is left after looking ahead; the rest is the velocity of a stop."""
+    blocked: tuple[str, ...] = ()
+    """What keeps the tasks from going on, once they have not for a while."""
     assumed: tuple[str, ...] = ()
     """What the tick took for granted, such as the twist of an obstacle that was given without one."""
     saturation: float = 0.0

@@ -16,9 +16,13 @@ from qpavoid.controller import Controller, Tick
 from qpavoid.errors import ConfigError, NumericalError
 from qpavoid.loading import load_scenario
 from qpavoid.log import STATUSES, Log, versions
-from qpavoid.problem import Array
+from qpavoid.problem import Array, Solution, Status
 from qpavoid.proximity import DistanceQuery
 from qpavoid.solvers import parse_solver
+
+
+_MOST_EVENTS = 1000
+"""Number of events that a log keeps."""
 
 
 class StartWarning(UserWarning):
@@ -102,13 +106,16 @@ class Recorder:
         shapes: dict[str, tuple[int, ...]] = {
             "t": (), "q": (model.nq,), "v": (model.nv,),
             "target": (tasks, 3), "tool": (tasks, 3), "tool_rotation": (tasks, 3, 3), "turn_error": (tasks,),
-            "body_distance": (bodies,), "alpha": (), "beta": (), "slack": (), "saturation": (),
+            "body_distance": (bodies,), "alpha": (), "beta": (), "slack": (), "share": (), "saturation": (),
             "build_time": (), "solve_time": (),
             "body_ends": (bodies, 2, 3), "obstacle_position": (obstacles, 3), "obstacle_rotation": (obstacles, 3, 3),
         }  # fmt: skip
         self._arrays: dict[str, Any] = {name: np.zeros((ticks, *shape)) for name, shape in shapes.items()}
         self._arrays["closest_pair"] = np.full(ticks, -1, dtype=np.intp)
         self._arrays["status"] = np.zeros(ticks, dtype=np.int8)
+        self._arrays["blocked"] = np.zeros(ticks, dtype=np.bool_)
+        self._events: list[list[Any]] = []
+        self._said: tuple[str, ...] = ()
         self._count = 0
 
     def add(self, tick: Tick) -> None:
@@ -127,6 +134,8 @@ class Recorder:
         values = {
             "t": state.t,
             "slack": 0.0 if solution.slack is None else float(np.max(solution.slack, initial=0.0)),
+            "share": solution.share,
+            "blocked": bool(solution.blocked),
             "saturation": solution.saturation,
             "build_time": solution.build_time,
             "solve_time": solution.solve_time,
@@ -139,6 +148,16 @@ class Recorder:
         for name, value in values.items():
             scalars[name][self._count] = value
         self._count += 1
+        self._note(state.t, solution)
+
+    def _note(self, t: float, solution: Solution) -> None:
+        """Keeps what a tick says, when it says something else than the one before."""
+        named = tuple(line.partition(":")[0] for line in (*solution.reasons, *solution.blocked, *solution.assumed))
+        said = (solution.status.value, *named)
+        if said != self._said and (solution.status is not Status.SOLVED or named) and len(self._events) < _MOST_EVENTS:
+            lines = [*solution.reasons, *solution.blocked, *solution.assumed]
+            self._events.append([t, solution.status.value, lines])
+        self._said = said
 
     def _write_bodies(self, tick: Tick, rows: dict[str, Array]) -> None:
         scene = self._scene
@@ -176,6 +195,7 @@ class Recorder:
             "source": self._scenario.source.name,
             "completed": stopped_by is None and self._count == len(self._arrays["t"]),
             "stopped_by": stopped_by,
+            "events": self._events,
             "robot": robot.name,
             "notes": list(robot.notes),
             "coordinates": robot.coordinate_names,

@@ -129,3 +129,23 @@ class Sensing(Block):
         if self.stop_after is not None and (self.stale_after is None or self.stop_after < self.stale_after):
             raise ValueError("stop_after needs a stale_after that is not longer")
         return self
+
+
+class Detour(Block):
+    """A way round what blocks a task: circulation along its tangent."""
+
+    speed: Positive = 0.1
+    """Speed along the tangent, added to the task's [m/s]."""
+    settle: NonNegative = 0.3
+    """Time for which the way has to be free before the detour ends [s]."""
+    longest: Positive = 15.0
+    """Time after which a detour is given up [s]; the other side is tried then, once."""
+
+
+class Progress(Block):
+    """When a task counts as blocked, and what is done about it."""
+
+    blocked_after: Positive = 1.0
+    """Time without progress after which it is said [s]."""
+    detour: Detour | None = None
+    """Way round; left out: none is tried."""

@@ -8,7 +8,7 @@ from typing import Annotated
 from pydantic import Field, PrivateAttr, model_validator
 
 from qpavoid.config.base import Block, NonNegative, Number, Positive
-from qpavoid.config.control import Avoidance, Limits, Sensing, Task
+from qpavoid.config.control import Avoidance, Limits, Progress, Sensing, Task
 from qpavoid.config.motion import Circle, Fixed, Line, Motion
 from qpavoid.config.shapes import Shape
 from qpavoid.config.solver import QpSolver, SolverConfig
@@ -47,6 +47,7 @@ class ScenarioConfig(Block):
     avoidance: Avoidance = Avoidance()
     limits: Limits = Limits()
     sensing: Sensing = Sensing()
+    progress: Progress = Progress()
     solver: SolverConfig = QpSolver()
     """A name (`eq10`, `qp:osqp`) or a mapping with that solver's settings."""
     dt: Annotated[float, Field(gt=0, le=0.1)] = 0.01

@@ -144,14 +144,14 @@ def closest_call(x: Any, v: Array, k: int, reach: float, horizon: float) -> floa
         vx, vy, vz = twist[0] + wy * cz - wz * cy, twist[1] + wz * cx - wx * cz, twist[2] + wx * cy - wy * cx
         turning = np.sqrt(wx * wx + wy * wy + wz * wz)
         speed[i] = np.sqrt(vx * vx + vy * vy + vz * vz) + turning * sphere[3]
-        fastest = max(fastest, speed[i])
+        fastest = np.maximum(fastest, speed[i])  # keeps NaN, unlike max
     any_fastest = fastest
     for i in range(len(x.body_support), len(speed)):
-        any_fastest = max(any_fastest, speed[i])
+        any_fastest = np.maximum(any_fastest, speed[i])
     least = reach + x.offset - x.hold - (fastest + any_fastest) * horizon
     for i in range(k):
         a, b = x.bodies[x.near[i], 0], x.bodies[x.near[i], 1]
-        least = np.minimum(least, x.d[i] - x.hold - (speed[a] + speed[b]) * horizon)  # keeps NaN, unlike min
+        least = np.minimum(least, x.d[i] - x.hold - (speed[a] + speed[b]) * horizon)
     return least
 
 
