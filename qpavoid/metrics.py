@@ -22,9 +22,9 @@ def run_metrics(log: Log) -> dict[str, Any]:
         collided; min_distance: surface to surface [m], None where nothing is paired; min_pair: names of that pair;
         time_in_collision [s]; time_below: threshold -> [s]; final_error [m]; max_deviation: largest distance of a tool
         from its planned path [m]; tracking_rmse: of the distance to the moving target [m]; peak_velocity: fastest
-        joint [rad/s or m/s]; jitter: Σ|Δq̇| over joints and ticks [rad/s]; status_counts; relaxed_ticks; shortened_ticks: drawn back
-        after looking ahead; time_blocked [s]; tick_us: p50,
-        p99 and max of the tick's time [µs].
+        joint [rad/s or m/s]; jitter: Σ|Δq̇| over joints and ticks [rad/s]; status_counts; relaxed_ticks;
+        shortened_ticks: drawn back after looking ahead; time_blocked [s]; tick_us: p50, p99 and max of the tick's
+        time [µs].
     """
     config, dt = log.meta["config"], log.meta["config"]["dt"]
     distance = log.min_distance

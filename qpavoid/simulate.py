@@ -20,7 +20,6 @@ from qpavoid.problem import Array, Solution, Status
 from qpavoid.proximity import DistanceQuery
 from qpavoid.solvers import parse_solver
 
-
 _MOST_EVENTS = 1000
 """Number of events that a log keeps."""
 
