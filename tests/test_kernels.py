@@ -8,12 +8,13 @@ from importlib import import_module
 import numpy as np
 import pinocchio as pin
 import pytest
+from conftest import make_layout
+
+from qpavoid.kernels.layout import RowLayout
 
 SEEDS = range(8)
-NAMES = (
-    *("candidates", "closing_speed_bound", "damped_solution", "distance_rows", "frame_rows", "projection_cost"),
-    *("shortfall", "tracking_shortfall", "velocity_bounds"),
-)
+OF_PAIRS = ("near", "closest", "J", "drift", "d", "least")
+"""Outputs of which only what belongs to near pairs counts."""
 
 
 def version(name):
@@ -26,6 +27,11 @@ def version(name):
 def kernels(request):
     """Each version in turn."""
     return version(request.param)
+
+
+def run(kernels, name, x, *args):
+    """Packs a layout and calls a kernel with it."""
+    return getattr(kernels, name)(kernels.pack(x), *args)
 
 
 def call(function, args):
@@ -46,6 +52,30 @@ def check_parity(name, *args):
     return expected
 
 
+def assert_same(found, expected, k):
+    """Two layouts hold the same, of pairs the first k."""
+    for name in RowLayout._fields:
+        a, b = getattr(found, name), getattr(expected, name)
+        if name in OF_PAIRS:
+            a, b = a[:k], b[:k]
+        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12, err_msg=name)
+
+
+def both(make, name, *args, k=0):
+    """Runs a kernel of both versions, each on a layout of its own: they return and leave the same.
+
+    Gives what the vectorised one returns, and the layout as it leaves it.
+    """
+    x, y = make(), make()
+    expected, found = run(version("vectorised"), name, x, *args), run(version("compiled"), name, y, *args)
+    if expected is not None:
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+    if name in ("assemble", "distance_rows"):
+        k = int(np.ravel(expected)[0])
+    assert_same(y, x, k)
+    return expected, x
+
+
 def gaps(array, columns):
     """The same as a read-only view into rows of `columns` doubles, as coal and Pinocchio hold them in memory."""
     buffer = np.full((len(array), columns), np.nan)
@@ -64,11 +94,76 @@ def poses_of(R, p, columns=12):
     return gaps(np.hstack((R.swapaxes(1, 2).reshape(-1, 9), p)), columns)
 
 
+def random_layout(seed, frames=2, turns=(1,), pairs=9, nv=7, obstacles=3, robot=4, views=True, plain=False, **fields):
+    """Memory of a tick of a robot that nobody has built: any number in any place that the layout allows.
+
+    Args:
+        seed: of the random numbers.
+        frames: number of tracked frames, of two more that the robot has.
+        turns: which of them have an orientation to follow.
+        pairs: number of them.
+        nv: number of velocity coordinates.
+        obstacles: number of them.
+        robot: number of bodies of the robot.
+        views: whether poses and results stand in memory with gaps, as those of Pinocchio and coal do.
+        plain: whether every coordinate has a position limit and the same place in q and v; else two do not.
+        fields: in place of the random ones.
+    """
+    rng = np.random.default_rng(seed)
+    rows, capped = 3 * (frames + len(turns)), frames + len(turns)
+    scale = rng.uniform(0.5, 2.0, rows)
+    results = rng.normal(size=(pairs, 10))
+    results[:, 1:4] /= np.linalg.norm(results[:, 1:4], axis=1, keepdims=True)
+    poses = poses_of(rotations(rng, frames + 2), rng.normal(size=(frames + 2, 3)), 14 if views else 12)
+    targets = np.hstack(
+        (rng.normal(size=(frames, 3)), rotations(rng, frames).reshape(-1, 9), rng.normal(size=(frames, 6)))
+    )
+    limited = np.arange(nv) if plain else np.delete(np.arange(nv), [0, nv // 2][: nv - 1])
+    q_lower = rng.uniform(-2.0, 0.0, len(limited))
+    v_step = np.where(rng.random(nv) < 0.7, rng.uniform(0.01, 0.5, nv), np.inf)
+    random = {
+        "J_world": np.asfortranarray(rng.normal(size=(6, nv))),
+        "frame_poses": poses if views else np.array(poses),
+        "frame_ids": rng.permutation(frames + 2)[:frames],
+        "targets": targets,
+        "gain": rng.uniform(0.5, 3.0, frames),
+        "cap": np.where(rng.random(capped) < 0.5, rng.uniform(0.1, 2.0, capped), np.inf),
+        "scale": scale,
+        "task_support": scale[:, None] * rng.integers(0, 2, (rows, nv)),
+        "results": gaps(results, 17) if views and pairs > 1 else results,
+        "support": rng.integers(-1, 2, (pairs, nv)).astype(float),
+        "twists": np.vstack((rng.normal(size=(obstacles, 6)), np.zeros(6))),
+        "twist_row": rng.integers(0, obstacles + 1, pairs),
+        "margin": np.append(rng.choice([0.0, 0.02, 0.1], obstacles), 0.0),
+        "bodies": np.sort(rng.permuted(np.tile(np.arange(robot + obstacles), (pairs, 1)), axis=1)[:, :2], axis=1),
+        "body_poses": poses_of(rotations(rng, robot + obstacles), rng.normal(size=(robot + obstacles, 3)), 12),
+        "spheres": rng.uniform(0.05, 0.3, (robot + obstacles, 4)),
+        "body_support": rng.integers(0, 2, (robot, nv)).astype(float),
+        "body_speed": np.append(np.full(robot, np.nan), rng.uniform(0.0, 0.5, obstacles)),
+        "q_index": limited + (0 if plain else 1),
+        "v_index": limited,
+        "q_lower": np.where(rng.random(len(limited)) < 0.2, -np.inf, q_lower),
+        "q_upper": np.where(rng.random(len(limited)) < 0.2, np.inf, q_lower + rng.uniform(0.5, 3.0, len(limited))),
+        "v_max": np.where(rng.random(nv) < 0.8, rng.uniform(0.1, 5.0, nv), np.inf),
+        "v_step": v_step,
+        "v_last": rng.uniform(-5.0, 5.0, nv),
+        "accelerated": bool(np.isfinite(v_step).any()),
+        "damping": 0.1,
+        "offset": 0.03,
+    }
+    return make_layout(nv, frames, turns, pairs, obstacles, robot, **{**random, **fields})
+
+
+NO_LIMIT = {"v_step": np.full(7, np.inf), "accelerated": False}
+
+
 def test_there_are_two_versions_of_everything():
     import qpavoid.kernels as used
 
-    assert set(NAMES) == set(used.__all__) - {"ACCELERATED"}
-    for name in NAMES:
+    plain = version("vectorised")
+    functions = {name for name, value in vars(plain).items() if getattr(value, "__module__", "") == plain.__name__}
+    assert set(used.__all__) - {"ACCELERATED"} == functions - {"Workspace", "rotation_vector", "speed_to_stop"}
+    for name in set(used.__all__) - {"ACCELERATED"}:
         assert getattr(used, name) is getattr(version("compiled" if used.ACCELERATED else "vectorised"), name)
 
 
@@ -79,7 +174,8 @@ def spheres(seed, bodies=5, geometries=12, size=1.0, columns=12):
     """Random bounding spheres: arguments of `candidates`, and the pairs that a look at each combination finds."""
     rng = np.random.default_rng(seed)
     R, p = rotations(rng, geometries), rng.uniform(-1, 1, (geometries, 3))
-    local, touching = rng.uniform(-0.3, 0.3, (geometries, 3)), size * rng.uniform(0.2, 1.5, (bodies, geometries))
+    local, radius = rng.uniform(-0.3, 0.3, (geometries, 3)), size * rng.uniform(0.1, 0.6, geometries)
+    reach = size * rng.uniform(-0.05, 0.3)
     world = np.array([R[i] @ local[i] + p[i] for i in range(geometries)])
     pair_of = np.full((bodies, geometries), -1)
     combinations = [(i, j) for i in range(bodies) for j in range(i + 1, geometries) if rng.random() < 0.8]
@@ -88,118 +184,152 @@ def spheres(seed, bodies=5, geometries=12, size=1.0, columns=12):
     centers = np.ones((geometries, 5))
     centers[:, :3] = world
     centers[:, 4] = -np.sum(world**2, axis=1)
-    expected = sorted(pair_of[i, j] for i, j in combinations if np.linalg.norm(world[i] - world[j]) <= touching[i, j])
+    expected = sorted(
+        pair_of[i, j] for i, j in combinations if np.linalg.norm(world[i] - world[j]) <= radius[i] + radius[j] + reach
+    )
     left = centers.copy()
     left[:bodies, [0, 1, 2, 4]] = np.nan  # to be overwritten
-    within = np.where(pair_of >= 0, touching**2, -1.0)
-    return (poses_of(R, p, columns), local, left, within, pair_of), expected, centers
+    found = np.full(len(combinations), -7)
+    return [poses_of(R, p, columns), local, left, radius, pair_of, reach, found], expected, centers
+
+
+def found_by(kernels, args):
+    """The pairs that `candidates` gives; it leaves the rest of their array alone."""
+    count, found = kernels.candidates(*args), args[-1]
+    assert (found[count:] == -7).all()
+    return found[:count].tolist()
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_candidates_are_the_pairs_whose_spheres_are_within_reach(kernels, seed):
     args, expected, centers = spheres(seed)
     assert 0 < len(expected) < (args[4] >= 0).sum()
-    found = kernels.candidates(*args)
-    assert found.dtype == np.intp and found.tolist() == expected
+    assert found_by(kernels, args) == expected
     np.testing.assert_allclose(args[2], centers, rtol=0, atol=1e-14)
 
 
 def test_candidates_none_one_and_all(kernels):
-    assert kernels.candidates(*spheres(0, size=0.0)[0]).tolist() == []
+    assert found_by(kernels, spheres(0, size=0.0)[0]) == []
     args, _, _ = spheres(1)
-    args[3][args[4] >= 0] = np.inf
-    assert kernels.candidates(*args).tolist() == list(range((args[4] >= 0).sum()))
+    args[5] = np.inf
+    assert found_by(kernels, args) == list(range((args[4] >= 0).sum()))
+    args, _, _ = spheres(1)
     args[4][:] = np.where(args[4] == 3, 0, -1)
-    args[3][args[4] < 0] = -1.0
-    assert kernels.candidates(*args).tolist() == [0]
+    args[5] = np.inf
+    assert found_by(kernels, args) == [0]
 
 
 def test_candidates_include_spheres_that_just_touch(kernels):
-    """3-4-5 triangles: 25e-2 is within 25e-2 (1 + 1e-9), and not within 25e-2 (1 - 1e-9)."""
+    """3-4-5 triangles: radii and reach of 0.5 m together touch, and those that miss by 1e-9 do not."""
     world = np.array([[0.0, 0, 0], [0.3, 0.4, 0], [0, -0.3, 0.4], [0.4, 0, -0.3]])
     poses = poses_of(np.array([np.eye(3)] * 4), world)
-    for sign, expected in ((1, [0, 1, 2]), (-1, [])):
+    for share, expected in ((1.0, [0, 1, 2]), (1.0 - 1e-9, [])):
         centers = np.hstack((world, np.ones((4, 1)), -np.sum(world**2, axis=1, keepdims=True)))
-        within = np.array([[-1.0, *[0.25 * (1 + sign * 1e-9)] * 3]])
-        pair_of = np.array([[-1, 0, 1, 2]])
-        assert kernels.candidates(poses, np.zeros((4, 3)), centers, within, pair_of).tolist() == expected
+        radius = share * np.array([0.1, 0.15, 0.15, 0.15])
+        pair_of, found = np.array([[-1, 0, 1, 2]]), np.full(3, -7)
+        args = [poses, np.zeros((4, 3)), centers, radius, pair_of, share * 0.25, found]
+        assert found_by(kernels, args) == expected
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_candidates_of_both_versions(seed):
     for size in (0.0, 0.5, 1.0, 100.0):
         args, expected, _ = spheres(seed, bodies=1 + 3 * seed, geometries=2 + 8 * seed, size=size, columns=12 + seed)
-        assert check_parity("candidates", *args)[0].tolist() == expected
+        count = check_parity("candidates", *args)[0]
+        assert found_by(version("vectorised"), args) == expected and count == len(expected)
 
 
 # --- distances ---------------------------------------------------------------------------------------------------
 
 
-def distances(seed, pairs=9, nv=7, obstacles=3, columns=17):
-    """Random arguments of `distance_rows`: every other pair is looked at, some of these are near."""
-    rng = np.random.default_rng(seed)
-    results = rng.normal(size=(pairs, 10))
-    results[:, 1:4] /= np.linalg.norm(results[:, 1:4], axis=1, keepdims=True)
-    chosen = np.flatnonzero(rng.random(pairs) < 0.7)
-    twists = np.vstack((rng.normal(size=(obstacles, 6)), np.zeros(6)))
-    support = rng.integers(-1, 2, (pairs, nv)).astype(float)
-    J = np.asfortranarray(rng.normal(size=(6, nv)))
-    return [gaps(results, columns), chosen, 0.5, J, support, twists, rng.integers(0, obstacles + 1, pairs), True]
+def chosen(pairs, seed=0):
+    """Some of the pairs."""
+    return np.flatnonzero(np.random.default_rng(seed).random(pairs) < 0.7)
 
 
 @pytest.mark.parametrize("moving", [True, False])
 @pytest.mark.parametrize("seed", SEEDS)
 def test_rate_of_a_distance_is_that_of_the_witness_points_along_the_normal(kernels, seed, moving):
     """ḋ = n·(ṗ_b - ṗ_a), each point carried by the joints that move its body, and by its obstacle."""
-    args = distances(seed, pairs=40)
-    results, chosen, reach, J_world, support, twists, twist_row, _ = args
-    args[-1] = moving
+    x, pairs = random_layout(seed, pairs=40), chosen(40, seed)
     if not moving:
-        twists[:] = 0.0
-    near, closest, J, drift = kernels.distance_rows(*args)
-    expected = [i for i in chosen if results[i, 0] < reach]
-    assert len(expected) < len(chosen) < len(results)
-    assert near.dtype == np.intp and near.tolist() == expected
-    np.testing.assert_array_equal(closest, results[expected])
-    for k, i in enumerate(expected):
-        n, p = results[i, 1:4], results[i, 4:7]
+        x.twists[:] = 0.0
+    k = run(kernels, "distance_rows", x, pairs, 0.5, moving)
+    expected = [i for i in pairs if x.results[i, 0] < 0.5]
+    assert 0 < len(expected) < len(pairs) < 40
+    assert x.near[:k].tolist() == expected
+    np.testing.assert_array_equal(x.closest[:k], x.results[expected])
+    for j, i in enumerate(expected):
+        n, p = x.results[i, 1:4], x.results[i, 4:7]
 
         def speed(twist, n=n, p=p):
             return n @ (twist[:3] + np.cross(twist[3:], p))
 
-        np.testing.assert_allclose(J[k], [speed(twist) for twist in J_world.T] * support[i], rtol=0, atol=1e-13)
-        assert drift[k] == pytest.approx(speed(twists[twist_row[i]]), abs=1e-13)
+        np.testing.assert_allclose(x.J[j], [speed(twist) for twist in x.J_world.T] * x.support[i], rtol=0, atol=1e-13)
+        assert x.drift[j] == pytest.approx(speed(x.twists[x.twist_row[i]]), abs=1e-13)
 
 
 def test_a_pair_exactly_at_the_reach_is_not_near(kernels):
-    args = distances(0, pairs=3)
-    results = np.array(args[0])
+    results = np.random.default_rng(0).normal(size=(3, 10))
     results[:, 0] = 0.5, np.nextafter(0.5, 0.0), -0.5
-    args[0], args[1] = gaps(results, 17), np.arange(3)
-    assert kernels.distance_rows(*args)[0].tolist() == [1, 2]
+    x = random_layout(0, pairs=3, results=gaps(results, 17))
+    assert run(kernels, "distance_rows", x, np.arange(3), 0.5, True) == 2
+    assert x.near[:2].tolist() == [1, 2]
 
 
-@pytest.mark.parametrize("columns", [10, 17])
-def test_no_pair_near(kernels, columns):
-    args = distances(0, columns=columns)
-    for chosen, reach in ((args[1], -np.inf), (args[1][:0], np.inf)):
-        near, closest, J, drift = kernels.distance_rows(args[0], chosen, reach, *args[3:])
-        assert (near.shape, closest.shape, J.shape, drift.shape) == ((0,), (0, 10), (0, 7), (0,))
-        assert near.dtype == np.intp
+def test_a_pair_whose_distance_is_not_a_number_is_near(kernels):
+    """And no bound is made up for it: what is left is NaN, which no velocity meets."""
+    results = np.random.default_rng(0).normal(size=(3, 10))
+    results[:, 0] = 9.0, np.nan, 0.2
+    for fields in (NO_LIMIT, {}):
+        x = random_layout(0, pairs=3, results=gaps(results, 17), **fields)
+        k, worst = run(kernels, "assemble", x, np.zeros(8), np.arange(3), 0.5, True)
+        assert x.near[:k].tolist() == [1, 2]
+        assert np.isnan(x.least[:k]).tolist() == [True, False] and np.isnan(worst)
 
 
-@pytest.mark.parametrize("columns", [10, 13, 17])
+@pytest.mark.parametrize("views", [True, False])
+def test_no_pair_near(kernels, views):
+    x = random_layout(0, views=views)
+    assert run(kernels, "distance_rows", x, np.arange(9), -np.inf, True) == 0
+    assert run(kernels, "distance_rows", x, np.arange(0), np.inf, True) == 0
+
+
+def test_an_obstacle_that_comes_to_rest_leaves_no_drift(kernels):
+    x = random_layout(0)
+    packed = kernels.pack(x)
+    drifts = []
+    for moving in (False, True, False):
+        x.twists[:-1] = float(moving)
+        assert kernels.distance_rows(packed, np.arange(9), np.inf, moving) == 9
+        drifts.append(np.abs(x.drift).max())
+    assert drifts[0] == drifts[2] == 0.0 < drifts[1]
+
+
+@pytest.mark.parametrize("views", [True, False])
 @pytest.mark.parametrize("pairs", [0, 1, 2, 50])
-def test_distance_rows_of_both_versions(pairs, columns):
+def test_distance_rows_of_both_versions(pairs, views):
     for seed in SEEDS:
-        args = distances(seed, pairs=pairs, nv=1 + seed, columns=columns)
-        check_parity("distance_rows", *args)
-        every = np.arange(pairs)
-        assert len(check_parity("distance_rows", args[0], every, np.inf, *args[3:])[0]) == pairs
-        check_parity("distance_rows", args[0], every, 0.0, np.ascontiguousarray(args[3]), *args[4:-1], False)
+
+        def make(seed=seed):
+            return random_layout(seed, pairs=pairs, nv=2 + seed, views=views)
+
+        both(make, "distance_rows", chosen(pairs, seed), 0.5, True)
+        assert both(make, "distance_rows", np.arange(pairs), np.inf, True)[0] == pairs
+        both(make, "distance_rows", np.arange(pairs), 0.0, False)
 
 
 # --- bounds of rows ----------------------------------------------------------------------------------------------
+
+
+def rows_at(d, **fields):
+    """Memory in which rows of all pairs are made, at distances d."""
+    count = len(d)
+    closest = np.zeros((count, 10))
+    closest[:, 0] = d
+    given = {"closest": closest, "near": np.arange(count), "drift": np.zeros(count), "J": np.ones((count, 7))}
+    bounds = {"lower": np.full(7, -np.inf), "upper": np.full(7, np.inf), "v_stop": np.zeros(7)}
+    return make_layout(7, pairs=count, obstacles=2, **{**given, **bounds, **fields})
 
 
 @pytest.mark.parametrize("switching", [True, False])
@@ -211,66 +341,184 @@ def test_closing_speed_bound_by_its_definition(kernels, switching):
     for cap in (0.2, np.inf):
         raw = gain * (d1 - d)
         expected = np.minimum(np.where(raw > 0.0, raw, (1.0 - beta) * raw) if switching else raw, cap)
-        found = kernels.closing_speed_bound(d, d1, gain, cap, switching, d1, d2)
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-14)
+        x = rows_at(d, row_gain=gain, recovery=cap, switching=switching)
+        run(kernels, "row_bounds", x, len(d), False)
+        np.testing.assert_allclose(x.least, expected, rtol=0, atol=1e-14)
+        np.testing.assert_array_equal(x.d, d)
+
+
+def test_offset_margin_and_drift_of_a_row(kernels):
+    """The offset widens all distances, the margin of an obstacle narrows those to it, its drift counts as motion."""
+    closest, margin, of = np.array([0.20, 0.20, 0.20, 0.02]), np.array([0.01, 0.04, 0.0]), np.array([0, 1, 2, 1])
+    drift = np.array([0.1, -0.2, 0.0, 0.3])
+    x = rows_at(closest, offset=0.05, margin=margin, twist_row=of, drift=drift, switching=False)
+    run(kernels, "row_bounds", x, 4, True)
+    np.testing.assert_allclose(x.d, [0.24, 0.21, 0.25, 0.03], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(x.least, [-0.7 - 0.1, -0.55 + 0.2, -0.75, 0.2 - 0.3], rtol=0, atol=1e-14)
+
+
+def test_margins_are_those_of_the_near_pairs(kernels):
+    """Row i belongs to pair near[i], not to pair i."""
+    x = rows_at(np.full(2, 0.2), switching=False)
+    y = make_layout(7, pairs=4, obstacles=2, **{
+        **{name: np.concatenate((getattr(x, name),) * 2) for name in ("closest", "drift", "J")},
+        "near": np.array([1, 3, -1, -1]), "twist_row": np.array([0, 1, 0, 2]), "margin": np.array([9.0, 0.05, 0.0]),
+        "lower": x.lower, "upper": x.upper, "v_stop": x.v_stop, "switching": False,
+    })  # fmt: skip
+    run(kernels, "row_bounds", y, 2, False)
+    np.testing.assert_allclose(y.d[:2], [0.15, 0.2], rtol=0, atol=1e-15)
+
+
+def filled(seed, pairs=30, **fields):
+    """Memory with all that `row_bounds` reads."""
+    x = random_layout(seed, pairs=pairs, **fields)
+    plain = version("vectorised")
+    packed = plain.pack(x)
+    plain.velocity_bounds(packed, np.random.default_rng(seed).uniform(-3, 3, 8))
+    plain.stop_velocity(packed)
+    assert plain.distance_rows(packed, np.arange(pairs), np.inf, True) == pairs
+    return x
+
+
+def largest(row, lower, upper):
+    """Largest J v within bounds that include a standstill, coordinate by coordinate."""
+    return sum(max(a * low, a * high) for a, low, high in zip(row, lower, upper, strict=True) if a != 0.0)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_row_never_asks_for_more_than_can_be_had(kernels, seed):
+    """To part at most as fast as the bounds allow; not to close no sooner than a stop would end it."""
+    x = filled(seed)
+    x.lower[:], x.upper[:] = np.minimum(x.lower, 0.0), np.maximum(x.upper, 0.0)
+    x.lower[:3], x.upper[:3] = -0.01, 0.01
+    run(kernels, "row_bounds", x, 30, True)
+    raw = x.row_gain * (x.hold - x.d)
+    weight = 0.5 - 0.5 * np.cos(np.pi * np.clip((x.d - x.d1) / (x.d2 - x.d1), 0.0, 1.0))
+    plain = np.minimum(np.where(raw > 0.0, raw, weight * raw), x.recovery) - x.drift
+    assert x.accelerated and (raw > 0.0).any() and (raw < 0.0).any()
+    for i in range(30):
+        if raw[i] > 0.0:
+            expected = min(plain[i], max(largest(x.J[i], x.lower, x.upper), -x.drift[i]))
+        elif x.drift[i] >= 0.0:
+            expected = min(plain[i], x.J[i] @ x.v_stop)
+        else:
+            expected = plain[i]
+        assert x.least[i] == pytest.approx(expected, abs=1e-13)
 
 
 @pytest.mark.parametrize("pairs", [0, 1, 100])
-def test_closing_speed_bounds_of_both_versions(pairs):
-    d = np.random.default_rng(0).uniform(-0.2, 0.5, pairs)
-    for switching in (True, False):
-        for cap in (0.2, np.inf):
-            check_parity("closing_speed_bound", d, 0.1, 5.0, cap, switching, 0.1, 0.3)
-    check_parity("closing_speed_bound", d, 0.2, 5.0, 0.2, False, 0.1, 0.3)
+def test_row_bounds_of_both_versions(pairs):
+    for seed in SEEDS:
+        for fields in (
+            {}, {"switching": False, "recovery": np.inf}, {"switching": False, "hold": 0.2}, NO_LIMIT,
+            {"margin": np.zeros(4)},
+        ):  # fmt: skip
+
+            def make(seed=seed, fields=fields):
+                return filled(seed, pairs, **fields)
+
+            both(make, "row_bounds", pairs, True, k=pairs)
+
+
+# --- looking ahead -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_no_point_of_a_body_is_faster_than_it_is_said_to_be(kernels, seed):
+    """Nor is the bound a loose one: it is reached where the body does not turn, and at most √2 too large elsewhere."""
+    rng = np.random.default_rng(seed)
+    x, v = filled(seed), rng.normal(size=7)
+    run(kernels, "closest_call", x, v, 30, 0.5, 0.1)
+    for i, (pose, (*center, radius)) in enumerate(zip(x.body_poses[:4], x.spheres[:4], strict=True)):
+        twist = x.J_world @ (v * x.body_support[i])
+        offsets = rng.normal(size=(2000, 3))
+        offsets *= radius / np.linalg.norm(offsets, axis=1, keepdims=True)
+        points = pose[:9].reshape(3, 3).T @ center + pose[9:] + offsets
+        speeds = np.linalg.norm(twist[:3] + np.cross(twist[3:], points), axis=1)
+        assert speeds.max() <= x.body_speed[i] <= 1.01 * np.sqrt(2.0) * speeds.max()
+    y = random_layout(seed, J_world=np.asfortranarray(np.vstack((x.J_world[:3], np.zeros((3, 7))))))
+    run(kernels, "closest_call", y, v, 0, 0.5, 0.1)
+    expected = np.linalg.norm((y.body_support * v) @ y.J_world[:3].T, axis=1)
+    np.testing.assert_allclose(y.body_speed[:4], expected, rtol=1e-13)
+
+
+@pytest.mark.parametrize("near", [0, 1, 30])
+def test_closest_call_is_the_least_that_the_fastest_points_leave(kernels, near):
+    """Of the near pairs at their own distances, of all others at the reach."""
+    for seed in SEEDS:
+        x, v = filled(seed), np.random.default_rng(seed).normal(size=7)
+        run(kernels, "row_bounds", x, 30, True)
+        found = run(kernels, "closest_call", x, v, near, 0.5, 0.1)
+        speed = x.body_speed
+        left = [x.d[i] - x.hold - 0.1 * speed[x.bodies[i]].sum() for i in range(near)]
+        others = 0.5 + x.offset - x.hold - 0.1 * (speed[:4].max() + speed.max())
+        assert found == pytest.approx(min([others, *left]), abs=1e-14)
+        v[:] = np.nan
+        assert np.isnan(run(kernels, "closest_call", x, v, near, 0.5, 0.1))
+
+
+@pytest.mark.parametrize("pairs", [0, 1, 30])
+def test_closest_calls_of_both_versions(pairs):
+    for seed in SEEDS:
+        v = np.random.default_rng(seed).normal(size=7)
+
+        def make(seed=seed):
+            x = filled(seed, pairs)
+            run(version("vectorised"), "row_bounds", x, pairs, True)
+            return x
+
+        both(make, "closest_call", v, pairs, 0.5, 0.1, k=pairs)
 
 
 # --- frames ------------------------------------------------------------------------------------------------------
-
-
-def frames(seed, count, turns, nv=7):
-    """Random arguments of `frame_rows` for frames of which `turns` have orientations."""
-    rng = np.random.default_rng(seed)
-    turns = np.array(turns, dtype=np.intp)
-    rows = 3 * (count + len(turns))
-    screws = np.zeros((rows, 6))
-    screws[: 3 * count, :3] = np.tile(np.eye(3), (count, 1))
-    screws[3 * count :, 3:] = np.tile(np.eye(3), (len(turns), 1))
-    poses = np.array(poses_of(rotations(rng, count), rng.normal(size=(count, 3))))
-    scale = rng.uniform(0.5, 2.0, rows)
-    support = scale[:, None] * rng.integers(0, 2, (rows, nv))
-    position, linear, angular = rng.normal(size=(3, count, 3))
-    J = np.asfortranarray(rng.normal(size=(6, nv)))
-    gain = rng.uniform(0.5, 3.0, (count, 1))
-    return [screws, turns, poses, position, rotations(rng, count), linear, angular, gain, scale, J, support]
-
 
 FRAMES = [(1, []), (1, [0]), (2, [1]), (4, []), (4, [0, 2]), (4, [0, 1, 2, 3])]
 
 
 @pytest.mark.parametrize(("count", "turns"), FRAMES)
 def test_rows_of_frames_by_their_definition(kernels, count, turns):
-    """Velocity of a point p of a body: J_v + J_ω × p; b = v_ref + K (x_ref - x), with log(R_ref Rᵀ) for turns."""
-    args = frames(count, count, turns)
-    _, _, poses, position, rotation, linear, angular, gain, scale, J, support = args
+    """Velocity of a point p of a body: J_v + J_ω × p; b = v_ref + K (x_ref - x), with log(R_ref Rᵀ) for turns.
+
+    A command faster than its cap is shortened to it; then everything is scaled.
+    """
+    x = random_layout(count, frames=count, turns=turns)
     expected_A, expected_b = [], []
-    for f in range(count):
-        expected_A += list(J[:3] + np.array([np.cross(twist[3:], poses[f, 9:]) for twist in J.T]).T)
-        expected_b += list(linear[f] + gain[f] * (position[f] - poses[f, 9:]))
+    for f, pose in enumerate(x.frame_poses[x.frame_ids]):
+        expected_A += list(x.J_world[:3] + np.array([np.cross(twist[3:], pose[9:]) for twist in x.J_world.T]).T)
+        expected_b += [x.targets[f, 12:15] + x.gain[f] * (x.targets[f, :3] - pose[9:])]
     for f in turns:
-        R = poses[f, :9].reshape(3, 3).T
-        expected_A += list(J[3:])
-        expected_b += list(angular[f] + gain[f] * pin.log3(rotation[f] @ R.T))
+        R = x.frame_poses[x.frame_ids[f], :9].reshape(3, 3).T
+        expected_A += list(x.J_world[3:])
+        expected_b += [x.targets[f, 15:] + x.gain[f] * pin.log3(x.targets[f, 3:12].reshape(3, 3) @ R.T)]
+    expected_b = [b * min(1.0, cap / np.linalg.norm(b)) for b, cap in zip(expected_b, x.cap, strict=True)]
+    packed = kernels.pack(x)
     for _ in range(2):  # what the first call leaves in `screws` does not show in the second
-        A, b = kernels.frame_rows(*args)
-        np.testing.assert_allclose(A, np.array(expected_A) * support, rtol=0, atol=1e-13)
-        np.testing.assert_allclose(b, np.array(expected_b) * scale, rtol=0, atol=1e-12)
+        kernels.frame_rows(packed)
+        np.testing.assert_allclose(x.A, np.array(expected_A) * x.task_support, rtol=0, atol=1e-13)
+        np.testing.assert_allclose(x.b, np.concatenate(expected_b) * x.scale, rtol=0, atol=1e-12)
+        np.testing.assert_array_equal(x.poses, x.frame_poses[x.frame_ids])
+
+
+def test_caps_at_their_edges(kernels):
+    """A command at rest stays at rest, one just at its cap is left alone, and NaN is not capped away."""
+    for speed, expected in ((0.0, 0.0), (0.5, 0.5), (2.0, 0.5), (np.nan, np.nan)):
+        targets = np.zeros((1, 18))
+        targets[0, 3:12] = np.eye(3).ravel()
+        targets[0, 12] = speed
+        x = make_layout(7, frames=1, targets=targets, frame_poses=np.zeros((1, 12)), cap=np.array([0.5]))
+        run(kernels, "frame_rows", x)
+        np.testing.assert_allclose(x.b[0], expected, rtol=1e-15)
 
 
 @pytest.mark.parametrize(("count", "turns"), FRAMES)
 def test_frame_rows_of_both_versions(count, turns):
     for seed in SEEDS:
-        args = frames(seed, count, turns, nv=1 + 2 * seed)
-        check_parity("frame_rows", *args)
+        for fields in ({}, {"cap": np.full(count + len(turns), np.inf)}):
+
+            def make(seed=seed, fields=fields):
+                return random_layout(seed, frames=count, turns=turns, nv=2 + 2 * seed, **fields)
+
+            both(make, "frame_rows")
 
 
 AXES = [(1, 0, 0), (0, -1, 0), (0, 0, 1), (1, 1, 0), (1, -2, 3), (-3, 1e-9, 1e-5)]
@@ -280,7 +528,7 @@ AXES = [(1, 0, 0), (0, -1, 0), (0, 0, 1), (1, 1, 0), (1, -2, 3), (-3, 1e-9, 1e-5
 def test_rotation_vector_at_all_angles(kernels, axis):
     """Angle and axis come back, in tiny turns to the last digit; at half a turn either of the two axes."""
     axis = np.array(axis) / np.linalg.norm(axis)
-    rotation_vector = getattr(kernels, "rotation_vector", None) or kernels._rotation_vector
+    rotation_vector = getattr(kernels, "_rotation_vector", None) or kernels.rotation_vector
     for angle in (0.0, 1e-15, 1e-12, 1e-9, 1e-5, 0.1, 1.0, np.pi / 2, 2.0, 2.1, 3.0, np.pi - 1e-5, np.pi - 1e-9):
         found = rotation_vector(pin.exp3(angle * axis))
         np.testing.assert_allclose(found, angle * axis, rtol=0, atol=1e-15 + 1e-14 * angle / (np.pi - angle) ** 0.1)
@@ -301,66 +549,115 @@ def test_velocity_bounds_by_hand(kernels):
     """
     inf = np.inf
     q = np.array([9.0, 0.0, 0.99, 1.02, 9.0, 9.0, 0.3, -4.0])  # q[0], q[4] and q[5] have no limits in this chart
-    q_index, v_index = np.array([1, 2, 3, 6, 7]), np.array([0, 1, 2, 4, 5])
-    lower, upper = kernels.velocity_bounds(
-        q, q_index, v_index, np.array([-1.0, -1, -1, -inf, -1]), np.array([1.0, 1, 1, 1, 1]),
-        np.array([2.0, 3.0, 4.0, inf, inf, 5.0]), 50.0,
+    x = make_layout(
+        6, q_index=np.array([1, 2, 3, 6, 7]), v_index=np.array([0, 1, 2, 4, 5]),
+        q_lower=np.array([-1.0, -1, -1, -inf, -1]), q_upper=np.array([1.0, 1, 1, 1, 1]),
+        v_max=np.array([2.0, 3.0, 4.0, inf, inf, 5.0]), rate=50.0,
     )  # fmt: skip
-    np.testing.assert_allclose(lower, [-2.0, -3.0, -4.0, -inf, -inf, 5.0])
-    np.testing.assert_allclose(upper, [2.0, 0.5, -1.0, inf, 35.0, 5.0])
+    run(kernels, "velocity_bounds", x, q)
+    np.testing.assert_allclose(x.lower, [-2.0, -3.0, -4.0, -inf, -inf, 5.0])
+    np.testing.assert_allclose(x.upper, [2.0, 0.5, -1.0, inf, 35.0, 5.0])
+
+
+@pytest.mark.parametrize("plain", [True, False])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_velocity_bounds_of_both_versions(seed, plain):
+    """They never cross, and those with acceleration limits are never outside those without, from any state."""
+    for nv in (2, 5, 30):
+        q = np.random.default_rng(seed).uniform(-3, 3, nv + 1)
+        for fields in ({}, {"v_step": np.full(nv, np.inf), "accelerated": False}):
+
+            def make(nv=nv, fields=fields):
+                return random_layout(seed, nv=nv, plain=plain, **fields)
+
+            _, x = both(make, "velocity_bounds", q[:nv] if plain else q)
+            assert (x.hard_lower <= x.lower).all() and (x.lower <= x.upper).all() and (x.upper <= x.hard_upper).all()
+            assert (np.maximum(np.abs(x.lower), np.abs(x.upper)) <= x.v_max).all()
+            none = make_layout(nv, v_max=x.v_max, v_step=x.v_step, v_last=x.v_last, accelerated=x.accelerated)
+            both(none._replace, "velocity_bounds", q)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_velocity_bounds_of_both_versions(seed):
-    rng = np.random.default_rng(seed)
-    nv = 1 + 3 * seed
-    limited = np.flatnonzero(rng.random(nv) < 0.7)
-    q_lower, q_upper = rng.uniform(-2, 0, len(limited)), rng.uniform(0, 2, len(limited))
-    v_max = rng.uniform(0.1, 5.0, nv)
-    v_max[rng.random(nv) < 0.2] = np.inf
-    q_lower[rng.random(len(limited)) < 0.2] = -np.inf
-    q_upper[rng.random(len(limited)) < 0.2] = np.inf
-    q = rng.uniform(-3, 3, nv + 1)
-    lower, upper, *_ = check_parity("velocity_bounds", q, limited + 1, limited, q_lower, q_upper, v_max, 50.0)
-    assert (lower <= upper).all()
-    check_parity("velocity_bounds", q, limited[:0], limited[:0], q_lower[:0], q_upper[:0], v_max, 50.0)
+def test_a_stop_slows_all_coordinates_alike_and_as_fast_as_it_can(kernels, seed):
+    """v_stop = s v_last, the largest change being exactly one step of its coordinate; 0 once that is within reach."""
+    x = random_layout(seed, plain=True)
+    x.lower[:], x.upper[:] = -np.inf, np.inf
+    run(kernels, "stop_velocity", x)
+    share = x.v_stop / x.v_last
+    np.testing.assert_allclose(share, share[0], rtol=1e-13)
+    assert 0.0 < share[0] < 1.0
+    assert np.max(np.abs(x.v_last - x.v_stop) / x.v_step) == pytest.approx(1.0, rel=1e-12)
+    y = random_layout(seed, plain=True, v_last=0.5 * np.minimum(x.v_step, 1.0))
+    y.lower[:], y.upper[:] = -np.inf, np.inf
+    y.lower[1], y.upper[2] = 0.2, -0.3  # a coordinate that is sent back goes on moving
+    run(kernels, "stop_velocity", y)
+    np.testing.assert_array_equal(y.v_stop, [0.0, 0.2, -0.3, 0.0, 0.0, 0.0, 0.0])
+
+
+def test_without_acceleration_limits_a_stop_is_a_standstill_where_the_bounds_allow_it(kernels):
+    x = random_layout(0, **NO_LIMIT)
+    x.lower[:], x.upper[:] = -1.0, 1.0
+    x.lower[1], x.upper[2] = 0.2, -0.3
+    run(kernels, "stop_velocity", x)
+    np.testing.assert_array_equal(x.v_stop, [0.0, 0.2, -0.3, 0.0, 0.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_stop_velocities_of_both_versions(seed):
+    for fields in ({}, NO_LIMIT):
+        both(lambda fields=fields: filled(seed, **fields), "stop_velocity")
 
 
 # --- solutions ---------------------------------------------------------------------------------------------------
 
 
-def rows(seed, count, nv=14):
+def rows(seed, count, nv=14, damping=0.1):
+    """Memory with random task rows."""
     rng = np.random.default_rng(seed)
-    return rng.normal(size=(count, nv)), rng.normal(size=count)
+    x = make_layout(nv, frames=count // 3, damping=damping)
+    x.A[:], x.b[:] = rng.normal(size=(count, nv)), rng.normal(size=count)
+    return x
+
+
+def damped_solution(kernels, x):
+    v = np.full(x.A.shape[1], 9.0)
+    run(kernels, "damped_solution", x, v)
+    return v
+
+
+def check_damped_solution(x):
+    """Both versions give the same, which is returned."""
+    found, expected = (damped_solution(version(name), x) for name in ("compiled", "vectorised"))
+    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+    return expected
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.01, 0.5])
-@pytest.mark.parametrize("count", [1, 3, 6, 9])
+@pytest.mark.parametrize("count", [0, 3, 6, 9])
 def test_damped_solution_by_singular_values(kernels, count, damping):
     """Each singular value s becomes s / (s² + λ²)."""
     for seed in SEEDS:
-        A, b = rows(seed, count)
-        U, s, Vt = np.linalg.svd(A, full_matrices=False)
-        expected = Vt.T @ (s / (s**2 + damping**2) * (U.T @ b))
-        np.testing.assert_allclose(kernels.damped_solution(A, b, damping), expected, rtol=0, atol=1e-12)
+        x = rows(seed, count, damping=damping)
+        U, s, Vt = np.linalg.svd(x.A, full_matrices=False)
+        expected = Vt.T @ (s / (s**2 + damping**2) * (U.T @ x.b))
+        np.testing.assert_allclose(damped_solution(kernels, x), expected, rtol=0, atol=1e-12)
 
 
 def test_damped_solution_minimises_error_and_effort(kernels):
     """More rows than joints, and repeated ones: ‖A v - b‖² + λ² ‖v‖² is stationary."""
     for count, nv in ((9, 7), (6, 3)):
-        A, b = rows(0, count, nv)
-        A[-1], b[-1] = A[0], 1.0 - b[0]
-        v = kernels.damped_solution(A, b, 0.1)
-        np.testing.assert_allclose(A.T @ (A @ v - b) + 0.01 * v, 0.0, rtol=0, atol=1e-11)
+        x = rows(0, count, nv)
+        x.A[-1], x.b[-1] = x.A[0], 1.0 - x.b[0]
+        v = damped_solution(kernels, x)
+        np.testing.assert_allclose(x.A.T @ (x.A @ v - x.b) + 0.01 * v, 0.0, rtol=0, atol=1e-11)
 
 
-@pytest.mark.parametrize("count", [1, 3, 6, 9])
+@pytest.mark.parametrize("count", [0, 3, 6, 9])
 def test_damped_solutions_of_both_versions(count):
     for seed in SEEDS:
-        A, b = rows(seed, count)
         for damping in (0.0, 0.01, 0.5):
-            check_parity("damped_solution", A, b, damping)
-        check_parity("damped_solution", A[:, :7], b, 0.3)  # not contiguous; for 9 rows, singular but for the damping
+            check_damped_solution(rows(seed, count, damping=damping))
+        check_damped_solution(rows(seed, count, nv=7, damping=0.3))  # for 9 rows, singular but for the damping
 
 
 @pytest.mark.parametrize("shrink", [0.0, 1e-12, 1e-8, 1e-4])
@@ -368,26 +665,29 @@ def test_damped_solutions_of_both_versions(count):
 def test_rows_that_are_nearly_dependent_have_no_undamped_solution(shrink, which):
     """Pivots of A Aᵀ that differ by more than 1e6; with damping there always is a solution."""
     for count in (3, 6, 9):
-        A, b = rows(count, count)
-        A[which] = shrink * A[which] + A[which - 1]
-        assert np.isnan(check_parity("damped_solution", A, b, 0.0)[0]).all()
-        assert np.isfinite(version("compiled").damped_solution(A, b, 0.1)).all()
-    small = np.diag([1.0, 1.0, 1e-2]) @ np.eye(3, 14)
-    assert np.isfinite(check_parity("damped_solution", small, np.ones(3), 0.0)[0]).all()
-    small[2] *= 1e-2
-    assert np.isnan(check_parity("damped_solution", small, np.ones(3), 0.0)[0]).all()
+        for damping in (0.0, 0.1):
+            x = rows(count, count, damping=damping)
+            x.A[which] = shrink * x.A[which] + x.A[which - 1]
+            for name in ("compiled", "vectorised"):
+                v = damped_solution(version(name), x)
+                assert np.isfinite(v).all() if damping else np.isnan(v).all()
+    for third, solvable in ((1e-2, True), (1e-4, False)):
+        x = rows(0, 3, damping=0.0)
+        x.A[:], x.b[:] = np.diag([1.0, 1.0, third]) @ np.eye(3, 14), 1.0
+        v = check_damped_solution(x)
+        assert np.isfinite(v).all() if solvable else np.isnan(v).all()
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.1])
 def test_damped_solution_does_not_lose_nan(kernels, damping):
-    for count in (1, 3, 6):
+    for count in (3, 6):
         for i in range(count):
-            A, b = rows(0, count)
-            b[i] = np.nan
-            assert np.isnan(kernels.damped_solution(A, b, damping)).all()
-            A, b = rows(0, count)
-            A[i, 5] = np.nan
-            assert np.isnan(kernels.damped_solution(A, b, damping)).all()
+            x = rows(0, count, damping=damping)
+            x.b[i] = np.nan
+            assert np.isnan(damped_solution(kernels, x)).all()
+            x = rows(0, count, damping=damping)
+            x.A[i, 5] = np.nan
+            assert np.isnan(damped_solution(kernels, x)).all()
 
 
 def constraints(seed, pairs, nv=7):
@@ -427,17 +727,21 @@ def test_shortfall_does_not_lose_nan(kernels, argument, pairs):
         assert np.isnan(kernels.shortfall(*args)), place
 
 
-def test_tracking_shortfall_is_both_in_one(kernels):
+@pytest.mark.parametrize("near", [0, 1, 5])
+def test_tracking_shortfall_is_that_of_the_tracking_velocity_and_the_near_rows(kernels, near):
     for seed in SEEDS:
-        A, b = rows(seed, 6, 7)
-        _, J, least, lower, upper = constraints(seed, 5)
-        v, worst = kernels.tracking_shortfall(A, b, 0.1, J, least, lower, upper)
-        np.testing.assert_array_equal(v, kernels.damped_solution(A, b, 0.1))
-        assert worst == kernels.shortfall(v, J, least, lower, upper)
-        check_parity("tracking_shortfall", A, b, 0.1, J, least, lower, upper)
-        A[1] = A[0]
-        v, worst = kernels.tracking_shortfall(A, b, 0.0, J, least, lower, upper)
-        assert np.isnan(v).all() and np.isnan(worst)
+        v, J, least, lower, upper = constraints(seed, 8)
+
+        def make(v=v, J=J, least=least, lower=lower, upper=upper):
+            return make_layout(7, pairs=8, v0=v, J=J, least=least, lower=lower, upper=upper)._replace(
+                lower=lower, upper=upper
+            )
+
+        expected = kernels.shortfall(v, J[:near], least[:near], lower, upper)
+        assert run(kernels, "tracking_shortfall", make(), near) == pytest.approx(expected, abs=1e-15)
+        both(make, "tracking_shortfall", near)
+        v[3] = np.nan
+        assert np.isnan(run(kernels, "tracking_shortfall", make(), near))
 
 
 @pytest.mark.parametrize("count", [3, 6, 9])
@@ -458,6 +762,53 @@ def test_projection_cost_is_smallest_at_the_velocity_it_is_made_for(kernels, cou
 
 # --- whole ticks -------------------------------------------------------------------------------------------------
 
+
+def moments(seed, x, ticks=6):
+    """Arguments of `assemble` in a row of ticks: pairs come and go, obstacles move and rest."""
+    rng, pairs = np.random.default_rng(seed), len(x.results)
+    for tick in range(ticks):
+        q = rng.uniform(-3, 3, x.A.shape[1] + 1)
+        chosen = [np.arange(pairs), np.flatnonzero(rng.random(pairs) < 0.5), np.arange(0)][tick % 3]
+        yield q, chosen, float(rng.choice([0.0, 0.3, np.inf])), tick % 2 == 0
+
+
+@pytest.mark.parametrize("fields", [{}, NO_LIMIT, {"plain": True}, {"views": False, "damping": 0.0}])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_tick_is_the_sum_of_its_parts(kernels, seed, fields):
+    """Whatever the ticks before have left in memory."""
+    x = random_layout(seed, pairs=40, **fields)
+    packed = kernels.pack(x)
+    for q, pairs, reach, moving in moments(seed, x):
+        x.v_last[:] = np.random.default_rng(seed).uniform(-1, 1, 7)
+        y = random_layout(seed, pairs=40, **fields)
+        y.v_last[:] = x.v_last
+        apart = kernels.pack(y)
+        kernels.frame_rows(apart)
+        kernels.velocity_bounds(apart, q[:7] if "plain" in fields else q)
+        kernels.stop_velocity(apart)
+        kernels.damped_solution(apart, y.v0)
+        k = kernels.distance_rows(apart, pairs, reach, moving)
+        kernels.row_bounds(apart, k, moving)
+        worst = kernels.tracking_shortfall(apart, k)
+        found = kernels.assemble(packed, q[:7] if "plain" in fields else q, pairs, reach, moving)
+        np.testing.assert_array_equal(found, (k, worst))
+        assert_same(x, y, k)
+
+
+@pytest.mark.parametrize("fields", [{}, NO_LIMIT, {"plain": True}, {"views": False}])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_ticks_of_both_versions(seed, fields):
+    def make():
+        return random_layout(seed, pairs=40, frames=3, turns=(0, 2), **fields)
+
+    counts = []
+    for q, *args in moments(seed, make()):
+        (k, _), x = both(make, "assemble", q[:7] if "plain" in fields else q, *args)
+        counts.append(k)
+        np.testing.assert_allclose(x.A.T @ (x.A @ x.v0 - x.b) + x.damping**2 * x.v0, 0.0, rtol=0, atol=1e-9)
+    assert min(counts) == 0 and len(set(counts)) > 2
+
+
 RUN = """
 import sys
 
@@ -474,10 +825,12 @@ for k in range(ticks):
     q = pin.integrate(model, q, controller.dt * v[-1])
 
 rng, problems = np.random.default_rng(0), []
-for k in range(200):  # the same configurations for both
+for k in range(200):  # the same configurations and velocities for both
     q = pin.integrate(model, start, rng.uniform(-0.8, 0.8, model.nv))
-    problems.append(controller.tick(q, 0.05 * k).problem)
-parts = {"v": v, "lower": [p.lower for p in problems], "upper": [p.upper for p in problems]}
+    problems.append(controller.tick(q, 0.05 * k, v=rng.uniform(-0.5, 0.5, model.nv)).problem)
+parts = {"v": v}
+for name in ("lower", "upper", "hard_lower", "hard_upper", "v_stop", "v0"):
+    parts[name] = [getattr(p, name) for p in problems]
 for name in ("A", "b"):
     parts["tracking " + name] = [getattr(p.tracking, name) for p in problems]
 for name in ("pair", "d", "J", "b"):

@@ -1,12 +1,17 @@
 """Joint limits: bounds that never cross and are never left."""
 
+from importlib import import_module
+
 import numpy as np
 import pytest
+from conftest import make_layout
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from qpavoid.limits import JointBounds, saturate, velocity_bounds
+from qpavoid.config import Limits
+from qpavoid.kernels.vectorised import speed_to_stop
+from qpavoid.limits import JointBounds, limit_layout, saturate
 
 N = 4
 fast = settings(max_examples=200, deadline=None)
@@ -14,6 +19,34 @@ share = st.floats(0.01, 1.0)
 period = st.floats(1e-4, 0.1)
 velocities = arrays(np.float64, N, elements=st.floats(-50.0, 50.0))
 INDEX = np.arange(N)
+FREE = np.full(N, np.inf)
+
+
+class Axes:
+    """Bounds of joints in any number of ticks, by one of the two kernel versions."""
+
+    def __init__(self, joints, gain, dt, kernels="vectorised"):
+        if kernels == "compiled":
+            pytest.importorskip("numba")
+        self._kernels = import_module(f"qpavoid.kernels.{kernels}")
+        self.layout = make_layout(len(joints.velocity), **limit_layout(joints, gain, dt))
+        self._packed = self._kernels.pack(self.layout)
+
+    def bounds(self, q, v_last=0.0):
+        """Copies of lower and upper."""
+        self.layout.v_last[:] = v_last
+        self._kernels.velocity_bounds(self._packed, q)
+        return self.layout.lower.copy(), self.layout.upper.copy()
+
+
+def bounds_at(joints, q, gain, dt):
+    return Axes(joints, gain, dt).bounds(q)
+
+
+@pytest.fixture(params=["vectorised", "compiled"])
+def version(request):
+    """Name of each kernel version in turn."""
+    return request.param
 
 
 def vector(low, high):
@@ -25,13 +58,13 @@ def bounds(draw):
     """Limits of four joints, some without a speed limit."""
     lower = draw(vector(-3.0, 2.0))
     speed = np.where(draw(arrays(bool, N)), draw(vector(0.01, 5.0)), np.inf)
-    return JointBounds(speed, INDEX, INDEX, lower, lower + draw(vector(1e-3, 4.0)))
+    return JointBounds(speed, INDEX, INDEX, lower, lower + draw(vector(1e-3, 4.0)), FREE)
 
 
 @fast
 @given(bounds(), vector(-10.0, 10.0), period, share, share)
 def test_bounds_never_cross_and_keep_to_the_speed(joints, q, dt, gain, scale):
-    lower, upper = velocity_bounds(joints.slowed(scale), q, gain / dt)
+    lower, upper = bounds_at(joints.within(Limits(velocity_scale=scale)), q, gain, dt)
     assert not np.isnan([lower, upper]).any()
     assert (lower <= upper).all()
     assert (np.maximum(np.abs(lower), np.abs(upper)) <= scale * joints.velocity).all()
@@ -41,7 +74,7 @@ def test_bounds_never_cross_and_keep_to_the_speed(joints, q, dt, gain, scale):
 @given(bounds(), vector(0.0, 1.0), vector(0.0, 1.0), period, share, share)
 def test_the_next_configuration_stays_inside(joints, place, choice, dt, gain, scale):
     q = joints.lower + place * (joints.upper - joints.lower)
-    lower, upper = velocity_bounds(joints.slowed(scale), q, gain / dt)
+    lower, upper = bounds_at(joints.within(Limits(velocity_scale=scale)), q, gain, dt)
     for v in (lower, upper, lower + choice * (upper - lower)):
         following = q + dt * v
         assert (following >= joints.lower - 1e-12).all()
@@ -55,7 +88,7 @@ def test_the_next_configuration_stays_inside(joints, place, choice, dt, gain, sc
 def test_outside_its_limits_a_joint_is_sent_back_without_overshoot(joints, beyond, side, dt, gain):
     edge = joints.upper if side > 0 else joints.lower
     q = edge + side * beyond
-    lower, upper = velocity_bounds(joints, q, gain / dt)
+    lower, upper = bounds_at(joints, q, gain, dt)
     for v in (lower, upper):
         assert (side * v < 0).all()
     back = upper if side > 0 else lower  # the slowest return that is allowed
@@ -63,10 +96,12 @@ def test_outside_its_limits_a_joint_is_sent_back_without_overshoot(joints, beyon
     assert (following < beyond).all() and (following >= -1e-9).all()
 
 
-def test_bounds_by_hand():
-    joints = JointBounds(np.array([2.0, 1.0, np.inf]), np.array([0, 3]), np.array([0, 2]), -np.ones(2), np.ones(2))
+def test_bounds_by_hand(version):
+    joints = JointBounds(
+        np.array([2.0, 1.0, np.inf]), np.array([0, 3]), np.array([0, 2]), -np.ones(2), np.ones(2), np.full(3, np.inf)
+    )
     q = np.array([0.99, 7.0, 7.0, 0.0])  # the middle joint is continuous: two numbers in q, one in v
-    lower, upper = velocity_bounds(joints.slowed(0.5), q, 0.5 / 0.01)
+    lower, upper = Axes(joints.within(Limits(velocity_scale=0.5)), 0.5, 0.01, version).bounds(q)
     np.testing.assert_allclose(upper, [0.5, 0.5, 50.0])
     np.testing.assert_allclose(lower, [-1.0, -0.5, -50.0])
 
@@ -75,7 +110,7 @@ def test_bounds_by_hand():
 @given(bounds(), vector(0.0, 1.0), velocities, period, share)
 def test_saturated_velocity_is_within_the_bounds_and_its_change_is_reported(joints, place, v, dt, gain):
     q = joints.lower + place * (joints.upper - joints.lower)
-    lower, upper = velocity_bounds(joints, q, gain / dt)
+    lower, upper = bounds_at(joints, q, gain, dt)
     within, change = saturate(v, lower, upper, joints.velocity)
     assert (within >= lower).all() and (within <= upper).all()
     assert change == pytest.approx(np.abs(within - v).max(), abs=1e-15)
@@ -109,8 +144,8 @@ def test_saturate_by_hand():
 def test_without_any_limit_nothing_changes():
     infinite = np.full(2, np.inf)
     nothing = np.array([], dtype=np.intp)
-    joints = JointBounds(infinite, nothing, nothing, np.array([]), np.array([]))
-    lower, upper = velocity_bounds(joints.slowed(0.5), np.zeros(2), 0.5 / 0.01)
+    joints = JointBounds(infinite, nothing, nothing, np.array([]), np.array([]), infinite)
+    lower, upper = bounds_at(joints.within(Limits(velocity_scale=0.5)), np.zeros(2), 0.5, 0.01)
     v = np.array([1e6, -1e6])
     within, change = saturate(v, lower, upper, infinite)
     np.testing.assert_array_equal(within, v)
@@ -128,3 +163,185 @@ def test_bounds_of_robots(panda, solo):
     np.testing.assert_array_equal(legs.v_index, np.arange(6, 18))
     np.testing.assert_array_equal(legs.q_index, np.arange(7, 19))
     assert np.isinf(legs.velocity[:6]).all()
+
+
+# --- accelerations -----------------------------------------------------------------------------------------------
+
+
+def travel(v, step, dt):
+    """How far a coordinate goes that moves at v for one tick, and is then slowed by `step` in every tick."""
+    far, v = np.zeros_like(v), v.copy()
+    while (v > 0.0).any():
+        far += dt * v
+        v = np.maximum(v - step, 0.0)
+    return far
+
+
+def stopping_speed(kernels):
+    if kernels == "vectorised":
+        return speed_to_stop
+    pytest.importorskip("numba")
+    from qpavoid.kernels.compiled import _speed_to_stop
+
+    return np.vectorize(_speed_to_stop, otypes=[float])
+
+
+def test_a_coordinate_just_stops_in_time_from_the_speed_to_stop(version):
+    """And does not from a speed that is a thousandth larger."""
+    rng = np.random.default_rng(0)
+    room, step, dt = (
+        10.0 ** rng.uniform(-9, 1, 3000),
+        10.0 ** rng.uniform(-3, 1, 3000),
+        10.0 ** rng.uniform(-3, -1, 3000),
+    )
+    v = stopping_speed(version)(room, step, dt)
+    np.testing.assert_allclose(travel(v, step, dt), room, rtol=1e-9)
+    assert (travel(1.001 * v, step, dt) > 1.0005 * room).all()
+
+
+def test_speed_to_stop_by_hand(version):
+    """Steps of 0.1 in ticks of 0.01: 0.1 goes 1e-3, 0.2 goes 3e-3, 0.15 goes 2e-3; n steps go 1e-3 n (n + 1) / 2."""
+    room = 1e-3 * np.array([0.0, 0.5, 1.0, 2.0, 3.0, 55.0, np.inf])
+    found = stopping_speed(version)(room, np.full(7, 0.1), 0.01)
+    np.testing.assert_allclose(found, [0.0, 0.05, 0.1, 0.15, 0.2, 1.0, np.inf], rtol=1e-12)
+
+
+def viable(joints, q, v, dt):
+    """Speeds that braking brings to a standstill within the position limits, after this tick: v - step can stop."""
+    step = joints.acceleration * dt
+    room = np.stack((q - joints.lower, joints.upper - q))
+    slowed = np.maximum(np.stack((-v, v)) - step, 0.0)
+    slack = 1e-9 * np.maximum(1.0, joints.acceleration)
+    return ((room >= -1e-9) & (slowed <= speed_to_stop(np.maximum(room, 0.0), step, dt) + slack)).all(axis=0)
+
+
+@st.composite
+def braked(draw):
+    """Joints with limits of position and acceleration, some without a speed limit; a tick, and a viable state."""
+    lower = draw(vector(-3.0, 2.0))
+    speed = np.where(draw(arrays(bool, N)), draw(vector(0.01, 5.0)), np.inf)
+    joints = JointBounds(speed, INDEX, INDEX, lower, lower + draw(vector(1e-3, 4.0)), draw(vector(0.05, 100.0)))
+    dt = draw(st.floats(1e-3, 0.1))
+    q = lower + draw(vector(0.0, 1.0)) * (joints.upper - lower)
+    below, above = (
+        speed_to_stop(np.maximum(room, 0.0), joints.acceleration * dt, dt) for room in (q - lower, joints.upper - q)
+    )
+    v = -np.minimum(below, speed) + draw(vector(0.0, 1.0)) * (np.minimum(below, speed) + np.minimum(above, speed))
+    return joints, dt, q, v
+
+
+@pytest.mark.parametrize("kernels", ["vectorised", "compiled"])
+@fast
+@given(state=braked(), choice=vector(0.0, 1.0), gain=share)
+def test_a_state_that_can_be_braked_is_followed_by_one_that_can(kernels, state, choice, gain):
+    """Whatever is chosen within the bounds keeps position, speed and acceleration limits, now and later."""
+    joints, dt, q, v_last = state
+    lower, upper = Axes(joints, gain, dt, kernels).bounds(q, v_last)
+    assert (lower <= upper).all()
+    for v in (lower, upper, lower + choice * (upper - lower)):
+        assert (np.abs(v - v_last) <= joints.acceleration * dt + 1e-9).all()
+        assert (np.abs(v) <= joints.velocity + 1e-9).all()
+        following = q + dt * v
+        assert (following >= joints.lower - 1e-9).all() and (following <= joints.upper + 1e-9).all()
+        assert viable(joints, following, v, dt).all()
+
+
+def random_joints(rng, count):
+    """Joints of all kinds, at rest somewhere in their range: of a millimetre or some radians, of any acceleration."""
+    lower = rng.uniform(-3.0, 2.0, count)
+    upper = lower + 10.0 ** rng.uniform(-3, 0.6, count)
+    speed = np.where(rng.random(count) < 0.8, 10.0 ** rng.uniform(-2, 0.7, count), np.inf)
+    index = np.arange(count)
+    joints = JointBounds(speed, index, index, lower, upper, 10.0 ** rng.uniform(-1, 2, count))
+    return joints, rng.uniform(lower, upper)
+
+
+@pytest.mark.parametrize("dt", [0.001, 0.01, 0.05])
+def test_no_limit_is_left_in_a_hundred_thousand_ticks(version, dt):
+    """500 joints, 200 ticks each, driven into their limits, to and fro, or at random."""
+    joints, q = random_joints(np.random.default_rng(1), 500)
+    axes, rng, v_last = Axes(joints, 0.5, dt, version), np.random.default_rng(2), np.zeros(500)
+    reached = np.zeros(500, dtype=bool)
+    for tick in range(200):
+        lower, upper = axes.bounds(q, v_last)
+        assert (lower <= upper).all()
+        if tick % 40 == 0:
+            goal = rng.choice([0.0, 0.5, 1.0], 500)  # pushed one way for a while; 0.5: anywhere
+        v = lower + np.where(goal == 0.5, rng.random(500), goal) * (upper - lower)
+        assert (np.abs(v - v_last) <= joints.acceleration * dt + 1e-9).all()
+        assert (np.abs(v) <= joints.velocity + 1e-9).all()
+        q, v_last = q + dt * v, v
+        assert (q >= joints.lower - 1e-9).all() and (q <= joints.upper + 1e-9).all()
+        reached |= np.minimum(q - joints.lower, joints.upper - q) < 1e-6
+    assert reached.mean() > 0.05  # pushed right to a limit, and no farther
+
+
+def test_from_a_state_that_no_braking_saves_the_acceleration_gives_way(version):
+    """Position and speed are kept, and the bounds do not cross."""
+    joints, q = random_joints(np.random.default_rng(3), 500)
+    rng, dt = np.random.default_rng(4), 0.01
+    v_last = rng.uniform(-50.0, 50.0, 500)
+    broken = ~viable(joints, q, v_last, dt) | (np.abs(v_last) > joints.velocity + joints.acceleration * dt)
+    assert broken.sum() > 100
+    axes = Axes(joints, 0.5, dt, version)
+    lower, upper = axes.bounds(q, v_last)
+    hard_lower, hard_upper = axes.layout.hard_lower, axes.layout.hard_upper
+    assert (hard_lower <= lower).all() and (lower <= upper).all() and (upper <= hard_upper).all()
+    for v in (lower, upper):
+        assert (np.abs(v) <= joints.velocity).all()
+        assert (q + dt * v >= joints.lower - 1e-12).all() and (q + dt * v <= joints.upper + 1e-12).all()
+    change = np.where(v_last > 0.0, v_last - upper, lower - v_last)  # the least that is left to choose
+    assert (change[broken] > joints.acceleration[broken] * dt).all()
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_outside_its_position_limits_a_joint_is_braked_and_sent_back(version, side):
+    """With no more than its acceleration, from any speed within its limits; then it stays inside."""
+    joints, _ = random_joints(np.random.default_rng(5), 500)
+    joints = JointBounds(*(getattr(joints, name) for name in ("velocity", "q_index", "v_index", "lower", "upper")),
+                         10.0 ** np.random.default_rng(6).uniform(0, 2, 500))  # fmt: skip
+    rng, dt = np.random.default_rng(7), 0.01
+    step = joints.acceleration * dt
+    edge, width = (joints.upper if side > 0 else joints.lower), joints.upper - joints.lower
+    q = edge + side * rng.uniform(0.01, 5.0, 500) * np.minimum(joints.velocity, 0.1)
+    v = side * rng.uniform(-0.2, 1.0, 500) * np.minimum(joints.velocity, 1.0)
+    v = np.where(side * v < 0.0, -side * np.minimum(np.abs(v), speed_to_stop(width, step, dt)), v)
+    axes, choose = Axes(joints, 0.5, dt, version), rng.random(500)
+    back = np.zeros(500, dtype=bool)
+    for _ in range(3000):
+        lower, upper = axes.bounds(q, v)
+        assert (lower <= upper).all()
+        outside = side * (q - edge) > 1e-9
+        following = lower + choose * (upper - lower)
+        assert (np.abs(following - v) <= step + 1e-9).all()
+        assert (np.abs(following) <= joints.velocity + 1e-9).all()
+        assert (side * (following - v) <= 1e-9)[outside & (side * v > 0.0)].all()  # never faster outwards
+        q, v = q + dt * following, following
+        inside = (q >= joints.lower - 1e-9) & (q <= joints.upper + 1e-9)
+        assert inside[back].all()
+        back |= inside
+    assert back.all()
+
+
+def test_acceleration_limits_of_a_robot_and_of_a_scenario():
+    """The scenario's is for joints to which the robot gives none; its share is of all of them."""
+    given = np.array([2.0, np.inf, 4.0, np.inf])
+    joints = JointBounds(np.ones(N), INDEX, INDEX, -np.ones(N), np.ones(N), given)
+    np.testing.assert_array_equal(joints.within(Limits()).acceleration, given)
+    found = joints.within(Limits(acceleration=6.0, acceleration_scale=0.5)).acceleration
+    np.testing.assert_array_equal(found, [1.0, 3.0, 2.0, 3.0])
+
+
+def test_joints_with_and_without_acceleration_limits(version):
+    """3 mm from a limit: 0.2 where steps of 0.1 brake, half of the way in a tick where nothing does; one is free."""
+    joints = JointBounds(
+        np.full(3, 9.0),
+        np.array([0, 1]),
+        np.array([0, 1]),
+        np.full(2, -np.inf),
+        np.ones(2),
+        np.array([10.0, np.inf, 10.0]),
+    )
+    lower, upper = Axes(joints, 0.5, 0.01, version).bounds(np.array([0.997, 0.997, 0.0]), np.array([0.25, 3.0, 1.0]))
+    np.testing.assert_allclose(lower, [0.15, -9.0, 0.9], rtol=1e-9)
+    np.testing.assert_allclose(upper, [0.2, 0.15, 1.1], rtol=1e-9)
