@@ -1,0 +1,166 @@
+"""A scene in MuJoCo: the same joints, bodies and obstacles, with MuJoCo's own kinematics and distances."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import coal
+import mujoco
+import numpy as np
+import pinocchio as pin
+
+from qpavoid import Robot, Sample, ScenarioConfig, Scene, build_scene
+from qpavoid.problem import Array, IntArray
+from qpavoid.scene import build_obstacles
+
+FAR = 100.0
+"""Distances are looked for up to here [m]."""
+
+
+@dataclass(frozen=True)
+class Arena:
+    """A scene and its MuJoCo twin. Configurations and velocities go in and out in the scene's order."""
+
+    scene: Scene
+    q0: Array
+    """(nq,) where the robot starts."""
+    model: Any
+    data: Any
+    geoms: IntArray
+    """(g,) MuJoCo geom of each of the scene's geometries."""
+    q_index: IntArray
+    """(nv,) place in qpos of each coordinate."""
+    v_index: IntArray
+    """(nv,) place in qvel of each coordinate."""
+    bodies: int
+    """How many of the geometries are the robot's; the obstacles come after them."""
+
+    @property
+    def movable(self) -> Any:
+        """(m,) whether the robot can change the distance of a pair at all: false for its fixed base."""
+        return np.any(self.scene.support != 0.0, axis=1)
+
+    def place(self, q: Array, t: float) -> None:
+        """Puts the robot to q (nv,) and the obstacles to where they are at t [s]."""
+        self.data.qpos[self.q_index] = q
+        for i, obstacle in enumerate(self.scene.obstacles):
+            if obstacle.moves:
+                self._place_obstacle(i, obstacle.motion.sample(t))
+        mujoco.mj_kinematics(self.model, self.data)
+
+    def _place_obstacle(self, index: int, sample: Sample) -> None:
+        self.data.mocap_pos[index] = sample.position
+        mujoco.mju_mat2Quat(self.data.mocap_quat[index], np.ascontiguousarray(sample.rotation).ravel())
+
+    def integrate(self, q: Array, v: Array, dt: float) -> Array:
+        """q (nv,) after v (nv,) for dt [s], by MuJoCo's integration."""
+        position, velocity = np.zeros(self.model.nq), np.zeros(self.model.nv)
+        position[self.q_index], velocity[self.v_index] = q, v
+        mujoco.mj_integratePos(self.model, position, velocity, dt)
+        return position[self.q_index]
+
+    def poses(self) -> tuple[Array, Array]:
+        """Centres (g, 3) [m] and axes (g, 9) of the geometries where they are now."""
+        return self.data.geom_xpos[self.geoms], self.data.geom_xmat[self.geoms]
+
+    def distance(self, pair: int, ends: Array | None = None) -> float:
+        """Signed distance of a pair where it is now [m]; its witness points go to `ends` (6,)."""
+        a, b = self.geoms[self.scene.pairs[pair]]
+        return float(mujoco.mj_geomDistance(self.model, self.data, a, b, FAR, np.empty(6) if ends is None else ends))
+
+
+def load(scenario: ScenarioConfig) -> Arena:
+    """The arena of a scenario."""
+    source = scenario.source
+    robot = Robot.load(scenario.robot, source.parent)
+    robot, q0 = robot.lock(scenario.lock, robot.configuration(scenario.q0, str(source)), str(source))
+    return build(build_scene(robot, build_obstacles(scenario.obstacles, source)), q0)
+
+
+def build(scene: Scene, q0: Array) -> Arena:
+    """Writes the scene as MJCF: one MuJoCo body a joint, one mocap body an obstacle.
+
+    Raises:
+        ValueError: a joint that is neither a hinge nor a slide, or a shape that MuJoCo does not know.
+    """
+    spec, robot = mujoco.MjSpec(), scene.robot.model
+    # the default, 1e-6, is of the size of what is to be told apart in penetration
+    spec.option.ccd_tolerance, spec.option.ccd_iterations = 1e-9, 200
+    bodies = [spec.worldbody]
+    for i in range(1, robot.njoints):
+        placement = robot.jointPlacements[i]
+        body = bodies[robot.parents[i]].add_body(
+            name=robot.names[i], pos=placement.translation, quat=_quaternion(placement.rotation),
+            explicitinertial=True, mass=1.0, inertia=[1.0, 1.0, 1.0],
+        )  # fmt: skip
+        kind, axis = _joint(robot, i)
+        body.add_joint(name=robot.names[i], type=kind, axis=axis)
+        bodies.append(body)
+    first = len(scene.body_names)
+    for i, geometry in enumerate(scene.geometry.geometryObjects):
+        if i < first:
+            _add_geom(spec, bodies[geometry.parentJoint], geometry, geometry.placement)
+        else:
+            _add_geom(spec, spec.worldbody.add_body(name=f"obstacle {i}", mocap=True), geometry, pin.SE3.Identity())
+    model = spec.compile()
+    joints = [model.joint(name) for name in list(robot.names)[1:]]
+    arena = Arena(
+        scene=scene,
+        q0=np.array(q0),
+        model=model,
+        data=mujoco.MjData(model),
+        geoms=np.array([model.geom(geometry.name).id for geometry in scene.geometry.geometryObjects], dtype=np.intp),
+        q_index=np.array([joint.qposadr[0] for joint in joints], dtype=np.intp),
+        v_index=np.array([joint.dofadr[0] for joint in joints], dtype=np.intp),
+        bodies=first,
+    )
+    for i, obstacle in enumerate(scene.obstacles):
+        arena._place_obstacle(i, obstacle.motion.sample(0.0))
+    arena.place(arena.q0, 0.0)
+    return arena
+
+
+def _joint(model: Any, index: int) -> tuple[Any, Array]:
+    """Type and axis (3,) of a joint, in its own frame."""
+    joint = model.joints[index]
+    if joint.nq != 1 or joint.nv != 1:
+        raise ValueError(f"joint {model.names[index]!r}: {joint.shortname()} is neither a hinge nor a slide")
+    data = model.createData()
+    pin.computeJointJacobians(model, data, pin.neutral(model))
+    screw = np.asarray(data.joints[index].S).ravel()
+    if np.any(screw[:3]):
+        return mujoco.mjtJoint.mjJNT_SLIDE, screw[:3]
+    return mujoco.mjtJoint.mjJNT_HINGE, screw[3:]
+
+
+def _add_geom(spec: Any, body: Any, geometry: Any, placement: Any) -> None:
+    kinds, shape = mujoco.mjtGeom, geometry.geometry
+    place = {"name": geometry.name, "pos": placement.translation, "quat": _quaternion(placement.rotation)}
+    match shape:
+        case coal.Sphere():
+            body.add_geom(type=kinds.mjGEOM_SPHERE, size=_three(shape.radius), **place)
+        case coal.Capsule():
+            body.add_geom(type=kinds.mjGEOM_CAPSULE, size=_three(shape.radius, shape.halfLength), **place)
+        case coal.Cylinder():
+            body.add_geom(type=kinds.mjGEOM_CYLINDER, size=_three(shape.radius, shape.halfLength), **place)
+        case coal.Box():
+            body.add_geom(type=kinds.mjGEOM_BOX, size=_three(*shape.halfSide), **place)
+        case coal.ConvexBase():
+            mesh = spec.add_mesh(name=geometry.name, uservert=np.array(shape.points()).ravel())
+            mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+            body.add_geom(type=kinds.mjGEOM_MESH, meshname=geometry.name, **place)
+        case _:
+            raise ValueError(f"body {geometry.name!r}: {type(shape).__name__} has no counterpart")
+
+
+def _three(*sizes: float) -> Sequence[float]:
+    return [*sizes, 0.0, 0.0][:3]
+
+
+def _quaternion(rotation: Array) -> Array:
+    """(4,) w first, from (3, 3)."""
+    quaternion = np.empty(4)
+    mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(rotation).ravel())
+    return quaternion

@@ -1,0 +1,155 @@
+"""Random obstacles: what they look like, and how they get in the way."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from qpavoid.problem import Array
+
+if TYPE_CHECKING:
+    from bench.safety.campaign import Ranges
+
+
+class Way(NamedTuple):
+    """The straight line that a tool is meant to follow."""
+
+    start: Array
+    """(3,) [m]."""
+    goal: Array
+    """(3,) [m]."""
+    begin: float
+    """When it sets out [s]."""
+    end: float
+    """When it is there [s]."""
+
+    def point(self, share: float) -> Array:
+        """(3,) where it is at that share of its time, at constant speed [m]."""
+        return self.start + share * (self.goal - self.start)
+
+    def time(self, share: float) -> float:
+        """When that is [s]."""
+        return self.begin + share * (self.end - self.begin)
+
+    @property
+    def direction(self) -> Array:
+        """(3,) unit vector."""
+        along = self.goal - self.start
+        return np.asarray(along / max(np.linalg.norm(along), 1e-9))
+
+
+def draw_obstacle(
+    random: np.random.Generator, name: str, moving: bool, way: Way, bodies: Array, ranges: Ranges
+) -> dict[str, Any]:
+    """An obstacle as a scenario file has it; whether there is room for it at the start is not looked at.
+
+    Args:
+        random: where it is drawn from.
+        name: its name.
+        moving: whether it moves.
+        way: of a tool.
+        bodies: (b, 3) where parts of the robot are likely to be at some time [m].
+        ranges: sizes and speeds.
+    """
+    if moving:
+        motion = MOTIONS[random.integers(len(MOTIONS))](random, way, bodies, ranges)
+        if motion["type"] == "line" and random.random() < ranges.tumbling_share:
+            motion = _tumbling(random, motion, ranges)
+    else:
+        motion = {"type": "fixed", "position": _beside(random, way, bodies).tolist(), "rpy": _rpy(random)}
+    return {"name": name, "shape": _shape(random, ranges), "motion": motion}
+
+
+def _shape(random: np.random.Generator, ranges: Ranges) -> dict[str, Any]:
+    radius, sides = random.uniform(*ranges.radius), random.uniform(*ranges.length, size=3)
+    match random.integers(5):
+        case 0:
+            return {"type": "sphere", "radius": radius}
+        case 1:
+            return {"type": "capsule", "radius": radius, "length": sides[0]}
+        case 2:
+            return {"type": "cylinder", "radius": radius, "length": sides[0]}
+        case 3:
+            return {"type": "box", "size": sides.tolist()}
+        case _:
+            return {"type": "box", "size": [sides[0], sides[1], random.uniform(*ranges.thickness)]}
+
+
+def _beside(random: np.random.Generator, way: Way, bodies: Array) -> Array:
+    """Somewhere near the tool's way, two times in three, else near the robot, (3,) [m]."""
+    near_way = random.random() < 2.0 / 3.0
+    point = way.point(random.uniform(-0.1, 1.1)) if near_way else bodies[random.integers(len(bodies))]
+    return np.asarray(point + random.uniform(0.0, 0.35) * _direction(random))
+
+
+def _crossing(random: np.random.Generator, way: Way, bodies: Array, ranges: Ranges) -> dict[str, Any]:
+    """A line through the tool's way, at the time when the tool is there."""
+    speed, share, direction = random.uniform(*ranges.obstacle_speed), random.uniform(0.2, 1.0), _direction(random)
+    point = way.point(share) + random.uniform(0.0, 0.05) * _direction(random)
+    return _line(point - speed * way.time(share) * direction, point + 1.5 * direction, speed)
+
+
+def _at_the_arm(random: np.random.Generator, way: Way, bodies: Array, ranges: Ranges) -> dict[str, Any]:
+    """A line through a part of the robot."""
+    speed, direction = random.uniform(*ranges.obstacle_speed), _direction(random)
+    point = bodies[random.integers(len(bodies))] + random.uniform(0.0, 0.1) * _direction(random)
+    return _line(point - random.uniform(0.3, 1.0) * direction, point + 1.5 * direction, speed)
+
+
+def _head_on(random: np.random.Generator, way: Way, bodies: Array, ranges: Ranges) -> dict[str, Any]:
+    """Along the tool's way, towards it."""
+    aside = random.uniform(0.0, 0.03) * _direction(random)
+    start = way.goal + random.uniform(0.2, 0.6) * way.direction + aside
+    return _line(start, way.start - 1.5 * way.direction + aside, random.uniform(*ranges.obstacle_speed))
+
+
+def _chasing(random: np.random.Generator, way: Way, bodies: Array, ranges: Ranges) -> dict[str, Any]:
+    """Along the tool's way from behind, and on past the goal."""
+    aside = random.uniform(0.0, 0.03) * _direction(random)
+    start = way.start - random.uniform(0.2, 0.6) * way.direction + aside
+    return _line(start, way.goal + 1.5 * way.direction + aside, random.uniform(*ranges.obstacle_speed))
+
+
+def _circling(random: np.random.Generator, way: Way, bodies: Array, ranges: Ranges) -> dict[str, Any]:
+    """Round and round, near the tool's way or the robot."""
+    radius = random.uniform(0.05, 0.3)
+    return {
+        "type": "circle",
+        "center": _beside(random, way, bodies).tolist(),
+        "radius": radius,
+        "normal": _direction(random).tolist(),
+        "start_direction": _direction(random).tolist(),
+        "period": 2.0 * np.pi * radius / random.uniform(*ranges.obstacle_speed),
+        "rpy": _rpy(random),
+    }
+
+
+MOTIONS = (_crossing, _at_the_arm, _head_on, _chasing, _circling)
+"""All equally likely."""
+
+
+def _line(start: Array, end: Array, speed: float) -> dict[str, Any]:
+    return {"type": "line", "start": start.tolist(), "end": end.tolist(), "speed": speed}
+
+
+def _tumbling(random: np.random.Generator, line: dict[str, Any], ranges: Ranges) -> dict[str, Any]:
+    """The same line, turning from one orientation to another."""
+    time = float(np.linalg.norm(np.subtract(line["end"], line["start"]))) / line["speed"]
+    yaw = random.uniform(-1.0, 1.0) * min(ranges.turn_rate * time, np.pi)
+    first = _rpy(random)
+    return {
+        "type": "waypoints",
+        "times": [0.0, time],
+        "positions": [line["start"], line["end"]],
+        "rpys": [first, [first[0], first[1], first[2] + yaw]],
+    }
+
+
+def _direction(random: np.random.Generator) -> Array:
+    vector = random.normal(size=3)
+    return np.asarray(vector / np.linalg.norm(vector))
+
+
+def _rpy(random: np.random.Generator) -> list[float]:
+    return [random.uniform(-np.pi, np.pi), random.uniform(-0.5 * np.pi, 0.5 * np.pi), random.uniform(-np.pi, np.pi)]
