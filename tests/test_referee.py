@@ -1,0 +1,299 @@
+"""The referee of the safety campaign: MuJoCo's distances, contacts between ticks, verdicts, and a small campaign."""
+
+from dataclasses import replace
+from functools import cache
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from conftest import BOX, CAPSULE, CYLINDER, SPHERE, obstacle, random_q, random_scene, write_chain
+
+from qpavoid import Robot, ScenarioConfig, build_scene, load_scenario, simulate
+
+pytest.importorskip("mujoco")
+pytest.importorskip("bench", reason="bench/ is in the repository only")
+
+from bench.safety import report
+from bench.safety.arena import build, load
+from bench.safety.campaign import FOLDER, KINDS, RANGES, draw
+from bench.safety.referee import STEP, Watch, referee
+from bench.safety.trial import trials
+from bench.safety.verdict import judge
+
+PLATE = BOX.model_copy(update={"size": (0.3, 0.2, 0.006)})
+
+
+@cache
+def robot(name):
+    return Robot.load(name, FOLDER)
+
+
+@cache
+def situation(solver):
+    scenario = load_scenario("situation1")
+    return load(scenario), simulate(scenario, solver)
+
+
+def scene_of(robot_path, tasks, obstacles, **fields):
+    config = {"robot": str(robot_path), "tasks": tasks, "obstacles": obstacles, **fields}
+    return ScenarioConfig.model_validate(config).read_from(Path("handmade.yaml"))
+
+
+# --- the arena ----------------------------------------------------------------------------------------------
+
+
+def coal_distances(scene, q):
+    """(m,) by pinocchio and coal, without anything of ours."""
+    model, data = scene.robot.model, scene.geometry.createData()
+    pin.updateGeometryPlacements(model, model.createData(), scene.geometry, data, q)
+    pin.computeDistances(scene.geometry, data)
+    return np.array([result.min_distance for result in data.distanceResults])
+
+
+@pytest.mark.parametrize("name", [kind.robot for kind in KINDS])
+def test_distances_are_those_of_coal(name):
+    rng, apart, inside = np.random.default_rng(1), 0, 0
+    for _ in range(6):
+        q = random_q(robot(name), rng)
+        data = robot(name).bodies.createData()
+        pin.updateGeometryPlacements(robot(name).model, robot(name).model.createData(), robot(name).bodies, data, q)
+        bodies = rng.integers(len(data.oMg), size=15).tolist()
+        near = [data.oMg[body].translation + rng.uniform(-0.12, 0.12, 3) for body in bodies]
+        shapes = zip([SPHERE, CAPSULE, BOX, CYLINDER, PLATE] * 3, near, strict=True)
+        obstacles = [obstacle(f"o{i}", shape, at, rng.uniform(-3.0, 3.0, 3)) for i, (shape, at) in enumerate(shapes)]
+        scene = build_scene(robot(name), obstacles)
+        arena, bodies = build(scene, robot(name).home), scene.geometry.geometryObjects
+        arena.place(q, 0.0)
+        for pair, d in enumerate(coal_distances(scene, q)):
+            radii = [bodies[body].geometry.radius for body in scene.pairs[pair].tolist() if body < arena.bodies]
+            if d > -0.9 * min(radii):  # MuJoCo's depth means something else once the axis of a capsule is inside a box
+                assert arena.distance(pair) == pytest.approx(d, abs=1e-4), scene.pair_names[pair]
+                apart, inside = apart + (d > 0.0), inside + (d < 0.0)
+    assert apart > 300 and inside > 30
+
+
+def test_hulls_are_those_of_coal(panda_convex):
+    rng = np.random.default_rng(2)
+    scene = random_scene(panda_convex, rng, [SPHERE, BOX, CAPSULE])
+    arena = build(scene, panda_convex.home)
+    for _ in range(5):
+        q = random_q(panda_convex, rng)
+        arena.place(q, 0.0)
+        expected = coal_distances(scene, q)
+        got = np.array([arena.distance(pair) for pair in range(len(expected))])
+        np.testing.assert_allclose(got[expected > 0.0], expected[expected > 0.0], atol=1e-4)
+
+
+def test_a_floating_base_is_refused(solo):
+    with pytest.raises(ValueError, match="neither a hinge nor a slide"):
+        build(random_scene(solo, np.random.default_rng(0), [SPHERE]), solo.home)
+
+
+# --- the referee --------------------------------------------------------------------------------------------
+
+
+def test_it_finds_the_collision_of_situation_1_and_its_depth():
+    arena, log = situation("tracking")
+    findings = referee(arena, log)
+    names = [arena.scene.pair_names[contact.pair] for contact in findings.contacts]
+    assert names == [("left_hand", "fist")]
+    # the depth by hand: radii less the distance of the sphere's centre from the hand's axis
+    model, k = arena.scene.robot.model, round(findings.time / 0.01)
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, log.q[k])
+    wrist = data.oMf[model.getFrameId("left_link7")]
+    start, end = wrist.translation, wrist.act(np.array([0.0, 0.0, -0.25]))
+    center = np.array([0.39644872, 0.41090125, 0.74741443])
+    share = np.clip((center - start) @ (end - start) / 0.25**2, 0.0, 1.0)
+    depth = 0.1 - np.linalg.norm(start + share * (end - start) - center)
+    assert findings.contacts[0].depth == pytest.approx(depth, abs=1e-4)
+    assert findings.distance == pytest.approx(-depth, abs=1e-4)
+    assert findings.contacts[0].time < findings.time
+
+
+def test_it_sees_none_where_there_is_none():
+    arena, log = situation("qp")
+    findings = referee(arena, log)
+    assert findings.contacts == ()
+    assert findings.distance == pytest.approx(0.02, abs=1e-3)
+    assert findings.distance == pytest.approx(log.min_distance.min(), abs=1e-4)
+    assert findings.disagreement < 1e-6 and findings.drift < 1e-9
+
+
+def test_it_plays_velocities_and_does_not_believe_the_configurations():
+    arena, log = situation("tracking")
+    findings, told = referee(arena, log), referee(arena, replace(log, q=log.q + 0.1))
+    assert told.contacts == findings.contacts
+    assert told.drift == pytest.approx(0.1)
+
+
+def test_it_checks_the_joint_limits():
+    arena, log = situation("qp")
+    bounds = arena.scene.robot.bounds()
+    assert referee(arena, log).speed_excess <= 0.0
+    fast = log.v.copy()
+    fast[10:20, 2] = bounds.velocity[2] + 0.5
+    assert referee(arena, replace(log, v=fast)).speed_excess == pytest.approx(0.5)
+    steady = np.zeros_like(log.v)
+    steady[:, 0] = 1.0  # rad/s, for 12.99 s
+    excess = arena.q0[0] + 13.0 - bounds.upper[0]
+    assert referee(arena, replace(log, v=steady)).position_excess == pytest.approx(excess, abs=0.02)
+
+
+def test_it_checks_accelerations():
+    scenario = load_scenario("situation1", ["limits.acceleration=3.0", "duration=1.0"])
+    arena, log = load(scenario), simulate(scenario, "tracking")
+    v = np.zeros_like(log.v)
+    v[5:, 1] = 0.05  # rad/s, within one tick of 0.01 s
+    assert referee(arena, replace(log, v=v)).acceleration_excess == pytest.approx(5.0 - 3.0)
+    assert referee(*situation("tracking")).acceleration_excess == -np.inf
+
+
+def test_it_refuses_the_log_of_another_scene():
+    arena, _ = situation("qp")
+    with pytest.raises(ValueError, match="another scene"):
+        referee(arena, simulate(load_scenario("situation2", ["duration=0.1"])))
+
+
+def test_it_catches_what_passes_between_two_ticks(tmp_path):
+    # a plate of 6 mm at 3 m/s goes through a rod of 60 mm while the controller does not look
+    plate = {"type": "box", "size": [0.2, 0.006, 0.2]}
+    line = {"type": "line", "start": [0.0, -0.45, 0.55], "end": [0.0, 0.45, 0.55], "speed": 3.0}
+    scenario = scene_of(
+        write_chain(tmp_path, joints=2),
+        [{"frame": "link1"}],
+        [{"name": "plate", "shape": plate, "motion": line}],
+        dt=0.1,
+        duration=0.4,
+    )
+    arena, log = load(scenario), simulate(scenario, "tracking")
+    findings = referee(arena, log)
+    assert log.min_distance.min() > 0.05
+    assert [arena.scene.pair_names[contact.pair] for contact in findings.contacts] == [("link1_0", "plate")]
+    assert findings.contacts[0].time == pytest.approx((0.45 - 0.033) / 3.0, abs=STEP)
+
+
+@pytest.mark.parametrize("seed", [2, 9])
+def test_what_it_does_not_measure_again_does_not_matter(seed):
+    scenario = draw(seed)
+    arena, log = load(scenario), simulate(scenario, "tracking")
+    findings = referee(arena, log)
+    touched, smallest = set(), np.inf
+    for q, t in zip(findings.q, log.t.tolist(), strict=True):
+        arena.place(q, t)
+        distances = np.array([arena.distance(pair) for pair in range(len(arena.scene.pairs))])
+        touched |= set(np.flatnonzero(distances < 0.0).tolist())
+        smallest = min(smallest, distances[arena.movable].min())
+    found = {contact.pair for contact in findings.contacts}
+    assert touched and touched <= found
+    assert smallest - STEP < findings.distance <= smallest + 1e-12
+    assert findings.looks >= len(log.t)
+
+
+def test_no_step_is_longer_than_it_says():
+    class Seen(Watch):
+        def look(self, t):
+            centers.append(arena.poses()[0].copy())
+            super().look(t)
+
+    arena, centers = load(draw(9)), []
+    watch = Seen(arena)
+    watch.look(0.0)
+    watch.follow(arena.q0, 0.5 * arena.scene.robot.bounds().velocity, 0.0, 0.05)
+    assert len(centers) > 5
+    assert np.linalg.norm(np.diff(centers, axis=0), axis=2).max() <= 1.05 * STEP
+
+
+# --- verdicts -----------------------------------------------------------------------------------------------
+
+
+def ball(name, y, speed, z=0.5):
+    """A ball that comes along y and stops in the middle of the rod."""
+    line = {"type": "line", "start": [0.0, y, z], "end": [0.0, 0.0, z], "speed": speed}
+    return {"name": name, "shape": {"type": "sphere", "radius": 0.04}, "motion": line}
+
+
+@pytest.mark.parametrize(
+    ("obstacles", "why"),
+    [
+        ([ball("left", 0.3, 0.1)], ["avoidable"]),
+        ([ball("left", 0.3, 0.1), ball("right", -0.3, 0.1)], ["squeezed", "squeezed"]),
+        ([ball("left", 0.6, 2.0)], ["outrun"]),
+        ([ball("left", 0.3, 0.1, z=0.15)], ["fixed"]),
+        ([ball("below", 0.3, 0.1, z=0.15), ball("left", 0.4, 0.1)], ["fixed", "avoidable"]),
+    ],
+    ids=["room to go", "from both sides", "too fast", "at the base", "at the base, then room to go"],
+)
+def test_verdicts(tmp_path, obstacles, why):
+    # a rod 0.05 to 0.25 m above its hinge, at up to 1.5 rad/s, with another on top, out of the balls' way
+    scenario = scene_of(
+        write_chain(tmp_path, joints=2),
+        [{"frame": "link1"}],
+        obstacles,
+        avoidance={"d1": 0.02, "d2": 0.1},
+        duration=4.0,
+    )
+    arena, log = load(scenario), simulate(scenario, "tracking")
+    verdicts = judge(arena, scenario, log, referee(arena, log))
+    assert [verdict.why for verdict in verdicts] == why, verdicts
+    assert verdicts[-1].avoidable == (why[-1] == "avoidable")
+
+
+def test_standing_still_proves_that_a_static_obstacle_is_avoidable():
+    scenario, (arena, log) = load_scenario("situation1"), situation("tracking")
+    (verdict,) = judge(arena, scenario, log, referee(arena, log))
+    assert verdict.why == "avoidable" and "standing still" in verdict.detail
+
+
+# --- the campaign -------------------------------------------------------------------------------------------
+
+
+def test_scenarios_can_be_drawn_again_and_begin_clear():
+    drawn = [draw(seed) for seed in range(30)]
+    assert drawn == [draw(seed) for seed in range(30)]
+    assert {scenario.robot for scenario in drawn} == {kind.robot for kind in KINDS}
+    assert len({scenario.dt for scenario in drawn}) > 3
+    assert max(len(scenario.obstacles) for scenario in drawn) > 10
+    for scenario in drawn:
+        arena = load(scenario)
+        smallest = min(arena.distance(pair) for pair in range(len(arena.scene.pairs)))
+        assert smallest > scenario.avoidance.d1 - 1e-6, scenario.title
+        assert RANGES.d1[0] <= scenario.avoidance.d1 <= RANGES.d1[1]
+        assert RANGES.duration[0] <= scenario.duration <= RANGES.duration[1]
+
+
+@cache
+def small_campaign(solver, count):
+    seeds = (seed for seed in range(100) if draw(seed).dt > 0.002)  # short periods take many ticks
+    return [trial for seed in islice(seeds, count) for trial in trials(seed, (solver,))]
+
+
+def test_qp_has_no_avoidable_collision():
+    found = small_campaign("qp", 15)
+    assert {(trial.seed, trial.judged) for trial in found if trial.avoidable} == set()
+    assert all(trial.speed_excess < 1e-9 and trial.position_excess < 1e-9 for trial in found)
+    assert all(trial.disagreement < 1e-6 and trial.drift < 1e-6 and not trial.failure for trial in found)
+
+
+@pytest.mark.xfail(strict=False, raises=AssertionError, reason="found by the campaign, not yet explained")
+@pytest.mark.parametrize("seed", [26, 99, 100, 122])  # and 23 and 30, which are slow
+def test_qp_collisions_that_were_found(seed):
+    (trial,) = trials(seed, ("qp",))
+    assert not trial.avoidable, trial.judged
+
+
+def test_tracking_alone_collides_and_could_have_avoided_it():
+    assert sum(trial.avoidable for trial in small_campaign("tracking", 8)) > 4
+
+
+def test_the_report_has_every_run(tmp_path):
+    found = small_campaign("qp", 15) + small_campaign("tracking", 8)
+    text = report.write(found, {99: "ValueError: no"}, ("qp", "tracking"), report.Took(60.0, (0.1, 0.2)), tmp_path, "s")
+    assert (tmp_path / "s.md").read_text() == text
+    assert len((tmp_path / "s.csv").read_text().splitlines()) == 1 + len(found)
+    assert "seed 99: ValueError: no" in text
+    bad = [trial for trial in found if trial.solver == "tracking" and trial.avoidable]
+    assert f"| **{len(bad)}** |" in text
+    assert all(f"| {trial.seed} | {trial.robot} |" in text for trial in bad[: report.LISTED])
