@@ -15,7 +15,7 @@ from qpavoid.limits import JointBounds, limit_layout
 from qpavoid.motion import Sample
 from qpavoid.problem import Array, AvoidanceRows, Problem, Proximity, Tracking
 from qpavoid.proximity import DistanceQuery
-from qpavoid.scene import Scene, body_support
+from qpavoid.scene import Scene
 from qpavoid.tasks import FrameTask, task_layout
 
 
@@ -45,11 +45,10 @@ class Assembly:
             twists=query.twists,
             twist_row=query.twist_row,
             margin=query.margin,
-            bodies=scene.pairs,
-            body_poses=query.poses,
-            spheres=query.spheres,
-            body_support=body_support(scene),
-            body_speed=query.body_speed,
+            joint_velocities=kinematics.joint_velocities,
+            joint_reach=query.joint_reach(),
+            carriers=query.carriers(),
+            speeds=query.speeds,
             near=np.zeros(pairs, dtype=np.intp),
             closest=np.zeros((pairs, 10)),
             J=np.zeros((pairs, nv)),
@@ -89,12 +88,12 @@ class Assembly:
             self._tracking, rows, x.lower, x.upper, x.hard_lower, x.hard_upper, x.v_stop, *self._names, x.v0, worst
         )
 
-    def closest_call(self, v: Array, near: int, reach: float, horizon: float) -> float:
-        """How much is certainly left of the safe distances if all move at v until `horizon`, wherever to [m].
+    def closest_call(self, near: int, reach: float, horizon: float) -> float:
+        """How much is certainly left of the safe distances if all move as they do until `horizon` [m].
 
-        See `kernels.vectorised.closest_call`.
+        See `kernels.vectorised.closest_call`; the velocity is that of the last `ForwardKinematics.move`.
         """
-        return float(kernels.closest_call(self._packed, v, near, reach, horizon))
+        return float(kernels.closest_call(self._packed, near, reach, horizon))
 
     def follow(self, v: Array, problem: Problem) -> Problem:
         """The problem of this tick with the velocity v (nv,) to follow in place of the tasks."""
@@ -138,11 +137,10 @@ class Assembly:
         """Takes v (nv,) as the velocity at which the robot moves until the next tick."""
         self._layout.v_last[:] = v
 
-    def stop(self) -> Array:
-        """Next velocity of a stop (nv,) for which nothing but the last velocity is known: slowed by one factor."""
-        x = self._layout
-        slowing = float(np.max(np.abs(x.v_last) / x.v_step, initial=1.0))
-        return (1.0 - 1.0 / slowing) * x.v_last
+    @property
+    def v_last(self) -> Array:
+        """Velocity (nv,) at which the robot moves until this tick."""
+        return self._layout.v_last
 
     def _view(self, k: int) -> tuple[Proximity, AvoidanceRows]:
         x = self._layout

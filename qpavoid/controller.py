@@ -9,26 +9,30 @@ from time import perf_counter
 from typing import Any, NamedTuple
 
 import numpy as np
+import pinocchio as pin
 
 from qpavoid import kernels
 from qpavoid.assembly import Assembly
 from qpavoid.config import Avoidance, Limits, Progress, ScenarioConfig, Sensing
-from qpavoid.errors import UnknownName, located
+from qpavoid.errors import NumericalError, UnknownName, located
 from qpavoid.guard import TOLERANCE, Guard
 from qpavoid.kinematics import ForwardKinematics, Kinematics
 from qpavoid.limits import saturate
 from qpavoid.loading import nearest
 from qpavoid.motion import Sample
-from qpavoid.problem import Array, Problem, Proximity, Solution, State, Status, as_vector
+from qpavoid.problem import Array, Problem, Proximity, Solution, State, Status, as_vector, require_finite
 from qpavoid.progress import ProgressWatch
 from qpavoid.proximity import DistanceQuery
 from qpavoid.robot import Robot
 from qpavoid.scene import Scene, build_obstacles, build_scene
-from qpavoid.sensing import Obstacles, Pose
+from qpavoid.sensing import Obstacles, Pose, as_sample, finite
 from qpavoid.solvers import Solver, make_solver
+from qpavoid.solvers.qp import Qp
 from qpavoid.tasks import FrameTask, build_tasks
 
 _log = logging.getLogger(__name__)
+_ABSURD = 1e100
+"""Violation of a row or bound from which numbers are looked through for what cannot be true [m/s, rad/s]."""
 
 
 class Tick(NamedTuple):
@@ -85,11 +89,13 @@ class Controller:
         self._progress = ProgressWatch(progress or Progress(), dt, scene.pair_names)
         self._reach = self.avoidance.d2 - self.avoidance.offset
         self._bounds = scene.robot.bounds().within(self.limits)
+        self._verifies = isinstance(self.solver, Qp)
+        self._q_last = scene.robot.home.copy()
         self._assembly = Assembly(
             scene, self.tasks, self._bounds, self._kinematics, self._query, self.avoidance,
             self.limits.position_gain, tracking_damping, dt,
         )  # fmt: skip
-        self._guard = Guard(scene, self._bounds, self.avoidance.hold - self.avoidance.offset, dt)
+        self._guard = Guard(scene, self._kinematics, self._bounds, self.avoidance.hold - self.avoidance.offset, dt)
         self._warm_up()
 
     def _warm_up(self) -> None:
@@ -97,7 +103,7 @@ class Controller:
         q, v = self.scene.robot.home, np.zeros(self._v_shape)
         self.tick(q)
         self.filter(q, v)
-        self._assembly.closest_call(v, 0, self._reach, self.dt)
+        self._assembly.closest_call(0, self._reach, self.dt)
         self.reset()
         self.warm_up_time = perf_counter() - begin
         """Time that the first tick took, compilation included [s]; no later one waits for the compiler."""
@@ -144,7 +150,8 @@ class Controller:
         """Velocity for the next dt.
 
         Every call with arguments of the right kind ends in a solution. Numbers that cannot be true (NaN, infinity) end
-        in a stop that says so; of an obstacle, they count as no news.
+        in a stop that says so; of an obstacle, they count as no news. Where q is unknown, the stop takes the robot to
+        be where the last velocity has led it.
 
         Args:
             q: configuration (nq,) as measured.
@@ -199,7 +206,8 @@ class Controller:
 
     def reset(self, v: Array | None = None) -> None:
         """Forgets the ticks before: the robot moves at v (nv,), or stands still."""
-        self._assembly.remember(np.zeros(self._v_shape) if v is None else as_vector("v", v, self._v_shape))
+        self._assembly.remember(np.zeros(self._v_shape) if v is None else require_finite("v", v, self._v_shape))
+        self._q_last[:] = self.scene.robot.home
         self._obstacles.reset()
         self._progress.reset()
 
@@ -214,12 +222,26 @@ class Controller:
     ) -> tuple[tuple[Sample, ...], Proximity, Problem, Solution]:
         begin = perf_counter()
         q = as_vector("q", q, self._q_shape)
-        if v is not None:
-            self._assembly.remember(as_vector("v", v, self._v_shape))
         faults: tuple[str, ...] = ()
-        if not isfinite(np.vdot(q, q) + t):
-            faults = _not_finite(q, t)
-            q, t = np.where(np.isfinite(q), q, self.scene.robot.home), 0.0
+        if v is not None:
+            v = as_vector("v", v, self._v_shape)
+            if isfinite(np.vdot(v, v)):
+                self._assembly.remember(v)
+            else:
+                faults = (_not_finite("v", v),)
+        try:
+            known = isfinite(np.vdot(q, q) + t)
+        except TypeError:
+            raise NumericalError(f"t: not a number: {t!r:.60}") from None
+        if not known:
+            if not isfinite(np.vdot(q, q)):
+                faults += (_not_finite("q", q),)
+                q = self._expected()
+            if not isfinite(t):
+                faults, t = (*faults, f"t: {t}"), 0.0
+        self._q_last[:] = q
+        if desired is not None and not isfinite(np.vdot(desired, desired)):
+            faults += (_not_finite("v_desired", desired),)
         samples = self._targets(t, targets)
         observed = self._obstacles.observe(t, obstacles)
         assumed: tuple[str, ...] = ()
@@ -233,32 +255,43 @@ class Controller:
         proximity, problem = self._assembly.compute(q, samples, self._query, self._reach)
         if desired is not None:
             problem = self._assembly.follow(desired, problem)
+        elif targets and not problem.shortfall < _ABSURD:
+            faults += tuple([f"target {frame!r}: NaN or infinity" for frame in targets if not finite(targets[frame])])
         built = perf_counter()
         if faults:
-            solution = self._stop(faults)
+            solution = _stop(problem, faults)
         elif desired is not None:
             solution = self._solve(q, problem)
         else:
-            solution = self._solve(q, self._progress.redirect(problem, proximity, self._assembly, self.solver))
+            solution = self._solve(q, problem, proximity)
             blocked = self._progress.update(problem, solution)
             solution = solution._replace(blocked=blocked) if blocked else solution
         self._assembly.remember(solution.v)
         solution = solution._replace(assumed=assumed) if assumed else solution
         return samples, proximity, problem, solution.timed(built - begin, perf_counter() - built)
 
-    def _solve(self, q: Array, problem: Problem) -> Solution:
+    def _solve(self, q: Array, problem: Problem, proximity: Proximity | None = None) -> Solution:
+        """What the solver says, within the limits and looked ahead; with a proximity, ways round may be tried."""
         try:
+            if proximity is not None:
+                problem = self._progress.redirect(problem, proximity, self._assembly, self.solver)
             solution = self.solver.solve(problem)
-            usable = solution.v.shape == self._v_shape and isfinite(np.vdot(solution.v, solution.v))
+            v = solution.v
+            usable = v.dtype == np.float64 and v.shape == self._v_shape and isfinite(np.vdot(v, v))
         except Exception as error:  # a law of the user's own may raise anything; the robot must get a velocity
-            return self._stop((f"the solver raised {type(error).__name__}: {error}",))
+            return _stop(problem, (f"the solver raised {type(error).__name__}: {error}",))
         if not usable:
-            return self._stop(solution.reasons or ("the solver returned no finite velocity of the right shape",))
+            return _stop(problem, solution.reasons or ("the solver returned no finite velocity of the right shape",))
         if not self.solver.bounded:
             if self.limits.saturate:
-                v, change = saturate(solution.v, problem.lower, problem.upper, self._bounds.velocity)
+                v, change = saturate(v, problem.lower, problem.upper, self._bounds.velocity)
                 return solution._replace(v=v, saturation=change)
             return solution
+        if not self._verifies:
+            met = solution.status is Status.SOLVED
+            limits = (problem.lower, problem.upper) if met else (problem.hard_lower, problem.hard_upper)
+            v = np.clip(v, *limits)
+            solution = solution._replace(v=v, saturation=float(np.max(np.abs(v - solution.v), initial=0.0)))
         if self.avoidance.look_ahead:
             return self._looked_ahead(q, problem, solution)
         return solution
@@ -272,26 +305,35 @@ class Controller:
             return solution
         if short <= TOLERANCE:
             return solution._replace(v=v, share=share)
+        if short != short:
+            names = " - ".join(self.scene.pair_names[pair])
+            return _stop(problem, (*solution.reasons, f"{names}: no distance can be told on the way ahead"))
         reason = f"{' - '.join(self.scene.pair_names[pair])}: comes {1e3 * short:.1f} mm too near"
         status = solution.status if solution.status is Status.STOPPED else Status.RELAXED
         return solution._replace(v=v, share=share, status=status, reasons=(*solution.reasons, reason))
 
-    def _stop(self, reasons: tuple[str, ...]) -> Solution:
-        return Solution(self._assembly.stop(), Status.STOPPED, reasons)
+    def _expected(self) -> Array:
+        """Where the robot is if it did what it was told last (nq,)."""
+        return np.asarray(pin.integrate(self.scene.robot.model, self._q_last, self.dt * self._assembly.v_last))
 
     def _targets(self, t: float, given: Mapping[str, Sample] | None) -> tuple[Sample, ...]:
         if not given:
             return tuple([task.motion.sample(t) for task in self.tasks])
-        for frame in given:
+        checked = {}
+        for frame, sample in given.items():
             if frame not in self._frame_index:
                 raise UnknownName(f"no target {frame!r}{nearest(frame, self._frame_index)}")
-        return tuple([given.get(task.settings.frame) or task.motion.sample(t) for task in self.tasks])
+            checked[frame] = as_sample(f"target {frame!r}", sample)
+        return tuple([checked.get(task.settings.frame) or task.motion.sample(t) for task in self.tasks])
 
 
-def _not_finite(q: Array, t: float) -> tuple[str, ...]:
-    bad = np.flatnonzero(~np.isfinite(q)).tolist()
-    reasons = [f"q: NaN or infinity at index {', '.join(map(str, bad[:5]))}"] if bad else []
-    return (*reasons, *([] if isfinite(t) else [f"t: {t}"]))
+def _stop(problem: Problem, reasons: tuple[str, ...]) -> Solution:
+    return Solution(problem.v_stop.copy(), Status.STOPPED, reasons)
+
+
+def _not_finite(name: str, value: Array) -> str:
+    bad = np.flatnonzero(~np.isfinite(value)).tolist()
+    return f"{name}: NaN or infinity at index {', '.join(map(str, bad[:5]))}" if bad else f"{name}: absurdly large"
 
 
 def _copied(value: Any) -> Any:

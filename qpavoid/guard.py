@@ -20,6 +20,7 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid.assembly import Assembly
+from qpavoid.kinematics import ForwardKinematics
 from qpavoid.limits import JointBounds
 from qpavoid.motion import Sample
 from qpavoid.problem import Array
@@ -54,16 +55,19 @@ class Checked(NamedTuple):
 class Guard:
     """Follows velocities ahead in time, on kinematics and distances of its own."""
 
-    def __init__(self, scene: Scene, bounds: JointBounds, hold: float, dt: float) -> None:
+    def __init__(
+        self, scene: Scene, kinematics: ForwardKinematics, bounds: JointBounds, hold: float, dt: float
+    ) -> None:
         """Lays the memory out.
 
         Args:
             scene: robot and obstacles.
+            kinematics: of the tick, brought to the velocities that are looked at.
             bounds: limits of the joints.
             hold: safe distance between surfaces [m].
             dt: how long a velocity is held [s].
         """
-        self._scene, self._model, self._hold, self._dt = scene, scene.robot.model, hold, dt
+        self._model, self._kinematics, self._hold, self._dt = scene.robot.model, kinematics, hold, dt
         self._data, self._ahead = scene.robot.model.createData(), DistanceQuery(scene)
         self._acceleration, self._accelerated = bounds.acceleration, bool(np.isfinite(bounds.acceleration).any())
         self._samples: dict[int, Sample] = {}
@@ -87,10 +91,11 @@ class Guard:
             reach: surface distance up to which they were looked for [m].
         """
         horizon = self._dt + 0.5 * self._stopping(v)
-        if assembly.closest_call(v, near, reach, horizon) > 0.0:
+        self._kinematics.move(q, v)
+        if assembly.closest_call(near, reach, horizon) > 0.0:
             return Checked(v, 1.0, 0.0, -1)
         self._place_obstacles(query.margin)
-        travel = float(np.max(query.body_speed)) * horizon
+        travel = float(np.max(query.speeds)) * horizon
         worst, pair = self._worst(q, v, query, travel)
         best = Checked(v, 1.0, max(-worst, 0.0), pair)
         for share in _SHARES if best.short > 0.0 else ():

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from qpavoid.memory import read_poses, view_poses
+from qpavoid.memory import read_poses, read_velocities, view_poses, view_velocities
 from qpavoid.problem import Array
 
 
@@ -45,12 +45,16 @@ class ForwardKinematics:
         self.data = model.createData()
         self._model, self._ids = model, list(frame_ids)
         pin.framesForwardKinematics(model, self.data, pin.neutral(model))
-        view = view_poses(self.data.oMf)
-        self._copy = view is None
+        pin.forwardKinematics(model, self.data, pin.neutral(model), np.arange(1.0, 1.0 + model.nv))
+        view, motions = view_poses(self.data.oMf), view_velocities(self.data.v)
+        self._copy, self._copy_velocities = view is None, motions is None
         self.J: Array = self.data.J
         """(6, nv) see `Kinematics.J`."""
         self.frame_poses: Array = read_poses(self.data.oMf) if view is None else view
         """(frames, 12) world poses of all frames; only those of `frame_ids` are kept up to date."""
+
+        self.joint_velocities: Array = read_velocities(self.data.v) if motions is None else motions
+        """(njoints, 6) linear velocity of each joint's origin and angular velocity, in the joint's axes."""
 
     def compute(self, q: Array) -> None:
         """Brings everything to a configuration q (nq,); `data` then holds the joint placements."""
@@ -60,6 +64,12 @@ class ForwardKinematics:
             pin.updateFramePlacement(model, data, frame_id)
         if self._copy:
             self.frame_poses[:] = read_poses(data.oMf)
+
+    def move(self, q: Array, v: Array) -> None:
+        """Brings `joint_velocities` to velocity v (nv,) at the configuration q (nq,)."""
+        pin.forwardKinematics(self._model, self.data, q, v)
+        if self._copy_velocities:
+            self.joint_velocities[:] = read_velocities(self.data.v)
 
 
 def support_masks(model: Any) -> Array:

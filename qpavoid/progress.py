@@ -25,6 +25,8 @@ _SLOWEST = 2e-3
 _TIGHT = 1e-3
 """How close to its bound a row counts as being in the way [m/s]."""
 _DIRECTIONS = 8
+_EVERY = 5
+"""Ticks from one look at the progress to the next."""
 
 
 class Obstruction(NamedTuple):
@@ -59,7 +61,7 @@ class ProgressWatch:
 
     def reset(self) -> None:
         """Forgets everything."""
-        self._without, self._tried = 0, 0
+        self._clock, self._without, self._tried = 0, 0, 0
         self._way: _Way | None = None
         self._culprits: list[Obstruction] = []
 
@@ -98,10 +100,13 @@ class ProgressWatch:
         if not len(A) or (problem.shortfall <= 0.0 and solution.share == 1.0):
             self._without = 0
             return ()
+        self._clock += 1
+        if self._clock % _EVERY and not self.blocked:
+            return ()
         wanted, got = A @ problem.v0, A @ solution.v
         size = float(wanted @ wanted)
         stuck = size > _SLOWEST**2 and float(got @ wanted) < _LEFT * size
-        self._without = self._without + 1 if stuck else max(self._without - 1, 0)
+        self._without = max(self._without + (_EVERY if stuck else -_EVERY), 0)
         if not self.blocked:
             return ()
         self._culprits = _culprits(problem, solution.v)

@@ -53,20 +53,35 @@ class DistanceQuery:
         poses = view_poses(self._data.oMg)
         self.poses: Array = read_poses(self._data.oMg) if poses is None else poses
         """(g, 12) world poses of all bodies, the robot's first."""
-        self._copy = view is None or poses is None
+        self._copy, self._copy_poses = view is None, poses is None
         shapes = [bounding_sphere(body.geometry) for body in self._geometry.geometryObjects]
         self.spheres = np.array([(*center, radius) for center, radius in shapes]).reshape(-1, 4)
         """(g, 4) bounding sphere of each body in its own frame: centre and radius [m]."""
-        self.body_speed = np.zeros(len(shapes))
-        """(g,) largest speed of any point of each body [m/s]; here, those of the obstacles."""
+        self._joints = model.njoints
+        self.speeds = np.zeros(model.njoints + obstacles)
+        """(njoints + o,) largest speed of any point that a joint carries, or of an obstacle [m/s]; here, the latter."""
         self._cull = _Cull(scene, self) if len(scene.pairs) >= _CULL_FROM else None
         self.pairs: IntArray = np.arange(len(scene.pairs))
         """(c,) pairs that were computed, increasing."""
 
     @property
     def moving(self) -> bool:
-        """Whether any obstacle has a velocity."""
+        """Whether any obstacle has a velocity or a margin."""
         return bool(self._moving)
+
+    def carriers(self) -> IntArray:
+        """(m, 2) what moves the two bodies of each pair: number of a joint, or njoints plus that of an obstacle."""
+        joints = np.array([body.parentJoint for body in self._geometry.geometryObjects], dtype=np.intp)
+        joints[self._first_obstacle :] = self._joints + np.arange(len(self._scene.obstacles))
+        return joints[self._scene.pairs]
+
+    def joint_reach(self) -> Array:
+        """(njoints,) distance from each joint's origin to the farthest point of a body that it carries [m]."""
+        reach = np.zeros(self._joints)
+        for body, (*center, radius) in zip(self._scene.robot.bodies.geometryObjects, self.spheres, strict=False):
+            placed = body.placement.rotation @ np.array(center) + body.placement.translation
+            reach[body.parentJoint] = max(reach[body.parentJoint], float(np.linalg.norm(placed)) + radius)
+        return reach
 
     def place_obstacle(self, index: int, sample: Sample, margin: float = 0.0) -> None:
         """Puts obstacle number `index` to a pose, with a velocity, and takes a margin [m] off its distances.
@@ -90,13 +105,14 @@ class DistanceQuery:
             self._placements[geometry, 9:] = sample.position
         twist = (vx - wy * z + wz * y, vy - wz * x + wx * z, vz - wx * y + wy * x, wx, wy, wz)
         self.twists[index] = twist
-        if any(twist):
+        if any(twist) or margin:
             self._moving.add(index)
             reach = float(np.linalg.norm(self.spheres[geometry, :3]) + self.spheres[geometry, 3])
-            self.body_speed[geometry] = hypot(vx, vy, vz) + hypot(wx, wy, wz) * reach
+            own = sample.linear.tolist()
+            self.speeds[self._joints + index] = hypot(*own) + hypot(wx, wy, wz) * reach
         else:
             self._moving.discard(index)
-            self.body_speed[geometry] = 0.0
+            self.speeds[self._joints + index] = 0.0
         if self._cull is not None:
             self._cull.place(geometry, sample.rotation, sample.position)
 
@@ -108,7 +124,7 @@ class DistanceQuery:
             reach: surface distance [m].
         """
         pin.updateGeometryPlacements(self._scene.robot.model, data, self._geometry, self._data)
-        if self._copy:
+        if self._copy_poses:
             self.poses[:] = read_poses(self._data.oMg)
         if self._cull is not None:
             self.pairs = self._cull.switch(reach)

@@ -113,12 +113,6 @@ def build_scene(robot: Robot, obstacles: Sequence[Obstacle] = ()) -> Scene:
     )
 
 
-def body_support(scene: Scene) -> Array:
-    """Which velocity coordinates move which of the robot's bodies (b, nv), 0 or 1."""
-    joints = np.array([body.parentJoint for body in scene.robot.bodies.geometryObjects], dtype=np.intp)
-    return support_masks(scene.robot.model)[joints]
-
-
 def build_obstacles(configs: Sequence[config.ObstacleConfig], source: Path) -> list[Obstacle]:
     """Obstacles of a scenario.
 

@@ -9,17 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from math import isfinite
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from qpavoid.config import Sensing
-from qpavoid.errors import UnknownName
+from qpavoid.errors import NumericalError, UnknownName
 from qpavoid.loading import nearest
 from qpavoid.motion import Sample
-from qpavoid.problem import Array
+from qpavoid.problem import Array, as_vector
 from qpavoid.scene import Obstacle
 
 
@@ -91,6 +92,7 @@ class Obstacles:
 
         Raises:
             UnknownName: there is no such obstacle.
+            NumericalError: an entry of the wrong shape, or not made of numbers.
         """
         if not given and not self._moving and not self._tracks:
             return None
@@ -99,11 +101,11 @@ class Obstacles:
         for name, what in (given or {}).items():
             if name not in self._index:
                 raise UnknownName(f"no obstacle {name!r}{nearest(name, self._index)}")
-            if all(np.isfinite(part).all() for part in what):
-                fresh[self._index[name]] = what
-            else:
-                notes.append(f"{name}: NaN or infinity in its pose or twist, taken as not given")
-                self._tracks.setdefault(self._index[name], self._unseen(self._index[name], t))
+            fresh[self._index[name]] = as_sample(f"obstacle {name!r}", what)
+        for index in [index for index, what in fresh.items() if not finite(what)]:
+            notes.append(f"{self._obstacles[index].name}: NaN or infinity in its pose or twist, taken as not given")
+            del fresh[index]
+            self._tracks.setdefault(index, self._unseen(index, t))
         seen = [
             Seen(i, self._obstacles[i].motion.sample(t), 0.0)
             for i in self._moving
@@ -154,3 +156,31 @@ class Obstacles:
             if config.stop_after is not None and age > config.stop_after:
                 stop.append(f"{name}: not seen for {age:.3f} s")
         return Seen(index, moved, margin)
+
+
+_SHAPES = {"position": (3,), "rotation": (3, 3), "linear": (3,), "angular": (3,)}
+
+
+def as_sample(name: str, what: Any) -> Any:
+    """A sample or pose whose parts are float arrays of the right shapes, whatever their numbers are.
+
+    Raises:
+        NumericalError: wrong shapes, or not numbers; names the argument and its part.
+    """
+    if type(what) is Sample:
+        try:
+            if what.position.shape == what.linear.shape == what.angular.shape == (3,) and what.rotation.shape == (3, 3):
+                return what
+        except AttributeError:
+            pass
+    if not isinstance(what, (Sample, Pose)):
+        raise NumericalError(f"{name}: neither a Sample nor a Pose: {what!r:.60}")
+    parts = [
+        as_vector(f"{name}: {field}", part, _SHAPES[field]) for field, part in zip(what._fields, what, strict=True)
+    ]
+    return type(what)(*parts)
+
+
+def finite(what: Sample | Pose) -> bool:
+    """Whether all its numbers are finite."""
+    return isfinite(sum(float(np.vdot(part, part)) for part in what))

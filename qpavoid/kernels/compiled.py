@@ -126,32 +126,23 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
 
 
 @njit(cache=True)
-def closest_call(x: Any, v: Array, k: int, reach: float, horizon: float) -> float:
+def closest_call(x: Any, k: int, reach: float, horizon: float) -> float:
     """See `vectorised.closest_call`."""
-    speed, J_world = x.body_speed, x.J_world
-    fastest, twist = 0.0, np.empty(6)
-    for i in range(len(x.body_support)):
-        twist[:] = 0.0
-        for c in range(len(v)):
-            if x.body_support[i, c] != 0.0:
-                for s in range(6):
-                    twist[s] += J_world[s, c] * v[c]
-        pose, sphere = x.body_poses[i], x.spheres[i]
-        cx = pose[0] * sphere[0] + pose[3] * sphere[1] + pose[6] * sphere[2] + pose[9]
-        cy = pose[1] * sphere[0] + pose[4] * sphere[1] + pose[7] * sphere[2] + pose[10]
-        cz = pose[2] * sphere[0] + pose[5] * sphere[1] + pose[8] * sphere[2] + pose[11]
-        wx, wy, wz = twist[3], twist[4], twist[5]
-        vx, vy, vz = twist[0] + wy * cz - wz * cy, twist[1] + wz * cx - wx * cz, twist[2] + wx * cy - wy * cx
-        turning = np.sqrt(wx * wx + wy * wy + wz * wz)
-        speed[i] = np.sqrt(vx * vx + vy * vy + vz * vz) + turning * sphere[3]
-        fastest = np.maximum(fastest, speed[i])  # keeps NaN, unlike max
+    speeds, motions, joints = x.speeds, x.joint_velocities, len(x.joint_velocities)
+    fastest = 0.0
+    for i in range(joints):
+        linear = np.sqrt(motions[i, 0] ** 2 + motions[i, 1] ** 2 + motions[i, 2] ** 2)
+        angular = np.sqrt(motions[i, 3] ** 2 + motions[i, 4] ** 2 + motions[i, 5] ** 2)
+        speeds[i] = linear + angular * x.joint_reach[i]
+        fastest = max(fastest, speeds[i])
     any_fastest = fastest
-    for i in range(len(x.body_support), len(speed)):
-        any_fastest = np.maximum(any_fastest, speed[i])
+    for i in range(joints, len(speeds)):
+        any_fastest = max(any_fastest, speeds[i])
     least = reach + x.offset - x.hold - (fastest + any_fastest) * horizon
     for i in range(k):
-        a, b = x.bodies[x.near[i], 0], x.bodies[x.near[i], 1]
-        least = np.minimum(least, x.d[i] - x.hold - (speed[a] + speed[b]) * horizon)
+        pair = x.near[i]
+        closing = speeds[x.carriers[pair, 0]] + speeds[x.carriers[pair, 1]]
+        least = np.minimum(least, x.d[i] - x.hold - closing * horizon)  # keeps NaN, unlike min
     return least
 
 

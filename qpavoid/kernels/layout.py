@@ -55,16 +55,14 @@ class RowLayout(NamedTuple):
     """(m,) row of `twists` that moves each pair's second body."""
     margin: Array
     """(o + 1,) taken off the distances to each obstacle, for what is not known of it [m]; the last one stays zero."""
-    bodies: IntArray
-    """(m, 2) the two bodies of each pair; obstacles come after the robot's."""
-    body_poses: Array
-    """(g, 12) world poses of all bodies."""
-    spheres: Array
-    """(g, 4) bounding sphere of each body in its own frame: centre and radius [m]."""
-    body_support: Array
-    """(B, n) which coordinates move each of the robot's B bodies."""
-    body_speed: Array
-    """(g,) largest speed of any point of a body [m/s]; those of the robot's are overwritten, obstacles' are given."""
+    joint_velocities: Array
+    """(J, 6) linear velocity of each joint's origin and angular velocity, in the joint's axes; row 0 is the world."""
+    joint_reach: Array
+    """(J,) distance from a joint's origin to the farthest point of a body that it carries [m]."""
+    carriers: IntArray
+    """(m, 2) what moves the two bodies of each pair: number of a joint, or J plus that of an obstacle."""
+    speeds: Array
+    """(J + o,) largest speed of any point that a joint carries, which is overwritten, or of an obstacle [m/s]."""
     near: IntArray
     """(m,) out: which pairs are near, in increasing order; here as below, as many as there are near ones count."""
     closest: Array

@@ -48,7 +48,7 @@ class Workspace:
         self.linear, self.angular = layout.targets[:, 12:15], layout.targets[:, 15:]
         self.moments = layout.screws.reshape(-1, 3, 6)[:frames, :, 3:]
         self.wanted, self.wanted_turns = layout.b[:split].reshape(-1, 3), layout.b[split:].reshape(-1, 3)
-        self.speeds = layout.b.reshape(-1, 3)
+        self.asked = layout.b.reshape(-1, 3)
         self.every_turns = len(layout.turns) == frames
         self.capped = bool(np.isfinite(layout.cap).any())
         self.gram = np.empty((rows, rows))
@@ -58,13 +58,11 @@ class Workspace:
         self.was_moving = True
         self.screw_columns = np.empty((6, pairs))
         self.scratch = np.empty((3, pairs))
-        robot, poses = len(layout.body_support), layout.body_poses
-        self.sphere_centers, self.sphere_radii = (
-            layout.spheres[:robot, None, :3].copy(),
-            layout.spheres[:robot, 3].copy(),
-        )
-        self.body_turns, self.body_places = poses[:robot, :9].reshape(-1, 3, 3), poses[:robot, 9:]
-        self.robot_speed = layout.body_speed[:robot]
+        joints = len(layout.joint_velocities)
+        self.squares, self.linear_angular = np.empty((joints, 6)), np.empty((joints, 2))
+        self.squares_by_kind = self.squares.reshape(-1, 2, 3)
+        self.linear_speed, self.angular_speed = self.linear_angular[:, 0], self.linear_angular[:, 1]
+        self.joint_speeds = layout.speeds[:joints]
         # every joint has one coordinate and position limits: bounds are made in place, the lower and upper ones at once
         self.plain = np.array_equal(layout.q_index, np.arange(nv)) and np.array_equal(layout.v_index, np.arange(nv))
         self.q_limits = np.stack((layout.q_lower, layout.q_upper))
@@ -190,7 +188,7 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
     """
     d, least = x.d[:k], x.least[:k]
     np.add(x.closest[:k, 0], x.offset_, out=d)
-    if x.margin.any():
+    if moving:
         d -= x.margin[x.twist_row[x.near[:k]]]
     np.subtract(x.hold_, d, out=least)
     if x.switching:
@@ -212,53 +210,44 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
         least -= x.drift[:k]
     if x.accelerated:
         np.minimum(least, np.dot(x.J[:k], x.v_stop), out=least, where=~parting & (x.drift[:k] >= 0.0))
-    if parting.any():
+    if np.count_nonzero(parting):
         with np.errstate(invalid="ignore"):  # no lever times no limit
             most = np.fmax(np.fmax(x.J[:k] * x.lower, x.J[:k] * x.upper), 0.0).sum(axis=1)
         np.minimum(least, np.maximum(most, -x.drift[:k]), out=least, where=parting)
 
 
-def closest_call(x: Any, v: Array, k: int, reach: float, horizon: float) -> float:
-    """How much is certainly left of the safe distance of every pair, if all move at v until `horizon`, wherever to.
+def closest_call(x: Any, k: int, reach: float, horizon: float) -> float:
+    """How much is certainly left of the safe distance of every pair, if all move as they do until `horizon`.
 
-    No distance falls faster than the fastest points of its two bodies move; a point of a body moves at most at
-    |speed of the centre of its bounding sphere| + |angular velocity| times radius.
+    No distance falls faster than the fastest points of its two bodies move, and a point that a joint carries moves at
+    most at the speed of the joint's origin plus its angular speed times the distance.
 
     Args:
-        x: reads what the tick found; writes the speeds of the robot's bodies.
-        v: velocity (n,).
+        x: reads what the tick found, and joint_velocities; writes the speeds of the joints.
         k: number of near pairs.
         reach: surface distance below which a pair is near; all others are at least so far apart [m].
         horizon: [s].
 
     Returns:
-        Least of distance - hold - closing speed × horizon [m]; NaN where there is one.
+        A bound below the least of distance - hold [m] on the way; NaN where there is one.
     """
-    twist = np.dot(x.J_world, (x.body_support * v).T)
-    center = np.matmul(x.sphere_centers, x.body_turns)[:, 0]
-    center += x.body_places
-    turning, center = twist[3:], center.T
-    products = turning[_CYCLE]
-    products *= center[_ANTICYCLE]
-    twist[:3] += products[:3]
-    twist[:3] -= products[3:]
-    twist *= twist
-    speed = x.robot_speed
-    np.sqrt(np.add.reduce(turning), out=speed)
-    speed *= x.sphere_radii
-    speed += np.sqrt(np.add.reduce(twist[:3]))
-    fastest = speed.max()
-    others = (
-        reach
-        + x.offset
-        - x.hold
-        - (fastest + (x.body_speed.max() if len(speed) < len(x.body_speed) else fastest)) * horizon
-    )
+    np.multiply(x.joint_velocities, x.joint_velocities, out=x.squares)
+    np.add.reduce(x.squares_by_kind, axis=2, out=x.linear_angular)
+    np.sqrt(x.linear_angular, out=x.linear_angular)
+    np.multiply(x.angular_speed, x.joint_reach, out=x.joint_speeds)
+    x.joint_speeds += x.linear_speed
+    fastest = x.joint_speeds.max()
+    fastest_two = (fastest + max(fastest, x.speeds[len(x.joint_speeds) :].max(initial=0.0))) * horizon
+    others = reach + x.offset - x.hold - fastest_two
     if not k:
         return float(others)
-    closing = np.add.reduce(x.body_speed[x.bodies[x.near[:k]]], axis=1)
-    closing *= horizon
-    return float(min((x.d[:k] - closing).min() - x.hold, others))
+    d = x.d[:k]
+    least = d.min() - x.hold - fastest_two
+    if least <= 0.0:  # look closer
+        closing = np.add.reduce(x.speeds[x.carriers[x.near[:k]]], axis=1)
+        closing *= horizon
+        least = (d - closing).min() - x.hold
+    return float(min(least, others)) if least == least else math.nan
 
 
 def rotation_vector(R: Any) -> tuple[float, float, float]:
@@ -309,8 +298,8 @@ def frame_rows(x: Any) -> None:
             x.wanted_turns *= x.gain_column[turns]
             x.wanted_turns += x.angular[turns]
     if x.capped:
-        speeds = x.speeds
-        speeds *= np.minimum(x.cap / np.maximum(np.sqrt((speeds * speeds).sum(axis=1)), 1e-12), 1.0)[:, None]
+        asked = x.asked
+        asked *= np.minimum(x.cap / np.maximum(np.sqrt((asked * asked).sum(axis=1)), 1e-12), 1.0)[:, None]
     np.dot(x.screws, x.J_world, out=x.A)
     np.multiply(x.A, x.task_support, out=x.A)
     np.multiply(x.b, x.scale, out=x.b)
@@ -411,11 +400,15 @@ def tracking_shortfall(x: Any, k: int) -> float:
 def shortfall(v: Array, J: Array, b: Array, lower: Array, upper: Array) -> float:
     """Largest violation of J v >= b and lower <= v <= upper; negative inside, NaN where there is one."""
     over = np.maximum(v - upper, lower - v).max()
-    return float(np.maximum(over, (b - J @ v).max()) if len(b) else over)
+    if len(b):
+        outside = (b - np.dot(J, v)).max()
+        if not (over >= outside or over != over):
+            return float(outside)
+    return float(over)
 
 
 def projection_cost(A: Array, regularization: float, v0: Array) -> tuple[Array, Array]:
     """P = AᵀA + λ (n, n) and q = -P v0 (n,): ½ vᵀP v + qᵀv is smallest at v0."""
-    P = A.T @ A
+    P = np.dot(A.T, A)
     P.ravel()[:: len(P) + 1] += regularization
-    return P, -(P @ v0)
+    return P, -np.dot(P, v0)

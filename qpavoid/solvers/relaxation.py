@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from qpavoid import kernels
 from qpavoid.problem import Array, IntArray, Problem
 from qpavoid.solvers.backends import Backend
 
@@ -70,13 +71,9 @@ def closest(backend: Backend, P: Array, q: Array, J: Array, b: Array, lower: Arr
         v = backend(P, q, J, b, lower, upper)
     except Exception:  # whatever a library raises, the robot must get a velocity
         return None
-    if v is None or np.shape(v) != np.shape(q):
-        return None
-    within = np.minimum(np.maximum(v, lower), upper)
-    # NaN fails every comparison
-    if not np.max(np.abs(v - within)) <= TOLERANCE or not np.max(b - J @ v, initial=-np.inf) <= TOLERANCE:
-        return None
-    return np.asarray(within)
+    if v is None or np.shape(v) != q.shape or not kernels.shortfall(v, J, b, lower, upper) <= TOLERANCE:
+        return None  # NaN fails the comparison too
+    return np.asarray(np.minimum(np.maximum(v, lower), upper))
 
 
 def _least_excess(P: Array, q: Array, x: Problem, backend: Backend) -> Array | None:
