@@ -27,10 +27,12 @@ _SHAPES = {
     "t": "N", "q": "N nq", "v": "N nv",
     "target": "N k 3", "tool": "N k 3", "tool_rotation": "N k 3 3", "turn_error": "N k",
     "body_distance": "N b", "closest_pair": "N", "alpha": "N", "beta": "N", "status": "N",
-    "slack": "N", "saturation": "N", "build_time": "N", "solve_time": "N",
+    "slack": "N", "saturation": "N", "build_time": "N", "solve_time": "N", "share": "N", "blocked": "N",
     "body_ends": "N b 2 3", "obstacle_position": "N o 3", "obstacle_rotation": "N o 3 3",
 }  # fmt: skip
 """Array: its sides; a letter is the same number wherever it stands."""
+_KINDS = {"closest_pair": "i", "status": "i", "blocked": "b"}
+"""Array: kind of its numbers, where it is not floating point."""
 _META = {"scenario": str, "solver": str, "completed": bool, "pairs": list, "config": dict}
 
 
@@ -146,7 +148,7 @@ class Log:
         sides: dict[str, int] = {"2": 2, "3": 3}
         for name, wanted in _SHAPES.items():
             array = getattr(self, name)
-            if array.dtype.kind != ("i" if name in ("closest_pair", "status") else "f"):
+            if array.dtype.kind != _KINDS.get(name, "f"):
                 raise ValueError(f"{name} holds {array.dtype}")
             letters = wanted.split()
             if len(letters) != array.ndim or any(

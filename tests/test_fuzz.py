@@ -384,6 +384,12 @@ def test_log_whose_parts_do_not_belong_together(changes, told, arrays, tmp_path)
     assert re.search(told, refusal("run.npz", tmp_path))
 
 
+def test_every_array_of_a_log_is_looked_at(arrays, tmp_path):
+    for name in arrays.keys() - {"meta"}:
+        np.savez(tmp_path / "run.npz", **{**arrays, name: arrays[name].reshape(-1, 1, 1, 1, 1)})
+        assert f"{name} has shape" in refusal("run.npz", tmp_path)
+
+
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
