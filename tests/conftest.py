@@ -101,7 +101,7 @@ class Bench:
         return self.assembly.compute(np.asarray(q), targets, self.query, reach)
 
 
-def make_layout(nv, frames=0, turns=(), pairs=0, obstacles=0, robot=0, **fields):
+def make_layout(nv, frames=0, turns=(), pairs=0, obstacles=0, joints=1, **fields):
     """Memory of a tick in which all inputs but `fields` are zero or without effect, and all outputs NaN."""
     rows = 3 * (frames + len(turns))
     screws = np.zeros((rows, 6))
@@ -115,9 +115,9 @@ def make_layout(nv, frames=0, turns=(), pairs=0, obstacles=0, robot=0, **fields)
         "task_support": np.ones((rows, nv)), "screws": screws, "results": np.zeros((pairs, 10)),
         "support": np.ones((pairs, nv)), "twists": np.zeros((obstacles + 1, 6)),
         "twist_row": np.full(pairs, obstacles), "margin": np.zeros(obstacles + 1),
-        "bodies": np.zeros((pairs, 2), dtype=np.intp), "body_poses": np.zeros((robot + obstacles, 12)),
-        "spheres": np.zeros((robot + obstacles, 4)), "body_support": np.ones((robot, nv)),
-        "body_speed": np.zeros(robot + obstacles), "q_index": none, "v_index": none, "q_lower": np.zeros(0),
+        "joint_velocities": np.zeros((joints, 6)), "joint_reach": np.zeros(joints),
+        "carriers": np.zeros((pairs, 2), dtype=np.intp), "speeds": np.zeros(joints + obstacles),
+        "q_index": none, "v_index": none, "q_lower": np.zeros(0),
         "q_upper": np.zeros(0), "v_max": np.full(nv, np.inf), "v_step": np.full(nv, np.inf), "v_last": np.zeros(nv),
         "damping": 0.0, "offset": 0.0, "hold": 0.1, "row_gain": 5.0, "recovery": 0.2, "switching": True, "d1": 0.1,
         "d2": 0.3, "rate": 50.0, "dt": 0.01, "accelerated": False,

@@ -2,19 +2,28 @@
 
 import numpy as np
 import pytest
+from conftest import SPHERE, Bench, make_layout, obstacle
 
-from qpavoid import Avoidance
-from qpavoid.avoidance import avoidance_rows, closing_speed_bound
+from qpavoid import Avoidance, Sample, build_scene, kernels
+from qpavoid.avoidance import row_form
 from qpavoid.gains import alpha, beta
-from qpavoid.problem import Proximity
 
 D1, D2, XI = 0.12, 0.24, 5.0
 TINY = 1e-9
 
 
 def bound(d, **row):
+    """Right-hand sides of rows at distances d, for a robot without limits among obstacles at rest."""
     settings = Avoidance(d1=D1, d2=D2, recovery_speed=0.2, row={"gain": XI, **row})
-    return closing_speed_bound(np.array(d, dtype=float), settings)
+    closest = np.zeros((len(d), 10))
+    closest[:, 0] = d
+    free = np.full(2, np.inf)
+    x = make_layout(
+        2, pairs=len(d), closest=closest, near=np.arange(len(d)), drift=np.zeros(len(d)), J=np.ones((len(d), 2)),
+        lower=-free, upper=free, **row_form(settings),
+    )  # fmt: skip
+    kernels.row_bounds(kernels.pack(x), len(d), False)
+    return x.least
 
 
 # --- eq. 11 --------------------------------------------------------------------------------------------------
@@ -113,28 +122,37 @@ def test_a_row_that_is_met_exactly_never_passes_what_it_holds():
         assert d[1] == pytest.approx(D1, abs=1e-9)
 
 
-def test_offset_is_added_and_near_pairs_keep_their_order():
-    """ḋ = J v + drift >= bound becomes J v >= bound - drift."""
-    rng = np.random.default_rng(0)
-    near = np.array([1, 4])
-    J, drift = rng.normal(size=(2, 3)), rng.normal(size=2)
-    closest = rng.normal(size=(2, 10))
-    closest[:, 0] = 0.08, 0.02
-    proximity = Proximity(near, closest, J, drift)
+def test_offset_is_added_and_near_pairs_keep_their_order(panda):
+    """ḋ = J v + drift >= bound becomes J v >= bound - drift; one ball touches the arm, one is out of reach."""
+    places = [(0.25, 0.0, 0.6), (9.0, 0.0, 0.0), (0.1, 0.3, 0.3)]
+    scene = build_scene(panda, [obstacle(f"o{i}", SPHERE, place) for i, place in enumerate(places)])
     settings = Avoidance(d1=D1, d2=D2, offset=0.1, row={"type": "switching", "gain": XI})
-    rows = avoidance_rows(proximity, settings)
+    bench = Bench(scene, avoidance=settings)
+    for i, place in enumerate(places):
+        bench.query.place_obstacle(i, Sample.at(place, linear=[0.1, 0.2, -0.3]))
+    everything, _ = bench.compute(panda.home)
+    distance, rate = everything.distance.copy(), everything.drift.copy()
+    near = np.flatnonzero(distance < D2 - 0.1)
+    proximity, problem = bench.compute(panda.home, reach=D2 - 0.1)
+    rows = problem.avoidance
+    assert 3 < len(near) < len(distance)
     np.testing.assert_array_equal(rows.pair, near)
-    np.testing.assert_allclose(rows.d, [0.18, 0.12])
-    np.testing.assert_allclose(beta(rows.d, rows.d1, rows.d2), [0.5, 1.0], atol=1e-15)
-    np.testing.assert_allclose(alpha(rows.d, rows.d2), [1 / 9, 1.0])
-    np.testing.assert_allclose(rows.b, [-0.15, 0.0] - drift, rtol=0, atol=1e-12)
-    np.testing.assert_array_equal(rows.J, J)
-    np.testing.assert_array_equal(proximity.drift, drift)
+    np.testing.assert_allclose(rows.d, distance[near] + 0.1, rtol=0, atol=1e-12)
+    h = rows.d - D1
+    expected = np.where(h < 0.0, np.minimum(-XI * h, settings.recovery_speed), -(1.0 - beta(rows.d, D1, D2)) * XI * h)
+    most = np.maximum(rows.J * problem.lower, rows.J * problem.upper).sum(axis=1)  # the fastest that the arm can part
+    expected = np.where(
+        h < 0.0, np.minimum(expected - rate[near], np.maximum(most, -rate[near])), expected - rate[near]
+    )
+    np.testing.assert_allclose(rows.b, expected, rtol=0, atol=1e-12)
+    assert (h < 0.0).any() and (h > 0.0).any() and np.ptp(rate[near]) > 0.1
+    np.testing.assert_array_equal(rows.J, proximity.J)
+    np.testing.assert_array_equal(proximity.drift, rate[near])
 
 
 @pytest.mark.parametrize("kind", ["switching", "damper", "cbf"])
-def test_no_pair_gives_no_row(kind):
-    proximity = Proximity(np.zeros(0, dtype=np.intp), np.zeros((0, 10)), np.zeros((0, 7)), np.zeros(0))
-    rows = avoidance_rows(proximity, Avoidance(row={"type": kind}))
+def test_no_pair_gives_no_row(kind, panda):
+    bench = Bench(build_scene(panda), avoidance=Avoidance(row={"type": kind}))
+    rows = bench.compute(panda.home, reach=-1.0)[1].avoidance
     assert rows.J.shape == (0, 7) and rows.pair.shape == rows.d.shape == rows.b.shape == (0,)
     assert alpha(rows.d, rows.d2).shape == beta(rows.d, rows.d1, rows.d2).shape == (0,)

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from conftest import differences, random_q
+from conftest import Bench, differences, random_q
 
-from qpavoid import Sample, UnknownName, config
-from qpavoid.kinematics import ForwardKinematics, support_masks
-from qpavoid.tasks import TaskRows, build_tasks
+from qpavoid import Sample, UnknownName, build_scene, config
+from qpavoid.problem import Tracking
+from qpavoid.tasks import build_tasks
 
 FIXED = config.Fixed(type="fixed")
 FRAMES = {
@@ -19,17 +19,19 @@ FRAMES = {
 }
 
 
-class Bench:
+class Tasks:
     """Tasks of a robot without anything else around them."""
 
-    def __init__(self, robot, frames, damping=0.0, **settings):
-        configs = [config.Task(**{"frame": f, "type": "pose", "motion": FIXED, **settings}) for f in frames]
+    def __init__(self, robot, configs, damping=0.0):
         self.robot = robot
         self.tasks = build_tasks(configs, robot, robot.home, Path("bench.yaml"))
         self.ids = [task.frame_id for task in self.tasks]
-        joints = [robot.model.frames[i].parentJoint for i in self.ids]
-        self.kinematics = ForwardKinematics(robot.model, self.ids)
-        self.rows = TaskRows(self.tasks, support_masks(robot.model), joints, damping)
+        self.bench = Bench(build_scene(robot), self.tasks, damping=damping)
+
+    @classmethod
+    def of_frames(cls, robot, frames, **settings):
+        """Pose tasks, or what the settings make of them."""
+        return cls(robot, [config.Task(**{"frame": f, "type": "pose", "motion": FIXED, **settings}) for f in frames])
 
     def poses(self, q):
         """Samples at rest of all frames, on data of their own."""
@@ -38,16 +40,16 @@ class Bench:
         return [Sample.at(data.oMf[i].translation, data.oMf[i].rotation) for i in self.ids]
 
     def compute(self, q, targets=None):
-        return self.rows.compute(
-            self.kinematics.compute(q), targets or [task.motion.sample(0.0) for task in self.tasks]
-        )
+        """Rows that the next call leaves alone."""
+        A, b, damping = self.bench.compute(q, targets, reach=-1.0)[1].tracking
+        return Tracking(A.copy(), b.copy(), damping)
 
 
 @pytest.mark.parametrize("name", FRAMES)
 def test_jacobian_against_finite_differences(name, request):
     """Position and orientation, of two arms, of a locked robot and of a floating base."""
     robot = request.getfixturevalue(name)
-    bench, rng = Bench(robot, FRAMES[name]), np.random.default_rng(1)
+    bench, rng = Tasks.of_frames(robot, FRAMES[name]), np.random.default_rng(1)
     for _ in range(5):
         q = random_q(robot, rng)
         here = bench.poses(q)
@@ -67,13 +69,9 @@ def test_position_and_pose_tasks_share_one_layout(paper):
         config.Task(frame="left_tool", type="position", motion=FIXED, weight=3.0),
         config.Task(frame="right_tool", type="pose", motion=FIXED, weight=5.0, orientation_weight=0.5),
     ]
-    tasks = build_tasks(both, paper, paper.home, Path("bench.yaml"))
-    joints = [paper.model.frames[task.frame_id].parentJoint for task in tasks]
-    rows = TaskRows(tasks, support_masks(paper.model), joints, 0.02)
     q = random_q(paper, np.random.default_rng(2))
-    targets = [task.motion.sample(0.0) for task in tasks]
-    found = rows.compute(ForwardKinematics(paper.model, [t.frame_id for t in tasks]).compute(q), targets)
-    separate = [Bench(paper, [t.settings.frame], type=t.settings.type).compute(q) for t in tasks]
+    found = Tasks(paper, both, damping=0.02).compute(q)
+    separate = [Tasks.of_frames(paper, [task.frame], type=task.type).compute(q) for task in both]
     root = np.sqrt([3.0] * 3 + [5.0] * 3 + [0.5] * 3)
     np.testing.assert_allclose(found.A, root[:, None] * np.concatenate([s.A for s in separate]), atol=1e-15)
     np.testing.assert_allclose(found.b, root * np.concatenate([s.b for s in separate]), atol=1e-15)
@@ -81,7 +79,7 @@ def test_position_and_pose_tasks_share_one_layout(paper):
 
 
 def test_at_the_target_only_the_feed_forward_is_left(panda):
-    bench = Bench(panda, ["panda_hand_tcp"], gain=7.0)
+    bench = Tasks.of_frames(panda, ["panda_hand_tcp"], gain=7.0)
     q = random_q(panda, np.random.default_rng(3))
     linear, angular = np.array([0.1, -0.2, 0.3]), np.array([0.4, 0.5, -0.6])
     target = bench.poses(q)[0]._replace(linear=linear, angular=angular)
@@ -90,7 +88,7 @@ def test_at_the_target_only_the_feed_forward_is_left(panda):
 
 def test_a_frame_that_obeys_keeps_up_with_a_target_that_moves(panda):
     """A v = b moves the frame with the target's own twist: the error between the two does not grow."""
-    bench, rng = Bench(panda, ["panda_hand_tcp"], gain=0.0), np.random.default_rng(4)
+    bench, rng = Tasks.of_frames(panda, ["panda_hand_tcp"], gain=0.0), np.random.default_rng(4)
     q, step = panda.home, 1e-6
     target = bench.poses(q)[0]._replace(linear=rng.uniform(-1, 1, 3), angular=rng.uniform(-1, 1, 3))
     rows = bench.compute(q, [target])
@@ -102,7 +100,7 @@ def test_a_frame_that_obeys_keeps_up_with_a_target_that_moves(panda):
 
 def test_pose_error_decays_exponentially(panda):
     gain, dt = 2.0, 1e-3
-    bench = Bench(panda, ["panda_hand_tcp"], gain=gain)
+    bench = Tasks.of_frames(panda, ["panda_hand_tcp"], gain=gain)
     q, start = panda.home, bench.poses(panda.home)[0]
     turn = np.array([0.3, -0.2, 0.4])
     target = Sample.at(start.position + np.array([0.05, 0.08, -0.06]), pin.exp3(turn) @ start.rotation)
@@ -120,12 +118,12 @@ def test_pose_error_decays_exponentially(panda):
 
 def test_caps_shorten_the_command_and_keep_its_direction(panda):
     q = panda.home
-    start = Bench(panda, ["panda_hand_tcp"]).poses(q)[0]
+    start = Tasks.of_frames(panda, ["panda_hand_tcp"]).poses(q)[0]
     shift, turn = np.array([3.0, 4.0, 0.0]), np.array([0.0, 0.6, 0.8])
     far = Sample.at(start.position + shift, pin.exp3(turn) @ start.rotation)
 
     def b(target, **caps):
-        return Bench(panda, ["panda_hand_tcp"], gain=2.0, **caps).compute(q, [target]).b
+        return Tasks.of_frames(panda, ["panda_hand_tcp"], gain=2.0, **caps).compute(q, [target]).b
 
     np.testing.assert_allclose(b(far), [*2 * shift, *2 * turn], atol=1e-9)
     np.testing.assert_allclose(b(far, max_speed=0.5), [0.3, 0.4, 0.0, *2 * turn], atol=1e-9)
@@ -136,7 +134,7 @@ def test_caps_shorten_the_command_and_keep_its_direction(panda):
 
 
 def test_a_motion_without_a_start_begins_where_the_frame_is(panda):
-    bench = Bench(panda, ["panda_hand_tcp"])
+    bench = Tasks.of_frames(panda, ["panda_hand_tcp"])
     start, here = bench.tasks[0].motion.sample(0.0), bench.poses(panda.home)[0]
     np.testing.assert_allclose(start.position, here.position, atol=1e-12)
     np.testing.assert_allclose(start.rotation, here.rotation, atol=1e-12)
@@ -147,7 +145,7 @@ def test_frames_of_locked_joints_can_still_be_followed(paper):
     q = random_q(paper, np.random.default_rng(5))
     locked, q_left = paper.lock(["left_joint[67]", "right_*"], q, "test")
     assert locked.model.nv == 5
-    whole, part = Bench(paper, ["left_tool"]), Bench(locked, ["left_tool"])
+    whole, part = Tasks.of_frames(paper, ["left_tool"]), Tasks.of_frames(locked, ["left_tool"])
     np.testing.assert_allclose(part.poses(q_left)[0].position, whole.poses(q)[0].position, atol=1e-12)
     np.testing.assert_allclose(part.poses(q_left)[0].rotation, whole.poses(q)[0].rotation, atol=1e-12)
     np.testing.assert_allclose(part.compute(q_left).A, whole.compute(q).A[:, :5], atol=1e-12)
@@ -155,4 +153,4 @@ def test_frames_of_locked_joints_can_still_be_followed(paper):
 
 def test_unknown_frame(panda):
     with pytest.raises(UnknownName, match=r"bench\.yaml: tasks\.0\.frame: panda has no frame 'panda_hand_tpc'.*tcp"):
-        Bench(panda, ["panda_hand_tpc"])
+        Tasks.of_frames(panda, ["panda_hand_tpc"])

@@ -134,15 +134,15 @@ def closest_call(x: Any, k: int, reach: float, horizon: float) -> float:
         linear = np.sqrt(motions[i, 0] ** 2 + motions[i, 1] ** 2 + motions[i, 2] ** 2)
         angular = np.sqrt(motions[i, 3] ** 2 + motions[i, 4] ** 2 + motions[i, 5] ** 2)
         speeds[i] = linear + angular * x.joint_reach[i]
-        fastest = max(fastest, speeds[i])
+        fastest = np.maximum(fastest, speeds[i])  # keeps NaN, unlike max
     any_fastest = fastest
     for i in range(joints, len(speeds)):
-        any_fastest = max(any_fastest, speeds[i])
+        any_fastest = np.maximum(any_fastest, speeds[i])
     least = reach + x.offset - x.hold - (fastest + any_fastest) * horizon
     for i in range(k):
         pair = x.near[i]
         closing = speeds[x.carriers[pair, 0]] + speeds[x.carriers[pair, 1]]
-        least = np.minimum(least, x.d[i] - x.hold - closing * horizon)  # keeps NaN, unlike min
+        least = np.minimum(least, x.d[i] - x.hold - closing * horizon)
     return least
 
 
