@@ -10,7 +10,7 @@ import pinocchio as pin
 import pytest
 from conftest import BOX, CAPSULE, CYLINDER, SPHERE, obstacle, random_q, random_scene, write_chain
 
-from qpavoid import Robot, ScenarioConfig, build_scene, load_scenario, simulate
+from qpavoid import Limits, Robot, ScenarioConfig, build_scene, load_scenario, simulate
 
 pytest.importorskip("mujoco")
 pytest.importorskip("bench", reason="bench/ is in the repository only")
@@ -18,6 +18,7 @@ pytest.importorskip("bench", reason="bench/ is in the repository only")
 from bench.safety import report
 from bench.safety.arena import build, load
 from bench.safety.campaign import FOLDER, KINDS, RANGES, draw
+from bench.safety.flight import Start, fly, joint_means, manners
 from bench.safety.referee import STEP, Watch, referee
 from bench.safety.trial import trials
 from bench.safety.verdict import judge
@@ -239,6 +240,31 @@ def test_verdicts(tmp_path, obstacles, why):
     verdicts = judge(arena, scenario, log, referee(arena, log))
     assert [verdict.why for verdict in verdicts] == why, verdicts
     assert verdicts[-1].avoidable == (why[-1] == "avoidable")
+
+
+@pytest.mark.parametrize("acceleration", [None, 10.0])
+def test_flights_keep_to_the_limits(monkeypatch, acceleration):
+    flown, follow = [], Watch.follow
+
+    def recorded(watch, q, v, t, dt):
+        after = follow(watch, q, v, t, dt)
+        flown.append((after, v))
+        return after
+
+    monkeypatch.setattr(Watch, "follow", recorded)
+    limits = Limits(acceleration=acceleration)
+    scenario = draw(9).model_copy(update={"limits": limits, "dt": 0.02})
+    arena = load(scenario)
+    means = joint_means(arena, scenario)
+    start = Start(arena.q0, np.zeros_like(arena.q0), 0.0, 1.2)
+    for manner in list(manners(len(arena.q0)))[::3]:
+        flown.clear()
+        fly(arena, means, start, scenario.dt, manner, arena.movable)
+        q, v = (np.array(array) for array in zip(*flown, strict=True))
+        assert np.all(np.abs(v) <= means.speed + 1e-9)
+        assert np.all((q >= means.lower - 1e-6) & (q <= means.upper + 1e-6))
+        change = np.abs(np.diff(v, axis=0, prepend=0.0))
+        assert np.all(change <= scenario.dt * means.acceleration + 1e-9)
 
 
 def test_standing_still_proves_that_a_static_obstacle_is_avoidable():

@@ -42,11 +42,18 @@ class Means:
 
     def box(self, q: Array, v: Array, dt: float) -> tuple[Array, Array]:
         """Smallest and largest velocities (nv,) for the next dt, at q (nv,) after velocity v (nv,)."""
-        change, stop = self.acceleration * dt, 1.5 * self.acceleration  # less than 2: it takes a tick to begin braking
-        below, above = np.maximum(q - self.lower, 0.0), np.maximum(self.upper - q, 0.0)
-        low = np.maximum.reduce((-self.speed, v - change, -below / dt, -np.sqrt(stop * np.maximum(below, 1e-9))))
-        high = np.minimum.reduce((self.speed, v + change, above / dt, np.sqrt(stop * np.maximum(above, 1e-9))))
+        change = self.acceleration * dt
+        low = np.maximum.reduce((-self.speed, v - change, -self._fastest(q - self.lower, dt)))
+        high = np.minimum.reduce((self.speed, v + change, self._fastest(self.upper - q, dt)))
         return np.minimum(low, high), np.maximum(low, high)
+
+    def _fastest(self, room: Array, dt: float) -> Array:
+        """Speed (nv,) that can be held for dt and then be braked within the room (nv,) left to a position limit."""
+        brake = 0.5 * np.where(np.isfinite(self.acceleration), self.acceleration, 0.0)  # half: the rest is in reserve
+        left = np.maximum(room - brake * dt**2, 0.0)
+        return np.where(
+            brake > 0.0, 2.0 * left / (dt + np.sqrt(dt**2 + 2.0 * left / np.maximum(brake, 1e-9))), left / dt
+        )
 
 
 @dataclass(frozen=True)
