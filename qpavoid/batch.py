@@ -84,7 +84,7 @@ def simulate_many(
 
 
 def steps(scenario: ScenarioConfig | str, q: Array, t: float | Array = 0.0, jobs: int | Workers | None = None) -> Steps:
-    """One tick in each of n states of a scenario that have nothing to do with each other.
+    """One tick in each of n states of a scenario that have nothing to do with each other; the robot is at rest in all.
 
     Args:
         scenario: configuration, shipped name or path.
@@ -112,7 +112,10 @@ def steps(scenario: ScenarioConfig | str, q: Array, t: float | Array = 0.0, jobs
 
 def _steps(scenario: bytes, q: Array, t: Array) -> Steps:
     controller = _controller(scenario)
-    solutions = [controller.step(*state) for state in zip(q, t.tolist(), strict=True)]
+    solutions = []
+    for state in zip(q, t.tolist(), strict=True):
+        controller.reset()
+        solutions.append(controller.step(*state))
     status = np.array([STATUSES.index(solution.status) for solution in solutions], dtype=np.int8)
     return Steps(np.array([solution.v for solution in solutions]), status)
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from qpavoid import ConfigError, Controller, Log, ScenarioConfig, load_scenario, simulate
+from qpavoid.log import STATUSES
 from qpavoid.solvers.analytic import TrackingOnly
 
 ARRAYS = [f.name for f in fields(Log) if f.name != "meta"]
@@ -142,19 +143,27 @@ def test_interrupt_before_the_first_tick_is_over(monkeypatch, tmp_path):
     assert Log.load(log.save(tmp_path / "none")).metrics()["completed"] is False
 
 
-def test_malformed_state_ends_the_run_and_says_why(log, monkeypatch, tmp_path):
+def said(log: Log) -> str:
+    return " ".join(line for *_, lines in log.meta["events"] for line in lines)
+
+
+def test_malformed_state_stops_the_robot_and_says_why(log, monkeypatch, tmp_path):
     tick = Controller.tick
 
     def lose_the_encoder(self, q, t=0.0):
         return tick(self, np.full_like(q, np.nan) if t > 0.045 else q, t)
 
     monkeypatch.setattr(Controller, "tick", lose_the_encoder)
-    partial = simulate(load_scenario("panda_line", SHORT))
-    assert_partial(partial, 5, log, tmp_path)
-    assert "q: NaN or infinity" in partial.meta["stopped_by"]
+    blind = simulate(load_scenario("panda_line", SHORT))
+    np.testing.assert_array_equal(blind.v[:5], log.v[:5])
+    stopped = blind.status == STATUSES.index("STOPPED")
+    assert stopped[5:].all() and not stopped[:5].any()
+    assert (np.diff(np.abs(blind.v[4:]), axis=0) <= 0.0).all() and not blind.v[-1].any()
+    assert "q: NaN or infinity" in said(blind)
+    assert_equal(Log.load(blind.save(tmp_path / "blind")), blind)
 
 
-def test_solver_that_returns_nan_ends_the_run_and_is_seen(monkeypatch):
+def test_solver_that_returns_nan_stops_the_robot_and_is_seen(monkeypatch):
     solve = TrackingOnly.solve
 
     def fail(self, problem):
@@ -163,9 +172,9 @@ def test_solver_that_returns_nan_ends_the_run_and_is_seen(monkeypatch):
 
     monkeypatch.setattr(TrackingOnly, "solve", fail)
     log = simulate(load_scenario("situation1", SHORT, "tracking"))
-    assert "NaN" in log.meta["stopped_by"]
-    assert len(log.t) == 1
-    assert np.isnan(log.v).all()
+    assert "no finite velocity" in said(log)
+    assert (log.status == STATUSES.index("STOPPED")).all()
+    np.testing.assert_array_equal(log.v, 0.0)
 
 
 # Files that are no logs

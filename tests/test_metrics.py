@@ -46,6 +46,8 @@ def log():
         body_distance=[[0.3, 0.5], [0.1, 0.5], [0.2, -0.02], [0.4, -0.01], [0.05, 0.06]],
         closest_pair=[0, 0, 1, 1, 0],
         status=[STATUSES.index(s) for s in ("SOLVED", "RELAXED", "RELAXED", "STOPPED", "SOLVED")],
+        share=[1.0, 0.5, 1.0, 0.0, 1.0],
+        blocked=np.array([False, False, True, True, True]),
         build_time=np.array([4, 5, 6, 7, 8]) * 1e-6,
         solve_time=np.array([6, 15, 24, 33, 92]) * 1e-6,
     )
@@ -69,6 +71,8 @@ def test_every_figure_of_a_run(log):
         "jitter": pytest.approx(3 + 3 + 4 + 4),
         "status_counts": {"SOLVED": 2, "RELAXED": 2, "STOPPED": 1},
         "relaxed_ticks": 2,
+        "shortened_ticks": 2,
+        "time_blocked": pytest.approx(3 * DT),
         "tick_us": {"p50": pytest.approx(30.0), "p99": pytest.approx(97.6), "max": pytest.approx(100.0)},
     }
 
