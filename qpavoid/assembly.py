@@ -146,5 +146,9 @@ class Assembly:
         x = self._layout
         near = x.near[:k]
         proximity = Proximity(near, x.closest[:k], x.J[:k], x.drift[:k])
-        self._views[k] = proximity, AvoidanceRows(near, x.d[:k], x.J[:k], x.least[:k], x.d1, x.d2)
-        return self._views[k]
+        rows = AvoidanceRows(
+            near, x.d[:k], x.J[:k], x.least[:k], x.d1, x.d2,
+            x.drift[:k], x.hold, x.row_gain, x.recovery, x.d1 - x.offset,
+        )  # fmt: skip
+        self._views[k] = proximity, rows
+        return proximity, rows

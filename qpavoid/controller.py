@@ -95,7 +95,10 @@ class Controller:
             scene, self.tasks, self._bounds, self._kinematics, self._query, self.avoidance,
             self.limits.position_gain, tracking_damping, dt,
         )  # fmt: skip
-        self._guard = Guard(scene, self._kinematics, self._bounds, self.avoidance.hold - self.avoidance.offset, dt)
+        self._guard = Guard(
+            scene, self._kinematics, self._bounds, self.limits.position_gain,
+            self.avoidance.hold - self.avoidance.offset, dt,
+        )  # fmt: skip
         self._warm_up()
 
     def _warm_up(self) -> None:
@@ -297,10 +300,8 @@ class Controller:
         return solution
 
     def _looked_ahead(self, q: Array, problem: Problem, solution: Solution) -> Solution:
-        near = len(problem.avoidance.d)
-        v, share, short, pair = self._guard.check(
-            q, solution.v, problem.v_stop, self._assembly, near, self._query, self._reach
-        )
+        checked = self._guard.check(q, solution, problem, self._assembly, self._query, self._reach)
+        v, share, short, pair = checked
         if share == 1.0 and short <= TOLERANCE:
             return solution
         if short <= TOLERANCE:

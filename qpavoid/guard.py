@@ -2,8 +2,8 @@
 
 The rows of a problem are a linearisation, and they know only what is near. What is commanded must hold for the real
 distances, of all pairs, at q ⊕ v dt with obstacles moved on; and it must leave a way to stop. So every velocity is
-followed for one tick and then slowed down uniformly, as fast as the accelerations allow, and the distances along that
-way are computed anew. Where it comes too near, the velocity is drawn back towards the stop of this tick, whose way was
+followed for one tick and then slowed down uniformly, as the accelerations and joint limits allow, and the distances
+along that way are computed anew. Where it comes too near, it is drawn back towards the stop of this tick, whose way was
 looked at one tick ago. By induction a stop that was found clear is always at hand, as long as obstacles do what they
 were last seen to do, for one tick.
 
@@ -13,17 +13,18 @@ could stop (`kernels.vectorised.closest_call`), the velocity is clear as it is.
 
 from __future__ import annotations
 
-from math import ceil
+from math import ceil, floor
 from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
 from qpavoid.assembly import Assembly
+from qpavoid.kernels.vectorised import speed_to_stop
 from qpavoid.kinematics import ForwardKinematics
 from qpavoid.limits import JointBounds
 from qpavoid.motion import Sample
-from qpavoid.problem import Array
+from qpavoid.problem import Array, Problem, Solution
 from qpavoid.proximity import DistanceQuery
 from qpavoid.scene import Scene
 
@@ -35,6 +36,8 @@ _FINEST = 5e-3
 """Distance between poses that are looked at, at the least [m]."""
 _MOST_POSES = 24
 """Poses that are looked at along one way."""
+_MOST_TICKS = 200
+"""Ticks of a stop that are followed."""
 _SHARES = (0.75, 0.5, 0.25, 0.0)
 """Shares of the velocity, the rest being the stop, that are tried where it leads too near."""
 
@@ -56,7 +59,13 @@ class Guard:
     """Follows velocities ahead in time, on kinematics and distances of its own."""
 
     def __init__(
-        self, scene: Scene, kinematics: ForwardKinematics, bounds: JointBounds, hold: float, dt: float
+        self,
+        scene: Scene,
+        kinematics: ForwardKinematics,
+        bounds: JointBounds,
+        position_gain: float,
+        hold: float,
+        dt: float,
     ) -> None:
         """Lays the memory out.
 
@@ -64,12 +73,15 @@ class Guard:
             scene: robot and obstacles.
             kinematics: of the tick, brought to the velocities that are looked at.
             bounds: limits of the joints.
+            position_gain: share of the room to a position limit that one tick may use [-].
             hold: safe distance between surfaces [m].
             dt: how long a velocity is held [s].
         """
         self._model, self._kinematics, self._hold, self._dt = scene.robot.model, kinematics, hold, dt
         self._data, self._ahead = scene.robot.model.createData(), DistanceQuery(scene)
+        self._bounds, self._rate = bounds, position_gain / dt
         self._acceleration, self._accelerated = bounds.acceleration, bool(np.isfinite(bounds.acceleration).any())
+        self._given = np.zeros(len(scene.pairs))
         self._samples: dict[int, Sample] = {}
 
     def see(self, index: int, sample: Sample) -> None:
@@ -77,23 +89,28 @@ class Guard:
         self._samples[index] = sample
 
     def check(
-        self, q: Array, v: Array, v_stop: Array, assembly: Assembly, near: int, query: DistanceQuery, reach: float
+        self, q: Array, solution: Solution, problem: Problem, assembly: Assembly, query: DistanceQuery, reach: float
     ) -> Checked:
-        """The velocity itself where its way is clear, else as much of it as can be had.
+        """The velocity of a solution where its way is clear, else as much of it as can be had.
+
+        Where the solution lets a pair come nearer on purpose, because it had to, that is not held against it.
 
         Args:
             q: configuration (nq,).
-            v: wanted velocity (nv,).
-            v_stop: velocity of the stop (nv,).
+            solution: the law's.
+            problem: what it is a solution of.
             assembly: of this tick.
-            near: number of near pairs.
             query: distances of this tick.
             reach: surface distance up to which they were looked for [m].
         """
+        v, v_stop, near = solution.v, problem.v_stop, problem.avoidance.pair
         horizon = self._dt + 0.5 * self._stopping(v)
         self._kinematics.move(q, v)
-        if assembly.closest_call(near, reach, horizon) > 0.0:
+        if assembly.closest_call(len(near), reach, horizon) > 0.0:
             return Checked(v, 1.0, 0.0, -1)
+        self._given[:] = 0.0
+        if solution.slack is not None:
+            self._given[near] = 1.1 * horizon * solution.slack
         self._place_obstacles(query.margin)
         travel = float(np.max(query.speeds)) * horizon
         worst, pair = self._worst(q, v, query, travel)
@@ -122,22 +139,58 @@ class Guard:
     def _worst(self, q: Array, v: Array, now: DistanceQuery, travel: float) -> tuple[float, int]:
         """Least of distance - what it has to be, along the way of v and its stop [m], and the pair that it is of."""
         worst, pair = np.inf, -1
-        for t in self._times(v, travel):
-            found, which = self._look(pin.integrate(self._model, q, v * t), now)
+        for pose in self._way(q, v, travel):
+            found, which = self._look(pose, now)
             if not found >= worst:
                 worst, pair = found, which
         return worst, pair
 
-    def _times(self, v: Array, travel: float) -> list[float]:
-        """When to look: so often that no point moves farther than the safe distance in between, and at the end."""
+    def _way(self, q: Array, v: Array, travel: float) -> list[Array]:
+        """Poses to look at: so many that no point moves farther than the safe distance in between, and the last."""
         stopping = self._stopping(v)
         spacing = max(self._hold, _FINEST)
         if stopping == 0.0 and travel <= spacing:
-            return [self._dt]
-        end = self._dt + 0.5 * stopping
+            return [pin.integrate(self._model, q, self._dt * v)]
+        end = self._end(stopping)
         count = min(max(ceil(travel / spacing), 1), _MOST_POSES)
-        times = {self._dt, *(end * (i + 1) / count for i in range(count))}
-        return sorted(times)
+        x = self._bounds
+        last = pin.integrate(self._model, q, end * v)[x.q_index]
+        if stopping and ((last < x.lower) | (last > x.upper)).any():
+            poses = self._bent_way(q, v)
+            return [poses[i] for i in sorted({0, *np.linspace(0, len(poses) - 1, count + 1).round().astype(int)})]
+        times = sorted({self._dt, *(end * (i + 1) / count for i in range(count))})
+        return [pin.integrate(self._model, q, t * v) for t in times]
+
+    def _bent_way(self, q: Array, v: Array) -> list[Array]:
+        """Poses after v and every tick of the stop from it, where some joints have to brake harder for their limits.
+
+        A joint that uniform slowing leaves inside its limits is never clipped on the way, because what is left of its
+        way then suffices for braking all the more; so the way is straight unless its end lies outside.
+        """
+        x, dt = self._bounds, self._dt
+        step, i, j = x.acceleration * dt, x.q_index, x.v_index
+        limited = np.isfinite(step[j])
+        finite_step = np.where(limited, step[j], 1.0)
+        poses: list[Array] = []
+        while len(poses) < _MOST_TICKS:
+            q = pin.integrate(self._model, q, dt * v)
+            poses.append(q)
+            slowing = float((np.abs(v) / step).max())
+            if slowing <= 1.0:
+                break
+            room = np.maximum(np.array([q[i] - x.lower, x.upper - q[i]]), 0.0)
+            down, up = np.where(limited, speed_to_stop(room, finite_step, dt), self._rate * room)
+            following = (1.0 - 1.0 / slowing) * v
+            hardest = v[j] - step[j], v[j] + step[j]
+            following[j] = np.clip(following[j], np.maximum(-down, hardest[0]), np.minimum(up, hardest[1]))
+            v = following
+        return poses
+
+    def _end(self, stopping: float) -> float:
+        """Time for which v leads as far as v and the ticks of its stop: dt Σ (1 - i dt / stopping), i = 0, 1, … [s]."""
+        n = stopping / self._dt
+        m = floor(n)
+        return self._dt * (1.0 + m - (0.5 * m * (m + 1) / n if m else 0.0))
 
     def _stopping(self, v: Array) -> float:
         """Time that the stop from v takes [s]."""
@@ -154,6 +207,6 @@ class Guard:
         if ahead.margin.any():
             margin = ahead.margin[ahead.twist_row[pairs]]
             there, here = there - margin, here - margin
-        left = there - np.minimum(self._hold - TOLERANCE, here - _CREEP)
+        left = there - np.minimum(self._hold - TOLERANCE, here - _CREEP) + self._given[pairs]
         worst = int(left.argmin())  # the first NaN, where there is one
         return float(left[worst]), int(pairs[worst])

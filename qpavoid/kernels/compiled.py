@@ -116,11 +116,12 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
                 elif x.J[i, c] < 0.0:
                     most += max(x.J[i, c] * x.lower[c], 0.0)
             least = min(least, max(most, -x.drift[i]))
-        elif x.accelerated and x.drift[i] >= 0.0:
+        if x.accelerated and x.drift[i] >= 0.0:
             stop = 0.0
             for c in range(len(x.lower)):
                 stop += x.J[i, c] * x.v_stop[c]
-            least = min(least, stop)
+            if stop < 0.0 or not value > 0.0:
+                least = min(least, stop)
         x.d[i] = d
         x.least[i] = least
 

@@ -1,28 +1,30 @@
-"""What gives way when rows and bounds contradict each other: accelerations first, then rows, the deepest threat last.
+"""What gives way when rows and bounds contradict each other: margins, then accelerations, as evenly as they must.
 
-Position and velocity limits never give way. Only a tick that has no safe velocity comes here, so its QPs are solved
-cold and one after the other; a few hundred microseconds buy an answer that gives up no more than it must.
+First, all pairs get one distance to hold, which falls short of the safe one by no more than the worst of them forces:
+the deepest threat decides, and no pair comes nearer than that for the sake of another one's margin. Then margins are
+restored as far as that allows, by least squares. Both steps change continuously with the distances, so that the robot
+does not jump between threats of the same depth. Acceleration limits give way only where pairs would touch otherwise:
+given up earlier, they cost more by the jumps that follow than they gain. Position and velocity limits never give way.
+
+Only a tick that has no safe velocity comes here: its three or six QPs take some tens of microseconds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from qpavoid import kernels
-from qpavoid.problem import Array, IntArray, Problem
+from qpavoid.problem import Array, Problem
 from qpavoid.solvers.backends import Backend
 
 TOLERANCE = 1e-6
 """Largest violation of a row [m/s] or bound [rad/s] with which an answer still counts as a solution."""
-_LEVEL = 2e-3
-"""Rows whose distances differ by less are threats of the same depth and share what has to be given up [m]."""
-_MOST_LEVELS = 8
-"""Levels that are relaxed one after the other; what is left shares by least squares, so that the time is bounded."""
 _SMALL = 1e-6
 """Weight of the tracking cost beside that of what is given up."""
+_TOUCHING = 0.2
+"""Share of the safe distance down to which margins are given up before acceleration limits are [-]."""
 
 
 class Relaxed(NamedTuple):
@@ -48,21 +50,23 @@ def relax(P: Array, q: Array, problem: Problem, backend: Backend) -> Relaxed | N
     Returns:
         None where the back end fails.
     """
-    x = problem
-    rows, none = x.avoidance, np.zeros(len(x.avoidance.d))
-    if x.hard_lower is not x.lower:
-        excess = _least_excess(P, q, problem, backend)
-        if excess is not None:
-            lower, upper = np.maximum(x.lower - excess, x.hard_lower), np.minimum(x.upper + excess, x.hard_upper)
-            v = closest(backend, P, q, rows.J, rows.b - 0.5 * TOLERANCE, lower, upper)
-            if v is not None:
-                return Relaxed(v, none, np.maximum(np.maximum(v - x.upper, x.lower - v), 0.0))
-    slack = _lexicographic_slack(P, q, problem, backend)
-    v = closest(backend, P, q, rows.J, rows.b - slack - 0.5 * TOLERANCE, x.hard_lower, x.hard_upper)
-    if v is None:
+    x, rows = problem, problem.avoidance
+    lower, upper = x.lower, x.upper
+    held, floor = _shared_floor(P, q, problem, lower, upper, backend)
+    surface = rows.d1 - rows.clearance  # what d has more than the distance between surfaces
+    if x.hard_lower is not x.lower and not held > surface + _TOUCHING * rows.clearance:
+        excess = _least_excess(P, q, problem, surface + _TOUCHING * rows.clearance, backend)
+        lower, upper = np.maximum(lower - excess, x.hard_lower), np.minimum(upper + excess, x.hard_upper)
+        held, floor = _shared_floor(P, q, problem, lower, upper, backend)
+    if floor is None:
         return None
-    left = np.maximum(rows.b - rows.J @ v, 0.0)
-    return Relaxed(v, left, np.maximum(np.maximum(v - x.upper, x.lower - v), 0.0))
+    least = np.maximum(floor, rows.b - _least_slack(P, q, problem, floor, lower, upper, backend)) - TOLERANCE
+    for b in (least, floor - TOLERANCE):
+        v = closest(backend, P, q, rows.J, b, lower, upper)
+        if v is not None:
+            slack = np.maximum(rows.b - rows.J @ v, 0.0)
+            return Relaxed(v, slack, np.maximum(np.maximum(v - x.upper, x.lower - v), 0.0))
+    return None
 
 
 def closest(backend: Backend, P: Array, q: Array, J: Array, b: Array, lower: Array, upper: Array) -> Array | None:
@@ -73,87 +77,68 @@ def closest(backend: Backend, P: Array, q: Array, J: Array, b: Array, lower: Arr
         return None
     if v is None or np.shape(v) != q.shape or not kernels.shortfall(v, J, b, lower, upper) <= TOLERANCE:
         return None  # NaN fails the comparison too
-    return np.asarray(np.minimum(np.maximum(v, lower), upper))
+    within: Array = np.minimum(np.maximum(v, lower), upper)
+    return within
 
 
-def _least_excess(P: Array, q: Array, x: Problem, backend: Backend) -> Array | None:
-    """Least e >= 0 (n,), in units of the speeds, with lower - e <= v <= upper + e for some v that meets all rows."""
+def _approach(problem: Problem) -> Array:
+    """What pairs (k,) may lose: to hold a distance z, J v >= ξ z - approach [m/s].
+
+    A pair at distance d that is to hold z must have ḋ >= ξ (z - d). Pairs that are so deep that their rows are capped
+    at the recovery speed count as if they were just so deep that they are not.
+    """
+    rows = problem.avoidance
+    deepest = rows.hold - rows.recovery / rows.gain
+    return np.asarray(rows.gain * np.maximum(rows.d, deepest) + rows.drift)
+
+
+def _shared_floor(
+    P: Array, q: Array, x: Problem, lower: Array, upper: Array, backend: Backend
+) -> tuple[float, Array | None]:
+    """The largest distance, up to the safe one, that all pairs can hold together [m], and rows J v >= floor for it."""
+    n, rows, approach = len(q), x.avoidance, _approach(x)
+    hessian = np.zeros((n + 1, n + 1))
+    hessian[:n, :n], hessian[n, n] = _SMALL * P, 1.0
+    gradient = np.concatenate((_SMALL * q, [-rows.gain * rows.hold]))
+    J = np.hstack((rows.J, np.full((len(rows.d), 1), -1.0)))
+    below, above = np.append(lower, -1e6), np.append(upper, rows.gain * rows.hold)
+    answer = closest(backend, hessian, gradient, J, -approach, below, above)
+    if answer is None:
+        return -np.inf, None
+    floor = np.minimum(np.minimum(rows.b, answer[n] - approach), rows.J @ answer[:n])
+    return float(answer[n]) / rows.gain, floor
+
+
+def _least_slack(P: Array, q: Array, x: Problem, floor: Array, lower: Array, upper: Array, backend: Backend) -> Array:
+    """Slack (k,) of the rows J v >= b that is least in squares, with J v >= floor."""
+    n, rows, k = len(q), x.avoidance, len(floor)
+    hessian = np.zeros((n + k, n + k))
+    hessian[:n, :n], hessian[n:, n:] = _SMALL * P, np.eye(k)
+    J = np.zeros((2 * k, n + k))
+    J[:k, :n], J[k:, :n], J[k:, n:] = rows.J, rows.J, np.eye(k)
+    b = np.concatenate((floor - TOLERANCE, rows.b))
+    below, above = np.concatenate((lower, np.zeros(k))), np.concatenate((upper, np.full(k, np.inf)))
+    answer = closest(backend, hessian, np.concatenate((_SMALL * q, np.zeros(k))), J, b, below, above)
+    v = np.full(n, np.nan) if answer is None else answer[:n]
+    return np.where(np.isnan(v).any(), np.inf, np.maximum(rows.b - rows.J @ v, 0.0) + TOLERANCE)
+
+
+def _least_excess(P: Array, q: Array, x: Problem, distance: float, backend: Backend) -> Array:
+    """Least e >= 0 (n,), in units of the speeds, with which lower - e <= v <= upper + e lets all pairs hold `distance`.
+
+    Infinite where nothing does: the velocity limits are all that is left then.
+    """
     n, rows = len(q), x.avoidance
     room = np.maximum(x.upper - x.lower, 1e-9)
-    eye, none = np.eye(n), np.zeros((len(rows.d), n))
-    J = np.block([[rows.J, none], [eye, eye], [-eye, eye]])
-    b = np.concatenate((rows.b, x.lower, -x.upper))
+    eye = np.eye(n)
+    J = np.block([[rows.J, np.zeros((len(rows.d), n))], [eye, eye], [-eye, eye]])
+    asked = np.minimum(rows.gain * distance - _approach(x), rows.b)
+    b = np.concatenate((asked, x.lower, -x.upper))
     finite = np.isfinite(b)
     hessian = np.zeros((2 * n, 2 * n))
-    hessian[:n, :n] = _SMALL * P
-    hessian[n:, n:] = np.diag(1.0 / room**2)
+    hessian[:n, :n], hessian[n:, n:] = _SMALL * P, np.diag(1.0 / room**2)
+    below = np.concatenate((x.hard_lower, np.zeros(n)))
+    above = np.concatenate((x.hard_upper, np.full(n, np.inf)))
     gradient = np.concatenate((_SMALL * q, np.zeros(n)))
-    lower = np.concatenate((x.hard_lower, np.zeros(n)))
-    upper = np.concatenate((x.hard_upper, np.full(n, np.inf)))
-    answer = closest(backend, hessian, gradient, np.ascontiguousarray(J[finite]), b[finite], lower, upper)
-    return None if answer is None else answer[n:] + TOLERANCE
-
-
-def _lexicographic_slack(P: Array, q: Array, x: Problem, backend: Backend) -> Array:
-    """Slack (k,) of the rows, level by level from the deepest threat on: each gives only what those before it force."""
-    rows = x.avoidance
-    slack = np.zeros(len(rows.d))
-    levels = _levels(rows.d)
-
-    def feasible(count: int) -> bool:
-        """Whether the first `count` levels can be met with the slack that they have."""
-        chosen = np.concatenate(levels[:count])
-        b = rows.b[chosen] - slack[chosen]
-        return closest(backend, P, q, rows.J[chosen], b, x.hard_lower, x.hard_upper) is not None
-
-    done = 0
-    for _ in range(_MOST_LEVELS):
-        done = _last_true(feasible, done, len(levels))
-        if done == len(levels):
-            return slack
-        _give(slack, np.concatenate([*levels[:done], np.zeros(0, dtype=np.intp)]), levels[done], P, q, x, backend)
-        done += 1
-    if done < len(levels):
-        _give(slack, np.concatenate(levels[:done]), np.concatenate(levels[done:]), P, q, x, backend)
-    return slack
-
-
-def _levels(d: Array) -> list[IntArray]:
-    """Rows by depth: each level holds those within `_LEVEL` of its deepest one."""
-    order = np.argsort(d, kind="stable")
-    levels: list[IntArray] = []
-    start = 0
-    for i in range(1, len(order) + 1):
-        if i == len(order) or d[order[i]] - d[order[start]] > _LEVEL:
-            levels.append(order[start:i])
-            start = i
-    return levels
-
-
-def _last_true(test: Callable[[int], bool], low: int, high: int) -> int:
-    """Largest i in [low, high] with test(i), for a test that is true up to some i; `low` is taken to be true."""
-    if low < high and test(high):
-        return high
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (middle, high) if test(middle) else (low, middle)
-    return low
-
-
-def _give(slack: Array, kept: IntArray, giving: IntArray, P: Array, q: Array, x: Problem, backend: Backend) -> None:
-    """Writes the least slack of the rows `giving` that lets them be met together with the rows `kept`."""
-    n, rows, count = len(q), x.avoidance, len(giving)
-    hessian = np.zeros((n + count, n + count))
-    hessian[:n, :n] = _SMALL * P
-    hessian[n:, n:] = np.eye(count)
-    J = np.zeros((len(kept) + count, n + count))
-    J[: len(kept), :n], J[len(kept) :, :n] = rows.J[kept], rows.J[giving]
-    J[len(kept) :, n:] = np.eye(count)
-    b = np.concatenate((rows.b[kept] - slack[kept], rows.b[giving]))
-    lower = np.concatenate((x.hard_lower, np.zeros(count)))
-    upper = np.concatenate((x.hard_upper, np.full(count, np.inf)))
-    answer = closest(backend, hessian, np.concatenate((_SMALL * q, np.zeros(count))), J, b, lower, upper)
-    if answer is None:  # give everything that the bounds could ever take
-        slack[giving] = np.inf
-    else:
-        slack[giving] = np.maximum(rows.b[giving] - rows.J[giving] @ answer[:n], 0.0) + TOLERANCE
+    answer = closest(backend, hessian, gradient, np.ascontiguousarray(J[finite]), b[finite], below, above)
+    return np.full(n, np.inf) if answer is None else np.asarray(answer[n:] + TOLERANCE)
