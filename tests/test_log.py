@@ -160,7 +160,10 @@ def test_malformed_state_stops_the_robot_and_says_why(log, monkeypatch, tmp_path
     assert stopped[5:].all() and not stopped[:5].any()
     assert (np.diff(np.abs(blind.v[4:]), axis=0) <= 0.0).all() and not blind.v[-1].any()
     assert "q: NaN or infinity" in said(blind)
-    assert_equal(Log.load(blind.save(tmp_path / "blind")), blind)
+    loaded = Log.load(blind.save(tmp_path / "blind"))
+    assert loaded.meta == blind.meta
+    for name in ARRAYS:  # NaN is kept
+        np.testing.assert_array_equal(getattr(loaded, name), getattr(blind, name))
 
 
 def test_solver_that_returns_nan_stops_the_robot_and_is_seen(monkeypatch):

@@ -1,7 +1,7 @@
 """QPs of real runs: everything that the `qp` solver hands to its back end, in the order of the ticks.
 
-Ticks at which tracking alone is safe need no QP and leave none. A tick whose rows contradict each other leaves up to
-three: the one without a solution, the one that finds the least slack, and the one with that slack.
+Ticks at which tracking alone is safe need no QP and leave none. A tick without a velocity that meets everything leaves
+several: the one without a solution, those that find out what has to give way, and the one with that given up.
 """
 
 from __future__ import annotations
