@@ -13,7 +13,7 @@ could stop (`kernels.vectorised.closest_call`), the velocity is clear as it is.
 
 from __future__ import annotations
 
-from math import ceil, floor
+from math import floor
 from typing import NamedTuple
 
 import numpy as np
@@ -33,9 +33,11 @@ TOLERANCE = 2e-4
 _CREEP = 1e-5
 """How much nearer a pair that is too near already may come in a tick [m]."""
 _FINEST = 5e-3
-"""Distance between poses that are looked at, at the least [m]."""
-_MOST_POSES = 24
-"""Poses that are looked at along one way."""
+"""How far the fastest point moves between poses that are looked at, at the least [m]."""
+_FARTHEST = 0.04
+"""Distance beyond the safe one up to which pairs are looked at [m]."""
+_MOST_POSES = 48
+"""Poses that are looked at along one way, about."""
 _MOST_TICKS = 200
 """Ticks of a stop that are followed."""
 _SHARES = (0.75, 0.5, 0.25, 0.0)
@@ -112,12 +114,13 @@ class Guard:
         if solution.slack is not None:
             self._given[near] = 1.1 * horizon * solution.slack
         self._place_obstacles(query.margin)
-        travel = float(np.max(query.speeds)) * horizon
-        worst, pair = self._worst(q, v, query, travel)
+        speed = float(np.max(query.speeds))
+        gap = float(np.min(query.found(query.pairs), initial=reach)) - self._hold
+        worst, pair = self._worst(q, v, query, gap, speed)
         best = Checked(v, 1.0, max(-worst, 0.0), pair)
         for share in _SHARES if best.short > 0.0 else ():
             blend = v_stop + share * (v - v_stop)
-            worst, pair = self._worst(q, blend, query, travel)
+            worst, pair = self._worst(q, blend, query, gap, speed)
             if worst >= 0.0:
                 return Checked(blend, share, 0.0, -1)
             if -worst < best.short:
@@ -136,33 +139,46 @@ class Guard:
             del self._samples[index]
         self._ahead.margin[:] = margin
 
-    def _worst(self, q: Array, v: Array, now: DistanceQuery, travel: float) -> tuple[float, int]:
-        """Least of distance - what it has to be, along the way of v and its stop [m], and the pair that it is of."""
-        worst, pair = np.inf, -1
-        for pose in self._way(q, v, travel):
-            found, which = self._look(pose, now)
-            if not found >= worst:
-                worst, pair = found, which
+    def _worst(self, q: Array, v: Array, now: DistanceQuery, gap: float, speed: float) -> tuple[float, int]:
+        """Least of distance - what it has to be, along the way of v and its stop [m], and the pair that it is of.
+
+        The steps are such that no two bodies can meet in between, and no shorter than `_FINEST`: what a pair could come
+        nearer within one of those is of second order in it, as it was not too near at either end.
+
+        Args:
+            q: start (nq,).
+            v: velocity (nv,).
+            now: distances there.
+            gap: by how much the nearest pair is farther apart than it has to be [m].
+            speed: that no point of the robot exceeds [m/s].
+        """
+        worst, pair, looks = np.inf, -1, 0
+        pieces = self._way(q, v)
+        left = sum(duration for *_, duration in pieces)
+        for start, along, duration in pieces:
+            t = 0.0
+            while t < duration:
+                step = max(0.5 * gap, _FINEST, speed * left / (_MOST_POSES - looks)) / max(speed, 1e-9)
+                # the end of the tick is always looked at
+                step = min(step, self._dt - t if t < self._dt and not looks else duration - t)
+                t, left, looks = t + step, left - step, min(looks + 1, _MOST_POSES - 1)
+                found, which = self._look(pin.integrate(self._model, start, t * along), now)
+                if not found >= worst:
+                    worst, pair = found, which
+                gap = min(max(found, 0.0), _FARTHEST)
         return worst, pair
 
-    def _way(self, q: Array, v: Array, travel: float) -> list[Array]:
-        """Poses to look at: so many that no point moves farther than the safe distance in between, and the last."""
-        stopping = self._stopping(v)
-        spacing = max(self._hold, _FINEST)
-        if stopping == 0.0 and travel <= spacing:
-            return [pin.integrate(self._model, q, self._dt * v)]
-        end = self._end(stopping)
-        count = min(max(ceil(travel / spacing), 1), _MOST_POSES)
+    def _way(self, q: Array, v: Array) -> list[tuple[Array, Array, float]]:
+        """Straight pieces of the way of v and its stop: where each starts, its velocity and for how long [s]."""
+        end = self._end(self._stopping(v))
         x = self._bounds
         last = pin.integrate(self._model, q, end * v)[x.q_index]
-        if stopping and ((last < x.lower) | (last > x.upper)).any():
-            poses = self._bent_way(q, v)
-            return [poses[i] for i in sorted({0, *np.linspace(0, len(poses) - 1, count + 1).round().astype(int)})]
-        times = sorted({self._dt, *(end * (i + 1) / count for i in range(count))})
-        return [pin.integrate(self._model, q, t * v) for t in times]
+        if end > self._dt and ((last < x.lower) | (last > x.upper)).any():
+            return self._bent_way(q, v)
+        return [(q, v, end)]
 
-    def _bent_way(self, q: Array, v: Array) -> list[Array]:
-        """Poses after v and every tick of the stop from it, where some joints have to brake harder for their limits.
+    def _bent_way(self, q: Array, v: Array) -> list[tuple[Array, Array, float]]:
+        """The ticks of v and of the stop from it, where some joints have to brake harder for their limits.
 
         A joint that uniform slowing leaves inside its limits is never clipped on the way, because what is left of its
         way then suffices for braking all the more; so the way is straight unless its end lies outside.
@@ -171,10 +187,10 @@ class Guard:
         step, i, j = x.acceleration * dt, x.q_index, x.v_index
         limited = np.isfinite(step[j])
         finite_step = np.where(limited, step[j], 1.0)
-        poses: list[Array] = []
-        while len(poses) < _MOST_TICKS:
+        pieces: list[tuple[Array, Array, float]] = []
+        while len(pieces) < _MOST_TICKS:
+            pieces.append((q, v, dt))
             q = pin.integrate(self._model, q, dt * v)
-            poses.append(q)
             slowing = float((np.abs(v) / step).max())
             if slowing <= 1.0:
                 break
@@ -184,7 +200,7 @@ class Guard:
             hardest = v[j] - step[j], v[j] + step[j]
             following[j] = np.clip(following[j], np.maximum(-down, hardest[0]), np.minimum(up, hardest[1]))
             v = following
-        return poses
+        return pieces
 
     def _end(self, stopping: float) -> float:
         """Time for which v leads as far as v and the ticks of its stop: dt Σ (1 - i dt / stopping), i = 0, 1, … [s]."""
@@ -199,10 +215,10 @@ class Guard:
     def _look(self, q: Array, now: DistanceQuery) -> tuple[float, int]:
         pin.forwardKinematics(self._model, self._data, q)
         ahead = self._ahead
-        ahead.compute(self._data, self._hold)
+        ahead.compute(self._data, self._hold + _FARTHEST)
         pairs = ahead.pairs
         if not len(pairs):
-            return np.inf, -1
+            return _FARTHEST, -1
         there, here = ahead.found(pairs), now.found(pairs)
         if ahead.margin.any():
             margin = ahead.margin[ahead.twist_row[pairs]]

@@ -112,16 +112,17 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
             most = 0.0
             for c in range(len(x.lower)):
                 if x.J[i, c] > 0.0:
-                    most += max(x.J[i, c] * x.upper[c], 0.0)
+                    most += x.J[i, c] * x.upper[c]
                 elif x.J[i, c] < 0.0:
-                    most += max(x.J[i, c] * x.lower[c], 0.0)
-            least = min(least, max(most, -x.drift[i]))
-        if x.accelerated and x.drift[i] >= 0.0:
+                    most += x.J[i, c] * x.lower[c]
+            if x.drift[i] < 0.0:
+                most = max(most, -x.drift[i])
+            least = min(least, most)
+        elif x.accelerated and x.drift[i] >= 0.0:
             stop = 0.0
             for c in range(len(x.lower)):
                 stop += x.J[i, c] * x.v_stop[c]
-            if stop < 0.0 or not value > 0.0:
-                least = min(least, stop)
+            least = min(least, stop)
         x.d[i] = d
         x.least[i] = least
 

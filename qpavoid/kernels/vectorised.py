@@ -182,9 +182,9 @@ def distance_rows(x: Any, pairs: IntArray, reach: float, moving: bool) -> int:
 def row_bounds(x: Any, k: int, moving: bool) -> None:
     """Right-hand sides of the first k avoidance rows: see `qpavoid.avoidance`; writes d and least.
 
-    A row never asks for more than can be had: of a pair that may still close, or that a stop does not keep from closing
-    yet, and whose obstacle does not come nearer, no more than a stop gives, so that the stop meets all such rows at
-    once; of one that has to part, no more speed of parting than the bounds allow.
+    A row never asks for more than can be had: of a pair that may still close, and whose obstacle does not come nearer,
+    no more than a stop gives, so that the stop meets all such rows at once; of one that has to part, no more speed of
+    parting than the bounds allow, and where they do not allow any yet, no harder braking.
     """
     d, least = x.d[:k], x.least[:k]
     np.add(x.closest[:k, 0], x.offset_, out=d)
@@ -209,12 +209,13 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
     if moving:
         least -= x.drift[:k]
     if x.accelerated:
-        stop = np.dot(x.J[:k], x.v_stop)
-        np.minimum(least, stop, out=least, where=(~parting | (stop < 0.0)) & (x.drift[:k] >= 0.0))
+        np.minimum(least, np.dot(x.J[:k], x.v_stop), out=least, where=~parting & (x.drift[:k] >= 0.0))
     if np.count_nonzero(parting):
         with np.errstate(invalid="ignore"):  # no lever times no limit
-            most = np.fmax(np.fmax(x.J[:k] * x.lower, x.J[:k] * x.upper), 0.0).sum(axis=1)
-        np.minimum(least, np.maximum(most, -x.drift[:k]), out=least, where=parting)
+            most = np.nansum(np.fmax(x.J[:k] * x.lower, x.J[:k] * x.upper), axis=1)
+        coming = x.drift[:k] < 0.0
+        np.maximum(most, -x.drift[:k], out=most, where=coming)
+        np.minimum(least, most, out=least, where=parting)
 
 
 def closest_call(x: Any, k: int, reach: float, horizon: float) -> float:
