@@ -228,6 +228,31 @@ def test_columns_of_joints_beyond_the_body_are_exactly_zero(paper):
         assert row.max() > 1e-2  # not in every configuration: the closest points may be the shoulders, which rest
 
 
+@pytest.mark.parametrize("name", ["paper", "panda", "solo"])
+def test_nothing_comes_nearer_than_the_closest_call_says(name, request):
+    """Robot and obstacles move on at constant velocities; also what was out of reach counts."""
+    robot = request.getfixturevalue(name)
+    rng = np.random.default_rng(19)
+    scene = random_scene(robot, rng, [SPHERE, CAPSULE, BOX, CYLINDER])
+    bench, hold = Bench(scene), Avoidance().hold
+    for _ in range(20):
+        q, v = random_q(robot, rng), rng.uniform(-1.0, 1.0, robot.model.nv)
+        samples = {}
+        for i, body in enumerate(scene.obstacles):
+            start, speed = body.motion.sample(0.0), rng.choice([0.0, 0.3, 1.0])
+            twist = {"linear": speed * rng.uniform(-1, 1, 3), "angular": speed * rng.uniform(-1, 1, 3)}
+            samples[i] = start._replace(**twist)
+            bench.query.place_obstacle(i, samples[i])
+        near = len(bench.compute(q, reach=0.3)[0].pair)
+        bench.kinematics.move(q, v)
+        for horizon in (0.01, 0.1, 0.3):
+            least = bench.assembly.closest_call(near, 0.3, horizon)
+            assert np.isfinite(least)
+            later = {i: moved(sample, horizon) for i, sample in samples.items()}
+            found = look(scene, pin.integrate(robot.model, q, horizon * v), later)
+            assert found.distance.min() - hold >= least - 1e-9
+
+
 # --- penetration -------------------------------------------------------------------------------------------------
 
 
