@@ -8,7 +8,7 @@ import numpy as np
 
 from qpavoid import kernels
 from qpavoid.avoidance import row_form
-from qpavoid.config import Avoidance
+from qpavoid.config import Avoidance, Limits
 from qpavoid.kernels.layout import RowLayout
 from qpavoid.kinematics import ForwardKinematics, Kinematics
 from qpavoid.limits import JointBounds, limit_layout
@@ -30,7 +30,7 @@ class Assembly:
         kinematics: ForwardKinematics,
         query: DistanceQuery,
         avoidance: Avoidance,
-        position_gain: float,
+        limits: Limits,
         damping: float,
         dt: float,
     ) -> None:
@@ -55,11 +55,14 @@ class Assembly:
             drift=np.zeros(pairs),
             d=np.zeros(pairs),
             least=np.zeros(pairs),
-            **limit_layout(bounds, position_gain, dt),
+            touch=np.zeros(pairs),
+            **limit_layout(bounds, limits.position_gain, dt),
             v0=np.zeros(nv),
             damping=damping,
             **row_form(avoidance),
         )
+        x = self._layout
+        self._hard = (x.hard_lower, x.hard_upper) if limits.acceleration_gives_way else (x.lower, x.upper)
         self._packed = kernels.pack(self._layout)
         self._names = scene.pair_names, tuple(scene.robot.coordinate_names)
         self._targets = [(row[:3], row[3:12].reshape(3, 3), row[12:15], row[15:]) for row in self._layout.targets]
@@ -85,7 +88,7 @@ class Assembly:
         k, worst = kernels.assemble(self._packed, q, query.pairs, reach, query.moving)
         proximity, rows = self._views.get(k) or self._view(k)
         return proximity, Problem(
-            self._tracking, rows, x.lower, x.upper, x.hard_lower, x.hard_upper, x.v_stop, *self._names, x.v0, worst
+            self._tracking, rows, x.lower, x.upper, *self._hard, x.v_stop, *self._names, x.v0, worst
         )
 
     def closest_call(self, near: int, reach: float, horizon: float) -> float:
@@ -146,9 +149,5 @@ class Assembly:
         x = self._layout
         near = x.near[:k]
         proximity = Proximity(near, x.closest[:k], x.J[:k], x.drift[:k])
-        rows = AvoidanceRows(
-            near, x.d[:k], x.J[:k], x.least[:k], x.d1, x.d2,
-            x.drift[:k], x.hold, x.row_gain, x.recovery, x.d1 - x.offset,
-        )  # fmt: skip
-        self._views[k] = proximity, rows
-        return proximity, rows
+        self._views[k] = proximity, AvoidanceRows(near, x.d[:k], x.J[:k], x.least[:k], x.d1, x.d2, x.touch[:k])
+        return self._views[k]

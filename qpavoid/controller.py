@@ -93,7 +93,7 @@ class Controller:
         self._q_last = scene.robot.home.copy()
         self._assembly = Assembly(
             scene, self.tasks, self._bounds, self._kinematics, self._query, self.avoidance,
-            self.limits.position_gain, tracking_damping, dt,
+            self.limits, tracking_damping, dt,
         )  # fmt: skip
         self._guard = Guard(
             scene, self._kinematics, self._bounds, self.limits.position_gain,

@@ -48,7 +48,7 @@ class ForwardKinematics:
         pin.forwardKinematics(model, self.data, pin.neutral(model), np.arange(1.0, 1.0 + model.nv))
         view, motions = view_poses(self.data.oMf), view_velocities(self.data.v)
         self._copy, self._copy_velocities = view is None, motions is None
-        self.J: Array = self.data.J
+        self.J: Array = self.data.J.reshape(6, model.nv, order="F")  # of one joint, it comes as a vector
         """(6, nv) see `Kinematics.J`."""
         self.frame_poses: Array = read_poses(self.data.oMf) if view is None else view
         """(frames, 12) world poses of all frames; only those of `frame_ids` are kept up to date."""

@@ -105,16 +105,8 @@ class AvoidanceRows(NamedTuple):
     """Distance below which β is 1 [m]."""
     d2: float
     """Influence distance: α and β are 0 beyond it [m]."""
-    drift: Array | float = 0.0
-    """(k,) rate of the distances due to the obstacles' own motion [m/s]."""
-    hold: float = 0.0
-    """Distance at which a row lets a pair come no nearer [m]."""
-    gain: float = 5.0
-    """ξ of the rows [1/s]."""
-    recovery: float = 0.2
-    """Cap on the speed of parting that a row asks for [m/s]."""
-    clearance: float = 0.0
-    """d1 as a distance between surfaces [m]."""
+    touch: Array
+    """(k,) lower bound on J v that keeps the pair from touching: that of a row with no margin; at most `b` [m/s]."""
 
 
 class Problem(NamedTuple):

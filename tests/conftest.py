@@ -90,7 +90,7 @@ class Bench:
         self.query = query or DistanceQuery(scene)
         self.assembly = Assembly(
             scene, tasks, scene.robot.bounds(), self.kinematics, self.query, avoidance or config.Avoidance(),
-            position_gain, damping, dt,
+            config.Limits(position_gain=position_gain), damping, dt,
         )  # fmt: skip
 
     def compute(self, q, targets=None, reach=np.inf):
@@ -124,7 +124,7 @@ def make_layout(nv, frames=0, turns=(), pairs=0, obstacles=0, joints=1, **fields
     }  # fmt: skip
     shapes = {
         "poses": (frames, 12), "A": (rows, nv), "b": rows, "closest": (pairs, 10), "J": (pairs, nv), "drift": pairs,
-        "d": pairs, "least": pairs, "hard_lower": nv, "hard_upper": nv, "lower": nv, "upper": nv, "v_stop": nv,
+        "d": pairs, "least": pairs, "touch": pairs, "hard_lower": nv, "hard_upper": nv, "lower": nv, "upper": nv, "v_stop": nv,
         "v0": nv,
     }  # fmt: skip
     outputs = {"near": np.full(pairs, -1), **{name: np.full(shape, np.nan) for name, shape in shapes.items()}}

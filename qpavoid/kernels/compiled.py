@@ -15,7 +15,7 @@ from numba import njit, types
 from numba.experimental import structref
 
 from qpavoid.kernels.layout import RowLayout
-from qpavoid.kernels.vectorised import WELL_CONDITIONED, rotation_vector
+from qpavoid.kernels.vectorised import BRAKING_SHARE, WELL_CONDITIONED, rotation_vector
 from qpavoid.problem import Array, IntArray
 
 
@@ -107,6 +107,15 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
         if x.switching and not value > 0.0:
             share = min(max((d - x.d1) / (x.d2 - x.d1), 0.0), 1.0)
             value *= 0.5 - 0.5 * np.cos(np.pi * share)
+        if x.accelerated and value < 0.0:
+            braking = 0.0
+            for c in range(len(x.v_step)):
+                if x.J[i, c] != 0.0:
+                    braking += abs(x.J[i, c]) * x.v_step[c]
+            if braking < np.inf:
+                braking *= 0.5 * BRAKING_SHARE
+                room = max(d - x.hold, 0.0) / x.dt
+                value = max(value, braking - np.sqrt(braking * braking + 4.0 * braking * room))
         least = min(value, x.recovery) - x.drift[i]
         if value > 0.0:
             most = 0.0
@@ -125,6 +134,7 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
             least = min(least, stop)
         x.d[i] = d
         x.least[i] = least
+        x.touch[i] = min(x.row_gain * (x.offset - d) - x.drift[i], least)
 
 
 @njit(cache=True)

@@ -75,6 +75,8 @@ class RowLayout(NamedTuple):
     """(m,) out: distance that the gains take [m]."""
     least: Array
     """(m,) out: lower bound on J v [m/s]."""
+    touch: Array
+    """(m,) out: the same of rows without a margin, which only keep pairs from touching [m/s]."""
     # --- limits
     q_index: IntArray
     """(p,) index in q of each limited coordinate."""

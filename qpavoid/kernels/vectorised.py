@@ -14,6 +14,8 @@ from scipy.linalg.lapack import dposv
 from qpavoid.kernels.layout import RowLayout
 from qpavoid.problem import Array, IntArray
 
+BRAKING_SHARE = 0.5
+"""Share of the joints' accelerations on which a pair counts for braking; other pairs want some, too [-]."""
 WELL_CONDITIONED = 1e-6
 """Ratio of the smallest to the largest pivot of J Jᵀ down to which J⁺ is taken from it without damping."""
 
@@ -180,7 +182,10 @@ def distance_rows(x: Any, pairs: IntArray, reach: float, moving: bool) -> int:
 
 
 def row_bounds(x: Any, k: int, moving: bool) -> None:
-    """Right-hand sides of the first k avoidance rows: see `qpavoid.avoidance`; writes d and least.
+    """Right-hand sides of the first k avoidance rows: see `qpavoid.avoidance`; writes d, least and touch.
+
+    With acceleration limits, a pair closes no faster than the speed from which a share of its joints' accelerations,
+    all at work on it, brings it to rest in what is left: ½ a dt - √((½ a dt)² + 2 a h).
 
     A row never asks for more than can be had: of a pair that may still close, and whose obstacle does not come nearer,
     no more than a stop gives, so that the stop meets all such rows at once; of one that has to part, no more speed of
@@ -204,6 +209,12 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
         np.maximum(least, x.zero, out=beyond)
         np.add(share, beyond, out=least)
     least *= x.gain_
+    if x.accelerated:
+        with np.errstate(invalid="ignore"):  # no lever times no limit
+            braking = 0.5 * BRAKING_SHARE * np.nansum(np.abs(x.J[:k]) * x.v_step, axis=1)
+            room = np.maximum(d - x.hold, 0.0) / x.dt
+            fastest = braking - np.sqrt(braking * braking + 4.0 * braking * room)
+        np.maximum(least, fastest, out=least, where=(least < 0.0) & np.isfinite(braking))
     np.minimum(least, x.recovery_, out=least)
     parting = least > x.zero
     if moving:
@@ -216,6 +227,12 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
         coming = x.drift[:k] < 0.0
         np.maximum(most, -x.drift[:k], out=most, where=coming)
         np.minimum(least, most, out=least, where=parting)
+    touch = x.touch[:k]
+    np.subtract(x.offset_, d, out=touch)
+    touch *= x.gain_
+    if moving:
+        touch -= x.drift[:k]
+    np.minimum(touch, least, out=touch)
 
 
 def closest_call(x: Any, k: int, reach: float, horizon: float) -> float:

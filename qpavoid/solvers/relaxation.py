@@ -1,30 +1,33 @@
-"""What gives way when rows and bounds contradict each other: margins, then accelerations, as evenly as they must.
+"""What gives way when rows and bounds contradict each other: margins, then accelerations, then contact.
 
-First, all pairs get one distance to hold, which falls short of the safe one by no more than the worst of them forces:
-the deepest threat decides, and no pair comes nearer than that for the sake of another one's margin. Then margins are
-restored as far as that allows, by least squares. Both steps change continuously with the distances, so that the robot
-does not jump between threats of the same depth. Acceleration limits give way only where pairs would touch otherwise:
-given up earlier, they cost more by the jumps that follow than they gain. Position and velocity limits never give way.
+Among pairs, the deepest threat gives way last: first, every pair is kept from touching, from the deepest on; then
+margins are restored as far as that allows, in the same order. Acceleration limits give way only where pairs would
+touch otherwise: given up for margins, a few mm/s cost jumps of a joint with a short lever between its velocity limits.
+Position and velocity limits never give way.
 
-Only a tick that has no safe velocity comes here: its three or six QPs take some tens of microseconds.
+Only a tick that has no safe velocity comes here, so its QPs are solved cold and one after the other; a few hundred
+microseconds buy an answer that gives up no more than it must.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from qpavoid import kernels
-from qpavoid.problem import Array, Problem
+from qpavoid.problem import Array, AvoidanceRows, IntArray, Problem
 from qpavoid.solvers.backends import Backend
 
 TOLERANCE = 1e-6
 """Largest violation of a row [m/s] or bound [rad/s] with which an answer still counts as a solution."""
+_LEVEL = 2e-3
+"""Rows whose distances differ by less are threats of the same depth and share what has to be given up [m]."""
+_MOST_LEVELS = 8
+"""Levels that are relaxed one after the other; what is left shares by least squares, so that the time is bounded."""
 _SMALL = 1e-6
 """Weight of the tracking cost beside that of what is given up."""
-_TOUCHING = 0.2
-"""Share of the safe distance down to which margins are given up before acceleration limits are [-]."""
 
 
 class Relaxed(NamedTuple):
@@ -50,23 +53,25 @@ def relax(P: Array, q: Array, problem: Problem, backend: Backend) -> Relaxed | N
     Returns:
         None where the back end fails.
     """
-    x, rows = problem, problem.avoidance
-    lower, upper = x.lower, x.upper
-    held, floor = _shared_floor(P, q, problem, lower, upper, backend)
-    surface = rows.d1 - rows.clearance  # what d has more than the distance between surfaces
-    if x.hard_lower is not x.lower and not held > surface + _TOUCHING * rows.clearance:
-        excess = _least_excess(P, q, problem, surface + _TOUCHING * rows.clearance, backend)
-        lower, upper = np.maximum(lower - excess, x.hard_lower), np.minimum(upper + excess, x.hard_upper)
-        held, floor = _shared_floor(P, q, problem, lower, upper, backend)
-    if floor is None:
+    rows, within = problem.avoidance, _Bounds(problem.lower, problem.upper)
+    nothing = np.full(len(rows.d), -np.inf)
+    touch = rows.touch - TOLERANCE
+    if problem.hard_lower is not problem.lower and _solve(P, q, rows, touch, within, backend) is None:
+        hard = _Bounds(problem.hard_lower, problem.hard_upper)
+        touch = touch - _lexicographic_slack(P, q, rows, touch, nothing, hard, backend)
+        within = _least_excess(P, q, problem, touch, backend)
+    touch = touch - _lexicographic_slack(P, q, rows, touch, nothing, within, backend)
+    slack = _lexicographic_slack(P, q, rows, rows.b, touch, within, backend)
+    v = _solve(P, q, rows, np.maximum(touch, rows.b - slack) - TOLERANCE, within, backend)
+    if v is None:
         return None
-    least = np.maximum(floor, rows.b - _least_slack(P, q, problem, floor, lower, upper, backend)) - TOLERANCE
-    for b in (least, floor - TOLERANCE):
-        v = closest(backend, P, q, rows.J, b, lower, upper)
-        if v is not None:
-            slack = np.maximum(rows.b - rows.J @ v, 0.0)
-            return Relaxed(v, slack, np.maximum(np.maximum(v - x.upper, x.lower - v), 0.0))
-    return None
+    excess = np.maximum(np.maximum(v - problem.upper, problem.lower - v), 0.0)
+    return Relaxed(v, np.maximum(rows.b - rows.J @ v, 0.0), excess)
+
+
+class _Bounds(NamedTuple):
+    lower: Array
+    upper: Array
 
 
 def closest(backend: Backend, P: Array, q: Array, J: Array, b: Array, lower: Array, upper: Array) -> Array | None:
@@ -77,68 +82,109 @@ def closest(backend: Backend, P: Array, q: Array, J: Array, b: Array, lower: Arr
         return None
     if v is None or np.shape(v) != q.shape or not kernels.shortfall(v, J, b, lower, upper) <= TOLERANCE:
         return None  # NaN fails the comparison too
-    within: Array = np.minimum(np.maximum(v, lower), upper)
-    return within
+    return np.asarray(np.minimum(np.maximum(v, lower), upper))
 
 
-def _approach(problem: Problem) -> Array:
-    """What pairs (k,) may lose: to hold a distance z, J v >= ξ z - approach [m/s].
+def _least_excess(P: Array, q: Array, x: Problem, least: Array, backend: Backend) -> _Bounds:
+    """Bounds widened just so far, in squares of their widths, that some v meets the rows J v >= least.
 
-    A pair at distance d that is to hold z must have ḋ >= ξ (z - d). Pairs that are so deep that their rows are capped
-    at the recovery speed count as if they were just so deep that they are not.
+    Where nothing does, the velocity limits are all that is left.
     """
-    rows = problem.avoidance
-    deepest = rows.hold - rows.recovery / rows.gain
-    return np.asarray(rows.gain * np.maximum(rows.d, deepest) + rows.drift)
-
-
-def _shared_floor(
-    P: Array, q: Array, x: Problem, lower: Array, upper: Array, backend: Backend
-) -> tuple[float, Array | None]:
-    """The largest distance, up to the safe one, that all pairs can hold together [m], and rows J v >= floor for it."""
-    n, rows, approach = len(q), x.avoidance, _approach(x)
-    hessian = np.zeros((n + 1, n + 1))
-    hessian[:n, :n], hessian[n, n] = _SMALL * P, 1.0
-    gradient = np.concatenate((_SMALL * q, [-rows.gain * rows.hold]))
-    J = np.hstack((rows.J, np.full((len(rows.d), 1), -1.0)))
-    below, above = np.append(lower, -1e6), np.append(upper, rows.gain * rows.hold)
-    answer = closest(backend, hessian, gradient, J, -approach, below, above)
-    if answer is None:
-        return -np.inf, None
-    floor = np.minimum(np.minimum(rows.b, answer[n] - approach), rows.J @ answer[:n])
-    return float(answer[n]) / rows.gain, floor
-
-
-def _least_slack(P: Array, q: Array, x: Problem, floor: Array, lower: Array, upper: Array, backend: Backend) -> Array:
-    """Slack (k,) of the rows J v >= b that is least in squares, with J v >= floor."""
-    n, rows, k = len(q), x.avoidance, len(floor)
-    hessian = np.zeros((n + k, n + k))
-    hessian[:n, :n], hessian[n:, n:] = _SMALL * P, np.eye(k)
-    J = np.zeros((2 * k, n + k))
-    J[:k, :n], J[k:, :n], J[k:, n:] = rows.J, rows.J, np.eye(k)
-    b = np.concatenate((floor - TOLERANCE, rows.b))
-    below, above = np.concatenate((lower, np.zeros(k))), np.concatenate((upper, np.full(k, np.inf)))
-    answer = closest(backend, hessian, np.concatenate((_SMALL * q, np.zeros(k))), J, b, below, above)
-    v = np.full(n, np.nan) if answer is None else answer[:n]
-    return np.where(np.isnan(v).any(), np.inf, np.maximum(rows.b - rows.J @ v, 0.0) + TOLERANCE)
-
-
-def _least_excess(P: Array, q: Array, x: Problem, distance: float, backend: Backend) -> Array:
-    """Least e >= 0 (n,), in units of the speeds, with which lower - e <= v <= upper + e lets all pairs hold `distance`.
-
-    Infinite where nothing does: the velocity limits are all that is left then.
-    """
-    n, rows = len(q), x.avoidance
+    n, J = len(q), x.avoidance.J
     room = np.maximum(x.upper - x.lower, 1e-9)
     eye = np.eye(n)
-    J = np.block([[rows.J, np.zeros((len(rows.d), n))], [eye, eye], [-eye, eye]])
-    asked = np.minimum(rows.gain * distance - _approach(x), rows.b)
-    b = np.concatenate((asked, x.lower, -x.upper))
+    G = np.block([[J, np.zeros_like(J)], [eye, eye], [-eye, eye]])
+    b = np.concatenate((least, x.lower, -x.upper))
     finite = np.isfinite(b)
     hessian = np.zeros((2 * n, 2 * n))
     hessian[:n, :n], hessian[n:, n:] = _SMALL * P, np.diag(1.0 / room**2)
-    below = np.concatenate((x.hard_lower, np.zeros(n)))
-    above = np.concatenate((x.hard_upper, np.full(n, np.inf)))
     gradient = np.concatenate((_SMALL * q, np.zeros(n)))
-    answer = closest(backend, hessian, gradient, np.ascontiguousarray(J[finite]), b[finite], below, above)
-    return np.full(n, np.inf) if answer is None else np.asarray(answer[n:] + TOLERANCE)
+    lower = np.concatenate((x.hard_lower, np.zeros(n)))
+    upper = np.concatenate((x.hard_upper, np.full(n, np.inf)))
+    answer = closest(backend, hessian, gradient, np.ascontiguousarray(G[finite]), b[finite], lower, upper)
+    if answer is None:
+        return _Bounds(x.hard_lower, x.hard_upper)
+    v = answer[:n]  # each side gives for itself: no joint gets room to jump the other way
+    return _Bounds(np.minimum(x.lower, v - TOLERANCE), np.maximum(x.upper, v + TOLERANCE))
+
+
+def _lexicographic_slack(
+    P: Array, q: Array, rows: AvoidanceRows, b: Array, floor: Array, within: _Bounds, backend: Backend
+) -> Array:
+    """Slack (k,) of the rows J v >= b, level by level from the deepest threat on.
+
+    Each level gives only what those before it and the rows J v >= floor, which can be met, force it to.
+    """
+    slack = np.zeros(len(rows.d))
+    levels = _levels(rows.d)
+
+    def least(count: int) -> Array:
+        """Right-hand sides with the first `count` levels at their bounds, less their slack, the others at the floor."""
+        chosen = np.concatenate([*levels[:count], np.zeros(0, dtype=np.intp)])
+        bound = floor.copy()
+        bound[chosen] = np.maximum(floor[chosen], b[chosen] - slack[chosen])
+        return np.asarray(bound)
+
+    def feasible(count: int) -> bool:
+        return _solve(P, q, rows, least(count), within, backend) is not None
+
+    done = 0
+    for _ in range(_MOST_LEVELS):
+        done = _last_true(feasible, done, len(levels))
+        if done == len(levels):
+            return slack
+        _give(slack, levels[done], P, q, rows, b, least(done), within, backend)
+        done += 1
+    if done < len(levels):
+        _give(slack, np.concatenate(levels[done:]), P, q, rows, b, least(done), within, backend)
+    return slack
+
+
+def _solve(P: Array, q: Array, rows: AvoidanceRows, least: Array, within: _Bounds, backend: Backend) -> Array | None:
+    """`closest` with those of the rows J v >= least that ask for something."""
+    asking = np.flatnonzero(least > -np.inf)
+    return closest(backend, P, q, rows.J[asking], least[asking], *within)
+
+
+def _levels(d: Array) -> list[IntArray]:
+    """Rows by depth: each level holds those within `_LEVEL` of its deepest one."""
+    order = np.argsort(d, kind="stable")
+    levels: list[IntArray] = []
+    start = 0
+    for i in range(1, len(order) + 1):
+        if i == len(order) or d[order[i]] - d[order[start]] > _LEVEL:
+            levels.append(order[start:i])
+            start = i
+    return levels
+
+
+def _last_true(test: Callable[[int], bool], low: int, high: int) -> int:
+    """Largest i in [low, high] with test(i), for a test that is true up to some i; `low` is taken to be true."""
+    if low < high and test(high):
+        return high
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if test(middle) else (low, middle)
+    return low
+
+
+def _give(
+    slack: Array, giving: IntArray, P: Array, q: Array, rows: AvoidanceRows, b: Array, least: Array, within: _Bounds,
+    backend: Backend,
+) -> None:  # fmt: skip
+    """Writes the least slack of the rows `giving` with which they can be met together with J v >= least."""
+    n, count = len(q), len(giving)
+    asking = np.flatnonzero(least > -np.inf)
+    hessian = np.zeros((n + count, n + count))
+    hessian[:n, :n], hessian[n:, n:] = _SMALL * P, np.eye(count)
+    J = np.zeros((len(asking) + count, n + count))
+    J[: len(asking), :n], J[len(asking) :, :n] = rows.J[asking], rows.J[giving]
+    J[len(asking) :, n:] = np.eye(count)
+    lower = np.concatenate((within.lower, np.zeros(count)))
+    upper = np.concatenate((within.upper, np.full(count, np.inf)))
+    right = np.concatenate((least[asking], b[giving]))
+    answer = closest(backend, hessian, np.concatenate((_SMALL * q, np.zeros(count))), J, right, lower, upper)
+    if answer is None:  # give everything that the bounds could ever take
+        slack[giving] = np.inf
+    else:
+        slack[giving] = np.maximum(b[giving] - rows.J[giving] @ answer[:n], 0.0) + TOLERANCE
