@@ -1,0 +1,91 @@
+"""Every tick has a defined outcome: SOLVED, RELAXED or STOPPED, with a finite velocity within the hard limits."""
+
+import re
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from closed_loop import cartesian, make_controller
+
+from qpavoid import Obstacle, Sample, Status
+from qpavoid.config import Box, Capsule, Sphere
+
+
+def test_a_joint_limit_in_the_way_is_named(tmp_path):
+    """A ball comes at 0.3 m/s, and the tool stands at the limit of the only joint that leads away from it."""
+    robot = cartesian(tmp_path, axes="x", acceleration=None)
+    controller = make_controller(robot, [Obstacle.at("ball", Sphere(radius=0.05), [0.0, 0, 0])], "x")
+    coming = Sample.at([-4.87, 0.0, 0.0], linear=[-0.3, 0.0, 0.0])
+    s = controller.step([-5.0], obstacles={"ball": coming})
+    assert s.status is Status.RELAXED
+    assert s.v[0] == pytest.approx(0.0, abs=1e-5)
+    assert "joint_x: at its lower limit" in s.reasons
+    slack = float(re.match(r"tool - ball: ([\d.]+) mm/s short", s.reasons[0])[1])
+    # 10 mm above d1 and β all but gone: it may close at 50 mm/s times 1 - β
+    assert slack == pytest.approx(300.0 - 50.0 * (0.5 - 0.5 * np.cos(np.pi / 8)), abs=0.06)
+
+
+ROBOTS = ("panda", "paper", "solo")
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("solver", ["qp", "qp:daqp"])
+def test_whatever_the_state_a_tick_ends_in_a_velocity(name, solver, request):
+    """Deep penetration, limits violated, any velocity before, obstacles at any speed: 400 ticks a robot."""
+    robot = request.getfixturevalue(name)
+    rng, bounds, nv = np.random.default_rng(3), robot.bounds(), robot.model.nv
+    frame = {"panda": "panda_hand_tcp", "paper": "left_tool", "solo": "FL_FOOT"}[name]
+    shapes = (
+        Sphere(radius=0.2),
+        Box(size=(0.4, 0.01, 0.6)),
+        Capsule(radius=0.1, length=0.5),
+        Box(size=(0.3, 0.3, 0.3)),
+    )
+    obstacles = [Obstacle.at(f"o{i}", shape, [0.0, 0.0, 9.0]) for i, shape in enumerate(shapes)]
+    controller = make_controller(robot, obstacles, frame, solver)
+    fastest = np.where(np.isfinite(bounds.velocity), bounds.velocity, 5.0)
+    seen = dict.fromkeys(Status, 0)
+    for k in range(400):
+        if k % 4 == 0:
+            q = pin.integrate(robot.model, robot.home, rng.uniform(-2.5, 2.5, nv))
+            controller.reset(rng.uniform(-1.2, 1.2, nv) * fastest)
+            places = {
+                o.name: Sample.at(
+                    rng.uniform(-0.5, 0.7, 3), linear=rng.uniform(-1, 1, 3), angular=rng.uniform(-3, 3, 3)
+                )
+                for o in obstacles
+            }
+            target = {frame: Sample.at(rng.uniform(-2.0, 2.0, 3), linear=rng.uniform(-5, 5, 3))}
+        tick = controller.tick(q, 0.01 * k, target, places)
+        s, x = tick.solution, tick.problem
+        seen[s.status] += 1
+        assert np.isfinite(s.v).all()
+        assert (np.abs(s.v) <= bounds.velocity + 2e-6).all()
+        assert (s.v >= x.hard_lower - 2e-6).all() and (s.v <= x.hard_upper + 2e-6).all()
+        assert (s.status is Status.SOLVED) == (not s.reasons) or s.share < 1.0
+        q = pin.integrate(robot.model, q, 0.01 * s.v)
+    assert seen[Status.STOPPED] == 0
+    # the quadruped's free base has no limits: it can always get out of the way
+    assert seen[Status.RELAXED] >= {"panda": 50, "paper": 5, "solo": 0}[name] and seen[Status.SOLVED] > 5
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_stop_from_any_speed_brakes_all_joints_alike_to_rest(panda, seed):
+    """Within the accelerations, and with no distance closing faster on the way, as all rates shrink by one factor."""
+    rng, bounds = np.random.default_rng(seed), panda.bounds()
+    controller = make_controller(panda, [Obstacle.at("ball", Sphere(radius=0.1), [0.5, 0.2, 0.5])])
+    step = 0.01 * bounds.acceleration
+    v = rng.uniform(-1.0, 1.0, 7) * bounds.velocity
+    q, ticks = panda.home.copy(), 0
+    needed = int(np.ceil(np.max(np.abs(v) / step)))
+    controller.reset(v)
+    while v.any():
+        tick = controller.tick(q, np.nan)
+        following, rates = tick.solution.v, tick.proximity.J
+        assert tick.solution.status is Status.STOPPED
+        assert (np.abs(following - v) <= step + 1e-9).all()
+        closing = np.maximum(-(rates @ v), 0.0)
+        inside = ((q + 0.5 > bounds.lower) & (q - 0.5 < bounds.upper)).all()
+        assert inside and (-(rates @ following) <= closing + 1e-9).all()
+        v, q, ticks = following, q + 0.01 * following, ticks + 1
+    assert ticks == needed
