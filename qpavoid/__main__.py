@@ -26,7 +26,7 @@ from qpavoid.errors import ConfigError, QpavoidError
 from qpavoid.kernels import ACCELERATED
 from qpavoid.loading import load_scenario, robot_names, scenario_names
 from qpavoid.log import Log
-from qpavoid.report import failed, metrics_table, to_json
+from qpavoid.report import events, failed, metrics_table, to_json
 from qpavoid.simulate import simulate
 from qpavoid.solvers import SOLVERS, backend_names
 
@@ -169,7 +169,11 @@ def _print(metrics: list[dict[str, Any]], files: list[Path], document: dict[str,
         print(to_json(document))
         return
     for scenario in dict.fromkeys(run["scenario"] for run in metrics):
-        _out.print(metrics_table([run for run in metrics if run["scenario"] == scenario]))
+        runs = [run for run in metrics if run["scenario"] == scenario]
+        _out.print(metrics_table(runs))
+        for run in runs:
+            for line in events(run):
+                _out.print(f"{run['solver']}: {line}", highlight=False, soft_wrap=True, markup=False)
     for file in files:
         _out.print(str(file), highlight=False, soft_wrap=True)
 

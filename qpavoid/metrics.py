@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from qpavoid.log import Log
 
 
+_MOST_EVENTS = 20
+"""How many of the things that the ticks of a run had to say are among its figures."""
+
+
 def run_metrics(log: Log) -> dict[str, Any]:
     """The figures by which runs are compared.
 
@@ -23,7 +27,8 @@ def run_metrics(log: Log) -> dict[str, Any]:
         time_in_collision [s]; time_below: threshold -> [s]; final_error [m]; max_deviation: largest distance of a tool
         from its planned path [m]; tracking_rmse: of the distance to the moving target [m]; peak_velocity: fastest
         joint [rad/s or m/s]; jitter: Σ|Δq̇| over joints and ticks [rad/s]; status_counts; relaxed_ticks;
-        shortened_ticks: drawn back after looking ahead; time_blocked [s]; tick_us: p50, p99 and max of the tick's
+        shortened_ticks: drawn back after looking ahead; time_blocked [s]; events: the first
+        things that ticks had to say, as [t, status, lines]; tick_us: p50, p99 and max of the tick's
         time [µs].
     """
     config, dt = log.meta["config"], log.meta["config"]["dt"]
@@ -53,6 +58,7 @@ def run_metrics(log: Log) -> dict[str, Any]:
         "relaxed_ticks": counts[Status.RELAXED.value],
         "shortened_ticks": int(np.sum(log.share < 1.0)),
         "time_blocked": dt * float(np.sum(log.blocked)),
+        "events": log.meta["events"][:_MOST_EVENTS],
         "tick_us": {
             "p50": float(np.median(tick_us)) if len(tick_us) else float("nan"),
             "p99": float(np.quantile(tick_us, 0.99)) if len(tick_us) else float("nan"),

@@ -59,10 +59,22 @@ def outcome(run: dict[str, Any]) -> str:
         said.append(f"[red]{counts['STOPPED']} stopped[/]")
     if counts["RELAXED"]:
         said.append(f"[yellow]{counts['RELAXED']} relaxed[/]")
+    if run["time_blocked"] > 0.0:
+        said.append(f"[yellow]blocked {run['time_blocked']:.1f} s[/]")
     if not run["completed"]:
         said.append("[red]broken off[/]")
     said.append("[green]arrived[/]" if run["arrived"] else "[yellow]short of goal[/]")
     return ", ".join(said)
+
+
+_WIDEST = 200
+"""Characters of a line of events."""
+
+
+def events(run: dict[str, Any], most: int = 4) -> list[str]:
+    """What the ticks of a run had to say first, a line each: time, status, reasons."""
+    lines = [f"{t:.3f} s {status}: {'; '.join(said)}" for t, status, said in run["events"][:most]]
+    return [line if len(line) <= _WIDEST else f"{line[: _WIDEST - 2]} …" for line in lines]
 
 
 def failed(run: dict[str, Any]) -> bool:
