@@ -22,6 +22,8 @@ _LEFT = 0.1
 """Share of the wanted task velocity below which there is no progress [-]."""
 _SLOWEST = 2e-3
 """Wanted task velocity below which nothing needs to progress [m/s, rad/s]."""
+_RESTING = 0.01
+"""Task velocity below which a task that makes no progress is not under way round something either [m/s, rad/s]."""
 _TIGHT = 1e-3
 """How close to its bound a row counts as being in the way [m/s]."""
 _DIRECTIONS = 8
@@ -105,7 +107,8 @@ class ProgressWatch:
             return ()
         wanted, got = A @ problem.v0, A @ solution.v
         size = float(wanted @ wanted)
-        stuck = size > _SLOWEST**2 and float(got @ wanted) < _LEFT * size
+        resting = float(got @ got) < _RESTING**2
+        stuck = resting and size > _SLOWEST**2 and float(got @ wanted) < _LEFT * size
         self._without = max(self._without + (_EVERY if stuck else -_EVERY), 0)
         if not self.blocked:
             return ()
