@@ -1,5 +1,7 @@
 """Gains (eqs. 11, 12) and avoidance rows by hand-computed numbers, limits and monotony."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from conftest import SPHERE, Bench, make_layout, obstacle
@@ -125,6 +127,7 @@ def test_a_row_that_is_met_exactly_never_passes_what_it_holds():
 def test_offset_is_added_and_near_pairs_keep_their_order(panda):
     """ḋ = J v + drift >= bound becomes J v >= bound - drift; one ball touches the arm, one is out of reach."""
     places = [(0.25, 0.0, 0.6), (9.0, 0.0, 0.0), (0.1, 0.3, 0.3)]
+    panda = replace(panda, acceleration={})
     scene = build_scene(panda, [obstacle(f"o{i}", SPHERE, place) for i, place in enumerate(places)])
     settings = Avoidance(d1=D1, d2=D2, offset=0.1, row={"type": "switching", "gain": XI})
     bench = Bench(scene, avoidance=settings)
@@ -141,9 +144,8 @@ def test_offset_is_added_and_near_pairs_keep_their_order(panda):
     h = rows.d - D1
     expected = np.where(h < 0.0, np.minimum(-XI * h, settings.recovery_speed), -(1.0 - beta(rows.d, D1, D2)) * XI * h)
     most = np.maximum(rows.J * problem.lower, rows.J * problem.upper).sum(axis=1)  # the fastest that the arm can part
-    expected = np.where(
-        h < 0.0, np.minimum(expected - rate[near], np.maximum(most, -rate[near])), expected - rate[near]
-    )
+    most = np.where(rate[near] < 0.0, np.maximum(most, -rate[near]), most)
+    expected = np.where(h < 0.0, np.minimum(expected - rate[near], most), expected - rate[near])
     np.testing.assert_allclose(rows.b, expected, rtol=0, atol=1e-12)
     assert (h < 0.0).any() and (h > 0.0).any() and np.ptp(rate[near]) > 0.1
     np.testing.assert_array_equal(rows.J, proximity.J)

@@ -13,7 +13,7 @@ from conftest import make_layout
 from qpavoid.kernels.layout import RowLayout
 
 SEEDS = range(8)
-OF_PAIRS = ("near", "closest", "J", "drift", "d", "least")
+OF_PAIRS = ("near", "closest", "J", "drift", "d", "least", "touch")
 """Outputs of which only what belongs to near pairs counts."""
 
 
@@ -380,7 +380,7 @@ def filled(seed, pairs=30, **fields):
 
 
 def largest(row, lower, upper):
-    """Largest J v within bounds that include a standstill, coordinate by coordinate."""
+    """Largest J v within bounds, coordinate by coordinate."""
     return sum(max(a * low, a * high) for a, low, high in zip(row, lower, upper, strict=True) if a != 0.0)
 
 
@@ -388,21 +388,55 @@ def largest(row, lower, upper):
 def test_a_row_never_asks_for_more_than_can_be_had(kernels, seed):
     """To part at most as fast as the bounds allow; not to close no sooner than a stop would end it."""
     x = filled(seed)
-    x.lower[:], x.upper[:] = np.minimum(x.lower, 0.0), np.maximum(x.upper, 0.0)
-    x.lower[:3], x.upper[:3] = -0.01, 0.01
+    run(kernels, "row_bounds", x, 30, True)
+    parting, receding = x.d < x.hold, x.drift >= 0.0
+    assert x.accelerated and (parting & receding).any() and (~parting & receding).any()
+    assert (x.J @ x.v_stop >= x.least - 1e-9)[~parting & receding].all()
+    most = np.array([largest(row, x.lower, x.upper) for row in x.J])
+    assert (most >= x.least - 1e-9)[parting & receding].all()
+    assert (np.maximum(most, -x.drift) >= x.least - 1e-9)[parting].all()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_row_bounds_by_their_definition(kernels, seed):
+    """The switching row, closing no faster than half of the accelerations brake, less the drift; and touch at d = 0."""
+    x = filled(seed)
     run(kernels, "row_bounds", x, 30, True)
     raw = x.row_gain * (x.hold - x.d)
     weight = 0.5 - 0.5 * np.cos(np.pi * np.clip((x.d - x.d1) / (x.d2 - x.d1), 0.0, 1.0))
-    plain = np.minimum(np.where(raw > 0.0, raw, weight * raw), x.recovery) - x.drift
-    assert x.accelerated and (raw > 0.0).any() and (raw < 0.0).any()
     for i in range(30):
+        J, drift = x.J[i], x.drift[i]
         if raw[i] > 0.0:
-            expected = min(plain[i], max(largest(x.J[i], x.lower, x.upper), -x.drift[i]))
-        elif x.drift[i] >= 0.0:
-            expected = min(plain[i], x.J[i] @ x.v_stop)
+            most = largest(J, x.lower, x.upper)
+            expected = min(min(raw[i], x.recovery) - drift, most if drift >= 0.0 else max(most, -drift))
         else:
-            expected = plain[i]
+            half = 0.25 * np.sum(np.abs(J[J != 0.0]) * x.v_step[J != 0.0])
+            brake = half - np.sqrt(half**2 + 4.0 * half * (x.d[i] - x.hold) / x.dt) if half < np.inf else -np.inf
+            expected = max(weight[i] * raw[i], brake) - drift
+            expected = expected if drift < 0.0 else min(expected, J @ x.v_stop)
         assert x.least[i] == pytest.approx(expected, rel=1e-12, abs=1e-13)
+        assert x.touch[i] == pytest.approx(
+            min(x.row_gain * (x.offset - x.d[i]) - drift, expected), rel=1e-12, abs=1e-13
+        )
+
+
+def test_half_of_the_accelerations_bring_a_pair_to_rest_where_it_has_to_be(kernels):
+    """Each tick closes as fast as its row allows: never by more than half of the acceleration less than before."""
+    step, d, v = np.array([0.1, 0.2]), np.array([0.9]), 0.0
+    way = []
+    for _ in range(400):
+        x = rows_at(
+            d, J=np.array([[0.5, -1.0]]), v_step=step, accelerated=True, v_stop=np.array([0.0, -1e3]), switching=False,
+            row_gain=100.0, lower=-np.ones(2), upper=np.ones(2),
+        )  # fmt: skip
+        run(kernels, "row_bounds", x, 1, False)
+        slower = x.least[0] - v
+        v = x.least[0]
+        d = d + x.dt * v
+        way.append((d[0], slower))
+    distances, changes = np.array(way[1:]).T
+    assert (changes <= 0.5 * (0.05 + 0.2) + 1e-9).all() and changes.max() > 0.1
+    assert distances.min() >= x.hold - 1e-9 and distances[-1] == pytest.approx(x.hold, abs=1e-3)
 
 
 @pytest.mark.parametrize("pairs", [0, 1, 100])
