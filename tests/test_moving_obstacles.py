@@ -1,0 +1,158 @@
+"""Obstacles and arms that move: the safety distance holds because their velocity is in the rows."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from closed_loop import SHIPPED, Ruler, changed, drive, make_controller
+
+from qpavoid import Controller, Obstacle, ScenarioConfig, Status, load_scenario, simulate
+from qpavoid.config import Sphere
+from qpavoid.sensing import Pose
+
+TOOL = np.array([0.39644872, 0.65090125, 0.74741443])
+"""Where Situation 1 begins."""
+COURSES = {
+    **{f"head-on {v}": ([0, -1.2, 0], [0, 0.6, 0], v) for v in (0.1, 0.2, 0.4)},
+    **{f"front {v}": ([0.05 + 3 * v, -0.3, 0], [-0.5, -0.3, 0], v) for v in (0.1, 0.2, 0.4)},
+    **{f"chase {v}": ([0, 0.5, 0], [0, -1.2, 0], v) for v in (0.15, 0.3)},
+}
+"""Start, end and speed of a sphere that meets the arm, relative to the tool's start."""
+HELD = 0.020
+"""Safety distance of Situation 1 between surfaces: 0.12 m between axes."""
+
+
+def situation(course):
+    start, end, speed = COURSES[course]
+    line = {"type": "line", "start": (TOOL + start).tolist(), "end": (TOOL + end).tolist(), "speed": speed}
+    return changed(
+        "situation1", obstacles=[{"name": "fist", "shape": {"type": "sphere", "radius": 0.05}, "motion": line}]
+    )
+
+
+@cache
+def followed(course):
+    return simulate(situation(course))
+
+
+@pytest.mark.parametrize("course", COURSES)
+def test_qp_holds_its_safety_distance_in_situation_1(course):
+    metrics = followed(course).metrics()
+    assert HELD - 2e-3 < metrics["min_distance"] < 0.03
+    assert metrics["status_counts"]["STOPPED"] == 0
+
+
+def given(course, what, ticks):
+    """The same course with the sphere given tick by tick as `what`(sample) makes it; least distance, velocities."""
+    scenario = situation(course)
+    scenario = scenario.model_copy(
+        update={"obstacles": [o.model_copy(update={"motion": load_scenario("situation1").obstacles[0].motion})
+                              for o in scenario.obstacles]}
+    )  # fmt: skip
+    motion = Controller.from_scenario(situation(course))[0].scene.obstacles[0].motion
+    controller, q = Controller.from_scenario(scenario)
+    least, vs, said = np.inf, [], []
+    for tick in drive(controller, q, ticks, obstacles=lambda t: {"fist": what(motion.sample(t))}):
+        least = min(least, tick.proximity.distance.min(initial=np.inf))
+        vs.append(tick.solution.v)
+        said.append(tick.solution.assumed)
+    return least, np.array(vs), said
+
+
+def blind(sample):
+    return sample._replace(linear=np.zeros(3), angular=np.zeros(3))
+
+
+@pytest.mark.parametrize(("course", "below"), [("head-on 0.4", 5e-3), ("chase 0.3", 5e-3), ("front 0.4", 5e-3)])
+def test_without_the_obstacles_velocity_it_would_fall_well_below(course, below):
+    least, _, _ = given(course, blind, 900)
+    assert least < HELD - below
+
+
+@pytest.mark.parametrize("course", ["head-on 0.2", "front 0.4", "chase 0.15"])
+def test_trajectory_twist_and_pose_stream_agree(course):
+    log = followed(course)
+    ticks = 600
+    least, vs, said = given(course, lambda sample: sample, ticks)
+    np.testing.assert_allclose(vs, log.v[:ticks], atol=1e-8)
+    assert not any(said)
+    streamed, vs, said = given(course, lambda sample: Pose(sample.position, sample.rotation), ticks)
+    assert all(notes == ("fist: twist estimated from its poses",) for notes in said)
+    assert streamed == pytest.approx(least, abs=2e-4)
+    np.testing.assert_allclose(vs, log.v[:ticks], atol=0.05)
+
+
+def test_an_estimated_twist_is_the_difference_quotient_also_after_a_gap(panda):
+    controller = make_controller(panda, [Obstacle.at("ball", Sphere(radius=0.05), [0.5, 0, 0.8])], "panda_hand_tcp")
+    speed = np.array([0.1, -0.2, 0.05])
+    for k in (0, 1, 2, 5, 6):  # nothing is heard of it in ticks 3 and 4
+        seen = {"ball": Pose.at([0.45, 0.0, 0.7] + 0.01 * k * speed)}
+        tick = controller.tick(panda.home, 0.01 * k, None, seen)
+        for _ in range(2 if k == 2 else 0):
+            controller.tick(panda.home, 0.0)
+        expected = 0.0 if k == 0 else tick.proximity.normal @ speed
+        np.testing.assert_allclose(tick.proximity.drift, np.where(controller.scene.pairs[tick.proximity.pair, 1]
+                                   >= len(controller.scene.body_names), expected, 0.0), atol=1e-12)  # fmt: skip
+    assert len(tick.proximity.drift) > 1
+
+
+# --- both arms at once -----------------------------------------------------------------------------------------
+
+LEFT = np.array([-1.18, 1.13, 0.14, -1.02, 1.45, -1.07, -1.44])
+RIGHT = LEFT * [-1, -1, -1, -1, -1, -1, 1]
+"""Mirror images: the tools start at y = 0.651 and -0.651 m, at the same x and z."""
+
+
+@cache
+def crossing(left, right):
+    """Both arms as one problem of 14 joints, the tools on straight lines at 0.2 m/s."""
+    lines = [{"type": "line", "displacement": way, "speed": 0.2} for way in (left, right)]
+    fields = {
+        "robot": "paper-dual-arm",
+        "q0": [*LEFT.tolist(), *RIGHT.tolist()],
+        "tasks": [{"frame": f, "motion": m} for f, m in zip(("left_tool", "right_tool"), lines, strict=True)],
+        "avoidance": {"d1": 0.02, "d2": 0.15, "row": {"type": "damper", "gain": 5}},
+        "tracking_damping": 0.05,
+        "duration": 10.0,
+    }
+    scenario = ScenarioConfig.model_validate(fields).read_from(SHIPPED)
+    controller, q = Controller.from_scenario(scenario)
+    ruler, least, blocked, ticks = Ruler(controller.scene), np.inf, set(), []
+    for tick in drive(controller, q, 1000):
+        least = min(least, ruler.distances(tick.state.q).min())
+        blocked |= set(tick.solution.blocked)
+        ticks.append(tick)
+    errors = [
+        np.linalg.norm(target.position - at) for target, at in zip(tick.targets, tick.kinematics.position, strict=True)
+    ]
+    assert all(t.solution.status is Status.SOLVED for t in ticks)
+    assert len(tick.solution.v) == 14
+    return least, max(errors), blocked, tick.solution.blocked
+
+
+@pytest.mark.parametrize(
+    ("left", "right"),
+    [
+        ((0.0, -0.8, 0.05), (0.0, 0.8, -0.05)),
+        ((0.0, -0.8, 0.1), (0.0, 0.8, -0.1)),
+        ((0.0, -0.75, 0.1), (0.0, 0.75, 0.0)),
+        ((0.1, -0.8, 0.0), (0.0, 0.8, 0.0)),
+    ],
+)
+def test_two_arms_on_crossing_paths_both_arrive(left, right):
+    """Each tool goes 0.1 to 0.15 m past the middle; the hands pass each other at the safety distance."""
+    least, error, blocked, _ = crossing(left, right)
+    assert 0.02 - 2e-4 < least < 0.025
+    assert error < 1e-5
+    assert not blocked
+
+
+@pytest.mark.parametrize(
+    ("left", "right"), [((0.0, -0.651, 0.0), (0.0, 0.651, 0.0)), ((0.0, -0.651, 0.0), (0.0, 0.651, 0.05))]
+)
+def test_two_arms_with_goals_that_exclude_each_other_say_why(left, right):
+    """Goals 0 and 50 mm apart; hands of 50 mm radius cannot both be there."""
+    least, error, blocked, at_last = crossing(left, right)
+    assert least > 0.02 - 2e-4
+    assert error > 0.03
+    assert blocked == {"blocked by right_hand at left_hand"} and set(at_last) == blocked
