@@ -7,7 +7,7 @@ from qpavoid import Avoidance, Controller, Obstacle, Robot, build_scene
 from qpavoid.config import Sphere
 
 robot = Robot.load("panda")
-scene = build_scene(robot, [Obstacle.at("ball", Sphere(radius=0.08), [0.35, 0.35, 0.55])])
+scene = build_scene(robot, [Obstacle.at("ball", Sphere(radius=0.08), [0.25, 0.25, 0.45])])
 controller = Controller(scene, [], "qp", dt=0.01, avoidance=Avoidance(d1=0.03, d2=0.15))
 onlooker = Controller(scene, [], "tracking", avoidance=Avoidance(d1=0.03, d2=0.5))  # only measures distances
 
