@@ -1,0 +1,136 @@
+"""The safety filter: any command comes back unchanged where it is safe, else the closest velocity that is."""
+
+import numpy as np
+import pytest
+import qpsolvers
+from closed_loop import cartesian, make_controller
+
+from qpavoid import Avoidance, Controller, NumericalError, Obstacle, Sample, Status, build_scene
+from qpavoid.config import Box, Sphere
+
+
+@pytest.fixture
+def filtering(panda):
+    """No tasks at all."""
+    boxes = [Obstacle.at("shelf", Box(size=(0.4, 0.8, 0.02)), [0.5, 0.0, 0.35])]
+    balls = [Obstacle.at(f"ball{i}", Sphere(radius=0.06), p) for i, p in enumerate([[0.5, 0.2, 0.6], [0.3, -0.3, 0.6]])]
+    return Controller(build_scene(panda, boxes + balls), [], "qp", 0.01, Avoidance(d1=0.02, d2=0.15))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_safe_command_comes_back_bit_for_bit(panda, seed):
+    """Nothing near, within the joints' speeds and accelerations: also zeros, and what rounding would change."""
+    controller = Controller(build_scene(panda), [], "qp", 0.01, Avoidance(d1=0.005, d2=0.01))
+    rng, bounds = np.random.default_rng(seed), panda.bounds()
+    q, v = panda.home, np.zeros(7)
+    for _ in range(100):
+        command = v + rng.uniform(-1.0, 1.0, 7) * 0.0099 * bounds.acceleration
+        command = np.clip(command, -0.3, 0.3) * rng.choice([0.0, -0.0, 1.0], 7)
+        if (np.abs(command - v) > 0.01 * bounds.acceleration).any():
+            command = v.copy()
+        s = controller.filter(q, command)
+        assert s.v.tobytes() == command.tobytes() and s.v is not command
+        assert s.status is Status.SOLVED and s.share == 1.0 and s.reasons == ()
+        q, v = q + 0.01 * s.v, s.v
+
+
+@pytest.mark.parametrize("solver", ["qp", "qp:daqp", "qp:quadprog"])
+def test_otherwise_it_is_the_closest_that_meets_rows_and_bounds(panda, filtering, solver):
+    """min |v - command| by a QP of our own on the same rows; commands from a robot that is already moving."""
+    controller = make_controller(
+        panda, filtering.scene.obstacles, solver=solver, avoidance=Avoidance(d1=0.02, d2=0.15, look_ahead=False)
+    )
+    rng, changed = np.random.default_rng(1), 0
+    q, v = panda.home, np.zeros(7)
+    for k in range(300):
+        if k % 25 == 0:
+            q, v = panda.home + rng.uniform(-0.3, 0.3, 7), np.zeros(7)
+            controller.reset()
+        command = rng.uniform(-2.0, 2.0, 7)
+        rows = rows_at(controller, q, v)
+        expected = qpsolvers.solve_qp(
+            np.eye(7), -command, -rows.avoidance.J, -rows.avoidance.b, lb=rows.lower, ub=rows.upper, solver="quadprog"
+        )
+        s = controller.filter(q, command)
+        if expected is not None:
+            np.testing.assert_allclose(s.v, expected, atol=1e-6)
+            changed += bool(len(rows.avoidance.d))
+        q, v = q + 0.01 * s.v, s.v
+    assert changed > 150
+
+
+def rows_at(controller, q, v):
+    """The problem of the tick that comes, without taking it."""
+    problem = controller.tick(q, v=v).problem
+    controller.reset(v)
+    return problem
+
+
+def test_a_reckless_operator_is_kept_out_of_everything(panda, filtering):
+    """Full speed in random directions for 20 s: never nearer than the safe distance, accelerations kept."""
+    rng, bounds = np.random.default_rng(2), panda.bounds()
+    q, v, least = panda.home.copy(), np.zeros(7), np.inf
+    query = make_controller(panda, filtering.scene.obstacles, avoidance=Avoidance(d1=0.02, d2=0.15))
+    for k in range(2000):
+        if k % 40 == 0:
+            command = rng.uniform(-1.5, 1.5, 7) * bounds.velocity
+        s = filtering.filter(q, command)
+        assert (np.abs(s.v) <= bounds.velocity + 1e-9).all()
+        if s.status is Status.SOLVED:
+            assert (np.abs(s.v - v) <= 0.01 * bounds.acceleration + 1e-9).all()
+        q, v = q + 0.01 * s.v, s.v
+        if k % 5 == 0:
+            least = min(least, query.tick(q).proximity.distance.min(initial=np.inf))
+    assert 0.019 < least < 0.022
+
+
+def test_the_wall_is_reached_and_not_passed(tmp_path):
+    robot = cartesian(tmp_path)
+    controller = make_controller(robot, [Obstacle.at("wall", Box(size=(0.1, 2, 2)), [0.55, 0, 0])])
+    q = np.zeros(3)
+    for _ in range(600):
+        v = controller.filter(q, np.array([5.0, 0.1, 0.0])).v
+        q = q + 0.01 * v
+    assert 0.0199 < 0.5 - 0.05 - q[0] < 0.05
+    assert v[1] == pytest.approx(0.1)  # along the wall it is the operator's
+
+
+def test_tasks_play_no_part(panda):
+    free = make_controller(panda)
+    bound = make_controller(panda, frame="panda_hand_tcp")
+    command = np.full(7, 0.05)
+    np.testing.assert_array_equal(bound.filter(panda.home, command).v, command)
+    np.testing.assert_array_equal(free.filter(panda.home, command).v, command)
+    free.reset()
+    assert not free.step(panda.home).v.any()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e300])
+def test_a_command_that_cannot_be_true_stops_the_robot(panda, filtering, value):
+    moving = np.full(7, 0.2)
+    filtering.reset(moving)
+    bad = np.zeros(7)
+    bad[4] = value
+    s = filtering.filter(panda.home, bad)
+    assert s.status is Status.STOPPED and s.reasons[0].startswith("v_desired: ")
+    np.testing.assert_allclose(s.v, (1.0 - 0.075 / 0.2) * moving)
+    again = filtering.filter(panda.home, s.v)
+    np.testing.assert_array_equal(again.v, s.v)
+
+
+@pytest.mark.parametrize("command", [np.zeros(6), np.zeros((7, 1)), "left", None])
+def test_a_malformed_command_is_an_error_that_names_it(panda, filtering, command):
+    with pytest.raises(NumericalError, match=r"^v_desired: "):
+        filtering.filter(panda.home, command)
+
+
+def test_a_moving_obstacle_pushes_a_robot_whose_operator_has_left(tmp_path):
+    robot = cartesian(tmp_path)
+    controller = make_controller(robot, [Obstacle.at("ball", Sphere(radius=0.05), [1.0, 0, 0])])
+    q, least = np.zeros(3), np.inf
+    for k in range(400):
+        ball = np.array([0.6 - 0.003 * k, 0.0, 0.0])
+        s = controller.filter(q, np.zeros(3), obstacles={"ball": Sample.at(ball, linear=[-0.3, 0.0, 0.0])})
+        least = min(least, np.linalg.norm(ball - q) - 0.1)
+        q = q + 0.01 * s.v
+    assert least > 0.0195 and q[0] < -0.3
