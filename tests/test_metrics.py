@@ -28,6 +28,7 @@ def make_log(ticks: int, meta: dict | None = None, **arrays) -> Log:
     rows |= {"closest_pair": np.full(ticks, -1), "status": np.zeros(ticks, dtype=np.int8)}
     config = {"dt": DT, "goal_tolerance": 0.2, "thresholds": [0.0, 0.1, 0.2]}
     names = {"scenario": "by hand", "solver": "qp", "completed": True, "stopped_by": None}
+    names["events"] = [[0.1 * i, "RELAXED", [f"line {i}"]] for i in range(min(ticks, 3))]
     pairs = [["upper arm", "ball"], ["hand", "ball"]]
     given = {name: np.asarray(array) for name, array in arrays.items()}
     return Log(**{**rows, **given}, meta={**names, "config": config, "pairs": pairs, **(meta or {})})
@@ -73,6 +74,7 @@ def test_every_figure_of_a_run(log):
         "relaxed_ticks": 2,
         "shortened_ticks": 2,
         "time_blocked": pytest.approx(3 * DT),
+        "events": log.meta["events"],
         "tick_us": {"p50": pytest.approx(30.0), "p99": pytest.approx(97.6), "max": pytest.approx(100.0)},
     }
 
