@@ -245,6 +245,7 @@ class Controller:
         self._q_last[:] = q
         if desired is not None and not isfinite(np.vdot(desired, desired)):
             faults += (_not_finite("v_desired", desired),)
+            desired = np.zeros(self._v_shape)
         samples = self._targets(t, targets)
         observed = self._obstacles.observe(t, obstacles)
         assumed: tuple[str, ...] = ()

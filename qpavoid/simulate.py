@@ -86,6 +86,7 @@ def _check_start(controller: Controller, q: Array, scenario: ScenarioConfig) -> 
             stacklevel=3,
         )
     proximity = controller.tick(q, 0.0).proximity
+    controller.reset()  # that tick was not taken: the run begins at rest
     for i in np.flatnonzero(proximity.distance < 0.0):
         a, b = controller.scene.pair_names[proximity.pair[i]]
         depth = -1e3 * proximity.distance[i]

@@ -57,6 +57,13 @@ class Qp:
         return self._relaxed(P, q, problem)
 
     def _relaxed(self, P: Array, q: Array, problem: Problem) -> Solution:
+        rows = problem.avoidance
+        unknown = np.flatnonzero(~np.isfinite(rows.b + rows.J.sum(axis=1)))
+        if len(unknown):
+            pairs = [" - ".join(problem.pair_names[rows.pair[i]]) for i in unknown.tolist()]
+            return Solution(
+                problem.v_stop.copy(), Status.STOPPED, tuple(f"{p}: no distance can be told" for p in pairs)
+            )
         for backend in (self._backend, solve_daqp):
             relaxed = relax(P, q, problem, backend)
             if relaxed is not None:

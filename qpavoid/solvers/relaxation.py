@@ -105,7 +105,8 @@ def _least_excess(P: Array, q: Array, x: Problem, least: Array, backend: Backend
     if answer is None:
         return _Bounds(x.hard_lower, x.hard_upper)
     v = answer[:n]  # each side gives for itself: no joint gets room to jump the other way
-    return _Bounds(np.minimum(x.lower, v - TOLERANCE), np.maximum(x.upper, v + TOLERANCE))
+    lower, upper = np.minimum(x.lower, v - TOLERANCE), np.maximum(x.upper, v + TOLERANCE)
+    return _Bounds(np.maximum(lower, x.hard_lower), np.minimum(upper, x.hard_upper))
 
 
 def _lexicographic_slack(
