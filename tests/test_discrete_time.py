@@ -1,0 +1,156 @@
+"""What holds between the ticks: distances on the way from one to the next, thin plates, long periods, full speed."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from closed_loop import Ruler, cartesian, drive, make_controller, scenario
+
+from qpavoid import Avoidance, Controller, Obstacle, Sample, Status, simulate
+from qpavoid.config import Box, Damper, Sphere
+
+PLATE = {"type": "box", "size": [0.004, 0.6, 0.6]}
+BALL = {"type": "sphere", "radius": 0.06}
+BOX = {"type": "box", "size": [0.2, 0.2, 0.2]}
+HELD = 0.02
+
+
+def least_on_the_way(log, controller, steps=10):
+    """Least distance of a run, also between its ticks."""
+    ruler, dt = Ruler(controller.scene), log.t[1] - log.t[0]
+    return min(ruler.least_between(q, v, dt, t, steps) for q, v, t in zip(log.q, log.v, log.t, strict=True))
+
+
+@pytest.mark.parametrize("row", ["switching", "damper"])
+@pytest.mark.parametrize("shape", [PLATE, BALL, BOX], ids=["plate", "ball", "box"])
+@pytest.mark.parametrize(("dt", "duration"), [(0.001, 0.8), (0.01, 2.0), (0.02, 2.0), (0.05, 3.0)])
+def test_no_period_and_no_speed_pass_the_safe_distance(row, shape, dt, duration):
+    """A target that leaves at 2 m/s leads through the obstacle: the Panda comes at its joints' full speed."""
+    run = scenario(
+        "panda",
+        {"type": "line", "displacement": [0.4, 0.05, -0.1], "speed": 2.0},
+        [{"name": "it", "shape": shape, "motion": {"type": "fixed", "position": [0.55, 0.0, 0.45]}}],
+        dt=dt,
+        duration=duration,
+        avoidance={"d1": HELD, "d2": 0.10, "row": {"type": row}},
+    )
+    log = simulate(run)
+    controller, _ = Controller.from_scenario(run)
+    assert least_on_the_way(log, controller, 10 if dt > 0.001 else 2) > HELD - 1e-3
+    assert log.metrics()["peak_velocity"] > 1.0
+    counts = log.metrics()["status_counts"]
+    assert counts["RELAXED"] == counts["STOPPED"] == 0
+    bounds = controller.scene.robot.bounds()
+    change = np.abs(np.diff(log.v, axis=0, prepend=0.0 * log.v[:1]))
+    assert (change <= dt * bounds.acceleration + 1e-9).all()
+
+
+@pytest.mark.parametrize("dt", [0.001, 0.005, 0.01, 0.02, 0.05])
+@pytest.mark.parametrize("speed", [0.5, 2.0, 10.0])
+def test_nothing_tunnels_through_a_plate(tmp_path, dt, speed):
+    """2 mm of plate, up to 0.5 m in one tick, without an acceleration limit and first seen at 0.1 m."""
+    robot = cartesian(tmp_path, speed=speed, acceleration=None)
+    plate = Obstacle.at("plate", Box(size=(0.002, 2.0, 2.0)), [1.0, 0.0, 0.0])
+    controller = make_controller(robot, [plate], "z", dt=dt, task={"gain": 1.0 / dt})
+    for tick in drive(controller, np.zeros(3), round(3.0 / speed / dt) + 200, target=[3.0, 0.0, 0.0]):
+        after = tick.state.q[0] + dt * tick.solution.v[0]
+        assert 1.0 - 0.001 - 0.05 - after > HELD - 1e-3
+    assert after > 0.8
+
+
+def turned(controller, q, v, horizon, samples):
+    """Least of distance - safe distance of all pairs on the way of v, obstacles on theirs."""
+    ruler = Ruler(controller.scene)
+    found = []
+    for s in np.linspace(0.0, horizon, 12):
+        there = {i: x._replace(position=x.position + s * x.linear) for i, x in samples.items()}
+        found.append(ruler.distances(pin.integrate(controller.scene.robot.model, q, s * v), there).min())
+    return min(found) - HELD
+
+
+def test_the_closest_call_is_a_lower_bound(panda):
+    rng, bounds = np.random.default_rng(0), panda.bounds()
+    balls = [Obstacle.at(f"ball{i}", Sphere(radius=0.08), [9.0, 0.0, 0.0]) for i in range(4)]
+    controller = make_controller(panda, balls)
+    close = 0
+    for _ in range(400):
+        q, v = rng.uniform(bounds.lower, bounds.upper), rng.uniform(-1.0, 1.0, 7) * bounds.velocity
+        horizon = rng.uniform(0.005, 0.3)
+        places = {b.name: Sample.at(rng.uniform(-0.8, 0.8, 3), linear=rng.uniform(-0.5, 0.5, 3)) for b in balls}
+        near = len(controller.tick(q, 0.0, None, places).proximity.pair)
+        controller._kinematics.move(q, v)
+        bound = controller._assembly.closest_call(near, 0.1, horizon)
+        least = turned(controller, q, v, horizon, dict(enumerate(places.values())))
+        assert least >= bound - 1e-9
+        close += bound > 0.0
+    assert close > 5
+
+
+def braking(q, v, step, dt):
+    """Poses along the tick and the stop after it, all joints slowed by one factor; five in each tick."""
+    poses = []
+    while v.any():
+        poses += [q + s * dt * v for s in (0.2, 0.4, 0.6, 0.8, 1.0)]
+        q, v = poses[-1], (1.0 - 1.0 / max(np.max(np.abs(v) / step), 1.0)) * v
+    return poses
+
+
+def test_what_the_guard_lets_through_is_clear_by_brute_force(panda):
+    """Reckless commands among plates: along every tick and the stop after it, no pair comes 0.6 mm too near."""
+    rng, bounds = np.random.default_rng(0), panda.bounds()
+    step, looked, drawn_back = 0.01 * bounds.acceleration, 0, 0
+    for _ in range(6):
+        places = rng.uniform([0.3, -0.4, 0.2], [0.7, 0.4, 0.9], (3, 3))
+        boxes = [Obstacle.at(f"box{i}", Box(size=(0.25, 0.25, 0.01)), place) for i, place in enumerate(places)]
+        controller = make_controller(panda, boxes, avoidance=Avoidance(d1=HELD, d2=0.1, row=Damper(gain=50.0)))
+        ruler, q = Ruler(controller.scene), panda.home + rng.uniform(-0.5, 0.5, 7)
+        while ruler.distances(q).min() < HELD:
+            q = panda.home + rng.uniform(-1.0, 1.0, 7)
+        for k in range(150):
+            if k % 30 == 0:
+                command = rng.uniform(-1.0, 1.0, 7) * bounds.velocity
+            s = controller.filter(q, command)
+            drawn_back += s.share < 1.0
+            way = braking(q, s.v, step, 0.01) if k % 4 == 0 else []
+            if way and (bounds.lower < way[-1]).all() and (way[-1] < bounds.upper).all():
+                looked += 1
+                assert min(ruler.distances(pose).min() for pose in way) > HELD - 6e-4
+            q = q + 0.01 * s.v
+    assert looked > 100 and drawn_back > 20
+
+
+@pytest.mark.parametrize(("shape", "speed", "alone"), [(PLATE, 2.0, 0.0), (BALL, 0.5, 0.002), (BOX, 2.0, 0.015)])
+def test_where_the_linearisation_is_too_kind_the_step_is_shortened_and_logged(shape, speed, alone):
+    """50 ms ticks and a row that may use all that is left in one: alone, it leads into the plate."""
+    least, shares = {}, {}
+    for look_ahead in (False, True):
+        run = scenario(
+            "panda",
+            {"type": "line", "displacement": [0.4, 0.05, -0.1], "speed": speed},
+            [{"name": "it", "shape": shape, "motion": {"type": "fixed", "position": [0.55, 0.0, 0.45]}}],
+            dt=0.05,
+            avoidance={"d1": HELD, "d2": 0.10, "row": {"type": "damper", "gain": 20.0}, "look_ahead": look_ahead},
+        )
+        log = simulate(run)
+        least[look_ahead] = least_on_the_way(log, Controller.from_scenario(run)[0])
+        shares[look_ahead] = log.share
+        assert log.metrics()["shortened_ticks"] == np.sum(log.share < 1.0)
+    assert least[False] < alone and least[True] > HELD - 5e-4
+    assert (shares[False] == 1.0).all() and shares[True].min() < 1.0
+
+
+def test_nothing_is_first_seen_inside_its_margin(tmp_path):
+    """A row sees 30 mm ahead; at 2 m/s and 4 m/s² braking takes 0.5 m."""
+    robot = cartesian(tmp_path, speed=2.0, acceleration=4.0)
+    wall = Obstacle.at("wall", Box(size=(0.1, 2.0, 2.0)), [2.05, 0.0, 0.0])
+    controller = make_controller(
+        robot, [wall], "z", avoidance=Avoidance(d1=HELD, d2=0.03, row=Damper(gain=20.0)), task={"gain": 50.0}
+    )
+    braking, before = [], np.zeros(3)
+    for tick in drive(controller, np.array([-1.0, 0.0, 0.0]), 400, target=[4.0, 0.0, 0.0]):
+        v = tick.solution.v
+        assert tick.solution.status is Status.SOLVED and (np.abs(v - before) <= 0.04 + 1e-9).all()
+        if v[0] < before[0] - 1e-6:
+            braking.append(1.95 - tick.state.q[0])
+        before = v
+        assert 1.95 - tick.state.q[0] > HELD - 1e-3
+    assert braking[0] > 0.45 and 1.95 - tick.state.q[0] < HELD + 2e-3
