@@ -8,15 +8,17 @@ library costs several times what a problem of this size takes to solve.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from qpavoid.problem import Array
+from qpavoid.kernels.compiled import compiled
+from qpavoid.problem import Array, IntArray
 
 _TOLERANCE = 1e-10
 """Violation of a constraint that counts as none [m/s, rad/s]."""
+_DEPENDENT = 1e-11
+"""Share of a constraint's normal, in the metric P⁻¹, below which the active ones are said to contain it."""
 
 
-@njit(cache=True)
+@compiled
 def project(
     A: Array, regularization: float, v0: Array, J: Array, least: Array, lower: Array, upper: Array
 ) -> tuple[Array, bool]:
@@ -38,7 +40,7 @@ def project(
     P = np.zeros((nv, nv))
     for r in range(rows):
         for i in range(nv):
-            for j in range(nv):
+            for j in range(i + 1):  # the lower triangle is all that is read
                 P[i, j] += A[r, i] * A[r, j]
     for i in range(nv):
         P[i, i] += regularization
@@ -52,12 +54,15 @@ def project(
     return v, True
 
 
-@njit(cache=True)
+@compiled
 def minimize(P: Array, x: Array, G: Array, h: Array, lower: Array, upper: Array) -> bool:
     """Moves x from the minimiser of ½ (x - x0)ᵀP (x - x0) to the one with G x >= h, lower <= x <= upper.
 
+    The active constraints' normals N and what they become, W = P⁻¹N, are kept, with a Cholesky factor of S = NᵀW: few
+    constraints bind at a time, so that this is less work than to keep an orthogonal basis of the whole space.
+
     Args:
-        P: positive definite (n, n).
+        P: positive definite (n, n); its lower triangle is read.
         x: x0 (n,), overwritten.
         G: rows (m, n).
         h: right-hand sides (m,).
@@ -68,11 +73,12 @@ def minimize(P: Array, x: Array, G: Array, h: Array, lower: Array, upper: Array)
         Whether x now solves the problem; if not, it is infeasible or too badly conditioned.
     """
     n, m = len(x), len(h)
-    basis = _inverse_transposed_factor(P)  # J in the paper: basisᵀ P basis = 1
-    R = np.zeros((n, n))
-    active = np.empty(n, np.intp)
-    u = np.zeros(n + 1)
-    d, z, r, normal = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    L = np.zeros((n, n))
+    _factorise(P, L, n)
+    N, W = np.zeros((n + 1, n)), np.zeros((n + 1, n))
+    S, R = np.zeros((n + 1, n + 1)), np.zeros((n + 1, n + 1))
+    active, u = np.empty(n + 1, np.intp), np.zeros(n + 1)
+    r, z = np.empty(n + 1), np.empty(n)
     count = 0
     for _ in range(10 * (n + m)):
         p, violation = _most_violated(x, G, h, lower, upper)
@@ -80,82 +86,113 @@ def minimize(P: Array, x: Array, G: Array, h: Array, lower: Array, upper: Array)
             return True
         if np.isnan(violation):
             return False
-        normal[:] = 0.0
-        if p < n:
-            normal[p] = 1.0
-        elif p < 2 * n:
-            normal[p - n] = -1.0
-        else:
-            normal[:] = G[p - 2 * n]
+        _enter(p, N[count], G)
+        _solve(L, N[count], W[count], n)
         u[count] = 0.0
+        square = _dot(N[count], W[count])
         while True:
-            d[:] = 0.0
-            for i in range(n):
-                if normal[i] != 0.0:
-                    for j in range(n):
-                        d[j] += basis[i, j] * normal[i]
-            square, free = 0.0, 0.0
-            for j in range(n):
-                square += d[j] * d[j]
-                if j >= count:
-                    free += d[j] * d[j]
-            for i in range(count - 1, -1, -1):
-                total = d[i]
-                for j in range(i + 1, count):
-                    total -= R[i, j] * r[j]
-                r[i] = total / R[i, i]
+            for j in range(count):
+                S[count, j] = _dot(N[j], W[count])
+            _solve(R, S[count], r, count)
+            z[:] = W[count]
+            for j in range(count):
+                for i in range(n):
+                    z[i] -= r[j] * W[j, i]
+            free = _dot(N[count], z)
             # the longest step that keeps all multipliers positive, and the one that reaches the constraint
             dual_step, leaving = np.inf, -1
             for j in range(count):
                 if r[j] > 0.0 and u[j] / r[j] < dual_step:
                     dual_step, leaving = u[j] / r[j], j
-            reachable = count < n and free > 1e-13 * square
+            reachable = count < n and free > _DEPENDENT * square
             step = min(dual_step, violation / free) if reachable else dual_step
             if step == np.inf:
                 return False
             if reachable:
                 for i in range(n):
-                    z[i] = 0.0
-                    for j in range(count, n):
-                        z[i] += basis[i, j] * d[j]
                     x[i] += step * z[i]
             for j in range(count):
                 u[j] -= step * r[j]
             u[count] += step
             if reachable and step == violation / free:
-                _add(basis, R, d, count)
+                S[count, count] = square
+                _extend(S, R, count)
                 active[count] = p
                 count += 1
                 break
-            _drop(basis, R, active, u, leaving, count)
+            _drop(N, W, S, R, active, u, leaving, count)
             count -= 1
             violation = -_slack(p, x, G, h, lower, upper)
     return False
 
 
-@njit(cache=True)
-def _inverse_transposed_factor(P: Array) -> Array:
-    """L⁻ᵀ of P = L Lᵀ (n, n)."""
-    n = len(P)
-    L = np.zeros((n, n))
-    inverse = np.zeros((n, n))
+@compiled
+def _dot(a: Array, b: Array) -> float:
+    total = 0.0
+    for i in range(len(a)):
+        total += a[i] * b[i]
+    return total
+
+
+@compiled
+def _factorise(M: Array, L: Array, n: int) -> None:
+    """Writes the lower Cholesky factor of the first n rows and columns of M."""
     for i in range(n):
-        for j in range(i + 1):
-            total = P[i, j]
-            for c in range(j):
-                total -= L[i, c] * L[j, c]
-            L[i, j] = np.sqrt(total) if i == j else total / L[j, j]
-    for j in range(n):
-        inverse[j, j] = 1.0 / L[j, j]
-        for i in range(j + 1, n):
-            total = 0.0
-            for c in range(j, i):
-                total -= L[i, c] * inverse[j, c]
-            inverse[j, i] = total / L[i, i]
-    return inverse
+        _extend(M, L, i)
 
 
-@njit(cache=True)
+@compiled
+def _extend(M: Array, L: Array, i: int) -> None:
+    """Writes row i of the Cholesky factor; NaN where M is not positive definite."""
+    for j in range(i):
+        total = M[i, j]
+        for c in range(j):
+            total -= L[i, c] * L[j, c]
+        L[i, j] = total / L[j, j]
+    total = M[i, i]
+    for c in range(i):
+        total -= L[i, c] * L[i, c]
+    L[i, i] = np.sqrt(total)
+
+
+@compiled
+def _solve(L: Array, b: Array, y: Array, n: int) -> None:
+    """Writes the solution of L Lᵀ y = b, of the first n rows and columns."""
+    for i in range(n):
+        total = b[i]
+        for c in range(i):
+            total -= L[i, c] * y[c]
+        y[i] = total / L[i, i]
+    for i in range(n - 1, -1, -1):
+        y[i] /= L[i, i]
+        for c in range(i):
+            y[c] -= L[i, c] * y[i]
+
+
+@compiled
+def _enter(p: int, normal: Array, G: Array) -> None:
+    """Writes the normal of constraint p, pointing inwards."""
+    n = len(normal)
+    if p < 2 * n:
+        normal[:] = 0.0
+        normal[p % n] = 1.0 if p < n else -1.0
+    else:
+        normal[:] = G[p - 2 * n]
+
+
+@compiled
+def _drop(N: Array, W: Array, S: Array, R: Array, active: IntArray, u: Array, leaving: int, count: int) -> None:
+    """Takes constraint number `leaving` out of the active set of `count`; what enters moves up with its multiplier."""
+    for j in range(leaving, count):
+        u[j], N[j], W[j] = u[j + 1], N[j + 1], W[j + 1]
+    for j in range(leaving, count - 1):
+        active[j] = active[j + 1]
+        for c in range(j + 1):
+            S[j, c] = S[j + 1, c if c < leaving else c + 1]
+        _extend(S, R, j)
+
+
+@compiled
 def _slack(p: int, x: Array, G: Array, h: Array, lower: Array, upper: Array) -> float:
     """How far inside constraint p the point x lies: n lower bounds, n upper bounds, then the rows; negative outside."""
     n = len(x)
@@ -169,7 +206,7 @@ def _slack(p: int, x: Array, G: Array, h: Array, lower: Array, upper: Array) -> 
     return slack
 
 
-@njit(cache=True)
+@compiled
 def _most_violated(x: Array, G: Array, h: Array, lower: Array, upper: Array) -> tuple[int, float]:
     """Which constraint x violates most, and by how much; NaN in a row shows."""
     n = len(x)
@@ -188,49 +225,3 @@ def _most_violated(x: Array, G: Array, h: Array, lower: Array, upper: Array) -> 
         if np.isnan(outside):
             break
     return worst, violation
-
-
-@njit(cache=True)
-def _rotate(a: float, b: float) -> tuple[float, float, float]:
-    """Cosine and sine of the rotation that takes (a, b) to (length, 0), and the length."""
-    length = np.sqrt(a * a + b * b)
-    if length == 0.0:
-        return 1.0, 0.0, 0.0
-    return a / length, b / length, length
-
-
-@njit(cache=True)
-def _turn_columns(basis: Array, j: int, cosine: float, sine: float) -> None:
-    for i in range(len(basis)):
-        first, second = basis[i, j], basis[i, j + 1]
-        basis[i, j] = cosine * first + sine * second
-        basis[i, j + 1] = cosine * second - sine * first
-
-
-@njit(cache=True)
-def _add(basis: Array, R: Array, d: Array, count: int) -> None:
-    """Takes a constraint with d = basisᵀ normal into the active set, as column `count` of R."""
-    for j in range(len(d) - 2, count - 1, -1):
-        cosine, sine, d[j] = _rotate(d[j], d[j + 1])
-        _turn_columns(basis, j, cosine, sine)
-    for i in range(count + 1):
-        R[i, count] = d[i]
-
-
-@njit(cache=True)
-def _drop(basis: Array, R: Array, active: Array, u: Array, leaving: int, count: int) -> None:
-    """Takes constraint number `leaving` out of the active set of `count`; u keeps the entering one's multiplier."""
-    for j in range(leaving, count - 1):
-        active[j] = active[j + 1]
-        for i in range(count):
-            R[i, j] = R[i, j + 1]
-    for j in range(leaving, count):
-        u[j] = u[j + 1]
-    for j in range(leaving, count - 1):
-        cosine, sine, R[j, j] = _rotate(R[j, j], R[j + 1, j])
-        R[j + 1, j] = 0.0
-        for c in range(j + 1, count - 1):
-            first, second = R[j, c], R[j + 1, c]
-            R[j, c] = cosine * first + sine * second
-            R[j + 1, c] = cosine * second - sine * first
-        _turn_columns(basis, j, cosine, sine)

@@ -18,6 +18,9 @@ from qpavoid.kernels.layout import RowLayout
 from qpavoid.kernels.vectorised import BRAKING_SHARE, WELL_CONDITIONED, rotation_vector
 from qpavoid.problem import Array, IntArray
 
+compiled = njit(cache=True, fastmath={"reassoc", "contract", "nsz"})
+"""How kernels are compiled: sums may be taken in any order, so that they become vector instructions; NaN stays NaN."""
+
 
 class PackedRows(structref.StructRefProxy):  # type: ignore[misc]
     """A `RowLayout` as compiled code sees it."""
@@ -36,7 +39,7 @@ structref.define_boxing(PackedRowsType, PackedRows)
 structref.define_constructor(PackedRows, PackedRowsType, list(RowLayout._fields))
 
 
-@njit(cache=True)
+@compiled
 def _pack(fields: Any) -> Any:
     return PackedRows(*fields)
 
@@ -46,7 +49,7 @@ def pack(layout: RowLayout) -> Any:
     return _pack(tuple(layout))
 
 
-@njit(cache=True)
+@compiled
 def candidates(
     poses: Array, local: Array, centers: Array, radius: Array, pair_of: IntArray, reach: float, found: IntArray
 ) -> int:
@@ -72,7 +75,7 @@ def candidates(
     return count
 
 
-@njit(cache=True)
+@compiled
 def distance_rows(x: Any, pairs: IntArray, reach: float, moving: bool) -> int:
     """See `vectorised.distance_rows`."""
     results, J_world, closest, J = x.results, x.J_world, x.closest, x.J
@@ -98,7 +101,7 @@ def distance_rows(x: Any, pairs: IntArray, reach: float, moving: bool) -> int:
     return k
 
 
-@njit(cache=True)
+@compiled
 def row_bounds(x: Any, k: int, moving: bool) -> None:
     """See `vectorised.row_bounds`."""
     for i in range(k):
@@ -137,7 +140,7 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
         x.touch[i] = min(x.row_gain * (x.offset - d) - x.drift[i], least)
 
 
-@njit(cache=True)
+@compiled
 def closest_call(x: Any, k: int, reach: float, horizon: float) -> float:
     """See `vectorised.closest_call`."""
     speeds, motions, joints = x.speeds, x.joint_velocities, len(x.joint_velocities)
@@ -158,10 +161,10 @@ def closest_call(x: Any, k: int, reach: float, horizon: float) -> float:
     return least
 
 
-_rotation_vector = njit(cache=True)(rotation_vector)
+_rotation_vector = compiled(rotation_vector)
 
 
-@njit(cache=True)
+@compiled
 def frame_rows(x: Any) -> None:
     """See `vectorised.frame_rows`."""
     poses, targets, screws, A, b, J_world = x.poses, x.targets, x.screws, x.A, x.b, x.J_world
@@ -206,14 +209,14 @@ def frame_rows(x: Any) -> None:
             A[r, c] *= x.task_support[r, c]
 
 
-@njit(cache=True)
+@compiled
 def _speed_to_stop(room: float, step: float, dt: float) -> float:
     """See `vectorised.speed_to_stop`."""
     ticks = min(max(np.ceil(0.5 * np.sqrt(1.0 + 8.0 * room / (step * dt)) - 0.5), 1.0), 1e15)
     return room / (dt * ticks) + 0.5 * step * (ticks - 1.0)
 
 
-@njit(cache=True)
+@compiled
 def velocity_bounds(x: Any, q: Array) -> None:
     """See `vectorised.velocity_bounds`."""
     lower, upper = x.hard_lower, x.hard_upper
@@ -239,7 +242,7 @@ def velocity_bounds(x: Any, q: Array) -> None:
         x.upper[j] = max(min(x.v_last[j] + x.v_step[j], upper[j]), lower[j])
 
 
-@njit(cache=True)
+@compiled
 def stop_velocity(x: Any) -> None:
     """See `vectorised.stop_velocity`."""
     slowing = 1.0 if x.accelerated else np.inf
@@ -250,7 +253,7 @@ def stop_velocity(x: Any) -> None:
         x.v_stop[j] = min(max(share * x.v_last[j], x.lower[j]), x.upper[j])
 
 
-@njit(cache=True)
+@compiled
 def damped_solution(x: Any, v: Array) -> None:
     """See `vectorised.damped_solution`: Cholesky factorisation of the Gram matrix, row by row."""
     A, b, damping = x.A, x.b, x.damping
@@ -289,7 +292,7 @@ def damped_solution(x: Any, v: Array) -> None:
             v[c] += A[i, c] * y[i]
 
 
-@njit(cache=True)
+@compiled
 def shortfall(v: Array, J: Array, b: Array, lower: Array, upper: Array) -> float:
     """See `vectorised.shortfall`."""
     worst = -np.inf
@@ -303,13 +306,13 @@ def shortfall(v: Array, J: Array, b: Array, lower: Array, upper: Array) -> float
     return worst
 
 
-@njit(cache=True)
+@compiled
 def tracking_shortfall(x: Any, k: int) -> float:
     """See `vectorised.tracking_shortfall`."""
     return shortfall(x.v0, x.J[:k], x.least[:k], x.lower, x.upper)
 
 
-@njit(cache=True)
+@compiled
 def assemble(x: Any, q: Array, pairs: IntArray, reach: float, moving: bool) -> tuple[int, float]:
     """See `vectorised.assemble`."""
     frame_rows(x)
@@ -321,7 +324,7 @@ def assemble(x: Any, q: Array, pairs: IntArray, reach: float, moving: bool) -> t
     return k, tracking_shortfall(x, k)
 
 
-@njit(cache=True)
+@compiled
 def projection_cost(A: Array, regularization: float, v0: Array) -> tuple[Array, Array]:
     """See `vectorised.projection_cost`."""
     rows, nv = A.shape
