@@ -543,20 +543,24 @@ def balls(rng, count, radius):
     return [Obstacle.at(f"o{i}", shape, place) for i, place in enumerate(places)]
 
 
+PARTING = Avoidance(d1=20.0, d2=30.0)
+"""All pairs nearer than that have to part: with few and with many, the rows take the same branches."""
+
+
 @pytest.mark.usefixtures("culling")
 @pytest.mark.parametrize(("radius", "reach"), [(50.0, 0.1), (0.6, 0.1), (0.6, 10.0)])
 def test_python_work_does_not_grow_with_the_number_of_pairs(panda, radius, reach):
     rng = np.random.default_rng(14)
     work, near = [], []
     for count in (10, 500):
-        bench = Bench(build_scene(panda, balls(rng, count, radius)))
+        bench = Bench(build_scene(panda, balls(rng, count, radius)), avoidance=PARTING)
         switches = Switches(bench.query)
         bench.compute(panda.home, reach=reach)
         switches.calls.clear()
         near.append(len(bench.compute(panda.home, reach=reach)[0].pair))
         work.append(instructions(lambda bench=bench: bench.compute(panda.home, reach=reach)))
         assert not switches.calls
-    assert 0 < work[0] == work[1] < 2000
+    assert 0 < work[0] == work[1] < 3000
     assert near[0] == near[1] if radius == 50.0 else 0 < 10 * near[0] < near[1]
 
 
