@@ -131,6 +131,11 @@ class Assembly:
         linear = (x.b / x.scale)[: 3 * len(x.targets)].reshape(-1, 3)
         return int(np.argmax(np.linalg.norm(linear, axis=1)))
 
+    def wanted_velocity(self, frame: int) -> Array:
+        """Linear velocity (3,) that a task asks of its frame [m/s]."""
+        rows = slice(3 * frame, 3 * frame + 3)
+        return np.asarray(self._layout.b[rows] / self._layout.scale[rows])
+
     def frame_velocity(self, frame: int, v: Array) -> Array:
         """Linear velocity (3,) of a task's frame at v [m/s]."""
         rows = slice(3 * frame, 3 * frame + 3)

@@ -27,6 +27,10 @@ _RESTING = 0.01
 _TIGHT = 1e-3
 """How close to its bound a row counts as being in the way [m/s]."""
 _DIRECTIONS = 8
+_MOST_TRIES = 4
+"""Ways round one pair that are tried, on one side and on the other in turn."""
+_CALM = 3.0
+"""Time without anything in the way after which they may be tried again [s]."""
 _EVERY = 5
 """Ticks from one look at the progress to the next."""
 
@@ -63,7 +67,7 @@ class ProgressWatch:
 
     def reset(self) -> None:
         """Forgets everything."""
-        self._clock, self._without, self._tried = 0, 0, 0
+        self._clock, self._without, self._tried, self._calm, self._last = 0, 0, 0, 0, -1
         self._way: _Way | None = None
         self._culprits: list[Obstruction] = []
 
@@ -74,7 +78,11 @@ class ProgressWatch:
             return problem
         way = self._way
         if way is None:
-            if not self.blocked or not self._culprits or self._tried > 1:
+            if not self.blocked or not self._culprits:
+                return problem
+            if self._culprits[0].pair != self._last:
+                self._last, self._tried = self._culprits[0].pair, 0
+            if self._tried >= _MOST_TRIES:
                 return problem
             way = self._begin(problem, proximity, assembly, solver, detour)
             if way is None:
@@ -86,10 +94,12 @@ class ProgressWatch:
         way.free = 0 if opposed else way.free + 1
         way.ticks += 1
         if not len(row) or way.free * self._dt > detour.settle or way.ticks * self._dt > detour.longest:
-            self._tried = 0 if way.ticks * self._dt <= detour.longest else self._tried + 1
-            self._way, self._without = None, 0
+            self._tried += 1
+            self._way, self._without, self._calm = None, 0, 0
             return problem
-        return assembly.redirected(problem, way.frame, detour.speed * _tangent(way.axis, proximity.normal[row[0]]))
+        t = _tangent(way.axis, proximity.normal[row[0]])
+        back = max(-float(t @ assembly.wanted_velocity(way.frame)), 0.0)  # what the task would have of the way undone
+        return assembly.redirected(problem, way.frame, (detour.speed + back) * t)
 
     def update(self, problem: Problem, solution: Solution) -> tuple[str, ...]:
         """What blocks the tasks, once they have been without progress for long enough; else nothing.
@@ -101,6 +111,9 @@ class ProgressWatch:
         A = problem.tracking.A
         if not len(A) or (problem.shortfall <= 0.0 and solution.share == 1.0):
             self._without = 0
+            self._calm += 1
+            if self._calm * self._dt > _CALM:
+                self._tried = 0
             return ()
         self._clock += 1
         if self._clock % _EVERY and not self.blocked:
@@ -153,6 +166,9 @@ def _culprits(problem: Problem, v: Array) -> list[Obstruction]:
     rows = problem.avoidance
     against = rows.b - rows.J @ problem.v0
     tight = (rows.J @ v - rows.b < _TIGHT) & (against > 0.0)
+    if not tight.any():  # a law that is not made of rows: the nearest of the pairs that the task would have close
+        tight = (rows.J @ problem.v0 < -_TIGHT) & (rows.d < rows.d2)
+        tight &= rows.d <= np.min(rows.d, where=tight, initial=np.inf)
     found = [Obstruction(int(rows.pair[i]), float(against[i])) for i in np.flatnonzero(tight)]
     return sorted(found, key=lambda obstruction: -obstruction.force)
 

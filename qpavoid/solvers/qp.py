@@ -23,9 +23,9 @@ class Qp:
     that is safe. As A v0 = b wherever the task can be met, the first term is the tracking cost ‖A v - b‖²;
     measuring λ from v0 rather than from 0 leaves tracking free of bias.
 
-    Where no velocity meets everything, acceleration limits give way, then rows, as little as they must and the deepest
-    threat least (`solvers.relaxation`). An answer counts only if it verifies: a back end that fails or lies is
-    replaced by daqp for that tick, and where that fails too, the robot is told to stop.
+    Where no velocity meets everything, margins give way, then acceleration limits, then contact, as little as they must
+    and the deepest threat least (`solvers.relaxation`), by daqp whatever the back end. An answer counts only if it verifies: a back end
+    that fails or lies is replaced by daqp for that tick, and where that fails too, the robot is told to stop.
     """
 
     bounded = True
@@ -64,12 +64,11 @@ class Qp:
             return Solution(
                 problem.v_stop.copy(), Status.STOPPED, tuple(f"{p}: no distance can be told" for p in pairs)
             )
-        for backend in (self._backend, solve_daqp):
-            relaxed = relax(P, q, problem, backend)
-            if relaxed is not None:
-                slack = relaxed.slack if relaxed.slack.any() else None
-                return Solution(relaxed.v, Status.RELAXED, what_gave_way(relaxed, problem), slack)
-        return Solution(problem.v_stop.copy(), Status.STOPPED, ("the QP back end returned no usable velocity",))
+        relaxed = relax(P, q, problem, solve_daqp)
+        if relaxed is None:
+            return Solution(problem.v_stop.copy(), Status.STOPPED, ("the QP back end returned no usable velocity",))
+        slack = relaxed.slack if relaxed.slack.any() else None
+        return Solution(relaxed.v, Status.RELAXED, what_gave_way(relaxed, problem), slack)
 
 
 def _compiled_projection() -> Callable[..., tuple[Array, bool]]:
