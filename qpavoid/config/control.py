@@ -141,7 +141,7 @@ class Detour(Block):
     settle: NonNegative = 0.3
     """Time for which the way has to be free before the detour ends [s]."""
     longest: Positive = 15.0
-    """Time after which a detour is given up [s]; the other side is tried then, once."""
+    """Time after which a detour is given up [s]; the other side is tried then, up to four ways in all."""
 
 
 class Progress(Block):
