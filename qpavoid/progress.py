@@ -115,7 +115,7 @@ class ProgressWatch:
             if self._calm * self._dt > _CALM:
                 self._tried = 0
             return ()
-        self._clock += 1
+        self._clock, self._calm = self._clock + 1, 0
         if self._clock % _EVERY and not self.blocked:
             return ()
         wanted, got = A @ problem.v0, A @ solution.v
