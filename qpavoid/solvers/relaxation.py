@@ -96,12 +96,16 @@ def _least_excess(P: Array, q: Array, x: Problem, least: Array, backend: Backend
     G = np.block([[J, np.zeros_like(J)], [eye, eye], [-eye, eye]])
     b = np.concatenate((least, x.lower, -x.upper))
     finite = np.isfinite(b)
+    G, b = np.ascontiguousarray(G[finite]), b[finite]
     hessian = np.zeros((2 * n, 2 * n))
-    hessian[:n, :n], hessian[n:, n:] = _SMALL * P, np.diag(1.0 / room**2)
-    gradient = np.concatenate((_SMALL * q, np.zeros(n)))
     lower = np.concatenate((x.hard_lower, np.zeros(n)))
     upper = np.concatenate((x.hard_upper, np.full(n, np.inf)))
-    answer = closest(backend, hessian, gradient, np.ascontiguousarray(G[finite]), b[finite], lower, upper)
+    answer = None
+    for small in (_SMALL, 1e2 * _SMALL, 1e3 * _SMALL):  # daqp fails on one in seven of the first
+        hessian[:n, :n], hessian[n:, n:] = small * P, np.diag(1.0 / room**2)
+        answer = closest(backend, hessian, np.concatenate((small * q, np.zeros(n))), G, b, lower, upper)
+        if answer is not None:
+            break
     if answer is None:
         return _Bounds(x.hard_lower, x.hard_upper)
     v = answer[:n]  # each side gives for itself: no joint gets room to jump the other way
