@@ -73,7 +73,7 @@ def test_margins_then_accelerations_then_contact_and_the_deepest_last(seed):
     if feasible(rows.J, rows.touch, x.lower, x.upper):
         assert within  # margins come before accelerations
         expected = least_slack(rows, rows.b, rows.touch, x.lower, x.upper)
-        np.testing.assert_allclose(s.slack, expected, atol=2e-4)
+        np.testing.assert_allclose(s.slack, expected, atol=1e-3)
         return
     contact = least_slack(rows, rows.touch, nothing, x.hard_lower, x.hard_upper)
     assert (rows.J @ s.v >= rows.touch - contact - 1e-4).all()
