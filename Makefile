@@ -2,7 +2,8 @@
 PYTHON ?= python3
 BIN := .venv/bin
 # what runs a second time without numba: the tick and everything that it is made of
-TICK_TESTS := $(addprefix tests/test_,$(addsuffix .py,avoidance backends examples limits proximity situations solvers tasks))
+TICK_TESTS := $(addprefix tests/test_,$(addsuffix .py,avoidance backends controller examples faults filter \
+  giving_way limits outcome penetration proximity situations solvers tasks))
 
 .PHONY: run figures test lint types clean
 
