@@ -10,7 +10,7 @@ from qpavoid import kernels
 from qpavoid.avoidance import row_form
 from qpavoid.config import Avoidance, Limits
 from qpavoid.kernels.layout import RowLayout
-from qpavoid.kinematics import ForwardKinematics, Kinematics
+from qpavoid.kinematics import ForwardKinematics, Kinematics, chains, longest_lever
 from qpavoid.limits import JointBounds, limit_layout
 from qpavoid.motion import Sample
 from qpavoid.problem import Array, AvoidanceRows, Problem, Proximity, Tracking
@@ -36,6 +36,7 @@ class Assembly:
     ) -> None:
         """Lays the memory out; see `Controller` for the arguments."""
         pairs, nv = len(scene.pairs), scene.robot.model.nv
+        turning, sliding = chains(scene.robot.model)
         self._layout = RowLayout(
             J_world=kinematics.J,
             frame_poses=kinematics.frame_poses,
@@ -48,6 +49,8 @@ class Assembly:
             joint_velocities=kinematics.joint_velocities,
             joint_reach=query.joint_reach(),
             carriers=query.carriers(),
+            turning=turning,
+            sliding=sliding,
             speeds=query.speeds,
             near=np.zeros(pairs, dtype=np.intp),
             closest=np.zeros((pairs, 10)),
@@ -58,6 +61,7 @@ class Assembly:
             touch=np.zeros(pairs),
             **limit_layout(bounds, limits.position_gain, dt),
             v0=np.zeros(nv),
+            lever=longest_lever(scene.robot.model, query.joint_reach()),
             damping=damping,
             **row_form(avoidance),
         )
@@ -91,12 +95,12 @@ class Assembly:
             self._tracking, rows, x.lower, x.upper, *self._hard, x.v_stop, *self._names, x.v0, worst
         )
 
-    def closest_call(self, near: int, reach: float, horizon: float) -> float:
-        """How much is certainly left of the safe distances if all move as they do until `horizon` [m].
+    def closest_call(self, v: Array, near: int, reach: float, horizon: float) -> float:
+        """A bound below what is left of the safe distances on the way of v until `horizon` [m].
 
-        See `kernels.vectorised.closest_call`; the velocity is that of the last `ForwardKinematics.move`.
+        See `kernels.vectorised.closest_call`; v is that of the last `ForwardKinematics.move`.
         """
-        return float(kernels.closest_call(self._packed, near, reach, horizon))
+        return float(kernels.closest_call(self._packed, v, near, reach, horizon))
 
     def follow(self, v: Array, problem: Problem) -> Problem:
         """The problem of this tick with the velocity v (nv,) to follow in place of the tasks."""

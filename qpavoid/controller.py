@@ -106,7 +106,7 @@ class Controller:
         q, v = self.scene.robot.home, np.zeros(self._v_shape)
         self.tick(q)
         self.filter(q, v)
-        self._assembly.closest_call(0, self._reach, self.dt)
+        self._assembly.closest_call(v, 0, self._reach, self.dt)
         self.reset()
         self.warm_up_time = perf_counter() - begin
         """Time that the first tick took, compilation included [s]; no later one waits for the compiler."""
@@ -302,9 +302,9 @@ class Controller:
 
     def _looked_ahead(self, q: Array, problem: Problem, solution: Solution) -> Solution:
         checked = self._guard.check(q, solution, problem, self._assembly, self._query, self._reach)
-        v, share, short, pair = checked
-        if share == 1.0 and short <= TOLERANCE:
+        if checked is None:
             return solution
+        v, share, short, pair = checked
         if short <= TOLERANCE:
             return solution._replace(v=v, share=share)
         if short != short:

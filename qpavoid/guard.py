@@ -8,7 +8,7 @@ looked at one tick ago. By induction a stop that was found clear is always at ha
 were last seen to do, for one tick.
 
 Most ticks need none of this: where no body moves fast enough to use up what is left of a distance before the robot
-could stop (`kernels.vectorised.closest_call`), the velocity is clear as it is.
+could stop, the velocity is clear as it is (`kernels.vectorised.closest_call`, with the bound and its proof).
 """
 
 from __future__ import annotations
@@ -92,8 +92,8 @@ class Guard:
 
     def check(
         self, q: Array, solution: Solution, problem: Problem, assembly: Assembly, query: DistanceQuery, reach: float
-    ) -> Checked:
-        """The velocity of a solution where its way is clear, else as much of it as can be had.
+    ) -> Checked | None:
+        """None where the way of a solution's velocity is clear, else as much of it as can be had.
 
         Where the solution lets a pair come nearer on purpose, because it had to, that is not held against it.
 
@@ -108,8 +108,8 @@ class Guard:
         v, v_stop, near = solution.v, problem.v_stop, problem.avoidance.pair
         horizon = self._dt + 0.5 * self._stopping(v)
         self._kinematics.move(q, v)
-        if assembly.closest_call(len(near), reach, horizon) > 0.0:
-            return Checked(v, 1.0, 0.0, -1)
+        if assembly.closest_call(v, len(near), reach, horizon) > 0.0:
+            return None
         self._given[:] = 0.0
         if solution.slack is not None:
             self._given[near] = 1.1 * horizon * solution.slack
@@ -117,8 +117,10 @@ class Guard:
         speed = float(np.max(query.speeds))
         gap = float(np.min(query.found(query.pairs), initial=reach)) - self._hold
         worst, pair = self._worst(q, v, query, gap, speed)
-        best = Checked(v, 1.0, max(-worst, 0.0), pair)
-        for share in _SHARES if best.short > 0.0 else ():
+        if worst >= 0.0:
+            return None
+        best = Checked(v, 1.0, -worst, pair)
+        for share in _SHARES:
             blend = v_stop + share * (v - v_stop)
             worst, pair = self._worst(q, blend, query, gap, speed)
             if worst >= 0.0:

@@ -11,6 +11,17 @@ import pinocchio as pin
 from qpavoid.memory import read_poses, read_velocities, view_poses, view_velocities
 from qpavoid.problem import Array
 
+TRANSLATIONS = {
+    "JointModelPX": 1,
+    "JointModelPY": 1,
+    "JointModelPZ": 1,
+    "JointModelPrismaticUnaligned": 1,
+    "JointModelPlanar": 2,
+    "JointModelTranslation": 3,
+    "JointModelFreeFlyer": 3,
+}
+"""How many velocity coordinates of a joint are lengths; they come before its angles."""
+
 
 class Kinematics(NamedTuple):
     """Where the tracked frames are, and how everything moves with v, until the next tick overwrites it."""
@@ -70,6 +81,44 @@ class ForwardKinematics:
         pin.forwardKinematics(self._model, self.data, q, v)
         if self._copy_velocities:
             self.joint_velocities[:] = read_velocities(self.data.v)
+
+
+def chains(model: Any) -> tuple[Array, Array]:
+    """Which angles, and which lengths, move the end of each chain of joints: twice (chains, nv), 0 or 1."""
+    turns = np.ones(model.nv)
+    for joint in list(model.joints)[1:]:
+        turns[joint.idx_v : joint.idx_v + TRANSLATIONS.get(joint.shortname(), 0)] = 0.0
+    ends = np.setdiff1d(np.arange(1, model.njoints), list(model.parents))
+    support = support_masks(model)[ends]
+    return support * turns, support * (1.0 - turns)
+
+
+def longest_lever(model: Any, joint_reach: Array) -> float:
+    """Largest distance that any point of a body can ever have from a joint that turns it [m].
+
+    Lengths of the links in between, one after the other, with what joints can slide; infinite where one can slide
+    without a limit.
+
+    Args:
+        model: pinocchio model.
+        joint_reach: distance from each joint's origin to the farthest point that it carries (njoints,) [m].
+    """
+    lever = np.zeros(model.njoints)  # from the first joint that turns to the origin of each one
+    turned = np.zeros(model.njoints, dtype=bool)
+    for i, joint in enumerate(list(model.joints)):
+        if i == 0:
+            continue
+        parent, slides = model.parents[i], TRANSLATIONS.get(joint.shortname(), 0)
+        if turned[parent]:
+            lower, upper = (limit[joint.idx_q : joint.idx_q + slides] for limit in _position_limits(model))
+            slide = float(np.sum(np.maximum(np.abs(lower), np.abs(upper))))
+            lever[i] = lever[parent] + float(np.linalg.norm(model.jointPlacements[i].translation)) + slide
+        turned[i] = turned[parent] or joint.nv > slides
+    return float(np.max((lever + joint_reach)[turned], initial=0.0))
+
+
+def _position_limits(model: Any) -> tuple[Array, Array]:
+    return np.asarray(model.lowerPositionLimit), np.asarray(model.upperPositionLimit)
 
 
 def support_masks(model: Any) -> Array:

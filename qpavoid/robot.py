@@ -15,23 +15,13 @@ import pinocchio as pin
 from qpavoid.bodies import MeshWarning, check_meshes, convert_bodies, make_shape, triangle_meshes
 from qpavoid.config import Body, RobotConfig
 from qpavoid.errors import ConfigError, UnknownName
+from qpavoid.kinematics import TRANSLATIONS
 from qpavoid.limits import JointBounds
 from qpavoid.loading import find_robot, nearest, read_config, validate
 from qpavoid.motion import rpy_to_matrix
 from qpavoid.pairs import add_self_pairs, drop_always_touching, pair_array
 from qpavoid.problem import Array, IntArray
 from qpavoid.urdf import find_resource, honour_srdf, read_collision, read_model
-
-_TRANSLATIONS = {
-    "JointModelPX": 1,
-    "JointModelPY": 1,
-    "JointModelPZ": 1,
-    "JointModelPrismaticUnaligned": 1,
-    "JointModelPlanar": 2,
-    "JointModelTranslation": 3,
-    "JointModelFreeFlyer": 3,
-}
-"""How many velocity coordinates of a joint are lengths; they come before its angles."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +93,7 @@ class Robot:
         """What each of the nv velocity coordinates changes per second: `m` or `rad`."""
         units = []
         for _, joint in self._joints():
-            metres = _TRANSLATIONS.get(joint.shortname(), 0)
+            metres = TRANSLATIONS.get(joint.shortname(), 0)
             units += ["m"] * metres + ["rad"] * (joint.nv - metres)
         return units
 

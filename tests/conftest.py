@@ -116,6 +116,7 @@ def make_layout(nv, frames=0, turns=(), pairs=0, obstacles=0, joints=1, **fields
         "support": np.ones((pairs, nv)), "twists": np.zeros((obstacles + 1, 6)),
         "twist_row": np.full(pairs, obstacles), "margin": np.zeros(obstacles + 1),
         "joint_velocities": np.zeros((joints, 6)), "joint_reach": np.zeros(joints),
+        "turning": np.ones((1, nv)), "sliding": np.zeros((1, nv)), "lever": 1.0,
         "carriers": np.zeros((pairs, 2), dtype=np.intp), "speeds": np.zeros(joints + obstacles),
         "q_index": none, "v_index": none, "q_lower": np.zeros(0),
         "q_upper": np.zeros(0), "v_max": np.full(nv, np.inf), "v_step": np.full(nv, np.inf), "v_last": np.zeros(nv),

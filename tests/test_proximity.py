@@ -246,7 +246,7 @@ def test_nothing_comes_nearer_than_the_closest_call_says(name, request):
         near = len(bench.compute(q, reach=0.3)[0].pair)
         bench.kinematics.move(q, v)
         for horizon in (0.01, 0.1, 0.3):
-            least = bench.assembly.closest_call(near, 0.3, horizon)
+            least = bench.assembly.closest_call(v, near, 0.3, horizon)
             assert np.isfinite(least)
             later = {i: moved(sample, horizon) for i, sample in samples.items()}
             found = look(scene, pin.integrate(robot.model, q, horizon * v), later)

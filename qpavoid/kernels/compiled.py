@@ -141,7 +141,7 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
 
 
 @compiled
-def closest_call(x: Any, k: int, reach: float, horizon: float) -> float:
+def closest_call(x: Any, v: Array, k: int, reach: float, horizon: float) -> float:
     """See `vectorised.closest_call`."""
     speeds, motions, joints = x.speeds, x.joint_velocities, len(x.joint_velocities)
     fastest = 0.0
@@ -153,11 +153,19 @@ def closest_call(x: Any, k: int, reach: float, horizon: float) -> float:
     any_fastest = fastest
     for i in range(joints, len(speeds)):
         any_fastest = np.maximum(any_fastest, speeds[i])
-    least = reach + x.offset - x.hold - (fastest + any_fastest) * horizon
+    omega, slide = 0.0, 0.0
+    for chain in range(len(x.turning)):
+        turning, sliding = 0.0, 0.0
+        for c in range(len(v)):
+            turning += x.turning[chain, c] * abs(v[c])
+            sliding += x.sliding[chain, c] * abs(v[c])
+        omega, slide = max(omega, turning), max(slide, sliding)
+    bend = horizon * horizon * omega * (omega * x.lever + 2.0 * slide)
+    least = reach + x.offset - x.hold - (fastest + any_fastest) * horizon - bend
     for i in range(k):
         pair = x.near[i]
         closing = speeds[x.carriers[pair, 0]] + speeds[x.carriers[pair, 1]]
-        least = np.minimum(least, x.d[i] - x.hold - closing * horizon)
+        least = np.minimum(least, x.d[i] - x.hold - closing * horizon - bend)
     return least
 
 

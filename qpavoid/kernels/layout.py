@@ -61,6 +61,10 @@ class RowLayout(NamedTuple):
     """(J,) distance from a joint's origin to the farthest point of a body that it carries [m]."""
     carriers: IntArray
     """(m, 2) what moves the two bodies of each pair: number of a joint, or J plus that of an obstacle."""
+    turning: Array
+    """(chains, n) 1 for each angle among the coordinates that move the end of a chain of joints, else 0."""
+    sliding: Array
+    """(chains, n) the same for lengths."""
     speeds: Array
     """(J + o,) largest speed of any point that a joint carries, which is overwritten, or of an obstacle [m/s]."""
     near: IntArray
@@ -128,5 +132,7 @@ class RowLayout(NamedTuple):
     """Share of the room to a position limit that may be used in a second [1/s]."""
     dt: float
     """Length of a tick [s]."""
+    lever: float
+    """Largest distance that any point can ever have from a joint that turns it [m]."""
     accelerated: bool
     """Whether any acceleration has a limit."""

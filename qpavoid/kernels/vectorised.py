@@ -61,6 +61,7 @@ class Workspace:
         self.screw_columns = np.empty((6, pairs))
         self.scratch = np.empty((3, pairs))
         joints = len(layout.joint_velocities)
+        self.slides = bool(layout.sliding.any())
         self.squares, self.linear_angular = np.empty((joints, 6)), np.empty((joints, 2))
         self.squares_by_kind = self.squares.reshape(-1, 2, 3)
         self.linear_speed, self.angular_speed = self.linear_angular[:, 0], self.linear_angular[:, 1]
@@ -235,21 +236,29 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
     np.minimum(touch, least, out=touch)
 
 
-def closest_call(x: Any, k: int, reach: float, horizon: float) -> float:
-    """How much is certainly left of the safe distance of every pair, if all move as they do until `horizon`.
+def closest_call(x: Any, v: Array, k: int, reach: float, horizon: float) -> float:
+    """A bound below what is left of the safe distance of every pair on the straight way of v until `horizon`.
 
-    No distance falls faster than the fastest points of its two bodies move, and a point that a joint carries moves at
-    most at the speed of the joint's origin plus its angular speed times the distance.
+    No distance falls faster than the fastest points of its two bodies move. A point that a joint carries moves at most
+    at the speed of the joint's origin plus its angular speed times the distance. It comes at most s h + ½ a h² far in
+    the time h, if it starts at speed s and its acceleration stays below a; at constant joint rates that is at most
+    Ω² R + 2 Ω V, with the sums Ω of the angular and V of the linear rates of the joints that carry it and the longest
+    lever R.
 
     Args:
         x: reads what the tick found, and joint_velocities; writes the speeds of the joints.
+        v: velocity (n,), that of joint_velocities.
         k: number of near pairs.
         reach: surface distance below which a pair is near; all others are at least so far apart [m].
-        horizon: [s].
+        horizon: h [s].
 
     Returns:
-        A bound below the least of distance - hold [m] on the way; NaN where there is one.
+        Least of distance - hold [m] on the way, or less; NaN where there is one.
     """
+    rates = np.abs(v)
+    turning = np.dot(x.turning, rates).max()
+    sliding = np.dot(x.sliding, rates).max() if x.slides else 0.0
+    bend = horizon * horizon * turning * (turning * x.lever + 2.0 * sliding)  # of both bodies: twice ½ a h²
     np.multiply(x.joint_velocities, x.joint_velocities, out=x.squares)
     np.add.reduce(x.squares_by_kind, axis=2, out=x.linear_angular)
     np.sqrt(x.linear_angular, out=x.linear_angular)
@@ -257,15 +266,15 @@ def closest_call(x: Any, k: int, reach: float, horizon: float) -> float:
     x.joint_speeds += x.linear_speed
     fastest = x.joint_speeds.max()
     fastest_two = (fastest + max(fastest, x.speeds[len(x.joint_speeds) :].max(initial=0.0))) * horizon
-    others = reach + x.offset - x.hold - fastest_two
+    others = reach + x.offset - x.hold - fastest_two - bend
     if not k:
         return float(others)
     d = x.d[:k]
-    least = d.min() - x.hold - fastest_two
+    least = d.min() - x.hold - fastest_two - bend
     if least <= 0.0:  # look closer
         closing = np.add.reduce(x.speeds[x.carriers[x.near[:k]]], axis=1)
         closing *= horizon
-        least = (d - closing).min() - x.hold
+        least = (d - closing).min() - x.hold - bend
     return float(min(least, others)) if least == least else math.nan
 
 

@@ -24,8 +24,9 @@ class Qp:
     measuring λ from v0 rather than from 0 leaves tracking free of bias.
 
     Where no velocity meets everything, margins give way, then acceleration limits, then contact, as little as they must
-    and the deepest threat least (`solvers.relaxation`), by daqp whatever the back end. An answer counts only if it verifies: a back end
-    that fails or lies is replaced by daqp for that tick, and where that fails too, the robot is told to stop.
+    and the deepest threat least (`solvers.relaxation`), by daqp whatever the back end. An answer counts only if it
+    verifies: a back end that fails or lies is replaced by daqp for that tick, and where that fails too, the robot is
+    told to stop.
     """
 
     bounded = True
