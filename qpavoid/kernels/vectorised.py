@@ -12,6 +12,7 @@ import numpy as np
 from scipy.linalg.lapack import dposv
 
 from qpavoid.kernels.layout import RowLayout
+from qpavoid.kernels.workspace import Rows, Workspace
 from qpavoid.problem import Array, IntArray
 
 BRAKING_SHARE = 0.5
@@ -26,58 +27,6 @@ _SKEW = np.zeros((3, 9))
 _SKEW[2, [1, 3]] = 1.0, -1.0
 _SKEW[1, [2, 6]] = -1.0, 1.0
 _SKEW[0, [5, 7]] = 1.0, -1.0
-
-
-class Workspace:
-    """A layout as attributes, with scratch memory and views: a tick allocates and slices as little as it can."""
-
-    def __init__(self, layout: RowLayout) -> None:
-        for name, value in layout._asdict().items():
-            setattr(self, name, value)
-        (rows, nv), frames, pairs = layout.A.shape, len(layout.targets), len(layout.near)
-        split = 3 * frames
-        # numbers as arrays: a ufunc takes them in half the time
-        self.damping2, self.rate_, self.quarter = (
-            np.array([value]) for value in (layout.damping**2, layout.rate, 0.5 * np.pi)
-        )
-        self.offset_, self.hold_, self.d1_ = (np.array([value]) for value in (layout.offset, layout.hold, layout.d1))
-        self.gain_, self.recovery_, self.zero = (np.array([v]) for v in (layout.row_gain, layout.recovery, 0.0))
-        self.blend = np.array([0.5 * np.pi / (layout.d2 - layout.d1)])
-        self.gain_column = layout.gain[:, None]
-        self.here = layout.poses[:, 9:]
-        self.turned = layout.poses[:, :9].reshape(-1, 3, 3)
-        self.position, self.rotation = layout.targets[:, :3], layout.targets[:, 3:12].reshape(-1, 3, 3)
-        self.linear, self.angular = layout.targets[:, 12:15], layout.targets[:, 15:]
-        self.moments = layout.screws.reshape(-1, 3, 6)[:frames, :, 3:]
-        self.wanted, self.wanted_turns = layout.b[:split].reshape(-1, 3), layout.b[split:].reshape(-1, 3)
-        self.asked = layout.b.reshape(-1, 3)
-        self.every_turns = len(layout.turns) == frames
-        self.capped = bool(np.isfinite(layout.cap).any())
-        self.gram = np.empty((rows, rows))
-        self.gram_diagonal = self.gram.ravel()[:: rows + 1]
-        self.over = np.empty(2 * nv + pairs)
-        self.over_upper, self.over_lower = self.over[:nv], self.over[nv : 2 * nv]
-        self.was_moving = True
-        self.screw_columns = np.empty((6, pairs))
-        self.scratch = np.empty((3, pairs))
-        joints = len(layout.joint_velocities)
-        self.slides = bool(layout.sliding.any())
-        self.squares, self.linear_angular = np.empty((joints, 6)), np.empty((joints, 2))
-        self.squares_by_kind = self.squares.reshape(-1, 2, 3)
-        self.linear_speed, self.angular_speed = self.linear_angular[:, 0], self.linear_angular[:, 1]
-        self.joint_speeds = layout.speeds[:joints]
-        # every joint has one coordinate and position limits: bounds are made in place, the lower and upper ones at once
-        self.plain = np.array_equal(layout.q_index, np.arange(nv)) and np.array_equal(layout.v_index, np.arange(nv))
-        self.q_limits = np.stack((layout.q_lower, layout.q_upper))
-        self.room = np.empty_like(self.q_limits)
-        self.signs = np.array([[-1.0], [1.0]])
-        self.limited_step = layout.v_step[layout.v_index]
-        self.finite_step = np.where(np.isfinite(self.limited_step), self.limited_step, 1.0)
-        self.fastest = layout.v_max[layout.v_index]
-        self.slowest, self.v_min = -self.fastest, -layout.v_max
-
-    def __getattr__(self, name: str) -> Any:  # for the type checker: the fields of the layout
-        raise AttributeError(name)
 
 
 def pack(layout: RowLayout) -> Workspace:
@@ -163,19 +112,18 @@ def distance_rows(x: Any, pairs: IntArray, reach: float, moving: bool) -> int:
     k = len(near)
     if not k:
         return 0
-    x.near[:k] = near
-    closest, J, drift, screws = x.closest[:k], x.J[:k], x.drift[:k], x.screw_columns[:, :k]
-    results.take(near, axis=0, out=closest, mode="clip")
-    columns = closest.T
-    normal, point = columns[1:4], columns[4:7]
-    screws[:3] = normal
-    products = point[_CYCLE]
-    products *= normal[_ANTICYCLE]
-    np.subtract(products[:3], products[3:], out=screws[3:])
-    np.dot(screws.T, x.J_world, out=J)
+    rows = x.rows(k)
+    rows.near[:] = near
+    results.take(near, axis=0, out=rows.closest, mode="clip")
+    rows.linear[:] = rows.normal
+    products = rows.point[_CYCLE]
+    products *= rows.normal[_ANTICYCLE]
+    np.subtract(products[:3], products[3:], out=rows.angular)
+    J = rows.J
+    np.dot(rows.screw_rows, x.J_world, out=J)
     J *= x.support.take(near, axis=0, mode="clip")
     if moving:
-        np.einsum("ij,ji->i", x.twists[x.twist_row[near]], screws, out=drift)
+        np.einsum("ij,ji->i", x.twists[x.twist_row[near]], rows.screws, out=rows.drift)
     elif x.was_moving:
         x.drift.fill(0.0)
     x.was_moving = moving
@@ -192,48 +140,58 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
     no more than a stop gives, so that the stop meets all such rows at once; of one that has to part, no more speed of
     parting than the bounds allow, and where they do not allow any yet, no harder braking.
     """
-    d, least = x.d[:k], x.least[:k]
-    np.add(x.closest[:k, 0], x.offset_, out=d)
+    rows = x.rows(k)
+    d, least, touch, share, drift = rows.d, rows.least, rows.touch, rows.share, rows.drift
+    np.add(rows.distance, x.offset_, out=d)
     if moving:
-        d -= x.margin[x.twist_row[x.near[:k]]]
+        d -= x.margin[x.twist_row[rows.near]]
     np.subtract(x.hold_, d, out=least)
+    parting = least > x.zero
+    some = np.count_nonzero(parting) > 0
     if x.switching:
-        beyond, share = x.scratch[0, :k], x.scratch[1, :k]
         np.subtract(d, x.d1_, out=share)
         share *= x.blend
-        np.maximum(share, x.zero, out=share)
+        if some:
+            np.maximum(share, x.zero, out=share)
         np.minimum(share, x.quarter, out=share)
         np.sin(share, out=share)
         share *= share
         share *= least
         # 1 - β = sin² is 0 below d1, where the row asks for recovery instead, which β does not weaken
-        np.maximum(least, x.zero, out=beyond)
-        np.add(share, beyond, out=least)
-    least *= x.gain_
+        if some:
+            np.maximum(least, x.zero, out=rows.beyond)
+            np.add(share, rows.beyond, out=least)
+            least *= x.gain_
+        else:
+            np.multiply(share, x.gain_, out=least)
+    else:
+        least *= x.gain_
     if x.accelerated:
-        with np.errstate(invalid="ignore"):  # no lever times no limit
-            braking = 0.5 * BRAKING_SHARE * np.nansum(np.abs(x.J[:k]) * x.v_step, axis=1)
-            room = np.maximum(d - x.hold, 0.0) / x.dt
-            fastest = braking - np.sqrt(braking * braking + 4.0 * braking * room)
-        np.maximum(least, fastest, out=least, where=(least < 0.0) & np.isfinite(braking))
-    np.minimum(least, x.recovery_, out=least)
-    parting = least > x.zero
+        _leave_room_to_brake(x, rows)
+    if some:
+        np.minimum(least, x.recovery_, out=least)
     if moving:
-        least -= x.drift[:k]
+        least -= drift
     if x.accelerated:
-        np.minimum(least, np.dot(x.J[:k], x.v_stop), out=least, where=~parting & (x.drift[:k] >= 0.0))
-    if np.count_nonzero(parting):
+        np.minimum(least, np.dot(rows.J, x.v_stop), out=least, where=~parting & (drift >= 0.0))
+    if some:
         with np.errstate(invalid="ignore"):  # no lever times no limit
-            most = np.nansum(np.fmax(x.J[:k] * x.lower, x.J[:k] * x.upper), axis=1)
-        coming = x.drift[:k] < 0.0
-        np.maximum(most, -x.drift[:k], out=most, where=coming)
+            most = np.nansum(np.fmax(rows.J * x.lower, rows.J * x.upper), axis=1)
+        np.maximum(most, -drift, out=most, where=drift < 0.0)
         np.minimum(least, most, out=least, where=parting)
-    touch = x.touch[:k]
     np.subtract(x.offset_, d, out=touch)
     touch *= x.gain_
     if moving:
-        touch -= x.drift[:k]
+        touch -= drift
     np.minimum(touch, least, out=touch)
+
+
+def _leave_room_to_brake(x: Any, rows: Rows) -> None:
+    with np.errstate(invalid="ignore"):  # no lever times no limit
+        braking = 0.5 * BRAKING_SHARE * np.nansum(np.abs(rows.J) * x.v_step, axis=1)
+        room = np.maximum(rows.d - x.hold, 0.0) / x.dt
+        fastest = braking - np.sqrt(braking * braking + 4.0 * braking * room)
+    np.maximum(rows.least, fastest, out=rows.least, where=(rows.least < 0.0) & np.isfinite(braking))
 
 
 def closest_call(x: Any, v: Array, k: int, reach: float, horizon: float) -> float:
@@ -256,26 +214,27 @@ def closest_call(x: Any, v: Array, k: int, reach: float, horizon: float) -> floa
         Least of distance - hold [m] on the way, or less; NaN where there is one.
     """
     rates = np.abs(v)
-    turning = np.dot(x.turning, rates).max()
-    sliding = np.dot(x.sliding, rates).max() if x.slides else 0.0
+    turning = max(np.dot(x.turning, rates).tolist())  # of a few numbers, Python's max is the quicker one
+    sliding = max(np.dot(x.sliding, rates).tolist()) if x.slides else 0.0
     bend = horizon * horizon * turning * (turning * x.lever + 2.0 * sliding)  # of both bodies: twice ½ a h²
     np.multiply(x.joint_velocities, x.joint_velocities, out=x.squares)
-    np.add.reduce(x.squares_by_kind, axis=2, out=x.linear_angular)
+    np.dot(x.squares, x.by_kind, out=x.linear_angular)
     np.sqrt(x.linear_angular, out=x.linear_angular)
     np.multiply(x.angular_speed, x.joint_reach, out=x.joint_speeds)
     x.joint_speeds += x.linear_speed
-    fastest = x.joint_speeds.max()
-    fastest_two = (fastest + max(fastest, x.speeds[len(x.joint_speeds) :].max(initial=0.0))) * horizon
-    others = reach + x.offset - x.hold - fastest_two - bend
-    if not k:
-        return float(others)
-    d = x.d[:k]
-    least = d.min() - x.hold - fastest_two - bend
-    if least <= 0.0:  # look closer
-        closing = np.add.reduce(x.speeds[x.carriers[x.near[:k]]], axis=1)
-        closing *= horizon
-        least = (d - closing).min() - x.hold - bend
-    return float(min(least, others)) if least == least else math.nan
+    speeds = x.speeds.tolist()
+    fastest, known = max(speeds[: x.joints]), sum(speeds)
+    least = reach + x.offset - x.hold - (fastest + max(speeds)) * horizon - bend
+    if k:
+        rows = x.rows(k)
+        closing = x.speeds.take(x.carriers.take(rows.near, axis=0, mode="clip"), mode="clip")
+        ways = rows.share
+        np.add(closing[:, 0], closing[:, 1], out=ways)
+        ways *= horizon
+        np.subtract(rows.d, ways, out=ways)
+        left = float(ways.min()) - x.hold - bend
+        least = min(least, left) if left == left else left
+    return float(least) if known == known else math.nan
 
 
 def rotation_vector(R: Any) -> tuple[float, float, float]:
@@ -415,14 +374,13 @@ def damped_solution(x: Any, v: Array) -> None:
 
 def tracking_shortfall(x: Any, k: int) -> float:
     """`shortfall` of v0, with the first k rows."""
-    v, over = x.v0, x.over[: 2 * len(x.v0) + k]
+    v, rows = x.v0, x.rows(k)
     np.subtract(v, x.upper, out=x.over_upper)
     np.subtract(x.lower, v, out=x.over_lower)
     if k:
-        outside = over[2 * len(v) :]
-        np.dot(x.J[:k], v, out=outside)
-        np.subtract(x.least[:k], outside, out=outside)
-    return float(over.max())
+        np.dot(rows.J, v, out=rows.outside)
+        np.subtract(rows.least, rows.outside, out=rows.outside)
+    return float(rows.over.max())
 
 
 def shortfall(v: Array, J: Array, b: Array, lower: Array, upper: Array) -> float:
