@@ -151,6 +151,8 @@ class _Cull:
             self.place(i, body.placement.rotation, body.placement.translation)
         self._pair_of = np.full((self._bodies, len(self._local)), -1, dtype=np.intp)
         self._pair_of[scene.pairs[:, 0], scene.pairs[:, 1]] = np.arange(len(scene.pairs))
+        self._reach = np.nan
+        self._within: Array = np.empty(self._pair_of.shape)
         self._found = np.zeros(len(scene.pairs), dtype=np.intp)
         self.active = np.ones(len(scene.pairs), dtype=bool)
         """(m,) which pairs are on."""
@@ -163,8 +165,12 @@ class _Cull:
 
     def switch(self, reach: float) -> IntArray:
         """Switches pairs on and off; gives those that are on, in increasing order."""
+        if reach != self._reach:
+            touching = self._radius[: self._bodies, None] + self._radius + reach
+            self._within = np.where(self._pair_of >= 0, touching**2 * (1.0 + 1e-9), -1.0)
+            self._reach = reach
         count = kernels.candidates(
-            self._query.poses, self._local, self._centers, self._radius, self._pair_of, reach, self._found
+            self._query.poses, self._local, self._centers, self._within, self._pair_of, self._found
         )
         pairs = self._found[:count]
         if pairs.tobytes() != self._last:

@@ -177,8 +177,7 @@ def spheres(seed, bodies=5, geometries=12, size=1.0, columns=12):
     """Random bounding spheres: arguments of `candidates`, and the pairs that a look at each combination finds."""
     rng = np.random.default_rng(seed)
     R, p = rotations(rng, geometries), rng.uniform(-1, 1, (geometries, 3))
-    local, radius = rng.uniform(-0.3, 0.3, (geometries, 3)), size * rng.uniform(0.1, 0.6, geometries)
-    reach = size * rng.uniform(-0.05, 0.3)
+    local, touching = rng.uniform(-0.3, 0.3, (geometries, 3)), size * rng.uniform(0.2, 1.5, (bodies, geometries))
     world = np.array([R[i] @ local[i] + p[i] for i in range(geometries)])
     pair_of = np.full((bodies, geometries), -1)
     combinations = [(i, j) for i in range(bodies) for j in range(i + 1, geometries) if rng.random() < 0.8]
@@ -187,13 +186,12 @@ def spheres(seed, bodies=5, geometries=12, size=1.0, columns=12):
     centers = np.ones((geometries, 5))
     centers[:, :3] = world
     centers[:, 4] = -np.sum(world**2, axis=1)
-    expected = sorted(
-        pair_of[i, j] for i, j in combinations if np.linalg.norm(world[i] - world[j]) <= radius[i] + radius[j] + reach
-    )
+    expected = sorted(pair_of[i, j] for i, j in combinations if np.linalg.norm(world[i] - world[j]) <= touching[i, j])
+    within = np.where(pair_of >= 0, touching**2, -1.0)
     left = centers.copy()
     left[:bodies, [0, 1, 2, 4]] = np.nan  # to be overwritten
     found = np.full(len(combinations), -7)
-    return [poses_of(R, p, columns), local, left, radius, pair_of, reach, found], expected, centers
+    return [poses_of(R, p, columns), local, left, within, pair_of, found], expected, centers
 
 
 def found_by(kernels, args):
@@ -214,23 +212,23 @@ def test_candidates_are_the_pairs_whose_spheres_are_within_reach(kernels, seed):
 def test_candidates_none_one_and_all(kernels):
     assert found_by(kernels, spheres(0, size=0.0)[0]) == []
     args, _, _ = spheres(1)
-    args[5] = np.inf
+    args[3][args[4] >= 0] = np.inf
     assert found_by(kernels, args) == list(range((args[4] >= 0).sum()))
     args, _, _ = spheres(1)
     args[4][:] = np.where(args[4] == 3, 0, -1)
-    args[5] = np.inf
+    args[3][:] = np.where(args[4] >= 0, np.inf, -1.0)
     assert found_by(kernels, args) == [0]
 
 
 def test_candidates_include_spheres_that_just_touch(kernels):
-    """3-4-5 triangles: radii and reach of 0.5 m together touch, and those that miss by 1e-9 do not."""
+    """3-4-5 triangles: 25e-2 is within 25e-2 (1 + 1e-9), and not within 25e-2 (1 - 1e-9)."""
     world = np.array([[0.0, 0, 0], [0.3, 0.4, 0], [0, -0.3, 0.4], [0.4, 0, -0.3]])
     poses = poses_of(np.array([np.eye(3)] * 4), world)
-    for share, expected in ((1.0, [0, 1, 2]), (1.0 - 1e-9, [])):
+    for sign, expected in ((1, [0, 1, 2]), (-1, [])):
         centers = np.hstack((world, np.ones((4, 1)), -np.sum(world**2, axis=1, keepdims=True)))
-        radius = share * np.array([0.1, 0.15, 0.15, 0.15])
+        within = np.array([[-1.0, *[0.25 * (1 + sign * 1e-9)] * 3]])
         pair_of, found = np.array([[-1, 0, 1, 2]]), np.full(3, -7)
-        args = [poses, np.zeros((4, 3)), centers, radius, pair_of, share * 0.25, found]
+        args = [poses, np.zeros((4, 3)), centers, within, pair_of, found]
         assert found_by(kernels, args) == expected
 
 

@@ -50,9 +50,7 @@ def pack(layout: RowLayout) -> Any:
 
 
 @compiled
-def candidates(
-    poses: Array, local: Array, centers: Array, radius: Array, pair_of: IntArray, reach: float, found: IntArray
-) -> int:
+def candidates(poses: Array, local: Array, centers: Array, within: Array, pair_of: IntArray, found: IntArray) -> int:
     """See `vectorised.candidates`."""
     bodies, geometries = pair_of.shape
     for i in range(bodies):
@@ -66,10 +64,9 @@ def candidates(
     for i in range(bodies):
         for j in range(geometries):  # free of branches, so that it becomes vector instructions
             dx, dy, dz = x[j] - x[i], y[j] - y[i], z[j] - z[i]
-            within = radius[i] + reach + radius[j]
-            near[j] = dx * dx + dy * dy + dz * dz <= within * within * (1.0 + 1e-9)
+            near[j] = dx * dx + dy * dy + dz * dz <= within[i, j]
         for j in range(geometries):
-            if near[j] and pair_of[i, j] >= 0:
+            if near[j]:
                 found[count] = pair_of[i, j]
                 count += 1
     return count

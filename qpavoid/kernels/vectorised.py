@@ -34,9 +34,7 @@ def pack(layout: RowLayout) -> Workspace:
     return Workspace(layout)
 
 
-def candidates(
-    poses: Array, local: Array, centers: Array, radius: Array, pair_of: IntArray, reach: float, found: IntArray
-) -> int:
+def candidates(poses: Array, local: Array, centers: Array, within: Array, pair_of: IntArray, found: IntArray) -> int:
     """Pairs whose bounding spheres are within reach of each other.
 
     Args:
@@ -44,10 +42,9 @@ def candidates(
         local: centres of their bounding spheres in their own frames (g, 3) [m].
         centers: the same in the world, as rows [c, 1, -|c|²] (g, 5) [m]; those of the b bodies of the robot, which
             come first, are overwritten.
-        radius: of the spheres (g,) [m].
-        pair_of: index of the pair of each combination (b, g), increasing along the rows, one after the other;
-            negative where there is none.
-        reach: distance between spheres up to which a pair counts [m].
+        within: squared distance of centres up to which each combination counts (b, g) [m²]; negative where there is no
+            pair.
+        pair_of: index of the pair of each combination (b, g), increasing along the rows, one after the other.
         found: overwritten with the indices of these pairs, increasing (m,).
 
     Returns:
@@ -57,12 +54,8 @@ def candidates(
     body = centers[:bodies]
     body[:, :3] = np.matmul(local[:bodies, None], poses[:bodies, :9].reshape(-1, 3, 3))[:, 0] + poses[:bodies, 9:]
     np.einsum("ij,ij->i", body[:, :3], -body[:, :3], out=body[:, 4])
-    within = (radius[:bodies, None] + reach) + radius
-    within *= within
-    within *= 1.0 + 1e-9
     # 2 a·c - |a|² - |c|² >= -within, the left side as one matrix product
-    within += (body[:, _SWAPPED] * _DOUBLED) @ centers.T
-    pairs = pair_of[(within >= 0.0) & (pair_of >= 0)]
+    pairs = pair_of[np.dot(body[:, _SWAPPED] * _DOUBLED, centers.T) + within >= 0.0]
     found[: len(pairs)] = pairs
     return len(pairs)
 
