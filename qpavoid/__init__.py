@@ -1,7 +1,7 @@
 """qpavoid: follow a planned motion and stay clear of obstacles, other arms and yourself."""
 
 from qpavoid.batch import BatchError, Steps, WorkerDied, Workers, simulate_many, steps
-from qpavoid.config import Avoidance, Limits, ScenarioConfig
+from qpavoid.config import Avoidance, Limits, Progress, ScenarioConfig, Sensing
 from qpavoid.controller import Controller, Tick
 from qpavoid.errors import ConfigError, NumericalError, QpavoidError, SolverNotInstalled, UnknownName
 from qpavoid.loading import load_scenario
@@ -10,6 +10,7 @@ from qpavoid.motion import Sample
 from qpavoid.problem import Problem, Solution, Status
 from qpavoid.robot import Robot
 from qpavoid.scene import Obstacle, Scene, build_scene
+from qpavoid.sensing import Pose
 from qpavoid.simulate import simulate
 from qpavoid.solvers import SOLVERS, Solver, make_solver
 from qpavoid.tasks import build_tasks
@@ -24,12 +25,15 @@ __all__ = [
     "Log",
     "NumericalError",
     "Obstacle",
+    "Pose",
     "Problem",
+    "Progress",
     "QpavoidError",
     "Robot",
     "Sample",
     "ScenarioConfig",
     "Scene",
+    "Sensing",
     "Solution",
     "Solver",
     "SolverNotInstalled",
