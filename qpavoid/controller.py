@@ -301,7 +301,10 @@ class Controller:
         return solution
 
     def _looked_ahead(self, q: Array, problem: Problem, solution: Solution) -> Solution:
-        checked = self._guard.check(q, solution, problem, self._assembly, self._query, self._reach)
+        def gentle() -> Array | None:
+            return self.solver.gentle(problem, solution.slack) if isinstance(self.solver, Qp) else None
+
+        checked = self._guard.check(q, solution, problem, gentle, self._assembly, self._query, self._reach)
         if checked is None:
             return solution
         v, share, short, pair = checked

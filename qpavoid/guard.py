@@ -3,9 +3,9 @@
 The rows of a problem are a linearisation, and they know only what is near. What is commanded must hold for the real
 distances, of all pairs, at q ⊕ v dt with obstacles moved on; and it must leave a way to stop. So every velocity is
 followed for one tick and then slowed down uniformly, as the accelerations and joint limits allow, and the distances
-along that way are computed anew. Where it comes too near, it is drawn back towards the stop of this tick, whose way was
-looked at one tick ago. By induction a stop that was found clear is always at hand, as long as obstacles do what they
-were last seen to do, for one tick.
+along that way are computed anew. Where it comes too near, a solution that moves the joints less is tried, whose way
+bends less; and that is drawn back towards the stop of this tick, whose way was looked at one tick ago. By induction a
+stop that was found clear is always at hand, as long as obstacles do what they were last seen to do, for one tick.
 
 Most ticks need none of this: where no body moves fast enough to use up what is left of a distance before the robot
 could stop, the velocity is clear as it is (`kernels.vectorised.closest_call`, with the bound and its proof).
@@ -13,6 +13,7 @@ could stop, the velocity is clear as it is (`kernels.vectorised.closest_call`, w
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import floor
 from typing import NamedTuple
 
@@ -40,6 +41,8 @@ _MOST_POSES = 48
 """Poses that are looked at along one way, about."""
 _MOST_TICKS = 200
 """Ticks of a stop that are followed."""
+_PATIENCE = 0.1
+"""For how long a speed that a row misses counts, where nothing is clear: a stop lets an obstacle come on [s]."""
 _SHARES = (0.75, 0.5, 0.25, 0.0)
 """Shares of the velocity, the rest being the stop, that are tried where it leads too near."""
 
@@ -91,7 +94,14 @@ class Guard:
         self._samples[index] = sample
 
     def check(
-        self, q: Array, solution: Solution, problem: Problem, assembly: Assembly, query: DistanceQuery, reach: float
+        self,
+        q: Array,
+        solution: Solution,
+        problem: Problem,
+        gentle: Callable[[], Array | None],
+        assembly: Assembly,
+        query: DistanceQuery,
+        reach: float,
     ) -> Checked | None:
         """None where the way of a solution's velocity is clear, else as much of it as can be had.
 
@@ -101,11 +111,13 @@ class Guard:
             q: configuration (nq,).
             solution: the law's.
             problem: what it is a solution of.
+            gentle: gives another solution that moves the joints less, if there is one.
             assembly: of this tick.
             query: distances of this tick.
             reach: surface distance up to which they were looked for [m].
         """
-        v, v_stop, near = solution.v, problem.v_stop, problem.avoidance.pair
+        v, v_stop, rows = solution.v, problem.v_stop, problem.avoidance
+        near = rows.pair
         horizon = self._dt + 0.5 * self._stopping(v)
         self._kinematics.move(q, v)
         if assembly.closest_call(v, len(near), reach, horizon) > 0.0:
@@ -119,14 +131,17 @@ class Guard:
         worst, pair = self._worst(q, v, query, gap, speed)
         if worst >= 0.0:
             return None
-        best = Checked(v, 1.0, -worst, pair)
-        for share in _SHARES:
-            blend = v_stop + share * (v - v_stop)
+        best, price = Checked(v, 1.0, -worst, pair), -worst
+        straight = gentle()
+        full = v if straight is None else straight
+        for share in _SHARES if straight is None else (1.0, *_SHARES):
+            blend = v_stop + share * (full - v_stop)
             worst, pair = self._worst(q, blend, query, gap, speed)
             if worst >= 0.0:
                 return Checked(blend, share, 0.0, -1)
-            if -worst < best.short:
-                best = Checked(blend, share, -worst, pair)
+            missed = np.max(rows.b - rows.J @ blend - (0.0 if solution.slack is None else solution.slack), initial=0.0)
+            if _PATIENCE * missed - worst < price:
+                best, price = Checked(blend, share, -worst, pair), _PATIENCE * missed - worst
         return best
 
     def _place_obstacles(self, margin: Array) -> None:

@@ -15,6 +15,9 @@ from qpavoid.solvers.backends import make_backend, solve_daqp
 from qpavoid.solvers.reasons import what_gave_way
 from qpavoid.solvers.relaxation import closest, relax
 
+_GENTLE = 1.0
+"""λ of a solution that moves the joints little [(rad/s)⁻²]."""
+
 
 class Qp:
     """min ‖A (v - v0)‖² + λ ‖v - v0‖²  s.t.  J v >= b,  lower <= v <= upper.
@@ -56,6 +59,24 @@ class Qp:
             if v is not None:
                 return Solution(v)
         return self._relaxed(P, q, problem)
+
+    def gentle(self, problem: Problem, slack: Array | None) -> Array | None:
+        """A solution with rows and bounds as they were met, that counts joint speeds as much as the task's.
+
+        The usual one may send joints through the null space of the task at full speed for a few mm/s of a row; how the
+        distances then change within a tick, no row knows.
+
+        Args:
+            problem: rows and bounds.
+            slack: what rows gave way (k,) [m/s].
+
+        Returns:
+            (nv,), or None where there is none.
+        """
+        rows = problem.avoidance
+        least = rows.b if slack is None else rows.b - slack
+        P, q = kernels.projection_cost(problem.tracking.A, _GENTLE, tracking_velocity(problem))
+        return closest(solve_daqp, P, q, rows.J, least, problem.lower, problem.upper)
 
     def _relaxed(self, P: Array, q: Array, problem: Problem) -> Solution:
         rows = problem.avoidance
