@@ -303,9 +303,19 @@ def test_qp_has_no_avoidable_collision():
     assert all(trial.disagreement < 1e-6 and trial.drift < 1e-6 and not trial.failure for trial in found)
 
 
-@pytest.mark.xfail(strict=False, raises=AssertionError, reason="found by the campaign, not yet explained")
-@pytest.mark.parametrize("seed", [26, 99, 100, 122])  # and 23 and 30, which are slow
-def test_qp_collisions_that_were_found(seed):
+@pytest.mark.parametrize("seed", [13, 79, 99, 122, 912, 957])
+def test_qp_collisions_that_were_found_and_mended(seed):
+    """Margins bought with jumps of a wrist, ways that bend, a stop that let an obstacle come on."""
+    (trial,) = trials(seed, ("qp",))
+    assert not trial.avoidable, trial.judged
+
+
+TRAPS = "several obstacles close in on a robot that follows its task until it is too late to flee"
+
+
+@pytest.mark.xfail(strict=False, raises=AssertionError, reason=TRAPS)
+@pytest.mark.parametrize("seed", [26, 100])  # and more, in bench/results/safety.md
+def test_qp_collisions_that_only_giving_up_the_task_avoids(seed):
     (trial,) = trials(seed, ("qp",))
     assert not trial.avoidable, trial.judged
 
