@@ -37,6 +37,7 @@ class Assembly:
         """Lays the memory out; see `Controller` for the arguments."""
         pairs, nv = len(scene.pairs), scene.robot.model.nv
         turning, sliding = chains(scene.robot.model)
+        joint_reach = query.joint_reach()
         self._layout = RowLayout(
             J_world=kinematics.J,
             frame_poses=kinematics.frame_poses,
@@ -47,7 +48,7 @@ class Assembly:
             twist_row=query.twist_row,
             margin=query.margin,
             joint_velocities=kinematics.joint_velocities,
-            joint_reach=query.joint_reach(),
+            joint_reach=joint_reach,
             carriers=query.carriers(),
             turning=turning,
             sliding=sliding,
@@ -61,7 +62,7 @@ class Assembly:
             touch=np.zeros(pairs),
             **limit_layout(bounds, limits.position_gain, dt),
             v0=np.zeros(nv),
-            lever=longest_lever(scene.robot.model, query.joint_reach()),
+            lever=longest_lever(scene.robot.model, joint_reach),
             damping=damping,
             **row_form(avoidance),
         )

@@ -89,7 +89,6 @@ class Controller:
         self._progress = ProgressWatch(progress or Progress(), dt, scene.pair_names)
         self._reach = self.avoidance.d2 - self.avoidance.offset
         self._bounds = scene.robot.bounds().within(self.limits)
-        self._verifies = isinstance(self.solver, Qp)
         self._q_last = scene.robot.home.copy()
         self._assembly = Assembly(
             scene, self.tasks, self._bounds, self._kinematics, self._query, self.avoidance,
@@ -291,7 +290,7 @@ class Controller:
                 v, change = saturate(v, problem.lower, problem.upper, self._bounds.velocity)
                 return solution._replace(v=v, saturation=change)
             return solution
-        if not self._verifies:
+        if not isinstance(self.solver, Qp):
             met = solution.status is Status.SOLVED
             limits = (problem.lower, problem.upper) if met else (problem.hard_lower, problem.hard_upper)
             v = np.clip(v, *limits)
@@ -310,10 +309,10 @@ class Controller:
         v, share, short, pair = checked
         if short <= TOLERANCE:
             return solution._replace(v=v, share=share)
+        names = " - ".join(self.scene.pair_names[pair])
         if short != short:
-            names = " - ".join(self.scene.pair_names[pair])
             return _stop(problem, (*solution.reasons, f"{names}: no distance can be told on the way ahead"))
-        reason = f"{' - '.join(self.scene.pair_names[pair])}: comes {1e3 * short:.1f} mm too near"
+        reason = f"{names}: comes {1e3 * short:.1f} mm too near"
         status = solution.status if solution.status is Status.STOPPED else Status.RELAXED
         return solution._replace(v=v, share=share, status=status, reasons=(*solution.reasons, reason))
 

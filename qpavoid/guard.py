@@ -24,7 +24,7 @@ from qpavoid.assembly import Assembly
 from qpavoid.kernels.vectorised import speed_to_stop
 from qpavoid.kinematics import ForwardKinematics
 from qpavoid.limits import JointBounds
-from qpavoid.motion import Sample
+from qpavoid.motion import Sample, moved_on
 from qpavoid.problem import Array, Problem, Solution
 from qpavoid.proximity import DistanceQuery
 from qpavoid.scene import Scene
@@ -146,11 +146,8 @@ class Guard:
 
     def _place_obstacles(self, margin: Array) -> None:
         """Puts the obstacles where they will be at the end of the tick."""
-        dt = self._dt
         for index, sample in self._samples.items():
-            turned = pin.exp3(dt * sample.angular) @ sample.rotation if sample.angular.any() else sample.rotation
-            ahead = sample._replace(position=sample.position + dt * sample.linear, rotation=turned)
-            self._ahead.place_obstacle(index, ahead)
+            self._ahead.place_obstacle(index, moved_on(sample, self._dt))
         still = [i for i, sample in self._samples.items() if not sample.linear.any() and not sample.angular.any()]
         for index in still:
             del self._samples[index]

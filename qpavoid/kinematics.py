@@ -105,20 +105,15 @@ def longest_lever(model: Any, joint_reach: Array) -> float:
     """
     lever = np.zeros(model.njoints)  # from the first joint that turns to the origin of each one
     turned = np.zeros(model.njoints, dtype=bool)
-    for i, joint in enumerate(list(model.joints)):
-        if i == 0:
-            continue
+    lower, upper = np.abs(model.lowerPositionLimit), np.abs(model.upperPositionLimit)
+    for i, joint in enumerate(list(model.joints)[1:], start=1):
         parent, slides = model.parents[i], TRANSLATIONS.get(joint.shortname(), 0)
         if turned[parent]:
-            lower, upper = (limit[joint.idx_q : joint.idx_q + slides] for limit in _position_limits(model))
-            slide = float(np.sum(np.maximum(np.abs(lower), np.abs(upper))))
+            slid = slice(joint.idx_q, joint.idx_q + slides)
+            slide = float(np.maximum(lower[slid], upper[slid]).sum())
             lever[i] = lever[parent] + float(np.linalg.norm(model.jointPlacements[i].translation)) + slide
         turned[i] = turned[parent] or joint.nv > slides
     return float(np.max((lever + joint_reach)[turned], initial=0.0))
-
-
-def _position_limits(model: Any) -> tuple[Array, Array]:
-    return np.asarray(model.lowerPositionLimit), np.asarray(model.upperPositionLimit)
 
 
 def support_masks(model: Any) -> Array:

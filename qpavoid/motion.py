@@ -68,6 +68,14 @@ class Sample(NamedTuple):
         )
 
 
+def moved_on(sample: Sample, t: float) -> Sample:
+    """Where a body is t seconds later if it keeps its twist about its origin [s]."""
+    if not sample.linear.any() and not sample.angular.any():
+        return sample
+    rotation = pin.exp3(t * sample.angular) @ sample.rotation if sample.angular.any() else sample.rotation
+    return sample._replace(position=sample.position + t * sample.linear, rotation=rotation)
+
+
 class Motion(Protocol):
     """A trajectory that is known beforehand."""
 

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from qpavoid.config import Sensing
 from qpavoid.errors import NumericalError, UnknownName
 from qpavoid.loading import nearest
-from qpavoid.motion import Sample
+from qpavoid.motion import Sample, moved_on
 from qpavoid.problem import Array, as_vector
 from qpavoid.scene import Obstacle
 
@@ -144,18 +144,14 @@ class Obstacles:
         return _Track(Sample(what.position, what.rotation, linear, angular), estimated=True)
 
     def _predicted(self, index: int, track: _Track, notes: list[str], stop: list[str]) -> Seen:
-        name, sample, config, age = self._obstacles[index].name, track.sample, self._config, track.age * self._dt
-        moved = sample
-        if sample.linear.any() or sample.angular.any():
-            turned = pin.exp3(age * sample.angular) @ sample.rotation
-            moved = sample._replace(position=sample.position + age * sample.linear, rotation=turned)
+        name, config, age = self._obstacles[index].name, self._config, track.age * self._dt
         margin = 0.0
         if config.stale_after is not None and age > config.stale_after:
             margin = config.margin_growth * (age - config.stale_after)
             notes.append(f"{name}: not seen for {age:.3f} s, margin {1e3 * margin:.0f} mm")
             if config.stop_after is not None and age > config.stop_after:
                 stop.append(f"{name}: not seen for {age:.3f} s")
-        return Seen(index, moved, margin)
+        return Seen(index, moved_on(track.sample, age), margin)
 
 
 _SHAPES = {"position": (3,), "rotation": (3, 3), "linear": (3,), "angular": (3,)}
