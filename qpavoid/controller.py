@@ -20,7 +20,7 @@ from qpavoid.kinematics import ForwardKinematics, Kinematics
 from qpavoid.limits import saturate
 from qpavoid.loading import nearest
 from qpavoid.motion import Sample
-from qpavoid.problem import Array, Problem, Proximity, Solution, State, Status, as_vector, require_finite
+from qpavoid.problem import Array, Problem, Proximity, Solution, State, Status, as_vector, not_finite, require_finite
 from qpavoid.progress import ProgressWatch
 from qpavoid.proximity import DistanceQuery
 from qpavoid.robot import Robot
@@ -230,20 +230,20 @@ class Controller:
             if isfinite(np.vdot(v, v)):
                 self._assembly.remember(v)
             else:
-                faults = (_not_finite("v", v),)
+                faults = (not_finite("v", v),)
         try:
             known = isfinite(np.vdot(q, q) + t)
         except TypeError:
             raise NumericalError(f"t: not a number: {t!r:.60}") from None
         if not known:
             if not isfinite(np.vdot(q, q)):
-                faults += (_not_finite("q", q),)
+                faults += (not_finite("q", q),)
                 q = self._expected()
             if not isfinite(t):
                 faults, t = (*faults, f"t: {t}"), 0.0
         self._q_last[:] = q
         if desired is not None and not isfinite(np.vdot(desired, desired)):
-            faults += (_not_finite("v_desired", desired),)
+            faults += (not_finite("v_desired", desired),)
             desired = np.zeros(self._v_shape)
         samples = self._targets(t, targets)
         observed = self._obstacles.observe(t, obstacles)
@@ -333,11 +333,6 @@ class Controller:
 
 def _stop(problem: Problem, reasons: tuple[str, ...]) -> Solution:
     return Solution(problem.v_stop.copy(), Status.STOPPED, reasons)
-
-
-def _not_finite(name: str, value: Array) -> str:
-    bad = np.flatnonzero(~np.isfinite(value)).tolist()
-    return f"{name}: NaN or infinity at index {', '.join(map(str, bad[:5]))}" if bad else f"{name}: absurdly large"
 
 
 def _copied(value: Any) -> Any:

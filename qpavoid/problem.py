@@ -221,6 +221,11 @@ def require_finite(name: str, value: Any, shape: tuple[int, ...]) -> Array:
     """
     array = as_vector(name, value, shape)
     if not np.isfinite(array).all():
-        bad = ", ".join(str(i) for i in np.argwhere(~np.isfinite(array)).ravel()[:5])
-        raise NumericalError(f"{name}: NaN or infinity at index {bad}")
+        raise NumericalError(not_finite(name, array))
     return array
+
+
+def not_finite(name: str, array: Array) -> str:
+    """What is wrong with an array whose sum of squares is not finite; names the argument and where."""
+    bad = np.argwhere(~np.isfinite(array)).ravel()[:5].tolist()
+    return f"{name}: NaN or infinity at index {', '.join(map(str, bad))}" if bad else f"{name}: absurdly large"

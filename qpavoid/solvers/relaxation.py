@@ -5,8 +5,8 @@ margins are restored as far as that allows, in the same order. Acceleration limi
 touch otherwise: given up for margins, a few mm/s cost jumps of a joint with a short lever between its velocity limits.
 Position and velocity limits never give way.
 
-Only a tick that has no safe velocity comes here, so its QPs are solved cold and one after the other; a few hundred
-microseconds buy an answer that gives up no more than it must.
+Only a tick that has no safe velocity comes here, so its QPs are solved cold and one after the other: such a tick takes
+longer, for an answer that gives up no more than it must.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def _least_excess(P: Array, q: Array, x: Problem, least: Array, backend: Backend
     lower = np.concatenate((x.hard_lower, np.zeros(n)))
     upper = np.concatenate((x.hard_upper, np.full(n, np.inf)))
     answer = None
-    for small in (_SMALL, 1e2 * _SMALL, 1e3 * _SMALL):  # daqp fails on one in seven of the first
+    for small in (_SMALL, 1e2 * _SMALL, 1e3 * _SMALL):  # daqp fails on some of the first
         hessian[:n, :n], hessian[n:, n:] = small * P, np.diag(1.0 / room**2)
         answer = closest(backend, hessian, np.concatenate((small * q, np.zeros(n))), G, b, lower, upper)
         if answer is not None:
