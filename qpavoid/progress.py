@@ -9,7 +9,6 @@ the two and a an axis that is chosen once, so that the motion leads round on one
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -33,15 +32,6 @@ _CALM = 3.0
 """Time without anything in the way after which they may be tried again [s]."""
 _EVERY = 5
 """Ticks from one look at the progress to the next."""
-
-
-class Obstruction(NamedTuple):
-    """A pair in the way."""
-
-    pair: int
-    """Its number in the scene."""
-    force: float
-    """How much faster the task would have it close than its row allows [m/s]."""
 
 
 @dataclass
@@ -69,7 +59,7 @@ class ProgressWatch:
         """Forgets everything."""
         self._clock, self._without, self._tried, self._calm, self._last = 0, 0, 0, 0, -1
         self._way: _Way | None = None
-        self._culprits: list[Obstruction] = []
+        self._culprits: list[int] = []
 
     def redirect(self, problem: Problem, proximity: Proximity, assembly: Assembly, solver: Solver) -> Problem:
         """The problem to solve: as it is, or with the tool sent round what blocks it."""
@@ -80,8 +70,8 @@ class ProgressWatch:
         if way is None:
             if not self.blocked or not self._culprits:
                 return problem
-            if self._culprits[0].pair != self._last:
-                self._last, self._tried = self._culprits[0].pair, 0
+            if self._culprits[0] != self._last:
+                self._last, self._tried = self._culprits[0], 0
             if self._tried >= _MOST_TRIES:
                 return problem
             way = self._begin(problem, proximity, assembly, solver, detour)
@@ -126,7 +116,7 @@ class ProgressWatch:
         if not self.blocked:
             return ()
         self._culprits = _culprits(problem, solution.v)
-        lines = [f"blocked by {self._names[c.pair][1]} at {self._names[c.pair][0]}" for c in self._culprits]
+        lines = [f"blocked by {self._names[pair][1]} at {self._names[pair][0]}" for pair in self._culprits]
         return (*lines, *_limits(problem, solution.v)) or ("blocked by several rows together",)
 
     @property
@@ -138,7 +128,7 @@ class ProgressWatch:
         self, problem: Problem, proximity: Proximity, assembly: Assembly, solver: Solver, detour: Detour
     ) -> _Way | None:
         """The way round along which the tool gets on fastest, of several directions."""
-        pair = self._culprits[0].pair
+        pair = self._culprits[0]
         row = np.flatnonzero(proximity.pair == pair)
         if not len(row):
             return None
@@ -161,16 +151,16 @@ def _tangent(axis: Array, normal: Array) -> Array:
     return t / max(float(np.linalg.norm(t)), 1e-9)
 
 
-def _culprits(problem: Problem, v: Array) -> list[Obstruction]:
-    """Pairs whose rows bind and stand against the wanted velocity, the strongest first."""
+def _culprits(problem: Problem, v: Array) -> list[int]:
+    """Numbers of the pairs whose rows bind and stand against the wanted velocity, the strongest first."""
     rows = problem.avoidance
     against = rows.b - rows.J @ problem.v0
     tight = (rows.J @ v - rows.b < _TIGHT) & (against > 0.0)
     if not tight.any():  # a law that is not made of rows: the nearest of the pairs that the task would have close
         tight = (rows.J @ problem.v0 < -_TIGHT) & (rows.d < rows.d2)
         tight &= rows.d <= np.min(rows.d, where=tight, initial=np.inf)
-    found = [Obstruction(int(rows.pair[i]), float(against[i])) for i in np.flatnonzero(tight)]
-    return sorted(found, key=lambda obstruction: -obstruction.force)
+    found = np.flatnonzero(tight)
+    return [int(pair) for pair in rows.pair[found[np.argsort(-against[found], kind="stable")]]]
 
 
 def _limits(problem: Problem, v: Array) -> list[str]:
