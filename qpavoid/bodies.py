@@ -107,7 +107,7 @@ def enclosing_capsule(geometry: Any) -> CapsuleFit:
         return CapsuleFit(np.zeros(3), np.eye(3), geometry.radius, 0.0)
     if isinstance(geometry, coal.Capsule):
         return CapsuleFit(np.zeros(3), np.eye(3), geometry.radius, 2.0 * geometry.halfLength)
-    points = _vertices(geometry)
+    points = hull_points(geometry)
     return cached("capsule", points, lambda: fit_capsule(points), _pack_fit, _unpack_fit)
 
 
@@ -140,7 +140,12 @@ def _convex_hull(mesh: Any) -> tuple[Any, Any]:
 
 
 def _run_qhull(mesh: Any) -> Any:
-    mesh.buildConvexHull(True, "Qt")
+    try:
+        mesh.buildConvexHull(True, "Qt")
+    except RuntimeError:
+        # a corner with more than 255 neighbours, as where a round flat face is cut into a fan of triangles: qhull's
+        # other way with flat faces moves corners by rounding errors and makes no fans
+        mesh.buildConvexHull(True, "QJ")
     return mesh.convex
 
 
@@ -170,7 +175,7 @@ _THINNEST = 1e-4
 """Side of the box that stands for a flat mesh, across its plane [m]."""
 
 
-def _vertices(geometry: Any) -> Array:
+def hull_points(geometry: Any) -> Array:
     """Points whose hull encloses the shape (n, 3)."""
     if isinstance(geometry, coal.BVHModelBase):
         hull, _ = _convex_hull(geometry)  # fine meshes have a hundred times the points of their hulls

@@ -72,7 +72,7 @@ def find_scenario(name_or_path: str | Path) -> Path:
 
 
 def find_robot(name_or_path: str, folder: Path | None = None) -> Path:
-    """Path of a robot.yaml or URDF, given by shipped name or by path (relative paths: from `folder` first).
+    """Path of a robot.yaml, URDF or MJCF, given by shipped name or by path (relative paths: from `folder` first).
 
     Raises:
         ConfigError, UnknownName: there is none.
@@ -83,7 +83,7 @@ def find_robot(name_or_path: str, folder: Path | None = None) -> Path:
 
 
 def _looks_like_path(name: str) -> bool:
-    return "/" in name or "\\" in name or name.endswith((".yaml", ".yml", ".urdf"))
+    return "/" in name or "\\" in name or name.endswith((".yaml", ".yml", ".urdf", ".xml"))
 
 
 def _find(name: str, kind: str, folder: Path, pattern: str, names: list[str]) -> Path:

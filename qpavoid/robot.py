@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid.bodies import MeshWarning, check_meshes, convert_bodies, make_shape, triangle_meshes
-from qpavoid.config import Body, RobotConfig
+from qpavoid.config import Body, Hull, RobotConfig
 from qpavoid.errors import ConfigError, UnknownName
 from qpavoid.kinematics import TRANSLATIONS
 from qpavoid.limits import JointBounds
@@ -46,7 +46,7 @@ class Robot:
 
     @classmethod
     def load(cls, name_or_path: str, folder: Path | None = None) -> Robot:
-        """The robot of a shipped name, a robot.yaml or a URDF.
+        """The robot of a shipped name, a robot.yaml, a URDF or an MJCF (`.xml`).
 
         Args:
             name_or_path: what a scenario's `robot:` field says.
@@ -57,15 +57,28 @@ class Robot:
         """
         path = find_robot(name_or_path, folder)
         if path.suffix in (".yaml", ".yml"):
-            return _build(read_config(path, RobotConfig), path)
+            return cls.from_config(read_config(path, RobotConfig), path)
         return cls.from_urdf(path)
 
     @classmethod
-    def from_urdf(cls, path: str | Path, **fields: Any) -> Robot:
-        """A robot from a bare URDF.
+    def from_config(cls, config: RobotConfig, path: Path) -> Robot:
+        """A robot from what a robot.yaml says.
 
         Args:
-            path: the URDF.
+            config: its fields.
+            path: the file, from which relative paths start; named in errors.
+
+        Raises:
+            ConfigError, UnknownName: naming file, field and remedy.
+        """
+        return _build(config, path)
+
+    @classmethod
+    def from_urdf(cls, path: str | Path, **fields: Any) -> Robot:
+        """A robot from a bare URDF or MJCF.
+
+        Args:
+            path: the file.
             fields: any other field of a robot.yaml, such as `bodies="capsule"` or `root_joint="free_flyer"`.
 
         Raises:
@@ -73,7 +86,7 @@ class Robot:
         """
         path = Path(path)
         config = validate({"name": path.stem, "urdf": path.name, **fields}, RobotConfig, path)
-        return _build(config, path)
+        return cls.from_config(config, path)
 
     @property
     def joint_names(self) -> list[str]:
@@ -201,13 +214,14 @@ _MOST_BODIES = 300
 def _build(config: RobotConfig, path: Path) -> Robot:
     urdf = find_resource(config.urdf, path, "urdf")
     model = read_model(urdf, config.root_joint)
+    package_dirs = [str(path.parent / folder) for folder in config.package_dirs]
     if isinstance(config.bodies, str):
-        package_dirs = [str(path.parent / folder) for folder in config.package_dirs]
         collision = read_collision(urdf, model, package_dirs, path)
         check_meshes(collision, str(path))
         bodies = convert_bodies(collision, config.bodies)
     else:
-        bodies = _listed_bodies(config.bodies, model, path)
+        hulls = _hulls(config.bodies, lambda: read_collision(urdf, model, package_dirs, path), path)
+        bodies = _listed_bodies(config.bodies, model, hulls, path)
     if meshes := triangle_meshes(bodies):
         warnings.warn(
             f"{path}: bodies: mesh: {len(meshes)} triangle meshes such as {meshes[0]!r} cost 100 to 500 µs a pair at "
@@ -251,7 +265,24 @@ def _build(config: RobotConfig, path: Path) -> Robot:
     )
 
 
-def _listed_bodies(configs: Sequence[Body], model: Any, path: Path) -> Any:
+def _hulls(configs: Sequence[Body], read: Callable[[], Any], path: Path) -> dict[str, Any]:
+    """Hulls of the pieces of collision geometry that bodies name."""
+    wanted = {body.shape.geometry: index for index, body in enumerate(configs) if isinstance(body.shape, Hull)}
+    if not wanted:
+        return {}
+    pieces = {piece.name: piece for piece in read().geometryObjects}
+    chosen = pin.GeometryModel()
+    for name, index in wanted.items():
+        if name not in pieces:
+            raise UnknownName(
+                f"{path}: bodies.{index}.shape.geometry: no collision geometry {name!r}{nearest(name, pieces)}"
+            )
+        chosen.addGeometryObject(pieces[name])
+    check_meshes(chosen, str(path))
+    return {hull.name: hull for hull in convert_bodies(chosen, "convex").geometryObjects}
+
+
+def _listed_bodies(configs: Sequence[Body], model: Any, hulls: Mapping[str, Any], path: Path) -> Any:
     bodies = pin.GeometryModel()
     for index, body in enumerate(configs):
         if not model.existFrame(body.frame):
@@ -262,10 +293,18 @@ def _listed_bodies(configs: Sequence[Body], model: Any, path: Path) -> Any:
         frame_id = model.getFrameId(body.frame)
         frame = model.frames[frame_id]
         placement = frame.placement * pin.SE3(rpy_to_matrix(body.rpy), np.array(body.position))
-        bodies.addGeometryObject(
-            pin.GeometryObject(body.name, frame.parentJoint, frame_id, placement, make_shape(body.shape))
-        )
+        if isinstance(body.shape, Hull):
+            hull = hulls[body.shape.geometry]
+            geometry, placement = hull.geometry, placement * _in_link(hull, model)
+        else:
+            geometry = make_shape(body.shape)
+        bodies.addGeometryObject(pin.GeometryObject(body.name, frame.parentJoint, frame_id, placement, geometry))
     return bodies
+
+
+def _in_link(body: Any, model: Any) -> Any:
+    """Placement of a body in the frame of its link."""
+    return model.frames[body.parentFrame].placement.actInv(body.placement)
 
 
 def _apply_limits(config: RobotConfig, model: Any, path: Path) -> None:

@@ -1,4 +1,4 @@
-"""What a URDF must be before pinocchio reads it: it takes NaN, cycles and axes of no length without a word."""
+"""What a URDF or MJCF must be before pinocchio reads it: NaN, cycles and axes of no length pass without a word."""
 
 from __future__ import annotations
 
@@ -60,6 +60,38 @@ def check_urdf(path: Path) -> None:
             _check_joint(joint, f"joint {name!r}")
     except ValueError as fault:
         raise ConfigError(f"{path}: not a usable URDF: {fault}") from None
+
+
+def check_mjcf(path: Path) -> None:
+    """Reads an MJCF and says what is wrong with it.
+
+    Raises:
+        ConfigError: naming file, element and remedy.
+    """
+    root = read_robot_xml(path, "MJCF")
+    where = f"{path}: not a usable MJCF"
+    if root.find(".//include") is not None:
+        raise ConfigError(f"{where}: it has an <include>; save it as one file, for example with mj_saveLastXML")
+    for tag, most, what in (
+        ("body", _MOST_LINKS, "bodies"), ("joint", _MOST_MOVING, "joints"), ("geom", _MOST_SHAPES, "shapes"),
+    ):  # fmt: skip
+        found = len(root.findall(f"worldbody//{tag}"))
+        if found > most:
+            raise ConfigError(f"{where}: {found} {what}; at most {most} are read")
+    if root.find("worldbody//body") is None:
+        raise ConfigError(f"{where}: its worldbody has no body")
+    for element in root.iter():
+        for attribute, text in element.items():
+            if attribute not in ("name", "class", "childclass") and _not_finite(text):
+                raise ConfigError(f"{where}: {element.tag} {attribute}={text!r:.60}: must be finite")
+
+
+def _not_finite(text: str) -> bool:
+    """Whether a text is a list of numbers with a NaN or infinity among them."""
+    try:
+        return not all(math.isfinite(float(word)) for word in text.split())
+    except ValueError:
+        return False
 
 
 def _named(root: ET.Element, tag: str) -> dict[str, ET.Element]:
