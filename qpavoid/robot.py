@@ -39,8 +39,8 @@ class Robot:
     """Frames that are meant as tools."""
     source: str
     """File that it was read from, for messages."""
-    notes: tuple[str, ...] = ()
-    """What was decided at loading, such as pairs switched off."""
+    always_touching: tuple[tuple[str, str], ...] = ()
+    """Pairs of bodies that were switched off at loading, because they touch in every configuration."""
     acceleration: Mapping[str, float] = field(default_factory=dict)
     """Joint: largest acceleration [rad/s² or m/s²]; joints left out have no such limit."""
 
@@ -87,6 +87,11 @@ class Robot:
         path = Path(path)
         config = validate({"name": path.stem, "urdf": path.name, **fields}, RobotConfig, path)
         return cls.from_config(config, path)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was decided at loading, in words."""
+        return tuple(f"pair {a} - {b} is off: it touches in every configuration" for a, b in self.always_touching)
 
     @property
     def joint_names(self) -> list[str]:
@@ -231,7 +236,7 @@ def _build(config: RobotConfig, path: Path) -> Robot:
             stacklevel=3,
         )
     _apply_limits(config, model, path)
-    home = _set_joints(model, _middle(model), config.home, f"{path}: home")
+    home = _set_joints(model, middle(model), config.home, f"{path}: home")
     home = _set_joints(model, home, config.lock, f"{path}: lock")
     if config.lock:
         model, bodies, index = _reduce(model, bodies, list(config.lock), home)
@@ -245,10 +250,7 @@ def _build(config: RobotConfig, path: Path) -> Robot:
     add_self_pairs(model, bodies, config.disabled_pairs, str(path))
     if config.srdf is not None:
         honour_srdf(model, bodies, find_resource(config.srdf, path, "srdf"))
-    notes = [
-        f"pair {a} - {b} is off: it touches in every configuration"
-        for a, b in drop_always_touching(model, bodies, joint_bounds(model))
-    ]
+    always_touching = drop_always_touching(model, bodies, joint_bounds(model))
     for name in config.end_effectors:
         if not model.existFrame(name):
             frames = [f.name for f in model.frames]
@@ -260,7 +262,7 @@ def _build(config: RobotConfig, path: Path) -> Robot:
         home,
         tuple(config.end_effectors),
         str(path),
-        tuple(notes),
+        tuple(always_touching),
         config.limits.acceleration,
     )
 
@@ -330,8 +332,8 @@ def _joint(model: Any, name: str, where: str) -> Any:
     return model.joints[model.getJointId(name)]
 
 
-def _middle(model: Any) -> Array:
-    """Neutral configuration, with bounded joints at the middle of their range where 0 is outside it."""
+def middle(model: Any) -> Array:
+    """Neutral configuration (nq,) of a model, with bounded joints at the middle of their range where 0 is outside it."""
     q = pin.neutral(model)
     for joint in list(model.joints)[1:]:
         lower, upper = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]

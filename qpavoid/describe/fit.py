@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import coal
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from qpavoid.bodies import CapsuleFit, enclosing_capsule, fit_capsule, hull_points
+from qpavoid.bodies import CapsuleFit, enclosing_capsule, fit_capsule, hull_points, outermost
 from qpavoid.problem import Array
 
 Bodies = Literal["auto", "capsule", "capsules", "convex"]
@@ -18,9 +17,9 @@ Bodies = Literal["auto", "capsule", "capsules", "convex"]
 
 MOST = 4
 """Capsules that one piece is cut into at most."""
-GROSS = 1.6
-"""Volume of the capsules, in units of the hull's, from which `auto` takes the hull instead: a hull costs a pair twenty
-times what a capsule costs."""
+GROSS = 2.0
+"""Volume of capsules, in units of the hull's, from which `auto` takes the hull instead, although a hull costs a pair
+twenty times what a capsule costs. A capsule around a cylinder takes 1.3 to 2, around a cube 2.7."""
 WORTH = 0.15
 """Part of the volume that a further capsule must save."""
 _CUTS = np.linspace(0.2, 0.8, 7)
@@ -29,40 +28,28 @@ _COARSE = 24
 """Directions that are tried for each capsule while cuts are compared."""
 
 
-@dataclass(frozen=True)
-class PieceFit:
-    """What stands for one piece of collision geometry."""
-
-    capsules: tuple[CapsuleFit, ...]
-    """In the geometry's own frame; none where the hull, or the primitive itself, stands for it."""
-    volume: float
-    """Of all shapes together, what overlaps counted twice [m³]."""
-    hull_volume: float
-    """Of the convex hull of the piece [m³]."""
-
-
-def fit_piece(geometry: Any, how: Bodies) -> PieceFit:
-    """Shapes that enclose a coal geometry entirely.
+def fit_piece(geometry: Any, how: Bodies) -> tuple[CapsuleFit, ...]:
+    """Capsules that enclose a coal geometry entirely; none where its hull, or the primitive itself, is to stand for it.
 
     Args:
         geometry: as read from a URDF.
         how: which kind of shapes.
+
+    Returns:
+        Capsules in the geometry's own frame.
     """
-    hull = hull_volume(geometry)
+    if isinstance(geometry, coal.Sphere | coal.Capsule):
+        return (enclosing_capsule(geometry),)
     if how == "convex":
-        return PieceFit((), hull, hull)
+        return ()
     one = enclosing_capsule(geometry)
-    if how == "capsule" or isinstance(geometry, coal.Sphere | coal.Capsule):
-        return PieceFit((one,), one.volume, hull)
-    if how == "auto" and one.volume <= GROSS * hull:
-        return PieceFit((one,), one.volume, hull)
+    gross = GROSS * hull_volume(geometry)
+    if how == "capsule" or (how == "auto" and one.volume <= gross):
+        return (one,)
     if how == "auto" and not isinstance(geometry, coal.BVHModelBase | coal.ConvexBase):
-        return PieceFit((), hull, hull)  # boxes and cylinders are exact as they are
+        return ()  # boxes and cylinders are exact as they are
     several = decompose(triangles(geometry), one)
-    volume = sum(fit.volume for fit in several)
-    if how == "auto" and volume > GROSS * hull:
-        return PieceFit((), hull, hull)
-    return PieceFit(several, volume, hull)
+    return () if how == "auto" and sum(fit.volume for fit in several) > gross else several
 
 
 def decompose(surface: Array, whole: CapsuleFit, most: int = MOST) -> tuple[CapsuleFit, ...]:
@@ -91,7 +78,7 @@ def decompose(surface: Array, whole: CapsuleFit, most: int = MOST) -> tuple[Caps
 
 def _best_cut(surface: Array) -> list[tuple[Array, CapsuleFit]]:
     """The two halves with the least volume, each with its capsule."""
-    points = _extreme(surface.reshape(-1, 3))
+    points = _corners(surface)
     axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
     tried = []
     for axis in axes:
@@ -99,12 +86,12 @@ def _best_cut(surface: Array) -> list[tuple[Array, CapsuleFit]]:
         for height in low + _CUTS * (high - low):
             halves = [cut(surface, axis, height, side) for side in (-1.0, 1.0)]
             if all(len(half) for half in halves):
-                volume = sum(fit_capsule(_extreme(half.reshape(-1, 3)), _COARSE).volume for half in halves)
+                volume = sum(fit_capsule(outermost(half.reshape(-1, 3)), _COARSE).volume for half in halves)
                 tried.append((volume, halves))
     if not tried:
         return [(surface, fit_capsule(points))]
     _, halves = min(tried, key=lambda pair: pair[0])
-    return [(half, fit_capsule(_extreme(half.reshape(-1, 3)))) for half in halves]
+    return [(half, fit_capsule(_corners(half))) for half in halves]
 
 
 def cut(surface: Array, normal: Array, height: float, side: float) -> Array:
@@ -154,10 +141,9 @@ def hull_volume(geometry: Any) -> float:
         return 0.0
 
 
-def _extreme(points: Array) -> Array:
-    """The corners of the hull of points, or all of them where they are flat."""
-    if len(points) < 40:
-        return points
+def _corners(surface: Array) -> Array:
+    """The corners of the hull of a surface, or all of its points where it is flat (n, 3)."""
+    points = surface.reshape(-1, 3)
     try:
         return np.asarray(points[ConvexHull(points).vertices])
     except QhullError:

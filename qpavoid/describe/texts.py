@@ -1,0 +1,115 @@
+"""The robot.yaml and the SRDF of a description, as text."""
+
+from __future__ import annotations
+
+import os.path
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from qpavoid.config import Body
+from qpavoid.describe.add import Described
+from qpavoid.describe.sampling import NEAR
+from qpavoid.describe.srdf import MADE_BY, srdf_text
+from qpavoid.describe.written import BLANK, seal
+from qpavoid.loading import example_robot_data
+
+
+def description_files(described: Described, folder: Path) -> dict[Path, bytes]:
+    """The files of a description, sealed.
+
+    Args:
+        described: what they say.
+        folder: where they are to stand; paths in them are relative to it.
+    """
+    srdf = folder / f"{described.config.name}.srdf"
+    comment = f"{described.config.name}: {MADE_BY}; {BLANK}"
+    text = srdf_text(described.robot.model.name, comment, described.disabled, described.config.end_effectors)
+    return {
+        folder / "robot.yaml": seal(_robot_yaml(described, folder, srdf.name).encode()),
+        srdf: seal(text.encode()),
+    }
+
+
+def _robot_yaml(described: Described, folder: Path, srdf: str) -> str:
+    config = described.config
+    lines = [f"# {line}" for line in _header(described)]
+    lines += [f"name: {_flow(config.name)}", f"urdf: {_flow(_reference(Path(config.urdf), folder))}"]
+    lines.append(f"srdf: {_flow(srdf)}")
+    if config.package_dirs:
+        lines.append(f"package_dirs: {_flow([_relative(Path(path), folder) for path in config.package_dirs])}")
+    if config.root_joint != "fixed":
+        lines.append(f"root_joint: {config.root_joint}")
+    lines.append(f"end_effectors: {_flow(list(config.end_effectors))}")
+    assert not isinstance(config.bodies, str)
+    lines += ["bodies:" if config.bodies else "bodies: []"]
+    lines += _body_lines(config.bodies, described)
+    if config.disabled_pairs:
+        lines.append("disabled_pairs:   # of links that have other pairs which are watched; the rest is in the SRDF")
+        lines += [f"  - {_flow(list(pair))}" for pair in config.disabled_pairs]
+    for field, values in (("home", config.home), ("lock", config.lock)):
+        if values:
+            lines += [f"{field}:", *(f"  {_flow(joint)}: {value:g}" for joint, value in values.items())]
+    return "\n".join([*lines, ""])
+
+
+def _header(described: Described) -> list[str]:
+    counts, wishes = described.counts, described.wishes
+    honoured = "none" if described.honoured is None else described.honoured.name
+    return [
+        f"{described.config.name}: {MADE_BY}, which leaves it alone once you edit it; {BLANK}",
+        f"Bodies: {volume_line(described)}.",
+        f"Pairs: {counts['all']} in all; {counts['adjacent']} adjacent, {counts['srdf']} off in the SRDF it came with "
+        f"({honoured}), {counts['always']} always touch,",
+        f"{counts['never']} never come within {1000 * NEAR:g} mm ({wishes.samples} samples, seed {wishes.seed}, descent "
+        f"from the nearest); {counts['watched']} are watched.",
+        f"Home: least distance {1000 * described.clearance:.1f} mm."
+        if described.clearance < float("inf")
+        else "Home: no pair is watched.",
+        *described.notes,
+    ]
+
+
+def volume_line(described: Described) -> str:
+    """How many bodies there are, and what room they take beside the hulls of the meshes."""
+    bodies, hulls = (sum(volumes[i] for volumes in described.volume.values()) for i in (0, 1))
+    over = f", {bodies / hulls:.2f} times the {1000 * hulls:.2f} l of the meshes' convex hulls" if hulls > 0.0 else ""
+    return f"{len(described.config.bodies)}, {1000 * bodies:.2f} l{over}"
+
+
+def _body_lines(bodies: Sequence[Body], described: Described) -> list[str]:
+    lines, last = [], ""
+    for body in bodies:
+        fields: dict[str, Any] = {"name": body.name, "frame": body.frame, "shape": body.shape.model_dump()}
+        fields["shape"] = {key: list(v) if isinstance(v, tuple) else v for key, v in fields["shape"].items()}
+        if any(body.position):
+            fields["position"] = list(body.position)
+        if any(body.rpy):
+            fields["rpy"] = list(body.rpy)
+        taken, hull = described.volume[body.frame]
+        comment = f"   # {taken / hull:.2f} of its hull" if hull > 0.0 and body.frame != last else ""
+        lines.append(f"  - {_flow(fields)}{comment}")
+        last = body.frame
+    return lines
+
+
+def _flow(value: Any) -> str:
+    text = str(yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=10**6))
+    return text.strip().removesuffix("\n...")
+
+
+def _reference(urdf: Path, folder: Path) -> str:
+    """The URDF as a robot.yaml names it."""
+    robots = (example_robot_data() / "example-robot-data" / "robots").resolve()
+    if urdf.is_relative_to(robots):
+        return f"example-robot-data:{urdf.relative_to(robots).as_posix()}"
+    return _relative(urdf, folder)
+
+
+def _relative(path: Path, folder: Path) -> str:
+    try:
+        return Path(os.path.relpath(path, folder.resolve())).as_posix()
+    except ValueError:  # on another drive
+        return path.as_posix()
