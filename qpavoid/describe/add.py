@@ -55,6 +55,18 @@ class Wishes:
 
 
 @dataclass(frozen=True)
+class Piece:
+    """A piece of a robot's geometry, as its file has it."""
+
+    name: str
+    link: str
+    geometry: Any
+    """coal geometry."""
+    placement: Any
+    """In the frame of its link."""
+
+
+@dataclass(frozen=True)
 class Described:
     """A robot's description, with how it came about."""
 
@@ -66,8 +78,8 @@ class Described:
     """The file that it was made of."""
     wishes: Wishes
     """What the user chose."""
-    geometry: Any
-    """pinocchio geometry model of the meshes that the bodies enclose."""
+    pieces: Sequence[Piece]
+    """What the bodies enclose."""
     semantics: Semantics
     """Of the SRDF that was honoured."""
     honoured: Path | None
@@ -101,7 +113,7 @@ def describe(urdf: Path, wishes: Wishes | None = None) -> Described:
     honoured = wishes.srdf or find_srdf(urdf)
     semantics = Semantics() if honoured is None else read_srdf(honoured)
     notes: list[str] = []
-    geometry = _geometry(urdf, model, wishes, notes)
+    pieces = _pieces(urdf, model, wishes, notes)
     fields: dict[str, Any] = {
         "name": name,
         "urdf": str(urdf),
@@ -112,7 +124,7 @@ def describe(urdf: Path, wishes: Wishes | None = None) -> Described:
     given = None if honoured is None else str(honoured.resolve())
     lean: set[str] = set()
     while True:
-        fields["bodies"], volume = _bodies(geometry, model, wishes, lean)
+        fields["bodies"], volume = _bodies(pieces, wishes, lean)
         robot = Robot.from_config(RobotConfig(**fields, srdf=given), urdf)
         more = _too_fat(robot, _wished_homes(robot, semantics)[0]) - lean
         if not more:
@@ -146,7 +158,7 @@ def describe(urdf: Path, wishes: Wishes | None = None) -> Described:
         replace(watched, home=home),
         urdf,
         wishes,
-        geometry,
+        pieces,
         semantics,
         honoured,
         {**disabled, **{pair: why for pair, why in semantics.disabled.items() if _known(pair, model)}},
@@ -157,7 +169,7 @@ def describe(urdf: Path, wishes: Wishes | None = None) -> Described:
     )
 
 
-def _geometry(urdf: Path, model: Any, wishes: Wishes, notes: list[str]) -> Any:
+def _pieces(urdf: Path, model: Any, wishes: Wishes, notes: list[str]) -> list[Piece]:
     """Collision geometry; what is meant to be seen where the file has none."""
     folders = [str(folder) for folder in wishes.package_dirs]
     geometry = read_collision(urdf, model, folders, urdf)
@@ -168,7 +180,11 @@ def _geometry(urdf: Path, model: Any, wishes: Wishes, notes: list[str]) -> Any:
         else:
             notes.append("the file has no geometry at all: nothing is watched until you list `bodies`")
     check_meshes(geometry, str(urdf))
-    return geometry
+    found = []
+    for piece in geometry.geometryObjects:
+        frame = model.frames[piece.parentFrame]
+        found.append(Piece(piece.name, frame.name, piece.geometry, frame.placement.actInv(piece.placement)))
+    return found
 
 
 # --- bodies -------------------------------------------------------------------------------------------------
@@ -181,37 +197,35 @@ def _too_fat(robot: Robot, home: Array) -> set[str]:
 
 
 def _bodies(
-    geometry: Any, model: Any, wishes: Wishes, lean: Iterable[str]
+    pieces: Iterable[Piece], wishes: Wishes, lean: Iterable[str]
 ) -> tuple[list[Body], dict[str, tuple[float, float]]]:
     """Bodies of every link, and the volumes that they and the hulls take.
 
     Args:
-        geometry: pieces of all links.
-        model: pinocchio model.
+        pieces: of all links.
         wishes: which kinds of bodies.
         lean: links for which `auto` is to take what is exact.
     """
-    by_link: dict[str, list[Any]] = {}
-    for piece in geometry.geometryObjects:
-        by_link.setdefault(model.frames[piece.parentFrame].name, []).append(piece)
+    by_link: dict[str, list[Piece]] = {}
+    for piece in pieces:
+        by_link.setdefault(piece.link, []).append(piece)
     for pattern in wishes.bodies_of:
         if not any(fnmatchcase(link, pattern) for link in by_link):
             raise UnknownName(f"--bodies: no link {pattern!r} with geometry{nearest(pattern, by_link)}")
     bodies: list[Body] = []
     volume = {}
-    for link, pieces in by_link.items():
+    for link, of_link in by_link.items():
         kinds = [kind for pattern, kind in wishes.bodies_of.items() if fnmatchcase(link, pattern)]
         kind = kinds[-1] if kinds else wishes.bodies
         kind = "convex" if kind == "auto" and link in lean else kind
-        placement = model.frames[pieces[0].parentFrame].placement.inverse()
-        shapes, taken, hulls = _link_shapes(pieces, placement, kind)
+        shapes, taken, hulls = _link_shapes(of_link, kind)
         volume[link] = taken, hulls
         for index, shape in enumerate(shapes):
             bodies.append(Body(name=link if len(shapes) == 1 else f"{link}_{index}", frame=link, **shape))
     return bodies, volume
 
 
-def _link_shapes(pieces: Sequence[Any], placement: Any, kind: Bodies) -> tuple[list[dict[str, Any]], float, float]:
+def _link_shapes(pieces: Sequence[Piece], kind: Bodies) -> tuple[list[dict[str, Any]], float, float]:
     """Shapes of one link, in its frame, as fields of a `Body`; their volume, and that of the hulls of its pieces.
 
     One capsule around all pieces takes the place of several shapes where it takes no more room than they do, or, in
@@ -224,15 +238,15 @@ def _link_shapes(pieces: Sequence[Any], placement: Any, kind: Bodies) -> tuple[l
         for capsules, hull in zip(fits, hulls, strict=True)
     )
     if len(pieces) > 1 and kind != "convex":
-        points = [_moved(hull_points(piece.geometry), placement * piece.placement) for piece in pieces]
+        points = [_moved(hull_points(piece.geometry), piece.placement) for piece in pieces]
         whole = fit_capsule(np.concatenate(points))
         if whole.volume <= max(total, GROSS * sum(hulls) if kind == "auto" else 0.0):
             return [capsule_fields(whole, pin.SE3.Identity())], whole.volume, sum(hulls)
     shapes = []
     for piece, capsules in zip(pieces, fits, strict=True):
-        shapes += [capsule_fields(capsule, placement * piece.placement) for capsule in capsules]
+        shapes += [capsule_fields(capsule, piece.placement) for capsule in capsules]
         if not capsules:
-            shapes.append(_exact_fields(piece, placement * piece.placement))
+            shapes.append(_exact_fields(piece))
     return shapes, total, sum(hulls)
 
 
@@ -267,9 +281,9 @@ _DIGITS = 5
 """After the point, of lengths [m] and angles [rad] in files."""
 
 
-def _exact_fields(piece: Any, placement: Any) -> dict[str, Any]:
+def _exact_fields(piece: Piece) -> dict[str, Any]:
     """Fields of a `Body` that is a primitive as it is, or the hull of a mesh."""
-    geometry = piece.geometry
+    geometry, placement = piece.geometry, piece.placement
     if isinstance(geometry, coal.Box):
         shape: Any = Box(size=_up(2.0 * np.array(geometry.halfSide)))
     elif isinstance(geometry, coal.Cylinder):
@@ -402,8 +416,8 @@ def _locks(
         if not found:
             raise UnknownName(f"--lock: no joint {pattern!r}{nearest(pattern, names)}")
         held += found
-    mimics = {name: source for name, source in _mimics(urdf).items() if name in names}
-    coupled = [name for name in names if name in mimics or name in {source[0] for source in mimics.values()}]
+    followers = {name: source for name, source in mimics(urdf).items() if name in names}
+    coupled = [name for name in names if name in followers or name in {source[0] for source in followers.values()}]
     if coupled := [name for name in coupled if name not in held]:
         notes.append(f"held at home, because they move together (mimic): {', '.join(coupled)}")
     state = next(iter(semantics.states.values()), {})
@@ -412,12 +426,12 @@ def _locks(
     for name in [*held, *coupled]:
         if name not in start:
             raise ConfigError(f"--lock: joint {name!r} is not described by one number and cannot be held; leave it out")
-        leader, multiplier, offset = mimics.get(name, (name, 1.0, 0.0))
+        leader, multiplier, offset = followers.get(name, (name, 1.0, 0.0))
         values[name] = round(multiplier * start.get(leader, 0.0) + offset, _DIGITS)
     return values
 
 
-def _mimics(urdf: Path) -> dict[str, tuple[str, float, float]]:
+def mimics(urdf: Path) -> dict[str, tuple[str, float, float]]:
     """Joint: the one that it follows, multiplier and offset."""
     if is_mjcf(urdf):
         return {}
