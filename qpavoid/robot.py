@@ -21,7 +21,7 @@ from qpavoid.loading import find_robot, nearest, read_config, validate
 from qpavoid.motion import rpy_to_matrix
 from qpavoid.pairs import add_self_pairs, drop_always_touching, pair_array
 from qpavoid.problem import Array, IntArray
-from qpavoid.urdf import find_resource, honour_srdf, read_collision, read_model
+from qpavoid.urdf import find_resource, honour_srdf, read_collision, read_model, read_pieces
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ class Robot:
         if not self.model.existFrame(name):
             frames = [f.name for f in self.model.frames if f.type in (pin.BODY, pin.OP_FRAME)]
             raise UnknownName(f"{where}: {self.name} has no frame {name!r}{nearest(name, frames)}")
-        return int(self.model.getFrameId(name))
+        return frame_index(self.model, name)
 
     def lock(self, patterns: Sequence[str], q: Array, where: str) -> tuple[Robot, Array]:
         """The robot with some joints held where they are, as if they were fixed.
@@ -180,6 +180,11 @@ class Robot:
 
     def _joints(self) -> Iterator[tuple[str, Any]]:
         return zip(self.joint_names, list(self.model.joints)[1:], strict=True)
+
+
+def frame_index(model: Any, name: str) -> int:
+    """Index of an existing frame; that of the link where a joint has the same name."""
+    return int(model.getFrameId(name, pin.BODY) if model.existFrame(name, pin.BODY) else model.getFrameId(name))
 
 
 _ABSURD = 1e9
@@ -225,7 +230,7 @@ def _build(config: RobotConfig, path: Path) -> Robot:
         check_meshes(collision, str(path))
         bodies = convert_bodies(collision, config.bodies)
     else:
-        hulls = _hulls(config.bodies, lambda: read_collision(urdf, model, package_dirs, path), path)
+        hulls = _hulls(config.bodies, lambda: read_pieces(urdf, model, package_dirs, path), path)
         bodies = _listed_bodies(config.bodies, model, hulls, path)
     if meshes := triangle_meshes(bodies):
         warnings.warn(
@@ -268,7 +273,7 @@ def _build(config: RobotConfig, path: Path) -> Robot:
 
 
 def _hulls(configs: Sequence[Body], read: Callable[[], Any], path: Path) -> dict[str, Any]:
-    """Hulls of the pieces of collision geometry that bodies name."""
+    """Hulls of the pieces of geometry that bodies name."""
     wanted = {body.shape.geometry: index for index, body in enumerate(configs) if isinstance(body.shape, Hull)}
     if not wanted:
         return {}
@@ -292,7 +297,7 @@ def _listed_bodies(configs: Sequence[Body], model: Any, hulls: Mapping[str, Any]
             raise UnknownName(f"{path}: bodies.{index}.frame: no frame {body.frame!r}{nearest(body.frame, frames)}")
         if bodies.existGeometryName(body.name):
             raise ConfigError(f"{path}: bodies.{index}.name: {body.name!r} is given twice: names must differ")
-        frame_id = model.getFrameId(body.frame)
+        frame_id = frame_index(model, body.frame)
         frame = model.frames[frame_id]
         placement = frame.placement * pin.SE3(rpy_to_matrix(body.rpy), np.array(body.position))
         if isinstance(body.shape, Hull):

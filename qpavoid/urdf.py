@@ -14,7 +14,7 @@ from typing import Any
 import pinocchio as pin
 
 from qpavoid.errors import ConfigError
-from qpavoid.loading import example_robot_data
+from qpavoid.loading import EXAMPLES, example_robot, example_robot_data
 from qpavoid.safe_xml import read_robot_xml
 from qpavoid.urdf_check import check_mjcf, check_urdf
 
@@ -36,13 +36,9 @@ def find_resource(value: str, path: Path, field: str) -> Path:
     Raises:
         ConfigError: there is no such file.
     """
-    prefix = "example-robot-data:"
-    if value.startswith(prefix):
-        found = example_robot_data() / "example-robot-data" / "robots" / value.removeprefix(prefix)
-    else:
-        found = path.parent / value
+    found = example_robot(value) if value.startswith(EXAMPLES) else path.parent / value
     if not os.path.isfile(found):  # False where the name is one that no file can have; Path.is_file may raise
-        raise ConfigError(f"{path}: {field}: no such file {value!r}; give a path relative to this file or {prefix}PATH")
+        raise ConfigError(f"{path}: {field}: no such file {value!r}; give a path relative to this file or {EXAMPLES}PATH")
     return found
 
 
@@ -104,6 +100,12 @@ def _model_of_mjcf(mjcf: Path, root: Any) -> Any:
 def _reason(error: Exception) -> str:
     """The last part of what pinocchio says: before it comes where in its own source it was said."""
     return " ".join(str(error).split()).rpartition("message: ")[2].rstrip(".")
+
+
+def read_pieces(urdf: Path, model: Any, package_dirs: list[str], path: Path) -> Any:
+    """Collision geometry of a URDF or MJCF, or what is meant to be seen where it has none; see `read_collision`."""
+    collision = read_collision(urdf, model, package_dirs, path)
+    return collision if collision.ngeoms else read_collision(urdf, model, package_dirs, path, visual=True)
 
 
 def read_collision(urdf: Path, model: Any, package_dirs: list[str], path: Path, visual: bool = False) -> Any:

@@ -11,7 +11,10 @@ from qpavoid.config.shapes import Shape
 
 
 class Hull(Block):
-    """Convex hull of a piece of the URDF's collision geometry, where it stands in its link; primitives as they are."""
+    """Convex hull of a piece of the URDF's collision geometry, where it stands in its link; primitives as they are.
+
+    Where the URDF has no collision geometry at all, of what is meant to be seen.
+    """
 
     type: Literal["hull"] = "hull"
     geometry: str

@@ -18,14 +18,14 @@ from qpavoid.bodies import CapsuleFit, check_meshes, fit_capsule, hull_points
 from qpavoid.config import Body, Box, Capsule, Cylinder, Hull, RobotConfig, Sphere
 from qpavoid.describe.ends import end_effectors
 from qpavoid.describe.fit import GROSS, Bodies, fit_piece, hull_volume
-from qpavoid.describe.sampling import CLEAR, SAMPLES, SEED, clear_home, sample_pairs, touching
+from qpavoid.describe.sampling import CLEAR, SAMPLES, SEED, Sampled, always_near, clear_home, sample_pairs, touching
 from qpavoid.describe.srdf import Semantics, find_srdf, read_srdf
 from qpavoid.errors import ConfigError, UnknownName
 from qpavoid.loading import nearest
 from qpavoid.problem import Array
 from qpavoid.robot import Robot, middle
 from qpavoid.safe_xml import read_robot_xml
-from qpavoid.urdf import is_mjcf, read_collision, read_model
+from qpavoid.urdf import is_mjcf, read_collision, read_model, read_pieces
 
 Root = Literal["fixed", "planar", "free_flyer"]
 
@@ -44,6 +44,8 @@ class Wishes:
     """How the root link is attached to the world."""
     lock: Sequence[str] = ()
     """Joints (with `*` and `?`) held at the home pose for good."""
+    home: Mapping[str, float] = field(default_factory=dict)
+    """Joint: position of a home pose to prefer [rad or m]."""
     package_dirs: Sequence[Path] = ()
     """Folders in which `package://` meshes are looked up."""
     srdf: Path | None = None
@@ -112,6 +114,11 @@ def describe(urdf: Path, wishes: Wishes | None = None) -> Described:
     model = read_model(urdf, wishes.root)
     honoured = wishes.srdf or find_srdf(urdf)
     semantics = Semantics() if honoured is None else read_srdf(honoured)
+    for joint in wishes.home:
+        if not model.existJointName(joint):
+            raise UnknownName(f"--home: no joint {joint!r}{nearest(joint, list(model.names)[1:])}")
+    if wishes.home:
+        semantics = replace(semantics, states={"--home": wishes.home, **semantics.states})
     notes: list[str] = []
     pieces = _pieces(urdf, model, wishes, notes)
     fields: dict[str, Any] = {
@@ -126,19 +133,19 @@ def describe(urdf: Path, wishes: Wishes | None = None) -> Described:
     while True:
         fields["bodies"], volume = _bodies(pieces, wishes, lean)
         robot = Robot.from_config(RobotConfig(**fields, srdf=given), urdf)
-        more = _too_fat(robot, _wished_homes(robot, semantics)[0]) - lean
+        more = _too_fat(robot, _wished_homes(robot, semantics)[0], wishes.seed) - lean
         if not more:
             break
         lean |= more
     if lean:
-        notes.append(f"exact where capsules would be too near at the home pose: {', '.join(sorted(lean))}")
+        notes.append(f"exact where capsules would be too near at home or everywhere: {', '.join(sorted(lean))}")
     bare = Robot.from_config(RobotConfig(**fields), urdf)
     fields["end_effectors"] = end_effectors(bare.model, semantics.end_effectors)
     sampled = sample_pairs(robot, wishes.samples, wishes.seed)
-    reasons = _reasons(bare, robot, sampled.never)
+    reasons = _reasons(bare, robot, sampled)
     disabled, single = _by_link(bare, reasons)
     fields["disabled_pairs"] = single
-    watched = _watched(robot, ~sampled.never)
+    watched = _watched(robot, ~sampled.never & ~sampled.always)
     home, clearance, taken = clear_home(watched, _wished_homes(watched, semantics), seed=wishes.seed)
     fields["home"] = _joint_values(watched.model, home)
     if taken is None and clearance > 0.0:
@@ -172,13 +179,11 @@ def describe(urdf: Path, wishes: Wishes | None = None) -> Described:
 def _pieces(urdf: Path, model: Any, wishes: Wishes, notes: list[str]) -> list[Piece]:
     """Collision geometry; what is meant to be seen where the file has none."""
     folders = [str(folder) for folder in wishes.package_dirs]
-    geometry = read_collision(urdf, model, folders, urdf)
-    if not len(geometry.geometryObjects):
-        geometry = read_collision(urdf, model, folders, urdf, visual=True)
-        if len(geometry.geometryObjects):
-            notes.append("the file has no collision geometry: bodies are fitted to what is meant to be seen")
-        else:
-            notes.append("the file has no geometry at all: nothing is watched until you list `bodies`")
+    geometry = read_pieces(urdf, model, folders, urdf)
+    if not geometry.ngeoms:
+        notes.append("the file has no geometry at all: nothing is watched until you list `bodies`")
+    elif not read_collision(urdf, model, folders, urdf).ngeoms:
+        notes.append("the file has no collision geometry: bodies are fitted to what is meant to be seen")
     check_meshes(geometry, str(urdf))
     found = []
     for piece in geometry.geometryObjects:
@@ -190,10 +195,18 @@ def _pieces(urdf: Path, model: Any, wishes: Wishes, notes: list[str]) -> list[Pi
 # --- bodies -------------------------------------------------------------------------------------------------
 
 
-def _too_fat(robot: Robot, home: Array) -> set[str]:
-    """Links of the pairs that are too near at a pose, as far as `auto` made capsules of them."""
+def _too_fat(robot: Robot, home: Array, seed: int) -> set[str]:
+    """Links of the pairs that are too near at the home pose, or in every one of a few random poses."""
+    names = [body.name for body in robot.bodies.geometryObjects]
+    near = [names[i] for pair in always_near(robot, _FEW, seed) for i in pair]
+    near += [body for pair in robot.always_touching for body in pair]
+    near += [body for a, b, _ in touching(robot, home, CLEAR) for body in (a, b)]
     link = {body.name: robot.model.frames[body.parentFrame].name for body in robot.bodies.geometryObjects}
-    return {link[body] for a, b, _ in touching(robot, home, CLEAR) for body in (a, b)}
+    return {link[body] for body in near}
+
+
+_FEW = 200
+"""Random poses that tell whether capsules are too fat."""
 
 
 def _bodies(
@@ -308,18 +321,19 @@ def _pairs(robot: Robot) -> list[frozenset[str]]:
     return [frozenset((names[pair.first], names[pair.second])) for pair in robot.bodies.collisionPairs]
 
 
-def _reasons(bare: Robot, robot: Robot, never: Array) -> dict[frozenset[str], str]:
+def _reasons(bare: Robot, robot: Robot, sampled: Sampled) -> dict[frozenset[str], str]:
     """Why each pair of bodies that is not watched is not.
 
     Args:
         bare: the robot without an SRDF.
         robot: the robot with it.
-        never: (m,) which of its pairs never come near.
+        sampled: what became of its pairs.
     """
     names = [body.name for body in bare.bodies.geometryObjects]
     every = [frozenset((a, b)) for i, a in enumerate(names) for b in names[:i]]
     touching = {frozenset(pair) for pair in bare.always_touching}
-    checked, kept = set(_pairs(bare)), dict(zip(_pairs(robot), never, strict=True))
+    checked = set(_pairs(bare))
+    kept = dict(zip(_pairs(robot), zip(sampled.always, sampled.never, strict=True), strict=True))
     reasons = {}
     for pair in every:
         if pair in touching:
@@ -328,8 +342,8 @@ def _reasons(bare: Robot, robot: Robot, never: Array) -> dict[frozenset[str], st
             reasons[pair] = "adjacent"
         elif pair not in kept:
             reasons[pair] = "srdf"
-        elif kept[pair]:
-            reasons[pair] = "never"
+        elif any(kept[pair]):
+            reasons[pair] = "always" if kept[pair][0] else "never"
     return reasons
 
 
@@ -349,7 +363,7 @@ def _by_link(robot: Robot, reasons: Mapping[frozenset[str], str]) -> tuple[dict[
     single = [
         tuple(sorted(pair))
         for pair, why in reasons.items()
-        if why == "never" and len(pair) == 2 and frozenset(link[body] for body in pair) not in off
+        if why in ("never", "always") and frozenset(link[body] for body in pair) not in off
     ]
     return off, sorted(single)
 

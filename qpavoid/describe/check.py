@@ -21,7 +21,7 @@ from qpavoid.describe.ends import end_effectors
 from qpavoid.describe.sampling import Space, touching
 from qpavoid.errors import ConfigError, QpavoidError
 from qpavoid.loading import find_robot, read_config
-from qpavoid.robot import Robot
+from qpavoid.robot import Robot, frame_index
 from qpavoid.safe_xml import read_robot_xml
 from qpavoid.scene import build_scene
 from qpavoid.tasks import build_tasks
@@ -175,14 +175,6 @@ def _look_at_geometry(report: Report, config: RobotConfig, path: Path, urdf: Pat
     report.shapes = dict(Counter(_shape_name(piece.geometry) for piece in pieces))
     meshes = [piece.geometry for piece in pieces if isinstance(piece.geometry, coal.BVHModelBase)]
     report.triangles = sum(int(mesh.num_tris) for mesh in meshes)
-    if not pieces and isinstance(config.bodies, str):
-        report.problems.append(
-            Problem(
-                "error",
-                "the file has no collision geometry: nothing would be avoided",
-                "`qpavoid robot add` fits bodies to the visual geometry; or list `bodies` in a robot.yaml",
-            )
-        )
 
 
 def _absent(urdf: Path, tag: str, folders: list[str]) -> list[str]:
@@ -277,6 +269,14 @@ def _some(names: Sequence[str], most: int = 5) -> str:
 def _look_at_robot(report: Report, robot: Robot) -> None:
     report.nq, report.nv = robot.model.nq, robot.model.nv
     report.bodies, report.pairs = len(robot.bodies.geometryObjects), len(robot.bodies.collisionPairs)
+    if not report.bodies:
+        report.problems.append(
+            Problem(
+                "error",
+                "it has no collision bodies: nothing would be avoided",
+                "`qpavoid robot add` fits them to what is meant to be seen; or list `bodies` in a robot.yaml",
+            )
+        )
     report.home_collisions = touching(robot, robot.home)
     if report.home_collisions:
         pairs = [f"{a} - {b} ({1000 * d:.1f} mm)" for a, b, d in report.home_collisions]
@@ -330,7 +330,7 @@ def _is_stretched(robot: Robot, frame: str) -> bool:
     """Whether a frame on a limb of six joints or more has lost a direction of motion at home."""
     if not robot.model.existFrame(frame):
         return False
-    data, frame_id = robot.model.createData(), robot.model.getFrameId(frame)
+    data, frame_id = robot.model.createData(), frame_index(robot.model, frame)
     J = pin.computeFrameJacobian(robot.model, data, robot.home, frame_id, pin.LOCAL_WORLD_ALIGNED)
     J = J[:, np.any(J != 0.0, axis=0)]
     return J.shape[1] >= 6 and bool(np.linalg.svd(J, compute_uv=False)[5] < _SINGULAR)

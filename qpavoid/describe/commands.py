@@ -15,9 +15,10 @@ from rich.markup import escape
 from qpavoid.describe.add import Described, Root, Wishes, describe
 from qpavoid.describe.check import Joint, Report, check_robot
 from qpavoid.describe.fit import Bodies
-from qpavoid.describe.sampling import NEAR, SAMPLES, SEED
+from qpavoid.describe.sampling import FAR, NEAR, SAMPLES, SEED
 from qpavoid.describe.texts import description_files, volume_line
 from qpavoid.describe.written import write_files
+from qpavoid.config.base import LARGEST
 from qpavoid.errors import ConfigError
 from qpavoid.loading import find_robot
 from qpavoid.report import to_json
@@ -97,6 +98,9 @@ def add(
     ] = None,
     root: RootJoint = "fixed",
     lock: Annotated[list[str] | None, typer.Option(help="Joint to hold at home for good; * and ? match.")] = None,
+    home: Annotated[
+        list[str] | None, typer.Option(metavar="JOINT=VALUE", help="Of a home pose to prefer [rad or m].")
+    ] = None,
     package_dir: PackageDirs = None,
     srdf: Annotated[Path | None, typer.Option(help="SRDF to honour; one beside the URDF if left out.")] = None,
     samples: Annotated[int, typer.Option(min=1, max=1_000_000, help="Configurations drawn to judge pairs.")] = SAMPLES,
@@ -110,7 +114,7 @@ def add(
     kind, by_link = _kinds(bodies or [])
     wishes = Wishes(
         name=name, bodies=kind, bodies_of=by_link, root=_one_of(root, Root, "--root"), lock=tuple(lock or ()),
-        package_dirs=tuple(package_dir or ()), srdf=srdf, samples=samples, seed=seed,
+        home=_values(home or []), package_dirs=tuple(package_dir or ()), srdf=srdf, samples=samples, seed=seed,
     )  # fmt: skip
     urdf = find_robot(path)
     if urdf.suffix in (".yaml", ".yml"):
@@ -139,6 +143,19 @@ def _kinds(given: list[str]) -> tuple[Bodies, dict[str, Bodies]]:
         else:
             kind = chosen
     return kind, by_link
+
+
+def _values(given: list[str]) -> dict[str, float]:
+    values = {}
+    for text in given:
+        joint, equals, value = text.rpartition("=")
+        try:
+            values[joint] = float(value)
+        except ValueError:
+            equals = ""
+        if not equals or not abs(values[joint]) <= LARGEST:  # NaN as well
+            raise ConfigError(f"--home {text}: expected JOINT=VALUE, as in elbow=1.57")
+    return values
 
 
 def _one_of(value: str, kind: Any, option: str) -> Any:
@@ -185,7 +202,7 @@ def _report(described: Described, outcome: dict[Path, str], seconds: float) -> N
     lines = [
         f"bodies         {volume_line(described)}",
         f"pairs          {counts['watched']} of {counts['all']} are watched: {counts['adjacent']} adjacent, "
-        f"{counts['srdf']} off ({honoured}), {counts['always']} always touch, {counts['never']} never come within "
+        f"{counts['srdf']} off ({honoured}), {counts['always']} always within {1000 * FAR:g} mm, {counts['never']} never come within "
         f"{1000 * NEAR:g} mm ({wishes.samples} samples, seed {wishes.seed}, descent from the nearest)",
         f"end effectors  {', '.join(described.config.end_effectors) or 'none recognised'}",
         f"home           least distance {1000 * described.clearance:.1f} mm"

@@ -22,6 +22,7 @@ from qpavoid.describe.texts import volume_line
 from qpavoid.describe.written import BLANK, seal
 from qpavoid.plot_motion import normals, shade, shape_faces, towards_viewer
 from qpavoid.problem import Array
+from qpavoid.robot import frame_index
 
 _VIEWS = ((15.0, -50.0), (15.0, 130.0))
 """Elevation and azimuth [deg]."""
@@ -84,7 +85,7 @@ def _surfaces(described: Described) -> tuple[Array, Array, Array]:
     pin.framesForwardKinematics(robot.model, data, robot.home)
 
     def placed(faces: Array, link: str, placement: Any) -> Array:
-        pose = data.oMf[robot.model.getFrameId(link)] * placement
+        pose = data.oMf[frame_index(robot.model, link)] * placement
         return np.asarray(faces @ pose.rotation.T + pose.translation)
 
     meshes = [placed(_piece_faces(piece.geometry), piece.link, piece.placement) for piece in described.pieces]

@@ -9,20 +9,24 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from qpavoid.config import Avoidance
 from qpavoid.kinematics import support_masks
 from qpavoid.memory import read_results, view_results
 from qpavoid.pairs import pair_array
-from qpavoid.problem import Array
+from qpavoid.problem import Array, IntArray
 from qpavoid.robot import Robot
 
 SAMPLES, SEED = 5000, 0
 NEAR = 0.02
 """Distance [m] that a pair must keep from each other in every sample, and where descent from the nearest of them
 ends, to count as never colliding."""
+FAR = Avoidance().d1
+"""Distance [m] beyond which a pair must come in some sample: others could never keep the default margin. They are
+neighbours by design, and the joints' limits keep them apart, if anything does."""
 CLEAR = 0.005
 """Least distance [m] of any pair at a home pose."""
 _SETTLE = 250
-"""Samples after which pairs that have been near and apart are not looked at any more."""
+"""Samples after which pairs that have been near and far are not looked at any more."""
 _STEPS = 60
 """Of a descent."""
 _UNBOUNDED = np.pi
@@ -114,7 +118,7 @@ class Sampled:
     """What became of each of a robot's pairs."""
 
     always: Array
-    """(m,) touched in every sample."""
+    """(m,) were within `FAR` in every sample."""
     never: Array
     """(m,) kept away from each other in every sample and in a descent from the nearest one."""
     closest: Array
@@ -122,7 +126,7 @@ class Sampled:
 
 
 def sample_pairs(robot: Robot, samples: int = SAMPLES, seed: int = SEED) -> Sampled:
-    """Looks which of a robot's pairs always touch and which never come near.
+    """Looks which of a robot's pairs are always near and which never.
 
     Random configurations first; each pair that stayed apart in all of them is then led downhill from where it came
     closest, so that "never" does not rest on luck alone. It is still no proof: samples are finite, descents local.
@@ -145,12 +149,23 @@ def sample_pairs(robot: Robot, samples: int = SAMPLES, seed: int = SEED) -> Samp
             closest[nearer], at[nearer] = d[nearer], q
             farthest = np.where(watched, np.maximum(farthest, d), farthest)
         done += _SETTLE
-        settled = watched & (closest < NEAR) & (farthest > 0.0)
+        settled = watched & (closest < NEAR) & (farthest >= FAR)
         distances.switch_off(np.flatnonzero(settled))
         watched &= ~settled
     for index in np.flatnonzero(closest >= NEAR):
         closest[index] = min(closest[index], _descend(distances, space, int(index), at[index]))
-    return Sampled(farthest <= 0.0, closest >= NEAR, closest)
+    always = farthest < FAR
+    return Sampled(always, (closest >= NEAR) & ~always, closest)
+
+
+def always_near(robot: Robot, samples: int, seed: int = SEED) -> IntArray:
+    """Pairs of bodies (k, 2) that are within `FAR` in every sample."""
+    distances = PairDistances(robot)
+    near = np.ones(len(distances.pairs), dtype=bool)
+    for q in Space(robot).draw(np.random.default_rng(seed), samples if near.any() else 0):
+        near &= distances.all(q) < FAR
+        distances.switch_off(np.flatnonzero(~near))
+    return distances.pairs[near]
 
 
 def _descend(distances: PairDistances, space: Space, index: int, q: Array) -> float:

@@ -5,16 +5,17 @@ from __future__ import annotations
 import os.path
 from collections.abc import Sequence
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import yaml
 
 from qpavoid.config import Body
-from qpavoid.describe.add import Described
-from qpavoid.describe.sampling import NEAR
+from qpavoid.describe.add import Described, Wishes
+from qpavoid.describe.sampling import FAR, NEAR
 from qpavoid.describe.srdf import MADE_BY, srdf_text
 from qpavoid.describe.written import BLANK, seal
-from qpavoid.loading import example_robot_data
+from qpavoid.loading import EXAMPLES, example_robot
 
 
 def description_files(described: Described, folder: Path) -> dict[Path, bytes]:
@@ -35,7 +36,7 @@ def description_files(described: Described, folder: Path) -> dict[Path, bytes]:
 
 def _robot_yaml(described: Described, folder: Path, srdf: str) -> str:
     config = described.config
-    lines = [f"# {line}" for line in _header(described)]
+    lines = [f"# {line}" for line in [*_header(described), f"Again: {_command(described, folder)}"]]
     lines += [f"name: {_flow(config.name)}", f"urdf: {_flow(_reference(Path(config.urdf), folder))}"]
     lines.append(f"srdf: {_flow(srdf)}")
     if config.package_dirs:
@@ -62,7 +63,7 @@ def _header(described: Described) -> list[str]:
         f"{described.config.name}: {MADE_BY}, which leaves it alone once you edit it; {BLANK}",
         f"Bodies: {volume_line(described)}.",
         f"Pairs: {counts['all']} in all; {counts['adjacent']} adjacent, {counts['srdf']} off in the SRDF it came with "
-        f"({honoured}), {counts['always']} always touch,",
+        f"({honoured}), {counts['always']} always within {1000 * FAR:g} mm,",
         f"{counts['never']} never come within {1000 * NEAR:g} mm ({wishes.samples} samples, seed {wishes.seed}, descent "
         f"from the nearest); {counts['watched']} are watched.",
         f"Home: least distance {1000 * described.clearance:.1f} mm."
@@ -70,6 +71,23 @@ def _header(described: Described) -> list[str]:
         else "Home: no pair is watched.",
         *described.notes,
     ]
+
+
+def _command(described: Described, folder: Path) -> str:
+    """The command that writes the same again."""
+    wishes = described.wishes
+    words = ["qpavoid robot add", _reference(described.urdf, Path()), "--name", described.config.name]
+    words += ["--out", folder.as_posix()] if folder != Path(described.config.name) else []
+    words += ["--bodies", wishes.bodies] if wishes.bodies != Wishes.bodies else []
+    words += [word for link, kind in wishes.bodies_of.items() for word in ("--bodies", f"{link}={kind}")]
+    words += ["--root", wishes.root] if wishes.root != Wishes.root else []
+    words += [word for joint in wishes.lock for word in ("--lock", joint)]
+    words += [word for joint, value in wishes.home.items() for word in ("--home", f"{joint}={value:g}")]
+    words += [word for path in wishes.package_dirs for word in ("--package-dir", path.as_posix())]
+    words += ["--srdf", wishes.srdf.as_posix()] if wishes.srdf is not None else []
+    words += ["--samples", str(wishes.samples)] if wishes.samples != Wishes.samples else []
+    words += ["--seed", str(wishes.seed)] if wishes.seed != Wishes.seed else []
+    return " ".join([words[0], *(quote(word) for word in words[1:])])
 
 
 def volume_line(described: Described) -> str:
@@ -102,9 +120,9 @@ def _flow(value: Any) -> str:
 
 def _reference(urdf: Path, folder: Path) -> str:
     """The URDF as a robot.yaml names it."""
-    robots = (example_robot_data() / "example-robot-data" / "robots").resolve()
+    robots = example_robot("").resolve()
     if urdf.is_relative_to(robots):
-        return f"example-robot-data:{urdf.relative_to(robots).as_posix()}"
+        return f"{EXAMPLES}{urdf.relative_to(robots).as_posix()}"
     return _relative(urdf, folder)
 
 
