@@ -21,21 +21,22 @@ from qpavoid.loading import example_robot_data
 
 ROBOTS = example_robot_data() / "example-robot-data" / "robots"
 OUT = Path(__file__).parent.parent / "docs" / "robots.md"
+PACKAGES = {"data": "example-robot-data", "pin": "pin", "coal": "coal"}
 LIMIT = 300
 """Seconds that a command may take."""
 HEAD = """# Every robot of example-robot-data
 
-`python -m bench.robots` sends each of its {count} URDF files through `qpavoid robot check` and `qpavoid robot add`, with
-default options and a fixed base, and then checks the robot.yaml that was written. example-robot-data {data},
+`python -m bench.robots` sends each of its {count} URDF files through `qpavoid robot check` and `qpavoid robot add`,
+with default options and a fixed base, and then checks the robot.yaml that was written. example-robot-data {data},
 pinocchio {pin}, coal {coal}; a machine with 2 cores that was busy with other things: take the times as upper bounds.
 
-- *pairs*: as the bare URDF loads (adjacent pairs and those that always touch are off already) → in the written robot.yaml;
+- *pairs*: as the bare URDF loads (adjacent pairs and those that always touch are off already) → as written;
 - *bodies*: pieces of collision geometry → bodies in the written robot.yaml, and their volume in units of the convex
   hulls of the geometry;
 - *step*: median control step that tracks all end effectors near the home pose, without obstacles, bare → written;
 - *home*: least distance between bodies at the written home pose;
 - *seconds*: `check` of the URDF, and `add`;
-- *worst problem*: the first one that `check` names of the URDF, and what `add` or the check of its robot.yaml adds to it.
+- *worst problem*: the first one that `check` names of the URDF, and what `add` or the check of its robot.yaml adds.
 
 | robot | coordinates | bodies | volume | pairs | home [mm] | step [µs] | seconds | worst problem |
 |---|---:|---:|---:|---:|---:|---:|---:|---|
@@ -110,7 +111,8 @@ def main() -> None:
             rows.append(line)
             fine &= ended_well
     if not words:
-        head = HEAD.format(count=len(every), data=version("example-robot-data"), pin=version("pin"), coal=version("coal"))
+        versions = {name: version(package) for name, package in PACKAGES.items()}
+        head = HEAD.format(count=len(every), **versions)
         OUT.write_text(head + "".join(rows), encoding="utf-8")
         print(OUT)
     sys.exit(0 if fine else 1)

@@ -338,7 +338,7 @@ def _joint(model: Any, name: str, where: str) -> Any:
 
 
 def middle(model: Any) -> Array:
-    """Neutral configuration (nq,) of a model, with bounded joints at the middle of their range where 0 is outside it."""
+    """Neutral configuration (nq,), with bounded joints at the middle of their range where 0 is outside it."""
     q = pin.neutral(model)
     for joint in list(model.joints)[1:]:
         lower, upper = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]

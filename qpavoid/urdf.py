@@ -38,7 +38,8 @@ def find_resource(value: str, path: Path, field: str) -> Path:
     """
     found = example_robot(value) if value.startswith(EXAMPLES) else path.parent / value
     if not os.path.isfile(found):  # False where the name is one that no file can have; Path.is_file may raise
-        raise ConfigError(f"{path}: {field}: no such file {value!r}; give a path relative to this file or {EXAMPLES}PATH")
+        remedy = f"give a path relative to this file or {EXAMPLES}PATH"
+        raise ConfigError(f"{path}: {field}: no such file {value!r}; {remedy}")
     return found
 
 

@@ -62,7 +62,8 @@ class RobotConfig(Block):
     name: str
     """Name for tables and figures."""
     urdf: str
-    """URDF, or MJCF (`.xml`): a path relative to this file, an absolute path, or `example-robot-data:PATH` below its robots folder."""
+    """URDF, or MJCF (`.xml`): a path relative to this file, an absolute path, or `example-robot-data:PATH` below its
+    robots folder."""
     srdf: str | None = None
     """SRDF whose `disable_collisions` are honoured; found like `urdf`."""
     package_dirs: list[str] = []

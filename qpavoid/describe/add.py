@@ -18,7 +18,17 @@ from qpavoid.bodies import CapsuleFit, check_meshes, fit_capsule, hull_points
 from qpavoid.config import Body, Box, Capsule, Cylinder, Hull, RobotConfig, Sphere
 from qpavoid.describe.ends import end_effectors
 from qpavoid.describe.fit import GROSS, Bodies, fit_piece, hull_volume
-from qpavoid.describe.sampling import CLEAR, SAMPLES, SEED, Sampled, always_near, clear_home, sample_pairs, touching
+from qpavoid.describe.sampling import (
+    CLEAR,
+    SAMPLES,
+    SEED,
+    BoolArray,
+    Sampled,
+    always_near,
+    clear_home,
+    sample_pairs,
+    touching,
+)
 from qpavoid.describe.srdf import Semantics, find_srdf, read_srdf
 from qpavoid.errors import ConfigError, UnknownName
 from qpavoid.loading import nearest
@@ -298,9 +308,10 @@ def _exact_fields(piece: Piece) -> dict[str, Any]:
     """Fields of a `Body` that is a primitive as it is, or the hull of a mesh."""
     geometry, placement = piece.geometry, piece.placement
     if isinstance(geometry, coal.Box):
-        shape: Any = Box(size=_up(2.0 * np.array(geometry.halfSide)))
+        x, y, z = (_up(2.0 * half) for half in geometry.halfSide)
+        shape: Any = Box(size=(x, y, z))
     elif isinstance(geometry, coal.Cylinder):
-        shape = Cylinder(radius=_up([geometry.radius])[0], length=_up([2.0 * geometry.halfLength])[0])
+        shape = Cylinder(radius=_up(geometry.radius), length=_up(2.0 * geometry.halfLength))
     else:
         return {"shape": Hull(geometry=piece.name)}
     rpy = np.round(pin.rpy.matrixToRpy(placement.rotation), 2 * _DIGITS) + 0.0  # no -0.0
@@ -308,9 +319,9 @@ def _exact_fields(piece: Piece) -> dict[str, Any]:
     return {"shape": shape, "position": tuple(position.tolist()), "rpy": tuple(rpy.tolist())}
 
 
-def _up(sizes: Iterable[float]) -> tuple[float, ...]:
-    """Sizes rounded up, but for rounding errors."""
-    return tuple(math.ceil(size * 10**_DIGITS - 1e-6) / 10**_DIGITS for size in sizes)
+def _up(size: float) -> float:
+    """A size rounded up, but for rounding errors."""
+    return math.ceil(size * 10**_DIGITS - 1e-6) / 10**_DIGITS
 
 
 # --- pairs --------------------------------------------------------------------------------------------------
@@ -368,7 +379,7 @@ def _by_link(robot: Robot, reasons: Mapping[frozenset[str], str]) -> tuple[dict[
     return off, sorted(single)
 
 
-def _watched(robot: Robot, kept: Array) -> Robot:
+def _watched(robot: Robot, kept: BoolArray) -> Robot:
     """The robot with some of its pairs only."""
     bodies = pin.GeometryModel(robot.bodies)
     pairs = list(robot.bodies.collisionPairs)
@@ -416,9 +427,7 @@ def _joint_values(model: Any, q: Array) -> dict[str, float]:
     return values
 
 
-def _locks(
-    urdf: Path, model: Any, patterns: Sequence[str], semantics: Semantics, notes: list[str]
-) -> dict[str, float]:
+def _locks(urdf: Path, model: Any, patterns: Sequence[str], semantics: Semantics, notes: list[str]) -> dict[str, float]:
     """Joints that are held, and where: those the user names, and those that move together with others.
 
     A joint that mimics another would move on its own otherwise, which it cannot.

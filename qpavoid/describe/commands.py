@@ -12,13 +12,13 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from qpavoid.config.base import LARGEST
 from qpavoid.describe.add import Described, Root, Wishes, describe
 from qpavoid.describe.check import Joint, Report, check_robot
 from qpavoid.describe.fit import Bodies
-from qpavoid.describe.sampling import FAR, NEAR, SAMPLES, SEED
-from qpavoid.describe.texts import description_files, volume_line
+from qpavoid.describe.sampling import SAMPLES, SEED
+from qpavoid.describe.texts import description_files, home_line, pairs_line, volume_line
 from qpavoid.describe.written import write_files
-from qpavoid.config.base import LARGEST
 from qpavoid.errors import ConfigError
 from qpavoid.loading import find_robot
 from qpavoid.report import to_json
@@ -197,20 +197,13 @@ def _document(described: Described, outcome: dict[Path, str], seconds: float) ->
 
 
 def _report(described: Described, outcome: dict[Path, str], seconds: float) -> None:
-    counts, wishes = described.counts, described.wishes
-    honoured = "no SRDF beside the URDF" if described.honoured is None else f"in {described.honoured.name}"
-    lines = [
+    for line in (
         f"bodies         {volume_line(described)}",
-        f"pairs          {counts['watched']} of {counts['all']} are watched: {counts['adjacent']} adjacent, "
-        f"{counts['srdf']} off ({honoured}), {counts['always']} always within {1000 * FAR:g} mm, {counts['never']} never come within "
-        f"{1000 * NEAR:g} mm ({wishes.samples} samples, seed {wishes.seed}, descent from the nearest)",
+        f"pairs          {pairs_line(described)}",
         f"end effectors  {', '.join(described.config.end_effectors) or 'none recognised'}",
-        f"home           least distance {1000 * described.clearance:.1f} mm"
-        if described.counts["watched"]
-        else "home           no pair is watched",
+        f"home           {home_line(described)}",
         *(f"note           {note}" for note in described.notes),
         *(f"{what:<14} {path}" for path, what in outcome.items()),
         f"               in {seconds:.1f} s; in a scenario: `robot: {next(iter(outcome))}`",
-    ]
-    for line in lines:
+    ):
         _out.print(line, highlight=False, markup=False, soft_wrap=True)

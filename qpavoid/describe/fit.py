@@ -112,7 +112,7 @@ def cut(surface: Array, normal: Array, height: float, side: float) -> Array:
         a, b, c = (corners[:, k] for k in order)
         h_a, h_b, h_c = (heights[:, k] for k in order)
         alone = (h_a > 0.0) & (h_b <= 0.0) & (h_c <= 0.0)
-        rest = (h_a < 0.0) & (h_b >= 0.0) & (h_c >= 0.0)
+        rest = (h_a < 0.0) & (h_b > 0.0) & (h_c > 0.0)
         with np.errstate(divide="ignore", invalid="ignore"):
             ab = a + (h_a / (h_a - h_b))[:, None] * (b - a)
             ac = a + (h_a / (h_a - h_c))[:, None] * (c - a)

@@ -90,7 +90,8 @@ def _surfaces(described: Described) -> tuple[Array, Array, Array]:
 
     meshes = [placed(_piece_faces(piece.geometry), piece.link, piece.placement) for piece in described.pieces]
     pieces = {piece.name: piece for piece in described.pieces}
-    capsules, exact = [], []
+    capsules: list[Array] = []
+    exact: list[Array] = []
     for body, live in zip(described.config.bodies, robot.bodies.geometryObjects, strict=True):
         assert isinstance(body, Body)
         in_link = robot.model.frames[live.parentFrame].placement.actInv(live.placement)
@@ -131,11 +132,10 @@ def _as_quads(corners: Array) -> Array:
 
 
 def _coarser(faces: Array, cell: float) -> Array:
-    """Faces with their corners drawn onto a grid, without those that vanish or are there twice: enough for a picture."""
+    """Faces with corners drawn onto a grid, without those that vanish or are there twice: enough for a picture."""
     if not len(faces):
         return faces
     index = np.round(faces / cell).astype(np.int64)
-    ordered = np.sort(index.view([("", np.int64)] * 3)[..., 0], axis=1)
-    distinct = (ordered[:, 1:] != ordered[:, :-1]).sum(axis=1) >= 2
-    _, first = np.unique(ordered[distinct], axis=0, return_index=True) if distinct.any() else (None, [])
-    return np.asarray(cell * index[distinct][np.sort(first)])
+    number = np.sort(np.unique(index.reshape(-1, 3), axis=0, return_inverse=True)[1].reshape(-1, 4), axis=1)
+    index = index[(number[:, 1:] != number[:, :-1]).sum(axis=1) >= 2]
+    return np.asarray(cell * np.unique(index, axis=0))

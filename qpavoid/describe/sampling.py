@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from qpavoid.config import Avoidance
 from qpavoid.kinematics import support_masks
@@ -113,13 +114,16 @@ def _root_names(robot: Robot) -> set[str]:
     return set()
 
 
+BoolArray = NDArray[np.bool_]
+
+
 @dataclass(frozen=True)
 class Sampled:
     """What became of each of a robot's pairs."""
 
-    always: Array
+    always: BoolArray
     """(m,) were within `FAR` in every sample."""
-    never: Array
+    never: BoolArray
     """(m,) kept away from each other in every sample and in a descent from the nearest one."""
     closest: Array
     """(m,) nearest that was seen [m]; of pairs that were settled early, up to then."""

@@ -77,18 +77,17 @@ def _number(text: str) -> float | None:
     return value if abs(value) < 1e9 else None
 
 
-def srdf_text(name: str, comment: str, disabled: Mapping[frozenset[str], str], ends: Sequence[str]) -> str:
+def srdf_text(robot: str, comment: str, disabled: Mapping[frozenset[str], str], ends: Sequence[str]) -> str:
     """An SRDF.
 
     Args:
-        name: of the robot, as in its URDF.
+        robot: its name, as in its URDF.
         comment: what it says at the top.
         disabled: links that are not to be checked, and why.
         ends: links that carry tools.
     """
-    lines = ['<?xml version="1.0"?>', f"<!-- {comment.replace('--', '- -')} -->", f"<robot name={quoteattr(name)}>"]
-    for end in ends:
-        lines.append(f"  <end_effector name={quoteattr(end)} parent_link={quoteattr(end)} group={quoteattr(end)}/>")
+    lines = ['<?xml version="1.0"?>', f"<!-- {comment.replace('--', '- -')} -->", f"<robot name={quoteattr(robot)}>"]
+    lines += [f"  <end_effector name={name} parent_link={name} group={name}/>" for name in map(quoteattr, ends)]
     for pair in sorted(sorted(links) for links in disabled):
         a, b = pair[0], pair[-1]
         reason = quoteattr(disabled[frozenset(pair)])

@@ -57,20 +57,31 @@ def _robot_yaml(described: Described, folder: Path, srdf: str) -> str:
 
 
 def _header(described: Described) -> list[str]:
-    counts, wishes = described.counts, described.wishes
-    honoured = "none" if described.honoured is None else described.honoured.name
-    return [
-        f"{described.config.name}: {MADE_BY}, which leaves it alone once you edit it; {BLANK}",
+    lines = [f"{described.config.name}: {MADE_BY}, which leaves it alone once you edit it; {BLANK}"]
+    lines += [
         f"Bodies: {volume_line(described)}.",
-        f"Pairs: {counts['all']} in all; {counts['adjacent']} adjacent, {counts['srdf']} off in the SRDF it came with "
-        f"({honoured}), {counts['always']} always within {1000 * FAR:g} mm,",
-        f"{counts['never']} never come within {1000 * NEAR:g} mm ({wishes.samples} samples, seed {wishes.seed}, descent "
-        f"from the nearest); {counts['watched']} are watched.",
-        f"Home: least distance {1000 * described.clearance:.1f} mm."
-        if described.clearance < float("inf")
-        else "Home: no pair is watched.",
-        *described.notes,
+        f"Pairs: {pairs_line(described)}.",
+        f"Home: {home_line(described)}.",
     ]
+    return [*lines, *described.notes]
+
+
+def pairs_line(described: Described) -> str:
+    """How many pairs are watched, and why the others are not."""
+    counts, wishes = described.counts, described.wishes
+    honoured = "no SRDF came with it" if described.honoured is None else f"in {described.honoured.name}"
+    return (
+        f"{counts['watched']} of {counts['all']} are watched; {counts['adjacent']} are adjacent, {counts['srdf']} off "
+        f"({honoured}), {counts['always']} always within {1000 * FAR:g} mm, {counts['never']} never within "
+        f"{1000 * NEAR:g} mm ({wishes.samples} samples, seed {wishes.seed}, descent from the nearest)"
+    )
+
+
+def home_line(described: Described) -> str:
+    """How clear the home pose is."""
+    if not described.counts["watched"]:
+        return "no pair is watched"
+    return f"least distance {1000 * described.clearance:.1f} mm"
 
 
 def _command(described: Described, folder: Path) -> str:
