@@ -16,7 +16,7 @@ from scipy.spatial import ConvexHull
 from qpavoid import ConfigError, Robot, UnknownName
 from qpavoid.bodies import CapsuleFit, fit_capsule
 from qpavoid.config import Box, Capsule, Hull, RobotConfig, Sphere
-from qpavoid.describe.add import Wishes, capsule_fields, describe
+from qpavoid.describe.add import Wishes, describe
 from qpavoid.describe.ends import end_effectors
 from qpavoid.describe.fit import cut, decompose, fit_piece, hull_volume, triangles
 from qpavoid.describe.sampling import (
@@ -29,6 +29,7 @@ from qpavoid.describe.sampling import (
     sample_pairs,
     touching,
 )
+from qpavoid.describe.shapes import capsule_fields
 from qpavoid.describe.srdf import MADE_BY, Semantics, find_srdf, read_srdf, srdf_text
 from qpavoid.describe.texts import description_files
 from qpavoid.describe.written import BLANK, seal, untouched, write_files

@@ -16,8 +16,8 @@ import pinocchio as pin
 
 from qpavoid.config import RobotConfig, Task
 from qpavoid.controller import Controller
-from qpavoid.describe.add import mimics
 from qpavoid.describe.ends import end_effectors
+from qpavoid.describe.poses import mimics
 from qpavoid.describe.sampling import Space, touching
 from qpavoid.errors import ConfigError, QpavoidError
 from qpavoid.loading import find_robot, read_config
