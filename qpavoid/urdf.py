@@ -84,7 +84,7 @@ def read_model(urdf: Path, root_joint: str) -> Any:
                 return _model_of_mjcf(urdf, root)
             check_urdf(urdf)
             return pin.buildModelFromUrdf(str(urdf), *([] if root is None else [root]))
-        except (ValueError, RuntimeError) as error:
+        except (ValueError, RuntimeError, IndexError) as error:
             reason = _reason(error)
     first = next((line.split(":", 1)[1].strip() for line in printed if line.startswith("Error:")), "")
     raise ConfigError(f"{urdf}: not a usable {kind}: {first or reason}")
@@ -100,6 +100,8 @@ def _model_of_mjcf(mjcf: Path, root: Any) -> Any:
 
 def _reason(error: Exception) -> str:
     """The last part of what pinocchio says: before it comes where in its own source it was said."""
+    if isinstance(error, IndexError):  # of a look-up in C++, without a name
+        return "it refers to a class, mesh or other name that it does not define"
     return " ".join(str(error).split()).rpartition("message: ")[2].rstrip(".")
 
 
@@ -132,7 +134,7 @@ def read_collision(urdf: Path, model: Any, package_dirs: list[str], path: Path, 
             if is_mjcf(urdf):
                 return _without_world(pin.buildGeomFromMJCF(model, str(urdf), kind))
             return pin.buildGeomFromUrdf(model, str(urdf), kind, package_dirs=folders)
-        except (ValueError, RuntimeError) as error:
+        except (ValueError, RuntimeError, IndexError) as error:
             reason = _reason(error)
     raise ConfigError(
         f"{path}: {urdf.name}: {reason}; name the folder that holds the package in `package_dirs` of a robot.yaml, "

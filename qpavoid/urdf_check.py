@@ -81,17 +81,21 @@ def check_mjcf(path: Path) -> None:
     if root.find("worldbody//body") is None:
         raise ConfigError(f"{where}: its worldbody has no body")
     for element in root.iter():
-        for attribute, text in element.items():
-            if attribute not in ("name", "class", "childclass") and _not_finite(text):
-                raise ConfigError(f"{where}: {element.tag} {attribute}={text!r:.60}: must be finite")
+        for attribute in sorted(_MJCF_NUMBERS.intersection(element.keys())):
+            place = f"{element.tag} {attribute}={element.get(attribute)!r:.60}"
+            try:
+                finite = all(abs(value) <= LARGEST for value in _floats(element.get(attribute, ""), place))
+            except ValueError as fault:
+                raise ConfigError(f"{where}: {fault}") from None
+            if not finite:
+                raise ConfigError(f"{where}: {place}: must be finite, and at most {LARGEST:g}")
 
 
-def _not_finite(text: str) -> bool:
-    """Whether a text is a list of numbers with a NaN or infinity among them."""
-    try:
-        return not all(math.isfinite(float(word)) for word in text.split())
-    except ValueError:
-        return False
+_MJCF_NUMBERS = {
+    "pos", "quat", "axis", "axisangle", "xyaxes", "zaxis", "euler", "range", "size", "fromto", "ref", "scale", "mass",
+    "diaginertia", "fullinertia", "vertex",
+}  # fmt: skip
+"""Attributes that are numbers, in every element that has them."""
 
 
 def _named(root: ET.Element, tag: str) -> dict[str, ET.Element]:
