@@ -1,6 +1,7 @@
 """Sends every robot of example-robot-data through `qpavoid robot check` and `add`, and writes docs/robots.md.
 
-    python -m bench.robots
+    python -m bench.robots              # all of them
+    python -m bench.robots talos pr2    # those with a word in their path: replaces their rows
 
 Each command runs in a process of its own with a time limit: a crash or a hang is a row of the table. The exit status is
 1 if there was one.
@@ -99,7 +100,7 @@ def _n(value: float | None) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("words", nargs="*", help="only robots with one of these words in their path; prints the rows")
+    parser.add_argument("words", nargs="*", help="only robots with one of these words in their path")
     words = parser.parse_args().words
     every = sorted(ROBOTS.rglob("*.urdf"))
     chosen = [path for path in every if not words or any(word in path.as_posix() for word in words)]
@@ -110,11 +111,14 @@ def main() -> None:
             print(line, end="", flush=True)
             rows.append(line)
             fine &= ended_well
-    if not words:
-        versions = {name: version(package) for name, package in PACKAGES.items()}
-        head = HEAD.format(count=len(every), **versions)
+    if words and OUT.exists():
+        fresh = {line.split("|")[1]: line for line in rows}
+        before = OUT.read_text(encoding="utf-8").splitlines(keepends=True)
+        OUT.write_text("".join(fresh.get("|".join(line.split("|")[1:2]), line) for line in before), encoding="utf-8")
+    else:
+        head = HEAD.format(count=len(every), **{name: version(package) for name, package in PACKAGES.items()})
         OUT.write_text(head + "".join(rows), encoding="utf-8")
-        print(OUT)
+    print(OUT)
     sys.exit(0 if fine else 1)
 
 

@@ -238,7 +238,7 @@ def _build(config: RobotConfig, path: Path) -> Robot:
             "every tick, some pairs several ms, convex hulls about 1 µs, capsules 0.1 µs; set `bodies` to convex or "
             "capsule",
             MeshWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
     _apply_limits(config, model, path)
     home = _set_joints(model, middle(model), config.home, f"{path}: home")

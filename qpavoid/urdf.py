@@ -162,8 +162,10 @@ def find_mesh(name: str, folders: list[str]) -> str | None:
         name: as the URDF has it.
         folders: see `mesh_folders`.
     """
-    for scheme in ("package://", "model://", "file://"):
-        name = name.removeprefix(scheme)
+    for scheme in ("package://", "model://"):
+        if name.startswith(scheme):
+            name = name.removeprefix(scheme).lstrip("/")  # some write three slashes
+    name = name.removeprefix("file://")
     return next((found for folder in folders if os.path.isfile(found := os.path.join(folder, name))), None)
 
 

@@ -18,6 +18,7 @@ from qpavoid.describe.check import check_robot
 from qpavoid.describe.sampling import CLEAR, touching
 from qpavoid.describe.written import untouched
 from qpavoid.loading import data_folder, find_robot, read_config
+from qpavoid.urdf import find_mesh
 
 MADE = ("baxter", "g1", "tiago", "ur5")
 """Robots that ship as `robot add` wrote them."""
@@ -91,6 +92,15 @@ def test_missing_meshes_are_named_with_where_they_were_looked_for(cli, tmp_path)
     assert added.status == 0
     assert yaml.safe_load((tmp_path / "chain" / "robot.yaml").read_text())["package_dirs"] == ["../elsewhere"]
     assert Robot.load("chain/robot.yaml").bodies.ngeoms == 4
+
+
+@pytest.mark.parametrize("name", ["package://arm/hand.stl", "package:///arm/hand.stl", "model://arm/hand.stl"])
+def test_meshes_are_looked_for_as_pinocchio_does(tmp_path, name):
+    (tmp_path / "arm").mkdir()
+    (tmp_path / "arm" / "hand.stl").touch()
+    assert find_mesh(name, ["/nowhere", str(tmp_path)]) == str(tmp_path / "arm" / "hand.stl")
+    assert find_mesh(f"file://{tmp_path}/arm/hand.stl", ["/nowhere"]) == str(tmp_path / "arm" / "hand.stl")
+    assert find_mesh(name.replace("hand", "foot"), ["/nowhere", str(tmp_path)]) is None
 
 
 def test_limits_that_cannot_be_meant(tmp_path):
