@@ -108,7 +108,8 @@ def test_limits_that_cannot_be_meant(tmp_path):
     old = '<limit lower="-2" upper="2" velocity="1.5" effort="1"/>'
     text = urdf.read_text()
     for new in (
-        '<limit lower="0" upper="0" velocity="0" effort="1"/>', '<limit lower="-99" upper="99" velocity="1e3" effort="1"/>',
+        '<limit lower="0" upper="0" velocity="0" effort="1"/>',
+        '<limit lower="-99" upper="99" velocity="1e3" effort="1"/>',
         '<limit lower="0" upper="0.0001" velocity="1" effort="1"/>',
     ):  # fmt: skip
         text = text.replace(old, new, 1)

@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
-from typing import Any, Literal
+from typing import Any
 
 import coal
 import numpy as np
@@ -17,6 +16,7 @@ import pinocchio as pin
 from qpavoid.config import RobotConfig, Task
 from qpavoid.controller import Controller
 from qpavoid.describe.ends import end_effectors
+from qpavoid.describe.findings import Joint, Problem, Report
 from qpavoid.describe.poses import mimics
 from qpavoid.describe.sampling import Space, touching
 from qpavoid.errors import ConfigError, QpavoidError
@@ -37,66 +37,6 @@ _WIDE = {"revolute": 8.0 * math.pi, "prismatic": 20.0}
 """Ranges [rad, m] above which one is hardly meant."""
 _NARROW = 1e-3
 """Range [rad, m] below which a joint is better locked."""
-
-
-@dataclass(frozen=True)
-class Problem:
-    """Something to know or to mend."""
-
-    severity: Literal["error", "warning", "note"]
-    what: str
-    remedy: str
-
-
-@dataclass(frozen=True)
-class Joint:
-    """A joint as the file has it, with the limits that hold."""
-
-    name: str
-    kind: str
-    """`fixed`, `revolute`, `continuous`, `prismatic`, `planar`, `floating` or `spherical`."""
-    mimics: str | None = None
-    lower: float | None = None
-    """[rad or m]; None: no limit."""
-    upper: float | None = None
-    velocity: float | None = None
-    """[rad/s or m/s]; None: no limit."""
-    locked: bool = False
-
-
-@dataclass
-class Report:
-    """What `robot check` found."""
-
-    name: str
-    source: str
-    nq: int = 0
-    nv: int = 0
-    joints: list[Joint] = field(default_factory=list)
-    frames: list[str] = field(default_factory=list)
-    shapes: dict[str, int] = field(default_factory=dict)
-    """Pieces of collision geometry by type."""
-    triangles: int = 0
-    """Of all collision meshes."""
-    missing_meshes: list[str] = field(default_factory=list)
-    searched: list[str] = field(default_factory=list)
-    """Folders in which meshes were looked for."""
-    without_mass: int = 0
-    """Links that move and have none."""
-    bodies: int = 0
-    pairs: int = 0
-    home_collisions: list[tuple[str, str, float]] = field(default_factory=list)
-    """Pairs that touch at the home pose, and their distance [m]."""
-    end_effectors: list[str] = field(default_factory=list)
-    load_seconds: float | None = None
-    tick_us: float | None = None
-    """Median control step that tracks all end effectors, without obstacles [µs]."""
-    problems: list[Problem] = field(default_factory=list)
-
-    @property
-    def usable(self) -> bool:
-        """Whether it can run as it is."""
-        return not any(problem.severity == "error" for problem in self.problems)
 
 
 def check_robot(name_or_path: str, root: str = "fixed", package_dirs: Sequence[Path] = ()) -> Report:

@@ -14,7 +14,8 @@ from rich.markup import escape
 
 from qpavoid.config.base import LARGEST
 from qpavoid.describe.add import Described, Root, Wishes, describe
-from qpavoid.describe.check import Joint, Report, check_robot
+from qpavoid.describe.check import check_robot
+from qpavoid.describe.findings import Joint, Report
 from qpavoid.describe.fit import Bodies
 from qpavoid.describe.sampling import SAMPLES, SEED
 from qpavoid.describe.texts import description_files, home_line, pairs_line, volume_line
