@@ -276,11 +276,14 @@ def test_the_picture_shows_the_bodies(cli, tmp_path):
 
 def test_an_added_robot_runs_at_once(cli, tmp_path):
     """From a URDF to a run that stays clear, in two commands and a scenario."""
-    urdf = EXAMPLES / "xarm_description/urdf/xarm7.urdf"
-    assert cli("robot", "add", urdf, "--name", "mine", "--no-picture", "--samples", "200").status == 0
+    urdf = EXAMPLES / "ur_description/urdf/ur10_robot.urdf"
+    home = [
+        word for j in ("shoulder_lift_joint=-1.57", "elbow_joint=1.57", "wrist_2_joint=-1.57") for word in ("--home", j)
+    ]
+    assert cli("robot", "add", urdf, "--name", "mine", *home, "--no-picture", "--samples", "200").status == 0
     scenario = {
         "robot": "mine/robot.yaml",
-        "tasks": [{"frame": "link7", "type": "position", "motion": {"type": "line", "displacement": [0, 0.3, 0],
+        "tasks": [{"frame": "tool0", "type": "position", "motion": {"type": "line", "displacement": [0, 0.3, 0],
                    "speed": 0.15}}],
         "obstacles": [{"name": "ball", "shape": {"type": "sphere", "radius": 0.05}, "motion": {"type": "fixed",
                        "position": None}}],
@@ -289,7 +292,7 @@ def test_an_added_robot_runs_at_once(cli, tmp_path):
     robot = Robot.load("mine/robot.yaml")
     data = robot.model.createData()
     pin.framesForwardKinematics(robot.model, data, robot.home)
-    tool = data.oMf[robot.frame_id("link7", "test")].translation
+    tool = data.oMf[robot.frame_id("tool0", "test")].translation
     scenario["obstacles"][0]["motion"]["position"] = (tool + np.array([0.0, 0.17, -0.02])).tolist()
     (tmp_path / "scene.yaml").write_text(yaml.safe_dump(scenario))
     assert simulate(load_scenario("scene.yaml", solver="tracking")).metrics()["collided"]
