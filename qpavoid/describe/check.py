@@ -27,8 +27,8 @@ from qpavoid.scene import build_scene
 from qpavoid.tasks import build_tasks
 from qpavoid.urdf import find_mesh, find_resource, is_mjcf, mesh_folders, mesh_names, read_collision, read_model
 
-_TICKS = 300
-"""Timed for the median."""
+_TICKS, _PATIENCE = 300, 5.0
+"""Timed for the median, as far as they take no longer than so many seconds."""
 _SLOW = 1000.0
 """Median tick from which it is worth a word [µs]."""
 _FAST = {"revolute": 50.0, "continuous": 50.0, "prismatic": 10.0}
@@ -292,4 +292,6 @@ def tick_time(robot: Robot, frames: Sequence[str]) -> float:
         begin = perf_counter()
         controller.step(q)
         times.append(perf_counter() - begin)
+        if sum(times) > _PATIENCE:
+            break
     return 1e6 * float(np.median(times))
