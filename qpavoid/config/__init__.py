@@ -7,14 +7,14 @@ and read by `qpavoid.loading`; `qpavoid.scene` and `qpavoid.motion` turn these m
 from qpavoid.config.base import Block
 from qpavoid.config.control import Avoidance, Cbf, Damper, Detour, Limits, Progress, Sensing, Switching, Task
 from qpavoid.config.motion import Circle, Csv, Fixed, Line, Motion, Waypoints
-from qpavoid.config.robot import Body, JointLimits, RobotConfig
+from qpavoid.config.robot import Body, Hull, JointLimits, RobotConfig
 from qpavoid.config.scenario import ObstacleConfig, ScenarioConfig
 from qpavoid.config.shapes import Box, Capsule, Cylinder, Shape, Sphere
 from qpavoid.config.solver import Eq10Solver, QpSolver, SolverConfig, TrackingSolver, expand_solver
 
 __all__ = [
     "Avoidance", "Block", "Body", "Box", "Capsule", "Cbf", "Circle", "Csv", "Cylinder", "Damper", "Detour",
-    "Eq10Solver", "Fixed", "JointLimits", "Limits", "Line", "Motion", "ObstacleConfig", "Progress", "QpSolver",
-    "RobotConfig", "ScenarioConfig", "Sensing", "Shape", "SolverConfig", "Sphere", "Switching", "Task",
+    "Eq10Solver", "Fixed", "Hull", "JointLimits", "Limits", "Line", "Motion", "ObstacleConfig", "Progress",
+    "QpSolver", "RobotConfig", "ScenarioConfig", "Sensing", "Shape", "SolverConfig", "Sphere", "Switching", "Task",
     "TrackingSolver", "Waypoints", "expand_solver",
 ]  # fmt: skip
