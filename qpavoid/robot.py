@@ -149,16 +149,25 @@ class Robot:
         Raises:
             UnknownName: a pattern without a joint.
         """
-        locked = []
-        for pattern in patterns:
-            found = [name for name in self.joint_names if fnmatchcase(name, pattern)]
-            if not found:
-                raise UnknownName(f"{where}: {self.name} has no joint {pattern!r}{nearest(pattern, self.joint_names)}")
-            locked += [name for name in found if name not in locked]
+        locked = self.matching(patterns, where)
         if not locked:
             return self, q
         model, bodies, index = _reduce(self.model, self.bodies, locked, q)
         return replace(self, model=model, bodies=bodies, home=self.home[index]), q[index]
+
+    def matching(self, patterns: Sequence[str], where: str) -> list[str]:
+        """Joints whose names match one of some patterns, in their order; `*` and `?` match as in file names.
+
+        Raises:
+            UnknownName: a pattern without a joint.
+        """
+        matched = []
+        for pattern in patterns:
+            found = [name for name in self.joint_names if fnmatchcase(name, pattern)]
+            if not found:
+                raise UnknownName(f"{where}: {self.name} has no joint {pattern!r}{nearest(pattern, self.joint_names)}")
+            matched += [name for name in found if name not in matched]
+        return matched
 
     def _joints(self) -> Iterator[tuple[str, Any]]:
         return zip(self.joint_names, list(self.model.joints)[1:], strict=True)

@@ -109,7 +109,8 @@ def make_layout(nv, frames=0, turns=(), pairs=0, obstacles=0, joints=1, **fields
     screws[3 * frames :, 3:] = np.tile(np.eye(3), (len(turns), 1))
     none = np.zeros(0, dtype=np.intp)
     inputs = {
-        "J_world": np.zeros((6, nv), order="F"), "frame_poses": np.zeros((frames, 12)),
+        "J_world": np.zeros((6, nv), order="F"), "columns": np.arange(nv), "mimics": False, "mimicking": np.zeros(nv),
+        "frame_poses": np.zeros((frames, 12)),
         "frame_ids": np.arange(frames), "targets": np.zeros((frames, 18)), "turns": np.array(turns, dtype=np.intp),
         "gain": np.ones(frames), "cap": np.full(frames + len(turns), np.inf), "scale": np.ones(rows),
         "task_support": np.ones((rows, nv)), "screws": screws, "results": np.zeros((pairs, 10)),

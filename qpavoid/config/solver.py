@@ -53,6 +53,22 @@ class QpSolver(Block):
         return self.name if self.backend == "auto" else f"{self.name}:{self.backend}"
 
 
+class HqpSolver(Block):
+    """Strict priorities: a cascade of QPs, one for each level of the tasks."""
+
+    name: Literal["hqp"] = "hqp"
+    backend: str = "auto"
+    """As of `qp`."""
+    regularization: Positive = 1e-6
+    """λ: cost, at each level, of leaving the velocity of the tasks alone [(rad/s)⁻²]. What it is above 0, a level may
+    be short of its best by."""
+
+    @property
+    def label(self) -> str:
+        """Short form that names it."""
+        return self.name if self.backend == "auto" else f"{self.name}:{self.backend}"
+
+
 def expand_solver(value: Any) -> Any:
     """`qp:proxqp` -> {name: qp, backend: proxqp}; `eq10` -> {name: eq10}."""
     if not isinstance(value, str):
@@ -62,5 +78,6 @@ def expand_solver(value: Any) -> Any:
 
 
 SolverConfig = Annotated[
-    Annotated[TrackingSolver | Eq10Solver | QpSolver, Field(discriminator="name")], BeforeValidator(expand_solver)
+    Annotated[TrackingSolver | Eq10Solver | QpSolver | HqpSolver, Field(discriminator="name")],
+    BeforeValidator(expand_solver),
 ]
