@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import tempfile
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,6 +17,11 @@ from qpavoid.errors import ConfigError
 from qpavoid.loading import example_robot_data
 from qpavoid.safe_xml import read_robot_xml
 from qpavoid.urdf_check import check_urdf
+
+
+class MimicWarning(UserWarning):
+    """Joints that should follow others do not: lock them."""
+
 
 _ROOT_JOINTS = {
     "fixed": lambda: None,
@@ -65,6 +71,10 @@ def _quiet_stderr() -> Iterator[list[str]]:
 def read_model(urdf: Path, root_joint: str) -> Any:
     """Pinocchio model of a URDF.
 
+    Joints that mimic another one have no coordinate of their own. Where Pinocchio cannot read them so (they come before
+    the other one in the tree, or turn all the way round where that has limits), they move on their own, with a
+    `MimicWarning`.
+
     Args:
         urdf: the file.
         root_joint: `fixed`, `planar` or `free_flyer`.
@@ -74,12 +84,21 @@ def read_model(urdf: Path, root_joint: str) -> Any:
     """
     check_urdf(urdf)
     root = _ROOT_JOINTS[root_joint]()
-    with _quiet_stderr() as printed:
-        try:
-            arguments = (str(urdf),) if root is None else (str(urdf), root)
-            return pin.buildModelFromUrdf(*arguments)
-        except (ValueError, RuntimeError) as error:
-            reason = " ".join(str(error).split())
+    arguments = (str(urdf),) if root is None else (str(urdf), root)
+    for mimic in (True, False):
+        with _quiet_stderr() as printed:
+            try:
+                model = pin.buildModelFromUrdf(*arguments, mimic=mimic)
+            except (ValueError, RuntimeError) as error:
+                reason = " ".join(str(error).split())
+                continue
+        if not mimic:
+            warnings.warn(
+                f"{urdf}: joints that mimic others move on their own, and should be locked: {reason[-120:]}",
+                MimicWarning,
+                stacklevel=5,
+            )
+        return model
     first = next((line.split(":", 1)[1].strip() for line in printed if line.startswith("Error:")), "")
     raise ConfigError(f"{urdf}: not a usable URDF: {first or reason}")
 

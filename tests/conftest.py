@@ -14,6 +14,7 @@ from qpavoid.kinematics import ForwardKinematics
 from qpavoid.loading import example_robot_data
 from qpavoid.motion import build_motion
 from qpavoid.proximity import DistanceQuery
+from qpavoid.tasks import in_order
 
 settings.register_profile("patient", deadline=None)  # the first call of a compiled function may wait for the compiler
 settings.load_profile("patient")
@@ -86,7 +87,10 @@ class Bench:
 
     def __init__(self, scene, tasks=(), avoidance=None, position_gain=0.5, damping=0.0, dt=0.01, query=None):
         self.robot, self.tasks = scene.robot, tuple(tasks)
-        self.kinematics = ForwardKinematics(scene.robot.model, [task.frame_id for task in tasks])
+        self.kinematics = ForwardKinematics(
+            scene.robot.model,
+            [i for task in tasks for i in (task.frame_ids if hasattr(task, "frame_ids") else (task.frame_id,))],
+        )
         self.query = query or DistanceQuery(scene)
         self.assembly = Assembly(
             scene, tasks, scene.robot.bounds(), self.kinematics, self.query, avoidance or config.Avoidance(),
@@ -97,7 +101,7 @@ class Bench:
         """Proximity and problem at q, as they are until the next call."""
         self.kinematics.compute(q)
         self.query.compute(self.kinematics.data, reach)
-        targets = targets or [task.motion.sample(0.0) for task in self.tasks]
+        targets = targets or [task.motion.sample(0.0) for part in in_order(self.tasks) for task in part]
         return self.assembly.compute(np.asarray(q), targets, self.query, reach)
 
 
