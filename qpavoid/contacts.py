@@ -49,8 +49,9 @@ class ContactRows:
                 for frame_id, anchor, gain in zip(self.frame_ids, self._anchors, self._gains, strict=True)
             ]
         )
+        b = b[self._rows]
         b *= min(1.0, _CORRECTION / max(float(np.abs(b).max()), 1e-12))
-        return solve_contacts(J[self._rows], b[self._rows])
+        return solve_contacts(J[self._rows], b)
 
 
 def build_contacts(

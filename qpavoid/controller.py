@@ -144,18 +144,21 @@ class Controller:
         obstacles = build_obstacles(scenario.obstacles, source)
         with located(str(source)):
             scene = build_scene(robot, obstacles)
-        controller = cls(
-            scene,
-            build_tasks(scenario.tasks, robot, q0, source),
-            solver,
-            scenario.dt,
-            scenario.avoidance,
-            scenario.limits,
-            scenario.tracking_damping,
-            scenario.sensing,
-            scenario.progress,
-            build_contacts(scenario.contacts, robot, q0, source),
-        )
+        tasks = build_tasks(scenario.tasks, robot, q0, source)
+        contacts = build_contacts(scenario.contacts, robot, q0, source)
+        with located(str(source)):
+            controller = cls(
+                scene,
+                tasks,
+                solver,
+                scenario.dt,
+                scenario.avoidance,
+                scenario.limits,
+                scenario.tracking_damping,
+                scenario.sensing,
+                scenario.progress,
+                contacts,
+            )
         return controller, q0
 
     def step(

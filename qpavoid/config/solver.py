@@ -59,9 +59,9 @@ class HqpSolver(Block):
     name: Literal["hqp"] = "hqp"
     backend: str = "auto"
     """As of `qp`."""
-    regularization: Positive = 1e-6
-    """λ: cost, at each level, of leaving the velocity of the tasks alone [(rad/s)⁻²]. What it is above 0, a level may
-    be short of its best by."""
+    regularization: Annotated[float, Field(ge=1e-7, le=1e3)] = 1e-3
+    """λ: cost, at each level, of leaving the velocity that the tasks alone would have [(rad/s)⁻²]. As of `qp`, it keeps
+    joints from full speed for the last mm/s of a level that obstacles hold up; it gives nothing to later levels."""
 
     @property
     def label(self) -> str:

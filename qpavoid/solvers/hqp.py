@@ -18,6 +18,8 @@ from qpavoid.solvers.reasons import what_gave_way
 from qpavoid.solvers.reduced import solve_within
 from qpavoid.solvers.relaxation import closest
 
+Levels = list[tuple[Array, Array]]
+"""Rows A (r, nv) and right-hand sides b (r,) of each priority, the first one first."""
 _FREE = 1e-8
 """Share of a level's largest singular value below which it leaves a direction free [-]."""
 
@@ -41,12 +43,12 @@ class Hqp(Qp):
             return Solution(problem.v0.copy())
         levels = problem.levels or (np.arange(len(problem.tracking.b)),)
         rows, lower, upper = problem.avoidance, problem.lower, problem.upper
-        alone = _cascade(problem, levels)
+        alone, asked = _cascade(problem, levels)
         if kernels.shortfall(alone, rows.J, rows.b, lower, upper) <= 0.0:
             return Solution(alone)
         if not np.isfinite(alone).all():
             alone = np.zeros_like(alone)
-        v = self._levels(problem, levels, alone, rows.b, lower, upper)
+        v = self._levels(problem, asked, alone, rows.b, lower, upper)
         if v is not None:
             return Solution(v)
         P, q = kernels.projection_cost(problem.tracking.A, 1e-3, alone)
@@ -54,19 +56,18 @@ class Hqp(Qp):
         if isinstance(relaxed, Solution):
             return relaxed
         lower, upper = np.minimum(lower, relaxed.v), np.maximum(upper, relaxed.v)
-        v = self._levels(problem, levels, alone, rows.b - relaxed.slack, lower, upper)
+        v = self._levels(problem, asked, alone, rows.b - relaxed.slack, lower, upper)
         relaxed = relaxed if v is None else relaxed._replace(v=v)
         slack = relaxed.slack if relaxed.slack.any() else None
         return Solution(relaxed.v, Status.RELAXED, what_gave_way(relaxed, problem), slack)
 
     def _levels(
-        self, problem: Problem, levels: tuple[IntArray, ...], alone: Array, least: Array, lower: Array, upper: Array
+        self, problem: Problem, asked: Levels, alone: Array, least: Array, lower: Array, upper: Array
     ) -> Array | None:
         """The cascade within J v >= least and the bounds (nv,); None where its first level has no solution."""
-        tracking, J = problem.tracking, problem.avoidance.J
-        Z, v = _start(problem)
+        J, (Z, v) = problem.avoidance.J, _start(problem)
         met = False
-        for A, b in [*((tracking.A[rows], tracking.b[rows]) for rows in levels), (np.eye(len(v)), alone)]:
+        for A, b in (*asked, (np.eye(len(v)), alone)):
             P = A.T @ A
             P.ravel()[:: len(P) + 1] += self.config.regularization
             q = -(A.T @ b + self.config.regularization * alone)
@@ -108,23 +109,29 @@ def _start(problem: Problem) -> tuple[Array, Array]:
     return (np.eye(nv), np.zeros(nv)) if contacts is None else (contacts.Z, contacts.rest)
 
 
-def _cascade(problem: Problem, levels: tuple[IntArray, ...]) -> Array:
-    """The velocity (nv,) of the tasks alone; NaN where a row holds one."""
+def _cascade(problem: Problem, levels: tuple[IntArray, ...]) -> tuple[Array, Levels]:
+    """The velocity (nv,) of the tasks alone, NaN where a row holds one, and the levels of which it is the best.
+
+    These ask for what damping leaves of the tasks, so that where an inequality begins to bind, nothing jumps.
+    """
     tracking = problem.tracking
+    asked = [(tracking.A[rows], tracking.b[rows]) for rows in levels]
     Z, v = _start(problem)
-    for rows in levels:
-        A, b = tracking.A[rows], tracking.b[rows]
+    for level, (A, b) in enumerate(asked):
         reduced, missing = A @ Z, b - A @ v
         if not (np.isfinite(reduced).all() and np.isfinite(missing).all()):
-            return np.full_like(v, np.nan)
+            return np.full_like(v, np.nan), asked[:level]
         U, s, V = np.linalg.svd(reduced, full_matrices=True)
         used = s > _FREE * max(float(s[0]), 1e-12)
         s, count = s[used], int(used.sum())
-        v = v + Z @ (V[:count].T @ (s / (s**2 + tracking.damping**2) * (U[:, :count].T @ missing)))
+        within = U[:, :count].T @ missing
+        step = s / (s**2 + tracking.damping**2) * within
+        v = v + Z @ (V[:count].T @ step)
+        asked[level] = (A, b - U[:, :count] @ (within - s * step))
         Z = Z @ V[count:].T
         if not Z.shape[1]:
             break
-    return v
+    return v, asked
 
 
 def _free(A: Array) -> Array:
