@@ -285,9 +285,13 @@ def _apply_limits(config: RobotConfig, model: Any, path: Path) -> None:
         if joint.nq != 1:
             raise ConfigError(f"{path}: limits.position: joint {name!r} turns all the way round; leave it out")
         lower[joint.idx_q], upper[joint.idx_q] = low, high
-    given = {"position": config.limits.position, "velocity": config.limits.velocity}
-    for kind, limits in {**given, "acceleration": config.limits.acceleration}.items():
-        for name in limits:
+    own = config.limits
+    for kind, names in (
+        ("position", [*own.position]),
+        ("velocity", [*own.velocity]),
+        ("acceleration", [*own.acceleration]),
+    ):
+        for name in names:
             if _joint(model, name, f"{path}: limits.{kind}").shortname() == MIMIC:
                 raise ConfigError(f"{path}: limits.{kind}: {_follows(model, name)}; limit that one")
     for name, speed in config.limits.velocity.items():

@@ -160,7 +160,7 @@ def test_a_stop_holds_the_contacts(solo):
     """From full speed, within acceleration limits, with no news of the state but the last command."""
     controller, q = standing(solo, limits=config.Limits(acceleration=5.0))
     begin, here = feet(solo, q), controller.tick(q).targets[0]
-    target = here._replace(position=here.position + [0.05, 0.0, 0.02])
+    target = here._replace(position=here.position + np.array([0.05, 0.0, 0.02]))
     for tick in range(80):
         solution = controller.step(q if tick < 30 else np.full_like(q, np.nan), targets={"base_link": target})
         assert (solution.status is Status.STOPPED) == (tick >= 30)

@@ -1,4 +1,4 @@
-"""Strict priorities against the closed form where nothing binds, and against plain cascades of QPs where something does."""
+"""Strict priorities against the closed form where nothing binds, and against plain cascades of QPs elsewhere."""
 
 import numpy as np
 import pinocchio as pin
@@ -42,7 +42,7 @@ def costs(problem, v):
 
 @pytest.mark.parametrize("seed", range(10))
 def test_nothing_binds_and_it_is_the_cascade_of_null_space_projections(seed):
-    """v += (A_p N)⁺ (b_p - A_p v), N the projector on what all levels before leave free (Siciliano and Slotine 1991)."""
+    """v += (A_p N)⁺ (b_p - A_p v), N the projector on what levels before leave free (Siciliano and Slotine 1991)."""
     problem = random_problem(seed, bound=1e3)
     v, stacked = np.zeros(NV), np.zeros((0, NV))
     for rows in problem.levels:

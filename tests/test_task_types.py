@@ -58,9 +58,10 @@ class Rows:
 
 
 def frames(robot, names, q):
-    if robot.source not in DATA:
-        DATA[robot.source] = robot.model, robot.model.createData()
-    model, data = DATA[robot.source]
+    key = robot.source, robot.model.nq
+    if key not in DATA:
+        DATA[key] = robot.model, robot.model.createData()
+    model, data = DATA[key]
     pin.framesForwardKinematics(model, data, q)
     return [data.oMf[robot.model.getFrameId(name)].copy() for name in names]
 
