@@ -258,7 +258,7 @@ def test_missing_urdf(tmp_path):
     ):
         Robot.load(str(tmp_path / "robot.yaml"))
     with pytest.raises(
-        ConfigError, match=r"none\.urdf: no such file; give a robot file, or one of panda, paper-dual-arm"
+        ConfigError, match=r"none\.urdf: no such file; give a robot file, or one of g1, panda, paper-dual-arm"
     ):
         Robot.load(str(tmp_path / "none.urdf"))
     with pytest.raises(ConfigError, match=r"none\.urdf: .*no such file"):
