@@ -326,20 +326,15 @@ def _in_link(body: Any, model: Any) -> Any:
 def _apply_limits(config: RobotConfig, model: Any, path: Path) -> None:
     lower, upper = np.array(model.lowerPositionLimit), np.array(model.upperPositionLimit)
     velocity = np.array(model.velocityLimit)
+    for kind in ("position", "velocity", "acceleration"):
+        for name in getattr(config.limits, kind):
+            if _joint(model, name, f"{path}: limits.{kind}").shortname() == MIMIC:
+                raise ConfigError(f"{path}: limits.{kind}: {_follows(model, name)}; limit that one")
     for name, (low, high) in config.limits.position.items():
         joint = _joint(model, name, f"{path}: limits.position")
         if joint.nq != 1:
             raise ConfigError(f"{path}: limits.position: joint {name!r} turns all the way round; leave it out")
         lower[joint.idx_q], upper[joint.idx_q] = low, high
-    own = config.limits
-    for kind, names in (
-        ("position", [*own.position]),
-        ("velocity", [*own.velocity]),
-        ("acceleration", [*own.acceleration]),
-    ):
-        for name in names:
-            if _joint(model, name, f"{path}: limits.{kind}").shortname() == MIMIC:
-                raise ConfigError(f"{path}: limits.{kind}: {_follows(model, name)}; limit that one")
     for name, speed in config.limits.velocity.items():
         joint = _joint(model, name, f"{path}: limits.velocity")
         velocity[joint.idx_v : joint.idx_v + joint.nv] = speed
