@@ -33,7 +33,7 @@ class Qp:
     told to stop.
 
     Contacts are held exactly, whatever gives way: with v = rest + Z w, all of the above is solved for w
-    (`solvers.reduced`).
+    (`solvers.reduced`), by daqp where the back end is `native`.
     """
 
     bounded = True
@@ -41,7 +41,8 @@ class Qp:
 
     def __init__(self, config: QpSolver | HqpSolver) -> None:
         self.config = config
-        compiled = config.backend == "native" or (config.backend == "auto" and kernels.ACCELERATED)
+        wanted = config.backend == "native" or (config.backend == "auto" and kernels.ACCELERATED)
+        compiled = wanted and isinstance(config, QpSolver)
         self._project = _compiled_projection() if compiled else None
         self._backend = make_backend("daqp" if config.backend in ("auto", "native") else config.backend)
 
