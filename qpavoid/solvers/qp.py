@@ -35,7 +35,7 @@ class Qp:
     where that fails too, the robot is told to stop.
 
     Contacts are held exactly, whatever gives way: with v = rest + Z w, all of the above is solved for w
-    (`solvers.reduced`), by a back end.
+    (`solvers.reduced`), by daqp where the back end is `native`.
     """
 
     bounded = True
