@@ -43,7 +43,7 @@ class Assembly:
             frame_poses=kinematics.frame_poses,
             **task_layout(tasks, scene.robot.model),
             results=query.results,
-            support=scene.support,
+            support=scene.support.copy(),
             twists=query.twists,
             twist_row=query.twist_row,
             margin=query.margin,

@@ -13,6 +13,7 @@ import pinocchio as pin
 
 from qpavoid import kernels
 from qpavoid.assembly import Assembly
+from qpavoid.cloud import Points
 from qpavoid.config import Avoidance, Limits, Progress, ScenarioConfig, Sensing
 from qpavoid.errors import NumericalError, UnknownName, located
 from qpavoid.guard import TOLERANCE, Guard
@@ -146,7 +147,7 @@ class Controller:
         q: Array,
         t: float = 0.0,
         targets: Mapping[str, Sample] | None = None,
-        obstacles: Mapping[str, Sample | Pose] | None = None,
+        obstacles: Mapping[str, Sample | Pose | Points] | None = None,
         v: Array | None = None,
     ) -> Solution:
         """Velocity for the next dt.
@@ -173,7 +174,7 @@ class Controller:
         q: Array,
         t: float = 0.0,
         targets: Mapping[str, Sample] | None = None,
-        obstacles: Mapping[str, Sample | Pose] | None = None,
+        obstacles: Mapping[str, Sample | Pose | Points] | None = None,
         v: Array | None = None,
     ) -> Tick:
         """Like `step`, with everything that led to the velocity."""
@@ -187,7 +188,7 @@ class Controller:
         q: Array,
         v_desired: Array,
         t: float = 0.0,
-        obstacles: Mapping[str, Sample | Pose] | None = None,
+        obstacles: Mapping[str, Sample | Pose | Points] | None = None,
         v: Array | None = None,
     ) -> Solution:
         """The safe velocity that is closest to any command: of a teleoperator, a policy, another controller.
@@ -218,7 +219,7 @@ class Controller:
         q: Array,
         t: float,
         targets: Mapping[str, Sample] | None,
-        obstacles: Mapping[str, Sample | Pose] | None,
+        obstacles: Mapping[str, Sample | Pose | Points] | None,
         v: Array | None,
         desired: Array | None = None,
     ) -> tuple[tuple[Sample, ...], Proximity, Problem, Solution]:
@@ -249,9 +250,9 @@ class Controller:
         observed = self._obstacles.observe(t, obstacles)
         assumed: tuple[str, ...] = ()
         if observed is not None:
-            for index, sample, margin in observed.seen:
-                self._query.place_obstacle(index, sample, margin)
-                self._guard.see(index, sample)
+            for index, sample, margin, voxels in observed.seen:
+                self._query.place_obstacle(index, sample, margin, voxels)
+                self._guard.see(index, sample, voxels)
             faults, assumed = faults + observed.stop, observed.assumed
         self._kinematics.compute(q)
         self._query.compute(self._kinematics.data, self._reach)

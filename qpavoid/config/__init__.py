@@ -9,12 +9,24 @@ from qpavoid.config.control import Avoidance, Cbf, Damper, Detour, Limits, Progr
 from qpavoid.config.motion import Circle, Csv, Fixed, Line, Motion, Waypoints
 from qpavoid.config.robot import Body, JointLimits, RobotConfig
 from qpavoid.config.scenario import ObstacleConfig, ScenarioConfig
-from qpavoid.config.shapes import Box, Capsule, Cylinder, Shape, Sphere
+from qpavoid.config.shapes import (
+    Box,
+    Capsule,
+    Cone,
+    Cylinder,
+    Ellipsoid,
+    HalfSpace,
+    Mesh,
+    ObstacleShape,
+    PointCloud,
+    Shape,
+    Sphere,
+)
 from qpavoid.config.solver import Eq10Solver, QpSolver, SolverConfig, TrackingSolver, expand_solver
 
 __all__ = [
-    "Avoidance", "Block", "Body", "Box", "Capsule", "Cbf", "Circle", "Csv", "Cylinder", "Damper", "Detour",
-    "Eq10Solver", "Fixed", "JointLimits", "Limits", "Line", "Motion", "ObstacleConfig", "Progress", "QpSolver",
-    "RobotConfig", "ScenarioConfig", "Sensing", "Shape", "SolverConfig", "Sphere", "Switching", "Task",
-    "TrackingSolver", "Waypoints", "expand_solver",
+    "Avoidance", "Block", "Body", "Box", "Capsule", "Cbf", "Circle", "Cone", "Csv", "Cylinder", "Damper", "Detour",
+    "Ellipsoid", "Eq10Solver", "Fixed", "HalfSpace", "JointLimits", "Limits", "Line", "Mesh", "Motion",
+    "ObstacleConfig", "ObstacleShape", "PointCloud", "Progress", "QpSolver", "RobotConfig", "ScenarioConfig",
+    "Sensing", "Shape", "SolverConfig", "Sphere", "Switching", "Task", "TrackingSolver", "Waypoints", "expand_solver",
 ]  # fmt: skip
