@@ -16,6 +16,8 @@ from qpavoid.problem import Array, IntArray
 
 _CUTS = 8
 """Slabs along each axis, at most."""
+_CLOSE = 1e-3
+"""Share of a part's extent below which coordinates count as the same."""
 _THIN = 1e-9
 """Thickness of what has no volume: a share of the size of the mesh."""
 
@@ -77,30 +79,36 @@ def _cells(triangles: Array) -> list[Array]:
     """The triangles (t, 3, 3) of a part cut up along all three axes."""
     cells = [triangles]
     for axis in range(3):
-        planes = _planes(triangles[..., axis].ravel())
+        coordinates = triangles[..., axis].ravel()
+        close = _CLOSE * float(np.ptp(coordinates))
+        planes = _planes(np.sort(coordinates), close)
         slabs = []
         for cell in cells:
             rest = cell
             for plane in planes:
-                below, rest = _cut(rest, axis, plane)
+                below, rest = _cut(rest, axis, plane, close)
                 slabs.append(below)
             slabs.append(rest)
         cells = [slab for slab in slabs if len(slab)]
     return cells
 
 
-def _planes(coordinates: Array) -> list[float]:
-    """Where to cut along an axis: at the corners' own coordinates where these are few, else evenly."""
-    low, high = float(coordinates.min()), float(coordinates.max())
-    distinct = np.unique(np.round((coordinates - low) / max(high - low, 1e-12), 3))
+def _planes(coordinates: Array, close: float) -> list[float]:
+    """Where to cut along an axis: at the corners' own coordinates (n,), sorted, where these are few, else evenly."""
+    distinct = coordinates[np.diff(coordinates, prepend=-np.inf) > close]
     if len(distinct) > _CUTS + 1:
-        distinct = np.linspace(0.0, 1.0, _CUTS + 1)
-    return [low + share * (high - low) for share in distinct[1:-1].tolist()]
+        distinct = np.linspace(coordinates[0], coordinates[-1], _CUTS + 1)
+        return distinct[1:-1].tolist()
+    return distinct[1:-1].tolist() if coordinates[-1] - distinct[-1] <= close else distinct[1:].tolist()
 
 
-def _cut(triangles: Array, axis: int, plane: float) -> tuple[Array, Array]:
-    """The triangles (t, 3, 3) below and above a plane; those that it crosses are cut into three."""
+def _cut(triangles: Array, axis: int, plane: float, close: float) -> tuple[Array, Array]:
+    """The triangles (t, 3, 3) below and above a plane; those that it crosses are cut into three.
+
+    Corners closer to the plane than `close` count as lying in it, and stay where they are.
+    """
     height = triangles[..., axis] - plane
+    height[np.abs(height) <= close] = 0.0
     below, above = (height <= 0.0).all(axis=1), (height >= 0.0).all(axis=1)
     crossed = ~(below | above)
     # the corner that is alone on its side comes first
@@ -112,7 +120,6 @@ def _cut(triangles: Array, axis: int, plane: float) -> tuple[Array, Array]:
     with np.errstate(divide="ignore", invalid="ignore"):
         share = np.clip(h[:, :1] / (h[:, :1] - h[:, 1:]), 0.0, 1.0)
     on = cut[:, :1] + share[..., None] * (cut[:, 1:] - cut[:, :1])
-    on[..., axis] = plane
     tip = np.stack((cut[:, 0], on[:, 0], on[:, 1]), axis=1)
     rest = np.concatenate(
         (np.stack((on[:, 0], cut[:, 1], cut[:, 2]), axis=1), np.stack((on[:, 0], cut[:, 2], on[:, 1]), axis=1))

@@ -26,6 +26,8 @@ from qpavoid.slots import Slots
 
 _CULL_FROM = 48 if kernels.ACCELERATED else 192
 """Number of pairs from which looking at bounding spheres first pays."""
+_LONGEST_GRASP = 0.5
+"""Largest gap between the robot and what it carries [m]."""
 _FARTHEST_STOP = 1.0
 """How far the robot may go before it stands, where a half-space that turns is concerned [m]."""
 
@@ -68,7 +70,8 @@ class DistanceQuery:
         self.speeds = np.zeros(model.njoints + obstacles)
         """(njoints + o,) largest speed of any point that a joint carries, or of an obstacle [m/s]; here, the latter."""
         self._samples = [obstacle.motion.sample(0.0) for obstacle in scene.obstacles]
-        self._group: IntArray = np.arange(len(scene.pairs))
+        self.group: IntArray = np.arange(len(scene.pairs))
+        """(m,) first of the pairs of the same body and point cloud; of other pairs, their own number."""
         self._grouped = np.zeros(len(scene.pairs), dtype=bool)
         self._slots = {i: self._make_slots(i, voxels) for i, voxels in scene.clouds.items()}
         self.carried: dict[int, int] = {}
@@ -89,6 +92,16 @@ class DistanceQuery:
     def moving(self) -> bool:
         """Whether any obstacle has a velocity or a margin."""
         return bool(self._moving)
+
+    @property
+    def bodies(self) -> Any:
+        """Geometries as they are placed and carried now, in the order of the geometry model."""
+        return self._geometry.geometryObjects
+
+    def longest_reach(self) -> Array:
+        """(njoints,) the same as `joint_reach` with whatever may ever be carried: it is no farther from its joint [m]."""
+        radii, reach = self.spheres[self._first_obstacle : self._movable, 3], self.joint_reach()
+        return np.full_like(reach, reach.max() + 2.0 * radii.max() + _LONGEST_GRASP) if len(radii) else reach
 
     def carriers(self) -> IntArray:
         """(m, 2) what moves the two bodies of each pair: number of a joint, or njoints plus that of an obstacle."""
@@ -222,6 +235,7 @@ class DistanceQuery:
             self.results[:] = read_results(self._data.distanceResults)
         if len(self._surface):
             self._mend_surfaces(pairs)
+        self._computed = pairs
         self.pairs = pairs if self.unwatched is None else pairs[~self.unwatched[pairs]]
 
     def found(self, pairs: IntArray) -> Array:
@@ -234,9 +248,9 @@ class DistanceQuery:
             distance = np.where(self._cull.active[pairs], distance, np.inf)
         if self._slots:
             least = np.full(len(self._scene.pairs), np.inf)
-            near = self.pairs
-            np.minimum.at(least, self._group[near], self.results[near, 0])
-            distance = np.where(self._grouped[pairs], least[self._group[pairs]], distance)
+            near = self._computed
+            np.minimum.at(least, self.group[near], self.results[near, 0])
+            distance = np.where(self._grouped[pairs], least[self.group[pairs]], distance)
         return distance
 
     def widest(self, given: Array) -> Array:
@@ -244,8 +258,8 @@ class DistanceQuery:
         if not self._slots:
             return given
         most = np.zeros_like(given)
-        np.maximum.at(most, self._group, given)
-        return most[self._group]
+        np.maximum.at(most, self.group, given)
+        return most[self.group]
 
     def _make_slots(self, index: int, voxels: Voxels) -> Slots:
         shape, first = self._scene.obstacles[index].shape, self._movable
@@ -253,7 +267,7 @@ class DistanceQuery:
         a, b = self._scene.pairs.T
         mine = np.flatnonzero(self._scene.obstacle_of[b] == index)
         self._grouped[mine] = True
-        self._group[mine] = mine[np.searchsorted(a[mine], a[mine])]
+        self.group[mine] = mine[np.searchsorted(a[mine], a[mine])]
         bodies = [self._geometry.geometryObjects[i].geometry for i in range(first)]
         return Slots(bodies, np.array(self._pieces[index]), shape.resolution, shape.nearest, voxels)
 
