@@ -84,9 +84,7 @@ class Voxels:
         if len(starts):
             low, high = np.minimum.reduceat(centers, starts), np.maximum.reduceat(centers, starts)
             blocks[:, :3], blocks[:, 3] = 0.5 * (low + high), 0.5 * np.linalg.norm(high - low, axis=1)
-        return cls(
-            resolution, centers, keys, blocks, np.append(starts, len(keys)), len(array) - len(kept), len(array)
-        )
+        return cls(resolution, centers, keys, blocks, np.append(starts, len(keys)), len(array) - len(kept), len(array))
 
     @classmethod
     def of_octree(cls, tree: Any, resolution: float | None = None) -> Voxels:

@@ -144,6 +144,10 @@ class Controller:
             scenario.sensing,
             scenario.progress,
         )
+        for c in scenario.obstacles:
+            if c.carried_by is not None:
+                with located(f"{source}: obstacles: {c.name!r}: carried_by"):
+                    controller.attach(c.name, c.carried_by, q0)
         return controller, q0
 
     def step(
@@ -271,11 +275,15 @@ class Controller:
         """World pose of an obstacle as the last tick had it, carried or not; see `release` for the arguments."""
         return self._grasps.pose(self._obstacles.index(obstacle), self._given_or_last(q))
 
+    def tell_who_carries(self, query: DistanceQuery) -> None:
+        """Brings other distances of the scene to what the robot carries now, and what may touch."""
+        self._grasps.tell(query)
+
     def _given_or_last(self, q: Array | None) -> Array:
         return self._q_last if q is None else require_finite("q", q, self._q_shape)
 
     def reset(self, v: Array | None = None) -> None:
-        """Forgets the ticks before: the robot moves at v (nv,), or stands still. What it carries it goes on carrying."""
+        """Forgets the ticks before: the robot moves at v (nv,), or stands still; it keeps what it carries."""
         self._assembly.remember(np.zeros(self._v_shape) if v is None else require_finite("v", v, self._v_shape))
         self._q_last[:] = self.scene.robot.home
         self._obstacles.reset()

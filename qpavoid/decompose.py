@@ -95,11 +95,11 @@ def _cells(triangles: Array) -> list[Array]:
 
 def _planes(coordinates: Array, close: float) -> list[float]:
     """Where to cut along an axis: at the corners' own coordinates (n,), sorted, where these are few, else evenly."""
-    distinct = coordinates[np.diff(coordinates, prepend=-np.inf) > close]
+    distinct = coordinates[np.diff(coordinates, prepend=-np.inf) > close].tolist()
     if len(distinct) > _CUTS + 1:
-        distinct = np.linspace(coordinates[0], coordinates[-1], _CUTS + 1)
-        return distinct[1:-1].tolist()
-    return distinct[1:-1].tolist() if coordinates[-1] - distinct[-1] <= close else distinct[1:].tolist()
+        distinct = np.linspace(coordinates[0], coordinates[-1], _CUTS + 1).tolist()
+    inner: list[float] = [x for x in distinct if coordinates[0] + close < x < coordinates[-1] - close]
+    return inner
 
 
 def _cut(triangles: Array, axis: int, plane: float, close: float) -> tuple[Array, Array]:
@@ -179,5 +179,3 @@ def _corners(points: Array) -> Array:
         return np.asarray(points[ConvexHull(points).vertices])
     except (QhullError, ValueError):
         return points
-
-

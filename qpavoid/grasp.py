@@ -102,6 +102,15 @@ class Grasps:
             self._touching = self._touching[~apart]
             self._look_away()
 
+    def tell(self, query: DistanceQuery) -> None:
+        """Brings other distances of the same scene to who carries what now."""
+        if query.carried != self.carried:
+            for index in {*query.carried, *self.carried}:
+                body = self._queries[0].bodies[self._geometry(index)]
+                placement = Sample.at(body.placement.translation, body.placement.rotation)
+                query.carry(index, int(body.parentJoint), placement)
+        query.unwatched = self._queries[0].unwatched
+
     def pose(self, index: int, q: Array) -> Sample:
         """World pose of an obstacle at q (nq,)."""
         pose = self._pose(index, q)
@@ -118,13 +127,14 @@ class Grasps:
         self._assembly.carry(self._queries[0])
         self._rigid[:] = False
         joints = np.array([body.parentJoint for body in self._queries[0].bodies], dtype=np.intp)
-        a, b = joints[self._scene.pairs].T
+        first, second = self._scene.pairs.T
+        a, b = joints[first], joints[second]
         for carried, carrier in self.carried.items():
             # what moves with the carrier or hangs below it: its support has all of the carrier's coordinates
-            below = (self._masks[:, self._masks[carrier] > 0.0] > 0.0).all(axis=1)
-            mine = self._scene.pairs == self._geometry(carried)
-            self._rigid |= (mine[:, 0] & below[b]) | (mine[:, 1] & below[a])
-        mine = (self._scene.pairs == self._geometry(index)).any(axis=1)
+            below = np.all(self._masks[:, self._masks[carrier] > 0.0] > 0.0, axis=1, keepdims=True)[:, 0]
+            self._rigid |= (first == self._geometry(carried)) & below[b]
+            self._rigid |= (second == self._geometry(carried)) & below[a]
+        mine = (first == self._geometry(index)) | (second == self._geometry(index))
         was = np.zeros(len(mine), dtype=bool)
         was[self._touching] = True
         query = self._queries[0]

@@ -46,9 +46,8 @@ class DistanceQuery:
         self._pieces = [np.flatnonzero(scene.obstacle_of == i).tolist() for i in range(len(scene.obstacles))]
         obstacles, graspable = len(scene.obstacles), self._movable - self._first_obstacle
         self.twists = np.zeros((obstacles + 1 + graspable, 6))
-        """(o + 1 + c, 6) of the obstacles at the world's origin; row o stays zero: for the robot's own bodies and what it
-        carries. The last c are those of the obstacles that can be carried, negative: for pairs of which they come first.
-        """
+        """(o + 1 + c, 6) of the obstacles at the world's origin; row o stays zero: for the robot and its loads.
+        The last c are those of the obstacles that can be carried, negative: for pairs of which they come first."""
         self.margin = np.zeros(len(self.twists))
         """(o + 1 + c,) to be taken off the distances to each obstacle, likewise [m]."""
         self._moving: set[int] = set()
@@ -99,7 +98,7 @@ class DistanceQuery:
         return self._geometry.geometryObjects
 
     def longest_reach(self) -> Array:
-        """(njoints,) the same as `joint_reach` with whatever may ever be carried: it is no farther from its joint [m]."""
+        """(njoints,) the same as `joint_reach`, with whatever may ever be carried [m]."""
         radii, reach = self.spheres[self._first_obstacle : self._movable, 3], self.joint_reach()
         return np.full_like(reach, reach.max() + 2.0 * radii.max() + _LONGEST_GRASP) if len(radii) else reach
 
@@ -251,7 +250,7 @@ class DistanceQuery:
             near = self._computed
             np.minimum.at(least, self.group[near], self.results[near, 0])
             distance = np.where(self._grouped[pairs], least[self.group[pairs]], distance)
-        return distance
+        return np.asarray(distance)
 
     def widest(self, given: Array) -> Array:
         """What is granted (m,) to each pair; of the balls of a cloud, each body's most."""
@@ -283,7 +282,7 @@ class DistanceQuery:
         self._cull.place_points(geometries, places)
 
     def _mend_surfaces(self, pairs: IntArray) -> None:
-        """Of two triangle meshes coal gives no normal; of one that is cut through, no distance that could be trusted."""
+        """Of two triangle meshes coal gives no normal; of one that is cut through, no distance to be trusted."""
         pairs = pairs[np.isin(pairs, self._surface, assume_unique=True)]
         results = self.results[pairs]
         apart = results[:, 0] > 0.0

@@ -106,6 +106,7 @@ def build_scene(robot: Robot, obstacles: Sequence[Obstacle] = ()) -> Scene:
     Args:
         robot: the robot with its own pairs.
         obstacles: the obstacles; each is paired with every body of the robot, and with those that it may carry.
+            Half-spaces have no pair with bodies that no joint moves: a base stands on the ground.
 
     Raises:
         ConfigError: an obstacle that has the name of a body or that cannot be carried, a mesh or points that cannot be
@@ -141,7 +142,9 @@ def build_scene(robot: Robot, obstacles: Sequence[Obstacle] = ()) -> Scene:
             if isinstance(shape, config.PointCloud):
                 others = range((index - first) // shape.nearest, (index - first) // shape.nearest + 1)
             for other in others:
-                geometry.addCollisionPair(pin.CollisionPair(other, index))
+                fixed = other < bodies and geometry.geometryObjects[other].parentJoint == 0
+                if not (fixed and isinstance(shape, config.HalfSpace)):
+                    geometry.addCollisionPair(pin.CollisionPair(other, index))
     _without_cylinders_among_spheres(geometry)
     pairs = pair_array(geometry)
     pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]  # in the order in which bounding spheres are compared
@@ -182,7 +185,7 @@ def _points(shape: config.PointCloud, source: Path) -> Voxels:
     voxels = Voxels.of(read_points(source.parent / shape.path, where), shape.resolution)
     if voxels.dropped:
         raise ConfigError(
-            f"{where}: {voxels.dropped} of {voxels.given} points are NaN, infinite or more than 100 m away; leave them out"
+            f"{where}: {voxels.dropped} of {voxels.given} points are NaN, infinite or over 100 m away; leave them out"
         )
     return voxels
 

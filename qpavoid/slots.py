@@ -23,7 +23,9 @@ from qpavoid.scene import FAR
 class Slots:
     """The balls of one cloud, for every body that can move."""
 
-    def __init__(self, bodies: list[Any], geometries: IntArray, resolution: float, nearest: int, voxels: Voxels) -> None:
+    def __init__(
+        self, bodies: list[Any], geometries: IntArray, resolution: float, nearest: int, voxels: Voxels
+    ) -> None:
         """Lays the memory out.
 
         Args:
@@ -78,9 +80,7 @@ class Slots:
         axes = ((turned - pose.position) @ rotation).reshape(-1, 6)
         axes[off] = np.nan
         found = self._first, self._point, self._distance, self._witness
-        kernels.within_reach(
-            axes, self._radii, reach, voxels.centers, voxels.blocks, voxels.starts, *found
-        )
+        kernels.within_reach(axes, self._radii, reach, voxels.centers, voxels.blocks, voxels.starts, *found)
         for body in self._planes:
             if self._first[body] < self._first[body + 1]:
                 self._refine(body, poses[body], pose)
@@ -106,7 +106,8 @@ class Slots:
         if isinstance(self._bodies[body], coal.Cylinder):
             ball = coal.Capsule(self._ball, 0.0)
         where = coal.Transform3s(rotation.T.copy(), placement[9:].copy())
-        wanted, exact = (self._slots.shape[1] + 1) // 2, []
+        wanted = (self._slots.shape[1] + 1) // 2
+        exact: list[float] = []
         for i in np.argsort(bound, kind="stable").tolist():
             if len(exact) >= wanted and bound[i] >= sorted(exact)[wanted - 1]:
                 break

@@ -8,6 +8,7 @@ from typing import Any
 
 import coal
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from qpavoid.bodies import MeshWarning, make_shape
 from qpavoid.cloud import ball_radius
@@ -46,8 +47,8 @@ def make_solids(shape: ObstacleShape, source: Path) -> list[Any]:
     vertices, triangles = corners(mesh)
     if shape.method == "surface":
         warnings.warn(
-            f"{source}: shape.method: surface: {len(triangles)} triangles cost 100 to 500 µs a pair at every tick, some "
-            "pairs several ms; set `method` to decomposed or convex",
+            f"{source}: shape.method: surface: {len(triangles)} triangles cost 100 to 500 µs a pair at every tick, "
+            "some pairs several ms; set `method` to decomposed or convex",
             MeshWarning,
             stacklevel=5,
         )
@@ -89,6 +90,20 @@ def corners(mesh: Any) -> tuple[Array, IntArray]:
     """Corners (n, 3) [m] and triangles (t, 3) of a coal mesh."""
     triangles = [[mesh.tri_indices(i)[k] for k in range(3)] for i in range(mesh.num_tris)]
     return np.array(mesh.vertices()), np.array(triangles, dtype=np.intp)
+
+
+def drawn_triangles(geometry: Any) -> Array:
+    """Triangles (t, 3, 3) of a mesh or a hull, looking outwards as far as the file's do."""
+    if isinstance(geometry, coal.BVHModelBase):
+        vertices, triangles = corners(geometry)
+        return np.asarray(vertices[triangles])
+    points = np.array([geometry.point(i) for i in range(geometry.num_points)])
+    faces = points[ConvexHull(points).simplices]
+    outwards = np.einsum(
+        "ij,ij->i", np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0]), faces[:, 0] - points.mean(axis=0)
+    )
+    faces[outwards < 0.0] = faces[outwards < 0.0][:, ::-1]
+    return np.asarray(faces)
 
 
 def hull_of(points: Array) -> Any:

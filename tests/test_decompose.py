@@ -18,7 +18,9 @@ def torus(around=24, across=10, big=0.3, small=0.06):
     r = big + small * np.cos(b)
     grid = np.stack((r * np.cos(a), r * np.sin(a), small * np.sin(b)), axis=-1)
     quads = grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]
-    return np.concatenate((np.stack(quads[:3], axis=2).reshape(-1, 3, 3), np.stack((quads[0], *quads[2:]), axis=2).reshape(-1, 3, 3)))
+    return np.concatenate(
+        (np.stack(quads[:3], axis=2).reshape(-1, 3, 3), np.stack((quads[0], *quads[2:]), axis=2).reshape(-1, 3, 3))
+    )
 
 
 def bracket():

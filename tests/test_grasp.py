@@ -135,7 +135,7 @@ def carry_past(panda, attach):
     held = pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.14]))
     pole_at = pin.SE3(np.eye(3), pole.motion.sample(0.0).position)
     for k in range(500):
-        target = Sample.at(start + [0.0, min(0.08 * k * 0.01, 0.4), 0.0])
+        target = Sample.at(start + np.array([0.0, min(0.08 * k * 0.01, 0.4), 0.0]))
         given = None if attach else {"box": Sample.at([0.0, 0.0, 5.0])}
         tick = controller.tick(q, targets={TCP: target}, obstacles=given)
         q = pin.integrate(panda.model, q, 0.01 * tick.solution.v)
@@ -146,7 +146,7 @@ def carry_past(panda, attach):
 
 def test_a_carried_box_keeps_clear_of_a_pole(panda):
     *_, without, _, _ = carry_past(panda, False)
-    controller, q, least, vs, tick = carry_past(panda, True)
+    _, _, least, vs, tick = carry_past(panda, True)
     assert without < 0.0, "the way must lead through the pole, or this shows nothing"
     assert least > HOLD - 1e-3
     assert tick.solution.status is Status.SOLVED
@@ -167,7 +167,7 @@ def test_attaching_and_releasing_in_motion_makes_no_jump(panda):
             controller.release("box", q)
         box = grasp_at(panda, q, offset=(0.0, 0.0, 0.08))
         given = {"box": Pose(box.translation, box.rotation)} if k == 60 else None
-        target = {TCP: Sample.at(start + [0.0, 0.4 * np.sin(0.02 * k), 0.0])}
+        target = {TCP: Sample.at(start + np.array([0.0, 0.4 * np.sin(0.02 * k), 0.0]))}
         solution = controller.step(q, targets=target, obstacles=given)
         assert solution.status is Status.SOLVED, solution.reasons
         vs.append(solution.v)
@@ -181,7 +181,9 @@ def test_what_is_put_down_stays_there_and_is_kept_clear_of(panda):
     controller.attach("box", TCP, panda.home)
     start, q = grasp_at(panda, panda.home).translation, panda.home.copy()
     for k in range(150):
-        q = pin.integrate(panda.model, q, 0.01 * controller.step(q, targets={TCP: Sample.at(start + [0, 0.001 * k, 0])}).v)
+        q = pin.integrate(
+            panda.model, q, 0.01 * controller.step(q, targets={TCP: Sample.at(start + np.array([0, 0.001 * k, 0]))}).v
+        )
     there = grasp_at(panda, q, offset=(0.0, 0.0, 0.14))
     np.testing.assert_allclose(controller.obstacle_pose("box", q).position, there.translation, atol=1e-9)
     sample = controller.release("box", q)
@@ -189,7 +191,9 @@ def test_what_is_put_down_stays_there_and_is_kept_clear_of(panda):
     np.testing.assert_allclose(sample.rotation, there.rotation, atol=1e-9)
     here, ruler = grasp_at(panda, q).translation, Ruler(controller.scene)
     for k in range(150):  # up and away, then down again: now it is in the way
-        q = pin.integrate(panda.model, q, 0.01 * controller.step(q, targets={TCP: Sample.at(here + [0, 0, 0.0015 * k])}).v)
+        q = pin.integrate(
+            panda.model, q, 0.01 * controller.step(q, targets={TCP: Sample.at(here + np.array([0, 0, 0.0015 * k]))}).v
+        )
     np.testing.assert_allclose(controller.obstacle_pose("box", q).position, there.translation, atol=1e-12)
     away = ruler.distances(q, {0: sample}).min()
     assert away > HOLD
@@ -213,7 +217,7 @@ def test_a_box_is_lifted_off_its_table_without_being_thrown_off(panda):
     start, q, heights = grasp_at(panda, panda.home).translation, panda.home.copy(), []
     for k in range(600):
         z = 0.0005 * min(k, 200) - 0.0005 * max(k - 300, 0)
-        solution = controller.step(q, targets={TCP: Sample.at(start + [0, 0, z])})
+        solution = controller.step(q, targets={TCP: Sample.at(start + np.array([0, 0, z]))})
         q = pin.integrate(panda.model, q, 0.01 * solution.v)
         pose = grasp_at(panda, q, offset=(0.0, 0.0, 0.08))
         corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 0.5 * np.array(BOX.size)
@@ -225,7 +229,9 @@ def test_a_box_is_lifted_off_its_table_without_being_thrown_off(panda):
 def test_the_look_ahead_knows_what_is_carried(tmp_path):
     """Full speed at a wall with a rod in front: it stops with the rod's tip short of it, braking seen to."""
     robot = cartesian(tmp_path, speed=2.0, acceleration=4.0)
-    rod = Obstacle.at("rod", Capsule(radius=0.02, length=0.6), [0.37, 0, 0], pin.rpy.rpyToMatrix(0, np.pi / 2, 0), graspable=True)
+    rod = Obstacle.at(
+        "rod", Capsule(radius=0.02, length=0.6), [0.37, 0, 0], pin.rpy.rpyToMatrix(0, np.pi / 2, 0), graspable=True
+    )
     wall = Obstacle.at("wall", Box(size=(0.02, 2.0, 2.0)), [2.0, 0.0, 0.0])
     controller = make_controller(robot, [rod, wall], "z", task={"gain": 20.0})
     controller.attach("rod", "z", np.zeros(3))
@@ -255,7 +261,9 @@ def test_nothing_comes_nearer_than_the_closest_call_says_with_a_load(panda):
 
 
 def test_a_load_keeps_clear_of_points_too(panda, tmp_path):
-    controller = panda_with(panda, [Obstacle.at("camera", PointCloud(), [0, 0, 0])], avoidance=Avoidance(d1=HOLD, d2=0.3))
+    controller = panda_with(
+        panda, [Obstacle.at("camera", PointCloud(), [0, 0, 0])], avoidance=Avoidance(d1=HOLD, d2=0.3)
+    )
     tip = grasp_at(panda, panda.home, offset=(0.0, 0.0, 0.30)).translation
     given = {"camera": Points(tip[None])}
     names = controller.scene.pair_names
@@ -346,7 +354,9 @@ def test_a_scene_serves_two_controllers_of_which_one_carries(panda):
 def test_graspable_costs_nothing_while_nothing_is_carried(panda):
     others = [Obstacle.at("pole", POLE, [0.45, 0.2, 0.3])]
     plain = Controller(build_scene(panda, [Obstacle.at("box", BOX, [0.4, -0.2, 0.4]), *others]), [], "qp")
-    graspable = Controller(build_scene(panda, [Obstacle.at("box", BOX, [0.4, -0.2, 0.4], graspable=True), *others]), [], "qp")
+    graspable = Controller(
+        build_scene(panda, [Obstacle.at("box", BOX, [0.4, -0.2, 0.4], graspable=True), *others]), [], "qp"
+    )
     v = np.full(7, 0.1)
     assert np.array_equal(plain.filter(panda.home, v).v, graspable.filter(panda.home, v).v)
     on = [c._query._data.activeCollisionPairs for c in (plain, graspable)]

@@ -50,7 +50,9 @@ def cloud_scene(robot, points=None, shape=CLOUD, tmp=None):
     if points is None:
         return build_scene(robot, [Obstacle.at("camera", shape, [0, 0, 0])])
     np.save(tmp / "cloud.npy", points)
-    return build_scene(robot, [Obstacle.at("camera", shape.model_copy(update={"path": str(tmp / "cloud.npy")}), [0, 0, 0])])
+    return build_scene(
+        robot, [Obstacle.at("camera", shape.model_copy(update={"path": str(tmp / "cloud.npy")}), [0, 0, 0])]
+    )
 
 
 def body_distances(scene, q, centers):
@@ -199,7 +201,9 @@ def test_both_versions_of_the_kernels_agree(seed):
         first, point = np.zeros(6, dtype=np.intp), np.zeros(room, dtype=np.intp)
         distance, witness = np.zeros(room), np.zeros((room, 3))
         reach = 0.2 if seed else np.inf
-        module.within_reach(axes, radii, reach, voxels.centers, voxels.blocks, voxels.starts, first, point, distance, witness)
+        module.within_reach(
+            axes, radii, reach, voxels.centers, voxels.blocks, voxels.starts, first, point, distance, witness
+        )
         count, kept, slots = first[-1], kept0.copy(), np.zeros((5, 6), dtype=np.intp)
         for body in range(5):  # by definition
             a, b = axes[body, :3], axes[body, 3:]
@@ -264,8 +268,8 @@ def test_a_wall_of_points_is_not_passed(tmp_path, dt, speed):
 def test_velocities_do_not_chatter_along_a_wall_of_points(tmp_path):
     """Sliding at 0.2 m/s along a wall while pressed against it: the nearest voxel changes all the time.
 
-    Voxels 20 mm apart, of which the nearest is 87 mm from the axis, tilt the normal by 6.6° at most: that, and not more,
-    is felt of them.
+    Voxels 20 mm apart, of which the nearest is 87 mm from the axis, tilt the normal by 6.6° at most: no more than that is
+    felt of them.
     """
     robot = cartesian(tmp_path, speed=1.0, acceleration=20.0, shape={"type": "capsule", "radius": 0.05, "length": 0.2})
     controller = make_controller(robot, [Obstacle.at("camera", CLOUD, [0, 0, 0])], "z")
@@ -285,7 +289,14 @@ def test_pictures_replace_each_other(panda):
     controller = make_controller(panda, scene.obstacles)
     far, near = np.full((50, 3), 3.0), np.full((50, 3), [0.45, 0.0, 0.5])
     q = panda.home
-    for picture, seen in ((None, False), (far, False), (near, True), (None, True), (far, False), (np.zeros((0, 3)), False)):
+    for picture, seen in (
+        (None, False),
+        (far, False),
+        (near, True),
+        (None, True),
+        (far, False),
+        (np.zeros((0, 3)), False),
+    ):
         given = None if picture is None else {"camera": Points(picture)}
         tick = controller.tick(q, obstacles=given)
         assert (len(tick.proximity.pair) > 0) == seen
@@ -380,6 +391,14 @@ def test_points_of_files(tmp_path):
 @pytest.mark.skipif(not kernels.ACCELERATED, reason="this is the run without numba")
 def test_without_numba_too():
     env = {**os.environ, "QPAVOID_NUMBA": "0"}
-    tests = [f"{__file__}::{name}" for name in ("test_a_wall_of_points_is_not_passed", "test_pictures_replace_each_other")]
-    done = subprocess.run([sys.executable, "-m", "pytest", "-q", "-p", "no:xdist", *tests], env=env, capture_output=True, text=True, check=False)
+    tests = [
+        f"{__file__}::{name}" for name in ("test_a_wall_of_points_is_not_passed", "test_pictures_replace_each_other")
+    ]
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:xdist", *tests],
+        env=env,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stdout[-2000:]

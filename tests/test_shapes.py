@@ -1,4 +1,4 @@
-"""Shapes of obstacles against support functions and closed forms: apart, in penetration and at ties; files of meshes."""
+"""Shapes of obstacles against support functions and closed forms: apart, in penetration, at ties; files of meshes."""
 
 import coal
 import numpy as np
@@ -60,7 +60,9 @@ def boards(*boxes):
     return np.concatenate([(corner * size + center)[faces] for center, size in boxes])
 
 
-SHELF = [((0, 0, z), (0.8, 0.3, 0.02)) for z in (0.01, 0.4, 0.79)] + [((x, 0, 0.4), (0.02, 0.3, 0.8)) for x in (-0.39, 0.39)]
+SHELF = [((0, 0, z), (0.8, 0.3, 0.02)) for z in (0.01, 0.4, 0.79)] + [
+    ((x, 0, 0.4), (0.02, 0.3, 0.8)) for x in (-0.39, 0.39)
+]
 
 
 @pytest.fixture
@@ -228,7 +230,8 @@ def test_the_closest_call_holds_for_half_spaces_that_move_and_turn(panda, turnin
         for horizon in (0.01, 0.1, 0.3):
             least = bench.assembly.closest_call(v, near, 0.3, horizon)
             later = sample._replace(
-                position=sample.position + horizon * sample.linear, rotation=pin.exp3(horizon * sample.angular) @ sample.rotation
+                position=sample.position + horizon * sample.linear,
+                rotation=pin.exp3(horizon * sample.angular) @ sample.rotation,
             )
             found = look(scene, pin.integrate(panda.model, q, horizon * v), {0: later})
             assert np.isfinite(least) and found.distance.min() - hold >= least - 1e-9
@@ -240,7 +243,9 @@ def test_full_speed_towards_the_ground_stops_short_of_it(tmp_path, angular):
     robot = cartesian(tmp_path, speed=2.0, acceleration=4.0, shape=BODIES["capsule"])
     controller = make_controller(robot, [Obstacle.at("ground", FLOOR, [0, 0, -1.0])], "z", task={"gain": 20.0})
     told = None if angular is None else {"ground": Sample.at([0, 0, -1.0], angular=angular)}
-    for tick in drive(controller, np.zeros(3), 150, target=[0, 0, -3.0], obstacles=None if told is None else lambda t: told):
+    for tick in drive(
+        controller, np.zeros(3), 150, target=[0, 0, -3.0], obstacles=None if told is None else lambda t: told
+    ):
         bottom = tick.state.q[2] + 0.01 * tick.solution.v[2] - 0.15
         assert bottom + 1.0 > 0.02 - 1e-3
         assert tick.solution.status is Status.SOLVED
@@ -277,7 +282,9 @@ def test_meshes_move_and_turn_like_any_other_obstacle(tmp_path, method):
     scenes = [build_scene(robot, [Obstacle.at("it", shape, [0, 0, 0])]) for shape in (mesh, BOX)]
     for _ in range(10):
         q = rng.uniform(-0.4, 0.4, 3)
-        sample = Sample.at(rng.uniform(-0.3, 0.3, 3), pin.rpy.rpyToMatrix(*rng.uniform(-3, 3, 3)), rng.uniform(-1, 1, 3))
+        sample = Sample.at(
+            rng.uniform(-0.3, 0.3, 3), pin.rpy.rpyToMatrix(*rng.uniform(-3, 3, 3)), rng.uniform(-1, 1, 3)
+        )
         found, expected = (look(scene, q, {0: sample}) for scene in scenes)
         if expected.distance[0] < 0.0 and method == "surface":
             assert np.isnan(found.distance[0])
@@ -346,9 +353,14 @@ def test_every_shape_can_be_given_in_a_scenario(tmp_path, shelf):
         "{type: mesh, path: shelf.stl}", "{type: mesh, path: shelf.stl, method: convex, scale: 0.1}",
         "{type: point_cloud, path: cloud.npy}",
     ]  # fmt: skip
-    rows = [f"  - {{name: o{i}, shape: {shape}, motion: {{type: fixed, position: [2, {i}, 0]}}}}" for i, shape in enumerate(shapes)]
+    rows = [
+        f"  - {{name: o{i}, shape: {shape}, motion: {{type: fixed, position: [2, {i}, 0]}}}}"
+        for i, shape in enumerate(shapes)
+    ]
     rows.append("  - {name: floor, shape: {type: half_space}, motion: {type: fixed, position: [0, 0, -0.2]}}")
     path = tmp_path / "run.yaml"
-    path.write_text("robot: panda\ntasks: [{frame: panda_hand_tcp}]\nduration: 0.05\nobstacles:\n" + "\n".join(rows) + "\n")
+    path.write_text(
+        "robot: panda\ntasks: [{frame: panda_hand_tcp}]\nduration: 0.05\nobstacles:\n" + "\n".join(rows) + "\n"
+    )
     log = simulate(load_scenario(path))
     assert log.metrics()["completed"] and log.metrics()["status_counts"]["STOPPED"] == 0

@@ -36,7 +36,9 @@ class ObstacleConfig(Block):
         if isinstance(self.shape, Mesh):
             whole = self.shape.method == "convex"
         if (self.graspable or self.carried_by is not None) and not whole:
-            raise ValueError(f"a {self.shape.type} cannot be carried; give a primitive, or a mesh with `method: convex`")
+            raise ValueError(
+                f"a {self.shape.type} cannot be carried; give a primitive, or a mesh with `method: convex`"
+            )
         return self
 
 

@@ -78,8 +78,8 @@ class Mesh(Block):
     scale: Positive = 1.0
     """Length of the file's unit [m]."""
     method: Literal["convex", "decomposed", "surface"] = "decomposed"
-    """`convex`: its hull. `decomposed`: hulls of pieces, which enclose it together. `surface`: the triangles as they are,
-    100 to 500 µs a pair at every tick; once a body cuts through them, no side is the way out, and the robot stops."""
+    """`convex`: its hull. `decomposed`: hulls of pieces, which enclose it together. `surface`: the triangles,
+    100 to 500 µs a pair at every tick; once a body cuts through them, no side is the way out: the robot stops."""
     max_pieces: Annotated[int, Field(ge=1, le=64)] = 16
     """Of `decomposed`: most pieces [-]; each is a body of its own, with its pairs."""
     tolerance: Annotated[float, Field(gt=0, le=1)] = 0.02
@@ -95,7 +95,7 @@ class PointCloud(Block):
     out: none until a program gives some."""
     resolution: Annotated[float, Field(ge=1e-3, le=1.0)] = 0.02
     """Edge of a voxel [m]; balls have a radius of √3/2 of it."""
-    nearest: Annotated[int, Field(ge=1, le=32)] = 6
+    nearest: Annotated[int, Field(ge=1, le=32)] = 8
     """How many points each body of the robot keeps clear of at a time [-]: half of them the nearest ones, the others
     the nearest that face other parts of the body."""
 
