@@ -73,7 +73,8 @@ def pair_table(rounds: int) -> list[str]:
             "cylinder": Cylinder(radius=0.1, length=0.2), "cone": Cone(radius=0.1, length=0.2),
             "ellipsoid": Ellipsoid(radii=(0.1, 0.2, 0.05)), "half_space": HalfSpace(),
             "mesh, convex": Mesh(path=str(path), method="convex"),
-            "mesh, decomposed (16 pieces)": Mesh(path=str(path)), "mesh, surface (1536 triangles)": Mesh(path=str(path), method="surface"),
+            "mesh, decomposed (16 pieces)": Mesh(path=str(path)),
+            "mesh, surface (1536 triangles)": Mesh(path=str(path), method="surface"),
         }  # fmt: skip
         lines = [f"| obstacle | {' | '.join(bodies)} |", f"|---|{'---:|' * len(bodies)}"]
         for name, shape in obstacles.items():

@@ -17,7 +17,7 @@ controller = Controller(build_scene(robot, [cloud, ground]), tasks, dt=0.005, av
 def picture(t: float) -> np.ndarray:
     """10 000 points on a board that is carried past; a camera sees some of them as NaN."""
     rng = np.random.default_rng(int(1000 * t))
-    points = rng.uniform([-0.01, -0.15, 0.0], [0.01, 0.15, 0.9], (10_000, 3)) + [0.48, 0.6 - 0.1 * t, 0.0]
+    points = rng.uniform([-0.01, -0.15, 0.0], [0.01, 0.15, 0.9], (10_000, 3)) + np.array([0.48, 0.6 - 0.1 * t, 0.0])
     points[:50] = np.nan
     return points
 

@@ -39,7 +39,7 @@ for k in range(600):
     q = pin.integrate(robot.model, q, tick.solution.v * controller.dt)  # your robot goes here
 down = controller.release("box", q)
 for _ in range(100):  # up and away: the box stays
-    solution = controller.step(q, targets={TCP: Sample.at(tool(q).translation + [0.0, 0.0, 0.1])})
+    solution = controller.step(q, targets={TCP: Sample.at(tool(q).translation + np.array([0.0, 0.0, 0.1]))})
     q = pin.integrate(robot.model, q, solution.v * controller.dt)
 
 print(f"box and pole: closest {1e3 * closest:.1f} mm; the box rests at {np.round(down.position, 3)}")

@@ -1,4 +1,4 @@
-"""Command line: `qpavoid list | run | compare`.
+"""Command line: `qpavoid list | run | compare | robot`.
 
 Exit status: 0 done, 1 a run ended in a defined failure (collision, safe stop, broken off), 2 bad input.
 """
@@ -22,6 +22,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 
 from qpavoid.config import ScenarioConfig
 from qpavoid.controller import Controller
+from qpavoid.describe import commands as robot_commands
 from qpavoid.errors import ConfigError, QpavoidError
 from qpavoid.kernels import ACCELERATED
 from qpavoid.loading import load_scenario, robot_names, scenario_names
@@ -36,6 +37,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Follow a planned motion and stay clear of obstacles, other arms and yourself.",
 )
+app.add_typer(robot_commands.app, name="robot")
 _out = Console()
 _err = Console(stderr=True)
 

@@ -142,13 +142,19 @@ def _convex_hull(mesh: Any) -> tuple[Any, Any]:
     low, high = local.min(axis=0), local.max(axis=0)
     size = high - low
     if size.min() > 1e-6 * size.max():
-        return cached("hull", points, lambda: _run_qhull(mesh), _pack_hull, _unpack_hull), pin.SE3.Identity()
+        return cached("hull", points, lambda: run_qhull(mesh), _pack_hull, _unpack_hull), pin.SE3.Identity()
     middle = center + axes.T @ (0.5 * (low + high))
     return coal.Box(*np.maximum(size, _THINNEST)), pin.SE3(np.ascontiguousarray(axes.T), middle)
 
 
-def _run_qhull(mesh: Any) -> Any:
-    mesh.buildConvexHull(True, "Qt")
+def run_qhull(mesh: Any) -> Any:
+    """coal's convex hull of the vertices of a mesh that are not all in one plane: qhull ends the process over those."""
+    try:
+        mesh.buildConvexHull(True, "Qt")
+    except RuntimeError:
+        # a corner with more than 255 neighbours, as where a round flat face is cut into a fan of triangles: qhull's
+        # other way with flat faces moves corners by rounding errors and makes no fans
+        mesh.buildConvexHull(True, "QJ")
     return mesh.convex
 
 
@@ -221,17 +227,30 @@ def fit_capsule(points: Array, directions: int = 250) -> CapsuleFit:
     points = np.unique(np.asarray(points, dtype=np.float64), axis=0)
     principal = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
     rotations = _rotations_to(np.concatenate((principal, _half_sphere(directions))))
+    if len(points) > _MANY:  # the outermost points tell which axes are worth trying with all of them
+        best = np.argsort(_tried_along(outermost(points), rotations)[0].min(axis=0))
+        rotations = rotations[best[:_PROMISING]]
+    volume, fits, center = _tried_along(points, rotations)
+    wider, axis = np.unravel_index(np.argmin(volume), volume.shape)
+    radius, length, middle = fits[wider, axis]
+    origin = rotations[axis] @ np.array([*center[axis], middle])
+    margin = 1e-10  # against rounding, so that the points on the surface count as inside
+    return CapsuleFit(origin, rotations[axis], float(radius) + margin, float(length))
+
+
+_MANY, _PROMISING = 200, 12
+"""Points from which axes are sorted out first, and axes that are left then."""
+
+
+def _tried_along(points: Array, rotations: Array) -> tuple[Array, Array, Array]:
+    """Capsules along k axes, of several radii each: volumes (w, k), fits (w, k, 3) and the axes' centres (k, 2)."""
     local = points @ rotations
     center, narrowest = _enclosing_circles(local[..., :2])
     off_axis = np.sum((local[..., :2] - center[:, None]) ** 2, axis=2)
     # wider than needed is worth it where it lets flat ends sink into the caps
-    tried = np.concatenate([_fit_along(local[..., 2], off_axis, narrowest * wider) for wider in _WIDER])
-    best = int(np.argmin(np.pi * tried[:, 0] ** 2 * (tried[:, 1] + 4.0 / 3.0 * tried[:, 0])))
-    radius, length, middle = tried[best]
-    axis = best % len(rotations)
-    origin = rotations[axis] @ np.array([*center[axis], middle])
-    margin = 1e-10  # against rounding, so that the points on the surface count as inside
-    return CapsuleFit(origin, rotations[axis], float(radius) + margin, float(length))
+    fits = np.stack([_fit_along(local[..., 2], off_axis, narrowest * wider) for wider in _WIDER])
+    volume = np.pi * fits[..., 0] ** 2 * (fits[..., 1] + 4.0 / 3.0 * fits[..., 0])
+    return volume, fits, center
 
 
 _WIDER = (1.0, 1.02, 1.05, 1.1, 1.2, 1.4)
@@ -254,6 +273,11 @@ def _fit_along(height: Array, off_axis: Array, radius: Array) -> Array:
     return np.column_stack((radius, np.maximum(high - low, 0.0), 0.5 * (low + high)))
 
 
+def outermost(points: Array) -> Array:
+    """Those of many points (n, 3) that reach farthest along 120 fixed directions."""
+    return np.asarray(points[np.unique(np.argmax(_ROUND @ points.T, axis=1))])
+
+
 def _half_sphere(count: int) -> Array:
     """Evenly spread unit vectors with z >= 0 (count, 3): a golden-angle spiral."""
     i = np.arange(count) + 0.5
@@ -264,6 +288,9 @@ def _half_sphere(count: int) -> Array:
 
 _AROUND_BALL = 1.04 * np.concatenate((_half_sphere(100), -_half_sphere(100)))
 """Points whose hull encloses the unit ball (200, 3)."""
+
+
+_ROUND = np.concatenate([side * _half_sphere(60) for side in (1.0, -1.0)])
 
 
 def _rotations_to(axes: Array) -> Array:

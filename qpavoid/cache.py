@@ -24,7 +24,7 @@ import numpy as np
 
 from qpavoid.problem import Array
 
-VERSION = 1
+VERSION = 2
 """To be raised whenever the same points would give another result than before, or a file is written otherwise."""
 
 _MADE_WITH = repr((VERSION, coal.__version__, np.__version__, sys.platform, platform.machine()))

@@ -53,6 +53,19 @@ def example_robot_data() -> Path:
     return Path(str(share))
 
 
+EXAMPLES = "example-robot-data:"
+"""What a path below the robots folder of example-robot-data begins with."""
+
+
+def example_robot(name: str) -> Path:
+    """The file that `example-robot-data:PATH` stands for, whether it exists or not.
+
+    Raises:
+        ConfigError: the package is not installed.
+    """
+    return example_robot_data() / "example-robot-data" / "robots" / name.removeprefix(EXAMPLES)
+
+
 def nearest(name: str, valid: Iterable[str]) -> str:
     """`; did you mean 'x'?` with the nearest valid name, or the list of the valid ones."""
     names = sorted(valid)
@@ -72,18 +85,22 @@ def find_scenario(name_or_path: str | Path) -> Path:
 
 
 def find_robot(name_or_path: str, folder: Path | None = None) -> Path:
-    """Path of a robot.yaml or URDF, given by shipped name or by path (relative paths: from `folder` first).
+    """Path of a robot.yaml, URDF or MJCF, given by shipped name or by path (relative paths: from `folder` first).
+
+    `example-robot-data:PATH` is a file of that package.
 
     Raises:
         ConfigError, UnknownName: there is none.
     """
+    if name_or_path.startswith(EXAMPLES):
+        return _find(str(example_robot(name_or_path)), "robot", Path(), "", [])
     if folder is not None and _looks_like_path(name_or_path) and os.path.isfile(folder / name_or_path):
         return folder / name_or_path
     return _find(name_or_path, "robot", data_folder("robots"), "{}/robot.yaml", robot_names())
 
 
 def _looks_like_path(name: str) -> bool:
-    return "/" in name or "\\" in name or name.endswith((".yaml", ".yml", ".urdf"))
+    return "/" in name or "\\" in name or name.endswith((".yaml", ".yml", ".urdf", ".xml"))
 
 
 def _find(name: str, kind: str, folder: Path, pattern: str, names: list[str]) -> Path:
@@ -94,7 +111,7 @@ def _find(name: str, kind: str, folder: Path, pattern: str, names: list[str]) ->
         if os.path.isfile(path):  # False where the name is one that no file can have; Path.is_file may raise
             return path
         reason = "is a folder" if os.path.isdir(path) else "no such file"
-        raise ConfigError(f"{name}: {reason}; give a {kind} file, or one of {', '.join(names)}")
+        raise ConfigError(f"{name}: {reason}; give a {kind} file{', or one of ' * bool(names)}{', '.join(names)}")
     raise UnknownName(f"unknown {kind} {name!r}{nearest(name, names)}")
 
 

@@ -37,7 +37,7 @@ def motion_figure(log: Log) -> Figure:
     lower, upper = _limits(log, ticks)
     size = upper - lower
     elevation, azimuth = view_angles(log)
-    towards = _towards_viewer(elevation, azimuth)
+    towards = towards_viewer(elevation, azimuth)
     # Size of the drawn box on paper. An Axes3D is a square of 0.97 times the box's diagonal, mostly empty: the squares
     # overlap, so that the boxes lie side by side.
     right = np.array([-np.sin(np.radians(azimuth)), np.cos(np.radians(azimuth)), 0.0])
@@ -184,7 +184,8 @@ def endless(log: Log, index: int) -> bool:
 # --- view ---------------------------------------------------------------------------------------------------
 
 
-def _towards_viewer(elevation: float, azimuth: float) -> Array:
+def towards_viewer(elevation: float, azimuth: float) -> Array:
+    """Unit vector (3,) from what is seen to the viewer; angles in degrees."""
     e, a = np.radians([elevation, azimuth])
     return np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
 
@@ -210,7 +211,7 @@ def view_angles(log: Log) -> tuple[float, float]:
     best, best_score = (20.0, -45.0), -1.0
     for elevation in (20.0, 35.0):
         for azimuth in (-25.0, 25.0, -45.0, 45.0, -65.0, 65.0, -115.0, 115.0, -135.0, 135.0, -155.0, 155.0):
-            towards = _towards_viewer(elevation, azimuth)
+            towards = towards_viewer(elevation, azimuth)
             hidden = segment_segment(points, points + 10.0 * towards, start, end).distance < thickness
             seen = 1.0 - float(np.mean(np.any(hidden & ~own, axis=1)))
             length = float(np.linalg.norm(spread - np.outer(spread @ towards, towards)) / size) if size > 1e-6 else 1.0
@@ -256,8 +257,8 @@ def _draw(ax: Any, log: Log, tick: int, towards: Array, lower: Array, upper: Arr
     if surfaces:
         # One collection for all: matplotlib sorts faces by depth within a collection only.
         faces = np.concatenate([faces for faces, _ in surfaces])
-        colours = np.concatenate([_shade(faces, colour, towards) for faces, colour in surfaces])
-        front = _normals(faces) @ towards > -0.02
+        colours = np.concatenate([shade(faces, colour, towards) for faces, colour in surfaces])
+        front = normals(faces) @ towards > -0.02
         faces, colours = faces[front], colours[front]
         ax.add_collection3d(Poly3DCollection(faces, facecolors=colours, edgecolors=colours, linewidths=0.3, zorder=1))
     # Paths lie on top of the bodies, so that no part of them is hidden.
@@ -267,14 +268,16 @@ def _draw(ax: Any, log: Log, tick: int, towards: Array, lower: Array, upper: Arr
         ax.plot(*log.tool[tick, k, :, None], color=TOOL_PATH, marker="o", markersize=4, zorder=4)
 
 
-def _normals(faces: Array) -> Array:
-    normals = np.cross(faces[:, 2] - faces[:, 0], faces[:, 3] - faces[:, 1])
-    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-15))
+def normals(faces: Array) -> Array:
+    """Unit normals (m, 3) of quadrilaterals (m, 4, 3)."""
+    across = np.cross(faces[:, 2] - faces[:, 0], faces[:, 3] - faces[:, 1])
+    return np.asarray(across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-15))
 
 
-def _shade(faces: Array, colour: str, towards: Array) -> Array:
+def shade(faces: Array, colour: str, towards: Array) -> Array:
+    """Colours (m, 3) of faces (m, 4, 3) lit from the viewer's side and from above."""
     light = towards + np.array([0.0, 0.0, 0.7])
-    brightness = 0.55 + 0.5 * np.clip(_normals(faces) @ (light / np.linalg.norm(light)), 0.0, 1.0)
+    brightness = 0.55 + 0.5 * np.clip(normals(faces) @ (light / np.linalg.norm(light)), 0.0, 1.0)
     return np.asarray(np.clip(brightness[:, None] * to_rgb(colour), 0.0, 1.0))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid.bodies import MeshWarning, check_meshes, convert_bodies, make_shape, triangle_meshes
-from qpavoid.config import Body, RobotConfig
+from qpavoid.config import Body, Hull, RobotConfig
 from qpavoid.errors import ConfigError, UnknownName
 from qpavoid.kinematics import TRANSLATIONS
 from qpavoid.limits import JointBounds
@@ -21,7 +21,7 @@ from qpavoid.loading import find_robot, nearest, read_config, validate
 from qpavoid.motion import rpy_to_matrix
 from qpavoid.pairs import add_self_pairs, drop_always_touching, pair_array
 from qpavoid.problem import Array, IntArray
-from qpavoid.urdf import find_resource, honour_srdf, read_collision, read_model
+from qpavoid.urdf import find_resource, honour_srdf, read_collision, read_model, read_pieces
 
 
 @dataclass(frozen=True)
@@ -39,14 +39,14 @@ class Robot:
     """Frames that are meant as tools."""
     source: str
     """File that it was read from, for messages."""
-    notes: tuple[str, ...] = ()
-    """What was decided at loading, such as pairs switched off."""
+    always_touching: tuple[tuple[str, str], ...] = ()
+    """Pairs of bodies that were switched off at loading, because they touch in every configuration."""
     acceleration: Mapping[str, float] = field(default_factory=dict)
     """Joint: largest acceleration [rad/s² or m/s²]; joints left out have no such limit."""
 
     @classmethod
     def load(cls, name_or_path: str, folder: Path | None = None) -> Robot:
-        """The robot of a shipped name, a robot.yaml or a URDF.
+        """The robot of a shipped name, a robot.yaml, a URDF or an MJCF (`.xml`).
 
         Args:
             name_or_path: what a scenario's `robot:` field says.
@@ -57,15 +57,28 @@ class Robot:
         """
         path = find_robot(name_or_path, folder)
         if path.suffix in (".yaml", ".yml"):
-            return _build(read_config(path, RobotConfig), path)
+            return cls.from_config(read_config(path, RobotConfig), path)
         return cls.from_urdf(path)
 
     @classmethod
-    def from_urdf(cls, path: str | Path, **fields: Any) -> Robot:
-        """A robot from a bare URDF.
+    def from_config(cls, config: RobotConfig, path: Path) -> Robot:
+        """A robot from what a robot.yaml says.
 
         Args:
-            path: the URDF.
+            config: its fields.
+            path: the file, from which relative paths start; named in errors.
+
+        Raises:
+            ConfigError, UnknownName: naming file, field and remedy.
+        """
+        return _build(config, path)
+
+    @classmethod
+    def from_urdf(cls, path: str | Path, **fields: Any) -> Robot:
+        """A robot from a bare URDF or MJCF.
+
+        Args:
+            path: the file.
             fields: any other field of a robot.yaml, such as `bodies="capsule"` or `root_joint="free_flyer"`.
 
         Raises:
@@ -73,7 +86,12 @@ class Robot:
         """
         path = Path(path)
         config = validate({"name": path.stem, "urdf": path.name, **fields}, RobotConfig, path)
-        return _build(config, path)
+        return cls.from_config(config, path)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was decided at loading, in words."""
+        return tuple(f"pair {a} - {b} is off: it touches in every configuration" for a, b in self.always_touching)
 
     @property
     def joint_names(self) -> list[str]:
@@ -133,7 +151,7 @@ class Robot:
         if not self.model.existFrame(name):
             frames = [f.name for f in self.model.frames if f.type in (pin.BODY, pin.OP_FRAME)]
             raise UnknownName(f"{where}: {self.name} has no frame {name!r}{nearest(name, frames)}")
-        return int(self.model.getFrameId(name))
+        return frame_index(self.model, name)
 
     def lock(self, patterns: Sequence[str], q: Array, where: str) -> tuple[Robot, Array]:
         """The robot with some joints held where they are, as if they were fixed.
@@ -162,6 +180,11 @@ class Robot:
 
     def _joints(self) -> Iterator[tuple[str, Any]]:
         return zip(self.joint_names, list(self.model.joints)[1:], strict=True)
+
+
+def frame_index(model: Any, name: str) -> int:
+    """Index of an existing frame; that of the link where a joint has the same name."""
+    return int(model.getFrameId(name, pin.BODY) if model.existFrame(name, pin.BODY) else model.getFrameId(name))
 
 
 _ABSURD = 1e9
@@ -201,23 +224,24 @@ _MOST_BODIES = 300
 def _build(config: RobotConfig, path: Path) -> Robot:
     urdf = find_resource(config.urdf, path, "urdf")
     model = read_model(urdf, config.root_joint)
+    package_dirs = [str(path.parent / folder) for folder in config.package_dirs]
     if isinstance(config.bodies, str):
-        package_dirs = [str(path.parent / folder) for folder in config.package_dirs]
         collision = read_collision(urdf, model, package_dirs, path)
         check_meshes(collision, str(path))
         bodies = convert_bodies(collision, config.bodies)
     else:
-        bodies = _listed_bodies(config.bodies, model, path)
+        hulls = _hulls(config.bodies, lambda: read_pieces(urdf, model, package_dirs, path), path)
+        bodies = _listed_bodies(config.bodies, model, hulls, path)
     if meshes := triangle_meshes(bodies):
         warnings.warn(
             f"{path}: bodies: mesh: {len(meshes)} triangle meshes such as {meshes[0]!r} cost 100 to 500 µs a pair at "
             "every tick, some pairs several ms, convex hulls about 1 µs, capsules 0.1 µs; set `bodies` to convex or "
             "capsule",
             MeshWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
     _apply_limits(config, model, path)
-    home = _set_joints(model, _middle(model), config.home, f"{path}: home")
+    home = _set_joints(model, middle(model), config.home, f"{path}: home")
     home = _set_joints(model, home, config.lock, f"{path}: lock")
     if config.lock:
         model, bodies, index = _reduce(model, bodies, list(config.lock), home)
@@ -231,10 +255,7 @@ def _build(config: RobotConfig, path: Path) -> Robot:
     add_self_pairs(model, bodies, config.disabled_pairs, str(path))
     if config.srdf is not None:
         honour_srdf(model, bodies, find_resource(config.srdf, path, "srdf"))
-    notes = [
-        f"pair {a} - {b} is off: it touches in every configuration"
-        for a, b in drop_always_touching(model, bodies, joint_bounds(model))
-    ]
+    always_touching = drop_always_touching(model, bodies, joint_bounds(model))
     for name in config.end_effectors:
         if not model.existFrame(name):
             frames = [f.name for f in model.frames]
@@ -246,12 +267,29 @@ def _build(config: RobotConfig, path: Path) -> Robot:
         home,
         tuple(config.end_effectors),
         str(path),
-        tuple(notes),
+        tuple(always_touching),
         config.limits.acceleration,
     )
 
 
-def _listed_bodies(configs: Sequence[Body], model: Any, path: Path) -> Any:
+def _hulls(configs: Sequence[Body], read: Callable[[], Any], path: Path) -> dict[str, Any]:
+    """Hulls of the pieces of geometry that bodies name."""
+    wanted = {body.shape.geometry: index for index, body in enumerate(configs) if isinstance(body.shape, Hull)}
+    if not wanted:
+        return {}
+    pieces = {piece.name: piece for piece in read().geometryObjects}
+    chosen = pin.GeometryModel()
+    for name, index in wanted.items():
+        if name not in pieces:
+            raise UnknownName(
+                f"{path}: bodies.{index}.shape.geometry: no collision geometry {name!r}{nearest(name, pieces)}"
+            )
+        chosen.addGeometryObject(pieces[name])
+    check_meshes(chosen, str(path))
+    return {hull.name: hull for hull in convert_bodies(chosen, "convex").geometryObjects}
+
+
+def _listed_bodies(configs: Sequence[Body], model: Any, hulls: Mapping[str, Any], path: Path) -> Any:
     bodies = pin.GeometryModel()
     for index, body in enumerate(configs):
         if not model.existFrame(body.frame):
@@ -259,13 +297,21 @@ def _listed_bodies(configs: Sequence[Body], model: Any, path: Path) -> Any:
             raise UnknownName(f"{path}: bodies.{index}.frame: no frame {body.frame!r}{nearest(body.frame, frames)}")
         if bodies.existGeometryName(body.name):
             raise ConfigError(f"{path}: bodies.{index}.name: {body.name!r} is given twice: names must differ")
-        frame_id = model.getFrameId(body.frame)
+        frame_id = frame_index(model, body.frame)
         frame = model.frames[frame_id]
         placement = frame.placement * pin.SE3(rpy_to_matrix(body.rpy), np.array(body.position))
-        bodies.addGeometryObject(
-            pin.GeometryObject(body.name, frame.parentJoint, frame_id, placement, make_shape(body.shape))
-        )
+        if isinstance(body.shape, Hull):
+            hull = hulls[body.shape.geometry]
+            geometry, placement = hull.geometry, placement * _in_link(hull, model)
+        else:
+            geometry = make_shape(body.shape)
+        bodies.addGeometryObject(pin.GeometryObject(body.name, frame.parentJoint, frame_id, placement, geometry))
     return bodies
+
+
+def _in_link(body: Any, model: Any) -> Any:
+    """Placement of a body in the frame of its link."""
+    return model.frames[body.parentFrame].placement.actInv(body.placement)
 
 
 def _apply_limits(config: RobotConfig, model: Any, path: Path) -> None:
@@ -291,8 +337,8 @@ def _joint(model: Any, name: str, where: str) -> Any:
     return model.joints[model.getJointId(name)]
 
 
-def _middle(model: Any) -> Array:
-    """Neutral configuration, with bounded joints at the middle of their range where 0 is outside it."""
+def middle(model: Any) -> Array:
+    """Neutral configuration (nq,), with bounded joints at the middle of their range where 0 is outside it."""
     q = pin.neutral(model)
     for joint in list(model.joints)[1:]:
         lower, upper = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]

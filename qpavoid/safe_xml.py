@@ -1,4 +1,4 @@
-"""URDF and SRDF text, checked before a C++ parser sees it: those recurse, and some are quadratic."""
+"""URDF, SRDF and MJCF text, checked before a C++ parser sees it: those recurse, and some are quadratic."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ _MOST_ATTRIBUTES = 100
 
 
 def read_robot_xml(path: Path, kind: str) -> ET.Element:
-    """The root of a URDF or SRDF.
+    """The root of a URDF, SRDF or MJCF.
 
     Args:
         path: the file.
-        kind: what it should be, for messages.
+        kind: `URDF`, `SRDF` or `MJCF`.
 
     Raises:
-        ConfigError: unreadable, not XML, not a <robot>, a DOCTYPE, or nested too deep.
+        ConfigError: unreadable, not XML, another root than <robot> (<mujoco>), a DOCTYPE, or nested too deep.
     """
     text = read_text(path, _LARGEST)
     where = f"{path}: not a usable {kind}"
@@ -37,8 +37,9 @@ def read_robot_xml(path: Path, kind: str) -> ET.Element:
         root: ET.Element = parser.close()
     except (ET.ParseError, ValueError) as error:
         raise ConfigError(f"{where}: {error}") from None
-    if root.tag != "robot":
-        raise ConfigError(f"{where}: its root is <{root.tag}>; must be <robot>")
+    wanted = "mujoco" if kind == "MJCF" else "robot"
+    if root.tag != wanted:
+        raise ConfigError(f"{where}: its root is <{root.tag}>; must be <{wanted}>")
     return root
 
 

@@ -10,7 +10,7 @@ import coal
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from qpavoid.bodies import MeshWarning, make_shape
+from qpavoid.bodies import MeshWarning, make_shape, run_qhull
 from qpavoid.cloud import ball_radius
 from qpavoid.config import HalfSpace, Mesh, ObstacleShape, PointCloud
 from qpavoid.config.base import LARGEST
@@ -115,5 +115,4 @@ def hull_of(points: Array) -> Any:
     model = coal.BVHModelOBBRSS()
     model.beginModel(0, len(points))
     model.addVertices(points)
-    model.buildConvexHull(True, "Qt")
-    return model.convex
+    return run_qhull(model)

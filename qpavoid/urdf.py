@@ -1,10 +1,11 @@
-"""Reads URDF files: the model, and the collision geometry with its meshes."""
+"""Reads URDF and MJCF files: the model, and the collision geometry with its meshes."""
 
 from __future__ import annotations
 
 import os
 import sys
 import tempfile
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,9 +14,9 @@ from typing import Any
 import pinocchio as pin
 
 from qpavoid.errors import ConfigError
-from qpavoid.loading import example_robot_data
+from qpavoid.loading import EXAMPLES, example_robot, example_robot_data
 from qpavoid.safe_xml import read_robot_xml
-from qpavoid.urdf_check import check_urdf
+from qpavoid.urdf_check import check_mjcf, check_urdf
 
 _ROOT_JOINTS = {
     "fixed": lambda: None,
@@ -35,13 +36,10 @@ def find_resource(value: str, path: Path, field: str) -> Path:
     Raises:
         ConfigError: there is no such file.
     """
-    prefix = "example-robot-data:"
-    if value.startswith(prefix):
-        found = example_robot_data() / "example-robot-data" / "robots" / value.removeprefix(prefix)
-    else:
-        found = path.parent / value
+    found = example_robot(value) if value.startswith(EXAMPLES) else path.parent / value
     if not os.path.isfile(found):  # False where the name is one that no file can have; Path.is_file may raise
-        raise ConfigError(f"{path}: {field}: no such file {value!r}; give a path relative to this file or {prefix}PATH")
+        remedy = f"give a path relative to this file or {EXAMPLES}PATH"
+        raise ConfigError(f"{path}: {field}: no such file {value!r}; {remedy}")
     return found
 
 
@@ -62,55 +60,113 @@ def _quiet_stderr() -> Iterator[list[str]]:
             lines += file.read().decode(errors="replace").splitlines()
 
 
+def is_mjcf(path: Path) -> bool:
+    """Whether a robot's file is an MJCF, by its name."""
+    return path.suffix == ".xml"
+
+
 def read_model(urdf: Path, root_joint: str) -> Any:
-    """Pinocchio model of a URDF.
+    """Pinocchio model of a URDF or MJCF.
 
     Args:
         urdf: the file.
         root_joint: `fixed`, `planar` or `free_flyer`.
 
     Raises:
-        ConfigError: not a usable URDF, with the parser's own reason.
+        ConfigError: not a usable file, with the parser's own reason.
     """
-    check_urdf(urdf)
+    kind = "MJCF" if is_mjcf(urdf) else "URDF"
     root = _ROOT_JOINTS[root_joint]()
     with _quiet_stderr() as printed:
         try:
-            arguments = (str(urdf),) if root is None else (str(urdf), root)
-            return pin.buildModelFromUrdf(*arguments)
-        except (ValueError, RuntimeError) as error:
-            reason = " ".join(str(error).split())
+            if kind == "MJCF":
+                check_mjcf(urdf)
+                return _model_of_mjcf(urdf, root)
+            check_urdf(urdf)
+            return pin.buildModelFromUrdf(str(urdf), *([] if root is None else [root]))
+        except (ValueError, RuntimeError, IndexError) as error:
+            reason = _reason(error)
     first = next((line.split(":", 1)[1].strip() for line in printed if line.startswith("Error:")), "")
-    raise ConfigError(f"{urdf}: not a usable URDF: {first or reason}")
+    raise ConfigError(f"{urdf}: not a usable {kind}: {first or reason}")
 
 
-def read_collision(urdf: Path, model: Any, package_dirs: list[str], path: Path) -> Any:
-    """Collision geometry of a URDF, meshes as they are.
+def _model_of_mjcf(mjcf: Path, root: Any) -> Any:
+    with warnings.catch_warnings():  # of a change of name that older versions do not have
+        warnings.simplefilter("ignore", DeprecationWarning)
+        if root is None:
+            return pin.buildModelFromMJCF(str(mjcf))
+        return pin.buildModelFromMJCF(str(mjcf), root, "root_joint")[0]
 
-    `package://` is looked up in the given folders, above the URDF, in example-robot-data and along ROS_PACKAGE_PATH.
+
+def _reason(error: Exception) -> str:
+    """The last part of what pinocchio says: before it comes where in its own source it was said."""
+    if isinstance(error, IndexError):  # of a look-up in C++, without a name
+        return "it refers to a class, mesh or other name that it does not define"
+    return " ".join(str(error).split()).rpartition("message: ")[2].rstrip(".")
+
+
+def read_pieces(urdf: Path, model: Any, package_dirs: list[str], path: Path) -> Any:
+    """Collision geometry of a URDF or MJCF, or what is meant to be seen where it has none; see `read_collision`."""
+    collision = read_collision(urdf, model, package_dirs, path)
+    return collision if collision.ngeoms else read_collision(urdf, model, package_dirs, path, visual=True)
+
+
+def read_collision(urdf: Path, model: Any, package_dirs: list[str], path: Path, visual: bool = False) -> Any:
+    """Collision geometry of a URDF or MJCF, meshes as they are.
+
+    What an MJCF fixes to its world (a floor) is no part of the robot and left out.
 
     Args:
         urdf: the file.
         model: its model.
-        package_dirs: folders to look in first.
+        package_dirs: folders to look for meshes in first; see `mesh_folders`.
         path: file to name in errors.
+        visual: what is meant to be seen instead.
 
     Raises:
         ConfigError: a mesh that cannot be found or read.
     """
-    ros = [folder for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if folder]
-    above = [str(parent) for parent in urdf.resolve().parents]
-    folders = [*package_dirs, *above, str(example_robot_data()), *ros]
+    kind = pin.VISUAL if visual else pin.COLLISION
+    folders = mesh_folders(urdf, package_dirs)
     _check_mesh_sizes(urdf, folders, path)
     with _quiet_stderr():
         try:
-            return pin.buildGeomFromUrdf(model, str(urdf), pin.COLLISION, package_dirs=folders)
-        except (ValueError, RuntimeError) as error:
-            reason = " ".join(str(error).split()).rstrip(".")
+            if is_mjcf(urdf):
+                return _without_world(pin.buildGeomFromMJCF(model, str(urdf), kind))
+            return pin.buildGeomFromUrdf(model, str(urdf), kind, package_dirs=folders)
+        except (ValueError, RuntimeError, IndexError) as error:
+            reason = _reason(error)
     raise ConfigError(
         f"{path}: {urdf.name}: {reason}; name the folder that holds the package in `package_dirs` of a robot.yaml, "
         "or set ROS_PACKAGE_PATH"
     )
+
+
+def _without_world(geometry: Any) -> Any:
+    for name in [piece.name for piece in geometry.geometryObjects if piece.parentFrame == 0]:
+        geometry.removeGeometryObject(name)
+    return geometry
+
+
+def mesh_folders(urdf: Path, package_dirs: list[str]) -> list[str]:
+    """Where `package://` is looked up: given folders, above the file, example-robot-data, along ROS_PACKAGE_PATH."""
+    ros = [folder for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if folder]
+    above = [str(parent) for parent in urdf.resolve().parents]
+    return [*package_dirs, *above, str(example_robot_data()), *ros]
+
+
+def find_mesh(name: str, folders: list[str]) -> str | None:
+    """The file that a mesh of a URDF is in, or None.
+
+    Args:
+        name: as the URDF has it.
+        folders: see `mesh_folders`.
+    """
+    for scheme in ("package://", "model://"):
+        if name.startswith(scheme):
+            name = name.removeprefix(scheme).lstrip("/")  # some write three slashes
+    name = name.removeprefix("file://")
+    return next((found for folder in folders if os.path.isfile(found := os.path.join(folder, name))), None)
 
 
 _LARGEST_MESH = 100_000_000
@@ -118,14 +174,27 @@ _LARGEST_MESH = 100_000_000
 
 
 def _check_mesh_sizes(urdf: Path, folders: list[str], path: Path) -> None:
-    for mesh in read_robot_xml(urdf, "URDF").iter("mesh"):
-        name = mesh.get("filename", "").removeprefix("package://").removeprefix("file://")
-        for found in (os.path.join(folder, name) for folder in folders):
-            if os.path.isfile(found) and os.path.getsize(found) > _LARGEST_MESH:
-                raise ConfigError(
-                    f"{path}: mesh {found}: {os.path.getsize(found)} bytes; at most {_LARGEST_MESH} are read, "
-                    "make it coarser"
-                )
+    for name in mesh_names(urdf):
+        found = find_mesh(name, folders)
+        if found is not None and os.path.getsize(found) > _LARGEST_MESH:
+            raise ConfigError(
+                f"{path}: mesh {found}: {os.path.getsize(found)} bytes; at most {_LARGEST_MESH} are read, "
+                "make it coarser"
+            )
+
+
+def mesh_names(urdf: Path, tag: str = "") -> list[str]:
+    """Names of the mesh files of a URDF or MJCF, each once.
+
+    Args:
+        urdf: the file.
+        tag: `collision` or `visual` for those of a URDF alone.
+    """
+    mjcf = is_mjcf(urdf)
+    root = read_robot_xml(urdf, "MJCF" if mjcf else "URDF")
+    meshes = root.iterfind(f".//{tag}//mesh" if tag and not mjcf else ".//mesh")
+    names = (mesh.get("file" if mjcf else "filename", "") for mesh in meshes)
+    return list(dict.fromkeys(name for name in names if name))
 
 
 def honour_srdf(model: Any, bodies: Any, srdf: Path) -> None:
@@ -145,5 +214,5 @@ def honour_srdf(model: Any, bodies: Any, srdf: Path) -> None:
             pin.removeCollisionPairs(model, bodies, str(srdf), False)
             return
         except (ValueError, RuntimeError) as error:
-            reason = " ".join(str(error).split())
+            reason = _reason(error)
     raise ConfigError(f"{srdf}: not a usable SRDF: {reason}")

@@ -1,4 +1,4 @@
-"""What a URDF must be before pinocchio reads it: it takes NaN, cycles and axes of no length without a word."""
+"""What a URDF or MJCF must be before pinocchio reads it: NaN, cycles and axes of no length pass without a word."""
 
 from __future__ import annotations
 
@@ -60,6 +60,42 @@ def check_urdf(path: Path) -> None:
             _check_joint(joint, f"joint {name!r}")
     except ValueError as fault:
         raise ConfigError(f"{path}: not a usable URDF: {fault}") from None
+
+
+def check_mjcf(path: Path) -> None:
+    """Reads an MJCF and says what is wrong with it.
+
+    Raises:
+        ConfigError: naming file, element and remedy.
+    """
+    root = read_robot_xml(path, "MJCF")
+    where = f"{path}: not a usable MJCF"
+    if root.find(".//include") is not None:
+        raise ConfigError(f"{where}: it has an <include>; save it as one file, for example with mj_saveLastXML")
+    for tag, most, what in (
+        ("body", _MOST_LINKS, "bodies"), ("joint", _MOST_MOVING, "joints"), ("geom", _MOST_SHAPES, "shapes"),
+    ):  # fmt: skip
+        found = len(root.findall(f"worldbody//{tag}"))
+        if found > most:
+            raise ConfigError(f"{where}: {found} {what}; at most {most} are read")
+    if root.find("worldbody//body") is None:
+        raise ConfigError(f"{where}: its worldbody has no body")
+    for element in root.iter():
+        for attribute in sorted(_MJCF_NUMBERS.intersection(element.keys())):
+            place = f"{element.tag} {attribute}={element.get(attribute)!r:.60}"
+            try:
+                finite = all(abs(value) <= LARGEST for value in _floats(element.get(attribute, ""), place))
+            except ValueError as fault:
+                raise ConfigError(f"{where}: {fault}") from None
+            if not finite:
+                raise ConfigError(f"{where}: {place}: must be finite, and at most {LARGEST:g}")
+
+
+_MJCF_NUMBERS = {
+    "pos", "quat", "axis", "axisangle", "xyaxes", "zaxis", "euler", "range", "size", "fromto", "ref", "scale", "mass",
+    "diaginertia", "fullinertia", "vertex",
+}  # fmt: skip
+"""Attributes that are numbers, in every element that has them."""
 
 
 def _named(root: ET.Element, tag: str) -> dict[str, ET.Element]:

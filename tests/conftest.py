@@ -1,6 +1,8 @@
 """Robots, random scenes and finite differences shared by the tests."""
 
 import os
+import sys
+import warnings
 
 import numpy as np
 import pinocchio as pin
@@ -8,6 +10,7 @@ import pytest
 from hypothesis import settings
 
 from qpavoid import Obstacle, Robot, Sample, build_scene, config
+from qpavoid.__main__ import main
 from qpavoid.assembly import Assembly
 from qpavoid.kernels.layout import RowLayout
 from qpavoid.kinematics import ForwardKinematics
@@ -33,6 +36,34 @@ def cache_of_the_tests(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("QPAVOID_CACHE", str(shared / "qpavoid-cache"))
         yield
+
+
+class Result:
+    """What a command left behind."""
+
+    def __init__(self, status: int, stdout: str, stderr: str) -> None:
+        self.status, self.stdout, self.stderr = status, stdout, stderr
+
+    @property
+    def lines(self) -> list[str]:
+        """Lines on stderr, without the progress bar."""
+        return [line for line in self.stderr.splitlines() if line.strip() and "━" not in line]
+
+
+@pytest.fixture
+def cli(monkeypatch, capfd, tmp_path):
+    """Runs a command in this process, in a folder of its own, and lets every other exception through."""
+    monkeypatch.chdir(tmp_path)
+
+    def cli(*args: object) -> Result:
+        monkeypatch.setattr(sys, "argv", ["qpavoid", *map(str, args)])
+        with warnings.catch_warnings(), pytest.raises(SystemExit) as exit_:
+            warnings.simplefilter("default")
+            main()
+        captured = capfd.readouterr()  # what C++ prints counts as well
+        return Result(exit_.value.code, captured.out, captured.err)
+
+    return cli
 
 
 @pytest.fixture(scope="session")

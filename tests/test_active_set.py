@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+import qpsolvers
 import quadprog
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 pytest.importorskip("numba")
-from qpavoid.kernels.active_set import minimize, project
+from qpavoid.kernels.active_set import minimize, project, project_soft
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -33,7 +34,7 @@ def random_problem(seed, feasible, repeated):
 def test_feasible_problems_are_solved_as_quadprog_solves_them(seed, repeated):
     P, x0, G, h, lower, upper = random_problem(seed, True, repeated)
     x = x0.copy()
-    assert minimize(P, x, G, h, lower, upper)
+    assert minimize(P, x, G, h, lower, upper, np.zeros(len(h)))
     assert np.all(G @ x >= h - 1e-8) and np.all(x >= lower - 1e-9) and np.all(x <= upper + 1e-9)
     constraints = np.vstack((G, np.eye(len(x)), -np.eye(len(x))))
     bounds = np.concatenate((h, np.maximum(lower, -1e6), -upper))
@@ -51,7 +52,7 @@ def test_no_answer_means_that_there_is_none(seed):
 
     P, x0, G, h, lower, upper = random_problem(seed, False, False)
     x = x0.copy()
-    if minimize(P, x, G, h, lower, upper):
+    if minimize(P, x, G, h, lower, upper, np.zeros(len(h))):
         assert np.all(G @ x >= h - 1e-8)
     else:
         programme = linprog(np.zeros(len(x)), A_ub=-G, b_ub=-h - 1e-9, bounds=list(zip(lower, upper, strict=True)))
@@ -60,7 +61,7 @@ def test_no_answer_means_that_there_is_none(seed):
 
 def test_without_constraints_in_the_way_nothing_moves():
     x = np.array([0.1, -0.2])
-    assert minimize(np.eye(2), x, np.ones((1, 2)), np.array([-5.0]), -np.ones(2), np.ones(2))
+    assert minimize(np.eye(2), x, np.ones((1, 2)), np.array([-5.0]), -np.ones(2), np.ones(2), np.zeros(1))
     np.testing.assert_array_equal(x, [0.1, -0.2])
 
 
@@ -73,3 +74,27 @@ def test_nan_is_no_answer(place):
     arguments[place] = arguments[place].copy()
     arguments[place].flat[0] = np.nan
     assert not project(*arguments.values())[1]
+
+
+@settings(derandomize=True, deadline=None, max_examples=300)
+@given(seeds)
+def test_soft_rows_lack_what_costs_least(seed):
+    """Against quadprog, to which what a row lacks is a variable of its own."""
+    rng = np.random.default_rng(seed)
+    n, m = rng.integers(1, 7), rng.integers(1, 12)
+    J, h, v0 = rng.normal(size=(m, n)), rng.normal(size=m), rng.normal(size=n)
+    soft = np.where(rng.random(m) < 0.6, 10.0 ** rng.uniform(-6.0, 0.0, m), 0.0)
+    lower, upper = -rng.uniform(0.0, 1.0, n), rng.uniform(0.0, 1.0, n)
+    giving = np.flatnonzero(soft)
+    count = len(giving)
+    G = np.hstack((J, np.zeros((m, count))))
+    G[giving, n + np.arange(count)] = np.sqrt(soft[giving])
+    far = np.full(count, 1e9)
+    limits = {"lb": np.r_[lower, -far], "ub": np.r_[upper, far]}
+    expected = qpsolvers.solve_qp(
+        np.eye(n + count), np.r_[-v0, np.zeros(count)], -G, -h, **limits, solver="quadprog"
+    )  # fmt: skip
+    v, solved = project_soft(np.zeros((0, n)), 1.0, v0, J, h, lower, upper, soft)
+    assert solved == (expected is not None)
+    if solved:
+        np.testing.assert_allclose(v, expected[:n], atol=1e-6)

@@ -5,14 +5,13 @@ import os
 import signal
 import subprocess
 import sys
-import warnings
 from pathlib import Path
 
 import pytest
 import yaml
+from conftest import Result
 
 from qpavoid import Log
-from qpavoid.__main__ import main
 from qpavoid.loading import data_folder, robot_names, scenario_names
 
 METRICS = {
@@ -21,34 +20,6 @@ METRICS = {
     "tick_us",
 }  # fmt: skip
 SITUATION = yaml.safe_load((data_folder("tasks") / "situation1.yaml").read_text(encoding="utf-8"))
-
-
-class Result:
-    """What a command left behind."""
-
-    def __init__(self, status: int, stdout: str, stderr: str) -> None:
-        self.status, self.stdout, self.stderr = status, stdout, stderr
-
-    @property
-    def lines(self) -> list[str]:
-        """Lines on stderr, without the progress bar."""
-        return [line for line in self.stderr.splitlines() if line.strip() and "━" not in line]
-
-
-@pytest.fixture
-def cli(monkeypatch, capfd, tmp_path):
-    """Runs a command in this process, in a folder of its own, and lets every other exception through."""
-    monkeypatch.chdir(tmp_path)
-
-    def cli(*args: object) -> Result:
-        monkeypatch.setattr(sys, "argv", ["qpavoid", *map(str, args)])
-        with warnings.catch_warnings(), pytest.raises(SystemExit) as exit_:
-            warnings.simplefilter("default")
-            main()
-        captured = capfd.readouterr()  # what C++ prints counts as well
-        return Result(exit_.value.code, captured.out, captured.err)
-
-    return cli
 
 
 @pytest.fixture

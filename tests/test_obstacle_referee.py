@@ -10,8 +10,8 @@ from conftest import random_q
 from test_shapes import SHELF, boards, write_stl
 
 from qpavoid import Avoidance, Obstacle, Points, Robot, Status, Voxels, build_scene
-from qpavoid.cloud import ball_radius
 from qpavoid.bodies import make_shape
+from qpavoid.cloud import ball_radius
 from qpavoid.config import Box, Capsule, Ellipsoid, HalfSpace, Mesh, PointCloud, Sphere
 
 pytest.importorskip("mujoco")
@@ -60,7 +60,7 @@ def test_distances_to_the_new_shapes(panda, tmp_path):
 def test_a_cloud_against_all_its_voxels(panda):
     """The referee has a ball for every voxel, and knows nothing of slots."""
     rng, tool = np.random.default_rng(1), tool_at(panda).translation
-    points = tool + [0.0, 0.28, 0.0] + rng.uniform(-1, 1, (400, 3)) * [0.15, 0.004, 0.15]
+    points = tool + np.array([0.0, 0.28, 0.0]) + rng.uniform(-1, 1, (400, 3)) * [0.15, 0.004, 0.15]
     shape = PointCloud(resolution=0.03)
     controller = make_controller(
         panda, [Obstacle.at("camera", shape, [0, 0, 0])], TCP, avoidance=Avoidance(d1=HOLD, d2=0.1)
@@ -69,7 +69,9 @@ def test_a_cloud_against_all_its_voxels(panda):
     arena = build(build_scene(panda, [Obstacle.at(f"v{i}", ball, c) for i, c in enumerate(centers)]), panda.home)
     of_voxels = arena.scene.pairs[:, 1] >= arena.bodies
     assert len(centers) > 60
-    least = played(controller, arena, 90, lambda t: tool + [0.0, 0.5 * t, 0.0], lambda t: {"camera": Points(points)})
+    least = played(
+        controller, arena, 90, lambda t: tool + np.array([0.0, 0.5 * t, 0.0]), lambda t: {"camera": Points(points)}
+    )
     assert HOLD - 1e-3 < least[of_voxels].min() < 0.08
 
 
@@ -78,7 +80,7 @@ def test_a_load_as_a_body_of_another_robot(panda):
     tool = tool_at(panda)
     held = tool * pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.14]))
     box, pole = Box(size=(0.06, 0.06, 0.24)), Capsule(radius=0.025, length=0.16)
-    at = held.translation + [0.02, 0.2, -0.02]
+    at = held.translation + np.array([0.02, 0.2, -0.02])
     load = Obstacle.at("box", box, held.translation, held.rotation, graspable=True)
     avoidance = Avoidance(d1=HOLD, d2=0.1)
     controller = make_controller(panda, [load, Obstacle.at("pole", pole, at)], TCP, avoidance=avoidance)
@@ -89,7 +91,7 @@ def test_a_load_as_a_body_of_another_robot(panda):
     start = tool.translation
 
     def way(t):
-        return start + [0.0, min(0.3 * t, 0.4), 0.0]
+        return start + np.array([0.0, min(0.3 * t, 0.4), 0.0])
 
     assert HOLD - 1e-3 < played(controller, arena, 150, way)[pair] < HOLD + 0.03
     alone = make_controller(panda, [Obstacle.at("pole", pole, at)], TCP, avoidance=avoidance)
@@ -108,7 +110,7 @@ def _with_body(robot: Robot, name, shape, inside):
 def test_a_shelf_as_a_mesh_against_its_boards(panda, tmp_path):
     """The referee has five boxes."""
     tool = tool_at(panda).translation
-    place = tool + [0.28, 0.0, -0.35]
+    place = tool + np.array([0.28, 0.0, -0.35])
     turn = pin.rpy.rpyToMatrix(0, 0, np.pi / 2)
     mesh = Mesh(path=str(write_stl(tmp_path / "shelf.stl", boards(*SHELF))))
     controller = make_controller(
@@ -119,5 +121,5 @@ def test_a_shelf_as_a_mesh_against_its_boards(panda, tmp_path):
     ]
     arena = build(build_scene(panda, pieces), panda.home)
     of_boards = arena.scene.pairs[:, 1] >= arena.bodies
-    least = played(controller, arena, 120, lambda t: tool + [min(0.3 * t, 0.2), 0.0, 0.2 * np.sin(3.0 * t)])
+    least = played(controller, arena, 120, lambda t: tool + np.array([min(0.3 * t, 0.2), 0.0, 0.2 * np.sin(3.0 * t)]))
     assert HOLD - 1e-3 < least[of_boards].min() < 0.05

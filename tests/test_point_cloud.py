@@ -268,8 +268,8 @@ def test_a_wall_of_points_is_not_passed(tmp_path, dt, speed):
 def test_velocities_do_not_chatter_along_a_wall_of_points(tmp_path):
     """Sliding at 0.2 m/s along a wall while pressed against it: the nearest voxel changes all the time.
 
-    Voxels 20 mm apart, of which the nearest is 87 mm from the axis, tilt the normal by 6.6° at most: no more than that is
-    felt of them.
+    Voxels 20 mm apart, of which the nearest is 87 mm from the axis, tilt the normal by 6.6° at most: no more than that
+    is felt of them.
     """
     robot = cartesian(tmp_path, speed=1.0, acceleration=20.0, shape={"type": "capsule", "radius": 0.05, "length": 0.2})
     controller = make_controller(robot, [Obstacle.at("camera", CLOUD, [0, 0, 0])], "z")

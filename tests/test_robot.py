@@ -257,9 +257,7 @@ def test_missing_urdf(tmp_path):
         ConfigError, match=r"robot\.yaml: urdf: no such file 'none\.urdf'; give a path relative to this"
     ):
         Robot.load(str(tmp_path / "robot.yaml"))
-    with pytest.raises(
-        ConfigError, match=r"none\.urdf: no such file; give a robot file, or one of panda, paper-dual-arm"
-    ):
+    with pytest.raises(ConfigError, match=r"none\.urdf: no such file; give a robot file, or one of baxter, g1, panda"):
         Robot.load(str(tmp_path / "none.urdf"))
     with pytest.raises(ConfigError, match=r"none\.urdf: .*no such file"):
         Robot.from_urdf(tmp_path / "none.urdf")

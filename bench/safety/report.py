@@ -17,7 +17,7 @@ import numpy as np
 from bench.safety.campaign import KINDS, RANGES
 from bench.safety.referee import MOST_LOOKS, STEP
 from bench.safety.trial import Trial
-from bench.safety.verdict import AHEAD
+from bench.safety.verdict import AHEAD, RESOLUTION
 
 PACKAGES = ("qpavoid", "mujoco", "pin", "coal", "daqp", "numpy", "scipy", "numba")
 LISTED = 10
@@ -162,15 +162,40 @@ def _avoidable(found: list[Trial], solver: str) -> list[str]:
             f"`python -m bench.safety --seed SEED --solver {solver}` runs one again."
             + (f" The first {len(shown)} of {len(bad)}:" if len(shown) < len(bad) else ""),
             "",
-            "| seed | robot | dt [ms] | obstacles, moving | distance [mm] | contact, and how it is known |",
-            "|---:|---|---:|---:|---:|---|",
+            "| seed | robot | dt [ms] | obstacles, moving | distance [mm] | last way out | contact, how it is known |",
+            "|---:|---|---:|---:|---:|---|---|",
         ]
         lines += [
             f"| {t.seed} | {t.robot} | {1e3 * t.dt:g} | {t.obstacles}, {t.moving} | {1e3 * t.distance:.2f} | "
-            f"{t.verdict}: {t.judged} |"
+            f"{_way_out(t)} | {t.verdict}: {t.judged} |"
             for t in shown
         ]
+        lines += _explained(bad)
     return lines
+
+
+def _way_out(trial: Trial) -> str:
+    if np.isnan(trial.way_out):
+        return ""
+    return f"{trial.way_out:.2f} s before, {1e3 * trial.apart:.0f} mm apart, {trial.then}"
+
+
+def _explained(bad: list[Trial]) -> list[str]:
+    """What the last ways out have in common."""
+    known = [trial for trial in bad if not np.isnan(trial.way_out)]
+    if not known:
+        return []
+    early = [trial for trial in known if trial.apart > trial.d1]
+    met = sum(trial.then == "SOLVED" for trial in early)
+    return [
+        "",
+        "**Why.** The last way out is the last moment from which one of the ten flights still gets away (to within "
+        f"{1e3 * RESOLUTION:g} ms). In {len(early)} of {len(known)} runs the pair was then still farther apart than "
+        f"d1, in {met} of these every row was met: a law that looks at the distances and velocities of one tick has "
+        "nothing to go by yet; what closes the way is where obstacles will be later. Time from there to the contact: "
+        f"{np.median([t.way_out for t in early] or [np.nan]):.2f} s in the median of these, "
+        f"{max((t.way_out for t in known), default=np.nan):.2f} s at most.",
+    ]
 
 
 def _ranges() -> list[str]:

@@ -11,7 +11,7 @@ import numpy as np
 from bench.safety.arena import Arena, load
 from bench.safety.campaign import draw
 from bench.safety.referee import Findings, referee
-from bench.safety.verdict import Verdict, judge
+from bench.safety.verdict import Verdict, judge, last_way_out
 from qpavoid import Log, ScenarioConfig, Status, simulate
 from qpavoid.log import STATUSES
 
@@ -43,6 +43,12 @@ class Trial:
     """`clear`, or that of the first contact that is avoidable, or else of the first contact."""
     judged: str
     """Pair and time of that contact, and how the verdict is known."""
+    way_out: float
+    """How long before that contact the last flight got away; NaN where that was not looked for [s]."""
+    apart: float
+    """How far apart the pair was then [m]."""
+    then: str
+    """How the tick ended that let it pass."""
     relaxed: float
     """Time of ticks that ended RELAXED [s]."""
     stopped: float
@@ -102,6 +108,10 @@ def examine(
     verdicts = judge(arena, scenario, log, findings)
     names, metrics = [" - ".join(pair) for pair in arena.scene.pair_names], log.metrics()
     decisive = next((verdict for verdict in verdicts if verdict.avoidable), verdicts[0] if verdicts else None)
+    way_out, apart, then = np.nan, np.nan, ""
+    if decisive and decisive.why == "avoidable" and solver.startswith("qp"):  # the others' would take hours
+        way_out, apart, status = last_way_out(arena, scenario, log, findings, decisive)
+        then = STATUSES[status].value
     trial = Trial(
         seed=seed,
         robot=arena.scene.robot.name,
@@ -119,6 +129,9 @@ def examine(
         judged=f"{names[decisive.contact.pair]} at {decisive.contact.time:.3f} s: {decisive.detail}"
         if decisive
         else "",
+        way_out=way_out,
+        apart=apart,
+        then=then,
         relaxed=_time(log, Status.RELAXED, scenario.dt),
         stopped=_time(log, Status.STOPPED, scenario.dt),
         arrived=metrics["arrived"],
@@ -134,10 +147,6 @@ def examine(
         failure=log.meta["stopped_by"] or "",
     )
     return trial, log, findings, verdicts
-
-
-def _sentence(verdict: Verdict, names: Sequence[str]) -> str:
-    return f"{names[verdict.contact.pair]} at {verdict.contact.time:.3f} s: {verdict.detail}"
 
 
 def _time(log: Log, status: Status, dt: float) -> float:

@@ -19,7 +19,7 @@ All of it is computed in MuJoCo: distances, normals, Jacobians and motion. Nothi
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -30,8 +30,21 @@ from qpavoid import Log, ScenarioConfig
 
 AFTER = 0.5
 """Flights must stay clear for so long after the contact in question [s]."""
+RESOLUTION = 0.02
+"""To which the last way out is sought [s]."""
 AHEAD = 0.1
 """What is to be unavoidable must be so within that time after the last step of a flight [s]."""
+
+
+class LastWayOut(NamedTuple):
+    """The last moment at which one of the flights still kept clear of a contact that could have been avoided."""
+
+    before: float
+    """How long before the contact that was [s]."""
+    apart: float
+    """How far apart the pair was then [m]."""
+    status: int
+    """How the tick ended that let it pass: index into `qpavoid.log.STATUSES`."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +98,29 @@ def _judge(
         if why != "outrun" or last.touched == contact.pair:
             return Verdict(contact, why, detail)
         watched[last.touched] = False
+
+
+def last_way_out(arena: Arena, scenario: ScenarioConfig, log: Log, findings: Findings, verdict: Verdict) -> LastWayOut:
+    """When it was too late for every flight, by bisection between coming into range and the contact.
+
+    Flights watch the pair that touched and all that had not touched before it.
+    """
+    contact, means = verdict.contact, joint_means(arena, scenario)
+    watched = arena.movable.copy()
+    watched[[other.pair for other in findings.contacts if other.time < contact.time]] = False
+    until = min(contact.time + AFTER, float(log.t[-1]))
+
+    def clear(k: int) -> bool:
+        start = Start(findings.q[k], log.v[k - 1] if k else np.zeros(len(means.speed)), float(log.t[k]), until)
+        flights = (fly(arena, means, start, scenario.dt, manner, watched) for manner in manners(len(means.speed)))
+        return any(flight.touched is None for flight in flights)
+
+    low, high = _in_range(arena, scenario, log, findings, contact), int(np.searchsorted(log.t, contact.time)) - 1
+    while high - low > max(1, round(RESOLUTION / scenario.dt)):
+        middle = (low + high) // 2
+        low, high = (middle, high) if clear(middle) else (low, middle)
+    arena.place(findings.q[low], float(log.t[low]))
+    return LastWayOut(contact.time - float(log.t[low]), arena.distance(contact.pair), int(log.status[low]))
 
 
 def _in_range(arena: Arena, scenario: ScenarioConfig, log: Log, findings: Findings, contact: Contact) -> int:

@@ -72,7 +72,7 @@ def _compiled() -> dict[str, Callable[[], Backend]]:
     @njit
     def from_cost(P: Array, q: Array, G: Array, h: Array, lower: Array, upper: Array) -> tuple[Array, bool]:
         x = np.linalg.solve(P, -q)
-        return x, minimize(P, x, G, h, lower, upper)
+        return x, minimize(P, x, G, h, lower, upper, np.zeros(len(h)))
 
     def solve(*qp: Array) -> Array | None:
         x, solved = from_cost(*qp)

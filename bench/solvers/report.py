@@ -13,7 +13,7 @@ import numpy as np
 
 from bench.solvers.record import Run
 from bench.solvers.replay import Cell, Loose
-from bench.solvers.verify import DISTANCE, GAP, VIOLATION, Judgement, Truth
+from bench.solvers.verify import DISTANCE, EDGE, GAP, VIOLATION, Judgement, Truth
 
 PACKAGES = (
     "qpavoid",
@@ -76,7 +76,8 @@ def _sections(results: Results) -> list[str]:
         "",
         f"**An answer is right** when rows and bounds hold to {VIOLATION:g} and no coordinate is farther than "
         f"{DISTANCE:g} rad/s from the reference (or, for the least-slack QPs, whose minimum is flat, its cost is "
-        f"within {GAP:g}); when the rows contradict each other, the right answer is none. The reference is the better "
+        f"within {GAP:g}); when the rows contradict each other, the right answer is none, and where less than "
+        f"{EDGE:g} m/s is left between them, either counts. The reference is the better "
         "of daqp and quadprog, solved again as equations on its active set, and proved by multipliers that we compute "
         "(non-negative least squares); a contradiction is proved by a linear programme. What a solver says about its "
         "own answer counts for nothing.",

@@ -21,6 +21,9 @@ GAP = 1e-8
 FLAT = 1e-6
 """Smallest eigenvalue of P below which a minimum is called flat."""
 
+EDGE = 1e-9
+"""Room between rows and bounds below which round-off decides whether there is any [m/s]."""
+
 
 class Truth(NamedTuple):
     """What the right answer to a QP is."""
@@ -31,6 +34,8 @@ class Truth(NamedTuple):
     """‖P x + q - Aᵀy‖∞ of the reference itself, y >= 0 of its active rows and bounds by non-negative least squares."""
     flat: bool
     """Whether the minimum is judged by its cost."""
+    edge: bool = False
+    """Rows can be met with less than `EDGE` to spare, below what solvers can tell: no answer is right too."""
     open: bool = False
     """Neither minimum nor contradiction could be shown; such a QP judges nobody."""
 
@@ -58,7 +63,8 @@ def truth(qp: QP) -> Truth:
             if violation(qp, candidate) <= 1e-9 and residual < best.stationarity:
                 best = Truth(candidate, residual, flat)
     if best.x is not None:
-        return best._replace(open=best.stationarity > 1e-8 * max(1.0, float(np.abs(qp.q).max())))
+        edge = least_violation(qp) > -EDGE
+        return best._replace(edge=edge, open=best.stationarity > 1e-8 * max(1.0, float(np.abs(qp.q).max())))
     return best._replace(open=least_violation(qp) <= VIOLATION)
 
 
@@ -67,7 +73,7 @@ def judge(qp: QP, right: Truth, x: Array | None) -> Judgement:
     if right.x is None:
         return Judgement(x is None, x is None or not violation(qp, x) <= VIOLATION, np.nan, np.nan)
     if x is None:
-        return Judgement(False, False, np.nan, np.nan)
+        return Judgement(right.edge, right.edge, np.nan, np.nan)
     excess, off = violation(qp, x), float(np.abs(x - right.x).max())
     reference = cost(qp, right.x)
     close = abs(cost(qp, x) - reference) <= GAP * (1.0 + abs(reference)) if right.flat else off <= DISTANCE
@@ -93,9 +99,9 @@ def stationarity(qp: QP, x: Array) -> float:
 
 
 def least_violation(qp: QP) -> float:
-    """Least t >= 0 for which some x within the bounds meets every row up to t: above 0, the rows contradict."""
+    """Least t for which some x within the bounds meets every row up to t: above 0, the rows contradict; at least -1."""
     m, n = qp.G.shape
-    bounds = [*zip(qp.lower, qp.upper, strict=True), (0.0, None)]
+    bounds = [*zip(qp.lower, qp.upper, strict=True), (-1.0, None)]
     result = linprog(np.eye(n + 1)[-1], np.hstack((-qp.G, -np.ones((m, 1)))), -qp.h, bounds=bounds)
     return float(result.x[-1]) if result.success else np.inf
 

@@ -7,7 +7,7 @@ and read by `qpavoid.loading`; `qpavoid.scene` and `qpavoid.motion` turn these m
 from qpavoid.config.base import Block
 from qpavoid.config.control import Avoidance, Cbf, Damper, Detour, Limits, Progress, Sensing, Switching, Task
 from qpavoid.config.motion import Circle, Csv, Fixed, Line, Motion, Waypoints
-from qpavoid.config.robot import Body, JointLimits, RobotConfig
+from qpavoid.config.robot import Body, Hull, JointLimits, RobotConfig
 from qpavoid.config.scenario import ObstacleConfig, ScenarioConfig
 from qpavoid.config.shapes import (
     Box,
@@ -26,7 +26,7 @@ from qpavoid.config.solver import Eq10Solver, QpSolver, SolverConfig, TrackingSo
 
 __all__ = [
     "Avoidance", "Block", "Body", "Box", "Capsule", "Cbf", "Circle", "Cone", "Csv", "Cylinder", "Damper", "Detour",
-    "Ellipsoid", "Eq10Solver", "Fixed", "HalfSpace", "JointLimits", "Limits", "Line", "Mesh", "Motion",
+    "Ellipsoid", "Eq10Solver", "Fixed", "HalfSpace", "Hull", "JointLimits", "Limits", "Line", "Mesh", "Motion",
     "ObstacleConfig", "ObstacleShape", "PointCloud", "Progress", "QpSolver", "RobotConfig", "ScenarioConfig",
     "Sensing", "Shape", "SolverConfig", "Sphere", "Switching", "Task", "TrackingSolver", "Waypoints", "expand_solver",
 ]  # fmt: skip

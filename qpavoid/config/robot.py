@@ -2,22 +2,36 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from qpavoid.config.base import Block, Number, Positive, Vec3
 from qpavoid.config.shapes import Shape
 
 
+class Hull(Block):
+    """Convex hull of a piece of the URDF's collision geometry, where it stands in its link; primitives as they are.
+
+    Where the URDF has no collision geometry at all, of what is meant to be seen.
+    """
+
+    type: Literal["hull"] = "hull"
+    geometry: str
+    """Name of the piece: that of its link, with `_0`, `_1`, … in the order of the file."""
+
+
+BodyShape = Annotated[Shape | Hull, Field(discriminator="type")]
+
+
 class Body(Block):
-    """A collision body given by hand."""
+    """A collision body given one by one."""
 
     name: str
     """Name by which pairs, logs and messages know it."""
     frame: str
     """Link or frame of the URDF that carries it."""
-    shape: Shape
+    shape: BodyShape
     position: Vec3 = (0.0, 0.0, 0.0)
     """Position of the shape's origin in `frame` [m]."""
     rpy: Vec3 = (0.0, 0.0, 0.0)
@@ -48,7 +62,8 @@ class RobotConfig(Block):
     name: str
     """Name for tables and figures."""
     urdf: str
-    """URDF: a path relative to this file, an absolute path, or `example-robot-data:PATH` below its robots folder."""
+    """URDF, or MJCF (`.xml`): a path relative to this file, an absolute path, or `example-robot-data:PATH` below its
+    robots folder."""
     srdf: str | None = None
     """SRDF whose `disable_collisions` are honoured; found like `urdf`."""
     package_dirs: list[str] = []

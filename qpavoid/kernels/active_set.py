@@ -8,12 +8,15 @@ library costs several times what a problem of this size takes to solve.
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from qpavoid.kernels.compiled import compiled
 from qpavoid.problem import Array, IntArray
 
 _TOLERANCE = 1e-10
 """Violation of a constraint that counts as none [m/s, rad/s]."""
+_ROUND_OFF = 1e-7
+"""How far off an active constraint a solution may lie after all [m/s, rad/s]."""
 _DEPENDENT = 1e-11
 """Share of a constraint's normal, in the metric P⁻¹, below which the active ones are said to contain it."""
 
@@ -22,7 +25,17 @@ _DEPENDENT = 1e-11
 def project(
     A: Array, regularization: float, v0: Array, J: Array, least: Array, lower: Array, upper: Array
 ) -> tuple[Array, bool]:
+    """`project_soft` with no soft rows."""
+    return project_soft(A, regularization, v0, J, least, lower, upper, np.zeros(len(least)))
+
+
+@compiled
+def project_soft(
+    A: Array, regularization: float, v0: Array, J: Array, least: Array, lower: Array, upper: Array, soft: Array
+) -> tuple[Array, bool]:
     """The velocity closest to v0 in the metric P = AᵀA + λ with J v >= least and lower <= v <= upper.
+
+    Rows may be soft: one falls short of its right-hand side at the cost of ½ (what it lacks)² / its softness.
 
     Args:
         A: tracking rows (r, nv).
@@ -32,6 +45,7 @@ def project(
         least: their right-hand sides (k,).
         lower: lower bounds (nv,).
         upper: upper bounds (nv,).
+        soft: softness of the rows (k,); 0 of those that have to be met.
 
     Returns:
         (nv,), and whether it is the answer; if not, no point meets all constraints, or round-off got in the way.
@@ -45,7 +59,7 @@ def project(
     for i in range(nv):
         P[i, i] += regularization
     v = v0.copy()
-    if not minimize(P, v, J, least, lower, upper):
+    if not minimize(P, v, J, least, lower, upper, soft):
         return v, False
     for i in range(nv):
         v[i] = min(max(v[i], lower[i]), upper[i])
@@ -55,8 +69,10 @@ def project(
 
 
 @compiled
-def minimize(P: Array, x: Array, G: Array, h: Array, lower: Array, upper: Array) -> bool:
+def minimize(P: Array, x: Array, G: Array, h: Array, lower: Array, upper: Array, soft: Array) -> bool:
     """Moves x from the minimiser of ½ (x - x0)ᵀP (x - x0) to the one with G x >= h, lower <= x <= upper.
+
+    With the multiplier u, a row of softness c falls short by c u: in the dual, softness adds to the diagonal of S.
 
     The active constraints' normals N and what they become, W = P⁻¹N, are kept, with a Cholesky factor of S = NᵀW: few
     constraints bind at a time, so that this is less work than to keep an orthogonal basis of the whole space.
@@ -68,6 +84,7 @@ def minimize(P: Array, x: Array, G: Array, h: Array, lower: Array, upper: Array)
         h: right-hand sides (m,).
         lower: lower bounds (n,).
         upper: upper bounds (n,).
+        soft: softness of the rows (m,); see `project_soft`.
 
     Returns:
         Whether x now solves the problem; if not, it is infeasible or too badly conditioned.
@@ -75,21 +92,27 @@ def minimize(P: Array, x: Array, G: Array, h: Array, lower: Array, upper: Array)
     n, m = len(x), len(h)
     L = np.zeros((n, n))
     _factorise(P, L, n)
-    N, W = np.zeros((n + 1, n)), np.zeros((n + 1, n))
-    S, R = np.zeros((n + 1, n + 1)), np.zeros((n + 1, n + 1))
-    active, u = np.empty(n + 1, np.intp), np.zeros(n + 1)
-    r, z = np.empty(n + 1), np.empty(n)
+    most = n + np.count_nonzero(soft)  # constraints that can be active at a time
+    N, W = np.zeros((most + 1, n)), np.zeros((most + 1, n))
+    S, R = np.zeros((most + 1, most + 1)), np.zeros((most + 1, most + 1))
+    active, u = np.empty(most + 1, np.intp), np.zeros(most + 1)
+    r, z, bound = np.empty(most + 1), np.empty(n), h.copy()
+    met = np.zeros(2 * n + m, np.bool_)  # active ones are, but for round-off
     count = 0
     for _ in range(10 * (n + m)):
-        p, violation = _most_violated(x, G, h, lower, upper)
+        p, violation = _most_violated(x, G, bound, lower, upper, met)
         if violation <= _TOLERANCE:
-            return True
+            off = 0.0
+            for j in range(count):
+                off = max(off, abs(_slack(active[j], x, G, bound, lower, upper)))
+            return off <= _ROUND_OFF
         if np.isnan(violation):
             return False
         _enter(p, N[count], G)
         _solve(L, N[count], W[count], n)
         u[count] = 0.0
-        square = _dot(N[count], W[count])
+        give = soft[p - 2 * n] if p >= 2 * n else 0.0
+        square = _dot(N[count], W[count]) + give
         while True:
             for j in range(count):
                 S[count, j] = _dot(N[j], W[count])
@@ -98,13 +121,13 @@ def minimize(P: Array, x: Array, G: Array, h: Array, lower: Array, upper: Array)
             for j in range(count):
                 for i in range(n):
                     z[i] -= r[j] * W[j, i]
-            free = _dot(N[count], z)
+            free = _dot(N[count], z) + give
             # the longest step that keeps all multipliers positive, and the one that reaches the constraint
             dual_step, leaving = np.inf, -1
             for j in range(count):
                 if r[j] > 0.0 and u[j] / r[j] < dual_step:
                     dual_step, leaving = u[j] / r[j], j
-            reachable = count < n and free > _DEPENDENT * square
+            reachable = count < most and free > _DEPENDENT * square
             step = min(dual_step, violation / free) if reachable else dual_step
             if step == np.inf:
                 return False
@@ -113,17 +136,28 @@ def minimize(P: Array, x: Array, G: Array, h: Array, lower: Array, upper: Array)
                     x[i] += step * z[i]
             for j in range(count):
                 u[j] -= step * r[j]
+                _settle(active[j], u[j], bound, h, soft, n)
             u[count] += step
+            _settle(p, u[count], bound, h, soft, n)
             if reachable and step == violation / free:
                 S[count, count] = square
                 _extend(S, R, count)
-                active[count] = p
+                active[count], met[p] = p, True
                 count += 1
                 break
+            met[active[leaving]] = False
+            _settle(active[leaving], 0.0, bound, h, soft, n)
             _drop(N, W, S, R, active, u, leaving, count)
             count -= 1
-            violation = -_slack(p, x, G, h, lower, upper)
+            violation = -_slack(p, x, G, bound, lower, upper)
     return False
+
+
+@compiled
+def _settle(p: int, multiplier: float, bound: Array, h: Array, soft: Array, n: int) -> None:
+    """Writes what a row asks for once its multiplier has made it give."""
+    if p >= 2 * n:
+        bound[p - 2 * n] = h[p - 2 * n] - soft[p - 2 * n] * multiplier
 
 
 @compiled
@@ -207,16 +241,20 @@ def _slack(p: int, x: Array, G: Array, h: Array, lower: Array, upper: Array) -> 
 
 
 @compiled
-def _most_violated(x: Array, G: Array, h: Array, lower: Array, upper: Array) -> tuple[int, float]:
-    """Which constraint x violates most, and by how much; NaN in a row shows."""
+def _most_violated(
+    x: Array, G: Array, h: Array, lower: Array, upper: Array, met: npt.NDArray[np.bool_]
+) -> tuple[int, float]:
+    """Which constraint x violates most, and by how much, without those that are met; NaN in a row shows."""
     n = len(x)
     worst, violation = -1, -np.inf
     for i in range(n):
-        if not lower[i] - x[i] <= violation:
+        if not (lower[i] - x[i] <= violation or met[i]):
             worst, violation = i, lower[i] - x[i]
-        if not x[i] - upper[i] <= violation:
+        if not (x[i] - upper[i] <= violation or met[n + i]):
             worst, violation = n + i, x[i] - upper[i]
     for k in range(len(h)):
+        if met[2 * n + k]:
+            continue
         outside = h[k]
         for i in range(n):
             outside -= G[k, i] * x[i]

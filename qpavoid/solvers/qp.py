@@ -11,12 +11,14 @@ from qpavoid.config import QpSolver
 from qpavoid.errors import SolverNotInstalled
 from qpavoid.problem import Array, Problem, Solution, Status
 from qpavoid.solvers.analytic import tracking_velocity
-from qpavoid.solvers.backends import make_backend, solve_daqp
+from qpavoid.solvers.backends import Daqp, make_backend, solve_daqp
 from qpavoid.solvers.reasons import what_gave_way
-from qpavoid.solvers.relaxation import closest, relax
+from qpavoid.solvers.relaxation import Closest, by_back_end, closest, relax
 
 _GENTLE = 1.0
 """λ of a solution that moves the joints little [(rad/s)⁻²]."""
+
+_Projection = Callable[..., "tuple[Array, bool]"]
 
 
 class Qp:
@@ -27,9 +29,9 @@ class Qp:
     measuring λ from v0 rather than from 0 leaves tracking free of bias.
 
     Where no velocity meets everything, margins give way, then acceleration limits, then contact, as little as they must
-    and the deepest threat least (`solvers.relaxation`), by daqp whatever the back end. An answer counts only if it
-    verifies: a back end that fails or lies is replaced by daqp for that tick, and where that fails too, the robot is
-    told to stop.
+    and the deepest threat least (`solvers.relaxation`): in compiled code with `native`, by daqp with every other back
+    end. An answer counts only if it verifies: a back end that fails or lies is replaced by daqp for that tick, and
+    where that fails too, the robot is told to stop.
     """
 
     bounded = True
@@ -37,7 +39,7 @@ class Qp:
     def __init__(self, config: QpSolver) -> None:
         self.config = config
         compiled = config.backend == "native" or (config.backend == "auto" and kernels.ACCELERATED)
-        self._project = _compiled_projection() if compiled else None
+        self._projections = _compiled_projections() if compiled else None
         self._backend = make_backend("daqp" if config.backend in ("auto", "native") else config.backend)
 
     def solve(self, problem: Problem) -> Solution:
@@ -49,12 +51,12 @@ class Qp:
             v0 = tracking_velocity(problem)
             if kernels.shortfall(v0, rows.J, rows.b, lower, upper) <= 0.0:
                 return Solution(v0)
-        if self._project is not None:
-            answer, solved = self._project(A, self.config.regularization, v0, rows.J, rows.b, lower, upper)
+        if self._projections is not None:
+            answer, solved = self._projections[0](A, self.config.regularization, v0, rows.J, rows.b, lower, upper)
             if solved:
                 return Solution(answer)
         P, q = kernels.projection_cost(A, self.config.regularization, v0)
-        for backend in (self._backend, solve_daqp):
+        for backend in (self._backend,) if isinstance(self._backend, Daqp) else (self._backend, solve_daqp):
             v = closest(backend, P, q, rows.J, rows.b, lower, upper)
             if v is not None:
                 return Solution(v)
@@ -86,23 +88,40 @@ class Qp:
             return Solution(
                 problem.v_stop.copy(), Status.STOPPED, tuple(f"{p}: no distance can be told" for p in pairs)
             )
-        relaxed = relax(P, q, problem, solve_daqp)
+        relaxed = None
+        if self._projections is not None:
+            relaxed = relax(problem, self._compiled(self._projections[1], problem))
+        if relaxed is None:
+            relaxed = relax(problem, by_back_end(solve_daqp, P, q, tracking_velocity(problem)))
         if relaxed is None:
             return Solution(problem.v_stop.copy(), Status.STOPPED, ("the QP back end returned no usable velocity",))
         slack = relaxed.slack if relaxed.slack.any() else None
         return Solution(relaxed.v, Status.RELAXED, what_gave_way(relaxed, problem), slack)
 
+    def _compiled(self, project: _Projection, problem: Problem) -> Closest:
+        """Solves the QPs of a problem's tracking cost in compiled code."""
+        A, v0, plain = problem.tracking.A, tracking_velocity(problem), np.zeros((0, len(problem.lower)))
 
-def _compiled_projection() -> Callable[..., tuple[Array, bool]]:
-    """The back end `native`, warmed up.
+        def solve(J: Array, least: Array, soft: Array, lower: Array, upper: Array) -> Array | None:
+            cost = (plain, 1.0) if soft.any() else (A, self.config.regularization)
+            v, solved = project(*cost, v0, J, least, lower, upper, soft)
+            return v if solved else None
+
+        return solve
+
+
+def _compiled_projections() -> tuple[_Projection, _Projection]:
+    """The back end `native`, without and with soft rows, warmed up.
 
     Raises:
         SolverNotInstalled: it needs numba.
     """
     try:
-        from qpavoid.kernels.active_set import project
+        from qpavoid.kernels.active_set import project, project_soft
     except ModuleNotFoundError:
         raise SolverNotInstalled("QP back end 'native' needs numba: pip install 'qpavoid[fast]'") from None
     one, row = np.ones(1), np.ones((1, 1))
-    project(row, 1.0, one, row, 2.0 * one, -3.0 * one, 3.0 * one)
-    return project  # type: ignore[no-any-return]
+    arguments = row, 1.0, one, row, 2.0 * one, -3.0 * one, 3.0 * one
+    project(*arguments)
+    project_soft(*arguments, one)
+    return project, project_soft

@@ -65,4 +65,4 @@ def make_backend(name: str) -> Backend:
     raise UnknownName(f"unknown QP back end {name!r}; usable are {usable}")
 
 
-__all__ = ["Backend", "backend_names", "make_backend", "solve_daqp"]
+__all__ = ["Backend", "Daqp", "backend_names", "make_backend", "solve_daqp"]

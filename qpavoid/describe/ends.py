@@ -1,0 +1,74 @@
+"""Frames of a robot that are likely tools, hands or feet."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import pinocchio as pin
+
+_LIMB = 3
+"""Joints in a row that make a limb: two move a head, one turns a wheel or a finger."""
+_FINGER = 4
+"""Joints of a finger at most: what branches into shorter chains is a hand."""
+_FINGERS = re.compile(r"hand|finger|thumb|grip|jaw", re.IGNORECASE)
+"""What fingers' joints are called, of which some hands have only one, and others chains longer than those of a leg."""
+_TOOL_WORDS = ("tcp", "tool", "end_effector", "ee", "grasp", "gripper", "palm", "hand", "sole", "foot", "tip")
+"""Parts of a frame's name that make it the tool among those that move together, the best first."""
+_LINKS = (pin.BODY, pin.OP_FRAME)
+_NO_TOOLS = re.compile(r"head|eye|camera|neck|wheel|caster|laser|imu|lidar|sensor|optical", re.IGNORECASE)
+
+
+def end_effectors(model: Any, known: Sequence[str] = ()) -> list[str]:
+    """Names of frames at the ends of a robot's limbs: those that are known, then others in the order of the joints.
+
+    A limb is a chain of at least three joints since the last branch; where it branches into fingers, its hand is the
+    end. Where no limb is that long, every end counts.
+
+    Args:
+        model: pinocchio model.
+        known: frames that an SRDF calls end effectors; those that do not exist are left out.
+    """
+    frames = {f.name: f.parentJoint for f in model.frames if f.type in _LINKS}
+    ends = [name for name in known if name in frames]
+    taken = {frames[name] for name in ends}
+    root = 1 if model.njoints > 1 and model.names[1] == "root_joint" else 0
+    for least in (_LIMB, 1):
+        joints = _ends(model, root, 0, least)
+        tools = [_tool_frame(model, joint) for joint in joints if joint not in taken]
+        ends += [name for name in tools if name is not None and not _NO_TOOLS.search(name)]
+        if ends:
+            break
+    return ends
+
+
+def _ends(model: Any, joint: int, above: int, least: int) -> list[int]:
+    """Joints that carry the ends of the tree below `joint`, which has `above` joints in a row above it."""
+    children = list(model.children[joint])
+    if not children:
+        return [joint] if above >= least else []
+    fingers = any(_FINGERS.search(model.names[child]) for child in children)
+    short = len(children) > 1 and all(_depth(model, child) <= _FINGER for child in children)
+    if above >= _LIMB and (fingers or short):
+        return [joint]
+    if len(children) == 1:
+        return _ends(model, children[0], above + 1, least)
+    return [end for child in children for end in _ends(model, child, 1, least)]
+
+
+def _depth(model: Any, joint: int) -> int:
+    """Joints in the longest chain that begins with a joint."""
+    return 1 + max((_depth(model, child) for child in model.children[joint]), default=0)
+
+
+def _tool_frame(model: Any, joint: int) -> str | None:
+    """The frame that is best called a tool among those that a joint carries: by name, else its own link."""
+    names = [f.name for f in model.frames if f.parentJoint == joint and f.type in _LINKS]
+    if not names:
+        return None
+    for word in _TOOL_WORDS:
+        pattern = re.compile(rf"(?:^|[^a-z]){word}(?:[^a-z]|$)", re.IGNORECASE)
+        if named := [name for name in names if pattern.search(name)]:
+            return str(min(named, key=len))
+    return str(names[0])

@@ -1,0 +1,144 @@
+"""The robot.yaml and the SRDF of a description, as text."""
+
+from __future__ import annotations
+
+import os.path
+from collections.abc import Sequence
+from pathlib import Path
+from shlex import quote
+from typing import Any
+
+import yaml
+
+from qpavoid.config import Body
+from qpavoid.describe.add import Described, Wishes
+from qpavoid.describe.sampling import FAR, NEAR
+from qpavoid.describe.srdf import MADE_BY, srdf_text
+from qpavoid.describe.written import BLANK, seal
+from qpavoid.loading import EXAMPLES, example_robot
+
+
+def description_files(described: Described, folder: Path) -> dict[Path, bytes]:
+    """The files of a description, sealed.
+
+    Args:
+        described: what they say.
+        folder: where they are to stand; paths in them are relative to it.
+    """
+    srdf = folder / f"{described.config.name}.srdf"
+    comment = f"{described.config.name}: {MADE_BY}; {BLANK}"
+    text = srdf_text(described.robot.model.name, comment, described.disabled, described.config.end_effectors)
+    return {
+        folder / "robot.yaml": seal(_robot_yaml(described, folder, srdf.name).encode()),
+        srdf: seal(text.encode()),
+    }
+
+
+def _robot_yaml(described: Described, folder: Path, srdf: str) -> str:
+    config = described.config
+    lines = [f"# {line}" for line in [*_header(described), f"Again: {_command(described, folder)}"]]
+    lines += [f"name: {_flow(config.name)}", f"urdf: {_flow(_reference(Path(config.urdf), folder))}"]
+    lines.append(f"srdf: {_flow(srdf)}")
+    if config.package_dirs:
+        lines.append(f"package_dirs: {_flow([_relative(Path(path), folder) for path in config.package_dirs])}")
+    if config.root_joint != "fixed":
+        lines.append(f"root_joint: {config.root_joint}")
+    lines.append(f"end_effectors: {_flow(list(config.end_effectors))}")
+    assert not isinstance(config.bodies, str)
+    lines += ["bodies:" if config.bodies else "bodies: []"]
+    lines += _body_lines(config.bodies, described)
+    if config.disabled_pairs:
+        lines.append("disabled_pairs:   # of links that have other pairs which are watched; the rest is in the SRDF")
+        lines += [f"  - {_flow(list(pair))}" for pair in config.disabled_pairs]
+    for field, values in (("home", config.home), ("lock", config.lock)):
+        if values:
+            lines += [f"{field}:", *(f"  {_flow(joint)}: {value:g}" for joint, value in values.items())]
+    return "\n".join([*lines, ""])
+
+
+def _header(described: Described) -> list[str]:
+    lines = [f"{described.config.name}: {MADE_BY}, which leaves it alone once you edit it; {BLANK}"]
+    lines += [
+        f"Bodies: {volume_line(described)}.",
+        f"Pairs: {pairs_line(described)}.",
+        f"Home: {home_line(described)}.",
+    ]
+    return [*lines, *described.notes]
+
+
+def pairs_line(described: Described) -> str:
+    """How many pairs are watched, and why the others are not."""
+    counts, wishes = described.counts, described.wishes
+    honoured = "no SRDF came with it" if described.honoured is None else f"in {described.honoured.name}"
+    return (
+        f"{counts['watched']} of {counts['all']} are watched; {counts['adjacent']} are adjacent, {counts['srdf']} off "
+        f"({honoured}), {counts['always']} always within {1000 * FAR:g} mm, {counts['never']} never within "
+        f"{1000 * NEAR:g} mm ({wishes.samples} samples, seed {wishes.seed}, descent from the nearest)"
+    )
+
+
+def home_line(described: Described) -> str:
+    """How clear the home pose is."""
+    if not described.counts["watched"]:
+        return "no pair is watched"
+    return f"least distance {1000 * described.clearance:.1f} mm"
+
+
+def _command(described: Described, folder: Path) -> str:
+    """The command that writes the same again."""
+    wishes = described.wishes
+    words = ["qpavoid robot add", _reference(described.urdf, Path()), "--name", described.config.name]
+    words += ["--out", folder.as_posix()] if folder != Path(described.config.name) else []
+    words += ["--bodies", wishes.bodies] if wishes.bodies != Wishes.bodies else []
+    words += [word for link, kind in wishes.bodies_of.items() for word in ("--bodies", f"{link}={kind}")]
+    words += ["--root", wishes.root] if wishes.root != Wishes.root else []
+    words += [word for joint in wishes.lock for word in ("--lock", joint)]
+    words += [word for joint, value in wishes.home.items() for word in ("--home", f"{joint}={value:g}")]
+    words += [word for path in wishes.package_dirs for word in ("--package-dir", path.as_posix())]
+    words += ["--srdf", wishes.srdf.as_posix()] if wishes.srdf is not None else []
+    words += ["--samples", str(wishes.samples)] if wishes.samples != Wishes.samples else []
+    words += ["--seed", str(wishes.seed)] if wishes.seed != Wishes.seed else []
+    return " ".join([words[0], *(quote(word) for word in words[1:])])
+
+
+def volume_line(described: Described) -> str:
+    """How many bodies there are, and what room they take beside the hulls of the meshes."""
+    bodies, hulls = (sum(volumes[i] for volumes in described.volume.values()) for i in (0, 1))
+    over = f", {bodies / hulls:.2f} times the {1000 * hulls:.2f} l of the meshes' convex hulls" if hulls > 0.0 else ""
+    return f"{len(described.config.bodies)}, {1000 * bodies:.2f} l{over}"
+
+
+def _body_lines(bodies: Sequence[Body], described: Described) -> list[str]:
+    lines, last = [], ""
+    for body in bodies:
+        fields: dict[str, Any] = {"name": body.name, "frame": body.frame, "shape": body.shape.model_dump()}
+        fields["shape"] = {key: list(v) if isinstance(v, tuple) else v for key, v in fields["shape"].items()}
+        if any(body.position):
+            fields["position"] = list(body.position)
+        if any(body.rpy):
+            fields["rpy"] = list(body.rpy)
+        taken, hull = described.volume[body.frame]
+        comment = f"   # {taken / hull:.2f} of its hull" if hull > 0.0 and body.frame != last else ""
+        lines.append(f"  - {_flow(fields)}{comment}")
+        last = body.frame
+    return lines
+
+
+def _flow(value: Any) -> str:
+    text = str(yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=10**6))
+    return text.strip().removesuffix("\n...")
+
+
+def _reference(urdf: Path, folder: Path) -> str:
+    """The URDF as a robot.yaml names it."""
+    robots = example_robot("").resolve()
+    if urdf.is_relative_to(robots):
+        return f"{EXAMPLES}{urdf.relative_to(robots).as_posix()}"
+    return _relative(urdf, folder)
+
+
+def _relative(path: Path, folder: Path) -> str:
+    try:
+        return Path(os.path.relpath(path, folder.resolve())).as_posix()
+    except ValueError:  # on another drive
+        return path.as_posix()

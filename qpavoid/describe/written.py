@@ -1,0 +1,67 @@
+"""Files that are written again only as long as nobody else has touched them.
+
+Each carries the digest of its own content, so that an edit shows.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from hashlib import sha256
+from pathlib import Path
+
+from qpavoid.errors import ConfigError
+
+_DIGITS = 16
+BLANK = "sha256 " + _DIGITS * "0"
+"""What a file must hold once, where its digest goes."""
+_SEAL = re.compile(rb"sha256 [0-9a-f]{%d}" % _DIGITS)
+
+
+def seal(content: bytes) -> bytes:
+    """Puts the digest of a content in the place of its `BLANK`."""
+    return content.replace(BLANK.encode(), b"sha256 " + sha256(content).hexdigest()[:_DIGITS].encode(), 1)
+
+
+def untouched(content: bytes) -> bool:
+    """Whether a content is as `seal` left it."""
+    return seal(_SEAL.sub(BLANK.encode(), content, count=1)) == content and _SEAL.search(content) is not None
+
+
+def write_files(contents: Mapping[Path, bytes], force: bool = False) -> dict[Path, str]:
+    """Writes all files, or none.
+
+    Args:
+        contents: what each is to hold, sealed.
+        force: overwrites files that somebody edited.
+
+    Returns:
+        For each file `written`, `unchanged` or `updated`.
+
+    Raises:
+        ConfigError: a file was edited since it was written, or is somebody else's; or it cannot be written.
+    """
+    outcome = {}
+    for path, content in contents.items():
+        try:
+            before = path.read_bytes()
+        except FileNotFoundError:
+            outcome[path] = "written"
+            continue
+        except OSError as error:
+            raise ConfigError(f"{path}: {error.strerror}; give another folder with --out") from None
+        if not (force or before == content or untouched(before)):
+            raise ConfigError(
+                f"{path}: edited since it was written, or written by hand: left as it is; --force overwrites it, "
+                "--out DIR writes elsewhere"
+            )
+        outcome[path] = "unchanged" if before == content else "updated"
+    for path, content in contents.items():
+        if outcome[path] == "unchanged":
+            continue
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(content)
+        except OSError as error:
+            raise ConfigError(f"{path}: {error.strerror}; give a folder that can be written with --out") from None
+    return outcome

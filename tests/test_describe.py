@@ -1,0 +1,480 @@
+"""From a URDF to a robot.yaml: bodies enclose, pairs are judged right, a home pose is clear, tools are found."""
+
+import math
+import xml.etree.ElementTree as ElementTree
+
+import coal
+import numpy as np
+import pinocchio as pin
+import pytest
+from conftest import EXAMPLES, differences, write_chain
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.spatial import ConvexHull
+
+from qpavoid import ConfigError, Robot, UnknownName
+from qpavoid.bodies import CapsuleFit, fit_capsule
+from qpavoid.config import Box, Capsule, Hull, RobotConfig, Sphere
+from qpavoid.describe.add import Wishes, describe
+from qpavoid.describe.ends import end_effectors
+from qpavoid.describe.fit import cut, decompose, fit_piece, hull_volume, triangles
+from qpavoid.describe.sampling import (
+    CLEAR,
+    NEAR,
+    PairDistances,
+    Space,
+    always_near,
+    clear_home,
+    sample_pairs,
+    touching,
+)
+from qpavoid.describe.shapes import capsule_fields
+from qpavoid.describe.srdf import MADE_BY, Semantics, find_srdf, read_srdf, srdf_text
+from qpavoid.describe.texts import description_files
+from qpavoid.describe.written import BLANK, seal, untouched, write_files
+from qpavoid.motion import rpy_to_matrix
+from qpavoid.segments import point_segment
+from qpavoid.urdf import read_model
+
+PANDA = EXAMPLES / "panda_description/urdf/panda.urdf"
+
+
+def box_surface(low, high):
+    """Triangles (12, 3, 3) of a box."""
+    points = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * np.subtract(high, low) + low
+    return points[ConvexHull(points).simplices]
+
+
+L_SHAPE = np.concatenate([box_surface([0, 0, 0], [0.5, 0.05, 0.05]), box_surface([0, 0, 0], [0.05, 0.05, 0.4])])
+
+
+def on_surface(surface, count, rng):
+    """Random points (count, 3) on triangles."""
+    corners = surface[rng.integers(len(surface), size=count)]
+    return np.einsum("nk,nki->ni", rng.dirichlet(np.ones(3), count), corners)
+
+
+def outside(points, capsules):
+    """How far the outermost point sticks out of all capsules [m]."""
+    depth = []
+    for fit in capsules:
+        half = 0.5 * fit.length * fit.rotation[:, 2]
+        depth.append(point_segment(points, fit.center - half, fit.center + half).distance - fit.radius)
+    return float(np.min(depth, axis=0).max())
+
+
+def area(surface):
+    return 0.5 * np.linalg.norm(
+        np.cross(surface[:, 1] - surface[:, 0], surface[:, 2] - surface[:, 0]), axis=1
+    ).sum()  # fmt: skip
+
+
+# --- fit ------------------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=60)
+@given(
+    arrays(np.float64, (6, 3, 3), elements=st.floats(-1.0, 1.0)),
+    arrays(np.float64, 3, elements=st.floats(-1.0, 1.0)).filter(lambda n: np.linalg.norm(n) > 0.1),
+    st.floats(-0.8, 0.8),
+)
+def test_a_cut_surface_is_the_same_surface(surface, normal, height):
+    """The halves have the whole's area, and each lies on its side of the plane."""
+    normal = normal / np.linalg.norm(normal)
+    above, below = cut(surface, normal, height, 1.0), cut(surface, normal, height, -1.0)
+    in_plane = np.all(surface @ normal - height == 0.0, axis=1)  # such triangles belong to both
+    assert area(above) + area(below) == pytest.approx(area(surface) + area(surface[in_plane]), abs=1e-9)
+    assert np.all(above @ normal >= height - 1e-9) and np.all(below @ normal <= height + 1e-9)
+
+
+def test_several_capsules_enclose_an_angle_in_less_room():
+    whole = fit_capsule(L_SHAPE.reshape(-1, 3))
+    capsules = decompose(L_SHAPE, whole)
+    assert len(capsules) >= 2
+    assert sum(fit.volume for fit in capsules) < 0.4 * whole.volume
+    assert outside(on_surface(L_SHAPE, 4000, np.random.default_rng(0)), capsules) <= 1e-9
+
+
+def test_one_capsule_stays_where_a_cut_would_not_pay():
+    rod = box_surface([0, 0, 0], [0.6, 0.05, 0.05])
+    whole = fit_capsule(rod.reshape(-1, 3))
+    assert decompose(rod, whole) == (whole,)
+
+
+@pytest.mark.parametrize(
+    ("shape", "expected"),
+    [
+        (coal.Sphere(0.1), 1),
+        (coal.Capsule(0.05, 0.3), 1),
+        (coal.Cylinder(0.05, 0.4), 1),  # 1.3 times its volume
+        (coal.Box(0.2, 0.2, 0.2), 0),  # 2.7 times
+        (coal.Cylinder(0.2, 0.02), 0),  # a disc
+    ],
+)
+def test_auto_takes_a_capsule_only_where_it_is_not_gross(shape, expected):
+    capsules = fit_piece(shape, "auto")
+    assert len(capsules) == expected
+    assert sum(fit.volume for fit in capsules) <= 2.0 * hull_volume(shape)
+    assert fit_piece(shape, "capsule")
+
+
+directions = arrays(np.float64, 3, elements=st.floats(-1.0, 1.0)).filter(lambda v: np.linalg.norm(v) > 0.1)
+
+
+@settings(max_examples=100)
+@given(directions, directions, st.floats(1e-6, 0.5), st.floats(0.0, 0.8), directions)
+def test_what_is_written_encloses_what_was_fitted(axis, center, radius, length, turn):
+    """Five digits after the point, and the radius makes up for what they lose."""
+    z = axis / np.linalg.norm(axis)
+    x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
+    x /= np.linalg.norm(x)
+    fit = CapsuleFit(center, np.column_stack([x, np.cross(z, x), z]), radius, length)
+    placement = pin.SE3(pin.exp3(turn), np.array([0.3, -0.2, 0.1]))
+    fields = capsule_fields(fit, placement)
+    shape = fields["shape"]
+    written = 0.5 * getattr(shape, "length", 0.0) * rpy_to_matrix(fields["rpy"])[:, 2]
+    for side in (-1.0, 1.0):
+        end = placement.act(fit.center + side * 0.5 * length * fit.rotation[:, 2])
+        sticks_out = np.linalg.norm(end - (np.array(fields["position"]) + side * written))
+        assert sticks_out + radius <= shape.radius + 1e-12
+    assert shape.radius < radius + 5e-5
+    assert all(round(number, 5) == number for number in (*fields["position"], *fields["rpy"], shape.radius))
+
+
+@pytest.fixture(scope="module")
+def panda_described():
+    kinds = ("auto", "capsule", "capsules", "convex")
+    return {kind: describe(PANDA, Wishes(bodies=kind, samples=300)) for kind in kinds}
+
+
+@pytest.mark.parametrize("kind", ["auto", "capsule", "capsules", "convex"])
+def test_bodies_enclose_every_vertex(panda_described, kind):
+    """Of every mesh and box, in the shapes that are written, but for rounding errors of coal's own distance."""
+    described = panda_described[kind]
+    bodies = {}
+    for body, live in zip(described.config.bodies, described.robot.bodies.geometryObjects, strict=True):
+        in_link = described.robot.model.frames[live.parentFrame].placement.actInv(live.placement)
+        bodies.setdefault(body.frame, []).append((live.geometry, in_link))
+    point = coal.Sphere(1e-9)
+    for piece in described.pieces:
+        corners = triangles(piece.geometry).reshape(-1, 3)
+        corners = corners[np.unique(ConvexHull(corners).vertices)] if kind == "convex" else np.unique(corners, axis=0)
+        for corner in corners[:: max(1, len(corners) // 60)]:
+            place = pin.SE3(np.eye(3), piece.placement.act(corner))
+            assert min(signed_distance(point, place, shape, at) for shape, at in bodies[piece.link]) < 1e-6
+
+
+def signed_distance(point, place, shape, at):
+    request, result = coal.DistanceRequest(), coal.DistanceResult()
+    request.gjk_tolerance = 1e-9
+    to = [coal.Transform3s(pose.rotation, pose.translation) for pose in (place, at)]
+    return coal.distance(point, to[0], shape, to[1], request, result)
+
+
+def test_more_faithful_bodies_take_less_room(panda_described):
+    volumes = {kind: sum(v[0] for v in d.volume.values()) for kind, d in panda_described.items()}
+    hulls = sum(v[1] for v in panda_described["auto"].volume.values())
+    assert volumes["convex"] == pytest.approx(hulls)
+    assert hulls < volumes["auto"] <= volumes["capsules"] <= volumes["capsule"] < 2.0 * hulls
+    assert all(taken <= 2.0 * hull for taken, hull in panda_described["auto"].volume.values())
+
+
+def test_single_links_may_be_another_kind():
+    described = describe(PANDA, Wishes(bodies="capsule", bodies_of={"panda_link[02]": "convex"}, samples=10))
+    shapes = {body.name: type(body.shape) for body in described.config.bodies}
+    assert shapes["panda_link0"] is shapes["panda_link2"] is Hull
+    assert shapes["panda_link1"] is Capsule
+    with pytest.raises(UnknownName, match=r"--bodies: no link 'panda_lnk0' with geometry; did you mean 'panda_link"):
+        describe(PANDA, Wishes(bodies_of={"panda_lnk0": "convex"}))
+
+
+# --- pairs ----------------------------------------------------------------------------------------------------
+
+
+def chain(tmp_path, bodies, joints=2, **fields):
+    return Robot.from_urdf(write_chain(tmp_path, joints), bodies=bodies, **fields)
+
+
+def ball(name, frame, position, radius=0.05):
+    return {"name": name, "frame": frame, "shape": {"type": "sphere", "radius": radius}, "position": position}
+
+
+def test_distances_fall_along_their_gradient(tmp_path):
+    robot = chain(tmp_path, [ball("base", "link0", [0, 0.3, 0]), ball("tip", "link2", [0, 0, 0.25])])
+    distances = PairDistances(robot)
+    q = np.array([0.4, -0.7])
+    d, slope = distances.gradient(0, q)
+    assert d == pytest.approx(distances.all(q)[0])
+    np.testing.assert_allclose(slope, differences(lambda q: distances.all(q), robot, q)[0], atol=1e-6)
+
+
+def test_descent_finds_what_samples_miss(tmp_path):
+    """A ball in the reach of the tip at one pose only: of ten samples none comes near, the descent does."""
+    reach = 0.3 * np.array([0.0, -math.sin(1.2), math.cos(1.2)]) + [0, 0, 0.3]
+    tip = reach + 0.25 * np.array([0.0, -math.sin(1.2 - 0.9), math.cos(1.2 - 0.9)])
+    robot = chain(tmp_path, [ball("base", "link0", tip, 0.01), ball("tip", "link2", [0, 0, 0.25], 0.01)])
+    assert touching(robot, np.array([1.2, -0.9]))
+    distances, draws = PairDistances(robot), Space(robot).draw(np.random.default_rng(0), 10)
+    assert min(distances.all(q)[0] for q in draws) > NEAR
+    assert not sample_pairs(robot, samples=10).never[0]
+
+
+def test_pairs_out_of_reach_are_never_near(tmp_path):
+    bodies = [
+        ball("far", "link0", [0, 0, -2.0]), ball("tip", "link2", [0, 0, 0.25]), ball("side", "link0", [0, 0.4, 0.3])
+    ]  # fmt: skip
+    robot = chain(tmp_path, bodies)
+    names = [body.name for body in robot.bodies.geometryObjects]
+    sampled = sample_pairs(robot, samples=300)
+    judged = {
+        frozenset((names[p.first], names[p.second])): (bool(a), bool(n))
+        for p, a, n in zip(robot.bodies.collisionPairs, sampled.always, sampled.never, strict=True)
+    }
+    assert judged[frozenset(("far", "tip"))] == (False, True)
+    assert judged[frozenset(("side", "tip"))] == (False, False)
+    # the descent comes at least as near as ten times the samples do
+    far = [names[p.first] == "far" for p in robot.bodies.collisionPairs].index(True)
+    distances, q = PairDistances(robot), Space(robot).draw(np.random.default_rng(1), 3000)
+    assert sampled.closest[far] <= min(distances.all(x)[far] for x in q) + 1e-6
+
+
+def test_a_pair_that_cannot_part_is_always_near(tmp_path):
+    side = [ball("a", "link0", [0, 0, 0.28], 0.1), ball("b", "link2", [0, 0, -0.25], 0.03)]
+    robot = chain(tmp_path, side)
+    # b turns about link2's joint at 0.25 m from it; with limits of ±2 rad it comes away from a
+    assert len(always_near(robot, 50)) == 0
+    held = chain(tmp_path, [ball("a", "link0", [0.0, 0.0, 0.26], 0.01), ball("b", "link2", [0, 0, -0.3], 0.01)],
+                 limits={"position": {"joint1": (-0.01, 0.01), "joint2": (-0.01, 0.01)}})  # fmt: skip
+    assert len(always_near(held, 50)) == len(held.bodies.collisionPairs)
+    assert sample_pairs(held, 300).always.all()
+
+
+def test_home_is_the_wish_or_near_it(tmp_path):
+    robot = chain(tmp_path, [ball("base", "link0", [0, 0, 0.85]), ball("tip", "link2", [0, 0, 0.25])])
+    assert touching(robot, robot.home)[0][2] < 0.0
+    good = np.array([0.0, 1.0])
+    q, d, wish = clear_home(robot, [robot.home, good])
+    assert wish == 1 and np.array_equal(q, good) and d >= CLEAR
+    q, d, wish = clear_home(robot, [robot.home])
+    assert wish is None and d >= CLEAR and not touching(robot, q)
+    assert np.linalg.norm(q - robot.home) < 1.0
+    bounds = robot.bounds()
+    assert np.all(q >= bounds.lower) and np.all(q <= bounds.upper)
+
+
+def test_samples_keep_to_the_limits_and_the_root_stays():
+    robot = Robot.from_urdf(EXAMPLES / "kinova_description/robots/kinova.urdf", root_joint="free_flyer")
+    bounds = robot.bounds()
+    draws = Space(robot).draw(np.random.default_rng(0), 50)
+    np.testing.assert_allclose(draws[:, :7], np.tile(pin.neutral(robot.model)[:7], (50, 1)), atol=1e-12)
+    assert all(np.allclose(pin.normalize(robot.model, q), q) for q in draws)
+    assert np.all(draws[:, bounds.q_index] >= bounds.lower) and np.all(draws[:, bounds.q_index] <= bounds.upper)
+    assert np.ptp(draws[:, 7:], axis=0).min() > 0.5
+
+
+# --- ends and SRDF ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("urdf", "expected"),
+    [
+        ("panda_description/urdf/panda.urdf", ["panda_hand_tcp"]),
+        ("ur_description/urdf/ur5_robot.urdf", ["tool0"]),
+        ("baxter_description/urdf/baxter.urdf", ["left_gripper", "right_gripper"]),
+        ("solo_description/robots/solo12.urdf", ["FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT"]),
+        ("tiago_description/robots/tiago_dual.urdf", ["arm_left_tool_link", "arm_right_tool_link"]),
+        (
+            "g1_description/urdf/g1_29dof_with_hand_rev_1_0.urdf",
+            ["left_ankle_roll_link", "right_ankle_roll_link", "left_hand_palm_link", "right_hand_palm_link"],
+        ),
+        ("double_pendulum_description/urdf/double_pendulum.urdf", ["link2"]),
+        ("hector_description/robots/quadrotor_base.urdf", []),
+    ],
+)
+def test_ends_of_limbs(urdf, expected):
+    assert end_effectors(read_model(EXAMPLES / urdf, "fixed")) == expected
+
+
+def test_known_ends_come_first_and_are_not_doubled():
+    model = read_model(EXAMPLES / "talos_data/robots/talos_reduced.urdf", "fixed")
+    ends = end_effectors(model, ["right_sole_link", "no_such_link"])
+    assert ends[0] == "right_sole_link"
+    assert sorted(ends) == [
+        "left_sole_link", "right_sole_link", "wrist_left_ft_tool_link", "wrist_right_ft_tool_link"
+    ]  # fmt: skip
+
+
+def test_srdf_is_read_back_as_written(tmp_path):
+    disabled = {frozenset(("a", "b")): "Never", frozenset(('c"&', "a")): "User"}
+    path = tmp_path / "x.srdf"
+    path.write_text(srdf_text("x", "words -- and more", disabled, ["hand"]))
+    semantics = read_srdf(path)
+    assert semantics.disabled == disabled and semantics.end_effectors == ("hand",)
+
+
+def test_the_srdf_beside_a_urdf_is_found_unless_it_is_our_own(tmp_path):
+    urdf = write_chain(tmp_path)
+    assert find_srdf(urdf) is None
+    (tmp_path / "other.srdf").write_text("<robot name='x'/>")
+    (tmp_path / "chain.srdf").write_text(f"<!-- {MADE_BY} --><robot name='x'/>")
+    assert find_srdf(urdf) is None
+    (tmp_path / "srdf").mkdir()
+    (tmp_path / "srdf" / "chain_moveit.srdf").write_text("<robot name='x'/>")
+    assert find_srdf(urdf) == tmp_path / "srdf" / "chain_moveit.srdf"
+    assert find_srdf(PANDA) == EXAMPLES / "panda_description/srdf/panda.srdf"
+
+
+def test_states_that_sound_like_home_come_first(tmp_path):
+    path = tmp_path / "x.srdf"
+    states = "".join(f"<group_state name='{n}'><joint name='j' value='{v}'/></group_state>"
+                     for n, v in (("arm_up", "1"), ("home", "2"), ("odd", "1 2")))  # fmt: skip
+    path.write_text(f"<robot name='x'>{states}</robot>")
+    assert read_srdf(path) == Semantics({}, {"home": {"j": 2.0}, "arm_up": {"j": 1.0}, "odd": {}}, ())
+    assert list(read_srdf(path).states) == ["home", "arm_up", "odd"]
+
+
+# --- the whole ------------------------------------------------------------------------------------------------
+
+
+def pairs(robot):
+    names = [body.name for body in robot.bodies.geometryObjects]
+    return {frozenset((names[p.first], names[p.second])) for p in robot.bodies.collisionPairs}
+
+
+@pytest.mark.parametrize("kind", ["auto", "capsules"])
+def test_the_written_robot_is_the_one_that_was_worked_out(panda_described, kind, tmp_path):
+    described = panda_described[kind]
+    write_files(description_files(described, tmp_path / "made"))
+    robot = Robot.load(str(tmp_path / "made" / "robot.yaml"))
+    assert pairs(robot) == pairs(described.robot) and len(pairs(robot)) == described.counts["watched"]
+    np.testing.assert_allclose(robot.home, described.robot.home, atol=1e-5)
+    assert robot.end_effectors == ("panda_hand_tcp",)
+    assert not touching(robot, robot.home, CLEAR)
+    assert robot.always_touching == ()
+    for mine, theirs in zip(robot.bodies.geometryObjects, described.robot.bodies.geometryObjects, strict=True):
+        assert mine.name == theirs.name
+        np.testing.assert_allclose(mine.placement.homogeneous, theirs.placement.homogeneous, atol=1e-12)
+
+
+def test_an_srdf_is_honoured_and_its_pairs_are_kept(panda_described, tmp_path):
+    described = panda_described["auto"]
+    theirs = read_srdf(EXAMPLES / "panda_description/srdf/panda.srdf").disabled
+    assert {pair: described.disabled[pair] for pair in theirs} == dict(theirs)
+    links = {body.name: body.frame for body in described.config.bodies}
+    assert not any(frozenset(links[b] for b in pair) in theirs for pair in pairs(described.robot))
+    counts = described.counts
+    assert counts["all"] == sum(counts[k] for k in ("adjacent", "srdf", "always", "never", "watched"))
+    path = tmp_path / "made" / "panda.srdf"
+    write_files(description_files(described, path.parent))
+    assert {d.get("reason") for d in ElementTree.parse(path).iter("disable_collisions")} >= {"Adjacent", "Never"}
+
+
+def test_mimic_joints_are_held_where_they_belong(panda_described):
+    """panda_finger_joint2 follows joint1, which the SRDF's pose has at 1 mm."""
+    assert panda_described["auto"].config.lock == {"panda_finger_joint1": 0.001, "panda_finger_joint2": 0.001}
+
+
+def test_home_and_locks_may_be_wished():
+    urdf = EXAMPLES / "ur_description/urdf/ur5_robot.urdf"
+    wishes = Wishes(home={"elbow_joint": 1.57, "wrist_3_joint": 0.5}, lock=["wrist_3*"], samples=10)
+    config = describe(urdf, wishes).config
+    assert config.home["elbow_joint"] == 1.57 and config.lock == {"wrist_3_joint": 0.5}
+    with pytest.raises(UnknownName, match=r"--home: no joint 'elbow'; did you mean 'elbow_joint'"):
+        describe(urdf, Wishes(home={"elbow": 1.0}))
+    with pytest.raises(UnknownName, match=r"--lock: no joint 'wrist_9'"):
+        describe(urdf, Wishes(lock=["wrist_9"]))
+
+
+def test_capsules_too_fat_for_the_home_pose_become_exact(tmp_path):
+    """Two discs, 8 cm apart: the capsules around them are 20 cm thick."""
+    urdf = write_chain(tmp_path, 2, shape='<cylinder radius="0.1" length="0.12"/>')
+    described = describe(urdf, Wishes(samples=50))
+    assert all(isinstance(body.shape, Capsule) for body in described.config.bodies)
+    close = urdf.read_text().replace('xyz="0 0 0.3"', 'xyz="0 0 0.08"')
+    urdf.write_text(close.replace('length="0.12"', 'length="0.12"'))
+    described = describe(urdf, Wishes(samples=50))
+    shapes = {body.name: body.shape.type for body in described.config.bodies}
+    assert shapes["link0"] == shapes["link2"] == "cylinder"
+    assert any("exact where capsules" in note for note in described.notes)
+
+
+def test_bodies_are_fitted_to_what_is_seen_where_there_is_nothing_else(tmp_path):
+    urdf = write_chain(tmp_path, shape='<box size="0.1 0.1 0.2"/>')
+    urdf.write_text(urdf.read_text().replace("collision>", "visual>"))
+    described = describe(urdf, Wishes(samples=50))
+    assert {type(body.shape) for body in described.config.bodies} <= {Box, Capsule}
+    assert any("no collision geometry" in note for note in described.notes)
+    urdf.write_text(urdf.read_text().replace("visual>", "nothing>"))
+    described = describe(urdf, Wishes(samples=50))
+    assert described.config.bodies == [] and any("no geometry at all" in note for note in described.notes)
+    assert Robot.from_config(described.config, urdf).bodies.ngeoms == 0
+
+
+def test_a_link_with_the_name_of_a_joint(tmp_path):
+    urdf = write_chain(tmp_path)
+    urdf.write_text(urdf.read_text().replace('joint name="joint2"', 'joint name="link2"'))
+    robot = Robot.from_config(describe(urdf, Wishes(samples=20)).config, urdf)
+    assert robot.model.frames[robot.frame_id("link2", "here")].type == pin.BODY
+
+
+def test_hulls_of_a_robot_yaml(panda_convex):
+    bodies = [
+        {"name": "elbow", "frame": "panda_link4", "shape": {"type": "hull", "geometry": "panda_link4_0"}},
+        {"name": "shifted", "frame": "panda_link4", "shape": {"type": "hull", "geometry": "panda_link4_0"},
+         "position": [0.1, 0.0, 0.0]},
+    ]  # fmt: skip
+    robot = Robot.from_urdf(PANDA, bodies=bodies)
+    whole = {body.name: body for body in panda_convex.bodies.geometryObjects}["panda_link4_0"]
+    elbow, shifted = robot.bodies.geometryObjects
+    assert elbow.geometry == whole.geometry and elbow.parentJoint == whole.parentJoint
+    np.testing.assert_allclose(elbow.placement.homogeneous, whole.placement.homogeneous, atol=1e-12)
+    np.testing.assert_allclose(shifted.placement.translation - elbow.placement.translation, [0.1, 0, 0], atol=1e-12)
+    bodies[0]["shape"]["geometry"] = "panda_link4"
+    with pytest.raises(UnknownName, match=r"bodies\.0\.shape\.geometry: no collision geometry 'panda_link4'; did you"):
+        Robot.from_urdf(PANDA, bodies=bodies)
+
+
+def test_hull_of_a_round_flat_face():
+    """qhull cuts the disc into a fan of triangles whose tip has more neighbours than a hull can hold."""
+    robot = Robot.from_urdf(EXAMPLES / "centauro_description/urdf/centauro.urdf")
+    assert robot.bodies.ngeoms == 45
+
+
+# --- written files ---------------------------------------------------------------------------------------------
+
+
+@given(st.binary(max_size=60), st.binary(max_size=60), st.integers(0, 200))
+def test_every_edit_of_a_sealed_file_shows(before, after, at):
+    content = seal(before + BLANK.encode() + after)
+    assert untouched(content)
+    at %= len(content)
+    assert not untouched(content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :])
+    assert not untouched(content[:-1])
+
+
+def test_all_files_are_written_or_none(tmp_path):
+    a, b = tmp_path / "new" / "a", tmp_path / "new" / "b"
+    old, new = (seal(f"{word} {BLANK}".encode()) for word in ("old", "new"))
+    assert write_files({a: old, b: old}) == {a: "written", b: "written"}
+    assert write_files({a: old, b: new}) == {a: "unchanged", b: "updated"}
+    b.write_bytes(new + b"!")
+    with pytest.raises(ConfigError, match=r"new/b: edited since it was written.*--force"):
+        write_files({a: new, b: old})
+    assert (a.read_bytes(), b.read_bytes()) == (old, new + b"!")
+    assert write_files({a: new, b: old}, force=True) == {a: "updated", b: "updated"}
+    b.write_text("mine")
+    with pytest.raises(ConfigError, match="written by hand"):
+        write_files({b: old})
+
+
+def test_describing_twice_is_the_same(tmp_path):
+    one, two = (description_files(describe(PANDA, Wishes(samples=200)), tmp_path) for _ in range(2))
+    assert one == two
+    assert all(untouched(content) for content in one.values())
+
+
+def test_a_config_that_is_written_reads_back_with_its_units(panda_described):
+    config = panda_described["capsules"].config
+    assert RobotConfig.model_validate(config.model_dump()) == config
+    assert all(isinstance(body.shape, Capsule | Sphere) for body in config.bodies)

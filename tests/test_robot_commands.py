@@ -1,0 +1,354 @@
+"""`qpavoid robot check` and `add` as a user meets them, and the robots that ship."""
+
+import json
+import math
+import re
+import shlex
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import yaml
+from conftest import EXAMPLES, write_chain
+
+from qpavoid import Robot, load_scenario, simulate
+from qpavoid.config import RobotConfig
+from qpavoid.describe.add import Wishes, describe
+from qpavoid.describe.check import check_robot
+from qpavoid.describe.sampling import CLEAR, touching
+from qpavoid.describe.written import untouched
+from qpavoid.loading import data_folder, find_robot, read_config
+from qpavoid.urdf import find_mesh
+
+MADE = ("baxter", "g1", "tiago", "ur5")
+"""Robots that ship as `robot add` wrote them."""
+MJCF = """
+<mujoco model="arm"><compiler angle="radian"/><worldbody><geom type="plane" size="1 1 1"/>
+  <body name="base"><geom type="box" size=".1 .1 .1"/>
+    <body name="upper" pos="0 0 .2"><joint name="turn" type="hinge" axis="0 0 1" range="-2 2"/>
+      <geom type="capsule" fromto="0 0 0 0 0 .3" size=".04"/>
+      <body name="lower" pos="0 0 .3"><joint name="bend" type="hinge" axis="0 1 0" range="-2 2"/>
+        <geom type="cylinder" fromto="0 0 0 0 0 .3" size=".04"/><site name="tool" pos="0 0 .35"/>
+</body></body></body></worldbody></mujoco>
+"""
+
+
+def problems(report, severity=None):
+    return " | ".join(f"{p.what} → {p.remedy}" for p in report.problems if severity in (None, p.severity))
+
+
+# --- check ----------------------------------------------------------------------------------------------------
+
+
+def test_a_ready_robot_has_no_problem(cli):
+    result = cli("robot", "check", "panda")
+    assert result.status == 0
+    assert "no problem found" in result.stdout
+    assert "panda_joint4 [-3.07, -0.0698]" in result.stdout
+    assert "panda_finger_joint2 mimics panda_finger_joint1 locked" in result.stdout
+
+
+def test_json_is_all_there_is_on_stdout(cli):
+    urdf = EXAMPLES / "ur_description/urdf/ur5_robot.urdf"
+    result = cli("robot", "check", urdf, "--json")
+    report = json.loads(result.stdout)
+    assert (result.status, report["usable"], report["nq"], report["nv"]) == (0, True, 6, 6)
+    assert report["shapes"] == {"mesh": 7, "box": 1} and report["triangles"] == 5328
+    assert report["end_effectors"] == ["tool0"]
+    assert [j["kind"] for j in report["joints"]].count("fixed") == 4
+    assert 1.0 < report["tick_us"] < 1e5 and report["home_collisions"] == []
+    assert any("singular" in problem["what"] for problem in report["problems"])  # stretched out at zero
+
+
+def test_kinds_of_joints():
+    kinova = check_robot(str(EXAMPLES / "kinova_description/robots/kinova.urdf"), root="free_flyer")
+    kinds = [joint.kind for joint in kinova.joints]
+    assert (kinds.count("floating"), kinds.count("continuous"), kinds.count("revolute")) == (1, 3, 3)
+    assert (kinova.nq, kinova.nv) == (16, 12)
+    tiago = check_robot("tiago")
+    assert sorted(joint.kind for joint in tiago.joints if joint.locked) == ["continuous"] * 2 + ["revolute"] * 2
+    assert tiago.joints[0].kind == "planar"
+
+
+def test_missing_meshes_are_named_with_where_they_were_looked_for(cli, tmp_path):
+    shape = '<mesh filename="package://arm/hand.stl"/>'
+    urdf = write_chain(tmp_path, shape=shape)
+    result = cli("robot", "check", urdf)
+    assert result.status == 1
+    assert "collision meshes are missing, such as 'package://arm/hand.stl'; looked for in" in result.stdout
+    assert str(tmp_path) in result.stdout and "--package-dir" in result.stdout
+    cube = "solid c\n" + "".join(
+        f"facet normal 0 0 1\nouter loop\n{''.join(f'vertex {a} {b} {c}' + chr(10) for a, b, c in corners)}endloop\n"
+        "endfacet\n"
+        for corners in (
+            [(0, 0, 0), (0.1, 0, 0), (0, 0.1, 0)], [(0, 0, 0), (0.1, 0, 0), (0, 0, 0.1)],
+            [(0, 0, 0), (0, 0.1, 0), (0, 0, 0.1)], [(0.1, 0, 0), (0, 0.1, 0), (0, 0, 0.1)],
+        )
+    ) + "endsolid c\n"  # fmt: skip
+    (tmp_path / "elsewhere" / "arm").mkdir(parents=True)
+    (tmp_path / "elsewhere" / "arm" / "hand.stl").write_text(cube)
+    assert cli("robot", "check", urdf, "--package-dir", tmp_path / "elsewhere").status == 0
+    added = cli("robot", "add", urdf, "--package-dir", tmp_path / "elsewhere", "--no-picture", "--samples", "50")
+    assert added.status == 0
+    assert yaml.safe_load((tmp_path / "chain" / "robot.yaml").read_text())["package_dirs"] == ["../elsewhere"]
+    assert Robot.load("chain/robot.yaml").bodies.ngeoms == 4
+
+
+@pytest.mark.parametrize("name", ["package://arm/hand.stl", "package:///arm/hand.stl", "model://arm/hand.stl"])
+def test_meshes_are_looked_for_as_pinocchio_does(tmp_path, name):
+    (tmp_path / "arm").mkdir()
+    (tmp_path / "arm" / "hand.stl").touch()
+    assert find_mesh(name, ["/nowhere", str(tmp_path)]) == str(tmp_path / "arm" / "hand.stl")
+    assert find_mesh(f"file://{tmp_path}/arm/hand.stl", ["/nowhere"]) == str(tmp_path / "arm" / "hand.stl")
+    assert find_mesh(name.replace("hand", "foot"), ["/nowhere", str(tmp_path)]) is None
+
+
+def test_limits_that_cannot_be_meant(tmp_path):
+    urdf = write_chain(tmp_path, 4)
+    old = '<limit lower="-2" upper="2" velocity="1.5" effort="1"/>'
+    text = urdf.read_text()
+    for new in (
+        '<limit lower="0" upper="0" velocity="0" effort="1"/>',
+        '<limit lower="-99" upper="99" velocity="1e3" effort="1"/>',
+        '<limit lower="0" upper="0.0001" velocity="1" effort="1"/>',
+    ):  # fmt: skip
+        text = text.replace(old, new, 1)
+    urdf.write_text(text)
+    report = check_robot(str(urdf))
+    told = problems(report, "warning")
+    assert "no position limits: joint1 → `limits: {position" in told
+    assert "no velocity limit: joint1 → `limits: {velocity" in told
+    assert "a velocity limit beyond what such joints do: joint2 →" in told
+    assert "a range wider than such joints have: joint2 →" in told
+    assert "hardly any range: joint3 → `lock" in told
+    assert "joint4" not in told
+    assert report.usable
+
+
+def test_mimic_mass_feet_and_home_collisions_are_told(tmp_path):
+    urdf = write_chain(tmp_path, 3, shape='<sphere radius="0.35"/>')
+    urdf.write_text(
+        urdf.read_text().replace('<child link="link3"/>', '<child link="link3"/><mimic joint="joint1"/>')
+        .replace("link3", "left_foot")
+    )  # fmt: skip
+    report = check_robot(str(urdf))
+    told = problems(report)
+    assert "mimic joints that move on their own here: joint3 →" in told
+    assert "3 moving links have no mass → none is needed" in told
+    assert "it has feet (left_foot) and a fixed base → `root_joint: free_flyer`" in told
+    assert [(a, b) for a, b, _ in report.home_collisions] or "touch in every configuration" in told
+    assert check_robot(str(urdf), root="free_flyer").nv == 9
+
+
+def test_no_bodies_is_an_error_with_its_remedy(cli, tmp_path):
+    urdf = write_chain(tmp_path)
+    urdf.write_text(urdf.read_text().replace("collision>", "visual>"))
+    result = cli("robot", "check", urdf)
+    assert result.status == 1
+    assert "it has no collision bodies: nothing would be avoided" in result.stdout
+    assert "robot add" in result.stdout
+
+
+def test_mjcf_is_read_checked_and_added(cli, tmp_path):
+    (tmp_path / "arm.xml").write_text(MJCF)
+    report = check_robot("arm.xml")
+    assert report.shapes == {"box": 1, "capsule": 1, "cylinder": 1}  # the floor is the world's
+    assert report.end_effectors == ["tool"] and report.nq == 2
+    assert "no velocity limit: turn, bend" in problems(report)
+    assert cli("robot", "add", "arm.xml", "--no-picture").status == 0
+    assert [body.name for body in Robot.load("arm/robot.yaml").bodies.geometryObjects] == ["base", "upper", "lower"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("<mujoco/>", "worldbody has no body"),
+        ("<robot/>", "its root is <robot>; must be <mujoco>"),
+        (MJCF.replace('pos="0 0 .2"', 'pos="0 0 nan"'), r"body pos='0 0 nan': must be finite"),
+        (MJCF.replace("<worldbody>", '<include file="x.xml"/><worldbody>'), "it has an <include>"),
+        (MJCF.replace('type="hinge"', 'type="hing"'), "not a usable MJCF"),
+        (MJCF.replace('range="-2 2"', 'range="a b"'), "'a' is not a number"),
+        (MJCF.replace('<joint name="turn"', '<joint class="a" name="turn"'), "a name that it does not define|class"),
+        ("<mujoco><worldbody>", "not a usable MJCF"),
+    ],
+)
+def test_bad_mjcf_is_refused_in_one_line(cli, tmp_path, text, message):
+    (tmp_path / "arm.xml").write_text(text)
+    for command in ("check", "add"):
+        result = cli("robot", command, "arm.xml")
+        assert result.status == 2 and result.stdout == ""
+        (line,) = result.stderr.splitlines()
+        assert line.startswith("error: ") and "arm.xml" in line
+        assert re.search(message, line)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["check", "pandaa"], ["unknown robot 'pandaa'", "did you mean 'panda'"]),
+        (["check", "none.urdf"], ["none.urdf: no such file"]),
+        (["check", "example-robot-data:none.urdf"], ["none.urdf: no such file"]),
+        (["check", "panda", "--root", "wheels"], ["--root: 'wheels' is none of fixed, planar, free_flyer"]),
+        (["add", "panda"], ["panda: is described already; give a URDF or MJCF"]),
+        (["add", "chain.urdf", "--bodies", "box"], ["--bodies box: 'box' is none of auto, capsule, capsules, convex"]),
+        (["add", "chain.urdf", "--bodies", "arm=auto"], ["--bodies: no link 'arm' with geometry"]),
+        (["add", "chain.urdf", "--lock", "joint9"], ["--lock: no joint 'joint9'; did you mean 'joint"]),
+        (["add", "chain.urdf", "--home", "joint1"], ["--home joint1: expected JOINT=VALUE"]),
+        (["add", "chain.urdf", "--home", "joint1=nan"], ["--home joint1=nan: expected JOINT=VALUE"]),
+        (["add", "chain.urdf", "--home", "j=1"], ["--home: no joint 'j'"]),
+        (["add", "chain.urdf", "--srdf", "none.srdf"], ["none.srdf", "cannot be read"]),
+        (["add", "chain.urdf", "--out", "chain.urdf"], ["chain.urdf", "--out"]),
+    ],
+)
+def test_bad_arguments_are_refused_in_one_line(cli, tmp_path, arguments, words):
+    write_chain(tmp_path)
+    result = cli("robot", *arguments)
+    assert result.status == 2 and result.stdout == ""
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("error: ") and all(word in line for word in words)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["chain.urdf"]
+
+
+# --- add ------------------------------------------------------------------------------------------------------
+
+
+def test_a_second_run_writes_the_same_bytes_and_says_so(cli, tmp_path):
+    write_chain(tmp_path)
+    first = json.loads(cli("robot", "add", "chain.urdf", "--json").stdout)
+    assert set(first["files"].values()) == {"written"}
+    before = {path.name: path.read_bytes() for path in (tmp_path / "chain").iterdir()}
+    assert {"robot.yaml", "chain.srdf"} <= before.keys()
+    assert all(untouched(content) for content in before.values())
+    second = json.loads(cli("robot", "add", "chain.urdf", "--json").stdout)
+    assert set(second["files"].values()) == {"unchanged"}
+    assert {path.name: path.read_bytes() for path in (tmp_path / "chain").iterdir()} == before
+    assert cli("robot", "add", "chain.urdf", "--seed", "1").stdout.count("updated") >= 1  # nobody edited it
+
+
+def test_a_run_into_the_folder_of_the_urdf_does_not_honour_its_own_srdf(cli, tmp_path):
+    write_chain(tmp_path, 4)
+    for outcome in ("written", "unchanged"):
+        document = json.loads(cli("robot", "add", "chain.urdf", "--out", ".", "--no-picture", "--json").stdout)
+        assert document["srdf"] is None and set(document["files"].values()) == {outcome}
+
+
+def test_an_edited_file_is_left_alone_unless_told_otherwise(cli, tmp_path):
+    write_chain(tmp_path)
+    cli("robot", "add", "chain.urdf", "--no-picture")
+    path = tmp_path / "chain" / "robot.yaml"
+    edited = path.read_text().replace("joint2: 0", "joint2: 0.5")
+    path.write_text(edited)
+    assert Robot.load(str(path)).home[1] == 0.5
+    result = cli("robot", "add", "chain.urdf", "--no-picture")
+    assert result.status == 2 and "edited since it was written" in result.stderr and "--force" in result.stderr
+    assert path.read_text() == edited
+    assert cli("robot", "add", "chain.urdf", "--no-picture", "--force").status == 0
+    assert untouched(path.read_bytes())
+
+
+def test_the_written_command_writes_the_same_again(cli, tmp_path):
+    write_chain(tmp_path)
+    arguments = ["--name", "my arm", "--bodies", "capsule", "--bodies", "link0=convex", "--home", "joint1=0.5",
+                 "--lock", "joint3", "--root", "planar", "--samples", "40", "--seed", "3", "--no-picture"]  # fmt: skip
+    assert cli("robot", "add", "chain.urdf", *arguments).status == 0
+    before = (tmp_path / "my arm" / "robot.yaml").read_text()
+    command = next(line for line in before.splitlines() if line.startswith("# Again: "))
+    words = shlex.split(command.removeprefix("# Again: qpavoid "))
+    again = cli(*words, "--no-picture")
+    assert again.stdout.count("unchanged") == 2
+    robot = Robot.load("my arm/robot.yaml")
+    assert robot.name == "my arm" and (robot.model.nq, robot.model.nv) == (6, 5)
+    assert robot.home[4] == pytest.approx(0.5)
+
+
+def test_the_picture_shows_the_bodies(cli, tmp_path):
+    image = pytest.importorskip("matplotlib.image")
+    write_chain(tmp_path, shape='<box size="0.1 0.1 0.2"/>')
+    cli("robot", "add", "chain.urdf", "--bodies", "capsule")
+    pixels = image.imread(tmp_path / "chain" / "bodies.png")[..., :3]
+    blue = (pixels[..., 2] > pixels[..., 0] + 0.1).mean()
+    assert 0.01 < blue < 0.5
+    cli("robot", "add", "chain.urdf", "--bodies", "convex")
+    pixels = image.imread(tmp_path / "chain" / "bodies.png")[..., :3]
+    legend = (pixels[..., 2] > pixels[..., 0] + 0.1).mean()
+    assert legend < 0.2 * blue
+
+
+def test_an_added_robot_runs_at_once(cli, tmp_path):
+    """From a URDF to a run that stays clear, in two commands and a scenario."""
+    urdf = EXAMPLES / "ur_description/urdf/ur10_robot.urdf"
+    home = [
+        word for j in ("shoulder_lift_joint=-1.57", "elbow_joint=1.57", "wrist_2_joint=-1.57") for word in ("--home", j)
+    ]
+    assert cli("robot", "add", urdf, "--name", "mine", *home, "--no-picture", "--samples", "200").status == 0
+    scenario = {
+        "robot": "mine/robot.yaml",
+        "tasks": [{"frame": "tool0", "type": "position", "motion": {"type": "line", "displacement": [0, 0.3, 0],
+                   "speed": 0.15}}],
+        "obstacles": [{"name": "ball", "shape": {"type": "sphere", "radius": 0.05}, "motion": {"type": "fixed",
+                       "position": None}}],
+        "avoidance": {"d1": 0.02, "d2": 0.1}, "duration": 4.0,
+    }  # fmt: skip
+    robot = Robot.load("mine/robot.yaml")
+    data = robot.model.createData()
+    pin.framesForwardKinematics(robot.model, data, robot.home)
+    tool = data.oMf[robot.frame_id("tool0", "test")].translation
+    scenario["obstacles"][0]["motion"]["position"] = (tool + np.array([0.0, 0.17, -0.02])).tolist()
+    (tmp_path / "scene.yaml").write_text(yaml.safe_dump(scenario))
+    assert simulate(load_scenario("scene.yaml", solver="tracking")).metrics()["collided"]
+    result = json.loads(cli("run", "scene.yaml", "--no-figures", "--json").stdout)
+    at_home = touching(robot, robot.home, 0.02)  # pairs that are nearer than the margin from the start
+    assert not result["collided"] and result["min_distance"] > min([0.02, *(d for _, _, d in at_home)]) - 1e-3
+
+
+# --- robots that ship -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", MADE)
+def test_shipped_robots_are_as_they_were_written_and_ready(name):
+    path = find_robot(name)
+    assert untouched(path.read_bytes()) and untouched((path.parent / f"{name}.srdf").read_bytes())
+    robot = Robot.load(name)
+    assert not touching(robot, robot.home, CLEAR)
+    assert robot.end_effectors and robot.always_touching == ()
+    report = check_robot(name)
+    assert report.usable and not problems(report, "warning")
+
+
+def test_a_shipped_robot_comes_out_the_same_again():
+    """Digits may differ where another machine rounds otherwise."""
+    shipped = read_config(find_robot("ur5"), RobotConfig)
+    home = {name: value for name, value in shipped.home.items() if value}
+    made = describe(EXAMPLES / "ur_description/urdf/ur5_robot.urdf", Wishes(name="ur5", home=home)).config
+    assert made.home == shipped.home and made.end_effectors == shipped.end_effectors
+    assert made.disabled_pairs == shipped.disabled_pairs
+    for mine, theirs in zip(made.bodies, shipped.bodies, strict=True):
+        assert (mine.name, mine.shape.type) == (theirs.name, theirs.shape.type)
+        np.testing.assert_allclose(mine.position, theirs.position, atol=1e-3)
+
+
+SHOWN = {
+    # scenario: what tracking alone runs into
+    "ur5_pole": "the pole",
+    "baxter_cross": "the other arm",
+    "g1_reach_across": "its own body",
+    "tiago_column": "the column",
+}
+
+
+@pytest.mark.parametrize("scenario", SHOWN)
+def test_scenarios_of_shipped_robots_show_avoidance(scenario):
+    """Tracking alone collides; the QP arrives, keeps its margin, and never has to let it go."""
+    config = load_scenario(scenario)
+    assert simulate(load_scenario(scenario, solver="tracking")).metrics()["collided"], SHOWN[scenario]
+    metrics = simulate(config).metrics()
+    assert not metrics["collided"] and metrics["completed"]
+    assert metrics["final_error"] < config.goal_tolerance
+    assert metrics["min_distance"] > config.avoidance.d1 - 1e-3
+    assert metrics["status_counts"]["STOPPED"] == 0
+    assert metrics["relaxed_ticks"] <= 0.02 * math.ceil(config.duration / config.dt)
+
+
+def test_every_shipped_robot_has_a_scenario():
+    used = {yaml.safe_load(path.read_text())["robot"] for path in data_folder("tasks").glob("*.yaml")}
+    assert set(MADE) <= used
