@@ -19,6 +19,9 @@ from qpavoid.motion import Sample
 from qpavoid.problem import Array, IntArray
 from qpavoid.scene import FAR
 
+_PLACES = 3
+"""Into how many stretches a body's axis counts as divided: voxels that face the same one in one direction are alike."""
+
 
 class Slots:
     """The balls of one cloud, for every body that can move."""
@@ -43,7 +46,7 @@ class Slots:
         half = [0.5 * fit.length * fit.rotation[:, 2] for fit in fits]
         self._ends = np.array([[fit.center - h, fit.center + h] for fit, h in zip(fits, half, strict=True)])
         self._radii = np.array([fit.radius for fit in fits]) + self._ball
-        self._spacing = np.maximum(0.5 * (self._radii - self._ball), 2.0 * resolution)
+        self._spacing = np.maximum([fit.length / _PLACES for fit in fits], 2.0 * resolution)
         self._planes = {i: _planes(body) for i, body in enumerate(bodies) if not _is_capsule(body)}
         self._slots = np.full((count, nearest), -1, dtype=np.intp)
         self._kept = np.full((count, nearest), -1, dtype=np.intp)
@@ -58,7 +61,7 @@ class Slots:
         if room > self._room:
             self._room = room
             self._point = np.zeros(room, dtype=np.intp)
-            self._distance, self._witness = np.zeros(room), np.zeros((room, 3))
+            self._distance, self._place = np.zeros(room), np.zeros((room, 4))
 
     @property
     def reach(self) -> float:
@@ -79,7 +82,7 @@ class Slots:
         turned = np.matmul(self._ends, poses[:, :9].reshape(-1, 3, 3)) + poses[:, None, 9:]
         axes = ((turned - pose.position) @ rotation).reshape(-1, 6)
         axes[off] = np.nan
-        found = self._first, self._point, self._distance, self._witness
+        found = self._first, self._point, self._distance, self._place
         kernels.within_reach(axes, self._radii, reach, voxels.centers, voxels.blocks, voxels.starts, *found)
         for body in self._planes:
             if self._first[body] < self._first[body + 1]:

@@ -96,8 +96,8 @@ class PointCloud(Block):
     resolution: Annotated[float, Field(ge=1e-3, le=1.0)] = 0.02
     """Edge of a voxel [m]; balls have a radius of √3/2 of it."""
     nearest: Annotated[int, Field(ge=1, le=32)] = 8
-    """How many points each body of the robot keeps clear of at a time [-]: half of them the nearest ones, the others
-    the nearest that face other parts of the body."""
+    """How many voxels each body of the robot keeps clear of at a time [-]: the nearest at different places of the body,
+    then the nearest in different directions."""
 
 
 Shape = Annotated[Sphere | Capsule | Box | Cylinder | Cone | Ellipsoid, Field(discriminator="type")]

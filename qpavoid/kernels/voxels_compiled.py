@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from qpavoid.kernels.voxels import ALIKE
 from qpavoid.problem import Array, IntArray
 
 compiled = njit(cache=True, fastmath={"reassoc", "contract", "nsz"})
@@ -21,7 +22,7 @@ def within_reach(
     first: IntArray,
     point: IntArray,
     distance: Array,
-    witness: Array,
+    place: Array,
 ) -> None:
     """See `voxels.within_reach`."""
     count = 0
@@ -49,10 +50,9 @@ def within_reach(
                     gap = np.sqrt(gap2)
                     if gap - radii[body] < reach:
                         point[count], distance[count] = i, gap - radii[body]
-                        scale = radii[body] / max(gap, 1e-300)
-                        witness[count, 0] = sx + share * ax + scale * px
-                        witness[count, 1] = sy + share * ay + scale * py
-                        witness[count, 2] = sz + share * az + scale * pz
+                        scale = 1.0 / max(gap, 1e-300)
+                        place[count, 0], place[count, 1] = 2.0 * half * share, scale * px
+                        place[count, 2], place[count, 3] = scale * py, scale * pz
                         count += 1
     first[len(axes)] = count
 
@@ -62,7 +62,7 @@ def choose(
     first: IntArray,
     point: IntArray,
     distance: Array,
-    witness: Array,
+    place: Array,
     spacing: Array,
     keys: IntArray,
     slots: IntArray,
@@ -70,28 +70,33 @@ def choose(
 ) -> None:
     """See `voxels.choose`."""
     bodies, size = slots.shape
-    nearest = (size + 1) // 2
     chosen = np.empty(size, np.intp)
     for body in range(bodies):
         low, high = first[body], first[body + 1]
         count = 0
-        near2 = spacing[body] ** 2
-        for k in range(size):
-            if k == nearest:
-                for c in range(count):
-                    _rule_out(distance, witness, low, high, chosen[c], near2)
+        while count < size:
             best, least = -1, np.inf
-            for i in range(low, high):
-                if distance[i] < least:
-                    best, least = i, distance[i]
+            if count < (size + 1) // 2:
+                for i in range(low, high):
+                    if distance[i] < least:
+                        beside = False
+                        for c in range(count):
+                            beside = beside or abs(place[i, 0] - place[chosen[c], 0]) < spacing[body]
+                        if not beside:
+                            best, least = i, distance[i]
+            if best < 0:
+                for i in range(low, high):
+                    if distance[i] < least:
+                        best, least = i, distance[i]
             if best < 0:
                 break
             chosen[count] = best
             count += 1
-            if k < nearest:
-                distance[best] = np.inf
-            else:
-                _rule_out(distance, witness, low, high, best, near2)
+            for i in range(low, high):
+                dx, dy, dz = (place[i, 1] - place[best, 1], place[i, 2] - place[best, 2], place[i, 3] - place[best, 3])
+                if dx * dx + dy * dy + dz * dz < ALIKE**2 and abs(place[i, 0] - place[best, 0]) < spacing[body]:
+                    distance[i] = np.inf
+            distance[best] = np.inf
         for slot in range(size):
             slots[body, slot] = -1
         for c in range(count):
@@ -109,14 +114,3 @@ def choose(
                 slots[body, slot] = point[chosen[c]]
         for slot in range(size):
             kept[body, slot] = keys[slots[body, slot]] if slots[body, slot] >= 0 else -1
-
-
-@compiled
-def _rule_out(distance: Array, witness: Array, low: int, high: int, one: int, near2: float) -> None:
-    """Leaves out what touches the body close to where one voxel does."""
-    x, y, z = witness[one, 0], witness[one, 1], witness[one, 2]
-    for i in range(low, high):
-        dx, dy, dz = witness[i, 0] - x, witness[i, 1] - y, witness[i, 2] - z
-        if dx * dx + dy * dy + dz * dz < near2:
-            distance[i] = np.inf
-    distance[one] = np.inf
