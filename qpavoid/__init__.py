@@ -3,6 +3,7 @@
 from qpavoid.batch import BatchError, Steps, WorkerDied, Workers, simulate_many, steps
 from qpavoid.cloud import Points, Voxels
 from qpavoid.config import Avoidance, Limits, Progress, ScenarioConfig, Sensing
+from qpavoid.contacts import build_contacts
 from qpavoid.controller import Controller, Tick
 from qpavoid.errors import ConfigError, NumericalError, QpavoidError, SolverNotInstalled, UnknownName
 from qpavoid.loading import load_scenario
@@ -46,6 +47,7 @@ __all__ = [
     "Voxels",
     "WorkerDied",
     "Workers",
+    "build_contacts",
     "build_scene",
     "build_tasks",
     "load_scenario",

@@ -9,14 +9,15 @@ import numpy as np
 from qpavoid import kernels
 from qpavoid.avoidance import row_form
 from qpavoid.config import Avoidance, Limits
+from qpavoid.contacts import ContactRows, tracking_within
 from qpavoid.kernels.layout import RowLayout
-from qpavoid.kinematics import ForwardKinematics, Kinematics, chains, longest_lever, support_masks
+from qpavoid.kinematics import ForwardKinematics, Kinematics, chains, columns, longest_lever, support_masks
 from qpavoid.limits import JointBounds, limit_layout
 from qpavoid.motion import Sample
 from qpavoid.problem import Array, AvoidanceRows, Problem, Proximity, Tracking
 from qpavoid.proximity import DistanceQuery
 from qpavoid.scene import Scene
-from qpavoid.tasks import FrameTask, task_layout
+from qpavoid.tasks import AnyTask, in_order, task_layout, task_levels
 
 
 class Assembly:
@@ -25,7 +26,7 @@ class Assembly:
     def __init__(
         self,
         scene: Scene,
-        tasks: Sequence[FrameTask],
+        tasks: Sequence[AnyTask],
         bounds: JointBounds,
         kinematics: ForwardKinematics,
         query: DistanceQuery,
@@ -33,16 +34,21 @@ class Assembly:
         limits: Limits,
         damping: float,
         dt: float,
+        contacts: ContactRows | None = None,
     ) -> None:
         """Lays the memory out; see `Controller` for the arguments."""
+        frames, self._others = in_order(tasks)
         pairs, nv = len(scene.pairs), scene.robot.model.nv
         self._pairs, self._masks = scene.pairs, support_masks(scene.robot.model)
         turning, sliding = chains(scene.robot.model)
         joint_reach = query.joint_reach()
         self._layout = RowLayout(
             J_world=kinematics.J,
+            columns=columns(scene.robot.model),
+            mimics=scene.robot.model.nvExtended > nv,
+            mimicking=np.zeros(scene.robot.model.nvExtended),
             frame_poses=kinematics.frame_poses,
-            **task_layout(tasks, scene.robot.model),
+            **task_layout(frames, self._others, scene.robot.model),
             results=query.results,
             support=scene.support.copy(),
             twists=query.twists,
@@ -73,7 +79,10 @@ class Assembly:
         self._names = scene.pair_names, tuple(scene.robot.coordinate_names)
         self._targets = [(row[:3], row[3:12].reshape(3, 3), row[12:15], row[15:]) for row in self._layout.targets]
         self._views: dict[int, tuple[Proximity, AvoidanceRows]] = {}
+        levels = task_levels(frames, self._others)
         self._tracking = Tracking(self._layout.A, self._layout.b, damping)
+        self._levels = levels if len(levels) > 1 else ()
+        self._forward, self._contacts = kinematics, contacts
         self._eye = np.eye(nv)
         self.kinematics = Kinematics(self._layout.J_world, self._layout.poses)
 
@@ -84,17 +93,27 @@ class Assembly:
 
         Args:
             q: configuration (nq,).
-            targets: where each task's frame should be now, and how fast.
+            targets: what each task should reach now, in the order of `in_order`.
             query: distances of this tick.
             reach: surface distance below which a pair is near [m].
         """
         x = self._layout
         for views, target in zip(self._targets, targets):  # noqa: B905 (strict costs as much as the copying)
             views[0][:], views[1][:], views[2][:], views[3][:] = target
+        if self._others:
+            for task, target in zip(self._others, targets[len(self._targets) :], strict=True):
+                task.update(q, self._forward, target)
+        held = None
+        if self._contacts is not None:
+            held = self._contacts.update(self._forward)
+            x.v_last[:] = held.held(x.v_last)
         k, worst = kernels.assemble(self._packed, q, query.pairs, reach, query.moving)
         proximity, rows = self._views.get(k) or self._view(k)
+        if held is not None:
+            x.v0[:] = tracking_within(held, x.A, x.b, x.damping)
+            worst = float(kernels.tracking_shortfall(self._packed, k))
         return proximity, Problem(
-            self._tracking, rows, x.lower, x.upper, *self._hard, x.v_stop, *self._names, x.v0, worst
+            self._tracking, rows, x.lower, x.upper, *self._hard, x.v_stop, *self._names, x.v0, worst, held, self._levels
         )
 
     def carry(self, query: DistanceQuery) -> None:
@@ -115,9 +134,9 @@ class Assembly:
     def follow(self, v: Array, problem: Problem) -> Problem:
         """The problem of this tick with the velocity v (nv,) to follow in place of the tasks."""
         x = self._layout
-        x.v0[:] = v
+        x.v0[:] = v if problem.contacts is None else problem.contacts.held(v)
         worst = float(kernels.tracking_shortfall(self._packed, len(problem.avoidance.d)))
-        return problem._replace(tracking=Tracking(self._eye, x.v0, 0.0), shortfall=worst)
+        return problem._replace(tracking=Tracking(self._eye, x.v0, 0.0), shortfall=worst, levels=())
 
     def redirected(self, problem: Problem, frame: int, velocity: Array) -> Problem:
         """The problem of this tick with a velocity (3,) added to the linear one that a task asks for [m/s].
@@ -132,17 +151,23 @@ class Assembly:
         b = x.b.copy()
         x.b[rows] += x.scale[rows] * velocity
         v0 = np.empty_like(x.v0)
-        kernels.damped_solution(self._packed, v0)
-        tracking = Tracking(x.A, x.b.copy(), x.damping)
+        if problem.contacts is None:
+            kernels.damped_solution(self._packed, v0)
+        else:
+            v0[:] = tracking_within(problem.contacts, x.A, x.b, x.damping)
+        tracking = problem.tracking._replace(b=x.b.copy())
         x.b[:] = b
         near = problem.avoidance
         worst = float(kernels.shortfall(v0, near.J, near.b, x.lower, x.upper))
         return problem._replace(tracking=tracking, v0=v0, shortfall=worst)
 
     def fastest_frame(self) -> int:
-        """The task that asks for the largest linear speed."""
+        """The task that asks for the largest linear speed; -1 where no frame has a position to follow."""
         x = self._layout
-        linear = (x.b / x.scale)[: 3 * len(x.targets)].reshape(-1, 3)
+        moving = len(x.scale) - 3 * len(x.turns)
+        if not moving:
+            return -1
+        linear = (x.b[:moving] / x.scale[:moving]).reshape(-1, 3)
         return int(np.argmax(np.linalg.norm(linear, axis=1)))
 
     def wanted_velocity(self, frame: int) -> Array:

@@ -15,7 +15,8 @@ from qpavoid import kernels
 from qpavoid.assembly import Assembly
 from qpavoid.cloud import Points
 from qpavoid.config import Avoidance, Limits, Progress, ScenarioConfig, Sensing
-from qpavoid.errors import NumericalError, UnknownName, located
+from qpavoid.contacts import ContactRows, build_contacts
+from qpavoid.errors import ConfigError, NumericalError, UnknownName, located
 from qpavoid.grasp import Grasps
 from qpavoid.guard import TOLERANCE, Guard
 from qpavoid.kinematics import ForwardKinematics, Kinematics
@@ -27,10 +28,10 @@ from qpavoid.progress import ProgressWatch
 from qpavoid.proximity import DistanceQuery
 from qpavoid.robot import Robot
 from qpavoid.scene import Scene, build_obstacles, build_scene
-from qpavoid.sensing import Obstacles, Pose, as_sample, finite
+from qpavoid.sensing import Obstacles, Pose, finite
 from qpavoid.solvers import Solver, make_solver
 from qpavoid.solvers.qp import Qp
-from qpavoid.tasks import FrameTask, build_tasks
+from qpavoid.tasks import AnyTask, build_tasks, in_order
 
 _log = logging.getLogger(__name__)
 _ABSURD = 1e100
@@ -41,7 +42,10 @@ class Tick(NamedTuple):
     """Everything that one tick computed."""
 
     state: State
-    targets: tuple[Sample, ...]
+    targets: tuple[Any, ...]
+    """One for each of the controller's tasks."""
+    errors: Array
+    """How far each of the tasks that are not frames was from its target, in its unit."""
     kinematics: Kinematics
     proximity: Proximity
     problem: Problem
@@ -54,7 +58,7 @@ class Controller:
     def __init__(
         self,
         scene: Scene,
-        tasks: Sequence[FrameTask],
+        tasks: Sequence[AnyTask],
         solver: Solver | str = "qp",
         dt: float = 0.01,
         avoidance: Avoidance | None = None,
@@ -62,6 +66,7 @@ class Controller:
         tracking_damping: float = 0.01,
         sensing: Sensing | None = None,
         progress: Progress | None = None,
+        contacts: ContactRows | None = None,
     ) -> None:
         """Lays out the memory of the tick.
 
@@ -75,18 +80,29 @@ class Controller:
             tracking_damping: λ of the damped J⁺ [-].
             sensing: what is made of obstacles without news; the defaults of a scenario if left out.
             progress: when a task counts as blocked, and whether a way round is tried; likewise.
+            contacts: frames that rest, see `build_contacts`; none if left out.
 
         Raises:
             UnknownName, SolverNotInstalled: of the solver.
+            ConfigError: there are contacts, and the solver is one that does not hold them.
         """
-        self.scene, self.tasks, self.dt = scene, tuple(tasks), dt
+        frames, others = in_order(tasks)
+        self.scene, self.dt = scene, dt
+        self.tasks: tuple[AnyTask, ...] = (*frames, *others)
+        """Frames with a position to follow, then with an orientation alone, then all other tasks."""
         self.solver: Solver = make_solver(solver) if isinstance(solver, str) else solver
+        if contacts is not None and not getattr(self.solver, "holds_contacts", False):
+            raise ConfigError(f"contacts: {_name(solver)} cannot hold them; use qp or hqp")
         self.avoidance, self.limits = avoidance or Avoidance(), limits or Limits()
         model = scene.robot.model
-        self._kinematics = ForwardKinematics(model, [task.frame_id for task in tasks])
+        more = [i for task in others for i in task.frame_ids] + list(contacts.frame_ids if contacts else ())
+        self._kinematics = ForwardKinematics(model, [*(task.frame_id for task in frames), *more])
         self._query = DistanceQuery(scene)
         self._q_shape, self._v_shape = (model.nq,), (model.nv,)
-        self._frame_index = {task.settings.frame: i for i, task in enumerate(tasks)}
+        self._task_names = {task.settings.label: task for task in self.tasks}
+        self._others = others
+        if len(self._task_names) < len(self.tasks):
+            raise ConfigError(f"tasks: two have the same name among {', '.join(self._task_names)}; give one a `name`")
         self._obstacles = Obstacles(scene.obstacles, sensing or Sensing(), dt)
         self._progress = ProgressWatch(progress or Progress(), dt, scene.pair_names)
         self._reach = self.avoidance.d2 - self.avoidance.offset
@@ -94,7 +110,7 @@ class Controller:
         self._q_last = scene.robot.home.copy()
         self._assembly = Assembly(
             scene, self.tasks, self._bounds, self._kinematics, self._query, self.avoidance,
-            self.limits, tracking_damping, dt,
+            self.limits, tracking_damping, dt, contacts,
         )  # fmt: skip
         self._guard = Guard(
             scene, self._kinematics, self._bounds, self.limits.position_gain,
@@ -133,17 +149,21 @@ class Controller:
         obstacles = build_obstacles(scenario.obstacles, source)
         with located(str(source)):
             scene = build_scene(robot, obstacles)
-        controller = cls(
-            scene,
-            build_tasks(scenario.tasks, robot, q0, source),
-            solver,
-            scenario.dt,
-            scenario.avoidance,
-            scenario.limits,
-            scenario.tracking_damping,
-            scenario.sensing,
-            scenario.progress,
-        )
+        tasks = build_tasks(scenario.tasks, robot, q0, source)
+        contacts = build_contacts(scenario.contacts, robot, q0, source)
+        with located(str(source)):
+            controller = cls(
+                scene,
+                tasks,
+                solver,
+                scenario.dt,
+                scenario.avoidance,
+                scenario.limits,
+                scenario.tracking_damping,
+                scenario.sensing,
+                scenario.progress,
+                contacts,
+            )
         for c in scenario.obstacles:
             if c.carried_by is not None:
                 with located(f"{source}: obstacles: {c.name!r}: carried_by"):
@@ -154,7 +174,7 @@ class Controller:
         self,
         q: Array,
         t: float = 0.0,
-        targets: Mapping[str, Sample] | None = None,
+        targets: Mapping[str, Any] | None = None,
         obstacles: Mapping[str, Sample | Pose | Points] | None = None,
         v: Array | None = None,
     ) -> Solution:
@@ -167,7 +187,9 @@ class Controller:
         Args:
             q: configuration (nq,) as measured.
             t: time [s] at which motions are evaluated.
-            targets: where frames should be now, by frame name, in place of their motion.
+            targets: what tasks should reach now, by their names, in place of their motion: a `Sample` for what is
+                somewhere (frames, a relative pose, the centre of mass, a point to look at), a configuration (nq,) for a
+                posture, a direction (3,) for an axis. A frame's task has the frame's name unless it was given one.
             obstacles: where obstacles are now, and how they move if that is known, by name, in place of their motion.
             v: velocity (nv,) as measured, from which acceleration limits count; the last command if left out.
 
@@ -181,7 +203,7 @@ class Controller:
         self,
         q: Array,
         t: float = 0.0,
-        targets: Mapping[str, Sample] | None = None,
+        targets: Mapping[str, Any] | None = None,
         obstacles: Mapping[str, Sample | Pose | Points] | None = None,
         v: Array | None = None,
     ) -> Tick:
@@ -189,7 +211,8 @@ class Controller:
         samples, proximity, problem, solution = self._compute(q, t, targets, obstacles, v)
         state = State(np.array(q, dtype=np.float64), solution.v, t)
         kinematics = _copied(self._assembly.kinematics)
-        return Tick(state, samples, kinematics, _copied(proximity), _copied(problem), solution)
+        errors = np.array([task.error for task in self._others])
+        return Tick(state, samples, errors, kinematics, _copied(proximity), _copied(problem), solution)
 
     def filter(
         self,
@@ -293,11 +316,11 @@ class Controller:
         self,
         q: Array,
         t: float,
-        targets: Mapping[str, Sample] | None,
+        targets: Mapping[str, Any] | None,
         obstacles: Mapping[str, Sample | Pose | Points] | None,
         v: Array | None,
         desired: Array | None = None,
-    ) -> tuple[tuple[Sample, ...], Proximity, Problem, Solution]:
+    ) -> tuple[tuple[Any, ...], Proximity, Problem, Solution]:
         begin = perf_counter()
         q = as_vector("q", q, self._q_shape)
         faults: tuple[str, ...] = ()
@@ -397,15 +420,23 @@ class Controller:
         """Where the robot is if it did what it was told last (nq,)."""
         return np.asarray(pin.integrate(self.scene.robot.model, self._q_last, self.dt * self._assembly.v_last))
 
-    def _targets(self, t: float, given: Mapping[str, Sample] | None) -> tuple[Sample, ...]:
+    def _targets(self, t: float, given: Mapping[str, Any] | None) -> tuple[Any, ...]:
         if not given:
             return tuple([task.motion.sample(t) for task in self.tasks])
         checked = {}
-        for frame, sample in given.items():
-            if frame not in self._frame_index:
-                raise UnknownName(f"no target {frame!r}{nearest(frame, self._frame_index)}")
-            checked[frame] = as_sample(f"target {frame!r}", sample)
-        return tuple([checked.get(task.settings.frame) or task.motion.sample(t) for task in self.tasks])
+        for name, target in given.items():
+            if name not in self._task_names:
+                raise UnknownName(f"no target {name!r}{nearest(name, self._task_names)}")
+            checked[name] = self._task_names[name].as_target(f"target {name!r}", target)
+        return tuple(
+            [checked[name] if name in checked else task.motion.sample(t) for name, task in self._task_names.items()]
+        )
+
+
+def _name(solver: Solver | str) -> str:
+    if isinstance(solver, str):
+        return f"solver {solver!r}"
+    return f"solver {solver.config.name!r}" if hasattr(solver, "config") else f"the solver {type(solver).__name__}"
 
 
 def _stop(problem: Problem, reasons: tuple[str, ...]) -> Solution:

@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid.memory import read_poses, read_velocities, view_poses, view_velocities
-from qpavoid.problem import Array
+from qpavoid.problem import Array, IntArray
 
 TRANSLATIONS = {
     "JointModelPX": 1,
@@ -21,14 +21,17 @@ TRANSLATIONS = {
     "JointModelFreeFlyer": 3,
 }
 """How many velocity coordinates of a joint are lengths; they come before its angles."""
+MIMIC = "JointModelMimic"
+"""A joint that another joint's coordinate moves, at a constant ratio; it has none of its own."""
 
 
 class Kinematics(NamedTuple):
     """Where the tracked frames are, and how everything moves with v, until the next tick overwrites it."""
 
     J: Array
-    """(6, nv) world Jacobian: column j is the twist of joint j [linear velocity of the body point at the world
-    origin; angular velocity], for every joint of the robot."""
+    """(6, e) world Jacobian: column j is the twist of joint j [linear velocity of the body point at the world
+    origin; angular velocity], for every joint of the robot. e = nv, and one more for each joint that mimics another
+    one: its column is moved by the other's coordinate, see `columns`."""
     poses: Array
     """(f, 12) world poses of the tracked frames: rotation by columns, then position [m]."""
 
@@ -59,8 +62,8 @@ class ForwardKinematics:
         pin.forwardKinematics(model, self.data, pin.neutral(model), np.arange(1.0, 1.0 + model.nv))
         view, motions = view_poses(self.data.oMf), view_velocities(self.data.v)
         self._copy, self._copy_velocities = view is None, motions is None
-        self.J: Array = self.data.J.reshape(6, model.nv, order="F")  # of one joint, it comes as a vector
-        """(6, nv) see `Kinematics.J`."""
+        self.J: Array = self.data.J.reshape(6, model.nvExtended, order="F")  # of one joint, it comes as a vector
+        """(6, e) see `Kinematics.J`."""
         self.frame_poses: Array = read_poses(self.data.oMf) if view is None else view
         """(frames, 12) world poses of all frames; only those of `frame_ids` are kept up to date."""
 
@@ -83,14 +86,40 @@ class ForwardKinematics:
             self.joint_velocities[:] = read_velocities(self.data.v)
 
 
-def chains(model: Any) -> tuple[Array, Array]:
-    """Which angles, and which lengths, move the end of each chain of joints: twice (chains, nv), 0 or 1."""
-    turns = np.ones(model.nv)
+def columns(model: Any) -> IntArray:
+    """Which velocity coordinate moves each of the e columns of the world Jacobian (e,)."""
+    index = np.zeros(model.nvExtended, dtype=np.intp)
     for joint in list(model.joints)[1:]:
-        turns[joint.idx_v : joint.idx_v + TRANSLATIONS.get(joint.shortname(), 0)] = 0.0
+        width = joint.nvExtended
+        index[joint.idx_vExtended : joint.idx_vExtended + width] = np.arange(joint.idx_v, joint.idx_v + width)
+    return index
+
+
+def chains(model: Any) -> tuple[Array, Array]:
+    """How far each coordinate turns, and slides, the end of each chain of joints: twice (chains, nv).
+
+    One angle or length of a chain for each coordinate, as a rule; more where a joint mimics another one.
+    """
+    turns, rates = np.ones(model.nvExtended), np.ones(model.nvExtended)
+    for i, joint in enumerate(list(model.joints)[1:], start=1):
+        start = joint.idx_vExtended
+        turns[start : start + lengths(model, i)] = 0.0
+        if joint.shortname() == MIMIC:
+            rates[start] = abs(joint.extract().scaling)
     ends = np.setdiff1d(np.arange(1, model.njoints), list(model.parents))
+    fold = rates[:, None] * np.eye(model.nv)[columns(model)]
     support = support_masks(model)[ends]
-    return support * turns, support * (1.0 - turns)
+    return (support * turns) @ fold, (support * (1.0 - turns)) @ fold
+
+
+def lengths(model: Any, joint: int) -> int:
+    """How many of the velocity coordinates of a joint are lengths; they come before its angles."""
+    name = model.joints[joint].shortname()
+    if name != MIMIC:
+        return TRANSLATIONS.get(name, 0)
+    data = model.createData()
+    pin.computeJointJacobians(model, data, pin.neutral(model))
+    return int(not data.J.reshape(6, -1, order="F")[3:, model.joints[joint].idx_vExtended].any())
 
 
 def longest_lever(model: Any, joint_reach: Array) -> float:
@@ -107,20 +136,22 @@ def longest_lever(model: Any, joint_reach: Array) -> float:
     turned = np.zeros(model.njoints, dtype=bool)
     lower, upper = np.abs(model.lowerPositionLimit), np.abs(model.upperPositionLimit)
     for i, joint in enumerate(list(model.joints)[1:], start=1):
-        parent, slides = model.parents[i], TRANSLATIONS.get(joint.shortname(), 0)
+        parent, slides = model.parents[i], lengths(model, i)
         if turned[parent]:
             slid = slice(joint.idx_q, joint.idx_q + slides)
             slide = float(np.maximum(lower[slid], upper[slid]).sum())
+            if slides and joint.shortname() == MIMIC:
+                slide = abs(joint.extract().scaling) * slide + abs(joint.extract().offset)
             lever[i] = lever[parent] + float(np.linalg.norm(model.jointPlacements[i].translation)) + slide
-        turned[i] = turned[parent] or joint.nv > slides
+        turned[i] = turned[parent] or joint.nvExtended > slides
     return float(np.max((lever + joint_reach)[turned], initial=0.0))
 
 
 def support_masks(model: Any) -> Array:
-    """Which velocity coordinates move which joint: (njoints, nv) of 0 and 1, row 0 (the world) all 0."""
-    mask = np.zeros((model.njoints, model.nv))
+    """Which columns of the world Jacobian move which joint: (njoints, e) of 0 and 1, row 0 (the world) all 0."""
+    mask = np.zeros((model.njoints, model.nvExtended))
     for joint in range(1, model.njoints):
         for ancestor in list(model.supports[joint])[1:]:  # without the world, which supports everything
-            start, width = model.joints[ancestor].idx_v, model.joints[ancestor].nv
+            start, width = model.joints[ancestor].idx_vExtended, model.joints[ancestor].nvExtended
             mask[joint, start : start + width] = 1.0
     return mask

@@ -278,4 +278,4 @@ def _blocks(annotation: Any) -> list[type[BaseModel]]:
 def _tags(block: type[BaseModel]) -> set[str]:
     """Names by which a block is chosen from a union: its literal `type` or `name`."""
     fields = [block.model_fields[key] for key in ("type", "name") if key in block.model_fields]
-    return {tag for field in fields for tag in typing.get_args(field.annotation)}
+    return {tag for field in fields for tag in typing.get_args(field.annotation) if isinstance(tag, str)}

@@ -20,12 +20,13 @@ from qpavoid.problem import Array, IntArray, Status
 
 STATUSES = tuple(Status)
 """Status of each code in `Log.status`."""
-_FORMAT = 2
+_FORMAT = 3
 _LARGEST = 2_000_000_000
 """What a log may take in memory [bytes]; a small file can unpack to a thousand times its size."""
 _SHAPES = {
     "t": "N", "q": "N nq", "v": "N nv",
     "target": "N k 3", "tool": "N k 3", "tool_rotation": "N k 3 3", "turn_error": "N k",
+    "task_error": "N s",
     "body_distance": "N b", "closest_pair": "N", "alpha": "N", "beta": "N", "status": "N",
     "slack": "N", "saturation": "N", "build_time": "N", "solve_time": "N", "share": "N", "blocked": "N",
     "body_ends": "N b 2 3", "obstacle_position": "N o 3", "obstacle_rotation": "N o 3 3",
@@ -38,7 +39,7 @@ _META = {"scenario": str, "solver": str, "completed": bool, "pairs": list, "conf
 
 @dataclass(frozen=True)
 class Log:
-    """Arrays of a run with N ticks; n joints, k tasks, b bodies, o obstacles.
+    """Arrays of a run with N ticks; n joints, k frames that follow motions, s other tasks, b bodies, o obstacles.
 
     Distances are between surfaces [m]. Everything is in world axes and SI units.
     """
@@ -50,13 +51,15 @@ class Log:
     v: Array
     """(N, nv) commanded velocity [rad/s or m/s]."""
     target: Array
-    """(N, k, 3) where each task's frame should be [m]."""
+    """(N, k, 3) where each task's frame should be [m]; where it is, if only its orientation counts."""
     tool: Array
     """(N, k, 3) where it is [m]."""
     tool_rotation: Array
     """(N, k, 3, 3) orientation of each task's frame."""
     turn_error: Array
     """(N, k) angle between target and frame [rad]; 0 for position tasks."""
+    task_error: Array
+    """(N, s) how far each other task is from its target, in its unit; see `meta["tasks"]`."""
     body_distance: Array
     """(N, b) distance of each body to the nearest thing that it is paired with [m]; inf where there is none."""
     closest_pair: IntArray

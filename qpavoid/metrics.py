@@ -21,8 +21,8 @@ def run_metrics(log: Log) -> dict[str, Any]:
     """The figures by which runs are compared.
 
     Returns:
-        scenario, solver; completed: ran for its whole duration; arrived: so it did, and every task
-        ended within the goal tolerance;
+        scenario, solver; completed: ran for its whole duration; arrived: so it did, and every task that is measured in
+        metres ended within the goal tolerance; task_errors: of tasks that are not frames, [error, unit] at the end;
         collided; min_distance: surface to surface [m], None where nothing is paired; min_pair: names of that pair;
         time_in_collision [s]; time_below: threshold -> [s]; final_error [m]; max_deviation: largest distance of a tool
         from its planned path [m]; tracking_rmse: of the distance to the moving target [m]; peak_velocity: fastest
@@ -38,7 +38,13 @@ def run_metrics(log: Log) -> dict[str, Any]:
     statuses = [status.value for status in Status]
     counts = {name: int(np.sum(log.status == code)) for code, name in enumerate(statuses)}
     tick_us = 1e6 * (log.build_time + log.solve_time)
-    final_error = float(np.max(error[-1])) if len(error) else float("nan")
+    others = {
+        name: [float(log.task_error[-1, i]), unit]
+        for i, (name, unit) in enumerate(log.meta.get("tasks", []))
+        if len(log.task_error)
+    }
+    metres = [value for value, unit in others.values() if unit == "m"]
+    final_error = float(np.max([*error[-1], *metres])) if len(error) and (error.shape[1] or metres) else float("nan")
     return {
         "scenario": log.meta["scenario"],
         "solver": log.meta["solver"],
@@ -50,6 +56,7 @@ def run_metrics(log: Log) -> dict[str, Any]:
         "time_in_collision": dt * float(np.sum(distance < 0.0)),
         "time_below": {str(limit): dt * float(np.sum(distance < limit)) for limit in config["thresholds"]},
         "final_error": final_error,
+        "task_errors": others,
         "max_deviation": float(np.max(path_deviation(log), initial=0.0)),
         "tracking_rmse": float(np.sqrt(np.mean(error**2))) if error.size else float("nan"),
         "peak_velocity": float(np.max(np.abs(log.v), initial=0.0)),

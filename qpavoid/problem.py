@@ -87,6 +87,29 @@ class Tracking(NamedTuple):
     """λ of the damped J⁺, the same for every solver [-]."""
 
 
+class Contacts(NamedTuple):
+    """Rows J v = b of the frames that rest, which come before everything else, solved: v = rest + Z w."""
+
+    Z: Array
+    """(nv, n) orthonormal basis of the velocities with which no contact moves."""
+    rest: Array
+    """(nv,) the least velocity with J v = b: zero but for what frames have slid."""
+    J: Array
+    """(c, nv)."""
+    b: Array
+    """(c,) [m/s, rad/s]."""
+
+    def held(self, v: Array) -> Array:
+        """The velocity (nv,) closest to v that holds the contacts; v itself where it does."""
+        if np.abs(self.J @ v - self.b).max() <= HELD:
+            return v
+        return np.asarray(self.rest + self.Z @ (self.Z.T @ v))
+
+
+HELD = 1e-6
+"""Velocity of a contact up to which it counts as held [m/s, rad/s]."""
+
+
 class AvoidanceRows(NamedTuple):
     """Rows J v >= b for the k pairs within the influence distance.
 
@@ -132,6 +155,10 @@ class Problem(NamedTuple):
     """(nv,) J⁺ẋ, the tracking law's velocity; NaN where λ is 0 and rows repeat each other."""
     shortfall: float
     """By how much v0 violates the worst row or bound [m/s, rad/s]; not positive where it is safe, NaN with v0."""
+    contacts: Contacts | None = None
+    """What holds the contacts, where there are any; v0 does."""
+    levels: tuple[IntArray, ...] = ()
+    """Which rows of `tracking` belong to each priority, the first one first; empty where all have the same."""
 
 
 def make_problem(

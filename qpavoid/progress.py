@@ -134,6 +134,8 @@ class ProgressWatch:
             return None
         n = proximity.normal[row[0]]
         frame = assembly.fastest_frame()
+        if frame < 0:
+            return None
         across = np.cross(n, np.eye(3)[np.argmin(np.abs(n))])
         across /= np.linalg.norm(across)
         best, axis = -np.inf, across

@@ -15,7 +15,7 @@ import pinocchio as pin
 from qpavoid.bodies import MeshWarning, check_meshes, convert_bodies, make_shape, triangle_meshes
 from qpavoid.config import Body, Hull, RobotConfig
 from qpavoid.errors import ConfigError, UnknownName
-from qpavoid.kinematics import TRANSLATIONS
+from qpavoid.kinematics import MIMIC, TRANSLATIONS
 from qpavoid.limits import JointBounds
 from qpavoid.loading import find_robot, nearest, read_config, validate
 from qpavoid.motion import rpy_to_matrix
@@ -167,16 +167,25 @@ class Robot:
         Raises:
             UnknownName: a pattern without a joint.
         """
-        locked = []
+        locked = self.matching(patterns, where)
+        if not locked:
+            return self, q
+        model, bodies, index = _reduce(self.model, self.bodies, locked, q, where)
+        return replace(self, model=model, bodies=bodies, home=self.home[index]), q[index]
+
+    def matching(self, patterns: Sequence[str], where: str) -> list[str]:
+        """Joints whose names match one of some patterns, in their order; `*` and `?` match as in file names.
+
+        Raises:
+            UnknownName: a pattern without a joint.
+        """
+        matched = []
         for pattern in patterns:
             found = [name for name in self.joint_names if fnmatchcase(name, pattern)]
             if not found:
                 raise UnknownName(f"{where}: {self.name} has no joint {pattern!r}{nearest(pattern, self.joint_names)}")
-            locked += [name for name in found if name not in locked]
-        if not locked:
-            return self, q
-        model, bodies, index = _reduce(self.model, self.bodies, locked, q)
-        return replace(self, model=model, bodies=bodies, home=self.home[index]), q[index]
+            matched += [name for name in found if name not in matched]
+        return matched
 
     def _joints(self) -> Iterator[tuple[str, Any]]:
         return zip(self.joint_names, list(self.model.joints)[1:], strict=True)
@@ -244,7 +253,7 @@ def _build(config: RobotConfig, path: Path) -> Robot:
     home = _set_joints(model, middle(model), config.home, f"{path}: home")
     home = _set_joints(model, home, config.lock, f"{path}: lock")
     if config.lock:
-        model, bodies, index = _reduce(model, bodies, list(config.lock), home)
+        model, bodies, index = _reduce(model, bodies, list(config.lock), home, f"{path}: lock")
         home = home[index]
     if model.nv == 0:
         raise ConfigError(f"{path}: no joint of {urdf.name} moves; give at least one that is neither fixed nor locked")
@@ -317,13 +326,15 @@ def _in_link(body: Any, model: Any) -> Any:
 def _apply_limits(config: RobotConfig, model: Any, path: Path) -> None:
     lower, upper = np.array(model.lowerPositionLimit), np.array(model.upperPositionLimit)
     velocity = np.array(model.velocityLimit)
+    for kind in ("position", "velocity", "acceleration"):
+        for name in getattr(config.limits, kind):
+            if _joint(model, name, f"{path}: limits.{kind}").shortname() == MIMIC:
+                raise ConfigError(f"{path}: limits.{kind}: {_follows(model, name)}; limit that one")
     for name, (low, high) in config.limits.position.items():
         joint = _joint(model, name, f"{path}: limits.position")
         if joint.nq != 1:
             raise ConfigError(f"{path}: limits.position: joint {name!r} turns all the way round; leave it out")
         lower[joint.idx_q], upper[joint.idx_q] = low, high
-    for name in config.limits.acceleration:
-        _joint(model, name, f"{path}: limits.acceleration")
     for name, speed in config.limits.velocity.items():
         joint = _joint(model, name, f"{path}: limits.velocity")
         velocity[joint.idx_v : joint.idx_v + joint.nv] = speed
@@ -349,20 +360,43 @@ def middle(model: Any) -> Array:
 
 def _set_joints(model: Any, q: Array, values: Mapping[str, float], where: str) -> Array:
     q = q.copy()
+    mimics = [name for name in values if _joint(model, name, where).shortname() == MIMIC]
     for name, value in values.items():
-        joint = _joint(model, name, where)
+        joint = model.joints[model.getJointId(name)]
+        if name in mimics:
+            continue
         if joint.nq == 1:
             q[joint.idx_q] = value
         elif joint.nq == 2 and joint.nv == 1:
             q[joint.idx_q : joint.idx_q + 2] = np.cos(value), np.sin(value)
         else:
             raise ConfigError(f"{where}: joint {name!r} has {joint.nq} coordinates; give q0 as a list of all of q")
+    for name in mimics:
+        joint = model.joints[model.getJointId(name)]
+        there = joint.extract().scaling * q[joint.idx_q] + joint.extract().offset
+        if abs(values[name] - there) > _SAME:
+            raise ConfigError(f"{where}: {_follows(model, name)}, to {there:g} and not {values[name]:g}; leave it out")
     return q
 
 
-def _reduce(model: Any, bodies: Any, locked: Sequence[str], q: Array) -> tuple[Any, Any, IntArray]:
+_SAME = 1e-6
+"""How far a joint may be given from where the one that it mimics takes it [rad or m]."""
+
+
+def _follows(model: Any, name: str) -> str:
+    mimicking, mimicked = list(model.mimicking_joints), list(model.mimicked_joints)
+    leader = mimicked[mimicking.index(model.getJointId(name))]
+    return f"joint {name!r} follows {model.names[leader]!r} (mimic)"
+
+
+def _reduce(model: Any, bodies: Any, locked: Sequence[str], q: Array, where: str) -> tuple[Any, Any, IntArray]:
     """Model and bodies without the locked joints, and which coordinates of q are left."""
-    ids = [_joint(model, name, "lock").id for name in locked]
+    ids = [_joint(model, name, where).id for name in locked]
+    for joint, leader in zip(list(model.mimicking_joints), list(model.mimicked_joints), strict=True):
+        if leader in ids and joint not in ids:
+            ids.append(joint)
+        elif joint in ids and leader not in ids:
+            raise ConfigError(f"{where}: {_follows(model, model.names[joint])}; lock that one")
     kept = [joint for joint in list(model.joints)[1:] if joint.id not in ids]
     index = np.array([i for joint in kept for i in range(joint.idx_q, joint.idx_q + joint.nq)], dtype=np.intp)
     model, bodies = pin.buildReducedModel(model, bodies, ids, q)

@@ -239,6 +239,6 @@ def as_sample(name: str, what: Any) -> Any:
     return type(what)(*parts)
 
 
-def finite(what: Sample | Pose) -> bool:
+def finite(what: Any) -> bool:
     """Whether all its numbers are finite."""
     return isfinite(sum(float(np.vdot(part, part)) for part in what))

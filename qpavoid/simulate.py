@@ -21,6 +21,7 @@ from qpavoid.proximity import DistanceQuery
 from qpavoid.scene import FAR, Scene
 from qpavoid.solids import drawn_triangles
 from qpavoid.solvers import parse_solver
+from qpavoid.tasks import in_order
 
 _MOST_EVENTS = 1000
 """Number of events that a log keeps."""
@@ -101,14 +102,16 @@ class Recorder:
     def __init__(self, controller: Controller, scenario: ScenarioConfig, ticks: int) -> None:
         """Lays the arrays out for at most `ticks` ticks."""
         scene, model = controller.scene, controller.scene.robot.model
-        self._scene, self._scenario, self._tasks = scene, scenario, controller.tasks
+        self._scene, self._scenario = scene, scenario
+        self._frames, self._others = in_order(controller.tasks)
         self._controller = controller
         self._data, self._query = model.createData(), DistanceQuery(scene)  # distances of all pairs, near or not
         self._ends, self._radii = _drawing_axes(scene.robot.bodies)
-        tasks, bodies, obstacles = len(controller.tasks), len(scene.body_names), len(scene.obstacles)
+        tasks, bodies, obstacles = len(self._frames), len(scene.body_names), len(scene.obstacles)
         shapes: dict[str, tuple[int, ...]] = {
             "t": (), "q": (model.nq,), "v": (model.nv,),
             "target": (tasks, 3), "tool": (tasks, 3), "tool_rotation": (tasks, 3, 3), "turn_error": (tasks,),
+            "task_error": (len(self._others),),
             "body_distance": (bodies,), "alpha": (), "beta": (), "slack": (), "share": (), "saturation": (),
             "build_time": (), "solve_time": (),
             "body_ends": (bodies, 2, 3), "obstacle_position": (obstacles, 3), "obstacle_rotation": (obstacles, 3, 3),
@@ -127,10 +130,11 @@ class Recorder:
         scalars = {name: array for name, array in self._arrays.items() if array.ndim == 1}
         state, solution, rows_avoid = tick.state, tick.solution, tick.problem.avoidance
         rows["q"][:], rows["v"][:] = state.q, solution.v
-        rows["target"][:] = [target.position for target in tick.targets]
         rows["tool"][:], rows["tool_rotation"][:] = tick.kinematics.position, tick.kinematics.rotation
-        for i, (task, target) in enumerate(zip(self._tasks, tick.targets, strict=True)):
-            if task.settings.type == "pose":
+        rows["task_error"][:] = tick.errors
+        for i, (task, target) in enumerate(zip(self._frames, tick.targets, strict=False)):
+            rows["target"][i] = target.position if task.moves else rows["tool"][i]
+            if task.turns:
                 error = pin.log3(target.rotation @ tick.kinematics.rotation[i].T)
                 rows["turn_error"][i] = np.linalg.norm(error)
         self._write_bodies(tick, rows)
@@ -219,7 +223,8 @@ class Recorder:
                 [robot.coordinate_names[v], lower, upper]
                 for v, lower, upper in zip(bounds.v_index, bounds.lower.tolist(), bounds.upper.tolist(), strict=True)
             ],
-            "frames": [task.settings.frame for task in self._tasks],
+            "frames": [task.settings.label for task in self._frames],
+            "tasks": [[task.settings.label, task.unit] for task in self._others],
             "bodies": scene.body_names,
             "body_radii": self._radii,
             "obstacles": [_described(scene, i) for i in range(len(scene.obstacles))],

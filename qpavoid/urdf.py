@@ -18,6 +18,11 @@ from qpavoid.loading import EXAMPLES, example_robot, example_robot_data
 from qpavoid.safe_xml import read_robot_xml
 from qpavoid.urdf_check import check_mjcf, check_urdf
 
+
+class MimicWarning(UserWarning):
+    """Joints that should follow others do not: lock them."""
+
+
 _ROOT_JOINTS = {
     "fixed": lambda: None,
     "planar": pin.JointModelPlanar,
@@ -68,6 +73,10 @@ def is_mjcf(path: Path) -> bool:
 def read_model(urdf: Path, root_joint: str) -> Any:
     """Pinocchio model of a URDF or MJCF.
 
+    Joints that mimic another one have no coordinate of their own. Where Pinocchio cannot read them so (they come before
+    the other one in the tree, or turn all the way round where that has limits), they move on their own, with a
+    `MimicWarning`.
+
     Args:
         urdf: the file.
         root_joint: `fixed`, `planar` or `free_flyer`.
@@ -83,11 +92,26 @@ def read_model(urdf: Path, root_joint: str) -> Any:
                 check_mjcf(urdf)
                 return _model_of_mjcf(urdf, root)
             check_urdf(urdf)
-            return pin.buildModelFromUrdf(str(urdf), *([] if root is None else [root]))
+            return _model_of_urdf(urdf, root)
         except (ValueError, RuntimeError, IndexError) as error:
             reason = _reason(error)
     first = next((line.split(":", 1)[1].strip() for line in printed if line.startswith("Error:")), "")
     raise ConfigError(f"{urdf}: not a usable {kind}: {first or reason}")
+
+
+def _model_of_urdf(urdf: Path, root: Any) -> Any:
+    arguments = (str(urdf),) if root is None else (str(urdf), root)
+    try:
+        return pin.buildModelFromUrdf(*arguments, mimic=True)
+    except (ValueError, RuntimeError) as error:
+        reason = _reason(error)
+    model = pin.buildModelFromUrdf(*arguments, mimic=False)
+    warnings.warn(
+        f"{urdf}: joints that mimic others move on their own, and should be locked: {reason[-120:]}",
+        MimicWarning,
+        stacklevel=6,
+    )
+    return model
 
 
 def _model_of_mjcf(mjcf: Path, root: Any) -> Any:

@@ -17,6 +17,7 @@ from qpavoid.kinematics import ForwardKinematics
 from qpavoid.loading import example_robot_data
 from qpavoid.motion import build_motion
 from qpavoid.proximity import DistanceQuery
+from qpavoid.tasks import in_order
 
 settings.register_profile("patient", deadline=None)  # the first call of a compiled function may wait for the compiler
 settings.load_profile("patient")
@@ -117,7 +118,10 @@ class Bench:
 
     def __init__(self, scene, tasks=(), avoidance=None, position_gain=0.5, damping=0.0, dt=0.01, query=None):
         self.robot, self.tasks = scene.robot, tuple(tasks)
-        self.kinematics = ForwardKinematics(scene.robot.model, [task.frame_id for task in tasks])
+        self.kinematics = ForwardKinematics(
+            scene.robot.model,
+            [i for task in tasks for i in (task.frame_ids if hasattr(task, "frame_ids") else (task.frame_id,))],
+        )
         self.query = query or DistanceQuery(scene)
         self.assembly = Assembly(
             scene, tasks, scene.robot.bounds(), self.kinematics, self.query, avoidance or config.Avoidance(),
@@ -128,7 +132,7 @@ class Bench:
         """Proximity and problem at q, as they are until the next call."""
         self.kinematics.compute(q)
         self.query.compute(self.kinematics.data, reach)
-        targets = targets or [task.motion.sample(0.0) for task in self.tasks]
+        targets = targets or [task.motion.sample(0.0) for part in in_order(self.tasks) for task in part]
         return self.assembly.compute(np.asarray(q), targets, self.query, reach)
 
 
@@ -140,7 +144,8 @@ def make_layout(nv, frames=0, turns=(), pairs=0, obstacles=0, joints=1, **fields
     screws[3 * frames :, 3:] = np.tile(np.eye(3), (len(turns), 1))
     none = np.zeros(0, dtype=np.intp)
     inputs = {
-        "J_world": np.zeros((6, nv), order="F"), "frame_poses": np.zeros((frames, 12)),
+        "J_world": np.zeros((6, nv), order="F"), "columns": np.arange(nv), "mimics": False, "mimicking": np.zeros(nv),
+        "frame_poses": np.zeros((frames, 12)),
         "frame_ids": np.arange(frames), "targets": np.zeros((frames, 18)), "turns": np.array(turns, dtype=np.intp),
         "gain": np.ones(frames), "cap": np.full(frames + len(turns), np.inf), "scale": np.ones(rows),
         "task_support": np.ones((rows, nv)), "screws": screws, "results": np.zeros((pairs, 10)),

@@ -232,8 +232,8 @@ def test_robots_of_capsules_enclose_their_convex_hulls(panda, panda_convex):
         data = bodies.createData()
         q = pin.neutral(model)
         q[:7] = panda.home
-        if model.nq == 9:
-            q[7:] = 0.04  # the fingers are locked there in the other model
+        if model.nq == 8:
+            q[7] = 0.04  # the fingers are locked there in the other model; the second one mimics the first
         pin.updateGeometryPlacements(model, model.createData(), bodies, data, q)
         pin.computeDistances(bodies, data)
         names = [b.name for b in bodies.geometryObjects]

@@ -187,7 +187,7 @@ def test_key_that_resembles_nothing_gets_the_list_of_the_block_it_is_in(load):
         ("obstacles.0.shape.type", "spher", "obstacles.0.shape: unknown type 'spher'; did you mean 'sphere'?"),
         ("avoidance.row.type", "dampr", "avoidance.row: unknown type 'dampr'; did you mean 'damper'?"),
         ("avoidance.row", {"gain": 3}, "avoidance.row: `type` is missing; valid are cbf, damper, switching"),
-        ("solver", {"backend": "osqp"}, "solver: `name` is missing; valid are eq10, eq10-literal, qp, tracking"),
+        ("solver", {"backend": "osqp"}, "solver: `name` is missing; valid are eq10, eq10-literal, hqp, qp, tracking"),
         ("solver", "eq10:daqp", "solver.backend: unknown key; valid are alpha_cap, damping, name, retreat_speed"),
     ],
 )
@@ -287,7 +287,7 @@ def test_obstacle_without_a_place(load, motion, missing):
 
 @pytest.mark.parametrize(
     ("path", "told"),
-    [("obstacles", "obstacle 'fist' is given twice"), ("tasks", "task frame 'left_tool' is given twice")],
+    [("obstacles", "obstacle 'fist' is given twice"), ("tasks", "task 'left_tool' is given twice")],
 )
 def test_names_must_differ(load, path, told):
     with pytest.raises(ConfigError, match=told):

@@ -7,6 +7,8 @@ from closed_loop import Ruler, cartesian, drive, make_controller, scenario
 
 from qpavoid import Avoidance, Controller, Obstacle, Sample, Status, simulate
 from qpavoid.config import Box, Damper, Sphere
+from qpavoid.guard import TOLERANCE
+from qpavoid.motion import moved_on
 
 PLATE = {"type": "box", "size": [0.004, 0.6, 0.6]}
 BALL = {"type": "sphere", "radius": 0.06}
@@ -154,3 +156,23 @@ def test_nothing_is_first_seen_inside_its_margin(tmp_path):
         before = v
         assert 1.95 - tick.state.q[0] > HELD - 1e-3
     assert braking[0] > 0.45 and 1.95 - tick.state.q[0] < HELD + 2e-3
+
+
+@pytest.mark.parametrize(
+    ("linear", "angular"), [([-4.0, 0.0, 0.0], [0.0, 0.0, 0.0]), ([0.0, 0.0, 0.0], [0.0, 0.0, 4.0])]
+)
+def test_the_look_ahead_moves_obstacles_on(tmp_path, linear, angular):
+    """No row sees it at 150 mm; at the end of the tick it is 200 mm nearer, or has turned on the robot."""
+    robot = cartesian(tmp_path, acceleration=None)
+    bar = Obstacle.at("bar", Box(size=(0.02, 2.0, 0.02)), [9.0, 0.0, 0.0])
+    controller = make_controller(robot, [bar], "z", dt=0.05)
+    center = [0.21, 0.0, 0.0] if any(linear) else [0.21, -0.9, 0.0]  # the tool is a ball of 50 mm
+    seen = {"bar": Sample.at(center, linear=linear, angular=angular)}
+    tick = controller.tick(np.zeros(3), 0.0, {"z": Sample.at([0.0, 0.0, 0.0])}, seen)
+    assert not len(tick.proximity.pair) and tick.problem.shortfall <= 0.0
+    turned_on = moved_on(seen["bar"], 0.05)
+    short = HELD - Ruler(controller.scene).distances(np.zeros(3), {0: turned_on}).min()
+    assert short > 0.02 and tick.solution.status is Status.RELAXED
+    assert tick.solution.reasons == (f"tool - bar: comes {1e3 * (short - TOLERANCE):.1f} mm too near",)
+    away = seen["bar"]._replace(linear=-seen["bar"].linear, angular=-seen["bar"].angular)
+    assert controller.step(np.zeros(3), 0.0, None, {"bar": away}).status is Status.SOLVED

@@ -29,6 +29,8 @@ from qpavoid.motion import build_motion
 if not hasattr(signal, "SIGALRM"):
     pytest.skip("a hang can only be stopped with SIGALRM", allow_module_level=True)
 
+pytestmark = pytest.mark.filterwarnings("ignore::qpavoid.urdf.MimicWarning")
+
 LIMIT = 30
 """Seconds that a test may take."""
 

@@ -66,6 +66,7 @@ def test_every_figure_of_a_run(log):
         "time_in_collision": pytest.approx(2 * DT),
         "time_below": {"0.0": pytest.approx(2 * DT), "0.1": pytest.approx(3 * DT), "0.2": pytest.approx(4 * DT)},
         "final_error": pytest.approx(0.1),
+        "task_errors": {},
         "max_deviation": pytest.approx(0.5),
         "tracking_rmse": pytest.approx(np.sqrt((0.3**2 + 0.5**2 + 1.0**2 + 0.1**2) / 5)),
         "peak_velocity": 3.0,

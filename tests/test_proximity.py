@@ -32,7 +32,7 @@ from qpavoid.solvers.analytic import tracking_velocity
 from qpavoid.tasks import build_tasks
 
 TICKS = 10
-ROUND = 3e-5
+ROUND = 5e-5
 """Tolerance on rates [m/rad] where coal iterates to a curved surface: its stopping criterion leaves the normal
 uncertain by the root of 1e-6."""
 

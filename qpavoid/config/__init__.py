@@ -5,7 +5,7 @@ and read by `qpavoid.loading`; `qpavoid.scene` and `qpavoid.motion` turn these m
 """
 
 from qpavoid.config.base import Block
-from qpavoid.config.control import Avoidance, Cbf, Damper, Detour, Limits, Progress, Sensing, Switching, Task
+from qpavoid.config.control import Avoidance, Cbf, Damper, Detour, Limits, Progress, Sensing, Switching
 from qpavoid.config.motion import Circle, Csv, Fixed, Line, Motion, Waypoints
 from qpavoid.config.robot import Body, Hull, JointLimits, RobotConfig
 from qpavoid.config.scenario import ObstacleConfig, ScenarioConfig
@@ -22,11 +22,26 @@ from qpavoid.config.shapes import (
     Shape,
     Sphere,
 )
-from qpavoid.config.solver import Eq10Solver, QpSolver, SolverConfig, TrackingSolver, expand_solver
+from qpavoid.config.solver import Eq10Solver, HqpSolver, QpSolver, SolverConfig, TrackingSolver, expand_solver
+from qpavoid.config.tasks import (
+    AlignTask,
+    AnyTask,
+    ComTask,
+    Contact,
+    DampingTask,
+    LookAtTask,
+    ManipulabilityTask,
+    PostureTask,
+    RelativeTask,
+    Task,
+    TaskBlock,
+)
 
 __all__ = [
-    "Avoidance", "Block", "Body", "Box", "Capsule", "Cbf", "Circle", "Cone", "Csv", "Cylinder", "Damper", "Detour",
-    "Ellipsoid", "Eq10Solver", "Fixed", "HalfSpace", "Hull", "JointLimits", "Limits", "Line", "Mesh", "Motion",
-    "ObstacleConfig", "ObstacleShape", "PointCloud", "Progress", "QpSolver", "RobotConfig", "ScenarioConfig",
-    "Sensing", "Shape", "SolverConfig", "Sphere", "Switching", "Task", "TrackingSolver", "Waypoints", "expand_solver",
+    "AlignTask", "AnyTask", "Avoidance", "Block", "Body", "Box", "Capsule", "Cbf", "Circle", "ComTask", "Cone",
+    "Contact", "Csv", "Cylinder", "Damper", "DampingTask", "Detour", "Ellipsoid", "Eq10Solver", "Fixed", "HalfSpace",
+    "HqpSolver", "Hull", "JointLimits", "Limits", "Line", "LookAtTask", "ManipulabilityTask", "Mesh", "Motion",
+    "ObstacleConfig", "ObstacleShape", "PointCloud", "PostureTask", "Progress", "QpSolver", "RelativeTask",
+    "RobotConfig", "ScenarioConfig", "Sensing", "Shape", "SolverConfig", "Sphere", "Switching", "Task", "TaskBlock",
+    "TrackingSolver", "Waypoints", "expand_solver",
 ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""Tasks, avoidance and joint limits."""
+"""Avoidance, joint limits, obstacles without news and tasks without progress."""
 
 from __future__ import annotations
 
@@ -7,28 +7,6 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from qpavoid.config.base import Block, NonNegative, Positive
-from qpavoid.config.motion import Fixed, Motion
-
-
-class Task(Block):
-    """One frame that follows a motion: v_frame = v_ref(t) + gain (x_ref(t) - x)."""
-
-    frame: str
-    """Frame of the robot that is to follow."""
-    type: Literal["position", "pose"] = "position"
-    """`position`: 3 rows; `pose`: position and orientation, 6 rows."""
-    motion: Motion = Fixed()
-    """What it follows; left out, it stays where it is at the start."""
-    gain: NonNegative = 2.0
-    """Feedback gain K [1/s]."""
-    weight: Positive = 1.0
-    """Cost of the position rows [(m/s)⁻²]."""
-    orientation_weight: Positive = 1.0
-    """Cost of the orientation rows [(rad/s)⁻²]."""
-    max_speed: Positive | None = None
-    """Cap on the commanded linear speed [m/s]; left out: no cap."""
-    max_turn_rate: Positive | None = None
-    """Cap on the commanded angular speed [rad/s]; left out: no cap."""
 
 
 class Switching(Block):

@@ -8,10 +8,11 @@ from typing import Annotated
 from pydantic import Field, PrivateAttr, model_validator
 
 from qpavoid.config.base import Block, NonNegative, Number, Positive
-from qpavoid.config.control import Avoidance, Limits, Progress, Sensing, Task
+from qpavoid.config.control import Avoidance, Limits, Progress, Sensing
 from qpavoid.config.motion import Circle, Fixed, Line, Motion
 from qpavoid.config.shapes import HalfSpace, Mesh, ObstacleShape, PointCloud
 from qpavoid.config.solver import QpSolver, SolverConfig
+from qpavoid.config.tasks import AnyTask, Contact
 
 _MOST_TICKS = 1_000_000
 """The log of so many takes a gigabyte or two of memory; at 10 ms they are 2.8 hours."""
@@ -55,7 +56,9 @@ class ScenarioConfig(Block):
     """Initial configuration [rad or m]: all of q, or by joint name over the home pose."""
     lock: list[str] = []
     """Joints held at q0 for the whole run; `*` and `?` match as in file names."""
-    tasks: Annotated[list[Task], Field(min_length=1)]
+    tasks: Annotated[list[AnyTask], Field(min_length=1)]
+    contacts: list[Contact] = []
+    """Frames that stay where they are at q0, such as feet; for `qp` and `hqp`."""
     obstacles: list[ObstacleConfig] = []
     tracking_damping: NonNegative = 0.01
     """λ of the damped J⁺ of the tracking task, the same for every solver [-]; 0 gives the plain pseudo-inverse."""
@@ -98,7 +101,8 @@ class ScenarioConfig(Block):
     def _unique(self) -> ScenarioConfig:
         for what, names in (
             ("obstacle", [o.name for o in self.obstacles]),
-            ("task frame", [t.frame for t in self.tasks]),
+            ("task", [t.label for t in self.tasks]),
+            ("contact frame", [c.frame for c in self.contacts]),
         ):
             twice = sorted({n for n in names if names.count(n) > 1})
             if twice:

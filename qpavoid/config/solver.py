@@ -53,6 +53,22 @@ class QpSolver(Block):
         return self.name if self.backend == "auto" else f"{self.name}:{self.backend}"
 
 
+class HqpSolver(Block):
+    """Strict priorities: a cascade of QPs, one for each level of the tasks."""
+
+    name: Literal["hqp"] = "hqp"
+    backend: str = "auto"
+    """As of `qp`."""
+    regularization: Annotated[float, Field(ge=1e-7, le=1e3)] = 1e-3
+    """λ: cost, at each level, of leaving the velocity that the tasks alone would have [(rad/s)⁻²]. As of `qp`, it keeps
+    joints from full speed for the last mm/s of a level that obstacles hold up; it gives nothing to later levels."""
+
+    @property
+    def label(self) -> str:
+        """Short form that names it."""
+        return self.name if self.backend == "auto" else f"{self.name}:{self.backend}"
+
+
 def expand_solver(value: Any) -> Any:
     """`qp:proxqp` -> {name: qp, backend: proxqp}; `eq10` -> {name: eq10}."""
     if not isinstance(value, str):
@@ -62,5 +78,6 @@ def expand_solver(value: Any) -> Any:
 
 
 SolverConfig = Annotated[
-    Annotated[TrackingSolver | Eq10Solver | QpSolver, Field(discriminator="name")], BeforeValidator(expand_solver)
+    Annotated[TrackingSolver | Eq10Solver | QpSolver | HqpSolver, Field(discriminator="name")],
+    BeforeValidator(expand_solver),
 ]

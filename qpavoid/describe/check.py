@@ -20,6 +20,7 @@ from qpavoid.describe.findings import Joint, Problem, Report
 from qpavoid.describe.poses import mimics
 from qpavoid.describe.sampling import Space, touching
 from qpavoid.errors import ConfigError, QpavoidError
+from qpavoid.kinematics import MIMIC
 from qpavoid.loading import find_robot, read_config
 from qpavoid.robot import Robot, frame_index
 from qpavoid.safe_xml import read_robot_xml
@@ -143,11 +144,18 @@ _KINDS = {
 def _joints(urdf: Path, model: Any, config: RobotConfig, whole: Any) -> list[Joint]:
     """All joints: those that move with the limits that hold, those that are locked, and those that never moved."""
     followers = {name: source for name, (source, _, _) in mimics(urdf).items()}
+    written = [] if is_mjcf(urdf) else read_robot_xml(urdf, "URDF").findall("joint")
+    kinds = {joint.get("name", ""): joint.get("type", "") for joint in written}
     joints = []
     for name, joint in zip(list(whole.names)[1:], list(whole.joints)[1:], strict=True):
-        kind = _KINDS.get(joint.shortname(), "revolute")
-        if name in config.lock:
-            joints.append(Joint(name, kind, followers.get(name), locked=True))
+        kind, leader = _KINDS.get(joint.shortname(), "revolute"), followers.get(name)
+        led = joint.shortname() == MIMIC
+        kind = kinds[name] if led else kind
+        if name in config.lock or (led and leader in config.lock):
+            joints.append(Joint(name, kind, leader, locked=True))
+            continue
+        if led:
+            joints.append(Joint(name, kind, leader, led=True))
             continue
         live = model.joints[model.getJointId(name)]
         velocity = _limit(float(np.max(model.velocityLimit[live.idx_v : live.idx_v + live.nv])))
@@ -155,11 +163,8 @@ def _joints(urdf: Path, model: Any, config: RobotConfig, whole: Any) -> list[Joi
         if live.nq == live.nv == 1:
             lower, upper = (_limit(float(bound[live.idx_q])) for bound in (
                 model.lowerPositionLimit, model.upperPositionLimit))  # fmt: skip
-        joints.append(Joint(name, kind, followers.get(name), lower, upper, velocity or None))
-    if not is_mjcf(urdf):
-        fixed = [j.get("name", "") for j in read_robot_xml(urdf, "URDF").findall("joint") if j.get("type") == "fixed"]
-        joints += [Joint(name, "fixed") for name in fixed]
-    return joints
+        joints.append(Joint(name, kind, leader, lower, upper, velocity or None))
+    return joints + [Joint(name, "fixed") for name, kind in kinds.items() if kind == "fixed"]
 
 
 def _limit(value: float) -> float | None:
@@ -167,7 +172,7 @@ def _limit(value: float) -> float | None:
 
 
 def _judge_joints(report: Report, config: RobotConfig) -> None:
-    moving = [joint for joint in report.joints if joint.kind in _FAST and not joint.locked]
+    moving = [joint for joint in report.joints if joint.kind in _FAST and not (joint.locked or joint.led)]
     spans = {
         joint.name: (joint, joint.upper - joint.lower)
         for joint in moving

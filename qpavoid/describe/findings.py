@@ -29,6 +29,8 @@ class Joint:
     velocity: float | None = None
     """[rad/s or m/s]; None: no limit."""
     locked: bool = False
+    led: bool = False
+    """It moves with the joint that it mimics, and has no coordinate of its own."""
 
 
 @dataclass

@@ -13,6 +13,7 @@ import numpy as np
 
 from qpavoid.describe.srdf import Semantics
 from qpavoid.errors import ConfigError, UnknownName
+from qpavoid.kinematics import MIMIC
 from qpavoid.loading import nearest
 from qpavoid.problem import Array
 from qpavoid.robot import Robot, middle
@@ -73,6 +74,8 @@ def locks(urdf: Path, model: Any, patterns: Sequence[str], semantics: Semantics,
     start = joint_values(model, _posed(model, middle(model), state))
     values = {}
     for name in [*held, *coupled]:
+        if model.joints[model.getJointId(name)].shortname() == MIMIC:
+            continue  # it is held with the one that it follows
         if name not in start:
             raise ConfigError(f"--lock: joint {name!r} is not described by one number and cannot be held; leave it out")
         leader, multiplier, offset = followers.get(name, (name, 1.0, 0.0))

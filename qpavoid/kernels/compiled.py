@@ -73,10 +73,18 @@ def candidates(poses: Array, local: Array, centers: Array, within: Array, pair_o
 
 
 @compiled
+def _fold(row: Array, columns: IntArray, folded: Array) -> None:
+    """Adds up the columns (e,) of a Jacobian's row that one coordinate moves (n,)."""
+    folded[:] = 0.0
+    for c in range(len(row)):
+        folded[columns[c]] += row[c]
+
+
+@compiled
 def distance_rows(x: Any, pairs: IntArray, reach: float, moving: bool) -> int:
     """See `vectorised.distance_rows`."""
     results, J_world, closest, J = x.results, x.J_world, x.closest, x.J
-    nv = J_world.shape[1]
+    columns = J_world.shape[1]
     k = 0
     for i in pairs:
         if not results[i, 0] >= reach:
@@ -86,10 +94,13 @@ def distance_rows(x: Any, pairs: IntArray, reach: float, moving: bool) -> int:
             nx, ny, nz = results[i, 1], results[i, 2], results[i, 3]
             px, py, pz = results[i, 4], results[i, 5], results[i, 6]
             mx, my, mz = py * nz - pz * ny, pz * nx - px * nz, px * ny - py * nx
-            for c in range(nv):
+            row = x.mimicking if x.mimics else J[k]
+            for c in range(columns):
                 linear = nx * J_world[0, c] + ny * J_world[1, c] + nz * J_world[2, c]
                 angular = mx * J_world[3, c] + my * J_world[4, c] + mz * J_world[5, c]
-                J[k, c] = (linear + angular) * x.support[i, c]
+                row[c] = (linear + angular) * x.support[i, c]
+            if x.mimics:
+                _fold(row, x.columns, J[k])
             x.drift[k] = 0.0
             if moving:
                 t = x.twists[x.twist_row[i]]
@@ -173,11 +184,12 @@ _rotation_vector = compiled(rotation_vector)
 def frame_rows(x: Any) -> None:
     """See `vectorised.frame_rows`."""
     poses, targets, screws, A, b, J_world = x.poses, x.targets, x.screws, x.A, x.b, x.J_world
-    rows, nv = A.shape
-    frames = len(poses)
-    for f in range(frames):
+    rows, columns = len(screws), J_world.shape[1]
+    moving = rows // 3 - len(x.turns)
+    for f in range(len(poses)):
         for c in range(12):
             poses[f, c] = x.frame_poses[x.frame_ids[f], c]
+    for f in range(moving):
         r, px, py, pz = 3 * f, poses[f, 9], poses[f, 10], poses[f, 11]
         screws[r, 4], screws[r, 5] = pz, -py
         screws[r + 1, 3], screws[r + 1, 5] = -pz, px
@@ -194,7 +206,7 @@ def frame_rows(x: Any) -> None:
                     missing[i, j] += targets[f, 3 + 3 * i + c] * poses[f, 3 * c + j]
         errors = _rotation_vector(missing)
         for i in range(3):
-            b[3 * (frames + n) + i] = targets[f, 15 + i] + x.gain[f] * errors[i]
+            b[3 * (moving + n) + i] = targets[f, 15 + i] + x.gain[f] * errors[i]
     for part in range(len(x.cap)):
         r = 3 * part
         speed = np.sqrt(b[r] * b[r] + b[r + 1] * b[r + 1] + b[r + 2] * b[r + 2])
@@ -203,15 +215,18 @@ def frame_rows(x: Any) -> None:
                 b[r + i] *= x.cap[part] / speed
     for r in range(rows):
         b[r] *= x.scale[r]
-        for c in range(nv):
-            A[r, c] = 0.0
+        row = x.mimicking if x.mimics else A[r]
+        for c in range(columns):
+            row[c] = 0.0
         for s in range(6):
             e = screws[r, s]
             if e != 0.0:
-                for c in range(nv):
-                    A[r, c] += e * J_world[s, c]
-        for c in range(nv):
-            A[r, c] *= x.task_support[r, c]
+                for c in range(columns):
+                    row[c] += e * J_world[s, c]
+        for c in range(columns):
+            row[c] *= x.task_support[r, c]
+        if x.mimics:
+            _fold(row, x.columns, A[r])
 
 
 @compiled

@@ -13,12 +13,19 @@ from qpavoid.problem import Array, IntArray
 class RowLayout(NamedTuple):
     """Everything from which the rows and bounds of a tick are made, and where they go.
 
-    n velocity coordinates, f tracked frames of which t with an orientation, r = 3 (f + t) task rows, m pairs,
-    o obstacles, p coordinates with a position limit.
+    n velocity coordinates, f tracked frames of which the first p have a position and t an orientation to follow,
+    r >= 3 (p + t) task rows, m pairs, o obstacles, l coordinates with a position limit. The world Jacobian has e >= n
+    columns: those of joints that mimic another one are moved by its coordinate.
     """
 
     J_world: Array
-    """(6, n) world Jacobian of all joints."""
+    """(6, e) world Jacobian of all joints."""
+    columns: IntArray
+    """(e,) which velocity coordinate moves each of its columns."""
+    mimics: bool
+    """Whether any coordinate moves several columns."""
+    mimicking: Array
+    """(e,) scratch: one row before the columns of a coordinate are added up."""
     # --- tasks
     frame_poses: Array
     """(frames, 12) world poses of all frames of the model: rotation by columns, then position [m]."""
@@ -31,24 +38,24 @@ class RowLayout(NamedTuple):
     gain: Array
     """(f,) feedback gain [1/s]."""
     cap: Array
-    """(f + t,) largest commanded linear, then angular speed; infinite where there is none [m/s, rad/s]."""
+    """(p + t,) largest commanded linear, then angular speed; infinite where there is none [m/s, rad/s]."""
     scale: Array
-    """(r,) root of each row's weight."""
+    """(3 (p + t),) root of each row's weight."""
     task_support: Array
-    """(r, n) scale of the coordinates that move each row's frame, 0 for the others."""
+    """(3 (p + t), e) scale of the columns that move each row's frame, 0 for the others."""
     screws: Array
-    """(r, 6) directions of the rows; the moments of the linear ones are filled in by every tick."""
+    """(3 (p + t), 6) directions of the rows; the moments of the linear ones are filled in by every tick."""
     poses: Array
     """(f, 12) out: poses of the tracked frames."""
     A: Array
-    """(r, n) out: task rows."""
+    """(r, n) task rows; out: those of the frames, which come first."""
     b: Array
-    """(r,) out: their right-hand sides."""
+    """(r,) their right-hand sides; likewise."""
     # --- pairs
     results: Array
     """(m, 10) [distance, normal, point a, point b] of all pairs."""
     support: Array
-    """(m, n) support of the second body minus that of the first."""
+    """(m, e) support of the second body minus that of the first."""
     twists: Array
     """(o + 1, 6) velocity of each obstacle at the world's origin, [linear, angular]; the last row stays zero."""
     twist_row: IntArray
@@ -62,7 +69,7 @@ class RowLayout(NamedTuple):
     carriers: IntArray
     """(m, 2) what moves the two bodies of each pair: number of a joint, or J plus that of an obstacle."""
     turning: Array
-    """(chains, n) 1 for each angle among the coordinates that move the end of a chain of joints, else 0."""
+    """(chains, n) how many angles each coordinate turns among those that move the end of a chain of joints."""
     sliding: Array
     """(chains, n) the same for lengths."""
     speeds: Array
@@ -83,13 +90,13 @@ class RowLayout(NamedTuple):
     """(m,) out: the same of rows without a margin, which only keep pairs from touching [m/s]."""
     # --- limits
     q_index: IntArray
-    """(p,) index in q of each limited coordinate."""
+    """(l,) index in q of each limited coordinate."""
     v_index: IntArray
-    """(p,) index in v of the same."""
+    """(l,) index in v of the same."""
     q_lower: Array
-    """(p,) [rad or m]."""
+    """(l,) [rad or m]."""
     q_upper: Array
-    """(p,) [rad or m]."""
+    """(l,) [rad or m]."""
     v_max: Array
     """(n,) largest speed, infinite where there is none."""
     v_step: Array

@@ -112,9 +112,12 @@ def distance_rows(x: Any, pairs: IntArray, reach: float, moving: bool) -> int:
     products = rows.point[_CYCLE]
     products *= rows.normal[_ANTICYCLE]
     np.subtract(products[:3], products[3:], out=rows.angular)
-    J = rows.J
-    np.dot(rows.screw_rows, x.J_world, out=J)
-    J *= x.support.take(near, axis=0, mode="clip")
+    if x.mimics:
+        np.dot(np.dot(rows.screw_rows, x.J_world) * x.support[near], x.fold, out=rows.J)
+    else:
+        J = rows.J
+        np.dot(rows.screw_rows, x.J_world, out=J)
+        J *= x.support.take(near, axis=0, mode="clip")
     if moving:
         np.einsum("ij,ji->i", x.twists[x.twist_row[near]], rows.screws, out=rows.drift)
     elif x.was_moving:
@@ -254,8 +257,8 @@ def rotation_vector(R: Any) -> tuple[float, float, float]:
 def frame_rows(x: Any) -> None:
     """Rows A v = b of f frames that follow targets: feed-forward plus gain times what is missing, capped and scaled.
 
-    The orientation error is the rotation vector of R_target Rᵀ. Three linear rows for each frame come first, then
-    three angular rows for each frame whose orientation counts.
+    The orientation error is the rotation vector of R_target Rᵀ. Three linear rows for each frame whose position counts
+    come first, then three angular rows for each whose orientation does; rows after these are left as they are.
 
     Args:
         x: reads frame_poses, targets and the layout of the tasks; writes poses, A, b.
@@ -264,7 +267,7 @@ def frame_rows(x: Any) -> None:
     here, turns, wanted = x.here, x.turns, x.wanted
     x.moments[:] = np.dot(here, _SKEW).reshape(-1, 3, 3)
     np.subtract(x.position, here, out=wanted)
-    wanted *= x.gain_column
+    wanted *= x.moving_gain
     wanted += x.linear
     if len(turns):
         # poses hold rotations by columns, so these are their transposes
@@ -280,9 +283,12 @@ def frame_rows(x: Any) -> None:
     if x.capped:
         asked = x.asked
         asked *= np.minimum(x.cap / np.maximum(np.sqrt((asked * asked).sum(axis=1)), 1e-12), 1.0)[:, None]
-    np.dot(x.screws, x.J_world, out=x.A)
-    np.multiply(x.A, x.task_support, out=x.A)
-    np.multiply(x.b, x.scale, out=x.b)
+    if x.mimics:
+        np.dot(np.dot(x.screws, x.J_world) * x.task_support, x.fold, out=x.A_frames)
+    else:
+        np.dot(x.screws, x.J_world, out=x.A_frames)
+        np.multiply(x.A_frames, x.task_support, out=x.A_frames)
+    np.multiply(x.b_frames, x.scale, out=x.b_frames)
 
 
 def speed_to_stop(room: Array, step: Array, dt: float) -> Array:

@@ -41,7 +41,8 @@ class Workspace:
         for name, value in layout._asdict().items():
             setattr(self, name, value)
         (rows, nv), frames, pairs = layout.A.shape, len(layout.targets), len(layout.near)
-        split = 3 * frames
+        moving = len(layout.screws) // 3 - len(layout.turns)
+        split, framed = 3 * moving, len(layout.screws)
         # numbers as arrays: a ufunc takes them in half the time
         self.damping2, self.rate_, self.quarter = (
             np.array([value]) for value in (layout.damping**2, layout.rate, 0.5 * np.pi)
@@ -49,14 +50,17 @@ class Workspace:
         self.offset_, self.hold_, self.d1_ = (np.array([value]) for value in (layout.offset, layout.hold, layout.d1))
         self.gain_, self.recovery_, self.zero = (np.array([v]) for v in (layout.row_gain, layout.recovery, 0.0))
         self.blend = np.array([0.5 * np.pi / (layout.d2 - layout.d1)])
-        self.gain_column = layout.gain[:, None]
-        self.here = layout.poses[:, 9:]
+        self.gain_column, self.moving_gain = layout.gain[:, None], layout.gain[:moving, None]
+        self.A_frames, self.b_frames = layout.A[:framed], layout.b[:framed]
+        self.fold = np.zeros((len(layout.columns), nv))
+        self.fold[np.arange(len(layout.columns)), layout.columns] = 1.0
+        self.here = layout.poses[:moving, 9:]
         self.turned = layout.poses[:, :9].reshape(-1, 3, 3)
-        self.position, self.rotation = layout.targets[:, :3], layout.targets[:, 3:12].reshape(-1, 3, 3)
-        self.linear, self.angular = layout.targets[:, 12:15], layout.targets[:, 15:]
-        self.moments = layout.screws.reshape(-1, 3, 6)[:frames, :, 3:]
-        self.wanted, self.wanted_turns = layout.b[:split].reshape(-1, 3), layout.b[split:].reshape(-1, 3)
-        self.asked = layout.b.reshape(-1, 3)
+        self.position, self.rotation = layout.targets[:moving, :3], layout.targets[:, 3:12].reshape(-1, 3, 3)
+        self.linear, self.angular = layout.targets[:moving, 12:15], layout.targets[:, 15:]
+        self.moments = layout.screws.reshape(-1, 3, 6)[:moving, :, 3:]
+        self.wanted, self.wanted_turns = layout.b[:split].reshape(-1, 3), layout.b[split:framed].reshape(-1, 3)
+        self.asked = self.b_frames.reshape(-1, 3)
         self.every_turns = len(layout.turns) == frames
         self.capped = bool(np.isfinite(layout.cap).any())
         self.gram = np.empty((rows, rows))

@@ -16,6 +16,7 @@ from qpavoid.loading import nearest
 from qpavoid.problem import Problem, Solution
 from qpavoid.solvers.analytic import Eq10, TrackingOnly
 from qpavoid.solvers.backends import backend_names
+from qpavoid.solvers.hqp import Hqp
 from qpavoid.solvers.qp import Qp
 
 
@@ -35,6 +36,7 @@ SOLVERS: dict[str, Callable[[Any], Solver]] = {
     "eq10": Eq10,
     "eq10-literal": Eq10,
     "qp": Qp,
+    "hqp": Hqp,
 }
 
 
@@ -55,7 +57,7 @@ def parse_solver(name: str, settings: SolverConfig | None = None) -> SolverConfi
         return TypeAdapter[SolverConfig](SolverConfig).validate_python(wanted)
     except ValidationError:
         if wanted["name"] in SOLVERS:
-            raise ConfigError(f"solver {name!r}: {wanted['name']} takes no backend; only qp does") from None
+            raise ConfigError(f"solver {name!r}: {wanted['name']} takes no backend; only qp and hqp do") from None
         raise UnknownName(f"unknown solver {name!r}{nearest(wanted['name'], SOLVERS)}") from None
 
 

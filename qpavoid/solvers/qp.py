@@ -7,13 +7,14 @@ from collections.abc import Callable
 import numpy as np
 
 from qpavoid import kernels
-from qpavoid.config import QpSolver
+from qpavoid.config import HqpSolver, QpSolver
 from qpavoid.errors import SolverNotInstalled
 from qpavoid.problem import Array, Problem, Solution, Status
 from qpavoid.solvers.analytic import tracking_velocity
 from qpavoid.solvers.backends import Daqp, make_backend, solve_daqp
 from qpavoid.solvers.reasons import what_gave_way
-from qpavoid.solvers.relaxation import Closest, by_back_end, closest, relax
+from qpavoid.solvers.reduced import holding
+from qpavoid.solvers.relaxation import Closest, Relaxed, by_back_end, closest, relax
 
 _GENTLE = 1.0
 """λ of a solution that moves the joints little [(rad/s)⁻²]."""
@@ -32,11 +33,15 @@ class Qp:
     and the deepest threat least (`solvers.relaxation`): in compiled code with `native`, by daqp with every other back
     end. An answer counts only if it verifies: a back end that fails or lies is replaced by daqp for that tick, and
     where that fails too, the robot is told to stop.
+
+    Contacts are held exactly, whatever gives way: with v = rest + Z w, all of the above is solved for w
+    (`solvers.reduced`), by a back end.
     """
 
     bounded = True
+    holds_contacts = True
 
-    def __init__(self, config: QpSolver) -> None:
+    def __init__(self, config: QpSolver | HqpSolver) -> None:
         self.config = config
         compiled = config.backend == "native" or (config.backend == "auto" and kernels.ACCELERATED)
         self._projections = _compiled_projections() if compiled else None
@@ -49,15 +54,15 @@ class Qp:
         A, rows, lower, upper, v0 = problem.tracking.A, problem.avoidance, problem.lower, problem.upper, problem.v0
         if v0[0] != v0[0]:
             v0 = tracking_velocity(problem)
-            if kernels.shortfall(v0, rows.J, rows.b, lower, upper) <= 0.0:
+            if problem.contacts is None and kernels.shortfall(v0, rows.J, rows.b, lower, upper) <= 0.0:
                 return Solution(v0)
-        if self._projections is not None:
+        if self._projections is not None and problem.contacts is None:
             answer, solved = self._projections[0](A, self.config.regularization, v0, rows.J, rows.b, lower, upper)
             if solved:
                 return Solution(answer)
         P, q = kernels.projection_cost(A, self.config.regularization, v0)
         for backend in (self._backend,) if isinstance(self._backend, Daqp) else (self._backend, solve_daqp):
-            v = closest(backend, P, q, rows.J, rows.b, lower, upper)
+            v = closest(holding(problem.contacts, backend), P, q, rows.J, rows.b, lower, upper)
             if v is not None:
                 return Solution(v)
         return self._relaxed(P, q, problem)
@@ -78,9 +83,17 @@ class Qp:
         rows = problem.avoidance
         least = rows.b if slack is None else rows.b - slack
         P, q = kernels.projection_cost(problem.tracking.A, _GENTLE, tracking_velocity(problem))
-        return closest(solve_daqp, P, q, rows.J, least, problem.lower, problem.upper)
+        return closest(holding(problem.contacts, solve_daqp), P, q, rows.J, least, problem.lower, problem.upper)
 
     def _relaxed(self, P: Array, q: Array, problem: Problem) -> Solution:
+        relaxed = self._give_way(P, q, problem)
+        if isinstance(relaxed, Solution):
+            return relaxed
+        slack = relaxed.slack if relaxed.slack.any() else None
+        return Solution(relaxed.v, Status.RELAXED, what_gave_way(relaxed, problem), slack)
+
+    def _give_way(self, P: Array, q: Array, problem: Problem) -> Relaxed | Solution:
+        """The least that has to give way; a stop where not even that helps."""
         rows = problem.avoidance
         unknown = np.flatnonzero(~np.isfinite(rows.b + rows.J.sum(axis=1)))
         if len(unknown):
@@ -89,14 +102,18 @@ class Qp:
                 problem.v_stop.copy(), Status.STOPPED, tuple(f"{p}: no distance can be told" for p in pairs)
             )
         relaxed = None
-        if self._projections is not None:
+        if self._projections is not None and problem.contacts is None:
             relaxed = relax(problem, self._compiled(self._projections[1], problem))
+        backend = holding(problem.contacts, solve_daqp)
         if relaxed is None:
-            relaxed = relax(problem, by_back_end(solve_daqp, P, q, tracking_velocity(problem)))
-        if relaxed is None:
-            return Solution(problem.v_stop.copy(), Status.STOPPED, ("the QP back end returned no usable velocity",))
-        slack = relaxed.slack if relaxed.slack.any() else None
-        return Solution(relaxed.v, Status.RELAXED, what_gave_way(relaxed, problem), slack)
+            relaxed = relax(problem, by_back_end(backend, P, q, tracking_velocity(problem)))
+        if relaxed is not None:
+            return relaxed
+        reason = "the QP back end returned no usable velocity"
+        hard = problem.hard_lower, problem.hard_upper
+        if problem.contacts is not None and closest(backend, P, q, rows.J[:0], rows.b[:0], *hard) is None:
+            reason = "contacts: the joint limits leave no velocity that holds them"
+        return Solution(problem.v_stop.copy(), Status.STOPPED, (reason,))
 
     def _compiled(self, project: _Projection, problem: Problem) -> Closest:
         """Solves the QPs of a problem's tracking cost in compiled code."""

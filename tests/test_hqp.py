@@ -1,0 +1,216 @@
+"""Strict priorities against the closed form where nothing binds, and against plain cascades of QPs elsewhere."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import qpsolvers
+from conftest import SPHERE, obstacle
+
+from qpavoid import Controller, Sample, build_scene, build_tasks, config, load_scenario, simulate
+from qpavoid.config import HqpSolver
+from qpavoid.problem import AvoidanceRows, Status, Tracking, make_problem
+from qpavoid.solvers import backend_names, make_solver, parse_solver
+from qpavoid.solvers.backends import solve_daqp
+from qpavoid.solvers.hqp import Hqp
+
+NV = 9
+SMALL = 1e-7
+BACKENDS = ["auto", *[name for name in ("daqp", "proxqp", "quadprog") if name in backend_names()]]
+
+
+def random_problem(seed, sizes=(3, 3, 4), bound=10.0, k=0, low=-0.5, damping=0.0, touch=-5.0):
+    """Levels of random rows; the second one repeats a row of the first, at another right-hand side."""
+    rng = np.random.default_rng(seed)
+    A, b = rng.normal(size=(sum(sizes), NV)), rng.normal(size=sum(sizes))
+    A[sizes[0]] = A[0]
+    rows = AvoidanceRows(
+        np.arange(k), np.linspace(0.02, 0.05, k), rng.normal(size=(k, NV)), low + rng.uniform(0.0, 0.8, k), 0.03, 0.1,
+        np.full(k, touch),
+    )  # fmt: skip
+    ends = np.cumsum(sizes)
+    levels = tuple(np.arange(end - size, end) for size, end in zip(sizes, ends, strict=True))
+    limits = np.full(NV, bound)
+    problem = make_problem(Tracking(A, b, damping), rows, -limits, limits, [(f"a{i}", f"b{i}") for i in range(k)])
+    return problem._replace(levels=levels)
+
+
+def costs(problem, v):
+    """Residual of each level."""
+    A, b, _ = problem.tracking
+    return np.array([np.linalg.norm(A[rows] @ v - b[rows]) for rows in problem.levels])
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_nothing_binds_and_it_is_the_cascade_of_null_space_projections(seed):
+    """v += (A_p N)⁺ (b_p - A_p v), N the projector on what levels before leave free (Siciliano and Slotine 1991)."""
+    problem = random_problem(seed, bound=1e3)
+    v, stacked = np.zeros(NV), np.zeros((0, NV))
+    for rows in problem.levels:
+        A, b = problem.tracking.A[rows], problem.tracking.b[rows]
+        N = np.eye(NV) - np.linalg.pinv(stacked, rcond=1e-9) @ stacked if len(stacked) else np.eye(NV)
+        v = v + np.linalg.pinv(A @ N, rcond=1e-9) @ (b - A @ v)
+        stacked = np.concatenate((stacked, A))
+    solution = make_solver("hqp").solve(problem)
+    assert solution.status is Status.SOLVED
+    np.testing.assert_allclose(solution.v, v, atol=1e-9)
+    assert costs(problem, v)[0] < 1e-9 < costs(problem, v)[1]  # the row that repeats another one has to give way
+
+
+def cascade(problem):
+    """Lexicographic optimum by QPs in all of v, each level before held by equalities; None where daqp gives up."""
+    rows = problem.avoidance
+    E, e, v = np.zeros((0, NV)), np.zeros(0), np.zeros(NV)
+    for level in problem.levels:
+        A, b = problem.tracking.A[level], problem.tracking.b[level]
+        held = (E, e) if len(e) else ()
+        P = A.T @ A + SMALL * np.eye(NV)
+        qp = qpsolvers.Problem(P, -A.T @ b, -rows.J, -rows.b, *held, lb=problem.lower, ub=problem.upper)
+        v = qpsolvers.solve_problem(qp, solver="daqp").x
+        if v is None:
+            return None
+        E, e = np.concatenate((E, A)), np.concatenate((e, A @ v))
+    return v
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_rows_and_bounds_bind(backend):
+    """Every level is as good as in the plain cascade, and no better: the levels before it would have had to give."""
+    solver, binding, later = Hqp(HqpSolver(backend=backend, regularization=SMALL)), 0, 0
+    for seed in range(30):
+        problem = random_problem(seed, bound=0.6, k=4, low=-0.6)
+        solution = solver.solve(problem)
+        if solution.status is not Status.SOLVED:
+            continue
+        v, rows = solution.v, problem.avoidance
+        assert (np.abs(v) <= 0.6 + 1e-9).all() and (rows.J @ v >= rows.b - 1e-6).all()
+        reference = cascade(problem)
+        if reference is None:
+            continue
+        found = costs(problem, v)
+        np.testing.assert_allclose(found, costs(problem, reference), atol=2e-5)
+        binding += found[0] > 1e-3
+        later += found[2] > 1e-3
+    assert binding >= 3 and later >= 6
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_weighted_qp_comes_to_it_as_the_ratio_of_weights_grows(seed):
+    problem = random_problem(seed, bound=0.8, k=3)
+    best = costs(problem, Hqp(HqpSolver(regularization=SMALL)).solve(problem).v)
+    far = []
+    for ratio in (1e1, 1e2, 1e3):
+        weight = np.concatenate([np.full(len(rows), ratio**-p) for p, rows in enumerate(problem.levels)])
+        A, b = problem.tracking.A * weight[:, None] ** 0.5, problem.tracking.b * weight**0.5
+        rows = problem.avoidance
+        P = A.T @ A + SMALL * np.eye(NV)
+        v = solve_daqp(P, -A.T @ b, rows.J, rows.b, problem.lower, problem.upper)
+        far.append(np.abs(costs(problem, v) - best)[:2].max())
+    assert far[2] < max(0.1 * far[0], 1e-4)
+
+
+def test_later_levels_change_nothing_of_earlier_ones():
+    for seed in range(10):
+        problem = random_problem(seed, bound=0.6, k=3)
+        alone = problem._replace(levels=problem.levels[:1])
+        solver = Hqp(HqpSolver(regularization=SMALL))
+        whole, first = solver.solve(problem), solver.solve(alone)
+        if whole.status is Status.SOLVED:
+            assert costs(problem, whole.v)[0] == pytest.approx(costs(problem, first.v)[0], abs=1e-5)
+
+
+def test_contradicting_rows_give_way_as_those_of_the_qp():
+    """The same pairs by the same amounts; tasks then keep their order within what is left."""
+    relaxed = 0
+    for seed in range(15):
+        problem = random_problem(seed, bound=0.3, k=8, low=0.0)
+        found, expected = make_solver("hqp").solve(problem), make_solver("qp").solve(problem)
+        assert found.status is expected.status
+        if found.status is Status.RELAXED:
+            relaxed += 1
+            np.testing.assert_allclose(found.slack, expected.slack, atol=3e-3)
+            assert [r.split(":")[0] for r in found.reasons][:1] == [r.split(":")[0] for r in expected.reasons][:1]
+            assert (np.abs(found.v) <= 0.3 + 1e-9).all()
+    assert relaxed >= 5
+
+
+def test_what_is_not_finite_stops_the_robot():
+    problem = random_problem(0, k=2)
+    J = problem.avoidance.J.copy()
+    J[1, 0] = np.nan
+    bad = problem._replace(avoidance=problem.avoidance._replace(J=J), shortfall=np.nan)
+    solution = make_solver("hqp").solve(bad)
+    assert solution.status is Status.STOPPED and solution.reasons == ("a1 - b1: no distance can be told",)
+    b = problem.tracking.b.copy()
+    b[0] = np.nan
+    assert np.isfinite(make_solver("hqp").solve(problem._replace(tracking=problem.tracking._replace(b=b))).v).all()
+
+
+def test_one_level_without_threats_is_the_tracking_velocity_bit_for_bit():
+    problem = random_problem(1, damping=0.05)._replace(levels=())
+    solution = make_solver("hqp").solve(problem)
+    np.testing.assert_array_equal(solution.v, problem.v0)
+
+
+# On a robot
+
+
+def panda_controller(panda, solver, tool=1, posture=2, **settings):
+    tasks = [
+        config.Task(frame="panda_hand_tcp", type="position", priority=tool, gain=5.0),
+        config.PostureTask(priority=posture, q={"panda_joint4": -1.2}),
+    ]
+    ball = obstacle("ball", SPHERE, (0.55, 0.2, 0.55))
+    return Controller(build_scene(panda, [ball]), build_tasks(tasks, panda, panda.home), solver, dt=0.01, **settings)
+
+
+def test_a_posture_of_equal_weight_takes_nothing_from_the_tool(panda):
+    """The posture wants the elbow elsewhere; with `qp` the tool pays for it, with `hqp` it does not."""
+    errors = {}
+    for solver in ("qp", "hqp"):
+        controller, q = panda_controller(panda, solver, tracking_damping=1e-3), panda.home
+        for _ in range(300):
+            q = pin.integrate(panda.model, q, 0.01 * controller.step(q).v)
+        tick = controller.tick(q)
+        errors[solver] = np.linalg.norm(tick.targets[0].position - tick.kinematics.position[0])
+    assert errors["hqp"] < 1e-4 < 0.02 < errors["qp"]
+
+
+@pytest.mark.parametrize("order", [(1, 2), (2, 1)])
+def test_the_order_of_priorities_is_that_of_the_file(panda, order):
+    controller = panda_controller(panda, "hqp", *order, tracking_damping=0.0)
+    q = pin.integrate(panda.model, panda.home, 0.1 * np.ones(7))
+    problem = controller.tick(q).problem
+    assert [len(rows) for rows in problem.levels] == ([3, 7] if order == (1, 2) else [7, 3])
+    free = np.full(7, np.inf)
+    v = make_solver("hqp").solve(problem._replace(lower=-free, upper=free)).v
+    A, b, _ = problem.tracking
+    first = problem.levels[0]
+    np.testing.assert_allclose(A[first] @ v, b[first], atol=1e-6)
+
+
+def test_it_keeps_clear_and_arrives(panda):
+    controller, q = panda_controller(panda, "hqp"), panda.home
+    goal = Sample.at([0.55, 0.38, 0.45])
+    worst = np.inf
+    for _ in range(500):
+        tick = controller.tick(q, targets={"panda_hand_tcp": goal})
+        assert tick.solution.status is not Status.STOPPED
+        worst = min(worst, float(np.min(tick.proximity.distance, initial=np.inf)))
+        q = pin.integrate(panda.model, q, 0.01 * tick.solution.v)
+    assert worst > controller.avoidance.d1 - 1e-3
+    assert np.linalg.norm(tick.kinematics.position[0] - goal.position) < 0.01
+
+
+def test_a_safe_command_comes_back_bit_for_bit(panda):
+    controller = panda_controller(panda, "hqp")
+    wish = 0.01 * np.arange(7.0)
+    np.testing.assert_array_equal(controller.filter(panda.home, wish).v, wish)
+
+
+def test_named_in_a_file_and_on_the_command_line():
+    assert isinstance(make_solver("hqp"), Hqp)
+    assert parse_solver("hqp:proxqp").label == "hqp:proxqp"
+    assert load_scenario("panda_line", solver="hqp").solver == HqpSolver()
+    assert load_scenario("panda_line", ["solver={name: hqp, regularization: 1.0e-4}"]).solver.regularization == 1e-4
+    log = simulate(load_scenario("panda_line", ["duration=1.0"], solver="hqp"))
+    assert log.meta["solver"] == "hqp" and not log.metrics()["collided"]
