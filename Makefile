@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 # what runs a second time without numba: the tick and everything that it is made of
 TICK_TESTS := $(addprefix tests/test_,$(addsuffix .py,avoidance backends controller examples faults filter \
-  giving_way limits outcome penetration proximity situations solvers tasks))
+  giving_way grasp limits outcome penetration point_cloud proximity shapes situations solvers tasks))
 
 .PHONY: run figures test lint types clean
 

@@ -1,6 +1,7 @@
 """qpavoid: follow a planned motion and stay clear of obstacles, other arms and yourself."""
 
 from qpavoid.batch import BatchError, Steps, WorkerDied, Workers, simulate_many, steps
+from qpavoid.cloud import Points, Voxels
 from qpavoid.config import Avoidance, Limits, Progress, ScenarioConfig, Sensing
 from qpavoid.contacts import build_contacts
 from qpavoid.controller import Controller, Tick
@@ -26,6 +27,7 @@ __all__ = [
     "Log",
     "NumericalError",
     "Obstacle",
+    "Points",
     "Pose",
     "Problem",
     "Progress",
@@ -42,6 +44,7 @@ __all__ = [
     "Steps",
     "Tick",
     "UnknownName",
+    "Voxels",
     "WorkerDied",
     "Workers",
     "build_contacts",

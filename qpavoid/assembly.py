@@ -11,7 +11,7 @@ from qpavoid.avoidance import row_form
 from qpavoid.config import Avoidance, Limits
 from qpavoid.contacts import ContactRows, tracking_within
 from qpavoid.kernels.layout import RowLayout
-from qpavoid.kinematics import ForwardKinematics, Kinematics, chains, columns, longest_lever
+from qpavoid.kinematics import ForwardKinematics, Kinematics, chains, columns, longest_lever, support_masks
 from qpavoid.limits import JointBounds, limit_layout
 from qpavoid.motion import Sample
 from qpavoid.problem import Array, AvoidanceRows, Problem, Proximity, Tracking
@@ -39,6 +39,7 @@ class Assembly:
         """Lays the memory out; see `Controller` for the arguments."""
         frames, self._others = in_order(tasks)
         pairs, nv = len(scene.pairs), scene.robot.model.nv
+        self._pairs, self._masks = scene.pairs, support_masks(scene.robot.model)
         turning, sliding = chains(scene.robot.model)
         joint_reach = query.joint_reach()
         self._layout = RowLayout(
@@ -49,7 +50,7 @@ class Assembly:
             frame_poses=kinematics.frame_poses,
             **task_layout(frames, self._others, scene.robot.model),
             results=query.results,
-            support=scene.support,
+            support=scene.support.copy(),
             twists=query.twists,
             twist_row=query.twist_row,
             margin=query.margin,
@@ -68,7 +69,7 @@ class Assembly:
             touch=np.zeros(pairs),
             **limit_layout(bounds, limits.position_gain, dt),
             v0=np.zeros(nv),
-            lever=longest_lever(scene.robot.model, joint_reach),
+            lever=longest_lever(scene.robot.model, query.longest_reach()),
             damping=damping,
             **row_form(avoidance),
         )
@@ -114,6 +115,14 @@ class Assembly:
         return proximity, Problem(
             self._tracking, rows, x.lower, x.upper, *self._hard, x.v_stop, *self._names, x.v0, worst, held, self._levels
         )
+
+    def carry(self, query: DistanceQuery) -> None:
+        """Takes over which joint carries what, in place."""
+        x = self._layout
+        joints = np.array([body.parentJoint for body in query.bodies], dtype=np.intp)[self._pairs]
+        x.support[:] = self._masks[joints[:, 1]] - self._masks[joints[:, 0]]
+        x.carriers[:] = query.carriers()
+        x.joint_reach[:] = query.joint_reach()
 
     def closest_call(self, v: Array, near: int, reach: float, horizon: float) -> float:
         """A bound below what is left of the safe distances on the way of v until `horizon` [m].

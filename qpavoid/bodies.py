@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid.cache import cached
-from qpavoid.config import Box, Capsule, Cylinder, Shape, Sphere
+from qpavoid.config import Box, Capsule, Cone, Cylinder, Ellipsoid, Shape, Sphere
 from qpavoid.config.base import LARGEST
 from qpavoid.errors import ConfigError
 from qpavoid.problem import Array
@@ -48,6 +48,10 @@ def make_shape(shape: Shape) -> Any:
         return coal.Capsule(shape.radius, shape.length)
     if isinstance(shape, Box):
         return coal.Box(*shape.size)
+    if isinstance(shape, Cone):
+        return coal.Cone(shape.radius, shape.length)
+    if isinstance(shape, Ellipsoid):
+        return coal.Ellipsoid(*shape.radii)
     assert isinstance(shape, Cylinder)
     return coal.Cylinder(shape.radius, shape.length)
 
@@ -112,7 +116,11 @@ def enclosing_capsule(geometry: Any) -> CapsuleFit:
 
 
 def bounding_sphere(geometry: Any) -> tuple[Array, float]:
-    """Centre (3,) in the shape's own frame and radius [m] of a ball around a coal shape."""
+    """Centre (3,) in the shape's own frame and radius [m] of a ball around a coal shape; infinite of a half-space."""
+    if isinstance(geometry, coal.Halfspace):
+        return np.zeros(3), np.inf
+    if isinstance(geometry, coal.Ellipsoid):
+        return np.zeros(3), float(np.max(geometry.radii))
     if isinstance(geometry, coal.Sphere | coal.Capsule | coal.Cylinder):
         half = getattr(geometry, "halfLength", 0.0)
         wide = isinstance(geometry, coal.Cylinder)
@@ -134,12 +142,13 @@ def _convex_hull(mesh: Any) -> tuple[Any, Any]:
     low, high = local.min(axis=0), local.max(axis=0)
     size = high - low
     if size.min() > 1e-6 * size.max():
-        return cached("hull", points, lambda: _run_qhull(mesh), _pack_hull, _unpack_hull), pin.SE3.Identity()
+        return cached("hull", points, lambda: run_qhull(mesh), _pack_hull, _unpack_hull), pin.SE3.Identity()
     middle = center + axes.T @ (0.5 * (low + high))
     return coal.Box(*np.maximum(size, _THINNEST)), pin.SE3(np.ascontiguousarray(axes.T), middle)
 
 
-def _run_qhull(mesh: Any) -> Any:
+def run_qhull(mesh: Any) -> Any:
+    """coal's convex hull of the vertices of a mesh that are not all in one plane: qhull ends the process over those."""
     try:
         mesh.buildConvexHull(True, "Qt")
     except RuntimeError:
@@ -183,15 +192,22 @@ def hull_points(geometry: Any) -> Array:
     if isinstance(geometry, coal.ConvexBase):
         return np.array(geometry.points())
     if isinstance(geometry, coal.Cylinder):
-        # corners of the prism around it
-        angle = np.linspace(0.0, 2.0 * np.pi, 48, endpoint=False)
-        rim = geometry.radius / np.cos(np.pi / 48) * np.column_stack((np.cos(angle), np.sin(angle), 0.0 * angle))
-        top = np.array([0.0, 0.0, geometry.halfLength])
-        return np.concatenate((rim + top, rim - top))
+        return np.concatenate([rim(geometry.radius, z) for z in (-geometry.halfLength, geometry.halfLength)])
+    if isinstance(geometry, coal.Cone):
+        return np.concatenate((rim(geometry.radius, -geometry.halfLength), [[0.0, 0.0, geometry.halfLength]]))
+    if isinstance(geometry, coal.Ellipsoid):
+        return np.asarray(_AROUND_BALL * np.asarray(geometry.radii))
     geometry.computeLocalAABB()
     half, center = 0.5 * (geometry.aabb_local.max_ - geometry.aabb_local.min_), geometry.aabb_center
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
     return np.asarray(center + corners * half)
+
+
+def rim(radius: float, z: float) -> Array:
+    """Corners (48, 3) of a polygon around a circle about the z axis."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 48, endpoint=False)
+    around = radius / np.cos(np.pi / 48)
+    return np.column_stack((around * np.cos(angle), around * np.sin(angle), np.full(48, z)))
 
 
 def fit_capsule(points: Array, directions: int = 250) -> CapsuleFit:
@@ -268,6 +284,10 @@ def _half_sphere(count: int) -> Array:
     z, angle = i / count, np.pi * (1.0 + np.sqrt(5.0)) * i
     r = np.sqrt(1.0 - z * z)
     return np.column_stack((r * np.cos(angle), r * np.sin(angle), z))
+
+
+_AROUND_BALL = 1.04 * np.concatenate((_half_sphere(100), -_half_sphere(100)))
+"""Points whose hull encloses the unit ball (200, 3)."""
 
 
 _ROUND = np.concatenate([side * _half_sphere(60) for side in (1.0, -1.0)])

@@ -13,9 +13,11 @@ import pinocchio as pin
 
 from qpavoid import kernels
 from qpavoid.assembly import Assembly
+from qpavoid.cloud import Points
 from qpavoid.config import Avoidance, Limits, Progress, ScenarioConfig, Sensing
 from qpavoid.contacts import ContactRows, build_contacts
 from qpavoid.errors import ConfigError, NumericalError, UnknownName, located
+from qpavoid.grasp import Grasps
 from qpavoid.guard import TOLERANCE, Guard
 from qpavoid.kinematics import ForwardKinematics, Kinematics
 from qpavoid.limits import saturate
@@ -114,6 +116,9 @@ class Controller:
             scene, self._kinematics, self._bounds, self.limits.position_gain,
             self.avoidance.hold - self.avoidance.offset, dt,
         )  # fmt: skip
+        self._grasps = Grasps(
+            scene, (self._query, self._guard.ahead), self._assembly, self.avoidance.hold - self.avoidance.offset
+        )
         self._warm_up()
 
     def _warm_up(self) -> None:
@@ -159,6 +164,10 @@ class Controller:
                 scenario.progress,
                 contacts,
             )
+        for c in scenario.obstacles:
+            if c.carried_by is not None:
+                with located(f"{source}: obstacles: {c.name!r}: carried_by"):
+                    controller.attach(c.name, c.carried_by, q0)
         return controller, q0
 
     def step(
@@ -166,7 +175,7 @@ class Controller:
         q: Array,
         t: float = 0.0,
         targets: Mapping[str, Any] | None = None,
-        obstacles: Mapping[str, Sample | Pose] | None = None,
+        obstacles: Mapping[str, Sample | Pose | Points] | None = None,
         v: Array | None = None,
     ) -> Solution:
         """Velocity for the next dt.
@@ -195,7 +204,7 @@ class Controller:
         q: Array,
         t: float = 0.0,
         targets: Mapping[str, Any] | None = None,
-        obstacles: Mapping[str, Sample | Pose] | None = None,
+        obstacles: Mapping[str, Sample | Pose | Points] | None = None,
         v: Array | None = None,
     ) -> Tick:
         """Like `step`, with everything that led to the velocity."""
@@ -210,7 +219,7 @@ class Controller:
         q: Array,
         v_desired: Array,
         t: float = 0.0,
-        obstacles: Mapping[str, Sample | Pose] | None = None,
+        obstacles: Mapping[str, Sample | Pose | Points] | None = None,
         v: Array | None = None,
     ) -> Solution:
         """The safe velocity that is closest to any command: of a teleoperator, a policy, another controller.
@@ -229,8 +238,75 @@ class Controller:
         """
         return self._compute(q, t, None, obstacles, v, as_vector("v_desired", v_desired, self._v_shape))[-1]
 
+    def attach(self, obstacle: str, frame: str, q: Array | None = None) -> None:
+        """From now on, a frame of the robot carries an obstacle, which stays where it is relative to the frame.
+
+        Until it is released it is a body of the robot: it keeps clear of the other obstacles and of the robot, except
+        of what it touches now, until the two have once been apart, and of the link that carries it and all beyond it.
+        What is given of it in `step` is not read meanwhile.
+
+        Args:
+            obstacle: name of one that is `graspable`.
+            frame: name of the frame.
+            q: configuration (nq,) at which it is grasped; that of the last tick if left out.
+
+        Raises:
+            UnknownName: no such obstacle or frame.
+            ConfigError: it cannot be carried, or not by this frame.
+        """
+        index, frame_id = self._obstacles.index(obstacle), self.scene.robot.frame_id(frame, "attach")
+        self._grasps.attach(index, frame_id, self._given_or_last(q))
+        self._obstacles.carry(index, True)
+        self._guard.forget(index)
+
+    def release(self, obstacle: str, q: Array | None = None) -> Sample:
+        """Puts an obstacle down that the robot carries: it rests where it is, until `step` is told something else.
+
+        What touches it now need not part from it at once: it is kept clear of when it has once been apart.
+
+        Args:
+            obstacle: its name.
+            q: configuration (nq,) at which it is released; that of the last tick if left out.
+
+        Returns:
+            Its world pose.
+
+        Raises:
+            UnknownName: no such obstacle.
+            ConfigError: it is not carried.
+        """
+        index = self._obstacles.index(obstacle)
+        sample = self._grasps.release(index, self._given_or_last(q))
+        self._obstacles.carry(index, False)
+        return sample
+
+    def allow_contact(self, obstacle: str, others: Sequence[str], allowed: bool = True) -> None:
+        """Lets an obstacle and some bodies or other obstacles touch, as a gripper has to that is about to grasp it.
+
+        Args:
+            obstacle: its name.
+            others: names of bodies or obstacles.
+            allowed: False takes it back.
+
+        Raises:
+            UnknownName: no such obstacle.
+            ConfigError: none of the others has a pair with it.
+        """
+        self._grasps.allow(self._obstacles.index(obstacle), set(others), allowed)
+
+    def obstacle_pose(self, obstacle: str, q: Array | None = None) -> Sample:
+        """World pose of an obstacle as the last tick had it, carried or not; see `release` for the arguments."""
+        return self._grasps.pose(self._obstacles.index(obstacle), self._given_or_last(q))
+
+    def tell_who_carries(self, query: DistanceQuery) -> None:
+        """Brings other distances of the scene to what the robot carries now, and what may touch."""
+        self._grasps.tell(query)
+
+    def _given_or_last(self, q: Array | None) -> Array:
+        return self._q_last if q is None else require_finite("q", q, self._q_shape)
+
     def reset(self, v: Array | None = None) -> None:
-        """Forgets the ticks before: the robot moves at v (nv,), or stands still."""
+        """Forgets the ticks before: the robot moves at v (nv,), or stands still; it keeps what it carries."""
         self._assembly.remember(np.zeros(self._v_shape) if v is None else require_finite("v", v, self._v_shape))
         self._q_last[:] = self.scene.robot.home
         self._obstacles.reset()
@@ -241,7 +317,7 @@ class Controller:
         q: Array,
         t: float,
         targets: Mapping[str, Any] | None,
-        obstacles: Mapping[str, Sample | Pose] | None,
+        obstacles: Mapping[str, Sample | Pose | Points] | None,
         v: Array | None,
         desired: Array | None = None,
     ) -> tuple[tuple[Any, ...], Proximity, Problem, Solution]:
@@ -272,12 +348,13 @@ class Controller:
         observed = self._obstacles.observe(t, obstacles)
         assumed: tuple[str, ...] = ()
         if observed is not None:
-            for index, sample, margin in observed.seen:
-                self._query.place_obstacle(index, sample, margin)
-                self._guard.see(index, sample)
+            for index, sample, margin, voxels in observed.seen:
+                self._query.place_obstacle(index, sample, margin, voxels)
+                self._guard.see(index, sample, voxels)
             faults, assumed = faults + observed.stop, observed.assumed
         self._kinematics.compute(q)
         self._query.compute(self._kinematics.data, self._reach)
+        self._grasps.update()
         proximity, problem = self._assembly.compute(q, samples, self._query, self._reach)
         if desired is not None:
             problem = self._assembly.follow(desired, problem)

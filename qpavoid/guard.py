@@ -21,6 +21,7 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid.assembly import Assembly
+from qpavoid.cloud import Voxels
 from qpavoid.kernels.vectorised import speed_to_stop
 from qpavoid.kinematics import ForwardKinematics
 from qpavoid.limits import JointBounds
@@ -89,9 +90,20 @@ class Guard:
         self._given = np.zeros(len(scene.pairs))
         self._samples: dict[int, Sample] = {}
 
-    def see(self, index: int, sample: Sample) -> None:
-        """Where obstacle number `index` is now, and how it moves."""
+    def see(self, index: int, sample: Sample, voxels: Voxels | None = None) -> None:
+        """Where obstacle number `index` is now, how it moves and, of a cloud with news, what is in it."""
         self._samples[index] = sample
+        if voxels is not None:
+            self._ahead.place_obstacle(index, sample, voxels=voxels)
+
+    @property
+    def ahead(self) -> DistanceQuery:
+        """Distances along the way, for what has to know who carries what."""
+        return self._ahead
+
+    def forget(self, index: int) -> None:
+        """Takes obstacle number `index` as resting where it is, or as carried."""
+        self._samples.pop(index, None)
 
     def check(
         self,
@@ -125,6 +137,7 @@ class Guard:
         self._given[:] = 0.0
         if solution.slack is not None:
             self._given[near] = 1.1 * horizon * solution.slack
+            self._given[:] = self._ahead.widest(self._given)
         self._place_obstacles(query.margin)
         speed = float(np.max(query.speeds))
         gap = float(np.min(query.found(query.pairs), initial=reach)) - self._hold

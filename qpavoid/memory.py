@@ -68,6 +68,6 @@ def read_results(results: Any) -> Array:
 def view_results(results: Any) -> Array | None:
     """The same as a view, or None where it does not agree with the accessors."""
     # the distance stands before the normal
-    view = _view([_address(result.normal) - 8 for result in results], RESULT)
+    view = _view([_address(result.normal) - 8 for result in results], RESULT, writeable=True)
     agrees = view is not None and np.array_equal(view, read_results(results), equal_nan=True)
     return view if agrees else None

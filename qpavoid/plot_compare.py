@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull
 
 from qpavoid.log import Log
 from qpavoid.metrics import path_deviation
-from qpavoid.plot_motion import OBSTACLE, RESTING, capsule_faces, moving_bodies, obstacle_faces
+from qpavoid.plot_motion import OBSTACLE, RESTING, capsule_faces, endless, moving_bodies, obstacle_faces
 from qpavoid.plot_style import COLOURS, D2, DASHES, add_grid, add_legend, draw_levels, is_qp, label_distances, units
 from qpavoid.problem import Array
 
@@ -109,7 +109,7 @@ def path_figure(logs: Sequence[Log], styles: Sequence[dict[str, Any]]) -> Figure
         ax = figure.add_axes(box, xlim=(lower[across], upper[across]), ylim=(lower[up], upper[up]))
         for faces, colour, alpha in outlines:
             flat = faces.reshape(-1, 3)[:, [across, up]]
-            hull = flat[ConvexHull(flat).vertices]
+            hull = flat[ConvexHull(flat, qhull_options="QJ").vertices]
             ax.add_patch(Polygon(hull, facecolor=(colour, alpha), edgecolor=colour, linewidth=0.8, zorder=1))
         for k in range(longest.tool.shape[1]):
             path = longest.target[:, k]
@@ -140,6 +140,8 @@ def _outlines(logs: Sequence[Log], log: Log) -> list[tuple[Array, str, float]]:
     """Faces, colour and opacity of obstacles at up to four places, and of bodies at rest that came near."""
     outlines = []
     for i in range(len(log.meta["obstacles"]) if len(log.t) else 0):
+        if endless(log, i):
+            continue
         way = np.cumsum(np.r_[0.0, np.linalg.norm(np.diff(log.obstacle_position[:, i], axis=0), axis=1)])
         ticks = np.unique(np.searchsorted(way, np.linspace(0.0, way[-1], 4))) if way[-1] > 1e-3 else np.zeros(1, int)
         for rank, tick in enumerate(ticks.tolist()):

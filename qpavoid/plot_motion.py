@@ -17,6 +17,7 @@ from qpavoid.problem import Array, IntArray
 from qpavoid.segments import point_segment, segment_segment
 
 MOVING, RESTING, HIT, OBSTACLE, TOOL_PATH = "#6BA3D6", "#C4C4C4", "#C62F2F", "#E69F00", "#007A56"
+GROUND = "#EFE3C8"
 PANELS = 6
 _PANEL = np.array([3.0, 2.9])  # largest width and height of a panel on paper [in]
 _AROUND, _ARC = 28, 8
@@ -56,7 +57,7 @@ def motion_figure(log: Log) -> Figure:
         ax: Any = figure.add_axes(box, projection="3d", proj_type="ortho", computed_zorder=False)
         ax.patch.set_visible(False)
         ax.view_init(elevation, azimuth)
-        _draw(ax, log, int(tick), towards)
+        _draw(ax, log, int(tick), towards, lower, upper)
         ax.set(xlim=(lower[0], upper[0]), ylim=(lower[1], upper[1]), zlim=(lower[2], upper[2]))
         ax.set_box_aspect(size)
         title = f"t = {log.t[tick]:.2f} s" + (" (closest)" if tick == closest else "")
@@ -99,11 +100,18 @@ def moving_bodies(log: Log) -> Any:
 
 
 def shape_faces(shape: dict[str, Any]) -> Array:
-    """Outward quadrilaterals (m, 4, 3) of a shape of the log in its own frame [m]."""
+    """Outward quadrilaterals (m, 4, 3) of a shape of the log in its own frame [m]; of a half-space, of its plane."""
     if shape["type"] == "box":
         return _box_faces(np.array(shape["size"]))
+    if shape["type"] == "ellipsoid":
+        return np.asarray(shape_faces({"type": "sphere", "radius": 1.0}) * np.array(shape["radii"]))
+    if shape["type"] == "half_space":
+        return _box_faces(np.array([_PLANE, _PLANE, 0.0]), 40)[-1600:]
     radius, half = shape["radius"], 0.5 * shape.get("length", 0.0)
-    if shape["type"] == "cylinder":
+    if shape["type"] == "cone":
+        side = np.linspace(0.0, 1.0, _ARC)
+        profile_r, profile_z = np.r_[0.0, radius * (1.0 - side)], np.r_[-half, half * (2.0 * side - 1.0)]
+    elif shape["type"] == "cylinder":
         side = np.linspace(-half, half, _ARC)
         profile_r, profile_z = np.r_[0.0, np.full(_ARC, radius), 0.0], np.r_[-half, side, half]
     else:
@@ -147,10 +155,30 @@ def _box_faces(size: Array, cuts: int = 6) -> Array:
     return np.concatenate(faces) * 0.5 * size
 
 
+_PLANE = 4.0
+"""Side of what is drawn of the plane of a half-space [m]."""
+
+
+def local_faces(obstacle: dict[str, Any]) -> Array:
+    """Outward quadrilaterals (m, 4, 3) of an obstacle of the log in its own frame [m]."""
+    if "triangles" in obstacle:
+        triangles = np.array(obstacle["triangles"]).reshape(-1, 3, 3)
+        return triangles[:, [0, 1, 2, 2]]
+    if "voxels" in obstacle:
+        voxel = _box_faces(np.full(3, obstacle["shape"]["resolution"]), 1)
+        return np.asarray(voxel + np.array(obstacle["voxels"]).reshape(-1, 1, 1, 3)).reshape(-1, 4, 3)
+    return shape_faces(obstacle["shape"])
+
+
 def obstacle_faces(log: Log, index: int, tick: int) -> Array:
     """Outward quadrilaterals (m, 4, 3) of an obstacle at a tick, in world axes [m]."""
-    faces = shape_faces(log.meta["obstacles"][index]["shape"])
+    faces = local_faces(log.meta["obstacles"][index])
     return np.asarray(faces @ log.obstacle_rotation[tick, index].T + log.obstacle_position[tick, index])
+
+
+def endless(log: Log, index: int) -> bool:
+    """Whether an obstacle is a half-space: it has no size and no middle."""
+    return bool(log.meta["obstacles"][index]["shape"]["type"] == "half_space")
 
 
 # --- view ---------------------------------------------------------------------------------------------------
@@ -172,8 +200,9 @@ def view_angles(log: Log) -> tuple[float, float]:
     path = log.target[np.linspace(0, len(log.t) - 1, 2 * PANELS).astype(int)].reshape(-1, 3)
     spread = path - path.mean(axis=0)
     size = np.linalg.norm(spread)
-    centres = log.obstacle_position[np.linspace(0, len(log.t) - 1, PANELS).astype(int)].reshape(-1, 3)
-    half_sizes = [np.ptp(shape_faces(o["shape"]).reshape(-1, 3), axis=0).mean() / 2 for o in log.meta["obstacles"]]
+    sized = [i for i in range(len(log.meta["obstacles"])) if not endless(log, i)]
+    centres = log.obstacle_position[np.linspace(0, len(log.t) - 1, PANELS).astype(int)][:, sized].reshape(-1, 3)
+    half_sizes = [_extent(log.meta["obstacles"][i]) / 2 for i in sized]
     points = np.concatenate([path, log.body_ends[0].mean(axis=1), log.body_ends[0, :, 1], centres])[:, None]
     start = np.concatenate([log.body_ends[0, :, 0], centres])
     end = np.concatenate([log.body_ends[0, :, 1], centres])
@@ -191,11 +220,17 @@ def view_angles(log: Log) -> tuple[float, float]:
     return best
 
 
+def _extent(obstacle: dict[str, Any]) -> float:
+    faces = local_faces(obstacle).reshape(-1, 3)
+    return float(np.ptp(faces, axis=0).mean()) if len(faces) else 0.0
+
+
 def _limits(log: Log, ticks: IntArray) -> tuple[Array, Array]:
     radii = np.array(log.meta["body_radii"]).reshape(-1, 1, 1)
     points = [log.target.reshape(-1, 3), log.tool.reshape(-1, 3)]
     points += [(log.body_ends[ticks] + sign * radii).reshape(-1, 3) for sign in (-1.0, 1.0)]
-    points += [obstacle_faces(log, i, t).reshape(-1, 3) for i in range(len(log.meta["obstacles"])) for t in ticks]
+    sized = [i for i in range(len(log.meta["obstacles"])) if not endless(log, i)]
+    points += [obstacle_faces(log, i, t).reshape(-1, 3) for i in sized for t in ticks]
     cloud = np.concatenate(points)
     cloud = cloud[np.isfinite(cloud).all(axis=1)]
     lower, upper = (cloud.min(axis=0), cloud.max(axis=0)) if len(cloud) else (-np.ones(3), np.ones(3))
@@ -207,14 +242,18 @@ def _limits(log: Log, ticks: IntArray) -> tuple[Array, Array]:
 # --- drawing ------------------------------------------------------------------------------------------------
 
 
-def _draw(ax: Any, log: Log, tick: int, towards: Array) -> None:
+def _draw(ax: Any, log: Log, tick: int, towards: Array, lower: Array, upper: Array) -> None:
     moving, touching = moving_bodies(log), log.body_distance[tick] < 0.0
     surfaces = []
     for i, radius in enumerate(log.meta["body_radii"]):
         # A little thicker when hit: neighbours share the ball at their joint, and its colour would be patchy.
         faces = capsule_faces(log.body_ends[tick, i], 1.06 * radius if touching[i] else radius)
         surfaces.append((faces, HIT if touching[i] else MOVING if moving[i] else RESTING))
-    surfaces += [(obstacle_faces(log, i, tick), OBSTACLE) for i in range(len(log.meta["obstacles"]))]
+    for i in range(len(log.meta["obstacles"])):
+        faces = obstacle_faces(log, i, tick)
+        if endless(log, i):
+            faces = faces[((faces >= lower) & (faces <= upper)).all(axis=(1, 2))]
+        surfaces.append((faces, GROUND if endless(log, i) else OBSTACLE))
     if surfaces:
         # One collection for all: matplotlib sorts faces by depth within a collection only.
         faces = np.concatenate([faces for faces, _ in surfaces])

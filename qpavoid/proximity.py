@@ -9,19 +9,27 @@ from __future__ import annotations
 from math import hypot, isfinite
 from typing import Any
 
+import coal
 import numpy as np
 import pinocchio as pin
 
 from qpavoid import kernels
 from qpavoid.bodies import bounding_sphere
+from qpavoid.cloud import Voxels
+from qpavoid.config import PointCloud
 from qpavoid.errors import NumericalError
 from qpavoid.memory import read_poses, read_results, view_poses, view_results
 from qpavoid.motion import Sample
 from qpavoid.problem import Array, IntArray
 from qpavoid.scene import Scene
+from qpavoid.slots import Slots
 
 _CULL_FROM = 48 if kernels.ACCELERATED else 192
 """Number of pairs from which looking at bounding spheres first pays."""
+_LONGEST_GRASP = 0.5
+"""Largest gap between the robot and what it carries [m]."""
+_FARTHEST_STOP = 1.0
+"""How far the robot may go before it stands, where a half-space that turns is concerned [m]."""
 
 
 class DistanceQuery:
@@ -33,58 +41,93 @@ class DistanceQuery:
         self._data = self._geometry.createData()
         for request in self._data.distanceRequests:
             request.gjk_tolerance = 1e-10  # the default 1e-6 leaves errors of 7e-3 in normals of boxes and hulls
-        self._first_obstacle = len(scene.body_names)
-        obstacles = len(scene.obstacles)
-        self.twists = np.zeros((obstacles + 1, 6))
-        """(o + 1, 6) of the obstacles at the world's origin; the last row stays zero: for the robot's own bodies."""
-        self.margin = np.zeros(obstacles + 1)
-        """(o + 1,) to be taken off the distances to each obstacle [m]; the last one stays zero."""
+        bodies = self._geometry.geometryObjects
+        self._first_obstacle, self._movable = len(scene.body_names), scene.movable
+        self._pieces = [np.flatnonzero(scene.obstacle_of == i).tolist() for i in range(len(scene.obstacles))]
+        obstacles, graspable = len(scene.obstacles), self._movable - self._first_obstacle
+        self.twists = np.zeros((obstacles + 1 + graspable, 6))
+        """(o + 1 + c, 6) of the obstacles at the world's origin; row o stays zero: for the robot and its loads.
+        The last c are those of the obstacles that can be carried, negative: for pairs of which they come first."""
+        self.margin = np.zeros(len(self.twists))
+        """(o + 1 + c,) to be taken off the distances to each obstacle, likewise [m]."""
         self._moving: set[int] = set()
-        self._placements = view_poses([body.placement for body in self._geometry.geometryObjects], writeable=True)
-        second = scene.pairs[:, 1] - self._first_obstacle
-        self.twist_row: IntArray = np.where(second >= 0, second, obstacles)
-        """(m,) row of `twists` that moves each pair's second body."""
+        self._placements = view_poses([body.placement for body in bodies], writeable=True)
         model = scene.robot.model
         pin.updateGeometryPlacements(model, model.createData(), self._geometry, self._data, pin.neutral(model))
         pin.computeDistances(self._geometry, self._data)  # so that there is something to compare the view with
         view = view_results(self._data.distanceResults)
         self.results: Array = read_results(self._data.distanceResults) if view is None else view
         """(m, 10) [distance, normal, point a, point b] of all pairs; only those of `pairs` are of this tick."""
-        poses = view_poses(self._data.oMg)
+        poses = view_poses(self._data.oMg, writeable=True)
         self.poses: Array = read_poses(self._data.oMg) if poses is None else poses
         """(g, 12) world poses of all bodies, the robot's first."""
         self._copy, self._copy_poses = view is None, poses is None
-        shapes = [bounding_sphere(body.geometry) for body in self._geometry.geometryObjects]
+        shapes = [bounding_sphere(body.geometry) for body in bodies]
         self.spheres = np.array([(*center, radius) for center, radius in shapes]).reshape(-1, 4)
-        """(g, 4) bounding sphere of each body in its own frame: centre and radius [m]."""
+        """(g, 4) bounding sphere of each body in its own frame: centre and radius [m]; infinite of a half-space."""
         self._joints = model.njoints
         self.speeds = np.zeros(model.njoints + obstacles)
         """(njoints + o,) largest speed of any point that a joint carries, or of an obstacle [m/s]; here, the latter."""
-        self._cull = _Cull(scene, self) if len(scene.pairs) >= _CULL_FROM else None
+        self._samples = [obstacle.motion.sample(0.0) for obstacle in scene.obstacles]
+        self.group: IntArray = np.arange(len(scene.pairs))
+        """(m,) first of the pairs of the same body and point cloud; of other pairs, their own number."""
+        self._grouped = np.zeros(len(scene.pairs), dtype=bool)
+        self._slots = {i: self._make_slots(i, voxels) for i, voxels in scene.clouds.items()}
+        self.carried: dict[int, int] = {}
+        """Joint that carries each obstacle which is carried, by number of the obstacle."""
+        self.unwatched: Any = None
+        """(m,) pairs that are computed but of which no row is made; None where there are none."""
+        self.enabled = np.ones(len(scene.pairs), dtype=bool)
+        """(m,) which pairs are computed at all."""
+        self.twist_row: IntArray = np.zeros(len(scene.pairs), dtype=np.intp)
+        """(m,) row of `twists` that moves each pair."""
+        self._cull = _Cull(scene, self) if len(scene.pairs) >= _CULL_FROM or self._slots else None
         self.pairs: IntArray = np.arange(len(scene.pairs))
-        """(c,) pairs that were computed, increasing."""
+        """(c,) pairs that were computed and are to get rows, increasing."""
+        self._surface = _surface_pairs(scene)
+        self.switch()
 
     @property
     def moving(self) -> bool:
         """Whether any obstacle has a velocity or a margin."""
         return bool(self._moving)
 
+    @property
+    def bodies(self) -> Any:
+        """Geometries as they are placed and carried now, in the order of the geometry model."""
+        return self._geometry.geometryObjects
+
+    def longest_reach(self) -> Array:
+        """(njoints,) the same as `joint_reach`, with whatever may ever be carried [m]."""
+        radii, reach = self.spheres[self._first_obstacle : self._movable, 3], self.joint_reach()
+        return np.full_like(reach, reach.max() + 2.0 * radii.max() + _LONGEST_GRASP) if len(radii) else reach
+
     def carriers(self) -> IntArray:
         """(m, 2) what moves the two bodies of each pair: number of a joint, or njoints plus that of an obstacle."""
         joints = np.array([body.parentJoint for body in self._geometry.geometryObjects], dtype=np.intp)
-        joints[self._first_obstacle :] = self._joints + np.arange(len(self._scene.obstacles))
+        of = self._scene.obstacle_of
+        free = (of >= 0) & ~np.isin(of, list(self.carried))
+        joints[free] = self._joints + of[free]
         return joints[self._scene.pairs]
 
     def joint_reach(self) -> Array:
         """(njoints,) distance from each joint's origin to the farthest point of a body that it carries [m]."""
         reach = np.zeros(self._joints)
-        for body, (*center, radius) in zip(self._scene.robot.bodies.geometryObjects, self.spheres, strict=False):
+        bodies = self._geometry.geometryObjects
+        for i in [*range(self._first_obstacle), *(self._pieces[index][0] for index in self.carried)]:
+            body, (*center, radius) = bodies[i], self.spheres[i]
             placed = body.placement.rotation @ np.array(center) + body.placement.translation
             reach[body.parentJoint] = max(reach[body.parentJoint], float(np.linalg.norm(placed)) + radius)
         return reach
 
-    def place_obstacle(self, index: int, sample: Sample, margin: float = 0.0) -> None:
+    def place_obstacle(self, index: int, sample: Sample, margin: float = 0.0, voxels: Voxels | None = None) -> None:
         """Puts obstacle number `index` to a pose, with a velocity, and takes a margin [m] off its distances.
+
+        Args:
+            index: which one; not one that is carried.
+            sample: where it is and how it moves.
+            margin: taken off its distances [m].
+            voxels: of a point cloud, what is in it now; as before if left out.
 
         Raises:
             NumericalError: NaN or infinity; names the obstacle, which stays where it was.
@@ -96,25 +139,82 @@ class DistanceQuery:
             raise NumericalError(
                 f"obstacle {self._scene.obstacles[index].name!r}: NaN or infinity in its pose or twist"
             )
-        geometry = self._first_obstacle + index
         self.margin[index] = margin
+        self._samples[index] = sample
+        slots = self._slots.get(index)
+        if slots is None:
+            for geometry in self._pieces[index]:
+                self._place(geometry, sample)
+        elif voxels is not None and voxels is not slots.voxels:
+            slots.fill_with(voxels)
+        twist = (vx - wy * z + wz * y, vy - wz * x + wx * z, vz - wx * y + wy * x, wx, wy, wz)
+        self.twists[index] = twist
+        if self._pieces[index][0] < self._movable:
+            negative = len(self._pieces) + 1 + index
+            self.twists[negative], self.margin[negative] = np.negative(twist), margin
+        if any(twist) or margin:
+            self._moving.add(index)
+            turn = hypot(wx, wy, wz)
+            self.speeds[self._joints + index] = hypot(vx, vy, vz) + (turn * self._reach_of(index) if turn else 0.0)
+        else:
+            self._moving.discard(index)
+            self.speeds[self._joints + index] = 0.0
+
+    def _reach_of(self, index: int) -> float:
+        """Distance from an obstacle's origin to its farthest point that may matter [m]."""
+        if index in self._slots:
+            return self._slots[index].reach
+        reach = max(
+            float(np.linalg.norm(self.spheres[geometry, :3]) + self.spheres[geometry, 3])
+            for geometry in self._pieces[index]
+        )
+        if isfinite(reach):
+            return reach
+        # of a half-space, as far as the robot reaches, and what it may come to reach before it stands
+        away = np.linalg.norm(self.poses[: self._movable, 9:] - self._samples[index].position, axis=1)
+        return float(np.max(away + self.spheres[: self._movable, 3])) + _FARTHEST_STOP
+
+    def _place(self, geometry: int, sample: Sample) -> None:
         if self._placements is None:
             self._geometry.geometryObjects[geometry].placement = pin.SE3(sample.rotation, sample.position)
         else:
             self._placements[geometry, :9] = sample.rotation.T.ravel()
             self._placements[geometry, 9:] = sample.position
-        twist = (vx - wy * z + wz * y, vy - wz * x + wx * z, vz - wx * y + wy * x, wx, wy, wz)
-        self.twists[index] = twist
-        if any(twist) or margin:
-            self._moving.add(index)
-            reach = float(np.linalg.norm(self.spheres[geometry, :3]) + self.spheres[geometry, 3])
-            own = sample.linear.tolist()
-            self.speeds[self._joints + index] = hypot(*own) + hypot(wx, wy, wz) * reach
-        else:
-            self._moving.discard(index)
-            self.speeds[self._joints + index] = 0.0
         if self._cull is not None:
             self._cull.place(geometry, sample.rotation, sample.position)
+
+    def carry(self, index: int, joint: int, sample: Sample) -> None:
+        """Lets a joint carry an obstacle from now on, or nobody.
+
+        Args:
+            index: number of the obstacle.
+            joint: number of the joint; 0 for none.
+            sample: its pose in the joint's frame, or in the world.
+        """
+        (geometry,) = self._pieces[index]
+        self._geometry.geometryObjects[geometry].parentJoint = joint
+        self.place_obstacle(index, sample)
+        self.carried.pop(index, None)
+        if joint:
+            self.carried[index] = joint
+        self.switch()
+
+    def switch(self) -> None:
+        """Brings what depends on who carries what up to date, in place."""
+        scene, obstacles = self._scene, len(self._scene.obstacles)
+        free = ~np.isin(scene.obstacle_of, list(self.carried)) & (scene.obstacle_of >= 0)
+        first, second = scene.pairs.T
+        of = scene.obstacle_of
+        negative = np.where(free[first], obstacles + 1 + of[first], obstacles)
+        self.twist_row[:] = np.where(free[second], of[second], negative)
+        self.enabled[:] = ~(free[first] & free[second])
+        self._off = np.flatnonzero(free[: self._movable])
+        self._on = np.flatnonzero(self.enabled)
+        if self._cull is not None:
+            self._cull.enable(self.enabled)
+        else:
+            for pair, on in enumerate(self.enabled.tolist()):
+                (self._data.activateCollisionPair if on else self._data.deactivateCollisionPair)(pair)
 
     def compute(self, data: Any, reach: float) -> None:
         """Brings `results` up to date for every pair nearer than `reach`, and says in `pairs` which ones it computed.
@@ -126,16 +226,79 @@ class DistanceQuery:
         pin.updateGeometryPlacements(self._scene.robot.model, data, self._geometry, self._data)
         if self._copy_poses:
             self.poses[:] = read_poses(self._data.oMg)
-        if self._cull is not None:
-            self.pairs = self._cull.switch(reach)
+        for index, slots in self._slots.items():
+            self._fill(index, slots, reach)
+        pairs = self._on if self._cull is None else self._cull.switch(reach)
         pin.computeDistances(self._geometry, self._data)
         if self._copy:
             self.results[:] = read_results(self._data.distanceResults)
+        if len(self._surface):
+            self._mend_surfaces(pairs)
+        self._computed = pairs
+        self.pairs = pairs if self.unwatched is None else pairs[~self.unwatched[pairs]]
 
     def found(self, pairs: IntArray) -> Array:
-        """Distances (k,) of some pairs at the last call; infinite for those that were out of reach [m]."""
+        """Distances (k,) of some pairs at the last call; infinite for those that were out of reach [m].
+
+        Of a point cloud, that of its nearest voxel to each body: which voxel it is changes, and is not what counts.
+        """
         distance = self.results[pairs, 0]
-        return distance if self._cull is None else np.where(self._cull.active[pairs], distance, np.inf)
+        if self._cull is not None:
+            distance = np.where(self._cull.active[pairs], distance, np.inf)
+        if self._slots:
+            least = np.full(len(self._scene.pairs), np.inf)
+            near = self._computed
+            np.minimum.at(least, self.group[near], self.results[near, 0])
+            distance = np.where(self._grouped[pairs], least[self.group[pairs]], distance)
+        return np.asarray(distance)
+
+    def widest(self, given: Array) -> Array:
+        """What is granted (m,) to each pair; of the balls of a cloud, each body's most."""
+        if not self._slots:
+            return given
+        most = np.zeros_like(given)
+        np.maximum.at(most, self.group, given)
+        return most[self.group]
+
+    def _make_slots(self, index: int, voxels: Voxels) -> Slots:
+        shape, first = self._scene.obstacles[index].shape, self._movable
+        assert isinstance(shape, PointCloud)
+        a, b = self._scene.pairs.T
+        mine = np.flatnonzero(self._scene.obstacle_of[b] == index)
+        self._grouped[mine] = True
+        self.group[mine] = mine[np.searchsorted(a[mine], a[mine])]
+        bodies = [self._geometry.geometryObjects[i].geometry for i in range(first)]
+        return Slots(bodies, np.array(self._pieces[index]), shape.resolution, shape.nearest, voxels)
+
+    def _fill(self, index: int, slots: Slots, reach: float) -> None:
+        """Puts the balls of a cloud to the voxels that are nearest to each body."""
+        places = slots.places(self.poses[: self._movable], self._off, self._samples[index], reach).reshape(-1, 3)
+        geometries = slots.geometries.ravel()
+        self.poses[geometries, 9:] = places
+        if self._copy_poses:
+            for geometry, place in zip(geometries.tolist(), places, strict=True):
+                self._data.oMg[geometry] = pin.SE3(np.eye(3), place)
+        assert self._cull is not None
+        self._cull.place_points(geometries, places)
+
+    def _mend_surfaces(self, pairs: IntArray) -> None:
+        """Of two triangle meshes coal gives no normal; of one that is cut through, no distance to be trusted."""
+        pairs = pairs[np.isin(pairs, self._surface, assume_unique=True)]
+        results = self.results[pairs]
+        apart = results[:, 0] > 0.0
+        results[~apart, 0] = np.nan
+        way = results[:, 7:10] - results[:, 4:7]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            results[:, 1:4] = way / np.linalg.norm(way, axis=1, keepdims=True)
+        self.results[pairs] = results
+
+
+def _surface_pairs(scene: Scene) -> IntArray:
+    """Pairs with a triangle mesh in them, other than with a half-space."""
+    kinds = [body.geometry for body in scene.geometry.geometryObjects]
+    mesh = np.array([isinstance(kind, coal.BVHModelBase) for kind in kinds], dtype=bool)
+    flat = np.array([isinstance(kind, coal.Halfspace) for kind in kinds], dtype=bool)
+    return np.flatnonzero(mesh[scene.pairs].any(axis=1) & ~flat[scene.pairs].any(axis=1))
 
 
 class _Cull:
@@ -143,7 +306,7 @@ class _Cull:
 
     def __init__(self, scene: Scene, query: DistanceQuery) -> None:
         self._query, self._data = query, query._data
-        self._bodies = len(scene.body_names)
+        self._bodies = scene.movable
         self._local, self._radius = query.spheres[:, :3].copy(), query.spheres[:, 3].copy()
         self._centered = (self._local == 0.0).all(axis=1).tolist()
         self._centers = np.ones((len(self._local), 5))
@@ -152,6 +315,7 @@ class _Cull:
         self._pair_of = np.full((self._bodies, len(self._local)), -1, dtype=np.intp)
         self._pair_of[scene.pairs[:, 0], scene.pairs[:, 1]] = np.arange(len(scene.pairs))
         self._reach = np.nan
+        self._wanted: Any = None
         self._within: Array = np.empty(self._pair_of.shape)
         self._found = np.zeros(len(scene.pairs), dtype=np.intp)
         self.active = np.ones(len(scene.pairs), dtype=bool)
@@ -163,11 +327,20 @@ class _Cull:
         center = position if self._centered[index] else rotation @ self._local[index] + position
         self._centers[index, :3], self._centers[index, 4] = center, -(center @ center)
 
+    def place_points(self, indices: IntArray, positions: Array) -> None:
+        """Moves the bounding spheres of several geometries (k,), whose centres are their origins (k, 3)."""
+        self._centers[indices, :3] = positions
+        self._centers[indices, 4] = -np.einsum("ij,ij->i", positions, positions)
+
+    def enable(self, pairs: Any) -> None:
+        """Takes only some pairs (m,) into account from now on."""
+        self._wanted, self._reach = (self._pair_of >= 0) & pairs[self._pair_of], np.nan
+
     def switch(self, reach: float) -> IntArray:
         """Switches pairs on and off; gives those that are on, in increasing order."""
         if reach != self._reach:
             touching = self._radius[: self._bodies, None] + self._radius + reach
-            self._within = np.where(self._pair_of >= 0, touching**2 * (1.0 + 1e-9), -1.0)
+            self._within = np.where(self._wanted, touching**2 * (1.0 + 1e-9), -1.0)
             self._reach = reach
         count = kernels.candidates(
             self._query.poses, self._local, self._centers, self._within, self._pair_of, self._found

@@ -16,7 +16,8 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from qpavoid.config import Sensing
+from qpavoid.cloud import Points, Voxels
+from qpavoid.config import PointCloud, Sensing
 from qpavoid.errors import NumericalError, UnknownName
 from qpavoid.loading import nearest
 from qpavoid.motion import Sample, moved_on
@@ -51,6 +52,8 @@ class Seen(NamedTuple):
     sample: Sample
     margin: float
     """To be taken off its distances [m]."""
+    voxels: Voxels | None = None
+    """Of a point cloud with news: what is in it now."""
 
 
 class Observation(NamedTuple):
@@ -82,8 +85,25 @@ class Obstacles:
         self._index = {obstacle.name: i for i, obstacle in enumerate(obstacles)}
         self._moving = [i for i, obstacle in enumerate(obstacles) if obstacle.moves]
         self._tracks: dict[int, _Track] = {}
+        self._carried: set[int] = set()
 
-    def observe(self, t: float, given: Mapping[str, Sample | Pose] | None) -> Observation | None:
+    def index(self, name: str) -> int:
+        """Number of an obstacle.
+
+        Raises:
+            UnknownName: there is none of that name.
+        """
+        if name not in self._index:
+            raise UnknownName(f"no obstacle {name!r}{nearest(name, self._index)}")
+        return self._index[name]
+
+    def carry(self, index: int, carried: bool) -> None:
+        """Takes an obstacle as carried by the robot, or as resting where it was put down, until it is given again."""
+        self._moving = [i for i in self._moving if i != index]
+        self._tracks.pop(index, None)
+        (self._carried.add if carried else self._carried.discard)(index)
+
+    def observe(self, t: float, given: Mapping[str, Sample | Pose | Points] | None) -> Observation | None:
         """What there is to know at time t [s]; None where nothing has changed.
 
         Args:
@@ -97,11 +117,17 @@ class Obstacles:
         if not given and not self._moving and not self._tracks:
             return None
         fresh: dict[int, Sample | Pose] = {}
+        voxels: dict[int, Voxels] = {}
         notes: list[str] = []
         for name, what in (given or {}).items():
-            if name not in self._index:
-                raise UnknownName(f"no obstacle {name!r}{nearest(name, self._index)}")
-            fresh[self._index[name]] = as_sample(f"obstacle {name!r}", what)
+            index = self.index(name)
+            if index in self._carried:
+                notes.append(f"{name}: carried by the robot, what is given of it is not read")
+            elif type(what) is Points:
+                if not self._look_at(index, what, t, fresh, voxels, notes):
+                    self._tracks.setdefault(index, self._unseen(index, t))
+            else:
+                fresh[index] = as_sample(f"obstacle {name!r}", what)
         for index in [index for index, what in fresh.items() if not finite(what)]:
             notes.append(f"{self._obstacles[index].name}: NaN or infinity in its pose or twist, taken as not given")
             del fresh[index]
@@ -117,7 +143,7 @@ class Obstacles:
         for index, track in self._tracks.items():
             name = self._obstacles[index].name
             if index in fresh:
-                seen.append(Seen(index, track.sample, 0.0))
+                seen.append(Seen(index, track.sample, 0.0, voxels.get(index)))
                 if track.estimated:
                     notes.append(f"{name}: twist estimated from its poses")
             else:
@@ -128,6 +154,42 @@ class Obstacles:
     def reset(self) -> None:
         """Forgets what was given."""
         self._tracks.clear()
+
+    def _look_at(
+        self,
+        index: int,
+        what: Points,
+        t: float,
+        fresh: dict[int, Sample | Pose],
+        voxels: dict[int, Voxels],
+        notes: list[str],
+    ) -> bool:
+        """Takes a picture of a camera in; false where none of its points can be used."""
+        name, shape = self._obstacles[index].name, self._obstacles[index].shape
+        if not isinstance(shape, PointCloud):
+            raise NumericalError(f"obstacle {name!r}: points of a {shape.type}; give a Sample or a Pose")
+        if isinstance(what.points, Voxels):
+            seen = what.points
+            if seen.resolution != shape.resolution:
+                raise NumericalError(
+                    f"obstacle {name!r}: voxels of {seen.resolution} m, but its resolution is {shape.resolution}"
+                )
+        else:
+            try:
+                seen = Voxels.of(what.points, shape.resolution)
+            except NumericalError as error:
+                raise NumericalError(f"obstacle {name!r}: {error}") from None
+        if seen.dropped:
+            bad = f"{seen.dropped} of {seen.given} points are NaN, infinite or more than 100 m away"
+            if seen.dropped == seen.given:
+                notes.append(f"{name}: {bad}, taken as not given")
+                return False
+            notes.append(f"{name}: {bad}, dropped")
+        before = self._tracks.get(index)
+        last = before.sample if before else self._obstacles[index].motion.sample(t)
+        fresh[index] = last if what.pose is None else as_sample(f"obstacle {name!r}", what.pose)
+        voxels[index] = seen
+        return True
 
     def _unseen(self, index: int, t: float) -> _Track:
         return _Track(self._obstacles[index].motion.sample(t), estimated=False)

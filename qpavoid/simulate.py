@@ -11,13 +11,15 @@ import pinocchio as pin
 
 from qpavoid import gains
 from qpavoid.bodies import enclosing_capsule
-from qpavoid.config import ScenarioConfig
+from qpavoid.config import Mesh, PointCloud, ScenarioConfig
 from qpavoid.controller import Controller, Tick
 from qpavoid.errors import ConfigError, NumericalError
 from qpavoid.loading import load_scenario
 from qpavoid.log import STATUSES, Log, versions
 from qpavoid.problem import Array, Solution, Status
 from qpavoid.proximity import DistanceQuery
+from qpavoid.scene import FAR, Scene
+from qpavoid.solids import drawn_triangles
 from qpavoid.solvers import parse_solver
 from qpavoid.tasks import in_order
 
@@ -102,6 +104,7 @@ class Recorder:
         scene, model = controller.scene, controller.scene.robot.model
         self._scene, self._scenario = scene, scenario
         self._frames, self._others = in_order(controller.tasks)
+        self._controller = controller
         self._data, self._query = model.createData(), DistanceQuery(scene)  # distances of all pairs, near or not
         self._ends, self._radii = _drawing_axes(scene.robot.bodies)
         tasks, bodies, obstacles = len(self._frames), len(scene.body_names), len(scene.obstacles)
@@ -166,18 +169,29 @@ class Recorder:
     def _write_bodies(self, tick: Tick, rows: dict[str, Array]) -> None:
         scene = self._scene
         pin.forwardKinematics(scene.robot.model, self._data, tick.state.q)
+        self._controller.tell_who_carries(self._query)
+        bearer = np.arange(len(scene.geometry.geometryObjects))
         for i, obstacle in enumerate(scene.obstacles):
-            sample = obstacle.motion.sample(tick.state.t)
+            carried = i in self._query.carried
+            sample = (
+                self._controller.obstacle_pose(obstacle.name, tick.state.q)
+                if carried
+                else obstacle.motion.sample(tick.state.t)
+            )
             rows["obstacle_position"][i], rows["obstacle_rotation"][i] = sample.position, sample.rotation
-            if obstacle.moves:
+            if carried:
+                bearer[np.flatnonzero(scene.obstacle_of == i)] = _bearer(scene, self._query.carried[i])
+            elif obstacle.moves:
                 self._query.place_obstacle(i, sample)
         self._query.compute(self._data, np.inf)
-        distance = self._query.results[:, 0]
-        if len(distance):
+        distance, pairs = np.full(len(scene.pairs), np.inf), self._query.pairs
+        distance[pairs] = self._query.results[pairs, 0]
+        distance[distance > 0.5 * FAR] = np.inf
+        if np.isfinite(distance).any():
             self._arrays["closest_pair"][self._count] = np.argmin(distance)
         nearest = np.full(len(scene.geometry.geometryObjects), np.inf)
-        np.minimum.at(nearest, scene.pairs[:, 0], distance)
-        np.minimum.at(nearest, scene.pairs[:, 1], distance)
+        np.minimum.at(nearest, bearer[scene.pairs[:, 0]], distance)
+        np.minimum.at(nearest, bearer[scene.pairs[:, 1]], distance)
         rows["body_distance"][:] = nearest[: rows["body_distance"].shape[0]]
         for i, body in enumerate(scene.robot.bodies.geometryObjects):
             joint = self._data.oMi[body.parentJoint]
@@ -213,12 +227,38 @@ class Recorder:
             "tasks": [[task.settings.label, task.unit] for task in self._others],
             "bodies": scene.body_names,
             "body_radii": self._radii,
-            "obstacles": [{"name": o.name, "shape": o.shape.model_dump(mode="json")} for o in scene.obstacles],
+            "obstacles": [_described(scene, i) for i in range(len(scene.obstacles))],
             "pairs": [list(pair) for pair in scene.pair_names],
             "versions": versions(),
         }
         arrays = {name: array[: self._count].copy() for name, array in self._arrays.items()}
         return Log(**arrays, meta=meta)
+
+
+def _bearer(scene: Scene, joint: int) -> int:
+    """The body to which distances of a load count: the first on the joint that carries it, or on one above."""
+    joints, parents = [body.parentJoint for body in scene.robot.bodies.geometryObjects], scene.robot.model.parents
+    while joint and joint not in joints:
+        joint = int(parents[joint])
+    return joints.index(joint) if joint in joints else 0
+
+
+_MOST_DRAWN = 2000
+"""Triangles or voxels of an obstacle that a log keeps for its figures."""
+
+
+def _described(scene: Scene, index: int) -> dict[str, Any]:
+    """Name and shape of an obstacle, and what figures need of those that come from files."""
+    obstacle = scene.obstacles[index]
+    described: dict[str, Any] = {"name": obstacle.name, "shape": obstacle.shape.model_dump(mode="json")}
+    if isinstance(obstacle.shape, Mesh):
+        solids = [scene.geometry.geometryObjects[int(g)].geometry for g in np.flatnonzero(scene.obstacle_of == index)]
+        triangles = np.concatenate([drawn_triangles(solid) for solid in solids])
+        described["triangles"] = np.round(triangles[:: -(-len(triangles) // _MOST_DRAWN)], 5).tolist()
+    elif isinstance(obstacle.shape, PointCloud):
+        centers = scene.clouds[index].centers
+        described["voxels"] = np.round(centers[:: -(-len(centers) // _MOST_DRAWN) or 1], 5).tolist()
+    return described
 
 
 def _drawing_axes(bodies: Any) -> tuple[Array, list[float]]:

@@ -99,11 +99,12 @@ def build(scene: Scene, q0: Array) -> Arena:
         body.add_joint(name=robot.names[i], type=kind, axis=axis)
         bodies.append(body)
     first = len(scene.body_names)
+    obstacles = [spec.worldbody.add_body(name=f"obstacle {i}", mocap=True) for i in range(len(scene.obstacles))]
     for i, geometry in enumerate(scene.geometry.geometryObjects):
         if i < first:
             _add_geom(spec, bodies[geometry.parentJoint], geometry, geometry.placement)
         else:
-            _add_geom(spec, spec.worldbody.add_body(name=f"obstacle {i}", mocap=True), geometry, pin.SE3.Identity())
+            _add_geom(spec, obstacles[scene.obstacle_of[i]], geometry, pin.SE3.Identity())
     model = spec.compile()
     joints = [model.joint(name) for name in list(robot.names)[1:]]
     arena = Arena(
@@ -141,18 +142,35 @@ def _add_geom(spec: Any, body: Any, geometry: Any, placement: Any) -> None:
     match shape:
         case coal.Sphere():
             body.add_geom(type=kinds.mjGEOM_SPHERE, size=_three(shape.radius), **place)
+        case coal.Capsule() if shape.halfLength == 0.0:
+            body.add_geom(type=kinds.mjGEOM_SPHERE, size=_three(shape.radius), **place)
         case coal.Capsule():
             body.add_geom(type=kinds.mjGEOM_CAPSULE, size=_three(shape.radius, shape.halfLength), **place)
         case coal.Cylinder():
             body.add_geom(type=kinds.mjGEOM_CYLINDER, size=_three(shape.radius, shape.halfLength), **place)
         case coal.Box():
             body.add_geom(type=kinds.mjGEOM_BOX, size=_three(*shape.halfSide), **place)
+        case coal.Ellipsoid():
+            body.add_geom(type=kinds.mjGEOM_ELLIPSOID, size=_three(*shape.radii), **place)
+        case coal.Halfspace():
+            body.add_geom(type=kinds.mjGEOM_BOX, size=_three(_WIDE, _WIDE, _WIDE), **_sunk(place))
         case coal.ConvexBase():
             mesh = spec.add_mesh(name=geometry.name, uservert=np.array(shape.points()).ravel())
             mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
             body.add_geom(type=kinds.mjGEOM_MESH, meshname=geometry.name, **place)
         case _:
             raise ValueError(f"body {geometry.name!r}: {type(shape).__name__} has no counterpart")
+
+
+_WIDE = 20.0
+"""Half the side of the box that stands for a half-space: MuJoCo tells no distance to planes [m]."""
+
+
+def _sunk(place: dict[str, Any]) -> dict[str, Any]:
+    """The same place, for a box whose top face is the plane."""
+    up = np.empty(9)
+    mujoco.mju_quat2Mat(up, place["quat"])
+    return {**place, "pos": np.asarray(place["pos"]) - _WIDE * up[2::3]}
 
 
 def _three(*sizes: float) -> Sequence[float]:

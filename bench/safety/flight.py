@@ -176,8 +176,8 @@ def near_rows(arena: Arena, q: Array, t: float, pairs: Any, reach: float) -> Row
             if geometry < arena.bodies:
                 body = model.geom_bodyid[arena.geoms[geometry]]
                 mujoco.mj_jac(model, data, jacobian[i, side], None, ends[i, side], body)
-            elif scene.obstacles[geometry - arena.bodies].moves:
-                sample = scene.obstacles[geometry - arena.bodies].motion.sample(t)
+            elif scene.obstacles[scene.obstacle_of[geometry]].moves:
+                sample = scene.obstacles[scene.obstacle_of[geometry]].motion.sample(t)
                 velocity[i] = sample.linear + np.cross(sample.angular, ends[i, 1] - sample.position)
     J = np.einsum("kx,kxv->kv", normal, jacobian[:, 1] - jacobian[:, 0])[:, arena.v_index]
     return Rows(pair, d, J, np.sum(normal * velocity, axis=1))

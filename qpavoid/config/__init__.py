@@ -9,7 +9,19 @@ from qpavoid.config.control import Avoidance, Cbf, Damper, Detour, Limits, Progr
 from qpavoid.config.motion import Circle, Csv, Fixed, Line, Motion, Waypoints
 from qpavoid.config.robot import Body, Hull, JointLimits, RobotConfig
 from qpavoid.config.scenario import ObstacleConfig, ScenarioConfig
-from qpavoid.config.shapes import Box, Capsule, Cylinder, Shape, Sphere
+from qpavoid.config.shapes import (
+    Box,
+    Capsule,
+    Cone,
+    Cylinder,
+    Ellipsoid,
+    HalfSpace,
+    Mesh,
+    ObstacleShape,
+    PointCloud,
+    Shape,
+    Sphere,
+)
 from qpavoid.config.solver import Eq10Solver, HqpSolver, QpSolver, SolverConfig, TrackingSolver, expand_solver
 from qpavoid.config.tasks import (
     AlignTask,
@@ -26,9 +38,10 @@ from qpavoid.config.tasks import (
 )
 
 __all__ = [
-    "AlignTask", "AnyTask", "Avoidance", "Block", "Body", "Box", "Capsule", "Cbf", "Circle", "ComTask", "Contact",
-    "Csv", "Cylinder", "Damper", "DampingTask", "Detour", "Eq10Solver", "Fixed", "HqpSolver", "Hull", "JointLimits",
-    "Limits", "Line", "LookAtTask", "ManipulabilityTask", "Motion", "ObstacleConfig", "PostureTask", "Progress",
-    "QpSolver", "RelativeTask", "RobotConfig", "ScenarioConfig", "Sensing", "Shape", "SolverConfig", "Sphere",
-    "Switching", "Task", "TaskBlock", "TrackingSolver", "Waypoints", "expand_solver",
+    "AlignTask", "AnyTask", "Avoidance", "Block", "Body", "Box", "Capsule", "Cbf", "Circle", "ComTask", "Cone",
+    "Contact", "Csv", "Cylinder", "Damper", "DampingTask", "Detour", "Ellipsoid", "Eq10Solver", "Fixed", "HalfSpace",
+    "HqpSolver", "Hull", "JointLimits", "Limits", "Line", "LookAtTask", "ManipulabilityTask", "Mesh", "Motion",
+    "ObstacleConfig", "ObstacleShape", "PointCloud", "PostureTask", "Progress", "QpSolver", "RelativeTask",
+    "RobotConfig", "ScenarioConfig", "Sensing", "Shape", "SolverConfig", "Sphere", "Switching", "Task", "TaskBlock",
+    "TrackingSolver", "Waypoints", "expand_solver",
 ]  # fmt: skip

@@ -10,7 +10,7 @@ from pydantic import Field, PrivateAttr, model_validator
 from qpavoid.config.base import Block, NonNegative, Number, Positive
 from qpavoid.config.control import Avoidance, Limits, Progress, Sensing
 from qpavoid.config.motion import Circle, Fixed, Line, Motion
-from qpavoid.config.shapes import Shape
+from qpavoid.config.shapes import HalfSpace, Mesh, ObstacleShape, PointCloud
 from qpavoid.config.solver import QpSolver, SolverConfig
 from qpavoid.config.tasks import AnyTask, Contact
 
@@ -23,9 +23,24 @@ class ObstacleConfig(Block):
 
     name: str
     """Name by which pairs, logs and messages know it."""
-    shape: Shape
+    shape: ObstacleShape
     motion: Motion
     """Where its origin is; what a task could take from its frame must be given here."""
+    graspable: bool = False
+    """Whether a frame of the robot may carry it for a while; costs pairs with the other obstacles."""
+    carried_by: str | None = None
+    """Frame of the robot that carries it from the start, where `motion` puts it at first."""
+
+    @model_validator(mode="after")
+    def _can_be_carried(self) -> ObstacleConfig:
+        whole = not isinstance(self.shape, HalfSpace | PointCloud)
+        if isinstance(self.shape, Mesh):
+            whole = self.shape.method == "convex"
+        if (self.graspable or self.carried_by is not None) and not whole:
+            raise ValueError(
+                f"a {self.shape.type} cannot be carried; give a primitive, or a mesh with `method: convex`"
+            )
+        return self
 
 
 class ScenarioConfig(Block):

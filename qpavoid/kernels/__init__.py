@@ -14,8 +14,10 @@ ACCELERATED = os.environ.get("QPAVOID_NUMBA", "1") != "0" and find_spec("numba")
 
 if TYPE_CHECKING or not ACCELERATED:
     from qpavoid.kernels import vectorised as _chosen
+    from qpavoid.kernels import voxels as _voxels
 else:
     from qpavoid.kernels import compiled as _chosen
+    from qpavoid.kernels import voxels_compiled as _voxels
 
 assemble = _chosen.assemble
 candidates = _chosen.candidates
@@ -30,11 +32,14 @@ shortfall = _chosen.shortfall
 stop_velocity = _chosen.stop_velocity
 tracking_shortfall = _chosen.tracking_shortfall
 velocity_bounds = _chosen.velocity_bounds
+choose = _voxels.choose
+within_reach = _voxels.within_reach
 
 __all__ = [
     "ACCELERATED",
     "assemble",
     "candidates",
+    "choose",
     "closest_call",
     "damped_solution",
     "distance_rows",
@@ -46,4 +51,5 @@ __all__ = [
     "stop_velocity",
     "tracking_shortfall",
     "velocity_bounds",
+    "within_reach",
 ]

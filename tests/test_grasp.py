@@ -1,0 +1,363 @@
+"""Objects that are picked up, carried and put down: rows, pairs, the loop, the look ahead, and the referee."""
+
+import coal
+import numpy as np
+import pinocchio as pin
+import pytest
+from closed_loop import Ruler, accelerations, cartesian, drive, make_controller
+from conftest import differences, random_q
+
+from qpavoid import (
+    Avoidance,
+    ConfigError,
+    Controller,
+    Obstacle,
+    Points,
+    Pose,
+    Sample,
+    Sensing,
+    Status,
+    UnknownName,
+    build_scene,
+    build_tasks,
+)
+from qpavoid.bodies import make_shape
+from qpavoid.config import Box, Capsule, Cylinder, HalfSpace, PointCloud, Sphere, Task
+
+TCP = "panda_hand_tcp"
+BOX = Box(size=(0.06, 0.06, 0.24))
+POLE = Cylinder(radius=0.03, length=0.8)
+HOLD = 0.02
+
+
+def grasp_at(robot, q, frame=TCP, offset=(0.0, 0.0, 0.0)):
+    data = robot.model.createData()
+    pin.framesForwardKinematics(robot.model, data, q)
+    return data.oMf[robot.model.getFrameId(frame)] * pin.SE3(np.eye(3), np.array(offset))
+
+
+def panda_with(panda, others=(), offset=(0.0, 0.0, 0.08), shape=BOX, **fields):
+    place = grasp_at(panda, panda.home, offset=offset)
+    box = Obstacle.at("box", shape, place.translation, place.rotation, graspable=True)
+    tasks = build_tasks([Task(frame=TCP, gain=3.0)], panda, panda.home)
+    fields.setdefault("avoidance", Avoidance(d1=HOLD, d2=0.12))
+    return Controller(build_scene(panda, [box, *others]), tasks, "qp", 0.01, **fields)
+
+
+def distance_between(one, pose_one, two, pose_two):
+    """By coal, of two obstacles' shapes."""
+    request, result = coal.DistanceRequest(), coal.DistanceResult()
+    request.gjk_tolerance = 1e-10
+    places = [coal.Transform3s(pose.rotation, pose.translation) for pose in (pose_one, pose_two)]
+    return coal.distance(make_shape(one), places[0], make_shape(two), places[1], request, result)
+
+
+# --- rows ---------------------------------------------------------------------------------------------------------
+
+
+def test_rows_of_what_is_carried_by_finite_differences(panda):
+    """Against obstacles at rest and moving, and against the robot's own links."""
+    rng = np.random.default_rng(0)
+    pole = pin.SE3(np.eye(3), np.array([0.45, 0.25, 0.3]))
+    controller = panda_with(panda, [Obstacle.at("pole", POLE, pole.translation)], avoidance=Avoidance(d1=HOLD, d2=3.0))
+    controller.attach("box", TCP, panda.home)
+    held = pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.08]))
+    twist = Sample.at(pole.translation, linear=[0.1, -0.2, 0.05])
+    names, count = controller.scene.pair_names, 0
+    for _ in range(6):
+        q = random_q(panda, rng, 0.7)
+        tick = controller.tick(q, obstacles={"pole": twist})
+        row = int(np.flatnonzero([names[pair] == ("box", "pole") for pair in tick.proximity.pair])[0])
+
+        def at(q, t=0.0):
+            there = pin.SE3(np.eye(3), pole.translation + t * twist.linear)
+            return np.array([distance_between(BOX, grasp_at(panda, q) * held, POLE, there)])
+
+        assert tick.proximity.distance[row] == pytest.approx(at(q)[0], abs=1e-6)
+        if at(q)[0] > 5e-3:
+            np.testing.assert_allclose(tick.proximity.J[row], differences(at, panda, q, 1e-5)[0], atol=1e-4)
+            rate = (at(q, 1e-5)[0] - at(q, -1e-5)[0]) / 2e-5
+            assert tick.proximity.drift[row] == pytest.approx(rate, abs=1e-4)
+            count += 1
+        link = next(i for i, pair in enumerate(tick.proximity.pair) if names[pair][1] == "box")
+        body = panda.bodies.geometryObjects[panda.bodies.getGeometryId(names[tick.proximity.pair[link]][0])]
+
+        def own(q, body=body):
+            data = panda.model.createData()
+            pin.forwardKinematics(panda.model, data, q)
+            result, request = coal.DistanceResult(), coal.DistanceRequest()
+            request.gjk_tolerance = 1e-10
+            a, b = data.oMi[body.parentJoint] * body.placement, grasp_at(panda, q) * held
+            shapes = [coal.Transform3s(x.rotation, x.translation) for x in (a, b)]
+            return np.array([coal.distance(body.geometry, shapes[0], coal.Box(*BOX.size), shapes[1], request, result)])
+
+        assert tick.proximity.distance[link] == pytest.approx(own(q)[0], abs=1e-6)
+        np.testing.assert_allclose(tick.proximity.J[link], differences(own, panda, q, 1e-5)[0], atol=1e-4)
+    assert count > 3
+
+
+def test_pairs_with_the_hand_are_off_and_the_others_on(panda):
+    controller = panda_with(panda, [Obstacle.at("pole", POLE, [0.45, 0.4, 0.3])], avoidance=Avoidance(d1=HOLD, d2=5.0))
+
+    def watched():
+        tick = controller.tick(panda.home)
+        return {frozenset(controller.scene.pair_names[pair]) for pair in tick.proximity.pair}
+
+    bodies = controller.scene.body_names
+    free = watched()
+    assert {frozenset((body, "box")) for body in bodies} <= free
+    assert frozenset(("box", "pole")) not in free
+    controller.attach("box", TCP)
+    carried = watched()
+    joint = panda.model.frames[panda.model.getFrameId(TCP)].parentJoint
+    rigid = [b.name for b in panda.bodies.geometryObjects if b.parentJoint == joint]
+    assert rigid and not {frozenset((body, "box")) for body in rigid} & carried
+    assert {frozenset((body, "box")) for body in bodies[:4]} <= carried
+    assert frozenset(("box", "pole")) in carried
+    assert {pair for pair in free if "box" not in pair} == {pair for pair in carried if "box" not in pair}
+    controller.release("box")
+    # what touched the box when it was put down is looked at again once it has been clear
+    assert {frozenset((body, "box")) for body in bodies[:4]} <= watched()
+
+
+# --- the loop -----------------------------------------------------------------------------------------------------
+
+
+def carry_past(panda, attach):
+    """The tool goes along a line that the pole is beside: far from the hand, near what hangs from it."""
+    place = grasp_at(panda, panda.home, offset=(0.0, 0.0, 0.14)).translation
+    pole = Obstacle.at("pole", Capsule(radius=0.025, length=0.16), [place[0] + 0.02, 0.2, place[2] - 0.02])
+    controller = panda_with(panda, [pole], offset=(0.0, 0.0, 0.14))
+    if attach:
+        controller.attach("box", TCP, panda.home)
+    start = grasp_at(panda, panda.home).translation
+    q, least, vs = panda.home.copy(), np.inf, []
+    held = pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.14]))
+    pole_at = pin.SE3(np.eye(3), pole.motion.sample(0.0).position)
+    for k in range(500):
+        target = Sample.at(start + np.array([0.0, min(0.08 * k * 0.01, 0.4), 0.0]))
+        given = None if attach else {"box": Sample.at([0.0, 0.0, 5.0])}
+        tick = controller.tick(q, targets={TCP: target}, obstacles=given)
+        q = pin.integrate(panda.model, q, 0.01 * tick.solution.v)
+        vs.append(tick.solution.v)
+        least = min(least, distance_between(BOX, grasp_at(panda, q) * held, pole.shape, pole_at))
+    return controller, q, least, np.array(vs), tick
+
+
+def test_a_carried_box_keeps_clear_of_a_pole(panda):
+    *_, without, _, _ = carry_past(panda, False)
+    _, _, least, vs, tick = carry_past(panda, True)
+    assert without < 0.0, "the way must lead through the pole, or this shows nothing"
+    assert least > HOLD - 1e-3
+    assert tick.solution.status is Status.SOLVED
+    bounds = panda.bounds()
+    assert (accelerations(vs, 0.01) <= bounds.acceleration + 1e-6).all()
+
+
+def test_attaching_and_releasing_in_motion_makes_no_jump(panda):
+    """The robot is at full tilt when the box becomes its own, and when it stops being so."""
+    near = Obstacle.at("wall", Box(size=(0.5, 0.02, 0.5)), [0.4, 0.3, 0.45])
+    controller = panda_with(panda, [near])
+    controller.allow_contact("box", controller.scene.body_names)
+    start, q, vs = grasp_at(panda, panda.home).translation, panda.home.copy(), []
+    for k in range(300):
+        if k == 61:
+            controller.attach("box", TCP, q)
+        if k == 180:
+            controller.release("box", q)
+        box = grasp_at(panda, q, offset=(0.0, 0.0, 0.08))
+        given = {"box": Pose(box.translation, box.rotation)} if k == 60 else None
+        target = {TCP: Sample.at(start + np.array([0.0, 0.4 * np.sin(0.02 * k), 0.0]))}
+        solution = controller.step(q, targets=target, obstacles=given)
+        assert solution.status is Status.SOLVED, solution.reasons
+        vs.append(solution.v)
+        q = pin.integrate(panda.model, q, 0.01 * solution.v)
+    assert np.abs(vs).max() > 0.3
+    assert (accelerations(vs, 0.01) <= panda.bounds().acceleration + 1e-6).all()
+
+
+def test_what_is_put_down_stays_there_and_is_kept_clear_of(panda):
+    controller = panda_with(panda, [], offset=(0.0, 0.0, 0.14))
+    controller.attach("box", TCP, panda.home)
+    start, q = grasp_at(panda, panda.home).translation, panda.home.copy()
+    for k in range(150):
+        q = pin.integrate(
+            panda.model, q, 0.01 * controller.step(q, targets={TCP: Sample.at(start + np.array([0, 0.001 * k, 0]))}).v
+        )
+    there = grasp_at(panda, q, offset=(0.0, 0.0, 0.14))
+    np.testing.assert_allclose(controller.obstacle_pose("box", q).position, there.translation, atol=1e-9)
+    sample = controller.release("box", q)
+    np.testing.assert_allclose(sample.position, there.translation, atol=1e-9)
+    np.testing.assert_allclose(sample.rotation, there.rotation, atol=1e-9)
+    here, ruler = grasp_at(panda, q).translation, Ruler(controller.scene)
+    for k in range(150):  # up and away, then down again: now it is in the way
+        q = pin.integrate(
+            panda.model, q, 0.01 * controller.step(q, targets={TCP: Sample.at(here + np.array([0, 0, 0.0015 * k]))}).v
+        )
+    np.testing.assert_allclose(controller.obstacle_pose("box", q).position, there.translation, atol=1e-12)
+    away = ruler.distances(q, {0: sample}).min()
+    assert away > HOLD
+    for _ in range(300):
+        solution = controller.step(q, targets={TCP: Sample.at(here - [0, 0, 0.15])})
+        q = pin.integrate(panda.model, q, 0.01 * solution.v)
+    pairs = [i for i, pair in enumerate(controller.scene.pair_names) if "box" in pair]
+    assert ruler.distances(q, {0: sample})[pairs].min() > HOLD - 1e-3
+
+
+def test_a_box_is_lifted_off_its_table_without_being_thrown_off(panda):
+    """It touches the table when it is picked up: that pair counts once it has been clear, and then it does."""
+    place = grasp_at(panda, panda.home, offset=(0.0, 0.0, 0.08)).translation
+    top = place[2] - 0.12
+    table = Obstacle.at("table", HalfSpace(), [0, 0, top - 1e-4])
+    controller = panda_with(panda, [table], avoidance=Avoidance(d1=HOLD, d2=0.06))
+    controller.allow_contact("table", controller.scene.body_names)
+    controller.attach("box", TCP, panda.home)
+    first = controller.step(panda.home)
+    assert first.status is Status.SOLVED and np.abs(first.v).max() < 1e-3
+    start, q, heights = grasp_at(panda, panda.home).translation, panda.home.copy(), []
+    for k in range(600):
+        z = 0.0005 * min(k, 200) - 0.0005 * max(k - 300, 0)
+        solution = controller.step(q, targets={TCP: Sample.at(start + np.array([0, 0, z]))})
+        q = pin.integrate(panda.model, q, 0.01 * solution.v)
+        pose = grasp_at(panda, q, offset=(0.0, 0.0, 0.08))
+        corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 0.5 * np.array(BOX.size)
+        heights.append((corners @ pose.rotation.T + pose.translation)[:, 2].min() - top)
+    assert max(heights) > 0.05
+    assert min(heights[300:]) > HOLD - 1e-3
+
+
+def test_the_look_ahead_knows_what_is_carried(tmp_path):
+    """Full speed at a wall with a rod in front: it stops with the rod's tip short of it, braking seen to."""
+    robot = cartesian(tmp_path, speed=2.0, acceleration=4.0)
+    rod = Obstacle.at(
+        "rod", Capsule(radius=0.02, length=0.6), [0.37, 0, 0], pin.rpy.rpyToMatrix(0, np.pi / 2, 0), graspable=True
+    )
+    wall = Obstacle.at("wall", Box(size=(0.02, 2.0, 2.0)), [2.0, 0.0, 0.0])
+    controller = make_controller(robot, [rod, wall], "z", task={"gain": 20.0})
+    controller.attach("rod", "z", np.zeros(3))
+    for tick in drive(controller, np.zeros(3), 300, target=[5.0, 0.0, 0.0]):
+        tip = tick.state.q[0] + 0.01 * tick.solution.v[0] + 0.37 + 0.3 + 0.02
+        assert 1.99 - tip > HOLD - 1e-3
+        assert tick.solution.status is Status.SOLVED
+    assert 1.99 - tip < HOLD + 5e-3
+
+
+def test_nothing_comes_nearer_than_the_closest_call_says_with_a_load(panda):
+    rng, hold = np.random.default_rng(3), HOLD
+    balls = [Obstacle.at(f"b{i}", Sphere(radius=0.05), rng.uniform(-0.7, 0.7, 3)) for i in range(5)]
+    controller = panda_with(panda, balls, offset=(0.1, 0.0, 0.2), avoidance=Avoidance(d1=hold, d2=0.3))
+    controller.attach("box", TCP, panda.home)
+    held = pin.SE3(np.eye(3), np.array([0.1, 0.0, 0.2]))
+    for _ in range(40):
+        q, v = random_q(panda, rng), rng.uniform(-1, 1, 7)
+        near = len(controller.tick(q).proximity.pair)
+        controller._kinematics.move(q, v)
+        for horizon in (0.02, 0.2):
+            least = controller._assembly.closest_call(v, near, 0.3, horizon)
+            after = pin.integrate(panda.model, q, horizon * v)
+            for ball in balls:
+                there = pin.SE3(np.eye(3), ball.motion.sample(0.0).position)
+                assert distance_between(BOX, grasp_at(panda, after) * held, ball.shape, there) - hold >= least - 1e-9
+
+
+def test_a_load_keeps_clear_of_points_too(panda, tmp_path):
+    controller = panda_with(
+        panda, [Obstacle.at("camera", PointCloud(), [0, 0, 0])], avoidance=Avoidance(d1=HOLD, d2=0.3)
+    )
+    tip = grasp_at(panda, panda.home, offset=(0.0, 0.0, 0.30)).translation
+    given = {"camera": Points(tip[None])}
+    names = controller.scene.pair_names
+    before = [names[pair] for pair in controller.tick(panda.home, obstacles=given).proximity.pair]
+    assert ("box", "camera") not in before
+    controller.attach("box", TCP)
+    tick = controller.tick(panda.home, obstacles=given)
+    row = [names[pair] for pair in tick.proximity.pair].index(("box", "camera"))
+    voxel = 0.02 * (np.floor(tip / 0.02) + 0.5)
+    box = grasp_at(panda, panda.home, offset=(0.0, 0.0, 0.08))
+    expected = distance_between(BOX, box, Sphere(radius=0.01 * np.sqrt(3.0)), pin.SE3(np.eye(3), voxel))
+    assert tick.proximity.distance[row] == pytest.approx(expected, abs=1e-6)
+
+
+def test_two_loads_and_a_handover(tmp_path):
+    """Each is a body of the robot; free ones are obstacles to the carried ones, moving ones included."""
+    robot = cartesian(tmp_path)
+    one = Obstacle.at("one", Sphere(radius=0.05), [0.2, 0, 0], graspable=True)
+    two = Obstacle.at("two", Sphere(radius=0.05), [0.6, 0, 0], graspable=True)
+    controller = make_controller(robot, [one, two], "z", avoidance=Avoidance(d1=HOLD, d2=1.0))
+    names = controller.scene.pair_names
+    for carried, free, sign in (("one", "two", 1.0), ("two", "one", -1.0)):
+        controller.attach(carried, "z", np.zeros(3))
+        at = {"one": 0.2, "two": 0.6}[free]
+        tick = controller.tick(np.zeros(3), obstacles={free: Sample.at([at, 0, 0], linear=[0.3, 0, 0])})
+        row = [names[pair] for pair in tick.proximity.pair].index(("one", "two"))
+        assert tick.proximity.distance[row] == pytest.approx(0.3)
+        np.testing.assert_allclose(tick.proximity.J[row], [-sign, 0, 0], atol=1e-12)
+        assert tick.proximity.drift[row] == pytest.approx(0.3 * sign)
+        controller.release(carried, np.zeros(3))
+    for carried in ("one", "two"):
+        controller.attach(carried, "y", np.zeros(3))
+    rows = controller.tick(np.zeros(3)).proximity.pair
+    assert ("one", "two") not in [names[pair] for pair in rows]  # carried by the same joint
+    controller.attach("two", "x", np.zeros(3))  # handed over, to a joint above: now y moves one against two
+    tick = controller.tick(np.zeros(3))
+    assert ("one", "two") not in [names[pair] for pair in tick.proximity.pair]  # one hangs below two's carrier
+
+
+# --- what is said ------------------------------------------------------------------------------------------------
+
+
+def test_wrong_calls_are_named_with_a_remedy(panda):
+    controller = panda_with(panda, [Obstacle.at("pole", POLE, [1, 0, 0])])
+    with pytest.raises(ConfigError, match="declare it with `graspable: true`"):
+        controller.attach("pole", TCP)
+    with pytest.raises(UnknownName, match="did you mean 'box'"):
+        controller.attach("bax", TCP)
+    with pytest.raises(UnknownName, match=TCP):
+        controller.attach("box", "panda_hand_tpc")
+    with pytest.raises(ConfigError, match="fixed to the world"):
+        controller.attach("box", "universe")
+    with pytest.raises(ConfigError, match="not carried"):
+        controller.release("box")
+    with pytest.raises(ConfigError, match="no pair"):
+        controller.allow_contact("box", ["nobody"])
+    controller.step(panda.home, obstacles={"box": Sample.at([5.0, 0, 0])})
+    with pytest.raises(ConfigError, match="too far"):
+        controller.attach("box", TCP)
+    for shape in (HalfSpace(), PointCloud()):
+        with pytest.raises(ConfigError, match="cannot be carried"):
+            build_scene(panda, [Obstacle.at("it", shape, [0, 0, 0], graspable=True)])
+
+
+def test_what_is_given_of_a_carried_box_is_not_read_and_that_is_said(panda):
+    controller = panda_with(panda, sensing=Sensing(stale_after=0.02, stop_after=0.05))
+    controller.step(panda.home, obstacles={"box": controller.obstacle_pose("box")})
+    controller.attach("box", TCP)
+    before = controller.obstacle_pose("box").position
+    solution = controller.step(panda.home, obstacles={"box": Sample.at([0.0, 0.0, 3.0])})
+    assert solution.assumed == ("box: carried by the robot, what is given of it is not read",)
+    np.testing.assert_allclose(controller.obstacle_pose("box").position, before)
+    for _ in range(20):
+        solution = controller.step(panda.home)
+    assert solution.status is Status.SOLVED and solution.assumed == ()  # it is not late
+
+
+def test_a_scene_serves_two_controllers_of_which_one_carries(panda):
+    one, two = panda_with(panda), None
+    two = Controller(one.scene, one.tasks, "qp", 0.01, avoidance=one.avoidance)
+    before = two.tick(panda.home).proximity
+    one.attach("box", TCP)
+    after = two.tick(panda.home).proximity
+    for name in ("pair", "closest", "J"):
+        np.testing.assert_array_equal(getattr(before, name), getattr(after, name))
+
+
+def test_graspable_costs_nothing_while_nothing_is_carried(panda):
+    others = [Obstacle.at("pole", POLE, [0.45, 0.2, 0.3])]
+    plain = Controller(build_scene(panda, [Obstacle.at("box", BOX, [0.4, -0.2, 0.4]), *others]), [], "qp")
+    graspable = Controller(
+        build_scene(panda, [Obstacle.at("box", BOX, [0.4, -0.2, 0.4], graspable=True), *others]), [], "qp"
+    )
+    v = np.full(7, 0.1)
+    assert np.array_equal(plain.filter(panda.home, v).v, graspable.filter(panda.home, v).v)
+    on = [c._query._data.activeCollisionPairs for c in (plain, graspable)]
+    assert sum(on[0]) == sum(on[1])

@@ -1,0 +1,125 @@
+"""MuJoCo as referee of what this project treats in a way of its own: clouds, loads, decomposed meshes, half-spaces."""
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from closed_loop import drive, make_controller
+from conftest import random_q
+from test_shapes import SHELF, boards, write_stl
+
+from qpavoid import Avoidance, Obstacle, Points, Robot, Status, Voxels, build_scene
+from qpavoid.bodies import make_shape
+from qpavoid.cloud import ball_radius
+from qpavoid.config import Box, Capsule, Ellipsoid, HalfSpace, Mesh, PointCloud, Sphere
+
+pytest.importorskip("mujoco")
+pytest.importorskip("bench", reason="bench/ is in the repository only")
+
+from bench.safety.arena import build
+
+TCP, HOLD = "panda_hand_tcp", 0.02
+
+
+def played(controller, arena, ticks, target, given=None):
+    """Least distance of every pair of the arena on the way, looked at five times in each tick."""
+    least = np.full(len(arena.scene.pairs), np.inf)
+    for tick in drive(controller, controller.scene.robot.home.copy(), ticks, target=target, obstacles=given):
+        assert tick.solution.status is Status.SOLVED, tick.solution.reasons
+        for share in (0.2, 0.4, 0.6, 0.8, 1.0):
+            arena.place(arena.integrate(tick.state.q, tick.solution.v, share * controller.dt), 0.0)
+            least = np.minimum(least, [arena.distance(pair) for pair in range(len(least))])
+    return least
+
+
+def tool_at(robot):
+    data = robot.model.createData()
+    pin.framesForwardKinematics(robot.model, data, robot.home)
+    return data.oMf[robot.model.getFrameId(TCP)].copy()
+
+
+def test_distances_to_the_new_shapes(panda, tmp_path):
+    mesh = Mesh(path=str(write_stl(tmp_path / "shelf.stl", boards(*SHELF))))
+    shapes = [Ellipsoid(radii=(0.1, 0.2, 0.1)), HalfSpace(), mesh]
+    scene = build_scene(panda, [Obstacle.at(f"o{i}", s, [0.5, 0.1, 0.2 * i - 0.2]) for i, s in enumerate(shapes)])
+    arena, rng, count = build(scene, panda.home), np.random.default_rng(0), 0
+    for _ in range(8):
+        q = random_q(panda, rng)
+        arena.place(q, 0.0)
+        model, data = panda.model, scene.geometry.createData()
+        pin.updateGeometryPlacements(model, model.createData(), scene.geometry, data, q)
+        pin.computeDistances(scene.geometry, data)
+        for pair, result in enumerate(data.distanceResults):
+            if result.min_distance > 0.0:
+                assert arena.distance(pair) == pytest.approx(result.min_distance, abs=2e-4), scene.pair_names[pair]
+                count += 1
+    assert count > 150
+
+
+def test_a_cloud_against_all_its_voxels(panda):
+    """The referee has a ball for every voxel, and knows nothing of slots."""
+    rng, tool = np.random.default_rng(1), tool_at(panda).translation
+    points = tool + np.array([0.0, 0.28, 0.0]) + rng.uniform(-1, 1, (400, 3)) * [0.15, 0.004, 0.15]
+    shape = PointCloud(resolution=0.03)
+    controller = make_controller(
+        panda, [Obstacle.at("camera", shape, [0, 0, 0])], TCP, avoidance=Avoidance(d1=HOLD, d2=0.1)
+    )
+    centers, ball = Voxels.of(points, shape.resolution).centers, Sphere(radius=ball_radius(shape.resolution))
+    arena = build(build_scene(panda, [Obstacle.at(f"v{i}", ball, c) for i, c in enumerate(centers)]), panda.home)
+    of_voxels = arena.scene.pairs[:, 1] >= arena.bodies
+    assert len(centers) > 60
+    least = played(
+        controller, arena, 90, lambda t: tool + np.array([0.0, 0.5 * t, 0.0]), lambda t: {"camera": Points(points)}
+    )
+    assert HOLD - 1e-3 < least[of_voxels].min() < 0.08
+
+
+def test_a_load_as_a_body_of_another_robot(panda):
+    """The referee's robot has the box welded to its hand, by its own description."""
+    tool = tool_at(panda)
+    held = tool * pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.14]))
+    box, pole = Box(size=(0.06, 0.06, 0.24)), Capsule(radius=0.025, length=0.16)
+    at = held.translation + np.array([0.02, 0.2, -0.02])
+    load = Obstacle.at("box", box, held.translation, held.rotation, graspable=True)
+    avoidance = Avoidance(d1=HOLD, d2=0.1)
+    controller = make_controller(panda, [load, Obstacle.at("pole", pole, at)], TCP, avoidance=avoidance)
+    controller.attach("box", TCP, panda.home)
+    welded = _with_body(panda, "box", box, pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.14])))
+    arena = build(build_scene(welded, [Obstacle.at("pole", pole, at)]), panda.home)
+    pair = arena.scene.pair_names.index(("box", "pole"))
+    start = tool.translation
+
+    def way(t):
+        return start + np.array([0.0, min(0.3 * t, 0.4), 0.0])
+
+    assert HOLD - 1e-3 < played(controller, arena, 150, way)[pair] < HOLD + 0.03
+    alone = make_controller(panda, [Obstacle.at("pole", pole, at)], TCP, avoidance=avoidance)
+    assert played(alone, arena, 150, way)[pair] < 0.0
+
+
+def _with_body(robot: Robot, name, shape, inside):
+    """The robot with one more body, in its tool's frame."""
+    bodies, frame = robot.bodies.copy(), robot.model.frames[robot.model.getFrameId(TCP)]
+    bodies.addGeometryObject(
+        pin.GeometryObject(name, frame.parentJoint, 0, frame.placement * inside, make_shape(shape))
+    )
+    return replace(robot, bodies=bodies)
+
+
+def test_a_shelf_as_a_mesh_against_its_boards(panda, tmp_path):
+    """The referee has five boxes."""
+    tool = tool_at(panda).translation
+    place = tool + np.array([0.28, 0.0, -0.35])
+    turn = pin.rpy.rpyToMatrix(0, 0, np.pi / 2)
+    mesh = Mesh(path=str(write_stl(tmp_path / "shelf.stl", boards(*SHELF))))
+    controller = make_controller(
+        panda, [Obstacle.at("shelf", mesh, place, turn)], TCP, avoidance=Avoidance(d1=HOLD, d2=0.1)
+    )
+    pieces = [
+        Obstacle.at(f"b{i}", Box(size=size), place + turn @ np.array(c), turn) for i, (c, size) in enumerate(SHELF)
+    ]
+    arena = build(build_scene(panda, pieces), panda.home)
+    of_boards = arena.scene.pairs[:, 1] >= arena.bodies
+    least = played(controller, arena, 120, lambda t: tool + np.array([min(0.3 * t, 0.2), 0.0, 0.2 * np.sin(3.0 * t)]))
+    assert HOLD - 1e-3 < least[of_boards].min() < 0.05
