@@ -187,9 +187,10 @@ class Controller:
         Args:
             q: configuration (nq,) as measured.
             t: time [s] at which motions are evaluated.
-            targets: what tasks should reach now, by their names, in place of their motion: a `Sample` for what is
-                somewhere (frames, a relative pose, the centre of mass, a point to look at), a configuration (nq,) for a
-                posture, a direction (3,) for an axis. A frame's task has the frame's name unless it was given one.
+            targets: what tasks should reach now, by their names, in place of their motion: a `Sample`, or a `Pose` that
+                rests, for what is somewhere (frames, a relative pose, the centre of mass, a point to look at), a
+                configuration (nq,) for a posture, a direction (3,) for an axis. A frame's task has the frame's name
+                unless it was given one.
             obstacles: where obstacles are now, and how they move if that is known, by name, in place of their motion.
             v: velocity (nv,) as measured, from which acceleration limits count; the last command if left out.
 

@@ -16,7 +16,7 @@ from qpavoid.errors import NumericalError
 from qpavoid.kernels.vectorised import rotation_vector
 from qpavoid.kinematics import ForwardKinematics, columns, support_masks
 from qpavoid.problem import Array, IntArray, as_vector
-from qpavoid.sensing import as_sample
+from qpavoid.sensing import as_goal
 
 _PARTS = {"position": slice(0, 3), "orientation": slice(3, 6), "pose": slice(0, 6)}
 """Rows of a frame's Jacobian, [linear, angular]."""
@@ -76,7 +76,7 @@ class RowTask:
         raise NotImplementedError
 
     def as_target(self, where: str, value: Any) -> Any:
-        """A target that was given at run time, checked: here, a `Sample`.
+        """A target that was given at run time, checked: here, a `Sample` or a `Pose` that rests.
 
         Raises:
             NumericalError: of the wrong kind or shape, or the task has no target; `where` names it.
@@ -85,7 +85,7 @@ class RowTask:
             raise NumericalError(
                 f"{where}: a task of type {getattr(self.settings, 'type', '?')} takes none; leave it out"
             )
-        return as_sample(where, value)
+        return as_goal(where, value)
 
     def _write(self, J: Array, wanted: Array, error: Array) -> None:
         np.multiply(J, self.scale[:, None], out=self._A)
@@ -210,7 +210,7 @@ class Axis(RowTask):
 
     def as_target(self, where: str, value: Any) -> Any:
         """A `Sample` of the point to look at, or a direction (3,) to align with."""
-        return as_sample(where, value) if self._looks else as_vector(where, value, (3,))
+        return as_goal(where, value) if self._looks else as_vector(where, value, (3,))
 
 
 class Manipulability(RowTask):

@@ -239,6 +239,12 @@ def as_sample(name: str, what: Any) -> Any:
     return type(what)(*parts)
 
 
+def as_goal(name: str, what: Any) -> Sample:
+    """`as_sample` of what a task should reach: a bare `Pose` is one at rest."""
+    sample = as_sample(name, what)
+    return sample if isinstance(sample, Sample) else Sample(*sample, np.zeros(3), np.zeros(3))
+
+
 def finite(what: Any) -> bool:
     """Whether all its numbers are finite."""
     return isfinite(sum(float(np.vdot(part, part)) for part in what))

@@ -17,7 +17,7 @@ from qpavoid.motion import Motion, Sample, build_motion
 from qpavoid.problem import Array, IntArray
 from qpavoid.robot import Robot
 from qpavoid.row_tasks import Axis, Com, Constant, Damping, Manipulability, Posture, Relative, RowTask
-from qpavoid.sensing import as_sample
+from qpavoid.sensing import as_goal
 
 
 @dataclass(frozen=True)
@@ -44,8 +44,8 @@ class FrameTask:
         return self.settings.type != "position"
 
     def as_target(self, where: str, value: Any) -> Any:
-        """A target that was given at run time, checked: a `Sample`."""
-        return as_sample(where, value)
+        """A target that was given at run time, checked: a `Sample`, or a `Pose` that rests."""
+        return as_goal(where, value)
 
 
 AnyTask = FrameTask | RowTask

@@ -8,6 +8,7 @@ from qpavoid import (
     Controller,
     NumericalError,
     Obstacle,
+    Pose,
     Sample,
     Status,
     UnknownName,
@@ -48,6 +49,9 @@ def test_targets_given_by_the_caller_replace_the_motion(controller, panda):
     solution = controller.step(panda.home, targets={"panda_hand_tcp": Sample.at(here + np.array([0.0, 0.0, 0.05]))})
     assert solution.status is Status.SOLVED
     assert np.abs(solution.v).max() > 1e-2
+    controller.reset()
+    bare = controller.step(panda.home, targets={"panda_hand_tcp": Pose.at(here + np.array([0.0, 0.0, 0.05]))})
+    np.testing.assert_array_equal(bare.v, solution.v)
 
 
 @pytest.mark.parametrize("field", ["position", "linear", "angular", "rotation"])
