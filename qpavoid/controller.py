@@ -355,7 +355,8 @@ class Controller:
             faults, assumed = faults + observed.stop, observed.assumed
         self._kinematics.compute(q)
         self._query.compute(self._kinematics.data, self._reach)
-        self._grasps.update()
+        if self._query.unwatched is not None:
+            self._grasps.update()
         proximity, problem = self._assembly.compute(q, samples, self._query, self._reach)
         if desired is not None:
             problem = self._assembly.follow(desired, problem)

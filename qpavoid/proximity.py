@@ -226,13 +226,14 @@ class DistanceQuery:
         pin.updateGeometryPlacements(self._scene.robot.model, data, self._geometry, self._data)
         if self._copy_poses:
             self.poses[:] = read_poses(self._data.oMg)
-        for index, slots in self._slots.items():
-            self._fill(index, slots, reach)
+        if self._slots:
+            for index, slots in self._slots.items():
+                self._fill(index, slots, reach)
         pairs = self._on if self._cull is None else self._cull.switch(reach)
         pin.computeDistances(self._geometry, self._data)
         if self._copy:
             self.results[:] = read_results(self._data.distanceResults)
-        if len(self._surface):
+        if self._surface is not None:
             self._mend_surfaces(pairs)
         self._computed = pairs
         self.pairs = pairs if self.unwatched is None else pairs[~self.unwatched[pairs]]
@@ -283,6 +284,7 @@ class DistanceQuery:
 
     def _mend_surfaces(self, pairs: IntArray) -> None:
         """Of two triangle meshes coal gives no normal; of one that is cut through, no distance to be trusted."""
+        assert self._surface is not None
         pairs = pairs[np.isin(pairs, self._surface, assume_unique=True)]
         results = self.results[pairs]
         apart = results[:, 0] > 0.0
@@ -293,12 +295,13 @@ class DistanceQuery:
         self.results[pairs] = results
 
 
-def _surface_pairs(scene: Scene) -> IntArray:
-    """Pairs with a triangle mesh in them, other than with a half-space."""
+def _surface_pairs(scene: Scene) -> IntArray | None:
+    """Pairs with a triangle mesh in them, other than with a half-space; None where there are none."""
     kinds = [body.geometry for body in scene.geometry.geometryObjects]
     mesh = np.array([isinstance(kind, coal.BVHModelBase) for kind in kinds], dtype=bool)
     flat = np.array([isinstance(kind, coal.Halfspace) for kind in kinds], dtype=bool)
-    return np.flatnonzero(mesh[scene.pairs].any(axis=1) & ~flat[scene.pairs].any(axis=1))
+    pairs = np.flatnonzero(mesh[scene.pairs].any(axis=1) & ~flat[scene.pairs].any(axis=1))
+    return pairs if len(pairs) else None
 
 
 class _Cull:
