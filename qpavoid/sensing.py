@@ -242,7 +242,7 @@ def as_sample(name: str, what: Any) -> Any:
 def as_goal(name: str, what: Any) -> Sample:
     """`as_sample` of what a task should reach: a bare `Pose` is one at rest."""
     sample = as_sample(name, what)
-    return sample if isinstance(sample, Sample) else Sample(*sample, np.zeros(3), np.zeros(3))
+    return sample if isinstance(sample, Sample) else Sample(sample.position, sample.rotation, np.zeros(3), np.zeros(3))
 
 
 def finite(what: Any) -> bool:
