@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from qpavoid.kernels.compiled import compiled
 from qpavoid.kernels.voxels import ALIKE
 from qpavoid.problem import Array, IntArray
-
-compiled = njit(cache=True, fastmath={"reassoc", "contract", "nsz"})
 
 
 @compiled

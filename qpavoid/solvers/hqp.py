@@ -12,7 +12,7 @@ import numpy as np
 
 from qpavoid import kernels
 from qpavoid.problem import Array, IntArray, Problem, Solution, Status
-from qpavoid.solvers.backends import Backend, solve_daqp
+from qpavoid.solvers.backends import Backend
 from qpavoid.solvers.qp import Qp
 from qpavoid.solvers.reasons import what_gave_way
 from qpavoid.solvers.reduced import solve_within
@@ -87,7 +87,7 @@ class Hqp(Qp):
     ) -> Array | None:
         if met:
             least, lower, upper = np.minimum(least, J @ v), np.minimum(lower, v), np.maximum(upper, v)
-        for backend in (self._backend, solve_daqp):
+        for backend in self._backends:
             better = _attempt(backend, Z, v, P, q, J, least, lower, upper)
             if better is not None:
                 return better

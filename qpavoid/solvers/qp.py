@@ -11,7 +11,7 @@ from qpavoid.config import HqpSolver, QpSolver
 from qpavoid.errors import SolverNotInstalled
 from qpavoid.problem import Array, Problem, Solution, Status
 from qpavoid.solvers.analytic import tracking_velocity
-from qpavoid.solvers.backends import Daqp, make_backend, solve_daqp
+from qpavoid.solvers.backends import Backend, Daqp, make_backend, solve_daqp
 from qpavoid.solvers.reasons import what_gave_way
 from qpavoid.solvers.reduced import holding
 from qpavoid.solvers.relaxation import Closest, Relaxed, by_back_end, closest, relax
@@ -47,6 +47,11 @@ class Qp:
         self._projections = _compiled_projections() if compiled else None
         self._backend = make_backend("daqp" if config.backend in ("auto", "native") else config.backend)
 
+    @property
+    def _backends(self) -> tuple[Backend, ...]:
+        """The chosen back end, and daqp where that is another one."""
+        return (self._backend,) if isinstance(self._backend, Daqp) else (self._backend, solve_daqp)
+
     def solve(self, problem: Problem) -> Solution:
         """The closest safe velocity; relaxed where there is none; a stop where that fails too."""
         if problem.shortfall <= 0.0:
@@ -61,7 +66,7 @@ class Qp:
             if solved:
                 return Solution(answer)
         P, q = kernels.projection_cost(A, self.config.regularization, v0)
-        for backend in (self._backend,) if isinstance(self._backend, Daqp) else (self._backend, solve_daqp):
+        for backend in self._backends:
             v = closest(holding(problem.contacts, backend), P, q, rows.J, rows.b, lower, upper)
             if v is not None:
                 return Solution(v)
