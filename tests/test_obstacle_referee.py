@@ -17,19 +17,19 @@ from qpavoid.config import Box, Capsule, Ellipsoid, HalfSpace, Mesh, PointCloud,
 pytest.importorskip("mujoco")
 pytest.importorskip("bench", reason="bench/ is in the repository only")
 
-from bench.safety.arena import build
+from qpavoid.arena.twin import build
 
 TCP, HOLD = "panda_hand_tcp", 0.02
 
 
-def played(controller, arena, ticks, target, given=None):
-    """Least distance of every pair of the arena on the way, looked at five times in each tick."""
-    least = np.full(len(arena.scene.pairs), np.inf)
+def played(controller, twin, ticks, target, given=None):
+    """Least distance of every pair of the twin on the way, looked at five times in each tick."""
+    least = np.full(len(twin.scene.pairs), np.inf)
     for tick in drive(controller, controller.scene.robot.home.copy(), ticks, target=target, obstacles=given):
         assert tick.solution.status is Status.SOLVED, tick.solution.reasons
         for share in (0.2, 0.4, 0.6, 0.8, 1.0):
-            arena.place(arena.integrate(tick.state.q, tick.solution.v, share * controller.dt), 0.0)
-            least = np.minimum(least, [arena.distance(pair) for pair in range(len(least))])
+            twin.place(twin.integrate(tick.state.q, tick.solution.v, share * controller.dt), 0.0)
+            least = np.minimum(least, [twin.distance(pair) for pair in range(len(least))])
     return least
 
 
@@ -43,16 +43,16 @@ def test_distances_to_the_new_shapes(panda, tmp_path):
     mesh = Mesh(path=str(write_stl(tmp_path / "shelf.stl", boards(*SHELF))))
     shapes = [Ellipsoid(radii=(0.1, 0.2, 0.1)), HalfSpace(), mesh]
     scene = build_scene(panda, [Obstacle.at(f"o{i}", s, [0.5, 0.1, 0.2 * i - 0.2]) for i, s in enumerate(shapes)])
-    arena, rng, count = build(scene, panda.home), np.random.default_rng(0), 0
+    twin, rng, count = build(scene, panda.home), np.random.default_rng(0), 0
     for _ in range(8):
         q = random_q(panda, rng)
-        arena.place(q, 0.0)
+        twin.place(q, 0.0)
         model, data = panda.model, scene.geometry.createData()
         pin.updateGeometryPlacements(model, model.createData(), scene.geometry, data, q)
         pin.computeDistances(scene.geometry, data)
         for pair, result in enumerate(data.distanceResults):
             if result.min_distance > 0.0:
-                assert arena.distance(pair) == pytest.approx(result.min_distance, abs=2e-4), scene.pair_names[pair]
+                assert twin.distance(pair) == pytest.approx(result.min_distance, abs=2e-4), scene.pair_names[pair]
                 count += 1
     assert count > 150
 
@@ -66,11 +66,11 @@ def test_a_cloud_against_all_its_voxels(panda):
         panda, [Obstacle.at("camera", shape, [0, 0, 0])], TCP, avoidance=Avoidance(d1=HOLD, d2=0.1)
     )
     centers, ball = Voxels.of(points, shape.resolution).centers, Sphere(radius=ball_radius(shape.resolution))
-    arena = build(build_scene(panda, [Obstacle.at(f"v{i}", ball, c) for i, c in enumerate(centers)]), panda.home)
-    of_voxels = arena.scene.pairs[:, 1] >= arena.bodies
+    twin = build(build_scene(panda, [Obstacle.at(f"v{i}", ball, c) for i, c in enumerate(centers)]), panda.home)
+    of_voxels = twin.scene.pairs[:, 1] >= twin.bodies
     assert len(centers) > 60
     least = played(
-        controller, arena, 90, lambda t: tool + np.array([0.0, 0.5 * t, 0.0]), lambda t: {"camera": Points(points)}
+        controller, twin, 90, lambda t: tool + np.array([0.0, 0.5 * t, 0.0]), lambda t: {"camera": Points(points)}
     )
     assert HOLD - 1e-3 < least[of_voxels].min() < 0.08
 
@@ -86,16 +86,16 @@ def test_a_load_as_a_body_of_another_robot(panda):
     controller = make_controller(panda, [load, Obstacle.at("pole", pole, at)], TCP, avoidance=avoidance)
     controller.attach("box", TCP, panda.home)
     welded = _with_body(panda, "box", box, pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.14])))
-    arena = build(build_scene(welded, [Obstacle.at("pole", pole, at)]), panda.home)
-    pair = arena.scene.pair_names.index(("box", "pole"))
+    twin = build(build_scene(welded, [Obstacle.at("pole", pole, at)]), panda.home)
+    pair = twin.scene.pair_names.index(("box", "pole"))
     start = tool.translation
 
     def way(t):
         return start + np.array([0.0, min(0.3 * t, 0.4), 0.0])
 
-    assert HOLD - 1e-3 < played(controller, arena, 150, way)[pair] < HOLD + 0.03
+    assert HOLD - 1e-3 < played(controller, twin, 150, way)[pair] < HOLD + 0.03
     alone = make_controller(panda, [Obstacle.at("pole", pole, at)], TCP, avoidance=avoidance)
-    assert played(alone, arena, 150, way)[pair] < 0.0
+    assert played(alone, twin, 150, way)[pair] < 0.0
 
 
 def _with_body(robot: Robot, name, shape, inside):
@@ -119,7 +119,7 @@ def test_a_shelf_as_a_mesh_against_its_boards(panda, tmp_path):
     pieces = [
         Obstacle.at(f"b{i}", Box(size=size), place + turn @ np.array(c), turn) for i, (c, size) in enumerate(SHELF)
     ]
-    arena = build(build_scene(panda, pieces), panda.home)
-    of_boards = arena.scene.pairs[:, 1] >= arena.bodies
-    least = played(controller, arena, 120, lambda t: tool + np.array([min(0.3 * t, 0.2), 0.0, 0.2 * np.sin(3.0 * t)]))
+    twin = build(build_scene(panda, pieces), panda.home)
+    of_boards = twin.scene.pairs[:, 1] >= twin.bodies
+    least = played(controller, twin, 120, lambda t: tool + np.array([min(0.3 * t, 0.2), 0.0, 0.2 * np.sin(3.0 * t)]))
     assert HOLD - 1e-3 < least[of_boards].min() < 0.05

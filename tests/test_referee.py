@@ -16,12 +16,13 @@ pytest.importorskip("mujoco")
 pytest.importorskip("bench", reason="bench/ is in the repository only")
 
 from bench.safety import report
-from bench.safety.arena import build, load
 from bench.safety.campaign import FOLDER, KINDS, RANGES, draw
 from bench.safety.flight import Start, fly, joint_means, manners
-from bench.safety.referee import STEP, Watch, referee
+from bench.safety.referee import disagreement, drift, referee
 from bench.safety.trial import trials
 from bench.safety.verdict import judge
+from qpavoid.arena.referee import STEP, Watch
+from qpavoid.arena.twin import build, load
 
 PLATE = BOX.model_copy(update={"size": (0.3, 0.2, 0.006)})
 
@@ -42,7 +43,7 @@ def scene_of(robot_path, tasks, obstacles, **fields):
     return ScenarioConfig.model_validate(config).read_from(Path("handmade.yaml"))
 
 
-# --- the arena ----------------------------------------------------------------------------------------------
+# --- the twin ----------------------------------------------------------------------------------------------
 
 
 def coal_distances(scene, q):
@@ -65,12 +66,12 @@ def test_distances_are_those_of_coal(name):
         shapes = zip([SPHERE, CAPSULE, BOX, CYLINDER, PLATE] * 3, near, strict=True)
         obstacles = [obstacle(f"o{i}", shape, at, rng.uniform(-3.0, 3.0, 3)) for i, (shape, at) in enumerate(shapes)]
         scene = build_scene(robot(name), obstacles)
-        arena, bodies = build(scene, robot(name).home), scene.geometry.geometryObjects
-        arena.place(q, 0.0)
+        twin, bodies = build(scene, robot(name).home), scene.geometry.geometryObjects
+        twin.place(q, 0.0)
         for pair, d in enumerate(coal_distances(scene, q)):
-            radii = [bodies[body].geometry.radius for body in scene.pairs[pair].tolist() if body < arena.bodies]
+            radii = [bodies[body].geometry.radius for body in scene.pairs[pair].tolist() if body < twin.bodies]
             if d > -0.9 * min(radii):  # MuJoCo's depth means something else once the axis of a capsule is inside a box
-                assert arena.distance(pair) == pytest.approx(d, abs=1e-4), scene.pair_names[pair]
+                assert twin.distance(pair) == pytest.approx(d, abs=1e-4), scene.pair_names[pair]
                 apart, inside = apart + (d > 0.0), inside + (d < 0.0)
     assert apart > 300 and inside > 30
 
@@ -79,12 +80,12 @@ def test_hulls_are_those_of_coal(panda_convex):
     rng = np.random.default_rng(2)
     robot, _ = panda_convex.lock(["panda_finger*"], panda_convex.home, "test")  # one of them mimics the other one
     scene = random_scene(robot, rng, [SPHERE, BOX, CAPSULE])
-    arena = build(scene, robot.home)
+    twin = build(scene, robot.home)
     for _ in range(5):
         q = random_q(robot, rng)
-        arena.place(q, 0.0)
+        twin.place(q, 0.0)
         expected = coal_distances(scene, q)
-        got = np.array([arena.distance(pair) for pair in range(len(expected))])
+        got = np.array([twin.distance(pair) for pair in range(len(expected))])
         np.testing.assert_allclose(got[expected > 0.0], expected[expected > 0.0], atol=1e-4)
 
 
@@ -97,12 +98,12 @@ def test_a_floating_base_is_refused(solo):
 
 
 def test_it_finds_the_collision_of_situation_1_and_its_depth():
-    arena, log = situation("tracking")
-    findings = referee(arena, log)
-    names = [arena.scene.pair_names[contact.pair] for contact in findings.contacts]
+    twin, log = situation("tracking")
+    findings = referee(twin, log)
+    names = [twin.scene.pair_names[contact.pair] for contact in findings.contacts]
     assert names == [("left_hand", "fist")]
     # the depth by hand: radii less the distance of the sphere's centre from the hand's axis
-    model, k = arena.scene.robot.model, round(findings.time / 0.01)
+    model, k = twin.scene.robot.model, round(findings.time / 0.01)
     data = model.createData()
     pin.framesForwardKinematics(model, data, log.q[k])
     wrist = data.oMf[model.getFrameId("left_link7")]
@@ -116,47 +117,48 @@ def test_it_finds_the_collision_of_situation_1_and_its_depth():
 
 
 def test_it_sees_none_where_there_is_none():
-    arena, log = situation("qp")
-    findings = referee(arena, log)
+    twin, log = situation("qp")
+    findings = referee(twin, log)
     assert findings.contacts == ()
     assert findings.distance == pytest.approx(0.02, abs=1e-3)
     assert findings.distance == pytest.approx(log.min_distance.min(), abs=1e-4)
-    assert findings.disagreement < 1e-6 and findings.drift < 1e-9
+    assert disagreement(twin, log, findings) < 1e-6 and drift(log, findings) < 1e-9
 
 
 def test_it_plays_velocities_and_does_not_believe_the_configurations():
-    arena, log = situation("tracking")
-    findings, told = referee(arena, log), referee(arena, replace(log, q=log.q + 0.1))
+    twin, log = situation("tracking")
+    moved = replace(log, q=log.q + 0.1)
+    findings, told = referee(twin, log), referee(twin, moved)
     assert told.contacts == findings.contacts
-    assert told.drift == pytest.approx(0.1)
+    assert drift(moved, told) == pytest.approx(0.1)
 
 
 def test_it_checks_the_joint_limits():
-    arena, log = situation("qp")
-    bounds = arena.scene.robot.bounds()
-    assert referee(arena, log).speed_excess <= 0.0
+    twin, log = situation("qp")
+    bounds = twin.scene.robot.bounds()
+    assert referee(twin, log).speed_excess <= 0.0
     fast = log.v.copy()
     fast[10:20, 2] = bounds.velocity[2] + 0.5
-    assert referee(arena, replace(log, v=fast)).speed_excess == pytest.approx(0.5)
+    assert referee(twin, replace(log, v=fast)).speed_excess == pytest.approx(0.5)
     steady = np.zeros_like(log.v)
     steady[:, 0] = 1.0  # rad/s, for 12.99 s
-    excess = arena.q0[0] + 13.0 - bounds.upper[0]
-    assert referee(arena, replace(log, v=steady)).position_excess == pytest.approx(excess, abs=0.02)
+    excess = twin.q0[0] + 13.0 - bounds.upper[0]
+    assert referee(twin, replace(log, v=steady)).position_excess == pytest.approx(excess, abs=0.02)
 
 
 def test_it_checks_accelerations():
     scenario = load_scenario("situation1", ["limits.acceleration=3.0", "duration=1.0"])
-    arena, log = load(scenario), simulate(scenario, "tracking")
+    twin, log = load(scenario), simulate(scenario, "tracking")
     v = np.zeros_like(log.v)
     v[5:, 1] = 0.05  # rad/s, within one tick of 0.01 s
-    assert referee(arena, replace(log, v=v)).acceleration_excess == pytest.approx(5.0 - 3.0)
+    assert referee(twin, replace(log, v=v)).acceleration_excess == pytest.approx(5.0 - 3.0)
     assert referee(*situation("tracking")).acceleration_excess == -np.inf
 
 
 def test_it_refuses_the_log_of_another_scene():
-    arena, _ = situation("qp")
+    twin, _ = situation("qp")
     with pytest.raises(ValueError, match="another scene"):
-        referee(arena, simulate(load_scenario("situation2", ["duration=0.1"])))
+        referee(twin, simulate(load_scenario("situation2", ["duration=0.1"])))
 
 
 def test_it_catches_what_passes_between_two_ticks(tmp_path):
@@ -170,24 +172,24 @@ def test_it_catches_what_passes_between_two_ticks(tmp_path):
         dt=0.1,
         duration=0.4,
     )
-    arena, log = load(scenario), simulate(scenario, "tracking")
-    findings = referee(arena, log)
+    twin, log = load(scenario), simulate(scenario, "tracking")
+    findings = referee(twin, log)
     assert log.min_distance.min() > 0.05
-    assert [arena.scene.pair_names[contact.pair] for contact in findings.contacts] == [("link1_0", "plate")]
+    assert [twin.scene.pair_names[contact.pair] for contact in findings.contacts] == [("link1_0", "plate")]
     assert findings.contacts[0].time == pytest.approx((0.45 - 0.033) / 3.0, abs=STEP)
 
 
 @pytest.mark.parametrize("seed", [2, 9])
 def test_what_it_does_not_measure_again_does_not_matter(seed):
     scenario = draw(seed)
-    arena, log = load(scenario), simulate(scenario, "tracking")
-    findings = referee(arena, log)
+    twin, log = load(scenario), simulate(scenario, "tracking")
+    findings = referee(twin, log)
     touched, smallest = set(), np.inf
     for q, t in zip(findings.q, log.t.tolist(), strict=True):
-        arena.place(q, t)
-        distances = np.array([arena.distance(pair) for pair in range(len(arena.scene.pairs))])
+        twin.place(q, t)
+        distances = np.array([twin.distance(pair) for pair in range(len(twin.scene.pairs))])
         touched |= set(np.flatnonzero(distances < 0.0).tolist())
-        smallest = min(smallest, distances[arena.movable].min())
+        smallest = min(smallest, distances[twin.movable].min())
     found = {contact.pair for contact in findings.contacts}
     assert touched and touched <= found
     assert smallest - STEP < findings.distance <= smallest + 1e-12
@@ -197,13 +199,13 @@ def test_what_it_does_not_measure_again_does_not_matter(seed):
 def test_no_step_is_longer_than_it_says():
     class Seen(Watch):
         def look(self, t):
-            centers.append(arena.poses()[0].copy())
+            centers.append(twin.poses()[0].copy())
             super().look(t)
 
-    arena, centers = load(draw(9)), []
-    watch = Seen(arena)
+    twin, centers = load(draw(9)), []
+    watch = Seen(twin)
     watch.look(0.0)
-    watch.follow(arena.q0, 0.5 * arena.scene.robot.bounds().velocity, 0.0, 0.05)
+    watch.follow(twin.q0, 0.5 * twin.scene.robot.bounds().velocity, 0.0, 0.05)
     assert len(centers) > 5
     assert np.linalg.norm(np.diff(centers, axis=0), axis=2).max() <= 1.05 * STEP
 
@@ -237,8 +239,8 @@ def test_verdicts(tmp_path, obstacles, why):
         avoidance={"d1": 0.02, "d2": 0.1},
         duration=4.0,
     )
-    arena, log = load(scenario), simulate(scenario, "tracking")
-    verdicts = judge(arena, scenario, log, referee(arena, log))
+    twin, log = load(scenario), simulate(scenario, "tracking")
+    verdicts = judge(twin, scenario, log, referee(twin, log))
     assert [verdict.why for verdict in verdicts] == why, verdicts
     assert verdicts[-1].avoidable == (why[-1] == "avoidable")
 
@@ -255,12 +257,12 @@ def test_flights_keep_to_the_limits(monkeypatch, acceleration):
     monkeypatch.setattr(Watch, "follow", recorded)
     limits = Limits(acceleration=acceleration)
     scenario = draw(9).model_copy(update={"limits": limits, "dt": 0.02})
-    arena = load(scenario)
-    means = joint_means(arena, scenario)
-    start = Start(arena.q0, np.zeros_like(arena.q0), 0.0, 1.2)
-    for manner in list(manners(len(arena.q0)))[::3]:
+    twin = load(scenario)
+    means = joint_means(twin, scenario)
+    start = Start(twin.q0, np.zeros_like(twin.q0), 0.0, 1.2)
+    for manner in list(manners(len(twin.q0)))[::3]:
         flown.clear()
-        fly(arena, means, start, scenario.dt, manner, arena.movable)
+        fly(twin, means, start, scenario.dt, manner, twin.movable)
         q, v = (np.array(array) for array in zip(*flown, strict=True))
         assert np.all(np.abs(v) <= means.speed + 1e-9)
         assert np.all((q >= means.lower - 1e-6) & (q <= means.upper + 1e-6))
@@ -269,8 +271,8 @@ def test_flights_keep_to_the_limits(monkeypatch, acceleration):
 
 
 def test_standing_still_proves_that_a_static_obstacle_is_avoidable():
-    scenario, (arena, log) = load_scenario("situation1"), situation("tracking")
-    (verdict,) = judge(arena, scenario, log, referee(arena, log))
+    scenario, (twin, log) = load_scenario("situation1"), situation("tracking")
+    (verdict,) = judge(twin, scenario, log, referee(twin, log))
     assert verdict.why == "avoidable" and "standing still" in verdict.detail
 
 
@@ -284,8 +286,8 @@ def test_scenarios_can_be_drawn_again_and_begin_clear():
     assert len({scenario.dt for scenario in drawn}) > 3
     assert max(len(scenario.obstacles) for scenario in drawn) > 10
     for scenario in drawn:
-        arena = load(scenario)
-        smallest = min(arena.distance(pair) for pair in range(len(arena.scene.pairs)))
+        twin = load(scenario)
+        smallest = min(twin.distance(pair) for pair in range(len(twin.scene.pairs)))
         assert smallest > scenario.avoidance.d1 - 1e-6, scenario.title
         assert RANGES.d1[0] <= scenario.avoidance.d1 <= RANGES.d1[1]
         assert RANGES.duration[0] <= scenario.duration <= RANGES.duration[1]

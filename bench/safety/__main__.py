@@ -8,10 +8,10 @@ from pathlib import Path
 from time import perf_counter
 
 from bench.safety import report
-from bench.safety.arena import load
 from bench.safety.campaign import draw
 from bench.safety.trial import Trial, examine, trials
 from qpavoid import Workers
+from qpavoid.arena.twin import load
 from qpavoid.log import STATUSES
 
 RESULTS = Path(__file__).parents[1] / "results"
@@ -54,8 +54,8 @@ def campaign(seeds: range, solvers: list[str], jobs: int | None = None) -> tuple
 def describe(seed: int, solver: str) -> None:
     """Runs one seed and prints its scene, what the referee saw, and all verdicts."""
     scenario = draw(seed)
-    arena = load(scenario)
-    trial, log, findings, verdicts = examine(seed, scenario, arena, solver)
+    twin = load(scenario)
+    trial, log, findings, verdicts = examine(seed, scenario, twin, solver)
     avoidance = scenario.avoidance
     print(
         f"seed {seed}, {trial.robot}, {solver}; dt {scenario.dt:g} s, {scenario.duration:g} s, locked {scenario.lock}"
@@ -67,7 +67,7 @@ def describe(seed: int, solver: str) -> None:
         print(f"  {obstacle.name}: {obstacle.shape}, {obstacle.motion}")
     for name, value in vars(trial).items():
         print(f"{name:16} {value}")
-    names = arena.scene.pair_names
+    names = twin.scene.pair_names
     for contact in findings.contacts:
         tick = int(log.t.searchsorted(contact.time)) - 1
         status = STATUSES[log.status[max(tick, 0)]].value

@@ -10,9 +10,9 @@ import mujoco
 import numpy as np
 from scipy.optimize import linprog
 
-from bench.safety.arena import Arena
-from bench.safety.referee import Watch
 from qpavoid import ScenarioConfig
+from qpavoid.arena.referee import Watch
+from qpavoid.arena.twin import Twin
 from qpavoid.problem import Array
 
 PERIOD = 0.02
@@ -109,9 +109,9 @@ class Flight:
     """Smallest distance on it [m]."""
 
 
-def joint_means(arena: Arena, scenario: ScenarioConfig) -> Means:
+def joint_means(twin: Twin, scenario: ScenarioConfig) -> Means:
     """What a scenario lets the joints do."""
-    bounds = arena.scene.robot.bounds().within(scenario.limits)
+    bounds = twin.scene.robot.bounds().within(scenario.limits)
     lower, upper = np.full_like(bounds.velocity, -np.inf), np.full_like(bounds.velocity, np.inf)
     lower[bounds.v_index], upper[bounds.v_index] = bounds.lower, bounds.upper
     return Means(bounds.velocity, lower, upper, bounds.acceleration)
@@ -127,21 +127,21 @@ def manners(count: int) -> Iterator[Manner]:
         yield Manner(f"fleeing, leaning {i},", HORIZONS[0], LEAN * direction / np.linalg.norm(direction))
 
 
-def fly(arena: Arena, means: Means, start: Start, dt: float, manner: Manner, pairs: Any) -> Flight:
+def fly(twin: Twin, means: Means, start: Start, dt: float, manner: Manner, pairs: Any) -> Flight:
     """Flees with ticks of dt [s], to the end or to the first contact of one of the pairs (m,)."""
     q, v, t, _ = start
-    arena.place(q, t)
-    watch = Watch(arena)
+    twin.place(q, t)
+    watch = Watch(twin)
     watch.look(t)
     pairs = pairs.copy()
     pairs[[contact.pair for contact in watch.contacts]] = False
-    watch = Watch(arena, pairs)
+    watch = Watch(twin, pairs)
     watch.look(t)
     ticks = int(np.ceil(PERIOD / dt - 1e-9))
     while t < start.until - 1e-9:
         box, begin, before, last = means.box(q, v, ticks * dt), t, q, v
         rest = np.clip(np.zeros(len(q)), *box)
-        wanted = flee(near_rows(arena, q, t, pairs, REACH), box, manner) if manner.horizon else rest
+        wanted = flee(near_rows(twin, q, t, pairs, REACH), box, manner) if manner.horizon else rest
         # as long as the velocity stays, several ticks are as good as one
         count = ticks if np.isfinite(means.acceleration).any() else 1
         for _ in range(count):
@@ -153,17 +153,17 @@ def fly(arena: Arena, means: Means, start: Start, dt: float, manner: Manner, pai
     return Flight(None, t, q, v, watch.distance)
 
 
-def near_rows(arena: Arena, q: Array, t: float, pairs: Any, reach: float) -> Rows:
+def near_rows(twin: Twin, q: Array, t: float, pairs: Any, reach: float) -> Rows:
     """Rows of those of the pairs (m,) that are nearer than `reach` [m], all by MuJoCo."""
-    arena.place(q, t)
-    scene, model, data = arena.scene, arena.model, arena.data
+    twin.place(q, t)
+    scene, model, data = twin.scene, twin.model, twin.data
     mujoco.mj_comPos(model, data)
     first, second = scene.pairs.T
-    centers, radius = arena.poses()[0], model.geom_rbound[arena.geoms]
+    centers, radius = twin.poses()[0], model.geom_rbound[twin.geoms]
     gap = np.linalg.norm(centers[first] - centers[second], axis=1) - radius[first] - radius[second]
     found, distance, points = [], [], np.empty((len(gap), 6))
     for pair in np.flatnonzero(pairs & (gap < reach)).tolist():
-        d = arena.distance(pair, points[len(found)])
+        d = twin.distance(pair, points[len(found)])
         if 0.0 < d < reach:
             found.append(pair)
             distance.append(d)
@@ -173,13 +173,13 @@ def near_rows(arena: Arena, q: Array, t: float, pairs: Any, reach: float) -> Row
     velocity = np.zeros((len(found), 3))
     for i, sides in enumerate(scene.pairs[pair].tolist()):
         for side, geometry in enumerate(sides):
-            if geometry < arena.bodies:
-                body = model.geom_bodyid[arena.geoms[geometry]]
+            if geometry < twin.bodies:
+                body = model.geom_bodyid[twin.geoms[geometry]]
                 mujoco.mj_jac(model, data, jacobian[i, side], None, ends[i, side], body)
             elif scene.obstacles[scene.obstacle_of[geometry]].moves:
                 sample = scene.obstacles[scene.obstacle_of[geometry]].motion.sample(t)
                 velocity[i] = sample.linear + np.cross(sample.angular, ends[i, 1] - sample.position)
-    J = np.einsum("kx,kxv->kv", normal, jacobian[:, 1] - jacobian[:, 0])[:, arena.v_index]
+    J = np.einsum("kx,kxv->kv", normal, jacobian[:, 1] - jacobian[:, 0])[:, twin.v_index]
     return Rows(pair, d, J, np.sum(normal * velocity, axis=1))
 
 

@@ -15,9 +15,9 @@ from typing import NamedTuple
 import numpy as np
 
 from bench.safety.campaign import KINDS, RANGES
-from bench.safety.referee import MOST_LOOKS, STEP
 from bench.safety.trial import Trial
 from bench.safety.verdict import AHEAD, RESOLUTION
+from qpavoid.arena.referee import MOST_LOOKS, STEP
 
 PACKAGES = ("qpavoid", "mujoco", "pin", "coal", "daqp", "numpy", "scipy", "numba")
 LISTED = 10

@@ -8,11 +8,12 @@ from time import perf_counter
 
 import numpy as np
 
-from bench.safety.arena import Arena, load
 from bench.safety.campaign import draw
-from bench.safety.referee import Findings, referee
+from bench.safety.referee import disagreement, drift, referee
 from bench.safety.verdict import Verdict, judge, last_way_out
 from qpavoid import Log, ScenarioConfig, Status, simulate
+from qpavoid.arena.referee import Findings
+from qpavoid.arena.twin import Twin, load
 from qpavoid.log import STATUSES
 
 
@@ -94,32 +95,32 @@ class Trial:
 def trials(seed: int, solvers: Sequence[str]) -> list[Trial]:
     """The scenario of a seed with several solvers."""
     scenario = draw(seed)
-    arena = load(scenario)
-    return [examine(seed, scenario, arena, solver)[0] for solver in solvers]
+    twin = load(scenario)
+    return [examine(seed, scenario, twin, solver)[0] for solver in solvers]
 
 
 def examine(
-    seed: int, scenario: ScenarioConfig, arena: Arena, solver: str
+    seed: int, scenario: ScenarioConfig, twin: Twin, solver: str
 ) -> tuple[Trial, Log, Findings, tuple[Verdict, ...]]:
     """One run, with everything that its row was made of."""
     begin = perf_counter()
     log = simulate(scenario, solver)
-    findings = referee(arena, log)
-    verdicts = judge(arena, scenario, log, findings)
-    names, metrics = [" - ".join(pair) for pair in arena.scene.pair_names], log.metrics()
+    findings = referee(twin, log)
+    verdicts = judge(twin, scenario, log, findings)
+    names, metrics = [" - ".join(pair) for pair in twin.scene.pair_names], log.metrics()
     decisive = next((verdict for verdict in verdicts if verdict.avoidable), verdicts[0] if verdicts else None)
     way_out, apart, then = np.nan, np.nan, ""
     if decisive and decisive.why == "avoidable" and solver.startswith("qp"):  # the others' would take hours
-        way_out, apart, status = last_way_out(arena, scenario, log, findings, decisive)
+        way_out, apart, status = last_way_out(twin, scenario, log, findings, decisive)
         then = STATUSES[status].value
     trial = Trial(
         seed=seed,
-        robot=arena.scene.robot.name,
+        robot=twin.scene.robot.name,
         solver=solver,
         dt=scenario.dt,
         ticks=len(log.t),
         obstacles=len(scenario.obstacles),
-        moving=sum(obstacle.moves for obstacle in arena.scene.obstacles),
+        moving=sum(obstacle.moves for obstacle in twin.scene.obstacles),
         d1=scenario.avoidance.d1,
         distance=findings.distance,
         pair=names[findings.pair] if findings.pair >= 0 else "",
@@ -137,8 +138,8 @@ def examine(
         arrived=metrics["arrived"],
         error=metrics["final_error"],
         seen=metrics["collided"],
-        disagreement=findings.disagreement,
-        drift=findings.drift,
+        disagreement=disagreement(twin, log, findings),
+        drift=drift(log, findings),
         speed_excess=findings.speed_excess,
         position_excess=findings.position_excess,
         acceleration_excess=findings.acceleration_excess,

@@ -23,10 +23,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bench.safety.arena import Arena
 from bench.safety.flight import REACH, Flight, Means, Start, fly, joint_means, largest, manners, near_rows
-from bench.safety.referee import Contact, Findings
 from qpavoid import Log, ScenarioConfig
+from qpavoid.arena.referee import Contact, Findings
+from qpavoid.arena.twin import Twin
 
 AFTER = 0.5
 """Flights must stay clear for so long after the contact in question [s]."""
@@ -62,12 +62,12 @@ class Verdict:
         return self.why in ("avoidable", "unproven")
 
 
-def judge(arena: Arena, scenario: ScenarioConfig, log: Log, findings: Findings) -> tuple[Verdict, ...]:
+def judge(twin: Twin, scenario: ScenarioConfig, log: Log, findings: Findings) -> tuple[Verdict, ...]:
     """Verdicts on the contacts of a run in the order of time, up to the first that is avoidable."""
     verdicts: list[Verdict] = []
-    excused = ~arena.movable
+    excused = ~twin.movable
     for contact in findings.contacts:
-        verdicts.append(_judge(arena, scenario, log, findings, contact, excused))
+        verdicts.append(_judge(twin, scenario, log, findings, contact, excused))
         if verdicts[-1].avoidable:
             break
         excused[contact.pair] |= verdicts[-1].why != "squeezed"  # a squeeze is one matter, with all who take part
@@ -75,12 +75,12 @@ def judge(arena: Arena, scenario: ScenarioConfig, log: Log, findings: Findings) 
 
 
 def _judge(
-    arena: Arena, scenario: ScenarioConfig, log: Log, findings: Findings, contact: Contact, excused: Any
+    twin: Twin, scenario: ScenarioConfig, log: Log, findings: Findings, contact: Contact, excused: Any
 ) -> Verdict:
-    names = " - ".join(arena.scene.pair_names[contact.pair])
-    if not arena.movable[contact.pair]:
+    names = " - ".join(twin.scene.pair_names[contact.pair])
+    if not twin.movable[contact.pair]:
         return Verdict(contact, "fixed", f"no joint changes the distance of {names}")
-    means, first = joint_means(arena, scenario), _in_range(arena, scenario, log, findings, contact)
+    means, first = joint_means(twin, scenario), _in_range(twin, scenario, log, findings, contact)
     before = log.v[first - 1] if first else np.zeros(len(means.speed))
     start = Start(findings.q[first], before, float(log.t[first]), min(contact.time + AFTER, float(log.t[-1])))
     watched = ~excused
@@ -88,55 +88,55 @@ def _judge(
     while True:
         flights = []
         for manner in manners(len(means.speed)):
-            flight = fly(arena, means, start, scenario.dt, manner, watched)
+            flight = fly(twin, means, start, scenario.dt, manner, watched)
             if flight.touched is None:
                 how = f"{manner.name} from t = {start.t:.3f} s on keeps {1e3 * flight.clearance:.1f} mm"
                 return Verdict(contact, "avoidable", how)
             flights.append(flight)
         last = max(flights, key=lambda flight: flight.t)
-        why, detail = certify(arena, means, last, watched)
+        why, detail = certify(twin, means, last, watched)
         if why != "outrun" or last.touched == contact.pair:
             return Verdict(contact, why, detail)
         watched[last.touched] = False
 
 
-def last_way_out(arena: Arena, scenario: ScenarioConfig, log: Log, findings: Findings, verdict: Verdict) -> LastWayOut:
+def last_way_out(twin: Twin, scenario: ScenarioConfig, log: Log, findings: Findings, verdict: Verdict) -> LastWayOut:
     """When it was too late for every flight, by bisection between coming into range and the contact.
 
     Flights watch the pair that touched and all that had not touched before it.
     """
-    contact, means = verdict.contact, joint_means(arena, scenario)
-    watched = arena.movable.copy()
+    contact, means = verdict.contact, joint_means(twin, scenario)
+    watched = twin.movable.copy()
     watched[[other.pair for other in findings.contacts if other.time < contact.time]] = False
     until = min(contact.time + AFTER, float(log.t[-1]))
 
     def clear(k: int) -> bool:
         start = Start(findings.q[k], log.v[k - 1] if k else np.zeros(len(means.speed)), float(log.t[k]), until)
-        flights = (fly(arena, means, start, scenario.dt, manner, watched) for manner in manners(len(means.speed)))
+        flights = (fly(twin, means, start, scenario.dt, manner, watched) for manner in manners(len(means.speed)))
         return any(flight.touched is None for flight in flights)
 
-    low, high = _in_range(arena, scenario, log, findings, contact), int(np.searchsorted(log.t, contact.time)) - 1
+    low, high = _in_range(twin, scenario, log, findings, contact), int(np.searchsorted(log.t, contact.time)) - 1
     while high - low > max(1, round(RESOLUTION / scenario.dt)):
         middle = (low + high) // 2
         low, high = (middle, high) if clear(middle) else (low, middle)
-    arena.place(findings.q[low], float(log.t[low]))
-    return LastWayOut(contact.time - float(log.t[low]), arena.distance(contact.pair), int(log.status[low]))
+    twin.place(findings.q[low], float(log.t[low]))
+    return LastWayOut(contact.time - float(log.t[low]), twin.distance(contact.pair), int(log.status[low]))
 
 
-def _in_range(arena: Arena, scenario: ScenarioConfig, log: Log, findings: Findings, contact: Contact) -> int:
+def _in_range(twin: Twin, scenario: ScenarioConfig, log: Log, findings: Findings, contact: Contact) -> int:
     """The last tick before a contact at which the pair was out of range; 0 if there is none."""
     reach = scenario.avoidance.d2 - scenario.avoidance.offset
     for k in range(int(np.searchsorted(log.t, contact.time)) - 1, 0, -1):
-        arena.place(findings.q[k], float(log.t[k]))
-        if arena.distance(contact.pair) > reach:
+        twin.place(findings.q[k], float(log.t[k]))
+        if twin.distance(contact.pair) > reach:
             return k
     return 0
 
 
-def certify(arena: Arena, means: Means, flight: Flight, watched: Any) -> tuple[str, str]:
+def certify(twin: Twin, means: Means, flight: Flight, watched: Any) -> tuple[str, str]:
     """Why a flight among the watched pairs (m,) had to end in contact, and the figures that prove it, if they do."""
-    rows = near_rows(arena, flight.q, flight.t, watched, REACH)
-    box, names = means.box(flight.q, flight.v, AHEAD), arena.scene.pair_names
+    rows = near_rows(twin, flight.q, flight.t, watched, REACH)
+    box, names = means.box(flight.q, flight.v, AHEAD), twin.scene.pair_names
     for i in np.flatnonzero(rows.pair == flight.touched).tolist():
         retreat = float(np.maximum(rows.J[i] * box[0], rows.J[i] * box[1]).sum())
         if rows.d[i] + AHEAD * (retreat + rows.drift[i]) < 0.0:

@@ -20,7 +20,7 @@ FAR = 100.0
 
 
 @dataclass(frozen=True)
-class Arena:
+class Twin:
     """A scene and its MuJoCo twin. Configurations and velocities go in and out in the scene's order."""
 
     scene: Scene
@@ -71,15 +71,15 @@ class Arena:
         return float(mujoco.mj_geomDistance(self.model, self.data, a, b, FAR, np.empty(6) if ends is None else ends))
 
 
-def load(scenario: ScenarioConfig) -> Arena:
-    """The arena of a scenario."""
+def load(scenario: ScenarioConfig) -> Twin:
+    """The twin of a scenario."""
     source = scenario.source
     robot = Robot.load(scenario.robot, source.parent)
     robot, q0 = robot.lock(scenario.lock, robot.configuration(scenario.q0, str(source)), str(source))
     return build(build_scene(robot, build_obstacles(scenario.obstacles, source)), q0)
 
 
-def build(scene: Scene, q0: Array) -> Arena:
+def build(scene: Scene, q0: Array) -> Twin:
     """Writes the scene as MJCF: one MuJoCo body a joint, one mocap body an obstacle.
 
     Raises:
@@ -107,7 +107,7 @@ def build(scene: Scene, q0: Array) -> Arena:
             _add_geom(spec, obstacles[scene.obstacle_of[i]], geometry, pin.SE3.Identity())
     model = spec.compile()
     joints = [model.joint(name) for name in list(robot.names)[1:]]
-    arena = Arena(
+    twin = Twin(
         scene=scene,
         q0=np.array(q0),
         model=model,
@@ -118,9 +118,9 @@ def build(scene: Scene, q0: Array) -> Arena:
         bodies=first,
     )
     for i, obstacle in enumerate(scene.obstacles):
-        arena._place_obstacle(i, obstacle.motion.sample(0.0))
-    arena.place(arena.q0, 0.0)
-    return arena
+        twin._place_obstacle(i, obstacle.motion.sample(0.0))
+    twin.place(twin.q0, 0.0)
+    return twin
 
 
 def _joint(model: Any, index: int) -> tuple[Any, Array]:

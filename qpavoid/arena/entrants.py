@@ -1,0 +1,115 @@
+"""Who takes part: laws of this library with their settings, other libraries, and what users bring."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from typing import Any
+
+from qpavoid.arena.case import Case
+from qpavoid.arena.pilot import Pilot
+from qpavoid.arena.world import World
+from qpavoid.config import ScenarioConfig
+from qpavoid.controller import Controller
+from qpavoid.errors import ConfigError, UnknownName
+from qpavoid.loading import nearest
+from qpavoid.solvers import parse_solver
+
+
+@dataclass(frozen=True)
+class Entrant:
+    """One column of the report."""
+
+    name: str
+    says: str
+    """What it is, in a line."""
+    start: Callable[[Case, World], Pilot]
+    """Sets it up for a case."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """What tells it from others of its kind; changes of it make results of their own."""
+    packages: tuple[str, ...] = ()
+    """What it runs on, for the report; where one is not installed, it does not take part."""
+
+    @property
+    def digest(self) -> str:
+        """Of its name and settings."""
+        text = json.dumps([self.name, dict(self.settings)], sort_keys=True, default=str)
+        return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Those of its packages that are not installed."""
+        return tuple(package for package in self.packages if not _installed(package))
+
+
+def law(name: str, says: str, solver: str, packages: tuple[str, ...] = (), **changes: Any) -> Entrant:
+    """A solver of this library, within a `Controller`.
+
+    Args:
+        name: of the entrant.
+        says: what it is, in a line.
+        solver: as in `eq10` or `qp:proxqp`.
+        packages: what its back end needs.
+        changes: blocks of the scenario that it has its own way, as in `avoidance={"row": {"type": "cbf"}}`; what is
+            not named of a block stays as it is.
+    """
+
+    def start(case: Case, world: World) -> Pilot:
+        scenario = case.scenario.model_dump()
+        for block, fields in changes.items():
+            scenario[block] = {**scenario[block], **fields}
+        scenario["solver"] = parse_solver(solver).model_dump()
+        controller, _ = Controller.from_scenario(
+            ScenarioConfig.model_validate(scenario).read_from(case.scenario.source)
+        )
+        return controller
+
+    return Entrant(name, says, start, {"solver": solver, **changes}, packages)
+
+
+def _row(kind: str) -> dict[str, Any]:
+    return {"row": {"type": kind}}
+
+
+ENTRANTS = {
+    entrant.name: entrant
+    for entrant in (
+        law("tracking", "damped least squares on the task, no avoidance: the baseline", "tracking"),
+        law("eq10", "task switching, eq. 10 with the consistent bracket", "eq10"),
+        law("eq10-literal", "task switching, eq. 10 as printed", "eq10-literal"),
+        law("qp", "QP with switching α/β rows, default back end", "qp", avoidance=_row("switching")),
+        law("qp-damper", "QP with velocity damper rows", "qp", avoidance=_row("damper")),
+        law("qp-cbf", "QP with control barrier rows", "qp", avoidance=_row("cbf")),
+        law("qp:native", "QP, compiled active-set method", "qp:native", ("numba",)),
+        law("qp:daqp", "QP, back end daqp", "qp:daqp"),
+        law("qp:proxqp", "QP, back end ProxQP", "qp:proxqp"),
+        law("qp:osqp", "QP, back end OSQP", "qp:osqp"),
+        law("qp:quadprog", "QP, back end quadprog", "qp:quadprog", ("quadprog",)),
+        law("hqp", "strict priorities, a cascade of QPs", "hqp"),
+    )
+}
+"""Those that ship, in the order of the report."""
+
+
+def find_entrant(name: str) -> Entrant:
+    """One that ships.
+
+    Raises:
+        UnknownName: there is none of that name.
+        ConfigError: it runs on something that is not installed.
+    """
+    if name not in ENTRANTS:
+        raise UnknownName(f"unknown entrant {name!r}{nearest(name, ENTRANTS)}")
+    entrant = ENTRANTS[name]
+    if entrant.missing:
+        raise ConfigError(
+            f"entrant {name!r} needs {', '.join(entrant.missing)}: pip install {' '.join(entrant.missing)}"
+        )
+    return entrant
+
+
+def _installed(package: str) -> bool:
+    return find_spec(package) is not None

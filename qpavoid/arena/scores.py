@@ -1,0 +1,205 @@
+"""The figures of one run by which entrants are compared; a row of the results."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from qpavoid.arena.case import Case
+from qpavoid.arena.referee import Findings
+from qpavoid.arena.rollout import Rollout
+from qpavoid.arena.world import World
+from qpavoid.config import ScenarioConfig
+from qpavoid.log import STATUSES
+from qpavoid.problem import Array, Status
+from qpavoid.segments import point_segment
+
+RESTING = 1e-3
+"""Speed of a tool below which it rests [m/s]."""
+SETTLE = 1.0
+"""A run that has not arrived is stuck when its tools have rested for so long at its end [s]."""
+_CORNERS = 500
+_ROUND_OFF = 1e-6
+
+
+@dataclass(frozen=True)
+class Score:
+    """One run. Distances and limits are the referee's; a failure counts at its limit, and every run has all figures."""
+
+    family: str
+    seed: int
+    robot: str
+    case: str
+    """`Case.key`: digest of the scenario."""
+    entrant: str
+    settings: str
+    """Digest of what the entrant is and how it is set."""
+    version: str
+    """Of qpavoid."""
+    reachable: bool
+    """Whether the goals can be reached."""
+    success: bool
+    """No contact, and all goals reached; where they cannot be, at rest at the end."""
+    collided: bool
+    """Something touched."""
+    contacts: int
+    """Pairs that touched."""
+    min_distance: float
+    """Smallest of the pairs that the robot can part [m]."""
+    d1: float
+    """The distance between surfaces that was to be kept [m]."""
+    below_d1: float
+    """Share of the time with something nearer than d1 [-]."""
+    arrived: bool
+    """Every tool ended within the goal tolerance."""
+    final_error: float
+    """Of the worst tool [m]."""
+    tracking_error: float
+    """Root mean square of the distances between tools and their moving targets [m]."""
+    deviation: float
+    """Largest distance of a tool from the path of its target [m]."""
+    path_length: float
+    """Of the tools together, over that of their targets [-]."""
+    time_to_goal: float
+    """After which every tool stayed within the goal tolerance, over the duration; 1 where that was never [-]."""
+    stuck: bool
+    """Not arrived, no contact, and the tools rested for the last second."""
+    jerk: float
+    """Root mean square of the joints' jerk [rad/s³ or m/s³]."""
+    jitter: float
+    """Σ|Δq̇| over joints and ticks, per second [rad/s² or m/s²]."""
+    peak_velocity: float
+    """Of the fastest joint, over its limit [-]."""
+    violations: float
+    """Share of ticks that pass a velocity, position or acceleration limit [-]."""
+    relaxed: float
+    """Share of ticks that gave something up [-]."""
+    stopped: float
+    """Share of ticks in which the robot was braked or held, the entrant's failures among them [-]."""
+    failed: float
+    """Share of ticks in which the entrant raised, or gave no finite velocity [-]."""
+    failure: str
+    """The first thing that it said then; empty if it never did."""
+    tick_p50: float
+    """Median time of a tick [µs]."""
+    tick_p99: float
+    """[µs]."""
+    ticks: int
+    dt: float
+    """[s]."""
+    duration: float
+    """[s]."""
+    seconds: float
+    """What the run took, referee included [s]."""
+
+    def row(self) -> dict[str, Any]:
+        """As a row of a table."""
+        return asdict(self)
+
+
+COLUMNS = {field.name: str(field.type) for field in fields(Score)}
+"""Column: `str`, `int`, `float` or `bool`."""
+KEY = ("case", "entrant", "settings", "version")
+"""Columns that tell one run from another."""
+
+
+def score(
+    case: Case, world: World, entrant: str, settings: str, rollout: Rollout, findings: Findings, seconds: float
+) -> Score:
+    """The figures of a run.
+
+    Args:
+        case: what was run.
+        world: of the same case.
+        entrant: who ran it.
+        settings: digest of the entrant.
+        rollout: what it did.
+        findings: what the referee says of that.
+        seconds: what the run took [s].
+    """
+    scenario, ticks = case.scenario, len(rollout.t)
+    error = np.linalg.norm(rollout.target - rollout.tool, axis=2).max(axis=1, initial=0.0)
+    goal_error = np.linalg.norm(rollout.target[-1] - rollout.tool, axis=2).max(axis=1, initial=0.0)
+    away = np.flatnonzero(goal_error > scenario.goal_tolerance)
+    arrived = bool(goal_error[-1] <= scenario.goal_tolerance)
+    settled = rollout.tool[-1 - min(ticks - 1, round(SETTLE / scenario.dt)) :]
+    rests = bool(np.ptp(settled, axis=0).max(initial=0.0) <= RESTING * SETTLE)
+    change = np.diff(rollout.v, axis=0)
+    limit = world.scene.robot.bounds().velocity
+    return Score(
+        family=case.family,
+        seed=case.seed,
+        robot=world.scene.robot.name,
+        case=case.key,
+        entrant=entrant,
+        settings=settings,
+        version=version("qpavoid"),
+        reachable=case.reachable,
+        success=not findings.contacts and (arrived if case.reachable else rests),
+        collided=bool(findings.contacts),
+        contacts=len(findings.contacts),
+        min_distance=findings.distance,
+        d1=to_keep(scenario),
+        below_d1=float(np.mean(findings.nearest < to_keep(scenario))),
+        arrived=arrived,
+        final_error=float(goal_error[-1]),
+        tracking_error=float(np.sqrt(np.mean(error**2))),
+        deviation=_deviation(rollout),
+        path_length=_length(rollout.tool) / max(_length(rollout.target), 1e-9),
+        time_to_goal=(away[-1] + 1 if len(away) else 0) / ticks if arrived else 1.0,
+        stuck=case.reachable and not arrived and not findings.contacts and rests,
+        jerk=float(np.sqrt(np.mean(np.square(np.diff(change, axis=0))))) / scenario.dt**2,
+        jitter=float(np.abs(change).sum()) / scenario.duration,
+        peak_velocity=float(np.max(np.abs(rollout.v) / limit, initial=0.0)),
+        violations=float(np.mean(_violating(world, scenario, rollout, findings))),
+        relaxed=_share(rollout, Status.RELAXED),
+        stopped=_share(rollout, Status.STOPPED),
+        failed=float(np.mean(rollout.failed)),
+        failure=rollout.failure,
+        tick_p50=1e6 * float(np.median(rollout.tick)),
+        tick_p99=1e6 * float(np.quantile(rollout.tick, 0.99)),
+        ticks=ticks,
+        dt=scenario.dt,
+        duration=scenario.duration,
+        seconds=seconds,
+    )
+
+
+def to_keep(scenario: ScenarioConfig) -> float:
+    """The distance between surfaces below which avoiding is meant to have taken over entirely: d1 [m]."""
+    return scenario.avoidance.d1 - scenario.avoidance.offset
+
+
+def _share(rollout: Rollout, status: Status) -> float:
+    return float(np.mean(rollout.status == STATUSES.index(status)))
+
+
+def _length(path: Array) -> float:
+    """Of all tools' paths (N, k, 3) together [m]."""
+    return float(np.linalg.norm(np.diff(path, axis=0), axis=2).sum())
+
+
+def _deviation(rollout: Rollout) -> float:
+    """Largest distance of a tool from the path that its target draws, at whatever time [m]."""
+    worst, corners = 0.0, np.unique(np.linspace(0, len(rollout.t) - 1, _CORNERS).astype(int))
+    for tool, target in zip(rollout.tool.swapaxes(0, 1), rollout.target[corners].swapaxes(0, 1), strict=True):
+        nearest = np.full(len(tool), np.inf)
+        for start, end in zip(target, np.concatenate((target[1:], target[-1:])), strict=True):
+            nearest = np.minimum(nearest, point_segment(tool, start, end).distance)
+        worst = max(worst, float(nearest.max()))
+    return worst
+
+
+def _violating(world: World, scenario: ScenarioConfig, rollout: Rollout, findings: Findings) -> Array:
+    """(N,) whether a tick passes a velocity, position or acceleration limit by more than round-off."""
+    bounds = world.scene.robot.bounds().within(scenario.limits)
+    q = findings.q[:, bounds.q_index]
+    acceleration = np.diff(rollout.v, axis=0, prepend=0.0) / scenario.dt
+    return np.asarray(
+        (np.abs(rollout.v) > bounds.velocity + _ROUND_OFF).any(axis=1)
+        | ((q < bounds.lower - _ROUND_OFF) | (q > bounds.upper + _ROUND_OFF)).any(axis=1)
+        | (np.abs(acceleration) > bounds.acceleration + _ROUND_OFF / scenario.dt).any(axis=1)
+    )

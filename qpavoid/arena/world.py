@@ -1,0 +1,42 @@
+"""What a case consists of once it is built: the scene, what is to be followed, and where the robot starts."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from qpavoid.config import ScenarioConfig
+from qpavoid.errors import located
+from qpavoid.problem import Array
+from qpavoid.robot import Robot
+from qpavoid.scene import Scene, build_obstacles, build_scene
+from qpavoid.tasks import AnyTask, FrameTask, build_tasks
+
+
+class World(NamedTuple):
+    """A scenario, built."""
+
+    scene: Scene
+    tasks: tuple[AnyTask, ...]
+    q0: Array
+    """(nq,) where the robot starts."""
+
+    @property
+    def tools(self) -> list[FrameTask]:
+        """Tasks whose frames have a position to follow."""
+        return [task for task in self.tasks if isinstance(task, FrameTask) and task.moves]
+
+
+def build_world(scenario: ScenarioConfig) -> World:
+    """The world of a scenario.
+
+    Raises:
+        ConfigError, UnknownName: naming file, field and remedy.
+    """
+    source = scenario.source
+    with located(f"{source}: robot"):
+        robot = Robot.load(scenario.robot, source.parent)
+    robot, q0 = robot.lock(scenario.lock, robot.configuration(scenario.q0, f"{source}: q0"), f"{source}: lock")
+    obstacles = build_obstacles(scenario.obstacles, source)
+    with located(str(source)):
+        scene = build_scene(robot, obstacles)
+    return World(scene, tuple(build_tasks(scenario.tasks, robot, q0, source)), q0)
