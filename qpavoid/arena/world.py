@@ -35,7 +35,8 @@ def build_world(scenario: ScenarioConfig) -> World:
     source = scenario.source
     with located(f"{source}: robot"):
         robot = Robot.load(scenario.robot, source.parent)
-    return world_of(scenario, *robot.lock(scenario.lock, robot.configuration(scenario.q0, f"{source}: q0"), f"{source}: lock"))
+    q0 = robot.configuration(scenario.q0, f"{source}: q0")
+    return world_of(scenario, *robot.lock(scenario.lock, q0, f"{source}: lock"))
 
 
 def world_of(scenario: ScenarioConfig, robot: Robot, q0: Array) -> World:

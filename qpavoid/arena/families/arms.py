@@ -16,7 +16,7 @@ from qpavoid.arena.families.ways import Way
 from qpavoid.problem import Array
 from qpavoid.robot import Robot
 
-REST = 2.0
+REST = 3.0
 """Time from the end of the planned motion to that of the run [s]."""
 _PRECISE = 1e-4
 """How far a tool may be from where it was put [m]."""

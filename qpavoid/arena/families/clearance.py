@@ -11,8 +11,10 @@ from qpavoid.proximity import DistanceQuery
 
 STEP = 0.005
 """Shortest change of distance between two looks at a motion [m]."""
-_REACH = 0.25
-"""Distances are looked for up to here [m]."""
+_FAR = 0.1
+"""Distances are looked for up to so much more than what is kept [m]."""
+_LOOKS = 0.05
+"""Time between two looks at what no joint moves [s]."""
 _PERIOD = 0.01
 """Of the samples that tell how fast obstacles move [s]."""
 
@@ -20,13 +22,17 @@ _PERIOD = 0.01
 class Clearance:
     """Distances of a world's pairs, for planning: q (nv,) of joints with one coordinate each."""
 
-    def __init__(self, world: World, duration: float) -> None:
+    def __init__(self, world: World, duration: float, keep: float) -> None:
         """Lays everything out.
 
         Args:
             world: nothing in it is carried.
             duration: how long obstacles are followed [s].
+            keep: distance that everything is to keep all the time [m].
         """
+        self.least = keep + 0.5 * STEP
+        """What every look has to find [m]."""
+        self._reach = self.least + _FAR
         scene = world.scene
         self._model, self._data, self._query = scene.robot.model, scene.robot.model.createData(), DistanceQuery(scene)
         self._movers = [(i, o.motion) for i, o in enumerate(scene.obstacles) if o.moves]
@@ -43,35 +49,39 @@ class Clearance:
         return bool(self._movers)
 
     def at(self, q: Array, t: float) -> float:
-        """Least distance of any pair [m], at most 0.25 m."""
+        """Least distance of any pair [m]; of those 0.1 m farther apart than they must be, that limit."""
         self._look(q, t)
         pairs = self._query.pairs
-        return float(min(self._query.results[pairs, 0].min(initial=_REACH), _REACH))
+        return float(min(self._query.results[pairs, 0].min(initial=self._reach), self._reach))
 
-    def unavoidable(self, q: Array) -> float:
-        """Least distance ever of pairs that no joint can part, such as a fixed base and an obstacle [m]."""
-        least, fixed = _REACH, np.flatnonzero(self._fixed)
+    def clear(self, q: Array, t: float) -> bool:
+        """Whether everything is far enough apart for a look."""
+        return self.at(q, t) >= self.least
+
+    def roots_clear(self, q: Array) -> bool:
+        """Whether pairs that no joint can part, such as a base and an obstacle, are always far enough apart; any q."""
+        fixed = np.flatnonzero(self._fixed)
         if not len(fixed):
-            return least
-        for t in np.arange(0.0, self._duration + 0.05, 0.05) if self.timed else (0.0,):
+            return True
+        for t in np.arange(0.0, self._duration + _LOOKS, _LOOKS) if self.timed else (0.0,):
             self._look(q, float(t))
-            least = min(least, float(self._query.found(fixed).min()))
-        return least
+            if self._query.found(fixed).min() < self.least:
+                return False
+        return True
 
-    def clear(self, a: Array, ta: float, b: Array, tb: float, keep: float) -> bool:
-        """Whether everything stays farther than `keep` apart on the straight motion from a (nv,) at ta to b at tb.
+    def clear_between(self, a: Array, ta: float, b: Array, tb: float) -> bool:
+        """Whether everything keeps its distance on the straight motion from a (nv,) at ta to b at tb.
 
         Conservative advancement: no distance changes faster than the levers and the speed of obstacles allow, so that
-        what is left of the least one tells how far to go before looking again. Looks are at least `STEP` apart, and at
-        each one everything has to be half as much farther than `keep`: nothing between two looks can come below it.
+        what is left of the least one tells how far to go before looking again. Looks are at least `STEP` apart, and
+        each has to find half as much more than what is to be kept: nothing between two looks can come below that.
         """
-        way = b - a
-        change, least = float(self.lever @ np.abs(way)) + self.speed * (tb - ta), keep + 0.5 * STEP
-        if self.at(b, tb) < least:
+        if not self.clear(b, tb):
             return False
-        share = 0.0
+        way, share = b - a, 0.0
+        change = float(self.lever @ np.abs(way)) + self.speed * (tb - ta)
         while share < 1.0:
-            room = self.at(a + share * way, ta + share * (tb - ta)) - least
+            room = self.at(a + share * way, ta + share * (tb - ta)) - self.least
             if room < 0.0:
                 return False
             share += max(room, STEP) / max(change, 1e-12)
@@ -81,7 +91,7 @@ class Clearance:
         for index, motion in self._movers:
             self._query.place_obstacle(index, motion.sample(t))
         pin.forwardKinematics(self._model, self._data, q)
-        self._query.compute(self._data, _REACH)
+        self._query.compute(self._data, self._reach)
 
     def _fastest(self) -> float:
         fastest = 0.0

@@ -26,7 +26,7 @@ GENERATORS: dict[str, Generator] = {
     "shelf": statics.shelf,
     "box": statics.box,
     "opening": statics.opening,
-    "gap": statics.gap_between_blocks,
+    "narrow_gap": statics.narrow_gap,
     "crossing_arms": two_arms.crossing_arms,
     "passing": two_arms.passing,
     "crossing": moving.crossing,
@@ -51,13 +51,13 @@ class FamilyConfig(Block):
     """What it asks of a controller."""
     robots: Annotated[list[str | dict[str, Any]], Field(min_length=1)]
     """Who takes part, one a seed in turn: a setup or a robot by name, or fields of a scenario, `robot` among them."""
-    parameters: dict[str, Parameter] = {}
+    parameters: dict[str, Parameter] = Field(default_factory=dict)
     """What varies."""
-    scenario: dict[str, Any] = {}
+    scenario: dict[str, Any] = Field(default_factory=dict)
     """Fields of a scenario, in which "$name" stands for the value of a parameter."""
     generator: str | None = None
     """Who works out the fields that are missing: one that ships, or `file.py:function` beside this file."""
-    sensor: dict[str, Any] = {}
+    sensor: dict[str, Any] = Field(default_factory=dict)
     """How obstacles are seen: fields of `qpavoid.arena.case.Sensor`, "$name" as above."""
     reachable: bool = True
     """Whether the goals can be reached; it is checked, whichever it is."""
@@ -108,11 +108,7 @@ def load_family(name_or_path: str | Path) -> Family:
     """
     path = find_family(name_or_path)
     config = read_config(path, FamilyConfig)
-    used = {
-        name: where
-        for key in ("scenario", "sensor")
-        for name, where in _names(getattr(config, key), key)
-    }
+    used = {name: where for key in ("scenario", "sensor") for name, where in _names(getattr(config, key), key)}
     for name, where in used.items():
         if name not in config.parameters:
             raise UnknownName(f"{path}: {where}: unknown parameter '${name}'{nearest(name, config.parameters)}")

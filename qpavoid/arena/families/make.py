@@ -36,8 +36,8 @@ def make_case(family: Family, seed: int) -> Case:
         seed: 0 or more; it also picks the robot, `robots[seed % len(robots)]`.
 
     Raises:
-        ConfigError, UnknownName: the family makes no scenario, has parameters that its generator never draws, or not one
-            draw that is solvable.
+        ConfigError, UnknownName: the family makes no scenario, has parameters that its generator never draws, or none
+            of its draws is solvable.
     """
     if seed < 0:
         raise ConfigError(f"{family.path}: seed {seed}: give 0 or more")

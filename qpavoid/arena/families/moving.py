@@ -82,7 +82,7 @@ def _random_walk(draw: Draw, one: Arm, way: Way) -> dict[str, Any]:
 
 
 def _aside(draw: Draw, one: Arm) -> Array:
-    return one.length * draw("aside") * np.array(draw("direction"))
+    return np.asarray(one.length * draw("aside") * np.array(draw("direction")))
 
 
 def _beside(draw: Draw, one: Arm, way: Way) -> Array:

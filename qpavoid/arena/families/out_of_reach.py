@@ -62,7 +62,7 @@ def arm(robot: Robot, frame_id: int, first: int = 1) -> tuple[Array, float]:
 
 
 def _shell(robot: Robot, frame_id: int) -> float:
-    """How far a frame's origin is from the nearest body that moves with it [m]: 0 if inside one, inf if there is none."""
+    """How far a frame's origin is from the nearest body that moves with it [m]; inf if there is none."""
     frame = robot.model.frames[frame_id]
     mates = [placed(body) for body in robot.bodies.geometryObjects if body.parentJoint == frame.parentJoint]
     return max(gap(_POINT, coal.Transform3s(np.eye(3), frame.placement.translation), mates), 0.0)

@@ -103,8 +103,8 @@ class Redraw(Exception):
 class Draw:
     """One draw of a family: gives values of its parameters by name.
 
-    Each parameter has a stream of random numbers of its own, made from seed, number of the draw and its name: adding one
-    leaves the others as they are.
+    Each parameter has a stream of random numbers of its own, made from seed, number of the draw and its name: adding
+    one leaves the others as they are.
     """
 
     def __init__(self, parameters: Mapping[str, Parameter], seed: int, number: int, once: frozenset[str]) -> None:

@@ -68,9 +68,8 @@ class _Tree:
 class _Search:
     """What both trees share."""
 
-    def __init__(self, clearance: Clearance, keep: float, speed: Array) -> None:
-        self._clearance, self._keep, self._speed = clearance, keep, speed
-        self._timed = clearance.timed
+    def __init__(self, clearance: Clearance, speed: Array) -> None:
+        self._clearance, self._speed, self._timed = clearance, speed, clearance.timed
 
     def nearest(self, tree: _Tree, q: Array, t: float) -> int:
         """The node of a tree from which (or to which) q at t can be reached with the least motion; -1 if none."""
@@ -89,12 +88,9 @@ class _Search:
         share = min(1.0, _LONGEST / max(cost, 1e-12), _LONGEST_TIME / abs(time) if self._timed and time else 1.0)
         there, then = tree.q[node] + share * way, float(tree.t[node]) + share * time
         ends = (tree.q[node], float(tree.t[node]), there, then)
-        if not self.clear(*(ends if tree.forward else (*ends[2:], *ends[:2]))):
+        if not self._clearance.clear_between(*(ends if tree.forward else (*ends[2:], *ends[:2]))):
             return -1, False
         return tree.add(there, then, node), share == 1.0
-
-    def clear(self, a: Array, ta: float, b: Array, tb: float) -> bool:
-        return self._clearance.clear(a, ta, b, tb, self._keep)
 
 
 def plan(
@@ -102,7 +98,6 @@ def plan(
     ranges: Ranges,
     start: Array,
     goals: Array,
-    keep: float,
     speed: Array,
     duration: float,
     random: np.random.Generator,
@@ -110,16 +105,15 @@ def plan(
     """A motion from start to one of the goals, within the duration; None if none was found.
 
     Args:
-        clearance: of the scene.
+        clearance: of the scene, and what is to be kept.
         ranges: of the joints.
         start: (nv,), clear at time 0.
         goals: (g, nv), clear at the end.
-        keep: distance that everything keeps all the time [m].
         speed: (nv,) that joints may have [rad/s or m/s].
         duration: of the run [s].
         random: where samples come from.
     """
-    search, last = _Search(clearance, keep, speed), duration if clearance.timed else 0.0
+    search, last = _Search(clearance, speed), duration if clearance.timed else 0.0
     trees = (_Tree(start[None], 0.0, True), _Tree(goals, last, False))
     for a in range(_MOST_ROUNDS):
         tree, other = trees[a % 2], trees[1 - a % 2]
@@ -135,10 +129,10 @@ def plan(
         met = _connect(search, other, tree.q[new], float(tree.t[new]))
         if met >= 0:
             one, two = (new, met) if tree.forward else (met, new)
-            path = [*(trees[0].trace(one)[::-1]),], trees[1].trace(two)
-            q_path = np.concatenate((trees[0].q[path[0]], trees[1].q[path[1]]))
-            t_path = np.concatenate((trees[0].t[path[0]], trees[1].t[path[1]]))
-            found = _shortened(search, q_path, t_path, random)
+            there, back = trees[0].trace(one)[::-1], trees[1].trace(two)[1:]  # both end where the trees met
+            q_path = np.concatenate((trees[0].q[there], trees[1].q[back]))
+            t_path = np.concatenate((trees[0].t[there], trees[1].t[back]))
+            found = _shortened(clearance, q_path, t_path, random)
             return _in_time(Plan(*found, trees[0].count + trees[1].count), speed, duration, clearance.timed)
     return None
 
@@ -163,14 +157,14 @@ def _sample(
     return np.clip(start + share * (goal - start) + aside, ranges.lower, ranges.upper), t
 
 
-def _shortened(search: _Search, q: Array, t: Array, random: np.random.Generator) -> tuple[Array, Array]:
+def _shortened(clearance: Clearance, q: Array, t: Array, random: np.random.Generator) -> tuple[Array, Array]:
     """The path without detours that straight edges can cut off."""
     for _ in range(_SHORTCUTS):
         if len(q) < 3:
             break
         i = int(random.integers(0, len(q) - 2))
         j = int(random.integers(i + 2, len(q)))
-        if search.clear(q[i], float(t[i]), q[j], float(t[j])):
+        if clearance.clear_between(q[i], float(t[i]), q[j], float(t[j])):
             q, t = np.delete(q, slice(i + 1, j), axis=0), np.delete(t, slice(i + 1, j))
     return q, t
 

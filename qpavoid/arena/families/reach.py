@@ -39,9 +39,9 @@ class Ranges(NamedTuple):
             ConfigError: a joint with other than one coordinate that is an angle or a length.
         """
         model = robot.model
-        if model.nq != model.nv:
-            odd = next(name for name, joint in zip(robot.joint_names, list(model.joints)[1:], strict=True) if joint.nq != joint.nv)
-            raise ConfigError(f"{robot.name}: joint {odd!r} has {'' if odd else 'no '}coordinates on a manifold; lock it")
+        odd = [name for name, joint in zip(robot.joint_names, list(model.joints)[1:], strict=True) if joint.nq != 1]
+        if odd:
+            raise ConfigError(f"{robot.name}: joint {odd[0]!r} has more than one coordinate; lock it")
         bounds = robot.bounds()
         lower, upper = np.full(model.nv, -np.pi), np.full(model.nv, np.pi)
         lower[bounds.v_index] = np.where(np.isfinite(bounds.lower), bounds.lower, -np.pi)

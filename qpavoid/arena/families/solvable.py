@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from qpavoid.arena.families.clearance import STEP, Clearance
+from qpavoid.arena.families.clearance import Clearance
 from qpavoid.arena.families.out_of_reach import out_of_reach
 from qpavoid.arena.families.parameters import Redraw
 from qpavoid.arena.families.planner import Plan, plan
@@ -35,16 +35,16 @@ def solved_by(scenario: ScenarioConfig, world: World, reachable: bool, random: n
     Raises:
         Redraw: it starts too near to something, or no solution, or no proof that there is none, was found.
     """
-    clearance, keep = Clearance(world, scenario.duration), to_keep(scenario)
-    if clearance.at(world.q0, 0.0) < keep + 0.5 * STEP:
+    clearance = Clearance(world, scenario.duration, to_keep(scenario))
+    if not clearance.clear(world.q0, 0.0):
         raise Redraw("the start is too near to something")
-    if clearance.unavoidable(world.q0) < keep + 0.5 * STEP:
+    if not clearance.roots_clear(world.q0):
         raise Redraw("an obstacle comes too near to what cannot move")
     if reachable:
-        found = find_plan(scenario, world, random, clearance)
+        found = find_plan(scenario, world, clearance, random)
         return (
             f"RRT-Connect{' in space and time' * clearance.timed}: path of {found.length:.1f} rad in "
-            f"{found.t[-1]:.1f} s, {found.nodes} nodes, clear by {1e3 * keep:.0f} mm"
+            f"{found.t[-1]:.1f} s, {found.nodes} nodes, clear by {1e3 * to_keep(scenario):.0f} mm"
         )
     for task in world.tools:
         why = out_of_reach(world, task, scenario.duration, scenario.goal_tolerance)
@@ -53,20 +53,16 @@ def solved_by(scenario: ScenarioConfig, world: World, reachable: bool, random: n
     raise Redraw("no goal is out of reach")
 
 
-def find_plan(
-    scenario: ScenarioConfig, world: World, random: np.random.Generator, clearance: Clearance | None = None
-) -> Plan:
-    """A motion from the start to where all frames attain their targets at the end, farther than d1 from everything.
+def find_plan(scenario: ScenarioConfig, world: World, clearance: Clearance, random: np.random.Generator) -> Plan:
+    """A motion from the start to where all frames attain their targets at the end, always clear.
 
     Raises:
         Redraw: none was found.
     """
-    clearance = clearance or Clearance(world, scenario.duration)
-    ranges, keep = Ranges.of(world.scene.robot), to_keep(scenario)
+    ranges, bounds = Ranges.of(world.scene.robot), world.scene.robot.bounds().within(scenario.limits)
     goals = _goals(scenario, world, ranges, clearance, random)
-    bounds = world.scene.robot.bounds().within(scenario.limits)
     speed = np.minimum(_SPEED_SHARE * bounds.velocity, _FASTEST)
-    found = plan(clearance, ranges, world.q0, goals, keep, speed, scenario.duration, random)
+    found = plan(clearance, ranges, world.q0, goals, speed, scenario.duration, random)
     if found is None:
         raise Redraw("no plan was found")
     return found
@@ -91,7 +87,7 @@ def _goals(
         begin = world.q0 + spread * (random.uniform(ranges.lower, ranges.upper) - world.q0)
         q = configuration_at(robot, wants, begin, ranges, _PRECISE * scenario.goal_tolerance)
         attained |= q is not None
-        if q is not None and clearance.at(q, end) > to_keep(scenario) + 0.5 * STEP:
+        if q is not None and clearance.clear(q, end):
             found.append(q)
             if len(found) == _MOST_GOALS:
                 break

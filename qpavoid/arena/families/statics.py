@@ -45,85 +45,91 @@ def sphere_field(draw: Draw, robot: Robot) -> dict[str, Any]:
             radius, aside = draw("radius"), one.length * draw("aside") * np.array(draw("direction"))
             center = way.point(draw("along")) + aside
             if gap(coal.Sphere(radius), coal.Transform3s(np.eye(3), center), taken) > ROOM:
-                obstacles.append(_fixed(f"ball{i}", {"type": "sphere", "radius": radius}, center))
+                obstacles.append(fixed(f"ball{i}", {"type": "sphere", "radius": radius}, center))
                 break
-    return _reach(robot, one, way, q, obstacles)
+    return run(robot, q, [follow(one.tool, along(way))], obstacles)
 
 
 def shelf(draw: Draw, robot: Robot) -> dict[str, Any]:
-    """From one compartment of a shelf to the one above or below it."""
+    """From one compartment of a shelf, or from in front of it, into the one above or below."""
     one, up = arms(robot)[0], draw("up")
-    front, depth, width, height = draw.vector("front", "depth", "width", "height")
-    corner = np.array([front, one.home[1] + draw("aside"), draw("middle")])
-    inside = [np.array([draw("inside"), draw("left"), level]) for level in (-0.5 * up * height, 0.5 * up * height)]
-    inside[0][0] = draw("start")
-    back = 0.5 * depth
-    obstacles = [
-        _board(f"board{i}", corner + [back, 0.0, (i - 1) * height], [depth, width, _BOARD]) for i in range(3)
-    ]
-    for name, sign in (("left", 1.0), ("right", -1.0)):
-        obstacles.append(_board(name, corner + [back, 0.5 * sign * width, 0.0], [depth, _BOARD, 2.0 * height]))
-    obstacles.append(_board("back", corner + [depth, 0.0, 0.0], [_BOARD, width, 2.0 * height]))
-    return _go(draw, robot, one, corner + inside[0], corner + inside[1], obstacles)
+    depth, width, height = draw.vector("depth", "width", "height")
+    edge = np.array([draw("front"), one.home[1] + draw("aside"), draw("middle")])  # of the board between both
+    start = _off(edge, draw("start"), draw("left"), -0.5 * up * height)
+    goal = _off(edge, draw("inside"), draw("left"), 0.5 * up * height)
+    middle = _off(edge, 0.5 * depth)
+    obstacles = [_board(f"board{i}", _off(middle, up=(i - 1) * height), depth, width, _BOARD) for i in range(3)]
+    for name, sign in _SIDES:
+        obstacles.append(_board(name, _off(middle, left=0.5 * sign * width), depth, _BOARD, 2.0 * height))
+    obstacles.append(_board("back", _off(edge, depth), _BOARD, width, 2.0 * height))
+    return _reach(draw, robot, one, start, goal, obstacles)
 
 
 def box(draw: Draw, robot: Robot) -> dict[str, Any]:
     """From beside a box without a lid down into it."""
     one, side = arms(robot)[0], draw("side")
     length, width, height = draw.vector("length", "width", "height")
-    center = np.array([draw("ahead"), one.home[1] + draw("left"), draw("rim")])  # of the opening
-    start = center + [draw("shift"), side * (0.5 * width + draw("beside")), draw("start_height")]
-    goal = center + [draw("shift"), draw("shift"), -draw("deep")]
-    obstacles = [_board("bottom", center - [0.0, 0.0, height], [length, width, _BOARD])]
+    rim = np.array([draw("ahead"), one.home[1] + draw("left"), draw("rim")])
+    start = _off(rim, draw("shift"), side * (0.5 * width + draw("beside")), draw("start_height"))
+    goal = _off(rim, draw("shift"), draw("shift"), -draw("deep"))
+    middle = _off(rim, up=-0.5 * height)
+    obstacles = [_board("bottom", _off(rim, up=-height), length, width, _BOARD)]
     for name, sign in (("front", -1.0), ("back", 1.0)):
-        obstacles.append(_board(name, center + [0.5 * sign * length, 0.0, -0.5 * height], [_BOARD, width, height]))
-    for name, sign in (("left", 1.0), ("right", -1.0)):
-        obstacles.append(_board(name, center + [0.0, 0.5 * sign * width, -0.5 * height], [length, _BOARD, height]))
-    return _go(draw, robot, one, start, goal, obstacles)
+        obstacles.append(_board(name, _off(middle, 0.5 * sign * length), _BOARD, width, height))
+    for name, sign in _SIDES:
+        obstacles.append(_board(name, _off(middle, left=0.5 * sign * width), length, _BOARD, height))
+    return _reach(draw, robot, one, start, goal, obstacles)
 
 
 def opening(draw: Draw, robot: Robot) -> dict[str, Any]:
     """Through a wall with an opening in it, a window or a doorway, from beside it on this side to behind it."""
     one, side = arms(robot)[0], draw("side")
     width, height, wall = draw.vector("width", "height", "wall")
-    center = one.home + draw.vector("ahead", "left", "up")
+    center = _off(one.home, draw("ahead"), draw("left"), draw("up"))
     obstacles = [
-        _board("left", center + [0.0, 0.5 * (width + wall), 0.0], [_BOARD, wall, height + 2.0 * wall]),
-        _board("right", center - [0.0, 0.5 * (width + wall), 0.0], [_BOARD, wall, height + 2.0 * wall]),
-        _board("above", center + [0.0, 0.0, 0.5 * (height + wall)], [_BOARD, width, wall]),
+        _board(name, _off(center, left=0.5 * sign * (width + wall)), _BOARD, wall, height + 2.0 * wall)
+        for name, sign in _SIDES
     ]
-    if draw("kind") == "window":
-        obstacles.append(_board("below", center - [0.0, 0.0, 0.5 * (height + wall)], [_BOARD, width, wall]))
-    start = center + [-draw("before"), side * (0.5 * width + draw("beside")), draw("shift")]
-    return _go(draw, robot, one, start, center + [draw("behind"), draw("shift"), draw("shift")], obstacles)
+    for name, sign in (("above", 1.0), ("below", -1.0))[: 2 if draw("kind") == "window" else 1]:
+        obstacles.append(_board(name, _off(center, up=0.5 * sign * (height + wall)), _BOARD, width, wall))
+    start = _off(center, -draw("before"), side * (0.5 * width + draw("beside")), draw("shift"))
+    goal = _off(center, draw("behind"), draw("shift"), draw("shift"))
+    return _reach(draw, robot, one, start, goal, obstacles)
 
 
-def gap_between_blocks(draw: Draw, robot: Robot) -> dict[str, Any]:
+def narrow_gap(draw: Draw, robot: Robot) -> dict[str, Any]:
     """Between two blocks that stand side by side, to a place behind them."""
     one, side = arms(robot)[0], draw("side")
     width, thick, block = draw.vector("width", "thick", "block")
-    center = one.home + draw.vector("ahead", "left", "up")
+    center = _off(one.home, draw("ahead"), draw("left"), draw("up"))
     obstacles = [
-        _board(name, center + [0.0, 0.5 * sign * (width + block), 0.0], [thick, block, 2.0 * block])
-        for name, sign in (("left", 1.0), ("right", -1.0))
+        _board(name, _off(center, left=0.5 * sign * (width + block)), thick, block, 2.0 * block)
+        for name, sign in _SIDES
     ]
-    start = center + [-0.5 * thick - draw("before"), side * (0.5 * width + draw("beside")), draw("shift")]
-    return _go(draw, robot, one, start, center + [0.5 * thick + draw("behind"), draw("shift"), draw("shift")], obstacles)
+    start = _off(center, -0.5 * thick - draw("before"), side * (0.5 * width + draw("beside")), draw("shift"))
+    goal = _off(center, 0.5 * thick + draw("behind"), draw("shift"), draw("shift"))
+    return _reach(draw, robot, one, start, goal, obstacles)
 
 
-def _go(
+_SIDES = (("left", 1.0), ("right", -1.0))
+
+
+def _off(place: Array, forward: float = 0.0, left: float = 0.0, up: float = 0.0) -> Array:
+    """(3,) a place moved along the world axes [m]."""
+    return np.asarray(place + np.array([forward, left, up]))
+
+
+def _reach(
     draw: Draw, robot: Robot, one: Arm, start: Array, goal: Array, obstacles: list[dict[str, Any]]
 ) -> dict[str, Any]:
-    return _reach(robot, one, set_out(start, goal, draw("speed")), posture(robot, {one.tool: start}), obstacles)
+    way = set_out(start, goal, draw("speed"))
+    return run(robot, posture(robot, {one.tool: start}), [follow(one.tool, along(way))], obstacles)
 
 
-def _reach(robot: Robot, one: Arm, way: Way, q: Array, obstacles: list[dict[str, Any]]) -> dict[str, Any]:
-    return run(robot, q, [follow(one.tool, along(way))], obstacles)
+def _board(name: str, center: Array, length: float, width: float, height: float) -> dict[str, Any]:
+    return fixed(name, {"type": "box", "size": [length, width, height]}, center)
 
 
-def _board(name: str, center: Array, size: list[float]) -> dict[str, Any]:
-    return _fixed(name, {"type": "box", "size": size}, center)
-
-
-def _fixed(name: str, shape: dict[str, Any], position: Array) -> dict[str, Any]:
+def fixed(name: str, shape: dict[str, Any], position: Array) -> dict[str, Any]:
+    """An obstacle that rests at a position (3,) [m]."""
     return {"name": name, "shape": shape, "motion": {"type": "fixed", "position": position}}

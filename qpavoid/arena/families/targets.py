@@ -9,7 +9,7 @@ import numpy as np
 from qpavoid.arena.families.arms import follow, run, set_out
 from qpavoid.arena.families.out_of_reach import arm
 from qpavoid.arena.families.parameters import Draw
-from qpavoid.arena.families.statics import sweep
+from qpavoid.arena.families.statics import fixed, sweep
 from qpavoid.arena.families.ways import along
 from qpavoid.robot import Robot
 
@@ -27,6 +27,5 @@ def unreachable(draw: Draw, robot: Robot) -> dict[str, Any]:
         goal = root + (length + beyond) * towards / np.linalg.norm(towards)
         ball = way.start + share * (goal - way.start)
     way = set_out(way.start, goal, draw("speed"))
-    shape = {"type": "sphere", "radius": radius}
-    obstacles = [{"name": "ball", "shape": shape, "motion": {"type": "fixed", "position": ball}}]
-    return run(robot, q, [follow(one.tool, along(way))], obstacles)
+    obstacle = fixed("ball", {"type": "sphere", "radius": radius}, ball)
+    return run(robot, q, [follow(one.tool, along(way))], [obstacle])

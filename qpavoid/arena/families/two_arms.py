@@ -20,7 +20,7 @@ _BEGIN = 0.5
 def crossing_arms(draw: Draw, robot: Robot) -> dict[str, Any]:
     """Each tool goes, straight, to about where the other one comes from, both in the same time."""
     left, right = _pair(robot)
-    paths = [[_place(draw, left, right, s), _place(draw, left, right, -s)] for s in (1.0, -1.0)]
+    paths = [[start, goal] for start, goal in _ends(draw, left, right)]
     return _together(draw, robot, (left, right), paths, 0.0)
 
 
@@ -29,9 +29,8 @@ def passing(draw: Draw, robot: Robot) -> dict[str, Any]:
     left, right = _pair(robot)
     middle = 0.5 * (left.home + right.home) + left.length * draw.vector("forward", "lean", "up")
     half = 0.5 * draw("between") * np.array([0.0, 1.0, 0.0])
-    paths = [
-        [_place(draw, left, right, s), middle + s * half, _place(draw, left, right, -s)] for s in (1.0, -1.0)
-    ]
+    ends = zip(_ends(draw, left, right), (half, -half), strict=True)
+    paths = [[start, middle + aside, goal] for (start, goal), aside in ends]
     return _together(draw, robot, (left, right), paths, draw("pause"))
 
 
@@ -42,10 +41,15 @@ def _pair(robot: Robot) -> tuple[Arm, Arm]:
     return found[0], found[1]
 
 
-def _place(draw: Draw, left: Arm, right: Arm, side: float) -> Array:
-    """Somewhere at the left (1) or at the right (-1) of the middle between both homes."""
-    away = np.array([draw("forward"), side * draw("sideways"), draw("up")])
-    return 0.5 * (left.home + right.home) + left.length * away
+def _ends(draw: Draw, left: Arm, right: Arm) -> list[tuple[Array, Array]]:
+    """Start and goal of the left tool, then of the right one; at the goals, one is `over` the other."""
+    middle, over = 0.5 * (left.home + right.home), 0.5 * draw("above") * draw("over")
+
+    def place(side: float, higher: float) -> Array:
+        away = [draw("forward"), side * draw("sideways"), draw("up") + higher]
+        return np.asarray(middle + left.length * np.array(away))
+
+    return [(place(1.0, 0.0), place(-1.0, over)), (place(-1.0, 0.0), place(1.0, -over))]
 
 
 def _together(

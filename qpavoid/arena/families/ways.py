@@ -37,7 +37,7 @@ class Way(NamedTuple):
     def direction(self) -> Array:
         """(3,) unit vector."""
         along = self.goal - self.start
-        return np.asarray(along / max(np.linalg.norm(along), 1e-9))
+        return np.asarray(along / max(float(np.linalg.norm(along)), 1e-9))
 
 
 def crossing(way: Way, share: float, direction: Array, aside: Array, speed: float) -> dict[str, Any]:
