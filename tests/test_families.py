@@ -52,7 +52,7 @@ def test_a_case_starts_clear_and_is_told_how_it_is_solved(name):
         made = case(name, seed)
         scenario = made.scenario
         assert (made.family, made.seed, made.reachable) == (name, seed, family.config.reachable)
-        assert scenario.robot == family.setups[seed % len(family.setups)]["robot"]
+        assert scenario.robot == family.templates[seed % len(family.templates)]["robot"]
         assert ("RRT-Connect" in made.solved_by) == made.reachable
         assert ("time" in made.solved_by) == (name in TIMED)
         assert 3.0 < scenario.duration < 15.0
@@ -147,6 +147,21 @@ def test_crossing_obstacles_meet_the_target(seed):
         assert gaps.min() < 0.05 * 1.3 + 0.01
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_two_tools_change_sides_and_meet_where_they_pass(seed):
+    for name in ("crossing_arms", "passing"):
+        scenario = case(name, seed).scenario
+        left, right = (task.motion for task in build_world(scenario).tools)
+        times = np.linspace(0.0, scenario.duration, 1000)
+        apart = np.array([left.sample(t).position - right.sample(t).position for t in times])
+        assert apart[0, 1] > 0.0 > apart[-1, 1]
+        assert np.abs(apart[-1, 2]) > 0.01
+        if name == "passing":
+            at_rest = np.linalg.norm(np.diff(apart, axis=0), axis=1) < 1e-12
+            gaps = np.linalg.norm(apart[1:][at_rest], axis=1)
+            assert ((gaps >= 0.04 - 1e-9) & (gaps <= 0.12 + 1e-9)).any()
+
+
 # --- drawing -----------------------------------------------------------------------------------------------
 
 RANGES = st.tuples(st.floats(0.1, 10.0), st.floats(0.1, 10.0)).map(sorted).filter(lambda r: r[1] - r[0] > 1e-3)
@@ -167,13 +182,13 @@ def test_draws_stay_within_their_range(limits, kind, seed):
 def test_whole_numbers_reach_both_ends_and_logarithms_are_even():
     rng = np.random.default_rng(0)
     assert {parameter(type="uniform", range=[2, 4], whole=True).draw(rng) for _ in range(100)} == {2, 3, 4}
-    counts = [parameter(type="log_uniform", range=[2, 40], whole=True).draw(rng) for _ in range(4000)]
+    counts = [parameter(type="log_uniform", range=[2, 40], whole=True).draw(rng) for _ in range(2000)]
     assert {2, 40} <= set(counts) <= set(range(2, 41))
     below = np.mean(np.array(counts) < 9)  # P = log(9/2) / log(41/2)
-    assert below == pytest.approx(np.log(4.5) / np.log(20.5), abs=0.03)
-    directions = np.array([parameter(type="direction").draw(rng) for _ in range(4000)])
+    assert below == pytest.approx(np.log(4.5) / np.log(20.5), abs=0.04)
+    directions = np.array([parameter(type="direction").draw(rng) for _ in range(2000)])
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1.0)
-    np.testing.assert_allclose(directions.T @ directions / 4000, np.eye(3) / 3.0, atol=0.03)
+    np.testing.assert_allclose(directions.T @ directions / 2000, np.eye(3) / 3.0, atol=0.03)
 
 
 def test_a_new_parameter_leaves_the_others_as_they_are():
@@ -428,6 +443,7 @@ def test_a_function_beside_the_file_is_a_generator(family):
         (TEMPLATE, ("range: [-0.25, -0.1]", "rang: [-0.25, -0.1]"), ConfigError, r"did you mean 'range'"),
         (TEMPLATE, ("type: uniform", "type: unifrom"), ConfigError, r"unknown type 'unifrom'; did you mean 'uniform'"),
         (TEMPLATE, ("robots: [ur5]", "robots: [ur6]"), UnknownName, r"robots.0: unknown robot 'ur6'.*'ur5'"),
+        (TEMPLATE, ("robots: [ur5]", "robots: [{robot: ur5, lock: [$l]}]"), UnknownName, r"robots.0.lock.0: unknown .*\$l"),
         (TEMPLATE, ("robots: [ur5]", "robots: [{q0: {}}]"), ConfigError, r"robots.0: needs a field `robot`"),
         (TEMPLATE, ("  dt: 0.02", "  robot: ur5"), ConfigError, r"`robot` belongs into `robots`"),
         (GENERATED, ("posts.py:posts", "posts.py:post"), UnknownName, r"no function 'post'; did you mean 'posts'"),
@@ -454,6 +470,10 @@ def test_a_file_at_fault_is_told_so(family, text, change, error, said):
         (TEMPLATE, ("[0, -0.5, 0]", "[0, -5, 0]"), POSTS, ConfigError, r"most often: the goal is not attained"),
         (TEMPLATE, ("[0.6, $y, 0.25]", "[0, 0, 0.1], rpy: [0, 0, $y]"), POSTS, ConfigError, r"most often: .* too near"),
         (TEMPLATE, ("sensor:", "reachable: false\nsensor:"), POSTS, ConfigError, r"no goal is out of reach"),
+        (TEMPLATE, ("dt: 0.02", "contacts: [{frame: tool0}]"), POSTS, ConfigError, r"know nothing of `contacts`"),
+        (TEMPLATE, ("{frame: tool0, motion", "{frame: tool0, type: orientation, motion"), POSTS, ConfigError,
+         r"none is that of a frame with a position"),
+        (GENERATED, ("posts.py:posts", "passing"), POSTS, ConfigError, r"ur5 has 1 arms that move; two are needed"),
         (TEMPLATE, ("{delay: $delay}", "{dealy: $delay}"), POSTS, ConfigError, r"did you mean 'delay'"),
     ],
 )  # fmt: skip
@@ -463,6 +483,23 @@ def test_a_family_that_makes_no_case_says_why(family, monkeypatch, text, change,
     with pytest.raises(error, match=said) as raised:
         make_case(loaded, 0)
     assert "own.yaml" in str(raised.value)
+
+
+def test_the_file_counts_more_than_a_setup_and_a_robots_entry_more_than_the_file(family):
+    stated = ("  dt: 0.02", "  dt: 0.02\n  avoidance: {d1: 0.05, d2: 0.2}")
+    assert make_case(family(TEMPLATE, stated), 0).scenario.avoidance.d1 == 0.05
+    entry = ("robots: [ur5]", "robots: [ur5, {robot: ur5, avoidance: {d1: 0.04, d2: 0.2}}]")
+    loaded = family(TEMPLATE, stated, entry)
+    assert [make_case(loaded, seed).scenario.avoidance.d1 for seed in range(2)] == [0.05, 0.04]
+    assert make_case(family(TEMPLATE), 0).scenario.avoidance.d1 == 0.02
+
+
+def test_a_case_is_the_same_wherever_its_file_lies(family, tmp_path):
+    here = make_case(family(TEMPLATE), 0)
+    there = tmp_path / "elsewhere" / "own.yaml"
+    there.parent.mkdir()
+    there.write_text(TEMPLATE)
+    assert make_case(load_family(there), 0).key == here.key
 
 
 def test_seeds_begin_at_zero(family):

@@ -13,6 +13,7 @@ from qpavoid.arena.families.out_of_reach import arm
 from qpavoid.arena.families.parameters import Redraw
 from qpavoid.arena.families.reach import Ranges, Want, configuration_at
 from qpavoid.arena.families.ways import Way
+from qpavoid.errors import ConfigError
 from qpavoid.problem import Array
 from qpavoid.robot import Robot
 
@@ -40,7 +41,11 @@ class Arm(NamedTuple):
 
 
 def arms(robot: Robot) -> list[Arm]:
-    """The arms of a robot, those at the left first. A tool that moves only with others has none."""
+    """The arms of a robot, those at the left first. A tool that moves only with others has none.
+
+    Raises:
+        ConfigError: there is none.
+    """
     model, data = robot.model, robot.model.createData()
     pin.framesForwardKinematics(model, data, robot.home)
     frames = {tool: robot.frame_id(tool, "end_effectors") for tool in robot.end_effectors}
@@ -52,6 +57,8 @@ def arms(robot: Robot) -> list[Arm]:
         if own:
             length = arm(robot, frames[tool], own[0])[1]
             found.append(Arm(tool, np.array(data.oMf[frames[tool]].translation), length))
+    if not found:
+        raise ConfigError(f"{robot.name} has no tool that moves; give `end_effectors` in its robot.yaml")
     return sorted(found, key=lambda one: -one.home[1])
 
 

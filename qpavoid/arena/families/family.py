@@ -80,11 +80,11 @@ class Family:
     name: str
     path: Path
     config: FamilyConfig
-    setups: tuple[dict[str, Any], ...]
-    """Fields of a scenario for each of the robots."""
+    templates: tuple[dict[str, Any], ...]
+    """Fields of a scenario for each robot: of its setup, of `scenario`, of its own entry; later ones count."""
     generator: Generator | None
     in_template: frozenset[str]
-    """Parameters that stand in the template."""
+    """Parameters that stand in one of them, or in `sensor`."""
 
     def filled(self, template: Any, draw: Draw) -> Any:
         """A template with values in the places of "$name"."""
@@ -108,7 +108,8 @@ def load_family(name_or_path: str | Path) -> Family:
     """
     path = find_family(name_or_path)
     config = read_config(path, FamilyConfig)
-    used = {name: where for key in ("scenario", "sensor") for name, where in _names(getattr(config, key), key)}
+    layers = {"scenario": config.scenario, "robots": config.robots, "sensor": config.sensor}
+    used = {name: where for key, layer in layers.items() for name, where in _names(layer, key)}
     for name, where in used.items():
         if name not in config.parameters:
             raise UnknownName(f"{path}: {where}: unknown parameter '${name}'{nearest(name, config.parameters)}")
@@ -119,7 +120,7 @@ def load_family(name_or_path: str | Path) -> Family:
         name=path.stem,
         path=path,
         config=config,
-        setups=tuple(_setup(entry, f"{path}: robots.{i}", path) for i, entry in enumerate(config.robots)),
+        templates=tuple(_template(entry, config, f"{path}: robots.{i}") for i, entry in enumerate(config.robots)),
         generator=None if config.generator is None else _generator(config.generator, path),
         in_template=frozenset(used),
     )
@@ -134,17 +135,19 @@ def _names(template: Any, where: str) -> Iterator[tuple[str, str]]:
         yield template[1:], where
 
 
-def _setup(entry: str | dict[str, Any], where: str, path: Path) -> dict[str, Any]:
-    if isinstance(entry, str) and entry in setup_names():
-        return read_mapping(find_setup(entry))
-    fields = {"robot": entry} if isinstance(entry, str) else entry
+def _template(entry: str | dict[str, Any], config: FamilyConfig, where: str) -> dict[str, Any]:
+    """Fields of a scenario for a robot."""
+    if isinstance(entry, dict):
+        return {**config.scenario, **entry}
+    if entry in setup_names():
+        return {**read_mapping(find_setup(entry)), **config.scenario}
     try:
-        find_robot(fields["robot"], path.parent)
+        find_robot(entry, Path(where.partition(": ")[0]).parent)
     except UnknownName as error:
         raise UnknownName(f"{where}: {error}; or a setup: {', '.join(setup_names())}") from None
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from None
-    return fields
+    return {**config.scenario, "robot": entry}
 
 
 def _generator(name: str, path: Path) -> Generator:

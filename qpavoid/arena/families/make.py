@@ -21,7 +21,7 @@ from qpavoid.robot import Robot
 
 MOST_DRAWS = 100
 """Draws of a seed that may turn out to be no case."""
-_DIGITS = 6
+_DIGITS = 9
 """Decimals that numbers of a scenario keep: machines round differently in the last ones."""
 
 
@@ -41,12 +41,12 @@ def make_case(family: Family, seed: int) -> Case:
     """
     if seed < 0:
         raise ConfigError(f"{family.path}: seed {seed}: give 0 or more")
-    setup = family.setups[seed % len(family.setups)]
+    template = family.templates[seed % len(family.templates)]
     said: list[str] = []
     for number in range(MOST_DRAWS):
         draw = Draw(family.config.parameters, seed, number, family.in_template)
         try:
-            scenario = _scenario(family, setup, draw, seed)
+            scenario = _scenario(family, template, draw, seed)
             robot, q0 = _robot(family, scenario.robot, scenario.q0, scenario.lock)
             world = world_of(scenario, robot, q0)
             how = solved_by(scenario, world, family.config.reachable, np.random.default_rng([seed, number]))
@@ -60,26 +60,26 @@ def make_case(family: Family, seed: int) -> Case:
     )
 
 
-def _scenario(family: Family, setup: dict[str, Any], draw: Draw, seed: int) -> ScenarioConfig:
-    """The scenario of a draw: what the file says, the robot's setup, what the generator adds."""
-    stated = {**family.filled(family.config.scenario, draw), **setup}
+def _scenario(family: Family, template: dict[str, Any], draw: Draw, seed: int) -> ScenarioConfig:
+    """The scenario of a draw: what the template says, and what the generator adds."""
+    stated = family.filled(template, draw)
     fields = {"title": f"{family.config.title}, seed {seed}", "tags": [family.name], **stated}
     if family.generator is not None:
-        made = _made(family, setup, draw)
+        made = _made(family, stated, draw)
         twice = sorted(made.keys() & stated.keys() - {"q0"})
         if twice:
             raise ConfigError(f"{family.path}: scenario.{twice[0]}: the generator gives it, too; leave one out")
         fields.update(made)
-        if "q0" in made and isinstance(setup.get("q0"), dict):
-            fields["q0"] = {**setup["q0"], **made["q0"]}
+        if "q0" in made and isinstance(stated.get("q0"), dict):
+            fields["q0"] = {**stated["q0"], **made["q0"]}
     return validate(_plain(fields), ScenarioConfig, family.path).read_from(family.path)
 
 
-def _made(family: Family, setup: dict[str, Any], draw: Draw) -> dict[str, Any]:
+def _made(family: Family, stated: dict[str, Any], draw: Draw) -> dict[str, Any]:
     """What the generator says."""
     assert family.generator is not None
     where = f"{family.path}: generator {family.config.generator}"
-    robot, q0 = _robot(family, setup["robot"], setup.get("q0", {}), setup.get("lock", []))
+    robot, q0 = _robot(family, stated["robot"], stated.get("q0", {}), stated.get("lock", []))
     try:
         made = dict(family.generator(draw, replace(robot, home=q0)))
     except Redraw:

@@ -12,10 +12,11 @@ from qpavoid.arena.families.reach import Ranges, Want, configuration_at
 from qpavoid.arena.scores import to_keep
 from qpavoid.arena.world import World
 from qpavoid.config import ScenarioConfig
+from qpavoid.errors import ConfigError
 from qpavoid.problem import Array
 from qpavoid.tasks import FrameTask
 
-_MOST_GOALS, _TRIES = 6, 60
+_MOST_GOALS, _TRIES = 6, 40
 """Configurations that attain the goal: how many are wanted, how many searches are made."""
 _PRECISE = 0.2
 """Share of the goal's tolerance that they use [-]."""
@@ -33,8 +34,13 @@ def solved_by(scenario: ScenarioConfig, world: World, reachable: bool, random: n
         random: where samples come from.
 
     Raises:
+        ConfigError: it has what plans know nothing of.
         Redraw: it starts too near to something, or no solution, or no proof that there is none, was found.
     """
+    if scenario.contacts or any(obstacle.carried_by for obstacle in scenario.obstacles):
+        raise ConfigError(f"{scenario.source}: plans know nothing of `contacts` and `carried_by`; leave them out")
+    if not world.tools:
+        raise ConfigError(f"{scenario.source}: tasks: none is that of a frame with a position; give one")
     clearance = Clearance(world, scenario.duration, to_keep(scenario))
     if not clearance.clear(world.q0, 0.0):
         raise Redraw("the start is too near to something")
