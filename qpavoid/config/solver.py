@@ -52,7 +52,7 @@ class PotentialFieldSolver(ClosedForm):
     name: Literal["potential-field"] = "potential-field"
     gain: Positive = 1.0
     """Push of a pair at distance d1: joints move by J_dᵀ times as much [rad²/(m s)]."""
-    cap: Positive = 3.0
+    cap: Positive = 5.0
     """Largest push of a pair, contact and penetration included [rad²/(m s)]."""
 
 
