@@ -85,6 +85,12 @@ ENTRANTS = {
         law("qp", "QP with switching α/β rows, default back end", "qp", avoidance=_row("switching")),
         law("qp-damper", "QP with velocity damper rows", "qp", avoidance=_row("damper")),
         law("qp-cbf", "QP with control barrier rows", "qp", avoidance=_row("cbf")),
+        law(
+            "qp-escape",
+            "QP that also keeps a way out at hand where obstacles move",
+            "qp",
+            avoidance={**_row("switching"), "escape": {}},
+        ),
         law("qp:native", "QP, compiled active-set method", "qp:native", ("numba",)),
         law("qp:daqp", "QP, back end daqp", "qp:daqp"),
         law("qp:proxqp", "QP, back end ProxQP", "qp:proxqp"),
