@@ -15,7 +15,7 @@ from pydantic import TypeAdapter
 from qpavoid import ScenarioConfig
 from qpavoid.arena.case import Case
 from qpavoid.arena.families import Draw, Redraw, family_names, load_family, make_case
-from qpavoid.arena.families.clearance import Clearance
+from qpavoid.arena.families.clearance import STEP, Clearance
 from qpavoid.arena.families.parameters import Parameter
 from qpavoid.arena.families.planner import plan
 from qpavoid.arena.families.reach import Ranges, Want, configuration_at
@@ -283,6 +283,26 @@ def test_a_plan_waits_for_a_door(gantry):
         planned(scenario_of(gantry, walls, duration=3.4))
 
 
+@pytest.mark.parametrize("moves", [False, True])
+def test_straight_motions_are_judged_by_their_nearest_point(gantry, moves):
+    fixed = {"type": "fixed", "position": [0.0, 0.0, 0.0]}
+    rolls = {"type": "line", "start": [0.0, -1.0, 0.0], "end": [0.0, 1.0, 0.0], "speed": 0.25}
+    bead = {"name": "bead", "shape": {"type": "sphere", "radius": 0.005}, "motion": rolls if moves else fixed}
+    world = build_world(scenario_of(gantry, [bead]))
+    clearance, motion = Clearance(world, 8.0, 0.01), world.scene.obstacles[0].motion
+    random, answers = np.random.default_rng(0), []
+    for _ in range(400):
+        ta, tb = sorted(random.uniform(0.0, 8.0, 2))
+        a, b = random.uniform(-0.5, 0.5, (2, 2))
+        # both go straight at constant speed: so does one as seen from the other
+        first, last = (q - motion.sample(t).position[:2] for q, t in ((a, ta), (b, tb)))
+        share = np.clip(first @ (first - last) / ((first - last) @ (first - last)), 0.0, 1.0)
+        least = np.linalg.norm(first + share * (last - first)) - 0.055
+        answers.append(clearance.clear_between(a, ta, b, tb))
+        assert least >= 0.01 if answers[-1] else least < 0.01 + STEP
+    assert 50 < sum(answers) < 350
+
+
 @settings(max_examples=30)
 @given(seed=st.integers(0, 10_000))
 def test_a_motion_that_is_passed_is_clear_at_every_place(seed):
@@ -443,7 +463,7 @@ def test_a_function_beside_the_file_is_a_generator(family):
         (TEMPLATE, ("range: [-0.25, -0.1]", "rang: [-0.25, -0.1]"), ConfigError, r"did you mean 'range'"),
         (TEMPLATE, ("type: uniform", "type: unifrom"), ConfigError, r"unknown type 'unifrom'; did you mean 'uniform'"),
         (TEMPLATE, ("robots: [ur5]", "robots: [ur6]"), UnknownName, r"robots.0: unknown robot 'ur6'.*'ur5'"),
-        (TEMPLATE, ("robots: [ur5]", "robots: [{robot: ur5, lock: [$l]}]"), UnknownName, r"robots.0.lock.0: unknown .*\$l"),
+        (TEMPLATE, ("robots: [ur5]", "robots: [{robot: ur5, lock: [$l]}]"), UnknownName, r"lock.0: unknown .*\$l"),
         (TEMPLATE, ("robots: [ur5]", "robots: [{q0: {}}]"), ConfigError, r"robots.0: needs a field `robot`"),
         (TEMPLATE, ("  dt: 0.02", "  robot: ur5"), ConfigError, r"`robot` belongs into `robots`"),
         (GENERATED, ("posts.py:posts", "posts.py:post"), UnknownName, r"no function 'post'; did you mean 'posts'"),
