@@ -80,14 +80,15 @@ def test_cases_are_the_same_in_another_process():
 
 
 @pytest.mark.parametrize("name", [name for name in FAMILIES if name != "unreachable"])
-def test_mujoco_finds_the_plan_clear(name):
+def test_mujoco_finds_the_plan_clear(name, monkeypatch):
     pytest.importorskip("mujoco")
     from qpavoid.arena.referee import Watch
     from qpavoid.arena.twin import build
 
-    scenario = case(name, 0).scenario
-    world, keep = build_world(scenario), to_keep(scenario)
-    found = find_plan(scenario, world, Clearance(world, scenario.duration, keep), np.random.default_rng(7))
+    plans = []
+    monkeypatch.setattr("qpavoid.arena.families.solvable.plan", lambda *given: plans.append(plan(*given)) or plans[-1])
+    scenario = make_case(load_family(name), 0).scenario
+    world, keep, found = build_world(scenario), to_keep(scenario), plans[-1]
     twin = build(world.scene, world.q0)
     watch, q = Watch(twin, near=keep), np.array(found.q[0])
     np.testing.assert_array_equal(q, world.q0)
