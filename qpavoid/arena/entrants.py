@@ -80,6 +80,8 @@ ENTRANTS = {
         law("tracking", "damped least squares on the task, no avoidance: the baseline", "tracking"),
         law("eq10", "task switching, eq. 10 with the consistent bracket", "eq10"),
         law("eq10-literal", "task switching, eq. 10 as printed", "eq10-literal"),
+        law("gradient-projection", "tracking, clearance climbed in its null space", "gradient-projection"),
+        law("potential-field", "tracking pulls, near pairs push: FIRAS at velocity level", "potential-field"),
         law("qp", "QP with switching α/β rows, default back end", "qp", avoidance=_row("switching")),
         law("qp-damper", "QP with velocity damper rows", "qp", avoidance=_row("damper")),
         law("qp-cbf", "QP with control barrier rows", "qp", avoidance=_row("cbf")),

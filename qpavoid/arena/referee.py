@@ -64,7 +64,7 @@ class Watch:
     greatest depth: what is left out could not have changed the outcome.
     """
 
-    def __init__(self, twin: Twin, pairs: Any = None, near: float = 0.0) -> None:
+    def __init__(self, twin: Twin, pairs: Any = None, near: float = -np.inf) -> None:
         """Begins where the twin is.
 
         Args:
@@ -88,7 +88,7 @@ class Watch:
         self._bound -= travel[self._first] + travel[self._second]
         self._poses = self.twin.poses()
         self.looks += 1
-        matters = np.where(self._depth > 0.0, -self._depth, max(self.distance, self._near))
+        matters = np.maximum(np.where(self._depth > 0.0, -self._depth, max(self.distance, 0.0)), self._near)
         for pair in np.flatnonzero(self._bound < matters).tolist():
             d = self._bound[pair] = self.twin.distance(pair)
             if d < self.distance and self._counts[pair]:
@@ -128,7 +128,7 @@ class Watch:
         return np.asarray(np.sqrt(np.square(center - old_center).sum(axis=1)) + self._radius * turn)
 
 
-def play(twin: Twin, t: Array, v: Array, limits: Limits, near: float = 0.0) -> Findings:
+def play(twin: Twin, t: Array, v: Array, limits: Limits, near: float = -np.inf) -> Findings:
     """Plays velocities from the twin's start, each until the next tick.
 
     Args:

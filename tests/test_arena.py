@@ -1,0 +1,213 @@
+"""The arena's closed loop, its referee's distances and its scores, against closed forms and against `simulate`."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from qpavoid import Solution, load_scenario, simulate
+from qpavoid.arena.case import Case, Sensor, Sight
+from qpavoid.arena.entrants import ENTRANTS, find_entrant
+from qpavoid.arena.referee import Contact, Findings, play
+from qpavoid.arena.rollout import Rollout, roll_out
+from qpavoid.arena.scores import COLUMNS, score
+from qpavoid.arena.trial import run_trial
+from qpavoid.arena.twin import build
+from qpavoid.arena.world import build_world
+from qpavoid.errors import UnknownName
+
+DT = 0.01
+
+
+def make_case(name="ur5_pole", sensor=None, reachable=True, **changes):
+    scenario = load_scenario(name, [f"{key}={value}" for key, value in changes.items()])
+    return Case("shipped", 3, scenario, sensor or Sensor(), reachable, "it ships")
+
+
+class Constant:
+    """Commands the same velocity for ever."""
+
+    def __init__(self, v):
+        self.v = np.asarray(v)
+
+    def step(self, q, t, targets, obstacles):
+        return Solution(self.v)
+
+
+class Broken(Constant):
+    """Fails from its third tick on, in one way or another."""
+
+    def __init__(self, v, how):
+        super().__init__(v)
+        self.how, self.count = how, 0
+
+    def step(self, q, t, targets, obstacles):
+        self.count += 1
+        if self.count < 3:
+            return Solution(self.v)
+        if self.how == "raises":
+            raise RuntimeError("no solution found")
+        return Solution(np.full(len(self.v), np.nan))
+
+
+def test_a_case_survives_json_and_its_key_tells_cases_apart():
+    case = make_case(duration=1, sensor=Sensor(delay=0.05))
+    again = Case.from_json(case.to_json())
+    assert again == case and again.key == case.key and again.scenario.source == case.scenario.source
+    others = [replace(case, seed=4), replace(case, sensor=Sensor()), make_case(duration=1.5)]
+    assert len({case.key, *(other.key for other in others)}) == 4
+
+
+def test_a_perfect_sensor_tells_what_moves_and_a_late_one_what_was():
+    case = make_case("moving_sphere")
+    world = build_world(case.scenario)
+    (moving,) = [obstacle for obstacle in world.scene.obstacles if obstacle.moves]
+    seen = Sight(case, world.scene.obstacles).look(1.0)
+    assert list(seen) == [moving.name]
+    assert np.array_equal(seen[moving.name].position, moving.motion.sample(1.0).position)
+    late = Sight(replace(case, sensor=Sensor(delay=0.25)), world.scene.obstacles)
+    assert np.array_equal(late.look(1.0)[moving.name].position, moving.motion.sample(0.75).position)
+    assert np.array_equal(late.look(0.1)[moving.name].position, moving.motion.sample(0.0).position)
+
+
+def test_noise_has_the_stated_spread_and_is_the_same_for_all():
+    case = make_case("moving_sphere", Sensor(position_noise=0.01, velocity_noise=0.05))
+    world = build_world(case.scenario)
+    first, second = (Sight(case, world.scene.obstacles) for _ in range(2))
+    errors = []
+    for t in np.arange(0.0, 20.0, DT):
+        one, two = first.look(t), second.look(t)
+        for obstacle in world.scene.obstacles:
+            truth, seen = obstacle.motion.sample(t), one[obstacle.name]
+            assert np.array_equal(seen.position, two[obstacle.name].position)
+            if obstacle.moves:
+                errors.append(np.concatenate((seen.position - truth.position, seen.linear - truth.linear)))
+    spread = np.std(errors, axis=0)
+    assert spread[:3] == pytest.approx(0.01, rel=0.1) and spread[3:] == pytest.approx(0.05, rel=0.1)
+
+
+def test_velocities_are_followed_exactly():
+    case = make_case(duration=1)
+    world, v = build_world(case.scenario), np.array([0.1, -0.05, 0.02, 0.0, 0.3, -0.1])
+    rollout = roll_out(case, Constant(v), world)
+    assert len(rollout.t) == 101 and not rollout.failed.any() and rollout.failure == ""
+    assert rollout.q == pytest.approx(world.q0 + rollout.t[:, None] * v, abs=1e-12)
+    assert np.all(rollout.v == v)
+
+
+@pytest.mark.parametrize(("how", "said"), [("raises", "RuntimeError: no solution found"), ("nan", "NaN or infinity")])
+def test_an_entrant_that_fails_is_held_and_every_tick_counts(how, said):
+    case = make_case(duration=1)
+    world, v = build_world(case.scenario), np.full(6, 0.1)
+    rollout = roll_out(case, Broken(v, how), world)
+    assert rollout.failed.tolist() == [0.0] * 2 + [1.0] * 99 and said in rollout.failure
+    assert rollout.q[2:] == pytest.approx(np.tile(world.q0 + 2 * DT * v, (99, 1)), abs=1e-12)
+
+
+def test_an_entrant_that_takes_for_ever_is_given_up():
+    case = make_case(duration=1)
+    rollout = roll_out(case, Constant(np.zeros(6)), build_world(case.scenario), patience=1e-9)
+    assert rollout.failed.sum() == 100 and rollout.failure == "out of time"
+
+
+@pytest.mark.parametrize("name", ["ur5_pole", "moving_sphere", "crossing_arms"])
+@pytest.mark.parametrize("law", ["qp", "eq10", "tracking"])
+def test_the_loop_is_that_of_simulate(name, law):
+    case = make_case(name, duration=3)
+    world = build_world(case.scenario)
+    entrant = ENTRANTS[law]
+    rollout = roll_out(case, entrant.start(case, world), world)
+    log = simulate(load_scenario(name, ["duration=3", "avoidance.row={type: switching}"], law))  # as `qp` has them
+    assert rollout.q == pytest.approx(log.q, abs=1e-9)
+    assert rollout.tool == pytest.approx(log.tool, abs=1e-9)
+
+
+def test_distances_below_the_threshold_are_the_true_ones():
+    case = make_case(duration=4)
+    world = build_world(case.scenario)
+    rollout = roll_out(case, ENTRANTS["tracking"].start(case, world), world)
+    twin = build(world.scene, world.q0)
+    near = 0.05
+    findings = play(twin, rollout.t, rollout.v, case.scenario.limits, near)
+    movable, below = np.flatnonzero(twin.movable), 0
+    for k in range(0, len(rollout.t), 7):
+        twin.place(findings.q[k], rollout.t[k])
+        smallest = min(twin.distance(pair) for pair in movable)
+        if smallest < near:
+            assert findings.nearest[k] == pytest.approx(smallest, abs=1e-9)
+            below += 1
+        else:
+            assert near <= findings.nearest[k] <= smallest + 1e-9
+    assert below > 5
+
+
+def made_by_hand(case, tool, target, v):
+    """A rollout and findings with nothing in them but what is given."""
+    count = len(tool)
+    world = build_world(case.scenario)
+    t, q = DT * np.arange(count), np.tile(world.q0, (count, 1))
+    zeros = np.zeros(count)
+    rollout = Rollout(t, q, v, tool[:, None], target[:, None], zeros.astype(int), zeros, zeros, "")
+    findings = Findings(0.1, 0, 0.0, (), q, np.full(count, 0.1), -1.0, -1.0, -1.0, count)
+    return world, rollout, findings
+
+
+def test_scores_of_a_known_motion():
+    case = make_case(duration=2)
+    t = DT * np.arange(201)
+    along, v = np.zeros((201, 3)), np.zeros((201, 6))
+    along[:, 0] = np.minimum(0.1 * t, 0.1)  # the target rests after a second
+    tool = along + np.array([0.0, 0.03, 0.0])
+    tool[151:] = along[151:]  # there after 1.51 s
+    v[:, 0] = t**2  # jerk 2 rad/s³ in one of six joints
+    world, rollout, findings = made_by_hand(case, tool, along, v)
+    row = score(case, world, "x", "y", rollout, findings, 0.0)
+    assert row.arrived and row.success and not row.stuck and row.final_error == 0.0
+    assert row.time_to_goal == pytest.approx(151 / 201)
+    assert row.tracking_error == pytest.approx(0.03 * np.sqrt(151 / 201))
+    assert row.deviation == pytest.approx(0.03)
+    assert row.path_length == pytest.approx((0.1 + 0.03) / 0.1)
+    assert row.jerk == pytest.approx(2.0 / np.sqrt(6.0))
+    assert row.jitter == pytest.approx(2.0)
+    assert row.below_d1 == 0.0 and row.violations == pytest.approx(np.mean(t**2 > np.pi), abs=0.01)
+    assert set(row.row()) == set(COLUMNS)
+
+
+def test_what_counts_as_success():
+    case = make_case(duration=2)
+    rest, v = np.zeros((201, 3)), np.zeros((201, 6))
+    away = rest + np.array([0.1, 0.0, 0.0])
+    world, rollout, findings = made_by_hand(case, away, rest, v)
+    row = score(case, world, "x", "y", rollout, findings, 0.0)
+    assert not row.success and row.stuck and row.time_to_goal == 1.0 and row.final_error == pytest.approx(0.1)
+    unreachable = score(replace(case, reachable=False), world, "x", "y", rollout, findings, 0.0)
+    assert unreachable.success and not unreachable.stuck  # clear and at rest is all that can be asked
+    touched = replace(findings, contacts=(Contact(0, 1.0, 0.01),), nearest=np.full(201, 0.01))
+    row = score(replace(case, reachable=False), world, "x", "y", rollout, touched, 0.0)
+    assert row.collided and not row.success and not row.stuck and row.below_d1 == 1.0
+    shaking = away + 0.01 * np.sin(np.arange(201))[:, None]
+    world, rollout, findings = made_by_hand(case, shaking, rest, v)
+    assert not score(replace(case, reachable=False), world, "x", "y", rollout, findings, 0.0).success
+
+
+def test_a_trial_tells_a_law_that_avoids_from_one_that_does_not():
+    case = make_case()
+    tracking, qp = (run_trial(case, ENTRANTS[name]) for name in ("tracking", "qp"))
+    assert tracking.collided and tracking.min_distance < 0.0 and tracking.tracking_error < 1e-3
+    assert qp.success and qp.min_distance >= qp.d1 - 1e-3 and qp.tick_p99 >= qp.tick_p50 > 0.0
+    assert tracking.case == qp.case and tracking.settings != qp.settings
+
+
+def test_entrants_are_what_they_say():
+    for name, entrant in ENTRANTS.items():
+        assert entrant.name == name and entrant.says
+    assert len({entrant.digest for entrant in ENTRANTS.values()}) == len(ENTRANTS)
+    with pytest.raises(UnknownName, match="did you mean 'eq10'"):
+        find_entrant("eq_10")
+
+
+def test_every_law_that_is_installed_runs():
+    case = make_case(duration=0.2)
+    for entrant in ENTRANTS.values():
+        if not entrant.missing:
+            assert run_trial(case, entrant).failure == "", entrant.name
