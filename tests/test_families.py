@@ -99,6 +99,8 @@ def test_mujoco_finds_the_plan_clear(name, monkeypatch):
         assert (np.abs(v) <= speed).all()
         q = watch.follow(q, v, begin, end - begin)
         np.testing.assert_allclose(q, to, atol=1e-9)
+    assert found.t[-1] <= (scenario.duration - 1.0 if name in TIMED else scenario.duration)
+    watch.follow(q, 0.0 * q, found.t[-1], scenario.duration - found.t[-1])
     assert watch.distance >= keep - 1e-4
     assert watch.looks > 50
     data = world.scene.robot.model.createData()
@@ -106,7 +108,6 @@ def test_mujoco_finds_the_plan_clear(name, monkeypatch):
     for task in world.tools:
         goal = task.motion.sample(scenario.duration).position
         assert np.linalg.norm(data.oMf[task.frame_id].translation - goal) < scenario.goal_tolerance
-    assert found.t[-1] <= scenario.duration + 1e-9
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -277,11 +278,11 @@ def test_a_plan_waits_for_a_door(gantry):
     times = np.linspace(0.0, 8.0, 4000)
     x = np.interp(times, found.t, found.q[:, 0])
     assert times[x > 0.0].min() > 3.0
-    assert found.t[-1] == 8.0
+    assert found.t[-1] == 7.0  # a second before the end
     rates = np.abs(np.diff(found.q, axis=0)) / np.diff(found.t)[:, None]
     assert rates.max() <= 0.5 + 1e-9
     with pytest.raises(Redraw):  # closed again before a ball at 0.5 m/s comes through
-        planned(scenario_of(gantry, walls, duration=3.4))
+        planned(scenario_of(gantry, walls, duration=4.4))
 
 
 @pytest.mark.parametrize("moves", [False, True])
