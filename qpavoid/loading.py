@@ -13,12 +13,12 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from qpavoid.config import RobotConfig, ScenarioConfig, expand_solver
+from qpavoid.config import ScenarioConfig, expand_solver
 from qpavoid.errors import ConfigError, UnknownName
 from qpavoid.files import read_text
 from qpavoid.safe_yaml import parse_yaml
 
-Config = TypeVar("Config", RobotConfig, ScenarioConfig)
+Config = TypeVar("Config", bound=BaseModel)
 _PACKAGE = Path(__file__).parent
 _LARGEST = 1_000_000
 """Size of a YAML file [bytes]; those that ship take 3000."""
@@ -38,6 +38,20 @@ def robot_names() -> list[str]:
 def scenario_names() -> list[str]:
     """Names of the scenarios that ship."""
     return sorted(p.stem for p in data_folder("tasks").glob("*.yaml"))
+
+
+def family_names() -> list[str]:
+    """Names of the families of scenarios that ship."""
+    return sorted(p.stem for p in _families().glob("*.yaml"))
+
+
+def setup_names() -> list[str]:
+    """Names of the robots that are set up for families: a posture, and what is held."""
+    return sorted(p.stem for p in (_families() / "setups").glob("*.yaml"))
+
+
+def _families() -> Path:
+    return data_folder("tasks") / "families"
 
 
 def example_robot_data() -> Path:
@@ -82,6 +96,24 @@ def find_scenario(name_or_path: str | Path) -> Path:
         ConfigError, UnknownName: there is none.
     """
     return _find(str(name_or_path), "scenario", data_folder("tasks"), "{}.yaml", scenario_names())
+
+
+def find_family(name_or_path: str | Path) -> Path:
+    """Path of the file of a family of scenarios, given by shipped name or by path.
+
+    Raises:
+        ConfigError, UnknownName: there is none.
+    """
+    return _find(str(name_or_path), "family", _families(), "{}.yaml", family_names())
+
+
+def find_setup(name: str) -> Path:
+    """Path of a shipped setup.
+
+    Raises:
+        UnknownName: there is none.
+    """
+    return _find(name, "setup", _families() / "setups", "{}.yaml", setup_names())
 
 
 def find_robot(name_or_path: str, folder: Path | None = None) -> Path:
@@ -138,7 +170,7 @@ def read_config(path: Path, model: type[Config], overrides: Sequence[str] = (), 
     Raises:
         ConfigError: unreadable file, bad YAML, unknown key (with the nearest valid one) or bad value.
     """
-    data = _read_yaml(path)
+    data = read_mapping(path)
     if solver is not None:
         wanted, kept = _solver_mapping(solver), _solver_mapping(data.get("solver"))
         data["solver"] = {**kept, **wanted} if kept.get("name") == wanted["name"] else wanted
@@ -170,7 +202,12 @@ def _solver_mapping(value: Any) -> dict[str, Any]:
     return dict(expanded) if isinstance(expanded, dict) else {}
 
 
-def _read_yaml(path: Path) -> dict[str, Any]:
+def read_mapping(path: Path) -> dict[str, Any]:
+    """The fields of a YAML file, as they stand there.
+
+    Raises:
+        ConfigError: unreadable file, bad YAML, or something else than a mapping.
+    """
     text = read_text(path, _LARGEST)
     try:
         data = parse_yaml(text)

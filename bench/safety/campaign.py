@@ -11,8 +11,10 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from bench.safety.obstacles import Way, draw_obstacle
-from qpavoid import Robot, Sample, ScenarioConfig
+from bench.safety.obstacles import draw_obstacle
+from qpavoid import Robot, ScenarioConfig
+from qpavoid.arena.families.room import Placed, bodies_at, gap
+from qpavoid.arena.families.ways import Way
 from qpavoid.bodies import make_shape
 from qpavoid.config import Fixed, ObstacleConfig
 from qpavoid.problem import Array
@@ -113,10 +115,10 @@ def draw(seed: int, ranges: Ranges = RANGES) -> ScenarioConfig:
         tasks.append(task)
         ways.append(way)
     duration = float(np.clip(max(way.end for way in ways) + 2.0, *ranges.duration))
-    midway = _bodies(robot, start + random.uniform() * (goal - start))
+    midway = bodies_at(robot, start + random.uniform() * (goal - start))
     targets = np.array([place.getTranslation() for joint, _, place in midway if joint > 0])
     roots = [(coal.Sphere(radius), coal.Transform3s(np.eye(3), np.array(at))) for *at, radius in kind.roots]
-    roots += [(shape, place) for joint, shape, place in _bodies(robot, start) if joint > 0 and held[joint - 1]]
+    roots += [(shape, place) for joint, shape, place in bodies_at(robot, start) if joint > 0 and held[joint - 1]]
     if random.random() < ranges.root_share:
         roots = []
     obstacles: list[dict[str, Any]] = []
@@ -218,25 +220,11 @@ def _has_room(
     """Whether an obstacle is d1 off the robot at the start, off its roots for ever, and off the goal if it stays."""
     config = ObstacleConfig.model_validate(obstacle)
     motion, shape = build_obstacles([config], FOLDER)[0].motion, make_shape(config.shape)
+
+    def apart(t: float, others: list[Placed]) -> bool:
+        pose = motion.sample(t)
+        return gap(shape, coal.Transform3s(pose.rotation, pose.position), others) > d1
+
     still = isinstance(config.motion, Fixed)
-    robots = [(body, place) for q in ((start, goal) if still else (start,)) for _, body, place in _bodies(robot, q)]
-    if _gap(shape, motion.sample(0.0), robots) <= d1:
-        return False
-    return all(_gap(shape, motion.sample(t), roots) > d1 for t in ((0.0,) if still else np.arange(0.0, duration, 0.1)))
-
-
-def _gap(shape: Any, pose: Sample, others: list[Any]) -> float:
-    """Smallest distance of a shape from others in their places [m]; inf from none."""
-    here, request = coal.Transform3s(pose.rotation, pose.position), coal.DistanceRequest()
-    distances = (coal.distance(shape, here, *other, request, coal.DistanceResult()) for other in others)
-    return min(distances, default=np.inf)
-
-
-def _bodies(robot: Robot, q: Array) -> list[tuple[int, Any, Any]]:
-    """Joint, shape and place of each of the robot's bodies."""
-    data = robot.bodies.createData()
-    pin.updateGeometryPlacements(robot.model, robot.model.createData(), robot.bodies, data, q)
-    return [
-        (body.parentJoint, body.geometry, coal.Transform3s(place.rotation, place.translation))
-        for body, place in zip(robot.bodies.geometryObjects, data.oMg, strict=True)
-    ]
+    robots = [(body, place) for q in ((start, goal) if still else (start,)) for _, body, place in bodies_at(robot, q)]
+    return apart(0.0, robots) and all(apart(t, roots) for t in ((0.0,) if still else np.arange(0.0, duration, 0.1)))

@@ -2,41 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from qpavoid.arena.families import ways
+from qpavoid.arena.families.ways import Way, line
 from qpavoid.problem import Array
 
 if TYPE_CHECKING:
     from bench.safety.campaign import Ranges
-
-
-class Way(NamedTuple):
-    """The straight line that a tool is meant to follow."""
-
-    start: Array
-    """(3,) [m]."""
-    goal: Array
-    """(3,) [m]."""
-    begin: float
-    """When it sets out [s]."""
-    end: float
-    """When it is there [s]."""
-
-    def point(self, share: float) -> Array:
-        """(3,) where it is at that share of its time, at constant speed [m]."""
-        return self.start + share * (self.goal - self.start)
-
-    def time(self, share: float) -> float:
-        """When that is [s]."""
-        return self.begin + share * (self.end - self.begin)
-
-    @property
-    def direction(self) -> Array:
-        """(3,) unit vector."""
-        along = self.goal - self.start
-        return np.asarray(along / max(np.linalg.norm(along), 1e-9))
 
 
 def draw_obstacle(
@@ -86,29 +61,26 @@ def _beside(random: np.random.Generator, way: Way, bodies: Array) -> Array:
 def _crossing(random: np.random.Generator, way: Way, bodies: Array, ranges: Ranges) -> dict[str, Any]:
     """A line through the tool's way, at the time when the tool is there."""
     speed, share, direction = random.uniform(*ranges.obstacle_speed), random.uniform(0.2, 1.0), _direction(random)
-    point = way.point(share) + random.uniform(0.0, 0.05) * _direction(random)
-    return _line(point - speed * way.time(share) * direction, point + 1.5 * direction, speed)
+    return ways.crossing(way, share, direction, random.uniform(0.0, 0.05) * _direction(random), speed)
 
 
 def _at_the_arm(random: np.random.Generator, way: Way, bodies: Array, ranges: Ranges) -> dict[str, Any]:
     """A line through a part of the robot."""
     speed, direction = random.uniform(*ranges.obstacle_speed), _direction(random)
     point = bodies[random.integers(len(bodies))] + random.uniform(0.0, 0.1) * _direction(random)
-    return _line(point - random.uniform(0.3, 1.0) * direction, point + 1.5 * direction, speed)
+    return line(point - random.uniform(0.3, 1.0) * direction, point + ways.BEYOND * direction, speed)
 
 
 def _head_on(random: np.random.Generator, way: Way, bodies: Array, ranges: Ranges) -> dict[str, Any]:
     """Along the tool's way, towards it."""
     aside = random.uniform(0.0, 0.03) * _direction(random)
-    start = way.goal + random.uniform(0.2, 0.6) * way.direction + aside
-    return _line(start, way.start - 1.5 * way.direction + aside, random.uniform(*ranges.obstacle_speed))
+    return ways.head_on(way, random.uniform(0.2, 0.6), aside, random.uniform(*ranges.obstacle_speed))
 
 
 def _chasing(random: np.random.Generator, way: Way, bodies: Array, ranges: Ranges) -> dict[str, Any]:
     """Along the tool's way from behind, and on past the goal."""
     aside = random.uniform(0.0, 0.03) * _direction(random)
-    start = way.start - random.uniform(0.2, 0.6) * way.direction + aside
-    return _line(start, way.goal + 1.5 * way.direction + aside, random.uniform(*ranges.obstacle_speed))
+    return ways.chasing(way, random.uniform(0.2, 0.6), aside, random.uniform(*ranges.obstacle_speed))
 
 
 def _circling(random: np.random.Generator, way: Way, bodies: Array, ranges: Ranges) -> dict[str, Any]:
@@ -127,10 +99,6 @@ def _circling(random: np.random.Generator, way: Way, bodies: Array, ranges: Rang
 
 MOTIONS = (_crossing, _at_the_arm, _head_on, _chasing, _circling)
 """All equally likely."""
-
-
-def _line(start: Array, end: Array, speed: float) -> dict[str, Any]:
-    return {"type": "line", "start": start.tolist(), "end": end.tolist(), "speed": speed}
 
 
 def _tumbling(random: np.random.Generator, line: dict[str, Any], ranges: Ranges) -> dict[str, Any]:

@@ -48,15 +48,18 @@ class Case:
 
     @property
     def key(self) -> str:
-        """Digest of all that makes the run, whatever family and seed it came from."""
-        return hashlib.sha256(self.to_json().encode()).hexdigest()[:16]
+        """Digest of all that makes the run, wherever the family's file lies."""
+        return hashlib.sha256(self._text().encode()).hexdigest()[:16]
 
     def to_json(self) -> str:
         """The same as text."""
+        return self._text(source=str(self.scenario.source))
+
+    def _text(self, **more: str) -> str:
         fields = {
+            **more,
             "family": self.family,
             "seed": self.seed,
-            "source": str(self.scenario.source),
             "scenario": self.scenario.model_dump(mode="json"),
             "sensor": self.sensor.model_dump(mode="json"),
             "reachable": self.reachable,

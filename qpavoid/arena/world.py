@@ -35,7 +35,17 @@ def build_world(scenario: ScenarioConfig) -> World:
     source = scenario.source
     with located(f"{source}: robot"):
         robot = Robot.load(scenario.robot, source.parent)
-    robot, q0 = robot.lock(scenario.lock, robot.configuration(scenario.q0, f"{source}: q0"), f"{source}: lock")
+    q0 = robot.configuration(scenario.q0, f"{source}: q0")
+    return world_of(scenario, *robot.lock(scenario.lock, q0, f"{source}: lock"))
+
+
+def world_of(scenario: ScenarioConfig, robot: Robot, q0: Array) -> World:
+    """The same, of a robot that is loaded, its joints locked.
+
+    Raises:
+        ConfigError, UnknownName: naming file, field and remedy.
+    """
+    source = scenario.source
     obstacles = build_obstacles(scenario.obstacles, source)
     with located(str(source)):
         scene = build_scene(robot, obstacles)

@@ -1,0 +1,8 @@
+"""Families of scenarios: what varies stands in a YAML file each, and every case is known to have a solution."""
+
+from qpavoid.arena.families.family import Family, load_family
+from qpavoid.arena.families.make import make_case
+from qpavoid.arena.families.parameters import Draw, Redraw
+from qpavoid.loading import family_names
+
+__all__ = ["Draw", "Family", "Redraw", "family_names", "load_family", "make_case"]

@@ -1,0 +1,88 @@
+"""Inverse kinematics: configurations in which frames are where they are meant to be."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from qpavoid.errors import ConfigError
+from qpavoid.problem import Array
+from qpavoid.robot import Robot
+
+_STEPS, _LONGEST, _DAMPING = 80, 0.4, 1e-3
+"""Of one search: steps, largest step of a joint [rad or m], damping of the pseudo-inverse [-]."""
+
+
+class Want(NamedTuple):
+    """Where a frame is to be."""
+
+    frame: int
+    position: Array | None
+    """(3,) world [m]; None: anywhere."""
+    rotation: Array | None = None
+    """(3, 3); None: any."""
+
+
+class Ranges(NamedTuple):
+    """Where joints may be, (nv,) each; those without limits turn half a turn either way."""
+
+    lower: Array
+    upper: Array
+
+    @classmethod
+    def of(cls, robot: Robot) -> Ranges:
+        """Position limits of a robot.
+
+        Raises:
+            ConfigError: a joint with other than one coordinate that is an angle or a length.
+        """
+        model = robot.model
+        odd = [name for name, joint in zip(robot.joint_names, list(model.joints)[1:], strict=True) if joint.nq != 1]
+        if odd:
+            raise ConfigError(f"{robot.name}: joint {odd[0]!r} has more than one coordinate; lock it")
+        bounds = robot.bounds()
+        lower, upper = np.full(model.nv, -np.pi), np.full(model.nv, np.pi)
+        lower[bounds.v_index] = np.where(np.isfinite(bounds.lower), bounds.lower, -np.pi)
+        upper[bounds.v_index] = np.where(np.isfinite(bounds.upper), bounds.upper, np.pi)
+        return cls(np.maximum(lower, -np.pi), np.minimum(upper, np.pi))
+
+
+def configuration_at(robot: Robot, wants: list[Want], q: Array, ranges: Ranges, tolerance: float) -> Array | None:
+    """A configuration (nv,) within limits that attains what is wanted, near q; None if the search ends elsewhere.
+
+    Damped least squares with joints kept within their ranges.
+
+    Args:
+        robot: whose joints have one coordinate each.
+        wants: of frames.
+        q: where the search begins (nv,).
+        ranges: of the joints.
+        tolerance: distance that is good enough [m]; orientations as many rad.
+    """
+    model, data = robot.model, robot.model.createData()
+    for _ in range(_STEPS):
+        error, J = _errors(model, data, wants, q)
+        if np.abs(error).max() < tolerance:
+            return q
+        step = J.T @ np.linalg.solve(J @ J.T + _DAMPING * np.eye(len(error)), error)
+        step *= min(1.0, _LONGEST / max(np.abs(step).max(), 1e-12))
+        q = np.clip(q + step, ranges.lower, ranges.upper)
+    return None
+
+
+def _errors(model: Any, data: Any, wants: list[Want], q: Array) -> tuple[Array, Array]:
+    """What is missing (m,) and its Jacobian (m, nv)."""
+    pin.computeJointJacobians(model, data, q)
+    errors, rows = [], []
+    for want in wants:
+        pose = pin.updateFramePlacement(model, data, want.frame)
+        J = pin.getFrameJacobian(model, data, want.frame, pin.LOCAL_WORLD_ALIGNED)
+        if want.position is not None:
+            errors.append(want.position - pose.translation)
+            rows.append(J[:3])
+        if want.rotation is not None:
+            errors.append(pin.log3(want.rotation @ pose.rotation.T))
+            rows.append(J[3:])
+    return np.concatenate(errors), np.concatenate(rows)
