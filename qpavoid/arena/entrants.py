@@ -91,6 +91,13 @@ ENTRANTS = {
             "qp",
             avoidance={**_row("switching"), "escape": {}},
         ),
+        law(
+            "qp-detour",
+            "QP that tries a way round what blocks it",
+            "qp",
+            avoidance=_row("switching"),
+            progress={"detour": {}},
+        ),
         law("qp:native", "QP, compiled active-set method", "qp:native", ("numba",)),
         law("qp:daqp", "QP, back end daqp", "qp:daqp"),
         law("qp:proxqp", "QP, back end ProxQP", "qp:proxqp"),
