@@ -17,6 +17,7 @@ from qpavoid.cloud import Points
 from qpavoid.config import Avoidance, Limits, Progress, ScenarioConfig, Sensing
 from qpavoid.contacts import ContactRows, build_contacts
 from qpavoid.errors import ConfigError, NumericalError, UnknownName, located
+from qpavoid.escape import EscapePlanner
 from qpavoid.grasp import Grasps
 from qpavoid.guard import TOLERANCE, Guard
 from qpavoid.kinematics import ForwardKinematics, Kinematics
@@ -116,9 +117,15 @@ class Controller:
             scene, self._kinematics, self._bounds, self.limits.position_gain,
             self.avoidance.hold - self.avoidance.offset, dt,
         )  # fmt: skip
-        self._grasps = Grasps(
-            scene, (self._query, self._guard.ahead), self._assembly, self.avoidance.hold - self.avoidance.offset
-        )
+        self._escape: EscapePlanner | None = None
+        if self.avoidance.escape is not None:
+            if contacts is not None:
+                raise ConfigError("avoidance.escape: flights do not hold contacts; leave one of the two out")
+            self._escape = EscapePlanner(
+                scene, self._bounds, self._obstacles, self.avoidance, self.limits, dt, self.avoidance.escape
+            )
+        queries = (self._query, self._guard.ahead, *([self._escape.query] if self._escape else []))
+        self._grasps = Grasps(scene, queries, self._assembly, self.avoidance.hold - self.avoidance.offset)
         self._warm_up()
 
     def _warm_up(self) -> None:
@@ -312,6 +319,8 @@ class Controller:
         self._q_last[:] = self.scene.robot.home
         self._obstacles.reset()
         self._progress.reset()
+        if self._escape is not None:
+            self._escape.reset()
 
     def _compute(
         self,
@@ -352,6 +361,8 @@ class Controller:
             for index, sample, margin, voxels in observed.seen:
                 self._query.place_obstacle(index, sample, margin, voxels)
                 self._guard.see(index, sample, voxels)
+                if self._escape is not None:
+                    self._escape.see(index, sample, voxels)
             faults, assumed = faults + observed.stop, observed.assumed
         self._kinematics.compute(q)
         self._query.compute(self._kinematics.data, self._reach)
@@ -371,6 +382,8 @@ class Controller:
             solution = self._solve(q, problem, proximity)
             blocked = self._progress.update(problem, solution)
             solution = solution._replace(blocked=blocked) if blocked else solution
+        if self._escape is not None and not faults:
+            solution = self._with_a_way_out(self._escape, q, t, solution)
         self._assembly.remember(solution.v)
         solution = solution._replace(assumed=assumed) if assumed else solution
         return samples, proximity, problem, solution.timed(built - begin, perf_counter() - built)
@@ -417,6 +430,14 @@ class Controller:
         reason = f"{names}: comes {1e3 * short:.1f} mm too near"
         status = solution.status if solution.status is Status.STOPPED else Status.RELAXED
         return solution._replace(v=v, share=share, status=status, reasons=(*solution.reasons, reason))
+
+    def _with_a_way_out(self, escape: EscapePlanner, q: Array, t: float, solution: Solution) -> Solution:
+        v = escape.check(q, solution.v, t, self._assembly.v_last)
+        if v is None:
+            return solution
+        reason = "the tasks: no way out would be left among the obstacles that move"
+        status = solution.status if solution.status is Status.STOPPED else Status.RELAXED
+        return solution._replace(v=v, status=status, reasons=(*solution.reasons, reason))
 
     def _expected(self) -> Array:
         """Where the robot is if it did what it was told last (nq,)."""

@@ -85,6 +85,7 @@ class Obstacles:
         self._index = {obstacle.name: i for i, obstacle in enumerate(obstacles)}
         self._moving = [i for i, obstacle in enumerate(obstacles) if obstacle.moves]
         self._tracks: dict[int, _Track] = {}
+        self._now = 0.0
         self._carried: set[int] = set()
 
     def index(self, name: str) -> int:
@@ -96,6 +97,18 @@ class Obstacles:
         if name not in self._index:
             raise UnknownName(f"no obstacle {name!r}{nearest(name, self._index)}")
         return self._index[name]
+
+    @property
+    def moving(self) -> list[int]:
+        """Numbers of those that move, or are given from outside; what the robot carries is none of them."""
+        return [*self._moving, *(i for i in self._tracks if i not in self._moving)]
+
+    def foreseen(self, index: int, t: float) -> Sample:
+        """Where an obstacle will be at t [s], on its trajectory, or as it was last seen to move."""
+        track = self._tracks.get(index)
+        if track is None:
+            return self._obstacles[index].motion.sample(t)
+        return moved_on(track.sample, t - self._now + track.age * self._dt)
 
     def carry(self, index: int, carried: bool) -> None:
         """Takes an obstacle as carried by the robot, or as resting where it was put down, until it is given again."""
@@ -116,6 +129,7 @@ class Obstacles:
         """
         if not given and not self._moving and not self._tracks:
             return None
+        self._now = t
         fresh: dict[int, Sample | Pose] = {}
         voxels: dict[int, Voxels] = {}
         notes: list[str] = []

@@ -13,6 +13,7 @@ from conftest import Result
 
 from qpavoid import Log
 from qpavoid.loading import data_folder, robot_names, scenario_names
+from qpavoid.solvers import SOLVERS
 
 METRICS = {
     "scenario", "solver", "completed", "collided", "min_distance", "min_pair", "time_in_collision", "time_below",
@@ -47,7 +48,7 @@ def test_list_names_everything_that_ships(cli):
     result = cli("list")
     assert result.status == 0
     words = result.stdout.split()
-    assert {*robot_names(), *scenario_names(), "tracking", "eq10", "eq10-literal", "qp", "qp:daqp"} <= set(words)
+    assert {*robot_names(), *scenario_names(), *SOLVERS, "qp:daqp"} <= set(words)
 
 
 def test_list_of_one_kind_is_a_name_a_line(cli):

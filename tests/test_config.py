@@ -12,7 +12,7 @@ from pydantic import BaseModel
 from qpavoid import ConfigError, Robot, UnknownName, config, load_scenario, simulate
 from qpavoid.config import Block, RobotConfig, ScenarioConfig
 from qpavoid.loading import data_folder, nearest, read_config, robot_names, scenario_names
-from qpavoid.solvers import parse_solver
+from qpavoid.solvers import SOLVERS, parse_solver
 
 BLOCKS = [b for b in vars(config).values() if isinstance(b, type) and issubclass(b, Block) and b is not Block]
 FIELDS = [(block, name) for block in BLOCKS for name in block.model_fields]
@@ -187,7 +187,7 @@ def test_key_that_resembles_nothing_gets_the_list_of_the_block_it_is_in(load):
         ("obstacles.0.shape.type", "spher", "obstacles.0.shape: unknown type 'spher'; did you mean 'sphere'?"),
         ("avoidance.row.type", "dampr", "avoidance.row: unknown type 'dampr'; did you mean 'damper'?"),
         ("avoidance.row", {"gain": 3}, "avoidance.row: `type` is missing; valid are cbf, damper, switching"),
-        ("solver", {"backend": "osqp"}, "solver: `name` is missing; valid are eq10, eq10-literal, hqp, qp, tracking"),
+        ("solver", {"backend": "osqp"}, f"solver: `name` is missing; valid are {', '.join(sorted(SOLVERS))}"),
         ("solver", "eq10:daqp", "solver.backend: unknown key; valid are alpha_cap, damping, name, retreat_speed"),
     ],
 )

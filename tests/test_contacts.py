@@ -169,7 +169,7 @@ def test_a_stop_holds_the_contacts(solo):
     assert np.abs(feet(solo, q) - begin).max() < 1e-4
 
 
-@pytest.mark.parametrize("solver", ["eq10", "tracking"])
+@pytest.mark.parametrize("solver", ["eq10", "tracking", "gradient-projection", "potential-field"])
 def test_laws_that_cannot_hold_contacts_are_refused(solo, solver):
     with pytest.raises(ConfigError, match=f"contacts: solver '{solver}' cannot hold them; use qp or hqp"):
         standing(solo, solver=solver)

@@ -15,7 +15,7 @@ from pydantic import TypeAdapter
 from qpavoid import ScenarioConfig
 from qpavoid.arena.case import Case
 from qpavoid.arena.families import Draw, Redraw, family_names, load_family, make_case
-from qpavoid.arena.families.clearance import Clearance
+from qpavoid.arena.families.clearance import STEP, Clearance
 from qpavoid.arena.families.parameters import Parameter
 from qpavoid.arena.families.planner import plan
 from qpavoid.arena.families.reach import Ranges, Want, configuration_at
@@ -55,7 +55,7 @@ def test_a_case_starts_clear_and_is_told_how_it_is_solved(name):
         assert scenario.robot == family.templates[seed % len(family.templates)]["robot"]
         assert ("RRT-Connect" in made.solved_by) == made.reachable
         assert ("time" in made.solved_by) == (name in TIMED)
-        assert 3.0 < scenario.duration < 15.0
+        assert 3.0 < scenario.duration < 25.0
         world = build_world(scenario)
         data = world.scene.geometry.createData()
         pin.updateGeometryPlacements(
@@ -80,14 +80,15 @@ def test_cases_are_the_same_in_another_process():
 
 
 @pytest.mark.parametrize("name", [name for name in FAMILIES if name != "unreachable"])
-def test_mujoco_finds_the_plan_clear(name):
+def test_mujoco_finds_the_plan_clear(name, monkeypatch):
     pytest.importorskip("mujoco")
     from qpavoid.arena.referee import Watch
     from qpavoid.arena.twin import build
 
-    scenario = case(name, 0).scenario
-    world, keep = build_world(scenario), to_keep(scenario)
-    found = find_plan(scenario, world, Clearance(world, scenario.duration, keep), np.random.default_rng(7))
+    plans = []
+    monkeypatch.setattr("qpavoid.arena.families.solvable.plan", lambda *given: plans.append(plan(*given)) or plans[-1])
+    scenario = make_case(load_family(name), 0).scenario
+    world, keep, found = build_world(scenario), to_keep(scenario), plans[-1]
     twin = build(world.scene, world.q0)
     watch, q = Watch(twin, near=keep), np.array(found.q[0])
     np.testing.assert_array_equal(q, world.q0)
@@ -98,6 +99,8 @@ def test_mujoco_finds_the_plan_clear(name):
         assert (np.abs(v) <= speed).all()
         q = watch.follow(q, v, begin, end - begin)
         np.testing.assert_allclose(q, to, atol=1e-9)
+    assert found.t[-1] <= (scenario.duration - 1.0 if name in TIMED else scenario.duration)
+    watch.follow(q, 0.0 * q, found.t[-1], scenario.duration - found.t[-1])
     assert watch.distance >= keep - 1e-4
     assert watch.looks > 50
     data = world.scene.robot.model.createData()
@@ -105,7 +108,6 @@ def test_mujoco_finds_the_plan_clear(name):
     for task in world.tools:
         goal = task.motion.sample(scenario.duration).position
         assert np.linalg.norm(data.oMf[task.frame_id].translation - goal) < scenario.goal_tolerance
-    assert found.t[-1] <= scenario.duration + 1e-9
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -147,7 +149,7 @@ def test_crossing_obstacles_meet_the_target(seed):
         assert gaps.min() < 0.05 * 1.3 + 0.01
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, 2])
 def test_two_tools_change_sides_and_meet_where_they_pass(seed):
     for name in ("crossing_arms", "passing"):
         scenario = case(name, seed).scenario
@@ -276,11 +278,31 @@ def test_a_plan_waits_for_a_door(gantry):
     times = np.linspace(0.0, 8.0, 4000)
     x = np.interp(times, found.t, found.q[:, 0])
     assert times[x > 0.0].min() > 3.0
-    assert found.t[-1] == 8.0
+    assert found.t[-1] == 7.0  # a second before the end
     rates = np.abs(np.diff(found.q, axis=0)) / np.diff(found.t)[:, None]
     assert rates.max() <= 0.5 + 1e-9
     with pytest.raises(Redraw):  # closed again before a ball at 0.5 m/s comes through
-        planned(scenario_of(gantry, walls, duration=3.4))
+        planned(scenario_of(gantry, walls, duration=4.4))
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_straight_motions_are_judged_by_their_nearest_point(gantry, moves):
+    fixed = {"type": "fixed", "position": [0.0, 0.0, 0.0]}
+    rolls = {"type": "line", "start": [0.0, -1.0, 0.0], "end": [0.0, 1.0, 0.0], "speed": 0.25}
+    bead = {"name": "bead", "shape": {"type": "sphere", "radius": 0.005}, "motion": rolls if moves else fixed}
+    world = build_world(scenario_of(gantry, [bead]))
+    clearance, motion = Clearance(world, 8.0, 0.01), world.scene.obstacles[0].motion
+    random, answers = np.random.default_rng(0), []
+    for _ in range(400):
+        ta, tb = sorted(random.uniform(0.0, 8.0, 2))
+        a, b = random.uniform(-0.5, 0.5, (2, 2))
+        # both go straight at constant speed: so does one as seen from the other
+        first, last = (q - motion.sample(t).position[:2] for q, t in ((a, ta), (b, tb)))
+        share = np.clip(first @ (first - last) / ((first - last) @ (first - last)), 0.0, 1.0)
+        least = np.linalg.norm(first + share * (last - first)) - 0.055
+        answers.append(clearance.clear_between(a, ta, b, tb))
+        assert least >= 0.01 if answers[-1] else least < 0.01 + STEP
+    assert 50 < sum(answers) < 350
 
 
 @settings(max_examples=30)
@@ -443,7 +465,7 @@ def test_a_function_beside_the_file_is_a_generator(family):
         (TEMPLATE, ("range: [-0.25, -0.1]", "rang: [-0.25, -0.1]"), ConfigError, r"did you mean 'range'"),
         (TEMPLATE, ("type: uniform", "type: unifrom"), ConfigError, r"unknown type 'unifrom'; did you mean 'uniform'"),
         (TEMPLATE, ("robots: [ur5]", "robots: [ur6]"), UnknownName, r"robots.0: unknown robot 'ur6'.*'ur5'"),
-        (TEMPLATE, ("robots: [ur5]", "robots: [{robot: ur5, lock: [$l]}]"), UnknownName, r"robots.0.lock.0: unknown .*\$l"),
+        (TEMPLATE, ("robots: [ur5]", "robots: [{robot: ur5, lock: [$l]}]"), UnknownName, r"lock.0: unknown .*\$l"),
         (TEMPLATE, ("robots: [ur5]", "robots: [{q0: {}}]"), ConfigError, r"robots.0: needs a field `robot`"),
         (TEMPLATE, ("  dt: 0.02", "  robot: ur5"), ConfigError, r"`robot` belongs into `robots`"),
         (GENERATED, ("posts.py:posts", "posts.py:post"), UnknownName, r"no function 'post'; did you mean 'posts'"),
@@ -466,7 +488,7 @@ def test_a_file_at_fault_is_told_so(family, text, change, error, said):
         (GENERATED, None, POSTS.replace("robot.end", "robot.and"), ConfigError, r"AttributeError: .*and_effectors"),
         (GENERATED, None, POSTS.replace('"duration"', '"duratoin"'), ConfigError, r"did you mean 'duration'"),
         (GENERATED, ("{dt: 0.02}", "{duration: 3}"), POSTS, ConfigError, r"scenario.duration: the generator gives it"),
-        (GENERATED, None, UNLUCKY, ConfigError, r"100 draws and no case, most often: bad luck"),
+        (GENERATED, None, UNLUCKY, ConfigError, r"10 draws and no case, most often: bad luck"),
         (TEMPLATE, ("[0, -0.5, 0]", "[0, -5, 0]"), POSTS, ConfigError, r"most often: the goal is not attained"),
         (TEMPLATE, ("[0.6, $y, 0.25]", "[0, 0, 0.1], rpy: [0, 0, $y]"), POSTS, ConfigError, r"most often: .* too near"),
         (TEMPLATE, ("sensor:", "reachable: false\nsensor:"), POSTS, ConfigError, r"no goal is out of reach"),
@@ -479,6 +501,7 @@ def test_a_file_at_fault_is_told_so(family, text, change, error, said):
 )  # fmt: skip
 def test_a_family_that_makes_no_case_says_why(family, monkeypatch, text, change, code, error, said):
     monkeypatch.setattr("qpavoid.arena.families.solvable._TRIES", 5)
+    monkeypatch.setattr("qpavoid.arena.families.make.MOST_DRAWS", 10)
     loaded = family(text, *([change] if change else []), code=code)
     with pytest.raises(error, match=said) as raised:
         make_case(loaded, 0)

@@ -323,6 +323,12 @@ def test_qp_collisions_that_only_giving_up_the_task_avoids(seed):
     assert not trial.avoidable, trial.judged
 
 
+@pytest.mark.parametrize("seed", [265, 309, 419])  # of those that `qp` alone does not get through
+def test_foresight_gets_out_of_traps(seed):
+    (trial,) = trials(seed, ("qp+escape",))
+    assert not trial.collided and trial.speed_excess <= 1e-9, trial.judged
+
+
 def test_tracking_alone_collides_and_could_have_avoided_it():
     assert sum(trial.avoidable for trial in small_campaign("tracking", 8)) > 4
 

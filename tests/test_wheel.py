@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from qpavoid.loading import robot_names, scenario_names
+from qpavoid.loading import family_names, robot_names, scenario_names, setup_names
 
 ROOT = Path(__file__).parent.parent
 
@@ -61,6 +61,8 @@ def test_wheel_holds_the_package_its_robots_and_scenarios(built):
     assert "qpavoid/py.typed" in package
     assert {f"qpavoid/_data/robots/{name}/robot.yaml" for name in robot_names()} <= package
     assert {f"qpavoid/_data/tasks/{name}.yaml" for name in scenario_names()} <= package
+    assert {f"qpavoid/_data/tasks/families/{name}.yaml" for name in family_names()} <= package
+    assert {f"qpavoid/_data/tasks/families/setups/{name}.yaml" for name in setup_names()} <= package
     assert "qpavoid/_data/robots/paper-dual-arm/paper_dual_arm.urdf" in package
     assert {name.split("/")[0] for name in package} == {"qpavoid"}
     assert not any("__pycache__" in name or name.endswith((".npz", ".png")) for name in names)

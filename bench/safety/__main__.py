@@ -9,7 +9,7 @@ from time import perf_counter
 
 from bench.safety import report
 from bench.safety.campaign import draw
-from bench.safety.trial import Trial, examine, trials
+from bench.safety.trial import Trial, examine, foresighted, trials
 from qpavoid import Workers
 from qpavoid.arena.twin import load
 from qpavoid.log import STATUSES
@@ -55,6 +55,7 @@ def describe(seed: int, solver: str) -> None:
     """Runs one seed and prints its scene, what the referee saw, and all verdicts."""
     scenario = draw(seed)
     twin = load(scenario)
+    scenario = foresighted(scenario, solver)
     trial, log, findings, verdicts = examine(seed, scenario, twin, solver)
     avoidance = scenario.avoidance
     print(

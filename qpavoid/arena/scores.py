@@ -149,7 +149,7 @@ def score(
         tracking_error=float(np.sqrt(np.mean(error**2))),
         deviation=_deviation(rollout),
         path_length=_length(rollout.tool) / max(_length(rollout.target), 1e-9),
-        time_to_goal=(away[-1] + 1 if len(away) else 0) / ticks if arrived else 1.0,
+        time_to_goal=(int(away[-1]) + 1 if len(away) else 0) / ticks if arrived else 1.0,
         stuck=case.reachable and not arrived and not findings.contacts and rests,
         jerk=float(np.sqrt(np.mean(np.square(np.diff(change, axis=0))))) / scenario.dt**2,
         jitter=float(np.abs(change).sum()) / scenario.duration,

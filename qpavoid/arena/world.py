@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+from pathlib import Path
 from typing import NamedTuple
 
 from qpavoid.config import ScenarioConfig
@@ -34,9 +36,15 @@ def build_world(scenario: ScenarioConfig) -> World:
     """
     source = scenario.source
     with located(f"{source}: robot"):
-        robot = Robot.load(scenario.robot, source.parent)
+        robot = _loaded(scenario.robot, source.parent)
     q0 = robot.configuration(scenario.q0, f"{source}: q0")
     return world_of(scenario, *robot.lock(scenario.lock, q0, f"{source}: lock"))
+
+
+@lru_cache(maxsize=16)
+def _loaded(name: str, folder: Path) -> Robot:
+    """Sweeps run the same few robots again and again; reading the meshes of a humanoid takes longer than a run."""
+    return Robot.load(name, folder)
 
 
 def world_of(scenario: ScenarioConfig, robot: Robot, q0: Array) -> World:

@@ -5,7 +5,7 @@ and read by `qpavoid.loading`; `qpavoid.scene` and `qpavoid.motion` turn these m
 """
 
 from qpavoid.config.base import Block
-from qpavoid.config.control import Avoidance, Cbf, Damper, Detour, Limits, Progress, Sensing, Switching
+from qpavoid.config.control import Avoidance, Cbf, Damper, Detour, Escape, Limits, Progress, Sensing, Switching
 from qpavoid.config.motion import Circle, Csv, Fixed, Line, Motion, Waypoints
 from qpavoid.config.robot import Body, Hull, JointLimits, RobotConfig
 from qpavoid.config.scenario import ObstacleConfig, ScenarioConfig
@@ -22,7 +22,16 @@ from qpavoid.config.shapes import (
     Shape,
     Sphere,
 )
-from qpavoid.config.solver import Eq10Solver, HqpSolver, QpSolver, SolverConfig, TrackingSolver, expand_solver
+from qpavoid.config.solver import (
+    Eq10Solver,
+    GradientProjectionSolver,
+    HqpSolver,
+    PotentialFieldSolver,
+    QpSolver,
+    SolverConfig,
+    TrackingSolver,
+    expand_solver,
+)
 from qpavoid.config.tasks import (
     AlignTask,
     AnyTask,
@@ -39,9 +48,9 @@ from qpavoid.config.tasks import (
 
 __all__ = [
     "AlignTask", "AnyTask", "Avoidance", "Block", "Body", "Box", "Capsule", "Cbf", "Circle", "ComTask", "Cone",
-    "Contact", "Csv", "Cylinder", "Damper", "DampingTask", "Detour", "Ellipsoid", "Eq10Solver", "Fixed", "HalfSpace",
-    "HqpSolver", "Hull", "JointLimits", "Limits", "Line", "LookAtTask", "ManipulabilityTask", "Mesh", "Motion",
-    "ObstacleConfig", "ObstacleShape", "PointCloud", "PostureTask", "Progress", "QpSolver", "RelativeTask",
-    "RobotConfig", "ScenarioConfig", "Sensing", "Shape", "SolverConfig", "Sphere", "Switching", "Task", "TaskBlock",
-    "TrackingSolver", "Waypoints", "expand_solver",
+    "Contact", "Csv", "Cylinder", "Damper", "DampingTask", "Detour", "Ellipsoid", "Eq10Solver", "Escape", "Fixed",
+    "GradientProjectionSolver", "HalfSpace", "HqpSolver", "Hull", "JointLimits", "Limits", "Line", "LookAtTask",
+    "ManipulabilityTask", "Mesh", "Motion", "ObstacleConfig", "ObstacleShape", "PointCloud", "PostureTask",
+    "PotentialFieldSolver", "Progress", "QpSolver", "RelativeTask", "RobotConfig", "ScenarioConfig", "Sensing", "Shape",
+    "SolverConfig", "Sphere", "Switching", "Task", "TaskBlock", "TrackingSolver", "Waypoints", "expand_solver",
 ]  # fmt: skip

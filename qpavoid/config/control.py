@@ -40,6 +40,26 @@ class Cbf(Block):
 AvoidanceRow = Annotated[Switching | Damper | Cbf, Field(discriminator="type")]
 
 
+class Escape(Block):
+    """Foresight where obstacles move: tasks go on only where the robot could still flee (`qpavoid.escape`).
+
+    It takes obstacles to go on as their trajectories or last twists say, and some milliseconds a tick.
+    """
+
+    horizon: Annotated[float, Field(ge=0.1, le=10.0)] = 1.5
+    """How long a flight has to stay clear [s]."""
+    period: Annotated[float, Field(ge=0.005, le=0.5)] = 0.04
+    """Time from one decision of a flight to the next [s]; distances are looked at as often."""
+    reach: Positive = 0.3
+    """Distance up to which flights look at pairs [m]."""
+    comfort: Positive = 0.1
+    """Distance beyond which flights want no more [m]."""
+    safe: Annotated[float, Field(ge=0, le=1)] = 0.3
+    """Share of the safe distance that a flight has to keep [-]."""
+    attempts: Annotated[int, Field(ge=1, le=7)] = 3
+    """Manners of fleeing that a tick tries beside standing still and the one that last worked [-]."""
+
+
 class Avoidance(Block):
     """When and how the robot keeps clear."""
 
@@ -57,6 +77,9 @@ class Avoidance(Block):
     look_ahead: bool = True
     """Whether a velocity of the QP is followed ahead, over its tick and the stop after it, and drawn back where that
     leads nearer than the safe distance."""
+
+    escape: Escape | None = None
+    """Whether a way out is kept at hand where obstacles move; left out: no."""
 
     @property
     def hold(self) -> float:

@@ -9,10 +9,10 @@ from pydantic import BeforeValidator, Field
 from qpavoid.config.base import Block, NonNegative, Positive
 
 
-class TrackingSolver(Block):
-    """Damped least squares on the tracking task; does not avoid."""
+class ClosedForm(Block):
+    """A law without a back end."""
 
-    name: Literal["tracking"] = "tracking"
+    name: str
 
     @property
     def label(self) -> str:
@@ -20,7 +20,13 @@ class TrackingSolver(Block):
         return self.name
 
 
-class Eq10Solver(Block):
+class TrackingSolver(ClosedForm):
+    """Damped least squares on the tracking task; does not avoid."""
+
+    name: Literal["tracking"] = "tracking"
+
+
+class Eq10Solver(ClosedForm):
     """Eq. 10: `eq10` with the consistent bracket and α while approaching only, `eq10-literal` as printed."""
 
     name: Literal["eq10", "eq10-literal"] = "eq10"
@@ -31,10 +37,23 @@ class Eq10Solver(Block):
     alpha_cap: Positive = 1e6
     """Largest α; eq. 11 grows without bound as d goes to 0 [-]."""
 
-    @property
-    def label(self) -> str:
-        """Short form that names it."""
-        return self.name
+
+class GradientProjectionSolver(ClosedForm):
+    """Tracking, with the gradient of the clearance in its null space (Liégeois 1977)."""
+
+    name: Literal["gradient-projection"] = "gradient-projection"
+    gain: NonNegative = 10.0
+    """k: self-motion for each m/rad of gradient; joint limits may leave room for less [rad²/(m s)]."""
+
+
+class PotentialFieldSolver(ClosedForm):
+    """Tracking as attraction, and FIRAS repulsion from every pair in range (Khatib 1986)."""
+
+    name: Literal["potential-field"] = "potential-field"
+    gain: Positive = 1.0
+    """Push of a pair at distance d1: joints move by J_dᵀ times as much [rad²/(m s)]."""
+    cap: Positive = 5.0
+    """Largest push of a pair, contact and penetration included [rad²/(m s)]."""
 
 
 class QpSolver(Block):
@@ -78,6 +97,9 @@ def expand_solver(value: Any) -> Any:
 
 
 SolverConfig = Annotated[
-    Annotated[TrackingSolver | Eq10Solver | QpSolver | HqpSolver, Field(discriminator="name")],
+    Annotated[
+        TrackingSolver | Eq10Solver | GradientProjectionSolver | PotentialFieldSolver | QpSolver | HqpSolver,
+        Field(discriminator="name"),
+    ],
     BeforeValidator(expand_solver),
 ]

@@ -17,6 +17,8 @@ from qpavoid.problem import Problem, Solution
 from qpavoid.solvers.analytic import Eq10, TrackingOnly
 from qpavoid.solvers.backends import backend_names
 from qpavoid.solvers.hqp import Hqp
+from qpavoid.solvers.potential import PotentialField
+from qpavoid.solvers.projection import GradientProjection
 from qpavoid.solvers.qp import Qp
 
 
@@ -35,6 +37,8 @@ SOLVERS: dict[str, Callable[[Any], Solver]] = {
     "tracking": TrackingOnly,
     "eq10": Eq10,
     "eq10-literal": Eq10,
+    "gradient-projection": GradientProjection,
+    "potential-field": PotentialField,
     "qp": Qp,
     "hqp": Hqp,
 }

@@ -6,7 +6,7 @@ import numpy as np
 
 from qpavoid import gains
 from qpavoid.config import Eq10Solver, TrackingSolver
-from qpavoid.problem import Array, Problem, Solution
+from qpavoid.problem import Array, Problem, Solution, Tracking
 
 _VANISHING = 1e-12
 """Squared length below which a projected row counts as zero: an absolute cut-off, since a relative one inverts
@@ -41,6 +41,20 @@ def tracking_velocity(problem: Problem) -> Array:
     return np.asarray(pseudo_inverse(tracking.A, 0.0) @ tracking.b)
 
 
+def null_space_part(row: Array, tracking: Tracking) -> Array:
+    """row N, N = I - J⁺J: the part of a row that the task leaves free. N is symmetric: it is that of a velocity, too.
+
+    Args:
+        row: (nv,).
+        tracking: task rows; with damping λ, J N = λ² (J Jᵀ + λ²)⁻¹ J is small instead of zero.
+
+    Returns:
+        (nv,).
+    """
+    J = tracking.A
+    return np.asarray(row - (row @ pseudo_inverse(J, tracking.damping)) @ J)
+
+
 class TrackingOnly:
     """q̇ = J⁺ẋ, damped least squares (Nakamura and Hanafusa 1986; Wampler 1986). The baseline: avoids nothing."""
 
@@ -71,12 +85,9 @@ class Eq10:
 
     def solve(self, problem: Problem) -> Solution:
         """Eq. 10, or J⁺ẋ when nothing is in range."""
-        tracking, rows = problem.tracking, problem.avoidance
-        primary = tracking_velocity(problem)
+        rows, primary = problem.avoidance, tracking_velocity(problem)
         if rows.d.size == 0:
             return Solution(primary)
-        J = tracking.A
-        J_inv = pseudo_inverse(J, tracking.damping)
         closest = int(np.argmin(rows.d))
         J_d = rows.J[closest]
         approach = float(J_d @ primary)
@@ -86,7 +97,7 @@ class Eq10:
         if not literal and approach >= 0.0:
             alpha = 0.0
         switched = primary - alpha * approach * _row_inverse(J_d, damping=0.0)
-        J_dN = J_d - (J_d @ J_inv) @ J
+        J_dN = null_space_part(J_d, problem.tracking)
         wanted = self.config.retreat_speed - (approach if literal else float(J_d @ switched))
         retreat = float(gains.beta(d, rows.d1, rows.d2)[0]) * wanted * _row_inverse(J_dN, self.config.damping)
         return Solution(switched + retreat)

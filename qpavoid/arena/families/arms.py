@@ -90,7 +90,9 @@ def set_out(start: Array, goal: Array, speed: float, begin: float = 0.5) -> Way:
     return Way(start, goal, begin, begin + max(float(np.linalg.norm(goal - start)), 0.01) / speed)
 
 
-def run(robot: Robot, q: Array, tasks: list[dict[str, Any]], obstacles: list[dict[str, Any]]) -> dict[str, Any]:
-    """Fields of a scenario that begins at q (nv,) and ends some time after its tasks' waypoints."""
+def run(
+    robot: Robot, q: Array, tasks: list[dict[str, Any]], obstacles: list[dict[str, Any]], rest: float = REST
+) -> dict[str, Any]:
+    """Fields of a scenario that begins at q (nv,) and ends some time [s] after its tasks' waypoints."""
     end = max(task["motion"]["times"][-1] for task in tasks)
-    return {"q0": named(robot, q), "tasks": tasks, "obstacles": obstacles, "duration": round(end + REST, 1)}
+    return {"q0": named(robot, q), "tasks": tasks, "obstacles": obstacles, "duration": round(end + rest, 1)}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 
+from qpavoid.arena.families.reach import Ranges
 from qpavoid.arena.world import World
 from qpavoid.problem import Array
 from qpavoid.proximity import DistanceQuery
@@ -40,8 +41,9 @@ class Clearance:
         self._duration = duration
         self.speed = self._fastest()
         """Largest speed of any point of an obstacle [m/s]."""
-        self.lever = self._levers()
-        """(nv,) how far a unit of each coordinate moves any point of the robot, at most [m/rad or 1]."""
+        self.lever = self._levers(Ranges.of(scene.robot))
+        """(nv,) how far a unit of each coordinate moves any point of the robot, at most [m/rad or 1]. A joint moves one
+        body of a pair, or both as one: no distance changes by more than lever @ |Δq|."""
 
     @property
     def timed(self) -> bool:
@@ -59,7 +61,7 @@ class Clearance:
         return self.at(q, t) >= self.least
 
     def roots_clear(self, q: Array) -> bool:
-        """Whether pairs that no joint can part, such as a base and an obstacle, are always far enough apart; any q."""
+        """A first look, with any q (nv,), at pairs that no joint can part, such as a base and an obstacle."""
         fixed = np.flatnonzero(self._fixed)
         if not len(fixed):
             return True
@@ -101,16 +103,15 @@ class Clearance:
             fastest = max(fastest, float(self._query.speeds.max()))
         return fastest
 
-    def _levers(self) -> Array:
+    def _levers(self, ranges: Ranges) -> Array:
         """A joint turns no point that is farther from it than the links after it are long together."""
-        model, reach = self._model, self._query.joint_reach()
-        lower, upper = np.abs(model.lowerPositionLimit), np.abs(model.upperPositionLimit)
-        lever = np.ones(model.nv)
+        model, reach, lever = self._model, self._query.joint_reach(), np.ones(self._model.nv)
+        farthest = np.maximum(np.abs(ranges.lower), np.abs(ranges.upper))
         for i in range(model.njoints - 1, 0, -1):
             joint, parent = model.joints[i], model.parents[i]
             slides = joint.shortname().startswith("JointModelP")
             lever[joint.idx_v] = 1.0 if slides else reach[i]
-            travel = max(lower[joint.idx_q], upper[joint.idx_q]) if slides else 0.0
+            travel = farthest[joint.idx_v] if slides else 0.0
             length = float(np.linalg.norm(model.jointPlacements[i].translation)) + travel
             reach[parent] = max(reach[parent], length + reach[i])
         return lever

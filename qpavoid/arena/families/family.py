@@ -120,7 +120,7 @@ def load_family(name_or_path: str | Path) -> Family:
         name=path.stem,
         path=path,
         config=config,
-        templates=tuple(_template(entry, config, f"{path}: robots.{i}") for i, entry in enumerate(config.robots)),
+        templates=tuple(_template(entry, config, path, f"{path}: robots.{i}") for i, entry in enumerate(config.robots)),
         generator=None if config.generator is None else _generator(config.generator, path),
         in_template=frozenset(used),
     )
@@ -135,19 +135,19 @@ def _names(template: Any, where: str) -> Iterator[tuple[str, str]]:
         yield template[1:], where
 
 
-def _template(entry: str | dict[str, Any], config: FamilyConfig, where: str) -> dict[str, Any]:
+def _template(entry: str | dict[str, Any], config: FamilyConfig, path: Path, where: str) -> dict[str, Any]:
     """Fields of a scenario for a robot."""
-    if isinstance(entry, dict):
-        return {**config.scenario, **entry}
-    if entry in setup_names():
+    if isinstance(entry, str) and entry in setup_names():
         return {**read_mapping(find_setup(entry)), **config.scenario}
+    fields = {"robot": entry} if isinstance(entry, str) else entry
     try:
-        find_robot(entry, Path(where.partition(": ")[0]).parent)
+        if not fields["robot"].startswith("$"):
+            find_robot(fields["robot"], path.parent)
     except UnknownName as error:
         raise UnknownName(f"{where}: {error}; or a setup: {', '.join(setup_names())}") from None
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from None
-    return {**config.scenario, "robot": entry}
+    return {**config.scenario, **fields}
 
 
 def _generator(name: str, path: Path) -> Generator:

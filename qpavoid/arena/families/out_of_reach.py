@@ -6,7 +6,6 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from qpavoid.arena.families.reach import Ranges
 from qpavoid.arena.families.room import gap, placed
 from qpavoid.arena.world import World
 from qpavoid.problem import Array
@@ -48,7 +47,7 @@ def arm(robot: Robot, frame_id: int, first: int = 1) -> tuple[Array, float]:
         frame_id: of the frame.
         first: which joint of the chain it begins with, counted from 1.
     """
-    model, data, ranges = robot.model, robot.model.createData(), Ranges.of(robot)
+    model, data = robot.model, robot.model.createData()
     frame = model.frames[frame_id]
     chain = list(model.supports[frame.parentJoint])[first:]
     pin.forwardKinematics(model, data, robot.home)
@@ -57,7 +56,7 @@ def arm(robot: Robot, frame_id: int, first: int = 1) -> tuple[Array, float]:
         joint = model.joints[i]
         length += float(np.linalg.norm(model.jointPlacements[i].translation)) if place else 0.0
         if joint.shortname().startswith("JointModelP"):
-            length += float(max(abs(ranges.lower[joint.idx_v]), abs(ranges.upper[joint.idx_v])))
+            length += max(abs(model.lowerPositionLimit[joint.idx_q]), abs(model.upperPositionLimit[joint.idx_q]))
     return np.array(data.oMi[chain[0]].translation), length
 
 

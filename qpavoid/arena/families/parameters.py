@@ -12,6 +12,7 @@ from pydantic import Field, model_validator
 from qpavoid.config.base import Block, Number, Positive
 from qpavoid.errors import UnknownName
 from qpavoid.loading import nearest
+from qpavoid.problem import Array
 
 
 class ParameterBlock(Block):
@@ -137,7 +138,7 @@ class Draw:
             self._kept[name] = value
         return value
 
-    def vector(self, *names: str) -> np.ndarray[Any, np.dtype[np.float64]]:
+    def vector(self, *names: str) -> Array:
         """Values of several parameters, (len(names),)."""
         return np.array([self(name) for name in names], dtype=np.float64)
 

@@ -23,7 +23,7 @@ _LONGEST = 0.6
 _LONGEST_TIME = 0.5
 """The same in time [s]."""
 _NEAR = 0.8
-"""How far from the straight motion every other sample may be, in each joint [rad or m]."""
+"""How far from the straight motion two samples of three may be, in each joint [rad or m]."""
 _SHORTCUTS = 60
 
 
@@ -115,11 +115,11 @@ def plan(
     """
     search, last = _Search(clearance, speed), duration if clearance.timed else 0.0
     trees = (_Tree(start[None], 0.0, True), _Tree(goals, last, False))
-    for a in range(_MOST_ROUNDS):
-        tree, other = trees[a % 2], trees[1 - a % 2]
+    for turn in range(_MOST_ROUNDS):
+        tree, other = trees[turn % 2], trees[1 - turn % 2]
         if tree.count + other.count > MOST_NODES:
             return None
-        q, t = (goals[0], last) if a == 0 else _sample(ranges, start, goals, a, last, random)
+        q, t = (goals[0], last) if turn == 0 else _sample(ranges, start, goals, turn, last, random)
         node = search.nearest(tree, q, t)
         if node < 0:
             continue

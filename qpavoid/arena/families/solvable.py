@@ -20,6 +20,8 @@ _MOST_GOALS, _TRIES = 6, 40
 """Configurations that attain the goal: how many are wanted, how many searches are made."""
 _PRECISE = 0.2
 """Share of the goal's tolerance that they use [-]."""
+_HOLD = 1.0
+"""Where obstacles move, how long before the end the goal is attained, and held [s]."""
 _SPEED_SHARE, _FASTEST = 0.5, 1.5
 """Share of the joints' speed limits that plans use [-], and what they use at most [rad/s or m/s]."""
 
@@ -60,24 +62,33 @@ def solved_by(scenario: ScenarioConfig, world: World, reachable: bool, random: n
 
 
 def find_plan(scenario: ScenarioConfig, world: World, clearance: Clearance, random: np.random.Generator) -> Plan:
-    """A motion from the start to where all frames attain their targets at the end, always clear.
+    """A motion from the start to where all frames attain their targets, always clear. It can rest at its last node
+    until the end of the run.
 
     Raises:
         Redraw: none was found.
     """
     ranges, bounds = Ranges.of(world.scene.robot), world.scene.robot.bounds().within(scenario.limits)
-    goals = _goals(scenario, world, ranges, clearance, random)
+    latest = max(scenario.duration - _HOLD, 0.0) if clearance.timed else scenario.duration
+    goals = _goals(scenario, world, ranges, clearance, latest, random)
     speed = np.minimum(_SPEED_SHARE * bounds.velocity, _FASTEST)
-    found = plan(clearance, ranges, world.q0, goals, speed, scenario.duration, random)
+    found = plan(clearance, ranges, world.q0, goals, speed, latest, random)
     if found is None:
         raise Redraw("no plan was found")
     return found
 
 
 def _goals(
-    scenario: ScenarioConfig, world: World, ranges: Ranges, clearance: Clearance, random: np.random.Generator
+    scenario: ScenarioConfig,
+    world: World,
+    ranges: Ranges,
+    clearance: Clearance,
+    since: float,
+    random: np.random.Generator,
 ) -> Array:
-    """(g, nv) configurations that attain the targets of the end, clear of everything; those near the start first."""
+    """(g, nv) configurations that attain the targets of the end, clear of everything from some time on [s]; those near
+    the start first.
+    """
     robot, end = world.scene.robot, scenario.duration
     wants = []
     for task in world.tasks:
@@ -93,7 +104,7 @@ def _goals(
         begin = world.q0 + spread * (random.uniform(ranges.lower, ranges.upper) - world.q0)
         q = configuration_at(robot, wants, begin, ranges, _PRECISE * scenario.goal_tolerance)
         attained |= q is not None
-        if q is not None and clearance.clear(q, end):
+        if q is not None and clearance.clear_between(q, since, q, end):
             found.append(q)
             if len(found) == _MOST_GOALS:
                 break

@@ -13,14 +13,17 @@ from qpavoid.arena.families.statics import fixed, sweep
 from qpavoid.arena.families.ways import along
 from qpavoid.robot import Robot
 
+_REST = 8.0
+"""Time to come to rest in, after the planned motion [s]."""
+
 
 def unreachable(draw: Draw, robot: Robot) -> dict[str, Any]:
-    """A goal inside a ball, or `beyond` all links in a row, with a ball on the way there."""
+    """A goal inside a ball, as `deep` as a share of its radius, or `beyond` all links in a row, a ball on the way."""
     one, way, q = sweep(draw, robot)
     radius = one.length * draw("radius")
-    goal, share, beyond = way.goal, draw("share"), draw("beyond")
+    goal, share, beyond, deep = way.goal, draw("share"), draw("beyond"), draw("deep")
     if draw("kind") == "inside":
-        ball = goal
+        ball = goal + (1.0 - deep) * radius * way.direction  # its nearest point is on this side: a place to rest
     else:
         root, length = arm(robot, robot.frame_id(one.tool, "tool"))
         towards = goal - root
@@ -28,4 +31,4 @@ def unreachable(draw: Draw, robot: Robot) -> dict[str, Any]:
         ball = way.start + share * (goal - way.start)
     way = set_out(way.start, goal, draw("speed"))
     obstacle = fixed("ball", {"type": "sphere", "radius": radius}, ball)
-    return run(robot, q, [follow(one.tool, along(way))], [obstacle])
+    return run(robot, q, [follow(one.tool, along(way))], [obstacle], _REST)

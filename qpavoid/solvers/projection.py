@@ -1,0 +1,68 @@
+"""Gradient projection: the tool tracks, and what that leaves free climbs away from obstacles."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from qpavoid.config import GradientProjectionSolver
+from qpavoid.problem import Array, Problem, Solution
+from qpavoid.solvers.analytic import null_space_part, tracking_velocity
+
+
+class GradientProjection:
+    """q̇ = J⁺ẋ + (I - J⁺J) a,  a = k ∇h (Liégeois 1977, "Automatic supervisory control of the configuration and behavior
+    of multibody mechanisms", IEEE Trans. SMC 7(12); eq. 9 of the task-switching paper).
+
+    The clearance h = -Σ c(d_i) [m] adds up over the pairs in range the obstacle cost of CHOMP (Ratliff et al. 2009;
+    Zucker et al. 2013, IJRR 32(9-10)) for a safe distance d1 and an influence distance d2:
+
+        c(d) = 0 beyond d2,  (d2 - d)²/(2 (d2 - d1)) down to d1,  (d1 + d2)/2 - d below.
+
+    Its slope grows from 0 to 1, so that pairs come and go without a jump and nothing blows up in contact. With J_i, the
+    Jacobians of the distances, ∇h = -Σ c'(d_i) J_iᵀ is exact. Obstacles count by where they are, not by how they move.
+
+    k is `gain`, or as much of it as keeps joints that J⁺ẋ leaves within their bounds there (Euler, Dubey and Babcock
+    1989, "Self motion determination based on actuator velocity bounds for redundant manipulators"): clipped joint by
+    joint, motion of the null space would no longer be one, and take the tool off its path.
+    """
+
+    bounded = False
+
+    def __init__(self, config: GradientProjectionSolver) -> None:
+        self.config = config
+
+    def solve(self, problem: Problem) -> Solution:
+        """J⁺ẋ and the self-motion that adds clearance; J⁺ẋ itself when nothing is in range."""
+        rows, primary = problem.avoidance, tracking_velocity(problem)
+        if rows.d.size == 0:
+            return Solution(primary)
+        gradient = clearance_slope(rows.d, rows.d1, rows.d2) @ rows.J
+        a = null_space_part(self.config.gain * gradient, problem.tracking)
+        return Solution(primary + room(primary, a, problem.lower, problem.upper) * a)
+
+
+def clearance_slope(d: Array, d1: float, d2: float) -> Array:
+    """∂h/∂d (k,) of each pair: 0 from d2 on, 1 from d1 down, linear between [-].
+
+    Args:
+        d: distances (k,) [m].
+        d1: safe distance [m].
+        d2: influence distance [m].
+    """
+    return np.asarray(np.clip((d2 - d) / (d2 - d1), 0.0, 1.0))
+
+
+def room(v: Array, a: Array, lower: Array, upper: Array) -> float:
+    """Largest share s in [0, 1] of a with which v + s a passes no bound that v keeps, and none further that it passes.
+
+    Args:
+        v: velocity (nv,).
+        a: what is added to it (nv,); where it is 0, bounds do not matter.
+        lower: lower bound (nv,), may be infinite.
+        upper: upper bound (nv,), likewise.
+    """
+    ahead = np.where(a > 0.0, upper, lower) - v
+    moving = a != 0.0
+    with np.errstate(over="ignore"):
+        share = np.min(ahead[moving] / a[moving], initial=1.0)
+    return float(np.maximum(share, 0.0))

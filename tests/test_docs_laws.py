@@ -1,0 +1,97 @@
+"""docs/laws.md: its blocks are scenarios' with every setting at its default, its figures those of its commands."""
+
+import json
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+import yaml
+
+from qpavoid import ScenarioConfig
+from qpavoid.config import Avoidance
+from qpavoid.solvers import SOLVERS, parse_solver
+
+PAGE = (Path(__file__).parent.parent / "docs" / "laws.md").read_text(encoding="utf-8")
+METRICS = {
+    "closest surfaces [mm]": ("min_distance", 1e3),
+    "in collision [s]": ("time_in_collision", 1.0),
+    "end error [mm]": ("final_error", 1e3),
+    "off the path [mm]": ("max_deviation", 1e3),
+    "peak q̇ [rad/s]": ("peak_velocity", 1.0),
+    "Σ|Δq̇| [rad/s]": ("jitter", 1.0),
+}
+"""Column of a table of figures: name among the figures of a run, and its unit."""
+
+
+def tables():
+    """Rows of each table, as {column: cell}."""
+    for table in re.findall(r"(?:^\|.*\n)+", PAGE, re.M):
+        lines = [
+            [cell.strip().strip("`").replace("\\|", "|") for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
+            for line in table.splitlines()
+        ]
+        yield [dict(zip(lines[0], line, strict=True)) for line in lines[2:]]
+
+
+FIGURES = [rows for rows in tables() if "Σ|Δq̇| [rad/s]" in rows[0]]
+COMMANDS = re.findall(r"^    qpavoid (compare .*)$", PAGE, re.M)
+
+
+def ran(cli, command):
+    return json.loads(cli(*shlex.split(command), "--json").stdout)["runs"]
+
+
+def assert_said(row, run):
+    """Each figure of a row is within one of its last digit and 2 per mille: platforms differ where a law chatters."""
+    for column in set(row) & set(METRICS):
+        name, unit = METRICS[column]
+        digit = 10.0 ** -len(row[column].partition(".")[2])
+        assert float(row[column]) == pytest.approx(unit * run[name], abs=digit, rel=2e-3), f"{row}: {column}"
+
+
+def test_every_law_has_a_part_with_all_its_settings_at_their_defaults():
+    parts = re.split(r"^## ", PAGE, flags=re.M)
+    for name in SOLVERS:
+        (part,) = [part for part in parts if f"`{name}`" in part.splitlines()[0]]
+        (block,) = [yaml.safe_load(block) for block in re.findall(r"```yaml\n(.*?)```", part, re.S)]
+        ScenarioConfig.model_validate({"robot": "panda", "tasks": [{"frame": "panda_hand"}], "duration": 1.0, **block})
+        default = parse_solver(name).model_dump()
+        assert block["solver"] | {"name": name} == default
+        if "avoidance" in block:
+            assert Avoidance(**block["avoidance"]) == Avoidance()
+
+
+def test_laws_side_by_side(cli):
+    (command,) = [command for command in COMMANDS if "situation1" in command]
+    runs = ran(cli, command)
+    assert [(row["scenario"], row["law"]) for row in FIGURES[0]] == [(run["scenario"], run["solver"]) for run in runs]
+    for row, run in zip(FIGURES[0], runs, strict=True):
+        assert_said(row, run)
+
+
+def test_what_changes_the_chatter(cli):
+    commands = [command for command in COMMANDS if "eq10 " in command]
+    for row, command in zip(FIGURES[1], commands, strict=True):
+        assert command.endswith(f"--set {row['set']}")
+        (run,) = ran(cli, command)
+        assert_said(row, run)
+
+
+def test_rows_side_by_side(cli):
+    commands = [command for command in COMMANDS if "avoidance.row" in command]
+    runs = [(command, run) for command in commands for run in ran(cli, command)]
+    for row, (command, run) in zip(FIGURES[2], runs, strict=True):
+        assert row["row"] in command and row["scenario"] == run["scenario"]
+        assert_said(row, run)
+
+
+def test_the_snippet_prints_what_the_page_says(capsys):
+    (snippet,) = re.findall(r"```python\n(.*?)```", PAGE, re.S)
+    (said,) = re.findall(r"```text\n(.*?)```", PAGE, re.S)
+    exec(compile(snippet, "docs/laws.md", "exec"), {})
+    printed = capsys.readouterr().out
+    numbers = r"(?<![\w.])\d+"
+    assert re.sub(numbers, "#", printed) == re.sub(numbers, "#", said)
+    found, given = ([int(n) for n in re.findall(numbers, text)] for text in (printed, said))
+    assert found == pytest.approx(given, rel=0.02, abs=1.0)
