@@ -71,10 +71,9 @@ def _scatter(results: Results, x: list[Interval], y: list[Interval], across: str
     ax = figure.subplots()
     xs, ys = np.array([point.value for point in x]), np.array([point.value for point in y])
     front = pareto(xs, ys)
-    for i, name in enumerate(results.entrants):
+    for i in range(len(results.entrants)):
         colour = COLOURS[i % len(COLOURS)]
-        across_bar = [[x[i].value - x[i].low], [x[i].high - x[i].value]]
-        up_bar = [[y[i].value - y[i].low], [y[i].high - y[i].value]]
+        across_bar, up_bar = _bar(x[i]), _bar(y[i])
         face = colour if front[i] else "white"
         ax.errorbar(xs[i], ys[i], yerr=up_bar, xerr=across_bar, fmt="o", ms=6, color=colour, mfc=face, elinewidth=0.8)
     best = np.flatnonzero(front)[np.argsort(xs[front])]
@@ -85,6 +84,12 @@ def _scatter(results: Results, x: list[Interval], y: list[Interval], across: str
     ax.margins(x=0.04, y=0.08)
     _label(ax, results.entrants, xs, ys)
     return figure
+
+
+def _bar(interval: Interval) -> Array:
+    """(2, 1) what the interval reaches down and up; round-off may turn nothing into less."""
+    value, low, high = interval
+    return np.array([[max(value - low, 0.0)], [max(high - value, 0.0)]])
 
 
 def _label(ax: Any, names: tuple[str, ...], xs: Array, ys: Array) -> None:
