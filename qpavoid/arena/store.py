@@ -8,8 +8,8 @@
 
 A row is in its journal, flushed, before anything else begins. A journal becomes a Parquet file when it has grown long,
 when a sweep ends and when the next one begins: the file is written beside, renamed, and only then is the journal
-removed. Whoever is killed in between leaves rows in both; the file is named after its content, so that writing it again
-changes nothing, and what is in both is read once.
+removed. Whoever is killed in between leaves rows in both: the file is named after its content, so that it is not
+written again, and what is in both is read once.
 """
 
 from __future__ import annotations
@@ -49,14 +49,14 @@ class Kind(NamedTuple):
 RUNS = Kind("runs", pa.schema([(name, _TYPES[kind]) for name, kind in COLUMNS.items()]), KEY)
 CASES = Kind(
     "cases",
-    pa.schema({"family": pa.string(), "seed": pa.int64(), "origin": pa.string(), "case": pa.string(), "json": pa.string()}),
+    pa.schema([("seed", pa.int64()), *((name, pa.string()) for name in ("family", "origin", "case", "json"))]),
     ("family", "seed", "origin"),
-)  # fmt: skip
+)
 """`origin` is the digest of the family and the version that made the case, `case` is `Case.key`."""
 
 
 def read_runs(folder: Path, columns: Sequence[str] | None = None) -> pa.Table:
-    """All runs of a folder, each once; also while a sweep is going on there.
+    """All runs of a folder, each once, in the order in which they were done; also while a sweep is going on there.
 
     Args:
         folder: of results.
@@ -77,26 +77,19 @@ def read_cases(folder: Path, columns: Sequence[str] | None = None) -> pa.Table:
     return _read(folder, CASES, columns)
 
 
-def without(rows: pa.Table, others: pa.Table, key: Sequence[str]) -> pa.Table:
-    """The rows whose key none of the others has, in their order."""
-    order = pa.array(np.arange(len(rows)))
-    keys = rows.select(key).append_column("order", order)
-    left = keys.join(others.select(key), keys=list(key), join_type="left anti")
-    return rows.take(left["order"].combine_chunks().sort())
-
-
 def _read(folder: Path, kind: Kind, columns: Sequence[str] | None = None) -> pa.Table:
     if not any((folder / name).exists() for name in (kind.name, f"{kind.name}.jsonl")):
         raise ConfigError(f"{folder}: no results here; give a folder that `qpavoid bench run … --out` wrote")
     journal = _journalled(folder / f"{kind.name}.jsonl", kind)  # first: what moves meanwhile is seen twice, not never
     parts = sorted(map(str, (folder / kind.name).glob("*.parquet")))
+    chosen = None if columns is None else list(columns)
     try:
-        table = ds.dataset(parts, schema=kind.schema, format="parquet").to_table(columns) if parts else None
+        table = ds.dataset(parts, schema=kind.schema, format="parquet").to_table(chosen) if parts else None
     except (pa.ArrowException, OSError) as error:
         remedy = "move the damaged file away, and its rows are made again by the same sweep"
         raise ConfigError(f"{folder / kind.name}: {error}; {remedy}") from None
     if table is None or len(journal):
-        journal = journal if columns is None else journal.select(columns)
+        journal = journal if chosen is None else journal.select(chosen)
         table = journal if table is None else pa.concat_tables([table, journal])
     return _each_once(table, kind.key)
 
@@ -148,15 +141,20 @@ class Journal:
         self.close()
         table = _journalled(self._path, self._kind)
         if len(table):
-            digest = hashlib.sha256(self._path.read_bytes()).hexdigest()[:16]
-            beside = self._parts / f".{digest}.tmp"
-            with beside.open("wb") as file:
-                pq.write_table(table, file, compression="zstd")
-                file.flush()
-                os.fsync(file.fileno())
-            beside.replace(self._parts / f"{digest}.parquet")
+            self._write(table, hashlib.sha256(self._path.read_bytes()).hexdigest()[:16])
         self._path.unlink(missing_ok=True)
         self._file, self._count = self._path.open("ab"), 0
+
+    def _write(self, table: pa.Table, digest: str) -> None:
+        parts = list(self._parts.glob("*.parquet"))
+        if any(part.stem.endswith(digest) for part in parts):
+            return
+        beside = self._parts / f".{digest}.tmp"
+        with beside.open("wb") as file:
+            pq.write_table(table, file, compression="zstd")
+            file.flush()
+            os.fsync(file.fileno())
+        beside.replace(self._parts / f"{len(parts):06d}-{digest}.parquet")
 
     def close(self) -> None:
         """No more rows; what is in the journal stays there."""

@@ -107,11 +107,11 @@ def load_suite(
         if solvers:
             chosen = {}
             for name in solvers:
-                _add(chosen, own[name] if name in own and not own[name].missing else _installed(name, Path()))
+                _add(chosen, own[name] if name in own and not own[name].missing else find_any(name))
             absent = ()
     with located("--entrant"):
         for name in more:
-            _add(chosen, _installed(name, Path()))
+            _add(chosen, find_any(name))
     if not chosen:
         missing = ", ".join(f"{entrant.name} needs {', '.join(entrant.missing)}" for entrant in absent)
         raise ConfigError(f"{path}: entrants: none can take part: {missing}")
@@ -129,11 +129,20 @@ def load_suite(
 
 
 def origin(family: Family) -> str:
-    """Digest of all that a family's cases are made of: its file, what that refers to, and the version that makes them."""
+    """Digest of what a family's cases are made of: its file, what that refers to, and the version that makes them."""
     generator = (family.config.generator or "").rpartition(":")[0]
     text = (family.path.parent / generator).read_text(encoding="utf-8") if generator else ""
     fields: list[Any] = [version("qpavoid"), family.config.model_dump(mode="json"), family.templates, text]
     return hashlib.sha256(json.dumps(fields, sort_keys=True, default=str).encode()).hexdigest()[:12]
+
+
+def find_any(name: str) -> Entrant:
+    """An entrant that ships and is installed, by name, or one of a user's own, as `my_law.py:MyLaw`.
+
+    Raises:
+        ConfigError, UnknownName: there is none.
+    """
+    return find_entrant(name) if name in ENTRANTS else _entrant(name, Path())
 
 
 def facts_of(entrants: Iterable[Entrant]) -> dict[str, Any]:
@@ -153,10 +162,6 @@ def _entrant(name: str, folder: Path) -> Entrant:
     if file.endswith(".py"):
         return own_entrant(folder / file, inside)
     return ENTRANTS[name] if name in ENTRANTS else find_entrant(name)
-
-
-def _installed(name: str, folder: Path) -> Entrant:
-    return find_entrant(name) if name in ENTRANTS else _entrant(name, folder)
 
 
 def _add(chosen: dict[str, Entrant], entrant: Entrant) -> None:
