@@ -19,7 +19,7 @@ from qpavoid.config import ScenarioConfig, SolverConfig
 from qpavoid.controller import Controller
 from qpavoid.errors import ConfigError, UnknownName
 from qpavoid.loading import nearest
-from qpavoid.solvers import parse_solver
+from qpavoid.solvers import make_solver, parse_solver
 
 
 @dataclass(frozen=True)
@@ -76,10 +76,9 @@ def law(name: str, says: str, solver: str | SolverConfig, packages: tuple[str, .
         for block, fields in changes.items():
             scenario[block] = {**scenario[block], **fields}
         scenario["solver"] = config.model_dump()
-        controller, _ = Controller.from_scenario(
-            ScenarioConfig.model_validate(scenario).read_from(case.scenario.source)
-        )
-        return controller
+        x = ScenarioConfig.model_validate(scenario)
+        blocks = x.avoidance, x.limits, x.tracking_damping, x.sensing, x.progress
+        return Controller(world.scene, world.tasks, make_solver(x.solver), x.dt, *blocks)
 
     settings = {"solver": solver if isinstance(solver, str) else solver.model_dump(), **changes}
     return Entrant(name, says, start, settings, packages)

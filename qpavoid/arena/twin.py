@@ -113,9 +113,7 @@ def build(scene: Scene, q0: Array, frames: Sequence[int] = ()) -> Twin:
         bodies.append(body)
     for i, frame in enumerate(robot.frames[index] for index in frames):
         place = frame.placement
-        bodies[frame.parentJoint].add_site(
-            name=f"frame {i}", pos=place.translation, quat=_quaternion(place.rotation)
-        )
+        bodies[frame.parentJoint].add_site(name=f"frame {i}", pos=place.translation, quat=_quaternion(place.rotation))
     first = len(scene.body_names)
     obstacles = [spec.worldbody.add_body(name=f"obstacle {i}", mocap=True) for i in range(len(scene.obstacles))]
     for i, geometry in enumerate(scene.geometry.geometryObjects):
