@@ -422,6 +422,24 @@ def test_what_cannot_be_set_up_or_takes_its_process_down_has_failed_and_is_not_l
     assert complete(suite, folder / "out")
 
 
+def test_processes_that_dask_gives_up_are_replaced(folder, monkeypatch):
+    """As when a machine is so busy that they take too long to start again; otherwise the sweep waits for ever."""
+
+    def too_long(*_):
+        raise AssertionError("the sweep waits for a process that never comes")
+
+    monkeypatch.setitem(sweep._DASK, "distributed.deploy.lost-worker-timeout", "1 ms")
+    suite = load_suite(write_suite(folder, ["laws.py:Deadly", "laws.py:Still"], seeds=1))
+    before = signal.signal(signal.SIGALRM, too_long)
+    signal.alarm(120)
+    try:
+        with sweep.local_cluster(1) as client:
+            assert swept(suite, folder / "out", client)[1:] == (2, 2, 0, 0)
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+
+
 def test_a_case_that_cannot_be_made_is_told_and_the_others_run(folder, client):
     (post,) = POST["scenario"]["obstacles"]
     around = {**post, "motion": {"type": "fixed", "position": [0.0, 0.0, 0.5]}}  # the arm itself: no draw will do

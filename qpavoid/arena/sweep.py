@@ -22,6 +22,7 @@ import dask
 import pyarrow as pa
 import pyarrow.compute as pc
 from distributed import Client, KilledWorker, LocalCluster, as_completed
+from tornado.ioloop import PeriodicCallback
 
 from qpavoid.arena.case import Case
 from qpavoid.arena.entrants import Entrant
@@ -37,6 +38,8 @@ from qpavoid.errors import ConfigError, QpavoidError
 
 _ANSWER_WITHIN = 10.0
 """Time in which a scheduler has to answer, and a first worker to be there [s]."""
+_LOOK_FOR_LOST = 2.0
+"""Time between looks at whether all processes of this machine are there [s]."""
 _KILLED = "the processes that ran it ended before it was done, each time: killed, out of memory or crashed"
 _GONE = "the scheduler went away"
 _SINGLE_THREADED = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "NUMBA")}
@@ -46,6 +49,7 @@ _DASK = {
     "distributed.scheduler.worker-saturation": 1.0,  # what waits does so at the scheduler, not at a worker that may die
     "distributed.scheduler.allowed-failures": 0,  # whose worker died is tried again by us, alone
     "distributed.admin.low-level-log-length": 0,  # the scheduler's memory stays flat
+    "distributed.deploy.lost-worker-timeout": "60 s",  # on a busy machine it takes long to start again
 }
 
 
@@ -71,11 +75,12 @@ class Tally(NamedTuple):
 def local_cluster(jobs: int | None = None) -> Iterator[Client]:
     """Processes of one thread each on this machine, one a core if `jobs` is left out."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    count = cores if jobs is None else jobs
     with (
         _quiet(),
         dask.config.set(_DASK),
         LocalCluster(
-            n_workers=cores if jobs is None else jobs,
+            n_workers=count,
             threads_per_worker=1,
             scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
             silence_logs=logging.CRITICAL,
@@ -84,6 +89,10 @@ def local_cluster(jobs: int | None = None) -> Iterator[Client]:
         ) as cluster,
         Client(cluster) as client,
     ):
+        # Dask gives a worker up that is not back in time, or that dies again as it starts, and replaces it when asked
+        asking = PeriodicCallback(lambda: cluster.scale(count), 1e3 * _LOOK_FOR_LOST)
+        cluster.periodic_callbacks["lost workers"] = asking  # stopped when the cluster is closed
+        cluster.loop.add_callback(asking.start)
         yield client
 
 
