@@ -27,7 +27,7 @@ from qpavoid.log import Log
 from qpavoid.report import events, failed, metrics_table, to_json
 from qpavoid.simulate import simulate
 from qpavoid.solvers import SOLVERS, backend_names
-from qpavoid.terminal import ERR, OUT, progress, terminate_like_interrupt
+from qpavoid.terminal import ERR, OUT, names_of, progress, terminate_like_interrupt
 
 app = typer.Typer(
     add_completion=False,
@@ -101,9 +101,7 @@ def compare(
 
     A collision is a result here, not a failure: the exit status is 1 only when a run was broken off.
     """
-    names = [name.strip() for name in solvers.split(",") if name.strip()]
-    if not names:
-        raise ConfigError("--solvers: names none; give some, as in tracking,eq10,qp")
+    names = names_of("--solvers", solvers)
     configs = [load_scenario(scenario, set_ or (), name) for scenario in scenarios for name in names]
     logs, files = _run_all(configs, out)
     if figures:

@@ -10,6 +10,8 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from qpavoid.errors import ConfigError
+
 OUT = Console()
 ERR = Console(stderr=True)
 
@@ -42,3 +44,15 @@ def terminate_like_interrupt() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+def names_of(option: str, text: str) -> list[str]:
+    """Names with commas between them.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    if not names:
+        raise ConfigError(f"{option}: names none; give some, as in tracking,eq10,qp")
+    return names

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import tempfile
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import ExitStack
 from importlib.util import find_spec
+from json import loads
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.markup import escape
 
-from qpavoid.errors import ConfigError, UnknownName
-from qpavoid.loading import family_names, nearest, suite_names
+from qpavoid.errors import ConfigError
+from qpavoid.loading import family_names, suite_names
 from qpavoid.report import to_json
-from qpavoid.terminal import ERR, OUT, progress, terminate_like_interrupt
+from qpavoid.terminal import ERR, OUT, names_of, progress, terminate_like_interrupt
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -59,16 +59,19 @@ def run(
 
     The exit status is 1 when something could not be made or run, or was interrupted; collisions are results.
     """
+    from qpavoid.arena.plan import runs_of
     from qpavoid.arena.suite import load_suite
+    from qpavoid.arena.summary import FIGURES
 
     if cluster is not None and jobs is not None:
         raise ConfigError("--jobs: the cluster has its own; leave one of --jobs and --cluster out")
-    names = _names(solvers, "--solvers")
+    names = [] if solvers is None else names_of("--solvers", solvers)
     chosen = load_suite(suite, names, entrant or (), seeds)
     folder = out or Path("out") / "bench" / chosen.name
-    tally = _swept(chosen, folder, cluster, jobs, f"qpavoid bench run {suite} … --out {folder}")
-    runs, _ = _results(chosen, folder)
-    _print(chosen, runs, folder, tally, json)
+    tally = _swept(chosen, folder, cluster, jobs)
+    for failure in _failures(folder):
+        _complain(failure)
+    _print(chosen, runs_of(chosen, folder, FIGURES), folder, tally, json)
     raise typer.Exit(1 if tally.failed else 0)
 
 
@@ -79,15 +82,16 @@ def smoke(
     json: Json = False,
 ) -> None:
     """Run a few cases of everything, and say what is broken: exit status 1 if anything is."""
+    from qpavoid.arena.plan import cases_of, runs_of
     from qpavoid.arena.suite import load_suite
     from qpavoid.arena.summary import broken
 
     chosen = load_suite("smoke")
     with ExitStack() as stack:
         folder = out or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="qpavoid-smoke-")))
-        tally = _swept(chosen, folder, None, jobs, f"qpavoid bench smoke --out {folder}")
-        runs, cases = _results(chosen, folder)
-        faults = [*_failures(folder), *broken(chosen, runs, cases)]
+        tally = _swept(chosen, folder, None, jobs)
+        runs = runs_of(chosen, folder)
+        faults = [*_failures(folder), *broken(chosen, runs, cases_of(chosen, folder, ["case", "json"]))]
     _print(chosen, runs, out, tally, json, {"broken": faults})
     for fault in faults:
         _complain(f"broken: {fault}")
@@ -125,7 +129,8 @@ def show(
     if json:
         print(to_json(fields))
         return
-    for name, value in {**fields, **fields.pop("run", {})}.items():
+    figures = fields.pop("run", {})
+    for name, value in {**fields, **figures}.items():
         OUT.print(f"{name:16} {value}", highlight=False, soft_wrap=True, markup=False)
 
 
@@ -137,52 +142,79 @@ def list_(json: Json = False) -> None:
     from qpavoid.arena.suite import SuiteConfig
     from qpavoid.loading import find_suite, read_config
 
-    document = {
-        "suites": {name: read_config(find_suite(name), SuiteConfig).title for name in suite_names()},
-        "families": {name: load_family(name).config.title for name in family_names()},
-        "entrants": {e.name: {"says": e.says, "missing": list(e.missing)} for e in ENTRANTS.values()},
-    }
+    suites = {name: read_config(find_suite(name), SuiteConfig).title for name in suite_names()}
+    families = {name: load_family(name).config.title for name in family_names()}
     if json:
-        print(to_json(document))
+        entrants = {e.name: {"says": e.says, "missing": list(e.missing)} for e in ENTRANTS.values()}
+        print(to_json({"suites": suites, "families": families, "entrants": entrants}))
         return
-    lacks = {name: f"   (needs {', '.join(e['missing'])})" if e["missing"] else "" for name, e in document["entrants"].items()}
-    says = {name: entrant["says"] + lacks[name] for name, entrant in document["entrants"].items()}
-    for heading, entries in {**document, "entrants": says}.items():
+    says = {e.name: e.says + f" (needs {', '.join(e.missing)})" * bool(e.missing) for e in ENTRANTS.values()}
+    for heading, entries in {"suites": suites, "families": families, "entrants": says}.items():
         OUT.print(f"[bold]{heading}[/]")
         for name, text in entries.items():
             OUT.print(f"  {name:22} {text}", highlight=False, soft_wrap=True, markup=False)
 
 
-def _swept(suite: Suite, folder: Path, cluster: str | None, jobs: int | None, again: str) -> Tally:
+def _swept(suite: Suite, folder: Path, cluster: str | None, jobs: int | None) -> Tally:
     """Runs a suite, with bars.
 
     Raises:
         Exit: it was interrupted, or the cluster went away.
     """
+    from qpavoid.arena.plan import complete
     from qpavoid.arena.store import Store
-    from qpavoid.arena.sweep import ClusterLost, local_cluster, remote_cluster, sweep
+    from qpavoid.arena.sweep import ClusterLost, Tally, local_cluster, remote_cluster, sweep
 
     for entrant in suite.absent:
         _complain(f"{entrant.name} does not take part: it needs {', '.join(entrant.missing)}")
+    last: Tally | None = None
     with terminate_like_interrupt(), Store(folder) as store, progress() as bar:
-        told: list[Tally] = []
-        jobs_of = {stage: bar.add_task(stage, total=None, visible=False) for stage in ("cases", "runs")}
+        bars = {stage: bar.add_task(stage, total=None, visible=False) for stage in ("cases", "runs")}
 
         def tell(tally: Tally) -> None:
-            told[:] = [tally]
-            said = f"{tally.stage} ({tally.collided} collided)" if tally.collided else tally.stage
-            bar.update(
-                jobs_of[tally.stage], completed=tally.done, total=tally.total, description=said, visible=tally.total > 0
-            )
+            nonlocal last
+            last = tally
+            said = f"{tally.stage}, {tally.collided} collided" if tally.collided else tally.stage
+            task, visible = bars[tally.stage], tally.total > 0
+            bar.update(task, completed=tally.done, total=tally.total, description=said, visible=visible)
 
+        if complete(suite, folder):
+            return Tally("runs", 0, 0, 0, 0)
         try:
             with remote_cluster(cluster) if cluster is not None else local_cluster(jobs) as client:
-                tally = sweep(suite, store, client, tell)
+                return sweep(suite, store, client, tell)
         except (KeyboardInterrupt, ClusterLost) as reason:
-            done = f"{told[0].done} of {told[0].total} {told[0].stage}" if told else "nothing yet"
             why = "interrupted" if isinstance(reason, KeyboardInterrupt) else str(reason)
-            _complain(f"{why}: {done} done, all kept; go on with the same command ({again})")
+            done = "nothing" if last is None else f"{last.done} of {last.total} {last.stage}"
+            _complain(f"{why}: {done} done, all that is done is kept in {folder}; the same command goes on")
             raise typer.Exit(1) from None
-    for failure in _failures(folder):
-        _complain(failure)
-    return tally
+
+
+def _failures(folder: Path) -> list[str]:
+    """What the last sweep could not make or run, a line each."""
+    said = []
+    for line in (folder / "failures.jsonl").read_text(encoding="utf-8").splitlines():
+        f = loads(line)
+        what = "the case could not be made" if f["entrant"] is None else f"{f['entrant']} could not be run"
+        said.append(f"{f['family']}, seed {f['seed']}: {what}: {f['failure']}")
+    return said
+
+
+def _print(
+    suite: Suite, runs: pa.Table, folder: Path | None, tally: Tally, json: bool, more: dict[str, Any] | None = None
+) -> None:
+    from qpavoid.arena.summary import summary, summary_table
+
+    if json:
+        fields = {"suite": suite.name, "folder": folder and str(folder), "new": tally.done, "runs": len(runs)}
+        print(to_json({**fields, "failed": tally.failed, **(more or {}), "entrants": summary(runs)}))
+        return
+    OUT.print(summary_table(runs, f"{suite.name}: {suite.title}"))
+    if folder is not None:
+        OUT.print(
+            f"{folder}: {len(runs)} runs, {tally.done} of them new", highlight=False, soft_wrap=True, markup=False
+        )
+
+
+def _complain(what: str) -> None:
+    ERR.print(what, highlight=False, soft_wrap=True, markup=False)

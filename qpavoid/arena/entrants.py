@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from importlib.util import find_spec
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, distribution
 from typing import Any
 
 from qpavoid.arena.case import Case
+from qpavoid.arena.outside.settings import MINK, PINK
 from qpavoid.arena.pilot import Pilot
 from qpavoid.arena.world import World
 from qpavoid.config import ScenarioConfig, SolverConfig
 from qpavoid.controller import Controller
 from qpavoid.errors import ConfigError, UnknownName
 from qpavoid.loading import nearest
-from qpavoid.solvers import parse_solver
+from qpavoid.solvers import make_solver, parse_solver
 
 
 @dataclass(frozen=True)
@@ -31,7 +34,9 @@ class Entrant:
     settings: Mapping[str, Any] = field(default_factory=dict)
     """What tells it from others of its kind; changes of it make results of their own."""
     packages: tuple[str, ...] = ()
-    """What it runs on, for the report; where one is not installed, it does not take part."""
+    """What it runs on, as `pip install` knows it; where one is not installed, it does not take part."""
+    elsewhere: str = ""
+    """Environment variable that may name another Python interpreter that has its packages."""
 
     @property
     def digest(self) -> str:
@@ -42,7 +47,15 @@ class Entrant:
     @property
     def missing(self) -> tuple[str, ...]:
         """Those of its packages that are not installed."""
+        if self.elsewhere and os.environ.get(self.elsewhere):
+            return ()
         return tuple(package for package in self.packages if not _installed(package))
+
+    @property
+    def remedy(self) -> str:
+        """How to get what is missing."""
+        instead = f", or set {self.elsewhere} to the Python interpreter that has it" if self.elsewhere else ""
+        return f"pip install {' '.join(self.missing)}{instead}"
 
 
 def law(name: str, says: str, solver: str | SolverConfig, packages: tuple[str, ...] = (), **changes: Any) -> Entrant:
@@ -63,13 +76,33 @@ def law(name: str, says: str, solver: str | SolverConfig, packages: tuple[str, .
         for block, fields in changes.items():
             scenario[block] = {**scenario[block], **fields}
         scenario["solver"] = config.model_dump()
-        controller, _ = Controller.from_scenario(
-            ScenarioConfig.model_validate(scenario).read_from(case.scenario.source)
-        )
-        return controller
+        x = ScenarioConfig.model_validate(scenario)
+        blocks = x.avoidance, x.limits, x.tracking_damping, x.sensing, x.progress
+        return Controller(world.scene, world.tasks, make_solver(x.solver), x.dt, *blocks)
 
     settings = {"solver": solver if isinstance(solver, str) else solver.model_dump(), **changes}
     return Entrant(name, says, start, settings, packages)
+
+
+def outside(
+    name: str, says: str, module: str, settings: Mapping[str, Any], packages: tuple[str, ...], elsewhere: str = ""
+) -> Entrant:
+    """Another library, through its adapter.
+
+    Args:
+        name: of the entrant.
+        says: what it is, in a line.
+        module: of the adapter, in `qpavoid.arena.outside`; read when the entrant is first started.
+        settings: how it is set.
+        packages: what it runs on.
+        elsewhere: environment variable that may name another Python interpreter that has them.
+    """
+
+    def start(case: Case, world: World) -> Pilot:
+        pilot: Pilot = import_module(f"qpavoid.arena.outside.{module}").Pilot(case, world)
+        return pilot
+
+    return Entrant(name, says, start, settings, packages, elsewhere)
 
 
 def _row(kind: str) -> dict[str, Any]:
@@ -106,6 +139,8 @@ ENTRANTS = {
         law("qp:osqp", "QP, back end OSQP", "qp:osqp"),
         law("qp:quadprog", "QP, back end quadprog", "qp:quadprog", ("quadprog",)),
         law("hqp", "strict priorities, a cascade of QPs", "hqp"),
+        outside("pink", "Pink, with its barrier between collision bodies", "pinks", PINK, ("pin-pink",)),
+        outside("mink", "mink, with its limit on collisions", "minks", MINK, ("mink", "mujoco")),
     )
 }
 """Those that ship, in the order of the report."""
@@ -122,11 +157,13 @@ def find_entrant(name: str) -> Entrant:
         raise UnknownName(f"unknown entrant {name!r}{nearest(name, ENTRANTS)}")
     entrant = ENTRANTS[name]
     if entrant.missing:
-        raise ConfigError(
-            f"entrant {name!r} needs {', '.join(entrant.missing)}: pip install {' '.join(entrant.missing)}"
-        )
+        raise ConfigError(f"entrant {name!r} needs {', '.join(entrant.missing)}: {entrant.remedy}")
     return entrant
 
 
 def _installed(package: str) -> bool:
-    return find_spec(package) is not None
+    try:
+        distribution(package)
+    except PackageNotFoundError:
+        return False
+    return True

@@ -16,12 +16,15 @@ from qpavoid.arena.case import Case
 from qpavoid.arena.suite import Suite
 from qpavoid.config import Fixed
 
+FIGURES = ("entrant", "success", "collided", "min_distance", "tick_p50", "failed")
+"""Columns of which the summary is made."""
+
 
 def summary(runs: pa.Table) -> list[dict[str, Any]]:
     """A row each entrant, in the order in which they first appear.
 
     Args:
-        runs: rows of `scores.Score`.
+        runs: rows of `scores.Score`, FIGURES of them at least.
 
     Returns:
         entrant, runs, success [-], collided [-], min_distance (of all its runs) [m], tick_p50 (median of its runs)
@@ -73,7 +76,7 @@ def broken(suite: Suite, runs: pa.Table, cases: pa.Table) -> Iterator[str]:
 
     - every entrant has a row for every case, and no figure is NaN;
     - no entrant fails at every tick of a run, nor at any tick in all of its runs;
-    - `tracking`, which knows of no obstacles, is within a millimetre of its path and touches something somewhere;
+    - `tracking`, which knows of no obstacles, stays on its path, to 20 mm, and touches something somewhere;
     - `qp` touches nothing where all obstacles rest and are seen as they are.
 
     Args:

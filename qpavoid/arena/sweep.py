@@ -1,8 +1,8 @@
 """Runs a suite: makes the cases that are not there yet, then all runs that are not there yet, on a Dask cluster.
 
-The same code runs on the cores of this machine and on a cluster of many: only the client differs. The scheduler sends a
-task again when the worker that had it dies; a task has one answer, whoever gave it, and each answer is in the results
-folder before the next one is looked at.
+The same code runs on the cores of this machine and on a cluster of many: only the client differs. A task whose worker
+dies is done again, in the end with nothing else beside it that could have brought the worker down; a task has one
+answer, whoever gave it, and each answer is in the results folder before the next one is looked at.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from typing import Any, NamedTuple
 from uuid import uuid4
 
 import dask
-import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 from distributed import Client, KilledWorker, LocalCluster, as_completed
+from tornado.ioloop import PeriodicCallback
 
 from qpavoid.arena.case import Case
 from qpavoid.arena.entrants import Entrant
 from qpavoid.arena.families import Family, load_family, make_case
 from qpavoid.arena.machine import machine, versions
-from qpavoid.arena.scores import KEY
-from qpavoid.arena.store import CASES, Journal, Store, read_cases, read_runs, without
+from qpavoid.arena.plan import cases_of, missing_cases, missing_runs
+from qpavoid.arena.store import Journal, Store, read_cases
 from qpavoid.arena.suite import Suite, facts_of, origin
 from qpavoid.arena.trial import held, run_trial
 from qpavoid.arena.twin import build
@@ -38,11 +38,18 @@ from qpavoid.errors import ConfigError, QpavoidError
 
 _ANSWER_WITHIN = 10.0
 """Time in which a scheduler has to answer, and a first worker to be there [s]."""
+_LOOK_FOR_LOST = 2.0
+"""Time between looks at whether all processes of this machine are there [s]."""
 _KILLED = "the processes that ran it ended before it was done, each time: killed, out of memory or crashed"
+_GONE = "the scheduler went away"
 _SINGLE_THREADED = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "NUMBA")}
+_DEAF = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
+"""Run by a worker as it starts: a terminal sends Ctrl-C to it as well, and it is for the sweep to end its workers."""
 _DASK = {
-    "distributed.scheduler.worker-saturation": 1.0,  # whoever dies takes no other task with it
+    "distributed.scheduler.worker-saturation": 1.0,  # what waits does so at the scheduler, not at a worker that may die
+    "distributed.scheduler.allowed-failures": 0,  # whose worker died is tried again by us, alone
     "distributed.admin.low-level-log-length": 0,  # the scheduler's memory stays flat
+    "distributed.deploy.lost-worker-timeout": "60 s",  # on a busy machine it takes long to start again
 }
 
 
@@ -61,25 +68,31 @@ class Tally(NamedTuple):
     collided: int
     """Runs with a contact among them."""
     failed: int
-    """Cases that could not be made, and runs of which there is no row; all are in failures.jsonl."""
+    """Of which there is no row: they are in failures.jsonl."""
 
 
 @contextmanager
 def local_cluster(jobs: int | None = None) -> Iterator[Client]:
     """Processes of one thread each on this machine, one a core if `jobs` is left out."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    count = cores if jobs is None else jobs
     with (
         _quiet(),
         dask.config.set(_DASK),
         LocalCluster(
-            n_workers=cores if jobs is None else jobs,
+            n_workers=count,
             threads_per_worker=1,
-            dashboard_address=None,
-            worker_dashboard_address=None,
+            scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
+            silence_logs=logging.CRITICAL,
             env=_SINGLE_THREADED,
+            preload=[_DEAF],
         ) as cluster,
         Client(cluster) as client,
     ):
+        # Dask gives a worker up that is not back in time, or that dies again as it starts, and replaces it when asked
+        asking = PeriodicCallback(lambda: cluster.scale(count), 1e3 * _LOOK_FOR_LOST)
+        cluster.periodic_callbacks["lost workers"] = asking  # stopped when the cluster is closed
+        cluster.loop.add_callback(asking.start)
         yield client
 
 
@@ -131,79 +144,41 @@ def sweep(suite: Suite, store: Store, client: Client, tell: Callable[[Tally], No
         ClusterLost: the scheduler went away.
     """
     store.describe(_facts(suite, client))
-    cases, lost = _make_cases(suite, store, client, tell)
-    todo = missing_runs(suite, store.folder, cases)
-
-    def collected(tally: Tally) -> None:
-        tell(tally._replace(failed=tally.failed + lost))
+    lost = _make_cases(suite, store, client, tell).failed
+    todo = missing_runs(suite, store.folder, cases_of(suite, store.folder))
 
     def about(unit: _Unit) -> dict[str, Any]:
         case = Case.from_json(unit[0])
         return {"family": case.family, "seed": case.seed, "entrant": unit[1].name}
 
-    answers = _run_all(client, _units(suite, todo, cases))
-    tally = _collect("runs", len(todo), answers, store.runs, store.fail, about, collected)
+    answers = _run_all(client, _units(suite, todo, store.folder))
+    tally = _collect("runs", len(todo), answers, store.runs, store.fail, about, tell)
     return tally._replace(failed=tally.failed + lost)
 
 
-def missing_runs(suite: Suite, folder: Path, cases: pa.Table) -> pa.Table:
-    """Which of a suite's runs are not in a folder: (case, entrant), case by case.
-
-    Args:
-        suite: what is to be there.
-        folder: of results.
-        cases: those of the suite; column `case`.
-    """
-    count, entrants = len(cases), suite.entrants
-    order = np.repeat(np.arange(count), len(entrants))
-    wanted = pa.table(
-        {
-            "case": cases["case"].take(pa.array(order)),
-            "entrant": pa.array([entrant.name for entrant in entrants] * count, type=pa.string()),
-            "settings": pa.array([entrant.digest for entrant in entrants] * count, type=pa.string()),
-            "version": pa.array([version("qpavoid")] * len(order), type=pa.string()),
-        }
-    )
-    return without(wanted, read_runs(folder, KEY), KEY).select(["case", "entrant"])
-
-
-def _make_cases(suite: Suite, store: Store, client: Client, tell: Callable[[Tally], None]) -> tuple[pa.Table, int]:
-    """All cases of a suite (case, json), family by family, made where they are not there; how many cannot be."""
-    names, count = [family.name for family in suite.families], len(suite.seeds)
-    wanted = pa.table(
-        {
-            "family": pa.array(np.repeat(names, count), type=pa.string()),
-            "seed": np.tile(np.asarray(suite.seeds, dtype=np.int64), len(names)),
-            "origin": pa.array(np.repeat([origin(family) for family in suite.families], count), type=pa.string()),
-        }
-    )
-    todo = without(wanted, read_cases(store.folder, CASES.key), CASES.key)
+def _make_cases(suite: Suite, store: Store, client: Client, tell: Callable[[Tally], None]) -> Tally:
+    todo = missing_cases(suite, store.folder)
     paths = {family.name: str(family.path.resolve()) for family in suite.families}
     calls = ((paths[row["family"]], row["origin"], row["seed"]) for row in _each(todo))
 
     def about(call: tuple[str, str, int]) -> dict[str, Any]:
         return {"family": Path(call[0]).stem, "seed": call[2], "entrant": None}
 
-    answers = _answers(client, _make, calls)
-    tally = _collect("cases", len(todo), answers, store.cases, store.fail, about, tell)
-    return _those_of(wanted, read_cases(store.folder)), tally.failed
+    return _collect("cases", len(todo), _answers(client, _make, calls), store.cases, store.fail, about, tell)
 
 
-def _those_of(wanted: pa.Table, cases: pa.Table) -> pa.Table:
-    """The wanted cases (case, json), in the order in which they are wanted."""
-    key = list(CASES.key)
-    ours = wanted.append_column("order", pa.array(np.arange(len(wanted))))
-    there = cases.select(key).append_column("at", pa.array(np.arange(len(cases))))
-    at = ours.join(there, keys=key, join_type="inner").sort_by("order")["at"]
-    return cases.select(["case", "json"]).take(at)
+def _each(table: pa.Table) -> Iterator[dict[str, Any]]:
+    for batch in table.to_batches(max_chunksize=1000):
+        yield from batch.to_pylist()
 
 
 _Unit = tuple[str, Entrant]
 """A run that is to be done: the case as JSON, and who runs it."""
 
 
-def _units(suite: Suite, todo: pa.Table, cases: pa.Table) -> Iterator[_Unit]:
+def _units(suite: Suite, todo: pa.Table, folder: Path) -> Iterator[_Unit]:
     entrants = {entrant.name: entrant for entrant in suite.entrants}
+    cases = read_cases(folder)
     for batch in todo.to_batches(max_chunksize=1000):
         texts = cases["json"].take(pc.index_in(batch["case"], cases["case"]))
         yield from zip(texts.to_pylist(), (entrants[name] for name in batch["entrant"].to_pylist()), strict=True)
@@ -211,13 +186,10 @@ def _units(suite: Suite, todo: pa.Table, cases: pa.Table) -> Iterator[_Unit]:
 
 def _run_all(client: Client, units: Iterable[_Unit]) -> Iterator[tuple[_Unit, Any]]:
     """Runs with their rows, or what was raised; one that takes its process down counts as one that never moves."""
-    ours, killed = version("qpavoid"), []
+    ours = version("qpavoid")
     for (text, entrant, _), answer in _answers(client, _run, ((*unit, ours) for unit in units)):
         if isinstance(answer, KilledWorker):
-            killed.append((text, held(entrant, _KILLED), ours))
-        else:
-            yield (text, entrant), answer
-    for (text, entrant, _), answer in _answers(client, _run, killed):
+            ((_, answer),) = _answers(client, _run, [(text, held(entrant, _KILLED), ours)])
         yield (text, entrant), answer
 
 
@@ -243,11 +215,6 @@ def _collect(
         tally = Tally(stage, tally.done + 1, total, tally.collided + collided, tally.failed + failed)
         tell(tally)
     return tally
-
-
-def _each(table: pa.Table) -> Iterator[dict[str, Any]]:
-    for batch in table.to_batches(max_chunksize=1000):
-        yield from batch.to_pylist()
 
 
 # --- what workers do ---------------------------------------------------------------------------------------
@@ -285,12 +252,27 @@ def _run(case: str, entrant: Entrant, of: str) -> dict[str, Any]:
 def _answers(
     client: Client, function: Callable[..., Any], calls: Iterable[tuple[Any, ...]]
 ) -> Iterator[tuple[tuple[Any, ...], Any]]:
+    """Each call with what it returned or raised, as they come; at the end, one by one, those whose workers died."""
+    killed = []
+    for call, answer in _together(client, function, calls):
+        if isinstance(answer, KilledWorker):
+            killed.append(call)
+        else:
+            yield call, answer
+    for call in killed:
+        yield from _together(client, function, [call])
+
+
+def _together(
+    client: Client, function: Callable[..., Any], calls: Iterable[tuple[Any, ...]]
+) -> Iterator[tuple[tuple[Any, ...], Any]]:
     """Each call with what it returned or raised, as they come. Few are under way at a time, however many there are."""
-    calls, under_way = iter(calls), {}
+    calls = iter(calls)
+    under_way: dict[str, tuple[Any, ...]] = {}
     futures = as_completed(with_results=True, raise_errors=False)
 
     def refill() -> None:
-        most = 2 * sum(client.nthreads().values()) + 8
+        most = 2 * _threads(client) + 8
         for call in itertools.islice(calls, max(most - len(under_way), 0)):
             future = client.submit(function, *call, key=f"{function.__name__}-{uuid4().hex}", pure=False)
             under_way[future.key] = call
@@ -300,10 +282,18 @@ def _answers(
     for future, answer in futures:
         call = under_way.pop(future.key)
         if future.cancelled():
-            raise ClusterLost("the scheduler went away")
+            raise ClusterLost(_GONE)
         yield call, answer[1] if future.status == "error" else answer
         del future
         refill()
+
+
+def _threads(client: Client) -> int:
+    """How many tasks can run at a time, on all workers that are there now."""
+    try:
+        return sum(client.nthreads().values())
+    except OSError:  # of a connection that is closed
+        raise ClusterLost(_GONE) from None
 
 
 @contextmanager
@@ -329,5 +319,5 @@ def _facts(suite: Suite, client: Client) -> dict[str, Any]:
         "absent": {entrant.name: list(entrant.missing) for entrant in suite.absent},
         "versions": versions(),
         "machine": machine(),
-        "workers": len(client.nthreads()),
+        "workers": _threads(client),
     }

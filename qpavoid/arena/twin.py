@@ -47,12 +47,8 @@ class Twin:
         self.data.qpos[self.q_index] = q
         for i, obstacle in enumerate(self.scene.obstacles):
             if obstacle.moves:
-                self._place_obstacle(i, obstacle.motion.sample(t))
+                place_mocap(self.data, i, obstacle.motion.sample(t))
         mujoco.mj_kinematics(self.model, self.data)
-
-    def _place_obstacle(self, index: int, sample: Sample) -> None:
-        self.data.mocap_pos[index] = sample.position
-        mujoco.mju_mat2Quat(self.data.mocap_quat[index], np.ascontiguousarray(sample.rotation).ravel())
 
     def integrate(self, q: Array, v: Array, dt: float) -> Array:
         """q (nv,) after v (nv,) for dt [s], by MuJoCo's integration."""
@@ -71,6 +67,12 @@ class Twin:
         return float(mujoco.mj_geomDistance(self.model, self.data, a, b, FAR, np.empty(6) if ends is None else ends))
 
 
+def place_mocap(data: Any, index: int, sample: Sample) -> None:
+    """Puts an obstacle, by its number, to where it is; MuJoCo's kinematics come after that."""
+    data.mocap_pos[index] = sample.position
+    mujoco.mju_mat2Quat(data.mocap_quat[index], np.ascontiguousarray(sample.rotation).ravel())
+
+
 def load(scenario: ScenarioConfig) -> Twin:
     """The twin of a scenario."""
     source = scenario.source
@@ -79,15 +81,24 @@ def load(scenario: ScenarioConfig) -> Twin:
     return build(build_scene(robot, build_obstacles(scenario.obstacles, source)), q0)
 
 
-def build(scene: Scene, q0: Array) -> Twin:
+def build(scene: Scene, q0: Array, frames: Sequence[int] = ()) -> Twin:
     """Writes the scene as MJCF: one MuJoCo body a joint, one mocap body an obstacle.
+
+    Args:
+        scene: what is written.
+        q0: where the robot starts (nq,).
+        frames: of the robot's model, by their indices; these become sites `frame 0`, `frame 1` and so on.
 
     Raises:
         ValueError: a joint that is neither a hinge nor a slide, or a shape that MuJoCo does not know.
     """
     spec, robot = mujoco.MjSpec(), scene.robot.model
+    spec.compiler.degree = False
     # the default, 1e-6, is of the size of what is to be told apart in penetration
     spec.option.ccd_tolerance, spec.option.ccd_iterations = 1e-9, 200
+    bounds = scene.robot.bounds()
+    room = np.clip(np.stack((bounds.lower, bounds.upper), axis=1), -mujoco.mjMAXVAL, mujoco.mjMAXVAL)
+    ranges = dict(zip(bounds.q_index.tolist(), room, strict=True))
     bodies = [spec.worldbody]
     for i in range(1, robot.njoints):
         placement = robot.jointPlacements[i]
@@ -96,8 +107,13 @@ def build(scene: Scene, q0: Array) -> Twin:
             explicitinertial=True, mass=1.0, inertia=[1.0, 1.0, 1.0],
         )  # fmt: skip
         kind, axis = _joint(robot, i)
-        body.add_joint(name=robot.names[i], type=kind, axis=axis)
+        joint = body.add_joint(name=robot.names[i], type=kind, axis=axis)
+        if robot.joints[i].idx_q in ranges:  # neither kinematics nor integration heed them; who reads the model may
+            joint.limited, joint.range = True, ranges[robot.joints[i].idx_q]
         bodies.append(body)
+    for i, frame in enumerate(robot.frames[index] for index in frames):
+        place = frame.placement
+        bodies[frame.parentJoint].add_site(name=f"frame {i}", pos=place.translation, quat=_quaternion(place.rotation))
     first = len(scene.body_names)
     obstacles = [spec.worldbody.add_body(name=f"obstacle {i}", mocap=True) for i in range(len(scene.obstacles))]
     for i, geometry in enumerate(scene.geometry.geometryObjects):
@@ -118,7 +134,7 @@ def build(scene: Scene, q0: Array) -> Twin:
         bodies=first,
     )
     for i, obstacle in enumerate(scene.obstacles):
-        twin._place_obstacle(i, obstacle.motion.sample(0.0))
+        place_mocap(twin.data, i, obstacle.motion.sample(0.0))
     twin.place(twin.q0, 0.0)
     return twin
 

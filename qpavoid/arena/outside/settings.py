@@ -1,0 +1,38 @@
+"""How each library is set; read by its adapter and printed in the report. Nothing here needs the library."""
+
+from __future__ import annotations
+
+from typing import Any
+
+_SHARED = {
+    "targets": "one period ahead along the task's own law",
+    "damping": "tracking_damping squared",
+}
+
+PINK: dict[str, Any] = {
+    **_SHARED,
+    "solver": "daqp",
+    "cost": 50.0,
+    "n_collision_pairs": 20,
+    "gain": 20.0,
+    "safe_displacement_gain": 1.0,
+    "d_min": "d1",
+}
+"""`cost` multiplies the root of a task's weight; it and the barrier's gains are those of Pink's example
+kukas_self_collision. Fewer pairs than `n_collision_pairs`: all of them; more: the nearest ones."""
+
+MINK: dict[str, Any] = {
+    **_SHARED,
+    "solver": "daqp",
+    "minimum_distance_from_collisions": "d1",
+    "collision_detection_distance": "d2",
+}
+"""The rest of its limits is at its defaults: gains 0.85 for pairs and 0.95 for joints."""
+
+PLACO: dict[str, Any] = {
+    **_SHARED,
+    "self_collisions_margin": "d1",
+    "self_collisions_trigger": "d2",
+    "priority": "hard",
+}
+"""Its tasks are soft, its joint limits and velocity limits on."""
