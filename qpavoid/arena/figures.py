@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, StrMethodFormatter
 
 from qpavoid.arena.results import Results
-from qpavoid.arena.statistics import Interval, mean, pareto, ranks, rate
+from qpavoid.arena.statistics import Interval, mean, pareto, rate
 from qpavoid.plot_style import COLOURS, add_grid
 from qpavoid.problem import Array
 
@@ -42,7 +42,7 @@ def success_against_time(results: Results) -> Figure:
 def success_by_family(results: Results) -> Figure:
     """Entrants, best first, by families: share of runs that succeed."""
     families = results.families
-    entrants = tuple(ranks(results.table("success").astype(bool), results.entrants))
+    entrants = tuple(results.ranking())
     order = [results.entrants.index(name) for name in entrants]
     share = np.full((len(entrants), len(families)), np.nan)
     for j in range(len(families)):

@@ -17,7 +17,7 @@ from qpavoid.arena.entrants import ENTRANTS
 from qpavoid.arena.families import load_family
 from qpavoid.arena.pages import write_markdown, write_page
 from qpavoid.arena.results import Results, results_of
-from qpavoid.arena.statistics import CONFIDENCE, duel, mean, ranks
+from qpavoid.arena.statistics import CONFIDENCE, duel, mean
 from qpavoid.arena.store import read_runs
 from qpavoid.arena.suite import facts_of
 from qpavoid.arena.tables import (
@@ -96,21 +96,36 @@ def report_of(runs: pa.Table, facts: dict[str, Any], folder: Path = Path("DIR"))
 
 
 def _facts(folder: Path) -> dict[str, Any]:
+    """What suite.json says, and what the last sweep could not make or run."""
     try:
         facts = json.loads((folder / "suite.json").read_text(encoding="utf-8"))
+        failures = [json.loads(line) for line in (folder / "failures.jsonl").read_text(encoding="utf-8").splitlines()]
     except (OSError, ValueError):
         return {}
-    return facts if isinstance(facts, dict) else {}
+    return {**facts, "failures": failures}
 
 
 def _made_on(results: Results, runs: pa.Table, facts: dict[str, Any]) -> Section:
-    count = int(results.common.sum())
     points = [
+        f"{what.capitalize()}: " + ", ".join(f"{name} {value}" for name, value in facts[what].items()) + "."
+        for what in ("versions", "machine")
+        if facts.get(what)
+    ]
+    points.append(
         f"{len(runs)} runs: {len(results.entrants)} entrants, {len(results.families)} families, {len(results.cell)} "
-        f"cases. All figures are of the {count} cases that every entrant has run."
+        f"cases. All figures are of the {int(results.common.sum())} cases that every entrant has run."
+    )
+    points += [
+        f"{name} has not run {count} cases of {family}, which count for nobody."
+        for name, family, count in results.missing()
     ]
     points += [
-        f"{name} has not run {n} cases of {family}, which count for nobody." for name, family, n in results.missing()
+        f"{name} does not take part: it needs {', '.join(packages)}."
+        for name, packages in facts.get("absent", {}).items()
+    ]
+    points += [
+        f"Not made or run: {' '.join(f'{name} {value}' for name, value in failure.items())}"
+        for failure in facts.get("failures", [])
     ]
     if results.replaced:
         points.append(
@@ -118,11 +133,6 @@ def _made_on(results: Results, runs: pa.Table, facts: dict[str, Any]) -> Section
         )
     if results.bounded:
         points.append(f"{results.bounded} figures were infinite or no numbers: they stand at the worst of all runs.")
-    machine, versions = facts.get("machine", {}), facts.get("versions", {})
-    if machine:
-        points.append("Machine: " + ", ".join(f"{name} {value}" for name, value in machine.items()) + ".")
-    if versions:
-        points.append("Versions: " + ", ".join(f"{name} {value}" for name, value in versions.items()) + ".")
     return Section("What this was made on", points=tuple(points))
 
 
@@ -141,9 +151,9 @@ def _definitions() -> Section:
         f"Ranges with figures hold the true value with {100 * CONFIDENCE:.0f} % over further seeds: of rates that of "
         "Wilson, of means the bootstrap's, of medians that of the sign test. A run that fails counts at its limit and "
         "is never left out: an entrant that raises is held for that tick, and its run goes on.",
-        "**Ranking.** By the share of runs that succeed. Whoever cannot be told from the first of a rank by McNemar's "
-        f"exact test over the same cases, at {100 * (1 - CONFIDENCE):.0f} %, shares it. With few cases, little can be "
-        "told apart.",
+        "**Ranking.** By the share of runs that succeed; where that is the same, by the mean tracking error. Whoever "
+        "cannot be told from the first of a rank by McNemar's exact test over the same cases, at "
+        f"{100 * (1 - CONFIDENCE):.0f} %, shares it. With few cases, little can be told apart.",
     )
     rows = tuple((text_cell(column.heading), text_cell(column.says)) for column in (*COLUMNS, *MORE))
     return Section("How it is scored", text, tables=(Table(("figure", "what it is"), rows),))
@@ -178,9 +188,9 @@ def _about(name: str) -> tuple[str, ...]:
 
 
 def _duels(results: Results) -> Section:
-    """Everybody against the one that succeeds most often."""
+    """Everybody against the first of the ranking."""
     success, tracking = results.table("success").astype(bool), results.table("tracking_error")
-    first = next(iter(ranks(success, results.entrants)))
+    first = next(iter(results.ranking()))
     best = results.entrants.index(first)
     rows = []
     for i, name in enumerate(results.entrants):
@@ -191,7 +201,7 @@ def _duels(results: Results) -> Section:
             rows.append((text_cell(name), *cells))
     headings = ("entrant", f"only {first} succeeds", "only this one does", "p of no difference", "more tracking [mm]")
     text = (
-        f"Case by case against {first}, which succeeds most often: in how many cases only one of the two does, and how "
+        f"Case by case against {first}, first of the ranking: in how many cases only one of the two does, and how "
         "much larger the tracking error is.",
     )
     return Section("Beside the best", text, tables=(Table(headings, tuple(rows)),) if rows else ())

@@ -12,6 +12,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from qpavoid.arena.scores import COLUMNS, KEY
+from qpavoid.arena.statistics import ranks
 from qpavoid.problem import Array, IntArray
 
 
@@ -63,6 +64,11 @@ class Results:
     def row(self, index: int) -> dict[str, Any]:
         """One run, by its column."""
         return {name: values[index] for name, values in self.columns.items()}
+
+    def ranking(self, family: int | None = None) -> dict[str, int]:
+        """Rank by name, best first: by success, then by tracking error (see `statistics.ranks`)."""
+        success = self.table("success", family).astype(bool)
+        return ranks(success, self.table("tracking_error", family), self.entrants)
 
     @cached_property
     def _common_rows(self) -> dict[int | None, IntArray]:

@@ -113,7 +113,7 @@ def duel(first: Flags, second: Flags) -> Duel:
     return Duel(won, lost, min(1.0, 2.0 * float(bdtr(min(won, lost), won + lost, 0.5))))
 
 
-def ranks(success: Flags, names: Sequence[str]) -> dict[str, int]:
+def ranks(success: Flags, error: Array, names: Sequence[str]) -> dict[str, int]:
     """Rank by name, by number of successes; whoever cannot be told from the first of a rank shares it.
 
     Each is tested against the first of the rank above alone, not against all: the order has no cycles, and the tests,
@@ -121,12 +121,14 @@ def ranks(success: Flags, names: Sequence[str]) -> dict[str, int]:
 
     Args:
         success: (cases, entrants).
-        names: of the entrants.
+        error: (cases, entrants) by the mean of which those are put in order that succeed equally often.
+        names: (entrants,).
 
     Returns:
         In the order of the ranking; 1 is best.
     """
-    order = sorted(range(len(names)), key=lambda i: (-int(success[:, i].sum()), names[i]))
+    won, missed = success.sum(axis=0), error.mean(axis=0)
+    order = sorted(range(len(names)), key=lambda i: (-won[i], missed[i], names[i]))
     found: dict[str, int] = {}
     leader, rank = order[0] if order else 0, 1
     for place, i in enumerate(order, 1):

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from qpavoid.arena.results import Results
-from qpavoid.arena.statistics import Interval, mean, median, ranks, rate
+from qpavoid.arena.statistics import Interval, mean, median, rate
 from qpavoid.problem import Array
 
 
@@ -90,7 +90,7 @@ class Section:
 
 def score_tables(results: Results, family: int | None = None) -> tuple[Table, ...]:
     """What matters most, and the rest; entrants in the order of their ranks, of one family or of all."""
-    place = ranks(results.table("success", family).astype(bool), results.entrants)
+    place = results.ranking(family)
     return tuple(_score_table(results, columns, place, family) for columns in (COLUMNS, MORE))
 
 
@@ -110,7 +110,7 @@ def _cell(values: Array, column: Column) -> Cell:
     values = values.astype(float)
     if column.kind == "low":
         value = float(np.quantile(values, 0.05, method="inverted_cdf"))  # one of them: some may be infinite
-        return Cell(f"{column.scale * value:.{column.digits}f}", value)
+        return Cell(_shown(column.scale * value, column.digits), value)
     if column.kind == "rate":
         return interval_cell(rate(int(values.sum()), len(values)), column.scale, column.digits)
     return interval_cell(_ESTIMATES[column.kind](values), column.scale, column.digits)
@@ -118,8 +118,12 @@ def _cell(values: Array, column: Column) -> Cell:
 
 def interval_cell(interval: Interval, scale: float, digits: int) -> Cell:
     """A figure and its range."""
-    value, low, high = (f"{scale * side:.{digits}f}" for side in interval)
+    value, low, high = (_shown(scale * side, digits) for side in interval)
     return Cell(value, interval.value, f"{low} – {high}")
+
+
+def _shown(value: float, digits: int) -> str:
+    return f"{round(value, digits) + 0.0:.{digits}f}"  # -0.0 + 0.0 is 0.0
 
 
 def text_cell(text: str) -> Cell:
