@@ -146,12 +146,12 @@ def test_a_duel_is_fair_and_that_of_the_binomial_test(first, random):
 
 
 def test_ranks_are_shared_by_those_that_cannot_be_told_from_the_first():
-    success = np.zeros((20, 4), dtype=bool)
-    for i, won in enumerate((0, 20, 17, 10)):
+    success, names = np.zeros((20, 5), dtype=bool), ["never", "always", "nearly", "half", "less than half"]
+    for i, won in enumerate((0, 20, 17, 10, 9)):
         success[:won, i] = True
-    found = ranks(success, np.zeros((20, 4)), ["never", "always", "nearly", "half"])
-    assert found == {"always": 1, "nearly": 1, "half": 3, "never": 4}  # 3 of 20: p = 0.25; 10 of 20: p = 0.002
-    assert list(found) == ["always", "nearly", "half", "never"]
+    found = ranks(success, np.zeros((20, 5)), names)
+    assert list(found) == ["always", "nearly", "half", "less than half", "never"]
+    assert list(found.values()) == [1, 1, 3, 3, 5]  # 3 of 20 apart: p = 0.25; 10 apart: p = 0.002
 
 
 def test_equal_success_is_put_in_order_by_tracking_but_shares_the_rank():

@@ -1,0 +1,50 @@
+"""docs/arena_report.md: its sections, figures and numbers are those of the report."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pyarrow")
+pytest.importorskip("jinja2")
+pytest.importorskip("matplotlib")
+pytest.importorskip("mujoco")
+
+import pyarrow as pa
+
+from qpavoid.arena.report import report_of
+from qpavoid.arena.scores import COLUMNS
+from qpavoid.arena.statistics import _MANY, CONFIDENCE, duel, mean
+from qpavoid.arena.tables import COLUMNS as SHOWN
+from qpavoid.arena.tables import MORE
+
+PAGE = (Path(__file__).parent.parent / "docs/arena_report.md").read_text(encoding="utf-8")
+
+
+def rows_of(heading):
+    table = PAGE[PAGE.index(heading) :].split("\n\n")[0].splitlines()[2:]
+    return [[cell.strip().replace("\\|", "|") for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in table]
+
+
+def test_its_sections_are_those_of_the_report_in_their_order():
+    blank = {"str": "", "int": 1, "float": 0.01, "bool": False}
+    run = {name: blank[kind] for name, kind in COLUMNS.items()} | {"family": "…"}
+    titles = [section.title for section in report_of(pa.Table.from_pylist([run]), {})]
+    assert [name for name, _ in rows_of("| section |")] == titles
+
+
+def test_its_figures_are_those_of_the_tables():
+    kinds = {"rate": "share", "low": "5th percentile"}
+    columns = [[column.heading, kinds.get(column.kind, column.kind), column.says] for column in (*SHOWN, *MORE)]
+    assert rows_of("| figure |") == columns
+
+
+def test_its_numbers_are_those_of_the_statistics():
+    assert f"with {100 * CONFIDENCE:.0f} %" in PAGE and f"from {_MANY} runs on" in PAGE
+    assert f"p is not below {1 - CONFIDENCE:.2f}" in PAGE
+    assert not duel(np.ones(5, dtype=bool), np.zeros(5, dtype=bool)).decided  # five cases tell nobody apart, six do
+    assert duel(np.ones(6, dtype=bool), np.zeros(6, dtype=bool)).decided
+    draw = np.random.default_rng(0)
+    held = [low <= 1.0 <= high for _, low, high in (mean(draw.exponential(size=6)) for _ in range(1000))]
+    assert 0.85 < np.mean(held) < 0.93  # 9 times in 10
