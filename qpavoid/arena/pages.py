@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 from jinja2 import Environment, PackageLoader
 from markupsafe import Markup
 
-from qpavoid.arena.tables import Section
+from qpavoid.arena.tables import Cell, Section
 
 
 def write_markdown(folder: Path, title: str, sections: Sequence[Section]) -> list[Path]:
@@ -28,14 +30,23 @@ def write_markdown(folder: Path, title: str, sections: Sequence[Section]) -> lis
             lines += [f"![{caption}]({path.name})", ""]
         for table in section.tables:
             lines += [_row(table.headings), _row(["---"] * len(table.headings))]
-            lines += [_row([cell.text for cell in row]) for row in table.rows] + [""]
+            lines += [_row([_markdown(cell) for cell in row]) for row in table.rows] + [""]
     path = folder / "report.md"
     path.write_text("\n".join(lines), encoding="utf-8")
     return [path, *written]
 
 
 def _row(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in cells) + " |"
+    return "| " + " | ".join(cells) + " |"
+
+
+def _markdown(cell: Cell) -> str:
+    """Text that means what it says within a table."""
+    text = " ".join(cell.text.split())
+    if cell.code:
+        return f"`{text.replace('|', chr(92) + '|')}`"
+    text = re.sub(r"([\\`*_<>\[\]|~])", r"\\\1", text)
+    return f"{text} ({cell.span})" if cell.span else text
 
 
 def write_page(folder: Path, title: str, sections: Sequence[Section]) -> Path:
@@ -52,7 +63,8 @@ def write_page(folder: Path, title: str, sections: Sequence[Section]) -> Path:
 def _svg(figure: Any) -> Markup:
     """A figure as an element of a page."""
     buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", metadata={"Date": None})
+    with matplotlib.rc_context({"svg.hashsalt": "qpavoid"}):  # the same picture, the same text
+        figure.savefig(buffer, format="svg", metadata={"Date": None})
     text = buffer.getvalue()
     return Markup(text[text.index("<svg") :])
 
