@@ -36,7 +36,7 @@ class Robot:
         self.solver.enable_velocity_limits(True)
         self.solver.add_regularization_task(setup["regularization"])
         self._frames = [f"frame {number}" for number in range(len(setup["tasks"]))]
-        self._tasks = [self._task(name, *task) for name, task in zip(self._frames, setup["tasks"])]
+        self._tasks = [self._task(name, *task) for name, task in zip(self._frames, setup["tasks"], strict=True)]
         if setup["pairs"]:
             avoid = self.solver.add_avoid_self_collisions_constraint()
             avoid.configure("avoid", setup["priority"], 1.0)
@@ -79,7 +79,7 @@ class Robot:
 
     def solve(self, poses: Any) -> Any:
         """Velocity (nv,) towards poses (f, 4, 4) of the frames; placo gives a displacement."""
-        for set_pose, pose in zip(self._tasks, poses):
+        for set_pose, pose in zip(self._tasks, poses, strict=True):
             set_pose(pose)
         return np.asarray(self.solver.solve(False))[self._v_index] / self._dt
 
