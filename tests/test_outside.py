@@ -96,8 +96,8 @@ def test_frames_and_distances_are_ours(library, name):
     assert frames == pytest.approx(np.array(ours), abs=1e-6)
     truth, seen = true_distances(world, q, moved), seen_by(library, pilot, world)
     assert not np.isnan(seen).any()
-    # hulls: the libraries' iterations end within a tolerance of their own
-    assert seen[truth > 0.0] == pytest.approx(truth[truth > 0.0], abs=1e-6)
+    apart = truth > 0.0  # relative: cylinders and hulls are iterated on, to such a tolerance, from where each begins
+    assert apart.mean() > 0.9 and seen[apart] == pytest.approx(truth[apart], rel=4e-6, abs=1e-6)
 
 
 def test_obstacles_that_move_reach_the_library(library):
@@ -130,22 +130,21 @@ def test_pink_tracks_as_we_do_with_the_damping_of_its_barrier_on_top():
     from qpavoid.arena.outside.settings import PINK
 
     case, world, pilot = start("pink", "ur5_pole", "obstacles=[]")
-    targets = targets_at(world, 1.0)
-    v = pilot.step(world.q0, 1.0, targets, {}).v
-    configuration, model = pilot.configuration, world.scene.robot.model
-    count = min(PINK["n_collision_pairs"], len(parted_pairs(world.scene)))
-    Jh = SelfCollisionBarrier(count).compute_jacobian(configuration)
-    (task,) = world.tasks
-    J = pin.computeFrameJacobian(
-        model, model.createData(), world.q0, task.frame_id, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-    )[:3]
-    (target,) = targets.values()
-    b = target.linear + task.settings.gain * (target.position - pilot.frames()[0, :3, 3])
-    damping = case.scenario.tracking_damping**2 + PINK["safe_displacement_gain"] / (PINK["cost"] * np.linalg.norm(Jh)) ** 2
-    expected = np.linalg.solve(J.T @ J + damping * np.eye(model.nv), J.T @ b)
-    assert v == pytest.approx(expected, abs=1e-5)
+    (task,), targets = world.tasks, targets_at(world, 1.0)
+    v, model, dt = pilot.step(world.q0, 1.0, targets, {}).v, world.scene.robot.model, case.scenario.dt
+    here = pin.SE3(pilot.frames()[0])
+    there = pin.SE3(one_period_ahead(task, targets[task.settings.label], here.homogeneous, dt))
+    # a translation of its frame task is that of a screw, so that turning counts: half the step times the turn
+    J = pin.computeFrameJacobian(model, model.createData(), world.q0, task.frame_id, pin.ReferenceFrame.LOCAL)
+    J = (pin.Jlog6(there.actInv(here)) @ J)[:3]
+    e = pin.log6(here.actInv(there)).linear
+    rows = SelfCollisionBarrier(min(PINK["n_collision_pairs"], len(parted_pairs(world.scene))))
+    scale = PINK["cost"] * np.linalg.norm(rows.compute_jacobian(pilot.configuration))
+    damping = case.scenario.tracking_damping**2 + PINK["safe_displacement_gain"] / scale**2
+    damped = J.T @ J + damping * np.eye(model.nv)
+    assert v == pytest.approx(np.linalg.solve(damped, J.T @ e) / dt, abs=1e-6)
     tracking = ENTRANTS["tracking"].start(case, world).step(world.q0, 1.0, targets, {}).v
-    assert v == pytest.approx(tracking, abs=0.01 * np.abs(tracking).max())
+    assert np.abs(tracking).max() > 0.1 and v == pytest.approx(tracking, abs=0.01 * np.abs(tracking).max())
 
 
 def test_speed_caps_and_orientations_of_a_target_one_period_ahead():
@@ -184,7 +183,7 @@ def test_who_gets_out_of_the_way_of_an_obstacle_when_the_robot_rests(library):
     data = scene.robot.model.createData()
     pin.framesForwardKinematics(scene.robot.model, data, world.q0)
     tip = data.oMf[tool.frame_id].translation
-    for away in (0.30, 0.20, 0.12, 0.10, 0.08, 0.07):
+    for away in (0.30, 0.20, 0.15, 0.12, 0.10, 0.097):
         seen = {"pole": Sample.at(tip + np.array([away, 0.0, 0.0]))}
         v = pilot.step(world.q0, 0.0, targets, seen).v
         distances.append(seen_by(library, pilot, world)[hand].min())
@@ -201,12 +200,12 @@ def test_who_gets_out_of_the_way_of_an_obstacle_when_the_robot_rests(library):
         assert np.abs(v).max() > 0.05
 
 
-def test_pink_is_held_where_it_finds_nothing():
-    pytest.importorskip("pink")
+def test_pink_refuses_to_go_on_beyond_a_limit():
+    exceptions = pytest.importorskip("pink.exceptions")
     _, world, pilot = start("pink", "ur5_pole")
     beyond = world.q0.copy()
     beyond[2] = world.scene.robot.model.upperPositionLimit[2] + 0.1
-    with pytest.raises(Exception, match="NotWithin|violates|limit"):
+    with pytest.raises(exceptions.NotWithinConfigurationLimits):
         pilot.step(beyond, 0.0, targets_at(world, 0.0), {})
     assert np.isfinite(pilot.step(world.q0, 0.0, targets_at(world, 0.0), {}).v).all()
 
@@ -282,7 +281,7 @@ def test_what_is_missing_and_how_to_get_it(monkeypatch):
 
 
 def test_what_an_adapter_does_not_know_is_refused_at_the_start():
-    posture = make_case("ur5_pole", "tasks.1={type: posture}")
+    posture = make_case("ur5_pole", "tasks=[{frame: tool0}, {type: posture}]")
     with pytest.raises(ConfigError, match=r"adapter of Pink knows no tasks other than `position`, `pose`"):
         frame_tasks(posture, build_world(posture.scenario), "Pink")
     contact = make_case("ur5_pole", "contacts=[{frame: tool0}]")
