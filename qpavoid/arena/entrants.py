@@ -12,7 +12,7 @@ from importlib.metadata import PackageNotFoundError, distribution
 from typing import Any
 
 from qpavoid.arena.case import Case
-from qpavoid.arena.outside.settings import MINK, PINK
+from qpavoid.arena.outside.settings import MINK, PINK, PLACO, PLACO_PYTHON
 from qpavoid.arena.pilot import Pilot
 from qpavoid.arena.world import World
 from qpavoid.config import ScenarioConfig, SolverConfig
@@ -141,6 +141,7 @@ ENTRANTS = {
         law("hqp", "strict priorities, a cascade of QPs", "hqp"),
         outside("pink", "Pink, with its barrier between collision bodies", "pinks", PINK, ("pin-pink",)),
         outside("mink", "mink, with its limit on collisions", "minks", MINK, ("mink", "mujoco")),
+        outside("placo", "placo, with its constraint on self-collisions", "placos", PLACO, ("placo",), PLACO_PYTHON),
     )
 }
 """Those that ship, in the order of the report."""

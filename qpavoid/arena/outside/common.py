@@ -83,7 +83,7 @@ def one_period_ahead(task: FrameTask, target: Sample, here: Array, dt: float) ->
     Returns:
         Pose (4, 4); what of it does not count is as it is.
     """
-    settings, there = task.settings, here.copy()
+    settings, there = task.settings, np.array(here)
     if task.moves:
         linear = target.linear + settings.gain * (target.position - here[:3, 3])
         there[:3, 3] += dt * _capped(linear, settings.max_speed)

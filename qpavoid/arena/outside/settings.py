@@ -36,3 +36,6 @@ PLACO: dict[str, Any] = {
     "priority": "hard",
 }
 """Its tasks are soft, its joint limits and velocity limits on."""
+
+PLACO_PYTHON = "QPAVOID_PLACO_PYTHON"
+"""Environment variable that names the Python interpreter that has placo; left out: this one."""
