@@ -1,25 +1,22 @@
-"""Command line: `qpavoid list | run | compare | robot`.
+"""Command line: `qpavoid list | run | compare | robot | bench`.
 
 Exit status: 0 done, 1 a run ended in a defined failure (collision, safe stop, broken off), 2 bad input.
 """
 
 from __future__ import annotations
 
-import signal
 import sys
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from enum import Enum
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import Progress, TaskID
 
+from qpavoid.arena import commands as bench_commands
 from qpavoid.config import ScenarioConfig
 from qpavoid.controller import Controller
 from qpavoid.describe import commands as robot_commands
@@ -30,6 +27,7 @@ from qpavoid.log import Log
 from qpavoid.report import events, failed, metrics_table, to_json
 from qpavoid.simulate import simulate
 from qpavoid.solvers import SOLVERS, backend_names
+from qpavoid.terminal import ERR, OUT, names_of, progress, terminate_like_interrupt
 
 app = typer.Typer(
     add_completion=False,
@@ -38,8 +36,7 @@ app = typer.Typer(
     help="Follow a planned motion and stay clear of obstacles, other arms and yourself.",
 )
 app.add_typer(robot_commands.app, name="robot")
-_out = Console()
-_err = Console(stderr=True)
+app.add_typer(bench_commands.app, name="bench")
 
 Sets = Annotated[
     list[str] | None, typer.Option("--set", metavar="PATH=VALUE", help="Override a field: avoidance.d2=0.30")
@@ -70,7 +67,7 @@ def list_(kind: Annotated[Kind | None, typer.Argument(help="Only these.")] = Non
             print(name)
         return
     for heading, entries in names.items():
-        _out.print(f"[bold]{heading.value}[/]  {'  '.join(entries)}", highlight=False)
+        OUT.print(f"[bold]{heading.value}[/]  {'  '.join(entries)}", highlight=False)
 
 
 @app.command()
@@ -104,9 +101,7 @@ def compare(
 
     A collision is a result here, not a failure: the exit status is 1 only when a run was broken off.
     """
-    names = [name.strip() for name in solvers.split(",") if name.strip()]
-    if not names:
-        raise ConfigError("--solvers: names none; give some, as in tracking,eq10,qp")
+    names = names_of("--solvers", solvers)
     configs = [load_scenario(scenario, set_ or (), name) for scenario in scenarios for name in names]
     logs, files = _run_all(configs, out)
     if figures:
@@ -130,14 +125,14 @@ def _run_all(configs: list[ScenarioConfig], out: Path) -> tuple[list[Log], list[
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(f"--out {out}: {error.strerror}; give a folder that can be written") from None
-    with _progress() as bar, _terminate_like_interrupt():
+    with progress() as bar, terminate_like_interrupt():
         for label, config in zip(labels, configs, strict=True):
             update = partial(_update, bar, bar.add_task(label, total=None))
             logs.append(simulate(config, progress=update))
             files.append(logs[-1].save(out / f"{label.replace(' ', '_').replace(':', '-')}.npz"))
             if logs[-1].meta["stopped_by"]:
                 why = escape(f"{label}: broken off: {logs[-1].meta['stopped_by']}")
-                _err.print(f"[red]{why}[/]", highlight=False)
+                ERR.print(f"[red]{why}[/]", highlight=False)
                 break
     return logs, files
 
@@ -152,9 +147,9 @@ def _draw(logs: list[Log], out: Path, compare: bool) -> list[Path]:
     except ModuleNotFoundError as missing:
         if missing.name is None or missing.name.split(".")[0] != "matplotlib":
             raise
-        _err.print("no figures: matplotlib is missing; pip install 'qpavoid\\[plots]'", highlight=False)
+        ERR.print("no figures: matplotlib is missing; pip install 'qpavoid\\[plots]'", highlight=False)
         return []
-    with _progress() as bar:
+    with progress() as bar:
         job = bar.add_task("figures", total=len(logs))
         files = []
         for log in logs:
@@ -172,36 +167,16 @@ def _print(metrics: list[dict[str, Any]], files: list[Path], document: dict[str,
         return
     for scenario in dict.fromkeys(run["scenario"] for run in metrics):
         runs = [run for run in metrics if run["scenario"] == scenario]
-        _out.print(metrics_table(runs))
+        OUT.print(metrics_table(runs))
         for run in runs:
             for line in events(run):
-                _out.print(f"{run['solver']}: {line}", highlight=False, soft_wrap=True, markup=False)
+                OUT.print(f"{run['solver']}: {line}", highlight=False, soft_wrap=True, markup=False)
     for file in files:
-        _out.print(str(file), highlight=False, soft_wrap=True)
-
-
-def _progress() -> Progress:
-    return Progress(
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), console=_err
-    )
-
-
-@contextmanager
-def _terminate_like_interrupt() -> Iterator[None]:
-    """A polite kill ends a run as Ctrl-C does: what was recorded is kept."""
-
-    def interrupt(*_: Any) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
+        OUT.print(str(file), highlight=False, soft_wrap=True)
 
 
 def _show_warning(message: Warning | str, *_: Any) -> None:
-    _err.print(f"[yellow]warning:[/] {escape(str(message))}", highlight=False, soft_wrap=True)
+    ERR.print(f"[yellow]warning:[/] {escape(str(message))}", highlight=False, soft_wrap=True)
 
 
 def main() -> None:
@@ -210,7 +185,7 @@ def main() -> None:
     try:
         app()
     except QpavoidError as error:
-        _err.print(f"[red]error:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
+        ERR.print(f"[red]error:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
         sys.exit(2)
 
 

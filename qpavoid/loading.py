@@ -45,6 +45,11 @@ def family_names() -> list[str]:
     return sorted(p.stem for p in _families().glob("*.yaml"))
 
 
+def suite_names() -> list[str]:
+    """Names of the suites of the arena that ship."""
+    return sorted(p.stem for p in _suites().glob("*.yaml"))
+
+
 def setup_names() -> list[str]:
     """Names of the robots that are set up for families: a posture, and what is held."""
     return sorted(p.stem for p in (_families() / "setups").glob("*.yaml"))
@@ -52,6 +57,10 @@ def setup_names() -> list[str]:
 
 def _families() -> Path:
     return data_folder("tasks") / "families"
+
+
+def _suites() -> Path:
+    return data_folder("tasks") / "suites"
 
 
 def example_robot_data() -> Path:
@@ -105,6 +114,15 @@ def find_family(name_or_path: str | Path) -> Path:
         ConfigError, UnknownName: there is none.
     """
     return _find(str(name_or_path), "family", _families(), "{}.yaml", family_names())
+
+
+def find_suite(name_or_path: str | Path) -> Path:
+    """Path of the file of a suite of the arena, given by shipped name or by path.
+
+    Raises:
+        ConfigError, UnknownName: there is none.
+    """
+    return _find(str(name_or_path), "suite", _suites(), "{}.yaml", suite_names())
 
 
 def find_setup(name: str) -> Path:

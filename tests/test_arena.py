@@ -14,7 +14,7 @@ from qpavoid.arena.scores import COLUMNS, score
 from qpavoid.arena.trial import run_trial
 from qpavoid.arena.twin import build
 from qpavoid.arena.world import build_world
-from qpavoid.errors import UnknownName
+from qpavoid.errors import ConfigError, UnknownName
 
 DT = 0.01
 
@@ -204,6 +204,11 @@ def test_entrants_are_what_they_say():
     assert len({entrant.digest for entrant in ENTRANTS.values()}) == len(ENTRANTS)
     with pytest.raises(UnknownName, match="did you mean 'eq10'"):
         find_entrant("eq_10")
+
+
+def test_cases_that_no_entrant_could_be_given_are_refused():
+    with pytest.raises(ConfigError, match=r"humanoid_reach.*neither contacts nor obstacles that are carried"):
+        build_world(load_scenario("humanoid_reach"))
 
 
 def test_every_law_that_is_installed_runs():

@@ -15,11 +15,11 @@ from qpavoid.arena.case import Case
 from qpavoid.arena.outside.settings import MINK, PINK, PLACO, PLACO_PYTHON
 from qpavoid.arena.pilot import Pilot
 from qpavoid.arena.world import World
-from qpavoid.config import ScenarioConfig
+from qpavoid.config import ScenarioConfig, SolverConfig
 from qpavoid.controller import Controller
 from qpavoid.errors import ConfigError, UnknownName
 from qpavoid.loading import nearest
-from qpavoid.solvers import parse_solver
+from qpavoid.solvers import make_solver, parse_solver
 
 
 @dataclass(frozen=True)
@@ -58,29 +58,30 @@ class Entrant:
         return f"pip install {' '.join(self.missing)}{instead}"
 
 
-def law(name: str, says: str, solver: str, packages: tuple[str, ...] = (), **changes: Any) -> Entrant:
+def law(name: str, says: str, solver: str | SolverConfig, packages: tuple[str, ...] = (), **changes: Any) -> Entrant:
     """A solver of this library, within a `Controller`.
 
     Args:
         name: of the entrant.
         says: what it is, in a line.
-        solver: as in `eq10` or `qp:proxqp`.
+        solver: as in `eq10` or `qp:proxqp`, or with its settings.
         packages: what its back end needs.
         changes: blocks of the scenario that it has its own way, as in `avoidance={"row": {"type": "cbf"}}`; what is
             not named of a block stays as it is.
     """
+    config = parse_solver(solver) if isinstance(solver, str) else solver
 
     def start(case: Case, world: World) -> Pilot:
         scenario = case.scenario.model_dump()
         for block, fields in changes.items():
             scenario[block] = {**scenario[block], **fields}
-        scenario["solver"] = parse_solver(solver).model_dump()
-        controller, _ = Controller.from_scenario(
-            ScenarioConfig.model_validate(scenario).read_from(case.scenario.source)
-        )
-        return controller
+        scenario["solver"] = config.model_dump()
+        x = ScenarioConfig.model_validate(scenario)
+        blocks = x.avoidance, x.limits, x.tracking_damping, x.sensing, x.progress
+        return Controller(world.scene, world.tasks, make_solver(x.solver), x.dt, *blocks)
 
-    return Entrant(name, says, start, {"solver": solver, **changes}, packages)
+    settings = {"solver": solver if isinstance(solver, str) else solver.model_dump(), **changes}
+    return Entrant(name, says, start, settings, packages)
 
 
 def outside(

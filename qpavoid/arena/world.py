@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from qpavoid.config import ScenarioConfig
-from qpavoid.errors import located
+from qpavoid.errors import ConfigError, located
 from qpavoid.problem import Array
 from qpavoid.robot import Robot
 from qpavoid.scene import Scene, build_obstacles, build_scene
@@ -54,6 +54,8 @@ def world_of(scenario: ScenarioConfig, robot: Robot, q0: Array) -> World:
         ConfigError, UnknownName: naming file, field and remedy.
     """
     source = scenario.source
+    if scenario.contacts or any(obstacle.carried_by for obstacle in scenario.obstacles):
+        raise ConfigError(f"{source}: the arena knows neither contacts nor obstacles that are carried; leave them out")
     obstacles = build_obstacles(scenario.obstacles, source)
     with located(str(source)):
         scene = build_scene(robot, obstacles)

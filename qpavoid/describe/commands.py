@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, Any, get_args
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 
 from qpavoid.config.base import LARGEST
@@ -23,10 +22,9 @@ from qpavoid.describe.written import write_files
 from qpavoid.errors import ConfigError
 from qpavoid.loading import find_robot
 from qpavoid.report import to_json
+from qpavoid.terminal import ERR, OUT
 
 app = typer.Typer(no_args_is_help=True, help="Look a robot over, or describe one for the first time.")
-_out = Console()
-_err = Console(stderr=True)
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else on stdout.")]
 PackageDirs = Annotated[
@@ -51,7 +49,7 @@ def check(
         print(to_json({**asdict(report), "usable": report.usable}))
     else:
         for line in _check_lines(report):
-            _out.print(line, highlight=False, soft_wrap=True)
+            OUT.print(line, highlight=False, soft_wrap=True)
     raise typer.Exit(0 if report.usable else 1)
 
 
@@ -171,7 +169,7 @@ def _picture(described: Described) -> bytes | None:
     except ModuleNotFoundError as missing:
         if missing.name is None or missing.name.split(".")[0] not in ("matplotlib", "mpl_toolkits"):
             raise
-        _err.print("no picture: matplotlib is missing; pip install 'qpavoid\\[plots]'", highlight=False)
+        ERR.print("no picture: matplotlib is missing; pip install 'qpavoid\\[plots]'", highlight=False)
         return None
     return bodies_picture(described)
 
@@ -207,4 +205,4 @@ def _report(described: Described, outcome: dict[Path, str], seconds: float) -> N
         *(f"{what:<14} {path}" for path, what in outcome.items()),
         f"               in {seconds:.1f} s; in a scenario: `robot: {next(iter(outcome))}`",
     ):
-        _out.print(line, highlight=False, markup=False, soft_wrap=True)
+        OUT.print(line, highlight=False, markup=False, soft_wrap=True)

@@ -1,0 +1,220 @@
+"""Command line: `qpavoid bench run | smoke | report | show | list`. What it stands on is imported when it is needed."""
+
+from __future__ import annotations
+
+import tempfile
+from contextlib import ExitStack
+from importlib.util import find_spec
+from json import loads
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from qpavoid.errors import ConfigError
+from qpavoid.loading import family_names, suite_names
+from qpavoid.report import to_json
+from qpavoid.terminal import ERR, OUT, names_of, progress, terminate_like_interrupt
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from qpavoid.arena.suite import Suite
+    from qpavoid.arena.sweep import Tally
+
+app = typer.Typer(no_args_is_help=True, help="Compare laws on families of scenarios: the arena.")
+
+_NEEDED = ("distributed", "pyarrow", "mujoco", "jinja2", "matplotlib")
+
+Name = Annotated[str, typer.Argument(metavar="SUITE", help="Shipped name or path of a YAML file.")]
+Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of results.")]
+Jobs = Annotated[int | None, typer.Option(min=1, help="Processes on this machine; one a core if left out.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else on stdout.")]
+
+
+@app.callback()
+def arena() -> None:
+    """Compare laws on families of scenarios: the arena."""
+    missing = [package for package in _NEEDED if find_spec(package) is None]
+    if missing:
+        raise ConfigError(f"qpavoid bench needs {', '.join(missing)}: pip install 'qpavoid[arena]'")
+
+
+@app.command()
+def run(
+    suite: Name,
+    solvers: Annotated[str | None, typer.Option(help="Comma-separated entrants in place of the suite's.")] = None,
+    entrant: Annotated[
+        list[str] | None, typer.Option(metavar="FILE.py:NAME", help="One more, of your own; may be given again.")
+    ] = None,
+    seeds: Annotated[int | None, typer.Option(help="Cases of each family.")] = None,
+    jobs: Jobs = None,
+    cluster: Annotated[
+        str | None, typer.Option(metavar="tcp://HOST:PORT", help="A Dask scheduler, in place of this machine.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder of results; out/bench/SUITE if left out.")] = None,
+    json: Json = False,
+) -> None:
+    """Run a suite, or go on with it: what is in the folder already is not done again.
+
+    The exit status is 1 when something could not be made or run, or was interrupted; collisions are results.
+    """
+    from qpavoid.arena.plan import runs_of
+    from qpavoid.arena.suite import load_suite
+    from qpavoid.arena.summary import FIGURES
+
+    if cluster is not None and jobs is not None:
+        raise ConfigError("--jobs: the cluster has its own; leave one of --jobs and --cluster out")
+    names = [] if solvers is None else names_of("--solvers", solvers)
+    chosen = load_suite(suite, names, entrant or (), seeds)
+    folder = out or Path("out") / "bench" / chosen.name
+    tally = _swept(chosen, folder, cluster, jobs)
+    for failure in _failures(folder):
+        _complain(failure)
+    _print(chosen, runs_of(chosen, folder, FIGURES), folder, tally, json)
+    raise typer.Exit(1 if tally.failed else 0)
+
+
+@app.command()
+def smoke(
+    out: Annotated[Path | None, typer.Option(help="Folder of results; none is kept if left out.")] = None,
+    jobs: Jobs = None,
+    json: Json = False,
+) -> None:
+    """Run a few cases of everything, and say what is broken: exit status 1 if anything is."""
+    from qpavoid.arena.plan import cases_of, runs_of
+    from qpavoid.arena.suite import load_suite
+    from qpavoid.arena.summary import broken
+
+    chosen = load_suite("smoke")
+    with ExitStack() as stack:
+        folder = out or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="qpavoid-smoke-")))
+        tally = _swept(chosen, folder, None, jobs)
+        runs = runs_of(chosen, folder)
+        faults = [*_failures(folder), *broken(chosen, runs, cases_of(chosen, folder, ["case", "json"]))]
+    _print(chosen, runs, out, tally, json, {"broken": faults})
+    for fault in faults:
+        _complain(f"broken: {fault}")
+    raise typer.Exit(1 if faults else 0)
+
+
+@app.command()
+def report(folder: Folder) -> None:
+    """Write the report of a folder: Markdown, and one page of HTML."""
+    from qpavoid.arena.report import write_report
+
+    for file in write_report(folder):
+        OUT.print(str(file), highlight=False, soft_wrap=True, markup=False)
+
+
+@app.command()
+def show(
+    folder: Folder,
+    family: Annotated[str, typer.Option(help="Name of the family.")],
+    seed: Annotated[int, typer.Option(help="Of the case.")],
+    entrant: Annotated[str | None, typer.Option(help="Runs it once more; a name, or my_law.py:MyLaw.")] = None,
+    scenario: Annotated[Path | None, typer.Option(help="Write the case as a scenario, for `qpavoid run`.")] = None,
+    json: Json = False,
+) -> None:
+    """Show a case of a folder, and run it once more with one entrant."""
+    from qpavoid.arena.show import again, find_case, write_scenario
+
+    case = find_case(folder, family, seed)
+    fields: dict[str, Any] = {"family": family, "seed": seed, "case": case.key, "solved_by": case.solved_by}
+    if scenario is not None:
+        write_scenario(case, scenario)
+        fields["scenario"] = str(scenario)
+    if entrant is not None:
+        fields["run"] = again(case, entrant, folder)
+    if json:
+        print(to_json(fields))
+        return
+    figures = fields.pop("run", {})
+    for name, value in {**fields, **figures}.items():
+        OUT.print(f"{name:16} {value}", highlight=False, soft_wrap=True, markup=False)
+
+
+@app.command("list")
+def list_(json: Json = False) -> None:
+    """List suites, families and entrants, and what entrants lack."""
+    from qpavoid.arena.entrants import ENTRANTS
+    from qpavoid.arena.families import load_family
+    from qpavoid.arena.suite import SuiteConfig
+    from qpavoid.loading import find_suite, read_config
+
+    suites = {name: read_config(find_suite(name), SuiteConfig).title for name in suite_names()}
+    families = {name: load_family(name).config.title for name in family_names()}
+    if json:
+        entrants = {e.name: {"says": e.says, "missing": list(e.missing)} for e in ENTRANTS.values()}
+        print(to_json({"suites": suites, "families": families, "entrants": entrants}))
+        return
+    says = {e.name: e.says + f" (needs {', '.join(e.missing)})" * bool(e.missing) for e in ENTRANTS.values()}
+    for heading, entries in {"suites": suites, "families": families, "entrants": says}.items():
+        OUT.print(f"[bold]{heading}[/]")
+        for name, text in entries.items():
+            OUT.print(f"  {name:22} {text}", highlight=False, soft_wrap=True, markup=False)
+
+
+def _swept(suite: Suite, folder: Path, cluster: str | None, jobs: int | None) -> Tally:
+    """Runs a suite, with bars.
+
+    Raises:
+        Exit: it was interrupted, or the cluster went away.
+    """
+    from qpavoid.arena.plan import complete
+    from qpavoid.arena.store import Store
+    from qpavoid.arena.sweep import ClusterLost, Tally, local_cluster, remote_cluster, sweep
+
+    for entrant in suite.absent:
+        _complain(f"{entrant.name} does not take part: it needs {', '.join(entrant.missing)}")
+    last: Tally | None = None
+    with terminate_like_interrupt(), Store(folder) as store, progress() as bar:
+        bars = {stage: bar.add_task(stage, total=None, visible=False) for stage in ("cases", "runs")}
+
+        def tell(tally: Tally) -> None:
+            nonlocal last
+            last = tally
+            said = f"{tally.stage}, {tally.collided} collided" if tally.collided else tally.stage
+            task, visible = bars[tally.stage], tally.total > 0
+            bar.update(task, completed=tally.done, total=tally.total, description=said, visible=visible)
+
+        if complete(suite, folder):
+            return Tally("runs", 0, 0, 0, 0)
+        try:
+            with remote_cluster(cluster) if cluster is not None else local_cluster(jobs) as client:
+                return sweep(suite, store, client, tell)
+        except (KeyboardInterrupt, ClusterLost) as reason:
+            why = "interrupted" if isinstance(reason, KeyboardInterrupt) else str(reason)
+            done = "nothing" if last is None else f"{last.done} of {last.total} {last.stage}"
+            _complain(f"{why}: {done} done, all that is done is kept in {folder}; the same command goes on")
+            raise typer.Exit(1) from None
+
+
+def _failures(folder: Path) -> list[str]:
+    """What the last sweep could not make or run, a line each."""
+    said = []
+    for line in (folder / "failures.jsonl").read_text(encoding="utf-8").splitlines():
+        f = loads(line)
+        what = "the case could not be made" if f["entrant"] is None else f"{f['entrant']} could not be run"
+        said.append(f"{f['family']}, seed {f['seed']}: {what}: {f['failure']}")
+    return said
+
+
+def _print(
+    suite: Suite, runs: pa.Table, folder: Path | None, tally: Tally, json: bool, more: dict[str, Any] | None = None
+) -> None:
+    from qpavoid.arena.summary import summary, summary_table
+
+    if json:
+        fields = {"suite": suite.name, "folder": folder and str(folder), "new": tally.done, "runs": len(runs)}
+        print(to_json({**fields, "failed": tally.failed, **(more or {}), "entrants": summary(runs)}))
+        return
+    OUT.print(summary_table(runs, f"{suite.name}: {suite.title}"))
+    if folder is not None:
+        OUT.print(
+            f"{folder}: {len(runs)} runs, {tally.done} of them new", highlight=False, soft_wrap=True, markup=False
+        )
+
+
+def _complain(what: str) -> None:
+    ERR.print(what, highlight=False, soft_wrap=True, markup=False)

@@ -1,0 +1,46 @@
+"""On what results were made: versions and hardware, for the head of a report."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Iterable
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+PACKAGES = (
+    "qpavoid", "numpy", "scipy", "pin", "coal", "numba", "mujoco", "daqp", "proxsuite", "osqp", "quadprog", "qpsolvers",
+    "pin-pink", "mink", "placo", "distributed", "pyarrow",
+)  # fmt: skip
+"""Whose versions are told, where they are installed."""
+
+
+def machine() -> dict[str, Any]:
+    """Processor, cores, system and interpreter of the machine that this runs on."""
+    return {
+        "cpu": _cpu(),
+        "cores": os.cpu_count(),
+        "system": platform.platform(),
+        "python": platform.python_version(),
+    }
+
+
+def versions(packages: Iterable[str] = PACKAGES) -> dict[str, str]:
+    """Version by package, of those that are installed."""
+    found = {}
+    for package in packages:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def _cpu() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()

@@ -1,0 +1,69 @@
+"""One case of a results folder, looked at closely: as a scenario, and run once more."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pyarrow.compute as pc
+import yaml
+
+from qpavoid.arena.case import Case
+from qpavoid.arena.entrants import ENTRANTS
+from qpavoid.arena.store import read_cases
+from qpavoid.arena.suite import EntrantConfig, find_any
+from qpavoid.arena.trial import run_trial
+from qpavoid.errors import ConfigError, UnknownName
+from qpavoid.loading import nearest
+
+
+def find_case(folder: Path, family: str, seed: int) -> Case:
+    """The case of a family and seed, the one that was made last where there are several.
+
+    Raises:
+        UnknownName: the folder has no such family.
+        ConfigError: it has no case of that seed, or no results.
+    """
+    cases = read_cases(folder)
+    there = cases.filter(pc.equal(cases["family"], family))
+    if not len(there):
+        raise UnknownName(f"{folder}: no family {family!r}{nearest(family, pc.unique(cases['family']).to_pylist())}")
+    texts = there.filter(pc.equal(there["seed"], seed))["json"].to_pylist()
+    if not texts:
+        low, high = pc.min_max(there["seed"]).as_py().values()
+        raise ConfigError(f"{folder}: {family} has no seed {seed}; there are {len(there)} from {low} to {high}")
+    return Case.from_json(texts[-1])
+
+
+def write_scenario(case: Case, path: Path) -> None:
+    """Writes a case as a scenario file. Relative paths in it start from the folder of the family's file."""
+    text = yaml.safe_dump(case.scenario.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"--scenario {path}: {error.strerror}; give a file that can be written") from None
+
+
+def again(case: Case, entrant: str, folder: Path) -> dict[str, Any]:
+    """The figures of an entrant in a case, run anew.
+
+    Args:
+        case: what is run.
+        entrant: a name that ships, `my_law.py:MyLaw`, or the name that a law has in a suite that the folder is of.
+        folder: of results.
+
+    Raises:
+        ConfigError, UnknownName: there is no such entrant.
+    """
+    found = _of_suite(entrant, folder)
+    return run_trial(case, found.entrant() if found else find_any(entrant)).row()
+
+
+def _of_suite(name: str, folder: Path) -> EntrantConfig | None:
+    """A law with settings of its own, by what suite.json tells of it."""
+    told = json.loads((folder / "suite.json").read_text(encoding="utf-8"))["entrants"].values()
+    fields = [entry for entry in told if entry["name"] == name and "solver" in entry["settings"]]
+    if name in ENTRANTS or not fields:
+        return None
+    return EntrantConfig(name=name, says=fields[-1]["says"], **fields[-1]["settings"])

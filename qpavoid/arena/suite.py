@@ -1,0 +1,170 @@
+"""A suite: which entrants run in which families, with which seeds; a YAML file each."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from qpavoid.arena.entrants import ENTRANTS, Entrant, find_entrant, law
+from qpavoid.arena.families import Family, load_family
+from qpavoid.arena.own import own_entrant
+from qpavoid.config import Avoidance, Limits, Progress, Sensing, SolverConfig
+from qpavoid.config.base import Block
+from qpavoid.errors import ConfigError, located
+from qpavoid.loading import find_suite, read_config
+
+MOST_SEEDS = 1_000_000
+
+
+class EntrantConfig(Block):
+    """A law of this library with settings of one's own."""
+
+    name: Annotated[str, Field(min_length=1)]
+    """Under which it appears."""
+    says: str = ""
+    """What it is, in a line."""
+    solver: SolverConfig
+    """As in a scenario."""
+    avoidance: Avoidance | None = None
+    """Fields that it has its own way, whatever the scenario says; likewise the blocks below."""
+    limits: Limits | None = None
+    sensing: Sensing | None = None
+    progress: Progress | None = None
+
+    def entrant(self) -> Entrant:
+        """Who takes part."""
+        said = self.model_dump(exclude_unset=True)
+        changes = {block: said[block] for block in ("avoidance", "limits", "sensing", "progress") if said.get(block)}
+        return law(self.name, self.says or self.solver.label, self.solver, **changes)
+
+
+class SuiteConfig(Block):
+    """A file of tasks/suites/."""
+
+    title: Annotated[str, Field(min_length=1)]
+    """What it is, in a few words."""
+    about: str = ""
+    """What it is for."""
+    families: Annotated[list[str], Field(min_length=1)]
+    """Shipped names, or paths of YAML files, from this file's folder."""
+    entrants: Annotated[list[str | EntrantConfig], Field(min_length=1)]
+    """Shipped names, `my_law.py:MyLaw` from this file's folder, or laws with settings of their own."""
+    seeds: Annotated[int, Field(ge=1, le=MOST_SEEDS)] = 10
+    """Cases of each family [-]."""
+    first_seed: Annotated[int, Field(ge=0)] = 0
+    """Seed of the first one."""
+
+
+@dataclass(frozen=True)
+class Suite:
+    """A suite that was read and checked."""
+
+    name: str
+    title: str
+    families: tuple[Family, ...]
+    entrants: tuple[Entrant, ...]
+    seeds: range
+    absent: tuple[Entrant, ...]
+    """Those of the file that cannot take part, because what they run on is not installed."""
+
+
+def load_suite(
+    name_or_path: str | Path, solvers: Sequence[str] = (), more: Sequence[str] = (), seeds: int | None = None
+) -> Suite:
+    """Reads a suite.
+
+    Args:
+        name_or_path: shipped name or path of a YAML file. Python files that it names are run.
+        solvers: these entrants in place of its own; names of its own or shipped ones, or `my_law.py:MyLaw`.
+        more: further entrants, likewise.
+        seeds: number of seeds in place of its own.
+
+    Raises:
+        ConfigError, UnknownName: naming file, field and remedy.
+    """
+    path = find_suite(name_or_path)
+    config = read_config(path, SuiteConfig)
+    families = []
+    for i, family in enumerate(config.families):
+        with located(f"{path}: families.{i}"):
+            beside = path.parent / family
+            families.append(load_family(beside if beside.is_file() else family))
+    own: dict[str, Entrant] = {}
+    for i, entry in enumerate(config.entrants):
+        with located(f"{path}: entrants.{i}"):
+            entrant = entry.entrant() if isinstance(entry, EntrantConfig) else _entrant(entry, path.parent)
+            _add(own, entrant)
+    absent = tuple(entrant for entrant in own.values() if entrant.missing)
+    chosen = {name: entrant for name, entrant in own.items() if not entrant.missing}
+    with located("--solvers"):
+        if solvers:
+            chosen = {}
+            for name in solvers:
+                _add(chosen, own[name] if name in own and not own[name].missing else find_any(name))
+            absent = ()
+    with located("--entrant"):
+        for name in more:
+            _add(chosen, find_any(name))
+    if not chosen:
+        missing = ", ".join(f"{entrant.name} needs {', '.join(entrant.missing)}" for entrant in absent)
+        raise ConfigError(f"{path}: entrants: none can take part: {missing}")
+    names = [family.name for family in families]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise ConfigError(f"{path}: families: {twice[0]!r} is there twice; leave one out, or rename its file")
+    return Suite(
+        name=path.stem,
+        title=config.title,
+        families=tuple(families),
+        entrants=tuple(chosen.values()),
+        seeds=range(config.first_seed, config.first_seed + _seeds(config.seeds if seeds is None else seeds)),
+        absent=absent,
+    )
+
+
+def origin(family: Family) -> str:
+    """Digest of what a family's cases are made of: its file, what that refers to, and the version that makes them."""
+    generator = (family.config.generator or "").rpartition(":")[0]
+    text = (family.path.parent / generator).read_text(encoding="utf-8") if generator else ""
+    fields: list[Any] = [version("qpavoid"), family.config.model_dump(mode="json"), family.templates, text]
+    return hashlib.sha256(json.dumps(fields, sort_keys=True, default=str).encode()).hexdigest()[:12]
+
+
+def find_any(name: str) -> Entrant:
+    """An entrant that ships and is installed, by name, or one of a user's own, as `my_law.py:MyLaw`.
+
+    Raises:
+        ConfigError, UnknownName: there is none.
+    """
+    return find_entrant(name) if name in ENTRANTS else _entrant(name, Path())
+
+
+def facts_of(entrants: Iterable[Entrant]) -> dict[str, Any]:
+    """What a report says of entrants, by their digests."""
+    return {e.digest: {"name": e.name, "says": e.says, "settings": dict(e.settings)} for e in entrants}
+
+
+def _seeds(count: int) -> int:
+    if not 1 <= count <= MOST_SEEDS:
+        raise ConfigError(f"--seeds {count}: give 1 to {MOST_SEEDS}")
+    return count
+
+
+def _entrant(name: str, folder: Path) -> Entrant:
+    """By shipped name, installed or not, or from a file."""
+    file, _, inside = name.rpartition(":")
+    if file.endswith(".py"):
+        return own_entrant(folder / file, inside)
+    return ENTRANTS[name] if name in ENTRANTS else find_entrant(name)
+
+
+def _add(chosen: dict[str, Entrant], entrant: Entrant) -> None:
+    if entrant.name in chosen:
+        raise ConfigError(f"{entrant.name!r} is there twice; leave one out, or give it another name")
+    chosen[entrant.name] = entrant

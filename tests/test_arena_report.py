@@ -1,0 +1,444 @@
+"""The arena's report: its statistics against closed forms and brute force, and that nothing is dropped or mixed."""
+
+import json
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+pytest.importorskip("pyarrow")
+pytest.importorskip("jinja2")
+pytest.importorskip("matplotlib")
+pytest.importorskip("mujoco")
+
+import pyarrow as pa
+from scipy.stats import binom, binomtest
+
+from qpavoid.arena import statistics
+from qpavoid.arena.report import report_of, rerun_line, write_report
+from qpavoid.arena.results import results_of
+from qpavoid.arena.scores import COLUMNS
+from qpavoid.arena.statistics import CONFIDENCE, duel, mean, median, pareto, ranks, rate
+from qpavoid.arena.store import Store
+from qpavoid.arena.tables import COLUMNS as SHOWN
+from qpavoid.arena.tables import MORE
+from qpavoid.errors import ConfigError
+
+flags = st.lists(st.booleans(), min_size=1, max_size=30)
+
+
+def row(entrant="qp", case="a", family="field", success=True, **more):
+    """A run, of which only what matters is given."""
+    blank = {"str": "", "int": 1, "float": 0.01, "bool": False}
+    given = {"entrant": entrant, "case": case, "family": family, "success": success, "settings": f"of {entrant}"}
+    return {
+        **{name: blank[kind] for name, kind in COLUMNS.items()},
+        "robot": "panda",
+        "reachable": True,
+        **given,
+        **more,
+    }
+
+
+def table(rows):
+    return pa.Table.from_pylist(rows)
+
+
+def grid(entrants, cases=12, seed=0, **more):
+    """Every entrant in every case, the later ones succeeding more often."""
+    draw = np.random.default_rng(seed)
+    rows = []
+    for i, entrant in enumerate(entrants):
+        for k in range(cases):
+            won = bool(draw.random() < (i + 1) / len(entrants))
+            error, distance = 0.1 * draw.random(2)
+            own = {"success": won, "collided": not won, "min_distance": distance if won else -distance}
+            rows.append(row(entrant, f"case {k}", f"field {k % 2}", seed=k, tracking_error=error, **own, **more))
+    return rows
+
+
+def sections(rows, facts=None):
+    return {section.title: section for section in report_of(table(rows), facts or {})}
+
+
+def texts(section):
+    """The tables of a section as text."""
+    return [[[cell.text for cell in cells] for cells in t.rows] for t in section.tables]
+
+
+# --- statistics -----------------------------------------------------------------------------------------------------
+
+
+@given(st.integers(0, 60), st.integers(1, 60))
+def test_a_rate_has_wilsons_interval(won, trials):
+    won = min(won, trials)
+    expected = binomtest(won, trials).proportion_ci(CONFIDENCE, method="wilson")
+    assert rate(won, trials) == pytest.approx((won / trials, expected.low, expected.high), abs=1e-12)
+
+
+def test_a_rate_as_in_print():
+    """Newcombe, Statistics in Medicine 17 (1998), table I, method 3."""
+    printed = {
+        (81, 263): (0.2553, 0.3662),
+        (15, 148): (0.0624, 0.1605),
+        (0, 20): (0.0, 0.1611),
+        (1, 29): (0.0061, 0.1718),
+    }
+    for (won, trials), limits in printed.items():
+        assert rate(won, trials)[1:] == pytest.approx(limits, abs=6e-5)
+
+
+@pytest.mark.parametrize("estimate", [mean, median])
+def test_nothing_gives_no_estimate(estimate):
+    with pytest.raises(ValueError, match="no values"):
+        estimate(np.zeros(0))
+    with pytest.raises(ValueError, match="no trials"):
+        rate(0, 0)
+
+
+@pytest.mark.parametrize("count", [6, 20, 60])
+@pytest.mark.parametrize(("estimate", "truth"), [(mean, 1.0), (median, np.log(2.0))])
+def test_intervals_of_exponential_values_hold_the_truth_about_as_often_as_they_say(estimate, truth, count):
+    draw = np.random.default_rng(count)
+    held = [low <= truth <= high for _, low, high in (estimate(draw.exponential(size=count)) for _ in range(400))]
+    least = 0.93 if estimate is median else 0.85  # the skew costs the mean of few something
+    assert least <= np.mean(held) <= 0.995
+
+
+def test_the_interval_of_a_mean_is_as_wide_as_students_for_few_normal_values_and_as_the_normal_one_for_many():
+    draw = np.random.default_rng(1)
+    few, many = draw.normal(size=(300, 8)), draw.normal(size=statistics._MANY)
+    held = np.mean([low <= 0.0 <= high for _, low, high in map(mean, few)])
+    assert 0.92 <= held <= 0.98  # plain percentiles hold 0.89
+    fewer = many[: statistics._MANY - 1]
+    assert mean(fewer)[1:] == pytest.approx(mean(many)[1:], abs=0.004)
+
+
+@given(st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=40))
+def test_estimates_lie_within_their_intervals_and_these_within_the_values(values):
+    values = np.array(values)
+    for estimate in (mean, median):
+        middle, low, high = estimate(values)
+        assert values.min() - 1e-9 <= low <= middle <= high <= values.max() + 1e-9
+        assert estimate(values) == (middle, low, high)
+
+
+@pytest.mark.parametrize("count", [6, 11, 40, 101])
+def test_the_interval_of_a_median_is_the_narrowest_that_the_sign_test_allows(count):
+    low = int(median(np.arange(count, dtype=float)).low)
+    outside = 2.0 * binom.cdf(low, count, 0.5)
+    assert outside <= 1.0 - CONFIDENCE < 2.0 * binom.cdf(low + 1, count, 0.5)
+    assert median(np.arange(count, dtype=float)).high == count - 1 - low
+
+
+@given(flags, st.randoms())
+def test_a_duel_is_fair_and_that_of_the_binomial_test(first, random):
+    second = np.array([random.random() < 0.5 for _ in first])
+    first = np.array(first)
+    there, back = duel(first, second), duel(second, first)
+    assert (there.only_first, there.only_second, there.p) == (back.only_second, back.only_first, back.p)
+    apart = there.only_first + there.only_second
+    assert there.p == pytest.approx(binomtest(there.only_first, apart).pvalue if apart else 1.0)
+    assert not duel(first, first).decided
+
+
+def test_ranks_are_shared_by_those_that_cannot_be_told_from_the_first():
+    success = np.zeros((20, 4), dtype=bool)
+    for i, won in enumerate((0, 20, 17, 10)):
+        success[:won, i] = True
+    found = ranks(success, np.zeros((20, 4)), ["never", "always", "nearly", "half"])
+    assert found == {"always": 1, "nearly": 1, "half": 3, "never": 4}  # 3 of 20: p = 0.25; 10 of 20: p = 0.002
+    assert list(found) == ["always", "nearly", "half", "never"]
+
+
+def test_equal_success_is_put_in_order_by_tracking_but_shares_the_rank():
+    error = np.tile([0.03, 0.01, 0.02], (9, 1))
+    assert list(ranks(np.ones((9, 3), dtype=bool), error, ["a", "b", "c"]).items()) == [("b", 1), ("c", 1), ("a", 1)]
+
+
+@given(st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), min_size=1, max_size=15))
+def test_the_pareto_front_is_what_nobody_beats(points):
+    x, y = np.array(points, dtype=float).T
+    beaten = [
+        any((a <= c and b >= d) and (a < c or b > d) for a, b in zip(x, y, strict=True))
+        for c, d in zip(x, y, strict=True)
+    ]
+    assert pareto(x, y).tolist() == [not b for b in beaten]
+
+
+# --- nothing is dropped, nothing is mixed ---------------------------------------------------------------------------
+
+
+@given(st.randoms(use_true_random=False))
+def test_the_order_of_rows_changes_nothing(random):
+    rows = grid(["c", "a", "b"])
+    expected = results_of(table(rows))
+    random.shuffle(rows)
+    found = results_of(table(rows))
+    assert found.entrants == expected.entrants and found.families == expected.families
+    assert found.ranking() == expected.ranking()
+    for family in (None, 0, 1):
+        for column in ("tracking_error", "min_distance"):
+            assert np.array_equal(
+                np.sort(found.table(column, family), axis=0), np.sort(expected.table(column, family), axis=0)
+            )
+
+
+def test_every_cell_is_that_of_its_case_and_entrant():
+    rows = grid(["a", "b", "c"], cases=5)
+    found = results_of(table(rows), ["c"])
+    assert found.entrants == ("c", "a", "b")
+    cells = {(r["entrant"], r["case"]): r["tracking_error"] for r in rows}
+    cases = sorted({r["case"] for r in rows})
+    expected = [[cells[entrant, case] for entrant in found.entrants] for case in cases]
+    assert found.table("tracking_error").tolist() == expected
+    assert [rows[0]["family"], rows[1]["family"]] == [found.families[i] for i in found.family[:2]]
+
+
+def test_duplicates_count_once_and_are_told():
+    rows = grid(["a", "b"])
+    once, twice = results_of(table(rows)), results_of(table(rows + rows[5:9]))
+    assert twice.replaced == 4 and once.replaced == 0
+    assert twice.ranking() == once.ranking()
+    assert np.array_equal(twice.table("tracking_error"), once.table("tracking_error"))
+
+
+@pytest.mark.parametrize("changed", [{"settings": "new"}, {"version": "2"}])
+def test_settings_and_versions_of_an_entrant_are_never_mixed(changed):
+    rows = grid(["a", "b"], cases=4)
+    anew = [{**r, **changed, "tracking_error": 1.0} for r in rows if r["entrant"] == "a"][:3]
+    found = results_of(table(rows + anew))
+    assert found.replaced == 4  # the fourth case, too: it was run by another a
+    assert list(found.missing()) == [("a", "field 1", 1)]
+    assert found.values("tracking_error", 0).tolist() == [1.0, 1.0, 1.0]
+    assert len(found.values("tracking_error", 1)) == 3
+
+
+def test_a_missing_cell_is_named_and_its_case_counts_for_nobody():
+    rows = grid(["a", "b"])
+    gone = next(r for r in rows if r["entrant"] == "b" and r["family"] == "field 1")
+    rows.remove(gone)
+    found = sections(rows)
+    points = found["What this was made on"].points
+    assert any(point == "b has not run 1 cases of field 1, which count for nobody." for point in points)
+    assert any("11 cases that every entrant has run" in point for point in points)
+    assert "5 cases, on panda." in found["Family: field 1"].text
+    left = np.mean([r["success"] for r in rows if r["entrant"] == "a" and r["case"] != gone["case"]])
+    shown = {cells[1]: cells[2] for cells in texts(found["Overall"])[0]}
+    assert shown["a"] == f"{100 * left:.0f}"
+
+
+def test_every_run_is_counted_in_the_rates_of_its_family():
+    rows = grid(["a", "b", "c"], cases=30)
+    found = sections(rows)
+    for family in ("field 0", "field 1"):
+        for cells in texts(found[f"Family: {family}"])[0]:
+            own = [r["success"] for r in rows if r["entrant"] == cells[1] and r["family"] == family]
+            assert len(own) == 15 and cells[2] == f"{100 * np.mean(own):.0f}"
+
+
+def test_figures_that_are_no_numbers_stand_at_the_worst():
+    rows = grid(["a", "b"], cases=4)
+    worst = {name: max(r[name] for r in rows) for name in ("tracking_error", "jerk")}
+    deepest = min(r["min_distance"] for r in rows)
+    rows[0] |= {"tracking_error": float("nan"), "jerk": float("inf"), "min_distance": float("nan")}
+    rows[1] |= {"min_distance": float("inf")}  # nothing to touch: a figure as good as any
+    found = results_of(table(rows))
+    assert found.bounded == 3
+    assert found.row(0)["tracking_error"] == worst["tracking_error"] and found.row(0)["jerk"] == worst["jerk"]
+    assert found.row(0)["min_distance"] <= deepest and found.row(1)["min_distance"] == np.inf
+    for section in report_of(table(rows), {}):
+        assert "nan" not in str(texts(section))
+
+
+def test_no_runs_and_no_common_case_say_what_to_do(tmp_path):
+    with pytest.raises(ConfigError, match="no runs to report; `qpavoid bench run` makes some"):
+        list(report_of(table([row()]).slice(0, 0), {}))
+    with pytest.raises(ConfigError, match="no case was run by all of a, b, b has run the fewest"):
+        list(report_of(table([row("a", "1"), row("a", "2"), row("b", "3")]), {}))
+    with pytest.raises(ConfigError, match="no results here"):
+        write_report(tmp_path)
+
+
+def test_one_run_makes_a_report():
+    found = sections([row()])
+    assert texts(found["Overall"])[0][0][:3] == ["1", "qp", "100"]
+    assert not found["Beside the best"].tables and found["Worst runs"].text == ("None.",)
+
+
+# --- what is written ------------------------------------------------------------------------------------------------
+
+NASTY = "<b>a|b</b> $x$ & `c` __d__"
+
+
+class Page(HTMLParser):
+    """Checks that elements nest, and keeps what matters of them."""
+
+    VOID = ("meta", "br", "img", "link", "hr")
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.elements, self.cells = [], [], []
+        self.feed(text)
+        self.close()
+        assert not self.open
+
+    def handle_starttag(self, tag, attributes):
+        self.elements.append((tag, dict(attributes)))
+        if tag not in self.VOID:
+            self.open.append(tag)
+        if tag == "td":
+            self.cells.append("")
+
+    def handle_startendtag(self, tag, attributes):
+        self.elements.append((tag, dict(attributes)))
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if "td" in self.open:
+            self.cells[-1] += data
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """A folder with a report on entrants and failures that a page may stumble over."""
+    folder = tmp_path_factory.mktemp("a folder")
+    rows = grid(["qp", NASTY, "$y", "tracking"], failure=f"ValueError: {NASTY}\nsecond line", failed=0.5)
+    with Store(folder) as store:
+        for one in rows:
+            store.runs.append(one)
+        store.fail({"family": "field 0", "seed": 99, "failure": NASTY})
+        entrants = {f"of {NASTY}": {"name": NASTY, "says": NASTY, "settings": {"solver": NASTY}}}
+        facts = {"title": NASTY, "machine": {"cpu": NASTY}, "versions": {"numpy": "2"}, "absent": {"placo": ["placo"]}}
+        store.describe({**facts, "entrants": entrants})
+    return folder, write_report(folder)
+
+
+def test_the_report_is_markdown_with_its_pictures_and_one_page(written):
+    folder, files = written
+    assert {file.suffix for file in files} == {".md", ".png", ".html"} and all(f.stat().st_size > 1000 for f in files)
+    markdown = (folder / "report.md").read_text()
+    assert sorted(re.findall(r"!\[.*?\]\((.*?)\)", markdown)) == sorted(f.name for f in files if f.suffix == ".png")
+    order = [
+        "What this was made on",
+        "Limits",
+        "Who takes part",
+        "How it is scored",
+        "Overall",
+        "Family: ",
+        "Worst",
+        "Failures",
+    ]
+    places = [markdown.index(f"\n## {title}") for title in order]
+    assert places == sorted(places)
+
+
+def test_the_page_nests_needs_no_network_and_carries_what_it_is_sorted_by(written):
+    folder, _ = written
+    text = (folder / "report.html").read_text()
+    page = Page(text)
+    references = [
+        value
+        for _, attributes in page.elements
+        for name, value in attributes.items()
+        if name in ("src", "href", "xlink:href")
+    ]
+    assert references and all(reference.startswith(("#", "data:")) for reference in references)
+    assert not re.search(r"@import|url\((?!#)", text)
+    assert sum(tag == "svg" for tag, _ in page.elements) == 3 and sum(tag == "script" for tag, _ in page.elements) == 1
+    cells = [attributes for tag, attributes in page.elements if tag == "td"]
+    assert len(cells) > 100
+    for cell in cells:
+        assert cell.get("class") == "text" or np.isfinite(float(cell["data-sort"]))
+
+
+def test_whatever_names_and_failures_hold_is_shown_as_it_is(written):
+    folder, _ = written
+    page = Page((folder / "report.html").read_text())
+    assert not any(tag == "b" and attributes for tag, attributes in page.elements)
+    assert NASTY in page.cells and f"ValueError: {NASTY}\nsecond line" in page.cells
+    markdown = (folder / "report.md").read_text()
+    escaped = r"\<b\>a\|b\</b\> $x$ & \`c\` \_\_d\_\_"
+    assert f"| {escaped} |" in markdown and f"ValueError: {escaped} second line |" in markdown
+
+
+def test_tables_of_the_markdown_are_well_formed(written):
+    folder, _ = written
+    lines = (folder / "report.md").read_text().splitlines()
+    tables = 0
+    for i, line in enumerate(lines):
+        if not line.startswith("|"):
+            continue
+        count = len(re.findall(r"(?<!\\)\|", line))
+        if not lines[i - 1].startswith("|"):
+            tables += 1
+            assert lines[i - 1] == "" and lines[i + 1].count("---") == count - 1
+            expected = count
+        assert line.endswith(" |") and count == expected
+    assert tables == 2 + 2 + 1 + 2 * 2 + 1 + 1  # who, how; overall; beside; two families; worst; failures
+
+
+def test_who_took_no_part_and_what_was_not_made_is_told(written):
+    markdown = (written[0] / "report.md").read_text()
+    assert "placo does not take part: it needs placo." in markdown
+    assert "Not made or run: family field 0 seed 99" in markdown
+
+
+def test_the_same_results_make_the_same_report(written, tmp_path):
+    folder, files = written
+    before = {file: file.read_bytes() for file in files}
+    write_report(folder)
+    assert {file: file.read_bytes() for file in files} == before
+
+
+def test_the_worst_runs_are_the_deepest_then_those_that_stop_shortest():
+    runs = [
+        row(case="1", seed=1, success=False, collided=True, min_distance=-0.002, contacts=1),
+        row(case="2", seed=2, success=False, final_error=0.5),
+        row(case="3", seed=3, success=False, final_error=0.1, stuck=True),
+        row(case="4", seed=4, success=False, collided=True, min_distance=-0.03, contacts=2),
+        row(case="5", seed=5),
+    ]
+    (rows,) = texts(sections(runs)["Worst runs"])
+    assert [cells[2] for cells in rows] == ["4", "1", "2"]
+    assert [cells[4] for cells in rows] == [
+        "2 contacts, 30.0 mm deep",
+        "1 contacts, 2.0 mm deep",
+        "500 mm short of its goal",
+    ]
+
+
+def test_the_line_that_runs_one_again_is_a_command(cli, tmp_path):
+    run = row("my law", family="situation1", seed=7)
+    line = rerun_line(run, tmp_path / "a folder")
+    assert line == f"qpavoid bench show '{tmp_path / 'a folder'}' --family situation1 --seed 7 --entrant 'my law'"
+    shown = cli("bench", "show", "--help").stdout
+    assert all(option in shown for option in ("--family", "--seed", "--entrant"))
+
+
+def test_failures_are_counted_with_what_they_said():
+    runs = [row(case=str(k), failure="" if k < 2 else f"said {k % 2}" if k < 7 else "said 0") for k in range(9)]
+    (rows,) = texts(sections(runs)["Failures"])
+    assert rows == [["qp", "5", "said 0"], ["qp", "2", "said 1"]]
+
+
+def test_figures_have_the_units_that_they_say():
+    """A column's scale is that from the unit of the score to the unit of its heading."""
+    score_units = {"[mm]": ("[m]", 1e3), "[%]": ("", 100.0), "[µs]": ("[µs]", 1.0)}
+    for column in (*SHOWN, *MORE):
+        unit = re.search(r"\[.*\]", column.heading)[0]
+        assert column.name in COLUMNS
+        assert column.scale == score_units.get(unit, (unit, 1.0))[1], column.heading
+
+
+def test_the_command_writes_the_report(cli, written):
+    folder, files = written
+    done = cli("bench", "report", folder)
+    assert done.status == 0 and done.stdout.split("\n")[:-1] == [str(file) for file in files]
+    assert cli("bench", "report", folder / "nowhere").status == 2
+    assert json.loads((folder / "suite.json").read_text())["title"] == NASTY
