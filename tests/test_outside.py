@@ -200,6 +200,28 @@ def test_who_gets_out_of_the_way_of_an_obstacle_when_the_robot_rests(library):
         assert np.abs(v).max() > 0.05
 
 
+def test_the_rows_of_pink_turn_round_in_penetration():
+    """Records it: the docs say so."""
+    barriers = pytest.importorskip("pink.barriers")
+    _, world, pilot = start("pink", "ur5_pole")
+    data, (tool,), nv = world.scene.robot.model.createData(), world.tasks, world.scene.robot.model.nv
+    pin.framesForwardKinematics(world.scene.robot.model, data, world.q0)
+    seen = {"pole": Sample.at(data.oMf[tool.frame_id].translation + np.array([0.02, 0.0, 0.0]))}
+    with pytest.raises(pytest.importorskip("pink.exceptions").NoSolutionFound):
+        pilot.step(world.q0, 0.0, targets_at(world, 0.0), seen)
+    steps = 1e-5 * np.eye(nv)
+    change = [true_distances(world, world.q0 + e, seen) - true_distances(world, world.q0 - e, seen) for e in steps]
+    slope = np.transpose(change) / 2e-5
+    distance, count = pilot.distances(), len(parted_pairs(world.scene))
+    J = barriers.SelfCollisionBarrier(count).compute_jacobian(pilot.configuration)
+    J = J[np.argsort(np.argpartition(-distance, -count))]  # its rows are in the order of its own selection
+    moves = np.linalg.norm(slope, axis=1) > 1e-2
+    along = (J * slope).sum(axis=1)[moves] / np.square(slope[moves]).sum(axis=1)
+    inside = distance[moves] < 0.0
+    assert inside.any() and along[inside] == pytest.approx(-1.0, abs=0.01)
+    assert along[~inside] == pytest.approx(1.0, abs=0.01)
+
+
 def test_pink_refuses_to_go_on_beyond_a_limit():
     exceptions = pytest.importorskip("pink.exceptions")
     _, world, pilot = start("pink", "ur5_pole")
