@@ -306,9 +306,6 @@ def test_what_an_adapter_does_not_know_is_refused_at_the_start():
     posture = make_case("ur5_pole", "tasks=[{frame: tool0}, {type: posture}]")
     with pytest.raises(ConfigError, match=r"adapter of Pink knows no tasks other than `position`, `pose`"):
         frame_tasks(posture, build_world(posture.scenario), "Pink")
-    contact = make_case("ur5_pole", "contacts=[{frame: tool0}]")
-    with pytest.raises(ConfigError, match="adapter of mink knows no contacts"):
-        frame_tasks(contact, build_world(contact.scenario), "mink")
     cloud = make_case("ur5_pole", "obstacles.0.shape={type: point_cloud, resolution: 0.05}")
     with pytest.raises(ConfigError, match="knows no point clouds"):
         frame_tasks(cloud, build_world(cloud.scenario), "placo")
