@@ -2,10 +2,10 @@
 PYTHON ?= python3
 BIN := .venv/bin
 # what runs a second time without numba: the tick and everything that it is made of
-TICK_TESTS := $(addprefix tests/test_,$(addsuffix .py,avoidance backends controller examples faults filter \
+TICK_TESTS := $(addprefix tests/test_,$(addsuffix .py,avoidance backends controller escape examples faults filter \
   giving_way grasp limits outcome penetration point_cloud proximity shapes situations solvers tasks))
 
-.PHONY: run figures test lint types clean
+.PHONY: run figures test smoke lint types clean
 
 run: .venv/run
 	$(BIN)/qpavoid compare situation1 situation2 --solvers tracking,eq10-literal,eq10,qp --out out
@@ -16,6 +16,9 @@ figures: run
 test: .venv/dev
 	$(BIN)/pytest -n auto
 	QPAVOID_NUMBA=0 $(BIN)/pytest -n auto $(TICK_TESTS)
+
+smoke: .venv/dev
+	$(BIN)/qpavoid bench smoke
 
 lint: .venv/dev
 	$(BIN)/ruff check .

@@ -2,6 +2,7 @@
 
 import re
 import shlex
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ pytest.importorskip("pyarrow")
 pytest.importorskip("distributed")
 pytest.importorskip("mujoco")
 
+from qpavoid.arena import sweep
 from qpavoid.arena.store import read_runs
 from qpavoid.loading import suite_names
 
@@ -32,12 +34,20 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_sweeps_of_the_page_print_what_it_says(cli, folder, capfd):
+@pytest.fixture
+def one_cluster(monkeypatch):
+    """One process for all sweeps, as its start takes longer than they do."""
+    with sweep.local_cluster(1) as client:
+        monkeypatch.setattr(sweep, "local_cluster", lambda jobs: nullcontext(client))
+        yield
+
+
+def test_sweeps_of_the_page_print_what_it_says(cli, folder, one_cluster, capfd):
     said = [line for block in blocks(PAGE, "console") for line in block.splitlines()]
     for command, printed in zip(said, [*said[2:], "", ""], strict=False):
         if not command.startswith("$ qpavoid bench run suite.yaml"):
             continue
-        done = cli(*shlex.split(command.removeprefix("$ qpavoid ")), "--jobs", "1")
+        done = cli(*shlex.split(command.removeprefix("$ qpavoid ")))
         assert done.status == 0
         assert done.stdout.splitlines()[-1] == printed, command
     assert len(read_runs(Path("out/bench/suite"))) == 15

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from time import perf_counter
 
@@ -22,7 +23,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m bench.safety", description=__doc__)
     parser.add_argument("--runs", type=int, default=2000, help="scenarios, each with every solver (2000)")
     parser.add_argument("--first", type=int, default=0, help="seed of the first (0)")
-    parser.add_argument("--solvers", "--solver", default="qp,eq10,tracking", help="comma-separated (qp,eq10,tracking)")
+    parser.add_argument("--seeds", help="comma-separated, in place of --runs and --first")
+    parser.add_argument(
+        "--solvers", "--solver", default="qp,eq10,tracking", help="comma-separated (qp,eq10,tracking); qp+escape"
+    )
     parser.add_argument("--jobs", type=int, help="processes (one a core)")
     parser.add_argument("--name", default="safety", help="of the files written to bench/results (safety)")
     parser.add_argument("--seed", type=int, help="run this one only, and print everything about it")
@@ -33,12 +37,14 @@ def main() -> None:
             describe(options.seed, solver)
         return
     load_before, begin = os.getloadavg()[0], perf_counter()
-    found, failures = campaign(range(options.first, options.first + options.runs), solvers, options.jobs)
+    seeds = range(options.first, options.first + options.runs)
+    chosen = list(seeds) if options.seeds is None else [int(seed) for seed in options.seeds.split(",")]
+    found, failures = campaign(chosen, solvers, options.jobs)
     took = report.Took(perf_counter() - begin, (load_before, os.getloadavg()[0]))
     print(report.write(found, failures, solvers, took, RESULTS, options.name))
 
 
-def campaign(seeds: range, solvers: list[str], jobs: int | None = None) -> tuple[list[Trial], dict[int, str]]:
+def campaign(seeds: Sequence[int], solvers: list[str], jobs: int | None = None) -> tuple[list[Trial], dict[int, str]]:
     """Trials of all seeds in their order, and what went wrong by seed."""
 
     def tell(done: int, total: int) -> None:

@@ -51,7 +51,7 @@ def _sections(found: list[Trial], failures: dict[int, str], solvers: Sequence[st
     lines = [
         "# Safety",
         "",
-        f"{len(seeds)} random scenarios (seeds {seeds[0]} to {seeds[-1]}), each with {', '.join(solvers)}: "
+        f"{len(seeds)} random scenarios (seeds {_named(seeds)}), each with {', '.join(solvers)}: "
         f"{len(found)} runs in {took.seconds / 60:.1f} minutes. The commanded joint velocities of every run are played "
         "in MuJoCo, with its own integration, kinematics and distances, at every tick and between ticks, so that "
         f"nothing moves more than {1e3 * STEP:g} mm from one look to the next. {_machine()}; load before and at the "
@@ -84,6 +84,11 @@ def _sections(found: list[Trial], failures: dict[int, str], solvers: Sequence[st
         lines += [f"- seed {seed}: {text}" for seed, text in failures.items()]
         lines += [f"- seed {trial.seed}, {trial.solver}: {trial.failure}" for trial in found if trial.failure]
     return [*lines, "", *_ranges()]
+
+
+def _named(seeds: list[int]) -> str:
+    whole = len(seeds) == seeds[-1] - seeds[0] + 1
+    return f"{seeds[0]} to {seeds[-1]}" if whole else ", ".join(map(str, seeds))
 
 
 _COLUMNS = (

@@ -12,7 +12,7 @@ from importlib.metadata import PackageNotFoundError, distribution
 from typing import Any
 
 from qpavoid.arena.case import Case
-from qpavoid.arena.outside.settings import MINK, PINK
+from qpavoid.arena.outside.settings import MINK, PINK, PLACO, PLACO_PYTHON
 from qpavoid.arena.pilot import Pilot
 from qpavoid.arena.world import World
 from qpavoid.config import ScenarioConfig, SolverConfig
@@ -133,14 +133,15 @@ ENTRANTS = {
             avoidance=_row("switching"),
             progress={"detour": {}},
         ),
-        law("qp:native", "QP, compiled active-set method", "qp:native", ("numba",)),
-        law("qp:daqp", "QP, back end daqp", "qp:daqp"),
-        law("qp:proxqp", "QP, back end ProxQP", "qp:proxqp"),
-        law("qp:osqp", "QP, back end OSQP", "qp:osqp"),
-        law("qp:quadprog", "QP, back end quadprog", "qp:quadprog", ("quadprog",)),
-        law("hqp", "strict priorities, a cascade of QPs", "hqp"),
+        law("qp:native", "QP, compiled active-set method", "qp:native", ("numba",), avoidance=_row("switching")),
+        law("qp:daqp", "QP, back end daqp", "qp:daqp", avoidance=_row("switching")),
+        law("qp:proxqp", "QP, back end ProxQP", "qp:proxqp", avoidance=_row("switching")),
+        law("qp:osqp", "QP, back end OSQP", "qp:osqp", avoidance=_row("switching")),
+        law("qp:quadprog", "QP, back end quadprog", "qp:quadprog", ("quadprog",), avoidance=_row("switching")),
+        law("hqp", "strict priorities, a cascade of QPs", "hqp", avoidance=_row("switching")),
         outside("pink", "Pink, with its barrier between collision bodies", "pinks", PINK, ("pin-pink",)),
         outside("mink", "mink, with its limit on collisions", "minks", MINK, ("mink", "mujoco")),
+        outside("placo", "placo, with its constraint on self-collisions", "placos", PLACO, ("placo",), PLACO_PYTHON),
     )
 }
 """Those that ship, in the order of the report."""

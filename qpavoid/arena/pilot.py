@@ -10,7 +10,10 @@ from qpavoid.problem import Array, Solution
 
 
 class Pilot(Protocol):
-    """One entrant, set up for one case. A `Controller` is one; other libraries come in through adapters."""
+    """One entrant, set up for one case. A `Controller` is one; other libraries come in through adapters.
+
+    One that works in another process says in an attribute `seconds` what its last step took there [s].
+    """
 
     def step(self, q: Array, t: float, targets: Mapping[str, Sample], obstacles: Mapping[str, Sample]) -> Solution:
         """Velocity for the next dt.

@@ -36,7 +36,7 @@ class Rollout:
     failed: Array
     """(N,) 1 where the entrant raised or gave no finite velocity, else 0."""
     tick: Array
-    """(N,) time that it took [s]."""
+    """(N,) time that it took [s]; where a pilot works in another process, what it says of that."""
     failure: str
     """The first thing that it said when it failed."""
 
@@ -67,7 +67,8 @@ def roll_out(case: Case, pilot: Pilot, world: World, patience: float = np.inf) -
         begin = perf_counter()
         patient = tick.sum() < patience
         solution, said = _asked(pilot, q, k * dt, targets, seen) if patient else (None, "out of time")
-        tick[k] = perf_counter() - begin
+        elapsed = perf_counter() - begin
+        tick[k] = getattr(pilot, "seconds", elapsed) if patient else elapsed
         if solution is None:
             failed[k], failure = 1.0, failure or said
         else:

@@ -106,7 +106,8 @@ def build(scene: Scene, q0: Array, frames: Sequence[int] = ()) -> Twin:
             name=robot.names[i], pos=placement.translation, quat=_quaternion(placement.rotation),
             explicitinertial=True, mass=1.0, inertia=[1.0, 1.0, 1.0],
         )  # fmt: skip
-        kind, axis = _joint(robot, i)
+        slides, axis = hinge_or_slide(robot, i)
+        kind = mujoco.mjtJoint.mjJNT_SLIDE if slides else mujoco.mjtJoint.mjJNT_HINGE
         joint = body.add_joint(name=robot.names[i], type=kind, axis=axis)
         if robot.joints[i].idx_q in ranges:  # neither kinematics nor integration heed them; who reads the model may
             joint.limited, joint.range = True, ranges[robot.joints[i].idx_q]
@@ -139,17 +140,19 @@ def build(scene: Scene, q0: Array, frames: Sequence[int] = ()) -> Twin:
     return twin
 
 
-def _joint(model: Any, index: int) -> tuple[Any, Array]:
-    """Type and axis (3,) of a joint, in its own frame."""
+def hinge_or_slide(model: Any, index: int) -> tuple[bool, Array]:
+    """Whether a joint slides, and its axis (3,) in its own frame.
+
+    Raises:
+        ValueError: it is neither a hinge nor a slide.
+    """
     joint = model.joints[index]
     if joint.nq != 1 or joint.nv != 1:
         raise ValueError(f"joint {model.names[index]!r}: {joint.shortname()} is neither a hinge nor a slide")
     data = model.createData()
     pin.computeJointJacobians(model, data, pin.neutral(model))
     screw = np.asarray(data.joints[index].S).ravel()
-    if np.any(screw[:3]):
-        return mujoco.mjtJoint.mjJNT_SLIDE, screw[:3]
-    return mujoco.mjtJoint.mjJNT_HINGE, screw[3:]
+    return (True, screw[:3]) if np.any(screw[:3]) else (False, screw[3:])
 
 
 def _add_geom(spec: Any, body: Any, geometry: Any, placement: Any) -> None:

@@ -23,20 +23,16 @@ def frame_tasks(case: Case, world: World, library: str) -> list[FrameTask]:
     Raises:
         ConfigError: the case has something that the library is not given.
     """
-    scenario, refused = case.scenario, []
+    refused = []
     tasks = [task for task in world.tasks if isinstance(task, FrameTask)]
     if len(tasks) < len(world.tasks):
         refused.append("tasks other than `position`, `pose` and `orientation`")
-    if scenario.contacts:
-        refused.append("contacts")
-    if any(obstacle.carried_by for obstacle in scenario.obstacles):
-        refused.append("carried obstacles")
     if world.scene.clouds:
         refused.append("point clouds")
     if any(joint.nq != 1 or joint.nv != 1 for joint in list(world.scene.robot.model.joints)[1:]):
         refused.append("joints that are neither hinges nor slides; lock them")
     if refused:
-        raise ConfigError(f"{scenario.source}: the adapter of {library} knows no {', no '.join(refused)}")
+        raise ConfigError(f"{case.scenario.source}: the adapter of {library} knows no {', no '.join(refused)}")
     return tasks
 
 
@@ -83,7 +79,7 @@ def one_period_ahead(task: FrameTask, target: Sample, here: Array, dt: float) ->
     Returns:
         Pose (4, 4); what of it does not count is as it is.
     """
-    settings, there = task.settings, here.copy()
+    settings, there = task.settings, np.array(here)
     if task.moves:
         linear = target.linear + settings.gain * (target.position - here[:3, 3])
         there[:3, 3] += dt * _capped(linear, settings.max_speed)

@@ -17,6 +17,7 @@ PINK: dict[str, Any] = {
     "gain": 20.0,
     "safe_displacement_gain": 1.0,
     "d_min": "d1",
+    "limits": "position and velocity, and acceleration where the robot has one",
 }
 """`cost` multiplies the root of a task's weight; it and the barrier's gains are those of Pink's example
 kukas_self_collision. Fewer pairs than `n_collision_pairs`: all of them; more: the nearest ones."""
@@ -36,3 +37,6 @@ PLACO: dict[str, Any] = {
     "priority": "hard",
 }
 """Its tasks are soft, its joint limits and velocity limits on."""
+
+PLACO_PYTHON = "QPAVOID_PLACO_PYTHON"
+"""Environment variable that names the Python interpreter that has placo; left out: this one."""

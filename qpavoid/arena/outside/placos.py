@@ -1,0 +1,249 @@
+"""placo, through a process of its own: it needs an older pinocchio than this library does."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import subprocess
+import sys
+import weakref
+from collections.abc import Mapping
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import coal
+import numpy as np
+import pinocchio as pin
+
+from qpavoid.arena.case import Case
+from qpavoid.arena.outside.common import between, frame_tasks, one_period_ahead, parted_pairs, pieces
+from qpavoid.arena.outside.settings import PLACO, PLACO_PYTHON
+from qpavoid.arena.twin import hinge_or_slide
+from qpavoid.arena.world import World
+from qpavoid.config import Limits
+from qpavoid.errors import ConfigError
+from qpavoid.motion import Sample
+from qpavoid.problem import Array, Solution
+from qpavoid.scene import Scene
+from qpavoid.tasks import FrameTask
+
+WORKER = Path(__file__).with_name("placo_worker.py")
+START_PATIENCE = 120.0
+"""For its imports and set-up [s]."""
+STEP_PATIENCE = 10.0
+"""For one answer [s]; then the process is ended, and every later tick fails."""
+_UNLIMITED = 1e6
+"""Stands in the URDF for a limit that a joint has not [rad, m or their rates]."""
+
+
+class Pilot:
+    """Obstacles are bodies that no joint moves; placo's constraint knows no motion of theirs."""
+
+    seconds: float
+    """What the last step took in placo's process, and for its targets: without the way there and back [s]."""
+
+    def __init__(self, case: Case, world: World) -> None:
+        """Starts the process.
+
+        Raises:
+            ConfigError: the case has something that it cannot be given, or the interpreter has no placo.
+        """
+        scenario, scene = case.scenario, world.scene
+        self._followed = frame_tasks(case, world, "placo")
+        self._dt, self._pieces = scenario.dt, pieces(scene)
+        margin, trigger = between(scenario.avoidance)
+        setup = {
+            "urdf": write_urdf(scene, self._followed, scenario.limits),
+            "joints": list(scene.robot.model.names)[1:],
+            "bodies": describe_bodies(scene, str(scenario.source)),
+            "pairs": parted_pairs(scene).tolist(),
+            "tasks": [_described(task) for task in self._followed],
+            "dt": scenario.dt,
+            "regularization": scenario.tracking_damping**2,
+            "margin": margin,
+            "trigger": trigger,
+            "priority": PLACO["priority"],
+        }
+        self.worker = Worker(os.environ.get(PLACO_PYTHON) or sys.executable)
+        try:
+            self.worker.ask("setup", setup, START_PATIENCE)
+        except Ended as error:
+            raise ConfigError(
+                f"{self.worker.python} cannot run placo: {error}; set {PLACO_PYTHON} to the Python interpreter of an "
+                "environment with placo"
+            ) from error
+        except RuntimeError as error:
+            raise ConfigError(f"{scenario.source}: placo cannot be set up: {error}") from error
+
+    def step(self, q: Array, t: float, targets: Mapping[str, Sample], obstacles: Mapping[str, Sample]) -> Solution:
+        """Velocity for the next dt.
+
+        Raises:
+            RuntimeError: placo found none, or its process has ended; the robot is held then.
+        """
+        begin, self.seconds = perf_counter(), 0.0
+        try:
+            poses, placing = self.worker.ask("place", {"q": q, "bodies": self._moved(obstacles)}, STEP_PATIENCE)
+            here = perf_counter()
+            there = [
+                one_period_ahead(task, targets[task.settings.label], pose, self._dt)
+                for task, pose in zip(self._followed, poses, strict=True)
+            ]
+            here = perf_counter() - here
+            v, solving = self.worker.ask("solve", there, STEP_PATIENCE)
+        except Exception:
+            self.seconds = perf_counter() - begin
+            raise
+        self.seconds = placing + here + solving
+        return Solution(np.asarray(v))
+
+    def _moved(self, obstacles: Mapping[str, Sample]) -> dict[int, Array]:
+        """(4, 4) where each piece of the obstacles is, by its number."""
+        return {
+            piece: pin.SE3(seen.rotation, seen.position).homogeneous
+            for name, seen in obstacles.items()
+            for piece in self._pieces[name]
+        }
+
+    def frames(self, q: Array, obstacles: Mapping[str, Sample]) -> Array:
+        """(f, 4, 4) where placo has the frames of the tasks."""
+        poses, _ = self.worker.ask("place", {"q": q, "bodies": self._moved(obstacles)}, STEP_PATIENCE)
+        return np.asarray(poses)
+
+    def distances(self) -> Array:
+        """(k,) what placo takes for the distances of the pairs [m]."""
+        return np.asarray(self.worker.ask("distances", None, STEP_PATIENCE)[0])
+
+
+class Ended(RuntimeError):
+    """The other process is gone."""
+
+
+class Worker:
+    """The other process, and the connection to it. It ends with this object."""
+
+    def __init__(self, python: str) -> None:
+        """Starts it by the interpreter `python`.
+
+        Raises:
+            ConfigError: there is no such interpreter.
+        """
+        self.python = python
+        self._connection, there = Pipe()
+        quiet = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+        try:
+            self.process = subprocess.Popen(
+                [python, str(WORKER), str(there.fileno())],
+                pass_fds=[there.fileno()],
+                env=quiet,  # its packages are its own
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+            )
+        except OSError as error:
+            raise ConfigError(f"{PLACO_PYTHON}: {python} cannot be run: {error.strerror}") from error
+        finally:
+            there.close()
+        weakref.finalize(self, _end, self.process, self._connection)
+
+    def ask(self, command: str, argument: Any, patience: float) -> tuple[Any, float]:
+        """What it answers, and how long it took over that [s].
+
+        Raises:
+            Ended: it has ended, or does not answer within `patience` [s] and has been ended for that.
+            RuntimeError: it raised.
+        """
+        try:
+            self._connection.send_bytes(pickle.dumps((command, argument), protocol=4))
+            if not self._connection.poll(patience):
+                _end(self.process, self._connection)
+                raise Ended(f"the process did not answer within {patience:g} s, and was ended")
+            answer, said, seconds = pickle.loads(self._connection.recv_bytes())
+        except (EOFError, OSError) as error:
+            raise Ended(f"the process has ended, with code {self.process.wait(STEP_PATIENCE)}") from error
+        if said:
+            raise RuntimeError(said)
+        return answer, seconds
+
+
+def _end(process: subprocess.Popen[bytes], connection: Connection) -> None:
+    connection.close()
+    process.kill()
+    process.wait()
+
+
+def _described(task: FrameTask) -> tuple[bool, bool, float, float]:
+    return task.moves, task.turns, task.settings.weight, task.settings.orientation_weight
+
+
+def describe_bodies(scene: Scene, source: str) -> list[tuple[int, str, Any, Array]]:
+    """Joint, shape, sizes and placement (4, 4) of each geometry.
+
+    Raises:
+        ConfigError: a shape that cannot be described.
+    """
+    bodies = []
+    for body in scene.geometry.geometryObjects:
+        kind, sizes = _shape(body, source)
+        bodies.append((int(body.parentJoint), kind, sizes, np.array(body.placement.homogeneous)))
+    return bodies
+
+
+def _shape(body: Any, source: str) -> tuple[str, Any]:
+    match body.geometry:
+        case coal.Sphere() as shape:
+            return "Sphere", (shape.radius,)
+        case coal.Capsule() | coal.Cylinder() | coal.Cone() as shape:
+            return type(shape).__name__, (shape.radius, 2.0 * shape.halfLength)
+        case coal.Box() as shape:
+            return "Box", tuple((2.0 * shape.halfSide).tolist())
+        case coal.Ellipsoid() as shape:
+            return "Ellipsoid", tuple(shape.radii.tolist())
+        case coal.Halfspace() as shape:
+            return "Halfspace", (np.array(shape.n), shape.d)
+        case coal.ConvexBase() as shape:
+            return "Convex", np.array(shape.points())
+        case shape:
+            raise ConfigError(f"{source}: {body.name!r}: the adapter of placo knows no {type(shape).__name__}")
+
+
+def write_urdf(scene: Scene, tasks: list[FrameTask], limits: Limits) -> str:
+    """Joints of a robot and frames of its tasks, without geometry: one link a joint, one on a fixed joint a frame."""
+    model, bounds = scene.robot.model, scene.robot.bounds().within(limits)
+    ranges = dict(zip(bounds.q_index.tolist(), np.stack((bounds.lower, bounds.upper), axis=1).tolist(), strict=True))
+    lines = ['<robot name="robot">', *(f'<link name="link {joint}"/>' for joint in range(model.njoints))]
+    for index in range(1, model.njoints):
+        joint = model.joints[index]
+        slides, axis = hinge_or_slide(model, index)
+        low, high = ranges.get(joint.idx_q, (-_UNLIMITED, _UNLIMITED))
+        lines.append(
+            f'<joint name="{model.names[index]}" type="{"prismatic" if slides else "revolute"}">'
+            f'<parent link="link {model.parents[index]}"/><child link="link {index}"/>'
+            f'{_origin(model.jointPlacements[index])}<axis xyz="{_numbers(axis)}"/>'
+            f'<limit lower="{_finite(low)!r}" upper="{_finite(high)!r}" '
+            f'velocity="{_finite(bounds.velocity[joint.idx_v])!r}" effort="1"/></joint>'
+        )
+    for number, task in enumerate(tasks):
+        frame = model.frames[task.frame_id]
+        lines.append(
+            f'<link name="frame {number}"/><joint name="to frame {number}" type="fixed">'
+            f'<parent link="link {frame.parentJoint}"/><child link="frame {number}"/>'
+            f"{_origin(frame.placement)}</joint>"
+        )
+    return "\n".join([*lines, "</robot>"])
+
+
+def _finite(limit: float) -> float:
+    return float(np.clip(limit, -_UNLIMITED, _UNLIMITED))
+
+
+def _origin(placement: Any) -> str:
+    angles = pin.rpy.matrixToRpy(placement.rotation)
+    return f'<origin xyz="{_numbers(placement.translation)}" rpy="{_numbers(angles)}"/>'
+
+
+def _numbers(values: Any) -> str:
+    return " ".join(repr(float(value)) for value in values)

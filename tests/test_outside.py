@@ -1,0 +1,314 @@
+"""Adapters of other libraries: each sees what this library sees, and is asked for what its tasks ask for."""
+
+import os
+import signal
+import sys
+from functools import cache
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from qpavoid import Sample, load_scenario
+from qpavoid.arena.case import Case, Sensor
+from qpavoid.arena.entrants import ENTRANTS, find_entrant
+from qpavoid.arena.outside.common import frame_tasks, one_period_ahead, parted_pairs
+from qpavoid.arena.outside.settings import PLACO_PYTHON
+from qpavoid.arena.rollout import roll_out
+from qpavoid.arena.trial import run_trial
+from qpavoid.arena.world import build_world
+from qpavoid.errors import ConfigError
+
+pytest.importorskip("mujoco")
+
+SCENARIOS = ["ur5_pole", "panda_line", "crossing_arms", "g1_reach_across"]
+PYTHON = os.environ.get(PLACO_PYTHON) or sys.executable
+
+
+@pytest.fixture(params=["pink", "mink", "placo"])
+def library(request):
+    if ENTRANTS[request.param].missing:
+        pytest.skip(f"{request.param} is not installed")
+    return request.param
+
+
+@pytest.fixture
+def placo():
+    if ENTRANTS["placo"].missing:
+        pytest.skip("placo is not installed")
+
+
+@cache
+def make_case(name, *overrides):
+    return Case("shipped", 3, load_scenario(name, list(overrides)), Sensor(), True, "it ships")
+
+
+@cache
+def world_of(case_name, *overrides):
+    return build_world(make_case(case_name, *overrides).scenario)
+
+
+def start(library, name, *overrides):
+    case, world = make_case(name, *overrides), world_of(name, *overrides)
+    return case, world, ENTRANTS[library].start(case, world)
+
+
+def targets_at(world, t):
+    return {task.settings.label: task.motion.sample(t) for task in world.tasks}
+
+
+def true_distances(world, q, moved):
+    """(k,) distances of the pairs that the robot can part, by coal, obstacles `moved` to where they are said to be."""
+    scene = world.scene
+    geometry, pairs = pin.GeometryModel(scene.geometry), parted_pairs(scene).tolist()
+    for number, obstacle in enumerate(scene.obstacles):
+        if obstacle.name in moved:
+            sample = moved[obstacle.name]
+            for piece in np.flatnonzero(scene.obstacle_of == number):
+                geometry.geometryObjects[int(piece)].placement = pin.SE3(sample.rotation, sample.position)
+    geometry.removeAllCollisionPairs()
+    for a, b in pairs:
+        geometry.addCollisionPair(pin.CollisionPair(a, b))
+    model, data = scene.robot.model, geometry.createData()
+    pin.computeDistances(model, model.createData(), geometry, data, q)
+    return np.array([result.min_distance for result in data.distanceResults])
+
+
+def seen_by(library, pilot, world):
+    """Distances of the same pairs as the library has them, after its last step; NaN for pairs that it leaves out."""
+    if library != "mink":
+        return pilot.distances()
+    found = pilot.distances()
+    return np.array([found.get((a, b), np.nan) for a, b in parted_pairs(world.scene).tolist()])
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_frames_and_distances_are_ours(library, name):
+    _, world, pilot = start(library, name)
+    model, t = world.scene.robot.model, 2.5
+    q = pin.integrate(model, world.q0, 0.1 * np.random.default_rng(1).uniform(-1.0, 1.0, model.nv))
+    moved = {o.name: o.motion.sample(t) for o in world.scene.obstacles if o.moves}
+    pilot.step(q, t, targets_at(world, 0.0), moved)
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, q)
+    frames = pilot.frames(q, moved) if library == "placo" else pilot.frames()
+    ours = [data.oMf[task.frame_id].homogeneous for task in world.tasks]
+    assert frames == pytest.approx(np.array(ours), abs=1e-6)
+    truth, seen = true_distances(world, q, moved), seen_by(library, pilot, world)
+    assert not np.isnan(seen).any()
+    apart = truth > 0.0  # relative: cylinders and hulls are iterated on, to such a tolerance, from where each begins
+    assert apart.mean() > 0.9 and seen[apart] == pytest.approx(truth[apart], rel=4e-6, abs=1e-6)
+
+
+def test_obstacles_that_move_reach_the_library(library):
+    _, world, pilot = start(library, "panda_line")
+    for x in (0.9, 0.75, 0.6):
+        moved = {"ball": Sample.at((x, -0.1, 0.4))}
+        pilot.step(world.q0, 0.0, targets_at(world, 0.0), moved)
+        seen = seen_by(library, pilot, world)
+        assert seen == pytest.approx(true_distances(world, world.q0, moved), abs=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["position", "pose"])
+@pytest.mark.parametrize("library", ["mink", "placo"])
+def test_with_nothing_near_the_velocity_is_that_of_our_tracking_law(library, kind):
+    if ENTRANTS[library].missing:
+        pytest.skip(f"{library} is not installed")
+    case, world, pilot = start(library, "ur5_pole", "obstacles=[]", f"tasks.0.type={kind}")
+    ours = ENTRANTS["tracking"].start(case, world)
+    for t in (0.5, 1.0, 2.0):
+        targets = targets_at(world, t)
+        v = ours.step(world.q0, t, targets, {}).v
+        assert np.abs(v).max() > 0.1
+        assert pilot.step(world.q0, t, targets, {}).v == pytest.approx(v, abs=1e-6)
+
+
+def test_pink_tracks_as_we_do_with_the_damping_of_its_barrier_on_top():
+    pytest.importorskip("pink")
+    from pink.barriers import SelfCollisionBarrier
+
+    from qpavoid.arena.outside.settings import PINK
+
+    case, world, pilot = start("pink", "ur5_pole", "obstacles=[]")
+    (task,), targets = world.tasks, targets_at(world, 1.0)
+    v, model, dt = pilot.step(world.q0, 1.0, targets, {}).v, world.scene.robot.model, case.scenario.dt
+    here = pin.SE3(pilot.frames()[0])
+    there = pin.SE3(one_period_ahead(task, targets[task.settings.label], here.homogeneous, dt))
+    # a translation of its frame task is that of a screw, so that turning counts: half the step times the turn
+    J = pin.computeFrameJacobian(model, model.createData(), world.q0, task.frame_id, pin.ReferenceFrame.LOCAL)
+    J = (pin.Jlog6(there.actInv(here)) @ J)[:3]
+    e = pin.log6(here.actInv(there)).linear
+    rows = SelfCollisionBarrier(min(PINK["n_collision_pairs"], len(parted_pairs(world.scene))))
+    scale = PINK["cost"] * np.linalg.norm(rows.compute_jacobian(pilot.configuration))
+    damping = case.scenario.tracking_damping**2 + PINK["safe_displacement_gain"] / scale**2
+    damped = J.T @ J + damping * np.eye(model.nv)
+    assert v == pytest.approx(np.linalg.solve(damped, J.T @ e) / dt, abs=1e-6)
+    tracking = ENTRANTS["tracking"].start(case, world).step(world.q0, 1.0, targets, {}).v
+    assert np.abs(tracking).max() > 0.1 and v == pytest.approx(tracking, abs=0.01 * np.abs(tracking).max())
+
+
+def test_speed_caps_and_orientations_of_a_target_one_period_ahead():
+    world = world_of("ur5_pole", "tasks.0.type=pose", "tasks.0.max_speed=0.1", "tasks.0.max_turn_rate=0.5")
+    (task,) = world.tasks
+    here = np.array(pin.SE3(pin.exp3(np.array([0.2, -0.4, 1.0])), np.array([0.1, 0.2, 0.3])).homogeneous)
+    turn = np.array([0.3, 0.1, -0.2])
+    target = Sample.at((0.4, 0.2, 0.7), pin.exp3(turn) @ here[:3, :3])
+    there = one_period_ahead(task, target, here, 0.01)
+    assert (there[:3, 3] - here[:3, 3]) / 0.01 == pytest.approx(0.1 * np.array([0.6, 0.0, 0.8]))
+    rate = pin.log3(there[:3, :3] @ here[:3, :3].T) / 0.01
+    assert rate == pytest.approx(0.5 * turn / np.linalg.norm(turn))
+    near = Sample.at(here[:3, 3] + 0.01, pin.exp3(0.1 * turn) @ here[:3, :3], linear=(0.01, 0.0, 0.0))
+    there = one_period_ahead(task, near, here, 0.01)
+    assert (there[:3, 3] - here[:3, 3]) / 0.01 == pytest.approx([0.03, 0.02, 0.02])  # gain 2
+    assert pin.log3(there[:3, :3] @ here[:3, :3].T) / 0.01 == pytest.approx(0.2 * turn)
+
+
+def test_an_obstacle_that_rests_is_kept_clear_of(library):
+    score = run_trial(make_case("ur5_pole", "duration=5"), ENTRANTS[library])
+    assert score.failed == 0.0 and score.violations == 0.0 and not score.collided
+    assert run_trial(make_case("ur5_pole", "duration=5"), ENTRANTS["tracking"]).collided
+    # mink asks only not to come nearer, tick by tick, and what is lost to curvature stays lost
+    assert score.min_distance > score.d1 - (0.005 if library == "mink" else 1e-3)
+
+
+def test_who_gets_out_of_the_way_of_an_obstacle_when_the_robot_rests(library):
+    """Records what the libraries do: none knows the obstacle's velocity, mink does not back away, Pink does not see."""
+    case, world, pilot = start(library, "ur5_pole")
+    targets = {name: sample._replace(linear=np.zeros(3)) for name, sample in targets_at(world, 0.0).items()}
+    scene, count = world.scene, len(parted_pairs(world.scene))
+    hand = [i for i, (_, b) in enumerate(parted_pairs(scene).tolist()) if b >= len(scene.body_names)]
+    assert hand and count > len(hand)
+    distances, speeds = [], []
+    (tool,) = world.tasks
+    data = scene.robot.model.createData()
+    pin.framesForwardKinematics(scene.robot.model, data, world.q0)
+    tip = data.oMf[tool.frame_id].translation
+    for away in (0.30, 0.20, 0.15, 0.12, 0.10, 0.097):
+        seen = {"pole": Sample.at(tip + np.array([away, 0.0, 0.0]))}
+        v = pilot.step(world.q0, 0.0, targets, seen).v
+        distances.append(seen_by(library, pilot, world)[hand].min())
+        speeds.append(float(np.abs(v).max()))
+    assert np.all(np.diff(distances) < 0.0)
+    d1 = case.scenario.avoidance.d1
+    assert distances[0] > 0.1 and 0.0 < distances[-1] < d1
+    if library == "placo":
+        assert speeds[-1] > 0.05
+    else:
+        assert speeds[-1] == pytest.approx(0.0, abs=1e-6)
+    if library == "pink":  # its rows are as old as q: with another q it sees, and backs away
+        v = pilot.step(world.q0 + 1e-3, 0.0, targets, seen).v
+        assert np.abs(v).max() > 0.05
+
+
+def test_the_rows_of_pink_turn_round_in_penetration():
+    """Records it: the docs say so."""
+    barriers = pytest.importorskip("pink.barriers")
+    _, world, pilot = start("pink", "ur5_pole")
+    data, (tool,), nv = world.scene.robot.model.createData(), world.tasks, world.scene.robot.model.nv
+    pin.framesForwardKinematics(world.scene.robot.model, data, world.q0)
+    seen = {"pole": Sample.at(data.oMf[tool.frame_id].translation + np.array([0.02, 0.0, 0.0]))}
+    with pytest.raises(pytest.importorskip("pink.exceptions").NoSolutionFound):
+        pilot.step(world.q0, 0.0, targets_at(world, 0.0), seen)
+    steps = 1e-5 * np.eye(nv)
+    change = [true_distances(world, world.q0 + e, seen) - true_distances(world, world.q0 - e, seen) for e in steps]
+    slope = np.transpose(change) / 2e-5
+    distance, count = pilot.distances(), len(parted_pairs(world.scene))
+    J = barriers.SelfCollisionBarrier(count).compute_jacobian(pilot.configuration)
+    J = J[np.argsort(np.argpartition(-distance, -count))]  # its rows are in the order of its own selection
+    moves = np.linalg.norm(slope, axis=1) > 1e-2
+    along = (J * slope).sum(axis=1)[moves] / np.square(slope[moves]).sum(axis=1)
+    inside = distance[moves] < 0.0
+    assert inside.any() and along[inside] == pytest.approx(-1.0, abs=0.01)
+    assert along[~inside] == pytest.approx(1.0, abs=0.01)
+
+
+def test_pink_refuses_to_go_on_beyond_a_limit():
+    exceptions = pytest.importorskip("pink.exceptions")
+    _, world, pilot = start("pink", "ur5_pole")
+    beyond = world.q0.copy()
+    beyond[2] = world.scene.robot.model.upperPositionLimit[2] + 0.1
+    with pytest.raises(exceptions.NotWithinConfigurationLimits):
+        pilot.step(beyond, 0.0, targets_at(world, 0.0), {})
+    assert np.isfinite(pilot.step(world.q0, 0.0, targets_at(world, 0.0), {}).v).all()
+
+
+def test_a_process_that_is_killed_makes_failures_and_no_hang(placo):
+    case = make_case("ur5_pole", "duration=1")
+    world = build_world(case.scenario)
+    pilot = ENTRANTS["placo"].start(case, world)
+
+    class Killed:
+        def step(self, q, t, targets, obstacles):
+            if round(t / case.scenario.dt) == 40:
+                os.kill(pilot.worker.process.pid, signal.SIGKILL)
+            return pilot.step(q, t, targets, obstacles)
+
+    rollout = roll_out(case, Killed(), world)
+    assert rollout.failed[:40].sum() == 0 and rollout.failed[40:].all()
+    assert "has ended" in rollout.failure and not rollout.v[40:].any()
+
+
+def test_a_process_that_does_not_answer_is_ended(placo, monkeypatch):
+    monkeypatch.setattr("qpavoid.arena.outside.placos.STEP_PATIENCE", 0.3)
+    _, world, pilot = start("placo", "ur5_pole")
+    pilot.worker.process.send_signal(signal.SIGSTOP)
+    with pytest.raises(RuntimeError, match=r"did not answer within 0\.3 s"):
+        pilot.step(world.q0, 0.0, targets_at(world, 0.0), {})
+    assert pilot.seconds >= 0.3
+    assert pilot.worker.process.poll() == -signal.SIGKILL
+    with pytest.raises(RuntimeError, match="has ended"):
+        pilot.step(world.q0, 0.0, targets_at(world, 0.0), {})
+
+
+def test_the_process_ends_with_its_pilot(placo):
+    _, _, pilot = start("placo", "ur5_pole")
+    process = pilot.worker.process
+    assert process.poll() is None
+    del pilot
+    assert process.poll() is not None
+
+
+def test_the_time_of_a_tick_is_that_in_the_other_process(placo):
+    case = make_case("ur5_pole", "duration=0.5")
+    world = build_world(case.scenario)
+    pilot = ENTRANTS["placo"].start(case, world)
+
+    class Slow:
+        seconds = 0.0
+
+        def step(self, q, t, targets, obstacles):
+            solution = pilot.step(q, t, targets, obstacles)
+            self.seconds = 123.0
+            return solution
+
+    assert np.all(roll_out(case, Slow(), world).tick == 123.0)
+
+
+def test_an_interpreter_without_placo_is_told_apart(monkeypatch):
+    case, world = make_case("ur5_pole"), world_of("ur5_pole")
+    monkeypatch.setenv(PLACO_PYTHON, "/nowhere/python")
+    assert not ENTRANTS["placo"].missing
+    with pytest.raises(ConfigError, match=r"/nowhere/python cannot be run: No such file"):
+        ENTRANTS["placo"].start(case, world)
+    monkeypatch.setenv(PLACO_PYTHON, "/bin/true")
+    with pytest.raises(ConfigError, match=r"/bin/true cannot run placo.*has ended, with code 0; set QPAVOID_PLACO"):
+        ENTRANTS["placo"].start(case, world)
+
+
+def test_what_is_missing_and_how_to_get_it(monkeypatch):
+    monkeypatch.delenv(PLACO_PYTHON, raising=False)
+    if ENTRANTS["placo"].missing:
+        with pytest.raises(ConfigError, match=r"needs placo: pip install placo, or set QPAVOID_PLACO_PYTHON"):
+            find_entrant("placo")
+
+
+def test_what_an_adapter_does_not_know_is_refused_at_the_start():
+    posture = make_case("ur5_pole", "tasks=[{frame: tool0}, {type: posture}]")
+    with pytest.raises(ConfigError, match=r"adapter of Pink knows no tasks other than `position`, `pose`"):
+        frame_tasks(posture, build_world(posture.scenario), "Pink")
+    cloud = make_case("ur5_pole", "obstacles.0.shape={type: point_cloud, resolution: 0.05}")
+    with pytest.raises(ConfigError, match="knows no point clouds"):
+        frame_tasks(cloud, build_world(cloud.scenario), "placo")
+    free = make_case("g1_reach_across", "lock=[]")
+    with pytest.raises(ConfigError, match="neither hinges nor slides; lock them"):
+        frame_tasks(free, build_world(free.scenario), "placo")
