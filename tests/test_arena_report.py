@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 from html.parser import HTMLParser
 
 import numpy as np
@@ -18,11 +19,12 @@ import pyarrow as pa
 from scipy.stats import binom, binomtest
 
 from qpavoid.arena import statistics
+from qpavoid.arena.coverage import gaps
 from qpavoid.arena.report import report_of, rerun_line, write_report
 from qpavoid.arena.results import results_of
 from qpavoid.arena.scores import COLUMNS
 from qpavoid.arena.statistics import CONFIDENCE, duel, mean, median, pareto, ranks, rate
-from qpavoid.arena.store import Store
+from qpavoid.arena.store import Store, read_failures
 from qpavoid.arena.tables import COLUMNS as SHOWN
 from qpavoid.arena.tables import MORE
 from qpavoid.errors import ConfigError
@@ -38,6 +40,7 @@ def row(entrant="qp", case="a", family="field", success=True, **more):
         **{name: blank[kind] for name, kind in COLUMNS.items()},
         "robot": "panda",
         "reachable": True,
+        "seed": int.from_bytes(case.encode()[-6:], "big"),  # another case, another seed
         **given,
         **more,
     }
@@ -312,7 +315,7 @@ def written(tmp_path_factory):
     with Store(folder) as store:
         for one in rows:
             store.runs.append(one)
-        store.fail({"family": "field 0", "seed": 99, "failure": NASTY})
+        store.fail({"family": "field 0", "seed": 99, "entrant": None, "failure": NASTY})
         entrants = {f"of {NASTY}": {"name": NASTY, "says": NASTY, "settings": {"solver": NASTY}}}
         facts = {"title": NASTY, "machine": {"cpu": NASTY}, "versions": {"numpy": "2"}, "absent": {"placo": ["placo"]}}
         store.describe({**facts, "entrants": entrants})
@@ -386,7 +389,7 @@ def test_tables_of_the_markdown_are_well_formed(written):
 def test_who_took_no_part_and_what_was_not_made_is_told(written):
     markdown = (written[0] / "report.md").read_text()
     assert "placo does not take part: it needs placo." in markdown
-    assert "Not made or run: family field 0 seed 99" in markdown
+    assert f"- field 0, seed 99: could not be made: `{NASTY.replace('`', chr(39))}`\n" in markdown
 
 
 def test_the_same_results_make_the_same_report(written, tmp_path):
@@ -442,3 +445,60 @@ def test_the_command_writes_the_report(cli, written):
     assert done.status == 0 and done.stdout.split("\n")[:-1] == [str(file) for file in files]
     assert cli("bench", "report", folder / "nowhere").status == 2
     assert json.loads((folder / "suite.json").read_text())["title"] == NASTY
+
+
+# --- what is not there ---------------------------------------------------------------------------------------
+
+
+def test_a_family_that_was_changed_does_not_count_twice():
+    before = [row(name, f"before {k}", seed=k, success=name == "qp") for k in range(3) for name in ("qp", "eq10")]
+    after = [row(name, f"after {k}", seed=k, success=name == "eq10") for k in range(2) for name in ("qp", "eq10")]
+    results = results_of(table([*before, *after]), ("qp", "eq10"))
+    assert results.table("success").sum(axis=0).tolist() == [1, 2]  # the third seed is as it was
+    assert results.replaced == 4 and len(results.cell) == 3
+    one_alone = results_of(table([*before, *after[:1]]), ("qp", "eq10"))  # then there is nothing to compare it with
+    assert list(one_alone.missing()) == [("eq10", "field", 1)] and one_alone.replaced == 2
+
+
+def test_what_a_suite_asks_for_and_has_not_got_is_told():
+    results = results_of(table([row(name, str(k), seed=k) for k in (3, 4, 7) for name in ("qp", "pink")]))
+    entrants = {name: {"name": name, "says": "", "settings": {}} for name in ("qp", "hqp")}
+    facts = {"families": ["field", "shelf"], "first_seed": 3, "seeds": 4, "entrants": entrants}
+    facts["absent"] = {"pink": ["pin-pink"], "mink": ["mink"]}  # pink has run here before
+    facts["failures"] = [
+        {"family": "shelf", "seed": k, "entrant": who, "failure": "no\nway"} for who in (None, "hqp") for k in range(7)
+    ]
+    assert list(gaps(results, facts)) == [
+        "Nobody has run 2 of the 4 cases of field that the suite asks for.",
+        "Nobody has run 4 of the 4 cases of shelf that the suite asks for.",
+        "mink does not take part: it needs mink.",
+        "hqp was to take part, and has no run.",
+        "shelf, seed 0, 1, 2, 3, 4, …: could not be made: `no way`",
+        "shelf, seed 0, 1, 2, 3, 4, …: could not be run by hqp: `no way`",
+    ]
+    whole = {"families": ["field"], "first_seed": 3, "seeds": 2, "entrants": {"qp": entrants["qp"]}}
+    assert not list(gaps(results, whole)) and not list(gaps(results, {}))
+
+
+def test_versions_that_differ_are_told():
+    results = results_of(table([row("qp", version="2"), row("eq10", version="1")]))
+    assert [line for line in gaps(results, {}) if "different versions" in line and "eq10 1, qp 2" in line]
+
+
+def test_an_entrant_from_a_file_is_run_again_from_it(tmp_path):
+    facts = {"entrants": {"of Mine": {"name": "Mine", "says": "", "settings": {"file": "my law.py", "digest": "0"}}}}
+    runs = [row(name, success=False) for name in ("Mine", "qp")]
+    worst = next(section for section in report_of(table(runs), facts, tmp_path) if section.title == "Worst runs")
+    commands = {line[0].text: shlex.split(line[-1].text)[-1] for line in worst.tables[0].rows}
+    assert commands == {"Mine": "my law.py:Mine", "qp": "qp"}
+
+
+def test_a_folder_without_a_list_of_failures_keeps_its_facts(tmp_path):
+    with Store(tmp_path) as store:
+        store.runs.append(row())
+        store.describe({"title": "Told", "entrants": {}})
+    (tmp_path / "failures.jsonl").write_text('{"family": "field", "se')  # a sweep is writing it
+    assert read_failures(tmp_path) == []
+    (tmp_path / "failures.jsonl").unlink()
+    write_report(tmp_path)
+    assert (tmp_path / "report.md").read_text(encoding="utf-8").startswith("# Arena: Told\n")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import tempfile
 from contextlib import ExitStack
 from importlib.util import find_spec
-from json import loads
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -192,9 +191,10 @@ def _swept(suite: Suite, folder: Path, cluster: str | None, jobs: int | None) ->
 
 def _failures(folder: Path) -> list[str]:
     """What the last sweep could not make or run, a line each."""
+    from qpavoid.arena.store import read_failures
+
     said = []
-    for line in (folder / "failures.jsonl").read_text(encoding="utf-8").splitlines():
-        f = loads(line)
+    for f in read_failures(folder):
         what = "the case could not be made" if f["entrant"] is None else f"{f['entrant']} could not be run"
         said.append(f"{f['family']}, seed {f['seed']}: {what}: {f['failure']}")
     return said

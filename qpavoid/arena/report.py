@@ -13,12 +13,13 @@ import numpy as np
 import pyarrow as pa
 
 from qpavoid.arena import figures
+from qpavoid.arena.coverage import gaps
 from qpavoid.arena.entrants import ENTRANTS
 from qpavoid.arena.families import load_family
 from qpavoid.arena.pages import write_markdown, write_page
 from qpavoid.arena.results import Results, results_of
 from qpavoid.arena.statistics import CONFIDENCE, duel, mean
-from qpavoid.arena.store import read_runs
+from qpavoid.arena.store import read_failures, read_runs
 from qpavoid.arena.suite import facts_of
 from qpavoid.arena.tables import (
     COLUMNS,
@@ -41,12 +42,15 @@ LIMITS = (
     "way, the QPs hold d1.",
     "Laws without limits of their own are scaled to the joints' limits by the controller. No entrant plans: a way that "
     "leads round by going back is out of reach for all, though a planner has shown that there is one.",
-    "Other libraries are in their documented default use; nothing is tuned for or against them. They do not know the "
-    "velocities of obstacles, or of targets, unless their interface takes them.",
-    "Times are those of whole ticks, from state to velocity, on the machine above with as many processes at once as it "
-    "has cores. Ratios of less than 1.5 mean little; `bench/tick` is where libraries are timed side by side.",
+    "Other libraries are in their documented default use; nothing is tuned for or against them. Targets are given to "
+    "them one period ahead, as a task of this library would have it; of obstacles they know where these are, not how "
+    "they move.",
+    "Times are those of whole ticks, from state to velocity, on the machine above, with that many processes at once. "
+    "Ratios of less than 1.5 mean little; `bench/tick` is where libraries are timed side by side.",
     "Distances, contacts and limit violations are MuJoCo's, which plays the commanded velocities again with kinematics "
     "and distances of its own, at the ticks and between them.",
+    "Not measured: drives, dynamics and forces; sensors, beyond the delay and noise of a family that says so; memory, "
+    "and the time to set up; what a tick that comes late would do, for here every velocity is there in time.",
 )
 
 
@@ -91,7 +95,7 @@ def report_of(runs: pa.Table, facts: dict[str, Any], folder: Path = Path("DIR"))
     yield _duels(results)
     for index, name in enumerate(results.families):
         yield _family(results, index, name)
-    yield _worst(results, folder)
+    yield _worst(results, facts, folder)
     yield _failures(results)
 
 
@@ -99,10 +103,9 @@ def _facts(folder: Path) -> dict[str, Any]:
     """What suite.json says, and what the last sweep could not make or run."""
     try:
         facts = json.loads((folder / "suite.json").read_text(encoding="utf-8"))
-        failures = [json.loads(line) for line in (folder / "failures.jsonl").read_text(encoding="utf-8").splitlines()]
     except (OSError, ValueError):
-        return {}
-    return {**facts, "failures": failures}
+        facts = {}
+    return {**facts, "failures": read_failures(folder)}
 
 
 def _made_on(results: Results, runs: pa.Table, facts: dict[str, Any]) -> Section:
@@ -111,28 +114,13 @@ def _made_on(results: Results, runs: pa.Table, facts: dict[str, Any]) -> Section
         for what in ("versions", "machine")
         if facts.get(what)
     ]
+    if "workers" in facts:
+        points.append(f"Processes at once, in the last sweep: {facts['workers']}.")
     points.append(
         f"{len(runs)} runs: {len(results.entrants)} entrants, {len(results.families)} families, {len(results.cell)} "
         f"cases. All figures are of the {int(results.common.sum())} cases that every entrant has run."
     )
-    points += [
-        f"{name} has not run {count} cases of {family}, which count for nobody."
-        for name, family, count in results.missing()
-    ]
-    points += [
-        f"{name} does not take part: it needs {', '.join(packages)}."
-        for name, packages in facts.get("absent", {}).items()
-    ]
-    points += [
-        f"Not made or run: {' '.join(f'{name} {value}' for name, value in failure.items())}"
-        for failure in facts.get("failures", [])
-    ]
-    if results.replaced:
-        points.append(
-            f"{results.replaced} rows are of older versions or settings of an entrant, and count for nothing."
-        )
-    if results.bounded:
-        points.append(f"{results.bounded} figures were infinite or no numbers: they stand at the worst of all runs.")
+    points += gaps(results, facts)
     return Section("What this was made on", points=tuple(points))
 
 
@@ -210,16 +198,17 @@ def _duels(results: Results) -> Section:
 _LISTED = 3
 
 
-def _worst(results: Results, folder: Path) -> Section:
-    rows = []
+def _worst(results: Results, facts: dict[str, Any], folder: Path) -> Section:
+    rows, told = [], facts.get("entrants", {})
     for entrant, name in enumerate(results.entrants):
+        file = told.get(results.settings[entrant], {"settings": {}})["settings"].get("file", "")
         index = results.rows_of(entrant)
         index = index[~results.columns["success"][index].astype(bool)]
         collided, distance, error = (results.columns[c][index] for c in ("collided", "min_distance", "final_error"))
         worst = index[np.lexsort((-error, np.where(collided, distance, 0.0), ~collided.astype(bool)))[:_LISTED]]
         for row in (results.row(i) for i in worst.tolist()):
             where = text_cell(row["family"]), count_cell(row["seed"]), text_cell(row["robot"])
-            again = Cell(rerun_line(row, folder), name, code=True)
+            again = Cell(rerun_line(row, folder, file), name, code=True)
             rows.append((text_cell(name), *where, text_cell(_went_wrong(row)), again))
     headings = ("entrant", "family", "seed", "robot", "what went wrong", "run it again")
     text = (
@@ -236,21 +225,17 @@ def _went_wrong(row: dict[str, Any]) -> str:
     return "not at rest at the end"
 
 
-def rerun_line(row: dict[str, Any], folder: Path) -> str:
-    """The command that runs one row once more."""
-    words = (
-        "qpavoid",
-        "bench",
-        "show",
-        folder,
-        "--family",
-        row["family"],
-        "--seed",
-        row["seed"],
-        "--entrant",
-        row["entrant"],
-    )
-    return shlex.join(map(str, words))
+def rerun_line(row: dict[str, Any], folder: Path, file: str = "") -> str:
+    """The command that runs one row once more.
+
+    Args:
+        row: the run.
+        folder: of the results.
+        file: that the entrant came from, where it does not ship.
+    """
+    entrant = f"{file}:{row['entrant']}" if file else row["entrant"]
+    case = ("--family", row["family"], "--seed", row["seed"])
+    return shlex.join(map(str, ("qpavoid", "bench", "show", folder, *case, "--entrant", entrant)))
 
 
 def _failures(results: Results) -> Section:

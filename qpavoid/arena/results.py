@@ -23,6 +23,8 @@ class Results:
     entrants: tuple[str, ...]
     settings: tuple[str, ...]
     """Digest of each."""
+    versions: tuple[str, ...]
+    """Of qpavoid, with which each ran."""
     families: tuple[str, ...]
     columns: dict[str, Any]
     """Column of `scores.Score` -> (n,) its values."""
@@ -31,7 +33,7 @@ class Results:
     family: IntArray
     """(cases,) index of the family."""
     replaced: int
-    """Rows of older versions or settings of an entrant, which count for nothing."""
+    """Rows of older versions or settings of an entrant, or of older cases, which count for nothing."""
     bounded: int
     """Figures that were not finite, and stand at the worst of all runs."""
 
@@ -81,14 +83,16 @@ def results_of(runs: pa.Table, order: Sequence[str] = ()) -> Results:
     """Results of a table of runs.
 
     An entrant is what its last row says that it is: rows under the same name with other settings, or of another version
-    of this library, are not mixed with these.
+    of this library, are not mixed with these. Likewise a seed of a family is the case that was run last, so that a
+    family that has been changed does not count twice.
 
     Args:
         runs: columns as in `scores.COLUMNS`, at least one row, in the order in which they were done.
         order: entrants that come first, in this order; the others follow by name.
     """
     given = len(runs)
-    runs = _current(runs)
+    runs = _newest(runs, ("entrant",), [name for name in KEY if name != "case"])
+    runs = _newest(runs, ("family", "seed"), ("case",))
     columns = {name: runs[name].to_numpy(zero_copy_only=False) for name in runs.column_names}
     bounded = sum(_bound(columns, name) for name, kind in COLUMNS.items() if kind == "float")
     who, names = _coded(runs["entrant"], order)
@@ -98,19 +102,24 @@ def results_of(runs: pa.Table, order: Sequence[str] = ()) -> Results:
     cell[case, who] = np.arange(len(runs))
     family_of = np.empty(len(cases), dtype=np.intp)
     family_of[case] = family
-    settings = np.empty(len(names), dtype=object)
-    settings[who] = columns["settings"]
+    some = cell.max(axis=0)
+    settings, versions = (tuple(columns[name][some].tolist()) for name in ("settings", "version"))
     kept = int(np.sum(cell >= 0))
-    return Results(names, tuple(settings.tolist()), families, columns, cell, family_of, given - kept, bounded)
+    return Results(names, settings, versions, families, columns, cell, family_of, given - kept, bounded)
 
 
-def _current(runs: pa.Table) -> pa.Table:
-    """The rows whose settings and version are those of the last row of their entrant."""
-    who, names = _coded(runs["entrant"])
-    what, _ = _coded(pc.binary_join_element_wise(*(runs[name].cast("string") for name in KEY if name != "case"), "\0"))
-    last = np.empty(len(names), dtype=np.intp)
-    last[who] = np.arange(len(runs))  # of several numpy keeps the last
-    return runs.filter(pa.array(what == what[last[who]]))
+def _newest(runs: pa.Table, of: Sequence[str], what: Sequence[str]) -> pa.Table:
+    """The rows in which the columns `what` are as in the last row that has the same columns `of`."""
+    place, values = _coded(_joined(runs, of))
+    said, _ = _coded(_joined(runs, what))
+    last = np.empty(len(values), dtype=np.intp)
+    last[place] = np.arange(len(runs))  # of several numpy keeps the last
+    return runs.filter(pa.array(said == said[last[place]]))
+
+
+def _joined(runs: pa.Table, columns: Sequence[str]) -> pa.ChunkedArray:
+    """Columns as one of text."""
+    return pc.binary_join_element_wise(*(runs[name].cast("string") for name in columns), "\0")
 
 
 def _coded(column: pa.ChunkedArray, first: Sequence[str] = ()) -> tuple[IntArray, tuple[str, ...]]:

@@ -77,6 +77,14 @@ def read_cases(folder: Path, columns: Sequence[str] | None = None) -> pa.Table:
     return _read(folder, CASES, columns)
 
 
+def read_failures(folder: Path) -> list[dict[str, Any]]:
+    """What the last sweep could not make or run: family, seed, entrant (None: the case could not be made), failure."""
+    try:
+        return list(_rows((folder / "failures.jsonl").read_bytes()))
+    except FileNotFoundError:
+        return []
+
+
 def _read(folder: Path, kind: Kind, columns: Sequence[str] | None = None) -> pa.Table:
     if not any((folder / name).exists() for name in (kind.name, f"{kind.name}.jsonl")):
         raise ConfigError(f"{folder}: no results here; give a folder that `qpavoid bench run … --out` wrote")
