@@ -121,14 +121,14 @@ def ranks(success: Flags, error: Array, names: Sequence[str]) -> dict[str, int]:
 
     Args:
         success: (cases, entrants).
-        error: (cases, entrants) by the mean of which those are put in order that succeed equally often.
+        error: (cases, entrants) by the mean of which, to 1e-4, those are put in order that succeed equally often.
         names: (entrants,).
 
     Returns:
         In the order of the ranking; 1 is best.
     """
     won, missed = success.sum(axis=0), error.mean(axis=0)
-    order = sorted(range(len(names)), key=lambda i: (-won[i], missed[i], names[i]))
+    order = sorted(range(len(names)), key=lambda i: (-won[i], round(float(missed[i]), 4)))
     found: dict[str, int] = {}
     leader, rank = order[0] if order else 0, 1
     for place, i in enumerate(order, 1):
