@@ -383,7 +383,7 @@ class Controller:
             blocked = self._progress.update(problem, solution)
             solution = solution._replace(blocked=blocked) if blocked else solution
         if self._escape is not None and not faults:
-            solution = self._with_a_way_out(self._escape, q, t, solution)
+            solution = self._with_a_way_out(self._escape, q, t, problem, solution)
         self._assembly.remember(solution.v)
         solution = solution._replace(assumed=assumed) if assumed else solution
         return samples, proximity, problem, solution.timed(built - begin, perf_counter() - built)
@@ -431,10 +431,13 @@ class Controller:
         status = solution.status if solution.status is Status.STOPPED else Status.RELAXED
         return solution._replace(v=v, share=share, status=status, reasons=(*solution.reasons, reason))
 
-    def _with_a_way_out(self, escape: EscapePlanner, q: Array, t: float, solution: Solution) -> Solution:
+    def _with_a_way_out(
+        self, escape: EscapePlanner, q: Array, t: float, problem: Problem, solution: Solution
+    ) -> Solution:
         v = escape.check(q, solution.v, t, self._assembly.v_last)
         if v is None:
             return solution
+        v = np.clip(v, problem.lower, problem.upper)
         reason = "the tasks: no way out would be left among the obstacles that move"
         status = solution.status if solution.status is Status.STOPPED else Status.RELAXED
         return solution._replace(v=v, status=status, reasons=(*solution.reasons, reason))
