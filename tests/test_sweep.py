@@ -36,7 +36,7 @@ from qpavoid.arena.summary import broken, summary
 from qpavoid.arena.trial import run_trial
 from qpavoid.arena.world import build_world
 from qpavoid.errors import ConfigError, UnknownName
-from qpavoid.loading import suite_names
+from qpavoid.loading import family_names, suite_names
 
 POST = {
     "title": "A post",
@@ -293,6 +293,12 @@ def test_suites_that_ship(name):
     assert suite.families and suite.entrants and len(suite.seeds) >= 2
 
 
+def test_the_full_suite_is_everything():
+    suite = load_suite("full")
+    assert sorted(family.name for family in suite.families) == family_names()
+    assert {entrant.name for entrant in suite.entrants + suite.absent} == set(ENTRANTS)
+
+
 def test_a_law_with_settings_of_its_own_changes_these_and_no_others(folder):
     path = write_suite(
         folder, [{"name": "wide", "solver": {"name": "qp", "backend": "daqp"}, "avoidance": {"d2": 0.3}}]
@@ -481,7 +487,7 @@ def cluster(tmp_path):
             process.wait()
 
 
-def until(true, seconds=60.0):
+def until(true, seconds=300.0):
     end = time.monotonic() + seconds
     while not true():
         assert time.monotonic() < end, "waited in vain"

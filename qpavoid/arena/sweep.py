@@ -46,7 +46,6 @@ _SINGLE_THREADED = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBL
 _DEAF = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
 """Run by a worker as it starts: a terminal sends Ctrl-C to it as well, and it is for the sweep to end its workers."""
 _DASK = {
-    "distributed.scheduler.worker-saturation": 1.0,  # what waits does so at the scheduler, not at a worker that may die
     "distributed.scheduler.allowed-failures": 0,  # whose worker died is tried again by us, alone
     "distributed.admin.low-level-log-length": 0,  # the scheduler's memory stays flat
     "distributed.deploy.lost-worker-timeout": "60 s",  # on a busy machine it takes long to start again
@@ -266,14 +265,18 @@ def _answers(
 def _together(
     client: Client, function: Callable[..., Any], calls: Iterable[tuple[Any, ...]]
 ) -> Iterator[tuple[tuple[Any, ...], Any]]:
-    """Each call with what it returned or raised, as they come. Few are under way at a time, however many there are."""
+    """Each call with what it returned or raised, as they come.
+
+    No more are under way than there are threads, however many there are in all: none waits at a worker behind one that
+    brings it down.
+    """
     calls = iter(calls)
     under_way: dict[str, tuple[Any, ...]] = {}
     futures = as_completed(with_results=True, raise_errors=False)
 
     def refill() -> None:
-        most = 2 * _threads(client) + 8
-        for call in itertools.islice(calls, max(most - len(under_way), 0)):
+        free = max(_threads(client) - len(under_way), not under_way)
+        for call in itertools.islice(calls, free):
             future = client.submit(function, *call, key=f"{function.__name__}-{uuid4().hex}", pure=False)
             under_way[future.key] = call
             futures.add(future)
