@@ -3,7 +3,7 @@
 A row is the *state* of a body: rotation by columns, position, linear and angular velocity, all in world axes (18,).
 Every trajectory of `qpavoid.motion` is cut into pieces on which the state is a weighted sum of constant ones, with
 weights that follow from the time alone (`kernels.motions.Pieces`): rest, a straight line (p0, Δp), the shortest turn by
-Rodrigues' formula (R0 + [a]² R0, [a] R0, -[a]² R0), a circle (c, w, u). A trajectory of another class has its `sample` called.
+Rodrigues' formula (R0 + [a]² R0, [a] R0, -[a]² R0), a circle (c, w, u). A trajectory of another class is sampled alone.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ from qpavoid.problem import Array
 
 STATE = 18
 """Numbers in a state."""
+_TOGETHER_FROM = 1 if kernels.ACCELERATED else 3
+"""Number of bodies from which sampling them together pays."""
 
 
 def as_samples(states: Array) -> list[Sample]:
@@ -58,7 +60,10 @@ class Courses:
         Args:
             motions: trajectory of each body, by the row of the states that it has.
         """
-        known = {body: pieces for body, motion in motions.items() if (pieces := _cut(motion)) is not None}
+        cuts = {body: _cut(motion) for body, motion in motions.items()}
+        known = {body: cut for body, cut in cuts.items() if cut is not None}
+        if len(known) < _TOGETHER_FROM:
+            known = {}
         self.others = {body: motion for body, motion in motions.items() if body not in known}
         """Those that have to be sampled one by one."""
         self._pieces = kernels.pack_pieces(_joined(known)) if known else None

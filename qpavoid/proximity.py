@@ -40,7 +40,7 @@ class DistanceQuery:
             request.gjk_tolerance = 1e-10  # the default 1e-6 leaves errors of 7e-3 in normals of boxes and hulls
         bodies = self._geometry.geometryObjects
         self._first_obstacle, self._movable = len(scene.body_names), scene.movable
-        self._pieces = [np.flatnonzero(scene.obstacle_of == i) for i in range(len(scene.obstacles))]
+        self._pieces = [np.flatnonzero(scene.obstacle_of == i).tolist() for i in range(len(scene.obstacles))]
         model = scene.robot.model
         pin.updateGeometryPlacements(model, model.createData(), self._geometry, self._data, pin.neutral(model))
         pin.computeDistances(self._geometry, self._data)  # so that there is something to compare the view with
@@ -214,7 +214,7 @@ class DistanceQuery:
         self._grouped[mine] = True
         self.group[mine] = mine[np.searchsorted(a[mine], a[mine])]
         bodies = [self._geometry.geometryObjects[i].geometry for i in range(first)]
-        return Slots(bodies, self._pieces[index], shape.resolution, shape.nearest, voxels)
+        return Slots(bodies, np.array(self._pieces[index]), shape.resolution, shape.nearest, voxels)
 
     def _fill(self, index: int, slots: Slots, reach: float) -> None:
         """Puts the balls of a cloud to the voxels that are nearest to each body."""

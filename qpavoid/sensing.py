@@ -25,6 +25,9 @@ from qpavoid.motion import Sample
 from qpavoid.problem import Array, IntArray, as_vector
 from qpavoid.scene import Obstacle
 
+_AT_REST = np.zeros(3)
+_AT_REST.setflags(write=False)
+
 
 class Pose(NamedTuple):
     """Where an obstacle was seen, when nothing is known of its velocity."""
@@ -123,18 +126,22 @@ class Obstacles:
         if not given and not self._moving and not self._tracks:
             return None
         known = len(self._tracks)
+        self._follow(t)
         fresh, voxels, notes = self._read(t, given or {})
         for index, what in fresh.items():
-            self._tracks[index] = self._track(index, what)
+            if isinstance(what, Pose):
+                self._tracks[index] = _Track(self._with_twist(index, what), estimated=True)
+                put(self._views[index], self._tracks[index].sample)
+            else:
+                self._tracks[index] = _Track(what, estimated=False)
         if len(self._tracks) != known:
             self._renew()
-        self._follow(t)
         stop: list[str] = []
         self._seen.margin.fill(0.0)
         for index, track in self._tracks.items():
-            put(self._views[index], track.sample)
             if index not in fresh:
                 track.age += 1
+                put(self._views[index], track.sample)
                 self._predict(index, track.age * self._dt, notes, stop)
             elif track.estimated:
                 notes.append(f"{self._obstacles[index].name}: twist estimated from its poses")
@@ -172,12 +179,22 @@ class Obstacles:
                     self._tracks.setdefault(index, self._unseen(index, t))
             else:
                 fresh[index] = as_sample(f"obstacle {name!r}", what)
-        for index in [index for index, what in fresh.items() if not finite(what)]:
+        for index in self._unusable(fresh):
             notes.append(f"{self._obstacles[index].name}: NaN or infinity in its pose or twist, taken as not given")
             del fresh[index]
             voxels.pop(index, None)
             self._tracks.setdefault(index, self._unseen(index, t))
         return fresh, voxels, notes
+
+    def _unusable(self, fresh: Mapping[int, Sample | Pose]) -> list[int]:
+        """Numbers of those with NaN or infinity; puts what is given into the states."""
+        if not fresh:
+            return []
+        for index, what in fresh.items():
+            put(self._views[index], what if isinstance(what, Sample) else Sample(*what, _AT_REST, _AT_REST))
+        which = np.array(list(fresh))
+        usable = np.isfinite(self._seen.states[which]).all(axis=1)
+        return [] if usable.all() else which[~usable].tolist()
 
     def _look_at(
         self,
@@ -218,16 +235,14 @@ class Obstacles:
     def _unseen(self, index: int, t: float) -> _Track:
         return _Track(self._obstacles[index].motion.sample(t), estimated=False)
 
-    def _track(self, index: int, what: Sample | Pose) -> _Track:
-        if isinstance(what, Sample):
-            return _Track(what, estimated=False)
+    def _with_twist(self, index: int, pose: Pose) -> Sample:
+        """A pose with the twist that has led to it since the last one; at rest if it is the first."""
         before = self._tracks.get(index)
-        linear, angular = np.zeros(3), np.zeros(3)
-        if before is not None:
-            elapsed = (before.age + 1) * self._dt
-            linear = (what.position - before.sample.position) / elapsed
-            angular = pin.log3(what.rotation @ before.sample.rotation.T) / elapsed
-        return _Track(Sample(what.position, what.rotation, linear, angular), estimated=True)
+        if before is None:
+            return Sample(*pose, _AT_REST, _AT_REST)
+        elapsed = (before.age + 1) * self._dt
+        linear = (pose.position - before.sample.position) / elapsed
+        return Sample(*pose, linear, pin.log3(pose.rotation @ before.sample.rotation.T) / elapsed)
 
     def _predict(self, index: int, age: float, notes: list[str], stop: list[str]) -> None:
         """Moves an obstacle on from where it was last seen, `age` seconds ago."""
@@ -267,7 +282,7 @@ def as_sample(name: str, what: Any) -> Any:
 def as_goal(name: str, what: Any) -> Sample:
     """`as_sample` of what a task should reach: a bare `Pose` is one at rest."""
     sample = as_sample(name, what)
-    return sample if isinstance(sample, Sample) else Sample(sample.position, sample.rotation, np.zeros(3), np.zeros(3))
+    return sample if isinstance(sample, Sample) else Sample(sample.position, sample.rotation, _AT_REST, _AT_REST)
 
 
 def finite(what: Any) -> bool:

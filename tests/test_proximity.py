@@ -23,7 +23,18 @@ from conftest import (
     random_scene,
 )
 
-from qpavoid import Avoidance, Controller, Obstacle, Sample, build_scene, config, load_scenario, memory, placing, proximity
+from qpavoid import (
+    Avoidance,
+    Controller,
+    Obstacle,
+    Sample,
+    build_scene,
+    config,
+    load_scenario,
+    memory,
+    placing,
+    proximity,
+)
 from qpavoid.kinematics import support_masks
 from qpavoid.problem import Proximity
 from qpavoid.proximity import DistanceQuery
@@ -306,7 +317,7 @@ def test_without_the_views_the_result_is_the_same(panda, monkeypatch, missing):
     qs = [random_q(panda, rng) for _ in range(3)]
     starts = {i: o.motion.sample(0.0) for i, o in enumerate(scene.obstacles)}
     samples = [{i: next_sample(rng, start) for i, start in starts.items()} for _ in qs]
-    fast = [look(scene, q, moved, reach=0.3) for q, moved in zip(qs, samples, strict=True)]
+    fast = [look(scene, q, there, reach=0.3) for q, there in zip(qs, samples, strict=True)]
     for name in missing:
         monkeypatch.setattr(proximity, name, lambda *_, **__: None)
         monkeypatch.setattr(placing, name, lambda *_, **__: None, raising=False)
@@ -314,8 +325,8 @@ def test_without_the_views_the_result_is_the_same(panda, monkeypatch, missing):
     assert query._cull is not None
     views = ("view_results", "view_poses", "view_poses")
     assert (query._copy, query._copy_poses, query.placing.copies) == tuple(name in missing for name in views)
-    for q, moved, expected in zip(qs, samples, fast, strict=True):
-        slow = look(scene, q, moved, reach=0.3)
+    for q, there, expected in zip(qs, samples, fast, strict=True):
+        slow = look(scene, q, there, reach=0.3)
         assert len(slow.pair)
         for name in Proximity._fields:  # GJK starts elsewhere in a fresh query: equal to rounding
             np.testing.assert_allclose(getattr(slow, name), getattr(expected, name), rtol=0, atol=1e-12)
