@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -51,14 +50,16 @@ class Placing:
         """Views of the states."""
         for view, obstacle in zip(self.samples, scene.obstacles, strict=True):
             put(view, obstacle.motion.sample(0.0))
-        self._pieces = [
-            [] if i in scene.clouds else np.flatnonzero(scene.obstacle_of == i).tolist() for i in range(count)
-        ]
+        self._first: IntArray = np.searchsorted(scene.obstacle_of, np.arange(count))
+        self._pieces: IntArray = np.bincount(scene.obstacle_of[len(scene.body_names) :], minlength=count)
+        self._pieces[list(scene.clouds)] = 0  # their balls are placed by every call for distances
         placements = view_poses([body.placement for body in bodies], writeable=True)
         self.copies = placements is None
         """Whether coal's placements cannot be viewed as an array."""
-        reach = [self._reach_of(pieces) for pieces in self._pieces]
-        self._planes = [i for i in range(count) if not isfinite(reach[i])]
+        farthest = np.linalg.norm(spheres[:, :3], axis=1) + spheres[:, 3]
+        reach = np.zeros(count)
+        np.maximum.at(reach, scene.obstacle_of[len(scene.body_names) :], farthest[len(scene.body_names) :])
+        self._planes = np.flatnonzero(np.isinf(reach)).tolist()
         self._memory = Placed(
             states=self.states,
             twists=self.twists,
@@ -80,6 +81,7 @@ class Placing:
         self._given, self._margins = np.zeros_like(self.states), np.zeros(count)
         self._views = as_samples(self._given)
         self._which: IntArray | None = None
+        self.place(np.zeros(0, dtype=np.intp), self.states, self.margin)  # no tick waits for the compiler
 
     def place(self, which: IntArray, states: Array, margin: Array) -> None:
         """Moves some obstacles, in one go.
@@ -93,9 +95,10 @@ class Placing:
             NumericalError: NaN or infinity; names the obstacle. All stay where they were.
         """
         if which is not self._which:
-            self._which, pieces = which, [self._pieces[i] for i in which.tolist()]
-            self._geometries = np.array([g for own in pieces for g in own], dtype=np.intp)
-            self._owners = np.repeat(np.arange(len(pieces)), [len(own) for own in pieces])
+            self._which, count = which, self._pieces[which]
+            self._owners = np.repeat(np.arange(len(which)), count)
+            before = np.cumsum(count) - count
+            self._geometries = (self._first[which] - before)[self._owners] + np.arange(len(self._owners))
         for i in self._planes:
             self._memory.reach[i] = self._reach_of_plane(states[i]) if states[i, 15:].any() else 0.0
         bad, moving = kernels.place_obstacles(self._memory, which, self._geometries, self._owners, states, margin)
@@ -117,12 +120,7 @@ class Placing:
         """Takes another distance from an obstacle's origin to its farthest point [m]."""
         self._memory.reach[index] = reach
 
-    def _reach_of(self, pieces: list[int]) -> float:
-        """Distance from an obstacle's origin to its farthest point [m]."""
-        spheres = self._spheres[pieces]
-        return float(np.max(np.linalg.norm(spheres[:, :3], axis=1) + spheres[:, 3], initial=0.0))
-
     def _reach_of_plane(self, state: Array) -> float:
-        """The same of a half-space: as far as the robot reaches, and what it may come to reach before it stands [m]."""
+        """Distance from a half-space's origin to what the robot reaches, and may come to before it stands [m]."""
         away = np.linalg.norm(self._poses[: self._movable, 9:] - state[9:12], axis=1)
         return float(np.max(away + self._spheres[: self._movable, 3])) + _FARTHEST_STOP

@@ -130,8 +130,9 @@ class Obstacles:
         fresh, voxels, notes = self._read(t, given or {})
         for index, what in fresh.items():
             if isinstance(what, Pose):
-                self._tracks[index] = _Track(self._with_twist(index, what), estimated=True)
-                put(self._views[index], self._tracks[index].sample)
+                sample, view = self._with_twist(index, what), self._views[index]
+                view.linear[:], view.angular[:] = sample.linear, sample.angular
+                self._tracks[index] = _Track(sample, estimated=True)
             else:
                 self._tracks[index] = _Track(what, estimated=False)
         if len(self._tracks) != known:
@@ -265,9 +266,11 @@ def as_sample(name: str, what: Any) -> Any:
     Raises:
         NumericalError: wrong shapes, or not numbers; names the argument and its part.
     """
-    if type(what) is Sample:
+    kind = type(what)
+    if kind is Sample or kind is Pose:
         try:
-            if what.position.shape == what.linear.shape == what.angular.shape == (3,) and what.rotation.shape == (3, 3):
+            placed = what.position.shape == (3,) and what.rotation.shape == (3, 3)
+            if placed and (kind is Pose or what.linear.shape == what.angular.shape == (3,)):
                 return what
         except AttributeError:
             pass

@@ -1,7 +1,6 @@
 """Distances against closed forms, rates against finite differences, culling against none, and what a tick costs."""
 
 import gc
-import sys
 import tracemalloc
 from dataclasses import replace
 
@@ -16,6 +15,7 @@ from conftest import (
     SPHERE,
     Bench,
     differences,
+    instructions,
     look,
     moved,
     obstacle,
@@ -528,25 +528,6 @@ def test_pairs_are_switched_only_when_something_changed(panda):
 
 
 # --- cost of a tick ----------------------------------------------------------------------------------------------
-
-
-def instructions(call):
-    """How many bytecode instructions a call executes: any loop in Python over the pairs shows in it."""
-    count = 0
-
-    def trace(frame, event, arg):
-        nonlocal count
-        frame.f_trace_opcodes = True
-        count += event == "opcode"
-        return trace
-
-    before = sys.gettrace()
-    sys.settrace(trace)
-    try:
-        call()
-    finally:
-        sys.settrace(before)
-    return count
 
 
 def balls(rng, count, radius):

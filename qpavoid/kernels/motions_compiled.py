@@ -53,7 +53,7 @@ def place_obstacles(
         total = 0.0
         for c in range(18):
             total += states[i, c]
-        if not np.isfinite(total):
+        if not abs(total) < np.inf:  # isfinite does not survive the reordering of sums
             return i, True
     for i in which:
         x.states[i] = states[i]
