@@ -51,15 +51,15 @@ class Assembly:
             **task_layout(frames, self._others, scene.robot.model),
             results=query.results,
             support=scene.support.copy(),
-            twists=query.twists,
+            twists=query.placing.twists,
             twist_row=query.twist_row,
-            margin=query.margin,
+            margin=query.placing.margin,
             joint_velocities=kinematics.joint_velocities,
             joint_reach=joint_reach,
             carriers=query.carriers(),
             turning=turning,
             sliding=sliding,
-            speeds=query.speeds,
+            speeds=query.placing.speeds,
             near=np.zeros(pairs, dtype=np.intp),
             closest=np.zeros((pairs, 10)),
             J=np.zeros((pairs, nv)),
@@ -107,7 +107,7 @@ class Assembly:
         if self._contacts is not None:
             held = self._contacts.update(self._forward)
             x.v_last[:] = held.held(x.v_last)
-        k, worst = kernels.assemble(self._packed, q, query.pairs, reach, query.moving)
+        k, worst = kernels.assemble(self._packed, q, query.pairs, reach, query.placing.moving)
         proximity, rows = self._views.get(k) or self._view(k)
         if held is not None:
             x.v0[:] = tracking_within(held, x.A, x.b, x.damping)

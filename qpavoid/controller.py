@@ -358,11 +358,13 @@ class Controller:
         observed = self._obstacles.observe(t, obstacles)
         assumed: tuple[str, ...] = ()
         if observed is not None:
-            for index, sample, margin, voxels in observed.seen:
-                self._query.place_obstacle(index, sample, margin, voxels)
-                self._guard.see(index, sample, voxels)
+            for index, voxels in observed.voxels.items():
+                self._query.fill(index, voxels)
+                self._guard.ahead.fill(index, voxels)
                 if self._escape is not None:
-                    self._escape.see(index, sample, voxels)
+                    self._escape.query.fill(index, voxels)
+            self._query.placing.place(*observed.seen)
+            self._guard.see(observed.seen.which)
             faults, assumed = faults + observed.stop, observed.assumed
         self._kinematics.compute(q)
         self._query.compute(self._kinematics.data, self._reach)

@@ -26,15 +26,13 @@ import pinocchio as pin
 
 from qpavoid import kernels
 from qpavoid.assembly import Assembly
-from qpavoid.cloud import Voxels
 from qpavoid.config import Avoidance, Escape, Limits
 from qpavoid.kinematics import ForwardKinematics
 from qpavoid.limits import JointBounds
-from qpavoid.motion import Sample
 from qpavoid.problem import Array, Problem, Proximity
 from qpavoid.proximity import DistanceQuery
 from qpavoid.scene import Scene
-from qpavoid.sensing import Obstacles
+from qpavoid.sensing import Obstacles, Seen
 from qpavoid.solvers.backends import solve_daqp
 
 _HORIZONS = (0.2, 0.05, 0.5)
@@ -115,14 +113,9 @@ class EscapePlanner:
         self._safe = settings.safe * (avoidance.hold - avoidance.offset)
         self._manners = list(_manners(model.nv))
         self._next = 0
-        self._foreseen: dict[float, list[tuple[int, Sample]]] = {}
+        self._foreseen: dict[float, Seen] = {}
         self._kept: Flight | None = None
         self._enough = Value(settings.horizon, self._safe)
-
-    def see(self, index: int, sample: Sample, voxels: Voxels | None = None) -> None:
-        """Takes over what is in a point cloud; poses are asked for when they are needed."""
-        if voxels is not None:
-            self.query.place_obstacle(index, sample, voxels=voxels)
 
     def reset(self) -> None:
         """Forgets the flight that was kept."""
@@ -137,7 +130,7 @@ class EscapePlanner:
             t: now [s].
             v_last: velocity (nv,) at which the robot moves.
         """
-        if not self._obstacles.moving:
+        if not len(self._obstacles.moving):
             return None
         self._foreseen.clear()
         proximity, _ = self._look(q, t, v_last)
@@ -209,9 +202,8 @@ class EscapePlanner:
     def _look(self, q: Array, t: float, v: Array) -> tuple[Proximity, Problem]:
         """Distances and bounds at q (nq,), reached with v (nv,), with the obstacles where they will be at t [s]."""
         if t not in self._foreseen:
-            self._foreseen[t] = [(index, self._obstacles.foreseen(index, t)) for index in self._obstacles.moving]
-        for index, sample in self._foreseen[t]:
-            self.query.place_obstacle(index, sample)
+            self._foreseen[t] = self._obstacles.foreseen(t)
+        self.query.placing.place(*self._foreseen[t])
         self._assembly.remember(v)
         self._kinematics.compute(q)
         self.query.compute(self._kinematics.data, self._settings.reach)

@@ -21,12 +21,11 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid.assembly import Assembly
-from qpavoid.cloud import Voxels
+from qpavoid.courses import move_on
 from qpavoid.kernels.vectorised import speed_to_stop
 from qpavoid.kinematics import ForwardKinematics
 from qpavoid.limits import JointBounds
-from qpavoid.motion import Sample, moved_on
-from qpavoid.problem import Array, Problem, Solution
+from qpavoid.problem import Array, IntArray, Problem, Solution
 from qpavoid.proximity import DistanceQuery
 from qpavoid.scene import Scene
 
@@ -88,13 +87,11 @@ class Guard:
         self._bounds, self._rate = bounds, position_gain / dt
         self._acceleration, self._accelerated = bounds.acceleration, bool(np.isfinite(bounds.acceleration).any())
         self._given = np.zeros(len(scene.pairs))
-        self._samples: dict[int, Sample] = {}
+        self._news = np.zeros(len(scene.obstacles), dtype=bool)
 
-    def see(self, index: int, sample: Sample, voxels: Voxels | None = None) -> None:
-        """Where obstacle number `index` is now, how it moves and, of a cloud with news, what is in it."""
-        self._samples[index] = sample
-        if voxels is not None:
-            self._ahead.place_obstacle(index, sample, voxels=voxels)
+    def see(self, which: IntArray) -> None:
+        """There is news of some obstacles (k,): they are not where they were last placed ahead."""
+        self._news[which] = True
 
     @property
     def ahead(self) -> DistanceQuery:
@@ -103,7 +100,7 @@ class Guard:
 
     def forget(self, index: int) -> None:
         """Takes obstacle number `index` as resting where it is, or as carried."""
-        self._samples.pop(index, None)
+        self._news[index] = False
 
     def check(
         self,
@@ -138,8 +135,8 @@ class Guard:
         if solution.slack is not None:
             self._given[near] = 1.1 * horizon * solution.slack
             self._given[:] = self._ahead.widest(self._given)
-        self._place_obstacles(query.margin)
-        speed = float(np.max(query.speeds))
+        self._place_obstacles(query)
+        speed = float(np.max(query.placing.speeds))
         gap = float(np.min(query.found(query.pairs), initial=reach)) - self._hold
         worst, pair = self._worst(q, v, query, gap, speed)
         if worst >= 0.0:
@@ -157,14 +154,15 @@ class Guard:
                 best, price = Checked(blend, share, -worst, pair), _PATIENCE * missed - worst
         return best
 
-    def _place_obstacles(self, margin: Array) -> None:
+    def _place_obstacles(self, now: DistanceQuery) -> None:
         """Puts the obstacles where they will be at the end of the tick."""
-        for index, sample in self._samples.items():
-            self._ahead.place_obstacle(index, moved_on(sample, self._dt))
-        still = [i for i, sample in self._samples.items() if not sample.linear.any() and not sample.angular.any()]
-        for index in still:
-            del self._samples[index]
-        self._ahead.margin[:] = margin
+        which = np.flatnonzero(self._news)
+        if len(which):
+            states = now.placing.states.copy()
+            move_on(states, self._dt)
+            self._ahead.placing.place(which, states, now.placing.margin)
+            self._news[which] = states[which, 12:].any(axis=1)
+        self._ahead.placing.margin[:] = now.placing.margin
 
     def _worst(self, q: Array, v: Array, now: DistanceQuery, gap: float, speed: float) -> tuple[float, int]:
         """Least of distance - what it has to be, along the way of v and its stop [m], and the pair that it is of.
@@ -247,8 +245,9 @@ class Guard:
         if not len(pairs):
             return _FARTHEST, -1
         there, here = ahead.found(pairs), now.found(pairs)
-        if ahead.margin.any():
-            margin = ahead.margin[ahead.twist_row[pairs]]
+        margins = ahead.placing.margin
+        if margins.any():
+            margin = margins[ahead.twist_row[pairs]]
             there, here = there - margin, here - margin
         left = there - np.minimum(self._hold - TOLERANCE, here - _CREEP) + self._given[pairs]
         worst = int(left.argmin())  # the first NaN, where there is one

@@ -68,14 +68,6 @@ class Sample(NamedTuple):
         )
 
 
-def moved_on(sample: Sample, t: float) -> Sample:
-    """Where a body is t seconds later if it keeps its twist about its origin [s]."""
-    if not sample.linear.any() and not sample.angular.any():
-        return sample
-    rotation = pin.exp3(t * sample.angular) @ sample.rotation if sample.angular.any() else sample.rotation
-    return sample._replace(position=sample.position + t * sample.linear, rotation=rotation)
-
-
 class Motion(Protocol):
     """A trajectory that is known beforehand."""
 
@@ -151,10 +143,11 @@ class Orbit:
 
     def sample(self, t: float) -> Sample:
         """See `Motion.sample`."""
-        moves = 0.0 <= _finite(t) + END_TOLERANCE < self.end
-        angle = self.omega * min(max(t, 0.0), self.end)
+        early = _finite(t) + END_TOLERANCE
+        angle = self.omega * (max(t, 0.0) if early < self.end else self.end)
         cos, sin = math.cos(angle), math.sin(angle)
         center = self.center
+        moves = 0.0 <= early < self.end
         linear = self.omega * (cos * self.w - sin * self.u) if moves else center.linear
         return Sample(center.position + cos * self.u + sin * self.w, center.rotation, linear, center.angular)
 

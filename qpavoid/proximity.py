@@ -6,7 +6,6 @@ does the rest, and its results are viewed as one array.
 
 from __future__ import annotations
 
-from math import hypot, isfinite
 from typing import Any
 
 import coal
@@ -17,9 +16,9 @@ from qpavoid import kernels
 from qpavoid.bodies import bounding_sphere
 from qpavoid.cloud import Voxels
 from qpavoid.config import PointCloud
-from qpavoid.errors import NumericalError
 from qpavoid.memory import read_poses, read_results, view_poses, view_results
 from qpavoid.motion import Sample
+from qpavoid.placing import Placing
 from qpavoid.problem import Array, IntArray
 from qpavoid.scene import Scene
 from qpavoid.slots import Slots
@@ -28,8 +27,6 @@ _CULL_FROM = 48 if kernels.ACCELERATED else 192
 """Number of pairs from which looking at bounding spheres first pays."""
 _LONGEST_GRASP = 0.5
 """Largest gap between the robot and what it carries [m]."""
-_FARTHEST_STOP = 1.0
-"""How far the robot may go before it stands, where a half-space that turns is concerned [m]."""
 
 
 class DistanceQuery:
@@ -44,14 +41,6 @@ class DistanceQuery:
         bodies = self._geometry.geometryObjects
         self._first_obstacle, self._movable = len(scene.body_names), scene.movable
         self._pieces = [np.flatnonzero(scene.obstacle_of == i).tolist() for i in range(len(scene.obstacles))]
-        obstacles, graspable = len(scene.obstacles), self._movable - self._first_obstacle
-        self.twists = np.zeros((obstacles + 1 + graspable, 6))
-        """(o + 1 + c, 6) of the obstacles at the world's origin; row o stays zero: for the robot and its loads.
-        The last c are those of the obstacles that can be carried, negative: for pairs of which they come first."""
-        self.margin = np.zeros(len(self.twists))
-        """(o + 1 + c,) to be taken off the distances to each obstacle, likewise [m]."""
-        self._moving: set[int] = set()
-        self._placements = view_poses([body.placement for body in bodies], writeable=True)
         model = scene.robot.model
         pin.updateGeometryPlacements(model, model.createData(), self._geometry, self._data, pin.neutral(model))
         pin.computeDistances(self._geometry, self._data)  # so that there is something to compare the view with
@@ -66,13 +55,14 @@ class DistanceQuery:
         self.spheres = np.array([(*center, radius) for center, radius in shapes]).reshape(-1, 4)
         """(g, 4) bounding sphere of each body in its own frame: centre and radius [m]; infinite of a half-space."""
         self._joints = model.njoints
-        self.speeds = np.zeros(model.njoints + obstacles)
-        """(njoints + o,) largest speed of any point that a joint carries, or of an obstacle [m/s]; here, the latter."""
-        self._samples = [obstacle.motion.sample(0.0) for obstacle in scene.obstacles]
+        self.placing = Placing(scene, bodies, self.poses, self.spheres)
+        """Where the obstacles are."""
         self.group: IntArray = np.arange(len(scene.pairs))
         """(m,) first of the pairs of the same body and point cloud; of other pairs, their own number."""
         self._grouped = np.zeros(len(scene.pairs), dtype=bool)
         self._slots = {i: self._make_slots(i, voxels) for i, voxels in scene.clouds.items()}
+        for i, slots in self._slots.items():
+            self.placing.reaches(i, slots.reach)
         self.carried: dict[int, int] = {}
         """Joint that carries each obstacle which is carried, by number of the obstacle."""
         self.unwatched: Any = None
@@ -86,11 +76,6 @@ class DistanceQuery:
         """(c,) pairs that were computed and are to get rows, increasing."""
         self._surface = _surface_pairs(scene)
         self.switch()
-
-    @property
-    def moving(self) -> bool:
-        """Whether any obstacle has a velocity or a margin."""
-        return bool(self._moving)
 
     @property
     def bodies(self) -> Any:
@@ -132,56 +117,16 @@ class DistanceQuery:
         Raises:
             NumericalError: NaN or infinity; names the obstacle, which stays where it was.
         """
-        # plain floats: numpy's scalars cost more than the arithmetic
-        (x, y, z), (vx, vy, vz) = sample.position.tolist(), sample.linear.tolist()
-        wx, wy, wz = sample.angular.tolist()
-        if not isfinite(x + y + z + vx + vy + vz + wx + wy + wz + float(np.vdot(sample.rotation, sample.rotation))):
-            raise NumericalError(
-                f"obstacle {self._scene.obstacles[index].name!r}: NaN or infinity in its pose or twist"
-            )
-        self.margin[index] = margin
-        self._samples[index] = sample
-        slots = self._slots.get(index)
-        if slots is None:
-            for geometry in self._pieces[index]:
-                self._place(geometry, sample)
-        elif voxels is not None and voxels is not slots.voxels:
+        if voxels is not None:
+            self.fill(index, voxels)
+        self.placing.place_one(index, sample, margin)
+
+    def fill(self, index: int, voxels: Voxels) -> None:
+        """Takes other voxels as what is in obstacle number `index`, a point cloud."""
+        slots = self._slots[index]
+        if voxels is not slots.voxels:
             slots.fill_with(voxels)
-        twist = (vx - wy * z + wz * y, vy - wz * x + wx * z, vz - wx * y + wy * x, wx, wy, wz)
-        self.twists[index] = twist
-        if self._pieces[index][0] < self._movable:
-            negative = len(self._pieces) + 1 + index
-            self.twists[negative], self.margin[negative] = np.negative(twist), margin
-        if any(twist) or margin:
-            self._moving.add(index)
-            turn = hypot(wx, wy, wz)
-            self.speeds[self._joints + index] = hypot(vx, vy, vz) + (turn * self._reach_of(index) if turn else 0.0)
-        else:
-            self._moving.discard(index)
-            self.speeds[self._joints + index] = 0.0
-
-    def _reach_of(self, index: int) -> float:
-        """Distance from an obstacle's origin to its farthest point that may matter [m]."""
-        if index in self._slots:
-            return self._slots[index].reach
-        reach = max(
-            float(np.linalg.norm(self.spheres[geometry, :3]) + self.spheres[geometry, 3])
-            for geometry in self._pieces[index]
-        )
-        if isfinite(reach):
-            return reach
-        # of a half-space, as far as the robot reaches, and what it may come to reach before it stands
-        away = np.linalg.norm(self.poses[: self._movable, 9:] - self._samples[index].position, axis=1)
-        return float(np.max(away + self.spheres[: self._movable, 3])) + _FARTHEST_STOP
-
-    def _place(self, geometry: int, sample: Sample) -> None:
-        if self._placements is None:
-            self._geometry.geometryObjects[geometry].placement = pin.SE3(sample.rotation, sample.position)
-        else:
-            self._placements[geometry, :9] = sample.rotation.T.ravel()
-            self._placements[geometry, 9:] = sample.position
-        if self._cull is not None:
-            self._cull.place(geometry, sample.rotation, sample.position)
+            self.placing.reaches(index, slots.reach)
 
     def carry(self, index: int, joint: int, sample: Sample) -> None:
         """Lets a joint carry an obstacle from now on, or nobody.
@@ -273,7 +218,7 @@ class DistanceQuery:
 
     def _fill(self, index: int, slots: Slots, reach: float) -> None:
         """Puts the balls of a cloud to the voxels that are nearest to each body."""
-        places = slots.places(self.poses[: self._movable], self._off, self._samples[index], reach).reshape(-1, 3)
+        places = slots.places(self.poses[: self._movable], self._off, self.placing.samples[index], reach).reshape(-1, 3)
         geometries = slots.geometries.ravel()
         self.poses[geometries, 9:] = places
         if self._copy_poses:
@@ -311,10 +256,7 @@ class _Cull:
         self._query, self._data = query, query._data
         self._bodies = scene.movable
         self._local, self._radius = query.spheres[:, :3].copy(), query.spheres[:, 3].copy()
-        self._centered = (self._local == 0.0).all(axis=1).tolist()
-        self._centers = np.ones((len(self._local), 5))
-        for i, body in enumerate(query._geometry.geometryObjects):
-            self.place(i, body.placement.rotation, body.placement.translation)
+        self._centers = query.placing.centers
         self._pair_of = np.full((self._bodies, len(self._local)), -1, dtype=np.intp)
         self._pair_of[scene.pairs[:, 0], scene.pairs[:, 1]] = np.arange(len(scene.pairs))
         self._reach = np.nan
@@ -324,11 +266,6 @@ class _Cull:
         self.active = np.ones(len(scene.pairs), dtype=bool)
         """(m,) which pairs are on."""
         self._last = b""
-
-    def place(self, index: int, rotation: Array, position: Array) -> None:
-        """Moves the bounding sphere of one geometry."""
-        center = position if self._centered[index] else rotation @ self._local[index] + position
-        self._centers[index, :3], self._centers[index, 4] = center, -(center @ center)
 
     def place_points(self, indices: IntArray, positions: Array) -> None:
         """Moves the bounding spheres of several geometries (k,), whose centres are their origins (k, 3)."""

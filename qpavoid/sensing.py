@@ -18,11 +18,15 @@ from numpy.typing import ArrayLike
 
 from qpavoid.cloud import Points, Voxels
 from qpavoid.config import PointCloud, Sensing
+from qpavoid.courses import STATE, Courses, as_samples, move_on, put
 from qpavoid.errors import NumericalError, UnknownName
 from qpavoid.loading import nearest
-from qpavoid.motion import Sample, moved_on
-from qpavoid.problem import Array, as_vector
+from qpavoid.motion import Sample
+from qpavoid.problem import Array, IntArray, as_vector
 from qpavoid.scene import Obstacle
+
+_AT_REST = np.zeros(3)
+_AT_REST.setflags(write=False)
 
 
 class Pose(NamedTuple):
@@ -45,21 +49,22 @@ class Pose(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """What a tick has to know of one obstacle."""
+    """What a tick has to know of where obstacles are."""
 
-    obstacle: int
-    """Its number in the scene."""
-    sample: Sample
-    margin: float
-    """To be taken off its distances [m]."""
-    voxels: Voxels | None = None
-    """Of a point cloud with news: what is in it now."""
+    which: IntArray
+    """(k,) numbers of those of which there is news."""
+    states: Array
+    """(o, 18) of all obstacles, see `courses`; those of which there is none may be anything."""
+    margin: Array
+    """(o,) to be taken off the distances to each, likewise [m]."""
 
 
 class Observation(NamedTuple):
     """What a tick has to know of all obstacles."""
 
-    seen: tuple[Seen, ...]
+    seen: Seen
+    voxels: dict[int, Voxels]
+    """Of point clouds with news, by number: what is in them now."""
     assumed: tuple[str, ...] = ()
     """What was not told but taken for granted."""
     stop: tuple[str, ...] = ()
@@ -84,9 +89,12 @@ class Obstacles:
         self._obstacles, self._config, self._dt = obstacles, config, dt
         self._index = {obstacle.name: i for i, obstacle in enumerate(obstacles)}
         self._moving = [i for i, obstacle in enumerate(obstacles) if obstacle.moves]
+        self._courses = Courses({i: obstacles[i].motion for i in self._moving})
         self._tracks: dict[int, _Track] = {}
         self._now = 0.0
         self._carried: set[int] = set()
+        self._seen = Seen(np.array(self._moving, np.intp), np.zeros((len(obstacles), STATE)), np.zeros(len(obstacles)))
+        self._views = as_samples(self._seen.states)
 
     def index(self, name: str) -> int:
         """Number of an obstacle.
@@ -99,22 +107,27 @@ class Obstacles:
         return self._index[name]
 
     @property
-    def moving(self) -> list[int]:
-        """Numbers of those that move, or are given from outside; what the robot carries is none of them."""
-        return [*self._moving, *(i for i in self._tracks if i not in self._moving)]
+    def moving(self) -> IntArray:
+        """(k,) numbers of those that move, or are given from outside; what the robot carries is none of them."""
+        return self._seen.which
 
-    def foreseen(self, index: int, t: float) -> Sample:
-        """Where an obstacle will be at t [s], on its trajectory, or as it was last seen to move."""
-        track = self._tracks.get(index)
-        if track is None:
-            return self._obstacles[index].motion.sample(t)
-        return moved_on(track.sample, t - self._now + track.age * self._dt)
+    def foreseen(self, t: float) -> Seen:
+        """Where they will be at t [s], on their trajectories, or as they were last seen to move."""
+        states, given = self._seen.states.copy(), list(self._tracks)
+        move_on(states, t - self._now)
+        last_seen = states[given]
+        self._courses.sample(t, states)
+        for index, motion in self._courses.others.items():
+            put(as_samples(states)[index], motion.sample(t))
+        states[given] = last_seen
+        return self._seen._replace(states=states)
 
     def carry(self, index: int, carried: bool) -> None:
         """Takes an obstacle as carried by the robot, or as resting where it was put down, until it is given again."""
         self._moving = [i for i in self._moving if i != index]
         self._tracks.pop(index, None)
         (self._carried.add if carried else self._carried.discard)(index)
+        self._renew()
 
     def observe(self, t: float, given: Mapping[str, Sample | Pose | Points] | None) -> Observation | None:
         """What there is to know at time t [s]; None where nothing has changed.
@@ -130,10 +143,53 @@ class Obstacles:
         if not given and not self._moving and not self._tracks:
             return None
         self._now = t
+        known = len(self._tracks)
+        self._follow(t)
+        fresh, voxels, notes = self._read(t, given or {})
+        for index, what in fresh.items():
+            if isinstance(what, Pose):
+                sample, view = self._with_twist(index, what), self._views[index]
+                view.linear[:], view.angular[:] = sample.linear, sample.angular
+                self._tracks[index] = _Track(sample, estimated=True)
+            else:
+                self._tracks[index] = _Track(what, estimated=False)
+        if len(self._tracks) != known:
+            self._renew()
+        stop: list[str] = []
+        self._seen.margin.fill(0.0)
+        for index, track in self._tracks.items():
+            if index not in fresh:
+                track.age += 1
+                put(self._views[index], track.sample)
+                self._predict(index, track.age * self._dt, notes, stop)
+            elif track.estimated:
+                notes.append(f"{self._obstacles[index].name}: twist estimated from its poses")
+        return Observation(self._seen, voxels, tuple(notes), tuple(stop))
+
+    def reset(self) -> None:
+        """Forgets what was given."""
+        self._tracks.clear()
+        self._renew()
+
+    def _renew(self) -> None:
+        """Lays out anew of which obstacles there is news in every tick."""
+        self._seen = self._seen._replace(which=np.array(sorted({*self._moving, *self._tracks}), dtype=np.intp))
+
+    def _follow(self, t: float) -> None:
+        """Brings the states of those that follow a trajectory to time t [s]."""
+        self._courses.sample(t, self._seen.states)
+        for index, motion in self._courses.others.items():
+            if index in self._moving and index not in self._tracks:
+                put(self._views[index], motion.sample(t))
+
+    def _read(
+        self, t: float, given: Mapping[str, Sample | Pose | Points]
+    ) -> tuple[dict[int, Sample | Pose], dict[int, Voxels], list[str]]:
+        """Poses and voxels by number of the obstacle, with notes on what is not taken."""
         fresh: dict[int, Sample | Pose] = {}
         voxels: dict[int, Voxels] = {}
         notes: list[str] = []
-        for name, what in (given or {}).items():
+        for name, what in given.items():
             index = self.index(name)
             if index in self._carried:
                 notes.append(f"{name}: carried by the robot, what is given of it is not read")
@@ -142,32 +198,22 @@ class Obstacles:
                     self._tracks.setdefault(index, self._unseen(index, t))
             else:
                 fresh[index] = as_sample(f"obstacle {name!r}", what)
-        for index in [index for index, what in fresh.items() if not finite(what)]:
+        for index in self._unusable(fresh):
             notes.append(f"{self._obstacles[index].name}: NaN or infinity in its pose or twist, taken as not given")
             del fresh[index]
+            voxels.pop(index, None)
             self._tracks.setdefault(index, self._unseen(index, t))
-        seen = [
-            Seen(i, self._obstacles[i].motion.sample(t), 0.0)
-            for i in self._moving
-            if i not in fresh and i not in self._tracks
-        ]
-        stop: list[str] = []
-        for index, what in fresh.items():
-            self._tracks[index] = self._track(index, what)
-        for index, track in self._tracks.items():
-            name = self._obstacles[index].name
-            if index in fresh:
-                seen.append(Seen(index, track.sample, 0.0, voxels.get(index)))
-                if track.estimated:
-                    notes.append(f"{name}: twist estimated from its poses")
-            else:
-                track.age += 1
-                seen.append(self._predicted(index, track, notes, stop))
-        return Observation(tuple(seen), tuple(notes), tuple(stop))
+        return fresh, voxels, notes
 
-    def reset(self) -> None:
-        """Forgets what was given."""
-        self._tracks.clear()
+    def _unusable(self, fresh: Mapping[int, Sample | Pose]) -> list[int]:
+        """Numbers of those with NaN or infinity; puts what is given into the states."""
+        if not fresh:
+            return []
+        for index, what in fresh.items():
+            put(self._views[index], what if isinstance(what, Sample) else Sample(*what, _AT_REST, _AT_REST))
+        which = np.array(list(fresh))
+        usable = np.isfinite(self._seen.states[which]).all(axis=1)
+        return [] if usable.all() else which[~usable].tolist()
 
     def _look_at(
         self,
@@ -208,26 +254,25 @@ class Obstacles:
     def _unseen(self, index: int, t: float) -> _Track:
         return _Track(self._obstacles[index].motion.sample(t), estimated=False)
 
-    def _track(self, index: int, what: Sample | Pose) -> _Track:
-        if isinstance(what, Sample):
-            return _Track(what, estimated=False)
+    def _with_twist(self, index: int, pose: Pose) -> Sample:
+        """A pose with the twist that has led to it since the last one; at rest if it is the first."""
         before = self._tracks.get(index)
-        linear, angular = np.zeros(3), np.zeros(3)
-        if before is not None:
-            elapsed = (before.age + 1) * self._dt
-            linear = (what.position - before.sample.position) / elapsed
-            angular = pin.log3(what.rotation @ before.sample.rotation.T) / elapsed
-        return _Track(Sample(what.position, what.rotation, linear, angular), estimated=True)
+        if before is None:
+            return Sample(*pose, _AT_REST, _AT_REST)
+        elapsed = (before.age + 1) * self._dt
+        linear = (pose.position - before.sample.position) / elapsed
+        return Sample(*pose, linear, pin.log3(pose.rotation @ before.sample.rotation.T) / elapsed)
 
-    def _predicted(self, index: int, track: _Track, notes: list[str], stop: list[str]) -> Seen:
-        name, config, age = self._obstacles[index].name, self._config, track.age * self._dt
-        margin = 0.0
+    def _predict(self, index: int, age: float, notes: list[str], stop: list[str]) -> None:
+        """Moves an obstacle on from where it was last seen, `age` seconds ago."""
+        name, config, margin = self._obstacles[index].name, self._config, 0.0
         if config.stale_after is not None and age > config.stale_after:
             margin = config.margin_growth * (age - config.stale_after)
             notes.append(f"{name}: not seen for {age:.3f} s, margin {1e3 * margin:.0f} mm")
             if config.stop_after is not None and age > config.stop_after:
                 stop.append(f"{name}: not seen for {age:.3f} s")
-        return Seen(index, moved_on(track.sample, age), margin)
+        move_on(self._seen.states[index : index + 1], age)
+        self._seen.margin[index] = margin
 
 
 _SHAPES = {"position": (3,), "rotation": (3, 3), "linear": (3,), "angular": (3,)}
@@ -239,9 +284,11 @@ def as_sample(name: str, what: Any) -> Any:
     Raises:
         NumericalError: wrong shapes, or not numbers; names the argument and its part.
     """
-    if type(what) is Sample:
+    kind = type(what)
+    if kind is Sample or kind is Pose:
         try:
-            if what.position.shape == what.linear.shape == what.angular.shape == (3,) and what.rotation.shape == (3, 3):
+            placed = what.position.shape == (3,) and what.rotation.shape == (3, 3)
+            if placed and (kind is Pose or what.linear.shape == what.angular.shape == (3,)):
                 return what
         except AttributeError:
             pass
@@ -256,7 +303,7 @@ def as_sample(name: str, what: Any) -> Any:
 def as_goal(name: str, what: Any) -> Sample:
     """`as_sample` of what a task should reach: a bare `Pose` is one at rest."""
     sample = as_sample(name, what)
-    return sample if isinstance(sample, Sample) else Sample(sample.position, sample.rotation, np.zeros(3), np.zeros(3))
+    return sample if isinstance(sample, Sample) else Sample(sample.position, sample.rotation, _AT_REST, _AT_REST)
 
 
 def finite(what: Any) -> bool:

@@ -206,3 +206,22 @@ def write_chain(folder, joints=3, joint_type="revolute", shape='<cylinder radius
     path = folder / "chain.urdf"
     path.write_text(f'<robot name="chain">{"".join(parts)}</robot>')
     return path
+
+
+def instructions(call):
+    """How many bytecode instructions a call executes: any loop in Python over the pairs shows in it."""
+    count = 0
+
+    def trace(frame, event, arg):
+        nonlocal count
+        frame.f_trace_opcodes = True
+        count += event == "opcode"
+        return trace
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        call()
+    finally:
+        sys.settrace(before)
+    return count

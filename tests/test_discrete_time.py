@@ -4,11 +4,11 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from closed_loop import Ruler, cartesian, drive, make_controller, scenario
+from conftest import moved
 
 from qpavoid import Avoidance, Controller, Obstacle, Sample, Status, simulate
 from qpavoid.config import Box, Damper, Sphere
 from qpavoid.guard import TOLERANCE
-from qpavoid.motion import moved_on
 
 PLATE = {"type": "box", "size": [0.004, 0.6, 0.6]}
 BALL = {"type": "sphere", "radius": 0.06}
@@ -170,7 +170,7 @@ def test_the_look_ahead_moves_obstacles_on(tmp_path, linear, angular):
     seen = {"bar": Sample.at(center, linear=linear, angular=angular)}
     tick = controller.tick(np.zeros(3), 0.0, {"z": Sample.at([0.0, 0.0, 0.0])}, seen)
     assert not len(tick.proximity.pair) and tick.problem.shortfall <= 0.0
-    turned_on = moved_on(seen["bar"], 0.05)
+    turned_on = moved(seen["bar"], 0.05)
     short = HELD - Ruler(controller.scene).distances(np.zeros(3), {0: turned_on}).min()
     assert short > 0.02 and tick.solution.status is Status.RELAXED
     assert tick.solution.reasons == (f"tool - bar: comes {1e3 * (short - TOLERANCE):.1f} mm too near",)

@@ -1,7 +1,6 @@
 """Distances against closed forms, rates against finite differences, culling against none, and what a tick costs."""
 
 import gc
-import sys
 import tracemalloc
 from dataclasses import replace
 
@@ -16,6 +15,7 @@ from conftest import (
     SPHERE,
     Bench,
     differences,
+    instructions,
     look,
     moved,
     obstacle,
@@ -23,7 +23,18 @@ from conftest import (
     random_scene,
 )
 
-from qpavoid import Avoidance, Controller, Obstacle, Sample, build_scene, config, load_scenario, memory, proximity
+from qpavoid import (
+    Avoidance,
+    Controller,
+    Obstacle,
+    Sample,
+    build_scene,
+    config,
+    load_scenario,
+    memory,
+    placing,
+    proximity,
+)
 from qpavoid.kinematics import support_masks
 from qpavoid.problem import Proximity
 from qpavoid.proximity import DistanceQuery
@@ -304,15 +315,18 @@ def test_without_the_views_the_result_is_the_same(panda, monkeypatch, missing):
     rng = np.random.default_rng(11)
     scene = random_scene(panda, rng, [SPHERE, CAPSULE, BOX])
     qs = [random_q(panda, rng) for _ in range(3)]
-    fast = [look(scene, q, reach=0.3) for q in qs]
+    starts = {i: o.motion.sample(0.0) for i, o in enumerate(scene.obstacles)}
+    samples = [{i: next_sample(rng, start) for i, start in starts.items()} for _ in qs]
+    fast = [look(scene, q, there, reach=0.3) for q, there in zip(qs, samples, strict=True)]
     for name in missing:
         monkeypatch.setattr(proximity, name, lambda *_, **__: None)
+        monkeypatch.setattr(placing, name, lambda *_, **__: None, raising=False)
     query = DistanceQuery(scene)
     assert query._cull is not None
     views = ("view_results", "view_poses", "view_poses")
-    assert (query._copy, query._copy_poses, query._placements is None) == tuple(name in missing for name in views)
-    for q, expected in zip(qs, fast, strict=True):
-        slow = look(scene, q, reach=0.3)
+    assert (query._copy, query._copy_poses, query.placing.copies) == tuple(name in missing for name in views)
+    for q, there, expected in zip(qs, samples, fast, strict=True):
+        slow = look(scene, q, there, reach=0.3)
         assert len(slow.pair)
         for name in Proximity._fields:  # GJK starts elsewhere in a fresh query: equal to rounding
             np.testing.assert_allclose(getattr(slow, name), getattr(expected, name), rtol=0, atol=1e-12)
@@ -514,25 +528,6 @@ def test_pairs_are_switched_only_when_something_changed(panda):
 
 
 # --- cost of a tick ----------------------------------------------------------------------------------------------
-
-
-def instructions(call):
-    """How many bytecode instructions a call executes: any loop in Python over the pairs shows in it."""
-    count = 0
-
-    def trace(frame, event, arg):
-        nonlocal count
-        frame.f_trace_opcodes = True
-        count += event == "opcode"
-        return trace
-
-    before = sys.gettrace()
-    sys.settrace(trace)
-    try:
-        call()
-    finally:
-        sys.settrace(before)
-    return count
 
 
 def balls(rng, count, radius):

@@ -224,7 +224,7 @@ def test_the_closest_call_holds_for_half_spaces_that_move_and_turn(panda, turnin
             turning * rng.uniform(-1, 1, 3),
         )  # fmt: skip
         bench.query.place_obstacle(0, sample)
-        assert np.isfinite(bench.query.speeds).all()
+        assert np.isfinite(bench.query.placing.speeds).all()
         near = len(bench.compute(q, reach=0.3)[0].pair)
         bench.kinematics.move(q, v)
         for horizon in (0.01, 0.1, 0.3):

@@ -13,10 +13,12 @@ ACCELERATED = os.environ.get("QPAVOID_NUMBA", "1") != "0" and find_spec("numba")
 """Whether the compiled version is used."""
 
 if TYPE_CHECKING or not ACCELERATED:
+    from qpavoid.kernels import motions as _motions
     from qpavoid.kernels import vectorised as _chosen
     from qpavoid.kernels import voxels as _voxels
 else:
     from qpavoid.kernels import compiled as _chosen
+    from qpavoid.kernels import motions_compiled as _motions
     from qpavoid.kernels import voxels_compiled as _voxels
 
 assemble = _chosen.assemble
@@ -33,6 +35,9 @@ stop_velocity = _chosen.stop_velocity
 tracking_shortfall = _chosen.tracking_shortfall
 velocity_bounds = _chosen.velocity_bounds
 choose = _voxels.choose
+pack_pieces = _motions.pack_pieces
+place_obstacles = _motions.place_obstacles
+sample_pieces = _motions.sample_pieces
 within_reach = _voxels.within_reach
 
 __all__ = [
@@ -45,8 +50,11 @@ __all__ = [
     "distance_rows",
     "frame_rows",
     "pack",
+    "pack_pieces",
+    "place_obstacles",
     "projection_cost",
     "row_bounds",
+    "sample_pieces",
     "shortfall",
     "stop_velocity",
     "tracking_shortfall",

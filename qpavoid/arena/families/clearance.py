@@ -100,7 +100,7 @@ class Clearance:
         for t in np.arange(0.0, self._duration, _PERIOD) if self._movers else ():
             for index, motion in self._movers:
                 self._query.place_obstacle(index, motion.sample(float(t)))
-            fastest = max(fastest, float(self._query.speeds.max()))
+            fastest = max(fastest, float(self._query.placing.speeds.max()))
         return fastest
 
     def _levers(self, ranges: Ranges) -> Array:

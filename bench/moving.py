@@ -1,0 +1,121 @@
+"""`python -m bench.moving`: what obstacles that move, and obstacles that a program tells of, add to a tick."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from time import perf_counter_ns
+from typing import Any
+
+import numpy as np
+
+ROOT = Path(__file__).parent.parent
+RESULTS = ROOT / "bench" / "results" / "moving.md"
+OBSTACLES = 50
+MOVING = (0, 1, 10, 50)
+DT = 0.01
+BATCH = 25
+"""Ticks that are timed as one."""
+MODES = {"numpy": "0", "numba": "1"}
+
+
+def main() -> None:
+    """Parses the options, measures in a process for each mode, writes bench/results/moving.md and prints it."""
+    parser = argparse.ArgumentParser(prog="python -m bench.moving", description=__doc__)
+    parser.add_argument("--rounds", type=int, default=200, help=f"batches of {BATCH} ticks of each kind (200)")
+    parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.child:
+        print(json.dumps(measure(options.rounds)))
+        return
+    load = os.getloadavg()[0]
+    found = {mode: _child(options.rounds, number) for mode, number in MODES.items()}
+    lines = [
+        "# Moving obstacles",
+        "",
+        f"{platform.system()}, {os.cpu_count()} CPUs, Python {platform.python_version()}, numpy {np.__version__}, "
+        f"load {load:.1f} at the start. One thread.",
+        "",
+        f"A Panda holds its tool still among {OBSTACLES} spheres, 2 m away, so that nothing is near: a tick is "
+        f"kinematics, bounding spheres, task rows and bounds. Some move on lines and circles, or are given to `step` as a "
+        f"`Sample` or a `Pose`. Kinds take turns, {BATCH} ticks each; median over {options.rounds} turns [µs]; in brackets what "
+        "one such obstacle adds.",
+        "",
+        "| obstacles | " + " | ".join(MODES) + " |",
+        "|---|" + "---:|" * len(MODES),
+    ]
+    for kind, count in ((kind, count) for kind in ("moving", "given as Sample", "given as Pose") for count in MOVING):
+        name = f"{kind}, {count}"
+        if name in found["numpy"]:
+            cells = [_cell(found[mode][name], found[mode]["moving, 0"], count) for mode in MODES]
+            lines.append(f"| {count} of {OBSTACLES} {kind} | {' | '.join(cells)} |")
+    text = "\n".join(lines) + "\n"
+    RESULTS.write_text(text)
+    print(text)
+
+
+def _cell(time: float, still: float, count: int) -> str:
+    return f"{time:.1f}" if not count else f"{time:.1f} ({(time - still) / count:.2f})"
+
+
+def _child(rounds: int, accelerated: str) -> dict[str, float]:
+    command = [sys.executable, "-m", "bench.moving", "--rounds", str(rounds), "--child"]
+    environment = {**os.environ, "QPAVOID_NUMBA": accelerated, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
+    answer: dict[str, float] = json.loads(done.stdout)
+    return answer
+
+
+def measure(rounds: int) -> dict[str, float]:
+    """Median time of a tick of each kind [µs]."""
+    kinds = dict(_kinds())
+    samples: dict[str, list[int]] = {name: [] for name in kinds}
+    for turn in range(rounds):
+        for name, step in kinds.items():
+            begin = perf_counter_ns()
+            for k in range(BATCH):
+                step((turn + k) * DT)
+            samples[name].append(perf_counter_ns() - begin)
+    return {name: 1e-3 * float(np.median(ns)) / BATCH for name, ns in samples.items()}
+
+
+def _kinds() -> Any:
+    from qpavoid import Pose, Sample
+
+    for count in MOVING:
+        yield f"moving, {count}", _stepper(count)
+    for what in (Sample, Pose):
+        for count in MOVING[1:]:
+            given = {f"o{i}": what.at([2.0 + 0.1 * i, 0.0, 1.0]) for i in range(count)}
+            yield f"given as {what.__name__}, {count}", _stepper(0, given)
+
+
+def _stepper(moving: int, given: dict[str, Any] | None = None) -> Callable[[float], Any]:
+    """A tick at a time [s], of a scene in which the first so many obstacles move."""
+    from qpavoid import Controller, Obstacle, Robot, build_scene, build_tasks
+    from qpavoid.config import Circle, Fixed, Line, Sphere, Task
+    from qpavoid.motion import build_motion
+
+    random, obstacles = np.random.default_rng(3), []
+    for i in range(OBSTACLES):
+        way = random.normal(size=3)
+        place = 2.0 * random.uniform(0.9, 1.1) * way / np.linalg.norm(way)
+        motion: Any = Fixed(position=tuple(place))
+        if i < moving:
+            line = Line(start=tuple(place), displacement=(0.2, 0.1, 0.1), speed=0.02)
+            motion = Circle(center=tuple(place), radius=0.1, period=10.0) if i % 2 else line
+        obstacles.append(Obstacle(f"o{i}", Sphere(radius=0.04), build_motion(motion), moves=i < moving))
+    robot = Robot.load("panda")
+    tasks = build_tasks([Task(frame="panda_hand_tcp", type="pose", motion=Fixed())], robot, robot.home)
+    controller = Controller(build_scene(robot, obstacles), tasks, dt=DT)
+    return lambda t: controller.step(robot.home, t, None, given)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,88 @@
+"""The functions of `qpavoid.kernels.motions` as loops that numba compiles; documented there."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from qpavoid.kernels.compiled import compiled
+from qpavoid.kernels.motions import Pieces, Placed
+from qpavoid.problem import Array, IntArray
+
+
+def pack_pieces(pieces: Pieces) -> Pieces:
+    """See `motions.pack_pieces`."""
+    return pieces
+
+
+@compiled
+def sample_pieces(x: Pieces, t: float, tolerance: float, states: Array) -> None:
+    """See `motions.sample_pieces`."""
+    weights = np.empty(7)
+    for k in range(len(x.bodies)):
+        low, high = x.first[k], x.first[k + 1]
+        while high - low > 1:  # the piece lies in [low, high)
+            middle = (low + high) // 2
+            if x.starts[middle] <= t + tolerance:
+                low = middle
+            else:
+                high = middle
+        origin, duration, angle = x.clock[low, 0], x.clock[low, 1], x.clock[low, 2]
+        s, rate = max((t - origin) / duration, 0.0), 1.0 / duration
+        if x.clock[low, 3] > 0.0:
+            rate *= 30.0 * (s * (1.0 - s)) ** 2
+            s *= s * s * (10.0 + s * (6.0 * s - 15.0))
+        sin, cos, spin = np.sin(s * angle), np.cos(s * angle), rate * angle
+        weights[0], weights[1], weights[2], weights[3] = 1.0, s, sin, cos
+        weights[4], weights[5], weights[6] = rate, spin * sin, spin * cos
+        state = states[x.bodies[k]]
+        state[:] = 0.0
+        for i in range(7):
+            if weights[i] != 0.0:
+                for c in range(18):
+                    state[c] += weights[i] * x.terms[low, i, c]
+
+
+@compiled
+def place_obstacles(
+    x: Placed, which: IntArray, geometries: IntArray, owners: IntArray, states: Array, margin: Array
+) -> tuple[int, bool]:
+    """See `motions.place_obstacles`."""
+    obstacles = len(x.states)
+    negative = len(x.twists) - obstacles - 1
+    for i in which:
+        total = 0.0
+        for c in range(18):
+            total += states[i, c]
+        if not abs(total) < np.inf:  # isfinite does not survive the reordering of sums
+            return i, True
+    for i in which:
+        x.states[i] = states[i]
+        state, twist = x.states[i], x.twists[i]
+        px, py, pz = state[9], state[10], state[11]
+        vx, vy, vz, wx, wy, wz = state[12], state[13], state[14], state[15], state[16], state[17]
+        twist[0], twist[1], twist[2] = vx - wy * pz + wz * py, vy - wz * px + wx * pz, vz - wx * py + wy * px
+        twist[3], twist[4], twist[5] = wx, wy, wz
+        x.margin[i] = margin[i]
+        if i < negative:
+            x.margin[obstacles + 1 + i] = margin[i]
+            for c in range(6):
+                x.twists[obstacles + 1 + i, c] = -twist[c]
+        turn = np.sqrt(wx * wx + wy * wy + wz * wz)
+        x.speeds[i] = np.sqrt(vx * vx + vy * vy + vz * vz) + turn * x.reach[i]
+    for n in range(len(geometries)):
+        g, state = geometries[n], x.states[which[owners[n]]]
+        for c in range(12):
+            x.placements[g, c] = state[c]
+        length = 0.0
+        for r in range(3):
+            turned = state[r] * x.local[g, 0] + state[3 + r] * x.local[g, 1] + state[6 + r] * x.local[g, 2]
+            x.centers[g, r] = turned + state[9 + r]
+            length += x.centers[g, r] ** 2
+        x.centers[g, 4] = -length
+    for i in range(obstacles):
+        if x.margin[i] != 0.0:
+            return -1, True
+        for c in range(6):
+            if x.twists[i, c] != 0.0:
+                return -1, True
+    return -1, False

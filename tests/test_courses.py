@@ -1,0 +1,359 @@
+"""Many moving obstacles at once: against each motion's own `sample`, plain definitions, and one by one in a loop."""
+
+import math
+from importlib import import_module
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from closed_loop import drive, make_controller
+from conftest import BOX, CAPSULE, SPHERE, instructions, moved, obstacle
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import TypeAdapter
+
+from qpavoid import Obstacle, Sample, Status, build_scene, config, courses, kernels
+from qpavoid.errors import NumericalError
+from qpavoid.kernels.motions import Placed
+from qpavoid.motion import END_TOLERANCE, Motion, Orbit, Still, build_motion
+from qpavoid.proximity import DistanceQuery
+
+coordinate = st.floats(-2.0, 2.0)
+point = st.tuples(coordinate, coordinate, coordinate)
+angles = st.tuples(*[st.floats(-math.pi, math.pi)] * 3)
+profile = st.sampled_from(["constant", "smooth"])
+direction = point.filter(lambda v: np.linalg.norm(v) > 0.1)
+EARLY = (-1.0, -1e-6, -2.0 * END_TOLERANCE, -0.5 * END_TOLERANCE, 0.0, 0.5 * END_TOLERANCE, 1e-6)
+"""Where to look around a corner [s]."""
+
+
+@pytest.fixture(params=["motions", "motions_compiled"])
+def version(request):
+    """Each version of the kernels in turn."""
+    if request.param == "motions_compiled":
+        pytest.importorskip("numba")
+    return import_module(f"qpavoid.kernels.{request.param}")
+
+
+def build(**block):
+    return build_motion(TypeAdapter(config.Motion).validate_python(block))
+
+
+fixed = st.builds(build, type=st.just("fixed"), position=point, rpy=angles)
+line = st.builds(
+    build, type=st.just("line"), start=point, displacement=direction, speed=st.floats(0.05, 3.0), rpy=angles,
+    start_time=st.floats(0.0, 3.0), profile=profile,
+)  # fmt: skip
+circle = st.builds(
+    build, type=st.just("circle"), center=point, radius=st.floats(0.01, 1.0), normal=st.just((0.2, -0.4, 1.0)),
+    start_direction=st.sampled_from([(1.0, 0.0, 0.0), (0.0, -1.0, 0.3)]), period=st.floats(0.3, 8.0), rpy=angles,
+    turns=st.none() | st.floats(0.05, 3.0),
+)  # fmt: skip
+
+
+@st.composite
+def way(draw):
+    """Some waypoints, of which some only turn, some do not, and some do neither."""
+    count = draw(st.integers(2, 5))
+    steps = draw(st.lists(st.floats(0.05, 2.0), min_size=count, max_size=count))
+    positions = draw(st.lists(st.sampled_from([(0.1, 0.2, 0.3)]) | point, min_size=count, max_size=count))
+    rpys = draw(st.lists(st.sampled_from([(0.0, 0.0, 0.0), (0.4, 0.0, 3.1)]) | angles, min_size=count, max_size=count))
+    times = (np.cumsum(steps) - 1.0).tolist()
+    return build(type="waypoints", times=times, positions=positions, rpys=rpys, profile=draw(profile))
+
+
+def corners(motion):
+    if isinstance(motion, Still):
+        return [0.0]
+    return [0.0, min(motion.end, 1e6)] if isinstance(motion, Orbit) else list(motion.times)
+
+
+def laid_out(motions, version, monkeypatch):
+    """Courses on one version of the kernels, however few the motions are."""
+    monkeypatch.setattr(kernels, "pack_pieces", version.pack_pieces)
+    monkeypatch.setattr(kernels, "sample_pieces", version.sample_pieces)
+    monkeypatch.setattr(courses, "_TOGETHER_FROM", 1)
+    return courses.Courses(motions)
+
+
+def assert_samples(views, motions, t):
+    for view, motion in zip(views, motions, strict=True):
+        for found, expected in zip(view, motion.sample(t), strict=True):
+            np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+
+
+# --- where they are ----------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=50)
+@given(motions=st.lists(fixed | line | circle | way(), min_size=1, max_size=4), data=st.data())
+@pytest.mark.parametrize("name", ["motions", "motions_compiled"])
+def test_all_at_once_are_where_each_alone_is(name, motions, data):
+    """At any time, around corners, and when time goes back."""
+    if name == "motions_compiled":
+        pytest.importorskip("numba")
+    edges = [corner + early for motion in motions for corner in corners(motion) for early in EARLY]
+    times = [*data.draw(st.permutations(edges)), *data.draw(st.lists(st.floats(-5.0, 20.0), max_size=10)), 1.7e9]
+    with pytest.MonkeyPatch.context() as patch:
+        together = laid_out(dict(enumerate(motions)), import_module(f"qpavoid.kernels.{name}"), patch)
+        assert not together.others
+        states = np.full((len(motions), courses.STATE), np.nan)
+        for t in times:
+            together.sample(t, states)
+            assert_samples(courses.as_samples(states), motions, t)
+
+
+def test_only_rows_of_its_own_are_written(version, monkeypatch):
+    motions = {
+        4: build(type="line", start=(0, 0, 1), end=(1, 0, 1), speed=0.5),
+        1: build(type="fixed", position=(1, 2, 3)),
+    }
+    states = np.full((6, courses.STATE), np.nan)
+    laid_out(motions, version, monkeypatch).sample(1.0, states)
+    assert np.flatnonzero(np.isfinite(states).all(axis=1)).tolist() == [1, 4]
+    assert np.flatnonzero(np.isnan(states).all(axis=1)).tolist() == [0, 2, 3, 5]
+    np.testing.assert_allclose(states[4, 9:15], [0.5, 0, 1, 0.5, 0, 0], atol=1e-15)
+
+
+class Pendulum:
+    """A motion that somebody else has made."""
+
+    def sample(self, t):
+        return Sample.at([2.0, 0.1 * math.sin(t), 1.0], linear=[0.0, 0.1 * math.cos(t), 0.0])
+
+
+class Drifting(Still):
+    """One that is derived from one of ours."""
+
+    def sample(self, t):
+        return self.pose._replace(position=self.pose.position + t)
+
+
+def test_motions_of_other_classes_are_left_to_their_sample(version, monkeypatch):
+    motions: dict[int, Motion] = {0: Pendulum(), 1: build(type="circle", center=(0, 0, 1), radius=0.2, period=3)}
+    motions[2] = Drifting(Sample.at([0.0, 0.0, 0.0]))
+    assert set(laid_out(motions, version, monkeypatch).others) == {0, 2}
+
+
+def test_a_controller_follows_motions_of_other_classes(panda):
+    controller = make_controller(panda, [Obstacle("it", SPHERE, Pendulum()), obstacle("rock", SPHERE, (2.0, 1.0, 0.0))])
+    for t in (0.3, 1.1):
+        controller.step(panda.home, t)
+        found = controller.obstacle_pose("it")
+        np.testing.assert_array_equal(found.position, Pendulum().sample(t).position)
+        np.testing.assert_array_equal(controller._query.placing.samples[0].linear, Pendulum().sample(t).linear)
+
+
+def test_a_motion_that_gives_nonsense_is_named_and_moves_nothing(panda):
+    class Broken:
+        def sample(self, t):
+            return Sample.at([2.0, 0.0, 1.0])._replace(position=np.array([2.0 + t, np.nan if t > 1.0 else 0.0, 1.0]))
+
+    scene = [Obstacle("broken", SPHERE, Broken()), Obstacle("other", SPHERE, Pendulum())]
+    controller = make_controller(panda, scene)
+    controller.step(panda.home, 0.5)
+    before = [controller.obstacle_pose(name).position for name in ("broken", "other")]
+    with pytest.raises(NumericalError, match="'broken': NaN or infinity"):
+        controller.step(panda.home, 1.5)
+    np.testing.assert_array_equal([controller.obstacle_pose(name).position for name in ("broken", "other")], before)
+
+
+@given(data=st.data())
+def test_states_move_on_at_their_twists(data):
+    states = np.zeros((4, courses.STATE))
+    views, expected = courses.as_samples(states), []
+    t = data.draw(st.floats(-1.0, 1.0))
+    for view in views:
+        twist = data.draw(st.sampled_from([(0.0, 0.0, 0.0)]) | point)
+        sample = Sample.at(data.draw(point), pin.exp3(np.array(data.draw(point))), data.draw(point), twist)
+        courses.put(view, sample)
+        expected.append(moved(sample, t))
+    courses.move_on(states, t)
+    for view, sample in zip(views, expected, strict=True):
+        np.testing.assert_allclose(view.position, sample.position, atol=1e-14)
+        np.testing.assert_allclose(view.rotation, sample.rotation, atol=1e-14)
+
+
+# --- what distances know of them ---------------------------------------------------------------------------------
+
+
+def memory(rng, obstacles, loads, centred):
+    """Of a scene that nobody has built: obstacle i has i % 3 bodies; five bodies before them are the robot's."""
+    owner = np.concatenate([np.full(5, -1), np.repeat(np.arange(obstacles), np.arange(obstacles) % 3)])
+    local = rng.normal(size=(len(owner), 3)) * (not centred)
+    return owner, Placed(
+        states=np.zeros((obstacles, courses.STATE)), twists=np.zeros((obstacles + 1 + loads, 6)),
+        margin=np.zeros(obstacles + 1 + loads), speeds=np.zeros(obstacles), reach=rng.uniform(0.1, 1.0, obstacles),
+        placements=rng.normal(size=(len(owner), 12)), local=local, centred=centred,
+        centers=np.ones((len(owner), 5)),
+    )  # fmt: skip
+
+
+def random_states(rng, count, turning):
+    states = np.zeros((count, courses.STATE))
+    for view in courses.as_samples(states):
+        twist = rng.normal(size=(2, 3)) * (rng.random() < 0.7)
+        rotation = pin.exp3(rng.normal(size=3))
+        courses.put(view, Sample(rng.normal(size=3), rotation, twist[0], turning * twist[1]))
+    return states
+
+
+@pytest.mark.parametrize("turning", [False, True])
+@pytest.mark.parametrize("centred", [False, True])
+@pytest.mark.parametrize("loads", [0, 2])
+def test_what_distances_know_by_definition(version, loads, centred, turning):
+    rng = np.random.default_rng(1)
+    owner, x = memory(rng, 8, loads, centred)
+    before = x.placements.copy()
+    for which in ([0, 2, 3, 7], [5], [4, 1], []):
+        which = np.array(which, dtype=np.intp)
+        geometries = np.array([g for i in which for g in np.flatnonzero(owner == i)], dtype=np.intp)
+        owners = np.array([list(which).index(i) for i in owner[geometries]], dtype=np.intp)
+        states, margin = random_states(rng, 8, turning), rng.choice([0.0, 0.1], 8)
+        bad, moving = version.place_obstacles(x, which, geometries, owners, states, margin)
+        assert bad == -1 and moving == bool(x.twists.any() or x.margin.any())
+        for i in which:
+            sample = courses.as_samples(states)[i]
+            at_origin = pin.SE3(np.eye(3), sample.position).act(pin.Motion(sample.linear, sample.angular))
+            np.testing.assert_allclose(x.twists[i], at_origin.vector, atol=1e-14)
+            speed = np.linalg.norm(sample.linear) + x.reach[i] * np.linalg.norm(sample.angular)
+            assert x.speeds[i] == pytest.approx(speed, abs=1e-14)
+            assert x.margin[i] == margin[i] and (x.states[i] == states[i]).all()
+        for g in geometries:
+            sample = courses.as_samples(states)[owner[g]]
+            np.testing.assert_array_equal(x.placements[g, :9].reshape(3, 3).T, sample.rotation)
+            np.testing.assert_array_equal(x.placements[g, 9:], sample.position)
+            center = sample.rotation @ x.local[g] + sample.position
+            np.testing.assert_allclose(x.centers[g], [*center, 1.0, -center @ center], atol=1e-13)
+        np.testing.assert_array_equal(x.twists[9:], -x.twists[:loads])
+        np.testing.assert_array_equal(x.margin[9:], x.margin[:loads])
+        assert not x.twists[8].any() and x.margin[8] == 0.0
+    untouched = ~np.isin(owner, [0, 2, 3, 7, 5, 4, 1])
+    np.testing.assert_array_equal(x.placements[untouched], before[untouched])
+
+
+def test_both_versions_leave_the_same_memory():
+    pytest.importorskip("numba")
+    plain, fast = (import_module(f"qpavoid.kernels.{name}") for name in ("motions", "motions_compiled"))
+    for seed in range(20):
+        found = []
+        for module in (plain, fast):
+            rng = np.random.default_rng(seed)
+            owner, x = memory(rng, 12, 3, seed % 2 == 0)
+            which = np.flatnonzero(rng.random(12) < 0.5)
+            geometries = np.flatnonzero(np.isin(owner, which))
+            owners = np.searchsorted(which, owner[geometries])
+            states = random_states(rng, 12, seed % 3 > 0)
+            if seed % 5 == 4:
+                states[which[-1], rng.integers(18)] = rng.choice([np.nan, np.inf])
+            said = module.place_obstacles(x, which, geometries, owners, states, rng.choice([0.0, 0.1], 12))
+            found.append((said, x))
+        assert found[0][0] == found[1][0] and (found[0][0][0] >= 0) == (seed % 5 == 4)
+        for name, a, b in zip(Placed._fields, found[0][1], found[1][1], strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12, err_msg=name)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_numbers_that_cannot_be_true_change_nothing(version, value):
+    rng = np.random.default_rng(2)
+    owner, x = memory(rng, 6, 1, False)
+    before = [np.copy(part) for part in x]
+    which, geometries = np.arange(6), np.flatnonzero(owner >= 0)
+    for column in range(courses.STATE):
+        states = random_states(rng, 6, True)
+        states[3, column] = value
+        bad, _ = version.place_obstacles(x, which, geometries, owner[geometries], states, np.zeros(6))
+        assert bad == 3
+        for part, was in zip(x, before, strict=True):
+            np.testing.assert_array_equal(part, was)
+
+
+def test_some_move_in_coals_model_and_the_others_stay(panda):
+    """Through the query: each body where its obstacle is, and no other."""
+    shapes = [SPHERE, CAPSULE, BOX, SPHERE]
+    scene = build_scene(panda, [obstacle(f"o{i}", shape, (1.0 + i, 0.0, 0.5)) for i, shape in enumerate(shapes)])
+    query, rng = DistanceQuery(scene), np.random.default_rng(3)
+    states = random_states(rng, 4, True)
+    query.placing.place(np.array([2, 0]), states, np.zeros(4))
+    views = courses.as_samples(states)
+    first = len(scene.body_names)
+    for i, body in enumerate(list(query.bodies)[first:]):
+        expected = views[i] if i in (0, 2) else scene.obstacles[i].motion.sample(0.0)
+        np.testing.assert_array_equal(body.placement.rotation, expected.rotation)
+        np.testing.assert_array_equal(body.placement.translation, expected.position)
+
+
+# --- in the tick -------------------------------------------------------------------------------------------------
+
+
+def circling(rng, count, away, radius=0.3):
+    """Spheres, capsules and boxes on circles, lines and turning ways around the robot."""
+    found = []
+    for i in range(count):
+        center = away * rng.uniform(0.9, 1.1) * np.array([np.cos(i), np.sin(i), 0.4])
+        if i % 3 == 0:
+            motion = build(
+                type="circle", center=center.tolist(), radius=radius, period=4.0, normal=rng.normal(size=3).tolist()
+            )
+        elif i % 3 == 1:
+            motion = build(type="line", start=center.tolist(), displacement=(-0.5 * center).tolist(), speed=0.3)
+        else:
+            ends = [center.tolist(), (0.6 * center).tolist()]
+            motion = build(type="waypoints", times=[0.0, 2.0], positions=ends, rpys=[(0, 0, 0), (1.0, 2.0, 0.5)])
+        found.append(Obstacle(f"o{i}", (SPHERE, CAPSULE, BOX)[i % 3], motion))
+    return found
+
+
+def test_python_work_does_not_grow_with_the_number_of_moving_obstacles(panda):
+    """Neither that of a tick, nor that of looking ahead."""
+    ticks, ahead = [], []
+    for count in (30, 90):
+        controller = make_controller(panda, circling(np.random.default_rng(5), count, 20.0), "panda_hand_tcp")
+        for t in (0.10, 0.11):
+            controller.step(panda.home, t)
+        assert not len(controller.tick(panda.home, 0.12).proximity.pair)
+        ticks.append(instructions(lambda controller=controller: controller.step(panda.home, 0.13)))
+        controller._guard._place_obstacles(controller._query)  # scipy looks for what it needs at the first call
+        ahead.append(instructions(lambda controller=controller: controller._guard._place_obstacles(controller._query)))
+        speeds = controller._query.placing.speeds[panda.model.njoints :]
+        assert np.count_nonzero(speeds) == count  # they do move
+    assert 0 < ticks[0] == ticks[1] < 4000
+    assert 0 < ahead[0] == ahead[1] < 2000
+
+
+def test_a_loop_is_the_same_as_with_every_motion_sampled_alone(panda, monkeypatch):
+    runs = []
+    for alone in (False, True):
+        if alone:
+            monkeypatch.setattr(courses, "_cut", lambda motion: None)
+        controller = make_controller(panda, circling(np.random.default_rng(6), 9, 0.6), "panda_hand_tcp")
+        assert len(controller._obstacles._courses.others) == (9 if alone else 0)
+        runs.append(list(drive(controller, panda.home, 200, target=[0.6, 0.2, 0.5])))
+    together, alone = runs
+    near = [len(tick.proximity.pair) for tick in alone]
+    statuses = {tick.solution.status for tick in alone}
+    assert max(near) > 3 and statuses == {Status.SOLVED, Status.RELAXED}
+    for a, b in zip(together, alone, strict=True):
+        np.testing.assert_allclose(a.solution.v, b.solution.v, atol=1e-9)
+        np.testing.assert_array_equal(a.proximity.pair, b.proximity.pair)
+        np.testing.assert_allclose(a.proximity.drift, b.proximity.drift, atol=1e-9)
+
+
+def test_what_the_robot_carries_leaves_its_trajectory(panda):
+    """And what is given takes the place of a trajectory, for good."""
+    load = Obstacle(
+        "load", SPHERE, build(type="line", start=(0.4, 0, 0.5), end=(2.0, 0, 0.5), speed=0.5), graspable=True
+    )
+    controller = make_controller(panda, [load, *circling(np.random.default_rng(7), 4, 5.0)], "panda_hand_tcp")
+    controller.step(panda.home, 0.1)
+    controller.attach("load", "panda_hand_tcp", panda.home)
+    at = controller.obstacle_pose("load", panda.home)
+    np.testing.assert_allclose(at.position, [0.45, 0.0, 0.5], atol=1e-12)
+    given = Sample.at([3.0, 3.0, 3.0], linear=[0.0, 0.0, 0.4])
+    for k in range(3):
+        controller.step(panda.home, 0.2 + 0.01 * k, None, {"o1": given} if k == 0 else None)
+    np.testing.assert_array_equal(controller.obstacle_pose("load", panda.home).position, at.position)
+    later = [3.0, 3.0, 3.0 + 2 * controller.dt * 0.4]
+    np.testing.assert_allclose(controller.obstacle_pose("o1").position, later, atol=1e-12)
+    expected = controller.scene.obstacles[3].motion.sample(0.22)
+    np.testing.assert_allclose(controller.obstacle_pose("o2").position, expected.position, atol=1e-12)
