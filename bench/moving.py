@@ -43,8 +43,9 @@ def main() -> None:
         f"load {load:.1f} at the start. One thread.",
         "",
         f"A Panda holds its tool still among {OBSTACLES} spheres, 2 m away, so that nothing is near: a tick is "
-        f"kinematics, bounding spheres, task rows and bounds. Some move on lines and circles, or are given to `step` as a "
-        f"`Sample` or a `Pose`. Kinds take turns, {BATCH} ticks each; median over {options.rounds} turns [µs]; in brackets what "
+        "kinematics, bounding spheres, task rows and bounds. Some move on lines and circles, or are given to `step` as "
+        f"a `Sample` or a `Pose`. Kinds take turns, {BATCH} ticks each; median over {options.rounds} turns [µs]; in "
+        "brackets what "
         "one such obstacle adds.",
         "",
         "| obstacles | " + " | ".join(MODES) + " |",
