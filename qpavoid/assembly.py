@@ -181,8 +181,19 @@ class Assembly:
         return np.asarray(self._layout.A[rows] @ v / self._layout.scale[rows])
 
     def remember(self, v: Array) -> None:
-        """Takes v (nv,) as the velocity at which the robot moves until the next tick."""
+        """Takes v (nv,) as the velocity at which the robot moves from this tick to the next."""
+        x = self._layout
+        if x.jerked:
+            np.clip(v - x.v_last, -x.v_step, x.v_step, out=x.w_last)
+        x.v_last[:] = v
+
+    def measured(self, v: Array) -> None:
+        """Takes v (nv,) as the velocity at which the robot moves until this tick; accelerations stay as commanded."""
         self._layout.v_last[:] = v
+
+    def restart(self, v: Array) -> None:
+        """Takes v (nv,) as the velocity at which the robot has been moving, without any acceleration."""
+        self._layout.v_last[:], self._layout.w_last[:] = v, 0.0
 
     @property
     def v_last(self) -> Array:
