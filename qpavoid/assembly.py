@@ -20,6 +20,24 @@ from qpavoid.scene import Scene
 from qpavoid.tasks import AnyTask, in_order, task_layout, task_levels
 
 
+_MOST_TICKS = 1000
+"""Ticks of a stop that are followed."""
+
+
+class _StopAhead:
+    """Follows stops within jerk limits, in memory of its own."""
+
+    def __init__(self, layout: RowLayout) -> None:
+        names = "v_last", "w_last", "lower", "upper", "hard_lower", "hard_upper", "v_stop"
+        self._packed = kernels.pack(layout._replace(**{name: getattr(layout, name).copy() for name in names}))
+        self._way = np.zeros((_MOST_TICKS, len(layout.v_last)))
+
+    def way(self, q: Array, v: Array, w: Array) -> Array:
+        """See `kernels.vectorised.stop_way`; a view of memory that the next call overwrites."""
+        self._way[0] = v
+        return self._way[: kernels.stop_way(self._packed, q, w, self._way)]
+
+
 class Assembly:
     """Rows and bounds of a tick. What it returns looks into memory that the next tick overwrites."""
 
@@ -76,6 +94,7 @@ class Assembly:
         x = self._layout
         self._hard = (x.hard_lower, x.hard_upper) if limits.acceleration_gives_way else (x.lower, x.upper)
         self._packed = kernels.pack(self._layout)
+        self._stop = _StopAhead(x) if x.jerked else None
         self._names = scene.pair_names, tuple(scene.robot.coordinate_names)
         self._targets = [(row[:3], row[3:12].reshape(3, 3), row[12:15], row[15:]) for row in self._layout.targets]
         self._views: dict[int, tuple[Proximity, AvoidanceRows]] = {}
@@ -124,12 +143,46 @@ class Assembly:
         x.carriers[:] = query.carriers()
         x.joint_reach[:] = query.joint_reach()
 
-    def closest_call(self, v: Array, near: int, reach: float, horizon: float) -> float:
+    def closest_call(self, v: Array, near: int, reach: float, horizon: float, aside: Array | None = None) -> float:
         """A bound below what is left of the safe distances on the way of v until `horizon` [m].
 
         See `kernels.vectorised.closest_call`; v is that of the last `ForwardKinematics.move`.
+
+        Args:
+            v: velocity (nv,).
+            near: number of near pairs.
+            reach: surface distance below which a pair is near [m].
+            horizon: time for which v leads on [s].
+            aside: how far the coordinates move beside (nv,) [rad or m]; not at all if left out.
         """
-        return float(kernels.closest_call(self._packed, v, near, reach, horizon))
+        left = float(kernels.closest_call(self._packed, v, near, reach, horizon))
+        if aside is None:
+            return left
+        straight = horizon * np.abs(v)
+        return left - 2.0 * self.longest_way(aside) - (self._bend(straight + aside) - self._bend(straight))
+
+    def longest_way(self, ways: Array) -> float:
+        """How far a point can move at most where coordinates move by `ways` (nv,) [m]."""
+        turned, slid = self._turned_and_slid(ways)
+        return turned * self._layout.lever + slid
+
+    def _bend(self, ways: Array) -> float:
+        """What `closest_call` allows for ways that are not straight, where coordinates move by `ways` (nv,) [m]."""
+        turned, slid = self._turned_and_slid(ways)
+        return turned * (turned * self._layout.lever + 2.0 * slid)
+
+    def _turned_and_slid(self, ways: Array) -> tuple[float, float]:
+        return float(np.max(self._layout.turning @ ways)), float(np.max(self._layout.sliding @ ways))
+
+    def stop_way(self, q: Array, v: Array) -> Array:
+        """Velocities (ticks, nv) of a tick at v and of the stop after it, where jerks have limits.
+
+        Args:
+            q: configuration (nq,) at which the tick begins.
+            v: velocity (nv,).
+        """
+        assert self._stop is not None
+        return self._stop.way(q, v, np.clip(v - self._layout.v_last, -self._layout.v_step, self._layout.v_step))
 
     def follow(self, v: Array, problem: Problem) -> Problem:
         """The problem of this tick with the velocity v (nv,) to follow in place of the tasks."""

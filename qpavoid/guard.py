@@ -2,8 +2,8 @@
 
 The rows of a problem are a linearisation, and they know only what is near. What is commanded must hold for the real
 distances, of all pairs, at q ⊕ v dt with obstacles moved on; and it must leave a way to stop. So every velocity is
-followed for one tick and then slowed down uniformly, as the accelerations and joint limits allow, and the distances
-along that way are computed anew. Where it comes too near, a solution that moves the joints less is tried, whose way
+followed for one tick and then slowed down uniformly, as the joint limits allow, and the distances along that way are
+computed anew. Where it comes too near, a solution that moves the joints less is tried, whose way
 bends less; and that is drawn back towards the stop of this tick, whose way was looked at one tick ago. By induction a
 stop that was found clear is always at hand, as long as obstacles do what they were last seen to do, for one tick.
 
@@ -42,6 +42,12 @@ _MOST_POSES = 48
 """Poses that are looked at along one way, about."""
 _MOST_TICKS = 200
 """Ticks of a stop that are followed."""
+_MOST_PIECES = 24
+"""Straight pieces of the way of a stop within jerk limits, about."""
+_STRAIGHT = 5e-4
+"""How far the fastest point may move beside the direction of a way that counts as straight [m]."""
+_SLOWEST = 1e-3
+"""Speed from which such a way is looked at in steps of time [m/s]."""
 _PATIENCE = 0.1
 """For how long a speed that a row misses counts, where nothing is clear: a stop lets an obstacle come on [s]."""
 _SHARES = (0.75, 0.5, 0.25, 0.0)
@@ -87,6 +93,7 @@ class Guard:
         self._data, self._ahead = scene.robot.model.createData(), DistanceQuery(scene)
         self._bounds, self._rate = bounds, position_gain / dt
         self._acceleration, self._accelerated = bounds.acceleration, bool(np.isfinite(bounds.acceleration).any())
+        self._jerked = bool(np.isfinite(bounds.jerk).any())
         self._given = np.zeros(len(scene.pairs))
         self._samples: dict[int, Sample] = {}
 
@@ -130,9 +137,11 @@ class Guard:
         """
         v, v_stop, rows = solution.v, problem.v_stop, problem.avoidance
         near = rows.pair
-        horizon = self._dt + 0.5 * self._stopping(v)
+        horizon, aside = self._dt + 0.5 * self._stopping(v), None
+        if self._jerked:
+            horizon, aside = self._swept(assembly.stop_way(q, v), v)
         self._kinematics.move(q, v)
-        if assembly.closest_call(v, len(near), reach, horizon) > 0.0:
+        if assembly.closest_call(v, len(near), reach, horizon, aside) > 0.0:
             return None
         self._given[:] = 0.0
         if solution.slack is not None:
@@ -141,7 +150,7 @@ class Guard:
         self._place_obstacles(query.margin)
         speed = float(np.max(query.speeds))
         gap = float(np.min(query.found(query.pairs), initial=reach)) - self._hold
-        worst, pair = self._worst(q, v, query, gap, speed)
+        worst, pair = self._worst(q, v, query, gap, speed, assembly)
         if worst >= 0.0:
             return None
         best, price = Checked(v, 1.0, -worst, pair), -worst
@@ -149,7 +158,7 @@ class Guard:
         full = v if straight is None else straight
         for share in _SHARES if straight is None else (1.0, *_SHARES):
             blend = v_stop + share * (full - v_stop)
-            worst, pair = self._worst(q, blend, query, gap, speed)
+            worst, pair = self._worst(q, blend, query, gap, speed, assembly)
             if worst >= 0.0:
                 return Checked(blend, share, 0.0, -1)
             missed = np.max(rows.b - rows.J @ blend - (0.0 if solution.slack is None else solution.slack), initial=0.0)
@@ -166,7 +175,9 @@ class Guard:
             del self._samples[index]
         self._ahead.margin[:] = margin
 
-    def _worst(self, q: Array, v: Array, now: DistanceQuery, gap: float, speed: float) -> tuple[float, int]:
+    def _worst(
+        self, q: Array, v: Array, now: DistanceQuery, gap: float, speed: float, assembly: Assembly
+    ) -> tuple[float, int]:
         """Least of distance - what it has to be, along the way of v and its stop [m], and the pair that it is of.
 
         The steps are such that no two bodies can meet in between, and no shorter than `_FINEST`: what a pair could come
@@ -178,9 +189,14 @@ class Guard:
             now: distances there.
             gap: by how much the nearest pair is farther apart than it has to be [m].
             speed: that no point of the robot exceeds [m/s].
+            assembly: of this tick.
         """
         worst, pair, looks = np.inf, -1, 0
-        pieces = self._way(q, v)
+        if self._jerked:
+            speed = max(speed, _SLOWEST)
+            pieces = self._curved_way(q, v, speed, assembly)
+        else:
+            pieces = self._way(q, v)
         left = sum(duration for *_, duration in pieces)
         for start, along, duration in pieces:
             t = 0.0
@@ -228,6 +244,37 @@ class Guard:
             following[j] = np.clip(following[j], np.maximum(-down, hardest[0]), np.minimum(up, hardest[1]))
             v = following
         return pieces
+
+    def _curved_way(self, q: Array, v: Array, speed: float, assembly: Assembly) -> list[tuple[Array, Array, float]]:
+        """The tick of v and the stop within jerk limits after it, in pieces that take as long as at constant speed.
+
+        The more of it leads beside the direction of v, the more pieces there are.
+
+        Args:
+            q: start (nq,).
+            v: velocity (nv,).
+            speed: of the fastest point at v, or more [m/s].
+            assembly: of this tick.
+        """
+        way = assembly.stop_way(q, v)
+        off = assembly.longest_way(self._swept(way, v)[1])
+        count = min(1 + int(np.sqrt(off / _STRAIGHT)), _MOST_PIECES) if np.isfinite(off) else _MOST_PIECES
+        pieces = [(q, v, self._dt)]
+        q = pin.integrate(self._model, q, self._dt * v)
+        for ticks in np.array_split(way[1:], min(count, max(len(way) - 1, 1))):
+            forwards, aside = self._swept(ticks, v)
+            off = assembly.longest_way(aside)
+            duration = forwards + (off / speed if np.isfinite(off) else len(ticks) * self._dt)
+            if duration > 0.0:
+                change = self._dt * ticks.sum(axis=0)
+                pieces.append((q, change / duration, duration))
+                q = pin.integrate(self._model, q, change)
+        return pieces
+
+    def _swept(self, way: Array, v: Array) -> tuple[float, Array]:
+        """For how long the velocities of ticks (k, nv) lead along v [s], and how far beside it (nv,) [rad or m]."""
+        shares = way @ v / max(float(v @ v), 1e-300)
+        return self._dt * float(np.abs(shares).sum()), self._dt * np.abs(way - shares[:, None] * v).sum(axis=0)
 
     def _end(self, stopping: float) -> float:
         """Time for which v leads as far as v and the ticks of its stop: dt Σ (1 - i dt / stopping), i = 0, 1, … [s]."""

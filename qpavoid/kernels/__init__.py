@@ -30,6 +30,7 @@ projection_cost = _chosen.projection_cost
 row_bounds = _chosen.row_bounds
 shortfall = _chosen.shortfall
 stop_velocity = _chosen.stop_velocity
+stop_way = _chosen.stop_way
 tracking_shortfall = _chosen.tracking_shortfall
 velocity_bounds = _chosen.velocity_bounds
 choose = _voxels.choose
@@ -49,6 +50,7 @@ __all__ = [
     "row_bounds",
     "shortfall",
     "stop_velocity",
+    "stop_way",
     "tracking_shortfall",
     "velocity_bounds",
     "within_reach",

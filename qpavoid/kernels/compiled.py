@@ -15,7 +15,7 @@ from numba import njit, types
 from numba.experimental import structref
 
 from qpavoid.kernels.layout import RowLayout
-from qpavoid.kernels.stopping import MOST_STEPS, way_to_stop
+from qpavoid.kernels.stopping import AT_REST, MOST_STEPS, way_to_stop
 from qpavoid.kernels.vectorised import BRAKING_SHARE, WELL_CONDITIONED, rotation_vector
 from qpavoid.problem import Array, IntArray
 
@@ -336,21 +336,65 @@ def stop_velocity(x: Any) -> None:
     slowing = 1.0 if x.accelerated else np.inf
     for j in range(len(x.v_last)):
         slowing = max(slowing, abs(x.v_last[j]) / x.v_step[j])
-    share, kept = 1.0 - 1.0 / slowing if x.accelerated else 0.0, 0.0
+    share = 1.0 - 1.0 / slowing if x.accelerated else 0.0
     if x.jerked:
-        fastest, off = 0.0, 0.0
+        _easing_stop(x, 1.0 / slowing)
+    else:
         for j in range(len(x.v_last)):
-            fastest = max(fastest, abs(x.v_last[j]) / x.w_step[j])
-        braking = 1.0 / slowing
-        if fastest > 0.0:
-            braking = min(braking, _speed_to_stop(fastest, 1.0, 1.0) / fastest)
-        for j in range(len(x.v_last)):
-            off = max(off, abs(x.w_last[j] + braking * x.v_last[j]) / x.w_step[j])
-        kept = 1.0 - 1.0 / max(off, 1.0)
-        share = 1.0 - (1.0 - kept) * braking
+            x.v_stop[j] = share * x.v_last[j]
     for j in range(len(x.v_last)):
-        v = share * x.v_last[j] + kept * x.w_last[j] if x.jerked else share * x.v_last[j]
-        x.v_stop[j] = min(max(v, x.lower[j]), x.upper[j])
+        x.v_stop[j] = min(max(x.v_stop[j], x.lower[j]), x.upper[j])
+
+
+@compiled
+def _easing_stop(x: Any, braking: float) -> None:
+    """See `vectorised._easing_stop`."""
+    fastest, off = 0.0, 1.0
+    for j in range(len(x.v_last)):
+        fastest = max(fastest, abs(x.v_last[j]) / x.w_step[j])
+    if fastest > 0.0:
+        braking = min(braking, _speed_to_stop(fastest, 1.0, 1.0) / fastest)
+    for j in range(len(x.v_last)):
+        off = max(off, abs(x.w_last[j] + braking * x.v_last[j]) / x.w_step[j])
+    kept = 1.0 - 1.0 / off
+    share = 1.0 - (1.0 - kept) * braking
+    for j in range(len(x.v_last)):
+        x.v_stop[j] = share * x.v_last[j] + kept * x.w_last[j]
+
+
+@compiled
+def stop_way(x: Any, q: Array, w: Array, way: Array) -> int:
+    """See `vectorised.stop_way`."""
+    x.lower[:], x.upper[:] = -np.inf, np.inf
+    count = _stop_ticks(x, q, w, way, False)
+    for i in range(len(x.q_index)):
+        here, j = q[x.q_index[i]], x.v_index[i]
+        for k in range(count):
+            here += x.dt * way[k, j]
+            if here < x.q_lower[i] or here > x.q_upper[i] or abs(way[k, j]) > x.v_max[j]:
+                return _stop_ticks(x, q.copy(), w, way, True)
+    return count
+
+
+@compiled
+def _stop_ticks(x: Any, q: Array, w: Array, way: Array, bounded: bool) -> int:
+    """See `vectorised._stop_ticks`."""
+    x.v_last[:], x.w_last[:] = way[0], w
+    for k in range(1, len(way)):
+        if bounded:
+            for i in range(len(x.q_index)):
+                q[x.q_index[i]] += x.dt * x.v_last[x.v_index[i]]
+            velocity_bounds(x, q)
+        stop_velocity(x)
+        moves = False
+        for j in range(len(w)):
+            change = x.v_stop[j] - x.v_last[j]
+            x.w_last[j], x.v_last[j] = min(max(change, -x.v_step[j]), x.v_step[j]), x.v_stop[j]
+            way[k, j] = x.v_stop[j]
+            moves = moves or abs(x.v_stop[j]) > AT_REST * x.v_step[j] or abs(x.w_last[j]) > x.w_step[j]
+        if not moves:
+            return k
+    return len(way)
 
 
 @compiled

@@ -22,6 +22,8 @@ import numpy as np
 
 MOST_STEPS = 20
 """Newton steps of `change_to_stop`; two to five are taken."""
+AT_REST = 1e-9
+"""Share of the largest change of v below which a speed is round-off of 0 [-]."""
 
 
 def way_to_stop(v: Any, w: Any, most: Any) -> tuple[Any, Any]:

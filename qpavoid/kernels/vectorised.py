@@ -12,7 +12,7 @@ import numpy as np
 from scipy.linalg.lapack import dposv
 
 from qpavoid.kernels.layout import RowLayout
-from qpavoid.kernels.stopping import MOST_STEPS, longest_way, way_to_stop
+from qpavoid.kernels.stopping import AT_REST, MOST_STEPS, longest_way, way_to_stop
 from qpavoid.kernels.workspace import Rows, Workspace
 from qpavoid.problem import Array, IntArray
 
@@ -431,20 +431,70 @@ def stop_velocity(x: Any) -> None:
     factor, in steps that no coordinate's jerk forbids; once it is there, it stays there to the end.
     """
     if x.jerked:
-        slowing = np.max(np.abs(x.v_last) / x.v_step, initial=1.0)
-        fastest = np.max(np.abs(x.v_last) / x.w_step)
-        braking = 1.0 / slowing
-        if fastest > 0.0:
-            braking = min(braking, speed_to_stop(fastest, 1.0, 1.0) / fastest)
-        kept = 1.0 - 1.0 / np.max(np.abs(x.w_last + braking * x.v_last) / x.w_step, initial=1.0)
-        v = (1.0 - (1.0 - kept) * braking) * x.v_last + kept * x.w_last
-        np.clip(v, x.lower, x.upper, out=x.v_stop)
+        np.clip(_easing_stop(x, x.v_last, x.w_last), x.lower, x.upper, out=x.v_stop)
     elif x.accelerated:
         slowing = np.max(np.abs(x.v_last) / x.v_step, initial=1.0)  # number of ticks to a standstill
         np.clip((1.0 - 1.0 / slowing) * x.v_last, x.lower, x.upper, out=x.v_stop)
     else:
         np.minimum(x.upper, x.zero, out=x.v_stop)
         np.maximum(x.v_stop, x.lower, out=x.v_stop)
+
+
+def _easing_stop(x: Any, v: Array, w: Array) -> Array:
+    """Next velocity (n,) of a stop within jerk limits: see `stop_velocity`.
+
+    Args:
+        x: reads v_step and w_step.
+        v: velocity (n,).
+        w: by how much it has just changed (n,).
+    """
+    speeds = np.abs(v)
+    braking, fastest = 1.0 / max(float((speeds / x.v_step).max()), 1.0), float((speeds / x.w_step).max())
+    if fastest > 0.0:
+        ticks = max(math.ceil(0.5 * math.sqrt(1.0 + 8.0 * fastest) - 0.5), 1)
+        braking = min(braking, 1.0 / ticks + 0.5 * (ticks - 1) / fastest)  # σ(fastest) / fastest
+    kept = 1.0 - 1.0 / max(float((np.abs(w + braking * v) / x.w_step).max()), 1.0)
+    return (1.0 - (1.0 - kept) * braking) * v + kept * w
+
+
+def stop_way(x: Any, q: Array, w: Array, way: Array) -> int:
+    """Velocities of the ticks of a stop within jerk limits, from the velocity way[0] on.
+
+    Bounds matter only where the stop without them passes a limit of position or velocity.
+
+    Args:
+        x: memory of its own; the limits are read.
+        q: configuration (nq,) before the first of these ticks.
+        w: change of v that has led to way[0] (n,), no larger than v_step.
+        way: out, room for as many ticks as are looked at (m, n).
+
+    Returns:
+        Number of ticks in which the robot moves, or m.
+    """
+    count = _stop_ticks(x, q, w, way, False)
+    places = q[x.q_index] + x.dt * np.cumsum(way[:count, x.v_index], axis=0)
+    if (places >= x.q_lower).all() and (places <= x.q_upper).all() and (np.abs(way[:count]) <= x.v_max).all():
+        return count
+    return _stop_ticks(x, q.copy(), w, way, True)
+
+
+def _stop_ticks(x: Any, q: Array, w: Array, way: Array, bounded: bool) -> int:
+    """`stop_way`, with all bounds at all places of the way, or with none."""
+    v = way[0]
+    for k in range(1, len(way)):
+        if bounded:
+            x.v_last[:], x.w_last[:] = v, w
+            q[x.q_index] += x.dt * v[x.v_index]
+            velocity_bounds(x, q)
+            stop_velocity(x)
+            way[k] = x.v_stop
+        else:
+            way[k] = _easing_stop(x, v, w)
+        w = np.clip(way[k] - v, -x.v_step, x.v_step)
+        v = way[k]
+        if (np.abs(v) <= AT_REST * x.v_step).all() and (np.abs(w) <= x.w_step).all():
+            return k
+    return len(way)
 
 
 def damped_solution(x: Any, v: Array) -> None:
