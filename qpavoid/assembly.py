@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,6 +23,23 @@ from qpavoid.tasks import AnyTask, in_order, task_layout, task_levels
 
 _MOST_TICKS = 1000
 """Ticks of a stop that are followed."""
+
+
+_ROUND_OFF = 1e-9
+"""Share of a coordinate's largest change of speed in a tick that counts as round-off [-]."""
+
+
+class Stop(NamedTuple):
+    """A tick at a velocity v and the stop within jerk limits after it, of m ticks in all."""
+
+    way: Array
+    """(m, nv) velocities; memory that the next stop overwrites."""
+    forwards: Array
+    """(m,) for how long v would lead as far [s]."""
+    aside: Array
+    """(m,) how far any point moves beside that, at most [m]."""
+    ways: Array
+    """(nv,) how far each coordinate moves in all [rad or m]."""
 
 
 class _StopAhead:
@@ -94,7 +112,7 @@ class Assembly:
         x = self._layout
         self._hard = (x.hard_lower, x.hard_upper) if limits.acceleration_gives_way else (x.lower, x.upper)
         self._packed = kernels.pack(self._layout)
-        self._stop = _StopAhead(x) if x.jerked else None
+        self._stop, self._dt = _StopAhead(x) if x.jerked else None, dt
         self._names = scene.pair_names, tuple(scene.robot.coordinate_names)
         self._targets = [(row[:3], row[3:12].reshape(3, 3), row[12:15], row[15:]) for row in self._layout.targets]
         self._views: dict[int, tuple[Proximity, AvoidanceRows]] = {}
@@ -132,8 +150,9 @@ class Assembly:
             x.v0[:] = tracking_within(held, x.A, x.b, x.damping)
             worst = float(kernels.tracking_shortfall(self._packed, k))
         return proximity, Problem(
-            self._tracking, rows, x.lower, x.upper, *self._hard, x.v_stop, *self._names, x.v0, worst, held, self._levels
-        )
+            self._tracking, rows, x.lower, x.upper, *self._hard, x.v_stop, *self._names, x.v0, worst, held, self._levels,
+            x.jerked,
+        )  # fmt: skip
 
     def carry(self, query: DistanceQuery) -> None:
         """Takes over which joint carries what, in place."""
@@ -143,7 +162,7 @@ class Assembly:
         x.carriers[:] = query.carriers()
         x.joint_reach[:] = query.joint_reach()
 
-    def closest_call(self, v: Array, near: int, reach: float, horizon: float, aside: Array | None = None) -> float:
+    def closest_call(self, v: Array, near: int, reach: float, horizon: float, stop: Stop | None = None) -> float:
         """A bound below what is left of the safe distances on the way of v until `horizon` [m].
 
         See `kernels.vectorised.closest_call`; v is that of the last `ForwardKinematics.move`.
@@ -153,36 +172,47 @@ class Assembly:
             near: number of near pairs.
             reach: surface distance below which a pair is near [m].
             horizon: time for which v leads on [s].
-            aside: how far the coordinates move beside (nv,) [rad or m]; not at all if left out.
+            stop: what else there is of the way, if there is.
         """
         left = float(kernels.closest_call(self._packed, v, near, reach, horizon))
-        if aside is None:
+        if stop is None:
             return left
-        straight = horizon * np.abs(v)
-        return left - 2.0 * self.longest_way(aside) - (self._bend(straight + aside) - self._bend(straight))
-
-    def longest_way(self, ways: Array) -> float:
-        """How far a point can move at most where coordinates move by `ways` (nv,) [m]."""
-        turned, slid = self._turned_and_slid(ways)
-        return turned * self._layout.lever + slid
+        return left - 2.0 * float(stop.aside.sum()) - (self._bend(stop.ways) - self._bend(horizon * np.abs(v)))
 
     def _bend(self, ways: Array) -> float:
-        """What `closest_call` allows for ways that are not straight, where coordinates move by `ways` (nv,) [m]."""
-        turned, slid = self._turned_and_slid(ways)
-        return turned * (turned * self._layout.lever + 2.0 * slid)
+        """What `closest_call` allows for bodies that turn, where coordinates move by `ways` (nv,) in all [m]."""
+        x = self._layout
+        turned, slid = float(np.max(x.turning @ ways)), float(np.max(x.sliding @ ways))
+        return turned * (turned * x.lever + 2.0 * slid)
 
-    def _turned_and_slid(self, ways: Array) -> tuple[float, float]:
-        return float(np.max(self._layout.turning @ ways)), float(np.max(self._layout.sliding @ ways))
+    def stop(self, q: Array, v: Array) -> Stop:
+        """A tick at v and the stop after it, where jerks have limits; brings the kinematics to another velocity.
 
-    def stop_way(self, q: Array, v: Array) -> Array:
-        """Velocities (ticks, nv) of a tick at v and of the stop after it, where jerks have limits.
+        All of it is along v and the change that has led to v, but for what position and velocity limits forbid.
 
         Args:
             q: configuration (nq,) at which the tick begins.
             v: velocity (nv,).
         """
+        x = self._layout
         assert self._stop is not None
-        return self._stop.way(q, v, np.clip(v - self._layout.v_last, -self._layout.v_step, self._layout.v_step))
+        w = np.clip(v - x.v_last, -x.v_step, x.v_step)
+        way = self._stop.way(q, v, w)
+        size = max(float(v @ v), 1e-300)
+        shares = way @ v / size
+        across = w - (w @ v / size) * v
+        beside = way - shares[:, None] * v
+        parts = beside @ across / max(float(across @ across), 1e-300)
+        beside -= parts[:, None] * across
+        self._forward.move(q, across)
+        twists = x.joint_velocities
+        speeds = np.sqrt(np.square(twists[:, :3]).sum(axis=1))
+        speeds += x.joint_reach * np.sqrt(np.square(twists[:, 3:]).sum(axis=1))
+        aside = np.abs(parts) * speeds.max()
+        if (np.abs(beside).max(axis=0) > _ROUND_OFF * x.v_step).any():
+            turned, slid = np.abs(beside) @ x.turning.T, np.abs(beside) @ x.sliding.T
+            aside += turned.max(axis=1) * x.lever + slid.max(axis=1)
+        return Stop(way, self._dt * np.abs(shares), self._dt * aside, self._dt * np.abs(way).sum(axis=0))
 
     def follow(self, v: Array, problem: Problem) -> Problem:
         """The problem of this tick with the velocity v (nv,) to follow in place of the tasks."""

@@ -14,6 +14,7 @@ could stop, the velocity is clear as it is (`kernels.vectorised.closest_call`, w
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 from math import floor
 from typing import NamedTuple
 
@@ -137,11 +138,10 @@ class Guard:
         """
         v, v_stop, rows = solution.v, problem.v_stop, problem.avoidance
         near = rows.pair
-        horizon, aside = self._dt + 0.5 * self._stopping(v), None
-        if self._jerked:
-            horizon, aside = self._swept(assembly.stop_way(q, v), v)
+        stop = assembly.stop(q, v) if self._jerked else None
+        horizon = self._dt + 0.5 * self._stopping(v) if stop is None else float(stop.forwards.sum())
         self._kinematics.move(q, v)
-        if assembly.closest_call(v, len(near), reach, horizon, aside) > 0.0:
+        if assembly.closest_call(v, len(near), reach, horizon, stop) > 0.0:
             return None
         self._given[:] = 0.0
         if solution.slack is not None:
@@ -197,13 +197,17 @@ class Guard:
             pieces = self._curved_way(q, v, speed, assembly)
         else:
             pieces = self._way(q, v)
-        left = sum(duration for *_, duration in pieces)
-        for start, along, duration in pieces:
+        left, skip = sum(duration for *_, duration in pieces), 0.0
+        for number, (start, along, duration) in enumerate(pieces, start=1):
             t = 0.0
             while t < duration:
-                step = max(0.5 * gap, _FINEST, speed * left / (_MOST_POSES - looks)) / max(speed, 1e-9)
+                step = skip or max(0.5 * gap, _FINEST, speed * left / (_MOST_POSES - looks)) / max(speed, 1e-9)
                 # the end of the tick is always looked at
-                step = min(step, self._dt - t if t < self._dt and not looks else duration - t)
+                end = self._dt - t if t < self._dt and not looks else duration - t
+                if self._jerked and looks and step > end and number < len(pieces):
+                    t, left, skip = duration, left - end, step - end
+                    continue
+                step, skip = min(step, end), 0.0
                 t, left, looks = t + step, left - step, min(looks + 1, _MOST_POSES - 1)
                 found, which = self._look(pin.integrate(self._model, start, t * along), now)
                 if not found >= worst:
@@ -246,9 +250,7 @@ class Guard:
         return pieces
 
     def _curved_way(self, q: Array, v: Array, speed: float, assembly: Assembly) -> list[tuple[Array, Array, float]]:
-        """The tick of v and the stop within jerk limits after it, in pieces that take as long as at constant speed.
-
-        The more of it leads beside the direction of v, the more pieces there are.
+        """The tick of v and the stop within jerk limits after it, in pieces that no point passes at more than `speed`.
 
         Args:
             q: start (nq,).
@@ -256,25 +258,16 @@ class Guard:
             speed: of the fastest point at v, or more [m/s].
             assembly: of this tick.
         """
-        way = assembly.stop_way(q, v)
-        off = assembly.longest_way(self._swept(way, v)[1])
-        count = min(1 + int(np.sqrt(off / _STRAIGHT)), _MOST_PIECES) if np.isfinite(off) else _MOST_PIECES
+        stop = assembly.stop(q, v)
         pieces = [(q, v, self._dt)]
         q = pin.integrate(self._model, q, self._dt * v)
-        for ticks in np.array_split(way[1:], min(count, max(len(way) - 1, 1))):
-            forwards, aside = self._swept(ticks, v)
-            off = assembly.longest_way(aside)
-            duration = forwards + (off / speed if np.isfinite(off) else len(ticks) * self._dt)
-            if duration > 0.0:
-                change = self._dt * ticks.sum(axis=0)
-                pieces.append((q, change / duration, duration))
-                q = pin.integrate(self._model, q, change)
+        count, ticks = min(1 + int(np.sqrt(stop.aside.sum() / _STRAIGHT)), _MOST_PIECES), len(stop.way)
+        for begin, end in pairwise(np.linspace(1, ticks, min(count, ticks - 1) + 1, dtype=int).tolist()):
+            change = self._dt * stop.way[begin:end].sum(axis=0)
+            duration = float(stop.forwards[begin:end].sum() + stop.aside[begin:end].sum() / speed)
+            pieces.append((q, change / max(duration, 1e-9), max(duration, 1e-9)))
+            q = pin.integrate(self._model, q, change)
         return pieces
-
-    def _swept(self, way: Array, v: Array) -> tuple[float, Array]:
-        """For how long the velocities of ticks (k, nv) lead along v [s], and how far beside it (nv,) [rad or m]."""
-        shares = way @ v / max(float(v @ v), 1e-300)
-        return self._dt * float(np.abs(shares).sum()), self._dt * np.abs(way - shares[:, None] * v).sum(axis=0)
 
     def _end(self, stopping: float) -> float:
         """Time for which v leads as far as v and the ticks of its stop: dt Σ (1 - i dt / stopping), i = 0, 1, … [s]."""
