@@ -14,7 +14,7 @@ could stop, the velocity is clear as it is (`kernels.vectorised.closest_call`, w
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import pairwise
+from functools import partial
 from math import floor
 from typing import NamedTuple
 
@@ -43,12 +43,10 @@ _MOST_POSES = 48
 """Poses that are looked at along one way, about."""
 _MOST_TICKS = 200
 """Ticks of a stop that are followed."""
-_MOST_PIECES = 24
-"""Straight pieces of the way of a stop within jerk limits, about."""
-_STRAIGHT = 5e-4
-"""How far the fastest point may move beside the direction of a way that counts as straight [m]."""
+_CLOSE = 2e-3
+"""What is left of a distance below which it is looked for where on a bent way it is least [m]."""
 _SLOWEST = 1e-3
-"""Speed from which such a way is looked at in steps of time [m/s]."""
+"""Speed from which a bent way is looked at in steps of time [m/s]."""
 _PATIENCE = 0.1
 """For how long a speed that a row misses counts, where nothing is clear: a stop lets an obstacle come on [s]."""
 _SHARES = (0.75, 0.5, 0.25, 0.0)
@@ -150,7 +148,8 @@ class Guard:
         self._place_obstacles(query.margin)
         speed = float(np.max(query.speeds))
         gap = float(np.min(query.found(query.pairs), initial=reach)) - self._hold
-        worst, pair = self._worst(q, v, query, gap, speed, assembly)
+        look = partial(self._worst_of_stop, assembly) if self._jerked else self._worst
+        worst, pair = look(q, v, query, gap, speed)
         if worst >= 0.0:
             return None
         best, price = Checked(v, 1.0, -worst, pair), -worst
@@ -158,7 +157,7 @@ class Guard:
         full = v if straight is None else straight
         for share in _SHARES if straight is None else (1.0, *_SHARES):
             blend = v_stop + share * (full - v_stop)
-            worst, pair = self._worst(q, blend, query, gap, speed, assembly)
+            worst, pair = look(q, blend, query, gap, speed)
             if worst >= 0.0:
                 return Checked(blend, share, 0.0, -1)
             missed = np.max(rows.b - rows.J @ blend - (0.0 if solution.slack is None else solution.slack), initial=0.0)
@@ -175,9 +174,7 @@ class Guard:
             del self._samples[index]
         self._ahead.margin[:] = margin
 
-    def _worst(
-        self, q: Array, v: Array, now: DistanceQuery, gap: float, speed: float, assembly: Assembly
-    ) -> tuple[float, int]:
+    def _worst(self, q: Array, v: Array, now: DistanceQuery, gap: float, speed: float) -> tuple[float, int]:
         """Least of distance - what it has to be, along the way of v and its stop [m], and the pair that it is of.
 
         The steps are such that no two bodies can meet in between, and no shorter than `_FINEST`: what a pair could come
@@ -189,31 +186,57 @@ class Guard:
             now: distances there.
             gap: by how much the nearest pair is farther apart than it has to be [m].
             speed: that no point of the robot exceeds [m/s].
-            assembly: of this tick.
         """
         worst, pair, looks = np.inf, -1, 0
-        if self._jerked:
-            speed = max(speed, _SLOWEST)
-            pieces = self._curved_way(q, v, speed, assembly)
-        else:
-            pieces = self._way(q, v)
-        left, skip = sum(duration for *_, duration in pieces), 0.0
-        for number, (start, along, duration) in enumerate(pieces, start=1):
+        pieces = self._way(q, v)
+        left = sum(duration for *_, duration in pieces)
+        for start, along, duration in pieces:
             t = 0.0
             while t < duration:
-                step = skip or max(0.5 * gap, _FINEST, speed * left / (_MOST_POSES - looks)) / max(speed, 1e-9)
+                step = max(0.5 * gap, _FINEST, speed * left / (_MOST_POSES - looks)) / max(speed, 1e-9)
                 # the end of the tick is always looked at
-                end = self._dt - t if t < self._dt and not looks else duration - t
-                if self._jerked and looks and step > end and number < len(pieces):
-                    t, left, skip = duration, left - end, step - end
-                    continue
-                step, skip = min(step, end), 0.0
+                step = min(step, self._dt - t if t < self._dt and not looks else duration - t)
                 t, left, looks = t + step, left - step, min(looks + 1, _MOST_POSES - 1)
                 found, which = self._look(pin.integrate(self._model, start, t * along), now)
                 if not found >= worst:
                     worst, pair = found, which
                 gap = min(max(found, 0.0), _FARTHEST)
         return worst, pair
+
+    def _worst_of_stop(
+        self, assembly: Assembly, q: Array, v: Array, now: DistanceQuery, gap: float, speed: float
+    ) -> tuple[float, int]:
+        """`_worst` where jerks have limits: that way bends, and may come nearest anywhere between two looks."""
+        stop, speed = assembly.stop(q, v), max(speed, _SLOWEST)
+        # at such times no point moves faster than `speed`
+        times = np.concatenate(([0.0], np.cumsum(np.maximum(stop.forwards + stop.aside / speed, 1e-9))))
+        ways = np.concatenate((np.zeros((1, len(v))), np.cumsum(self._dt * stop.way, axis=0)))
+
+        def walk(pose: Array, start: float, end: float) -> Array:
+            places = []
+            for t in (start, end):
+                k = min(int(np.searchsorted(times, t, side="right")), len(times) - 1)
+                places.append(ways[k] - (times[k] - t) / (times[k] - times[k - 1]) * (ways[k] - ways[k - 1]))
+            return np.asarray(pin.integrate(self._model, pose, places[1] - places[0]))
+
+        seen = [(0.0, q, gap, -1)]
+        while (t := seen[-1][0]) < times[-1]:
+            looks = max(_MOST_POSES - len(seen), 1)
+            step = max(0.5 * gap, _FINEST, speed * (times[-1] - t) / looks) / speed
+            # the end of the tick is always looked at
+            end = min(t + step, times[1] if len(seen) == 1 else times[-1])
+            pose = walk(seen[-1][1], t, end)
+            found, which = self._look(pose, now)
+            seen.append((float(end), pose, found, which))
+            gap = min(max(found, 0.0), _FARTHEST)
+        for before, here, after in zip(seen[:-2], seen[1:-1], seen[2:], strict=True):
+            if before[2] >= here[2] <= after[2] and here[2] < _CLOSE:
+                t = _vertex(*((t, found) for t, _, found, _ in (before, here, after)))
+                pose = walk(here[1], here[0], t)
+                seen.append((t, pose, *self._look(pose, now)))
+        left = np.array([found for *_, found, _ in seen[1:]])
+        least = int(left.argmin())  # the first NaN, where there is one
+        return float(left[least]), seen[1 + least][3]
 
     def _way(self, q: Array, v: Array) -> list[tuple[Array, Array, float]]:
         """Straight pieces of the way of v and its stop: where each starts, its velocity and for how long [s]."""
@@ -249,26 +272,6 @@ class Guard:
             v = following
         return pieces
 
-    def _curved_way(self, q: Array, v: Array, speed: float, assembly: Assembly) -> list[tuple[Array, Array, float]]:
-        """The tick of v and the stop within jerk limits after it, in pieces that no point passes at more than `speed`.
-
-        Args:
-            q: start (nq,).
-            v: velocity (nv,).
-            speed: of the fastest point at v, or more [m/s].
-            assembly: of this tick.
-        """
-        stop = assembly.stop(q, v)
-        pieces = [(q, v, self._dt)]
-        q = pin.integrate(self._model, q, self._dt * v)
-        count, ticks = min(1 + int(np.sqrt(stop.aside.sum() / _STRAIGHT)), _MOST_PIECES), len(stop.way)
-        for begin, end in pairwise(np.linspace(1, ticks, min(count, ticks - 1) + 1, dtype=int).tolist()):
-            change = self._dt * stop.way[begin:end].sum(axis=0)
-            duration = float(stop.forwards[begin:end].sum() + stop.aside[begin:end].sum() / speed)
-            pieces.append((q, change / max(duration, 1e-9), max(duration, 1e-9)))
-            q = pin.integrate(self._model, q, change)
-        return pieces
-
     def _end(self, stopping: float) -> float:
         """Time for which v leads as far as v and the ticks of its stop: dt Σ (1 - i dt / stopping), i = 0, 1, … [s]."""
         n = stopping / self._dt
@@ -293,3 +296,10 @@ class Guard:
         left = there - np.minimum(self._hold - TOLERANCE, here - _CREEP) + self._given[pairs]
         worst = int(left.argmin())  # the first NaN, where there is one
         return float(left[worst]), int(pairs[worst])
+
+
+def _vertex(before: tuple[float, float], here: tuple[float, float], after: tuple[float, float]) -> float:
+    """Where the parabola through three points (t, value), of which the middle one is the lowest, is lowest."""
+    left, right = here[0] - before[0], after[0] - here[0]
+    falls, rises = (before[1] - here[1]) / left, (after[1] - here[1]) / right
+    return here[0] + 0.5 * (falls * right - rises * left) / max(falls + rises, 1e-300)

@@ -15,7 +15,7 @@ from numba import njit, types
 from numba.experimental import structref
 
 from qpavoid.kernels.layout import RowLayout
-from qpavoid.kernels.stopping import AT_REST, MOST_STEPS, way_to_stop
+from qpavoid.kernels.stopping import AT_REST, MOST_STEPS, longest_way, way_to_stop
 from qpavoid.kernels.vectorised import BRAKING_SHARE, WELL_CONDITIONED, rotation_vector
 from qpavoid.problem import Array, IntArray
 
@@ -257,7 +257,7 @@ def _speed_to_stop(room: float, step: float, dt: float) -> float:
     return room / (dt * ticks) + 0.5 * step * (ticks - 1.0)
 
 
-_way_to_stop = compiled(way_to_stop)
+_way_to_stop, _longest_way = compiled(way_to_stop), compiled(longest_way)
 
 
 @compiled
@@ -287,8 +287,9 @@ def _within_jerk(x: Any, q: Array) -> None:
         speed, change, most, fastest = x.v_last[j] / unit, x.w_last[j] / unit, x.v_step[j] / unit, x.v_max[j] / unit
         target = min(_speed_to_stop(abs(speed), 1.0, 1.0), most)
         stop = min(max(-target if speed > 0.0 else target, change - 1.0), change + 1.0)
-        high = min(change + 1.0, most, _speed_to_stop(max(fastest - speed, 0.0), 1.0, 1.0))
-        deep = min(1.0 - change, most, _speed_to_stop(max(fastest + speed, 0.0), 1.0, 1.0))
+        faster, deeper = fastest if above[j] >= 0.0 else 0.0, fastest if below[j] >= 0.0 else 0.0
+        high = min(change + 1.0, most, _speed_to_stop(max(faster - speed, 0.0), 1.0, 1.0))
+        deep = min(1.0 - change, most, _speed_to_stop(max(deeper + speed, 0.0), 1.0, 1.0))
         up = _change_to_stop(speed, high, stop, most, max(above[j], 0.0) / (x.dt * unit))
         down = _change_to_stop(-speed, deep, -stop, most, max(below[j], 0.0) / (x.dt * unit))
         x.lower[j], x.upper[j] = x.v_last[j] - unit * down, x.v_last[j] + unit * up
@@ -367,11 +368,26 @@ def stop_way(x: Any, q: Array, w: Array, way: Array) -> int:
     """See `vectorised.stop_way`."""
     x.lower[:], x.upper[:] = -np.inf, np.inf
     count = _stop_ticks(x, q, w, way, False)
+    below, above = np.full(len(w), np.inf), np.full(len(w), np.inf)
     for i in range(len(x.q_index)):
-        here, j = q[x.q_index[i]], x.v_index[i]
-        for k in range(count):
-            here += x.dt * way[k, j]
-            if here < x.q_lower[i] or here > x.q_upper[i] or abs(way[k, j]) > x.v_max[j]:
+        here = q[x.q_index[i]]
+        below[x.v_index[i]], above[x.v_index[i]] = here - x.q_lower[i], x.q_upper[i] - here
+    for j in range(len(w)):
+        unit, most = x.w_step[j], x.v_step[j] / x.w_step[j]
+        if not unit < np.inf:
+            if min(below[j], above[j], x.v_max[j]) < np.inf:
+                return _stop_ticks(x, q.copy(), w, way, True)
+            continue
+        fastest = x.v_max[j] / unit * (1.0 + AT_REST)
+        for k in range(1, count):
+            below[j] += x.dt * way[k - 1, j]
+            above[j] -= x.dt * way[k - 1, j]
+            speed, change = way[k, j] / unit, (way[k, j] - way[k - 1, j]) / unit
+            if (
+                abs(speed) + 0.5 * change * change > fastest
+                or _longest_way(speed, change, most) > above[j] / (x.dt * unit)
+                or _longest_way(-speed, -change, most) > below[j] / (x.dt * unit)
+            ):
                 return _stop_ticks(x, q.copy(), w, way, True)
     return count
 

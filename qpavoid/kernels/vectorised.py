@@ -410,11 +410,12 @@ def _within_jerk(x: Any, room: Array) -> tuple[Array, Array]:
     target = np.copysign(np.minimum(speed_to_stop(np.abs(speed), 1.0, 1.0), most), -speed)
     stop = np.minimum(np.maximum(target, change - 1.0), change + 1.0)
     speed, change, stop = x.signs * speed, x.signs * change, x.signs * stop
-    fastest = speed_to_stop(np.maximum(x.jerk_fastest - speed, 0.0), 1.0, 1.0)
-    high = np.minimum(np.minimum(change + 1.0, most), fastest)
     left, bounds = np.full((2, len(x.v_max)), np.inf), np.repeat(np.inf * x.signs, len(x.v_max), axis=1)
-    left[:, x.v_index] = np.maximum(room, 0.0)
-    found = change_to_stop(speed.ravel(), high.ravel(), np.tile(most, 2), (left[:, j] / (x.dt * unit)).ravel())
+    left[:, x.v_index] = room
+    left = left[:, j] / (x.dt * unit)
+    fastest = np.where(left >= 0.0, x.jerk_fastest, 0.0)  # once on its way back, a coordinate does not turn round again
+    high = np.minimum(np.minimum(change + 1.0, most), speed_to_stop(np.maximum(fastest - speed, 0.0), 1.0, 1.0))
+    found = change_to_stop(speed.ravel(), high.ravel(), np.tile(most, 2), np.maximum(left, 0.0).ravel())
     bounds[:, j] = x.v_last[j] + x.signs * unit * np.maximum(found.reshape(2, -1), stop)
     lower, upper = bounds
     beyond, below = x.v_index[room[1] < 0.0], x.v_index[room[0] < 0.0]
@@ -460,7 +461,7 @@ def _easing_stop(x: Any, v: Array, w: Array) -> Array:
 def stop_way(x: Any, q: Array, w: Array, way: Array) -> int:
     """Velocities of the ticks of a stop within jerk limits, from the velocity way[0] on.
 
-    Bounds matter only where the stop without them passes a limit of position or velocity.
+    Bounds are looked at only where the stop without them may come near a limit of position or velocity.
 
     Args:
         x: memory of its own; the limits are read.
@@ -472,10 +473,22 @@ def stop_way(x: Any, q: Array, w: Array, way: Array) -> int:
         Number of ticks in which the robot moves, or m.
     """
     count = _stop_ticks(x, q, w, way, False)
-    places = q[x.q_index] + x.dt * np.cumsum(way[:count, x.v_index], axis=0)
-    if (places >= x.q_lower).all() and (places <= x.q_upper).all() and (np.abs(way[:count]) <= x.v_max).all():
-        return count
-    return _stop_ticks(x, q.copy(), w, way, True)
+    return count if _free(x, q, way[:count]) else _stop_ticks(x, q.copy(), w, way, True)
+
+
+def _free(x: Any, q: Array, way: Array) -> bool:
+    """Whether the velocities (m, n) of a stop that began at q are surely within the bounds of their ticks."""
+    speed, change, j = way[1:, x.jerk_index] / x.jerk_unit, np.diff(way[:, x.jerk_index], axis=0) / x.jerk_unit, x.v_index
+    unlimited = np.isinf(x.w_step)
+    if np.isfinite(x.v_max[unlimited]).any() or unlimited[j].any():
+        return False
+    if (np.abs(speed) + 0.5 * change * change > x.jerk_fastest * (1.0 + AT_REST)).any():
+        return False
+    places = q[x.q_index] + x.dt * np.cumsum(way[:-1, j], axis=0)
+    unit, most = x.limited_jerk, x.v_step[j] / x.limited_jerk
+    speed, change = way[1:, j] / unit, np.diff(way[:, j], axis=0) / unit
+    far = longest_way(speed, change, most) <= (x.q_upper - places) / (x.dt * unit)
+    return bool((far & (longest_way(-speed, -change, most) <= (places - x.q_lower) / (x.dt * unit))).all())
 
 
 def _stop_ticks(x: Any, q: Array, w: Array, way: Array, bounded: bool) -> int:
