@@ -20,7 +20,6 @@ from qpavoid.proximity import DistanceQuery
 from qpavoid.scene import Scene
 from qpavoid.tasks import AnyTask, in_order, task_layout, task_levels
 
-
 _MOST_TICKS = 1000
 """Ticks of a stop that are followed."""
 
@@ -149,10 +148,10 @@ class Assembly:
         if held is not None:
             x.v0[:] = tracking_within(held, x.A, x.b, x.damping)
             worst = float(kernels.tracking_shortfall(self._packed, k))
+        bounds = x.lower, x.upper, *self._hard, x.v_stop
         return proximity, Problem(
-            self._tracking, rows, x.lower, x.upper, *self._hard, x.v_stop, *self._names, x.v0, worst, held, self._levels,
-            x.jerked,
-        )  # fmt: skip
+            self._tracking, rows, *bounds, *self._names, x.v0, worst, held, self._levels, x.jerked
+        )
 
     def carry(self, query: DistanceQuery) -> None:
         """Takes over which joint carries what, in place."""

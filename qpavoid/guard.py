@@ -45,6 +45,10 @@ _MOST_TICKS = 200
 """Ticks of a stop that are followed."""
 _CLOSE = 2e-3
 """What is left of a distance below which it is looked for where on a bent way it is least [m]."""
+_CLOSER = 6
+"""Looks that are spent on that."""
+_NOISE = 1e-4
+"""By how much the least that is found on the same bent way may differ from tick to tick [m]."""
 _SLOWEST = 1e-3
 """Speed from which a bent way is looked at in steps of time [m/s]."""
 _PATIENCE = 0.1
@@ -64,6 +68,16 @@ class Checked(NamedTuple):
     """How much too near it leads all the same [m]; 0 where it is clear."""
     pair: int
     """Which pair comes too near; -1 where none does."""
+
+
+class _Look(NamedTuple):
+    """What was seen at a place of a way."""
+
+    t: float
+    pose: Array
+    left: float
+    """Least of distance - what it has to be [m]."""
+    pair: int
 
 
 class Guard:
@@ -158,7 +172,7 @@ class Guard:
         for share in _SHARES if straight is None else (1.0, *_SHARES):
             blend = v_stop + share * (full - v_stop)
             worst, pair = look(q, blend, query, gap, speed)
-            if worst >= 0.0:
+            if worst >= (-_NOISE if self._jerked and share == 0.0 else 0.0):  # a stop was clear one tick ago
                 return Checked(blend, share, 0.0, -1)
             missed = np.max(rows.b - rows.J @ blend - (0.0 if solution.slack is None else solution.slack), initial=0.0)
             if _PATIENCE * missed - worst < price:
@@ -219,24 +233,30 @@ class Guard:
                 places.append(ways[k] - (times[k] - t) / (times[k] - times[k - 1]) * (ways[k] - ways[k - 1]))
             return np.asarray(pin.integrate(self._model, pose, places[1] - places[0]))
 
-        seen = [(0.0, q, gap, -1)]
-        while (t := seen[-1][0]) < times[-1]:
+        def look(before: _Look, t: float) -> _Look:
+            pose = walk(before.pose, before.t, t)
+            return _Look(t, pose, *self._look(pose, now))
+
+        seen = [_Look(0.0, q, gap, -1)]
+        while (t := seen[-1].t) < times[-1]:
             looks = max(_MOST_POSES - len(seen), 1)
-            step = max(0.5 * gap, _FINEST, speed * (times[-1] - t) / looks) / speed
+            step = max(0.5 * min(max(seen[-1].left, 0.0), _FARTHEST), _FINEST, speed * (times[-1] - t) / looks) / speed
             # the end of the tick is always looked at
-            end = min(t + step, times[1] if len(seen) == 1 else times[-1])
-            pose = walk(seen[-1][1], t, end)
-            found, which = self._look(pose, now)
-            seen.append((float(end), pose, found, which))
-            gap = min(max(found, 0.0), _FARTHEST)
+            seen.append(look(seen[-1], float(min(t + step, times[1] if len(seen) == 1 else times[-1]))))
+        found = [*seen[1:], look(seen[-2], 0.5 * (seen[-2].t + seen[-1].t))]  # it may turn back just before its end
         for before, here, after in zip(seen[:-2], seen[1:-1], seen[2:], strict=True):
-            if before[2] >= here[2] <= after[2] and here[2] < _CLOSE:
-                t = _vertex(*((t, found) for t, _, found, _ in (before, here, after)))
-                pose = walk(here[1], here[0], t)
-                seen.append((t, pose, *self._look(pose, now)))
-        left = np.array([found for *_, found, _ in seen[1:]])
-        least = int(left.argmin())  # the first NaN, where there is one
-        return float(left[least]), seen[1 + least][3]
+            if not (before.left >= here.left <= after.left and here.left < _CLOSE):
+                continue
+            for _ in range(_CLOSER):
+                first = here.t - before.t > after.t - here.t
+                between = look(here, 0.5 * (here.t + (before.t if first else after.t)))
+                found.append(between)
+                if between.left < here.left:
+                    before, here, after = (before, between, here) if first else (here, between, after)
+                else:
+                    before, after = (between, after) if first else (before, between)
+        least = found[int(np.argmin([each.left for each in found]))]  # the first NaN, where there is one
+        return least.left, least.pair
 
     def _way(self, q: Array, v: Array) -> list[tuple[Array, Array, float]]:
         """Straight pieces of the way of v and its stop: where each starts, its velocity and for how long [s]."""
@@ -296,10 +316,3 @@ class Guard:
         left = there - np.minimum(self._hold - TOLERANCE, here - _CREEP) + self._given[pairs]
         worst = int(left.argmin())  # the first NaN, where there is one
         return float(left[worst]), int(pairs[worst])
-
-
-def _vertex(before: tuple[float, float], here: tuple[float, float], after: tuple[float, float]) -> float:
-    """Where the parabola through three points (t, value), of which the middle one is the lowest, is lowest."""
-    left, right = here[0] - before[0], after[0] - here[0]
-    falls, rises = (before[1] - here[1]) / left, (after[1] - here[1]) / right
-    return here[0] + 0.5 * (falls * right - rises * left) / max(falls + rises, 1e-300)

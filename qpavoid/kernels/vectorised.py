@@ -318,7 +318,7 @@ def frame_rows(x: Any) -> None:
     np.multiply(x.b_frames, x.scale, out=x.b_frames)
 
 
-def speed_to_stop(room: Array, step: Array, dt: float) -> Array:
+def speed_to_stop(room: Array, step: Array | float, dt: float) -> Array:
     """Largest speed from which a coordinate that is slowed by `step` in every tick comes to rest within `room`.
 
     From v it still goes S(v) = dt Σ max(v - i step, 0), i = 0, 1, …; on (n - 1) step <= v <= n step that is
@@ -355,7 +355,7 @@ def change_to_stop(speed: Array, high: Array, most: Array, room: Array) -> Array
         if not len(left):
             break
         change[left] -= (way[over] - room[left]) / growth[over]
-    return change
+    return np.asarray(change)
 
 
 def velocity_bounds(x: Any, q: Array) -> None:
@@ -478,8 +478,8 @@ def stop_way(x: Any, q: Array, w: Array, way: Array) -> int:
 
 def _free(x: Any, q: Array, way: Array) -> bool:
     """Whether the velocities (m, n) of a stop that began at q are surely within the bounds of their ticks."""
-    speed, change, j = way[1:, x.jerk_index] / x.jerk_unit, np.diff(way[:, x.jerk_index], axis=0) / x.jerk_unit, x.v_index
-    unlimited = np.isinf(x.w_step)
+    unlimited, i, j = np.isinf(x.w_step), x.jerk_index, x.v_index
+    speed, change = way[1:, i] / x.jerk_unit, np.diff(way[:, i], axis=0) / x.jerk_unit
     if np.isfinite(x.v_max[unlimited]).any() or unlimited[j].any():
         return False
     if (np.abs(speed) + 0.5 * change * change > x.jerk_fastest * (1.0 + AT_REST)).any():
