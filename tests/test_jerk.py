@@ -224,8 +224,9 @@ def test_outside_its_position_limits_a_joint_is_sent_back_within_its_jerk(versio
     joints = replace(joints, acceleration=10.0 ** np.random.default_rng(6).uniform(0, 2, 300))
     rng, dt = np.random.default_rng(7), 0.01
     edge = joints.upper if side > 0 else joints.lower
-    q, v, w = edge + side * rng.uniform(0.01, 5.0, 300) * 0.1, np.zeros(300), np.zeros(300)
-    axes, choose, back = Axes(joints, 0.5, dt, version), 0.7 * rng.random(300), np.zeros(300, dtype=bool)
+    q = edge + side * rng.uniform(0.01, 5.0, 300) * np.minimum(joints.velocity, 0.1)
+    v, w = np.zeros(300), np.zeros(300)
+    axes, choose, back = Axes(joints, 0.5, dt, version), rng.random(300), np.zeros(300, dtype=bool)
     unit = np.where(np.isinf(joints.jerk), np.inf, joints.jerk * dt**2)
     for _ in range(3000):
         lower, upper = bounds_after(axes, q, v, w)
