@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,6 +19,40 @@ from qpavoid.problem import Array, AvoidanceRows, Problem, Proximity, Tracking
 from qpavoid.proximity import DistanceQuery
 from qpavoid.scene import Scene
 from qpavoid.tasks import AnyTask, in_order, task_layout, task_levels
+
+_MOST_TICKS = 1000
+"""Ticks of a stop that are followed."""
+
+
+_ROUND_OFF = 1e-9
+"""Share of a coordinate's largest change of speed in a tick that counts as round-off [-]."""
+
+
+class Stop(NamedTuple):
+    """A tick at a velocity v and the stop within jerk limits after it, of m ticks in all."""
+
+    way: Array
+    """(m, nv) velocities; memory that the next stop overwrites."""
+    forwards: Array
+    """(m,) for how long v would lead as far [s]."""
+    aside: Array
+    """(m,) how far any point moves beside that, at most [m]."""
+    ways: Array
+    """(nv,) how far each coordinate moves in all [rad or m]."""
+
+
+class _StopAhead:
+    """Follows stops within jerk limits, in memory of its own."""
+
+    def __init__(self, layout: RowLayout) -> None:
+        names = "v_last", "w_last", "lower", "upper", "hard_lower", "hard_upper", "v_stop"
+        self._packed = kernels.pack(layout._replace(**{name: getattr(layout, name).copy() for name in names}))
+        self._way = np.zeros((_MOST_TICKS, len(layout.v_last)))
+
+    def way(self, q: Array, v: Array, w: Array) -> Array:
+        """See `kernels.vectorised.stop_way`; a view of memory that the next call overwrites."""
+        self._way[0] = v
+        return self._way[: kernels.stop_way(self._packed, q, w, self._way)]
 
 
 class Assembly:
@@ -76,6 +111,7 @@ class Assembly:
         x = self._layout
         self._hard = (x.hard_lower, x.hard_upper) if limits.acceleration_gives_way else (x.lower, x.upper)
         self._packed = kernels.pack(self._layout)
+        self._stop, self._dt = _StopAhead(x) if x.jerked else None, dt
         self._names = scene.pair_names, tuple(scene.robot.coordinate_names)
         self._targets = [(row[:3], row[3:12].reshape(3, 3), row[12:15], row[15:]) for row in self._layout.targets]
         self._views: dict[int, tuple[Proximity, AvoidanceRows]] = {}
@@ -112,8 +148,9 @@ class Assembly:
         if held is not None:
             x.v0[:] = tracking_within(held, x.A, x.b, x.damping)
             worst = float(kernels.tracking_shortfall(self._packed, k))
+        bounds = x.lower, x.upper, *self._hard, x.v_stop
         return proximity, Problem(
-            self._tracking, rows, x.lower, x.upper, *self._hard, x.v_stop, *self._names, x.v0, worst, held, self._levels
+            self._tracking, rows, *bounds, *self._names, x.v0, worst, held, self._levels, x.jerked
         )
 
     def carry(self, query: DistanceQuery) -> None:
@@ -124,12 +161,57 @@ class Assembly:
         x.carriers[:] = query.carriers()
         x.joint_reach[:] = query.joint_reach()
 
-    def closest_call(self, v: Array, near: int, reach: float, horizon: float) -> float:
+    def closest_call(self, v: Array, near: int, reach: float, horizon: float, stop: Stop | None = None) -> float:
         """A bound below what is left of the safe distances on the way of v until `horizon` [m].
 
         See `kernels.vectorised.closest_call`; v is that of the last `ForwardKinematics.move`.
+
+        Args:
+            v: velocity (nv,).
+            near: number of near pairs.
+            reach: surface distance below which a pair is near [m].
+            horizon: time for which v leads on [s].
+            stop: what else there is of the way, if there is.
         """
-        return float(kernels.closest_call(self._packed, v, near, reach, horizon))
+        left = float(kernels.closest_call(self._packed, v, near, reach, horizon))
+        if stop is None:
+            return left
+        return left - 2.0 * float(stop.aside.sum()) - (self._bend(stop.ways) - self._bend(horizon * np.abs(v)))
+
+    def _bend(self, ways: Array) -> float:
+        """What `closest_call` allows for bodies that turn, where coordinates move by `ways` (nv,) in all [m]."""
+        x = self._layout
+        turned, slid = float(np.max(x.turning @ ways)), float(np.max(x.sliding @ ways))
+        return turned * (turned * x.lever + 2.0 * slid)
+
+    def stop(self, q: Array, v: Array) -> Stop:
+        """A tick at v and the stop after it, where jerks have limits; brings the kinematics to another velocity.
+
+        All of it is along v and the change that has led to v, but for what position and velocity limits forbid.
+
+        Args:
+            q: configuration (nq,) at which the tick begins.
+            v: velocity (nv,).
+        """
+        x = self._layout
+        assert self._stop is not None
+        w = np.clip(v - x.v_last, -x.v_step, x.v_step)
+        way = self._stop.way(q, v, w)
+        size = max(float(v @ v), 1e-300)
+        shares = way @ v / size
+        across = w - (w @ v / size) * v
+        beside = way - shares[:, None] * v
+        parts = beside @ across / max(float(across @ across), 1e-300)
+        beside -= parts[:, None] * across
+        self._forward.move(q, across)
+        twists = x.joint_velocities
+        speeds = np.sqrt(np.square(twists[:, :3]).sum(axis=1))
+        speeds += x.joint_reach * np.sqrt(np.square(twists[:, 3:]).sum(axis=1))
+        aside = np.abs(parts) * speeds.max()
+        if (np.abs(beside).max(axis=0) > _ROUND_OFF * x.v_step).any():
+            turned, slid = np.abs(beside) @ x.turning.T, np.abs(beside) @ x.sliding.T
+            aside += turned.max(axis=1) * x.lever + slid.max(axis=1)
+        return Stop(way, self._dt * np.abs(shares), self._dt * aside, self._dt * np.abs(way).sum(axis=0))
 
     def follow(self, v: Array, problem: Problem) -> Problem:
         """The problem of this tick with the velocity v (nv,) to follow in place of the tasks."""
@@ -181,8 +263,19 @@ class Assembly:
         return np.asarray(self._layout.A[rows] @ v / self._layout.scale[rows])
 
     def remember(self, v: Array) -> None:
-        """Takes v (nv,) as the velocity at which the robot moves until the next tick."""
+        """Takes v (nv,) as the velocity at which the robot moves from this tick to the next."""
+        x = self._layout
+        if x.jerked:
+            np.clip(v - x.v_last, -x.v_step, x.v_step, out=x.w_last)
+        x.v_last[:] = v
+
+    def measured(self, v: Array) -> None:
+        """Takes v (nv,) as the velocity at which the robot moves until this tick; accelerations stay as commanded."""
         self._layout.v_last[:] = v
+
+    def restart(self, v: Array) -> None:
+        """Takes v (nv,) as the velocity at which the robot has been moving, without any acceleration."""
+        self._layout.v_last[:], self._layout.w_last[:] = v, 0.0
 
     @property
     def v_last(self) -> Array:

@@ -315,7 +315,7 @@ class Controller:
 
     def reset(self, v: Array | None = None) -> None:
         """Forgets the ticks before: the robot moves at v (nv,), or stands still; it keeps what it carries."""
-        self._assembly.remember(np.zeros(self._v_shape) if v is None else require_finite("v", v, self._v_shape))
+        self._assembly.restart(np.zeros(self._v_shape) if v is None else require_finite("v", v, self._v_shape))
         self._q_last[:] = self.scene.robot.home
         self._obstacles.reset()
         self._progress.reset()
@@ -337,7 +337,7 @@ class Controller:
         if v is not None:
             v = as_vector("v", v, self._v_shape)
             if isfinite(np.vdot(v, v)):
-                self._assembly.remember(v)
+                self._assembly.measured(v)
             else:
                 faults = (not_finite("v", v),)
         try:

@@ -2,8 +2,8 @@
 
 The rows of a problem are a linearisation, and they know only what is near. What is commanded must hold for the real
 distances, of all pairs, at q ⊕ v dt with obstacles moved on; and it must leave a way to stop. So every velocity is
-followed for one tick and then slowed down uniformly, as the accelerations and joint limits allow, and the distances
-along that way are computed anew. Where it comes too near, a solution that moves the joints less is tried, whose way
+followed for one tick and then slowed down uniformly, as the joint limits allow, and the distances along that way are
+computed anew. Where it comes too near, a solution that moves the joints less is tried, whose way
 bends less; and that is drawn back towards the stop of this tick, whose way was looked at one tick ago. By induction a
 stop that was found clear is always at hand, as long as obstacles do what they were last seen to do, for one tick.
 
@@ -14,6 +14,7 @@ could stop, the velocity is clear as it is (`kernels.vectorised.closest_call`, w
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from math import floor
 from typing import NamedTuple
 
@@ -41,6 +42,14 @@ _MOST_POSES = 48
 """Poses that are looked at along one way, about."""
 _MOST_TICKS = 200
 """Ticks of a stop that are followed."""
+_CLOSE = 2e-3
+"""What is left of a distance below which it is looked for where on a bent way it is least [m]."""
+_CLOSER = 6
+"""Looks that are spent on that."""
+_NOISE = 1e-4
+"""By how much the least that is found on the same bent way may differ from tick to tick [m]."""
+_SLOWEST = 1e-3
+"""Speed from which a bent way is looked at in steps of time [m/s]."""
 _PATIENCE = 0.1
 """For how long a speed that a row misses counts, where nothing is clear: a stop lets an obstacle come on [s]."""
 _SHARES = (0.75, 0.5, 0.25, 0.0)
@@ -58,6 +67,16 @@ class Checked(NamedTuple):
     """How much too near it leads all the same [m]; 0 where it is clear."""
     pair: int
     """Which pair comes too near; -1 where none does."""
+
+
+class _Look(NamedTuple):
+    """What was seen at a place of a way."""
+
+    t: float
+    pose: Array
+    left: float
+    """Least of distance - what it has to be [m]."""
+    pair: int
 
 
 class Guard:
@@ -86,6 +105,7 @@ class Guard:
         self._data, self._ahead = scene.robot.model.createData(), DistanceQuery(scene)
         self._bounds, self._rate = bounds, position_gain / dt
         self._acceleration, self._accelerated = bounds.acceleration, bool(np.isfinite(bounds.acceleration).any())
+        self._jerked = bool(np.isfinite(bounds.jerk).any())
         self._given = np.zeros(len(scene.pairs))
         self._news = np.zeros(len(scene.obstacles), dtype=bool)
 
@@ -127,9 +147,10 @@ class Guard:
         """
         v, v_stop, rows = solution.v, problem.v_stop, problem.avoidance
         near = rows.pair
-        horizon = self._dt + 0.5 * self._stopping(v)
+        stop = assembly.stop(q, v) if self._jerked else None
+        horizon = self._dt + 0.5 * self._stopping(v) if stop is None else float(stop.forwards.sum())
         self._kinematics.move(q, v)
-        if assembly.closest_call(v, len(near), reach, horizon) > 0.0:
+        if assembly.closest_call(v, len(near), reach, horizon, stop) > 0.0:
             return None
         self._given[:] = 0.0
         if solution.slack is not None:
@@ -138,7 +159,8 @@ class Guard:
         self._place_obstacles(query)
         speed = float(np.max(query.placing.speeds))
         gap = float(np.min(query.found(query.pairs), initial=reach)) - self._hold
-        worst, pair = self._worst(q, v, query, gap, speed)
+        look = partial(self._worst_of_stop, assembly) if self._jerked else self._worst
+        worst, pair = look(q, v, query, gap, speed)
         if worst >= 0.0:
             return None
         best, price = Checked(v, 1.0, -worst, pair), -worst
@@ -146,8 +168,8 @@ class Guard:
         full = v if straight is None else straight
         for share in _SHARES if straight is None else (1.0, *_SHARES):
             blend = v_stop + share * (full - v_stop)
-            worst, pair = self._worst(q, blend, query, gap, speed)
-            if worst >= 0.0:
+            worst, pair = look(q, blend, query, gap, speed)
+            if worst >= (-_NOISE if self._jerked and share == 0.0 else 0.0):  # a stop was clear one tick ago
                 return Checked(blend, share, 0.0, -1)
             missed = np.max(rows.b - rows.J @ blend - (0.0 if solution.slack is None else solution.slack), initial=0.0)
             if _PATIENCE * missed - worst < price:
@@ -192,6 +214,47 @@ class Guard:
                     worst, pair = found, which
                 gap = min(max(found, 0.0), _FARTHEST)
         return worst, pair
+
+    def _worst_of_stop(
+        self, assembly: Assembly, q: Array, v: Array, now: DistanceQuery, gap: float, speed: float
+    ) -> tuple[float, int]:
+        """`_worst` where jerks have limits: that way bends, and may come nearest anywhere between two looks."""
+        stop, speed = assembly.stop(q, v), max(speed, _SLOWEST)
+        # at such times no point moves faster than `speed`
+        times = np.concatenate(([0.0], np.cumsum(np.maximum(stop.forwards + stop.aside / speed, 1e-9))))
+        ways = np.concatenate((np.zeros((1, len(v))), np.cumsum(self._dt * stop.way, axis=0)))
+
+        def walk(pose: Array, start: float, end: float) -> Array:
+            places = []
+            for t in (start, end):
+                k = min(int(np.searchsorted(times, t, side="right")), len(times) - 1)
+                places.append(ways[k] - (times[k] - t) / (times[k] - times[k - 1]) * (ways[k] - ways[k - 1]))
+            return np.asarray(pin.integrate(self._model, pose, places[1] - places[0]))
+
+        def look(before: _Look, t: float) -> _Look:
+            pose = walk(before.pose, before.t, t)
+            return _Look(t, pose, *self._look(pose, now))
+
+        seen = [_Look(0.0, q, gap, -1)]
+        while (t := seen[-1].t) < times[-1]:
+            looks = max(_MOST_POSES - len(seen), 1)
+            step = max(0.5 * min(max(seen[-1].left, 0.0), _FARTHEST), _FINEST, speed * (times[-1] - t) / looks) / speed
+            # the end of the tick is always looked at
+            seen.append(look(seen[-1], float(min(t + step, times[1] if len(seen) == 1 else times[-1]))))
+        found = [*seen[1:], look(seen[-2], 0.5 * (seen[-2].t + seen[-1].t))]  # it may turn back just before its end
+        for before, here, after in zip(seen[:-2], seen[1:-1], seen[2:], strict=True):
+            if not (before.left >= here.left <= after.left and here.left < _CLOSE):
+                continue
+            for _ in range(_CLOSER):
+                first = here.t - before.t > after.t - here.t
+                between = look(here, 0.5 * (here.t + (before.t if first else after.t)))
+                found.append(between)
+                if between.left < here.left:
+                    before, here, after = (before, between, here) if first else (here, between, after)
+                else:
+                    before, after = (between, after) if first else (before, between)
+        least = found[int(np.argmin([each.left for each in found]))]  # the first NaN, where there is one
+        return least.left, least.pair
 
     def _way(self, q: Array, v: Array) -> list[tuple[Array, Array, float]]:
         """Straight pieces of the way of v and its stop: where each starts, its velocity and for how long [s]."""

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from qpavoid.config import Limits
+from qpavoid.errors import ConfigError
 from qpavoid.problem import Array, IntArray
 
 
@@ -27,16 +28,33 @@ class JointBounds:
     """(nb,) upper position limits [rad or m]."""
     acceleration: Array
     """(nv,) largest acceleration [rad/s² or m/s²], infinite where there is none."""
+    jerk: Array
+    """(nv,) largest jerk [rad/s³ or m/s³], infinite where there is none."""
 
     def within(self, config: Limits) -> JointBounds:
-        """The share of the limits that a scenario allows to be used."""
-        given = np.inf if config.acceleration is None else config.acceleration
-        acceleration = np.where(np.isfinite(self.acceleration), self.acceleration, given)
+        """The share of the limits that a scenario allows to be used.
+
+        Raises:
+            ConfigError: a coordinate has a jerk limit, and none of its acceleration.
+        """
+        acceleration, jerk = _or(self.acceleration, config.acceleration), _or(self.jerk, config.jerk)
+        lacking = np.isfinite(jerk) & np.isinf(acceleration)
+        if lacking.any():
+            raise ConfigError(
+                f"limits.jerk: {lacking.sum()} of {len(jerk)} coordinates have no acceleration limit, which a jerk "
+                "limit needs; give limits.acceleration"
+            )
         return replace(
             self,
             velocity=config.velocity_scale * self.velocity,
             acceleration=config.acceleration_scale * acceleration,
+            jerk=jerk,
         )
+
+
+def _or(limits: Array, given: float | None) -> Array:
+    """The limits (nv,) of a robot, and what a scenario gives to the coordinates that have none."""
+    return np.where(np.isfinite(limits), limits, np.inf if given is None else given)
 
 
 def limit_layout(joints: JointBounds, position_gain: float, dt: float) -> dict[str, Any]:
@@ -45,8 +63,10 @@ def limit_layout(joints: JointBounds, position_gain: float, dt: float) -> dict[s
     The bounds keep the next configuration inside its limits. A joint without an acceleration limit uses at most a
     share `position_gain` of what is left to a position limit in one tick; a joint with one keeps to the speeds from
     which it can still brake (`kernels.vectorised.speed_to_stop`), so that position, velocity and acceleration limits
-    never contradict each other once they are met. A joint outside its limits is sent back, at no more than its largest
-    speed. Bounds never cross: from a state that no braking can save, the acceleration limit gives way.
+    never contradict each other once they are met; where its jerk has a limit, too, it keeps to the velocities from
+    which a stop within all of these ends in time (`kernels.stopping`). A joint outside its limits is sent back, at no
+    more than its largest speed. Bounds never cross: from a state that no braking can save, the jerk limit gives way,
+    then that of the acceleration.
 
     Args:
         joints: the robot's limits.
@@ -54,7 +74,7 @@ def limit_layout(joints: JointBounds, position_gain: float, dt: float) -> dict[s
         dt: length of a tick [s].
     """
     nv = len(joints.velocity)
-    accelerated = bool(np.isfinite(joints.acceleration).any())
+    accelerated, jerked = (bool(np.isfinite(limits).any()) for limits in (joints.acceleration, joints.jerk))
     lower, upper = np.zeros(nv), np.zeros(nv)
     return {
         "q_index": joints.q_index,
@@ -64,6 +84,8 @@ def limit_layout(joints: JointBounds, position_gain: float, dt: float) -> dict[s
         "v_max": joints.velocity,
         "v_step": joints.acceleration * dt,
         "v_last": np.zeros(nv),
+        "w_step": joints.jerk * dt**2,
+        "w_last": np.zeros(nv),
         "v_stop": np.zeros(nv),
         "hard_lower": np.zeros(nv) if accelerated else lower,
         "hard_upper": np.zeros(nv) if accelerated else upper,
@@ -72,6 +94,7 @@ def limit_layout(joints: JointBounds, position_gain: float, dt: float) -> dict[s
         "rate": position_gain / dt,
         "dt": dt,
         "accelerated": accelerated,
+        "jerked": jerked,
     }
 
 

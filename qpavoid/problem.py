@@ -28,7 +28,7 @@ class Status(str, Enum):
     RELAXED = "RELAXED"
     """The rows contradict each other or the limits; `reasons` says which gave way and by how much."""
     STOPPED = "STOPPED"
-    """No velocity can be answered for: the robot is braked to a standstill within its acceleration limits."""
+    """No velocity can be answered for: the robot is braked to a standstill within its acceleration and jerk limits."""
 
 
 class State(NamedTuple):
@@ -146,7 +146,7 @@ class Problem(NamedTuple):
     hard_upper: Array
     """(nv,) upper bound from the same."""
     v_stop: Array
-    """(nv,) next velocity of a stop: all coordinates slowed alike within their acceleration limits."""
+    """(nv,) next velocity of a stop: all coordinates slowed alike within their acceleration and jerk limits."""
     pair_names: Sequence[tuple[str, str]]
     """Names of the bodies of all m pairs."""
     joint_names: Sequence[str]
@@ -159,6 +159,8 @@ class Problem(NamedTuple):
     """What holds the contacts, where there are any; v0 does."""
     levels: tuple[IntArray, ...] = ()
     """Which rows of `tracking` belong to each priority, the first one first; empty where all have the same."""
+    jerked: bool = False
+    """Whether `lower` and `upper` keep to jerk limits, beside those of accelerations."""
 
 
 def make_problem(
@@ -178,7 +180,7 @@ def make_problem(
         lower: (nv,) lower bound on v.
         upper: (nv,) upper bound on v.
         pair_names: names of the bodies of all pairs.
-        hard: bounds without acceleration limits; `lower` and `upper` if left out.
+        hard: bounds without acceleration and jerk limits; `lower` and `upper` if left out.
         v_stop: next velocity of a stop; as little as the bounds allow if left out.
     """
     A, b, damping = tracking

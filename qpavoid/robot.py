@@ -43,6 +43,8 @@ class Robot:
     """Pairs of bodies that were switched off at loading, because they touch in every configuration."""
     acceleration: Mapping[str, float] = field(default_factory=dict)
     """Joint: largest acceleration [rad/s² or m/s²]; joints left out have no such limit."""
+    jerk: Mapping[str, float] = field(default_factory=dict)
+    """Joint: largest jerk [rad/s³ or m/s³]; likewise."""
 
     @classmethod
     def load(cls, name_or_path: str, folder: Path | None = None) -> Robot:
@@ -117,8 +119,11 @@ class Robot:
 
     def bounds(self) -> JointBounds:
         """Joint limits in tangent space; see `joint_bounds`."""
-        limits = [self.acceleration.get(name, np.inf) for name, joint in self._joints() for _ in range(joint.nv)]
-        return replace(joint_bounds(self.model), acceleration=np.array(limits))
+        acceleration, jerk = (
+            np.array([limits.get(name, np.inf) for name, joint in self._joints() for _ in range(joint.nv)])
+            for limits in (self.acceleration, self.jerk)
+        )
+        return replace(joint_bounds(self.model), acceleration=acceleration, jerk=jerk)
 
     def configuration(self, values: Sequence[float] | Mapping[str, float], where: str) -> Array:
         """A full configuration from a scenario's `q0`.
@@ -201,7 +206,7 @@ _ABSURD = 1e9
 
 
 def joint_bounds(model: Any) -> JointBounds:
-    """Joint limits of a model in tangent space; a URDF says nothing of accelerations.
+    """Joint limits of a model in tangent space; a URDF says nothing of accelerations and jerks.
 
     Only joints with one coordinate in q and v have position limits. A velocity limit of 0, and a range from 0 to 0,
     mean that the URDF gives none.
@@ -223,6 +228,7 @@ def joint_bounds(model: Any) -> JointBounds:
         lower=lower[q_indices],
         upper=upper[q_indices],
         acceleration=np.full(model.nv, np.inf),
+        jerk=np.full(model.nv, np.inf),
     )
 
 
@@ -278,6 +284,7 @@ def _build(config: RobotConfig, path: Path) -> Robot:
         str(path),
         tuple(always_touching),
         config.limits.acceleration,
+        config.limits.jerk,
     )
 
 
@@ -326,7 +333,7 @@ def _in_link(body: Any, model: Any) -> Any:
 def _apply_limits(config: RobotConfig, model: Any, path: Path) -> None:
     lower, upper = np.array(model.lowerPositionLimit), np.array(model.upperPositionLimit)
     velocity = np.array(model.velocityLimit)
-    for kind in ("position", "velocity", "acceleration"):
+    for kind in ("position", "velocity", "acceleration", "jerk"):
         for name in getattr(config.limits, kind):
             if _joint(model, name, f"{path}: limits.{kind}").shortname() == MIMIC:
                 raise ConfigError(f"{path}: limits.{kind}: {_follows(model, name)}; limit that one")

@@ -149,6 +149,7 @@ def random_layout(seed, frames=2, turns=(1,), pairs=9, nv=7, obstacles=3, joints
         "v_max": np.where(rng.random(nv) < 0.8, rng.uniform(0.1, 5.0, nv), np.inf),
         "v_step": v_step,
         "v_last": rng.uniform(-5.0, 5.0, nv),
+        "w_last": rng.uniform(-1.0, 1.0, nv) * np.minimum(v_step, 1.0),
         "accelerated": bool(np.isfinite(v_step).any()),
         "damping": 0.1,
         "offset": 0.03,
@@ -159,6 +160,15 @@ def random_layout(seed, frames=2, turns=(1,), pairs=9, nv=7, obstacles=3, joints
 NO_LIMIT = {"v_step": np.full(7, np.inf), "accelerated": False}
 
 
+def jerk(seed, nv=7, all_of_them=False):
+    """Limits of the jerk of some coordinates, or of all."""
+    rng = np.random.default_rng(seed)
+    step = rng.uniform(0.01, 0.5, nv)
+    some = np.array([all_of_them, True])[(rng.random(nv) < 0.7).astype(int)]
+    return {"v_step": step, "w_step": np.where(some, 10.0 ** -rng.uniform(0.0, 2.0, nv) * step, np.inf),
+            "w_last": rng.uniform(-1.0, 1.0, nv) * step, "accelerated": True, "jerked": True}  # fmt: skip
+
+
 def test_there_are_two_versions_of_everything():
     import qpavoid.kernels as used
 
@@ -167,7 +177,8 @@ def test_there_are_two_versions_of_everything():
     public = {name for name in functions if not name.startswith("_")}
     elsewhere = {"choose", "within_reach"}  # in modules of their own: test_point_cloud
     elsewhere |= {"pack_pieces", "place_obstacles", "sample_pieces"}  # likewise: test_courses
-    assert set(used.__all__) - {"ACCELERATED"} - elsewhere == public - {"rotation_vector", "speed_to_stop"}
+    of_one = {"rotation_vector", "speed_to_stop", "change_to_stop"}
+    assert set(used.__all__) - {"ACCELERATED"} - elsewhere == public - of_one
     for name in set(used.__all__) - {"ACCELERATED"} - elsewhere:
         assert getattr(used, name) is getattr(version("compiled" if used.ACCELERATED else "vectorised"), name)
 
@@ -449,7 +460,8 @@ def test_row_bounds_of_both_versions(pairs):
     for seed in SEEDS:
         for fields in (
             {}, {"switching": False, "recovery": np.inf}, {"switching": False, "hold": 0.2}, NO_LIMIT,
-            {"margin": np.zeros(4)},
+            {"margin": np.zeros(4)}, jerk(seed), jerk(seed, all_of_them=True),
+            {"switching": False, "row_gain": 100.0, **jerk(seed, all_of_them=True)},
         ):  # fmt: skip
 
             def make(seed=seed, fields=fields):
@@ -662,7 +674,7 @@ def test_velocity_bounds_of_both_versions(seed, plain):
     """They never cross, and those with acceleration limits are never outside those without, from any state."""
     for nv in (2, 5, 30):
         q = np.random.default_rng(seed).uniform(-3, 3, nv + 1)
-        for fields in ({}, {"v_step": np.full(nv, np.inf), "accelerated": False}):
+        for fields in ({}, {"v_step": np.full(nv, np.inf), "accelerated": False}, jerk(seed, nv), jerk(seed, nv, True)):
 
             def make(nv=nv, fields=fields):
                 return random_layout(seed, nv=nv, plain=plain, **fields)
@@ -670,7 +682,8 @@ def test_velocity_bounds_of_both_versions(seed, plain):
             _, x = both(make, "velocity_bounds", q[:nv] if plain else q)
             assert (x.hard_lower <= x.lower).all() and (x.lower <= x.upper).all() and (x.upper <= x.hard_upper).all()
             assert (np.maximum(np.abs(x.lower), np.abs(x.upper)) <= x.v_max).all()
-            none = make_layout(nv, v_max=x.v_max, v_step=x.v_step, v_last=x.v_last, accelerated=x.accelerated)
+            names = "v_max", "v_step", "v_last", "w_step", "w_last", "accelerated", "jerked"
+            none = make_layout(nv, **{name: getattr(x, name) for name in names})
             both(none._replace, "velocity_bounds", q)
 
 
@@ -701,7 +714,7 @@ def test_without_acceleration_limits_a_stop_is_a_standstill_where_the_bounds_all
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_stop_velocities_of_both_versions(seed):
-    for fields in ({}, NO_LIMIT):
+    for fields in ({}, NO_LIMIT, jerk(seed), jerk(seed, all_of_them=True)):
         both(lambda fields=fields: filled(seed, **fields), "stop_velocity")
 
 

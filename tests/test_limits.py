@@ -1,5 +1,6 @@
 """Joint limits: bounds that never cross and are never left."""
 
+from dataclasses import replace
 from importlib import import_module
 
 import numpy as np
@@ -58,7 +59,7 @@ def bounds(draw):
     """Limits of four joints, some without a speed limit."""
     lower = draw(vector(-3.0, 2.0))
     speed = np.where(draw(arrays(bool, N)), draw(vector(0.01, 5.0)), np.inf)
-    return JointBounds(speed, INDEX, INDEX, lower, lower + draw(vector(1e-3, 4.0)), FREE)
+    return JointBounds(speed, INDEX, INDEX, lower, lower + draw(vector(1e-3, 4.0)), FREE, FREE)
 
 
 @fast
@@ -98,8 +99,9 @@ def test_outside_its_limits_a_joint_is_sent_back_without_overshoot(joints, beyon
 
 def test_bounds_by_hand(version):
     joints = JointBounds(
-        np.array([2.0, 1.0, np.inf]), np.array([0, 3]), np.array([0, 2]), -np.ones(2), np.ones(2), np.full(3, np.inf)
-    )
+        np.array([2.0, 1.0, np.inf]), np.array([0, 3]), np.array([0, 2]), -np.ones(2), np.ones(2),
+        np.full(3, np.inf), np.full(3, np.inf),
+    )  # fmt: skip
     q = np.array([0.99, 7.0, 7.0, 0.0])  # the middle joint is continuous: two numbers in q, one in v
     lower, upper = Axes(joints.within(Limits(velocity_scale=0.5)), 0.5, 0.01, version).bounds(q)
     np.testing.assert_allclose(upper, [0.5, 0.5, 50.0])
@@ -144,7 +146,7 @@ def test_saturate_by_hand():
 def test_without_any_limit_nothing_changes():
     infinite = np.full(2, np.inf)
     nothing = np.array([], dtype=np.intp)
-    joints = JointBounds(infinite, nothing, nothing, np.array([]), np.array([]), infinite)
+    joints = JointBounds(infinite, nothing, nothing, np.array([]), np.array([]), infinite, infinite)
     lower, upper = bounds_at(joints.within(Limits(velocity_scale=0.5)), np.zeros(2), 0.5, 0.01)
     v = np.array([1e6, -1e6])
     within, change = saturate(v, lower, upper, infinite)
@@ -220,7 +222,7 @@ def braked(draw):
     """Joints with limits of position and acceleration, some without a speed limit; a tick, and a viable state."""
     lower = draw(vector(-3.0, 2.0))
     speed = np.where(draw(arrays(bool, N)), draw(vector(0.01, 5.0)), np.inf)
-    joints = JointBounds(speed, INDEX, INDEX, lower, lower + draw(vector(1e-3, 4.0)), draw(vector(0.05, 100.0)))
+    joints = JointBounds(speed, INDEX, INDEX, lower, lower + draw(vector(1e-3, 4.0)), draw(vector(0.05, 100.0)), FREE)
     dt = draw(st.floats(1e-3, 0.1))
     q = lower + draw(vector(0.0, 1.0)) * (joints.upper - lower)
     below, above = (
@@ -252,7 +254,8 @@ def random_joints(rng, count):
     upper = lower + 10.0 ** rng.uniform(-3, 0.6, count)
     speed = np.where(rng.random(count) < 0.8, 10.0 ** rng.uniform(-2, 0.7, count), np.inf)
     index = np.arange(count)
-    joints = JointBounds(speed, index, index, lower, upper, 10.0 ** rng.uniform(-1, 2, count))
+    acceleration = 10.0 ** rng.uniform(-1, 2, count)
+    joints = JointBounds(speed, index, index, lower, upper, acceleration, np.full(count, np.inf))
     return joints, rng.uniform(lower, upper)
 
 
@@ -298,8 +301,7 @@ def test_from_a_state_that_no_braking_saves_the_acceleration_gives_way(version):
 def test_outside_its_position_limits_a_joint_is_braked_and_sent_back(version, side):
     """With no more than its acceleration, from any speed within its limits; then it stays inside."""
     joints, _ = random_joints(np.random.default_rng(5), 500)
-    joints = JointBounds(*(getattr(joints, name) for name in ("velocity", "q_index", "v_index", "lower", "upper")),
-                         10.0 ** np.random.default_rng(6).uniform(0, 2, 500))  # fmt: skip
+    joints = replace(joints, acceleration=10.0 ** np.random.default_rng(6).uniform(0, 2, 500))
     rng, dt = np.random.default_rng(7), 0.01
     step = joints.acceleration * dt
     edge, width = (joints.upper if side > 0 else joints.lower), joints.upper - joints.lower
@@ -326,7 +328,7 @@ def test_outside_its_position_limits_a_joint_is_braked_and_sent_back(version, si
 def test_acceleration_limits_of_a_robot_and_of_a_scenario():
     """The scenario's is for joints to which the robot gives none; its share is of all of them."""
     given = np.array([2.0, np.inf, 4.0, np.inf])
-    joints = JointBounds(np.ones(N), INDEX, INDEX, -np.ones(N), np.ones(N), given)
+    joints = JointBounds(np.ones(N), INDEX, INDEX, -np.ones(N), np.ones(N), given, FREE)
     np.testing.assert_array_equal(joints.within(Limits()).acceleration, given)
     found = joints.within(Limits(acceleration=6.0, acceleration_scale=0.5)).acceleration
     np.testing.assert_array_equal(found, [1.0, 3.0, 2.0, 3.0])
@@ -341,6 +343,7 @@ def test_joints_with_and_without_acceleration_limits(version):
         np.full(2, -np.inf),
         np.ones(2),
         np.array([10.0, np.inf, 10.0]),
+        np.full(3, np.inf),
     )
     lower, upper = Axes(joints, 0.5, 0.01, version).bounds(np.array([0.997, 0.997, 0.0]), np.array([0.25, 3.0, 1.0]))
     np.testing.assert_allclose(lower, [0.15, -9.0, 0.9], rtol=1e-9)

@@ -110,8 +110,11 @@ class Limits(Block):
     """Acceleration limit of the joints to which the robot gives none [rad/s² or m/s²]; left out: they have none."""
     acceleration_scale: Annotated[float, Field(gt=0, le=1)] = 1.0
     """Share of the acceleration limits that may be used [-]."""
+    jerk: Positive | None = None
+    """Jerk limit of the joints to which the robot gives none [rad/s³ or m/s³]; needs acceleration limits of all of
+    them; left out: they have none."""
     acceleration_gives_way: bool = True
-    """Whether the QP passes acceleration limits before it lets a pair come too near; false: it never does."""
+    """Whether the QP passes acceleration and jerk limits before it lets a pair come too near; false: it never does."""
     saturate: bool = True
     """Whether the laws that know no limits (all but the QP) are scaled and clipped to them afterwards."""
 

@@ -47,12 +47,17 @@ class JointLimits(Block):
     """Joint: largest speed [rad/s or m/s]."""
     acceleration: dict[str, Positive] = {}
     """Joint: largest acceleration [rad/s² or m/s²]; a URDF has no field for it."""
+    jerk: dict[str, Positive] = {}
+    """Joint: largest jerk [rad/s³ or m/s³]; needs an acceleration limit of the same joint."""
 
     @model_validator(mode="after")
     def _ordered(self) -> JointLimits:
         for joint, (lower, upper) in self.position.items():
             if lower >= upper:
                 raise ValueError(f"position of {joint!r}: needs lower < upper, got {lower}, {upper}; see `lock`")
+        for joint in self.jerk:
+            if joint not in self.acceleration:
+                raise ValueError(f"jerk of {joint!r}: needs a limit under `acceleration`, too")
         return self
 
 

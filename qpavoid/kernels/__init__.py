@@ -32,6 +32,7 @@ projection_cost = _chosen.projection_cost
 row_bounds = _chosen.row_bounds
 shortfall = _chosen.shortfall
 stop_velocity = _chosen.stop_velocity
+stop_way = _chosen.stop_way
 tracking_shortfall = _chosen.tracking_shortfall
 velocity_bounds = _chosen.velocity_bounds
 choose = _voxels.choose
@@ -57,6 +58,7 @@ __all__ = [
     "sample_pieces",
     "shortfall",
     "stop_velocity",
+    "stop_way",
     "tracking_shortfall",
     "velocity_bounds",
     "within_reach",

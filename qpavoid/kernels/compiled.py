@@ -15,6 +15,7 @@ from numba import njit, types
 from numba.experimental import structref
 
 from qpavoid.kernels.layout import RowLayout
+from qpavoid.kernels.stopping import AT_REST, MOST_STEPS, longest_way, way_to_stop
 from qpavoid.kernels.vectorised import BRAKING_SHARE, WELL_CONDITIONED, rotation_vector
 from qpavoid.problem import Array, IntArray
 
@@ -110,12 +111,30 @@ def distance_rows(x: Any, pairs: IntArray, reach: float, moving: bool) -> int:
 
 
 @compiled
+def _room_for_jerk(x: Any, i: int, value: float, step: float, room: float) -> float:
+    """See `vectorised._room_for_jerk`."""
+    speed, change, unit = -x.drift[i], 0.0, 0.0
+    for c in range(len(x.v_last)):
+        if x.J[i, c] != 0.0:
+            speed -= x.J[i, c] * x.v_last[c]
+            change -= x.J[i, c] * x.w_last[c]
+            unit += abs(x.J[i, c]) * x.w_step[c]
+    unit *= BRAKING_SHARE
+    if not 0.0 < unit < np.inf:
+        return -np.inf
+    high = min((-value - speed) / unit, change / unit + 1.0 / BRAKING_SHARE)
+    change = _change_to_stop(speed / unit, high, -np.inf, step / unit, room / unit)
+    return -speed - unit * change
+
+
+@compiled
 def row_bounds(x: Any, k: int, moving: bool) -> None:
     """See `vectorised.row_bounds`."""
     for i in range(k):
         d = x.closest[i, 0] + x.offset - x.margin[x.twist_row[x.near[i]]]
         value = x.row_gain * (x.hold - d)
-        if x.switching and not value > 0.0:
+        parting = value > 0.0
+        if x.switching and not parting:
             share = min(max((d - x.d1) / (x.d2 - x.d1), 0.0), 1.0)
             value *= 0.5 - 0.5 * np.cos(np.pi * share)
         if x.accelerated and value < 0.0:
@@ -127,8 +146,10 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
                 braking *= 0.5 * BRAKING_SHARE
                 room = max(d - x.hold, 0.0) / x.dt
                 value = max(value, braking - np.sqrt(braking * braking + 4.0 * braking * room))
+                if x.jerked:
+                    value = max(value, _room_for_jerk(x, i, value, 2.0 * braking, room))
         least = min(value, x.recovery) - x.drift[i]
-        if value > 0.0:
+        if parting:
             most = 0.0
             for c in range(len(x.lower)):
                 if x.J[i, c] > 0.0:
@@ -236,6 +257,48 @@ def _speed_to_stop(room: float, step: float, dt: float) -> float:
     return room / (dt * ticks) + 0.5 * step * (ticks - 1.0)
 
 
+_way_to_stop, _longest_way = compiled(way_to_stop), compiled(longest_way)
+
+
+@compiled
+def _change_to_stop(speed: float, high: float, low: float, most: float, room: float) -> float:
+    """See `vectorised.change_to_stop`."""
+    change = high
+    for _ in range(MOST_STEPS):
+        way, growth = _way_to_stop(speed + change, change, most)
+        if not way > room:
+            break
+        change -= (way - room) / growth
+    return max(change, low)
+
+
+@compiled
+def _within_jerk(x: Any, q: Array) -> None:
+    """See `vectorised._within_jerk`."""
+    below, above = np.full(len(x.v_max), np.inf), np.full(len(x.v_max), np.inf)
+    for i in range(len(x.q_index)):
+        here = q[x.q_index[i]]
+        below[x.v_index[i]], above[x.v_index[i]] = here - x.q_lower[i], x.q_upper[i] - here
+    for j in range(len(x.v_max)):
+        x.lower[j], x.upper[j] = -np.inf, np.inf
+        unit = x.w_step[j]
+        if not unit < np.inf:
+            continue
+        speed, change, most, fastest = x.v_last[j] / unit, x.w_last[j] / unit, x.v_step[j] / unit, x.v_max[j] / unit
+        target = min(_speed_to_stop(abs(speed), 1.0, 1.0), most)
+        stop = min(max(-target if speed > 0.0 else target, change - 1.0), change + 1.0)
+        faster, deeper = fastest if above[j] >= 0.0 else 0.0, fastest if below[j] >= 0.0 else 0.0
+        high = min(change + 1.0, most, _speed_to_stop(max(faster - speed, 0.0), 1.0, 1.0))
+        deep = min(1.0 - change, most, _speed_to_stop(max(deeper + speed, 0.0), 1.0, 1.0))
+        up = _change_to_stop(speed, high, stop, most, max(above[j], 0.0) / (x.dt * unit))
+        down = _change_to_stop(-speed, deep, -stop, most, max(below[j], 0.0) / (x.dt * unit))
+        x.lower[j], x.upper[j] = x.v_last[j] - unit * down, x.v_last[j] + unit * up
+        if above[j] < 0.0:
+            x.hard_upper[j] = max(x.hard_upper[j], min(x.lower[j], x.v_max[j]))
+        elif below[j] < 0.0:
+            x.hard_lower[j] = min(x.hard_lower[j], max(x.upper[j], -x.v_max[j]))
+
+
 @compiled
 def velocity_bounds(x: Any, q: Array) -> None:
     """See `vectorised.velocity_bounds`."""
@@ -247,8 +310,9 @@ def velocity_bounds(x: Any, q: Array) -> None:
         fastest, step, last = x.v_max[j], x.v_step[j], x.v_last[j]
         below, above = here - x.q_lower[i], x.q_upper[i] - here
         if step < np.inf:
-            down = _speed_to_stop(below, step, x.dt) if below > 0.0 else max(x.rate * below, -last - step)
-            up = _speed_to_stop(above, step, x.dt) if above > 0.0 else max(x.rate * above, last - step)
+            faster, slower = min(step, x.w_step[j] + x.w_last[j]), min(step, x.w_step[j] - x.w_last[j])
+            down = _speed_to_stop(below, step, x.dt) if below > 0.0 else max(x.rate * below, -last - faster)
+            up = _speed_to_stop(above, step, x.dt) if above > 0.0 else max(x.rate * above, last - slower)
             if below < 0.0:
                 down = max(down, -up)  # on the way back from outside one limit it can still brake for the other
             elif above < 0.0:
@@ -257,9 +321,14 @@ def velocity_bounds(x: Any, q: Array) -> None:
             down, up = x.rate * below, x.rate * above
         lower[j] = max(min(-down, fastest), -fastest)
         upper[j] = max(min(up, fastest), -fastest)
+    if x.jerked:
+        _within_jerk(x, q)
     for j in range(len(x.v_max)):
-        x.lower[j] = min(max(x.v_last[j] - x.v_step[j], lower[j]), upper[j])
-        x.upper[j] = max(min(x.v_last[j] + x.v_step[j], upper[j]), lower[j])
+        low = min(max(x.v_last[j] - x.v_step[j], lower[j]), upper[j])
+        high = max(min(x.v_last[j] + x.v_step[j], upper[j]), lower[j])
+        if x.jerked:
+            low, high = min(max(x.lower[j], low), high), max(min(x.upper[j], high), low)
+        x.lower[j], x.upper[j] = low, high
 
 
 @compiled
@@ -269,8 +338,79 @@ def stop_velocity(x: Any) -> None:
     for j in range(len(x.v_last)):
         slowing = max(slowing, abs(x.v_last[j]) / x.v_step[j])
     share = 1.0 - 1.0 / slowing if x.accelerated else 0.0
+    if x.jerked:
+        _easing_stop(x, 1.0 / slowing)
+    else:
+        for j in range(len(x.v_last)):
+            x.v_stop[j] = share * x.v_last[j]
     for j in range(len(x.v_last)):
-        x.v_stop[j] = min(max(share * x.v_last[j], x.lower[j]), x.upper[j])
+        x.v_stop[j] = min(max(x.v_stop[j], x.lower[j]), x.upper[j])
+
+
+@compiled
+def _easing_stop(x: Any, braking: float) -> None:
+    """See `vectorised._easing_stop`."""
+    fastest, off = 0.0, 1.0
+    for j in range(len(x.v_last)):
+        fastest = max(fastest, abs(x.v_last[j]) / x.w_step[j])
+    if fastest > 0.0:
+        braking = min(braking, _speed_to_stop(fastest, 1.0, 1.0) / fastest)
+    for j in range(len(x.v_last)):
+        off = max(off, abs(x.w_last[j] + braking * x.v_last[j]) / x.w_step[j])
+    kept = 1.0 - 1.0 / off
+    share = 1.0 - (1.0 - kept) * braking
+    for j in range(len(x.v_last)):
+        x.v_stop[j] = share * x.v_last[j] + kept * x.w_last[j]
+
+
+@compiled
+def stop_way(x: Any, q: Array, w: Array, way: Array) -> int:
+    """See `vectorised.stop_way`."""
+    x.lower[:], x.upper[:] = -np.inf, np.inf
+    count = _stop_ticks(x, q, w, way, False)
+    below, above = np.full(len(w), np.inf), np.full(len(w), np.inf)
+    for i in range(len(x.q_index)):
+        here = q[x.q_index[i]]
+        below[x.v_index[i]], above[x.v_index[i]] = here - x.q_lower[i], x.q_upper[i] - here
+    for j in range(len(w)):
+        unit, most = x.w_step[j], x.v_step[j] / x.w_step[j]
+        if not unit < np.inf:
+            if min(below[j], above[j], x.v_max[j]) < np.inf:
+                return _stop_ticks(x, q.copy(), w, way, True)
+            continue
+        fastest = x.v_max[j] / unit * (1.0 + AT_REST)
+        for k in range(1, count):
+            below[j] += x.dt * way[k - 1, j]
+            above[j] -= x.dt * way[k - 1, j]
+            speed, change = way[k, j] / unit, (way[k, j] - way[k - 1, j]) / unit
+            if (
+                abs(speed) + 0.5 * change * change > fastest
+                or _longest_way(speed, change, most) > above[j] / (x.dt * unit)
+                or _longest_way(-speed, -change, most) > below[j] / (x.dt * unit)
+            ):
+                return _stop_ticks(x, q.copy(), w, way, True)
+    return count
+
+
+@compiled
+def _stop_ticks(x: Any, q: Array, w: Array, way: Array, bounded: bool) -> int:
+    """See `vectorised._stop_ticks`."""
+    x.v_last[:], x.w_last[:] = way[0], w
+    for k in range(1, len(way)):
+        if bounded:
+            for i in range(len(x.q_index)):
+                q[x.q_index[i]] += x.dt * x.v_last[x.v_index[i]]
+            velocity_bounds(x, q)
+        stop_velocity(x)
+        moves = False
+        for j in range(len(w)):
+            change = x.v_stop[j] - x.v_last[j]
+            x.w_last[j], x.v_last[j] = min(max(change, -x.v_step[j]), x.v_step[j]), x.v_stop[j]
+            way[k, j] = x.v_stop[j]
+            moves = moves or abs(x.v_stop[j]) > AT_REST * x.v_step[j] or abs(x.w_last[j]) > x.w_step[j]
+        if not moves:
+            return k
+    return len(way)
 
 
 @compiled

@@ -103,6 +103,10 @@ class RowLayout(NamedTuple):
     """(n,) largest change of v in one tick; infinite where the acceleration has no limit."""
     v_last: Array
     """(n,) velocity of the tick before."""
+    w_step: Array
+    """(n,) largest change, from one tick to the next, of that change of v; infinite where the jerk has no limit."""
+    w_last: Array
+    """(n,) by how much v changed in the tick before, no more than `v_step`."""
     hard_lower: Array
     """(n,) out: lower bound on v from position and velocity limits.
 
@@ -110,11 +114,11 @@ class RowLayout(NamedTuple):
     hard_upper: Array
     """(n,) out: upper bound from the same."""
     lower: Array
-    """(n,) out: lower bound on v from all limits, acceleration included."""
+    """(n,) out: lower bound on v from all limits, acceleration and jerk included."""
     upper: Array
     """(n,) out: upper bound from the same."""
     v_stop: Array
-    """(n,) out: the next velocity of a stop: all coordinates slowed alike, as fast as their accelerations allow."""
+    """(n,) out: the next velocity of a stop: all coordinates slowed alike, as fast as their limits allow."""
     # --- answer of the tracking law
     v0: Array
     """(n,) out: J⁺ẋ."""
@@ -143,3 +147,5 @@ class RowLayout(NamedTuple):
     """Largest distance that any point can ever have from a joint that turns it [m]."""
     accelerated: bool
     """Whether any acceleration has a limit."""
+    jerked: bool
+    """Whether any jerk has one."""

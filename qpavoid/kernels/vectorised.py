@@ -12,6 +12,7 @@ import numpy as np
 from scipy.linalg.lapack import dposv
 
 from qpavoid.kernels.layout import RowLayout
+from qpavoid.kernels.stopping import AT_REST, MOST_STEPS, longest_way, way_to_stop
 from qpavoid.kernels.workspace import Rows, Workspace
 from qpavoid.problem import Array, IntArray
 
@@ -164,7 +165,7 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
         least *= x.gain_
     if x.accelerated:
         _leave_room_to_brake(x, rows)
-    if some:
+    if some or x.jerked:
         np.minimum(least, x.recovery_, out=least)
     if moving:
         least -= drift
@@ -187,7 +188,33 @@ def _leave_room_to_brake(x: Any, rows: Rows) -> None:
         braking = 0.5 * BRAKING_SHARE * np.nansum(np.abs(rows.J) * x.v_step, axis=1)
         room = np.maximum(rows.d - x.hold, 0.0) / x.dt
         fastest = braking - np.sqrt(braking * braking + 4.0 * braking * room)
-    np.maximum(rows.least, fastest, out=rows.least, where=(rows.least < 0.0) & np.isfinite(braking))
+    closing = (rows.least < 0.0) & np.isfinite(braking)
+    np.maximum(rows.least, fastest, out=rows.least, where=closing)
+    if x.jerked:
+        _room_for_jerk(x, rows, np.flatnonzero(closing), 2.0 * braking, room)
+
+
+def _room_for_jerk(x: Any, rows: Rows, closing: IntArray, step: Array, room: Array) -> None:
+    """Raises the bounds of closing pairs to the speeds from which a share of their joints' jerks, too, brings them to
+    rest in time, at the change of speed that has led to them (`kernels.stopping`).
+
+    Args:
+        x: memory of the tick.
+        rows: of the near pairs (k,).
+        closing: which of them close (c,).
+        step: change of the speed of closing that a share of the joints' accelerations makes in a tick (k,) [m/s].
+        room: distance left over the length of a tick (k,) [m/s].
+    """
+    J = rows.J[closing]
+    with np.errstate(invalid="ignore"):  # no lever times no limit
+        unit = BRAKING_SHARE * np.nansum(np.abs(J) * x.w_step, axis=1)
+    known = (unit > 0.0) & (unit < np.inf)
+    closing, J, unit = closing[known], J[known], unit[known]
+    speed, change = -np.dot(J, x.v_last) - rows.drift[closing], -np.dot(J, x.w_last)
+    # all jerks at work on a pair change the change of its speed no more than this
+    high = np.minimum((-rows.least[closing] - speed) / unit, change / unit + 1.0 / BRAKING_SHARE)
+    change = change_to_stop(speed / unit, high, step[closing] / unit, room[closing] / unit)
+    rows.least[closing] = np.maximum(rows.least[closing], -speed - unit * change)
 
 
 def closest_call(x: Any, v: Array, k: int, reach: float, horizon: float) -> float:
@@ -291,7 +318,7 @@ def frame_rows(x: Any) -> None:
     np.multiply(x.b_frames, x.scale, out=x.b_frames)
 
 
-def speed_to_stop(room: Array, step: Array, dt: float) -> Array:
+def speed_to_stop(room: Array, step: Array | float, dt: float) -> Array:
     """Largest speed from which a coordinate that is slowed by `step` in every tick comes to rest within `room`.
 
     From v it still goes S(v) = dt Σ max(v - i step, 0), i = 0, 1, …; on (n - 1) step <= v <= n step that is
@@ -307,13 +334,41 @@ def speed_to_stop(room: Array, step: Array, dt: float) -> Array:
     return np.asarray(room / (dt * ticks) + 0.5 * step * (ticks - 1.0))
 
 
+def change_to_stop(speed: Array, high: Array, most: Array, room: Array) -> Array:
+    """Largest change of v, no larger than `high`, after which a stop within the limits ends within `room`.
+
+    Newton's method from above, on the convex way of `kernels.stopping.way_to_stop`, with its units. -∞ where not even
+    a coordinate that comes to rest at once would do.
+
+    Args:
+        speed: v (n,).
+        high: largest change that matters (n,).
+        most: largest that the acceleration allows (n,).
+        room: way that is left (n,), not negative.
+    """
+    change = high.copy()
+    left = np.flatnonzero(longest_way(speed + high, high, most) > room)
+    for _ in range(MOST_STEPS):
+        way, growth = way_to_stop(speed[left] + change[left], change[left], most[left])
+        over = way > room[left]
+        left = left[over]
+        if not len(left):
+            break
+        change[left] -= (way[over] - room[left]) / growth[over]
+    return np.asarray(change)
+
+
 def velocity_bounds(x: Any, q: Array) -> None:
     """Bounds on v from the joint limits: see `qpavoid.limits`; writes hard_lower, hard_upper, lower and upper."""
     room = x.room  # [lower, upper]: how far the coordinate is above its lower limit, and below the upper one
     np.subtract(x.q_limits, q if x.plain else q[x.q_index], out=room)
     if x.accelerated:
         room[0] *= -1.0
-        slowed = np.maximum(x.rate_ * room, x.signs * x.v_last[x.v_index] - x.limited_step)
+        step = x.limited_step
+        if x.jerked:
+            left = np.array(room)
+            step = np.minimum(step, x.limited_jerk - x.signs * x.w_last[x.v_index])
+        slowed = np.maximum(x.rate_ * room, x.signs * x.v_last[x.v_index] - step)
         stop = speed_to_stop(np.maximum(room, 0.0), x.finite_step, x.dt)
         speed = np.where(np.isinf(x.limited_step), x.rate_ * room, np.where(room > 0.0, stop, slowed))
         # on the way back from outside one limit it can still brake for the other
@@ -330,22 +385,129 @@ def velocity_bounds(x: Any, q: Array) -> None:
         np.maximum(room, x.slowest, out=room)
         x.hard_lower[:], x.hard_upper[:] = x.v_min, x.v_max
         x.hard_lower[x.v_index], x.hard_upper[x.v_index] = room
+    if x.jerked:
+        lower, upper = _within_jerk(x, left)
     if x.accelerated:
         np.clip(x.v_last - x.v_step, x.hard_lower, x.hard_upper, out=x.lower)
         np.clip(x.v_last + x.v_step, x.hard_lower, x.hard_upper, out=x.upper)
+    if x.jerked:
+        within = np.clip(lower, x.lower, x.upper), np.clip(upper, x.lower, x.upper)
+        x.lower[:], x.upper[:] = within
+
+
+def _within_jerk(x: Any, room: Array) -> tuple[Array, Array]:
+    """Bounds (n,) on v between which the stops of `kernels.stopping` end within position and velocity limits.
+
+    They never cross, as the stop's own next velocity is between them from any state. Of a coordinate outside its
+    limits, the hard bounds that send it back give way to what it needs to stop before the opposite limit.
+
+    Args:
+        x: memory of the tick.
+        room: how far coordinates are from their position limits (2, l).
+    """
+    unit, most, j = x.jerk_unit, x.jerk_most, x.jerk_index
+    speed, change = x.v_last[j] / unit, x.w_last[j] / unit
+    target = np.copysign(np.minimum(speed_to_stop(np.abs(speed), 1.0, 1.0), most), -speed)
+    stop = np.minimum(np.maximum(target, change - 1.0), change + 1.0)
+    speed, change, stop = x.signs * speed, x.signs * change, x.signs * stop
+    left, bounds = np.full((2, len(x.v_max)), np.inf), np.repeat(np.inf * x.signs, len(x.v_max), axis=1)
+    left[:, x.v_index] = room
+    left = left[:, j] / (x.dt * unit)
+    fastest = np.where(left >= 0.0, x.jerk_fastest, 0.0)  # once on its way back, a coordinate does not turn round again
+    high = np.minimum(np.minimum(change + 1.0, most), speed_to_stop(np.maximum(fastest - speed, 0.0), 1.0, 1.0))
+    found = change_to_stop(speed.ravel(), high.ravel(), np.tile(most, 2), np.maximum(left, 0.0).ravel())
+    bounds[:, j] = x.v_last[j] + x.signs * unit * np.maximum(found.reshape(2, -1), stop)
+    lower, upper = bounds
+    beyond, below = x.v_index[room[1] < 0.0], x.v_index[room[0] < 0.0]
+    x.hard_upper[beyond] = np.maximum(x.hard_upper[beyond], np.minimum(lower, x.v_max)[beyond])
+    x.hard_lower[below] = np.minimum(x.hard_lower[below], np.maximum(upper, -x.v_max)[below])
+    return lower, upper
 
 
 def stop_velocity(x: Any) -> None:
     """Slows v_last down by one factor for all coordinates, so that no distance closes faster; writes v_stop.
 
     Bounds of position and velocity come first. Without acceleration limits it is a standstill, if they allow that.
+    With jerk limits, the change of v goes straight towards that of the stop that would be the fastest of all with one
+    factor, in steps that no coordinate's jerk forbids; once it is there, it stays there to the end.
     """
-    if x.accelerated:
+    if x.jerked:
+        np.clip(_easing_stop(x, x.v_last, x.w_last), x.lower, x.upper, out=x.v_stop)
+    elif x.accelerated:
         slowing = np.max(np.abs(x.v_last) / x.v_step, initial=1.0)  # number of ticks to a standstill
         np.clip((1.0 - 1.0 / slowing) * x.v_last, x.lower, x.upper, out=x.v_stop)
     else:
         np.minimum(x.upper, x.zero, out=x.v_stop)
         np.maximum(x.v_stop, x.lower, out=x.v_stop)
+
+
+def _easing_stop(x: Any, v: Array, w: Array) -> Array:
+    """Next velocity (n,) of a stop within jerk limits: see `stop_velocity`.
+
+    Args:
+        x: reads v_step and w_step.
+        v: velocity (n,).
+        w: by how much it has just changed (n,).
+    """
+    speeds = np.abs(v)
+    braking, fastest = 1.0 / max(float((speeds / x.v_step).max()), 1.0), float((speeds / x.w_step).max())
+    if fastest > 0.0:
+        ticks = max(math.ceil(0.5 * math.sqrt(1.0 + 8.0 * fastest) - 0.5), 1)
+        braking = min(braking, 1.0 / ticks + 0.5 * (ticks - 1) / fastest)  # σ(fastest) / fastest
+    kept = 1.0 - 1.0 / max(float((np.abs(w + braking * v) / x.w_step).max()), 1.0)
+    return (1.0 - (1.0 - kept) * braking) * v + kept * w
+
+
+def stop_way(x: Any, q: Array, w: Array, way: Array) -> int:
+    """Velocities of the ticks of a stop within jerk limits, from the velocity way[0] on.
+
+    Bounds are looked at only where the stop without them may come near a limit of position or velocity.
+
+    Args:
+        x: memory of its own; the limits are read.
+        q: configuration (nq,) before the first of these ticks.
+        w: change of v that has led to way[0] (n,), no larger than v_step.
+        way: out, room for as many ticks as are looked at (m, n).
+
+    Returns:
+        Number of ticks in which the robot moves, or m.
+    """
+    count = _stop_ticks(x, q, w, way, False)
+    return count if _free(x, q, way[:count]) else _stop_ticks(x, q.copy(), w, way, True)
+
+
+def _free(x: Any, q: Array, way: Array) -> bool:
+    """Whether the velocities (m, n) of a stop that began at q are surely within the bounds of their ticks."""
+    unlimited, i, j = np.isinf(x.w_step), x.jerk_index, x.v_index
+    speed, change = way[1:, i] / x.jerk_unit, np.diff(way[:, i], axis=0) / x.jerk_unit
+    if np.isfinite(x.v_max[unlimited]).any() or unlimited[j].any():
+        return False
+    if (np.abs(speed) + 0.5 * change * change > x.jerk_fastest * (1.0 + AT_REST)).any():
+        return False
+    places = q[x.q_index] + x.dt * np.cumsum(way[:-1, j], axis=0)
+    unit, most = x.limited_jerk, x.v_step[j] / x.limited_jerk
+    speed, change = way[1:, j] / unit, np.diff(way[:, j], axis=0) / unit
+    far = longest_way(speed, change, most) <= (x.q_upper - places) / (x.dt * unit)
+    return bool((far & (longest_way(-speed, -change, most) <= (places - x.q_lower) / (x.dt * unit))).all())
+
+
+def _stop_ticks(x: Any, q: Array, w: Array, way: Array, bounded: bool) -> int:
+    """`stop_way`, with all bounds at all places of the way, or with none."""
+    v = way[0]
+    for k in range(1, len(way)):
+        if bounded:
+            x.v_last[:], x.w_last[:] = v, w
+            q[x.q_index] += x.dt * v[x.v_index]
+            velocity_bounds(x, q)
+            stop_velocity(x)
+            way[k] = x.v_stop
+        else:
+            way[k] = _easing_stop(x, v, w)
+        w = np.clip(way[k] - v, -x.v_step, x.v_step)
+        v = way[k]
+        if (np.abs(v) <= AT_REST * x.v_step).all() and (np.abs(w) <= x.w_step).all():
+            return k
+    return len(way)
 
 
 def damped_solution(x: Any, v: Array) -> None:

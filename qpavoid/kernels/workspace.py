@@ -85,6 +85,10 @@ class Workspace:
         self.limited_step = layout.v_step[layout.v_index]
         self.finite_step = np.where(np.isfinite(self.limited_step), self.limited_step, 1.0)
         self.fastest = layout.v_max[layout.v_index]
+        self.jerk_index = np.flatnonzero(np.isfinite(layout.w_step))
+        self.jerk_unit, self.limited_jerk = layout.w_step[self.jerk_index], layout.w_step[layout.v_index]
+        self.jerk_most = layout.v_step[self.jerk_index] / self.jerk_unit
+        self.jerk_fastest = layout.v_max[self.jerk_index] / self.jerk_unit
         self.slowest, self.v_min = -self.fastest, -layout.v_max
 
         self._views: dict[int, Rows] = {}

@@ -9,7 +9,7 @@ from qpavoid.solvers.relaxation import TOLERANCE, Relaxed
 
 
 def what_gave_way(relaxed: Relaxed, problem: Problem) -> tuple[str, ...]:
-    """One line for each pair that gave way, the deepest first, each joint in its way, each acceleration passed.
+    """One line for each pair that gave way, the deepest first, each joint in its way, each acceleration or jerk passed.
 
     Args:
         relaxed: the solution.
@@ -23,8 +23,9 @@ def what_gave_way(relaxed: Relaxed, problem: Problem) -> tuple[str, ...]:
     for pair, lack, d in zip(rows.pair[gave].tolist(), slack[gave].tolist(), rows.d[gave].tolist(), strict=True):
         short = f", {1e3 * (rows.d1 - d):.1f} mm short of d1" if d < rows.d1 else ""
         lines.append(f"{' - '.join(problem.pair_names[pair])}: {1e3 * lack:.1f} mm/s short of its row{short}")
+    limit = "acceleration and jerk limits" if problem.jerked else "acceleration limit"
     hurried = [
-        f"{names[j]}: {excess[j]:.3f} rad/s or m/s beyond its acceleration limit"
+        f"{names[j]}: {excess[j]:.3f} rad/s or m/s beyond its {limit}"
         for j in np.flatnonzero(excess > 2.0 * TOLERANCE).tolist()
     ]
     return (*lines, *hurried, *sorted(_limits_in_the_way(rows.J[gave], relaxed.v, problem)))

@@ -1,9 +1,9 @@
 """What gives way when rows and bounds contradict each other: margins, then accelerations, then contact.
 
 Among pairs, the deepest threat gives way last: first, every pair is kept from touching, from the deepest on; then
-margins are restored as far as that allows, in the same order. Acceleration limits give way only where pairs would
-touch otherwise: given up for margins, a few mm/s cost jumps of a joint with a short lever between its velocity limits.
-Position and velocity limits never give way.
+margins are restored as far as that allows, in the same order. Acceleration and jerk limits, one set of bounds, give way
+only where pairs would touch otherwise: given up for margins, a few mm/s cost jumps of a joint with a short lever
+between its velocity limits. Position and velocity limits never give way.
 
 Only a tick that has no safe velocity comes here. It takes longer than others, some tens of small QPs, for an answer
 that gives up no more than it must.
@@ -44,7 +44,7 @@ class Relaxed(NamedTuple):
     slack: Array
     """(k,) what each avoidance row gave way [m/s]."""
     excess: Array
-    """(n,) by how much each coordinate passes what its acceleration limit allows [rad/s or m/s]."""
+    """(n,) by how much each coordinate passes what its acceleration and jerk limits allow [rad/s or m/s]."""
 
 
 class _Bounds(NamedTuple):
