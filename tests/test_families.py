@@ -492,7 +492,7 @@ def test_a_file_at_fault_is_told_so(family, text, change, error, said):
         (TEMPLATE, ("[0, -0.5, 0]", "[0, -5, 0]"), POSTS, ConfigError, r"most often: the goal is not attained"),
         (TEMPLATE, ("[0.6, $y, 0.25]", "[0, 0, 0.1], rpy: [0, 0, $y]"), POSTS, ConfigError, r"most often: .* too near"),
         (TEMPLATE, ("sensor:", "reachable: false\nsensor:"), POSTS, ConfigError, r"no goal is out of reach"),
-        (TEMPLATE, ("dt: 0.02", "contacts: [{frame: tool0}]"), POSTS, ConfigError, r"know nothing of `contacts`"),
+        (TEMPLATE, ("dt: 0.02", "contacts: [{frame: tool0}]"), POSTS, ConfigError, r"knows neither contacts"),
         (TEMPLATE, ("{frame: tool0, motion", "{frame: tool0, type: orientation, motion"), POSTS, ConfigError,
          r"none is that of a frame with a position"),
         (GENERATED, ("posts.py:posts", "passing"), POSTS, ConfigError, r"ur5 has 1 arms that move; two are needed"),

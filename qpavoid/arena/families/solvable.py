@@ -36,11 +36,9 @@ def solved_by(scenario: ScenarioConfig, world: World, reachable: bool, random: n
         random: where samples come from.
 
     Raises:
-        ConfigError: it has what plans know nothing of.
+        ConfigError: no task is that of a frame with a position.
         Redraw: it starts too near to something, or no solution, or no proof that there is none, was found.
     """
-    if scenario.contacts or any(obstacle.carried_by for obstacle in scenario.obstacles):
-        raise ConfigError(f"{scenario.source}: plans know nothing of `contacts` and `carried_by`; leave them out")
     if not world.tools:
         raise ConfigError(f"{scenario.source}: tasks: none is that of a frame with a position; give one")
     clearance = Clearance(world, scenario.duration, to_keep(scenario))
