@@ -12,6 +12,7 @@ import numpy as np
 
 from qpavoid import Controller, ScenarioConfig, Workers, load_scenario, simulate, simulate_many, steps
 from qpavoid.kernels import ACCELERATED
+from qpavoid.machine import cpu
 
 RESULTS = Path(__file__).parent / "results" / "batch.md"
 SCENARIOS = ("situation1", "panda_line")
@@ -33,7 +34,7 @@ def main() -> None:
         f"`simulate_many` over {options.runs} scenarios of {options.duration:g} s that differ in d2, and `steps` over "
         f"{options.states:,} random states around the initial one, with `Workers` that are kept: their start is given "
         "apart, and what they do for the first time (compiled code loaded, robots read) is not timed. `in this "
-        f"process`: the same in a plain loop. {_cpu()}, {os.cpu_count()} CPUs, {platform.system()}, Python "
+        f"process`: the same in a plain loop. {cpu()}, {os.cpu_count()} CPUs, {platform.system()}, Python "
         f"{platform.python_version()}, numpy {np.__version__}, {'numba' if ACCELERATED else 'no numba'}; load of the "
         f"machine before: {load:.1f}.",
         "",
@@ -117,14 +118,6 @@ def _parts(name: str, options: argparse.Namespace) -> str:
 
 def _doubling(most: int) -> list[int]:
     return [n for n in (1, 2, 4, 8, 16, 32, 64, 128) if n < most] + [most]
-
-
-def _cpu() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        lines = []
-    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
 if __name__ == "__main__":

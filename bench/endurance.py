@@ -22,6 +22,8 @@ import numpy as np
 import numpy.typing as npt
 import pinocchio as pin
 
+from qpavoid.machine import cpu
+
 ROOT = Path(__file__).parent.parent
 LAP = 1000
 DT = 0.01
@@ -313,18 +315,10 @@ def _report(latency: Any, memory: Any, ticks: int, load: tuple[float, float]) ->
 
 
 def _machine() -> str:
-    names = (line.split(":", 1)[1].strip() for line in _cpuinfo() if line.startswith("model name"))
     return (
-        f"{next(names, platform.processor())}, {os.cpu_count()} CPUs, {platform.system()}, Python "
+        f"{cpu()}, {os.cpu_count()} CPUs, {platform.system()}, Python "
         f"{platform.python_version()}, numpy {np.__version__}, pin {pin.__version__}; one thread"
     )
-
-
-def _cpuinfo() -> list[str]:
-    try:
-        return Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return []
 
 
 if __name__ == "__main__":

@@ -385,7 +385,7 @@ class Controller:
             blocked = self._progress.update(problem, solution)
             solution = solution._replace(blocked=blocked) if blocked else solution
         if self._escape is not None and not faults:
-            solution = self._with_a_way_out(self._escape, q, t, problem, solution)
+            solution = self._with_a_way_out(self._escape, q, t, proximity, problem, solution)
         self._assembly.remember(solution.v)
         solution = solution._replace(assumed=assumed) if assumed else solution
         return samples, proximity, problem, solution.timed(built - begin, perf_counter() - built)
@@ -434,9 +434,9 @@ class Controller:
         return solution._replace(v=v, share=share, status=status, reasons=(*solution.reasons, reason))
 
     def _with_a_way_out(
-        self, escape: EscapePlanner, q: Array, t: float, problem: Problem, solution: Solution
+        self, escape: EscapePlanner, q: Array, t: float, proximity: Proximity, problem: Problem, solution: Solution
     ) -> Solution:
-        v = escape.check(q, solution.v, t, self._assembly.v_last)
+        v = escape.check(q, solution.v, t, self._assembly.v_last, proximity)
         if v is None:
             return solution
         v = np.clip(v, problem.lower, problem.upper)

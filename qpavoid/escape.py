@@ -43,11 +43,11 @@ _LEAN = 2.0
 """‖v̂‖ of those [rad/s, m/s]."""
 _GENTLE = 1e-4
 """ε: what the square of a joint speed counts beside that of a distance [m²/(rad/s)²]."""
-Mask = npt.NDArray[np.bool_]
 _DEEPEST = 10.0
 """Penetration that no flight foresees [m]."""
 _TOUCH = 1e-3
 """Distance below which a pair counts as touching [m]."""
+Mask = npt.NDArray[np.bool_]
 
 
 class Manner(NamedTuple):
@@ -121,7 +121,7 @@ class EscapePlanner:
         """Forgets the flight that was kept."""
         self._kept = None
 
-    def check(self, q: Array, v: Array, t: float, v_last: Array) -> Array | None:
+    def check(self, q: Array, v: Array, t: float, v_last: Array, proximity: Proximity) -> Array | None:
         """None where v may be commanded, else what to command in its place (nv,).
 
         Args:
@@ -129,11 +129,11 @@ class EscapePlanner:
             v: what the law and the look ahead want (nv,).
             t: now [s].
             v_last: velocity (nv,) at which the robot moves.
+            proximity: distances of this tick; pairs that touch already are left out of account.
         """
         if not len(self._obstacles.moving):
             return None
         self._foreseen.clear()
-        proximity, _ = self._look(q, t, v_last)
         watched = self._parted.copy()
         watched[proximity.pair[proximity.distance < _TOUCH]] = False
         onward = self._best(pin.integrate(self._model, q, self._dt * v), v, t + self._dt, watched)

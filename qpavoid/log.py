@@ -6,7 +6,6 @@ import json
 import os.path
 import platform
 from dataclasses import dataclass, field, fields
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 from zipfile import ZipFile
@@ -14,6 +13,7 @@ from zipfile import ZipFile
 import numpy as np
 import numpy.typing as npt
 
+from qpavoid import machine
 from qpavoid.errors import ConfigError
 from qpavoid.metrics import run_metrics
 from qpavoid.problem import Array, IntArray, Status
@@ -172,12 +172,9 @@ class Log:
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "meta"}
 
 
+_SHAPING = ("qpavoid", "pin", "coal", "numpy", "qpsolvers", "daqp", "proxsuite", "osqp", "quadprog")
+
+
 def versions() -> dict[str, str]:
     """Versions of everything that shapes a result."""
-    found = {"python": platform.python_version(), "machine": platform.machine()}
-    for package in ("qpavoid", "pin", "coal", "numpy", "qpsolvers", "daqp", "proxsuite", "osqp", "quadprog"):
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            continue
-    return found
+    return {"python": platform.python_version(), "machine": platform.machine(), **machine.versions(_SHAPING)}

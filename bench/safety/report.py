@@ -8,7 +8,6 @@ import platform
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, fields
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,6 +17,7 @@ from bench.safety.campaign import KINDS, RANGES
 from bench.safety.trial import Trial
 from bench.safety.verdict import AHEAD, RESOLUTION
 from qpavoid.arena.referee import MOST_LOOKS, STEP
+from qpavoid.machine import cpu, versions
 
 PACKAGES = ("qpavoid", "mujoco", "pin", "coal", "daqp", "numpy", "scipy", "numba")
 LISTED = 10
@@ -222,15 +222,5 @@ def _cell(value: object) -> object:
 
 
 def _machine() -> str:
-    found = []
-    for package in PACKAGES:
-        try:
-            found.append(f"{package} {version(package)}")
-        except PackageNotFoundError:
-            continue
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        lines = []
-    cpu = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
-    return f"{cpu}, {os.cpu_count()} CPUs, {platform.system()}, Python {platform.python_version()}, {', '.join(found)}"
+    found = ", ".join(f"{package} {number}" for package, number in versions(PACKAGES).items())
+    return f"{cpu()}, {os.cpu_count()} CPUs, {platform.system()}, Python {platform.python_version()}, {found}"

@@ -14,6 +14,7 @@ import numpy as np
 from bench.solvers.record import Run
 from bench.solvers.replay import Cell, Loose
 from bench.solvers.verify import DISTANCE, EDGE, GAP, VIOLATION, Judgement, Truth
+from qpavoid.machine import cpu
 
 PACKAGES = (
     "qpavoid",
@@ -253,9 +254,4 @@ def _version(name: str) -> str:
 
 
 def _machine() -> str:
-    model = platform.processor() or platform.machine()
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        models = [line.split(":")[1].strip() for line in cpuinfo.read_text().splitlines() if "model name" in line]
-        model = models[0] if models else model
-    return f"{model}, {os.cpu_count()} CPUs, {platform.system()}, Python {platform.python_version()}"
+    return f"{cpu()}, {os.cpu_count()} CPUs, {platform.system()}, Python {platform.python_version()}"

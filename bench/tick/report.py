@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from bench.tick.runner import Cell, Results, Row
+from qpavoid.machine import cpu
 
 TARGETS = {
     "qpavoid": {"pink-20": 15.0, "mink": 2.2, "placo": 1.0},
@@ -260,9 +261,4 @@ def _line(cells: Any) -> str:
 
 
 def _machine() -> str:
-    model = platform.processor() or platform.machine()
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        names = [line.split(":")[1].strip() for line in cpuinfo.read_text().splitlines() if "model name" in line]
-        model = names[0] if names else model
-    return f"{model}, {os.cpu_count()} CPUs, {platform.system()}, Python {platform.python_version()}"
+    return f"{cpu()}, {os.cpu_count()} CPUs, {platform.system()}, Python {platform.python_version()}"

@@ -27,7 +27,6 @@ from tornado.ioloop import PeriodicCallback
 from qpavoid.arena.case import Case
 from qpavoid.arena.entrants import Entrant
 from qpavoid.arena.families import Family, load_family, make_case
-from qpavoid.arena.machine import machine, versions
 from qpavoid.arena.plan import cases_of, missing_cases, missing_runs
 from qpavoid.arena.store import Journal, Store, read_cases
 from qpavoid.arena.suite import Suite, facts_of, origin
@@ -35,6 +34,7 @@ from qpavoid.arena.trial import held, run_trial
 from qpavoid.arena.twin import build
 from qpavoid.arena.world import build_world
 from qpavoid.errors import ConfigError, QpavoidError
+from qpavoid.machine import machine, versions
 
 _ANSWER_WITHIN = 10.0
 """Time in which a scheduler has to answer, and a first worker to be there [s]."""
