@@ -12,7 +12,15 @@ from qpavoid.avoidance import row_form
 from qpavoid.config import Avoidance, Limits
 from qpavoid.contacts import ContactRows, tracking_within
 from qpavoid.kernels.layout import RowLayout
-from qpavoid.kinematics import ForwardKinematics, Kinematics, chains, columns, longest_lever, support_masks
+from qpavoid.kinematics import (
+    ForwardKinematics,
+    Kinematics,
+    chains,
+    column_joints,
+    columns,
+    longest_lever,
+    support_masks,
+)
 from qpavoid.limits import JointBounds, limit_layout
 from qpavoid.motion import Sample
 from qpavoid.problem import Array, AvoidanceRows, Problem, Proximity, Tracking
@@ -89,7 +97,9 @@ class Assembly:
             twists=query.placing.twists,
             twist_row=query.twist_row,
             margin=query.placing.margin,
-            joint_velocities=kinematics.joint_velocities,
+            joint_poses=kinematics.joint_poses,
+            parents=np.array(list(scene.robot.model.parents), dtype=np.intp),
+            column_joints=column_joints(scene.robot.model),
             joint_reach=joint_reach,
             carriers=query.carriers(),
             turning=turning,
@@ -164,7 +174,7 @@ class Assembly:
     def closest_call(self, v: Array, near: int, reach: float, horizon: float, stop: Stop | None = None) -> float:
         """A bound below what is left of the safe distances on the way of v until `horizon` [m].
 
-        See `kernels.vectorised.closest_call`; v is that of the last `ForwardKinematics.move`.
+        See `kernels.vectorised.closest_call`.
 
         Args:
             v: velocity (nv,).
@@ -185,7 +195,7 @@ class Assembly:
         return turned * (turned * x.lever + 2.0 * slid)
 
     def stop(self, q: Array, v: Array) -> Stop:
-        """A tick at v and the stop after it, where jerks have limits; brings the kinematics to another velocity.
+        """A tick at v and the stop after it, where jerks have limits.
 
         All of it is along v and the change that has led to v, but for what position and velocity limits forbid.
 
@@ -203,11 +213,8 @@ class Assembly:
         beside = way - shares[:, None] * v
         parts = beside @ across / max(float(across @ across), 1e-300)
         beside -= parts[:, None] * across
-        self._forward.move(q, across)
-        twists = x.joint_velocities
-        speeds = np.sqrt(np.square(twists[:, :3]).sum(axis=1))
-        speeds += x.joint_reach * np.sqrt(np.square(twists[:, 3:]).sum(axis=1))
-        aside = np.abs(parts) * speeds.max()
+        kernels.joint_speeds(self._packed, across)
+        aside = np.abs(parts) * x.speeds[: len(x.joint_poses)].max()
         if (np.abs(beside).max(axis=0) > _ROUND_OFF * x.v_step).any():
             turned, slid = np.abs(beside) @ x.turning.T, np.abs(beside) @ x.sliding.T
             aside += turned.max(axis=1) * x.lever + slid.max(axis=1)

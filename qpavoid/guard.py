@@ -24,7 +24,6 @@ import pinocchio as pin
 from qpavoid.assembly import Assembly
 from qpavoid.courses import move_on
 from qpavoid.kernels.vectorised import speed_to_stop
-from qpavoid.kinematics import ForwardKinematics
 from qpavoid.limits import JointBounds
 from qpavoid.problem import Array, IntArray, Problem, Solution
 from qpavoid.proximity import DistanceQuery
@@ -85,7 +84,6 @@ class Guard:
     def __init__(
         self,
         scene: Scene,
-        kinematics: ForwardKinematics,
         bounds: JointBounds,
         position_gain: float,
         hold: float,
@@ -95,13 +93,12 @@ class Guard:
 
         Args:
             scene: robot and obstacles.
-            kinematics: of the tick, brought to the velocities that are looked at.
             bounds: limits of the joints.
             position_gain: share of the room to a position limit that one tick may use [-].
             hold: safe distance between surfaces [m].
             dt: how long a velocity is held [s].
         """
-        self._model, self._kinematics, self._hold, self._dt = scene.robot.model, kinematics, hold, dt
+        self._model, self._hold, self._dt = scene.robot.model, hold, dt
         self._data, self._ahead = scene.robot.model.createData(), DistanceQuery(scene)
         self._bounds, self._rate = bounds, position_gain / dt
         self._acceleration, self._accelerated = bounds.acceleration, bool(np.isfinite(bounds.acceleration).any())
@@ -149,7 +146,6 @@ class Guard:
         near = rows.pair
         stop = assembly.stop(q, v) if self._jerked else None
         horizon = self._dt + 0.5 * self._stopping(v) if stop is None else float(stop.forwards.sum())
-        self._kinematics.move(q, v)
         if assembly.closest_call(v, len(near), reach, horizon, stop) > 0.0:
             return None
         self._given[:] = 0.0

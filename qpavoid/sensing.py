@@ -197,7 +197,7 @@ class Obstacles:
                 if not self._look_at(index, what, t, fresh, voxels, notes):
                     self._tracks.setdefault(index, self._unseen(index, t))
             else:
-                fresh[index] = as_sample(f"obstacle {name!r}", what)
+                fresh[index] = _checked(name, what)
         for index in self._unusable(fresh):
             notes.append(f"{self._obstacles[index].name}: NaN or infinity in its pose or twist, taken as not given")
             del fresh[index]
@@ -247,7 +247,7 @@ class Obstacles:
             notes.append(f"{name}: {bad}, dropped")
         before = self._tracks.get(index)
         last = before.sample if before else self._obstacles[index].motion.sample(t)
-        fresh[index] = last if what.pose is None else as_sample(f"obstacle {name!r}", what.pose)
+        fresh[index] = last if what.pose is None else _checked(name, what.pose)
         voxels[index] = seen
         return True
 
@@ -278,11 +278,18 @@ class Obstacles:
 _SHAPES = {"position": (3,), "rotation": (3, 3), "linear": (3,), "angular": (3,)}
 
 
-def as_sample(name: str, what: Any) -> Any:
+def _checked(obstacle: str, what: Any) -> Any:
+    try:
+        return as_sample(what)
+    except NumericalError as error:
+        raise NumericalError(f"obstacle {obstacle!r}: {error}") from None
+
+
+def as_sample(what: Any) -> Any:
     """A sample or pose whose parts are float arrays of the right shapes, whatever their numbers are.
 
     Raises:
-        NumericalError: wrong shapes, or not numbers; names the argument and its part.
+        NumericalError: wrong shapes, or not numbers; names the part.
     """
     kind = type(what)
     if kind is Sample or kind is Pose:
@@ -293,16 +300,13 @@ def as_sample(name: str, what: Any) -> Any:
         except AttributeError:
             pass
     if not isinstance(what, (Sample, Pose)):
-        raise NumericalError(f"{name}: neither a Sample nor a Pose: {what!r:.60}")
-    parts = [
-        as_vector(f"{name}: {field}", part, _SHAPES[field]) for field, part in zip(what._fields, what, strict=True)
-    ]
-    return type(what)(*parts)
+        raise NumericalError(f"neither a Sample nor a Pose: {what!r:.60}")
+    return type(what)(*[as_vector(name, part, _SHAPES[name]) for name, part in zip(what._fields, what, strict=True)])
 
 
-def as_goal(name: str, what: Any) -> Sample:
+def as_goal(what: Any) -> Sample:
     """`as_sample` of what a task should reach: a bare `Pose` is one at rest."""
-    sample = as_sample(name, what)
+    sample = as_sample(what)
     return sample if isinstance(sample, Sample) else Sample(sample.position, sample.rotation, _AT_REST, _AT_REST)
 
 

@@ -135,7 +135,9 @@ def random_layout(seed, frames=2, turns=(1,), pairs=9, nv=7, obstacles=3, joints
         "twists": np.vstack((rng.normal(size=(obstacles, 6)), np.zeros(6))),
         "twist_row": rng.integers(0, obstacles + 1, pairs),
         "margin": np.append(rng.choice([0.0, 0.02, 0.1], obstacles), 0.0),
-        "joint_velocities": gaps(rng.normal(size=(joints, 6)), 8) if views else rng.normal(size=(joints, 6)),
+        "joint_poses": poses_of(rotations(rng, joints), rng.normal(size=(joints, 3)), 14 if views else 12),
+        "parents": np.array([0, *(rng.integers(0, joint) for joint in range(1, joints))], dtype=np.intp),
+        "column_joints": np.sort(rng.integers(1, joints, nv)),
         "joint_reach": rng.uniform(0.0, 0.5, joints),
         "carriers": np.sort(rng.permuted(np.tile(np.arange(joints + obstacles), (pairs, 1)), axis=1)[:, :2], axis=1),
         "turning": rng.integers(0, 2, (2, nv)).astype(float),
@@ -481,16 +483,34 @@ RATES = np.zeros(7)
 def test_no_point_that_a_joint_carries_is_faster_than_it_is_said_to_be(kernels, seed):
     """Nor is the bound a loose one: at most √2 too large, and exact for a joint that does not turn."""
     rng, x = np.random.default_rng(seed), filled(seed)
-    run(kernels, "closest_call", x, RATES, 30, 0.5, 0.1)
-    for motion, reach, speed in zip(x.joint_velocities, x.joint_reach, x.speeds[:4], strict=True):
+    v = rng.normal(size=7)
+    run(kernels, "joint_speeds", x, v)
+    twists = np.zeros((4, 6))
+    for joint in range(1, 4):
+        own = x.column_joints == joint
+        twists[joint] = twists[x.parents[joint]] + x.J_world[:, own] @ v[own]
+    for twist, pose, reach, speed in zip(twists, x.joint_poses, x.joint_reach, x.speeds[:4], strict=True):
         points = rng.normal(size=(2000, 3))
         points *= reach / np.linalg.norm(points, axis=1, keepdims=True)
-        speeds = np.linalg.norm(motion[:3] + np.cross(motion[3:], points), axis=1)
+        speeds = np.linalg.norm(twist[:3] + np.cross(twist[3:], pose[9:] + points), axis=1)
         assert speeds.max() <= speed <= 1.01 * np.sqrt(2.0) * speeds.max()
-    motion = np.hstack((x.joint_velocities[:, :3], np.zeros((4, 3))))
-    y = random_layout(seed, joint_velocities=gaps(motion, 8))
-    run(kernels, "closest_call", y, RATES, 0, 0.5, 0.1)
-    np.testing.assert_allclose(y.speeds[:4], np.linalg.norm(motion[:, :3], axis=1), rtol=1e-13)
+    J = np.asfortranarray(np.vstack((x.J_world[:3], np.zeros((3, 7)))))
+    y = x._replace(J_world=J)
+    run(kernels, "joint_speeds", y, v)
+    np.testing.assert_allclose(y.speeds[:4], np.linalg.norm(twists[:, :3], axis=1), rtol=1e-13)
+
+
+def test_speeds_where_joints_mimic_others():
+    """One coordinate moves several columns of the Jacobian: as many as have its number."""
+    for seed in SEEDS:
+        rng, x = np.random.default_rng(seed), filled(seed)
+        columns, v = np.append(np.arange(5), [1, 3]), rng.normal(size=5)
+        run(version("vectorised"), "joint_speeds", x, v[columns])
+        expected = x.speeds[:4].copy()
+        for name in ("vectorised", "compiled"):
+            y = random_layout(seed, pairs=30, columns=columns, mimics=True)
+            run(version(name), "joint_speeds", y, v)
+            np.testing.assert_allclose(y.speeds[:4], expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("near", [0, 1, 30])
@@ -513,13 +533,11 @@ def test_closest_call_is_below_what_the_fastest_points_leave(kernels, near, hori
 
 @pytest.mark.parametrize("near", [0, 1, 30])
 def test_closest_call_does_not_lose_nan(kernels, near):
-    for joint in range(4):
+    for column in range(7):
         x = filled(0)
-        motion = np.array(x.joint_velocities)
-        motion[joint, joint] = np.nan
-        y = x._replace(joint_velocities=gaps(motion, 8))
-        y.d[:] = 0.2
-        assert np.isnan(run(kernels, "closest_call", y, RATES, near, 0.5, 0.1))
+        x.J_world[column % 6, column] = np.nan
+        x.d[:] = 0.2
+        assert np.isnan(run(kernels, "closest_call", x, np.ones(7), near, 0.5, 0.1))
     for i in range(near):
         x = filled(0)
         x.d[:] = 0.2
@@ -532,7 +550,7 @@ def test_speeds_of_both_versions(pairs):
     for seed in SEEDS:
         x, y = filled(seed, pairs), filled(seed, pairs)
         for name, layout in (("vectorised", x), ("compiled", y)):
-            run(version(name), "closest_call", layout, RATES, 0, 0.5, 0.1)
+            run(version(name), "closest_call", layout, np.random.default_rng(seed).normal(size=7), 0, 0.5, 0.1)
         assert_same(y, x, 0)
 
 

@@ -385,7 +385,6 @@ def test_the_closest_call_counts_voxels_that_have_no_slot(panda, tmp_path):
     for _ in range(15):
         q, v = random_q(panda, rng), rng.uniform(-1.0, 1.0, 7)
         near = len(bench.compute(q, reach=0.3)[0].pair)
-        bench.kinematics.move(q, v)
         for horizon in (0.01, 0.1):
             least = bench.assembly.closest_call(v, near, 0.3, horizon)
             assert ruler.distances(pin.integrate(panda.model, q, horizon * v)).min() - hold >= least - 1e-9

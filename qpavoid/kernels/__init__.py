@@ -27,6 +27,7 @@ closest_call = _chosen.closest_call
 damped_solution = _chosen.damped_solution
 distance_rows = _chosen.distance_rows
 frame_rows = _chosen.frame_rows
+joint_speeds = _chosen.joint_speeds
 pack = _chosen.pack
 projection_cost = _chosen.projection_cost
 row_bounds = _chosen.row_bounds
@@ -50,6 +51,7 @@ __all__ = [
     "damped_solution",
     "distance_rows",
     "frame_rows",
+    "joint_speeds",
     "pack",
     "pack_pieces",
     "place_obstacles",

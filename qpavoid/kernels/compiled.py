@@ -84,7 +84,8 @@ def _fold(row: Array, columns: IntArray, folded: Array) -> None:
 @compiled
 def distance_rows(x: Any, pairs: IntArray, reach: float, moving: bool) -> int:
     """See `vectorised.distance_rows`."""
-    results, J_world, closest, J = x.results, x.J_world, x.closest, x.J
+    results, closest, J = x.results, x.closest, x.J
+    J_world = np.ascontiguousarray(x.J_world)  # rows in one piece become vector instructions
     columns = J_world.shape[1]
     k = 0
     for i in pairs:
@@ -170,14 +171,31 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
 
 
 @compiled
+def joint_speeds(x: Any, v: Array) -> None:
+    """See `vectorised.joint_speeds`."""
+    J, poses, twists = x.J_world, x.joint_poses, np.zeros((len(x.joint_poses), 6))
+    c = 0
+    for i in range(len(poses)):
+        twist, parent = twists[i], twists[x.parents[i]]
+        for s in range(6):
+            twist[s] = parent[s]
+        while c < len(x.column_joints) and x.column_joints[c] == i:
+            for s in range(6):
+                twist[s] += J[s, c] * v[x.columns[c]]
+            c += 1
+        px, py, pz, wx, wy, wz = poses[i, 9], poses[i, 10], poses[i, 11], twist[3], twist[4], twist[5]
+        vx, vy, vz = twist[0] + wy * pz - wz * py, twist[1] + wz * px - wx * pz, twist[2] + wx * py - wy * px
+        x.speeds[i] = np.sqrt(vx * vx + vy * vy + vz * vz)
+        x.speeds[i] += np.sqrt(wx * wx + wy * wy + wz * wz) * x.joint_reach[i]
+
+
+@compiled
 def closest_call(x: Any, v: Array, k: int, reach: float, horizon: float) -> float:
     """See `vectorised.closest_call`."""
-    speeds, motions, joints = x.speeds, x.joint_velocities, len(x.joint_velocities)
+    speeds, joints = x.speeds, len(x.joint_poses)
+    joint_speeds(x, v)
     fastest = 0.0
     for i in range(joints):
-        linear = np.sqrt(motions[i, 0] ** 2 + motions[i, 1] ** 2 + motions[i, 2] ** 2)
-        angular = np.sqrt(motions[i, 3] ** 2 + motions[i, 4] ** 2 + motions[i, 5] ** 2)
-        speeds[i] = linear + angular * x.joint_reach[i]
         fastest = np.maximum(fastest, speeds[i])  # keeps NaN, unlike max
     any_fastest = fastest
     for i in range(joints, len(speeds)):
@@ -204,7 +222,8 @@ _rotation_vector = compiled(rotation_vector)
 @compiled
 def frame_rows(x: Any) -> None:
     """See `vectorised.frame_rows`."""
-    poses, targets, screws, A, b, J_world = x.poses, x.targets, x.screws, x.A, x.b, x.J_world
+    poses, targets, screws, A, b = x.poses, x.targets, x.screws, x.A, x.b
+    J_world = np.ascontiguousarray(x.J_world)  # rows in one piece become vector instructions
     rows, columns = len(screws), J_world.shape[1]
     moving = rows // 3 - len(x.turns)
     for f in range(len(poses)):
@@ -237,15 +256,11 @@ def frame_rows(x: Any) -> None:
     for r in range(rows):
         b[r] *= x.scale[r]
         row = x.mimicking if x.mimics else A[r]
+        lx, ly, lz, ax, ay, az = screws[r, 0], screws[r, 1], screws[r, 2], screws[r, 3], screws[r, 4], screws[r, 5]
         for c in range(columns):
-            row[c] = 0.0
-        for s in range(6):
-            e = screws[r, s]
-            if e != 0.0:
-                for c in range(columns):
-                    row[c] += e * J_world[s, c]
-        for c in range(columns):
-            row[c] *= x.task_support[r, c]
+            linear = lx * J_world[0, c] + ly * J_world[1, c] + lz * J_world[2, c]
+            angular = ax * J_world[3, c] + ay * J_world[4, c] + az * J_world[5, c]
+            row[c] = (linear + angular) * x.task_support[r, c]
         if x.mimics:
             _fold(row, x.columns, A[r])
 
@@ -419,7 +434,7 @@ def damped_solution(x: Any, v: Array) -> None:
     A, b, damping = x.A, x.b, x.damping
     rows, nv = A.shape
     L = np.empty((rows, rows))
-    y = np.empty(rows)
+    y, inverse = np.empty(rows), np.empty(rows)
     smallest, largest = np.inf, 0.0
     for i in range(rows):
         for j in range(i + 1):
@@ -435,19 +450,18 @@ def damped_solution(x: Any, v: Array) -> None:
                 if not dot > 0.0 or (damping == 0.0 and smallest < WELL_CONDITIONED * largest):
                     v[:] = np.nan
                     return
-                L[i, i] = np.sqrt(dot)
+                inverse[i] = 1.0 / np.sqrt(dot)
             else:
-                L[i, j] = dot / L[j, j]
+                L[i, j] = dot * inverse[j]
         total = b[i]
         for c in range(i):
             total -= L[i, c] * y[c]
-        y[i] = total / L[i, i]
+        y[i] = total * inverse[i]
     v[:] = 0.0
     for i in range(rows - 1, -1, -1):
-        total = y[i]
-        for c in range(i + 1, rows):
-            total -= L[c, i] * y[c]
-        y[i] = total / L[i, i]
+        y[i] *= inverse[i]
+        for c in range(i):
+            y[c] -= L[i, c] * y[i]
         for c in range(nv):
             v[c] += A[i, c] * y[i]
 

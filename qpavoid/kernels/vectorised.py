@@ -227,8 +227,8 @@ def closest_call(x: Any, v: Array, k: int, reach: float, horizon: float) -> floa
     lever R.
 
     Args:
-        x: reads what the tick found, and joint_velocities; writes the speeds of the joints.
-        v: velocity (n,), that of joint_velocities.
+        x: reads what the tick found; writes the speeds of the joints.
+        v: velocity (n,).
         k: number of near pairs.
         reach: surface distance below which a pair is near; all others are at least so far apart [m].
         horizon: h [s].
@@ -240,11 +240,7 @@ def closest_call(x: Any, v: Array, k: int, reach: float, horizon: float) -> floa
     turning = max(np.dot(x.turning, rates).tolist())  # of a few numbers, Python's max is the quicker one
     sliding = max(np.dot(x.sliding, rates).tolist()) if x.slides else 0.0
     bend = horizon * horizon * turning * (turning * x.lever + 2.0 * sliding)  # of both bodies: twice ½ a h²
-    np.multiply(x.joint_velocities, x.joint_velocities, out=x.squares)
-    np.dot(x.squares, x.by_kind, out=x.linear_angular)
-    np.sqrt(x.linear_angular, out=x.linear_angular)
-    np.multiply(x.angular_speed, x.joint_reach, out=x.joint_speeds)
-    x.joint_speeds += x.linear_speed
+    joint_speeds(x, v)
     speeds = x.speeds.tolist()
     fastest, known = max(speeds[: x.joints]), sum(speeds)
     least = reach + x.offset - x.hold - (fastest + max(speeds)) * horizon - bend
@@ -258,6 +254,26 @@ def closest_call(x: Any, v: Array, k: int, reach: float, horizon: float) -> floa
         left = float(ways.min()) - x.hold - bend
         least = min(least, left) if left == left else left
     return float(least) if known == known else math.nan
+
+
+def joint_speeds(x: Any, v: Array) -> None:
+    """Largest speed of any point that each joint carries: of its origin, and angular speed times the farthest distance.
+
+    Args:
+        x: reads J_world, joint_poses and joint_reach; writes the first J of speeds.
+        v: velocity (n,).
+    """
+    np.multiply(x.J_world, v.take(x.columns) if x.mimics else v, out=x.moved)
+    twists = np.dot(x.moved, x.carried, out=x.joint_twists)
+    products = twists[3:].take(_CYCLE, axis=0)
+    products *= x.origins.take(_ANTICYCLE, axis=0)
+    twists[:3] += products[:3]
+    twists[:3] -= products[3:]
+    twists *= twists
+    speeds = np.dot(x.by_kind, twists, out=x.squares)
+    np.sqrt(speeds, out=speeds)
+    np.multiply(speeds[1], x.joint_reach, out=x.joint_speeds)
+    x.joint_speeds += speeds[0]
 
 
 def rotation_vector(R: Any) -> tuple[float, float, float]:
