@@ -84,7 +84,7 @@ def _fold(row: Array, columns: IntArray, folded: Array) -> None:
 @compiled
 def distance_rows(x: Any, pairs: IntArray, reach: float, moving: bool) -> int:
     """See `vectorised.distance_rows`."""
-    results, closest, J = x.results, x.closest, x.J
+    results, closest, J, support = x.results, x.closest, x.J, x.support
     J_world = np.ascontiguousarray(x.J_world)  # rows in one piece become vector instructions
     columns = J_world.shape[1]
     k = 0
@@ -100,7 +100,7 @@ def distance_rows(x: Any, pairs: IntArray, reach: float, moving: bool) -> int:
             for c in range(columns):
                 linear = nx * J_world[0, c] + ny * J_world[1, c] + nz * J_world[2, c]
                 angular = mx * J_world[3, c] + my * J_world[4, c] + mz * J_world[5, c]
-                row[c] = (linear + angular) * x.support[i, c]
+                row[c] = (linear + angular) * support[i, c]
             if x.mimics:
                 _fold(row, x.columns, J[k])
             x.drift[k] = 0.0
@@ -222,7 +222,7 @@ _rotation_vector = compiled(rotation_vector)
 @compiled
 def frame_rows(x: Any) -> None:
     """See `vectorised.frame_rows`."""
-    poses, targets, screws, A, b = x.poses, x.targets, x.screws, x.A, x.b
+    poses, targets, screws, support, A, b = x.poses, x.targets, x.screws, x.task_support, x.A, x.b
     J_world = np.ascontiguousarray(x.J_world)  # rows in one piece become vector instructions
     rows, columns = len(screws), J_world.shape[1]
     moving = rows // 3 - len(x.turns)
@@ -260,7 +260,7 @@ def frame_rows(x: Any) -> None:
         for c in range(columns):
             linear = lx * J_world[0, c] + ly * J_world[1, c] + lz * J_world[2, c]
             angular = ax * J_world[3, c] + ay * J_world[4, c] + az * J_world[5, c]
-            row[c] = (linear + angular) * x.task_support[r, c]
+            row[c] = (linear + angular) * support[r, c]
         if x.mimics:
             _fold(row, x.columns, A[r])
 
