@@ -255,6 +255,13 @@ def test_candidates_of_both_versions(seed):
         assert found_by(version("vectorised"), args) == expected and count == len(expected)
 
 
+def test_what_is_in_one_of_two_alone(kernels):
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        a, b = (np.flatnonzero(rng.random(rng.integers(0, 30)) < rng.random()) for _ in range(2))
+        assert kernels.in_one_alone(a, b).tolist() == sorted({*a.tolist()} ^ {*b.tolist()})
+
+
 # --- distances ---------------------------------------------------------------------------------------------------
 
 

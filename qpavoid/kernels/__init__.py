@@ -27,6 +27,7 @@ closest_call = _chosen.closest_call
 damped_solution = _chosen.damped_solution
 distance_rows = _chosen.distance_rows
 frame_rows = _chosen.frame_rows
+in_one_alone = _chosen.in_one_alone
 joint_speeds = _chosen.joint_speeds
 pack = _chosen.pack
 projection_cost = _chosen.projection_cost
@@ -51,6 +52,7 @@ __all__ = [
     "damped_solution",
     "distance_rows",
     "frame_rows",
+    "in_one_alone",
     "joint_speeds",
     "pack",
     "pack_pieces",

@@ -74,6 +74,21 @@ def candidates(poses: Array, local: Array, centers: Array, within: Array, pair_o
 
 
 @compiled
+def in_one_alone(a: IntArray, b: IntArray) -> IntArray:
+    """See `vectorised.in_one_alone`."""
+    found = np.empty(len(a) + len(b), np.intp)
+    i, j, count = 0, 0, 0
+    while i < len(a) or j < len(b):
+        if j == len(b) or (i < len(a) and a[i] < b[j]):
+            found[count], i, count = a[i], i + 1, count + 1
+        elif i == len(a) or b[j] < a[i]:
+            found[count], j, count = b[j], j + 1, count + 1
+        else:
+            i, j = i + 1, j + 1
+    return found[:count]
+
+
+@compiled
 def _fold(row: Array, columns: IntArray, folded: Array) -> None:
     """Adds up the columns (e,) of a Jacobian's row that one coordinate moves (n,)."""
     folded[:] = 0.0

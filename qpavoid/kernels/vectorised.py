@@ -61,6 +61,11 @@ def candidates(poses: Array, local: Array, centers: Array, within: Array, pair_o
     return len(pairs)
 
 
+def in_one_alone(a: IntArray, b: IntArray) -> IntArray:
+    """What is in one of two increasing arrays (m,), (n,) and not in the other, increasing (k,)."""
+    return np.setxor1d(a, b, assume_unique=True)
+
+
 def assemble(x: Any, q: Array, pairs: IntArray, reach: float, moving: bool) -> tuple[int, float]:
     """All rows and bounds of a tick, and the tracking law's velocity.
 
