@@ -78,8 +78,9 @@ class Assembly:
         damping: float,
         dt: float,
         contacts: ContactRows | None = None,
+        looks_ahead: bool = False,
     ) -> None:
-        """Lays the memory out; see `Controller` for the arguments."""
+        """Lays the memory out; see `Controller` for the arguments, and `RowLayout` for `looks_ahead`."""
         frames, self._others = in_order(tasks)
         pairs, nv = len(scene.pairs), scene.robot.model.nv
         self._pairs, self._masks = scene.pairs, support_masks(scene.robot.model)
@@ -116,6 +117,8 @@ class Assembly:
             v0=np.zeros(nv),
             lever=longest_lever(scene.robot.model, query.longest_reach()),
             damping=damping,
+            # with jerk limits, a stop goes another way; with contacts, v0 does
+            looks_ahead=looks_ahead and contacts is None and not np.isfinite(bounds.jerk).any(),
             **row_form(avoidance),
         )
         x = self._layout
@@ -153,14 +156,14 @@ class Assembly:
         if self._contacts is not None:
             held = self._contacts.update(self._forward)
             x.v_last[:] = held.held(x.v_last)
-        k, worst = kernels.assemble(self._packed, q, query.pairs, reach, query.placing.moving)
+        k, worst, clear = kernels.assemble(self._packed, q, query.pairs, reach, query.placing.moving)
         proximity, rows = self._views.get(k) or self._view(k)
         if held is not None:
             x.v0[:] = tracking_within(held, x.A, x.b, x.damping)
             worst = float(kernels.tracking_shortfall(self._packed, k))
         bounds = x.lower, x.upper, *self._hard, x.v_stop
         return proximity, Problem(
-            self._tracking, rows, *bounds, *self._names, x.v0, worst, held, self._levels, x.jerked
+            self._tracking, rows, *bounds, *self._names, x.v0, worst, held, self._levels, x.jerked, clear
         )
 
     def carry(self, query: DistanceQuery) -> None:
@@ -225,7 +228,7 @@ class Assembly:
         x = self._layout
         x.v0[:] = v if problem.contacts is None else problem.contacts.held(v)
         worst = float(kernels.tracking_shortfall(self._packed, len(problem.avoidance.d)))
-        return problem._replace(tracking=Tracking(self._eye, x.v0, 0.0), shortfall=worst, levels=())
+        return problem._replace(tracking=Tracking(self._eye, x.v0, 0.0), shortfall=worst, levels=(), clear=False)
 
     def redirected(self, problem: Problem, frame: int, velocity: Array) -> Problem:
         """The problem of this tick with a velocity (3,) added to the linear one that a task asks for [m/s].
@@ -248,7 +251,7 @@ class Assembly:
         x.b[:] = b
         near = problem.avoidance
         worst = float(kernels.shortfall(v0, near.J, near.b, x.lower, x.upper))
-        return problem._replace(tracking=tracking, v0=v0, shortfall=worst)
+        return problem._replace(tracking=tracking, v0=v0, shortfall=worst, clear=False)
 
     def fastest_frame(self) -> int:
         """The task that asks for the largest linear speed; -1 where no frame has a position to follow."""

@@ -122,7 +122,7 @@ class Controller:
         self._q_last = scene.robot.home.copy()
         self._assembly = Assembly(
             scene, self.tasks, self._bounds, self._kinematics, self._query, self.avoidance,
-            self.limits, tracking_damping, dt, contacts,
+            self.limits, tracking_damping, dt, contacts, self.solver.bounded and self.avoidance.look_ahead,
         )  # fmt: skip
         self._guard = Guard(
             scene, self._bounds, self.limits.position_gain,

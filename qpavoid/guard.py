@@ -143,6 +143,8 @@ class Guard:
             reach: surface distance up to which they were looked for [m].
         """
         v, v_stop, rows = solution.v, problem.v_stop, problem.avoidance
+        if problem.clear and v.tobytes() == problem.v0.tobytes():
+            return None
         near = rows.pair
         stop = assembly.stop(q, v) if self._jerked else None
         horizon = self._dt + 0.5 * self._stopping(v) if stop is None else float(stop.forwards.sum())

@@ -164,6 +164,8 @@ class Problem(NamedTuple):
     """Which rows of `tracking` belong to each priority, the first one first; empty where all have the same."""
     jerked: bool = False
     """Whether `lower` and `upper` keep to jerk limits, beside those of accelerations."""
+    clear: bool = False
+    """Whether v0 is safe and known to lead nowhere near anything, nor a stop from it."""
 
 
 def make_problem(

@@ -306,9 +306,9 @@ def test_a_pair_whose_distance_is_not_a_number_is_near(kernels):
     results[:, 0] = 9.0, np.nan, 0.2
     for fields in (NO_LIMIT, {}):
         x = random_layout(0, pairs=3, results=gaps(results, 17), **fields)
-        k, worst = run(kernels, "assemble", x, np.zeros(8), np.arange(3), 0.5, True)
+        k, worst, clear = run(kernels, "assemble", x, np.zeros(8), np.arange(3), 0.5, True)
         assert x.near[:k].tolist() == [1, 2]
-        assert np.isnan(x.least[:k]).tolist() == [True, False] and np.isnan(worst)
+        assert np.isnan(x.least[:k]).tolist() == [True, False] and np.isnan(worst) and not clear
 
 
 @pytest.mark.parametrize("views", [True, False])
@@ -550,6 +550,20 @@ def test_closest_call_does_not_lose_nan(kernels, near):
         x.d[:] = 0.2
         x.d[i] = np.nan
         assert np.isnan(run(kernels, "closest_call", x, RATES, near, 0.5, 0.1))
+
+
+@pytest.mark.parametrize("fields", [{}, NO_LIMIT])
+def test_the_way_of_the_tracking_velocity_is_clear_if_the_closest_call_until_its_stop_is(kernels, fields):
+    clear = 0
+    for seed in range(40):
+        x = filled(seed, 30, **fields)
+        x.v0[:] = 10.0 ** -(seed % 4) * np.random.default_rng(seed).normal(size=7)
+        x.d[:] = np.random.default_rng(seed).uniform(0.1, 0.5, 30)
+        ticks = 1.0 + 0.5 * np.max(np.abs(x.v0) / x.v_step)
+        expected = run(kernels, "closest_call", x, x.v0, 30, 0.5, x.dt * ticks) > 0.0
+        assert run(kernels, "tracking_clear", x, 30, 0.5) == expected
+        clear += expected
+    assert 0 < clear < 40
 
 
 @pytest.mark.parametrize("pairs", [0, 1, 30])
@@ -926,7 +940,8 @@ def test_a_tick_is_the_sum_of_its_parts(kernels, seed, fields):
         kernels.row_bounds(apart, k, moving)
         worst = kernels.tracking_shortfall(apart, k)
         found = kernels.assemble(packed, q[:7] if "plain" in fields else q, pairs, reach, moving)
-        np.testing.assert_array_equal(found, (k, worst))
+        clear = worst <= 0.0 and kernels.tracking_clear(apart, k, reach)
+        np.testing.assert_array_equal(found, (k, worst, clear))
         assert_same(x, y, k)
 
 
@@ -941,7 +956,7 @@ def test_ticks_of_both_versions(seed, fields):
             x.margin[:-1] *= moving
             return x
 
-        (k, _), x = both(make, "assemble", q[:7] if "plain" in fields else q, pairs, reach, moving)
+        (k, *_), x = both(make, "assemble", q[:7] if "plain" in fields else q, pairs, reach, moving)
         counts.append(k)
         np.testing.assert_allclose(x.A.T @ (x.A @ x.v0 - x.b) + x.damping**2 * x.v0, 0.0, rtol=0, atol=1e-9)
     assert min(counts) == 0 and len(set(counts)) > 2

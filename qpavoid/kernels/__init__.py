@@ -35,6 +35,7 @@ row_bounds = _chosen.row_bounds
 shortfall = _chosen.shortfall
 stop_velocity = _chosen.stop_velocity
 stop_way = _chosen.stop_way
+tracking_clear = _chosen.tracking_clear
 tracking_shortfall = _chosen.tracking_shortfall
 velocity_bounds = _chosen.velocity_bounds
 choose = _voxels.choose
@@ -63,6 +64,7 @@ __all__ = [
     "shortfall",
     "stop_velocity",
     "stop_way",
+    "tracking_clear",
     "tracking_shortfall",
     "velocity_bounds",
     "within_reach",

@@ -502,7 +502,16 @@ def tracking_shortfall(x: Any, k: int) -> float:
 
 
 @compiled
-def assemble(x: Any, q: Array, pairs: IntArray, reach: float, moving: bool) -> tuple[int, float]:
+def tracking_clear(x: Any, k: int, reach: float) -> bool:
+    """See `vectorised.tracking_clear`."""
+    slowing = 0.0
+    for j in range(len(x.v0)):
+        slowing = max(slowing, abs(x.v0[j]) / x.v_step[j])
+    return closest_call(x, x.v0, k, reach, x.dt * (1.0 + 0.5 * slowing)) > 0.0
+
+
+@compiled
+def assemble(x: Any, q: Array, pairs: IntArray, reach: float, moving: bool) -> tuple[int, float, bool]:
     """See `vectorised.assemble`."""
     frame_rows(x)
     velocity_bounds(x, q)
@@ -510,7 +519,8 @@ def assemble(x: Any, q: Array, pairs: IntArray, reach: float, moving: bool) -> t
     damped_solution(x, x.v0)
     k = distance_rows(x, pairs, reach, moving)
     row_bounds(x, k, moving)
-    return k, tracking_shortfall(x, k)
+    worst = tracking_shortfall(x, k)
+    return k, worst, x.looks_ahead and worst <= 0.0 and tracking_clear(x, k, reach)
 
 
 @compiled

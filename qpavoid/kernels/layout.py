@@ -153,3 +153,5 @@ class RowLayout(NamedTuple):
     """Whether any acceleration has a limit."""
     jerked: bool
     """Whether any jerk has one."""
+    looks_ahead: bool
+    """Whether the way of the tracking law's velocity is looked at, where that velocity is safe."""

@@ -66,7 +66,7 @@ def in_one_alone(a: IntArray, b: IntArray) -> IntArray:
     return np.setxor1d(a, b, assume_unique=True)
 
 
-def assemble(x: Any, q: Array, pairs: IntArray, reach: float, moving: bool) -> tuple[int, float]:
+def assemble(x: Any, q: Array, pairs: IntArray, reach: float, moving: bool) -> tuple[int, float, bool]:
     """All rows and bounds of a tick, and the tracking law's velocity.
 
     Args:
@@ -78,7 +78,7 @@ def assemble(x: Any, q: Array, pairs: IntArray, reach: float, moving: bool) -> t
 
     Returns:
         Number k of near pairs; by how much the tracking law's velocity violates the worst of rows and bounds
-        (negative inside, NaN where there is one).
+        (negative inside, NaN where there is one); whether it is safe, looked at, and its way surely clear.
     """
     frame_rows(x)
     velocity_bounds(x, q)
@@ -87,7 +87,8 @@ def assemble(x: Any, q: Array, pairs: IntArray, reach: float, moving: bool) -> t
     k = distance_rows(x, pairs, reach, moving)
     if k:
         row_bounds(x, k, moving)
-    return k, tracking_shortfall(x, k)
+    worst = tracking_shortfall(x, k)
+    return k, worst, x.looks_ahead and worst <= 0.0 and tracking_clear(x, k, reach)
 
 
 def distance_rows(x: Any, pairs: IntArray, reach: float, moving: bool) -> int:
@@ -563,6 +564,12 @@ def tracking_shortfall(x: Any, k: int) -> float:
         np.dot(rows.J, v, out=rows.outside)
         np.subtract(rows.least, rows.outside, out=rows.outside)
     return float(rows.over.max())
+
+
+def tracking_clear(x: Any, k: int, reach: float) -> bool:
+    """Whether `closest_call` leaves something over on the way of v0 and a stop from it; see it for the arguments."""
+    slowing = float((np.abs(x.v0) / x.v_step).max()) if x.accelerated else 0.0  # ticks to a standstill
+    return closest_call(x, x.v0, k, reach, x.dt * (1.0 + 0.5 * slowing)) > 0.0
 
 
 def shortfall(v: Array, J: Array, b: Array, lower: Array, upper: Array) -> float:
