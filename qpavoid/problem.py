@@ -19,6 +19,7 @@ from qpavoid.errors import NumericalError
 
 Array = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.intp]
+Mask = npt.NDArray[np.bool_]
 _ABSURD = 1e150
 """Length that no vector of a robot has."""
 

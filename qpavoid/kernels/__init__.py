@@ -42,6 +42,7 @@ choose = _voxels.choose
 pack_pieces = _motions.pack_pieces
 place_obstacles = _motions.place_obstacles
 sample_pieces = _motions.sample_pieces
+take_in = _motions.take_in
 within_reach = _voxels.within_reach
 
 __all__ = [
@@ -64,6 +65,7 @@ __all__ = [
     "shortfall",
     "stop_velocity",
     "stop_way",
+    "take_in",
     "tracking_clear",
     "tracking_shortfall",
     "velocity_bounds",

@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from qpavoid.problem import Array, IntArray
+from qpavoid.kernels.vectorised import rotation_vector
+from qpavoid.problem import Array, IntArray, Mask
 
 _CYCLE = np.array([1, 2, 0, 2, 0, 1])
 _ANTICYCLE = np.array([2, 0, 1, 1, 2, 0])
@@ -170,3 +171,35 @@ def place_obstacles(
     np.vecdot(center, -center, out=spheres[:, 4])
     x.centers[geometries] = spheres
     return -1, bool(np.count_nonzero(x.twists) or np.count_nonzero(x.margin))
+
+
+def take_in(which: IntArray, posed: Mask, news: Array, age: IntArray, last: Array, states: Array, dt: float) -> Mask:
+    """Takes over the states of obstacles that are given from outside; a bare pose gets the twist that has led to it.
+
+    That is the difference of its last two poses, over the time between them; the first one counts as at rest.
+
+    Args:
+        which: numbers of the obstacles (k,).
+        posed: which of them are given without a twist (k,).
+        news: what is given, read where `which` says (o, 18); the twists of bare poses are overwritten.
+        age: ticks since each was given last, negative if it never was (o,); 0 afterwards.
+        last: what was given last, with its twist (o, 18); overwritten.
+        states: (o, 18) overwritten likewise.
+        dt: length of a tick [s].
+
+    Returns:
+        Which of them are finite (k,); the others are left as they were.
+    """
+    news[which[posed], 12:] = 0.0
+    fine = np.asarray(np.isfinite(news.take(which, axis=0)).all(axis=1))
+    given = which[fine]
+    before = which[fine & posed & (age[which] >= 0)]
+    if len(before):
+        new, old = news[before], last[before]
+        share = 1.0 / (dt * (age[before, None] + 1))
+        turns = np.matmul(new[:, :9].reshape(-1, 3, 3).swapaxes(1, 2), old[:, :9].reshape(-1, 3, 3))
+        news[before, 12:15] = share * (new[:, 9:12] - old[:, 9:12])
+        news[before, 15:] = share * np.array([rotation_vector(turn) for turn in turns.tolist()])
+    last[given] = states[given] = news[given]
+    age[given] = 0
+    return fine

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from qpavoid.kernels.compiled import compiled
+from qpavoid.kernels.compiled import _rotation_vector, compiled
 from qpavoid.kernels.motions import Pieces, Placed
-from qpavoid.problem import Array, IntArray
+from qpavoid.problem import Array, IntArray, Mask
 
 
 def pack_pieces(pieces: Pieces) -> Pieces:
@@ -86,3 +86,33 @@ def place_obstacles(
             if x.twists[i, c] != 0.0:
                 return -1, True
     return -1, False
+
+
+@compiled
+def take_in(which: IntArray, posed: Mask, news: Array, age: IntArray, last: Array, states: Array, dt: float) -> Mask:
+    """See `motions.take_in`."""
+    fine, turn = np.empty(len(which), np.bool_), np.empty((3, 3))
+    for k in range(len(which)):
+        i = which[k]
+        new, old = news[i], last[i]
+        total = 0.0
+        for c in range(12 if posed[k] else 18):
+            total += abs(new[c])
+        fine[k] = total < np.inf  # isfinite does not survive the reordering of sums
+        if not fine[k]:
+            continue
+        if posed[k]:
+            new[12:] = 0.0
+            if age[i] >= 0:
+                share = 1.0 / (dt * (age[i] + 1))
+                for r in range(3):
+                    new[12 + r] = share * (new[9 + r] - old[9 + r])
+                    for c in range(3):
+                        turn[r, c] = new[r] * old[c] + new[3 + r] * old[3 + c] + new[6 + r] * old[6 + c]
+                angles = _rotation_vector(turn)
+                for r in range(3):
+                    new[15 + r] = share * angles[r]
+        old[:] = new
+        states[i] = new
+        age[i] = 0
+    return fine
