@@ -58,7 +58,7 @@ class _StopAhead:
         self._way = np.zeros((_MOST_TICKS, len(layout.v_last)))
 
     def way(self, q: Array, v: Array, w: Array) -> Array:
-        """See `kernels.vectorised.stop_way`; a view of memory that the next call overwrites."""
+        """See `kernels.vectorised.stops.stop_way`; a view of memory that the next call overwrites."""
         self._way[0] = v
         return self._way[: kernels.stop_way(self._packed, q, w, self._way)]
 
@@ -177,7 +177,7 @@ class Assembly:
     def closest_call(self, v: Array, near: int, reach: float, horizon: float, stop: Stop | None = None) -> float:
         """A bound below what is left of the safe distances on the way of v until `horizon` [m].
 
-        See `kernels.vectorised.closest_call`.
+        See `kernels.vectorised.ahead.closest_call`.
 
         Args:
             v: velocity (nv,).

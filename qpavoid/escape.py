@@ -230,7 +230,7 @@ def _farthest(A: Array, d: Array, comfort: float, v: Array, lower: Array, upper:
     low, high = np.append(lower, -_DEEPEST), np.append(upper, comfort)
     x = np.append(v, comfort)
     if kernels.ACCELERATED:
-        from qpavoid.kernels.active_set import minimize
+        from qpavoid.kernels.compiled.active_set import minimize
 
         return x[:n] if minimize(P, x, G, -d, low, high, np.zeros(k)) else None
     answer = solve_daqp(P, -P @ x, G, -d, low, high)

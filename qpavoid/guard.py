@@ -8,7 +8,7 @@ bends less; and that is drawn back towards the stop of this tick, whose way was 
 stop that was found clear is always at hand, as long as obstacles do what they were last seen to do, for one tick.
 
 Most ticks need none of this: where no body moves fast enough to use up what is left of a distance before the robot
-could stop, the velocity is clear as it is (`kernels.vectorised.closest_call`, with the bound and its proof).
+could stop, the velocity is clear as it is (`kernels.vectorised.ahead.closest_call`, with the bound and its proof).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import pinocchio as pin
 
 from qpavoid.assembly import Assembly
 from qpavoid.courses import move_on
-from qpavoid.kernels.vectorised import speed_to_stop
+from qpavoid.kernels.vectorised.bounds import speed_to_stop
 from qpavoid.limits import JointBounds
 from qpavoid.problem import Array, IntArray, Problem, Solution
 from qpavoid.proximity import DistanceQuery

@@ -13,7 +13,7 @@ import pinocchio as pin
 
 from qpavoid import config
 from qpavoid.errors import NumericalError
-from qpavoid.kernels.vectorised import rotation_vector
+from qpavoid.kernels.rotation import rotation_vector
 from qpavoid.kinematics import ForwardKinematics, columns, support_masks
 from qpavoid.problem import Array, IntArray, as_vector
 from qpavoid.sensing import as_goal

@@ -14,7 +14,7 @@ from pydantic import TypeAdapter
 
 from qpavoid import Obstacle, Sample, Status, build_scene, config, courses, kernels
 from qpavoid.errors import NumericalError
-from qpavoid.kernels.motions import Placed
+from qpavoid.kernels.vectorised.motions import Placed
 from qpavoid.motion import END_TOLERANCE, Motion, Orbit, Still, build_motion
 from qpavoid.proximity import DistanceQuery
 
@@ -27,10 +27,10 @@ EARLY = (-1.0, -1e-6, -2.0 * END_TOLERANCE, -0.5 * END_TOLERANCE, 0.0, 0.5 * END
 """Where to look around a corner [s]."""
 
 
-@pytest.fixture(params=["motions", "motions_compiled"])
+@pytest.fixture(params=["vectorised", "compiled"])
 def version(request):
     """Each version of the kernels in turn."""
-    if request.param == "motions_compiled":
+    if request.param == "compiled":
         pytest.importorskip("numba")
     return import_module(f"qpavoid.kernels.{request.param}")
 
@@ -87,10 +87,10 @@ def assert_samples(views, motions, t):
 
 @settings(max_examples=50)
 @given(motions=st.lists(fixed | line | circle | way(), min_size=1, max_size=4), data=st.data())
-@pytest.mark.parametrize("name", ["motions", "motions_compiled"])
+@pytest.mark.parametrize("name", ["vectorised", "compiled"])
 def test_all_at_once_are_where_each_alone_is(name, motions, data):
     """At any time, around corners, and when time goes back."""
-    if name == "motions_compiled":
+    if name == "compiled":
         pytest.importorskip("numba")
     edges = [corner + early for motion in motions for corner in corners(motion) for early in EARLY]
     times = [*data.draw(st.permutations(edges)), *data.draw(st.lists(st.floats(-5.0, 20.0), max_size=10)), 1.7e9]
@@ -234,7 +234,7 @@ def test_what_distances_know_by_definition(version, loads, centred, turning):
 
 def test_both_versions_leave_the_same_memory():
     pytest.importorskip("numba")
-    plain, fast = (import_module(f"qpavoid.kernels.{name}") for name in ("motions", "motions_compiled"))
+    plain, fast = (import_module(f"qpavoid.kernels.{name}") for name in ("vectorised", "compiled"))
     for seed in range(20):
         found = []
         for module in (plain, fast):
@@ -309,7 +309,7 @@ def test_both_versions_take_in_the_same():
     pytest.importorskip("numba")
     for seed in range(20):
         found = []
-        for name in ("motions", "motions_compiled"):
+        for name in ("vectorised", "compiled"):
             args = random_news(np.random.default_rng(seed))
             found.append([import_module(f"qpavoid.kernels.{name}").take_in(*args), *args[3:6]])
         for a, b in zip(*found, strict=True):

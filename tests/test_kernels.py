@@ -174,15 +174,25 @@ def jerk(seed, nv=7, all_of_them=False):
 def test_there_are_two_versions_of_everything():
     import qpavoid.kernels as used
 
-    plain = version("vectorised")
-    functions = {name for name, value in vars(plain).items() if getattr(value, "__module__", "") == plain.__name__}
-    public = {name for name in functions if not name.startswith("_")}
-    elsewhere = {"choose", "within_reach"}  # in modules of their own: test_point_cloud
-    elsewhere |= {"pack_pieces", "place_obstacles", "sample_pieces", "take_in"}  # likewise: test_courses
-    of_one = {"rotation_vector", "speed_to_stop", "change_to_stop"}
-    assert set(used.__all__) - {"ACCELERATED"} - elsewhere == public - of_one
-    for name in set(used.__all__) - {"ACCELERATED"} - elsewhere:
-        assert getattr(used, name) is getattr(version("compiled" if used.ACCELERATED else "vectorised"), name)
+    chosen = version("compiled" if used.ACCELERATED else "vectorised")
+    assert version("vectorised").__all__ == [name for name in used.__all__ if name != "ACCELERATED"]
+    assert version("compiled").__all__ == version("vectorised").__all__
+    assert all(getattr(used, name) is getattr(chosen, name) for name in chosen.__all__)
+
+
+def test_code_older_than_any_source_is_not_run_again(tmp_path):
+    pytest.importorskip("numba")
+    from qpavoid.kernels.compiled.packing import forget_stale_code
+
+    files = {"a.py": 10, "part/b.py": 20, "__pycache__/a.f-1.nbi": 15, "__pycache__/a.f-1.1.nbc": 15,
+             "part/__pycache__/b.g-1.nbi": 25, "part/__pycache__/b.cpython.pyc": 5}  # fmt: skip
+    for name, time in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+        os.utime(tmp_path / name, (time, time))
+    forget_stale_code(tmp_path)
+    left = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.*")}
+    assert left == {"a.py", "part/b.py", "part/__pycache__/b.g-1.nbi", "part/__pycache__/b.cpython.pyc"}
 
 
 # --- candidates --------------------------------------------------------------------------------------------------
@@ -676,7 +686,7 @@ def test_orientations_alone_and_rows_of_other_tasks(seed):
 def test_rotation_vector_at_all_angles(kernels, axis):
     """Angle and axis come back, in tiny turns to the last digit; at half a turn either of the two axes."""
     axis = np.array(axis) / np.linalg.norm(axis)
-    rotation_vector = getattr(kernels, "_rotation_vector", None) or kernels.rotation_vector
+    rotation_vector = getattr(kernels.frames, "_rotation_vector", None) or kernels.frames.rotation_vector
     for angle in (0.0, 1e-15, 1e-12, 1e-9, 1e-5, 0.1, 1.0, np.pi / 2, 2.0, 2.1, 3.0, np.pi - 1e-5, np.pi - 1e-9):
         found = rotation_vector(pin.exp3(angle * axis))
         np.testing.assert_allclose(found, angle * axis, rtol=0, atol=1e-15 + 1e-14 * angle / (np.pi - angle) ** 0.1)

@@ -25,12 +25,12 @@ from qpavoid import (
 )
 from qpavoid.cloud import ball_radius, read_points
 from qpavoid.config import PointCloud
-from qpavoid.kernels import voxels as voxels_module
+from qpavoid.kernels.vectorised import voxels as voxels_module
 from qpavoid.proximity import DistanceQuery
 
 CLOUD = PointCloud()
 BALL = ball_radius(CLOUD.resolution)
-VERSIONS = ["voxels", "voxels_compiled"] if kernels.ACCELERATED else ["voxels"]
+VERSIONS = ["vectorised", "compiled"] if kernels.ACCELERATED else ["vectorised"]
 
 
 def scattered(rng, count=400, spread=0.8):

@@ -1,22 +1,23 @@
-"""The functions of `qpavoid.kernels.motions` as loops that numba compiles; documented there."""
+"""The functions of `qpavoid.kernels.vectorised.motions` as loops that numba compiles; documented there."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from qpavoid.kernels.compiled import _rotation_vector, compiled
-from qpavoid.kernels.motions import Pieces, Placed
+from qpavoid.kernels.compiled.frames import _rotation_vector
+from qpavoid.kernels.compiled.packing import compiled
+from qpavoid.kernels.vectorised.motions import Pieces, Placed
 from qpavoid.problem import Array, IntArray, Mask
 
 
 def pack_pieces(pieces: Pieces) -> Pieces:
-    """See `motions.pack_pieces`."""
+    """See `vectorised.motions.pack_pieces`."""
     return pieces
 
 
 @compiled
 def sample_pieces(x: Pieces, t: float, tolerance: float, states: Array) -> None:
-    """See `motions.sample_pieces`."""
+    """See `vectorised.motions.sample_pieces`."""
     weights = np.empty(7)
     for k in range(len(x.bodies)):
         low, high = x.first[k], x.first[k + 1]
@@ -46,7 +47,7 @@ def sample_pieces(x: Pieces, t: float, tolerance: float, states: Array) -> None:
 def place_obstacles(
     x: Placed, which: IntArray, geometries: IntArray, owners: IntArray, states: Array, margin: Array
 ) -> tuple[int, bool]:
-    """See `motions.place_obstacles`."""
+    """See `vectorised.motions.place_obstacles`."""
     obstacles = len(x.states)
     negative = len(x.twists) - obstacles - 1
     for i in which:
@@ -90,7 +91,7 @@ def place_obstacles(
 
 @compiled
 def take_in(which: IntArray, posed: Mask, news: Array, age: IntArray, last: Array, states: Array, dt: float) -> Mask:
-    """See `motions.take_in`."""
+    """See `vectorised.motions.take_in`."""
     fine, turn = np.empty(len(which), np.bool_), np.empty((3, 3))
     for k in range(len(which)):
         i = which[k]

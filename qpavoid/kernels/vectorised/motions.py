@@ -1,6 +1,6 @@
 """Array work of moving obstacles in numpy: where all of them are at a time, and what distances need to know of it.
 
-`qpavoid.kernels.motions_compiled` has the same functions as loops for numba; both pass the same tests.
+`qpavoid.kernels.compiled.motions` has the same functions as loops for numba; both pass the same tests.
 
 A *state* is a row of 18: rotation by columns, position, linear and angular velocity, in world axes [-, m, m/s, rad/s].
 """
@@ -12,11 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from qpavoid.kernels.vectorised import rotation_vector
+from qpavoid.kernels.rotation import ANTICYCLE, CYCLE, rotation_vector
 from qpavoid.problem import Array, IntArray, Mask
-
-_CYCLE = np.array([1, 2, 0, 2, 0, 1])
-_ANTICYCLE = np.array([2, 0, 1, 1, 2, 0])
 
 
 class Pieces(NamedTuple):
@@ -150,8 +147,8 @@ def place_obstacles(
     twists, speed = new[:, 12:], np.sqrt(np.vecdot(linear, linear))
     if np.count_nonzero(angular):
         twists = twists.copy()
-        products = angular.take(_CYCLE, axis=1)
-        products *= new[:, 9:12].take(_ANTICYCLE, axis=1)  # ω × p
+        products = angular.take(CYCLE, axis=1)
+        products *= new[:, 9:12].take(ANTICYCLE, axis=1)  # ω × p
         twists[:, :3] -= products[:, :3]
         twists[:, :3] += products[:, 3:]
         speed += np.sqrt(np.vecdot(angular, angular)) * x.reach.take(which)
