@@ -104,11 +104,11 @@ class Guard:
         self._acceleration, self._accelerated = bounds.acceleration, bool(np.isfinite(bounds.acceleration).any())
         self._jerked = bool(np.isfinite(bounds.jerk).any())
         self._given = np.zeros(len(scene.pairs))
-        self._news = np.zeros(len(scene.obstacles), dtype=bool)
+        self._news, self._heard = np.zeros(len(scene.obstacles), dtype=bool), False
 
     def see(self, which: IntArray) -> None:
         """There is news of some obstacles (k,): they are not where they were last placed ahead."""
-        self._news[which] = True
+        self._news[which] = self._heard = True
 
     @property
     def ahead(self) -> DistanceQuery:
@@ -150,13 +150,13 @@ class Guard:
         horizon = self._dt + 0.5 * self._stopping(v) if stop is None else float(stop.forwards.sum())
         if assembly.closest_call(v, len(near), reach, horizon, stop) > 0.0:
             return None
-        self._given[:] = 0.0
+        self._given.fill(0.0)
         if solution.slack is not None:
             self._given[near] = 1.1 * horizon * solution.slack
             self._given[:] = self._ahead.widest(self._given)
         self._place_obstacles(query)
-        speed = float(np.max(query.placing.speeds))
-        gap = float(np.min(query.found(query.pairs), initial=reach)) - self._hold
+        speed = float(query.placing.speeds.max())
+        gap = (float(query.found(query.pairs).min()) if len(near) else reach) - self._hold
         look = partial(self._worst_of_stop, assembly) if self._jerked else self._worst
         worst, pair = look(q, v, query, gap, speed)
         if worst >= 0.0:
@@ -176,12 +176,13 @@ class Guard:
 
     def _place_obstacles(self, now: DistanceQuery) -> None:
         """Puts the obstacles where they will be at the end of the tick."""
-        which = np.flatnonzero(self._news)
-        if len(which):
+        if self._heard:
+            which = np.flatnonzero(self._news)
             states = now.placing.states.copy()
             move_on(states, self._dt)
             self._ahead.placing.place(which, states, now.placing.margin)
-            self._news[which] = states[which, 12:].any(axis=1)
+            self._news[which] = states[which, 12:].any(axis=1)  # those that move will be elsewhere at the next tick
+            self._heard = bool(self._news.any())
         self._ahead.placing.margin[:] = now.placing.margin
 
     def _worst(self, q: Array, v: Array, now: DistanceQuery, gap: float, speed: float) -> tuple[float, int]:

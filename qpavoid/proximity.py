@@ -189,7 +189,7 @@ class DistanceQuery:
         Of a point cloud, that of its nearest voxel to each body: which voxel it is changes, and is not what counts.
         """
         distance = self.results[pairs, 0]
-        if self._cull is not None:
+        if self._cull is not None and pairs is not self.pairs:
             distance = np.where(self._cull.active[pairs], distance, np.inf)
         if self._slots:
             least = np.full(len(self._scene.pairs), np.inf)
