@@ -107,6 +107,17 @@ def test_bodies_that_stay_far_are_grey_and_share_one_entry(panda):
     assert len(ax.get_lines()) == len(panda.meta["bodies"]) + 3  # the far ones are still drawn
 
 
+def test_a_legend_of_many_bodies_stays_within_its_panel(panda):
+    bodies = [f"body{i}" for i in range(40)]
+    distance = np.tile(0.05 + 0.001 * np.arange(40)[::-1], (len(panda.t), 1))
+    figure = distances_figure(replace(panda, body_distance=distance, meta={**panda.meta, "bodies": bodies}))
+    figure.canvas.draw()
+    legend = figure.axes[0].get_legend()
+    named = [text.get_text() for text in legend.get_texts()]
+    assert named[:14] == bodies[26:] and named[14] == "26 bodies farther away"
+    assert legend.get_window_extent().y0 > figure.axes[0].get_window_extent().y0
+
+
 def test_gains_are_drawn_and_alpha_is_cut_off_where_it_is_infinite(sphere):
     alpha = sphere[0].alpha.copy()
     alpha[3] = np.inf
@@ -168,6 +179,16 @@ def test_velocity_limits_are_drawn_where_they_are_near(panda):
     assert_allclose(lines(ax)["panda_joint7"].get_ydata(), v[:, 6])
     assert {limits[6], -limits[6]} <= {line.get_ydata()[0] for line in ax.get_lines()}
     assert ax.get_ylim()[0] <= -limits[6] and limits[6] <= ax.get_ylim()[1]
+
+
+def test_a_velocity_limit_names_its_joint(panda):
+    limits, v = panda.meta["velocity_limit"], np.zeros_like(panda.v)
+    v[:, 6] = limits[6]
+    shown = [text.get_text() for text in speeds_figure(replace(panda, v=v)).axes[0].get_legend().get_texts()]
+    assert f"limit ±{limits[6]:g} of panda_joint7" in shown
+    v[:, 4:] = limits[6]
+    shown = [text.get_text() for text in speeds_figure(replace(panda, v=v)).axes[0].get_legend().get_texts()]
+    assert limits[4] == limits[6] and f"limit ±{limits[6]:g} of 3 joints near it" in shown
 
 
 def test_ticks_that_are_not_solved_are_shaded(panda):
@@ -283,9 +304,21 @@ def test_known_solvers_differ_in_colour_and_dash():
     assert len({str(dash) for _, dash in SOLVER_STYLES.values()}) == len(SOLVER_STYLES)
 
 
-def test_two_runs_of_one_solver_can_be_told_apart(sphere):
-    first, second = solver_styles([sphere[2], sphere[2]])
-    assert first["label"] != second["label"] and first["color"] != second["color"]
+def test_runs_that_are_alike_can_be_told_apart(sphere):
+    """Of two runs with one course, neither line is hidden: they differ in colour and dash, and dashes lie on top."""
+    tracking, eq10, qp, proxqp = sphere
+    for logs in ([qp, qp], [proxqp, qp], [qp, proxqp, proxqp, tracking, eq10, proxqp, qp]):
+        styles = solver_styles(logs)
+        assert len({style["label"] for style in styles}) == len(logs)
+        assert len({style["color"] for style in styles}) == len(logs)
+        assert len({str(style["linestyle"]) for style in styles}) == len(logs)
+        solid = [style["zorder"] for style in styles if style["linestyle"] == "-"]
+        assert solid and all(style["zorder"] > max(solid) for style in styles if style["linestyle"] != "-")
+
+
+def test_many_runs_all_look_different(sphere):
+    styles = solver_styles([log for log in sphere for _ in range(10)])
+    assert len({(style["color"], str(style["linestyle"])) for style in styles}) == 40
 
 
 def test_compared_curves_are_those_of_the_logs(sphere):
