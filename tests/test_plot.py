@@ -1,9 +1,11 @@
 """Figures carry the data of the log, and every kind of log can be drawn."""
 
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 from numpy.testing import assert_allclose
 
@@ -111,10 +113,11 @@ def test_a_legend_of_many_bodies_stays_within_its_panel(panda):
     bodies = [f"body{i}" for i in range(40)]
     distance = np.tile(0.05 + 0.001 * np.arange(40)[::-1], (len(panda.t), 1))
     figure = distances_figure(replace(panda, body_distance=distance, meta={**panda.meta, "bodies": bodies}))
-    figure.canvas.draw()
+    FigureCanvasAgg(figure).draw()
     legend = figure.axes[0].get_legend()
     named = [text.get_text() for text in legend.get_texts()]
-    assert named[:14] == bodies[26:] and named[14] == "26 bodies farther away"
+    assert named[:14] == bodies[26:]
+    assert named[14] == "26 bodies farther away"
     assert legend.get_window_extent().y0 > figure.axes[0].get_window_extent().y0
 
 
@@ -283,6 +286,30 @@ def test_view_does_not_put_an_obstacle_before_the_path(sphere):
         seen_from_here = ball - np.outer(ball @ towards, towards)
         assert np.all((np.linalg.norm(seen_from_here, axis=1) > 0.25) | (ball @ towards < 0.0))
         assert abs(towards @ along) < 0.8  # nor is the path foreshortened to a point
+
+
+def test_view_is_not_from_behind_a_wall(sphere):
+    """A board before the robot hides all of it, though its middle is nowhere near what is behind it."""
+    log = sphere[2]
+    board = {"name": "board", "shape": {"type": "box", "size": [0.02, 3.0, 3.0]}}
+    for side in (-1.0, 1.0):
+        place = np.broadcast_to([0.8 * side, 1.2, 0.5], log.obstacle_position.shape)
+        views = view_angles(replace(log, obstacle_position=place, meta={**log.meta, "obstacles": [board]}))
+        assert np.cos(np.radians(views[1])) * side < 0.0
+
+
+def test_numbers_and_names_of_axes_do_not_overlap(sphere, arms):
+    size = np.array([0.2, 1.0, 1.0])  # of a body that is thin across, as a humanoid is
+    thin = replace(arms, **{name: getattr(arms, name) * size for name in ("body_ends", "target", "tool")})
+    for log in (sphere[0], arms, thin):
+        figure = motion_figure(log)
+        FigureCanvasAgg(figure).draw()
+        ax = figure.axes[0]
+        numbers = [tick.label1 for axis in (ax.xaxis, ax.yaxis, ax.zaxis) for tick in axis.get_major_ticks()]
+        names = [axis.label for axis in (ax.xaxis, ax.yaxis, ax.zaxis)]
+        boxes = [text.get_window_extent() for text in (*numbers, *names) if text.get_text()]
+        assert len(boxes) > 5
+        assert not any(a.padded(-2).overlaps(b.padded(-2)) for a, b in combinations(boxes, 2))
 
 
 # --- several solvers ----------------------------------------------------------------------------------------
