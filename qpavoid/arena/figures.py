@@ -117,7 +117,8 @@ def _label(ax: Any, names: tuple[str, ...], xs: Array, ys: Array) -> None:
         heights[i] = min(heights[i], heights[i + 1] - gap)
     for i, height in zip(order.tolist(), heights.tolist(), strict=True):
         colour = COLOURS[i % len(COLOURS)]
-        line = {"arrowstyle": "-", "color": colour, "linewidth": 0.5, "linestyle": ":"}
+        # to the middle of the name's left edge: to its centre, a steep line would cross it out
+        line = {"arrowstyle": "-", "color": colour, "linewidth": 0.5, "linestyle": ":", "relpos": (0.0, 0.5)}
         place = {
             "xytext": (1.03, height),
             "textcoords": "axes fraction",
