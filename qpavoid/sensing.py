@@ -293,7 +293,8 @@ def as_sample(name: str, what: Any) -> Any:
         except AttributeError:
             pass
     if not isinstance(what, (Sample, Pose)):
-        raise NumericalError(f"{name}: neither a Sample nor a Pose: {what!r:.60}")
+        remedy = "give Sample.at(position, rotation, linear, angular), all but the first optional"
+        raise NumericalError(f"{name}: neither a Sample nor a Pose: {' '.join(repr(what).split()):.60}; {remedy}")
     parts = [
         as_vector(f"{name}: {field}", part, _SHAPES[field]) for field, part in zip(what._fields, what, strict=True)
     ]
