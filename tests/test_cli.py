@@ -247,7 +247,7 @@ def test_start_outside_the_limits_is_a_warning(cli, scene):
     Path("arm.yaml").write_text(yaml.safe_dump(robot), encoding="utf-8")
     result = cli("run", scene(robot="arm.yaml"), "--no-figures", "--json")
     assert result.status == 0
-    assert result.lines == ["warning: scene.yaml: q0: left_joint1 = -1.18 lies outside its limits [-1, 1]"]
+    assert result.lines == ["warning: scene.yaml: q0: left_joint1 = -1.18 lies outside its limits [-1, 1] [rad or m]"]
 
 
 # Usage
