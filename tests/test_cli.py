@@ -49,6 +49,8 @@ def test_list_names_everything_that_ships(cli):
     assert result.status == 0
     words = result.stdout.split()
     assert {*robot_names(), *scenario_names(), *SOLVERS, "qp:daqp"} <= set(words)
+    assert SITUATION["title"] in next(line for line in result.stdout.splitlines() if "situation1" in line)
+    assert all(len(line) <= 80 for line in result.stdout.splitlines())
 
 
 def test_list_of_one_kind_is_a_name_a_line(cli):
