@@ -233,5 +233,6 @@ def _shade_status(ax: Any, log: Log) -> list[Any]:
         for start, end in zip(starts, ends, strict=True):
             ax.axvspan(log.t[start], log.t[end - 1] + dt, color=colour, alpha=0.35, linewidth=0, zorder=0)
         if len(starts):
-            handles.append(Patch(color=colour, alpha=0.35, label=f"{status.value}: {int(bad.sum())} ticks"))
+            count = int(bad.sum())
+            handles.append(Patch(color=colour, alpha=0.35, label=f"{status.value}: {count} tick{'s' * (count > 1)}"))
     return handles

@@ -202,6 +202,9 @@ def test_ticks_that_are_not_solved_are_shaded(panda):
     assert_allclose(spans, [(0.04, 0.07), (0.20, 0.21)])
     assert "RELAXED: 4 ticks" in [text.get_text() for text in ax.get_legend().get_texts()]
     assert not speeds_figure(panda).axes[0].patches
+    status[[4, 5, 6]] = panda.status[0]
+    ax = speeds_figure(replace(panda, status=status)).axes[0]
+    assert "RELAXED: 1 tick" in [text.get_text() for text in ax.get_legend().get_texts()]
 
 
 # --- motion -------------------------------------------------------------------------------------------------

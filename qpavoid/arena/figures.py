@@ -33,7 +33,8 @@ def success_against_time(results: Results) -> Figure:
     figure = _scatter(results, x, y, "median tick [µs], with quartiles over runs", "runs that succeed [%]")
     axis = figure.axes[0]
     axis.set_xscale("log")
-    axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    low, high = axis.get_xlim()
+    axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high > 8.0 * low else np.arange(1.0, 10.0)))
     axis.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axis.xaxis.set_minor_formatter("")
     return figure
