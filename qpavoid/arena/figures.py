@@ -34,7 +34,7 @@ def success_against_time(results: Results) -> Figure:
     axis = figure.axes[0]
     axis.set_xscale("log")
     low, high = axis.get_xlim()
-    axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high > 8.0 * low else np.arange(1.0, 10.0)))
+    axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high > 8.0 * low else range(1, 10)))
     axis.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axis.xaxis.set_minor_formatter("")
     return figure
