@@ -1,4 +1,4 @@
-"""A law of your own in the arena: this file is all that it takes.
+"""A law of your own in the arena: this file is all that it takes. Needs `pip install 'qpavoid[arena]'`.
 
 `qpavoid bench run smoke --entrant examples/08_an_entrant_of_your_own.py:RowByRow` runs it beside the laws that ship.
 """

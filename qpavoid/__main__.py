@@ -10,6 +10,7 @@ import warnings
 from enum import Enum
 from functools import partial
 from pathlib import Path
+from textwrap import wrap
 from typing import Annotated, Any
 
 import typer
@@ -56,7 +57,7 @@ class Kind(str, Enum):
 
 @app.command("list")
 def list_(kind: Annotated[Kind | None, typer.Argument(help="Only these.")] = None) -> None:
-    """List what ships: robots, scenarios, solvers."""
+    """List what ships: robots, scenarios with their titles, solvers."""
     names = {
         Kind.robots: robot_names(),
         Kind.scenarios: scenario_names(),
@@ -66,8 +67,11 @@ def list_(kind: Annotated[Kind | None, typer.Argument(help="Only these.")] = Non
         for name in names[kind]:
             print(name)
         return
+    titles = [f"{name:16} {load_scenario(name).title}" for name in names[Kind.scenarios]]
     for heading, entries in names.items():
-        OUT.print(f"[bold]{heading.value}[/]  {'  '.join(entries)}", highlight=False)
+        OUT.print(f"[bold]{heading.value}[/]")
+        for line in titles if heading is Kind.scenarios else wrap("  ".join(entries), 76):
+            OUT.print(f"  {line}", highlight=False, soft_wrap=True, markup=False)
 
 
 @app.command()

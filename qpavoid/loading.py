@@ -310,7 +310,18 @@ def _fault(fault: ErrorDetails, model: type[BaseModel]) -> str:
         return f"unknown {key} {context['tag']!r}{nearest(str(context['tag']), tags)}"
     if kind == "value_error":
         return fault["msg"].removeprefix("Value error, ")
-    return f"{fault['msg']}, got {fault['input']!r:.60}"
+    remedy = _REMEDIES.get(kind)
+    return f"{fault['msg']}, got {fault['input']!r:.60}" + (f": {remedy}" if remedy else "")
+
+
+_NUMBER = "give a number alone, in m, rad, kg and s"
+_REMEDIES = {
+    "float_parsing": _NUMBER,
+    "float_type": _NUMBER,
+    "dict_type": "give a mapping by name, as in {joint1: 10.0}",
+    "list_type": "give a list, as in [a, b]",
+}
+"""What to do about faults of which pydantic says in Python's words what they are."""
 
 
 def _blocks_at(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[type[BaseModel]]:

@@ -37,6 +37,8 @@ ALPHA_SHOWN = 100.0
 """α is drawn up to here: it grows without bound as the distance goes to 0."""
 _STATUS_COLOUR = {Status.RELAXED: "#F5C242", Status.STOPPED: "#C62F2F"}
 _GREY = "#B8B8B8"
+_NAMED = 2 * len(COLOURS)
+"""Lines of a panel that have a colour and a name; the legend of more would run out of the panel."""
 
 
 def plot_run(log: Log, folder: str | Path) -> list[Path]:
@@ -151,6 +153,9 @@ def distances_figure(log: Log) -> Figure:
     drawn = np.flatnonzero(np.isfinite(distance).any(axis=0))
     nearest = np.min(distance, axis=0, initial=np.inf)
     near = drawn if len(drawn) <= len(COLOURS) else drawn[nearest[drawn] < reach]
+    rest = f"never within {reach:g} m"
+    if len(near) > _NAMED:
+        near, rest = np.sort(near[np.argsort(nearest[near], kind="stable")[:_NAMED]]), "farther away"
     far = [i for i in drawn if i not in near]
     for i in far:
         ax.plot(log.t, distance[:, i], color=_GREY, linewidth=0.7, zorder=1)
@@ -159,7 +164,7 @@ def distances_figure(log: Log) -> Figure:
         ax.plot(log.t, distance[:, i], label=log.meta["bodies"][i], linewidth=width, zorder=3, **_style(rank))
     handles = ax.get_legend_handles_labels()[0]
     if far:
-        handles.append(Line2D([], [], color=_GREY, linewidth=0.7, label=f"{len(far)} bodies never within {reach:g} m"))
+        handles.append(Line2D([], [], color=_GREY, linewidth=0.7, label=f"{len(far)} bodies {rest}"))
     handles += draw_levels(ax, log, qp=is_qp(log))
     handles += _shade_status(ax, log)
     _plot_gains(gains, log)
@@ -188,7 +193,7 @@ def speeds_figure(log: Log) -> Figure:
     """Joint velocities over time; limits of the joints that use more than 80 % of theirs; ticks not SOLVED shaded."""
     names, limits = log.meta["coordinates"], log.meta["velocity_limit"]
     peak = np.max(np.abs(log.v), axis=0, initial=0.0)
-    fastest = np.sort(np.argsort(-peak)[: 2 * len(COLOURS)])
+    fastest = np.sort(np.argsort(-peak)[:_NAMED])
     figure = Figure(figsize=(9.5, 4.5), layout="constrained")
     ax = figure.add_subplot()
     rest = [i for i in range(len(names)) if i not in fastest]
@@ -199,10 +204,13 @@ def speeds_figure(log: Log) -> Figure:
     handles = ax.get_legend_handles_labels()[0]
     if rest:
         handles.append(Line2D([], [], color=_GREY, linewidth=0.7, label=f"{len(rest)} slower joints"))
-    for limit in {limits[i] for i in fastest if limits[i] is not None and peak[i] > 0.8 * limits[i]}:
+    at_limit = [i for i in fastest if limits[i] is not None and peak[i] > 0.8 * limits[i]]
+    for limit in sorted({limits[i] for i in at_limit}):
         style = {"color": COLLISION, "linewidth": 1.0, "linestyle": DASHES[3]}
         ax.axhline(-limit, **style)
-        handles.append(ax.axhline(limit, label=f"velocity limit ±{limit:g}", **style))
+        whose = [names[i] for i in at_limit if limits[i] == limit]
+        of = whose[0] if len(whose) == 1 else f"{len(whose)} joints near it"
+        handles.append(ax.axhline(limit, label=f"limit ±{limit:g} of {of}", **style))
     handles += _shade_status(ax, log)
     ax.set_xlabel("time [s]")
     ax.set_ylabel(f"joint velocity [{units(log, '/s')}]")
@@ -225,5 +233,6 @@ def _shade_status(ax: Any, log: Log) -> list[Any]:
         for start, end in zip(starts, ends, strict=True):
             ax.axvspan(log.t[start], log.t[end - 1] + dt, color=colour, alpha=0.35, linewidth=0, zorder=0)
         if len(starts):
-            handles.append(Patch(color=colour, alpha=0.35, label=f"{status.value}: {int(bad.sum())} ticks"))
+            count = int(bad.sum())
+            handles.append(Patch(color=colour, alpha=0.35, label=f"{status.value}: {count} tick{'s' * (count > 1)}"))
     return handles

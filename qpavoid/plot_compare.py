@@ -31,18 +31,26 @@ PLANNED = "#B9A6D3"
 
 
 def solver_styles(logs: Sequence[Log]) -> list[dict[str, Any]]:
-    """Label, colour and line style of each run, the same in every panel and, for known solvers, in every figure."""
+    """Label, colour and line style of each run, the same in every panel and, for known solvers, in every figure.
+
+    No two of up to seven runs share a colour or a dash, and dashed lines lie over solid ones: runs that are alike, as
+    of one law with two back ends, show both their lines.
+    """
     solvers = [log.meta["solver"] for log in logs]
-    known = [SOLVER_STYLES[solver] for solver in solvers if solver in SOLVER_STYLES]
-    spare = [(colour, dash) for dash in DASHES for colour in COLOURS if (colour, dash) not in known]
-    spare.sort(key=lambda style: style[0] in [colour for colour, _ in known])  # colours of their own first
+    used = [SOLVER_STYLES[solver] for solver in dict.fromkeys(solvers) if solver in SOLVER_STYLES]
+    spare = [(colour, dash) for dash in DASHES[::-1] for colour in COLOURS[::-1]]  # wide gaps first
     taken: list[str] = []
     styles = []
     for solver in solvers:
-        colour, dash = SOLVER_STYLES[solver] if solver in SOLVER_STYLES and solver not in taken else spare.pop(0)
+        if solver in SOLVER_STYLES and solver not in taken:
+            colour, dash = SOLVER_STYLES[solver]
+        else:
+            colours, dashes = [c for c, _ in used], [d for _, d in used]
+            colour, dash = min(spare, key=lambda s: (s in used, colours.count(s[0]), dashes.count(s[1])))
+            used.append((colour, dash))
         label = f"{solver} ({taken.count(solver) + 1})" if solver in taken else solver
         taken.append(solver)
-        styles.append({"label": label, "color": colour, "linestyle": dash})
+        styles.append({"label": label, "color": colour, "linestyle": dash, "zorder": 3.0 if dash == "-" else 3.5})
     return styles
 
 
@@ -116,7 +124,7 @@ def path_figure(logs: Sequence[Log], styles: Sequence[dict[str, Any]]) -> Figure
             ax.plot(path[:, across], path[:, up], color=PLANNED, linewidth=4.0, zorder=2, label="planned path")
             ax.plot(path[-1:, across], path[-1:, up], "k*", markersize=9, zorder=4, label="goal")
             for log, style in zip(logs, styles, strict=True):
-                ax.plot(log.tool[:, k, across], log.tool[:, k, up], linewidth=1.7, zorder=3, **style)
+                ax.plot(log.tool[:, k, across], log.tool[:, k, up], linewidth=1.7, **style)
         add_grid(ax)
         ax.set_ylabel(f"{'xyz'[up]} [m]")
         if up == views[0]:

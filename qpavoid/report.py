@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 _COLUMNS = (
-    "min dist\n[mm]", "in coll\n[s]", "end err\n[mm]", "dev\n[mm]", "peak q̇\n[rad/s]", "Σ|Δq̇|\n[rad/s]", "tick\n[µs]"
+    "min\ndist\n[mm]", "in\ncoll\n[s]", "end\nerr\n[mm]", "dev\n[mm]", "peak q̇\n[rad/s]", "Σ|Δq̇|\n[rad/s]", "tick\n[µs]"
 )  # fmt: skip
 
 
@@ -28,12 +28,12 @@ def metrics_table(runs: Sequence[dict[str, Any]]) -> Table:
         title_style="",
         box=box.SIMPLE_HEAD,
         pad_edge=False,
-        collapse_padding=True,
+        padding=0,  # columns are a blank apart, which leaves the outcome its room
     )
     table.add_column("solver", no_wrap=True)
     for heading in _COLUMNS:
         table.add_column(escape(heading), justify="right", no_wrap=True)
-    table.add_column("outcome", min_width=14)
+    table.add_column("outcome")
     for run in runs:
         table.add_row(
             run["solver"],

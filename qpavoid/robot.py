@@ -237,7 +237,7 @@ _MOST_BODIES = 300
 
 
 def _build(config: RobotConfig, path: Path) -> Robot:
-    urdf = find_resource(config.urdf, path, "urdf")
+    urdf = find_resource(config.urdf, path.parent, f"{path}: urdf")
     model = read_model(urdf, config.root_joint)
     package_dirs = [str(path.parent / folder) for folder in config.package_dirs]
     if isinstance(config.bodies, str):
@@ -269,7 +269,7 @@ def _build(config: RobotConfig, path: Path) -> Robot:
         )
     add_self_pairs(model, bodies, config.disabled_pairs, str(path))
     if config.srdf is not None:
-        honour_srdf(model, bodies, find_resource(config.srdf, path, "srdf"))
+        honour_srdf(model, bodies, find_resource(config.srdf, path.parent, f"{path}: srdf"))
     always_touching = drop_always_touching(model, bodies, joint_bounds(model))
     for name in config.end_effectors:
         if not model.existFrame(name):

@@ -123,7 +123,8 @@ def build_scene(robot: Robot, obstacles: Sequence[Obstacle] = ()) -> Scene:
             raise ConfigError(f"obstacles: {obstacle.name!r} is the name of a body of {robot.name}: rename it")
         start, shape = obstacle.motion.sample(0.0), obstacle.shape
         placement = pin.SE3(start.rotation, start.position)
-        solids = make_solids(shape, obstacle.source)
+        where, folder = f"obstacles: {obstacle.name!r}: shape", obstacle.source.parent
+        solids = make_solids(shape, folder, where)
         if obstacle.graspable and (len(solids) > 1 or isinstance(shape, config.HalfSpace | config.PointCloud)):
             raise ConfigError(
                 f"obstacles: {obstacle.name!r}: a {shape.type} cannot be carried; give a primitive, or a mesh with "
@@ -131,7 +132,7 @@ def build_scene(robot: Robot, obstacles: Sequence[Obstacle] = ()) -> Scene:
             )
         first = len(names)
         if isinstance(shape, config.PointCloud):
-            clouds[number] = _points(shape, obstacle.source)
+            clouds[number] = _points(shape, folder, where)
             solids, placement = solids * (movable * shape.nearest), pin.SE3(np.eye(3), np.array([FAR, 0.0, 0.0]))
         for solid in solids:
             piece = f"{obstacle.name}[{len(names) - first}]" if len(solids) > 1 else obstacle.name
@@ -178,14 +179,14 @@ def _without_cylinders_among_spheres(geometry: Any) -> None:
                 body.geometry = coal.Capsule(body.geometry.radius, 0.0)
 
 
-def _points(shape: config.PointCloud, source: Path) -> Voxels:
+def _points(shape: config.PointCloud, folder: Path, where: str) -> Voxels:
     if shape.path is None:
         return Voxels.of(np.zeros((0, 3)), shape.resolution)
-    where = f"{source}: shape.path"
-    voxels = Voxels.of(read_points(source.parent / shape.path, where), shape.resolution)
+    voxels = Voxels.of(read_points(folder / shape.path, f"{where}.path"), shape.resolution)
     if voxels.dropped:
         raise ConfigError(
-            f"{where}: {voxels.dropped} of {voxels.given} points are NaN, infinite or over 100 m away; leave them out"
+            f"{where}.path: {voxels.dropped} of {voxels.given} points are NaN, infinite or over 100 m away; leave them "
+            "out"
         )
     return voxels
 

@@ -275,7 +275,8 @@ def as_sample(what: Any) -> Any:
         except AttributeError:
             pass
     if not isinstance(what, (Sample, Pose)):
-        raise NumericalError(f"neither a Sample nor a Pose: {what!r:.60}")
+        remedy = "give Sample.at(position, rotation, linear, angular), all but the first optional"
+        raise NumericalError(f"neither a Sample nor a Pose: {' '.join(repr(what).split()):.60}; {remedy}")
     return type(what)(*[as_vector(name, part, _SHAPES[name]) for name, part in zip(what._fields, what, strict=True)])
 
 

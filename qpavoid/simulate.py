@@ -84,7 +84,8 @@ def _check_start(controller: Controller, q: Array, scenario: ScenarioConfig) -> 
     for i in np.flatnonzero((here < bounds.lower) | (here > bounds.upper)):
         joint = robot.coordinate_names[bounds.v_index[i]]
         warnings.warn(
-            f"{source}: q0: {joint} = {here[i]:g} lies outside its limits [{bounds.lower[i]:g}, {bounds.upper[i]:g}]",
+            f"{source}: q0: {joint} = {here[i]:g} lies outside its limits [{bounds.lower[i]:g}, {bounds.upper[i]:g}] "
+            "[rad or m]",
             StartWarning,
             stacklevel=3,
         )

@@ -27,12 +27,13 @@ _THINNEST = 1e-4
 """Thickness that is given to what is flat [m]: a hull needs an inside."""
 
 
-def make_solids(shape: ObstacleShape, source: Path) -> list[Any]:
+def make_solids(shape: ObstacleShape, folder: Path, where: str) -> list[Any]:
     """coal geometries, all in the obstacle's own frame.
 
     Args:
         shape: of a point cloud, the ball that stands for one of its voxels.
-        source: file to name in errors, from whose folder relative paths start.
+        folder: where relative paths start.
+        where: the obstacle's `shape`, to name in errors.
 
     Raises:
         ConfigError: a mesh that cannot be found, read or used.
@@ -43,11 +44,11 @@ def make_solids(shape: ObstacleShape, source: Path) -> list[Any]:
         return [coal.Sphere(ball_radius(shape.resolution))]
     if not isinstance(shape, Mesh):
         return [make_shape(shape)]
-    mesh = read_mesh(shape, source)
+    mesh = read_mesh(shape, folder, f"{where}.path")
     vertices, triangles = corners(mesh)
     if shape.method == "surface":
         warnings.warn(
-            f"{source}: shape.method: surface: {len(triangles)} triangles cost 100 to 500 µs a pair at every tick, "
+            f"{where}.method: surface: {len(triangles)} triangles cost 100 to 500 µs a pair at every tick, "
             "some pairs several ms; set `method` to decomposed or convex",
             MeshWarning,
             stacklevel=5,
@@ -57,20 +58,19 @@ def make_solids(shape: ObstacleShape, source: Path) -> list[Any]:
         return [hull_of(vertices)]
     if len(triangles) > _MOST_TRIANGLES:
         raise ConfigError(
-            f"{source}: shape.path: {len(triangles)} triangles; at most {_MOST_TRIANGLES} are decomposed: make it "
+            f"{where}.path: {len(triangles)} triangles; at most {_MOST_TRIANGLES} are decomposed: make it "
             "coarser, or set `method: convex`"
         )
     return [hull_of(piece) for piece in decompose(vertices, triangles, shape.max_pieces, shape.tolerance)]
 
 
-def read_mesh(shape: Mesh, source: Path) -> Any:
+def read_mesh(shape: Mesh, folder: Path, where: str) -> Any:
     """The triangle mesh of a file, as coal has it.
 
     Raises:
         ConfigError: no such file, too large, not a mesh, or corners that are no numbers.
     """
-    where = f"{source}: shape.path"
-    path = find_resource(shape.path, source, "shape.path")
+    path = find_resource(shape.path, folder, where)
     if path.stat().st_size > _LARGEST:
         raise ConfigError(f"{where}: {path.stat().st_size} bytes; at most {_LARGEST} are read, make it coarser")
     try:

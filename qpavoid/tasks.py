@@ -14,7 +14,7 @@ from qpavoid import config
 from qpavoid.errors import ConfigError, located
 from qpavoid.kinematics import support_masks
 from qpavoid.motion import Motion, Sample, build_motion
-from qpavoid.problem import Array, IntArray
+from qpavoid.problem import Array, IntArray, require_finite
 from qpavoid.robot import Robot
 from qpavoid.row_tasks import Axis, Com, Constant, Damping, Manipulability, Posture, Relative, RowTask
 from qpavoid.sensing import as_goal
@@ -64,7 +64,9 @@ def build_tasks(
 
     Raises:
         ConfigError, UnknownName: unknown frame or joint, motion or axis that cannot be used.
+        NumericalError: q0 of another shape, or not finite.
     """
+    q0 = require_finite("q0", q0, (robot.model.nq,))
     builder = _Builder(robot, q0, source.parent)
     tasks = []
     for index, settings in enumerate(configs):

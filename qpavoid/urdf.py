@@ -30,21 +30,21 @@ _ROOT_JOINTS = {
 }
 
 
-def find_resource(value: str, path: Path, field: str) -> Path:
-    """A URDF or SRDF named in a robot.yaml.
+def find_resource(value: str, folder: Path, where: str) -> Path:
+    """A URDF, SRDF or mesh that a file names.
 
     Args:
-        value: path relative to the robot.yaml, or `example-robot-data:PATH`.
-        path: the robot.yaml.
-        field: which of its fields, for messages.
+        value: path relative to the file, or `example-robot-data:PATH`.
+        folder: that of the file.
+        where: file and field, for messages.
 
     Raises:
         ConfigError: there is no such file.
     """
-    found = example_robot(value) if value.startswith(EXAMPLES) else path.parent / value
+    found = example_robot(value) if value.startswith(EXAMPLES) else folder / value
     if not os.path.isfile(found):  # False where the name is one that no file can have; Path.is_file may raise
         remedy = f"give a path relative to this file or {EXAMPLES}PATH"
-        raise ConfigError(f"{path}: {field}: no such file {value!r}; {remedy}")
+        raise ConfigError(f"{where}: no such file {value!r}; {remedy}")
     return found
 
 

@@ -4,6 +4,7 @@ import json
 import re
 import shlex
 from html.parser import HTMLParser
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -16,10 +17,13 @@ pytest.importorskip("matplotlib")
 pytest.importorskip("mujoco")
 
 import pyarrow as pa
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.text import Text
 from scipy.stats import binom, binomtest
 
 from qpavoid.arena import statistics
 from qpavoid.arena.coverage import gaps
+from qpavoid.arena.figures import safety_against_tracking, success_against_time
 from qpavoid.arena.report import report_of, rerun_line, write_report
 from qpavoid.arena.results import results_of
 from qpavoid.arena.scores import COLUMNS
@@ -502,3 +506,30 @@ def test_a_folder_without_a_list_of_failures_keeps_its_facts(tmp_path):
     (tmp_path / "failures.jsonl").unlink()
     write_report(tmp_path)
     assert (tmp_path / "report.md").read_text(encoding="utf-8").startswith("# Arena: Told\n")
+
+
+@pytest.mark.parametrize("times", [(60.0, 104.0, 143.0), (20.0, 90.0, 4000.0)])
+def test_an_axis_of_times_has_numbers_to_read_it_by(times):
+    rows = [row(e, f"case {k}", tick_p50=t) for e, t in zip("abc", times, strict=True) for k in range(3)]
+    figure = success_against_time(results_of(table(rows)))
+    FigureCanvasAgg(figure).draw()
+    axis = figure.axes[0].xaxis
+    low, high = figure.axes[0].get_xlim()
+    shown = [tick for tick in axis.get_major_ticks() if tick.label1.get_text() and low <= tick.get_loc() <= high]
+    assert low < min(times) and max(times) < high and 3 <= len(shown) <= 12
+    boxes = [tick.label1.get_window_extent() for tick in shown]
+    assert not any(a.overlaps(b) for a, b in pairwise(boxes))
+
+
+def test_lines_to_names_do_not_cross_names_out():
+    """In the picture of many that are good and some that are not, lines come down steeply."""
+    rows = []
+    for i, entrant in enumerate(f"entrant {k}" for k in range(17)):
+        rows += [row(entrant, f"case {k}", collided=k < max(0, i - 12), tracking_error=0.01 * i) for k in range(20)]
+    figure = safety_against_tracking(results_of(table(rows)))
+    FigureCanvasAgg(figure).draw()
+    names = figure.axes[0].texts
+    assert len(names) == 17
+    for name in names:
+        text, line = Text.get_window_extent(name), name.arrow_patch.get_window_extent()
+        assert line.x1 <= text.x0 + 1.0

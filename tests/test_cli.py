@@ -49,6 +49,8 @@ def test_list_names_everything_that_ships(cli):
     assert result.status == 0
     words = result.stdout.split()
     assert {*robot_names(), *scenario_names(), *SOLVERS, "qp:daqp"} <= set(words)
+    assert SITUATION["title"] in next(line for line in result.stdout.splitlines() if "situation1" in line)
+    assert all(len(line) <= 80 for line in result.stdout.splitlines())
 
 
 def test_list_of_one_kind_is_a_name_a_line(cli):
@@ -247,7 +249,7 @@ def test_start_outside_the_limits_is_a_warning(cli, scene):
     Path("arm.yaml").write_text(yaml.safe_dump(robot), encoding="utf-8")
     result = cli("run", scene(robot="arm.yaml"), "--no-figures", "--json")
     assert result.status == 0
-    assert result.lines == ["warning: scene.yaml: q0: left_joint1 = -1.18 lies outside its limits [-1, 1]"]
+    assert result.lines == ["warning: scene.yaml: q0: left_joint1 = -1.18 lies outside its limits [-1, 1] [rad or m]"]
 
 
 # Usage

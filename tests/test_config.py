@@ -211,6 +211,8 @@ NAN, INF = float("nan"), float("inf")
     ("path", "value", "field", "told"),
     [
         ("duration", "long", "duration", "valid number"),
+        ("duration", "8 s", "duration", "got '8 s': give a number alone, in m, rad, kg and s"),
+        ("lock", "right_joint1", "lock", "got 'right_joint1': give a list"),
         ("robot", 3, "robot", "valid string"),
         ("tasks", {}, "tasks", "valid list"),
         ("tasks", [], "tasks", "at least 1"),

@@ -184,6 +184,21 @@ def test_table_holds_the_figures(log):
     assert max(map(cell_len, lines)) <= 80
 
 
+def test_table_cuts_no_outcome(log):
+    wide = log.metrics() | {"min_distance": -0.3, "time_in_collision": 12.5, "final_error": 0.23, "max_deviation": 0.5}
+    runs = [
+        wide | {"solver": solver, "collided": collided, "time_blocked": blocked, "tick_us": {"p50": 1234.0}}
+        for solver in ("tracking", "eq10-literal", "gradient-projection")
+        for collided in (False, True)
+        for blocked in (0.0, 12.3)
+    ]
+    for run in runs:
+        words = " ".join(printed([run])).split()
+        said = Console().render_str(outcome(run)).plain.split()
+        start = words.index(said[0])
+        assert words[start : start + len(said)] == said
+
+
 def test_table_heads_its_columns_with_units(log):
     heading = "\n".join(printed([log.metrics()])[:5])
     for unit, count in (("[mm]", 3), ("[s]", 1), ("[rad/s]", 2), ("[µs]", 1)):

@@ -1,9 +1,11 @@
 """Figures carry the data of the log, and every kind of log can be drawn."""
 
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 from numpy.testing import assert_allclose
 
@@ -107,6 +109,18 @@ def test_bodies_that_stay_far_are_grey_and_share_one_entry(panda):
     assert len(ax.get_lines()) == len(panda.meta["bodies"]) + 3  # the far ones are still drawn
 
 
+def test_a_legend_of_many_bodies_stays_within_its_panel(panda):
+    bodies = [f"body{i}" for i in range(40)]
+    distance = np.tile(0.05 + 0.001 * np.arange(40)[::-1], (len(panda.t), 1))
+    figure = distances_figure(replace(panda, body_distance=distance, meta={**panda.meta, "bodies": bodies}))
+    FigureCanvasAgg(figure).draw()
+    legend = figure.axes[0].get_legend()
+    named = [text.get_text() for text in legend.get_texts()]
+    assert named[:14] == bodies[26:]
+    assert named[14] == "26 bodies farther away"
+    assert legend.get_window_extent().y0 > figure.axes[0].get_window_extent().y0
+
+
 def test_gains_are_drawn_and_alpha_is_cut_off_where_it_is_infinite(sphere):
     alpha = sphere[0].alpha.copy()
     alpha[3] = np.inf
@@ -170,6 +184,16 @@ def test_velocity_limits_are_drawn_where_they_are_near(panda):
     assert ax.get_ylim()[0] <= -limits[6] and limits[6] <= ax.get_ylim()[1]
 
 
+def test_a_velocity_limit_names_its_joint(panda):
+    limits, v = panda.meta["velocity_limit"], np.zeros_like(panda.v)
+    v[:, 6] = limits[6]
+    shown = [text.get_text() for text in speeds_figure(replace(panda, v=v)).axes[0].get_legend().get_texts()]
+    assert f"limit ±{limits[6]:g} of panda_joint7" in shown
+    v[:, 4:] = limits[6]
+    shown = [text.get_text() for text in speeds_figure(replace(panda, v=v)).axes[0].get_legend().get_texts()]
+    assert limits[4] == limits[6] and f"limit ±{limits[6]:g} of 3 joints near it" in shown
+
+
 def test_ticks_that_are_not_solved_are_shaded(panda):
     status = panda.status.copy()
     status[[4, 5, 6, 20]] = STATUSES.index(Status.RELAXED)
@@ -178,6 +202,9 @@ def test_ticks_that_are_not_solved_are_shaded(panda):
     assert_allclose(spans, [(0.04, 0.07), (0.20, 0.21)])
     assert "RELAXED: 4 ticks" in [text.get_text() for text in ax.get_legend().get_texts()]
     assert not speeds_figure(panda).axes[0].patches
+    status[[4, 5, 6]] = panda.status[0]
+    ax = speeds_figure(replace(panda, status=status)).axes[0]
+    assert "RELAXED: 1 tick" in [text.get_text() for text in ax.get_legend().get_texts()]
 
 
 # --- motion -------------------------------------------------------------------------------------------------
@@ -264,6 +291,30 @@ def test_view_does_not_put_an_obstacle_before_the_path(sphere):
         assert abs(towards @ along) < 0.8  # nor is the path foreshortened to a point
 
 
+def test_view_is_not_from_behind_a_wall(sphere):
+    """A board before the robot hides all of it, though its middle is nowhere near what is behind it."""
+    log = sphere[2]
+    board = {"name": "board", "shape": {"type": "box", "size": [0.02, 3.0, 3.0]}}
+    for side in (-1.0, 1.0):
+        place = np.broadcast_to([0.8 * side, 1.2, 0.5], log.obstacle_position.shape)
+        views = view_angles(replace(log, obstacle_position=place, meta={**log.meta, "obstacles": [board]}))
+        assert np.cos(np.radians(views[1])) * side < 0.0
+
+
+def test_numbers_and_names_of_axes_do_not_overlap(sphere, arms):
+    size = np.array([0.2, 1.0, 1.0])  # of a body that is thin across, as a humanoid is
+    thin = replace(arms, **{name: getattr(arms, name) * size for name in ("body_ends", "target", "tool")})
+    for log in (sphere[0], arms, thin):
+        figure = motion_figure(log)
+        FigureCanvasAgg(figure).draw()
+        ax = figure.axes[0]
+        numbers = [tick.label1 for axis in (ax.xaxis, ax.yaxis, ax.zaxis) for tick in axis.get_major_ticks()]
+        names = [axis.label for axis in (ax.xaxis, ax.yaxis, ax.zaxis)]
+        boxes = [text.get_window_extent() for text in (*numbers, *names) if text.get_text()]
+        assert len(boxes) > 5
+        assert not any(a.padded(-2).overlaps(b.padded(-2)) for a, b in combinations(boxes, 2))
+
+
 # --- several solvers ----------------------------------------------------------------------------------------
 
 
@@ -283,9 +334,21 @@ def test_known_solvers_differ_in_colour_and_dash():
     assert len({str(dash) for _, dash in SOLVER_STYLES.values()}) == len(SOLVER_STYLES)
 
 
-def test_two_runs_of_one_solver_can_be_told_apart(sphere):
-    first, second = solver_styles([sphere[2], sphere[2]])
-    assert first["label"] != second["label"] and first["color"] != second["color"]
+def test_runs_that_are_alike_can_be_told_apart(sphere):
+    """Of two runs with one course, neither line is hidden: they differ in colour and dash, and dashes lie on top."""
+    tracking, eq10, qp, proxqp = sphere
+    for logs in ([qp, qp], [proxqp, qp], [qp, proxqp, proxqp, tracking, eq10, proxqp, qp]):
+        styles = solver_styles(logs)
+        assert len({style["label"] for style in styles}) == len(logs)
+        assert len({style["color"] for style in styles}) == len(logs)
+        assert len({str(style["linestyle"]) for style in styles}) == len(logs)
+        solid = [style["zorder"] for style in styles if style["linestyle"] == "-"]
+        assert solid and all(style["zorder"] > max(solid) for style in styles if style["linestyle"] != "-")
+
+
+def test_many_runs_all_look_different(sphere):
+    styles = solver_styles([log for log in sphere for _ in range(10)])
+    assert len({(style["color"], str(style["linestyle"])) for style in styles}) == 40
 
 
 def test_compared_curves_are_those_of_the_logs(sphere):

@@ -198,6 +198,7 @@ def test_bad_mjcf_is_refused_in_one_line(cli, tmp_path, text, message):
         (["add", "chain.urdf", "--home", "joint1"], ["--home joint1: expected JOINT=VALUE"]),
         (["add", "chain.urdf", "--home", "joint1=nan"], ["--home joint1=nan: expected JOINT=VALUE"]),
         (["add", "chain.urdf", "--home", "j=1"], ["--home: no joint 'j'"]),
+        (["add", "chain.urdf", "--home", "joint1=90"], ["--home: joint1 = 90 lies outside its limits"]),
         (["add", "chain.urdf", "--srdf", "none.srdf"], ["none.srdf", "cannot be read"]),
         (["add", "chain.urdf", "--out", "chain.urdf"], ["chain.urdf", "--out"]),
     ],

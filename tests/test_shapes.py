@@ -325,8 +325,8 @@ def test_two_triangle_meshes_have_normals(tmp_path):
 @pytest.mark.parametrize(
     ("field", "message"),
     [
-        ({"path": "no.stl"}, "no such file 'no.stl'"),
-        ({"path": "junk.stl"}, "shape.path: junk.stl"),
+        ({"path": "no.stl"}, r"^\S*run.yaml: obstacles: 'it': shape.path: no such file 'no.stl'"),
+        ({"path": "junk.stl"}, r"^\S*run.yaml: obstacles: 'it': shape.path: junk.stl"),
         ({"path": "part.stl", "method": "hollow"}, "method"),
         ({"path": "part.stl", "scale": -1.0}, "scale"),
     ],

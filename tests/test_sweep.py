@@ -108,6 +108,21 @@ class Picky:
     def solve(self, problem):
         raise AssertionError
 
+class Mistyped:
+    def solve(self, problem):
+        return Solution(problem.v00)
+
+def short(problem):
+    return problem.v0[:3]
+
+def nan(problem):
+    return np.nan * problem.v0
+
+def now_and_then(problem):
+    if problem.v0[0] > 0.0:
+        raise ValueError("not now")
+    return problem.v0
+
 NUMBER = 7
 '''
 
@@ -370,6 +385,25 @@ def test_the_digest_of_an_own_entrant_follows_its_text_and_not_its_place(folder)
     (folder / "laws.py").write_text(LAWS.replace("0.5", "0.4"))
     assert own_entrant(folder / "laws.py", "Halved").digest != first.digest
     assert first.says == "A class with solve."
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("Mistyped", "AttributeError: 'Problem' object has no attribute 'v00'"),
+        ("short", r"NumericalError: its velocity: shape \(3,\), expected \(6,\)"),
+        ("nan", "NumericalError: its velocity: NaN or infinity"),
+    ],
+)
+def test_a_law_that_fails_has_failed_and_says_why(folder, name, said):
+    """A controller brakes where its law fails; the arena must not take that for what the law wants."""
+    row = run_trial(make_case(load_family(folder / "post.yaml"), 0), own_entrant(folder / "laws.py", name))
+    assert row.failed == row.stopped == 1.0 and not row.success and re.search(said, row.failure)
+
+
+def test_a_law_that_fails_now_and_then_goes_on(folder):
+    row = run_trial(make_case(load_family(folder / "post.yaml"), 0), own_entrant(folder / "laws.py", "now_and_then"))
+    assert 0.0 < row.failed < 1.0 and row.failure == "ValueError: not now" and row.path_length > 0.0
 
 
 # --- sweeps ------------------------------------------------------------------------------------------------------
@@ -671,14 +705,17 @@ def test_the_summary_is_that_of_numpy(tmp_path):
     rng = np.random.default_rng(0)
     figures = [{"failed": x, "min_distance": y, "tick_p50": z} for x, y, z in rng.normal(size=(200, 3))]
     rows = [
-        row_of(entrant=str(rng.choice(["b", "a"])), case=str(n), success=bool(rng.random() < 0.5), **fields)
+        row_of(
+            entrant=str(rng.choice(["b", "a"])), case=str(n), success=bool(rng.random() < 0.5), failure=f"{n}", **fields
+        )
         for n, fields in enumerate(figures)
     ]
     table = summary(pa.Table.from_pylist(rows, schema=store.RUNS.schema))
     assert [entry["entrant"] for entry in table] == list(dict.fromkeys(row["entrant"] for row in rows))
     for entry in table:
         own = [row for row in rows if row["entrant"] == entry["entrant"]]
-        assert entry["runs"] == len(own) and entry["failed"] == sum(row["failed"] > 0 for row in own)
+        failed = [row["failure"] for row in own if row["failed"] > 0]
+        assert entry["runs"] == len(own) and entry["failed"] == len(failed) and entry["failure"] == failed[0]
         assert entry["success"] == pytest.approx(np.mean([row["success"] for row in own]))
         assert entry["min_distance"] == min(row["min_distance"] for row in own)
         assert entry["tick_p50"] == pytest.approx(np.median([row["tick_p50"] for row in own]), abs=0.1)

@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 from conftest import Bench, differences, random_q
 
-from qpavoid import Sample, UnknownName, build_scene, config
+from qpavoid import NumericalError, Sample, UnknownName, build_scene, config
 from qpavoid.problem import Tracking
 from qpavoid.tasks import build_tasks
 
@@ -154,3 +154,9 @@ def test_frames_of_locked_joints_can_still_be_followed(paper):
 def test_unknown_frame(panda):
     with pytest.raises(UnknownName, match=r"bench\.yaml: tasks\.0\.frame: panda has no frame 'panda_hand_tpc'.*tcp"):
         Tasks.of_frames(panda, ["panda_hand_tpc"])
+
+
+@pytest.mark.parametrize("q0", [np.zeros(3), np.full(7, np.nan)])
+def test_a_configuration_that_is_none_is_refused(panda, q0):
+    with pytest.raises(NumericalError, match=r"q0: (shape \(3,\), expected \(7,\)|NaN)"):
+        build_tasks([config.Task(frame="panda_hand_tcp")], panda, q0)

@@ -210,6 +210,9 @@ def _print(
         print(to_json({**fields, "failed": tally.failed, **(more or {}), "entrants": summary(runs)}))
         return
     OUT.print(summary_table(runs, f"{suite.name}: {suite.title}"))
+    for row in summary(runs):
+        if row["failed"]:
+            _complain(f"{row['entrant']} failed in {row['failed']} of {row['runs']} runs: {row['failure']}")
     if folder is not None:
         OUT.print(
             f"{folder}: {len(runs)} runs, {tally.done} of them new", highlight=False, soft_wrap=True, markup=False

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import inspect
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import lru_cache, partial
 from pathlib import Path
 from types import ModuleType
@@ -21,8 +21,8 @@ from qpavoid.controller import Controller
 from qpavoid.errors import ConfigError, UnknownName
 from qpavoid.files import read_text
 from qpavoid.loading import nearest
-from qpavoid.problem import Problem, Solution
-from qpavoid.solvers import Solver
+from qpavoid.motion import Sample
+from qpavoid.problem import Array, Problem, Solution, require_finite
 
 _LARGEST = 10_000_000
 """Size of a Python file [bytes]."""
@@ -66,12 +66,9 @@ def _start(text: str, file: str, name: str, case: Case, world: World) -> Pilot:
     if kind == "pilot":
         pilot: Pilot = found(case, world)
         return pilot
-    solver: Solver = found() if kind == "solver" else _Law(found)
+    solver = found() if kind == "solver" else None
     controller, _ = Controller.from_scenario(case.scenario)
-    if not hasattr(solver, "bounded"):
-        solver.bounded = False
-    controller.solver = solver
-    return controller
+    return _LawPilot(controller, solver.solve if solver else found, getattr(solver, "bounded", False))
 
 
 def _kind(found: Any) -> str | None:
@@ -84,18 +81,33 @@ def _kind(found: Any) -> str | None:
     return {1: "law", 2: "pilot"}.get(len(needed))
 
 
-class _Law:
-    """A solver of a function."""
+class _LawPilot:
+    """A law in its controller; what it raises is a failure of the entrant, not the braking stop that it ends in."""
 
-    bounded = False
-
-    def __init__(self, law: Callable[[Problem], Any]) -> None:
-        self._law = law
+    def __init__(self, controller: Controller, law: Callable[[Problem], Any], bounded: bool) -> None:
+        self.bounded = bounded
+        self._controller, self._law = controller, law
+        self._raised: Exception | None = None
+        controller.solver = self
 
     def solve(self, problem: Problem) -> Solution:
-        """What the function says, which may be a velocity alone."""
-        answer = self._law(problem)
-        return answer if isinstance(answer, Solution) else Solution(np.asarray(answer, dtype=np.float64))
+        """What the law says, which may be a velocity alone."""
+        try:
+            answer = self._law(problem)
+            solution = answer if isinstance(answer, Solution) else Solution(np.asarray(answer, dtype=np.float64))
+            require_finite("its velocity", solution.v, problem.lower.shape)
+        except Exception as error:  # whatever a user's law does
+            self._raised = error
+            raise
+        return solution
+
+    def step(self, q: Array, t: float, targets: Mapping[str, Sample], obstacles: Mapping[str, Sample]) -> Solution:
+        """Velocity to follow until the next tick."""
+        self._raised = None
+        solution = self._controller.step(q, t, targets, obstacles)
+        if self._raised is not None:
+            raise self._raised
+        return solution
 
 
 def _find(text: str, file: str, name: str) -> Any:

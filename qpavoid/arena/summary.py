@@ -16,7 +16,7 @@ from qpavoid.arena.case import Case
 from qpavoid.arena.suite import Suite
 from qpavoid.config import Fixed
 
-FIGURES = ("entrant", "success", "collided", "min_distance", "tick_p50", "failed")
+FIGURES = ("entrant", "success", "collided", "min_distance", "tick_p50", "failed", "failure")
 """Columns of which the summary is made."""
 
 
@@ -28,7 +28,7 @@ def summary(runs: pa.Table) -> list[dict[str, Any]]:
 
     Returns:
         entrant, runs, success [-], collided [-], min_distance (of all its runs) [m], tick_p50 (median of its runs)
-        [µs], failed (runs in which it failed at some tick).
+        [µs], failed (runs in which it failed at some tick), failure (what it said in the first of them).
     """
     if not len(runs):
         return []
@@ -48,8 +48,10 @@ def summary(runs: pa.Table) -> list[dict[str, Any]]:
     )
     columns = ["entrant", "entrant_count", *(f"{name}_{how}" for name, how in means), "tick_p50_approximate_median"]
     names = ["entrant", "runs", "success", "collided", "min_distance", "failed", "tick_p50"]
+    said = runs.filter(pc.greater(runs["failed"], 0.0)).group_by("entrant", use_threads=False)
+    first = {row["entrant"]: row["failure_first"] for row in said.aggregate([("failure", "first")]).to_pylist()}
     rows: list[dict[str, Any]] = table.select(columns).rename_columns(names).to_pylist()
-    return rows
+    return [{**row, "failure": first.get(row["entrant"], "")} for row in rows]
 
 
 def summary_table(runs: pa.Table, title: str) -> Table:

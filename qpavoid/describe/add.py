@@ -16,7 +16,7 @@ from qpavoid.describe.reasons import by_link, pair_reasons, watching
 from qpavoid.describe.sampling import CLEAR, SAMPLES, SEED, always_near, clear_home, sample_pairs, touching
 from qpavoid.describe.shapes import LinkBodies, Piece, bodies_of_link, kinds_of_links
 from qpavoid.describe.srdf import Semantics, find_srdf, read_srdf
-from qpavoid.errors import UnknownName
+from qpavoid.errors import ConfigError, UnknownName
 from qpavoid.loading import nearest
 from qpavoid.problem import Array
 from qpavoid.robot import Robot
@@ -135,9 +135,14 @@ def describe(urdf: Path, wishes: Wishes | None = None) -> Described:
 def _semantics(srdf: Path | None, model: Any, wishes: Wishes) -> Semantics:
     """What an SRDF says, with the home pose that the user prefers as its first one."""
     semantics = Semantics() if srdf is None else read_srdf(srdf)
-    for joint in wishes.home:
-        if not model.existJointName(joint):
-            raise UnknownName(f"--home: no joint {joint!r}{nearest(joint, list(model.names)[1:])}")
+    for name, value in wishes.home.items():
+        if not model.existJointName(name):
+            raise UnknownName(f"--home: no joint {name!r}{nearest(name, list(model.names)[1:])}")
+        joint = model.joints[model.getJointId(name)]
+        if joint.nq == 1:
+            low, high = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
+            if low < high and not low <= value <= high:
+                raise ConfigError(f"--home: {name} = {value:g} lies outside its limits [{low:g}, {high:g}] [rad or m]")
     return replace(semantics, states={"--home": wishes.home, **semantics.states}) if wishes.home else semantics
 
 

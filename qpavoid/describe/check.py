@@ -57,7 +57,7 @@ def check_robot(name_or_path: str, root: str = "fixed", package_dirs: Sequence[P
     else:
         folders = [str(folder.resolve()) for folder in package_dirs]
         config = RobotConfig(name=path.stem, urdf=path.name, root_joint=root, package_dirs=folders)  # type: ignore[arg-type]
-    urdf = find_resource(config.urdf, path, "urdf")
+    urdf = find_resource(config.urdf, path.parent, f"{path}: urdf")
     model = read_model(urdf, config.root_joint)
     report = Report(config.name, str(path), model.nq, model.nv)
     report.frames = [f.name for f in model.frames if f.type in (pin.BODY, pin.OP_FRAME)]
