@@ -10,14 +10,17 @@ systems in dynamic environments", with flights as its backup.
 
 Flights maximise the smallest distance at a horizon h, to first order, in every period anew:
 
-    max s - ε/2 ‖v - v̂‖²  s.t.  d + h (J v + ḋ_obs) >= s,  s <= comfort,  lower <= v <= upper,
+    max s - ½ s²/c - ε/2c ‖v - v̂‖²  s.t.  d + h (J v + ḋ_obs) >= s,  s <= c,  lower <= v <= upper,    c: the comfort.
 
-with several h and several v̂, since one way out may be closed and another one not.
+This is greedy, and runs into dead ends; which v̂ leads out of one cannot be told beforehand. So many are tried, drawn at
+random, a few in every tick, as long as no flight is good enough: from here, and from places on the flight that is kept,
+whose beginning may be right though its end is not. What is found in one tick is flown anew in the next one, farther by
+a tick, from where the robot is then and among obstacles as they are seen then.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -36,17 +39,19 @@ from qpavoid.sensing import Obstacles, Seen
 from qpavoid.solvers.backends import solve_daqp
 
 _HORIZONS = (0.2, 0.05, 0.5)
-"""h of the flights that lean to no side [s]."""
-_LEANINGS = 4
-"""How many flights lean to one side, with the first of the horizons."""
-_LEAN = 2.0
-"""‖v̂‖ of those [rad/s, m/s]."""
+"""h of flights [s]."""
+_STRAIGHT = 0.25
+"""Share of the flights drawn that lean to no side [-]."""
+_LEANS = (2.0, 30.0)
+"""Range of ‖v̂‖ of the others, with equally likely logarithms [rad/s, m/s]."""
 _GENTLE = 1e-4
 """ε: what the square of a joint speed counts beside that of a distance [m²/(rad/s)²]."""
 _DEEPEST = 10.0
 """Penetration that no flight foresees [m]."""
 _TOUCH = 1e-3
 """Distance below which a pair counts as touching [m]."""
+_ALIKE = 1e-6
+"""Difference of two flights' distances that counts as none [m]."""
 Mask = npt.NDArray[np.bool_]
 
 
@@ -57,6 +62,19 @@ class Manner(NamedTuple):
     """h [s]; 0 stands still."""
     leaning: Array
     """v̂ (nv,) [rad/s, m/s]."""
+
+
+class Start(NamedTuple):
+    """Where a flight begins."""
+
+    q: Array
+    """(nq,)."""
+    v: Array
+    """(nv,) velocity that has led there."""
+    t: float
+    """[s]."""
+    watched: Mask
+    """(m,) pairs that are not to touch."""
 
 
 class Value(NamedTuple):
@@ -110,16 +128,17 @@ class EscapePlanner:
         )
         self._step, self._accelerated = bounds.acceleration * dt, bool(np.isfinite(bounds.acceleration).any())
         self._parted = np.any(scene.support != 0.0, axis=1)
-        self._safe = settings.safe * (avoidance.hold - avoidance.offset)
-        self._manners = list(_manners(model.nv))
-        self._next = 0
+        safe = settings.safe * (avoidance.hold - avoidance.offset)
+        self._enough = Value(settings.horizon, safe)
+        self._still = Manner(0.0, np.zeros(model.nv))
         self._foreseen: dict[float, Seen] = {}
-        self._kept: Flight | None = None
-        self._enough = Value(settings.horizon, self._safe)
+        _farthest(np.zeros((1, model.nv)), np.zeros(1), 0.1, np.zeros(model.nv), *2 * [np.zeros(model.nv)])  # compiles
+        self.reset()
 
     def reset(self) -> None:
-        """Forgets the flight that was kept."""
-        self._kept = None
+        """Forgets the flight that was kept; what is drawn from now on is drawn again after the next reset."""
+        self._kept: Flight | None = None
+        self._random = np.random.default_rng(0)
 
     def check(self, q: Array, v: Array, t: float, v_last: Array, proximity: Proximity) -> Array | None:
         """None where v may be commanded, else what to command in its place (nv,).
@@ -136,68 +155,125 @@ class EscapePlanner:
         self._foreseen.clear()
         watched = self._parted.copy()
         watched[proximity.pair[proximity.distance < _TOUCH]] = False
-        onward = self._best(pin.integrate(self._model, q, self._dt * v), v, t + self._dt, watched)
-        if onward.value >= self._enough:
-            self._kept = onward
-            return None
-        kept = self._kept
-        if kept is None or not kept.v or kept.value.clear < 0.5 * self._settings.horizon:
-            away = self._best(q, v_last.copy(), t, watched)
-            if kept is None or not kept.v or away.value.clear > kept.value.clear + self._settings.period:
-                kept = away
-        if onward.value.clear + self._dt >= kept.value.clear and onward.value.distance >= kept.value.distance - 1e-4:
-            self._kept = onward
-            return None
-        self._kept = Flight(Value(kept.value.clear - self._dt, kept.value.distance), kept.v[1:], kept.manner)
-        return None if np.array_equal(kept.v[0], v) else kept.v[0]
+        next_tick = Start(pin.integrate(self._model, q, self._dt * v), v, t + self._dt, watched)
+        onward = self._best(self._onward(next_tick))
+        if onward.value < self._enough:
+            kept, left = self._way_out(Start(q, v_last.copy(), t, watched))
+            onward = self._best((self._fly(next_tick, self._drawn()) for _ in range(left)), onward)
+            if not self._as_good(onward.value, kept.value) and kept.v:
+                self._kept = kept._replace(v=kept.v[1:])
+                return None if np.array_equal(kept.v[0], v) else kept.v[0]
+        self._kept = onward
+        return None
 
-    def _best(self, q: Array, v: Array, t: float, watched: Mask) -> Flight:
-        """The best of some flights from q (nq,) after velocity v (nv,); others have their turn at the next ticks."""
-        best: Flight | None = None
-        for manner in self._in_turn():
-            flight = self._fly(q, v, t, manner, watched)
-            if best is None or flight.value > best.value:
-                best = flight
-            if flight.value >= self._enough:
-                break
+    def _onward(self, start: Start) -> Iterator[Flight]:
+        """Flights like the one that is kept, by its manner and by its velocities, and standing still."""
+        if self._kept is not None:
+            yield self._fly(start, self._kept.manner)
+            yield self._fly(start, self._kept.manner, self._kept.v[1:])
+        yield self._fly(start, self._still)
+
+    def _best(self, flights: Iterable[Flight], best: Flight | None = None) -> Flight:
+        """The first flight that is good enough, or the best of all; no more are flown than that takes."""
+        if best is None or best.value < self._enough:
+            for flight in flights:
+                best = flight if best is None or flight.value > best.value else best
+                if best.value >= self._enough:
+                    break
         assert best is not None
         return best
 
-    def _in_turn(self) -> Iterator[Manner]:
-        """The manner that is kept, standing still, and some of the others."""
-        if self._kept is not None and self._kept.manner is not self._manners[0]:
-            yield self._kept.manner
-        yield self._manners[0]
-        for _ in range(self._settings.attempts):
-            self._next = self._next % (len(self._manners) - 1) + 1
-            yield self._manners[self._next]
+    def _as_good(self, onward: Value, kept: Value) -> bool:
+        """Whether a flight that begins in a tick is as good as one that begins now; times are told to a period."""
+        if onward.clear > kept.clear + self._ticks * self._dt:
+            return True
+        return onward.clear + self._dt >= kept.clear and onward.distance >= kept.distance - _ALIKE
 
-    def _fly(self, q: Array, v: Array, t: float, manner: Manner, watched: Mask) -> Flight:
-        """Flees with decisions a period apart, until something touches or the horizon is reached."""
-        plan: list[Array] = []
-        distance, begin = self._safe, t
-        while True:
-            proximity, problem = self._look(q, t, v)
-            here = float(np.min(proximity.distance, initial=np.inf, where=watched[proximity.pair]))
-            if here < _TOUCH or t - begin >= self._settings.horizon:
-                return Flight(Value(min(t - begin, self._settings.horizon), distance), plan, manner)
-            distance = min(distance, here)
-            wanted = self._flee(proximity, problem, manner, watched)
-            for step, ticks in self._towards(v, wanted):
-                q = pin.integrate(self._model, q, ticks * self._dt * step)
-                plan += [step] * ticks
-            v = plan[-1]
-            t += self._ticks * self._dt
+    def _way_out(self, start: Start) -> tuple[Flight, int]:
+        """The flight that is kept, as good as it is from here and now, or a better one; and attempts that are left."""
+        known, attempts = self._kept, self._settings.attempts
+        best = self._fly(start, self._still) if known is None else self._fly(start, known.manner, known.v)
+        while attempts and best.value < self._enough:
+            attempts -= 1
+            turn = self._random.integers(len(best.v) + 1) if attempts % 2 else 0
+            flight = self._fly(start, self._drawn(), best.v[:turn])
+            best = max(best, flight, key=lambda flight: flight.value)
+        return best, attempts
 
-    def _towards(self, v: Array, wanted: Array) -> list[tuple[Array, int]]:
-        """The velocities of a period, each with its number of ticks: as fast as accelerations allow to the wanted."""
+    def _drawn(self) -> Manner:
+        """Some manner or other."""
+        random = self._random
+        h = _HORIZONS[random.integers(len(_HORIZONS))]
+        if random.random() < _STRAIGHT:
+            return Manner(h, self._still.leaning)
+        side, lean = random.normal(size=self._model.nv), np.exp(random.uniform(*np.log(_LEANS)))
+        return Manner(h, lean / np.linalg.norm(side) * side)
+
+    def _fly(self, start: Start, manner: Manner, given: Sequence[Array] = ()) -> Flight:
+        """Flees with decisions a period apart, until something touches or the horizon is reached.
+
+        Distances are looked at as often, and midway where something may come too near and part again before that. All
+        flights decide and look at the same times, multiples of the period: only so can their values be compared.
+
+        Args:
+            start: where it begins.
+            manner: how it flees.
+            given: velocities (nv,) of the first ticks, for as many decisions as they suffice; it flees from then on.
+        """
+        q, v, t, watched = start
+        horizon, distance = self._enough
+        plan = list[Array]()
+        proximity, problem = self._look(q, t, v)
+        before = here = self._least(proximity, watched)
+        count = self._ticks - round(t / self._dt) % self._ticks
+        while here >= _TOUCH and t - start.t < horizon - 1e-9:
+            wanted = given[len(plan) : len(plan) + count]
+            if len(wanted) < count:
+                wanted = [self._flee(proximity, problem, manner, watched)] * count
+            steps = self._towards(v, wanted)
+            ahead, span = self._moved(q, steps), count * self._dt
+            before, distance = here, min(distance, here)
+            if self._passing(proximity, steps, watched):
+                proximity, _ = self._look(pin.interpolate(self._model, q, ahead, 0.5), t + 0.5 * span, v)
+                here = self._least(proximity, watched)
+                distance = min(distance, max(here, _TOUCH))
+            if here >= _TOUCH:
+                proximity, problem = self._look(ahead, t + span, steps[-1])
+                here = self._least(proximity, watched)
+            plan += steps
+            q, v, t, count = ahead, steps[-1], t + span, self._ticks
+        clear = t - start.t
+        if here < _TOUCH and plan:
+            clear -= span * (_TOUCH - here) / (before - here)
+        return Flight(Value(min(clear, horizon), distance), plan, manner)
+
+    def _moved(self, q: Array, steps: Sequence[Array]) -> Array:
+        """Where the velocities (nv,) of some ticks lead from q (nq,)."""
+        if steps[0] is steps[-1]:
+            return np.asarray(pin.integrate(self._model, q, len(steps) * self._dt * steps[0]))
+        for step in steps:
+            q = pin.integrate(self._model, q, self._dt * step)
+        return q
+
+    def _towards(self, v: Array, wanted: Sequence[Array]) -> Sequence[Array]:
+        """The velocities of some ticks: from v, as close to the wanted ones (nv,) as accelerations allow."""
         if not self._accelerated:
-            return [(wanted, self._ticks)]
+            return wanted
         ramp = []
-        for _ in range(self._ticks):
-            v = v + np.minimum(np.maximum(wanted - v, -self._step), self._step)
-            ramp.append((v, 1))
+        for target in wanted:
+            v = v + np.minimum(np.maximum(target - v, -self._step), self._step)
+            ramp.append(v)
         return ramp
+
+    def _least(self, proximity: Proximity, watched: Mask) -> float:
+        """Smallest distance of the watched pairs, up to that at which flights look at pairs [m]."""
+        return float(np.min(proximity.distance, initial=self._settings.reach, where=watched[proximity.pair]))
+
+    def _passing(self, proximity: Proximity, steps: Sequence[Array], watched: Mask) -> bool:
+        """Whether a watched pair may come too near within a period, by its distance and rate at the beginning."""
+        mean = steps[0] if steps[0] is steps[-1] else np.mean(steps, axis=0)
+        ahead = proximity.distance + len(steps) * self._dt * (proximity.J @ mean + proximity.drift)
+        return bool((watched[proximity.pair] & (ahead < self._enough.distance)).any())
 
     def _look(self, q: Array, t: float, v: Array) -> tuple[Proximity, Problem]:
         """Distances and bounds at q (nq,), reached with v (nv,), with the obstacles where they will be at t [s]."""
@@ -235,14 +311,3 @@ def _farthest(A: Array, d: Array, comfort: float, v: Array, lower: Array, upper:
         return x[:n] if minimize(P, x, G, -d, low, high, np.zeros(k)) else None
     answer = solve_daqp(P, -P @ x, G, -d, low, high)
     return None if answer is None else answer[:n]
-
-
-def _manners(nv: int) -> Iterator[Manner]:
-    """Standing still, fleeing with several horizons, and leaning to some sides that are the same every time."""
-    straight = np.zeros(nv)
-    yield Manner(0.0, straight)
-    for horizon in _HORIZONS:
-        yield Manner(horizon, straight)
-    for side in range(_LEANINGS):
-        direction = np.random.default_rng(side).normal(size=nv)
-        yield Manner(_HORIZONS[0], _LEAN * direction / np.linalg.norm(direction))

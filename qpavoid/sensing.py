@@ -114,8 +114,8 @@ class Obstacles:
     def foreseen(self, t: float) -> Seen:
         """Where they will be at t [s], on their trajectories, or as they were last seen to move."""
         states, given = self._seen.states.copy(), list(self._tracks)
-        move_on(states, t - self._now)
         last_seen = states[given]
+        move_on(last_seen, t - self._now)
         self._courses.sample(t, states)
         for index, motion in self._courses.others.items():
             put(as_samples(states)[index], motion.sample(t))
