@@ -30,9 +30,9 @@ import pinocchio as pin
 from qpavoid import kernels
 from qpavoid.assembly import Assembly
 from qpavoid.config import Avoidance, Escape, Limits
-from qpavoid.kinematics import ForwardKinematics
+from qpavoid.kinematics import ForwardKinematics, longest_lever
 from qpavoid.limits import JointBounds
-from qpavoid.problem import Array, Problem, Proximity
+from qpavoid.problem import Array, Proximity
 from qpavoid.proximity import DistanceQuery
 from qpavoid.scene import Scene
 from qpavoid.sensing import Obstacles, Seen
@@ -50,6 +50,8 @@ _DEEPEST = 10.0
 """Penetration that no flight foresees [m]."""
 _TOUCH = 1e-3
 """Distance below which a pair counts as touching [m]."""
+_SPAN = 0.1
+"""Time from one look at bounding spheres to the next [s]."""
 _ALIKE = 1e-6
 """Difference of two flights' distances that counts as none [m]."""
 Mask = npt.NDArray[np.bool_]
@@ -62,6 +64,23 @@ class Manner(NamedTuple):
     """h [s]; 0 stands still."""
     leaning: Array
     """v̂ (nv,) [rad/s, m/s]."""
+
+
+class Near(NamedTuple):
+    """What a flight looks at; in memory that the next look overwrites."""
+
+    distance: Array
+    """(k,) of the watched pairs within reach [m]."""
+    J: Array
+    """(k, nv) velocity Jacobian of these distances."""
+    drift: Array
+    """(k,) their rate due to the obstacles [m/s]."""
+    lower: Array
+    """(nv,) bounds on the velocity of the next period."""
+    upper: Array
+    """(nv,)."""
+    least: float
+    """Smallest distance; the reach, where nothing is nearer [m]."""
 
 
 class Start(NamedTuple):
@@ -127,6 +146,8 @@ class EscapePlanner:
             scene, (), bounds, self._kinematics, self.query, avoidance, limits, 0.01, self._ticks * dt
         )
         self._step, self._accelerated = bounds.acceleration * dt, bool(np.isfinite(bounds.acceleration).any())
+        self._braking = 0.5 / bounds.acceleration
+        self._lever = max(1.0, longest_lever(model, self.query.longest_reach()))
         self._parted = np.any(scene.support != 0.0, axis=1)
         safe = settings.safe * (avoidance.hold - avoidance.offset)
         self._enough = Value(settings.horizon, safe)
@@ -156,6 +177,9 @@ class EscapePlanner:
         watched = self._parted.copy()
         watched[proximity.pair[proximity.distance < _TOUCH]] = False
         next_tick = Start(pin.integrate(self._model, q, self._dt * v), v, t + self._dt, watched)
+        if self._nobody_comes(next_tick):
+            self._kept = None
+            return None
         onward = self._best(self._onward(next_tick))
         if onward.value < self._enough:
             kept, left = self._way_out(Start(q, v_last.copy(), t, watched))
@@ -165,6 +189,22 @@ class EscapePlanner:
                 return None if np.array_equal(kept.v[0], v) else kept.v[0]
         self._kept = onward
         return None
+
+    def _nobody_comes(self, start: Start) -> bool:
+        """Whether what moves stays away from a robot that stops here, which bounding spheres can tell or not.
+
+        Between the times at which they are looked at, obstacles are taken to be no faster than at these.
+        """
+        moving, horizon = self._obstacles.moving, self._settings.horizon
+        times = start.t + np.arange(0.0, horizon + _SPAN, _SPAN)
+        states = np.array([self._obstacles.foreseen(t).states[moving] for t in times])
+        strides = 0.5 * _SPAN * np.sqrt(np.square(states[:, :, 12:15]).sum(axis=2).max(axis=0))
+        self._kinematics.compute(start.q)
+        centers, radii = self.query.body_spheres(self._kinematics.data)
+        apart = np.linalg.norm(states[:, :, None, 9:12] - centers, axis=3) - radii
+        stop = float(np.square(start.v) @ self._braking)
+        least = self._settings.comfort + (self._lever * stop if stop else 0.0)
+        return bool((apart.min(axis=(0, 2)) - self.query.placing.reach[moving] - strides > least).all())
 
     def _onward(self, start: Start) -> Iterator[Flight]:
         """Flights like the one that is kept, by its manner and by its velocities, and standing still."""
@@ -223,23 +263,23 @@ class EscapePlanner:
         q, v, t, watched = start
         horizon, distance = self._enough
         plan = list[Array]()
-        proximity, problem = self._look(q, t, v)
-        before = here = self._least(proximity, watched)
+        near = self._look(q, t, v, watched)
+        before = here = near.least
         count = self._ticks - round(t / self._dt) % self._ticks
         while here >= _TOUCH and t - start.t < horizon - 1e-9:
             wanted = given[len(plan) : len(plan) + count]
             if len(wanted) < count:
-                wanted = [self._flee(proximity, problem, manner, watched)] * count
+                wanted = [self._flee(near, manner)] * count
             steps = self._towards(v, wanted)
             ahead, span = self._moved(q, steps), count * self._dt
             before, distance = here, min(distance, here)
-            if self._passing(proximity, steps, watched):
-                proximity, _ = self._look(pin.interpolate(self._model, q, ahead, 0.5), t + 0.5 * span, v)
-                here = self._least(proximity, watched)
+            rate = near.J @ steps[len(steps) // 2] + near.drift
+            if (near.distance + span * rate < self._enough.distance).any():
+                here = self._look(pin.interpolate(self._model, q, ahead, 0.5), t + 0.5 * span, v, watched).least
                 distance = min(distance, max(here, _TOUCH))
             if here >= _TOUCH:
-                proximity, problem = self._look(ahead, t + span, steps[-1])
-                here = self._least(proximity, watched)
+                near = self._look(ahead, t + span, steps[-1], watched)
+                here = near.least
             plan += steps
             q, v, t, count = ahead, steps[-1], t + span, self._ticks
         clear = t - start.t
@@ -265,49 +305,40 @@ class EscapePlanner:
             ramp.append(v)
         return ramp
 
-    def _least(self, proximity: Proximity, watched: Mask) -> float:
-        """Smallest distance of the watched pairs, up to that at which flights look at pairs [m]."""
-        return float(np.min(proximity.distance, initial=self._settings.reach, where=watched[proximity.pair]))
-
-    def _passing(self, proximity: Proximity, steps: Sequence[Array], watched: Mask) -> bool:
-        """Whether a watched pair may come too near within a period, by its distance and rate at the beginning."""
-        mean = steps[0] if steps[0] is steps[-1] else np.mean(steps, axis=0)
-        ahead = proximity.distance + len(steps) * self._dt * (proximity.J @ mean + proximity.drift)
-        return bool((watched[proximity.pair] & (ahead < self._enough.distance)).any())
-
-    def _look(self, q: Array, t: float, v: Array) -> tuple[Proximity, Problem]:
-        """Distances and bounds at q (nq,), reached with v (nv,), with the obstacles where they will be at t [s]."""
+    def _look(self, q: Array, t: float, v: Array, watched: Mask) -> Near:
+        """What is near at q (nq,), reached with v (nv,), with the obstacles where they will be at t [s]."""
         if t not in self._foreseen:
             self._foreseen[t] = self._obstacles.foreseen(t)
         self.query.placing.place(*self._foreseen[t])
         self._assembly.remember(v)
         self._kinematics.compute(q)
         self.query.compute(self._kinematics.data, self._settings.reach)
-        return self._assembly.compute(q, (), self.query, self._settings.reach)
+        (pair, closest, J, drift), problem = self._assembly.compute(q, (), self.query, self._settings.reach)
+        distance, counts = closest[:, 0], watched[pair]
+        if not counts.all():
+            distance, J, drift = distance[counts], J[counts], drift[counts]
+        least = float(distance.min(initial=self._settings.reach))
+        return Near(distance, J, drift, problem.lower, problem.upper, least)
 
-    def _flee(self, proximity: Proximity, problem: Problem, manner: Manner, watched: Mask) -> Array:
+    def _flee(self, near: Near, manner: Manner) -> Array:
         """Velocity (nv,) of a flight for its next period."""
-        rest = np.minimum(np.maximum(0.0, problem.lower), problem.upper)
-        near = watched[proximity.pair]
-        h, J = manner.horizon, proximity.J[near]
-        ahead = proximity.distance[near] + h * proximity.drift[near]
-        if not h or (not manner.leaning.any() and (ahead + h * (J @ rest) >= self._settings.comfort).all()):
-            return rest
-        v = _farthest(h * J, ahead, self._settings.comfort, manner.leaning, problem.lower, problem.upper)
-        return rest if v is None else np.minimum(np.maximum(v, problem.lower), problem.upper)
+        h, v = manner.horizon, None
+        if h:
+            ahead = near.distance + h * near.drift
+            v = _farthest(h * near.J, ahead, self._settings.comfort, manner.leaning, near.lower, near.upper)
+        return np.minimum(np.maximum(0.0 if v is None else v, near.lower), near.upper)
 
 
 def _farthest(A: Array, d: Array, comfort: float, v: Array, lower: Array, upper: Array) -> Array | None:
     """v (nv,) with the largest s, A v + d >= s, s <= comfort, close to the one given; None where none is found."""
+    if kernels.ACCELERATED:
+        from qpavoid.kernels.active_set import farthest
+
+        w, met = farthest(A, d, comfort, _DEEPEST, _GENTLE, v, lower, upper)
+        return w if met else None
     k, n = A.shape
     P = np.diag(np.append(np.full(n, _GENTLE), 1.0))
-    G = np.empty((k, n + 1))
-    G[:, :n], G[:, n] = A, -1.0
+    G = np.column_stack((A, np.full(k, -1.0)))
     low, high = np.append(lower, -_DEEPEST), np.append(upper, comfort)
-    x = np.append(v, comfort)
-    if kernels.ACCELERATED:
-        from qpavoid.kernels.active_set import minimize
-
-        return x[:n] if minimize(P, x, G, -d, low, high, np.zeros(k)) else None
-    answer = solve_daqp(P, -P @ x, G, -d, low, high)
+    answer = solve_daqp(P, -P @ np.append(v, comfort), G, -d, low, high)
     return None if answer is None else answer[:n]
