@@ -50,6 +50,8 @@ _DEEPEST = 10.0
 """Penetration that no flight foresees [m]."""
 _TOUCH = 1e-3
 """Distance below which a pair counts as touching [m]."""
+_BEYOND = 0.1
+"""How much longer than the horizon flights are, so that they need not be flown anew in every tick [s]."""
 _SPAN = 0.1
 """Time from one look at bounding spheres to the next [s]."""
 _ALIKE = 1e-6
@@ -108,10 +110,15 @@ class Value(NamedTuple):
 class Flight(NamedTuple):
     """Velocities, and where they lead."""
 
-    value: Value
+    start: Start
     v: list[Array]
     """(nv,) for each tick."""
     manner: Manner
+    value: Value
+    until: float
+    """When something touches; the end, if nothing does before [s]."""
+    least: float
+    """Smallest distance until then, up to that at which flights look at pairs [m]."""
 
 
 class EscapePlanner:
@@ -185,7 +192,7 @@ class EscapePlanner:
             kept, left = self._way_out(Start(q, v_last.copy(), t, watched))
             onward = self._best((self._fly(next_tick, self._drawn()) for _ in range(left)), onward)
             if not self._as_good(onward.value, kept.value) and kept.v:
-                self._kept = kept._replace(v=kept.v[1:])
+                self._kept = self._a_tick_on(kept)
                 return None if np.array_equal(kept.v[0], v) else kept.v[0]
         self._kept = onward
         return None
@@ -207,11 +214,41 @@ class EscapePlanner:
         return bool((apart.min(axis=(0, 2)) - self.query.placing.reach[moving] - strides > least).all())
 
     def _onward(self, start: Start) -> Iterator[Flight]:
-        """Flights like the one that is kept, by its manner and by its velocities, and standing still."""
+        """The flight that is kept, if it holds; flights like it, by its manner and its velocities; standing still."""
         if self._kept is not None:
-            yield self._fly(start, self._kept.manner)
-            yield self._fly(start, self._kept.manner, self._kept.v[1:])
+            kept = self._a_tick_on(self._kept)
+            if self._holds_from(kept, start):
+                yield kept
+            yield self._fly(start, kept.manner)
+            yield self._fly(start, kept.manner, kept.v)
         yield self._fly(start, self._still)
+
+    def _a_tick_on(self, flight: Flight) -> Flight:
+        """What is left of a flight after a tick."""
+        (q, _, t, watched), v = flight.start, flight.v[0]
+        begun = Start(pin.integrate(self._model, q, self._dt * v), v, t + self._dt, watched)
+        return flight._replace(start=begun, v=flight.v[1:])
+
+    def _holds_from(self, flight: Flight, start: Start) -> bool:
+        """Whether a flight that is good enough is so from a start close to its own, without another look.
+
+        The same velocities lead past the same places, but for how far the start is off, and what is lost until they are
+        reached. No point of the robot is farther off than the longest lever times the sum of that over the joints.
+        """
+        if self._obstacles.told or flight.until < start.t + self._settings.horizon - 1e-9:
+            return False
+        if not np.array_equal(flight.start.watched, start.watched):
+            return False
+        off, v = pin.difference(self._model, flight.start.q, start.q), start.v
+        most = float(np.abs(off).sum())
+        if self._accelerated:
+            for wanted in flight.v:
+                (v,) = self._towards(v, [wanted])
+                off += self._dt * (v - wanted)
+                most = max(most, float(np.abs(off).sum()))
+                if np.array_equal(v, wanted):
+                    break
+        return bool(flight.least - self._lever * most >= self._enough.distance)
 
     def _best(self, flights: Iterable[Flight], best: Flight | None = None) -> Flight:
         """The first flight that is good enough, or the best of all; no more are flown than that takes."""
@@ -232,6 +269,8 @@ class EscapePlanner:
     def _way_out(self, start: Start) -> tuple[Flight, int]:
         """The flight that is kept, as good as it is from here and now, or a better one; and attempts that are left."""
         known, attempts = self._kept, self._settings.attempts
+        if known is not None and self._holds_from(known, start):
+            return known._replace(start=start), attempts
         best = self._fly(start, self._still) if known is None else self._fly(start, known.manner, known.v)
         while attempts and best.value < self._enough:
             attempts -= 1
@@ -261,31 +300,31 @@ class EscapePlanner:
             given: velocities (nv,) of the first ticks, for as many decisions as they suffice; it flees from then on.
         """
         q, v, t, watched = start
-        horizon, distance = self._enough
-        plan = list[Array]()
+        horizon, safe = self._enough
+        end, plan = t + horizon + _BEYOND, list[Array]()
         near = self._look(q, t, v, watched)
-        before = here = near.least
+        least = before = here = near.least
         count = self._ticks - round(t / self._dt) % self._ticks
-        while here >= _TOUCH and t - start.t < horizon - 1e-9:
+        while here >= _TOUCH and t < end - 1e-9:
             wanted = given[len(plan) : len(plan) + count]
             if len(wanted) < count:
                 wanted = [self._flee(near, manner)] * count
             steps = self._towards(v, wanted)
-            ahead, span = self._moved(q, steps), count * self._dt
-            before, distance = here, min(distance, here)
+            ahead, span, before = self._moved(q, steps), count * self._dt, here
             rate = near.J @ steps[len(steps) // 2] + near.drift
-            if (near.distance + span * rate < self._enough.distance).any():
+            if (near.distance + span * rate < safe).any():
                 here = self._look(pin.interpolate(self._model, q, ahead, 0.5), t + 0.5 * span, v, watched).least
-                distance = min(distance, max(here, _TOUCH))
+                least = min(least, max(here, _TOUCH))
             if here >= _TOUCH:
                 near = self._look(ahead, t + span, steps[-1], watched)
                 here = near.least
+                least = min(least, max(here, _TOUCH))
             plan += steps
             q, v, t, count = ahead, steps[-1], t + span, self._ticks
-        clear = t - start.t
         if here < _TOUCH and plan:
-            clear -= span * (_TOUCH - here) / (before - here)
-        return Flight(Value(min(clear, horizon), distance), plan, manner)
+            t -= span * (_TOUCH - here) / (before - here)
+        value = Value(min(t - start.t, horizon), min(least, safe))
+        return Flight(start, plan, manner, value, t, least)
 
     def _moved(self, q: Array, steps: Sequence[Array]) -> Array:
         """Where the velocities (nv,) of some ticks lead from q (nq,)."""

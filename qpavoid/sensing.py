@@ -111,6 +111,11 @@ class Obstacles:
         """(k,) numbers of those that move, or are given from outside; what the robot carries is none of them."""
         return self._seen.which
 
+    @property
+    def told(self) -> bool:
+        """Whether any is given from outside, so that what was foreseen of it may change from tick to tick."""
+        return bool(self._tracks)
+
     def foreseen(self, t: float) -> Seen:
         """Where they will be at t [s], on their trajectories, or as they were last seen to move."""
         states, given = self._seen.states.copy(), list(self._tracks)
