@@ -303,7 +303,7 @@ class EscapePlanner:
         horizon, safe = self._enough
         end, plan = t + horizon + _BEYOND, list[Array]()
         near = self._look(q, t, v, watched)
-        least = before = here = near.least
+        least = here = near.least
         count = self._ticks - round(t / self._dt) % self._ticks
         while here >= _TOUCH and t < end - 1e-9:
             wanted = given[len(plan) : len(plan) + count]
@@ -313,15 +313,19 @@ class EscapePlanner:
             ahead, span, before = self._moved(q, steps), count * self._dt, here
             rate = near.J @ steps[len(steps) // 2] + near.drift
             if (near.distance + span * rate < safe).any():
-                here = self._look(pin.interpolate(self._model, q, ahead, 0.5), t + 0.5 * span, v, watched).least
-                least = min(least, max(here, _TOUCH))
+                span *= 0.5
+                t += span
+                here = self._look(pin.interpolate(self._model, q, ahead, 0.5), t, v, watched).least
             if here >= _TOUCH:
-                near = self._look(ahead, t + span, steps[-1], watched)
+                before, least = here, min(least, here)
+                t += span
+                near = self._look(ahead, t, steps[-1], watched)
                 here = near.least
-                least = min(least, max(here, _TOUCH))
             plan += steps
-            q, v, t, count = ahead, steps[-1], t + span, self._ticks
-        if here < _TOUCH and plan:
+            q, v, count = ahead, steps[-1], self._ticks
+        if here >= _TOUCH:
+            least = min(least, here)
+        elif plan:
             t -= span * (_TOUCH - here) / (before - here)
         value = Value(min(t - start.t, horizon), min(least, safe))
         return Flight(start, plan, manner, value, t, least)
