@@ -12,7 +12,15 @@ from qpavoid.avoidance import row_form
 from qpavoid.config import Avoidance, Limits
 from qpavoid.contacts import ContactRows, tracking_within
 from qpavoid.kernels.layout import RowLayout
-from qpavoid.kinematics import ForwardKinematics, Kinematics, chains, columns, longest_lever, support_masks
+from qpavoid.kinematics import (
+    ForwardKinematics,
+    Kinematics,
+    chains,
+    column_joints,
+    columns,
+    longest_lever,
+    support_masks,
+)
 from qpavoid.limits import JointBounds, limit_layout
 from qpavoid.motion import Sample
 from qpavoid.problem import Array, AvoidanceRows, Problem, Proximity, Tracking
@@ -50,7 +58,7 @@ class _StopAhead:
         self._way = np.zeros((_MOST_TICKS, len(layout.v_last)))
 
     def way(self, q: Array, v: Array, w: Array) -> Array:
-        """See `kernels.vectorised.stop_way`; a view of memory that the next call overwrites."""
+        """See `kernels.vectorised.stops.stop_way`; a view of memory that the next call overwrites."""
         self._way[0] = v
         return self._way[: kernels.stop_way(self._packed, q, w, self._way)]
 
@@ -70,8 +78,9 @@ class Assembly:
         damping: float,
         dt: float,
         contacts: ContactRows | None = None,
+        looks_ahead: bool = False,
     ) -> None:
-        """Lays the memory out; see `Controller` for the arguments."""
+        """Lays the memory out; see `Controller` for the arguments, and `RowLayout` for `looks_ahead`."""
         frames, self._others = in_order(tasks)
         pairs, nv = len(scene.pairs), scene.robot.model.nv
         self._pairs, self._masks = scene.pairs, support_masks(scene.robot.model)
@@ -89,7 +98,9 @@ class Assembly:
             twists=query.placing.twists,
             twist_row=query.twist_row,
             margin=query.placing.margin,
-            joint_velocities=kinematics.joint_velocities,
+            joint_poses=kinematics.joint_poses,
+            parents=np.array(list(scene.robot.model.parents), dtype=np.intp),
+            column_joints=column_joints(scene.robot.model),
             joint_reach=joint_reach,
             carriers=query.carriers(),
             turning=turning,
@@ -106,6 +117,8 @@ class Assembly:
             v0=np.zeros(nv),
             lever=longest_lever(scene.robot.model, query.longest_reach()),
             damping=damping,
+            # with jerk limits, a stop goes another way; with contacts, v0 does
+            looks_ahead=looks_ahead and contacts is None and not np.isfinite(bounds.jerk).any(),
             **row_form(avoidance),
         )
         x = self._layout
@@ -143,14 +156,14 @@ class Assembly:
         if self._contacts is not None:
             held = self._contacts.update(self._forward)
             x.v_last[:] = held.held(x.v_last)
-        k, worst = kernels.assemble(self._packed, q, query.pairs, reach, query.placing.moving)
+        k, worst, clear = kernels.assemble(self._packed, q, query.pairs, reach, query.placing.moving)
         proximity, rows = self._views.get(k) or self._view(k)
         if held is not None:
             x.v0[:] = tracking_within(held, x.A, x.b, x.damping)
             worst = float(kernels.tracking_shortfall(self._packed, k))
         bounds = x.lower, x.upper, *self._hard, x.v_stop
         return proximity, Problem(
-            self._tracking, rows, *bounds, *self._names, x.v0, worst, held, self._levels, x.jerked
+            self._tracking, rows, *bounds, *self._names, x.v0, worst, held, self._levels, x.jerked, clear
         )
 
     def carry(self, query: DistanceQuery) -> None:
@@ -164,7 +177,7 @@ class Assembly:
     def closest_call(self, v: Array, near: int, reach: float, horizon: float, stop: Stop | None = None) -> float:
         """A bound below what is left of the safe distances on the way of v until `horizon` [m].
 
-        See `kernels.vectorised.closest_call`; v is that of the last `ForwardKinematics.move`.
+        See `kernels.vectorised.ahead.closest_call`.
 
         Args:
             v: velocity (nv,).
@@ -185,7 +198,7 @@ class Assembly:
         return turned * (turned * x.lever + 2.0 * slid)
 
     def stop(self, q: Array, v: Array) -> Stop:
-        """A tick at v and the stop after it, where jerks have limits; brings the kinematics to another velocity.
+        """A tick at v and the stop after it, where jerks have limits.
 
         All of it is along v and the change that has led to v, but for what position and velocity limits forbid.
 
@@ -203,11 +216,8 @@ class Assembly:
         beside = way - shares[:, None] * v
         parts = beside @ across / max(float(across @ across), 1e-300)
         beside -= parts[:, None] * across
-        self._forward.move(q, across)
-        twists = x.joint_velocities
-        speeds = np.sqrt(np.square(twists[:, :3]).sum(axis=1))
-        speeds += x.joint_reach * np.sqrt(np.square(twists[:, 3:]).sum(axis=1))
-        aside = np.abs(parts) * speeds.max()
+        kernels.joint_speeds(self._packed, across)
+        aside = np.abs(parts) * x.speeds[: len(x.joint_poses)].max()
         if (np.abs(beside).max(axis=0) > _ROUND_OFF * x.v_step).any():
             turned, slid = np.abs(beside) @ x.turning.T, np.abs(beside) @ x.sliding.T
             aside += turned.max(axis=1) * x.lever + slid.max(axis=1)
@@ -218,7 +228,7 @@ class Assembly:
         x = self._layout
         x.v0[:] = v if problem.contacts is None else problem.contacts.held(v)
         worst = float(kernels.tracking_shortfall(self._packed, len(problem.avoidance.d)))
-        return problem._replace(tracking=Tracking(self._eye, x.v0, 0.0), shortfall=worst, levels=())
+        return problem._replace(tracking=Tracking(self._eye, x.v0, 0.0), shortfall=worst, levels=(), clear=False)
 
     def redirected(self, problem: Problem, frame: int, velocity: Array) -> Problem:
         """The problem of this tick with a velocity (3,) added to the linear one that a task asks for [m/s].
@@ -241,7 +251,7 @@ class Assembly:
         x.b[:] = b
         near = problem.avoidance
         worst = float(kernels.shortfall(v0, near.J, near.b, x.lower, x.upper))
-        return problem._replace(tracking=tracking, v0=v0, shortfall=worst)
+        return problem._replace(tracking=tracking, v0=v0, shortfall=worst, clear=False)
 
     def fastest_frame(self) -> int:
         """The task that asks for the largest linear speed; -1 where no frame has a position to follow."""

@@ -17,7 +17,7 @@ from scipy.linalg.lapack import dgeqp3, dorgqr, dtrtrs
 
 from qpavoid import config
 from qpavoid.errors import ConfigError
-from qpavoid.kernels.vectorised import rotation_vector
+from qpavoid.kernels.rotation import rotation_vector
 from qpavoid.kinematics import ForwardKinematics
 from qpavoid.problem import Array, Contacts
 from qpavoid.robot import Robot

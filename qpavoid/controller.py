@@ -24,7 +24,18 @@ from qpavoid.kinematics import ForwardKinematics, Kinematics
 from qpavoid.limits import saturate
 from qpavoid.loading import nearest
 from qpavoid.motion import Sample
-from qpavoid.problem import Array, Problem, Proximity, Solution, State, Status, as_vector, not_finite, require_finite
+from qpavoid.problem import (
+    Array,
+    Problem,
+    Proximity,
+    Solution,
+    State,
+    Status,
+    as_vector,
+    not_finite,
+    require_finite,
+    sane,
+)
 from qpavoid.progress import ProgressWatch
 from qpavoid.proximity import DistanceQuery
 from qpavoid.robot import Robot
@@ -111,10 +122,10 @@ class Controller:
         self._q_last = scene.robot.home.copy()
         self._assembly = Assembly(
             scene, self.tasks, self._bounds, self._kinematics, self._query, self.avoidance,
-            self.limits, tracking_damping, dt, contacts,
+            self.limits, tracking_damping, dt, contacts, self.solver.bounded and self.avoidance.look_ahead,
         )  # fmt: skip
         self._guard = Guard(
-            scene, self._kinematics, self._bounds, self.limits.position_gain,
+            scene, self._bounds, self.limits.position_gain,
             self.avoidance.hold - self.avoidance.offset, dt,
         )  # fmt: skip
         self._escape: EscapePlanner | None = None
@@ -336,22 +347,22 @@ class Controller:
         faults: tuple[str, ...] = ()
         if v is not None:
             v = as_vector("v", v, self._v_shape)
-            if isfinite(np.vdot(v, v)):
+            if sane(v):
                 self._assembly.measured(v)
             else:
                 faults = (not_finite("v", v),)
         try:
-            known = isfinite(np.vdot(q, q) + t)
+            known = sane(q) and isfinite(t)
         except TypeError:
             raise NumericalError(f"t: not a number: {t!r:.60}") from None
         if not known:
-            if not isfinite(np.vdot(q, q)):
+            if not sane(q):
                 faults += (not_finite("q", q),)
                 q = self._expected()
             if not isfinite(t):
                 faults, t = (*faults, f"t: {t}"), 0.0
         self._q_last[:] = q
-        if desired is not None and not isfinite(np.vdot(desired, desired)):
+        if desired is not None and not sane(desired):
             faults += (not_finite("v_desired", desired),)
             desired = np.zeros(self._v_shape)
         samples = self._targets(t, targets)
@@ -397,7 +408,7 @@ class Controller:
                 problem = self._progress.redirect(problem, proximity, self._assembly, self.solver)
             solution = self.solver.solve(problem)
             v = solution.v
-            usable = v.dtype == np.float64 and v.shape == self._v_shape and isfinite(np.vdot(v, v))
+            usable = v.dtype == np.float64 and v.shape == self._v_shape and sane(v)
         except Exception as error:  # a law of the user's own may raise anything; the robot must get a velocity
             return _stop(problem, (f"the solver raised {type(error).__name__}: {error}",))
         if not usable:
@@ -451,14 +462,20 @@ class Controller:
     def _targets(self, t: float, given: Mapping[str, Any] | None) -> tuple[Any, ...]:
         if not given:
             return tuple([task.motion.sample(t) for task in self.tasks])
-        checked = {}
-        for name, target in given.items():
-            if name not in self._task_names:
-                raise UnknownName(f"no target {name!r}{nearest(name, self._task_names)}")
-            checked[name] = self._task_names[name].as_target(f"target {name!r}", target)
-        return tuple(
-            [checked[name] if name in checked else task.motion.sample(t) for name, task in self._task_names.items()]
-        )
+        samples, known = [], 0
+        for name, task in self._task_names.items():
+            if name in given:
+                try:
+                    samples.append(task.as_target(given[name]))
+                except NumericalError as error:
+                    raise NumericalError(f"target {name!r}: {error}") from None
+                known += 1
+            else:
+                samples.append(task.motion.sample(t))
+        if known < len(given):
+            name = next(name for name in given if name not in self._task_names)
+            raise UnknownName(f"no target {name!r}{nearest(name, self._task_names)}")
+        return tuple(samples)
 
 
 def _name(solver: Solver | str) -> str:

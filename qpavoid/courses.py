@@ -2,8 +2,9 @@
 
 A row is the *state* of a body: rotation by columns, position, linear and angular velocity, all in world axes (18,).
 Every trajectory of `qpavoid.motion` is cut into pieces on which the state is a weighted sum of constant ones, with
-weights that follow from the time alone (`kernels.motions.Pieces`): rest, a straight line (p0, Δp), the shortest turn by
-Rodrigues' formula (R0 + [a]² R0, [a] R0, -[a]² R0), a circle (c, w, u). A trajectory of another class is sampled alone.
+weights that follow from the time alone (`kernels.vectorised.motions.Pieces`): rest, a straight line (p0, Δp), the
+shortest turn by Rodrigues' formula (R0 + [a]² R0, [a] R0, -[a]² R0), a circle (c, w, u). A trajectory of another class
+is sampled alone.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from qpavoid import kernels
-from qpavoid.kernels.motions import Pieces
+from qpavoid.kernels.vectorised.motions import Pieces
 from qpavoid.motion import END_TOLERANCE, Motion, Orbit, Polyline, Sample, Still
 from qpavoid.problem import Array
 

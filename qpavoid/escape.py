@@ -375,7 +375,7 @@ class EscapePlanner:
 def _farthest(A: Array, d: Array, comfort: float, v: Array, lower: Array, upper: Array) -> Array | None:
     """v (nv,) with the largest s, A v + d >= s, s <= comfort, close to the one given; None where none is found."""
     if kernels.ACCELERATED:
-        from qpavoid.kernels.active_set import farthest
+        from qpavoid.kernels.compiled.active_set import farthest
 
         w, met = farthest(A, d, comfort, _DEEPEST, _GENTLE, v, lower, upper)
         return w if met else None

@@ -8,7 +8,7 @@ bends less; and that is drawn back towards the stop of this tick, whose way was 
 stop that was found clear is always at hand, as long as obstacles do what they were last seen to do, for one tick.
 
 Most ticks need none of this: where no body moves fast enough to use up what is left of a distance before the robot
-could stop, the velocity is clear as it is (`kernels.vectorised.closest_call`, with the bound and its proof).
+could stop, the velocity is clear as it is (`kernels.vectorised.ahead.closest_call`, with the bound and its proof).
 """
 
 from __future__ import annotations
@@ -23,8 +23,7 @@ import pinocchio as pin
 
 from qpavoid.assembly import Assembly
 from qpavoid.courses import move_on
-from qpavoid.kernels.vectorised import speed_to_stop
-from qpavoid.kinematics import ForwardKinematics
+from qpavoid.kernels.vectorised.bounds import speed_to_stop
 from qpavoid.limits import JointBounds
 from qpavoid.problem import Array, IntArray, Problem, Solution
 from qpavoid.proximity import DistanceQuery
@@ -85,7 +84,6 @@ class Guard:
     def __init__(
         self,
         scene: Scene,
-        kinematics: ForwardKinematics,
         bounds: JointBounds,
         position_gain: float,
         hold: float,
@@ -95,13 +93,12 @@ class Guard:
 
         Args:
             scene: robot and obstacles.
-            kinematics: of the tick, brought to the velocities that are looked at.
             bounds: limits of the joints.
             position_gain: share of the room to a position limit that one tick may use [-].
             hold: safe distance between surfaces [m].
             dt: how long a velocity is held [s].
         """
-        self._model, self._kinematics, self._hold, self._dt = scene.robot.model, kinematics, hold, dt
+        self._model, self._hold, self._dt = scene.robot.model, hold, dt
         self._data, self._ahead = scene.robot.model.createData(), DistanceQuery(scene)
         self._bounds, self._rate = bounds, position_gain / dt
         self._acceleration, self._accelerated = bounds.acceleration, bool(np.isfinite(bounds.acceleration).any())
@@ -146,10 +143,11 @@ class Guard:
             reach: surface distance up to which they were looked for [m].
         """
         v, v_stop, rows = solution.v, problem.v_stop, problem.avoidance
+        if problem.clear and v.tobytes() == problem.v0.tobytes():
+            return None
         near = rows.pair
         stop = assembly.stop(q, v) if self._jerked else None
         horizon = self._dt + 0.5 * self._stopping(v) if stop is None else float(stop.forwards.sum())
-        self._kinematics.move(q, v)
         if assembly.closest_call(v, len(near), reach, horizon, stop) > 0.0:
             return None
         self._given[:] = 0.0

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from qpavoid.memory import read_poses, read_velocities, view_poses, view_velocities
+from qpavoid.memory import read_poses, view_poses
 from qpavoid.problem import Array, IntArray
 
 TRANSLATIONS = {
@@ -59,16 +59,14 @@ class ForwardKinematics:
         self.data = model.createData()
         self._model, self._ids = model, list(frame_ids)
         pin.framesForwardKinematics(model, self.data, pin.neutral(model))
-        pin.forwardKinematics(model, self.data, pin.neutral(model), np.arange(1.0, 1.0 + model.nv))
-        view, motions = view_poses(self.data.oMf), view_velocities(self.data.v)
-        self._copy, self._copy_velocities = view is None, motions is None
+        view, joints = view_poses(self.data.oMf), view_poses(self.data.oMi)
+        self._copy, self._copy_joints = view is None, joints is None
         self.J: Array = self.data.J.reshape(6, model.nvExtended, order="F")  # of one joint, it comes as a vector
         """(6, e) see `Kinematics.J`."""
         self.frame_poses: Array = read_poses(self.data.oMf) if view is None else view
         """(frames, 12) world poses of all frames; only those of `frame_ids` are kept up to date."""
-
-        self.joint_velocities: Array = read_velocities(self.data.v) if motions is None else motions
-        """(njoints, 6) linear velocity of each joint's origin and angular velocity, in the joint's axes."""
+        self.joint_poses: Array = read_poses(self.data.oMi) if joints is None else joints
+        """(njoints, 12) world poses of all joints."""
 
     def compute(self, q: Array) -> None:
         """Brings everything to a configuration q (nq,); `data` then holds the joint placements."""
@@ -78,12 +76,8 @@ class ForwardKinematics:
             pin.updateFramePlacement(model, data, frame_id)
         if self._copy:
             self.frame_poses[:] = read_poses(data.oMf)
-
-    def move(self, q: Array, v: Array) -> None:
-        """Brings `joint_velocities` to velocity v (nv,) at the configuration q (nq,)."""
-        pin.forwardKinematics(self._model, self.data, q, v)
-        if self._copy_velocities:
-            self.joint_velocities[:] = read_velocities(self.data.v)
+        if self._copy_joints:
+            self.joint_poses[:] = read_poses(data.oMi)
 
 
 def columns(model: Any) -> IntArray:
@@ -93,6 +87,12 @@ def columns(model: Any) -> IntArray:
         width = joint.nvExtended
         index[joint.idx_vExtended : joint.idx_vExtended + width] = np.arange(joint.idx_v, joint.idx_v + width)
     return index
+
+
+def column_joints(model: Any) -> IntArray:
+    """Which joint each of the e columns of the world Jacobian belongs to (e,)."""
+    widths = [joint.nvExtended for joint in list(model.joints)[1:]]  # that of the world counts for nothing
+    return np.repeat(np.arange(1, model.njoints), widths)
 
 
 def chains(model: Any) -> tuple[Array, Array]:

@@ -48,17 +48,6 @@ def view_poses(poses: Any, writeable: bool = False) -> Array | None:
     return view if view is not None and np.array_equal(view, read_poses(poses)) else None
 
 
-def read_velocities(motions: Any) -> Array:
-    """Spatial velocities through the accessors: linear, then angular (n, 6)."""
-    return np.array([motion.vector for motion in motions]).reshape(-1, 6)
-
-
-def view_velocities(motions: Any) -> Array | None:
-    """The same as a view, or None where it does not agree with the accessors."""
-    view = _view([_address(motion.linear) for motion in motions], 6)
-    return view if view is not None and np.array_equal(view, read_velocities(motions)) else None
-
-
 def read_results(results: Any) -> Array:
     """Distance results through the accessors (m, RESULT)."""
     rows = [(r.min_distance, *r.normal, *r.getNearestPoint1(), *r.getNearestPoint2()) for r in results]

@@ -10,7 +10,7 @@ import pinocchio as pin
 from qpavoid import kernels
 from qpavoid.courses import STATE, as_samples, put
 from qpavoid.errors import NumericalError
-from qpavoid.kernels.motions import Placed
+from qpavoid.kernels.vectorised.motions import Placed
 from qpavoid.memory import read_poses, view_poses
 from qpavoid.motion import Sample
 from qpavoid.problem import Array, IntArray

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import Enum
+from math import hypot
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +19,9 @@ from qpavoid.errors import NumericalError
 
 Array = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.intp]
+Mask = npt.NDArray[np.bool_]
+_ABSURD = 1e150
+"""Length that no vector of a robot has."""
 
 
 class Status(str, Enum):
@@ -161,6 +165,8 @@ class Problem(NamedTuple):
     """Which rows of `tracking` belong to each priority, the first one first; empty where all have the same."""
     jerked: bool = False
     """Whether `lower` and `upper` keep to jerk limits, beside those of accelerations."""
+    clear: bool = False
+    """Whether v0 is safe and known to lead nowhere near anything, nor a stop from it."""
 
 
 def make_problem(
@@ -242,6 +248,11 @@ def as_vector(name: str, value: Any, shape: tuple[int, ...]) -> Array:
     return array
 
 
+def sane(v: Array) -> bool:
+    """Whether a vector (n,) is finite and not absurdly large; for a few dozen numbers, quicker than numpy."""
+    return hypot(*v.tolist()) < _ABSURD
+
+
 def require_finite(name: str, value: Any, shape: tuple[int, ...]) -> Array:
     """`value` as a float array of `shape`.
 
@@ -255,6 +266,6 @@ def require_finite(name: str, value: Any, shape: tuple[int, ...]) -> Array:
 
 
 def not_finite(name: str, array: Array) -> str:
-    """What is wrong with an array whose sum of squares is not finite; names the argument and where."""
+    """What is wrong with an array that is not `sane`; names the argument and where."""
     bad = np.argwhere(~np.isfinite(array)).ravel()[:5].tolist()
     return f"{name}: NaN or infinity at index {', '.join(map(str, bad))}" if bad else f"{name}: absurdly large"

@@ -277,7 +277,8 @@ class _Cull:
         self._found = np.zeros(len(scene.pairs), dtype=np.intp)
         self.active = np.ones(len(scene.pairs), dtype=bool)
         """(m,) which pairs are on."""
-        self._last = b""
+        self._last = np.arange(len(scene.pairs)).tobytes()
+        kernels.in_one_alone(self._found, np.frombuffer(self._last, dtype=np.intp))  # so that no tick compiles it
 
     def place_points(self, indices: IntArray, positions: Array) -> None:
         """Moves the bounding spheres of several geometries (k,), whose centres are their origins (k, 3)."""
@@ -298,13 +299,11 @@ class _Cull:
             self._query.poses, self._local, self._centers, self._within, self._pair_of, self._found
         )
         pairs = self._found[:count]
-        if pairs.tobytes() != self._last:
-            self._last = pairs.tobytes()
-            wanted = np.zeros_like(self.active)
-            wanted[pairs] = True
-            for pair in np.flatnonzero(wanted & ~self.active).tolist():
-                self._data.activateCollisionPair(pair)
-            for pair in np.flatnonzero(self.active & ~wanted).tolist():
-                self._data.deactivateCollisionPair(pair)
-            self.active = wanted
+        now = pairs.tobytes()
+        if now != self._last:
+            changed = kernels.in_one_alone(pairs, np.frombuffer(self._last, dtype=np.intp))
+            self._last = now
+            self.active[changed] ^= True
+            for pair, on in zip(changed.tolist(), self.active[changed].tolist(), strict=True):
+                (self._data.activateCollisionPair if on else self._data.deactivateCollisionPair)(pair)
         return pairs

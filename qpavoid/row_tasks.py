@@ -13,7 +13,7 @@ import pinocchio as pin
 
 from qpavoid import config
 from qpavoid.errors import NumericalError
-from qpavoid.kernels.vectorised import rotation_vector
+from qpavoid.kernels.rotation import rotation_vector
 from qpavoid.kinematics import ForwardKinematics, columns, support_masks
 from qpavoid.problem import Array, IntArray, as_vector
 from qpavoid.sensing import as_goal
@@ -75,17 +75,15 @@ class RowTask:
         """Writes its rows at q (nq,), for which the kinematics are up to date."""
         raise NotImplementedError
 
-    def as_target(self, where: str, value: Any) -> Any:
+    def as_target(self, value: Any) -> Any:
         """A target that was given at run time, checked: here, a `Sample` or a `Pose` that rests.
 
         Raises:
-            NumericalError: of the wrong kind or shape, or the task has no target; `where` names it.
+            NumericalError: of the wrong kind or shape, or the task has no target.
         """
         if isinstance(self.motion, Constant) and self.motion.value is None:
-            raise NumericalError(
-                f"{where}: a task of type {getattr(self.settings, 'type', '?')} takes none; leave it out"
-            )
-        return as_goal(where, value)
+            raise NumericalError(f"a task of type {getattr(self.settings, 'type', '?')} takes none; leave it out")
+        return as_goal(value)
 
     def _write(self, J: Array, wanted: Array, error: Array) -> None:
         np.multiply(J, self.scale[:, None], out=self._A)
@@ -169,9 +167,9 @@ class Posture(Damping):
         np.multiply(error, self._asked, out=self._b)
         self.error = _length(error)
 
-    def as_target(self, where: str, value: Any) -> Any:
+    def as_target(self, value: Any) -> Any:
         """A configuration (nq,)."""
-        return as_vector(where, value, (self._model.nq,))
+        return as_vector("q", value, (self._model.nq,))
 
 
 class Axis(RowTask):
@@ -208,9 +206,9 @@ class Axis(RowTask):
             wanted -= across @ target.linear / distance
         self._write(rates, wanted, np.array([angle]))
 
-    def as_target(self, where: str, value: Any) -> Any:
+    def as_target(self, value: Any) -> Any:
         """A `Sample` of the point to look at, or a direction (3,) to align with."""
-        return as_goal(where, value) if self._looks else as_vector(where, value, (3,))
+        return as_goal(value) if self._looks else as_vector("direction", value, (3,))
 
 
 class Manipulability(RowTask):

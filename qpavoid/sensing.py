@@ -8,14 +8,13 @@ left out goes on at its last twist; after `stale_after` its distances shrink by 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from math import isfinite
 from typing import Any, NamedTuple
 
 import numpy as np
-import pinocchio as pin
 from numpy.typing import ArrayLike
 
+from qpavoid import kernels
 from qpavoid.cloud import Points, Voxels
 from qpavoid.config import PointCloud, Sensing
 from qpavoid.courses import STATE, Courses, as_samples, move_on, put
@@ -71,17 +70,6 @@ class Observation(NamedTuple):
     """Why the robot has to stop; empty if it has not."""
 
 
-@dataclass
-class _Track:
-    """One obstacle that is given from outside."""
-
-    sample: Sample
-    """As it was given last, with an estimated twist where none was."""
-    estimated: bool
-    age: int = 0
-    """Ticks since then."""
-
-
 class Obstacles:
     """Keeps track of the obstacles of a scene."""
 
@@ -90,11 +78,15 @@ class Obstacles:
         self._index = {obstacle.name: i for i, obstacle in enumerate(obstacles)}
         self._moving = [i for i, obstacle in enumerate(obstacles) if obstacle.moves]
         self._courses = Courses({i: obstacles[i].motion for i in self._moving})
-        self._tracks: dict[int, _Track] = {}
         self._now = 0.0
         self._carried: set[int] = set()
-        self._seen = Seen(np.array(self._moving, np.intp), np.zeros((len(obstacles), STATE)), np.zeros(len(obstacles)))
-        self._views = as_samples(self._seen.states)
+        count = len(obstacles)
+        self._seen = Seen(np.array(self._moving, np.intp), np.zeros((count, STATE)), np.zeros(count))
+        self._known: dict[int, None] = {}  # those that are given from outside, in the order in which they were first
+        self._age = np.full(count, -1)  # ticks since each was given last, negative if it never was
+        self._last, self._news = np.zeros((count, STATE)), np.zeros((count, STATE))  # as it was given then, and now
+        self._views = [as_samples(states) for states in (self._seen.states, self._last, self._news)]
+        self._by_pose = [f"{obstacle.name}: twist estimated from its poses" for obstacle in obstacles]
 
     def index(self, name: str) -> int:
         """Number of an obstacle.
@@ -114,13 +106,14 @@ class Obstacles:
     @property
     def told(self) -> bool:
         """Whether any is given from outside, so that what was foreseen of it may change from tick to tick."""
-        return bool(self._tracks)
+        return bool(self._known)
 
     def foreseen(self, t: float) -> Seen:
         """Where they will be at t [s], on their trajectories, or as they were last seen to move."""
-        states, given = self._seen.states.copy(), list(self._tracks)
+        states, given = self._seen.states.copy(), list(self._known)
         last_seen = states[given]
-        move_on(last_seen, t - self._now)
+        if given:
+            move_on(last_seen, t - self._now)
         self._courses.sample(t, states)
         for index, motion in self._courses.others.items():
             put(as_samples(states)[index], motion.sample(t))
@@ -130,7 +123,7 @@ class Obstacles:
     def carry(self, index: int, carried: bool) -> None:
         """Takes an obstacle as carried by the robot, or as resting where it was put down, until it is given again."""
         self._moving = [i for i in self._moving if i != index]
-        self._tracks.pop(index, None)
+        self._forget(index)
         (self._carried.add if carried else self._carried.discard)(index)
         self._renew()
 
@@ -145,91 +138,87 @@ class Obstacles:
             UnknownName: there is no such obstacle.
             NumericalError: an entry of the wrong shape, or not made of numbers.
         """
-        if not given and not self._moving and not self._tracks:
+        if not given and not self._moving and not self._known:
             return None
         self._now = t
-        known = len(self._tracks)
         self._follow(t)
-        fresh, voxels, notes = self._read(t, given or {})
-        for index, what in fresh.items():
-            if isinstance(what, Pose):
-                sample, view = self._with_twist(index, what), self._views[index]
-                view.linear[:], view.angular[:] = sample.linear, sample.angular
-                self._tracks[index] = _Track(sample, estimated=True)
-            else:
-                self._tracks[index] = _Track(what, estimated=False)
-        if len(self._tracks) != known:
-            self._renew()
-        stop: list[str] = []
         self._seen.margin.fill(0.0)
-        for index, track in self._tracks.items():
+        notes: list[str] = []
+        stop: list[str] = []
+        fresh, voxels = self._read(t, given, notes) if given else (set(), {})
+        for index in self._known:
             if index not in fresh:
-                track.age += 1
-                put(self._views[index], track.sample)
-                self._predict(index, track.age * self._dt, notes, stop)
-            elif track.estimated:
-                notes.append(f"{self._obstacles[index].name}: twist estimated from its poses")
+                self._predict(index, notes, stop)
         return Observation(self._seen, voxels, tuple(notes), tuple(stop))
 
     def reset(self) -> None:
         """Forgets what was given."""
-        self._tracks.clear()
+        for index in list(self._known):
+            self._forget(index)
         self._renew()
+
+    def _forget(self, index: int) -> None:
+        self._known.pop(index, None)
+        self._age[index] = -1
 
     def _renew(self) -> None:
         """Lays out anew of which obstacles there is news in every tick."""
-        self._seen = self._seen._replace(which=np.array(sorted({*self._moving, *self._tracks}), dtype=np.intp))
+        self._seen = self._seen._replace(which=np.array(sorted({*self._moving, *self._known}), dtype=np.intp))
 
     def _follow(self, t: float) -> None:
         """Brings the states of those that follow a trajectory to time t [s]."""
         self._courses.sample(t, self._seen.states)
         for index, motion in self._courses.others.items():
-            if index in self._moving and index not in self._tracks:
-                put(self._views[index], motion.sample(t))
+            if index in self._moving and index not in self._known:
+                put(self._views[0][index], motion.sample(t))
 
     def _read(
-        self, t: float, given: Mapping[str, Sample | Pose | Points]
-    ) -> tuple[dict[int, Sample | Pose], dict[int, Voxels], list[str]]:
-        """Poses and voxels by number of the obstacle, with notes on what is not taken."""
-        fresh: dict[int, Sample | Pose] = {}
+        self, t: float, given: Mapping[str, Sample | Pose | Points], notes: list[str]
+    ) -> tuple[set[int], dict[int, Voxels]]:
+        """Takes in what is given: numbers of those of which something is known now, and the voxels of clouds."""
+        which, posed = [], []
         voxels: dict[int, Voxels] = {}
-        notes: list[str] = []
         for name, what in given.items():
             index = self.index(name)
             if index in self._carried:
                 notes.append(f"{name}: carried by the robot, what is given of it is not read")
-            elif type(what) is Points:
-                if not self._look_at(index, what, t, fresh, voxels, notes):
-                    self._tracks.setdefault(index, self._unseen(index, t))
-            else:
-                fresh[index] = as_sample(f"obstacle {name!r}", what)
-        for index in self._unusable(fresh):
+                continue
+            if type(what) is Points:
+                seen = self._look_at(index, what, notes)
+                if seen is None or what.pose is None:
+                    self._begin(index, t)
+                if seen is None:
+                    continue
+                voxels[index], what = seen, self._views[1][index] if what.pose is None else what.pose
+            sample = _checked(name, what)
+            for view, part in zip(self._views[2][index], sample):  # noqa: B905 (a bare pose has only the first two)
+                view[:] = part
+            which.append(index)
+            posed.append(len(sample) == 2)
+        if not which:
+            return set(), voxels
+        numbers, bare = np.array(which), np.array(posed)
+        fine = kernels.take_in(numbers, bare, self._news, self._age, self._last, self._seen.states, self._dt)
+        for index in numbers[~fine].tolist():
             notes.append(f"{self._obstacles[index].name}: NaN or infinity in its pose or twist, taken as not given")
-            del fresh[index]
             voxels.pop(index, None)
-            self._tracks.setdefault(index, self._unseen(index, t))
-        return fresh, voxels, notes
+            self._begin(index, t)
+        notes += [self._by_pose[index] for index in numbers[fine & bare].tolist()]
+        fresh = set(numbers[fine].tolist())
+        if not fresh <= self._known.keys():
+            self._known |= dict.fromkeys(numbers[fine].tolist())
+            self._renew()
+        return fresh, voxels
 
-    def _unusable(self, fresh: Mapping[int, Sample | Pose]) -> list[int]:
-        """Numbers of those with NaN or infinity; puts what is given into the states."""
-        if not fresh:
-            return []
-        for index, what in fresh.items():
-            put(self._views[index], what if isinstance(what, Sample) else Sample(*what, _AT_REST, _AT_REST))
-        which = np.array(list(fresh))
-        usable = np.isfinite(self._seen.states[which]).all(axis=1)
-        return [] if usable.all() else which[~usable].tolist()
+    def _begin(self, index: int, t: float) -> None:
+        """Takes an obstacle of which nothing was given that can be used to be where its motion has it."""
+        if index not in self._known:
+            put(self._views[1][index], self._obstacles[index].motion.sample(t))
+            self._known[index], self._age[index] = None, 0
+            self._renew()
 
-    def _look_at(
-        self,
-        index: int,
-        what: Points,
-        t: float,
-        fresh: dict[int, Sample | Pose],
-        voxels: dict[int, Voxels],
-        notes: list[str],
-    ) -> bool:
-        """Takes a picture of a camera in; false where none of its points can be used."""
+    def _look_at(self, index: int, what: Points, notes: list[str]) -> Voxels | None:
+        """What a picture of a camera shows; None where none of its points can be used."""
         name, shape = self._obstacles[index].name, self._obstacles[index].shape
         if not isinstance(shape, PointCloud):
             raise NumericalError(f"obstacle {name!r}: points of a {shape.type}; give a Sample or a Pose")
@@ -248,34 +237,21 @@ class Obstacles:
             bad = f"{seen.dropped} of {seen.given} points are NaN, infinite or more than 100 m away"
             if seen.dropped == seen.given:
                 notes.append(f"{name}: {bad}, taken as not given")
-                return False
+                return None
             notes.append(f"{name}: {bad}, dropped")
-        before = self._tracks.get(index)
-        last = before.sample if before else self._obstacles[index].motion.sample(t)
-        fresh[index] = last if what.pose is None else as_sample(f"obstacle {name!r}", what.pose)
-        voxels[index] = seen
-        return True
+        return seen
 
-    def _unseen(self, index: int, t: float) -> _Track:
-        return _Track(self._obstacles[index].motion.sample(t), estimated=False)
-
-    def _with_twist(self, index: int, pose: Pose) -> Sample:
-        """A pose with the twist that has led to it since the last one; at rest if it is the first."""
-        before = self._tracks.get(index)
-        if before is None:
-            return Sample(*pose, _AT_REST, _AT_REST)
-        elapsed = (before.age + 1) * self._dt
-        linear = (pose.position - before.sample.position) / elapsed
-        return Sample(*pose, linear, pin.log3(pose.rotation @ before.sample.rotation.T) / elapsed)
-
-    def _predict(self, index: int, age: float, notes: list[str], stop: list[str]) -> None:
-        """Moves an obstacle on from where it was last seen, `age` seconds ago."""
+    def _predict(self, index: int, notes: list[str], stop: list[str]) -> None:
+        """Moves an obstacle of which there is no news on from where it was last seen."""
+        self._age[index] += 1
         name, config, margin = self._obstacles[index].name, self._config, 0.0
+        age = float(self._age[index]) * self._dt
         if config.stale_after is not None and age > config.stale_after:
             margin = config.margin_growth * (age - config.stale_after)
             notes.append(f"{name}: not seen for {age:.3f} s, margin {1e3 * margin:.0f} mm")
             if config.stop_after is not None and age > config.stop_after:
                 stop.append(f"{name}: not seen for {age:.3f} s")
+        self._seen.states[index] = self._last[index]
         move_on(self._seen.states[index : index + 1], age)
         self._seen.margin[index] = margin
 
@@ -283,11 +259,18 @@ class Obstacles:
 _SHAPES = {"position": (3,), "rotation": (3, 3), "linear": (3,), "angular": (3,)}
 
 
-def as_sample(name: str, what: Any) -> Any:
+def _checked(obstacle: str, what: Any) -> Any:
+    try:
+        return as_sample(what)
+    except NumericalError as error:
+        raise NumericalError(f"obstacle {obstacle!r}: {error}") from None
+
+
+def as_sample(what: Any) -> Any:
     """A sample or pose whose parts are float arrays of the right shapes, whatever their numbers are.
 
     Raises:
-        NumericalError: wrong shapes, or not numbers; names the argument and its part.
+        NumericalError: wrong shapes, or not numbers; names the part.
     """
     kind = type(what)
     if kind is Sample or kind is Pose:
@@ -298,16 +281,13 @@ def as_sample(name: str, what: Any) -> Any:
         except AttributeError:
             pass
     if not isinstance(what, (Sample, Pose)):
-        raise NumericalError(f"{name}: neither a Sample nor a Pose: {what!r:.60}")
-    parts = [
-        as_vector(f"{name}: {field}", part, _SHAPES[field]) for field, part in zip(what._fields, what, strict=True)
-    ]
-    return type(what)(*parts)
+        raise NumericalError(f"neither a Sample nor a Pose: {what!r:.60}")
+    return type(what)(*[as_vector(name, part, _SHAPES[name]) for name, part in zip(what._fields, what, strict=True)])
 
 
-def as_goal(name: str, what: Any) -> Sample:
+def as_goal(what: Any) -> Sample:
     """`as_sample` of what a task should reach: a bare `Pose` is one at rest."""
-    sample = as_sample(name, what)
+    sample = as_sample(what)
     return sample if isinstance(sample, Sample) else Sample(sample.position, sample.rotation, _AT_REST, _AT_REST)
 
 

@@ -43,9 +43,9 @@ class FrameTask:
         """Whether the orientation counts."""
         return self.settings.type != "position"
 
-    def as_target(self, where: str, value: Any) -> Any:
+    def as_target(self, value: Any) -> Any:
         """A target that was given at run time, checked: a `Sample`, or a `Pose` that rests."""
-        return as_goal(where, value)
+        return as_goal(value)
 
 
 AnyTask = FrameTask | RowTask

@@ -14,7 +14,7 @@ from pydantic import TypeAdapter
 
 from qpavoid import Obstacle, Sample, Status, build_scene, config, courses, kernels
 from qpavoid.errors import NumericalError
-from qpavoid.kernels.motions import Placed
+from qpavoid.kernels.vectorised.motions import Placed
 from qpavoid.motion import END_TOLERANCE, Motion, Orbit, Still, build_motion
 from qpavoid.proximity import DistanceQuery
 
@@ -27,10 +27,10 @@ EARLY = (-1.0, -1e-6, -2.0 * END_TOLERANCE, -0.5 * END_TOLERANCE, 0.0, 0.5 * END
 """Where to look around a corner [s]."""
 
 
-@pytest.fixture(params=["motions", "motions_compiled"])
+@pytest.fixture(params=["vectorised", "compiled"])
 def version(request):
     """Each version of the kernels in turn."""
-    if request.param == "motions_compiled":
+    if request.param == "compiled":
         pytest.importorskip("numba")
     return import_module(f"qpavoid.kernels.{request.param}")
 
@@ -87,10 +87,10 @@ def assert_samples(views, motions, t):
 
 @settings(max_examples=50)
 @given(motions=st.lists(fixed | line | circle | way(), min_size=1, max_size=4), data=st.data())
-@pytest.mark.parametrize("name", ["motions", "motions_compiled"])
+@pytest.mark.parametrize("name", ["vectorised", "compiled"])
 def test_all_at_once_are_where_each_alone_is(name, motions, data):
     """At any time, around corners, and when time goes back."""
-    if name == "motions_compiled":
+    if name == "compiled":
         pytest.importorskip("numba")
     edges = [corner + early for motion in motions for corner in corners(motion) for early in EARLY]
     times = [*data.draw(st.permutations(edges)), *data.draw(st.lists(st.floats(-5.0, 20.0), max_size=10)), 1.7e9]
@@ -234,7 +234,7 @@ def test_what_distances_know_by_definition(version, loads, centred, turning):
 
 def test_both_versions_leave_the_same_memory():
     pytest.importorskip("numba")
-    plain, fast = (import_module(f"qpavoid.kernels.{name}") for name in ("motions", "motions_compiled"))
+    plain, fast = (import_module(f"qpavoid.kernels.{name}") for name in ("vectorised", "compiled"))
     for seed in range(20):
         found = []
         for module in (plain, fast):
@@ -266,6 +266,54 @@ def test_numbers_that_cannot_be_true_change_nothing(version, value):
         assert bad == 3
         for part, was in zip(x, before, strict=True):
             np.testing.assert_array_equal(part, was)
+
+
+def random_news(rng, count=9):
+    """Arguments of `take_in`: some obstacles as bare poses, of which some are new, and one that is out of its mind."""
+    which = rng.permutation(count)[:6]
+    news, last = random_states(rng, count, True), random_states(rng, count, True)
+    bad = which[0]
+    news[bad, rng.integers(12)] = rng.choice([np.nan, np.inf, -np.inf])
+    news[which[2], 15] = np.nan  # of a bare pose, that is nothing that was given
+    posed = np.array([False, False, True, True, True, False])
+    age = rng.integers(-1, 4, count)
+    age[which[3]], age[which[4]] = -1, 2
+    return [which, posed, news, age, last, random_states(rng, count, True), 0.01]
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_what_is_given_is_taken_in_with_the_twist_that_has_led_to_it(version, seed):
+    rng = np.random.default_rng(seed)
+    which, posed, news, age, last, states, dt = args = random_news(rng)
+    given, ages, before, were = news.copy(), age.copy(), last.copy(), states.copy()
+    fine = version.take_in(*args)
+    assert fine.tolist() == [False, True, True, True, True, True]
+    for i, bare in zip(which[1:], posed[1:], strict=True):
+        expected = given[i].copy()
+        if bare:
+            expected[12:] = 0.0
+            if ages[i] >= 0:
+                elapsed = dt * (ages[i] + 1)
+                R, R0 = (state[i, :9].reshape(3, 3).T for state in (given, before))
+                expected[12:15] = (given[i, 9:12] - before[i, 9:12]) / elapsed
+                expected[15:] = pin.log3(R @ R0.T) / elapsed
+        np.testing.assert_allclose(states[i], expected, rtol=1e-9, atol=1e-9)
+        np.testing.assert_array_equal(last[i], states[i])
+        assert age[i] == 0
+    others = np.setdiff1d(np.arange(9), which[1:])
+    for now, was in ((age, ages), (last, before), (states, were)):
+        np.testing.assert_array_equal(now[others], was[others])
+
+
+def test_both_versions_take_in_the_same():
+    pytest.importorskip("numba")
+    for seed in range(20):
+        found = []
+        for name in ("vectorised", "compiled"):
+            args = random_news(np.random.default_rng(seed))
+            found.append([import_module(f"qpavoid.kernels.{name}").take_in(*args), *args[3:6]])
+        for a, b in zip(*found, strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
 
 
 def test_some_move_in_coals_model_and_the_others_stay(panda):

@@ -79,7 +79,6 @@ def test_the_closest_call_is_a_lower_bound(panda):
         horizon = rng.uniform(0.005, 0.3)
         places = {b.name: Sample.at(rng.uniform(-0.8, 0.8, 3), linear=rng.uniform(-0.5, 0.5, 3)) for b in balls}
         near = len(controller.tick(q, 0.0, None, places).proximity.pair)
-        controller._kinematics.move(q, v)
         bound = controller._assembly.closest_call(v, near, 0.1, horizon)
         least = turned(controller, q, v, horizon, dict(enumerate(places.values())))
         assert least >= bound - 1e-9

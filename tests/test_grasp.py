@@ -251,7 +251,6 @@ def test_nothing_comes_nearer_than_the_closest_call_says_with_a_load(panda):
     for _ in range(40):
         q, v = random_q(panda, rng), rng.uniform(-1, 1, 7)
         near = len(controller.tick(q).proximity.pair)
-        controller._kinematics.move(q, v)
         for horizon in (0.02, 0.2):
             least = controller._assembly.closest_call(v, near, 0.3, horizon)
             after = pin.integrate(panda.model, q, horizon * v)

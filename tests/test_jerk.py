@@ -461,7 +461,6 @@ def test_what_is_left_on_the_way_of_a_stop_is_a_lower_bound(panda):
         v = before + 0.01 * change
         stop = assembly.stop(q, v)
         way = stop.way.copy()
-        controller._kinematics.move(q, v)
         bound = assembly.closest_call(v, near, 0.1, float(stop.forwards.sum()), stop)
         least = np.inf
         for velocity in way:

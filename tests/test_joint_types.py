@@ -4,7 +4,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import yaml
-from conftest import EXAMPLES, SPHERE, differences, look, obstacle, random_q
+from conftest import EXAMPLES, SPHERE, Bench, differences, look, obstacle, random_q
 
 from qpavoid import (
     ConfigError,
@@ -18,7 +18,7 @@ from qpavoid import (
     load_scenario,
     simulate,
 )
-from qpavoid.kinematics import ForwardKinematics, chains, longest_lever
+from qpavoid.kinematics import chains, longest_lever
 from qpavoid.urdf import MimicWarning
 
 
@@ -75,14 +75,31 @@ def test_bounds_of_looking_ahead_hold(named):
     _, robot = named
     model, rng = robot.model, np.random.default_rng(2)
     turning, sliding = chains(model)
-    kinematics = ForwardKinematics(model)
+    data = model.createData()
     lever = longest_lever(model, np.zeros(model.njoints))
     for _ in range(20):
         q, v = random_q(robot, rng), rng.normal(size=model.nv)
-        kinematics.move(q, v)
-        assert np.linalg.norm(kinematics.joint_velocities[:, 3:], axis=1).max() <= max(turning @ np.abs(v)) + 1e-9
+        pin.forwardKinematics(model, data, q, v)
+        velocities = np.array([motion.vector for motion in data.v])
+        assert np.linalg.norm(velocities[:, 3:], axis=1).max() <= max(turning @ np.abs(v)) + 1e-9
         reach = max(turning @ np.abs(v)) * lever + max(sliding @ np.abs(v))
-        assert np.linalg.norm(kinematics.joint_velocities[:, :3], axis=1).max() <= reach + 1e-9
+        assert np.linalg.norm(velocities[:, :3], axis=1).max() <= reach + 1e-9
+
+
+def test_speeds_of_all_joints(named):
+    """Those that Pinocchio's forward kinematics gives, whatever the joints are."""
+    _, robot = named
+    model, rng, bench = robot.model, np.random.default_rng(3), Bench(build_scene(robot, []))
+    data = model.createData()
+    for _ in range(20):
+        q, v = random_q(robot, rng), rng.normal(size=model.nv)
+        bench.compute(q)
+        bench.assembly.closest_call(v, 0, 1.0, 0.01)
+        pin.forwardKinematics(model, data, q, v)
+        velocities = np.array([motion.vector for motion in data.v])
+        expected = np.linalg.norm(velocities[:, :3], axis=1)
+        expected += np.linalg.norm(velocities[:, 3:], axis=1) * bench.query.joint_reach()
+        np.testing.assert_allclose(bench.query.placing.speeds[: model.njoints], expected, atol=1e-12)
 
 
 def test_a_run_from_file_to_log(named, tmp_path):

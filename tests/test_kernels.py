@@ -135,7 +135,9 @@ def random_layout(seed, frames=2, turns=(1,), pairs=9, nv=7, obstacles=3, joints
         "twists": np.vstack((rng.normal(size=(obstacles, 6)), np.zeros(6))),
         "twist_row": rng.integers(0, obstacles + 1, pairs),
         "margin": np.append(rng.choice([0.0, 0.02, 0.1], obstacles), 0.0),
-        "joint_velocities": gaps(rng.normal(size=(joints, 6)), 8) if views else rng.normal(size=(joints, 6)),
+        "joint_poses": poses_of(rotations(rng, joints), rng.normal(size=(joints, 3)), 14 if views else 12),
+        "parents": np.array([0, *(rng.integers(0, joint) for joint in range(1, joints))], dtype=np.intp),
+        "column_joints": np.sort(rng.integers(1, joints, nv)),
         "joint_reach": rng.uniform(0.0, 0.5, joints),
         "carriers": np.sort(rng.permuted(np.tile(np.arange(joints + obstacles), (pairs, 1)), axis=1)[:, :2], axis=1),
         "turning": rng.integers(0, 2, (2, nv)).astype(float),
@@ -172,15 +174,25 @@ def jerk(seed, nv=7, all_of_them=False):
 def test_there_are_two_versions_of_everything():
     import qpavoid.kernels as used
 
-    plain = version("vectorised")
-    functions = {name for name, value in vars(plain).items() if getattr(value, "__module__", "") == plain.__name__}
-    public = {name for name in functions if not name.startswith("_")}
-    elsewhere = {"choose", "within_reach"}  # in modules of their own: test_point_cloud
-    elsewhere |= {"pack_pieces", "place_obstacles", "sample_pieces"}  # likewise: test_courses
-    of_one = {"rotation_vector", "speed_to_stop", "change_to_stop"}
-    assert set(used.__all__) - {"ACCELERATED"} - elsewhere == public - of_one
-    for name in set(used.__all__) - {"ACCELERATED"} - elsewhere:
-        assert getattr(used, name) is getattr(version("compiled" if used.ACCELERATED else "vectorised"), name)
+    chosen = version("compiled" if used.ACCELERATED else "vectorised")
+    assert version("vectorised").__all__ == [name for name in used.__all__ if name != "ACCELERATED"]
+    assert version("compiled").__all__ == version("vectorised").__all__
+    assert all(getattr(used, name) is getattr(chosen, name) for name in chosen.__all__)
+
+
+def test_code_older_than_any_source_is_not_run_again(tmp_path):
+    pytest.importorskip("numba")
+    from qpavoid.kernels.compiled.packing import forget_stale_code
+
+    files = {"a.py": 10, "part/b.py": 20, "__pycache__/a.f-1.nbi": 15, "__pycache__/a.f-1.1.nbc": 15,
+             "part/__pycache__/b.g-1.nbi": 25, "part/__pycache__/b.cpython.pyc": 5}  # fmt: skip
+    for name, time in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+        os.utime(tmp_path / name, (time, time))
+    forget_stale_code(tmp_path)
+    left = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.*")}
+    assert left == {"a.py", "part/b.py", "part/__pycache__/b.g-1.nbi", "part/__pycache__/b.cpython.pyc"}
 
 
 # --- candidates --------------------------------------------------------------------------------------------------
@@ -253,6 +265,13 @@ def test_candidates_of_both_versions(seed):
         assert found_by(version("vectorised"), args) == expected and count == len(expected)
 
 
+def test_what_is_in_one_of_two_alone(kernels):
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        a, b = (np.flatnonzero(rng.random(rng.integers(0, 30)) < rng.random()) for _ in range(2))
+        assert kernels.in_one_alone(a, b).tolist() == sorted({*a.tolist()} ^ {*b.tolist()})
+
+
 # --- distances ---------------------------------------------------------------------------------------------------
 
 
@@ -297,9 +316,9 @@ def test_a_pair_whose_distance_is_not_a_number_is_near(kernels):
     results[:, 0] = 9.0, np.nan, 0.2
     for fields in (NO_LIMIT, {}):
         x = random_layout(0, pairs=3, results=gaps(results, 17), **fields)
-        k, worst = run(kernels, "assemble", x, np.zeros(8), np.arange(3), 0.5, True)
+        k, worst, clear = run(kernels, "assemble", x, np.zeros(8), np.arange(3), 0.5, True)
         assert x.near[:k].tolist() == [1, 2]
-        assert np.isnan(x.least[:k]).tolist() == [True, False] and np.isnan(worst)
+        assert np.isnan(x.least[:k]).tolist() == [True, False] and np.isnan(worst) and not clear
 
 
 @pytest.mark.parametrize("views", [True, False])
@@ -481,16 +500,34 @@ RATES = np.zeros(7)
 def test_no_point_that_a_joint_carries_is_faster_than_it_is_said_to_be(kernels, seed):
     """Nor is the bound a loose one: at most √2 too large, and exact for a joint that does not turn."""
     rng, x = np.random.default_rng(seed), filled(seed)
-    run(kernels, "closest_call", x, RATES, 30, 0.5, 0.1)
-    for motion, reach, speed in zip(x.joint_velocities, x.joint_reach, x.speeds[:4], strict=True):
+    v = rng.normal(size=7)
+    run(kernels, "joint_speeds", x, v)
+    twists = np.zeros((4, 6))
+    for joint in range(1, 4):
+        own = x.column_joints == joint
+        twists[joint] = twists[x.parents[joint]] + x.J_world[:, own] @ v[own]
+    for twist, pose, reach, speed in zip(twists, x.joint_poses, x.joint_reach, x.speeds[:4], strict=True):
         points = rng.normal(size=(2000, 3))
         points *= reach / np.linalg.norm(points, axis=1, keepdims=True)
-        speeds = np.linalg.norm(motion[:3] + np.cross(motion[3:], points), axis=1)
+        speeds = np.linalg.norm(twist[:3] + np.cross(twist[3:], pose[9:] + points), axis=1)
         assert speeds.max() <= speed <= 1.01 * np.sqrt(2.0) * speeds.max()
-    motion = np.hstack((x.joint_velocities[:, :3], np.zeros((4, 3))))
-    y = random_layout(seed, joint_velocities=gaps(motion, 8))
-    run(kernels, "closest_call", y, RATES, 0, 0.5, 0.1)
-    np.testing.assert_allclose(y.speeds[:4], np.linalg.norm(motion[:, :3], axis=1), rtol=1e-13)
+    J = np.asfortranarray(np.vstack((x.J_world[:3], np.zeros((3, 7)))))
+    y = x._replace(J_world=J)
+    run(kernels, "joint_speeds", y, v)
+    np.testing.assert_allclose(y.speeds[:4], np.linalg.norm(twists[:, :3], axis=1), rtol=1e-13)
+
+
+def test_speeds_where_joints_mimic_others():
+    """One coordinate moves several columns of the Jacobian: as many as have its number."""
+    for seed in SEEDS:
+        rng, x = np.random.default_rng(seed), filled(seed)
+        columns, v = np.append(np.arange(5), [1, 3]), rng.normal(size=5)
+        run(version("vectorised"), "joint_speeds", x, v[columns])
+        expected = x.speeds[:4].copy()
+        for name in ("vectorised", "compiled"):
+            y = random_layout(seed, pairs=30, columns=columns, mimics=True)
+            run(version(name), "joint_speeds", y, v)
+            np.testing.assert_allclose(y.speeds[:4], expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("near", [0, 1, 30])
@@ -513,13 +550,11 @@ def test_closest_call_is_below_what_the_fastest_points_leave(kernels, near, hori
 
 @pytest.mark.parametrize("near", [0, 1, 30])
 def test_closest_call_does_not_lose_nan(kernels, near):
-    for joint in range(4):
+    for column in range(7):
         x = filled(0)
-        motion = np.array(x.joint_velocities)
-        motion[joint, joint] = np.nan
-        y = x._replace(joint_velocities=gaps(motion, 8))
-        y.d[:] = 0.2
-        assert np.isnan(run(kernels, "closest_call", y, RATES, near, 0.5, 0.1))
+        x.J_world[column % 6, column] = np.nan
+        x.d[:] = 0.2
+        assert np.isnan(run(kernels, "closest_call", x, np.ones(7), near, 0.5, 0.1))
     for i in range(near):
         x = filled(0)
         x.d[:] = 0.2
@@ -527,12 +562,26 @@ def test_closest_call_does_not_lose_nan(kernels, near):
         assert np.isnan(run(kernels, "closest_call", x, RATES, near, 0.5, 0.1))
 
 
+@pytest.mark.parametrize("fields", [{}, NO_LIMIT])
+def test_the_way_of_the_tracking_velocity_is_clear_if_the_closest_call_until_its_stop_is(kernels, fields):
+    clear = 0
+    for seed in range(40):
+        x = filled(seed, 30, **fields)
+        x.v0[:] = 10.0 ** -(seed % 4) * np.random.default_rng(seed).normal(size=7)
+        x.d[:] = np.random.default_rng(seed).uniform(0.1, 0.5, 30)
+        ticks = 1.0 + 0.5 * np.max(np.abs(x.v0) / x.v_step)
+        expected = run(kernels, "closest_call", x, x.v0, 30, 0.5, x.dt * ticks) > 0.0
+        assert run(kernels, "tracking_clear", x, 30, 0.5) == expected
+        clear += expected
+    assert 0 < clear < 40
+
+
 @pytest.mark.parametrize("pairs", [0, 1, 30])
 def test_speeds_of_both_versions(pairs):
     for seed in SEEDS:
         x, y = filled(seed, pairs), filled(seed, pairs)
         for name, layout in (("vectorised", x), ("compiled", y)):
-            run(version(name), "closest_call", layout, RATES, 0, 0.5, 0.1)
+            run(version(name), "closest_call", layout, np.random.default_rng(seed).normal(size=7), 0, 0.5, 0.1)
         assert_same(y, x, 0)
 
 
@@ -637,7 +686,7 @@ def test_orientations_alone_and_rows_of_other_tasks(seed):
 def test_rotation_vector_at_all_angles(kernels, axis):
     """Angle and axis come back, in tiny turns to the last digit; at half a turn either of the two axes."""
     axis = np.array(axis) / np.linalg.norm(axis)
-    rotation_vector = getattr(kernels, "_rotation_vector", None) or kernels.rotation_vector
+    rotation_vector = getattr(kernels.frames, "_rotation_vector", None) or kernels.frames.rotation_vector
     for angle in (0.0, 1e-15, 1e-12, 1e-9, 1e-5, 0.1, 1.0, np.pi / 2, 2.0, 2.1, 3.0, np.pi - 1e-5, np.pi - 1e-9):
         found = rotation_vector(pin.exp3(angle * axis))
         np.testing.assert_allclose(found, angle * axis, rtol=0, atol=1e-15 + 1e-14 * angle / (np.pi - angle) ** 0.1)
@@ -901,7 +950,8 @@ def test_a_tick_is_the_sum_of_its_parts(kernels, seed, fields):
         kernels.row_bounds(apart, k, moving)
         worst = kernels.tracking_shortfall(apart, k)
         found = kernels.assemble(packed, q[:7] if "plain" in fields else q, pairs, reach, moving)
-        np.testing.assert_array_equal(found, (k, worst))
+        clear = worst <= 0.0 and kernels.tracking_clear(apart, k, reach)
+        np.testing.assert_array_equal(found, (k, worst, clear))
         assert_same(x, y, k)
 
 
@@ -916,7 +966,7 @@ def test_ticks_of_both_versions(seed, fields):
             x.margin[:-1] *= moving
             return x
 
-        (k, _), x = both(make, "assemble", q[:7] if "plain" in fields else q, pairs, reach, moving)
+        (k, *_), x = both(make, "assemble", q[:7] if "plain" in fields else q, pairs, reach, moving)
         counts.append(k)
         np.testing.assert_allclose(x.A.T @ (x.A @ x.v0 - x.b) + x.damping**2 * x.v0, 0.0, rtol=0, atol=1e-9)
     assert min(counts) == 0 and len(set(counts)) > 2

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from qpavoid.config import Limits
-from qpavoid.kernels.vectorised import speed_to_stop
+from qpavoid.kernels.vectorised.bounds import speed_to_stop
 from qpavoid.limits import JointBounds, limit_layout, saturate
 
 N = 4
@@ -183,7 +183,7 @@ def stopping_speed(kernels):
     if kernels == "vectorised":
         return speed_to_stop
     pytest.importorskip("numba")
-    from qpavoid.kernels.compiled import _speed_to_stop
+    from qpavoid.kernels.compiled.bounds import _speed_to_stop
 
     return np.vectorize(_speed_to_stop, otypes=[float])
 

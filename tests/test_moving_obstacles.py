@@ -96,6 +96,18 @@ def test_an_estimated_twist_is_the_difference_quotient_also_after_a_gap(panda):
     assert len(tick.proximity.drift) > 1
 
 
+def test_a_program_may_write_into_the_arrays_that_it_gave(panda):
+    """What was given last is kept, not looked up: a pose that is moved in place has moved."""
+    controller = make_controller(panda, [Obstacle.at("ball", Sphere(radius=0.05), [0.5, 0, 0.8])], "panda_hand_tcp")
+    position, rotation, speed = np.array([0.45, 0.0, 0.7]), np.eye(3), np.array([0.1, -0.2, 0.05])
+    for k in range(3):
+        tick = controller.tick(panda.home, 0.01 * k, None, {"ball": Pose(position, rotation)})
+        position += 0.01 * speed
+    of_ball = controller.scene.pairs[tick.proximity.pair, 1] >= len(controller.scene.body_names)
+    np.testing.assert_allclose(tick.proximity.drift[of_ball], (tick.proximity.normal @ speed)[of_ball], atol=1e-12)
+    assert of_ball.any()
+
+
 # --- both arms at once -----------------------------------------------------------------------------------------
 
 LEFT = np.array([-1.18, 1.13, 0.14, -1.02, 1.45, -1.07, -1.44])

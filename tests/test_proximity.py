@@ -255,7 +255,6 @@ def test_nothing_comes_nearer_than_the_closest_call_says(name, request):
             samples[i] = start._replace(**twist)
             bench.query.place_obstacle(i, samples[i])
         near = len(bench.compute(q, reach=0.3)[0].pair)
-        bench.kinematics.move(q, v)
         for horizon in (0.01, 0.1, 0.3):
             least = bench.assembly.closest_call(v, near, 0.3, horizon)
             assert np.isfinite(least)

@@ -226,7 +226,6 @@ def test_the_closest_call_holds_for_half_spaces_that_move_and_turn(panda, turnin
         bench.query.place_obstacle(0, sample)
         assert np.isfinite(bench.query.placing.speeds).all()
         near = len(bench.compute(q, reach=0.3)[0].pair)
-        bench.kinematics.move(q, v)
         for horizon in (0.01, 0.1, 0.3):
             least = bench.assembly.closest_call(v, near, 0.3, horizon)
             later = sample._replace(

@@ -321,7 +321,7 @@ def test_targets_of_the_wrong_kind(panda):
         panda, config.Task(frame="panda_hand_tcp"), config.PostureTask(weight=1e-3), config.DampingTask(weight=1e-3)
     )
     for name, target, told in [
-        ("posture", np.zeros(3), r"target 'posture': shape \(3,\), expected \(7,\)"),
+        ("posture", np.zeros(3), r"target 'posture': q: shape \(3,\), expected \(7,\)"),
         ("posture", Sample.at([0, 0, 0]), "target 'posture'"),
         ("damping", np.zeros(7), "target 'damping': a task of type damping takes none"),
         ("panda_hand_tcp", np.zeros(3), "target 'panda_hand_tcp': neither a Sample"),

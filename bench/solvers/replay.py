@@ -65,7 +65,7 @@ def _compiled() -> dict[str, Callable[[], Backend]]:
     try:
         from numba import njit
 
-        from qpavoid.kernels.active_set import minimize
+        from qpavoid.kernels.compiled.active_set import minimize
     except ModuleNotFoundError:
         return {}
 

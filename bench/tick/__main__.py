@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import os
 
 from bench.tick.libs import LIBRARIES
-
-os.environ.setdefault("QPAVOID_NUMBA", "0")
 
 
 def main() -> None:

@@ -265,8 +265,7 @@ def _look_at_robot(report: Report, robot: Robot) -> None:
             Problem(
                 "warning",
                 f"a control step takes {report.tick_us:.0f} µs with {report.pairs} pairs",
-                "`qpavoid robot add` finds pairs that never collide, and capsules; `lock` joints that you do not use; "
-                "pip install 'qpavoid[fast]'",
+                "`qpavoid robot add` finds pairs that never collide, and capsules; `lock` joints that you do not use",
             )
         )
 

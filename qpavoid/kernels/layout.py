@@ -62,8 +62,12 @@ class RowLayout(NamedTuple):
     """(m,) row of `twists` that moves each pair's second body."""
     margin: Array
     """(o + 1,) taken off the distances to each obstacle, for what is not known of it [m]; the last one stays zero."""
-    joint_velocities: Array
-    """(J, 6) linear velocity of each joint's origin and angular velocity, in the joint's axes; row 0 is the world."""
+    joint_poses: Array
+    """(J, 12) world poses of all joints: rotation by columns, then origin [m]; row 0 is the world."""
+    parents: IntArray
+    """(J,) the joint that carries each joint, which comes before it; that of the world is the world."""
+    column_joints: IntArray
+    """(e,) the joint that each column of the world Jacobian belongs to, in increasing order."""
     joint_reach: Array
     """(J,) distance from a joint's origin to the farthest point of a body that it carries [m]."""
     carriers: IntArray
@@ -149,3 +153,5 @@ class RowLayout(NamedTuple):
     """Whether any acceleration has a limit."""
     jerked: bool
     """Whether any jerk has one."""
+    looks_ahead: bool
+    """Whether the way of the tracking law's velocity is looked at, where that velocity is safe."""

@@ -70,12 +70,16 @@ class Workspace:
         self.was_moving = True
         self.screw_columns = np.empty((6, pairs))
         self.scratch = np.empty((3, pairs))
-        joints = len(layout.joint_velocities)
+        joints = len(layout.joint_poses)
         self.slides = bool(layout.sliding.any())
-        self.squares, self.linear_angular = np.empty((joints, 6)), np.empty((joints, 2))
-        self.by_kind = np.repeat(np.eye(2), 3, axis=0)
+        carried_by = np.zeros((joints, len(layout.column_joints)))  # which columns of the Jacobian move which joint
+        for joint in range(1, joints):
+            carried_by[joint] = carried_by[layout.parents[joint]] + (layout.column_joints == joint)
+        self.carried = carried_by.T
+        self.origins = layout.joint_poses[:, 9:].T
+        self.moved, self.joint_twists = np.empty((6, len(layout.column_joints))), np.empty((6, joints))
+        self.squares, self.by_kind = np.empty((2, joints)), np.repeat(np.eye(2), 3, axis=1)
         self.joints = joints
-        self.linear_speed, self.angular_speed = self.linear_angular[:, 0], self.linear_angular[:, 1]
         self.joint_speeds = layout.speeds[:joints]
         # every joint has one coordinate and position limits: bounds are made in place, the lower and upper ones at once
         self.plain = np.array_equal(layout.q_index, np.arange(nv)) and np.array_equal(layout.v_index, np.arange(nv))

@@ -139,9 +139,9 @@ def _compiled_projections() -> tuple[_Projection, _Projection]:
         SolverNotInstalled: it needs numba.
     """
     try:
-        from qpavoid.kernels.active_set import project, project_soft
+        from qpavoid.kernels.compiled.active_set import project, project_soft
     except ModuleNotFoundError:
-        raise SolverNotInstalled("QP back end 'native' needs numba: pip install 'qpavoid[fast]'") from None
+        raise SolverNotInstalled("QP back end 'native' needs numba: pip install numba") from None
     one, row = np.ones(1), np.ones((1, 1))
     arguments = row, 1.0, one, row, 2.0 * one, -3.0 * one, 3.0 * one
     project(*arguments)

@@ -30,8 +30,8 @@ class Library:
 LIBRARIES = {
     library.name: library
     for library in (
-        Library("qpavoid", "ours:Numpy", {"QPAVOID_NUMBA": "0"}),
-        Library("qpavoid-numba", "ours:Numba", {"QPAVOID_NUMBA": "1"}),
+        Library("qpavoid", "ours:Compiled", {"QPAVOID_NUMBA": "1"}),
+        Library("qpavoid-numpy", "ours:Ours", {"QPAVOID_NUMBA": "0"}),
         Library("pink-all", "pinks:AllPairs"),
         Library("pink-20", "pinks:Closest20"),
         Library("mink", "minks:Mink"),

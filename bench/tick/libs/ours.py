@@ -16,8 +16,8 @@ from qpavoid.motion import Sample
 from qpavoid.tasks import build_tasks
 
 
-class Numpy:
-    """The default installation."""
+class Ours:
+    """Without numba."""
 
     settings = (
         "Controller(solver='qp') at its defaults; Task.gain = 1/dt, which is the dead beat that the others have by "
@@ -76,10 +76,10 @@ class Numpy:
         return reference(self.scene, self.workload, [tick])[1][0]
 
 
-class Numba(Numpy):
-    """With the compiled tick: `pip install qpavoid[fast]`."""
+class Compiled(Ours):
+    """The default installation."""
 
-    packages = (*Numpy.packages, "numba")
+    packages = (*Ours.packages, "numba")
 
     def __init__(self, workload: Workload) -> None:
         super().__init__(workload)

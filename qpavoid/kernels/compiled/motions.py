@@ -1,22 +1,23 @@
-"""The functions of `qpavoid.kernels.motions` as loops that numba compiles; documented there."""
+"""The functions of `qpavoid.kernels.vectorised.motions` as loops that numba compiles; documented there."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from qpavoid.kernels.compiled import compiled
-from qpavoid.kernels.motions import Pieces, Placed
-from qpavoid.problem import Array, IntArray
+from qpavoid.kernels.compiled.frames import _rotation_vector
+from qpavoid.kernels.compiled.packing import compiled
+from qpavoid.kernels.vectorised.motions import Pieces, Placed
+from qpavoid.problem import Array, IntArray, Mask
 
 
 def pack_pieces(pieces: Pieces) -> Pieces:
-    """See `motions.pack_pieces`."""
+    """See `vectorised.motions.pack_pieces`."""
     return pieces
 
 
 @compiled
 def sample_pieces(x: Pieces, t: float, tolerance: float, states: Array) -> None:
-    """See `motions.sample_pieces`."""
+    """See `vectorised.motions.sample_pieces`."""
     weights = np.empty(7)
     for k in range(len(x.bodies)):
         low, high = x.first[k], x.first[k + 1]
@@ -46,7 +47,7 @@ def sample_pieces(x: Pieces, t: float, tolerance: float, states: Array) -> None:
 def place_obstacles(
     x: Placed, which: IntArray, geometries: IntArray, owners: IntArray, states: Array, margin: Array
 ) -> tuple[int, bool]:
-    """See `motions.place_obstacles`."""
+    """See `vectorised.motions.place_obstacles`."""
     obstacles = len(x.states)
     negative = len(x.twists) - obstacles - 1
     for i in which:
@@ -86,3 +87,33 @@ def place_obstacles(
             if x.twists[i, c] != 0.0:
                 return -1, True
     return -1, False
+
+
+@compiled
+def take_in(which: IntArray, posed: Mask, news: Array, age: IntArray, last: Array, states: Array, dt: float) -> Mask:
+    """See `vectorised.motions.take_in`."""
+    fine, turn = np.empty(len(which), np.bool_), np.empty((3, 3))
+    for k in range(len(which)):
+        i = which[k]
+        new, old = news[i], last[i]
+        total = 0.0
+        for c in range(12 if posed[k] else 18):
+            total += abs(new[c])
+        fine[k] = total < np.inf  # isfinite does not survive the reordering of sums
+        if not fine[k]:
+            continue
+        if posed[k]:
+            new[12:] = 0.0
+            if age[i] >= 0:
+                share = 1.0 / (dt * (age[i] + 1))
+                for r in range(3):
+                    new[12 + r] = share * (new[9 + r] - old[9 + r])
+                    for c in range(3):
+                        turn[r, c] = new[r] * old[c] + new[3 + r] * old[3 + c] + new[6 + r] * old[6 + c]
+                angles = _rotation_vector(turn)
+                for r in range(3):
+                    new[15 + r] = share * angles[r]
+        old[:] = new
+        states[i] = new
+        age[i] = 0
+    return fine

@@ -1,6 +1,6 @@
 """Array work of moving obstacles in numpy: where all of them are at a time, and what distances need to know of it.
 
-`qpavoid.kernels.motions_compiled` has the same functions as loops for numba; both pass the same tests.
+`qpavoid.kernels.compiled.motions` has the same functions as loops for numba; both pass the same tests.
 
 A *state* is a row of 18: rotation by columns, position, linear and angular velocity, in world axes [-, m, m/s, rad/s].
 """
@@ -12,10 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from qpavoid.problem import Array, IntArray
-
-_CYCLE = np.array([1, 2, 0, 2, 0, 1])
-_ANTICYCLE = np.array([2, 0, 1, 1, 2, 0])
+from qpavoid.kernels.rotation import ANTICYCLE, CYCLE, rotation_vector
+from qpavoid.problem import Array, IntArray, Mask
 
 
 class Pieces(NamedTuple):
@@ -149,8 +147,8 @@ def place_obstacles(
     twists, speed = new[:, 12:], np.sqrt(np.vecdot(linear, linear))
     if np.count_nonzero(angular):
         twists = twists.copy()
-        products = angular.take(_CYCLE, axis=1)
-        products *= new[:, 9:12].take(_ANTICYCLE, axis=1)  # ω × p
+        products = angular.take(CYCLE, axis=1)
+        products *= new[:, 9:12].take(ANTICYCLE, axis=1)  # ω × p
         twists[:, :3] -= products[:, :3]
         twists[:, :3] += products[:, 3:]
         speed += np.sqrt(np.vecdot(angular, angular)) * x.reach.take(which)
@@ -170,3 +168,35 @@ def place_obstacles(
     np.vecdot(center, -center, out=spheres[:, 4])
     x.centers[geometries] = spheres
     return -1, bool(np.count_nonzero(x.twists) or np.count_nonzero(x.margin))
+
+
+def take_in(which: IntArray, posed: Mask, news: Array, age: IntArray, last: Array, states: Array, dt: float) -> Mask:
+    """Takes over the states of obstacles that are given from outside; a bare pose gets the twist that has led to it.
+
+    That is the difference of its last two poses, over the time between them; the first one counts as at rest.
+
+    Args:
+        which: numbers of the obstacles (k,).
+        posed: which of them are given without a twist (k,).
+        news: what is given, read where `which` says (o, 18); the twists of bare poses are overwritten.
+        age: ticks since each was given last, negative if it never was (o,); 0 afterwards.
+        last: what was given last, with its twist (o, 18); overwritten.
+        states: (o, 18) overwritten likewise.
+        dt: length of a tick [s].
+
+    Returns:
+        Which of them are finite (k,); the others are left as they were.
+    """
+    news[which[posed], 12:] = 0.0
+    fine = np.asarray(np.isfinite(news.take(which, axis=0)).all(axis=1))
+    given = which[fine]
+    before = which[fine & posed & (age[which] >= 0)]
+    if len(before):
+        new, old = news[before], last[before]
+        share = 1.0 / (dt * (age[before, None] + 1))
+        turns = np.matmul(new[:, :9].reshape(-1, 3, 3).swapaxes(1, 2), old[:, :9].reshape(-1, 3, 3))
+        news[before, 12:15] = share * (new[:, 9:12] - old[:, 9:12])
+        news[before, 15:] = share * np.array([rotation_vector(turn) for turn in turns.tolist()])
+    last[given] = states[given] = news[given]
+    age[given] = 0
+    return fine

@@ -1,4 +1,4 @@
-"""Which voxels of a cloud are nearest to each body, in numpy; `voxels_compiled` has the same for numba.
+"""Which voxels of a cloud are nearest to each body, in numpy; `kernels.compiled.voxels` has the same for numba.
 
 Bodies count as capsules: those that are something else as the capsule around them.
 """

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from qpavoid.kernels.compiled import compiled
+from qpavoid.kernels.compiled.packing import compiled
 from qpavoid.problem import Array, IntArray
 
 _TOLERANCE = 1e-10
@@ -53,9 +53,11 @@ def project_soft(
     rows, nv = A.shape
     P = np.zeros((nv, nv))
     for r in range(rows):
+        row = A[r]
         for i in range(nv):
-            for j in range(i + 1):  # the lower triangle is all that is read
-                P[i, j] += A[r, i] * A[r, j]
+            if row[i] != 0.0:  # a frame is moved by few of the joints
+                for j in range(i + 1):  # the lower triangle is all that is read
+                    P[i, j] += row[i] * row[j]
     for i in range(nv):
         P[i, i] += regularization
     v = v0.copy()
@@ -209,16 +211,16 @@ def _factorise(M: Array, L: Array, n: int) -> None:
 
 @compiled
 def _extend(M: Array, L: Array, i: int) -> None:
-    """Writes row i of the Cholesky factor; NaN where M is not positive definite."""
+    """Writes row i of the Cholesky factor, on the diagonal the inverse of it; NaN where M is not positive definite."""
     for j in range(i):
         total = M[i, j]
         for c in range(j):
             total -= L[i, c] * L[j, c]
-        L[i, j] = total / L[j, j]
+        L[i, j] = total * L[j, j]
     total = M[i, i]
     for c in range(i):
         total -= L[i, c] * L[i, c]
-    L[i, i] = np.sqrt(total)
+    L[i, i] = 1.0 / np.sqrt(total)
 
 
 @compiled
@@ -228,9 +230,9 @@ def _solve(L: Array, b: Array, y: Array, n: int) -> None:
         total = b[i]
         for c in range(i):
             total -= L[i, c] * y[c]
-        y[i] = total / L[i, i]
+        y[i] = total * L[i, i]
     for i in range(n - 1, -1, -1):
-        y[i] /= L[i, i]
+        y[i] *= L[i, i]
         for c in range(i):
             y[c] -= L[i, c] * y[i]
 

@@ -1,11 +1,11 @@
-"""The functions of `qpavoid.kernels.voxels` as loops that numba compiles; documented there."""
+"""The functions of `qpavoid.kernels.vectorised.voxels` as loops that numba compiles; documented there."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from qpavoid.kernels.compiled import compiled
-from qpavoid.kernels.voxels import ALIKE
+from qpavoid.kernels.compiled.packing import compiled
+from qpavoid.kernels.vectorised.voxels import ALIKE
 from qpavoid.problem import Array, IntArray
 
 
@@ -22,7 +22,7 @@ def within_reach(
     distance: Array,
     place: Array,
 ) -> None:
-    """See `voxels.within_reach`."""
+    """See `vectorised.voxels.within_reach`."""
     count = 0
     for body in range(len(axes)):
         first[body] = count
@@ -66,7 +66,7 @@ def choose(
     slots: IntArray,
     kept: IntArray,
 ) -> None:
-    """See `voxels.choose`."""
+    """See `vectorised.voxels.choose`."""
     bodies, size = slots.shape
     chosen = np.empty(size, np.intp)
     for body in range(bodies):

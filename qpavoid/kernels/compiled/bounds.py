@@ -1,0 +1,91 @@
+"""`kernels.vectorised.bounds` as loops that numba compiles; documented there."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from qpavoid.kernels.compiled.packing import compiled
+from qpavoid.kernels.stopping import MOST_STEPS, longest_way, way_to_stop
+from qpavoid.problem import Array
+
+_way_to_stop, _longest_way = compiled(way_to_stop), compiled(longest_way)
+
+
+@compiled
+def velocity_bounds(x: Any, q: Array) -> None:
+    """See `vectorised.bounds.velocity_bounds`."""
+    lower, upper = x.hard_lower, x.hard_upper
+    for j in range(len(x.v_max)):
+        lower[j], upper[j] = -x.v_max[j], x.v_max[j]
+    for i in range(len(x.q_index)):
+        j, here = x.v_index[i], q[x.q_index[i]]
+        fastest, step, last = x.v_max[j], x.v_step[j], x.v_last[j]
+        below, above = here - x.q_lower[i], x.q_upper[i] - here
+        if step < np.inf:
+            faster, slower = min(step, x.w_step[j] + x.w_last[j]), min(step, x.w_step[j] - x.w_last[j])
+            down = _speed_to_stop(below, step, x.dt) if below > 0.0 else max(x.rate * below, -last - faster)
+            up = _speed_to_stop(above, step, x.dt) if above > 0.0 else max(x.rate * above, last - slower)
+            if below < 0.0:
+                down = max(down, -up)  # on the way back from outside one limit it can still brake for the other
+            elif above < 0.0:
+                up = max(up, -down)
+        else:
+            down, up = x.rate * below, x.rate * above
+        lower[j] = max(min(-down, fastest), -fastest)
+        upper[j] = max(min(up, fastest), -fastest)
+    if x.jerked:
+        _within_jerk(x, q)
+    for j in range(len(x.v_max)):
+        low = min(max(x.v_last[j] - x.v_step[j], lower[j]), upper[j])
+        high = max(min(x.v_last[j] + x.v_step[j], upper[j]), lower[j])
+        if x.jerked:
+            low, high = min(max(x.lower[j], low), high), max(min(x.upper[j], high), low)
+        x.lower[j], x.upper[j] = low, high
+
+
+@compiled
+def _within_jerk(x: Any, q: Array) -> None:
+    """See `vectorised.bounds._within_jerk`."""
+    below, above = np.full(len(x.v_max), np.inf), np.full(len(x.v_max), np.inf)
+    for i in range(len(x.q_index)):
+        here = q[x.q_index[i]]
+        below[x.v_index[i]], above[x.v_index[i]] = here - x.q_lower[i], x.q_upper[i] - here
+    for j in range(len(x.v_max)):
+        x.lower[j], x.upper[j] = -np.inf, np.inf
+        unit = x.w_step[j]
+        if not unit < np.inf:
+            continue
+        speed, change, most, fastest = x.v_last[j] / unit, x.w_last[j] / unit, x.v_step[j] / unit, x.v_max[j] / unit
+        target = min(_speed_to_stop(abs(speed), 1.0, 1.0), most)
+        stop = min(max(-target if speed > 0.0 else target, change - 1.0), change + 1.0)
+        faster, deeper = fastest if above[j] >= 0.0 else 0.0, fastest if below[j] >= 0.0 else 0.0
+        high = min(change + 1.0, most, _speed_to_stop(max(faster - speed, 0.0), 1.0, 1.0))
+        deep = min(1.0 - change, most, _speed_to_stop(max(deeper + speed, 0.0), 1.0, 1.0))
+        up = _change_to_stop(speed, high, stop, most, max(above[j], 0.0) / (x.dt * unit))
+        down = _change_to_stop(-speed, deep, -stop, most, max(below[j], 0.0) / (x.dt * unit))
+        x.lower[j], x.upper[j] = x.v_last[j] - unit * down, x.v_last[j] + unit * up
+        if above[j] < 0.0:
+            x.hard_upper[j] = max(x.hard_upper[j], min(x.lower[j], x.v_max[j]))
+        elif below[j] < 0.0:
+            x.hard_lower[j] = min(x.hard_lower[j], max(x.upper[j], -x.v_max[j]))
+
+
+@compiled
+def _speed_to_stop(room: float, step: float, dt: float) -> float:
+    """See `vectorised.bounds.speed_to_stop`."""
+    ticks = min(max(np.ceil(0.5 * np.sqrt(1.0 + 8.0 * room / (step * dt)) - 0.5), 1.0), 1e15)
+    return room / (dt * ticks) + 0.5 * step * (ticks - 1.0)
+
+
+@compiled
+def _change_to_stop(speed: float, high: float, low: float, most: float, room: float) -> float:
+    """See `vectorised.bounds.change_to_stop`."""
+    change = high
+    for _ in range(MOST_STEPS):
+        way, growth = _way_to_stop(speed + change, change, most)
+        if not way > room:
+            break
+        change -= (way - room) / growth
+    return max(change, low)

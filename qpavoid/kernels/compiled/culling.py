@@ -1,0 +1,46 @@
+"""`kernels.vectorised.culling` as loops that numba compiles; documented there."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from qpavoid.kernels.compiled.packing import compiled
+from qpavoid.problem import Array, IntArray
+
+
+@compiled
+def candidates(poses: Array, local: Array, centers: Array, within: Array, pair_of: IntArray, found: IntArray) -> int:
+    """See `vectorised.culling.candidates`."""
+    bodies, geometries = pair_of.shape
+    for i in range(bodies):
+        for r in range(3):
+            turned = poses[i, r] * local[i, 0] + poses[i, 3 + r] * local[i, 1] + poses[i, 6 + r] * local[i, 2]
+            centers[i, r] = turned + poses[i, 9 + r]
+        centers[i, 4] = -(centers[i, 0] ** 2 + centers[i, 1] ** 2 + centers[i, 2] ** 2)
+    x, y, z = centers[:, 0].copy(), centers[:, 1].copy(), centers[:, 2].copy()
+    near = np.empty(geometries, np.bool_)
+    count = 0
+    for i in range(bodies):
+        for j in range(geometries):  # free of branches, so that it becomes vector instructions
+            dx, dy, dz = x[j] - x[i], y[j] - y[i], z[j] - z[i]
+            near[j] = dx * dx + dy * dy + dz * dz <= within[i, j]
+        for j in range(geometries):
+            if near[j]:
+                found[count] = pair_of[i, j]
+                count += 1
+    return count
+
+
+@compiled
+def in_one_alone(a: IntArray, b: IntArray) -> IntArray:
+    """See `vectorised.culling.in_one_alone`."""
+    found = np.empty(len(a) + len(b), np.intp)
+    i, j, count = 0, 0, 0
+    while i < len(a) or j < len(b):
+        if j == len(b) or (i < len(a) and a[i] < b[j]):
+            found[count], i, count = a[i], i + 1, count + 1
+        elif i == len(a) or b[j] < a[i]:
+            found[count], j, count = b[j], j + 1, count + 1
+        else:
+            i, j = i + 1, j + 1
+    return found[:count]

@@ -1,0 +1,33 @@
+"""Rotations as vectors, in closed form; the source of both kernel versions."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+CYCLE = np.array([1, 2, 0, 2, 0, 1])
+ANTICYCLE = np.array([2, 0, 1, 1, 2, 0])
+"""a × b is a[CYCLE] b[ANTICYCLE], the first three less the last three."""
+
+
+def rotation_vector(R: Any) -> tuple[float, float, float]:
+    """Rotation vector [rad] of a rotation R[i][j], with an angle up to and including π.
+
+    By way of the quaternion, whose largest component is taken first, so that nothing is lost near half a turn.
+    """
+    trace = R[0][0] + R[1][1] + R[2][2]
+    if trace >= max(R[0][0], R[1][1], R[2][2]):
+        w, x, y, z = 1.0 + trace, R[2][1] - R[1][2], R[0][2] - R[2][0], R[1][0] - R[0][1]
+    elif R[0][0] >= max(R[1][1], R[2][2]):
+        w, x, y, z = R[2][1] - R[1][2], 1.0 + 2.0 * R[0][0] - trace, R[0][1] + R[1][0], R[0][2] + R[2][0]
+    elif R[1][1] >= R[2][2]:
+        w, x, y, z = R[0][2] - R[2][0], R[0][1] + R[1][0], 1.0 + 2.0 * R[1][1] - trace, R[1][2] + R[2][1]
+    else:
+        w, x, y, z = R[1][0] - R[0][1], R[0][2] + R[2][0], R[1][2] + R[2][1], 1.0 + 2.0 * R[2][2] - trace
+    length = math.sqrt(x * x + y * y + z * z)
+    if length < 1e-12:
+        return 0.5 * x, 0.5 * y, 0.5 * z
+    scale = (2.0 if w >= 0.0 else -2.0) * math.atan2(length, abs(w)) / length
+    return scale * x, scale * y, scale * z
