@@ -168,6 +168,11 @@ class EscapePlanner:
         self._kept: Flight | None = None
         self._random = np.random.default_rng(0)
 
+    def look_anew(self) -> None:
+        """What the robot carries, or what may touch, has changed: the flight that is kept has to be flown anew."""
+        if self._kept is not None:
+            self._kept = self._kept._replace(until=-np.inf)
+
     def check(self, q: Array, v: Array, t: float, v_last: Array, proximity: Proximity) -> Array | None:
         """None where v may be commanded, else what to command in its place (nv,).
 
@@ -237,7 +242,7 @@ class EscapePlanner:
         """
         if self._obstacles.told or flight.until < start.t + self._settings.horizon - 1e-9:
             return False
-        if not np.array_equal(flight.start.watched, start.watched):
+        if abs(start.t - flight.start.t) > 1e-6 or not np.array_equal(flight.start.watched, start.watched):
             return False
         off, v = pin.difference(self._model, flight.start.q, start.q), start.v
         most = float(np.abs(off).sum())

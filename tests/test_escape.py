@@ -278,6 +278,7 @@ def test_what_was_found_clear_is_looked_at_anew_when_obstacles_turn(tmp_path):
         as_kept = planner._fly(start, planner._still, planner._kept.v)
         assert as_kept.value.clear == pytest.approx(clear, abs=0.005)
         assert found.value >= planner._enough  # aside, at less than 0.25 m/s: 0.21 m in 0.4 m / (0.5 m/s)
+        assert planner._fly(start, planner._still, found.v).value == pytest.approx(found.value, abs=1e-9)
 
 
 def test_no_flight_is_flown_where_nothing_comes_near(tmp_path, monkeypatch):
@@ -328,3 +329,33 @@ def test_where_nobody_is_said_to_come_nobody_does(tmp_path_factory, lines, t, v)
 
 ROBOTS = {}
 """Robots that are built once."""
+
+
+def test_a_flight_holds_only_while_it_is_of_what_is(tmp_path, among_balls):
+    _, planner, q = among_balls
+    planner.reset()
+    planner._foreseen.clear()
+    flight = next(
+        f
+        for f in iter(lambda: planner._fly(start_of(planner, q, 0.0), planner._drawn()), None)
+        if f.value >= planner._enough
+    )
+    assert planner._holds_from(flight, flight.start)
+    assert not planner._holds_from(flight, flight.start._replace(t=0.02))  # obstacles are elsewhere by then
+    assert not planner._holds_from(flight, flight.start._replace(watched=~planner._parted))
+    load = Obstacle.at("load", Sphere(radius=0.02), [0.3, 0.0, 0.0], graspable=True)
+    ball = Obstacle(
+        "ball", Sphere(radius=0.1), build_motion(Line(start=(0.0, 0.6, 0.0), end=(0.0, -2.0, 0.0), speed=0.01)), True
+    )
+    robot = cartesian(tmp_path, "xy", speed=0.25, acceleration=None)
+    controller = make_controller(robot, [load, ball], avoidance=Avoidance(d1=0.02, d2=0.1, escape=Escape(comfort=0.5)))
+    planner = controller._escape
+    for change in (
+        lambda: controller.attach("load", "y", robot.home),
+        lambda: controller.allow_contact("load", ["ball"]),
+        lambda: controller.release("load", robot.home),
+    ):
+        controller.filter(robot.home, np.zeros(2), 0.0)
+        assert planner._kept is not None and planner._holds_from(planner._kept, planner._kept.start)
+        change()
+        assert not planner._holds_from(planner._kept, planner._kept.start)
