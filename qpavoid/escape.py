@@ -220,7 +220,7 @@ class EscapePlanner:
 
     def _onward(self, start: Start) -> Iterator[Flight]:
         """The flight that is kept, if it holds; flights like it, by its manner and its velocities; standing still."""
-        if self._kept is not None:
+        if self._kept is not None and self._kept.v:
             kept = self._a_tick_on(self._kept)
             if self._holds_from(kept, start):
                 yield kept

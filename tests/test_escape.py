@@ -168,6 +168,19 @@ def test_a_way_out_that_leads_nearer_first_is_found(tmp_path):
         assert crushed or (q[0] > 0.3 and least > 0.9 * 0.3 * 0.02)
 
 
+def test_where_there_is_no_way_out_every_tick_has_an_outcome_all_the_same(tmp_path):
+    robot = cartesian(tmp_path, "xy", speed=0.4, acceleration=None)
+    closed, dt = [*press(), slab("plug", (0.05, 0.2, 0.2), (0.325, -0.15, 0.0))], 0.05
+    controller = make_controller(robot, closed, "y", dt=dt, avoidance=Avoidance(d1=0.02, d2=0.10, escape=Escape()))
+    ruler, q, least = Ruler(controller.scene), robot.home.copy(), np.inf
+    for k in range(60):
+        v = controller.step(q, k * dt, {"y": Sample.at([0.0, 0.0, 0.0])}).v
+        assert np.abs(v).max() <= 0.4 + 1e-9
+        least = min(least, ruler.least_between(q, v, dt, k * dt, steps=2))
+        q = pin.integrate(robot.model, q, dt * v)
+    assert least < -0.02
+
+
 def planner_of(scenario):
     """A planner, its controller, and the start of a run."""
     controller, q = Controller.from_scenario(scenario)
