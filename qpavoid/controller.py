@@ -275,6 +275,7 @@ class Controller:
         """
         index, frame_id = self._obstacles.index(obstacle), self.scene.robot.frame_id(frame, "attach")
         self._grasps.attach(index, frame_id, self._given_or_last(q))
+        self._look_anew()
         self._obstacles.carry(index, True)
         self._guard.forget(index)
 
@@ -296,6 +297,7 @@ class Controller:
         """
         index = self._obstacles.index(obstacle)
         sample = self._grasps.release(index, self._given_or_last(q))
+        self._look_anew()
         self._obstacles.carry(index, False)
         return sample
 
@@ -312,6 +314,11 @@ class Controller:
             ConfigError: none of the others has a pair with it.
         """
         self._grasps.allow(self._obstacles.index(obstacle), set(others), allowed)
+        self._look_anew()
+
+    def _look_anew(self) -> None:
+        if self._escape is not None:
+            self._escape.look_anew()
 
     def obstacle_pose(self, obstacle: str, q: Array | None = None) -> Sample:
         """World pose of an obstacle as the last tick had it, carried or not; see `release` for the arguments."""

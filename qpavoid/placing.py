@@ -59,6 +59,8 @@ class Placing:
         farthest = np.linalg.norm(spheres[:, :3], axis=1) + spheres[:, 3]
         reach = np.zeros(count)
         np.maximum.at(reach, scene.obstacle_of[len(scene.body_names) :], farthest[len(scene.body_names) :])
+        self.reach = reach
+        """(o,) distance from each obstacle's origin to its farthest point; infinite of a half-space [m]."""
         self._planes = np.flatnonzero(np.isinf(reach)).tolist()
         self._memory = Placed(
             states=self.states,
@@ -118,7 +120,7 @@ class Placing:
 
     def reaches(self, index: int, reach: float) -> None:
         """Takes another distance from an obstacle's origin to its farthest point [m]."""
-        self._memory.reach[index] = reach
+        self._memory.reach[index] = self.reach[index] = reach
 
     def _reach_of_plane(self, state: Array) -> float:
         """Distance from a half-space's origin to what the robot reaches, and may come to before it stands [m]."""

@@ -183,6 +183,18 @@ class DistanceQuery:
         self._computed = pairs
         self.pairs = pairs if self.unwatched is None else pairs[~self.unwatched[pairs]]
 
+    def body_spheres(self, data: Any) -> tuple[Array, Array]:
+        """World centres (b, 3) and radii (b,) of spheres around the robot's bodies and all that it may carry [m].
+
+        Args:
+            data: pinocchio data that holds the joint placements.
+        """
+        pin.updateGeometryPlacements(self._scene.robot.model, data, self._geometry, self._data)
+        poses = read_poses(self._data.oMg) if self._copy_poses else self.poses
+        poses, spheres = poses[: self._movable], self.spheres[: self._movable]
+        turned = (spheres[:, None, :3] @ poses[:, :9].reshape(-1, 3, 3))[:, 0]
+        return turned + poses[:, 9:], spheres[:, 3]
+
     def found(self, pairs: IntArray) -> Array:
         """Distances (k,) of some pairs at the last call; infinite for those that were out of reach [m].
 

@@ -103,11 +103,17 @@ class Obstacles:
         """(k,) numbers of those that move, or are given from outside; what the robot carries is none of them."""
         return self._seen.which
 
+    @property
+    def told(self) -> bool:
+        """Whether any is given from outside, so that what was foreseen of it may change from tick to tick."""
+        return bool(self._known)
+
     def foreseen(self, t: float) -> Seen:
         """Where they will be at t [s], on their trajectories, or as they were last seen to move."""
         states, given = self._seen.states.copy(), list(self._known)
-        move_on(states, t - self._now)
         last_seen = states[given]
+        if given:
+            move_on(last_seen, t - self._now)
         self._courses.sample(t, states)
         for index, motion in self._courses.others.items():
             put(as_samples(states)[index], motion.sample(t))

@@ -3,12 +3,14 @@
 import numpy as np
 import pinocchio as pin
 import pytest
-from closed_loop import SHIPPED, cartesian, make_controller
+from closed_loop import SHIPPED, Ruler, cartesian, changed, make_controller
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from qpavoid import Controller, Obstacle, Sample, ScenarioConfig, Status, kernels, load_scenario
-from qpavoid.config import Avoidance, Escape, Line, Sphere
+from qpavoid.config import Avoidance, Box, Escape, Line, Sphere
 from qpavoid.errors import ConfigError
-from qpavoid.escape import _farthest
+from qpavoid.escape import Start, _farthest
 from qpavoid.motion import build_motion
 
 DT = 0.01
@@ -132,3 +134,241 @@ def test_limits_of_the_settings_are_told():
     with pytest.raises(ValueError, match="horizon"):
         ScenarioConfig.model_validate({**fields, "avoidance": {"escape": {"horizon": 0.0}}})
     assert ScenarioConfig.model_validate(fields).avoidance.escape is None
+
+
+def slab(name, size, at, to=None, speed=0.3):
+    """A box at rest, or on its way to somewhere else."""
+    if to is None:
+        return Obstacle.at(name, Box(size=size), at)
+    return Obstacle(name, Box(size=size), build_motion(Line(start=at, end=to, speed=speed), None, SHIPPED.parent), True)
+
+
+def press():
+    """A chamber 0.6 m wide, with a piston that comes down in it, and a way out: a neck 20 cm high low in one wall."""
+    return [
+        slab("floor", (0.7, 0.1, 0.2), (0.0, -0.35, 0.0)),
+        slab("left", (0.1, 2.0, 0.2), (-0.35, 0.65, 0.0)),
+        slab("above", (0.05, 1.05, 0.2), (0.325, 0.475, 0.0)),
+        slab("below", (0.05, 0.75, 0.2), (0.325, -0.625, 0.0)),
+        slab("piston", (0.58, 0.1, 0.2), (0.0, 0.5, 0.0), (0.0, -0.4, 0.0)),
+    ]
+
+
+def test_a_way_out_that_leads_nearer_first_is_found(tmp_path):
+    """Whoever only keeps away from everything stays in the chamber: in the neck walls are at 5 cm, not at 10."""
+    robot = cartesian(tmp_path, "xy", speed=0.4, acceleration=None)
+    for escape, crushed in ((None, True), (Escape(), False)):
+        controller = make_controller(robot, press(), "y", avoidance=Avoidance(d1=0.02, d2=0.10, escape=escape))
+        ruler, q, least = Ruler(controller.scene), robot.home.copy(), np.inf
+        for k in range(240):
+            v = controller.step(q, k * DT, {"y": Sample.at([0.0, 0.0, 0.0])}).v
+            least = min(least, ruler.least_between(q, v, DT, k * DT, steps=2))
+            q = pin.integrate(robot.model, q, DT * v)
+        assert (least < 0.0) == crushed, least
+        assert crushed or (q[0] > 0.3 and least > 0.9 * 0.3 * 0.02)
+
+
+def test_where_there_is_no_way_out_every_tick_has_an_outcome_all_the_same(tmp_path):
+    robot = cartesian(tmp_path, "xy", speed=0.4, acceleration=None)
+    closed, dt = [*press(), slab("plug", (0.05, 0.2, 0.2), (0.325, -0.15, 0.0))], 0.05
+    controller = make_controller(robot, closed, "y", dt=dt, avoidance=Avoidance(d1=0.02, d2=0.10, escape=Escape()))
+    ruler, q, least = Ruler(controller.scene), robot.home.copy(), np.inf
+    for k in range(60):
+        v = controller.step(q, k * dt, {"y": Sample.at([0.0, 0.0, 0.0])}).v
+        assert np.abs(v).max() <= 0.4 + 1e-9
+        least = min(least, ruler.least_between(q, v, dt, k * dt, steps=2))
+        q = pin.integrate(robot.model, q, dt * v)
+    assert least < -0.02
+
+
+def planner_of(scenario):
+    """A planner, its controller, and the start of a run."""
+    controller, q = Controller.from_scenario(scenario)
+    planner = controller._escape
+    assert planner is not None
+    return controller, planner, q
+
+
+@pytest.fixture(scope="module", params=[None, 3.0], ids=["speeds", "accelerations"])
+def among_balls(request):
+    """A Panda among balls that cross its way."""
+    balls = [
+        {
+            "name": f"ball{i}",
+            "shape": {"type": "sphere", "radius": 0.08},
+            "motion": {"type": "line", "start": start, "end": end, "speed": 0.3},
+        }
+        for i, (start, end) in enumerate(
+            [
+                ((0.9, 0.1, 0.5), (-0.9, 0.1, 0.5)),
+                ((0.4, -0.8, 0.7), (0.4, 0.8, 0.4)),
+                ((0.2, 0.7, 0.3), (0.2, -0.7, 0.3)),
+            ]
+        )
+    ]
+    limits = {"acceleration": request.param} if request.param else {}
+    avoidance = {"d1": 0.03, "d2": 0.1, "escape": {}}
+    return planner_of(changed("panda_line", obstacles=balls, avoidance=avoidance, limits=limits, dt=0.01))
+
+
+def start_of(planner, q, t, v=None):
+    return Start(q, np.zeros(len(q)) if v is None else v, t, planner._parted)
+
+
+def test_a_flight_that_is_flown_again_is_the_same_and_so_is_what_is_left_of_it(among_balls):
+    _, planner, q = among_balls
+    planner.reset()
+    touched = 0
+    for t in (0.02, 0.13, 0.51, 1.17):  # a tick later, flights end at the same time
+        for manner in [planner._still, *(planner._drawn() for _ in range(5))]:
+            planner._foreseen.clear()
+            flight = planner._fly(start_of(planner, q, t), manner)
+            again = planner._fly(flight.start, planner._still, flight.v)
+            assert again.value == pytest.approx(flight.value, abs=1e-12)
+            assert np.array_equal(again.v, flight.v)
+            touched += flight.value.clear < 1.5
+            left = planner._a_tick_on(flight)
+            later = planner._fly(left.start, manner, left.v)
+            assert later.until == pytest.approx(flight.until, abs=1e-9)
+            assert later.least >= flight.least - 1e-9
+    assert 0 < touched < 24
+
+
+def test_flights_that_hold_from_a_start_close_by_do_so(among_balls):
+    """With the bound taken at its word by flying anew what it says need not be."""
+    _, planner, q = among_balls
+    planner.reset()
+    rng, held = np.random.default_rng(2), 0
+    for _ in range(60):
+        t = rng.uniform(0.0, 2.0)
+        planner._foreseen.clear()
+        flight = planner._fly(start_of(planner, q, t), planner._drawn())
+        off = rng.uniform(-1.0, 1.0, len(q)) * 10.0 ** rng.uniform(-4.0, -1.5)
+        start = start_of(planner, pin.integrate(planner._model, q, off), t, rng.uniform(-0.05, 0.05, len(q)))
+        if planner._holds_from(flight, start):
+            held += 1
+            again = planner._fly(start, planner._still, flight.v)
+            assert again.value >= planner._enough
+            assert again.least >= flight.least - planner._lever * 0.1 * len(q)
+    assert 5 < held < 55
+
+
+def test_a_plate_that_is_passed_between_two_looks_is_seen(tmp_path):
+    """A ball of 10 cm at 3 m/s passes a plate of 2 mm within 34 ms; flights decide every 40 ms."""
+    robot = cartesian(tmp_path, "xy", speed=3.0, acceleration=None)
+    plate = slab("plate", (0.002, 2.0, 0.2), (0.001, 0.0, 0.0))
+    for shift in np.linspace(0.0, 0.12, 7):
+        controller = make_controller(
+            robot, [plate, *jaws()], "y", avoidance=Avoidance(d1=0.02, d2=0.1, escape=Escape())
+        )
+        planner = controller._escape
+        q = np.array([-0.5 - shift, 0.0])
+        flight = planner._fly(
+            Start(q, np.zeros(2), 0.0, planner._parted), planner._still, 4 * 10 * [np.array([3.0, 0.0])]
+        )
+        touches = (0.45 + shift) / 3.0
+        assert flight.until == pytest.approx(touches, abs=0.04), shift
+
+
+def test_what_was_found_clear_is_looked_at_anew_when_obstacles_turn(tmp_path):
+    robot = cartesian(tmp_path, "xy", speed=0.25, acceleration=None)
+    chaser = Obstacle.at("chaser", Sphere(radius=0.1), [-0.4, 0.0, 0.0])
+    avoidance = Avoidance(d1=0.02, d2=0.1, escape=Escape(attempts=20))
+    controller = make_controller(robot, [chaser], "y", avoidance=avoidance)
+    planner = controller._escape
+
+    def told(speed):
+        return {"chaser": Sample.at([-0.4, 0.0, 0.0], linear=[speed, 0.0, 0.0])}
+
+    start = Start(robot.home, np.zeros(2), 0.0, planner._parted)
+    for speed, clear in ((0.0, 1.5), (0.5, 0.25 / 0.5)):
+        controller._obstacles.observe(0.0, told(speed))
+        planner._foreseen.clear()
+        found, _ = planner._way_out(start)
+        if speed == 0.0:
+            planner._kept = found
+            assert np.abs(found.v).max() < 1e-9
+        as_kept = planner._fly(start, planner._still, planner._kept.v)
+        assert as_kept.value.clear == pytest.approx(clear, abs=0.005)
+        assert found.value >= planner._enough  # aside, at less than 0.25 m/s: 0.21 m in 0.4 m / (0.5 m/s)
+        assert planner._fly(start, planner._still, found.v).value == pytest.approx(found.value, abs=1e-9)
+
+
+def test_no_flight_is_flown_where_nothing_comes_near(tmp_path, monkeypatch):
+    robot = cartesian(tmp_path, "xy", speed=0.25, acceleration=None)
+    far = [
+        Obstacle(
+            "far", Sphere(radius=0.1), build_motion(Line(start=(0.0, 3.0, 0.0), end=(0.0, 0.0, 0.0), speed=0.3)), True
+        )
+    ]
+    controller = make_controller(robot, far, "y", avoidance=Avoidance(d1=0.02, d2=0.1, escape=Escape()))
+    flown = []
+    fly = controller._escape._fly
+    monkeypatch.setattr(controller._escape, "_fly", lambda *a: flown.append(a[0].t) or fly(*a))
+    q = robot.home.copy()
+    for k in range(0, 900, 10):
+        controller.step(q, k * DT, {"y": Sample.at([0.0, 0.0, 0.0])})
+        if flown:
+            break
+    near = 3.0 - 0.15 - 0.3 * (k * DT + 1.51)  # where it will be a tick and 1.5 s later, looked at every 0.1 s
+    assert near - 0.015 < 0.1 < near - 0.015 + 0.03
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.tuples(*[st.floats(-1.5, 1.5)] * 6, st.floats(0.05, 0.5)), min_size=1, max_size=4),
+    st.floats(0.0, 1.0),
+    st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0)),
+)
+def test_where_nobody_is_said_to_come_nobody_does(tmp_path_factory, lines, t, v):
+    robot = ROBOTS.setdefault("xy", cartesian(tmp_path_factory.mktemp("robot"), "xy", speed=1.0, acceleration=2.0))
+    obstacles = [
+        Obstacle(f"o{i}", Sphere(radius=0.1), build_motion(Line(start=line[:3], end=line[3:6], speed=line[6])), True)
+        for i, line in enumerate(lines)
+        if np.linalg.norm(np.subtract(line[:3], line[3:6])) > 1e-3
+    ]
+    if not obstacles:
+        return
+    controller = make_controller(robot, obstacles, avoidance=Avoidance(d1=0.02, d2=0.1, escape=Escape()))
+    planner, v = controller._escape, np.array(v)
+    if planner._nobody_comes(Start(robot.home, v, t, planner._parted)):
+        for later in np.linspace(0.0, 1.5, 76):
+            ramp = np.minimum(later, np.abs(v) / 2.0)
+            q = robot.home + np.sign(v) * (np.abs(v) * ramp - ramp**2)
+            place = np.array([*q, 0.0])
+            centers = [o.motion.sample(t + later).position for o in obstacles]
+            assert min(np.linalg.norm(place - center) for center in centers) - 0.15 > 0.1
+
+
+ROBOTS = {}
+"""Robots that are built once."""
+
+
+def test_a_flight_holds_only_while_it_is_of_what_is(tmp_path, among_balls):
+    _, planner, q = among_balls
+    planner.reset()
+    planner._foreseen.clear()
+    flight = next(
+        f
+        for f in iter(lambda: planner._fly(start_of(planner, q, 0.0), planner._drawn()), None)
+        if f.value >= planner._enough
+    )
+    assert planner._holds_from(flight, flight.start)
+    assert not planner._holds_from(flight, flight.start._replace(t=0.02))  # obstacles are elsewhere by then
+    assert not planner._holds_from(flight, flight.start._replace(watched=~planner._parted))
+    load = Obstacle.at("load", Sphere(radius=0.02), [0.3, 0.0, 0.0], graspable=True)
+    ball = Obstacle(
+        "ball", Sphere(radius=0.1), build_motion(Line(start=(0.0, 0.6, 0.0), end=(0.0, -2.0, 0.0), speed=0.01)), True
+    )
+    robot = cartesian(tmp_path, "xy", speed=0.25, acceleration=None)
+    controller = make_controller(robot, [load, ball], avoidance=Avoidance(d1=0.02, d2=0.1, escape=Escape(comfort=0.5)))
+    planner = controller._escape
+    for change in (
+        lambda: controller.attach("load", "y", robot.home),
+        lambda: controller.allow_contact("load", ["ball"]),
+        lambda: controller.release("load", robot.home),
+    ):
+        controller.filter(robot.home, np.zeros(2), 0.0)
+        assert planner._kept is not None and planner._holds_from(planner._kept, planner._kept.start)
+        change()
+        assert not planner._holds_from(planner._kept, planner._kept.start)

@@ -323,7 +323,7 @@ def test_qp_collisions_that_only_giving_up_the_task_avoids(seed):
     assert not trial.avoidable, trial.judged
 
 
-@pytest.mark.parametrize("seed", [265, 309, 419])  # of those that `qp` alone does not get through
+@pytest.mark.parametrize("seed", [265, 309, 419, 100, 488, 559, 670])  # `qp` alone does not get through these
 def test_foresight_gets_out_of_traps(seed):
     (trial,) = trials(seed, ("qp+escape",))
     assert not trial.collided and trial.speed_excess <= 1e-9, trial.judged

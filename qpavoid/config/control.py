@@ -49,15 +49,16 @@ class Escape(Block):
     horizon: Annotated[float, Field(ge=0.1, le=10.0)] = 1.5
     """How long a flight has to stay clear [s]."""
     period: Annotated[float, Field(ge=0.005, le=0.5)] = 0.04
-    """Time from one decision of a flight to the next [s]; distances are looked at as often."""
+    """Time from one decision of a flight to the next [s]; distances are looked at as often, or twice as often."""
     reach: Positive = 0.3
     """Distance up to which flights look at pairs [m]."""
     comfort: Positive = 0.1
     """Distance beyond which flights want no more [m]."""
     safe: Annotated[float, Field(ge=0, le=1)] = 0.3
     """Share of the safe distance that a flight has to keep [-]."""
-    attempts: Annotated[int, Field(ge=1, le=7)] = 3
-    """Manners of fleeing that a tick tries beside standing still and the one that last worked [-]."""
+    attempts: Annotated[int, Field(ge=1, le=100)] = 3
+    """Flights drawn at random that a tick may try where those like the last good one do not stay clear [-]. The more,
+    the sooner a way out is found, and the more time such a tick takes."""
 
 
 class Avoidance(Block):

@@ -71,6 +71,38 @@ def project_soft(
 
 
 @compiled
+def farthest(
+    A: Array, d: Array, comfort: float, deepest: float, gentle: float, v: Array, lower: Array, upper: Array
+) -> tuple[Array, bool]:
+    """max s - ½ s²/c - ε/2c ‖w - v‖² over w and s, with A w + d >= s, lower <= w <= upper, s <= c.
+
+    Args:
+        A: rows (k, nv).
+        d: what is added to them (k,).
+        comfort: c, where the slope of the objective in s has come to nothing.
+        deepest: s is not below its negative.
+        gentle: ε.
+        v: (nv,).
+        lower: lower bounds (nv,).
+        upper: upper bounds (nv,).
+
+    Returns:
+        w (nv,), and whether it is the answer; if not, round-off got in the way, or s would lie too deep.
+    """
+    k, n = A.shape
+    P, G = np.zeros((n + 1, n + 1)), np.empty((k, n + 1))
+    x, low, high = np.empty(n + 1), np.empty(n + 1), np.empty(n + 1)
+    for i in range(n):
+        P[i, i], x[i], low[i], high[i] = gentle, v[i], lower[i], upper[i]
+        for j in range(k):
+            G[j, i] = A[j, i]
+    P[n, n], x[n], low[n], high[n] = 1.0, comfort, -deepest, comfort
+    G[:, n] = -1.0
+    met = minimize(P, x, G, -d, low, high, np.zeros(k))
+    return x[:n], met
+
+
+@compiled
 def minimize(P: Array, x: Array, G: Array, h: Array, lower: Array, upper: Array, soft: Array) -> bool:
     """Moves x from the minimiser of ½ (x - x0)ᵀP (x - x0) to the one with G x >= h, lower <= x <= upper.
 
