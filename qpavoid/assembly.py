@@ -243,14 +243,17 @@ class Assembly:
         worst = float(kernels.shortfall(v0, near.J, near.b, x.lower, x.upper))
         return problem._replace(tracking=tracking, v0=v0, shortfall=worst)
 
-    def fastest_frame(self) -> int:
-        """The task that asks for the largest linear speed; -1 where no frame has a position to follow."""
+    def at_length(self, problem: Problem) -> Problem:
+        """The problem of this tick with what the limits of accelerations and jerks allow at length, not at once."""
         x = self._layout
-        moving = len(x.scale) - 3 * len(x.turns)
-        if not moving:
-            return -1
-        linear = (x.b[:moving] / x.scale[:moving]).reshape(-1, 3)
-        return int(np.argmax(np.linalg.norm(linear, axis=1)))
+        return problem._replace(
+            lower=x.hard_lower, upper=x.hard_upper, hard_lower=x.hard_lower, hard_upper=x.hard_upper
+        )
+
+    def goal(self, frame: int) -> tuple[Array, float]:
+        """Where a task wants its frame (3,), world, and how far that is from where the frame is [m]."""
+        target = self._targets[frame][0]
+        return target.copy(), float(np.linalg.norm(target - self.kinematics.position[frame]))
 
     def wanted_velocity(self, frame: int) -> Array:
         """Linear velocity (3,) that a task asks of its frame [m/s]."""

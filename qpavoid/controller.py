@@ -16,6 +16,7 @@ from qpavoid.assembly import Assembly
 from qpavoid.cloud import Points
 from qpavoid.config import Avoidance, Limits, Progress, ScenarioConfig, Sensing
 from qpavoid.contacts import ContactRows, build_contacts
+from qpavoid.detour import Detours
 from qpavoid.errors import ConfigError, NumericalError, UnknownName, located
 from qpavoid.escape import EscapePlanner
 from qpavoid.grasp import Grasps
@@ -105,7 +106,6 @@ class Controller:
         if len(self._task_names) < len(self.tasks):
             raise ConfigError(f"tasks: two have the same name among {', '.join(self._task_names)}; give one a `name`")
         self._obstacles = Obstacles(scene.obstacles, sensing or Sensing(), dt)
-        self._progress = ProgressWatch(progress or Progress(), dt, scene.pair_names)
         self._reach = self.avoidance.d2 - self.avoidance.offset
         self._bounds = scene.robot.bounds().within(self.limits)
         self._q_last = scene.robot.home.copy()
@@ -113,10 +113,11 @@ class Controller:
             scene, self.tasks, self._bounds, self._kinematics, self._query, self.avoidance,
             self.limits, tracking_damping, dt, contacts,
         )  # fmt: skip
-        self._guard = Guard(
-            scene, self._kinematics, self._bounds, self.limits.position_gain,
-            self.avoidance.hold - self.avoidance.offset, dt,
-        )  # fmt: skip
+        keep, progress = self.avoidance.hold - self.avoidance.offset, progress or Progress()
+        self._guard = Guard(scene, self._kinematics, self._bounds, self.limits.position_gain, keep, dt)
+        moving = [task for task in frames if task.moves]
+        detours = Detours(progress.detour, dt, scene, moving, self._query, keep) if progress.detour else None
+        self._progress = ProgressWatch(progress, dt, scene.pair_names, detours)
         self._escape: EscapePlanner | None = None
         if self.avoidance.escape is not None:
             if contacts is not None:
@@ -125,7 +126,7 @@ class Controller:
                 scene, self._bounds, self._obstacles, self.avoidance, self.limits, dt, self.avoidance.escape
             )
         queries = (self._query, self._guard.ahead, *([self._escape.query] if self._escape else []))
-        self._grasps = Grasps(scene, queries, self._assembly, self.avoidance.hold - self.avoidance.offset)
+        self._grasps = Grasps(scene, queries, self._assembly, keep)
         self._warm_up()
 
     def _warm_up(self) -> None:
