@@ -63,7 +63,7 @@ class _Search:
     """Distance to it from which the budget counts [m]."""
     tries: int = 0
     ticks: int = 0
-    """On ways round, in all."""
+    """In which something was in the way."""
     given_up: str = ""
     """Why; empty while it goes on."""
     culprits: dict[int, Array] = field(default_factory=dict)
@@ -124,52 +124,65 @@ class Detours:
         opposed = len(row) and rows.J[row[0]] @ problem.v0 < rows.b[row[0]]
         way.free = 0 if opposed else way.free + 1
         way.ticks += 1
-        search.ticks += 1
         if len(row):
             t = _tangent(way.axis, proximity.normal[row[0]])
             headway = t @ assembly.frame_velocity(way.frame, assembly.v_last)
             way.stalled = 0 if headway > _HEADWAY * config.speed else way.stalled + 1
-        longest = min(config.longest, config.patience - (search.ticks - way.ticks) * dt)
-        if not len(row) or way.free * dt > config.settle or way.stalled * dt > patience or way.ticks * dt > longest:
+        late = way.ticks * dt > config.longest or search.ticks * dt > config.patience
+        if not len(row) or way.free * dt > config.settle or way.stalled * dt > patience or late:
             search.tries += 1
             self.way = None
-            if search.tries >= config.tries or search.ticks * dt > config.patience:
-                ways = "1 way" if search.tries == 1 else f"{search.tries} ways"
-                self._give_up(
-                    way.frame, f"gave up after {ways} round in {search.ticks * dt:.1f} s", self._obstacle(way.pair)
-                )
             return None
         back = max(-float(t @ assembly.wanted_velocity(way.frame)), 0.0)  # what the task would have of the way undone
         return assembly.redirected(problem, way.frame, (config.speed + back) * t)
 
-    def begin(self, problem: Problem, proximity: Proximity, assembly: Assembly, solver: Solver, pair: int) -> None:
-        """Sets out on a way round a pair, the one along which a tool gets on fastest, if any is left to try."""
+    def begin(
+        self, problem: Problem, proximity: Proximity, assembly: Assembly, solver: Solver, culprits: list[int]
+    ) -> None:
+        """Sets out on a way round one of the pairs that are in the way, if there is any left to try."""
         frame = self._blocked_frame(assembly)
-        row = np.flatnonzero(proximity.pair == pair)
-        if frame < 0 or not len(row):
+        if frame < 0:
             return
         goal, distance = assembly.goal(frame)
         search = self._searches.setdefault(frame, _Search(goal, distance))
+        obstacles = [self._scene.pairs[pair, 1] for pair in culprits]
+        seconds = search.ticks * self._dt
         if self._hopeless(frame, goal):
             return
-        n = proximity.normal[row[0]]
+        if search.tries >= self._config.tries or seconds > self._config.patience:
+            ways = "1 way" if search.tries == 1 else f"{search.tries} ways"
+            self._give_up(frame, f"gave up after {ways} round in {seconds:.1f} s", obstacles)
+            return
+        for pair in culprits:
+            self.way = self._way_round(pair, frame, problem, proximity, assembly, solver)
+            if self.way is not None:
+                return
+        self._give_up(frame, "gave up, as no way leads round", obstacles)
+
+    def _way_round(
+        self, pair: int, frame: int, problem: Problem, proximity: Proximity, assembly: Assembly, solver: Solver
+    ) -> _Way | None:
+        """The way round a pair along which the tool gets on fastest; None where it does along none."""
+        row = np.flatnonzero(proximity.pair == pair)
+        if not len(row):
+            return None
+        n, speed = proximity.normal[row[0]], self._config.speed
         across = np.cross(n, np.eye(3)[np.argmin(np.abs(n))])
         across /= np.linalg.norm(across)
         best, axis = -np.inf, across
-        for angle in np.linspace(0.0, 2.0 * np.pi, _DIRECTIONS, endpoint=False) + search.tries * np.pi:
+        begin = self._searches[frame].tries * np.pi  # every other try on the other side
+        for angle in np.linspace(0.0, 2.0 * np.pi, _DIRECTIONS, endpoint=False) + begin:
             t = np.cos(angle) * across + np.sin(angle) * np.cross(n, across)
-            tried = assembly.redirected(problem, frame, self._config.speed * t)
-            speed = float(t @ assembly.frame_velocity(frame, solver.solve(assembly.at_length(tried)).v))
-            if speed > best + 1e-6:
-                best, axis = speed, np.cross(n, t)
-        if best > _HEADWAY * self._config.speed:
-            self.way = _Way(pair, axis, frame)
-        else:
-            self._give_up(frame, "gave up, as no way leads round", self._obstacle(pair))
+            tried = assembly.at_length(assembly.redirected(problem, frame, speed * t))
+            headway = float(t @ assembly.frame_velocity(frame, solver.solve(tried).v))
+            if headway > best + 1e-6:
+                best, axis = headway, np.cross(n, t)
+        return _Way(pair, axis, frame) if best > _HEADWAY * speed else None
 
-    def notice(self, assembly: Assembly) -> None:
-        """Renews what a change of the situation has renewed: goals, obstacles in the way, tools nearer than before."""
+    def notice(self, problem: Problem, assembly: Assembly) -> None:
+        """Counts the time, and begins anew where a goal or an obstacle has moved, or a tool is nearer than before."""
         for frame, search in self._searches.items():
+            search.ticks += problem.shortfall > 0.0
             goal, distance = assembly.goal(frame)
             if float(np.linalg.norm(goal - search.goal)) > _MOVED:
                 search.renew(goal, distance)
@@ -203,16 +216,13 @@ class Detours:
         return False
 
     def _give_up(self, frame: int, why: str, obstacles: list[int]) -> None:
-        """Gives up the goal of a task, until some geometries of obstacles have moved, or what else `notice` sees."""
-        search = self._searches[frame]
-        search.given_up, search.culprits = why, {i: self._query.poses[i].copy() for i in obstacles}
+        """Gives up the goal of a task, until some geometries have moved, or what else `notice` sees.
 
-    def _obstacle(self, pair: int) -> list[int]:
-        """Geometry of the obstacle of a pair; none for bodies of the robot, what it carries, and points."""
-        geometry = int(self._scene.pairs[pair, 1])
-        number = int(self._scene.obstacle_of[geometry])
-        rigid = number >= 0 and number not in self._scene.clouds and number not in self._query.carried
-        return [geometry] if rigid else []
+        Those of the robot, of what it carries and of points do not count: where they are also depends on the robot.
+        """
+        search, of = self._searches[frame], self._scene.obstacle_of
+        rigid = [i for i in obstacles if of[i] >= 0 and of[i] not in (*self._scene.clouds, *self._query.carried)]
+        search.given_up, search.culprits = why, {i: self._query.poses[i].copy() for i in rigid}
 
     def _has_moved(self, geometry: int, pose: Array) -> bool:
         turn, shift = np.split(self._query.poses[geometry] - pose, [9])

@@ -48,9 +48,9 @@ class ProgressWatch:
         detours = self._detours
         if detours is None:
             return problem
-        detours.notice(assembly)
+        detours.notice(problem, assembly)
         if detours.way is None and self.blocked and self._culprits:
-            detours.begin(problem, proximity, assembly, solver, self._culprits[0])
+            detours.begin(problem, proximity, assembly, solver, self._culprits)
         if detours.way is None:
             return problem
         redirected = detours.follow(problem, proximity, assembly, self._config.blocked_after)

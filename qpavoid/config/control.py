@@ -148,8 +148,8 @@ class Detour(Block):
     """Time after which a way has ended [s]; the other side is tried next."""
     tries: Annotated[int, Field(ge=1)] = 4
     """Ways that bring the tool no nearer to its goal than before, after which the goal is given up."""
-    patience: Positive = 30.0
-    """Time on such ways in all, after which it is given up, too [s]."""
+    patience: Positive = 40.0
+    """Time with something in the way, on such ways and back, after which no way is gone on with, or begun [s]."""
 
 
 class Progress(Block):
