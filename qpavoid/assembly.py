@@ -120,6 +120,9 @@ class Assembly:
         self._levels = levels if len(levels) > 1 else ()
         self._forward, self._contacts = kinematics, contacts
         self._eye = np.eye(nv)
+        self._before, self._change = np.zeros(nv), np.zeros(nv)
+        self.limits_may_give_way = x.jerked or (contacts is not None and x.accelerated)
+        """Whether `beyond_limits` has to be asked: bounds alone do not keep to accelerations and jerks then."""
         self.kinematics = Kinematics(self._layout.J_world, self._layout.poses)
 
     def compute(
@@ -147,6 +150,7 @@ class Assembly:
         proximity, rows = self._views.get(k) or self._view(k)
         if held is not None:
             x.v0[:] = tracking_within(held, x.A, x.b, x.damping)
+            self._count_from_before()
             worst = float(kernels.tracking_shortfall(self._packed, k))
         bounds = x.lower, x.upper, *self._hard, x.v_stop
         return proximity, Problem(
@@ -265,20 +269,40 @@ class Assembly:
         rows = slice(3 * frame, 3 * frame + 3)
         return np.asarray(self._layout.A[rows] @ v / self._layout.scale[rows])
 
+    def _count_from_before(self) -> None:
+        """Narrows the bounds to what accelerations and jerks allow from the velocity before.
+
+        The kernels count from the nearest one that holds the contacts, which have turned a little since.
+        """
+        x = self._layout
+        low = np.maximum(self._before - x.v_step, self._before + x.w_last - x.w_step)
+        high = np.minimum(self._before + x.v_step, self._before + x.w_last + x.w_step)
+        low, high = np.minimum(low, x.upper), np.maximum(high, x.lower)
+        np.maximum(x.lower, low, out=x.lower)
+        np.minimum(x.upper, high, out=x.upper)
+
+    def beyond_limits(self, v: Array) -> tuple[Array, Array]:
+        """By how much v (nv,) passes what accelerations and what jerks allow (nv,), negative within [rad/s or m/s]."""
+        x, change = self._layout, v - self._before
+        return np.abs(change) - x.v_step, np.abs(change - self._change) - x.w_step
+
     def remember(self, v: Array) -> None:
         """Takes v (nv,) as the velocity at which the robot moves from this tick to the next."""
         x = self._layout
-        if x.jerked:
-            np.clip(v - x.v_last, -x.v_step, x.v_step, out=x.w_last)
+        if self.limits_may_give_way:
+            np.subtract(v, self._before, out=self._change)
+            self._before[:] = v
+            np.clip(self._change, -x.v_step, x.v_step, out=x.w_last)
         x.v_last[:] = v
 
     def measured(self, v: Array) -> None:
         """Takes v (nv,) as the velocity at which the robot moves until this tick; accelerations stay as commanded."""
-        self._layout.v_last[:] = v
+        self._layout.v_last[:], self._before[:] = v, v
 
     def restart(self, v: Array) -> None:
         """Takes v (nv,) as the velocity at which the robot has been moving, without any acceleration."""
         self._layout.v_last[:], self._layout.w_last[:] = v, 0.0
+        self._before[:], self._change[:] = v, 0.0
 
     @property
     def v_last(self) -> Array:

@@ -40,6 +40,10 @@ _ABSURD = 1e100
 """Violation of a row or bound from which numbers are looked through for what cannot be true [m/s, rad/s]."""
 
 
+_UNFELT = 2e-6
+"""What a velocity may pass limits of acceleration or jerk by without a word: the tolerance of the QP [rad/s, m/s]."""
+
+
 class Tick(NamedTuple):
     """Everything that one tick computed."""
 
@@ -387,6 +391,8 @@ class Controller:
             solution = solution._replace(blocked=blocked) if blocked else solution
         if self._escape is not None and not faults:
             solution = self._with_a_way_out(self._escape, q, t, proximity, problem, solution)
+        if self._assembly.limits_may_give_way and self.solver.bounded:
+            solution = self._with_limits_passed(problem, solution)
         self._assembly.remember(solution.v)
         solution = solution._replace(assumed=assumed) if assumed else solution
         return samples, proximity, problem, solution.timed(built - begin, perf_counter() - built)
@@ -444,6 +450,22 @@ class Controller:
         reason = "the tasks: no way out would be left among the obstacles that move"
         status = solution.status if solution.status is Status.STOPPED else Status.RELAXED
         return solution._replace(v=v, status=status, reasons=(*solution.reasons, reason))
+
+    def _with_limits_passed(self, problem: Problem, solution: Solution) -> Solution:
+        """Says which accelerations and jerks pass their limits, where bounds had to: to get back from where a relaxed
+        tick has led to, before a position or velocity limit, or to hold contacts.
+        """
+        said = " ".join([reason for reason in solution.reasons if "beyond its" in reason])
+        lines = [
+            f"{problem.joint_names[j]}: {excess[j]:.4f} rad/s or m/s beyond its {name} limit"
+            for name, excess in zip(("acceleration", "jerk"), self._assembly.beyond_limits(solution.v), strict=True)
+            for j in np.flatnonzero(excess > _UNFELT).tolist()
+            if f"{problem.joint_names[j]}: " not in said
+        ]
+        if not lines:
+            return solution
+        status = solution.status if solution.status is Status.STOPPED else Status.RELAXED
+        return solution._replace(status=status, reasons=(*solution.reasons, *lines))
 
     def _expected(self) -> Array:
         """Where the robot is if it did what it was told last (nq,)."""
