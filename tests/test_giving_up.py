@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from qpavoid import Avoidance, Obstacle, Robot, Sample
 from qpavoid.config import Box, Detour, Progress, Sphere
-from qpavoid.reach import arm
+from qpavoid.reach import arm, too_near
 
 DT, KEEP, RADIUS = 0.01, 0.03, 0.05
 QUICK = {"speed": 0.2, "longest": 2.0, "patience": 20.0}
@@ -147,16 +147,42 @@ def test_nothing_is_tried_for_a_goal_inside_an_obstacle(tmp_path):
     assert np.abs(q[:, 1:]).max() < 1e-3 and np.abs(q[-1] - q[-200]).max() < 2e-3
 
 
-def test_a_goal_near_an_obstacle_proves_nothing_where_the_tool_may_stand_off_from_it(tmp_path):
-    """A frame 0.2 m in front of its body may be inside the ball, as long as the body is not."""
-    robot = cartesian(tmp_path, acceleration=None)
+def stand_off(folder):
+    """A tool 0.25 m in front of the one body that it has."""
+    cartesian(folder, acceleration=None)
     body = {"name": "tool", "frame": "z", "shape": {"type": "sphere", "radius": 0.05}, "position": [-0.25, 0.0, 0.0]}
-    robot = Robot.from_urdf(tmp_path / "cartesian.urdf", bodies=[body])
+    return Robot.from_urdf(folder / "cartesian.urdf", bodies=[body])
+
+
+def test_a_goal_inside_an_obstacle_is_reached_where_the_body_stands_off_from_it(tmp_path):
+    robot = stand_off(tmp_path)
     ball = Obstacle.at("ball", Sphere(radius=0.1), [0.3, 0.0, 0.0])
     controller = make_controller(robot, [ball], "z", progress=Progress(detour=Detour()), task={"max_speed": 0.3})
     ticks = list(drive(controller, np.zeros(3), 600, target=[0.3, 0.0, 0.0]))
     assert np.linalg.norm(ticks[-1].state.q - [0.3, 0.0, 0.0]) < 1e-3
     assert not any(tick.solution.blocked for tick in ticks)
+
+
+@pytest.mark.parametrize("where", ["panda", "stand-off"])
+def test_what_is_attained_is_never_said_to_be_too_near(panda, tmp_path, where):
+    """Wherever all bodies are as clear of a ball as they have to be, nothing is said of the place of the tool."""
+    rng, name = np.random.default_rng(0), "panda_hand_tcp" if where == "panda" else "z"
+    robot = panda if where == "panda" else stand_off(tmp_path)
+    controller = make_controller(robot, [Obstacle.at("ball", Sphere(radius=0.1), [0.0, 0.0, 5.0])], name)
+    tool, query, data, close = robot.frame_id(name, "test"), controller._query, robot.model.createData(), 0
+    for _ in range(300):
+        q = rng.uniform(robot.model.lowerPositionLimit, robot.model.upperPositionLimit)
+        pin.framesForwardKinematics(robot.model, data, q)
+        goal = data.oMf[tool].translation.copy()
+        away = rng.normal(size=3)
+        place = goal + rng.uniform(0.0, 0.25) * away / np.linalg.norm(away)
+        near = controller.tick(q, 0.0, None, {"ball": Sample.at(place)}).proximity
+        of_ball = controller.scene.obstacle_of[controller.scene.pairs[near.pair, 1]] == 0
+        least = near.distance[of_ball].min(initial=0.1)  # no farther than pairs are looked for
+        if least > 0.0:
+            assert too_near(controller.scene, query, tool, goal, least)[0] < 1e-6
+            close += least < 0.1
+    assert close > 5
 
 
 def test_a_goal_beyond_the_arm_is_given_up_by_name_and_amount(panda):
