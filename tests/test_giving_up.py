@@ -84,7 +84,7 @@ def test_the_bounds_are_kept_whatever_they_are(tmp_path_factory, tries, longest,
     _, _, said = loop(tmp_path_factory.mktemp("robot"), wall(20.0), (0.6, 0.0, 0.0), 30.0, config)
     ((_, line),) = given_up(said)
     ways, seconds = int(line.split()[4]), float(line.split()[-2])
-    assert ways <= tries and seconds < min(patience, tries * (longest + 5.0)) + 5.0  # and back
+    assert ways <= tries and seconds < min(patience, tries * (longest + 8.0)) + 8.0  # and back
     assert ways == tries or seconds > patience
 
 
