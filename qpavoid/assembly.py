@@ -133,6 +133,9 @@ class Assembly:
         self._levels = levels if len(levels) > 1 else ()
         self._forward, self._contacts = kinematics, contacts
         self._eye = np.eye(nv)
+        self._before, self._change = np.zeros(nv), np.zeros(nv)
+        self.limits_may_give_way = x.jerked or (contacts is not None and x.accelerated)
+        """Whether `beyond_limits` has to be asked: bounds alone do not keep to accelerations and jerks then."""
         self.kinematics = Kinematics(self._layout.J_world, self._layout.poses)
 
     def compute(
@@ -160,6 +163,7 @@ class Assembly:
         proximity, rows = self._views.get(k) or self._view(k)
         if held is not None:
             x.v0[:] = tracking_within(held, x.A, x.b, x.damping)
+            self._count_from_before()
             worst = float(kernels.tracking_shortfall(self._packed, k))
         bounds = x.lower, x.upper, *self._hard, x.v_stop
         return proximity, Problem(
@@ -253,14 +257,17 @@ class Assembly:
         worst = float(kernels.shortfall(v0, near.J, near.b, x.lower, x.upper))
         return problem._replace(tracking=tracking, v0=v0, shortfall=worst, clear=False)
 
-    def fastest_frame(self) -> int:
-        """The task that asks for the largest linear speed; -1 where no frame has a position to follow."""
+    def at_length(self, problem: Problem) -> Problem:
+        """The problem of this tick with what the limits of accelerations and jerks allow at length, not at once."""
         x = self._layout
-        moving = len(x.scale) - 3 * len(x.turns)
-        if not moving:
-            return -1
-        linear = (x.b[:moving] / x.scale[:moving]).reshape(-1, 3)
-        return int(np.argmax(np.linalg.norm(linear, axis=1)))
+        return problem._replace(
+            lower=x.hard_lower, upper=x.hard_upper, hard_lower=x.hard_lower, hard_upper=x.hard_upper
+        )
+
+    def goal(self, frame: int) -> tuple[Array, float]:
+        """Where a task wants its frame (3,), world, and how far that is from where the frame is [m]."""
+        target = self._targets[frame][0]
+        return target.copy(), float(np.linalg.norm(target - self.kinematics.position[frame]))
 
     def wanted_velocity(self, frame: int) -> Array:
         """Linear velocity (3,) that a task asks of its frame [m/s]."""
@@ -272,20 +279,40 @@ class Assembly:
         rows = slice(3 * frame, 3 * frame + 3)
         return np.asarray(self._layout.A[rows] @ v / self._layout.scale[rows])
 
+    def _count_from_before(self) -> None:
+        """Narrows the bounds to what accelerations and jerks allow from the velocity before.
+
+        The kernels count from the nearest one that holds the contacts, which have turned a little since.
+        """
+        x = self._layout
+        low = np.maximum(self._before - x.v_step, self._before + x.w_last - x.w_step)
+        high = np.minimum(self._before + x.v_step, self._before + x.w_last + x.w_step)
+        low, high = np.minimum(low, x.upper), np.maximum(high, x.lower)
+        np.maximum(x.lower, low, out=x.lower)
+        np.minimum(x.upper, high, out=x.upper)
+
+    def beyond_limits(self, v: Array) -> tuple[Array, Array]:
+        """By how much v (nv,) passes what accelerations and what jerks allow (nv,), negative within [rad/s or m/s]."""
+        x, change = self._layout, v - self._before
+        return np.abs(change) - x.v_step, np.abs(change - self._change) - x.w_step
+
     def remember(self, v: Array) -> None:
         """Takes v (nv,) as the velocity at which the robot moves from this tick to the next."""
         x = self._layout
-        if x.jerked:
-            np.clip(v - x.v_last, -x.v_step, x.v_step, out=x.w_last)
+        if self.limits_may_give_way:
+            np.subtract(v, self._before, out=self._change)
+            self._before[:] = v
+            np.clip(self._change, -x.v_step, x.v_step, out=x.w_last)
         x.v_last[:] = v
 
     def measured(self, v: Array) -> None:
         """Takes v (nv,) as the velocity at which the robot moves until this tick; accelerations stay as commanded."""
-        self._layout.v_last[:] = v
+        self._layout.v_last[:], self._before[:] = v, v
 
     def restart(self, v: Array) -> None:
         """Takes v (nv,) as the velocity at which the robot has been moving, without any acceleration."""
         self._layout.v_last[:], self._layout.w_last[:] = v, 0.0
+        self._before[:], self._change[:] = v, 0.0
 
     @property
     def v_last(self) -> Array:

@@ -16,6 +16,7 @@ from qpavoid.assembly import Assembly
 from qpavoid.cloud import Points
 from qpavoid.config import Avoidance, Limits, Progress, ScenarioConfig, Sensing
 from qpavoid.contacts import ContactRows, build_contacts
+from qpavoid.detour import Detours
 from qpavoid.errors import ConfigError, NumericalError, UnknownName, located
 from qpavoid.escape import EscapePlanner
 from qpavoid.grasp import Grasps
@@ -48,6 +49,10 @@ from qpavoid.tasks import AnyTask, build_tasks, in_order
 _log = logging.getLogger(__name__)
 _ABSURD = 1e100
 """Violation of a row or bound from which numbers are looked through for what cannot be true [m/s, rad/s]."""
+
+
+_UNFELT = 2e-6
+"""What a velocity may pass limits of acceleration or jerk by without a word: the tolerance of the QP [rad/s, m/s]."""
 
 
 class Tick(NamedTuple):
@@ -116,7 +121,6 @@ class Controller:
         if len(self._task_names) < len(self.tasks):
             raise ConfigError(f"tasks: two have the same name among {', '.join(self._task_names)}; give one a `name`")
         self._obstacles = Obstacles(scene.obstacles, sensing or Sensing(), dt)
-        self._progress = ProgressWatch(progress or Progress(), dt, scene.pair_names)
         self._reach = self.avoidance.d2 - self.avoidance.offset
         self._bounds = scene.robot.bounds().within(self.limits)
         self._q_last = scene.robot.home.copy()
@@ -124,10 +128,11 @@ class Controller:
             scene, self.tasks, self._bounds, self._kinematics, self._query, self.avoidance,
             self.limits, tracking_damping, dt, contacts, self.solver.bounded and self.avoidance.look_ahead,
         )  # fmt: skip
-        self._guard = Guard(
-            scene, self._bounds, self.limits.position_gain,
-            self.avoidance.hold - self.avoidance.offset, dt,
-        )  # fmt: skip
+        keep, progress = self.avoidance.hold - self.avoidance.offset, progress or Progress()
+        self._guard = Guard(scene, self._bounds, self.limits.position_gain, keep, dt)
+        moving = [task for task in frames if task.moves]
+        detours = Detours(progress.detour, dt, scene, moving, self._query, keep) if progress.detour else None
+        self._progress = ProgressWatch(progress, dt, scene.pair_names, detours)
         self._escape: EscapePlanner | None = None
         if self.avoidance.escape is not None:
             if contacts is not None:
@@ -136,7 +141,7 @@ class Controller:
                 scene, self._bounds, self._obstacles, self.avoidance, self.limits, dt, self.avoidance.escape
             )
         queries = (self._query, self._guard.ahead, *([self._escape.query] if self._escape else []))
-        self._grasps = Grasps(scene, queries, self._assembly, self.avoidance.hold - self.avoidance.offset)
+        self._grasps = Grasps(scene, queries, self._assembly, keep)
         self._warm_up()
 
     def _warm_up(self) -> None:
@@ -404,6 +409,8 @@ class Controller:
             solution = solution._replace(blocked=blocked) if blocked else solution
         if self._escape is not None and not faults:
             solution = self._with_a_way_out(self._escape, q, t, proximity, problem, solution)
+        if self._assembly.limits_may_give_way and self.solver.bounded:
+            solution = self._with_limits_passed(problem, solution)
         self._assembly.remember(solution.v)
         solution = solution._replace(assumed=assumed) if assumed else solution
         return samples, proximity, problem, solution.timed(built - begin, perf_counter() - built)
@@ -461,6 +468,22 @@ class Controller:
         reason = "the tasks: no way out would be left among the obstacles that move"
         status = solution.status if solution.status is Status.STOPPED else Status.RELAXED
         return solution._replace(v=v, status=status, reasons=(*solution.reasons, reason))
+
+    def _with_limits_passed(self, problem: Problem, solution: Solution) -> Solution:
+        """Says which accelerations and jerks pass their limits, where bounds had to: to get back from where a relaxed
+        tick has led to, before a position or velocity limit, or to hold contacts.
+        """
+        said = " ".join([reason for reason in solution.reasons if "beyond its" in reason])
+        lines = [
+            f"{problem.joint_names[j]}: {excess[j]:.4f} rad/s or m/s beyond its {name} limit"
+            for name, excess in zip(("acceleration", "jerk"), self._assembly.beyond_limits(solution.v), strict=True)
+            for j in np.flatnonzero(excess > _UNFELT).tolist()
+            if f"{problem.joint_names[j]}: " not in said
+        ]
+        if not lines:
+            return solution
+        status = solution.status if solution.status is Status.STOPPED else Status.RELAXED
+        return solution._replace(status=status, reasons=(*solution.reasons, *lines))
 
     def _expected(self) -> Array:
         """Where the robot is if it did what it was told last (nq,)."""

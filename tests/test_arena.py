@@ -173,6 +173,18 @@ def test_scores_of_a_known_motion():
     assert set(row.row()) == set(COLUMNS)
 
 
+def test_jerks_count_as_violations_where_they_have_limits():
+    """Speeds that grow by 0.7 t² have a jerk of 1.4 rad/s³."""
+    base, v = make_case(duration=2), np.zeros((201, 6))
+    v[:, 0] = 0.7 * (DT * np.arange(201)) ** 2
+    for limit, share in ((None, 0.0), (1.5, 0.0), (1.3, 199 / 201)):
+        limits = base.scenario.limits.model_copy(update={"acceleration": 9.0, "jerk": limit})
+        case = replace(base, scenario=base.scenario.model_copy(update={"limits": limits}))
+        world, rollout, findings = made_by_hand(case, np.zeros((201, 3)), np.zeros((201, 3)), v)
+        row = score(case, world, "x", "y", rollout, findings, 0.0)
+        assert row.violations == pytest.approx(share, abs=1.5 / 201)
+
+
 def test_what_counts_as_success():
     case = make_case(duration=2)
     rest, v = np.zeros((201, 3)), np.zeros((201, 6))

@@ -70,14 +70,6 @@ def test_the_detour_in_any_direction(tmp_path, course):
     assert np.linalg.norm(q[-1] - way) < 1e-3 and least > D1 - 5e-4
 
 
-def test_a_target_inside_an_obstacle_is_given_up_not_circled_for_ever(tmp_path):
-    controller = head_on(tmp_path, detour=Detour(longest=3.0))
-    q, said, least = watched(controller, 6000, np.array([0.37, 0.0, 0.0]))
-    assert np.abs(q[-1] - q[-1500]).max() < 5e-3
-    assert all(reasons == ("blocked by ball at tool",) for reasons in said[-1500:])
-    assert least > D1 - 5e-4
-
-
 def test_a_panda_that_cannot_come_nearer_says_what_keeps_it(panda):
     """The target is the centre of a ball; the fingers come as near as they may."""
     ball = Obstacle.at("ball", Sphere(radius=0.08), [0.5, 0.1, 0.4])

@@ -74,7 +74,7 @@ class Score:
     peak_velocity: float
     """Of the fastest joint, over its limit [-]."""
     violations: float
-    """Share of ticks that pass a velocity, position or acceleration limit [-]."""
+    """Share of ticks that pass a velocity, position, acceleration or jerk limit [-]."""
     relaxed: float
     """Share of ticks that gave something up [-]."""
     stopped: float
@@ -194,12 +194,14 @@ def _deviation(rollout: Rollout) -> float:
 
 
 def _violating(world: World, scenario: ScenarioConfig, rollout: Rollout, findings: Findings) -> Array:
-    """(N,) whether a tick passes a velocity, position or acceleration limit by more than round-off."""
+    """(N,) whether a tick passes a velocity, position, acceleration or jerk limit by more than round-off."""
     bounds = world.scene.robot.bounds().within(scenario.limits)
     q = findings.q[:, bounds.q_index]
     acceleration = np.diff(rollout.v, axis=0, prepend=0.0) / scenario.dt
+    jerk = np.diff(acceleration, axis=0, prepend=0.0) / scenario.dt
     return np.asarray(
         (np.abs(rollout.v) > bounds.velocity + _ROUND_OFF).any(axis=1)
         | ((q < bounds.lower - _ROUND_OFF) | (q > bounds.upper + _ROUND_OFF)).any(axis=1)
         | (np.abs(acceleration) > bounds.acceleration + _ROUND_OFF / scenario.dt).any(axis=1)
+        | (np.abs(jerk) > bounds.jerk + _ROUND_OFF / scenario.dt**2).any(axis=1)
     )

@@ -50,7 +50,7 @@ MORE = (
     Column("path_length", "length [-]", 1.0, 2, "mean", "of the tools' paths, over that of their targets"),
     Column("jerk", "jerk [rad/s³]", 1.0, 0, "median", "root mean square over joints and ticks"),
     Column("peak_velocity", "peak q̇ [-]", 1.0, 2, "median", "of the fastest joint, over its limit"),
-    Column("violations", "limits passed [%]", 100.0, 2, "mean", "ticks beyond a speed, position or acceleration"),
+    Column("violations", "limits passed [%]", 100.0, 2, "mean", "ticks beyond a speed, position, acceleration or jerk"),
     Column("relaxed", "relaxed [%]", 100.0, 1, "mean", "ticks that gave something up and said so"),
     Column("stopped", "stopped [%]", 100.0, 1, "mean", "ticks in which the robot was braked or held"),
     Column("failed", "failed [%]", 100.0, 2, "mean", "ticks in which the entrant raised or gave no finite velocity"),

@@ -139,14 +139,18 @@ class Sensing(Block):
 
 
 class Detour(Block):
-    """A way round what blocks a task: circulation along its tangent."""
+    """Ways round what blocks a task, by circulation along its tangent, until its goal is reached or given up."""
 
     speed: Positive = 0.1
     """Speed along the tangent, added to the task's [m/s]."""
     settle: NonNegative = 0.3
     """Time for which the way has to be free before the detour ends [s]."""
     longest: Positive = 15.0
-    """Time after which a detour is given up [s]; the other side is tried then, up to four ways in all."""
+    """Time after which a way has ended [s]; the other side is tried next."""
+    tries: Annotated[int, Field(ge=1)] = 4
+    """Ways that bring the tool no nearer to its goal than before, after which the goal is given up."""
+    patience: Positive = 40.0
+    """Time with something in the way, on such ways and back, after which no way is gone on with, or begun [s]."""
 
 
 class Progress(Block):

@@ -1,0 +1,225 @@
+"""Jerk limits among moving obstacles and points, with contacts, loads, bases that move, and strict priorities.
+
+Whatever happens, a tick that is SOLVED keeps to acceleration and jerk limits, and one that does not says which joint
+passes them.
+"""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from closed_loop import Ruler, cartesian, changed, drive, make_controller
+from test_joint_types import load
+from test_moving_obstacles import COURSES, HELD, situation
+from test_point_cloud import BALL, CLOUD, wall
+
+from qpavoid import Controller, Limits, Obstacle, Points, Sample, Status, Voxels
+from qpavoid.config import Sphere
+
+
+class Limited:
+    """Checks ticks, one after the other, against the limits by their definition."""
+
+    def __init__(self, controller):
+        bounds, dt = controller._bounds, controller.dt
+        self._steps, self._names = (
+            (bounds.acceleration * dt, bounds.jerk * dt**2),
+            controller.scene.robot.coordinate_names,
+        )
+        self._before, self.relaxed, self.passed, self.most = np.zeros((2, len(bounds.jerk))), [], 0, 0.0
+
+    def check(self, solution):
+        """What the last ticks and this one make of acceleration and jerk; returns the solution."""
+        change = solution.v - self._before[0]
+        said = [line.partition(": ")[0] for line in solution.reasons if "beyond its" in line]
+        for size, step in zip((change, change - self._before[1]), self._steps, strict=True):
+            passing = np.flatnonzero(np.abs(size) > step + 3e-6)
+            assert not len(passing) or solution.status is not Status.SOLVED
+            assert {self._names[j] for j in passing} <= set(said), solution
+            self.passed += len(passing)
+        self.most = max(self.most, float(np.max(np.abs(change - self._before[1]) / self._steps[1])))
+        self._before = np.array([solution.v, change])
+        if solution.status is not Status.SOLVED:
+            self.relaxed.append(solution)
+        return solution
+
+
+def followed(scenario, ticks):
+    """A scenario's first ticks, checked: the check, least distance, joint velocities (N, nv), configuration after."""
+    controller, q = Controller.from_scenario(scenario)
+    limited, vs, least = Limited(controller), [], np.inf
+    for k in range(ticks):
+        tick = controller.tick(q, k * controller.dt)
+        least = min(least, tick.proximity.distance.min(initial=np.inf))
+        vs.append(limited.check(tick.solution).v)
+        q = pin.integrate(controller.scene.robot.model, q, vs[-1] * controller.dt)
+    return limited, least, np.array(vs), q
+
+
+def limited_situation(course, acceleration, jerk):
+    fields = {**situation(course).model_dump(mode="json"), "limits": {"acceleration": acceleration, "jerk": jerk}}
+    return followed(changed("situation1", **fields), 1300)
+
+
+# --- moving obstacles --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("course", "jerk"), [(course, 50.0 * 4.0 ** (k % 2)) for k, course in enumerate(COURSES)])
+def test_a_sphere_that_comes_on_is_kept_clear_of_to_2_mm(course, jerk):
+    """As without jerk limits: a margin may have to give way for some ticks, accelerations and jerks do not."""
+    fields = situation(course).model_dump(mode="json")
+    limited, least, vs, _ = followed(
+        changed("situation1", **{**fields, "limits": {"acceleration": 5.0, "jerk": jerk}}), 1300
+    )
+    assert HELD - 2e-3 < least < 0.03
+    assert limited.most == pytest.approx(1.0, abs=1e-3) and not limited.passed
+    assert len(limited.relaxed) < 100
+    assert all(s.status is Status.RELAXED and any("fist" in reason for reason in s.reasons) for s in limited.relaxed)
+    assert np.abs(vs).max() > 0.1
+
+
+@pytest.mark.parametrize(("course", "short"), [("front 0.2", 4e-3), ("head-on 0.4", 2e-3), ("chase 0.3", 2e-3)])
+def test_with_harsh_limits_what_is_lacking_is_said(course, short):
+    """At 2 rad/s² and 10 rad/s³, where it takes 0.4 s until a joint brakes fully."""
+    fields = situation(course).model_dump(mode="json")
+    limited, least, _, _ = followed(
+        changed("situation1", **{**fields, "limits": {"acceleration": 2.0, "jerk": 10.0}}), 1300
+    )
+    assert least > HELD - short
+    assert any("fist" in reason and "short of its row" in reason for s in limited.relaxed for reason in s.reasons)
+
+
+@pytest.mark.parametrize("solver", ["qp", "qp:daqp", "hqp"])
+@pytest.mark.parametrize("seed", range(2))
+def test_balls_thrown_at_a_panda(panda, solver, seed):
+    """Contact is often avoided only beyond the limits; the ticks after that have to come back within them."""
+    rng, count = np.random.default_rng(100 + seed), 3
+    balls = [Obstacle.at(f"ball{i}", Sphere(radius=0.08), [5.0, 0.0, i]) for i in range(count)]
+    controller = make_controller(
+        panda, balls, "panda_hand_tcp", solver, limits=Limits(jerk=100.0), task={"gain": 3.0, "max_speed": 0.6}
+    )
+    limited, q, place, velocity = Limited(controller), panda.home.copy(), np.full((count, 3), 9.0), np.zeros((count, 3))
+    for k in range(250):
+        if k % 100 == 0:
+            goal = rng.uniform([0.25, -0.4, 0.2], [0.65, 0.4, 0.7])
+        for i in np.flatnonzero(np.linalg.norm(place - [0.3, 0.0, 0.4], axis=1) > 1.6):
+            way = rng.normal(size=3)
+            velocity[i] = rng.uniform(0.3, 0.9) * way / np.linalg.norm(way)
+            place[i] = rng.uniform([0.1, -0.4, 0.2], [0.6, 0.4, 0.8]) - velocity[i] * (
+                0.5 + 0.6 / np.linalg.norm(velocity[i])
+            )
+        seen = {f"ball{i}": Sample.at(place[i], linear=velocity[i]) for i in range(count)}
+        s = limited.check(controller.step(q, 0.01 * k, {"panda_hand_tcp": Sample.at(goal)}, seen))
+        q, place = q + 0.01 * s.v, place + 0.01 * velocity
+        bounds = panda.bounds()
+        assert (q >= bounds.lower - 1e-9).all() and (q <= bounds.upper + 1e-9).all()
+        assert (np.abs(s.v) <= bounds.velocity + 1e-9).all()
+    assert limited.passed > 0 and limited.relaxed
+
+
+def test_the_ticks_after_one_beyond_the_limits_say_so_as_long_as_they_are(tmp_path):
+    """A ball leaves the tool no time: it jumps away at its full speed, and what jumps has to come back."""
+    robot = cartesian(tmp_path, speed=1.0, acceleration=4.0)
+    ball = Obstacle.at("ball", Sphere(radius=0.1), [9.0, 0.0, 0.0])
+    controller = make_controller(robot, [ball], "z", limits=Limits(jerk=40.0))
+    limited, q, far = Limited(controller), np.zeros(3), [9.0, 0.0, 0.0]
+    for k in range(200):
+        near = k == 0
+        seen = {"ball": Sample.at([0.21 if near else 9.0, 0.0, 0.0], linear=[-6.0 if near else 0.0, 0.0, 0.0])}
+        s = limited.check(controller.step(q, 0.01 * k, {"z": Sample.at(far if near else q)}, seen))
+        q = q + 0.01 * s.v
+    assert limited.passed >= 2 and len(limited.relaxed) >= 2
+    assert "beyond its jerk limit" in " ".join(limited.relaxed[1].reasons)
+    assert s.status is Status.SOLVED and np.abs(s.v).max() < 1e-9
+
+
+# --- points ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dt", [0.005, 0.02])
+@pytest.mark.parametrize("speed", [0.5, 2.0])
+def test_a_wall_of_points_is_not_passed(tmp_path, dt, speed):
+    robot = cartesian(tmp_path, speed=speed, acceleration=8.0)
+    controller = make_controller(
+        robot, [Obstacle.at("camera", CLOUD, [0, 0, 0])], "z", dt=dt, task={"gain": 20.0}, limits=Limits(jerk=80.0)
+    )
+    points, limited, least = wall(), Limited(controller), []
+    surface = Voxels.of(points, CLOUD.resolution).centers
+    for tick in drive(controller, np.array([-0.5, 0.03, 0.0]), round(3.0 / dt), target=[2.0, 0.1, 0.05],
+                      obstacles=lambda t: {"camera": Points(points)} if t < 0.5 * dt else None):  # fmt: skip
+        limited.check(tick.solution)
+        after = tick.state.q + dt * tick.solution.v
+        least.append(np.linalg.norm(surface - after, axis=1).min() - 0.05 - BALL)
+    assert min(least) > 0.02 - 1e-3 and least[-1] < 0.05
+    assert not limited.relaxed and limited.most == pytest.approx(1.0, abs=1e-3)
+
+
+# --- robots that stand, drive, fly and carry -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("solver", ["qp", "hqp"])
+def test_a_humanoid_over_its_contacts(solver):
+    """Its feet do not slide, and its joints keep to their limits although contacts turn from tick to tick."""
+    scenario = changed("humanoid_reach", solver=solver, limits={"acceleration": 2.0, "jerk": 20.0})
+    limited, least, vs, q = followed(scenario, 220)
+    assert least > 0.015 - 1e-3 and np.abs(vs).max() > 0.05
+    controller, q0 = Controller.from_scenario(scenario)
+    model, data = controller.scene.robot.model, controller.scene.robot.model.createData()
+    feet = [model.getFrameId(f"{side}_ankle_roll_link") for side in ("left", "right")]
+    places = []
+    for at in (q0, q):
+        pin.framesForwardKinematics(model, data, at)
+        places.append([data.oMf[foot].translation.copy() for foot in feet])
+    assert np.abs(np.diff(places, axis=0)).max() < 1e-3
+    assert len(limited.relaxed) < (20 if solver == "hqp" else 1) and limited.most < 1.5
+
+
+@pytest.mark.parametrize("limits", [{"acceleration": 5.0, "jerk": 100.0}, {"acceleration": 2.0, "jerk": 20.0}])
+def test_a_base_that_drives(limits):
+    limited, least, vs, _ = followed(changed("tiago_column", limits=limits), 1200)
+    assert least > 0.012 - 1e-3 and np.abs(vs[:, :2]).max() > 0.05
+    assert not limited.relaxed and limited.most == pytest.approx(1.0, abs=1e-3)
+
+
+def test_a_base_that_flies_past_a_ball():
+    """A trunk with six coordinates of its own, whose velocities are in its own axes; the ball is in its way."""
+    robot = load("floating")
+    ball = Obstacle.at("ball", Sphere(radius=0.1), [0.5, 0.02, 0.0])
+    controller = make_controller(
+        robot, [ball], "base_link", limits=Limits(acceleration=3.0, jerk=60.0), task={"max_speed": 0.5}
+    )
+    ruler, limited, least, vs = Ruler(controller.scene), Limited(controller), np.inf, []
+    q = robot.home.copy()
+    for k in range(500):
+        s = limited.check(controller.step(q, 0.01 * k, {"base_link": Sample.at([1.0, 0.0, 0.0])}))
+        least = min(least, ruler.least_between(q, s.v, 0.01, 0.0, 2))
+        q = pin.integrate(robot.model, q, 0.01 * s.v)
+        vs.append(s.v)
+    assert 0.02 - 1e-3 < least < 0.05
+    assert np.abs(np.array(vs)[:, :3]).max() > 0.2 and not limited.relaxed
+
+
+@pytest.mark.parametrize("solver", ["qp", "hqp"])
+def test_a_load_past_a_pole_and_a_shelf(solver):
+    limits = {"acceleration": 5.0, "jerk": 100.0}
+    limited, least, vs, _ = followed(changed("carried_box", solver=solver, limits=limits), 500)
+    assert least > 0.02 - 1e-3 and np.abs(vs).max() > 0.1
+    assert not limited.relaxed and limited.most == pytest.approx(1.0, abs=1e-3)
+
+
+def test_a_joint_that_moves_another_one():
+    """Fingers that follow each other, one coordinate for both, closing on a ball."""
+    robot = load("mimic")
+    tool = robot.frame_id("l_gripper_r_finger_tip", "test")
+    data = robot.model.createData()
+    pin.framesForwardKinematics(robot.model, data, robot.home)
+    start = np.array(data.oMf[tool].translation)
+    ball = Obstacle.at("ball", Sphere(radius=0.06), start - [0.0, 0.15, 0.0])
+    controller = make_controller(
+        robot, [ball], "l_gripper_r_finger_tip", limits=Limits(acceleration=4.0, jerk=80.0), task={"max_speed": 0.4}
+    )
+    limited, ruler, least, q = Limited(controller), Ruler(controller.scene), np.inf, robot.home.copy()
+    for k in range(300):
+        s = limited.check(controller.step(q, 0.01 * k, {"l_gripper_r_finger_tip": Sample.at(start - [0.0, 0.3, 0.0])}))
+        q = pin.integrate(robot.model, q, 0.01 * s.v)
+        least = min(least, ruler.distances(q).min())
+    assert 0.02 - 1e-3 < least < 0.05 and not limited.relaxed

@@ -1,0 +1,213 @@
+"""Jerk limits in the loop of a controller: static obstacles, stops, what gives way, and what users say."""
+
+import numpy as np
+import pytest
+from closed_loop import Ruler, cartesian, changed, drive, make_controller, scenario
+
+from qpavoid import Avoidance, ConfigError, Controller, Limits, Obstacle, Robot, Sample, Status, simulate
+from qpavoid.config import Box, Damper, Sphere
+from qpavoid.solvers.reasons import what_gave_way
+from qpavoid.solvers.relaxation import Relaxed
+
+HELD = 0.02
+
+
+def within_limits(controller, vs, slack=1e-9):
+    """That commands, from a standstill on, keep to velocity, acceleration and jerk limits."""
+    b, dt = controller._bounds, controller.dt
+    changes = np.diff(vs, axis=0, prepend=np.zeros((1, len(vs[0]))))
+    jumps = np.diff(changes, axis=0, prepend=np.zeros((1, len(vs[0]))))
+    assert (np.abs(vs) <= b.velocity + slack).all()
+    assert (np.abs(changes) <= b.acceleration * dt + slack).all()
+    assert (np.abs(jumps) <= b.jerk * dt**2 + slack).all()
+    return np.max(np.abs(jumps) / (b.jerk * dt**2))
+
+
+@pytest.mark.parametrize("row", ["switching", "damper"])
+@pytest.mark.parametrize("size", [[0.004, 0.6, 0.6], [0.2, 0.2, 0.2]], ids=["plate", "box"])
+@pytest.mark.parametrize(("dt", "duration"), [(0.002, 0.8), (0.01, 1.5), (0.05, 3.0)])
+def test_no_period_and_no_speed_pass_the_safe_distance(row, size, dt, duration):
+    """As without jerk limits, with ones of about 10 times the accelerations a second: a target leads through a body."""
+    run = scenario(
+        "panda",
+        {"type": "line", "displacement": [0.4, 0.05, -0.1], "speed": 2.0},
+        [{"name": "it", "shape": {"type": "box", "size": size},
+          "motion": {"type": "fixed", "position": [0.55, 0.0, 0.45]}}],
+        dt=dt, duration=duration, limits={"jerk": 100.0},
+        avoidance={"d1": HELD, "d2": 0.10, "row": {"type": row}},
+    )  # fmt: skip
+    log = simulate(run)
+    controller, _ = Controller.from_scenario(run)
+    ruler = Ruler(controller.scene)
+    least = min(ruler.least_between(q, v, dt, t, 4) for q, v, t in zip(log.q, log.v, log.t, strict=True))
+    assert least > HELD - 1e-3
+    assert log.metrics()["status_counts"]["SOLVED"] == len(log.t)
+    assert within_limits(controller, log.v) == pytest.approx(1.0, abs=1e-6)
+    assert log.metrics()["peak_velocity"] > 1.0
+
+
+def test_nothing_is_first_seen_inside_its_margin(tmp_path):
+    """A row sees 30 mm ahead; at 2 m/s, 4 m/s² and 20 m/s³, braking takes 0.7 m."""
+    robot = cartesian(tmp_path, speed=2.0, acceleration=4.0)
+    wall = Obstacle.at("wall", Box(size=(0.1, 2.0, 2.0)), [2.05, 0.0, 0.0])
+    controller = make_controller(
+        robot, [wall], "z", avoidance=Avoidance(d1=HELD, d2=0.03, row=Damper(gain=20.0)), task={"gain": 50.0},
+        limits=Limits(jerk=20.0),
+    )  # fmt: skip
+    vs, near = [], []
+    for tick in drive(controller, np.array([-2.0, 0.0, 0.0]), 500, target=[4.0, 0.0, 0.0]):
+        assert tick.solution.status is Status.SOLVED
+        vs.append(tick.solution.v)
+        near.append(1.95 - tick.state.q[0])
+    within_limits(controller, np.array(vs))
+    assert max(v[0] for v in vs) == pytest.approx(2.0)
+    assert min(near) > HELD - 1e-3 and near[-1] < HELD + 2e-3
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_random_targets_among_obstacles_stay_feasible(panda, seed):
+    """At up to full speed, half of the targets inside obstacles, with the robot's own accelerations."""
+    rng, bounds = np.random.default_rng(seed), panda.bounds()
+    shapes = Box(size=(0.3, 0.3, 0.3)), Sphere(radius=0.1), Box(size=(0.004, 0.5, 0.5))
+    clear = False
+    while not clear:
+        obstacles = [Obstacle.at(f"o{i}", s, rng.uniform(-0.8, 0.8, 3)) for i, s in enumerate(shapes)]
+        controller = make_controller(
+            panda, obstacles, "panda_hand_tcp", task={"gain": 5.0, "max_speed": 2.0}, limits=Limits(jerk=300.0)
+        )
+        ruler = Ruler(controller.scene)
+        q = rng.uniform(bounds.lower, bounds.upper)
+        clear = ruler.distances(q).min() > 0.03
+    vs, least = [], np.inf
+    for k in range(700):
+        if k % 60 == 0:
+            inside = obstacles[rng.integers(3)].motion.sample(0.0).position
+            target = {"panda_hand_tcp": Sample.at(rng.uniform(-0.8, 0.8, 3) if rng.random() < 0.5 else inside)}
+        s = controller.step(q, 0.01 * k, target)
+        assert s.status is Status.SOLVED, s.reasons
+        vs.append(s.v)
+        q = q + 0.01 * s.v
+        assert (q <= bounds.upper + 1e-9).all() and (q >= bounds.lower - 1e-9).all()
+        least = min(least, ruler.distances(q).min())
+    assert within_limits(controller, np.array(vs)) > 0.99
+    assert least > HELD - 1e-3
+
+
+def test_what_is_left_on_the_way_of_a_stop_is_a_lower_bound(panda):
+    """Distances along stops from random velocities and accelerations, by brute force."""
+    rng, bounds = np.random.default_rng(0), panda.bounds()
+    balls = [Obstacle.at(f"ball{i}", Sphere(radius=0.08), p) for i, p in enumerate(rng.uniform(-0.7, 0.7, (3, 3)))]
+    controller = make_controller(panda, balls, limits=Limits(jerk=400.0))
+    assembly, ruler, close = controller._assembly, Ruler(controller.scene), 0
+    for _ in range(150):
+        q = rng.uniform(bounds.lower + 0.3, bounds.upper - 0.3)
+        before, change = rng.uniform(-0.3, 0.3, 7) * bounds.velocity, rng.uniform(-1.0, 1.0, 7) * bounds.acceleration
+        controller.reset(before)
+        near = len(controller.tick(q).proximity.pair)
+        controller.reset(before)
+        v = before + 0.01 * change
+        stop = assembly.stop(q, v)
+        way = stop.way.copy()
+        bound = assembly.closest_call(v, near, 0.1, float(stop.forwards.sum()), stop)
+        least = np.inf
+        for velocity in way:
+            least = min(least, ruler.distances(q).min())
+            q = q + 0.01 * velocity
+        assert min(least, ruler.distances(q).min()) - HELD >= bound - 1e-9
+        close += bound > 0.0
+    assert close > 3
+
+
+def test_a_stop_is_within_the_jerk_and_the_next_good_tick_goes_on(panda):
+    controller = make_controller(panda, frame="panda_hand_tcp", task={"gain": 4.0}, limits=Limits(jerk=200.0))
+    q, vs, target = panda.home.copy(), [], {"panda_hand_tcp": Sample.at([0.4, 0.3, 0.6])}
+    for k in range(90):
+        given = np.full(7, np.nan) if 15 <= k < 60 else q
+        s = controller.step(given, 0.01 * k, target)
+        assert s.status is (Status.STOPPED if 15 <= k < 60 else Status.SOLVED)
+        vs.append(s.v)
+        q = q + 0.01 * s.v
+    within_limits(controller, np.array(vs))
+    assert np.abs(vs[14]).max() > 0.2 and np.abs(vs[59]).max() < 1e-9 and np.abs(vs[75]).max() > 0.1
+
+
+def test_a_measured_velocity_counts_and_a_reset_forgets_the_acceleration(panda):
+    controller = make_controller(panda, frame="panda_hand_tcp", task={"gain": 50.0}, limits=Limits(jerk=200.0))
+    q, target, v, change = panda.home, {"panda_hand_tcp": Sample.at([0.2, 0.6, 0.6])}, np.zeros(7), np.zeros(7)
+    unit = 200.0 * 0.01**2
+    for _ in range(4):
+        s = controller.step(q, 0.0, target)
+        assert (np.abs(s.v - v - change) <= unit + 1e-12).all()
+        v, change = s.v, s.v - v
+    assert np.abs(change).max() > 3.9 * unit
+    measured = v + 0.01
+    found = controller.step(q, 0.0, target, v=measured).v
+    assert (np.abs(found - measured - change) <= unit + 1e-12).all()
+    controller.reset(v)
+    assert (np.abs(controller.step(q, 0.0, target).v - v) <= unit + 1e-12).all()
+
+
+# --- what gives way, and what users say --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("gives_way", [True, False])
+def test_jerk_gives_way_with_the_acceleration_or_never(tmp_path, gives_way):
+    """A ball that comes straight at the tool at 2 m/s from 60 mm off: contact cannot be avoided within the limits."""
+    robot = cartesian(tmp_path, speed=5.0, acceleration=4.0)
+    limits = Limits(jerk=40.0, acceleration_gives_way=gives_way)
+    ball = Obstacle.at("ball", Sphere(radius=0.1), [9.0, 0.0, 0.0])
+    controller = make_controller(robot, [ball], "z", limits=limits)
+    seen = {"ball": Sample.at([0.21, 0.0, 0.0], linear=[-6.0, 0.0, 0.0])}
+    tick = controller.tick(np.zeros(3), 0.0, {"z": Sample.at([0.0, 0.0, 0.0])}, seen)
+    assert tick.problem.jerked and tick.solution.status is Status.RELAXED
+    step = np.abs(tick.solution.v).max()
+    if gives_way:
+        assert step > 4.0 * 0.01
+        assert any("beyond its acceleration and jerk limits" in reason for reason in tick.solution.reasons)
+    else:
+        assert step <= 40.0 * 0.01**2 + 1e-12
+        assert not any("beyond" in reason for reason in tick.solution.reasons)
+
+
+def test_the_reason_names_the_limits_that_there_are(panda):
+    """Without jerk limits, none is named."""
+    for limits, said in ((Limits(), "acceleration limit"), (Limits(jerk=50.0), "acceleration and jerk limits")):
+        problem = make_controller(panda, frame="panda_hand_tcp", limits=limits).tick(panda.home).problem
+        relaxed = Relaxed(np.zeros(7), np.zeros(len(problem.avoidance.d)), np.array([0.0, 0.5, *np.zeros(5)]))
+        (line,) = what_gave_way(relaxed, problem)
+        assert line == f"panda_joint2: 0.500 rad/s or m/s beyond its {said}"
+
+
+def test_jerk_limits_of_a_robot_and_of_a_scenario(tmp_path):
+    """The scenario's is for joints to which the robot gives none."""
+    cartesian(tmp_path)
+    body = {"name": "tool", "frame": "z", "shape": {"type": "sphere", "radius": 0.05}}
+    limits = {"acceleration": {"joint_x": 2.0, "joint_y": 3.0}, "jerk": {"joint_x": 30.0}}
+    robot = Robot.from_urdf(tmp_path / "cartesian.urdf", bodies=[body], limits=limits)
+    np.testing.assert_array_equal(robot.bounds().jerk, [30.0, np.inf, np.inf])
+    found = robot.bounds().within(Limits(acceleration=5.0, jerk=70.0))
+    np.testing.assert_array_equal(found.jerk, [30.0, 70.0, 70.0])
+    np.testing.assert_array_equal(robot.bounds().within(Limits()).jerk, [30.0, np.inf, np.inf])
+    make_controller(robot, frame="z")
+    with pytest.raises(ConfigError, match=r"limits\.jerk: 1 of 3 coordinates have no acc.*give limits\.acceleration"):
+        make_controller(robot, frame="z", limits=Limits(jerk=70.0))
+
+
+@pytest.mark.parametrize(
+    ("limits", "said"),
+    [
+        ({"jerk": {"joint_x": 30.0}}, "jerk of 'joint_x': needs a limit under `acceleration`, too"),
+        ({"acceleration": {"joint_x": 3.0}, "jerk": {"joint_x": -1.0}}, "greater than 0"),
+        ({"acceleration": {"joint_q": 3.0}, "jerk": {"joint_q": 9.0}}, "joint_q"),
+    ],
+)
+def test_errors_name_the_field(tmp_path, limits, said):
+    cartesian(tmp_path)
+    with pytest.raises(ConfigError, match=said):
+        Robot.from_urdf(tmp_path / "cartesian.urdf", bodies="convex", limits=limits)
+
+
+def test_a_scenario_says_where_its_jerk_limit_lacks_an_acceleration():
+    run = changed("situation1", limits={"jerk": 50.0})
+    with pytest.raises(ConfigError, match=r"situation1.*limits\.jerk: 7 of 7"):
+        Controller.from_scenario(run)
