@@ -47,6 +47,8 @@ from qpavoid.solvers.qp import Qp
 from qpavoid.tasks import AnyTask, build_tasks, in_order
 
 _log = logging.getLogger(__name__)
+_LONGEST = 1.0
+"""Control period that is not meant [s]."""
 _ABSURD = 1e100
 """Violation of a row or bound from which numbers are looked through for what cannot be true [m/s, rad/s]."""
 
@@ -101,8 +103,10 @@ class Controller:
 
         Raises:
             UnknownName, SolverNotInstalled: of the solver.
-            ConfigError: there are contacts, and the solver is one that does not hold them.
+            ConfigError: dt is no period; there are contacts, and the solver is one that does not hold them.
         """
+        if not 0.0 < dt <= _LONGEST:
+            raise ConfigError(f"dt: {dt} s, expected more than 0 and at most {_LONGEST}; it is in seconds")
         frames, others = in_order(tasks)
         self.scene, self.dt = scene, dt
         self.tasks: tuple[AnyTask, ...] = (*frames, *others)

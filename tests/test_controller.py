@@ -5,6 +5,7 @@ import pytest
 
 from qpavoid import (
     Avoidance,
+    ConfigError,
     Controller,
     NumericalError,
     Obstacle,
@@ -35,6 +36,12 @@ def make(panda):
 @pytest.fixture
 def controller(make):
     return make()
+
+
+@pytest.mark.parametrize("dt", [0.0, -0.01, 10.0, np.nan])
+def test_a_period_that_is_none_is_named(panda, dt):
+    with pytest.raises(ConfigError, match="dt: .* in seconds"):
+        Controller(build_scene(panda, []), [], "qp", dt=dt)
 
 
 def test_an_obstacle_that_moves_while_the_robot_rests_is_seen(controller, panda):
