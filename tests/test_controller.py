@@ -40,7 +40,7 @@ def controller(make):
 
 @pytest.mark.parametrize("dt", [0.0, -0.01, 10.0, np.nan])
 def test_a_period_that_is_none_is_named(panda, dt):
-    with pytest.raises(ConfigError, match="dt: .* in seconds"):
+    with pytest.raises(ConfigError, match=r"dt: .* in seconds"):
         Controller(build_scene(panda, []), [], "qp", dt=dt)
 
 
