@@ -12,6 +12,7 @@ from qpavoid.avoidance import row_form
 from qpavoid.config import Avoidance, Limits
 from qpavoid.contacts import ContactRows, tracking_within
 from qpavoid.kernels.layout import RowLayout
+from qpavoid.kernels.vectorised.stops import easing_stop
 from qpavoid.kinematics import (
     ForwardKinematics,
     Kinematics,
@@ -233,6 +234,22 @@ class Assembly:
         x.v0[:] = v if problem.contacts is None else problem.contacts.held(v)
         worst = float(kernels.tracking_shortfall(self._packed, len(problem.avoidance.d)))
         return problem._replace(tracking=Tracking(self._eye, x.v0, 0.0), shortfall=worst, levels=(), clear=False)
+
+    def eased(self, problem: Problem) -> Problem:
+        """The problem of this tick with as much of its v0 as can be had now without swinging past it.
+
+        The way to v0 within jerk limits is a stop, for one who moves at v0. The velocity that is closest to v0 in every
+        tick gets there with an acceleration that cannot be taken back at once: it swings to and fro about v0, for ever.
+        """
+        x, rows, v0 = self._layout, problem.avoidance, problem.v0
+        if v0[0] != v0[0]:
+            return problem
+        eased = v0 + easing_stop(x, x.v_last - v0, x.w_last)
+        if problem.contacts is not None:
+            eased = problem.contacts.held(eased)
+        tracking = problem.tracking._replace(b=problem.tracking.b + problem.tracking.A @ (eased - v0))
+        worst = float(kernels.shortfall(eased, rows.J, rows.b, x.lower, x.upper))
+        return problem._replace(tracking=tracking, v0=eased, shortfall=worst)
 
     def redirected(self, problem: Problem, frame: int, velocity: Array) -> Problem:
         """The problem of this tick with a velocity (3,) added to the linear one that a task asks for [m/s].

@@ -43,6 +43,7 @@ from qpavoid.robot import Robot
 from qpavoid.scene import Scene, build_obstacles, build_scene
 from qpavoid.sensing import Obstacles, Pose, finite
 from qpavoid.solvers import Solver, make_solver
+from qpavoid.solvers.hqp import Hqp
 from qpavoid.solvers.qp import Qp
 from qpavoid.tasks import AnyTask, build_tasks, in_order
 
@@ -424,6 +425,8 @@ class Controller:
         try:
             if proximity is not None:
                 problem = self._progress.redirect(problem, proximity, self._assembly, self.solver)
+                if problem.jerked and not (problem.levels and isinstance(self.solver, Hqp)):  # v0 is not a cascade's
+                    problem = self._assembly.eased(problem)
             solution = self.solver.solve(problem)
             v = solution.v
             usable = v.dtype == np.float64 and v.shape == self._v_shape and sane(v)

