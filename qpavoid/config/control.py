@@ -148,7 +148,7 @@ class Detour(Block):
     longest: Positive = 15.0
     """Time after which a way has ended [s]; the other side is tried next."""
     tries: Annotated[int, Field(ge=1)] = 4
-    """Ways that bring the tool no nearer to its goal than before, after which the goal is given up."""
+    """Ways that bring the tool no nearer to its goal than before, after which the goal is given up [-]."""
     patience: Positive = 40.0
     """Time with something in the way, on such ways and back, after which no way is gone on with, or begun [s]."""
 
