@@ -461,9 +461,7 @@ class Controller:
         names = " - ".join(self.scene.pair_names[pair])
         if short != short:
             return _stop(problem, (*solution.reasons, f"{names}: no distance can be told on the way ahead"))
-        reason = f"{names}: comes {1e3 * short:.1f} mm too near"
-        status = solution.status if solution.status is Status.STOPPED else Status.RELAXED
-        return solution._replace(v=v, share=share, status=status, reasons=(*solution.reasons, reason))
+        return solution._replace(v=v, share=share).relaxed(f"{names}: comes {1e3 * short:.1f} mm too near")
 
     def _with_a_way_out(
         self, escape: EscapePlanner, q: Array, t: float, proximity: Proximity, problem: Problem, solution: Solution
@@ -471,10 +469,8 @@ class Controller:
         v = escape.check(q, solution.v, t, self._assembly.v_last, proximity)
         if v is None:
             return solution
-        v = np.clip(v, problem.lower, problem.upper)
         reason = "the tasks: no way out would be left among the obstacles that move"
-        status = solution.status if solution.status is Status.STOPPED else Status.RELAXED
-        return solution._replace(v=v, status=status, reasons=(*solution.reasons, reason))
+        return solution._replace(v=np.clip(v, problem.lower, problem.upper)).relaxed(reason)
 
     def _with_limits_passed(self, problem: Problem, solution: Solution) -> Solution:
         """Says which accelerations and jerks pass their limits, where bounds had to: to get back from where a relaxed
@@ -487,10 +483,7 @@ class Controller:
             for j in np.flatnonzero(excess > _UNFELT).tolist()
             if f"{problem.joint_names[j]}: " not in said
         ]
-        if not lines:
-            return solution
-        status = solution.status if solution.status is Status.STOPPED else Status.RELAXED
-        return solution._replace(status=status, reasons=(*solution.reasons, *lines))
+        return solution.relaxed(*lines) if lines else solution
 
     def _expected(self) -> Array:
         """Where the robot is if it did what it was told last (nq,)."""

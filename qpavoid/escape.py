@@ -24,7 +24,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import pinocchio as pin
 
 from qpavoid import kernels
@@ -32,7 +31,7 @@ from qpavoid.assembly import Assembly
 from qpavoid.config import Avoidance, Escape, Limits
 from qpavoid.kinematics import ForwardKinematics, longest_lever
 from qpavoid.limits import JointBounds
-from qpavoid.problem import Array, Proximity
+from qpavoid.problem import Array, Mask, Proximity
 from qpavoid.proximity import DistanceQuery
 from qpavoid.scene import Scene
 from qpavoid.sensing import Obstacles, Seen
@@ -56,7 +55,6 @@ _SPAN = 0.1
 """Time from one look at bounding spheres to the next [s]."""
 _ALIKE = 1e-6
 """Difference of two flights' distances that counts as none [m]."""
-Mask = npt.NDArray[np.bool_]
 
 
 class Manner(NamedTuple):

@@ -226,6 +226,11 @@ class Solution(NamedTuple):
     solve_time: float = 0.0
     """Time to solve it and to look ahead [s]."""
 
+    def relaxed(self, *reasons: str) -> Solution:
+        """The same with more that gave way; a stop stays one."""
+        status = self.status if self.status is Status.STOPPED else Status.RELAXED
+        return self._replace(status=status, reasons=(*self.reasons, *reasons))
+
     def timed(self, build_time: float, solve_time: float) -> Solution:
         """The same with its times [s]."""
         return Solution(*self[:-2], build_time, solve_time)

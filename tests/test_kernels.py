@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from importlib import import_module
+from types import FunctionType, ModuleType
 
 import numpy as np
 import pinocchio as pin
@@ -177,6 +178,16 @@ def test_there_are_two_versions_of_everything():
     chosen = version("compiled" if used.ACCELERATED else "vectorised")
     assert version("vectorised").__all__ == [name for name in used.__all__ if name != "ACCELERATED"]
     assert version("compiled").__all__ == version("vectorised").__all__
+    public = {
+        name
+        for module in vars(version("vectorised")).values()
+        if isinstance(module, ModuleType)
+        for name, value in vars(module).items()
+        if getattr(value, "__module__", "") == module.__name__ and isinstance(value, FunctionType)
+        if not name.startswith("_")
+    }
+    of_one = {"speed_to_stop", "change_to_stop", "easing_stop"}
+    assert set(chosen.__all__) == public - of_one
     assert all(getattr(used, name) is getattr(chosen, name) for name in chosen.__all__)
 
 
