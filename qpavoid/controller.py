@@ -14,15 +14,12 @@ import pinocchio as pin
 from qpavoid import kernels
 from qpavoid.assembly import Assembly
 from qpavoid.cloud import Points
+from qpavoid.command import Commander
 from qpavoid.config import Avoidance, Limits, Progress, ScenarioConfig, Sensing
 from qpavoid.contacts import ContactRows, build_contacts
-from qpavoid.detour import Detours
 from qpavoid.errors import ConfigError, NumericalError, UnknownName, located
-from qpavoid.escape import EscapePlanner
 from qpavoid.grasp import Grasps
-from qpavoid.guard import TOLERANCE, Guard
 from qpavoid.kinematics import ForwardKinematics, Kinematics
-from qpavoid.limits import saturate
 from qpavoid.loading import nearest
 from qpavoid.motion import Sample
 from qpavoid.problem import (
@@ -31,20 +28,16 @@ from qpavoid.problem import (
     Proximity,
     Solution,
     State,
-    Status,
     as_vector,
     not_finite,
     require_finite,
     sane,
 )
-from qpavoid.progress import ProgressWatch
 from qpavoid.proximity import DistanceQuery
 from qpavoid.robot import Robot
 from qpavoid.scene import Scene, build_obstacles, build_scene
 from qpavoid.sensing import Obstacles, Pose, finite
 from qpavoid.solvers import Solver, make_solver
-from qpavoid.solvers.hqp import Hqp
-from qpavoid.solvers.qp import Qp
 from qpavoid.tasks import AnyTask, build_tasks, in_order
 
 _log = logging.getLogger(__name__)
@@ -52,10 +45,6 @@ _LONGEST = 1.0
 """Control period that is not meant [s]."""
 _ABSURD = 1e100
 """Violation of a row or bound from which numbers are looked through for what cannot be true [m/s, rad/s]."""
-
-
-_UNFELT = 2e-6
-"""What a velocity may pass limits of acceleration or jerk by without a word: the tolerance of the QP [rad/s, m/s]."""
 
 
 class Tick(NamedTuple):
@@ -133,20 +122,14 @@ class Controller:
             scene, self.tasks, self._bounds, self._kinematics, self._query, self.avoidance,
             self.limits, tracking_damping, dt, contacts, self.solver.bounded and self.avoidance.look_ahead,
         )  # fmt: skip
-        keep, progress = self.avoidance.hold - self.avoidance.offset, progress or Progress()
-        self._guard = Guard(scene, self._bounds, self.limits.position_gain, keep, dt)
-        moving = [task for task in frames if task.moves]
-        detours = Detours(progress.detour, dt, scene, moving, self._query, keep) if progress.detour else None
-        self._progress = ProgressWatch(progress, dt, scene.pair_names, detours)
-        self._escape: EscapePlanner | None = None
-        if self.avoidance.escape is not None:
-            if contacts is not None:
-                raise ConfigError("avoidance.escape: flights do not hold contacts; leave one of the two out")
-            self._escape = EscapePlanner(
-                scene, self._bounds, self._obstacles, self.avoidance, self.limits, dt, self.avoidance.escape
-            )
-        queries = (self._query, self._guard.ahead, *([self._escape.query] if self._escape else []))
-        self._grasps = Grasps(scene, queries, self._assembly, keep)
+        if contacts is not None and self.avoidance.escape is not None:
+            raise ConfigError("avoidance.escape: flights do not hold contacts; leave one of the two out")
+        self._commander = Commander(
+            scene, self.solver, self._assembly, self._query, self._obstacles, self._bounds,
+            [task for task in frames if task.moves], self.avoidance, self.limits, progress or Progress(), dt,
+        )  # fmt: skip
+        hold = self.avoidance.hold - self.avoidance.offset
+        self._grasps = Grasps(scene, (self._query, *self._commander.queries), self._assembly, hold)
         self._warm_up()
 
     def _warm_up(self) -> None:
@@ -285,9 +268,9 @@ class Controller:
         """
         index, frame_id = self._obstacles.index(obstacle), self.scene.robot.frame_id(frame, "attach")
         self._grasps.attach(index, frame_id, self._given_or_last(q))
-        self._look_anew()
+        self._commander.look_anew()
         self._obstacles.carry(index, True)
-        self._guard.forget(index)
+        self._commander.guard.forget(index)
 
     def release(self, obstacle: str, q: Array | None = None) -> Sample:
         """Puts an obstacle down that the robot carries: it rests where it is, until `step` is told something else.
@@ -307,7 +290,7 @@ class Controller:
         """
         index = self._obstacles.index(obstacle)
         sample = self._grasps.release(index, self._given_or_last(q))
-        self._look_anew()
+        self._commander.look_anew()
         self._obstacles.carry(index, False)
         return sample
 
@@ -324,11 +307,7 @@ class Controller:
             ConfigError: none of the others has a pair with it.
         """
         self._grasps.allow(self._obstacles.index(obstacle), set(others), allowed)
-        self._look_anew()
-
-    def _look_anew(self) -> None:
-        if self._escape is not None:
-            self._escape.look_anew()
+        self._commander.look_anew()
 
     def obstacle_pose(self, obstacle: str, q: Array | None = None) -> Sample:
         """World pose of an obstacle as the last tick had it, carried or not; see `release` for the arguments."""
@@ -346,9 +325,7 @@ class Controller:
         self._assembly.restart(np.zeros(self._v_shape) if v is None else require_finite("v", v, self._v_shape))
         self._q_last[:] = self.scene.robot.home
         self._obstacles.reset()
-        self._progress.reset()
-        if self._escape is not None:
-            self._escape.reset()
+        self._commander.reset()
 
     def _compute(
         self,
@@ -360,39 +337,16 @@ class Controller:
         desired: Array | None = None,
     ) -> tuple[tuple[Any, ...], Proximity, Problem, Solution]:
         begin = perf_counter()
-        q = as_vector("q", q, self._q_shape)
-        faults: tuple[str, ...] = ()
-        if v is not None:
-            v = as_vector("v", v, self._v_shape)
-            if sane(v):
-                self._assembly.measured(v)
-            else:
-                faults = (not_finite("v", v),)
-        try:
-            known = sane(q) and isfinite(t)
-        except TypeError:
-            raise NumericalError(f"t: not a number: {t!r:.60}") from None
-        if not known:
-            if not sane(q):
-                faults += (not_finite("q", q),)
-                q = self._expected()
-            if not isfinite(t):
-                faults, t = (*faults, f"t: {t}"), 0.0
-        self._q_last[:] = q
-        if desired is not None and not sane(desired):
-            faults += (not_finite("v_desired", desired),)
-            desired = np.zeros(self._v_shape)
+        q, t, desired, faults = self._read(q, t, v, desired)
         samples = self._targets(t, targets)
         observed = self._obstacles.observe(t, obstacles)
         assumed: tuple[str, ...] = ()
         if observed is not None:
             for index, voxels in observed.voxels.items():
-                self._query.fill(index, voxels)
-                self._guard.ahead.fill(index, voxels)
-                if self._escape is not None:
-                    self._escape.query.fill(index, voxels)
+                for query in (self._query, *self._commander.queries):
+                    query.fill(index, voxels)
             self._query.placing.place(*observed.seen)
-            self._guard.see(observed.seen.which)
+            self._commander.guard.see(observed.seen.which)
             faults, assumed = faults + observed.stop, observed.assumed
         self._kinematics.compute(q)
         self._query.compute(self._kinematics.data, self._reach)
@@ -405,85 +359,39 @@ class Controller:
             faults += tuple([f"target {frame!r}: NaN or infinity" for frame in targets if not finite(targets[frame])])
         built = perf_counter()
         if faults:
-            solution = _stop(problem, faults)
-        elif desired is not None:
-            solution = self._solve(q, problem)
+            solution = self._commander.stop(problem, faults)
         else:
-            solution = self._solve(q, problem, proximity)
-            blocked = self._progress.update(problem, solution)
-            solution = solution._replace(blocked=blocked) if blocked else solution
-        if self._escape is not None and not faults:
-            solution = self._with_a_way_out(self._escape, q, t, proximity, problem, solution)
-        if self._assembly.limits_may_give_way and self.solver.bounded:
-            solution = self._with_limits_passed(problem, solution)
+            solution = self._commander.decide(q, t, problem, proximity, tasks=desired is None)
         self._assembly.remember(solution.v)
         solution = solution._replace(assumed=assumed) if assumed else solution
         return samples, proximity, problem, solution.timed(built - begin, perf_counter() - built)
 
-    def _solve(self, q: Array, problem: Problem, proximity: Proximity | None = None) -> Solution:
-        """What the solver says, within the limits and looked ahead; with a proximity, ways round may be tried."""
+    def _read(
+        self, q: Array, t: float, v: Array | None, desired: Array | None
+    ) -> tuple[Array, float, Array | None, tuple[str, ...]]:
+        """Arguments of a tick with what cannot be true replaced, and what that was."""
+        q = as_vector("q", q, self._q_shape)
+        faults: tuple[str, ...] = ()
+        if v is not None:
+            v = as_vector("v", v, self._v_shape)
+            if sane(v):
+                self._assembly.measured(v)
+            else:
+                faults = (not_finite("v", v),)
+        if not sane(q):
+            faults += (not_finite("q", q),)
+            q = self._expected()
         try:
-            if proximity is not None:
-                problem = self._progress.redirect(problem, proximity, self._assembly, self.solver)
-                if problem.jerked and not (problem.levels and isinstance(self.solver, Hqp)):  # v0 is not a cascade's
-                    problem = self._assembly.eased(problem)
-            solution = self.solver.solve(problem)
-            v = solution.v
-            usable = v.dtype == np.float64 and v.shape == self._v_shape and sane(v)
-        except Exception as error:  # a law of the user's own may raise anything; the robot must get a velocity
-            return _stop(problem, (f"the solver raised {type(error).__name__}: {error}",))
-        if not usable:
-            return _stop(problem, solution.reasons or ("the solver returned no finite velocity of the right shape",))
-        if not self.solver.bounded:
-            if self.limits.saturate:
-                v, change = saturate(v, problem.lower, problem.upper, self._bounds.velocity)
-                return solution._replace(v=v, saturation=change)
-            return solution
-        if not isinstance(self.solver, Qp):
-            met = solution.status is Status.SOLVED
-            limits = (problem.lower, problem.upper) if met else (problem.hard_lower, problem.hard_upper)
-            v = np.clip(v, *limits)
-            solution = solution._replace(v=v, saturation=float(np.max(np.abs(v - solution.v), initial=0.0)))
-        if self.avoidance.look_ahead:
-            return self._looked_ahead(q, problem, solution)
-        return solution
-
-    def _looked_ahead(self, q: Array, problem: Problem, solution: Solution) -> Solution:
-        def gentle() -> Array | None:
-            return self.solver.gentle(problem, solution.slack) if isinstance(self.solver, Qp) else None
-
-        checked = self._guard.check(q, solution, problem, gentle, self._assembly, self._query, self._reach)
-        if checked is None:
-            return solution
-        v, share, short, pair = checked
-        if short <= TOLERANCE:
-            return solution._replace(v=v, share=share)
-        names = " - ".join(self.scene.pair_names[pair])
-        if short != short:
-            return _stop(problem, (*solution.reasons, f"{names}: no distance can be told on the way ahead"))
-        return solution._replace(v=v, share=share).relaxed(f"{names}: comes {1e3 * short:.1f} mm too near")
-
-    def _with_a_way_out(
-        self, escape: EscapePlanner, q: Array, t: float, proximity: Proximity, problem: Problem, solution: Solution
-    ) -> Solution:
-        v = escape.check(q, solution.v, t, self._assembly.v_last, proximity)
-        if v is None:
-            return solution
-        reason = "the tasks: no way out would be left among the obstacles that move"
-        return solution._replace(v=np.clip(v, problem.lower, problem.upper)).relaxed(reason)
-
-    def _with_limits_passed(self, problem: Problem, solution: Solution) -> Solution:
-        """Says which accelerations and jerks pass their limits, where bounds had to: to get back from where a relaxed
-        tick has led to, before a position or velocity limit, or to hold contacts.
-        """
-        said = " ".join([reason for reason in solution.reasons if "beyond its" in reason])
-        lines = [
-            f"{problem.joint_names[j]}: {excess[j]:.4f} rad/s or m/s beyond its {name} limit"
-            for name, excess in zip(("acceleration", "jerk"), self._assembly.beyond_limits(solution.v), strict=True)
-            for j in np.flatnonzero(excess > _UNFELT).tolist()
-            if f"{problem.joint_names[j]}: " not in said
-        ]
-        return solution.relaxed(*lines) if lines else solution
+            known = isfinite(t)
+        except TypeError:
+            raise NumericalError(f"t: not a number: {t!r:.60}") from None
+        if not known:
+            faults, t = (*faults, f"t: {t}"), 0.0
+        self._q_last[:] = q
+        if desired is not None and not sane(desired):
+            faults += (not_finite("v_desired", desired),)
+            desired = np.zeros(self._v_shape)
+        return q, t, desired, faults
 
     def _expected(self) -> Array:
         """Where the robot is if it did what it was told last (nq,)."""
@@ -512,10 +420,6 @@ def _name(solver: Solver | str) -> str:
     if isinstance(solver, str):
         return f"solver {solver!r}"
     return f"solver {solver.config.name!r}" if hasattr(solver, "config") else f"the solver {type(solver).__name__}"
-
-
-def _stop(problem: Problem, reasons: tuple[str, ...]) -> Solution:
-    return Solution(problem.v_stop.copy(), Status.STOPPED, reasons)
 
 
 def _copied(value: Any) -> Any:

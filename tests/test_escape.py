@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from qpavoid import Controller, Obstacle, Sample, ScenarioConfig, Status, kernels, load_scenario
 from qpavoid.config import Avoidance, Box, Escape, Line, Sphere
 from qpavoid.errors import ConfigError
-from qpavoid.escape import Start, _farthest
+from qpavoid.flights import Start, _farthest
 from qpavoid.motion import build_motion
 
 DT = 0.01
@@ -184,7 +184,7 @@ def test_where_there_is_no_way_out_every_tick_has_an_outcome_all_the_same(tmp_pa
 def planner_of(scenario):
     """A planner, its controller, and the start of a run."""
     controller, q = Controller.from_scenario(scenario)
-    planner = controller._escape
+    planner = controller._commander.escape
     assert planner is not None
     return controller, planner, q
 
@@ -220,15 +220,15 @@ def test_a_flight_that_is_flown_again_is_the_same_and_so_is_what_is_left_of_it(a
     planner.reset()
     touched = 0
     for t in (0.02, 0.13, 0.51, 1.17):  # a tick later, flights end at the same time
-        for manner in [planner._still, *(planner._drawn() for _ in range(5))]:
-            planner._foreseen.clear()
-            flight = planner._fly(start_of(planner, q, t), manner)
-            again = planner._fly(flight.start, planner._still, flight.v)
+        for manner in [planner.flights.still, *(planner._drawn() for _ in range(5))]:
+            planner.flights.forget_foreseen()
+            flight = planner.flights.fly(start_of(planner, q, t), manner)
+            again = planner.flights.fly(flight.start, planner.flights.still, flight.v)
             assert again.value == pytest.approx(flight.value, abs=1e-12)
             assert np.array_equal(again.v, flight.v)
             touched += flight.value.clear < 1.5
-            left = planner._a_tick_on(flight)
-            later = planner._fly(left.start, manner, left.v)
+            left = planner.flights.a_tick_on(flight)
+            later = planner.flights.fly(left.start, manner, left.v)
             assert later.until == pytest.approx(flight.until, abs=1e-9)
             assert later.least >= flight.least - 1e-9
     assert 0 < touched < 24
@@ -241,15 +241,15 @@ def test_flights_that_hold_from_a_start_close_by_do_so(among_balls):
     rng, held = np.random.default_rng(2), 0
     for _ in range(60):
         t = rng.uniform(0.0, 2.0)
-        planner._foreseen.clear()
-        flight = planner._fly(start_of(planner, q, t), planner._drawn())
+        planner.flights.forget_foreseen()
+        flight = planner.flights.fly(start_of(planner, q, t), planner._drawn())
         off = rng.uniform(-1.0, 1.0, len(q)) * 10.0 ** rng.uniform(-4.0, -1.5)
         start = start_of(planner, pin.integrate(planner._model, q, off), t, rng.uniform(-0.05, 0.05, len(q)))
-        if planner._holds_from(flight, start):
+        if planner.flights.holds_from(flight, start):
             held += 1
-            again = planner._fly(start, planner._still, flight.v)
-            assert again.value >= planner._enough
-            assert again.least >= flight.least - planner._lever * 0.1 * len(q)
+            again = planner.flights.fly(start, planner.flights.still, flight.v)
+            assert again.value >= planner.flights.enough
+            assert again.least >= flight.least - planner.flights.lever * 0.1 * len(q)
     assert 5 < held < 55
 
 
@@ -261,10 +261,10 @@ def test_a_plate_that_is_passed_between_two_looks_is_seen(tmp_path):
         controller = make_controller(
             robot, [plate, *jaws()], "y", avoidance=Avoidance(d1=0.02, d2=0.1, escape=Escape())
         )
-        planner = controller._escape
+        planner = controller._commander.escape
         q = np.array([-0.5 - shift, 0.0])
-        flight = planner._fly(
-            Start(q, np.zeros(2), 0.0, planner._parted), planner._still, 4 * 10 * [np.array([3.0, 0.0])]
+        flight = planner.flights.fly(
+            Start(q, np.zeros(2), 0.0, planner._parted), planner.flights.still, 4 * 10 * [np.array([3.0, 0.0])]
         )
         touches = (0.45 + shift) / 3.0
         assert flight.until == pytest.approx(touches, abs=0.04), shift
@@ -275,7 +275,7 @@ def test_what_was_found_clear_is_looked_at_anew_when_obstacles_turn(tmp_path):
     chaser = Obstacle.at("chaser", Sphere(radius=0.1), [-0.4, 0.0, 0.0])
     avoidance = Avoidance(d1=0.02, d2=0.1, escape=Escape(attempts=20))
     controller = make_controller(robot, [chaser], "y", avoidance=avoidance)
-    planner = controller._escape
+    planner = controller._commander.escape
 
     def told(speed):
         return {"chaser": Sample.at([-0.4, 0.0, 0.0], linear=[speed, 0.0, 0.0])}
@@ -283,15 +283,15 @@ def test_what_was_found_clear_is_looked_at_anew_when_obstacles_turn(tmp_path):
     start = Start(robot.home, np.zeros(2), 0.0, planner._parted)
     for speed, clear in ((0.0, 1.5), (0.5, 0.25 / 0.5)):
         controller._obstacles.observe(0.0, told(speed))
-        planner._foreseen.clear()
+        planner.flights.forget_foreseen()
         found, _ = planner._way_out(start)
         if speed == 0.0:
             planner._kept = found
             assert np.abs(found.v).max() < 1e-9
-        as_kept = planner._fly(start, planner._still, planner._kept.v)
+        as_kept = planner.flights.fly(start, planner.flights.still, planner._kept.v)
         assert as_kept.value.clear == pytest.approx(clear, abs=0.005)
-        assert found.value >= planner._enough  # aside, at less than 0.25 m/s: 0.21 m in 0.4 m / (0.5 m/s)
-        assert planner._fly(start, planner._still, found.v).value == pytest.approx(found.value, abs=1e-9)
+        assert found.value >= planner.flights.enough  # aside, at less than 0.25 m/s: 0.21 m in 0.4 m / (0.5 m/s)
+        assert planner.flights.fly(start, planner.flights.still, found.v).value == pytest.approx(found.value, abs=1e-9)
 
 
 def test_no_flight_is_flown_where_nothing_comes_near(tmp_path, monkeypatch):
@@ -303,8 +303,8 @@ def test_no_flight_is_flown_where_nothing_comes_near(tmp_path, monkeypatch):
     ]
     controller = make_controller(robot, far, "y", avoidance=Avoidance(d1=0.02, d2=0.1, escape=Escape()))
     flown = []
-    fly = controller._escape._fly
-    monkeypatch.setattr(controller._escape, "_fly", lambda *a: flown.append(a[0].t) or fly(*a))
+    fly = controller._commander.escape.flights.fly
+    monkeypatch.setattr(controller._commander.escape.flights, "fly", lambda *a: flown.append(a[0].t) or fly(*a))
     q = robot.home.copy()
     for k in range(0, 900, 10):
         controller.step(q, k * DT, {"y": Sample.at([0.0, 0.0, 0.0])})
@@ -330,7 +330,7 @@ def test_where_nobody_is_said_to_come_nobody_does(tmp_path_factory, lines, t, v)
     if not obstacles:
         return
     controller = make_controller(robot, obstacles, avoidance=Avoidance(d1=0.02, d2=0.1, escape=Escape()))
-    planner, v = controller._escape, np.array(v)
+    planner, v = controller._commander.escape, np.array(v)
     if planner._nobody_comes(Start(robot.home, v, t, planner._parted)):
         for later in np.linspace(0.0, 1.5, 76):
             ramp = np.minimum(later, np.abs(v) / 2.0)
@@ -347,28 +347,28 @@ ROBOTS = {}
 def test_a_flight_holds_only_while_it_is_of_what_is(tmp_path, among_balls):
     _, planner, q = among_balls
     planner.reset()
-    planner._foreseen.clear()
+    planner.flights.forget_foreseen()
     flight = next(
         f
-        for f in iter(lambda: planner._fly(start_of(planner, q, 0.0), planner._drawn()), None)
-        if f.value >= planner._enough
+        for f in iter(lambda: planner.flights.fly(start_of(planner, q, 0.0), planner._drawn()), None)
+        if f.value >= planner.flights.enough
     )
-    assert planner._holds_from(flight, flight.start)
-    assert not planner._holds_from(flight, flight.start._replace(t=0.02))  # obstacles are elsewhere by then
-    assert not planner._holds_from(flight, flight.start._replace(watched=~planner._parted))
+    assert planner.flights.holds_from(flight, flight.start)
+    assert not planner.flights.holds_from(flight, flight.start._replace(t=0.02))  # obstacles are elsewhere by then
+    assert not planner.flights.holds_from(flight, flight.start._replace(watched=~planner._parted))
     load = Obstacle.at("load", Sphere(radius=0.02), [0.3, 0.0, 0.0], graspable=True)
     ball = Obstacle(
         "ball", Sphere(radius=0.1), build_motion(Line(start=(0.0, 0.6, 0.0), end=(0.0, -2.0, 0.0), speed=0.01)), True
     )
     robot = cartesian(tmp_path, "xy", speed=0.25, acceleration=None)
     controller = make_controller(robot, [load, ball], avoidance=Avoidance(d1=0.02, d2=0.1, escape=Escape(comfort=0.5)))
-    planner = controller._escape
+    planner = controller._commander.escape
     for change in (
         lambda: controller.attach("load", "y", robot.home),
         lambda: controller.allow_contact("load", ["ball"]),
         lambda: controller.release("load", robot.home),
     ):
         controller.filter(robot.home, np.zeros(2), 0.0)
-        assert planner._kept is not None and planner._holds_from(planner._kept, planner._kept.start)
+        assert planner._kept is not None and planner.flights.holds_from(planner._kept, planner._kept.start)
         change()
-        assert not planner._holds_from(planner._kept, planner._kept.start)
+        assert not planner.flights.holds_from(planner._kept, planner._kept.start)

@@ -1,0 +1,184 @@
+"""What is commanded: a solver's answer, brought within limits, looked ahead, and left only where a way out stays.
+
+A law may be anyone's, and may be wrong. What it says counts as far as it is finite, of the right shape, within the
+limits, clear of contact along its tick and the stop after it and, where foresight is asked for, not a trap.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from qpavoid.assembly import Assembly
+from qpavoid.config import Avoidance, Limits, Progress
+from qpavoid.detour import Detours
+from qpavoid.escape import EscapePlanner
+from qpavoid.guard import TOLERANCE, Guard
+from qpavoid.limits import JointBounds, saturate
+from qpavoid.problem import Array, Problem, Proximity, Solution, Status, sane
+from qpavoid.progress import ProgressWatch
+from qpavoid.proximity import DistanceQuery
+from qpavoid.scene import Scene
+from qpavoid.sensing import Obstacles
+from qpavoid.solvers import Solver
+from qpavoid.solvers.hqp import Hqp
+from qpavoid.solvers.qp import Qp
+from qpavoid.tasks import FrameTask
+
+_UNFELT = 2e-6
+"""What a velocity may pass limits of acceleration or jerk by without a word: the tolerance of the QP [rad/s, m/s]."""
+
+
+class Commander:
+    """Has problems solved, and decides what is commanded."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        solver: Solver,
+        assembly: Assembly,
+        query: DistanceQuery,
+        obstacles: Obstacles,
+        bounds: JointBounds,
+        frames: list[FrameTask],
+        avoidance: Avoidance,
+        limits: Limits,
+        progress: Progress,
+        dt: float,
+    ) -> None:
+        """Lays the memory out.
+
+        Args:
+            scene: robot and obstacles.
+            solver: the law.
+            assembly: of the tick's problems.
+            query: the tick's distances.
+            obstacles: what is known of the obstacles.
+            bounds: limits of the joints.
+            frames: tasks that may be sent a way round.
+            avoidance: distances and rows.
+            limits: use of the joint limits.
+            progress: when a task counts as blocked, and whether a way round is tried.
+            dt: control period [s].
+        """
+        self._scene, self._solver, self._assembly, self._query = scene, solver, assembly, query
+        self._bounds, self._avoidance, self._limits = bounds, avoidance, limits
+        self._v_shape = (scene.robot.model.nv,)
+        self._reach, keep = avoidance.d2 - avoidance.offset, avoidance.hold - avoidance.offset
+        self.guard = Guard(scene, bounds, limits.position_gain, keep, dt)
+        detours = Detours(progress.detour, dt, scene, frames, query, keep) if progress.detour else None
+        self.progress = ProgressWatch(progress, dt, scene.pair_names, detours)
+        settings = avoidance.escape
+        self.escape = (
+            None if settings is None else EscapePlanner(scene, bounds, obstacles, avoidance, limits, dt, settings)
+        )
+
+    @property
+    def queries(self) -> tuple[DistanceQuery, ...]:
+        """Distances ahead, which have to know who carries what, and what points are seen."""
+        return (self.guard.ahead, *([self.escape.flights.query] if self.escape else []))
+
+    def look_anew(self) -> None:
+        """What the robot carries, or what may touch, has changed."""
+        if self.escape is not None:
+            self.escape.look_anew()
+
+    def reset(self) -> None:
+        """Forgets the ticks before."""
+        self.progress.reset()
+        if self.escape is not None:
+            self.escape.reset()
+
+    def decide(self, q: Array, t: float, problem: Problem, proximity: Proximity, tasks: bool) -> Solution:
+        """The velocity that is commanded.
+
+        Args:
+            q: configuration (nq,).
+            t: now [s].
+            problem: of this tick.
+            proximity: distances of this tick.
+            tasks: whether the problem is of the tasks, whose progress is watched; else it is of a command.
+        """
+        if tasks:
+            solution = self._solve(q, problem, proximity)
+            blocked = self.progress.update(problem, solution)
+            solution = solution._replace(blocked=blocked) if blocked else solution
+        else:
+            solution = self._solve(q, problem)
+        if self.escape is not None:
+            solution = self._with_a_way_out(self.escape, q, t, proximity, problem, solution)
+        return self._with_limits_passed(problem, solution)
+
+    def stop(self, problem: Problem, reasons: tuple[str, ...]) -> Solution:
+        """The stop of this tick, and why."""
+        return self._with_limits_passed(problem, _stop(problem, reasons))
+
+    def _solve(self, q: Array, problem: Problem, proximity: Proximity | None = None) -> Solution:
+        """What the solver says, within the limits and looked ahead; with a proximity, ways round may be tried."""
+        try:
+            if proximity is not None:
+                problem = self.progress.redirect(problem, proximity, self._assembly, self._solver)
+                if problem.jerked and not (problem.levels and isinstance(self._solver, Hqp)):  # v0 is not a cascade's
+                    problem = self._assembly.eased(problem)
+            solution = self._solver.solve(problem)
+            v = solution.v
+            usable = v.dtype == np.float64 and v.shape == self._v_shape and sane(v)
+        except Exception as error:  # a law of the user's own may raise anything; the robot must get a velocity
+            return _stop(problem, (f"the solver raised {type(error).__name__}: {error}",))
+        if not usable:
+            return _stop(problem, solution.reasons or ("the solver returned no finite velocity of the right shape",))
+        if not self._solver.bounded:
+            if self._limits.saturate:
+                v, change = saturate(v, problem.lower, problem.upper, self._bounds.velocity)
+                return solution._replace(v=v, saturation=change)
+            return solution
+        if not isinstance(self._solver, Qp):
+            met = solution.status is Status.SOLVED
+            limits = (problem.lower, problem.upper) if met else (problem.hard_lower, problem.hard_upper)
+            v = np.clip(v, *limits)
+            solution = solution._replace(v=v, saturation=float(np.max(np.abs(v - solution.v), initial=0.0)))
+        if self._avoidance.look_ahead:
+            return self._looked_ahead(q, problem, solution)
+        return solution
+
+    def _looked_ahead(self, q: Array, problem: Problem, solution: Solution) -> Solution:
+        def gentle() -> Array | None:
+            return self._solver.gentle(problem, solution.slack) if isinstance(self._solver, Qp) else None
+
+        checked = self.guard.check(q, solution, problem, gentle, self._assembly, self._query, self._reach)
+        if checked is None:
+            return solution
+        v, share, short, pair = checked
+        if short <= TOLERANCE:
+            return solution._replace(v=v, share=share)
+        names = " - ".join(self._scene.pair_names[pair])
+        if short != short:
+            return _stop(problem, (*solution.reasons, f"{names}: no distance can be told on the way ahead"))
+        return solution._replace(v=v, share=share).relaxed(f"{names}: comes {1e3 * short:.1f} mm too near")
+
+    def _with_a_way_out(
+        self, escape: EscapePlanner, q: Array, t: float, proximity: Proximity, problem: Problem, solution: Solution
+    ) -> Solution:
+        v = escape.check(q, solution.v, t, self._assembly.v_last, proximity)
+        if v is None:
+            return solution
+        reason = "the tasks: no way out would be left among the obstacles that move"
+        return solution._replace(v=np.clip(v, problem.lower, problem.upper)).relaxed(reason)
+
+    def _with_limits_passed(self, problem: Problem, solution: Solution) -> Solution:
+        """Says which accelerations and jerks pass their limits, where bounds had to: to get back from where a relaxed
+        tick has led to, before a position or velocity limit, or to hold contacts.
+        """
+        if not (self._assembly.limits_may_give_way and self._solver.bounded):
+            return solution
+        said = " ".join([reason for reason in solution.reasons if "beyond its" in reason])
+        lines = [
+            f"{problem.joint_names[j]}: {excess[j]:.4f} rad/s or m/s beyond its {name} limit"
+            for name, excess in zip(("acceleration", "jerk"), self._assembly.beyond_limits(solution.v), strict=True)
+            for j in np.flatnonzero(excess > _UNFELT).tolist()
+            if f"{problem.joint_names[j]}: " not in said
+        ]
+        return solution.relaxed(*lines) if lines else solution
+
+
+def _stop(problem: Problem, reasons: tuple[str, ...]) -> Solution:
+    return Solution(problem.v_stop.copy(), Status.STOPPED, reasons)
