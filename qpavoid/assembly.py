@@ -160,7 +160,7 @@ class Assembly:
         if self._contacts is not None:
             held = self._contacts.update(self._forward)
             x.v_last[:] = held.held(x.v_last)
-        k, worst, clear = kernels.assemble(self._packed, q, query.pairs, reach, query.placing.moving)
+        k, worst, clear, room = kernels.assemble(self._packed, q, query.pairs, reach, query.placing.moving)
         proximity, rows = self._views.get(k) or self._view(k)
         if held is not None:
             x.v0[:] = tracking_within(held, x.A, x.b, x.damping)
@@ -168,7 +168,7 @@ class Assembly:
             worst = float(kernels.tracking_shortfall(self._packed, k))
         bounds = x.lower, x.upper, *self._hard, x.v_stop
         return proximity, Problem(
-            self._tracking, rows, *bounds, *self._names, x.v0, worst, held, self._levels, x.jerked, clear
+            self._tracking, rows, *bounds, *self._names, x.v0, worst, held, self._levels, x.jerked, clear, room
         )
 
     def carry(self, query: DistanceQuery) -> None:

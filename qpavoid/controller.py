@@ -20,6 +20,7 @@ from qpavoid.contacts import ContactRows, build_contacts
 from qpavoid.errors import ConfigError, NumericalError, UnknownName, located
 from qpavoid.grasp import Grasps
 from qpavoid.kinematics import ForwardKinematics, Kinematics
+from qpavoid.limits import OUTSIDE
 from qpavoid.loading import nearest
 from qpavoid.motion import Sample
 from qpavoid.problem import (
@@ -363,6 +364,8 @@ class Controller:
         else:
             solution = self._commander.decide(q, t, problem, proximity, tasks=desired is None)
         self._assembly.remember(solution.v)
+        if problem.room < -OUTSIDE:
+            assumed += self._bounds.outside(q, problem.joint_names)
         solution = solution._replace(assumed=assumed) if assumed else solution
         return samples, proximity, problem, solution.timed(built - begin, perf_counter() - built)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,6 +11,11 @@ import numpy as np
 from qpavoid.config import Limits
 from qpavoid.errors import ConfigError
 from qpavoid.problem import Array, IntArray
+
+OUTSIDE = 1e-6
+"""How far beyond a position limit a coordinate counts as outside it [rad, m]."""
+_TURN = 2.0 * np.pi
+"""Farther than this beyond its limit nothing is that was measured in radians [rad]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +56,16 @@ class JointBounds:
             acceleration=config.acceleration_scale * acceleration,
             jerk=jerk,
         )
+
+    def outside(self, q: Array, names: Sequence[str]) -> tuple[str, ...]:
+        """Which coordinates of q (nq,) are outside their position limits, with the names (nv,) of all, and how far."""
+        below, above = self.lower - q[self.q_index], q[self.q_index] - self.upper
+        lines = []
+        for i in np.flatnonzero(np.maximum(below, above) > OUTSIDE).tolist():
+            side, far = ("below its lower", below[i]) if below[i] > 0.0 else ("above its upper", above[i])
+            hint = "; is it in degrees?" if far > _TURN else ""
+            lines.append(f"q: {names[self.v_index[i]]} is {far:.4g} rad or m {side} limit, and sent back{hint}")
+        return tuple(lines)
 
 
 def _or(limits: Array, given: float | None) -> Array:

@@ -167,6 +167,8 @@ class Problem(NamedTuple):
     """Whether `lower` and `upper` keep to jerk limits, beside those of accelerations."""
     clear: bool = False
     """Whether v0 is safe and known to lead nowhere near anything, nor a stop from it."""
+    room: float = np.inf
+    """What is left to the nearest position limit [rad, m]; negative where a coordinate is outside."""
 
 
 def make_problem(

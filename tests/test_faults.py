@@ -140,7 +140,16 @@ def test_a_joint_outside_its_limits_is_brought_back(panda):
         assert left <= out[-1] + 1e-9
         assert (np.abs(tick.solution.v) <= bounds.velocity + 1e-9).all()
         out.append(left)
+        said = [line.split()[1] for line in tick.solution.assumed]  # "q: panda_joint1 is 0.1 rad …"
+        assert bool(said) == (left > 1e-6) and set(said) <= {"panda_joint1", "panda_joint4"}
     assert out[1] == pytest.approx(0.1) and out[-1] < 1e-6
+
+
+def test_a_configuration_in_degrees_is_said(panda):
+    solution = make_controller(panda, frame=TOOL).step(np.rad2deg(panda.home))
+    assert (np.abs(solution.v) <= panda.bounds().velocity).all()
+    said = "q: panda_joint2 is 43.24 rad or m below its lower limit, and sent back; is it in degrees?"
+    assert said in solution.assumed
 
 
 @pytest.mark.parametrize("seed", range(5))

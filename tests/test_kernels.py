@@ -327,7 +327,7 @@ def test_a_pair_whose_distance_is_not_a_number_is_near(kernels):
     results[:, 0] = 9.0, np.nan, 0.2
     for fields in (NO_LIMIT, {}):
         x = random_layout(0, pairs=3, results=gaps(results, 17), **fields)
-        k, worst, clear = run(kernels, "assemble", x, np.zeros(8), np.arange(3), 0.5, True)
+        k, worst, clear, _ = run(kernels, "assemble", x, np.zeros(8), np.arange(3), 0.5, True)
         assert x.near[:k].tolist() == [1, 2]
         assert np.isnan(x.least[:k]).tolist() == [True, False] and np.isnan(worst) and not clear
 
@@ -723,7 +723,7 @@ def test_velocity_bounds_by_hand(kernels):
         q_lower=np.array([-1.0, -1, -1, -inf, -1]), q_upper=np.array([1.0, 1, 1, 1, 1]),
         v_max=np.array([2.0, 3.0, 4.0, inf, inf, 5.0]), rate=50.0,
     )  # fmt: skip
-    run(kernels, "velocity_bounds", x, q)
+    assert run(kernels, "velocity_bounds", x, q) == -3.0
     np.testing.assert_allclose(x.lower, [-2.0, -3.0, -4.0, -inf, -inf, 5.0])
     np.testing.assert_allclose(x.upper, [2.0, 0.5, -1.0, inf, 35.0, 5.0])
 
@@ -954,7 +954,7 @@ def test_a_tick_is_the_sum_of_its_parts(kernels, seed, fields):
         x.margin[:-1] = y.margin[:-1] = 0.05 * moving
         apart = kernels.pack(y)
         kernels.frame_rows(apart)
-        kernels.velocity_bounds(apart, q[:7] if "plain" in fields else q)
+        room = kernels.velocity_bounds(apart, q[:7] if "plain" in fields else q)
         kernels.stop_velocity(apart)
         kernels.damped_solution(apart, y.v0)
         k = kernels.distance_rows(apart, pairs, reach, moving)
@@ -962,7 +962,7 @@ def test_a_tick_is_the_sum_of_its_parts(kernels, seed, fields):
         worst = kernels.tracking_shortfall(apart, k)
         found = kernels.assemble(packed, q[:7] if "plain" in fields else q, pairs, reach, moving)
         clear = worst <= 0.0 and kernels.tracking_clear(apart, k, reach)
-        np.testing.assert_array_equal(found, (k, worst, clear))
+        np.testing.assert_array_equal(found, (k, worst, clear, room))
         assert_same(x, y, k)
 
 

@@ -14,15 +14,16 @@ _way_to_stop, _longest_way = compiled(way_to_stop), compiled(longest_way)
 
 
 @compiled
-def velocity_bounds(x: Any, q: Array) -> None:
+def velocity_bounds(x: Any, q: Array) -> float:
     """See `vectorised.bounds.velocity_bounds`."""
-    lower, upper = x.hard_lower, x.hard_upper
+    lower, upper, least = x.hard_lower, x.hard_upper, np.inf
     for j in range(len(x.v_max)):
         lower[j], upper[j] = -x.v_max[j], x.v_max[j]
     for i in range(len(x.q_index)):
         j, here = x.v_index[i], q[x.q_index[i]]
         fastest, step, last = x.v_max[j], x.v_step[j], x.v_last[j]
         below, above = here - x.q_lower[i], x.q_upper[i] - here
+        least = min(least, below, above)
         if step < np.inf:
             faster, slower = min(step, x.w_step[j] + x.w_last[j]), min(step, x.w_step[j] - x.w_last[j])
             down = _speed_to_stop(below, step, x.dt) if below > 0.0 else max(x.rate * below, -last - faster)
@@ -43,6 +44,7 @@ def velocity_bounds(x: Any, q: Array) -> None:
         if x.jerked:
             low, high = min(max(x.lower[j], low), high), max(min(x.upper[j], high), low)
         x.lower[j], x.upper[j] = low, high
+    return least
 
 
 @compiled

@@ -16,16 +16,17 @@ from qpavoid.problem import Array, IntArray
 
 
 @compiled
-def assemble(x: Any, q: Array, pairs: IntArray, reach: float, moving: bool) -> tuple[int, float, bool]:
+def assemble(x: Any, q: Array, pairs: IntArray, reach: float, moving: bool) -> tuple[int, float, bool, float]:
     """See `vectorised.tick.assemble`."""
     frame_rows(x)
-    velocity_bounds(x, q)
+    room = velocity_bounds(x, q)
     stop_velocity(x)
     damped_solution(x, x.v0)
     k = distance_rows(x, pairs, reach, moving)
     row_bounds(x, k, moving)
     worst = tracking_shortfall(x, k)
-    return k, worst, x.looks_ahead and worst <= 0.0 and tracking_clear(x, k, reach)
+    clear = x.looks_ahead and worst <= 0.0 and tracking_clear(x, k, reach)
+    return k, worst, clear, room
 
 
 @compiled

@@ -10,10 +10,15 @@ from qpavoid.kernels.stopping import MOST_STEPS, longest_way, way_to_stop
 from qpavoid.problem import Array
 
 
-def velocity_bounds(x: Any, q: Array) -> None:
-    """Bounds on v from the joint limits: see `qpavoid.limits`; writes hard_lower, hard_upper, lower and upper."""
+def velocity_bounds(x: Any, q: Array) -> float:
+    """Bounds on v from the joint limits: see `qpavoid.limits`; writes hard_lower, hard_upper, lower and upper.
+
+    Returns:
+        Room that is left to the nearest position limit [rad, m]: negative outside, infinite where there are none.
+    """
     room = x.room  # [lower, upper]: how far the coordinate is above its lower limit, and below the upper one
     np.subtract(x.q_limits, q if x.plain else q[x.q_index], out=room)
+    least = min(room[1].min(initial=np.inf), -room[0].max(initial=-np.inf))
     if x.accelerated:
         room[0] *= -1.0
         step = x.limited_step
@@ -45,6 +50,7 @@ def velocity_bounds(x: Any, q: Array) -> None:
     if x.jerked:
         within = np.clip(lower, x.lower, x.upper), np.clip(upper, x.lower, x.upper)
         x.lower[:], x.upper[:] = within
+    return float(least)
 
 
 def _within_jerk(x: Any, room: Array) -> tuple[Array, Array]:

@@ -14,7 +14,7 @@ from qpavoid.kernels.vectorised.stops import stop_velocity
 from qpavoid.problem import Array, IntArray
 
 
-def assemble(x: Any, q: Array, pairs: IntArray, reach: float, moving: bool) -> tuple[int, float, bool]:
+def assemble(x: Any, q: Array, pairs: IntArray, reach: float, moving: bool) -> tuple[int, float, bool, float]:
     """All rows and bounds of a tick, and the tracking law's velocity.
 
     Args:
@@ -26,17 +26,19 @@ def assemble(x: Any, q: Array, pairs: IntArray, reach: float, moving: bool) -> t
 
     Returns:
         Number k of near pairs; by how much the tracking law's velocity violates the worst of rows and bounds
-        (negative inside, NaN where there is one); whether it is safe, looked at, and its way surely clear.
+        (negative inside, NaN where there is one); whether it is safe, looked at, and its way surely clear; room
+        left to the nearest position limit [rad, m].
     """
     frame_rows(x)
-    velocity_bounds(x, q)
+    room = velocity_bounds(x, q)
     stop_velocity(x)
     damped_solution(x, x.v0)
     k = distance_rows(x, pairs, reach, moving)
     if k:
         row_bounds(x, k, moving)
     worst = tracking_shortfall(x, k)
-    return k, worst, x.looks_ahead and worst <= 0.0 and tracking_clear(x, k, reach)
+    clear = x.looks_ahead and worst <= 0.0 and tracking_clear(x, k, reach)
+    return k, worst, clear, room
 
 
 def tracking_shortfall(x: Any, k: int) -> float:
