@@ -104,8 +104,13 @@ class Assembly:
             column_joints=column_joints(scene.robot.model),
             joint_reach=joint_reach,
             carriers=query.carriers(),
+            bodies=np.array(scene.pairs, dtype=np.intp),
+            body_poses=query.poses,
+            boxes=query.boxes(),
+            convex=query.convex(),
             turning=turning,
             sliding=sliding,
+            spins=np.zeros((scene.robot.model.njoints, 3)),
             speeds=query.placing.speeds,
             near=np.zeros(pairs, dtype=np.intp),
             closest=np.zeros((pairs, 10)),
@@ -195,6 +200,16 @@ class Assembly:
         if stop is None:
             return left
         return left - 2.0 * float(stop.aside.sum()) - (self._bend(stop.ways) - self._bend(horizon * np.abs(v)))
+
+    def bends(self, q: Array, v: Array, horizon: float) -> bool:
+        """Whether a joint has to brake harder than the others for its position limit: see `kernels…ahead.bends`.
+
+        Args:
+            q: configuration (nq,).
+            v: velocity (nv,).
+            horizon: time for which v leads on [s].
+        """
+        return bool(kernels.bends(self._packed, q, v, horizon))
 
     def _bend(self, ways: Array) -> float:
         """What `closest_call` allows for bodies that turn, where coordinates move by `ways` (nv,) in all [m]."""

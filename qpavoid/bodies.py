@@ -129,6 +129,15 @@ def bounding_sphere(geometry: Any) -> tuple[Array, float]:
     return np.array(geometry.aabb_center), float(geometry.aabb_radius)
 
 
+def bounding_box(geometry: Any) -> tuple[Array, Array]:
+    """Centre (3,) in the shape's own frame and half the sizes (3,) [m] of a box around it; endless of a plane."""
+    if isinstance(geometry, coal.Halfspace):
+        return np.zeros(3), np.full(3, _ENDLESS)
+    geometry.computeLocalAABB()
+    low, high = np.array(geometry.aabb_local.min_), np.array(geometry.aabb_local.max_)
+    return 0.5 * (low + high), 0.5 * (high - low)
+
+
 def _convex_hull(mesh: Any) -> tuple[Any, Any]:
     """Hull of a mesh and its placement in the mesh's frame; a thin box where the mesh is flat.
 
@@ -180,6 +189,8 @@ def _unpack_fit(path: Path) -> CapsuleFit:
     return CapsuleFit(numbers[:3], numbers[3:12].reshape(3, 3), float(numbers[12]), float(numbers[13]))
 
 
+_ENDLESS = 1e6
+"""Half the size of a box around what has no end [m]."""
 _THINNEST = 1e-4
 """Side of the box that stands for a flat mesh, across its plane [m]."""
 

@@ -12,7 +12,8 @@ from qpavoid.assembly import Assembly
 from qpavoid.config import Avoidance, Limits, Progress
 from qpavoid.detour import Detours
 from qpavoid.escape import EscapePlanner
-from qpavoid.guard import TOLERANCE, Guard
+from qpavoid.guard import Guard
+from qpavoid.kernels.vectorised.ahead import TOLERANCE
 from qpavoid.limits import JointBounds, saturate
 from qpavoid.problem import Array, Problem, Proximity, Solution, Status, sane
 from qpavoid.progress import ProgressWatch

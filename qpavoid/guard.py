@@ -7,8 +7,9 @@ computed anew. Where it comes too near, a solution that moves the joints less is
 bends less; and that is drawn back towards the stop of this tick, whose way was looked at one tick ago. By induction a
 stop that was found clear is always at hand, as long as obstacles do what they were last seen to do, for one tick.
 
-Most ticks need none of this: where no body moves fast enough to use up what is left of a distance before the robot
-could stop, the velocity is clear as it is (`kernels.vectorised.ahead.closest_call`, with the bound and its proof).
+Most ticks need none of this: where no body moves fast enough, or not in the direction, to use up what is left of a
+distance before the robot could stop, the velocity is clear as it is (`kernels.vectorised.ahead.closest_call`, with the
+bound and its proof).
 """
 
 from __future__ import annotations
@@ -23,14 +24,13 @@ import pinocchio as pin
 
 from qpavoid.assembly import Assembly
 from qpavoid.courses import move_on
+from qpavoid.kernels.vectorised.ahead import TOLERANCE
 from qpavoid.kernels.vectorised.bounds import speed_to_stop
 from qpavoid.limits import JointBounds
 from qpavoid.problem import Array, IntArray, Problem, Solution
 from qpavoid.proximity import DistanceQuery
 from qpavoid.scene import Scene
 
-TOLERANCE = 2e-4
-"""How much nearer than its safe distance a pair may come along the way [m]."""
 _CREEP = 1e-5
 """How much nearer a pair that is too near already may come in a tick [m]."""
 _FINEST = 5e-3
@@ -148,7 +148,8 @@ class Guard:
         near = rows.pair
         stop = assembly.stop(q, v) if self._jerked else None
         horizon = self._dt + 0.5 * self._stopping(v) if stop is None else float(stop.forwards.sum())
-        if assembly.closest_call(v, len(near), reach, horizon, stop) > 0.0:
+        uniform = horizon <= self._dt or stop is not None or not assembly.bends(q, v, horizon)
+        if uniform and assembly.closest_call(v, len(near), reach, horizon, stop) > -TOLERANCE:
             return None
         self._given.fill(0.0)
         if solution.slack is not None:

@@ -13,13 +13,13 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid import kernels
-from qpavoid.bodies import bounding_sphere
+from qpavoid.bodies import bounding_box, bounding_sphere
 from qpavoid.cloud import Voxels
 from qpavoid.config import PointCloud
 from qpavoid.memory import read_poses, read_results, view_poses, view_results
 from qpavoid.motion import Sample
 from qpavoid.placing import Placing
-from qpavoid.problem import Array, IntArray
+from qpavoid.problem import Array, IntArray, Mask
 from qpavoid.scene import Scene
 from qpavoid.slots import Slots
 
@@ -81,6 +81,15 @@ class DistanceQuery:
     def bodies(self) -> Any:
         """Geometries as they are placed and carried now, in the order of the geometry model."""
         return self._geometry.geometryObjects
+
+    def boxes(self) -> Array:
+        """(g, 6) box around each body in its own frame: centre and half its sizes [m]."""
+        return np.array([np.concatenate(bounding_box(body.geometry)) for body in self.bodies]).reshape(-1, 6)
+
+    def convex(self) -> Mask:
+        """(m,) whether both bodies of a pair are convex; pairs with a point cloud stand for more than they hold."""
+        mesh = np.array([isinstance(body.geometry, coal.BVHModelBase) for body in self.bodies], dtype=bool)
+        return ~mesh[self._scene.pairs].any(axis=1) & ~self._grouped
 
     def longest_reach(self) -> Array:
         """(njoints,) the same as `joint_reach`, with whatever may ever be carried [m]."""

@@ -154,6 +154,8 @@ def make_layout(nv, frames=0, turns=(), pairs=0, obstacles=0, joints=1, **fields
         "joint_poses": np.zeros((joints, 12)), "joint_reach": np.zeros(joints),
         "parents": np.maximum(np.arange(joints) - 1, 0), "column_joints": np.full(nv, joints - 1),
         "turning": np.ones((1, nv)), "sliding": np.zeros((1, nv)), "lever": 1.0,
+        "bodies": np.zeros((pairs, 2), dtype=np.intp), "body_poses": np.zeros((1, 12)), "boxes": np.zeros((1, 6)),
+        "convex": np.zeros(pairs, dtype=bool),
         "carriers": np.zeros((pairs, 2), dtype=np.intp), "speeds": np.zeros(joints + obstacles),
         "q_index": none, "v_index": none, "q_lower": np.zeros(0),
         "q_upper": np.zeros(0), "v_max": np.full(nv, np.inf), "v_step": np.full(nv, np.inf), "v_last": np.zeros(nv),
@@ -164,7 +166,7 @@ def make_layout(nv, frames=0, turns=(), pairs=0, obstacles=0, joints=1, **fields
     shapes = {
         "poses": (frames, 12), "A": (rows, nv), "b": rows, "closest": (pairs, 10), "J": (pairs, nv), "drift": pairs,
         "d": pairs, "least": pairs, "touch": pairs, "hard_lower": nv, "hard_upper": nv, "lower": nv, "upper": nv,
-        "v_stop": nv, "v0": nv,
+        "v_stop": nv, "v0": nv, "spins": (joints, 3),
     }  # fmt: skip
     outputs = {"near": np.full(pairs, -1), **{name: np.full(shape, np.nan) for name, shape in shapes.items()}}
     given = {**inputs, **outputs, **fields}

@@ -119,6 +119,35 @@ def test_what_the_guard_lets_through_is_clear_by_brute_force(panda):
     assert looked > 100 and drawn_back > 20
 
 
+def test_a_stop_ordered_at_any_tick_is_clear_also_at_the_limits(panda):
+    """The same with stops as they are driven, in which joints that come to their limits brake harder than others."""
+    rng, bounds, stops, at_limits = np.random.default_rng(1), panda.bounds(), 0, 0
+    for _ in range(6):
+        places = rng.uniform([0.3, -0.4, 0.2], [0.7, 0.4, 0.9], (3, 3))
+        boxes = [Obstacle.at(f"box{i}", Box(size=(0.25, 0.25, 0.01)), place) for i, place in enumerate(places)]
+        settings = Avoidance(d1=HELD, d2=0.1, row=Damper(gain=50.0))
+        driver, stopper = (make_controller(panda, boxes, avoidance=settings) for _ in range(2))
+        ruler, q = Ruler(driver.scene), panda.home + rng.uniform(-0.5, 0.5, 7)
+        while ruler.distances(q).min() < HELD:
+            q = panda.home + rng.uniform(-1.0, 1.0, 7)
+        for k in range(150):
+            if k % 50 == 0:
+                command = rng.choice([-1.0, 1.0], 7) * bounds.velocity
+            v = driver.filter(q, command).v
+            q = q + 0.01 * v
+            if k % 5:
+                continue
+            stopper.reset(v)
+            here, stops = q, stops + bool(v.any())
+            while v.any():
+                v = stopper.step(here, np.nan).v
+                for share in (0.5, 1.0):
+                    assert ruler.distances(here + 0.01 * share * v).min() > HELD - 6e-4
+                here = here + 0.01 * v
+            at_limits += bool((np.minimum(here - bounds.lower, bounds.upper - here) < 0.02).any())
+    assert stops > 100 and at_limits > 20
+
+
 @pytest.mark.parametrize(("shape", "speed", "alone"), [(PLATE, 2.0, 0.0), (BALL, 0.5, 0.002), (BOX, 2.0, 0.015)])
 def test_where_the_linearisation_is_too_kind_the_step_is_shortened_and_logged(shape, speed, alone):
     """50 ms ticks and a row that may use all that is left in one: alone, it leads into the plate."""

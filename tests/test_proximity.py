@@ -246,8 +246,8 @@ def test_nothing_comes_nearer_than_the_closest_call_says(name, request):
     rng = np.random.default_rng(19)
     scene = random_scene(robot, rng, [SPHERE, CAPSULE, BOX, CYLINDER])
     bench, hold = Bench(scene), Avoidance().hold
-    for _ in range(20):
-        q, v = random_q(robot, rng), rng.uniform(-1.0, 1.0, robot.model.nv)
+    for trial in range(40):
+        q, v = random_q(robot, rng), 0.1 ** (trial % 3) * rng.uniform(-1.0, 1.0, robot.model.nv)
         samples = {}
         for i, body in enumerate(scene.obstacles):
             start, speed = body.motion.sample(0.0), rng.choice([0.0, 0.3, 1.0])
@@ -255,12 +255,13 @@ def test_nothing_comes_nearer_than_the_closest_call_says(name, request):
             samples[i] = start._replace(**twist)
             bench.query.place_obstacle(i, samples[i])
         near = len(bench.compute(q, reach=0.3)[0].pair)
-        for horizon in (0.01, 0.1, 0.3):
+        for horizon in (0.01, 0.03, 0.1, 0.3):
             least = bench.assembly.closest_call(v, near, 0.3, horizon)
             assert np.isfinite(least)
-            later = {i: moved(sample, horizon) for i, sample in samples.items()}
-            found = look(scene, pin.integrate(robot.model, q, horizon * v), later)
-            assert found.distance.min() - hold >= least - 1e-9
+            for t in (0.5 * horizon, horizon):
+                later = {i: moved(sample, t) for i, sample in samples.items()}
+                found = look(scene, pin.integrate(robot.model, q, t * v), later)
+                assert found.distance.min() - hold >= least - 1e-9
 
 
 # --- penetration -------------------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from closed_loop import cartesian, drive, make_controller
-from conftest import BOX, SPHERE, Bench, differences, look, obstacle, random_q, write_chain
+from conftest import BOX, CAPSULE, SPHERE, Bench, differences, look, moved, obstacle, random_q, write_chain
 from hypothesis import given, strategies
 from oracle import signed_distance, support
 
@@ -209,6 +209,32 @@ def test_half_spaces_are_never_culled(panda, monkeypatch):
             np.testing.assert_array_equal(found.pair, expected.pair)
             np.testing.assert_allclose(found.distance, expected.distance, atol=1e-12)
     assert "floor" in {scene.pair_names[pair][1] for pair in found.pair}
+
+
+@pytest.mark.parametrize("shape", [SPHERE, CAPSULE, BOX, CYLINDER, CONE, ELLIPSOID, FLOOR])
+def test_what_passes_close_by_is_known_not_to_come_nearer(panda, shape):
+    """Along the normals the bound is close enough to tell, where the fastest points of the bodies would not be."""
+    rng = np.random.default_rng(20)
+    scene = build_scene(panda, [obstacle("it", shape, (9.0, 0.0, 0.0))])
+    bench, told, close = Bench(scene), 0, 0
+    for _ in range(3000):
+        q, v = random_q(panda, rng), rng.uniform(-0.5, 0.5, 7)
+        sample = Sample.at(
+            rng.uniform([-0.5, -0.5, 0.0], [0.5, 0.5, 0.9]), pin.exp3(rng.uniform(-2, 2, 3)),
+            *(rng.choice([0.0, 0.3]) * rng.uniform(-1, 1, 3) for _ in range(2)),
+        )  # fmt: skip
+        bench.query.place_obstacle(0, sample)
+        proximity = bench.compute(q, reach=0.1)[0]
+        gap = proximity.distance.min(initial=np.inf) - Avoidance().hold
+        if not 0.0 < gap < 0.01:
+            continue
+        close += 1
+        least = bench.assembly.closest_call(v, len(proximity.pair), 0.1, 0.02)
+        told += least > 0.0
+        for t in (0.005, 0.01, 0.02):
+            found = look(scene, pin.integrate(panda.model, q, t * v), {0: moved(sample, t)}, 0.1)
+            assert found.distance.min(initial=0.1) - Avoidance().hold >= least - 1e-9
+    assert close > 10 and told > 0.1 * close
 
 
 @pytest.mark.parametrize("turning", [0.0, 0.8])

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from qpavoid.problem import Array, IntArray
+from qpavoid.problem import Array, IntArray, Mask
 
 
 class RowLayout(NamedTuple):
@@ -72,10 +72,20 @@ class RowLayout(NamedTuple):
     """(J,) distance from a joint's origin to the farthest point of a body that it carries [m]."""
     carriers: IntArray
     """(m, 2) what moves the two bodies of each pair: number of a joint, or J plus that of an obstacle."""
+    bodies: IntArray
+    """(m, 2) the two bodies of each pair."""
+    body_poses: Array
+    """(g, 12) world poses of all bodies: rotation by columns, then origin [m]."""
+    boxes: Array
+    """(g, 6) a box around each body, in its frame: centre and half its sizes [m]."""
+    convex: Mask
+    """(m,) whether both bodies are convex, and their distance stands for nothing else."""
     turning: Array
     """(chains, n) how many angles each coordinate turns among those that move the end of a chain of joints."""
     sliding: Array
     """(chains, n) the same for lengths."""
+    spins: Array
+    """(J, 3) out: angular velocity of each joint [rad/s]."""
     speeds: Array
     """(J + o,) largest speed of any point that a joint carries, which is overwritten, or of an obstacle [m/s]."""
     near: IntArray

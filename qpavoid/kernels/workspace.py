@@ -81,6 +81,7 @@ class Workspace:
         self.squares, self.by_kind = np.empty((2, joints)), np.repeat(np.eye(2), 3, axis=1)
         self.joints = joints
         self.joint_speeds = layout.speeds[:joints]
+        self.body_rotations = layout.body_poses[:, :9].reshape(-1, 3, 3)  # transposed
         # every joint has one coordinate and position limits: bounds are made in place, the lower and upper ones at once
         self.plain = np.array_equal(layout.q_index, np.arange(nv)) and np.array_equal(layout.v_index, np.arange(nv))
         self.q_limits = np.stack((layout.q_lower, layout.q_upper))

@@ -3,7 +3,7 @@
 Compiled code is cached on disk, so that only the first run after an installation waits for the compiler.
 """
 
-from qpavoid.kernels.compiled.ahead import closest_call, joint_speeds, tracking_clear
+from qpavoid.kernels.compiled.ahead import bends, closest_call, joint_speeds, tracking_clear
 from qpavoid.kernels.compiled.bounds import velocity_bounds
 from qpavoid.kernels.compiled.culling import candidates, in_one_alone
 from qpavoid.kernels.compiled.frames import damped_solution, frame_rows, projection_cost
@@ -16,6 +16,7 @@ from qpavoid.kernels.compiled.voxels import choose, within_reach
 
 __all__ = [
     "assemble",
+    "bends",
     "candidates",
     "choose",
     "closest_call",

@@ -25,7 +25,7 @@ def assemble(x: Any, q: Array, pairs: IntArray, reach: float, moving: bool) -> t
     k = distance_rows(x, pairs, reach, moving)
     row_bounds(x, k, moving)
     worst = tracking_shortfall(x, k)
-    clear = x.looks_ahead and worst <= 0.0 and tracking_clear(x, k, reach)
+    clear = x.looks_ahead and worst <= 0.0 and tracking_clear(x, q, k, reach)
     return k, worst, clear, room
 
 

@@ -3,7 +3,7 @@
 `qpavoid.kernels.compiled` has the same functions as loops for numba; both pass the same tests.
 """
 
-from qpavoid.kernels.vectorised.ahead import closest_call, joint_speeds, tracking_clear
+from qpavoid.kernels.vectorised.ahead import bends, closest_call, joint_speeds, tracking_clear
 from qpavoid.kernels.vectorised.bounds import velocity_bounds
 from qpavoid.kernels.vectorised.culling import candidates, in_one_alone
 from qpavoid.kernels.vectorised.frames import damped_solution, frame_rows, projection_cost
@@ -16,6 +16,7 @@ from qpavoid.kernels.vectorised.voxels import choose, within_reach
 
 __all__ = [
     "assemble",
+    "bends",
     "candidates",
     "choose",
     "closest_call",
