@@ -15,6 +15,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from time import perf_counter, perf_counter_ns
 from typing import Any
 
@@ -44,7 +45,12 @@ def main() -> None:
     ticks, timed = int(options.ticks), int(options.timed)
     if options.child:
         what, collector = options.child
-        print(json.dumps(_memory(ticks) if what == "memory" else _latency(timed, collector)))
+        work: dict[str, Callable[[], Any]] = {
+            "memory": lambda: _memory(ticks),
+            "start": _start,
+            "latency": lambda: _latency(timed, collector),
+        }
+        print(json.dumps(work[what]()))
         return
     load = os.getloadavg()[0]
     modes = {"numpy": "0", "numba": "1"}
@@ -56,14 +62,21 @@ def main() -> None:
     with ThreadPoolExecutor() as both:  # memory is the same on a busy machine
         found = both.map(lambda number: _child(options, number, "memory", "on"), modes.values())
         memory = dict(zip(modes, found, strict=True))
-    text = _report(latency, memory, ticks, (load, os.getloadavg()[0]))
+    with TemporaryDirectory() as empty:
+        cases = (("numpy", "0"), ("numba, nothing compiled yet", "1"), ("numba, compiled before", "1"))
+        start = {case: _child(options, number, "start", "on", empty) for case, number in cases}
+    text = _report(latency, memory, start, ticks, (load, os.getloadavg()[0]))
     (ROOT / "bench" / "results" / "endurance.md").write_text(text)
     print(text)
 
 
-def _child(options: argparse.Namespace, accelerated: str, what: str, collector: str) -> dict[str, Any]:
+def _child(
+    options: argparse.Namespace, accelerated: str, what: str, collector: str, cache: str | None = None
+) -> dict[str, Any]:
     command = [sys.executable, "-m", "bench.endurance", "--ticks", str(options.ticks), "--timed", str(options.timed)]
     environment = {**os.environ, "QPAVOID_NUMBA": accelerated, "OMP_NUM_THREADS": "1"}
+    if cache is not None:
+        environment["NUMBA_CACHE_DIR"] = cache
     done = subprocess.run(
         [*command, "--child", what, collector], cwd=ROOT, env=environment, capture_output=True, text=True, check=True
     )
@@ -74,7 +87,7 @@ def _child(options: argparse.Namespace, accelerated: str, what: str, collector: 
 # --- what runs -------------------------------------------------------------------------------------------------
 
 
-def _scenario() -> Any:
+def scenario(**avoidance: Any) -> Any:
     """A Panda follows a circle among obstacles, some of which circle as well; everything repeats after LAP ticks."""
     from qpavoid import ScenarioConfig
 
@@ -102,7 +115,7 @@ def _scenario() -> Any:
             "robot": "panda",
             "tasks": [{"frame": "panda_hand_tcp", "type": "pose", "motion": tool}],
             "obstacles": obstacles,
-            "avoidance": {"d1": 0.03, "d2": 0.10},
+            "avoidance": {"d1": 0.03, "d2": 0.10, **avoidance},
             "dt": DT,
             "duration": lap,
         }
@@ -115,7 +128,7 @@ class _Lap:
     def __init__(self) -> None:
         from qpavoid import Controller
 
-        self.controller, q = Controller.from_scenario(_scenario())
+        self.controller, q = Controller.from_scenario(scenario())
         self.t = [k * DT for k in range(LAP)]
         self.q, pairs, self.status = [], [], []
         for k in range(2 * LAP):  # the first lap gets into the swing of it
@@ -133,6 +146,20 @@ class _Lap:
         step, q, t = self.controller.step, self.q, self.t
         for k in range(ticks):
             step(q[k % LAP], t[k % LAP])
+
+
+def _start() -> dict[str, float]:
+    """How long a program waits for its first controller [s]."""
+    begin = perf_counter()
+    from qpavoid import Controller
+
+    imported = perf_counter()
+    controller, _ = Controller.from_scenario(scenario())
+    return {
+        "import": imported - begin,
+        "made": perf_counter() - imported - controller.warm_up_time,
+        "warm": controller.warm_up_time,
+    }
 
 
 def _latency(ticks: int, collector: str) -> dict[str, Any]:
@@ -246,7 +273,7 @@ def _quantiles(ns: Any) -> list[float]:
 # --- the report ------------------------------------------------------------------------------------------------
 
 
-def _report(latency: Any, memory: Any, ticks: int, load: tuple[float, float]) -> str:
+def _report(latency: Any, memory: Any, start: Any, ticks: int, load: tuple[float, float]) -> str:
     any_ = next(iter(latency.values()))
     rows = np.array(any_["rows"])
     timed = any_["ticks"]
@@ -311,6 +338,14 @@ def _report(latency: Any, memory: Any, ticks: int, load: tuple[float, float]) ->
             f"| {mode} | {rss[0]:.1f} | {rss[half]:.1f} | {rss[-1]:.1f} | {slope:.3f} | {r['traced_ticks']:,} | "
             f"{after - before:+,} | {peak - after:,} |"
         )
+    lines += [
+        "",
+        "## Until the first tick [s]",
+        "",
+        "| | import | robot and scene | warm-up of the controller |",
+        "|---|---:|---:|---:|",
+        *(f"| {case} | {r['import']:.2f} | {r['made']:.2f} | {r['warm']:.2f} |" for case, r in start.items()),
+    ]
     return "\n".join(lines) + "\n"
 
 

@@ -32,7 +32,7 @@ def main() -> None:
     parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.child:
-        print(json.dumps(measure(options.rounds)))
+        print(json.dumps({**measure(options.rounds), "without": foresight(), "with": foresight(escape={})}))
         return
     load = os.getloadavg()[0]
     found = {mode: _child(options.rounds, number) for mode, number in MODES.items()}
@@ -56,6 +56,19 @@ def main() -> None:
         if name in found["numpy"]:
             cells = [_cell(found[mode][name], found[mode]["moving, 0"], count) for mode in MODES]
             lines.append(f"| {count} of {OBSTACLES} {kind} | {' | '.join(cells)} |")
+    lines += [
+        "",
+        "## Foresight",
+        "",
+        "The scenario of `bench.endurance`, in closed loop: a Panda follows a circle among 50 obstacles, 10 of them on "
+        "circles. With `avoidance: {escape: {}}`, flights are flown where what moves may come near [µs].",
+        "",
+        "| | p50 | p99 | worst | flights a tick | time of a flight |",
+        "|---|---:|---:|---:|---:|---:|",
+    ]
+    for name, mode in ((name, mode) for name in ("without", "with") for mode in MODES):
+        p50, p99, worst, flights, each = found[mode][name]
+        lines.append(f"| {name}, {mode} | {p50:.0f} | {p99:.0f} | {worst:.0f} | {flights:.2f} | {each:.0f} |")
     text = "\n".join(lines) + "\n"
     RESULTS.write_text(text)
     print(text)
@@ -65,11 +78,11 @@ def _cell(time: float, still: float, count: int) -> str:
     return f"{time:.1f}" if not count else f"{time:.1f} ({(time - still) / count:.2f})"
 
 
-def _child(rounds: int, accelerated: str) -> dict[str, float]:
+def _child(rounds: int, accelerated: str) -> dict[str, Any]:
     command = [sys.executable, "-m", "bench.moving", "--rounds", str(rounds), "--child"]
     environment = {**os.environ, "QPAVOID_NUMBA": accelerated, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
-    answer: dict[str, float] = json.loads(done.stdout)
+    answer: dict[str, Any] = json.loads(done.stdout)
     return answer
 
 
@@ -84,6 +97,35 @@ def measure(rounds: int) -> dict[str, float]:
                 step((turn + k) * DT)
             samples[name].append(perf_counter_ns() - begin)
     return {name: 1e-3 * float(np.median(ns)) / BATCH for name, ns in samples.items()}
+
+
+def foresight(**avoidance: Any) -> tuple[float, ...]:
+    """p50, p99 and worst of a lap's ticks in closed loop [µs]; flights a tick, and the time of one [µs]."""
+    import pinocchio as pin
+
+    from bench.endurance import LAP, scenario
+    from qpavoid import Controller
+
+    controller, q = Controller.from_scenario(scenario(**avoidance))
+    ticks, flights = [], []
+    escape = controller._commander.escape
+    if escape is not None:
+        fly = escape.flights.fly
+
+        def timed(*args: Any) -> Any:
+            begin = perf_counter_ns()
+            flight = fly(*args)
+            flights.append(1e-3 * (perf_counter_ns() - begin))
+            return flight
+
+        escape.flights.fly = timed  # type: ignore[method-assign]
+    for k in range(LAP):
+        begin = perf_counter_ns()
+        v = controller.step(q, k * DT).v
+        ticks.append(1e-3 * (perf_counter_ns() - begin))
+        q = pin.integrate(controller.scene.robot.model, q, DT * v)
+    each = float(np.median(flights)) if flights else 0.0
+    return *(float(p) for p in np.percentile(ticks, [50, 99, 100])), len(flights) / LAP, each
 
 
 def _kinds() -> Any:

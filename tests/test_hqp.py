@@ -133,6 +133,23 @@ def test_contradicting_rows_give_way_as_those_of_the_qp():
     assert relaxed >= 5
 
 
+def test_a_level_that_no_back_end_can_solve_is_named_and_the_levels_before_it_hold(monkeypatch):
+    problem = random_problem(0, bound=0.6, k=3)
+    solver, first = Hqp(HqpSolver(regularization=SMALL)), Hqp(HqpSolver(regularization=SMALL))
+    expected = first.solve(problem._replace(levels=problem.levels[:1]))
+    solve, calls = solver._solve, []
+
+    def fails_at_the_second(*args):
+        calls.append(args)
+        return None if len(calls) == 2 else solve(*args)
+
+    monkeypatch.setattr(solver, "_solve", fails_at_the_second)
+    solution = solver.solve(problem)
+    assert solution.status is Status.RELAXED
+    assert solution.reasons == ("priority level 2: no back end could solve its QP",)
+    assert costs(problem, solution.v)[0] == pytest.approx(costs(problem, expected.v)[0], abs=1e-5)
+
+
 def test_what_is_not_finite_stops_the_robot():
     problem = random_problem(0, k=2)
     J = problem.avoidance.J.copy()

@@ -34,7 +34,7 @@ class Hqp(Qp):
     last level stays as near to v̂ as it can. Contacts are held by the basis of the first level.
 
     Where no velocity meets the inequalities, they give way as those of `qp` do, and the cascade goes on within what is
-    left of them. Levels whose QP the back end and daqp fail to solve are left as the ones before them have them.
+    left of them. A level whose QP the back end and daqp fail to solve is left as the ones before it have it, and named.
     """
 
     def solve(self, problem: Problem) -> Solution:
@@ -48,26 +48,29 @@ class Hqp(Qp):
             return Solution(alone)
         if not np.isfinite(alone).all():
             alone = np.zeros_like(alone)
-        v = self._levels(problem, asked, alone, rows.b, lower, upper)
+        v, unsolved = self._levels(problem, asked, alone, rows.b, lower, upper)
         if v is not None:
-            return Solution(v)
+            return Solution(v).relaxed(*unsolved) if unsolved else Solution(v)
         P, q = kernels.projection_cost(problem.tracking.A, 1e-3, alone)
         relaxed = self._give_way(P, q, problem)
         if isinstance(relaxed, Solution):
             return relaxed
         lower, upper = np.minimum(lower, relaxed.v), np.maximum(upper, relaxed.v)
-        v = self._levels(problem, asked, alone, rows.b - relaxed.slack, lower, upper)
+        v, unsolved = self._levels(problem, asked, alone, rows.b - relaxed.slack, lower, upper)
         relaxed = relaxed if v is None else relaxed._replace(v=v)
         slack = relaxed.slack if relaxed.slack.any() else None
-        return Solution(relaxed.v, Status.RELAXED, what_gave_way(relaxed, problem), slack)
+        return Solution(relaxed.v, Status.RELAXED, (*what_gave_way(relaxed, problem), *unsolved), slack)
 
     def _levels(
         self, problem: Problem, asked: Levels, alone: Array, least: Array, lower: Array, upper: Array
-    ) -> Array | None:
-        """The cascade within J v >= least and the bounds (nv,); None where its first level has no solution."""
+    ) -> tuple[Array | None, tuple[str, ...]]:
+        """The cascade within J v >= least and the bounds (nv,), and which levels could not be solved.
+
+        None where its first level has no solution.
+        """
         J, (Z, v) = problem.avoidance.J, _start(problem)
-        met = False
-        for A, b in (*asked, (np.eye(len(v)), alone)):
+        met, unsolved = False, list[str]()
+        for level, (A, b) in enumerate((*asked, (np.eye(len(v)), alone))):
             P = A.T @ A
             P.ravel()[:: len(P) + 1] += self.config.regularization
             q = -(A.T @ b + self.config.regularization * alone)
@@ -76,11 +79,13 @@ class Hqp(Qp):
             if better is not None:
                 v, met = better, True
             elif not met:
-                return None
+                return None, ()
+            elif level < len(asked):
+                unsolved.append(f"priority level {level + 1}: no back end could solve its QP")
             Z = Z @ _free(A @ Z)
             if not Z.shape[1]:
                 break
-        return np.clip(v, lower, upper)
+        return np.clip(v, lower, upper), tuple(unsolved)
 
     def _solve(
         self, Z: Array, v: Array, P: Array, q: Array, J: Array, least: Array, lower: Array, upper: Array, met: bool
