@@ -15,12 +15,13 @@ import pinocchio as pin
 from qpavoid.bodies import MeshWarning, check_meshes, convert_bodies, make_shape, triangle_meshes
 from qpavoid.config import Body, Hull, RobotConfig
 from qpavoid.errors import ConfigError, UnknownName
-from qpavoid.kinematics import MIMIC, TRANSLATIONS
+from qpavoid.joints import frame_index, joint_bounds, middle, set_joints, set_limits, without
+from qpavoid.kinematics import TRANSLATIONS
 from qpavoid.limits import JointBounds
 from qpavoid.loading import find_robot, nearest, read_config, validate
 from qpavoid.motion import rpy_to_matrix
-from qpavoid.pairs import add_self_pairs, drop_always_touching, pair_array
-from qpavoid.problem import Array, IntArray
+from qpavoid.pairs import add_self_pairs, drop_always_touching
+from qpavoid.problem import Array
 from qpavoid.urdf import find_resource, honour_srdf, read_collision, read_model, read_pieces
 
 
@@ -139,7 +140,7 @@ class Robot:
             ConfigError, UnknownName: wrong number of values, unknown joint.
         """
         if isinstance(values, Mapping):
-            return _set_joints(self.model, self.home, values, where)
+            return set_joints(self.model, self.home, values, where)
         if len(values) != self.model.nq:
             raise ConfigError(
                 f"{where}: {len(values)} values for {self.model.nq} coordinates; the order is "
@@ -175,7 +176,7 @@ class Robot:
         locked = self.matching(patterns, where)
         if not locked:
             return self, q
-        model, bodies, index = _reduce(self.model, self.bodies, locked, q, where)
+        model, bodies, index = without(self.model, self.bodies, locked, q, where)
         return replace(self, model=model, bodies=bodies, home=self.home[index]), q[index]
 
     def matching(self, patterns: Sequence[str], where: str) -> list[str]:
@@ -194,42 +195,6 @@ class Robot:
 
     def _joints(self) -> Iterator[tuple[str, Any]]:
         return zip(self.joint_names, list(self.model.joints)[1:], strict=True)
-
-
-def frame_index(model: Any, name: str) -> int:
-    """Index of an existing frame; that of the link where a joint has the same name."""
-    return int(model.getFrameId(name, pin.BODY) if model.existFrame(name, pin.BODY) else model.getFrameId(name))
-
-
-_ABSURD = 1e9
-"""Speed [rad/s or m/s] or position [rad or m] from which a limit is a way of saying that there is none."""
-
-
-def joint_bounds(model: Any) -> JointBounds:
-    """Joint limits of a model in tangent space; a URDF says nothing of accelerations and jerks.
-
-    Only joints with one coordinate in q and v have position limits. A velocity limit of 0, and a range from 0 to 0,
-    mean that the URDF gives none.
-    """
-    lower, upper = np.array(model.lowerPositionLimit), np.array(model.upperPositionLimit)
-    lower[lower <= -_ABSURD], upper[upper >= _ABSURD] = -np.inf, np.inf
-    q_index, v_index = [], []
-    for joint in list(model.joints)[1:]:
-        low, high = lower[joint.idx_q], upper[joint.idx_q]
-        if joint.nq == joint.nv == 1 and np.isfinite([low, high]).any() and low < high:
-            q_index.append(joint.idx_q)
-            v_index.append(joint.idx_v)
-    q_indices = np.array(q_index, dtype=np.intp)
-    velocity = np.array(model.velocityLimit)
-    return JointBounds(
-        velocity=np.where((velocity > 0.0) & (velocity < _ABSURD), velocity, np.inf),
-        q_index=q_indices,
-        v_index=np.array(v_index, dtype=np.intp),
-        lower=lower[q_indices],
-        upper=upper[q_indices],
-        acceleration=np.full(model.nv, np.inf),
-        jerk=np.full(model.nv, np.inf),
-    )
 
 
 _MOST_BODIES = 300
@@ -255,11 +220,11 @@ def _build(config: RobotConfig, path: Path) -> Robot:
             MeshWarning,
             stacklevel=4,
         )
-    _apply_limits(config, model, path)
-    home = _set_joints(model, middle(model), config.home, f"{path}: home")
-    home = _set_joints(model, home, config.lock, f"{path}: lock")
+    set_limits(model, config.limits, path)
+    home = set_joints(model, middle(model), config.home, f"{path}: home")
+    home = set_joints(model, home, config.lock, f"{path}: lock")
     if config.lock:
-        model, bodies, index = _reduce(model, bodies, list(config.lock), home, f"{path}: lock")
+        model, bodies, index = without(model, bodies, list(config.lock), home, f"{path}: lock")
         home = home[index]
     if model.nv == 0:
         raise ConfigError(f"{path}: no joint of {urdf.name} moves; give at least one that is neither fixed nor locked")
@@ -328,87 +293,3 @@ def _listed_bodies(configs: Sequence[Body], model: Any, hulls: Mapping[str, Any]
 def _in_link(body: Any, model: Any) -> Any:
     """Placement of a body in the frame of its link."""
     return model.frames[body.parentFrame].placement.actInv(body.placement)
-
-
-def _apply_limits(config: RobotConfig, model: Any, path: Path) -> None:
-    lower, upper = np.array(model.lowerPositionLimit), np.array(model.upperPositionLimit)
-    velocity = np.array(model.velocityLimit)
-    for kind in ("position", "velocity", "acceleration", "jerk"):
-        for name in getattr(config.limits, kind):
-            if _joint(model, name, f"{path}: limits.{kind}").shortname() == MIMIC:
-                raise ConfigError(f"{path}: limits.{kind}: {_follows(model, name)}; limit that one")
-    for name, (low, high) in config.limits.position.items():
-        joint = _joint(model, name, f"{path}: limits.position")
-        if joint.nq != 1:
-            raise ConfigError(f"{path}: limits.position: joint {name!r} turns all the way round; leave it out")
-        lower[joint.idx_q], upper[joint.idx_q] = low, high
-    for name, speed in config.limits.velocity.items():
-        joint = _joint(model, name, f"{path}: limits.velocity")
-        velocity[joint.idx_v : joint.idx_v + joint.nv] = speed
-    model.lowerPositionLimit, model.upperPositionLimit, model.velocityLimit = lower, upper, velocity
-
-
-def _joint(model: Any, name: str, where: str) -> Any:
-    if not model.existJointName(name):
-        names = list(model.names)[1:]
-        raise UnknownName(f"{where}: no joint {name!r}{nearest(name, names)}")
-    return model.joints[model.getJointId(name)]
-
-
-def middle(model: Any) -> Array:
-    """Neutral configuration (nq,), with bounded joints at the middle of their range where 0 is outside it."""
-    q = pin.neutral(model)
-    for joint in list(model.joints)[1:]:
-        lower, upper = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
-        if joint.nq == 1 and not lower <= q[joint.idx_q] <= upper:
-            q[joint.idx_q] = 0.5 * (lower + upper)
-    return np.asarray(q)
-
-
-def _set_joints(model: Any, q: Array, values: Mapping[str, float], where: str) -> Array:
-    q = q.copy()
-    mimics = [name for name in values if _joint(model, name, where).shortname() == MIMIC]
-    for name, value in values.items():
-        joint = model.joints[model.getJointId(name)]
-        if name in mimics:
-            continue
-        if joint.nq == 1:
-            q[joint.idx_q] = value
-        elif joint.nq == 2 and joint.nv == 1:
-            q[joint.idx_q : joint.idx_q + 2] = np.cos(value), np.sin(value)
-        else:
-            raise ConfigError(f"{where}: joint {name!r} has {joint.nq} coordinates; give q0 as a list of all of q")
-    for name in mimics:
-        joint = model.joints[model.getJointId(name)]
-        there = joint.extract().scaling * q[joint.idx_q] + joint.extract().offset
-        if abs(values[name] - there) > _SAME:
-            raise ConfigError(f"{where}: {_follows(model, name)}, to {there:g} and not {values[name]:g}; leave it out")
-    return q
-
-
-_SAME = 1e-6
-"""How far a joint may be given from where the one that it mimics takes it [rad or m]."""
-
-
-def _follows(model: Any, name: str) -> str:
-    mimicking, mimicked = list(model.mimicking_joints), list(model.mimicked_joints)
-    leader = mimicked[mimicking.index(model.getJointId(name))]
-    return f"joint {name!r} follows {model.names[leader]!r} (mimic)"
-
-
-def _reduce(model: Any, bodies: Any, locked: Sequence[str], q: Array, where: str) -> tuple[Any, Any, IntArray]:
-    """Model and bodies without the locked joints, and which coordinates of q are left."""
-    ids = [_joint(model, name, where).id for name in locked]
-    for joint, leader in zip(list(model.mimicking_joints), list(model.mimicked_joints), strict=True):
-        if leader in ids and joint not in ids:
-            ids.append(joint)
-        elif joint in ids and leader not in ids:
-            raise ConfigError(f"{where}: {_follows(model, model.names[joint])}; lock that one")
-    kept = [joint for joint in list(model.joints)[1:] if joint.id not in ids]
-    index = np.array([i for joint in kept for i in range(joint.idx_q, joint.idx_q + joint.nq)], dtype=np.intp)
-    model, bodies = pin.buildReducedModel(model, bodies, ids, q)
-    joints = [body.parentJoint for body in bodies.geometryObjects]
-    for a, b in pair_array(bodies).tolist():
-        if joints[a] == joints[b]:
-            bodies.removeCollisionPair(pin.CollisionPair(a, b))
-    return model, bodies, index

@@ -20,9 +20,10 @@ from qpavoid.describe.findings import Joint, Problem, Report
 from qpavoid.describe.poses import mimics
 from qpavoid.describe.sampling import Space, touching
 from qpavoid.errors import ConfigError, QpavoidError
+from qpavoid.joints import frame_index
 from qpavoid.kinematics import MIMIC
 from qpavoid.loading import find_robot, read_config
-from qpavoid.robot import Robot, frame_index
+from qpavoid.robot import Robot
 from qpavoid.safe_xml import read_robot_xml
 from qpavoid.scene import build_scene
 from qpavoid.tasks import build_tasks

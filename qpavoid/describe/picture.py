@@ -20,9 +20,9 @@ from qpavoid.describe.add import Described
 from qpavoid.describe.fit import triangles
 from qpavoid.describe.texts import volume_line
 from qpavoid.describe.written import BLANK, seal
+from qpavoid.joints import frame_index
 from qpavoid.plot_motion import normals, shade, shape_faces, towards_viewer
 from qpavoid.problem import Array
-from qpavoid.robot import frame_index
 
 _VIEWS = ((15.0, -50.0), (15.0, 130.0))
 """Elevation and azimuth [deg]."""

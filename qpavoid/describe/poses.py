@@ -13,10 +13,11 @@ import numpy as np
 
 from qpavoid.describe.srdf import Semantics
 from qpavoid.errors import ConfigError, UnknownName
+from qpavoid.joints import middle
 from qpavoid.kinematics import MIMIC
 from qpavoid.loading import nearest
 from qpavoid.problem import Array
-from qpavoid.robot import Robot, middle
+from qpavoid.robot import Robot
 from qpavoid.safe_xml import read_robot_xml
 from qpavoid.urdf import is_mjcf
 
