@@ -1,4 +1,4 @@
-"""Command line: `qpavoid list | run | compare | robot | bench`.
+"""Command line: `qpavoid list | run | compare | fields | robot | bench`.
 
 Exit status: 0 done, 1 a run ended in a defined failure (collision, safe stop, broken off), 2 bad input.
 """
@@ -9,6 +9,7 @@ import sys
 import warnings
 from enum import Enum
 from functools import partial
+from json import dumps
 from pathlib import Path
 from textwrap import wrap
 from typing import Annotated, Any
@@ -18,10 +19,11 @@ from rich.markup import escape
 from rich.progress import Progress, TaskID
 
 from qpavoid.arena import commands as bench_commands
-from qpavoid.config import ScenarioConfig
+from qpavoid.config import RobotConfig, ScenarioConfig
 from qpavoid.controller import Controller
 from qpavoid.describe import commands as robot_commands
 from qpavoid.errors import ConfigError, QpavoidError
+from qpavoid.fields import page, schema_of
 from qpavoid.kernels import ACCELERATED
 from qpavoid.loading import load_scenario, robot_names, scenario_names
 from qpavoid.log import Log
@@ -113,6 +115,25 @@ def compare(
     metrics = [log.metrics() for log in logs]
     _print(metrics, files, {"runs": metrics, "files": [str(f) for f in files]} if json else None)
     raise typer.Exit(0 if all(run["completed"] for run in metrics) and len(logs) == len(configs) else 1)
+
+
+class Schema(str, Enum):
+    """Files that have a schema."""
+
+    scenario = "scenario"
+    robot = "robot"
+
+
+@app.command("fields")
+def fields_(
+    schema: Annotated[Schema | None, typer.Option(help="Print the JSON Schema of such a file, for an editor.")] = None,
+) -> None:
+    """Print every field that a scenario and a robot.yaml may have, with units and defaults, as Markdown."""
+    if schema is None:
+        print(page())
+    else:
+        root = ScenarioConfig if schema is Schema.scenario else RobotConfig
+        print(dumps(schema_of(root), indent=2))
 
 
 def _run_all(configs: list[ScenarioConfig], out: Path) -> tuple[list[Log], list[Path]]:

@@ -96,10 +96,8 @@ def expand_solver(value: Any) -> Any:
     return {"name": name, "backend": backend} if backend else {"name": name}
 
 
-SolverConfig = Annotated[
-    Annotated[
-        TrackingSolver | Eq10Solver | GradientProjectionSolver | PotentialFieldSolver | QpSolver | HqpSolver,
-        Field(discriminator="name"),
-    ],
-    BeforeValidator(expand_solver),
+_Solver = Annotated[
+    TrackingSolver | Eq10Solver | GradientProjectionSolver | PotentialFieldSolver | QpSolver | HqpSolver,
+    Field(discriminator="name"),
 ]
+SolverConfig = Annotated[_Solver, BeforeValidator(expand_solver, json_schema_input_type=str | _Solver)]
