@@ -351,6 +351,11 @@ class Assembly:
         """Velocity (nv,) at which the robot moves until this tick."""
         return self._layout.v_last
 
+    @property
+    def w_last(self) -> Array:
+        """By how much that changed in the tick before (nv,); 0 where jerks have no limits."""
+        return self._layout.w_last
+
     def _view(self, k: int) -> tuple[Proximity, AvoidanceRows]:
         x = self._layout
         near = x.near[:k]

@@ -159,7 +159,7 @@ class Commander:
     def _with_a_way_out(
         self, escape: EscapePlanner, q: Array, t: float, proximity: Proximity, problem: Problem, solution: Solution
     ) -> Solution:
-        v = escape.check(q, solution.v, t, self._assembly.v_last, proximity)
+        v = escape.check(q, solution.v, t, self._assembly.v_last, self._assembly.w_last, proximity)
         if v is None:
             return solution
         reason = "the tasks: no way out would be left among the obstacles that move"

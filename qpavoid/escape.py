@@ -80,7 +80,7 @@ class EscapePlanner:
         if self._kept is not None:
             self._kept = self._kept._replace(until=-np.inf)
 
-    def check(self, q: Array, v: Array, t: float, v_last: Array, proximity: Proximity) -> Array | None:
+    def check(self, q: Array, v: Array, t: float, v_last: Array, w_last: Array, proximity: Proximity) -> Array | None:
         """None where v may be commanded, else what to command in its place (nv,).
 
         Args:
@@ -88,6 +88,7 @@ class EscapePlanner:
             v: what the law and the look ahead want (nv,).
             t: now [s].
             v_last: velocity (nv,) at which the robot moves.
+            w_last: by how much that changed in the tick before (nv,).
             proximity: distances of this tick; pairs that touch already are left out of account.
         """
         if not len(self._obstacles.moving):
@@ -95,13 +96,13 @@ class EscapePlanner:
         self.flights.forget_foreseen()
         watched = self._parted.copy()
         watched[proximity.pair[proximity.distance < TOUCH]] = False
-        next_tick = Start(pin.integrate(self._model, q, self._dt * v), v, t + self._dt, watched)
+        next_tick = Start(pin.integrate(self._model, q, self._dt * v), v, v - v_last, t + self._dt, watched)
         if self._nobody_comes(next_tick):
             self._kept = None
             return None
         onward = self._best(self._onward(next_tick))
         if onward.value < self.flights.enough:
-            kept, left = self._way_out(Start(q, v_last.copy(), t, watched))
+            kept, left = self._way_out(Start(q, v_last.copy(), w_last.copy(), t, watched))
             onward = self._best((self.flights.fly(next_tick, self._drawn()) for _ in range(left)), onward)
             if not self._as_good(onward.value, kept.value) and kept.v:
                 self._kept = self.flights.a_tick_on(kept)

@@ -10,6 +10,7 @@ This is greedy, and runs into dead ends; which v̂ leads out of one cannot be to
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +23,7 @@ from qpavoid.kinematics import ForwardKinematics, longest_lever
 from qpavoid.limits import JointBounds
 from qpavoid.problem import Array, Mask
 from qpavoid.proximity import DistanceQuery
+from qpavoid.ramps import Ramps
 from qpavoid.scene import Scene
 from qpavoid.sensing import Obstacles, Seen
 from qpavoid.solvers.backends import solve_daqp
@@ -69,6 +71,8 @@ class Start(NamedTuple):
     """(nq,)."""
     v: Array
     """(nv,) velocity that has led there."""
+    w: Array
+    """(nv,) by how much that changed in the tick before."""
     t: float
     """[s]."""
     watched: Mask
@@ -118,8 +122,12 @@ class Flights:
         self.period = self._ticks * dt
         """Time between two decisions [s]."""
         self.kinematics, self.query = ForwardKinematics(model), DistanceQuery(scene)
-        self._assembly = Assembly(scene, (), bounds, self.kinematics, self.query, avoidance, limits, 0.01, self.period)
-        self._step, self._accelerated = bounds.acceleration * dt, bool(np.isfinite(bounds.acceleration).any())
+        free = replace(
+            bounds, jerk=np.full(model.nv, np.inf)
+        )  # what is wanted may be farther than jerks get in a period
+        self._assembly = Assembly(scene, (), free, self.kinematics, self.query, avoidance, limits, 0.01, self.period)
+        self.ramps = Ramps(bounds, dt)
+        """How it gets from one velocity to another."""
         self.lever = max(1.0, longest_lever(model, self.query.longest_reach()))
         """Farther than this no point of the robot moves when a joint moves by 1 [m/rad, 1]."""
         self.enough = Value(settings.horizon, settings.safe * (avoidance.hold - avoidance.offset))
@@ -141,8 +149,8 @@ class Flights:
 
     def a_tick_on(self, flight: Flight) -> Flight:
         """What is left of a flight after a tick."""
-        (q, _, t, watched), v = flight.start, flight.v[0]
-        begun = Start(pin.integrate(self._model, q, self._dt * v), v, t + self._dt, watched)
+        (q, before, _, t, watched), v = flight.start, flight.v[0]
+        begun = Start(pin.integrate(self._model, q, self._dt * v), v, v - before, t + self._dt, watched)
         return flight._replace(start=begun, v=flight.v[1:])
 
     def holds_from(self, flight: Flight, start: Start) -> bool:
@@ -155,11 +163,12 @@ class Flights:
             return False
         if abs(start.t - flight.start.t) > 1e-6 or not np.array_equal(flight.start.watched, start.watched):
             return False
-        off, v = pin.difference(self._model, flight.start.q, start.q), start.v
+        off, v, w = pin.difference(self._model, flight.start.q, start.q), start.v, start.w
         most = float(np.abs(off).sum())
-        if self._accelerated:
+        if self.ramps.accelerated:
             for wanted in flight.v:
-                (v,) = self._towards(v, [wanted])
+                before, (v,) = v, self.ramps.towards(v, w, [wanted])
+                w = v - before
                 off += self._dt * (v - wanted)
                 most = max(most, float(np.abs(off).sum()))
                 if np.array_equal(v, wanted):
@@ -177,7 +186,7 @@ class Flights:
             manner: how it flees.
             given: velocities (nv,) of the first ticks, for as many decisions as they suffice; it flees from then on.
         """
-        q, v, t, watched = start
+        q, v, w, t, watched = start
         horizon, safe = self.enough
         end, plan = t + horizon + _BEYOND, list[Array]()
         near = self._look(q, t, v, watched)
@@ -185,9 +194,10 @@ class Flights:
         count = self._ticks - round(t / self._dt) % self._ticks
         while here >= TOUCH and t < end - 1e-9:
             wanted = given[len(plan) : len(plan) + count]
-            if len(wanted) < count:
+            held = len(wanted) < count
+            if held:
                 wanted = [self._flee(near, manner)] * count
-            steps = self._towards(v, wanted)
+            steps = self.ramps.towards(v, w, wanted, held)
             ahead, span, before = self._moved(q, steps), count * self._dt, here
             rate = near.J @ steps[len(steps) // 2] + near.drift
             if (near.distance + span * rate < safe).any():
@@ -200,6 +210,7 @@ class Flights:
                 near = self._look(ahead, t, steps[-1], watched)
                 here = near.least
             plan += steps
+            w = steps[-1] - (steps[-2] if len(steps) > 1 else v)
             q, v, count = ahead, steps[-1], self._ticks
         if here >= TOUCH:
             least = min(least, here)
@@ -215,16 +226,6 @@ class Flights:
         for step in steps:
             q = pin.integrate(self._model, q, self._dt * step)
         return q
-
-    def _towards(self, v: Array, wanted: Sequence[Array]) -> Sequence[Array]:
-        """The velocities of some ticks: from v, as close to the wanted ones (nv,) as accelerations allow."""
-        if not self._accelerated:
-            return wanted
-        ramp = []
-        for target in wanted:
-            v = v + np.minimum(np.maximum(target - v, -self._step), self._step)
-            ramp.append(v)
-        return ramp
 
     def _look(self, q: Array, t: float, v: Array, watched: Mask) -> Near:
         """What is near at q (nq,), reached with v (nv,), with the obstacles where they will be at t [s]."""
