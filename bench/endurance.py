@@ -23,8 +23,6 @@ import numpy as np
 import numpy.typing as npt
 import pinocchio as pin
 
-from qpavoid.machine import cpu
-
 ROOT = Path(__file__).parent.parent
 LAP = 1000
 DT = 0.01
@@ -342,7 +340,7 @@ def _report(latency: Any, memory: Any, start: Any, ticks: int, load: tuple[float
         "",
         "## Until the first tick [s]",
         "",
-        "| | import | robot and scene | warm-up of the controller |",
+        "| | import | robot and scene | making the controller, which warms up |",
         "|---|---:|---:|---:|",
         *(f"| {case} | {r['import']:.2f} | {r['made']:.2f} | {r['warm']:.2f} |" for case, r in start.items()),
     ]
@@ -350,6 +348,8 @@ def _report(latency: Any, memory: Any, start: Any, ticks: int, load: tuple[float
 
 
 def _machine() -> str:
+    from qpavoid.machine import cpu
+
     return (
         f"{cpu()}, {os.cpu_count()} CPUs, {platform.system()}, Python "
         f"{platform.python_version()}, numpy {np.__version__}, pin {pin.__version__}; one thread"

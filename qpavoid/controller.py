@@ -96,6 +96,7 @@ class Controller:
             UnknownName, SolverNotInstalled: of the solver.
             ConfigError: dt is no period; there are contacts, and the solver is one that does not hold them.
         """
+        begin = perf_counter()
         if not 0.0 < dt <= _LONGEST:
             raise ConfigError(f"dt: {dt} s, expected more than 0 and at most {_LONGEST}; it is in seconds")
         frames, others = in_order(tasks)
@@ -132,17 +133,17 @@ class Controller:
         hold = self.avoidance.hold - self.avoidance.offset
         self._grasps = Grasps(scene, (self._query, *self._commander.queries), self._assembly, hold)
         self._warm_up()
+        self.warm_up_time = perf_counter() - begin
+        """Time that it took to lay out the memory and run the first ticks, compilation included [s]; no later tick
+        waits for the compiler."""
+        _log.info("warmed up in %.3f s, compiled kernels: %s", self.warm_up_time, kernels.ACCELERATED)
 
     def _warm_up(self) -> None:
-        begin = perf_counter()
         q, v = self.scene.robot.home, np.zeros(self._v_shape)
         self.tick(q)
         self.filter(q, v)
         self._assembly.closest_call(v, 0, self._reach, self.dt)
         self.reset()
-        self.warm_up_time = perf_counter() - begin
-        """Time that the first tick took, compilation included [s]; no later one waits for the compiler."""
-        _log.info("warmed up in %.3f s, compiled kernels: %s", self.warm_up_time, kernels.ACCELERATED)
 
     @classmethod
     def from_scenario(cls, scenario: ScenarioConfig) -> tuple[Controller, Array]:

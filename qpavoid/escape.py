@@ -73,7 +73,7 @@ class EscapePlanner:
     def reset(self) -> None:
         """Forgets the flight that was kept; what is drawn from now on is drawn again after the next reset."""
         self._kept: Flight | None = None
-        self._random = np.random.default_rng(0)
+        self._random, self._untried = np.random.default_rng(0), list[float]()
 
     def look_anew(self) -> None:
         """What the robot carries, or what may touch, has changed: the flight that is kept has to be flown anew."""
@@ -108,6 +108,8 @@ class EscapePlanner:
                 self._kept = self.flights.a_tick_on(kept)
                 return None if np.array_equal(kept.v[0], v) else kept.v[0]
         self._kept = onward
+        if onward.value >= self.flights.enough:
+            self._untried = list(_HORIZONS)
         return None
 
     def _nobody_comes(self, start: Start) -> bool:
@@ -167,7 +169,9 @@ class EscapePlanner:
         return best, attempts
 
     def _drawn(self) -> Manner:
-        """Some manner or other."""
+        """A manner: where trouble begins, each of those that lean to no side once; then some one or other."""
+        if self._untried:
+            return Manner(self._untried.pop(0), self.flights.still.leaning)
         random = self._random
         h = _HORIZONS[random.integers(len(_HORIZONS))]
         if random.random() < _STRAIGHT:
