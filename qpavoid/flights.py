@@ -21,7 +21,7 @@ from qpavoid.assembly import Assembly
 from qpavoid.config import Avoidance, Escape, Limits
 from qpavoid.kinematics import ForwardKinematics, longest_lever
 from qpavoid.limits import JointBounds
-from qpavoid.problem import Array, Mask
+from qpavoid.problem import Array, IntArray, Mask
 from qpavoid.proximity import DistanceQuery
 from qpavoid.ramps import Ramps
 from qpavoid.scene import Scene
@@ -50,8 +50,10 @@ class Manner(NamedTuple):
 class Near(NamedTuple):
     """What a flight looks at; in memory that the next look overwrites."""
 
+    pair: IntArray
+    """(k,) numbers of the watched pairs within reach."""
     distance: Array
-    """(k,) of the watched pairs within reach [m]."""
+    """(k,) of these [m]."""
     J: Array
     """(k, nv) velocity Jacobian of these distances."""
     drift: Array
@@ -83,9 +85,12 @@ class Value(NamedTuple):
     """How good a flight is, the larger the better."""
 
     clear: float
-    """Time until something touches, up to the horizon of the foresight [s]."""
+    """The horizon of the foresight, less what is left of it, for each pair that touches, when that first does [s].
+
+    Of a pair that touches in every flight, nothing more is lost by keeping the others apart.
+    """
     distance: float
-    """Smallest distance until then, up to what counts as safe [m]."""
+    """Smallest distance of pairs that do not touch, up to what counts as safe [m]."""
 
 
 class Flight(NamedTuple):
@@ -99,7 +104,32 @@ class Flight(NamedTuple):
     until: float
     """When something touches; the end, if nothing does before [s]."""
     least: float
-    """Smallest distance until then, up to that at which flights look at pairs [m]."""
+    """Smallest distance of pairs that do not touch, up to that at which flights look at pairs [m]."""
+
+
+class _Tally:
+    """What touches in the course of a flight."""
+
+    def __init__(self, start: Start, horizon: float, reach: float) -> None:
+        self.watched, self.until, self.least = start.watched, np.inf, np.inf
+        self.lost, self._before, self._deadline, self._reach = 0.0, np.inf, start.t + horizon, reach
+
+    def count(self, near: Near, t: float, span: float) -> Near:
+        """Takes a look into account, at t, `span` after the last one [s]; gives what of it is to be watched on."""
+        touching = near.distance < TOUCH
+        if touching.any():
+            closing = self._before - near.least
+            when = t - span * (TOUCH - near.least) / closing if 0.0 < closing < np.inf else t
+            self.until = min(self.until, float(when))
+            self.lost += float(touching.sum()) * max(self._deadline - when, 0.0)
+            self.watched = self.watched.copy()
+            self.watched[near.pair[touching]] = False
+            rest = ~touching
+            pair, distance = near.pair[rest], near.distance[rest]
+            least = float(distance.min(initial=self._reach))
+            near = Near(pair, distance, near.J[rest], near.drift[rest], near.lower, near.upper, least)
+        self.least, self._before = min(self.least, near.least), near.least
+        return near
 
 
 class Flights:
@@ -176,7 +206,7 @@ class Flights:
         return bool(flight.least - self.lever * most >= self.enough.distance)
 
     def fly(self, start: Start, manner: Manner, given: Sequence[Array] = ()) -> Flight:
-        """Flees with decisions a period apart, until something touches or the horizon is reached.
+        """Flees with decisions a period apart until the horizon; what has touched is left out of account from then on.
 
         Distances are looked at as often, and midway where something may come too near and part again before that. All
         flights decide and look at the same times, multiples of the period: only so can their values be compared.
@@ -186,38 +216,30 @@ class Flights:
             manner: how it flees.
             given: velocities (nv,) of the first ticks, for as many decisions as they suffice; it flees from then on.
         """
-        q, v, w, t, watched = start
+        q, v, w, t, _ = start
         horizon, safe = self.enough
-        end, plan = t + horizon + _BEYOND, list[Array]()
-        near = self._look(q, t, v, watched)
-        least = here = near.least
+        end, plan, tally = t + horizon + _BEYOND, list[Array](), _Tally(start, horizon, self._settings.reach)
+        near = tally.count(self._look(q, t, v, tally.watched), t, 0.0)
         count = self._ticks - round(t / self._dt) % self._ticks
-        while here >= TOUCH and t < end - 1e-9:
+        while t < end - 1e-9:
             wanted = given[len(plan) : len(plan) + count]
             held = len(wanted) < count
             if held:
                 wanted = [self._flee(near, manner)] * count
             steps = self.ramps.towards(v, w, wanted, held)
-            ahead, span, before = self._moved(q, steps), count * self._dt, here
+            ahead, span = self._moved(q, steps), count * self._dt
             rate = near.J @ steps[len(steps) // 2] + near.drift
             if (near.distance + span * rate < safe).any():
                 span *= 0.5
                 t += span
-                here = self._look(pin.interpolate(self._model, q, ahead, 0.5), t, v, watched).least
-            if here >= TOUCH:
-                before, least = here, min(least, here)
-                t += span
-                near = self._look(ahead, t, steps[-1], watched)
-                here = near.least
+                tally.count(self._look(pin.interpolate(self._model, q, ahead, 0.5), t, v, tally.watched), t, span)
+            t += span
+            near = tally.count(self._look(ahead, t, steps[-1], tally.watched), t, span)
             plan += steps
             w = steps[-1] - (steps[-2] if len(steps) > 1 else v)
             q, v, count = ahead, steps[-1], self._ticks
-        if here >= TOUCH:
-            least = min(least, here)
-        elif plan:
-            t -= span * (TOUCH - here) / (before - here)
-        value = Value(min(t - start.t, horizon), min(least, safe))
-        return Flight(start, plan, manner, value, t, least)
+        value = Value(horizon - tally.lost, min(tally.least, safe))
+        return Flight(start, plan, manner, value, min(tally.until, t), tally.least)
 
     def _moved(self, q: Array, steps: Sequence[Array]) -> Array:
         """Where the velocities (nv,) of some ticks lead from q (nq,)."""
@@ -236,9 +258,9 @@ class Flights:
         (pair, closest, J, drift), problem = self._assembly.compute(q, (), self.query, self._settings.reach)
         distance, counts = closest[:, 0], watched[pair]
         if not counts.all():
-            distance, J, drift = distance[counts], J[counts], drift[counts]
+            pair, distance, J, drift = pair[counts], distance[counts], J[counts], drift[counts]
         least = float(distance.min(initial=self._settings.reach))
-        return Near(distance, J, drift, problem.lower, problem.upper, least)
+        return Near(pair, distance, J, drift, problem.lower, problem.upper, least)
 
     def _flee(self, near: Near, manner: Manner) -> Array:
         """Velocity (nv,) of a flight for its next period."""
