@@ -170,6 +170,28 @@ def test_a_way_out_that_leads_nearer_first_is_found(tmp_path):
         assert crushed or (q[0] > 0.3 and least > 0.9 * 0.3 * 0.02)
 
 
+def test_past_a_contact_that_cannot_be_helped_others_are_kept_off(tmp_path):
+    """A slide along y cannot leave the way of a wall that comes along x, but that of a ball which comes after it."""
+    robot = cartesian(tmp_path, "y", speed=0.25)
+    wall = Obstacle(
+        "wall", Box(size=(0.02, 4.0, 0.4)),
+        build_motion(Line(start=(0.6, 0, 0), end=(-1.0, 0, 0), speed=0.5), None, SHIPPED.parent), moves=True,
+    )  # fmt: skip
+    ball = Obstacle(
+        "ball", Sphere(radius=0.15),
+        build_motion(Line(start=(-1.2, 0.02, 0), end=(1.0, 0.02, 0), speed=0.6), None, SHIPPED.parent), moves=True,
+    )  # fmt: skip
+    controller = make_controller(robot, [wall, ball], "y", avoidance=Avoidance(d1=0.02, d2=0.10, escape=Escape()))
+    q, walls, balls = robot.home.copy(), [], []
+    for k in range(280):
+        t = k * DT
+        x = [o.motion.sample(t).position[0] for o in (wall, ball)]
+        walls.append(abs(x[0]) - 0.01 - 0.05)
+        balls.append(np.hypot(x[1], q[0] - 0.02) - 0.15 - 0.05)
+        q = pin.integrate(robot.model, q, DT * controller.step(q, t, {"y": Sample.at([0.0, 0.0, 0.0])}).v)
+    assert min(walls) < 0.0 < 0.5 * 0.3 * 0.02 < min(balls)
+
+
 def test_where_there_is_no_way_out_every_tick_has_an_outcome_all_the_same(tmp_path):
     robot = cartesian(tmp_path, "xy", speed=0.4, acceleration=None)
     closed, dt = [*press(), slab("plug", (0.05, 0.2, 0.2), (0.325, -0.15, 0.0))], 0.05

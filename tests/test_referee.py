@@ -329,6 +329,13 @@ def test_foresight_gets_out_of_traps(seed):
     assert not trial.collided and trial.speed_excess <= 1e-9, trial.judged
 
 
+@pytest.mark.parametrize("seed", [768, 1084])
+def test_where_one_contact_cannot_be_helped_the_others_are_kept_off(seed):
+    """Foresight had given up on all pairs once one of them was to touch in every flight."""
+    (trial,) = trials(seed, ("qp+escape",))
+    assert trial.collided and not trial.avoidable, trial.judged
+
+
 def test_tracking_alone_collides_and_could_have_avoided_it():
     assert sum(trial.avoidable for trial in small_campaign("tracking", 8)) > 4
 
