@@ -25,9 +25,10 @@ from qpavoid.describe import commands as robot_commands
 from qpavoid.errors import ConfigError, QpavoidError
 from qpavoid.fields import page, schema_of
 from qpavoid.kernels import ACCELERATED
-from qpavoid.loading import load_scenario, robot_names, scenario_names
+from qpavoid.loading import load_scenario
 from qpavoid.log import Log
 from qpavoid.report import events, failed, metrics_table, to_json
+from qpavoid.shipped import robot_names, scenario_names
 from qpavoid.simulate import simulate
 from qpavoid.solvers import SOLVERS, backend_names
 from qpavoid.terminal import ERR, OUT, names_of, progress, terminate_like_interrupt

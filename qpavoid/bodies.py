@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid.cache import cached
+from qpavoid.capsules import CapsuleFit, fit_capsule, half_sphere
 from qpavoid.config import Box, Capsule, Cone, Cylinder, Ellipsoid, Shape, Sphere
 from qpavoid.config.base import LARGEST
 from qpavoid.errors import ConfigError
@@ -19,25 +19,6 @@ from qpavoid.problem import Array
 
 class MeshWarning(UserWarning):
     """Distances will be slow: a robot is made of triangle meshes."""
-
-
-@dataclass(frozen=True, slots=True)
-class CapsuleFit:
-    """An enclosing capsule: axis along z of `rotation`, centred on `center`; length 0 is a sphere."""
-
-    center: Array
-    """(3,) [m]."""
-    rotation: Array
-    """(3, 3)."""
-    radius: float
-    """[m]."""
-    length: float
-    """Between the centres of the caps [m]."""
-
-    @property
-    def volume(self) -> float:
-        """[m³]."""
-        return float(np.pi * self.radius**2 * (self.length + 4.0 / 3.0 * self.radius))
 
 
 def make_shape(shape: Shape) -> Any:
@@ -189,6 +170,8 @@ def _unpack_fit(path: Path) -> CapsuleFit:
     return CapsuleFit(numbers[:3], numbers[3:12].reshape(3, 3), float(numbers[12]), float(numbers[13]))
 
 
+_AROUND_BALL = 1.04 * np.concatenate((half_sphere(100), -half_sphere(100)))
+"""Points whose hull encloses the unit ball (200, 3)."""
 _ENDLESS = 1e6
 """Half the size of a box around what has no end [m]."""
 _THINNEST = 1e-4
@@ -219,106 +202,3 @@ def rim(radius: float, z: float) -> Array:
     angle = np.linspace(0.0, 2.0 * np.pi, 48, endpoint=False)
     around = radius / np.cos(np.pi / 48)
     return np.column_stack((around * np.cos(angle), around * np.sin(angle), np.full(48, z)))
-
-
-def fit_capsule(points: Array, directions: int = 250) -> CapsuleFit:
-    """A small capsule that encloses all points.
-
-    Tries the points' principal axes and a spiral of directions over the half sphere, all at once; for each, the axis
-    runs through the centre of the smallest circle around the projected points, and the caps are drawn in as far as
-    the points allow.
-
-    Args:
-        points: (n, 3) [m], at least one.
-        directions: how many directions are tried.
-
-    Returns:
-        The fit of smallest volume; every point is inside.
-    """
-    points = np.unique(np.asarray(points, dtype=np.float64), axis=0)
-    principal = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
-    rotations = _rotations_to(np.concatenate((principal, _half_sphere(directions))))
-    if len(points) > _MANY:  # the outermost points tell which axes are worth trying with all of them
-        best = np.argsort(_tried_along(outermost(points), rotations)[0].min(axis=0))
-        rotations = rotations[best[:_PROMISING]]
-    volume, fits, center = _tried_along(points, rotations)
-    wider, axis = np.unravel_index(np.argmin(volume), volume.shape)
-    radius, length, middle = fits[wider, axis]
-    origin = rotations[axis] @ np.array([*center[axis], middle])
-    margin = 1e-10  # against rounding, so that the points on the surface count as inside
-    return CapsuleFit(origin, rotations[axis], float(radius) + margin, float(length))
-
-
-_MANY, _PROMISING = 200, 12
-"""Points from which axes are sorted out first, and axes that are left then."""
-
-
-def _tried_along(points: Array, rotations: Array) -> tuple[Array, Array, Array]:
-    """Capsules along k axes, of several radii each: volumes (w, k), fits (w, k, 3) and the axes' centres (k, 2)."""
-    local = points @ rotations
-    center, narrowest = _enclosing_circles(local[..., :2])
-    off_axis = np.sum((local[..., :2] - center[:, None]) ** 2, axis=2)
-    # wider than needed is worth it where it lets flat ends sink into the caps
-    fits = np.stack([_fit_along(local[..., 2], off_axis, narrowest * wider) for wider in _WIDER])
-    volume = np.pi * fits[..., 0] ** 2 * (fits[..., 1] + 4.0 / 3.0 * fits[..., 0])
-    return volume, fits, center
-
-
-_WIDER = (1.0, 1.02, 1.05, 1.1, 1.2, 1.4)
-"""Radii that are tried, in units of the smallest one that encloses the projected points."""
-
-
-def _fit_along(height: Array, off_axis: Array, radius: Array) -> Array:
-    """Shortest capsules of given radii around points along given axes: rows [radius, length, height of the middle].
-
-    Each point lets the caps' centres come no nearer to the far side than its reach; where they would cross, a ball
-    about their middle encloses everything.
-
-    Args:
-        height: of the points along each axis (k, n).
-        off_axis: their squared distances from it (k, n).
-        radius: of the capsules (k,).
-    """
-    reach = np.sqrt(np.maximum(radius[:, None] ** 2 - off_axis, 0.0))
-    low, high = np.min(height + reach, axis=1), np.max(height - reach, axis=1)
-    return np.column_stack((radius, np.maximum(high - low, 0.0), 0.5 * (low + high)))
-
-
-def outermost(points: Array) -> Array:
-    """Those of many points (n, 3) that reach farthest along 120 fixed directions."""
-    return np.asarray(points[np.unique(np.argmax(_ROUND @ points.T, axis=1))])
-
-
-def _half_sphere(count: int) -> Array:
-    """Evenly spread unit vectors with z >= 0 (count, 3): a golden-angle spiral."""
-    i = np.arange(count) + 0.5
-    z, angle = i / count, np.pi * (1.0 + np.sqrt(5.0)) * i
-    r = np.sqrt(1.0 - z * z)
-    return np.column_stack((r * np.cos(angle), r * np.sin(angle), z))
-
-
-_AROUND_BALL = 1.04 * np.concatenate((_half_sphere(100), -_half_sphere(100)))
-"""Points whose hull encloses the unit ball (200, 3)."""
-
-
-_ROUND = np.concatenate([side * _half_sphere(60) for side in (1.0, -1.0)])
-
-
-def _rotations_to(axes: Array) -> Array:
-    """Rotations (k, 3, 3) whose z columns are the unit vectors `axes` (k, 3)."""
-    x = np.cross(np.eye(3)[np.argmin(np.abs(axes), axis=1)], axes)
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    return np.stack((x, np.cross(axes, x), axes), axis=2)
-
-
-def _enclosing_circles(points: Array) -> tuple[Array, Array]:
-    """Nearly smallest circle around each set of 2-D points (k, n, 2): centres (k, 2) and radii (k,).
-
-    Badoiu and Clarkson's iteration for the centre; the radius is then exact for that centre.
-    """
-    center = 0.5 * (points.min(axis=1) + points.max(axis=1))
-    every = np.arange(len(points))
-    for step in range(1, 60):
-        farthest = np.argmax(np.sum((points - center[:, None]) ** 2, axis=2), axis=1)
-        center = center + (points[every, farthest] - center) / (step + 1)
-    return center, np.sqrt(np.max(np.sum((points - center[:, None]) ** 2, axis=2), axis=1))

@@ -17,11 +17,10 @@ from qpavoid.cloud import Points
 from qpavoid.command import Commander
 from qpavoid.config import Avoidance, Limits, Progress, ScenarioConfig, Sensing
 from qpavoid.contacts import ContactRows, build_contacts
-from qpavoid.errors import ConfigError, NumericalError, UnknownName, located
+from qpavoid.errors import ConfigError, NumericalError, UnknownName, located, nearest
 from qpavoid.grasp import Grasps
 from qpavoid.kinematics import ForwardKinematics, Kinematics
 from qpavoid.limits import OUTSIDE
-from qpavoid.loading import nearest
 from qpavoid.motion import Sample
 from qpavoid.problem import (
     Array,

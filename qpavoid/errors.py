@@ -3,7 +3,8 @@
 An infeasible tick is not an error (it is a `Solution` with a status); these are for input that cannot be used.
 """
 
-from collections.abc import Iterator
+import difflib
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 
@@ -45,3 +46,12 @@ def located(where: str) -> Iterator[None]:
         yield
     except (ConfigError, SolverNotInstalled) as error:
         raise type(error)(f"{where}: {error}") from None
+
+
+def nearest(name: str, valid: Iterable[str]) -> str:
+    """`; did you mean 'x'?` with the nearest valid name, or the list of the valid ones."""
+    names = sorted(valid)
+    close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+    if close:
+        return f"; did you mean {close[0]!r}?"
+    return f"; valid are {', '.join(names)}" if names else ""

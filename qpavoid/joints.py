@@ -10,10 +10,9 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid.config import JointLimits
-from qpavoid.errors import ConfigError, UnknownName
+from qpavoid.errors import ConfigError, UnknownName, nearest
 from qpavoid.kinematics import MIMIC
 from qpavoid.limits import JointBounds
-from qpavoid.loading import nearest
 from qpavoid.pairs import pair_array
 from qpavoid.problem import Array, IntArray
 

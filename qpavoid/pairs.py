@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from qpavoid.errors import UnknownName
+from qpavoid.errors import UnknownName, nearest
 from qpavoid.limits import JointBounds
-from qpavoid.loading import nearest
 from qpavoid.problem import IntArray
 
 

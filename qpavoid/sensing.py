@@ -18,8 +18,7 @@ from qpavoid import kernels
 from qpavoid.cloud import Points, Voxels
 from qpavoid.config import PointCloud, Sensing
 from qpavoid.courses import STATE, Courses, as_samples, move_on, put
-from qpavoid.errors import NumericalError, UnknownName
-from qpavoid.loading import nearest
+from qpavoid.errors import NumericalError, UnknownName, nearest
 from qpavoid.motion import Sample
 from qpavoid.problem import Array, IntArray, as_vector
 from qpavoid.scene import Obstacle

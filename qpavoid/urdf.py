@@ -14,8 +14,8 @@ from typing import Any
 import pinocchio as pin
 
 from qpavoid.errors import ConfigError
-from qpavoid.loading import EXAMPLES, example_robot, example_robot_data
 from qpavoid.safe_xml import read_robot_xml
+from qpavoid.shipped import EXAMPLES, example_robot, example_robot_data
 from qpavoid.urdf_check import check_mjcf, check_urdf
 
 

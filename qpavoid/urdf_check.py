@@ -8,8 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from qpavoid.config.base import LARGEST
-from qpavoid.errors import ConfigError
-from qpavoid.loading import nearest
+from qpavoid.errors import ConfigError, nearest
 from qpavoid.safe_xml import read_robot_xml
 
 _MOST_LINKS, _MOST_MOVING, _MOST_SHAPES = 1000, 200, 300

@@ -14,9 +14,9 @@ from qpavoid.__main__ import main
 from qpavoid.assembly import Assembly
 from qpavoid.kernels.layout import RowLayout
 from qpavoid.kinematics import ForwardKinematics
-from qpavoid.loading import example_robot_data
 from qpavoid.motion import build_motion
 from qpavoid.proximity import DistanceQuery
+from qpavoid.shipped import example_robot_data
 from qpavoid.tasks import in_order
 
 settings.register_profile("patient", deadline=None)  # the first call of a compiled function may wait for the compiler

@@ -16,7 +16,8 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from qpavoid import Robot, config
-from qpavoid.bodies import convert_bodies, enclosing_capsule, fit_capsule, make_shape
+from qpavoid.bodies import convert_bodies, enclosing_capsule, make_shape
+from qpavoid.capsules import fit_capsule
 from qpavoid.segments import point_segment
 from qpavoid.urdf import read_collision, read_model
 

@@ -11,7 +11,9 @@ from pydantic import BaseModel
 
 from qpavoid import ConfigError, Robot, UnknownName, config, load_scenario, simulate
 from qpavoid.config import Block, RobotConfig, ScenarioConfig
-from qpavoid.loading import data_folder, nearest, read_config, robot_names, scenario_names
+from qpavoid.errors import nearest
+from qpavoid.loading import read_config
+from qpavoid.shipped import data_folder, robot_names, scenario_names
 from qpavoid.solvers import SOLVERS, parse_solver
 
 BLOCKS = [b for b in vars(config).values() if isinstance(b, type) and issubclass(b, Block) and b is not Block]

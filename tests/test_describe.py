@@ -14,7 +14,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial import ConvexHull
 
 from qpavoid import ConfigError, Robot, UnknownName
-from qpavoid.bodies import CapsuleFit, fit_capsule
+from qpavoid.capsules import CapsuleFit, fit_capsule
 from qpavoid.config import Box, Capsule, Hull, RobotConfig, Sphere
 from qpavoid.describe.add import Wishes, describe
 from qpavoid.describe.ends import end_effectors

@@ -23,8 +23,9 @@ from hypothesis import strategies as st
 
 from qpavoid import ConfigError, Controller, Log, Robot, Sample, load_scenario, simulate
 from qpavoid.config import Csv, RobotConfig
-from qpavoid.loading import data_folder, read_config
+from qpavoid.loading import read_config
 from qpavoid.motion import build_motion
+from qpavoid.shipped import data_folder
 
 if not hasattr(signal, "SIGALRM"):
     pytest.skip("a hang can only be stopped with SIGALRM", allow_module_level=True)

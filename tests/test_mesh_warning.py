@@ -7,7 +7,7 @@ from conftest import write_chain
 
 from qpavoid import Robot
 from qpavoid.bodies import MeshWarning
-from qpavoid.loading import robot_names
+from qpavoid.shipped import robot_names
 
 FACET = "facet normal 0 0 1\nouter loop\nvertex {}\nvertex {}\nvertex {}\nendloop\nendfacet\n"
 

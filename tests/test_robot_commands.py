@@ -17,7 +17,8 @@ from qpavoid.describe.add import Wishes, describe
 from qpavoid.describe.check import check_robot
 from qpavoid.describe.sampling import CLEAR, touching
 from qpavoid.describe.written import untouched
-from qpavoid.loading import data_folder, find_robot, read_config
+from qpavoid.loading import read_config
+from qpavoid.shipped import data_folder, find_robot
 from qpavoid.urdf import find_mesh
 
 MADE = ("baxter", "g1", "tiago", "ur5")

@@ -20,7 +20,7 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid import Robot
-from qpavoid.bodies import fit_capsule
+from qpavoid.capsules import fit_capsule
 from qpavoid.config import Body, Capsule, Sphere
 
 FITTED = Path(__file__).parent / "capsules"

@@ -17,8 +17,7 @@ from qpavoid.arena.pilot import Pilot
 from qpavoid.arena.world import World
 from qpavoid.config import ScenarioConfig, SolverConfig
 from qpavoid.controller import Controller
-from qpavoid.errors import ConfigError, UnknownName
-from qpavoid.loading import nearest
+from qpavoid.errors import ConfigError, UnknownName, nearest
 from qpavoid.solvers import make_solver, parse_solver
 
 

@@ -18,9 +18,8 @@ from qpavoid.arena.entrants import Entrant
 from qpavoid.arena.pilot import Pilot
 from qpavoid.arena.world import World
 from qpavoid.controller import Controller
-from qpavoid.errors import ConfigError, UnknownName
+from qpavoid.errors import ConfigError, UnknownName, nearest
 from qpavoid.files import read_text
-from qpavoid.loading import nearest
 from qpavoid.motion import Sample
 from qpavoid.problem import Array, Problem, Solution, require_finite
 

@@ -14,8 +14,7 @@ from qpavoid.arena.entrants import ENTRANTS
 from qpavoid.arena.store import read_cases
 from qpavoid.arena.suite import EntrantConfig, find_any
 from qpavoid.arena.trial import run_trial
-from qpavoid.errors import ConfigError, UnknownName
-from qpavoid.loading import nearest
+from qpavoid.errors import ConfigError, UnknownName, nearest
 
 
 def find_case(folder: Path, family: str, seed: int) -> Case:

@@ -16,8 +16,7 @@ from qpavoid.describe.reasons import by_link, pair_reasons, watching
 from qpavoid.describe.sampling import CLEAR, SAMPLES, SEED, always_near, clear_home, sample_pairs, touching
 from qpavoid.describe.shapes import LinkBodies, Piece, bodies_of_link, kinds_of_links
 from qpavoid.describe.srdf import Semantics, find_srdf, read_srdf
-from qpavoid.errors import ConfigError, UnknownName
-from qpavoid.loading import nearest
+from qpavoid.errors import ConfigError, UnknownName, nearest
 from qpavoid.problem import Array
 from qpavoid.robot import Robot
 from qpavoid.urdf import read_collision, read_model, read_pieces

@@ -22,10 +22,11 @@ from qpavoid.describe.sampling import Space, touching
 from qpavoid.errors import ConfigError, QpavoidError
 from qpavoid.joints import frame_index
 from qpavoid.kinematics import MIMIC
-from qpavoid.loading import find_robot, read_config
+from qpavoid.loading import read_config
 from qpavoid.robot import Robot
 from qpavoid.safe_xml import read_robot_xml
 from qpavoid.scene import build_scene
+from qpavoid.shipped import find_robot
 from qpavoid.tasks import build_tasks
 from qpavoid.urdf import find_mesh, find_resource, is_mjcf, mesh_folders, mesh_names, read_collision, read_model
 

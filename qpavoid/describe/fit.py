@@ -8,7 +8,8 @@ import coal
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from qpavoid.bodies import CapsuleFit, enclosing_capsule, fit_capsule, hull_points, outermost
+from qpavoid.bodies import enclosing_capsule, hull_points
+from qpavoid.capsules import CapsuleFit, fit_capsule, outermost
 from qpavoid.problem import Array
 
 Bodies = Literal["auto", "capsule", "capsules", "convex"]

@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 
 from qpavoid.describe.srdf import Semantics
-from qpavoid.errors import ConfigError, UnknownName
+from qpavoid.errors import ConfigError, UnknownName, nearest
 from qpavoid.joints import middle
 from qpavoid.kinematics import MIMIC
-from qpavoid.loading import nearest
 from qpavoid.problem import Array
 from qpavoid.robot import Robot
 from qpavoid.safe_xml import read_robot_xml

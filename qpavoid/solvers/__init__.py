@@ -11,8 +11,7 @@ from typing import Any, Protocol
 from pydantic import TypeAdapter, ValidationError
 
 from qpavoid.config import SolverConfig, expand_solver
-from qpavoid.errors import ConfigError, UnknownName
-from qpavoid.loading import nearest
+from qpavoid.errors import ConfigError, UnknownName, nearest
 from qpavoid.problem import Problem, Solution
 from qpavoid.solvers.analytic import Eq10, TrackingOnly
 from qpavoid.solvers.backends import backend_names

@@ -10,8 +10,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from qpavoid.config.base import Block, Number, Positive
-from qpavoid.errors import UnknownName
-from qpavoid.loading import nearest
+from qpavoid.errors import UnknownName, nearest
 from qpavoid.problem import Array
 
 

@@ -1,0 +1,90 @@
+"""What pydantic found wrong, in one line: the field as the file has it, what is wrong with it, and the remedy."""
+
+from __future__ import annotations
+
+import typing
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+from qpavoid.errors import nearest
+
+_FAULTS_TOLD = 5
+_NUMBER = "give a number alone, in m, rad, kg and s"
+_REMEDIES = {
+    "float_parsing": _NUMBER,
+    "float_type": _NUMBER,
+    "dict_type": "give a mapping by name, as in {joint1: 10.0}",
+    "list_type": "give a list, as in [a, b]",
+}
+"""What to do about faults of which pydantic says in Python's words what they are."""
+
+
+def explain(error: ValidationError, model: type[BaseModel], data: dict[str, Any]) -> str:
+    """All faults of a file in one line: field, what is wrong, nearest valid key."""
+    faults = [(tuple(_field(fault["loc"], fault["type"], data)), fault) for fault in error.errors()]
+    # Of a field that may be a list or a mapping, pydantic reports both; the one that was meant got deeper.
+    above = {field[:depth] for field, _ in faults for depth in range(len(field))}
+    deepest = [(field, fault) for field, fault in faults if field not in above]
+    more = f"; and {len(deepest) - _FAULTS_TOLD} more" if len(deepest) > _FAULTS_TOLD else ""
+    told = [(".".join(field), _fault(fault, model)) for field, fault in deepest[:_FAULTS_TOLD]]
+    return "; ".join(f"{field}: {what}" if field else what for field, what in told) + more
+
+
+def _field(loc: tuple[int | str, ...], kind: str, data: Any) -> list[str]:
+    """The keys and indices of the file among a location's parts; pydantic also names the members of unions."""
+    field = []
+    for part in loc:
+        try:
+            data = data[part]
+        except (LookupError, TypeError):
+            continue
+        field.append(str(part))
+    absent = kind == "missing" or (kind == "extra_forbidden" and field[-1] != loc[-1])  # the latter: `eq10:daqp`
+    return [*field, str(loc[-1])] if absent else field
+
+
+def _fault(fault: ErrorDetails, model: type[BaseModel]) -> str:
+    """What is wrong, in words."""
+    kind, loc, context = fault["type"], fault["loc"], fault.get("ctx", {})
+    if kind == "extra_forbidden":
+        keys = {key for block in _blocks_at(model, loc[:-1]) for key in block.model_fields}
+        return f"unknown key{nearest(str(loc[-1]), keys)}"
+    if kind == "missing":
+        return "is missing"
+    if kind in ("model_type", "model_attributes_type"):
+        return f"must be a mapping of fields, got {fault['input']!r:.60}"
+    if kind in ("union_tag_invalid", "union_tag_not_found"):
+        key = str(context["discriminator"]).strip("'")
+        tags = sorted(tag for block in _blocks_at(model, loc) for tag in _tags(block))
+        if kind == "union_tag_not_found":
+            return f"`{key}` is missing; valid are {', '.join(tags)}"
+        return f"unknown {key} {context['tag']!r}{nearest(str(context['tag']), tags)}"
+    if kind == "value_error":
+        return fault["msg"].removeprefix("Value error, ")
+    remedy = _REMEDIES.get(kind)
+    return f"{fault['msg']}, got {fault['input']!r:.60}" + (f": {remedy}" if remedy else "")
+
+
+def _blocks_at(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[type[BaseModel]]:
+    """The blocks that may stand at a location, in which the chosen member of a union is named by its tag."""
+    blocks = [model]
+    for part in loc:
+        fields = [block.model_fields[str(part)] for block in blocks if part in block.model_fields]
+        below = [inner for field in fields for inner in _blocks(field.annotation)]
+        blocks = below or [block for block in blocks if part in _tags(block)] or blocks
+    return blocks
+
+
+def _blocks(annotation: Any) -> list[type[BaseModel]]:
+    """Every block inside an annotation."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [block for inner in typing.get_args(annotation) for block in _blocks(inner)]
+
+
+def _tags(block: type[BaseModel]) -> set[str]:
+    """Names by which a block is chosen from a union: its literal `type` or `name`."""
+    fields = [block.model_fields[key] for key in ("type", "name") if key in block.model_fields]
+    return {tag for field in fields for tag in typing.get_args(field.annotation) if isinstance(tag, str)}
