@@ -1,18 +1,18 @@
 """qpavoid: follow a planned motion and stay clear of obstacles, other arms and yourself."""
 
 from qpavoid.batch import BatchError, Steps, WorkerDied, Workers, simulate_many, steps
-from qpavoid.cloud import Points, Voxels
 from qpavoid.config import Avoidance, Limits, Progress, ScenarioConfig, Sensing
 from qpavoid.contacts import build_contacts
 from qpavoid.controller import Controller, Tick
 from qpavoid.errors import ConfigError, NumericalError, QpavoidError, SolverNotInstalled, UnknownName
-from qpavoid.loading import load_scenario
+from qpavoid.files.loading import load_scenario
+from qpavoid.geometry.cloud import Points, Voxels
 from qpavoid.log import Log
 from qpavoid.motion import Sample
+from qpavoid.obstacles.sensing import Pose
 from qpavoid.problem import Problem, Solution, Status
 from qpavoid.robot import Robot
 from qpavoid.scene import Obstacle, Scene, build_scene
-from qpavoid.sensing import Pose
 from qpavoid.simulate import simulate
 from qpavoid.solvers import SOLVERS, Solver, make_solver
 from qpavoid.tasks import build_tasks

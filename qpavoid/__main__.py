@@ -23,12 +23,12 @@ from qpavoid.config import RobotConfig, ScenarioConfig
 from qpavoid.controller import Controller
 from qpavoid.describe import commands as robot_commands
 from qpavoid.errors import ConfigError, QpavoidError
-from qpavoid.fields import page, schema_of
+from qpavoid.files.fields import page, schema_of
+from qpavoid.files.loading import load_scenario
+from qpavoid.files.shipped import robot_names, scenario_names
 from qpavoid.kernels import ACCELERATED
-from qpavoid.loading import load_scenario
 from qpavoid.log import Log
 from qpavoid.report import events, failed, metrics_table, to_json
-from qpavoid.shipped import robot_names, scenario_names
 from qpavoid.simulate import simulate
 from qpavoid.solvers import SOLVERS, backend_names
 from qpavoid.terminal import ERR, OUT, names_of, progress, terminate_like_interrupt
@@ -169,7 +169,7 @@ def _update(bar: Progress, job: TaskID, done: int, total: int) -> None:
 
 def _draw(logs: list[Log], out: Path, compare: bool) -> list[Path]:
     try:
-        from qpavoid import plot
+        from qpavoid.plots import plot
     except ModuleNotFoundError as missing:
         if missing.name is None or missing.name.split(".")[0] != "matplotlib":
             raise

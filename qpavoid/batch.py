@@ -25,7 +25,7 @@ import numpy.typing as npt
 from qpavoid.config import ScenarioConfig
 from qpavoid.controller import Controller
 from qpavoid.errors import QpavoidError
-from qpavoid.loading import load_scenario
+from qpavoid.files.loading import load_scenario
 from qpavoid.log import STATUSES, Log
 from qpavoid.problem import Array, require_finite
 from qpavoid.simulate import simulate

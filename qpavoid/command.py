@@ -8,18 +8,18 @@ from __future__ import annotations
 
 import numpy as np
 
+from qpavoid.ahead.detour import Detours
+from qpavoid.ahead.escape import EscapePlanner
+from qpavoid.ahead.guard import Guard
+from qpavoid.ahead.progress import ProgressWatch
 from qpavoid.assembly import Assembly
 from qpavoid.config import Avoidance, Limits, Progress
-from qpavoid.detour import Detours
-from qpavoid.escape import EscapePlanner
-from qpavoid.guard import Guard
 from qpavoid.kernels.vectorised.ahead import TOLERANCE
 from qpavoid.limits import JointBounds, saturate
+from qpavoid.obstacles.sensing import Obstacles
 from qpavoid.problem import Array, Problem, Proximity, Solution, Status, sane
-from qpavoid.progress import ProgressWatch
 from qpavoid.proximity import DistanceQuery
 from qpavoid.scene import Scene
-from qpavoid.sensing import Obstacles
 from qpavoid.solvers import Solver
 from qpavoid.solvers.hqp import Hqp
 from qpavoid.solvers.qp import Qp

@@ -13,15 +13,16 @@ import pinocchio as pin
 
 from qpavoid import kernels
 from qpavoid.assembly import Assembly
-from qpavoid.cloud import Points
 from qpavoid.command import Commander
 from qpavoid.config import Avoidance, Limits, Progress, ScenarioConfig, Sensing
 from qpavoid.contacts import ContactRows, build_contacts
 from qpavoid.errors import ConfigError, NumericalError, UnknownName, located, nearest
-from qpavoid.grasp import Grasps
+from qpavoid.geometry.cloud import Points
 from qpavoid.kinematics import ForwardKinematics, Kinematics
 from qpavoid.limits import OUTSIDE
 from qpavoid.motion import Sample
+from qpavoid.obstacles.grasp import Grasps
+from qpavoid.obstacles.sensing import Obstacles, Pose, finite
 from qpavoid.problem import (
     Array,
     Problem,
@@ -36,7 +37,6 @@ from qpavoid.problem import (
 from qpavoid.proximity import DistanceQuery
 from qpavoid.robot import Robot
 from qpavoid.scene import Scene, build_obstacles, build_scene
-from qpavoid.sensing import Obstacles, Pose, finite
 from qpavoid.solvers import Solver, make_solver
 from qpavoid.tasks import AnyTask, build_tasks, in_order
 

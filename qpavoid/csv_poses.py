@@ -12,7 +12,7 @@ import pinocchio as pin
 
 from qpavoid.config.base import LARGEST
 from qpavoid.errors import ConfigError
-from qpavoid.files import read_text
+from qpavoid.files.text import read_text
 from qpavoid.problem import Array
 
 CSV_HEADERS = ("t,x,y,z", "t,x,y,z,qx,qy,qz,qw")

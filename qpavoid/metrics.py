@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from qpavoid.geometry.segments import point_segment
 from qpavoid.problem import Array, Status
-from qpavoid.segments import point_segment
 
 if TYPE_CHECKING:
     from qpavoid.log import Log

@@ -13,15 +13,15 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid import kernels
-from qpavoid.bodies import bounding_box, bounding_sphere
-from qpavoid.cloud import Voxels
 from qpavoid.config import PointCloud
+from qpavoid.geometry.bodies import bounding_box, bounding_sphere
+from qpavoid.geometry.cloud import Voxels
+from qpavoid.geometry.slots import Slots
 from qpavoid.memory import read_poses, read_results, view_poses, view_results
 from qpavoid.motion import Sample
-from qpavoid.placing import Placing
+from qpavoid.obstacles.placing import Placing
 from qpavoid.problem import Array, IntArray, Mask
 from qpavoid.scene import Scene
-from qpavoid.slots import Slots
 
 _CULL_FROM = 48 if kernels.ACCELERATED else 192
 """Number of pairs from which looking at bounding spheres first pays."""

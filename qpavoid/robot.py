@@ -12,18 +12,18 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from qpavoid.bodies import MeshWarning, check_meshes, convert_bodies, make_shape, triangle_meshes
 from qpavoid.config import Body, Hull, RobotConfig
 from qpavoid.errors import ConfigError, UnknownName, nearest
-from qpavoid.joints import frame_index, joint_bounds, middle, set_joints, set_limits, without
+from qpavoid.files.loading import read_config, validate
+from qpavoid.files.shipped import find_robot
+from qpavoid.geometry.bodies import MeshWarning, check_meshes, convert_bodies, make_shape, triangle_meshes
+from qpavoid.geometry.joints import frame_index, joint_bounds, middle, set_joints, set_limits, without
+from qpavoid.geometry.pairs import add_self_pairs, drop_always_touching
+from qpavoid.geometry.urdf import find_resource, honour_srdf, read_collision, read_model, read_pieces
 from qpavoid.kinematics import TRANSLATIONS
 from qpavoid.limits import JointBounds
-from qpavoid.loading import read_config, validate
 from qpavoid.motion import rpy_to_matrix
-from qpavoid.pairs import add_self_pairs, drop_always_touching
 from qpavoid.problem import Array
-from qpavoid.shipped import find_robot
-from qpavoid.urdf import find_resource, honour_srdf, read_collision, read_model, read_pieces
 
 
 @dataclass(frozen=True)

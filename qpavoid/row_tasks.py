@@ -15,8 +15,8 @@ from qpavoid import config
 from qpavoid.errors import NumericalError
 from qpavoid.kernels.rotation import rotation_vector
 from qpavoid.kinematics import ForwardKinematics, columns, support_masks
+from qpavoid.obstacles.sensing import as_goal
 from qpavoid.problem import Array, IntArray, as_vector
-from qpavoid.sensing import as_goal
 
 _PARTS = {"position": slice(0, 3), "orientation": slice(3, 6), "pose": slice(0, 6)}
 """Rows of a frame's Jacobian, [linear, angular]."""

@@ -13,14 +13,14 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from qpavoid import config
-from qpavoid.cloud import Voxels, read_points
 from qpavoid.errors import ConfigError, located
+from qpavoid.geometry.cloud import Voxels, read_points
+from qpavoid.geometry.pairs import pair_array
+from qpavoid.geometry.solids import make_solids
 from qpavoid.kinematics import support_masks
 from qpavoid.motion import Motion, Sample, Still, build_motion
-from qpavoid.pairs import pair_array
 from qpavoid.problem import Array, IntArray
 from qpavoid.robot import Robot
-from qpavoid.solids import make_solids
 
 FAR = 1e4
 """Where the balls of a cloud wait that stand for no voxel [m]."""

@@ -10,16 +10,16 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid import gains
-from qpavoid.bodies import enclosing_capsule
 from qpavoid.config import Mesh, PointCloud, ScenarioConfig
 from qpavoid.controller import Controller, Tick
 from qpavoid.errors import ConfigError, NumericalError
-from qpavoid.loading import load_scenario
+from qpavoid.files.loading import load_scenario
+from qpavoid.geometry.bodies import enclosing_capsule
+from qpavoid.geometry.solids import drawn_triangles
 from qpavoid.log import STATUSES, Log, versions
 from qpavoid.problem import Array, Solution, Status
 from qpavoid.proximity import DistanceQuery
 from qpavoid.scene import FAR, Scene
-from qpavoid.solids import drawn_triangles
 from qpavoid.solvers import parse_solver
 from qpavoid.tasks import in_order
 

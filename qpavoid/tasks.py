@@ -14,10 +14,10 @@ from qpavoid import config
 from qpavoid.errors import ConfigError, located
 from qpavoid.kinematics import support_masks
 from qpavoid.motion import Motion, Sample, build_motion
+from qpavoid.obstacles.sensing import as_goal
 from qpavoid.problem import Array, IntArray, require_finite
 from qpavoid.robot import Robot
 from qpavoid.row_tasks import Axis, Com, Constant, Damping, Manipulability, Posture, Relative, RowTask
-from qpavoid.sensing import as_goal
 
 
 @dataclass(frozen=True)

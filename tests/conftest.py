@@ -12,11 +12,11 @@ from hypothesis import settings
 from qpavoid import Obstacle, Robot, Sample, build_scene, config
 from qpavoid.__main__ import main
 from qpavoid.assembly import Assembly
+from qpavoid.files.shipped import example_robot_data
 from qpavoid.kernels.layout import RowLayout
 from qpavoid.kinematics import ForwardKinematics
 from qpavoid.motion import build_motion
 from qpavoid.proximity import DistanceQuery
-from qpavoid.shipped import example_robot_data
 from qpavoid.tasks import in_order
 
 settings.register_profile("patient", deadline=None)  # the first call of a compiled function may wait for the compiler

@@ -11,10 +11,12 @@ import pinocchio as pin
 import pytest
 from conftest import EXAMPLES, random_q
 
-from qpavoid import Robot, bodies, cache
-from qpavoid.bodies import enclosing_capsule
-from qpavoid.cache import VERSION, cache_folder
-from qpavoid.capsules import fit_capsule
+from qpavoid import Robot
+from qpavoid.files import cache
+from qpavoid.files.cache import VERSION, cache_folder
+from qpavoid.geometry import bodies
+from qpavoid.geometry.bodies import enclosing_capsule
+from qpavoid.geometry.capsules import fit_capsule
 
 PANDA = EXAMPLES / "panda_description/urdf/panda.urdf"
 CUBE = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)

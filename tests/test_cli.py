@@ -12,7 +12,7 @@ import yaml
 from conftest import Result
 
 from qpavoid import Log
-from qpavoid.shipped import data_folder, robot_names, scenario_names
+from qpavoid.files.shipped import data_folder, robot_names, scenario_names
 from qpavoid.solvers import SOLVERS
 
 METRICS = {

@@ -12,10 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
-from qpavoid import Obstacle, Sample, Status, build_scene, config, courses, kernels
+from qpavoid import Obstacle, Sample, Status, build_scene, config, kernels
 from qpavoid.errors import NumericalError
 from qpavoid.kernels.vectorised.motions import Placed
 from qpavoid.motion import END_TOLERANCE, Motion, Orbit, Still, build_motion
+from qpavoid.obstacles import courses
 from qpavoid.proximity import DistanceQuery
 
 coordinate = st.floats(-2.0, 2.0)

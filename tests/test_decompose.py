@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial import ConvexHull
 from test_shapes import SHELF, boards
 
-from qpavoid.decompose import decompose
+from qpavoid.geometry.decompose import decompose
 
 
 def indexed(triangles):

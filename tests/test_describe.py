@@ -14,7 +14,6 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial import ConvexHull
 
 from qpavoid import ConfigError, Robot, UnknownName
-from qpavoid.capsules import CapsuleFit, fit_capsule
 from qpavoid.config import Box, Capsule, Hull, RobotConfig, Sphere
 from qpavoid.describe.add import Wishes, describe
 from qpavoid.describe.ends import end_effectors
@@ -33,9 +32,10 @@ from qpavoid.describe.shapes import capsule_fields
 from qpavoid.describe.srdf import MADE_BY, Semantics, find_srdf, read_srdf, srdf_text
 from qpavoid.describe.texts import description_files
 from qpavoid.describe.written import BLANK, seal, untouched, write_files
+from qpavoid.geometry.capsules import CapsuleFit, fit_capsule
+from qpavoid.geometry.segments import point_segment
+from qpavoid.geometry.urdf import read_model
 from qpavoid.motion import rpy_to_matrix
-from qpavoid.segments import point_segment
-from qpavoid.urdf import read_model
 
 PANDA = EXAMPLES / "panda_description/urdf/panda.urdf"
 

@@ -7,8 +7,8 @@ from closed_loop import Ruler, cartesian, drive, make_controller, scenario
 from conftest import moved
 
 from qpavoid import Avoidance, Controller, Obstacle, Sample, Status, simulate
+from qpavoid.ahead.guard import TOLERANCE
 from qpavoid.config import Box, Damper, Sphere
-from qpavoid.guard import TOLERANCE
 
 PLATE = {"type": "box", "size": [0.004, 0.6, 0.6]}
 BALL = {"type": "sphere", "radius": 0.06}

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from qpavoid import Controller, Obstacle, Sample, ScenarioConfig, Status, kernels, load_scenario
+from qpavoid.ahead.flights import Start, _farthest
 from qpavoid.config import Avoidance, Box, Escape, Limits, Line, Sphere
 from qpavoid.errors import ConfigError
-from qpavoid.flights import Start, _farthest
 from qpavoid.motion import build_motion
 
 DT = 0.01

@@ -13,8 +13,8 @@ from scipy.optimize import brentq
 from qpavoid import Controller, Sample, Status, build_scene, load_scenario, make_solver, simulate
 from qpavoid.arena.entrants import ENTRANTS
 from qpavoid.config import Avoidance, GradientProjectionSolver, PotentialFieldSolver, Sphere
+from qpavoid.files.shipped import scenario_names
 from qpavoid.problem import AvoidanceRows, Tracking, make_problem
-from qpavoid.shipped import scenario_names
 from qpavoid.solvers.analytic import tracking_velocity
 from qpavoid.solvers.potential import repulsion
 from qpavoid.solvers.projection import clearance_slope, room

@@ -23,14 +23,14 @@ from hypothesis import strategies as st
 
 from qpavoid import ConfigError, Controller, Log, Robot, Sample, load_scenario, simulate
 from qpavoid.config import Csv, RobotConfig
-from qpavoid.loading import read_config
+from qpavoid.files.loading import read_config
+from qpavoid.files.shipped import data_folder
 from qpavoid.motion import build_motion
-from qpavoid.shipped import data_folder
 
 if not hasattr(signal, "SIGALRM"):
     pytest.skip("a hang can only be stopped with SIGALRM", allow_module_level=True)
 
-pytestmark = pytest.mark.filterwarnings("ignore::qpavoid.urdf.MimicWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::qpavoid.geometry.urdf.MimicWarning")
 
 LIMIT = 30
 """Seconds that a test may take."""

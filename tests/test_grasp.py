@@ -21,8 +21,8 @@ from qpavoid import (
     build_scene,
     build_tasks,
 )
-from qpavoid.bodies import make_shape
 from qpavoid.config import Box, Capsule, Cylinder, HalfSpace, PointCloud, Sphere, Task
+from qpavoid.geometry.bodies import make_shape
 
 TCP = "panda_hand_tcp"
 BOX = Box(size=(0.06, 0.06, 0.24))

@@ -18,8 +18,8 @@ from qpavoid import (
     load_scenario,
     simulate,
 )
+from qpavoid.geometry.urdf import MimicWarning
 from qpavoid.kinematics import chains, longest_lever
-from qpavoid.urdf import MimicWarning
 
 
 def body(name, frame):

@@ -6,8 +6,8 @@ import pytest
 from conftest import write_chain
 
 from qpavoid import Robot
-from qpavoid.bodies import MeshWarning
-from qpavoid.shipped import robot_names
+from qpavoid.files.shipped import robot_names
+from qpavoid.geometry.bodies import MeshWarning
 
 FACET = "facet normal 0 0 1\nouter loop\nvertex {}\nvertex {}\nvertex {}\nendloop\nendfacet\n"
 

@@ -8,7 +8,7 @@ from closed_loop import SHIPPED, Ruler, changed, drive, make_controller
 
 from qpavoid import Controller, Obstacle, ScenarioConfig, Status, load_scenario, simulate
 from qpavoid.config import Sphere
-from qpavoid.sensing import Pose
+from qpavoid.obstacles.sensing import Pose
 
 TOOL = np.array([0.39644872, 0.65090125, 0.74741443])
 """Where Situation 1 begins."""

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from qpavoid import ConfigError, Controller, Log, load_scenario, simulate
-from qpavoid.plot_motion import local_faces, motion_figure, shape_faces
+from qpavoid.plots.motion import local_faces, motion_figure, shape_faces
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,16 @@ from qpavoid.log import STATUSES
 
 pytest.importorskip("matplotlib")
 
-from qpavoid.plot import (
+from qpavoid.plots.compare import SOLVER_STYLES, compare_time_figure, path_figure, solver_styles
+from qpavoid.plots.motion import (
+    capsule_faces,
+    instants,
+    motion_figure,
+    obstacle_faces,
+    shape_faces,
+    view_angles,
+)
+from qpavoid.plots.plot import (
     ALPHA_SHOWN,
     distances_figure,
     joints_figure,
@@ -22,15 +31,6 @@ from qpavoid.plot import (
     plot_run,
     position_names,
     speeds_figure,
-)
-from qpavoid.plot_compare import SOLVER_STYLES, compare_time_figure, path_figure, solver_styles
-from qpavoid.plot_motion import (
-    capsule_faces,
-    instants,
-    motion_figure,
-    obstacle_faces,
-    shape_faces,
-    view_angles,
 )
 
 

@@ -23,8 +23,8 @@ from qpavoid import (
     build_scene,
     kernels,
 )
-from qpavoid.cloud import ball_radius, read_points
 from qpavoid.config import PointCloud
+from qpavoid.geometry.cloud import ball_radius, read_points
 from qpavoid.kernels.vectorised import voxels as voxels_module
 from qpavoid.proximity import DistanceQuery
 

@@ -35,10 +35,10 @@ from qpavoid import (
     placing,
     proximity,
 )
+from qpavoid.geometry.segments import capsule_distances
 from qpavoid.kinematics import support_masks
 from qpavoid.problem import Proximity
 from qpavoid.proximity import DistanceQuery
-from qpavoid.segments import capsule_distances
 from qpavoid.solvers.analytic import tracking_velocity
 from qpavoid.tasks import build_tasks
 

@@ -17,9 +17,9 @@ from qpavoid.describe.add import Wishes, describe
 from qpavoid.describe.check import check_robot
 from qpavoid.describe.sampling import CLEAR, touching
 from qpavoid.describe.written import untouched
-from qpavoid.loading import read_config
-from qpavoid.shipped import data_folder, find_robot
-from qpavoid.urdf import find_mesh
+from qpavoid.files.loading import read_config
+from qpavoid.files.shipped import data_folder, find_robot
+from qpavoid.geometry.urdf import find_mesh
 
 MADE = ("baxter", "g1", "tiago", "ur5")
 """Robots that ship as `robot add` wrote them."""

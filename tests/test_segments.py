@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 from scipy.spatial.transform import Rotation
 
-from qpavoid.segments import capsule_distances, line_parameters, point_segment, segment_segment
+from qpavoid.geometry.segments import capsule_distances, line_parameters, point_segment, segment_segment
 
 FloatArray = NDArray[np.float64]
 TOL = 1e-9

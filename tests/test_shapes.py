@@ -23,8 +23,8 @@ from qpavoid import (
     simulate,
 )
 from qpavoid import proximity as proximity_module
-from qpavoid.bodies import MeshWarning, enclosing_capsule, make_shape
 from qpavoid.config import Cone, Ellipsoid, HalfSpace, Mesh
+from qpavoid.geometry.bodies import MeshWarning, enclosing_capsule, make_shape
 from qpavoid.proximity import DistanceQuery
 
 CONE = Cone(radius=0.09, length=0.25)
@@ -299,7 +299,7 @@ def test_a_decomposed_mesh_is_its_boards(tmp_path, shelf):
 
 
 @pytest.mark.parametrize("method", ["convex", "decomposed", "surface"])
-@pytest.mark.filterwarnings("ignore::qpavoid.bodies.MeshWarning")
+@pytest.mark.filterwarnings("ignore::qpavoid.geometry.bodies.MeshWarning")
 def test_meshes_move_and_turn_like_any_other_obstacle(tmp_path, method):
     path = write_stl(tmp_path / "box.stl", boards(((0, 0, 0), (200.0, 300.0, 100.0))))
     mesh = Mesh(path=str(path), scale=1e-3, method=method)
@@ -329,7 +329,7 @@ def test_a_cut_surface_stops_the_robot_and_says_so(tmp_path):
     assert controller.step(np.array([0.0, 0.0, 0.0])).status is Status.SOLVED
 
 
-@pytest.mark.filterwarnings("ignore::qpavoid.bodies.MeshWarning")
+@pytest.mark.filterwarnings("ignore::qpavoid.geometry.bodies.MeshWarning")
 def test_two_triangle_meshes_have_normals(tmp_path):
     """coal leaves the normal of two meshes unset: rows of `bodies: mesh` used to be zero."""
     write_stl(tmp_path / "part.stl", boards(((0, 0, 0.15), (0.04, 0.04, 0.16))))

@@ -36,7 +36,7 @@ from qpavoid.arena.summary import broken, summary
 from qpavoid.arena.trial import run_trial
 from qpavoid.arena.world import build_world
 from qpavoid.errors import ConfigError, UnknownName
-from qpavoid.shipped import family_names, suite_names
+from qpavoid.files.shipped import family_names, suite_names
 
 POST = {
     "title": "A post",

@@ -72,8 +72,8 @@ def chain_run(folder, joint_type: str, root_joint: str) -> Log:
 )
 def test_log_holds_units_and_figures_show_them(tmp_path, joint_type, root_joint, units, position, speed):
     pytest.importorskip("matplotlib")
-    from qpavoid.plot import joints_figure, speeds_figure
-    from qpavoid.plot_compare import compare_time_figure
+    from qpavoid.plots.compare import compare_time_figure
+    from qpavoid.plots.plot import joints_figure, speeds_figure
 
     log = Log.load(chain_run(tmp_path, joint_type, root_joint).save(tmp_path / "log.npz"))
     assert log.meta["units"] == units.split()

@@ -15,8 +15,8 @@ from bench.safety.obstacles import draw_obstacle
 from qpavoid import Robot, ScenarioConfig
 from qpavoid.arena.families.room import Placed, bodies_at, gap
 from qpavoid.arena.families.ways import Way
-from qpavoid.bodies import make_shape
 from qpavoid.config import Fixed, ObstacleConfig
+from qpavoid.geometry.bodies import make_shape
 from qpavoid.problem import Array
 from qpavoid.scene import build_obstacles
 

@@ -20,8 +20,8 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid import Robot
-from qpavoid.capsules import fit_capsule
 from qpavoid.config import Body, Capsule, Sphere
+from qpavoid.geometry.capsules import fit_capsule
 
 FITTED = Path(__file__).parent / "capsules"
 SHARE = Path(str(distribution("example-robot-data").locate_file("cmeel.prefix/share/example-robot-data/robots")))

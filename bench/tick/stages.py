@@ -15,7 +15,7 @@ STAGES = {
     "proximity": ("qpavoid.proximity:DistanceQuery.compute",),
     "rows": ("qpavoid.assembly:Assembly.compute",),
     "solve": ("qpavoid.solvers.qp:Qp.solve",),
-    "look ahead": ("qpavoid.guard:Guard.check",),
+    "look ahead": ("qpavoid.ahead.guard:Guard.check",),
 }
 """Stage: the functions that make it up; one that is called by another counts as part of that. What is left of a step
 is `the rest`."""

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from qpavoid.errors import ConfigError
+from qpavoid.files.shipped import family_names, suite_names
 from qpavoid.report import to_json
-from qpavoid.shipped import family_names, suite_names
 from qpavoid.terminal import ERR, OUT, names_of, progress, terminate_like_interrupt
 
 if TYPE_CHECKING:
@@ -139,8 +139,8 @@ def list_(json: Json = False) -> None:
     from qpavoid.arena.entrants import ENTRANTS
     from qpavoid.arena.families import load_family
     from qpavoid.arena.suite import SuiteConfig
-    from qpavoid.loading import read_config
-    from qpavoid.shipped import find_suite
+    from qpavoid.files.loading import read_config
+    from qpavoid.files.shipped import find_suite
 
     suites = {name: read_config(find_suite(name), SuiteConfig).title for name in suite_names()}
     families = {name: load_family(name).config.title for name in family_names()}

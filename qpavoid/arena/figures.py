@@ -10,7 +10,7 @@ from matplotlib.ticker import LogLocator, StrMethodFormatter
 
 from qpavoid.arena.results import Results
 from qpavoid.arena.statistics import Interval, mean, pareto, rate
-from qpavoid.plot_style import COLOURS, add_grid
+from qpavoid.plots.style import COLOURS, add_grid
 from qpavoid.problem import Array
 
 _LINE = 0.24

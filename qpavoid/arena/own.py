@@ -19,7 +19,7 @@ from qpavoid.arena.pilot import Pilot
 from qpavoid.arena.world import World
 from qpavoid.controller import Controller
 from qpavoid.errors import ConfigError, UnknownName, nearest
-from qpavoid.files import read_text
+from qpavoid.files.text import read_text
 from qpavoid.motion import Sample
 from qpavoid.problem import Array, Problem, Solution, require_finite
 

@@ -18,8 +18,8 @@ from qpavoid.arena.own import own_entrant
 from qpavoid.config import Avoidance, Limits, Progress, Sensing, SolverConfig
 from qpavoid.config.base import Block
 from qpavoid.errors import ConfigError, located
-from qpavoid.loading import read_config
-from qpavoid.shipped import find_suite
+from qpavoid.files.loading import read_config
+from qpavoid.files.shipped import find_suite
 
 MOST_SEEDS = 1_000_000
 

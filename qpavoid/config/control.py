@@ -41,7 +41,7 @@ AvoidanceRow = Annotated[Switching | Damper | Cbf, Field(discriminator="type")]
 
 
 class Escape(Block):
-    """Foresight where obstacles move: tasks go on only where the robot could still flee (`qpavoid.escape`).
+    """Foresight where obstacles move: tasks go on only where the robot could still flee (`qpavoid.ahead.escape`).
 
     It takes obstacles to go on as their trajectories or last twists say, and some milliseconds a tick.
     """

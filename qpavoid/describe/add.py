@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from qpavoid.bodies import check_meshes
 from qpavoid.config import RobotConfig
 from qpavoid.describe.ends import end_effectors
 from qpavoid.describe.fit import Bodies
@@ -17,9 +16,10 @@ from qpavoid.describe.sampling import CLEAR, SAMPLES, SEED, always_near, clear_h
 from qpavoid.describe.shapes import LinkBodies, Piece, bodies_of_link, kinds_of_links
 from qpavoid.describe.srdf import Semantics, find_srdf, read_srdf
 from qpavoid.errors import ConfigError, UnknownName, nearest
+from qpavoid.geometry.bodies import check_meshes
+from qpavoid.geometry.urdf import read_collision, read_model, read_pieces
 from qpavoid.problem import Array
 from qpavoid.robot import Robot
-from qpavoid.urdf import read_collision, read_model, read_pieces
 
 Root = Literal["fixed", "planar", "free_flyer"]
 

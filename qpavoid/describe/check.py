@@ -20,15 +20,23 @@ from qpavoid.describe.findings import Joint, Problem, Report
 from qpavoid.describe.poses import mimics
 from qpavoid.describe.sampling import Space, touching
 from qpavoid.errors import ConfigError, QpavoidError
-from qpavoid.joints import frame_index
+from qpavoid.files.loading import read_config
+from qpavoid.files.safe_xml import read_robot_xml
+from qpavoid.files.shipped import find_robot
+from qpavoid.geometry.joints import frame_index
+from qpavoid.geometry.urdf import (
+    find_mesh,
+    find_resource,
+    is_mjcf,
+    mesh_folders,
+    mesh_names,
+    read_collision,
+    read_model,
+)
 from qpavoid.kinematics import MIMIC
-from qpavoid.loading import read_config
 from qpavoid.robot import Robot
-from qpavoid.safe_xml import read_robot_xml
 from qpavoid.scene import build_scene
-from qpavoid.shipped import find_robot
 from qpavoid.tasks import build_tasks
-from qpavoid.urdf import find_mesh, find_resource, is_mjcf, mesh_folders, mesh_names, read_collision, read_model
 
 _TICKS, _PATIENCE = 300, 5.0
 """Timed for the median, as far as they take no longer than so many seconds."""

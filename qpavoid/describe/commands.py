@@ -20,8 +20,8 @@ from qpavoid.describe.sampling import SAMPLES, SEED
 from qpavoid.describe.texts import description_files, home_line, pairs_line, volume_line
 from qpavoid.describe.written import write_files
 from qpavoid.errors import ConfigError
+from qpavoid.files.shipped import find_robot
 from qpavoid.report import to_json
-from qpavoid.shipped import find_robot
 from qpavoid.terminal import ERR, OUT
 
 app = typer.Typer(no_args_is_help=True, help="Look a robot over, or describe one for the first time.")

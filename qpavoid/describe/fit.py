@@ -8,8 +8,8 @@ import coal
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from qpavoid.bodies import enclosing_capsule, hull_points
-from qpavoid.capsules import CapsuleFit, fit_capsule, outermost
+from qpavoid.geometry.bodies import enclosing_capsule, hull_points
+from qpavoid.geometry.capsules import CapsuleFit, fit_capsule, outermost
 from qpavoid.problem import Array
 
 Bodies = Literal["auto", "capsule", "capsules", "convex"]

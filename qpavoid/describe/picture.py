@@ -14,14 +14,14 @@ from matplotlib.patches import Patch
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from scipy.spatial import ConvexHull
 
-from qpavoid.bodies import hull_points
 from qpavoid.config import Body, Hull
 from qpavoid.describe.add import Described
 from qpavoid.describe.fit import triangles
 from qpavoid.describe.texts import volume_line
 from qpavoid.describe.written import BLANK, seal
-from qpavoid.joints import frame_index
-from qpavoid.plot_motion import normals, shade, shape_faces, towards_viewer
+from qpavoid.geometry.bodies import hull_points
+from qpavoid.geometry.joints import frame_index
+from qpavoid.plots.motion import normals, shade, shape_faces, towards_viewer
 from qpavoid.problem import Array
 
 _VIEWS = ((15.0, -50.0), (15.0, 130.0))

@@ -13,12 +13,12 @@ import numpy as np
 
 from qpavoid.describe.srdf import Semantics
 from qpavoid.errors import ConfigError, UnknownName, nearest
-from qpavoid.joints import middle
+from qpavoid.files.safe_xml import read_robot_xml
+from qpavoid.geometry.joints import middle
+from qpavoid.geometry.urdf import is_mjcf
 from qpavoid.kinematics import MIMIC
 from qpavoid.problem import Array
 from qpavoid.robot import Robot
-from qpavoid.safe_xml import read_robot_xml
-from qpavoid.urdf import is_mjcf
 
 _DIGITS = 5
 """After the point, of positions in files [rad or m]."""

@@ -11,9 +11,9 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from qpavoid.config import Avoidance
+from qpavoid.geometry.pairs import pair_array
 from qpavoid.kinematics import support_masks
 from qpavoid.memory import read_results, view_results
-from qpavoid.pairs import pair_array
 from qpavoid.problem import Array, IntArray
 from qpavoid.robot import Robot
 

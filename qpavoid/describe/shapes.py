@@ -12,11 +12,11 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from qpavoid.bodies import hull_points
-from qpavoid.capsules import CapsuleFit, fit_capsule
 from qpavoid.config import Body, Box, Capsule, Cylinder, Hull, Sphere
 from qpavoid.describe.fit import GROSS, Bodies, fit_piece, hull_volume
 from qpavoid.errors import UnknownName, nearest
+from qpavoid.geometry.bodies import hull_points
+from qpavoid.geometry.capsules import CapsuleFit, fit_capsule
 from qpavoid.problem import Array
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
-from qpavoid.safe_xml import read_robot_xml
+from qpavoid.files.safe_xml import read_robot_xml
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from qpavoid.describe.add import Described, Wishes
 from qpavoid.describe.sampling import FAR, NEAR
 from qpavoid.describe.srdf import MADE_BY, srdf_text
 from qpavoid.describe.written import BLANK, seal
-from qpavoid.shipped import EXAMPLES, example_robot
+from qpavoid.files.shipped import EXAMPLES, example_robot
 
 
 def description_files(described: Described, folder: Path) -> dict[Path, bytes]:

@@ -9,12 +9,12 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
+from qpavoid.ahead.reach import arm
 from qpavoid.arena.families.parameters import Redraw
 from qpavoid.arena.families.reach import Ranges, Want, configuration_at
 from qpavoid.arena.families.ways import Way
 from qpavoid.errors import ConfigError
 from qpavoid.problem import Array
-from qpavoid.reach import arm
 from qpavoid.robot import Robot
 
 REST = 3.0

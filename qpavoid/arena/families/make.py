@@ -16,7 +16,7 @@ from qpavoid.arena.families.solvable import solved_by
 from qpavoid.arena.world import world_of
 from qpavoid.config import ScenarioConfig
 from qpavoid.errors import ConfigError, QpavoidError, located
-from qpavoid.loading import validate
+from qpavoid.files.loading import validate
 from qpavoid.robot import Robot
 
 MOST_DRAWS = 100

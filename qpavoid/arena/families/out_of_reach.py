@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from qpavoid.ahead.reach import arm, clearance
 from qpavoid.arena.world import World
-from qpavoid.reach import arm, clearance
 from qpavoid.robot import Robot
 from qpavoid.tasks import FrameTask
 

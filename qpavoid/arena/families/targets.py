@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from qpavoid.ahead.reach import arm
 from qpavoid.arena.families.arms import follow, run, set_out
 from qpavoid.arena.families.parameters import Draw
 from qpavoid.arena.families.statics import fixed, sweep
 from qpavoid.arena.families.ways import along
-from qpavoid.reach import arm
 from qpavoid.robot import Robot
 
 _REST = 8.0

@@ -17,15 +17,15 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid import kernels
+from qpavoid.ahead.ramps import Ramps
 from qpavoid.assembly import Assembly
 from qpavoid.config import Avoidance, Escape, Limits
 from qpavoid.kinematics import ForwardKinematics, longest_lever
 from qpavoid.limits import JointBounds
+from qpavoid.obstacles.sensing import Obstacles, Seen
 from qpavoid.problem import Array, IntArray, Mask
 from qpavoid.proximity import DistanceQuery
-from qpavoid.ramps import Ramps
 from qpavoid.scene import Scene
-from qpavoid.sensing import Obstacles, Seen
 from qpavoid.solvers.backends import solve_daqp
 
 _GENTLE = 1e-4

@@ -8,11 +8,11 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid import kernels
-from qpavoid.courses import STATE, as_samples, put
 from qpavoid.errors import NumericalError
 from qpavoid.kernels.vectorised.motions import Placed
 from qpavoid.memory import read_poses, view_poses
 from qpavoid.motion import Sample
+from qpavoid.obstacles.courses import STATE, as_samples, put
 from qpavoid.problem import Array, IntArray
 from qpavoid.scene import Scene
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from qpavoid.errors import ConfigError, NumericalError
-from qpavoid.files import read_text
+from qpavoid.files.text import read_text
 from qpavoid.motion import Sample
 from qpavoid.problem import Array, IntArray
 

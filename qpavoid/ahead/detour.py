@@ -14,11 +14,11 @@ from itertools import starmap
 
 import numpy as np
 
+from qpavoid.ahead.reach import arm, too_near
 from qpavoid.assembly import Assembly
 from qpavoid.config import Detour
 from qpavoid.problem import Array, Problem, Proximity
 from qpavoid.proximity import DistanceQuery
-from qpavoid.reach import arm, too_near
 from qpavoid.scene import Scene
 from qpavoid.solvers import Solver
 from qpavoid.tasks import FrameTask

@@ -17,9 +17,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from qpavoid.log import STATUSES, Log
-from qpavoid.plot_compare import compare_time_figure, path_figure, solver_styles
-from qpavoid.plot_motion import motion_figure
-from qpavoid.plot_style import (
+from qpavoid.plots.compare import compare_time_figure, path_figure, solver_styles
+from qpavoid.plots.motion import motion_figure
+from qpavoid.plots.style import (
     COLLISION,
     COLOURS,
     DASHES,

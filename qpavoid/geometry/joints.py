@@ -11,9 +11,9 @@ import pinocchio as pin
 
 from qpavoid.config import JointLimits
 from qpavoid.errors import ConfigError, UnknownName, nearest
+from qpavoid.geometry.pairs import pair_array
 from qpavoid.kinematics import MIMIC
 from qpavoid.limits import JointBounds
-from qpavoid.pairs import pair_array
 from qpavoid.problem import Array, IntArray
 
 _ABSURD = 1e9

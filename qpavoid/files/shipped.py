@@ -8,7 +8,7 @@ from pathlib import Path
 
 from qpavoid.errors import ConfigError, UnknownName, nearest
 
-_PACKAGE = Path(__file__).parent
+_PACKAGE = Path(__file__).parents[1]
 EXAMPLES = "example-robot-data:"
 """What a path below the robots folder of example-robot-data begins with."""
 

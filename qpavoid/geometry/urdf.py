@@ -14,9 +14,9 @@ from typing import Any
 import pinocchio as pin
 
 from qpavoid.errors import ConfigError
-from qpavoid.safe_xml import read_robot_xml
-from qpavoid.shipped import EXAMPLES, example_robot, example_robot_data
-from qpavoid.urdf_check import check_mjcf, check_urdf
+from qpavoid.files.safe_xml import read_robot_xml
+from qpavoid.files.shipped import EXAMPLES, example_robot, example_robot_data
+from qpavoid.files.urdf_check import check_mjcf, check_urdf
 
 
 class MimicWarning(UserWarning):

@@ -12,9 +12,9 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
+from qpavoid.geometry.segments import point_segment, segment_segment
 from qpavoid.log import Log
 from qpavoid.problem import Array, IntArray
-from qpavoid.segments import point_segment, segment_segment
 
 MOVING, RESTING, HIT, OBSTACLE, TOOL_PATH = "#6BA3D6", "#C4C4C4", "#C62F2F", "#E69F00", "#007A56"
 GROUND = "#EFE3C8"

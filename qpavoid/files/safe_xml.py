@@ -6,7 +6,7 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 from qpavoid.errors import ConfigError
-from qpavoid.files import read_text
+from qpavoid.files.text import read_text
 
 _LARGEST = 10_000_000
 """Size of a file [bytes]; humanoids take 200 000."""

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from qpavoid.config.base import LARGEST
 from qpavoid.errors import ConfigError, nearest
-from qpavoid.safe_xml import read_robot_xml
+from qpavoid.files.safe_xml import read_robot_xml
 
 _MOST_LINKS, _MOST_MOVING, _MOST_SHAPES = 1000, 200, 300
 """Humanoids have 130, 101 and 112. Parsers recurse along a chain; memory grows with the cube of the joints that move,

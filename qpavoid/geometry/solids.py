@@ -10,14 +10,14 @@ import coal
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from qpavoid.bodies import MeshWarning, make_shape, run_qhull
-from qpavoid.cloud import ball_radius
 from qpavoid.config import HalfSpace, Mesh, ObstacleShape, PointCloud
 from qpavoid.config.base import LARGEST
-from qpavoid.decompose import decompose
 from qpavoid.errors import ConfigError
+from qpavoid.geometry.bodies import MeshWarning, make_shape, run_qhull
+from qpavoid.geometry.cloud import ball_radius
+from qpavoid.geometry.decompose import decompose
+from qpavoid.geometry.urdf import find_resource
 from qpavoid.problem import Array, IntArray
-from qpavoid.urdf import find_resource
 
 _LARGEST = 100_000_000
 """Size of a file [bytes]: the reader takes it into memory as a whole before it looks at it."""

@@ -21,12 +21,12 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 import pinocchio as pin
 
+from qpavoid.ahead.flights import TOUCH, Flight, Flights, Manner, Start, Value
 from qpavoid.config import Avoidance, Escape, Limits
-from qpavoid.flights import TOUCH, Flight, Flights, Manner, Start, Value
 from qpavoid.limits import JointBounds
+from qpavoid.obstacles.sensing import Obstacles
 from qpavoid.problem import Array, Proximity
 from qpavoid.scene import Scene
-from qpavoid.sensing import Obstacles
 
 _HORIZONS = (0.2, 0.05, 0.5)
 """h of flights [s]."""

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from qpavoid import kernels
-from qpavoid.cloud import Points, Voxels
 from qpavoid.config import PointCloud, Sensing
-from qpavoid.courses import STATE, Courses, as_samples, move_on, put
 from qpavoid.errors import NumericalError, UnknownName, nearest
+from qpavoid.geometry.cloud import Points, Voxels
 from qpavoid.motion import Sample
+from qpavoid.obstacles.courses import STATE, Courses, as_samples, move_on, put
 from qpavoid.problem import Array, IntArray, as_vector
 from qpavoid.scene import Obstacle
 

@@ -13,8 +13,8 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from qpavoid import kernels
-from qpavoid.bodies import enclosing_capsule, hull_points
-from qpavoid.cloud import Voxels, ball_radius
+from qpavoid.geometry.bodies import enclosing_capsule, hull_points
+from qpavoid.geometry.cloud import Voxels, ball_radius
 from qpavoid.motion import Sample
 from qpavoid.problem import Array, IntArray
 from qpavoid.scene import FAR

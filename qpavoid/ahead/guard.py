@@ -23,10 +23,10 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid.assembly import Assembly
-from qpavoid.courses import move_on
 from qpavoid.kernels.vectorised.ahead import TOLERANCE
 from qpavoid.kernels.vectorised.bounds import speed_to_stop
 from qpavoid.limits import JointBounds
+from qpavoid.obstacles.courses import move_on
 from qpavoid.problem import Array, IntArray, Problem, Solution
 from qpavoid.proximity import DistanceQuery
 from qpavoid.scene import Scene

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from qpavoid.ahead.detour import Detours
 from qpavoid.assembly import Assembly
 from qpavoid.config import Progress
-from qpavoid.detour import Detours
 from qpavoid.problem import Array, Problem, Proximity, Solution
 from qpavoid.solvers import Solver
 

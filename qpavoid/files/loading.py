@@ -10,10 +10,10 @@ from pydantic import BaseModel, ValidationError
 
 from qpavoid.config import ScenarioConfig, expand_solver
 from qpavoid.errors import ConfigError
-from qpavoid.explain import explain
-from qpavoid.files import read_text
-from qpavoid.safe_yaml import parse_yaml
-from qpavoid.shipped import find_scenario
+from qpavoid.files.explain import explain
+from qpavoid.files.safe_yaml import parse_yaml
+from qpavoid.files.shipped import find_scenario
+from qpavoid.files.text import read_text
 
 Config = TypeVar("Config", bound=BaseModel)
 _LARGEST = 1_000_000

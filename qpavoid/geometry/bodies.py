@@ -9,11 +9,11 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from qpavoid.cache import cached
-from qpavoid.capsules import CapsuleFit, fit_capsule, half_sphere
 from qpavoid.config import Box, Capsule, Cone, Cylinder, Ellipsoid, Shape, Sphere
 from qpavoid.config.base import LARGEST
 from qpavoid.errors import ConfigError
+from qpavoid.files.cache import cached
+from qpavoid.geometry.capsules import CapsuleFit, fit_capsule, half_sphere
 from qpavoid.problem import Array
 
 

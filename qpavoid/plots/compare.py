@@ -12,8 +12,8 @@ from scipy.spatial import ConvexHull
 
 from qpavoid.log import Log
 from qpavoid.metrics import path_deviation
-from qpavoid.plot_motion import OBSTACLE, RESTING, capsule_faces, endless, moving_bodies, obstacle_faces
-from qpavoid.plot_style import COLOURS, D2, DASHES, add_grid, add_legend, draw_levels, is_qp, label_distances, units
+from qpavoid.plots.motion import OBSTACLE, RESTING, capsule_faces, endless, moving_bodies, obstacle_faces
+from qpavoid.plots.style import COLOURS, D2, DASHES, add_grid, add_legend, draw_levels, is_qp, label_distances, units
 from qpavoid.problem import Array
 
 SOLVER_STYLES: dict[str, tuple[str, Any]] = {
