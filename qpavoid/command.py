@@ -61,7 +61,7 @@ class Commander:
             progress: when a task counts as blocked, and whether a way round is tried.
             dt: control period [s].
         """
-        self._scene, self._solver, self._assembly, self._query = scene, solver, assembly, query
+        self._scene, self.solver, self._assembly, self._query = scene, solver, assembly, query
         self._bounds, self._avoidance, self._limits = bounds, avoidance, limits
         self._v_shape = (scene.robot.model.nv,)
         self._reach, keep = avoidance.d2 - avoidance.offset, avoidance.hold - avoidance.offset
@@ -117,22 +117,22 @@ class Commander:
         """What the solver says, within the limits and looked ahead; with a proximity, ways round may be tried."""
         try:
             if proximity is not None:
-                problem = self.progress.redirect(problem, proximity, self._assembly, self._solver)
-                if problem.jerked and not (problem.levels and isinstance(self._solver, Hqp)):  # v0 is not a cascade's
+                problem = self.progress.redirect(problem, proximity, self._assembly, self.solver)
+                if problem.jerked and not (problem.levels and isinstance(self.solver, Hqp)):  # v0 is not a cascade's
                     problem = self._assembly.eased(problem)
-            solution = self._solver.solve(problem)
+            solution = self.solver.solve(problem)
             v = solution.v
             usable = v.dtype == np.float64 and v.shape == self._v_shape and sane(v)
         except Exception as error:  # a law of the user's own may raise anything; the robot must get a velocity
             return _stop(problem, (f"the solver raised {type(error).__name__}: {error}",))
         if not usable:
             return _stop(problem, solution.reasons or ("the solver returned no finite velocity of the right shape",))
-        if not self._solver.bounded:
+        if not self.solver.bounded:
             if self._limits.saturate:
                 v, change = saturate(v, problem.lower, problem.upper, self._bounds.velocity)
                 return solution._replace(v=v, saturation=change)
             return solution
-        if not isinstance(self._solver, Qp):
+        if not isinstance(self.solver, Qp):
             met = solution.status is Status.SOLVED
             limits = (problem.lower, problem.upper) if met else (problem.hard_lower, problem.hard_upper)
             v = np.clip(v, *limits)
@@ -143,7 +143,7 @@ class Commander:
 
     def _looked_ahead(self, q: Array, problem: Problem, solution: Solution) -> Solution:
         def gentle() -> Array | None:
-            return self._solver.gentle(problem, solution.slack) if isinstance(self._solver, Qp) else None
+            return self.solver.gentle(problem, solution.slack) if isinstance(self.solver, Qp) else None
 
         checked = self.guard.check(q, solution, problem, gentle, self._assembly, self._query, self._reach)
         if checked is None:
@@ -169,7 +169,7 @@ class Commander:
         """Says which accelerations and jerks pass their limits, where bounds had to: to get back from where a relaxed
         tick has led to, before a position or velocity limit, or to hold contacts.
         """
-        if not (self._assembly.limits_may_give_way and self._solver.bounded):
+        if not (self._assembly.limits_may_give_way and self.solver.bounded):
             return solution
         said = " ".join([reason for reason in solution.reasons if "beyond its" in reason])
         lines = [

@@ -102,8 +102,8 @@ class Controller:
         self.scene, self.dt = scene, dt
         self.tasks: tuple[AnyTask, ...] = (*frames, *others)
         """Frames with a position to follow, then with an orientation alone, then all other tasks."""
-        self.solver: Solver = make_solver(solver) if isinstance(solver, str) else solver
-        if contacts is not None and not getattr(self.solver, "holds_contacts", False):
+        law: Solver = make_solver(solver) if isinstance(solver, str) else solver
+        if contacts is not None and not getattr(law, "holds_contacts", False):
             raise ConfigError(f"contacts: {_name(solver)} cannot hold them; use qp or hqp")
         self.avoidance, self.limits = avoidance or Avoidance(), limits or Limits()
         model = scene.robot.model
@@ -121,12 +121,12 @@ class Controller:
         self._q_last = scene.robot.home.copy()
         self._assembly = Assembly(
             scene, self.tasks, self._bounds, self._kinematics, self._query, self.avoidance,
-            self.limits, tracking_damping, dt, contacts, self.solver.bounded and self.avoidance.look_ahead,
+            self.limits, tracking_damping, dt, contacts, law.bounded and self.avoidance.look_ahead,
         )  # fmt: skip
         if contacts is not None and self.avoidance.escape is not None:
             raise ConfigError("avoidance.escape: flights do not hold contacts; leave one of the two out")
         self._commander = Commander(
-            scene, self.solver, self._assembly, self._query, self._obstacles, self._bounds,
+            scene, law, self._assembly, self._query, self._obstacles, self._bounds,
             [task for task in frames if task.moves], self.avoidance, self.limits, progress or Progress(), dt,
         )  # fmt: skip
         hold = self.avoidance.hold - self.avoidance.offset
@@ -136,6 +136,15 @@ class Controller:
         """Time that it took to lay out the memory and run the first ticks, compilation included [s]; no later tick
         waits for the compiler."""
         _log.info("warmed up in %.3f s, compiled kernels: %s", self.warm_up_time, kernels.ACCELERATED)
+
+    @property
+    def solver(self) -> Solver:
+        """The law, which may be exchanged between ticks."""
+        return self._commander.solver
+
+    @solver.setter
+    def solver(self, law: Solver) -> None:
+        self._commander.solver = law
 
     def _warm_up(self) -> None:
         q, v = self.scene.robot.home, np.zeros(self._v_shape)

@@ -11,6 +11,7 @@ from qpavoid import (
     Obstacle,
     Pose,
     Sample,
+    Solution,
     Status,
     UnknownName,
     build_scene,
@@ -135,6 +136,20 @@ def test_nan_distances_stop_the_robot_instead_of_being_dropped(make, panda, monk
 
 
 @pytest.mark.skipif(not kernels.ACCELERATED, reason="nothing is compiled")
+def test_a_law_that_takes_over_is_the_one_that_counts(controller, panda):
+    class Creep:
+        bounded = False
+
+        def solve(self, problem):
+            return Solution(np.full(7, 0.01))
+
+    before, controller.solver = controller.solver, Creep()
+    assert isinstance(controller.solver, Creep)
+    np.testing.assert_array_equal(controller.step(panda.home).v, 0.01)
+    controller.solver = before
+    assert not np.isclose(controller.step(panda.home).v, 0.01).any()
+
+
 def test_nothing_is_compiled_after_construction(controller, panda):
     def compiled():
         functions = {name: getattr(kernels, name) for name in kernels.__all__}

@@ -32,11 +32,11 @@ from qpavoid import (
     config,
     load_scenario,
     memory,
-    placing,
     proximity,
 )
 from qpavoid.geometry.segments import capsule_distances
 from qpavoid.kinematics import support_masks
+from qpavoid.obstacles import placing
 from qpavoid.problem import Proximity
 from qpavoid.proximity import DistanceQuery
 from qpavoid.solvers.analytic import tracking_velocity
