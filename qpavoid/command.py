@@ -10,6 +10,7 @@ import numpy as np
 
 from qpavoid.ahead.detour import Detours
 from qpavoid.ahead.escape import EscapePlanner
+from qpavoid.ahead.flights import Flights
 from qpavoid.ahead.guard import Guard
 from qpavoid.ahead.progress import ProgressWatch
 from qpavoid.assembly import Assembly
@@ -68,10 +69,10 @@ class Commander:
         self.guard = Guard(scene, bounds, limits.position_gain, keep, dt)
         detours = Detours(progress.detour, dt, scene, frames, query, keep) if progress.detour else None
         self.progress = ProgressWatch(progress, dt, scene.pair_names, detours)
-        settings = avoidance.escape
-        self.escape = (
-            None if settings is None else EscapePlanner(scene, bounds, obstacles, avoidance, limits, dt, settings)
-        )
+        self.escape: EscapePlanner | None = None
+        if avoidance.escape is not None:
+            flights = Flights(scene, bounds, obstacles, avoidance, limits, dt, avoidance.escape)
+            self.escape = EscapePlanner(flights, scene, bounds, obstacles, dt)
 
     @property
     def queries(self) -> tuple[DistanceQuery, ...]:

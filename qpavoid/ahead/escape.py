@@ -22,7 +22,6 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid.ahead.flights import TOUCH, Flight, Flights, Manner, Start, Value
-from qpavoid.config import Avoidance, Escape, Limits
 from qpavoid.limits import JointBounds
 from qpavoid.obstacles.sensing import Obstacles
 from qpavoid.problem import Array, Proximity
@@ -43,29 +42,18 @@ _ALIKE = 1e-6
 class EscapePlanner:
     """Tries flights, and decides which is commanded."""
 
-    def __init__(
-        self,
-        scene: Scene,
-        bounds: JointBounds,
-        obstacles: Obstacles,
-        avoidance: Avoidance,
-        limits: Limits,
-        dt: float,
-        settings: Escape,
-    ) -> None:
-        """Lays the memory out.
+    def __init__(self, flights: Flights, scene: Scene, bounds: JointBounds, obstacles: Obstacles, dt: float) -> None:
+        """Begins with no flight kept.
 
         Args:
+            flights: what is tried.
             scene: robot and obstacles.
             bounds: limits of the joints.
             obstacles: what is known of the obstacles.
-            avoidance: distances and rows of the controller.
-            limits: use of the joint limits.
             dt: control period [s].
-            settings: how far and how hard to look.
         """
-        self._model, self._obstacles, self._settings, self._dt = scene.robot.model, obstacles, settings, dt
-        self.flights = Flights(scene, bounds, obstacles, avoidance, limits, dt, settings)
+        self.flights, self._settings = flights, flights.settings
+        self._model, self._obstacles, self._dt = scene.robot.model, obstacles, dt
         self._braking = 0.5 / bounds.acceleration
         self._parted = np.any(scene.support != 0.0, axis=1)
         self.reset()

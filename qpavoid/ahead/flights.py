@@ -145,16 +145,25 @@ class Flights:
         dt: float,
         settings: Escape,
     ) -> None:
-        """Lays the memory out; see `EscapePlanner` for the arguments."""
+        """Lays the memory out.
+
+        Args:
+            scene: robot and obstacles.
+            bounds: limits of the joints.
+            obstacles: what is known of the obstacles.
+            avoidance: distances and rows of the controller.
+            limits: use of the joint limits.
+            dt: control period [s].
+            settings: how far and how hard to look.
+        """
         model = scene.robot.model
-        self._model, self._obstacles, self._settings, self._dt = model, obstacles, settings, dt
+        self._model, self._obstacles, self.settings, self._dt = model, obstacles, settings, dt
         self._ticks = max(1, int(np.ceil(settings.period / dt - 1e-9)))
         self.period = self._ticks * dt
         """Time between two decisions [s]."""
         self.kinematics, self.query = ForwardKinematics(model), DistanceQuery(scene)
-        free = replace(
-            bounds, jerk=np.full(model.nv, np.inf)
-        )  # what is wanted may be farther than jerks get in a period
+        # what is wanted may be farther away than jerks get in a period
+        free = replace(bounds, jerk=np.full(model.nv, np.inf))
         self._assembly = Assembly(scene, (), free, self.kinematics, self.query, avoidance, limits, 0.01, self.period)
         self.ramps = Ramps(bounds, dt)
         """How it gets from one velocity to another."""
@@ -189,7 +198,7 @@ class Flights:
         The same velocities lead past the same places, but for how far the start is off, and what is lost until they are
         reached. No point of the robot is farther off than the longest lever times the sum of that over the joints.
         """
-        if self._obstacles.told or flight.until < start.t + self._settings.horizon - 1e-9:
+        if self._obstacles.told or flight.until < start.t + self.settings.horizon - 1e-9:
             return False
         if abs(start.t - flight.start.t) > 1e-6 or not np.array_equal(flight.start.watched, start.watched):
             return False
@@ -218,7 +227,7 @@ class Flights:
         """
         q, v, w, t, _ = start
         horizon, safe = self.enough
-        end, plan, tally = t + horizon + _BEYOND, list[Array](), _Tally(start, horizon, self._settings.reach)
+        end, plan, tally = t + horizon + _BEYOND, list[Array](), _Tally(start, horizon, self.settings.reach)
         near = tally.count(self._look(q, t, v, tally.watched), t, 0.0)
         count = self._ticks - round(t / self._dt) % self._ticks
         while t < end - 1e-9:
@@ -254,12 +263,12 @@ class Flights:
         self.query.placing.place(*self.foreseen(t))
         self._assembly.remember(v)
         self.kinematics.compute(q)
-        self.query.compute(self.kinematics.data, self._settings.reach)
-        (pair, closest, J, drift), problem = self._assembly.compute(q, (), self.query, self._settings.reach)
+        self.query.compute(self.kinematics.data, self.settings.reach)
+        (pair, closest, J, drift), problem = self._assembly.compute(q, (), self.query, self.settings.reach)
         distance, counts = closest[:, 0], watched[pair]
         if not counts.all():
             pair, distance, J, drift = pair[counts], distance[counts], J[counts], drift[counts]
-        least = float(distance.min(initial=self._settings.reach))
+        least = float(distance.min(initial=self.settings.reach))
         return Near(pair, distance, J, drift, problem.lower, problem.upper, least)
 
     def _flee(self, near: Near, manner: Manner) -> Array:
@@ -267,7 +276,7 @@ class Flights:
         h, v = manner.horizon, None
         if h:
             ahead = near.distance + h * near.drift
-            v = _farthest(h * near.J, ahead, self._settings.comfort, manner.leaning, near.lower, near.upper)
+            v = _farthest(h * near.J, ahead, self.settings.comfort, manner.leaning, near.lower, near.upper)
         return np.minimum(np.maximum(0.0 if v is None else v, near.lower), near.upper)
 
 
