@@ -327,6 +327,18 @@ def test_what_was_found_clear_is_looked_at_anew_when_obstacles_turn(tmp_path):
         assert planner.flights.fly(start, planner.flights.still, found.v).value == pytest.approx(found.value, abs=1e-9)
 
 
+def test_what_was_foreseen_is_forgotten_when_it_is_over(among_balls):
+    controller, planner, q = among_balls
+    controller.reset()
+    most = 0
+    for k in range(400):
+        q = pin.integrate(planner._model, q, DT * controller.step(q, k * DT).v)
+        most = max(most, len(planner.flights._foreseen))
+    assert 100 < most < 600
+    for t, seen in planner.flights._foreseen.items():
+        np.testing.assert_array_equal(seen.states, controller._obstacles.foreseen(t).states)
+
+
 def test_no_flight_is_flown_where_nothing_comes_near(tmp_path, monkeypatch):
     robot = cartesian(tmp_path, "xy", speed=0.25, acceleration=None)
     far = [

@@ -62,9 +62,11 @@ class EscapePlanner:
         """Forgets the flight that was kept; what is drawn from now on is drawn again after the next reset."""
         self._kept: Flight | None = None
         self._random, self._untried = np.random.default_rng(0), list[float]()
+        self.flights.forget_foreseen()
 
     def look_anew(self) -> None:
         """What the robot carries, or what may touch, has changed: the flight that is kept has to be flown anew."""
+        self.flights.forget_foreseen()
         if self._kept is not None:
             self._kept = self._kept._replace(until=-np.inf)
 
@@ -81,7 +83,7 @@ class EscapePlanner:
         """
         if not len(self._obstacles.moving):
             return None
-        self.flights.forget_foreseen()
+        self.flights.go_on_to(t - _SPAN)
         watched = self._parted.copy()
         watched[proximity.pair[proximity.distance < TOUCH]] = False
         next_tick = Start(pin.integrate(self._model, q, self._dt * v), v, v - v_last, t + self._dt, watched)
@@ -106,12 +108,15 @@ class EscapePlanner:
         Between the times at which they are looked at, obstacles are taken to be no faster than at these.
         """
         moving, horizon = self._obstacles.moving, self._settings.horizon
-        times = start.t + np.arange(0.0, horizon + _SPAN, _SPAN)
+        end = start.t + horizon
+        between = range(int(np.floor(start.t / _SPAN)) + 1, int(np.ceil(end / _SPAN)))
+        times = [start.t, *[k * _SPAN for k in between], end]  # most are those of the tick before
         states = np.array([self.flights.foreseen(t).states[moving] for t in times])
         strides = 0.5 * _SPAN * np.sqrt(np.square(states[:, :, 12:15]).sum(axis=2).max(axis=0))
         self.flights.kinematics.compute(start.q)
         centers, radii = self.flights.query.body_spheres(self.flights.kinematics.data)
-        apart = np.linalg.norm(states[:, :, None, 9:12] - centers, axis=3) - radii
+        offset = states[:, :, None, 9:12] - centers
+        apart = np.sqrt(np.einsum("tobi,tobi->tob", offset, offset)) - radii
         stop = float(np.square(start.v) @ self._braking)
         least = self._settings.comfort + (self.flights.lever * stop if stop else 0.0)
         return bool((apart.min(axis=(0, 2)) - self.flights.query.placing.reach[moving] - strides > least).all())

@@ -34,6 +34,8 @@ _DEEPEST = 10.0
 """Penetration that no flight foresees [m]."""
 TOUCH = 1e-3
 """Distance below which a pair counts as touching [m]."""
+_MANY = 300
+"""Times of which it is remembered what was foreseen, before those that are over are forgotten."""
 _BEYOND = 0.1
 """How much longer than the horizon flights are, so that they need not be flown anew in every tick [s]."""
 
@@ -175,6 +177,13 @@ class Flights:
         """Standing still."""
         self._foreseen: dict[float, Seen] = {}
         _farthest(np.zeros((1, model.nv)), np.zeros(1), 0.1, np.zeros(model.nv), *2 * [np.zeros(model.nv)])  # compiles
+
+    def go_on_to(self, t: float) -> None:
+        """Forgets what was foreseen and is over at t [s]; all of it, where obstacles are told of."""
+        if self._obstacles.told:
+            self._foreseen.clear()
+        elif len(self._foreseen) > _MANY:
+            self._foreseen = {at: seen for at, seen in self._foreseen.items() if at > t}
 
     def forget_foreseen(self) -> None:
         """There is news of the obstacles: where they will be has to be foreseen anew."""
