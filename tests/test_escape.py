@@ -334,7 +334,7 @@ def test_what_was_foreseen_is_forgotten_when_it_is_over(among_balls):
     for k in range(400):
         q = pin.integrate(planner._model, q, DT * controller.step(q, k * DT).v)
         most = max(most, len(planner.flights._foreseen))
-    assert 100 < most < 600
+    assert 100 < most < 1000  # a tick in trouble foresees some hundreds
     for t, seen in planner.flights._foreseen.items():
         np.testing.assert_array_equal(seen.states, controller._obstacles.foreseen(t).states)
 
