@@ -135,7 +135,6 @@ def test_nan_distances_stop_the_robot_instead_of_being_dropped(make, panda, monk
     np.testing.assert_array_equal(solution.v, 0.0)
 
 
-@pytest.mark.skipif(not kernels.ACCELERATED, reason="nothing is compiled")
 def test_a_law_that_takes_over_is_the_one_that_counts(controller, panda):
     class Creep:
         bounded = False
@@ -150,6 +149,7 @@ def test_a_law_that_takes_over_is_the_one_that_counts(controller, panda):
     assert not np.isclose(controller.step(panda.home).v, 0.01).any()
 
 
+@pytest.mark.skipif(not kernels.ACCELERATED, reason="nothing is compiled")
 def test_nothing_is_compiled_after_construction(controller, panda):
     def compiled():
         functions = {name: getattr(kernels, name) for name in kernels.__all__}
