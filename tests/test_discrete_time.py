@@ -119,6 +119,22 @@ def test_what_the_guard_lets_through_is_clear_by_brute_force(panda):
     assert looked > 100 and drawn_back > 20
 
 
+def test_a_way_that_bends_is_looked_at_however_far_everything_is(panda, monkeypatch):
+    """A joint that comes fast to its limit brakes harder than others: what is known of straight ways will not do."""
+    controller, bounds, looks = make_controller(panda), panda.bounds(), []
+    guard = controller._commander.guard
+    worst = guard._worst
+    monkeypatch.setattr(guard, "_worst", lambda *given: looks.append(given[2]) or worst(*given))
+    q, v = panda.home.copy(), np.zeros(7)
+    v[0] = 0.5 * bounds.velocity[0]
+    for short, looked in ((0.5, False), (0.02, True)):
+        looks.clear()
+        q[0] = bounds.upper[0] - short
+        controller.reset(v)
+        commanded = controller.filter(q, v).v
+        assert commanded[0] > 0.0 and bool(looks) == looked
+
+
 def test_a_stop_ordered_at_any_tick_is_clear_also_at_the_limits(panda):
     """The same with stops as they are driven, in which joints that come to their limits brake harder than others."""
     rng, bounds, stops, at_limits = np.random.default_rng(1), panda.bounds(), 0, 0

@@ -158,7 +158,7 @@ class Guard:
         self._place_obstacles(query)
         speed = float(query.placing.speeds.max())
         gap = (float(query.found(query.pairs).min()) if len(near) else reach) - self._hold
-        look = partial(self._worst_of_stop, assembly) if self._jerked else self._worst
+        look = partial(self._worst_of_stop if self._jerked else self._worst, assembly)
         worst, pair = look(q, v, query, gap, speed)
         if worst >= 0.0:
             return None
@@ -186,13 +186,16 @@ class Guard:
             self._heard = bool(self._news.any())
         self._ahead.placing.margin[:] = now.placing.margin
 
-    def _worst(self, q: Array, v: Array, now: DistanceQuery, gap: float, speed: float) -> tuple[float, int]:
+    def _worst(
+        self, assembly: Assembly, q: Array, v: Array, now: DistanceQuery, gap: float, speed: float
+    ) -> tuple[float, int]:
         """Least of distance - what it has to be, along the way of v and its stop [m], and the pair that it is of.
 
         The steps are such that no two bodies can meet in between, and no shorter than `_FINEST`: what a pair could come
         nearer within one of those is of second order in it, as it was not too near at either end.
 
         Args:
+            assembly: of this tick.
             q: start (nq,).
             v: velocity (nv,).
             now: distances there.
@@ -200,7 +203,7 @@ class Guard:
             speed: that no point of the robot exceeds [m/s].
         """
         worst, pair, looks = np.inf, -1, 0
-        pieces = self._way(q, v)
+        pieces = self._way(assembly, q, v)
         left = sum(duration for *_, duration in pieces)
         for start, along, duration in pieces:
             t = 0.0
@@ -256,12 +259,10 @@ class Guard:
         least = found[int(np.argmin([each.left for each in found]))]  # the first NaN, where there is one
         return least.left, least.pair
 
-    def _way(self, q: Array, v: Array) -> list[tuple[Array, Array, float]]:
+    def _way(self, assembly: Assembly, q: Array, v: Array) -> list[tuple[Array, Array, float]]:
         """Straight pieces of the way of v and its stop: where each starts, its velocity and for how long [s]."""
         end = self._end(self._stopping(v))
-        x = self._bounds
-        last = pin.integrate(self._model, q, end * v)[x.q_index]
-        if end > self._dt and ((last < x.lower) | (last > x.upper)).any():
+        if end > self._dt and assembly.bends(q, v, end):
             return self._bent_way(q, v)
         return [(q, v, end)]
 
