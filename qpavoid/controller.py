@@ -151,6 +151,7 @@ class Controller:
         self.tick(q)
         self.filter(q, v)
         self._assembly.closest_call(v, 0, self._reach, self.dt)
+        self._assembly.bends(q, v, self.dt)
         self.reset()
 
     @classmethod
