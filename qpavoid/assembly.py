@@ -8,26 +8,18 @@ from typing import NamedTuple
 import numpy as np
 
 from qpavoid import kernels
-from qpavoid.avoidance import row_form
 from qpavoid.config import Avoidance, Limits
 from qpavoid.contacts import ContactRows, tracking_within
 from qpavoid.kernels.layout import RowLayout
 from qpavoid.kernels.vectorised.stops import easing_stop
-from qpavoid.kinematics import (
-    ForwardKinematics,
-    Kinematics,
-    chains,
-    column_joints,
-    columns,
-    longest_lever,
-    support_masks,
-)
-from qpavoid.limits import JointBounds, limit_layout
+from qpavoid.kinematics import ForwardKinematics, Kinematics, support_masks
+from qpavoid.limits import JointBounds
 from qpavoid.motion import Sample
 from qpavoid.problem import Array, AvoidanceRows, Problem, Proximity, Tracking
 from qpavoid.proximity import DistanceQuery
 from qpavoid.scene import Scene
-from qpavoid.tasks import AnyTask, in_order, task_layout, task_levels
+from qpavoid.tasks import AnyTask, in_order, task_levels
+from qpavoid.tick_memory import hand_over, lay_out
 
 _MOST_TICKS = 1000
 """Ticks of a stop that are followed."""
@@ -83,49 +75,11 @@ class Assembly:
     ) -> None:
         """Lays the memory out; see `Controller` for the arguments, and `RowLayout` for `looks_ahead`."""
         frames, self._others = in_order(tasks)
-        pairs, nv = len(scene.pairs), scene.robot.model.nv
-        self._pairs, self._masks = scene.pairs, support_masks(scene.robot.model)
-        turning, sliding = chains(scene.robot.model)
-        joint_reach = query.joint_reach()
-        self._layout = RowLayout(
-            J_world=kinematics.J,
-            columns=columns(scene.robot.model),
-            mimics=scene.robot.model.nvExtended > nv,
-            mimicking=np.zeros(scene.robot.model.nvExtended),
-            frame_poses=kinematics.frame_poses,
-            **task_layout(frames, self._others, scene.robot.model),
-            results=query.results,
-            support=scene.support.copy(),
-            twists=query.placing.twists,
-            twist_row=query.twist_row,
-            margin=query.placing.margin,
-            joint_poses=kinematics.joint_poses,
-            parents=np.array(list(scene.robot.model.parents), dtype=np.intp),
-            column_joints=column_joints(scene.robot.model),
-            joint_reach=joint_reach,
-            carriers=query.carriers(),
-            bodies=np.array(scene.pairs, dtype=np.intp),
-            body_poses=query.poses,
-            boxes=query.boxes(),
-            convex=query.convex(),
-            turning=turning,
-            sliding=sliding,
-            spins=np.zeros((scene.robot.model.njoints, 3)),
-            speeds=query.placing.speeds,
-            near=np.zeros(pairs, dtype=np.intp),
-            closest=np.zeros((pairs, 10)),
-            J=np.zeros((pairs, nv)),
-            drift=np.zeros(pairs),
-            d=np.zeros(pairs),
-            least=np.zeros(pairs),
-            touch=np.zeros(pairs),
-            **limit_layout(bounds, limits.position_gain, dt),
-            v0=np.zeros(nv),
-            lever=longest_lever(scene.robot.model, query.longest_reach()),
-            damping=damping,
-            # with jerk limits, a stop goes another way; with contacts, v0 does
-            looks_ahead=looks_ahead and contacts is None and not np.isfinite(bounds.jerk).any(),
-            **row_form(avoidance),
+        self._masks = support_masks(scene.robot.model)
+        # with jerk limits, a stop goes another way; with contacts, v0 does
+        looks_ahead = looks_ahead and contacts is None and not np.isfinite(bounds.jerk).any()
+        self._layout = lay_out(
+            scene, frames, self._others, bounds, kinematics, query, avoidance, limits, damping, dt, looks_ahead
         )
         x = self._layout
         self._hard = (x.hard_lower, x.hard_upper) if limits.acceleration_gives_way else (x.lower, x.upper)
@@ -138,8 +92,8 @@ class Assembly:
         self._tracking = Tracking(self._layout.A, self._layout.b, damping)
         self._levels = levels if len(levels) > 1 else ()
         self._forward, self._contacts = kinematics, contacts
-        self._eye = np.eye(nv)
-        self._before, self._change = np.zeros(nv), np.zeros(nv)
+        self._eye = np.eye(len(x.v0))
+        self._before, self._change = np.zeros_like(x.v0), np.zeros_like(x.v0)
         self.limits_may_give_way = x.jerked or (contacts is not None and x.accelerated)
         """Whether `beyond_limits` has to be asked: bounds alone do not keep to accelerations and jerks then."""
         self.kinematics = Kinematics(self._layout.J_world, self._layout.poses)
@@ -178,11 +132,7 @@ class Assembly:
 
     def carry(self, query: DistanceQuery) -> None:
         """Takes over which joint carries what, in place."""
-        x = self._layout
-        joints = np.array([body.parentJoint for body in query.bodies], dtype=np.intp)[self._pairs]
-        x.support[:] = self._masks[joints[:, 1]] - self._masks[joints[:, 0]]
-        x.carriers[:] = query.carriers()
-        x.joint_reach[:] = query.joint_reach()
+        hand_over(self._layout, self._masks, query)
 
     def closest_call(self, v: Array, near: int, reach: float, horizon: float, stop: Stop | None = None) -> float:
         """A bound below what is left of the safe distances on the way of v until `horizon` [m].

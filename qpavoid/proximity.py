@@ -1,7 +1,7 @@
-"""Closest points of the pairs within reach; by coal, without a Python loop.
+"""Closest points of the pairs within reach; without a Python loop.
 
-Bounding spheres tell which pairs can be within reach at all; the others are switched off, so that one call into C++
-does the rest, and its results are viewed as one array.
+Bounding spheres tell which pairs can be within reach at all. Compiled code has the closed forms of spheres, capsules
+and boxes; one call of coal does the rest, with all other pairs switched off, and its results are viewed as one array.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from qpavoid import kernels
 from qpavoid.config import PointCloud
 from qpavoid.geometry.bodies import bounding_box, bounding_sphere
 from qpavoid.geometry.cloud import Voxels
+from qpavoid.geometry.cores import cores, with_closed_form
 from qpavoid.geometry.slots import Slots
 from qpavoid.memory import read_poses, read_results, view_poses, view_results
 from qpavoid.motion import Sample
@@ -71,11 +72,17 @@ class DistanceQuery:
         """(m,) which pairs are computed at all."""
         self.twist_row: IntArray = np.zeros(len(scene.pairs), dtype=np.intp)
         """(m,) row of `twists` that moves each pair."""
+        self._cores = cores([body.geometry for body in bodies])
+        self._known = with_closed_form(self._cores, scene.pairs) & kernels.ACCELERATED
+        self._others = bool(len(self._known)) and not self._known.all()
+        self._met = np.zeros(len(scene.pairs), dtype=np.intp)
         self._cull = _Cull(scene, self) if len(scene.pairs) >= _CULL_FROM or self._slots else None
         self.pairs: IntArray = np.arange(len(scene.pairs))
         """(c,) pairs that were computed and are to get rows, increasing."""
         self._surface = _surface_pairs(scene)
         self.switch()
+        if kernels.ACCELERATED:
+            self._in_closed_form(self.pairs[:0])  # no tick waits for the compiler
 
     @property
     def bodies(self) -> Any:
@@ -167,7 +174,7 @@ class DistanceQuery:
         if self._cull is not None:
             self._cull.enable(self.enabled)
         else:
-            for pair, on in enumerate(self.enabled.tolist()):
+            for pair, on in enumerate((self.enabled & ~self._known).tolist()):
                 (self._data.activateCollisionPair if on else self._data.deactivateCollisionPair)(pair)
 
     def compute(self, data: Any, reach: float) -> None:
@@ -184,8 +191,11 @@ class DistanceQuery:
             for index, slots in self._slots.items():
                 self._fill(index, slots, reach)
         pairs = self._on if self._cull is None else self._cull.switch(reach)
-        pin.computeDistances(self._geometry, self._data)
-        if self._copy:
+        if self._others:
+            pin.computeDistances(self._geometry, self._data)
+        if kernels.ACCELERATED:
+            self._in_closed_form(pairs)
+        elif self._copy:
             self.results[:] = read_results(self._data.distanceResults)
         if self._surface is not None:
             self._mend_surfaces(pairs)
@@ -226,6 +236,19 @@ class DistanceQuery:
         most = np.zeros_like(given)
         np.maximum.at(most, self.group, given)
         return most[self.group]
+
+    def _in_closed_form(self, pairs: IntArray) -> None:
+        """Distances of the pairs that have one; those whose cores meet are computed by coal after all."""
+        from qpavoid.kernels.compiled.closed_forms import closed_forms
+
+        bodies, count = self._scene.pairs, 0
+        if self._copy and self._others:
+            self.results[~self._known] = read_results(self._data.distanceResults)[~self._known]
+        count = closed_forms(self.poses, self._cores, bodies, self._known, pairs, self.results, self._met)
+        for pair in self._met[:count].tolist():
+            pin.computeDistance(self._geometry, self._data, pair)
+            if self._copy:
+                self.results[pair] = read_results([self._data.distanceResults[pair]])
 
     def _make_slots(self, index: int, voxels: Voxels) -> Slots:
         shape, first = self._scene.obstacles[index].shape, self._movable
@@ -286,6 +309,9 @@ class _Cull:
         self._found = np.zeros(len(scene.pairs), dtype=np.intp)
         self.active = np.ones(len(scene.pairs), dtype=bool)
         """(m,) which pairs are on."""
+        self._by_coal = ~query._known
+        for pair in np.flatnonzero(query._known).tolist():
+            self._data.deactivateCollisionPair(pair)
         self._last = np.arange(len(scene.pairs)).tobytes()
         kernels.in_one_alone(self._found, np.frombuffer(self._last, dtype=np.intp))  # so that no tick compiles it
 
@@ -313,6 +339,7 @@ class _Cull:
             changed = kernels.in_one_alone(pairs, np.frombuffer(self._last, dtype=np.intp))
             self._last = now
             self.active[changed] ^= True
+            changed = changed[self._by_coal[changed]]
             for pair, on in zip(changed.tolist(), self.active[changed].tolist(), strict=True):
                 (self._data.activateCollisionPair if on else self._data.deactivateCollisionPair)(pair)
         return pairs

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from qpavoid import Controller, Obstacle, Sample, ScenarioConfig, Status, kernels, load_scenario
-from qpavoid.ahead.flights import Start, _farthest
+from qpavoid.ahead.flights import Manner, Near, Start, _farthest
 from qpavoid.config import Avoidance, Box, Escape, Limits, Line, Sphere
 from qpavoid.errors import ConfigError
 from qpavoid.motion import build_motion
@@ -91,6 +91,10 @@ def test_commands_of_others_are_kept_out_of_traps_too(tmp_path):
         assert (least < 0.0) == trapped
 
 
+STILL = Manner(1.0, np.zeros(4))
+"""A second ahead, leaning nowhere."""
+
+
 def test_the_farthest_velocity_is_that_of_a_linear_program():
     from scipy.optimize import linprog
 
@@ -98,7 +102,7 @@ def test_the_farthest_velocity_is_that_of_a_linear_program():
     for _ in range(50):
         A, d = 0.2 * rng.normal(size=(6, 4)), rng.uniform(0.0, 0.1, 6)
         lower, upper = -np.ones(4), np.ones(4)
-        v = _farthest(A, d, 10.0, np.zeros(4), lower, upper)
+        v = _farthest(Near(np.column_stack((d, np.zeros((6, 9)))), A, np.zeros(6)), STILL, 10.0, lower, upper)
         best = linprog(
             [0, 0, 0, 0, -1], A_ub=np.column_stack((-A, np.ones(6))), b_ub=d, bounds=[(-1, 1)] * 4 + [(None, None)]
         )
@@ -111,14 +115,8 @@ def test_both_solvers_of_flights_agree(monkeypatch):
         pytest.skip("there is only one without numba")
     rng = np.random.default_rng(1)
     for _ in range(20):
-        arguments = (
-            0.2 * rng.normal(size=(5, 3)),
-            rng.uniform(0.0, 0.1, 5),
-            0.1,
-            rng.normal(size=3),
-            -np.ones(3),
-            np.ones(3),
-        )
+        near = Near(rng.uniform(0.0, 0.1, (5, 10)), rng.normal(size=(5, 3)), 0.1 * rng.normal(size=5))
+        arguments = near, Manner(0.2, rng.normal(size=3)), 0.1, -np.ones(3), np.ones(3)
         fast = _farthest(*arguments)
         with monkeypatch.context() as patch:
             patch.setattr(kernels, "ACCELERATED", False)
@@ -238,13 +236,13 @@ def among_balls(request):
 
 
 def start_of(planner, q, t, v=None):
-    return Start(q, np.zeros(len(q)) if v is None else v, np.zeros(len(q)), t, planner._parted)
+    return Start(q, np.zeros(len(q)) if v is None else v, np.zeros(len(q)), t, planner.flights.parted)
 
 
 def largest_change(flight, times):
     """Of the velocities of a flight from tick to tick, or of that change itself."""
     before = [flight.start.v - flight.start.w, flight.start.v]
-    return np.abs(np.diff([*before, *flight.v], times, axis=0)).max(initial=0.0)
+    return np.abs(np.diff(np.vstack((before, flight.v)), times, axis=0)).max(initial=0.0)
 
 
 def test_a_flight_that_is_flown_again_is_the_same_and_so_is_what_is_left_of_it(among_balls):
@@ -298,7 +296,7 @@ def test_a_plate_that_is_passed_between_two_looks_is_seen(tmp_path):
         planner = controller._commander.escape
         q = np.array([-0.5 - shift, 0.0])
         still, start = planner.flights.still, start_of(planner, q, 0.0)
-        flight = planner.flights.fly(start, still, 4 * 10 * [np.array([3.0, 0.0])])
+        flight = planner.flights.fly(start, still, np.tile([3.0, 0.0], (40, 1)))
         touches = (0.45 + shift) / 3.0
         assert flight.until == pytest.approx(touches, abs=0.04), shift
 
@@ -313,7 +311,7 @@ def test_what_was_found_clear_is_looked_at_anew_when_obstacles_turn(tmp_path):
     def told(speed):
         return {"chaser": Sample.at([-0.4, 0.0, 0.0], linear=[speed, 0.0, 0.0])}
 
-    start = Start(robot.home, np.zeros(2), np.zeros(2), 0.0, planner._parted)
+    start = Start(robot.home, np.zeros(2), np.zeros(2), 0.0, planner.flights.parted)
     for speed, clear in ((0.0, 1.5), (0.5, 0.25 / 0.5)):
         controller._obstacles.observe(0.0, told(speed))
         planner.flights.forget_foreseen()
@@ -355,8 +353,10 @@ def test_no_flight_is_flown_where_nothing_comes_near(tmp_path, monkeypatch):
         controller.step(q, k * DT, {"y": Sample.at([0.0, 0.0, 0.0])})
         if flown:
             break
-    near = 3.0 - 0.15 - 0.3 * (k * DT + 1.51)  # where it will be a tick and 1.5 s later, looked at every 0.1 s
-    assert near - 0.015 < 0.1 < near - 0.015 + 0.03
+    near = 3.0 - 0.15 - 0.3 * (k * DT + 1.51)  # where it will be a tick and 1.5 s later
+    assert (
+        near - 0.015 - 0.03 < 0.1 < near - 0.015 + 0.03
+    )  # looked at every 0.1 s, up to the first such time after that
 
 
 @settings(max_examples=60, deadline=None)
@@ -376,7 +376,7 @@ def test_where_nobody_is_said_to_come_nobody_does(tmp_path_factory, lines, t, v)
         return
     controller = make_controller(robot, obstacles, avoidance=Avoidance(d1=0.02, d2=0.1, escape=Escape()))
     planner, v = controller._commander.escape, np.array(v)
-    if planner._nobody_comes(Start(robot.home, v, np.zeros(2), t, planner._parted)):
+    if planner._nobody_comes(Start(robot.home, v, np.zeros(2), t, planner.flights.parted)):
         for later in np.linspace(0.0, 1.5, 76):
             ramp = np.minimum(later, np.abs(v) / 2.0)
             q = robot.home + np.sign(v) * (np.abs(v) * ramp - ramp**2)
@@ -400,7 +400,7 @@ def test_a_flight_holds_only_while_it_is_of_what_is(tmp_path, among_balls):
     )
     assert planner.flights.holds_from(flight, flight.start)
     assert not planner.flights.holds_from(flight, flight.start._replace(t=0.02))  # obstacles are elsewhere by then
-    assert not planner.flights.holds_from(flight, flight.start._replace(watched=~planner._parted))
+    assert not planner.flights.holds_from(flight, flight.start._replace(watched=~planner.flights.parted))
     load = Obstacle.at("load", Sphere(radius=0.02), [0.3, 0.0, 0.0], graspable=True)
     ball = Obstacle(
         "ball", Sphere(radius=0.1), build_motion(Line(start=(0.0, 0.6, 0.0), end=(0.0, -2.0, 0.0), speed=0.01)), True

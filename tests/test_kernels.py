@@ -1081,7 +1081,8 @@ def test_a_run_is_the_same_with_and_without_numba(tmp_path, scenario, ticks):
             runs.append(dict(saved))
     plain, fast = runs
     assert not plain["accelerated"] and fast["accelerated"]
-    np.testing.assert_allclose(fast["v"], plain["v"], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(fast["v"], plain["v"], rtol=0, atol=1e-8)
     assert len(plain["avoidance d"]) > 50 and np.abs(plain["v"]).max() > 0.1
     for name in plain.keys() - {"v", "accelerated"}:
-        np.testing.assert_allclose(fast[name], plain[name], rtol=1e-12, atol=1e-12, err_msg=name)
+        exact = 1e-8 if "avoidance" in name else 1e-12  # coal iterates where compiled code has a closed form
+        np.testing.assert_allclose(fast[name], plain[name], rtol=exact, atol=exact, err_msg=name)

@@ -21,6 +21,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 import pinocchio as pin
 
+from qpavoid import kernels
 from qpavoid.ahead.flights import TOUCH, Flight, Flights, Manner, Start, Value
 from qpavoid.limits import JointBounds
 from qpavoid.obstacles.sensing import Obstacles
@@ -55,18 +56,20 @@ class EscapePlanner:
         self.flights, self._settings = flights, flights.settings
         self._model, self._obstacles, self._dt = scene.robot.model, obstacles, dt
         self._braking = 0.5 / bounds.acceleration
-        self._parted = np.any(scene.support != 0.0, axis=1)
         self.reset()
 
     def reset(self) -> None:
         """Forgets the flight that was kept; what is drawn from now on is drawn again after the next reset."""
         self._kept: Flight | None = None
         self._random, self._untried = np.random.default_rng(0), list[float]()
+        self._first: int | None = None
+        self._seen_paths = (np.zeros((0, 0, 3)), np.zeros(0))
         self.flights.forget_foreseen()
 
     def look_anew(self) -> None:
         """What the robot carries, or what may touch, has changed: the flight that is kept has to be flown anew."""
-        self.flights.forget_foreseen()
+        self.flights.look_anew()
+        self._first = None
         if self._kept is not None:
             self._kept = self._kept._replace(until=-np.inf)
 
@@ -84,7 +87,7 @@ class EscapePlanner:
         if not len(self._obstacles.moving):
             return None
         self.flights.go_on_to(t - _SPAN)
-        watched = self._parted.copy()
+        watched = self.flights.parted.copy()
         watched[proximity.pair[proximity.distance < TOUCH]] = False
         next_tick = Start(pin.integrate(self._model, q, self._dt * v), v, v - v_last, t + self._dt, watched)
         if self._nobody_comes(next_tick):
@@ -94,7 +97,7 @@ class EscapePlanner:
         if onward.value < self.flights.enough:
             kept, left = self._way_out(Start(q, v_last.copy(), w_last.copy(), t, watched))
             onward = self._best((self.flights.fly(next_tick, self._drawn()) for _ in range(left)), onward)
-            if not self._as_good(onward.value, kept.value) and kept.v:
+            if not self._as_good(onward.value, kept.value) and len(kept.v):
                 self._kept = self.flights.a_tick_on(kept)
                 return None if np.array_equal(kept.v[0], v) else kept.v[0]
         self._kept = onward
@@ -107,23 +110,27 @@ class EscapePlanner:
 
         Between the times at which they are looked at, obstacles are taken to be no faster than at these.
         """
-        moving, horizon = self._obstacles.moving, self._settings.horizon
-        end = start.t + horizon
-        between = range(int(np.floor(start.t / _SPAN)) + 1, int(np.ceil(end / _SPAN)))
-        times = [start.t, *[k * _SPAN for k in between], end]  # most are those of the tick before
-        states = np.array([self.flights.foreseen(t).states[moving] for t in times])
-        strides = 0.5 * _SPAN * np.sqrt(np.square(states[:, :, 12:15]).sum(axis=2).max(axis=0))
+        paths, strides = self._paths(int(np.floor(start.t / _SPAN)))
         self.flights.kinematics.compute(start.q)
         centers, radii = self.flights.query.body_spheres(self.flights.kinematics.data)
-        offset = states[:, :, None, 9:12] - centers
-        apart = np.sqrt(np.einsum("tobi,tobi->tob", offset, offset)) - radii
         stop = float(np.square(start.v) @ self._braking)
         least = self._settings.comfort + (self.flights.lever * stop if stop else 0.0)
-        return bool((apart.min(axis=(0, 2)) - self.flights.query.placing.reach[moving] - strides > least).all())
+        reach = self.flights.query.placing.reach[self._obstacles.moving] + strides + least
+        return kernels.least_apart(paths, centers, reach[:, None] + radii) > 0.0
+
+    def _paths(self, first: int) -> tuple[Array, Array]:
+        """Centres of what moves every `_SPAN` from a multiple of that on (t, k, 3), and how far it may be from these in
+        between (k,) [m].
+        """
+        if first != self._first or self._obstacles.told is not None:
+            count = int(np.ceil(self._settings.horizon / _SPAN)) + 2
+            paths, speeds = self._obstacles.paths(_SPAN * np.arange(first, first + count, dtype=np.float64))
+            self._first, self._seen_paths = first, (np.ascontiguousarray(paths), 0.5 * _SPAN * speeds.max(axis=0))
+        return self._seen_paths
 
     def _onward(self, start: Start) -> Iterator[Flight]:
         """The flight that is kept, if it holds; flights like it, by its manner and its velocities; standing still."""
-        if self._kept is not None and self._kept.v:
+        if self._kept is not None and len(self._kept.v):
             kept = self.flights.a_tick_on(self._kept)
             if self.flights.holds_from(kept, start):
                 yield kept
@@ -152,7 +159,7 @@ class EscapePlanner:
         known, attempts = self._kept, self._settings.attempts
         if known is not None and self.flights.holds_from(known, start):
             return known._replace(start=start), attempts
-        manner, given = (self.flights.still, ()) if known is None else (known.manner, known.v)
+        manner, given = (self.flights.still, None) if known is None else (known.manner, known.v)
         best = self.flights.fly(start, manner, given)
         while attempts and best.value < self.flights.enough:
             attempts -= 1

@@ -9,7 +9,6 @@ This is greedy, and runs into dead ends; which v̂ leads out of one cannot be to
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -18,15 +17,15 @@ import pinocchio as pin
 
 from qpavoid import kernels
 from qpavoid.ahead.ramps import Ramps
-from qpavoid.assembly import Assembly
 from qpavoid.config import Avoidance, Escape, Limits
-from qpavoid.kinematics import ForwardKinematics, longest_lever
+from qpavoid.kinematics import ForwardKinematics, longest_lever, support_masks
 from qpavoid.limits import JointBounds
-from qpavoid.obstacles.sensing import Obstacles, Seen
-from qpavoid.problem import Array, IntArray, Mask
+from qpavoid.obstacles.sensing import Obstacles, Seen, Told
+from qpavoid.problem import Array, Mask
 from qpavoid.proximity import DistanceQuery
 from qpavoid.scene import Scene
 from qpavoid.solvers.backends import solve_daqp
+from qpavoid.tick_memory import hand_over, lay_out
 
 _GENTLE = 1e-4
 """ε: what the square of a joint speed counts beside that of a distance [m²/(rad/s)²]."""
@@ -50,22 +49,14 @@ class Manner(NamedTuple):
 
 
 class Near(NamedTuple):
-    """What a flight looks at; in memory that the next look overwrites."""
+    """What a flight looks at: the watched pairs within reach; in memory that the next look overwrites."""
 
-    pair: IntArray
-    """(k,) numbers of the watched pairs within reach."""
-    distance: Array
-    """(k,) of these [m]."""
+    closest: Array
+    """(k, 10) distances first [m]."""
     J: Array
     """(k, nv) velocity Jacobian of these distances."""
     drift: Array
     """(k,) their rate due to the obstacles [m/s]."""
-    lower: Array
-    """(nv,) bounds on the velocity of the next period."""
-    upper: Array
-    """(nv,)."""
-    least: float
-    """Smallest distance; the reach, where nothing is nearer [m]."""
 
 
 class Start(NamedTuple):
@@ -99,39 +90,34 @@ class Flight(NamedTuple):
     """Velocities, and where they lead."""
 
     start: Start
-    v: list[Array]
-    """(nv,) for each tick."""
+    v: Array
+    """(k, nv) of each tick."""
     manner: Manner
     value: Value
     until: float
     """When something touches; the end, if nothing does before [s]."""
     least: float
     """Smallest distance of pairs that do not touch, up to that at which flights look at pairs [m]."""
+    told: Told | None
+    """What was told of obstacles when it was flown."""
 
 
 class _Tally:
     """What touches in the course of a flight."""
 
-    def __init__(self, start: Start, horizon: float, reach: float) -> None:
-        self.watched, self.until, self.least = start.watched, np.inf, np.inf
-        self.lost, self._before, self._deadline, self._reach = 0.0, np.inf, start.t + horizon, reach
+    def __init__(self, start: Start, horizon: float) -> None:
+        self.watched, self.until, self.least = start.watched.copy(), np.inf, np.inf
+        self.lost, self._before, self._deadline = 0.0, np.inf, start.t + horizon
 
-    def count(self, near: Near, t: float, span: float) -> Near:
-        """Takes a look into account, at t, `span` after the last one [s]; gives what of it is to be watched on."""
-        touching = near.distance < TOUCH
-        if touching.any():
-            closing = self._before - near.least
-            when = t - span * (TOUCH - near.least) / closing if 0.0 < closing < np.inf else t
-            self.until = min(self.until, float(when))
-            self.lost += float(touching.sum()) * max(self._deadline - when, 0.0)
-            self.watched = self.watched.copy()
-            self.watched[near.pair[touching]] = False
-            rest = ~touching
-            pair, distance = near.pair[rest], near.distance[rest]
-            least = float(distance.min(initial=self._reach))
-            near = Near(pair, distance, near.J[rest], near.drift[rest], near.lower, near.upper, least)
-        self.least, self._before = min(self.least, near.least), near.least
-        return near
+    def count(self, found: tuple[int, float, float], t: float, span: float) -> None:
+        """Takes what a look has found, see `look_around`, into account; at t, `span` after the last one [s]."""
+        touching, nearest, rest = found
+        if touching:
+            closing = self._before - nearest
+            when = t - span * (TOUCH - nearest) / closing if 0.0 < closing < np.inf else t
+            self.until = min(self.until, when)
+            self.lost += touching * max(self._deadline - when, 0.0)
+        self.least, self._before = min(self.least, rest), rest
 
 
 class Flights:
@@ -166,7 +152,14 @@ class Flights:
         self.kinematics, self.query = ForwardKinematics(model), DistanceQuery(scene)
         # what is wanted may be farther away than jerks get in a period
         free = replace(bounds, jerk=np.full(model.nv, np.inf))
-        self._assembly = Assembly(scene, (), free, self.kinematics, self.query, avoidance, limits, 0.01, self.period)
+        self._layout = lay_out(scene, (), (), free, self.kinematics, self.query, avoidance, limits, 0.01, self.period)
+        self._packed, self._masks = kernels.pack(self._layout), support_masks(model)
+        self._views: dict[int, Near] = {}
+        self._none = np.zeros((0, model.nv))
+        self._flat = all(joint.nv == 1 for joint in list(model.joints)[1:])
+        """Whether the velocities of some ticks lead as far as their sum: joints of one coordinate each."""
+        self.parted = self._which_part()
+        """(m,) pairs that the robot can part."""
         self.ramps = Ramps(bounds, dt)
         """How it gets from one velocity to another."""
         self.lever = max(1.0, longest_lever(model, self.query.longest_reach()))
@@ -176,18 +169,32 @@ class Flights:
         self.still = Manner(0.0, np.zeros(model.nv))
         """Standing still."""
         self._foreseen: dict[float, Seen] = {}
-        _farthest(np.zeros((1, model.nv)), np.zeros(1), 0.1, np.zeros(model.nv), *2 * [np.zeros(model.nv)])  # compiles
+        still, now = (
+            np.zeros(model.nv),
+            Start(scene.robot.home, self.still.leaning, self.still.leaning, 0.0, self.parted),
+        )
+        self.fly(now, Manner(0.1, still), still[None])  # compiles
+        self.forget_foreseen()
 
     def go_on_to(self, t: float) -> None:
         """Forgets what was foreseen and is over at t [s]; all of it, where obstacles are told of."""
-        if self._obstacles.told:
+        if self._obstacles.told is not None:
             self._foreseen.clear()
         elif len(self._foreseen) > _MANY:
             self._foreseen = {at: seen for at, seen in self._foreseen.items() if at > t}
 
+    def look_anew(self) -> None:
+        """What the robot carries, or what may touch, has changed."""
+        hand_over(self._layout, self._masks, self.query)
+        self.parted = self._which_part()
+        self.forget_foreseen()
+
     def forget_foreseen(self) -> None:
         """There is news of the obstacles: where they will be has to be foreseen anew."""
         self._foreseen.clear()
+
+    def _which_part(self) -> Mask:
+        return np.asarray(np.any(self._layout.support != 0.0, axis=1))
 
     def foreseen(self, t: float) -> Seen:
         """The obstacles that move, as far as is known, at t [s]."""
@@ -205,25 +212,24 @@ class Flights:
         """Whether a flight that is good enough is so from a start close to its own, without another look.
 
         The same velocities lead past the same places, but for how far the start is off, and what is lost until they are
-        reached. No point of the robot is farther off than the longest lever times the sum of that over the joints.
+        reached. No point of the robot is farther off than the longest lever times the sum of that over the joints; and
+        no point of an obstacle than what is told of it now differs from what was.
         """
-        if self._obstacles.told or flight.until < start.t + self.settings.horizon - 1e-9:
+        if flight.until < start.t + self.settings.horizon - 1e-9:
             return False
         if abs(start.t - flight.start.t) > 1e-6 or not np.array_equal(flight.start.watched, start.watched):
             return False
-        off, v, w = pin.difference(self._model, flight.start.q, start.q), start.v, start.w
+        off = pin.difference(self._model, flight.start.q, start.q)
         most = float(np.abs(off).sum())
         if self.ramps.accelerated:
-            for wanted in flight.v:
-                before, (v,) = v, self.ramps.towards(v, w, [wanted])
-                w = v - before
-                off += self._dt * (v - wanted)
-                most = max(most, float(np.abs(off).sum()))
-                if np.array_equal(v, wanted):
-                    break
-        return bool(flight.least - self.lever * most >= self.enough.distance)
+            steps = self.ramps.towards(start.v, start.w, flight.v, meets=True)
+            off = off + self._dt * np.cumsum(steps - flight.v[: len(steps)], axis=0)
+            most = max(most, float(np.abs(off).sum(axis=1).max(initial=0.0)))
+        span = self.settings.horizon + _BEYOND
+        strayed = self._obstacles.strayed(flight.told, span, self.query.placing.reach)
+        return bool(flight.least - self.lever * most - strayed >= self.enough.distance)
 
-    def fly(self, start: Start, manner: Manner, given: Sequence[Array] = ()) -> Flight:
+    def fly(self, start: Start, manner: Manner, given: Array | None = None) -> Flight:
         """Flees with decisions a period apart until the horizon; what has touched is left out of account from then on.
 
         Distances are looked at as often, and midway where something may come too near and part again before that. All
@@ -232,73 +238,86 @@ class Flights:
         Args:
             start: where it begins.
             manner: how it flees.
-            given: velocities (nv,) of the first ticks, for as many decisions as they suffice; it flees from then on.
+            given: velocities (k, nv) of the first ticks, for as many decisions as they suffice; it flees from then on.
         """
         q, v, w, t, _ = start
         horizon, safe = self.enough
-        end, plan, tally = t + horizon + _BEYOND, list[Array](), _Tally(start, horizon, self.settings.reach)
-        near = tally.count(self._look(q, t, v, tally.watched), t, 0.0)
-        count = self._ticks - round(t / self._dt) % self._ticks
+        end, plan, tally, given = (
+            t + horizon + _BEYOND,
+            list[Array](),
+            _Tally(start, horizon),
+            self._none if given is None else given,
+        )
+        near = self._look(q, t, v, tally, 0.0)
+        count, done = self._ticks - round(t / self._dt) % self._ticks, 0
         while t < end - 1e-9:
-            wanted = given[len(plan) : len(plan) + count]
+            wanted = given[done : done + count]
             held = len(wanted) < count
             if held:
-                wanted = [self._flee(near, manner)] * count
+                wanted = self._flee(near, manner)[None].repeat(count, axis=0)
             steps = self.ramps.towards(v, w, wanted, held)
             ahead, span = self._moved(q, steps), count * self._dt
-            rate = near.J @ steps[len(steps) // 2] + near.drift
-            if (near.distance + span * rate < safe).any():
+            if kernels.comes_too_near(*near, steps[count // 2], span, safe):
                 span *= 0.5
                 t += span
-                tally.count(self._look(pin.interpolate(self._model, q, ahead, 0.5), t, v, tally.watched), t, span)
+                self._look(pin.interpolate(self._model, q, ahead, 0.5), t, v, tally, span)
             t += span
-            near = tally.count(self._look(ahead, t, steps[-1], tally.watched), t, span)
-            plan += steps
-            w = steps[-1] - (steps[-2] if len(steps) > 1 else v)
-            q, v, count = ahead, steps[-1], self._ticks
+            near = self._look(ahead, t, steps[-1], tally, span)
+            plan.append(steps)
+            w = steps[-1] - (steps[-2] if count > 1 else v)
+            q, v, count, done = ahead, steps[-1], self._ticks, done + count
         value = Value(horizon - tally.lost, min(tally.least, safe))
-        return Flight(start, plan, manner, value, min(tally.until, t), tally.least)
+        return Flight(
+            start, np.concatenate(plan), manner, value, min(tally.until, t), tally.least, self._obstacles.told
+        )
 
-    def _moved(self, q: Array, steps: Sequence[Array]) -> Array:
-        """Where the velocities (nv,) of some ticks lead from q (nq,)."""
-        if steps[0] is steps[-1]:
-            return np.asarray(pin.integrate(self._model, q, len(steps) * self._dt * steps[0]))
+    def _moved(self, q: Array, steps: Array) -> Array:
+        """Where the velocities (k, nv) of some ticks lead from q (nq,)."""
+        if self._flat:
+            return np.asarray(pin.integrate(self._model, q, self._dt * np.add.reduce(steps)))
         for step in steps:
             q = pin.integrate(self._model, q, self._dt * step)
         return q
 
-    def _look(self, q: Array, t: float, v: Array, watched: Mask) -> Near:
-        """What is near at q (nq,), reached with v (nv,), with the obstacles where they will be at t [s]."""
-        self.query.placing.place(*self.foreseen(t))
-        self._assembly.remember(v)
+    def _look(self, q: Array, t: float, v: Array, tally: _Tally, span: float) -> Near:
+        """What is near at q (nq,), reached with v (nv,), with the obstacles where they will be at t, `span` after the
+        last look [s].
+        """
+        query, reach = self.query, self.settings.reach
+        query.placing.place(*self.foreseen(t))
         self.kinematics.compute(q)
-        self.query.compute(self.kinematics.data, self.settings.reach)
-        (pair, closest, J, drift), problem = self._assembly.compute(q, (), self.query, self.settings.reach)
-        distance, counts = closest[:, 0], watched[pair]
-        if not counts.all():
-            pair, distance, J, drift = pair[counts], distance[counts], J[counts], drift[counts]
-        least = float(distance.min(initial=self.settings.reach))
-        return Near(pair, distance, J, drift, problem.lower, problem.upper, least)
+        query.compute(self.kinematics.data, reach)
+        self._layout.v_last[:] = v
+        k, touching, nearest, rest = kernels.look_around(
+            self._packed, q, query.pairs, reach, query.placing.moving, tally.watched, TOUCH
+        )
+        tally.count((touching, nearest, rest), t, span)
+        return self._views.get(k) or self._view(k)
+
+    def _view(self, k: int) -> Near:
+        x = self._layout
+        self._views[k] = Near(x.closest[:k], x.J[:k], x.drift[:k])
+        return self._views[k]
 
     def _flee(self, near: Near, manner: Manner) -> Array:
         """Velocity (nv,) of a flight for its next period."""
-        h, v = manner.horizon, None
-        if h:
-            ahead = near.distance + h * near.drift
-            v = _farthest(h * near.J, ahead, self.settings.comfort, manner.leaning, near.lower, near.upper)
-        return np.minimum(np.maximum(0.0 if v is None else v, near.lower), near.upper)
+        lower, upper, v = self._layout.lower, self._layout.upper, None
+        if manner.horizon:
+            v = _farthest(near, manner, self.settings.comfort, lower, upper)
+        return np.minimum(np.maximum(0.0 if v is None else v, lower), upper)
 
 
-def _farthest(A: Array, d: Array, comfort: float, v: Array, lower: Array, upper: Array) -> Array | None:
-    """v (nv,) with the largest s, A v + d >= s, s <= comfort, close to the one given; None where none is found."""
+def _farthest(near: Near, manner: Manner, comfort: float, lower: Array, upper: Array) -> Array | None:
+    """v (nv,) with the largest s, see above, within its bounds (nv,); None where none is found."""
+    (closest, J, drift), (h, leaning) = near, manner
     if kernels.ACCELERATED:
         from qpavoid.kernels.compiled.active_set import farthest
 
-        w, met = farthest(A, d, comfort, _DEEPEST, _GENTLE, v, lower, upper)
-        return w if met else None
-    k, n = A.shape
+        v, met = farthest(h, closest, J, drift, comfort, _DEEPEST, _GENTLE, leaning, lower, upper)
+        return v if met else None
+    k, n = J.shape
     P = np.diag(np.append(np.full(n, _GENTLE), 1.0))
-    G = np.column_stack((A, np.full(k, -1.0)))
+    G = np.column_stack((h * J, np.full(k, -1.0)))
     low, high = np.append(lower, -_DEEPEST), np.append(upper, comfort)
-    answer = solve_daqp(P, -P @ np.append(v, comfort), G, -d, low, high)
+    answer = solve_daqp(P, -P @ np.append(leaning, comfort), G, -(closest[:, 0] + h * drift), low, high)
     return None if answer is None else answer[:n]

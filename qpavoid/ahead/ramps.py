@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from qpavoid import kernels
 from qpavoid.kernels.vectorised.bounds import speed_to_stop
+from qpavoid.kernels.vectorised.flights import ROUND_OFF
 from qpavoid.kernels.vectorised.stops import easing_stop
 from qpavoid.limits import JointBounds
 from qpavoid.problem import Array
@@ -16,8 +17,6 @@ _PLANNED = 0.8
 """Share of the jerk limits that a ramp is planned with: what is left brings the robot back onto it [-]."""
 _UNLIMITED = 1e9
 """What stands for no limit of a speed, or of the change of its change [rad/s, m/s]."""
-_ROUND_OFF = 1e-12
-"""Of a velocity [rad/s, m/s]."""
 
 
 class Steps(NamedTuple):
@@ -37,37 +36,41 @@ class Ramps:
         self.steps = Steps(bounds.acceleration * dt, np.minimum(bounds.jerk * dt * dt, _UNLIMITED))
         self.accelerated = bool(np.isfinite(bounds.acceleration).any())
         """Whether any acceleration has a limit; else whatever is wanted is had at once."""
-        self._jerked = bool(np.isfinite(bounds.jerk).any())
+        self.jerked = bool(np.isfinite(bounds.jerk).any())
+        """Whether any jerk has one."""
         self._fastest = np.minimum(bounds.velocity, _UNLIMITED)
 
-    def towards(self, v: Array, w: Array, wanted: Sequence[Array], held: bool = False) -> Sequence[Array]:
+    def towards(self, v: Array, w: Array, wanted: Array, held: bool = False, meets: bool = False) -> Array:
         """The velocities of some ticks, as close to what is wanted as the limits allow.
 
         Args:
             v: velocity (nv,).
             w: by how much it has just changed (nv,).
-            wanted: velocities (nv,), one for each tick.
+            wanted: velocities (k, nv).
             held: whether the same is wanted for long: then jerk limits do not let the ramp pass it. Else it is met
                 wherever that is possible, so that a ramp which is followed again comes out the same.
+            meets: whether to end where what is wanted is met.
+
+        Returns:
+            As many as there are until then (<= k, nv).
         """
-        if not self.accelerated:
-            return wanted
-        ramp, step = [], self.steps.v_step
+        if not self.jerked:
+            return kernels.ramp(v, wanted, self.steps.v_step, meets)
+        ramp = np.empty_like(wanted)
         for k, target in enumerate(wanted):
-            if self._jerked:
-                rate = 0.0 if held or len(wanted) < 2 else wanted[max(k, 1)] - wanted[max(k, 1) - 1]
-                w = self._change(v, w, target, rate, held)
-            else:
-                w = np.minimum(np.maximum(target - v, -step), step)
+            rate = 0.0 if held or len(wanted) < 2 else wanted[max(k, 1)] - wanted[max(k, 1) - 1]
+            w = self._change(v, w, target, rate, held)
             v = v + w
-            ramp.append(v)
+            ramp[k] = v
+            if meets and np.abs(v - target).max() < ROUND_OFF:
+                return ramp[: k + 1]
         return ramp
 
     def _change(self, v: Array, w: Array, target: Array, rate: Array | float, held: bool) -> Array:
         """The next change of v (nv,) towards a target (nv,) that itself changes at a rate (nv,) from tick to tick."""
         v_step, w_step = self.steps.v_step, (_PLANNED if held else 1.0) * self.steps.w_step
         low, high, change = np.maximum(-v_step, w - w_step), np.minimum(v_step, w + w_step), target - v
-        if held or ((change < low - _ROUND_OFF) | (change > high + _ROUND_OFF)).any():
+        if held or ((change < low - ROUND_OFF) | (change > high + ROUND_OFF)).any():
             change = change + easing_stop(Steps(v_step, w_step), rate - change, w - rate)
         room = np.maximum(np.array([self._fastest + v, self._fastest - v]), 0.0)
         down, up = speed_to_stop(room, w_step, 1.0)  # from any greater change it would pass its speed limit

@@ -23,6 +23,8 @@ from qpavoid.obstacles.courses import STATE, Courses, as_samples, move_on, put
 from qpavoid.problem import Array, IntArray, as_vector
 from qpavoid.scene import Obstacle
 
+_ROTATION, _POSITION, _LINEAR, _ANGULAR = slice(9), slice(9, 12), slice(12, 15), slice(15, 18)
+"""Where the parts of a state are."""
 _AT_REST = np.zeros(3)
 _AT_REST.setflags(write=False)
 
@@ -55,6 +57,17 @@ class Seen(NamedTuple):
     """(o, 18) of all obstacles, see `courses`; those of which there is none may be anything."""
     margin: Array
     """(o,) to be taken off the distances to each, likewise [m]."""
+
+
+class Told(NamedTuple):
+    """What a program has told of some obstacles, as far as the future follows from it."""
+
+    which: tuple[int, ...]
+    """Their numbers."""
+    states: Array
+    """(k, 18) see `courses`."""
+    t: float
+    """When [s]."""
 
 
 class Observation(NamedTuple):
@@ -103,9 +116,48 @@ class Obstacles:
         return self._seen.which
 
     @property
-    def told(self) -> bool:
-        """Whether any is given from outside, so that what was foreseen of it may change from tick to tick."""
-        return bool(self._known)
+    def told(self) -> Told | None:
+        """What is known at the last tick of those that are given from outside; None where none is."""
+        which = tuple(self._known)
+        return Told(which, self._seen.states[list(which)], self._now) if which else None
+
+    def strayed(self, before: Told | None, span: float, reach: Array) -> float:
+        """How far any point of an obstacle is off from where it was foreseen to be, now and for some time [m].
+
+        Positions and rotations that are off by δp and δR, and twists by δv and δω, leave a point that is r from the
+        origin no farther off than |δp| + t |δv| + r (‖δR‖ + t |δω|) after t.
+
+        Args:
+            before: what was told when it was foreseen.
+            span: for how long it counts [s].
+            reach: distance from each obstacle's origin to its farthest point (o,) [m].
+        """
+        now = self.told
+        if now is None or before is None or now.which != before.which:
+            return 0.0 if now is before else np.inf
+        expected = before.states.copy()
+        move_on(expected, now.t - before.t)
+        off = np.abs(now.states - expected)
+        if not off.any():
+            return 0.0
+        p, v, R, w = (np.linalg.norm(off[:, part], axis=1) for part in (_POSITION, _LINEAR, _ROTATION, _ANGULAR))
+        turned = R + span * w
+        radii = np.where(turned > 0.0, reach[list(now.which)], 0.0)  # half-spaces have no end
+        return float(np.max(p + span * v + radii * turned))
+
+    def paths(self, times: Array) -> tuple[Array, Array]:
+        """Where those that move will be at some times [s]: positions (t, k, 3) [m] and speeds (t, k) [m/s]."""
+        states = np.empty((len(times), *self._seen.states.shape))
+        if len(self._known) < len(self.moving):
+            for row, t in zip(states, times.tolist(), strict=True):
+                self._at(t, row)
+        if self._known:
+            given = list(self._known)
+            last = self._seen.states[given]
+            states[:, given] = last
+            states[:, given, 9:12] += (times - self._now)[:, None, None] * last[:, 12:15]
+        states = states[:, self.moving]
+        return states[:, :, 9:12], np.linalg.norm(states[:, :, 12:15], axis=2)
 
     def foreseen(self, t: float) -> Seen:
         """Where they will be at t [s], on their trajectories, or as they were last seen to move."""
@@ -113,11 +165,15 @@ class Obstacles:
         last_seen = states[given]
         if given:
             move_on(last_seen, t - self._now)
+        self._at(t, states)
+        states[given] = last_seen
+        return self._seen._replace(states=states)
+
+    def _at(self, t: float, states: Array) -> None:
+        """Brings the states (o, 18) of those that follow a trajectory to time t [s]."""
         self._courses.sample(t, states)
         for index, motion in self._courses.others.items():
             put(as_samples(states)[index], motion.sample(t))
-        states[given] = last_seen
-        return self._seen._replace(states=states)
 
     def carry(self, index: int, carried: bool) -> None:
         """Takes an obstacle as carried by the robot, or as resting where it was put down, until it is given again."""

@@ -72,13 +72,24 @@ def project_soft(
 
 @compiled
 def farthest(
-    A: Array, d: Array, comfort: float, deepest: float, gentle: float, v: Array, lower: Array, upper: Array
+    h: float,
+    closest: Array,
+    J: Array,
+    drift: Array,
+    comfort: float,
+    deepest: float,
+    gentle: float,
+    v: Array,
+    lower: Array,
+    upper: Array,
 ) -> tuple[Array, bool]:
-    """max s - ½ s²/c - ε/2c ‖w - v‖² over w and s, with A w + d >= s, lower <= w <= upper, s <= c.
+    """max s - ½ s²/c - ε/2c ‖w - v‖² over w and s, with d + h (J w + ḋ_obs) >= s, lower <= w <= upper, s <= c.
 
     Args:
-        A: rows (k, nv).
-        d: what is added to them (k,).
+        h: horizon [s].
+        closest: d first (k, 10) [m].
+        J: velocity Jacobian of these distances (k, nv).
+        drift: ḋ_obs (k,) [m/s].
         comfort: c, where the slope of the objective in s has come to nothing.
         deepest: s is not below its negative.
         gentle: ε.
@@ -89,16 +100,18 @@ def farthest(
     Returns:
         w (nv,), and whether it is the answer; if not, round-off got in the way, or s would lie too deep.
     """
-    k, n = A.shape
-    P, G = np.zeros((n + 1, n + 1)), np.empty((k, n + 1))
+    k, n = J.shape
+    P, G, least = np.zeros((n + 1, n + 1)), np.empty((k, n + 1)), np.empty(k)
     x, low, high = np.empty(n + 1), np.empty(n + 1), np.empty(n + 1)
     for i in range(n):
         P[i, i], x[i], low[i], high[i] = gentle, v[i], lower[i], upper[i]
-        for j in range(k):
-            G[j, i] = A[j, i]
+    for j in range(k):
+        least[j] = -(closest[j, 0] + h * drift[j])
+        for i in range(n):
+            G[j, i] = h * J[j, i]
     P[n, n], x[n], low[n], high[n] = 1.0, comfort, -deepest, comfort
     G[:, n] = -1.0
-    met = minimize(P, x, G, -d, low, high, np.zeros(k))
+    met = minimize(P, x, G, least, low, high, np.zeros(k))
     return x[:n], met
 
 

@@ -6,6 +6,7 @@
 from qpavoid.kernels.vectorised.ahead import bends, closest_call, joint_speeds, tracking_clear
 from qpavoid.kernels.vectorised.bounds import velocity_bounds
 from qpavoid.kernels.vectorised.culling import candidates, in_one_alone
+from qpavoid.kernels.vectorised.flights import comes_too_near, least_apart, look_around, ramp
 from qpavoid.kernels.vectorised.frames import damped_solution, frame_rows, projection_cost
 from qpavoid.kernels.vectorised.motions import pack_pieces, place_obstacles, sample_pieces, take_in
 from qpavoid.kernels.vectorised.packing import pack
@@ -20,15 +21,19 @@ __all__ = [
     "candidates",
     "choose",
     "closest_call",
+    "comes_too_near",
     "damped_solution",
     "distance_rows",
     "frame_rows",
     "in_one_alone",
     "joint_speeds",
+    "least_apart",
+    "look_around",
     "pack",
     "pack_pieces",
     "place_obstacles",
     "projection_cost",
+    "ramp",
     "row_bounds",
     "sample_pieces",
     "shortfall",
