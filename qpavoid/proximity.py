@@ -26,6 +26,8 @@ from qpavoid.scene import Scene
 
 _CULL_FROM = 48 if kernels.ACCELERATED else 192
 """Number of pairs from which looking at bounding spheres first pays."""
+_TOLERANCE = 1e-10
+"""At which coal stops; its default, 1e-6, leaves errors of 7e-3 in normals of boxes and hulls."""
 _LONGEST_GRASP = 0.5
 """Largest gap between the robot and what it carries [m]."""
 
@@ -38,7 +40,7 @@ class DistanceQuery:
         self._geometry = pin.GeometryModel(scene.geometry)
         self._data = self._geometry.createData()
         for request in self._data.distanceRequests:
-            request.gjk_tolerance = 1e-10  # the default 1e-6 leaves errors of 7e-3 in normals of boxes and hulls
+            request.gjk_tolerance = _TOLERANCE
         bodies = self._geometry.geometryObjects
         self._first_obstacle, self._movable = len(scene.body_names), scene.movable
         self._pieces = [np.flatnonzero(scene.obstacle_of == i).tolist() for i in range(len(scene.obstacles))]
@@ -75,7 +77,8 @@ class DistanceQuery:
         self._cores = cores([body.geometry for body in bodies])
         self._known = with_closed_form(self._cores, scene.pairs) & kernels.ACCELERATED
         self._others = bool(len(self._known)) and not self._known.all()
-        self._met = np.zeros(len(scene.pairs), dtype=np.intp)
+        self._met, self._request = np.zeros(len(scene.pairs), dtype=np.intp), coal.DistanceRequest()
+        self._request.gjk_tolerance = _TOLERANCE
         self._cull = _Cull(scene, self) if len(scene.pairs) >= _CULL_FROM or self._slots else None
         self.pairs: IntArray = np.arange(len(scene.pairs))
         """(c,) pairs that were computed and are to get rows, increasing."""
@@ -246,9 +249,13 @@ class DistanceQuery:
             self.results[~self._known] = read_results(self._data.distanceResults)[~self._known]
         count = closed_forms(self.poses, self._cores, bodies, self._known, pairs, self.results, self._met)
         for pair in self._met[:count].tolist():
-            pin.computeDistance(self._geometry, self._data, pair)
-            if self._copy:
-                self.results[pair] = read_results([self._data.distanceResults[pair]])
+            a, b = (
+                (self._geometry.geometryObjects[i].geometry, coal.Transform3s(pose.rotation, pose.translation))
+                for i, pose in ((i, self._data.oMg[i]) for i in bodies[pair].tolist())
+            )
+            result = coal.DistanceResult()
+            coal.distance(*a, *b, self._request, result)
+            self.results[pair] = read_results([result])[0]
 
     def _make_slots(self, index: int, voxels: Voxels) -> Slots:
         shape, first = self._scene.obstacles[index].shape, self._movable

@@ -17,7 +17,6 @@ from qpavoid import (
     build_scene,
     build_tasks,
     kernels,
-    proximity,
 )
 from qpavoid.config import Sphere, Task
 
@@ -119,17 +118,17 @@ def test_unknown_names_come_with_the_nearest(controller, panda):
 
 
 def test_nan_distances_stop_the_robot_instead_of_being_dropped(make, panda, monkeypatch):
-    """Whatever makes coal return NaN: the pair is not hidden."""
-    monkeypatch.setattr(proximity, "view_results", lambda *_: None)
-    controller, read = make(), proximity.read_results
-
-    def poisoned(results):
-        found = read(results)
-        found[:, 0] = np.nan
-        return found
-
+    """Whatever makes a distance NaN: the pair is not hidden."""
+    controller = make()
     assert controller.step(panda.home).status is Status.SOLVED
-    monkeypatch.setattr(proximity, "read_results", poisoned)
+    query = controller._query
+    compute = query.compute
+
+    def poisoned(data, reach):
+        compute(data, reach)
+        query.results[:, 0] = np.nan
+
+    monkeypatch.setattr(query, "compute", poisoned)
     solution = controller.step(panda.home)
     assert solution.status is Status.STOPPED
     np.testing.assert_array_equal(solution.v, 0.0)

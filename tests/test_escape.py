@@ -346,8 +346,8 @@ def test_no_flight_is_flown_where_nothing_comes_near(tmp_path, monkeypatch):
     ]
     controller = make_controller(robot, far, "y", avoidance=Avoidance(d1=0.02, d2=0.1, escape=Escape()))
     flown = []
-    fly = controller._commander.escape.flights.fly
-    monkeypatch.setattr(controller._commander.escape.flights, "fly", lambda *a: flown.append(a[0].t) or fly(*a))
+    better = controller._commander.escape.flights.better
+    monkeypatch.setattr(controller._commander.escape.flights, "better", lambda *a: flown.append(a[1].t) or better(*a))
     q = robot.home.copy()
     for k in range(0, 900, 10):
         controller.step(q, k * DT, {"y": Sample.at([0.0, 0.0, 0.0])})

@@ -34,6 +34,8 @@ _STRAIGHT = 0.25
 """Share of the flights drawn that lean to no side [-]."""
 _LEANS = (2.0, 30.0)
 """Range of ‖v̂‖ of the others, with equally likely logarithms [rad/s, m/s]."""
+_DECISION = 0.01
+"""Time for which a decision holds at the least [s]: not in every tick of a millisecond can flights be flown."""
 _SPAN = 0.1
 """Time from one look at bounding spheres to the next [s]."""
 _ALIKE = 1e-6
@@ -56,11 +58,14 @@ class EscapePlanner:
         self.flights, self._settings = flights, flights.settings
         self._model, self._obstacles, self._dt = scene.robot.model, obstacles, dt
         self._braking = 0.5 / bounds.acceleration
+        self._held = int(np.ceil(_DECISION / dt - 1e-9)) - 1
+        """For how many ticks more than one a decision holds."""
         self.reset()
 
     def reset(self) -> None:
         """Forgets the flight that was kept; what is drawn from now on is drawn again after the next reset."""
         self._kept: Flight | None = None
+        self._wait = 0
         self._random, self._untried = np.random.default_rng(0), list[float]()
         self._first: int | None = None
         self._seen_paths = (np.zeros((0, 0, 3)), np.zeros(0))
@@ -93,10 +98,26 @@ class EscapePlanner:
         if self._nobody_comes(next_tick):
             self._kept = None
             return None
-        onward = self._best(self._onward(next_tick))
+        wanted, known = v, self._kept
+        if known is not None and len(known.v):
+            left = self.flights.a_tick_on(known)
+            if not self.flights.holds_from(left, next_tick):
+                wanted = known.v[0]
+            if wanted is v or self._wait:
+                self._kept, self._wait = left, max(self._wait - 1, 0)
+                return None if np.array_equal(wanted, v) else wanted
+        self._wait = self._held
+        return self._decide(next_tick, Start(q, v_last.copy(), w_last.copy(), t, watched))
+
+    def _decide(self, next_tick: Start, now: Start) -> Array | None:
+        """None where a flight from the next tick on is good enough, or as good as any from now on; else what begins the
+        best one (nv,).
+        """
+        v = next_tick.v
+        onward = self._best(next_tick, self._onward(v))
         if onward.value < self.flights.enough:
-            kept, left = self._way_out(Start(q, v_last.copy(), w_last.copy(), t, watched))
-            onward = self._best((self.flights.fly(next_tick, self._drawn()) for _ in range(left)), onward)
+            kept, left = self._way_out(now)
+            onward = self._best(next_tick, ((self._drawn(), self._going_on(v)) for _ in range(left)), onward)
             if not self._as_good(onward.value, kept.value) and len(kept.v):
                 self._kept = self.flights.a_tick_on(kept)
                 return None if np.array_equal(kept.v[0], v) else kept.v[0]
@@ -128,22 +149,25 @@ class EscapePlanner:
             self._first, self._seen_paths = first, (np.ascontiguousarray(paths), 0.5 * _SPAN * speeds.max(axis=0))
         return self._seen_paths
 
-    def _onward(self, start: Start) -> Iterator[Flight]:
-        """The flight that is kept, if it holds; flights like it, by its manner and its velocities; standing still."""
+    def _onward(self, v: Array) -> Iterator[tuple[Manner, Array]]:
+        """Flights like the one that is kept, by its manner and its velocities; standing still."""
+        held = self._going_on(v)
         if self._kept is not None and len(self._kept.v):
-            kept = self.flights.a_tick_on(self._kept)
-            if self.flights.holds_from(kept, start):
-                yield kept
-            yield self.flights.fly(start, kept.manner)
-            yield self.flights.fly(start, kept.manner, kept.v)
-        yield self.flights.fly(start, self.flights.still)
+            manner, onward = self._kept.manner, self._kept.v[1:]
+            yield manner, held
+            yield manner, np.concatenate((held, onward[len(held) :]))
+        yield self.flights.still, held
 
-    def _best(self, flights: Iterable[Flight], best: Flight | None = None) -> Flight:
+    def _going_on(self, v: Array) -> Array:
+        """What a flight begins with when v (nv,) has been decided upon: the same, until there is a new decision."""
+        return np.tile(v, (self._held, 1))
+
+    def _best(self, start: Start, tried: Iterable[tuple[Manner, Array | None]], best: Flight | None = None) -> Flight:
         """The first flight that is good enough, or the best of all; no more are flown than that takes."""
         if best is None or best.value < self.flights.enough:
-            for flight in flights:
-                best = flight if best is None or flight.value > best.value else best
-                if best.value >= self.flights.enough:
+            for manner, given in tried:
+                best = self.flights.better(best, start, manner, given) or best
+                if best is not None and best.value >= self.flights.enough:
                     break
         assert best is not None
         return best
@@ -164,8 +188,7 @@ class EscapePlanner:
         while attempts and best.value < self.flights.enough:
             attempts -= 1
             turn = self._random.integers(len(best.v) + 1) if attempts % 2 else 0
-            flight = self.flights.fly(start, self._drawn(), best.v[:turn])
-            best = max(best, flight, key=lambda flight: flight.value)
+            best = self.flights.better(best, start, self._drawn(), best.v[:turn]) or best
         return best, attempts
 
     def _drawn(self) -> Manner:

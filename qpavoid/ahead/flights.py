@@ -230,15 +230,25 @@ class Flights:
         return bool(flight.least - self.lever * most - strayed >= self.enough.distance)
 
     def fly(self, start: Start, manner: Manner, given: Array | None = None) -> Flight:
+        """`better` than nothing."""
+        flight = self.better(None, start, manner, given)
+        assert flight is not None
+        return flight
+
+    def better(self, than: Flight | None, start: Start, manner: Manner, given: Array | None = None) -> Flight | None:
         """Flees with decisions a period apart until the horizon; what has touched is left out of account from then on.
 
         Distances are looked at as often, and midway where something may come too near and part again before that. All
         flights decide and look at the same times, multiples of the period: only so can their values be compared.
 
         Args:
+            than: flight that has to be outdone; one that turns out not to is not flown to its end.
             start: where it begins.
             manner: how it flees.
             given: velocities (k, nv) of the first ticks, for as many decisions as they suffice; it flees from then on.
+
+        Returns:
+            The flight; None where it is no better than the other one.
         """
         q, v, w, t, _ = start
         horizon, safe = self.enough
@@ -263,10 +273,12 @@ class Flights:
                 self._look(pin.interpolate(self._model, q, ahead, 0.5), t, v, tally, span)
             t += span
             near = self._look(ahead, t, steps[-1], tally, span)
+            value = Value(horizon - tally.lost, min(tally.least, safe))
+            if than is not None and value <= than.value:
+                return None
             plan.append(steps)
             w = steps[-1] - (steps[-2] if count > 1 else v)
             q, v, count, done = ahead, steps[-1], self._ticks, done + count
-        value = Value(horizon - tally.lost, min(tally.least, safe))
         return Flight(
             start, np.concatenate(plan), manner, value, min(tally.until, t), tally.least, self._obstacles.told
         )
