@@ -1,7 +1,7 @@
 """What is commanded: a solver's answer, brought within limits, looked ahead, and left only where a way out stays.
 
 A law may be anyone's, and may be wrong. What it says counts as far as it is finite, of the right shape, within the
-limits, clear of contact along its tick and the stop after it and, where foresight is asked for, not a trap.
+limits, clear of contact along its tick and the stop after it and, where obstacles move, not a trap.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from qpavoid.ahead.guard import Guard
 from qpavoid.ahead.progress import ProgressWatch
 from qpavoid.assembly import Assembly
 from qpavoid.config import Avoidance, Limits, Progress
+from qpavoid.errors import NumericalError
 from qpavoid.kernels.vectorised.ahead import TOLERANCE
 from qpavoid.limits import JointBounds, saturate
 from qpavoid.obstacles.sensing import Obstacles
@@ -70,7 +71,7 @@ class Commander:
         detours = Detours(progress.detour, dt, scene, frames, query, keep) if progress.detour else None
         self.progress = ProgressWatch(progress, dt, scene.pair_names, detours)
         self.escape: EscapePlanner | None = None
-        if avoidance.escape is not None:
+        if avoidance.escape is not None and scene.obstacles:
             flights = Flights(scene, bounds, obstacles, avoidance, limits, dt, avoidance.escape)
             self.escape = EscapePlanner(flights, scene, bounds, obstacles, dt)
 
@@ -106,7 +107,7 @@ class Commander:
             solution = solution._replace(blocked=blocked) if blocked else solution
         else:
             solution = self._solve(q, problem)
-        if self.escape is not None:
+        if self.escape is not None and self.solver.bounded:
             solution = self._with_a_way_out(self.escape, q, t, proximity, problem, solution)
         return self._with_limits_passed(problem, solution)
 
@@ -160,7 +161,10 @@ class Commander:
     def _with_a_way_out(
         self, escape: EscapePlanner, q: Array, t: float, proximity: Proximity, problem: Problem, solution: Solution
     ) -> Solution:
-        v = escape.check(q, solution.v, t, self._assembly.v_last, self._assembly.w_last, proximity)
+        try:
+            v = escape.check(q, solution.v, t, self._assembly.v_last, self._assembly.w_last, proximity)
+        except NumericalError as error:  # of what is to come; it is raised when it has come
+            return solution.relaxed(f"a way out: what is foreseen of an {error}")
         if v is None:
             return solution
         reason = "the tasks: no way out would be left among the obstacles that move"

@@ -61,6 +61,10 @@ class Tick(NamedTuple):
     solution: Solution
 
 
+_BLIND = "a way out is not looked for: flights do not hold contacts (avoidance.escape)"
+"""What is said where obstacles move and the robot stands on something."""
+
+
 class Controller:
     """Follows its tasks and keeps clear of everything in its scene."""
 
@@ -123,8 +127,9 @@ class Controller:
             scene, self.tasks, self._bounds, self._kinematics, self._query, self.avoidance,
             self.limits, tracking_damping, dt, contacts, law.bounded and self.avoidance.look_ahead,
         )  # fmt: skip
+        self._blind: tuple[str, ...] = ()
         if contacts is not None and self.avoidance.escape is not None:
-            raise ConfigError("avoidance.escape: flights do not hold contacts; leave one of the two out")
+            self.avoidance, self._blind = self.avoidance.model_copy(update={"escape": None}), (_BLIND,)
         self._commander = Commander(
             scene, law, self._assembly, self._query, self._obstacles, self._bounds,
             [task for task in frames if task.moves], self.avoidance, self.limits, progress or Progress(), dt,
@@ -374,6 +379,8 @@ class Controller:
         else:
             solution = self._commander.decide(q, t, problem, proximity, tasks=desired is None)
         self._assembly.remember(solution.v)
+        if self._blind and len(self._obstacles.moving):
+            assumed += self._blind
         if problem.room < -OUTSIDE:
             assumed += self._bounds.outside(q, problem.joint_names)
         solution = solution._replace(assumed=assumed) if assumed else solution

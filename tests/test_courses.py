@@ -148,11 +148,13 @@ def test_a_controller_follows_motions_of_other_classes(panda):
 def test_a_motion_that_gives_nonsense_is_named_and_moves_nothing(panda):
     class Broken:
         def sample(self, t):
-            return Sample.at([2.0, 0.0, 1.0])._replace(position=np.array([2.0 + t, np.nan if t > 1.0 else 0.0, 1.0]))
+            moving = Sample.at([2.0 + t, 0.0, 1.0], linear=[1.0, 0.0, 0.0])
+            return moving._replace(position=moving.position * (np.nan if t > 1.0 else 1.0))
 
     scene = [Obstacle("broken", SPHERE, Broken()), Obstacle("other", SPHERE, Pendulum())]
     controller = make_controller(panda, scene)
-    controller.step(panda.home, 0.5)
+    solution = controller.step(panda.home, 0.5)
+    assert solution.status is Status.RELAXED and "foreseen of an obstacle 'broken': NaN" in solution.reasons[0]
     before = [controller.obstacle_pose(name).position for name in ("broken", "other")]
     with pytest.raises(NumericalError, match="'broken': NaN or infinity"):
         controller.step(panda.home, 1.5)

@@ -209,7 +209,8 @@ def test_the_look_ahead_moves_obstacles_on(tmp_path, linear, angular):
     """No row sees it at 150 mm; at the end of the tick it is 200 mm nearer, or has turned on the robot."""
     robot = cartesian(tmp_path, acceleration=None)
     bar = Obstacle.at("bar", Box(size=(0.02, 2.0, 0.02)), [9.0, 0.0, 0.0])
-    controller = make_controller(robot, [bar], "z", dt=0.05)
+    avoidance = Avoidance(d1=0.02, d2=0.10, escape=None)  # a way out would be sought as well
+    controller = make_controller(robot, [bar], "z", dt=0.05, avoidance=avoidance)
     center = [0.21, 0.0, 0.0] if any(linear) else [0.21, -0.9, 0.0]  # the tool is a ball of 50 mm
     seen = {"bar": Sample.at(center, linear=linear, angular=angular)}
     tick = controller.tick(np.zeros(3), 0.0, {"z": Sample.at([0.0, 0.0, 0.0])}, seen)

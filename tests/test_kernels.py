@@ -1086,3 +1086,88 @@ def test_a_run_is_the_same_with_and_without_numba(tmp_path, scenario, ticks):
     for name in plain.keys() - {"v", "accelerated"}:
         exact = 1e-8 if "avoidance" in name else 1e-12  # coal iterates where compiled code has a closed form
         np.testing.assert_allclose(fast[name], plain[name], rtol=exact, atol=exact, err_msg=name)
+
+
+# --- flights -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_look_around_keeps_what_is_watched_and_apart(kernels, seed):
+    rng = np.random.default_rng(seed)
+    x, pairs = random_layout(seed, pairs=40), chosen(40, seed)
+    watched = rng.random(40) < 0.7
+    before, distance = watched.copy(), x.results[:, 0]
+    touch, reach = np.quantile(distance[pairs], [0.2, 0.8])
+    near = [i for i in pairs.tolist() if distance[i] < reach and before[i]]
+    kept = [i for i in near if distance[i] >= touch]
+    q = rng.normal(size=x.q_index.max(initial=0) + 1)
+    k, touching, nearest, rest = run(kernels, "look_around", x, q, pairs, reach, True, watched, touch)
+    assert x.near[:k].tolist() == kept and 0 < k < len(pairs)
+    assert touching == len(near) - len(kept) > 0
+    np.testing.assert_array_equal(x.closest[:k], x.results[kept])
+    assert nearest == min(distance[near]) and rest == min(distance[kept])
+    assert np.flatnonzero(before & ~watched).tolist() == [i for i in near if i not in kept]
+    whole = random_layout(seed, pairs=40)
+    run(kernels, "distance_rows", whole, np.array(kept), np.inf, True)
+    np.testing.assert_allclose(x.J[:k], whole.J[:k], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(x.drift[:k], whole.drift[:k], rtol=0, atol=1e-14)
+    run(kernels, "velocity_bounds", whole, q)
+    np.testing.assert_array_equal([x.lower, x.upper], [whole.lower, whole.upper])
+
+
+def test_a_distance_that_is_no_number_touches(kernels):
+    results = np.random.default_rng(0).normal(size=(3, 10))
+    results[1, 0] = np.nan
+    x = random_layout(0, pairs=3, results=gaps(results, 17))
+    watched, q = np.ones(3, dtype=bool), np.zeros(x.q_index.max(initial=0) + 1)
+    k, touching, nearest, _ = run(kernels, "look_around", x, q, np.arange(3), np.inf, False, watched, -np.inf)
+    assert (k, touching) == (2, 1) and np.isnan(nearest) and watched.tolist() == [True, False, True]
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_both_versions_look_around_alike(seed):
+    rng = np.random.default_rng(seed)
+    pairs, q, results = chosen(40, seed), rng.normal(size=40), []
+    for name in ("vectorised", "compiled"):
+        x, watched = random_layout(seed, pairs=40), np.random.default_rng(seed).random(40) < 0.7
+        found = run(version(name), "look_around", x, q, pairs, 0.5, True, watched, 0.1)
+        results.append((*found, watched, *(getattr(x, part)[: found[0]] for part in ("near", "closest", "J", "drift"))))
+    for a, b in zip(*results, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_what_comes_too_near(kernels, seed):
+    rng = np.random.default_rng(seed)
+    k = 5 * seed
+    closest, J, drift, v = rng.normal(size=(k, 10)), rng.normal(size=(k, 4)), rng.normal(size=k), rng.normal(size=4)
+    least = min((closest[i, 0] + 0.3 * (J[i] @ v + drift[i]) for i in range(k)), default=np.inf)
+    for safe, near in ((least - 1e-9, False), (least + 1e-9, k > 0)):
+        assert kernels.comes_too_near(closest, J, drift, v, 0.3, safe) == near
+
+
+@pytest.mark.parametrize("meets", [False, True])
+def test_a_ramp_changes_no_faster_than_it_may_and_ends_where_it_meets(kernels, meets):
+    wanted = np.array([[0.35, -0.1, 5.0]] * 6)
+    ramp = kernels.ramp(np.zeros(3), wanted, np.array([0.1, 0.1, np.inf]), meets)
+    expected = [[min(0.1 * (i + 1), 0.35), -0.1, 5.0] for i in range(4 if meets else 6)]
+    np.testing.assert_allclose(ramp, expected, rtol=0, atol=1e-15)
+    assert len(kernels.ramp(np.zeros(3), wanted[:0], np.ones(3), meets)) == 0
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_both_versions_of_ramps_and_paths(seed):
+    rng = np.random.default_rng(seed)
+    check_parity("ramp", rng.normal(size=5), rng.normal(size=(9, 5)), rng.uniform(0.1, 2.0, 5), bool(seed % 2))
+    paths, centers, sizes = rng.normal(size=(7, seed, 3)), rng.normal(size=(4, 3)), rng.uniform(0.0, 1.0, (seed, 4))
+    least = check_parity("least_apart", paths, centers, sizes)[0]
+    brute = [
+        np.linalg.norm(paths[t, o] - centers[b]) - sizes[o, b]
+        for t in range(7) for o in range(seed) for b in range(4)
+    ]  # fmt: skip
+    assert least == pytest.approx(min(brute, default=np.inf))
+
+
+def test_paths_that_are_no_numbers_are_not_far(kernels):
+    paths = np.array([[[3.0, 0.0, 0.0]], [[np.nan, 0.0, 0.0]], [[4.0, 0.0, 0.0]]])
+    assert not kernels.least_apart(paths, np.zeros((1, 3)), np.ones((1, 1))) > 0.0

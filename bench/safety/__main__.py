@@ -10,7 +10,7 @@ from time import perf_counter
 
 from bench.safety import report
 from bench.safety.campaign import draw
-from bench.safety.trial import Trial, examine, foresighted, trials
+from bench.safety.trial import Trial, as_named, examine, trials
 from qpavoid import Workers
 from qpavoid.arena.twin import load
 from qpavoid.log import STATUSES
@@ -25,7 +25,10 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="seed of the first (0)")
     parser.add_argument("--seeds", help="comma-separated, in place of --runs and --first")
     parser.add_argument(
-        "--solvers", "--solver", default="qp,eq10,tracking", help="comma-separated (qp,eq10,tracking); qp+escape"
+        "--solvers",
+        "--solver",
+        default="qp,qp-alone,eq10,tracking",
+        help="comma-separated (qp,qp-alone,eq10,tracking); qp-alone is qp without foresight",
     )
     parser.add_argument("--jobs", type=int, help="processes (one a core)")
     parser.add_argument("--name", default="safety", help="of the files written to bench/results (safety)")
@@ -61,7 +64,7 @@ def describe(seed: int, solver: str) -> None:
     """Runs one seed and prints its scene, what the referee saw, and all verdicts."""
     scenario = draw(seed)
     twin = load(scenario)
-    scenario = foresighted(scenario, solver)
+    scenario = as_named(scenario, solver)
     trial, log, findings, verdicts = examine(seed, scenario, twin, solver)
     avoidance = scenario.avoidance
     print(

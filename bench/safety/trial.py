@@ -14,11 +14,10 @@ from bench.safety.verdict import Verdict, judge, last_way_out
 from qpavoid import Log, ScenarioConfig, Status, simulate
 from qpavoid.arena.referee import Findings
 from qpavoid.arena.twin import Twin, load
-from qpavoid.config import Escape
 from qpavoid.log import STATUSES
 
-FORESIGHT = "+escape"
-"""What the name of a solver ends with that keeps a way out at hand."""
+ALONE = "-alone"
+"""What the name of a solver ends with that keeps no way out at hand."""
 
 
 @dataclass(frozen=True)
@@ -100,14 +99,14 @@ def trials(seed: int, solvers: Sequence[str]) -> list[Trial]:
     """The scenario of a seed with several solvers."""
     scenario = draw(seed)
     twin = load(scenario)
-    return [examine(seed, foresighted(scenario, solver), twin, solver)[0] for solver in solvers]
+    return [examine(seed, as_named(scenario, solver), twin, solver)[0] for solver in solvers]
 
 
-def foresighted(scenario: ScenarioConfig, solver: str) -> ScenarioConfig:
-    """The same scenario, with `avoidance.escape` at its defaults where the solver is given as `qp+escape`."""
-    if not solver.endswith(FORESIGHT):
+def as_named(scenario: ScenarioConfig, solver: str) -> ScenarioConfig:
+    """The same scenario, without `avoidance.escape` where the solver is given as `qp-alone`."""
+    if not solver.endswith(ALONE):
         return scenario
-    avoidance = scenario.avoidance.model_copy(update={"escape": Escape()})
+    avoidance = scenario.avoidance.model_copy(update={"escape": None})
     return scenario.model_copy(update={"avoidance": avoidance}).read_from(scenario.source)
 
 
@@ -116,7 +115,7 @@ def examine(
 ) -> tuple[Trial, Log, Findings, tuple[Verdict, ...]]:
     """One run, with everything that its row was made of."""
     begin = perf_counter()
-    log = simulate(scenario, solver.removesuffix(FORESIGHT))
+    log = simulate(scenario, solver.removesuffix(ALONE))
     findings = referee(twin, log)
     verdicts = judge(twin, scenario, log, findings)
     names, metrics = [" - ".join(pair) for pair in twin.scene.pair_names], log.metrics()

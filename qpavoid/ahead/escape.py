@@ -25,7 +25,7 @@ from qpavoid import kernels
 from qpavoid.ahead.flights import TOUCH, Flight, Flights, Manner, Start, Value
 from qpavoid.limits import JointBounds
 from qpavoid.obstacles.sensing import Obstacles
-from qpavoid.problem import Array, Proximity
+from qpavoid.problem import Array, IntArray, Proximity
 from qpavoid.scene import Scene
 
 _HORIZONS = (0.2, 0.05, 0.5)
@@ -68,7 +68,7 @@ class EscapePlanner:
         self._wait = 0
         self._random, self._untried = np.random.default_rng(0), list[float]()
         self._first: int | None = None
-        self._seen_paths = (np.zeros((0, 0, 3)), np.zeros(0))
+        self._seen_paths: tuple[IntArray, Array, Array] = (np.zeros(0, np.intp), np.zeros((0, 0, 3)), np.zeros(0))
         self.flights.forget_foreseen()
 
     def look_anew(self) -> None:
@@ -131,22 +131,27 @@ class EscapePlanner:
 
         Between the times at which they are looked at, obstacles are taken to be no faster than at these.
         """
-        paths, strides = self._paths(int(np.floor(start.t / _SPAN)))
+        moving, paths, strides = self._paths(int(np.floor(start.t / _SPAN)))
+        if not len(moving):
+            return True
         self.flights.kinematics.compute(start.q)
         centers, radii = self.flights.query.body_spheres(self.flights.kinematics.data)
         stop = float(np.square(start.v) @ self._braking)
         least = self._settings.comfort + (self.flights.lever * stop if stop else 0.0)
-        reach = self.flights.query.placing.reach[self._obstacles.moving] + strides + least
+        reach = self.flights.query.placing.reach[moving] + strides + least
         return kernels.least_apart(paths, centers, reach[:, None] + radii) > 0.0
 
-    def _paths(self, first: int) -> tuple[Array, Array]:
-        """Centres of what moves every `_SPAN` from a multiple of that on (t, k, 3), and how far it may be from these in
-        between (k,) [m].
+    def _paths(self, first: int) -> tuple[IntArray, Array, Array]:
+        """Numbers of those that do not rest until the horizon (k,); their centres every `_SPAN` from a multiple of that
+        on (t, k, 3), and how far they may be from these in between (k,) [m].
         """
         if first != self._first or self._obstacles.told is not None:
             count = int(np.ceil(self._settings.horizon / _SPAN)) + 2
             paths, speeds = self._obstacles.paths(_SPAN * np.arange(first, first + count, dtype=np.float64))
-            self._first, self._seen_paths = first, (np.ascontiguousarray(paths), 0.5 * _SPAN * speeds.max(axis=0))
+            fastest = speeds.max(axis=0)
+            moves = np.flatnonzero(fastest != 0.0)
+            moving = self._obstacles.moving[moves]
+            self._first, self._seen_paths = first, (moving, paths[:, moves].copy(), 0.5 * _SPAN * fastest[moves])
         return self._seen_paths
 
     def _onward(self, v: Array) -> Iterator[tuple[Manner, Array]]:

@@ -169,11 +169,14 @@ class Flights:
         self.still = Manner(0.0, np.zeros(model.nv))
         """Standing still."""
         self._foreseen: dict[float, Seen] = {}
-        still, now = (
-            np.zeros(model.nv),
-            Start(scene.robot.home, self.still.leaning, self.still.leaning, 0.0, self.parted),
-        )
-        self.fly(now, Manner(0.1, still), still[None])  # compiles
+        self._compile(scene.robot.home)
+
+    def _compile(self, q: Array) -> None:
+        """So that no tick waits for the compiler."""
+        still = self.still.leaning
+        near = self._look(q, 0.0, still, _Tally(Start(q, still, still, 0.0, self.parted), 1.0), 0.0)
+        kernels.comes_too_near(*near, still, 1.0, 0.0)
+        self.ramps.towards(still, still, self._flee(near, Manner(0.1, still))[None])
         self.forget_foreseen()
 
     def go_on_to(self, t: float) -> None:
@@ -198,6 +201,7 @@ class Flights:
 
     def foreseen(self, t: float) -> Seen:
         """The obstacles that move, as far as is known, at t [s]."""
+        t = round(t, 9)  # the same time may be come to in several ways
         if t not in self._foreseen:
             self._foreseen[t] = self._obstacles.foreseen(t)
         return self._foreseen[t]

@@ -105,7 +105,7 @@ def outside(
 
 
 def _row(kind: str) -> dict[str, Any]:
-    return {"row": {"type": kind}}
+    return {"row": {"type": kind}, "escape": None}
 
 
 ENTRANTS = {

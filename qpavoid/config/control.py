@@ -43,7 +43,8 @@ AvoidanceRow = Annotated[Switching | Damper | Cbf, Field(discriminator="type")]
 class Escape(Block):
     """Foresight where obstacles move: tasks go on only where the robot could still flee (`qpavoid.ahead.escape`).
 
-    It takes obstacles to go on as their trajectories or last twists say, and some milliseconds a tick.
+    It takes obstacles to go on as their trajectories or last twists say, and time where they come near. Laws that keep
+    no limits are commanded as they are, and flights do not hold contacts.
     """
 
     horizon: Annotated[float, Field(ge=0.1, le=10.0)] = 1.5
@@ -54,7 +55,7 @@ class Escape(Block):
     """Distance up to which flights look at pairs [m]."""
     comfort: Positive = 0.1
     """Distance beyond which flights want no more [m]."""
-    safe: Annotated[float, Field(ge=0, le=1)] = 0.3
+    safe: Annotated[float, Field(ge=0, le=1)] = 0.5
     """Share of the safe distance that a flight has to keep [-]."""
     attempts: Annotated[int, Field(ge=1, le=100)] = 3
     """Flights drawn at random that a tick may try where those like the last good one do not stay clear [-]. The more,
@@ -79,8 +80,8 @@ class Avoidance(Block):
     """Whether a velocity of the QP is followed ahead, over its tick and the stop after it, and drawn back where that
     leads nearer than the safe distance."""
 
-    escape: Escape | None = None
-    """Whether a way out is kept at hand where obstacles move; left out: no."""
+    escape: Escape | None = Escape()
+    """How a way out is kept at hand where obstacles move; `null`: none is."""
 
     @property
     def hold(self) -> float:

@@ -77,6 +77,6 @@ def least_apart(paths: Array, centers: Array, sizes: Array) -> float:
             nearest = np.inf
             for t in range(len(paths)):
                 x, y, z = paths[t, o, 0] - centers[b, 0], paths[t, o, 1] - centers[b, 1], paths[t, o, 2] - centers[b, 2]
-                nearest = min(nearest, x * x + y * y + z * z)
-            least = min(least, np.sqrt(nearest) - sizes[o, b])
+                nearest = np.minimum(nearest, x * x + y * y + z * z)  # keeps NaN, unlike min
+            least = np.minimum(least, np.sqrt(nearest) - sizes[o, b])
     return least
