@@ -68,6 +68,37 @@ def test_who_looks_farther_leaves_in_time_and_says_why(tmp_path, acceleration, g
         assert np.abs(change).max() <= acceleration + 1e-6
 
 
+def test_in_short_periods_decisions_hold_for_10_ms(tmp_path):
+    """A ball on slides that is to stay where the jaws close leaves in time, with a decision in ten ticks at most."""
+    dt, robot = 0.001, cartesian(tmp_path, "xy", speed=0.25, acceleration=2.0)
+    controller = make_controller(robot, jaws(), "y", dt=dt, avoidance=Avoidance(d1=0.02, d2=0.10))
+    flights, flown = controller._commander.escape.flights, []
+    better = flights.better
+    flights.better = lambda *a: flown.append(k) or better(*a)
+    q, least, far = robot.home.copy(), np.inf, 0.0
+    for k in range(2800):
+        centers = [obstacle.motion.sample(k * dt).position[:2] for obstacle in controller.scene.obstacles]
+        least = min(least, *(np.linalg.norm(q - center) - GAP - 0.05 for center in centers))
+        q = pin.integrate(robot.model, q, dt * controller.step(q, k * dt, {"y": Sample.at([0.0, 0.0, 0.0])}).v)
+        far = max(far, abs(q[0]) if k < 500 else 0.0)
+    assert least > 0.5 * Escape().safe * 0.02
+    assert far < 1e-3  # it stays at its task while that is safe
+    ticks = np.unique(flown)
+    assert len(ticks) > 5 and np.diff(ticks).min() >= 10
+
+
+def test_what_is_given_is_flown_before_it_flees(among_balls):
+    _, planner, q = among_balls
+    planner.reset()
+    v = np.full(len(q), 0.02)
+    for ticks in (1, 3, 4, 9):
+        flight = planner.flights.fly(start_of(planner, q, 0.02), planner.flights.still, np.tile(v, (ticks, 1)))
+        assert len(flight.v) >= 150
+        steps = planner.flights.ramps.towards(np.zeros(len(q)), np.zeros(len(q)), np.tile(v, (ticks, 1)))
+        np.testing.assert_allclose(flight.v[:ticks], steps, rtol=0, atol=1e-12)
+        assert np.abs(flight.v[ticks]).max() < 0.02 - 1e-4  # 0.03 rad/s a tick at the least
+
+
 def test_where_nothing_moves_it_changes_no_bit():
     base = load_scenario("ur5_pole", ["duration=3"])
     assert all(o.motion.type == "fixed" for o in base.obstacles)

@@ -192,7 +192,9 @@ class EscapePlanner:
         best = self.flights.fly(start, manner, given)
         while attempts and best.value < self.flights.enough:
             attempts -= 1
-            turn = self._random.integers(len(best.v) + 1) if attempts % 2 else 0
+            turn = (
+                self.flights.decision_before(start, int(self._random.integers(len(best.v) + 1))) if attempts % 2 else 0
+            )
             best = self.flights.better(best, start, self._drawn(), best.v[:turn]) or best
         return best, attempts
 

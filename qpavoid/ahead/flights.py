@@ -243,32 +243,30 @@ class Flights:
         """Flees with decisions a period apart until the horizon; what has touched is left out of account from then on.
 
         Distances are looked at as often, and midway where something may come too near and part again before that. All
-        flights decide and look at the same times, multiples of the period: only so can their values be compared.
+        flights decide and look at the same times, multiples of the period, so that their values can be compared; and
+        where what is given ends.
 
         Args:
             than: flight that has to be outdone; one that turns out not to is not flown to its end.
             start: where it begins.
             manner: how it flees.
-            given: velocities (k, nv) of the first ticks, for as many decisions as they suffice; it flees from then on.
+            given: velocities (k, nv) of the first ticks; it flees from then on.
 
         Returns:
             The flight; None where it is no better than the other one.
         """
         q, v, w, t, _ = start
         horizon, safe = self.enough
-        end, plan, tally, given = (
-            t + horizon + _BEYOND,
-            list[Array](),
-            _Tally(start, horizon),
-            self._none if given is None else given,
-        )
+        end, plan, tally = t + horizon + _BEYOND, list[Array](), _Tally(start, horizon)
         near = self._look(q, t, v, tally, 0.0)
-        count, done = self._ticks - round(t / self._dt) % self._ticks, 0
+        left = self._none if given is None else given
         while t < end - 1e-9:
-            wanted = given[done : done + count]
-            held = len(wanted) < count
+            count = self._ticks - round(t / self._dt) % self._ticks
+            wanted, left = left[:count], left[count:]
+            held = not len(wanted)
             if held:
                 wanted = self._flee(near, manner)[None].repeat(count, axis=0)
+            count = len(wanted)
             steps = self.ramps.towards(v, w, wanted, held)
             ahead, span = self._moved(q, steps), count * self._dt
             if kernels.comes_too_near(*near, steps[count // 2], span, safe):
@@ -282,10 +280,14 @@ class Flights:
                 return None
             plan.append(steps)
             w = steps[-1] - (steps[-2] if count > 1 else v)
-            q, v, count, done = ahead, steps[-1], self._ticks, done + count
+            q, v = ahead, steps[-1]
         return Flight(
             start, np.concatenate(plan), manner, value, min(tally.until, t), tally.least, self._obstacles.told
         )
+
+    def decision_before(self, start: Start, k: int) -> int:
+        """The last tick at which a flight that begins there decides before its k-th one; 0 where it has not yet."""
+        return max(k - (round(start.t / self._dt) + k) % self._ticks, 0)
 
     def _moved(self, q: Array, steps: Array) -> Array:
         """Where the velocities (k, nv) of some ticks lead from q (nq,)."""
