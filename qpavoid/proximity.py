@@ -14,6 +14,7 @@ import pinocchio as pin
 
 from qpavoid import kernels
 from qpavoid.config import PointCloud
+from qpavoid.culling import Cull
 from qpavoid.geometry.bodies import bounding_box, bounding_sphere
 from qpavoid.geometry.cloud import Voxels
 from qpavoid.geometry.cores import cores, with_closed_form
@@ -79,7 +80,9 @@ class DistanceQuery:
         self._others = bool(len(self._known)) and not self._known.all()
         self._met, self._request = np.zeros(len(scene.pairs), dtype=np.intp), coal.DistanceRequest()
         self._request.gjk_tolerance = _TOLERANCE
-        self._cull = _Cull(scene, self) if len(scene.pairs) >= _CULL_FROM or self._slots else None
+        culls = len(scene.pairs) >= _CULL_FROM or bool(self._slots)
+        arrays = self.poses, self.spheres, self.placing.centers, ~self._known
+        self._cull = Cull(scene, self._data, *arrays) if culls else None
         self.pairs: IntArray = np.arange(len(scene.pairs))
         """(c,) pairs that were computed and are to get rows, increasing."""
         self._surface = _surface_pairs(scene)
@@ -244,7 +247,7 @@ class DistanceQuery:
         """Distances of the pairs that have one; those whose cores meet are computed by coal after all."""
         from qpavoid.kernels.compiled.closed_forms import closed_forms
 
-        bodies, count = self._scene.pairs, 0
+        bodies = self._scene.pairs
         if self._copy and self._others:
             self.results[~self._known] = read_results(self._data.distanceResults)[~self._known]
         count = closed_forms(self.poses, self._cores, bodies, self._known, pairs, self.results, self._met)
@@ -298,55 +301,3 @@ def _surface_pairs(scene: Scene) -> IntArray | None:
     flat = np.array([isinstance(kind, coal.Halfspace) for kind in kinds], dtype=bool)
     pairs = np.flatnonzero(mesh[scene.pairs].any(axis=1) & ~flat[scene.pairs].any(axis=1))
     return pairs if len(pairs) else None
-
-
-class _Cull:
-    """Switches pairs off in coal's data whose bounding spheres are out of reach."""
-
-    def __init__(self, scene: Scene, query: DistanceQuery) -> None:
-        self._query, self._data = query, query._data
-        self._bodies = scene.movable
-        self._local, self._radius = query.spheres[:, :3].copy(), query.spheres[:, 3].copy()
-        self._centers = query.placing.centers
-        self._pair_of = np.full((self._bodies, len(self._local)), -1, dtype=np.intp)
-        self._pair_of[scene.pairs[:, 0], scene.pairs[:, 1]] = np.arange(len(scene.pairs))
-        self._reach = np.nan
-        self._wanted: Any = None
-        self._within: Array = np.empty(self._pair_of.shape)
-        self._found = np.zeros(len(scene.pairs), dtype=np.intp)
-        self.active = np.ones(len(scene.pairs), dtype=bool)
-        """(m,) which pairs are on."""
-        self._by_coal = ~query._known
-        for pair in np.flatnonzero(query._known).tolist():
-            self._data.deactivateCollisionPair(pair)
-        self._last = np.arange(len(scene.pairs)).tobytes()
-        kernels.in_one_alone(self._found, np.frombuffer(self._last, dtype=np.intp))  # so that no tick compiles it
-
-    def place_points(self, indices: IntArray, positions: Array) -> None:
-        """Moves the bounding spheres of several geometries (k,), whose centres are their origins (k, 3)."""
-        self._centers[indices, :3] = positions
-        self._centers[indices, 4] = -np.einsum("ij,ij->i", positions, positions)
-
-    def enable(self, pairs: Any) -> None:
-        """Takes only some pairs (m,) into account from now on."""
-        self._wanted, self._reach = (self._pair_of >= 0) & pairs[self._pair_of], np.nan
-
-    def switch(self, reach: float) -> IntArray:
-        """Switches pairs on and off; gives those that are on, in increasing order."""
-        if reach != self._reach:
-            touching = self._radius[: self._bodies, None] + self._radius + reach
-            self._within = np.where(self._wanted, touching**2 * (1.0 + 1e-9), -1.0)
-            self._reach = reach
-        count = kernels.candidates(
-            self._query.poses, self._local, self._centers, self._within, self._pair_of, self._found
-        )
-        pairs = self._found[:count]
-        now = pairs.tobytes()
-        if now != self._last:
-            changed = kernels.in_one_alone(pairs, np.frombuffer(self._last, dtype=np.intp))
-            self._last = now
-            self.active[changed] ^= True
-            changed = changed[self._by_coal[changed]]
-            for pair, on in zip(changed.tolist(), self.active[changed].tolist(), strict=True):
-                (self._data.activateCollisionPair if on else self._data.deactivateCollisionPair)(pair)
-        return pairs

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from qpavoid import Controller, Obstacle, Sample, ScenarioConfig, Status, kernels, load_scenario
-from qpavoid.ahead.flights import Manner, Near, Start, _farthest, _Tally
+from qpavoid.ahead.flight import Manner, Near, Start, Tally
+from qpavoid.ahead.flights import _farthest
 from qpavoid.config import Avoidance, Box, Escape, Limits, Line, Sensing, Sphere
 from qpavoid.motion import build_motion
 from qpavoid.obstacles.courses import move_on
@@ -487,7 +488,7 @@ def test_flights_know_what_the_robot_carries(tmp_path):
     assert flights.parted[pair]
 
     def look(q):
-        near = flights._look(q, 0.0, np.zeros(2), _Tally(Start(q, *np.zeros((2, 2)), 0.0, flights.parted), 1.5), 0.0)
+        near = flights._look(q, 0.0, np.zeros(2), Tally(Start(q, *np.zeros((2, 2)), 0.0, flights.parted), 1.5), 0.0)
         (row,) = np.flatnonzero(flights._layout.near[: len(near.drift)] == pair)
         return near.closest[row, 0], near.J[row].copy()
 

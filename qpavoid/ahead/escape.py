@@ -22,7 +22,8 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid import kernels
-from qpavoid.ahead.flights import TOUCH, Flight, Flights, Manner, Start, Value
+from qpavoid.ahead.flight import TOUCH, Flight, Manner, Start, Value
+from qpavoid.ahead.flights import Flights
 from qpavoid.limits import JointBounds
 from qpavoid.obstacles.sensing import Obstacles
 from qpavoid.problem import Array, IntArray, Proximity

@@ -10,17 +10,17 @@ This is greedy, and runs into dead ends; which v̂ leads out of one cannot be to
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
 from qpavoid import kernels
+from qpavoid.ahead.flight import TOUCH, Flight, Manner, Near, Start, Tally, Value
 from qpavoid.ahead.ramps import Ramps
 from qpavoid.config import Avoidance, Escape, Limits
 from qpavoid.kinematics import ForwardKinematics, longest_lever, support_masks
 from qpavoid.limits import JointBounds
-from qpavoid.obstacles.sensing import Obstacles, Seen, Told
+from qpavoid.obstacles.sensing import Obstacles, Seen
 from qpavoid.problem import Array, Mask
 from qpavoid.proximity import DistanceQuery
 from qpavoid.scene import Scene
@@ -31,93 +31,10 @@ _GENTLE = 1e-4
 """ε: what the square of a joint speed counts beside that of a distance [m²/(rad/s)²]."""
 _DEEPEST = 10.0
 """Penetration that no flight foresees [m]."""
-TOUCH = 1e-3
-"""Distance below which a pair counts as touching [m]."""
 _MANY = 300
 """Times of which it is remembered what was foreseen, before those that are over are forgotten."""
 _BEYOND = 0.1
 """How much longer than the horizon flights are, so that they need not be flown anew in every tick [s]."""
-
-
-class Manner(NamedTuple):
-    """A way to flee."""
-
-    horizon: float
-    """h [s]; 0 stands still."""
-    leaning: Array
-    """v̂ (nv,) [rad/s, m/s]."""
-
-
-class Near(NamedTuple):
-    """What a flight looks at: the watched pairs within reach; in memory that the next look overwrites."""
-
-    closest: Array
-    """(k, 10) distances first [m]."""
-    J: Array
-    """(k, nv) velocity Jacobian of these distances."""
-    drift: Array
-    """(k,) their rate due to the obstacles [m/s]."""
-
-
-class Start(NamedTuple):
-    """Where a flight begins."""
-
-    q: Array
-    """(nq,)."""
-    v: Array
-    """(nv,) velocity that has led there."""
-    w: Array
-    """(nv,) by how much that changed in the tick before."""
-    t: float
-    """[s]."""
-    watched: Mask
-    """(m,) pairs that are not to touch."""
-
-
-class Value(NamedTuple):
-    """How good a flight is, the larger the better."""
-
-    clear: float
-    """The horizon of the foresight, less what is left of it, for each pair that touches, when that first does [s].
-
-    Of a pair that touches in every flight, nothing more is lost by keeping the others apart.
-    """
-    distance: float
-    """Smallest distance of pairs that do not touch, up to what counts as safe [m]."""
-
-
-class Flight(NamedTuple):
-    """Velocities, and where they lead."""
-
-    start: Start
-    v: Array
-    """(k, nv) of each tick."""
-    manner: Manner
-    value: Value
-    until: float
-    """When something touches; the end, if nothing does before [s]."""
-    least: float
-    """Smallest distance of pairs that do not touch, up to that at which flights look at pairs [m]."""
-    told: Told | None
-    """What was told of obstacles when it was flown."""
-
-
-class _Tally:
-    """What touches in the course of a flight."""
-
-    def __init__(self, start: Start, horizon: float) -> None:
-        self.watched, self.until, self.least = start.watched.copy(), np.inf, np.inf
-        self.lost, self._before, self._deadline = 0.0, np.inf, start.t + horizon
-
-    def count(self, found: tuple[int, float, float], t: float, span: float) -> None:
-        """Takes what a look has found, see `look_around`, into account; at t, `span` after the last one [s]."""
-        touching, nearest, rest = found
-        if touching:
-            closing = self._before - nearest
-            when = t - span * (TOUCH - nearest) / closing if 0.0 < closing < np.inf else t
-            self.until = min(self.until, when)
-            self.lost += touching * max(self._deadline - when, 0.0)
-        self.least, self._before = min(self.least, rest), rest
 
 
 class Flights:
@@ -174,7 +91,7 @@ class Flights:
     def _compile(self, q: Array) -> None:
         """So that no tick waits for the compiler."""
         still = self.still.leaning
-        near = self._look(q, 0.0, still, _Tally(Start(q, still, still, 0.0, self.parted), 1.0), 0.0)
+        near = self._look(q, 0.0, still, Tally(Start(q, still, still, 0.0, self.parted), 1.0), 0.0)
         kernels.comes_too_near(*near, still, 1.0, 0.0)
         self.ramps.towards(still, still, self._flee(near, Manner(0.1, still))[None])
         self.forget_foreseen()
@@ -257,7 +174,7 @@ class Flights:
         """
         q, v, w, t, _ = start
         horizon, safe = self.enough
-        end, plan, tally = t + horizon + _BEYOND, list[Array](), _Tally(start, horizon)
+        end, plan, tally = t + horizon + _BEYOND, list[Array](), Tally(start, horizon)
         near = self._look(q, t, v, tally, 0.0)
         left = self._none if given is None else given
         while t < end - 1e-9:
@@ -297,7 +214,7 @@ class Flights:
             q = pin.integrate(self._model, q, self._dt * step)
         return q
 
-    def _look(self, q: Array, t: float, v: Array, tally: _Tally, span: float) -> Near:
+    def _look(self, q: Array, t: float, v: Array, tally: Tally, span: float) -> Near:
         """What is near at q (nq,), reached with v (nv,), with the obstacles where they will be at t, `span` after the
         last look [s].
         """
