@@ -150,7 +150,7 @@ class EscapePlanner:
             count = int(np.ceil(self._settings.horizon / _SPAN)) + 2
             paths, speeds = self._obstacles.paths(_SPAN * np.arange(first, first + count, dtype=np.float64))
             fastest = speeds.max(axis=0)
-            moves = np.flatnonzero(fastest != 0.0)
+            moves = np.flatnonzero((fastest != 0.0) | (paths != paths[0]).any(axis=(0, 2)))
             moving = self._obstacles.moving[moves]
             self._first, self._seen_paths = first, (moving, paths[:, moves].copy(), 0.5 * _SPAN * fastest[moves])
         return self._seen_paths

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from qpavoid.obstacles.sensing import Told
+from qpavoid.obstacles.told import Told
 from qpavoid.problem import Array, Mask
 
 TOUCH = 1e-3

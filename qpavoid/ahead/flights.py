@@ -21,6 +21,7 @@ from qpavoid.config import Avoidance, Escape, Limits
 from qpavoid.kinematics import ForwardKinematics, longest_lever, support_masks
 from qpavoid.limits import JointBounds
 from qpavoid.obstacles.sensing import Obstacles, Seen
+from qpavoid.obstacles.told import strayed
 from qpavoid.problem import Array, Mask
 from qpavoid.proximity import DistanceQuery
 from qpavoid.scene import Scene
@@ -147,8 +148,8 @@ class Flights:
             off = off + self._dt * np.cumsum(steps - flight.v[: len(steps)], axis=0)
             most = max(most, float(np.abs(off).sum(axis=1).max(initial=0.0)))
         span = self.settings.horizon + _BEYOND
-        strayed = self._obstacles.strayed(flight.told, span, self.query.placing.reach)
-        return bool(flight.least - self.lever * most - strayed >= self.enough.distance)
+        off_too = strayed(self._obstacles.told, flight.told, span, self.query.placing.reach)
+        return bool(flight.least - self.lever * most - off_too >= self.enough.distance)
 
     def fly(self, start: Start, manner: Manner, given: Array | None = None) -> Flight:
         """`better` than nothing."""

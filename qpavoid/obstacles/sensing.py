@@ -20,11 +20,10 @@ from qpavoid.errors import NumericalError, UnknownName, nearest
 from qpavoid.geometry.cloud import Points, Voxels
 from qpavoid.motion import Sample
 from qpavoid.obstacles.courses import STATE, Courses, as_samples, move_on, put
+from qpavoid.obstacles.told import MeanTwists, Told
 from qpavoid.problem import Array, IntArray, as_vector
 from qpavoid.scene import Obstacle
 
-_ROTATION, _POSITION, _LINEAR, _ANGULAR = slice(9), slice(9, 12), slice(12, 15), slice(15, 18)
-"""Where the parts of a state are."""
 _AT_REST = np.zeros(3)
 _AT_REST.setflags(write=False)
 
@@ -59,17 +58,6 @@ class Seen(NamedTuple):
     """(o,) to be taken off the distances to each, likewise [m]."""
 
 
-class Told(NamedTuple):
-    """What a program has told of some obstacles, as far as the future follows from it."""
-
-    which: tuple[int, ...]
-    """Their numbers."""
-    states: Array
-    """(k, 18) see `courses`."""
-    t: float
-    """When [s]."""
-
-
 class Observation(NamedTuple):
     """What a tick has to know of all obstacles."""
 
@@ -96,6 +84,7 @@ class Obstacles:
         self._seen = Seen(np.array(self._moving, np.intp), np.zeros((count, STATE)), np.zeros(count))
         self._known: dict[int, None] = {}  # those that are given from outside, in the order in which they were first
         self._age = np.full(count, -1)  # ticks since each was given last, negative if it never was
+        self._means = MeanTwists(count, dt)
         self._last, self._news = np.zeros((count, STATE)), np.zeros((count, STATE))  # as it was given then, and now
         self._views = [as_samples(states) for states in (self._seen.states, self._last, self._news)]
         self._by_pose = [f"{obstacle.name}: twist estimated from its poses" for obstacle in obstacles]
@@ -117,33 +106,16 @@ class Obstacles:
 
     @property
     def told(self) -> Told | None:
-        """What is known at the last tick of those that are given from outside; None where none is."""
-        which = tuple(self._known)
-        return Told(which, self._seen.states[list(which)], self._now) if which else None
+        """What is known at the last tick of those that are given from outside; None where none is.
 
-    def strayed(self, before: Told | None, span: float, reach: Array) -> float:
-        """How far any point of an obstacle is off from where it was foreseen to be, now and for some time [m].
-
-        Positions and rotations that are off by δp and δR, and twists by δv and δω, leave a point that is r from the
-        origin no farther off than |δp| + t |δv| + r (‖δR‖ + t |δω|) after t.
-
-        Args:
-            before: what was told when it was foreseen.
-            span: for how long it counts [s].
-            reach: distance from each obstacle's origin to its farthest point (o,) [m].
+        Their twists are means of what was told lately: those of a sensor are no base for what will be in a second.
         """
-        now = self.told
-        if now is None or before is None or now.which != before.which:
-            return 0.0 if now is before else np.inf
-        expected = before.states.copy()
-        move_on(expected, now.t - before.t)
-        off = np.abs(now.states - expected)
-        if not off.any():
-            return 0.0
-        p, v, R, w = (np.linalg.norm(off[:, part], axis=1) for part in (_POSITION, _LINEAR, _ROTATION, _ANGULAR))
-        turned = R + span * w
-        radii = np.where(turned > 0.0, reach[list(now.which)], 0.0)  # half-spaces have no end
-        return float(np.max(p + span * v + radii * turned))
+        which = tuple(self._known)
+        if not which:
+            return None
+        states = self._seen.states[list(which)]
+        states[:, 12:] = self._means.twists[list(which)]
+        return Told(which, states, self._now)
 
     def paths(self, times: Array) -> tuple[Array, Array]:
         """Where those that move will be at some times [s]: positions (t, k, 3) [m] and speeds (t, k) [m/s]."""
@@ -151,22 +123,20 @@ class Obstacles:
         if len(self._known) < len(self.moving):
             for row, t in zip(states, times.tolist(), strict=True):
                 self._at(t, row)
-        if self._known:
-            given = list(self._known)
-            last = self._seen.states[given]
-            states[:, given] = last
-            states[:, given, 9:12] += (times - self._now)[:, None, None] * last[:, 12:15]
+        if (told := self.told) is not None:
+            given = list(told.which)
+            states[:, given] = told.states
+            states[:, given, 9:12] += (times - self._now)[:, None, None] * told.states[:, 12:15]
         states = states[:, self.moving]
         return states[:, :, 9:12], np.linalg.norm(states[:, :, 12:15], axis=2)
 
     def foreseen(self, t: float) -> Seen:
         """Where they will be at t [s], on their trajectories, or as they were last seen to move."""
-        states, given = self._seen.states.copy(), list(self._known)
-        last_seen = states[given]
-        if given:
-            move_on(last_seen, t - self._now)
+        states, told = self._seen.states.copy(), self.told
         self._at(t, states)
-        states[given] = last_seen
+        if told is not None:
+            move_on(told.states, t - self._now)
+            states[list(told.which)] = told.states
         return self._seen._replace(states=states)
 
     def _at(self, t: float, states: Array) -> None:
@@ -215,6 +185,7 @@ class Obstacles:
     def _forget(self, index: int) -> None:
         self._known.pop(index, None)
         self._age[index] = -1
+        self._means.forget(index)
 
     def _renew(self) -> None:
         """Lays out anew of which obstacles there is news in every tick."""
@@ -253,7 +224,9 @@ class Obstacles:
         if not which:
             return set(), voxels
         numbers, bare = np.array(which), np.array(posed)
+        known = ~bare | (self._age[numbers] >= 0)  # of a first pose, no twist is known
         fine = kernels.take_in(numbers, bare, self._news, self._age, self._last, self._seen.states, self._dt)
+        self._means.hear(numbers[fine & known], self._last)
         for index in numbers[~fine].tolist():
             notes.append(f"{self._obstacles[index].name}: NaN or infinity in its pose or twist, taken as not given")
             voxels.pop(index, None)
@@ -270,6 +243,7 @@ class Obstacles:
         if index not in self._known:
             put(self._views[1][index], self._obstacles[index].motion.sample(t))
             self._known[index], self._age[index] = None, 0
+            self._means.hear(np.array([index]), self._last)
             self._renew()
 
     def _look_at(self, index: int, what: Points, notes: list[str]) -> Voxels | None:
