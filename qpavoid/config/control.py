@@ -43,8 +43,8 @@ AvoidanceRow = Annotated[Switching | Damper | Cbf, Field(discriminator="type")]
 class Escape(Block):
     """Foresight where obstacles move: tasks go on only where the robot could still flee (`qpavoid.ahead.escape`).
 
-    It takes obstacles to go on as their trajectories or last twists say, and time where they come near. Laws that keep
-    no limits are commanded as they are, and flights do not hold contacts.
+    It takes obstacles to go on as their trajectories say, or what was told of their twists lately, and time where they
+    come near. Laws that keep no limits are commanded as they are, and flights do not hold contacts.
     """
 
     horizon: Annotated[float, Field(ge=0.1, le=10.0)] = 1.5
