@@ -21,7 +21,7 @@ from qpavoid.machine import cpu, versions
 
 PACKAGES = ("qpavoid", "mujoco", "pin", "coal", "daqp", "numpy", "scipy", "numba")
 LISTED = 10
-"""Avoidable collisions that are listed for each solver; those of `qp` all are. The CSV has them all."""
+"""Avoidable collisions that are listed for each solver; those of `qp` and `qp-alone` all are. The CSV has them all."""
 
 
 class Took(NamedTuple):
@@ -75,6 +75,8 @@ def _sections(found: list[Trial], failures: dict[int, str], solvers: Sequence[st
         "",
         *_by_robot(found, solvers),
         "",
+        *_by_moving(found, solvers),
+        "",
         *_disagreement(found),
     ]
     for solver in solvers:
@@ -114,6 +116,18 @@ def _by_robot(found: list[Trial], solvers: Sequence[str]) -> list[str]:
         for solver in solvers:
             row = _summary([trial for trial in found if trial.solver == solver and trial.robot == robot])
             lines.append(f"| {robot}, {solver} | {' | '.join(row)} |")
+    return lines
+
+
+_MOVING = {"none": (0, 0), "1 or 2": (1, 2), "3 or more": (3, 99)}
+
+
+def _by_moving(found: list[Trial], solvers: Sequence[str]) -> list[str]:
+    lines = [f"| obstacles that move, solver | {' | '.join(_COLUMNS)} |", "|---|" + "---:|" * len(_COLUMNS)]
+    for name, (least, most) in _MOVING.items():
+        for solver in solvers:
+            row = _summary([trial for trial in found if trial.solver == solver and least <= trial.moving <= most])
+            lines.append(f"| {name}, {solver} | {' | '.join(row)} |")
     return lines
 
 

@@ -74,8 +74,8 @@ class Flights:
         self._packed, self._masks = kernels.pack(self._layout), support_masks(model)
         self._views: dict[int, Near] = {}
         self._none = np.zeros((0, model.nv))
-        self._flat = all(joint.nv == 1 for joint in list(model.joints)[1:])
-        """Whether the velocities of some ticks lead as far as their sum: joints of one coordinate each."""
+        self._flat = all(joint.nv <= 1 for joint in list(model.joints)[1:])
+        """Whether the velocities of some ticks lead as far as their sum: joints of one coordinate at most."""
         self.parted = self._which_part()
         """(m,) pairs that the robot can part."""
         self.ramps = Ramps(bounds, dt)
