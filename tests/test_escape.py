@@ -457,6 +457,10 @@ def test_a_flight_holds_only_while_it_is_of_what_is(tmp_path, among_balls):
     )
     assert planner.flights.holds_from(flight, flight.start)
     assert not planner.flights.holds_from(flight, flight.start._replace(t=0.02))  # obstacles are elsewhere by then
+    late = flight.start._replace(t=0.008)
+    room = flight.least - planner.flights.enough.distance
+    assert planner.flights.holds_from(flight, late, 0.99 * room / 0.008)
+    assert not planner.flights.holds_from(flight, late, 1.01 * room / 0.008)
     assert not planner.flights.holds_from(flight, flight.start._replace(watched=~planner.flights.parted))
     load = Obstacle.at("load", Sphere(radius=0.02), [0.3, 0.0, 0.0], graspable=True)
     ball = Obstacle(
@@ -539,9 +543,25 @@ def test_what_is_foreseen_is_of_the_mean_of_what_was_told_lately():
             np.testing.assert_array_equal(first, obstacles._seen.states[0, 12:15])  # of one twist, that is the mean
         if k > 50:
             off.append(obstacles.foreseen(t + 1.0).states[0, 9:12] - at - [0.2, 0.0, 0.0])
-            paths, _ = obstacles.paths(np.array([t + 1.0]))
+            paths = obstacles.paths(np.array([t + 1.0]))[:, :, 9:12]
             np.testing.assert_allclose(paths[0, 0], obstacles.foreseen(t + 1.0).states[0, 9:12], rtol=0, atol=1e-12)
     assert np.std(off) < 0.05 and np.abs(np.mean(off, axis=0)).max() < 0.02
+
+
+def test_a_clock_that_is_not_exact_costs_no_flights(tmp_path):
+    flown = {}
+    for jitter in (0.0, 1e-3):
+        rng, robot = np.random.default_rng(0), cartesian(tmp_path, "xy", speed=0.25, acceleration=None)
+        controller = make_controller(robot, jaws(speed=0.12), "y", avoidance=Avoidance(d1=0.02, d2=0.10))
+        flights, starts = controller._commander.escape.flights, []
+        better = flights.better
+        flights.better = lambda *a, s=starts, b=better: s.append(a[1].t) or b(*a)
+        q = robot.home.copy()
+        for k in range(300, 480):
+            t = k * DT + jitter * rng.uniform(-1.0, 1.0)
+            q = pin.integrate(robot.model, q, DT * controller.step(q, t, {"y": Sample.at([0.0, 0.0, 0.0])}).v)
+        flown[jitter] = len(starts)
+    assert flown[0.0] > 5 and flown[1e-3] < 2 * flown[0.0] < 100
 
 
 @settings(max_examples=60, deadline=None)

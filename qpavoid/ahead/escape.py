@@ -17,6 +17,7 @@ among obstacles as they are seen then.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -41,6 +42,19 @@ _SPAN = 0.1
 """Time from one look at bounding spheres to the next [s]."""
 _ALIKE = 1e-6
 """Difference of two flights' distances that counts as none [m]."""
+
+
+class _Paths(NamedTuple):
+    """Where what moves will be, every `_SPAN` until the horizon."""
+
+    moving: IntArray
+    """(k,) numbers of those that do not rest until then."""
+    places: Array
+    """(t, k, 3) [m]."""
+    strides: Array
+    """(k,) how far they may be from these in between [m]."""
+    fastest: float
+    """Largest speed of any point of them [m/s]."""
 
 
 class EscapePlanner:
@@ -69,7 +83,7 @@ class EscapePlanner:
         self._wait = 0
         self._random, self._untried = np.random.default_rng(0), list[float]()
         self._first: int | None = None
-        self._seen_paths: tuple[IntArray, Array, Array] = (np.zeros(0, np.intp), np.zeros((0, 0, 3)), np.zeros(0))
+        self._ways = _Paths(np.zeros(0, np.intp), np.zeros((0, 0, 3)), np.zeros(0), 0.0)
         self.flights.forget_foreseen()
 
     def look_anew(self) -> None:
@@ -102,9 +116,9 @@ class EscapePlanner:
         wanted, known = v, self._kept
         if known is not None and len(known.v):
             left = self.flights.a_tick_on(known)
-            if not self.flights.holds_from(left, next_tick):
+            if not self.flights.holds_from(left, next_tick, self._ways.fastest):
                 wanted = known.v[0]
-            if wanted is v or self._wait:
+            if wanted is v or (self._wait and abs(known.start.t - t) <= self._dt):
                 self._kept, self._wait = left, max(self._wait - 1, 0)
                 return None if np.array_equal(wanted, v) else wanted
         self._wait = self._held
@@ -132,28 +146,30 @@ class EscapePlanner:
 
         Between the times at which they are looked at, obstacles are taken to be no faster than at these.
         """
-        moving, paths, strides = self._paths(int(np.floor(start.t / _SPAN)))
-        if not len(moving):
+        ways = self._paths(int(np.floor(start.t / _SPAN)))
+        if not len(ways.moving):
             return True
         self.flights.kinematics.compute(start.q)
         centers, radii = self.flights.query.body_spheres(self.flights.kinematics.data)
         stop = float(np.square(start.v) @ self._braking)
         least = self._settings.comfort + (self.flights.lever * stop if stop else 0.0)
-        reach = self.flights.query.placing.reach[moving] + strides + least
-        return kernels.least_apart(paths, centers, reach[:, None] + radii) > 0.0
+        reach = self.flights.query.placing.reach[ways.moving] + ways.strides + least
+        return kernels.least_apart(ways.places, centers, reach[:, None] + radii) > 0.0
 
-    def _paths(self, first: int) -> tuple[IntArray, Array, Array]:
-        """Numbers of those that do not rest until the horizon (k,); their centres every `_SPAN` from a multiple of that
-        on (t, k, 3), and how far they may be from these in between (k,) [m].
-        """
+    def _paths(self, first: int) -> _Paths:
+        """The ways of all that moves from a multiple of `_SPAN` until the horizon."""
         if first != self._first or self._obstacles.told is not None:
             count = int(np.ceil(self._settings.horizon / _SPAN)) + 2
-            paths, speeds = self._obstacles.paths(_SPAN * np.arange(first, first + count, dtype=np.float64))
-            fastest = speeds.max(axis=0)
-            moves = np.flatnonzero((fastest != 0.0) | (paths != paths[0]).any(axis=(0, 2)))
+            states = self._obstacles.paths(_SPAN * np.arange(first, first + count, dtype=np.float64))
+            places = states[:, :, 9:12]
+            speed, spin = np.linalg.norm(states[:, :, 12:].reshape(*states.shape[:2], 2, 3), axis=3).max(axis=0).T
+            moves = np.flatnonzero((speed != 0.0) | (spin != 0.0) | (places != places[0]).any(axis=(0, 2)))
             moving = self._obstacles.moving[moves]
-            self._first, self._seen_paths = first, (moving, paths[:, moves].copy(), 0.5 * _SPAN * fastest[moves])
-        return self._seen_paths
+            speed, spin = speed[moves], spin[moves]
+            turning = np.where(spin > 0.0, spin * self.flights.query.placing.reach[moving], 0.0)
+            fastest = float(np.max(speed + turning, initial=0.0))
+            self._first, self._ways = first, _Paths(moving, places[:, moves].copy(), 0.5 * _SPAN * speed, fastest)
+        return self._ways
 
     def _onward(self, v: Array) -> Iterator[tuple[Manner, Array]]:
         """Flights like the one that is kept, by its manner and its velocities; standing still."""
@@ -187,7 +203,7 @@ class EscapePlanner:
     def _way_out(self, start: Start) -> tuple[Flight, int]:
         """The flight that is kept, as good as it is from here and now, or a better one; and attempts that are left."""
         known, attempts = self._kept, self._settings.attempts
-        if known is not None and self.flights.holds_from(known, start):
+        if known is not None and self.flights.holds_from(known, start, self._ways.fastest):
             return known._replace(start=start), attempts
         manner, given = (self.flights.still, None) if known is None else (known.manner, known.v)
         best = self.flights.fly(start, manner, given)

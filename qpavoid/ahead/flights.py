@@ -32,6 +32,8 @@ _GENTLE = 1e-4
 """ε: what the square of a joint speed counts beside that of a distance [m²/(rad/s)²]."""
 _DEEPEST = 10.0
 """Penetration that no flight foresees [m]."""
+_ROUND_OFF = 1e-6
+"""Difference of two times that counts as none [s]."""
 _MANY = 300
 """Times of which it is remembered what was foreseen, before those that are over are forgotten."""
 _BEYOND = 0.1
@@ -130,16 +132,23 @@ class Flights:
         begun = Start(pin.integrate(self._model, q, self._dt * v), v, v - before, t + self._dt, watched)
         return flight._replace(start=begun, v=flight.v[1:])
 
-    def holds_from(self, flight: Flight, start: Start) -> bool:
+    def holds_from(self, flight: Flight, start: Start, fastest: float = 0.0) -> bool:
         """Whether a flight that is good enough is so from a start close to its own, without another look.
 
         The same velocities lead past the same places, but for how far the start is off, and what is lost until they are
         reached. No point of the robot is farther off than the longest lever times the sum of that over the joints; and
-        no point of an obstacle than what is told of it now differs from what was.
+        no point of an obstacle than what is told of it now differs from what was, and than it moves in the time by
+        which the start is early or late.
+
+        Args:
+            flight: whether it holds.
+            start: from where.
+            fastest: largest speed of any point of an obstacle [m/s].
         """
         if flight.until < start.t + self.settings.horizon - 1e-9:
             return False
-        if abs(start.t - flight.start.t) > 1e-6 or not np.array_equal(flight.start.watched, start.watched):
+        late = abs(start.t - flight.start.t)
+        if late > self._dt or not np.array_equal(flight.start.watched, start.watched):
             return False
         off = pin.difference(self._model, flight.start.q, start.q)
         most = float(np.abs(off).sum())
@@ -148,7 +157,9 @@ class Flights:
             off = off + self._dt * np.cumsum(steps - flight.v[: len(steps)], axis=0)
             most = max(most, float(np.abs(off).sum(axis=1).max(initial=0.0)))
         span = self.settings.horizon + _BEYOND
-        off_too = strayed(self._obstacles.told, flight.told, span, self.query.placing.reach)
+        off_too = (late * fastest if late > _ROUND_OFF else 0.0) + strayed(
+            self._obstacles.told, flight.told, span, self.query.placing.reach
+        )
         return bool(flight.least - self.lever * most - off_too >= self.enough.distance)
 
     def fly(self, start: Start, manner: Manner, given: Array | None = None) -> Flight:

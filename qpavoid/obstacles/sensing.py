@@ -117,8 +117,10 @@ class Obstacles:
         states[:, 12:] = self._means.twists[list(which)]
         return Told(which, states, self._now)
 
-    def paths(self, times: Array) -> tuple[Array, Array]:
-        """Where those that move will be at some times [s]: positions (t, k, 3) [m] and speeds (t, k) [m/s]."""
+    def paths(self, times: Array) -> Array:
+        """States (t, k, 18) of those that move at some times [s]; turned they are as the last tick had those of which a
+        program tells.
+        """
         states = np.empty((len(times), *self._seen.states.shape))
         if len(self._known) < len(self.moving):
             for row, t in zip(states, times.tolist(), strict=True):
@@ -127,8 +129,7 @@ class Obstacles:
             given = list(told.which)
             states[:, given] = told.states
             states[:, given, 9:12] += (times - self._now)[:, None, None] * told.states[:, 12:15]
-        states = states[:, self.moving]
-        return states[:, :, 9:12], np.linalg.norm(states[:, :, 12:15], axis=2)
+        return np.asarray(states[:, self.moving])
 
     def foreseen(self, t: float) -> Seen:
         """Where they will be at t [s], on their trajectories, or as they were last seen to move."""
