@@ -313,7 +313,7 @@ def test_qp_collisions_that_were_found_and_mended(seed):
     assert not trial.avoidable, trial.judged
 
 
-@pytest.mark.parametrize("seed", [100, 265, 309, 419, 488, 559, 670])  # more in bench/results/safety.md
+@pytest.mark.parametrize("seed", [265, 309, 419, 488, 559, 670])  # more in bench/results/safety.md
 def test_foresight_gets_out_of_traps(seed):
     """Obstacles that close in from several sides, on a robot that follows its task until it is too late to flee."""
     watchful, blind = trials(seed, ("qp", "qp-alone"))
