@@ -25,6 +25,9 @@ from qpavoid.obstacles.placing import Placing
 from qpavoid.problem import Array, IntArray, Mask
 from qpavoid.scene import Scene
 
+if kernels.ACCELERATED:
+    from qpavoid.kernels.compiled.closed_forms import closed_forms as _closed_forms
+
 _CULL_FROM = 48 if kernels.ACCELERATED else 192
 """Number of pairs from which looking at bounding spheres first pays."""
 _TOLERANCE = 1e-10
@@ -245,12 +248,10 @@ class DistanceQuery:
 
     def _in_closed_form(self, pairs: IntArray) -> None:
         """Distances of the pairs that have one; those whose cores meet are computed by coal after all."""
-        from qpavoid.kernels.compiled.closed_forms import closed_forms
-
         bodies = self._scene.pairs
         if self._copy and self._others:
             self.results[~self._known] = read_results(self._data.distanceResults)[~self._known]
-        count = closed_forms(self.poses, self._cores, bodies, self._known, pairs, self.results, self._met)
+        count = _closed_forms(self.poses, self._cores, bodies, self._known, pairs, self.results, self._met)
         for pair in self._met[:count].tolist():
             a, b = (
                 (self._geometry.geometryObjects[i].geometry, coal.Transform3s(pose.rotation, pose.translation))

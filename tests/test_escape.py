@@ -530,6 +530,29 @@ def test_told_obstacles_are_foreseen_once_as_long_as_they_do_what_was_told(tmp_p
     assert 0 < flown[0.0] <= flown[1e-4] < 10 < flown[0.05]
 
 
+def test_paths_are_what_is_foreseen_of_those_on_trajectories_and_those_told_of():
+    times, given = np.array([0.3, 0.4, 1.9]), {"b": Sample.at([0, 1, 0], linear=[0.1, 0, 0.2], angular=[0, 0, 3.0])}
+    line = build_motion(Line(start=(0.0, 0.6, 0.0), end=(0.0, -2.0, 0.0), speed=0.5))
+    still = Obstacle.at("still", Sphere(radius=0.1), [9.0, 0.0, 0.0])
+    obstacles = Obstacles(
+        [still, Obstacle("a", Sphere(radius=0.1), line, True), Obstacle.at("b", Sphere(radius=0.1), [0, 0, 0])],
+        Sensing(),
+        0.1,
+    )
+    for k in range(4):
+        obstacles.observe(0.1 * k, given if k % 2 else None)
+        places, rates = obstacles.paths(times)
+        assert obstacles.restless and len(rates) == (2 if k else 1)
+        for t, row in zip(times, places, strict=True):
+            np.testing.assert_allclose(row, obstacles.foreseen(t).states[obstacles.moving, 9:12], rtol=0, atol=1e-12)
+        expected = [[0.5, 0.0], [np.sqrt(0.05), 3.0]][: len(rates)]
+        np.testing.assert_allclose(rates, expected, rtol=0, atol=1e-12)
+    rest = Obstacles([still], Sensing(), 0.1)
+    for twist, restless in (([0, 0, 0], False), ([0, 0, 0.1], True)):
+        rest.observe(0.0, {"still": Sample.at([9.0, 0.0, 0.0], linear=twist)})
+        assert rest.restless == restless
+
+
 def test_what_is_foreseen_is_of_the_mean_of_what_was_told_lately():
     """Of a ball that is seen to within 5 mm, a bare pose at a time, twists are off by 0.7 m/s; what will be is not."""
     dt, rng = 0.01, np.random.default_rng(0)
@@ -543,8 +566,8 @@ def test_what_is_foreseen_is_of_the_mean_of_what_was_told_lately():
             np.testing.assert_array_equal(first, obstacles._seen.states[0, 12:15])  # of one twist, that is the mean
         if k > 50:
             off.append(obstacles.foreseen(t + 1.0).states[0, 9:12] - at - [0.2, 0.0, 0.0])
-            paths = obstacles.paths(np.array([t + 1.0]))[:, :, 9:12]
-            np.testing.assert_allclose(paths[0, 0], obstacles.foreseen(t + 1.0).states[0, 9:12], rtol=0, atol=1e-12)
+            places, _ = obstacles.paths(np.array([t + 1.0]))
+            np.testing.assert_allclose(places[0, 0], obstacles.foreseen(t + 1.0).states[0, 9:12], rtol=0, atol=1e-12)
     assert np.std(off) < 0.05 and np.abs(np.mean(off, axis=0)).max() < 0.02
 
 

@@ -104,7 +104,8 @@ class EscapePlanner:
             w_last: by how much that changed in the tick before (nv,).
             proximity: distances of this tick; pairs that touch already are left out of account.
         """
-        if not len(self._obstacles.moving):
+        if not self._obstacles.restless:
+            self._kept = None
             return None
         self.flights.go_on_to(t - _SPAN)
         watched = self.flights.parted.copy()
@@ -160,12 +161,10 @@ class EscapePlanner:
         """The ways of all that moves from a multiple of `_SPAN` until the horizon."""
         if first != self._first or self._obstacles.told is not None:
             count = int(np.ceil(self._settings.horizon / _SPAN)) + 2
-            states = self._obstacles.paths(_SPAN * np.arange(first, first + count, dtype=np.float64))
-            places = states[:, :, 9:12]
-            speed, spin = np.linalg.norm(states[:, :, 12:].reshape(*states.shape[:2], 2, 3), axis=3).max(axis=0).T
-            moves = np.flatnonzero((speed != 0.0) | (spin != 0.0) | (places != places[0]).any(axis=(0, 2)))
+            places, rates = self._obstacles.paths(_SPAN * np.arange(first, first + count, dtype=np.float64))
+            moves = np.flatnonzero(rates.any(axis=1) | (places != places[0]).any(axis=(0, 2)))
             moving = self._obstacles.moving[moves]
-            speed, spin = speed[moves], spin[moves]
+            speed, spin = rates[moves].T
             turning = np.where(spin > 0.0, spin * self.flights.query.placing.reach[moving], 0.0)
             fastest = float(np.max(speed + turning, initial=0.0))
             self._first, self._ways = first, _Paths(moving, places[:, moves].copy(), 0.5 * _SPAN * speed, fastest)

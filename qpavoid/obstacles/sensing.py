@@ -82,6 +82,8 @@ class Obstacles:
         self._carried: set[int] = set()
         count = len(obstacles)
         self._seen = Seen(np.array(self._moving, np.intp), np.zeros((count, STATE)), np.zeros(count))
+        self._told: Told | None = None
+        self._sampled = np.zeros(0), np.zeros((0, count, 3)), np.zeros((count, 2))  # of the trajectories: see `paths`
         self._known: dict[int, None] = {}  # those that are given from outside, in the order in which they were first
         self._age = np.full(count, -1)  # ticks since each was given last, negative if it never was
         self._means = MeanTwists(count, dt)
@@ -110,34 +112,48 @@ class Obstacles:
 
         Their twists are means of what was told lately: those of a sensor are no base for what will be in a second.
         """
-        which = tuple(self._known)
-        if not which:
-            return None
-        states = self._seen.states[list(which)]
-        states[:, 12:] = self._means.twists[list(which)]
-        return Told(which, states, self._now)
+        if self._told is None and self._known:
+            which = list(self._known)
+            states = self._seen.states[which]
+            states[:, 12:] = self._means.twists[which]
+            self._told = Told(tuple(which), states, self._now)
+        return self._told
 
-    def paths(self, times: Array) -> Array:
-        """States (t, k, 18) of those that move at some times [s]; turned they are as the last tick had those of which a
-        program tells.
+    @property
+    def restless(self) -> bool:
+        """Whether any is on a trajectory, or told to move, so that it may be elsewhere later."""
+        told = self.told
+        if told is None or len(told.which) < len(self.moving):
+            return len(self.moving) > 0
+        return bool(told.states[:, 12:].any())
+
+    def paths(self, times: Array) -> tuple[Array, Array]:
+        """Places (t, k, 3) of those that move at some times [s], and their largest speeds and rates of turning at these
+        (k, 2) [m/s, rad/s].
         """
-        states = np.empty((len(times), *self._seen.states.shape))
-        if len(self._known) < len(self.moving):
-            for row, t in zip(states, times.tolist(), strict=True):
-                self._at(t, row)
-        if (told := self.told) is not None:
-            given = list(told.which)
-            states[:, given] = told.states
-            states[:, given, 9:12] += (times - self._now)[:, None, None] * told.states[:, 12:15]
-        return np.asarray(states[:, self.moving])
+        places, rates = np.empty((len(times), len(self.moving), 3)), np.empty((len(self.moving), 2))
+        told = self.told
+        if told is None or len(told.which) < len(self.moving):
+            if not np.array_equal(times, self._sampled[0]):
+                states = np.zeros((len(times), *self._seen.states.shape))
+                for row, t in zip(states, times.tolist(), strict=True):
+                    self._at(t, row)
+                self._sampled = times, states[:, :, 9:12].copy(), _rates(states).max(axis=0)
+            places[:], rates[:] = self._sampled[1][:, self.moving], self._sampled[2][self.moving]
+        if told is not None:
+            columns = np.searchsorted(self.moving, told.which)
+            ahead = (times - told.t)[:, None, None] * told.states[:, 12:15]
+            places[:, columns], rates[columns] = told.states[:, 9:12] + ahead, _rates(told.states)
+        return places, rates
 
     def foreseen(self, t: float) -> Seen:
         """Where they will be at t [s], on their trajectories, or as they were last seen to move."""
         states, told = self._seen.states.copy(), self.told
         self._at(t, states)
         if told is not None:
-            move_on(told.states, t - self._now)
-            states[list(told.which)] = told.states
+            later = told.states.copy()
+            move_on(later, t - told.t)
+            states[list(told.which)] = later
         return self._seen._replace(states=states)
 
     def _at(self, t: float, states: Array) -> None:
@@ -166,7 +182,7 @@ class Obstacles:
         """
         if not given and not self._moving and not self._known:
             return None
-        self._now = t
+        self._now, self._told = t, None
         self._follow(t)
         self._seen.margin.fill(0.0)
         notes: list[str] = []
@@ -190,6 +206,7 @@ class Obstacles:
 
     def _renew(self) -> None:
         """Lays out anew of which obstacles there is news in every tick."""
+        self._told = None
         self._seen = self._seen._replace(which=np.array(sorted({*self._moving, *self._known}), dtype=np.intp))
 
     def _follow(self, t: float) -> None:
@@ -284,6 +301,11 @@ class Obstacles:
         self._seen.states[index] = self._last[index]
         move_on(self._seen.states[index : index + 1], age)
         self._seen.margin[index] = margin
+
+
+def _rates(states: Array) -> Array:
+    """Speeds and rates of turning (..., 2) of states (..., 18) [m/s, rad/s]."""
+    return np.asarray(np.linalg.norm(states[..., 12:].reshape(*states.shape[:-1], 2, 3), axis=-1))
 
 
 _SHAPES = {"position": (3,), "rotation": (3, 3), "linear": (3,), "angular": (3,)}
