@@ -57,6 +57,17 @@ class _Paths(NamedTuple):
     """Largest speed of any point of them [m/s]."""
 
 
+class _Apart(NamedTuple):
+    """How far what moves stays apart, more than it has to, from a robot that rests."""
+
+    first: int
+    """From which multiple of `_SPAN` on until the horizon."""
+    q: Array
+    """(nq,) where that rests."""
+    room: float
+    """[m]."""
+
+
 class EscapePlanner:
     """Tries flights, and decides which is commanded."""
 
@@ -83,13 +94,14 @@ class EscapePlanner:
         self._wait = 0
         self._random, self._untried = np.random.default_rng(0), list[float]()
         self._first: int | None = None
+        self._apart: _Apart | None = None
         self._ways = _Paths(np.zeros(0, np.intp), np.zeros((0, 0, 3)), np.zeros(0), 0.0)
         self.flights.forget_foreseen()
 
     def look_anew(self) -> None:
         """What the robot carries, or what may touch, has changed: the flight that is kept has to be flown anew."""
         self.flights.look_anew()
-        self._first = None
+        self._first = self._apart = None
         if self._kept is not None:
             self._kept = self._kept._replace(until=-np.inf)
 
@@ -108,12 +120,16 @@ class EscapePlanner:
             self._kept = None
             return None
         self.flights.go_on_to(t - _SPAN)
-        watched = self.flights.parted.copy()
-        watched[proximity.pair[proximity.distance < TOUCH]] = False
+        watched = self.flights.parted
         next_tick = Start(pin.integrate(self._model, q, self._dt * v), v, v - v_last, t + self._dt, watched)
         if self._nobody_comes(next_tick):
             self._kept = None
             return None
+        touching = proximity.pair[proximity.distance < TOUCH]
+        if len(touching):
+            watched = watched.copy()
+            watched[touching] = False
+            next_tick = next_tick._replace(watched=watched)
         wanted, known = v, self._kept
         if known is not None and len(known.v):
             left = self.flights.a_tick_on(known)
@@ -145,17 +161,23 @@ class EscapePlanner:
     def _nobody_comes(self, start: Start) -> bool:
         """Whether what moves stays away from a robot that stops here, which bounding spheres can tell or not.
 
-        Between the times at which they are looked at, obstacles are taken to be no faster than at these.
+        Between the times at which they are looked at, obstacles are taken to be no faster than at these. What was found
+        counts until the next of these times, less what the robot has moved since.
         """
-        ways = self._paths(int(np.floor(start.t / _SPAN)))
+        first, stop = int(np.floor(start.t / _SPAN)), float(np.square(start.v) @ self._braking)
+        if self._apart is not None and self._apart.first == first and self._obstacles.told is None:
+            moved = float(np.abs(pin.difference(self._model, self._apart.q, start.q)).sum())
+            if self.flights.lever * (moved + stop) < self._apart.room:
+                return True
+        ways = self._paths(first)
         if not len(ways.moving):
             return True
         self.flights.kinematics.compute(start.q)
         centers, radii = self.flights.query.body_spheres(self.flights.kinematics.data)
-        stop = float(np.square(start.v) @ self._braking)
-        least = self._settings.comfort + (self.flights.lever * stop if stop else 0.0)
-        reach = self.flights.query.placing.reach[ways.moving] + ways.strides + least
-        return kernels.least_apart(ways.places, centers, reach[:, None] + radii) > 0.0
+        reach = self.flights.query.placing.reach[ways.moving] + ways.strides + self._settings.comfort
+        room = kernels.least_apart(ways.places, centers, reach[:, None] + radii)
+        self._apart = _Apart(first, start.q, room)
+        return (self.flights.lever * stop if stop else 0.0) < room
 
     def _paths(self, first: int) -> _Paths:
         """The ways of all that moves from a multiple of `_SPAN` until the horizon."""

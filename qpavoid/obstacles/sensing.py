@@ -83,7 +83,7 @@ class Obstacles:
         count = len(obstacles)
         self._seen = Seen(np.array(self._moving, np.intp), np.zeros((count, STATE)), np.zeros(count))
         self._told: Told | None = None
-        self._sampled = np.zeros(0), np.zeros((0, count, 3)), np.zeros((count, 2))  # of the trajectories: see `paths`
+        self._sampled: dict[float, tuple[Array, Array]] = {}  # of those on trajectories, by time: see `paths`
         self._known: dict[int, None] = {}  # those that are given from outside, in the order in which they were first
         self._age = np.full(count, -1)  # ticks since each was given last, negative if it never was
         self._means = MeanTwists(count, dt)
@@ -134,17 +134,20 @@ class Obstacles:
         places, rates = np.empty((len(times), len(self.moving), 3)), np.empty((len(self.moving), 2))
         told = self.told
         if told is None or len(told.which) < len(self.moving):
-            if not np.array_equal(times, self._sampled[0]):
-                states = np.zeros((len(times), *self._seen.states.shape))
-                for row, t in zip(states, times.tolist(), strict=True):
-                    self._at(t, row)
-                self._sampled = times, states[:, :, 9:12].copy(), _rates(states).max(axis=0)
-            places[:], rates[:] = self._sampled[1][:, self.moving], self._sampled[2][self.moving]
+            self._sampled = {t: self._sampled.get(t) or self._sample(t) for t in times.tolist()}
+            sampled = [np.array(parts) for parts in zip(*self._sampled.values(), strict=True)]
+            places[:], rates[:] = sampled[0][:, self.moving], sampled[1][:, self.moving].max(axis=0)
         if told is not None:
             columns = np.searchsorted(self.moving, told.which)
             ahead = (times - told.t)[:, None, None] * told.states[:, 12:15]
             places[:, columns], rates[columns] = told.states[:, 9:12] + ahead, _rates(told.states)
         return places, rates
+
+    def _sample(self, t: float) -> tuple[Array, Array]:
+        """Places (o, 3) and rates (o, 2) of those that follow a trajectory."""
+        states = np.zeros_like(self._seen.states)
+        self._at(t, states)
+        return states[:, 9:12], _rates(states)
 
     def foreseen(self, t: float) -> Seen:
         """Where they will be at t [s], on their trajectories, or as they were last seen to move."""
