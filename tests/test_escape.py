@@ -321,6 +321,25 @@ def test_a_flight_that_is_flown_again_is_the_same_and_so_is_what_is_left_of_it(a
     assert 0 < touched < 24
 
 
+def test_only_a_flight_that_outdoes_another_is_flown_to_its_end(among_balls):
+    _, planner, q = among_balls
+    planner.reset()
+    best, counts = None, {True: 0, False: 0}
+    for t in (0.13, 0.51, 1.17):
+        start, best = start_of(planner, q, t), None
+        for _ in range(8):
+            manner = planner._drawn()
+            alone = planner.flights.fly(start, manner)
+            outdoes = best is None or alone.value > best.value
+            found = planner.flights.better(best, start, manner)
+            assert (found is not None) == outdoes
+            if found is not None:
+                assert found.value == alone.value
+            counts[outdoes] += 1
+            best = found or best
+    assert min(counts.values()) > 2
+
+
 def test_flights_that_hold_from_a_start_close_by_do_so(among_balls):
     """With the bound taken at its word by flying anew what it says need not be."""
     _, planner, q = among_balls

@@ -47,6 +47,8 @@ _ALIKE = 1e-6
 class _Paths(NamedTuple):
     """Where what moves will be, every `_SPAN` until the horizon."""
 
+    first: int | None
+    """From which multiple of that on; None before anything was looked at."""
     moving: IntArray
     """(k,) numbers of those that do not rest until then."""
     places: Array
@@ -57,11 +59,14 @@ class _Paths(NamedTuple):
     """Largest speed of any point of them [m/s]."""
 
 
+_NO_PATHS = _Paths(None, np.zeros(0, np.intp), np.zeros((0, 0, 3)), np.zeros(0), 0.0)
+
+
 class _Apart(NamedTuple):
     """How far what moves stays apart, more than it has to, from a robot that rests."""
 
-    first: int
-    """From which multiple of `_SPAN` on until the horizon."""
+    ways: _Paths
+    """Of what moves."""
     q: Array
     """(nq,) where that rests."""
     room: float
@@ -93,15 +98,14 @@ class EscapePlanner:
         self._kept: Flight | None = None
         self._wait = 0
         self._random, self._untried = np.random.default_rng(0), list[float]()
-        self._first: int | None = None
         self._apart: _Apart | None = None
-        self._ways = _Paths(np.zeros(0, np.intp), np.zeros((0, 0, 3)), np.zeros(0), 0.0)
+        self._ways = _NO_PATHS
         self.flights.forget_foreseen()
 
     def look_anew(self) -> None:
         """What the robot carries, or what may touch, has changed: the flight that is kept has to be flown anew."""
         self.flights.look_anew()
-        self._first = self._apart = None
+        self._ways, self._apart = _NO_PATHS, None
         if self._kept is not None:
             self._kept = self._kept._replace(until=-np.inf)
 
@@ -164,24 +168,23 @@ class EscapePlanner:
         Between the times at which they are looked at, obstacles are taken to be no faster than at these. What was found
         counts until the next of these times, less what the robot has moved since.
         """
-        first, stop = int(np.floor(start.t / _SPAN)), float(np.square(start.v) @ self._braking)
-        if self._apart is not None and self._apart.first == first and self._obstacles.told is None:
+        ways, stop = self._paths(int(np.floor(start.t / _SPAN))), float(np.square(start.v) @ self._braking)
+        if not len(ways.moving):
+            return True
+        if self._apart is not None and self._apart.ways is ways:
             moved = float(np.abs(pin.difference(self._model, self._apart.q, start.q)).sum())
             if self.flights.lever * (moved + stop) < self._apart.room:
                 return True
-        ways = self._paths(first)
-        if not len(ways.moving):
-            return True
         self.flights.kinematics.compute(start.q)
         centers, radii = self.flights.query.body_spheres(self.flights.kinematics.data)
         reach = self.flights.query.placing.reach[ways.moving] + ways.strides + self._settings.comfort
         room = kernels.least_apart(ways.places, centers, reach[:, None] + radii)
-        self._apart = _Apart(first, start.q, room)
+        self._apart = _Apart(ways, start.q, room)
         return (self.flights.lever * stop if stop else 0.0) < room
 
     def _paths(self, first: int) -> _Paths:
         """The ways of all that moves from a multiple of `_SPAN` until the horizon."""
-        if first != self._first or self._obstacles.told is not None:
+        if first != self._ways.first or self._obstacles.told is not None:
             count = int(np.ceil(self._settings.horizon / _SPAN)) + 2
             places, rates = self._obstacles.paths(_SPAN * np.arange(first, first + count, dtype=np.float64))
             moves = np.flatnonzero(rates.any(axis=1) | (places != places[0]).any(axis=(0, 2)))
@@ -189,7 +192,7 @@ class EscapePlanner:
             speed, spin = rates[moves].T
             turning = np.where(spin > 0.0, spin * self.flights.query.placing.reach[moving], 0.0)
             fastest = float(np.max(speed + turning, initial=0.0))
-            self._first, self._ways = first, _Paths(moving, places[:, moves].copy(), 0.5 * _SPAN * speed, fastest)
+            self._ways = _Paths(first, moving, places[:, moves].copy(), 0.5 * _SPAN * speed, fastest)
         return self._ways
 
     def _onward(self, v: Array) -> Iterator[tuple[Manner, Array]]:
