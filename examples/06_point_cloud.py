@@ -28,7 +28,7 @@ for k in range(1600):
     target = Sample.at(start + np.array([0.15 * np.sin(t), 0.15 * np.sin(2 * t), 0.0]))
     seen = {"camera": Points(picture(t))} if k % 10 == 0 else None  # pictures in between are not needed
     tick = controller.tick(q, targets={"panda_hand_tcp": target}, obstacles=seen)
-    said |= set(tick.solution.assumed)
+    said |= set(map(str, tick.solution.assumptions))
     closest = tick.proximity.distance.min(initial=closest)
     q = pin.integrate(robot.model, q, tick.solution.v * controller.dt)  # your robot goes here
 

@@ -11,6 +11,7 @@ from qpavoid.log import Log
 from qpavoid.motion import Sample
 from qpavoid.obstacles.sensing import Pose
 from qpavoid.problem import Problem, Solution, Status
+from qpavoid.reason import Reason, ReasonKind, Severity
 from qpavoid.robot import Robot
 from qpavoid.scene import Obstacle, Scene, build_scene
 from qpavoid.simulate import simulate
@@ -32,11 +33,14 @@ __all__ = [
     "Problem",
     "Progress",
     "QpavoidError",
+    "Reason",
+    "ReasonKind",
     "Robot",
     "Sample",
     "ScenarioConfig",
     "Scene",
     "Sensing",
+    "Severity",
     "Solution",
     "Solver",
     "SolverNotInstalled",

@@ -85,7 +85,8 @@ class Assembly:
         self._hard = (x.hard_lower, x.hard_upper) if limits.acceleration_gives_way else (x.lower, x.upper)
         self._packed = kernels.pack(self._layout)
         self._stop, self._dt = _StopAhead(x) if x.jerked else None, dt
-        self._names = scene.pair_names, tuple(scene.robot.coordinate_names)
+        robot = scene.robot
+        self._names = scene.pair_names, tuple(robot.coordinate_names), tuple(robot.coordinate_units)
         self._targets = [(row[:3], row[3:12].reshape(3, 3), row[12:15], row[15:]) for row in self._layout.targets]
         self._views: dict[int, tuple[Proximity, AvoidanceRows]] = {}
         levels = task_levels(frames, self._others)

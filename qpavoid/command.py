@@ -21,6 +21,7 @@ from qpavoid.limits import JointBounds, saturate
 from qpavoid.obstacles.sensing import Obstacles
 from qpavoid.problem import Array, Problem, Proximity, Solution, Status, sane
 from qpavoid.proximity import DistanceQuery
+from qpavoid.reason import Reason, ReasonKind
 from qpavoid.scene import Scene
 from qpavoid.solvers import Solver
 from qpavoid.solvers.hqp import Hqp
@@ -60,7 +61,7 @@ class Commander:
             frames: tasks that may be sent a way round.
             avoidance: distances and rows.
             limits: use of the joint limits.
-            progress: when a task counts as blocked, and whether a way round is tried.
+            progress: when a task counts as stalled, and whether a way round is tried.
             dt: control period [s].
         """
         self._scene, self.solver, self._assembly, self._query = scene, solver, assembly, query
@@ -103,15 +104,15 @@ class Commander:
         """
         if tasks:
             solution = self._solve(q, problem, proximity)
-            blocked = self.progress.update(problem, solution)
-            solution = solution._replace(blocked=blocked) if blocked else solution
+            stalled = self.progress.update(problem, solution)
+            solution = solution._replace(stalled=stalled) if stalled else solution
         else:
             solution = self._solve(q, problem)
         if self.escape is not None and self.solver.bounded:
             solution = self._with_a_way_out(self.escape, q, t, proximity, problem, solution)
         return self._with_limits_passed(problem, solution)
 
-    def stop(self, problem: Problem, reasons: tuple[str, ...]) -> Solution:
+    def stop(self, problem: Problem, reasons: tuple[Reason, ...]) -> Solution:
         """The stop of this tick, and why."""
         return self._with_limits_passed(problem, _stop(problem, reasons))
 
@@ -126,9 +127,11 @@ class Commander:
             v = solution.v
             usable = v.dtype == np.float64 and v.shape == self._v_shape and sane(v)
         except Exception as error:  # a law of the user's own may raise anything; the robot must get a velocity
-            return _stop(problem, (f"the solver raised {type(error).__name__}: {error}",))
+            raised = Reason.of(ReasonKind.SOLVER_FAILED, detail=f"it raised {type(error).__name__}: {error}")
+            return _stop(problem, (raised,))
         if not usable:
-            return _stop(problem, solution.reasons or ("the solver returned no finite velocity of the right shape",))
+            failed = Reason.of(ReasonKind.SOLVER_FAILED, detail="no finite velocity of the right shape")
+            return _stop(problem, solution.reasons or (failed,))
         if not self.solver.bounded:
             if self._limits.saturate:
                 v, change = saturate(v, problem.lower, problem.upper, self._bounds.velocity)
@@ -153,10 +156,11 @@ class Commander:
         v, share, short, pair = checked
         if short <= TOLERANCE:
             return solution._replace(v=v, share=share)
-        names = " - ".join(self._scene.pair_names[pair])
+        names = self._scene.pair_names[pair]
         if short != short:
-            return _stop(problem, (*solution.reasons, f"{names}: no distance can be told on the way ahead"))
-        return solution._replace(v=v, share=share).relaxed(f"{names}: comes {1e3 * short:.1f} mm too near")
+            return _stop(problem, (*solution.reasons, Reason.of(ReasonKind.UNKNOWN_DISTANCE, *names)))
+        missing = Reason.of(ReasonKind.PREDICTED_TOO_NEAR, *names, amount=short, unit="m")
+        return solution._replace(v=v, share=share).relaxed(missing)
 
     def _with_a_way_out(
         self, escape: EscapePlanner, q: Array, t: float, proximity: Proximity, problem: Problem, solution: Solution
@@ -164,11 +168,10 @@ class Commander:
         try:
             v = escape.check(q, solution.v, t, self._assembly.v_last, self._assembly.w_last, proximity)
         except NumericalError as error:  # of what is to come; it is raised when it has come
-            return solution.relaxed(f"a way out: what is foreseen of an {error}")
+            return solution.relaxed(Reason.of(ReasonKind.NO_BACKUP, detail=f"prediction of an {error}"))
         if v is None:
             return solution
-        reason = "the tasks: no way out would be left among the obstacles that move"
-        return solution._replace(v=np.clip(v, problem.lower, problem.upper)).relaxed(reason)
+        return solution._replace(v=np.clip(v, problem.lower, problem.upper)).relaxed(Reason.of(ReasonKind.BACKUP))
 
     def _with_limits_passed(self, problem: Problem, solution: Solution) -> Solution:
         """Says which accelerations and jerks pass their limits, where bounds had to: to get back from where a relaxed
@@ -176,15 +179,16 @@ class Commander:
         """
         if not (self._assembly.limits_may_give_way and self.solver.bounded):
             return solution
-        said = " ".join([reason for reason in solution.reasons if "beyond its" in reason])
-        lines = [
-            f"{problem.joint_names[j]}: {excess[j]:.4f} rad/s or m/s beyond its {name} limit"
-            for name, excess in zip(("acceleration", "jerk"), self._assembly.beyond_limits(solution.v), strict=True)
+        kinds = (ReasonKind.ACCELERATION_RELAXED, ReasonKind.JERK_RELAXED)
+        named = {reason.subject for reason in solution.reasons if reason.kind in kinds}
+        passed = [
+            Reason.of(kind, problem.joint_names[j], amount=float(excess[j]), unit=f"{problem.joint_units[j]}/s")
+            for kind, excess in zip(kinds, self._assembly.beyond_limits(solution.v), strict=True)
             for j in np.flatnonzero(excess > _UNFELT).tolist()
-            if f"{problem.joint_names[j]}: " not in said
+            if (problem.joint_names[j],) not in named
         ]
-        return solution.relaxed(*lines) if lines else solution
+        return solution.relaxed(*passed) if passed else solution
 
 
-def _stop(problem: Problem, reasons: tuple[str, ...]) -> Solution:
+def _stop(problem: Problem, reasons: tuple[Reason, ...]) -> Solution:
     return Solution(problem.v_stop.copy(), Status.STOPPED, reasons)

@@ -35,6 +35,7 @@ from qpavoid.problem import (
     sane,
 )
 from qpavoid.proximity import DistanceQuery
+from qpavoid.reason import Reason, ReasonKind
 from qpavoid.robot import Robot
 from qpavoid.scene import Scene, build_obstacles, build_scene
 from qpavoid.solvers import Solver, make_solver
@@ -61,8 +62,10 @@ class Tick(NamedTuple):
     solution: Solution
 
 
-_BLIND = "a way out is not looked for: flights do not hold contacts (avoidance.escape)"
-"""What is said where obstacles move and the robot stands on something."""
+_NO_BACKUP_WITH_CONTACTS = Reason.of(
+    ReasonKind.NO_BACKUP, "contacts", detail="backup trajectories do not hold contacts: avoidance.escape"
+)
+"""Assumption where obstacles move and the robot stands on something."""
 
 
 class Controller:
@@ -92,7 +95,7 @@ class Controller:
             limits: use of the joint limits; the defaults of a scenario if left out.
             tracking_damping: λ of the damped J⁺ [-].
             sensing: what is made of obstacles without news; the defaults of a scenario if left out.
-            progress: when a task counts as blocked, and whether a way round is tried; likewise.
+            progress: when a task counts as stalled, and whether a way round is tried; likewise.
             contacts: frames that rest, see `build_contacts`; none if left out.
 
         Raises:
@@ -127,9 +130,10 @@ class Controller:
             scene, self.tasks, self._bounds, self._kinematics, self._query, self.avoidance,
             self.limits, tracking_damping, dt, contacts, law.bounded and self.avoidance.look_ahead,
         )  # fmt: skip
-        self._blind: tuple[str, ...] = ()
+        self._no_backup: tuple[Reason, ...] = ()
         if contacts is not None and self.avoidance.escape is not None:
-            self.avoidance, self._blind = self.avoidance.model_copy(update={"escape": None}), (_BLIND,)
+            self.avoidance = self.avoidance.model_copy(update={"escape": None})
+            self._no_backup = (_NO_BACKUP_WITH_CONTACTS,)
         self._commander = Commander(
             scene, law, self._assembly, self._query, self._obstacles, self._bounds,
             [task for task in frames if task.moves], self.avoidance, self.limits, progress or Progress(), dt,
@@ -356,14 +360,14 @@ class Controller:
         q, t, desired, faults = self._read(q, t, v, desired)
         samples = self._targets(t, targets)
         observed = self._obstacles.observe(t, obstacles)
-        assumed: tuple[str, ...] = ()
+        assumptions: tuple[Reason, ...] = ()
         if observed is not None:
             for index, voxels in observed.voxels.items():
                 for query in (self._query, *self._commander.queries):
                     query.fill(index, voxels)
             self._query.placing.place(*observed.seen)
             self._commander.guard.see(observed.seen.which)
-            faults, assumed = faults + observed.stop, observed.assumed
+            faults, assumptions = faults + observed.stop, observed.assumptions
         self._kinematics.compute(q)
         self._query.compute(self._kinematics.data, self._reach)
         if self._query.unwatched is not None:
@@ -372,44 +376,50 @@ class Controller:
         if desired is not None:
             problem = self._assembly.follow(desired, problem)
         elif targets and not problem.shortfall < _ABSURD:
-            faults += tuple([f"target {frame!r}: NaN or infinity" for frame in targets if not finite(targets[frame])])
+            faults += tuple(
+                [
+                    Reason.of(ReasonKind.IMPLAUSIBLE, f"target {frame}", detail="NaN or infinity")
+                    for frame in targets
+                    if not finite(targets[frame])
+                ]
+            )
         built = perf_counter()
         if faults:
             solution = self._commander.stop(problem, faults)
         else:
             solution = self._commander.decide(q, t, problem, proximity, tasks=desired is None)
         self._assembly.remember(solution.v)
-        if self._blind and len(self._obstacles.moving):
-            assumed += self._blind
+        if self._no_backup and len(self._obstacles.moving):
+            assumptions += self._no_backup
         if problem.room < -OUTSIDE:
-            assumed += self._bounds.outside(q, problem.joint_names)
-        solution = solution._replace(assumed=assumed) if assumed else solution
+            assumptions += self._bounds.outside(q, problem.joint_names, problem.joint_units)
+        solution = solution._replace(assumptions=assumptions) if assumptions else solution
         return samples, proximity, problem, solution.timed(built - begin, perf_counter() - built)
 
     def _read(
         self, q: Array, t: float, v: Array | None, desired: Array | None
-    ) -> tuple[Array, float, Array | None, tuple[str, ...]]:
+    ) -> tuple[Array, float, Array | None, tuple[Reason, ...]]:
         """Arguments of a tick with what cannot be true replaced, and what that was."""
         q = as_vector("q", q, self._q_shape)
-        faults: tuple[str, ...] = ()
+        faults: tuple[Reason, ...] = ()
         if v is not None:
             v = as_vector("v", v, self._v_shape)
             if sane(v):
                 self._assembly.measured(v)
             else:
-                faults = (not_finite("v", v),)
+                faults = (_implausible("v", v),)
         if not sane(q):
-            faults += (not_finite("q", q),)
+            faults += (_implausible("q", q),)
             q = self._expected()
         try:
             known = isfinite(t)
         except TypeError:
             raise NumericalError(f"t: not a number: {t!r:.60}") from None
         if not known:
-            faults, t = (*faults, f"t: {t}"), 0.0
+            faults, t = (*faults, Reason.of(ReasonKind.IMPLAUSIBLE, "t", detail=f"{t}")), 0.0
         self._q_last[:] = q
         if desired is not None and not sane(desired):
-            faults += (not_finite("v_desired", desired),)
+            faults += (_implausible("v_desired", desired),)
             desired = np.zeros(self._v_shape)
         return q, t, desired, faults
 
@@ -440,6 +450,10 @@ def _name(solver: Solver | str) -> str:
     if isinstance(solver, str):
         return f"solver {solver!r}"
     return f"solver {solver.config.name!r}" if hasattr(solver, "config") else f"the solver {type(solver).__name__}"
+
+
+def _implausible(name: str, array: Array) -> Reason:
+    return Reason.of(ReasonKind.IMPLAUSIBLE, name, detail=not_finite(array))
 
 
 def _copied(value: Any) -> Any:

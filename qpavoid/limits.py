@@ -11,6 +11,7 @@ import numpy as np
 from qpavoid.config import Limits
 from qpavoid.errors import ConfigError
 from qpavoid.problem import Array, IntArray
+from qpavoid.reason import Reason, ReasonKind
 
 OUTSIDE = 1e-6
 """How far beyond a position limit a coordinate counts as outside it [rad, m]."""
@@ -57,15 +58,21 @@ class JointBounds:
             jerk=jerk,
         )
 
-    def outside(self, q: Array, names: Sequence[str]) -> tuple[str, ...]:
-        """Which coordinates of q (nq,) are outside their position limits, with the names (nv,) of all, and how far."""
+    def outside(self, q: Array, names: Sequence[str], units: Sequence[str]) -> tuple[Reason, ...]:
+        """List which coordinates are outside their position limits, and how far, negative below the lower one.
+
+        Args:
+            q: configuration (nq,).
+            names: of all nv coordinates.
+            units: their units, rad or m.
+        """
         below, above = self.lower - q[self.q_index], q[self.q_index] - self.upper
-        lines = []
+        found = []
         for i in np.flatnonzero(np.maximum(below, above) > OUTSIDE).tolist():
-            side, far = ("below its lower", below[i]) if below[i] > 0.0 else ("above its upper", above[i])
-            hint = "; is it in degrees?" if far > _TURN else ""
-            lines.append(f"q: {names[self.v_index[i]]} is {far:.4g} rad or m {side} limit, and sent back{hint}")
-        return tuple(lines)
+            amount, j = float(-below[i] if below[i] > 0.0 else above[i]), int(self.v_index[i])
+            hint = "is it in degrees?" if abs(amount) > _TURN else ""
+            found.append(Reason.of(ReasonKind.LIMIT_RECOVERY, names[j], amount=amount, unit=units[j], detail=hint))
+        return tuple(found)
 
 
 def _or(limits: Array, given: float | None) -> Array:

@@ -20,7 +20,7 @@ from qpavoid.problem import Array, IntArray, Status
 
 STATUSES = tuple(Status)
 """Status of each code in `Log.status`."""
-_FORMAT = 3
+_FORMAT = 4
 _LARGEST = 2_000_000_000
 """What a log may take in memory [bytes]; a small file can unpack to a thousand times its size."""
 _SHAPES = {
@@ -28,11 +28,12 @@ _SHAPES = {
     "target": "N k 3", "tool": "N k 3", "tool_rotation": "N k 3 3", "turn_error": "N k",
     "task_error": "N s",
     "body_distance": "N b", "closest_pair": "N", "alpha": "N", "beta": "N", "status": "N",
-    "slack": "N", "saturation": "N", "build_time": "N", "solve_time": "N", "share": "N", "blocked": "N",
+    "slack": "N", "saturation": "N", "build_time": "N", "solve_time": "N", "share": "N", "stalled": "N",
+    "severity": "N",
     "body_ends": "N b 2 3", "obstacle_position": "N o 3", "obstacle_rotation": "N o 3 3",
 }  # fmt: skip
 """Array: its sides; a letter is the same number wherever it stands."""
-_KINDS = {"closest_pair": "i", "status": "i", "blocked": "b"}
+_KINDS = {"closest_pair": "i", "status": "i", "stalled": "b", "severity": "i"}
 """Array: kind of its numbers, where it is not floating point."""
 _META = {"scenario": str, "solver": str, "completed": bool, "pairs": list, "config": dict}
 
@@ -74,8 +75,10 @@ class Log:
     """(N,) largest slack of an avoidance row [m/s]."""
     share: Array
     """(N,) share of the law's velocity that was left after looking ahead; the rest was a stop's."""
-    blocked: npt.NDArray[np.bool_]
-    """(N,) whether something kept the tasks from going on."""
+    stalled: npt.NDArray[np.bool_]
+    """(N,) whether the tasks made no progress."""
+    severity: npt.NDArray[np.int8]
+    """(N,) worst severity of the step's reasons, see `qpavoid.reason.Severity`; 0 without reasons."""
     saturation: Array
     """(N,) largest change that the limits made to the raw law [rad/s or m/s]."""
     build_time: Array

@@ -8,13 +8,14 @@ import numpy as np
 
 from qpavoid.geometry.segments import point_segment
 from qpavoid.problem import Array, Status
+from qpavoid.reason import Severity
 
 if TYPE_CHECKING:
     from qpavoid.log import Log
 
 
 _MOST_EVENTS = 20
-"""How many of the things that the ticks of a run had to say are among its figures."""
+"""Number of changes of reasons that are among the figures of a run."""
 
 
 def run_metrics(log: Log) -> dict[str, Any]:
@@ -27,9 +28,9 @@ def run_metrics(log: Log) -> dict[str, Any]:
         time_in_collision [s]; time_below: threshold -> [s]; final_error [m]; max_deviation: largest distance of a tool
         from its planned path [m]; tracking_rmse: of the distance to the moving target [m]; peak_velocity: fastest
         joint [rad/s or m/s]; jitter: Σ|Δq̇| over joints and ticks [rad/s]; status_counts; relaxed_ticks;
-        shortened_ticks: drawn back after looking ahead; time_blocked [s]; events: the first
-        things that ticks had to say, as [t, status, lines]; tick_us: p50, p99 and max of the tick's
-        time [µs].
+        shortened_ticks: drawn back after looking ahead; time_stalled [s]; severity_counts: steps by the worst severity
+        of their reasons; events: the first changes of reasons, as [t, status, reasons as data]; tick_us: p50, p99 and
+        max of the tick's time [µs].
     """
     config, dt = log.meta["config"], log.meta["config"]["dt"]
     distance = log.min_distance
@@ -64,7 +65,8 @@ def run_metrics(log: Log) -> dict[str, Any]:
         "status_counts": counts,
         "relaxed_ticks": counts[Status.RELAXED.value],
         "shortened_ticks": int(np.sum(log.share < 1.0)),
-        "time_blocked": dt * float(np.sum(log.blocked)),
+        "time_stalled": dt * float(np.sum(log.stalled)),
+        "severity_counts": {level.name: int(np.sum(log.severity == level)) for level in Severity},
         "events": log.meta["events"][:_MOST_EVENTS],
         "tick_us": {
             "p50": float(np.median(tick_us)) if len(tick_us) else float("nan"),

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from qpavoid.errors import NumericalError
+from qpavoid.reason import Reason, Severity
 
 Array = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.intp]
@@ -155,6 +156,8 @@ class Problem(NamedTuple):
     """Names of the bodies of all m pairs."""
     joint_names: Sequence[str]
     """Name of each of the nv coordinates."""
+    joint_units: Sequence[str]
+    """Unit of each of the nv coordinates: rad or m."""
     v0: Array
     """(nv,) J⁺ẋ, the tracking law's velocity; NaN where λ is 0 and rows repeat each other."""
     shortfall: float
@@ -201,8 +204,9 @@ def make_problem(
     stop = np.clip(0.0, lower, upper) if v_stop is None else v_stop
     names = [f"joint{i + 1}" for i in range(len(lower))]
     return Problem(
-        tracking, avoidance, lower, upper, *(hard or (lower, upper)), stop, pair_names, names, v0, float(outside.max())
-    )
+        tracking, avoidance, lower, upper, *(hard or (lower, upper)), stop, pair_names, names, ["rad"] * len(names), v0,
+        float(outside.max()),
+    )  # fmt: skip
 
 
 class Solution(NamedTuple):
@@ -211,16 +215,16 @@ class Solution(NamedTuple):
     v: Array
     """(nv,) joint velocity [rad/s or m/s]."""
     status: Status = Status.SOLVED
-    reasons: tuple[str, ...] = ()
-    """What gave way, by name and amount; empty when nothing did."""
+    reasons: tuple[Reason, ...] = ()
+    """What was relaxed, or why the robot stops; empty when nothing was."""
     slack: Array | None = None
     """(k,) what each avoidance row gave way [m/s]; None when none did."""
     share: float = 1.0
     """How much of the law's velocity is left after looking ahead; the rest is the velocity of a stop."""
-    blocked: tuple[str, ...] = ()
-    """What keeps the tasks from going on, once they have not for a while."""
-    assumed: tuple[str, ...] = ()
-    """What the tick took for granted, such as the twist of an obstacle that was given without one."""
+    stalled: tuple[Reason, ...] = ()
+    """What keeps the tasks from making progress, once they have made none for a while."""
+    assumptions: tuple[Reason, ...] = ()
+    """What the step took for granted, such as the twist of an obstacle that was given without one."""
     saturation: float = 0.0
     """Largest change that the limits made to the law's raw velocity [rad/s or m/s]; 0 for laws that know limits."""
     build_time: float = 0.0
@@ -228,14 +232,20 @@ class Solution(NamedTuple):
     solve_time: float = 0.0
     """Time to solve it and to look ahead [s]."""
 
-    def relaxed(self, *reasons: str) -> Solution:
-        """The same with more that gave way; a stop stays one."""
+    @property
+    def severity(self) -> Severity | None:
+        """The worst severity of all reasons of the step; None where there is no reason."""
+        found = [reason.severity for reason in (*self.reasons, *self.stalled, *self.assumptions)]
+        return max(found) if found else None
+
+    def relaxed(self, *reasons: Reason) -> Solution:
+        """Return the same with more reasons, as RELAXED; a stop stays one."""
         status = self.status if self.status is Status.STOPPED else Status.RELAXED
         return self._replace(status=status, reasons=(*self.reasons, *reasons))
 
     def timed(self, build_time: float, solve_time: float) -> Solution:
-        """The same with its times [s]."""
-        return Solution(*self[:-2], build_time, solve_time)
+        """Return the same with its times [s]."""
+        return self._replace(build_time=build_time, solve_time=solve_time)
 
 
 def as_vector(name: str, value: Any, shape: tuple[int, ...]) -> Array:
@@ -268,11 +278,11 @@ def require_finite(name: str, value: Any, shape: tuple[int, ...]) -> Array:
     """
     array = as_vector(name, value, shape)
     if not np.isfinite(array).all():
-        raise NumericalError(not_finite(name, array))
+        raise NumericalError(f"{name}: {not_finite(array)}")
     return array
 
 
-def not_finite(name: str, array: Array) -> str:
-    """What is wrong with an array that is not `sane`; names the argument and where."""
+def not_finite(array: Array) -> str:
+    """Say what is wrong with an array that is not `sane`, and where."""
     bad = np.argwhere(~np.isfinite(array)).ravel()[:5].tolist()
-    return f"{name}: NaN or infinity at index {', '.join(map(str, bad))}" if bad else f"{name}: absurdly large"
+    return f"NaN or infinity at index {', '.join(map(str, bad))}" if bad else "too large"

@@ -59,8 +59,10 @@ def outcome(run: dict[str, Any]) -> str:
         said.append(f"[red]{counts['STOPPED']} stopped[/]")
     if counts["RELAXED"]:
         said.append(f"[yellow]{counts['RELAXED']} relaxed[/]")
-    if run["time_blocked"] > 0.0:
-        said.append(f"[yellow]blocked {run['time_blocked']:.1f} s[/]")
+    if run["severity_counts"]["ALARM"]:
+        said.append(f"[red]{run['severity_counts']['ALARM']} alarms[/]")
+    if run["time_stalled"] > 0.0:
+        said.append(f"[yellow]stalled {run['time_stalled']:.1f} s[/]")
     if not run["completed"]:
         said.append("[red]broken off[/]")
     said.append("[green]arrived[/]" if run["arrived"] else "[yellow]short of goal[/]")
@@ -72,8 +74,11 @@ _WIDEST = 200
 
 
 def events(run: dict[str, Any], most: int = 4) -> list[str]:
-    """What the ticks of a run had to say first, a line each: time, status, reasons."""
-    lines = [f"{t:.3f} s {status}: {'; '.join(said)}" for t, status, said in run["events"][:most]]
+    """List the first events of a run, a line each: time, status, reasons."""
+    lines = [
+        f"{t:.3f} s {status}: {'; '.join(reason['text'] for reason in reasons)}"
+        for t, status, reasons in run["events"][:most]
+    ]
     return [line if len(line) <= _WIDEST else f"{line[: _WIDEST - 2]} …" for line in lines]
 
 

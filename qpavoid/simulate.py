@@ -120,9 +120,10 @@ class Recorder:
         self._arrays: dict[str, Any] = {name: np.zeros((ticks, *shape)) for name, shape in shapes.items()}
         self._arrays["closest_pair"] = np.full(ticks, -1, dtype=np.intp)
         self._arrays["status"] = np.zeros(ticks, dtype=np.int8)
-        self._arrays["blocked"] = np.zeros(ticks, dtype=np.bool_)
+        self._arrays["stalled"] = np.zeros(ticks, dtype=np.bool_)
+        self._arrays["severity"] = np.zeros(ticks, dtype=np.int8)
         self._events: list[list[Any]] = []
-        self._said: tuple[str, ...] = ()
+        self._keys: tuple[object, ...] = ()
         self._count = 0
 
     def add(self, tick: Tick) -> None:
@@ -143,7 +144,8 @@ class Recorder:
             "t": state.t,
             "slack": 0.0 if solution.slack is None else float(np.max(solution.slack, initial=0.0)),
             "share": solution.share,
-            "blocked": bool(solution.blocked),
+            "stalled": bool(solution.stalled),
+            "severity": solution.severity or 0,
             "saturation": solution.saturation,
             "build_time": solution.build_time,
             "solve_time": solution.solve_time,
@@ -159,13 +161,13 @@ class Recorder:
         self._note(state.t, solution)
 
     def _note(self, t: float, solution: Solution) -> None:
-        """Keeps what a tick says, when it says something else than the one before."""
-        named = tuple(line.partition(":")[0] for line in (*solution.reasons, *solution.blocked, *solution.assumed))
-        said = (solution.status.value, *named)
-        if said != self._said and (solution.status is not Status.SOLVED or named) and len(self._events) < _MOST_EVENTS:
-            lines = [*solution.reasons, *solution.blocked, *solution.assumed]
-            self._events.append([t, solution.status.value, lines])
-        self._said = said
+        """Keep the reasons of a step where they differ from those of the step before in more than amounts."""
+        reasons = (*solution.reasons, *solution.stalled, *solution.assumptions)
+        keys = (solution.status, *[reason.key for reason in reasons])
+        eventful = solution.status is not Status.SOLVED or reasons
+        if keys != self._keys and eventful and len(self._events) < _MOST_EVENTS:
+            self._events.append([t, solution.status.value, [reason.as_dict() for reason in reasons]])
+        self._keys = keys
 
     def _write_bodies(self, tick: Tick, rows: dict[str, Array]) -> None:
         scene = self._scene

@@ -110,7 +110,7 @@ class Law:
         (lambda p: Solution(np.zeros(7, dtype=complex)), "no finite velocity"),
     ],
 )
-@pytest.mark.parametrize("progress", [Progress(), Progress(blocked_after=0.02, detour=Detour())])
+@pytest.mark.parametrize("progress", [Progress(), Progress(stalled_after=0.02, detour=Detour())])
 def test_a_users_law_that_fails_stops_the_robot_with_the_reason(panda, fault, reason, progress):
     law = Law()
     controller = panda_controller(panda, law, progress=progress)

@@ -19,6 +19,7 @@ from qpavoid.assembly import Assembly
 from qpavoid.config import Detour
 from qpavoid.problem import Array, Problem, Proximity
 from qpavoid.proximity import DistanceQuery
+from qpavoid.reason import Reason, ReasonKind
 from qpavoid.scene import Scene
 from qpavoid.solvers import Solver
 from qpavoid.tasks import FrameTask
@@ -64,15 +65,15 @@ class _Search:
     tries: int = 0
     ticks: int = 0
     """In which something was in the way."""
-    given_up: str = ""
-    """Why; empty while it goes on."""
+    given_up: Reason | None = None
+    """Why; None while it goes on."""
     culprits: dict[int, Array] = field(default_factory=dict)
     """Poses (12,) of the geometries of obstacles that were in the way then."""
 
     def renew(self, goal: Array, distance: float) -> None:
         """Begins anew."""
         self.goal, self.nearest = goal, distance
-        self.tries, self.ticks, self.given_up, self.culprits = 0, 0, "", {}
+        self.tries, self.ticks, self.given_up, self.culprits = 0, 0, None, {}
 
 
 class Detours:
@@ -104,9 +105,9 @@ class Detours:
         self._searches: dict[int, _Search] = {}
 
     @property
-    def given_up(self) -> tuple[str, ...]:
-        """What is not tried any more, by name."""
-        return tuple([f"{self._names[i]}: {x.given_up}" for i, x in self._searches.items() if x.given_up])
+    def given_up(self) -> tuple[Reason, ...]:
+        """Why the goals of some tasks are not tried any more."""
+        return tuple([search.given_up for search in self._searches.values() if search.given_up])
 
     def follow(self, problem: Problem, proximity: Proximity, assembly: Assembly, patience: float) -> Problem | None:
         """The problem with the tool sent along the way round that is being tried; None once that has ended.
@@ -150,14 +151,14 @@ class Detours:
         if self._hopeless(frame, goal):
             return
         if search.tries >= self._config.tries or seconds > self._config.patience:
-            ways = "1 way" if search.tries == 1 else f"{search.tries} ways"
-            self._give_up(frame, f"gave up after {ways} round in {seconds:.1f} s", obstacles)
+            tried = f"{search.tries} detours"
+            self._give_up(frame, self._reason(ReasonKind.DETOUR_ENDED, frame, seconds, "s", tried), obstacles)
             return
         for pair in culprits:
             self.way = self._way_round(pair, frame, problem, proximity, assembly, solver)
             if self.way is not None:
                 return
-        self._give_up(frame, "gave up, as no way leads round", obstacles)
+        self._give_up(frame, self._reason(ReasonKind.DETOUR_ENDED, frame, seconds, "s", "none possible"), obstacles)
 
     def _way_round(
         self, pair: int, frame: int, problem: Problem, proximity: Proximity, assembly: Assembly, solver: Solver
@@ -206,16 +207,20 @@ class Detours:
         root, length = self._arms[frame]
         beyond = float(np.linalg.norm(goal - root)) - length
         if beyond > _CERTAIN:
-            self._give_up(frame, f"gave up, as its goal is {1e3 * beyond:.0f} mm out of reach", [])
+            self._give_up(frame, self._reason(ReasonKind.OUT_OF_REACH, frame, beyond, "m"), [])
             return True
         short, geometry = too_near(self._scene, self._query, self._frame_ids[frame], goal, self._keep)
         if short > _CERTAIN:
             name = self._scene.obstacle_names[self._scene.obstacle_of[geometry]]
-            self._give_up(frame, f"gave up, as its goal is {1e3 * short:.0f} mm too near to {name}", [geometry])
+            reason = Reason.of(ReasonKind.TARGET_OBSTRUCTED, self._names[frame], name, amount=short, unit="m")
+            self._give_up(frame, reason, [geometry])
             return True
         return False
 
-    def _give_up(self, frame: int, why: str, obstacles: list[int]) -> None:
+    def _reason(self, kind: ReasonKind, frame: int, amount: float, unit: str, detail: str = "") -> Reason:
+        return Reason.of(kind, self._names[frame], amount=amount, unit=unit, detail=detail)
+
+    def _give_up(self, frame: int, why: Reason, obstacles: list[int]) -> None:
         """Gives up the goal of a task, until some geometries have moved, or what else `notice` sees.
 
         Those of the robot, of what it carries and of points do not count: where they are also depends on the robot.

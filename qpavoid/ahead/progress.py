@@ -13,6 +13,7 @@ from qpavoid.ahead.detour import Detours
 from qpavoid.assembly import Assembly
 from qpavoid.config import Progress
 from qpavoid.problem import Array, Problem, Proximity, Solution
+from qpavoid.reason import Reason, ReasonKind
 from qpavoid.solvers import Solver
 
 _LEFT = 0.1
@@ -39,7 +40,7 @@ class ProgressWatch:
     def reset(self) -> None:
         """Forgets everything."""
         self._clock, self._without = 0, 0
-        self._culprits: list[int] = []
+        self._culprits: list[tuple[int, float]] = []
         if self._detours is not None:
             self._detours.reset()
 
@@ -49,17 +50,17 @@ class ProgressWatch:
         if detours is None:
             return problem
         detours.notice(problem, assembly)
-        if detours.way is None and self.blocked and self._culprits:
-            detours.begin(problem, proximity, assembly, solver, self._culprits)
+        if detours.way is None and self.stalled and self._culprits:
+            detours.begin(problem, proximity, assembly, solver, [pair for pair, _ in self._culprits])
         if detours.way is None:
             return problem
-        redirected = detours.follow(problem, proximity, assembly, self._config.blocked_after)
+        redirected = detours.follow(problem, proximity, assembly, self._config.stalled_after)
         if redirected is None:
             self._without = 0
             return problem
         return redirected
 
-    def update(self, problem: Problem, solution: Solution) -> tuple[str, ...]:
+    def update(self, problem: Problem, solution: Solution) -> tuple[Reason, ...]:
         """What is given up, and what blocks the tasks, once they have been without progress for long enough.
 
         Args:
@@ -71,27 +72,31 @@ class ProgressWatch:
             self._without = 0
             return given_up
         self._clock += 1
-        if self._clock % _EVERY and not self.blocked:
+        if self._clock % _EVERY and not self.stalled:
             return given_up
         wanted, got = A @ problem.v0, A @ solution.v
         size = float(wanted @ wanted)
         resting = float(got @ got) < _RESTING**2
         stuck = resting and size > _SLOWEST**2 and float(got @ wanted) < _LEFT * size
         self._without = max(self._without + (_EVERY if stuck else -_EVERY), 0)
-        if not self.blocked:
+        if not self.stalled:
             return given_up
         self._culprits = _culprits(problem, solution.v)
-        lines = [f"blocked by {self._names[pair][1]} at {self._names[pair][0]}" for pair in self._culprits]
-        return (*given_up, *((*lines, *_limits(problem, solution.v)) or ("blocked by several rows together",)))
+        pairs = [
+            Reason.of(ReasonKind.STALLED, *self._names[pair], amount=amount, unit="m/s")
+            for pair, amount in self._culprits
+        ]
+        several = Reason.of(ReasonKind.STALLED, detail="several rows together")
+        return (*given_up, *((*pairs, *_limits(problem, solution.v)) or (several,)))
 
     @property
-    def blocked(self) -> bool:
+    def stalled(self) -> bool:
         """Whether there was no progress for long enough."""
-        return self._without * self._dt >= self._config.blocked_after
+        return self._without * self._dt >= self._config.stalled_after
 
 
-def _culprits(problem: Problem, v: Array) -> list[int]:
-    """Numbers of the pairs whose rows bind and stand against the wanted velocity, the strongest first."""
+def _culprits(problem: Problem, v: Array) -> list[tuple[int, float]]:
+    """Pairs whose rows bind and oppose v0, the strongest first, with the amount by which v0 violates them [m/s]."""
     rows = problem.avoidance
     against = rows.b - rows.J @ problem.v0
     tight = (rows.J @ v - rows.b < _TIGHT) & (against > 0.0)
@@ -99,16 +104,21 @@ def _culprits(problem: Problem, v: Array) -> list[int]:
         tight = (rows.J @ problem.v0 < -_TIGHT) & (rows.d < rows.d2)
         tight &= rows.d <= np.min(rows.d, where=tight, initial=np.inf)
     found = np.flatnonzero(tight)
-    return [int(pair) for pair in rows.pair[found[np.argsort(-against[found], kind="stable")]]]
+    order = found[np.argsort(-against[found], kind="stable")]
+    return list(zip(rows.pair[order].tolist(), against[order].tolist(), strict=True))
 
 
-def _limits(problem: Problem, v: Array) -> list[str]:
+def _limits(problem: Problem, v: Array) -> list[Reason]:
     """Joints at a position limit that the wanted velocity goes against."""
     high = (v >= problem.hard_upper - 1e-9) & (problem.v0 > problem.hard_upper)
     low = (v <= problem.hard_lower + 1e-9) & (problem.v0 < problem.hard_lower)
-    names = problem.joint_names
+    names, units = problem.joint_names, problem.joint_units
     full = np.maximum(problem.hard_upper, -problem.hard_lower)
     return [
-        *(f"{names[j]}: at its upper limit" for j in np.flatnonzero(high & (problem.hard_upper < full)).tolist()),
-        *(f"{names[j]}: at its lower limit" for j in np.flatnonzero(low & (-problem.hard_lower < full)).tolist()),
+        Reason.of(kind, names[j], amount=float(bound[j]), unit=f"{units[j]}/s")
+        for kind, bound, at_limit in (
+            (ReasonKind.AT_UPPER_LIMIT, problem.hard_upper, high & (problem.hard_upper < full)),
+            (ReasonKind.AT_LOWER_LIMIT, problem.hard_lower, low & (-problem.hard_lower < full)),
+        )
+        for j in np.flatnonzero(at_limit).tolist()
     ]

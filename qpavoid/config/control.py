@@ -155,9 +155,9 @@ class Detour(Block):
 
 
 class Progress(Block):
-    """When a task counts as blocked, and what is done about it."""
+    """When a task counts as stalled, and what is done about it."""
 
-    blocked_after: Positive = 1.0
+    stalled_after: Positive = 1.0
     """Time without progress after which it is said [s]."""
     detour: Detour | None = None
     """Way round; left out: none is tried."""

@@ -2,7 +2,7 @@
 
 An obstacle that is given as a bare pose gets a twist from the difference of its poses. One that was given and is then
 left out goes on at its last twist; after `stale_after` its distances shrink by a margin that grows, and after
-`stop_after` the robot stops. Whatever is assumed is said in `Solution.assumed`.
+`stop_after` the robot stops. Each assumption is named in `Solution.assumptions`.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from qpavoid.motion import Sample
 from qpavoid.obstacles.courses import STATE, Courses, as_samples, move_on, put
 from qpavoid.obstacles.told import MeanTwists, Told
 from qpavoid.problem import Array, IntArray, as_vector
+from qpavoid.reason import Reason, ReasonKind, Severity
 from qpavoid.scene import Obstacle
 
 _AT_REST = np.zeros(3)
@@ -64,9 +65,9 @@ class Observation(NamedTuple):
     seen: Seen
     voxels: dict[int, Voxels]
     """Of point clouds with news, by number: what is in them now."""
-    assumed: tuple[str, ...] = ()
-    """What was not told but taken for granted."""
-    stop: tuple[str, ...] = ()
+    assumptions: tuple[Reason, ...] = ()
+    """What was not measured but taken for granted."""
+    stop: tuple[Reason, ...] = ()
     """Why the robot has to stop; empty if it has not."""
 
 
@@ -89,7 +90,7 @@ class Obstacles:
         self._means = MeanTwists(count, dt)
         self._last, self._news = np.zeros((count, STATE)), np.zeros((count, STATE))  # as it was given then, and now
         self._views = [as_samples(states) for states in (self._seen.states, self._last, self._news)]
-        self._by_pose = [f"{obstacle.name}: twist estimated from its poses" for obstacle in obstacles]
+        self._by_pose = [Reason.of(ReasonKind.ESTIMATED, obstacle.name) for obstacle in obstacles]
 
     def index(self, name: str) -> int:
         """Number of an obstacle.
@@ -188,8 +189,8 @@ class Obstacles:
         self._now, self._told = t, None
         self._follow(t)
         self._seen.margin.fill(0.0)
-        notes: list[str] = []
-        stop: list[str] = []
+        notes: list[Reason] = []
+        stop: list[Reason] = []
         fresh, voxels = self._read(t, given, notes) if given else (set(), {})
         for index in self._known:
             if index not in fresh:
@@ -220,7 +221,7 @@ class Obstacles:
                 put(self._views[0][index], motion.sample(t))
 
     def _read(
-        self, t: float, given: Mapping[str, Sample | Pose | Points], notes: list[str]
+        self, t: float, given: Mapping[str, Sample | Pose | Points], notes: list[Reason]
     ) -> tuple[set[int], dict[int, Voxels]]:
         """Takes in what is given: numbers of those of which something is known now, and the voxels of clouds."""
         which, posed = [], []
@@ -228,7 +229,7 @@ class Obstacles:
         for name, what in given.items():
             index = self.index(name)
             if index in self._carried:
-                notes.append(f"{name}: carried by the robot, what is given of it is not read")
+                notes.append(Reason.of(ReasonKind.IGNORED, name, detail="attached to the robot"))
                 continue
             if type(what) is Points:
                 seen = self._look_at(index, what, notes)
@@ -249,7 +250,8 @@ class Obstacles:
         fine = kernels.take_in(numbers, bare, self._news, self._age, self._last, self._seen.states, self._dt)
         self._means.hear(numbers[fine & known], self._last)
         for index in numbers[~fine].tolist():
-            notes.append(f"{self._obstacles[index].name}: NaN or infinity in its pose or twist, taken as not given")
+            name = self._obstacles[index].name
+            notes.append(Reason.of(ReasonKind.IMPLAUSIBLE, name, severity=Severity.WARNING, detail="NaN or infinity"))
             voxels.pop(index, None)
             self._begin(index, t)
         notes += [self._by_pose[index] for index in numbers[fine & bare].tolist()]
@@ -267,7 +269,7 @@ class Obstacles:
             self._means.hear(np.array([index]), self._last)
             self._renew()
 
-    def _look_at(self, index: int, what: Points, notes: list[str]) -> Voxels | None:
+    def _look_at(self, index: int, what: Points, notes: list[Reason]) -> Voxels | None:
         """What a picture of a camera shows; None where none of its points can be used."""
         name, shape = self._obstacles[index].name, self._obstacles[index].shape
         if not isinstance(shape, PointCloud):
@@ -284,23 +286,33 @@ class Obstacles:
             except NumericalError as error:
                 raise NumericalError(f"obstacle {name!r}: {error}") from None
         if seen.dropped:
-            bad = f"{seen.dropped} of {seen.given} points are NaN, infinite or more than 100 m away"
-            if seen.dropped == seen.given:
-                notes.append(f"{name}: {bad}, taken as not given")
+            everything = seen.dropped == seen.given
+            notes.append(
+                Reason.of(
+                    ReasonKind.POINTS_DROPPED,
+                    name,
+                    amount=seen.dropped,
+                    unit="-",
+                    severity=Severity.WARNING if everything else None,
+                    detail=f"of {seen.given}: NaN, infinite or more than 100 m away",
+                )
+            )
+            if everything:
                 return None
-            notes.append(f"{name}: {bad}, dropped")
         return seen
 
-    def _predict(self, index: int, notes: list[str], stop: list[str]) -> None:
+    def _predict(self, index: int, notes: list[Reason], stop: list[Reason]) -> None:
         """Moves an obstacle of which there is no news on from where it was last seen."""
         self._age[index] += 1
         name, config, margin = self._obstacles[index].name, self._config, 0.0
         age = float(self._age[index]) * self._dt
         if config.stale_after is not None and age > config.stale_after:
             margin = config.margin_growth * (age - config.stale_after)
-            notes.append(f"{name}: not seen for {age:.3f} s, margin {1e3 * margin:.0f} mm")
+            notes.append(
+                Reason.of(ReasonKind.STALE, name, amount=age, unit="s", detail=f"margin {1e3 * margin:.0f} mm")
+            )
             if config.stop_after is not None and age > config.stop_after:
-                stop.append(f"{name}: not seen for {age:.3f} s")
+                stop.append(Reason.of(ReasonKind.STALE, name, amount=age, unit="s", severity=Severity.ALARM))
         self._seen.states[index] = self._last[index]
         move_on(self._seen.states[index : index + 1], age)
         self._seen.margin[index] = margin

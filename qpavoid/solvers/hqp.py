@@ -11,10 +11,10 @@ from __future__ import annotations
 import numpy as np
 
 from qpavoid import kernels
-from qpavoid.problem import Array, IntArray, Problem, Solution, Status
+from qpavoid.problem import Array, IntArray, Problem, Solution
+from qpavoid.reason import Reason, ReasonKind
 from qpavoid.solvers.backends import Backend
-from qpavoid.solvers.qp import Qp
-from qpavoid.solvers.reasons import what_gave_way
+from qpavoid.solvers.qp import Qp, relaxed_solution
 from qpavoid.solvers.reduced import solve_within
 from qpavoid.solvers.relaxation import closest
 
@@ -58,18 +58,17 @@ class Hqp(Qp):
         lower, upper = np.minimum(lower, relaxed.v), np.maximum(upper, relaxed.v)
         v, unsolved = self._levels(problem, asked, alone, rows.b - relaxed.slack, lower, upper)
         relaxed = relaxed if v is None else relaxed._replace(v=v)
-        slack = relaxed.slack if relaxed.slack.any() else None
-        return Solution(relaxed.v, Status.RELAXED, (*what_gave_way(relaxed, problem), *unsolved), slack)
+        return relaxed_solution(relaxed, problem, *unsolved)
 
     def _levels(
         self, problem: Problem, asked: Levels, alone: Array, least: Array, lower: Array, upper: Array
-    ) -> tuple[Array | None, tuple[str, ...]]:
+    ) -> tuple[Array | None, tuple[Reason, ...]]:
         """The cascade within J v >= least and the bounds (nv,), and which levels could not be solved.
 
         None where its first level has no solution.
         """
         J, (Z, v) = problem.avoidance.J, _start(problem)
-        met, unsolved = False, list[str]()
+        met, unsolved = False, list[Reason]()
         for level, (A, b) in enumerate((*asked, (np.eye(len(v)), alone))):
             P = A.T @ A
             P.ravel()[:: len(P) + 1] += self.config.regularization
@@ -81,7 +80,7 @@ class Hqp(Qp):
             elif not met:
                 return None, ()
             elif level < len(asked):
-                unsolved.append(f"priority level {level + 1}: no back end could solve its QP")
+                unsolved.append(Reason.of(ReasonKind.PRIORITY_UNSOLVED, f"priority level {level + 1}"))
             Z = Z @ _free(A @ Z)
             if not Z.shape[1]:
                 break

@@ -10,9 +10,10 @@ from qpavoid import kernels
 from qpavoid.config import HqpSolver, QpSolver
 from qpavoid.errors import SolverNotInstalled
 from qpavoid.problem import Array, Problem, Solution, Status
+from qpavoid.reason import Reason, ReasonKind
 from qpavoid.solvers.analytic import tracking_velocity
 from qpavoid.solvers.backends import Backend, Daqp, make_backend, solve_daqp
-from qpavoid.solvers.reasons import what_gave_way
+from qpavoid.solvers.reasons import relaxation_reasons
 from qpavoid.solvers.reduced import holding
 from qpavoid.solvers.relaxation import Closest, Relaxed, by_back_end, closest, relax
 
@@ -94,18 +95,16 @@ class Qp:
         relaxed = self._give_way(P, q, problem)
         if isinstance(relaxed, Solution):
             return relaxed
-        slack = relaxed.slack if relaxed.slack.any() else None
-        return Solution(relaxed.v, Status.RELAXED, what_gave_way(relaxed, problem), slack)
+        return relaxed_solution(relaxed, problem)
 
     def _give_way(self, P: Array, q: Array, problem: Problem) -> Relaxed | Solution:
         """The least that has to give way; a stop where not even that helps."""
         rows = problem.avoidance
         unknown = np.flatnonzero(~np.isfinite(rows.b + rows.J.sum(axis=1)))
         if len(unknown):
-            pairs = [" - ".join(problem.pair_names[rows.pair[i]]) for i in unknown.tolist()]
-            return Solution(
-                problem.v_stop.copy(), Status.STOPPED, tuple(f"{p}: no distance can be told" for p in pairs)
-            )
+            pairs = [problem.pair_names[rows.pair[i]] for i in unknown.tolist()]
+            reasons = tuple([Reason.of(ReasonKind.UNKNOWN_DISTANCE, *pair) for pair in pairs])
+            return Solution(problem.v_stop.copy(), Status.STOPPED, reasons)
         relaxed = None
         if self._projections is not None and problem.contacts is None:
             relaxed = relax(problem, self._compiled(self._projections[1], problem))
@@ -114,10 +113,10 @@ class Qp:
             relaxed = relax(problem, by_back_end(backend, P, q, tracking_velocity(problem)))
         if relaxed is not None:
             return relaxed
-        reason = "the QP back end returned no usable velocity"
+        reason = Reason.of(ReasonKind.SOLVER_FAILED, detail="the QP back end returned no usable velocity")
         hard = problem.hard_lower, problem.hard_upper
         if problem.contacts is not None and closest(backend, P, q, rows.J[:0], rows.b[:0], *hard) is None:
-            reason = "contacts: the joint limits leave no velocity that holds them"
+            reason = Reason.of(ReasonKind.CONTACTS_INFEASIBLE, "contacts")
         return Solution(problem.v_stop.copy(), Status.STOPPED, (reason,))
 
     def _compiled(self, project: _Projection, problem: Problem) -> Closest:
@@ -130,6 +129,20 @@ class Qp:
             return v if solved else None
 
         return solve
+
+
+def relaxed_solution(relaxed: Relaxed, problem: Problem, *reasons: Reason) -> Solution:
+    """Return the solution with its reasons; SOLVED where nothing is relaxed by more than the tolerance of a QP.
+
+    Args:
+        relaxed: the velocity, with what was relaxed for it.
+        problem: what it is a solution of.
+        reasons: more of them.
+    """
+    reasons = (*relaxation_reasons(relaxed, problem), *reasons)
+    if not reasons:
+        return Solution(np.clip(relaxed.v, problem.lower, problem.upper))
+    return Solution(relaxed.v, Status.RELAXED, reasons, relaxed.slack if relaxed.slack.any() else None)
 
 
 def _compiled_projections() -> tuple[_Projection, _Projection]:

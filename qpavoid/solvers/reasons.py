@@ -1,44 +1,65 @@
-"""What a relaxed solution gave up, in words: pairs, joints and amounts."""
+"""Reasons of a relaxed solution: pairs, joints and amounts."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from qpavoid.problem import Array, Problem
+from qpavoid.reason import Reason, ReasonKind, Severity
 from qpavoid.solvers.relaxation import TOLERANCE, Relaxed
 
 
-def what_gave_way(relaxed: Relaxed, problem: Problem) -> tuple[str, ...]:
-    """One line for each pair that gave way, the deepest first, each joint in its way, each acceleration or jerk passed.
+def relaxation_reasons(relaxed: Relaxed, problem: Problem) -> tuple[Reason, ...]:
+    """List each relaxed pair, the deepest first, then accelerations and jerks passed, then joints that limit pairs.
+
+    A relaxed row alarms where its pair may come into contact, warns below d1, and else informs.
 
     Args:
         relaxed: the solution.
         problem: what it is a solution of.
     """
     slack, excess = relaxed.slack, relaxed.excess
-    rows, names = problem.avoidance, problem.joint_names
-    gave = np.flatnonzero(slack > 2.0 * TOLERANCE)
-    gave = gave[np.argsort(rows.d[gave], kind="stable")]
-    lines = []
-    for pair, lack, d in zip(rows.pair[gave].tolist(), slack[gave].tolist(), rows.d[gave].tolist(), strict=True):
-        short = f", {1e3 * (rows.d1 - d):.1f} mm short of d1" if d < rows.d1 else ""
-        lines.append(f"{' - '.join(problem.pair_names[pair])}: {1e3 * lack:.1f} mm/s short of its row{short}")
-    limit = "acceleration and jerk limits" if problem.jerked else "acceleration limit"
-    hurried = [
-        f"{names[j]}: {excess[j]:.3f} rad/s or m/s beyond its {limit}"
+    rows, names, units = problem.avoidance, problem.joint_names, problem.joint_units
+    violated = np.flatnonzero(slack > 2.0 * TOLERANCE)
+    violated = violated[np.argsort(rows.d[violated], kind="stable")]
+    found = []
+    for i in violated.tolist():
+        pair, missing = problem.pair_names[rows.pair[i]], float(rows.d1 - rows.d[i])
+        touches = rows.b[i] - slack[i] < rows.touch[i] - 2.0 * TOLERANCE
+        severity = Severity.ALARM if touches else Severity.WARNING if missing > 0.0 else Severity.INFO
+        amount = float(slack[i])
+        found.append(Reason.of(ReasonKind.ROW_RELAXED, *pair, amount=amount, unit="m/s", severity=severity))
+        if missing > 0.0:
+            found.append(
+                Reason.of(ReasonKind.BELOW_SAFETY_DISTANCE, *pair, amount=missing, unit="m", severity=severity)
+            )
+    kind = ReasonKind.JERK_RELAXED if problem.jerked else ReasonKind.ACCELERATION_RELAXED
+    passed = [
+        Reason.of(kind, names[j], amount=float(excess[j]), unit=f"{units[j]}/s")
         for j in np.flatnonzero(excess > 2.0 * TOLERANCE).tolist()
     ]
-    return (*lines, *hurried, *sorted(_limits_in_the_way(rows.J[gave], relaxed.v, problem)))
+    return (*found, *passed, *_limiting_joints(rows.J[violated], relaxed.v, problem))
 
 
-def _limits_in_the_way(J: Array, v: Array, problem: Problem) -> list[str]:
-    """Joints at a limit of which the rows J (k, nv) want more; what is not the speed limit stems from a position."""
-    lower, upper, found = problem.hard_lower, problem.hard_upper, []
+def _limiting_joints(J: Array, v: Array, problem: Problem) -> list[Reason]:
+    """Joints at a limit of which the rows J (k, nv) want more; a bound below the full speed is of a position limit."""
+    lower, upper = problem.hard_lower, problem.hard_upper
+    found: list[Reason] = []
     matters = np.abs(J) > 0.05 * np.max(np.abs(J), axis=1, initial=0.0)[:, None]
     fastest = np.maximum(upper, -lower)
-    for side, limit, wanted in (("upper", upper, J > 0.0), ("lower", lower, J < 0.0)):
-        at = (np.abs(v - limit) <= 1e-5) & (matters & wanted).any(axis=0)
-        for j in np.flatnonzero(at).tolist():
-            what = "its full speed" if abs(limit[j]) >= fastest[j] else f"its {side} limit"
-            found.append(f"{problem.joint_names[j]}: at {what}")
-    return found
+    for kind, limit, wanted in (
+        (ReasonKind.AT_LOWER_LIMIT, lower, J < 0.0),
+        (ReasonKind.AT_UPPER_LIMIT, upper, J > 0.0),
+    ):
+        at_limit = (np.abs(v - limit) <= 1e-5) & (matters & wanted).any(axis=0)
+        for j in np.flatnonzero(at_limit).tolist():
+            full = abs(limit[j]) >= fastest[j]
+            found.append(
+                Reason.of(
+                    ReasonKind.AT_VELOCITY_LIMIT if full else kind,
+                    problem.joint_names[j],
+                    amount=float(limit[j]),
+                    unit=f"{problem.joint_units[j]}/s",
+                )
+            )
+    return sorted(found, key=lambda reason: reason.subject)

@@ -1,0 +1,183 @@
+"""Reasons: what a control step relaxed, assumed or could not do, as data; prose is made of it for people alone."""
+
+from __future__ import annotations
+
+from enum import Enum, IntEnum
+from typing import Any, NamedTuple
+
+
+class Severity(IntEnum):
+    """How much a reason matters to a supervisor."""
+
+    INFO = 1
+    """Noise or an estimate: no margin was used."""
+    WARNING = 2
+    """A margin was used: a distance, a limit, a task."""
+    ALARM = 3
+    """Contact is predicted, or the robot is stopped."""
+
+
+class ReasonKind(str, Enum):
+    """What happened. `subject` and `amount` of the `Reason` are as each kind says."""
+
+    ROW_RELAXED = "ROW_RELAXED"
+    """An avoidance row is violated: the pair, its slack [m/s]."""
+    BELOW_SAFETY_DISTANCE = "BELOW_SAFETY_DISTANCE"
+    """A pair of a relaxed row is too near: the pair, what is missing to the safety distance [m]."""
+    PREDICTED_TOO_NEAR = "PREDICTED_TOO_NEAR"
+    """The look-ahead found no velocity whose braking trajectory stays clear: the pair, what is missing [m]."""
+    UNKNOWN_DISTANCE = "UNKNOWN_DISTANCE"
+    """A distance is not a number: the pair."""
+    ACCELERATION_RELAXED = "ACCELERATION_RELAXED"
+    """A joint passes its acceleration limit: the joint, the excess of its velocity [rad/s or m/s]."""
+    JERK_RELAXED = "JERK_RELAXED"
+    """A joint passes its jerk limit, or its acceleration and jerk limits: the joint, the excess of its velocity
+    [rad/s or m/s]."""
+    LIMIT_RECOVERY = "LIMIT_RECOVERY"
+    """A joint is outside its position limits and sent back: the joint, how far [rad or m], negative below the lower."""
+    AT_LOWER_LIMIT = "AT_LOWER_LIMIT"
+    """A joint is kept from passing its lower position limit by a row or task: the joint, the bound on its velocity
+    [rad/s or m/s]."""
+    AT_UPPER_LIMIT = "AT_UPPER_LIMIT"
+    """The same of its upper position limit."""
+    AT_VELOCITY_LIMIT = "AT_VELOCITY_LIMIT"
+    """A joint moves at its velocity limit where a row wants more: the joint, its velocity [rad/s or m/s]."""
+    STALLED = "STALLED"
+    """The tasks make no progress: the pair in the way, by how much their velocity violates its row [m/s]; no pair where
+    several rows are in the way together."""
+    OUT_OF_REACH = "OUT_OF_REACH"
+    """A target cannot be reached: the task, by how much [m]."""
+    TARGET_OBSTRUCTED = "TARGET_OBSTRUCTED"
+    """A target is too near to an obstacle: task and obstacle, what is missing to the safety distance [m]."""
+    DETOUR_ENDED = "DETOUR_ENDED"
+    """The detours of a task ended without progress: the task, for how long they were tried [s]."""
+    BACKUP = "BACKUP"
+    """The backup trajectory replaces the tasks: from their velocity, none would stay clear of moving obstacles."""
+    NO_BACKUP = "NO_BACKUP"
+    """No backup trajectory is looked for: what excludes it."""
+    STALE = "STALE"
+    """An obstacle was not updated in time: the obstacle, the age of its last update [s]."""
+    NEVER_UPDATED = "NEVER_UPDATED"
+    """An external obstacle has not been given yet: the obstacle."""
+    ESTIMATED = "ESTIMATED"
+    """A twist was estimated from the poses of an obstacle: the obstacle."""
+    IGNORED = "IGNORED"
+    """An update was not used: of what."""
+    POINTS_DROPPED = "POINTS_DROPPED"
+    """Points of a cloud were not used: the cloud, how many [-]."""
+    IMPLAUSIBLE = "IMPLAUSIBLE"
+    """An argument cannot be true: its name."""
+    NORMALISED = "NORMALISED"
+    """A rotation or quaternion was nearly one, and is normalised: of what, how far it was off [-]."""
+    TIMING = "TIMING"
+    """Time went on by something else than the control period: `t`, by how much [s]."""
+    SOLVER_FAILED = "SOLVER_FAILED"
+    """The solver gave no usable velocity; `detail` has its own words."""
+    CONTACTS_INFEASIBLE = "CONTACTS_INFEASIBLE"
+    """The joint limits leave no velocity that holds the contacts."""
+    PRIORITY_UNSOLVED = "PRIORITY_UNSOLVED"
+    """No back end could solve the QP of a priority level: the level."""
+
+    @property
+    def severity(self) -> Severity:
+        """Severity of a reason of this kind, unless it gives its own."""
+        return _SEVERITIES.get(self, Severity.WARNING)
+
+
+_SEVERITIES = {
+    **dict.fromkeys(("NO_BACKUP", "ESTIMATED", "IGNORED", "POINTS_DROPPED", "NORMALISED", "TIMING"), Severity.INFO),
+    **dict.fromkeys(
+        ("PREDICTED_TOO_NEAR", "UNKNOWN_DISTANCE", "IMPLAUSIBLE", "SOLVER_FAILED", "CONTACTS_INFEASIBLE"),
+        Severity.ALARM,
+    ),
+}
+_TEXTS: dict[str, str] = {
+    "ROW_RELAXED": "row relaxed by",
+    "BELOW_SAFETY_DISTANCE": "below the safety distance by",
+    "PREDICTED_TOO_NEAR": "predicted below the safety distance by",
+    "UNKNOWN_DISTANCE": "distance is not a number",
+    "ACCELERATION_RELAXED": "acceleration limit passed by",
+    "JERK_RELAXED": "jerk limit passed by",
+    "LIMIT_RECOVERY": "outside its position limits by",
+    "AT_LOWER_LIMIT": "at its lower limit, velocity bound",
+    "AT_UPPER_LIMIT": "at its upper limit, velocity bound",
+    "AT_VELOCITY_LIMIT": "at its velocity limit,",
+    "STALLED": "no progress, row violated by",
+    "OUT_OF_REACH": "out of reach by",
+    "TARGET_OBSTRUCTED": "target too near by",
+    "DETOUR_ENDED": "detours ended without progress after",
+    "BACKUP": "backup trajectory instead of the tasks",
+    "NO_BACKUP": "no backup trajectory",
+    "STALE": "not updated for",
+    "NEVER_UPDATED": "external, not given yet",
+    "ESTIMATED": "twist estimated from its poses",
+    "IGNORED": "update not used",
+    "POINTS_DROPPED": "points dropped:",
+    "IMPLAUSIBLE": "implausible",
+    "NORMALISED": "normalised, off by",
+    "TIMING": "differs from the control period:",
+    "SOLVER_FAILED": "no usable velocity",
+    "CONTACTS_INFEASIBLE": "joint limits leave no velocity that holds them",
+    "PRIORITY_UNSOLVED": "no back end could solve its QP",
+}
+
+
+class Reason(NamedTuple):
+    """One thing that a control step relaxed, assumed or could not do."""
+
+    kind: ReasonKind
+    subject: tuple[str, ...] = ()
+    """Names of what it is about: the bodies of a pair, a joint, a task, an obstacle, an argument."""
+    amount: float | None = None
+    """How much, where the kind has an amount."""
+    unit: str = ""
+    """Unit of `amount`: m, m/s, rad, rad/s, s or - ."""
+    severity: Severity = Severity.WARNING
+    detail: str = ""
+    """More for people; not for programs."""
+
+    @classmethod
+    def of(
+        cls,
+        kind: ReasonKind,
+        *subject: str,
+        amount: float | None = None,
+        unit: str = "",
+        severity: Severity | None = None,
+        detail: str = "",
+    ) -> Reason:
+        """Make a reason with the severity of its kind unless another one is given; see the fields."""
+        return cls(kind, subject, amount, unit, kind.severity if severity is None else severity, detail)
+
+    def __str__(self) -> str:
+        """Return one line for people."""
+        parts = [_TEXTS[self.kind.value]]
+        if self.amount is not None:
+            parts.append(_quantity(self.amount, self.unit))
+        if self.detail:
+            parts.append(f"({self.detail})")
+        return f"{' - '.join(self.subject)}: {' '.join(parts)}" if self.subject else " ".join(parts)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain data for JSON and logs, with the line for people as `text`."""
+        return {
+            "kind": self.kind.value,
+            "subject": list(self.subject),
+            "amount": self.amount,
+            "unit": self.unit,
+            "severity": self.severity.name,
+            "text": str(self),
+        }
+
+    @property
+    def key(self) -> tuple[str, tuple[str, ...]]:
+        """Kind and subject: the same reason in two steps has the same key, whatever its amounts."""
+        return self.kind.value, self.subject
+
+
+def _quantity(amount: float, unit: str) -> str:
+    if unit in ("m", "m/s"):
+        return f"{1e3 * amount:.1f} m{unit}"
+    if unit == "s":
+        return f"{amount:.3f} s"
+    return f"{amount:.4g}" if unit in ("", "-") else f"{amount:.4g} {unit}"
