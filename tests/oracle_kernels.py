@@ -5,11 +5,7 @@ Each takes a `RowLayout` as its memory and writes nothing.
 
 import numpy as np
 
-from qpavoid.kernels.ahead import TOLERANCE
 from qpavoid.kernels.stopping import speed_to_stop, way_to_stop
-
-__all__ = ["TOLERANCE", "closest_call", "distance_rows", "joint_twists", "velocity_bounds"]
-
 
 # --- rows of the near pairs --------------------------------------------------------------------------------------
 

@@ -64,7 +64,6 @@ def _compiled() -> dict[str, Callable[[], Backend]]:
     """The back end `native`, which the `qp` solver calls without P and q: here x0 = -P⁻¹q is computed first."""
     try:
         from numba import njit
-
         from qpavoid.kernels.compiled.active_set import minimize
     except ModuleNotFoundError:
         return {}

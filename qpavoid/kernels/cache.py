@@ -67,6 +67,7 @@ class _Files:
             if _digest(content[_DIGEST:]) == content[:_DIGEST]:
                 found, code = pickle.loads(content[_DIGEST:])
                 if found == key:
+                    self._count_as_used()
                     return code
         first_use.begin()
         return None
@@ -90,6 +91,10 @@ class _Files:
         for path in self._folder.glob(f"{self._name}.*.code"):
             with suppress(OSError):
                 path.unlink()
+
+    def _count_as_used(self) -> None:
+        with suppress(OSError):
+            os.utime(self._folder / _COMPLETE)
 
     def _path(self, key: Any) -> Path:
         return self._folder / f"{self._name}.{_digest(repr(key).encode()).hex()}.code"
@@ -130,7 +135,7 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
 
 
 class FirstUse:
-    """Tells on stderr what takes so long where a machine has no compiled kernels yet; silent ever after."""
+    """What stderr says where a machine has no compiled kernels yet; nothing is said ever after."""
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._begin = folder, 0.0
@@ -160,7 +165,7 @@ def _say(line: str) -> None:
 
 
 def _make_room(parent: Path) -> None:
-    """Delete the folders that were completed first, down to the most that are kept."""
+    """Delete the folders that were not used for longest, down to the most that are kept."""
     with suppress(OSError):
         folders = sorted(parent.glob(f"kernels-*/{_COMPLETE}"), key=lambda path: path.stat().st_mtime)
         for complete in folders[:-_MOST]:
