@@ -144,7 +144,7 @@ class FirstUse:
         """Say that kernels are compiled, the first time that any is in an incomplete folder."""
         if not self._begin and not (self._folder / _COMPLETE).exists():
             self._begin = perf_counter()
-            _say("compiling kernels, once on this machine: about 30 s ...")
+            _say("compiling kernels, once on this machine: about 20 s ...")
 
     def end(self) -> None:
         """Say how long it took, where `begin` said anything, and mark the folder as complete."""
