@@ -38,7 +38,7 @@ def scene(tmp_path):
 
 def process(*args: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "qpavoid", *args]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=60, check=False)
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300, check=False)
 
 
 # list
@@ -313,7 +313,7 @@ def test_signal_leaves_a_log_of_what_was_done(tmp_path, signum):
     ) as child:
         assert child.stderr.readline() == "under way\n"
         child.send_signal(signum)
-        stdout, stderr = child.communicate(timeout=60)
+        stdout, stderr = child.communicate(timeout=300)
     assert child.returncode == 1
     assert "Traceback" not in stderr
     assert "broken off" in stderr
