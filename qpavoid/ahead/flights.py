@@ -189,7 +189,9 @@ class Flights:
         end, plan, tally = t + horizon + _BEYOND, list[Array](), Tally(start, horizon)
         near = self._look(q, t, v, tally, 0.0)
         left = self._none if given is None else given
-        while t < end - 1e-9:
+        for _ in range(int((horizon + _BEYOND) / self._dt) + 2):
+            if t >= end - 1e-9:
+                break
             count = self._ticks - round(t / self._dt) % self._ticks
             wanted, left = left[:count], left[count:]
             held = not len(wanted)

@@ -6,7 +6,20 @@ import numpy as np
 
 from qpavoid.kernels.compiled.frames import _rotation_vector
 from qpavoid.kernels.compiled.packing import compiled
-from qpavoid.kernels.vectorised.motions import Pieces, Placed
+from qpavoid.kernels.vectorised.motions import (
+    EXACT,
+    FAR,
+    FAST,
+    LEFT_HANDED,
+    NEARLY,
+    NO_ROTATION,
+    NORMALISED,
+    NOT_FINITE,
+    POSE,
+    SAMPLE,
+    Pieces,
+    Placed,
+)
 from qpavoid.problem import Array, IntArray, Mask
 
 
@@ -90,30 +103,82 @@ def place_obstacles(
 
 
 @compiled
-def take_in(which: IntArray, posed: Mask, news: Array, age: IntArray, last: Array, states: Array, dt: float) -> Mask:
+def check_states(
+    states: Array, which: IntArray, kind: IntArray, farthest: float, fastest: float
+) -> tuple[IntArray, Array]:
+    """See `vectorised.motions.check_states`."""
+    codes, off, gram, new = np.zeros(len(which), np.intp), np.zeros(len(which)), np.empty((3, 3)), np.empty(9)
+    for k in range(len(which)):
+        x, count = states[which[k]], 18 if kind[k] == SAMPLE else 12
+        total, far, fast = 0.0, 0.0, 0.0
+        for c in range(count):
+            total += abs(x[c])
+        if not total < np.inf:  # isfinite does not survive the reordering of sums
+            codes[k] = NOT_FINITE
+            continue
+        for c in range(9, 12):
+            far = max(far, abs(x[c]))
+        for c in range(12, count):
+            fast = max(fast, abs(x[c]))
+        if far > farthest or fast > fastest:
+            codes[k] = FAR if far > farthest else FAST
+            continue
+        _gram(x, gram)
+        for r in range(3):
+            for c in range(3):
+                off[k] = max(off[k], abs(gram[r, c] - (1.0 if r == c else 0.0)))
+        across = x[1] * x[5] - x[2] * x[4], x[2] * x[3] - x[0] * x[5], x[0] * x[4] - x[1] * x[3]
+        if across[0] * x[6] + across[1] * x[7] + across[2] * x[8] < 0.0:
+            codes[k] = LEFT_HANDED
+        elif not off[k] <= NEARLY:
+            codes[k] = NO_ROTATION
+        elif off[k] > EXACT:
+            codes[k] = NORMALISED
+            for _ in range(4):
+                _gram(x, gram)
+                for c in range(3):
+                    for r in range(3):
+                        new[3 * c + r] = 1.5 * x[3 * c + r]
+                        for i in range(3):
+                            new[3 * c + r] -= 0.5 * x[3 * i + r] * gram[i, c]
+                x[:9] = new
+    return codes, off
+
+
+@compiled
+def _gram(x: Array, gram: Array) -> None:
+    """RᵀR (3, 3) of a rotation by columns (9,)."""
+    for r in range(3):
+        for c in range(3):
+            gram[r, c] = x[3 * r] * x[3 * c] + x[3 * r + 1] * x[3 * c + 1] + x[3 * r + 2] * x[3 * c + 2]
+
+
+@compiled
+def take_in(
+    which: IntArray, kind: IntArray, times: Array, news: Array, stamps: Array, last: Array, states: Array,
+    shortest: float, fastest: float,
+) -> Mask:  # fmt: skip
     """See `vectorised.motions.take_in`."""
-    fine, turn = np.empty(len(which), np.bool_), np.empty((3, 3))
+    fine, turn = np.ones(len(which), np.bool_), np.empty((3, 3))
     for k in range(len(which)):
         i = which[k]
-        new, old = news[i], last[i]
-        total = 0.0
-        for c in range(12 if posed[k] else 18):
-            total += abs(new[c])
-        fine[k] = total < np.inf  # isfinite does not survive the reordering of sums
-        if not fine[k]:
-            continue
-        if posed[k]:
+        new, old, since = news[i], last[i], times[k] - stamps[i]
+        if kind[k] != SAMPLE:
             new[12:] = 0.0
-            if age[i] >= 0:
-                share = 1.0 / (dt * (age[i] + 1))
-                for r in range(3):
-                    new[12 + r] = share * (new[9 + r] - old[9 + r])
-                    for c in range(3):
-                        turn[r, c] = new[r] * old[c] + new[3 + r] * old[3 + c] + new[6 + r] * old[6 + c]
-                angles = _rotation_vector(turn)
-                for r in range(3):
-                    new[15 + r] = share * angles[r]
-        old[:] = new
-        states[i] = new
-        age[i] = 0
+        if kind[k] == POSE and since > shortest:
+            for r in range(3):
+                new[12 + r] = (new[9 + r] - old[9 + r]) / since
+                for c in range(3):
+                    turn[r, c] = new[r] * old[c] + new[3 + r] * old[3 + c] + new[6 + r] * old[6 + c]
+            angles = _rotation_vector(turn)
+            for r in range(3):
+                new[15 + r] = angles[r] / since
+            for c in range(12, 18):
+                fine[k] = fine[k] and abs(new[c]) <= fastest
+        elif kind[k] == POSE and stamps[i] == stamps[i]:
+            new[12:] = old[12:]
+        if fine[k]:
+            old[:] = new
+            states[i] = new
+            stamps[i] = times[k]
     return fine

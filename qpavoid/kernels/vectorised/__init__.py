@@ -8,7 +8,7 @@ from qpavoid.kernels.vectorised.bounds import velocity_bounds
 from qpavoid.kernels.vectorised.culling import candidates, in_one_alone
 from qpavoid.kernels.vectorised.flights import comes_too_near, least_apart, look_around, ramp
 from qpavoid.kernels.vectorised.frames import damped_solution, frame_rows, projection_cost
-from qpavoid.kernels.vectorised.motions import pack_pieces, place_obstacles, sample_pieces, take_in
+from qpavoid.kernels.vectorised.motions import check_states, pack_pieces, place_obstacles, sample_pieces, take_in
 from qpavoid.kernels.vectorised.packing import pack
 from qpavoid.kernels.vectorised.pairs import distance_rows, row_bounds
 from qpavoid.kernels.vectorised.stops import stop_velocity, stop_way
@@ -19,6 +19,7 @@ __all__ = [
     "assemble",
     "bends",
     "candidates",
+    "check_states",
     "choose",
     "closest_call",
     "comes_too_near",

@@ -170,33 +170,93 @@ def place_obstacles(
     return -1, bool(np.count_nonzero(x.twists) or np.count_nonzero(x.margin))
 
 
-def take_in(which: IntArray, posed: Mask, news: Array, age: IntArray, last: Array, states: Array, dt: float) -> Mask:
-    """Takes over the states of obstacles that are given from outside; a bare pose gets the twist that has led to it.
+FINE, NORMALISED, NOT_FINITE, FAR, FAST, NO_ROTATION, LEFT_HANDED = range(7)
+"""What `check_states` finds."""
+EXACT, NEARLY = 1e-6, 1e-3
+"""|RᵀR - I| up to which a matrix is taken for a rotation as it is (those of 32 bits are 1e-7 off), and up to which it
+is replaced by the rotation next to it."""
+SAMPLE, POSE, REST = range(3)
+"""How an obstacle is given: with a twist, without one, at rest."""
 
-    That is the difference of its last two poses, over the time between them; the first one counts as at rest.
+
+def check_states(
+    states: Array, which: IntArray, kind: IntArray, farthest: float, fastest: float
+) -> tuple[IntArray, Array]:
+    """Find states that cannot be true, and normalise rotations that are nearly ones in place.
+
+    R becomes ½ R (3 I - RᵀR), which squares its distance from the nearest rotation, four times over: from 1e-3 that
+    leaves nothing but round-off.
+
+    Args:
+        states: (o, 18).
+        which: numbers of those to look at (k,).
+        kind: how each is given (k,): SAMPLE, POSE or REST; of the latter two, twists are not looked at.
+        farthest: largest coordinate of a position [m].
+        fastest: largest component of a twist [m/s, rad/s].
+
+    Returns:
+        (k,) FINE, NORMALISED, or the first thing that is wrong; (k,) largest entry of |RᵀR - I|.
+    """
+    codes, off = np.zeros(len(which), dtype=np.intp), np.zeros(len(which))
+    for k, (i, how) in enumerate(zip(which.tolist(), kind.tolist(), strict=True)):
+        state = states[i, : 18 if how == SAMPLE else 12]
+        R = state[:9].reshape(3, 3).T
+        if not np.isfinite(state).all():
+            codes[k] = NOT_FINITE
+        elif np.abs(state[9:12]).max() > farthest:
+            codes[k] = FAR
+        elif np.abs(state[12:]).max(initial=0.0) > fastest:
+            codes[k] = FAST
+        else:
+            off[k] = np.abs(R.T @ R - np.eye(3)).max()
+            if np.linalg.det(R) < 0.0:
+                codes[k] = LEFT_HANDED
+            elif not off[k] <= NEARLY:
+                codes[k] = NO_ROTATION
+            elif off[k] > EXACT:
+                codes[k] = NORMALISED
+                for _ in range(4):
+                    R = 0.5 * R @ (3.0 * np.eye(3) - R.T @ R)
+                state[:9] = R.T.ravel()
+    return codes, off
+
+
+def take_in(
+    which: IntArray, kind: IntArray, times: Array, news: Array, stamps: Array, last: Array, states: Array,
+    shortest: float, fastest: float,
+) -> Mask:  # fmt: skip
+    """Take over checked states of obstacles that are given from outside; a bare pose gets the twist that has led to it.
+
+    That is the difference of its last two poses, over the time between their stamps; the first one counts as at rest,
+    and where no time lies between them the twist stays as it was.
 
     Args:
         which: numbers of the obstacles (k,).
-        posed: which of them are given without a twist (k,).
+        kind: how each is given (k,): SAMPLE, POSE or REST.
+        times: their time stamps (k,) [s].
         news: what is given, read where `which` says (o, 18); the twists of bare poses are overwritten.
-        age: ticks since each was given last, negative if it never was (o,); 0 afterwards.
+        stamps: time stamps of what was given last, NaN where nothing was (o,) [s]; overwritten.
         last: what was given last, with its twist (o, 18); overwritten.
-        states: (o, 18) overwritten likewise.
-        dt: length of a tick [s].
+        states: (o, 18) overwritten as well.
+        shortest: time between two poses below which no twist is estimated [s].
+        fastest: largest component of a twist that is estimated [m/s, rad/s].
 
     Returns:
-        Which of them are finite (k,); the others are left as they were.
+        Which of them were taken over (k,); not those whose poses are too far apart for `fastest`.
     """
-    news[which[posed], 12:] = 0.0
-    fine = np.asarray(np.isfinite(news.take(which, axis=0)).all(axis=1))
-    given = which[fine]
-    before = which[fine & posed & (age[which] >= 0)]
-    if len(before):
-        new, old = news[before], last[before]
-        share = 1.0 / (dt * (age[before, None] + 1))
-        turns = np.matmul(new[:, :9].reshape(-1, 3, 3).swapaxes(1, 2), old[:, :9].reshape(-1, 3, 3))
-        news[before, 12:15] = share * (new[:, 9:12] - old[:, 9:12])
-        news[before, 15:] = share * np.array([rotation_vector(turn) for turn in turns.tolist()])
-    last[given] = states[given] = news[given]
-    age[given] = 0
+    fine = np.ones(len(which), dtype=bool)
+    for k, (i, how) in enumerate(zip(which.tolist(), kind.tolist(), strict=True)):
+        new, old, since = news[i], last[i], times[k] - stamps[i]
+        if how != SAMPLE:
+            new[12:] = 0.0
+        if how == POSE and since > shortest:
+            turn = new[:9].reshape(3, 3).T @ old[:9].reshape(3, 3)
+            new[12:15] = (new[9:12] - old[9:12]) / since
+            new[15:] = np.array(rotation_vector(turn.tolist())) / since
+            fine[k] = np.abs(new[12:]).max() <= fastest
+        elif how == POSE and stamps[i] == stamps[i]:
+            new[12:] = old[12:]
+        if fine[k]:
+            last[i] = states[i] = new
+            stamps[i] = times[k]
     return fine
