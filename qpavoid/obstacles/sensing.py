@@ -509,7 +509,8 @@ def as_sample(what: Any) -> Any:
         remedy = "give Sample.at(position, rotation, linear, angular), all but the first optional"
         raise NumericalError(f"neither a Sample nor a Pose: {' '.join(repr(what).split()):.60}; {remedy}")
     parts = [as_vector(name, getattr(what, name), _SHAPES[name]) for name in what._fields[:-2]]
-    return type(what)(*parts, what.t, what.at_rest)
+    kind_of: Any = type(what)
+    return kind_of(*parts, what.t, what.at_rest)
 
 
 def as_goal(what: Any) -> Sample:

@@ -41,6 +41,7 @@ class MeanTwists:
             states: of all obstacles (o, 18).
         """
         self._counts[which] += 1.0
+        elapsed = np.maximum(elapsed, 0.0)
         share = np.fmax(1.0 / self._counts[which], elapsed / (_STEADY + elapsed))[:, None]
         self.twists[which] += share * (states[which, 12:] - self.twists[which])
 
