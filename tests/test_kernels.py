@@ -195,19 +195,30 @@ def test_there_are_two_versions_of_everything():
     assert all(getattr(used, name) is getattr(chosen, name) for name in chosen.__all__)
 
 
-def test_code_older_than_any_source_is_not_run_again(tmp_path):
+def test_compiled_code_is_used_again_only_while_no_source_has_changed(tmp_path):
+    """Content counts, wherever code is cached, and nothing is deleted."""
     pytest.importorskip("numba")
-    from qpavoid.kernels.compiled.packing import forget_stale_code
+    from qpavoid.kernels.compiled.packing import digest_of_sources
 
-    files = {"a.py": 10, "part/b.py": 20, "__pycache__/a.f-1.nbi": 15, "__pycache__/a.f-1.1.nbc": 15,
-             "part/__pycache__/b.g-1.nbi": 25, "part/__pycache__/b.cpython.pyc": 5}  # fmt: skip
-    for name, time in files.items():
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).touch()
-        os.utime(tmp_path / name, (time, time))
-    forget_stale_code(tmp_path)
-    left = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.*")}
-    assert left == {"a.py", "part/b.py", "part/__pycache__/b.g-1.nbi", "part/__pycache__/b.cpython.pyc"}
+    (tmp_path / "part").mkdir()
+    for name in ("a.py", "part/b.py"):
+        (tmp_path / name).write_text("x = 1")
+    found = [digest_of_sources(tmp_path)]
+    os.utime(tmp_path / "a.py", (10, 10))
+    assert digest_of_sources(tmp_path) == found[0]
+    for name, text in (("a.py", "x = 2"), ("part/b.py", "x = 2"), ("part/c.py", "")):
+        (tmp_path / name).write_text(text)
+        found.append(digest_of_sources(tmp_path))
+    assert len(set(found)) == 4
+    assert sorted(path.name for path in tmp_path.rglob("*.py")) == ["a.py", "b.py", "c.py"]
+    if kernels.ACCELERATED:
+        folder = Path(kernels.__file__).parent
+        cache = kernels.check_states._cache._cache_file
+        assert cache._source_stamp == digest_of_sources(folder)
+        kernels.check_states(np.zeros((1, 18)), np.zeros(1, int), np.zeros(1, int), 1.0, 1.0)
+        assert cache._load_index()
+        stale = type(cache)(cache._cache_path, cache._index_name.removesuffix(".nbi"), "of other sources")
+        assert not stale._load_index()
 
 
 # --- candidates --------------------------------------------------------------------------------------------------

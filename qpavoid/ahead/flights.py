@@ -96,6 +96,7 @@ class Flights:
         still = self.still.leaning
         near = self._look(q, 0.0, still, Tally(Start(q, still, still, 0.0, self.parted), 1.0), 0.0)
         kernels.comes_too_near(*near, still, 1.0, 0.0)
+        kernels.least_apart(np.zeros((1, 1, 3)), np.zeros((1, 3)), np.zeros((1, 1)))
         self.ramps.towards(still, still, self._flee(near, Manner(0.1, still))[None])
         self.forget_foreseen()
 

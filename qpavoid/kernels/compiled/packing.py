@@ -5,7 +5,7 @@ The layout crosses from Python as one structure: passing its forty arrays one by
 
 from __future__ import annotations
 
-from contextlib import suppress
+import hashlib
 from pathlib import Path
 from typing import Any
 
@@ -15,21 +15,30 @@ from numba.experimental import structref
 from qpavoid.kernels.layout import RowLayout
 
 
-def forget_stale_code(kernels: Path) -> None:
-    """Takes code out of the cache below a folder that is older than any of its sources.
+def digest_of_sources(kernels: Path) -> str:
+    """Return the digest of all sources below a folder."""
+    digest = hashlib.sha256()
+    for source in sorted(kernels.rglob("*.py")):
+        digest.update(source.relative_to(kernels).as_posix().encode() + b"\0" + source.read_bytes())
+    return digest.hexdigest()
 
-    numba looks at the file of a function alone, and would go on with what that took from other files.
+
+_STAMP = digest_of_sources(Path(__file__).parents[1])
+
+
+def compiled(function: Any) -> Any:
+    """Compile a function with numba; what is cached counts as long as no source of a kernel has changed.
+
+    numba itself compares the file of a function alone, and would go on with what that took from other files. Where the
+    cache lies is up to numba: beside the sources, or in the user's folder where these cannot be written.
+
+    Sums may be taken in any order, so that they become vector instructions; NaN stays NaN.
     """
-    newest = max(source.stat().st_mtime for source in kernels.rglob("*.py"))
-    for code in kernels.rglob("__pycache__/*.nb[ic]"):
-        with suppress(OSError):
-            if code.stat().st_mtime < newest:
-                code.unlink()
-
-
-forget_stale_code(Path(__file__).parents[1])
-compiled = njit(cache=True, fastmath={"reassoc", "contract", "nsz"})
-"""How kernels are compiled: sums may be taken in any order, so that they become vector instructions; NaN stays NaN."""
+    dispatcher = njit(cache=True, fastmath={"reassoc", "contract", "nsz"})(function)
+    cache = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
+    if cache is not None:  # not where NUMBA_DISABLE_JIT leaves functions as they are
+        cache._source_stamp = _STAMP
+    return dispatcher
 
 
 class PackedRows(structref.StructRefProxy):  # type: ignore[misc]
