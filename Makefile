@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: run figures test smoke lint types clean
+.PHONY: run figures test campaign smoke lint types clean
 
 run: .venv/run
 	$(BIN)/qpavoid compare situation1 situation2 --solvers tracking,eq10-literal,eq10,qp --out out
@@ -12,6 +12,9 @@ figures: run
 
 test: .venv/dev
 	$(BIN)/pytest -n auto
+
+campaign: .venv/dev
+	$(BIN)/pytest -n auto -m slow
 
 smoke: .venv/dev
 	$(BIN)/qpavoid bench smoke

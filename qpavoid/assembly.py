@@ -111,7 +111,7 @@ class Assembly:
         """
         x = self._layout
         for views, target in zip(self._targets, targets):  # noqa: B905 (strict costs as much as the copying)
-            views[0][:], views[1][:], views[2][:], views[3][:] = target
+            views[0][:], views[1][:], views[2][:], views[3][:] = target[:4]
         if self._others:
             for task, target in zip(self._others, targets[len(self._targets) :], strict=True):
                 task.update(q, self._forward, target)
@@ -129,6 +129,14 @@ class Assembly:
         return proximity, Problem(
             self._tracking, rows, *bounds, *self._names, x.v0, worst, held, self._levels, x.jerked, clear, room
         )
+
+    def look_ahead(self, looks_ahead: bool) -> None:
+        """Tell kernels whether to look for velocities that lead nowhere near anything; see `RowLayout.looks_ahead`."""
+        x = self._layout
+        looks_ahead = looks_ahead and self._contacts is None and not x.jerked
+        if looks_ahead != x.looks_ahead:
+            self._layout = x._replace(looks_ahead=looks_ahead)
+            self._packed = kernels.pack(self._layout)
 
     def carry(self, query: DistanceQuery) -> None:
         """Takes over which joint carries what, in place."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -122,21 +122,35 @@ class Limits(Block):
 
 
 class Sensing(Block):
-    """What is made of obstacles that a program gives tick by tick, and then does not."""
+    """What is made of external obstacles that are not updated: those that a program gives in `step`."""
 
-    stale_after: Positive | None = None
-    """Time without news after which an obstacle's distances shrink by a growing margin [s]; left out: never, it goes on
-    at its last twist."""
+    stale_after: Positive | None = 0.1
+    """Age of the last update after which an obstacle's distances shrink by a growing margin [s], but no less than three
+    control periods; `null`: never, it goes on at its last twist."""
     margin_growth: NonNegative = 0.1
     """How fast that margin grows: a bound on how wrong the last twist may be [m/s]."""
-    stop_after: Positive | None = None
-    """Time without news after which the robot stops [s]; left out: never."""
+    stop_after: Positive | None = 0.5
+    """Age of the last update after which the robot stops [s], but no less than three control periods; left out: five
+    times `stale_after`; `null`: never."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _stop_left_out(cls, fields: Any) -> Any:
+        if isinstance(fields, dict) and "stale_after" in fields and "stop_after" not in fields:
+            stale = fields["stale_after"]
+            if stale is None or (isinstance(stale, int | float) and 0.0 < stale < _LONG):
+                return {**fields, "stop_after": None if stale is None else 5.0 * stale}
+        return fields
 
     @model_validator(mode="after")
     def _ordered(self) -> Sensing:
         if self.stop_after is not None and (self.stale_after is None or self.stop_after < self.stale_after):
             raise ValueError("stop_after needs a stale_after that is not longer")
         return self
+
+
+_LONG = 1e8
+"""Time of which five are still a number that a file may give [s]."""
 
 
 class Detour(Block):
