@@ -12,7 +12,7 @@ from qpavoid import Avoidance, Obstacle, Robot, Sample, simulate
 from qpavoid.config import Box, Capsule, Damper, Sphere
 
 ROWS = {
-    "switching": Avoidance(d1=0.02, d2=0.1),
+    "beta": Avoidance(d1=0.02, d2=0.1),
     "damper": Avoidance(d1=0.02, d2=0.1, row=Damper(gain=5.0)),
 }
 

@@ -61,6 +61,10 @@ class Hqp(Qp):
         slack = relaxed.slack if relaxed.slack.any() else None
         return Solution(relaxed.v, Status.RELAXED, (*what_gave_way(relaxed, problem), *unsolved), slack)
 
+    def tracked(self, problem: Problem) -> Array:
+        """The velocity (nv,) of the cascade without inequalities, v̂."""
+        return _cascade(problem, problem.levels or (np.arange(len(problem.tracking.b)),))[0]
+
     def _levels(
         self, problem: Problem, asked: Levels, alone: Array, least: Array, lower: Array, upper: Array
     ) -> tuple[Array | None, tuple[str, ...]]:

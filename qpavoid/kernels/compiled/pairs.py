@@ -8,7 +8,7 @@ import numpy as np
 
 from qpavoid.kernels.compiled.bounds import _change_to_stop
 from qpavoid.kernels.compiled.packing import compiled
-from qpavoid.kernels.vectorised.pairs import BRAKING_SHARE
+from qpavoid.kernels.vectorised.pairs import BRAKING_SHARE, TINY
 from qpavoid.problem import Array, IntArray
 
 
@@ -56,10 +56,11 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
     for i in range(k):
         d = x.closest[i, 0] + x.offset - x.margin[x.twist_row[x.near[i]]]
         value = x.row_gain * (x.hold - d)
+        if x.beta and not value > 0.0:
+            value *= 1.0 - _beta(x, d)
+        elif x.task_switching:
+            value = max(_rate_of_eq10(x, i, d), value if value > 0.0 else (x.hold - d) / x.dt)
         parting = value > 0.0
-        if x.switching and not parting:
-            share = min(max((d - x.d1) / (x.d2 - x.d1), 0.0), 1.0)
-            value *= 0.5 - 0.5 * np.cos(np.pi * share)
         if x.accelerated and value < 0.0:
             braking = 0.0
             for c in range(len(x.v_step)):
@@ -90,6 +91,25 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
         x.d[i] = d
         x.least[i] = least
         x.touch[i] = min(x.row_gain * (x.offset - d) - x.drift[i], least)
+
+
+@compiled
+def _beta(x: Any, d: float) -> float:
+    """See `gains.beta`."""
+    return 0.5 + 0.5 * np.cos(np.pi * min(max((d - x.d1) / (x.d2 - x.d1), 0.0), 1.0))
+
+
+@compiled
+def _rate_of_eq10(x: Any, i: int, d: float) -> float:
+    """See `vectorised.pairs._rates_of_eq10`."""
+    u = x.drift[i]
+    for c in range(len(x.v0)):
+        u += x.J[i, c] * x.v0[c]
+    rate, beta = min(u, x.retreat_speed), _beta(x, d)
+    if u < 0.0:
+        ratio = max(x.d2 - d, 0.0) / max(d, TINY)
+        rate *= 1.0 - min(ratio * ratio, x.alpha_cap)
+    return (1.0 - beta) * rate + beta * x.retreat_speed
 
 
 @compiled

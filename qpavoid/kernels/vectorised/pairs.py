@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from qpavoid.gains import alpha, beta
 from qpavoid.kernels.rotation import ANTICYCLE, CYCLE
 from qpavoid.kernels.vectorised.bounds import change_to_stop
 from qpavoid.kernels.workspace import Rows
@@ -13,6 +14,8 @@ from qpavoid.problem import Array, IntArray
 
 BRAKING_SHARE = 0.5
 """Share of the joints' accelerations on which a pair counts for braking; other pairs want some, too [-]."""
+TINY = 1e-300
+"""Distance that α takes for none: no division by zero [m]."""
 
 
 def distance_rows(x: Any, pairs: IntArray, reach: float, moving: bool) -> int:
@@ -73,9 +76,12 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
     if moving:
         d -= x.margin[x.twist_row[rows.near]]
     np.subtract(x.hold_, d, out=least)
+    if x.task_switching:
+        rates = _rates_of_eq10(x, rows)
+        np.maximum(rates, np.where(least > x.zero, least * x.gain_, least / x.dt), out=least)
     parting = least > x.zero
     some = np.count_nonzero(parting) > 0
-    if x.switching:
+    if x.beta:
         np.subtract(d, x.d1_, out=share)
         share *= x.blend
         if some:
@@ -91,7 +97,7 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
             least *= x.gain_
         else:
             np.multiply(share, x.gain_, out=least)
-    else:
+    elif not x.task_switching:
         least *= x.gain_
     if x.accelerated:
         _leave_room_to_brake(x, rows)
@@ -111,6 +117,18 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
     if moving:
         touch -= drift
     np.minimum(touch, least, out=touch)
+
+
+def _rates_of_eq10(x: Any, rows: Rows) -> Array:
+    """Rates J_d q̇ (k,) [m/s] that eq. 10 with the consistent bracket gives, for J_d N != 0 and without damping:
+    (1 - β)(1 - α) min(u, ẋ0) + β ẋ0, with u = J v0 + drift and α for u < 0 only.
+
+    As lower bounds they ask of pairs that part by themselves for no more than ẋ0.
+    """
+    u = np.dot(rows.J, x.v0) + rows.drift
+    share = beta(rows.d, x.d1, x.d2)
+    taken = np.where(u < 0.0, np.minimum(alpha(rows.d, x.d2), x.alpha_cap), 0.0)
+    return np.asarray((1.0 - share) * (1.0 - taken) * np.minimum(u, x.retreat_speed) + share * x.retreat_speed)
 
 
 def _leave_room_to_brake(x: Any, rows: Rows) -> None:
