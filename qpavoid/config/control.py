@@ -28,7 +28,7 @@ class TaskSwitching(Block):
     retreat_speed: NonNegative = 0.0
     """ẋ0 [m/s]; more than 0 asks pairs that cannot part, as of neighbouring links, for what no velocity gives."""
     alpha_cap: Positive = 50.0
-    """Largest α; eq. 11 grows without bound as d goes to 0 [-]."""
+    """Largest α; eq. 11 grows without bound as d goes to 0 [-]. At most 1 counts between two bodies of the robot."""
 
 
 class Damper(Block):

@@ -8,7 +8,7 @@ import numpy as np
 
 from qpavoid.kernels.compiled.bounds import _change_to_stop
 from qpavoid.kernels.compiled.packing import compiled
-from qpavoid.kernels.vectorised.pairs import BRAKING_SHARE, TINY
+from qpavoid.kernels.vectorised.pairs import BRAKING_SHARE, OWN_CAP, TINY
 from qpavoid.problem import Array, IntArray
 
 
@@ -73,17 +73,20 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
                 if x.jerked:
                     value = max(value, _room_for_jerk(x, i, value, 2.0 * braking, room))
         least = min(value, x.recovery) - x.drift[i]
-        if parting:
+        farther = x.task_switching and d > x.hold
+        if parting or farther:
             most = 0.0
             for c in range(len(x.lower)):
                 if x.J[i, c] > 0.0:
                     most += x.J[i, c] * x.upper[c]
                 elif x.J[i, c] < 0.0:
                     most += x.J[i, c] * x.lower[c]
-            if x.drift[i] < 0.0:
+            if farther:
+                most = max(most, x.row_gain * (x.hold - d) - x.drift[i])
+            elif x.drift[i] < 0.0:
                 most = max(most, -x.drift[i])
             least = min(least, most)
-        elif x.accelerated and x.drift[i] >= 0.0:
+        if x.accelerated and x.drift[i] >= 0.0 and not parting:
             stop = 0.0
             for c in range(len(x.lower)):
                 stop += x.J[i, c] * x.v_stop[c]
@@ -108,7 +111,8 @@ def _rate_of_eq10(x: Any, i: int, d: float) -> float:
     rate, beta = min(u, x.retreat_speed), _beta(x, d)
     if u < 0.0:
         ratio = max(x.d2 - d, 0.0) / max(d, TINY)
-        rate *= 1.0 - min(ratio * ratio, x.alpha_cap)
+        own = x.twist_row[x.near[i]] == len(x.margin) - 1
+        rate *= 1.0 - min(ratio * ratio, min(x.alpha_cap, OWN_CAP) if own else x.alpha_cap)
     return (1.0 - beta) * rate + beta * x.retreat_speed
 
 

@@ -14,6 +14,8 @@ from qpavoid.problem import Array, IntArray
 
 BRAKING_SHARE = 0.5
 """Share of the joints' accelerations on which a pair counts for braking; other pairs want some, too [-]."""
+OWN_CAP = 1.0
+"""Largest α of a pair of two bodies of the robot, which may be unable to part [-]."""
 TINY = 1e-300
 """Distance that α takes for none: no division by zero [m]."""
 
@@ -68,7 +70,8 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
 
     A row never asks for more than can be had: of a pair that may still close, and whose obstacle does not come nearer,
     no more than a stop gives, so that the stop meets all such rows at once; of one that has to part, no more speed of
-    parting than the bounds allow, and where they do not allow any yet, no harder braking.
+    parting than the bounds allow, and where they do not allow any yet, no harder braking. Task-switching rows, which
+    reach as far as d2, ask beyond what the bounds allow for no more than a damper would.
     """
     rows = x.rows(k)
     d, least, touch, share, drift = rows.d, rows.least, rows.touch, rows.share, rows.drift
@@ -107,11 +110,13 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
         least -= drift
     if x.accelerated:
         np.minimum(least, np.dot(rows.J, x.v_stop), out=least, where=~parting & (drift >= 0.0))
-    if some:
+    if some or x.task_switching:
+        farther = x.task_switching & (d > x.hold_)
         with np.errstate(invalid="ignore"):  # no lever times no limit
             most = np.nansum(np.fmax(rows.J * x.lower, rows.J * x.upper), axis=1)
-        np.maximum(most, -drift, out=most, where=drift < 0.0)
-        np.minimum(least, most, out=least, where=parting)
+        np.maximum(most, -drift, out=most, where=(drift < 0.0) & ~farther)
+        np.maximum(most, x.gain_ * (x.hold_ - d) - drift, out=most, where=farther)
+        np.minimum(least, most, out=least, where=parting | farther)
     np.subtract(x.offset_, d, out=touch)
     touch *= x.gain_
     if moving:
@@ -123,11 +128,14 @@ def _rates_of_eq10(x: Any, rows: Rows) -> Array:
     """Rates J_d q̇ (k,) [m/s] that eq. 10 with the consistent bracket gives, for J_d N != 0 and without damping:
     (1 - β)(1 - α) min(u, ẋ0) + β ẋ0, with u = J v0 + drift and α for u < 0 only.
 
-    As lower bounds they ask of pairs that part by themselves for no more than ẋ0.
+    As lower bounds they ask of pairs that part by themselves for no more than ẋ0. α > 1 asks a pair that closes in to
+    part: of two bodies of the robot, as of neighbouring links, the cap is 1, so that for ẋ0 = 0 rest meets all of them.
     """
     u = np.dot(rows.J, x.v0) + rows.drift
     share = beta(rows.d, x.d1, x.d2)
-    taken = np.where(u < 0.0, np.minimum(alpha(rows.d, x.d2), x.alpha_cap), 0.0)
+    own = x.twist_row[rows.near] == len(x.margin) - 1
+    cap = np.where(own, min(x.alpha_cap, OWN_CAP), x.alpha_cap)
+    taken = np.where(u < 0.0, np.minimum(alpha(rows.d, x.d2), cap), 0.0)
     return np.asarray((1.0 - share) * (1.0 - taken) * np.minimum(u, x.retreat_speed) + share * x.retreat_speed)
 
 
