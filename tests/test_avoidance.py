@@ -152,7 +152,7 @@ def test_offset_is_added_and_near_pairs_keep_their_order(panda):
     np.testing.assert_array_equal(proximity.drift, rate[near])
 
 
-@pytest.mark.parametrize("kind", ["beta", "damper", "cbf"])
+@pytest.mark.parametrize("kind", ["beta", "task-switching", "damper", "cbf"])
 def test_no_pair_gives_no_row(kind, panda):
     bench = Bench(build_scene(panda), avoidance=Avoidance(row={"type": kind}))
     rows = bench.compute(panda.home, reach=-1.0)[1].avoidance

@@ -22,7 +22,7 @@ def least_on_the_way(log, controller, steps=10):
     return min(ruler.least_between(q, v, dt, t, steps) for q, v, t in zip(log.q, log.v, log.t, strict=True))
 
 
-@pytest.mark.parametrize("row", ["beta", "damper"])
+@pytest.mark.parametrize("row", ["beta", "task-switching", "damper"])
 @pytest.mark.parametrize("shape", [PLATE, BALL, BOX], ids=["plate", "ball", "box"])
 @pytest.mark.parametrize(("dt", "duration"), [(0.001, 0.8), (0.01, 2.0), (0.02, 2.0), (0.05, 3.0)])
 def test_no_period_and_no_speed_pass_the_safe_distance(row, shape, dt, duration):

@@ -489,6 +489,9 @@ def test_half_of_the_accelerations_bring_a_pair_to_rest_where_it_has_to_be(kerne
     assert distances.min() >= x.hold - 1e-9 and distances[-1] == pytest.approx(x.hold, abs=1e-3)
 
 
+RATES_OF_EQ10 = {"beta": False, "task_switching": True, "v0": np.linspace(-1.0, 1.0, 7)}
+
+
 @pytest.mark.parametrize("pairs", [0, 1, 100])
 def test_row_bounds_of_both_versions(pairs):
     for seed in SEEDS:
@@ -496,6 +499,8 @@ def test_row_bounds_of_both_versions(pairs):
             {}, {"beta": False, "recovery": np.inf}, {"beta": False, "hold": 0.2}, NO_LIMIT,
             {"margin": np.zeros(4)}, jerk(seed), jerk(seed, all_of_them=True),
             {"beta": False, "row_gain": 100.0, **jerk(seed, all_of_them=True)},
+            RATES_OF_EQ10, {**RATES_OF_EQ10, **NO_LIMIT, "retreat_speed": 0.1},
+            RATES_OF_EQ10 | jerk(seed, all_of_them=True),
         ):  # fmt: skip
 
             def make(seed=seed, fields=fields):

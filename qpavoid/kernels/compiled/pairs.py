@@ -56,11 +56,11 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
     for i in range(k):
         d = x.closest[i, 0] + x.offset - x.margin[x.twist_row[x.near[i]]]
         value = x.row_gain * (x.hold - d)
-        if x.beta and not value > 0.0:
+        parting = value > 0.0
+        if x.beta and not parting:
             value *= 1.0 - _beta(x, d)
         elif x.task_switching:
-            value = max(_rate_of_eq10(x, i, d), value if value > 0.0 else (x.hold - d) / x.dt)
-        parting = value > 0.0
+            value = max(_rate_of_eq10(x, i, d), value if parting else (x.hold - d) / x.dt)
         if x.accelerated and value < 0.0:
             braking = 0.0
             for c in range(len(x.v_step)):
@@ -73,7 +73,7 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
                 if x.jerked:
                     value = max(value, _room_for_jerk(x, i, value, 2.0 * braking, room))
         least = min(value, x.recovery) - x.drift[i]
-        farther = x.task_switching and d > x.hold
+        farther = x.task_switching and not parting
         if parting or farther:
             most = 0.0
             for c in range(len(x.lower)):

@@ -79,12 +79,11 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
     if moving:
         d -= x.margin[x.twist_row[rows.near]]
     np.subtract(x.hold_, d, out=least)
-    if x.task_switching:
-        rates = _rates_of_eq10(x, rows)
-        np.maximum(rates, np.where(least > x.zero, least * x.gain_, least / x.dt), out=least)
     parting = least > x.zero
     some = np.count_nonzero(parting) > 0
-    if x.beta:
+    if x.task_switching:
+        np.maximum(_rates_of_eq10(x, rows), np.where(parting, least * x.gain_, least / x.dt), out=least)
+    elif x.beta:
         np.subtract(d, x.d1_, out=share)
         share *= x.blend
         if some:
@@ -100,18 +99,18 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
             least *= x.gain_
         else:
             np.multiply(share, x.gain_, out=least)
-    elif not x.task_switching:
+    else:
         least *= x.gain_
     if x.accelerated:
         _leave_room_to_brake(x, rows)
-    if some or x.jerked:
+    if some or x.jerked or x.task_switching:
         np.minimum(least, x.recovery_, out=least)
     if moving:
         least -= drift
     if x.accelerated:
         np.minimum(least, np.dot(rows.J, x.v_stop), out=least, where=~parting & (drift >= 0.0))
     if some or x.task_switching:
-        farther = x.task_switching & (d > x.hold_)
+        farther = x.task_switching & ~parting
         with np.errstate(invalid="ignore"):  # no lever times no limit
             most = np.nansum(np.fmax(rows.J * x.lower, rows.J * x.upper), axis=1)
         np.maximum(most, -drift, out=most, where=(drift < 0.0) & ~farther)
