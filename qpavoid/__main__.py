@@ -28,7 +28,7 @@ from qpavoid.files.loading import load_scenario
 from qpavoid.files.shipped import robot_names, scenario_names
 from qpavoid.kernels import ACCELERATED
 from qpavoid.log import Log
-from qpavoid.report import events, failed, metrics_table, to_json
+from qpavoid.report import events, failed, metrics_table, ratios_table, to_json
 from qpavoid.simulate import simulate
 from qpavoid.solvers import SOLVERS, backend_names
 from qpavoid.terminal import ERR, OUT, names_of, progress, terminate_like_interrupt
@@ -104,7 +104,7 @@ def compare(
     json: Json = False,
     figures: Figures = True,
 ) -> None:
-    """Run scenarios with several solvers, side by side.
+    """Run scenarios with several solvers, side by side; the last but one is set against the last, as ratios.
 
     A collision is a result here, not a failure: the exit status is 1 only when a run was broken off.
     """
@@ -115,6 +115,8 @@ def compare(
         files += _draw(logs, out, compare=True)
     metrics = [log.metrics() for log in logs]
     _print(metrics, files, {"runs": metrics, "files": [str(f) for f in files]} if json else None)
+    if len(names) > 1 and not json:
+        OUT.print(ratios_table(metrics, names[-2], names[-1]))
     raise typer.Exit(0 if all(run["completed"] for run in metrics) and len(logs) == len(configs) else 1)
 
 

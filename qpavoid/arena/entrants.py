@@ -117,6 +117,7 @@ ENTRANTS = {
         law("gradient-projection", "tracking, clearance climbed in its null space", "gradient-projection"),
         law("potential-field", "tracking pulls, near pairs push: FIRAS at velocity level", "potential-field"),
         law("qp", "QP with beta rows, default back end, no backup trajectory", "qp", avoidance=_row("beta")),
+        law("qp-task-switching", "QP with the gains of eq. 10 in its rows", "qp", avoidance=_row("task-switching")),
         law("qp-damper", "QP with velocity damper rows", "qp", avoidance=_row("damper")),
         law("qp-cbf", "QP with control barrier rows", "qp", avoidance=_row("cbf")),
         law(
