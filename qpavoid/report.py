@@ -50,15 +50,18 @@ def metrics_table(runs: Sequence[dict[str, Any]]) -> Table:
 
 
 _RATIOS = (
-    ("min dist\n[mm]", "min_distance", 1e3, ".1f"), ("rms\n[mm]", "tracking_rmse", 1e3, ".0f"),
-    ("dev\n[mm]", "max_deviation", 1e3, ".0f"), ("peak q̇\n[rad/s]", "peak_velocity", 1.0, ".2f"),
-    ("Σ|Δq̇|\n[rad/s]", "jitter", 1.0, ".0f"),
+    ("min dist\n[mm]", "min_distance", 1e3, ".1f"), ("in coll\n[s]", "time_in_collision", 1.0, ".2f"),
+    ("rms err\n[mm]", "tracking_rmse", 1e3, ".1f"), ("end err\n[mm]", "final_error", 1e3, ".2f"),
+    ("dev\n[mm]", "max_deviation", 1e3, ".1f"), ("peak q̇\n[rad/s]", "peak_velocity", 1.0, ".2f"),
+    ("Σ|Δq̇|\n[rad/s]", "jitter", 1.0, ".1f"),
 )  # fmt: skip
 """Heading, name, unit and format of the figures that are set against each other."""
+_NOTHING = 0.05
+"""Figures no larger than this, in their unit, have no ratio."""
 
 
 def ratios_table(runs: Sequence[dict[str, Any]], over: str, under: str) -> Table:
-    """Figures of one solver over those of another, scenario by scenario, with their ratios; fits 80 columns.
+    """Figures of two solvers, scenario by scenario, and those of the first over those of the second.
 
     Args:
         runs: results of `Log.metrics` of all scenarios.
@@ -66,29 +69,35 @@ def ratios_table(runs: Sequence[dict[str, Any]], over: str, under: str) -> Table
         under: the other one.
     """
     table = Table(
-        title=f"[bold]{escape(over)} / {escape(under)}[/], and ratios (rms: of the distance to the target)",
-        title_justify="left", title_style="", box=box.SIMPLE_HEAD, pad_edge=False, padding=0,
+        title=f"[bold]{escape(over)} / {escape(under)}[/]", title_justify="left", title_style="",
+        box=box.SIMPLE_HEAD, pad_edge=False, padding=0,
     )  # fmt: skip
     table.add_column("scenario", no_wrap=True)
-    for heading in (*(heading for heading, *_ in _RATIOS), "in coll\n[s]"):
+    table.add_column("", no_wrap=True)
+    for heading, *_ in _RATIOS:
         table.add_column(escape(heading), justify="right", no_wrap=True)
-    table.add_column("arrived", justify="right", no_wrap=True)
     found = {(run["scenario"], run["solver"]): run for run in runs}
     for scenario in dict.fromkeys(run["scenario"] for run in runs):
-        if (scenario, over) in found and (scenario, under) in found:
-            a, b = found[scenario, over], found[scenario, under]
-            cells = [_ratio(a[name], b[name], unit, form) for _, name, unit, form in _RATIOS]
-            hit = " / ".join(f"{run['time_in_collision']:.2f}".replace("0.00", "0") for run in (a, b))
-            table.add_row(scenario, *cells, hit, " / ".join("yes" if run["arrived"] else "no" for run in (a, b)))
+        if (scenario, over) not in found or (scenario, under) not in found:
+            continue
+        values = [
+            [None if run[name] is None else unit * run[name] for _, name, unit, _ in _RATIOS]
+            for run in (found[scenario, over], found[scenario, under])
+        ]
+        for first, solver, figures in zip((scenario, ""), (over, under), values, strict=True):
+            cells = (
+                "-" if value is None else f"{value:{form}}" for value, (*_, form) in zip(figures, _RATIOS, strict=True)
+            )
+            table.add_row(first, solver, *cells)
+        table.add_row(
+            "", "ratio", *(f"[bold]{_ratio(a, b)}[/]" for a, b in zip(*values, strict=True)), end_section=True
+        )
     return table
 
 
-def _ratio(a: float | None, b: float | None, unit: float, form: str) -> str:
-    """`a / b` and their ratio below; one of figures that are not both positive says nothing."""
-    if a is None or b is None:
-        return "-"
-    said = f"{unit * a:{form}} / {unit * b:{form}}"
-    return f"{said}\n[bold]{a / b:.2f}[/]" if a > 0.0 and b > 1e-6 else said
+def _ratio(a: float | None, b: float | None) -> str:
+    """a / b; nothing where one of them is none to speak of, or a depth of penetration."""
+    return f"{a / b:.2f}" if a is not None and b is not None and min(a, b) > _NOTHING else ""
 
 
 def outcome(run: dict[str, Any]) -> str:
