@@ -121,7 +121,9 @@ class Commander:
         try:
             if proximity is not None:
                 problem = self.progress.redirect(problem, proximity, self._assembly, self.solver)
-                if problem.jerked and not (problem.levels and isinstance(self.solver, Hqp)):  # v0 is not a cascade's
+                if problem.levels and isinstance(self.solver, Hqp):  # v0 is not a cascade's
+                    problem = self._assembly.prioritised(problem, self.solver.tracked)
+                elif problem.jerked:
                     problem = self._assembly.eased(problem)
             solution = self.solver.solve(problem)
             v = solution.v
