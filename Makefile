@@ -1,9 +1,6 @@
 # `make run` and `make test` set up everything they need in .venv; PYTHON=python3.12 picks another interpreter.
 PYTHON ?= python3
 BIN := .venv/bin
-# what runs a second time without numba: the tick and everything that it is made of
-TICK_TESTS := $(addprefix tests/test_,$(addsuffix .py,avoidance backends controller escape examples faults filter \
-  giving_way grasp limits outcome penetration point_cloud proximity shapes situations solvers tasks))
 
 .PHONY: run figures test smoke lint types clean
 
@@ -15,7 +12,6 @@ figures: run
 
 test: .venv/dev
 	$(BIN)/pytest -n auto
-	QPAVOID_NUMBA=0 $(BIN)/pytest -n auto $(TICK_TESTS)
 
 smoke: .venv/dev
 	$(BIN)/qpavoid bench smoke

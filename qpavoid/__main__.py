@@ -27,7 +27,6 @@ from qpavoid.errors import ConfigError, QpavoidError
 from qpavoid.files.fields import page, schema_of
 from qpavoid.files.loading import load_scenario
 from qpavoid.files.shipped import robot_names, scenario_names
-from qpavoid.kernels import ACCELERATED
 from qpavoid.log import Log
 from qpavoid.report import events, failed, metrics_table, to_json
 from qpavoid.simulate import simulate
@@ -81,7 +80,7 @@ def list_(kind: Annotated[Kind | None, typer.Argument(help="Only these.")] = Non
     names = {
         Kind.robots: robot_names(),
         Kind.scenarios: scenario_names(),
-        Kind.solvers: [*SOLVERS, *["qp:native"] * ACCELERATED, *(f"qp:{name}" for name in backend_names())],
+        Kind.solvers: [*SOLVERS, "qp:native", *(f"qp:{name}" for name in backend_names())],
     }
     if kind is not None:
         for name in names[kind]:

@@ -11,7 +11,6 @@ from qpavoid import kernels
 from qpavoid.config import Avoidance, Limits
 from qpavoid.contacts import ContactRows, tracking_within
 from qpavoid.kernels.layout import RowLayout
-from qpavoid.kernels.vectorised.stops import easing_stop
 from qpavoid.kinematics import ForwardKinematics, Kinematics, support_masks
 from qpavoid.limits import JointBounds
 from qpavoid.motion import Sample
@@ -51,7 +50,7 @@ class _StopAhead:
         self._way = np.zeros((_MOST_TICKS, len(layout.v_last)))
 
     def way(self, q: Array, v: Array, w: Array) -> Array:
-        """See `kernels.vectorised.stops.stop_way`; a view of memory that the next call overwrites."""
+        """See `kernels.stop_way`; a view of memory that the next call overwrites."""
         self._way[0] = v
         return self._way[: kernels.stop_way(self._packed, q, w, self._way)]
 
@@ -138,7 +137,7 @@ class Assembly:
     def closest_call(self, v: Array, near: int, reach: float, horizon: float, stop: Stop | None = None) -> float:
         """A bound below what is left of the safe distances on the way of v until `horizon` [m].
 
-        See `kernels.vectorised.ahead.closest_call`.
+        See `kernels.closest_call`.
 
         Args:
             v: velocity (nv,).
@@ -153,7 +152,7 @@ class Assembly:
         return left - 2.0 * float(stop.aside.sum()) - (self._bend(stop.ways) - self._bend(horizon * np.abs(v)))
 
     def bends(self, q: Array, v: Array, horizon: float) -> bool:
-        """Whether a joint has to brake harder than the others for its position limit: see `kernels…ahead.bends`.
+        """Whether a joint has to brake harder than the others for its position limit: see `kernels.bends`.
 
         Args:
             q: configuration (nq,).
@@ -210,7 +209,7 @@ class Assembly:
         x, rows, v0 = self._layout, problem.avoidance, problem.v0
         if v0[0] != v0[0]:
             return problem
-        eased = v0 + easing_stop(x, x.v_last - v0, x.w_last)
+        eased = v0 + kernels.easing_stop(x.v_last - v0, x.w_last, x.v_step, x.w_step)
         if problem.contacts is not None:
             eased = problem.contacts.held(eased)
         tracking = problem.tracking._replace(b=problem.tracking.b + problem.tracking.A @ (eased - v0))

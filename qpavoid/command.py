@@ -16,7 +16,7 @@ from qpavoid.ahead.progress import ProgressWatch
 from qpavoid.assembly import Assembly
 from qpavoid.config import Avoidance, Limits, Progress
 from qpavoid.errors import NumericalError
-from qpavoid.kernels.vectorised.ahead import TOLERANCE
+from qpavoid.kernels import TOLERANCE
 from qpavoid.limits import JointBounds, saturate
 from qpavoid.obstacles.sensing import Obstacles
 from qpavoid.problem import Array, Problem, Proximity, Solution, Status, sane

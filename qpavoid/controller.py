@@ -141,10 +141,11 @@ class Controller:
         hold = self.avoidance.hold - self.avoidance.offset
         self._grasps = Grasps(scene, (self._query, *self._commander.queries), self._assembly, hold)
         self._warm_up()
+        kernels.first_use.end()
         self.warm_up_time = perf_counter() - begin
         """Time that it took to lay out the memory and run the first ticks, compilation included [s]; no later tick
         waits for the compiler."""
-        _log.info("warmed up in %.3f s, compiled kernels: %s", self.warm_up_time, kernels.ACCELERATED)
+        _log.info("warmed up in %.3f s", self.warm_up_time)
 
     @property
     def solver(self) -> Solver:

@@ -9,10 +9,11 @@ import pinocchio as pin
 import pytest
 from hypothesis import settings
 
-from qpavoid import Obstacle, Robot, Sample, build_scene, config
+from qpavoid import Controller, Obstacle, Robot, Sample, build_scene, config, load_scenario
 from qpavoid.__main__ import main
 from qpavoid.assembly import Assembly
 from qpavoid.files.shipped import example_robot_data
+from qpavoid.kernels.cache import FOLDER
 from qpavoid.kernels.layout import RowLayout
 from qpavoid.kinematics import ForwardKinematics
 from qpavoid.motion import build_motion
@@ -37,6 +38,13 @@ def cache_of_the_tests(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("QPAVOID_CACHE", str(shared / "qpavoid-cache"))
         yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def compiled_kernels(cache_of_the_tests):
+    """All kernels of a controller are on disk before any test: none finds on stderr that they are compiled."""
+    if not (FOLDER / "complete").exists():
+        Controller.from_scenario(load_scenario("situation1"))
 
 
 class Result:

@@ -15,6 +15,7 @@ from qpavoid.motion import build_motion
 from qpavoid.obstacles.courses import move_on
 from qpavoid.obstacles.sensing import Obstacles
 from qpavoid.obstacles.told import strayed
+from qpavoid.solvers.backends import solve_daqp
 
 DT = 0.01
 GAP = 0.5
@@ -144,17 +145,18 @@ def test_the_farthest_velocity_is_that_of_a_linear_program():
         assert v is not None and (A @ v + d).min() == pytest.approx(best.x[-1], abs=1e-4)
 
 
-def test_both_solvers_of_flights_agree(monkeypatch):
-    if not kernels.ACCELERATED:
-        pytest.skip("there is only one without numba")
+def test_farthest_is_the_minimum_that_daqp_finds():
+    """max s - ½ s²/c - ε/2c ‖v - v̂‖²  s.t.  d + h (J v + ḋ) >= s,  lower <= v <= upper, as one QP in (v, s)."""
     rng = np.random.default_rng(1)
     for _ in range(20):
-        near = Near(rng.uniform(0.0, 0.1, (5, 10)), rng.normal(size=(5, 3)), 0.1 * rng.normal(size=5))
-        arguments = near, Manner(0.2, rng.normal(size=3)), 0.1, -np.ones(3), np.ones(3)
-        fast = _farthest(*arguments)
-        with monkeypatch.context() as patch:
-            patch.setattr(kernels, "ACCELERATED", False)
-            assert _farthest(*arguments) == pytest.approx(fast, abs=1e-6)
+        closest, J, drift = rng.uniform(0.0, 0.1, (5, 10)), rng.normal(size=(5, 3)), 0.1 * rng.normal(size=5)
+        h, comfort, gentle, leaning = 0.2, 0.1, 1e-4, rng.normal(size=3)
+        v, met = kernels.farthest(h, closest, J, drift, comfort, 10.0, gentle, leaning, -np.ones(3), np.ones(3))
+        P = np.diag([gentle, gentle, gentle, 1.0])
+        G, least = np.column_stack((h * J, -np.ones(5))), -(closest[:, 0] + h * drift)
+        bounds = np.array([-1.0, -1.0, -1.0, -10.0]), np.array([1.0, 1.0, 1.0, comfort])
+        expected = solve_daqp(P, -P @ np.append(leaning, comfort), G, least, *bounds)
+        assert met and v == pytest.approx(expected[:3], abs=1e-6)
 
 
 def test_that_flights_do_not_hold_contacts_is_said_where_something_moves():

@@ -10,7 +10,6 @@ from qpavoid import Problem, ReasonKind, Severity, Status, UnknownName, make_sol
 from qpavoid.config import Eq10Solver
 from qpavoid.errors import SolverNotInstalled
 from qpavoid.gains import alpha, beta
-from qpavoid.kernels import ACCELERATED
 from qpavoid.problem import AvoidanceRows, Tracking, make_problem
 from qpavoid.solvers import qp
 from qpavoid.solvers.analytic import tracking_velocity
@@ -18,8 +17,7 @@ from qpavoid.solvers.backends import make_backend
 
 NV, D1, D2 = 7, 0.18, 0.36
 seeds = st.integers(0, 2**32 - 1)
-COMPILED = ("native",) if ACCELERATED else ()
-EXACT = ("daqp", "quadprog", *COMPILED)
+EXACT = ("daqp", "quadprog", "native")
 BACKENDS = (*EXACT, "proxqp", "osqp")
 
 

@@ -8,7 +8,7 @@ bends less; and that is drawn back towards the stop of this tick, whose way was 
 stop that was found clear is always at hand, as long as obstacles do what they were last seen to do, for one tick.
 
 Most ticks need none of this: where no body moves fast enough, or not in the direction, to use up what is left of a
-distance before the robot could stop, the velocity is clear as it is (`kernels.vectorised.ahead.closest_call`, with the
+distance before the robot could stop, the velocity is clear as it is (`kernels.closest_call`, with the
 bound and its proof).
 """
 
@@ -23,8 +23,7 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid.assembly import Assembly
-from qpavoid.kernels.vectorised.ahead import TOLERANCE
-from qpavoid.kernels.vectorised.bounds import speed_to_stop
+from qpavoid.kernels import TOLERANCE, speed_to_stop
 from qpavoid.limits import JointBounds
 from qpavoid.obstacles.courses import move_on
 from qpavoid.problem import Array, IntArray, Problem, Solution

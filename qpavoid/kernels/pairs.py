@@ -1,4 +1,4 @@
-"""`kernels.vectorised.pairs` as loops that numba compiles; documented there."""
+"""Rows of the pairs that are near, and how fast they may close."""
 
 from __future__ import annotations
 
@@ -6,15 +6,17 @@ from typing import Any
 
 import numpy as np
 
-from qpavoid.kernels.compiled.bounds import _change_to_stop
-from qpavoid.kernels.compiled.packing import compiled
-from qpavoid.kernels.vectorised.pairs import BRAKING_SHARE
+from qpavoid.kernels.bounds import _change_to_stop
+from qpavoid.kernels.packing import compiled
 from qpavoid.problem import Array, IntArray
+
+BRAKING_SHARE = 0.5
+"""Share of the joints' accelerations on which a pair counts for braking; other pairs want some, too [-]."""
 
 
 @compiled
 def _fold(row: Array, columns: IntArray, folded: Array) -> None:
-    """Adds up the columns (e,) of a Jacobian's row that one coordinate moves (n,)."""
+    """Add up the columns (e,) of a Jacobian's row that one coordinate moves (n,)."""
     folded[:] = 0.0
     for c in range(len(row)):
         folded[columns[c]] += row[c]
@@ -22,7 +24,20 @@ def _fold(row: Array, columns: IntArray, folded: Array) -> None:
 
 @compiled
 def distance_rows(x: Any, pairs: IntArray, reach: float, moving: bool) -> int:
-    """See `vectorised.pairs.distance_rows`."""
+    """Write the closest points and rates of the pairs that are nearer than `reach`, or whose distance is NaN.
+
+    The normal n is parallel to the line between the witness points, so p × n is the same at both, and every row is
+    J = [n, p × n]ᵀ J_world, times the difference of the supports of the two bodies.
+
+    Args:
+        x: reads results, J_world, support, twists, twist_row; writes near, closest, J, drift.
+        pairs: which pairs to consider (c,), increasing.
+        reach: distance below which a pair is near [m].
+        moving: whether any of the twists is not zero.
+
+    Returns:
+        Number of near pairs.
+    """
     results, closest, J, support = x.results, x.closest, x.J, x.support
     J_world = np.ascontiguousarray(x.J_world)  # rows in one piece become vector instructions
     columns = J_world.shape[1]
@@ -52,7 +67,20 @@ def distance_rows(x: Any, pairs: IntArray, reach: float, moving: bool) -> int:
 
 @compiled
 def row_bounds(x: Any, k: int, moving: bool) -> None:
-    """See `vectorised.pairs.row_bounds`."""
+    """Write the right-hand sides of the first k avoidance rows: d, least and touch; see `qpavoid.avoidance`.
+
+    With acceleration limits, a pair closes no faster than the speed from which a share of its joints' accelerations,
+    all at work on it, brings it to rest in what is left: ½ a dt - √((½ a dt)² + 2 a h).
+
+    A row never asks for more than can be had: of a pair that may still close, and whose obstacle does not come nearer,
+    no more than a stop gives, so that the stop meets all such rows at once; of one that has to part, no more speed of
+    parting than the bounds allow, and where they do not allow any yet, no harder braking.
+
+    Args:
+        x: reads what `distance_rows`, `velocity_bounds` and `stop_velocity` wrote; writes d, least, touch.
+        k: number of near pairs.
+        moving: whether any obstacle moves or has a margin.
+    """
     for i in range(k):
         d = x.closest[i, 0] + x.offset - x.margin[x.twist_row[x.near[i]]]
         value = x.row_gain * (x.hold - d)
@@ -94,7 +122,20 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
 
 @compiled
 def _room_for_jerk(x: Any, i: int, value: float, step: float, room: float) -> float:
-    """See `vectorised.pairs._room_for_jerk`."""
+    """Compute the bound of closing pair i from which a share of its joints' jerks, too, brings it to rest in time.
+
+    It counts from the change of speed that has led to the speed of closing; see `kernels.stopping`.
+
+    Args:
+        x: reads J, drift, v_last, w_last, w_step.
+        i: number of the near pair.
+        value: its bound so far [m/s]; all jerks at work on a pair change the change of its speed no more than this.
+        step: change of the speed of closing that a share of the joints' accelerations makes in a tick [m/s].
+        room: distance left over the length of a tick [m/s].
+
+    Returns:
+        Bound [m/s]; -∞ where the jerks of its joints have no limit.
+    """
     speed, change, unit = -x.drift[i], 0.0, 0.0
     for c in range(len(x.v_last)):
         if x.J[i, c] != 0.0:
