@@ -221,7 +221,8 @@ def _print(metrics: list[dict[str, Any]], files: list[Path], out: Path, verbose:
     logs = sum(file.suffix == ".npz" for file in files)
     kinds = (logs, "log"), (len(files) - logs, "figure")
     counts = [f"{count} {kind}{'s' * (count > 1)}" for count, kind in kinds if count]
-    OUT.print(f"{' and '.join(counts)} in {out}{'' if verbose else ' (--verbose lists them)'}", highlight=False, soft_wrap=True)
+    remedy = "" if verbose else " (--verbose lists them)"
+    OUT.print(f"{' and '.join(counts)} in {out}{remedy}", highlight=False, soft_wrap=True)
     for file in files if verbose else ():
         OUT.print(str(file), highlight=False, soft_wrap=True)
 
