@@ -221,9 +221,10 @@ def _print(metrics: list[dict[str, Any]], files: list[Path], out: Path, verbose:
             for line in events(run):
                 OUT.print(f"{run['solver']}: {line}", highlight=False, soft_wrap=True, markup=False)
     logs = sum(file.suffix == ".npz" for file in files)
-    counts = [f"{count} {what}{'s' * (count > 1)}" for count, what in ((logs, "log"), (len(files) - logs, "figure"))]
-    told = " and ".join(count for count in counts if count[0] != "0")
-    OUT.print(f"{told} in {out}{'' if verbose else ' (--verbose lists them)'}", highlight=False, soft_wrap=True)
+    kinds = (logs, "log"), (len(files) - logs, "figure")
+    counts = [f"{count} {kind}{'s' * (count > 1)}" for count, kind in kinds if count]
+    remedy = "" if verbose else " (--verbose lists them)"
+    OUT.print(f"{' and '.join(counts)} in {out}{remedy}", highlight=False, soft_wrap=True)
     for file in files if verbose else ():
         OUT.print(str(file), highlight=False, soft_wrap=True)
 

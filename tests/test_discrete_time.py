@@ -205,10 +205,11 @@ def test_nothing_is_first_seen_inside_its_margin(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("linear", "angular"), [([-4.0, 0.0, 0.0], [0.0, 0.0, 0.0]), ([0.0, 0.0, 0.0], [0.0, 0.0, 4.0])]
+    ("linear", "angular"),
+    [([-4.0, 0.0, 0.0], [0.0, 0.0, 0.0]), ([-2.8, 0.0, 0.0], [0.0, 0.0, 0.0]), ([0.0, 0.0, 0.0], [0.0, 0.0, 4.0])],
 )
 def test_the_look_ahead_moves_obstacles_on(tmp_path, linear, angular):
-    """No row sees it at 150 mm; at the end of the tick it is 200 mm nearer, or has turned on the robot."""
+    """No row sees it at 150 mm; at the end of the tick it is 200 or 140 mm nearer, or has turned on the robot."""
     robot = cartesian(tmp_path, acceleration=None)
     bar = Obstacle.at("bar", Box(size=(0.02, 2.0, 0.02)), [9.0, 0.0, 0.0])
     avoidance = Avoidance(d1=0.02, d2=0.10, escape=None)  # a way out would be sought as well
@@ -219,7 +220,7 @@ def test_the_look_ahead_moves_obstacles_on(tmp_path, linear, angular):
     assert not len(tick.proximity.pair) and tick.problem.shortfall <= 0.0
     turned_on = moved(seen["bar"], 0.05)
     short = HELD - Ruler(controller.scene).distances(np.zeros(3), {0: turned_on}).min()
-    assert short > 0.02 and tick.solution.status is Status.RELAXED
+    assert short > 5e-3 and tick.solution.status is Status.RELAXED
     (reason,) = tick.solution.reasons
     assert (reason.kind, reason.subject, reason.unit) == (ReasonKind.PREDICTED_TOO_NEAR, ("tool", "bar"), "m")
     assert reason.amount == pytest.approx(short - TOLERANCE, abs=1e-6)

@@ -8,9 +8,10 @@ from qpavoid.problem import Array, Problem
 from qpavoid.reason import Reason, ReasonKind, Severity
 from qpavoid.solvers.relaxation import TOLERANCE, Relaxed
 
+_USED = 5.0 * TOLERANCE
+"""Violation of a row [m/s] or bound [rad/s or m/s] that counts: tolerances of the relaxation add up to 4e-6."""
 _CONTACT = 1e-5
-"""Violation of a row with no margin from which contact is predicted; tolerances of the relaxation add up to 4e-6
-[m/s]."""
+"""Violation of a row with no margin from which contact is predicted [m/s]."""
 
 
 def relaxation_reasons(relaxed: Relaxed, problem: Problem) -> tuple[Reason, ...]:
@@ -25,7 +26,7 @@ def relaxation_reasons(relaxed: Relaxed, problem: Problem) -> tuple[Reason, ...]
     """
     slack, excess = relaxed.slack, relaxed.excess
     rows, names, units = problem.avoidance, problem.joint_names, problem.joint_units
-    violated = np.flatnonzero(slack > 2.0 * TOLERANCE)
+    violated = np.flatnonzero(slack > _USED)
     violated = violated[np.argsort(rows.d[violated], kind="stable")]
     found = []
     for i in violated.tolist():
@@ -41,7 +42,7 @@ def relaxation_reasons(relaxed: Relaxed, problem: Problem) -> tuple[Reason, ...]
     kind = ReasonKind.JERK_RELAXED if problem.jerked else ReasonKind.ACCELERATION_RELAXED
     passed = [
         Reason.of(kind, names[j], amount=float(excess[j]), unit=f"{units[j]}/s")
-        for j in np.flatnonzero(excess > 2.0 * TOLERANCE).tolist()
+        for j in np.flatnonzero(excess > _USED).tolist()
     ]
     worst = max([reason.severity for reason in found], default=Severity.INFO)
     return (*found, *passed, *_limiting_joints(rows.J[violated], relaxed.v, problem, worst))
