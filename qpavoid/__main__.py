@@ -9,6 +9,7 @@ import sys
 import warnings
 from enum import Enum
 from functools import partial
+from importlib.metadata import version
 from json import dumps
 from pathlib import Path
 from textwrap import wrap
@@ -47,6 +48,7 @@ Sets = Annotated[
 Out = Annotated[Path, typer.Option(help="Folder for logs and figures.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else on stdout.")]
 Figures = Annotated[bool, typer.Option("--figures/--no-figures", help="Draw the figures.")]
+Verbose = Annotated[bool, typer.Option("--verbose", help="List the files that were written.")]
 
 
 class Kind(str, Enum):
@@ -55,6 +57,21 @@ class Kind(str, Enum):
     robots = "robots"
     scenarios = "scenarios"
     solvers = "solvers"
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        print(f"qpavoid {version('qpavoid')}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version_: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Take options that stand before any command."""
 
 
 @app.command("list")
@@ -84,13 +101,17 @@ def run(
     out: Out = Path("out"),
     json: Json = False,
     figures: Figures = True,
+    verbose: Verbose = False,
 ) -> None:
     """Run one scenario; write its log and figures."""
     logs, files = _run_all([load_scenario(scenario, set_ or (), solver)], out)
     if figures:
         files += _draw(logs, out, compare=False)
     metrics = [log.metrics() for log in logs]
-    _print(metrics, files, {**metrics[0], "files": [str(f) for f in files]} if json else None)
+    if json:
+        print(to_json({**metrics[0], "files": [str(f) for f in files]}))
+    else:
+        _print(metrics, files, out, verbose)
     raise typer.Exit(1 if failed(metrics[0]) else 0)
 
 
@@ -102,6 +123,7 @@ def compare(
     out: Out = Path("out"),
     json: Json = False,
     figures: Figures = True,
+    verbose: Verbose = False,
 ) -> None:
     """Run scenarios with several solvers, side by side.
 
@@ -113,7 +135,10 @@ def compare(
     if figures:
         files += _draw(logs, out, compare=True)
     metrics = [log.metrics() for log in logs]
-    _print(metrics, files, {"runs": metrics, "files": [str(f) for f in files]} if json else None)
+    if json:
+        print(to_json({"runs": metrics, "files": [str(f) for f in files]}))
+    else:
+        _print(metrics, files, out, verbose)
     raise typer.Exit(0 if all(run["completed"] for run in metrics) and len(logs) == len(configs) else 1)
 
 
@@ -186,17 +211,18 @@ def _draw(logs: list[Log], out: Path, compare: bool) -> list[Path]:
     return files
 
 
-def _print(metrics: list[dict[str, Any]], files: list[Path], document: dict[str, Any] | None) -> None:
-    if document is not None:
-        print(to_json(document))
-        return
+def _print(metrics: list[dict[str, Any]], files: list[Path], out: Path, verbose: bool) -> None:
     for scenario in dict.fromkeys(run["scenario"] for run in metrics):
         runs = [run for run in metrics if run["scenario"] == scenario]
-        OUT.print(metrics_table(runs))
+        OUT.print(metrics_table(runs, OUT.width))
         for run in runs:
             for line in events(run):
                 OUT.print(f"{run['solver']}: {line}", highlight=False, soft_wrap=True, markup=False)
-    for file in files:
+    logs = sum(file.suffix == ".npz" for file in files)
+    counts = [f"{count} {what}{'s' * (count > 1)}" for count, what in ((logs, "log"), (len(files) - logs, "figure"))]
+    told = " and ".join(count for count in counts if count[0] != "0")
+    OUT.print(f"{told} in {out}{'' if verbose else ' (--verbose lists them)'}", highlight=False, soft_wrap=True)
+    for file in files if verbose else ():
         OUT.print(str(file), highlight=False, soft_wrap=True)
 
 

@@ -21,7 +21,7 @@ from qpavoid.limits import JointBounds, saturate
 from qpavoid.obstacles.sensing import Obstacles
 from qpavoid.problem import Array, Problem, Proximity, Solution, Status, sane
 from qpavoid.proximity import DistanceQuery
-from qpavoid.reason import Reason, ReasonKind
+from qpavoid.reason import Reason, ReasonKind, Severity
 from qpavoid.scene import Scene
 from qpavoid.solvers import Solver
 from qpavoid.solvers.hqp import Hqp
@@ -131,7 +131,7 @@ class Commander:
             return _stop(problem, (raised,))
         if not usable:
             failed = Reason.of(ReasonKind.SOLVER_FAILED, detail="no finite velocity of the right shape")
-            return _stop(problem, solution.reasons or (failed,))
+            return _stop(problem, (*solution.reasons, failed))
         if not self.solver.bounded:
             if self._limits.saturate:
                 v, change = saturate(v, problem.lower, problem.upper, self._bounds.velocity)
@@ -153,13 +153,14 @@ class Commander:
         checked = self.guard.check(q, solution, problem, gentle, self._assembly, self._query, self._reach)
         if checked is None:
             return solution
-        v, share, short, pair = checked
+        v, share, short, pair, distance = checked
         if short <= TOLERANCE:
             return solution._replace(v=v, share=share)
         names = self._scene.pair_names[pair]
         if short != short:
             return _stop(problem, (*solution.reasons, Reason.of(ReasonKind.UNKNOWN_DISTANCE, *names)))
-        missing = Reason.of(ReasonKind.PREDICTED_TOO_NEAR, *names, amount=short, unit="m")
+        severity = Severity.ALARM if distance < 0.0 else Severity.WARNING
+        missing = Reason.of(ReasonKind.PREDICTED_TOO_NEAR, *names, amount=short, unit="m", severity=severity)
         return solution._replace(v=v, share=share).relaxed(missing)
 
     def _with_a_way_out(
@@ -168,7 +169,8 @@ class Commander:
         try:
             v = escape.check(q, solution.v, t, self._assembly.v_last, self._assembly.w_last, proximity)
         except NumericalError as error:  # of what is to come; it is raised when it has come
-            return solution.relaxed(Reason.of(ReasonKind.NO_BACKUP, detail=f"prediction of an {error}"))
+            why = f"prediction of an {error}"
+            return solution.relaxed(Reason.of(ReasonKind.NO_BACKUP, severity=Severity.WARNING, detail=why))
         if v is None:
             return solution
         return solution._replace(v=np.clip(v, problem.lower, problem.upper)).relaxed(Reason.of(ReasonKind.BACKUP))

@@ -161,7 +161,7 @@ class Recorder:
         self._note(state.t, solution)
 
     def _note(self, t: float, solution: Solution) -> None:
-        """Keep the reasons of a step where they differ from those of the step before in more than amounts."""
+        """Keep the status and reasons of a step where they differ from those before in more than amounts."""
         reasons = (*solution.reasons, *solution.stalled, *solution.assumptions)
         keys = (solution.status, *[reason.key for reason in reasons])
         eventful = solution.status is not Status.SOLVED or reasons

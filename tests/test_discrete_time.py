@@ -6,7 +6,7 @@ import pytest
 from closed_loop import Ruler, cartesian, drive, make_controller, scenario
 from conftest import moved
 
-from qpavoid import Avoidance, Controller, Obstacle, Sample, Status, simulate
+from qpavoid import Avoidance, Controller, Obstacle, ReasonKind, Sample, Severity, Status, simulate
 from qpavoid.ahead.guard import TOLERANCE
 from qpavoid.config import Box, Damper, Sphere
 
@@ -218,6 +218,9 @@ def test_the_look_ahead_moves_obstacles_on(tmp_path, linear, angular):
     turned_on = moved(seen["bar"], 0.05)
     short = HELD - Ruler(controller.scene).distances(np.zeros(3), {0: turned_on}).min()
     assert short > 0.02 and tick.solution.status is Status.RELAXED
-    assert tick.solution.reasons == (f"tool - bar: comes {1e3 * (short - TOLERANCE):.1f} mm too near",)
+    (reason,) = tick.solution.reasons
+    assert (reason.kind, reason.subject, reason.unit) == (ReasonKind.PREDICTED_TOO_NEAR, ("tool", "bar"), "m")
+    assert reason.amount == pytest.approx(short - TOLERANCE, abs=1e-6)
+    assert reason.severity is (Severity.ALARM if short > HELD else Severity.WARNING)
     away = seen["bar"]._replace(linear=-seen["bar"].linear, angular=-seen["bar"].angular)
     assert controller.step(np.zeros(3), 0.0, None, {"bar": away}).status is Status.SOLVED

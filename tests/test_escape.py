@@ -7,7 +7,7 @@ from closed_loop import SHIPPED, Ruler, cartesian, changed, make_controller
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from qpavoid import Controller, Obstacle, Pose, Sample, ScenarioConfig, Status, kernels, load_scenario
+from qpavoid import Controller, Obstacle, Pose, ReasonKind, Sample, ScenarioConfig, Status, kernels, load_scenario
 from qpavoid.ahead.flight import Manner, Near, Start, Tally
 from qpavoid.ahead.flights import _farthest
 from qpavoid.config import Avoidance, Box, Escape, Limits, Line, Sensing, Sphere
@@ -58,7 +58,7 @@ def test_jaws_close_on_a_law_that_looks_one_tick_ahead(tmp_path):
 def test_who_looks_farther_leaves_in_time_and_says_why(tmp_path, acceleration, given, jerk):
     gaps, solutions = pincer(tmp_path, Escape(), acceleration, given, jerk)
     assert gaps.min() > 0.5 * Escape().safe * 0.02  # looked at every 40 ms
-    fled = [s for s in solutions if any("no way out" in reason for reason in s.reasons)]
+    fled = [s for s in solutions if any(reason.kind is ReasonKind.BACKUP for reason in s.reasons)]
     assert len(fled) > 10 and all(s.status is Status.RELAXED for s in fled)
     # beside balls that touch, a ball of 5 cm is clear at √(0.55² - 0.5²) m from there, which takes 0.92 s
     latest = (1.3 - GAP) / 0.3 - np.sqrt(0.55**2 - GAP**2) / 0.25
@@ -170,7 +170,8 @@ def test_that_flights_do_not_hold_contacts_is_said_where_something_moves():
         assert scenario.contacts and scenario.avoidance.escape is not None
         controller, q = Controller.from_scenario(scenario)
         assert controller._commander.escape is None
-        assert any("flights do not hold contacts" in said for said in controller.step(q).assumed) == moves
+        kinds = [reason.kind for reason in controller.step(q).assumptions]
+        assert (ReasonKind.NO_BACKUP in kinds) == moves
 
 
 def test_only_laws_that_keep_limits_are_held_back(tmp_path):
