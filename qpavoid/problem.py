@@ -258,7 +258,7 @@ def as_vector(name: str, value: Any, shape: tuple[int, ...]) -> Array:
         return value
     try:
         array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise NumericalError(f"{name}: not an array of numbers: {value!r:.60}") from None
     if array.shape != shape:
         raise NumericalError(f"{name}: shape {array.shape}, expected {shape}")

@@ -168,8 +168,9 @@ def make_layout(nv, frames=0, turns=(), pairs=0, obstacles=0, joints=1, **fields
         "q_index": none, "v_index": none, "q_lower": np.zeros(0),
         "q_upper": np.zeros(0), "v_max": np.full(nv, np.inf), "v_step": np.full(nv, np.inf), "v_last": np.zeros(nv),
         "w_step": np.full(nv, np.inf), "w_last": np.zeros(nv), "jerked": False, "looks_ahead": True,
-        "damping": 0.0, "offset": 0.0, "hold": 0.1, "row_gain": 5.0, "recovery": 0.2, "switching": True, "d1": 0.1,
-        "d2": 0.3, "rate": 50.0, "dt": 0.01, "accelerated": False,
+        "damping": 0.0, "offset": 0.0, "hold": 0.1, "row_gain": 5.0, "recovery": 0.2, "beta": True, "d1": 0.1,
+        "task_switching": False, "retreat_speed": 0.0, "alpha_cap": 50.0, "d2": 0.3, "rate": 50.0, "dt": 0.01,
+        "accelerated": False,
     }  # fmt: skip
     shapes = {
         "poses": (frames, 12), "A": (rows, nv), "b": rows, "closest": (pairs, 10), "J": (pairs, nv), "drift": pairs,

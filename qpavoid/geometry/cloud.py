@@ -34,6 +34,10 @@ class Points(NamedTuple):
     leaves the tick nothing to do."""
     pose: Sample | None = None
     """Where the cloud's frame is, and how it moves; where it was if left out, which is the world at first."""
+    t: float | None = None
+    """Time stamp: when they were seen [s]; that of the pose, or the time of the control step, if left out."""
+    at_rest: bool = False
+    """Whether they stay there until others are given: they are never stale."""
 
 
 @dataclass(frozen=True)
