@@ -31,6 +31,7 @@ from qpavoid import (
 from qpavoid.ahead.guard import Guard
 from qpavoid.config import (
     AlignTask,
+    Box,
     ComTask,
     DampingTask,
     HalfSpace,
@@ -554,3 +555,20 @@ def test_guard_looks_at_a_bounded_number_of_poses_whatever_moves(tmp_path, speed
     way = guard._worst if jerk is None else guard._worst_of_stop
     way(controller._assembly, np.zeros(3), tick.solution.v, query, 0.2, speed)
     assert 0 < len(looks) <= 48 + 200 + 6 * 48
+
+
+def test_what_moves_again_is_no_longer_stalled_however_long_it_was(tmp_path):
+    """Pressed against a wall for 9 s, then free to slide along it, still pressed."""
+    wall = Obstacle.at("wall", Box(size=(0.1, 20.0, 2.0)), [0.3, 0.0, 0.0])
+    controller = make_controller(cartesian(tmp_path), [wall], "z")
+
+    def target(t):
+        return [0.6, 0.3 * max(t - 9.0, 0.0), 0.0]
+
+    said = []
+    for tick in drive(controller, np.zeros(3), 1200, target=target):
+        said.append({reason.key for reason in tick.solution.stalled})
+    ((kind, pair),) = said[899]
+    assert kind == "STALLED" and set(pair) == {"tool", "wall"}
+    assert all(said[400:900]) and not any(said[925:])
+    assert np.abs(tick.solution.v[1]) > 0.2
