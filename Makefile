@@ -1,21 +1,18 @@
 # `make run` and `make test` set up everything they need in .venv; PYTHON=python3.12 picks another interpreter.
 PYTHON ?= python3
 BIN := .venv/bin
-# what runs a second time without numba: the tick and everything that it is made of
-TICK_TESTS := $(addprefix tests/test_,$(addsuffix .py,avoidance backends controller escape examples faults filter \
-  giving_way grasp limits outcome penetration point_cloud proximity shapes situations solvers tasks))
 
 .PHONY: run figures test campaign smoke lint types clean
 
 run: .venv/run
-	$(BIN)/qpavoid compare situation1 situation2 --solvers tracking,eq10-literal,eq10,qp --out out
+	$(BIN)/qpavoid compare situation1 situation2 chasing_sphere sphere_field stall \
+	  --solvers tracking,eq10-literal,eq10,qp --out out
 
 figures: run
-	cp out/situation1_compare_path.png out/situation1_qp_motion.png docs/figures/
+	cp out/situation1_compare_path.png out/situation1_qp_motion.png out/sphere_field_compare_time.png docs/figures/
 
 test: .venv/dev
 	$(BIN)/pytest -n auto
-	QPAVOID_NUMBA=0 $(BIN)/pytest -n auto $(TICK_TESTS)
 
 campaign: .venv/dev
 	$(BIN)/pytest -n auto -m slow

@@ -11,7 +11,6 @@ from time import perf_counter
 import numpy as np
 
 from qpavoid import Controller, ScenarioConfig, Workers, load_scenario, simulate, simulate_many, steps
-from qpavoid.kernels import ACCELERATED
 from qpavoid.machine import cpu
 
 RESULTS = Path(__file__).parent / "results" / "batch.md"
@@ -35,7 +34,7 @@ def main() -> None:
         f"{options.states:,} random states around the initial one, with `Workers` that are kept: their start is given "
         "apart, and what they do for the first time (compiled code loaded, robots read) is not timed. `in this "
         f"process`: the same in a plain loop. {cpu()}, {os.cpu_count()} CPUs, {platform.system()}, Python "
-        f"{platform.python_version()}, numpy {np.__version__}, {'numba' if ACCELERATED else 'no numba'}; load of the "
+        f"{platform.python_version()}, numpy {np.__version__}; load of the "
         f"machine before: {load:.1f}.",
         "",
         "| | processes | start [s] | sweep [s] | ticks/s | ratio | states [s] | ticks/s | ratio | "

@@ -12,7 +12,6 @@ import subprocess
 import sys
 import tracemalloc
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -51,28 +50,19 @@ def main() -> None:
         print(json.dumps(work[what]()))
         return
     load = os.getloadavg()[0]
-    modes = {"numpy": "0", "numba": "1"}
-    latency = {
-        (mode, collector): _child(options, number, "latency", collector)
-        for collector in COLLECTOR
-        for mode, number in modes.items()
-    }
-    with ThreadPoolExecutor() as both:  # memory is the same on a busy machine
-        found = both.map(lambda number: _child(options, number, "memory", "on"), modes.values())
-        memory = dict(zip(modes, found, strict=True))
+    latency = {collector: _child(options, "latency", collector) for collector in COLLECTOR}
+    memory = _child(options, "memory", "on")
     with TemporaryDirectory() as empty:
-        cases = (("numpy", "0"), ("numba, nothing compiled yet", "1"), ("numba, compiled before", "1"))
-        start = {case: _child(options, number, "start", "on", empty) for case, number in cases}
+        cases = "nothing compiled yet", "compiled before"
+        start = {case: _child(options, "start", "on", empty) for case in cases}
     text = _report(latency, memory, start, ticks, (load, os.getloadavg()[0]))
     (ROOT / "bench" / "results" / "endurance.md").write_text(text)
     print(text)
 
 
-def _child(
-    options: argparse.Namespace, accelerated: str, what: str, collector: str, cache: str | None = None
-) -> dict[str, Any]:
+def _child(options: argparse.Namespace, what: str, collector: str, cache: str | None = None) -> dict[str, Any]:
     command = [sys.executable, "-m", "bench.endurance", "--ticks", str(options.ticks), "--timed", str(options.timed)]
-    environment = {**os.environ, "QPAVOID_NUMBA": accelerated, "OMP_NUM_THREADS": "1"}
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     if cache is not None:
         environment["NUMBA_CACHE_DIR"] = cache
     done = subprocess.run(
@@ -287,14 +277,14 @@ def _report(latency: Any, memory: Any, start: Any, ticks: int, load: tuple[float
         "",
         f"## The worst of {timed:,} ticks [µs]",
         "",
-        "| | collector | p50 | p99 | p99.9 | worst | p99/p50 | slower than 2 p50 | collections | worst collection | "
+        "| collector | p50 | p99 | p99.9 | worst | p99/p50 | slower than 2 p50 | collections | worst collection | "
         "time in collector |",
-        "|---|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
+        "|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]
-    for (mode, collector), r in sorted(latency.items(), key=lambda item: list(latency).index(item[0]) % 2):
+    for collector, r in latency.items():
         p50, p99, p999, worst = r["us"]
         lines.append(
-            f"| {mode} | {collector} | {p50:.1f} | {p99:.1f} | {p999:.0f} | {worst:.0f} | {p99 / p50:.2f} | "
+            f"| {collector} | {p50:.1f} | {p99:.1f} | {p999:.0f} | {worst:.0f} | {p99 / p50:.2f} | "
             f"{100 * r['slow']:.2f} % | {r['collections']} | {r['pause']:.0f} | "
             f"{100 * r['collecting'] / r['wall']:.2f} % |"
         )
@@ -309,14 +299,14 @@ def _report(latency: Any, memory: Any, start: Any, ticks: int, load: tuple[float
         "scheduler gave the core to something else during the timed ticks; stolen: what the hypervisor took from all "
         "cores meanwhile.",
         "",
-        "| | collector | work p50 | work p99 | work p99/p50 | tick over its own median: p99 | p99.9 | machine p50 | "
+        "| collector | work p50 | work p99 | work p99/p50 | tick over its own median: p99 | p99.9 | machine p50 | "
         "machine p99/p50 | machine p99.9/p50 | machine worst | machine > 2 p50 | preempted | stolen |",
-        "|---|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
+        "|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]
-    for (mode, collector), r in sorted(latency.items(), key=lambda item: list(latency).index(item[0]) % 2):
+    for collector, r in latency.items():
         u, s, x = r["usual"], r["spin"], r["relative"]
         lines.append(
-            f"| {mode} | {collector} | {u[0]:.1f} | {u[1]:.1f} | {u[1] / u[0]:.2f} | {x[1]:.2f} | {x[2]:.2f} | "
+            f"| {collector} | {u[0]:.1f} | {u[1]:.1f} | {u[1] / u[0]:.2f} | {x[1]:.2f} | {x[2]:.2f} | "
             f"{s[0]:.1f} | {s[1] / s[0]:.2f} | {s[2] / s[0]:.2f} | {s[3]:.0f} | {100 * r['slow_spin']:.2f} % | "
             f"{1e3 * r['switches'] / timed:.1f} in 1000 ticks | {100 * r['stolen'] / r['wall']:.1f} % |"
         )
@@ -324,19 +314,16 @@ def _report(latency: Any, memory: Any, start: Any, ticks: int, load: tuple[float
         "",
         f"## Memory over {ticks:,} ticks",
         "",
-        "| | RSS at the start [MB] | half way | at the end | growth in the second half [bytes/tick] | "
+        "| RSS at the start [MB] | half way | at the end | growth in the second half [bytes/tick] | "
         "allocated by Python, over so many ticks | growth [bytes] | peak above the end [bytes] |",
-        "|---|---:|---:|---:|---:|---:|---:|---:|",
+        "|---:|---:|---:|---:|---:|---:|---:|",
     ]
-    for mode, r in memory.items():
-        at, rss, half = np.array(r["at"]), np.array(r["rss"]), SAMPLES // 2
-        slope = np.polyfit(at[half:], rss[half:], 1)[0] * 1e6
-        before, after, peak = r["traced"]
-        lines.append(
-            f"| {mode} | {rss[0]:.1f} | {rss[half]:.1f} | {rss[-1]:.1f} | {slope:.3f} | {r['traced_ticks']:,} | "
-            f"{after - before:+,} | {peak - after:,} |"
-        )
+    at, rss, half = np.array(memory["at"]), np.array(memory["rss"]), SAMPLES // 2
+    slope = np.polyfit(at[half:], rss[half:], 1)[0] * 1e6
+    before, after, peak = memory["traced"]
     lines += [
+        f"| {rss[0]:.1f} | {rss[half]:.1f} | {rss[-1]:.1f} | {slope:.3f} | {memory['traced_ticks']:,} | "
+        f"{after - before:+,} | {peak - after:,} |",
         "",
         "## Until the first tick [s]",
         "",

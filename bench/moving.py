@@ -22,11 +22,10 @@ MOVING = (0, 1, 10, 50)
 DT = 0.01
 BATCH = 25
 """Ticks that are timed as one."""
-MODES = {"numpy": "0", "numba": "1"}
 
 
 def main() -> None:
-    """Parses the options, measures in a process for each mode, writes bench/results/moving.md and prints it."""
+    """Parses the options, measures in a process of its own, writes bench/results/moving.md and prints it."""
     parser = argparse.ArgumentParser(prog="python -m bench.moving", description=__doc__)
     parser.add_argument("--rounds", type=int, default=200, help=f"batches of {BATCH} ticks of each kind (200)")
     parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
@@ -35,7 +34,7 @@ def main() -> None:
         print(json.dumps({**measure(options.rounds), "without": foresight(escape=None), "with": foresight()}))
         return
     load = os.getloadavg()[0]
-    found = {mode: _child(options.rounds, number) for mode, number in MODES.items()}
+    found = _child(options.rounds)
     lines = [
         "# Moving obstacles",
         "",
@@ -48,14 +47,13 @@ def main() -> None:
         "brackets what "
         "one such obstacle adds.",
         "",
-        "| obstacles | " + " | ".join(MODES) + " |",
-        "|---|" + "---:|" * len(MODES),
+        "| obstacles | tick |",
+        "|---|---:|",
     ]
     for kind, count in ((kind, count) for kind in ("moving", "given as Sample", "given as Pose") for count in MOVING):
         name = f"{kind}, {count}"
-        if name in found["numpy"]:
-            cells = [_cell(found[mode][name], found[mode]["moving, 0"], count) for mode in MODES]
-            lines.append(f"| {count} of {OBSTACLES} {kind} | {' | '.join(cells)} |")
+        if name in found:
+            lines.append(f"| {count} of {OBSTACLES} {kind} | {_cell(found[name], found['moving, 0'], count)} |")
     lines += [
         "",
         "## Foresight",
@@ -66,9 +64,9 @@ def main() -> None:
         "| | p50 | p99 | worst | flights a tick | time of a flight |",
         "|---|---:|---:|---:|---:|---:|",
     ]
-    for name, mode in ((name, mode) for name in ("without", "with") for mode in MODES):
-        p50, p99, worst, flights, each = found[mode][name]
-        lines.append(f"| {name}, {mode} | {p50:.0f} | {p99:.0f} | {worst:.0f} | {flights:.2f} | {each:.0f} |")
+    for name in ("without", "with"):
+        p50, p99, worst, flights, each = found[name]
+        lines.append(f"| {name} | {p50:.0f} | {p99:.0f} | {worst:.0f} | {flights:.2f} | {each:.0f} |")
     text = "\n".join(lines) + "\n"
     RESULTS.write_text(text)
     print(text)
@@ -78,9 +76,9 @@ def _cell(time: float, still: float, count: int) -> str:
     return f"{time:.1f}" if not count else f"{time:.1f} ({(time - still) / count:.2f})"
 
 
-def _child(rounds: int, accelerated: str) -> dict[str, Any]:
+def _child(rounds: int) -> dict[str, Any]:
     command = [sys.executable, "-m", "bench.moving", "--rounds", str(rounds), "--child"]
-    environment = {**os.environ, "QPAVOID_NUMBA": accelerated, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
     answer: dict[str, Any] = json.loads(done.stdout)
     return answer

@@ -16,12 +16,12 @@ import numpy as np
 import pinocchio as pin
 
 from bench.tick.robots import SHARE
-from qpavoid import Avoidance, Controller, Obstacle, Points, Robot, Sample, Voxels, build_scene, build_tasks, kernels
+from qpavoid import Avoidance, Controller, Obstacle, Points, Robot, Sample, Voxels, build_scene, build_tasks
 from qpavoid.config import Box, Capsule, Cone, Cylinder, Ellipsoid, HalfSpace, Mesh, PointCloud, Sphere, Task
 from qpavoid.geometry.bodies import MeshWarning
 from qpavoid.geometry.solids import hull_of
 
-RESULTS = Path(__file__).parent / "results" / f"obstacles{'' if kernels.ACCELERATED else '-numpy'}.md"
+RESULTS = Path(__file__).parent / "results" / "obstacles.md"
 CLOUDS = (1_000, 3_000, 10_000, 30_000, 100_000)
 TCP = "panda_hand_tcp"
 
@@ -37,7 +37,7 @@ def main() -> None:
         "# Obstacles",
         "",
         f"{platform.system()}, {os.cpu_count()} CPUs, Python {platform.python_version()}, numpy {np.__version__}, "
-        f"coal {coal.__version__}, compiled kernels: {kernels.ACCELERATED}. One thread; the machine was shared.",
+        f"coal {coal.__version__}. One thread; the machine was shared.",
         "",
         "## A pair",
         "",

@@ -9,6 +9,7 @@ import sys
 import warnings
 from enum import Enum
 from functools import partial
+from importlib.metadata import version
 from json import dumps
 from pathlib import Path
 from textwrap import wrap
@@ -26,9 +27,8 @@ from qpavoid.errors import ConfigError, QpavoidError
 from qpavoid.files.fields import page, schema_of
 from qpavoid.files.loading import load_scenario
 from qpavoid.files.shipped import robot_names, scenario_names
-from qpavoid.kernels import ACCELERATED
 from qpavoid.log import Log
-from qpavoid.report import events, failed, metrics_table, to_json
+from qpavoid.report import events, failed, metrics_table, ratios_table, to_json
 from qpavoid.simulate import simulate
 from qpavoid.solvers import SOLVERS, backend_names
 from qpavoid.terminal import ERR, OUT, names_of, progress, terminate_like_interrupt
@@ -48,6 +48,7 @@ Sets = Annotated[
 Out = Annotated[Path, typer.Option(help="Folder for logs and figures.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else on stdout.")]
 Figures = Annotated[bool, typer.Option("--figures/--no-figures", help="Draw the figures.")]
+Verbose = Annotated[bool, typer.Option("--verbose", help="List the files that were written.")]
 
 
 class Kind(str, Enum):
@@ -58,13 +59,28 @@ class Kind(str, Enum):
     solvers = "solvers"
 
 
+def _print_version(asked: bool) -> None:
+    if asked:
+        print(f"qpavoid {version('qpavoid')}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version_: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Take options that stand before any command."""
+
+
 @app.command("list")
 def list_(kind: Annotated[Kind | None, typer.Argument(help="Only these.")] = None) -> None:
     """List what ships: robots, scenarios with their titles, solvers."""
     names = {
         Kind.robots: robot_names(),
         Kind.scenarios: scenario_names(),
-        Kind.solvers: [*SOLVERS, *["qp:native"] * ACCELERATED, *(f"qp:{name}" for name in backend_names())],
+        Kind.solvers: [*SOLVERS, "qp:native", *(f"qp:{name}" for name in backend_names())],
     }
     if kind is not None:
         for name in names[kind]:
@@ -85,13 +101,17 @@ def run(
     out: Out = Path("out"),
     json: Json = False,
     figures: Figures = True,
+    verbose: Verbose = False,
 ) -> None:
     """Run one scenario; write its log and figures."""
     logs, files = _run_all([load_scenario(scenario, set_ or (), solver)], out)
     if figures:
         files += _draw(logs, out, compare=False)
     metrics = [log.metrics() for log in logs]
-    _print(metrics, files, {**metrics[0], "files": [str(f) for f in files]} if json else None)
+    if json:
+        print(to_json({**metrics[0], "files": [str(f) for f in files]}))
+    else:
+        _print(metrics, files, out, verbose)
     raise typer.Exit(1 if failed(metrics[0]) else 0)
 
 
@@ -103,8 +123,9 @@ def compare(
     out: Out = Path("out"),
     json: Json = False,
     figures: Figures = True,
+    verbose: Verbose = False,
 ) -> None:
-    """Run scenarios with several solvers, side by side.
+    """Run scenarios with several solvers, side by side; the last but one is set against the last, as ratios.
 
     A collision is a result here, not a failure: the exit status is 1 only when a run was broken off.
     """
@@ -114,7 +135,12 @@ def compare(
     if figures:
         files += _draw(logs, out, compare=True)
     metrics = [log.metrics() for log in logs]
-    _print(metrics, files, {"runs": metrics, "files": [str(f) for f in files]} if json else None)
+    if json:
+        print(to_json({"runs": metrics, "files": [str(f) for f in files]}))
+    else:
+        _print(metrics, files, out, verbose)
+        if len(names) > 1:
+            OUT.print(ratios_table(metrics, names[-2], names[-1]))
     raise typer.Exit(0 if all(run["completed"] for run in metrics) and len(logs) == len(configs) else 1)
 
 
@@ -187,17 +213,18 @@ def _draw(logs: list[Log], out: Path, compare: bool) -> list[Path]:
     return files
 
 
-def _print(metrics: list[dict[str, Any]], files: list[Path], document: dict[str, Any] | None) -> None:
-    if document is not None:
-        print(to_json(document))
-        return
+def _print(metrics: list[dict[str, Any]], files: list[Path], out: Path, verbose: bool) -> None:
     for scenario in dict.fromkeys(run["scenario"] for run in metrics):
         runs = [run for run in metrics if run["scenario"] == scenario]
-        OUT.print(metrics_table(runs))
+        OUT.print(metrics_table(runs, OUT.width))
         for run in runs:
             for line in events(run):
                 OUT.print(f"{run['solver']}: {line}", highlight=False, soft_wrap=True, markup=False)
-    for file in files:
+    logs = sum(file.suffix == ".npz" for file in files)
+    counts = [f"{count} {what}{'s' * (count > 1)}" for count, what in ((logs, "log"), (len(files) - logs, "figure"))]
+    told = " and ".join(count for count in counts if count[0] != "0")
+    OUT.print(f"{told} in {out}{'' if verbose else ' (--verbose lists them)'}", highlight=False, soft_wrap=True)
+    for file in files if verbose else ():
         OUT.print(str(file), highlight=False, soft_wrap=True)
 
 

@@ -16,12 +16,12 @@ from qpavoid.ahead.progress import ProgressWatch
 from qpavoid.assembly import Assembly
 from qpavoid.config import Avoidance, Limits, Progress
 from qpavoid.errors import NumericalError
-from qpavoid.kernels.vectorised.ahead import TOLERANCE
+from qpavoid.kernels import TOLERANCE
 from qpavoid.limits import JointBounds, saturate
 from qpavoid.obstacles.sensing import Obstacles
 from qpavoid.problem import Array, Problem, Proximity, Solution, Status, sane
 from qpavoid.proximity import DistanceQuery
-from qpavoid.reason import Reason, ReasonKind
+from qpavoid.reason import Reason, ReasonKind, Severity
 from qpavoid.scene import Scene
 from qpavoid.solvers import Solver
 from qpavoid.solvers.hqp import Hqp
@@ -121,7 +121,9 @@ class Commander:
         try:
             if proximity is not None:
                 problem = self.progress.redirect(problem, proximity, self._assembly, self.solver)
-                if problem.jerked and not (problem.levels and isinstance(self.solver, Hqp)):  # v0 is not a cascade's
+                if problem.levels and isinstance(self.solver, Hqp):  # v0 is not a cascade's
+                    problem = self._assembly.prioritised(problem, self.solver.tracked)
+                elif problem.jerked:
                     problem = self._assembly.eased(problem)
             solution = self.solver.solve(problem)
             v = solution.v
@@ -130,10 +132,10 @@ class Commander:
             raised = Reason.of(ReasonKind.SOLVER_FAILED, detail=f"it raised {type(error).__name__}: {error}")
             return _stop(problem, (raised,))
         if not usable:
-            if _well_formed(problem, solution) and solution.reasons:
-                return _stop(problem, solution.reasons)
             detail = "no finite velocity of the right shape, or no status, reasons or slack of the right kind"
-            return _stop(problem, (Reason.of(ReasonKind.SOLVER_FAILED, detail=detail),))
+            failed = Reason.of(ReasonKind.SOLVER_FAILED, detail=detail)
+            given = solution.reasons if _well_formed(problem, solution) else ()
+            return _stop(problem, (*given, failed))
         if not self.solver.bounded:
             if self._limits.saturate:
                 v, change = saturate(v, problem.lower, problem.upper, self._bounds.velocity)
@@ -155,13 +157,14 @@ class Commander:
         checked = self.guard.check(q, solution, problem, gentle, self._assembly, self._query, self._reach)
         if checked is None:
             return solution
-        v, share, short, pair = checked
+        v, share, short, pair, distance = checked
         if short <= TOLERANCE:
             return solution._replace(v=v, share=share)
         names = self._scene.pair_names[pair]
         if short != short:
             return _stop(problem, (*solution.reasons, Reason.of(ReasonKind.UNKNOWN_DISTANCE, *names)))
-        missing = Reason.of(ReasonKind.PREDICTED_TOO_NEAR, *names, amount=short, unit="m")
+        severity = Severity.ALARM if distance < 0.0 else Severity.WARNING
+        missing = Reason.of(ReasonKind.PREDICTED_TOO_NEAR, *names, amount=short, unit="m", severity=severity)
         return solution._replace(v=v, share=share).relaxed(missing)
 
     def _with_a_way_out(
@@ -170,7 +173,8 @@ class Commander:
         try:
             v = escape.check(q, solution.v, t, self._assembly.v_last, self._assembly.w_last, proximity)
         except NumericalError as error:  # of what is to come; it is raised when it has come
-            return solution.relaxed(Reason.of(ReasonKind.NO_BACKUP, detail=f"prediction of an {error}"))
+            why = f"prediction of an {error}"
+            return solution.relaxed(Reason.of(ReasonKind.NO_BACKUP, severity=Severity.WARNING, detail=why))
         if v is None:
             return solution
         return solution._replace(v=np.clip(v, problem.lower, problem.upper)).relaxed(Reason.of(ReasonKind.BACKUP))

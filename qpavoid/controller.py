@@ -28,7 +28,7 @@ from qpavoid.inputs import (
     Times,
     check_velocity,
 )
-from qpavoid.kernels.vectorised.motions import NORMALISED, SAMPLE
+from qpavoid.kernels.motions import NORMALISED, SAMPLE
 from qpavoid.kinematics import ForwardKinematics, Kinematics
 from qpavoid.limits import OUTSIDE
 from qpavoid.motion import Sample
@@ -178,10 +178,11 @@ class Controller:
         hold = self.avoidance.hold - self.avoidance.offset
         self._grasps = Grasps(scene, (self._query, *self._commander.queries), self._assembly, hold)
         self._warm_up()
+        kernels.first_use.end()
         self.warm_up_time = perf_counter() - begin
         """Time that it took to lay out the memory and run the first ticks, compilation included [s]; no later tick
         waits for the compiler."""
-        _log.info("warmed up in %.3f s, compiled kernels: %s", self.warm_up_time, kernels.ACCELERATED)
+        _log.info("warmed up in %.3f s", self.warm_up_time)
 
     @property
     def solver(self) -> Solver:

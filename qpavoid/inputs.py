@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from qpavoid.errors import NumericalError
-from qpavoid.kernels.vectorised.motions import EXACT, FAR, FAST, LEFT_HANDED, NEARLY, NO_ROTATION, NOT_FINITE
+from qpavoid.kernels.motions import EXACT, FAR, FAST, LEFT_HANDED, NEARLY, NO_ROTATION, NOT_FINITE
 from qpavoid.problem import Array, as_vector, not_finite
 from qpavoid.reason import Reason, ReasonKind, Severity
 

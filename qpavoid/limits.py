@@ -85,7 +85,7 @@ def limit_layout(joints: JointBounds, position_gain: float, dt: float) -> dict[s
 
     The bounds keep the next configuration inside its limits. A joint without an acceleration limit uses at most a
     share `position_gain` of what is left to a position limit in one tick; a joint with one keeps to the speeds from
-    which it can still brake (`kernels.vectorised.bounds.speed_to_stop`), so that position, velocity and acceleration
+    which it can still brake (`kernels.speed_to_stop`), so that position, velocity and acceleration
     limits never contradict each other once they are met; where its jerk has a limit, too, it keeps to the velocities
     from which a stop within all of these ends in time (`kernels.stopping`). A joint outside its limits is sent back, at
     no more than its largest speed. Bounds never cross: from a state that no braking can save, the jerk limit gives

@@ -17,6 +17,7 @@ from qpavoid import machine
 from qpavoid.errors import ConfigError
 from qpavoid.metrics import run_metrics
 from qpavoid.problem import Array, IntArray, Status
+from qpavoid.reason import Severity
 
 STATUSES = tuple(Status)
 """Status of each code in `Log.status`."""
@@ -167,7 +168,8 @@ class Log:
         for key in ("dt", "goal_tolerance", "thresholds"):
             if key not in self.meta["config"]:
                 raise ValueError(f"config.{key} is missing")
-        for name, count in (("closest_pair", len(self.meta["pairs"])), ("status", len(STATUSES))):
+        most = (("closest_pair", len(self.meta["pairs"])), ("status", len(STATUSES)), ("severity", len(Severity) + 1))
+        for name, count in most:
             if np.any(getattr(self, name) >= count):
                 raise ValueError(f"{name} points past the {count} that there are")
 

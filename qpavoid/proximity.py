@@ -1,7 +1,7 @@
 """Closest points of the pairs within reach; without a Python loop.
 
-Bounding spheres tell which pairs can be within reach at all. Compiled code has the closed forms of spheres, capsules
-and boxes; one call of coal does the rest, with all other pairs switched off, and its results are viewed as one array.
+Bounding spheres tell which pairs can be within reach at all. Spheres, capsules and boxes have closed forms; one call of
+coal does the rest, with all other pairs switched off, and its results are viewed as one array.
 """
 
 from __future__ import annotations
@@ -12,23 +12,20 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from qpavoid import kernels
 from qpavoid.config import PointCloud
 from qpavoid.culling import Cull
 from qpavoid.geometry.bodies import bounding_box, bounding_sphere
 from qpavoid.geometry.cloud import Voxels
 from qpavoid.geometry.cores import cores, with_closed_form
 from qpavoid.geometry.slots import Slots
+from qpavoid.kernels.closed_forms import closed_forms
 from qpavoid.memory import read_poses, read_results, view_poses, view_results
 from qpavoid.motion import Sample
 from qpavoid.obstacles.placing import Placing
 from qpavoid.problem import Array, IntArray, Mask
 from qpavoid.scene import Scene
 
-if kernels.ACCELERATED:
-    from qpavoid.kernels.compiled.closed_forms import closed_forms as _closed_forms
-
-_CULL_FROM = 48 if kernels.ACCELERATED else 192
+_CULL_FROM = 48
 """Number of pairs from which looking at bounding spheres first pays."""
 _TOLERANCE = 1e-10
 """At which coal stops; its default, 1e-6, leaves errors of 7e-3 in normals of boxes and hulls."""
@@ -79,7 +76,7 @@ class DistanceQuery:
         self.twist_row: IntArray = np.zeros(len(scene.pairs), dtype=np.intp)
         """(m,) row of `twists` that moves each pair."""
         self._cores = cores([body.geometry for body in bodies])
-        self._known = with_closed_form(self._cores, scene.pairs) & kernels.ACCELERATED
+        self._known = with_closed_form(self._cores, scene.pairs)
         self._others = bool(len(self._known)) and not self._known.all()
         self._met, self._request = np.zeros(len(scene.pairs), dtype=np.intp), coal.DistanceRequest()
         self._request.gjk_tolerance = _TOLERANCE
@@ -90,8 +87,7 @@ class DistanceQuery:
         """(c,) pairs that were computed and are to get rows, increasing."""
         self._surface = _surface_pairs(scene)
         self.switch()
-        if kernels.ACCELERATED:
-            self._in_closed_form(self.pairs[:0])  # no tick waits for the compiler
+        self._in_closed_form(self.pairs[:0])  # no tick waits for the compiler
 
     @property
     def bodies(self) -> Any:
@@ -202,10 +198,7 @@ class DistanceQuery:
         pairs = self._on if self._cull is None else self._cull.switch(reach)
         if self._others:
             pin.computeDistances(self._geometry, self._data)
-        if kernels.ACCELERATED:
-            self._in_closed_form(pairs)
-        elif self._copy:
-            self.results[:] = read_results(self._data.distanceResults)
+        self._in_closed_form(pairs)
         if self._surface is not None:
             self._mend_surfaces(pairs)
         self._computed = pairs
@@ -251,7 +244,7 @@ class DistanceQuery:
         bodies = self._scene.pairs
         if self._copy and self._others:
             self.results[~self._known] = read_results(self._data.distanceResults)[~self._known]
-        count = _closed_forms(self.poses, self._cores, bodies, self._known, pairs, self.results, self._met)
+        count = closed_forms(self.poses, self._cores, bodies, self._known, pairs, self.results, self._met)
         for pair in self._met[:count].tolist():
             a, b = (
                 (self._geometry.geometryObjects[i].geometry, coal.Transform3s(pose.rotation, pose.translation))

@@ -25,7 +25,8 @@ class ReasonKind(str, Enum):
     BELOW_SAFETY_DISTANCE = "BELOW_SAFETY_DISTANCE"
     """A pair of a relaxed row is too near: the pair, what is missing to the safety distance [m]."""
     PREDICTED_TOO_NEAR = "PREDICTED_TOO_NEAR"
-    """The look-ahead found no velocity whose braking trajectory stays clear: the pair, what is missing [m]."""
+    """The look-ahead found no velocity whose braking trajectory stays clear: the pair, what is missing to the safety
+    distance [m]; an alarm where any pair is predicted in contact, else a warning."""
     UNKNOWN_DISTANCE = "UNKNOWN_DISTANCE"
     """A distance is not a number: the pair."""
     ACCELERATION_RELAXED = "ACCELERATION_RELAXED"
@@ -171,7 +172,7 @@ class Reason(NamedTuple):
 
     @property
     def key(self) -> tuple[str, tuple[str, ...]]:
-        """Kind and subject: the same reason in two steps has the same key, whatever its amounts."""
+        """Kind and subject: the same reason in two steps has the same key, whatever its amount and severity."""
         return self.kind.value, self.subject
 
 

@@ -4,26 +4,46 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from rich import box
+from rich.cells import cell_len
 from rich.markup import escape
 from rich.table import Table
 
-_COLUMNS = (
-    "min\ndist\n[mm]", "in\ncoll\n[s]", "end\nerr\n[mm]", "dev\n[mm]", "peak q̇\n[rad/s]", "Σ|Δq̇|\n[rad/s]", "tick\n[µs]"
-)  # fmt: skip
+_COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
+    ("min\ndist\n[mm]", lambda run: "-" if run["min_distance"] is None else f"{1e3 * run['min_distance']:.1f}"),
+    ("in\ncoll\n[s]", lambda run: f"{run['time_in_collision']:.2f}"),
+    ("end\nerr\n[mm]", lambda run: f"{1e3 * run['final_error']:.2f}"),
+    ("dev\n[mm]", lambda run: f"{1e3 * run['max_deviation']:.1f}"),
+    ("peak q̇\n[rad/s]", lambda run: f"{run['peak_velocity']:.2f}"),
+    ("Σ|Δq̇|\n[rad/s]", lambda run: f"{run['jitter']:.1f}"),
+    ("tick\n[µs]", lambda run: f"{run['tick_us']['p50']:.0f}"),
+)
+"""Heading and cell of each column between solver and outcome, the most important first."""
+_OUTCOME = 13
+"""Width of the outcome below which columns are left out [characters]."""
 
 
-def metrics_table(runs: Sequence[dict[str, Any]]) -> Table:
-    """Runs of one scenario, a row each; fits a terminal of 80 columns.
+def metrics_table(runs: Sequence[dict[str, Any]], width: int = 80) -> Table:
+    """Lay out runs of one scenario, a row each; where the terminal is narrow, the last columns are left out.
 
     Args:
         runs: results of `Log.metrics`.
+        width: of the terminal [characters].
     """
+    cells = [[cell(run) for _, cell in _COLUMNS] for run in runs]
+    used, shown = 2 + max(cell_len(run["solver"]) for run in (*runs, {"solver": "solver"})), 0
+    for (heading, _), *column in zip(_COLUMNS, *cells, strict=True):
+        used += 1 + max(map(cell_len, (*heading.split("\n"), *column)))
+        if used + 1 + _OUTCOME > width:
+            break
+        shown += 1
+    hidden = len(_COLUMNS) - shown
+    more = f"; {hidden} more column{'s' * (hidden > 1)} in a wider terminal" if hidden else ""
     table = Table(
-        title=f"[bold]{escape(runs[0]['scenario'])}[/] (distances between surfaces)",
+        title=f"[bold]{escape(runs[0]['scenario'])}[/] (distances between surfaces{more})",
         title_justify="left",
         title_style="",
         box=box.SIMPLE_HEAD,
@@ -31,27 +51,68 @@ def metrics_table(runs: Sequence[dict[str, Any]]) -> Table:
         padding=0,  # columns are a blank apart, which leaves the outcome its room
     )
     table.add_column("solver", no_wrap=True)
-    for heading in _COLUMNS:
+    for heading, _ in _COLUMNS[:shown]:
         table.add_column(escape(heading), justify="right", no_wrap=True)
     table.add_column("outcome")
-    for run in runs:
+    for run, row in zip(runs, cells, strict=True):
+        table.add_row(run["solver"], *row[:shown], outcome(run))
+    return table
+
+
+_RATIOS = (
+    ("min dist\n[mm]", "min_distance", 1e3, ".1f"), ("in coll\n[s]", "time_in_collision", 1.0, ".2f"),
+    ("rms err\n[mm]", "tracking_rmse", 1e3, ".1f"), ("end err\n[mm]", "final_error", 1e3, ".2f"),
+    ("dev\n[mm]", "max_deviation", 1e3, ".1f"), ("peak q̇\n[rad/s]", "peak_velocity", 1.0, ".2f"),
+    ("Σ|Δq̇|\n[rad/s]", "jitter", 1.0, ".1f"),
+)  # fmt: skip
+"""Heading, name, unit and format of the figures that are set against each other."""
+_NOTHING = 0.05
+"""Figures no larger than this, in their unit, have no ratio."""
+
+
+def ratios_table(runs: Sequence[dict[str, Any]], over: str, under: str) -> Table:
+    """Figures of two solvers, scenario by scenario, and those of the first over those of the second.
+
+    Args:
+        runs: results of `Log.metrics` of all scenarios.
+        over: solver whose figures stand above the line.
+        under: the other one.
+    """
+    table = Table(
+        title=f"[bold]{escape(over)} / {escape(under)}[/]", title_justify="left", title_style="",
+        box=box.SIMPLE_HEAD, pad_edge=False, padding=0,
+    )  # fmt: skip
+    table.add_column("scenario", no_wrap=True)
+    table.add_column("", no_wrap=True)
+    for heading, *_ in _RATIOS:
+        table.add_column(escape(heading), justify="right", no_wrap=True)
+    found = {(run["scenario"], run["solver"]): run for run in runs}
+    for scenario in dict.fromkeys(run["scenario"] for run in runs):
+        if (scenario, over) not in found or (scenario, under) not in found:
+            continue
+        values = [
+            [None if run[name] is None else unit * run[name] for _, name, unit, _ in _RATIOS]
+            for run in (found[scenario, over], found[scenario, under])
+        ]
+        for first, solver, figures in zip((scenario, ""), (over, under), values, strict=True):
+            cells = (
+                "-" if value is None else f"{value:{form}}" for value, (*_, form) in zip(figures, _RATIOS, strict=True)
+            )
+            table.add_row(first, solver, *cells)
         table.add_row(
-            run["solver"],
-            "-" if run["min_distance"] is None else f"{1e3 * run['min_distance']:.1f}",
-            f"{run['time_in_collision']:.2f}",
-            f"{1e3 * run['final_error']:.2f}",
-            f"{1e3 * run['max_deviation']:.1f}",
-            f"{run['peak_velocity']:.2f}",
-            f"{run['jitter']:.1f}",
-            f"{run['tick_us']['p50']:.0f}",
-            outcome(run),
+            "", "ratio", *(f"[bold]{_ratio(a, b)}[/]" for a, b in zip(*values, strict=True)), end_section=True
         )
     return table
 
 
+def _ratio(a: float | None, b: float | None) -> str:
+    """a / b; nothing where one of them is none to speak of, or a depth of penetration."""
+    return f"{a / b:.2f}" if a is not None and b is not None and min(a, b) > _NOTHING else ""
+
+
 def outcome(run: dict[str, Any]) -> str:
-    """How a run went, in words."""
-    counts = run["status_counts"]
+    """Say how a run went: how many steps stopped and relaxed, and how many have each severity as their worst."""
+    counts, levels = run["status_counts"], run["severity_counts"]
     said = []
     if run["collided"]:
         said.append("[red]collided[/]")
@@ -59,8 +120,9 @@ def outcome(run: dict[str, Any]) -> str:
         said.append(f"[red]{counts['STOPPED']} stopped[/]")
     if counts["RELAXED"]:
         said.append(f"[yellow]{counts['RELAXED']} relaxed[/]")
-    if run["severity_counts"]["ALARM"]:
-        said.append(f"[red]{run['severity_counts']['ALARM']} alarms[/]")
+    for level, word, style in (("ALARM", "alarm", "red"), ("WARNING", "warning", "yellow"), ("INFO", "info", "dim")):
+        if levels[level]:
+            said.append(f"[{style}]{levels[level]} {word}[/]")
     if run["time_stalled"] > 0.0:
         said.append(f"[yellow]stalled {run['time_stalled']:.1f} s[/]")
     if not run["completed"]:

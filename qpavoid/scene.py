@@ -17,7 +17,7 @@ from qpavoid.errors import ConfigError, NumericalError, located
 from qpavoid.geometry.cloud import Voxels, read_points
 from qpavoid.geometry.pairs import pair_array
 from qpavoid.geometry.solids import make_solids
-from qpavoid.kernels.vectorised.motions import NEARLY
+from qpavoid.kernels.motions import NEARLY
 from qpavoid.kinematics import support_masks
 from qpavoid.motion import Motion, Sample, Still, build_motion
 from qpavoid.problem import Array, IntArray

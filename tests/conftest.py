@@ -9,10 +9,11 @@ import pinocchio as pin
 import pytest
 from hypothesis import settings
 
-from qpavoid import Obstacle, Robot, Sample, build_scene, config
+from qpavoid import Controller, Obstacle, Robot, Sample, build_scene, config, load_scenario
 from qpavoid.__main__ import main
 from qpavoid.assembly import Assembly
 from qpavoid.files.shipped import example_robot_data
+from qpavoid.kernels.cache import FOLDER
 from qpavoid.kernels.layout import RowLayout
 from qpavoid.kinematics import ForwardKinematics
 from qpavoid.motion import build_motion
@@ -37,6 +38,13 @@ def cache_of_the_tests(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("QPAVOID_CACHE", str(shared / "qpavoid-cache"))
         yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def compiled_kernels(cache_of_the_tests):
+    """All kernels of a controller are on disk before any test: none finds on stderr that they are compiled."""
+    if not (FOLDER / "complete").exists():
+        Controller.from_scenario(load_scenario("situation1"))
 
 
 class Result:
@@ -160,8 +168,9 @@ def make_layout(nv, frames=0, turns=(), pairs=0, obstacles=0, joints=1, **fields
         "q_index": none, "v_index": none, "q_lower": np.zeros(0),
         "q_upper": np.zeros(0), "v_max": np.full(nv, np.inf), "v_step": np.full(nv, np.inf), "v_last": np.zeros(nv),
         "w_step": np.full(nv, np.inf), "w_last": np.zeros(nv), "jerked": False, "looks_ahead": True,
-        "damping": 0.0, "offset": 0.0, "hold": 0.1, "row_gain": 5.0, "recovery": 0.2, "switching": True, "d1": 0.1,
-        "d2": 0.3, "rate": 50.0, "dt": 0.01, "accelerated": False,
+        "damping": 0.0, "offset": 0.0, "hold": 0.1, "row_gain": 5.0, "recovery": 0.2, "beta": True, "d1": 0.1,
+        "task_switching": False, "retreat_speed": 0.0, "alpha_cap": 50.0, "d2": 0.3, "rate": 50.0, "dt": 0.01,
+        "accelerated": False,
     }  # fmt: skip
     shapes = {
         "poses": (frames, 12), "A": (rows, nv), "b": rows, "closest": (pairs, 10), "J": (pairs, nv), "drift": pairs,

@@ -7,8 +7,7 @@ import quadprog
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-pytest.importorskip("numba")
-from qpavoid.kernels.compiled.active_set import minimize, project, project_soft
+from qpavoid.kernels import minimize, project, project_soft
 
 seeds = st.integers(0, 2**32 - 1)
 

@@ -186,7 +186,7 @@ def test_processes_at_once(folder):
     )
     command = [sys.executable, "-c", script, str(PANDA)]
     running = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(2)]
-    printed = [process.communicate(timeout=120)[0] for process in running]
+    printed = [process.communicate(timeout=300)[0] for process in running]
     assert all(process.returncode == 0 for process in running)
     assert len(set(printed)) == 1 and len(printed[0]) > 100
     assert {path.suffix for path in files(folder)} == {".bin"}

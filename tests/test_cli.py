@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -18,7 +19,7 @@ from qpavoid.solvers import SOLVERS
 METRICS = {
     "scenario", "solver", "completed", "collided", "min_distance", "min_pair", "time_in_collision", "time_below",
     "final_error", "max_deviation", "tracking_rmse", "peak_velocity", "jitter", "status_counts", "relaxed_ticks",
-    "tick_us",
+    "tick_us", "time_stalled", "severity_counts", "events",
 }  # fmt: skip
 SITUATION = yaml.safe_load((data_folder("tasks") / "situation1.yaml").read_text(encoding="utf-8"))
 
@@ -38,7 +39,7 @@ def scene(tmp_path):
 
 def process(*args: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "qpavoid", *args]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=60, check=False)
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300, check=False)
 
 
 # list
@@ -87,7 +88,15 @@ def test_table_for_people(cli, scene):
     result = cli("run", scene(), "--no-figures")
     assert result.status == 0
     assert "arrived" in result.stdout
-    assert os.path.join("out", "scene_qp.npz") in result.stdout
+    assert result.stdout.splitlines()[-1] == "1 log in out (--verbose lists them)"
+    assert os.path.join("out", "scene_qp.npz") not in result.stdout
+    verbose = cli("run", scene(), "--no-figures", "--verbose").stdout.splitlines()
+    assert verbose[-2:] == ["1 log in out", os.path.join("out", "scene_qp.npz")]
+
+
+def test_version(cli):
+    result = cli("--version")
+    assert (result.status, result.stdout) == (0, f"qpavoid {version('qpavoid')}\n")
 
 
 def test_set_and_solver_reach_the_run(cli, scene):
@@ -313,7 +322,7 @@ def test_signal_leaves_a_log_of_what_was_done(tmp_path, signum):
     ) as child:
         assert child.stderr.readline() == "under way\n"
         child.send_signal(signum)
-        stdout, stderr = child.communicate(timeout=60)
+        stdout, stderr = child.communicate(timeout=300)
     assert child.returncode == 1
     assert "Traceback" not in stderr
     assert "broken off" in stderr

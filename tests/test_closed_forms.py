@@ -9,14 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracle import support
 
-from qpavoid import kernels
 from qpavoid.geometry.cores import cores, with_closed_form
+from qpavoid.kernels.closed_forms import APART, closed_forms
 from qpavoid.proximity import DistanceQuery
-
-if not kernels.ACCELERATED:
-    pytest.skip("coal computes all distances without numba", allow_module_level=True)
-
-from qpavoid.kernels.compiled.closed_forms import APART, closed_forms
 
 AT_ORIGIN = pin.SE3.Identity()
 

@@ -5,7 +5,18 @@ import pinocchio as pin
 import pytest
 from conftest import SPHERE, obstacle, random_q
 
-from qpavoid import ConfigError, Controller, UnknownName, build_scene, build_tasks, config, load_scenario, simulate
+from qpavoid import (
+    ConfigError,
+    Controller,
+    ReasonKind,
+    Severity,
+    UnknownName,
+    build_scene,
+    build_tasks,
+    config,
+    load_scenario,
+    simulate,
+)
 from qpavoid.contacts import build_contacts, solve_contacts, tracking_within
 from qpavoid.problem import AvoidanceRows, Contacts, Problem, Solution, Status, Tracking, make_problem
 from qpavoid.solvers import backend_names, make_solver
@@ -102,7 +113,8 @@ def test_limits_that_leave_no_velocity_stop_the_robot():
                                hard_upper=np.full(3, 0.5), shortfall=0.4)  # fmt: skip
     solution = make_solver("qp").solve(problem)
     assert solution.status is Status.STOPPED
-    assert solution.reasons == ("contacts: the joint limits leave no velocity that holds them",)
+    (reason,) = solution.reasons
+    assert (reason.kind, reason.severity) == (ReasonKind.CONTACTS_INFEASIBLE, Severity.ALARM)
 
 
 # On robots

@@ -149,7 +149,6 @@ def test_a_law_that_takes_over_is_the_one_that_counts(controller, panda):
     assert not np.isclose(controller.step(panda.home).v, 0.01).any()
 
 
-@pytest.mark.skipif(not kernels.ACCELERATED, reason="nothing is compiled")
 def test_nothing_is_compiled_after_construction(controller, panda):
     def compiled():
         functions = {name: getattr(kernels, name) for name in kernels.__all__}

@@ -1,7 +1,6 @@
 """Many moving obstacles at once: against each motion's own `sample`, plain definitions, and one by one in a loop."""
 
 import math
-from importlib import import_module
 
 import numpy as np
 import pinocchio as pin
@@ -14,7 +13,7 @@ from pydantic import TypeAdapter
 
 from qpavoid import Obstacle, ReasonKind, Sample, Status, build_scene, config, kernels
 from qpavoid.errors import NumericalError
-from qpavoid.kernels.vectorised.motions import (
+from qpavoid.kernels.motions import (
     FAR,
     FAST,
     FINE,
@@ -25,7 +24,6 @@ from qpavoid.kernels.vectorised.motions import (
     POSE,
     REST,
     SAMPLE,
-    Placed,
 )
 from qpavoid.motion import END_TOLERANCE, Motion, Orbit, Still, build_motion
 from qpavoid.obstacles import courses
@@ -38,14 +36,6 @@ profile = st.sampled_from(["constant", "smooth"])
 direction = point.filter(lambda v: np.linalg.norm(v) > 0.1)
 EARLY = (-1.0, -1e-6, -2.0 * END_TOLERANCE, -0.5 * END_TOLERANCE, 0.0, 0.5 * END_TOLERANCE, 1e-6)
 """Where to look around a corner [s]."""
-
-
-@pytest.fixture(params=["vectorised", "compiled"])
-def version(request):
-    """Each version of the kernels in turn."""
-    if request.param == "compiled":
-        pytest.importorskip("numba")
-    return import_module(f"qpavoid.kernels.{request.param}")
 
 
 def build(**block):
@@ -81,14 +71,6 @@ def corners(motion):
     return [0.0, min(motion.end, 1e6)] if isinstance(motion, Orbit) else list(motion.times)
 
 
-def laid_out(motions, version, monkeypatch):
-    """Courses on one version of the kernels, however few the motions are."""
-    monkeypatch.setattr(kernels, "pack_pieces", version.pack_pieces)
-    monkeypatch.setattr(kernels, "sample_pieces", version.sample_pieces)
-    monkeypatch.setattr(courses, "_TOGETHER_FROM", 1)
-    return courses.Courses(motions)
-
-
 def assert_samples(views, motions, t):
     for view, motion in zip(views, motions, strict=True):
         for found, expected in zip(view[:4], motion.sample(t)[:4], strict=True):
@@ -100,29 +82,25 @@ def assert_samples(views, motions, t):
 
 @settings(max_examples=50)
 @given(motions=st.lists(fixed | line | circle | way(), min_size=1, max_size=4), data=st.data())
-@pytest.mark.parametrize("name", ["vectorised", "compiled"])
-def test_all_at_once_are_where_each_alone_is(name, motions, data):
+def test_all_at_once_are_where_each_alone_is(motions, data):
     """At any time, around corners, and when time goes back."""
-    if name == "compiled":
-        pytest.importorskip("numba")
     edges = [corner + early for motion in motions for corner in corners(motion) for early in EARLY]
     times = [*data.draw(st.permutations(edges)), *data.draw(st.lists(st.floats(-5.0, 20.0), max_size=10)), 1.7e9]
-    with pytest.MonkeyPatch.context() as patch:
-        together = laid_out(dict(enumerate(motions)), import_module(f"qpavoid.kernels.{name}"), patch)
-        assert not together.others
-        states = np.full((len(motions), courses.STATE), np.nan)
-        for t in times:
-            together.sample(t, states)
-            assert_samples(courses.as_samples(states), motions, t)
+    together = courses.Courses(dict(enumerate(motions)))
+    assert not together.others
+    states = np.full((len(motions), courses.STATE), np.nan)
+    for t in times:
+        together.sample(t, states)
+        assert_samples(courses.as_samples(states), motions, t)
 
 
-def test_only_rows_of_its_own_are_written(version, monkeypatch):
+def test_only_rows_of_its_own_are_written():
     motions = {
         4: build(type="line", start=(0, 0, 1), end=(1, 0, 1), speed=0.5),
         1: build(type="fixed", position=(1, 2, 3)),
     }
     states = np.full((6, courses.STATE), np.nan)
-    laid_out(motions, version, monkeypatch).sample(1.0, states)
+    courses.Courses(motions).sample(1.0, states)
     assert np.flatnonzero(np.isfinite(states).all(axis=1)).tolist() == [1, 4]
     assert np.flatnonzero(np.isnan(states).all(axis=1)).tolist() == [0, 2, 3, 5]
     np.testing.assert_allclose(states[4, 9:15], [0.5, 0, 1, 0.5, 0, 0], atol=1e-15)
@@ -142,10 +120,10 @@ class Drifting(Still):
         return self.pose._replace(position=self.pose.position + t)
 
 
-def test_motions_of_other_classes_are_left_to_their_sample(version, monkeypatch):
+def test_motions_of_other_classes_are_left_to_their_sample():
     motions: dict[int, Motion] = {0: Pendulum(), 1: build(type="circle", center=(0, 0, 1), radius=0.2, period=3)}
     motions[2] = Drifting(Sample.at([0.0, 0.0, 0.0]))
-    assert set(laid_out(motions, version, monkeypatch).others) == {0, 2}
+    assert set(courses.Courses(motions).others) == {0, 2}
 
 
 def test_a_controller_follows_motions_of_other_classes(panda):
@@ -196,10 +174,10 @@ def memory(rng, obstacles, loads, centred):
     """Of a scene that nobody has built: obstacle i has i % 3 bodies; five bodies before them are the robot's."""
     owner = np.concatenate([np.full(5, -1), np.repeat(np.arange(obstacles), np.arange(obstacles) % 3)])
     local = rng.normal(size=(len(owner), 3)) * (not centred)
-    return owner, Placed(
+    return owner, kernels.Placed(
         states=np.zeros((obstacles, courses.STATE)), twists=np.zeros((obstacles + 1 + loads, 6)),
         margin=np.zeros(obstacles + 1 + loads), speeds=np.zeros(obstacles), reach=rng.uniform(0.1, 1.0, obstacles),
-        placements=rng.normal(size=(len(owner), 12)), local=local, centred=centred,
+        placements=rng.normal(size=(len(owner), 12)), local=local,
         centers=np.ones((len(owner), 5)),
     )  # fmt: skip
 
@@ -216,7 +194,7 @@ def random_states(rng, count, turning):
 @pytest.mark.parametrize("turning", [False, True])
 @pytest.mark.parametrize("centred", [False, True])
 @pytest.mark.parametrize("loads", [0, 2])
-def test_what_distances_know_by_definition(version, loads, centred, turning):
+def test_what_distances_know_by_definition(loads, centred, turning):
     rng = np.random.default_rng(1)
     owner, x = memory(rng, 8, loads, centred)
     before = x.placements.copy()
@@ -225,7 +203,7 @@ def test_what_distances_know_by_definition(version, loads, centred, turning):
         geometries = np.array([g for i in which for g in np.flatnonzero(owner == i)], dtype=np.intp)
         owners = np.array([list(which).index(i) for i in owner[geometries]], dtype=np.intp)
         states, margin = random_states(rng, 8, turning), rng.choice([0.0, 0.1], 8)
-        bad, moving = version.place_obstacles(x, which, geometries, owners, states, margin)
+        bad, moving = kernels.place_obstacles(x, which, geometries, owners, states, margin)
         assert bad == -1 and moving == bool(x.twists.any() or x.margin.any())
         for i in which:
             sample = courses.as_samples(states)[i]
@@ -247,29 +225,8 @@ def test_what_distances_know_by_definition(version, loads, centred, turning):
     np.testing.assert_array_equal(x.placements[untouched], before[untouched])
 
 
-def test_both_versions_leave_the_same_memory():
-    pytest.importorskip("numba")
-    plain, fast = (import_module(f"qpavoid.kernels.{name}") for name in ("vectorised", "compiled"))
-    for seed in range(20):
-        found = []
-        for module in (plain, fast):
-            rng = np.random.default_rng(seed)
-            owner, x = memory(rng, 12, 3, seed % 2 == 0)
-            which = np.flatnonzero(rng.random(12) < 0.5)
-            geometries = np.flatnonzero(np.isin(owner, which))
-            owners = np.searchsorted(which, owner[geometries])
-            states = random_states(rng, 12, seed % 3 > 0)
-            if seed % 5 == 4:
-                states[which[-1], rng.integers(18)] = rng.choice([np.nan, np.inf])
-            said = module.place_obstacles(x, which, geometries, owners, states, rng.choice([0.0, 0.1], 12))
-            found.append((said, x))
-        assert found[0][0] == found[1][0] and (found[0][0][0] >= 0) == (seed % 5 == 4)
-        for name, a, b in zip(Placed._fields, found[0][1], found[1][1], strict=True):
-            np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12, err_msg=name)
-
-
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_numbers_that_cannot_be_true_change_nothing(version, value):
+def test_numbers_that_cannot_be_true_change_nothing(value):
     rng = np.random.default_rng(2)
     owner, x = memory(rng, 6, 1, False)
     before = [np.copy(part) for part in x]
@@ -277,7 +234,7 @@ def test_numbers_that_cannot_be_true_change_nothing(version, value):
     for column in range(courses.STATE):
         states = random_states(rng, 6, True)
         states[3, column] = value
-        bad, _ = version.place_obstacles(x, which, geometries, owner[geometries], states, np.zeros(6))
+        bad, _ = kernels.place_obstacles(x, which, geometries, owner[geometries], states, np.zeros(6))
         assert bad == 3
         for part, was in zip(x, before, strict=True):
             np.testing.assert_array_equal(part, was)
@@ -303,13 +260,13 @@ def test_numbers_that_cannot_be_true_change_nothing(version, value):
         (lambda x: x.__imul__(np.r_[np.full(9, 1.0 + 1e-7), np.ones(9)]), SAMPLE, FINE),
     ],
 )  # fmt: skip
-def test_check_states_by_definition(version, change, how, code):
+def test_check_states_by_definition(change, how, code):
     rng = np.random.default_rng(0)
     states = random_states(rng, 5, True)
     change(states[3])
     before, which = states.copy(), np.array([1, 3, 0])
     kind = np.array([SAMPLE, how, POSE])
-    codes, off = version.check_states(states, which, kind, 100.0, 10.0)
+    codes, off = kernels.check_states(states, which, kind, 100.0, 10.0)
     assert codes.tolist() == [FINE, code, FINE]
     if code == NORMALISED:
         R, was = (x[3, :9].reshape(3, 3).T for x in (states, before))
@@ -321,19 +278,15 @@ def test_check_states_by_definition(version, change, how, code):
 
 
 @given(data=st.data())
-@pytest.mark.parametrize("name", ["vectorised", "compiled"])
-def test_check_states_normalises_what_is_nearly_a_rotation(name, data):
+def test_check_states_normalises_what_is_nearly_a_rotation(data):
     """Whatever is less than 1e-3 off in every entry of RᵀR."""
-    if name == "compiled":
-        pytest.importorskip("numba")
     rng = np.random.default_rng(data.draw(st.integers(0, 10**6)))
     states = random_states(rng, 1, True)
     error = rng.normal(size=(3, 3))
     states[0, :9] += (data.draw(st.floats(0.0, 1e-3)) * error / np.abs(error).max()).ravel()
     was = states[0, :9].reshape(3, 3).T.copy()
     off = np.abs(was.T @ was - np.eye(3)).max()
-    module = import_module(f"qpavoid.kernels.{name}")
-    codes, found = module.check_states(states, np.array([0]), np.array([SAMPLE]), 100.0, 1e3)
+    codes, found = kernels.check_states(states, np.array([0]), np.array([SAMPLE]), 100.0, 1e3)
     assert found[0] == pytest.approx(off, abs=1e-15)
     assert codes[0] == (NO_ROTATION if off > 1e-3 else NORMALISED if off > 1e-6 else FINE)
     if codes[0] == NORMALISED:
@@ -353,11 +306,11 @@ def random_news(rng, count=9):
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_take_in_gives_bare_poses_the_twist_that_has_led_to_them(version, seed):
+def test_take_in_gives_bare_poses_the_twist_that_has_led_to_them(seed):
     rng = np.random.default_rng(seed)
     which, kind, times, news, stamps, last, states, _, _ = args = random_news(rng)
     given, known, before, were = news.copy(), stamps.copy(), last.copy(), states.copy()
-    fine = version.take_in(*args)
+    fine = kernels.take_in(*args)
     assert fine.tolist() == [True] * 6 + [False]
     for k, i in enumerate(which[:6]):
         expected = given[i].copy()
@@ -376,17 +329,6 @@ def test_take_in_gives_bare_poses_the_twist_that_has_led_to_them(version, seed):
     others = np.setdiff1d(np.arange(9), which[:6])
     for now, was in ((stamps, known), (last, before), (states, were)):
         np.testing.assert_array_equal(now[others], was[others])
-
-
-def test_both_versions_take_in_the_same():
-    pytest.importorskip("numba")
-    for seed in range(20):
-        found = []
-        for name in ("vectorised", "compiled"):
-            args = random_news(np.random.default_rng(seed))
-            found.append([import_module(f"qpavoid.kernels.{name}").take_in(*args), *args[4:7]])
-        for a, b in zip(*found, strict=True):
-            np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
 
 
 def test_some_move_in_coals_model_and_the_others_stay(panda):

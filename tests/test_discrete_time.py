@@ -6,7 +6,7 @@ import pytest
 from closed_loop import Ruler, cartesian, drive, make_controller, scenario
 from conftest import moved
 
-from qpavoid import Avoidance, Controller, Obstacle, Sample, Status, simulate
+from qpavoid import Avoidance, Controller, Obstacle, ReasonKind, Sample, Severity, Status, simulate
 from qpavoid.ahead.guard import TOLERANCE
 from qpavoid.config import Box, Damper, Sphere
 
@@ -22,7 +22,7 @@ def least_on_the_way(log, controller, steps=10):
     return min(ruler.least_between(q, v, dt, t, steps) for q, v, t in zip(log.q, log.v, log.t, strict=True))
 
 
-@pytest.mark.parametrize("row", ["switching", "damper"])
+@pytest.mark.parametrize("row", ["beta", "task-switching", "damper"])
 @pytest.mark.parametrize("shape", [PLATE, BALL, BOX], ids=["plate", "ball", "box"])
 @pytest.mark.parametrize(("dt", "duration"), [(0.001, 0.8), (0.01, 2.0), (0.02, 2.0), (0.05, 3.0)])
 def test_no_period_and_no_speed_pass_the_safe_distance(row, shape, dt, duration):
@@ -40,7 +40,9 @@ def test_no_period_and_no_speed_pass_the_safe_distance(row, shape, dt, duration)
     assert least_on_the_way(log, controller, 10 if dt > 0.001 else 2) > HELD - 1e-3
     assert log.metrics()["peak_velocity"] > 1.0
     counts = log.metrics()["status_counts"]
-    assert counts["RELAXED"] == counts["STOPPED"] == 0
+    # rows with α ask for the stop at once, and at the margin may lack a few mm/s
+    assert counts["STOPPED"] == 0 and log.slack.max() <= (4e-3 if row == "task-switching" else 0.0)
+    assert counts["RELAXED"] <= (0.01 * len(log.t) if row == "task-switching" else 0)
     bounds = controller.scene.robot.bounds()
     change = np.abs(np.diff(log.v, axis=0, prepend=0.0 * log.v[:1]))
     assert (change <= dt * bounds.acceleration + 1e-9).all()
@@ -218,6 +220,9 @@ def test_the_look_ahead_moves_obstacles_on(tmp_path, linear, angular):
     turned_on = moved(seen["bar"], 0.05)
     short = HELD - Ruler(controller.scene).distances(np.zeros(3), {0: turned_on}).min()
     assert short > 0.02 and tick.solution.status is Status.RELAXED
-    assert tick.solution.reasons == (f"tool - bar: comes {1e3 * (short - TOLERANCE):.1f} mm too near",)
+    (reason,) = tick.solution.reasons
+    assert (reason.kind, reason.subject, reason.unit) == (ReasonKind.PREDICTED_TOO_NEAR, ("tool", "bar"), "m")
+    assert reason.amount == pytest.approx(short - TOLERANCE, abs=1e-6)
+    assert reason.severity is (Severity.ALARM if short > HELD else Severity.WARNING)
     away = seen["bar"]._replace(linear=-seen["bar"].linear, angular=-seen["bar"].angular)
     assert controller.step(np.zeros(3), 0.0, None, {"bar": away}).status is Status.SOLVED

@@ -7,7 +7,7 @@ from closed_loop import SHIPPED, Ruler, cartesian, changed, make_controller
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from qpavoid import Controller, Obstacle, Pose, Sample, ScenarioConfig, Status, kernels, load_scenario
+from qpavoid import Controller, Obstacle, Pose, ReasonKind, Sample, ScenarioConfig, Status, kernels, load_scenario
 from qpavoid.ahead.flight import Manner, Near, Start, Tally
 from qpavoid.ahead.flights import _farthest
 from qpavoid.config import Avoidance, Box, Escape, Limits, Line, Sensing, Sphere
@@ -15,6 +15,7 @@ from qpavoid.motion import build_motion
 from qpavoid.obstacles.courses import move_on
 from qpavoid.obstacles.sensing import Obstacles
 from qpavoid.obstacles.told import strayed
+from qpavoid.solvers.backends import solve_daqp
 
 DT = 0.01
 GAP = 0.5
@@ -57,7 +58,7 @@ def test_jaws_close_on_a_law_that_looks_one_tick_ahead(tmp_path):
 def test_who_looks_farther_leaves_in_time_and_says_why(tmp_path, acceleration, given, jerk):
     gaps, solutions = pincer(tmp_path, Escape(), acceleration, given, jerk)
     assert gaps.min() > 0.5 * Escape().safe * 0.02  # looked at every 40 ms
-    fled = [s for s in solutions if any("no way out" in reason for reason in s.reasons)]
+    fled = [s for s in solutions if any(reason.kind is ReasonKind.BACKUP for reason in s.reasons)]
     assert len(fled) > 10 and all(s.status is Status.RELAXED for s in fled)
     # beside balls that touch, a ball of 5 cm is clear at √(0.55² - 0.5²) m from there, which takes 0.92 s
     latest = (1.3 - GAP) / 0.3 - np.sqrt(0.55**2 - GAP**2) / 0.25
@@ -144,17 +145,18 @@ def test_the_farthest_velocity_is_that_of_a_linear_program():
         assert v is not None and (A @ v + d).min() == pytest.approx(best.x[-1], abs=1e-4)
 
 
-def test_both_solvers_of_flights_agree(monkeypatch):
-    if not kernels.ACCELERATED:
-        pytest.skip("there is only one without numba")
+def test_farthest_is_the_minimum_that_daqp_finds():
+    """max s - ½ s²/c - ε/2c ‖v - v̂‖²  s.t.  d + h (J v + ḋ) >= s,  lower <= v <= upper, as one QP in (v, s)."""
     rng = np.random.default_rng(1)
     for _ in range(20):
-        near = Near(rng.uniform(0.0, 0.1, (5, 10)), rng.normal(size=(5, 3)), 0.1 * rng.normal(size=5))
-        arguments = near, Manner(0.2, rng.normal(size=3)), 0.1, -np.ones(3), np.ones(3)
-        fast = _farthest(*arguments)
-        with monkeypatch.context() as patch:
-            patch.setattr(kernels, "ACCELERATED", False)
-            assert _farthest(*arguments) == pytest.approx(fast, abs=1e-6)
+        closest, J, drift = rng.uniform(0.0, 0.1, (5, 10)), rng.normal(size=(5, 3)), 0.1 * rng.normal(size=5)
+        h, comfort, gentle, leaning = 0.2, 0.1, 1e-4, rng.normal(size=3)
+        v, met = kernels.farthest(h, closest, J, drift, comfort, 10.0, gentle, leaning, -np.ones(3), np.ones(3))
+        P = np.diag([gentle, gentle, gentle, 1.0])
+        G, least = np.column_stack((h * J, -np.ones(5))), -(closest[:, 0] + h * drift)
+        bounds = np.array([-1.0, -1.0, -1.0, -10.0]), np.array([1.0, 1.0, 1.0, comfort])
+        expected = solve_daqp(P, -P @ np.append(leaning, comfort), G, least, *bounds)
+        assert met and v == pytest.approx(expected[:3], abs=1e-6)
 
 
 def test_that_flights_do_not_hold_contacts_is_said_where_something_moves():
@@ -168,7 +170,8 @@ def test_that_flights_do_not_hold_contacts_is_said_where_something_moves():
         assert scenario.contacts and scenario.avoidance.escape is not None
         controller, q = Controller.from_scenario(scenario)
         assert controller._commander.escape is None
-        assert any("flights do not hold contacts" in said for said in controller.step(q).assumed) == moves
+        kinds = [reason.kind for reason in controller.step(q).assumptions]
+        assert (ReasonKind.NO_BACKUP in kinds) == moves
 
 
 def test_only_laws_that_keep_limits_are_held_back(tmp_path):

@@ -73,7 +73,7 @@ def test_cases_are_the_same_in_another_process():
         "print(json.dumps([make_case(load_family(n), s).to_json() for n, s in json.loads(sys.argv[1])]))"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code, json.dumps(chosen)], capture_output=True, text=True, check=True, timeout=60
+        [sys.executable, "-c", code, json.dumps(chosen)], capture_output=True, text=True, check=True, timeout=300
     )
     assert json.loads(done.stdout) == [make_case(load_family(n), s).to_json() for n, s in chosen]
     assert len({case("sphere_field", s).key for s in (1, 5)}) == 2

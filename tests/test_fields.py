@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
-from qpavoid import Controller, Sample, Status, build_scene, load_scenario, make_solver, simulate
+from qpavoid import Controller, ReasonKind, Sample, Status, build_scene, load_scenario, make_solver, simulate
 from qpavoid.arena.entrants import ENTRANTS
 from qpavoid.config import Avoidance, GradientProjectionSolver, PotentialFieldSolver, Sphere
 from qpavoid.files.shipped import scenario_names
@@ -240,7 +240,9 @@ def test_a_target_that_is_nan_ends_in_a_stop_that_says_so(name):
     controller, q = Controller.from_scenario(load_scenario("panda_line", solver=name))
     lost = Sample.at([0.5, 0.0, 0.5])._replace(position=np.array([np.nan, 0.0, 0.5]))
     solution = controller.step(q, targets={"panda_hand_tcp": lost})
-    assert solution.status is Status.STOPPED and "NaN" in solution.reasons[0]
+    (reason,) = solution.reasons
+    assert solution.status is Status.STOPPED
+    assert (reason.kind, reason.subject) == (ReasonKind.IMPLAUSIBLE, ("target panda_hand_tcp",))
     assert not solution.v.any()
 
 

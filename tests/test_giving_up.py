@@ -1,5 +1,7 @@
 """The search for a way round is bounded: what was given up is said, the robot rests, and a change begins it anew."""
 
+from itertools import pairwise
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -7,7 +9,7 @@ from closed_loop import cartesian, drive, make_controller
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from qpavoid import Avoidance, Obstacle, Robot, Sample
+from qpavoid import Avoidance, Obstacle, ReasonKind, Robot, Sample
 from qpavoid.ahead.reach import arm, too_near
 from qpavoid.config import Box, Detour, Progress, Sphere
 
@@ -28,16 +30,25 @@ def loop(
     target = goal if callable(goal) else np.array(goal)
     for tick in drive(controller, np.array(start), round(seconds / DT), target=target, obstacles=seen):
         q.append(tick.state.q)
-        said.append(tick.solution.blocked)
+        said.append(tick.solution.stalled)
         least = min(least, tick.proximity.distance.min(initial=np.inf))
     assert least > KEEP - 1e-3
     return controller, np.array(q), said
 
 
+ENDED = ReasonKind.DETOUR_ENDED, ReasonKind.OUT_OF_REACH, ReasonKind.TARGET_OBSTRUCTED
+
+
 def given_up(said):
-    """Tick and text of what is said to be given up, whenever that changes."""
-    lines = [next((line for line in reasons if "gave up" in line), "") for reasons in said]
-    return [(k, line) for k, line in enumerate(lines) if line != (lines[k - 1] if k else "")]
+    """Tick and reason of each end of a search, and of each end of that, which has None."""
+    found = [next((reason for reason in reasons if reason.kind in ENDED), None) for reasons in said]
+    return [(k, reason) for k, reason in enumerate(found) if reason != (found[k - 1] if k else None)]
+
+
+def stalls(said):
+    """How often the tasks stalled anew until the search ended: before each detour, and before its end."""
+    stalled = [any(reason.kind is ReasonKind.STALLED for reason in reasons) for reasons in said]
+    return sum(now and not before for before, now in pairwise([False, *stalled]))
 
 
 def cage(inner=0.3, thick=0.05, at=(0.6, 0.0, 0.0)):
@@ -59,11 +70,13 @@ def wall(size=3.0, at=(0.3, 0.0, 0.0)):
 def test_a_goal_in_a_closed_room_is_given_up_after_all_ways_and_the_robot_rests(tmp_path):
     """No try brings the tool nearer, whichever plate it meets: another culprit is no reason to begin anew."""
     _, q, said = loop(tmp_path, cage(), (0.6, 0.0, 0.0), 40.0)
-    ((tick, line),) = given_up(said)
-    assert line.startswith("z: gave up after 4 ways round in ")
+    ((tick, reason),) = given_up(said)
+    assert (reason.kind, reason.subject, reason.unit) == (ReasonKind.DETOUR_ENDED, ("z",), "s")
+    assert stalls(said) == 4 + 1
+    assert 4 * 1.0 < reason.amount < tick * DT
     assert tick * DT < 3.0 + 4 * (2.0 + 1.0 + 4.0)  # there; each way, back, and being blocked
-    assert all(reasons[0] == line for reasons in said[tick:])
-    assert any("blocked by" in reason for reason in said[-1])
+    assert all(reasons[0] == reason for reasons in said[tick:])
+    assert any(reason.kind is ReasonKind.STALLED for reason in said[-1])
     assert np.abs(q[-1] - q[-500]).max() < 1e-3 and np.abs(q[-1] - q[-1000]).max() < 5e-3
     np.testing.assert_allclose(np.linalg.norm(q[-1] - [0.6, 0.0, 0.0]), 0.2 + RADIUS + KEEP, atol=0.01)  # at a plate
 
@@ -71,8 +84,10 @@ def test_a_goal_in_a_closed_room_is_given_up_after_all_ways_and_the_robot_rests(
 def test_with_the_default_bounds_a_wall_without_end_is_given_up_within_them(tmp_path):
     config = Detour()
     _, q, said = loop(tmp_path, wall(20.0), (0.6, 0.0, 0.0), 60.0, config)
-    ((tick, line),) = given_up(said)
-    assert line.startswith("z: gave up after 2 ways round in ")  # as long on one side as on the other
+    ((tick, reason),) = given_up(said)
+    assert (reason.kind, reason.subject) == (ReasonKind.DETOUR_ENDED, ("z",))
+    assert stalls(said) == 2 + 1  # as long on one side as on the other
+    assert config.patience < reason.amount < tick * DT
     assert config.patience < tick * DT < config.patience + 15.0  # and back
     assert np.abs(q[-1] - q[-100]).max() < 1e-3
 
@@ -82,8 +97,9 @@ def test_with_the_default_bounds_a_wall_without_end_is_given_up_within_them(tmp_
 def test_the_bounds_are_kept_whatever_they_are(tmp_path_factory, tries, longest, patience):
     config = Detour(speed=0.2, longest=longest, tries=tries, patience=patience)
     _, _, said = loop(tmp_path_factory.mktemp("robot"), wall(20.0), (0.6, 0.0, 0.0), 30.0, config)
-    ((_, line),) = given_up(said)
-    ways, seconds = int(line.split()[4]), float(line.split()[-2])
+    ((_, reason),) = given_up(said)
+    ways, seconds = stalls(said) - 1, reason.amount
+    assert reason.kind is ReasonKind.DETOUR_ENDED
     assert ways <= tries and seconds < min(patience, tries * (longest + 8.0)) + 8.0  # and back
     assert ways == tries or seconds > patience
 
@@ -95,8 +111,8 @@ def test_what_brings_the_tool_nearer_renews_the_budget(tmp_path):
     ]
     _, q, said = loop(tmp_path, plates, (2.5, 0.0, 0.0), 40.0, Detour(tries=1))
     assert np.linalg.norm(q[-1] - [2.5, 0.0, 0.0]) < 1e-3
-    stopped = {reason for reasons in said for reason in reasons}
-    assert stopped == {f"blocked by plate{i} at tool" for i in range(3)}
+    stopped = {(reason.kind, reason.subject) for reasons in said for reason in reasons}
+    assert stopped == {(ReasonKind.STALLED, ("tool", f"plate{i}")) for i in range(3)}
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
@@ -126,24 +142,26 @@ def test_a_change_begins_it_anew_and_less_than_that_does_not(tmp_path, what):
 
     config = Detour(**QUICK, tries=2)
     controller, _, said = loop(tmp_path, wall(20.0), goal, 20.0, config, seen)
-    assert [bool(line) for _, line in given_up(said)] == [True]
+    ((_, ended),) = given_up(said)
+    assert ended is not None
     if what == "reset":
         controller.reset()
     ticks = list(drive(controller, np.array([0.2, 0.0, 0.0]), 2000, target=goal, obstacles=seen, start=2001))
-    again = given_up([("z: gave up",)] + [tick.solution.blocked for tick in ticks])
+    again = given_up([(ended,)] + [tick.solution.stalled for tick in ticks])
     moved = np.ptp([tick.state.q for tick in ticks], axis=0)[1:].max()
     if what == "jitter":
-        assert len(again) == 2 and moved < 0.05
+        assert len(again) == 1 and moved < 0.05
     else:
-        assert len(again) == 3 and again[1][1] == "" and moved > 0.2
+        assert len(again) == 3 and again[1][1] is None and moved > 0.2
 
 
 def test_nothing_is_tried_for_a_goal_inside_an_obstacle(tmp_path):
     """The amount: the tool's sphere, and its distance to keep, about the goal, against the ball."""
     _, q, said = loop(tmp_path, [Obstacle.at("ball", Sphere(radius=0.1), [0.3, 0.0, 0.0])], (0.37, 0.0, 0.0), 8.0)
-    (_, line), = given_up(said)  # fmt: skip
+    (_, reason), = given_up(said)  # fmt: skip
     # the frame is the tool's centre: some point of it would be as deep in the ball as the goal is
-    assert line == "z: gave up, as its goal is 60 mm too near to ball"
+    assert (reason.kind, reason.subject, reason.unit) == (ReasonKind.TARGET_OBSTRUCTED, ("z", "ball"), "m")
+    assert reason.amount == pytest.approx(0.1 - 0.07 + KEEP, abs=5e-6)
     assert np.abs(q[:, 1:]).max() < 1e-3 and np.abs(q[-1] - q[-200]).max() < 2e-3
 
 
@@ -160,7 +178,7 @@ def test_a_goal_inside_an_obstacle_is_reached_where_the_body_stands_off_from_it(
     controller = make_controller(robot, [ball], "z", progress=Progress(detour=Detour()), task={"max_speed": 0.3})
     ticks = list(drive(controller, np.zeros(3), 600, target=[0.3, 0.0, 0.0]))
     assert np.linalg.norm(ticks[-1].state.q - [0.3, 0.0, 0.0]) < 1e-3
-    assert not any(tick.solution.blocked for tick in ticks)
+    assert not any(tick.solution.stalled for tick in ticks)
 
 
 @pytest.mark.parametrize("where", ["panda", "stand-off"])
@@ -193,7 +211,9 @@ def test_a_goal_beyond_the_arm_is_given_up_by_name_and_amount(panda):
     ball = Obstacle.at("ball", Sphere(radius=0.1), [0.62, 0.0, 0.45])
     controller = make_controller(panda, [ball], "panda_hand_tcp", progress=Progress(detour=Detour()))
     ticks = list(drive(controller, panda.home, 1200, target=goal))
-    assert ticks[-1].solution.blocked[0] == "panda_hand_tcp: gave up, as its goal is 100 mm out of reach"
+    reason = ticks[-1].solution.stalled[0]
+    assert (reason.kind, reason.subject, reason.unit) == (ReasonKind.OUT_OF_REACH, ("panda_hand_tcp",), "m")
+    assert reason.amount == pytest.approx(0.1, abs=1e-9)
     assert np.abs(ticks[-1].solution.v).max() < 2e-3
 
 

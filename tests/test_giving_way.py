@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from qpavoid import Avoidance, Obstacle, Status, make_solver
+from qpavoid import Avoidance, Obstacle, ReasonKind, Severity, Status, make_solver
 from qpavoid.config import Box, Damper
 from qpavoid.problem import AvoidanceRows, Tracking, make_problem
 
@@ -113,8 +113,12 @@ def test_between_two_walls_the_nearer_one_decides_and_both_are_named(tmp_path, o
     controller = make_controller(robot, walls, "z", avoidance=Avoidance(d1=0.06, d2=0.1, row=Damper(gain=5.0)))
     s = controller.step([off, 0.0, 0.0])
     assert s.status is Status.RELAXED
-    near, far = ("right", "left") if off > 0.0 else ("left", "right")
+    far = "left" if off > 0.0 else "right"
     # 46 mm and 54 mm: the nearer asks for 5 1/s times 14 mm = 70 mm/s and gets it, the other for 30 and loses 100
     np.testing.assert_allclose(s.v, [-np.sign(off) * 0.07, 0.0, 0.0], atol=1e-5)
-    assert s.reasons == (f"tool - {far}: 100.0 mm/s short of its row, 6.0 mm short of d1",)
-    assert s.slack.max() == pytest.approx(0.1, abs=1e-5) and near not in s.reasons[0]
+    row, distance = s.reasons
+    assert (row.kind, row.subject, row.unit) == (ReasonKind.ROW_RELAXED, ("tool", far), "m/s")
+    assert row.amount == pytest.approx(0.1, abs=1e-5) and s.slack.max() == pytest.approx(0.1, abs=1e-5)
+    assert (distance.kind, distance.subject, distance.unit) == (ReasonKind.BELOW_SAFETY_DISTANCE, ("tool", far), "m")
+    assert distance.amount == pytest.approx(0.006, abs=1e-9)
+    assert {reason.severity for reason in s.reasons} == {Severity.WARNING}  # a margin, and no contact

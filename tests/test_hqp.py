@@ -6,7 +6,7 @@ import pytest
 import qpsolvers
 from conftest import SPHERE, obstacle
 
-from qpavoid import Controller, Sample, build_scene, build_tasks, config, load_scenario, simulate
+from qpavoid import Controller, ReasonKind, Sample, Severity, build_scene, build_tasks, config, load_scenario, simulate
 from qpavoid.config import HqpSolver
 from qpavoid.problem import AvoidanceRows, Status, Tracking, make_problem
 from qpavoid.solvers import backend_names, make_solver, parse_solver
@@ -118,6 +118,14 @@ def test_later_levels_change_nothing_of_earlier_ones():
             assert costs(problem, whole.v)[0] == pytest.approx(costs(problem, first.v)[0], abs=1e-5)
 
 
+def _rows(solution):
+    """Its reasons about pairs."""
+    kinds = ReasonKind.ROW_RELAXED, ReasonKind.BELOW_SAFETY_DISTANCE
+    return [
+        reason for reason in solution.reasons if reason.kind in kinds and (reason.unit == "m" or reason.amount > 3e-3)
+    ]
+
+
 def test_contradicting_rows_give_way_as_those_of_the_qp():
     """The same pairs by the same amounts; tasks then keep their order within what is left."""
     relaxed = 0
@@ -128,7 +136,9 @@ def test_contradicting_rows_give_way_as_those_of_the_qp():
         if found.status is Status.RELAXED:
             relaxed += 1
             np.testing.assert_allclose(found.slack, expected.slack, atol=3e-3)
-            assert [r.split(":")[0] for r in found.reasons][:1] == [r.split(":")[0] for r in expected.reasons][:1]
+            for got, wanted in zip(_rows(found), _rows(expected), strict=True):
+                assert (got.kind, got.subject, got.unit) == (wanted.kind, wanted.subject, wanted.unit)
+                assert got.amount == pytest.approx(wanted.amount, abs=3e-3)
             assert (np.abs(found.v) <= 0.3 + 1e-9).all()
     assert relaxed >= 5
 
@@ -146,7 +156,8 @@ def test_a_level_that_no_back_end_can_solve_is_named_and_the_levels_before_it_ho
     monkeypatch.setattr(solver, "_solve", fails_at_the_second)
     solution = solver.solve(problem)
     assert solution.status is Status.RELAXED
-    assert solution.reasons == ("priority level 2: no back end could solve its QP",)
+    (reason,) = solution.reasons
+    assert (reason.kind, reason.subject) == (ReasonKind.PRIORITY_UNSOLVED, ("priority level 2",))
     assert costs(problem, solution.v)[0] == pytest.approx(costs(problem, expected.v)[0], abs=1e-5)
 
 
@@ -156,7 +167,9 @@ def test_what_is_not_finite_stops_the_robot():
     J[1, 0] = np.nan
     bad = problem._replace(avoidance=problem.avoidance._replace(J=J), shortfall=np.nan)
     solution = make_solver("hqp").solve(bad)
-    assert solution.status is Status.STOPPED and solution.reasons == ("a1 - b1: no distance can be told",)
+    (reason,) = solution.reasons
+    assert solution.status is Status.STOPPED and reason.severity is Severity.ALARM
+    assert (reason.kind, reason.subject) == (ReasonKind.UNKNOWN_DISTANCE, ("a1", "b1"))
     b = problem.tracking.b.copy()
     b[0] = np.nan
     assert np.isfinite(make_solver("hqp").solve(problem._replace(tracking=problem.tracking._replace(b=b))).v).all()

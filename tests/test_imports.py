@@ -23,7 +23,7 @@ importlib.import_module(sys.argv[2])
 
 def import_alone(module: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-c", ALONE, str(PACKAGE), module]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
 
 
 READERS = ["config", "problem", "solvers", "files.loading", "report", "log", "metrics", "plots.plot"]

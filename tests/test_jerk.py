@@ -4,7 +4,6 @@ The stop of one coordinate is followed tick by tick here, by its definition; the
 """
 
 from dataclasses import replace
-from importlib import import_module
 
 import numpy as np
 import pytest
@@ -13,23 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_limits import Axes, random_joints
 
+from qpavoid import kernels
 from qpavoid.kernels.stopping import longest_way, way_to_stop
 from qpavoid.limits import JointBounds, limit_layout
 
 HELD = 0.02
-
-
-def kernels_of(name):
-    if name == "compiled":
-        pytest.importorskip("numba")
-    return import_module(f"qpavoid.kernels.{name}")
-
-
-@pytest.fixture(params=["vectorised", "compiled"])
-def version(request):
-    """Name of each kernel version in turn."""
-    kernels_of(request.param)
-    return request.param
 
 
 # --- the stop of one coordinate ----------------------------------------------------------------------------------
@@ -137,11 +124,11 @@ def stops_within(joints, i, q, v, w, dt, slack):
 
 
 @pytest.mark.parametrize("dt", [0.001, 0.01, 0.05])
-def test_no_limit_is_left_in_a_hundred_thousand_ticks(version, dt):
+def test_no_limit_is_left_in_a_hundred_thousand_ticks(dt):
     """400 joints, 300 ticks each, driven into their limits, to and fro, or at random."""
     rng = np.random.default_rng(1)
     joints, q = jerky_joints(rng, 400)
-    axes, v, w = Axes(joints, 0.5, dt, version), np.zeros(400), np.zeros(400)
+    axes, v, w = Axes(joints, 0.5, dt), np.zeros(400), np.zeros(400)
     unit, reached = np.where(np.isinf(joints.jerk), np.inf, joints.jerk * dt**2), np.zeros(400, dtype=bool)
     for tick in range(300):
         lower, upper = bounds_after(axes, q, v, w)
@@ -160,11 +147,11 @@ def test_no_limit_is_left_in_a_hundred_thousand_ticks(version, dt):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_stop_ends_in_time_from_the_bounds_and_not_from_beyond_them(version, seed):
+def test_a_stop_ends_in_time_from_the_bounds_and_not_from_beyond_them(seed):
     """Where neither the jerk nor the acceleration is what holds the bound; from all kinds of viable states."""
     rng, dt, held = np.random.default_rng(seed), 0.01, 0
     joints, q = jerky_joints(rng, 40, some=False)
-    axes, v, w = Axes(joints, 0.5, dt, version), np.zeros(40), np.zeros(40)
+    axes, v, w = Axes(joints, 0.5, dt), np.zeros(40), np.zeros(40)
     for _ in range(60):
         lower, upper = bounds_after(axes, q, v, w)
         following = np.where(rng.random(40) < 0.6, upper, lower + rng.random(40) * (upper - lower))
@@ -180,13 +167,13 @@ def test_a_stop_ends_in_time_from_the_bounds_and_not_from_beyond_them(version, s
     assert held > 10
 
 
-def test_a_jerk_that_is_hardly_limited_changes_nothing(version):
+def test_a_jerk_that_is_hardly_limited_changes_nothing():
     """Nor does it to a coordinate that has none beside one that has."""
     rng, dt = np.random.default_rng(0), 0.01
     joints, q = random_joints(rng, 500)
     free = np.full(500, np.inf)
     loose = replace(joints, jerk=np.where(rng.random(500) < 0.5, np.inf, 1e6 * joints.acceleration / dt))
-    one, other = Axes(replace(joints, jerk=free), 0.5, dt, version), Axes(loose, 0.5, dt, version)
+    one, other = Axes(replace(joints, jerk=free), 0.5, dt), Axes(loose, 0.5, dt)
     v, w = np.zeros(500), np.zeros(500)
     for _ in range(40):
         lower, upper = bounds_after(one, q, v, 0.0 * w)
@@ -196,15 +183,15 @@ def test_a_jerk_that_is_hardly_limited_changes_nothing(version):
         w, v, q = following - v, following, q + dt * following
 
 
-def test_from_a_state_that_no_stop_saves_jerk_gives_way_then_acceleration(version):
+def test_from_a_state_that_no_stop_saves_jerk_gives_way_then_acceleration():
     """Position and speed are kept, and the bounds do not cross; with acceleration, as far as that can be kept."""
     joints, q = jerky_joints(np.random.default_rng(3), 500)
     rng, dt = np.random.default_rng(4), 0.01
     v = rng.uniform(-5.0, 5.0, 500)
     w = rng.uniform(-1.0, 1.0, 500) * joints.acceleration * dt
-    axes = Axes(joints, 0.5, dt, version)
+    axes = Axes(joints, 0.5, dt)
     lower, upper = bounds_after(axes, q, v, w)
-    within = Axes(replace(joints, jerk=np.full(500, np.inf)), 0.5, dt, version).bounds(q, v)
+    within = Axes(replace(joints, jerk=np.full(500, np.inf)), 0.5, dt).bounds(q, v)
     assert (within[0] <= lower).all() and (lower <= upper).all() and (upper <= within[1]).all()
     change, unit = np.maximum(lower - v - w, v + w - upper), joints.jerk * dt**2
     assert (change > unit * (1.0 + 1e-9)).sum() > 100  # what jerk alone would forbid
@@ -213,7 +200,7 @@ def test_from_a_state_that_no_stop_saves_jerk_gives_way_then_acceleration(versio
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
-def test_outside_its_position_limits_a_joint_is_sent_back_within_its_jerk(version, side):
+def test_outside_its_position_limits_a_joint_is_sent_back_within_its_jerk(side):
     """From rest, with no more than its acceleration and jerk; once inside, it stays there."""
     joints, _ = jerky_joints(np.random.default_rng(5), 300)
     joints = replace(joints, acceleration=10.0 ** np.random.default_rng(6).uniform(0, 2, 300))
@@ -221,7 +208,7 @@ def test_outside_its_position_limits_a_joint_is_sent_back_within_its_jerk(versio
     edge = joints.upper if side > 0 else joints.lower
     q = edge + side * rng.uniform(0.01, 5.0, 300) * np.minimum(joints.velocity, 0.1)
     v, w = np.zeros(300), np.zeros(300)
-    axes, choose, back = Axes(joints, 0.5, dt, version), rng.random(300), np.zeros(300, dtype=bool)
+    axes, choose, back = Axes(joints, 0.5, dt), rng.random(300), np.zeros(300, dtype=bool)
     unit = np.where(np.isinf(joints.jerk), np.inf, joints.jerk * dt**2)
     for _ in range(3000):
         lower, upper = bounds_after(axes, q, v, w)
@@ -251,7 +238,7 @@ def limited(seed, n=7):
     return make_layout(n, **limit_layout(joints, 0.5, 0.01)), rng
 
 
-def stops(kernels, x, q, v, w):
+def stops(x, q, v, w):
     """Velocities of a stop as `velocity_bounds` and `stop_velocity` lead it, tick by tick."""
     packed, way = kernels.pack(x), [v]
     while (np.abs(v) > 1e-9 * x.v_step).any() or (np.abs(w) > x.w_step).any():
@@ -267,12 +254,11 @@ def stops(kernels, x, q, v, w):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_a_stop_ends_at_rest_within_all_limits(version, seed):
+def test_a_stop_ends_at_rest_within_all_limits(seed):
     """At most twice as late as the slowest coordinate could alone."""
-    kernels = kernels_of(version)
     x, rng = limited(seed)
     v, w = rng.uniform(-1.0, 1.0, 7) * 2.0, rng.uniform(-1.0, 1.0, 7) * x.v_step
-    way = stops(kernels, x, np.zeros(7), v, w)
+    way = stops(x, np.zeros(7), v, w)
     assert np.abs(way[-1]).max() < 1e-9
     changes = np.diff(way, axis=0)
     assert (np.abs(changes) <= x.v_step * (1.0 + 1e-9)).all()
@@ -282,10 +268,10 @@ def test_a_stop_ends_at_rest_within_all_limits(version, seed):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_stop_from_constant_speed_slows_all_coordinates_alike_and_as_fast_as_one_can(version, seed):
+def test_a_stop_from_constant_speed_slows_all_coordinates_alike_and_as_fast_as_one_can(seed):
     x, rng = limited(seed)
     v = rng.uniform(-2.0, 2.0, 7)
-    way = stops(kernels_of(version), x, np.zeros(7), v, np.zeros(7))
+    way = stops(x, np.zeros(7), v, np.zeros(7))
     shares = way / v
     np.testing.assert_allclose(shares, np.repeat(shares[:, :1], 7, axis=1), atol=1e-12)
     jerk = np.abs(np.diff(way, n=2, axis=0, prepend=np.array([v]))) / x.w_step
@@ -294,9 +280,8 @@ def test_a_stop_from_constant_speed_slows_all_coordinates_alike_and_as_fast_as_o
 
 @pytest.mark.parametrize("place", [0.0, 8.9])
 @pytest.mark.parametrize("seed", range(4))
-def test_the_way_of_a_stop_is_the_stop_of_the_ticks(version, seed, place):
-    """In free space, and where position limits bend it; both versions alike."""
-    kernels = kernels_of(version)
+def test_the_way_of_a_stop_is_the_stop_of_the_ticks(seed, place):
+    """In free space, and where position limits bend it."""
     x, rng = limited(seed)
     q, v, w = np.full(7, place), rng.uniform(0.5, 1.5, 7), rng.uniform(-1.0, 1.0, 7) * x.v_step
     if place:  # a state that is viable: on the way there
@@ -311,7 +296,7 @@ def test_the_way_of_a_stop_is_the_stop_of_the_ticks(version, seed, place):
             if q.max() > 8.6:
                 break
         q = q - x.dt * v
-    expected = stops(kernels, x, q, v, w)
+    expected = stops(x, q, v, w)
     way = np.full((1000, 7), np.nan)
     way[0] = v
     count = kernels.stop_way(kernels.pack(x), q.copy(), w, way)
@@ -319,18 +304,13 @@ def test_the_way_of_a_stop_is_the_stop_of_the_ticks(version, seed, place):
     size = min(count, len(expected))
     np.testing.assert_allclose(way[:size], expected[:size], rtol=1e-9, atol=1e-9)
     assert (np.ptp(expected[: size // 2] / v, axis=1) > 1e-6).any()  # not all coordinates alike
-    other = np.zeros((1000, 7))
-    other[0] = v
-    assert kernels_of("vectorised").stop_way(kernels_of("vectorised").pack(x), q.copy(), w, other) == count
-    np.testing.assert_allclose(other[:count], way[:count], rtol=1e-12, atol=1e-12)
 
 
 # --- rows --------------------------------------------------------------------------------------------------------
 
 
-def test_half_of_jerks_and_accelerations_bring_a_pair_to_rest_where_it_has_to_be(version):
+def test_half_of_jerks_and_accelerations_bring_a_pair_to_rest_where_it_has_to_be():
     """A pair that closes as fast as its row allows, and as its joints can follow, never comes nearer than it may."""
-    kernels = kernels_of(version)
     step, unit, J, dt = np.array([0.1, 0.2]), np.array([0.01, 0.02]), np.array([[0.5, -1.0]]), 0.01
     d, v, w = np.array([0.9]), np.zeros(2), np.zeros(2)
     way, changes = [], []
@@ -339,7 +319,7 @@ def test_half_of_jerks_and_accelerations_bring_a_pair_to_rest_where_it_has_to_be
         closest[:, 0] = d
         x = make_layout(2, pairs=1, closest=closest, near=np.arange(1), drift=np.zeros(1), J=J, v_step=step,
             w_step=unit, v_last=v, w_last=w, accelerated=True, jerked=True, v_stop=np.array([0.0, -1e3]),
-            switching=False, row_gain=100.0, lower=-np.ones(2), upper=np.ones(2),
+            beta=False, row_gain=100.0, lower=-np.ones(2), upper=np.ones(2),
         )  # fmt: skip
         kernels.row_bounds(kernels.pack(x), 1, False)
         # the velocity along J that closes fastest, within the row and within what half of the limits allow

@@ -1,7 +1,6 @@
 """Joint limits: bounds that never cross and are never left."""
 
 from dataclasses import replace
-from importlib import import_module
 
 import numpy as np
 import pytest
@@ -11,7 +10,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from qpavoid.config import Limits
-from qpavoid.kernels.vectorised.bounds import speed_to_stop
+from qpavoid.kernels import pack, speed_to_stop, velocity_bounds
+from qpavoid.kernels.packing import compiled
 from qpavoid.limits import JointBounds, limit_layout, saturate
 
 N = 4
@@ -24,30 +24,21 @@ FREE = np.full(N, np.inf)
 
 
 class Axes:
-    """Bounds of joints in any number of ticks, by one of the two kernel versions."""
+    """Bounds of joints in any number of ticks."""
 
-    def __init__(self, joints, gain, dt, kernels="vectorised"):
-        if kernels == "compiled":
-            pytest.importorskip("numba")
-        self._kernels = import_module(f"qpavoid.kernels.{kernels}")
+    def __init__(self, joints, gain, dt):
         self.layout = make_layout(len(joints.velocity), **limit_layout(joints, gain, dt))
-        self._packed = self._kernels.pack(self.layout)
+        self._packed = pack(self.layout)
 
     def bounds(self, q, v_last=0.0):
         """Copies of lower and upper."""
         self.layout.v_last[:] = v_last
-        self._kernels.velocity_bounds(self._packed, q)
+        velocity_bounds(self._packed, q)
         return self.layout.lower.copy(), self.layout.upper.copy()
 
 
 def bounds_at(joints, q, gain, dt):
     return Axes(joints, gain, dt).bounds(q)
-
-
-@pytest.fixture(params=["vectorised", "compiled"])
-def version(request):
-    """Name of each kernel version in turn."""
-    return request.param
 
 
 def vector(low, high):
@@ -97,13 +88,13 @@ def test_outside_its_limits_a_joint_is_sent_back_without_overshoot(joints, beyon
     assert (following < beyond).all() and (following >= -1e-9).all()
 
 
-def test_bounds_by_hand(version):
+def test_bounds_by_hand():
     joints = JointBounds(
         np.array([2.0, 1.0, np.inf]), np.array([0, 3]), np.array([0, 2]), -np.ones(2), np.ones(2),
         np.full(3, np.inf), np.full(3, np.inf),
     )  # fmt: skip
     q = np.array([0.99, 7.0, 7.0, 0.0])  # the middle joint is continuous: two numbers in q, one in v
-    lower, upper = Axes(joints.within(Limits(velocity_scale=0.5)), 0.5, 0.01, version).bounds(q)
+    lower, upper = Axes(joints.within(Limits(velocity_scale=0.5)), 0.5, 0.01).bounds(q)
     np.testing.assert_allclose(upper, [0.5, 0.5, 50.0])
     np.testing.assert_allclose(lower, [-1.0, -0.5, -50.0])
 
@@ -179,16 +170,8 @@ def travel(v, step, dt):
     return far
 
 
-def stopping_speed(kernels):
-    if kernels == "vectorised":
-        return speed_to_stop
-    pytest.importorskip("numba")
-    from qpavoid.kernels.compiled.bounds import _speed_to_stop
-
-    return np.vectorize(_speed_to_stop, otypes=[float])
-
-
-def test_a_coordinate_just_stops_in_time_from_the_speed_to_stop(version):
+@pytest.mark.parametrize("of", [speed_to_stop, compiled(speed_to_stop)])
+def test_a_coordinate_just_stops_in_time_from_the_speed_to_stop(of):
     """And does not from a speed that is a thousandth larger."""
     rng = np.random.default_rng(0)
     room, step, dt = (
@@ -196,15 +179,16 @@ def test_a_coordinate_just_stops_in_time_from_the_speed_to_stop(version):
         10.0 ** rng.uniform(-3, 1, 3000),
         10.0 ** rng.uniform(-3, -1, 3000),
     )
-    v = stopping_speed(version)(room, step, dt)
+    v = of(room, step, dt)
     np.testing.assert_allclose(travel(v, step, dt), room, rtol=1e-9)
     assert (travel(1.001 * v, step, dt) > 1.0005 * room).all()
 
 
-def test_speed_to_stop_by_hand(version):
+@pytest.mark.parametrize("of", [speed_to_stop, compiled(speed_to_stop)])
+def test_speed_to_stop_by_hand(of):
     """Steps of 0.1 in ticks of 0.01: 0.1 goes 1e-3, 0.2 goes 3e-3, 0.15 goes 2e-3; n steps go 1e-3 n (n + 1) / 2."""
     room = 1e-3 * np.array([0.0, 0.5, 1.0, 2.0, 3.0, 55.0, np.inf])
-    found = stopping_speed(version)(room, np.full(7, 0.1), 0.01)
+    found = of(room, np.full(7, 0.1), 0.01)
     np.testing.assert_allclose(found, [0.0, 0.05, 0.1, 0.15, 0.2, 1.0, np.inf], rtol=1e-12)
 
 
@@ -232,13 +216,12 @@ def braked(draw):
     return joints, dt, q, v
 
 
-@pytest.mark.parametrize("kernels", ["vectorised", "compiled"])
 @fast
 @given(state=braked(), choice=vector(0.0, 1.0), gain=share)
-def test_a_state_that_can_be_braked_is_followed_by_one_that_can(kernels, state, choice, gain):
+def test_a_state_that_can_be_braked_is_followed_by_one_that_can(state, choice, gain):
     """Whatever is chosen within the bounds keeps position, speed and acceleration limits, now and later."""
     joints, dt, q, v_last = state
-    lower, upper = Axes(joints, gain, dt, kernels).bounds(q, v_last)
+    lower, upper = Axes(joints, gain, dt).bounds(q, v_last)
     assert (lower <= upper).all()
     for v in (lower, upper, lower + choice * (upper - lower)):
         assert (np.abs(v - v_last) <= joints.acceleration * dt + 1e-9).all()
@@ -260,10 +243,10 @@ def random_joints(rng, count):
 
 
 @pytest.mark.parametrize("dt", [0.001, 0.01, 0.05])
-def test_no_limit_is_left_in_a_hundred_thousand_ticks(version, dt):
+def test_no_limit_is_left_in_a_hundred_thousand_ticks(dt):
     """500 joints, 200 ticks each, driven into their limits, to and fro, or at random."""
     joints, q = random_joints(np.random.default_rng(1), 500)
-    axes, rng, v_last = Axes(joints, 0.5, dt, version), np.random.default_rng(2), np.zeros(500)
+    axes, rng, v_last = Axes(joints, 0.5, dt), np.random.default_rng(2), np.zeros(500)
     reached = np.zeros(500, dtype=bool)
     for tick in range(200):
         lower, upper = axes.bounds(q, v_last)
@@ -279,14 +262,14 @@ def test_no_limit_is_left_in_a_hundred_thousand_ticks(version, dt):
     assert reached.mean() > 0.05  # pushed right to a limit, and no farther
 
 
-def test_from_a_state_that_no_braking_saves_the_acceleration_gives_way(version):
+def test_from_a_state_that_no_braking_saves_the_acceleration_gives_way():
     """Position and speed are kept, and the bounds do not cross."""
     joints, q = random_joints(np.random.default_rng(3), 500)
     rng, dt = np.random.default_rng(4), 0.01
     v_last = rng.uniform(-50.0, 50.0, 500)
     broken = ~viable(joints, q, v_last, dt) | (np.abs(v_last) > joints.velocity + joints.acceleration * dt)
     assert broken.sum() > 100
-    axes = Axes(joints, 0.5, dt, version)
+    axes = Axes(joints, 0.5, dt)
     lower, upper = axes.bounds(q, v_last)
     hard_lower, hard_upper = axes.layout.hard_lower, axes.layout.hard_upper
     assert (hard_lower <= lower).all() and (lower <= upper).all() and (upper <= hard_upper).all()
@@ -298,7 +281,7 @@ def test_from_a_state_that_no_braking_saves_the_acceleration_gives_way(version):
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
-def test_outside_its_position_limits_a_joint_is_braked_and_sent_back(version, side):
+def test_outside_its_position_limits_a_joint_is_braked_and_sent_back(side):
     """With no more than its acceleration, from any speed within its limits; then it stays inside."""
     joints, _ = random_joints(np.random.default_rng(5), 500)
     joints = replace(joints, acceleration=10.0 ** np.random.default_rng(6).uniform(0, 2, 500))
@@ -308,7 +291,7 @@ def test_outside_its_position_limits_a_joint_is_braked_and_sent_back(version, si
     q = edge + side * rng.uniform(0.01, 5.0, 500) * np.minimum(joints.velocity, 0.1)
     v = side * rng.uniform(-0.2, 1.0, 500) * np.minimum(joints.velocity, 1.0)
     v = np.where(side * v < 0.0, -side * np.minimum(np.abs(v), speed_to_stop(width, step, dt)), v)
-    axes, choose = Axes(joints, 0.5, dt, version), rng.random(500)
+    axes, choose = Axes(joints, 0.5, dt), rng.random(500)
     back = np.zeros(500, dtype=bool)
     for _ in range(3000):
         lower, upper = axes.bounds(q, v)
@@ -334,7 +317,7 @@ def test_acceleration_limits_of_a_robot_and_of_a_scenario():
     np.testing.assert_array_equal(found, [1.0, 3.0, 2.0, 3.0])
 
 
-def test_joints_with_and_without_acceleration_limits(version):
+def test_joints_with_and_without_acceleration_limits():
     """3 mm from a limit: 0.2 where steps of 0.1 brake, half of the way in a tick where nothing does; one is free."""
     joints = JointBounds(
         np.full(3, 9.0),
@@ -345,6 +328,6 @@ def test_joints_with_and_without_acceleration_limits(version):
         np.array([10.0, np.inf, 10.0]),
         np.full(3, np.inf),
     )
-    lower, upper = Axes(joints, 0.5, 0.01, version).bounds(np.array([0.997, 0.997, 0.0]), np.array([0.25, 3.0, 1.0]))
+    lower, upper = Axes(joints, 0.5, 0.01).bounds(np.array([0.997, 0.997, 0.0]), np.array([0.25, 3.0, 1.0]))
     np.testing.assert_allclose(lower, [0.15, -9.0, 0.9], rtol=1e-9)
     np.testing.assert_allclose(upper, [0.2, 0.15, 1.1], rtol=1e-9)

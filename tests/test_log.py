@@ -6,7 +6,7 @@ from dataclasses import FrozenInstanceError, fields
 import numpy as np
 import pytest
 
-from qpavoid import ConfigError, Controller, Log, ScenarioConfig, load_scenario, simulate
+from qpavoid import ConfigError, Controller, Log, ScenarioConfig, Severity, load_scenario, simulate
 from qpavoid.log import STATUSES
 from qpavoid.solvers.analytic import TrackingOnly
 
@@ -143,8 +143,10 @@ def test_interrupt_before_the_first_tick_is_over(monkeypatch, tmp_path):
     assert Log.load(log.save(tmp_path / "none")).metrics()["completed"] is False
 
 
-def said(log: Log) -> str:
-    return " ".join(line for *_, lines in log.meta["events"] for line in lines)
+def said(log: Log) -> list[tuple]:
+    """Kind, subject and severity of all reasons in its events."""
+    reasons = [reason for *_, reasons in log.meta["events"] for reason in reasons]
+    return [(reason["kind"], reason["subject"], reason["severity"]) for reason in reasons]
 
 
 def test_malformed_state_stops_the_robot_and_says_why(log, monkeypatch, tmp_path):
@@ -159,7 +161,8 @@ def test_malformed_state_stops_the_robot_and_says_why(log, monkeypatch, tmp_path
     stopped = blind.status == STATUSES.index("STOPPED")
     assert stopped[5:].all() and not stopped[:5].any()
     assert (np.diff(np.abs(blind.v[4:]), axis=0) <= 0.0).all() and not blind.v[-1].any()
-    assert "q: NaN or infinity" in said(blind)
+    assert ("IMPLAUSIBLE", ["q"], "ALARM") in said(blind)
+    assert (blind.severity[stopped] == Severity.ALARM).all() and (blind.severity[:5] == 0).all()
     loaded = Log.load(blind.save(tmp_path / "blind"))
     assert loaded.meta == blind.meta
     for name in ARRAYS:  # NaN is kept
@@ -175,7 +178,7 @@ def test_solver_that_returns_nan_stops_the_robot_and_is_seen(monkeypatch):
 
     monkeypatch.setattr(TrackingOnly, "solve", fail)
     log = simulate(load_scenario("situation1", SHORT, "tracking"))
-    assert "no finite velocity" in said(log)
+    assert said(log) == [("SOLVER_FAILED", [], "ALARM")]
     assert (log.status == STATUSES.index("STOPPED")).all()
     np.testing.assert_array_equal(log.v, 0.0)
 

@@ -12,6 +12,7 @@ from rich.console import Console
 from qpavoid import Log
 from qpavoid.log import STATUSES
 from qpavoid.metrics import path_deviation
+from qpavoid.reason import Reason, ReasonKind, Severity
 from qpavoid.report import failed, metrics_table, outcome, to_json
 
 DT = 0.1
@@ -28,7 +29,10 @@ def make_log(ticks: int, meta: dict | None = None, **arrays) -> Log:
     rows |= {"closest_pair": np.full(ticks, -1), "status": np.zeros(ticks, dtype=np.int8)}
     config = {"dt": DT, "goal_tolerance": 0.2, "thresholds": [0.0, 0.1, 0.2]}
     names = {"scenario": "by hand", "solver": "qp", "completed": True, "stopped_by": None}
-    names["events"] = [[0.1 * i, "RELAXED", [f"line {i}"]] for i in range(min(ticks, 3))]
+    names["events"] = [
+        [0.1 * i, "RELAXED", [Reason.of(ReasonKind.ROW_RELAXED, "hand", "ball", amount=0.1 * i, unit="m/s").as_dict()]]
+        for i in range(min(ticks, 3))
+    ]
     pairs = [["upper arm", "ball"], ["hand", "ball"]]
     given = {name: np.asarray(array) for name, array in arrays.items()}
     return Log(**{**rows, **given}, meta={**names, "config": config, "pairs": pairs, **(meta or {})})
@@ -48,7 +52,8 @@ def log():
         closest_pair=[0, 0, 1, 1, 0],
         status=[STATUSES.index(s) for s in ("SOLVED", "RELAXED", "RELAXED", "STOPPED", "SOLVED")],
         share=[1.0, 0.5, 1.0, 0.0, 1.0],
-        blocked=np.array([False, False, True, True, True]),
+        stalled=np.array([False, False, True, True, True]),
+        severity=np.array([0, Severity.WARNING, Severity.WARNING, Severity.ALARM, Severity.INFO], dtype=np.int8),
         build_time=np.array([4, 5, 6, 7, 8]) * 1e-6,
         solve_time=np.array([6, 15, 24, 33, 92]) * 1e-6,
     )
@@ -74,7 +79,8 @@ def test_every_figure_of_a_run(log):
         "status_counts": {"SOLVED": 2, "RELAXED": 2, "STOPPED": 1},
         "relaxed_ticks": 2,
         "shortened_ticks": 2,
-        "time_blocked": pytest.approx(3 * DT),
+        "time_stalled": pytest.approx(3 * DT),
+        "severity_counts": {"INFO": 1, "WARNING": 2, "ALARM": 1},
         "events": log.meta["events"],
         "tick_us": {"p50": pytest.approx(30.0), "p99": pytest.approx(97.6), "max": pytest.approx(100.0)},
     }
@@ -156,6 +162,9 @@ def test_nan_velocity_is_not_hidden():
     [
         ({}, False, "arrived"),
         ({"status_counts": {"SOLVED": 1, "RELAXED": 1, "STOPPED": 0}}, False, "1 relaxed, arrived"),
+        ({"severity_counts": {"INFO": 0, "WARNING": 7, "ALARM": 0}}, False, "7 warning, arrived"),
+        ({"severity_counts": {"INFO": 4, "WARNING": 3, "ALARM": 2}}, False, "2 alarm, 3 warning, 4 info, arrived"),
+        ({"time_stalled": 1.26}, False, "stalled 1.3 s, arrived"),
         ({"arrived": False}, False, "short of goal"),
         ({"collided": True}, True, "collided, arrived"),
         ({"status_counts": {"SOLVED": 1, "RELAXED": 0, "STOPPED": 1}}, True, "1 stopped, arrived"),
@@ -169,10 +178,10 @@ def test_outcome_in_words_and_as_failure(changes, bad, words):
     assert console.render_str(outcome(run)).plain == words
 
 
-def printed(runs: list[dict]) -> list[str]:
-    """Lines of the table in a terminal of 80 columns."""
-    console = Console(width=80, file=io.StringIO(), record=True)
-    console.print(metrics_table(runs))
+def printed(runs: list[dict], width: int = 80) -> list[str]:
+    """Lines of the table in a terminal of so many columns."""
+    console = Console(width=width, file=io.StringIO(), record=True)
+    console.print(metrics_table(runs, width))
     return console.export_text().splitlines()
 
 
@@ -184,19 +193,32 @@ def test_table_holds_the_figures(log):
     assert max(map(cell_len, lines)) <= 80
 
 
-def test_table_cuts_no_outcome(log):
+@pytest.mark.parametrize("width", [80, 60, 48])
+def test_table_cuts_no_outcome_however_narrow(log, width):
     wide = log.metrics() | {"min_distance": -0.3, "time_in_collision": 12.5, "final_error": 0.23, "max_deviation": 0.5}
     runs = [
-        wide | {"solver": solver, "collided": collided, "time_blocked": blocked, "tick_us": {"p50": 1234.0}}
+        wide | {"solver": solver, "collided": collided, "time_stalled": stalled, "tick_us": {"p50": 1234.0}}
         for solver in ("tracking", "eq10-literal", "gradient-projection")
         for collided in (False, True)
-        for blocked in (0.0, 12.3)
+        for stalled in (0.0, 12.3)
     ]
     for run in runs:
-        words = " ".join(printed([run])).split()
+        lines = printed([run], width)
+        assert max(map(cell_len, lines)) <= width and "…" not in "".join(lines)
+        words = " ".join(lines).split()
         said = Console().render_str(outcome(run)).plain.split()
-        start = words.index(said[0])
-        assert words[start : start + len(said)] == said
+        start = words.index(said[0], words.index(run["solver"]))
+        assert [word for word in words[start:] if word in said] == said
+
+
+def test_table_leaves_the_least_important_columns_out_and_says_how_many(log):
+    runs, said = [log.metrics()], []
+    for width in (100, 62, 52, 40):
+        heading = "\n".join(printed(runs, width))
+        said.append([name in heading for name in ("dist", "coll", "err", "dev", "peak", "Σ|Δq̇|", "tick")])
+        assert said[-1] == sorted(said[-1], reverse=True)
+        assert (f"{7 - sum(said[-1])} more column" in " ".join(heading.split())) == (sum(said[-1]) < 7)
+    assert [sum(shown) for shown in said] == sorted({sum(shown) for shown in said}, reverse=True) and all(said[0])
 
 
 def test_table_heads_its_columns_with_units(log):

@@ -19,14 +19,18 @@ COURSES = {
 }
 """Start, end and speed of a sphere that meets the arm, relative to the tool's start."""
 HELD = 0.020
-"""Safety distance of Situation 1 between surfaces: 0.12 m between axes."""
+"""Safety distance of the damper rows between surfaces: 0.12 m between axes."""
 
 
-def situation(course):
+def situation(course, row=None, **avoidance):
+    """Situation 1 with the sphere on a course, with rows of a damper that hold 20 mm unless it is said otherwise."""
     start, end, speed = COURSES[course]
     line = {"type": "line", "start": (TOOL + start).tolist(), "end": (TOOL + end).tolist(), "speed": speed}
+    row = row or {"type": "damper", "d_safe": 0.12, "gain": 5}
     return changed(
-        "situation1", obstacles=[{"name": "fist", "shape": {"type": "sphere", "radius": 0.05}, "motion": line}]
+        "situation1",
+        obstacles=[{"name": "fist", "shape": {"type": "sphere", "radius": 0.05}, "motion": line}],
+        avoidance={"d1": 0.18, "d2": 0.36, "offset": 0.1, "row": row, **avoidance},
     )
 
 
@@ -40,6 +44,18 @@ def test_qp_holds_its_safety_distance_in_situation_1(course):
     metrics = followed(course).metrics()
     assert HELD - 2e-3 < metrics["min_distance"] < 0.03
     assert metrics["status_counts"]["STOPPED"] == 0
+
+
+@pytest.mark.parametrize("escape", [{}, None], ids=["escape", "law alone"])
+@pytest.mark.parametrize("course", COURSES)
+def test_rows_of_eq10_hold_d1_as_eq10_does_not(course, escape):
+    """The same gains: 80 mm between surfaces are asked for. What chases the tool catches it under eq. 10."""
+    scenario = situation(course, {"type": "task-switching"}, escape=escape)
+    metrics = simulate(scenario).metrics()
+    assert metrics["min_distance"] > 0.080 - 2e-3
+    assert metrics["status_counts"]["RELAXED"] == metrics["status_counts"]["STOPPED"] == 0
+    theirs = simulate(scenario, "eq10").metrics()
+    assert theirs["min_distance"] < 0.080 - 5e-3 and theirs["collided"] == course.startswith("chase")
 
 
 def given(course, what, ticks):

@@ -1,6 +1,4 @@
-"""Point clouds: voxels, the nearest of them to each body by brute force, both kernels, the loop, and bad pictures."""
-
-from importlib import import_module
+"""Point clouds: voxels, the nearest of them to each body by brute force, the loop, and bad pictures."""
 
 import coal
 import numpy as np
@@ -26,12 +24,11 @@ from qpavoid import (
 )
 from qpavoid.config import PointCloud
 from qpavoid.geometry.cloud import ball_radius, read_points
-from qpavoid.kernels.vectorised import voxels as voxels_module
+from qpavoid.kernels.voxels import ALIKE
 from qpavoid.proximity import DistanceQuery
 
 CLOUD = PointCloud()
 BALL = ball_radius(CLOUD.resolution)
-VERSIONS = ["vectorised", "compiled"] if kernels.ACCELERATED else ["vectorised"]
 
 
 def scattered(rng, count=400, spread=0.8):
@@ -191,10 +188,7 @@ def by_definition(point, distance, place, size, spacing):
     order, chosen = np.argsort(distance, kind="stable"), []
 
     def alike(i, j):
-        return (
-            abs(place[i, 0] - place[j, 0]) < spacing
-            and np.linalg.norm(place[i, 1:] - place[j, 1:]) < voxels_module.ALIKE
-        )
+        return abs(place[i, 0] - place[j, 0]) < spacing and np.linalg.norm(place[i, 1:] - place[j, 1:]) < ALIKE
 
     for i in order:
         if len(chosen) < (size + 1) // 2 and all(abs(place[i, 0] - place[j, 0]) >= spacing for j in chosen):
@@ -206,51 +200,47 @@ def by_definition(point, distance, place, size, spacing):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_both_versions_of_the_kernels_agree(seed):
-    rng, found = np.random.default_rng(seed), []
+def test_nearest_voxels_of_bodies_by_their_definition(seed):
+    rng = np.random.default_rng(seed)
     voxels = Voxels.of(scattered(rng, 1 if seed == 0 else 600), 0.03)
     axes, radii = rng.uniform(-0.5, 0.5, (5, 6)), rng.uniform(0.05, 0.1, 5)
     axes[1, 3:], axes[3] = axes[1, :3], np.nan  # a sphere, and a body that is not looked at
     kept0 = np.full((5, 6), -1)
     if len(voxels.keys) > 10:
         kept0[:, 2:4] = rng.choice(voxels.keys, (5, 2))
-    for name in VERSIONS:
-        module = import_module(f"qpavoid.kernels.{name}")
-        room = 5 * len(voxels.centers)
-        first, point = np.zeros(6, dtype=np.intp), np.zeros(room, dtype=np.intp)
-        distance, place = np.zeros(room), np.zeros((room, 4))
-        reach = 0.2 if seed else np.inf
-        module.within_reach(
-            axes, radii, reach, voxels.centers, voxels.blocks, voxels.starts, first, point, distance, place
-        )
-        count, kept, slots = first[-1], kept0.copy(), np.zeros((5, 6), dtype=np.intp)
-        for body in range(5):  # by definition
-            a, b = axes[body, :3], axes[body, 3:]
-            mine = point[first[body] : first[body + 1]]
-            if np.isnan(a).any():
-                assert not len(mine)
-                continue
-            share = np.clip((voxels.centers - a) @ (b - a) / max((b - a) @ (b - a), 1e-300), 0.0, 1.0)
-            gap = np.linalg.norm(voxels.centers - a - share[:, None] * (b - a), axis=1) - radii[body]
-            np.testing.assert_array_equal(np.sort(mine), np.flatnonzero(gap < reach))
-            np.testing.assert_allclose(distance[first[body] : first[body + 1]], gap[mine], atol=1e-12)
-        before = point[:count].copy(), distance[:count].copy(), place[:count].copy()
-        module.choose(first, point, distance, place, np.full(5, 0.2), voxels.keys, slots, kept)
-        found.append((first, *before, slots, kept))
-        for body in range(5):
-            rows = slice(first[body], first[body + 1])
-            assert set(slots[body]) - {-1} == set(by_definition(*(x[rows] for x in before), 6, 0.2))
-            for slot in range(6):
-                if slots[body, slot] >= 0 and voxels.keys[slots[body, slot]] in kept0[body]:
-                    assert kept0[body, slot] == kept[body, slot]
-    for one, other in zip(found[0], found[-1], strict=True):
-        np.testing.assert_allclose(one, other, rtol=0, atol=1e-12)
+    room = 5 * len(voxels.centers)
+    first, point = np.zeros(6, dtype=np.intp), np.zeros(room, dtype=np.intp)
+    distance, place = np.zeros(room), np.zeros((room, 4))
+    reach = 0.2 if seed else np.inf
+    kernels.within_reach(
+        axes, radii, reach, voxels.centers, voxels.blocks, voxels.starts, first, point, distance, place
+    )
+    count, kept, slots = first[-1], kept0.copy(), np.zeros((5, 6), dtype=np.intp)
+    for body in range(5):  # by definition
+        a, b = axes[body, :3], axes[body, 3:]
+        mine = point[first[body] : first[body + 1]]
+        if np.isnan(a).any():
+            assert not len(mine)
+            continue
+        share = np.clip((voxels.centers - a) @ (b - a) / max((b - a) @ (b - a), 1e-300), 0.0, 1.0)
+        away = voxels.centers - a - share[:, None] * (b - a)
+        gap = np.linalg.norm(away, axis=1) - radii[body]
+        np.testing.assert_array_equal(np.sort(mine), np.flatnonzero(gap < reach))
+        np.testing.assert_allclose(distance[first[body] : first[body + 1]], gap[mine], atol=1e-12)
+        places = np.column_stack((share * np.linalg.norm(b - a), away / np.linalg.norm(away, axis=1)[:, None]))
+        np.testing.assert_allclose(place[first[body] : first[body + 1]], places[mine], atol=1e-12)
+    before = point[:count].copy(), distance[:count].copy(), place[:count].copy()
+    kernels.choose(first, point, distance, place, np.full(5, 0.2), voxels.keys, slots, kept)
+    for body in range(5):
+        rows = slice(first[body], first[body + 1])
+        assert set(slots[body]) - {-1} == set(by_definition(*(x[rows] for x in before), 6, 0.2))
+        for slot in range(6):
+            if slots[body, slot] >= 0 and voxels.keys[slots[body, slot]] in kept0[body]:
+                assert kept0[body, slot] == kept[body, slot]
 
 
-@pytest.mark.parametrize("version", VERSIONS)
-def test_voxels_stay_in_their_slots(version):
+def test_voxels_stay_in_their_slots():
     """One voxel comes in, one goes: the others stay where they were."""
-    choose = import_module(f"qpavoid.kernels.{version}").choose
     keys, kept = np.arange(100, 120), np.full((1, 4), -1)
     slots, first = np.zeros((1, 4), dtype=np.intp), np.array([0, 6])
     place = np.zeros((6, 4))
@@ -258,7 +248,7 @@ def test_voxels_stay_in_their_slots(version):
 
     def chosen(distances):
         point = np.arange(6)
-        choose(first, point, np.array(distances, dtype=float), place, np.array([0.5]), keys, slots, kept)
+        kernels.choose(first, point, np.array(distances, dtype=float), place, np.array([0.5]), keys, slots, kept)
         return slots[0].tolist()
 
     before = chosen([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])

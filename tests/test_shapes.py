@@ -14,8 +14,10 @@ from qpavoid import (
     ConfigError,
     Controller,
     Obstacle,
+    ReasonKind,
     Robot,
     Sample,
+    Severity,
     Status,
     build_scene,
     config,
@@ -325,7 +327,10 @@ def test_a_cut_surface_stops_the_robot_and_says_so(tmp_path):
         scene_obstacle = Obstacle.at("it", Mesh(path=str(path), method="surface"), [0.5, 0, 0])
         controller = make_controller(tool(tmp_path, BODIES["sphere"]), [scene_obstacle], "z")
     inside = controller.step(np.array([0.5, 0.09, 0.0]))
-    assert inside.status is Status.STOPPED and any("tool" in reason and "it" in reason for reason in inside.reasons)
+    assert inside.status is Status.STOPPED
+    for reason in inside.reasons:
+        assert (reason.kind, reason.subject) == (ReasonKind.UNKNOWN_DISTANCE, ("tool", "it"))
+        assert reason.severity is Severity.ALARM
     assert controller.step(np.array([0.0, 0.0, 0.0])).status is Status.SOLVED
 
 

@@ -6,11 +6,10 @@ import qpsolvers
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from qpavoid import Problem, Status, UnknownName, make_solver
+from qpavoid import Problem, ReasonKind, Severity, Status, UnknownName, make_solver
 from qpavoid.config import Eq10Solver
 from qpavoid.errors import SolverNotInstalled
 from qpavoid.gains import alpha, beta
-from qpavoid.kernels import ACCELERATED
 from qpavoid.problem import AvoidanceRows, Tracking, make_problem
 from qpavoid.solvers import qp
 from qpavoid.solvers.analytic import tracking_velocity
@@ -18,8 +17,7 @@ from qpavoid.solvers.backends import make_backend
 
 NV, D1, D2 = 7, 0.18, 0.36
 seeds = st.integers(0, 2**32 - 1)
-COMPILED = ("native",) if ACCELERATED else ()
-EXACT = ("daqp", "quadprog", *COMPILED)
+EXACT = ("daqp", "quadprog", "native")
 BACKENDS = (*EXACT, "proxqp", "osqp")
 
 
@@ -194,8 +192,10 @@ def test_contradicting_rows_relax_and_the_nearer_threat_gives_less(backend, d, v
     assert solution.v[0] == pytest.approx(v, abs=1e-4)
     np.testing.assert_allclose(solution.slack, np.maximum(rows.b - rows.J @ solution.v, 0.0), atol=1e-9)
     assert np.all(rows.J @ solution.v >= rows.touch - 1e-5)
-    gives = [f"body{i} - obstacle{i}:" for i in np.argsort(d, kind="stable") if solution.slack[i] > 1e-4]
-    assert [reason.split(": ")[0] + ":" for reason in solution.reasons if "short of its row" in reason] == gives
+    given = [i for i in np.argsort(d, kind="stable") if solution.slack[i] > 2e-6]
+    named = [reason for reason in solution.reasons if reason.kind is ReasonKind.ROW_RELAXED]
+    assert [reason.subject for reason in named] == [(f"body{i}", f"obstacle{i}") for i in given]
+    np.testing.assert_array_equal([reason.amount for reason in named], solution.slack[given])
 
 
 @pytest.mark.parametrize("backend", EXACT)  # proxqp and osqp are not exact enough to find the least excess
@@ -208,12 +208,14 @@ def test_acceleration_limits_give_way_before_pairs_touch_and_other_limits_never(
     solution = make_solver(f"qp:{backend}").solve(threatened(J, np.array([0.01]), drift, free=0.1))
     assert solution.status is Status.RELAXED
     assert solution.v[2] == pytest.approx(v, abs=1e-4)
-    hurried = [reason for reason in solution.reasons if "acceleration" in reason]
-    excess = {reason.split(":")[0]: float(reason.split(" ")[1]) for reason in hurried}
+    hurried = [reason for reason in solution.reasons if reason.kind is ReasonKind.ACCELERATION_RELAXED]
+    excess = {reason.subject: reason.amount for reason in hurried}
     if v == 0.1:
         assert not excess
     else:
-        assert excess["joint3"] == pytest.approx(v - 0.1, abs=2e-3)
+        assert excess[("joint3",)] == pytest.approx(v - 0.1, abs=1e-4)
+    contact = drift == -4.0  # at full speed, and still not enough
+    assert solution.severity is (Severity.ALARM if contact else Severity.WARNING)
     assert np.all(np.abs(solution.v) <= 2.0)
     assert solution.slack[0] == pytest.approx(0.2 - drift - v, abs=1e-4)
 
@@ -265,7 +267,8 @@ def test_a_back_end_that_fails_or_lies_is_replaced_and_ends_in_a_stop_where_that
         with monkeypatch.context() as patch:
             patch.setattr(qp, "solve_daqp", answer)
             solution = solver.solve(relaxed)
-        assert solution.status is Status.STOPPED and solution.reasons
+        assert solution.status is Status.STOPPED
+        assert [reason.kind for reason in solution.reasons] == [ReasonKind.SOLVER_FAILED]
         np.testing.assert_array_equal(solution.v, 0.05)
 
 

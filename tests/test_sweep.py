@@ -537,7 +537,7 @@ def test_a_cluster_loses_a_worker_half_way(folder, cluster):
             workers[0].kill()
 
     with sweep.remote_cluster(address) as client:
-        client.wait_for_workers(2, timeout=60)
+        client.wait_for_workers(2, timeout=300)
         tally = swept(suite, out, client, tell)
         assert len(client.nthreads()) == 1
     assert tally.done == tally.total == 12 and tally.failed == 0
@@ -578,7 +578,7 @@ def test_killed_then_interrupted_then_finished(folder, client):
     second, folded = bench(folder), folder / "out" / "runs"
     until(lambda: list(folded.glob("*.parquet")) and rows_in(folder) >= 3)  # of its own: the first one's are folded
     os.killpg(second.pid, signal.SIGINT)  # as a terminal does at Ctrl-C: to the workers as well
-    printed, said = second.communicate(timeout=30)
+    printed, said = second.communicate(timeout=300)
     assert second.returncode == 1 and printed == ""
     assert "interrupted: " in said and "the same command goes on" in said and "Traceback" not in said
     more = keys_of(read_runs(folder / "out"))
@@ -593,17 +593,17 @@ def test_killed_then_interrupted_then_finished(folder, client):
 # --- the commands ------------------------------------------------------------------------------------------------
 
 
-def test_run_then_show_then_nothing_left_to_do(cli, folder):
+def test_run_then_show_then_nothing_left_to_do(cli, folder, monkeypatch):
     write_suite(folder, ["tracking", {"name": "wide", "solver": "qp", "avoidance": {"d2": 0.3}}], seeds=2)
     first = cli("bench", "run", "mine.yaml", "--json", "--jobs", "1")
     assert first.status == 0
     document = json.loads(first.stdout)
     assert document["runs"] == document["new"] == 4 and document["failed"] == 0
     assert [entry["entrant"] for entry in document["entrants"]] == ["tracking", "wide"]
-    begin = time.monotonic()
-    again = cli("bench", "run", "mine.yaml")
+    with monkeypatch.context() as patch:
+        patch.setattr(sweep, "local_cluster", None)  # no process is started for it
+        again = cli("bench", "run", "mine.yaml")
     assert again.status == 0 and "4 runs, 0 of them new" in again.stdout and "tracking" in again.stdout
-    assert time.monotonic() - begin < 3.0  # no process was started for it
     out = Path("out/bench/mine")
     shown = cli(
         "bench", "show", out, "--family", "post", "--seed", 1, "--entrant", "wide", "--scenario", "case.yaml", "--json"
@@ -658,7 +658,7 @@ def test_the_rest_of_the_command_line_brings_nothing_of_the_arena_in():
         "import sys, qpavoid.__main__; "
         "sys.exit(bool({'dask', 'distributed', 'pyarrow', 'mujoco', 'matplotlib'} & sys.modules.keys()))"
     )
-    assert subprocess.run([sys.executable, "-c", code], check=False, timeout=60).returncode == 0
+    assert subprocess.run([sys.executable, "-c", code], check=False, timeout=300).returncode == 0
 
 
 # --- what must hold of any results -------------------------------------------------------------------------------

@@ -12,9 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 import qpsolvers
+from numba import njit
 
 from bench.solvers.record import QP, Run
 from bench.solvers.verify import Judgement, Truth, judge, truth, violation
+from qpavoid.kernels import minimize
 from qpavoid.problem import Array
 from qpavoid.solvers.backends import Backend, backend_names, make_backend
 from qpavoid.solvers.backends.wrapped import through_qpsolvers
@@ -62,12 +64,6 @@ def contestants() -> dict[str, Callable[[], Backend]]:
 
 def _compiled() -> dict[str, Callable[[], Backend]]:
     """The back end `native`, which the `qp` solver calls without P and q: here x0 = -P⁻¹q is computed first."""
-    try:
-        from numba import njit
-
-        from qpavoid.kernels.compiled.active_set import minimize
-    except ModuleNotFoundError:
-        return {}
 
     @njit
     def from_cost(P: Array, q: Array, G: Array, h: Array, lower: Array, upper: Array) -> tuple[Array, bool]:

@@ -94,7 +94,7 @@ def _sections(results: Results) -> list[str]:
         *(_line([name, *_row(total[name])]) for name in sorted(names, key=lambda name: np.median(total[name].us))),
         "",
         "`by qpsolvers` is the same solver through qpsolvers, at the tolerances that were used before it was called "
-        "natively. `native` is what the `qp` solver calls with numba; it gets -P⁻¹q from the tick, and here computes "
+        "natively. `native` is what the `qp` solver calls; it gets -P⁻¹q from the tick, and here computes "
         "it within the time shown. `gave an answer` counts a contradiction that was recognised.",
         "",
         "## Run by run: median / p99 [µs], and the share that is right where that is not all",
@@ -141,14 +141,10 @@ def _choice(names: list[str], total: dict[str, Cell], results: Results) -> list[
     ratios = ", ".join(f"{name} {np.median(total[name].us) / np.median(total[best].us):.1f}x" for name in others)
     wrong = ", ".join(name for name in names if name not in right)
     return [
-        f"**Choose `{best}`**{_without_numba(best, others)}: right on every problem, and the quickest of those that "
+        f"**Choose `{best}`**: right on every problem, and the quickest of those that "
         f"are on {wins} of {len(results.cells)} runs. Time of the others that are always right, by medians over all "
         f"problems: {ratios}." + (f" Not always right: {wrong}." if wrong else "")
     ]
-
-
-def _without_numba(best: str, others: list[str]) -> str:
-    return f" (and `{others[0]}` without numba)" if best == "native" and others else ""
 
 
 def _joined(cells: list[Cell]) -> Cell:

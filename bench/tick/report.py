@@ -13,13 +13,9 @@ import numpy as np
 from bench.tick.runner import Cell, Results, Row
 from qpavoid.machine import cpu
 
-TARGETS = {
-    "qpavoid": {"pink-20": 38.0, "mink": 8.0, "placo": 5.0},
-    "qpavoid-numpy": {"pink-20": 15.0, "mink": 2.2, "placo": 1.0},
-}
+OURS = "qpavoid"
+TARGETS = {"pink-20": 38.0, "mink": 8.0, "placo": 5.0}
 """How many times faster than a peer it is meant to be."""
-MORE = {("qpavoid-numpy", "mink", 5000): 5.0, ("qpavoid-numpy", "placo", 550): 5.0}
-"""From that many pairs on, this instead."""
 PLACO_FROM = 80
 """The target against placo holds from that many pairs on."""
 
@@ -91,21 +87,21 @@ def _sections(results: Results) -> list[str]:
         "",
         *_table(results, libraries, lambda row, cell: _number(_quantile(cell.us, 99))),
         "",
-        *[line for ours in TARGETS if ours in libraries for line in _ratios(results, ours, libraries)],
+        *(_ratios(results, libraries) if OURS in libraries else []),
         "## Growth with the number of pairs",
         "",
         *_growth(results, libraries),
         "",
         "## qpavoid: ticks at which nothing binds, and ticks at which something does (median [µs])",
         "",
-        *_free_and_bound(results, libraries),
+        *_free_and_bound(results),
         "",
         "## qpavoid: where the time goes (median of each stage [µs])",
         "",
         "Measured apart from the above, with clocks around its functions, which cost about 0.3 µs each; medians of "
         "parts need not add up to the median of the whole.",
         "",
-        *_stages(results, libraries),
+        *_stages(results),
         "",
         "## Agreement",
         "",
@@ -121,7 +117,6 @@ def _sections(results: Results) -> list[str]:
         "",
         *_table(results, libraries, lambda row, c: f"{1e3 * c.tracking_error:.3f}"),
         "",
-        *_both_paths(results),
         "## Libraries",
         "",
         *[
@@ -132,19 +127,6 @@ def _sections(results: Results) -> list[str]:
         *[f"- **{name}** was not run: {reason}." for name, reason in results.missing.items()],
         *_refusals(results),
     ]
-
-
-def _both_paths(results: Results) -> list[str]:
-    """How far the answers of the numpy and the compiled tick are apart."""
-    apart = []
-    for row in results.rows:
-        plain, fast = (row.cells.get(name, Cell()).velocities for name in TARGETS)
-        if plain is not None and fast is not None:
-            apart.append((float(np.abs(plain - fast).max()), row.workload.name))
-    if not apart:
-        return []
-    worst, where = max(apart)
-    return [f"qpavoid and qpavoid-numpy: velocities differ by at most {worst:.1e} rad/s or m/s ({where}).", ""]
 
 
 def _refusals(results: Results) -> list[str]:
@@ -173,34 +155,24 @@ def _table(results: Results, libraries: list[str], entry: Any) -> list[str]:
     return lines
 
 
-def _ratios(results: Results, ours: str, libraries: list[str]) -> list[str]:
-    peers = [name for name in libraries if not name.startswith("qpavoid")]
+def _ratios(results: Results, libraries: list[str]) -> list[str]:
+    peers = [name for name in libraries if name != OURS]
     lines = [
-        f"## How many times faster {ours} is (ratio of medians)",
+        f"## How many times faster {OURS} is (ratio of medians)",
         "",
         _line(["workload", "pairs", *peers]),
         _line(["---", *["---:"] * (len(peers) + 1)]),
     ]
     for row in results.rows:
-        mine, pairs = _quantile(row.cells[ours].us, 50), len(row.workload.pairs)
+        mine, pairs = _quantile(row.cells[OURS].us, 50), len(row.workload.pairs)
         entries = []
         for peer in peers:
             ratio = _quantile(row.cells[peer].us, 50) / mine
-            target = _target(ours, peer, pairs)
+            target = None if peer == "placo" and pairs < PLACO_FROM else TARGETS.get(peer)
             missed = target is not None and ratio < target
             entries.append("-" if np.isnan(ratio) else f"{ratio:.1f}" + (f" (missed: {target:g})" if missed else ""))
         lines.append(_line([row.workload.name, pairs, *entries]))
     return [*lines, ""]
-
-
-def _target(ours: str, peer: str, pairs: int) -> float | None:
-    target = TARGETS[ours].get(peer)
-    if peer == "placo" and pairs < PLACO_FROM:
-        return None
-    for (library, other, least), value in MORE.items():
-        if (library, other) == (ours, peer) and pairs >= least:
-            return value
-    return target
 
 
 def _growth(results: Results, libraries: list[str]) -> list[str]:
@@ -221,25 +193,17 @@ def _growth(results: Results, libraries: list[str]) -> list[str]:
     return lines
 
 
-def _stages(results: Results, libraries: list[str]) -> list[str]:
-    ours = [name for name in libraries if name.startswith("qpavoid")]
-    stages = list(dict.fromkeys(s for row in results.rows for name in ours for s in row.cells[name].stages))
-    lines = [_line(["workload", "", *stages]), _line(["---", "---", *["---:"] * len(stages)])]
-    for row in results.rows:
-        for name in ours:
-            times = row.cells[name].stages
-            if times:
-                lines.append(_line([row.workload.name, name, *(_number(times.get(s, np.nan)) for s in stages)]))
-    return lines
+def _stages(results: Results) -> list[str]:
+    own = [(row.workload.name, row.cells[OURS].stages) for row in results.rows if OURS in row.cells]
+    stages = list(dict.fromkeys(stage for _, times in own for stage in times))
+    lines = [_line(["workload", *stages]), _line(["---", *["---:"] * len(stages)])]
+    return lines + [_line([name, *(_number(times.get(s, np.nan)) for s in stages)]) for name, times in own if times]
 
 
-def _free_and_bound(results: Results, libraries: list[str]) -> list[str]:
-    ours = [name for name in libraries if name.startswith("qpavoid")]
-    lines = [_line(["workload", *ours]), _line(["---", *["---:"] * len(ours)])]
-    for row in results.rows:
-        entries = [" / ".join(_number(value) for value in _split(row, row.cells[name])) for name in ours]
-        lines.append(_line([row.workload.name, *entries]))
-    return lines
+def _free_and_bound(results: Results) -> list[str]:
+    own = [(row, row.cells[OURS]) for row in results.rows if OURS in row.cells]
+    parts = [(row.workload.name, *map(_number, _split(row, cell))) for row, cell in own]
+    return [_line(["workload", "free", "bound"]), _line(["---", "---:", "---:"]), *map(_line, parts)]
 
 
 def _split(row: Row, cell: Cell) -> tuple[float, float]:

@@ -47,7 +47,7 @@ class Process:
         self._process = subprocess.Popen(
             [python, "-m", "bench.tick.worker", library.adapter],
             cwd=ROOT,
-            env={**os.environ, **ONE_THREAD, **library.environment},
+            env={**os.environ, **ONE_THREAD},
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
@@ -93,7 +93,6 @@ class Cell:
     """Median distance of the frames to their targets after one step [m]."""
     stages: dict[str, float] = field(default_factory=dict)
     """Median time of each stage [µs], for qpavoid."""
-    velocities: Array | None = None
     """(k, nv) its answers at the checked ticks."""
     refused: str = ""
     """Why it was not timed."""
@@ -218,7 +217,7 @@ def _measure(
 def _bound(timed: Iterable[str], processes: dict[str, Process]) -> Array:
     """(T,) ticks at which something binds, told by qpavoid if it was timed; else NaN."""
     for name in timed:
-        if name.startswith("qpavoid"):
+        if name == "qpavoid":
             return np.array(processes[name].ask("bound")["bound"], dtype=np.float64)
     return np.full(build.TICKS, np.nan)
 
@@ -237,7 +236,6 @@ def _check(cell: Cell, answer: dict[str, Any], frames: Array, distances: Array, 
     cell.distance_error = float(np.max(error[:, ~box], initial=0.0))
     cell.box_error = float(np.max(np.where(relevant, error, 0.0)[:, box], initial=0.0))
     cell.tracking_error = _tracking_error(answer["velocities"], workload, scene)
-    cell.velocities = answer["velocities"]
     if not cell.frame_error <= FRAME_TOLERANCE:
         raise LibraryError(f"its frames differ by {cell.frame_error:.1e}")
     if not (cell.distance_error <= DISTANCE_TOLERANCE and cell.box_error <= BOX_TOLERANCE):

@@ -25,7 +25,6 @@ from qpavoid.obstacles.told import strayed
 from qpavoid.problem import Array, Mask
 from qpavoid.proximity import DistanceQuery
 from qpavoid.scene import Scene
-from qpavoid.solvers.backends import solve_daqp
 from qpavoid.tick_memory import hand_over, lay_out
 
 _GENTLE = 1e-4
@@ -260,14 +259,5 @@ class Flights:
 def _farthest(near: Near, manner: Manner, comfort: float, lower: Array, upper: Array) -> Array | None:
     """v (nv,) with the largest s, see above, within its bounds (nv,); None where none is found."""
     (closest, J, drift), (h, leaning) = near, manner
-    if kernels.ACCELERATED:
-        from qpavoid.kernels.compiled.active_set import farthest
-
-        v, met = farthest(h, closest, J, drift, comfort, _DEEPEST, _GENTLE, leaning, lower, upper)
-        return v if met else None
-    k, n = J.shape
-    P = np.diag(np.append(np.full(n, _GENTLE), 1.0))
-    G = np.column_stack((h * J, np.full(k, -1.0)))
-    low, high = np.append(lower, -_DEEPEST), np.append(upper, comfort)
-    answer = solve_daqp(P, -P @ np.append(leaning, comfort), G, -(closest[:, 0] + h * drift), low, high)
-    return None if answer is None else answer[:n]
+    v, met = kernels.farthest(h, closest, J, drift, comfort, _DEEPEST, _GENTLE, leaning, lower, upper)
+    return v if met else None

@@ -8,7 +8,7 @@ bends less; and that is drawn back towards the stop of this tick, whose way was 
 stop that was found clear is always at hand, as long as obstacles do what they were last seen to do, for one tick.
 
 Most ticks need none of this: where no body moves fast enough, or not in the direction, to use up what is left of a
-distance before the robot could stop, the velocity is clear as it is (`kernels.vectorised.ahead.closest_call`, with the
+distance before the robot could stop, the velocity is clear as it is (`kernels.closest_call`, with the
 bound and its proof).
 """
 
@@ -23,8 +23,7 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid.assembly import Assembly
-from qpavoid.kernels.vectorised.ahead import TOLERANCE
-from qpavoid.kernels.vectorised.bounds import speed_to_stop
+from qpavoid.kernels import TOLERANCE, speed_to_stop
 from qpavoid.limits import JointBounds
 from qpavoid.obstacles.courses import move_on
 from qpavoid.problem import Array, IntArray, Problem, Solution
@@ -66,6 +65,8 @@ class Checked(NamedTuple):
     """How much too near it leads all the same [m]; 0 where it is clear."""
     pair: int
     """Which pair comes too near; -1 where none does."""
+    distance: float
+    """Least distance of any pair along it, less the margins of stale obstacles [m]; negative: contact is predicted."""
 
 
 class _Look(NamedTuple):
@@ -104,6 +105,7 @@ class Guard:
         self._acceleration, self._accelerated = bounds.acceleration, bool(np.isfinite(bounds.acceleration).any())
         self._jerked = bool(np.isfinite(bounds.jerk).any())
         self._given = np.zeros(len(scene.pairs))
+        self._least = np.inf  # distance of any pair in the looks along the velocity under test [m]
         self._news, self._heard = np.zeros(len(scene.obstacles), dtype=bool), False
 
     def see(self, which: IntArray) -> None:
@@ -152,6 +154,7 @@ class Guard:
         if uniform and assembly.closest_call(v, len(near), reach, horizon, stop) > -TOLERANCE:
             return None
         self._given.fill(0.0)
+        self._least = np.inf
         if solution.slack is not None:
             self._given[near] = 1.1 * horizon * solution.slack
             self._given[:] = self._ahead.widest(self._given)
@@ -162,17 +165,17 @@ class Guard:
         worst, pair = look(q, v, query, gap, speed)
         if worst >= 0.0:
             return None
-        best, price = Checked(v, 1.0, -worst, pair), -worst
+        best, price = Checked(v, 1.0, -worst, pair, self._least), -worst
         straight = gentle()
         full = v if straight is None else straight
         for share in _SHARES if straight is None else (1.0, *_SHARES):
-            blend = v_stop + share * (full - v_stop)
+            blend, self._least = v_stop + share * (full - v_stop), np.inf
             worst, pair = look(q, blend, query, gap, speed)
             if worst >= (-_NOISE if self._jerked and share == 0.0 else 0.0):  # a stop was clear one tick ago
-                return Checked(blend, share, 0.0, -1)
+                return Checked(blend, share, 0.0, -1, self._least)
             missed = np.max(rows.b - rows.J @ blend - (0.0 if solution.slack is None else solution.slack), initial=0.0)
             if _PATIENCE * missed - worst < price:
-                best, price = Checked(blend, share, -worst, pair), _PATIENCE * missed - worst
+                best, price = Checked(blend, share, -worst, pair, self._least), _PATIENCE * missed - worst
         return best
 
     def _place_obstacles(self, now: DistanceQuery) -> None:
@@ -317,6 +320,7 @@ class Guard:
         if margins.any():
             margin = margins[ahead.twist_row[pairs]]
             there, here = there - margin, here - margin
+        self._least = min(self._least, float(there.min()))
         left = there - np.minimum(self._hold - TOLERANCE, here - _CREEP) + self._given[pairs]
         worst = int(left.argmin())  # the first NaN, where there is one
         return float(left[worst]), int(pairs[worst])

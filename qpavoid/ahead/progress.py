@@ -119,7 +119,7 @@ def _limits(problem: Problem, v: Array) -> list[Reason]:
     names, units = problem.joint_names, problem.joint_units
     full = np.maximum(problem.hard_upper, -problem.hard_lower)
     return [
-        Reason.of(kind, names[j], amount=float(bound[j]), unit=f"{units[j]}/s")
+        Reason.of(kind, names[j], amount=float(bound[j]) + 0.0, unit=f"{units[j]}/s")
         for kind, bound, at_limit in (
             (ReasonKind.AT_UPPER_LIMIT, problem.hard_upper, high & (problem.hard_upper < full)),
             (ReasonKind.AT_LOWER_LIMIT, problem.hard_lower, low & (-problem.hard_lower < full)),

@@ -7,9 +7,6 @@ from typing import NamedTuple
 import numpy as np
 
 from qpavoid import kernels
-from qpavoid.kernels.vectorised.bounds import speed_to_stop
-from qpavoid.kernels.vectorised.flights import ROUND_OFF
-from qpavoid.kernels.vectorised.stops import easing_stop
 from qpavoid.limits import JointBounds
 from qpavoid.problem import Array
 
@@ -39,6 +36,9 @@ class Ramps:
         self.jerked = bool(np.isfinite(bounds.jerk).any())
         """Whether any jerk has one."""
         self._fastest = np.minimum(bounds.velocity, _UNLIMITED)
+        if self.jerked:
+            rest = np.zeros(len(bounds.jerk))
+            kernels.easing_stop(rest, rest, self.steps.v_step, self.steps.w_step)  # no tick waits for the compiler
 
     def towards(self, v: Array, w: Array, wanted: Array, held: bool = False, meets: bool = False) -> Array:
         """The velocities of some ticks, as close to what is wanted as the limits allow.
@@ -62,7 +62,7 @@ class Ramps:
             w = self._change(v, w, target, rate, held)
             v = v + w
             ramp[k] = v
-            if meets and np.abs(v - target).max() < ROUND_OFF:
+            if meets and np.abs(v - target).max() < kernels.ROUND_OFF:
                 return ramp[: k + 1]
         return ramp
 
@@ -70,9 +70,9 @@ class Ramps:
         """The next change of v (nv,) towards a target (nv,) that itself changes at a rate (nv,) from tick to tick."""
         v_step, w_step = self.steps.v_step, (_PLANNED if held else 1.0) * self.steps.w_step
         low, high, change = np.maximum(-v_step, w - w_step), np.minimum(v_step, w + w_step), target - v
-        if held or ((change < low - ROUND_OFF) | (change > high + ROUND_OFF)).any():
-            change = change + easing_stop(Steps(v_step, w_step), rate - change, w - rate)
+        if held or ((change < low - kernels.ROUND_OFF) | (change > high + kernels.ROUND_OFF)).any():
+            change = change + kernels.easing_stop(rate - change, w - rate, v_step, w_step)
         room = np.maximum(np.array([self._fastest + v, self._fastest - v]), 0.0)
-        down, up = speed_to_stop(room, w_step, 1.0)  # from any greater change it would pass its speed limit
+        down, up = kernels.speed_to_stop(room, w_step, 1.0)  # from any greater change it would pass its speed limit
         change = np.minimum(np.maximum(change, -down), up)
         return np.asarray(np.minimum(np.maximum(change, low), high))

@@ -104,8 +104,9 @@ def outside(
     return Entrant(name, says, start, settings, packages, elsewhere)
 
 
-def _row(kind: str) -> dict[str, Any]:
-    return {"row": {"type": kind}, "escape": None}
+def _law_alone(row: str) -> dict[str, Any]:
+    """Avoidance rows of one kind, and no backup trajectory."""
+    return {"row": {"type": row}, "escape": None}
 
 
 ENTRANTS = {
@@ -116,34 +117,36 @@ ENTRANTS = {
         law("eq10-literal", "task switching, eq. 10 as printed", "eq10-literal"),
         law("gradient-projection", "tracking, clearance climbed in its null space", "gradient-projection"),
         law("potential-field", "tracking pulls, near pairs push: FIRAS at velocity level", "potential-field"),
-        law("qp", "QP with switching α/β rows, default back end, no foresight", "qp", avoidance=_row("switching")),
-        law("qp-damper", "QP with velocity damper rows", "qp", avoidance=_row("damper")),
-        law("qp-cbf", "QP with control barrier rows", "qp", avoidance=_row("cbf")),
+        law("qp", "QP as each scenario has it, with a backup trajectory", "qp"),
         law(
-            "qp-escape",
-            "QP as it is by default: with foresight, so that a way out is kept at hand",
+            "qp-task-switching",
+            "QP with the gains of eq. 10 in its rows, no backup trajectory",
             "qp",
-            avoidance={**_row("switching"), "escape": {}},
+            avoidance=_law_alone("task-switching"),
         ),
+        law("qp-no-backup", "QP with beta rows, no backup trajectory", "qp", avoidance=_law_alone("beta")),
+        law("qp-damper", "QP with velocity damper rows, no backup trajectory", "qp", avoidance=_law_alone("damper")),
+        law("qp-cbf", "QP with control barrier rows, no backup trajectory", "qp", avoidance=_law_alone("cbf")),
         law(
             "qp-detour",
-            "QP that tries a way round what blocks it",
+            "QP with beta rows that tries detours round what stalls it, no backup trajectory",
             "qp",
-            avoidance=_row("switching"),
+            avoidance=_law_alone("beta"),
             progress={"detour": {}},
         ),
-        law("qp:native", "QP, compiled active-set method", "qp:native", ("numba",), avoidance=_row("switching")),
-        law("qp:daqp", "QP, back end daqp", "qp:daqp", avoidance=_row("switching")),
-        law("qp:proxqp", "QP, back end ProxQP", "qp:proxqp", avoidance=_row("switching")),
-        law("qp:osqp", "QP, back end OSQP", "qp:osqp", avoidance=_row("switching")),
-        law("qp:quadprog", "QP, back end quadprog", "qp:quadprog", ("quadprog",), avoidance=_row("switching")),
-        law("hqp", "strict priorities, a cascade of QPs", "hqp", avoidance=_row("switching")),
+        law("qp:native", "QP, compiled active-set method", "qp:native", ("numba",)),
+        law("qp:daqp", "QP, back end daqp", "qp:daqp"),
+        law("qp:proxqp", "QP, back end ProxQP", "qp:proxqp"),
+        law("qp:osqp", "QP, back end OSQP", "qp:osqp"),
+        law("qp:quadprog", "QP, back end quadprog", "qp:quadprog", ("quadprog",)),
+        law("hqp", "strict priorities, a cascade of QPs, with a backup trajectory", "hqp"),
         outside("pink", "Pink, with its barrier between collision bodies", "pinks", PINK, ("pin-pink",)),
         outside("mink", "mink, with its limit on collisions", "minks", MINK, ("mink", "mujoco")),
         outside("placo", "placo, with its constraint on self-collisions", "placos", PLACO, ("placo",), PLACO_PYTHON),
     )
 }
-"""Those that ship, in the order of the report."""
+"""Those that ship, in the order of the report. One with the name of a solver is that solver in each scenario as it
+is, safety options included; variants have names of their own."""
 
 
 def find_entrant(name: str) -> Entrant:

@@ -9,12 +9,26 @@ from pydantic import Field, model_validator
 from qpavoid.config.base import Block, NonNegative, Positive
 
 
-class Switching(Block):
-    """Row of the task-switching QP: ḋ >= -(1 - β(d)) ξ (d - d1); below d1 it backs away."""
+class Beta(Block):
+    """Velocity damper weighted with eq. 12: ḋ >= -(1 - β(d)) ξ (d - d1); below d1 it backs away."""
 
-    type: Literal["switching"] = "switching"
+    type: Literal["beta"] = "beta"
     gain: Positive = 5.0
     """ξ [1/s]."""
+
+
+class TaskSwitching(Block):
+    """Rate of eq. 10 as a lower bound: ḋ >= (1 - β)(1 - α) min(u, ẋ0) + β ẋ0, u that of tracking alone; below d1 it
+    backs away.
+    """
+
+    type: Literal["task-switching"] = "task-switching"
+    gain: Positive = 5.0
+    """ξ [1/s], of backing away below d1."""
+    retreat_speed: NonNegative = 0.0
+    """ẋ0 [m/s]; more than 0 asks pairs that cannot part, as of neighbouring links, for what no velocity gives."""
+    alpha_cap: Positive = 50.0
+    """Largest α; eq. 11 grows without bound as d goes to 0 [-]. At most 1 counts between two bodies of the robot."""
 
 
 class Damper(Block):
@@ -37,7 +51,7 @@ class Cbf(Block):
     """Distance that is held [m], measured as d1 is; left out: d1."""
 
 
-AvoidanceRow = Annotated[Switching | Damper | Cbf, Field(discriminator="type")]
+AvoidanceRow = Annotated[Beta | TaskSwitching | Damper | Cbf, Field(discriminator="type")]
 
 
 class Escape(Block):
@@ -72,7 +86,7 @@ class Avoidance(Block):
     offset: NonNegative = 0.0
     """Added to the distance between surfaces before d1, d2 and d_safe are compared with it [m]. The paper measures
     between axes: its figures want the sum of the two radii here."""
-    row: AvoidanceRow = Switching()
+    row: AvoidanceRow = Beta()
     """Form of the QP's avoidance rows."""
     recovery_speed: Positive = 0.2
     """Cap on the speed at which rows ask a pair that is too close to part [m/s]."""
@@ -86,7 +100,7 @@ class Avoidance(Block):
     @property
     def hold(self) -> float:
         """Distance at which a row lets a pair come no nearer [m]."""
-        return self.d1 if isinstance(self.row, Switching) or self.row.d_safe is None else self.row.d_safe
+        return self.d1 if isinstance(self.row, Beta | TaskSwitching) or self.row.d_safe is None else self.row.d_safe
 
     @model_validator(mode="after")
     def _ordered(self) -> Avoidance:

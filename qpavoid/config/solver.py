@@ -61,8 +61,8 @@ class QpSolver(Block):
 
     name: Literal["qp"] = "qp"
     backend: str = "auto"
-    """`native` (compiled, wants numba), `daqp`, `proxqp`, `osqp`, `quadprog`, or whatever else qpsolvers finds
-    installed; `auto` is `native` where numba is installed, else `daqp`."""
+    """`native` (compiled by numba), `daqp`, `proxqp`, `osqp`, `quadprog`, or whatever else qpsolvers finds
+    installed; `auto` is `native`."""
     regularization: Positive = 1e-3
     """λ: cost of leaving the tracking law's velocity [(rad/s)⁻²]."""
 

@@ -147,8 +147,14 @@ class RowLayout(NamedTuple):
     """ξ [1/s]."""
     recovery: float
     """Cap on the speed of parting that a row asks for [m/s]."""
-    switching: bool
+    beta: bool
     """Whether rows are weighted with 1 - β."""
+    task_switching: bool
+    """Whether rows have the rate of eq. 10, which depends on v0."""
+    retreat_speed: float
+    """ẋ0 of such rows [m/s]."""
+    alpha_cap: float
+    """Largest α of such rows [-]."""
     d1: float
     """[m]."""
     d2: float

@@ -1,19 +1,13 @@
-"""Rotations as vectors, in closed form; the source of both kernel versions."""
+"""Rotations as vectors, in closed form: plain Python for tasks, compiled where a kernel calls it."""
 
 from __future__ import annotations
 
 import math
 from typing import Any
 
-import numpy as np
-
-CYCLE = np.array([1, 2, 0, 2, 0, 1])
-ANTICYCLE = np.array([2, 0, 1, 1, 2, 0])
-"""a × b is a[CYCLE] b[ANTICYCLE], the first three less the last three."""
-
 
 def rotation_vector(R: Any) -> tuple[float, float, float]:
-    """Rotation vector [rad] of a rotation R[i][j], with an angle up to and including π.
+    """Compute the rotation vector [rad] of a rotation R[i][j], with an angle up to and including π.
 
     By way of the quaternion, whose largest component is taken first, so that nothing is lost near half a turn.
     """

@@ -1,7 +1,10 @@
-"""Stops of one coordinate within limits of acceleration and jerk, in closed form; the source of both kernel versions.
+"""Stops of one coordinate within limits of acceleration and jerk, in closed form.
 
-Units are ticks, and what jerk allows: v is held for a tick and changes by w, which changes by no more than 1 and is no
-larger than `most`, the largest change of v over the largest change of that change.
+The functions take arrays or numbers: Python calls them as they are, kernels what numba compiles of them.
+
+With acceleration limits alone, `speed_to_stop` is all. With jerk limits, units are ticks, and what jerk allows: v is
+held for a tick and changes by w, which changes by no more than 1 and is no larger than `most`, the largest change of v
+over the largest change of that change.
 
 The stop brakes as hard as it can without having to let v pass zero: from v, a change of -b can be taken back, 1 less in
 every tick, before v is used up, if b is at most σ(v) = `speed_to_stop(v, 1, 1)`: the braking law of positions, one
@@ -26,8 +29,27 @@ AT_REST = 1e-9
 """Share of the largest change of v below which a speed is round-off of 0 [-]."""
 
 
+def speed_to_stop(room: Any, step: Any, dt: Any) -> Any:
+    """Compute the largest speed from which a coordinate that slows by `step` every period stops within `room`.
+
+    From v it still moves S(v) = dt Σ max(v - i step, 0), i = 0, 1, …; on (n - 1) step <= v <= n step that is
+    n dt v - dt step n (n - 1) / 2, and S(n step) = dt step n (n + 1) / 2, which gives the number of periods n. Once it
+    moves at such a speed, slowing by `step` keeps to it, so that the bounds of the next period never contradict.
+
+    Args:
+        room: distance left (...), not negative; infinite where there is no limit [rad or m].
+        step: change of speed in one period (...), positive [rad/s or m/s].
+        dt: length of a period [s].
+
+    Returns:
+        Speed (...) [rad/s or m/s].
+    """
+    n = np.minimum(np.maximum(np.ceil(0.5 * np.sqrt(1.0 + 8.0 * room / (step * dt)) - 0.5), 1.0), 1e15)
+    return room / (dt * n) + 0.5 * step * (n - 1.0)
+
+
 def way_to_stop(v: Any, w: Any, most: Any) -> tuple[Any, Any]:
-    """How far a coordinate that moves at v, after a change of w, comes at most before its stop ends, v's tick included.
+    """Compute how far a coordinate at v, after a change of w, moves until its stop ends, the period of v included.
 
     Elementwise, of arrays or numbers. The stop has three parts: v changes less by 1 in every tick, until -most or T(v)
     is reached; by -most; by -b with b = σ(v), b - 1, and so on. In each, the way is a polynomial of the number of
@@ -64,7 +86,7 @@ def way_to_stop(v: Any, w: Any, most: Any) -> tuple[Any, Any]:
 
 
 def longest_way(v: Any, w: Any, most: Any) -> Any:
-    """A quick bound above `way_to_stop`: up to the largest speed, and from there (...)."""
+    """Compute a quick bound above `way_to_stop` (...): up to the largest speed, and from there."""
     rising = np.maximum(w, 0.0)
     speed = np.maximum(v, 0.0) + 0.5 * rising * rising
     return speed * (rising + 2.0 + 0.5 * (speed / most + most))

@@ -2,7 +2,7 @@
 
 A row is the *state* of a body: rotation by columns, position, linear and angular velocity, all in world axes (18,).
 Every trajectory of `qpavoid.motion` is cut into pieces on which the state is a weighted sum of constant ones, with
-weights that follow from the time alone (`kernels.vectorised.motions.Pieces`): rest, a straight line (p0, Δp), the
+weights that follow from the time alone (`kernels.Pieces`): rest, a straight line (p0, Δp), the
 shortest turn by Rodrigues' formula (R0 + [a]² R0, [a] R0, -[a]² R0), a circle (c, w, u). A trajectory of another class
 is sampled alone.
 """
@@ -17,14 +17,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from qpavoid import kernels
-from qpavoid.kernels.vectorised.motions import Pieces
+from qpavoid.kernels import Pieces
 from qpavoid.motion import END_TOLERANCE, Motion, Orbit, Polyline, Sample, Still
 from qpavoid.problem import Array
 
 STATE = 18
 """Numbers in a state."""
-_TOGETHER_FROM = 1 if kernels.ACCELERATED else 3
-"""Number of bodies from which sampling them together pays."""
 
 
 def as_samples(states: Array) -> list[Sample]:
@@ -64,11 +62,9 @@ class Courses:
         """
         cuts = {body: _cut(motion) for body, motion in motions.items()}
         known = {body: cut for body, cut in cuts.items() if cut is not None}
-        if len(known) < _TOGETHER_FROM:
-            known = {}
         self.others = {body: motion for body, motion in motions.items() if body not in known}
         """Those that have to be sampled one by one."""
-        self._pieces = kernels.pack_pieces(_joined(known)) if known else None
+        self._pieces = _joined(known) if known else None
 
     def sample(self, t: float, states: Array) -> None:
         """Brings the states (o, 18) of all bodies but the `others` to a finite time t [s]; see `Motion.sample`."""

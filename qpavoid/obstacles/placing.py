@@ -9,7 +9,6 @@ import pinocchio as pin
 
 from qpavoid import kernels
 from qpavoid.errors import NumericalError
-from qpavoid.kernels.vectorised.motions import Placed
 from qpavoid.memory import read_poses, view_poses
 from qpavoid.motion import Sample
 from qpavoid.obstacles.courses import STATE, as_samples, put
@@ -62,7 +61,7 @@ class Placing:
         self.reach = reach
         """(o,) distance from each obstacle's origin to its farthest point; infinite of a half-space [m]."""
         self._planes = np.flatnonzero(np.isinf(reach)).tolist()
-        self._memory = Placed(
+        self._memory = kernels.Placed(
             states=self.states,
             twists=self.twists,
             margin=self.margin,
@@ -70,7 +69,6 @@ class Placing:
             reach=np.nan_to_num(reach, posinf=0.0),
             placements=read_poses([body.placement for body in bodies]) if placements is None else placements,
             local=spheres[:, :3].copy(),
-            centred=not spheres[len(scene.body_names) :, :3].any(),
             centers=np.ones((len(bodies), 5)),
         )
         for center, body, (*local, _) in zip(self._memory.centers, bodies, spheres.tolist(), strict=True):

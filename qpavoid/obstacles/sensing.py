@@ -21,7 +21,7 @@ from qpavoid.config import PointCloud, Sensing
 from qpavoid.errors import NumericalError, UnknownName, nearest
 from qpavoid.geometry.cloud import Points, Voxels
 from qpavoid.inputs import FARTHEST, FASTEST, FAULTS, as_time
-from qpavoid.kernels.vectorised.motions import FAST, NORMALISED, NOT_FINITE, POSE, REST, SAMPLE
+from qpavoid.kernels.motions import FAST, NORMALISED, NOT_FINITE, POSE, REST, SAMPLE
 from qpavoid.motion import Sample
 from qpavoid.obstacles.courses import STATE, Courses, as_samples, move_on, put
 from qpavoid.obstacles.told import MeanTwists, Told
@@ -300,7 +300,8 @@ class Obstacles:
                 continue
             if cloud is not None:
                 voxels[index] = cloud
-            for view, part in zip(self._views[2][index], sample[:-2]):  # noqa: B905 (a bare pose has only two)
+            views: Any = self._views[2][index]
+            for view, part in zip(views, sample[:-2]):  # noqa: B905 (a bare pose has only two)
                 view[:] = part
             which.append(index)
             kind.append(REST if rests else POSE if isinstance(sample, Pose) else SAMPLE)

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from qpavoid import kernels
 from qpavoid.config import HqpSolver, QpSolver
-from qpavoid.errors import SolverNotInstalled
 from qpavoid.problem import Array, Problem, Solution, Status
 from qpavoid.reason import Reason, ReasonKind
 from qpavoid.solvers.analytic import tracking_velocity
@@ -19,8 +16,6 @@ from qpavoid.solvers.relaxation import Closest, Relaxed, by_back_end, closest, r
 
 _GENTLE = 1.0
 """λ of a solution that moves the joints little [(rad/s)⁻²]."""
-
-_Projection = Callable[..., "tuple[Array, bool]"]
 
 
 class Qp:
@@ -44,9 +39,10 @@ class Qp:
 
     def __init__(self, config: QpSolver | HqpSolver) -> None:
         self.config = config
-        compiled = config.backend == "native" or (config.backend == "auto" and kernels.ACCELERATED)
-        self._projections = _compiled_projections() if compiled else None
-        self._backend = make_backend("daqp" if config.backend in ("auto", "native") else config.backend)
+        self._native = config.backend in ("auto", "native")
+        self._backend = make_backend("daqp" if self._native else config.backend)
+        if self._native:
+            _warm_up()
 
     @property
     def _backends(self) -> tuple[Backend, ...]:
@@ -62,8 +58,8 @@ class Qp:
             v0 = tracking_velocity(problem)
             if problem.contacts is None and kernels.shortfall(v0, rows.J, rows.b, lower, upper) <= 0.0:
                 return Solution(v0)
-        if self._projections is not None and problem.contacts is None:
-            answer, solved = self._projections[0](A, self.config.regularization, v0, rows.J, rows.b, lower, upper)
+        if self._native and problem.contacts is None:
+            answer, solved = kernels.project(A, self.config.regularization, v0, rows.J, rows.b, lower, upper)
             if solved:
                 return Solution(answer)
         P, q = kernels.projection_cost(A, self.config.regularization, v0)
@@ -106,8 +102,8 @@ class Qp:
             reasons = tuple([Reason.of(ReasonKind.UNKNOWN_DISTANCE, *pair) for pair in pairs])
             return Solution(problem.v_stop.copy(), Status.STOPPED, reasons)
         relaxed = None
-        if self._projections is not None and problem.contacts is None:
-            relaxed = relax(problem, self._compiled(self._projections[1], problem))
+        if self._native and problem.contacts is None:
+            relaxed = relax(problem, self._compiled(problem))
         backend = holding(problem.contacts, solve_daqp)
         if relaxed is None:
             relaxed = relax(problem, by_back_end(backend, P, q, tracking_velocity(problem)))
@@ -119,13 +115,13 @@ class Qp:
             reason = Reason.of(ReasonKind.CONTACTS_INFEASIBLE, "contacts")
         return Solution(problem.v_stop.copy(), Status.STOPPED, (reason,))
 
-    def _compiled(self, project: _Projection, problem: Problem) -> Closest:
+    def _compiled(self, problem: Problem) -> Closest:
         """Solves the QPs of a problem's tracking cost in compiled code."""
         A, v0, plain = problem.tracking.A, tracking_velocity(problem), np.zeros((0, len(problem.lower)))
 
         def solve(J: Array, least: Array, soft: Array, lower: Array, upper: Array) -> Array | None:
             cost = (plain, 1.0) if soft.any() else (A, self.config.regularization)
-            v, solved = project(*cost, v0, J, least, lower, upper, soft)
+            v, solved = kernels.project_soft(*cost, v0, J, least, lower, upper, soft)
             return v if solved else None
 
         return solve
@@ -145,18 +141,9 @@ def relaxed_solution(relaxed: Relaxed, problem: Problem, *reasons: Reason) -> So
     return Solution(relaxed.v, Status.RELAXED, reasons, relaxed.slack if relaxed.slack.any() else None)
 
 
-def _compiled_projections() -> tuple[_Projection, _Projection]:
-    """The back end `native`, without and with soft rows, warmed up.
-
-    Raises:
-        SolverNotInstalled: it needs numba.
-    """
-    try:
-        from qpavoid.kernels.compiled.active_set import project, project_soft
-    except ModuleNotFoundError:
-        raise SolverNotInstalled("QP back end 'native' needs numba: pip install numba") from None
+def _warm_up() -> None:
+    """Call the back end `native`, without and with soft rows, so that no tick waits for the compiler."""
     one, row = np.ones(1), np.ones((1, 1))
     arguments = row, 1.0, one, row, 2.0 * one, -3.0 * one, 3.0 * one
-    project(*arguments)
-    project_soft(*arguments, one)
-    return project, project_soft
+    kernels.project(*arguments)
+    kernels.project_soft(*arguments, one)

@@ -8,11 +8,16 @@ from qpavoid.problem import Array, Problem
 from qpavoid.reason import Reason, ReasonKind, Severity
 from qpavoid.solvers.relaxation import TOLERANCE, Relaxed
 
+_CONTACT = 1e-5
+"""Violation of a row with no margin from which contact is predicted; tolerances of the relaxation add up to 4e-6
+[m/s]."""
+
 
 def relaxation_reasons(relaxed: Relaxed, problem: Problem) -> tuple[Reason, ...]:
     """List each relaxed pair, the deepest first, then accelerations and jerks passed, then joints that limit pairs.
 
-    A relaxed row alarms where its pair may come into contact, warns below d1, and else informs.
+    A relaxed row alarms where its pair may come into contact, warns below d1, and else informs; the joints that limit
+    the rows have the worst severity of these.
 
     Args:
         relaxed: the solution.
@@ -25,7 +30,7 @@ def relaxation_reasons(relaxed: Relaxed, problem: Problem) -> tuple[Reason, ...]
     found = []
     for i in violated.tolist():
         pair, missing = problem.pair_names[rows.pair[i]], float(rows.d1 - rows.d[i])
-        touches = rows.b[i] - slack[i] < rows.touch[i] - 2.0 * TOLERANCE
+        touches = rows.b[i] - slack[i] < rows.touch[i] - _CONTACT
         severity = Severity.ALARM if touches else Severity.WARNING if missing > 0.0 else Severity.INFO
         amount = float(slack[i])
         found.append(Reason.of(ReasonKind.ROW_RELAXED, *pair, amount=amount, unit="m/s", severity=severity))
@@ -38,10 +43,11 @@ def relaxation_reasons(relaxed: Relaxed, problem: Problem) -> tuple[Reason, ...]
         Reason.of(kind, names[j], amount=float(excess[j]), unit=f"{units[j]}/s")
         for j in np.flatnonzero(excess > 2.0 * TOLERANCE).tolist()
     ]
-    return (*found, *passed, *_limiting_joints(rows.J[violated], relaxed.v, problem))
+    worst = max([reason.severity for reason in found], default=Severity.INFO)
+    return (*found, *passed, *_limiting_joints(rows.J[violated], relaxed.v, problem, worst))
 
 
-def _limiting_joints(J: Array, v: Array, problem: Problem) -> list[Reason]:
+def _limiting_joints(J: Array, v: Array, problem: Problem, severity: Severity) -> list[Reason]:
     """Joints at a limit of which the rows J (k, nv) want more; a bound below the full speed is of a position limit."""
     lower, upper = problem.hard_lower, problem.hard_upper
     found: list[Reason] = []
@@ -58,8 +64,9 @@ def _limiting_joints(J: Array, v: Array, problem: Problem) -> list[Reason]:
                 Reason.of(
                     ReasonKind.AT_VELOCITY_LIMIT if full else kind,
                     problem.joint_names[j],
-                    amount=float(limit[j]),
+                    amount=float(limit[j]) + 0.0,  # no negative zero
                     unit=f"{problem.joint_units[j]}/s",
+                    severity=severity,
                 )
             )
     return sorted(found, key=lambda reason: reason.subject)

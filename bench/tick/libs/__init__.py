@@ -12,7 +12,7 @@ An adapter is a class whose constructor takes a Workload (that is the set-up, no
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,6 @@ class Library:
     name: str
     adapter: str
     """MODULE:CLASS below bench.tick.libs."""
-    environment: dict[str, str] = field(default_factory=dict)
     own_python: bool = False
     """Whether it needs the environment bench/.venv-placo."""
 
@@ -30,8 +29,7 @@ class Library:
 LIBRARIES = {
     library.name: library
     for library in (
-        Library("qpavoid", "ours:Compiled", {"QPAVOID_NUMBA": "1"}),
-        Library("qpavoid-numpy", "ours:Ours", {"QPAVOID_NUMBA": "0"}),
+        Library("qpavoid", "ours:Ours"),
         Library("pink-all", "pinks:AllPairs"),
         Library("pink-20", "pinks:Closest20"),
         Library("mink", "minks:Mink"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from typing import Any
 
 import numpy as np
@@ -17,13 +16,13 @@ from qpavoid.tasks import build_tasks
 
 
 class Ours:
-    """Without numba."""
+    """The default installation."""
 
     settings = (
         "Controller(solver='qp') at its defaults; Task.gain = 1/dt, which is the dead beat that the others have by "
         "default; d1 = d_min, d2 = influence distance"
     )
-    packages = ("qpavoid", "pin", "coal", "daqp", "numpy")
+    packages = ("qpavoid", "pin", "coal", "daqp", "numpy", "numba")
 
     closing_gain = 5.0
     """ξ of its avoidance rows, by default [1/s]."""
@@ -74,14 +73,3 @@ class Ours:
     def distances(self, tick: int) -> Array:
         """By coal on this scene's geometry."""
         return reference(self.scene, self.workload, [tick])[1][0]
-
-
-class Compiled(Ours):
-    """The default installation."""
-
-    packages = (*Ours.packages, "numba")
-
-    def __init__(self, workload: Workload) -> None:
-        super().__init__(workload)
-        if "numba" not in sys.modules:
-            raise ImportError("this qpavoid has no compiled tick, or numba is not installed")

@@ -1,4 +1,4 @@
-"""`kernels.vectorised.ahead` as loops that numba compiles; documented there."""
+"""How near anything may come on the way of a velocity, by bounds alone: no distance on the way is computed."""
 
 from __future__ import annotations
 
@@ -6,14 +6,33 @@ from typing import Any
 
 import numpy as np
 
-from qpavoid.kernels.compiled.packing import compiled
-from qpavoid.kernels.vectorised.ahead import TOLERANCE
+from qpavoid.kernels.packing import compiled
 from qpavoid.problem import Array
+
+TOLERANCE = 2e-4
+"""How much nearer than its safe distance a pair may come along the way of a velocity [m]."""
 
 
 @compiled
 def closest_call(x: Any, v: Array, k: int, reach: float, horizon: float) -> float:
-    """See `vectorised.ahead.closest_call`."""
+    """Bound from below what is left of the safe distance of every pair on the straight way of v until `horizon`.
+
+    No distance falls faster than the fastest points of its two bodies move. A point that a joint carries moves at most
+    at the speed of the joint's origin plus its angular speed times the distance. It comes at most s h + ½ a h² far in
+    the time h, if it starts at speed s and its acceleration stays below a; at constant joint rates that is at most
+    Ω² R + 2 Ω V, with the sums Ω of the angular and V of the linear rates of the joints that carry it and the longest
+    lever R. Where that leaves nothing of a pair, `_left_along_normal` may.
+
+    Args:
+        x: reads what the tick found; writes the speeds and spins of the joints.
+        v: velocity (n,).
+        k: number of near pairs.
+        reach: surface distance below which a pair is near; all others are at least so far apart [m].
+        horizon: h [s].
+
+    Returns:
+        Least of distance - hold [m] on the way, or less; NaN where there is one.
+    """
     speeds, joints = x.speeds, len(x.joint_poses)
     joint_speeds(x, v)
     fastest = 0.0
@@ -43,7 +62,25 @@ def closest_call(x: Any, v: Array, k: int, reach: float, horizon: float) -> floa
 
 @compiled
 def _left_along_normal(x: Any, v: Array, i: int, horizon: float, bend: float) -> float:
-    """See `vectorised.ahead._left_along_normal`; of near pair number i."""
+    """Bound from below what is left of the safe distance of near pair i until `horizon`.
+
+    Two convex bodies are at least as far apart as along any direction: as far along it as the nearest points of the
+    two. In the direction of the normal n, these move with the witness points, and with the turning of the bodies: x, of
+    a body that turns with ω, comes by (x - p)·(n × ω) closer in a second than the witness point p. Of the box around
+    the body, no point comes closer than |n × ω| along its edges says. An obstacle that turns bends its way by no more
+    than ½ ω h² times the speed of its fastest point. A stop within jerk limits may lead backwards, and an obstacle need
+    not move as long as the robot does.
+
+    Args:
+        x: reads what the tick found, and the spins of the joints.
+        v: velocity (n,).
+        i: number of the near pair.
+        horizon: h [s].
+        bend: what the curved ways of two bodies of the robot may add [m].
+
+    Returns:
+        Bound [m]; -∞ for a pair of bodies that are not convex, or that stands for others.
+    """
     pair, found = x.near[i], x.closest[i]
     if not x.convex[pair]:
         return -np.inf
@@ -78,7 +115,14 @@ def _left_along_normal(x: Any, v: Array, i: int, horizon: float, bend: float) ->
 
 @compiled
 def bends(x: Any, q: Array, v: Array, horizon: float) -> bool:
-    """See `vectorised.ahead.bends`."""
+    """Return True if a coordinate would pass its position limit on the way of v, so that it brakes harder than others.
+
+    Args:
+        x: reads the position limits.
+        q: configuration (nq,).
+        v: velocity (n,).
+        horizon: time for which v leads on [s].
+    """
     for i in range(len(x.q_index)):
         ahead = q[x.q_index[i]] + horizon * v[x.v_index[i]]
         if ahead < x.q_lower[i] or ahead > x.q_upper[i]:
@@ -88,7 +132,14 @@ def bends(x: Any, q: Array, v: Array, horizon: float) -> bool:
 
 @compiled
 def joint_speeds(x: Any, v: Array) -> None:
-    """See `vectorised.ahead.joint_speeds`."""
+    """Write the largest speed of any point that each joint carries.
+
+    That of its origin, plus its angular speed times the distance of the farthest point.
+
+    Args:
+        x: reads J_world, joint_poses and joint_reach; writes spins and the first J of speeds.
+        v: velocity (n,).
+    """
     J, poses, twists = x.J_world, x.joint_poses, np.zeros((len(x.joint_poses), 6))
     c = 0
     for i in range(len(poses)):
@@ -108,7 +159,14 @@ def joint_speeds(x: Any, v: Array) -> None:
 
 @compiled
 def tracking_clear(x: Any, q: Array, k: int, reach: float) -> bool:
-    """See `vectorised.ahead.tracking_clear`."""
+    """Return True if, by `closest_call`, nothing comes too near on the way of v0 and a stop from it.
+
+    Args:
+        x: reads what the tick found, v0 among it.
+        q: configuration (nq,).
+        k: number of near pairs.
+        reach: surface distance below which a pair is near [m].
+    """
     slowing = 0.0
     for j in range(len(x.v0)):
         slowing = max(slowing, abs(x.v0[j]) / x.v_step[j])

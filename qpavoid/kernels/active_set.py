@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from qpavoid.kernels.compiled.packing import compiled
+from qpavoid.kernels.packing import compiled
 from qpavoid.problem import Array, IntArray
 
 _TOLERANCE = 1e-10

@@ -1,4 +1,4 @@
-"""`kernels.vectorised.stops` as loops that numba compiles; documented there."""
+"""Stops within the limits: the next velocity of one, and all of it."""
 
 from __future__ import annotations
 
@@ -6,22 +6,26 @@ from typing import Any
 
 import numpy as np
 
-from qpavoid.kernels.compiled.bounds import _longest_way, _speed_to_stop, velocity_bounds
-from qpavoid.kernels.compiled.packing import compiled
+from qpavoid.kernels.bounds import _longest_way, _speed_to_stop, velocity_bounds
+from qpavoid.kernels.packing import compiled
 from qpavoid.kernels.stopping import AT_REST
 from qpavoid.problem import Array
 
 
 @compiled
 def stop_velocity(x: Any) -> None:
-    """See `vectorised.stops.stop_velocity`."""
-    slowing = 1.0 if x.accelerated else np.inf
-    for j in range(len(x.v_last)):
-        slowing = max(slowing, abs(x.v_last[j]) / x.v_step[j])
-    share = 1.0 - 1.0 / slowing if x.accelerated else 0.0
+    """Write to v_stop the next velocity of a stop: v_last times one factor, so that no distance closes faster.
+
+    Bounds of position and velocity come first. Without acceleration limits it is a standstill, if they allow that.
+    With jerk limits, see `easing_stop`.
+    """
     if x.jerked:
-        _easing_stop(x, 1.0 / slowing)
+        x.v_stop[:] = easing_stop(x.v_last, x.w_last, x.v_step, x.w_step)
     else:
+        slowing = 1.0  # number of ticks to a standstill
+        for j in range(len(x.v_last)):
+            slowing = max(slowing, abs(x.v_last[j]) / x.v_step[j])
+        share = 1.0 - 1.0 / slowing if x.accelerated else 0.0
         for j in range(len(x.v_last)):
             x.v_stop[j] = share * x.v_last[j]
     for j in range(len(x.v_last)):
@@ -29,24 +33,50 @@ def stop_velocity(x: Any) -> None:
 
 
 @compiled
-def _easing_stop(x: Any, braking: float) -> None:
-    """See `vectorised.stops.easing_stop`."""
-    fastest, off = 0.0, 1.0
-    for j in range(len(x.v_last)):
-        fastest = max(fastest, abs(x.v_last[j]) / x.w_step[j])
+def easing_stop(v: Array, w: Array, v_step: Array, w_step: Array) -> Array:
+    """Compute the next velocity of a stop within jerk limits, before bounds.
+
+    The change of v goes straight towards that of the stop that would be the fastest of all with one factor for all
+    coordinates, in steps that no coordinate's jerk forbids; once it is there, it stays there to the end.
+
+    Args:
+        v: velocity (n,).
+        w: by how much it has just changed (n,).
+        v_step: largest change of v in a tick (n,), infinite where there is no limit.
+        w_step: largest change of that change from tick to tick (n,), infinite where there is no limit.
+
+    Returns:
+        Velocity (n,).
+    """
+    slowing, fastest, off = 1.0, 0.0, 1.0
+    for j in range(len(v)):
+        slowing = max(slowing, abs(v[j]) / v_step[j])
+        fastest = max(fastest, abs(v[j]) / w_step[j])
+    braking = 1.0 / slowing
     if fastest > 0.0:
         braking = min(braking, _speed_to_stop(fastest, 1.0, 1.0) / fastest)
-    for j in range(len(x.v_last)):
-        off = max(off, abs(x.w_last[j] + braking * x.v_last[j]) / x.w_step[j])
+    for j in range(len(v)):
+        off = max(off, abs(w[j] + braking * v[j]) / w_step[j])
     kept = 1.0 - 1.0 / off
     share = 1.0 - (1.0 - kept) * braking
-    for j in range(len(x.v_last)):
-        x.v_stop[j] = share * x.v_last[j] + kept * x.w_last[j]
+    return share * v + kept * w
 
 
 @compiled
 def stop_way(x: Any, q: Array, w: Array, way: Array) -> int:
-    """See `vectorised.stops.stop_way`."""
+    """Write the velocities of the ticks of a stop within jerk limits, from the velocity way[0] on.
+
+    Bounds are applied only where the stop without them may come near a limit of position or velocity.
+
+    Args:
+        x: memory of its own; the limits are read.
+        q: configuration (nq,) before the first of these ticks.
+        w: change of v that has led to way[0] (n,), no larger than v_step.
+        way: out, room for as many ticks as are considered (m, n).
+
+    Returns:
+        Number of ticks in which the robot moves, or m.
+    """
     x.lower[:], x.upper[:] = -np.inf, np.inf
     count = _stop_ticks(x, q, w, way, False)
     below, above = np.full(len(w), np.inf), np.full(len(w), np.inf)
@@ -75,7 +105,7 @@ def stop_way(x: Any, q: Array, w: Array, way: Array) -> int:
 
 @compiled
 def _stop_ticks(x: Any, q: Array, w: Array, way: Array, bounded: bool) -> int:
-    """See `vectorised.stops._stop_ticks`."""
+    """Follow a stop as `stop_way` does, with all bounds at all places of the way, or with none; overwrites q."""
     x.v_last[:], x.w_last[:] = way[0], w
     for k in range(1, len(way)):
         if bounded:

@@ -1,16 +1,30 @@
-"""`kernels.vectorised.culling` as loops that numba compiles; documented there."""
+"""Which pairs can be within reach at all, by bounding spheres."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from qpavoid.kernels.compiled.packing import compiled
+from qpavoid.kernels.packing import compiled
 from qpavoid.problem import Array, IntArray
 
 
 @compiled
 def candidates(poses: Array, local: Array, centers: Array, within: Array, pair_of: IntArray, found: IntArray) -> int:
-    """See `vectorised.culling.candidates`."""
+    """Find the pairs whose bounding spheres are within reach of each other.
+
+    Args:
+        poses: world poses of all geometries, rotation by columns and translation (g, 12).
+        local: centres of their bounding spheres in their own frames (g, 3) [m].
+        centers: the same in the world, as rows [c, 1, -|c|²] (g, 5) [m]; those of the b bodies of the robot, which
+            come first, are overwritten.
+        within: squared distance of centres up to which each combination counts (b, g) [m²]; negative where there is no
+            pair.
+        pair_of: index of the pair of each combination (b, g), increasing along the rows, one after the other.
+        found: overwritten with the indices of these pairs, increasing (m,).
+
+    Returns:
+        Number of these pairs.
+    """
     bodies, geometries = pair_of.shape
     for i in range(bodies):
         for r in range(3):
@@ -33,7 +47,7 @@ def candidates(poses: Array, local: Array, centers: Array, within: Array, pair_o
 
 @compiled
 def in_one_alone(a: IntArray, b: IntArray) -> IntArray:
-    """See `vectorised.culling.in_one_alone`."""
+    """Compute what is in one of two increasing arrays (m,), (n,) and not in the other, increasing (k,)."""
     found = np.empty(len(a) + len(b), np.intp)
     i, j, count = 0, 0, 0
     while i < len(a) or j < len(b):

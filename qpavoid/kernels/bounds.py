@@ -1,4 +1,4 @@
-"""`kernels.vectorised.bounds` as loops that numba compiles; documented there."""
+"""Bounds on v from the limits of the joints."""
 
 from __future__ import annotations
 
@@ -6,16 +6,26 @@ from typing import Any
 
 import numpy as np
 
-from qpavoid.kernels.compiled.packing import compiled
-from qpavoid.kernels.stopping import MOST_STEPS, longest_way, way_to_stop
+from qpavoid.kernels.packing import compiled
+from qpavoid.kernels.stopping import MOST_STEPS, longest_way, speed_to_stop, way_to_stop
 from qpavoid.problem import Array
 
-_way_to_stop, _longest_way = compiled(way_to_stop), compiled(longest_way)
+_speed_to_stop, _way_to_stop, _longest_way = compiled(speed_to_stop), compiled(way_to_stop), compiled(longest_way)
 
 
 @compiled
 def velocity_bounds(x: Any, q: Array) -> float:
-    """See `vectorised.bounds.velocity_bounds`."""
+    """Write the bounds on v from the joint limits: hard_lower, hard_upper, lower and upper; see `qpavoid.limits`.
+
+    A coordinate outside a position limit is sent back at a rate, from which it can still brake for the opposite limit.
+
+    Args:
+        x: reads the limits, v_last and w_last; writes the bounds.
+        q: configuration (nq,).
+
+    Returns:
+        Distance to the nearest position limit [rad, m]: negative outside, infinite where there are none.
+    """
     lower, upper, least = x.hard_lower, x.hard_upper, np.inf
     for j in range(len(x.v_max)):
         lower[j], upper[j] = -x.v_max[j], x.v_max[j]
@@ -49,7 +59,16 @@ def velocity_bounds(x: Any, q: Array) -> float:
 
 @compiled
 def _within_jerk(x: Any, q: Array) -> None:
-    """See `vectorised.bounds._within_jerk`."""
+    """Write to lower and upper the bounds on v between which the stops of `kernels.stopping` end within the limits.
+
+    They never cross, as the stop's own next velocity is between them from any state. Of a coordinate outside its
+    position limits, the hard bounds that send it back are relaxed to what it needs to stop before the opposite limit;
+    once on its way back, it does not turn round again.
+
+    Args:
+        x: reads the limits, v_last and w_last; writes lower, upper, and the hard bounds of coordinates outside.
+        q: configuration (nq,).
+    """
     below, above = np.full(len(x.v_max), np.inf), np.full(len(x.v_max), np.inf)
     for i in range(len(x.q_index)):
         here = q[x.q_index[i]]
@@ -75,15 +94,18 @@ def _within_jerk(x: Any, q: Array) -> None:
 
 
 @compiled
-def _speed_to_stop(room: float, step: float, dt: float) -> float:
-    """See `vectorised.bounds.speed_to_stop`."""
-    ticks = min(max(np.ceil(0.5 * np.sqrt(1.0 + 8.0 * room / (step * dt)) - 0.5), 1.0), 1e15)
-    return room / (dt * ticks) + 0.5 * step * (ticks - 1.0)
-
-
-@compiled
 def _change_to_stop(speed: float, high: float, low: float, most: float, room: float) -> float:
-    """See `vectorised.bounds.change_to_stop`."""
+    """Compute the largest change of v, between `low` and `high`, after which a stop ends within `room`.
+
+    Newton's method from above, on the convex way of `kernels.stopping.way_to_stop`, with its units.
+
+    Args:
+        speed: v before the change.
+        high: largest change that matters.
+        low: what is returned where no larger change will do.
+        most: largest change that the acceleration allows.
+        room: distance left, not negative.
+    """
     change = high
     for _ in range(MOST_STEPS):
         way, growth = _way_to_stop(speed + change, change, most)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from qpavoid.kernels.compiled.packing import compiled
+from qpavoid.kernels.packing import compiled
 from qpavoid.problem import Array, IntArray, Mask
 
 APART = 1e-6

@@ -1,12 +1,17 @@
-"""The functions of `qpavoid.kernels.vectorised.voxels` as loops that numba compiles; documented there."""
+"""Which voxels of a cloud are nearest to each body.
+
+Bodies count as capsules: those that are something else as the capsule around them.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
-from qpavoid.kernels.compiled.packing import compiled
-from qpavoid.kernels.vectorised.voxels import ALIKE
+from qpavoid.kernels.packing import compiled
 from qpavoid.problem import Array, IntArray
+
+ALIKE = 0.05
+"""Angle below which the directions to voxels at about the same place of a body count as one [rad]."""
 
 
 @compiled
@@ -22,7 +27,20 @@ def within_reach(
     distance: Array,
     place: Array,
 ) -> None:
-    """See `vectorised.voxels.within_reach`."""
+    """Find the voxels that are nearer to a body than `reach`, body after body.
+
+    Args:
+        axes: ends of the bodies' axes in the cloud's frame (b, 6) [m]; NaN for a body that is left out.
+        radii: of the bodies' capsules plus the voxels' balls (b,) [m].
+        reach: surface distance [m].
+        centers: of the voxels (m, 3), see `Voxels`.
+        blocks: balls around the blocks (k, 4).
+        starts: where each block begins (k + 1,).
+        first: out, where each body's voxels begin in what follows (b + 1,).
+        point: out, numbers of the voxels; as the others with room for b m.
+        distance: out, between surfaces [m].
+        place: out, where along the axis the nearest point is [m], and the direction from there (…, 4).
+    """
     count = 0
     for body in range(len(axes)):
         first[body] = count
@@ -66,7 +84,23 @@ def choose(
     slots: IntArray,
     kept: IntArray,
 ) -> None:
-    """See `vectorised.voxels.choose`."""
+    """Fill the slots of each body with its nearest voxels, but for those that make the same row as a nearer one.
+
+    Two voxels at about the same place of a body's axis, in about the same direction, make the same row. Up to half of
+    the slots go to the nearest voxels at different places of the axis, so that no end is left out for the other; the
+    others to the nearest that are not alike, which leaves a row on either side of each tie, so that rows do not jump. A
+    voxel that was in a slot before stays in it.
+
+    Args:
+        first: where each body's voxels begin (b + 1,), as of `within_reach`.
+        point: their numbers.
+        distance: from the body [m]; overwritten.
+        place: where along the axis, and in which direction (…, 4).
+        spacing: how far apart along the axis places count as different (b,) [m].
+        keys: of all voxels (m,).
+        slots: out, numbers of the chosen voxels (b, k); -1 for none.
+        kept: keys of the voxels that were in the slots before (b, k), -1 for none; overwritten with those of now.
+    """
     bodies, size = slots.shape
     chosen = np.empty(size, np.intp)
     for body in range(bodies):

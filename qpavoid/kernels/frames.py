@@ -1,4 +1,4 @@
-"""`kernels.vectorised.frames` as loops that numba compiles; documented there."""
+"""Rows of the frames that follow targets, and the velocity that the tracking law makes of all task rows."""
 
 from __future__ import annotations
 
@@ -6,18 +6,27 @@ from typing import Any
 
 import numpy as np
 
-from qpavoid.kernels.compiled.packing import compiled
-from qpavoid.kernels.compiled.pairs import _fold
+from qpavoid.kernels.packing import compiled
+from qpavoid.kernels.pairs import _fold
 from qpavoid.kernels.rotation import rotation_vector
-from qpavoid.kernels.vectorised.frames import WELL_CONDITIONED
 from qpavoid.problem import Array
+
+WELL_CONDITIONED = 1e-6
+"""Ratio of the smallest to the largest pivot of J Jᵀ down to which J⁺ is taken from it without damping."""
 
 _rotation_vector = compiled(rotation_vector)
 
 
 @compiled
 def frame_rows(x: Any) -> None:
-    """See `vectorised.frames.frame_rows`."""
+    """Write the rows A v = b of f frames that follow targets: feed-forward plus gain times error, capped and scaled.
+
+    The orientation error is the rotation vector of R_target Rᵀ. Three linear rows for each frame whose position counts
+    come first, then three angular rows for each whose orientation does; rows after these are left as they are.
+
+    Args:
+        x: reads frame_poses, targets and the layout of the tasks; writes poses, A, b.
+    """
     poses, targets, screws, support, A, b = x.poses, x.targets, x.screws, x.task_support, x.A, x.b
     J_world = np.ascontiguousarray(x.J_world)  # rows in one piece become vector instructions
     rows, columns = len(screws), J_world.shape[1]
@@ -63,7 +72,12 @@ def frame_rows(x: Any) -> None:
 
 @compiled
 def damped_solution(x: Any, v: Array) -> None:
-    """See `vectorised.frames.damped_solution`: Cholesky factorisation of the Gram matrix, row by row."""
+    """Write A⁺b with A⁺ = Aᵀ (A Aᵀ + λ²)⁻¹, by a Cholesky factorisation of the Gram matrix, row by row.
+
+    Args:
+        x: reads A (r, n), b (r,) and the damping λ.
+        v: out (n,); 0 where there are no rows, NaN where there is no damping and A Aᵀ is close to singular.
+    """
     A, b, damping = x.A, x.b, x.damping
     rows, nv = A.shape
     L = np.empty((rows, rows))
@@ -101,7 +115,7 @@ def damped_solution(x: Any, v: Array) -> None:
 
 @compiled
 def projection_cost(A: Array, regularization: float, v0: Array) -> tuple[Array, Array]:
-    """See `vectorised.frames.projection_cost`."""
+    """Compute P = AᵀA + λ (n, n) and q = -P v0 (n,): ½ vᵀP v + qᵀv is smallest at v0."""
     rows, nv = A.shape
     P = np.empty((nv, nv))
     q = np.zeros(nv)

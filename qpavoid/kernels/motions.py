@@ -1,36 +1,78 @@
-"""The functions of `qpavoid.kernels.vectorised.motions` as loops that numba compiles; documented there."""
+"""Moving obstacles: where all of them are at a time, and what distances need to know of it.
+
+A *state* is a row of 18: rotation by columns, position, linear and angular velocity, in world axes [-, m, m/s, rad/s].
+"""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from qpavoid.kernels.compiled.frames import _rotation_vector
-from qpavoid.kernels.compiled.packing import compiled
-from qpavoid.kernels.vectorised.motions import (
-    EXACT,
-    FAR,
-    FAST,
-    LEFT_HANDED,
-    NEARLY,
-    NO_ROTATION,
-    NORMALISED,
-    NOT_FINITE,
-    POSE,
-    SAMPLE,
-    Pieces,
-    Placed,
-)
+from qpavoid.kernels.frames import _rotation_vector
+from qpavoid.kernels.packing import compiled
 from qpavoid.problem import Array, IntArray, Mask
 
+FINE, NORMALISED, NOT_FINITE, FAR, FAST, NO_ROTATION, LEFT_HANDED = range(7)
+"""What `check_states` finds."""
+EXACT, NEARLY = 1e-6, 1e-3
+"""|RᵀR - I| up to which a matrix is taken for a rotation as it is (those of 32 bits are 1e-7 off), and up to which it
+is replaced by the rotation next to it."""
+SAMPLE, POSE, REST = range(3)
+"""How an obstacle is given: with a twist, without one, at rest."""
 
-def pack_pieces(pieces: Pieces) -> Pieces:
-    """See `vectorised.motions.pack_pieces`."""
-    return pieces
+
+class Pieces(NamedTuple):
+    """Motions of k bodies, cut into n pieces on which the state is a weighted sum of seven constant ones.
+
+    With the share s of a piece's time, its rate s' and the angle φ of the piece, the weights are 1, s, sin sφ, cos sφ,
+    s', s'φ sin sφ, s'φ cos sφ. A body's first piece starts at -∞, and each lasts until the next one starts.
+    """
+
+    bodies: IntArray
+    """(k,) row of the states that each body has."""
+    first: IntArray
+    """(k + 1,) first piece of each body, and n."""
+    starts: Array
+    """(n,) [s]."""
+    clock: Array
+    """(n, 4) time from which s counts and in which it grows by 1, infinite at rest [s]; φ [rad]; 1 where s is smooth:
+    10 τ³ - 15 τ⁴ + 6 τ⁵ in place of τ."""
+    terms: Array
+    """(n, 7, 18) the constant states."""
+
+
+class Placed(NamedTuple):
+    """What the distances of g bodies know of o obstacles, of which the first c can be carried."""
+
+    states: Array
+    """(o, 18)."""
+    twists: Array
+    """(o + 1 + c, 6) velocities at the world's origin; row o stays zero, the last c are negative."""
+    margin: Array
+    """(o + 1 + c,) taken off the distances to each, in the same order but positive [m]."""
+    speeds: Array
+    """(o,) largest speed of any of its points [m/s]."""
+    reach: Array
+    """(o,) distance from its origin to its farthest point that matters [m]."""
+    placements: Array
+    """(g, 12) poses of all bodies: rotation by columns, then position."""
+    local: Array
+    """(g, 3) centres of their bounding spheres in their own frames [m]."""
+    centers: Array
+    """(g, 5) the same in the world, as rows [c, 1, -|c|²]; those that joints carry are not kept up to date."""
 
 
 @compiled
 def sample_pieces(x: Pieces, t: float, tolerance: float, states: Array) -> None:
-    """See `vectorised.motions.sample_pieces`."""
+    """Write where the bodies are.
+
+    Args:
+        x: their motions.
+        t: time [s].
+        tolerance: how early a piece ends [s].
+        states: out: rows of `bodies`; the others stay (o, 18).
+    """
     weights = np.empty(7)
     for k in range(len(x.bodies)):
         low, high = x.first[k], x.first[k + 1]
@@ -60,7 +102,20 @@ def sample_pieces(x: Pieces, t: float, tolerance: float, states: Array) -> None:
 def place_obstacles(
     x: Placed, which: IntArray, geometries: IntArray, owners: IntArray, states: Array, margin: Array
 ) -> tuple[int, bool]:
-    """See `vectorised.motions.place_obstacles`."""
+    """Move some obstacles.
+
+    Args:
+        x: overwritten; as it was where a number is NaN or infinite.
+        which: numbers of the obstacles (k,).
+        geometries: numbers of their bodies (b,).
+        owners: to which of the k each of these belongs (b,).
+        states: of all obstacles; read where `which` says (o, 18).
+        margin: to be taken off their distances, read where `which` says (o,) [m].
+
+    Returns:
+        Number of the first obstacle with NaN or infinity, -1 where there is none; whether any of all obstacles has a
+        velocity or a margin.
+    """
     obstacles = len(x.states)
     negative = len(x.twists) - obstacles - 1
     for i in which:
@@ -106,7 +161,21 @@ def place_obstacles(
 def check_states(
     states: Array, which: IntArray, kind: IntArray, farthest: float, fastest: float
 ) -> tuple[IntArray, Array]:
-    """See `vectorised.motions.check_states`."""
+    """Find states that cannot be true, and normalise rotations that are nearly ones in place.
+
+    R becomes ½ R (3 I - RᵀR), which squares its distance from the nearest rotation, four times over: from 1e-3 that
+    leaves nothing but round-off.
+
+    Args:
+        states: (o, 18).
+        which: numbers of those to look at (k,).
+        kind: how each is given (k,): SAMPLE, POSE or REST; of the latter two, twists are not looked at.
+        farthest: largest coordinate of a position [m].
+        fastest: largest component of a twist [m/s, rad/s].
+
+    Returns:
+        (k,) FINE, NORMALISED, or the first thing that is wrong; (k,) largest entry of |RᵀR - I|.
+    """
     codes, off, gram, new = np.zeros(len(which), np.intp), np.zeros(len(which)), np.empty((3, 3)), np.empty(9)
     for k in range(len(which)):
         x, count = states[which[k]], 18 if kind[k] == SAMPLE else 12
@@ -158,7 +227,25 @@ def take_in(
     which: IntArray, kind: IntArray, times: Array, news: Array, stamps: Array, last: Array, states: Array,
     shortest: float, fastest: float,
 ) -> Mask:  # fmt: skip
-    """See `vectorised.motions.take_in`."""
+    """Take over checked states of obstacles that are given from outside; a bare pose gets the twist that has led to it.
+
+    That is the difference of its last two poses, over the time between their stamps; the first one counts as at rest,
+    and where no time lies between them the twist stays as it was.
+
+    Args:
+        which: numbers of the obstacles (k,).
+        kind: how each is given (k,): SAMPLE, POSE or REST.
+        times: their time stamps (k,) [s].
+        news: what is given, read where `which` says (o, 18); the twists of bare poses are overwritten.
+        stamps: time stamps of what was given last, NaN where nothing was (o,) [s]; overwritten.
+        last: what was given last, with its twist (o, 18); overwritten.
+        states: (o, 18) overwritten as well.
+        shortest: time between two poses below which no twist is estimated [s].
+        fastest: largest component of a twist that is estimated [m/s, rad/s].
+
+    Returns:
+        Which of them were taken over (k,); not those whose poses are too far apart for `fastest`.
+    """
     fine, turn = np.ones(len(which), np.bool_), np.empty((3, 3))
     for k in range(len(which)):
         i = which[k]

@@ -1,0 +1,178 @@
+"""Compiled kernels on disk: a folder for each state of their sources, so that code which is stale is never run.
+
+numba's own cache takes the code of a function as fresh as long as the file of that function is, and so goes on with
+what the function took from other files that have changed since. Here, all of it is kept in one folder of the user's
+cache directory, whose name holds a digest of all kernel sources and of the versions that compiled them. Nothing is
+written beside the sources, so that an installation may be read-only, and nothing is deleted but other such folders.
+
+Processes may start at the same time, and the folder may vanish, be read-only or full: whatever cannot be read is
+compiled, and whatever cannot be written is compiled by the next process, too.
+
+`NUMBA_CACHE_DIR` puts the folder elsewhere.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable
+from contextlib import suppress
+from hashlib import blake2b
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numba
+from numba.core.caching import CompileResultCacheImpl, FunctionCache
+from numba.core.serialize import dumps
+from numba.misc.appdirs import AppDirs
+
+_MOST = 8
+"""Folders that are kept, those used last: a few checkouts and versions of numba side by side, 5 MB each."""
+_DIGEST = 16
+"""Bytes of a digest; that of the content begins every file, as damaged machine code must not be run."""
+_COMPLETE = "complete"
+"""Empty file in a folder once the kernels of a controller are in it."""
+
+
+def _folder() -> Path:
+    """Return the folder of this state of the sources."""
+    sources = [(path.name, path.read_bytes()) for path in sorted(Path(__file__).parent.glob("*.py"))]
+    digest = _digest(repr((numba.__version__, sys.implementation.cache_tag, sources)).encode())
+    parent = numba.config.CACHE_DIR or AppDirs("qpavoid", appauthor=False).user_cache_dir
+    return Path(parent) / f"kernels-{digest.hex()}"
+
+
+def _digest(content: bytes) -> bytes:
+    return blake2b(content, digest_size=_DIGEST).digest()
+
+
+class _Files:
+    """The code of one function in a folder, a file for each signature; takes the place of numba's index of files.
+
+    Of two processes that add signatures to one index at the same time, either may end with an entry that leads to the
+    code of the other. Here a file is named after its signature, and holds it.
+    """
+
+    def __init__(self, folder: Path, name: str) -> None:
+        self._folder, self._name = folder, name
+
+    def load(self, key: Any) -> Any:
+        """Return the code of a signature, or None where there is none that can be read."""
+        with suppress(OSError):
+            content = self._path(key).read_bytes()
+            if _digest(content[_DIGEST:]) == content[:_DIGEST]:
+                found, code = pickle.loads(content[_DIGEST:])
+                if found == key:
+                    self._count_as_used()
+                    return code
+        first_use.begin()
+        return None
+
+    def save(self, key: Any, code: Any) -> None:
+        """Write the code of a signature, all of it at once, where that is possible."""
+        content = dumps((key, code))
+        with suppress(OSError):
+            self._folder.mkdir(parents=True, exist_ok=True)
+            handle, temporary = tempfile.mkstemp(suffix=".tmp", dir=self._folder)
+            try:
+                with open(handle, "wb") as file:
+                    file.write(_digest(content) + content)
+                os.replace(temporary, self._path(key))
+            except BaseException:
+                os.unlink(temporary)
+                raise
+
+    def flush(self) -> None:
+        """Delete the code of all signatures."""
+        for path in self._folder.glob(f"{self._name}.*.code"):
+            with suppress(OSError):
+                path.unlink()
+
+    def _count_as_used(self) -> None:
+        with suppress(OSError):
+            os.utime(self._folder / _COMPLETE)
+
+    def _path(self, key: Any) -> Path:
+        return self._folder / f"{self._name}.{_digest(repr(key).encode()).hex()}.code"
+
+
+class _Place:
+    """Where numba looks for the code of a function."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._py_file = function.__code__.co_filename
+
+    def get_cache_path(self) -> str:
+        """Return the folder."""
+        return str(FOLDER)
+
+    def get_source_stamp(self) -> str:
+        """Return what changes with the sources."""
+        return FOLDER.name
+
+    def ensure_cache_path(self) -> None:
+        """Leave it to `_Files.save` to make the folder."""
+
+
+class _Implementation(CompileResultCacheImpl):  # type: ignore[misc]
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._lineno, self._locator = function.__code__.co_firstlineno, _Place(function)
+        self._filename_base = f"{function.__module__.rpartition('.')[2]}.{function.__qualname__}-{self._lineno}"
+
+
+class KernelCache(FunctionCache):  # type: ignore[misc]
+    """The cache of one compiled function: numba's, with one folder for all sources."""
+
+    _impl_class = _Implementation
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        self._cache_file = _Files(FOLDER, self._impl.filename_base)
+
+
+class FirstUse:
+    """What stderr says where a machine has no compiled kernels yet; nothing is said ever after."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._begin = folder, 0.0
+
+    def begin(self) -> None:
+        """Say that kernels are compiled, the first time that any is in an incomplete folder."""
+        if not self._begin and not (self._folder / _COMPLETE).exists():
+            self._begin = perf_counter()
+            _say("compiling kernels, once on this machine: about 20 s ...")
+
+    def end(self) -> None:
+        """Say how long it took, where `begin` said anything, and mark the folder as complete."""
+        if not self._begin:
+            return
+        _say(f"compiled kernels in {perf_counter() - self._begin:.0f} s")
+        self._begin = 0.0
+        try:
+            (self._folder / _COMPLETE).touch()
+        except OSError as error:
+            _say(f"they could not be kept for the next run: {error}; NUMBA_CACHE_DIR=DIR puts them elsewhere")
+        _make_room(self._folder.parent)
+
+
+def _say(line: str) -> None:
+    if sys.stderr is not None:
+        print(f"qpavoid: {line}", file=sys.stderr, flush=True)
+
+
+def _make_room(parent: Path) -> None:
+    """Delete the folders that were not used for longest, down to the most that are kept."""
+    with suppress(OSError):
+        folders = sorted(parent.glob(f"kernels-*/{_COMPLETE}"), key=lambda path: path.stat().st_mtime)
+        for complete in folders[:-_MOST]:
+            shutil.rmtree(complete.parent, ignore_errors=True)
+
+
+FOLDER = _folder()
+"""Where the code of these sources is kept."""
+first_use = FirstUse(FOLDER)
+"""What there is to be said of the first compilation."""
