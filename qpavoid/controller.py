@@ -531,10 +531,10 @@ class Controller:
         self, t: float, given: Mapping[str, Any] | None
     ) -> tuple[tuple[Any, ...], tuple[Reason, ...], tuple[Reason, ...]]:
         """Targets of all tasks, what is wrong with those that are given, and what was normalised in them."""
+        if given is not None and not isinstance(given, Mapping):
+            raise NumericalError(f"targets: give a mapping of names to targets, not {given!r:.60}")
         if not given:
             return tuple([task.motion.sample(t) for task in self.tasks]), (), ()
-        if not isinstance(given, Mapping):
-            raise NumericalError(f"targets: give a mapping of names to targets, not {given!r:.60}")
         samples, known, placed, faults = [], 0, list[int](), list[Reason]()
         for row, (name, task) in enumerate(self._task_names.items()):
             sample = None

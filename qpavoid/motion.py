@@ -23,7 +23,7 @@ from qpavoid.config import Motion as MotionConfig
 from qpavoid.config.base import LARGEST
 from qpavoid.csv_poses import read_poses
 from qpavoid.errors import ConfigError, NumericalError, located
-from qpavoid.problem import Array
+from qpavoid.problem import Array, require_finite
 
 END_TOLERANCE = 1e-9
 """How early a piece ends [s]: k·dt may fall a rounding error short of the time it stands for."""
@@ -262,14 +262,7 @@ def _direction(vector: tuple[float, float, float], field: str) -> Array:
 
 
 def _checked(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    try:
-        array = np.array(value, dtype=float)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise NumericalError(f"{name}: {error}; give numbers of shape {shape}") from error
-    if array.shape != shape:
-        raise NumericalError(f"{name} has shape {array.shape}; give {shape}")
-    if not np.isfinite(array).all():
-        raise NumericalError(f"{name} = {array.tolist()} is not finite; give finite numbers")
+    array = np.array(require_finite(name, value, shape))
     array.setflags(write=False)  # samples of one motion share it
     return array
 

@@ -31,6 +31,7 @@ from qpavoid import (
 from qpavoid.ahead.guard import Guard
 from qpavoid.config import (
     AlignTask,
+    Box,
     ComTask,
     DampingTask,
     HalfSpace,
@@ -97,7 +98,7 @@ def test_time_that_goes_on_by_something_else_than_the_period_is_said(panda, begi
     assert not controller.step(panda.home, begin + step + 0.01).assumptions
 
 
-@pytest.mark.parametrize(("pause", "rests"), [(0.02, False), (0.1, False), (0.11, True), (2.0, True), (-1.0, True)])
+@pytest.mark.parametrize(("pause", "rests"), [(0.02, False), (0.099, False), (0.11, True), (2.0, True), (-1.0, True)])
 def test_after_a_gap_the_robot_starts_from_rest(panda, pause, rests):
     """The first command is one acceleration away from rest, not from what was commanded before the pause."""
     controller, limit = make_controller(panda), 0.01 * panda.bounds().acceleration
@@ -118,7 +119,7 @@ def test_times_are_believed_as_long_as_they_resolve_a_period(dt):
     clock = Clock(dt)
     assert bool(clock.read(1.7e9).faults) == (dt < 2e-4)
     assert not clock.read(1e3).faults and clock.read(1e3).t == 1e3
-    for t in (1.7e12, 1.7e15, -1.7e18, 1e300, np.inf, np.nan, 10**400):
+    for t in (*([1.7e12] if dt < 0.1 else []), 1.7e15, -1.7e18, 1e300, np.inf, np.nan, 10**400):
         times = clock.read(t)
         assert times.faults[0].key == ("IMPLAUSIBLE", ("t",)) and times.t == 0.0
     clock.set(5.0)
@@ -554,3 +555,20 @@ def test_guard_looks_at_a_bounded_number_of_poses_whatever_moves(tmp_path, speed
     way = guard._worst if jerk is None else guard._worst_of_stop
     way(controller._assembly, np.zeros(3), tick.solution.v, query, 0.2, speed)
     assert 0 < len(looks) <= 48 + 200 + 6 * 48
+
+
+def test_what_moves_again_is_no_longer_stalled_however_long_it_was(tmp_path):
+    """Pressed against a wall for 9 s, then free to slide along it, still pressed."""
+    wall = Obstacle.at("wall", Box(size=(0.1, 20.0, 2.0)), [0.3, 0.0, 0.0])
+    controller = make_controller(cartesian(tmp_path), [wall], "z")
+
+    def target(t):
+        return [0.6, 0.3 * max(t - 9.0, 0.0), 0.0]
+
+    said = []
+    for tick in drive(controller, np.zeros(3), 1200, target=target):
+        said.append({reason.key for reason in tick.solution.stalled})
+    ((kind, pair),) = said[899]
+    assert kind == "STALLED" and set(pair) == {"tool", "wall"}
+    assert all(said[400:900]) and not any(said[925:])
+    assert np.abs(tick.solution.v[1]) > 0.2

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from qpavoid.errors import ConfigError, NumericalError
 from qpavoid.files.text import read_text
 from qpavoid.motion import Sample
-from qpavoid.problem import Array, IntArray
+from qpavoid.problem import Array, IntArray, as_numbers
 
 _BLOCK = 4
 """Voxels along the edge of a block."""
@@ -70,10 +70,7 @@ class Voxels:
         Raises:
             NumericalError: wrong shape, or not numbers.
         """
-        try:
-            array = np.asarray(points, dtype=np.float64)
-        except (TypeError, ValueError):
-            raise NumericalError(f"points: not an array of numbers: {points!r:.60}") from None
+        array = as_numbers("points", points)
         if array.ndim != 2 or array.shape[1] != 3:
             raise NumericalError(f"points: shape {array.shape}, expected (n, 3)")
         good = np.abs(array).max(axis=1, initial=0.0) <= _FARTHEST  # False for NaN too

@@ -268,12 +268,12 @@ class Obstacles:
             NumericalError: an entry of the wrong shape, or not made of numbers; a trajectory of another class gives
                 what cannot be true.
         """
+        if given is not None and not isinstance(given, Mapping):
+            raise NumericalError(f"obstacles: give a mapping of names to samples, not {given!r:.60}")
         if not given:
             if not self._moving and not self._known and not self._awaited:
                 return None
             return Update(t, shift, _NONE, _NONE, _NO_STAMPS, {}, (), self._follow(t), ())
-        if not isinstance(given, Mapping):
-            raise NumericalError(f"obstacles: give a mapping of names to samples, not {given!r:.60}")
         which, kind, stamps = list[int](), list[int](), list[float]()
         voxels, unusable, notes = dict[int, Voxels](), list[int](), list[Reason]()
         for name, what in given.items():
@@ -284,6 +284,8 @@ class Obstacles:
             cloud = self._look_at(index, what, notes) if type(what) is Points else None
             sample = self._pose_of(index, what, t, shift) if type(what) is Points else _checked(name, what)
             stamp, rests = (t if sample.t is None else as_time(f"obstacle {name!r}: t", sample.t)), sample.at_rest
+            if not isinstance(rests, bool | np.bool_):
+                raise NumericalError(f"obstacle {name!r}: at_rest: {rests!r:.60}; give true or false")
             if rests and isinstance(sample, Sample) and (sample.linear.any() or sample.angular.any()):
                 raise NumericalError(f"obstacle {name!r}: at_rest, but it has a velocity; leave one of them out")
             if stamp != t:
@@ -298,7 +300,8 @@ class Obstacles:
                 continue
             if cloud is not None:
                 voxels[index] = cloud
-            for view, part in zip(self._views[2][index][:4], sample):  # noqa: B905 (a bare pose has only two)
+            views: Any = self._views[2][index]
+            for view, part in zip(views, sample[:-2]):  # noqa: B905 (a bare pose has only two)
                 view[:] = part
             which.append(index)
             kind.append(REST if rests else POSE if isinstance(sample, Pose) else SAMPLE)
@@ -337,7 +340,7 @@ class Obstacles:
             sample = as_samples(state)[0]
         else:
             sample = _checked(self._obstacles[index].name, what.pose)
-        return sample._replace(t=sample.t if what.t is None else what.t, at_rest=sample.at_rest or bool(what.at_rest))
+        return sample._replace(t=sample.t if what.t is None else what.t, at_rest=what.at_rest or sample.at_rest)
 
     def _follow(self, t: float, given: Sequence[int] = ()) -> tuple[tuple[int, Sample], ...]:
         """Sample the trajectories of other classes at t [s], but for obstacles that are given.
