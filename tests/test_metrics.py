@@ -12,7 +12,7 @@ from rich.console import Console
 from qpavoid import Log
 from qpavoid.log import STATUSES
 from qpavoid.metrics import path_deviation
-from qpavoid.report import failed, metrics_table, outcome, to_json
+from qpavoid.report import failed, metrics_table, outcome, ratios_table, to_json
 
 DT = 0.1
 
@@ -182,6 +182,21 @@ def test_table_holds_the_figures(log):
     assert cells["qp"][:6] == ["-20.0", "0.20", "100.00", "500.0", "3.00", "14.0"]
     assert cells["eq10-literal"][0] == "-"
     assert max(map(cell_len, lines)) <= 80
+
+
+def test_ratios_are_those_of_the_figures(log):
+    """0.06 m over 0.03 m is 2.00; depths of penetration, and what is none to speak of, have no ratio; 80 columns."""
+    one = log.metrics() | {"scenario": "a_long_scenario", "solver": "eq10-literal", "min_distance": 0.06, "jitter": 9.0}
+    other = one | {"solver": "qp", "min_distance": 0.03, "jitter": 4.0, "time_in_collision": 0.0, "peak_velocity": 3.3}
+    deep = [one | {"scenario": "deep", "min_distance": -0.1}, other | {"scenario": "deep"}]
+    alone = one | {"scenario": "alone"}
+    console = Console(width=80, file=io.StringIO(), record=True)
+    console.print(ratios_table([one, other, *deep, alone], "eq10-literal", "qp"))
+    lines = console.export_text().splitlines()
+    ratios = [line.split() for line in lines if line.split()[:1] == ["ratio"]]
+    assert [row[1] for row in ratios] == ["2.00", "1.00"] and all(row[-1] == "2.25" for row in ratios)
+    assert ratios[0][-2] == f"{one['peak_velocity'] / 3.3:.2f}"
+    assert max(map(cell_len, lines)) <= 80 and "alone" not in console.export_text()
 
 
 def test_table_cuts_no_outcome(log):
