@@ -5,11 +5,11 @@ BIN := .venv/bin
 .PHONY: run figures test campaign smoke lint types clean
 
 run: .venv/run
-	$(BIN)/qpavoid compare situation1 situation2 chasing_sphere sphere_field stall \
+	$(BIN)/qpavoid compare situation1 situation2 chasing_sphere five_spheres stall \
 	  --solvers tracking,eq10-literal,eq10,qp --out out
 
 figures: run
-	cp out/situation1_compare_path.png out/situation1_qp_motion.png out/sphere_field_compare_time.png docs/figures/
+	cp out/situation1_compare_path.png out/situation1_qp_motion.png out/five_spheres_compare_time.png docs/figures/
 
 test: .venv/dev
 	$(BIN)/pytest -n auto

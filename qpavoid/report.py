@@ -123,8 +123,8 @@ def outcome(run: dict[str, Any]) -> str:
     for level, word, style in (("ALARM", "alarm", "red"), ("WARNING", "warning", "yellow"), ("INFO", "info", "dim")):
         if levels[level]:
             said.append(f"[{style}]{levels[level]} {word}[/]")
-    if run["time_stalled"] > 0.0:
-        said.append(f"[yellow]stalled {run['time_stalled']:.1f} s[/]")
+    if run["time_blocked"] > 0.0:
+        said.append(f"[yellow]stalled {run['time_blocked']:.1f} s[/]")
     if not run["completed"]:
         said.append("[red]broken off[/]")
     said.append("[green]arrived[/]" if run["arrived"] else "[yellow]short of goal[/]")
