@@ -24,6 +24,10 @@ class NoteKind(str, Enum):
     """Joint: locked, moving on its own though it should follow another one."""
     LINK = "link"
     """Link: its size, its mass, its place in the tree."""
+    HOME = "home"
+    """Home pose: replaced, near a collision, singular."""
+    FRAME = "frame"
+    """Frame of a tool."""
     FILE = "file"
     """The file as a whole: prefixes of other tools, xacro."""
 
@@ -40,8 +44,10 @@ class Note:
     """One clause that says what was done with them, and why."""
     remedy: str = ""
     """What a user can do about it; empty where nothing is needed."""
-    severity: Literal["note", "warning"] = "note"
-    """`warning`: motion may differ from what the file's author meant."""
+    severity: Literal["note", "warning", "error"] = "note"
+    """`warning`: motion may differ from what the file's author meant; `error`: the robot cannot be used as it is."""
+    share: float | None = None
+    """Of a pair: share of random configurations in which it touches [-]; None where that was not looked at."""
 
     def __str__(self) -> str:
         """One line: kind, names, clause, remedy."""

@@ -18,11 +18,12 @@ from qpavoid.files.loading import read_config, validate
 from qpavoid.files.shipped import find_robot
 from qpavoid.geometry.bodies import MeshWarning, check_meshes, convert_bodies, make_shape, triangle_meshes
 from qpavoid.geometry.joints import frame_index, joint_bounds, middle, set_joints, set_limits, without
-from qpavoid.geometry.pairs import add_self_pairs, drop_always_touching
+from qpavoid.geometry.pairs import TouchingPair, add_self_pairs, drop_always_touching
 from qpavoid.geometry.urdf import find_resource, honour_srdf, read_collision, read_model, read_pieces
 from qpavoid.kinematics import TRANSLATIONS
 from qpavoid.limits import JointBounds
 from qpavoid.motion import rpy_to_matrix
+from qpavoid.notes import Note
 from qpavoid.problem import Array
 
 
@@ -41,8 +42,10 @@ class Robot:
     """Frames that are meant as tools."""
     source: str
     """File that it was read from, for messages."""
-    always_touching: tuple[tuple[str, str], ...] = ()
-    """Pairs of bodies that were switched off at loading, because they touch in every configuration."""
+    always_touching: tuple[TouchingPair, ...] = ()
+    """Pairs of bodies that were switched off at loading, because they touch in nearly every configuration."""
+    margins: Mapping[frozenset[str], float] = field(default_factory=dict)
+    """Two bodies: safety distance of their own, where it is less than the scenario's [m]."""
     acceleration: Mapping[str, float] = field(default_factory=dict)
     """Joint: largest acceleration [rad/s² or m/s²]; joints left out have no such limit."""
     jerk: Mapping[str, float] = field(default_factory=dict)
@@ -93,9 +96,9 @@ class Robot:
         return cls.from_config(config, path)
 
     @property
-    def notes(self) -> tuple[str, ...]:
-        """What was decided at loading, in words."""
-        return tuple(f"pair {a} - {b} is off: it touches in every configuration" for a, b in self.always_touching)
+    def notes(self) -> tuple[Note, ...]:
+        """What was left out, mended, replaced or assumed at loading."""
+        return tuple(pair.note() for pair in self.always_touching)
 
     @property
     def joint_names(self) -> list[str]:
@@ -118,6 +121,10 @@ class Robot:
             metres = TRANSLATIONS.get(joint.shortname(), 0)
             units += ["m"] * metres + ["rad"] * (joint.nv - metres)
         return units
+
+    def safety_distance(self, a: str, b: str, d1: float) -> float:
+        """Safety distance of two of its bodies where that of the scenario is d1 [m]."""
+        return min(d1, self.margins.get(frozenset((a, b)), d1))
 
     def bounds(self) -> JointBounds:
         """Joint limits in tangent space; see `joint_bounds`."""
@@ -249,9 +256,21 @@ def _build(config: RobotConfig, path: Path) -> Robot:
         tuple(config.end_effectors),
         str(path),
         tuple(always_touching),
+        _margins(config, bodies, path),
         config.limits.acceleration,
         config.limits.jerk,
     )
+
+
+def _margins(config: RobotConfig, bodies: Any, path: Path) -> dict[frozenset[str], float]:
+    """Safety distances of pairs of bodies [m]."""
+    names = [body.name for body in bodies.geometryObjects]
+    for index, own in enumerate(config.pair_margins):
+        for name in own.bodies:
+            if name not in names:
+                where = f"{path}: pair_margins.{index}.bodies"
+                raise UnknownName(f"{where}: no body {name!r}{nearest(name, names)}")
+    return {frozenset(own.bodies): own.d1 for own in config.pair_margins}
 
 
 def _hulls(configs: Sequence[Body], read: Callable[[], Any], path: Path) -> dict[str, Any]:

@@ -61,6 +61,15 @@ class JointLimits(Block):
         return self
 
 
+class PairMargin(Block):
+    """Safety distance of a pair of the robot's own bodies that are near each other by design."""
+
+    bodies: tuple[str, str]
+    """Their names, in either order."""
+    d1: Positive
+    """Safety distance [m], where it is less than that of the scenario."""
+
+
 class RobotConfig(Block):
     """A robot.yaml: everything that a URDF alone does not say."""
 
@@ -83,6 +92,8 @@ class RobotConfig(Block):
     hulls and 0.1 µs for capsules), or a list of bodies."""
     disabled_pairs: list[tuple[str, str]] = []
     """Pairs of bodies never checked; `*` and `?` match as in file names."""
+    pair_margins: list[PairMargin] = []
+    """Pairs of bodies with a smaller safety distance of their own."""
     limits: JointLimits = JointLimits()
     home: dict[str, Number] = {}
     """Joint: position of the home pose [rad or m]; joints left out are at 0, or at the middle
