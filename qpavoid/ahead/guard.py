@@ -103,7 +103,7 @@ class Guard:
         self._bounds, self._rate = bounds, position_gain / dt
         self._acceleration, self._accelerated = bounds.acceleration, bool(np.isfinite(bounds.acceleration).any())
         self._jerked = bool(np.isfinite(bounds.jerk).any())
-        self._given = np.zeros(len(scene.pairs))
+        self._given, self._slack = np.zeros(len(scene.pairs)), scene.slack(hold)
         self._news, self._heard = np.zeros(len(scene.obstacles), dtype=bool), False
 
     def see(self, which: IntArray) -> None:
@@ -308,7 +308,7 @@ class Guard:
         pairs = ahead.pairs
         if not len(pairs):
             return _FARTHEST, -1
-        there, here = ahead.found(pairs), now.found(pairs)
+        there, here = ahead.found(pairs) + self._slack[pairs], now.found(pairs) + self._slack[pairs]
         margins = ahead.placing.margin
         if margins.any():
             margin = margins[ahead.twist_row[pairs]]

@@ -51,6 +51,7 @@ __all__ = [
     "Contact", "Csv", "Cylinder", "Damper", "DampingTask", "Detour", "Ellipsoid", "Eq10Solver", "Escape", "Fixed",
     "GradientProjectionSolver", "HalfSpace", "HqpSolver", "Hull", "JointLimits", "Limits", "Line", "LookAtTask",
     "ManipulabilityTask", "Mesh", "Motion", "ObstacleConfig", "ObstacleShape", "PairMargin", "PointCloud",
-    "PostureTask", "PotentialFieldSolver", "Progress", "QpSolver", "RelativeTask", "RobotConfig", "ScenarioConfig", "Sensing", "Shape",
-    "SolverConfig", "Sphere", "Switching", "Task", "TaskBlock", "TrackingSolver", "Waypoints", "expand_solver",
+    "PostureTask", "PotentialFieldSolver", "Progress", "QpSolver", "RelativeTask", "RobotConfig", "ScenarioConfig",
+    "Sensing", "Shape", "SolverConfig", "Sphere", "Switching", "Task", "TaskBlock", "TrackingSolver", "Waypoints",
+    "expand_solver",
 ]  # fmt: skip

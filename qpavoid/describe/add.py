@@ -137,13 +137,13 @@ def describe(urdf: Path, wishes: Wishes | None = None, progress: Callable[[str],
         end_effectors=end_effectors(model, semantics.end_effectors),
     )
     given = bare.model_copy(update={"srdf": None if honoured is None else str(honoured.resolve())})
-    links = _links(pieces, given, semantics, wishes, notes, progress)
+    links, robot = _links(pieces, given, semantics, wishes, notes, progress)
     bodies = {"bodies": [body for link in links.values() for body in link.bodies]}
-    robot = Robot.from_config(given.model_copy(update=bodies), urdf)
+    everything = robot if honoured is None else Robot.from_config(bare.model_copy(update=bodies), urdf)
     progress(f"sampling {len(robot.bodies.collisionPairs)} pairs")
     sampled = sample_pairs(robot, wishes.samples, wishes.seed)
     nested = drawn_in(robot, sampled)
-    reasons = pair_reasons(Robot.from_config(bare.model_copy(update=bodies), urdf), robot, sampled, nested)
+    reasons = pair_reasons(everything, robot, sampled, nested)
     disabled, single = by_link(robot, reasons)
     kept = ~sampled.never & ~sampled.always & ~nested
     active, d1 = keeping(robot, kept), safety_distances(sampled)[kept]
@@ -252,8 +252,11 @@ def _links(
     wishes: Wishes,
     notes: list[Note],
     progress: Callable[[str], None],
-) -> dict[str, LinkBodies]:
-    """Bodies of every link; `auto` takes exact ones where capsules would be too near at home or everywhere."""
+) -> tuple[dict[str, LinkBodies], Robot]:
+    """Bodies of every link, and the robot with them.
+
+    `auto` takes exact ones where capsules would be too near at home or everywhere.
+    """
     kinds = kinds_of_links(pieces, wishes.bodies, wishes.bodies_of)
     fitted = {}
     for number, (link, kind) in enumerate(kinds.items(), start=1):
@@ -271,12 +274,15 @@ def _links(
     if exact := [link for link in links if links[link] != fitted[link]]:
         what = "exact bodies, because capsules would be too near at home or everywhere"
         notes.append(Note(NoteKind.SHAPE, tuple(exact), what))
-    for link, found in links.items():
-        if found.inside > 0.0 and found.volume > GROSS * found.inside:
-            what = f"bodies of {1e3 * found.volume:.3g} l around geometry that encloses {1e3 * found.inside:.3g} l"
-            remedy = f"--bodies {link}=capsules, or bodies of your own"
-            notes.append(Note(NoteKind.SHAPE, (link,), what, remedy, share=None))
-    return links
+    gross = {link: found for link, found in links.items() if found.volume > GROSS * found.inside > 0.0}
+    if worst := sorted(gross, key=lambda link: -gross[link].volume):
+        first = gross[worst[0]]
+        what = (
+            f"bodies of more than {GROSS:g} times what their geometry encloses, {1e3 * first.volume:.3g} l around "
+            f"{1e3 * first.inside:.3g} l of the first: concave, or no closed surface"
+        )
+        notes.append(Note(NoteKind.SHAPE, tuple(worst), what, f"--bodies {worst[0]}=capsules, or bodies of your own"))
+    return links, robot
 
 
 def _too_fat(robot: Robot, home: Array, seed: int) -> set[str]:

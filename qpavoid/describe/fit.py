@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Literal
 
 import coal
@@ -11,6 +12,7 @@ from scipy.spatial import ConvexHull, QhullError
 from qpavoid.describe.volume import solid_volume
 from qpavoid.geometry.bodies import enclosing_capsule, hull_points
 from qpavoid.geometry.capsules import CapsuleFit, fit_capsule, outermost
+from qpavoid.geometry.segments import point_segment
 from qpavoid.problem import Array
 
 Bodies = Literal["auto", "capsule", "capsules", "convex"]
@@ -26,7 +28,7 @@ CONCAVE = 1.3
 """Volume of a mesh's hull, in units of what the mesh encloses, from which `auto` compares several capsules [-]."""
 _FINE = 4000
 """Triangles from which cuts are chosen on a coarser surface; what is cut, and enclosed, is the surface itself."""
-_GRID = 60
+_GRID = 32
 """Cells of the coarser surface along its longest side."""
 WORTH = 0.15
 """Part of the volume that a further capsule must save."""
@@ -36,12 +38,13 @@ _COARSE = 24
 """Directions that are tried for each capsule while cuts are compared."""
 
 
-def fit_piece(geometry: Any, how: Bodies) -> tuple[CapsuleFit, ...]:
+def fit_piece(geometry: Any, how: Bodies, inside: float | None = None) -> tuple[CapsuleFit, ...]:
     """Capsules that enclose a coal geometry entirely; none where its hull, or the primitive itself, is to stand for it.
 
     Args:
         geometry: as read from a URDF.
         how: which kind of shapes.
+        inside: `inside_volume` of the geometry, where it is known [m³].
 
     Returns:
         Capsules in the geometry's own frame.
@@ -53,7 +56,8 @@ def fit_piece(geometry: Any, how: Bodies) -> tuple[CapsuleFit, ...]:
     one = enclosing_capsule(geometry)
     gross = GROSS * hull_volume(geometry)
     is_mesh = isinstance(geometry, coal.BVHModelBase)
-    hollow = how == "auto" and is_mesh and hull_volume(geometry) > CONCAVE * inside_volume(geometry)
+    inside = inside_volume(geometry) if inside is None and how == "auto" else inside
+    hollow = how == "auto" and is_mesh and hull_volume(geometry) > CONCAVE * (inside or 0.0)
     if how == "capsule" or (how == "auto" and one.volume <= gross and not hollow):
         return (one,)
     if how == "auto" and not (is_mesh or isinstance(geometry, coal.ConvexBase)):
@@ -94,8 +98,24 @@ def _halves(surface: Array) -> list[tuple[Array, CapsuleFit]]:
     plane = _best_cut(_coarse(surface))
     halves = [] if plane is None else [cut(surface, *plane, side) for side in (-1.0, 1.0)]
     if not halves or not all(len(half) for half in halves):
-        return [(surface, fit_capsule(_corners(surface)))]
-    return [(half, fit_capsule(_corners(half))) for half in halves]
+        return [(surface, _fit(surface))]
+    return [(half, _fit(half)) for half in halves]
+
+
+def _fit(surface: Array) -> CapsuleFit:
+    """A small capsule around a surface: of many corners, around the outermost, and then wider by what sticks out."""
+    points = _corners(surface)
+    if len(points) <= _MANY:
+        return fit_capsule(points)
+    fit = fit_capsule(outermost(points))
+    half = 0.5 * fit.length * fit.rotation[:, 2]
+    sticks_out = float(point_segment(points, fit.center - half, fit.center + half).distance.max()) - fit.radius
+    wider = replace(fit, radius=fit.radius + max(sticks_out, 0.0))
+    return wider if wider.volume <= _WIDER * fit.volume else fit_capsule(points)
+
+
+_MANY, _WIDER = 500, 1.05
+"""Corners from which the outermost are fitted first, and the volume that this may cost, in units of theirs [-]."""
 
 
 def _best_cut(surface: Array) -> tuple[Array, float] | None:
@@ -157,8 +177,7 @@ def cut(surface: Array, normal: Array, height: float, side: float) -> Array:
 def triangles(geometry: Any) -> Array:
     """Corners of the triangles of a coal geometry's surface, of its hull where it is no mesh (t, 3, 3) [m]."""
     if isinstance(geometry, coal.BVHModelBase):
-        corners = np.array(geometry.vertices())
-        index = [geometry.tri_indices(i) for i in range(geometry.num_tris)]
+        corners, index = np.array(geometry.vertices()), map(geometry.tri_indices, range(geometry.num_tris))
         return corners[np.array([(t[0], t[1], t[2]) for t in index], dtype=np.intp)]
     points = hull_points(geometry)
     return np.asarray(points[ConvexHull(points).simplices])

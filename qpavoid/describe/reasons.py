@@ -70,8 +70,9 @@ def pair_reasons(bare: Robot, robot: Robot, sampled: Sampled, nested: BoolArray)
         nested: which of them slide into each other (m,).
     """
     names = [body.name for body in bare.bodies.geometryObjects]
-    touching = {frozenset(pair[:2]) for pair in (*bare.always_touching, *robot.always_touching)}
-    checked, kept = set(_pairs(bare)), {pair: i for i, pair in enumerate(_pairs(robot))}
+    touching = {frozenset(pair[:2]) for pair in robot.always_touching}
+    checked = {*_pairs(bare), *(frozenset(pair[:2]) for pair in bare.always_touching)}
+    kept = {pair: i for i, pair in enumerate(_pairs(robot))}
     reasons: dict[frozenset[str], Reason] = {}
     for pair in [frozenset((a, b)) for i, a in enumerate(names) for b in names[:i]]:
         index = kept.get(pair)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from functools import cached_property
 from typing import Any
 
 import coal
@@ -30,6 +31,11 @@ class Piece:
     """coal geometry."""
     placement: Any
     """In the frame of its link."""
+
+    @cached_property
+    def inside(self) -> float:
+        """Volume that it encloses [m³]."""
+        return inside_volume(self.geometry)
 
 
 def pieces_of(geometry: Any, model: Any) -> list[Piece]:
@@ -81,7 +87,7 @@ def bodies_of_link(pieces: Sequence[Piece], link: str, kind: Bodies) -> LinkBodi
     `auto`, where it is not gross.
     """
     pieces = [piece for piece in pieces if piece.link == link]
-    fits = [fit_piece(piece.geometry, kind) for piece in pieces]
+    fits = [fit_piece(piece.geometry, kind, piece.inside) for piece in pieces]
     hulls = [hull_volume(piece.geometry) for piece in pieces]
     volume = sum(sum(c.volume for c in fit) if fit else hull for fit, hull in zip(fits, hulls, strict=True))
     shapes = []
@@ -94,7 +100,7 @@ def bodies_of_link(pieces: Sequence[Piece], link: str, kind: Bodies) -> LinkBodi
             shapes, volume = [capsule_fields(whole, pin.SE3.Identity())], whole.volume
     names = [link] if len(shapes) == 1 else [f"{link}_{index}" for index in range(len(shapes))]
     bodies = [Body(name=name, frame=link, **shape) for name, shape in zip(names, shapes, strict=True)]
-    return LinkBodies(tuple(bodies), volume, sum(hulls), sum(inside_volume(piece.geometry) for piece in pieces))
+    return LinkBodies(tuple(bodies), volume, sum(hulls), sum(piece.inside for piece in pieces))
 
 
 def _moved(points: Array, placement: Any) -> Array:

@@ -49,6 +49,7 @@ class Workspace:
         )
         self.offset_, self.hold_, self.d1_ = (np.array([value]) for value in (layout.offset, layout.hold, layout.d1))
         self.gain_, self.recovery_, self.zero = (np.array([v]) for v in (layout.row_gain, layout.recovery, 0.0))
+        self.eased = bool(layout.slack.any())
         self.blend = np.array([0.5 * np.pi / (layout.d2 - layout.d1)])
         self.gain_column, self.moving_gain = layout.gain[:, None], layout.gain[:moving, None]
         self.A_frames, self.b_frames = layout.A[:framed], layout.b[:framed]

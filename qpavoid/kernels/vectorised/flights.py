@@ -26,23 +26,23 @@ def look_around(
         touch: distance below which a pair touches [m].
 
     Returns:
-        How many rows there are, how many watched pairs touch, and the least distance with these and without [m];
-        `reach`, where nothing is nearer.
+        How many rows there are, how many watched pairs touch, and the least distance with these and without [m], plus
+        the slack of each pair; `reach`, where nothing is nearer.
     """
     velocity_bounds(x, q)
     k = distance_rows(x, pairs, reach, moving)
-    distance = x.closest[:k, 0]
+    distance, slack = x.closest[:k, 0], x.slack[x.near[:k]]
     counts = watched[x.near[:k]]
-    nearest = float(np.min(distance[counts], initial=reach))
+    nearest = float(np.min((distance + slack)[counts], initial=reach))
     touching = counts & ~(distance >= touch)
     count = int(np.count_nonzero(touching))
     watched[x.near[:k][touching]] = False
     kept = np.flatnonzero(counts & ~touching)
-    n = len(kept)
+    n, rest = len(kept), float(np.min((distance + slack)[kept], initial=reach))
     if n < k:
         for rows in (x.closest, x.J, x.drift, x.near):
             rows[:n] = rows[kept]
-    return n, count, nearest, float(np.min(x.closest[:n, 0], initial=reach))
+    return n, count, nearest, rest
 
 
 def comes_too_near(closest: Array, J: Array, drift: Array, v: Array, span: float, safe: float) -> bool:

@@ -72,6 +72,8 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
     np.add(rows.distance, x.offset_, out=d)
     if moving:
         d -= x.margin[x.twist_row[rows.near]]
+    if x.eased:
+        d += x.slack[rows.near]
     np.subtract(x.hold_, d, out=least)
     parting = least > x.zero
     some = np.count_nonzero(parting) > 0
@@ -107,6 +109,8 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
         np.maximum(most, -drift, out=most, where=drift < 0.0)
         np.minimum(least, most, out=least, where=parting)
     np.subtract(x.offset_, d, out=touch)
+    if x.eased:
+        touch += x.slack[rows.near]
     touch *= x.gain_
     if moving:
         touch -= drift
