@@ -48,7 +48,7 @@ def problems(report, severity=None):
 def test_a_ready_robot_has_no_problem(cli):
     result = cli("robot", "check", "panda")
     assert result.status == 0
-    assert "no problem found" in result.stdout
+    assert not re.search(r"^(error|warning)", result.stdout, re.MULTILINE)
     assert "panda_joint4 [-3.07, -0.0698]" in result.stdout
     assert "panda_finger_joint2 mimics panda_finger_joint1 locked" in result.stdout
 
@@ -144,7 +144,7 @@ def test_mimic_mass_feet_and_home_collisions_are_told(tmp_path):
     assert report.nv == 2 and "joint3" not in told
     assert "3 moving links have no mass → none is needed" in told
     assert "it has feet (left_foot) and a fixed base → `root_joint: free_flyer`" in told
-    assert [(a, b) for a, b, _ in report.home_collisions] or "touch in every configuration" in told
+    assert [(a, b) for a, b, _ in report.home_collisions] or "its bodies touch in 100 % of" in told
     assert check_robot(str(urdf), root="free_flyer").nv == 8
 
 
@@ -245,7 +245,7 @@ def test_an_edited_file_is_left_alone_unless_told_otherwise(cli, tmp_path):
     write_chain(tmp_path)
     cli("robot", "add", "chain.urdf", "--no-picture")
     path = tmp_path / "chain" / "robot.yaml"
-    edited = path.read_text().replace("joint2: 0", "joint2: 0.5")
+    edited = re.sub(r"joint2: .*", "joint2: 0.5", path.read_text())
     path.write_text(edited)
     assert Robot.load(str(path)).home[1] == 0.5
     result = cli("robot", "add", "chain.urdf", "--no-picture")

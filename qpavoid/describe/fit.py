@@ -24,7 +24,7 @@ MOST = 4
 GROSS = 2.0
 """Volume of capsules, in units of the hull's, from which `auto` takes the hull instead, although a hull costs a pair
 twenty times what a capsule costs. A capsule around a cylinder takes 1.3 to 2, around a cube 2.7."""
-CONCAVE = 1.3
+CONCAVE = 1.5
 """Volume of a mesh's hull, in units of what the mesh encloses, from which `auto` compares several capsules [-]."""
 _FINE = 4000
 """Triangles from which cuts are chosen on a coarser surface; what is cut, and enclosed, is the surface itself."""
@@ -56,17 +56,20 @@ def fit_piece(geometry: Any, how: Bodies, inside: float | None = None) -> tuple[
     one = enclosing_capsule(geometry)
     gross = GROSS * hull_volume(geometry)
     is_mesh = isinstance(geometry, coal.BVHModelBase)
-    inside = inside_volume(geometry) if inside is None and how == "auto" else inside
-    hollow = how == "auto" and is_mesh and hull_volume(geometry) > CONCAVE * (inside or 0.0)
-    if how == "capsule" or (how == "auto" and one.volume <= gross and not hollow):
+    lean = how == "capsule" or (how == "auto" and one.volume <= gross)
+    if how == "auto" and is_mesh:
+        inside = inside_volume(geometry) if inside is None else inside
+        hull = hull_volume(geometry)
+        if hull > CONCAVE * inside:  # several capsules may follow a bend that the hull spans
+            several = decompose(triangles(geometry), one)
+            if sum(fit.volume for fit in several) < min(hull, one.volume):
+                return several
+    if lean:
         return (one,)
     if how == "auto" and not (is_mesh or isinstance(geometry, coal.ConvexBase)):
         return ()  # boxes and cylinders are exact as they are
     several = decompose(triangles(geometry), one)
-    allowed = hull_volume(geometry) if hollow else gross
-    if how == "capsules" or sum(fit.volume for fit in several) <= allowed:
-        return several
-    return (one,) if one.volume <= gross and not hollow else ()
+    return () if how == "auto" and sum(fit.volume for fit in several) > gross else several
 
 
 def decompose(surface: Array, whole: CapsuleFit, most: int = MOST) -> tuple[CapsuleFit, ...]:

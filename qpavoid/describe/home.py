@@ -195,7 +195,17 @@ def _mended(robot: Robot, judge: _Judge, space: Space, start: Array, free: BoolA
                     break
         hopeless[worst] = better is q
         q = better
-    return _put_back(robot, judge, q, start)
+    return _put_back(robot, judge, _nearer(robot, judge, space, q, start), start)
+
+
+def _nearer(robot: Robot, judge: _Judge, space: Space, q: Array, start: Array) -> Array:
+    """The pose nearest to where it started on the straight way there that has no more faults than q."""
+    step, total = np.asarray(pin.difference(robot.model, start, q)), judge.faults(q).sum()
+    for part in np.linspace(0.05, 0.95, 19):
+        tried = space.move(start, np.round(part * step, _DIGITS))
+        if judge.faults(tried).sum() <= total:
+            return tried
+    return q
 
 
 def _put_back(robot: Robot, judge: _Judge, q: Array, start: Array) -> Array:
