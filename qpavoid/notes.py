@@ -1,0 +1,73 @@
+"""Notes of a robot: what was left out, mended, replaced or assumed when it was loaded."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Literal
+
+
+class NoteKind(str, Enum):
+    """Part of a robot that a note is about."""
+
+    SHAPE = "shape"
+    """Collision shape: left out, replaced, taken from what is meant to be seen."""
+    MESH = "mesh"
+    """File of a mesh: missing, implausibly large."""
+    PAIR = "pair"
+    """Pair of bodies that is not checked."""
+    LIMIT = "limit"
+    """Position or velocity limit: missing, assumed."""
+    JOINT = "joint"
+    """Joint: locked, moving on its own though it should follow another one."""
+    LINK = "link"
+    """Link: its size, its mass, its place in the tree."""
+    FILE = "file"
+    """The file as a whole: prefixes of other tools, xacro."""
+
+
+@dataclass(frozen=True)
+class Note:
+    """One thing that was left out, mended, replaced or assumed."""
+
+    kind: NoteKind
+    """Part of a robot that it is about."""
+    subject: tuple[str, ...]
+    """Names of the shapes, joints, links, … that it is about."""
+    what: str
+    """One clause that says what was done with them, and why."""
+    remedy: str = ""
+    """What a user can do about it; empty where nothing is needed."""
+    severity: Literal["note", "warning"] = "note"
+    """`warning`: motion may differ from what the file's author meant."""
+
+    def __str__(self) -> str:
+        """One line: kind, names, clause, remedy."""
+        names = " - ".join(self.subject) if self.kind is NoteKind.PAIR else shortened(self.subject)
+        remedy = f"; {self.remedy}" if self.remedy else ""
+        return f"{self.kind.value} {names}: {self.what}{remedy}"
+
+
+class RobotWarning(UserWarning):
+    """A robot was loaded, and something of it left out, mended, replaced or assumed; see `Robot.notes`."""
+
+
+def shortened(names: Sequence[str], most: int = 6) -> str:
+    """The first names of a list, and how many more there are."""
+    rest = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + rest
+
+
+def warn_of(notes: Iterable[Note], where: str, stacklevel: int = 2) -> None:
+    """Issue one `RobotWarning` that names the notes which are warnings; none where there are none.
+
+    Args:
+        notes: of one robot.
+        where: file to name.
+        stacklevel: as of `warnings.warn`, counted from the caller.
+    """
+    serious = [str(note) for note in notes if note.severity == "warning"]
+    if serious:
+        warnings.warn(f"{where}: " + " | ".join(serious), RobotWarning, stacklevel=stacklevel + 1)
