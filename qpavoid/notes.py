@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -24,6 +25,8 @@ class NoteKind(str, Enum):
     """Joint: locked, moving on its own though it should follow another one."""
     LINK = "link"
     """Link: its size, its mass, its place in the tree."""
+    FRAME = "frame"
+    """Frame: taken as an end effector."""
     FILE = "file"
     """The file as a whole: prefixes of other tools, xacro."""
 
@@ -60,14 +63,23 @@ def shortened(names: Sequence[str], most: int = 6) -> str:
     return ", ".join(names[:most]) + rest
 
 
-def warn_of(notes: Iterable[Note], where: str, stacklevel: int = 2) -> None:
+def warn_of(notes: Iterable[Note], where: str) -> None:
     """Issue one `RobotWarning` that names the notes which are warnings; none where there are none.
+
+    It is attributed to the line outside this package that asked for the robot.
 
     Args:
         notes: of one robot.
         where: file to name.
-        stacklevel: as of `warnings.warn`, counted from the caller.
     """
     serious = [str(note) for note in notes if note.severity == "warning"]
     if serious:
-        warnings.warn(f"{where}: " + " | ".join(serious), RobotWarning, stacklevel=stacklevel + 1)
+        warnings.warn(f"{where}: " + " | ".join(serious), RobotWarning, stacklevel=_levels_to_caller())
+
+
+def _levels_to_caller() -> int:
+    """How many frames above `warn_of` the first one outside this package is."""
+    frame, levels = sys._getframe(1), 1
+    while frame.f_back is not None and str(frame.f_globals.get("__name__", "")).partition(".")[0] == __package__:
+        frame, levels = frame.f_back, levels + 1
+    return levels

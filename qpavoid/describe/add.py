@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 from qpavoid.config import RobotConfig
-from qpavoid.describe.ends import end_effectors
 from qpavoid.describe.fit import Bodies
 from qpavoid.describe.poses import joint_values, locks, wished_homes
 from qpavoid.describe.reasons import by_link, pair_reasons, watching
@@ -17,6 +16,7 @@ from qpavoid.describe.shapes import LinkBodies, Piece, bodies_of_link, kinds_of_
 from qpavoid.describe.srdf import Semantics, find_srdf, read_srdf
 from qpavoid.errors import ConfigError, UnknownName, nearest
 from qpavoid.geometry.bodies import check_meshes
+from qpavoid.geometry.ends import end_effectors
 from qpavoid.geometry.urdf import read_collision, read_model, read_pieces
 from qpavoid.problem import Array
 from qpavoid.robot import Robot

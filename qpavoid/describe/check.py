@@ -15,24 +15,17 @@ import pinocchio as pin
 
 from qpavoid.config import RobotConfig, Task
 from qpavoid.controller import Controller
-from qpavoid.describe.ends import end_effectors
 from qpavoid.describe.findings import Joint, Problem, Report
 from qpavoid.describe.poses import mimics
 from qpavoid.describe.sampling import Space, touching
 from qpavoid.errors import ConfigError, QpavoidError
 from qpavoid.files.loading import read_config
+from qpavoid.files.packages import find_mesh, mesh_folders
 from qpavoid.files.safe_xml import read_robot_xml
 from qpavoid.files.shipped import find_robot
+from qpavoid.geometry.ends import end_effectors
 from qpavoid.geometry.joints import frame_index
-from qpavoid.geometry.urdf import (
-    find_mesh,
-    find_resource,
-    is_mjcf,
-    mesh_folders,
-    mesh_names,
-    read_collision,
-    read_model,
-)
+from qpavoid.geometry.urdf import find_resource, is_mjcf, mesh_names, read_collision, read_model
 from qpavoid.kinematics import MIMIC
 from qpavoid.robot import Robot
 from qpavoid.scene import build_scene
