@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import warnings
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Literal
 
@@ -61,6 +61,15 @@ def shortened(names: Sequence[str], most: int = 6) -> str:
     """The first names of a list, and how many more there are."""
     rest = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + rest
+
+
+def merged(notes: Iterable[Note]) -> list[Note]:
+    """Notes with one for all that say the same of different subjects, in the order of the first; pairs stay apart."""
+    alike: dict[Note, list[str]] = {}
+    for note in notes:
+        key = note if note.kind is NoteKind.PAIR else replace(note, subject=())
+        alike.setdefault(key, []).extend(note.subject)
+    return [replace(note, subject=tuple(dict.fromkeys(subject))) for note, subject in alike.items()]
 
 
 def warn_of(notes: Iterable[Note], where: str) -> None:

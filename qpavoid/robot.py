@@ -27,7 +27,7 @@ from qpavoid.geometry.urdf_tree import held_joints
 from qpavoid.kinematics import TRANSLATIONS
 from qpavoid.limits import JointBounds
 from qpavoid.motion import rpy_to_matrix
-from qpavoid.notes import Note, NoteKind, warn_of
+from qpavoid.notes import Note, NoteKind, merged, warn_of
 from qpavoid.problem import Array
 
 
@@ -221,7 +221,7 @@ _MOST_BODIES = 300
 
 def _fields_of_urdf(path: Path) -> dict[str, Any]:
     """Fields of the robot.yaml that a bare URDF or MJCF stands for."""
-    return {"name": path.name.removesuffix(".xacro").removesuffix(path.suffix), "urdf": path.name}
+    return {"name": Path(path.name.removesuffix(".xacro")).stem, "urdf": path.name}
 
 
 def _build(config: RobotConfig, path: Path) -> Robot:
@@ -249,7 +249,7 @@ def _build(config: RobotConfig, path: Path) -> Robot:
         honour_srdf(model, bodies, find_resource(config.srdf, path.parent, f"{path}: srdf"))
     always_touching = drop_always_touching(model, bodies, joint_bounds(model))
     what = "not checked: it touches in every one of 200 random configurations"
-    notes += [Note(NoteKind.PAIR, pair, what) for pair in always_touching]
+    notes = merged([*notes, *(Note(NoteKind.PAIR, pair, what) for pair in always_touching)])
     warn_of(notes, str(path))
     return Robot(
         config.name,

@@ -79,7 +79,13 @@ def set_limits(model: Any, limits: JointLimits, path: Path) -> None:
                 f"{path}: limits.velocity: joint {name!r}: {len(speed)} values for {joint.nv} coordinates"
             )
         velocity[joint.idx_v : joint.idx_v + joint.nv] = speed
-    model.lowerPositionLimit, model.upperPositionLimit, model.velocityLimit = lower, upper, velocity
+    model.lowerPositionLimit, model.upperPositionLimit = lower, upper
+    _set_speeds(model, velocity)
+
+
+def _set_speeds(model: Any, velocity: Array) -> None:
+    """Sets the largest speeds (nv,) of both directions, of which a URDF has one and Pinocchio reads both as that."""
+    model.velocityLimit, model.lowerVelocityLimit = velocity, -velocity
 
 
 ASSUMED_SPEED = 1.0
@@ -103,7 +109,7 @@ def assume_speeds(model: Any, notes: list[Note]) -> None:
             units = ["m/s"] * bool(metres) + ["rad/s"] * (joint.nv > metres)
             names.setdefault(" and ".join(f"{ASSUMED_SPEED:g} {unit}" for unit in units), []).append(name)
     velocity[~given] = ASSUMED_SPEED
-    model.velocityLimit = velocity
+    _set_speeds(model, velocity)
     for speed, joints in names.items():
         what = f"no velocity limit is given: {speed} {'is' if ' and ' not in speed else 'are'} assumed"
         notes.append(Note(NoteKind.LIMIT, tuple(joints), what, "give it under `limits.velocity`", "warning"))

@@ -112,8 +112,8 @@ def read_model(urdf: Path, root_joint: str, notes: list[Note] | None = None) -> 
 
 def _name_prefixes(root: ET.Element, notes: list[Note]) -> None:
     if prefixes := undeclared_prefixes(root):
-        what = "prefixes of XML that no xmlns attribute declares: what they stand before is left out"
-        remedy = 'declare them in the root, as in xmlns:drake="http://drake.mit.edu"'
+        what = "prefix of XML that no xmlns attribute declares: it is read all the same, without what other tools add"
+        remedy = 'declare it in the root, as in xmlns:drake="http://drake.mit.edu"'
         notes.append(Note(NoteKind.FILE, tuple(prefixes), what, remedy, "warning"))
 
 

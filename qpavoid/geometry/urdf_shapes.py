@@ -87,7 +87,7 @@ def read_shapes(
         for index, part in enumerate(link.findall(tag)):
             where = f"link {name!r}: {tag} {index}"
             try:
-                _add_part(geometry, model, name, f"{name}_{index}", part, where, meshes, notes)
+                _add_part(geometry, model, link, f"{name}_{index}", part, where, meshes, notes)
             except ValueError as fault:
                 if not meshes.allow_faults:
                     raise ConfigError(f"{meshes.where}: {fault}") from None
@@ -97,7 +97,14 @@ def read_shapes(
 
 
 def _add_part(
-    geometry: Any, model: Any, link: str, name: str, part: ET.Element, where: str, meshes: Meshes, notes: list[Note]
+    geometry: Any,
+    model: Any,
+    link: ET.Element,
+    name: str,
+    part: ET.Element,
+    where: str,
+    meshes: Meshes,
+    notes: list[Note],
 ) -> None:
     check_numbers(part, where)
     placement = origin(part, where)
@@ -105,10 +112,13 @@ def _add_part(
     if not shapes:
         what = f"left out: its <{part.tag}> has no shape"
         notes.append(Note(NoteKind.SHAPE, (name,), what, "give it one, or take the element out", "warning"))
-    frame_id = model.getFrameId(link, pin.BODY)
+    frame_id = model.getFrameId(link.get("name", ""), pin.BODY)
     frame = model.frames[frame_id]
+    rounded = {capsule.get("name") for capsule in link.iterfind("collision_checking/capsule")}
     for i, element in enumerate(shapes):
         shape = name if i == 0 else f"{name}_{i}"
+        if element.tag == "cylinder" and part.tag == "collision" and part.get("name", link.get("name")) in rounded:
+            element = ET.Element("capsule", element.attrib)  # an extension of Pinocchio's
         made = _make(element, where, shape, part.tag, meshes, notes)
         if made is not None:
             made_of, path, scale = made
@@ -200,7 +210,7 @@ def _make_mesh(element: ET.Element, where: str, name: str, meshes: Meshes, notes
         return coal.MeshLoader().load(path, np.array(scale)), path, scale
     except (ValueError, RuntimeError) as error:
         reason = " ".join(str(error).split()).rpartition("message: ")[2].rstrip(".")
-        raise ValueError(f"{where}: mesh {path}: {_pointer(path) or reason or 'it cannot be read'}") from None
+        raise ValueError(f"{where}: mesh {path}: {_pointer(path) or f'{reason}; export it again'}") from None
 
 
 def _pointer(path: str) -> str:
