@@ -19,7 +19,6 @@ from bench.tick.robots import SHARE
 from qpavoid import Avoidance, Controller, Obstacle, Points, Robot, Sample, Voxels, build_scene, build_tasks, kernels
 from qpavoid.config import Box, Capsule, Cone, Cylinder, Ellipsoid, HalfSpace, Mesh, PointCloud, Sphere, Task
 from qpavoid.geometry.bodies import MeshWarning
-from qpavoid.notes import RobotWarning
 from qpavoid.geometry.solids import hull_of
 
 RESULTS = Path(__file__).parent / "results" / f"obstacles{'' if kernels.ACCELERATED else '-numpy'}.md"
