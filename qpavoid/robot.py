@@ -23,7 +23,7 @@ from qpavoid.geometry.joints import assume_speeds, frame_index, joint_bounds, mi
 from qpavoid.geometry.pairs import add_self_pairs, drop_always_touching
 from qpavoid.geometry.plausible import name_implausible_sizes
 from qpavoid.geometry.urdf import find_resource, honour_srdf, is_mjcf, read_model, read_pieces
-from qpavoid.geometry.urdf_tree import held_joints
+from qpavoid.geometry.urdf_tree import fixed_by_limits
 from qpavoid.kinematics import TRANSLATIONS
 from qpavoid.limits import JointBounds
 from qpavoid.motion import rpy_to_matrix
@@ -232,10 +232,10 @@ def _build(config: RobotConfig, path: Path) -> Robot:
     bodies = _bodies(config, urdf, model, path, notes)
     set_limits(model, config.limits, path)
     home = set_joints(model, middle(model), config.home, f"{path}: home")
-    held = {**_held(urdf, model, config, notes), **config.lock}
-    home = set_joints(model, home, held, f"{path}: lock")
-    if held:
-        model, bodies, index = without(model, bodies, list(held), home, f"{path}: lock")
+    fixed = {**_fixed(urdf, config, notes), **config.lock}
+    home = set_joints(model, home, fixed, f"{path}: lock")
+    if fixed:
+        model, bodies, index = without(model, bodies, list(fixed), home, f"{path}: lock")
         home = home[index]
     if model.nv == 0:
         raise ConfigError(f"{path}: no joint of {urdf.name} moves; give at least one that is neither fixed nor locked")
@@ -278,21 +278,21 @@ def _end_effectors(model: Any, given: Sequence[str], path: Path, notes: list[Not
     return found
 
 
-def _held(urdf: Path, model: Any, config: RobotConfig, notes: list[Note]) -> dict[str, float]:
-    """Joints that the file's own limits leave no range, unless the robot.yaml gives one; see `held_joints`."""
+def _fixed(urdf: Path, config: RobotConfig, notes: list[Note]) -> dict[str, float]:
+    """Joints that the file's own limits leave no range, unless the robot.yaml gives one; see `fixed_by_limits`."""
     if is_mjcf(urdf):
         return {}
-    held = {
+    fixed = {
         name: value
-        for name, value in held_joints(read_robot_xml(urdf, "URDF")).items()
+        for name, value in fixed_by_limits(read_robot_xml(urdf, "URDF"), notes).items()
         if name not in config.limits.position and name not in config.lock
     }
-    for name, value in held.items():
+    for name, value in fixed.items():
         what = f"locked at {value:g}, which is its lower and its upper limit"
         notes.append(
             Note(NoteKind.JOINT, (name,), what, "give its range under `limits.position` if it moves", "warning")
         )
-    return held
+    return fixed
 
 
 def _bodies(config: RobotConfig, urdf: Path, model: Any, path: Path, notes: list[Note]) -> Any:

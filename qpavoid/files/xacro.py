@@ -49,7 +49,13 @@ def _packages_found(substitution_args: Any, path: Path) -> Iterator[None]:
     entries = mesh_folders(path, [])
 
     def find(name: str) -> str:
-        return find_package(name, entries) or str(original(name))
+        found = find_package(name, entries)
+        if found is None:
+            try:
+                found = str(original(name))
+            except ImportError:
+                raise LookupError(f"no package {name!r} beside the file or along ROS_PACKAGE_PATH") from None
+        return found
 
     substitution_args._eval_find = find
     try:

@@ -32,7 +32,7 @@ def joint_bounds(model: Any) -> JointBounds:
     """Joint limits of a model in tangent space; a URDF says nothing of accelerations and jerks.
 
     Only joints with one coordinate in q and v have position limits. A velocity limit of 0, and a range from 0 to 0,
-    mean that the URDF gives none; see `held_joints` of ranges that are meant, `assume_speeds` of velocities.
+    mean that the URDF gives none; see `fixed_by_limits` of ranges that are meant, `assume_speeds` of velocities.
     """
     lower, upper = np.array(model.lowerPositionLimit), np.array(model.upperPositionLimit)
     lower[lower <= -_ABSURD], upper[upper >= _ABSURD] = -np.inf, np.inf

@@ -199,9 +199,10 @@ def _make_mesh(element: ET.Element, where: str, name: str, meshes: Meshes, notes
     scale = vector(element, "scale", 3, where, _UNSCALED)
     path = find_mesh(file, meshes.entries)
     if path is None:
-        if not meshes.allow_missing:
+        if not (meshes.allow_missing or meshes.allow_faults):
             raise ValueError(f"{where}: mesh {file} could not be found; {MISSING}")
-        notes.append(Note(NoteKind.MESH, (name,), f"left out: its mesh {file} is missing", _PACKAGES, "warning"))
+        what = f"left out: a mesh in {os.path.dirname(file) or 'the folder of the file'} is missing"
+        notes.append(Note(NoteKind.MESH, (name,), what, _PACKAGES, "warning"))
         return None
     size = os.path.getsize(path)
     if size > _LARGEST_MESH:

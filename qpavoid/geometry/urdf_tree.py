@@ -86,11 +86,15 @@ def vector(element: ET.Element, attribute: str, size: int, where: str, default: 
     return found
 
 
-def held_joints(root: ET.Element) -> dict[str, float]:
+def fixed_by_limits(root: ET.Element, notes: list[Note]) -> dict[str, float]:
     """Joints whose lower limit is their upper one, and where that is [rad or m]: they do not move.
 
     Where every range of a file goes from 0 to 0, as some exporters write it unless asked for another one, it says
-    nothing, and no joint is held; nor is one that mimics another.
+    nothing, and no joint is fixed; nor is one that mimics another.
+
+    Args:
+        root: of the file.
+        notes: ranges that say nothing are named in them.
     """
     ranges = {}
     for joint in root.findall("joint"):
@@ -98,6 +102,9 @@ def held_joints(root: ET.Element) -> dict[str, float]:
         if joint.get("type") in _LIMITED and limit is not None and joint.find("mimic") is None:
             ranges[joint.get("name", "")] = _range(limit)
     if all(limits in (None, (0.0, 0.0)) for limits in ranges.values()):
+        if empty := tuple(name for name, limits in ranges.items() if limits is not None):
+            what = "every range of the file is [0, 0], which says nothing: they move without position limits"
+            notes.append(Note(NoteKind.LIMIT, empty, what, "give their ranges under `limits.position`", "warning"))
         return {}
     return {name: limits[0] for name, limits in ranges.items() if limits is not None and limits[0] == limits[1]}
 
