@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Literal
 
@@ -27,7 +28,7 @@ class NoteKind(str, Enum):
     HOME = "home"
     """Home pose: replaced, near a collision, singular."""
     FRAME = "frame"
-    """Frame of a tool."""
+    """Frame: taken as an end effector."""
     FILE = "file"
     """The file as a whole: prefixes of other tools, xacro."""
 
@@ -66,14 +67,32 @@ def shortened(names: Sequence[str], most: int = 6) -> str:
     return ", ".join(names[:most]) + rest
 
 
-def warn_of(notes: Iterable[Note], where: str, stacklevel: int = 2) -> None:
+def merged(notes: Iterable[Note]) -> list[Note]:
+    """Notes with one for all that say the same of different subjects, in the order of the first; pairs stay apart."""
+    alike: dict[Note, list[str]] = {}
+    for note in notes:
+        key = note if note.kind is NoteKind.PAIR else replace(note, subject=())
+        alike.setdefault(key, []).extend(note.subject)
+    return [replace(note, subject=tuple(dict.fromkeys(subject))) for note, subject in alike.items()]
+
+
+def warn_of(notes: Iterable[Note], where: str) -> None:
     """Issue one `RobotWarning` that names the notes which are warnings; none where there are none.
+
+    It is attributed to the line outside this package that asked for the robot.
 
     Args:
         notes: of one robot.
         where: file to name.
-        stacklevel: as of `warnings.warn`, counted from the caller.
     """
     serious = [str(note) for note in notes if note.severity == "warning"]
     if serious:
-        warnings.warn(f"{where}: " + " | ".join(serious), RobotWarning, stacklevel=stacklevel + 1)
+        warnings.warn(f"{where}: " + " | ".join(serious), RobotWarning, stacklevel=_levels_to_caller())
+
+
+def _levels_to_caller() -> int:
+    """How many frames above `warn_of` the first one outside this package is."""
+    frame, levels = sys._getframe(1), 1
+    while frame.f_back is not None and str(frame.f_globals.get("__name__", "")).partition(".")[0] == __package__:
+        frame, levels = frame.f_back, levels + 1
+    return levels

@@ -89,7 +89,8 @@ def solo():
     shank = {"shape": {"type": "capsule", "radius": 0.015, "length": 0.16}, "position": (0.0, 0.0, -0.08)}
     shanks = [{"name": leg, "frame": f"{leg}_LOWER_LEG", **shank} for leg in ("FL", "FR", "HL", "HR")]
     urdf = EXAMPLES / "solo_description/robots/solo12.urdf"
-    return Robot.from_urdf(urdf, root_joint="free_flyer", bodies=[trunk, *shanks])
+    limits = {"velocity": {"root_joint": 10.0}}
+    return Robot.from_urdf(urdf, root_joint="free_flyer", bodies=[trunk, *shanks], limits=limits)
 
 
 def random_q(robot, rng, spread=1.0):

@@ -16,7 +16,6 @@ from scipy.spatial import ConvexHull
 from qpavoid import ConfigError, Robot, UnknownName
 from qpavoid.config import Box, Capsule, Hull, RobotConfig, Sphere
 from qpavoid.describe.add import Wishes, describe
-from qpavoid.describe.ends import end_effectors
 from qpavoid.describe.fit import cut, decompose, fit_piece, hull_volume, triangles
 from qpavoid.describe.home import BENT, ROOM, Limbs, find_home
 from qpavoid.describe.sampling import (
@@ -35,6 +34,7 @@ from qpavoid.describe.srdf import MADE_BY, Semantics, find_srdf, read_srdf, srdf
 from qpavoid.describe.texts import description_files
 from qpavoid.describe.written import BLANK, seal, untouched, write_files
 from qpavoid.geometry.capsules import CapsuleFit, fit_capsule
+from qpavoid.geometry.ends import end_effectors
 from qpavoid.geometry.segments import point_segment
 from qpavoid.geometry.urdf import read_model
 from qpavoid.motion import rpy_to_matrix

@@ -18,8 +18,8 @@ from qpavoid.describe.check import check_robot
 from qpavoid.describe.sampling import touching
 from qpavoid.describe.written import untouched
 from qpavoid.files.loading import read_config
+from qpavoid.files.packages import find_mesh
 from qpavoid.files.shipped import data_folder, find_robot
-from qpavoid.geometry.urdf import find_mesh
 
 MADE = ("baxter", "g1", "tiago", "ur5")
 """Robots that ship as `robot add` wrote them."""

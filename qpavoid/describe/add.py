@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 from qpavoid.config import RobotConfig
-from qpavoid.describe.ends import end_effectors
 from qpavoid.describe.fit import GROSS, Bodies
 from qpavoid.describe.home import ROOM, Home, find_home
 from qpavoid.describe.poses import joint_values, locks, wished_homes
@@ -38,9 +38,12 @@ from qpavoid.describe.srdf import Semantics, find_srdf, read_srdf
 from qpavoid.describe.telescope import drawn_in
 from qpavoid.describe.wheels import wheel_joints
 from qpavoid.errors import ConfigError, UnknownName, nearest
+from qpavoid.files.packages import absolute_entries
 from qpavoid.geometry.bodies import check_meshes
-from qpavoid.geometry.urdf import read_collision, read_model, read_pieces
-from qpavoid.notes import Note, NoteKind
+from qpavoid.geometry.ends import end_effectors
+from qpavoid.geometry.plausible import name_implausible_sizes
+from qpavoid.geometry.urdf import read_model, read_pieces
+from qpavoid.notes import Note, NoteKind, RobotWarning, merged
 from qpavoid.problem import Array
 from qpavoid.robot import Robot
 
@@ -63,8 +66,10 @@ class Wishes:
     """Joints (with `*` and `?`) held at the home pose for good."""
     home: Mapping[str, float] = field(default_factory=dict)
     """Joint: position of a home pose to prefer [rad or m]."""
-    package_dirs: Sequence[Path] = ()
-    """Folders in which `package://` meshes are looked up."""
+    package_dirs: Sequence[str | Path] = ()
+    """Folders in which `package://` meshes are looked up, and `NAME=FOLDER` of single packages."""
+    allow_missing_meshes: bool = False
+    """Whether shapes whose mesh cannot be found are left out."""
     srdf: Path | None = None
     """An SRDF to honour; one found beside the URDF if left out."""
     samples: int = SAMPLES
@@ -123,16 +128,24 @@ def describe(urdf: Path, wishes: Wishes | None = None, progress: Callable[[str],
     wishes = wishes or Wishes()
     urdf = urdf.resolve()
     progress("reading the model")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RobotWarning)  # all notes of the robot are in the description
+        return _describe(urdf, wishes, progress)
+
+
+def _describe(urdf: Path, wishes: Wishes, progress: Callable[[str], None]) -> Described:
     model = read_model(urdf, wishes.root)
     honoured = wishes.srdf or find_srdf(urdf)
     semantics = _semantics(honoured, model, wishes)
     notes: list[Note] = []
-    pieces = _pieces(urdf, model, wishes, notes)
+    packages = absolute_entries([str(entry) for entry in wishes.package_dirs], Path.cwd())
+    pieces = _pieces(urdf, model, packages, wishes, notes)
     bare = RobotConfig(
         name=wishes.name or urdf.stem,
         urdf=str(urdf),
         root_joint=wishes.root,
-        package_dirs=[str(folder.resolve()) for folder in wishes.package_dirs],
+        package_dirs=packages,
+        allow_missing_meshes=wishes.allow_missing_meshes,
         lock=locks(urdf, model, wishes.lock, semantics, notes, _wheels(model, pieces, wishes)),
         end_effectors=end_effectors(model, semantics.end_effectors),
     )
@@ -183,7 +196,7 @@ def describe(urdf: Path, wishes: Wishes | None = None, progress: Callable[[str],
         near=sampled.near,
         left_out=out,
         home=home,
-        notes=(*robot.notes, *notes),
+        notes=tuple(dict.fromkeys(merged([*robot.notes, *notes]))),
     )
 
 
@@ -231,17 +244,14 @@ def _notes_of_home(robot: Robot, home: Home, wishes: Wishes) -> Iterator[Note]:
         yield Note(kind, tuple(home.singular), what, "bend it with --home")
 
 
-def _pieces(urdf: Path, model: Any, wishes: Wishes, notes: list[Note]) -> list[Piece]:
-    """Collision geometry; what is meant to be seen where the file has none."""
-    folders = [str(folder) for folder in wishes.package_dirs]
-    geometry = read_pieces(urdf, model, folders, urdf)
+def _pieces(urdf: Path, model: Any, packages: Sequence[str], wishes: Wishes, notes: list[Note]) -> list[Piece]:
+    """Collision geometry; of links without any, what is meant to be seen of them."""
+    geometry = read_pieces(urdf, model, packages, urdf, notes, allow_missing=wishes.allow_missing_meshes)
     if not geometry.ngeoms:
         what = "has no geometry at all: nothing is checked"
         notes.append(Note(NoteKind.SHAPE, (urdf.name,), what, "list `bodies`", "warning"))
-    elif not read_collision(urdf, model, folders, urdf).ngeoms:
-        what = "has no collision geometry: bodies are fitted to what is meant to be seen"
-        notes.append(Note(NoteKind.SHAPE, (urdf.name,), what, severity="warning"))
     check_meshes(geometry, str(urdf))
+    name_implausible_sizes(model, geometry, notes)
     return pieces_of(geometry.geometryObjects, model)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -16,7 +17,6 @@ import pinocchio as pin
 
 from qpavoid.config import RobotConfig, Task
 from qpavoid.controller import Controller
-from qpavoid.describe.ends import end_effectors
 from qpavoid.describe.findings import Joint, Report
 from qpavoid.describe.home import BENT, Limbs
 from qpavoid.describe.poses import mimics
@@ -25,20 +25,14 @@ from qpavoid.describe.sampling import D1, Space, touching
 from qpavoid.describe.shapes import Piece, pieces_of
 from qpavoid.errors import ConfigError, QpavoidError
 from qpavoid.files.loading import read_config
+from qpavoid.files.packages import absolute_entries, find_mesh, mesh_folders
 from qpavoid.files.safe_xml import read_robot_xml
 from qpavoid.files.shipped import find_robot
 from qpavoid.geometry.bodies import convert_bodies, triangle_meshes
-from qpavoid.geometry.urdf import (
-    find_mesh,
-    find_resource,
-    is_mjcf,
-    mesh_folders,
-    mesh_names,
-    read_collision,
-    read_model,
-)
+from qpavoid.geometry.ends import end_effectors
+from qpavoid.geometry.urdf import find_resource, is_mjcf, mesh_names, read_model, read_pieces
 from qpavoid.kinematics import MIMIC
-from qpavoid.notes import Note, NoteKind, shortened
+from qpavoid.notes import Note, NoteKind, RobotWarning, shortened
 from qpavoid.robot import Robot
 from qpavoid.scene import build_scene
 from qpavoid.tasks import build_tasks
@@ -58,7 +52,8 @@ _NARROW = 1e-3
 def check_robot(
     name_or_path: str,
     root: str = "fixed",
-    package_dirs: Sequence[Path] = (),
+    package_dirs: Sequence[str | Path] = (),
+    allow_missing_meshes: bool = False,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Report:
     """Look over a URDF, an MJCF, a robot.yaml or a robot that ships.
@@ -66,7 +61,8 @@ def check_robot(
     Args:
         name_or_path: which one.
         root: how its root link is attached to the world; a robot.yaml says so itself.
-        package_dirs: folders to look for meshes in; a robot.yaml names its own.
+        package_dirs: folders to look for meshes in, and `NAME=FOLDER`; before those that a robot.yaml names.
+        allow_missing_meshes: whether shapes whose mesh cannot be found are left out.
         progress: called with what is done next.
 
     Raises:
@@ -76,10 +72,18 @@ def check_robot(
     if path.suffix in (".yaml", ".yml"):
         config = read_config(path, RobotConfig)
     else:
-        folders = [str(folder.resolve()) for folder in package_dirs]
-        config = RobotConfig(name=path.stem, urdf=path.name, root_joint=root, package_dirs=folders)  # type: ignore[arg-type]
-    urdf = find_resource(config.urdf, path.parent, f"{path}: urdf")
+        config = RobotConfig(name=path.stem, urdf=path.name, root_joint=root)  # type: ignore[arg-type]
+    entries = [*absolute_entries([str(entry) for entry in package_dirs], Path.cwd()), *config.package_dirs]
+    missing = allow_missing_meshes or config.allow_missing_meshes
+    config = config.model_copy(update={"package_dirs": entries, "allow_missing_meshes": missing})
     progress("reading the model")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RobotWarning)  # all notes of the robot are in the report
+        return _report(config, path, progress)
+
+
+def _report(config: RobotConfig, path: Path, progress: Callable[[str], None]) -> Report:
+    urdf = find_resource(config.urdf, path.parent, f"{path}: urdf")
     model = read_model(urdf, config.root_joint)
     report = Report(config.name, str(path), model.nq, model.nv)
     report.frames = [f.name for f in model.frames if f.type in (pin.BODY, pin.OP_FRAME)]
@@ -87,7 +91,7 @@ def check_robot(
     report.without_mass = sum(inertia.mass <= 0.0 for inertia in list(model.inertias)[1:])
     pieces = _look_at_geometry(report, config, path, urdf, model)
     robot = None
-    if not report.missing_meshes:
+    if report.usable:
         progress("making the robot")
         begin = perf_counter()
         try:
@@ -122,26 +126,28 @@ def with_hulls(robot: Robot) -> Robot:
 
 
 def _look_at_geometry(report: Report, config: RobotConfig, path: Path, urdf: Path, model: Any) -> list[Piece]:
-    package_dirs = [str(path.parent / folder) for folder in config.package_dirs]
-    report.searched = mesh_folders(urdf, package_dirs)
+    packages = absolute_entries(config.package_dirs, path.parent)
+    report.searched = mesh_folders(urdf, packages)
     absent = {tag: _absent(urdf, tag, report.searched) for tag in ("collision", "visual")}
     report.missing_meshes = absent["collision"]
-    if report.missing_meshes:
+    if report.missing_meshes and not config.allow_missing_meshes:
         what = (
             f"{len(report.missing_meshes)} collision meshes are missing, such as {report.missing_meshes[0]!r}; "
             f"looked for in {shortened(report.searched, 8)}"
         )
         remedy = (
-            "name the folder that holds the package with --package-dir (`package_dirs` of a robot.yaml), or set "
-            "ROS_PACKAGE_PATH"
+            "name the folder that holds the package with --package-dir or --package NAME=FOLDER (`package_dirs` of a "
+            "robot.yaml), set ROS_PACKAGE_PATH, or go on without them: --allow-missing-meshes"
         )
         report.notes.append(Note(NoteKind.MESH, (), what, remedy, "error"))
         return []
     if absent["visual"]:
         what = f"{len(absent['visual'])} visual meshes are missing"
-        report.notes.append(Note(NoteKind.MESH, (), what, "none is needed: they are not used"))
+        report.notes.append(Note(NoteKind.MESH, (), what, "none is needed where there are collision shapes"))
     try:
-        geometry = read_collision(urdf, model, package_dirs, path).geometryObjects
+        geometry = read_pieces(
+            urdf, model, packages, path, visuals=config.visuals, allow_missing=config.allow_missing_meshes
+        ).geometryObjects
     except ConfigError as error:
         remedy = "export that mesh again, or take it out"
         report.notes.append(Note(NoteKind.MESH, (), str(error), remedy, "error"))
@@ -190,6 +196,9 @@ def _joints(urdf: Path, model: Any, config: RobotConfig, whole: Any) -> list[Joi
             continue
         if led:
             joints.append(Joint(name, kind, leader, led=True))
+            continue
+        if not model.existJointName(name):  # its limits leave it no range
+            joints.append(Joint(name, kind, leader, locked=True))
             continue
         live = model.joints[model.getJointId(name)]
         velocity = _limit(float(np.max(model.velocityLimit[live.idx_v : live.idx_v + live.nv])))

@@ -31,6 +31,12 @@ Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and 
 PackageDirs = Annotated[
     list[Path] | None, typer.Option("--package-dir", help="Folder in which package:// meshes are looked up.")
 ]
+Packages = Annotated[
+    list[str] | None, typer.Option("--package", metavar="NAME=FOLDER", help="Folder of one ROS package.")
+]
+MissingMeshes = Annotated[
+    bool, typer.Option("--allow-missing-meshes", help="Leave out shapes whose mesh cannot be found, and name them.")
+]
 RootJoint = Annotated[str, typer.Option("--root", help=f"How it stands: {', '.join(get_args(Root))}.")]
 
 
@@ -39,13 +45,17 @@ def check(
     robot: Annotated[str, typer.Argument(help="URDF, MJCF, robot.yaml, or the name of a robot that ships.")],
     root: RootJoint = "fixed",
     package_dir: PackageDirs = None,
+    package: Packages = None,
+    allow_missing_meshes: MissingMeshes = False,
     json: Json = False,
 ) -> None:
     """Look a robot over: joints, limits, geometry, pairs, home pose, time of a step; each problem with its remedy.
 
     The exit status is 1 when it cannot be used as it is.
     """
-    report = check_robot(robot, _one_of(root, Root, "--root"), package_dir or (), Progress())
+    report = check_robot(
+        robot, _one_of(root, Root, "--root"), _entries(package_dir, package), allow_missing_meshes, Progress()
+    )
     if json:
         print(to_json({**asdict(report), "usable": report.usable}))
     else:
@@ -110,6 +120,8 @@ def add(
         list[str] | None, typer.Option(metavar="JOINT=VALUE", help="Of a home pose to prefer [rad or m].")
     ] = None,
     package_dir: PackageDirs = None,
+    package: Packages = None,
+    allow_missing_meshes: MissingMeshes = False,
     srdf: Annotated[Path | None, typer.Option(help="SRDF to honour; one beside the URDF if left out.")] = None,
     samples: Annotated[int, typer.Option(min=1, max=1_000_000, help="Configurations drawn to judge pairs.")] = SAMPLES,
     seed: Annotated[int, typer.Option(min=0, help="Of the draw.")] = SEED,
@@ -122,7 +134,8 @@ def add(
     kind, by_link = _kinds(bodies or [])
     wishes = Wishes(
         name=name, bodies=kind, bodies_of=by_link, root=_one_of(root, Root, "--root"), lock=tuple(lock or ()),
-        home=_values(home or []), package_dirs=tuple(package_dir or ()), srdf=srdf, samples=samples, seed=seed,
+        home=_values(home or []), package_dirs=_entries(package_dir, package),
+        allow_missing_meshes=allow_missing_meshes, srdf=srdf, samples=samples, seed=seed,
     )  # fmt: skip
     urdf = find_robot(path)
     if urdf.suffix in (".yaml", ".yml"):
@@ -164,6 +177,17 @@ def _values(given: list[str]) -> dict[str, float]:
         if not equals or not abs(values[joint]) <= LARGEST:  # NaN as well
             raise ConfigError(f"--home {text}: expected JOINT=VALUE, as in elbow=1.57")
     return values
+
+
+def _entries(folders: list[Path] | None, packages: list[str] | None) -> tuple[str, ...]:
+    """Entries of `package_dirs`: packages by name first."""
+    for text in packages or []:
+        name, equals, folder = text.partition("=")
+        if not (name and equals and folder):
+            raise ConfigError(f"--package {text}: expected NAME=FOLDER, as in my_robot=~/src/my_robot")
+        if not Path(folder).is_dir():
+            raise ConfigError(f"--package {text}: no such folder {folder!r}")
+    return (*(packages or ()), *(str(folder) for folder in folders or ()))
 
 
 def _one_of(value: str, kind: Any, option: str) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os.path
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from shlex import quote
@@ -40,7 +41,9 @@ def _robot_yaml(described: Described, folder: Path, srdf: str) -> str:
     lines += [f"name: {_flow(config.name)}", f"urdf: {_flow(_reference(Path(config.urdf), folder))}"]
     lines.append(f"srdf: {_flow(srdf)}")
     if config.package_dirs:
-        lines.append(f"package_dirs: {_flow([_relative(Path(path), folder) for path in config.package_dirs])}")
+        lines.append(f"package_dirs: {_flow([_entry(entry, folder) for entry in config.package_dirs])}")
+    if config.allow_missing_meshes:
+        lines.append("allow_missing_meshes: true")
     if config.root_joint != "fixed":
         lines.append(f"root_joint: {config.root_joint}")
     lines.append(f"end_effectors: {_flow(list(config.end_effectors))}")
@@ -113,7 +116,9 @@ def _command(described: Described, folder: Path) -> str:
     words += ["--root", wishes.root] if wishes.root != Wishes.root else []
     words += [word for joint in wishes.lock for word in ("--lock", joint)]
     words += [word for joint, value in wishes.home.items() for word in ("--home", f"{joint}={value:g}")]
-    words += [word for path in wishes.package_dirs for word in ("--package-dir", path.as_posix())]
+    for entry in map(str, wishes.package_dirs):
+        words += ["--package" if _PACKAGE.fullmatch(entry) else "--package-dir", entry]
+    words += ["--allow-missing-meshes"] if wishes.allow_missing_meshes else []
     words += ["--srdf", wishes.srdf.as_posix()] if wishes.srdf is not None else []
     words += ["--samples", str(wishes.samples)] if wishes.samples != Wishes.samples else []
     words += ["--seed", str(wishes.seed)] if wishes.seed != Wishes.seed else []
@@ -160,6 +165,16 @@ def _reference(urdf: Path, folder: Path) -> str:
     if urdf.is_relative_to(robots):
         return f"{EXAMPLES}{urdf.relative_to(robots).as_posix()}"
     return _relative(urdf, folder)
+
+
+_PACKAGE = re.compile(r"([A-Za-z][\w.-]*)=(.+)", re.DOTALL)
+"""`NAME=FOLDER` of a package."""
+
+
+def _entry(entry: str, folder: Path) -> str:
+    """An entry of `package_dirs` with its folder relative to that of the robot.yaml."""
+    match = _PACKAGE.fullmatch(entry)
+    return f"{match[1]}={_relative(Path(match[2]), folder)}" if match else _relative(Path(entry), folder)
 
 
 def _relative(path: Path, folder: Path) -> str:
