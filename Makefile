@@ -5,7 +5,7 @@ BIN := .venv/bin
 TICK_TESTS := $(addprefix tests/test_,$(addsuffix .py,avoidance backends controller escape examples faults filter \
   giving_way grasp limits outcome penetration point_cloud proximity shapes situations solvers tasks))
 
-.PHONY: run figures test smoke lint types clean
+.PHONY: run figures test campaign smoke lint types clean
 
 run: .venv/run
 	$(BIN)/qpavoid compare situation1 situation2 --solvers tracking,eq10-literal,eq10,qp --out out
@@ -16,6 +16,9 @@ figures: run
 test: .venv/dev
 	$(BIN)/pytest -n auto
 	QPAVOID_NUMBA=0 $(BIN)/pytest -n auto $(TICK_TESTS)
+
+campaign: .venv/dev
+	$(BIN)/pytest -n auto -m slow
 
 smoke: .venv/dev
 	$(BIN)/qpavoid bench smoke

@@ -305,6 +305,7 @@ def test_home_is_bent(tmp_path):
     assert pinned.singular == ["link3"] and pinned.q[1] == 0.0
 
 
+@pytest.mark.filterwarnings("ignore::qpavoid.notes.RobotWarning")
 def test_samples_keep_to_the_limits_and_the_root_stays():
     robot = Robot.from_urdf(EXAMPLES / "kinova_description/robots/kinova.urdf", root_joint="free_flyer")
     bounds = robot.bounds()
@@ -450,7 +451,7 @@ def test_bodies_are_fitted_to_what_is_seen_where_there_is_nothing_else(tmp_path)
     urdf.write_text(urdf.read_text().replace("collision>", "visual>"))
     described = describe(urdf, Wishes(samples=50))
     assert {type(body.shape) for body in described.config.bodies} <= {Box, Capsule}
-    assert any("no collision geometry" in note.what for note in described.notes)
+    assert any("no collision shape" in note.what for note in described.notes)
     urdf.write_text(urdf.read_text().replace("visual>", "nothing>"))
     described = describe(urdf, Wishes(samples=50))
     assert described.config.bodies == [] and any("no geometry at all" in note.what for note in described.notes)
@@ -481,6 +482,7 @@ def test_hulls_of_a_robot_yaml(panda_convex):
         Robot.from_urdf(PANDA, bodies=bodies)
 
 
+@pytest.mark.filterwarnings("ignore::qpavoid.notes.RobotWarning")
 def test_hull_of_a_round_flat_face():
     """qhull cuts the disc into a fan of triangles whose tip has more neighbours than a hull can hold."""
     robot = Robot.from_urdf(EXAMPLES / "centauro_description/urdf/centauro.urdf")

@@ -122,8 +122,7 @@ def test_limits_that_cannot_be_meant(tmp_path):
     urdf.write_text(text)
     report = check_robot(str(urdf))
     told = problems(report, "warning")
-    assert "joint1: no position limits → `limits: {position" in told
-    assert "joint1: no velocity limit → `limits: {velocity" in told
+    assert "joint1: locked at 0, which is its lower and its upper limit" in told
     assert "joint2: a velocity limit beyond what such joints do →" in told
     assert "joint2: a range wider than such joints have →" in told
     assert "joint3: hardly any range → `lock" in told
@@ -151,6 +150,9 @@ def test_mimic_mass_feet_and_home_collisions_are_told(tmp_path):
 def test_no_bodies_is_an_error_with_its_remedy(cli, tmp_path):
     urdf = write_chain(tmp_path)
     urdf.write_text(urdf.read_text().replace("collision>", "visual>"))
+    result = cli("robot", "check", urdf)
+    assert result.status == 0 and "what is meant to be seen of it serves instead" in result.stdout
+    urdf.write_text(urdf.read_text().replace("visual>", "nothing>"))
     result = cli("robot", "check", urdf)
     assert result.status == 1
     assert "it has no collision bodies: nothing would be avoided" in result.stdout

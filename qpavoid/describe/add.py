@@ -8,7 +8,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from qpavoid.config import RobotConfig
+import numpy as np
+
+from qpavoid.config import JointLimits, RobotConfig
 from qpavoid.describe.fit import GROSS, Bodies
 from qpavoid.describe.home import ROOM, Home, find_home
 from qpavoid.describe.poses import joint_values, locks, wished_homes
@@ -43,6 +45,7 @@ from qpavoid.geometry.bodies import check_meshes
 from qpavoid.geometry.ends import end_effectors
 from qpavoid.geometry.plausible import name_implausible_sizes
 from qpavoid.geometry.urdf import read_model, read_pieces
+from qpavoid.kinematics import MIMIC
 from qpavoid.notes import Note, NoteKind, RobotWarning, merged
 from qpavoid.problem import Array
 from qpavoid.robot import Robot
@@ -179,6 +182,7 @@ def _describe(urdf: Path, wishes: Wishes, progress: Callable[[str], None]) -> De
                 **bodies,
                 "disabled_pairs": single,
                 "pair_margins": margins,
+                "limits": JointLimits(velocity=_assumed_speeds(model, active.model)),
                 "home": joint_values(active.model, home.q),
             }
         ),
@@ -216,6 +220,23 @@ def _semantics(srdf: Path | None, model: Any, wishes: Wishes) -> Semantics:
 
 def _known(pair: frozenset[str], model: Any) -> bool:
     return all(model.existFrame(link) for link in pair)
+
+
+def _assumed_speeds(model: Any, used: Any) -> dict[str, float | list[float]]:
+    """Largest speeds that the robot has though its file gives none: written out, so that they can be seen and mended.
+
+    Args:
+        model: as the file has it.
+        used: the robot's.
+    """
+    assumed: dict[str, float | list[float]] = {}
+    for name, joint in zip(list(used.names)[1:], list(used.joints)[1:], strict=True):
+        of_file = model.joints[model.getJointId(name)]
+        given = np.array(model.velocityLimit[of_file.idx_v : of_file.idx_v + of_file.nv])
+        speeds = np.array(used.velocityLimit[joint.idx_v : joint.idx_v + joint.nv])
+        if joint.shortname() != MIMIC and np.any((given != speeds) & np.isfinite(speeds)):
+            assumed[name] = float(speeds[0]) if joint.nv == 1 else speeds.tolist()
+    return assumed
 
 
 def _wheels(model: Any, pieces: Sequence[Piece], wishes: Wishes) -> list[str]:

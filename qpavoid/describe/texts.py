@@ -56,6 +56,9 @@ def _robot_yaml(described: Described, folder: Path, srdf: str) -> str:
     if config.pair_margins:
         lines.append("pair_margins:   # of bodies that are near each other by design")
         lines += [f"  - {_flow({'bodies': list(own.bodies), 'd1': own.d1})}" for own in config.pair_margins]
+    if config.limits.velocity:
+        lines.append("limits:   # assumed: the file gives no speed of these")
+        lines.append(f"  velocity: {_flow(dict(config.limits.velocity))}")
     for field, values in (("home", config.home), ("lock", config.lock)):
         if values:
             lines += [f"{field}:", *(f"  {_flow(joint)}: {value:g}" for joint, value in values.items())]
