@@ -48,10 +48,9 @@ class LeftOut:
             return Note(kind, self.links, "not checked: they slide into each other by design", share=share)
         if not 0.0 < share < ALWAYS:
             return None
-        why, remedy = {
-            "adjacent": ("one joint apart", "limit that joint so that they cannot"),
-            "srdf": ("disabled by hand", "take them out of the SRDF or `disabled_pairs`"),
-        }.get(self.reason, ("never near in samples", "draw more samples"))
+        why, remedy = "one joint apart", "limit that joint so that they cannot"
+        if self.reason == "srdf":
+            why, remedy = "disabled by hand", "take them out of the SRDF or `disabled_pairs`"
         return Note(kind, self.links, f"not checked ({why}), but can touch", remedy, share=share)
 
 
@@ -135,7 +134,8 @@ def left_out(
         off: two links that are not checked, and why.
         shares: two bodies: share of configurations in which they touch [-].
     """
-    of_geometry = geometry_contacts(robot, pieces, off)
+    # bodies enclose the geometry: where they never come near, it does not touch
+    of_geometry = geometry_contacts(robot, pieces, [links for links, reason in off.items() if reason != "never"])
     link = _links(robot)
     of_bodies: dict[frozenset[str], float] = {}
     for pair, share in shares.items():

@@ -135,9 +135,7 @@ def volume_line(described: Described) -> str:
     )
     over = ""
     if inside > 0.0:
-        over = (
-            f", {volume / inside:.2f} times the {1e3 * inside:.2f} l of the geometry (its hulls: {hulls / inside:.2f})"
-        )
+        over = f", {volume / inside:.2f} times the {1e3 * inside:.2f} l of the geometry (hulls: {hulls / inside:.2f})"
     return f"{len(described.config.bodies)}, {1e3 * volume:.2f} l{over}"
 
 
