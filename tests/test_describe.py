@@ -2,6 +2,7 @@
 
 import math
 import xml.etree.ElementTree as ElementTree
+from itertools import pairwise
 
 import coal
 import numpy as np
@@ -346,6 +347,31 @@ def test_known_ends_come_first_and_are_not_doubled():
     assert sorted(ends) == [
         "left_sole_link", "right_sole_link", "wrist_left_ft_tool_link", "wrist_right_ft_tool_link"
     ]  # fmt: skip
+
+
+def test_hands_of_a_dual_arm_are_its_ends(tmp_path):
+    """Two arms of seven joints below a waist, with a thumb of five joints and fingers of four, none called a finger."""
+    links, joints = ["base", "torso"], ["base torso"]
+    for side in "lr":
+        arm = ["torso", *(f"{side}_arm{i}" for i in range(1, 8))]
+        links += arm[1:]
+        joints += [f"{a} {b}" for a, b in pairwise(arm)]
+        for digit, count in (("th", 5), ("ff", 4), ("mf", 4), ("rf", 4), ("lf", 4)):
+            chain = [arm[-1], *(f"{side}_{digit}{i}" for i in range(count))]
+            links += chain[1:]
+            joints += [f"{a} {b}" for a, b in pairwise(chain)]
+    text = "".join(f'<link name="{link}"/>' for link in [*links, "l_tcp"])
+    for joint in joints:
+        parent, child = joint.split()
+        text += (
+            f'<joint name="{child}_joint" type="revolute"><parent link="{parent}"/><child link="{child}"/>'
+            '<origin xyz="0 0 .1"/><axis xyz="1 0 0"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint>'
+        )
+    text += '<joint name="flange" type="fixed"><parent link="l_arm7"/><child link="l_tcp"/></joint>'
+    (tmp_path / "dual.urdf").write_text(f'<robot name="dual">{text}</robot>')
+    model = read_model(tmp_path / "dual.urdf", "fixed")
+    assert end_effectors(model) == ["l_tcp", "r_arm7"]
+    assert end_effectors(model, ["l_arm7"]) == ["l_tcp", "r_arm7"]  # an SRDF names the link that carries the hand
 
 
 def test_srdf_is_read_back_as_written(tmp_path):
