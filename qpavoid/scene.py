@@ -108,6 +108,15 @@ class Scene:
         """Names of the obstacles."""
         return [obstacle.name for obstacle in self.obstacles]
 
+    def slack(self, hold: float) -> Array:
+        """By how much the safety distance of each pair is less than that of the scenario (m,) [m].
+
+        Args:
+            hold: safety distance of the scenario, between surfaces [m].
+        """
+        own = [self.robot.safety_distance(a, b, hold) for a, b in self.pair_names]
+        return hold - np.array(own, dtype=np.float64)
+
     @property
     def movable(self) -> int:
         """Number of geometries, the first ones, that joints move or may come to move."""

@@ -218,7 +218,7 @@ class Recorder:
             "stopped_by": stopped_by,
             "events": self._events,
             "robot": robot.name,
-            "notes": list(robot.notes),
+            "notes": [str(note) for note in robot.notes],
             "coordinates": robot.coordinate_names,
             "units": robot.coordinate_units,
             "velocity_limit": [v if np.isfinite(v) else None for v in bounds.velocity],

@@ -325,6 +325,20 @@ def test_offset_margin_and_drift_of_a_row():
     np.testing.assert_allclose(x.least, [-0.7 - 0.1, -0.55 + 0.2, -0.75, 0.2 - 0.3], rtol=0, atol=1e-14)
 
 
+def test_slack_moves_the_safety_distance_of_a_pair():
+    """A pair with slack s has the row of one that is s farther away, but touches where it touches."""
+    d, slack = np.array([0.02, 0.06, 0.2]), np.array([0.09, 0.0, 0.05])
+    fields = {"offset": 0.01, "beta": False, "row_gain": 5.0, "hold": 0.1}
+    x, y = rows_at(d, slack=slack, **fields), rows_at(d + slack, **fields)
+    z = rows_at(d, **fields)
+    for layout in (x, y, z):
+        run("row_bounds", layout, 3, False)
+    np.testing.assert_allclose(x.d, y.d, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(x.least, y.least, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(x.touch, np.minimum(5.0 * (0.0 - d), x.least), rtol=0, atol=1e-14)
+    assert x.least[0] < z.least[0] and x.least[1] == z.least[1]
+
+
 def test_margins_are_those_of_the_near_pairs():
     """Row i belongs to pair near[i], not to pair i."""
     x = rows_at(np.full(2, 0.2), beta=False)

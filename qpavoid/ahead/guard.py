@@ -104,7 +104,7 @@ class Guard:
         self._bounds, self._rate = bounds, position_gain / dt
         self._acceleration, self._accelerated = bounds.acceleration, bool(np.isfinite(bounds.acceleration).any())
         self._jerked = bool(np.isfinite(bounds.jerk).any())
-        self._given = np.zeros(len(scene.pairs))
+        self._given, self._slack = np.zeros(len(scene.pairs)), scene.slack(hold)
         self._least = np.inf  # distance of any pair in the looks along the velocity under test [m]
         self._news, self._heard = np.zeros(len(scene.obstacles), dtype=bool), False
 
@@ -315,7 +315,7 @@ class Guard:
         pairs = ahead.pairs
         if not len(pairs):
             return _FARTHEST, -1
-        there, here = ahead.found(pairs), now.found(pairs)
+        there, here = ahead.found(pairs) + self._slack[pairs], now.found(pairs) + self._slack[pairs]
         margins = ahead.placing.margin
         if margins.any():
             margin = margins[ahead.twist_row[pairs]]

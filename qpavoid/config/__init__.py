@@ -18,7 +18,7 @@ from qpavoid.config.control import (
     TaskSwitching,
 )
 from qpavoid.config.motion import Circle, Csv, Fixed, Line, Motion, Waypoints
-from qpavoid.config.robot import Body, Hull, JointLimits, RobotConfig
+from qpavoid.config.robot import Body, Hull, JointLimits, PairMargin, RobotConfig
 from qpavoid.config.scenario import ObstacleConfig, ScenarioConfig
 from qpavoid.config.shapes import (
     Box,
@@ -61,7 +61,8 @@ __all__ = [
     "AlignTask", "AnyTask", "Avoidance", "Beta", "Block", "Body", "Box", "Capsule", "Cbf", "Circle", "ComTask", "Cone",
     "Contact", "Csv", "Cylinder", "Damper", "DampingTask", "Detour", "Ellipsoid", "Eq10Solver", "Escape", "Fixed",
     "GradientProjectionSolver", "HalfSpace", "HqpSolver", "Hull", "JointLimits", "Limits", "Line", "LookAtTask",
-    "ManipulabilityTask", "Mesh", "Motion", "ObstacleConfig", "ObstacleShape", "PointCloud", "PostureTask",
-    "PotentialFieldSolver", "Progress", "QpSolver", "RelativeTask", "RobotConfig", "ScenarioConfig", "Sensing", "Shape",
-    "SolverConfig", "Sphere", "Task", "TaskBlock", "TaskSwitching", "TrackingSolver", "Waypoints", "expand_solver",
+    "ManipulabilityTask", "Mesh", "Motion", "ObstacleConfig", "ObstacleShape", "PairMargin", "PointCloud",
+    "PostureTask", "PotentialFieldSolver", "Progress", "QpSolver", "RelativeTask", "RobotConfig", "ScenarioConfig",
+    "Sensing", "Shape", "SolverConfig", "Sphere", "Task", "TaskBlock", "TaskSwitching", "TrackingSolver", "Waypoints",
+    "expand_solver",
 ]  # fmt: skip

@@ -87,7 +87,8 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
         moving: whether any obstacle moves or has a margin.
     """
     for i in range(k):
-        d = x.closest[i, 0] + x.offset - x.margin[x.twist_row[x.near[i]]]
+        slack = x.slack[x.near[i]]
+        d = x.closest[i, 0] + x.offset - x.margin[x.twist_row[x.near[i]]] + slack
         value = x.row_gain * (x.hold - d)
         parting = value > 0.0
         if x.beta and not parting:
@@ -126,7 +127,7 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
             least = min(least, stop)
         x.d[i] = d
         x.least[i] = least
-        x.touch[i] = min(x.row_gain * (x.offset - d) - x.drift[i], least)
+        x.touch[i] = min(x.row_gain * (x.offset + slack - d) - x.drift[i], least)
 
 
 @compiled
