@@ -9,6 +9,7 @@ from qpavoid.files.loading import load_scenario
 from qpavoid.geometry.cloud import Points, Voxels
 from qpavoid.log import Log
 from qpavoid.motion import Sample
+from qpavoid.notes import Note, NoteKind, RobotWarning
 from qpavoid.obstacles.sensing import Pose
 from qpavoid.problem import Problem, Solution, Status
 from qpavoid.robot import Robot
@@ -25,6 +26,8 @@ __all__ = [
     "Controller",
     "Limits",
     "Log",
+    "Note",
+    "NoteKind",
     "NumericalError",
     "Obstacle",
     "Points",
@@ -33,6 +36,7 @@ __all__ = [
     "Progress",
     "QpavoidError",
     "Robot",
+    "RobotWarning",
     "Sample",
     "ScenarioConfig",
     "Scene",
