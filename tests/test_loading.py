@@ -155,9 +155,9 @@ DUMMIES = [f"<collision><geometry>{shape}</geometry></collision>" for shape in (
 
 @pytest.mark.parametrize("dummy", EMPTY + DUMMIES)
 def test_shape_without_size_is_left_out_and_named(tmp_path, dummy):
-    robot, (told,) = load(write(tmp_path, arm(forearm=dummy + ROD)))
+    robot, (message,) = load(write(tmp_path, arm(forearm=dummy + ROD)))
     assert shapes(robot) == INTACT
-    assert "shape forearm_0: left out" in told
+    assert "shape forearm_0: left out" in message
     assert robot.bodies.geometryObjects[1].name == "forearm_1", "names do not depend on what is left out"
 
 
@@ -171,8 +171,8 @@ def test_shape_without_size_is_left_out_and_named(tmp_path, dummy):
 )
 def test_flat_shape_gets_a_thickness(tmp_path, shape, half):
     flat = f"<collision><geometry>{shape}</geometry></collision>"
-    robot, (told,) = load(write(tmp_path, arm(b=flat)))
-    assert "shape b_0: a size of 0" in told and "0.0001 m" in told
+    robot, (message,) = load(write(tmp_path, arm(b=flat)))
+    assert "shape b_0: a size of 0" in message and "0.0001 m" in message
     geometry = robot.bodies.geometryObjects[2].geometry
     geometry.computeLocalAABB()
     np.testing.assert_allclose(geometry.aabb_local.max_, half, atol=1e-12)
@@ -186,8 +186,8 @@ def test_several_shapes_in_one_element_all_count(tmp_path):
 
 
 def test_shape_in_another_element_is_named(tmp_path):
-    robot, (told,) = load(write(tmp_path, arm(b=f"{ROD}<visual>{BOX}{ROD}</visual>")))
-    assert shapes(robot) == INTACT and "shape b: 1 of its <collision> elements are left out" in told
+    robot, (message,) = load(write(tmp_path, arm(b=f"{ROD}<visual>{BOX}{ROD}</visual>")))
+    assert shapes(robot) == INTACT and "shape b: 1 of its <collision> elements are left out" in message
 
 
 def test_origin_as_a_quaternion(tmp_path):
@@ -206,9 +206,9 @@ def test_origin_as_a_quaternion(tmp_path):
 def test_visuals_serve_link_by_link(tmp_path, seen):
     own = {"base": BASE, "forearm": ROD, "b": ROD}
     path = write(tmp_path, arm(**{link: own[link].replace("collision", "visual") for link in seen}))
-    robot, (told,) = load(path)
+    robot, (message,) = load(path)
     assert shapes(robot) == INTACT
-    assert told.startswith(f"link {', '.join(seen)}: no collision shape")
+    assert message.startswith(f"link {', '.join(seen)}: no collision shape")
     bare, serious = load(path, visuals=False)
     assert shapes(bare) == {link: types for link, types in INTACT.items() if link not in seen} and serious == []
 
@@ -223,8 +223,8 @@ def test_visual_tool_on_a_chain_of_fixed_links(tmp_path):
     fixed = '<joint name="{0}" type="fixed"><parent link="{1}"/><child link="{0}l"/><origin xyz="0 0 .1"/></joint>'
     links = f'<link name="f1l"/><link name="f2l">{ROD}</link><link name="f3l">{SEEN_ROD}</link>'
     inside = links + fixed.format("f1", "b") + fixed.format("f2", "f1l") + fixed.format("f3", "f2l")
-    robot, (told,) = load(write(tmp_path, arm(inside=inside)))
-    assert shapes(robot) == {**INTACT, "f2l": ["Cylinder"], "f3l": ["Cylinder"]} and "link f3l:" in told
+    robot, (message,) = load(write(tmp_path, arm(inside=inside)))
+    assert shapes(robot) == {**INTACT, "f2l": ["Cylinder"], "f3l": ["Cylinder"]} and "link f3l:" in message
     tool = robot.bodies.geometryObjects[robot.bodies.getGeometryId("f3l_0")]
     assert tool.parentJoint == 2
     np.testing.assert_allclose(tool.placement.translation, [0.0, 0.0, 0.5], atol=1e-12)
@@ -232,9 +232,9 @@ def test_visual_tool_on_a_chain_of_fixed_links(tmp_path):
 
 def test_a_visual_that_cannot_be_read_does_not_refuse_a_robot_with_collision_shapes(tmp_path):
     missing = '<visual><geometry><mesh filename="package://no/tool.stl"/></geometry></visual>'
-    robot, (told,) = load(write(tmp_path, arm(b=missing)))
+    robot, (message,) = load(write(tmp_path, arm(b=missing)))
     assert "b" not in shapes(robot)
-    assert "mesh b_0: left out: a mesh in package://no is missing" in told
+    assert "mesh b_0: left out: a mesh in package://no is missing" in message
     everything = dict.fromkeys(("base", "forearm", "b"), missing)
     with pytest.raises(ConfigError, match=r"link 'base': visual 0: mesh package://no/tool\.stl could not be found"):
         load(write(tmp_path, arm(**everything)))
@@ -245,8 +245,8 @@ def test_a_visual_that_cannot_be_read_does_not_refuse_a_robot_with_collision_sha
 
 def test_undeclared_prefix_is_named(tmp_path):
     foreign = f'{LIMITS} drake:acceleration="3"'
-    robot, (told,) = load(write(tmp_path, arm(limits=foreign, inside="<gz:plugin><gz:a/></gz:plugin>")))
-    assert shapes(robot) == INTACT and "file drake, gz: prefix of XML that no xmlns attribute declares" in told
+    robot, (message,) = load(write(tmp_path, arm(limits=foreign, inside="<gz:plugin><gz:a/></gz:plugin>")))
+    assert shapes(robot) == INTACT and "file drake, gz: prefix of XML that no xmlns attribute declares" in message
     declared = '<robot name="m" xmlns:drake="d" xmlns:gz="g">'
     robot, serious = load(write(tmp_path, arm(limits=foreign, head=declared)))
     assert shapes(robot) == INTACT and serious == []
@@ -283,7 +283,7 @@ def test_xacro_finds_packages_without_ros(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ('<xacro:include filename="$(find nowhere)/a.xacro"/>', "xacro: .*nowhere"),
         ("<xacro:nothing/>", "xacro: .*nothing"),
@@ -291,10 +291,12 @@ def test_xacro_finds_packages_without_ros(tmp_path):
         ('<a b="$(arg side)"/>', "xacro: .*side"),
     ],
 )
-def test_xacro_that_cannot_be_expanded_says_what_to_run(tmp_path, capfd, text, told):
+def test_xacro_that_cannot_be_expanded_says_what_to_run(tmp_path, capfd, text, message):
     pytest.importorskip("xacro")
     path = write(tmp_path, arm(head=XACRO + text), "arm.urdf.xacro")
-    with pytest.raises(ConfigError, match=rf"arm\.urdf\.xacro: {told}.*`xacro arm\.urdf\.xacro > arm\.urdf`") as error:
+    with pytest.raises(
+        ConfigError, match=rf"arm\.urdf\.xacro: {message}.*`xacro arm\.urdf\.xacro > arm\.urdf`"
+    ) as error:
         Robot.load(path)
     assert "\n" not in str(error.value)
 
@@ -309,18 +311,18 @@ def test_xacro_without_its_package_says_what_to_install(tmp_path, monkeypatch):
 
 
 def test_limits_the_wrong_way_round_are_turned(tmp_path):
-    robot, (told,) = load(write(tmp_path, arm(limits='lower="0" upper="-1" velocity="1" effort="1"')))
+    robot, (message,) = load(write(tmp_path, arm(limits='lower="0" upper="-1" velocity="1" effort="1"')))
     bounds = robot.bounds()
     np.testing.assert_array_equal([bounds.lower[1], bounds.upper[1]], [-1.0, 0.0])
-    assert "limit j2: its lower limit 0 is above its upper one -1" in told
+    assert "limit j2: its lower limit 0 is above its upper one -1" in message
 
 
 @pytest.mark.parametrize("value", [0.3, -0.7, 0.0])
 @pytest.mark.parametrize("type_", ["revolute", "prismatic"])
 def test_joint_without_a_range_is_fixed_there(tmp_path, value, type_):
     limits = f'lower="{value}" upper="{value}" velocity="0" effort="0"'
-    robot, (told,) = load(write(tmp_path, arm(limits=limits, type_=type_)))
-    assert robot.joint_names == ["j1"] and f"joint j2: locked at {value:g}" in told
+    robot, (message,) = load(write(tmp_path, arm(limits=limits, type_=type_)))
+    assert robot.joint_names == ["j1"] and f"joint j2: locked at {value:g}" in message
     data = robot.model.createData()
     pin.framesForwardKinematics(robot.model, data, np.zeros(1))
     pose = data.oMf[robot.frame_id("b", "test")]
@@ -340,16 +342,16 @@ def test_range_of_the_robot_file_frees_a_joint(tmp_path):
 def test_ranges_that_are_all_zero_say_nothing(tmp_path):
     """As an exporter writes them unless asked otherwise: a robot of which no joint moved would be of no use."""
     text = arm(limits='lower="0" upper="0" velocity="0" effort="0"').replace(LIMITS, 'lower="0" upper="0"')
-    robot, told = load(write(tmp_path, text))
+    robot, message = load(write(tmp_path, text))
     assert robot.joint_names == ["j1", "j2"] and robot.bounds().q_index.size == 0
-    assert any("limit j1, j2: every range of the file is [0, 0]" in line for line in told)
+    assert any("limit j1, j2: every range of the file is [0, 0]" in line for line in message)
 
 
 @pytest.mark.parametrize("limits", ['velocity="0" effort="1" lower="-1" upper="1"', 'lower="-1" upper="1"'])
 def test_speed_that_is_not_given_is_assumed_and_named(tmp_path, limits):
-    robot, (told,) = load(write(tmp_path, arm(limits=limits)))
+    robot, (message,) = load(write(tmp_path, arm(limits=limits)))
     np.testing.assert_array_equal(robot.bounds().velocity, [1.0, 1.0])
-    assert "limit j2: no velocity limit is given: 1 rad/s is assumed" in told
+    assert "limit j2: no velocity limit is given: 1 rad/s is assumed" in message
     robot, serious = load(write(tmp_path, arm(limits=limits)), limits={"velocity": {"j2": 0.4}})
     np.testing.assert_array_equal(robot.bounds().velocity, [1.0, 0.4])
     assert serious == []
@@ -357,9 +359,9 @@ def test_speed_that_is_not_given_is_assumed_and_named(tmp_path, limits):
 
 @pytest.mark.parametrize("limits", ["", 'velocity="1" effort="1"'])
 def test_range_that_is_not_given_is_named(tmp_path, limits):
-    robot, told = load(write(tmp_path, arm(limits=limits)))
+    robot, message = load(write(tmp_path, arm(limits=limits)))
     assert robot.bounds().q_index.tolist() == [0]
-    assert any("limit j2: has no <limit> lower and upper: it moves without position limits" in line for line in told)
+    assert any("limit j2: has no <limit> lower and upper: it moves without position limits" in line for line in message)
 
 
 @pytest.mark.parametrize(
@@ -367,8 +369,8 @@ def test_range_that_is_not_given_is_named(tmp_path, limits):
 )
 def test_base_has_a_speed_limit_that_is_named(tmp_path, root, nv, units):
     path = write(tmp_path, arm())
-    robot, (told,) = load(path, root_joint=root)
-    assert f"limit root_joint: no velocity limit is given: {units} are assumed" in told
+    robot, (message,) = load(path, root_joint=root)
+    assert f"limit root_joint: no velocity limit is given: {units} are assumed" in message
     np.testing.assert_array_equal(robot.bounds().velocity, np.ones(nv + 2))
     speeds = [0.5 + 0.1 * i for i in range(nv)]
     robot, serious = load(path, root_joint=root, limits={"velocity": {"root_joint": speeds}}, lock={"j1": 0.2})
@@ -451,11 +453,11 @@ def test_missing_mesh_may_be_left_out(tmp_path):
     path = write(tmp_path, arm(b=missing))
     with pytest.raises(ConfigError, match=r"link 'b': collision 0: mesh package://no/hand.stl .*allow_missing_meshes"):
         load(path)
-    robot, (told,) = load(path, allow_missing_meshes=True)
+    robot, (message,) = load(path, allow_missing_meshes=True)
     assert shapes(robot) == {link: types for link, types in INTACT.items() if link != "b"}
-    assert "mesh b_0: left out: a mesh in package://no is missing" in told
-    robot, told = load(write(tmp_path, arm(b=missing + SEEN_ROD)), allow_missing_meshes=True)
-    assert shapes(robot) == INTACT and len(told) == 2, "what is meant to be seen serves instead"
+    assert "mesh b_0: left out: a mesh in package://no is missing" in message
+    robot, message = load(write(tmp_path, arm(b=missing + SEEN_ROD)), allow_missing_meshes=True)
+    assert shapes(robot) == INTACT and len(message) == 2, "what is meant to be seen serves instead"
 
 
 def test_pointer_of_git_lfs_is_called_one(tmp_path):
@@ -468,12 +470,12 @@ def test_pointer_of_git_lfs_is_called_one(tmp_path):
 # --- sizes and duplicates ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("scale", "told"), [(1000, "is 100 m across"), (0.001, "is 0.1 mm across")])
-def test_mesh_of_implausible_size_is_named(tmp_path, scale, told):
+@pytest.mark.parametrize(("scale", "message"), [(1000, "is 100 m across"), (0.001, "is 0.1 mm across")])
+def test_mesh_of_implausible_size_is_named(tmp_path, scale, message):
     (tmp_path / "part.stl").write_text(STL)
     mesh = f'<collision><geometry><mesh filename="part.stl" scale="{scale} {scale} {scale}"/></geometry></collision>'
     _, (line,) = load(write(tmp_path, arm(b=mesh)))
-    assert f"mesh b_0: {told}" in line and "scale" in line
+    assert f"mesh b_0: {message}" in line and "scale" in line
 
 
 def test_offset_of_implausible_length_is_named(tmp_path):
@@ -589,8 +591,8 @@ def test_the_warning_points_at_who_asked(tmp_path):
 
 
 def test_notes_of_the_same_are_one(tmp_path):
-    robot, (told,) = load(write(tmp_path, arm(b=SEEN_ROD, forearm=SEEN_ROD)))
-    assert "link forearm, b: no collision shape" in told
+    robot, (message,) = load(write(tmp_path, arm(b=SEEN_ROD, forearm=SEEN_ROD)))
+    assert "link forearm, b: no collision shape" in message
     assert len({note.what for note in robot.notes}) == len(robot.notes)
 
 

@@ -67,14 +67,14 @@ def test_geoms_that_collide_are_those_of_mujoco(tmp_path, name):
 def test_body_that_is_only_seen(tmp_path):
     seen = '<geom type="sphere" size=".1" contype="0" conaffinity="0"/>'
     path = write(tmp_path, mjcf(second=seen * 2), "m.xml")
-    robot, (told,) = load(path, limits=speeds())
+    robot, (message,) = load(path, limits=speeds())
     assert by_body(robot) == {"one": 1, "two": 1}, "the second is the same again"
-    assert "link two: no collision shape" in told
+    assert "link two: no collision shape" in message
     assert by_body(load(path, limits=speeds(), visuals=False)[0]) == {"one": 1}
 
 
 @pytest.mark.parametrize(
-    ("geoms", "told"),
+    ("geoms", "message"),
     [
         (f'<frame pos="0 0 1">{SPHERE}</frame>', "what is in a <frame> would be lost; save it as one plain file"),
         (f'<replicate count="2" offset="1 0 0">{SPHERE}</replicate>', "what is in a <replicate> would be lost"),
@@ -84,14 +84,14 @@ def test_body_that_is_only_seen(tmp_path):
         ('<geom type="sdf" size=".1"/>', "geomType does not exist"),
     ],
 )
-def test_geom_that_would_be_lost_is_refused(tmp_path, geoms, told):
+def test_geom_that_would_be_lost_is_refused(tmp_path, geoms, message):
     with pytest.raises(ConfigError) as error:
         load(write(tmp_path, mjcf(second=geoms), "m.xml"), limits=speeds())
-    assert "m.xml" in str(error.value) and told in str(error.value)
+    assert "m.xml" in str(error.value) and message in str(error.value)
 
 
 def test_speeds_that_no_mjcf_gives_are_assumed(tmp_path):
-    robot, (told,) = load(write(tmp_path, mjcf(), "m.xml"))
-    assert "limit j1, j2: no velocity limit is given: 1 rad/s is assumed" in told
+    robot, (message,) = load(write(tmp_path, mjcf(), "m.xml"))
+    assert "limit j1, j2: no velocity limit is given: 1 rad/s is assumed" in message
     np.testing.assert_array_equal(robot.bounds().velocity, [1.0, 1.0])
     assert robot.end_effectors == ("two",)
