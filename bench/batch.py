@@ -10,8 +10,9 @@ from time import perf_counter
 
 import numpy as np
 
-from qpavoid import Controller, ScenarioConfig, Workers, load_scenario, simulate, simulate_many, steps
-from qpavoid.machine import cpu
+from qpavoid import Controller, ScenarioConfig, Workers, load_scenario, simulate_many, steps
+from qpavoid.run import simulate
+from qpavoid.run.machine import cpu
 
 RESULTS = Path(__file__).parent / "results" / "batch.md"
 SCENARIOS = ("situation1", "panda_line")

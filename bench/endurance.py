@@ -335,7 +335,7 @@ def _report(latency: Any, memory: Any, start: Any, ticks: int, load: tuple[float
 
 
 def _machine() -> str:
-    from qpavoid.machine import cpu
+    from qpavoid.run.machine import cpu
 
     return (
         f"{cpu()}, {os.cpu_count()} CPUs, {platform.system()}, Python "

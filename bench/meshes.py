@@ -17,7 +17,7 @@ import pinocchio as pin
 
 from bench.tick.robots import ROBOTS, SHARE
 from qpavoid import Robot
-from qpavoid.notes import RobotWarning
+from qpavoid.model.notes import RobotWarning
 
 RESULTS = Path(__file__).parent / "results" / "meshes.md"
 KINDS = ("mesh", "convex", "capsule")

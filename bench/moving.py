@@ -141,7 +141,7 @@ def _stepper(moving: int, given: dict[str, Any] | None = None) -> Callable[[floa
     """A tick at a time [s], of a scene in which the first so many obstacles move."""
     from qpavoid import Controller, Obstacle, Robot, build_scene, build_tasks
     from qpavoid.config import Circle, Fixed, Line, Sphere, Task
-    from qpavoid.motion import build_motion
+    from qpavoid.model.trajectory import build_motion
 
     random, obstacles = np.random.default_rng(3), []
     for i in range(OBSTACLES):

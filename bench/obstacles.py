@@ -19,7 +19,7 @@ from bench.tick.robots import SHARE
 from qpavoid import Avoidance, Controller, Obstacle, Points, Robot, Sample, Voxels, build_scene, build_tasks
 from qpavoid.config import Box, Capsule, Cone, Cylinder, Ellipsoid, HalfSpace, Mesh, PointCloud, Sphere, Task
 from qpavoid.geometry.bodies import MeshWarning
-from qpavoid.geometry.solids import hull_of
+from qpavoid.model.solids import hull_of
 
 RESULTS = Path(__file__).parent / "results" / "obstacles.md"
 CLOUDS = (1_000, 3_000, 10_000, 30_000, 100_000)

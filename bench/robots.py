@@ -18,8 +18,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from qpavoid.files.shipped import example_robot_data
-from qpavoid.notes import shortened
+from qpavoid.config.shipped import example_robot_data
+from qpavoid.model.notes import shortened
 
 ROBOTS = example_robot_data() / "example-robot-data" / "robots"
 OUT = Path(__file__).parent.parent / "docs" / "robots.md"

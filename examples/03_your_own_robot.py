@@ -1,7 +1,7 @@
 """A robot of your own from a bare URDF, with collision capsules fitted to its meshes."""
 
 from qpavoid import Robot
-from qpavoid.files.shipped import example_robot_data
+from qpavoid.config.shipped import example_robot_data
 
 urdf = example_robot_data() / "example-robot-data/robots/ur_description/urdf/ur5_robot.urdf"  # put your path here
 robot = Robot.from_urdf(urdf, bodies="capsule")

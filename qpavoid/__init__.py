@@ -1,23 +1,23 @@
 """qpavoid: follow a planned motion and stay clear of obstacles, other arms and yourself."""
 
-from qpavoid.batch import BatchError, Steps, WorkerDied, Workers, simulate_many, steps
 from qpavoid.config import Avoidance, Limits, Progress, ScenarioConfig, Sensing
-from qpavoid.contacts import build_contacts
+from qpavoid.config.loading import load_scenario
+from qpavoid.control.contacts import build_contacts
+from qpavoid.control.obstacles import Pose
+from qpavoid.control.tasks.frames import build_tasks
 from qpavoid.controller import Controller, Tick
 from qpavoid.errors import ConfigError, NumericalError, QpavoidError, SolverNotInstalled, UnknownName
-from qpavoid.files.loading import load_scenario
-from qpavoid.geometry.cloud import Points, Voxels
-from qpavoid.log import Log
-from qpavoid.motion import Sample
-from qpavoid.notes import Note, NoteKind, RobotWarning
-from qpavoid.obstacles.sensing import Pose
+from qpavoid.model.cloud import Points, Voxels
+from qpavoid.model.notes import Note, NoteKind, RobotWarning
+from qpavoid.model.robot import Robot
+from qpavoid.model.scene import Obstacle, Scene, build_scene
+from qpavoid.model.trajectory import Sample
 from qpavoid.problem import Problem, Solution, Status
 from qpavoid.reason import Reason, ReasonKind, Severity
-from qpavoid.robot import Robot
-from qpavoid.scene import Obstacle, Scene, build_scene
-from qpavoid.simulate import simulate
+from qpavoid.run.batch import BatchError, Steps, WorkerDied, Workers, simulate_many, steps
+from qpavoid.run.log import Log
+from qpavoid.run.simulate import simulate
 from qpavoid.solvers import SOLVERS, Solver, make_solver
-from qpavoid.tasks import build_tasks
 
 __all__ = [
     "SOLVERS",

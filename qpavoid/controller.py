@@ -12,13 +12,12 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid import kernels
-from qpavoid.assembly import Assembly
-from qpavoid.command import Commander
 from qpavoid.config import Avoidance, Limits, Progress, ScenarioConfig, Sensing
-from qpavoid.contacts import ContactRows, build_contacts
-from qpavoid.errors import ConfigError, NumericalError, UnknownName, located, nearest
-from qpavoid.geometry.cloud import Points
-from qpavoid.inputs import (
+from qpavoid.control.assembler import Assembly
+from qpavoid.control.attach import Grasps
+from qpavoid.control.contacts import ContactRows, build_contacts
+from qpavoid.control.distances import DistanceQuery
+from qpavoid.control.inputs import (
     FARTHEST,
     FASTEST,
     FAULTS,
@@ -28,20 +27,21 @@ from qpavoid.inputs import (
     Times,
     check_velocity,
 )
-from qpavoid.kernels.motions import NORMALISED, SAMPLE
-from qpavoid.kinematics import ForwardKinematics, Kinematics
-from qpavoid.limits import OUTSIDE
-from qpavoid.motion import Sample
-from qpavoid.obstacles.courses import STATE, as_samples, put
-from qpavoid.obstacles.grasp import Grasps
-from qpavoid.obstacles.sensing import Obstacles, Pose, Update
+from qpavoid.control.obstacles import Obstacles, Pose, Update
+from qpavoid.control.tasks.frames import AnyTask, build_tasks, in_order
+from qpavoid.control.trajectories import STATE, as_samples, put
+from qpavoid.errors import ConfigError, NumericalError, UnknownName, located, nearest
+from qpavoid.kernels.obstacles import NORMALISED, SAMPLE
+from qpavoid.model.cloud import Points
+from qpavoid.model.kinematics import ForwardKinematics, Kinematics
+from qpavoid.model.limits import OUTSIDE
+from qpavoid.model.robot import Robot
+from qpavoid.model.scene import Scene, build_obstacles, build_scene
+from qpavoid.model.trajectory import Sample
 from qpavoid.problem import Array, Problem, Proximity, Solution, State, as_vector, require_finite
-from qpavoid.proximity import DistanceQuery
 from qpavoid.reason import Reason, ReasonKind
-from qpavoid.robot import Robot
-from qpavoid.scene import Scene, build_obstacles, build_scene
+from qpavoid.safety.arbiter import Commander
 from qpavoid.solvers import SOLVERS, Solver, make_solver
-from qpavoid.tasks import AnyTask, build_tasks, in_order
 
 _log = logging.getLogger(__name__)
 _LONGEST = 1.0

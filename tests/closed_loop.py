@@ -5,7 +5,7 @@ import pinocchio as pin
 
 from qpavoid import Avoidance, Controller, Limits, Robot, Sample, build_scene, build_tasks, load_scenario
 from qpavoid.config import Progress, ScenarioConfig, Sensing, Task
-from qpavoid.proximity import DistanceQuery
+from qpavoid.control.distances import DistanceQuery
 
 SHIPPED = load_scenario("situation1").source
 """A place from which scenarios made here are taken to be read, so that robots are found by name."""

@@ -10,15 +10,15 @@ import pytest
 from hypothesis import settings
 
 from qpavoid import Controller, Obstacle, Robot, Sample, build_scene, config, load_scenario
-from qpavoid.__main__ import main
-from qpavoid.assembly import Assembly
-from qpavoid.files.shipped import example_robot_data
+from qpavoid.cli import main
+from qpavoid.config.shipped import example_robot_data
+from qpavoid.control.assembler import Assembly
+from qpavoid.control.distances import DistanceQuery
+from qpavoid.control.tasks.frames import in_order
 from qpavoid.kernels.cache import FOLDER
 from qpavoid.kernels.layout import RowLayout
-from qpavoid.kinematics import ForwardKinematics
-from qpavoid.motion import build_motion
-from qpavoid.proximity import DistanceQuery
-from qpavoid.tasks import in_order
+from qpavoid.model.kinematics import ForwardKinematics
+from qpavoid.model.trajectory import build_motion
 
 settings.register_profile("patient", deadline=None)  # the first call of a compiled function may wait for the compiler
 settings.load_profile("patient")

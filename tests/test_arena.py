@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from qpavoid import Solution, load_scenario, simulate
+from qpavoid import Solution, load_scenario
 from qpavoid.arena.case import Case, Sensor, Sight
 from qpavoid.arena.entrants import ENTRANTS, find_entrant
 from qpavoid.arena.referee import Contact, Findings, play
@@ -15,6 +15,7 @@ from qpavoid.arena.trial import run_trial
 from qpavoid.arena.twin import build
 from qpavoid.arena.world import build_world
 from qpavoid.errors import ConfigError, UnknownName
+from qpavoid.run import simulate
 
 DT = 0.01
 

@@ -7,8 +7,8 @@ import pytest
 from conftest import SPHERE, Bench, make_layout, obstacle
 
 from qpavoid import Avoidance, Sample, build_scene, kernels
-from qpavoid.avoidance import row_form
-from qpavoid.gains import alpha, beta
+from qpavoid.control.avoidance import row_form
+from qpavoid.solvers.gains import alpha, beta
 
 D1, D2, XI = 0.12, 0.24, 5.0
 TINY = 1e-9

@@ -10,9 +10,10 @@ import time
 import numpy as np
 import pytest
 
-from qpavoid import ConfigError, Controller, NumericalError, SolverNotInstalled, UnknownName, load_scenario, simulate
-from qpavoid.batch import BatchError, WorkerDied, Workers, simulate_many, steps
-from qpavoid.log import STATUSES
+from qpavoid import ConfigError, Controller, NumericalError, SolverNotInstalled, UnknownName, load_scenario
+from qpavoid.run import simulate
+from qpavoid.run.batch import BatchError, WorkerDied, Workers, simulate_many, steps
+from qpavoid.run.log import STATUSES
 
 DIE = "__import__('os')._exit(3)"
 
@@ -163,7 +164,7 @@ def test_workers_that_cannot_work_say_so():
 
 def test_script_without_guard_is_told(tmp_path):
     script = tmp_path / "script.py"
-    script.write_text("from qpavoid.batch import simulate_many\nsimulate_many(['situation1'] * 50, jobs=1)\n")
+    script.write_text("from qpavoid.run.batch import simulate_many\nsimulate_many(['situation1'] * 50, jobs=1)\n")
     run = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=300, check=False)
     assert run.returncode != 0
     assert "WorkerDied" in run.stderr
@@ -175,7 +176,7 @@ def test_interrupt_ends_the_batch(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
         "from qpavoid import load_scenario\n"
-        "from qpavoid.batch import Workers, simulate_many\n"
+        "from qpavoid.run.batch import Workers, simulate_many\n"
         "if __name__ == '__main__':\n"
         "    with Workers(1) as workers:\n"
         "        print('started', flush=True)\n"

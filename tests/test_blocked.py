@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from closed_loop import cartesian, drive, make_controller
 
-from qpavoid import Avoidance, Obstacle, ReasonKind, Sample, Severity, simulate
+from qpavoid import Avoidance, Obstacle, ReasonKind, Sample, Severity
 from qpavoid.config import Box, Capsule, Detour, Progress, Sphere
+from qpavoid.run import simulate
 
 D1, GOAL = 0.03, np.array([0.6, 0.0, 0.0])
 SHAPES = {

@@ -19,7 +19,7 @@ from qpavoid import Robot, config
 from qpavoid.geometry.bodies import convert_bodies, enclosing_capsule, make_shape
 from qpavoid.geometry.capsules import fit_capsule
 from qpavoid.geometry.segments import point_segment
-from qpavoid.geometry.urdf import read_collision, read_model
+from qpavoid.model.urdf import read_collision, read_model
 
 PANDA = EXAMPLES / "panda_description/urdf/panda.urdf"
 STL_FACET = "facet normal 0 0 1\nouter loop\nvertex {}\nvertex {}\nvertex {}\nendloop\nendfacet\n"
@@ -192,7 +192,7 @@ def test_capsules_sit_around_the_meshes_in_the_link_frame(meshes):
         assert np.max(point_segment(points, a, b).distance) < body.geometry.radius + 1e-9
 
 
-@pytest.mark.filterwarnings("ignore::qpavoid.notes.RobotWarning")
+@pytest.mark.filterwarnings("ignore::qpavoid.model.notes.RobotWarning")
 def test_scaled_mesh_of_a_urdf_keeps_its_size(tmp_path):
     """A tetrahedron in mm with a scale of 0.001."""
     o, x, y, z = "0 0 0", "100 0 0", "0 100 0", "0 0 100"

@@ -12,10 +12,9 @@ import pytest
 from conftest import EXAMPLES, random_q
 
 from qpavoid import Robot
-from qpavoid.files import cache
-from qpavoid.files.cache import VERSION, cache_folder
-from qpavoid.geometry import bodies
+from qpavoid.geometry import bodies, cache
 from qpavoid.geometry.bodies import enclosing_capsule
+from qpavoid.geometry.cache import VERSION, cache_folder
 from qpavoid.geometry.capsules import fit_capsule
 
 PANDA = EXAMPLES / "panda_description/urdf/panda.urdf"

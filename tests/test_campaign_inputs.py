@@ -20,8 +20,8 @@ from qpavoid import (
     build_tasks,
 )
 from qpavoid.config import Box, Escape, HalfSpace, PointCloud, PostureTask, Sphere, Task
+from qpavoid.control.distances import DistanceQuery
 from qpavoid.controller import Controller
-from qpavoid.proximity import DistanceQuery
 
 TOOL = "panda_hand_tcp"
 MOST_LOOKS = 3000

@@ -13,7 +13,7 @@ import yaml
 from conftest import Result
 
 from qpavoid import Log
-from qpavoid.files.shipped import data_folder, robot_names, scenario_names
+from qpavoid.config.shipped import data_folder, robot_names, scenario_names
 from qpavoid.solvers import SOLVERS
 
 METRICS = {
@@ -298,7 +298,7 @@ def test_whole_process_good_and_bad(tmp_path):
 
 LONG_RUN = """
 import signal, sys
-from qpavoid import __main__ as cli
+from qpavoid import cli
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a parent in the background passes on that it is ignored
 update = cli._update

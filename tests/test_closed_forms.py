@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracle import support
 
+from qpavoid.control.distances import DistanceQuery
 from qpavoid.geometry.cores import cores, with_closed_form
-from qpavoid.kernels.closed_forms import APART, closed_forms
-from qpavoid.proximity import DistanceQuery
+from qpavoid.kernels.distances import APART, closed_forms
 
 AT_ORIGIN = pin.SE3.Identity()
 
@@ -118,7 +118,7 @@ def test_which_pairs_have_one():
 def test_a_query_has_the_same_results_as_coal_alone(panda, monkeypatch, copies):
     """Deep in penetration, too, with shapes of all kinds; and where the memory of coal cannot be looked into."""
     if copies:
-        monkeypatch.setattr("qpavoid.proximity.view_results", lambda *_: None)
+        monkeypatch.setattr("qpavoid.control.distances.view_results", lambda *_: None)
     rng = np.random.default_rng(3)
     scene = random_scene(panda, rng, [SPHERE, CAPSULE, BOX, CYLINDER] * 2)
     model = scene.robot.model

@@ -9,11 +9,12 @@ import pytest
 import yaml
 from pydantic import BaseModel
 
-from qpavoid import ConfigError, Robot, UnknownName, config, load_scenario, simulate
+from qpavoid import ConfigError, Robot, UnknownName, config, load_scenario
 from qpavoid.config import Block, RobotConfig, ScenarioConfig
+from qpavoid.config.loading import read_config
+from qpavoid.config.shipped import data_folder, robot_names, scenario_names
 from qpavoid.errors import nearest
-from qpavoid.files.loading import read_config
-from qpavoid.files.shipped import data_folder, robot_names, scenario_names
+from qpavoid.run import simulate
 from qpavoid.solvers import SOLVERS, parse_solver
 
 BLOCKS = [b for b in vars(config).values() if isinstance(b, type) and issubclass(b, Block) and b is not Block]

@@ -15,10 +15,10 @@ from qpavoid import (
     build_tasks,
     config,
     load_scenario,
-    simulate,
 )
-from qpavoid.contacts import build_contacts, solve_contacts, tracking_within
+from qpavoid.control.contacts import build_contacts, solve_contacts, tracking_within
 from qpavoid.problem import AvoidanceRows, Contacts, Problem, Solution, Status, Tracking, make_problem
+from qpavoid.run import simulate
 from qpavoid.solvers import backend_names, make_solver
 from qpavoid.solvers.backends import solve_daqp
 

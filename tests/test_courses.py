@@ -12,8 +12,10 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
 from qpavoid import Obstacle, ReasonKind, Sample, Status, build_scene, config, kernels
+from qpavoid.control import trajectories as courses
+from qpavoid.control.distances import DistanceQuery
 from qpavoid.errors import NumericalError
-from qpavoid.kernels.motions import (
+from qpavoid.kernels.obstacles import (
     FAR,
     FAST,
     FINE,
@@ -25,9 +27,7 @@ from qpavoid.kernels.motions import (
     REST,
     SAMPLE,
 )
-from qpavoid.motion import END_TOLERANCE, Motion, Orbit, Still, build_motion
-from qpavoid.obstacles import courses
-from qpavoid.proximity import DistanceQuery
+from qpavoid.model.trajectory import END_TOLERANCE, Motion, Orbit, Still, build_motion
 
 coordinate = st.floats(-2.0, 2.0)
 point = st.tuples(coordinate, coordinate, coordinate)

@@ -16,10 +16,15 @@ from scipy.spatial import ConvexHull
 
 from qpavoid import ConfigError, Robot, UnknownName
 from qpavoid.config import Box, Capsule, Hull, RobotConfig, Sphere
-from qpavoid.describe.add import Wishes, describe
-from qpavoid.describe.fit import cut, decompose, fit_piece, hull_volume, triangles
-from qpavoid.describe.home import BENT, ROOM, Limbs, find_home
-from qpavoid.describe.sampling import (
+from qpavoid.geometry.capsules import CapsuleFit, fit_capsule
+from qpavoid.geometry.segments import point_segment
+from qpavoid.model.end_effectors import end_effectors
+from qpavoid.model.trajectory import rpy_to_matrix
+from qpavoid.model.urdf import read_model
+from qpavoid.setup.add import Wishes, describe
+from qpavoid.setup.fit import cut, decompose, fit_piece, hull_volume, triangles
+from qpavoid.setup.home import BENT, ROOM, Limbs, find_home
+from qpavoid.setup.sampling import (
     D1,
     NEAR,
     PairDistances,
@@ -30,15 +35,10 @@ from qpavoid.describe.sampling import (
     sample_pairs,
     touching,
 )
-from qpavoid.describe.shapes import capsule_fields
-from qpavoid.describe.srdf import MADE_BY, Semantics, find_srdf, read_srdf, srdf_text
-from qpavoid.describe.texts import description_files
-from qpavoid.describe.written import BLANK, seal, untouched, write_files
-from qpavoid.geometry.capsules import CapsuleFit, fit_capsule
-from qpavoid.geometry.ends import end_effectors
-from qpavoid.geometry.segments import point_segment
-from qpavoid.geometry.urdf import read_model
-from qpavoid.motion import rpy_to_matrix
+from qpavoid.setup.shapes import capsule_fields
+from qpavoid.setup.srdf import MADE_BY, Semantics, find_srdf, read_srdf, srdf_text
+from qpavoid.setup.texts import description_files
+from qpavoid.setup.written import BLANK, seal, untouched, write_files
 
 PANDA = EXAMPLES / "panda_description/urdf/panda.urdf"
 
@@ -306,7 +306,7 @@ def test_home_is_bent(tmp_path):
     assert pinned.singular == ["link3"] and pinned.q[1] == 0.0
 
 
-@pytest.mark.filterwarnings("ignore::qpavoid.notes.RobotWarning")
+@pytest.mark.filterwarnings("ignore::qpavoid.model.notes.RobotWarning")
 def test_samples_keep_to_the_limits_and_the_root_stays():
     robot = Robot.from_urdf(EXAMPLES / "kinova_description/robots/kinova.urdf", root_joint="free_flyer")
     bounds = robot.bounds()
@@ -508,7 +508,7 @@ def test_hulls_of_a_robot_yaml(panda_convex):
         Robot.from_urdf(PANDA, bodies=bodies)
 
 
-@pytest.mark.filterwarnings("ignore::qpavoid.notes.RobotWarning")
+@pytest.mark.filterwarnings("ignore::qpavoid.model.notes.RobotWarning")
 def test_hull_of_a_round_flat_face():
     """qhull cuts the disc into a fan of triangles whose tip has more neighbours than a hull can hold."""
     robot = Robot.from_urdf(EXAMPLES / "centauro_description/urdf/centauro.urdf")

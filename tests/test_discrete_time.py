@@ -6,9 +6,10 @@ import pytest
 from closed_loop import Ruler, cartesian, drive, make_controller, scenario
 from conftest import moved
 
-from qpavoid import Avoidance, Controller, Obstacle, ReasonKind, Sample, Severity, Status, simulate
-from qpavoid.ahead.guard import TOLERANCE
+from qpavoid import Avoidance, Controller, Obstacle, ReasonKind, Sample, Severity, Status
 from qpavoid.config import Box, Damper, Sphere
+from qpavoid.run import simulate
+from qpavoid.safety.braking import TOLERANCE
 
 PLATE = {"type": "box", "size": [0.004, 0.6, 0.6]}
 BALL = {"type": "sphere", "radius": 0.06}

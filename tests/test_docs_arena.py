@@ -13,7 +13,7 @@ pytest.importorskip("mujoco")
 
 from qpavoid.arena import sweep
 from qpavoid.arena.store import read_runs
-from qpavoid.files.shipped import suite_names
+from qpavoid.config.shipped import suite_names
 
 DOCS = Path(__file__).parent.parent / "docs"
 PAGE = (DOCS / "arena.md").read_text(encoding="utf-8")

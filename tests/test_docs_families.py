@@ -7,7 +7,7 @@ import pytest
 
 from qpavoid.arena.families import family_names, load_family, make_case
 from qpavoid.arena.families.arms import arms
-from qpavoid.robot import Robot
+from qpavoid.model.robot import Robot
 
 PAGE = (Path(__file__).parent.parent / "docs" / "arena_families.md").read_text(encoding="utf-8")
 FAMILIES = re.findall(r"```yaml\n(.*?)```", PAGE, re.S)

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from qpavoid.config import RobotConfig, ScenarioConfig
-from qpavoid.files.fields import page
+from qpavoid.config.fields import page
 
 ROOT = Path(__file__).parent.parent
 

@@ -8,13 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from qpavoid import Controller, Obstacle, Pose, ReasonKind, Sample, ScenarioConfig, Status, kernels, load_scenario
-from qpavoid.ahead.flight import Manner, Near, Start, Tally
-from qpavoid.ahead.flights import _farthest
 from qpavoid.config import Avoidance, Box, Escape, Limits, Line, Sensing, Sphere
-from qpavoid.motion import build_motion
-from qpavoid.obstacles.courses import move_on
-from qpavoid.obstacles.sensing import Obstacles
-from qpavoid.obstacles.told import strayed
+from qpavoid.control.estimates import strayed
+from qpavoid.control.obstacles import Obstacles
+from qpavoid.control.trajectories import move_on
+from qpavoid.model.trajectory import build_motion
+from qpavoid.safety.policy import Manner, Near, Start, Tally
+from qpavoid.safety.rollout import _farthest
 from qpavoid.solvers.backends import solve_daqp
 
 DT = 0.01

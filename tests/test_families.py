@@ -22,8 +22,8 @@ from qpavoid.arena.families.reach import Ranges, Want, configuration_at
 from qpavoid.arena.families.solvable import find_plan
 from qpavoid.arena.scores import to_keep
 from qpavoid.arena.world import build_world
+from qpavoid.config.shipped import scenario_names, setup_names
 from qpavoid.errors import ConfigError, UnknownName
-from qpavoid.files.shipped import scenario_names, setup_names
 
 FAMILIES = family_names()
 TIMED = {"chasing", "crossing", "head_on", "noisy_sensor", "random_walk"}

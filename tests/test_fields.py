@@ -10,11 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
-from qpavoid import Controller, ReasonKind, Sample, Status, build_scene, load_scenario, make_solver, simulate
+from qpavoid import Controller, ReasonKind, Sample, Status, build_scene, load_scenario, make_solver
 from qpavoid.arena.entrants import ENTRANTS
 from qpavoid.config import Avoidance, GradientProjectionSolver, PotentialFieldSolver, Sphere
-from qpavoid.files.shipped import scenario_names
+from qpavoid.config.shipped import scenario_names
 from qpavoid.problem import AvoidanceRows, Tracking, make_problem
+from qpavoid.run import simulate
 from qpavoid.solvers.analytic import tracking_velocity
 from qpavoid.solvers.potential import repulsion
 from qpavoid.solvers.projection import clearance_slope, room

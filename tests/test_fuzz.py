@@ -21,16 +21,17 @@ from conftest import write_chain
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from qpavoid import ConfigError, Controller, Log, Robot, Sample, load_scenario, simulate
+from qpavoid import ConfigError, Controller, Log, Robot, Sample, load_scenario
 from qpavoid.config import Csv, RobotConfig
-from qpavoid.files.loading import read_config
-from qpavoid.files.shipped import data_folder
-from qpavoid.motion import build_motion
+from qpavoid.config.loading import read_config
+from qpavoid.config.shipped import data_folder
+from qpavoid.model.trajectory import build_motion
+from qpavoid.run import simulate
 
 if not hasattr(signal, "SIGALRM"):
     pytest.skip("a hang can only be stopped with SIGALRM", allow_module_level=True)
 
-pytestmark = pytest.mark.filterwarnings("ignore::qpavoid.notes.RobotWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::qpavoid.model.notes.RobotWarning")
 
 LIMIT = 300
 """Seconds after which a test counts as hanging, however busy the machine is."""
@@ -427,7 +428,7 @@ def test_log_with_an_array_of_any_header(header, arrays, tmp_path):
 
 
 def test_log_that_unpacks_to_more_than_memory_holds(tmp_path, monkeypatch):
-    monkeypatch.setattr("qpavoid.log._LARGEST", 20_000_000)
+    monkeypatch.setattr("qpavoid.run.log._LARGEST", 20_000_000)
     with zipfile.ZipFile(tmp_path / "run.npz", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("t.npy", bytes(30_000_000))
     assert (tmp_path / "run.npz").stat().st_size < 100_000

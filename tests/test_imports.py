@@ -26,7 +26,7 @@ def import_alone(module: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
 
 
-READERS = ["config", "problem", "solvers", "files.loading", "report", "log", "metrics", "plots.plot"]
+READERS = ["config", "problem", "solvers", "config.loading", "run.report", "run.log", "run.metrics", "viz.figures"]
 
 
 @pytest.mark.parametrize("module", READERS)
@@ -36,7 +36,7 @@ def test_module_needs_no_robot_library(module):
 
 
 def test_the_guard_would_notice():
-    done = import_alone("qpavoid.kinematics")
+    done = import_alone("qpavoid.model.kinematics")
     assert done.returncode != 0
     assert "pinocchio" in done.stderr
 

@@ -28,7 +28,6 @@ from qpavoid import (
     build_tasks,
     make_solver,
 )
-from qpavoid.ahead.guard import Guard
 from qpavoid.config import (
     AlignTask,
     Box,
@@ -41,8 +40,9 @@ from qpavoid.config import (
     Sphere,
     Task,
 )
+from qpavoid.control.inputs import Clock
 from qpavoid.errors import UnknownName
-from qpavoid.inputs import Clock
+from qpavoid.safety.braking import Guard
 
 TOOL = "panda_hand_tcp"
 BALL = Obstacle.at("ball", Sphere(radius=0.05), [0.6, 0.0, 0.5])

@@ -14,7 +14,7 @@ from test_limits import Axes, random_joints
 
 from qpavoid import kernels
 from qpavoid.kernels.stopping import longest_way, way_to_stop
-from qpavoid.limits import JointBounds, limit_layout
+from qpavoid.model.limits import JointBounds, limit_layout
 
 HELD = 0.02
 

@@ -6,20 +6,9 @@ import numpy as np
 import pytest
 from closed_loop import Ruler, cartesian, changed, drive, make_controller, scenario
 
-from qpavoid import (
-    Avoidance,
-    ConfigError,
-    Controller,
-    Limits,
-    Obstacle,
-    Reason,
-    ReasonKind,
-    Robot,
-    Sample,
-    Status,
-    simulate,
-)
+from qpavoid import Avoidance, ConfigError, Controller, Limits, Obstacle, Reason, ReasonKind, Robot, Sample, Status
 from qpavoid.config import Box, Damper, Sphere
+from qpavoid.run import simulate
 from qpavoid.solvers.reasons import relaxation_reasons
 from qpavoid.solvers.relaxation import Relaxed
 

@@ -6,20 +6,10 @@ import pytest
 import yaml
 from conftest import EXAMPLES, SPHERE, Bench, differences, look, obstacle, random_q
 
-from qpavoid import (
-    ConfigError,
-    Controller,
-    Log,
-    Robot,
-    Sample,
-    build_scene,
-    build_tasks,
-    config,
-    load_scenario,
-    simulate,
-)
-from qpavoid.kinematics import chains, longest_lever
-from qpavoid.notes import RobotWarning
+from qpavoid import ConfigError, Controller, Log, Robot, Sample, build_scene, build_tasks, config, load_scenario
+from qpavoid.model.kinematics import chains, longest_lever
+from qpavoid.model.notes import RobotWarning
+from qpavoid.run import simulate
 
 
 def body(name, frame):

@@ -11,13 +11,13 @@ from conftest import EXAMPLES
 
 from qpavoid import Controller, Robot, Sample, build_scene, build_tasks
 from qpavoid.config import Task
-from qpavoid.describe.add import Wishes, describe
-from qpavoid.describe.check import check_robot
-from qpavoid.describe.home import BENT, ROOM
-from qpavoid.describe.sampling import D1, touching
-from qpavoid.describe.texts import description_files
-from qpavoid.describe.written import write_files
-from qpavoid.notes import NoteKind
+from qpavoid.model.notes import NoteKind
+from qpavoid.setup.add import Wishes, describe
+from qpavoid.setup.check import check_robot
+from qpavoid.setup.home import BENT, ROOM
+from qpavoid.setup.sampling import D1, touching
+from qpavoid.setup.texts import description_files
+from qpavoid.setup.written import write_files
 
 LIMIT = 'velocity="1" effort="1"'
 
@@ -311,11 +311,11 @@ def package_urdfs():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", list(package_urdfs()))
-@pytest.mark.filterwarnings("ignore::qpavoid.notes.RobotWarning")
+@pytest.mark.filterwarnings("ignore::qpavoid.model.notes.RobotWarning")
 def test_robots_of_packages(path):
     from pathlib import Path
 
-    from qpavoid.files.packages import mesh_folders
+    from qpavoid.model.packages import mesh_folders
 
     assert check_robot(path).usable
     described = describe(Path(path), Wishes())
@@ -334,7 +334,7 @@ def test_robots_of_packages(path):
     ],
 )
 def test_robots_of_example_robot_data(name):
-    from qpavoid.files.packages import mesh_folders
+    from qpavoid.model.packages import mesh_folders
 
     described = describe(EXAMPLES / name, Wishes())
     nothing_unseen(EXAMPLES / name, described, 200, [e for e in mesh_folders(EXAMPLES / name, []) if "=" not in e])

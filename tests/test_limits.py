@@ -12,7 +12,7 @@ from hypothesis.extra.numpy import arrays
 from qpavoid.config import Limits
 from qpavoid.kernels import pack, speed_to_stop, velocity_bounds
 from qpavoid.kernels.packing import compiled
-from qpavoid.limits import JointBounds, limit_layout, saturate
+from qpavoid.model.limits import JointBounds, limit_layout, saturate
 
 N = 4
 fast = settings(max_examples=200, deadline=None)

@@ -19,9 +19,9 @@ from urdfs import BASE, HEAD, LIMITS, ROD, SEEN_ROD, arm, write
 
 from qpavoid import Avoidance, ConfigError, Controller, Obstacle, Robot, Sample, build_scene, build_tasks
 from qpavoid.config import Task
-from qpavoid.files.safe_xml import read_robot_xml
-from qpavoid.geometry.urdf import read_collision, read_model
-from qpavoid.notes import NoteKind, RobotWarning
+from qpavoid.model.notes import NoteKind, RobotWarning
+from qpavoid.model.urdf import read_collision, read_model
+from qpavoid.model.xml_file import read_robot_xml
 
 
 def load(path, **fields):

@@ -6,8 +6,9 @@ from dataclasses import FrozenInstanceError, fields
 import numpy as np
 import pytest
 
-from qpavoid import ConfigError, Controller, Log, ScenarioConfig, Severity, load_scenario, simulate
-from qpavoid.log import STATUSES
+from qpavoid import ConfigError, Controller, Log, ScenarioConfig, Severity, load_scenario
+from qpavoid.run import simulate
+from qpavoid.run.log import STATUSES
 from qpavoid.solvers.analytic import TrackingOnly
 
 ARRAYS = [f.name for f in fields(Log) if f.name != "meta"]

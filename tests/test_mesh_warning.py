@@ -6,8 +6,8 @@ import pytest
 from conftest import write_chain
 
 from qpavoid import Robot
-from qpavoid.files.shipped import robot_names
-from qpavoid.notes import NoteKind, RobotWarning
+from qpavoid.config.shipped import robot_names
+from qpavoid.model.notes import NoteKind, RobotWarning
 
 FACET = "facet normal 0 0 1\nouter loop\nvertex {}\nvertex {}\nvertex {}\nendloop\nendfacet\n"
 

@@ -10,10 +10,10 @@ from rich.cells import cell_len
 from rich.console import Console
 
 from qpavoid import Log
-from qpavoid.log import STATUSES
-from qpavoid.metrics import path_deviation
 from qpavoid.reason import Reason, ReasonKind, Severity
-from qpavoid.report import failed, metrics_table, outcome, ratios_table, to_json
+from qpavoid.run.log import STATUSES
+from qpavoid.run.metrics import path_deviation
+from qpavoid.run.report import failed, metrics_table, outcome, ratios_table, to_json
 
 DT = 0.1
 

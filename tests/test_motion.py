@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 
 from qpavoid import config
 from qpavoid.errors import ConfigError, NumericalError
-from qpavoid.motion import Motion, Sample, build_motion, rpy_to_matrix
+from qpavoid.model.trajectory import Motion, Sample, build_motion, rpy_to_matrix
 
 Array = NDArray[np.float64]
 Profile = Literal["constant", "smooth"]

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from closed_loop import SHIPPED, Ruler, changed, drive, make_controller
 
-from qpavoid import Controller, Obstacle, ScenarioConfig, Status, load_scenario, simulate
+from qpavoid import Controller, Obstacle, ScenarioConfig, Status, load_scenario
 from qpavoid.config import Sphere
-from qpavoid.obstacles.sensing import Pose
+from qpavoid.control.obstacles import Pose
+from qpavoid.run import simulate
 
 TOOL = np.array([0.39644872, 0.65090125, 0.74741443])
 """Where Situation 1 begins."""

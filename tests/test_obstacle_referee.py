@@ -12,7 +12,7 @@ from test_shapes import SHELF, boards, write_stl
 from qpavoid import Avoidance, Obstacle, Points, Robot, Status, Voxels, build_scene
 from qpavoid.config import Box, Capsule, Ellipsoid, HalfSpace, Mesh, PointCloud, Sphere
 from qpavoid.geometry.bodies import make_shape
-from qpavoid.geometry.cloud import ball_radius
+from qpavoid.model.cloud import ball_radius
 
 pytest.importorskip("mujoco")
 pytest.importorskip("bench", reason="bench/ is in the repository only")

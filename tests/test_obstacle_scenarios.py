@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from qpavoid import ConfigError, Controller, Log, load_scenario, simulate
-from qpavoid.plots.motion import local_faces, motion_figure, shape_faces
+from qpavoid import ConfigError, Controller, Log, load_scenario
+from qpavoid.run import simulate
+from qpavoid.viz.motion import local_faces, motion_figure, shape_faces
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import pytest
 from conftest import EXAMPLES, look, obstacle, write_chain
 
 from qpavoid import ConfigError, Robot, UnknownName, build_scene, config
-from qpavoid.notes import NoteKind
+from qpavoid.model.notes import NoteKind
 
 SPHERE = {"type": "sphere", "radius": 0.02}
 

@@ -9,21 +9,14 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 from numpy.testing import assert_allclose
 
-from qpavoid import Log, Status, load_scenario, simulate
-from qpavoid.log import STATUSES
+from qpavoid import Log, Status, load_scenario
+from qpavoid.run import simulate
+from qpavoid.run.log import STATUSES
 
 pytest.importorskip("matplotlib")
 
-from qpavoid.plots.compare import SOLVER_STYLES, compare_time_figure, path_figure, solver_styles
-from qpavoid.plots.motion import (
-    capsule_faces,
-    instants,
-    motion_figure,
-    obstacle_faces,
-    shape_faces,
-    view_angles,
-)
-from qpavoid.plots.plot import (
+from qpavoid.viz.compare import SOLVER_STYLES, compare_time_figure, path_figure, solver_styles
+from qpavoid.viz.figures import (
     ALPHA_SHOWN,
     distances_figure,
     joints_figure,
@@ -31,6 +24,14 @@ from qpavoid.plots.plot import (
     plot_run,
     position_names,
     speeds_figure,
+)
+from qpavoid.viz.motion import (
+    capsule_faces,
+    instants,
+    motion_figure,
+    obstacle_faces,
+    shape_faces,
+    view_angles,
 )
 
 

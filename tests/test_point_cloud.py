@@ -23,9 +23,9 @@ from qpavoid import (
     kernels,
 )
 from qpavoid.config import PointCloud
-from qpavoid.geometry.cloud import ball_radius, read_points
+from qpavoid.control.distances import DistanceQuery
 from qpavoid.kernels.voxels import ALIKE
-from qpavoid.proximity import DistanceQuery
+from qpavoid.model.cloud import ball_radius, read_points
 
 CLOUD = PointCloud()
 BALL = ball_radius(CLOUD.resolution)

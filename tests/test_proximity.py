@@ -23,24 +23,16 @@ from conftest import (
     random_scene,
 )
 
-from qpavoid import (
-    Avoidance,
-    Controller,
-    Obstacle,
-    Sample,
-    build_scene,
-    config,
-    load_scenario,
-    memory,
-    proximity,
-)
+from qpavoid import Avoidance, Controller, Obstacle, Sample, build_scene, config, load_scenario
+from qpavoid.control import distances as proximity
+from qpavoid.control import placement as placing
+from qpavoid.control.distances import DistanceQuery
+from qpavoid.control.tasks.frames import build_tasks
 from qpavoid.geometry.segments import capsule_distances
-from qpavoid.kinematics import support_masks
-from qpavoid.obstacles import placing
+from qpavoid.model import views as memory
+from qpavoid.model.kinematics import support_masks
 from qpavoid.problem import Proximity
-from qpavoid.proximity import DistanceQuery
 from qpavoid.solvers.analytic import tracking_velocity
-from qpavoid.tasks import build_tasks
 
 TICKS = 10
 ROUND = 5e-5

@@ -10,7 +10,8 @@ import pinocchio as pin
 import pytest
 from conftest import BOX, CAPSULE, CYLINDER, SPHERE, obstacle, random_q, random_scene, write_chain
 
-from qpavoid import Limits, Robot, ScenarioConfig, build_scene, load_scenario, simulate
+from qpavoid import Limits, Robot, ScenarioConfig, build_scene, load_scenario
+from qpavoid.run import simulate
 
 pytest.importorskip("mujoco")
 pytest.importorskip("bench", reason="bench/ is in the repository only")

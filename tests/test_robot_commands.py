@@ -11,15 +11,16 @@ import pytest
 import yaml
 from conftest import EXAMPLES, write_chain
 
-from qpavoid import Robot, load_scenario, simulate
+from qpavoid import Robot, load_scenario
 from qpavoid.config import RobotConfig
-from qpavoid.describe.add import Wishes, describe
-from qpavoid.describe.check import check_robot
-from qpavoid.describe.sampling import touching
-from qpavoid.describe.written import untouched
-from qpavoid.files.loading import read_config
-from qpavoid.files.packages import find_mesh
-from qpavoid.files.shipped import data_folder, find_robot
+from qpavoid.config.loading import read_config
+from qpavoid.config.shipped import data_folder, find_robot
+from qpavoid.model.packages import find_mesh
+from qpavoid.run import simulate
+from qpavoid.setup.add import Wishes, describe
+from qpavoid.setup.check import check_robot
+from qpavoid.setup.sampling import touching
+from qpavoid.setup.written import untouched
 
 MADE = ("baxter", "g1", "tiago", "ur5")
 """Robots that ship as `robot add` wrote them."""

@@ -22,12 +22,12 @@ from qpavoid import (
     build_scene,
     config,
     load_scenario,
-    simulate,
 )
-from qpavoid import proximity as proximity_module
 from qpavoid.config import Cone, Ellipsoid, HalfSpace, Mesh
+from qpavoid.control import distances as proximity_module
+from qpavoid.control.distances import DistanceQuery
 from qpavoid.geometry.bodies import MeshWarning, enclosing_capsule, make_shape
-from qpavoid.proximity import DistanceQuery
+from qpavoid.run import simulate
 
 CONE = Cone(radius=0.09, length=0.25)
 ELLIPSOID = Ellipsoid(radii=(0.1, 0.16, 0.07))
@@ -334,7 +334,7 @@ def test_a_cut_surface_stops_the_robot_and_says_so(tmp_path):
     assert controller.step(np.array([0.0, 0.0, 0.0])).status is Status.SOLVED
 
 
-@pytest.mark.filterwarnings("ignore::qpavoid.notes.RobotWarning")
+@pytest.mark.filterwarnings("ignore::qpavoid.model.notes.RobotWarning")
 def test_two_triangle_meshes_have_normals(tmp_path):
     """coal leaves the normal of two meshes unset: rows of `bodies: mesh` used to be zero."""
     write_stl(tmp_path / "part.stl", boards(((0, 0, 0.15), (0.04, 0.04, 0.16))))

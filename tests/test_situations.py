@@ -5,7 +5,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from qpavoid import Log, load_scenario, simulate
+from qpavoid import Log, load_scenario
+from qpavoid.run import simulate
 
 OFFSET = 0.10
 """Radii of the two bodies [m]: axis distance minus surface distance in both situations."""

@@ -8,8 +8,9 @@ import pinocchio as pin
 import pytest
 from closed_loop import accelerations, cartesian, changed, drive, make_controller
 
-from qpavoid import Avoidance, Obstacle, Robot, Sample, load_scenario, simulate
+from qpavoid import Avoidance, Obstacle, Robot, Sample, load_scenario
 from qpavoid.config import Box, Capsule, Damper, Sphere
+from qpavoid.run import simulate
 
 ROWS = {
     "beta": Avoidance(d1=0.02, d2=0.1),

@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from qpavoid import Problem, ReasonKind, Severity, Status, UnknownName, make_solver
 from qpavoid.config import Eq10Solver
 from qpavoid.errors import SolverNotInstalled
-from qpavoid.gains import alpha, beta
 from qpavoid.problem import AvoidanceRows, Tracking, make_problem
 from qpavoid.solvers import qp
 from qpavoid.solvers.analytic import tracking_velocity
 from qpavoid.solvers.backends import make_backend
+from qpavoid.solvers.gains import alpha, beta
 
 NV, D1, D2 = 7, 0.18, 0.36
 seeds = st.integers(0, 2**32 - 1)

@@ -35,8 +35,8 @@ from qpavoid.arena.suite import EntrantConfig, load_suite, origin
 from qpavoid.arena.summary import broken, summary
 from qpavoid.arena.trial import run_trial
 from qpavoid.arena.world import build_world
+from qpavoid.config.shipped import family_names, suite_names
 from qpavoid.errors import ConfigError, UnknownName
-from qpavoid.files.shipped import family_names, suite_names
 
 POST = {
     "title": "A post",
@@ -655,7 +655,7 @@ def test_without_the_extra_the_bench_says_what_to_install(cli, monkeypatch):
 
 def test_the_rest_of_the_command_line_brings_nothing_of_the_arena_in():
     code = (
-        "import sys, qpavoid.__main__; "
+        "import sys, qpavoid.cli; "
         "sys.exit(bool({'dask', 'distributed', 'pyarrow', 'mujoco', 'matplotlib'} & sys.modules.keys()))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False, timeout=300).returncode == 0

@@ -9,8 +9,8 @@ from closed_loop import cartesian, drive, make_controller
 from conftest import SPHERE, Bench, make_layout, obstacle
 
 from qpavoid import Avoidance, Obstacle, Robot, Sample, Status, build_scene, build_tasks, kernels
-from qpavoid.avoidance import row_form
 from qpavoid.config import Eq10Solver, QpSolver, Sphere, Task
+from qpavoid.control.avoidance import row_form
 from qpavoid.problem import AvoidanceRows, Tracking, make_problem
 from qpavoid.solvers import make_solver
 

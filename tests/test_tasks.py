@@ -8,8 +8,8 @@ import pytest
 from conftest import Bench, differences, random_q
 
 from qpavoid import NumericalError, Sample, UnknownName, build_scene, config
+from qpavoid.control.tasks.frames import build_tasks
 from qpavoid.problem import Tracking
-from qpavoid.tasks import build_tasks
 
 FIXED = config.Fixed(type="fixed")
 FRAMES = {

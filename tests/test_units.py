@@ -6,7 +6,8 @@ import pytest
 from conftest import write_chain
 from numpy.testing import assert_allclose
 
-from qpavoid import Log, Robot, load_scenario, simulate
+from qpavoid import Log, Robot, load_scenario
+from qpavoid.run import simulate
 
 OBLIQUE = np.array([0.6, 0.0, 0.8])
 JOINTS = [
@@ -75,8 +76,8 @@ def chain_run(folder, joint_type: str, root_joint: str) -> Log:
 )
 def test_log_holds_units_and_figures_show_them(tmp_path, joint_type, root_joint, units, position, speed):
     pytest.importorskip("matplotlib")
-    from qpavoid.plots.compare import compare_time_figure
-    from qpavoid.plots.plot import joints_figure, speeds_figure
+    from qpavoid.viz.compare import compare_time_figure
+    from qpavoid.viz.figures import joints_figure, speeds_figure
 
     log = Log.load(chain_run(tmp_path, joint_type, root_joint).save(tmp_path / "log.npz"))
     assert log.meta["units"] == units.split()

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from qpavoid.files.shipped import family_names, robot_names, scenario_names, setup_names
+from qpavoid.config.shipped import family_names, robot_names, scenario_names, setup_names
 
 ROOT = Path(__file__).parent.parent
 

@@ -13,7 +13,7 @@ from bench.safety.campaign import draw
 from bench.safety.trial import Trial, as_named, examine, trials
 from qpavoid import Workers
 from qpavoid.arena.twin import load
-from qpavoid.log import STATUSES
+from qpavoid.run.log import STATUSES
 
 RESULTS = Path(__file__).parents[1] / "results"
 

@@ -17,8 +17,8 @@ from qpavoid.arena.families.room import Placed, bodies_at, gap
 from qpavoid.arena.families.ways import Way
 from qpavoid.config import Fixed, ObstacleConfig
 from qpavoid.geometry.bodies import make_shape
+from qpavoid.model.scene import build_obstacles
 from qpavoid.problem import Array
-from qpavoid.scene import build_obstacles
 
 FOLDER = Path(__file__).parent
 

@@ -17,7 +17,7 @@ from bench.safety.campaign import KINDS, RANGES
 from bench.safety.trial import Trial
 from bench.safety.verdict import AHEAD, RESOLUTION
 from qpavoid.arena.referee import MOST_LOOKS, STEP
-from qpavoid.machine import cpu, versions
+from qpavoid.run.machine import cpu, versions
 
 PACKAGES = ("qpavoid", "mujoco", "pin", "coal", "daqp", "numpy", "scipy", "numba")
 LISTED = 10

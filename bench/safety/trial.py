@@ -11,10 +11,11 @@ import numpy as np
 from bench.safety.campaign import draw
 from bench.safety.referee import disagreement, drift, referee
 from bench.safety.verdict import Verdict, judge, last_way_out
-from qpavoid import Log, ScenarioConfig, Status, simulate
+from qpavoid import Log, ScenarioConfig, Status
 from qpavoid.arena.referee import Findings
 from qpavoid.arena.twin import Twin, load
-from qpavoid.log import STATUSES
+from qpavoid.run import simulate
+from qpavoid.run.log import STATUSES
 
 ALONE = "-alone"
 """What the name of a solver ends with that keeps no way out at hand."""

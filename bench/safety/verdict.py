@@ -44,7 +44,7 @@ class LastWayOut(NamedTuple):
     apart: float
     """How far apart the pair was then [m]."""
     status: int
-    """How the tick ended that let it pass: index into `qpavoid.log.STATUSES`."""
+    """How the tick ended that let it pass: index into `qpavoid.run.log.STATUSES`."""
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ import pinocchio as pin
 from bench.tick.build import build, make_scene
 from qpavoid import Avoidance, Controller, Sample, ScenarioConfig, build_tasks, load_scenario
 from qpavoid.config import QpSolver, Task
-from qpavoid.files.shipped import scenario_names
+from qpavoid.config.shipped import scenario_names
 from qpavoid.problem import Array
 
 FOLDER = Path(__file__).parent / "recordings"

@@ -14,7 +14,7 @@ import numpy as np
 from bench.solvers.record import Run
 from bench.solvers.replay import Cell, Loose
 from bench.solvers.verify import DISTANCE, EDGE, GAP, VIOLATION, Judgement, Truth
-from qpavoid.machine import cpu
+from qpavoid.run.machine import cpu
 
 PACKAGES = (
     "qpavoid",

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from bench.tick.runner import Cell, Results, Row
-from qpavoid.machine import cpu
+from qpavoid.run.machine import cpu
 
 OURS = "qpavoid"
 TARGETS = {"pink-20": 38.0, "mink": 8.0, "placo": 5.0}

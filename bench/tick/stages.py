@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 STAGES = {
-    "kinematics": ("qpavoid.kinematics:ForwardKinematics.compute",),
-    "proximity": ("qpavoid.proximity:DistanceQuery.compute",),
-    "rows": ("qpavoid.assembly:Assembly.compute",),
+    "kinematics": ("qpavoid.model.kinematics:ForwardKinematics.compute",),
+    "proximity": ("qpavoid.control.distances:DistanceQuery.compute",),
+    "rows": ("qpavoid.control.assembler:Assembly.compute",),
     "solve": ("qpavoid.solvers.qp:Qp.solve",),
-    "look ahead": ("qpavoid.ahead.guard:Guard.check",),
+    "look ahead": ("qpavoid.safety.braking:Guard.check",),
 }
 """Stage: the functions that make it up; one that is called by another counts as part of that. What is left of a step
 is `the rest`."""

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from qpavoid.config.shipped import family_names, suite_names
 from qpavoid.errors import ConfigError
-from qpavoid.files.shipped import family_names, suite_names
-from qpavoid.report import to_json
-from qpavoid.terminal import ERR, OUT, names_of, progress, terminate_like_interrupt
+from qpavoid.run.report import to_json
+from qpavoid.run.terminal import ERR, OUT, names_of, progress, terminate_like_interrupt
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -139,8 +139,8 @@ def list_(json: Json = False) -> None:
     from qpavoid.arena.entrants import ENTRANTS
     from qpavoid.arena.families import load_family
     from qpavoid.arena.suite import SuiteConfig
-    from qpavoid.files.loading import read_config
-    from qpavoid.files.shipped import find_suite
+    from qpavoid.config.loading import read_config
+    from qpavoid.config.shipped import find_suite
 
     suites = {name: read_config(find_suite(name), SuiteConfig).title for name in suite_names()}
     families = {name: load_family(name).config.title for name in family_names()}

@@ -10,8 +10,8 @@ from matplotlib.ticker import LogLocator, StrMethodFormatter
 
 from qpavoid.arena.results import Results
 from qpavoid.arena.statistics import Interval, mean, pareto, rate
-from qpavoid.plots.style import COLOURS, add_grid
 from qpavoid.problem import Array
+from qpavoid.viz.style import COLOURS, add_grid
 
 _LINE = 0.24
 """Least distance of two labels [in]."""

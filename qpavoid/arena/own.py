@@ -17,10 +17,10 @@ from qpavoid.arena.case import Case
 from qpavoid.arena.entrants import Entrant
 from qpavoid.arena.pilot import Pilot
 from qpavoid.arena.world import World
+from qpavoid.config.text import read_text
 from qpavoid.controller import Controller
 from qpavoid.errors import ConfigError, UnknownName, nearest
-from qpavoid.files.text import read_text
-from qpavoid.motion import Sample
+from qpavoid.model.trajectory import Sample
 from qpavoid.problem import Array, Problem, Solution, require_finite
 
 _LARGEST = 10_000_000

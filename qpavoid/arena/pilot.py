@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Protocol
 
-from qpavoid.motion import Sample
+from qpavoid.model.trajectory import Sample
 from qpavoid.problem import Array, Solution
 
 

@@ -12,9 +12,9 @@ import pinocchio as pin
 from qpavoid.arena.case import Case, Sight
 from qpavoid.arena.pilot import Pilot
 from qpavoid.arena.world import World
-from qpavoid.log import STATUSES
-from qpavoid.motion import Sample
+from qpavoid.model.trajectory import Sample
 from qpavoid.problem import Array, IntArray, Solution, Status
+from qpavoid.run.log import STATUSES
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Rollout:
     target: Array
     """(N, k, 3) where they were meant to be [m]."""
     status: IntArray
-    """(N,) indices into `qpavoid.log.STATUSES`."""
+    """(N,) indices into `qpavoid.run.log.STATUSES`."""
     failed: Array
     """(N,) 1 where the entrant raised or gave no finite velocity, else 0."""
     tick: Array

@@ -14,8 +14,8 @@ from qpavoid.arena.rollout import Rollout
 from qpavoid.arena.world import World
 from qpavoid.config import ScenarioConfig
 from qpavoid.geometry.segments import point_segment
-from qpavoid.log import STATUSES
 from qpavoid.problem import Array, Status
+from qpavoid.run.log import STATUSES
 
 RESTING = 1e-3
 """Speed of a tool below which it rests [m/s]."""

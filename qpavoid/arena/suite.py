@@ -17,9 +17,9 @@ from qpavoid.arena.families import Family, load_family
 from qpavoid.arena.own import own_entrant
 from qpavoid.config import Avoidance, Limits, Progress, Sensing, SolverConfig
 from qpavoid.config.base import Block
+from qpavoid.config.loading import read_config
+from qpavoid.config.shipped import find_suite
 from qpavoid.errors import ConfigError, located
-from qpavoid.files.loading import read_config
-from qpavoid.files.shipped import find_suite
 
 MOST_SEEDS = 1_000_000
 

@@ -34,7 +34,7 @@ from qpavoid.arena.trial import held, run_trial
 from qpavoid.arena.twin import build
 from qpavoid.arena.world import build_world
 from qpavoid.errors import ConfigError, QpavoidError
-from qpavoid.machine import machine, versions
+from qpavoid.run.machine import machine, versions
 
 _ANSWER_WITHIN = 10.0
 """Time in which a scheduler has to answer, and a first worker to be there [s]."""

@@ -14,7 +14,7 @@ from qpavoid.arena.rollout import roll_out
 from qpavoid.arena.scores import Score, score, to_keep
 from qpavoid.arena.twin import build
 from qpavoid.arena.world import World, build_world
-from qpavoid.motion import Sample
+from qpavoid.model.trajectory import Sample
 from qpavoid.problem import Array, Solution
 
 PATIENCE = 20.0

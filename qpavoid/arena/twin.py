@@ -12,8 +12,8 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid import Robot, Sample, ScenarioConfig, Scene, build_scene
+from qpavoid.model.scene import build_obstacles
 from qpavoid.problem import Array, IntArray
-from qpavoid.scene import build_obstacles
 
 FAR = 100.0
 """Distances are looked for up to here [m]."""

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from qpavoid.config import ScenarioConfig
+from qpavoid.control.tasks.frames import AnyTask, FrameTask, build_tasks
 from qpavoid.errors import ConfigError, located
+from qpavoid.model.robot import Robot
+from qpavoid.model.scene import Scene, build_obstacles, build_scene
 from qpavoid.problem import Array
-from qpavoid.robot import Robot
-from qpavoid.scene import Scene, build_obstacles, build_scene
-from qpavoid.tasks import AnyTask, FrameTask, build_tasks
 
 
 class World(NamedTuple):

@@ -1,7 +1,7 @@
 """What a scenario file and a robot file may say: one frozen pydantic model per block, each field with its unit.
 
 Nothing here imports a robot library: a configuration can be read, checked and compared on its own. Files are found
-and read by `qpavoid.files.loading`; `qpavoid.scene` and `qpavoid.motion` turn these models into live objects.
+and read by `qpavoid.config.loading`; `qpavoid.model` turns these models into live objects.
 """
 
 from qpavoid.config.base import Block

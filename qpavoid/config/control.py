@@ -55,7 +55,7 @@ AvoidanceRow = Annotated[Beta | TaskSwitching | Damper | Cbf, Field(discriminato
 
 
 class Escape(Block):
-    """Foresight where obstacles move: tasks go on only where the robot could still flee (`qpavoid.ahead.escape`).
+    """Foresight where obstacles move: tasks go on only where the robot could still flee (`qpavoid.safety.backup`).
 
     It takes obstacles to go on as their trajectories say, or what was told of their twists lately, and time where they
     come near. Laws that keep no limits are commanded as they are, and flights do not hold contacts.

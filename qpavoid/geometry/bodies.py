@@ -12,7 +12,7 @@ import pinocchio as pin
 from qpavoid.config import Box, Capsule, Cone, Cylinder, Ellipsoid, Shape, Sphere
 from qpavoid.config.base import LARGEST
 from qpavoid.errors import ConfigError
-from qpavoid.files.cache import cached
+from qpavoid.geometry.cache import cached
 from qpavoid.geometry.capsules import CapsuleFit, fit_capsule, half_sphere
 from qpavoid.problem import Array
 

@@ -15,7 +15,7 @@ _speed_to_stop, _way_to_stop, _longest_way = compiled(speed_to_stop), compiled(w
 
 @compiled
 def velocity_bounds(x: Any, q: Array) -> float:
-    """Write the bounds on v from the joint limits: hard_lower, hard_upper, lower and upper; see `qpavoid.limits`.
+    """Write the bounds on v from the joint limits: hard_lower, hard_upper, lower and upper; see `qpavoid.model.limits`.
 
     A coordinate outside a position limit is sent back at a rate, from which it can still brake for the opposite limit.
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from qpavoid import gains
 from qpavoid.config import Eq10Solver, TrackingSolver
 from qpavoid.problem import Array, Problem, Solution, Tracking
+from qpavoid.solvers import gains
 
 _VANISHING = 1e-12
 """Squared length below which a projected row counts as zero: an absolute cut-off, since a relative one inverts

@@ -9,13 +9,13 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from qpavoid.ahead.reach import arm
 from qpavoid.arena.families.parameters import Redraw
 from qpavoid.arena.families.reach import Ranges, Want, configuration_at
 from qpavoid.arena.families.ways import Way
 from qpavoid.errors import ConfigError
+from qpavoid.model.robot import Robot
 from qpavoid.problem import Array
-from qpavoid.robot import Robot
+from qpavoid.safety.reach import arm
 
 REST = 3.0
 """Time from the end of the planned motion to that of the run [s]."""

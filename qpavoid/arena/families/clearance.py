@@ -7,8 +7,8 @@ import pinocchio as pin
 
 from qpavoid.arena.families.reach import Ranges
 from qpavoid.arena.world import World
+from qpavoid.control.distances import DistanceQuery
 from qpavoid.problem import Array
-from qpavoid.proximity import DistanceQuery
 
 STEP = 0.005
 """Shortest change of distance between two looks at a motion [m]."""

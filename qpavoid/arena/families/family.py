@@ -14,10 +14,10 @@ from pydantic import Field, model_validator
 from qpavoid.arena.families import moving, statics, targets, two_arms
 from qpavoid.arena.families.parameters import Draw, Parameter
 from qpavoid.config.base import Block
+from qpavoid.config.loading import read_config, read_mapping
+from qpavoid.config.shipped import find_family, find_robot, find_setup, setup_names
 from qpavoid.errors import ConfigError, UnknownName, nearest
-from qpavoid.files.loading import read_config, read_mapping
-from qpavoid.files.shipped import find_family, find_robot, find_setup, setup_names
-from qpavoid.robot import Robot
+from qpavoid.model.robot import Robot
 
 Generator = Callable[[Draw, Robot], Mapping[str, Any]]
 """Fields of a scenario, from draws and the robot: its locked joints are gone, its home is the setup's q0."""

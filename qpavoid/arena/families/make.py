@@ -15,9 +15,9 @@ from qpavoid.arena.families.parameters import Draw, Redraw
 from qpavoid.arena.families.solvable import solved_by
 from qpavoid.arena.world import world_of
 from qpavoid.config import ScenarioConfig
+from qpavoid.config.loading import validate
 from qpavoid.errors import ConfigError, QpavoidError, located
-from qpavoid.files.loading import validate
-from qpavoid.robot import Robot
+from qpavoid.model.robot import Robot
 
 MOST_DRAWS = 100
 """Draws of a seed that may turn out to be no case."""

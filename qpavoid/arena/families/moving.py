@@ -12,8 +12,8 @@ from qpavoid.arena.families.arms import REST, Arm, follow, run
 from qpavoid.arena.families.parameters import Draw
 from qpavoid.arena.families.statics import sweep
 from qpavoid.arena.families.ways import Way, along, timed
+from qpavoid.model.robot import Robot
 from qpavoid.problem import Array
-from qpavoid.robot import Robot
 
 Motion = Callable[[Draw, Arm, Way], dict[str, Any]]
 

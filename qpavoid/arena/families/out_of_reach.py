@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from qpavoid.ahead.reach import arm, clearance
 from qpavoid.arena.world import World
-from qpavoid.robot import Robot
-from qpavoid.tasks import FrameTask
+from qpavoid.control.tasks.frames import FrameTask
+from qpavoid.model.robot import Robot
+from qpavoid.safety.reach import arm, clearance
 
 
 def out_of_reach(world: World, task: FrameTask, t: float, tolerance: float) -> str:

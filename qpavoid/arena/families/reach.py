@@ -8,8 +8,8 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid.errors import ConfigError
+from qpavoid.model.robot import Robot
 from qpavoid.problem import Array
-from qpavoid.robot import Robot
 
 _STEPS, _LONGEST, _DAMPING = 80, 0.4, 1e-3
 """Of one search: steps, largest step of a joint [rad or m], damping of the pseudo-inverse [-]."""

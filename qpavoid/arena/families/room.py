@@ -9,8 +9,8 @@ import coal
 import numpy as np
 import pinocchio as pin
 
+from qpavoid.model.robot import Robot
 from qpavoid.problem import Array
-from qpavoid.robot import Robot
 
 Placed = tuple[Any, Any]
 """A coal shape and its place."""

@@ -12,9 +12,9 @@ from qpavoid.arena.families.reach import Ranges, Want, configuration_at
 from qpavoid.arena.scores import to_keep
 from qpavoid.arena.world import World
 from qpavoid.config import ScenarioConfig
+from qpavoid.control.tasks.frames import FrameTask
 from qpavoid.errors import ConfigError
 from qpavoid.problem import Array
-from qpavoid.tasks import FrameTask
 
 _MOST_GOALS, _TRIES = 6, 40
 """Configurations that attain the goal: how many are wanted, how many searches are made."""

@@ -11,8 +11,8 @@ from qpavoid.arena.families.arms import Arm, arms, follow, posture, run, set_out
 from qpavoid.arena.families.parameters import Draw
 from qpavoid.arena.families.room import bodies_at, gap
 from qpavoid.arena.families.ways import Way, along
+from qpavoid.model.robot import Robot
 from qpavoid.problem import Array
-from qpavoid.robot import Robot
 
 ROOM = 0.03
 """Distance from the robot, at start and goal, at which single obstacles are put [m]."""

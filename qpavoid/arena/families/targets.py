@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from qpavoid.ahead.reach import arm
 from qpavoid.arena.families.arms import follow, run, set_out
 from qpavoid.arena.families.parameters import Draw
 from qpavoid.arena.families.statics import fixed, sweep
 from qpavoid.arena.families.ways import along
-from qpavoid.robot import Robot
+from qpavoid.model.robot import Robot
+from qpavoid.safety.reach import arm
 
 _REST = 8.0
 """Time to come to rest in, after the planned motion [s]."""

@@ -10,8 +10,8 @@ from qpavoid.arena.families.arms import Arm, arms, follow, posture, run
 from qpavoid.arena.families.parameters import Draw
 from qpavoid.arena.families.ways import timed
 from qpavoid.errors import ConfigError
+from qpavoid.model.robot import Robot
 from qpavoid.problem import Array
-from qpavoid.robot import Robot
 
 _BEGIN = 0.5
 """When the tools set out [s]."""

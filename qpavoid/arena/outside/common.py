@@ -10,11 +10,11 @@ import pinocchio as pin
 from qpavoid.arena.case import Case
 from qpavoid.arena.world import World
 from qpavoid.config import Avoidance
+from qpavoid.control.tasks.frames import FrameTask
 from qpavoid.errors import ConfigError
-from qpavoid.motion import Sample
+from qpavoid.model.scene import Scene
+from qpavoid.model.trajectory import Sample
 from qpavoid.problem import Array, IntArray
-from qpavoid.scene import Scene
-from qpavoid.tasks import FrameTask
 
 
 def frame_tasks(case: Case, world: World, library: str) -> list[FrameTask]:

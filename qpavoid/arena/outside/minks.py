@@ -14,7 +14,7 @@ from qpavoid.arena.outside.settings import MINK
 from qpavoid.arena.twin import build, place_mocap
 from qpavoid.arena.world import World
 from qpavoid.errors import ConfigError
-from qpavoid.motion import Sample
+from qpavoid.model.trajectory import Sample
 from qpavoid.problem import Array, Solution
 
 

@@ -16,7 +16,7 @@ from qpavoid.arena.case import Case
 from qpavoid.arena.outside.common import between, costs, frame_tasks, one_period_ahead, parted_pairs, pieces
 from qpavoid.arena.outside.settings import PINK
 from qpavoid.arena.world import World
-from qpavoid.motion import Sample
+from qpavoid.model.trajectory import Sample
 from qpavoid.problem import Array, Solution
 
 

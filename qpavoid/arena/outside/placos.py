@@ -24,11 +24,11 @@ from qpavoid.arena.outside.settings import PLACO, PLACO_PYTHON
 from qpavoid.arena.twin import hinge_or_slide
 from qpavoid.arena.world import World
 from qpavoid.config import Limits
+from qpavoid.control.tasks.frames import FrameTask
 from qpavoid.errors import ConfigError
-from qpavoid.motion import Sample
+from qpavoid.model.scene import Scene
+from qpavoid.model.trajectory import Sample
 from qpavoid.problem import Array, Solution
-from qpavoid.scene import Scene
-from qpavoid.tasks import FrameTask
 
 WORKER = Path(__file__).with_name("placo_worker.py")
 START_PATIENCE = 120.0

@@ -1,0 +1,243 @@
+"""Command line: `qpavoid list | run | compare | fields | robot | bench`.
+
+Exit status: 0 done, 1 a run ended in a defined failure (collision, safe stop, broken off), 2 bad input.
+"""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from enum import Enum
+from functools import partial
+from importlib.metadata import version
+from json import dumps
+from pathlib import Path
+from textwrap import wrap
+from typing import Annotated, Any
+
+import typer
+from rich.markup import escape
+from rich.progress import Progress, TaskID
+
+from qpavoid.arena import commands as bench_commands
+from qpavoid.config import RobotConfig, ScenarioConfig
+from qpavoid.config.fields import page, schema_of
+from qpavoid.config.loading import load_scenario
+from qpavoid.config.shipped import robot_names, scenario_names
+from qpavoid.controller import Controller
+from qpavoid.errors import ConfigError, QpavoidError
+from qpavoid.run.log import Log
+from qpavoid.run.report import events, failed, metrics_table, ratios_table, to_json
+from qpavoid.run.simulate import simulate
+from qpavoid.run.terminal import ERR, OUT, names_of, progress, terminate_like_interrupt
+from qpavoid.setup import commands as robot_commands
+from qpavoid.solvers import SOLVERS, backend_names
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="Follow a planned motion and stay clear of obstacles, other arms and yourself.",
+)
+app.add_typer(robot_commands.app, name="robot")
+app.add_typer(bench_commands.app, name="bench")
+
+Sets = Annotated[
+    list[str] | None, typer.Option("--set", metavar="PATH=VALUE", help="Override a field: avoidance.d2=0.30")
+]
+Out = Annotated[Path, typer.Option(help="Folder for logs and figures.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else on stdout.")]
+Figures = Annotated[bool, typer.Option("--figures/--no-figures", help="Draw the figures.")]
+Verbose = Annotated[bool, typer.Option("--verbose", help="List the files that were written.")]
+
+
+class Kind(str, Enum):
+    """What `list` can list."""
+
+    robots = "robots"
+    scenarios = "scenarios"
+    solvers = "solvers"
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        print(f"qpavoid {version('qpavoid')}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version_: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Take options that stand before any command."""
+
+
+@app.command("list")
+def list_(kind: Annotated[Kind | None, typer.Argument(help="Only these.")] = None) -> None:
+    """List what ships: robots, scenarios with their titles, solvers."""
+    names = {
+        Kind.robots: robot_names(),
+        Kind.scenarios: scenario_names(),
+        Kind.solvers: [*SOLVERS, "qp:native", *(f"qp:{name}" for name in backend_names())],
+    }
+    if kind is not None:
+        for name in names[kind]:
+            print(name)
+        return
+    titles = [f"{name:16} {load_scenario(name).title}" for name in names[Kind.scenarios]]
+    for heading, entries in names.items():
+        OUT.print(f"[bold]{heading.value}[/]")
+        for line in titles if heading is Kind.scenarios else wrap("  ".join(entries), 76):
+            OUT.print(f"  {line}", highlight=False, soft_wrap=True, markup=False)
+
+
+@app.command()
+def run(
+    scenario: Annotated[str, typer.Argument(help="Shipped name or path of a YAML file.")],
+    solver: Annotated[str | None, typer.Option(help="Such as eq10 or qp:proxqp; as in the file if left out.")] = None,
+    set_: Sets = None,
+    out: Out = Path("out"),
+    json: Json = False,
+    figures: Figures = True,
+    verbose: Verbose = False,
+) -> None:
+    """Run one scenario; write its log and figures."""
+    logs, files = _run_all([load_scenario(scenario, set_ or (), solver)], out)
+    if figures:
+        files += _draw(logs, out, compare=False)
+    metrics = [log.metrics() for log in logs]
+    if json:
+        print(to_json({**metrics[0], "files": [str(f) for f in files]}))
+    else:
+        _print(metrics, files, out, verbose)
+    raise typer.Exit(1 if failed(metrics[0]) else 0)
+
+
+@app.command()
+def compare(
+    scenarios: Annotated[list[str], typer.Argument(help="Shipped names or paths of YAML files.")],
+    solvers: Annotated[str, typer.Option(help="Comma-separated.")] = "tracking,eq10-literal,eq10,qp",
+    set_: Sets = None,
+    out: Out = Path("out"),
+    json: Json = False,
+    figures: Figures = True,
+    verbose: Verbose = False,
+) -> None:
+    """Run scenarios with several solvers, side by side; the last but one is set against the last, as ratios.
+
+    A collision is a result here, not a failure: the exit status is 1 only when a run was broken off.
+    """
+    names = names_of("--solvers", solvers)
+    configs = [load_scenario(scenario, set_ or (), name) for scenario in scenarios for name in names]
+    logs, files = _run_all(configs, out)
+    if figures:
+        files += _draw(logs, out, compare=True)
+    metrics = [log.metrics() for log in logs]
+    if json:
+        print(to_json({"runs": metrics, "files": [str(f) for f in files]}))
+    else:
+        _print(metrics, files, out, verbose)
+        if len(names) > 1:
+            OUT.print(ratios_table(metrics, names[-2], names[-1]))
+    raise typer.Exit(0 if all(run["completed"] for run in metrics) and len(logs) == len(configs) else 1)
+
+
+class Schema(str, Enum):
+    """Files that have a schema."""
+
+    scenario = "scenario"
+    robot = "robot"
+
+
+@app.command("fields")
+def fields_(
+    schema: Annotated[Schema | None, typer.Option(help="Print the JSON Schema of such a file, for an editor.")] = None,
+) -> None:
+    """Print every field that a scenario and a robot.yaml may have, with units and defaults, as Markdown."""
+    if schema is None:
+        print(page())
+    else:
+        root = ScenarioConfig if schema is Schema.scenario else RobotConfig
+        print(dumps(schema_of(root), indent=2))
+
+
+def _run_all(configs: list[ScenarioConfig], out: Path) -> tuple[list[Log], list[Path]]:
+    """Runs and saves one after the other; an interrupted run is saved as far as it came and is the last."""
+    logs: list[Log] = []
+    files = []
+    for config in configs:  # faults of the last scenario show before the first one runs
+        Controller.from_scenario(config)
+    labels = [f"{config.source.stem} {config.solver.label}" for config in configs]
+    for label in labels:
+        if labels.count(label) > 1:
+            raise ConfigError(f"{label} would be written twice: leave one out, or rename one scenario file")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"--out {out}: {error.strerror}; give a folder that can be written") from None
+    with progress() as bar, terminate_like_interrupt():
+        for label, config in zip(labels, configs, strict=True):
+            update = partial(_update, bar, bar.add_task(label, total=None))
+            logs.append(simulate(config, progress=update))
+            files.append(logs[-1].save(out / f"{label.replace(' ', '_').replace(':', '-')}.npz"))
+            if logs[-1].meta["stopped_by"]:
+                why = escape(f"{label}: broken off: {logs[-1].meta['stopped_by']}")
+                ERR.print(f"[red]{why}[/]", highlight=False)
+                break
+    return logs, files
+
+
+def _update(bar: Progress, job: TaskID, done: int, total: int) -> None:
+    bar.update(job, completed=done, total=total)
+
+
+def _draw(logs: list[Log], out: Path, compare: bool) -> list[Path]:
+    try:
+        from qpavoid.viz import figures as plot
+    except ModuleNotFoundError as missing:
+        if missing.name is None or missing.name.split(".")[0] != "matplotlib":
+            raise
+        ERR.print("no figures: matplotlib is missing; pip install 'qpavoid\\[plots]'", highlight=False)
+        return []
+    with progress() as bar:
+        job = bar.add_task("figures", total=len(logs))
+        files = []
+        for log in logs:
+            files += plot.plot_run(log, out)
+            bar.advance(job)
+        if compare:
+            for scenario in dict.fromkeys(log.meta["scenario"] for log in logs):
+                files += plot.plot_compare([log for log in logs if log.meta["scenario"] == scenario], out)
+    return files
+
+
+def _print(metrics: list[dict[str, Any]], files: list[Path], out: Path, verbose: bool) -> None:
+    for scenario in dict.fromkeys(run["scenario"] for run in metrics):
+        runs = [run for run in metrics if run["scenario"] == scenario]
+        OUT.print(metrics_table(runs, OUT.width))
+        for run in runs:
+            for line in events(run):
+                OUT.print(f"{run['solver']}: {line}", highlight=False, soft_wrap=True, markup=False)
+    logs = sum(file.suffix == ".npz" for file in files)
+    kinds = (logs, "log"), (len(files) - logs, "figure")
+    counts = [f"{count} {kind}{'s' * (count > 1)}" for count, kind in kinds if count]
+    remedy = "" if verbose else " (--verbose lists them)"
+    OUT.print(f"{' and '.join(counts)} in {out}{remedy}", highlight=False, soft_wrap=True)
+    for file in files if verbose else ():
+        OUT.print(str(file), highlight=False, soft_wrap=True)
+
+
+def _show_warning(message: Warning | str, *_: Any) -> None:
+    ERR.print(f"[yellow]warning:[/] {escape(str(message))}", highlight=False, soft_wrap=True)
+
+
+def main() -> None:
+    """Entry point: turns every expected error into one line and exit status 2."""
+    warnings.showwarning = _show_warning  # type: ignore[assignment]
+    try:
+        app()
+    except QpavoidError as error:
+        ERR.print(f"[red]error:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
+        sys.exit(2)

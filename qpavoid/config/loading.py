@@ -1,0 +1,120 @@
+"""Reads robot and scenario files, applies `--set` overrides, and says what is wrong in one line."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from qpavoid.config import ScenarioConfig, expand_solver
+from qpavoid.config.explain import explain
+from qpavoid.config.shipped import find_scenario
+from qpavoid.config.text import read_text
+from qpavoid.config.yaml_file import parse_yaml
+from qpavoid.errors import ConfigError
+
+Config = TypeVar("Config", bound=BaseModel)
+_LARGEST = 1_000_000
+"""Size of a YAML file [bytes]; those that ship take 3000."""
+
+
+def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), solver: str | None = None) -> ScenarioConfig:
+    """Reads a scenario.
+
+    Args:
+        name_or_path: shipped name or path of a YAML file.
+        overrides: `path=value` strings such as `avoidance.d2=0.30`; the value is YAML, `tasks.0.gain=3` indexes a
+            list.
+        solver: replaces the scenario's solver, as in `eq10` or `qp:proxqp`; settings of the file stay where the
+            name is the same.
+
+    Raises:
+        ConfigError, UnknownName: naming file, field and remedy.
+    """
+    path = find_scenario(name_or_path)
+    return read_config(path, ScenarioConfig, overrides, solver).read_from(path)
+
+
+def read_config(path: Path, model: type[Config], overrides: Sequence[str] = (), solver: str | None = None) -> Config:
+    """Reads a YAML file into `model`.
+
+    Raises:
+        ConfigError: unreadable file, bad YAML, unknown key (with the nearest valid one) or bad value.
+    """
+    data = read_mapping(path)
+    if solver is not None:
+        wanted, kept = _solver_mapping(solver), _solver_mapping(data.get("solver"))
+        data["solver"] = {**kept, **wanted} if kept.get("name") == wanted["name"] else wanted
+    for override in overrides:
+        _set(data, override, path)
+    return validate(data, model, path)
+
+
+def validate(data: dict[str, Any], model: type[Config], path: Path) -> Config:
+    """`data` as a configuration.
+
+    Args:
+        data: fields of a file, or what stands for one.
+        model: the configuration.
+        path: file to name in errors.
+
+    Raises:
+        ConfigError: unknown key (with the nearest valid one) or bad value.
+    """
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        raise ConfigError(f"{path}: {explain(error, model, data)}") from None
+
+
+def _solver_mapping(value: Any) -> dict[str, Any]:
+    """The mapping that a solver's short form stands for."""
+    expanded = expand_solver("qp" if value is None else value)
+    return dict(expanded) if isinstance(expanded, dict) else {}
+
+
+def read_mapping(path: Path) -> dict[str, Any]:
+    """The fields of a YAML file, as they stand there.
+
+    Raises:
+        ConfigError: unreadable file, bad YAML, or something else than a mapping.
+    """
+    text = read_text(path, _LARGEST)
+    try:
+        data = parse_yaml(text)
+    except ValueError as error:
+        raise ConfigError(f"{path}: not valid YAML: {error}") from None
+    if not isinstance(data, dict):
+        raise ConfigError(f"{path}: must be a mapping of fields, got {type(data).__name__}")
+    return data
+
+
+def _set(data: dict[str, Any], override: str, path: Path) -> None:
+    """Applies `a.b.0.c=value` in place; missing mappings on the way are made, so that defaults can be set."""
+    where, equals, text = override.partition("=")
+    if not equals or not where:
+        raise ConfigError(f"--set {override!r}: expected path=value, as in avoidance.d2=0.30")
+    try:
+        value = parse_yaml(text)
+    except ValueError:
+        raise ConfigError(f"--set {override!r}: {text!r} is not a YAML value") from None
+    node: Any = data
+    keys = where.split(".")
+    for depth, key in enumerate(keys):
+        last = depth == len(keys) - 1
+        if isinstance(node, list):
+            if not key.isdecimal() or len(key) > 9 or int(key) >= len(node):
+                raise ConfigError(f"{path}: --set {where}: {key!r} is not an index below {len(node)}")
+            index: Any = int(key)
+        elif isinstance(node, dict):
+            index = key
+            if not last and not isinstance(node.get(key), dict | list):
+                node[key] = _solver_mapping(node.get(key)) if key == "solver" else {}
+        else:
+            raise ConfigError(f"{path}: --set {where}: there is nothing below {'.'.join(keys[:depth])}")
+        if last:
+            node[index] = value
+        else:
+            node = node[index]

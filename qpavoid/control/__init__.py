@@ -1,0 +1,1 @@
+"""Turn the inputs of a control step into a problem: obstacles, distances, tasks, limits, rows."""

@@ -1,0 +1,359 @@
+"""From kinematics and distances to a problem: all rows and bounds of a tick in one call, in memory laid out once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from qpavoid import kernels
+from qpavoid.config import Avoidance, Limits
+from qpavoid.control.contacts import ContactRows, tracking_within
+from qpavoid.control.distances import DistanceQuery
+from qpavoid.control.row_layout import hand_over, lay_out
+from qpavoid.control.tasks.frames import AnyTask, in_order, task_levels
+from qpavoid.kernels.layout import RowLayout
+from qpavoid.model.kinematics import ForwardKinematics, Kinematics, support_masks
+from qpavoid.model.limits import JointBounds
+from qpavoid.model.scene import Scene
+from qpavoid.model.trajectory import Sample
+from qpavoid.problem import Array, AvoidanceRows, Problem, Proximity, Tracking
+from qpavoid.solvers.analytic import pseudo_inverse
+
+_MOST_TICKS = 1000
+"""Ticks of a stop that are followed."""
+
+
+_ROUND_OFF = 1e-9
+"""Share of a coordinate's largest change of speed in a tick that counts as round-off [-]."""
+
+
+class Stop(NamedTuple):
+    """A tick at a velocity v and the stop within jerk limits after it, of m ticks in all."""
+
+    way: Array
+    """(m, nv) velocities; memory that the next stop overwrites."""
+    forwards: Array
+    """(m,) for how long v would lead as far [s]."""
+    aside: Array
+    """(m,) how far any point moves beside that, at most [m]."""
+    ways: Array
+    """(nv,) how far each coordinate moves in all [rad or m]."""
+
+
+class _StopAhead:
+    """Follows stops within jerk limits, in memory of its own."""
+
+    def __init__(self, layout: RowLayout) -> None:
+        names = "v_last", "w_last", "lower", "upper", "hard_lower", "hard_upper", "v_stop"
+        self._packed = kernels.pack(layout._replace(**{name: getattr(layout, name).copy() for name in names}))
+        self._way = np.zeros((_MOST_TICKS, len(layout.v_last)))
+
+    def way(self, q: Array, v: Array, w: Array) -> Array:
+        """See `kernels.stop_way`; a view of memory that the next call overwrites."""
+        self._way[0] = v
+        return self._way[: kernels.stop_way(self._packed, q, w, self._way)]
+
+
+class Assembly:
+    """Rows and bounds of a tick. What it returns looks into memory that the next tick overwrites."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        tasks: Sequence[AnyTask],
+        bounds: JointBounds,
+        kinematics: ForwardKinematics,
+        query: DistanceQuery,
+        avoidance: Avoidance,
+        limits: Limits,
+        damping: float,
+        dt: float,
+        contacts: ContactRows | None = None,
+        looks_ahead: bool = False,
+    ) -> None:
+        """Lays the memory out; see `Controller` for the arguments, and `RowLayout` for `looks_ahead`."""
+        frames, self._others = in_order(tasks)
+        self._masks = support_masks(scene.robot.model)
+        # with jerk limits, a stop goes another way; with contacts, v0 does
+        looks_ahead = looks_ahead and contacts is None and not np.isfinite(bounds.jerk).any()
+        self._layout = lay_out(
+            scene, frames, self._others, bounds, kinematics, query, avoidance, limits, damping, dt, looks_ahead
+        )
+        x = self._layout
+        self._hard = (x.hard_lower, x.hard_upper) if limits.acceleration_gives_way else (x.lower, x.upper)
+        self._packed = kernels.pack(self._layout)
+        self._stop, self._dt = _StopAhead(x) if x.jerked else None, dt
+        robot = scene.robot
+        self._names = scene.pair_names, tuple(robot.coordinate_names), tuple(robot.coordinate_units)
+        self._targets = [(row[:3], row[3:12].reshape(3, 3), row[12:15], row[15:]) for row in self._layout.targets]
+        self._views: dict[int, tuple[Proximity, AvoidanceRows]] = {}
+        levels = task_levels(frames, self._others)
+        self._tracking = Tracking(self._layout.A, self._layout.b, damping)
+        self._levels = levels if len(levels) > 1 else ()
+        self._forward, self._contacts = kinematics, contacts
+        self._eye = np.eye(len(x.v0))
+        self._before, self._change = np.zeros_like(x.v0), np.zeros_like(x.v0)
+        self._moving = False
+        self.limits_may_give_way = x.jerked or (contacts is not None and x.accelerated)
+        """Whether `beyond_limits` has to be asked: bounds alone do not keep to accelerations and jerks then."""
+        self.kinematics = Kinematics(self._layout.J_world, self._layout.poses)
+
+    def compute(
+        self, q: Array, targets: Sequence[Sample], query: DistanceQuery, reach: float
+    ) -> tuple[Proximity, Problem]:
+        """Rows and bounds at a configuration, for which kinematics and distances are up to date.
+
+        Args:
+            q: configuration (nq,).
+            targets: what each task should reach now, in the order of `in_order`.
+            query: distances of this tick.
+            reach: surface distance below which a pair is near [m].
+        """
+        x = self._layout
+        for views, target in zip(self._targets, targets):  # noqa: B905 (strict costs as much as the copying)
+            views[0][:], views[1][:], views[2][:], views[3][:] = target[:4]
+        if self._others:
+            for task, target in zip(self._others, targets[len(self._targets) :], strict=True):
+                task.update(q, self._forward, target)
+        held = None
+        if self._contacts is not None:
+            held = self._contacts.update(self._forward)
+            x.v_last[:] = held.held(x.v_last)
+        self._moving = query.placing.moving
+        k, worst, clear, room = kernels.assemble(self._packed, q, query.pairs, reach, self._moving)
+        proximity, rows = self._views.get(k) or self._view(k)
+        if x.task_switching and x.v0[0] != x.v0[0] and np.isfinite(x.A).all():  # task rows repeat each other
+            v0 = pseudo_inverse(x.A, 0.0) @ x.b
+            along = self._along(rows, v0)
+            rows.b[:], rows.touch[:] = along.b, along.touch
+        if held is not None:
+            x.v0[:] = tracking_within(held, x.A, x.b, x.damping)
+            self._count_from_before()
+            if x.task_switching:
+                kernels.row_bounds(self._packed, k, self._moving)
+            worst = float(kernels.tracking_shortfall(self._packed, k))
+        bounds = x.lower, x.upper, *self._hard, x.v_stop
+        return proximity, Problem(
+            self._tracking, rows, *bounds, *self._names, x.v0, worst, held, self._levels, x.jerked, clear, room
+        )
+
+    def look_ahead(self, looks_ahead: bool) -> None:
+        """Tell kernels whether to look for velocities that lead nowhere near anything; see `RowLayout.looks_ahead`."""
+        x = self._layout
+        looks_ahead = looks_ahead and self._contacts is None and not x.jerked
+        if looks_ahead != x.looks_ahead:
+            self._layout = x._replace(looks_ahead=looks_ahead)
+            self._packed = kernels.pack(self._layout)
+
+    def carry(self, query: DistanceQuery) -> None:
+        """Takes over which joint carries what, in place."""
+        hand_over(self._layout, self._masks, query)
+
+    def closest_call(self, v: Array, near: int, reach: float, horizon: float, stop: Stop | None = None) -> float:
+        """A bound below what is left of the safe distances on the way of v until `horizon` [m].
+
+        See `kernels.closest_call`.
+
+        Args:
+            v: velocity (nv,).
+            near: number of near pairs.
+            reach: surface distance below which a pair is near [m].
+            horizon: time for which v leads on [s].
+            stop: what else there is of the way, if there is.
+        """
+        left = float(kernels.closest_call(self._packed, v, near, reach, horizon))
+        if stop is None:
+            return left
+        return left - 2.0 * float(stop.aside.sum()) - (self._bend(stop.ways) - self._bend(horizon * np.abs(v)))
+
+    def bends(self, q: Array, v: Array, horizon: float) -> bool:
+        """Whether a joint has to brake harder than the others for its position limit: see `kernels.bends`.
+
+        Args:
+            q: configuration (nq,).
+            v: velocity (nv,).
+            horizon: time for which v leads on [s].
+        """
+        return bool(kernels.bends(self._packed, q, v, horizon))
+
+    def _bend(self, ways: Array) -> float:
+        """What `closest_call` allows for bodies that turn, where coordinates move by `ways` (nv,) in all [m]."""
+        x = self._layout
+        turned, slid = float(np.max(x.turning @ ways)), float(np.max(x.sliding @ ways))
+        return turned * (turned * x.lever + 2.0 * slid)
+
+    def stop(self, q: Array, v: Array) -> Stop:
+        """A tick at v and the stop after it, where jerks have limits.
+
+        All of it is along v and the change that has led to v, but for what position and velocity limits forbid.
+
+        Args:
+            q: configuration (nq,) at which the tick begins.
+            v: velocity (nv,).
+        """
+        x = self._layout
+        assert self._stop is not None
+        w = np.clip(v - x.v_last, -x.v_step, x.v_step)
+        way = self._stop.way(q, v, w)
+        size = max(float(v @ v), 1e-300)
+        shares = way @ v / size
+        across = w - (w @ v / size) * v
+        beside = way - shares[:, None] * v
+        parts = beside @ across / max(float(across @ across), 1e-300)
+        beside -= parts[:, None] * across
+        kernels.joint_speeds(self._packed, across)
+        aside = np.abs(parts) * x.speeds[: len(x.joint_poses)].max()
+        if (np.abs(beside).max(axis=0) > _ROUND_OFF * x.v_step).any():
+            turned, slid = np.abs(beside) @ x.turning.T, np.abs(beside) @ x.sliding.T
+            aside += turned.max(axis=1) * x.lever + slid.max(axis=1)
+        return Stop(way, self._dt * np.abs(shares), self._dt * aside, self._dt * np.abs(way).sum(axis=0))
+
+    def follow(self, v: Array, problem: Problem) -> Problem:
+        """The problem of this tick with the velocity v (nv,) to follow in place of the tasks."""
+        x = self._layout
+        x.v0[:] = v if problem.contacts is None else problem.contacts.held(v)
+        if x.task_switching:
+            kernels.row_bounds(self._packed, len(problem.avoidance.d), self._moving)
+        worst = float(kernels.tracking_shortfall(self._packed, len(problem.avoidance.d)))
+        return problem._replace(tracking=Tracking(self._eye, x.v0, 0.0), shortfall=worst, levels=(), clear=False)
+
+    def eased(self, problem: Problem) -> Problem:
+        """The problem of this tick with as much of its v0 as can be had now without swinging past it.
+
+        The way to v0 within jerk limits is a stop, for one who moves at v0. The velocity that is closest to v0 in every
+        tick gets there with an acceleration that cannot be taken back at once: it swings to and fro about v0, for ever.
+        """
+        x, v0 = self._layout, problem.v0
+        if v0[0] != v0[0]:
+            return problem
+        eased = v0 + kernels.easing_stop(x.v_last - v0, x.w_last, x.v_step, x.w_step)
+        if problem.contacts is not None:
+            eased = problem.contacts.held(eased)
+        tracking = problem.tracking._replace(b=problem.tracking.b + problem.tracking.A @ (eased - v0))
+        rows = self._along(problem.avoidance, eased)
+        worst = float(kernels.shortfall(eased, rows.J, rows.b, x.lower, x.upper))
+        return problem._replace(tracking=tracking, avoidance=rows, v0=eased, shortfall=worst)
+
+    def redirected(self, problem: Problem, frame: int, velocity: Array) -> Problem:
+        """The problem of this tick with a velocity (3,) added to the linear one that a task asks for [m/s].
+
+        Args:
+            problem: as `compute` gave it.
+            frame: which task.
+            velocity: world [m/s].
+        """
+        x = self._layout
+        linear = slice(3 * frame, 3 * frame + 3)
+        b = x.b.copy()
+        x.b[linear] += x.scale[linear] * velocity
+        v0 = np.empty_like(x.v0)
+        if problem.contacts is None:
+            kernels.damped_solution(self._packed, v0)
+        else:
+            v0[:] = tracking_within(problem.contacts, x.A, x.b, x.damping)
+        tracking = problem.tracking._replace(b=x.b.copy())
+        x.b[:] = b
+        rows = self._along(problem.avoidance, v0)
+        worst = float(kernels.shortfall(v0, rows.J, rows.b, x.lower, x.upper))
+        return problem._replace(tracking=tracking, avoidance=rows, v0=v0, shortfall=worst, clear=False)
+
+    def prioritised(self, problem: Problem, tracked: Callable[[Problem], Array]) -> Problem:
+        """The problem of this tick with rows for what a cascade tracks, which is not v0.
+
+        Args:
+            problem: as `compute` gave it, or redirected.
+            tracked: gives that velocity (nv,).
+        """
+        if not self._layout.task_switching:
+            return problem
+        return problem._replace(avoidance=self._along(problem.avoidance, tracked(problem)), clear=False)
+
+    def _along(self, rows: AvoidanceRows, v: Array) -> AvoidanceRows:
+        """Rows of this tick as they are where v (nv,) is tracked in place of v0; the same ones if that is no matter."""
+        x, k = self._layout, len(rows.d)
+        if not (x.task_switching and k):
+            return rows
+        memory = x.v0, x.least[:k], x.touch[:k]
+        kept = [array.copy() for array in memory]
+        x.v0[:] = v
+        kernels.row_bounds(self._packed, k, self._moving)
+        along = rows._replace(b=x.least[:k].copy(), touch=x.touch[:k].copy())
+        for array, values in zip(memory, kept, strict=True):
+            array[:] = values
+        return along
+
+    def at_length(self, problem: Problem) -> Problem:
+        """The problem of this tick with what the limits of accelerations and jerks allow at length, not at once."""
+        x = self._layout
+        return problem._replace(
+            lower=x.hard_lower, upper=x.hard_upper, hard_lower=x.hard_lower, hard_upper=x.hard_upper
+        )
+
+    def goal(self, frame: int) -> tuple[Array, float]:
+        """Where a task wants its frame (3,), world, and how far that is from where the frame is [m]."""
+        target = self._targets[frame][0]
+        return target.copy(), float(np.linalg.norm(target - self.kinematics.position[frame]))
+
+    def wanted_velocity(self, frame: int) -> Array:
+        """Linear velocity (3,) that a task asks of its frame [m/s]."""
+        rows = slice(3 * frame, 3 * frame + 3)
+        return np.asarray(self._layout.b[rows] / self._layout.scale[rows])
+
+    def frame_velocity(self, frame: int, v: Array) -> Array:
+        """Linear velocity (3,) of a task's frame at v [m/s]."""
+        rows = slice(3 * frame, 3 * frame + 3)
+        return np.asarray(self._layout.A[rows] @ v / self._layout.scale[rows])
+
+    def _count_from_before(self) -> None:
+        """Narrows the bounds to what accelerations and jerks allow from the velocity before.
+
+        The kernels count from the nearest one that holds the contacts, which have turned a little since.
+        """
+        x = self._layout
+        low = np.maximum(self._before - x.v_step, self._before + x.w_last - x.w_step)
+        high = np.minimum(self._before + x.v_step, self._before + x.w_last + x.w_step)
+        low, high = np.minimum(low, x.upper), np.maximum(high, x.lower)
+        np.maximum(x.lower, low, out=x.lower)
+        np.minimum(x.upper, high, out=x.upper)
+
+    def beyond_limits(self, v: Array) -> tuple[Array, Array]:
+        """By how much v (nv,) passes what accelerations and what jerks allow (nv,), negative within [rad/s or m/s]."""
+        x, change = self._layout, v - self._before
+        return np.abs(change) - x.v_step, np.abs(change - self._change) - x.w_step
+
+    def remember(self, v: Array) -> None:
+        """Takes v (nv,) as the velocity at which the robot moves from this tick to the next."""
+        x = self._layout
+        if self.limits_may_give_way:
+            np.subtract(v, self._before, out=self._change)
+            self._before[:] = v
+            np.clip(self._change, -x.v_step, x.v_step, out=x.w_last)
+        x.v_last[:] = v
+
+    def measured(self, v: Array) -> None:
+        """Takes v (nv,) as the velocity at which the robot moves until this tick; accelerations stay as commanded."""
+        self._layout.v_last[:], self._before[:] = v, v
+
+    def restart(self, v: Array) -> None:
+        """Takes v (nv,) as the velocity at which the robot has been moving, without any acceleration."""
+        self._layout.v_last[:], self._layout.w_last[:] = v, 0.0
+        self._before[:], self._change[:] = v, 0.0
+
+    @property
+    def v_last(self) -> Array:
+        """Velocity (nv,) at which the robot moves until this tick."""
+        return self._layout.v_last
+
+    @property
+    def w_last(self) -> Array:
+        """By how much that changed in the tick before (nv,); 0 where jerks have no limits."""
+        return self._layout.w_last
+
+    def _view(self, k: int) -> tuple[Proximity, AvoidanceRows]:
+        x = self._layout
+        near = x.near[:k]
+        proximity = Proximity(near, x.closest[:k], x.J[:k], x.drift[:k])
+        self._views[k] = proximity, AvoidanceRows(near, x.d[:k], x.J[:k], x.least[:k], x.d1, x.d2, x.touch[:k])
+        return self._views[k]

@@ -1,0 +1,131 @@
+"""Puts the balls of a point cloud to the voxels that are nearest to each body, tick by tick.
+
+A cloud has a fixed number of balls for each body of the robot: to coal and to the rows they are spheres like any other,
+so that memory is laid out once and the QP stays small, however many points there are.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import coal
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from qpavoid import kernels
+from qpavoid.geometry.bodies import enclosing_capsule, hull_points
+from qpavoid.model.cloud import Voxels, ball_radius
+from qpavoid.model.scene import FAR
+from qpavoid.model.trajectory import Sample
+from qpavoid.problem import Array, IntArray
+
+_PLACES = 3
+"""Into how many stretches a body's axis counts as divided: voxels that face the same one in one direction are alike."""
+
+
+class Slots:
+    """The balls of one cloud, for every body that can move."""
+
+    def __init__(
+        self, bodies: list[Any], geometries: IntArray, resolution: float, nearest: int, voxels: Voxels
+    ) -> None:
+        """Lays the memory out.
+
+        Args:
+            bodies: coal geometries of the b bodies that can move.
+            geometries: numbers of the cloud's balls (b nearest,), those of a body one after the other.
+            resolution: edge of a voxel [m].
+            nearest: balls of each body.
+            voxels: what the cloud holds at first.
+        """
+        count = len(bodies)
+        self.geometries = geometries.reshape(count, nearest)
+        self._ball = ball_radius(resolution)
+        self._bodies = bodies
+        fits = [enclosing_capsule(body) for body in bodies]
+        half = [0.5 * fit.length * fit.rotation[:, 2] for fit in fits]
+        self._ends = np.array([[fit.center - h, fit.center + h] for fit, h in zip(fits, half, strict=True)])
+        self._radii = np.array([fit.radius for fit in fits]) + self._ball
+        self._spacing = np.maximum([fit.length / _PLACES for fit in fits], 2.0 * resolution)
+        self._planes = {i: _planes(body) for i, body in enumerate(bodies) if not _is_capsule(body)}
+        self._slots = np.full((count, nearest), -1, dtype=np.intp)
+        self._kept = np.full((count, nearest), -1, dtype=np.intp)
+        self._first = np.zeros(count + 1, dtype=np.intp)
+        self._room = -1
+        self.fill_with(voxels)
+
+    def fill_with(self, voxels: Voxels) -> None:
+        """Takes other voxels, in place of all that there were."""
+        self.voxels = voxels
+        room = len(self._bodies) * len(voxels.centers)
+        if room > self._room:
+            self._room = room
+            self._point = np.zeros(room, dtype=np.intp)
+            self._distance, self._place = np.zeros(room), np.zeros((room, 4))
+
+    @property
+    def reach(self) -> float:
+        """Distance of the farthest ball's surface from the cloud's origin [m]."""
+        farthest = np.sqrt(np.square(self.voxels.centers).sum(axis=1).max(initial=0.0))
+        return float(farthest) + self._ball
+
+    def places(self, poses: Array, off: Any, pose: Sample, reach: float) -> Array:
+        """World positions (b, nearest, 3) of the balls [m]; far away where they stand for no voxel.
+
+        Args:
+            poses: world poses of the bodies, rotation by columns and translation (b, 12).
+            off: bodies that do not move with the robot now (k,).
+            pose: of the cloud.
+            reach: surface distance up to which voxels are looked for [m].
+        """
+        rotation, voxels = pose.rotation, self.voxels
+        turned = np.matmul(self._ends, poses[:, :9].reshape(-1, 3, 3)) + poses[:, None, 9:]
+        axes = ((turned - pose.position) @ rotation).reshape(-1, 6)
+        axes[off] = np.nan
+        found = self._first, self._point, self._distance, self._place
+        kernels.within_reach(axes, self._radii, reach, voxels.centers, voxels.blocks, voxels.starts, *found)
+        for body in self._planes:
+            if self._first[body] < self._first[body + 1]:
+                self._refine(body, poses[body], pose)
+        kernels.choose(*found, self._spacing, voxels.keys, self._slots, self._kept)
+        places = np.full((*self._slots.shape, 3), FAR)
+        taken = self._slots >= 0
+        places[taken] = voxels.centers[self._slots[taken]] @ rotation.T + pose.position
+        return places
+
+    def _refine(self, body: int, placement: Array, pose: Sample) -> None:
+        """Distances of a body that is no capsule: exact for as many of its nearest voxels as get slots for nearness.
+
+        Planes of the faces, and the capsule around the body, bound the distances of the others from below.
+        """
+        here = slice(self._first[body], self._first[body + 1])
+        centers = self.voxels.centers[self._point[here]] @ pose.rotation.T + pose.position
+        rotation = placement[:9].reshape(3, 3)  # by columns: its transpose
+        normals, offsets = self._planes[body]
+        beyond = np.max((centers - placement[9:]) @ rotation.T @ normals.T + offsets, axis=1) - self._ball
+        bound = np.maximum(self._distance[here], beyond)
+        request, result, ball = coal.DistanceRequest(), coal.DistanceResult(), coal.Sphere(self._ball)
+        request.gjk_tolerance = 1e-10
+        if isinstance(self._bodies[body], coal.Cylinder):
+            ball = coal.Capsule(self._ball, 0.0)
+        where = coal.Transform3s(rotation.T.copy(), placement[9:].copy())
+        wanted = (self._slots.shape[1] + 1) // 2
+        exact: list[float] = []
+        for i in np.argsort(bound, kind="stable").tolist():
+            if len(exact) >= wanted and bound[i] >= sorted(exact)[wanted - 1]:
+                break
+            result.clear()
+            there = coal.Transform3s(np.eye(3), centers[i])
+            bound[i] = coal.distance(self._bodies[body], where, ball, there, request, result)
+            exact.append(float(bound[i]))
+        self._distance[here] = bound
+
+
+def _is_capsule(body: Any) -> bool:
+    return isinstance(body, coal.Sphere | coal.Capsule)
+
+
+def _planes(body: Any) -> tuple[Array, Array]:
+    """Outward normals (f, 3) and offsets (f,) of the faces of a polytope that encloses a body."""
+    equations = ConvexHull(hull_points(body)).equations
+    return equations[:, :3].copy(), equations[:, 3].copy()

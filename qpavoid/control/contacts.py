@@ -1,0 +1,130 @@
+"""Frames that rest on the ground: rows J v = 0 that never give way.
+
+They are solved before anything else: with an orthonormal basis Z of the velocities that move no contact, v = rest + Z w
+for any w, and all tasks, rows and bounds become ones of w. So they come before tracking, avoidance and acceleration
+limits; hard joint limits are kept as well, and where those leave no velocity that holds the contacts, the robot stops.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from scipy.linalg.lapack import dgeqp3, dorgqr, dtrtrs
+
+from qpavoid import config
+from qpavoid.control.tasks.rows import frame_jacobian, frame_pose
+from qpavoid.errors import ConfigError
+from qpavoid.kernels.rotation import rotation_vector
+from qpavoid.model.kinematics import ForwardKinematics
+from qpavoid.model.robot import Robot
+from qpavoid.problem import Array, Contacts
+
+_CORRECTION = 0.02
+"""Largest speed at which what has slid is put right [m/s, rad/s]."""
+_DEPENDENT = 1e-8
+"""Share of the largest pivot below which a row follows from the others, as with two hands on one wall [-]."""
+
+
+class ContactRows:
+    """The contacts of a robot, and where they rest."""
+
+    def __init__(self, settings: Sequence[config.Contact], frame_ids: Sequence[int], anchors: Any, model: Any) -> None:
+        """See `build_contacts`."""
+        self.frame_ids = tuple(frame_ids)
+        self._gains = np.array([contact.gain for contact in settings])
+        self._anchors, self._model = anchors, model
+        turns = [contact.type == "surface" for contact in settings]
+        self._rows = np.concatenate([np.repeat([True, turn], 3) for turn in turns])
+
+    def update(self, kinematics: ForwardKinematics) -> Contacts:
+        """Their rows at the configuration for which the kinematics are up to date, solved."""
+        J = np.concatenate([frame_jacobian(self._model, kinematics, i) for i in self.frame_ids])
+        b = np.concatenate(
+            [
+                gain * _slid(frame_pose(kinematics, frame_id), anchor)
+                for frame_id, anchor, gain in zip(self.frame_ids, self._anchors, self._gains, strict=True)
+            ]
+        )
+        b = b[self._rows]
+        b *= min(1.0, _CORRECTION / max(float(np.abs(b).max()), 1e-12))
+        return solve_contacts(J[self._rows], b)
+
+
+def build_contacts(
+    configs: Sequence[config.Contact], robot: Robot, q0: Array, source: Path = Path("contacts")
+) -> ContactRows | None:
+    """The contacts of a scenario, resting where their frames are at q0; None where there are none.
+
+    Args:
+        configs: the scenario's `contacts`.
+        robot: the robot that is controlled.
+        q0: configuration (nq,) at which they rest.
+        source: scenario file, named in errors.
+
+    Raises:
+        UnknownName: of a frame.
+    """
+    if not configs:
+        return None
+    data, ids = robot.model.createData(), []
+    for index, contact in enumerate(configs):
+        ids.append(robot.frame_id(contact.frame, f"{source}: contacts.{index}.frame"))
+    pin.framesForwardKinematics(robot.model, data, q0)
+    anchors = [(data.oMf[i].translation.copy(), data.oMf[i].rotation.copy()) for i in ids]
+    rows = ContactRows(configs, ids, anchors, robot.model)
+    kinematics = ForwardKinematics(robot.model, ids)
+    kinematics.compute(q0)
+    if not rows.update(kinematics).Z.shape[1]:
+        raise ConfigError(f"{source}: contacts leave {robot.name} no way to move; leave some out, or make them points")
+    return rows
+
+
+def solve_contacts(J: Array, b: Array) -> Contacts:
+    """Solves J v = b by a QR factorisation of Jᵀ with pivoting; rows that follow from others are left out.
+
+    Args:
+        J: (c, nv) contact Jacobian.
+        b: (c,) what has to be put right [m/s, rad/s].
+    """
+    c, nv = J.shape
+    packed, order, tau, _, _ = dgeqp3(J.T)
+    pivots = np.abs(packed.diagonal())
+    rank = int((pivots > _DEPENDENT * pivots[0]).sum())
+    Q = np.zeros((nv, nv), order="F")
+    Q[:, : min(c, nv)] = packed[:, :nv]
+    Q, _, _ = dorgqr(Q, tau)
+    rest = np.zeros(nv)
+    if b.any():
+        y, _ = dtrtrs(packed[:rank, :rank], b[order[:rank] - 1], trans=1)
+        rest = Q[:, :rank] @ y
+    return Contacts(np.ascontiguousarray(Q[:, rank:]), rest, J, b)
+
+
+def tracking_within(contacts: Contacts, A: Array, b: Array, damping: float) -> Array:
+    """Velocity (nv,) of the tracking law that holds the contacts: rest + Z (A Z)⁺ (b - A rest).
+
+    Args:
+        contacts: solved.
+        A: task rows (r, nv).
+        b: their right-hand sides (r,).
+        damping: λ of the damped inverse [-].
+    """
+    reduced, asked = A @ contacts.Z, b - A @ contacts.rest
+    if damping == 0.0:
+        known = np.isfinite(asked).all() and np.isfinite(reduced).all()
+        w = np.linalg.pinv(reduced, rcond=1e-10) @ asked if known else np.full(reduced.shape[1], np.nan)
+    else:
+        gram = reduced.T @ reduced
+        gram.ravel()[:: len(gram) + 1] += damping**2
+        w = np.linalg.solve(gram, reduced.T @ asked)
+    return np.asarray(contacts.rest + contacts.Z @ w)
+
+
+def _slid(pose: tuple[Array, Array], anchor: tuple[Array, Array]) -> Array:
+    """What is missing from a pose to the one where a contact rests (6,) [m, rad]."""
+    turned = rotation_vector((anchor[1] @ pose[1].T).tolist())
+    return np.concatenate((anchor[0] - pose[0], turned))

@@ -1,0 +1,133 @@
+"""Rows of the frames that follow targets, and the velocity that the tracking law makes of all task rows."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from qpavoid.kernels.packing import compiled
+from qpavoid.kernels.rotation import rotation_vector
+from qpavoid.kernels.rows import _fold
+from qpavoid.problem import Array
+
+WELL_CONDITIONED = 1e-6
+"""Ratio of the smallest to the largest pivot of J Jᵀ down to which J⁺ is taken from it without damping."""
+
+_rotation_vector = compiled(rotation_vector)
+
+
+@compiled
+def frame_rows(x: Any) -> None:
+    """Write the rows A v = b of f frames that follow targets: feed-forward plus gain times error, capped and scaled.
+
+    The orientation error is the rotation vector of R_target Rᵀ. Three linear rows for each frame whose position counts
+    come first, then three angular rows for each whose orientation does; rows after these are left as they are.
+
+    Args:
+        x: reads frame_poses, targets and the layout of the tasks; writes poses, A, b.
+    """
+    poses, targets, screws, support, A, b = x.poses, x.targets, x.screws, x.task_support, x.A, x.b
+    J_world = np.ascontiguousarray(x.J_world)  # rows in one piece become vector instructions
+    rows, columns = len(screws), J_world.shape[1]
+    moving = rows // 3 - len(x.turns)
+    for f in range(len(poses)):
+        for c in range(12):
+            poses[f, c] = x.frame_poses[x.frame_ids[f], c]
+    for f in range(moving):
+        r, px, py, pz = 3 * f, poses[f, 9], poses[f, 10], poses[f, 11]
+        screws[r, 4], screws[r, 5] = pz, -py
+        screws[r + 1, 3], screws[r + 1, 5] = -pz, px
+        screws[r + 2, 3], screws[r + 2, 4] = py, -px
+        for i in range(3):
+            b[r + i] = targets[f, 12 + i] + x.gain[f] * (targets[f, i] - poses[f, 9 + i])
+    missing = np.empty((3, 3))
+    for n in range(len(x.turns)):
+        f = x.turns[n]
+        for i in range(3):
+            for j in range(3):
+                missing[i, j] = 0.0
+                for c in range(3):
+                    missing[i, j] += targets[f, 3 + 3 * i + c] * poses[f, 3 * c + j]
+        errors = _rotation_vector(missing)
+        for i in range(3):
+            b[3 * (moving + n) + i] = targets[f, 15 + i] + x.gain[f] * errors[i]
+    for part in range(len(x.cap)):
+        r = 3 * part
+        speed = np.sqrt(b[r] * b[r] + b[r + 1] * b[r + 1] + b[r + 2] * b[r + 2])
+        if speed > x.cap[part]:
+            for i in range(3):
+                b[r + i] *= x.cap[part] / speed
+    for r in range(rows):
+        b[r] *= x.scale[r]
+        row = x.mimicking if x.mimics else A[r]
+        lx, ly, lz, ax, ay, az = screws[r, 0], screws[r, 1], screws[r, 2], screws[r, 3], screws[r, 4], screws[r, 5]
+        for c in range(columns):
+            linear = lx * J_world[0, c] + ly * J_world[1, c] + lz * J_world[2, c]
+            angular = ax * J_world[3, c] + ay * J_world[4, c] + az * J_world[5, c]
+            row[c] = (linear + angular) * support[r, c]
+        if x.mimics:
+            _fold(row, x.columns, A[r])
+
+
+@compiled
+def damped_solution(x: Any, v: Array) -> None:
+    """Write A⁺b with A⁺ = Aᵀ (A Aᵀ + λ²)⁻¹, by a Cholesky factorisation of the Gram matrix, row by row.
+
+    Args:
+        x: reads A (r, n), b (r,) and the damping λ.
+        v: out (n,); 0 where there are no rows, NaN where there is no damping and A Aᵀ is close to singular.
+    """
+    A, b, damping = x.A, x.b, x.damping
+    rows, nv = A.shape
+    L = np.empty((rows, rows))
+    y, inverse = np.empty(rows), np.empty(rows)
+    smallest, largest = np.inf, 0.0
+    for i in range(rows):
+        for j in range(i + 1):
+            dot = 0.0
+            for c in range(nv):
+                dot += A[i, c] * A[j, c]
+            if i == j:
+                dot += damping * damping
+            for c in range(j):
+                dot -= L[i, c] * L[j, c]
+            if i == j:
+                smallest, largest = min(smallest, dot), max(largest, dot)
+                if not dot > 0.0 or (damping == 0.0 and smallest < WELL_CONDITIONED * largest):
+                    v[:] = np.nan
+                    return
+                inverse[i] = 1.0 / np.sqrt(dot)
+            else:
+                L[i, j] = dot * inverse[j]
+        total = b[i]
+        for c in range(i):
+            total -= L[i, c] * y[c]
+        y[i] = total * inverse[i]
+    v[:] = 0.0
+    for i in range(rows - 1, -1, -1):
+        y[i] *= inverse[i]
+        for c in range(i):
+            y[c] -= L[i, c] * y[i]
+        for c in range(nv):
+            v[c] += A[i, c] * y[i]
+
+
+@compiled
+def projection_cost(A: Array, regularization: float, v0: Array) -> tuple[Array, Array]:
+    """Compute P = AᵀA + λ (n, n) and q = -P v0 (n,): ½ vᵀP v + qᵀv is smallest at v0."""
+    rows, nv = A.shape
+    P = np.empty((nv, nv))
+    q = np.zeros(nv)
+    for i in range(nv):
+        for j in range(i + 1):
+            dot = 0.0
+            for r in range(rows):
+                dot += A[r, i] * A[r, j]
+            P[i, j] = dot
+            P[j, i] = dot
+        P[i, i] += regularization
+    for i in range(nv):
+        for j in range(nv):
+            q[i] -= P[i, j] * v0[j]
+    return P, q

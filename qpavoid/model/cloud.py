@@ -1,0 +1,163 @@
+"""Points as from a depth camera: read, cleaned and sorted into voxels and blocks, so that a tick finds the near ones.
+
+A voxel that holds a point counts as the ball around it, whatever number of points it holds: how dense and how noisy a
+camera is makes no difference to what is kept clear, and the same voxels come back from one picture to the next.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from qpavoid.config.text import read_text
+from qpavoid.errors import ConfigError, NumericalError
+from qpavoid.model.trajectory import Sample
+from qpavoid.problem import Array, IntArray, as_numbers
+
+_BLOCK = 4
+"""Voxels along the edge of a block."""
+_FARTHEST = 1e2
+"""How far from the cloud's origin a point may lie [m]; those beyond are dropped, as if they were not finite."""
+_LARGEST, _MOST_POINTS = 200_000_000, 5_000_000
+"""Of a file [bytes], and points of it."""
+
+
+class Points(NamedTuple):
+    """What a camera saw: takes the place of all points of a cloud that were given before."""
+
+    points: ArrayLike | Voxels
+    """(n, 3) in the cloud's frame [m]; points with NaN or infinity are dropped. Or `Voxels` made beforehand, which
+    leaves the tick nothing to do."""
+    pose: Sample | None = None
+    """Where the cloud's frame is, and how it moves; where it was if left out, which is the world at first."""
+    t: float | None = None
+    """Time stamp: when they were seen [s]; that of the pose, or the time of the control step, if left out."""
+    at_rest: bool = False
+    """Whether they stay there until others are given: they are never stale."""
+
+
+@dataclass(frozen=True)
+class Voxels:
+    """The voxels that hold a point, sorted into blocks."""
+
+    resolution: float
+    """Edge of a voxel [m]."""
+    centers: Array
+    """(m, 3) in the cloud's frame [m], those of a block one after the other."""
+    keys: IntArray
+    """(m,) number of each voxel, the same in every cloud of this resolution."""
+    blocks: Array
+    """(b, 4) ball around the voxels' centres of each block: its centre and radius [m]."""
+    starts: IntArray
+    """(b + 1,) where each block begins in `centers`."""
+    dropped: int = 0
+    """How many points were NaN, infinite or absurdly far away."""
+    given: int = 0
+    """How many points there were in all."""
+
+    @classmethod
+    def of(cls, points: ArrayLike, resolution: float) -> Voxels:
+        """Sorts points; takes some ms for 10 000, which a thread of the camera may spend.
+
+        Args:
+            points: (n, 3) [m]; n may be 0.
+            resolution: edge of a voxel [m]; that of the cloud's configuration.
+
+        Raises:
+            NumericalError: wrong shape, or not numbers.
+        """
+        array = as_numbers("points", points)
+        if array.ndim != 2 or array.shape[1] != 3:
+            raise NumericalError(f"points: shape {array.shape}, expected (n, 3)")
+        good = np.abs(array).max(axis=1, initial=0.0) <= _FARTHEST  # False for NaN too
+        kept = array if good.all() else array[good]
+        voxel = np.floor(kept / resolution).astype(np.int64)
+        keys = np.unique(_key(voxel // _BLOCK) * _BLOCK**3 + _within(voxel % _BLOCK))
+        corner = _BLOCK * _unkey(keys // _BLOCK**3) + _unwithin(keys % _BLOCK**3)
+        centers = (corner + 0.5) * resolution
+        block = keys // _BLOCK**3
+        starts = np.flatnonzero(np.diff(block, prepend=-1)).astype(np.intp)
+        blocks = np.empty((len(starts), 4))
+        if len(starts):
+            low, high = np.minimum.reduceat(centers, starts), np.maximum.reduceat(centers, starts)
+            blocks[:, :3], blocks[:, 3] = 0.5 * (low + high), 0.5 * np.linalg.norm(high - low, axis=1)
+        return cls(resolution, centers, keys, blocks, np.append(starts, len(keys)), len(array) - len(kept), len(array))
+
+    @classmethod
+    def of_octree(cls, tree: Any, resolution: float | None = None) -> Voxels:
+        """The occupied leaves of a coal octree, large ones cut into voxels.
+
+        Args:
+            tree: `coal.OcTree`, such as `coal.makeOctree` or `coal.MeshLoader().loadOctree` gives.
+            resolution: edge of a voxel [m], the cloud's; the tree's own if left out.
+        """
+        edge = tree.getResolution() if resolution is None else resolution
+        leaves = [box for box in map(np.asarray, tree.toBoxes()) if box[4] >= box[5]]
+        points = [np.zeros((0, 3))]
+        for x, y, z, size, *_ in leaves:
+            steps = (np.arange(max(round(size / edge), 1)) + 0.5) * edge - 0.5 * size if size > edge else np.zeros(1)
+            points.append(np.array([x, y, z]) + np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3))
+        return cls.of(np.concatenate(points), edge)
+
+
+def ball_radius(resolution: float) -> float:
+    """Radius of the ball around a voxel [m]."""
+    return float(0.5 * np.sqrt(3.0) * resolution)
+
+
+def read_points(path: Path, where: str) -> Array:
+    """Points (n, 3) of a file [m].
+
+    Args:
+        path: `.npy` with an array (n, 3), or `.csv` with the header `x,y,z`.
+        where: file and field to name in errors.
+
+    Raises:
+        ConfigError: cannot be read, or not points.
+    """
+    if not path.is_file():
+        raise ConfigError(f"{where}: {path}: no such file; give an .npy or .csv")
+    if path.stat().st_size > _LARGEST:
+        raise ConfigError(f"{where}: {path}: {path.stat().st_size} bytes; at most {_LARGEST} are read")
+    try:
+        if path.suffix == ".npy":
+            points = np.load(path, allow_pickle=False)
+        elif path.suffix == ".csv":
+            header, _, rows = read_text(path, _LARGEST, where).partition("\n")
+            if header.replace(" ", "").strip() != "x,y,z":
+                raise ConfigError(f"{where}: {path}: header is `{header.strip():.40}`; the first line must be `x,y,z`")
+            points = np.loadtxt(rows.splitlines(), delimiter=",", ndmin=2, dtype=np.float64)
+        else:
+            raise ConfigError(f"{where}: {path}: neither .npy nor .csv; convert it, as with numpy.save")
+    except (ValueError, EOFError, OSError) as error:
+        raise ConfigError(f"{where}: {path}: {error}; give an array (n, 3) of numbers") from None
+    if getattr(points, "ndim", 0) != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
+        raise ConfigError(f"{where}: {path}: an array of shape {getattr(points, 'shape', ())}; give (n, 3) numbers")
+    if len(points) > _MOST_POINTS:
+        raise ConfigError(f"{where}: {path}: {len(points)} points; at most {_MOST_POINTS} are read: thin them out")
+    return np.asarray(points, dtype=np.float64)
+
+
+_HALF = 2**15
+"""Blocks are numbered from -_HALF to _HALF - 1 along each axis."""
+
+
+def _key(block: IntArray) -> Any:
+    shifted = block + _HALF
+    return (shifted[:, 0] * (2 * _HALF) + shifted[:, 1]) * (2 * _HALF) + shifted[:, 2]
+
+
+def _unkey(key: Any) -> Any:
+    return np.stack((key // (2 * _HALF) ** 2, key // (2 * _HALF) % (2 * _HALF), key % (2 * _HALF)), axis=1) - _HALF
+
+
+def _within(voxel: IntArray) -> Any:
+    return (voxel[:, 0] * _BLOCK + voxel[:, 1]) * _BLOCK + voxel[:, 2]
+
+
+def _unwithin(key: Any) -> Any:
+    return np.stack((key // _BLOCK**2, key // _BLOCK % _BLOCK, key % _BLOCK), axis=1)

@@ -1,0 +1,193 @@
+"""Joints of a model: their limits, configurations from joint names, and models in which some are locked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from qpavoid.config import JointLimits
+from qpavoid.errors import ConfigError, UnknownName, nearest
+from qpavoid.model.kinematics import MIMIC, TRANSLATIONS
+from qpavoid.model.limits import JointBounds
+from qpavoid.model.notes import Note, NoteKind
+from qpavoid.model.pairs import pair_array
+from qpavoid.problem import Array, IntArray
+
+_ABSURD = 1e9
+"""Speed [rad/s or m/s] or position [rad or m] from which a limit is a way of saying that there is none."""
+_SAME = 1e-6
+"""How far a joint may be given from where the one that it mimics takes it [rad or m]."""
+
+
+def frame_index(model: Any, name: str) -> int:
+    """Index of an existing frame; that of the link where a joint has the same name."""
+    return int(model.getFrameId(name, pin.BODY) if model.existFrame(name, pin.BODY) else model.getFrameId(name))
+
+
+def joint_bounds(model: Any) -> JointBounds:
+    """Joint limits of a model in tangent space; a URDF says nothing of accelerations and jerks.
+
+    Only joints with one coordinate in q and v have position limits. A velocity limit of 0, and a range from 0 to 0,
+    mean that the URDF gives none; see `fixed_by_limits` of ranges that are meant, `assume_speeds` of velocities.
+    """
+    lower, upper = np.array(model.lowerPositionLimit), np.array(model.upperPositionLimit)
+    lower[lower <= -_ABSURD], upper[upper >= _ABSURD] = -np.inf, np.inf
+    q_index, v_index = [], []
+    for joint in list(model.joints)[1:]:
+        low, high = lower[joint.idx_q], upper[joint.idx_q]
+        if joint.nq == joint.nv == 1 and np.isfinite([low, high]).any() and low < high:
+            q_index.append(joint.idx_q)
+            v_index.append(joint.idx_v)
+    q_indices = np.array(q_index, dtype=np.intp)
+    velocity = np.array(model.velocityLimit)
+    return JointBounds(
+        velocity=np.where((velocity > 0.0) & (velocity < _ABSURD), velocity, np.inf),
+        q_index=q_indices,
+        v_index=np.array(v_index, dtype=np.intp),
+        lower=lower[q_indices],
+        upper=upper[q_indices],
+        acceleration=np.full(model.nv, np.inf),
+        jerk=np.full(model.nv, np.inf),
+    )
+
+
+def set_limits(model: Any, limits: JointLimits, path: Path) -> None:
+    """Takes over the position and velocity limits that a robot.yaml gives.
+
+    Raises:
+        ConfigError, UnknownName: of a joint that mimics another one, has no position limits, or is unknown.
+    """
+    lower, upper = np.array(model.lowerPositionLimit), np.array(model.upperPositionLimit)
+    velocity = np.array(model.velocityLimit)
+    for kind in ("position", "velocity", "acceleration", "jerk"):
+        for name in getattr(limits, kind):
+            if named(model, name, f"{path}: limits.{kind}").shortname() == MIMIC:
+                raise ConfigError(f"{path}: limits.{kind}: {_follows(model, name)}; limit that one")
+    for name, (low, high) in limits.position.items():
+        joint = named(model, name, f"{path}: limits.position")
+        if joint.nq != 1:
+            raise ConfigError(f"{path}: limits.position: joint {name!r} turns all the way round; leave it out")
+        lower[joint.idx_q], upper[joint.idx_q] = low, high
+    for name, speed in limits.velocity.items():
+        joint = named(model, name, f"{path}: limits.velocity")
+        if isinstance(speed, list) and len(speed) != joint.nv:
+            raise ConfigError(
+                f"{path}: limits.velocity: joint {name!r}: {len(speed)} values for {joint.nv} coordinates"
+            )
+        velocity[joint.idx_v : joint.idx_v + joint.nv] = speed
+    model.lowerPositionLimit, model.upperPositionLimit = lower, upper
+    _set_speeds(model, velocity)
+
+
+def _set_speeds(model: Any, velocity: Array) -> None:
+    """Sets the largest speeds (nv,) of both directions, of which a URDF has one and Pinocchio reads both as that."""
+    model.velocityLimit, model.lowerVelocityLimit = velocity, -velocity
+
+
+ASSUMED_SPEED = 1.0
+"""Largest speed of a coordinate for which none is given [rad/s or m/s], as in MoveIt's time parameterisation."""
+
+
+def assume_speeds(model: Any, notes: list[Note]) -> None:
+    """Gives a largest speed to every coordinate without one: to bases that float or roll, and where a file says 0.
+
+    Args:
+        model: Pinocchio model, changed in place.
+        notes: the joints are named in them.
+    """
+    velocity = np.array(model.velocityLimit)
+    given = (velocity > 0.0) & (velocity < _ABSURD)
+    names: dict[str, list[str]] = {}
+    for name, joint in zip(list(model.names)[1:], list(model.joints)[1:], strict=True):
+        part = slice(joint.idx_v, joint.idx_v + joint.nv)
+        if joint.shortname() != MIMIC and not given[part].all():
+            metres = TRANSLATIONS.get(joint.shortname(), 0)
+            units = ["m/s"] * bool(metres) + ["rad/s"] * (joint.nv > metres)
+            names.setdefault(" and ".join(f"{ASSUMED_SPEED:g} {unit}" for unit in units), []).append(name)
+    velocity[~given] = ASSUMED_SPEED
+    _set_speeds(model, velocity)
+    for speed, joints in names.items():
+        what = f"no velocity limit is given: {speed} {'is' if ' and ' not in speed else 'are'} assumed"
+        notes.append(Note(NoteKind.LIMIT, tuple(joints), what, "give it under `limits.velocity`", "warning"))
+
+
+def named(model: Any, name: str, where: str) -> Any:
+    """The joint of a name.
+
+    Raises:
+        UnknownName: there is none; with the nearest one.
+    """
+    if not model.existJointName(name):
+        names = list(model.names)[1:]
+        raise UnknownName(f"{where}: no joint {name!r}{nearest(name, names)}")
+    return model.joints[model.getJointId(name)]
+
+
+def middle(model: Any) -> Array:
+    """Neutral configuration (nq,), with bounded joints at the middle of their range where 0 is outside it."""
+    q = pin.neutral(model)
+    for joint in list(model.joints)[1:]:
+        lower, upper = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
+        if joint.nq == 1 and not lower <= q[joint.idx_q] <= upper:
+            q[joint.idx_q] = 0.5 * (lower + upper)
+    return np.asarray(q)
+
+
+def set_joints(model: Any, q: Array, values: Mapping[str, float], where: str) -> Array:
+    """The configuration q (nq,) with some joints elsewhere.
+
+    Args:
+        model: pinocchio model.
+        q: configuration (nq,).
+        values: joint: value [rad or m]; a joint that mimics another one has to be where that takes it.
+        where: file and field to name in errors.
+
+    Raises:
+        ConfigError, UnknownName: a joint with more than one angle, in conflict with another one, or unknown.
+    """
+    q = q.copy()
+    mimics = [name for name in values if named(model, name, where).shortname() == MIMIC]
+    for name, value in values.items():
+        joint = model.joints[model.getJointId(name)]
+        if name in mimics:
+            continue
+        if joint.nq == 1:
+            q[joint.idx_q] = value
+        elif joint.nq == 2 and joint.nv == 1:
+            q[joint.idx_q : joint.idx_q + 2] = np.cos(value), np.sin(value)
+        else:
+            raise ConfigError(f"{where}: joint {name!r} has {joint.nq} coordinates; give q0 as a list of all of q")
+    for name in mimics:
+        joint = model.joints[model.getJointId(name)]
+        there = joint.extract().scaling * q[joint.idx_q] + joint.extract().offset
+        if abs(values[name] - there) > _SAME:
+            raise ConfigError(f"{where}: {_follows(model, name)}, to {there:g} and not {values[name]:g}; leave it out")
+    return q
+
+
+def _follows(model: Any, name: str) -> str:
+    mimicking, mimicked = list(model.mimicking_joints), list(model.mimicked_joints)
+    leader = mimicked[mimicking.index(model.getJointId(name))]
+    return f"joint {name!r} follows {model.names[leader]!r} (mimic)"
+
+
+def without(model: Any, bodies: Any, locked: Sequence[str], q: Array, where: str) -> tuple[Any, Any, IntArray]:
+    """Model and bodies without the locked joints, and which coordinates of q are left."""
+    ids = [named(model, name, where).id for name in locked]
+    for joint, leader in zip(list(model.mimicking_joints), list(model.mimicked_joints), strict=True):
+        if leader in ids and joint not in ids:
+            ids.append(joint)
+        elif joint in ids and leader not in ids:
+            raise ConfigError(f"{where}: {_follows(model, model.names[joint])}; lock that one")
+    kept = [joint for joint in list(model.joints)[1:] if joint.id not in ids]
+    index = np.array([i for joint in kept for i in range(joint.idx_q, joint.idx_q + joint.nq)], dtype=np.intp)
+    model, bodies = pin.buildReducedModel(model, bodies, ids, q)
+    joints = [body.parentJoint for body in bodies.geometryObjects]
+    for a, b in pair_array(bodies).tolist():
+        if joints[a] == joints[b]:
+            bodies.removeCollisionPair(pin.CollisionPair(a, b))
+    return model, bodies, index

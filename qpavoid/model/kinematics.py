@@ -1,0 +1,157 @@
+"""Forward kinematics and Jacobians of one configuration, by Pinocchio."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from qpavoid.model.views import read_poses, view_poses
+from qpavoid.problem import Array, IntArray
+
+TRANSLATIONS = {
+    "JointModelPX": 1,
+    "JointModelPY": 1,
+    "JointModelPZ": 1,
+    "JointModelPrismaticUnaligned": 1,
+    "JointModelPlanar": 2,
+    "JointModelTranslation": 3,
+    "JointModelFreeFlyer": 3,
+}
+"""How many velocity coordinates of a joint are lengths; they come before its angles."""
+MIMIC = "JointModelMimic"
+"""A joint that another joint's coordinate moves, at a constant ratio; it has none of its own."""
+
+
+class Kinematics(NamedTuple):
+    """Where the tracked frames are, and how everything moves with v, until the next tick overwrites it."""
+
+    J: Array
+    """(6, e) world Jacobian: column j is the twist of joint j [linear velocity of the body point at the world
+    origin; angular velocity], for every joint of the robot. e = nv, and one more for each joint that mimics another
+    one: its column is moved by the other's coordinate, see `columns`."""
+    poses: Array
+    """(f, 12) world poses of the tracked frames: rotation by columns, then position [m]."""
+
+    @property
+    def position(self) -> Array:
+        """(f, 3) world positions of the tracked frames [m]."""
+        return self.poses[:, 9:]
+
+    @property
+    def rotation(self) -> Array:
+        """(f, 3, 3) world orientations of the tracked frames."""
+        return np.swapaxes(self.poses[:, :9].reshape(-1, 3, 3), 1, 2)
+
+
+class ForwardKinematics:
+    """Joint placements, world Jacobian and the poses of some frames, in data that every call overwrites."""
+
+    def __init__(self, model: Any, frame_ids: Sequence[int] = ()) -> None:
+        """Lays the memory out.
+
+        Args:
+            model: pinocchio model.
+            frame_ids: the f frames to keep up to date.
+        """
+        self.data = model.createData()
+        self._model, self._ids = model, list(frame_ids)
+        pin.framesForwardKinematics(model, self.data, pin.neutral(model))
+        view, joints = view_poses(self.data.oMf), view_poses(self.data.oMi)
+        self._copy, self._copy_joints = view is None, joints is None
+        self.J: Array = self.data.J.reshape(6, model.nvExtended, order="F")  # of one joint, it comes as a vector
+        """(6, e) see `Kinematics.J`."""
+        self.frame_poses: Array = read_poses(self.data.oMf) if view is None else view
+        """(frames, 12) world poses of all frames; only those of `frame_ids` are kept up to date."""
+        self.joint_poses: Array = read_poses(self.data.oMi) if joints is None else joints
+        """(njoints, 12) world poses of all joints."""
+
+    def compute(self, q: Array) -> None:
+        """Brings everything to a configuration q (nq,); `data` then holds the joint placements."""
+        model, data = self._model, self.data
+        pin.computeJointJacobians(model, data, q)
+        for frame_id in self._ids:
+            pin.updateFramePlacement(model, data, frame_id)
+        if self._copy:
+            self.frame_poses[:] = read_poses(data.oMf)
+        if self._copy_joints:
+            self.joint_poses[:] = read_poses(data.oMi)
+
+
+def columns(model: Any) -> IntArray:
+    """Which velocity coordinate moves each of the e columns of the world Jacobian (e,)."""
+    index = np.zeros(model.nvExtended, dtype=np.intp)
+    for joint in list(model.joints)[1:]:
+        width = joint.nvExtended
+        index[joint.idx_vExtended : joint.idx_vExtended + width] = np.arange(joint.idx_v, joint.idx_v + width)
+    return index
+
+
+def column_joints(model: Any) -> IntArray:
+    """Which joint each of the e columns of the world Jacobian belongs to (e,)."""
+    widths = [joint.nvExtended for joint in list(model.joints)[1:]]  # that of the world counts for nothing
+    return np.repeat(np.arange(1, model.njoints), widths)
+
+
+def chains(model: Any) -> tuple[Array, Array]:
+    """How far each coordinate turns, and slides, the end of each chain of joints: twice (chains, nv).
+
+    One angle or length of a chain for each coordinate, as a rule; more where a joint mimics another one.
+    """
+    turns, rates = np.ones(model.nvExtended), np.ones(model.nvExtended)
+    for i, joint in enumerate(list(model.joints)[1:], start=1):
+        start = joint.idx_vExtended
+        turns[start : start + lengths(model, i)] = 0.0
+        if joint.shortname() == MIMIC:
+            rates[start] = abs(joint.extract().scaling)
+    ends = np.setdiff1d(np.arange(1, model.njoints), list(model.parents))
+    fold = rates[:, None] * np.eye(model.nv)[columns(model)]
+    support = support_masks(model)[ends]
+    return (support * turns) @ fold, (support * (1.0 - turns)) @ fold
+
+
+def lengths(model: Any, joint: int) -> int:
+    """How many of the velocity coordinates of a joint are lengths; they come before its angles."""
+    name = model.joints[joint].shortname()
+    if name != MIMIC:
+        return TRANSLATIONS.get(name, 0)
+    data = model.createData()
+    pin.computeJointJacobians(model, data, pin.neutral(model))
+    return int(not data.J.reshape(6, -1, order="F")[3:, model.joints[joint].idx_vExtended].any())
+
+
+def longest_lever(model: Any, joint_reach: Array) -> float:
+    """Largest distance that any point of a body can ever have from a joint that turns it [m].
+
+    Lengths of the links in between, one after the other, with what joints can slide; infinite where one can slide
+    without a limit.
+
+    Args:
+        model: pinocchio model.
+        joint_reach: distance from each joint's origin to the farthest point that it carries (njoints,) [m].
+    """
+    lever = np.zeros(model.njoints)  # from the first joint that turns to the origin of each one
+    turned = np.zeros(model.njoints, dtype=bool)
+    lower, upper = np.abs(model.lowerPositionLimit), np.abs(model.upperPositionLimit)
+    for i, joint in enumerate(list(model.joints)[1:], start=1):
+        parent, slides = model.parents[i], lengths(model, i)
+        if turned[parent]:
+            slid = slice(joint.idx_q, joint.idx_q + slides)
+            slide = float(np.maximum(lower[slid], upper[slid]).sum())
+            if slides and joint.shortname() == MIMIC:
+                slide = abs(joint.extract().scaling) * slide + abs(joint.extract().offset)
+            lever[i] = lever[parent] + float(np.linalg.norm(model.jointPlacements[i].translation)) + slide
+        turned[i] = turned[parent] or joint.nvExtended > slides
+    return float(np.max((lever + joint_reach)[turned], initial=0.0))
+
+
+def support_masks(model: Any) -> Array:
+    """Which columns of the world Jacobian move which joint: (njoints, e) of 0 and 1, row 0 (the world) all 0."""
+    mask = np.zeros((model.njoints, model.nvExtended))
+    for joint in range(1, model.njoints):
+        for ancestor in list(model.supports[joint])[1:]:  # without the world, which supports everything
+            start, width = model.joints[ancestor].idx_vExtended, model.joints[ancestor].nvExtended
+            mask[joint, start : start + width] = 1.0
+    return mask

@@ -1,0 +1,135 @@
+"""Which bodies of a robot can collide with each other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from fnmatch import fnmatchcase
+from typing import Any, NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from qpavoid.errors import UnknownName, nearest
+from qpavoid.model.limits import JointBounds
+from qpavoid.model.notes import Note, NoteKind
+from qpavoid.problem import Array, IntArray, Mask
+
+
+def add_self_pairs(model: Any, bodies: Any, disabled: Iterable[tuple[str, str]], origin: str) -> None:
+    """Adds every pair of bodies to `bodies` that is not rigidly connected, adjacent or disabled.
+
+    Args:
+        model: pinocchio model.
+        bodies: its collision bodies, changed in place.
+        disabled: pairs of name patterns, in either order.
+        origin: file to name in errors.
+
+    Raises:
+        UnknownName: a pattern that matches no body.
+    """
+    names = [body.name for body in bodies.geometryObjects]
+    off: set[frozenset[int]] = set()
+    for pattern_a, pattern_b in disabled:
+        matches = [_matching(pattern, names, origin) for pattern in (pattern_a, pattern_b)]
+        off |= {frozenset((i, j)) for i in matches[0] for j in matches[1]}
+    joints = [body.parentJoint for body in bodies.geometryObjects]
+    for i in range(len(names)):
+        for j in range(i + 1, len(names)):
+            a, b = joints[i], joints[j]
+            adjacent = a == b or model.parents[a] == b or model.parents[b] == a
+            if not adjacent and frozenset((i, j)) not in off:
+                bodies.addCollisionPair(pin.CollisionPair(i, j))
+
+
+def _matching(pattern: str, names: list[str], origin: str) -> list[int]:
+    found = [i for i, name in enumerate(names) if fnmatchcase(name, pattern)]
+    if not found:
+        raise UnknownName(f"{origin}: disabled_pairs: no body {pattern!r}{nearest(pattern, names)}")
+    return found
+
+
+ALWAYS = 0.95
+"""Share of random configurations from which on two bodies that touch in them do so by design: a row that is violated in
+nearly every configuration keeps nothing apart. The rest is left to configurations in which a joint is at its limits."""
+
+
+class TouchingPair(NamedTuple):
+    """Two bodies that touch in nearly every configuration."""
+
+    a: str
+    b: str
+    share: float
+    """Share of random configurations in which they touch [-]."""
+
+    def note(self) -> Note:
+        """Say that the pair is not checked."""
+        what = f"not checked: its bodies touch in {100.0 * self.share:.0f} % of random configurations"
+        return Note(NoteKind.PAIR, (self.a, self.b), what, share=self.share)
+
+
+def drop_always_touching(model: Any, bodies: Any, joints: JointBounds, samples: int = 200) -> list[TouchingPair]:
+    """Remove the pairs that touch in nearly every one of many random configurations.
+
+    Those are neighbours whose shapes overlap at the joint, not a threat.
+
+    Args:
+        model: pinocchio model.
+        bodies: its collision bodies with their pairs, changed in place.
+        joints: position limits, within which configurations are drawn; joints without are turned all the way round.
+        samples: how many configurations are drawn, always the same ones.
+
+    Returns:
+        The pairs that were removed.
+    """
+    random, neutral = np.random.default_rng(0), pin.neutral(model)
+    finite = np.isfinite(joints.lower) & np.isfinite(joints.upper)
+    poses = []
+    for _ in range(samples):
+        q = pin.integrate(model, neutral, random.uniform(-np.pi, np.pi, model.nv) * _turns(model))
+        q[joints.q_index[finite]] = random.uniform(joints.lower[finite], joints.upper[finite])
+        poses.append(q)
+    share = contacts(model, bodies, poses, ALWAYS).mean(axis=0)
+    removed = np.flatnonzero(share >= ALWAYS).tolist()
+    pairs, names = pair_array(bodies).tolist(), [body.name for body in bodies.geometryObjects]
+    for index in removed:
+        bodies.removeCollisionPair(pin.CollisionPair(*pairs[index]))
+    return [TouchingPair(names[pairs[i][0]], names[pairs[i][1]], float(share[i])) for i in removed]
+
+
+def _turns(model: Any) -> Array:
+    """(nv,) 1 for coordinates that move, 0 for joints whose range is a point."""
+    turns = np.ones(model.nv)
+    for joint in list(model.joints)[1:]:
+        if joint.nq == joint.nv == 1 and model.lowerPositionLimit[joint.idx_q] == model.upperPositionLimit[joint.idx_q]:
+            turns[joint.idx_v] = 0.0
+    return turns
+
+
+def contacts(model: Any, bodies: Any, poses: Sequence[Array], at_least: float = 0.0) -> Mask:
+    """Find in which configurations the bodies of each pair touch (k, m).
+
+    Args:
+        model: pinocchio model.
+        bodies: collision bodies with their m pairs.
+        poses: k configurations (nq,).
+        at_least: share of the configurations; a pair that cannot come to it any more is not looked at further.
+    """
+    model_data, data, count = model.createData(), bodies.createData(), len(bodies.collisionPairs)
+    found, active = np.zeros((len(poses), count), dtype=bool), np.arange(count)
+    for number, q in enumerate(poses):
+        pin.updateGeometryPlacements(model, model_data, bodies, data, q)
+        pin.computeCollisions(bodies, data, False)
+        found[number, active] = [data.collisionResults[int(i)].isCollision() for i in active]
+        apart = number + 1 - found[: number + 1, active].sum(axis=0)
+        hopeless = apart > (1.0 - at_least) * len(poses)
+        for i in active[hopeless].tolist():
+            data.deactivateCollisionPair(i)
+        active = active[~hopeless]
+        if not len(active):
+            break
+    return found
+
+
+def pair_array(bodies: Any) -> IntArray:
+    """(m, 2) indices of the bodies of each pair."""
+    return np.array([(p.first, p.second) for p in bodies.collisionPairs], dtype=np.intp).reshape(-1, 2)

@@ -1,0 +1,242 @@
+"""A scene: a robot among obstacles, with every pair that has to be watched. Built once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import coal
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike
+
+from qpavoid import config
+from qpavoid.errors import ConfigError, NumericalError, located
+from qpavoid.kernels.obstacles import NEARLY
+from qpavoid.model.cloud import Voxels, read_points
+from qpavoid.model.kinematics import support_masks
+from qpavoid.model.pairs import pair_array
+from qpavoid.model.robot import Robot
+from qpavoid.model.solids import make_solids
+from qpavoid.model.trajectory import Motion, Sample, Still, build_motion
+from qpavoid.problem import Array, IntArray
+
+FAR = 1e4
+"""Where the balls of a cloud wait that stand for no voxel [m]."""
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """A body that moves on its own."""
+
+    name: str
+    shape: config.ObstacleShape
+    motion: Motion
+    moves: bool = True
+    """Whether its motion has to be evaluated at every tick."""
+    graspable: bool = False
+    """Whether `Controller.attach` may let the robot carry it."""
+    external: bool = False
+    """Whether its pose comes from the program that steps the controller, and has to be updated from the start."""
+    source: Path = Path("obstacle")
+    """File to name in errors, from whose folder the paths of meshes and points start."""
+
+    @classmethod
+    def at(
+        cls,
+        name: str,
+        shape: config.ObstacleShape,
+        position: ArrayLike,
+        rotation: ArrayLike | None = None,
+        graspable: bool = False,
+        external: bool = False,
+    ) -> Obstacle:
+        """An obstacle that stays, unless the program that steps the controller says where it is.
+
+        Args:
+            name: by which pairs, logs and `Controller.step(obstacles=…)` know it.
+            shape: its shape; files are looked for in the working directory.
+            position: world position of the shape's origin (3,) [m].
+            rotation: its orientation (3, 3); along the world axes if left out.
+            graspable: whether the robot may carry it.
+            external: whether its pose has to be updated by `Controller.step(obstacles=…)` from the start: the robot
+                stops where it is not. An obstacle that is given in `step` is external from then on.
+
+        Raises:
+            ConfigError: wrong shape, NaN or infinity, no rotation.
+        """
+        try:
+            sample = Sample.at(position, rotation)
+        except NumericalError as error:
+            raise ConfigError(f"obstacle {name!r}: {error}") from None
+        off = float(np.abs(sample.rotation.T @ sample.rotation - np.eye(3)).max())
+        if off > NEARLY or np.linalg.det(sample.rotation) < 0.0:
+            what = "left-handed" if np.linalg.det(sample.rotation) < 0.0 else f"|RᵀR - I| is {off:.2g}"
+            raise ConfigError(f"obstacle {name!r}: rotation: {what}; give a rotation (3, 3)")
+        return cls(name, shape, Still(sample), moves=False, graspable=graspable, external=external)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Bodies of the robot, then obstacles, in one geometry model, and the layout of the pairs among them."""
+
+    robot: Robot
+    obstacles: tuple[Obstacle, ...]
+    """Those that can be carried first."""
+    geometry: Any
+    """pinocchio geometry model: the robot's bodies, then the pieces of the obstacles in their order."""
+    pairs: IntArray
+    """(m, 2) geometry indices; the first of a pair belongs to the robot, or is an obstacle that it may carry."""
+    pair_names: tuple[tuple[str, str], ...]
+    """Names of the bodies of each pair."""
+    support: Array
+    """(m, nv) support of the second body minus that of the first: which coordinates change the distance."""
+    obstacle_of: IntArray
+    """(g,) number of the obstacle that each geometry is a piece of; -1 for the robot's bodies."""
+    clouds: dict[int, Voxels] = field(default_factory=dict)
+    """What is in the point clouds at first, by number of the obstacle."""
+
+    @property
+    def body_names(self) -> list[str]:
+        """Names of the robot's bodies, in the order of the geometry model."""
+        return [body.name for body in self.robot.bodies.geometryObjects]
+
+    @property
+    def obstacle_names(self) -> list[str]:
+        """Names of the obstacles."""
+        return [obstacle.name for obstacle in self.obstacles]
+
+    def slack(self, hold: float) -> Array:
+        """By how much the safety distance of each pair is less than that of the scenario (m,) [m].
+
+        Args:
+            hold: safety distance of the scenario, between surfaces [m].
+        """
+        own = [self.robot.safety_distance(a, b, hold) for a, b in self.pair_names]
+        return hold - np.array(own, dtype=np.float64)
+
+    @property
+    def movable(self) -> int:
+        """Number of geometries, the first ones, that joints move or may come to move."""
+        return len(self.robot.bodies.geometryObjects) + sum(obstacle.graspable for obstacle in self.obstacles)
+
+
+def build_scene(robot: Robot, obstacles: Sequence[Obstacle] = ()) -> Scene:
+    """Lays out the pairs of a robot with itself and with every obstacle.
+
+    Args:
+        robot: the robot with its own pairs.
+        obstacles: the obstacles; each is paired with every body of the robot, and with those that it may carry.
+            Half-spaces have no pair with bodies that no joint moves: a base stands on the ground.
+
+    Raises:
+        ConfigError: an obstacle that has the name of a body or that cannot be carried, a mesh or points that cannot be
+            read.
+    """
+    obstacles = sorted(obstacles, key=lambda obstacle: not obstacle.graspable)
+    geometry = pin.GeometryModel(robot.bodies)
+    bodies = len(robot.bodies.geometryObjects)
+    movable = bodies + sum(obstacle.graspable for obstacle in obstacles)
+    names, obstacle_of = [body.name for body in robot.bodies.geometryObjects], [-1] * bodies
+    clouds: dict[int, Voxels] = {}
+    for number, obstacle in enumerate(obstacles):
+        if obstacle.name in names:
+            raise ConfigError(f"obstacles: {obstacle.name!r} is the name of a body of {robot.name}: rename it")
+        start, shape = obstacle.motion.sample(0.0), obstacle.shape
+        placement = pin.SE3(start.rotation, start.position)
+        where, folder = f"obstacles: {obstacle.name!r}: shape", obstacle.source.parent
+        solids = make_solids(shape, folder, where)
+        if obstacle.graspable and (len(solids) > 1 or isinstance(shape, config.HalfSpace | config.PointCloud)):
+            raise ConfigError(
+                f"obstacles: {obstacle.name!r}: a {shape.type} cannot be carried; give a primitive, or a mesh with "
+                "`method: convex`"
+            )
+        first = len(names)
+        if isinstance(shape, config.PointCloud):
+            clouds[number] = _points(shape, folder, where)
+            solids, placement = solids * (movable * shape.nearest), pin.SE3(np.eye(3), np.array([FAR, 0.0, 0.0]))
+        for solid in solids:
+            piece = f"{obstacle.name}[{len(names) - first}]" if len(solids) > 1 else obstacle.name
+            index = geometry.addGeometryObject(pin.GeometryObject(piece, 0, 0, placement, solid))
+            names.append(obstacle.name)
+            obstacle_of.append(number)
+            others = range(min(index, movable))
+            if isinstance(shape, config.PointCloud):
+                others = range((index - first) // shape.nearest, (index - first) // shape.nearest + 1)
+            for other in others:
+                fixed = other < bodies and geometry.geometryObjects[other].parentJoint == 0
+                if not (fixed and isinstance(shape, config.HalfSpace)):
+                    geometry.addCollisionPair(pin.CollisionPair(other, index))
+    _without_cylinders_among_spheres(geometry)
+    pairs = pair_array(geometry)
+    pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]  # in the order in which bounding spheres are compared
+    geometry.removeAllCollisionPairs()
+    for a, b in pairs.tolist():
+        geometry.addCollisionPair(pin.CollisionPair(a, b))
+    joints = np.array([body.parentJoint for body in geometry.geometryObjects], dtype=np.intp)
+    masks = support_masks(robot.model)
+    return Scene(
+        robot=robot,
+        obstacles=tuple(obstacles),
+        geometry=geometry,
+        pairs=pairs,
+        pair_names=tuple((names[a], names[b]) for a, b in pairs),
+        support=masks[joints[pairs[:, 1]]] - masks[joints[pairs[:, 0]]],
+        obstacle_of=np.array(obstacle_of, dtype=np.intp),
+        clouds=clouds,
+    )
+
+
+def _without_cylinders_among_spheres(geometry: Any) -> None:
+    """Where there are cylinders, spheres become capsules of no length.
+
+    coal 3.0 has a formula of its own for spheres and cylinders, which is wrong by centimetres once the centre of the
+    sphere is inside; for capsules it iterates.
+    """
+    bodies = geometry.geometryObjects
+    if any(isinstance(body.geometry, coal.Cylinder) for body in bodies):
+        for body in bodies:
+            if isinstance(body.geometry, coal.Sphere):
+                body.geometry = coal.Capsule(body.geometry.radius, 0.0)
+
+
+def _points(shape: config.PointCloud, folder: Path, where: str) -> Voxels:
+    if shape.path is None:
+        return Voxels.of(np.zeros((0, 3)), shape.resolution)
+    voxels = Voxels.of(read_points(folder / shape.path, f"{where}.path"), shape.resolution)
+    if voxels.dropped:
+        raise ConfigError(
+            f"{where}.path: {voxels.dropped} of {voxels.given} points are NaN, infinite or over 100 m away; leave them "
+            "out"
+        )
+    return voxels
+
+
+def build_obstacles(configs: Sequence[config.ObstacleConfig], source: Path) -> list[Obstacle]:
+    """Obstacles of a scenario.
+
+    Args:
+        configs: the scenario's `obstacles`.
+        source: scenario file, named in errors and the start of relative paths.
+
+    Raises:
+        ConfigError: a motion that cannot be built.
+    """
+    obstacles = []
+    for index, c in enumerate(configs):
+        with located(f"{source}: obstacles.{index}"):
+            motion = build_motion(c.motion, None, source.parent)
+        obstacles.append(
+            Obstacle(
+                c.name,
+                c.shape,
+                motion,
+                moves=not isinstance(c.motion, config.Fixed),
+                graspable=c.graspable or c.carried_by is not None,
+                external=c.source == "external",
+                source=source,
+            )
+        )
+    return obstacles

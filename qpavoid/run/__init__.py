@@ -1,0 +1,1 @@
+"""Closed loops: simulation, log, key figures, batches."""

@@ -1,0 +1,275 @@
+"""Closed loop: runs a scenario tick by tick and records it."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from qpavoid.config import Mesh, PointCloud, ScenarioConfig
+from qpavoid.config.loading import load_scenario
+from qpavoid.control.distances import DistanceQuery
+from qpavoid.control.tasks.frames import in_order
+from qpavoid.controller import Controller, Tick
+from qpavoid.errors import ConfigError, NumericalError
+from qpavoid.geometry.bodies import enclosing_capsule
+from qpavoid.model.scene import FAR, Scene
+from qpavoid.model.solids import drawn_triangles
+from qpavoid.problem import Array, Solution, Status
+from qpavoid.run.log import STATUSES, Log, versions
+from qpavoid.solvers import gains, parse_solver
+
+_MOST_EVENTS = 1000
+"""Number of events that a log keeps."""
+
+
+class StartWarning(UserWarning):
+    """The initial configuration is in collision or outside its limits; the run goes on from there."""
+
+
+def simulate(
+    scenario: ScenarioConfig | str,
+    solver: str | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Log:
+    """Runs a scenario with velocities that are followed exactly: q ⊕ v dt.
+
+    A run that is interrupted from the keyboard, or in which the loop itself fails, gives the log of what it did;
+    `meta["completed"]` is then false and `meta["stopped_by"]` says why.
+
+    Args:
+        scenario: configuration, shipped name or path.
+        solver: replaces the scenario's solver, as in `eq10` or `qp:proxqp`.
+        progress: called after each tick with the number done and the number in all.
+
+    Raises:
+        ConfigError, UnknownName, SolverNotInstalled: the scenario cannot be built.
+    """
+    if isinstance(scenario, str):
+        scenario = load_scenario(scenario, solver=solver)
+    elif solver is not None:
+        settings = parse_solver(solver, scenario.solver)
+        scenario = scenario.model_copy(update={"solver": settings})
+    controller, q = Controller.from_scenario(scenario)
+    _check_start(controller, q, scenario)
+    model, ticks = controller.scene.robot.model, round(scenario.duration / scenario.dt) + 1
+    try:
+        recorder = Recorder(controller, scenario, ticks)
+    except MemoryError:
+        raise ConfigError(
+            f"{scenario.source}: duration: {ticks} ticks do not fit into memory; shorten it, or lengthen dt"
+        ) from None
+    stopped_by = None
+    try:
+        for k in range(ticks):
+            tick = controller.tick(q, k * scenario.dt)
+            recorder.add(tick)
+            q = pin.integrate(model, q, tick.solution.v * scenario.dt)
+            if progress is not None:
+                progress(k + 1, ticks)
+    except KeyboardInterrupt:
+        stopped_by = "interrupted from the keyboard"
+    except NumericalError as error:
+        stopped_by = str(error)
+    return recorder.log(stopped_by)
+
+
+def _check_start(controller: Controller, q: Array, scenario: ScenarioConfig) -> None:
+    robot, source = controller.scene.robot, scenario.source
+    bounds, here = robot.bounds(), q[robot.bounds().q_index]
+    for i in np.flatnonzero((here < bounds.lower) | (here > bounds.upper)):
+        joint = robot.coordinate_names[bounds.v_index[i]]
+        warnings.warn(
+            f"{source}: q0: {joint} = {here[i]:g} lies outside its limits [{bounds.lower[i]:g}, {bounds.upper[i]:g}] "
+            "[rad or m]",
+            StartWarning,
+            stacklevel=3,
+        )
+    proximity = controller.tick(q, 0.0).proximity
+    controller.reset()  # that tick was not taken: the run begins at rest
+    for i in np.flatnonzero(proximity.distance < 0.0):
+        a, b = controller.scene.pair_names[proximity.pair[i]]
+        depth = -1e3 * proximity.distance[i]
+        warnings.warn(f"{source}: q0: {a} and {b} overlap by {depth:.1f} mm at the start", StartWarning, stacklevel=3)
+
+
+class Recorder:
+    """Writes ticks into arrays laid out beforehand; whatever was written can be taken as a log at any time."""
+
+    def __init__(self, controller: Controller, scenario: ScenarioConfig, ticks: int) -> None:
+        """Lays the arrays out for at most `ticks` ticks."""
+        scene, model = controller.scene, controller.scene.robot.model
+        self._scene, self._scenario = scene, scenario
+        self._frames, self._others = in_order(controller.tasks)
+        self._controller = controller
+        self._data, self._query = model.createData(), DistanceQuery(scene)  # distances of all pairs, near or not
+        self._ends, self._radii = _drawing_axes(scene.robot.bodies)
+        tasks, bodies, obstacles = len(self._frames), len(scene.body_names), len(scene.obstacles)
+        shapes: dict[str, tuple[int, ...]] = {
+            "t": (), "q": (model.nq,), "v": (model.nv,),
+            "target": (tasks, 3), "tool": (tasks, 3), "tool_rotation": (tasks, 3, 3), "turn_error": (tasks,),
+            "task_error": (len(self._others),),
+            "body_distance": (bodies,), "alpha": (), "beta": (), "slack": (), "share": (), "saturation": (),
+            "build_time": (), "solve_time": (),
+            "body_ends": (bodies, 2, 3), "obstacle_position": (obstacles, 3), "obstacle_rotation": (obstacles, 3, 3),
+        }  # fmt: skip
+        self._arrays: dict[str, Any] = {name: np.zeros((ticks, *shape)) for name, shape in shapes.items()}
+        self._arrays["closest_pair"] = np.full(ticks, -1, dtype=np.intp)
+        self._arrays["status"] = np.zeros(ticks, dtype=np.int8)
+        self._arrays["stalled"] = np.zeros(ticks, dtype=np.bool_)
+        self._arrays["severity"] = np.zeros(ticks, dtype=np.int8)
+        self._events: list[list[Any]] = []
+        self._keys: tuple[object, ...] = ()
+        self._count = 0
+
+    def add(self, tick: Tick) -> None:
+        """Writes one tick."""
+        rows = {name: array[self._count] for name, array in self._arrays.items() if array.ndim > 1}
+        scalars = {name: array for name, array in self._arrays.items() if array.ndim == 1}
+        state, solution, rows_avoid = tick.state, tick.solution, tick.problem.avoidance
+        rows["q"][:], rows["v"][:] = state.q, solution.v
+        rows["tool"][:], rows["tool_rotation"][:] = tick.kinematics.position, tick.kinematics.rotation
+        rows["task_error"][:] = tick.errors
+        for i, (task, target) in enumerate(zip(self._frames, tick.targets, strict=False)):
+            rows["target"][i] = target.position if task.moves else rows["tool"][i]
+            if task.turns:
+                error = pin.log3(target.rotation @ tick.kinematics.rotation[i].T)
+                rows["turn_error"][i] = np.linalg.norm(error)
+        self._write_bodies(tick, rows)
+        values = {
+            "t": state.t,
+            "slack": 0.0 if solution.slack is None else float(np.max(solution.slack, initial=0.0)),
+            "share": solution.share,
+            "stalled": bool(solution.stalled),
+            "severity": solution.severity or 0,
+            "saturation": solution.saturation,
+            "build_time": solution.build_time,
+            "solve_time": solution.solve_time,
+            "status": STATUSES.index(solution.status),
+        }
+        if len(rows_avoid.d):
+            d = rows_avoid.d.min(keepdims=True)
+            values["alpha"] = gains.alpha(d, rows_avoid.d2)[0]
+            values["beta"] = gains.beta(d, rows_avoid.d1, rows_avoid.d2)[0]
+        for name, value in values.items():
+            scalars[name][self._count] = value
+        self._count += 1
+        self._note(state.t, solution)
+
+    def _note(self, t: float, solution: Solution) -> None:
+        """Keep the status and reasons of a step where they differ from those before in more than amounts."""
+        reasons = (*solution.reasons, *solution.stalled, *solution.assumptions)
+        keys = (solution.status, *[(*reason.key, reason.severity) for reason in reasons])
+        eventful = solution.status is not Status.SOLVED or reasons
+        if keys != self._keys and eventful and len(self._events) < _MOST_EVENTS:
+            self._events.append([t, solution.status.value, [reason.as_dict() for reason in reasons]])
+        self._keys = keys
+
+    def _write_bodies(self, tick: Tick, rows: dict[str, Array]) -> None:
+        scene = self._scene
+        pin.forwardKinematics(scene.robot.model, self._data, tick.state.q)
+        self._controller.tell_who_carries(self._query)
+        bearer = np.arange(len(scene.geometry.geometryObjects))
+        for i, obstacle in enumerate(scene.obstacles):
+            carried = i in self._query.carried
+            sample = (
+                self._controller.obstacle_pose(obstacle.name, tick.state.q)
+                if carried
+                else obstacle.motion.sample(tick.state.t)
+            )
+            rows["obstacle_position"][i], rows["obstacle_rotation"][i] = sample.position, sample.rotation
+            if carried:
+                bearer[np.flatnonzero(scene.obstacle_of == i)] = _bearer(scene, self._query.carried[i])
+            elif obstacle.moves:
+                self._query.place_obstacle(i, sample)
+        self._query.compute(self._data, np.inf)
+        distance, pairs = np.full(len(scene.pairs), np.inf), self._query.pairs
+        distance[pairs] = self._query.results[pairs, 0]
+        distance[distance > 0.5 * FAR] = np.inf
+        if np.isfinite(distance).any():
+            self._arrays["closest_pair"][self._count] = np.argmin(distance)
+        nearest = np.full(len(scene.geometry.geometryObjects), np.inf)
+        np.minimum.at(nearest, bearer[scene.pairs[:, 0]], distance)
+        np.minimum.at(nearest, bearer[scene.pairs[:, 1]], distance)
+        rows["body_distance"][:] = nearest[: rows["body_distance"].shape[0]]
+        for i, body in enumerate(scene.robot.bodies.geometryObjects):
+            joint = self._data.oMi[body.parentJoint]
+            rows["body_ends"][i] = self._ends[i] @ joint.rotation.T + joint.translation
+
+    def log(self, stopped_by: str | None = None) -> Log:
+        """What was written so far.
+
+        Args:
+            stopped_by: why the run ended before its time, if it did.
+        """
+        scene, robot = self._scene, self._scene.robot
+        bounds = robot.bounds()
+        meta = {
+            "scenario": self._scenario.source.stem,
+            "title": self._scenario.title,
+            "solver": self._scenario.solver.label,
+            "config": self._scenario.model_dump(mode="json"),
+            "source": self._scenario.source.name,
+            "completed": stopped_by is None and self._count == len(self._arrays["t"]),
+            "stopped_by": stopped_by,
+            "events": self._events,
+            "robot": robot.name,
+            "notes": [str(note) for note in robot.notes],
+            "coordinates": robot.coordinate_names,
+            "units": robot.coordinate_units,
+            "velocity_limit": [v if np.isfinite(v) else None for v in bounds.velocity],
+            "position_limits": [
+                [robot.coordinate_names[v], lower, upper]
+                for v, lower, upper in zip(bounds.v_index, bounds.lower.tolist(), bounds.upper.tolist(), strict=True)
+            ],
+            "frames": [task.settings.label for task in self._frames],
+            "tasks": [[task.settings.label, task.unit] for task in self._others],
+            "bodies": scene.body_names,
+            "body_radii": self._radii,
+            "obstacles": [_described(scene, i) for i in range(len(scene.obstacles))],
+            "pairs": [list(pair) for pair in scene.pair_names],
+            "versions": versions(),
+        }
+        arrays = {name: array[: self._count].copy() for name, array in self._arrays.items()}
+        return Log(**arrays, meta=meta)
+
+
+def _bearer(scene: Scene, joint: int) -> int:
+    """The body to which distances of a load count: the first on the joint that carries it, or on one above."""
+    joints, parents = [body.parentJoint for body in scene.robot.bodies.geometryObjects], scene.robot.model.parents
+    while joint and joint not in joints:
+        joint = int(parents[joint])
+    return joints.index(joint) if joint in joints else 0
+
+
+_MOST_DRAWN = 2000
+"""Triangles or voxels of an obstacle that a log keeps for its figures."""
+
+
+def _described(scene: Scene, index: int) -> dict[str, Any]:
+    """Name and shape of an obstacle, and what figures need of those that come from files."""
+    obstacle = scene.obstacles[index]
+    described: dict[str, Any] = {"name": obstacle.name, "shape": obstacle.shape.model_dump(mode="json")}
+    if isinstance(obstacle.shape, Mesh):
+        solids = [scene.geometry.geometryObjects[int(g)].geometry for g in np.flatnonzero(scene.obstacle_of == index)]
+        triangles = np.concatenate([drawn_triangles(solid) for solid in solids])
+        described["triangles"] = np.round(triangles[:: -(-len(triangles) // _MOST_DRAWN)], 5).tolist()
+    elif isinstance(obstacle.shape, PointCloud):
+        centers = scene.clouds[index].centers
+        described["voxels"] = np.round(centers[:: -(-len(centers) // _MOST_DRAWN) or 1], 5).tolist()
+    return described
+
+
+def _drawing_axes(bodies: Any) -> tuple[Array, list[float]]:
+    """Axis ends in the parent joint's frame (b, 2, 3) and radius of each body, or of the capsule around it."""
+    ends, radii = np.empty((len(bodies.geometryObjects), 2, 3)), []
+    for i, body in enumerate(bodies.geometryObjects):
+        fit = enclosing_capsule(body.geometry)
+        half = 0.5 * fit.length * fit.rotation[:, 2]
+        local = np.array([fit.center - half, fit.center + half])
+        ends[i] = local @ body.placement.rotation.T + body.placement.translation
+        radii.append(fit.radius)
+    return ends, radii

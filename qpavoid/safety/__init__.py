@@ -1,0 +1,1 @@
+"""Turn a solution into a command: look-ahead, backup trajectories, progress."""

@@ -1,0 +1,267 @@
+"""Command line: `qpavoid robot check | add`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any, get_args
+
+import typer
+from rich.markup import escape
+
+from qpavoid.config.base import LARGEST
+from qpavoid.config.shipped import find_robot
+from qpavoid.errors import ConfigError
+from qpavoid.model.notes import Note
+from qpavoid.run.report import to_json
+from qpavoid.run.terminal import ERR, OUT
+from qpavoid.setup.add import Described, Root, Wishes, describe
+from qpavoid.setup.check import check_robot
+from qpavoid.setup.findings import Joint, Report
+from qpavoid.setup.fit import Bodies
+from qpavoid.setup.sampling import SAMPLES, SEED
+from qpavoid.setup.texts import description_files, home_line, note_lines, pairs_line, volume_line
+from qpavoid.setup.written import write_files
+
+app = typer.Typer(no_args_is_help=True, help="Look a robot over, or describe one for the first time.")
+
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else on stdout.")]
+PackageDirs = Annotated[
+    list[Path] | None, typer.Option("--package-dir", help="Folder in which package:// meshes are looked up.")
+]
+Packages = Annotated[
+    list[str] | None, typer.Option("--package", metavar="NAME=FOLDER", help="Folder of one ROS package.")
+]
+MissingMeshes = Annotated[
+    bool, typer.Option("--allow-missing-meshes", help="Leave out shapes whose mesh cannot be found, and name them.")
+]
+RootJoint = Annotated[str, typer.Option("--root", help=f"How it stands: {', '.join(get_args(Root))}.")]
+
+
+@app.command()
+def check(
+    robot: Annotated[str, typer.Argument(help="URDF, MJCF, robot.yaml, or the name of a robot that ships.")],
+    root: RootJoint = "fixed",
+    package_dir: PackageDirs = None,
+    package: Packages = None,
+    allow_missing_meshes: MissingMeshes = False,
+    json: Json = False,
+) -> None:
+    """Look a robot over: joints, limits, geometry, pairs, home pose, time of a step; each problem with its remedy.
+
+    The exit status is 1 when it cannot be used as it is.
+    """
+    report = check_robot(
+        robot, _one_of(root, Root, "--root"), _entries(package_dir, package), allow_missing_meshes, Progress()
+    )
+    if json:
+        print(to_json({**asdict(report), "usable": report.usable}))
+    else:
+        for line in _check_lines(report):
+            OUT.print(line, highlight=False, soft_wrap=True)
+    raise typer.Exit(0 if report.usable else 1)
+
+
+def _check_lines(report: Report) -> Iterator[str]:
+    yield f"[bold]{escape(report.name)}[/]  {escape(report.source)}"
+    yield f"coordinates    {report.nq} in q, {report.nv} in v"
+    for kind in dict.fromkeys(joint.kind for joint in report.joints):
+        of_kind = [joint for joint in report.joints if joint.kind == kind]
+        yield f"{kind:<14} {len(of_kind)}: {escape(', '.join(_joint_text(joint) for joint in of_kind))}"
+    yield f"frames         {len(report.frames)}"
+    shapes = ", ".join(f"{count} {shape}" for shape, count in report.shapes.items()) or "none"
+    yield f"geometry       {shapes}; {report.triangles} triangles"
+    if report.load_seconds is not None:
+        yield f"bodies, pairs  {report.bodies}, {report.pairs}; loaded in {report.load_seconds:.2f} s"
+    yield f"end effectors  {escape(', '.join(report.end_effectors) or 'none recognised')}"
+    if report.tick_us is not None:
+        yield f"control step   {report.tick_us:.0f} µs (median, tracks the end effectors, no obstacles)"
+    if report.clearance is not None:
+        yield f"home           least distance {1e3 * report.clearance:.1f} mm"
+    for frame, limb in report.conditioning.items():
+        yield f"{'':14} {escape(frame)}: {limb}"
+    yield from _table(report.notes)
+    if not report.notes:
+        yield "no problem found"
+
+
+def _table(notes: Sequence[Note]) -> Iterator[str]:
+    """What was left out, mended, replaced or assumed, coloured by severity."""
+    colours = {"error": "red", "warning": "yellow", "note": "dim"}
+    for line in note_lines(notes):
+        severity = line.partition(" ")[0]
+        colour = colours.get(severity)
+        yield f"[{colour}]{severity}[/]{escape(line.removeprefix(severity))}" if colour else escape(line)
+
+
+def _joint_text(joint: Joint) -> str:
+    words = joint.name + (f" mimics {joint.mimics}" if joint.mimics else "") + (" locked" if joint.locked else "")
+    if joint.lower is None and joint.upper is None:
+        return words
+    lower, upper = ("-∞" if joint.lower is None else f"{joint.lower:.3g}"), (
+        "∞" if joint.upper is None else f"{joint.upper:.3g}")  # fmt: skip
+    return f"{words} [{lower}, {upper}]"
+
+
+@app.command()
+def add(
+    path: Annotated[str, typer.Argument(help="URDF or MJCF.")],
+    name: Annotated[str | None, typer.Option(help="Of the robot; that of the file if left out.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for what is written; NAME if left out.")] = None,
+    bodies: Annotated[
+        list[str] | None,
+        typer.Option(metavar="KIND|LINK=KIND", help=f"Bodies: {', '.join(get_args(Bodies))}; also for single links."),
+    ] = None,
+    root: RootJoint = "fixed",
+    lock: Annotated[list[str] | None, typer.Option(help="Joint to hold at home for good; * and ? match.")] = None,
+    home: Annotated[
+        list[str] | None, typer.Option(metavar="JOINT=VALUE", help="Of a home pose to prefer [rad or m].")
+    ] = None,
+    package_dir: PackageDirs = None,
+    package: Packages = None,
+    allow_missing_meshes: MissingMeshes = False,
+    srdf: Annotated[Path | None, typer.Option(help="SRDF to honour; one beside the URDF if left out.")] = None,
+    samples: Annotated[int, typer.Option(min=1, max=1_000_000, help="Configurations drawn to judge pairs.")] = SAMPLES,
+    seed: Annotated[int, typer.Option(min=0, help="Of the draw.")] = SEED,
+    picture: Annotated[bool, typer.Option("--picture/--no-picture", help="Draw the bodies.")] = True,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite files that were edited.")] = False,
+    json: Json = False,
+) -> None:
+    """Write a robot.yaml with collision bodies, pairs, a home pose and end effectors."""
+    begin = time.perf_counter()
+    kind, by_link = _kinds(bodies or [])
+    wishes = Wishes(
+        name=name, bodies=kind, bodies_of=by_link, root=_one_of(root, Root, "--root"), lock=tuple(lock or ()),
+        home=_values(home or []), package_dirs=_entries(package_dir, package),
+        allow_missing_meshes=allow_missing_meshes, srdf=srdf, samples=samples, seed=seed,
+    )  # fmt: skip
+    urdf = find_robot(path)
+    if urdf.suffix in (".yaml", ".yml"):
+        raise ConfigError(f"{path}: is described already; give a URDF or MJCF")
+    described = describe(urdf, wishes, Progress())
+    folder = out or Path(described.config.name)
+    files = description_files(described, folder)
+    if picture and (drawn := _picture(described)) is not None:
+        files[folder / "bodies.png"] = drawn
+    outcome = write_files(files, force)
+    seconds = time.perf_counter() - begin
+    if json:
+        print(to_json(_document(described, outcome, seconds)))
+    else:
+        _report(described, outcome, seconds)
+
+
+def _kinds(given: list[str]) -> tuple[Bodies, dict[str, Bodies]]:
+    kind: Bodies = "auto"
+    by_link: dict[str, Bodies] = {}
+    for text in given:
+        link, equals, value = text.rpartition("=")
+        chosen = _one_of(value, Bodies, f"--bodies {text}")
+        if equals:
+            by_link[link] = chosen
+        else:
+            kind = chosen
+    return kind, by_link
+
+
+def _values(given: list[str]) -> dict[str, float]:
+    values = {}
+    for text in given:
+        joint, equals, value = text.rpartition("=")
+        try:
+            values[joint] = float(value)
+        except ValueError:
+            equals = ""
+        if not equals or not abs(values[joint]) <= LARGEST:  # NaN as well
+            raise ConfigError(f"--home {text}: expected JOINT=VALUE, as in elbow=1.57")
+    return values
+
+
+def _entries(folders: list[Path] | None, packages: list[str] | None) -> tuple[str, ...]:
+    """Entries of `package_dirs`: packages by name first."""
+    for text in packages or []:
+        name, equals, folder = text.partition("=")
+        if not (name and equals and folder):
+            raise ConfigError(f"--package {text}: expected NAME=FOLDER, as in my_robot=~/src/my_robot")
+        if not Path(folder).is_dir():
+            raise ConfigError(f"--package {text}: no such folder {folder!r}")
+    return (*(packages or ()), *(str(folder) for folder in folders or ()))
+
+
+def _one_of(value: str, kind: Any, option: str) -> Any:
+    if value not in get_args(kind):
+        raise ConfigError(f"{option}: {value!r} is none of {', '.join(get_args(kind))}")
+    return value
+
+
+def _picture(described: Described) -> bytes | None:
+    try:
+        from qpavoid.setup.picture import bodies_picture
+    except ModuleNotFoundError as missing:
+        if missing.name is None or missing.name.split(".")[0] not in ("matplotlib", "mpl_toolkits"):
+            raise
+        ERR.print("no picture: matplotlib is missing; pip install 'qpavoid\\[plots]'", highlight=False)
+        return None
+    return bodies_picture(described)
+
+
+def _document(described: Described, outcome: dict[Path, str], seconds: float) -> dict[str, Any]:
+    links, home = described.links.values(), described.home
+    return {
+        "name": described.config.name,
+        "files": {str(path): what for path, what in outcome.items()},
+        "bodies": len(described.robot.bodies.geometryObjects),
+        "bodies_volume": sum(link.volume for link in links),
+        "hulls_volume": sum(link.hulls for link in links),
+        "geometry_volume": sum(link.inside for link in links),
+        "pairs": dict(described.counts),
+        "pair_margins": [own.model_dump() for own in described.config.pair_margins],
+        "left_out": [asdict(entry) for entry in described.left_out],
+        "samples": described.wishes.samples,
+        "seed": described.wishes.seed,
+        "srdf": None if described.honoured is None else str(described.honoured),
+        "end_effectors": list(described.config.end_effectors),
+        "home": dict(described.config.home),
+        "lock": dict(described.config.lock),
+        "clearance": home.clearance,
+        "nearest": home.nearest,
+        "conditioning": {frame: asdict(limb) for frame, limb in home.conditioning.items()},
+        "notes": [asdict(note) for note in described.notes],
+        "seconds": seconds,
+    }
+
+
+def _report(described: Described, outcome: dict[Path, str], seconds: float) -> None:
+    for line in (
+        f"bodies         {volume_line(described)}",
+        f"pairs          {pairs_line(described)}",
+        f"end effectors  {', '.join(described.config.end_effectors) or 'none recognised'}",
+        f"home           {home_line(described)}",
+    ):
+        OUT.print(line, highlight=False, markup=False, soft_wrap=True)
+    for line in _table(described.notes):
+        OUT.print(line, highlight=False, soft_wrap=True)
+    for line in (
+        *(f"{what:<14} {path}" for path, what in outcome.items()),
+        f"               in {seconds:.1f} s; in a scenario: `robot: {next(iter(outcome))}`",
+    ):
+        OUT.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+class Progress:
+    """Says on stderr what is done, as soon as it takes long and then every other second."""
+
+    def __init__(self) -> None:
+        self._next = time.perf_counter() + _PATIENCE
+
+    def __call__(self, what: str) -> None:
+        """What is done next."""
+        if time.perf_counter() >= self._next:
+            ERR.print(f"{what} …", style="dim", highlight=False, markup=False, soft_wrap=True)
+            self._next = time.perf_counter() + _PATIENCE
+
+
+_PATIENCE = 2.0
+"""Time between two lines [s]."""

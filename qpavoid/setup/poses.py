@@ -1,0 +1,115 @@
+"""Poses of a robot's joints: those that an SRDF names, and those at which joints are held."""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from qpavoid.errors import ConfigError, UnknownName, nearest
+from qpavoid.model.joints import middle
+from qpavoid.model.kinematics import MIMIC
+from qpavoid.model.notes import Note, NoteKind
+from qpavoid.model.robot import Robot
+from qpavoid.model.urdf import is_mjcf
+from qpavoid.model.xml_file import read_robot_xml
+from qpavoid.problem import Array
+from qpavoid.setup.srdf import Semantics
+
+_DIGITS = 5
+"""After the point, of positions in files [rad or m]."""
+
+
+def wished_homes(robot: Robot, semantics: Semantics) -> list[Array]:
+    """Named poses of the SRDF, then the middle of the joints' ranges; rounded, and within the limits."""
+    states: list[Mapping[str, float]] = [*semantics.states.values(), {}]
+    return [_posed(robot.model, robot.home, state) for state in states]
+
+
+def _posed(model: Any, q: Array, state: Mapping[str, float]) -> Array:
+    values = {**joint_values(model, q), **{name: value for name, value in state.items() if model.existJointName(name)}}
+    q = q.copy()
+    for name, value in values.items():
+        joint = model.joints[model.getJointId(name)]
+        if joint.nq == 1:
+            low, high = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
+            q[joint.idx_q] = np.clip(round(value, 4), low, high) if low < high else round(value, 4)
+        elif joint.nq == 2:
+            q[joint.idx_q : joint.idx_q + 2] = math.cos(round(value, 4)), math.sin(round(value, 4))
+    return q
+
+
+def joint_values(model: Any, q: Array) -> dict[str, float]:
+    """Position of every joint that one number describes [rad or m]."""
+    values = {}
+    for name, joint in zip(list(model.names)[1:], list(model.joints)[1:], strict=True):
+        if joint.nq == 1:
+            values[name] = round(float(q[joint.idx_q]), _DIGITS)
+        elif joint.nq == 2 and joint.nv == 1:
+            values[name] = round(math.atan2(q[joint.idx_q + 1], q[joint.idx_q]), _DIGITS)
+    return values
+
+
+def locks(
+    urdf: Path,
+    model: Any,
+    patterns: Sequence[str],
+    semantics: Semantics,
+    notes: list[Note],
+    wheels: Sequence[str] = (),
+) -> dict[str, float]:
+    """Joints that are held, and where: those the user names, wheels, and joints that could not follow another one.
+
+    A joint that mimics another one follows it without a coordinate of its own, and the other one stays free. Where
+    Pinocchio cannot read the two so, they would move on their own, which they cannot, and both are held.
+    """
+    names = list(model.names)[1:]
+    held = []
+    for pattern in patterns:
+        found = [name for name in names if fnmatchcase(name, pattern)]
+        if not found:
+            raise UnknownName(f"--lock: no joint {pattern!r}{nearest(pattern, names)}")
+        held += found
+    if wheels := [name for name in wheels if name not in held]:
+        what = "locked: wheels of a mobile base, whose own coordinates move it"
+        notes.append(Note(NoteKind.JOINT, tuple(wheels), what, "take them out of `lock` to drive them"))
+    held += wheels
+    followers = {name: source for name, source in mimics(urdf).items() if name in names}
+    apart = {name for name in followers if model.joints[model.getJointId(name)].shortname() != MIMIC}
+    coupled = [name for name in names if name in apart or name in {followers[other][0] for other in apart}]
+    if coupled := [name for name in coupled if name not in held]:
+        what = "locked: they move together (mimic), in a way that the model cannot hold"
+        notes.append(Note(NoteKind.JOINT, tuple(coupled), what, severity="warning"))
+    led = dict.fromkeys(source for name, (source, _, _) in followers.items() if name not in apart)
+    if drivers := [name for name in led if name not in (*held, *coupled)]:
+        what = "free, and moved for avoidance: others follow them (mimic), as fingers do"
+        notes.append(Note(NoteKind.JOINT, tuple(drivers), what, f"--lock {drivers[0]} where something else moves it"))
+    state = next(iter(semantics.states.values()), {})
+    start = joint_values(model, _posed(model, middle(model), state))
+    values = {}
+    for name in [*held, *coupled]:
+        if model.joints[model.getJointId(name)].shortname() == MIMIC:
+            continue  # it is held with the one that it follows
+        if name not in start:
+            raise ConfigError(f"--lock: joint {name!r} is not described by one number and cannot be held; leave it out")
+        leader, multiplier, offset = followers.get(name, (name, 1.0, 0.0))
+        values[name] = round(multiplier * start.get(leader, 0.0) + offset, _DIGITS)
+    return values
+
+
+def mimics(urdf: Path) -> dict[str, tuple[str, float, float]]:
+    """Joint: the one that it follows, multiplier and offset."""
+    if is_mjcf(urdf):
+        return {}
+    found: dict[str, tuple[str, float, float]] = {}
+    for joint in read_robot_xml(urdf, "URDF").iter("joint"):
+        mimic: ET.Element | None = joint.find("mimic")
+        if mimic is not None:
+            numbers = float(mimic.get("multiplier", "1")), float(mimic.get("offset", "0"))
+            found[joint.get("name", "")] = (mimic.get("joint", ""), *numbers)
+    return found

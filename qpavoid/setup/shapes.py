@@ -1,0 +1,154 @@
+"""The bodies of a robot's links, as a robot.yaml lists them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from functools import cached_property
+from typing import Any
+
+import coal
+import numpy as np
+import pinocchio as pin
+
+from qpavoid.config import Body, Box, Capsule, Cylinder, Hull, Sphere
+from qpavoid.errors import UnknownName, nearest
+from qpavoid.geometry.bodies import hull_points
+from qpavoid.geometry.capsules import CapsuleFit, fit_capsule
+from qpavoid.problem import Array
+from qpavoid.setup.fit import GROSS, Bodies, fit_piece, hull_volume, inside_volume
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A piece of a robot's geometry, as its file has it."""
+
+    name: str
+    link: str
+    geometry: Any
+    """coal geometry."""
+    placement: Any
+    """In the frame of its link."""
+
+    @cached_property
+    def inside(self) -> float:
+        """Volume that it encloses [m³]."""
+        return inside_volume(self.geometry)
+
+
+def pieces_of(geometry: Any, model: Any) -> list[Piece]:
+    """The pieces of a pinocchio geometry model's objects, each in the frame of its link."""
+    found = []
+    for piece in geometry:
+        frame = model.frames[piece.parentFrame]
+        found.append(Piece(piece.name, frame.name, piece.geometry, frame.placement.actInv(piece.placement)))
+    return found
+
+
+@dataclass(frozen=True)
+class LinkBodies:
+    """The bodies of one link."""
+
+    bodies: tuple[Body, ...]
+    volume: float
+    """Of all of them, what overlaps counted twice [m³]."""
+    hulls: float
+    """Of the convex hulls of the link's pieces [m³]."""
+    inside: float
+    """Of what the link's pieces enclose, meshes as they are [m³]."""
+
+
+def kinds_of_links(pieces: Sequence[Piece], kind: Bodies, by_pattern: Mapping[str, Bodies]) -> dict[str, Bodies]:
+    """Which kind of bodies each link with geometry gets.
+
+    Args:
+        pieces: of all links.
+        kind: of links that no pattern matches.
+        by_pattern: link (with `*` and `?`): its kind; of several, the last one holds.
+
+    Raises:
+        UnknownName: a pattern without a link.
+    """
+    kinds = {piece.link: kind for piece in pieces}
+    for pattern, chosen in by_pattern.items():
+        found = [link for link in kinds if fnmatchcase(link, pattern)]
+        if not found:
+            raise UnknownName(f"--bodies: no link {pattern!r} with geometry{nearest(pattern, kinds)}")
+        kinds.update(dict.fromkeys(found, chosen))
+    return kinds
+
+
+def bodies_of_link(pieces: Sequence[Piece], link: str, kind: Bodies) -> LinkBodies:
+    """Bodies that enclose all pieces of a link.
+
+    One capsule around all pieces takes the place of several shapes where it takes no more room than they do, or, in
+    `auto`, where it is not gross.
+    """
+    pieces = [piece for piece in pieces if piece.link == link]
+    fits = [fit_piece(piece.geometry, kind, piece.inside) for piece in pieces]
+    hulls = [hull_volume(piece.geometry) for piece in pieces]
+    volume = sum(sum(c.volume for c in fit) if fit else hull for fit, hull in zip(fits, hulls, strict=True))
+    shapes = []
+    for piece, fit in zip(pieces, fits, strict=True):
+        shapes += [capsule_fields(capsule, piece.placement) for capsule in fit] or [_exact_fields(piece)]
+    if len(shapes) > 1 and kind != "convex":
+        points = [_moved(hull_points(piece.geometry), piece.placement) for piece in pieces]
+        whole = fit_capsule(np.concatenate(points))
+        if whole.volume <= max(volume, GROSS * sum(hulls) if kind == "auto" else 0.0):
+            shapes, volume = [capsule_fields(whole, pin.SE3.Identity())], whole.volume
+    names = [link] if len(shapes) == 1 else [f"{link}_{index}" for index in range(len(shapes))]
+    bodies = [Body(name=name, frame=link, **shape) for name, shape in zip(names, shapes, strict=True)]
+    return LinkBodies(tuple(bodies), volume, sum(hulls), sum(piece.inside for piece in pieces))
+
+
+def _moved(points: Array, placement: Any) -> Array:
+    return np.asarray(points @ placement.rotation.T + placement.translation)
+
+
+def capsule_fields(fit: CapsuleFit, placement: Any) -> dict[str, Any]:
+    """Fields of a `Body` that encloses a capsule, with five digits after the point.
+
+    The radius makes up for the rounding of everything else, so that what was enclosed stays so.
+
+    Args:
+        fit: the capsule.
+        placement: of its frame in the body's.
+    """
+    axis = placement.rotation @ fit.rotation[:, 2]
+    center = placement.act(np.asarray(fit.center))
+    position = np.round(center, _DIGITS) + 0.0  # no -0.0
+    pitch, yaw = round(math.acos(np.clip(axis[2], -1.0, 1.0)), _DIGITS), round(math.atan2(axis[1], axis[0]), _DIGITS)
+    length = round(fit.length, _DIGITS)
+    if length == 0.0:
+        pitch = yaw = 0.0
+    turned = np.array([math.cos(yaw) * math.sin(pitch), math.sin(yaw) * math.sin(pitch), math.cos(pitch)])
+    shift = np.linalg.norm(position - center) + 0.5 * np.linalg.norm(length * turned - fit.length * axis)
+    radius = math.ceil((fit.radius + float(shift)) * 10**_DIGITS) / 10**_DIGITS
+    shape = Capsule(radius=radius, length=length) if length > 0.0 else Sphere(radius=radius)
+    return {"shape": shape, "position": tuple(position.tolist()), "rpy": (0.0, pitch, yaw)}
+
+
+_DIGITS = 5
+"""After the point, of lengths [m] and angles [rad] in files."""
+
+
+def _exact_fields(piece: Piece) -> dict[str, Any]:
+    """Fields of a `Body` that is a primitive as it is, or the hull of a mesh."""
+    geometry, placement = piece.geometry, piece.placement
+    if isinstance(geometry, coal.Box):
+        x, y, z = (_up(2.0 * half) for half in geometry.halfSide)
+        shape: Any = Box(size=(x, y, z))
+    elif isinstance(geometry, coal.Cylinder):
+        shape = Cylinder(radius=_up(geometry.radius), length=_up(2.0 * geometry.halfLength))
+    else:
+        return {"shape": Hull(geometry=piece.name)}
+    rpy = np.round(pin.rpy.matrixToRpy(placement.rotation), 2 * _DIGITS) + 0.0  # no -0.0
+    position = np.round(placement.translation, 2 * _DIGITS) + 0.0
+    return {"shape": shape, "position": tuple(position.tolist()), "rpy": tuple(rpy.tolist())}
+
+
+def _up(size: float) -> float:
+    """A size rounded up, but for rounding errors."""
+    return float(math.ceil(size * 10**_DIGITS - 1e-6) / 10**_DIGITS)

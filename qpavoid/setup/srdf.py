@@ -1,0 +1,95 @@
+"""What an SRDF says of a robot, and how one is written."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+from qpavoid.model.xml_file import read_robot_xml
+
+
+@dataclass(frozen=True)
+class Semantics:
+    """The parts of an SRDF that matter here."""
+
+    disabled: Mapping[frozenset[str], str] = field(default_factory=dict)
+    """Two links that are not to be checked: the reason."""
+    states: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    """Named poses: joint and position [rad or m]; what comes first is most likely a home pose."""
+    end_effectors: Sequence[str] = ()
+    """Links that carry tools or feet, in the order of the file."""
+
+
+MADE_BY = "written by `qpavoid robot add`"
+_HOMES = ("home", "ready", "default", "standing", "half_sitting", "neutral")
+"""Names of poses to start from, the likeliest first."""
+
+
+def find_srdf(urdf: Path) -> Path | None:
+    """The SRDF beside a URDF, or in `srdf/` beside its folder: the one whose name has most in common with it.
+
+    Those that `robot add` wrote are left out: it would be told what it said before.
+    """
+    folders = (urdf.parent, urdf.parent / "srdf", urdf.parent.parent / "srdf")
+    found = [path for folder in folders for path in sorted(folder.glob("*.srdf")) if not _ours(path)]
+    same = [path for path in found if path.stem.startswith(urdf.stem) or urdf.stem.startswith(path.stem)]
+    return max(same, key=lambda path: (path.stem == urdf.stem, min(len(path.stem), len(urdf.stem))), default=None)
+
+
+def _ours(path: Path) -> bool:
+    with suppress(OSError):
+        return MADE_BY.encode() in path.read_bytes()[:500]
+    return False
+
+
+def read_srdf(path: Path) -> Semantics:
+    """What an SRDF says; what cannot be understood is left out.
+
+    Raises:
+        ConfigError: not a usable SRDF.
+    """
+    root = read_robot_xml(path, "SRDF")
+    disabled = {
+        frozenset((pair.get("link1", ""), pair.get("link2", ""))): pair.get("reason", "User")
+        for pair in root.iter("disable_collisions")
+    }
+    states = {
+        state.get("name", ""): {
+            joint.get("name", ""): value
+            for joint in state.iter("joint")
+            if (value := _number(joint.get("value", ""))) is not None
+        }
+        for state in root.iter("group_state")
+    }
+    names = sorted(states, key=lambda name: (_HOMES.index(name) if name in _HOMES else len(_HOMES), name))
+    ends = [end.get("parent_link", "") for end in root.iter("end_effector")]
+    return Semantics(disabled, {name: states[name] for name in names}, tuple(dict.fromkeys(ends)))
+
+
+def _number(text: str) -> float | None:
+    try:
+        value = float(text)
+    except ValueError:  # joints with several coordinates have several
+        return None
+    return value if abs(value) < 1e9 else None
+
+
+def srdf_text(robot: str, comment: str, disabled: Mapping[frozenset[str], str], ends: Sequence[str]) -> str:
+    """An SRDF.
+
+    Args:
+        robot: its name, as in its URDF.
+        comment: what it says at the top.
+        disabled: links that are not to be checked, and why.
+        ends: links that carry tools.
+    """
+    lines = ['<?xml version="1.0"?>', f"<!-- {comment.replace('--', '- -')} -->", f"<robot name={quoteattr(robot)}>"]
+    lines += [f"  <end_effector name={name} parent_link={name} group={name}/>" for name in map(quoteattr, ends)]
+    for pair in sorted(sorted(links) for links in disabled):
+        a, b = pair[0], pair[-1]
+        reason = quoteattr(disabled[frozenset(pair)])
+        lines.append(f"  <disable_collisions link1={quoteattr(a)} link2={quoteattr(b)} reason={reason}/>")
+    return "\n".join([*lines, "</robot>", ""])

@@ -1,0 +1,185 @@
+"""The robot.yaml and the SRDF of a description, as text."""
+
+from __future__ import annotations
+
+import os.path
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from shlex import quote
+from typing import Any
+
+import yaml
+
+from qpavoid.config import Body
+from qpavoid.config.shipped import EXAMPLES, example_robot
+from qpavoid.model.notes import Note, NoteKind, shortened
+from qpavoid.setup.add import Described, Wishes
+from qpavoid.setup.srdf import MADE_BY, srdf_text
+from qpavoid.setup.written import BLANK, seal
+
+
+def description_files(described: Described, folder: Path) -> dict[Path, bytes]:
+    """The files of a description, sealed.
+
+    Args:
+        described: what they say.
+        folder: where they are to stand; paths in them are relative to it.
+    """
+    srdf = folder / f"{described.config.name}.srdf"
+    comment = f"{described.config.name}: {MADE_BY}; {BLANK}"
+    text = srdf_text(described.robot.model.name, comment, described.disabled, described.config.end_effectors)
+    return {
+        folder / "robot.yaml": seal(_robot_yaml(described, folder, srdf.name).encode()),
+        srdf: seal(text.encode()),
+    }
+
+
+def _robot_yaml(described: Described, folder: Path, srdf: str) -> str:
+    config = described.config
+    lines = [f"# {line}" for line in [*_header(described), f"Again: {_command(described, folder)}"]]
+    lines += [f"name: {_flow(config.name)}", f"urdf: {_flow(_reference(Path(config.urdf), folder))}"]
+    lines.append(f"srdf: {_flow(srdf)}")
+    if config.package_dirs:
+        lines.append(f"package_dirs: {_flow([_entry(entry, folder) for entry in config.package_dirs])}")
+    if config.allow_missing_meshes:
+        lines.append("allow_missing_meshes: true")
+    if config.root_joint != "fixed":
+        lines.append(f"root_joint: {config.root_joint}")
+    lines.append(f"end_effectors: {_flow(list(config.end_effectors))}")
+    assert not isinstance(config.bodies, str)
+    lines += ["bodies:" if config.bodies else "bodies: []"]
+    lines += _body_lines(config.bodies, described)
+    if config.disabled_pairs:
+        lines.append("disabled_pairs:   # of links that have other pairs which are checked; the rest is in the SRDF")
+        lines += [f"  - {_flow(list(pair))}" for pair in config.disabled_pairs]
+    if config.pair_margins:
+        lines.append("pair_margins:   # of bodies that are near each other by design")
+        lines += [f"  - {_flow({'bodies': list(own.bodies), 'd1': own.d1})}" for own in config.pair_margins]
+    if config.limits.velocity:
+        lines.append("limits:   # assumed: the file gives no speed of these")
+        lines.append(f"  velocity: {_flow(dict(config.limits.velocity))}")
+    for field, values in (("home", config.home), ("lock", config.lock)):
+        if values:
+            lines += [f"{field}:", *(f"  {_flow(joint)}: {value:g}" for joint, value in values.items())]
+    return "\n".join([*lines, ""])
+
+
+def _header(described: Described) -> list[str]:
+    lines = [f"{described.config.name}: {MADE_BY}, which leaves it alone once you edit it; {BLANK}"]
+    lines += [
+        f"Bodies: {volume_line(described)}.",
+        f"Pairs: {pairs_line(described)}.",
+        f"Home: {home_line(described)}.",
+    ]
+    return [*lines, *note_lines(described.notes)]
+
+
+def pairs_line(described: Described) -> str:
+    """How many pairs are checked, and why the others are not."""
+    counts, wishes = described.counts, described.wishes
+    honoured = "no SRDF came with it" if described.honoured is None else f"in {described.honoured.name}"
+    return (
+        f"{counts['active']} of {counts['all']} are checked, {len(described.config.pair_margins)} of them with a "
+        f"smaller safety distance; {counts['adjacent']} are adjacent, {counts['srdf']} disabled ({honoured}), "
+        f"{counts['always']} touch always, {counts['drawn in']} when drawn in, {counts['never']} come never within "
+        f"{1000 * described.near:.0f} mm ({wishes.samples} samples, seed {wishes.seed}, descent from the nearest)"
+    )
+
+
+def home_line(described: Described) -> str:
+    """How clear the home pose is, and how well the limbs can move there."""
+    home = described.home
+    words = ["no pair is checked"]
+    if home.nearest is not None:
+        words = [f"least distance {1000 * home.clearance:.1f} mm ({' - '.join(home.nearest)})"]
+    return "; ".join([*words, *(f"{frame}: {limb}" for frame, limb in home.conditioning.items())])
+
+
+def note_lines(notes: Sequence[Note]) -> list[str]:
+    """The table of all that was left out, mended, replaced or assumed: a line each, and another for the remedy."""
+    order = {"error": 0, "warning": 1, "note": 2}
+    lines = []
+    for note in sorted(notes, key=lambda note: order[note.severity]):
+        share = "" if note.share is None else f"{100.0 * note.share:.0f} %"
+        names = " - ".join(note.subject) if note.kind is NoteKind.PAIR else shortened(note.subject)
+        lines.append(f"{note.severity:<8} {note.kind.value:<6} {share:>5}  {names}{': ' if names else ''}{note.what}")
+        if note.remedy:
+            lines.append(f"{'':24}→ {note.remedy}")
+    return lines
+
+
+def _command(described: Described, folder: Path) -> str:
+    """The command that writes the same again."""
+    wishes = described.wishes
+    words = ["qpavoid robot add", _reference(described.urdf, Path()), "--name", described.config.name]
+    words += ["--out", folder.as_posix()] if folder != Path(described.config.name) else []
+    words += ["--bodies", wishes.bodies] if wishes.bodies != Wishes.bodies else []
+    words += [word for link, kind in wishes.bodies_of.items() for word in ("--bodies", f"{link}={kind}")]
+    words += ["--root", wishes.root] if wishes.root != Wishes.root else []
+    words += [word for joint in wishes.lock for word in ("--lock", joint)]
+    words += [word for joint, value in wishes.home.items() for word in ("--home", f"{joint}={value:g}")]
+    for entry in map(str, wishes.package_dirs):
+        words += ["--package" if _PACKAGE.fullmatch(entry) else "--package-dir", entry]
+    words += ["--allow-missing-meshes"] if wishes.allow_missing_meshes else []
+    words += ["--srdf", wishes.srdf.as_posix()] if wishes.srdf is not None else []
+    words += ["--samples", str(wishes.samples)] if wishes.samples != Wishes.samples else []
+    words += ["--seed", str(wishes.seed)] if wishes.seed != Wishes.seed else []
+    return " ".join([words[0], *(quote(word) for word in words[1:])])
+
+
+def volume_line(described: Described) -> str:
+    """How many bodies there are, and what room they take beside what the geometry encloses and its hulls."""
+    volume, inside, hulls = (
+        sum(getattr(link, name) for link in described.links.values()) for name in ("volume", "inside", "hulls")
+    )
+    over = ""
+    if inside > 0.0:
+        over = f", {volume / inside:.2f} times the {1e3 * inside:.2f} l of the geometry (hulls: {hulls / inside:.2f})"
+    return f"{len(described.config.bodies)}, {1e3 * volume:.2f} l{over}"
+
+
+def _body_lines(bodies: Sequence[Body], described: Described) -> list[str]:
+    lines, last = [], ""
+    for body in bodies:
+        fields: dict[str, Any] = {"name": body.name, "frame": body.frame, "shape": body.shape.model_dump()}
+        fields["shape"] = {key: list(v) if isinstance(v, tuple) else v for key, v in fields["shape"].items()}
+        if any(body.position):
+            fields["position"] = list(body.position)
+        if any(body.rpy):
+            fields["rpy"] = list(body.rpy)
+        link = described.links[body.frame]
+        comment = f"   # {link.volume / link.inside:.2f} of it" if link.inside > 0.0 and body.frame != last else ""
+        lines.append(f"  - {_flow(fields)}{comment}")
+        last = body.frame
+    return lines
+
+
+def _flow(value: Any) -> str:
+    text = str(yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=10**6))
+    return text.strip().removesuffix("\n...")
+
+
+def _reference(urdf: Path, folder: Path) -> str:
+    """The URDF as a robot.yaml names it."""
+    robots = example_robot("").resolve()
+    if urdf.is_relative_to(robots):
+        return f"{EXAMPLES}{urdf.relative_to(robots).as_posix()}"
+    return _relative(urdf, folder)
+
+
+_PACKAGE = re.compile(r"([A-Za-z][\w.-]*)=(.+)", re.DOTALL)
+"""`NAME=FOLDER` of a package."""
+
+
+def _entry(entry: str, folder: Path) -> str:
+    """An entry of `package_dirs` with its folder relative to that of the robot.yaml."""
+    match = _PACKAGE.fullmatch(entry)
+    return f"{match[1]}={_relative(Path(match[2]), folder)}" if match else _relative(Path(entry), folder)
+
+
+def _relative(path: Path, folder: Path) -> str:
+    try:
+        return Path(os.path.relpath(path, folder.resolve())).as_posix()
+    except ValueError:  # on another drive
+        return path.as_posix()

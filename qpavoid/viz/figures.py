@@ -1,0 +1,238 @@
+"""Writes the figures of runs, and draws those of one run over time. Needs matplotlib: `pip install qpavoid[plots]`.
+
+Every `*_figure` function returns a `matplotlib.figure.Figure` of its own: no display and no global state is used, so
+they work headless and in threads.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from qpavoid.problem import Status
+from qpavoid.run.log import STATUSES, Log
+from qpavoid.viz.compare import compare_time_figure, path_figure, solver_styles
+from qpavoid.viz.motion import motion_figure
+from qpavoid.viz.style import (
+    COLLISION,
+    COLOURS,
+    DASHES,
+    add_grid,
+    add_legend,
+    draw_levels,
+    is_qp,
+    label_distances,
+    units,
+)
+
+DPI = 130
+ALPHA_SHOWN = 100.0
+"""α is drawn up to here: it grows without bound as the distance goes to 0."""
+_STATUS_COLOUR = {Status.RELAXED: "#F5C242", Status.STOPPED: "#C62F2F"}
+_GREY = "#B8B8B8"
+_NAMED = 2 * len(COLOURS)
+"""Lines of a panel that have a colour and a name; the legend of more would run out of the panel."""
+
+
+def plot_run(log: Log, folder: str | Path) -> list[Path]:
+    """Writes the figures of one run: motion, joints, distances, speeds.
+
+    Returns:
+        The files, `<scenario>_<solver>_<figure>.png`, in that order.
+    """
+    draw = {"motion": motion_figure, "joints": joints_figure, "distances": distances_figure, "speeds": speeds_figure}
+    figures = {name: make(log) for name, make in draw.items()}
+    for figure in figures.values():
+        figure.suptitle(_title(log), fontsize=11)
+    return _save(figures, folder, f"{log.meta['scenario']}_{log.meta['solver'].replace(':', '-')}")
+
+
+def plot_compare(logs: Sequence[Log], folder: str | Path) -> list[Path]:
+    """Writes the figures that lay several runs of one scenario over each other: time and path.
+
+    Returns:
+        The files, `<scenario>_compare_<figure>.png`, in that order.
+
+    Raises:
+        ValueError: no logs, or logs of different scenarios.
+    """
+    scenarios = {log.meta["scenario"] for log in logs}
+    if len(scenarios) != 1:
+        raise ValueError(f"needs logs of one scenario, got {sorted(scenarios)}")
+    figures = {"time": compare_time_figure(logs), "path": path_figure(logs, solver_styles(logs))}
+    return _save(figures, folder, f"{scenarios.pop()}_compare")
+
+
+def _save(figures: dict[str, Figure], folder: str | Path, stem: str) -> list[Path]:
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for name, figure in figures.items():
+        paths.append(folder / f"{stem}_{name}.png")
+        figure.savefig(paths[-1], dpi=DPI)
+    return paths
+
+
+def _title(log: Log) -> str:
+    title = f"{log.meta['title'] or log.meta['scenario']}  —  solver: {log.meta['solver']}"
+    return title if log.meta["completed"] else f"{title}\n(ended early: {log.meta['stopped_by'] or 'part of a run'})"
+
+
+# --- one run ------------------------------------------------------------------------------------------------
+
+
+def position_names(log: Log) -> list[str]:
+    """A name for each of the nq coordinates of q.
+
+    Where nq > nv, joints with several velocities are taken to have one coordinate more (a quaternion, or the sine and
+    cosine of a planar joint), and, if the count asks for it, joints without limits to be cosine and sine; whatever
+    does not add up is numbered.
+    """
+    names: list[str] = log.meta["coordinates"]
+    if len(names) == log.q.shape[1]:
+        return names
+    limited = {name for name, _, _ in log.meta["position_limits"]}
+    counts = Counter(name if name in limited else name.rpartition(".")[0] or name for name in names)
+    for circle in (("",), (".cos", ".sin")):
+        parts = {1: circle, 6: (".x", ".y", ".z", ".qx", ".qy", ".qz", ".qw")}
+        found = []
+        for joint, count in counts.items():
+            several = parts.get(count, tuple(f".{i}" for i in range(count + 1)))
+            found += [joint] if joint in limited else [joint + part for part in several]
+        if len(found) == log.q.shape[1]:
+            return found
+    return [f"q[{i}]" for i in range(log.q.shape[1])]
+
+
+def joints_figure(log: Log) -> Figure:
+    """Coordinates of q over time, a panel each, with position limits (Figs. 7 and 14 of the paper)."""
+    names = position_names(log)
+    limits = {name: (lower, upper) for name, lower, upper in log.meta["position_limits"]}
+    columns = 4 if len(names) <= 16 else 6
+    rows = max(-(-len(names) // columns), 1)
+    figure = Figure(figsize=(2.6 * columns, 1.8 * rows + 0.8), layout="constrained")
+    for i, name in enumerate(names):
+        ax = figure.add_subplot(rows, columns, i + 1)
+        ax.plot(log.t, log.q[:, i], color=COLOURS[0], linewidth=1.4)
+        ax.set_title(name, fontsize=9)
+        ax.tick_params(labelsize=8)
+        add_grid(ax)
+        if name in limits:
+            for limit in filter(np.isfinite, limits[name]):
+                ax.axhline(limit, color=COLLISION, linewidth=0.8)
+            bottom, top = ax.get_ylim()
+            ax.set_ylim(bottom, top)
+            for limit, outer in zip(limits[name], (bottom, top), strict=True):
+                if np.isfinite(limit):
+                    ax.axhspan(limit, outer, color=COLLISION, alpha=0.15, linewidth=0)
+        if i + columns >= len(names):
+            ax.set_xlabel("time [s]", fontsize=9)
+    figure.supylabel(f"joint position [{units(log)}]", fontsize=10)
+    handles = [
+        Line2D([], [], color=COLOURS[0], label="position"),
+        Patch(color=COLLISION, alpha=0.3, label="beyond limits"),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=9, frameon=False)
+    return figure
+
+
+def distances_figure(log: Log) -> Figure:
+    """Distance of each body over time with d1, d2 and collision, and α, β below (Figs. 8, 11, 13 of the paper)."""
+    avoidance = log.meta["config"]["avoidance"]
+    reach = round(1.5 * (avoidance["d2"] - avoidance["offset"]), 9)
+    distance = log.body_distance
+    figure = Figure(figsize=(9.5, 7.0), layout="constrained")
+    ax, gains = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
+    drawn = np.flatnonzero(np.isfinite(distance).any(axis=0))
+    nearest = np.min(distance, axis=0, initial=np.inf)
+    near = drawn if len(drawn) <= len(COLOURS) else drawn[nearest[drawn] < reach]
+    rest = f"never within {reach:g} m"
+    if len(near) > _NAMED:
+        near, rest = np.sort(near[np.argsort(nearest[near], kind="stable")[:_NAMED]]), "farther away"
+    far = [i for i in drawn if i not in near]
+    for i in far:
+        ax.plot(log.t, distance[:, i], color=_GREY, linewidth=0.7, zorder=1)
+    # Thinner and thinner: the two bodies of a pair share their distance, and neither line may hide the other.
+    for rank, (i, width) in enumerate(zip(near, np.linspace(3.0, 1.2, len(near)), strict=True)):
+        ax.plot(log.t, distance[:, i], label=log.meta["bodies"][i], linewidth=width, zorder=3, **_style(rank))
+    handles = ax.get_legend_handles_labels()[0]
+    if far:
+        handles.append(Line2D([], [], color=_GREY, linewidth=0.7, label=f"{len(far)} bodies {rest}"))
+    handles += draw_levels(ax, log, qp=is_qp(log))
+    handles += _shade_status(ax, log)
+    _plot_gains(gains, log)
+    label_distances(ax, distance[:, near])
+    add_legend(ax, handles)
+    return figure
+
+
+def _plot_gains(ax: Any, log: Log) -> None:
+    alpha = np.minimum(log.alpha, ALPHA_SHOWN)
+    ax.plot(log.t, alpha, color="#333333", label="α of the closest pair (eq. 11)")
+    ax.plot(log.t, log.beta, color="#8A8A8A", linestyle=DASHES[1], label="β of the closest pair (eq. 12)")
+    ax.set_yscale("symlog", linthresh=1.0)
+    top = next(top for top in (1.0, 10.0, ALPHA_SHOWN) if np.nanmax(alpha, initial=0.0) <= top)
+    ticks = [tick for tick in (0.0, 0.5, 1.0, 10.0, ALPHA_SHOWN) if tick <= top]
+    ax.set_ylim(-0.1, 1.15 * top)
+    ax.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
+    ax.set_yticks([], minor=True)
+    ax.set_ylabel(f"gains [-]\n(α up to {ALPHA_SHOWN:g})" if np.any(log.alpha > ALPHA_SHOWN) else "gains [-]")
+    ax.set_xlabel("time [s]")
+    add_grid(ax)
+    add_legend(ax, ax.get_lines())
+
+
+def speeds_figure(log: Log) -> Figure:
+    """Joint velocities over time; limits of the joints that use more than 80 % of theirs; ticks not SOLVED shaded."""
+    names, limits = log.meta["coordinates"], log.meta["velocity_limit"]
+    peak = np.max(np.abs(log.v), axis=0, initial=0.0)
+    fastest = np.sort(np.argsort(-peak)[:_NAMED])
+    figure = Figure(figsize=(9.5, 4.5), layout="constrained")
+    ax = figure.add_subplot()
+    rest = [i for i in range(len(names)) if i not in fastest]
+    for i in rest:
+        ax.plot(log.t, log.v[:, i], color=_GREY, linewidth=0.7, zorder=1)
+    for rank, i in enumerate(fastest):
+        ax.plot(log.t, log.v[:, i], label=names[i], linewidth=1.4, zorder=3, **_style(rank))
+    handles = ax.get_legend_handles_labels()[0]
+    if rest:
+        handles.append(Line2D([], [], color=_GREY, linewidth=0.7, label=f"{len(rest)} slower joints"))
+    at_limit = [i for i in fastest if limits[i] is not None and peak[i] > 0.8 * limits[i]]
+    for limit in sorted({limits[i] for i in at_limit}):
+        style = {"color": COLLISION, "linewidth": 1.0, "linestyle": DASHES[3]}
+        ax.axhline(-limit, **style)
+        whose = [names[i] for i in at_limit if limits[i] == limit]
+        of = whose[0] if len(whose) == 1 else f"{len(whose)} joints near it"
+        handles.append(ax.axhline(limit, label=f"limit ±{limit:g} of {of}", **style))
+    handles += _shade_status(ax, log)
+    ax.set_xlabel("time [s]")
+    ax.set_ylabel(f"joint velocity [{units(log, '/s')}]")
+    add_grid(ax)
+    add_legend(ax, handles)
+    return figure
+
+
+def _style(rank: int) -> dict[str, Any]:
+    return {"color": COLOURS[rank % len(COLOURS)], "linestyle": DASHES[rank // len(COLOURS) % len(DASHES)]}
+
+
+def _shade_status(ax: Any, log: Log) -> list[Any]:
+    """Shades ticks that were relaxed or stopped; gives a legend entry for each status that occurs."""
+    handles = []
+    dt = log.meta["config"]["dt"]
+    for status, colour in _STATUS_COLOUR.items():
+        bad = np.r_[False, log.status == STATUSES.index(status), False].astype(np.int8)
+        starts, ends = np.flatnonzero(np.diff(bad) == 1), np.flatnonzero(np.diff(bad) == -1)
+        for start, end in zip(starts, ends, strict=True):
+            ax.axvspan(log.t[start], log.t[end - 1] + dt, color=colour, alpha=0.35, linewidth=0, zorder=0)
+        if len(starts):
+            count = int(bad.sum())
+            handles.append(Patch(color=colour, alpha=0.35, label=f"{status.value}: {count} tick{'s' * (count > 1)}"))
+    return handles

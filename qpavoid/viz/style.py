@@ -1,0 +1,91 @@
+"""What the figures share: colours, units, grids, legends, and the levels of distance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from qpavoid.problem import Array
+from qpavoid.run.log import Log
+
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#333333")
+"""Colour-blind-safe (Okabe and Ito), without the yellow that fades on white."""
+DASHES: tuple[Any, ...] = (
+    "-",
+    (0, (5, 2)),
+    (0, (1, 1.2)),
+    (0, (6, 2, 1, 2)),
+    (0, (3, 1, 1, 1, 1, 1)),
+    (0, (10, 3)),
+    (0, (2, 2)),
+)
+COLLISION, D1, D2, D_SAFE = "#C62F2F", "#7A4B9A", "#8A8A8A", "#00695C"
+
+
+def units(log: Log, per: str = "") -> str:
+    """What the coordinates are measured in: `rad`, `m`, or `rad or m` where a robot has both.
+
+    Args:
+        log: the run.
+        per: put behind each unit, such as `/s`.
+    """
+    return " or ".join(unit + per for unit in ("rad", "m") if unit in log.meta["units"])
+
+
+def is_qp(log: Log) -> bool:
+    """Whether the solver has rows of its own that hold a distance."""
+    return str(log.meta["solver"]).partition(":")[0] in ("qp", "hqp")
+
+
+def add_grid(ax: Any) -> None:
+    """Pale grid behind the lines, which reach from edge to edge."""
+    ax.grid(True, color="#E4E4E4", linewidth=0.6)
+    ax.set_axisbelow(True)
+    ax.margins(x=0.0)
+
+
+def add_legend(ax: Any, handles: Sequence[Any]) -> None:
+    """Adds a legend beside the panel, where it hides nothing."""
+    style = {"fontsize": 8, "frameon": False, "borderaxespad": 0.0}
+    ax.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.01, 1.0), **style)
+
+
+def draw_levels(ax: Any, log: Log, qp: bool) -> list[Any]:
+    """Draws d2, d1, collision and, for QPs, the distance that their rows hold, all between surfaces.
+
+    Returns:
+        The lines, for a legend.
+    """
+    avoidance = log.meta["config"]["avoidance"]
+    offset = avoidance["offset"]
+    levels = [("$d_2$ = {:g} m", avoidance["d2"], D2, DASHES[1]), ("$d_1$ = {:g} m", avoidance["d1"], D1, DASHES[3])]
+    d_safe = avoidance["row"].get("d_safe")
+    if qp and d_safe is not None:
+        levels.append(("$d_{{safe}}$ = {:g} m (QP rows)", d_safe, D_SAFE, DASHES[2]))
+    levels.append(("collision", offset, COLLISION, DASHES[0]))
+    return [
+        ax.axhline(
+            d - offset, color=colour, linestyle=dash, linewidth=1.1, zorder=2, label=label.format(round(d - offset, 9))
+        )
+        for label, d, colour, dash in levels
+    ]
+
+
+def label_distances(ax: Any, *drawn: Array, name: str = "distance ") -> None:
+    """Names the axis of distances between surfaces, shades collision, and makes room for it.
+
+    Args:
+        ax: panel that has its lines already.
+        drawn: the distances of the lines [m].
+        name: what is shown.
+    """
+    ax.set_ylabel(f"{name}between surfaces [m]")
+    add_grid(ax)
+    finite = [d[np.isfinite(d)] for d in drawn]
+    lowest = min((float(np.min(d)) for d in finite if d.size), default=0.0)
+    bottom, top = ax.get_ylim()
+    bottom = min(lowest, 0.0) - 0.04 * top
+    ax.axhspan(bottom, 0.0, color=COLLISION, alpha=0.08, linewidth=0, zorder=0)
+    ax.set_ylim(bottom, top)
