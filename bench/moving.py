@@ -31,7 +31,7 @@ def main() -> None:
     parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.child:
-        print(json.dumps({**measure(options.rounds), "without": foresight(escape=None), "with": foresight()}))
+        print(json.dumps({**measure(options.rounds), "without": foresight(backup=None), "with": foresight()}))
         return
     load = os.getloadavg()[0]
     found = _child(options.rounds)
@@ -59,7 +59,7 @@ def main() -> None:
         "## Foresight",
         "",
         "The scenario of `bench.endurance`, in closed loop: a Panda follows a circle among 50 obstacles, 10 of them on "
-        "circles. Flights are flown where what moves may come near; without: `avoidance: {escape: null}` [µs].",
+        "circles. Flights are flown where what moves may come near; without: `avoidance: {backup: null}` [µs].",
         "",
         "| | p50 | p99 | worst | flights a tick | time of a flight |",
         "|---|---:|---:|---:|---:|---:|",
@@ -106,9 +106,9 @@ def foresight(**avoidance: Any) -> tuple[float, ...]:
 
     controller, q = Controller.from_scenario(scenario(**avoidance))
     ticks, flights = [], []
-    escape = controller._commander.escape
-    if escape is not None:
-        fly = escape.flights.better
+    backup = controller._commander.backup
+    if backup is not None:
+        fly = backup.flights.better
 
         def timed(*args: Any) -> Any:
             begin = perf_counter_ns()
@@ -116,7 +116,7 @@ def foresight(**avoidance: Any) -> tuple[float, ...]:
             flights.append(1e-3 * (perf_counter_ns() - begin))
             return flight
 
-        escape.flights.better = timed  # type: ignore[method-assign]
+        backup.flights.better = timed  # type: ignore[method-assign]
     for k in range(LAP):
         begin = perf_counter_ns()
         v = controller.step(q, k * DT).v

@@ -18,7 +18,7 @@ class RowByRow:
 
     def solve(self, problem: Problem) -> Solution:
         """Kaczmarz' method from the tracking velocity: v += Jᵀ (b - J v)⁺ / ‖J‖², row by row, within the bounds."""
-        v, rows = problem.v0, problem.avoidance
+        v, rows = problem.v_tracking, problem.avoidance
         for _ in range(self.rounds):
             for J, b in zip(rows.J, rows.b, strict=True):
                 v = v + J * max(b - J @ v, 0.0) / max(J @ J, 1e-9)

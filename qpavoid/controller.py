@@ -14,7 +14,7 @@ import pinocchio as pin
 from qpavoid import kernels
 from qpavoid.config import Avoidance, Limits, Progress, ScenarioConfig, Sensing
 from qpavoid.control.assembler import Assembly
-from qpavoid.control.attach import Grasps
+from qpavoid.control.attach import Attachments
 from qpavoid.control.contacts import ContactRows, build_contacts
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.inputs import (
@@ -40,7 +40,7 @@ from qpavoid.model.scene import Scene, build_obstacles, build_scene
 from qpavoid.model.trajectory import Sample
 from qpavoid.problem import Array, Problem, Proximity, Solution, State, as_vector, require_finite
 from qpavoid.reason import Reason, ReasonKind
-from qpavoid.safety.arbiter import Commander
+from qpavoid.safety.arbiter import Arbiter
 from qpavoid.solvers import SOLVERS, Solver, make_solver
 
 _log = logging.getLogger(__name__)
@@ -91,7 +91,7 @@ class _Output(NamedTuple):
 
 
 _NO_BACKUP_WITH_CONTACTS = Reason.of(
-    ReasonKind.NO_BACKUP, "contacts", detail="backup trajectories do not hold contacts: avoidance.escape"
+    ReasonKind.NO_BACKUP, "contacts", detail="backup trajectories do not hold contacts: avoidance.backup"
 )
 """Assumption where obstacles move and the robot stands on something."""
 
@@ -168,15 +168,15 @@ class Controller:
             self.limits, tracking_damping, dt, contacts, law.bounded and self.avoidance.look_ahead,
         )  # fmt: skip
         self._no_backup: tuple[Reason, ...] = ()
-        if contacts is not None and self.avoidance.escape is not None:
-            self.avoidance = self.avoidance.model_copy(update={"escape": None})
+        if contacts is not None and self.avoidance.backup is not None:
+            self.avoidance = self.avoidance.model_copy(update={"backup": None})
             self._no_backup = (_NO_BACKUP_WITH_CONTACTS,)
-        self._commander = Commander(
+        self._commander = Arbiter(
             scene, law, self._assembly, self._query, self._obstacles, self._bounds,
             [task for task in frames if task.moves], self.avoidance, self.limits, progress or Progress(), dt,
         )  # fmt: skip
         hold = self.avoidance.hold - self.avoidance.offset
-        self._grasps = Grasps(scene, (self._query, *self._commander.queries), self._assembly, hold)
+        self._grasps = Attachments(scene, (self._query, *self._commander.queries), self._assembly, hold)
         self._warm_up()
         kernels.first_use.end()
         self.warm_up_time = perf_counter() - begin
@@ -212,8 +212,8 @@ class Controller:
             self._commander.solver = make_solver("qp")
         self.tick(q)
         self.filter(q, v)
-        self._assembly.closest_call(v, 0, self._reach, self.dt)
-        self._assembly.bends(q, v, self.dt)
+        self._assembly.clearance_lower_bound(v, 0, self._reach, self.dt)
+        self._assembly.leaves_position_limits(q, v, self.dt)
         self._obstacles.warm_up()
         self._commander.solver = law
         self.reset()
@@ -259,9 +259,9 @@ class Controller:
                 contacts,
             )
         for c in scenario.obstacles:
-            if c.carried_by is not None:
-                with located(f"{source}: obstacles: {c.name!r}: carried_by"):
-                    controller.attach(c.name, c.carried_by, q0)
+            if c.attached_to is not None:
+                with located(f"{source}: obstacles: {c.name!r}: attached_to"):
+                    controller.attach(c.name, c.attached_to, q0)
         return controller, q0
 
     def step(
@@ -363,7 +363,7 @@ class Controller:
             raise UnknownName(f"attach: no frame {frame!r:.60}; give its name")
         index, frame_id = self._obstacles.index(obstacle), self.scene.robot.frame_id(frame, "attach")
         self._grasps.attach(index, frame_id, self._given_or_last(q))
-        self._commander.look_anew()
+        self._commander.invalidate()
         self._obstacles.carry(index, True)
         self._commander.guard.forget(index)
 
@@ -386,7 +386,7 @@ class Controller:
         """
         index = self._obstacles.index(obstacle)
         sample = self._grasps.release(index, self._given_or_last(q))
-        self._commander.look_anew()
+        self._commander.invalidate()
         self._obstacles.carry(index, False)
         return sample
 
@@ -411,13 +411,13 @@ class Controller:
             if not isinstance(name, str) or name not in known:
                 raise UnknownName(f"allow_contact: no body or obstacle {name!r:.60}{nearest(str(name), known)}")
         self._grasps.allow(index, set(names), allowed)
-        self._commander.look_anew()
+        self._commander.invalidate()
 
     def obstacle_pose(self, obstacle: str, q: Array | None = None) -> Sample:
         """World pose of an obstacle as the last tick had it, carried or not; see `release` for the arguments."""
         return self._grasps.pose(self._obstacles.index(obstacle), self._given_or_last(q))
 
-    def tell_who_carries(self, query: DistanceQuery) -> None:
+    def sync_attachments(self, query: DistanceQuery) -> None:
         """Brings other distances of the scene to what the robot carries now, and what may touch."""
         self._grasps.tell(query)
 
@@ -461,12 +461,12 @@ class Controller:
             faults, assumptions = faults + observed.stop, assumptions + observed.assumptions
         self._kinematics.compute(q)
         self._query.compute(self._kinematics.data, self._reach)
-        if self._query.unwatched is not None:
+        if self._query.disabled_pairs is not None:
             self._grasps.update()
         proximity, problem = self._assembly.compute(q, samples, self._query, self._reach)
         if desired is not None:
             problem = self._assembly.follow(desired, problem)
-        state = State(q.copy(), self._assembly.v_last.copy(), inputs.times.t)
+        state = State(q.copy(), self._assembly.v_prev.copy(), inputs.times.t)
         built = perf_counter()
         if faults:
             solution = self._commander.stop(problem, faults)
@@ -525,7 +525,7 @@ class Controller:
 
     def _expected(self) -> Array:
         """Where the robot is if it did what it was told last (nq,)."""
-        return np.asarray(pin.integrate(self.scene.robot.model, self._q_last, self.dt * self._assembly.v_last))
+        return np.asarray(pin.integrate(self.scene.robot.model, self._q_last, self.dt * self._assembly.v_prev))
 
     def _targets(
         self, t: float, given: Mapping[str, Any] | None

@@ -21,7 +21,7 @@ from qpavoid.reason import Reason, Severity
 Array = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.intp]
 Mask = npt.NDArray[np.bool_]
-_ABSURD = 1e150
+_MAX_NORM = 1e150
 """Length that no vector of a robot has."""
 
 
@@ -57,7 +57,7 @@ class Proximity(NamedTuple):
     """(k, 10) distance, normal and witness points of each pair; see the properties below."""
     J: Array
     """(k, nv) velocity Jacobian of the distances [m/rad or 1]."""
-    drift: Array
+    feedforward: Array
     """(k,) rate of these distances due to the obstacles' own motion [m/s]."""
 
     @property
@@ -106,12 +106,12 @@ class Contacts(NamedTuple):
 
     def held(self, v: Array) -> Array:
         """The velocity (nv,) closest to v that holds the contacts; v itself where it does."""
-        if np.abs(self.J @ v - self.b).max() <= HELD:
+        if np.abs(self.J @ v - self.b).max() <= CONTACT_TOLERANCE:
             return v
         return np.asarray(self.rest + self.Z @ (self.Z.T @ v))
 
 
-HELD = 1e-6
+CONTACT_TOLERANCE = 1e-6
 """Velocity of a contact up to which it counts as held [m/s, rad/s]."""
 
 
@@ -158,9 +158,9 @@ class Problem(NamedTuple):
     """Name of each of the nv coordinates."""
     joint_units: Sequence[str]
     """Unit of each of the nv coordinates: rad or m."""
-    v0: Array
+    v_tracking: Array
     """(nv,) J⁺ẋ, the tracking law's velocity; NaN where λ is 0 and rows repeat each other."""
-    shortfall: float
+    violation: float
     """By how much v0 violates the worst row or bound [m/s, rad/s]; not positive where it is safe, NaN with v0."""
     contacts: Contacts | None = None
     """What holds the contacts, where there are any; v0 does."""
@@ -197,15 +197,15 @@ def make_problem(
     A, b, damping = tracking
     gram = A @ A.T + damping**2 * np.eye(len(b))
     if not np.isfinite(gram).all() or (damping == 0.0 and len(b) and np.linalg.cond(gram) > 1e6):
-        v0 = np.full(len(lower), np.nan)
+        v_tracking = np.full(len(lower), np.nan)
     else:
-        v0 = np.linalg.solve(gram, b) @ A
-    outside = np.concatenate((v0 - upper, lower - v0, avoidance.b - avoidance.J @ v0))
+        v_tracking = np.linalg.solve(gram, b) @ A
+    outside = np.concatenate((v_tracking - upper, lower - v_tracking, avoidance.b - avoidance.J @ v_tracking))
     stop = np.clip(0.0, lower, upper) if v_stop is None else v_stop
     names = [f"joint{i + 1}" for i in range(len(lower))]
     return Problem(
-        tracking, avoidance, lower, upper, *(hard or (lower, upper)), stop, pair_names, names, ["rad"] * len(names), v0,
-        float(outside.max()),
+        tracking, avoidance, lower, upper, *(hard or (lower, upper)), stop, pair_names, names, ["rad"] * len(names),
+        v_tracking, float(outside.max()),
     )  # fmt: skip
 
 
@@ -279,7 +279,7 @@ def as_vector(name: str, value: Any, shape: tuple[int, ...]) -> Array:
 
 def sane(v: Array) -> bool:
     """Whether a vector (n,) is finite and not absurdly large; for a few dozen numbers, quicker than numpy."""
-    return hypot(*v.tolist()) < _ABSURD
+    return hypot(*v.tolist()) < _MAX_NORM
 
 
 def require_finite(name: str, value: Any, shape: tuple[int, ...]) -> Array:

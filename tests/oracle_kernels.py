@@ -17,10 +17,10 @@ def distance_rows(x, pairs, reach):
     """
     near = pairs[~(x.results[pairs, 0] >= reach)]  # a NaN is near, not hidden
     n, p = x.results[near, 1:4], x.results[near, 4:7]
-    screws = np.hstack((n, np.cross(p, n)))
+    row_wrenches = np.hstack((n, np.cross(p, n)))
     fold = np.eye(len(x.v_max))[x.columns]
-    J = (screws @ x.J_world * x.support[near]) @ fold
-    return near, J, np.sum(screws * x.twists[x.twist_row[near]], axis=1)
+    J = (row_wrenches @ x.J_world * x.support[near]) @ fold
+    return near, J, np.sum(row_wrenches * x.twists[x.twist_row[near]], axis=1)
 
 
 # --- bounds on v -------------------------------------------------------------------------------------------------
@@ -36,7 +36,7 @@ def velocity_bounds(x, q):
     limited = np.isfinite(x.v_step)
     step = np.where(limited, x.v_step, 1.0)
     stop = speed_to_stop(np.maximum(room, 0.0), step, x.dt)
-    slowed = np.maximum(x.rate * room, sign * x.v_last - np.minimum(step, x.w_step - sign * x.w_last))
+    slowed = np.maximum(x.rate * room, sign * x.v_prev - np.minimum(step, x.dv_step - sign * x.dv_prev))
     speed = np.where(limited, np.where(room > 0.0, stop, slowed), x.rate * room)
     # on the way back from outside one limit, a coordinate can still brake for the other
     speed = np.where(limited & (room < 0.0), np.maximum(speed, -speed[::-1]), speed)
@@ -48,21 +48,21 @@ def velocity_bounds(x, q):
         hard[1] = np.where(room[1] < 0.0, np.maximum(hard[1], np.minimum(lower, x.v_max)), hard[1])
         hard[0] = np.where(room[0] < 0.0, np.maximum(hard[0], np.minimum(-upper, x.v_max)), hard[0])
     hard_lower, hard_upper = -hard[0], hard[1]
-    lower, upper = (np.clip(x.v_last + s * x.v_step, hard_lower, hard_upper) for s in (-1.0, 1.0))
+    lower, upper = (np.clip(x.v_prev + s * x.v_step, hard_lower, hard_upper) for s in (-1.0, 1.0))
     bounds = np.clip(-inner[0], lower, upper), np.clip(inner[1], lower, upper)
     return hard_lower, hard_upper, *(bounds if x.jerked else (lower, upper)), room.min(initial=np.inf)
 
 
 def _within_jerk(x, room, sign):
     """(2, n) largest speed in each direction from which a stop within the limit of the jerk ends in time."""
-    unit = np.where(np.isfinite(x.w_step), x.w_step, 1.0)
-    speed, change, most = sign * x.v_last / unit, sign * x.w_last / unit, x.v_step / unit
+    unit = np.where(np.isfinite(x.dv_step), x.dv_step, 1.0)
+    speed, change, most = sign * x.v_prev / unit, sign * x.dv_prev / unit, x.v_step / unit
     target = -np.sign(speed) * np.minimum(speed_to_stop(np.abs(speed), 1.0, 1.0), most)
     stop = np.clip(target, change - 1.0, change + 1.0)
     fastest = np.where(room >= 0.0, x.v_max / unit, 0.0)
     high = np.minimum(np.minimum(change + 1.0, most), speed_to_stop(np.maximum(fastest - speed, 0.0), 1.0, 1.0))
     found = np.maximum(_change_to_stop(speed, high, most, np.maximum(room, 0.0) / (x.dt * unit)), stop)
-    return np.where(np.isfinite(x.w_step), sign * x.v_last + unit * found, np.inf)
+    return np.where(np.isfinite(x.dv_step), sign * x.v_prev + unit * found, np.inf)
 
 
 def _change_to_stop(speed, high, most, room):
@@ -89,32 +89,32 @@ def joint_twists(x, v):
     return twists
 
 
-def closest_call(x, v, k, reach, horizon):
+def clearance_lower_bound(x, v, k, reach, horizon):
     """Least of distance - hold on the straight way of v until `horizon`, by bounds on the speeds of points [m]."""
     twists, joints = joint_twists(x, v), len(x.joint_poses)
     origins = twists[:, :3] + np.cross(twists[:, 3:], x.joint_poses[:, 9:])
-    carried = np.linalg.norm(origins, axis=1) + np.linalg.norm(twists[:, 3:], axis=1) * x.joint_reach
+    carried = np.linalg.norm(origins, axis=1) + np.linalg.norm(twists[:, 3:], axis=1) * x.joint_radius
     speeds = np.concatenate((carried, x.speeds[joints:]))
-    spins = np.concatenate((twists[:, 3:], x.twists[:, 3:]))
+    omega = np.concatenate((twists[:, 3:], x.twists[:, 3:]))
     turning, sliding = ((chains @ np.abs(v)).max() for chains in (x.turning, x.sliding))
-    bend = horizon**2 * turning * (turning * x.lever + 2.0 * sliding)
+    bend = horizon**2 * turning * (turning * x.lever_arm + 2.0 * sliding)
     others = reach + x.offset - x.hold - (carried.max() + speeds.max()) * horizon - bend
     near = x.near[:k]
     room = x.d[:k] - x.hold
-    fastest = room - horizon * speeds[x.carriers[near]].sum(axis=1) - bend
+    fastest = room - horizon * speeds[x.moved_by[near]].sum(axis=1) - bend
     approach = x.J[:k] @ v
-    closing = (np.abs(approach) if x.jerked else np.maximum(-approach, 0.0)) + np.maximum(-x.drift[:k], 0.0)
+    closing = (np.abs(approach) if x.jerked else np.maximum(-approach, 0.0)) + np.maximum(-x.feedforward[:k], 0.0)
     bent = np.zeros(k)
     for side, sign in ((0, 1.0), (1, -1.0)):
-        carrier, body = x.carriers[near, side], x.bodies[near, side]
+        carrier, body = x.moved_by[near, side], x.bodies[near, side]
         columns = x.body_poses[body, :9].reshape(-1, 3, 3)  # rotations, transposed
-        turned = sign * np.cross(x.closest[:k, 1:4], spins[carrier])
+        turned = sign * np.cross(x.closest[:k, 1:4], omega[carrier])
         along = np.einsum("ijk,ik->ij", columns, turned)
         witness = x.closest[:k, 4 + 3 * side : 7 + 3 * side] - x.body_poses[body, 9:]
         to = x.boxes[body, :3] - np.einsum("ijk,ik->ij", columns, witness)
         farthest = np.sum(along * to, axis=1) + np.sum(np.abs(along) * x.boxes[body, 3:], axis=1)
         closing += np.maximum(farthest, 0.0)
-        arc = np.linalg.norm(spins[carrier], axis=1) * speeds[carrier]
+        arc = np.linalg.norm(omega[carrier], axis=1) * speeds[carrier]
         bent += np.where(carrier >= joints, 0.5 * horizon**2 * arc, 0.5 * bend)
     normal = np.where(x.convex[near], room - horizon * closing - bent, -np.inf)
     left = np.where(fastest > 0.0, fastest, np.maximum(fastest, normal))

@@ -64,10 +64,10 @@ def test_without_constraints_in_the_way_nothing_moves():
     np.testing.assert_array_equal(x, [0.1, -0.2])
 
 
-@pytest.mark.parametrize("place", ["A", "v0", "J", "least"])
+@pytest.mark.parametrize("place", ["A", "v_tracking", "J", "least"])
 def test_nan_is_no_answer(place):
     arguments = {
-        "A": np.eye(3), "regularization": 1e-3, "v0": np.ones(3), "J": np.ones((2, 3)),
+        "A": np.eye(3), "regularization": 1e-3, "v_tracking": np.ones(3), "J": np.ones((2, 3)),
         "least": np.array([2.9, 0.0]), "lower": -np.ones(3), "upper": 0.99 * np.ones(3),
     }  # fmt: skip
     arguments[place] = arguments[place].copy()
@@ -81,7 +81,7 @@ def test_soft_rows_lack_what_costs_least(seed):
     """Against quadprog, to which what a row lacks is a variable of its own."""
     rng = np.random.default_rng(seed)
     n, m = rng.integers(1, 7), rng.integers(1, 12)
-    J, h, v0 = rng.normal(size=(m, n)), rng.normal(size=m), rng.normal(size=n)
+    J, h, v_tracking = rng.normal(size=(m, n)), rng.normal(size=m), rng.normal(size=n)
     soft = np.where(rng.random(m) < 0.6, 10.0 ** rng.uniform(-6.0, 0.0, m), 0.0)
     lower, upper = -rng.uniform(0.0, 1.0, n), rng.uniform(0.0, 1.0, n)
     giving = np.flatnonzero(soft)
@@ -91,9 +91,9 @@ def test_soft_rows_lack_what_costs_least(seed):
     far = np.full(count, 1e9)
     limits = {"lb": np.r_[lower, -far], "ub": np.r_[upper, far]}
     expected = qpsolvers.solve_qp(
-        np.eye(n + count), np.r_[-v0, np.zeros(count)], -G, -h, **limits, solver="quadprog"
+        np.eye(n + count), np.r_[-v_tracking, np.zeros(count)], -G, -h, **limits, solver="quadprog"
     )  # fmt: skip
-    v, solved = project_soft(np.zeros((0, n)), 1.0, v0, J, h, lower, upper, soft)
+    v, solved = project_soft(np.zeros((0, n)), 1.0, v_tracking, J, h, lower, upper, soft)
     assert solved == (expected is not None)
     if solved:
         np.testing.assert_allclose(v, expected[:n], atol=1e-6)

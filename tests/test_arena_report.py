@@ -500,7 +500,7 @@ def test_an_entrant_from_a_file_is_run_again_from_it(tmp_path):
 def test_a_folder_without_a_list_of_failures_keeps_its_facts(tmp_path):
     with Store(tmp_path) as store:
         store.runs.append(row())
-        store.describe({"title": "Told", "entrants": {}})
+        store.describe({"title": "ObstacleEstimates", "entrants": {}})
     (tmp_path / "failures.jsonl").write_text('{"family": "field", "se')  # a sweep is writing it
     assert read_failures(tmp_path) == []
     (tmp_path / "failures.jsonl").unlink()

@@ -21,7 +21,7 @@ def bound(d, **row):
     closest[:, 0] = d
     free = np.full(2, np.inf)
     x = make_layout(
-        2, pairs=len(d), closest=closest, near=np.arange(len(d)), drift=np.zeros(len(d)), J=np.ones((len(d), 2)),
+        2, pairs=len(d), closest=closest, near=np.arange(len(d)), feedforward=np.zeros(len(d)), J=np.ones((len(d), 2)),
         lower=-free, upper=free, **row_form(settings),
     )  # fmt: skip
     kernels.row_bounds(kernels.pack(x), len(d), False)
@@ -134,7 +134,7 @@ def test_offset_is_added_and_near_pairs_keep_their_order(panda):
     for i, place in enumerate(places):
         bench.query.place_obstacle(i, Sample.at(place, linear=[0.1, 0.2, -0.3]))
     everything, _ = bench.compute(panda.home)
-    distance, rate = everything.distance.copy(), everything.drift.copy()
+    distance, rate = everything.distance.copy(), everything.feedforward.copy()
     near = np.flatnonzero(distance < D2 - 0.1)
     proximity, problem = bench.compute(panda.home, reach=D2 - 0.1)
     rows = problem.avoidance
@@ -149,7 +149,7 @@ def test_offset_is_added_and_near_pairs_keep_their_order(panda):
     np.testing.assert_allclose(rows.b, expected, rtol=0, atol=1e-12)
     assert (h < 0.0).any() and (h > 0.0).any() and np.ptp(rate[near]) > 0.1
     np.testing.assert_array_equal(rows.J, proximity.J)
-    np.testing.assert_array_equal(proximity.drift, rate[near])
+    np.testing.assert_array_equal(proximity.feedforward, rate[near])
 
 
 @pytest.mark.parametrize("kind", ["beta", "task-switching", "damper", "cbf"])

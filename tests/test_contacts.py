@@ -43,9 +43,9 @@ def problem_with(contacts, rng, k=4, low=-0.5, touch=None):
     )
     bound = rng.uniform(0.3, 1.0, nv) * (0.5 if k > 4 else 1.0)
     problem = make_problem(tracking, rows, -bound, bound, [(f"a{i}", f"b{i}") for i in range(k)])
-    v0 = tracking_within(contacts, *tracking)
-    short = max(float(np.max(rows.b - rows.J @ v0, initial=-np.inf)), float(np.max(np.abs(v0) - bound)))
-    return problem._replace(v0=v0, shortfall=short, contacts=contacts)
+    v_tracking = tracking_within(contacts, *tracking)
+    short = max(float(np.max(rows.b - rows.J @ v_tracking, initial=-np.inf)), float(np.max(np.abs(v_tracking) - bound)))
+    return problem._replace(v_tracking=v_tracking, violation=short, contacts=contacts)
 
 
 @pytest.mark.parametrize(("rows", "dependent"), [(3, 0), (12, 0), (6, 4), (1, 0), (20, 0)])
@@ -85,9 +85,9 @@ def test_contacts_hold_exactly_and_the_rest_is_optimal(name, backend):
         P = A.T @ A + 1e-3 * np.eye(12)
         both = np.ascontiguousarray(np.concatenate((rows.J, J, -J)))
         right = np.concatenate((rows.b, b - 1e-10, -b - 1e-10))
-        v = solve_daqp(P, -P @ problem.v0, both, right, problem.lower, problem.upper)
+        v = solve_daqp(P, -P @ problem.v_tracking, both, right, problem.lower, problem.upper)
         np.testing.assert_allclose(solution.v, v, atol=1e-5)
-        binding += problem.shortfall > 0.0
+        binding += problem.violation > 0.0
     assert binding >= 6
 
 
@@ -110,7 +110,7 @@ def test_limits_that_leave_no_velocity_stop_the_robot():
     contacts = solve_contacts(np.array([[1.0, 0.0, 0.0]]), np.array([0.9]))
     problem = problem_with(contacts, np.random.default_rng(0))
     problem = problem._replace(lower=np.full(3, -0.5), upper=np.full(3, 0.5), hard_lower=np.full(3, -0.5),
-                               hard_upper=np.full(3, 0.5), shortfall=0.4)  # fmt: skip
+                               hard_upper=np.full(3, 0.5), violation=0.4)  # fmt: skip
     solution = make_solver("qp").solve(problem)
     assert solution.status is Status.STOPPED
     (reason,) = solution.reasons
@@ -196,7 +196,7 @@ def test_a_law_of_the_users_own_may_say_that_it_holds_them(solo):
 
         def solve(self, problem: Problem) -> Solution:
             assert isinstance(problem.contacts, Contacts)
-            return Solution(problem.contacts.held(problem.v0))
+            return Solution(problem.contacts.held(problem.v_tracking))
 
     controller, q = standing(solo, solver=Own())
     assert controller.step(q).status is Status.SOLVED

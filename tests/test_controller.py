@@ -156,7 +156,7 @@ def test_nothing_is_compiled_after_construction(controller, panda):
 
     assert controller.warm_up_time > 0.0
     before = compiled()
-    assert before["bends"] and before["closest_call"]  # of which not every tick has need
+    assert before["leaves_position_limits"] and before["clearance_lower_bound"]  # of which not every tick has need
     for x in (2.0, 0.45, 0.40):  # out of range, in range, so near that the QP is needed
         controller.step(panda.home, obstacles={"ball": Sample.at([x, 0.0, 0.5], linear=[-0.3, 0.0, 0.0])})
         controller.filter(panda.home, np.full(7, 0.2), v=np.full(7, 0.1))

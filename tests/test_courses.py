@@ -86,7 +86,7 @@ def test_all_at_once_are_where_each_alone_is(motions, data):
     """At any time, around corners, and when time goes back."""
     edges = [corner + early for motion in motions for corner in corners(motion) for early in EARLY]
     times = [*data.draw(st.permutations(edges)), *data.draw(st.lists(st.floats(-5.0, 20.0), max_size=10)), 1.7e9]
-    together = courses.Courses(dict(enumerate(motions)))
+    together = courses.TrajectoryBatch(dict(enumerate(motions)))
     assert not together.others
     states = np.full((len(motions), courses.STATE), np.nan)
     for t in times:
@@ -100,7 +100,7 @@ def test_only_rows_of_its_own_are_written():
         1: build(type="fixed", position=(1, 2, 3)),
     }
     states = np.full((6, courses.STATE), np.nan)
-    courses.Courses(motions).sample(1.0, states)
+    courses.TrajectoryBatch(motions).sample(1.0, states)
     assert np.flatnonzero(np.isfinite(states).all(axis=1)).tolist() == [1, 4]
     assert np.flatnonzero(np.isnan(states).all(axis=1)).tolist() == [0, 2, 3, 5]
     np.testing.assert_allclose(states[4, 9:15], [0.5, 0, 1, 0.5, 0, 0], atol=1e-15)
@@ -123,7 +123,7 @@ class Drifting(Still):
 def test_motions_of_other_classes_are_left_to_their_sample():
     motions: dict[int, Motion] = {0: Pendulum(), 1: build(type="circle", center=(0, 0, 1), radius=0.2, period=3)}
     motions[2] = Drifting(Sample.at([0.0, 0.0, 0.0]))
-    assert set(courses.Courses(motions).others) == {0, 2}
+    assert set(courses.TrajectoryBatch(motions).others) == {0, 2}
 
 
 def test_a_controller_follows_motions_of_other_classes(panda):
@@ -161,7 +161,7 @@ def test_states_move_on_at_their_twists(data):
         sample = Sample.at(data.draw(point), pin.exp3(np.array(data.draw(point))), data.draw(point), twist)
         courses.put(view, sample)
         expected.append(moved(sample, t))
-    courses.move_on(states, t)
+    courses.extrapolate(states, t)
     for view, sample in zip(views, expected, strict=True):
         np.testing.assert_allclose(view.position, sample.position, atol=1e-14)
         np.testing.assert_allclose(view.rotation, sample.rotation, atol=1e-14)
@@ -295,7 +295,7 @@ def test_check_states_normalises_what_is_nearly_a_rotation(data):
 
 
 def random_news(rng, count=9):
-    """Arguments of `take_in`: samples, bare poses of which some are first ones or of the same time, and one at rest."""
+    """Arguments of `update_measured_states`: samples; bare poses, some first or of the same time; one at rest."""
     which = rng.permutation(count)[:7]
     news, last = random_states(rng, count, True), random_states(rng, count, True)
     kind = np.array([SAMPLE, POSE, POSE, POSE, REST, SAMPLE, POSE])
@@ -310,7 +310,7 @@ def test_take_in_gives_bare_poses_the_twist_that_has_led_to_them(seed):
     rng = np.random.default_rng(seed)
     which, kind, times, news, stamps, last, states, _, _ = args = random_news(rng)
     given, known, before, were = news.copy(), stamps.copy(), last.copy(), states.copy()
-    fine = kernels.take_in(*args)
+    fine = kernels.update_measured_states(*args)
     assert fine.tolist() == [True] * 6 + [False]
     for k, i in enumerate(which[:6]):
         expected = given[i].copy()
@@ -400,7 +400,7 @@ def test_a_loop_is_the_same_as_with_every_motion_sampled_alone(panda, monkeypatc
     for a, b in zip(together, alone, strict=True):
         np.testing.assert_allclose(a.solution.v, b.solution.v, atol=1e-9)
         np.testing.assert_array_equal(a.proximity.pair, b.proximity.pair)
-        np.testing.assert_allclose(a.proximity.drift, b.proximity.drift, atol=1e-9)
+        np.testing.assert_allclose(a.proximity.feedforward, b.proximity.feedforward, atol=1e-9)
 
 
 def test_what_the_robot_carries_leaves_its_trajectory(panda):

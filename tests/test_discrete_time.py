@@ -14,7 +14,7 @@ from qpavoid.safety.braking import TOLERANCE
 PLATE = {"type": "box", "size": [0.004, 0.6, 0.6]}
 BALL = {"type": "sphere", "radius": 0.06}
 BOX = {"type": "box", "size": [0.2, 0.2, 0.2]}
-HELD = 0.02
+SAFE = 0.02
 
 
 def least_on_the_way(log, controller, steps=10):
@@ -34,11 +34,11 @@ def test_no_period_and_no_speed_pass_the_safe_distance(row, shape, dt, duration)
         [{"name": "it", "shape": shape, "motion": {"type": "fixed", "position": [0.55, 0.0, 0.45]}}],
         dt=dt,
         duration=duration,
-        avoidance={"d1": HELD, "d2": 0.10, "row": {"type": row}},
+        avoidance={"d1": SAFE, "d2": 0.10, "row": {"type": row}},
     )
     log = simulate(run)
     controller, _ = Controller.from_scenario(run)
-    assert least_on_the_way(log, controller, 10 if dt > 0.001 else 2) > HELD - 1e-3
+    assert least_on_the_way(log, controller, 10 if dt > 0.001 else 2) > SAFE - 1e-3
     assert log.metrics()["peak_velocity"] > 1.0
     counts = log.metrics()["status_counts"]
     # rows with α ask for the stop at once, and at the margin may lack a few mm/s
@@ -58,7 +58,7 @@ def test_nothing_tunnels_through_a_plate(tmp_path, dt, speed):
     controller = make_controller(robot, [plate], "z", dt=dt, task={"gain": 1.0 / dt})
     for tick in drive(controller, np.zeros(3), round(3.0 / speed / dt) + 200, target=[3.0, 0.0, 0.0]):
         after = tick.state.q[0] + dt * tick.solution.v[0]
-        assert 1.0 - 0.001 - 0.05 - after > HELD - 1e-3
+        assert 1.0 - 0.001 - 0.05 - after > SAFE - 1e-3
     assert after > 0.8
 
 
@@ -69,7 +69,7 @@ def turned(controller, q, v, horizon, samples):
     for s in np.linspace(0.0, horizon, 12):
         there = {i: x._replace(position=x.position + s * x.linear) for i, x in samples.items()}
         found.append(ruler.distances(pin.integrate(controller.scene.robot.model, q, s * v), there).min())
-    return min(found) - HELD
+    return min(found) - SAFE
 
 
 def test_the_closest_call_is_a_lower_bound(panda):
@@ -82,7 +82,7 @@ def test_the_closest_call_is_a_lower_bound(panda):
         horizon = rng.uniform(0.005, 0.3)
         places = {b.name: Sample.at(rng.uniform(-0.8, 0.8, 3), linear=rng.uniform(-0.5, 0.5, 3)) for b in balls}
         near = len(controller.tick(q, 0.0, None, places).proximity.pair)
-        bound = controller._assembly.closest_call(v, near, 0.1, horizon)
+        bound = controller._assembly.clearance_lower_bound(v, near, 0.1, horizon)
         least = turned(controller, q, v, horizon, dict(enumerate(places.values())))
         assert least >= bound - 1e-9
         close += bound > 0.0
@@ -105,9 +105,9 @@ def test_what_the_guard_lets_through_is_clear_by_brute_force(panda):
     for _ in range(6):
         places = rng.uniform([0.3, -0.4, 0.2], [0.7, 0.4, 0.9], (3, 3))
         boxes = [Obstacle.at(f"box{i}", Box(size=(0.25, 0.25, 0.01)), place) for i, place in enumerate(places)]
-        controller = make_controller(panda, boxes, avoidance=Avoidance(d1=HELD, d2=0.1, row=Damper(gain=50.0)))
+        controller = make_controller(panda, boxes, avoidance=Avoidance(d1=SAFE, d2=0.1, row=Damper(gain=50.0)))
         ruler, q = Ruler(controller.scene), panda.home + rng.uniform(-0.5, 0.5, 7)
-        while ruler.distances(q).min() < HELD:
+        while ruler.distances(q).min() < SAFE:
             q = panda.home + rng.uniform(-1.0, 1.0, 7)
         for k in range(150):
             if k % 30 == 0:
@@ -117,7 +117,7 @@ def test_what_the_guard_lets_through_is_clear_by_brute_force(panda):
             way = braking(q, s.v, step, 0.01) if k % 4 == 0 else []
             if way and (bounds.lower < way[-1]).all() and (way[-1] < bounds.upper).all():
                 looked += 1
-                assert min(ruler.distances(pose).min() for pose in way) > HELD - 6e-4
+                assert min(ruler.distances(pose).min() for pose in way) > SAFE - 6e-4
             q = q + 0.01 * s.v
     assert looked > 100 and drawn_back > 20
 
@@ -144,10 +144,10 @@ def test_a_stop_ordered_at_any_tick_is_clear_also_at_the_limits(panda):
     for _ in range(6):
         places = rng.uniform([0.3, -0.4, 0.2], [0.7, 0.4, 0.9], (3, 3))
         boxes = [Obstacle.at(f"box{i}", Box(size=(0.25, 0.25, 0.01)), place) for i, place in enumerate(places)]
-        settings = Avoidance(d1=HELD, d2=0.1, row=Damper(gain=50.0))
+        settings = Avoidance(d1=SAFE, d2=0.1, row=Damper(gain=50.0))
         driver, stopper = (make_controller(panda, boxes, avoidance=settings) for _ in range(2))
         ruler, q = Ruler(driver.scene), panda.home + rng.uniform(-0.5, 0.5, 7)
-        while ruler.distances(q).min() < HELD:
+        while ruler.distances(q).min() < SAFE:
             q = panda.home + rng.uniform(-1.0, 1.0, 7)
         for k in range(150):
             if k % 50 == 0:
@@ -161,7 +161,7 @@ def test_a_stop_ordered_at_any_tick_is_clear_also_at_the_limits(panda):
             while v.any():
                 v = stopper.step(here, np.nan).v
                 for share in (0.5, 1.0):
-                    assert ruler.distances(here + 0.01 * share * v).min() > HELD - 6e-4
+                    assert ruler.distances(here + 0.01 * share * v).min() > SAFE - 6e-4
                 here = here + 0.01 * v
             at_limits += bool((np.minimum(here - bounds.lower, bounds.upper - here) < 0.02).any())
     assert stops > 100 and at_limits > 10
@@ -177,13 +177,18 @@ def test_where_the_linearisation_is_too_kind_the_step_is_shortened_and_logged(sh
             {"type": "line", "displacement": [0.4, 0.05, -0.1], "speed": speed},
             [{"name": "it", "shape": shape, "motion": {"type": "fixed", "position": [0.55, 0.0, 0.45]}}],
             dt=0.05,
-            avoidance={"d1": HELD, "d2": 0.10, "row": {"type": "damper", "gain": 20.0}, "look_ahead": look_ahead},
+            avoidance={
+                "d1": SAFE,
+                "d2": 0.10,
+                "row": {"type": "damper", "gain": 20.0},
+                "look_ahead": look_ahead,
+            },
         )
         log = simulate(run)
         least[look_ahead] = least_on_the_way(log, Controller.from_scenario(run)[0])
         shares[look_ahead] = log.share
         assert log.metrics()["shortened_ticks"] == np.sum(log.share < 1.0)
-    assert least[False] < alone and least[True] > HELD - 5e-4
+    assert least[False] < alone and least[True] > SAFE - 5e-4
     assert (shares[False] == 1.0).all() and shares[True].min() < 1.0
 
 
@@ -192,7 +197,11 @@ def test_nothing_is_first_seen_inside_its_margin(tmp_path):
     robot = cartesian(tmp_path, speed=2.0, acceleration=4.0)
     wall = Obstacle.at("wall", Box(size=(0.1, 2.0, 2.0)), [2.05, 0.0, 0.0])
     controller = make_controller(
-        robot, [wall], "z", avoidance=Avoidance(d1=HELD, d2=0.03, row=Damper(gain=20.0)), task={"gain": 50.0}
+        robot,
+        [wall],
+        "z",
+        avoidance=Avoidance(d1=SAFE, d2=0.03, row=Damper(gain=20.0)),
+        task={"gain": 50.0},
     )
     braking, before = [], np.zeros(3)
     for tick in drive(controller, np.array([-1.0, 0.0, 0.0]), 400, target=[4.0, 0.0, 0.0]):
@@ -201,8 +210,8 @@ def test_nothing_is_first_seen_inside_its_margin(tmp_path):
         if v[0] < before[0] - 1e-6:
             braking.append(1.95 - tick.state.q[0])
         before = v
-        assert 1.95 - tick.state.q[0] > HELD - 1e-3
-    assert braking[0] > 0.45 and 1.95 - tick.state.q[0] < HELD + 2e-3
+        assert 1.95 - tick.state.q[0] > SAFE - 1e-3
+    assert braking[0] > 0.45 and 1.95 - tick.state.q[0] < SAFE + 2e-3
 
 
 @pytest.mark.parametrize(
@@ -213,18 +222,18 @@ def test_the_look_ahead_moves_obstacles_on(tmp_path, linear, angular):
     """No row sees it at 150 mm; at the end of the tick it is 200 or 140 mm nearer, or has turned on the robot."""
     robot = cartesian(tmp_path, acceleration=None)
     bar = Obstacle.at("bar", Box(size=(0.02, 2.0, 0.02)), [9.0, 0.0, 0.0])
-    avoidance = Avoidance(d1=0.02, d2=0.10, escape=None)  # a way out would be sought as well
+    avoidance = Avoidance(d1=0.02, d2=0.10, backup=None)  # a way out would be sought as well
     controller = make_controller(robot, [bar], "z", dt=0.05, avoidance=avoidance)
     center = [0.21, 0.0, 0.0] if any(linear) else [0.21, -0.9, 0.0]  # the tool is a ball of 50 mm
     seen = {"bar": Sample.at(center, linear=linear, angular=angular)}
     tick = controller.tick(np.zeros(3), 0.0, {"z": Sample.at([0.0, 0.0, 0.0])}, seen)
-    assert not len(tick.proximity.pair) and tick.problem.shortfall <= 0.0
+    assert not len(tick.proximity.pair) and tick.problem.violation <= 0.0
     turned_on = moved(seen["bar"], 0.05)
-    short = HELD - Ruler(controller.scene).distances(np.zeros(3), {0: turned_on}).min()
+    short = SAFE - Ruler(controller.scene).distances(np.zeros(3), {0: turned_on}).min()
     assert short > 5e-3 and tick.solution.status is Status.RELAXED
     (reason,) = tick.solution.reasons
     assert (reason.kind, reason.subject, reason.unit) == (ReasonKind.PREDICTED_TOO_NEAR, ("tool", "bar"), "m")
     assert reason.amount == pytest.approx(short - TOLERANCE, abs=1e-6)
-    assert reason.severity is (Severity.ALARM if short > HELD else Severity.WARNING)
+    assert reason.severity is (Severity.ALARM if short > SAFE else Severity.WARNING)
     away = seen["bar"]._replace(linear=-seen["bar"].linear, angular=-seen["bar"].angular)
     assert controller.step(np.zeros(3), 0.0, None, {"bar": away}).status is Status.SOLVED

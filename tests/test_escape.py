@@ -8,12 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from qpavoid import Controller, Obstacle, Pose, ReasonKind, Sample, ScenarioConfig, Status, kernels, load_scenario
-from qpavoid.config import Avoidance, Box, Escape, Limits, Line, Sensing, Sphere
-from qpavoid.control.estimates import strayed
+from qpavoid.config import Avoidance, Backup, Box, Limits, Line, Sensing, Sphere
+from qpavoid.control.estimates import prediction_error_bound
 from qpavoid.control.obstacles import Obstacles
-from qpavoid.control.trajectories import move_on
+from qpavoid.control.trajectories import extrapolate
 from qpavoid.model.trajectory import build_motion
-from qpavoid.safety.policy import Manner, Near, Start, Tally
+from qpavoid.safety.policy import BackupPolicy, Near, Start, Tally
 from qpavoid.safety.rollout import _farthest
 from qpavoid.solvers.backends import solve_daqp
 
@@ -31,10 +31,10 @@ def jaws(stop=GAP, speed=0.3):
     return balls
 
 
-def pincer(folder, escape, acceleration=None, given=False, jerk=None):
+def pincer(folder, backup, acceleration=None, given=False, jerk=None):
     """A ball on slides, told to stay where the jaws close in 2.7 s; distances at every tick, and the solutions."""
     robot = cartesian(folder, "xy", speed=0.25, acceleration=acceleration)
-    avoidance = Avoidance(d1=0.02, d2=0.10, escape=escape)
+    avoidance = Avoidance(d1=0.02, d2=0.10, backup=backup)
     controller = make_controller(robot, jaws(), "y", avoidance=avoidance, limits=Limits(jerk=jerk))
     q, gaps, solutions = robot.home.copy(), [], []
     for k in range(280):
@@ -56,8 +56,8 @@ def test_jaws_close_on_a_law_that_looks_one_tick_ahead(tmp_path):
     ("acceleration", "given", "jerk"), [(None, True, None), (2.0, False, None), (2.0, False, 50.0), (2.0, False, 4.0)]
 )
 def test_who_looks_farther_leaves_in_time_and_says_why(tmp_path, acceleration, given, jerk):
-    gaps, solutions = pincer(tmp_path, Escape(), acceleration, given, jerk)
-    assert gaps.min() > 0.5 * Escape().safe * 0.02  # looked at every 40 ms
+    gaps, solutions = pincer(tmp_path, Backup(), acceleration, given, jerk)
+    assert gaps.min() > 0.5 * Backup().safe * 0.02  # looked at every 40 ms
     fled = [s for s in solutions if any(reason.kind is ReasonKind.BACKUP for reason in s.reasons)]
     assert len(fled) > 10 and all(s.status is Status.RELAXED for s in fled)
     # beside balls that touch, a ball of 5 cm is clear at √(0.55² - 0.5²) m from there, which takes 0.92 s
@@ -75,7 +75,7 @@ def test_in_short_periods_decisions_hold_for_10_ms(tmp_path):
     """A ball on slides that is to stay where the jaws close leaves in time, with a decision in ten ticks at most."""
     dt, robot = 0.001, cartesian(tmp_path, "xy", speed=0.25, acceleration=2.0)
     controller = make_controller(robot, jaws(), "y", dt=dt, avoidance=Avoidance(d1=0.02, d2=0.10))
-    flights, flown = controller._commander.escape.flights, []
+    flights, flown = controller._commander.backup.flights, []
     better = flights.better
     flights.better = lambda *a: flown.append(k) or better(*a)
     q, least, far = robot.home.copy(), np.inf, 0.0
@@ -84,7 +84,7 @@ def test_in_short_periods_decisions_hold_for_10_ms(tmp_path):
         least = min(least, *(np.linalg.norm(q - center) - GAP - 0.05 for center in centers))
         q = pin.integrate(robot.model, q, dt * controller.step(q, k * dt, {"y": Sample.at([0.0, 0.0, 0.0])}).v)
         far = max(far, abs(q[0]) if k < 500 else 0.0)
-    assert least > 0.5 * Escape().safe * 0.02
+    assert least > 0.5 * Backup().safe * 0.02
     assert far < 1e-3  # it stays at its task while that is safe
     ticks = np.unique(flown)
     assert len(ticks) > 5 and np.diff(ticks).min() >= 10
@@ -105,7 +105,7 @@ def test_what_is_given_is_flown_before_it_flees(among_balls):
 def test_where_nothing_moves_it_changes_no_bit():
     base = load_scenario("ur5_pole", ["duration=3"])
     assert all(o.motion.type == "fixed" for o in base.obstacles)
-    blind = base.model_copy(update={"avoidance": base.avoidance.model_copy(update={"escape": None})})
+    blind = base.model_copy(update={"avoidance": base.avoidance.model_copy(update={"backup": None})})
     (one, q), (two, _) = Controller.from_scenario(base), Controller.from_scenario(blind.read_from(base.source))
     for k in range(300):
         v = one.step(q, k * base.dt).v
@@ -115,8 +115,8 @@ def test_where_nothing_moves_it_changes_no_bit():
 
 def test_commands_of_others_are_kept_out_of_traps_too(tmp_path):
     robot = cartesian(tmp_path, "xy", speed=0.25, acceleration=None)
-    for escape, trapped in ((None, True), (Escape(), False)):
-        controller = make_controller(robot, jaws(), avoidance=Avoidance(d1=0.02, d2=0.10, escape=escape))
+    for backup, trapped in ((None, True), (Backup(), False)):
+        controller = make_controller(robot, jaws(), avoidance=Avoidance(d1=0.02, d2=0.10, backup=backup))
         q, least = robot.home.copy(), np.inf
         for k in range(300):
             solution = controller.filter(q, np.zeros(2), k * DT)
@@ -126,7 +126,7 @@ def test_commands_of_others_are_kept_out_of_traps_too(tmp_path):
         assert (least < 0.0) == trapped
 
 
-STILL = Manner(1.0, np.zeros(4))
+STILL = BackupPolicy(1.0, np.zeros(4))
 """A second ahead, leaning nowhere."""
 
 
@@ -149,11 +149,13 @@ def test_farthest_is_the_minimum_that_daqp_finds():
     """max s - ½ s²/c - ε/2c ‖v - v̂‖²  s.t.  d + h (J v + ḋ) >= s,  lower <= v <= upper, as one QP in (v, s)."""
     rng = np.random.default_rng(1)
     for _ in range(20):
-        closest, J, drift = rng.uniform(0.0, 0.1, (5, 10)), rng.normal(size=(5, 3)), 0.1 * rng.normal(size=5)
-        h, comfort, gentle, leaning = 0.2, 0.1, 1e-4, rng.normal(size=3)
-        v, met = kernels.farthest(h, closest, J, drift, comfort, 10.0, gentle, leaning, -np.ones(3), np.ones(3))
-        P = np.diag([gentle, gentle, gentle, 1.0])
-        G, least = np.column_stack((h * J, -np.ones(5))), -(closest[:, 0] + h * drift)
+        closest, J, feedforward = rng.uniform(0.0, 0.1, (5, 10)), rng.normal(size=(5, 3)), 0.1 * rng.normal(size=5)
+        h, comfort, low_effort, leaning = 0.2, 0.1, 1e-4, rng.normal(size=3)
+        v, met = kernels.farthest(
+            h, closest, J, feedforward, comfort, 10.0, low_effort, leaning, -np.ones(3), np.ones(3)
+        )
+        P = np.diag([low_effort, low_effort, low_effort, 1.0])
+        G, least = np.column_stack((h * J, -np.ones(5))), -(closest[:, 0] + h * feedforward)
         bounds = np.array([-1.0, -1.0, -1.0, -10.0]), np.array([1.0, 1.0, 1.0, comfort])
         expected = solve_daqp(P, -P @ np.append(leaning, comfort), G, least, *bounds)
         assert met and v == pytest.approx(expected[:3], abs=1e-6)
@@ -167,9 +169,9 @@ def test_that_flights_do_not_hold_contacts_is_said_where_something_moves():
             "humanoid_reach",
             obstacles=[{"name": "ball", "shape": {"type": "sphere", "radius": 0.1}, "motion": ball}],
         )
-        assert scenario.contacts and scenario.avoidance.escape is not None
+        assert scenario.contacts and scenario.avoidance.backup is not None
         controller, q = Controller.from_scenario(scenario)
-        assert controller._commander.escape is None
+        assert controller._commander.backup is None
         kinds = [reason.kind for reason in controller.step(q).assumptions]
         assert (ReasonKind.NO_BACKUP in kinds) == moves
 
@@ -180,8 +182,8 @@ def test_only_laws_that_keep_limits_are_held_back(tmp_path):
     for law, held_back in (("eq10", False), ("qp", True)):
         controller = make_controller(robot, jaws(), "y", solver=law, avoidance=Avoidance(d1=0.02, d2=0.10))
         flown = []
-        better = controller._commander.escape.flights.better
-        controller._commander.escape.flights.better = lambda *a, b=better, f=flown: f.append(a) or b(*a)
+        better = controller._commander.backup.flights.better
+        controller._commander.backup.flights.better = lambda *a, b=better, f=flown: f.append(a) or b(*a)
         controller.step(robot.home, 2.5, {"y": Sample.at([0.0, 0.0, 0.0])})
         assert bool(flown) == held_back
 
@@ -189,9 +191,9 @@ def test_only_laws_that_keep_limits_are_held_back(tmp_path):
 def test_limits_of_the_settings_are_told():
     fields = {"robot": "panda", "tasks": [{"frame": "panda_hand_tcp"}], "duration": 1.0}
     with pytest.raises(ValueError, match="horizon"):
-        ScenarioConfig.model_validate({**fields, "avoidance": {"escape": {"horizon": 0.0}}})
-    assert ScenarioConfig.model_validate(fields).avoidance.escape == Escape()
-    assert ScenarioConfig.model_validate({**fields, "avoidance": {"escape": None}}).avoidance.escape is None
+        ScenarioConfig.model_validate({**fields, "avoidance": {"backup": {"horizon": 0.0}}})
+    assert ScenarioConfig.model_validate(fields).avoidance.backup == Backup()
+    assert ScenarioConfig.model_validate({**fields, "avoidance": {"backup": None}}).avoidance.backup is None
 
 
 def slab(name, size, at, to=None, speed=0.3):
@@ -215,15 +217,15 @@ def press():
 def test_a_way_out_that_leads_nearer_first_is_found(tmp_path):
     """Whoever only keeps away from everything stays in the chamber: in the neck walls are at 5 cm, not at 10."""
     robot = cartesian(tmp_path, "xy", speed=0.4, acceleration=None)
-    for escape, crushed in ((None, True), (Escape(), False)):
-        controller = make_controller(robot, press(), "y", avoidance=Avoidance(d1=0.02, d2=0.10, escape=escape))
+    for backup, crushed in ((None, True), (Backup(), False)):
+        controller = make_controller(robot, press(), "y", avoidance=Avoidance(d1=0.02, d2=0.10, backup=backup))
         ruler, q, least = Ruler(controller.scene), robot.home.copy(), np.inf
         for k in range(240):
             v = controller.step(q, k * DT, {"y": Sample.at([0.0, 0.0, 0.0])}).v
             least = min(least, ruler.least_between(q, v, DT, k * DT, steps=2))
             q = pin.integrate(robot.model, q, DT * v)
         assert (least < 0.0) == crushed, least
-        assert crushed or (q[0] > 0.3 and least > 0.9 * Escape().safe * 0.02)
+        assert crushed or (q[0] > 0.3 and least > 0.9 * Backup().safe * 0.02)
 
 
 def test_past_a_contact_that_cannot_be_helped_others_are_kept_off(tmp_path):
@@ -237,7 +239,7 @@ def test_past_a_contact_that_cannot_be_helped_others_are_kept_off(tmp_path):
         "ball", Sphere(radius=0.15),
         build_motion(Line(start=(-1.2, 0.02, 0), end=(1.0, 0.02, 0), speed=0.6), None, SHIPPED.parent), moves=True,
     )  # fmt: skip
-    controller = make_controller(robot, [wall, ball], "y", avoidance=Avoidance(d1=0.02, d2=0.10, escape=Escape()))
+    controller = make_controller(robot, [wall, ball], "y", avoidance=Avoidance(d1=0.02, d2=0.10, backup=Backup()))
     q, walls, balls = robot.home.copy(), [], []
     for k in range(280):
         t = k * DT
@@ -245,13 +247,13 @@ def test_past_a_contact_that_cannot_be_helped_others_are_kept_off(tmp_path):
         walls.append(abs(x[0]) - 0.01 - 0.05)
         balls.append(np.hypot(x[1], q[0] - 0.02) - 0.15 - 0.05)
         q = pin.integrate(robot.model, q, DT * controller.step(q, t, {"y": Sample.at([0.0, 0.0, 0.0])}).v)
-    assert min(walls) < 0.0 < 0.5 * Escape().safe * 0.02 < min(balls)
+    assert min(walls) < 0.0 < 0.5 * Backup().safe * 0.02 < min(balls)
 
 
 def test_where_there_is_no_way_out_every_tick_has_an_outcome_all_the_same(tmp_path):
     robot = cartesian(tmp_path, "xy", speed=0.4, acceleration=None)
     closed, dt = [*press(), slab("plug", (0.05, 0.2, 0.2), (0.325, -0.15, 0.0))], 0.05
-    controller = make_controller(robot, closed, "y", dt=dt, avoidance=Avoidance(d1=0.02, d2=0.10, escape=Escape()))
+    controller = make_controller(robot, closed, "y", dt=dt, avoidance=Avoidance(d1=0.02, d2=0.10, backup=Backup()))
     ruler, q, least = Ruler(controller.scene), robot.home.copy(), np.inf
     for k in range(60):
         v = controller.step(q, k * dt, {"y": Sample.at([0.0, 0.0, 0.0])}).v
@@ -264,7 +266,7 @@ def test_where_there_is_no_way_out_every_tick_has_an_outcome_all_the_same(tmp_pa
 def planner_of(scenario):
     """A planner, its controller, and the start of a run."""
     controller, q = Controller.from_scenario(scenario)
-    planner = controller._commander.escape
+    planner = controller._commander.backup
     assert planner is not None
     return controller, planner, q
 
@@ -289,7 +291,7 @@ def among_balls(request):
             ]
         )
     ]
-    avoidance = {"d1": 0.03, "d2": 0.1, "escape": {}}
+    avoidance = {"d1": 0.03, "d2": 0.1, "backup": {}}
     return planner_of(changed("panda_line", obstacles=balls, avoidance=avoidance, limits=request.param, dt=0.01))
 
 
@@ -309,12 +311,12 @@ def test_a_flight_that_is_flown_again_is_the_same_and_so_is_what_is_left_of_it(a
     touched = 0
     for t in (0.02, 0.13, 0.51, 1.17):  # a tick later, flights end at the same time
         for manner in [planner.flights.still, *(planner._drawn() for _ in range(5))]:
-            planner.flights.forget_foreseen()
+            planner.flights.drop_predictions()
             flight = planner.flights.fly(start_of(planner, q, t), manner)
             again = planner.flights.fly(flight.start, planner.flights.still, flight.v)
             assert again.value == pytest.approx(flight.value, abs=1e-12)
             np.testing.assert_allclose(again.v, flight.v, rtol=0, atol=1e-12)
-            assert largest_change(flight, 2) <= planner.flights.ramps.steps.w_step.max() * (1.0 + 1e-9)
+            assert largest_change(flight, 2) <= planner.flights.ramps.steps.dv_step.max() * (1.0 + 1e-9)
             assert largest_change(flight, 1) <= planner.flights.ramps.steps.v_step.max() * (1.0 + 1e-9)
             touched += flight.value.clear < 1.5
             left = planner.flights.a_tick_on(flight)
@@ -350,7 +352,7 @@ def test_flights_that_hold_from_a_start_close_by_do_so(among_balls):
     rng, held = np.random.default_rng(2), 0
     for _ in range(60):
         t = rng.uniform(0.0, 2.0)
-        planner.flights.forget_foreseen()
+        planner.flights.drop_predictions()
         flight = planner.flights.fly(start_of(planner, q, t), planner._drawn())
         off = rng.uniform(-1.0, 1.0, len(q)) * 10.0 ** rng.uniform(-4.0, -1.5)
         start = start_of(planner, pin.integrate(planner._model, q, off), t, rng.uniform(-0.05, 0.05, len(q)))
@@ -358,7 +360,7 @@ def test_flights_that_hold_from_a_start_close_by_do_so(among_balls):
             held += 1
             again = planner.flights.fly(start, planner.flights.still, flight.v)
             assert again.value >= planner.flights.enough
-            assert again.least >= flight.least - planner.flights.lever * 0.1 * len(q)
+            assert again.least >= flight.least - planner.flights.lever_arm * 0.1 * len(q)
     assert 2 < held < 55
 
 
@@ -368,9 +370,9 @@ def test_a_plate_that_is_passed_between_two_looks_is_seen(tmp_path):
     plate = slab("plate", (0.002, 2.0, 0.2), (0.001, 0.0, 0.0))
     for shift in np.linspace(0.0, 0.12, 7):
         controller = make_controller(
-            robot, [plate, *jaws()], "y", avoidance=Avoidance(d1=0.02, d2=0.1, escape=Escape())
+            robot, [plate, *jaws()], "y", avoidance=Avoidance(d1=0.02, d2=0.1, backup=Backup())
         )
-        planner = controller._commander.escape
+        planner = controller._commander.backup
         q = np.array([-0.5 - shift, 0.0])
         still, start = planner.flights.still, start_of(planner, q, 0.0)
         flight = planner.flights.fly(start, still, np.tile([3.0, 0.0], (40, 1)))
@@ -381,9 +383,9 @@ def test_a_plate_that_is_passed_between_two_looks_is_seen(tmp_path):
 def test_what_was_found_clear_is_looked_at_anew_when_obstacles_turn(tmp_path):
     robot = cartesian(tmp_path, "xy", speed=0.25, acceleration=None)
     chaser = Obstacle.at("chaser", Sphere(radius=0.1), [-0.4, 0.0, 0.0])
-    avoidance = Avoidance(d1=0.02, d2=0.1, escape=Escape(attempts=20))
+    avoidance = Avoidance(d1=0.02, d2=0.1, backup=Backup(attempts=20))
     controller = make_controller(robot, [chaser], "y", avoidance=avoidance)
-    planner = controller._commander.escape
+    planner = controller._commander.backup
 
     def told(speed):
         return {"chaser": Sample.at([-0.4, 0.0, 0.0], linear=[speed, 0.0, 0.0])}
@@ -392,7 +394,7 @@ def test_what_was_found_clear_is_looked_at_anew_when_obstacles_turn(tmp_path):
     for speed, clear in ((0.0, 1.5), (0.5, 0.25 / 0.5)):
         for k in range(200):  # what is foreseen is of the mean of what was told lately
             controller._obstacles.observe(0.01 * (k - 199), told(speed))
-        planner.flights.forget_foreseen()
+        planner.flights.drop_predictions()
         found, _ = planner._way_out(start)
         if speed == 0.0:
             planner._kept = found
@@ -412,7 +414,7 @@ def test_what_was_foreseen_is_forgotten_when_it_is_over(among_balls):
         most = max(most, len(planner.flights._foreseen))
     assert 100 < most < 1000  # a tick in trouble foresees some hundreds
     for t, seen in planner.flights._foreseen.items():
-        np.testing.assert_array_equal(seen.states, controller._obstacles.foreseen(t).states)
+        np.testing.assert_array_equal(seen.states, controller._obstacles.predicted(t).states)
 
 
 def test_no_flight_is_flown_where_nothing_comes_near(tmp_path, monkeypatch):
@@ -422,10 +424,10 @@ def test_no_flight_is_flown_where_nothing_comes_near(tmp_path, monkeypatch):
             "far", Sphere(radius=0.1), build_motion(Line(start=(0.0, 3.0, 0.0), end=(0.0, 0.0, 0.0), speed=0.3)), True
         )
     ]
-    controller = make_controller(robot, far, "y", avoidance=Avoidance(d1=0.02, d2=0.1, escape=Escape()))
+    controller = make_controller(robot, far, "y", avoidance=Avoidance(d1=0.02, d2=0.1, backup=Backup()))
     flown = []
-    better = controller._commander.escape.flights.better
-    monkeypatch.setattr(controller._commander.escape.flights, "better", lambda *a: flown.append(a[1].t) or better(*a))
+    better = controller._commander.backup.flights.better
+    monkeypatch.setattr(controller._commander.backup.flights, "better", lambda *a: flown.append(a[1].t) or better(*a))
     q = robot.home.copy()
     for k in range(0, 900, 10):
         controller.step(q, k * DT, {"y": Sample.at([0.0, 0.0, 0.0])})
@@ -452,16 +454,16 @@ def test_where_nobody_is_said_to_come_nobody_does(tmp_path_factory, lines, t, v)
     ]
     if not obstacles:
         return
-    controller = make_controller(robot, obstacles, avoidance=Avoidance(d1=0.02, d2=0.1, escape=Escape()))
-    planner, v = controller._commander.escape, np.array(v)
+    controller = make_controller(robot, obstacles, avoidance=Avoidance(d1=0.02, d2=0.1, backup=Backup()))
+    planner, v = controller._commander.backup, np.array(v)
     for k, away in enumerate((0.0, 0.01, 0.1, 0.3)):  # what was found from one place counts for others near by
         home, at = robot.home + away, t + 0.02 * k
         moving = [o for o in obstacles if o.motion.sample(at).linear.any()]  # who rests does not come
         if not planner._nobody_comes(Start(home, v, np.zeros(2), at, planner.flights.parted)):
             continue
         for later in np.linspace(0.0, 1.5, 76):
-            ramp = np.minimum(later, np.abs(v) / 2.0)
-            q = home + np.sign(v) * (np.abs(v) * ramp - ramp**2)
+            rate_limit = np.minimum(later, np.abs(v) / 2.0)
+            q = home + np.sign(v) * (np.abs(v) * rate_limit - rate_limit**2)
             place = np.array([*q, 0.0])
             centers = [o.motion.sample(at + later).position for o in moving]
             assert min((np.linalg.norm(place - center) for center in centers), default=1.0) - 0.15 > 0.1
@@ -474,7 +476,7 @@ ROBOTS = {}
 def test_a_flight_holds_only_while_it_is_of_what_is(tmp_path, among_balls):
     _, planner, q = among_balls
     planner.reset()
-    planner.flights.forget_foreseen()
+    planner.flights.drop_predictions()
     flight = next(
         f
         for f in iter(lambda: planner.flights.fly(start_of(planner, q, 0.0), planner._drawn()), None)
@@ -492,8 +494,8 @@ def test_a_flight_holds_only_while_it_is_of_what_is(tmp_path, among_balls):
         "ball", Sphere(radius=0.1), build_motion(Line(start=(0.0, 0.6, 0.0), end=(0.0, -2.0, 0.0), speed=0.01)), True
     )
     robot = cartesian(tmp_path, "xy", speed=0.25, acceleration=None)
-    controller = make_controller(robot, [load, ball], avoidance=Avoidance(d1=0.02, d2=0.1, escape=Escape(comfort=0.5)))
-    planner = controller._commander.escape
+    controller = make_controller(robot, [load, ball], avoidance=Avoidance(d1=0.02, d2=0.1, backup=Backup(comfort=0.5)))
+    planner = controller._commander.backup
     for change in (
         lambda: controller.attach("load", "y", robot.home),
         lambda: controller.allow_contact("load", ["ball"]),
@@ -513,7 +515,7 @@ def test_flights_know_what_the_robot_carries(tmp_path):
     )
     robot = cartesian(tmp_path, "xy", speed=0.25, acceleration=None)
     controller = make_controller(robot, [load, ball], avoidance=Avoidance(d1=0.02, d2=0.1))
-    flights, q = controller._commander.escape.flights, robot.home
+    flights, q = controller._commander.backup.flights, robot.home
     pair = next(i for i, names in enumerate(controller.scene.pair_names) if set(names) == {"load", "ball"})
     assert not flights.parted[pair]
     controller.attach("load", "y", q)
@@ -521,7 +523,7 @@ def test_flights_know_what_the_robot_carries(tmp_path):
 
     def look(q):
         near = flights._look(q, 0.0, np.zeros(2), Tally(Start(q, *np.zeros((2, 2)), 0.0, flights.parted), 1.5), 0.0)
-        (row,) = np.flatnonzero(flights._layout.near[: len(near.drift)] == pair)
+        (row,) = np.flatnonzero(flights._layout.near[: len(near.feedforward)] == pair)
         return near.closest[row, 0], near.J[row].copy()
 
     d, J = look(q)
@@ -541,7 +543,7 @@ def test_told_obstacles_are_foreseen_once_as_long_as_they_do_what_was_told(tmp_p
         rng = np.random.default_rng(0)
         ball = Obstacle.at("ball", Sphere(radius=0.1), [0.5, 0.0, 0.0])
         controller = make_controller(robot, [ball], "y", avoidance=Avoidance(d1=0.02, d2=0.10))
-        flights, starts = controller._commander.escape.flights, []
+        flights, starts = controller._commander.backup.flights, []
         better = flights.better
         flights.better = lambda *a, s=starts, b=better: s.append(a[1].t) or b(*a)
         q = robot.home.copy()
@@ -567,15 +569,15 @@ def test_paths_are_what_is_foreseen_of_those_on_trajectories_and_those_told_of()
     for k in range(4):
         obstacles.observe(0.1 * k, given if k % 2 else None)
         places, rates = obstacles.paths(times)
-        assert obstacles.restless and len(rates) == (2 if k else 1)
+        assert obstacles.any_may_move and len(rates) == (2 if k else 1)
         for t, row in zip(times, places, strict=True):
-            np.testing.assert_allclose(row, obstacles.foreseen(t).states[obstacles.moving, 9:12], rtol=0, atol=1e-12)
+            np.testing.assert_allclose(row, obstacles.predicted(t).states[obstacles.moving, 9:12], rtol=0, atol=1e-12)
         expected = [[0.5, 0.0], [np.sqrt(0.05), 3.0]][: len(rates)]
         np.testing.assert_allclose(rates, expected, rtol=0, atol=1e-12)
     rest = Obstacles([still], Sensing(), 0.1)
-    for twist, restless in (([0, 0, 0], False), ([0, 0, 0.1], True)):
+    for twist, any_may_move in (([0, 0, 0], False), ([0, 0, 0.1], True)):
         rest.observe(0.0, {"still": Sample.at([9.0, 0.0, 0.0], linear=twist)})
-        assert rest.restless == restless
+        assert rest.any_may_move == any_may_move
 
 
 def test_what_is_foreseen_is_of_the_mean_of_what_was_told_lately():
@@ -590,9 +592,9 @@ def test_what_is_foreseen_is_of_the_mean_of_what_was_told_lately():
             first = obstacles.told.states[0, 12:15]
             np.testing.assert_array_equal(first, obstacles._seen.states[0, 12:15])  # of one twist, that is the mean
         if k > 50:
-            off.append(obstacles.foreseen(t + 1.0).states[0, 9:12] - at - [0.2, 0.0, 0.0])
+            off.append(obstacles.predicted(t + 1.0).states[0, 9:12] - at - [0.2, 0.0, 0.0])
             places, _ = obstacles.paths(np.array([t + 1.0]))
-            np.testing.assert_allclose(places[0, 0], obstacles.foreseen(t + 1.0).states[0, 9:12], rtol=0, atol=1e-12)
+            np.testing.assert_allclose(places[0, 0], obstacles.predicted(t + 1.0).states[0, 9:12], rtol=0, atol=1e-12)
     assert np.std(off) < 0.05 and np.abs(np.mean(off, axis=0)).max() < 0.02
 
 
@@ -601,7 +603,7 @@ def test_a_clock_that_is_not_exact_costs_no_flights(tmp_path):
     for jitter in (0.0, 1e-3):
         rng, robot = np.random.default_rng(0), cartesian(tmp_path, "xy", speed=0.25, acceleration=None)
         controller = make_controller(robot, jaws(speed=0.12), "y", avoidance=Avoidance(d1=0.02, d2=0.10))
-        flights, starts = controller._commander.escape.flights, []
+        flights, starts = controller._commander.backup.flights, []
         better = flights.better
         flights.better = lambda *a, s=starts, b=better: s.append(a[1].t) or b(*a)
         q = robot.home.copy()
@@ -625,7 +627,7 @@ def test_how_far_obstacles_stray_is_no_less_than_any_point_of_them(seed, size):
     first = {name: [rng.normal(size=3) for _ in range(4)] for name in names}
     obstacles.observe(0.0, {name: sample(*parts) for name, parts in first.items()})
     before, radii = obstacles.told, np.array([0.2, 0.3])
-    then = {name: obstacles.foreseen(dt).states[i] for i, name in enumerate(names)}
+    then = {name: obstacles.predicted(dt).states[i] for i, name in enumerate(names)}
     now = {}
     for name, state in then.items():
         R = state[:9].reshape(3, 3).T @ pin.exp3(size * rng.normal(size=3))
@@ -633,16 +635,16 @@ def test_how_far_obstacles_stray_is_no_less_than_any_point_of_them(seed, size):
             *(state[9:12] + size * rng.normal(size=3), R), *(state[12:].reshape(2, 3) + size * rng.normal(size=(2, 3)))
         )
     obstacles.observe(dt, now)
-    bound = strayed(obstacles.told, before, 1.0, radii)
+    bound = prediction_error_bound(obstacles.told, before, 1.0, radii)
     for i, name in enumerate(names):
         for t in np.linspace(0.0, 1.0, 11):
             points = rng.normal(size=(50, 3))
             points *= radii[i] / np.linalg.norm(points, axis=1, keepdims=True)
             states = np.array([then[name], obstacles.told.states[i]])
-            move_on(states, t)
+            extrapolate(states, t)
             places = [points @ state[:9].reshape(3, 3) + state[9:12] for state in states]
             assert np.linalg.norm(places[0] - places[1], axis=1).max() <= bound + 1e-9
-    assert strayed(obstacles.told, before, 1.0, np.array([np.inf, 0.3])) == np.inf or size < 1e-9
+    assert prediction_error_bound(obstacles.told, before, 1.0, np.array([np.inf, 0.3])) == np.inf or size < 1e-9
     assert bound > 0.0 or size < 1e-9
     obstacles.reset()
-    assert strayed(obstacles.told, before, 1.0, radii) == np.inf
+    assert prediction_error_bound(obstacles.told, before, 1.0, radii) == np.inf

@@ -330,7 +330,7 @@ def test_no_point_moves_farther_than_its_levers_allow(name, gantry):
     )  # fmt: skip
     world = build_world(made)
     robot, random = world.scene.robot, np.random.default_rng(3)
-    lever, ranges = Clearance(world, 1.0, 0.02).lever, Ranges.of(robot)
+    lever_arm, ranges = Clearance(world, 1.0, 0.02).lever_arm, Ranges.of(robot)
     data, longest = robot.model.createData(), 0.0
     for _ in range(300):
         q = random.uniform(ranges.lower, ranges.upper)
@@ -342,8 +342,8 @@ def test_no_point_moves_farther_than_its_levers_allow(name, gantry):
             point = place.act(np.array([0.0, 0.0, along]))
             J = pin.getJointJacobian(robot.model, data, body.parentJoint, pin.WORLD)
             speed = np.linalg.norm(J[:3] + np.cross(J[3:].T, point).T, axis=0)
-            assert (speed <= lever + 1e-9).all()
-            longest = max(longest, float((speed / lever).max()))
+            assert (speed <= lever_arm + 1e-9).all()
+            longest = max(longest, float((speed / lever_arm).max()))
     assert longest > 0.5  # they are no bounds for their own sake
 
 

@@ -247,7 +247,7 @@ def test_an_obstacle_without_news_moves_on_grows_and_stops_the_robot(tmp_path):
             assert gap > 0.0198
             assert tick.proximity.distance[0] == pytest.approx(gap, abs=1e-9)
             assert tick.problem.avoidance.d[0] == pytest.approx(gap - margin, abs=1e-9)
-            assert tick.proximity.drift[0] <= 0.0
+            assert tick.proximity.feedforward[0] <= 0.0
         stopped.append(tick.solution.status is Status.STOPPED)
         assert stopped[-1] == (age > 0.5 + 1e-9)
         if stopped[-1]:

@@ -166,11 +166,11 @@ def test_potential_field_descends_its_potential_and_parts_each_pair_alone(seed, 
 def test_self_motion_takes_no_joint_past_a_bound(seed, limit, gain):
     """Joints that tracking leaves within bounds stay there, others go no further out, and no room is given away."""
     problem = random_problem(seed, limit=limit)
-    v0, lower, upper = tracking_velocity(problem), problem.lower, problem.upper
+    v_tracking, lower, upper = tracking_velocity(problem), problem.lower, problem.upper
     v = make_solver(GradientProjectionSolver(gain=gain)).solve(problem).v
-    assert (v <= np.maximum(upper, v0) + 1e-9).all() and (v >= np.minimum(lower, v0) - 1e-9).all()
+    assert (v <= np.maximum(upper, v_tracking) + 1e-9).all() and (v >= np.minimum(lower, v_tracking) - 1e-9).all()
     a = added("gradient-projection", random_problem(seed, limit=1e9), gain=gain)
-    if not np.allclose(v, v0 + a, rtol=0.0, atol=1e-9 * np.abs(a).max()):
+    if not np.allclose(v, v_tracking + a, rtol=0.0, atol=1e-9 * np.abs(a).max()):
         heading = np.where(a > 0.0, upper - v, v - lower)
         assert heading[a != 0.0].min() <= 1e-9  # one of them is where it may not go on
 

@@ -22,9 +22,9 @@ def random_problem(seed):
     """Rows of distinct depths and bounds that contradict each other as often as not."""
     rng = np.random.default_rng(seed)
     d = rng.permutation(np.linspace(-0.03, 0.12, 12))[:PAIRS] + rng.uniform(-1e-3, 1e-3, PAIRS)
-    drift = rng.choice([0.0, 1.0], PAIRS) * rng.uniform(-0.4, 0.1, PAIRS)
-    b = np.minimum(GAIN * (HOLD - d), 0.2) - drift
-    touch = np.minimum(np.minimum(-GAIN * d, 0.2) - drift, b)
+    feedforward = rng.choice([0.0, 1.0], PAIRS) * rng.uniform(-0.4, 0.1, PAIRS)
+    b = np.minimum(GAIN * (HOLD - d), 0.2) - feedforward
+    touch = np.minimum(np.minimum(-GAIN * d, 0.2) - feedforward, b)
     rows = AvoidanceRows(np.arange(PAIRS), d, 0.5 * rng.normal(size=(PAIRS, NV)), b, HOLD, 0.2, touch)
     hard = rng.uniform(-1.0, 0.0, NV), rng.uniform(0.0, 1.0, NV)
     last, step = rng.uniform(*hard), rng.uniform(0.03, 0.4, NV)

@@ -56,7 +56,7 @@ def distance_between(one, pose_one, two, pose_two):
 # --- rows ---------------------------------------------------------------------------------------------------------
 
 
-def test_rows_of_what_is_carried_by_finite_differences(panda):
+def test_rows_of_what_is_attached_to_finite_differences(panda):
     """Against obstacles at rest and moving, and against the robot's own links."""
     rng = np.random.default_rng(0)
     pole = pin.SE3(np.eye(3), np.array([0.45, 0.25, 0.3]))
@@ -78,7 +78,7 @@ def test_rows_of_what_is_carried_by_finite_differences(panda):
         if at(q)[0] > 5e-3:
             np.testing.assert_allclose(tick.proximity.J[row], differences(at, panda, q, 1e-5)[0], atol=1e-4)
             rate = (at(q, 1e-5)[0] - at(q, -1e-5)[0]) / 2e-5
-            assert tick.proximity.drift[row] == pytest.approx(rate, abs=1e-4)
+            assert tick.proximity.feedforward[row] == pytest.approx(rate, abs=1e-4)
             count += 1
         link = next(i for i, pair in enumerate(tick.proximity.pair) if names[pair][1] == "box")
         body = panda.bodies.geometryObjects[panda.bodies.getGeometryId(names[tick.proximity.pair[link]][0])]
@@ -253,7 +253,7 @@ def test_nothing_comes_nearer_than_the_closest_call_says_with_a_load(panda):
         q, v = random_q(panda, rng), rng.uniform(-1, 1, 7)
         near = len(controller.tick(q).proximity.pair)
         for horizon in (0.02, 0.2):
-            least = controller._assembly.closest_call(v, near, 0.3, horizon)
+            least = controller._assembly.clearance_lower_bound(v, near, 0.3, horizon)
             after = pin.integrate(panda.model, q, horizon * v)
             for ball in balls:
                 there = pin.SE3(np.eye(3), ball.motion.sample(0.0).position)
@@ -292,7 +292,7 @@ def test_two_loads_and_a_handover(tmp_path):
         row = [names[pair] for pair in tick.proximity.pair].index(("one", "two"))
         assert tick.proximity.distance[row] == pytest.approx(0.3)
         np.testing.assert_allclose(tick.proximity.J[row], [-sign, 0, 0], atol=1e-12)
-        assert tick.proximity.drift[row] == pytest.approx(0.3 * sign)
+        assert tick.proximity.feedforward[row] == pytest.approx(0.3 * sign)
         controller.release(carried, np.zeros(3))
     for carried in ("one", "two"):
         controller.attach(carried, "y", np.zeros(3))

@@ -166,7 +166,7 @@ def test_what_is_not_finite_stops_the_robot():
     problem = random_problem(0, k=2)
     J = problem.avoidance.J.copy()
     J[1, 0] = np.nan
-    bad = problem._replace(avoidance=problem.avoidance._replace(J=J), shortfall=np.nan)
+    bad = problem._replace(avoidance=problem.avoidance._replace(J=J), violation=np.nan)
     solution = make_solver("hqp").solve(bad)
     (reason,) = solution.reasons
     assert solution.status is Status.STOPPED and reason.severity is Severity.ALARM
@@ -179,7 +179,7 @@ def test_what_is_not_finite_stops_the_robot():
 def test_one_level_without_threats_is_the_tracking_velocity_bit_for_bit():
     problem = random_problem(1, damping=0.05)._replace(levels=())
     solution = make_solver("hqp").solve(problem)
-    np.testing.assert_array_equal(solution.v, problem.v0)
+    np.testing.assert_array_equal(solution.v, problem.v_tracking)
 
 
 # On a robot

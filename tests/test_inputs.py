@@ -42,7 +42,7 @@ from qpavoid.config import (
 )
 from qpavoid.control.inputs import Clock
 from qpavoid.errors import UnknownName
-from qpavoid.safety.braking import Guard
+from qpavoid.safety.braking import BrakingCheck
 
 TOOL = "panda_hand_tcp"
 BALL = Obstacle.at("ball", Sphere(radius=0.05), [0.6, 0.0, 0.5])
@@ -137,7 +137,7 @@ def drifts(controller, q, t, what):
     tick = controller.tick(q, t, None, what)
     of_ball = controller.scene.pairs[tick.proximity.pair, 1] >= len(controller.scene.body_names)
     assert of_ball.any()
-    return tick.proximity.drift[of_ball] / tick.proximity.normal[of_ball, 0], tick.solution
+    return tick.proximity.feedforward[of_ball] / tick.proximity.normal[of_ball, 0], tick.solution
 
 
 @pytest.mark.parametrize("every", [1, 2, 5])
@@ -547,8 +547,8 @@ def test_guard_looks_at_a_bounded_number_of_poses_whatever_moves(tmp_path, speed
     limits = Limits() if jerk is None else Limits(jerk=jerk)
     controller = make_controller(robot, [Obstacle.at("ball", Sphere(radius=0.05), [0.3, 0.0, 0.0])], "z", limits=limits)
     controller.reset(np.array([0.9, 0.0, 0.0]))
-    looks, look = [], Guard._look
-    monkeypatch.setattr(Guard, "_look", lambda self, *args: looks.append(1) or look(self, *args))
+    looks, look = [], BrakingCheck._look
+    monkeypatch.setattr(BrakingCheck, "_look", lambda self, *args: looks.append(1) or look(self, *args))
     query, guard = controller._query, controller._commander.guard
     tick = controller.tick(np.zeros(3), v=np.array([0.9, 0.0, 0.0]))
     looks.clear()

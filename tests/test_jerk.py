@@ -16,7 +16,7 @@ from qpavoid import kernels
 from qpavoid.kernels.stopping import longest_way, way_to_stop
 from qpavoid.model.limits import JointBounds, limit_layout
 
-HELD = 0.02
+SAFE = 0.02
 
 
 # --- the stop of one coordinate ----------------------------------------------------------------------------------
@@ -110,7 +110,7 @@ def jerky_joints(rng, count, some=True):
 
 
 def bounds_after(axes, q, v, w):
-    axes.layout.w_last[:] = w
+    axes.layout.dv_prev[:] = w
     return axes.bounds(q, v)
 
 
@@ -195,8 +195,8 @@ def test_from_a_state_that_no_stop_saves_jerk_gives_way_then_acceleration():
     assert (within[0] <= lower).all() and (lower <= upper).all() and (upper <= within[1]).all()
     change, unit = np.maximum(lower - v - w, v + w - upper), joints.jerk * dt**2
     assert (change > unit * (1.0 + 1e-9)).sum() > 100  # what jerk alone would forbid
-    gentle = (np.abs(v) < 0.2 * joints.velocity) & (np.minimum(q - joints.lower, joints.upper - q) > 3.0)
-    assert (change[gentle] <= unit[gentle] * (1.0 + 1e-9)).all()
+    low_effort = (np.abs(v) < 0.2 * joints.velocity) & (np.minimum(q - joints.lower, joints.upper - q) > 3.0)
+    assert (change[low_effort] <= unit[low_effort] * (1.0 + 1e-9)).all()
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
@@ -208,12 +208,12 @@ def test_outside_its_position_limits_a_joint_is_sent_back_within_its_jerk(side):
     edge = joints.upper if side > 0 else joints.lower
     q = edge + side * rng.uniform(0.01, 5.0, 300) * np.minimum(joints.velocity, 0.1)
     v, w = np.zeros(300), np.zeros(300)
-    axes, choose, back = Axes(joints, 0.5, dt), rng.random(300), np.zeros(300, dtype=bool)
+    axes, select_voxels, back = Axes(joints, 0.5, dt), rng.random(300), np.zeros(300, dtype=bool)
     unit = np.where(np.isinf(joints.jerk), np.inf, joints.jerk * dt**2)
     for _ in range(3000):
         lower, upper = bounds_after(axes, q, v, w)
         assert (lower <= upper).all()
-        following = lower + choose * (upper - lower)
+        following = lower + select_voxels * (upper - lower)
         change = following - v
         assert (np.abs(change) <= joints.acceleration * dt + 1e-9).all()
         assert (np.abs(change - w) <= unit * (1.0 + 1e-7) + 1e-9).all()
@@ -241,9 +241,9 @@ def limited(seed, n=7):
 def stops(x, q, v, w):
     """Velocities of a stop as `velocity_bounds` and `stop_velocity` lead it, tick by tick."""
     packed, way = kernels.pack(x), [v]
-    while (np.abs(v) > 1e-9 * x.v_step).any() or (np.abs(w) > x.w_step).any():
+    while (np.abs(v) > 1e-9 * x.v_step).any() or (np.abs(w) > x.dv_step).any():
         q = q + x.dt * v
-        x.v_last[:], x.w_last[:] = v, w
+        x.v_prev[:], x.dv_prev[:] = v, w
         kernels.velocity_bounds(packed, q)
         kernels.stop_velocity(packed)
         assert (x.v_stop >= x.lower).all() and (x.v_stop <= x.upper).all()
@@ -262,8 +262,8 @@ def test_a_stop_ends_at_rest_within_all_limits(seed):
     assert np.abs(way[-1]).max() < 1e-9
     changes = np.diff(way, axis=0)
     assert (np.abs(changes) <= x.v_step * (1.0 + 1e-9)).all()
-    assert (np.abs(np.diff(changes, axis=0, prepend=w[None])) <= x.w_step * (1.0 + 1e-9)).all()
-    alone = [len(followed(v[i] / x.w_step[i], w[i] / x.w_step[i], x.v_step[i] / x.w_step[i])) for i in range(7)]
+    assert (np.abs(np.diff(changes, axis=0, prepend=w[None])) <= x.dv_step * (1.0 + 1e-9)).all()
+    alone = [len(followed(v[i] / x.dv_step[i], w[i] / x.dv_step[i], x.v_step[i] / x.dv_step[i])) for i in range(7)]
     assert len(way) <= 2 * max(alone) + 1
 
 
@@ -274,7 +274,7 @@ def test_a_stop_from_constant_speed_slows_all_coordinates_alike_and_as_fast_as_o
     way = stops(x, np.zeros(7), v, np.zeros(7))
     shares = way / v
     np.testing.assert_allclose(shares, np.repeat(shares[:, :1], 7, axis=1), atol=1e-12)
-    jerk = np.abs(np.diff(way, n=2, axis=0, prepend=np.array([v]))) / x.w_step
+    jerk = np.abs(np.diff(way, n=2, axis=0, prepend=np.array([v]))) / x.dv_step
     assert jerk[0].max() == pytest.approx(1.0) and (np.diff(shares[:, 0]) < 1e-12).all()
 
 
@@ -288,7 +288,7 @@ def test_the_way_of_a_stop_is_the_stop_of_the_ticks(seed, place):
         q, v, w = 0.0 * q + 5.0, 0.0 * v, 0.0 * w
         axes = kernels.pack(x)
         for _ in range(1000):
-            x.v_last[:], x.w_last[:] = v, w
+            x.v_prev[:], x.dv_prev[:] = v, w
             kernels.velocity_bounds(axes, q)
             following = x.upper.copy() if (q < 8.0).any() else 0.5 * (x.upper + np.minimum(v, x.upper))
             w, v = following - v, following
@@ -317,8 +317,8 @@ def test_half_of_jerks_and_accelerations_bring_a_pair_to_rest_where_it_has_to_be
     for _ in range(400):
         closest = np.zeros((1, 10))
         closest[:, 0] = d
-        x = make_layout(2, pairs=1, closest=closest, near=np.arange(1), drift=np.zeros(1), J=J, v_step=step,
-            w_step=unit, v_last=v, w_last=w, accelerated=True, jerked=True, v_stop=np.array([0.0, -1e3]),
+        x = make_layout(2, pairs=1, closest=closest, near=np.arange(1), feedforward=np.zeros(1), J=J, v_step=step,
+            dv_step=unit, v_prev=v, dv_prev=w, accelerated=True, jerked=True, v_stop=np.array([0.0, -1e3]),
             beta=False, row_gain=100.0, lower=-np.ones(2), upper=np.ones(2),
         )  # fmt: skip
         kernels.row_bounds(kernels.pack(x), 1, False)

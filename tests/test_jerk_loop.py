@@ -12,7 +12,7 @@ from qpavoid.run import simulate
 from qpavoid.solvers.reasons import relaxation_reasons
 from qpavoid.solvers.relaxation import Relaxed
 
-HELD = 0.02
+SAFE = 0.02
 
 
 def within_limits(controller, vs, slack=1e-9):
@@ -37,13 +37,13 @@ def test_no_period_and_no_speed_pass_the_safe_distance(row, size, dt, duration):
         [{"name": "it", "shape": {"type": "box", "size": size},
           "motion": {"type": "fixed", "position": [0.55, 0.0, 0.45]}}],
         dt=dt, duration=duration, limits={"jerk": 100.0},
-        avoidance={"d1": HELD, "d2": 0.10, "row": {"type": row}},
+        avoidance={"d1": SAFE, "d2": 0.10, "row": {"type": row}},
     )  # fmt: skip
     log = simulate(run)
     controller, _ = Controller.from_scenario(run)
     ruler = Ruler(controller.scene)
     least = min(ruler.least_between(q, v, dt, t, 4) for q, v, t in zip(log.q, log.v, log.t, strict=True))
-    assert least > HELD - 1e-3
+    assert least > SAFE - 1e-3
     assert log.metrics()["status_counts"]["SOLVED"] >= len(log.t) - 3  # at the margin, rows may lack a mm/s
     assert log.slack.max() < 2e-3
     assert within_limits(controller, log.v) == pytest.approx(1.0, abs=1e-6)
@@ -74,7 +74,7 @@ def test_nothing_is_first_seen_inside_its_margin(tmp_path):
     robot = cartesian(tmp_path, speed=2.0, acceleration=4.0)
     wall = Obstacle.at("wall", Box(size=(0.1, 2.0, 2.0)), [2.05, 0.0, 0.0])
     controller = make_controller(
-        robot, [wall], "z", avoidance=Avoidance(d1=HELD, d2=0.03, row=Damper(gain=20.0)), task={"gain": 50.0},
+        robot, [wall], "z", avoidance=Avoidance(d1=SAFE, d2=0.03, row=Damper(gain=20.0)), task={"gain": 50.0},
         limits=Limits(jerk=20.0),
     )  # fmt: skip
     vs, near = [], []
@@ -84,7 +84,7 @@ def test_nothing_is_first_seen_inside_its_margin(tmp_path):
         near.append(1.95 - tick.state.q[0])
     within_limits(controller, np.array(vs))
     assert max(v[0] for v in vs) == pytest.approx(2.0)
-    assert min(near) > HELD - 1e-3 and near[-1] < HELD + 2e-3
+    assert min(near) > SAFE - 1e-3 and near[-1] < SAFE + 2e-3
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -113,7 +113,7 @@ def test_random_targets_among_obstacles_stay_feasible(panda, seed):
         assert (q <= bounds.upper + 1e-9).all() and (q >= bounds.lower - 1e-9).all()
         least = min(least, ruler.distances(q).min())
     assert within_limits(controller, np.array(vs)) > 0.99
-    assert least > HELD - 1e-3
+    assert least > SAFE - 1e-3
 
 
 def test_what_is_left_on_the_way_of_a_stop_is_a_lower_bound(panda):
@@ -131,12 +131,12 @@ def test_what_is_left_on_the_way_of_a_stop_is_a_lower_bound(panda):
         v = before + 0.01 * change
         stop = assembly.stop(q, v)
         way = stop.way.copy()
-        bound = assembly.closest_call(v, near, 0.1, float(stop.forwards.sum()), stop)
+        bound = assembly.clearance_lower_bound(v, near, 0.1, float(stop.forwards.sum()), stop)
         least = np.inf
         for velocity in way:
             least = min(least, ruler.distances(q).min())
             q = q + 0.01 * velocity
-        assert min(least, ruler.distances(q).min()) - HELD >= bound - 1e-9
+        assert min(least, ruler.distances(q).min()) - SAFE >= bound - 1e-9
         close += bound > 0.0
     assert close > 3
 
@@ -180,7 +180,7 @@ PASSED = ReasonKind.ACCELERATION_RELAXED, ReasonKind.JERK_RELAXED
 def test_jerk_gives_way_with_the_acceleration_or_never(tmp_path, gives_way):
     """A ball that comes straight at the tool at 2 m/s from 60 mm off: contact cannot be avoided within the limits."""
     robot = cartesian(tmp_path, speed=5.0, acceleration=4.0)
-    limits = Limits(jerk=40.0, acceleration_gives_way=gives_way)
+    limits = Limits(jerk=40.0, relax_acceleration=gives_way)
     ball = Obstacle.at("ball", Sphere(radius=0.1), [9.0, 0.0, 0.0])
     controller = make_controller(robot, [ball], "z", limits=limits)
     seen = {"ball": Sample.at([0.21, 0.0, 0.0], linear=[-6.0, 0.0, 0.0])}

@@ -7,7 +7,7 @@ import yaml
 from conftest import EXAMPLES, SPHERE, Bench, differences, look, obstacle, random_q
 
 from qpavoid import ConfigError, Controller, Log, Robot, Sample, build_scene, build_tasks, config, load_scenario
-from qpavoid.model.kinematics import chains, longest_lever
+from qpavoid.model.kinematics import chains, max_lever_arm
 from qpavoid.model.notes import RobotWarning
 from qpavoid.run import simulate
 
@@ -68,13 +68,13 @@ def test_bounds_of_looking_ahead_hold(named):
     model, rng = robot.model, np.random.default_rng(2)
     turning, sliding = chains(model)
     data = model.createData()
-    lever = longest_lever(model, np.zeros(model.njoints))
+    lever_arm = max_lever_arm(model, np.zeros(model.njoints))
     for _ in range(20):
         q, v = random_q(robot, rng), rng.normal(size=model.nv)
         pin.forwardKinematics(model, data, q, v)
         velocities = np.array([motion.vector for motion in data.v])
         assert np.linalg.norm(velocities[:, 3:], axis=1).max() <= max(turning @ np.abs(v)) + 1e-9
-        reach = max(turning @ np.abs(v)) * lever + max(sliding @ np.abs(v))
+        reach = max(turning @ np.abs(v)) * lever_arm + max(sliding @ np.abs(v))
         assert np.linalg.norm(velocities[:, :3], axis=1).max() <= reach + 1e-9
 
 
@@ -86,11 +86,11 @@ def test_speeds_of_all_joints(named):
     for _ in range(20):
         q, v = random_q(robot, rng), rng.normal(size=model.nv)
         bench.compute(q)
-        bench.assembly.closest_call(v, 0, 1.0, 0.01)
+        bench.assembly.clearance_lower_bound(v, 0, 1.0, 0.01)
         pin.forwardKinematics(model, data, q, v)
         velocities = np.array([motion.vector for motion in data.v])
         expected = np.linalg.norm(velocities[:, :3], axis=1)
-        expected += np.linalg.norm(velocities[:, 3:], axis=1) * bench.query.joint_reach()
+        expected += np.linalg.norm(velocities[:, 3:], axis=1) * bench.query.joint_radius()
         np.testing.assert_allclose(bench.query.placing.speeds[: model.njoints], expected, atol=1e-12)
 
 

@@ -14,7 +14,7 @@ from qpavoid import kernels
 from qpavoid.kernels.packing import compiled
 
 SEEDS = range(8)
-OF_PAIRS = ("near", "closest", "J", "drift", "d", "least", "touch")
+OF_PAIRS = ("near", "closest", "J", "feedforward", "d", "least", "touch")
 """Outputs of which only what belongs to near pairs counts."""
 
 
@@ -94,15 +94,15 @@ def random_layout(seed, frames=2, turns=(1,), pairs=9, nv=7, obstacles=3, joints
         "joint_poses": poses_of(rotations(rng, joints), rng.normal(size=(joints, 3)), 14 if views else 12),
         "parents": np.array([0, *(rng.integers(0, joint) for joint in range(1, joints))], dtype=np.intp),
         "column_joints": np.sort(rng.integers(1, joints, nv)),
-        "joint_reach": rng.uniform(0.0, 0.5, joints),
-        "carriers": np.sort(rng.permuted(np.tile(np.arange(joints + obstacles), (pairs, 1)), axis=1)[:, :2], axis=1),
+        "joint_radius": rng.uniform(0.0, 0.5, joints),
+        "moved_by": np.sort(rng.permuted(np.tile(np.arange(joints + obstacles), (pairs, 1)), axis=1)[:, :2], axis=1),
         "bodies": rng.integers(0, 6, (pairs, 2)),
         "body_poses": poses_of(rotations(rng, 6), rng.normal(size=(6, 3)), 14 if views else 12),
         "boxes": rng.uniform(0.02, 0.2, (6, 6)),
         "convex": rng.random(pairs) < 0.8,
         "turning": rng.integers(0, 2, (2, nv)).astype(float),
         "sliding": rng.integers(0, 2, (2, nv)).astype(float),
-        "lever": 0.8,
+        "lever_arm": 0.8,
         "speeds": np.append(np.full(joints, np.nan), rng.uniform(0.0, 0.5, obstacles)),
         "q_index": limited + (0 if plain else 1),
         "v_index": limited,
@@ -110,8 +110,8 @@ def random_layout(seed, frames=2, turns=(1,), pairs=9, nv=7, obstacles=3, joints
         "q_upper": np.where(rng.random(len(limited)) < 0.2, np.inf, q_lower + rng.uniform(0.5, 3.0, len(limited))),
         "v_max": np.where(rng.random(nv) < 0.8, rng.uniform(0.1, 5.0, nv), np.inf),
         "v_step": v_step,
-        "v_last": rng.uniform(-5.0, 5.0, nv),
-        "w_last": rng.uniform(-1.0, 1.0, nv) * np.minimum(v_step, 1.0),
+        "v_prev": rng.uniform(-5.0, 5.0, nv),
+        "dv_prev": rng.uniform(-1.0, 1.0, nv) * np.minimum(v_step, 1.0),
         "accelerated": bool(np.isfinite(v_step).any()),
         "damping": 0.1,
         "offset": 0.03,
@@ -127,8 +127,8 @@ def jerk(seed, nv=7, all_of_them=False):
     rng = np.random.default_rng(seed)
     step = rng.uniform(0.01, 0.5, nv)
     some = np.array([all_of_them, True])[(rng.random(nv) < 0.7).astype(int)]
-    return {"v_step": step, "w_step": np.where(some, 10.0 ** -rng.uniform(0.0, 2.0, nv) * step, np.inf),
-            "w_last": rng.uniform(-1.0, 1.0, nv) * step, "accelerated": True, "jerked": True}  # fmt: skip
+    return {"v_step": step, "dv_step": np.where(some, 10.0 ** -rng.uniform(0.0, 2.0, nv) * step, np.inf),
+            "dv_prev": rng.uniform(-1.0, 1.0, nv) * step, "accelerated": True, "jerked": True}  # fmt: skip
 
 
 # --- candidates --------------------------------------------------------------------------------------------------
@@ -204,7 +204,7 @@ def test_what_is_in_one_of_two_alone():
     rng = np.random.default_rng(0)
     for _ in range(100):
         a, b = (np.flatnonzero(rng.random(rng.integers(0, 30)) < rng.random()) for _ in range(2))
-        assert kernels.in_one_alone(a, b).tolist() == sorted({*a.tolist()} ^ {*b.tolist()})
+        assert kernels.sorted_setxor(a, b).tolist() == sorted({*a.tolist()} ^ {*b.tolist()})
 
 
 # --- distances ---------------------------------------------------------------------------------------------------
@@ -234,7 +234,7 @@ def test_rate_of_a_distance_is_that_of_the_witness_points_along_the_normal(seed,
             return n @ (twist[:3] + np.cross(twist[3:], p))
 
         np.testing.assert_allclose(x.J[j], [speed(twist) for twist in x.J_world.T] * x.support[i], rtol=0, atol=1e-13)
-        assert x.drift[j] == pytest.approx(speed(x.twists[x.twist_row[i]]), abs=1e-13)
+        assert x.feedforward[j] == pytest.approx(speed(x.twists[x.twist_row[i]]), abs=1e-13)
 
 
 def test_a_pair_exactly_at_the_reach_is_not_near():
@@ -270,7 +270,7 @@ def test_an_obstacle_that_comes_to_rest_leaves_no_drift():
     for moving in (False, True, False):
         x.twists[:-1] = float(moving)
         assert kernels.distance_rows(packed, np.arange(9), np.inf, moving) == 9
-        drifts.append(np.abs(x.drift).max())
+        drifts.append(np.abs(x.feedforward).max())
     assert drifts[0] == drifts[2] == 0.0 < drifts[1]
 
 
@@ -281,10 +281,10 @@ def test_distance_rows_by_their_definition(pairs, views):
         for among, reach in ((chosen(pairs, seed), 0.5), (np.arange(pairs), np.inf), (np.arange(pairs), 0.0)):
             x = random_layout(seed, pairs=pairs, nv=2 + seed, views=views)
             k = run("distance_rows", x, among, reach, True)
-            near, J, drift = oracle.distance_rows(x, among, reach)
+            near, J, feedforward = oracle.distance_rows(x, among, reach)
             np.testing.assert_array_equal(x.near[:k], near)
             np.testing.assert_allclose(x.J[:k], J, rtol=1e-12, atol=1e-12)
-            np.testing.assert_allclose(x.drift[:k], drift, rtol=1e-12, atol=1e-12)
+            np.testing.assert_allclose(x.feedforward[:k], feedforward, rtol=1e-12, atol=1e-12)
 
 
 # --- bounds of rows ----------------------------------------------------------------------------------------------
@@ -295,7 +295,7 @@ def rows_at(d, **fields):
     count = len(d)
     closest = np.zeros((count, 10))
     closest[:, 0] = d
-    given = {"closest": closest, "near": np.arange(count), "drift": np.zeros(count), "J": np.ones((count, 7))}
+    given = {"closest": closest, "near": np.arange(count), "feedforward": np.zeros(count), "J": np.ones((count, 7))}
     bounds = {"lower": np.full(7, -np.inf), "upper": np.full(7, np.inf), "v_stop": np.zeros(7)}
     return make_layout(7, pairs=count, obstacles=2, **{**given, **bounds, **fields})
 
@@ -318,8 +318,8 @@ def test_closing_speed_bound_by_its_definition(weighted):
 def test_offset_margin_and_drift_of_a_row():
     """The offset widens all distances, the margin of an obstacle narrows those to it, its drift counts as motion."""
     closest, margin, of = np.array([0.20, 0.20, 0.20, 0.02]), np.array([0.01, 0.04, 0.0]), np.array([0, 1, 2, 1])
-    drift = np.array([0.1, -0.2, 0.0, 0.3])
-    x = rows_at(closest, offset=0.05, margin=margin, twist_row=of, drift=drift, beta=False)
+    feedforward = np.array([0.1, -0.2, 0.0, 0.3])
+    x = rows_at(closest, offset=0.05, margin=margin, twist_row=of, feedforward=feedforward, beta=False)
     run("row_bounds", x, 4, True)
     np.testing.assert_allclose(x.d, [0.24, 0.21, 0.25, 0.03], rtol=0, atol=1e-15)
     np.testing.assert_allclose(x.least, [-0.7 - 0.1, -0.55 + 0.2, -0.75, 0.2 - 0.3], rtol=0, atol=1e-14)
@@ -343,7 +343,7 @@ def test_margins_are_those_of_the_near_pairs():
     """Row i belongs to pair near[i], not to pair i."""
     x = rows_at(np.full(2, 0.2), beta=False)
     y = make_layout(7, pairs=4, obstacles=2, **{
-        **{name: np.concatenate((getattr(x, name),) * 2) for name in ("closest", "drift", "J")},
+        **{name: np.concatenate((getattr(x, name),) * 2) for name in ("closest", "feedforward", "J")},
         "near": np.array([1, 3, -1, -1]), "twist_row": np.array([0, 1, 0, 2]), "margin": np.array([9.0, 0.05, 0.0]),
         "lower": x.lower, "upper": x.upper, "v_stop": x.v_stop, "beta": False,
     })  # fmt: skip
@@ -371,12 +371,12 @@ def test_a_row_never_asks_for_more_than_can_be_had(seed):
     """To part at most as fast as the bounds allow; not to close no sooner than a stop would end it."""
     x = filled(seed)
     run("row_bounds", x, 30, True)
-    parting, receding = x.d < x.hold, x.drift >= 0.0
+    parting, receding = x.d < x.hold, x.feedforward >= 0.0
     assert x.accelerated and (parting & receding).any() and (~parting & receding).any()
     assert (x.J @ x.v_stop >= x.least - 1e-9)[~parting & receding].all()
     most = np.array([largest(row, x.lower, x.upper) for row in x.J])
     assert (most >= x.least - 1e-9)[parting & receding].all()
-    assert (np.maximum(most, -x.drift) >= x.least - 1e-9)[parting].all()
+    assert (np.maximum(most, -x.feedforward) >= x.least - 1e-9)[parting].all()
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -387,18 +387,20 @@ def test_row_bounds_by_their_definition(seed):
     raw = x.row_gain * (x.hold - x.d)
     weight = 0.5 - 0.5 * np.cos(np.pi * np.clip((x.d - x.d1) / (x.d2 - x.d1), 0.0, 1.0))
     for i in range(30):
-        J, drift = x.J[i], x.drift[i]
+        J, feedforward = x.J[i], x.feedforward[i]
         if raw[i] > 0.0:
             most = largest(J, x.lower, x.upper)
-            expected = min(min(raw[i], x.recovery) - drift, most if drift >= 0.0 else max(most, -drift))
+            expected = min(
+                min(raw[i], x.recovery) - feedforward, most if feedforward >= 0.0 else max(most, -feedforward)
+            )
         else:
             half = 0.25 * np.sum(np.abs(J[J != 0.0]) * x.v_step[J != 0.0])
             brake = half - np.sqrt(half**2 + 4.0 * half * (x.d[i] - x.hold) / x.dt) if half < np.inf else -np.inf
-            expected = max(weight[i] * raw[i], brake) - drift
-            expected = expected if drift < 0.0 else min(expected, J @ x.v_stop)
+            expected = max(weight[i] * raw[i], brake) - feedforward
+            expected = expected if feedforward < 0.0 else min(expected, J @ x.v_stop)
         assert x.least[i] == pytest.approx(expected, rel=1e-12, abs=1e-13)
         assert x.touch[i] == pytest.approx(
-            min(x.row_gain * (x.offset - x.d[i]) - drift, expected), rel=1e-12, abs=1e-13
+            min(x.row_gain * (x.offset - x.d[i]) - feedforward, expected), rel=1e-12, abs=1e-13
         )
 
 
@@ -439,7 +441,7 @@ def test_no_point_that_a_joint_carries_is_faster_than_it_is_said_to_be(seed):
     for joint in range(1, 4):
         own = x.column_joints == joint
         twists[joint] = twists[x.parents[joint]] + x.J_world[:, own] @ v[own]
-    for twist, pose, reach, speed in zip(twists, x.joint_poses, x.joint_reach, x.speeds[:4], strict=True):
+    for twist, pose, reach, speed in zip(twists, x.joint_poses, x.joint_radius, x.speeds[:4], strict=True):
         points = rng.normal(size=(2000, 3))
         points *= reach / np.linalg.norm(points, axis=1, keepdims=True)
         speeds = np.linalg.norm(twist[:3] + np.cross(twist[3:], pose[9:] + points), axis=1)
@@ -469,10 +471,10 @@ def test_closest_call_is_below_what_the_fastest_points_leave(near, horizon):
         x = filled(seed, convex=np.zeros(30, dtype=bool))
         rates = np.random.default_rng(seed).uniform(-1.0, 1.0, x.A.shape[1])
         turning, sliding = ((chain @ np.abs(rates)).max() for chain in (x.turning, x.sliding))
-        bend = horizon**2 * (turning**2 * x.lever + 2.0 * turning * sliding)
+        bend = horizon**2 * (turning**2 * x.lever_arm + 2.0 * turning * sliding)
         x.d[:] = np.random.default_rng(seed).uniform(0.05, 0.5, 30)
-        found = run("closest_call", x, rates, near, 0.5, horizon)
-        left = [x.d[i] - x.hold - horizon * x.speeds[x.carriers[i]].sum() for i in range(near)]
+        found = run("clearance_lower_bound", x, rates, near, 0.5, horizon)
+        left = [x.d[i] - x.hold - horizon * x.speeds[x.moved_by[i]].sum() for i in range(near)]
         others = 0.5 + x.offset - x.hold - horizon * (x.speeds[:4].max() + x.speeds.max())
         exact = min([others, *left]) - bend
         assert found <= exact + 1e-14 and (found > 0.0) == (exact > 0.0)
@@ -483,10 +485,10 @@ def closing_along_normal(x, v, i, horizon, bend):
     """How far a near pair closes along its normal: the witness points, and the farthest corner of each box."""
     pair, found = x.near[i], x.closest[i]
     n, approach, bent = found[1:4], x.J[i] @ v, 0.0
-    closing = (abs(approach) if x.jerked else max(-approach, 0.0)) + max(-x.drift[i], 0.0)
+    closing = (abs(approach) if x.jerked else max(-approach, 0.0)) + max(-x.feedforward[i], 0.0)
     for side, sign in ((0, 1.0), (1, -1.0)):
-        carrier, body = x.carriers[pair, side], x.bodies[pair, side]
-        spin = np.vstack((x.spins, x.twists[:, 3:]))[carrier]
+        carrier, body = x.moved_by[pair, side], x.bodies[pair, side]
+        spin = np.vstack((x.omega, x.twists[:, 3:]))[carrier]
         R, p = x.body_poses[body, :9].reshape(3, 3).T, x.body_poses[body, 9:]
         center, half = np.split(x.boxes[body], 2)
         signs = np.array([(a, b, c) for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)])
@@ -506,12 +508,12 @@ def test_of_convex_bodies_the_closest_call_looks_along_the_normal(horizon, field
         x = filled(seed, **fields)
         v = np.random.default_rng(seed).uniform(-0.3, 0.3, 7)
         turning, sliding = ((chain @ np.abs(v)).max() for chain in (x.turning, x.sliding))
-        bend = horizon**2 * (turning**2 * x.lever + 2.0 * turning * sliding)
+        bend = horizon**2 * (turning**2 * x.lever_arm + 2.0 * turning * sliding)
         x.d[:] = x.hold + horizon * np.random.default_rng(seed).uniform(0.0, 2.0, 30)
-        found = run("closest_call", x, v, 30, 9.0, horizon)
+        found = run("clearance_lower_bound", x, v, 30, 9.0, horizon)
         least = np.inf
         for i in range(30):
-            fastest = left = x.d[i] - x.hold - horizon * x.speeds[x.carriers[x.near[i]]].sum() - bend
+            fastest = left = x.d[i] - x.hold - horizon * x.speeds[x.moved_by[x.near[i]]].sum() - bend
             if left <= 0.0 and x.convex[x.near[i]]:
                 left = max(left, x.d[i] - x.hold - closing_along_normal(x, v, i, horizon, bend))
             better += left > fastest
@@ -525,7 +527,7 @@ def test_a_way_bends_where_a_joint_would_pass_its_limit():
     x = make_layout(3, q_index=np.array([2]), v_index=np.array([1]), q_lower=np.array([-0.1]), q_upper=np.array([0.1]))
     q = np.array([9.0, 9.0, 0.0, 9.0])
     for v, horizon, bent in ((0.5, 0.3, True), (-0.5, 0.3, True), (0.5, 0.19, False), (-0.5, 0.19, False)):
-        assert run("bends", x, q, np.array([9.0, v, 9.0]), horizon) == bent
+        assert run("leaves_position_limits", x, q, np.array([9.0, v, 9.0]), horizon) == bent
 
 
 @pytest.mark.parametrize("near", [0, 1, 30])
@@ -534,12 +536,12 @@ def test_closest_call_does_not_lose_nan(near):
         x = filled(0)
         x.J_world[column % 6, column] = np.nan
         x.d[:] = 0.2
-        assert np.isnan(run("closest_call", x, np.ones(7), near, 0.5, 0.1))
+        assert np.isnan(run("clearance_lower_bound", x, np.ones(7), near, 0.5, 0.1))
     for i in range(near):
         x = filled(0)
         x.d[:] = 0.2
         x.d[i] = np.nan
-        assert np.isnan(run("closest_call", x, RATES, near, 0.5, 0.1))
+        assert np.isnan(run("clearance_lower_bound", x, RATES, near, 0.5, 0.1))
 
 
 @pytest.mark.parametrize("fields", [{}, NO_LIMIT])
@@ -547,12 +549,12 @@ def test_the_way_of_the_tracking_velocity_is_clear_if_the_closest_call_until_its
     clear = 0
     for seed in range(40):
         x = filled(seed, 30, **fields)
-        x.v0[:] = 10.0 ** -(seed % 4) * np.random.default_rng(seed).normal(size=7)
+        x.v_tracking[:] = 10.0 ** -(seed % 4) * np.random.default_rng(seed).normal(size=7)
         x.d[:] = np.random.default_rng(seed).uniform(0.1, 0.5, 30)
-        ticks = 1.0 + 0.5 * np.max(np.abs(x.v0) / x.v_step)
+        ticks = 1.0 + 0.5 * np.max(np.abs(x.v_tracking) / x.v_step)
         q = np.random.default_rng(seed).uniform(-1.0, 1.0, 8)
-        expected = run("closest_call", x, x.v0, 30, 0.5, x.dt * ticks) > -2e-4
-        expected &= not (x.accelerated and run("bends", x, q, x.v0, x.dt * ticks))
+        expected = run("clearance_lower_bound", x, x.v_tracking, 30, 0.5, x.dt * ticks) > -2e-4
+        expected &= not (x.accelerated and run("leaves_position_limits", x, q, x.v_tracking, x.dt * ticks))
         assert run("tracking_clear", x, q, 30, 0.5) == expected
         clear += expected
     assert 0 < clear < 40
@@ -567,10 +569,10 @@ def test_closest_call_by_its_definition(near, fields):
         x, rng = filled(seed, **fields), np.random.default_rng(seed)
         x.d[:] = x.hold + rng.uniform(0.0, 0.5, 30)
         v, horizon = rng.uniform(-0.5, 0.5, 7), 10.0 ** rng.uniform(-3.0, -0.5)
-        left.append(oracle.closest_call(x, v, near, 0.8, horizon))
-        assert run("closest_call", x, v, near, 0.8, horizon) == pytest.approx(left[-1], rel=1e-12, abs=1e-13)
+        left.append(oracle.clearance_lower_bound(x, v, near, 0.8, horizon))
+        assert run("clearance_lower_bound", x, v, near, 0.8, horizon) == pytest.approx(left[-1], rel=1e-12, abs=1e-13)
         twists = oracle.joint_twists(x, v)
-        np.testing.assert_allclose(x.spins, twists[:, 3:], rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(x.omega, twists[:, 3:], rtol=1e-12, atol=1e-12)
     assert min(left) < 0.0 < max(left)
 
 
@@ -596,7 +598,7 @@ def test_rows_of_frames_by_their_definition(count, turns):
         expected_b += [x.targets[f, 15:] + x.gain[f] * pin.log3(x.targets[f, 3:12].reshape(3, 3) @ R.T)]
     expected_b = [b * min(1.0, cap / np.linalg.norm(b)) for b, cap in zip(expected_b, x.cap, strict=True)]
     packed = kernels.pack(x)
-    for _ in range(2):  # what the first call leaves in `screws` does not show in the second
+    for _ in range(2):  # what the first call leaves in `row_wrenches` does not show in the second
         kernels.frame_rows(packed)
         np.testing.assert_allclose(x.A, np.array(expected_A) * x.task_support, rtol=0, atol=1e-13)
         np.testing.assert_allclose(x.b, np.concatenate(expected_b) * x.scale, rtol=0, atol=1e-12)
@@ -646,7 +648,7 @@ def test_orientations_alone_and_rows_of_other_tasks(seed):
     whole = random_layout(seed, frames=3, turns=(0, 2))
     kept = np.r_[0:6, 9:15]
 
-    parts = {f: getattr(whole, f)[kept].copy() for f in ("scale", "task_support", "screws")}
+    parts = {f: getattr(whole, f)[kept].copy() for f in ("scale", "task_support", "row_wrenches")}
     outputs = {"A": np.full((15, 7), 5.0), "b": np.full(15, 6.0)}
     x = random_layout(seed, frames=3, turns=(0, 2), cap=np.delete(whole.cap, 2), **parts, **outputs)
     run("frame_rows", x)
@@ -699,7 +701,7 @@ def test_velocity_bounds_by_their_definition(seed, plain):
         q = np.random.default_rng(seed).uniform(-3, 3, nv + 1)
         for fields in ({}, {"v_step": np.full(nv, np.inf), "accelerated": False}, jerk(seed, nv), jerk(seed, nv, True)):
             x = random_layout(seed, nv=nv, plain=plain, **fields)
-            names = "v_max", "v_step", "v_last", "w_step", "w_last", "accelerated", "jerked"
+            names = "v_max", "v_step", "v_prev", "dv_step", "dv_prev", "accelerated", "jerked"
             without = make_layout(nv, **{name: getattr(x, name) for name in names})
             for layout, at in ((x, q[:nv] if plain else q), (without, q)):
                 *expected, room = oracle.velocity_bounds(layout, at)
@@ -718,11 +720,11 @@ def test_a_stop_slows_all_coordinates_alike_and_as_fast_as_it_can(seed):
     x = random_layout(seed, plain=True)
     x.lower[:], x.upper[:] = -np.inf, np.inf
     run("stop_velocity", x)
-    share = x.v_stop / x.v_last
+    share = x.v_stop / x.v_prev
     np.testing.assert_allclose(share, share[0], rtol=1e-13)
     assert 0.0 < share[0] < 1.0
-    assert np.max(np.abs(x.v_last - x.v_stop) / x.v_step) == pytest.approx(1.0, rel=1e-12)
-    y = random_layout(seed, plain=True, v_last=0.5 * np.minimum(x.v_step, 1.0))
+    assert np.max(np.abs(x.v_prev - x.v_stop) / x.v_step) == pytest.approx(1.0, rel=1e-12)
+    y = random_layout(seed, plain=True, v_prev=0.5 * np.minimum(x.v_step, 1.0))
     y.lower[:], y.upper[:] = -np.inf, np.inf
     y.lower[1], y.upper[2] = 0.2, -0.3  # a coordinate that is sent back goes on moving
     run("stop_velocity", y)
@@ -817,10 +819,10 @@ def test_shortfall_is_the_largest_violation(pairs):
         lower[3] = -np.inf
         violations = [b[k] - J[k] @ v for k in range(pairs)]
         violations += [v[i] - upper[i] for i in range(7)] + [lower[i] - v[i] for i in range(7)]
-        assert kernels.shortfall(*args) == pytest.approx(max(violations), abs=1e-13)
+        assert kernels.violation(*args) == pytest.approx(max(violations), abs=1e-13)
     v, J = np.zeros(7), np.ones((pairs, 7))
-    assert kernels.shortfall(v, J, np.full(pairs, -9.0), np.full(7, -1.0), np.full(7, 2.0)) == -1.0
-    assert kernels.shortfall(v, J, np.full(pairs, -9.0), np.full(7, -np.inf), np.full(7, np.inf)) == (
+    assert kernels.violation(v, J, np.full(pairs, -9.0), np.full(7, -1.0), np.full(7, 2.0)) == -1.0
+    assert kernels.violation(v, J, np.full(pairs, -9.0), np.full(7, -np.inf), np.full(7, np.inf)) == (
         -9.0 if pairs else -np.inf
     )
 
@@ -836,7 +838,7 @@ def test_shortfall_does_not_lose_nan(argument, pairs):
         if not -len(flat) <= place < len(flat):
             continue
         flat[place] = np.nan
-        assert np.isnan(kernels.shortfall(*args)), place
+        assert np.isnan(kernels.violation(*args)), place
 
 
 @pytest.mark.parametrize("near", [0, 1, 5])
@@ -845,14 +847,14 @@ def test_tracking_shortfall_is_that_of_the_tracking_velocity_and_the_near_rows(n
         v, J, least, lower, upper = constraints(seed, 8)
 
         def make(v=v, J=J, least=least, lower=lower, upper=upper):
-            return make_layout(7, pairs=8, v0=v, J=J, least=least, lower=lower, upper=upper)._replace(
+            return make_layout(7, pairs=8, v_tracking=v, J=J, least=least, lower=lower, upper=upper)._replace(
                 lower=lower, upper=upper
             )
 
-        expected = kernels.shortfall(v, J[:near], least[:near], lower, upper)
-        assert run("tracking_shortfall", make(), near) == pytest.approx(expected, abs=1e-15)
+        expected = kernels.violation(v, J[:near], least[:near], lower, upper)
+        assert run("tracking_violation", make(), near) == pytest.approx(expected, abs=1e-15)
         v[3] = np.nan
-        assert np.isnan(run("tracking_shortfall", make(), near))
+        assert np.isnan(run("tracking_violation", make(), near))
 
 
 @pytest.mark.parametrize("count", [3, 6, 9])
@@ -860,13 +862,13 @@ def test_projection_cost_is_smallest_at_the_velocity_it_is_made_for(count):
     """½ vᵀP v + qᵀv + const = ½ ‖A (v - v0)‖² + ½ λ ‖v - v0‖²."""
     for seed in SEEDS:
         rng = np.random.default_rng(seed)
-        A, v0 = rng.normal(size=(count, 7)), rng.normal(size=7)
-        P, q = kernels.projection_cost(A, 1e-3, v0)
+        A, v_tracking = rng.normal(size=(count, 7)), rng.normal(size=7)
+        P, q = kernels.projection_cost(A, 1e-3, v_tracking)
         np.testing.assert_array_equal(P, P.T)
-        np.testing.assert_allclose(np.linalg.solve(P, -q), v0, rtol=0, atol=1e-10)
+        np.testing.assert_allclose(np.linalg.solve(P, -q), v_tracking, rtol=0, atol=1e-10)
         for v in rng.normal(size=(5, 7)):
-            found = 0.5 * v @ P @ v + q @ v - (0.5 * v0 @ P @ v0 + q @ v0)
-            expected = 0.5 * np.sum((A @ (v - v0)) ** 2) + 0.5e-3 * np.sum((v - v0) ** 2)
+            found = 0.5 * v @ P @ v + q @ v - (0.5 * v_tracking @ P @ v_tracking + q @ v_tracking)
+            expected = 0.5 * np.sum((A @ (v - v_tracking)) ** 2) + 0.5e-3 * np.sum((v - v_tracking) ** 2)
             assert found == pytest.approx(expected, abs=1e-11)
 
 
@@ -890,16 +892,16 @@ def test_a_tick_is_the_sum_of_its_parts(seed, fields):
     packed = kernels.pack(x)
     for q, pairs, reach, moving in moments(seed, x):
         y = random_layout(seed, pairs=40, **fields)
-        x.v_last[:] = y.v_last[:] = np.random.default_rng(seed).uniform(-1, 1, 7)
+        x.v_prev[:] = y.v_prev[:] = np.random.default_rng(seed).uniform(-1, 1, 7)
         x.margin[:-1] = y.margin[:-1] = 0.05 * moving
         apart = kernels.pack(y)
         kernels.frame_rows(apart)
         room = kernels.velocity_bounds(apart, q[:7] if "plain" in fields else q)
         kernels.stop_velocity(apart)
-        kernels.damped_solution(apart, y.v0)
+        kernels.damped_solution(apart, y.v_tracking)
         k = kernels.distance_rows(apart, pairs, reach, moving)
         kernels.row_bounds(apart, k, moving)
-        worst = kernels.tracking_shortfall(apart, k)
+        worst = kernels.tracking_violation(apart, k)
         found = kernels.assemble(packed, q[:7] if "plain" in fields else q, pairs, reach, moving)
         clear = worst <= 0.0 and kernels.tracking_clear(apart, q[:7] if "plain" in fields else q, k, reach)
         np.testing.assert_array_equal(found, (k, worst, clear, room))
@@ -914,7 +916,9 @@ def test_the_tracking_velocity_of_a_tick_is_the_best_of_its_rows(seed, fields):
         x = random_layout(seed, pairs=40, frames=3, turns=(0, 2), **fields)
         x.margin[:-1] *= moving
         counts.append(run("assemble", x, q[:7] if "plain" in fields else q, pairs, reach, moving)[0])
-        np.testing.assert_allclose(x.A.T @ (x.A @ x.v0 - x.b) + x.damping**2 * x.v0, 0.0, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(
+            x.A.T @ (x.A @ x.v_tracking - x.b) + x.damping**2 * x.v_tracking, 0.0, rtol=0, atol=1e-9
+        )
     assert min(counts) == 0 and len(set(counts)) > 2
 
 
@@ -973,7 +977,7 @@ def test_a_look_around_keeps_what_is_watched_and_apart(seed):
     near = [i for i in pairs.tolist() if distance[i] < reach and before[i]]
     kept = [i for i in near if distance[i] >= touch]
     q = rng.normal(size=x.q_index.max(initial=0) + 1)
-    k, touching, nearest, rest = run("look_around", x, q, pairs, reach, True, watched, touch)
+    k, touching, nearest, rest = run("backup_rows", x, q, pairs, reach, True, watched, touch)
     assert x.near[:k].tolist() == kept and 0 < k < len(pairs)
     assert touching == len(near) - len(kept) > 0
     np.testing.assert_array_equal(x.closest[:k], x.results[kept])
@@ -982,7 +986,7 @@ def test_a_look_around_keeps_what_is_watched_and_apart(seed):
     whole = random_layout(seed, pairs=40)
     run("distance_rows", whole, np.array(kept), np.inf, True)
     np.testing.assert_allclose(x.J[:k], whole.J[:k], rtol=0, atol=1e-14)
-    np.testing.assert_allclose(x.drift[:k], whole.drift[:k], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(x.feedforward[:k], whole.feedforward[:k], rtol=0, atol=1e-14)
     run("velocity_bounds", whole, q)
     np.testing.assert_array_equal([x.lower, x.upper], [whole.lower, whole.upper])
 
@@ -992,7 +996,7 @@ def test_a_distance_that_is_no_number_touches():
     results[1, 0] = np.nan
     x = random_layout(0, pairs=3, results=gaps(results, 17))
     watched, q = np.ones(3, dtype=bool), np.zeros(x.q_index.max(initial=0) + 1)
-    k, touching, nearest, _ = run("look_around", x, q, np.arange(3), np.inf, False, watched, -np.inf)
+    k, touching, nearest, _ = run("backup_rows", x, q, np.arange(3), np.inf, False, watched, -np.inf)
     assert (k, touching) == (2, 1) and np.isnan(nearest) and watched.tolist() == [True, False, True]
 
 
@@ -1000,31 +1004,36 @@ def test_a_distance_that_is_no_number_touches():
 def test_what_comes_too_near(seed):
     rng = np.random.default_rng(seed)
     k = 5 * seed
-    closest, J, drift, v = rng.normal(size=(k, 10)), rng.normal(size=(k, 4)), rng.normal(size=k), rng.normal(size=4)
-    least = min((closest[i, 0] + 0.3 * (J[i] @ v + drift[i]) for i in range(k)), default=np.inf)
+    closest, J, feedforward, v = (
+        rng.normal(size=(k, 10)),
+        rng.normal(size=(k, 4)),
+        rng.normal(size=k),
+        rng.normal(size=4),
+    )
+    least = min((closest[i, 0] + 0.3 * (J[i] @ v + feedforward[i]) for i in range(k)), default=np.inf)
     for safe, near in ((least - 1e-9, False), (least + 1e-9, k > 0)):
-        assert kernels.comes_too_near(closest, J, drift, v, 0.3, safe) == near
+        assert kernels.closes_below(closest, J, feedforward, v, 0.3, safe) == near
 
 
 @pytest.mark.parametrize("meets", [False, True])
 def test_a_ramp_changes_no_faster_than_it_may_and_ends_where_it_meets(meets):
     wanted = np.array([[0.35, -0.1, 5.0]] * 6)
-    ramp = kernels.ramp(np.zeros(3), wanted, np.array([0.1, 0.1, np.inf]), meets)
+    rate_limit = kernels.rate_limit(np.zeros(3), wanted, np.array([0.1, 0.1, np.inf]), meets)
     expected = [[min(0.1 * (i + 1), 0.35), -0.1, 5.0] for i in range(4 if meets else 6)]
-    np.testing.assert_allclose(ramp, expected, rtol=0, atol=1e-15)
-    assert len(kernels.ramp(np.zeros(3), wanted[:0], np.ones(3), meets)) == 0
+    np.testing.assert_allclose(rate_limit, expected, rtol=0, atol=1e-15)
+    assert len(kernels.rate_limit(np.zeros(3), wanted[:0], np.ones(3), meets)) == 0
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_ramps_and_paths_by_their_definitions(seed):
     rng = np.random.default_rng(seed)
     v, wanted, step = rng.normal(size=5), rng.normal(size=(9, 5)), rng.uniform(0.1, 2.0, 5)
-    found = kernels.ramp(v, wanted, step, False)
+    found = kernels.rate_limit(v, wanted, step, False)
     for got, target in zip(found, wanted, strict=True):
         v = np.clip(target, v - step, v + step)
         np.testing.assert_allclose(got, v, rtol=0, atol=1e-14)
     paths, centers, sizes = rng.normal(size=(7, seed, 3)), rng.normal(size=(4, 3)), rng.uniform(0.0, 1.0, (seed, 4))
-    least = kernels.least_apart(paths, centers, sizes)
+    least = kernels.min_sphere_distance(paths, centers, sizes)
     brute = [
         np.linalg.norm(paths[t, o] - centers[b]) - sizes[o, b]
         for t in range(7) for o in range(seed) for b in range(4)
@@ -1034,4 +1043,4 @@ def test_ramps_and_paths_by_their_definitions(seed):
 
 def test_paths_that_are_no_numbers_are_not_far():
     paths = np.array([[[3.0, 0.0, 0.0]], [[np.nan, 0.0, 0.0]], [[4.0, 0.0, 0.0]]])
-    assert not kernels.least_apart(paths, np.zeros((1, 3)), np.ones((1, 1))) > 0.0
+    assert not kernels.min_sphere_distance(paths, np.zeros((1, 3)), np.ones((1, 1))) > 0.0

@@ -30,9 +30,9 @@ class Axes:
         self.layout = make_layout(len(joints.velocity), **limit_layout(joints, gain, dt))
         self._packed = pack(self.layout)
 
-    def bounds(self, q, v_last=0.0):
+    def bounds(self, q, v_prev=0.0):
         """Copies of lower and upper."""
-        self.layout.v_last[:] = v_last
+        self.layout.v_prev[:] = v_prev
         velocity_bounds(self._packed, q)
         return self.layout.lower.copy(), self.layout.upper.copy()
 
@@ -220,11 +220,11 @@ def braked(draw):
 @given(state=braked(), choice=vector(0.0, 1.0), gain=share)
 def test_a_state_that_can_be_braked_is_followed_by_one_that_can(state, choice, gain):
     """Whatever is chosen within the bounds keeps position, speed and acceleration limits, now and later."""
-    joints, dt, q, v_last = state
-    lower, upper = Axes(joints, gain, dt).bounds(q, v_last)
+    joints, dt, q, v_prev = state
+    lower, upper = Axes(joints, gain, dt).bounds(q, v_prev)
     assert (lower <= upper).all()
     for v in (lower, upper, lower + choice * (upper - lower)):
-        assert (np.abs(v - v_last) <= joints.acceleration * dt + 1e-9).all()
+        assert (np.abs(v - v_prev) <= joints.acceleration * dt + 1e-9).all()
         assert (np.abs(v) <= joints.velocity + 1e-9).all()
         following = q + dt * v
         assert (following >= joints.lower - 1e-9).all() and (following <= joints.upper + 1e-9).all()
@@ -246,37 +246,37 @@ def random_joints(rng, count):
 def test_no_limit_is_left_in_a_hundred_thousand_ticks(dt):
     """500 joints, 200 ticks each, driven into their limits, to and fro, or at random."""
     joints, q = random_joints(np.random.default_rng(1), 500)
-    axes, rng, v_last = Axes(joints, 0.5, dt), np.random.default_rng(2), np.zeros(500)
+    axes, rng, v_prev = Axes(joints, 0.5, dt), np.random.default_rng(2), np.zeros(500)
     reached = np.zeros(500, dtype=bool)
     for tick in range(200):
-        lower, upper = axes.bounds(q, v_last)
+        lower, upper = axes.bounds(q, v_prev)
         assert (lower <= upper).all()
         if tick % 40 == 0:
             goal = rng.choice([0.0, 0.5, 1.0], 500)  # pushed one way for a while; 0.5: anywhere
         v = lower + np.where(goal == 0.5, rng.random(500), goal) * (upper - lower)
-        assert (np.abs(v - v_last) <= joints.acceleration * dt + 1e-9).all()
+        assert (np.abs(v - v_prev) <= joints.acceleration * dt + 1e-9).all()
         assert (np.abs(v) <= joints.velocity + 1e-9).all()
-        q, v_last = q + dt * v, v
+        q, v_prev = q + dt * v, v
         assert (q >= joints.lower - 1e-9).all() and (q <= joints.upper + 1e-9).all()
         reached |= np.minimum(q - joints.lower, joints.upper - q) < 1e-6
     assert reached.mean() > 0.05  # pushed right to a limit, and no farther
 
 
-def test_from_a_state_that_no_braking_saves_the_acceleration_gives_way():
+def test_from_a_state_that_no_braking_saves_the_relax_acceleration():
     """Position and speed are kept, and the bounds do not cross."""
     joints, q = random_joints(np.random.default_rng(3), 500)
     rng, dt = np.random.default_rng(4), 0.01
-    v_last = rng.uniform(-50.0, 50.0, 500)
-    broken = ~viable(joints, q, v_last, dt) | (np.abs(v_last) > joints.velocity + joints.acceleration * dt)
+    v_prev = rng.uniform(-50.0, 50.0, 500)
+    broken = ~viable(joints, q, v_prev, dt) | (np.abs(v_prev) > joints.velocity + joints.acceleration * dt)
     assert broken.sum() > 100
     axes = Axes(joints, 0.5, dt)
-    lower, upper = axes.bounds(q, v_last)
+    lower, upper = axes.bounds(q, v_prev)
     hard_lower, hard_upper = axes.layout.hard_lower, axes.layout.hard_upper
     assert (hard_lower <= lower).all() and (lower <= upper).all() and (upper <= hard_upper).all()
     for v in (lower, upper):
         assert (np.abs(v) <= joints.velocity).all()
         assert (q + dt * v >= joints.lower - 1e-12).all() and (q + dt * v <= joints.upper + 1e-12).all()
-    change = np.where(v_last > 0.0, v_last - upper, lower - v_last)  # the least that is left to choose
+    change = np.where(v_prev > 0.0, v_prev - upper, lower - v_prev)  # the least that is left to choose
     assert (change[broken] > joints.acceleration[broken] * dt).all()
 
 
@@ -291,13 +291,13 @@ def test_outside_its_position_limits_a_joint_is_braked_and_sent_back(side):
     q = edge + side * rng.uniform(0.01, 5.0, 500) * np.minimum(joints.velocity, 0.1)
     v = side * rng.uniform(-0.2, 1.0, 500) * np.minimum(joints.velocity, 1.0)
     v = np.where(side * v < 0.0, -side * np.minimum(np.abs(v), speed_to_stop(width, step, dt)), v)
-    axes, choose = Axes(joints, 0.5, dt), rng.random(500)
+    axes, select_voxels = Axes(joints, 0.5, dt), rng.random(500)
     back = np.zeros(500, dtype=bool)
     for _ in range(3000):
         lower, upper = axes.bounds(q, v)
         assert (lower <= upper).all()
         outside = side * (q - edge) > 1e-9
-        following = lower + choose * (upper - lower)
+        following = lower + select_voxels * (upper - lower)
         assert (np.abs(following - v) <= step + 1e-9).all()
         assert (np.abs(following) <= joints.velocity + 1e-9).all()
         assert (side * (following - v) <= 1e-9)[outside & (side * v > 0.0)].all()  # never faster outwards

@@ -19,7 +19,7 @@ COURSES = {
     **{f"chase {v}": ([0, 0.5, 0], [0, -1.2, 0], v) for v in (0.15, 0.3)},
 }
 """Start, end and speed of a sphere that meets the arm, relative to the tool's start."""
-HELD = 0.020
+SAFE = 0.020
 """Safety distance of the damper rows between surfaces: 0.12 m between axes."""
 
 
@@ -43,15 +43,15 @@ def followed(course):
 @pytest.mark.parametrize("course", COURSES)
 def test_qp_holds_its_safety_distance_in_situation_1(course):
     metrics = followed(course).metrics()
-    assert HELD - 2e-3 < metrics["min_distance"] < 0.03
+    assert SAFE - 2e-3 < metrics["min_distance"] < 0.03
     assert metrics["status_counts"]["STOPPED"] == 0
 
 
-@pytest.mark.parametrize("escape", [{}, None], ids=["escape", "law alone"])
+@pytest.mark.parametrize("backup", [{}, None], ids=["backup", "law alone"])
 @pytest.mark.parametrize("course", COURSES)
-def test_rows_of_eq10_hold_d1_as_eq10_does_not(course, escape):
+def test_rows_of_eq10_hold_d1_as_eq10_does_not(course, backup):
     """The same gains: 80 mm between surfaces are asked for. What chases the tool catches it under eq. 10."""
-    scenario = situation(course, {"type": "task-switching"}, escape=escape)
+    scenario = situation(course, {"type": "task-switching"}, backup=backup)
     metrics = simulate(scenario).metrics()
     assert metrics["min_distance"] > 0.080 - 2e-3
     assert metrics["status_counts"]["RELAXED"] == metrics["status_counts"]["STOPPED"] == 0
@@ -83,7 +83,7 @@ def blind(sample):
 @pytest.mark.parametrize(("course", "below"), [("head-on 0.4", 5e-3), ("chase 0.3", 5e-3), ("front 0.4", 5e-3)])
 def test_without_the_obstacles_velocity_it_would_fall_well_below(course, below):
     least, _, _ = given(course, blind, 900)
-    assert least < HELD - below
+    assert least < SAFE - below
 
 
 @pytest.mark.parametrize("course", ["head-on 0.2", "front 0.4", "chase 0.15"])
@@ -108,9 +108,9 @@ def test_an_estimated_twist_is_the_difference_quotient_also_after_a_gap(panda):
         for later in (0.03, 0.04) if k == 2 else ():
             controller.tick(panda.home, later)
         expected = 0.0 if k == 0 else tick.proximity.normal @ speed
-        np.testing.assert_allclose(tick.proximity.drift, np.where(controller.scene.pairs[tick.proximity.pair, 1]
+        np.testing.assert_allclose(tick.proximity.feedforward, np.where(controller.scene.pairs[tick.proximity.pair, 1]
                                    >= len(controller.scene.body_names), expected, 0.0), atol=1e-12)  # fmt: skip
-    assert len(tick.proximity.drift) > 1
+    assert len(tick.proximity.feedforward) > 1
 
 
 def test_a_program_may_write_into_the_arrays_that_it_gave(panda):
@@ -121,7 +121,9 @@ def test_a_program_may_write_into_the_arrays_that_it_gave(panda):
         tick = controller.tick(panda.home, 0.01 * k, None, {"ball": Pose(position, rotation)})
         position += 0.01 * speed
     of_ball = controller.scene.pairs[tick.proximity.pair, 1] >= len(controller.scene.body_names)
-    np.testing.assert_allclose(tick.proximity.drift[of_ball], (tick.proximity.normal @ speed)[of_ball], atol=1e-12)
+    np.testing.assert_allclose(
+        tick.proximity.feedforward[of_ball], (tick.proximity.normal @ speed)[of_ball], atol=1e-12
+    )
     assert of_ball.any()
 
 

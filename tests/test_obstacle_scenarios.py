@@ -65,9 +65,9 @@ def test_faces_of_shapes_look_outwards(shape, extent):
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("obstacles.0.carried_by=panda_hand_tpc", "carried_by: .*did you mean 'panda_hand_tcp'"),
-        ("obstacles.0.carried_by=universe", "carried_by: attach: frame 'universe' is fixed to the world"),
-        ("obstacles.3.carried_by=panda_hand_tcp", "a half_space cannot be carried"),
+        ("obstacles.0.attached_to=panda_hand_tpc", "attached_to: .*did you mean 'panda_hand_tcp'"),
+        ("obstacles.0.attached_to=universe", "attached_to: attach: frame 'universe' is fixed to the world"),
+        ("obstacles.3.attached_to=panda_hand_tcp", "a half_space cannot be carried"),
         ("obstacles.2.graspable=true", "method: convex"),
         ("obstacles.0.motion.position=[3, 0, 0]", "too far to be carried"),
     ],

@@ -178,7 +178,7 @@ def test_rows_and_drift_by_finite_differences(panda, tmp_path):
         row = rows[found.distance[rows].argmin()] if len(rows) else None
         if row is not None and least[body] > 0.0:
             np.testing.assert_allclose(found.J[row], J[body], atol=1e-4)
-            assert found.drift[row] == pytest.approx(rate[body], abs=1e-4)
+            assert found.feedforward[row] == pytest.approx(rate[body], abs=1e-4)
             checked += 1
     assert checked > 5
 
@@ -230,7 +230,7 @@ def test_nearest_voxels_of_bodies_by_their_definition(seed):
         places = np.column_stack((share * np.linalg.norm(b - a), away / np.linalg.norm(away, axis=1)[:, None]))
         np.testing.assert_allclose(place[first[body] : first[body + 1]], places[mine], atol=1e-12)
     before = point[:count].copy(), distance[:count].copy(), place[:count].copy()
-    kernels.choose(first, point, distance, place, np.full(5, 0.2), voxels.keys, slots, kept)
+    kernels.select_voxels(first, point, distance, place, np.full(5, 0.2), voxels.keys, slots, kept)
     for body in range(5):
         rows = slice(first[body], first[body + 1])
         assert set(slots[body]) - {-1} == set(by_definition(*(x[rows] for x in before), 6, 0.2))
@@ -248,7 +248,7 @@ def test_voxels_stay_in_their_slots():
 
     def chosen(distances):
         point = np.arange(6)
-        kernels.choose(first, point, np.array(distances, dtype=float), place, np.array([0.5]), keys, slots, kept)
+        kernels.select_voxels(first, point, np.array(distances, dtype=float), place, np.array([0.5]), keys, slots, kept)
         return slots[0].tolist()
 
     before = chosen([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
@@ -325,7 +325,7 @@ def test_a_cloud_may_move_with_its_frame(panda):
     pose = Sample.at([0.45, 0.0, 0.5], linear=[0.1, 0.0, 0.0])
     first = controller.tick(panda.home, obstacles={"camera": Points(np.zeros((1, 3)), pose)})
     ray = first.proximity.normal[0]
-    assert first.proximity.drift[0] == pytest.approx(0.1 * ray[0])
+    assert first.proximity.feedforward[0] == pytest.approx(0.1 * ray[0])
     rest = controller.tick(panda.home, obstacles={"camera": Pose.at([0.45, 0.0, 0.5])})
     np.testing.assert_allclose(rest.proximity.distance, first.proximity.distance, atol=0.02)
 
@@ -380,7 +380,7 @@ def test_the_closest_call_counts_voxels_that_have_no_slot(panda, tmp_path):
         q, v = random_q(panda, rng), rng.uniform(-1.0, 1.0, 7)
         near = len(bench.compute(q, reach=0.3)[0].pair)
         for horizon in (0.01, 0.1):
-            least = bench.assembly.closest_call(v, near, 0.3, horizon)
+            least = bench.assembly.clearance_lower_bound(v, near, 0.3, horizon)
             assert ruler.distances(pin.integrate(panda.model, q, horizon * v)).min() - hold >= least - 1e-9
 
 

@@ -200,8 +200,8 @@ def test_drift_is_the_rate_when_only_obstacles_move(panda, shapes, tolerance):
     obstacles = with_obstacle(scene)
     assert np.abs(expected[obstacles]).max() > 0.1
     apart = found.distance > -0.02
-    np.testing.assert_allclose(found.drift[apart], expected[apart], atol=tolerance)
-    np.testing.assert_array_equal(found.drift[~obstacles], 0.0)
+    np.testing.assert_allclose(found.feedforward[apart], expected[apart], atol=tolerance)
+    np.testing.assert_array_equal(found.feedforward[~obstacles], 0.0)
 
 
 @pytest.mark.parametrize("name", ["paper", "solo"])
@@ -248,7 +248,7 @@ def test_nothing_comes_nearer_than_the_closest_call_says(name, request):
             bench.query.place_obstacle(i, samples[i])
         near = len(bench.compute(q, reach=0.3)[0].pair)
         for horizon in (0.01, 0.03, 0.1, 0.3):
-            least = bench.assembly.closest_call(v, near, 0.3, horizon)
+            least = bench.assembly.clearance_lower_bound(v, near, 0.3, horizon)
             assert np.isfinite(least)
             for t in (0.5 * horizon, horizon):
                 later = {i: moved(sample, t) for i, sample in samples.items()}
@@ -282,7 +282,7 @@ def test_in_penetration_the_normal_still_points_the_way_out(paper, shape):
     twist = start._replace(linear=np.array([1.0, 0, 0]), angular=np.array([0, 1.0, 0]))
     ahead, behind = (look(scene, q, {0: moved(twist, t)}) for t in (step, -step))
     rate = (ahead.distance[pair] - behind.distance[pair]) / (2 * step)
-    assert found.drift[pair] == pytest.approx(rate, abs=tolerance)
+    assert found.feedforward[pair] == pytest.approx(rate, abs=tolerance)
 
 
 # --- how it is read ----------------------------------------------------------------------------------------------
@@ -338,7 +338,7 @@ def test_few_pairs(paper, count):
             scene.geometry.removeCollisionPair(scene.geometry.collisionPairs[i])
     scene = replace(scene, pairs=scene.pairs[keep], support=scene.support[keep])
     found = look(scene, q)
-    assert found.distance.shape == found.drift.shape == (count,)
+    assert found.distance.shape == found.feedforward.shape == (count,)
     assert found.J.shape == (count, 7) and found.normal.shape == (count, 3)
     tip = np.array([0.0, 0.3, 0.3])  # the hand's axis ends there at the zero pose; radii 0.05 and 0.06
     for i in range(count):
@@ -430,7 +430,7 @@ def test_culling_changes_nothing(name, request):
         error = np.abs(found.distance - expected.distance)
         assert (error <= np.where(expected.distance > 0.0, 1e-9 * np.maximum(expected.distance, 1.0), 1e-6)).all()
         close = (expected.distance > 0.0) & (expected.distance < 3.0)
-        for field in ("point_a", "point_b", "normal", "J", "drift"):
+        for field in ("point_a", "point_b", "normal", "J", "feedforward"):
             np.testing.assert_allclose(
                 getattr(found, field)[close], getattr(expected, field)[close], rtol=0, atol=ROUND
             )
@@ -588,7 +588,7 @@ def test_python_work_of_a_tick_does_not_grow_with_the_number_of_pairs(panda, cas
 @pytest.mark.usefixtures("culling")
 def test_memory_does_not_grow():
     """20 000 ticks of a scene in which pairs come within reach and leave it, and the QP is solved."""
-    controller, q = Controller.from_scenario(load_scenario("panda_line", ["avoidance.escape=null"]))
+    controller, q = Controller.from_scenario(load_scenario("panda_line", ["avoidance.backup=null"]))
     model, dt = controller.scene.robot.model, controller.dt
     for near in range(len(controller.scene.pairs) + 1):
         controller._assembly._view(near)  # made once for each number of near pairs, and kept

@@ -127,7 +127,7 @@ def test_far_from_its_safety_distance_a_relaxed_row_informs_and_so_do_the_joints
     """At 90 mm of 100, from a ball at 1.4 m/s, which the tool's 1 m/s cannot quite leave: nothing touches for long."""
     robot = cartesian(tmp_path, axes="x", acceleration=None)
     controller = make_controller(
-        robot, [Obstacle.at("ball", BALL, [9.0, 0, 0])], "x", avoidance=Avoidance(d1=0.02, d2=0.1, escape=None)
+        robot, [Obstacle.at("ball", BALL, [9.0, 0, 0])], "x", avoidance=Avoidance(d1=0.02, d2=0.1, backup=None)
     )
     seen = {"ball": Sample.at([0.24, 0.0, 0.0], linear=[-1.4, 0.0, 0.0])}
     solution = controller.step(np.zeros(1), obstacles=seen)

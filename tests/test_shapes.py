@@ -231,7 +231,7 @@ def test_what_passes_close_by_is_known_not_to_come_nearer(panda, shape):
         if not 0.0 < gap < 0.01:
             continue
         close += 1
-        least = bench.assembly.closest_call(v, len(proximity.pair), 0.1, 0.02)
+        least = bench.assembly.clearance_lower_bound(v, len(proximity.pair), 0.1, 0.02)
         told += least > 0.0
         for t in (0.005, 0.01, 0.02):
             found = look(scene, pin.integrate(panda.model, q, t * v), {0: moved(sample, t)}, 0.1)
@@ -255,7 +255,7 @@ def test_the_closest_call_holds_for_half_spaces_that_move_and_turn(panda, turnin
         assert np.isfinite(bench.query.placing.speeds).all()
         near = len(bench.compute(q, reach=0.3)[0].pair)
         for horizon in (0.01, 0.1, 0.3):
-            least = bench.assembly.closest_call(v, near, 0.3, horizon)
+            least = bench.assembly.clearance_lower_bound(v, near, 0.3, horizon)
             later = sample._replace(
                 position=sample.position + horizon * sample.linear,
                 rotation=pin.exp3(horizon * sample.angular) @ sample.rotation,
@@ -318,7 +318,7 @@ def test_meshes_move_and_turn_like_any_other_obstacle(tmp_path, method):
             continue
         assert found.distance[0] == pytest.approx(expected.distance[0], abs=1e-5)
         np.testing.assert_allclose(found.normal, expected.normal, atol=1e-4)
-        np.testing.assert_allclose(found.drift, expected.drift, atol=1e-4)
+        np.testing.assert_allclose(found.feedforward, expected.feedforward, atol=1e-4)
 
 
 def test_a_cut_surface_stops_the_robot_and_says_so(tmp_path):

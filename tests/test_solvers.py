@@ -123,7 +123,7 @@ def test_rank_deficient_task_stays_bounded_without_damping():
     problem = random_problem(3)
     problem.tracking.A[2] = problem.tracking.A[1] * (1 + 1e-14)
     problem = with_rows(problem)
-    assert np.isnan(problem.v0).all()
+    assert np.isnan(problem.v_tracking).all()
     v = tracking_velocity(problem)
     assert np.linalg.norm(v) < 10.0
 
@@ -143,10 +143,10 @@ def test_qp_meets_rows_and_bounds_and_is_optimal(seed, backend, pairs):
     slackness = rows.J @ solution.v - rows.b
     assert np.all(slackness > -1e-6)
     assert np.all((solution.v >= problem.lower) & (solution.v <= problem.upper))
-    v0, tracking = tracking_velocity(problem), problem.tracking
+    v_tracking, tracking = tracking_velocity(problem), problem.tracking
     P = tracking.A.T @ tracking.A + 1e-3 * np.eye(NV)
     reference = qpsolvers.solve_qp(
-        P, -P @ v0, -rows.J if pairs else None, -rows.b if pairs else None,
+        P, -P @ v_tracking, -rows.J if pairs else None, -rows.b if pairs else None,
         lb=problem.lower, ub=problem.upper, solver="quadprog",
     )  # fmt: skip
     np.testing.assert_allclose(solution.v, reference, atol=1e-7 if backend in EXACT else 1e-4)
@@ -156,18 +156,18 @@ def test_qp_meets_rows_and_bounds_and_is_optimal(seed, backend, pairs):
 def test_qp_returns_the_tracking_velocity_bit_for_bit_when_that_is_safe(seed):
     problem = random_problem(seed, damping=0.01, limit=np.inf)
     rows = problem.avoidance
-    v0 = tracking_velocity(problem)
-    problem = with_rows(problem, b=rows.J @ v0 - 1e-9)
-    assert np.array_equal(make_solver("qp").solve(problem).v, v0)
+    v_tracking = tracking_velocity(problem)
+    problem = with_rows(problem, b=rows.J @ v_tracking - 1e-9)
+    assert np.array_equal(make_solver("qp").solve(problem).v, v_tracking)
 
 
 XI = 5.0
 
 
-def threatened(J: np.ndarray, d: np.ndarray, drift: float = 0.0, free: float = 2.0) -> Problem:
+def threatened(J: np.ndarray, d: np.ndarray, feedforward: float = 0.0, free: float = 2.0) -> Problem:
     """Damper rows at distances d, with accelerations that leave `free` of a speed limit of 2."""
-    b = np.minimum(XI * (D1 - d), 0.2) - drift
-    rows = AvoidanceRows(np.arange(len(d)), d, J, b, D1, D2, np.minimum(-XI * d - drift, b))
+    b = np.minimum(XI * (D1 - d), 0.2) - feedforward
+    rows = AvoidanceRows(np.arange(len(d)), d, J, b, D1, D2, np.minimum(-XI * d - feedforward, b))
     base = random_problem(5, pairs=len(d), damping=0.01)
     bounds = np.full(NV, -free), np.full(NV, free)
     return make_problem(base.tracking, rows, *bounds, base.pair_names, (base.lower, base.upper))
@@ -199,13 +199,13 @@ def test_contradicting_rows_relax_and_the_nearer_threat_gives_less(backend, d, v
 
 
 @pytest.mark.parametrize("backend", EXACT)  # proxqp and osqp are not exact enough to find the least excess
-@pytest.mark.parametrize(("drift", "v"), [(0.0, 0.1), (-1.0, 0.95), (-4.0, 2.0)])
-def test_acceleration_limits_give_way_before_pairs_touch_and_other_limits_never(backend, drift, v):
+@pytest.mark.parametrize(("feedforward", "v"), [(0.0, 0.1), (-1.0, 0.95), (-4.0, 2.0)])
+def test_acceleration_limits_give_way_before_pairs_touch_and_other_limits_never(backend, feedforward, v):
     """Accelerations leave 0.1, speeds 2. An obstacle at rest costs margin only; from one that comes at 1 m/s the arm
     flees just fast enough not to touch it, 1 - ξ d; from one at 4 m/s as fast as it can."""
     J = np.zeros((1, NV))
     J[0, 2] = 1.0
-    solution = make_solver(f"qp:{backend}").solve(threatened(J, np.array([0.01]), drift, free=0.1))
+    solution = make_solver(f"qp:{backend}").solve(threatened(J, np.array([0.01]), feedforward, free=0.1))
     assert solution.status is Status.RELAXED
     assert solution.v[2] == pytest.approx(v, abs=1e-4)
     hurried = [reason for reason in solution.reasons if reason.kind is ReasonKind.ACCELERATION_RELAXED]
@@ -214,10 +214,10 @@ def test_acceleration_limits_give_way_before_pairs_touch_and_other_limits_never(
         assert not excess
     else:
         assert excess[("joint3",)] == pytest.approx(v - 0.1, abs=1e-4)
-    contact = drift == -4.0  # at full speed, and still not enough
+    contact = feedforward == -4.0  # at full speed, and still not enough
     assert solution.severity is (Severity.ALARM if contact else Severity.WARNING)
     assert np.all(np.abs(solution.v) <= 2.0)
-    assert solution.slack[0] == pytest.approx(0.2 - drift - v, abs=1e-4)
+    assert solution.slack[0] == pytest.approx(0.2 - feedforward - v, abs=1e-4)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

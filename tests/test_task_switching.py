@@ -26,7 +26,7 @@ def formula(d, u, d1=D1, d2=D2, retreat=0.0, cap=50.0):
     return (1.0 - beta) * (1.0 - alpha) * min(u, retreat) + beta * retreat
 
 
-def rows(d, J, v0, drift=0.0, own=False, **settings):
+def rows(d, J, v_tracking, feedforward=0.0, own=False, **settings):
     """Memory with the bounds of rows between the robot and an obstacle, or of its `own` pairs, without limits."""
     count, fields = len(d), {"recovery_speed": settings.pop("recovery_speed", 1e3)}
     avoidance = Avoidance(d1=D1, d2=D2, row={"type": "task-switching", **settings}, **fields)
@@ -34,8 +34,9 @@ def rows(d, J, v0, drift=0.0, own=False, **settings):
     closest[:, 0] = d
     free = np.full(J.shape[1], np.inf)
     x = make_layout(
-        J.shape[1], pairs=count, obstacles=1, closest=closest, near=np.arange(count), J=J, v0=np.array(v0),
-        drift=np.full(count, drift), twist_row=np.full(count, 1 if own else 0), lower=-free, upper=free,
+        J.shape[1], pairs=count, obstacles=1, closest=closest, near=np.arange(count), J=J,
+        v_tracking=np.array(v_tracking), feedforward=np.full(count, feedforward),
+        twist_row=np.full(count, 1 if own else 0), lower=-free, upper=free,
         **row_form(avoidance),
     )  # fmt: skip
     kernels.row_bounds(kernels.pack(x), count, True)
@@ -75,18 +76,20 @@ def test_a_tick_uses_up_no_more_than_the_distance_that_is_left():
 
 def test_the_obstacles_velocity_counts_in_u_and_in_the_bound():
     """ḋ = J v + drift: a sphere that comes at 0.3 m/s on a robot at rest is an approach of 0.3 m/s."""
-    x = rows(np.array([0.24]), np.ones((1, 1)), [0.0], drift=-0.3)
+    x = rows(np.array([0.24]), np.ones((1, 1)), [0.0], feedforward=-0.3)
     assert x.least[0] == pytest.approx(formula(0.24, -0.3) + 0.3)
 
 
 @pytest.mark.parametrize("seed", range(20))
 def test_row_by_its_formula(seed):
     rng = np.random.default_rng(seed)
-    d, J, v0 = rng.uniform(D1, D2, 50), rng.normal(size=(50, NV)), rng.normal(size=NV)
-    drift, retreat, cap = rng.normal(), rng.uniform(0.0, 0.2), rng.uniform(1.0, 50.0)
-    x = rows(d, J, v0, drift, retreat_speed=retreat, alpha_cap=cap)
-    rate = np.array([formula(a, u, retreat=retreat, cap=cap) for a, u in zip(d, J @ v0 + drift, strict=True)])
-    np.testing.assert_allclose(x.least, np.maximum(rate, (D1 - d) / 0.01) - drift, atol=1e-12)
+    d, J, v_tracking = rng.uniform(D1, D2, 50), rng.normal(size=(50, NV)), rng.normal(size=NV)
+    feedforward, retreat, cap = rng.normal(), rng.uniform(0.0, 0.2), rng.uniform(1.0, 50.0)
+    x = rows(d, J, v_tracking, feedforward, retreat_speed=retreat, alpha_cap=cap)
+    rate = np.array(
+        [formula(a, u, retreat=retreat, cap=cap) for a, u in zip(d, J @ v_tracking + feedforward, strict=True)]
+    )
+    np.testing.assert_allclose(x.least, np.maximum(rate, (D1 - d) / 0.01) - feedforward, atol=1e-12)
 
 
 # --- beside eq. 10 ------------------------------------------------------------------------------------------------
@@ -97,8 +100,8 @@ def both(seed, regularization):
     rng = np.random.default_rng(seed)
     A, b, J = rng.normal(size=(3, NV)), 0.3 * rng.normal(size=3), rng.normal(size=(1, NV))
     d, retreat, cap = rng.uniform(D1, D2, 1), rng.choice([0.0, 0.1]), rng.choice([1.0, 50.0])
-    v0 = np.linalg.pinv(A) @ b
-    least = rows(d, J, v0, retreat_speed=retreat, alpha_cap=cap).least.copy()
+    v_tracking = np.linalg.pinv(A) @ b
+    least = rows(d, J, v_tracking, retreat_speed=retreat, alpha_cap=cap).least.copy()
     pair = AvoidanceRows(np.arange(1), d, J, least, D1, D2, least - 1.0)
     problem = make_problem(Tracking(A, b, 0.0), pair, np.full(NV, -1e3), np.full(NV, 1e3), [("hand", "fist")])
     eq10 = make_solver(Eq10Solver(damping=0.0, retreat_speed=retreat, alpha_cap=cap)).solve(problem)
@@ -112,11 +115,11 @@ def test_where_the_row_binds_both_laws_change_the_distance_alike():
     for seed in range(2000):
         problem, eq10, qp = both(seed, 1e-3)
         J, b = problem.avoidance.J[0], problem.avoidance.b[0]
-        if J @ problem.v0 < b:
+        if J @ problem.v_tracking < b:
             bound += 1
             assert J @ qp == pytest.approx(J @ eq10, abs=1e-9)
         else:
-            np.testing.assert_array_equal(qp, problem.v0)
+            np.testing.assert_array_equal(qp, problem.v_tracking)
             assert J @ eq10 >= b - 1e-9
     assert 800 < bound < 1900
 
@@ -146,7 +149,7 @@ def test_the_robots_own_pairs_never_make_it_infeasible(name, frame):
         controller.reset()
         tick = controller.tick(q, 0.0, {frame: Sample.at(rng.uniform(-0.8, 0.8, 3))})
         if tick.proximity.distance.min(initial=np.inf) > 0.02:
-            close += np.sum((tick.proximity.distance < 0.1) & (tick.proximity.J @ tick.problem.v0 < 0.0))
+            close += np.sum((tick.proximity.distance < 0.1) & (tick.proximity.J @ tick.problem.v_tracking < 0.0))
             assert tick.solution.status is Status.SOLVED, tick.solution.reasons
     assert close > 50
 
@@ -155,7 +158,7 @@ def test_what_comes_towards_a_body_that_cannot_move_is_no_contradiction(tmp_path
     """A tool on one rail, along x; a ball comes along z from 0.3 m: only below the safety distance is it said."""
     robot = cartesian(tmp_path, axes="x")
     ball = Obstacle.at("ball", Sphere(radius=0.05), [0.0, 0.0, 1.0])
-    controller = make_controller(robot, [ball], "x", avoidance=Avoidance(**SETTINGS, escape=None))
+    controller = make_controller(robot, [ball], "x", avoidance=Avoidance(**SETTINGS, backup=None))
 
     def here(t):
         return {"ball": Sample.at([0.0, 0.0, 0.405 - 0.2 * t], linear=[0.0, 0.0, -0.2])}
@@ -208,7 +211,7 @@ def test_rows_follow_the_velocity_that_is_tracked(panda, change):
     bench.assembly.restart(0.1 * rng.normal(size=7))
     targets = [Sample.at([0.45, 0.4, 0.4]), Sample.at([0.3, -0.2, 0.5])]
     near, problem = bench.compute(robot.home, targets, reach=0.3)
-    before, v = problem.avoidance.b.copy(), problem.v0.copy()
+    before, v = problem.avoidance.b.copy(), problem.v_tracking.copy()
     assert_rows(scene, near, problem, v)
     if change == "eased":
         changed = bench.assembly.eased(problem)
@@ -219,12 +222,12 @@ def test_rows_follow_the_velocity_that_is_tracked(panda, change):
     else:
         law = make_solver("hqp")
         changed = bench.assembly.prioritised(problem, law.tracked)
-    tracked = law.tracked(problem) if change == "of a cascade" else changed.v0
+    tracked = law.tracked(problem) if change == "of a cascade" else changed.v_tracking
     assert np.abs(tracked - v).max() > 0.01 and np.abs(changed.avoidance.b - before).max() > 0.01
     assert_rows(scene, near, changed, tracked)
     if change != "followed":  # which takes the tasks' place for good
         np.testing.assert_array_equal(problem.avoidance.b, before)
-        np.testing.assert_array_equal(problem.v0, v)
+        np.testing.assert_array_equal(problem.v_tracking, v)
 
 
 def assert_rows(scene, near, problem, v):
@@ -244,5 +247,5 @@ def test_tasks_that_repeat_each_other_without_damping_have_rows_too(panda):
     near, problem = Bench(scene, tasks, Avoidance(**SETTINGS, recovery_speed=1e3)).compute(
         robot.home, [Sample.at([0.45, 0.4, 0.4])] * 2, reach=0.3
     )
-    assert np.isnan(problem.v0).all()
+    assert np.isnan(problem.v_tracking).all()
     assert_rows(scene, near, problem, np.linalg.pinv(problem.tracking.A, rcond=1e-9) @ problem.tracking.b)

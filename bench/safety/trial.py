@@ -104,10 +104,10 @@ def trials(seed: int, solvers: Sequence[str]) -> list[Trial]:
 
 
 def as_named(scenario: ScenarioConfig, solver: str) -> ScenarioConfig:
-    """The same scenario, without `avoidance.escape` where the solver is given as `qp-alone`."""
+    """The same scenario, without `avoidance.backup` where the solver is given as `qp-alone`."""
     if not solver.endswith(ALONE):
         return scenario
-    avoidance = scenario.avoidance.model_copy(update={"escape": None})
+    avoidance = scenario.avoidance.model_copy(update={"backup": None})
     return scenario.model_copy(update={"avoidance": avoidance}).read_from(scenario.source)
 
 

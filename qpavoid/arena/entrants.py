@@ -106,7 +106,7 @@ def outside(
 
 def _law_alone(row: str) -> dict[str, Any]:
     """Avoidance rows of one kind, and no backup trajectory."""
-    return {"row": {"type": row}, "escape": None}
+    return {"row": {"type": row}, "backup": None}
 
 
 ENTRANTS = {

@@ -54,7 +54,7 @@ def world_of(scenario: ScenarioConfig, robot: Robot, q0: Array) -> World:
         ConfigError, UnknownName: naming file, field and remedy.
     """
     source = scenario.source
-    if scenario.contacts or any(obstacle.carried_by for obstacle in scenario.obstacles):
+    if scenario.contacts or any(obstacle.attached_to for obstacle in scenario.obstacles):
         raise ConfigError(f"{source}: the arena knows neither contacts nor obstacles that are carried; leave them out")
     obstacles = build_obstacles(scenario.obstacles, source)
     with located(str(source)):

@@ -54,7 +54,7 @@ class Cbf(Block):
 AvoidanceRow = Annotated[Beta | TaskSwitching | Damper | Cbf, Field(discriminator="type")]
 
 
-class Escape(Block):
+class Backup(Block):
     """Foresight where obstacles move: tasks go on only where the robot could still flee (`qpavoid.safety.backup`).
 
     It takes obstacles to go on as their trajectories say, or what was told of their twists lately, and time where they
@@ -94,7 +94,7 @@ class Avoidance(Block):
     """Whether a velocity of the QP is followed ahead, over its tick and the stop after it, and drawn back where that
     leads nearer than the safe distance."""
 
-    escape: Escape | None = Escape()
+    backup: Backup | None = Backup()
     """How a way out is kept at hand where obstacles move; `null`: none is."""
 
     @property
@@ -129,7 +129,7 @@ class Limits(Block):
     jerk: Positive | None = None
     """Jerk limit of the joints to which the robot gives none [rad/s³ or m/s³]; needs acceleration limits of all of
     them; left out: they have none."""
-    acceleration_gives_way: bool = True
+    relax_acceleration: bool = True
     """Whether the QP passes acceleration and jerk limits before it lets a pair come too near; false: it never does."""
     saturate: bool = True
     """Whether the laws that know no limits (all but the QP) are scaled and clipped to them afterwards."""

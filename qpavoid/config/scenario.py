@@ -28,7 +28,7 @@ class ObstacleConfig(Block):
     """Where its origin is; what a task could take from its frame must be given here."""
     graspable: bool = False
     """Whether a frame of the robot may carry it for a while; costs pairs with the other obstacles."""
-    carried_by: str | None = None
+    attached_to: str | None = None
     """Frame of the robot that carries it from the start, where `motion` puts it at first."""
     source: Literal["scene", "external"] = "scene"
     """Where its pose comes from: `scene`, from `motion`, unless a program gives it in `step`; `external`, from such a
@@ -42,7 +42,7 @@ class ObstacleConfig(Block):
         whole = not isinstance(self.shape, HalfSpace | PointCloud)
         if isinstance(self.shape, Mesh):
             whole = self.shape.method == "convex"
-        if (self.graspable or self.carried_by is not None) and not whole:
+        if (self.graspable or self.attached_to is not None) and not whole:
             raise ValueError(
                 f"a {self.shape.type} cannot be carried; give a primitive, or a mesh with `method: convex`"
             )

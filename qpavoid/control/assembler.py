@@ -46,9 +46,9 @@ class _StopAhead:
     """Follows stops within jerk limits, in memory of its own."""
 
     def __init__(self, layout: RowLayout) -> None:
-        names = "v_last", "w_last", "lower", "upper", "hard_lower", "hard_upper", "v_stop"
+        names = "v_prev", "dv_prev", "lower", "upper", "hard_lower", "hard_upper", "v_stop"
         self._packed = kernels.pack(layout._replace(**{name: getattr(layout, name).copy() for name in names}))
-        self._way = np.zeros((_MOST_TICKS, len(layout.v_last)))
+        self._way = np.zeros((_MOST_TICKS, len(layout.v_prev)))
 
     def way(self, q: Array, v: Array, w: Array) -> Array:
         """See `kernels.stop_way`; a view of memory that the next call overwrites."""
@@ -82,7 +82,7 @@ class Assembly:
             scene, frames, self._others, bounds, kinematics, query, avoidance, limits, damping, dt, looks_ahead
         )
         x = self._layout
-        self._hard = (x.hard_lower, x.hard_upper) if limits.acceleration_gives_way else (x.lower, x.upper)
+        self._hard = (x.hard_lower, x.hard_upper) if limits.relax_acceleration else (x.lower, x.upper)
         self._packed = kernels.pack(self._layout)
         self._stop, self._dt = _StopAhead(x) if x.jerked else None, dt
         robot = scene.robot
@@ -93,8 +93,8 @@ class Assembly:
         self._tracking = Tracking(self._layout.A, self._layout.b, damping)
         self._levels = levels if len(levels) > 1 else ()
         self._forward, self._contacts = kinematics, contacts
-        self._eye = np.eye(len(x.v0))
-        self._before, self._change = np.zeros_like(x.v0), np.zeros_like(x.v0)
+        self._eye = np.eye(len(x.v_tracking))
+        self._before, self._change = np.zeros_like(x.v_tracking), np.zeros_like(x.v_tracking)
         self._moving = False
         self.limits_may_give_way = x.jerked or (contacts is not None and x.accelerated)
         """Whether `beyond_limits` has to be asked: bounds alone do not keep to accelerations and jerks then."""
@@ -120,23 +120,25 @@ class Assembly:
         held = None
         if self._contacts is not None:
             held = self._contacts.update(self._forward)
-            x.v_last[:] = held.held(x.v_last)
+            x.v_prev[:] = held.held(x.v_prev)
         self._moving = query.placing.moving
         k, worst, clear, room = kernels.assemble(self._packed, q, query.pairs, reach, self._moving)
         proximity, rows = self._views.get(k) or self._view(k)
-        if x.task_switching and x.v0[0] != x.v0[0] and np.isfinite(x.A).all():  # task rows repeat each other
-            v0 = pseudo_inverse(x.A, 0.0) @ x.b
-            along = self._along(rows, v0)
+        if (
+            x.task_switching and x.v_tracking[0] != x.v_tracking[0] and np.isfinite(x.A).all()
+        ):  # task rows repeat each other
+            v_tracking = pseudo_inverse(x.A, 0.0) @ x.b
+            along = self._along(rows, v_tracking)
             rows.b[:], rows.touch[:] = along.b, along.touch
         if held is not None:
-            x.v0[:] = tracking_within(held, x.A, x.b, x.damping)
+            x.v_tracking[:] = tracking_within(held, x.A, x.b, x.damping)
             self._count_from_before()
             if x.task_switching:
                 kernels.row_bounds(self._packed, k, self._moving)
-            worst = float(kernels.tracking_shortfall(self._packed, k))
+            worst = float(kernels.tracking_violation(self._packed, k))
         bounds = x.lower, x.upper, *self._hard, x.v_stop
         return proximity, Problem(
-            self._tracking, rows, *bounds, *self._names, x.v0, worst, held, self._levels, x.jerked, clear, room
+            self._tracking, rows, *bounds, *self._names, x.v_tracking, worst, held, self._levels, x.jerked, clear, room
         )
 
     def look_ahead(self, looks_ahead: bool) -> None:
@@ -151,10 +153,12 @@ class Assembly:
         """Takes over which joint carries what, in place."""
         hand_over(self._layout, self._masks, query)
 
-    def closest_call(self, v: Array, near: int, reach: float, horizon: float, stop: Stop | None = None) -> float:
+    def clearance_lower_bound(
+        self, v: Array, near: int, reach: float, horizon: float, stop: Stop | None = None
+    ) -> float:
         """A bound below what is left of the safe distances on the way of v until `horizon` [m].
 
-        See `kernels.closest_call`.
+        See `kernels.clearance_lower_bound`.
 
         Args:
             v: velocity (nv,).
@@ -163,26 +167,26 @@ class Assembly:
             horizon: time for which v leads on [s].
             stop: what else there is of the way, if there is.
         """
-        left = float(kernels.closest_call(self._packed, v, near, reach, horizon))
+        left = float(kernels.clearance_lower_bound(self._packed, v, near, reach, horizon))
         if stop is None:
             return left
         return left - 2.0 * float(stop.aside.sum()) - (self._bend(stop.ways) - self._bend(horizon * np.abs(v)))
 
-    def bends(self, q: Array, v: Array, horizon: float) -> bool:
-        """Whether a joint has to brake harder than the others for its position limit: see `kernels.bends`.
+    def leaves_position_limits(self, q: Array, v: Array, horizon: float) -> bool:
+        """Return True if a joint brakes harder for its position limit, see `kernels.leaves_position_limits`.
 
         Args:
             q: configuration (nq,).
             v: velocity (nv,).
             horizon: time for which v leads on [s].
         """
-        return bool(kernels.bends(self._packed, q, v, horizon))
+        return bool(kernels.leaves_position_limits(self._packed, q, v, horizon))
 
     def _bend(self, ways: Array) -> float:
-        """What `closest_call` allows for bodies that turn, where coordinates move by `ways` (nv,) in all [m]."""
+        """Bound what turning bodies add [m], where coordinates travel `ways` (nv,) in all."""
         x = self._layout
         turned, slid = float(np.max(x.turning @ ways)), float(np.max(x.sliding @ ways))
-        return turned * (turned * x.lever + 2.0 * slid)
+        return turned * (turned * x.lever_arm + 2.0 * slid)
 
     def stop(self, q: Array, v: Array) -> Stop:
         """A tick at v and the stop after it, where jerks have limits.
@@ -195,7 +199,7 @@ class Assembly:
         """
         x = self._layout
         assert self._stop is not None
-        w = np.clip(v - x.v_last, -x.v_step, x.v_step)
+        w = np.clip(v - x.v_prev, -x.v_step, x.v_step)
         way = self._stop.way(q, v, w)
         size = max(float(v @ v), 1e-300)
         shares = way @ v / size
@@ -207,17 +211,19 @@ class Assembly:
         aside = np.abs(parts) * x.speeds[: len(x.joint_poses)].max()
         if (np.abs(beside).max(axis=0) > _ROUND_OFF * x.v_step).any():
             turned, slid = np.abs(beside) @ x.turning.T, np.abs(beside) @ x.sliding.T
-            aside += turned.max(axis=1) * x.lever + slid.max(axis=1)
+            aside += turned.max(axis=1) * x.lever_arm + slid.max(axis=1)
         return Stop(way, self._dt * np.abs(shares), self._dt * aside, self._dt * np.abs(way).sum(axis=0))
 
     def follow(self, v: Array, problem: Problem) -> Problem:
         """The problem of this tick with the velocity v (nv,) to follow in place of the tasks."""
         x = self._layout
-        x.v0[:] = v if problem.contacts is None else problem.contacts.held(v)
+        x.v_tracking[:] = v if problem.contacts is None else problem.contacts.held(v)
         if x.task_switching:
             kernels.row_bounds(self._packed, len(problem.avoidance.d), self._moving)
-        worst = float(kernels.tracking_shortfall(self._packed, len(problem.avoidance.d)))
-        return problem._replace(tracking=Tracking(self._eye, x.v0, 0.0), shortfall=worst, levels=(), clear=False)
+        worst = float(kernels.tracking_violation(self._packed, len(problem.avoidance.d)))
+        return problem._replace(
+            tracking=Tracking(self._eye, x.v_tracking, 0.0), violation=worst, levels=(), clear=False
+        )
 
     def eased(self, problem: Problem) -> Problem:
         """The problem of this tick with as much of its v0 as can be had now without swinging past it.
@@ -225,16 +231,16 @@ class Assembly:
         The way to v0 within jerk limits is a stop, for one who moves at v0. The velocity that is closest to v0 in every
         tick gets there with an acceleration that cannot be taken back at once: it swings to and fro about v0, for ever.
         """
-        x, v0 = self._layout, problem.v0
-        if v0[0] != v0[0]:
+        x, v_tracking = self._layout, problem.v_tracking
+        if v_tracking[0] != v_tracking[0]:
             return problem
-        eased = v0 + kernels.easing_stop(x.v_last - v0, x.w_last, x.v_step, x.w_step)
+        eased = v_tracking + kernels.easing_stop(x.v_prev - v_tracking, x.dv_prev, x.v_step, x.dv_step)
         if problem.contacts is not None:
             eased = problem.contacts.held(eased)
-        tracking = problem.tracking._replace(b=problem.tracking.b + problem.tracking.A @ (eased - v0))
+        tracking = problem.tracking._replace(b=problem.tracking.b + problem.tracking.A @ (eased - v_tracking))
         rows = self._along(problem.avoidance, eased)
-        worst = float(kernels.shortfall(eased, rows.J, rows.b, x.lower, x.upper))
-        return problem._replace(tracking=tracking, avoidance=rows, v0=eased, shortfall=worst)
+        worst = float(kernels.violation(eased, rows.J, rows.b, x.lower, x.upper))
+        return problem._replace(tracking=tracking, avoidance=rows, v_tracking=eased, violation=worst)
 
     def redirected(self, problem: Problem, frame: int, velocity: Array) -> Problem:
         """The problem of this tick with a velocity (3,) added to the linear one that a task asks for [m/s].
@@ -248,16 +254,16 @@ class Assembly:
         linear = slice(3 * frame, 3 * frame + 3)
         b = x.b.copy()
         x.b[linear] += x.scale[linear] * velocity
-        v0 = np.empty_like(x.v0)
+        v_tracking = np.empty_like(x.v_tracking)
         if problem.contacts is None:
-            kernels.damped_solution(self._packed, v0)
+            kernels.damped_solution(self._packed, v_tracking)
         else:
-            v0[:] = tracking_within(problem.contacts, x.A, x.b, x.damping)
+            v_tracking[:] = tracking_within(problem.contacts, x.A, x.b, x.damping)
         tracking = problem.tracking._replace(b=x.b.copy())
         x.b[:] = b
-        rows = self._along(problem.avoidance, v0)
-        worst = float(kernels.shortfall(v0, rows.J, rows.b, x.lower, x.upper))
-        return problem._replace(tracking=tracking, avoidance=rows, v0=v0, shortfall=worst, clear=False)
+        rows = self._along(problem.avoidance, v_tracking)
+        worst = float(kernels.violation(v_tracking, rows.J, rows.b, x.lower, x.upper))
+        return problem._replace(tracking=tracking, avoidance=rows, v_tracking=v_tracking, violation=worst, clear=False)
 
     def prioritised(self, problem: Problem, tracked: Callable[[Problem], Array]) -> Problem:
         """The problem of this tick with rows for what a cascade tracks, which is not v0.
@@ -275,9 +281,9 @@ class Assembly:
         x, k = self._layout, len(rows.d)
         if not (x.task_switching and k):
             return rows
-        memory = x.v0, x.least[:k], x.touch[:k]
+        memory = x.v_tracking, x.least[:k], x.touch[:k]
         kept = [array.copy() for array in memory]
-        x.v0[:] = v
+        x.v_tracking[:] = v
         kernels.row_bounds(self._packed, k, self._moving)
         along = rows._replace(b=x.least[:k].copy(), touch=x.touch[:k].copy())
         for array, values in zip(memory, kept, strict=True):
@@ -312,8 +318,8 @@ class Assembly:
         The kernels count from the nearest one that holds the contacts, which have turned a little since.
         """
         x = self._layout
-        low = np.maximum(self._before - x.v_step, self._before + x.w_last - x.w_step)
-        high = np.minimum(self._before + x.v_step, self._before + x.w_last + x.w_step)
+        low = np.maximum(self._before - x.v_step, self._before + x.dv_prev - x.dv_step)
+        high = np.minimum(self._before + x.v_step, self._before + x.dv_prev + x.dv_step)
         low, high = np.minimum(low, x.upper), np.maximum(high, x.lower)
         np.maximum(x.lower, low, out=x.lower)
         np.minimum(x.upper, high, out=x.upper)
@@ -321,7 +327,7 @@ class Assembly:
     def beyond_limits(self, v: Array) -> tuple[Array, Array]:
         """By how much v (nv,) passes what accelerations and what jerks allow (nv,), negative within [rad/s or m/s]."""
         x, change = self._layout, v - self._before
-        return np.abs(change) - x.v_step, np.abs(change - self._change) - x.w_step
+        return np.abs(change) - x.v_step, np.abs(change - self._change) - x.dv_step
 
     def remember(self, v: Array) -> None:
         """Takes v (nv,) as the velocity at which the robot moves from this tick to the next."""
@@ -329,31 +335,31 @@ class Assembly:
         if self.limits_may_give_way:
             np.subtract(v, self._before, out=self._change)
             self._before[:] = v
-            np.clip(self._change, -x.v_step, x.v_step, out=x.w_last)
-        x.v_last[:] = v
+            np.clip(self._change, -x.v_step, x.v_step, out=x.dv_prev)
+        x.v_prev[:] = v
 
     def measured(self, v: Array) -> None:
         """Takes v (nv,) as the velocity at which the robot moves until this tick; accelerations stay as commanded."""
-        self._layout.v_last[:], self._before[:] = v, v
+        self._layout.v_prev[:], self._before[:] = v, v
 
     def restart(self, v: Array) -> None:
         """Takes v (nv,) as the velocity at which the robot has been moving, without any acceleration."""
-        self._layout.v_last[:], self._layout.w_last[:] = v, 0.0
+        self._layout.v_prev[:], self._layout.dv_prev[:] = v, 0.0
         self._before[:], self._change[:] = v, 0.0
 
     @property
-    def v_last(self) -> Array:
+    def v_prev(self) -> Array:
         """Velocity (nv,) at which the robot moves until this tick."""
-        return self._layout.v_last
+        return self._layout.v_prev
 
     @property
-    def w_last(self) -> Array:
+    def dv_prev(self) -> Array:
         """By how much that changed in the tick before (nv,); 0 where jerks have no limits."""
-        return self._layout.w_last
+        return self._layout.dv_prev
 
     def _view(self, k: int) -> tuple[Proximity, AvoidanceRows]:
         x = self._layout
         near = x.near[:k]
-        proximity = Proximity(near, x.closest[:k], x.J[:k], x.drift[:k])
+        proximity = Proximity(near, x.closest[:k], x.J[:k], x.feedforward[:k])
         self._views[k] = proximity, AvoidanceRows(near, x.d[:k], x.J[:k], x.least[:k], x.d1, x.d2, x.touch[:k])
         return self._views[k]

@@ -20,7 +20,7 @@ from qpavoid.model.trajectory import Sample
 from qpavoid.problem import Array, IntArray
 
 
-class Grasps:
+class Attachments:
     """Who carries what, in the distances of the tick, in those ahead and in the rows."""
 
     def __init__(self, scene: Scene, queries: tuple[DistanceQuery, ...], assembly: Assembly, hold: float) -> None:
@@ -36,7 +36,7 @@ class Grasps:
         self._model = scene.robot.model
         self._data = self._model.createData()
         self._masks = support_masks(self._model)
-        self._longest = float(queries[0].longest_reach().max())
+        self._longest = float(queries[0].max_extension().max())
         self._touching: IntArray = np.zeros(0, dtype=np.intp)
         self._rigid = np.zeros(len(scene.pairs), dtype=bool)
         self._allowed = np.zeros(len(scene.pairs), dtype=bool)
@@ -109,7 +109,7 @@ class Grasps:
                 body = self._queries[0].bodies[self._geometry(index)]
                 placement = Sample.at(body.placement.translation, body.placement.rotation)
                 query.carry(index, int(body.parentJoint), placement)
-        query.unwatched = self._queries[0].unwatched
+        query.disabled_pairs = self._queries[0].disabled_pairs
 
     def pose(self, index: int, q: Array) -> Sample:
         """World pose of an obstacle at q (nq,)."""
@@ -138,7 +138,7 @@ class Grasps:
         was = np.zeros(len(mine), dtype=bool)
         was[self._touching] = True
         query = self._queries[0]
-        query.unwatched = None
+        query.disabled_pairs = None
         pin.forwardKinematics(self._model, self._data, q)
         query.compute(self._data, self._hold)
         found = query.pairs[query.results[query.pairs, 0] <= self._hold]
@@ -152,7 +152,7 @@ class Grasps:
         off = self._rigid | self._allowed
         off[self._touching] = True
         for query in self._queries:
-            query.unwatched = off if off.any() else None
+            query.disabled_pairs = off if off.any() else None
 
     def _geometry(self, index: int) -> int:
         return int(np.flatnonzero(self._scene.obstacle_of == index)[0])

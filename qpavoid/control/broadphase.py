@@ -22,7 +22,7 @@ class Cull:
             data: geometry data, in which pairs are switched on and off.
             poses: world poses of all bodies, kept up to date by others (g, 12).
             spheres: bounding sphere of each body in its own frame, centre and radius (g, 4) [m].
-            centers: see `Placing.centers` (g, 5).
+            centers: see `ObstaclePlacement.centers` (g, 5).
             by_coal: which pairs coal computes (m,); the others stay off in its data.
         """
         self._data, self._poses, self._centers, self._by_coal = data, poses, centers, by_coal
@@ -39,7 +39,7 @@ class Cull:
         for pair in np.flatnonzero(~by_coal).tolist():
             self._data.deactivateCollisionPair(pair)
         self._last = np.arange(len(scene.pairs)).tobytes()
-        kernels.in_one_alone(self._found, np.frombuffer(self._last, dtype=np.intp))  # so that no tick compiles it
+        kernels.sorted_setxor(self._found, np.frombuffer(self._last, dtype=np.intp))  # so that no tick compiles it
 
     def place_points(self, indices: IntArray, positions: Array) -> None:
         """Moves the bounding spheres of several geometries (k,), whose centres are their origins (k, 3)."""
@@ -60,7 +60,7 @@ class Cull:
         pairs = self._found[:count]
         now = pairs.tobytes()
         if now != self._last:
-            changed = kernels.in_one_alone(pairs, np.frombuffer(self._last, dtype=np.intp))
+            changed = kernels.sorted_setxor(pairs, np.frombuffer(self._last, dtype=np.intp))
             self._last = now
             self.active[changed] ^= True
             changed = changed[self._by_coal[changed]]

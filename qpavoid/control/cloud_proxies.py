@@ -23,7 +23,7 @@ _PLACES = 3
 """Into how many stretches a body's axis counts as divided: voxels that face the same one in one direction are alike."""
 
 
-class Slots:
+class CloudProxies:
     """The balls of one cloud, for every body that can move."""
 
     def __init__(
@@ -87,7 +87,7 @@ class Slots:
         for body in self._planes:
             if self._first[body] < self._first[body + 1]:
                 self._refine(body, poses[body], pose)
-        kernels.choose(*found, self._spacing, voxels.keys, self._slots, self._kept)
+        kernels.select_voxels(*found, self._spacing, voxels.keys, self._slots, self._kept)
         places = np.full((*self._slots.shape, 3), FAR)
         taken = self._slots >= 0
         places[taken] = voxels.centers[self._slots[taken]] @ rotation.T + pose.position

@@ -14,8 +14,8 @@ import pinocchio as pin
 
 from qpavoid.config import PointCloud
 from qpavoid.control.broadphase import Cull
-from qpavoid.control.cloud_proxies import Slots
-from qpavoid.control.placement import Placing
+from qpavoid.control.cloud_proxies import CloudProxies
+from qpavoid.control.placement import ObstaclePlacement
 from qpavoid.geometry.bodies import bounding_box, bounding_sphere
 from qpavoid.geometry.cores import cores, with_closed_form
 from qpavoid.kernels.distances import closed_forms
@@ -59,7 +59,7 @@ class DistanceQuery:
         self.spheres = np.array([(*center, radius) for center, radius in shapes]).reshape(-1, 4)
         """(g, 4) bounding sphere of each body in its own frame: centre and radius [m]; infinite of a half-space."""
         self._joints = model.njoints
-        self.placing = Placing(scene, bodies, self.poses, self.spheres)
+        self.placing = ObstaclePlacement(scene, bodies, self.poses, self.spheres)
         """Where the obstacles are."""
         self.group: IntArray = np.arange(len(scene.pairs))
         """(m,) first of the pairs of the same body and point cloud; of other pairs, their own number."""
@@ -69,7 +69,7 @@ class DistanceQuery:
             self.placing.reaches(i, slots.reach)
         self.carried: dict[int, int] = {}
         """Joint that carries each obstacle which is carried, by number of the obstacle."""
-        self.unwatched: Any = None
+        self.disabled_pairs: Any = None
         """(m,) pairs that are computed but of which no row is made; None where there are none."""
         self.enabled = np.ones(len(scene.pairs), dtype=bool)
         """(m,) which pairs are computed at all."""
@@ -103,12 +103,12 @@ class DistanceQuery:
         mesh = np.array([isinstance(body.geometry, coal.BVHModelBase) for body in self.bodies], dtype=bool)
         return ~mesh[self._scene.pairs].any(axis=1) & ~self._grouped
 
-    def longest_reach(self) -> Array:
-        """(njoints,) the same as `joint_reach`, with whatever may ever be carried [m]."""
-        radii, reach = self.spheres[self._first_obstacle : self._movable, 3], self.joint_reach()
+    def max_extension(self) -> Array:
+        """(njoints,) the same as `joint_radius`, with whatever may ever be carried [m]."""
+        radii, reach = self.spheres[self._first_obstacle : self._movable, 3], self.joint_radius()
         return np.full_like(reach, reach.max() + 2.0 * radii.max() + _LONGEST_GRASP) if len(radii) else reach
 
-    def carriers(self) -> IntArray:
+    def moved_by(self) -> IntArray:
         """(m, 2) what moves the two bodies of each pair: number of a joint, or njoints plus that of an obstacle."""
         joints = np.array([body.parentJoint for body in self._geometry.geometryObjects], dtype=np.intp)
         of = self._scene.obstacle_of
@@ -116,7 +116,7 @@ class DistanceQuery:
         joints[free] = self._joints + of[free]
         return joints[self._scene.pairs]
 
-    def joint_reach(self) -> Array:
+    def joint_radius(self) -> Array:
         """(njoints,) distance from each joint's origin to the farthest point of a body that it carries [m]."""
         reach = np.zeros(self._joints)
         bodies = self._geometry.geometryObjects
@@ -202,7 +202,7 @@ class DistanceQuery:
         if self._surface is not None:
             self._mend_surfaces(pairs)
         self._computed = pairs
-        self.pairs = pairs if self.unwatched is None else pairs[~self.unwatched[pairs]]
+        self.pairs = pairs if self.disabled_pairs is None else pairs[~self.disabled_pairs[pairs]]
 
     def body_spheres(self, data: Any) -> tuple[Array, Array]:
         """World centres (b, 3) and radii (b,) of spheres around the robot's bodies and all that it may carry [m].
@@ -254,7 +254,7 @@ class DistanceQuery:
             coal.distance(*a, *b, self._request, result)
             self.results[pair] = read_results([result])[0]
 
-    def _make_slots(self, index: int, voxels: Voxels) -> Slots:
+    def _make_slots(self, index: int, voxels: Voxels) -> CloudProxies:
         shape, first = self._scene.obstacles[index].shape, self._movable
         assert isinstance(shape, PointCloud)
         a, b = self._scene.pairs.T
@@ -262,9 +262,9 @@ class DistanceQuery:
         self._grouped[mine] = True
         self.group[mine] = mine[np.searchsorted(a[mine], a[mine])]
         bodies = [self._geometry.geometryObjects[i].geometry for i in range(first)]
-        return Slots(bodies, np.array(self._pieces[index]), shape.resolution, shape.nearest, voxels)
+        return CloudProxies(bodies, np.array(self._pieces[index]), shape.resolution, shape.nearest, voxels)
 
-    def _fill(self, index: int, slots: Slots, reach: float) -> None:
+    def _fill(self, index: int, slots: CloudProxies, reach: float) -> None:
         """Puts the balls of a cloud to the voxels that are nearest to each body."""
         places = slots.places(self.poses[: self._movable], self._off, self.placing.samples[index], reach).reshape(-1, 3)
         geometries = slots.geometries.ravel()

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from qpavoid.control.trajectories import move_on
+from qpavoid.control.trajectories import extrapolate
 from qpavoid.problem import Array, IntArray
 
 _STEADY = 0.2
@@ -15,7 +15,7 @@ _ROTATION, _POSITION, _LINEAR, _ANGULAR = slice(9), slice(9, 12), slice(12, 15),
 """Where the parts of a state are."""
 
 
-class Told(NamedTuple):
+class ObstacleEstimates(NamedTuple):
     """What is known of some obstacles."""
 
     which: tuple[int, ...]
@@ -50,7 +50,9 @@ class MeanTwists:
         self._counts[index], self.twists[index] = 0.0, 0.0
 
 
-def strayed(now: Told | None, before: Told | None, span: float, reach: Array) -> float:
+def prediction_error_bound(
+    now: ObstacleEstimates | None, before: ObstacleEstimates | None, span: float, reach: Array
+) -> float:
     """How far any point of an obstacle is off from where it was foreseen to be, now and for some time [m].
 
     Positions and rotations that are off by δp and δR, and twists by δv and δω, leave a point that is r from the
@@ -68,7 +70,7 @@ def strayed(now: Told | None, before: Told | None, span: float, reach: Array) ->
     if now is None or before is None or now.which != before.which:
         return 0.0 if now is before else np.inf
     expected = before.states.copy()
-    move_on(expected, now.t - before.t)
+    extrapolate(expected, now.t - before.t)
     off = np.abs(now.states - expected)
     if not off.any():
         return 0.0

@@ -18,9 +18,9 @@ from numpy.typing import ArrayLike
 
 from qpavoid import kernels
 from qpavoid.config import PointCloud, Sensing
-from qpavoid.control.estimates import MeanTwists, Told
+from qpavoid.control.estimates import MeanTwists, ObstacleEstimates
 from qpavoid.control.inputs import FARTHEST, FASTEST, FAULTS, as_time
-from qpavoid.control.trajectories import STATE, Courses, as_samples, move_on, put
+from qpavoid.control.trajectories import STATE, TrajectoryBatch, as_samples, extrapolate, put
 from qpavoid.errors import NumericalError, UnknownName, nearest
 from qpavoid.kernels.obstacles import FAST, NORMALISED, NOT_FINITE, POSE, REST, SAMPLE
 from qpavoid.model.cloud import Points, Voxels
@@ -123,12 +123,12 @@ class Obstacles:
         self._growth = config.margin_growth
         self._index = {obstacle.name: i for i, obstacle in enumerate(obstacles)}
         self._moving = [i for i, obstacle in enumerate(obstacles) if obstacle.moves]
-        self._courses = Courses({i: obstacles[i].motion for i in self._moving})
+        self._courses = TrajectoryBatch({i: obstacles[i].motion for i in self._moving})
         self._now = 0.0
         self._carried: set[int] = set()
         count = len(obstacles)
         self._seen = Seen(np.array(self._moving, np.intp), np.zeros((count, STATE)), np.zeros(count))
-        self._told: Told | None = None
+        self._told: ObstacleEstimates | None = None
         self._sampled: dict[float, tuple[Array, Array]] = {}  # of those on trajectories, by time: see `paths`
         self._known: dict[int, None] = {}  # those that are given from outside, in the order in which they were first
         self._external = np.zeros(0, dtype=np.intp)  # the same, as an array
@@ -145,7 +145,7 @@ class Obstacles:
         kernels.check_states(self._news, _NONE, _NONE, FARTHEST, FASTEST)
         times, copies = self._stamps.copy(), [self._last.copy() for _ in range(3)]
         news, last, states = copies
-        kernels.take_in(_NONE, _NONE, _NO_STAMPS, news, times, last, states, self._dt, FASTEST)
+        kernels.update_measured_states(_NONE, _NONE, _NO_STAMPS, news, times, last, states, self._dt, FASTEST)
 
     def index(self, name: str) -> int:
         """Number of an obstacle.
@@ -163,7 +163,7 @@ class Obstacles:
         return self._seen.which
 
     @property
-    def told(self) -> Told | None:
+    def told(self) -> ObstacleEstimates | None:
         """What is known at the last tick of those that are given from outside; None where none is.
 
         Their twists are means of what was told lately: those of a sensor are no base for what will be in a second.
@@ -172,11 +172,11 @@ class Obstacles:
             which = list(self._known)
             states = self._seen.states[which]
             states[:, 12:] = self._means.twists[which]
-            self._told = Told(tuple(which), states, self._now)
+            self._told = ObstacleEstimates(tuple(which), states, self._now)
         return self._told
 
     @property
-    def restless(self) -> bool:
+    def any_may_move(self) -> bool:
         """Whether any is on a trajectory, or told to move, so that it may be elsewhere later."""
         told = self.told
         if told is None or len(told.which) < len(self.moving):
@@ -205,13 +205,13 @@ class Obstacles:
         self._at(t, states)
         return states[:, 9:12], _rates(states)
 
-    def foreseen(self, t: float) -> Seen:
+    def predicted(self, t: float) -> Seen:
         """Where they will be at t [s], on their trajectories, or as they were last seen to move."""
         states, told = self._seen.states.copy(), self.told
         self._at(t, states)
         if told is not None:
             later = told.states.copy()
-            move_on(later, t - told.t)
+            extrapolate(later, t - told.t)
             states[list(told.which)] = later
         return self._seen._replace(states=states)
 
@@ -334,7 +334,7 @@ class Obstacles:
         if what.pose is None:
             state = self._last[index : index + 1].copy()
             if index in self._known:
-                move_on(state, t - shift - self._stamps[index])
+                extrapolate(state, t - shift - self._stamps[index])
             else:
                 put(as_samples(state)[0], self._obstacles[index].motion.sample(t))
             sample = as_samples(state)[0]
@@ -383,7 +383,7 @@ class Obstacles:
 
     def _take_in(self, update: Update, voxels: dict[int, Voxels]) -> list[Reason]:
         which, before = update.which, self._stamps[update.which]
-        fine = kernels.take_in(
+        fine = kernels.update_measured_states(
             which, update.kind, update.stamps, self._news, self._stamps, self._last, self._seen.states,
             _SHORTEST * self._dt, FASTEST,
         )  # fmt: skip
@@ -421,7 +421,7 @@ class Obstacles:
         if late.any():
             which = external[late]
             states = self._last[which]
-            move_on(states, np.minimum(age[late], _LONGEST))
+            extrapolate(states, np.minimum(age[late], _LONGEST))
             self._seen.states[which] = states
         for index in self._awaited:
             since = float(t - self._stamps[index])

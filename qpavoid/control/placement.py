@@ -19,7 +19,7 @@ _FARTHEST_STOP = 1.0
 """How far the robot may go before it stands, where a half-space that turns is concerned [m]."""
 
 
-class Placing:
+class ObstaclePlacement:
     """Moves the obstacles of a scene about, in the geometry model of its distances."""
 
     def __init__(self, scene: Scene, bodies: Any, poses: Array, spheres: Array) -> None:

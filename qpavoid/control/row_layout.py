@@ -12,7 +12,7 @@ from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.tasks.frames import FrameTask, task_layout
 from qpavoid.control.tasks.rows import RowTask
 from qpavoid.kernels.layout import RowLayout
-from qpavoid.model.kinematics import ForwardKinematics, chains, column_joints, columns, longest_lever
+from qpavoid.model.kinematics import ForwardKinematics, chains, column_joints, columns, max_lever_arm
 from qpavoid.model.limits import JointBounds, limit_layout
 from qpavoid.model.scene import Scene
 from qpavoid.problem import Array
@@ -64,26 +64,26 @@ def lay_out(
         joint_poses=kinematics.joint_poses,
         parents=np.array(list(model.parents), dtype=np.intp),
         column_joints=column_joints(model),
-        joint_reach=query.joint_reach(),
-        carriers=query.carriers(),
+        joint_radius=query.joint_radius(),
+        moved_by=query.moved_by(),
         bodies=np.array(scene.pairs, dtype=np.intp),
         body_poses=query.poses,
         boxes=query.boxes(),
         convex=query.convex(),
         turning=turning,
         sliding=sliding,
-        spins=np.zeros((model.njoints, 3)),
+        omega=np.zeros((model.njoints, 3)),
         speeds=query.placing.speeds,
         near=np.zeros(pairs, dtype=np.intp),
         closest=np.zeros((pairs, 10)),
         J=np.zeros((pairs, model.nv)),
-        drift=np.zeros(pairs),
+        feedforward=np.zeros(pairs),
         d=np.zeros(pairs),
         least=np.zeros(pairs),
         touch=np.zeros(pairs),
         **limit_layout(bounds, limits.position_gain, dt),
-        v0=np.zeros(model.nv),
-        lever=longest_lever(model, query.longest_reach()),
+        v_tracking=np.zeros(model.nv),
+        lever_arm=max_lever_arm(model, query.max_extension()),
         damping=damping,
         looks_ahead=looks_ahead,
         **row_form(avoidance),
@@ -100,5 +100,5 @@ def hand_over(x: RowLayout, masks: Array, query: DistanceQuery) -> None:
     """
     joints = np.array([body.parentJoint for body in query.bodies], dtype=np.intp)[x.bodies]
     x.support[:] = masks[joints[:, 1]] - masks[joints[:, 0]]
-    x.carriers[:] = query.carriers()
-    x.joint_reach[:] = query.joint_reach()
+    x.moved_by[:] = query.moved_by()
+    x.joint_radius[:] = query.joint_radius()

@@ -35,7 +35,7 @@ def put(view: Sample, sample: Sample) -> None:
     view[0][:], view[1][:], view[2][:], view[3][:] = sample[:4]
 
 
-def move_on(states: Array, t: float | Array) -> None:
+def extrapolate(states: Array, t: float | Array) -> None:
     """Brings bodies to where they are t seconds later if they keep their twists about their origins, in place [s].
 
     Args:
@@ -51,7 +51,7 @@ def move_on(states: Array, t: float | Array) -> None:
         states[turning, :9] = np.matmul(axes, turns.swapaxes(1, 2)).reshape(-1, 9)
 
 
-class Courses:
+class TrajectoryBatch:
     """The trajectories of some bodies."""
 
     def __init__(self, motions: Mapping[int, Motion]) -> None:

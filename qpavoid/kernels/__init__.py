@@ -1,21 +1,34 @@
 """Array work of a tick, as loops that numba compiles at their first use and keeps on disk (`kernels.cache`)."""
 
-from qpavoid.kernels.backup import ROUND_OFF, comes_too_near, least_apart, look_around, ramp
+from qpavoid.kernels.backup import ROUND_OFF, backup_rows, closes_below, min_sphere_distance, rate_limit
 from qpavoid.kernels.bounds import velocity_bounds
-from qpavoid.kernels.broadphase import candidates, in_one_alone
+from qpavoid.kernels.broadphase import candidates, sorted_setxor
 from qpavoid.kernels.cache import first_use
-from qpavoid.kernels.clearance import TOLERANCE, bends, closest_call, joint_speeds, tracking_clear
+from qpavoid.kernels.clearance import (
+    TOLERANCE,
+    clearance_lower_bound,
+    joint_speeds,
+    leaves_position_limits,
+    tracking_clear,
+)
 from qpavoid.kernels.layout import RowLayout
-from qpavoid.kernels.obstacles import Pieces, Placed, check_states, place_obstacles, sample_pieces, take_in
+from qpavoid.kernels.obstacles import (
+    Pieces,
+    Placed,
+    check_states,
+    place_obstacles,
+    sample_pieces,
+    update_measured_states,
+)
 from qpavoid.kernels.packing import pack
 from qpavoid.kernels.qp import farthest, minimize, project, project_soft
 from qpavoid.kernels.rotation import rotation_vector
 from qpavoid.kernels.rows import distance_rows, row_bounds
-from qpavoid.kernels.step import assemble, shortfall, tracking_shortfall
+from qpavoid.kernels.step import assemble, tracking_violation, violation
 from qpavoid.kernels.stopping import speed_to_stop
 from qpavoid.kernels.stops import easing_stop, stop_velocity, stop_way
 from qpavoid.kernels.tasks import damped_solution, frame_rows, projection_cost
-from qpavoid.kernels.voxels import choose, within_reach
+from qpavoid.kernels.voxels import select_voxels, within_reach
 
 __all__ = [
     "ROUND_OFF",
@@ -24,39 +37,39 @@ __all__ = [
     "Placed",
     "RowLayout",
     "assemble",
-    "bends",
+    "backup_rows",
     "candidates",
     "check_states",
-    "choose",
-    "closest_call",
-    "comes_too_near",
+    "clearance_lower_bound",
+    "closes_below",
     "damped_solution",
     "distance_rows",
     "easing_stop",
     "farthest",
     "first_use",
     "frame_rows",
-    "in_one_alone",
     "joint_speeds",
-    "least_apart",
-    "look_around",
+    "leaves_position_limits",
+    "min_sphere_distance",
     "minimize",
     "pack",
     "place_obstacles",
     "project",
     "project_soft",
     "projection_cost",
-    "ramp",
+    "rate_limit",
     "rotation_vector",
     "row_bounds",
     "sample_pieces",
-    "shortfall",
+    "select_voxels",
+    "sorted_setxor",
     "speed_to_stop",
     "stop_velocity",
     "stop_way",
-    "take_in",
     "tracking_clear",
-    "tracking_shortfall",
+    "tracking_violation",
+    "update_measured_states",
     "velocity_bounds",
+    "violation",
     "within_reach",
 ]

@@ -16,7 +16,7 @@ ROUND_OFF = 1e-12
 
 
 @compiled
-def look_around(
+def backup_rows(
     x: Any, q: Array, pairs: IntArray, reach: float, moving: bool, enabled: Mask, touch: float
 ) -> tuple[int, int, float, float]:
     """Write velocity bounds, and the rows of the enabled pairs that are near and do not touch.
@@ -48,7 +48,7 @@ def look_around(
             continue
         rest = min(rest, distance + slack)
         if n < i:
-            x.near[n], x.drift[n] = x.near[i], x.drift[i]
+            x.near[n], x.feedforward[n] = x.near[i], x.feedforward[i]
             for c in range(10):
                 x.closest[n, c] = x.closest[i, c]
             for c in range(x.J.shape[1]):
@@ -58,19 +58,19 @@ def look_around(
 
 
 @compiled
-def comes_too_near(closest: Array, J: Array, drift: Array, v: Array, span: float, safe: float) -> bool:
+def closes_below(closest: Array, J: Array, feedforward: Array, v: Array, span: float, safe: float) -> bool:
     """Return True if a pair is nearer than `safe` after `span`, to first order.
 
     Args:
         closest: distances first (k, 10) [m].
         J: velocity Jacobian of these (k, n).
-        drift: their rates due to the obstacles (k,) [m/s].
+        feedforward: their rates due to the obstacles (k,) [m/s].
         v: velocity (n,).
         span: [s].
         safe: [m].
     """
-    for i in range(len(drift)):
-        rate = drift[i]
+    for i in range(len(feedforward)):
+        rate = feedforward[i]
         for c in range(len(v)):
             rate += J[i, c] * v[c]
         if closest[i, 0] + span * rate < safe:
@@ -79,7 +79,7 @@ def comes_too_near(closest: Array, J: Array, drift: Array, v: Array, span: float
 
 
 @compiled
-def ramp(v: Array, wanted: Array, v_step: Array, meets: bool) -> Array:
+def rate_limit(v: Array, wanted: Array, v_step: Array, meets: bool) -> Array:
     """Compute velocities of successive ticks, each as close to the wanted one as the largest changes allow.
 
     Args:
@@ -104,7 +104,7 @@ def ramp(v: Array, wanted: Array, v_step: Array, meets: bool) -> Array:
 
 
 @compiled
-def least_apart(paths: Array, centers: Array, sizes: Array) -> float:
+def min_sphere_distance(paths: Array, centers: Array, sizes: Array) -> float:
     """Compute the least distance between spheres that move along paths and others at rest [m]; infinite without any.
 
     Args:

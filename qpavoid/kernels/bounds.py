@@ -31,11 +31,11 @@ def velocity_bounds(x: Any, q: Array) -> float:
         lower[j], upper[j] = -x.v_max[j], x.v_max[j]
     for i in range(len(x.q_index)):
         j, here = x.v_index[i], q[x.q_index[i]]
-        fastest, step, last = x.v_max[j], x.v_step[j], x.v_last[j]
+        fastest, step, last = x.v_max[j], x.v_step[j], x.v_prev[j]
         below, above = here - x.q_lower[i], x.q_upper[i] - here
         least = min(least, below, above)
         if step < np.inf:
-            faster, slower = min(step, x.w_step[j] + x.w_last[j]), min(step, x.w_step[j] - x.w_last[j])
+            faster, slower = min(step, x.dv_step[j] + x.dv_prev[j]), min(step, x.dv_step[j] - x.dv_prev[j])
             down = _speed_to_stop(below, step, x.dt) if below > 0.0 else max(x.rate * below, -last - faster)
             up = _speed_to_stop(above, step, x.dt) if above > 0.0 else max(x.rate * above, last - slower)
             if below < 0.0:
@@ -49,8 +49,8 @@ def velocity_bounds(x: Any, q: Array) -> float:
     if x.jerked:
         _within_jerk(x, q)
     for j in range(len(x.v_max)):
-        low = min(max(x.v_last[j] - x.v_step[j], lower[j]), upper[j])
-        high = max(min(x.v_last[j] + x.v_step[j], upper[j]), lower[j])
+        low = min(max(x.v_prev[j] - x.v_step[j], lower[j]), upper[j])
+        high = max(min(x.v_prev[j] + x.v_step[j], upper[j]), lower[j])
         if x.jerked:
             low, high = min(max(x.lower[j], low), high), max(min(x.upper[j], high), low)
         x.lower[j], x.upper[j] = low, high
@@ -75,10 +75,10 @@ def _within_jerk(x: Any, q: Array) -> None:
         below[x.v_index[i]], above[x.v_index[i]] = here - x.q_lower[i], x.q_upper[i] - here
     for j in range(len(x.v_max)):
         x.lower[j], x.upper[j] = -np.inf, np.inf
-        unit = x.w_step[j]
+        unit = x.dv_step[j]
         if not unit < np.inf:
             continue
-        speed, change, most, fastest = x.v_last[j] / unit, x.w_last[j] / unit, x.v_step[j] / unit, x.v_max[j] / unit
+        speed, change, most, fastest = x.v_prev[j] / unit, x.dv_prev[j] / unit, x.v_step[j] / unit, x.v_max[j] / unit
         target = min(_speed_to_stop(abs(speed), 1.0, 1.0), most)
         stop = min(max(-target if speed > 0.0 else target, change - 1.0), change + 1.0)
         faster, deeper = fastest if above[j] >= 0.0 else 0.0, fastest if below[j] >= 0.0 else 0.0
@@ -86,7 +86,7 @@ def _within_jerk(x: Any, q: Array) -> None:
         deep = min(1.0 - change, most, _speed_to_stop(max(deeper + speed, 0.0), 1.0, 1.0))
         up = _change_to_stop(speed, high, stop, most, max(above[j], 0.0) / (x.dt * unit))
         down = _change_to_stop(-speed, deep, -stop, most, max(below[j], 0.0) / (x.dt * unit))
-        x.lower[j], x.upper[j] = x.v_last[j] - unit * down, x.v_last[j] + unit * up
+        x.lower[j], x.upper[j] = x.v_prev[j] - unit * down, x.v_prev[j] + unit * up
         if above[j] < 0.0:
             x.hard_upper[j] = max(x.hard_upper[j], min(x.lower[j], x.v_max[j]))
         elif below[j] < 0.0:

@@ -46,7 +46,7 @@ def candidates(poses: Array, local: Array, centers: Array, within: Array, pair_o
 
 
 @compiled
-def in_one_alone(a: IntArray, b: IntArray) -> IntArray:
+def sorted_setxor(a: IntArray, b: IntArray) -> IntArray:
     """Compute what is in one of two increasing arrays (m,), (n,) and not in the other, increasing (k,)."""
     found = np.empty(len(a) + len(b), np.intp)
     i, j, count = 0, 0, 0

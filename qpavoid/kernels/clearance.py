@@ -14,7 +14,7 @@ TOLERANCE = 2e-4
 
 
 @compiled
-def closest_call(x: Any, v: Array, k: int, reach: float, horizon: float) -> float:
+def clearance_lower_bound(x: Any, v: Array, k: int, reach: float, horizon: float) -> float:
     """Bound from below what is left of the safe distance of every pair on the straight way of v until `horizon`.
 
     No distance falls faster than the fastest points of its two bodies move. A point that a joint carries moves at most
@@ -48,11 +48,11 @@ def closest_call(x: Any, v: Array, k: int, reach: float, horizon: float) -> floa
             turning += x.turning[chain, c] * abs(v[c])
             sliding += x.sliding[chain, c] * abs(v[c])
         omega, slide = max(omega, turning), max(slide, sliding)
-    bend = horizon * horizon * omega * (omega * x.lever + 2.0 * slide)
+    bend = horizon * horizon * omega * (omega * x.lever_arm + 2.0 * slide)
     least = reach + x.offset - x.hold - (fastest + any_fastest) * horizon - bend
     for i in range(k):
         pair = x.near[i]
-        closing = speeds[x.carriers[pair, 0]] + speeds[x.carriers[pair, 1]]
+        closing = speeds[x.moved_by[pair, 0]] + speeds[x.moved_by[pair, 1]]
         left = x.d[i] - x.hold - closing * horizon - bend
         if left <= 0.0:
             left = max(left, _left_along_normal(x, v, i, horizon, bend))
@@ -87,11 +87,11 @@ def _left_along_normal(x: Any, v: Array, i: int, horizon: float, bend: float) ->
     approach = 0.0
     for c in range(len(v)):
         approach += x.J[i, c] * v[c]
-    closing = (abs(approach) if x.jerked else max(-approach, 0.0)) + max(-x.drift[i], 0.0)
+    closing = (abs(approach) if x.jerked else max(-approach, 0.0)) + max(-x.feedforward[i], 0.0)
     joints, bent = len(x.joint_poses), 0.0
     for side in range(2):
-        carrier, body = x.carriers[pair, side], x.bodies[pair, side]
-        spin = x.spins[carrier] if carrier < joints else x.twists[carrier - joints, 3:]
+        carrier, body = x.moved_by[pair, side], x.bodies[pair, side]
+        spin = x.omega[carrier] if carrier < joints else x.twists[carrier - joints, 3:]
         sign, n, p = 1.0 - 2.0 * side, found[1:4], found[4 + 3 * side : 7 + 3 * side]
         mx, my, mz = (
             sign * (n[1] * spin[2] - n[2] * spin[1]),
@@ -114,7 +114,7 @@ def _left_along_normal(x: Any, v: Array, i: int, horizon: float, bend: float) ->
 
 
 @compiled
-def bends(x: Any, q: Array, v: Array, horizon: float) -> bool:
+def leaves_position_limits(x: Any, q: Array, v: Array, horizon: float) -> bool:
     """Return True if a coordinate would pass its position limit on the way of v, so that it brakes harder than others.
 
     Args:
@@ -152,14 +152,14 @@ def joint_speeds(x: Any, v: Array) -> None:
             c += 1
         px, py, pz, wx, wy, wz = poses[i, 9], poses[i, 10], poses[i, 11], twist[3], twist[4], twist[5]
         vx, vy, vz = twist[0] + wy * pz - wz * py, twist[1] + wz * px - wx * pz, twist[2] + wx * py - wy * px
-        x.spins[i, 0], x.spins[i, 1], x.spins[i, 2] = wx, wy, wz
+        x.omega[i, 0], x.omega[i, 1], x.omega[i, 2] = wx, wy, wz
         x.speeds[i] = np.sqrt(vx * vx + vy * vy + vz * vz)
-        x.speeds[i] += np.sqrt(wx * wx + wy * wy + wz * wz) * x.joint_reach[i]
+        x.speeds[i] += np.sqrt(wx * wx + wy * wy + wz * wz) * x.joint_radius[i]
 
 
 @compiled
 def tracking_clear(x: Any, q: Array, k: int, reach: float) -> bool:
-    """Return True if, by `closest_call`, nothing comes too near on the way of v0 and a stop from it.
+    """Return True if, by `clearance_lower_bound`, nothing comes too near on the way of v0 and a stop from it.
 
     Args:
         x: reads what the tick found, v0 among it.
@@ -168,9 +168,9 @@ def tracking_clear(x: Any, q: Array, k: int, reach: float) -> bool:
         reach: surface distance below which a pair is near [m].
     """
     slowing = 0.0
-    for j in range(len(x.v0)):
-        slowing = max(slowing, abs(x.v0[j]) / x.v_step[j])
+    for j in range(len(x.v_tracking)):
+        slowing = max(slowing, abs(x.v_tracking[j]) / x.v_step[j])
     horizon = x.dt * (1.0 + 0.5 * slowing)
-    if slowing > 0.0 and bends(x, q, x.v0, horizon):
+    if slowing > 0.0 and leaves_position_limits(x, q, x.v_tracking, horizon):
         return False
-    return closest_call(x, x.v0, k, reach, horizon) > -TOLERANCE
+    return clearance_lower_bound(x, x.v_tracking, k, reach, horizon) > -TOLERANCE

@@ -43,7 +43,7 @@ class RowLayout(NamedTuple):
     """(3 (p + t),) root of each row's weight."""
     task_support: Array
     """(3 (p + t), e) scale of the columns that move each row's frame, 0 for the others."""
-    screws: Array
+    row_wrenches: Array
     """(3 (p + t), 6) directions of the rows; the moments of the linear ones are filled in by every tick."""
     poses: Array
     """(f, 12) out: poses of the tracked frames."""
@@ -70,9 +70,9 @@ class RowLayout(NamedTuple):
     """(J,) the joint that carries each joint, which comes before it; that of the world is the world."""
     column_joints: IntArray
     """(e,) the joint that each column of the world Jacobian belongs to, in increasing order."""
-    joint_reach: Array
+    joint_radius: Array
     """(J,) distance from a joint's origin to the farthest point of a body that it carries [m]."""
-    carriers: IntArray
+    moved_by: IntArray
     """(m, 2) what moves the two bodies of each pair: number of a joint, or J plus that of an obstacle."""
     bodies: IntArray
     """(m, 2) the two bodies of each pair."""
@@ -86,7 +86,7 @@ class RowLayout(NamedTuple):
     """(chains, n) how many angles each coordinate turns among those that move the end of a chain of joints."""
     sliding: Array
     """(chains, n) the same for lengths."""
-    spins: Array
+    omega: Array
     """(J, 3) out: angular velocity of each joint [rad/s]."""
     speeds: Array
     """(J + o,) largest speed of any point that a joint carries, which is overwritten, or of an obstacle [m/s]."""
@@ -96,7 +96,7 @@ class RowLayout(NamedTuple):
     """(m, 10) out: their results."""
     J: Array
     """(m, n) out: velocity Jacobian of their distances."""
-    drift: Array
+    feedforward: Array
     """(m,) out: rate of their distances due to the obstacles [m/s]."""
     d: Array
     """(m,) out: distance that the gains take [m]."""
@@ -117,11 +117,11 @@ class RowLayout(NamedTuple):
     """(n,) largest speed, infinite where there is none."""
     v_step: Array
     """(n,) largest change of v in one tick; infinite where the acceleration has no limit."""
-    v_last: Array
+    v_prev: Array
     """(n,) velocity of the tick before."""
-    w_step: Array
+    dv_step: Array
     """(n,) largest change, from one tick to the next, of that change of v; infinite where the jerk has no limit."""
-    w_last: Array
+    dv_prev: Array
     """(n,) by how much v changed in the tick before, no more than `v_step`."""
     hard_lower: Array
     """(n,) out: lower bound on v from position and velocity limits.
@@ -136,7 +136,7 @@ class RowLayout(NamedTuple):
     v_stop: Array
     """(n,) out: the next velocity of a stop: all coordinates slowed alike, as fast as their limits allow."""
     # --- answer of the tracking law
-    v0: Array
+    v_tracking: Array
     """(n,) out: J⁺ẋ."""
     # --- numbers
     damping: float
@@ -165,7 +165,7 @@ class RowLayout(NamedTuple):
     """Share of the room to a position limit that may be used in a second [1/s]."""
     dt: float
     """Length of a tick [s]."""
-    lever: float
+    lever_arm: float
     """Largest distance that any point can ever have from a joint that turns it [m]."""
     accelerated: bool
     """Whether any acceleration has a limit."""

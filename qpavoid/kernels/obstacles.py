@@ -223,7 +223,7 @@ def _gram(x: Array, gram: Array) -> None:
 
 
 @compiled
-def take_in(
+def update_measured_states(
     which: IntArray, kind: IntArray, times: Array, news: Array, stamps: Array, last: Array, states: Array,
     shortest: float, fastest: float,
 ) -> Mask:  # fmt: skip

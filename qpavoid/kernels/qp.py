@@ -23,15 +23,15 @@ _DEPENDENT = 1e-11
 
 @compiled
 def project(
-    A: Array, regularization: float, v0: Array, J: Array, least: Array, lower: Array, upper: Array
+    A: Array, regularization: float, v_tracking: Array, J: Array, least: Array, lower: Array, upper: Array
 ) -> tuple[Array, bool]:
     """`project_soft` with no soft rows."""
-    return project_soft(A, regularization, v0, J, least, lower, upper, np.zeros(len(least)))
+    return project_soft(A, regularization, v_tracking, J, least, lower, upper, np.zeros(len(least)))
 
 
 @compiled
 def project_soft(
-    A: Array, regularization: float, v0: Array, J: Array, least: Array, lower: Array, upper: Array, soft: Array
+    A: Array, regularization: float, v_tracking: Array, J: Array, least: Array, lower: Array, upper: Array, soft: Array
 ) -> tuple[Array, bool]:
     """The velocity closest to v0 in the metric P = AᵀA + λ with J v >= least and lower <= v <= upper.
 
@@ -40,7 +40,7 @@ def project_soft(
     Args:
         A: tracking rows (r, nv).
         regularization: λ.
-        v0: wanted velocity (nv,).
+        v_tracking: wanted velocity (nv,).
         J: avoidance rows (k, nv).
         least: their right-hand sides (k,).
         lower: lower bounds (nv,).
@@ -60,7 +60,7 @@ def project_soft(
                     P[i, j] += row[i] * row[j]
     for i in range(nv):
         P[i, i] += regularization
-    v = v0.copy()
+    v = v_tracking.copy()
     if not minimize(P, v, J, least, lower, upper, soft):
         return v, False
     for i in range(nv):
@@ -75,10 +75,10 @@ def farthest(
     h: float,
     closest: Array,
     J: Array,
-    drift: Array,
+    feedforward: Array,
     comfort: float,
     deepest: float,
-    gentle: float,
+    low_effort: float,
     v: Array,
     lower: Array,
     upper: Array,
@@ -89,10 +89,10 @@ def farthest(
         h: horizon [s].
         closest: d first (k, 10) [m].
         J: velocity Jacobian of these distances (k, nv).
-        drift: ḋ_obs (k,) [m/s].
+        feedforward: ḋ_obs (k,) [m/s].
         comfort: c, where the slope of the objective in s has come to nothing.
         deepest: s is not below its negative.
-        gentle: ε.
+        low_effort: ε.
         v: (nv,).
         lower: lower bounds (nv,).
         upper: upper bounds (nv,).
@@ -104,9 +104,9 @@ def farthest(
     P, G, least = np.zeros((n + 1, n + 1)), np.empty((k, n + 1)), np.empty(k)
     x, low, high = np.empty(n + 1), np.empty(n + 1), np.empty(n + 1)
     for i in range(n):
-        P[i, i], x[i], low[i], high[i] = gentle, v[i], lower[i], upper[i]
+        P[i, i], x[i], low[i], high[i] = low_effort, v[i], lower[i], upper[i]
     for j in range(k):
-        least[j] = -(closest[j, 0] + h * drift[j])
+        least[j] = -(closest[j, 0] + h * feedforward[j])
         for i in range(n):
             G[j, i] = h * J[j, i]
     P[n, n], x[n], low[n], high[n] = 1.0, comfort, -deepest, comfort

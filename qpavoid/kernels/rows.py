@@ -61,10 +61,10 @@ def distance_rows(x: Any, pairs: IntArray, reach: float, moving: bool) -> int:
                 row[c] = (linear + angular) * support[i, c]
             if x.mimics:
                 _fold(row, x.columns, J[k])
-            x.drift[k] = 0.0
+            x.feedforward[k] = 0.0
             if moving:
                 t = x.twists[x.twist_row[i]]
-                x.drift[k] = nx * t[0] + ny * t[1] + nz * t[2] + mx * t[3] + my * t[4] + mz * t[5]
+                x.feedforward[k] = nx * t[0] + ny * t[1] + nz * t[2] + mx * t[3] + my * t[4] + mz * t[5]
             k += 1
     return k
 
@@ -106,7 +106,7 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
                 value = max(value, braking - np.sqrt(braking * braking + 4.0 * braking * room))
                 if x.jerked:
                     value = max(value, _room_for_jerk(x, i, value, 2.0 * braking, room))
-        least = min(value, x.recovery) - x.drift[i]
+        least = min(value, x.recovery) - x.feedforward[i]
         farther = x.task_switching and not parting
         if parting or farther:
             most = 0.0
@@ -116,18 +116,18 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
                 elif x.J[i, c] < 0.0:
                     most += x.J[i, c] * x.lower[c]
             if farther:
-                most = max(most, x.row_gain * (x.hold - d) - x.drift[i])
-            elif x.drift[i] < 0.0:
-                most = max(most, -x.drift[i])
+                most = max(most, x.row_gain * (x.hold - d) - x.feedforward[i])
+            elif x.feedforward[i] < 0.0:
+                most = max(most, -x.feedforward[i])
             least = min(least, most)
-        if x.accelerated and x.drift[i] >= 0.0 and not parting:
+        if x.accelerated and x.feedforward[i] >= 0.0 and not parting:
             stop = 0.0
             for c in range(len(x.lower)):
                 stop += x.J[i, c] * x.v_stop[c]
             least = min(least, stop)
         x.d[i] = d
         x.least[i] = least
-        x.touch[i] = min(x.row_gain * (x.offset + slack - d) - x.drift[i], least)
+        x.touch[i] = min(x.row_gain * (x.offset + slack - d) - x.feedforward[i], least)
 
 
 @compiled
@@ -149,9 +149,9 @@ def _rate_of_eq10(x: Any, i: int, d: float) -> float:
         i: number of the near pair.
         d: its distance [m].
     """
-    u = x.drift[i]
-    for c in range(len(x.v0)):
-        u += x.J[i, c] * x.v0[c]
+    u = x.feedforward[i]
+    for c in range(len(x.v_tracking)):
+        u += x.J[i, c] * x.v_tracking[c]
     rate, beta = min(u, x.retreat_speed), _beta(x, d)
     if u < 0.0:
         ratio = max(x.d2 - d, 0.0) / max(d, TINY)
@@ -176,12 +176,12 @@ def _room_for_jerk(x: Any, i: int, value: float, step: float, room: float) -> fl
     Returns:
         Bound [m/s]; -∞ where the jerks of its joints have no limit.
     """
-    speed, change, unit = -x.drift[i], 0.0, 0.0
-    for c in range(len(x.v_last)):
+    speed, change, unit = -x.feedforward[i], 0.0, 0.0
+    for c in range(len(x.v_prev)):
         if x.J[i, c] != 0.0:
-            speed -= x.J[i, c] * x.v_last[c]
-            change -= x.J[i, c] * x.w_last[c]
-            unit += abs(x.J[i, c]) * x.w_step[c]
+            speed -= x.J[i, c] * x.v_prev[c]
+            change -= x.J[i, c] * x.dv_prev[c]
+            unit += abs(x.J[i, c]) * x.dv_step[c]
     unit *= BRAKING_SHARE
     if not 0.0 < unit < np.inf:
         return -np.inf

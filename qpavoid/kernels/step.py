@@ -34,22 +34,22 @@ def assemble(x: Any, q: Array, pairs: IntArray, reach: float, moving: bool) -> t
     frame_rows(x)
     room = velocity_bounds(x, q)
     stop_velocity(x)
-    damped_solution(x, x.v0)
+    damped_solution(x, x.v_tracking)
     k = distance_rows(x, pairs, reach, moving)
     row_bounds(x, k, moving)
-    worst = tracking_shortfall(x, k)
+    worst = tracking_violation(x, k)
     clear = x.looks_ahead and worst <= 0.0 and tracking_clear(x, q, k, reach)
     return k, worst, clear, room
 
 
 @compiled
-def tracking_shortfall(x: Any, k: int) -> float:
-    """Compute `shortfall` of v0, with the first k rows."""
-    return shortfall(x.v0, x.J[:k], x.least[:k], x.lower, x.upper)
+def tracking_violation(x: Any, k: int) -> float:
+    """Compute `violation` of v0, with the first k rows."""
+    return violation(x.v_tracking, x.J[:k], x.least[:k], x.lower, x.upper)
 
 
 @compiled
-def shortfall(v: Array, J: Array, b: Array, lower: Array, upper: Array) -> float:
+def violation(v: Array, J: Array, b: Array, lower: Array, upper: Array) -> float:
     """Compute the largest violation of J v >= b and lower <= v <= upper; negative inside, NaN where there is one."""
     worst = -np.inf
     for i in range(len(v)):

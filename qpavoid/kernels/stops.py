@@ -20,20 +20,20 @@ def stop_velocity(x: Any) -> None:
     With jerk limits, see `easing_stop`.
     """
     if x.jerked:
-        x.v_stop[:] = easing_stop(x.v_last, x.w_last, x.v_step, x.w_step)
+        x.v_stop[:] = easing_stop(x.v_prev, x.dv_prev, x.v_step, x.dv_step)
     else:
         slowing = 1.0  # number of ticks to a standstill
-        for j in range(len(x.v_last)):
-            slowing = max(slowing, abs(x.v_last[j]) / x.v_step[j])
+        for j in range(len(x.v_prev)):
+            slowing = max(slowing, abs(x.v_prev[j]) / x.v_step[j])
         share = 1.0 - 1.0 / slowing if x.accelerated else 0.0
-        for j in range(len(x.v_last)):
-            x.v_stop[j] = share * x.v_last[j]
-    for j in range(len(x.v_last)):
+        for j in range(len(x.v_prev)):
+            x.v_stop[j] = share * x.v_prev[j]
+    for j in range(len(x.v_prev)):
         x.v_stop[j] = min(max(x.v_stop[j], x.lower[j]), x.upper[j])
 
 
 @compiled
-def easing_stop(v: Array, w: Array, v_step: Array, w_step: Array) -> Array:
+def easing_stop(v: Array, w: Array, v_step: Array, dv_step: Array) -> Array:
     """Compute the next velocity of a stop within jerk limits, before bounds.
 
     The change of v goes straight towards that of the stop that would be the fastest of all with one factor for all
@@ -43,7 +43,7 @@ def easing_stop(v: Array, w: Array, v_step: Array, w_step: Array) -> Array:
         v: velocity (n,).
         w: by how much it has just changed (n,).
         v_step: largest change of v in a tick (n,), infinite where there is no limit.
-        w_step: largest change of that change from tick to tick (n,), infinite where there is no limit.
+        dv_step: largest change of that change from tick to tick (n,), infinite where there is no limit.
 
     Returns:
         Velocity (n,).
@@ -51,12 +51,12 @@ def easing_stop(v: Array, w: Array, v_step: Array, w_step: Array) -> Array:
     slowing, fastest, off = 1.0, 0.0, 1.0
     for j in range(len(v)):
         slowing = max(slowing, abs(v[j]) / v_step[j])
-        fastest = max(fastest, abs(v[j]) / w_step[j])
+        fastest = max(fastest, abs(v[j]) / dv_step[j])
     braking = 1.0 / slowing
     if fastest > 0.0:
         braking = min(braking, _speed_to_stop(fastest, 1.0, 1.0) / fastest)
     for j in range(len(v)):
-        off = max(off, abs(w[j] + braking * v[j]) / w_step[j])
+        off = max(off, abs(w[j] + braking * v[j]) / dv_step[j])
     kept = 1.0 - 1.0 / off
     share = 1.0 - (1.0 - kept) * braking
     return share * v + kept * w
@@ -84,7 +84,7 @@ def stop_way(x: Any, q: Array, w: Array, way: Array) -> int:
         here = q[x.q_index[i]]
         below[x.v_index[i]], above[x.v_index[i]] = here - x.q_lower[i], x.q_upper[i] - here
     for j in range(len(w)):
-        unit, most = x.w_step[j], x.v_step[j] / x.w_step[j]
+        unit, most = x.dv_step[j], x.v_step[j] / x.dv_step[j]
         if not unit < np.inf:
             if min(below[j], above[j], x.v_max[j]) < np.inf:
                 return _stop_ticks(x, q.copy(), w, way, True)
@@ -106,19 +106,19 @@ def stop_way(x: Any, q: Array, w: Array, way: Array) -> int:
 @compiled
 def _stop_ticks(x: Any, q: Array, w: Array, way: Array, bounded: bool) -> int:
     """Follow a stop as `stop_way` does, with all bounds at all places of the way, or with none; overwrites q."""
-    x.v_last[:], x.w_last[:] = way[0], w
+    x.v_prev[:], x.dv_prev[:] = way[0], w
     for k in range(1, len(way)):
         if bounded:
             for i in range(len(x.q_index)):
-                q[x.q_index[i]] += x.dt * x.v_last[x.v_index[i]]
+                q[x.q_index[i]] += x.dt * x.v_prev[x.v_index[i]]
             velocity_bounds(x, q)
         stop_velocity(x)
         moves = False
         for j in range(len(w)):
-            change = x.v_stop[j] - x.v_last[j]
-            x.w_last[j], x.v_last[j] = min(max(change, -x.v_step[j]), x.v_step[j]), x.v_stop[j]
+            change = x.v_stop[j] - x.v_prev[j]
+            x.dv_prev[j], x.v_prev[j] = min(max(change, -x.v_step[j]), x.v_step[j]), x.v_stop[j]
             way[k, j] = x.v_stop[j]
-            moves = moves or abs(x.v_stop[j]) > AT_REST * x.v_step[j] or abs(x.w_last[j]) > x.w_step[j]
+            moves = moves or abs(x.v_stop[j]) > AT_REST * x.v_step[j] or abs(x.dv_prev[j]) > x.dv_step[j]
         if not moves:
             return k
     return len(way)

@@ -27,18 +27,18 @@ def frame_rows(x: Any) -> None:
     Args:
         x: reads frame_poses, targets and the layout of the tasks; writes poses, A, b.
     """
-    poses, targets, screws, support, A, b = x.poses, x.targets, x.screws, x.task_support, x.A, x.b
+    poses, targets, row_wrenches, support, A, b = x.poses, x.targets, x.row_wrenches, x.task_support, x.A, x.b
     J_world = np.ascontiguousarray(x.J_world)  # rows in one piece become vector instructions
-    rows, columns = len(screws), J_world.shape[1]
+    rows, columns = len(row_wrenches), J_world.shape[1]
     moving = rows // 3 - len(x.turns)
     for f in range(len(poses)):
         for c in range(12):
             poses[f, c] = x.frame_poses[x.frame_ids[f], c]
     for f in range(moving):
         r, px, py, pz = 3 * f, poses[f, 9], poses[f, 10], poses[f, 11]
-        screws[r, 4], screws[r, 5] = pz, -py
-        screws[r + 1, 3], screws[r + 1, 5] = -pz, px
-        screws[r + 2, 3], screws[r + 2, 4] = py, -px
+        row_wrenches[r, 4], row_wrenches[r, 5] = pz, -py
+        row_wrenches[r + 1, 3], row_wrenches[r + 1, 5] = -pz, px
+        row_wrenches[r + 2, 3], row_wrenches[r + 2, 4] = py, -px
         for i in range(3):
             b[r + i] = targets[f, 12 + i] + x.gain[f] * (targets[f, i] - poses[f, 9 + i])
     missing = np.empty((3, 3))
@@ -61,7 +61,14 @@ def frame_rows(x: Any) -> None:
     for r in range(rows):
         b[r] *= x.scale[r]
         row = x.mimicking if x.mimics else A[r]
-        lx, ly, lz, ax, ay, az = screws[r, 0], screws[r, 1], screws[r, 2], screws[r, 3], screws[r, 4], screws[r, 5]
+        lx, ly, lz, ax, ay, az = (
+            row_wrenches[r, 0],
+            row_wrenches[r, 1],
+            row_wrenches[r, 2],
+            row_wrenches[r, 3],
+            row_wrenches[r, 4],
+            row_wrenches[r, 5],
+        )
         for c in range(columns):
             linear = lx * J_world[0, c] + ly * J_world[1, c] + lz * J_world[2, c]
             angular = ax * J_world[3, c] + ay * J_world[4, c] + az * J_world[5, c]
@@ -114,7 +121,7 @@ def damped_solution(x: Any, v: Array) -> None:
 
 
 @compiled
-def projection_cost(A: Array, regularization: float, v0: Array) -> tuple[Array, Array]:
+def projection_cost(A: Array, regularization: float, v_tracking: Array) -> tuple[Array, Array]:
     """Compute P = AᵀA + λ (n, n) and q = -P v0 (n,): ½ vᵀP v + qᵀv is smallest at v0."""
     rows, nv = A.shape
     P = np.empty((nv, nv))
@@ -129,5 +136,5 @@ def projection_cost(A: Array, regularization: float, v0: Array) -> tuple[Array, 
         P[i, i] += regularization
     for i in range(nv):
         for j in range(nv):
-            q[i] -= P[i, j] * v0[j]
+            q[i] -= P[i, j] * v_tracking[j]
     return P, q

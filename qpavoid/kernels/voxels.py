@@ -74,7 +74,7 @@ def within_reach(
 
 
 @compiled
-def choose(
+def select_voxels(
     first: IntArray,
     point: IntArray,
     distance: Array,

@@ -17,7 +17,7 @@ from qpavoid.model.notes import Note, NoteKind
 from qpavoid.model.pairs import pair_array
 from qpavoid.problem import Array, IntArray
 
-_ABSURD = 1e9
+_MAX_NORM = 1e9
 """Speed [rad/s or m/s] or position [rad or m] from which a limit is a way of saying that there is none."""
 _SAME = 1e-6
 """How far a joint may be given from where the one that it mimics takes it [rad or m]."""
@@ -35,7 +35,7 @@ def joint_bounds(model: Any) -> JointBounds:
     mean that the URDF gives none; see `fixed_by_limits` of ranges that are meant, `assume_speeds` of velocities.
     """
     lower, upper = np.array(model.lowerPositionLimit), np.array(model.upperPositionLimit)
-    lower[lower <= -_ABSURD], upper[upper >= _ABSURD] = -np.inf, np.inf
+    lower[lower <= -_MAX_NORM], upper[upper >= _MAX_NORM] = -np.inf, np.inf
     q_index, v_index = [], []
     for joint in list(model.joints)[1:]:
         low, high = lower[joint.idx_q], upper[joint.idx_q]
@@ -45,7 +45,7 @@ def joint_bounds(model: Any) -> JointBounds:
     q_indices = np.array(q_index, dtype=np.intp)
     velocity = np.array(model.velocityLimit)
     return JointBounds(
-        velocity=np.where((velocity > 0.0) & (velocity < _ABSURD), velocity, np.inf),
+        velocity=np.where((velocity > 0.0) & (velocity < _MAX_NORM), velocity, np.inf),
         q_index=q_indices,
         v_index=np.array(v_index, dtype=np.intp),
         lower=lower[q_indices],
@@ -100,7 +100,7 @@ def assume_speeds(model: Any, notes: list[Note]) -> None:
         notes: the joints are named in them.
     """
     velocity = np.array(model.velocityLimit)
-    given = (velocity > 0.0) & (velocity < _ABSURD)
+    given = (velocity > 0.0) & (velocity < _MAX_NORM)
     names: dict[str, list[str]] = {}
     for name, joint in zip(list(model.names)[1:], list(model.joints)[1:], strict=True):
         part = slice(joint.idx_v, joint.idx_v + joint.nv)

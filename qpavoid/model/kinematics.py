@@ -122,7 +122,7 @@ def lengths(model: Any, joint: int) -> int:
     return int(not data.J.reshape(6, -1, order="F")[3:, model.joints[joint].idx_vExtended].any())
 
 
-def longest_lever(model: Any, joint_reach: Array) -> float:
+def max_lever_arm(model: Any, joint_radius: Array) -> float:
     """Largest distance that any point of a body can ever have from a joint that turns it [m].
 
     Lengths of the links in between, one after the other, with what joints can slide; infinite where one can slide
@@ -130,9 +130,9 @@ def longest_lever(model: Any, joint_reach: Array) -> float:
 
     Args:
         model: pinocchio model.
-        joint_reach: distance from each joint's origin to the farthest point that it carries (njoints,) [m].
+        joint_radius: distance from each joint's origin to the farthest point that it carries (njoints,) [m].
     """
-    lever = np.zeros(model.njoints)  # from the first joint that turns to the origin of each one
+    lever_arm = np.zeros(model.njoints)  # from the first joint that turns to the origin of each one
     turned = np.zeros(model.njoints, dtype=bool)
     lower, upper = np.abs(model.lowerPositionLimit), np.abs(model.upperPositionLimit)
     for i, joint in enumerate(list(model.joints)[1:], start=1):
@@ -142,9 +142,9 @@ def longest_lever(model: Any, joint_reach: Array) -> float:
             slide = float(np.maximum(lower[slid], upper[slid]).sum())
             if slides and joint.shortname() == MIMIC:
                 slide = abs(joint.extract().scaling) * slide + abs(joint.extract().offset)
-            lever[i] = lever[parent] + float(np.linalg.norm(model.jointPlacements[i].translation)) + slide
+            lever_arm[i] = lever_arm[parent] + float(np.linalg.norm(model.jointPlacements[i].translation)) + slide
         turned[i] = turned[parent] or joint.nvExtended > slides
-    return float(np.max((lever + joint_reach)[turned], initial=0.0))
+    return float(np.max((lever_arm + joint_radius)[turned], initial=0.0))
 
 
 def support_masks(model: Any) -> Array:

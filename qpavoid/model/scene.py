@@ -234,7 +234,7 @@ def build_obstacles(configs: Sequence[config.ObstacleConfig], source: Path) -> l
                 c.shape,
                 motion,
                 moves=not isinstance(c.motion, config.Fixed),
-                graspable=c.graspable or c.carried_by is not None,
+                graspable=c.graspable or c.attached_to is not None,
                 external=c.source == "external",
                 source=source,
             )

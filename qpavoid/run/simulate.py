@@ -171,7 +171,7 @@ class Recorder:
     def _write_bodies(self, tick: Tick, rows: dict[str, Array]) -> None:
         scene = self._scene
         pin.forwardKinematics(scene.robot.model, self._data, tick.state.q)
-        self._controller.tell_who_carries(self._query)
+        self._controller.sync_attachments(self._query)
         bearer = np.arange(len(scene.geometry.geometryObjects))
         for i, obstacle in enumerate(scene.obstacles):
             carried = i in self._query.carried

@@ -19,8 +19,8 @@ from qpavoid.model.limits import JointBounds, saturate
 from qpavoid.model.scene import Scene
 from qpavoid.problem import Array, Problem, Proximity, Solution, Status, sane
 from qpavoid.reason import Reason, ReasonKind, Severity
-from qpavoid.safety.backup import EscapePlanner
-from qpavoid.safety.braking import Guard
+from qpavoid.safety.backup import BackupPlanner
+from qpavoid.safety.braking import BrakingCheck
 from qpavoid.safety.detour import Detours
 from qpavoid.safety.progress import ProgressWatch
 from qpavoid.safety.rollout import Flights
@@ -28,11 +28,11 @@ from qpavoid.solvers import Solver
 from qpavoid.solvers.hqp import Hqp
 from qpavoid.solvers.qp import Qp
 
-_UNFELT = 2e-6
+_LIMIT_TOLERANCE = 2e-6
 """What a velocity may pass limits of acceleration or jerk by without a word: the tolerance of the QP [rad/s, m/s]."""
 
 
-class Commander:
+class Arbiter:
     """Has problems solved, and decides what is commanded."""
 
     def __init__(
@@ -68,29 +68,29 @@ class Commander:
         self._bounds, self._avoidance, self._limits = bounds, avoidance, limits
         self._v_shape = (scene.robot.model.nv,)
         self._reach, keep = avoidance.d2 - avoidance.offset, avoidance.hold - avoidance.offset
-        self.guard = Guard(scene, bounds, limits.position_gain, keep, dt)
+        self.guard = BrakingCheck(scene, bounds, limits.position_gain, keep, dt)
         detours = Detours(progress.detour, dt, scene, frames, query, keep) if progress.detour else None
         self.progress = ProgressWatch(progress, dt, scene.pair_names, detours)
-        self.escape: EscapePlanner | None = None
-        if avoidance.escape is not None and scene.obstacles:
-            flights = Flights(scene, bounds, obstacles, avoidance, limits, dt, avoidance.escape)
-            self.escape = EscapePlanner(flights, scene, bounds, obstacles, dt)
+        self.backup: BackupPlanner | None = None
+        if avoidance.backup is not None and scene.obstacles:
+            flights = Flights(scene, bounds, obstacles, avoidance, limits, dt, avoidance.backup)
+            self.backup = BackupPlanner(flights, scene, bounds, obstacles, dt)
 
     @property
     def queries(self) -> tuple[DistanceQuery, ...]:
         """Distances ahead, which have to know who carries what, and what points are seen."""
-        return (self.guard.ahead, *([self.escape.flights.query] if self.escape else []))
+        return (self.guard.ahead, *([self.backup.flights.query] if self.backup else []))
 
-    def look_anew(self) -> None:
+    def invalidate(self) -> None:
         """What the robot carries, or what may touch, has changed."""
-        if self.escape is not None:
-            self.escape.look_anew()
+        if self.backup is not None:
+            self.backup.invalidate()
 
     def reset(self) -> None:
         """Forgets the ticks before."""
         self.progress.reset()
-        if self.escape is not None:
-            self.escape.reset()
+        if self.backup is not None:
+            self.backup.reset()
 
     def decide(self, q: Array, t: float, problem: Problem, proximity: Proximity, tasks: bool) -> Solution:
         """The velocity that is commanded.
@@ -108,8 +108,8 @@ class Commander:
             solution = solution._replace(stalled=stalled) if stalled else solution
         else:
             solution = self._solve(q, problem)
-        if self.escape is not None and self.solver.bounded:
-            solution = self._with_a_way_out(self.escape, q, t, proximity, problem, solution)
+        if self.backup is not None and self.solver.bounded:
+            solution = self._with_a_way_out(self.backup, q, t, proximity, problem, solution)
         return self._with_limits_passed(problem, solution)
 
     def stop(self, problem: Problem, reasons: tuple[Reason, ...]) -> Solution:
@@ -151,10 +151,10 @@ class Commander:
         return solution
 
     def _looked_ahead(self, q: Array, problem: Problem, solution: Solution) -> Solution:
-        def gentle() -> Array | None:
-            return self.solver.gentle(problem, solution.slack) if isinstance(self.solver, Qp) else None
+        def low_effort() -> Array | None:
+            return self.solver.low_effort(problem, solution.slack) if isinstance(self.solver, Qp) else None
 
-        checked = self.guard.check(q, solution, problem, gentle, self._assembly, self._query, self._reach)
+        checked = self.guard.check(q, solution, problem, low_effort, self._assembly, self._query, self._reach)
         if checked is None:
             return solution
         v, share, short, pair, distance = checked
@@ -168,10 +168,10 @@ class Commander:
         return solution._replace(v=v, share=share).relaxed(missing)
 
     def _with_a_way_out(
-        self, escape: EscapePlanner, q: Array, t: float, proximity: Proximity, problem: Problem, solution: Solution
+        self, backup: BackupPlanner, q: Array, t: float, proximity: Proximity, problem: Problem, solution: Solution
     ) -> Solution:
         try:
-            v = escape.check(q, solution.v, t, self._assembly.v_last, self._assembly.w_last, proximity)
+            v = backup.check(q, solution.v, t, self._assembly.v_prev, self._assembly.dv_prev, proximity)
         except NumericalError as error:  # of what is to come; it is raised when it has come
             why = f"prediction of an {error}"
             return solution.relaxed(Reason.of(ReasonKind.NO_BACKUP, severity=Severity.WARNING, detail=why))
@@ -190,7 +190,7 @@ class Commander:
         passed = [
             Reason.of(kind, problem.joint_names[j], amount=float(excess[j]), unit=f"{problem.joint_units[j]}/s")
             for kind, excess in zip(kinds, self._assembly.beyond_limits(solution.v), strict=True)
-            for j in np.flatnonzero(excess > _UNFELT).tolist()
+            for j in np.flatnonzero(excess > _LIMIT_TOLERANCE).tolist()
             if (problem.joint_names[j],) not in named
         ]
         return solution.relaxed(*passed) if passed else solution

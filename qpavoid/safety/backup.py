@@ -27,7 +27,7 @@ from qpavoid.control.obstacles import Obstacles
 from qpavoid.model.limits import JointBounds
 from qpavoid.model.scene import Scene
 from qpavoid.problem import Array, IntArray, Proximity
-from qpavoid.safety.policy import TOUCH, Flight, Manner, Start, Value
+from qpavoid.safety.policy import TOUCH, BackupPolicy, Flight, Start, Value
 from qpavoid.safety.rollout import Flights
 
 _HORIZONS = (0.2, 0.05, 0.5)
@@ -73,7 +73,7 @@ class _Apart(NamedTuple):
     """[m]."""
 
 
-class EscapePlanner:
+class BackupPlanner:
     """Tries flights, and decides which is commanded."""
 
     def __init__(self, flights: Flights, scene: Scene, bounds: JointBounds, obstacles: Obstacles, dt: float) -> None:
@@ -100,32 +100,32 @@ class EscapePlanner:
         self._random, self._untried = np.random.default_rng(0), list[float]()
         self._apart: _Apart | None = None
         self._ways = _NO_PATHS
-        self.flights.forget_foreseen()
+        self.flights.drop_predictions()
 
-    def look_anew(self) -> None:
+    def invalidate(self) -> None:
         """What the robot carries, or what may touch, has changed: the flight that is kept has to be flown anew."""
-        self.flights.look_anew()
+        self.flights.invalidate()
         self._ways, self._apart = _NO_PATHS, None
         if self._kept is not None:
             self._kept = self._kept._replace(until=-np.inf)
 
-    def check(self, q: Array, v: Array, t: float, v_last: Array, w_last: Array, proximity: Proximity) -> Array | None:
+    def check(self, q: Array, v: Array, t: float, v_prev: Array, dv_prev: Array, proximity: Proximity) -> Array | None:
         """None where v may be commanded, else what to command in its place (nv,).
 
         Args:
             q: configuration (nq,).
             v: what the law and the look ahead want (nv,).
             t: now [s].
-            v_last: velocity (nv,) at which the robot moves.
-            w_last: by how much that changed in the tick before (nv,).
+            v_prev: velocity (nv,) at which the robot moves.
+            dv_prev: by how much that changed in the tick before (nv,).
             proximity: distances of this tick; pairs that touch already are left out of account.
         """
-        if not self._obstacles.restless:
+        if not self._obstacles.any_may_move:
             self._kept = None
             return None
         self.flights.go_on_to(t - _SPAN)
         watched = self.flights.parted
-        next_tick = Start(pin.integrate(self._model, q, self._dt * v), v, v - v_last, t + self._dt, watched)
+        next_tick = Start(pin.integrate(self._model, q, self._dt * v), v, v - v_prev, t + self._dt, watched)
         if self._nobody_comes(next_tick):
             self._kept = None
             return None
@@ -143,7 +143,7 @@ class EscapePlanner:
                 self._kept, self._wait = left, max(self._wait - 1, 0)
                 return None if np.array_equal(wanted, v) else wanted
         self._wait = self._held
-        return self._decide(next_tick, Start(q, v_last.copy(), w_last.copy(), t, watched))
+        return self._decide(next_tick, Start(q, v_prev.copy(), dv_prev.copy(), t, watched))
 
     def _decide(self, next_tick: Start, now: Start) -> Array | None:
         """None where a flight from the next tick on is good enough, or as good as any from now on; else what begins the
@@ -173,14 +173,14 @@ class EscapePlanner:
             return True
         if self._apart is not None and self._apart.ways is ways:
             moved = float(np.abs(pin.difference(self._model, self._apart.q, start.q)).sum())
-            if self.flights.lever * (moved + stop) < self._apart.room:
+            if self.flights.lever_arm * (moved + stop) < self._apart.room:
                 return True
         self.flights.kinematics.compute(start.q)
         centers, radii = self.flights.query.body_spheres(self.flights.kinematics.data)
         reach = self.flights.query.placing.reach[ways.moving] + ways.strides + self._settings.comfort
-        room = kernels.least_apart(ways.places, centers, reach[:, None] + radii)
+        room = kernels.min_sphere_distance(ways.places, centers, reach[:, None] + radii)
         self._apart = _Apart(ways, start.q, room)
-        return (self.flights.lever * stop if stop else 0.0) < room
+        return (self.flights.lever_arm * stop if stop else 0.0) < room
 
     def _paths(self, first: int) -> _Paths:
         """The ways of all that moves from a multiple of `_SPAN` until the horizon."""
@@ -197,7 +197,7 @@ class EscapePlanner:
             self._ways = _Paths(first, moving, places[:, moves].copy(), 0.5 * _SPAN * speed, fastest)
         return self._ways
 
-    def _onward(self, v: Array) -> Iterator[tuple[Manner, Array]]:
+    def _onward(self, v: Array) -> Iterator[tuple[BackupPolicy, Array]]:
         """Flights like the one that is kept, by its manner and its velocities; standing still."""
         held = self._going_on(v)
         if self._kept is not None and len(self._kept.v):
@@ -210,7 +210,9 @@ class EscapePlanner:
         """What a flight begins with when v (nv,) has been decided upon: the same, until there is a new decision."""
         return np.tile(v, (self._held, 1))
 
-    def _best(self, start: Start, tried: Iterable[tuple[Manner, Array | None]], best: Flight | None = None) -> Flight:
+    def _best(
+        self, start: Start, tried: Iterable[tuple[BackupPolicy, Array | None]], best: Flight | None = None
+    ) -> Flight:
         """The first flight that is good enough, or the best of all; no more are flown than that takes."""
         if best is None or best.value < self.flights.enough:
             for manner, given in tried:
@@ -241,13 +243,13 @@ class EscapePlanner:
             best = self.flights.better(best, start, self._drawn(), best.v[:turn]) or best
         return best, attempts
 
-    def _drawn(self) -> Manner:
+    def _drawn(self) -> BackupPolicy:
         """A manner: where trouble begins, each of those that lean to no side once; then some one or other."""
         if self._untried:
-            return Manner(self._untried.pop(0), self.flights.still.leaning)
+            return BackupPolicy(self._untried.pop(0), self.flights.still.leaning)
         random = self._random
         h = _HORIZONS[random.integers(len(_HORIZONS))]
         if random.random() < _STRAIGHT:
-            return Manner(h, self.flights.still.leaning)
+            return BackupPolicy(h, self.flights.still.leaning)
         side, lean = random.normal(size=self._model.nv), np.exp(random.uniform(*np.log(_LEANS)))
-        return Manner(h, lean / np.linalg.norm(side) * side)
+        return BackupPolicy(h, lean / np.linalg.norm(side) * side)

@@ -8,7 +8,7 @@ bends less; and that is drawn back towards the stop of this tick, whose way was 
 stop that was found clear is always at hand, as long as obstacles do what they were last seen to do, for one tick.
 
 Most ticks need none of this: where no body moves fast enough, or not in the direction, to use up what is left of a
-distance before the robot could stop, the velocity is clear as it is (`kernels.closest_call`, with the
+distance before the robot could stop, the velocity is clear as it is (`kernels.clearance_lower_bound`, with the
 bound and its proof).
 """
 
@@ -24,7 +24,7 @@ import pinocchio as pin
 
 from qpavoid.control.assembler import Assembly
 from qpavoid.control.distances import DistanceQuery
-from qpavoid.control.trajectories import move_on
+from qpavoid.control.trajectories import extrapolate
 from qpavoid.kernels import TOLERANCE, speed_to_stop
 from qpavoid.model.limits import JointBounds
 from qpavoid.model.scene import Scene
@@ -79,7 +79,7 @@ class _Look(NamedTuple):
     pair: int
 
 
-class Guard:
+class BrakingCheck:
     """Follows velocities ahead in time, on kinematics and distances of its own."""
 
     def __init__(
@@ -126,7 +126,7 @@ class Guard:
         q: Array,
         solution: Solution,
         problem: Problem,
-        gentle: Callable[[], Array | None],
+        low_effort: Callable[[], Array | None],
         assembly: Assembly,
         query: DistanceQuery,
         reach: float,
@@ -139,19 +139,19 @@ class Guard:
             q: configuration (nq,).
             solution: the law's.
             problem: what it is a solution of.
-            gentle: gives another solution that moves the joints less, if there is one.
+            low_effort: gives another solution that moves the joints less, if there is one.
             assembly: of this tick.
             query: distances of this tick.
             reach: surface distance up to which they were looked for [m].
         """
         v, v_stop, rows = solution.v, problem.v_stop, problem.avoidance
-        if problem.clear and v.tobytes() == problem.v0.tobytes():
+        if problem.clear and v.tobytes() == problem.v_tracking.tobytes():
             return None
         near = rows.pair
         stop = assembly.stop(q, v) if self._jerked else None
         horizon = self._dt + 0.5 * self._stopping(v) if stop is None else float(stop.forwards.sum())
-        uniform = horizon <= self._dt or stop is not None or not assembly.bends(q, v, horizon)
-        if uniform and assembly.closest_call(v, len(near), reach, horizon, stop) > -TOLERANCE:
+        uniform = horizon <= self._dt or stop is not None or not assembly.leaves_position_limits(q, v, horizon)
+        if uniform and assembly.clearance_lower_bound(v, len(near), reach, horizon, stop) > -TOLERANCE:
             return None
         self._given.fill(0.0)
         self._least = np.inf
@@ -166,7 +166,7 @@ class Guard:
         if worst >= 0.0:
             return None
         best, price = Checked(v, 1.0, -worst, pair, self._least), -worst
-        straight = gentle()
+        straight = low_effort()
         full = v if straight is None else straight
         for share in _SHARES if straight is None else (1.0, *_SHARES):
             blend, self._least = v_stop + share * (full - v_stop), np.inf
@@ -183,7 +183,7 @@ class Guard:
         if self._heard:
             which = np.flatnonzero(self._news)
             states = now.placing.states.copy()
-            move_on(states, self._dt)
+            extrapolate(states, self._dt)
             self._ahead.placing.place(which, states, now.placing.margin)
             self._news[which] = states[which, 12:].any(axis=1)  # those that move will be elsewhere at the next tick
             self._heard = bool(self._news.any())
@@ -269,7 +269,7 @@ class Guard:
     def _way(self, assembly: Assembly, q: Array, v: Array) -> list[tuple[Array, Array, float]]:
         """Straight pieces of the way of v and its stop: where each starts, its velocity and for how long [s]."""
         end = self._end(self._stopping(v))
-        if end > self._dt and assembly.bends(q, v, end):
+        if end > self._dt and assembly.leaves_position_limits(q, v, end):
             return self._bent_way(q, v)
         return [(q, v, end)]
 

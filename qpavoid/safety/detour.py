@@ -122,12 +122,12 @@ class Detours:
         assert way is not None
         search = self._searches[way.frame]
         row = np.flatnonzero(rows.pair == way.pair)
-        opposed = len(row) and rows.J[row[0]] @ problem.v0 < rows.b[row[0]]
+        opposed = len(row) and rows.J[row[0]] @ problem.v_tracking < rows.b[row[0]]
         way.free = 0 if opposed else way.free + 1
         way.ticks += 1
         if len(row):
             t = _tangent(way.axis, proximity.normal[row[0]])
-            headway = t @ assembly.frame_velocity(way.frame, assembly.v_last)
+            headway = t @ assembly.frame_velocity(way.frame, assembly.v_prev)
             way.stalled = 0 if headway > _HEADWAY * config.speed else way.stalled + 1
         late = way.ticks * dt > config.longest or search.ticks * dt > config.patience
         if not len(row) or way.free * dt > config.settle or way.stalled * dt > patience or late:
@@ -183,7 +183,7 @@ class Detours:
     def notice(self, problem: Problem, assembly: Assembly) -> None:
         """Counts the time, and begins anew where a goal or an obstacle has moved, or a tool is nearer than before."""
         for frame, search in self._searches.items():
-            search.ticks += problem.shortfall > 0.0
+            search.ticks += problem.violation > 0.0
             goal, distance = assembly.goal(frame)
             if float(np.linalg.norm(goal - search.goal)) > _MOVED:
                 search.renew(goal, distance)
@@ -196,7 +196,7 @@ class Detours:
         for i in range(len(self._frame_ids)):
             wanted = assembly.wanted_velocity(i)
             speed = float(np.linalg.norm(wanted))
-            headway = float(wanted @ assembly.frame_velocity(i, assembly.v_last))
+            headway = float(wanted @ assembly.frame_velocity(i, assembly.v_prev))
             given_up = i in self._searches and self._searches[i].given_up
             if speed > fastest and headway < _HEADWAY * speed**2 and not given_up:
                 fastest, found = speed, i

@@ -21,7 +21,7 @@ class Steps(NamedTuple):
 
     v_step: Array
     """(nv,) largest change of v in a tick; infinite where there is no limit."""
-    w_step: Array
+    dv_step: Array
     """(nv,) largest change of that change from tick to tick; very large where there is no limit."""
 
 
@@ -38,7 +38,7 @@ class Ramps:
         self._fastest = np.minimum(bounds.velocity, _UNLIMITED)
         if self.jerked:
             rest = np.zeros(len(bounds.jerk))
-            kernels.easing_stop(rest, rest, self.steps.v_step, self.steps.w_step)  # no tick waits for the compiler
+            kernels.easing_stop(rest, rest, self.steps.v_step, self.steps.dv_step)  # no tick waits for the compiler
 
     def towards(self, v: Array, w: Array, wanted: Array, held: bool = False, meets: bool = False) -> Array:
         """The velocities of some ticks, as close to what is wanted as the limits allow.
@@ -55,24 +55,24 @@ class Ramps:
             As many as there are until then (<= k, nv).
         """
         if not self.jerked:
-            return kernels.ramp(v, wanted, self.steps.v_step, meets)
-        ramp = np.empty_like(wanted)
+            return kernels.rate_limit(v, wanted, self.steps.v_step, meets)
+        rate_limit = np.empty_like(wanted)
         for k, target in enumerate(wanted):
             rate = 0.0 if held or len(wanted) < 2 else wanted[max(k, 1)] - wanted[max(k, 1) - 1]
             w = self._change(v, w, target, rate, held)
             v = v + w
-            ramp[k] = v
+            rate_limit[k] = v
             if meets and np.abs(v - target).max() < kernels.ROUND_OFF:
-                return ramp[: k + 1]
-        return ramp
+                return rate_limit[: k + 1]
+        return rate_limit
 
     def _change(self, v: Array, w: Array, target: Array, rate: Array | float, held: bool) -> Array:
         """The next change of v (nv,) towards a target (nv,) that itself changes at a rate (nv,) from tick to tick."""
-        v_step, w_step = self.steps.v_step, (_PLANNED if held else 1.0) * self.steps.w_step
-        low, high, change = np.maximum(-v_step, w - w_step), np.minimum(v_step, w + w_step), target - v
+        v_step, dv_step = self.steps.v_step, (_PLANNED if held else 1.0) * self.steps.dv_step
+        low, high, change = np.maximum(-v_step, w - dv_step), np.minimum(v_step, w + dv_step), target - v
         if held or ((change < low - kernels.ROUND_OFF) | (change > high + kernels.ROUND_OFF)).any():
-            change = change + kernels.easing_stop(rate - change, w - rate, v_step, w_step)
+            change = change + kernels.easing_stop(rate - change, w - rate, v_step, dv_step)
         room = np.maximum(np.array([self._fastest + v, self._fastest - v]), 0.0)
-        down, up = kernels.speed_to_stop(room, w_step, 1.0)  # from any greater change it would pass its speed limit
+        down, up = kernels.speed_to_stop(room, dv_step, 1.0)  # from any greater change it would pass its speed limit
         change = np.minimum(np.maximum(change, -down), up)
         return np.asarray(np.minimum(np.maximum(change, low), high))

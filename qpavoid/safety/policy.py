@@ -6,14 +6,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from qpavoid.control.estimates import Told
+from qpavoid.control.estimates import ObstacleEstimates
 from qpavoid.problem import Array, Mask
 
 TOUCH = 1e-3
 """Distance below which a pair counts as touching [m]."""
 
 
-class Manner(NamedTuple):
+class BackupPolicy(NamedTuple):
     """A way to flee."""
 
     horizon: float
@@ -29,7 +29,7 @@ class Near(NamedTuple):
     """(k, 10) distances first [m]."""
     J: Array
     """(k, nv) velocity Jacobian of these distances."""
-    drift: Array
+    feedforward: Array
     """(k,) their rate due to the obstacles [m/s]."""
 
 
@@ -66,13 +66,13 @@ class Flight(NamedTuple):
     start: Start
     v: Array
     """(k, nv) of each tick."""
-    manner: Manner
+    manner: BackupPolicy
     value: Value
     until: float
     """When something touches; the end, if nothing does before [s]."""
     least: float
     """Smallest distance of pairs that do not touch, up to that at which flights look at pairs [m]."""
-    told: Told | None
+    told: ObstacleEstimates | None
     """What was told of obstacles when it was flown."""
 
 
@@ -84,7 +84,7 @@ class Tally:
         self.lost, self._before, self._deadline = 0.0, np.inf, start.t + horizon
 
     def count(self, found: tuple[int, float, float], t: float, span: float) -> None:
-        """Takes what a look has found, see `look_around`, into account; at t, `span` after the last one [s]."""
+        """Takes what a look has found, see `backup_rows`, into account; at t, `span` after the last one [s]."""
         touching, nearest, rest = found
         if touching:
             closing = self._before - nearest

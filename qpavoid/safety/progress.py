@@ -71,14 +71,14 @@ class ProgressWatch:
             solution: what is commanded.
         """
         A, given_up = problem.tracking.A, self._detours.given_up if self._detours is not None else ()
-        if not len(A) or (problem.shortfall <= 0.0 and solution.share == 1.0):
+        if not len(A) or (problem.violation <= 0.0 and solution.share == 1.0):
             self._without = 0.0
             return given_up
         self._clock += 1
         if self._clock % _EVERY and not self.stalled:
             return given_up
         since = 1 if self.stalled else _EVERY
-        wanted, got = A @ problem.v0, A @ solution.v
+        wanted, got = A @ problem.v_tracking, A @ solution.v
         size = float(wanted @ wanted)
         resting = float(got @ got) < _RESTING**2
         stuck = resting and size > _SLOWEST**2 and float(got @ wanted) < _LEFT * size
@@ -102,10 +102,10 @@ class ProgressWatch:
 def _culprits(problem: Problem, v: Array) -> list[tuple[int, float]]:
     """Pairs whose rows bind and oppose v0, the strongest first, with the amount by which v0 violates them [m/s]."""
     rows = problem.avoidance
-    against = rows.b - rows.J @ problem.v0
+    against = rows.b - rows.J @ problem.v_tracking
     tight = (rows.J @ v - rows.b < _TIGHT) & (against > 0.0)
     if not tight.any():  # a law that is not made of rows: the nearest of the pairs that the task would have close
-        tight = (rows.J @ problem.v0 < -_TIGHT) & (rows.d < rows.d2)
+        tight = (rows.J @ problem.v_tracking < -_TIGHT) & (rows.d < rows.d2)
         tight &= rows.d <= np.min(rows.d, where=tight, initial=np.inf)
     found = np.flatnonzero(tight)
     order = found[np.argsort(-against[found], kind="stable")]
@@ -114,8 +114,8 @@ def _culprits(problem: Problem, v: Array) -> list[tuple[int, float]]:
 
 def _limits(problem: Problem, v: Array) -> list[Reason]:
     """Joints at a position limit that the wanted velocity goes against."""
-    high = (v >= problem.hard_upper - 1e-9) & (problem.v0 > problem.hard_upper)
-    low = (v <= problem.hard_lower + 1e-9) & (problem.v0 < problem.hard_lower)
+    high = (v >= problem.hard_upper - 1e-9) & (problem.v_tracking > problem.hard_upper)
+    low = (v <= problem.hard_lower + 1e-9) & (problem.v_tracking < problem.hard_lower)
     names, units = problem.joint_names, problem.joint_units
     full = np.maximum(problem.hard_upper, -problem.hard_lower)
     return [

@@ -84,7 +84,7 @@ def too_near(scene: Scene, query: DistanceQuery, frame_id: int, goal: Array, kee
     first, second = scene.pairs.T
     free = (scene.obstacle_of[second] >= 0) & (joints[second] == 0)
     free &= ~np.isin(scene.obstacle_of[second], list(scene.clouds))
-    watched = query.enabled if query.unwatched is None else query.enabled & ~query.unwatched
+    watched = query.enabled if query.disabled_pairs is None else query.enabled & ~query.disabled_pairs
     worst, which = 0.0, -1
     from_origin: dict[int, float] = {}
     for a, b in scene.pairs[free & watched & (joints[first] == frame.parentJoint)].tolist():

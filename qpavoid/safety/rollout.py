@@ -15,17 +15,17 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid import kernels
-from qpavoid.config import Avoidance, Escape, Limits
+from qpavoid.config import Avoidance, Backup, Limits
 from qpavoid.control.distances import DistanceQuery
-from qpavoid.control.estimates import strayed
+from qpavoid.control.estimates import prediction_error_bound
 from qpavoid.control.obstacles import Obstacles, Seen
 from qpavoid.control.row_layout import hand_over, lay_out
-from qpavoid.model.kinematics import ForwardKinematics, longest_lever, support_masks
+from qpavoid.model.kinematics import ForwardKinematics, max_lever_arm, support_masks
 from qpavoid.model.limits import JointBounds
 from qpavoid.model.scene import Scene
 from qpavoid.problem import Array, Mask
 from qpavoid.safety.jerk import Ramps
-from qpavoid.safety.policy import TOUCH, Flight, Manner, Near, Start, Tally, Value
+from qpavoid.safety.policy import TOUCH, BackupPolicy, Flight, Near, Start, Tally, Value
 
 _GENTLE = 1e-4
 """ε: what the square of a joint speed counts beside that of a distance [m²/(rad/s)²]."""
@@ -50,7 +50,7 @@ class Flights:
         avoidance: Avoidance,
         limits: Limits,
         dt: float,
-        settings: Escape,
+        settings: Backup,
     ) -> None:
         """Lays the memory out.
 
@@ -81,11 +81,11 @@ class Flights:
         """(m,) pairs that the robot can part."""
         self.ramps = Ramps(bounds, dt)
         """How it gets from one velocity to another."""
-        self.lever = max(1.0, longest_lever(model, self.query.longest_reach()))
+        self.lever_arm = max(1.0, max_lever_arm(model, self.query.max_extension()))
         """Farther than this no point of the robot moves when a joint moves by 1 [m/rad, 1]."""
         self.enough = Value(settings.horizon, settings.safe * (avoidance.hold - avoidance.offset))
         """What a flight is worth that need not be any better."""
-        self.still = Manner(0.0, np.zeros(model.nv))
+        self.still = BackupPolicy(0.0, np.zeros(model.nv))
         """Standing still."""
         self._foreseen: dict[float, Seen] = {}
         self._compile(scene.robot.home)
@@ -94,10 +94,10 @@ class Flights:
         """So that no tick waits for the compiler."""
         still = self.still.leaning
         near = self._look(q, 0.0, still, Tally(Start(q, still, still, 0.0, self.parted), 1.0), 0.0)
-        kernels.comes_too_near(*near, still, 1.0, 0.0)
-        kernels.least_apart(np.zeros((1, 1, 3)), np.zeros((1, 3)), np.zeros((1, 1)))
-        self.ramps.towards(still, still, self._flee(near, Manner(0.1, still))[None])
-        self.forget_foreseen()
+        kernels.closes_below(*near, still, 1.0, 0.0)
+        kernels.min_sphere_distance(np.zeros((1, 1, 3)), np.zeros((1, 3)), np.zeros((1, 1)))
+        self.ramps.towards(still, still, self._flee(near, BackupPolicy(0.1, still))[None])
+        self.drop_predictions()
 
     def go_on_to(self, t: float) -> None:
         """Forgets what was foreseen and is over at t [s]; all of it, where obstacles are told of."""
@@ -106,24 +106,24 @@ class Flights:
         elif len(self._foreseen) > _MANY:
             self._foreseen = {at: seen for at, seen in self._foreseen.items() if at > t}
 
-    def look_anew(self) -> None:
+    def invalidate(self) -> None:
         """What the robot carries, or what may touch, has changed."""
         hand_over(self._layout, self._masks, self.query)
         self.parted = self._which_part()
-        self.forget_foreseen()
+        self.drop_predictions()
 
-    def forget_foreseen(self) -> None:
+    def drop_predictions(self) -> None:
         """There is news of the obstacles: where they will be has to be foreseen anew."""
         self._foreseen.clear()
 
     def _which_part(self) -> Mask:
         return np.asarray(np.any(self._layout.support != 0.0, axis=1))
 
-    def foreseen(self, t: float) -> Seen:
+    def predicted(self, t: float) -> Seen:
         """The obstacles that move, as far as is known, at t [s]."""
         t = round(t, 9)  # the same time may be come to in several ways
         if t not in self._foreseen:
-            self._foreseen[t] = self._obstacles.foreseen(t)
+            self._foreseen[t] = self._obstacles.predicted(t)
         return self._foreseen[t]
 
     def a_tick_on(self, flight: Flight) -> Flight:
@@ -157,18 +157,20 @@ class Flights:
             off = off + self._dt * np.cumsum(steps - flight.v[: len(steps)], axis=0)
             most = max(most, float(np.abs(off).sum(axis=1).max(initial=0.0)))
         span = self.settings.horizon + _BEYOND
-        off_too = (late * fastest if late > _ROUND_OFF else 0.0) + strayed(
+        off_too = (late * fastest if late > _ROUND_OFF else 0.0) + prediction_error_bound(
             self._obstacles.told, flight.told, span, self.query.placing.reach
         )
-        return bool(flight.least - self.lever * most - off_too >= self.enough.distance)
+        return bool(flight.least - self.lever_arm * most - off_too >= self.enough.distance)
 
-    def fly(self, start: Start, manner: Manner, given: Array | None = None) -> Flight:
+    def fly(self, start: Start, manner: BackupPolicy, given: Array | None = None) -> Flight:
         """`better` than nothing."""
         flight = self.better(None, start, manner, given)
         assert flight is not None
         return flight
 
-    def better(self, than: Flight | None, start: Start, manner: Manner, given: Array | None = None) -> Flight | None:
+    def better(
+        self, than: Flight | None, start: Start, manner: BackupPolicy, given: Array | None = None
+    ) -> Flight | None:
         """Flees with decisions a period apart until the horizon; what has touched is left out of account from then on.
 
         Distances are looked at as often, and midway where something may come too near and part again before that. All
@@ -200,7 +202,7 @@ class Flights:
             count = len(wanted)
             steps = self.ramps.towards(v, w, wanted, held)
             ahead, span = self._moved(q, steps), count * self._dt
-            if kernels.comes_too_near(*near, steps[count // 2], span, safe):
+            if kernels.closes_below(*near, steps[count // 2], span, safe):
                 span *= 0.5
                 t += span
                 self._look(pin.interpolate(self._model, q, ahead, 0.5), t, v, tally, span)
@@ -233,11 +235,11 @@ class Flights:
         last look [s].
         """
         query, reach = self.query, self.settings.reach
-        query.placing.place(*self.foreseen(t))
+        query.placing.place(*self.predicted(t))
         self.kinematics.compute(q)
         query.compute(self.kinematics.data, reach)
-        self._layout.v_last[:] = v
-        k, touching, nearest, rest = kernels.look_around(
+        self._layout.v_prev[:] = v
+        k, touching, nearest, rest = kernels.backup_rows(
             self._packed, q, query.pairs, reach, query.placing.moving, tally.watched, TOUCH
         )
         tally.count((touching, nearest, rest), t, span)
@@ -245,10 +247,10 @@ class Flights:
 
     def _view(self, k: int) -> Near:
         x = self._layout
-        self._views[k] = Near(x.closest[:k], x.J[:k], x.drift[:k])
+        self._views[k] = Near(x.closest[:k], x.J[:k], x.feedforward[:k])
         return self._views[k]
 
-    def _flee(self, near: Near, manner: Manner) -> Array:
+    def _flee(self, near: Near, manner: BackupPolicy) -> Array:
         """Velocity (nv,) of a flight for its next period."""
         lower, upper, v = self._layout.lower, self._layout.upper, None
         if manner.horizon:
@@ -256,8 +258,8 @@ class Flights:
         return np.minimum(np.maximum(0.0 if v is None else v, lower), upper)
 
 
-def _farthest(near: Near, manner: Manner, comfort: float, lower: Array, upper: Array) -> Array | None:
+def _farthest(near: Near, manner: BackupPolicy, comfort: float, lower: Array, upper: Array) -> Array | None:
     """v (nv,) with the largest s, see above, within its bounds (nv,); None where none is found."""
-    (closest, J, drift), (h, leaning) = near, manner
-    v, met = kernels.farthest(h, closest, J, drift, comfort, _DEEPEST, _GENTLE, leaning, lower, upper)
+    (closest, J, feedforward), (h, leaning) = near, manner
+    v, met = kernels.farthest(h, closest, J, feedforward, comfort, _DEEPEST, _GENTLE, leaning, lower, upper)
     return v if met else None

@@ -32,9 +32,9 @@ def pseudo_inverse(A: Array, damping: float) -> Array:
 
 def tracking_velocity(problem: Problem) -> Array:
     """Velocity (nv,) that tracks as if nothing else mattered: J⁺ẋ of the weighted rows."""
-    v0, tracking = problem.v0, problem.tracking
-    if v0[0] == v0[0]:
-        return np.array(v0)
+    v_tracking, tracking = problem.v_tracking, problem.tracking
+    if v_tracking[0] == v_tracking[0]:
+        return np.array(v_tracking)
     # rows repeat each other and no damping was asked for; NaN in `tracking` stays NaN
     if not np.isfinite(tracking.A).all():
         return np.full(tracking.A.shape[1], np.nan)

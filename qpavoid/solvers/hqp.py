@@ -39,12 +39,12 @@ class Hqp(Qp):
 
     def solve(self, problem: Problem) -> Solution:
         """The lexicographically best safe velocity; relaxed where there is none; a stop where that fails too."""
-        if problem.shortfall <= 0.0 and not problem.levels:
-            return Solution(problem.v0.copy())
+        if problem.violation <= 0.0 and not problem.levels:
+            return Solution(problem.v_tracking.copy())
         levels = problem.levels or (np.arange(len(problem.tracking.b)),)
         rows, lower, upper = problem.avoidance, problem.lower, problem.upper
         alone, asked = _cascade(problem, levels)
-        if kernels.shortfall(alone, rows.J, rows.b, lower, upper) <= 0.0:
+        if kernels.violation(alone, rows.J, rows.b, lower, upper) <= 0.0:
             return Solution(alone)
         if not np.isfinite(alone).all():
             alone = np.zeros_like(alone)

@@ -51,25 +51,31 @@ class Qp:
 
     def solve(self, problem: Problem) -> Solution:
         """The closest safe velocity; relaxed where there is none; a stop where that fails too."""
-        if problem.shortfall <= 0.0:
-            return Solution(problem.v0.copy())
-        A, rows, lower, upper, v0 = problem.tracking.A, problem.avoidance, problem.lower, problem.upper, problem.v0
-        if v0[0] != v0[0]:
-            v0 = tracking_velocity(problem)
-            if problem.contacts is None and kernels.shortfall(v0, rows.J, rows.b, lower, upper) <= 0.0:
-                return Solution(v0)
+        if problem.violation <= 0.0:
+            return Solution(problem.v_tracking.copy())
+        A, rows, lower, upper, v_tracking = (
+            problem.tracking.A,
+            problem.avoidance,
+            problem.lower,
+            problem.upper,
+            problem.v_tracking,
+        )
+        if v_tracking[0] != v_tracking[0]:
+            v_tracking = tracking_velocity(problem)
+            if problem.contacts is None and kernels.violation(v_tracking, rows.J, rows.b, lower, upper) <= 0.0:
+                return Solution(v_tracking)
         if self._native and problem.contacts is None:
-            answer, solved = kernels.project(A, self.config.regularization, v0, rows.J, rows.b, lower, upper)
+            answer, solved = kernels.project(A, self.config.regularization, v_tracking, rows.J, rows.b, lower, upper)
             if solved:
                 return Solution(answer)
-        P, q = kernels.projection_cost(A, self.config.regularization, v0)
+        P, q = kernels.projection_cost(A, self.config.regularization, v_tracking)
         for backend in self._backends:
             v = closest(holding(problem.contacts, backend), P, q, rows.J, rows.b, lower, upper)
             if v is not None:
                 return Solution(v)
         return self._relaxed(P, q, problem)
 
-    def gentle(self, problem: Problem, slack: Array | None) -> Array | None:
+    def low_effort(self, problem: Problem, slack: Array | None) -> Array | None:
         """A solution with rows and bounds as they were met, that counts joint speeds as much as the task's.
 
         The usual one may send joints through the null space of the task at full speed for a few mm/s of a row; how the
@@ -117,11 +123,11 @@ class Qp:
 
     def _compiled(self, problem: Problem) -> Closest:
         """Solves the QPs of a problem's tracking cost in compiled code."""
-        A, v0, plain = problem.tracking.A, tracking_velocity(problem), np.zeros((0, len(problem.lower)))
+        A, v_tracking, plain = problem.tracking.A, tracking_velocity(problem), np.zeros((0, len(problem.lower)))
 
         def solve(J: Array, least: Array, soft: Array, lower: Array, upper: Array) -> Array | None:
             cost = (plain, 1.0) if soft.any() else (A, self.config.regularization)
-            v, solved = kernels.project_soft(*cost, v0, J, least, lower, upper, soft)
+            v, solved = kernels.project_soft(*cost, v_tracking, J, least, lower, upper, soft)
             return v if solved else None
 
         return solve

@@ -86,12 +86,12 @@ def closest(backend: Backend, P: Array, q: Array, J: Array, b: Array, lower: Arr
         v = backend(P, q, J, b, lower, upper)
     except Exception:  # whatever a library raises, the robot must get a velocity
         return None
-    if v is None or np.shape(v) != q.shape or not kernels.shortfall(v, J, b, lower, upper) <= TOLERANCE:
+    if v is None or np.shape(v) != q.shape or not kernels.violation(v, J, b, lower, upper) <= TOLERANCE:
         return None  # NaN fails the comparison too
     return np.asarray(np.minimum(np.maximum(v, lower), upper))
 
 
-def by_back_end(backend: Backend, P: Array, q: Array, v0: Array) -> Closest:
+def by_back_end(backend: Backend, P: Array, q: Array, v_tracking: Array) -> Closest:
     """Lets a back end solve the QPs of a tracking cost ½ vᵀP v + qᵀv: what soft rows lack becomes a variable."""
 
     def solve(J: Array, least: Array, soft: Array, lower: Array, upper: Array) -> Array | None:
@@ -109,7 +109,7 @@ def by_back_end(backend: Backend, P: Array, q: Array, v0: Array) -> Closest:
         answer = closest(
             backend,
             hessian,
-            np.concatenate((-_SMALL * v0, np.zeros(count))),
+            np.concatenate((-_SMALL * v_tracking, np.zeros(count))),
             rows,
             np.concatenate((least[hard], least[giving])),
             np.concatenate((lower, np.zeros(count))),

@@ -41,7 +41,7 @@ class Clearance:
         self._duration = duration
         self.speed = self._fastest()
         """Largest speed of any point of an obstacle [m/s]."""
-        self.lever = self._levers(Ranges.of(scene.robot))
+        self.lever_arm = self._levers(Ranges.of(scene.robot))
         """(nv,) how far a unit of each coordinate moves any point of the robot, at most [m/rad or 1]. A joint moves one
         body of a pair, or both as one: no distance changes by more than lever @ |Δq|."""
 
@@ -81,7 +81,7 @@ class Clearance:
         if not self.clear(b, tb):
             return False
         way, share = b - a, 0.0
-        change = float(self.lever @ np.abs(way)) + self.speed * (tb - ta)
+        change = float(self.lever_arm @ np.abs(way)) + self.speed * (tb - ta)
         while share < 1.0:
             room = self.at(a + share * way, ta + share * (tb - ta)) - self.least
             if room < 0.0:
@@ -105,13 +105,13 @@ class Clearance:
 
     def _levers(self, ranges: Ranges) -> Array:
         """A joint turns no point that is farther from it than the links after it are long together."""
-        model, reach, lever = self._model, self._query.joint_reach(), np.ones(self._model.nv)
+        model, reach, lever_arm = self._model, self._query.joint_radius(), np.ones(self._model.nv)
         farthest = np.maximum(np.abs(ranges.lower), np.abs(ranges.upper))
         for i in range(model.njoints - 1, 0, -1):
             joint, parent = model.joints[i], model.parents[i]
             slides = joint.shortname().startswith("JointModelP")
-            lever[joint.idx_v] = 1.0 if slides else reach[i]
+            lever_arm[joint.idx_v] = 1.0 if slides else reach[i]
             travel = farthest[joint.idx_v] if slides else 0.0
             length = float(np.linalg.norm(model.jointPlacements[i].translation)) + travel
             reach[parent] = max(reach[parent], length + reach[i])
-        return lever
+        return lever_arm

@@ -74,7 +74,7 @@ class _Search:
     def nearest(self, tree: _Tree, q: Array, t: float) -> int:
         """The node of a tree from which (or to which) q at t can be reached with the least motion; -1 if none."""
         way = np.abs(tree.q[: tree.count] - q)
-        cost = way @ self._clearance.lever
+        cost = way @ self._clearance.lever_arm
         if self._timed:
             time = t - tree.t[: tree.count] if tree.forward else tree.t[: tree.count] - t
             cost[(way / self._speed).max(axis=1) > time] = np.inf
@@ -84,7 +84,7 @@ class _Search:
     def extend(self, tree: _Tree, node: int, q: Array, t: float) -> tuple[int, bool]:
         """A node one edge on from another one towards q at t, and whether that is q itself; -1 if it is not clear."""
         way, time = q - tree.q[node], t - float(tree.t[node])
-        cost = float(self._clearance.lever @ np.abs(way))
+        cost = float(self._clearance.lever_arm @ np.abs(way))
         share = min(1.0, _LONGEST / max(cost, 1e-12), _LONGEST_TIME / abs(time) if self._timed and time else 1.0)
         there, then = tree.q[node] + share * way, float(tree.t[node]) + share * time
         ends = (tree.q[node], float(tree.t[node]), there, then)

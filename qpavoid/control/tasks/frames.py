@@ -177,9 +177,9 @@ def task_layout(tasks: Sequence[FrameTask], others: Sequence[RowTask], model: An
     turns = np.array([i for i, task in enumerate(tasks) if task.turns], dtype=np.intp)
     moving, turning = [task for task in tasks if task.moves], [tasks[i] for i in turns]
     split, framed = 3 * len(moving), 3 * (len(moving) + len(turning))
-    screws = np.zeros((framed, 6))
-    screws[:split, :3] = np.tile(np.eye(3), (len(moving), 1))
-    screws[split:, 3:] = np.tile(np.eye(3), (len(turning), 1))
+    row_wrenches = np.zeros((framed, 6))
+    row_wrenches[:split, :3] = np.tile(np.eye(3), (len(moving), 1))
+    row_wrenches[split:, 3:] = np.tile(np.eye(3), (len(turning), 1))
     joints = np.array([model.frames[task.frame_id].parentJoint for task in (*moving, *turning)], dtype=np.intp)
     weights = [task.settings.weight for task in moving] + [task.settings.orientation_weight for task in turning]
     caps = [task.settings.max_speed for task in moving] + [task.settings.max_turn_rate for task in turning]
@@ -197,7 +197,7 @@ def task_layout(tasks: Sequence[FrameTask], others: Sequence[RowTask], model: An
         "cap": np.array([np.inf if cap is None else cap for cap in caps]),
         "scale": scale,
         "task_support": moved * scale[:, None],
-        "screws": screws,
+        "row_wrenches": row_wrenches,
         "poses": np.zeros((len(tasks), 12)),
         "A": A,
         "b": b,
