@@ -176,7 +176,8 @@ def make_layout(nv, frames=0, turns=(), pairs=0, obstacles=0, joints=1, **fields
     }  # fmt: skip
     shapes = {
         "poses": (frames, 12), "A": (rows, nv), "b": rows, "closest": (pairs, 10), "J": (pairs, nv),
-        "feedforward": pairs, "d": pairs, "least": pairs, "touch": pairs, "hard_lower": nv, "hard_upper": nv, "lower": nv, "upper": nv,
+        "feedforward": pairs,
+        "d": pairs, "least": pairs, "touch": pairs, "hard_lower": nv, "hard_upper": nv, "lower": nv, "upper": nv,
         "v_stop": nv, "v_tracking": nv, "omega": (joints, 3),
     }  # fmt: skip
     outputs = {"near": np.full(pairs, -1), **{name: np.full(shape, np.nan) for name, shape in shapes.items()}}
