@@ -2,16 +2,20 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: run figures test smoke lint types clean
+.PHONY: run figures test campaign smoke lint types clean
 
 run: .venv/run
-	$(BIN)/qpavoid compare situation1 situation2 --solvers tracking,eq10-literal,eq10,qp --out out
+	$(BIN)/qpavoid compare situation1 situation2 chasing_sphere five_spheres stall \
+	  --solvers tracking,eq10-literal,eq10,qp --out out
 
 figures: run
-	cp out/situation1_compare_path.png out/situation1_qp_motion.png docs/figures/
+	cp out/situation1_compare_path.png out/situation1_qp_motion.png out/five_spheres_compare_time.png docs/figures/
 
 test: .venv/dev
 	$(BIN)/pytest -n auto
+
+campaign: .venv/dev
+	$(BIN)/pytest -n auto -m slow
 
 smoke: .venv/dev
 	$(BIN)/qpavoid bench smoke

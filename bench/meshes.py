@@ -17,7 +17,7 @@ import pinocchio as pin
 
 from bench.tick.robots import ROBOTS, SHARE
 from qpavoid import Robot
-from qpavoid.geometry.bodies import MeshWarning
+from qpavoid.notes import RobotWarning
 
 RESULTS = Path(__file__).parent / "results" / "meshes.md"
 KINDS = ("mesh", "convex", "capsule")
@@ -36,7 +36,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3, help="times that the swing is gone through (3)")
     parser.add_argument("--loads", type=int, default=5, help="times that each robot is loaded (5)")
     options = parser.parse_args()
-    warnings.simplefilter("ignore", MeshWarning)
+    warnings.simplefilter("ignore", RobotWarning)
     lines = [
         "# Meshes",
         "",

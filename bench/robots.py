@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from qpavoid.files.shipped import example_robot_data
+from qpavoid.notes import shortened
 
 ROBOTS = example_robot_data() / "example-robot-data" / "robots"
 OUT = Path(__file__).parent.parent / "docs" / "robots.md"
@@ -32,8 +33,8 @@ with default options and a fixed base, and then checks the robot.yaml that was w
 pinocchio {pin}, coal {coal}; a machine with 2 cores that was busy with other things: take the times as upper bounds.
 
 - *pairs*: as the bare URDF loads (adjacent pairs and those that always touch are off already) → as written;
-- *bodies*: pieces of collision geometry → bodies in the written robot.yaml, and their volume in units of the convex
-  hulls of the geometry;
+- *bodies*: pieces of collision geometry → bodies in the written robot.yaml, and their volume in units of what the
+  geometry encloses;
 - *step*: median control step that tracks all end effectors near the home pose, without obstacles, bare → written;
 - *home*: least distance between bodies at the written home pose;
 - *seconds*: `check` of the URDF, and `add`;
@@ -66,14 +67,14 @@ def row(urdf: Path, folder: Path) -> tuple[str, bool]:
     added, why_not = run("add", str(urdf), "--out", str(folder / name), "--no-picture")
     written, why_neither = run("check", str(folder / name / "robot.yaml")) if added else (None, "")
     said = list(dict.fromkeys(text.replace(f"{urdf}: ", "") for text in (why, why_not, why_neither) if text))
-    if checked and checked["problems"]:
+    if checked and checked["notes"]:
         said.append(_problem(checked))
     if added:
-        said += [note for note in added["notes"] if note.startswith(("no pose", "the file has"))]
+        said += [note["what"] for note in added["notes"] if note["severity"] == "warning"]
     if written and not written["usable"]:
         said.append(f"written: {_problem(written)}")
     bare, made, last = checked or {}, added or {}, written or {}
-    ratio = made["bodies_volume"] / made["hulls_volume"] if made and made["hulls_volume"] else None
+    ratio = made["bodies_volume"] / made["geometry_volume"] if made and made["geometry_volume"] else None
     clear = made["clearance"] if made else None
     cells = (
         name,
@@ -90,8 +91,9 @@ def row(urdf: Path, folder: Path) -> tuple[str, bool]:
 
 
 def _problem(report: dict[str, Any]) -> str:
-    problem = report["problems"][0]
-    return f"{problem['severity']}: {problem['what']}"
+    note = report["notes"][0]
+    names = f"{shortened(note['subject'], 5)}: " if note["subject"] else ""
+    return f"{note['severity']}: {names}{note['what']}"
 
 
 def _n(value: float | None) -> str:

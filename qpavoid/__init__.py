@@ -9,6 +9,7 @@ from qpavoid.files.loading import load_scenario
 from qpavoid.geometry.cloud import Points, Voxels
 from qpavoid.log import Log
 from qpavoid.motion import Sample
+from qpavoid.notes import Note, NoteKind, RobotWarning
 from qpavoid.obstacles.sensing import Pose
 from qpavoid.problem import Problem, Solution, Status
 from qpavoid.reason import Reason, ReasonKind, Severity
@@ -26,6 +27,8 @@ __all__ = [
     "Controller",
     "Limits",
     "Log",
+    "Note",
+    "NoteKind",
     "NumericalError",
     "Obstacle",
     "Points",
@@ -36,6 +39,7 @@ __all__ = [
     "Reason",
     "ReasonKind",
     "Robot",
+    "RobotWarning",
     "Sample",
     "ScenarioConfig",
     "Scene",

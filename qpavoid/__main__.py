@@ -28,7 +28,7 @@ from qpavoid.files.fields import page, schema_of
 from qpavoid.files.loading import load_scenario
 from qpavoid.files.shipped import robot_names, scenario_names
 from qpavoid.log import Log
-from qpavoid.report import events, failed, metrics_table, to_json
+from qpavoid.report import events, failed, metrics_table, ratios_table, to_json
 from qpavoid.simulate import simulate
 from qpavoid.solvers import SOLVERS, backend_names
 from qpavoid.terminal import ERR, OUT, names_of, progress, terminate_like_interrupt
@@ -125,7 +125,7 @@ def compare(
     figures: Figures = True,
     verbose: Verbose = False,
 ) -> None:
-    """Run scenarios with several solvers, side by side.
+    """Run scenarios with several solvers, side by side; the last but one is set against the last, as ratios.
 
     A collision is a result here, not a failure: the exit status is 1 only when a run was broken off.
     """
@@ -139,6 +139,8 @@ def compare(
         print(to_json({"runs": metrics, "files": [str(f) for f in files]}))
     else:
         _print(metrics, files, out, verbose)
+        if len(names) > 1:
+            OUT.print(ratios_table(metrics, names[-2], names[-1]))
     raise typer.Exit(0 if all(run["completed"] for run in metrics) and len(logs) == len(configs) else 1)
 
 

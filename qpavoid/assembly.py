@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +17,7 @@ from qpavoid.motion import Sample
 from qpavoid.problem import Array, AvoidanceRows, Problem, Proximity, Tracking
 from qpavoid.proximity import DistanceQuery
 from qpavoid.scene import Scene
+from qpavoid.solvers.analytic import pseudo_inverse
 from qpavoid.tasks import AnyTask, in_order, task_levels
 from qpavoid.tick_memory import hand_over, lay_out
 
@@ -94,6 +95,7 @@ class Assembly:
         self._forward, self._contacts = kinematics, contacts
         self._eye = np.eye(len(x.v0))
         self._before, self._change = np.zeros_like(x.v0), np.zeros_like(x.v0)
+        self._moving = False
         self.limits_may_give_way = x.jerked or (contacts is not None and x.accelerated)
         """Whether `beyond_limits` has to be asked: bounds alone do not keep to accelerations and jerks then."""
         self.kinematics = Kinematics(self._layout.J_world, self._layout.poses)
@@ -111,7 +113,7 @@ class Assembly:
         """
         x = self._layout
         for views, target in zip(self._targets, targets):  # noqa: B905 (strict costs as much as the copying)
-            views[0][:], views[1][:], views[2][:], views[3][:] = target
+            views[0][:], views[1][:], views[2][:], views[3][:] = target[:4]
         if self._others:
             for task, target in zip(self._others, targets[len(self._targets) :], strict=True):
                 task.update(q, self._forward, target)
@@ -119,16 +121,31 @@ class Assembly:
         if self._contacts is not None:
             held = self._contacts.update(self._forward)
             x.v_last[:] = held.held(x.v_last)
-        k, worst, clear, room = kernels.assemble(self._packed, q, query.pairs, reach, query.placing.moving)
+        self._moving = query.placing.moving
+        k, worst, clear, room = kernels.assemble(self._packed, q, query.pairs, reach, self._moving)
         proximity, rows = self._views.get(k) or self._view(k)
+        if x.task_switching and x.v0[0] != x.v0[0] and np.isfinite(x.A).all():  # task rows repeat each other
+            v0 = pseudo_inverse(x.A, 0.0) @ x.b
+            along = self._along(rows, v0)
+            rows.b[:], rows.touch[:] = along.b, along.touch
         if held is not None:
             x.v0[:] = tracking_within(held, x.A, x.b, x.damping)
             self._count_from_before()
+            if x.task_switching:
+                kernels.row_bounds(self._packed, k, self._moving)
             worst = float(kernels.tracking_shortfall(self._packed, k))
         bounds = x.lower, x.upper, *self._hard, x.v_stop
         return proximity, Problem(
             self._tracking, rows, *bounds, *self._names, x.v0, worst, held, self._levels, x.jerked, clear, room
         )
+
+    def look_ahead(self, looks_ahead: bool) -> None:
+        """Tell kernels whether to look for velocities that lead nowhere near anything; see `RowLayout.looks_ahead`."""
+        x = self._layout
+        looks_ahead = looks_ahead and self._contacts is None and not x.jerked
+        if looks_ahead != x.looks_ahead:
+            self._layout = x._replace(looks_ahead=looks_ahead)
+            self._packed = kernels.pack(self._layout)
 
     def carry(self, query: DistanceQuery) -> None:
         """Takes over which joint carries what, in place."""
@@ -197,6 +214,8 @@ class Assembly:
         """The problem of this tick with the velocity v (nv,) to follow in place of the tasks."""
         x = self._layout
         x.v0[:] = v if problem.contacts is None else problem.contacts.held(v)
+        if x.task_switching:
+            kernels.row_bounds(self._packed, len(problem.avoidance.d), self._moving)
         worst = float(kernels.tracking_shortfall(self._packed, len(problem.avoidance.d)))
         return problem._replace(tracking=Tracking(self._eye, x.v0, 0.0), shortfall=worst, levels=(), clear=False)
 
@@ -206,15 +225,16 @@ class Assembly:
         The way to v0 within jerk limits is a stop, for one who moves at v0. The velocity that is closest to v0 in every
         tick gets there with an acceleration that cannot be taken back at once: it swings to and fro about v0, for ever.
         """
-        x, rows, v0 = self._layout, problem.avoidance, problem.v0
+        x, v0 = self._layout, problem.v0
         if v0[0] != v0[0]:
             return problem
         eased = v0 + kernels.easing_stop(x.v_last - v0, x.w_last, x.v_step, x.w_step)
         if problem.contacts is not None:
             eased = problem.contacts.held(eased)
         tracking = problem.tracking._replace(b=problem.tracking.b + problem.tracking.A @ (eased - v0))
+        rows = self._along(problem.avoidance, eased)
         worst = float(kernels.shortfall(eased, rows.J, rows.b, x.lower, x.upper))
-        return problem._replace(tracking=tracking, v0=eased, shortfall=worst)
+        return problem._replace(tracking=tracking, avoidance=rows, v0=eased, shortfall=worst)
 
     def redirected(self, problem: Problem, frame: int, velocity: Array) -> Problem:
         """The problem of this tick with a velocity (3,) added to the linear one that a task asks for [m/s].
@@ -225,9 +245,9 @@ class Assembly:
             velocity: world [m/s].
         """
         x = self._layout
-        rows = slice(3 * frame, 3 * frame + 3)
+        linear = slice(3 * frame, 3 * frame + 3)
         b = x.b.copy()
-        x.b[rows] += x.scale[rows] * velocity
+        x.b[linear] += x.scale[linear] * velocity
         v0 = np.empty_like(x.v0)
         if problem.contacts is None:
             kernels.damped_solution(self._packed, v0)
@@ -235,9 +255,34 @@ class Assembly:
             v0[:] = tracking_within(problem.contacts, x.A, x.b, x.damping)
         tracking = problem.tracking._replace(b=x.b.copy())
         x.b[:] = b
-        near = problem.avoidance
-        worst = float(kernels.shortfall(v0, near.J, near.b, x.lower, x.upper))
-        return problem._replace(tracking=tracking, v0=v0, shortfall=worst, clear=False)
+        rows = self._along(problem.avoidance, v0)
+        worst = float(kernels.shortfall(v0, rows.J, rows.b, x.lower, x.upper))
+        return problem._replace(tracking=tracking, avoidance=rows, v0=v0, shortfall=worst, clear=False)
+
+    def prioritised(self, problem: Problem, tracked: Callable[[Problem], Array]) -> Problem:
+        """The problem of this tick with rows for what a cascade tracks, which is not v0.
+
+        Args:
+            problem: as `compute` gave it, or redirected.
+            tracked: gives that velocity (nv,).
+        """
+        if not self._layout.task_switching:
+            return problem
+        return problem._replace(avoidance=self._along(problem.avoidance, tracked(problem)), clear=False)
+
+    def _along(self, rows: AvoidanceRows, v: Array) -> AvoidanceRows:
+        """Rows of this tick as they are where v (nv,) is tracked in place of v0; the same ones if that is no matter."""
+        x, k = self._layout, len(rows.d)
+        if not (x.task_switching and k):
+            return rows
+        memory = x.v0, x.least[:k], x.touch[:k]
+        kept = [array.copy() for array in memory]
+        x.v0[:] = v
+        kernels.row_bounds(self._packed, k, self._moving)
+        along = rows._replace(b=x.least[:k].copy(), touch=x.touch[:k].copy())
+        for array, values in zip(memory, kept, strict=True):
+            array[:] = values
+        return along
 
     def at_length(self, problem: Problem) -> Problem:
         """The problem of this tick with what the limits of accelerations and jerks allow at length, not at once."""

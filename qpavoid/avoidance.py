@@ -1,8 +1,11 @@
 """Avoidance rows: how fast each near pair may close, as a function of its distance.
 
-With h = d - hold and gain ξ (hold is d1 for the switching row, d_safe for the others), ḋ = J v + drift stays above
+With h = d - hold and gain ξ (hold is d_safe for damper and cbf, d1 for the others), ḋ = J v + drift stays above
 
-- switching: -(1 - β) ξ h, and for h < 0 min(-ξ h, recovery_speed);
+- beta: -(1 - β) ξ h, and for h < 0 min(-ξ h, recovery_speed);
+- task-switching: (1 - β)(1 - α) min(u, ẋ0) + β ẋ0, at least -ξ h for h < 0 and at most recovery_speed. That is the rate
+  of eq. 10 with the consistent bracket. u = J v0 + drift is the rate that tracking alone would give; α, capped, counts
+  for u < 0 only. No more of h than there is may be used in a tick: ḋ >= -h / dt;
 - damper: -ξ h, capped in the same way (Faverjon and Tournassoud 1987, in its linear form);
 - cbf: -γ h, not capped (Ames et al. 2019, with a linear class-K function).
 """
@@ -13,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from qpavoid.config import Avoidance, Cbf, Switching
+from qpavoid.config import Avoidance, Beta, Cbf, TaskSwitching
 
 
 def row_form(config: Avoidance) -> dict[str, Any]:
@@ -24,7 +27,10 @@ def row_form(config: Avoidance) -> dict[str, Any]:
         "hold": config.hold,
         "row_gain": row.gain,
         "recovery": np.inf if isinstance(row, Cbf) else config.recovery_speed,
-        "switching": isinstance(row, Switching),
+        "beta": isinstance(row, Beta),
+        "task_switching": isinstance(row, TaskSwitching),
+        "retreat_speed": row.retreat_speed if isinstance(row, TaskSwitching) else 0.0,
+        "alpha_cap": row.alpha_cap if isinstance(row, TaskSwitching) else 0.0,
         "d1": config.d1,
         "d2": config.d2,
     }

@@ -121,17 +121,21 @@ class Commander:
         try:
             if proximity is not None:
                 problem = self.progress.redirect(problem, proximity, self._assembly, self.solver)
-                if problem.jerked and not (problem.levels and isinstance(self.solver, Hqp)):  # v0 is not a cascade's
+                if problem.levels and isinstance(self.solver, Hqp):  # v0 is not a cascade's
+                    problem = self._assembly.prioritised(problem, self.solver.tracked)
+                elif problem.jerked:
                     problem = self._assembly.eased(problem)
             solution = self.solver.solve(problem)
             v = solution.v
-            usable = v.dtype == np.float64 and v.shape == self._v_shape and sane(v)
+            usable = v.dtype == np.float64 and v.shape == self._v_shape and sane(v) and _well_formed(problem, solution)
         except Exception as error:  # a law of the user's own may raise anything; the robot must get a velocity
             raised = Reason.of(ReasonKind.SOLVER_FAILED, detail=f"it raised {type(error).__name__}: {error}")
             return _stop(problem, (raised,))
         if not usable:
-            failed = Reason.of(ReasonKind.SOLVER_FAILED, detail="no finite velocity of the right shape")
-            return _stop(problem, (*solution.reasons, failed))
+            detail = "no finite velocity of the right shape, or no status, reasons or slack of the right kind"
+            failed = Reason.of(ReasonKind.SOLVER_FAILED, detail=detail)
+            given = solution.reasons if _well_formed(problem, solution) else ()
+            return _stop(problem, (*given, failed))
         if not self.solver.bounded:
             if self._limits.saturate:
                 v, change = saturate(v, problem.lower, problem.upper, self._bounds.velocity)
@@ -190,6 +194,18 @@ class Commander:
             if (problem.joint_names[j],) not in named
         ]
         return solution.relaxed(*passed) if passed else solution
+
+
+def _well_formed(problem: Problem, solution: Solution) -> bool:
+    """Return whether all but the velocity of a law's answer is of the right kind."""
+    slack, k = solution.slack, len(problem.avoidance.d)
+    return (
+        isinstance(solution, Solution)
+        and isinstance(solution.status, Status)
+        and isinstance(solution.reasons, tuple)
+        and all(isinstance(reason, Reason) for reason in solution.reasons)
+        and (slack is None or (getattr(slack, "shape", None) == (k,) and bool(np.isfinite(slack).all())))
+    )
 
 
 def _stop(problem: Problem, reasons: tuple[Reason, ...]) -> Solution:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from math import isfinite
+from copy import copy
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 import pinocchio as pin
@@ -18,34 +18,34 @@ from qpavoid.config import Avoidance, Limits, Progress, ScenarioConfig, Sensing
 from qpavoid.contacts import ContactRows, build_contacts
 from qpavoid.errors import ConfigError, NumericalError, UnknownName, located, nearest
 from qpavoid.geometry.cloud import Points
+from qpavoid.inputs import (
+    FARTHEST,
+    FASTEST,
+    FAULTS,
+    LARGEST_COMMAND,
+    Clock,
+    Configurations,
+    Times,
+    check_velocity,
+)
+from qpavoid.kernels.motions import NORMALISED, SAMPLE
 from qpavoid.kinematics import ForwardKinematics, Kinematics
 from qpavoid.limits import OUTSIDE
 from qpavoid.motion import Sample
+from qpavoid.obstacles.courses import STATE, as_samples, put
 from qpavoid.obstacles.grasp import Grasps
-from qpavoid.obstacles.sensing import Obstacles, Pose, finite
-from qpavoid.problem import (
-    Array,
-    Problem,
-    Proximity,
-    Solution,
-    State,
-    as_vector,
-    not_finite,
-    require_finite,
-    sane,
-)
+from qpavoid.obstacles.sensing import Obstacles, Pose, Update
+from qpavoid.problem import Array, Problem, Proximity, Solution, State, as_vector, require_finite
 from qpavoid.proximity import DistanceQuery
 from qpavoid.reason import Reason, ReasonKind
 from qpavoid.robot import Robot
 from qpavoid.scene import Scene, build_obstacles, build_scene
-from qpavoid.solvers import Solver, make_solver
+from qpavoid.solvers import SOLVERS, Solver, make_solver
 from qpavoid.tasks import AnyTask, build_tasks, in_order
 
 _log = logging.getLogger(__name__)
 _LONGEST = 1.0
 """Control period that is not meant [s]."""
-_ABSURD = 1e100
-"""Violation of a row or bound from which numbers are looked through for what cannot be true [m/s, rad/s]."""
 
 
 class Tick(NamedTuple):
@@ -57,6 +57,34 @@ class Tick(NamedTuple):
     errors: Array
     """How far each of the tasks that are not frames was from its target, in its unit."""
     kinematics: Kinematics
+    proximity: Proximity
+    problem: Problem
+    solution: Solution
+
+
+class _Inputs(NamedTuple):
+    """Arguments of a step, checked; nothing has been changed by them yet."""
+
+    times: Times
+    q: Array | None
+    """(nq,); None where it cannot be true."""
+    v: Array | None
+    """(nv,) as measured; None where it is not given, or cannot be true."""
+    desired: Array | None
+    """(nv,) velocity to follow in place of the tasks; zero where it cannot be true."""
+    samples: tuple[Any, ...]
+    """Targets of all tasks."""
+    update: Update | None
+    faults: tuple[Reason, ...]
+    """Why the robot has to stop."""
+    notes: tuple[Reason, ...]
+
+
+class _Output(NamedTuple):
+    """What a step worked out."""
+
+    state: State
+    samples: tuple[Any, ...]
     proximity: Proximity
     problem: Problem
     solution: Solution
@@ -106,18 +134,20 @@ class Controller:
         if not 0.0 < dt <= _LONGEST:
             raise ConfigError(f"dt: {dt} s, expected more than 0 and at most {_LONGEST}; it is in seconds")
         frames, others = in_order(tasks)
+        others = [copy(task) for task in others]  # each writes into the memory of its own controller
         self.scene, self.dt = scene, dt
         self.tasks: tuple[AnyTask, ...] = (*frames, *others)
         """Frames with a position to follow, then with an orientation alone, then all other tasks."""
         law: Solver = make_solver(solver) if isinstance(solver, str) else solver
-        if contacts is not None and not getattr(law, "holds_contacts", False):
-            raise ConfigError(f"contacts: {_name(solver)} cannot hold them; use qp or hqp")
+        self._contacts = contacts is not None
+        self._check_law(law, solver)
         self.avoidance, self.limits = avoidance or Avoidance(), limits or Limits()
         model = scene.robot.model
         more = [i for task in others for i in task.frame_ids] + list(contacts.frame_ids if contacts else ())
         self._kinematics = ForwardKinematics(model, [*(task.frame_id for task in frames), *more])
         self._query = DistanceQuery(scene)
         self._q_shape, self._v_shape = (model.nq,), (model.nv,)
+        self._clock = Clock(dt)
         self._task_names = {task.settings.label: task for task in self.tasks}
         self._others = others
         if len(self._task_names) < len(self.tasks):
@@ -125,6 +155,13 @@ class Controller:
         self._obstacles = Obstacles(scene.obstacles, sensing or Sensing(), dt)
         self._reach = self.avoidance.d2 - self.avoidance.offset
         self._bounds = scene.robot.bounds().within(self.limits)
+        names = scene.robot.coordinate_units
+        self._configurations = Configurations(
+            model, self._bounds.q_index, self._bounds.lower, self._bounds.upper,
+            [names[j] for j in self._bounds.v_index.tolist()],
+        )  # fmt: skip
+        self._goals = np.zeros((len(self.tasks), STATE))
+        self._goal_views = as_samples(self._goals)
         self._q_last = scene.robot.home.copy()
         self._assembly = Assembly(
             scene, self.tasks, self._bounds, self._kinematics, self._query, self.avoidance,
@@ -149,20 +186,45 @@ class Controller:
 
     @property
     def solver(self) -> Solver:
-        """The law, which may be exchanged between ticks."""
+        """The law, which may be exchanged between steps.
+
+        Raises:
+            ConfigError: on assignment, of a law that has no `solve` or `bounded`, or does not hold contacts.
+        """
         return self._commander.solver
 
     @solver.setter
     def solver(self, law: Solver) -> None:
+        self._check_law(law, law)
         self._commander.solver = law
+        self._assembly.look_ahead(law.bounded and self.avoidance.look_ahead)
+
+    def _check_law(self, law: Solver, name: Solver | str) -> None:
+        if not callable(getattr(law, "solve", None)) or not hasattr(law, "bounded"):
+            raise ConfigError(f"solver: {type(law).__name__} is no law; it needs `solve(problem)` and `bounded`")
+        if self._contacts and not getattr(law, "holds_contacts", False):
+            raise ConfigError(f"contacts: {_name(name)} cannot hold them; use qp or hqp")
 
     def _warm_up(self) -> None:
-        q, v = self.scene.robot.home, np.zeros(self._v_shape)
+        """Run the first steps, with a law that ships: one of the user's own may remember what it is asked."""
+        q, v, law = self.scene.robot.home, np.zeros(self._v_shape), self._commander.solver
+        if type(law) not in SOLVERS.values():
+            self._commander.solver = make_solver("qp")
         self.tick(q)
         self.filter(q, v)
         self._assembly.closest_call(v, 0, self._reach, self.dt)
         self._assembly.bends(q, v, self.dt)
+        self._obstacles.warm_up()
+        self._commander.solver = law
         self.reset()
+
+    def __reduce_ex__(self, protocol: Any) -> NoReturn:
+        """Refuse to be copied or pickled: a copy would share memory that coal and compiled code look into.
+
+        Raises:
+            TypeError: always.
+        """
+        raise TypeError("a Controller is neither copied nor pickled; build another one of its scene and tasks")
 
     @classmethod
     def from_scenario(cls, scenario: ScenarioConfig) -> tuple[Controller, Array]:
@@ -205,25 +267,33 @@ class Controller:
     def step(
         self,
         q: Array,
-        t: float = 0.0,
+        t: float | None = None,
         targets: Mapping[str, Any] | None = None,
         obstacles: Mapping[str, Sample | Pose | Points] | None = None,
         v: Array | None = None,
     ) -> Solution:
         """Velocity for the next dt.
 
-        Every call with arguments of the right kind ends in a solution. Numbers that cannot be true (NaN, infinity) end
-        in a stop that says so; of an obstacle, they count as no news. Where q is unknown, the stop takes the robot to
-        be where the last velocity has led it.
+        Every call with arguments of the right kind ends in a solution, and one that raises changes nothing. What cannot
+        be true ends in a stop that says so, with a reason of kind IMPLAUSIBLE: NaN, infinity, a joint more than 2π
+        beyond its limits, a quaternion that is more than 1e-3 off length 1, a matrix that is no rotation, positions
+        beyond 1e6 m, speeds beyond 1e3 m/s or rad/s, a time whose resolution is coarser than dt/1000. Of an obstacle,
+        it counts as no update. Where q is unknown, the stop takes the robot to be where the last velocity has led it.
+        Rotations and quaternions that are less than 1e-3 off are normalised, with a reason of kind NORMALISED.
 
         Args:
             q: configuration (nq,) as measured.
-            t: time [s] at which motions are evaluated.
+            t: time [s], at which motions are evaluated and from which ages of obstacles count; one dt after the last
+                step if left out. Where it goes on by less than dt/2 or more than 3 dt/2, a reason of kind TIMING says
+                so; after a gap of more than 10 dt and 0.1 s, or where it goes back, the robot counts as standing still
+                unless v is given, and plans are dropped. Where it goes back, ages go on as if dt had passed.
             targets: what tasks should reach now, by their names, in place of their motion: a `Sample`, or a `Pose` that
                 rests, for what is somewhere (frames, a relative pose, the centre of mass, a point to look at), a
                 configuration (nq,) for a posture, a direction (3,) for an axis. A frame's task has the frame's name
                 unless it was given one.
-            obstacles: where obstacles are now, and how they move if that is known, by name, in place of their motion.
+            obstacles: where obstacles are, and how they move if that is known, by name, in place of their motion. From
+                then on they have to be updated, see `Sensing`, unless they are given `at_rest`. Each may have a time
+                stamp of its own.
             v: velocity (nv,) as measured, from which acceleration limits count; the last command if left out.
 
         Raises:
@@ -235,14 +305,13 @@ class Controller:
     def tick(
         self,
         q: Array,
-        t: float = 0.0,
+        t: float | None = None,
         targets: Mapping[str, Any] | None = None,
         obstacles: Mapping[str, Sample | Pose | Points] | None = None,
         v: Array | None = None,
     ) -> Tick:
         """Like `step`, with everything that led to the velocity."""
-        samples, proximity, problem, solution = self._compute(q, t, targets, obstacles, v)
-        state = State(np.array(q, dtype=np.float64), solution.v, t)
+        state, samples, proximity, problem, solution = self._compute(q, t, targets, obstacles, v)
         kinematics = _copied(self._assembly.kinematics)
         errors = np.array([task.error for task in self._others])
         return Tick(state, samples, errors, kinematics, _copied(proximity), _copied(problem), solution)
@@ -251,7 +320,7 @@ class Controller:
         self,
         q: Array,
         v_desired: Array,
-        t: float = 0.0,
+        t: float | None = None,
         obstacles: Mapping[str, Sample | Pose | Points] | None = None,
         v: Array | None = None,
     ) -> Solution:
@@ -262,14 +331,15 @@ class Controller:
         Args:
             q: configuration (nq,) as measured.
             v_desired: the command (nv,) [rad/s or m/s].
-            t: time [s] at which the obstacles' motions are evaluated.
+            t: time [s]; see `step`.
             obstacles: where obstacles are now; see `step`.
             v: velocity (nv,) as measured; see `step`.
 
         Raises:
             NumericalError, UnknownName: as `step`.
         """
-        return self._compute(q, t, None, obstacles, v, as_vector("v_desired", v_desired, self._v_shape))[-1]
+        desired = as_vector("v_desired", v_desired, self._v_shape)
+        return self._compute(q, t, None, obstacles, v, desired)[-1]
 
     def attach(self, obstacle: str, frame: str, q: Array | None = None) -> None:
         """From now on, a frame of the robot carries an obstacle, which stays where it is relative to the frame.
@@ -281,12 +351,16 @@ class Controller:
         Args:
             obstacle: name of one that is `graspable`.
             frame: name of the frame.
-            q: configuration (nq,) at which it is grasped; that of the last tick if left out.
+            q: configuration (nq,) at which it is grasped; that of the last step if left out, the home pose before the
+                first one.
 
         Raises:
             UnknownName: no such obstacle or frame.
             ConfigError: it cannot be carried, or not by this frame.
+            NumericalError: q cannot be true.
         """
+        if not isinstance(frame, str):
+            raise UnknownName(f"attach: no frame {frame!r:.60}; give its name")
         index, frame_id = self._obstacles.index(obstacle), self.scene.robot.frame_id(frame, "attach")
         self._grasps.attach(index, frame_id, self._given_or_last(q))
         self._commander.look_anew()
@@ -300,7 +374,7 @@ class Controller:
 
         Args:
             obstacle: its name.
-            q: configuration (nq,) at which it is released; that of the last tick if left out.
+            q: configuration (nq,) at which it is released; see `attach`.
 
         Returns:
             Its world pose.
@@ -308,6 +382,7 @@ class Controller:
         Raises:
             UnknownName: no such obstacle.
             ConfigError: it is not carried.
+            NumericalError: q cannot be true.
         """
         index = self._obstacles.index(obstacle)
         sample = self._grasps.release(index, self._given_or_last(q))
@@ -324,10 +399,18 @@ class Controller:
             allowed: False takes it back.
 
         Raises:
-            UnknownName: no such obstacle.
+            UnknownName: no such obstacle or body.
             ConfigError: none of the others has a pair with it.
         """
-        self._grasps.allow(self._obstacles.index(obstacle), set(others), allowed)
+        index, known = self._obstacles.index(obstacle), {*self.scene.body_names, *self.scene.obstacle_names}
+        try:
+            names = [others] if isinstance(others, str) else list(others)
+        except TypeError:
+            raise UnknownName(f"allow_contact: {others!r:.60}; give a list of names") from None
+        for name in names:
+            if not isinstance(name, str) or name not in known:
+                raise UnknownName(f"allow_contact: no body or obstacle {name!r:.60}{nearest(str(name), known)}")
+        self._grasps.allow(index, set(names), allowed)
         self._commander.look_anew()
 
     def obstacle_pose(self, obstacle: str, q: Array | None = None) -> Sample:
@@ -339,36 +422,43 @@ class Controller:
         self._grasps.tell(query)
 
     def _given_or_last(self, q: Array | None) -> Array:
-        return self._q_last if q is None else require_finite("q", q, self._q_shape)
+        return self._q_last if q is None else self._configurations.require("q", q)
 
     def reset(self, v: Array | None = None) -> None:
-        """Forgets the ticks before: the robot moves at v (nv,), or stands still; it keeps what it carries."""
-        self._assembly.restart(np.zeros(self._v_shape) if v is None else require_finite("v", v, self._v_shape))
-        self._q_last[:] = self.scene.robot.home
+        """Forgets the steps before: the robot moves at v (nv,), or stands still; it keeps what it carries.
+
+        Raises:
+            NumericalError: v has the wrong shape, or cannot be true.
+        """
+        v = np.zeros(self._v_shape) if v is None else require_finite("v", v, self._v_shape)
+        if faults := check_velocity("v", v, FASTEST):
+            raise NumericalError(str(faults[0]))
+        self._assembly.restart(v)
+        self._clock.reset()
         self._obstacles.reset()
         self._commander.reset()
 
     def _compute(
         self,
         q: Array,
-        t: float,
+        t: float | None,
         targets: Mapping[str, Any] | None,
         obstacles: Mapping[str, Sample | Pose | Points] | None,
         v: Array | None,
         desired: Array | None = None,
-    ) -> tuple[tuple[Any, ...], Proximity, Problem, Solution]:
+    ) -> _Output:
         begin = perf_counter()
-        q, t, desired, faults = self._read(q, t, v, desired)
-        samples = self._targets(t, targets)
-        observed = self._obstacles.observe(t, obstacles)
-        assumptions: tuple[Reason, ...] = ()
+        inputs = self._read(q, t, targets, obstacles, v, desired)
+        q, desired, samples = self._take_over(inputs), inputs.desired, inputs.samples
+        observed = self._obstacles.advance(inputs.update)
+        faults, assumptions = inputs.faults, inputs.notes
         if observed is not None:
             for index, voxels in observed.voxels.items():
                 for query in (self._query, *self._commander.queries):
                     query.fill(index, voxels)
             self._query.placing.place(*observed.seen)
             self._commander.guard.see(observed.seen.which)
-            faults, assumptions = faults + observed.stop, observed.assumptions
+            faults, assumptions = faults + observed.stop, assumptions + observed.assumptions
         self._kinematics.compute(q)
         self._query.compute(self._kinematics.data, self._reach)
         if self._query.unwatched is not None:
@@ -376,85 +466,117 @@ class Controller:
         proximity, problem = self._assembly.compute(q, samples, self._query, self._reach)
         if desired is not None:
             problem = self._assembly.follow(desired, problem)
-        elif targets and not problem.shortfall < _ABSURD:
-            faults += tuple(
-                [
-                    Reason.of(ReasonKind.IMPLAUSIBLE, f"target {frame}", detail="NaN or infinity")
-                    for frame in targets
-                    if not finite(targets[frame])
-                ]
-            )
+        state = State(q.copy(), self._assembly.v_last.copy(), inputs.times.t)
         built = perf_counter()
         if faults:
             solution = self._commander.stop(problem, faults)
         else:
-            solution = self._commander.decide(q, t, problem, proximity, tasks=desired is None)
+            solution = self._commander.decide(q, inputs.times.t, problem, proximity, tasks=desired is None)
         self._assembly.remember(solution.v)
         if self._no_backup and len(self._obstacles.moving):
             assumptions += self._no_backup
         if problem.room < -OUTSIDE:
             assumptions += self._bounds.outside(q, problem.joint_names, problem.joint_units)
         solution = solution._replace(assumptions=assumptions) if assumptions else solution
-        return samples, proximity, problem, solution.timed(built - begin, perf_counter() - built)
+        solution = solution.timed(built - begin, perf_counter() - built)
+        return _Output(state, samples, proximity, problem, solution)
 
     def _read(
-        self, q: Array, t: float, v: Array | None, desired: Array | None
-    ) -> tuple[Array, float, Array | None, tuple[Reason, ...]]:
-        """Arguments of a tick with what cannot be true replaced, and what that was."""
-        q = as_vector("q", q, self._q_shape)
-        faults: tuple[Reason, ...] = ()
-        if v is not None:
-            v = as_vector("v", v, self._v_shape)
-            if sane(v):
-                self._assembly.measured(v)
-            else:
-                faults = (_implausible("v", v),)
-        if not sane(q):
-            faults += (_implausible("q", q),)
-            q = self._expected()
-        try:
-            known = isfinite(t)
-        except TypeError:
-            raise NumericalError(f"t: not a number: {t!r:.60}") from None
-        if not known:
-            faults, t = (*faults, Reason.of(ReasonKind.IMPLAUSIBLE, "t", detail=f"{t}")), 0.0
+        self,
+        q: Any,
+        t: Any,
+        targets: Mapping[str, Any] | None,
+        obstacles: Mapping[str, Sample | Pose | Points] | None,
+        v: Any,
+        desired: Array | None,
+    ) -> _Inputs:
+        """Check the arguments of a step: whatever raises does so here, before anything is changed."""
+        measured = as_vector("q", q, self._q_shape)
+        known = None if v is None else as_vector("v", v, self._v_shape)
+        times = self._clock.read(t)
+        configuration, faults, notes = self._configurations.read("q", measured)
+        if wrong := () if known is None else check_velocity("v", known, FASTEST):
+            known = None
+        slow = () if desired is None else check_velocity("v_desired", desired, LARGEST_COMMAND)
+        samples, missed, normalised = self._targets(times.t, targets)
+        update = self._obstacles.read(times.t, obstacles, times.shift)
+        return _Inputs(
+            times=times,
+            q=None if faults else configuration,
+            v=known,
+            desired=np.zeros(self._v_shape) if slow else desired,
+            samples=samples,
+            update=update,
+            faults=(*wrong, *faults, *times.faults, *slow, *missed),
+            notes=(*times.notes, *notes, *normalised),
+        )
+
+    def _take_over(self, inputs: _Inputs) -> Array:
+        """Begin a step with checked arguments; where the robot is (nq,)."""
+        if inputs.times.resumed:
+            self._assembly.restart(np.zeros(self._v_shape))
+            self._commander.reset()
+        if inputs.v is not None:
+            self._assembly.measured(inputs.v)
+        q = self._expected() if inputs.q is None else inputs.q
         self._q_last[:] = q
-        if desired is not None and not sane(desired):
-            faults += (_implausible("v_desired", desired),)
-            desired = np.zeros(self._v_shape)
-        return q, t, desired, faults
+        self._clock.set(inputs.times.t)
+        return q
 
     def _expected(self) -> Array:
         """Where the robot is if it did what it was told last (nq,)."""
         return np.asarray(pin.integrate(self.scene.robot.model, self._q_last, self.dt * self._assembly.v_last))
 
-    def _targets(self, t: float, given: Mapping[str, Any] | None) -> tuple[Any, ...]:
+    def _targets(
+        self, t: float, given: Mapping[str, Any] | None
+    ) -> tuple[tuple[Any, ...], tuple[Reason, ...], tuple[Reason, ...]]:
+        """Targets of all tasks, what is wrong with those that are given, and what was normalised in them."""
+        if given is not None and not isinstance(given, Mapping):
+            raise NumericalError(f"targets: give a mapping of names to targets, not {given!r:.60}")
         if not given:
-            return tuple([task.motion.sample(t) for task in self.tasks])
-        samples, known = [], 0
-        for name, task in self._task_names.items():
+            return tuple([task.motion.sample(t) for task in self.tasks]), (), ()
+        samples, known, placed, faults = [], 0, list[int](), list[Reason]()
+        for row, (name, task) in enumerate(self._task_names.items()):
+            sample = None
             if name in given:
+                known += 1
                 try:
-                    samples.append(task.as_target(given[name]))
+                    sample = task.as_target(given[name])
                 except NumericalError as error:
                     raise NumericalError(f"target {name!r}: {error}") from None
-                known += 1
-            else:
-                samples.append(task.motion.sample(t))
+                if isinstance(sample, Sample):
+                    put(self._goal_views[row], sample)
+                    placed.append(row)
+                elif fault := task.fault(sample):
+                    faults.append(_implausible(name, fault))
+                    sample = None
+            samples.append(task.motion.sample(t) if sample is None else sample)
         if known < len(given):
             name = next(name for name in given if name not in self._task_names)
-            raise UnknownName(f"no target {name!r}{nearest(name, self._task_names)}")
-        return tuple(samples)
+            raise UnknownName(f"no target {name!r:.60}{nearest(str(name), self._task_names)}")
+        if not placed:
+            return tuple(samples), tuple(faults), ()
+        rows, normalised = np.array(placed), list[Reason]()
+        codes, off = kernels.check_states(self._goals, rows, np.full(len(rows), SAMPLE), FARTHEST, FASTEST)
+        for k in np.flatnonzero(codes).tolist() if codes.any() else ():
+            name, task = list(self._task_names.items())[placed[k]]
+            if codes[k] == NORMALISED:
+                samples[placed[k]] = samples[placed[k]]._replace(rotation=self._goal_views[placed[k]].rotation.copy())
+                normalised.append(Reason.of(ReasonKind.NORMALISED, "target", name, amount=float(off[k]), unit="-"))
+            else:
+                samples[placed[k]] = task.motion.sample(t)
+                faults.append(_implausible(name, FAULTS[int(codes[k])]))
+        return tuple(samples), tuple(faults), tuple(normalised)
+
+
+def _implausible(target: str, detail: str) -> Reason:
+    return Reason.of(ReasonKind.IMPLAUSIBLE, "target", target, detail=detail)
 
 
 def _name(solver: Solver | str) -> str:
     if isinstance(solver, str):
         return f"solver {solver!r}"
     return f"solver {solver.config.name!r}" if hasattr(solver, "config") else f"the solver {type(solver).__name__}"
-
-
-def _implausible(name: str, array: Array) -> Reason:
-    return Reason.of(ReasonKind.IMPLAUSIBLE, name, detail=not_finite(array))
 
 
 def _copied(value: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Switching gains between tracking and avoiding (eqs. 11, 12)."""
+"""Gains that switch between tracking and avoiding (eqs. 11, 12)."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ def run_metrics(log: Log) -> dict[str, Any]:
         time_in_collision [s]; time_below: threshold -> [s]; final_error [m]; max_deviation: largest distance of a tool
         from its planned path [m]; tracking_rmse: of the distance to the moving target [m]; peak_velocity: fastest
         joint [rad/s or m/s]; jitter: Σ|Δq̇| over joints and ticks [rad/s]; status_counts; relaxed_ticks;
-        shortened_ticks: drawn back after looking ahead; time_stalled [s]; severity_counts: steps by the worst severity
+        shortened_ticks: drawn back after looking ahead; time_blocked [s]; severity_counts: steps by the worst severity
         of their reasons; events: the first changes of reasons, as [t, status, reasons as data]; tick_us: p50, p99 and
         max of the tick's time [µs].
     """
@@ -65,7 +65,7 @@ def run_metrics(log: Log) -> dict[str, Any]:
         "status_counts": counts,
         "relaxed_ticks": counts[Status.RELAXED.value],
         "shortened_ticks": int(np.sum(log.share < 1.0)),
-        "time_stalled": dt * float(np.sum(log.stalled)),
+        "time_blocked": dt * float(np.sum(log.stalled)),
         "severity_counts": {level.name: int(np.sum(log.severity == level)) for level in Severity},
         "events": log.meta["events"][:_MOST_EVENTS],
         "tick_us": {

@@ -23,7 +23,7 @@ from qpavoid.config import Motion as MotionConfig
 from qpavoid.config.base import LARGEST
 from qpavoid.csv_poses import read_poses
 from qpavoid.errors import ConfigError, NumericalError, located
-from qpavoid.problem import Array
+from qpavoid.problem import Array, require_finite
 
 END_TOLERANCE = 1e-9
 """How early a piece ends [s]: k·dt may fall a rounding error short of the time it stands for."""
@@ -40,6 +40,10 @@ class Sample(NamedTuple):
     """(3,) velocity of the origin [m/s]."""
     angular: Array
     """(3,) angular velocity [rad/s]."""
+    t: float | None = None
+    """Time stamp: when an obstacle was there [s]; the time of the control step if left out."""
+    at_rest: bool = False
+    """Whether an obstacle stays there until another sample is given: it is never stale."""
 
     @classmethod
     def at(
@@ -48,17 +52,21 @@ class Sample(NamedTuple):
         rotation: ArrayLike | None = None,
         linear: ArrayLike | None = None,
         angular: ArrayLike | None = None,
+        t: float | None = None,
+        at_rest: bool = False,
     ) -> Sample:
-        """Read-only copies of what is given, checked; identity and zero for what is not.
+        """Make read-only copies of what is given, checked; identity and zero for what is not.
 
         Raises:
-            ConfigError: an entry has the wrong shape, or holds what is not a finite number.
+            NumericalError: an entry has the wrong shape, or holds what is not a finite number.
         """
         return cls(
             _checked("position", position, (3,)),
             _checked("rotation", np.eye(3) if rotation is None else rotation, (3, 3)),
             _checked("linear", np.zeros(3) if linear is None else linear, (3,)),
             _checked("angular", np.zeros(3) if angular is None else angular, (3,)),
+            t,
+            at_rest,
         )
 
 
@@ -254,14 +262,7 @@ def _direction(vector: tuple[float, float, float], field: str) -> Array:
 
 
 def _checked(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    try:
-        array = np.array(value, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise ConfigError(f"{name}: {error}; give numbers of shape {shape}") from error
-    if array.shape != shape:
-        raise ConfigError(f"{name} has shape {array.shape}; give {shape}")
-    if not np.isfinite(array).all():
-        raise ConfigError(f"{name} = {array.tolist()} is not finite; give finite numbers")
+    array = np.array(require_finite(name, value, shape))
     array.setflags(write=False)  # samples of one motion share it
     return array
 

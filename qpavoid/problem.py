@@ -248,6 +248,21 @@ class Solution(NamedTuple):
         return self._replace(build_time=build_time, solve_time=solve_time)
 
 
+def as_numbers(name: str, value: Any) -> Array:
+    """Return `value` as a float array of whatever shape, and whatever its numbers are.
+
+    Raises:
+        NumericalError: text, complex numbers, or no numbers; names the argument.
+    """
+    try:
+        array = np.asarray(value)
+        if array.dtype.kind not in "biufO":
+            raise TypeError
+        return array.astype(np.float64, copy=False)
+    except (TypeError, ValueError, OverflowError):
+        raise NumericalError(f"{name}: not an array of numbers: {value!r:.60}") from None
+
+
 def as_vector(name: str, value: Any, shape: tuple[int, ...]) -> Array:
     """`value` as a float array of `shape`, whatever its numbers are.
 
@@ -256,10 +271,7 @@ def as_vector(name: str, value: Any, shape: tuple[int, ...]) -> Array:
     """
     if type(value) is np.ndarray and value.dtype == np.float64 and value.shape == shape:
         return value
-    try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise NumericalError(f"{name}: not an array of numbers: {value!r:.60}") from None
+    array = as_numbers(name, value)
     if array.shape != shape:
         raise NumericalError(f"{name}: shape {array.shape}, expected {shape}")
     return array

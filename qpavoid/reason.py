@@ -59,7 +59,7 @@ class ReasonKind(str, Enum):
     STALE = "STALE"
     """An obstacle was not updated in time: the obstacle, the age of its last update [s]."""
     NEVER_UPDATED = "NEVER_UPDATED"
-    """An external obstacle has not been given yet: the obstacle."""
+    """An external obstacle has not been given yet: the obstacle, since when [s]."""
     ESTIMATED = "ESTIMATED"
     """A twist was estimated from the poses of an obstacle: the obstacle."""
     IGNORED = "IGNORED"
@@ -110,7 +110,7 @@ _TEXTS: dict[str, str] = {
     "BACKUP": "backup trajectory instead of the tasks",
     "NO_BACKUP": "no backup trajectory",
     "STALE": "not updated for",
-    "NEVER_UPDATED": "external, not given yet",
+    "NEVER_UPDATED": "external, not given yet after",
     "ESTIMATED": "twist estimated from its poses",
     "IGNORED": "update not used",
     "POINTS_DROPPED": "points dropped:",
@@ -171,9 +171,9 @@ class Reason(NamedTuple):
         }
 
     @property
-    def key(self) -> tuple[str, tuple[str, ...], Severity]:
-        """Kind, subject and severity: the same reason in two steps has the same key, whatever its amounts."""
-        return self.kind.value, self.subject, self.severity
+    def key(self) -> tuple[str, tuple[str, ...]]:
+        """Kind and subject: the same reason in two steps has the same key, whatever its amount and severity."""
+        return self.kind.value, self.subject
 
 
 def _quantity(amount: float, unit: str) -> str:

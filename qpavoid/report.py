@@ -59,6 +59,57 @@ def metrics_table(runs: Sequence[dict[str, Any]], width: int = 80) -> Table:
     return table
 
 
+_RATIOS = (
+    ("min dist\n[mm]", "min_distance", 1e3, ".1f"), ("in coll\n[s]", "time_in_collision", 1.0, ".2f"),
+    ("rms err\n[mm]", "tracking_rmse", 1e3, ".1f"), ("end err\n[mm]", "final_error", 1e3, ".2f"),
+    ("dev\n[mm]", "max_deviation", 1e3, ".1f"), ("peak q̇\n[rad/s]", "peak_velocity", 1.0, ".2f"),
+    ("Σ|Δq̇|\n[rad/s]", "jitter", 1.0, ".1f"),
+)  # fmt: skip
+"""Heading, name, unit and format of the figures that are set against each other."""
+_NOTHING = 0.05
+"""Figures no larger than this, in their unit, have no ratio."""
+
+
+def ratios_table(runs: Sequence[dict[str, Any]], over: str, under: str) -> Table:
+    """Figures of two solvers, scenario by scenario, and those of the first over those of the second.
+
+    Args:
+        runs: results of `Log.metrics` of all scenarios.
+        over: solver whose figures stand above the line.
+        under: the other one.
+    """
+    table = Table(
+        title=f"[bold]{escape(over)} / {escape(under)}[/]", title_justify="left", title_style="",
+        box=box.SIMPLE_HEAD, pad_edge=False, padding=0,
+    )  # fmt: skip
+    table.add_column("scenario", no_wrap=True)
+    table.add_column("", no_wrap=True)
+    for heading, *_ in _RATIOS:
+        table.add_column(escape(heading), justify="right", no_wrap=True)
+    found = {(run["scenario"], run["solver"]): run for run in runs}
+    for scenario in dict.fromkeys(run["scenario"] for run in runs):
+        if (scenario, over) not in found or (scenario, under) not in found:
+            continue
+        values = [
+            [None if run[name] is None else unit * run[name] for _, name, unit, _ in _RATIOS]
+            for run in (found[scenario, over], found[scenario, under])
+        ]
+        for first, solver, figures in zip((scenario, ""), (over, under), values, strict=True):
+            cells = (
+                "-" if value is None else f"{value:{form}}" for value, (*_, form) in zip(figures, _RATIOS, strict=True)
+            )
+            table.add_row(first, solver, *cells)
+        table.add_row(
+            "", "ratio", *(f"[bold]{_ratio(a, b)}[/]" for a, b in zip(*values, strict=True)), end_section=True
+        )
+    return table
+
+
+def _ratio(a: float | None, b: float | None) -> str:
+    """a / b; nothing where one of them is none to speak of, or a depth of penetration."""
+    return f"{a / b:.2f}" if a is not None and b is not None and min(a, b) > _NOTHING else ""
+
+
 def outcome(run: dict[str, Any]) -> str:
     """Say how a run went: how many steps stopped and relaxed, and how many have each severity as their worst."""
     counts, levels = run["status_counts"], run["severity_counts"]
@@ -72,8 +123,8 @@ def outcome(run: dict[str, Any]) -> str:
     for level, word, style in (("ALARM", "alarm", "red"), ("WARNING", "warning", "yellow"), ("INFO", "info", "dim")):
         if levels[level]:
             said.append(f"[{style}]{levels[level]} {word}[/]")
-    if run["time_stalled"] > 0.0:
-        said.append(f"[yellow]stalled {run['time_stalled']:.1f} s[/]")
+    if run["time_blocked"] > 0.0:
+        said.append(f"[yellow]stalled {run['time_blocked']:.1f} s[/]")
     if not run["completed"]:
         said.append("[red]broken off[/]")
     said.append("[green]arrived[/]" if run["arrived"] else "[yellow]short of goal[/]")

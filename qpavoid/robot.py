@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
@@ -14,15 +13,21 @@ import pinocchio as pin
 
 from qpavoid.config import Body, Hull, RobotConfig
 from qpavoid.errors import ConfigError, UnknownName, nearest
-from qpavoid.files.loading import read_config, validate
+from qpavoid.files.loading import read_mapping, validate
+from qpavoid.files.packages import absolute_entries
+from qpavoid.files.safe_xml import read_robot_xml
 from qpavoid.files.shipped import find_robot
-from qpavoid.geometry.bodies import MeshWarning, check_meshes, convert_bodies, make_shape, triangle_meshes
-from qpavoid.geometry.joints import frame_index, joint_bounds, middle, set_joints, set_limits, without
-from qpavoid.geometry.pairs import add_self_pairs, drop_always_touching
-from qpavoid.geometry.urdf import find_resource, honour_srdf, read_collision, read_model, read_pieces
+from qpavoid.geometry.bodies import check_meshes, convert_bodies, make_shape, triangle_meshes
+from qpavoid.geometry.ends import end_effectors
+from qpavoid.geometry.joints import assume_speeds, frame_index, joint_bounds, middle, set_joints, set_limits, without
+from qpavoid.geometry.pairs import TouchingPair, add_self_pairs, drop_always_touching
+from qpavoid.geometry.plausible import name_implausible_sizes
+from qpavoid.geometry.urdf import find_resource, honour_srdf, is_mjcf, read_model, read_pieces
+from qpavoid.geometry.urdf_tree import fixed_by_limits
 from qpavoid.kinematics import TRANSLATIONS
 from qpavoid.limits import JointBounds
 from qpavoid.motion import rpy_to_matrix
+from qpavoid.notes import Note, NoteKind, merged, warn_of
 from qpavoid.problem import Array
 
 
@@ -41,28 +46,48 @@ class Robot:
     """Frames that are meant as tools."""
     source: str
     """File that it was read from, for messages."""
-    always_touching: tuple[tuple[str, str], ...] = ()
-    """Pairs of bodies that were switched off at loading, because they touch in every configuration."""
+    always_touching: tuple[TouchingPair, ...] = ()
+    """Pairs of bodies that were switched off at loading, because they touch in nearly every configuration."""
+    margins: Mapping[frozenset[str], float] = field(default_factory=dict)
+    """Two bodies: safety distance of their own, where it is less than the scenario's [m]."""
     acceleration: Mapping[str, float] = field(default_factory=dict)
     """Joint: largest acceleration [rad/s² or m/s²]; joints left out have no such limit."""
     jerk: Mapping[str, float] = field(default_factory=dict)
     """Joint: largest jerk [rad/s³ or m/s³]; likewise."""
+    notes: tuple[Note, ...] = ()
+    """What was left out, mended, replaced or assumed at loading."""
 
     @classmethod
-    def load(cls, name_or_path: str, folder: Path | None = None) -> Robot:
-        """The robot of a shipped name, a robot.yaml, a URDF or an MJCF (`.xml`).
+    def load(
+        cls,
+        name_or_path: str | Path,
+        folder: Path | None = None,
+        *,
+        packages: Mapping[str, str | Path] | None = None,
+        **fields: Any,
+    ) -> Robot:
+        """The robot of a shipped name, a robot.yaml, a URDF (also in xacro) or an MJCF (`.xml`).
+
+        What of it was left out, mended, replaced or assumed is in its `notes`, and the serious part in one
+        `RobotWarning`.
 
         Args:
             name_or_path: what a scenario's `robot:` field says.
             folder: where relative paths are looked up first.
+            packages: name of a ROS package: its folder, for `package://NAME/…`; relative ones start from the file.
+            fields: fields of a robot.yaml, such as `package_dirs=["../.."]`, `root_joint="planar"` or
+                `allow_missing_meshes=True`; they replace those that the file has.
 
         Raises:
             ConfigError, UnknownName: naming file, field and remedy.
         """
-        path = find_robot(name_or_path, folder)
-        if path.suffix in (".yaml", ".yml"):
-            return cls.from_config(read_config(path, RobotConfig), path)
-        return cls.from_urdf(path)
+        path = find_robot(str(name_or_path), folder)
+        given = read_mapping(path) if path.suffix in (".yaml", ".yml") else _fields_of_urdf(path)
+        config = validate({**given, **fields}, RobotConfig, path)
+        if packages:
+            entries = [*(f"{name}={place}" for name, place in packages.items()), *config.package_dirs]
+            config = config.model_copy(update={"package_dirs": entries})
+        return cls.from_config(config, path)
 
     @classmethod
     def from_config(cls, config: RobotConfig, path: Path) -> Robot:
@@ -89,13 +114,7 @@ class Robot:
             ConfigError, UnknownName: naming file, field and remedy.
         """
         path = Path(path)
-        config = validate({"name": path.stem, "urdf": path.name, **fields}, RobotConfig, path)
-        return cls.from_config(config, path)
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What was decided at loading, in words."""
-        return tuple(f"pair {a} - {b} is off: it touches in every configuration" for a, b in self.always_touching)
+        return cls.from_config(validate({**_fields_of_urdf(path), **fields}, RobotConfig, path), path)
 
     @property
     def joint_names(self) -> list[str]:
@@ -118,6 +137,10 @@ class Robot:
             metres = TRANSLATIONS.get(joint.shortname(), 0)
             units += ["m"] * metres + ["rad"] * (joint.nv - metres)
         return units
+
+    def safety_distance(self, a: str, b: str, d1: float) -> float:
+        """Safety distance of two of its bodies where that of the scenario is d1 [m]."""
+        return min(d1, self.margins.get(frozenset((a, b)), d1))
 
     def bounds(self) -> JointBounds:
         """Joint limits in tangent space; see `joint_bounds`."""
@@ -202,33 +225,27 @@ _MOST_BODIES = 300
 """Time and memory grow with the square: 45 000 pairs of 300 bodies take ten seconds. Humanoids have 112."""
 
 
+def _fields_of_urdf(path: Path) -> dict[str, Any]:
+    """Fields of the robot.yaml that a bare URDF or MJCF stands for."""
+    return {"name": Path(path.name.removesuffix(".xacro")).stem, "urdf": path.name}
+
+
 def _build(config: RobotConfig, path: Path) -> Robot:
+    notes: list[Note] = []
     urdf = find_resource(config.urdf, path.parent, f"{path}: urdf")
-    model = read_model(urdf, config.root_joint)
-    package_dirs = [str(path.parent / folder) for folder in config.package_dirs]
-    if isinstance(config.bodies, str):
-        collision = read_collision(urdf, model, package_dirs, path)
-        check_meshes(collision, str(path))
-        bodies = convert_bodies(collision, config.bodies)
-    else:
-        hulls = _hulls(config.bodies, lambda: read_pieces(urdf, model, package_dirs, path), path)
-        bodies = _listed_bodies(config.bodies, model, hulls, path)
-    if meshes := triangle_meshes(bodies):
-        warnings.warn(
-            f"{path}: bodies: mesh: {len(meshes)} triangle meshes such as {meshes[0]!r} cost 100 to 500 µs a pair at "
-            "every tick, some pairs several ms, convex hulls about 1 µs, capsules 0.1 µs; set `bodies` to convex or "
-            "capsule",
-            MeshWarning,
-            stacklevel=4,
-        )
+    model = read_model(urdf, config.root_joint, notes)
+    ends = _end_effectors(model, config.end_effectors, path, notes)
+    bodies = _bodies(config, urdf, model, path, notes)
     set_limits(model, config.limits, path)
     home = set_joints(model, middle(model), config.home, f"{path}: home")
-    home = set_joints(model, home, config.lock, f"{path}: lock")
-    if config.lock:
-        model, bodies, index = without(model, bodies, list(config.lock), home, f"{path}: lock")
+    fixed = {**_fixed(urdf, config, notes), **config.lock}
+    home = set_joints(model, home, fixed, f"{path}: lock")
+    if fixed:
+        model, bodies, index = without(model, bodies, list(fixed), home, f"{path}: lock")
         home = home[index]
     if model.nv == 0:
         raise ConfigError(f"{path}: no joint of {urdf.name} moves; give at least one that is neither fixed nor locked")
+    assume_speeds(model, notes)
     if len(bodies.geometryObjects) > _MOST_BODIES:
         raise ConfigError(
             f"{path}: {len(bodies.geometryObjects)} bodies; at most {_MOST_BODIES} are read: list fewer under `bodies`"
@@ -237,21 +254,88 @@ def _build(config: RobotConfig, path: Path) -> Robot:
     if config.srdf is not None:
         honour_srdf(model, bodies, find_resource(config.srdf, path.parent, f"{path}: srdf"))
     always_touching = drop_always_touching(model, bodies, joint_bounds(model))
-    for name in config.end_effectors:
-        if not model.existFrame(name):
-            frames = [f.name for f in model.frames]
-            raise UnknownName(f"{path}: end_effectors: no frame {name!r}{nearest(name, frames)}")
+    notes = merged([*notes, *(pair.note() for pair in always_touching)])
+    warn_of(notes, str(path))
     return Robot(
         config.name,
         model,
         bodies,
         home,
-        tuple(config.end_effectors),
+        ends,
         str(path),
         tuple(always_touching),
+        _margins(config, bodies, path),
         config.limits.acceleration,
         config.limits.jerk,
+        tuple(notes),
     )
+
+
+def _margins(config: RobotConfig, bodies: Any, path: Path) -> dict[frozenset[str], float]:
+    """Safety distances of pairs of bodies [m]."""
+    names = [body.name for body in bodies.geometryObjects]
+    for index, own in enumerate(config.pair_margins):
+        for name in own.bodies:
+            if name not in names:
+                where = f"{path}: pair_margins.{index}.bodies"
+                raise UnknownName(f"{where}: no body {name!r}{nearest(name, names)}")
+    return {frozenset(own.bodies): own.d1 for own in config.pair_margins}
+
+
+def _end_effectors(model: Any, given: Sequence[str], path: Path, notes: list[Note]) -> tuple[str, ...]:
+    """The frames that are given as end effectors, or those at the ends of the limbs."""
+    for name in given:
+        if not model.existFrame(name):
+            frames = [f.name for f in model.frames]
+            raise UnknownName(f"{path}: end_effectors: no frame {name!r}{nearest(name, frames)}")
+    found = tuple(given or end_effectors(model))
+    if found and not given:
+        what = "taken as end effectors, since limbs end there"
+        notes.append(Note(NoteKind.FRAME, found, what, "list those that you mean under `end_effectors`"))
+    return found
+
+
+def _fixed(urdf: Path, config: RobotConfig, notes: list[Note]) -> dict[str, float]:
+    """Joints that the file's own limits leave no range, unless the robot.yaml gives one; see `fixed_by_limits`."""
+    if is_mjcf(urdf):
+        return {}
+    fixed = {
+        name: value
+        for name, value in fixed_by_limits(read_robot_xml(urdf, "URDF"), notes).items()
+        if name not in config.limits.position and name not in config.lock
+    }
+    for name, value in fixed.items():
+        what = f"locked at {value:g}, which is its lower and its upper limit"
+        notes.append(
+            Note(NoteKind.JOINT, (name,), what, "give its range under `limits.position` if it moves", "warning")
+        )
+    return fixed
+
+
+def _bodies(config: RobotConfig, urdf: Path, model: Any, path: Path, notes: list[Note]) -> Any:
+    package_dirs = absolute_entries(config.package_dirs, path.parent)
+
+    def read(enclosed: bool, collected: list[Note]) -> Any:
+        return read_pieces(
+            urdf, model, package_dirs, path, collected,
+            visuals=config.visuals, allow_missing=config.allow_missing_meshes, enclosed=enclosed,
+        )  # fmt: skip
+
+    if not isinstance(config.bodies, str):
+        hulls = _hulls(config.bodies, lambda: read(True, []), path)  # what is not listed is left out on purpose
+        return _listed_bodies(config.bodies, model, hulls, path)
+    pieces = read(False, notes)
+    check_meshes(pieces, str(path))
+    name_implausible_sizes(model, pieces, notes)
+    bodies = convert_bodies(pieces, config.bodies)
+    if meshes := triangle_meshes(bodies):
+        what = (
+            f"{len(meshes)} triangle meshes cost 100 to 500 µs a pair at every tick, some pairs several ms, convex "
+            "hulls about 1 µs, capsules 0.1 µs"
+        )
+        remedy = "set `bodies` to convex or capsule"
+        notes.append(Note(NoteKind.MESH, tuple(meshes), what, remedy, "warning"))
+    return bodies
 
 
 def _hulls(configs: Sequence[Body], read: Callable[[], Any], path: Path) -> dict[str, Any]:

@@ -13,6 +13,7 @@ import pinocchio as pin
 
 from qpavoid import config
 from qpavoid.errors import NumericalError
+from qpavoid.inputs import FARTHEST, Configurations
 from qpavoid.kernels.rotation import rotation_vector
 from qpavoid.kinematics import ForwardKinematics, columns, support_masks
 from qpavoid.obstacles.sensing import as_goal
@@ -84,6 +85,10 @@ class RowTask:
         if isinstance(self.motion, Constant) and self.motion.value is None:
             raise NumericalError(f"a task of type {getattr(self.settings, 'type', '?')} takes none; leave it out")
         return as_goal(value)
+
+    def fault(self, target: Any) -> str:
+        """Say why a target that is no `Sample` cannot be true; nothing if it can."""
+        return ""
 
     def _write(self, J: Array, wanted: Array, error: Array) -> None:
         np.multiply(J, self.scale[:, None], out=self._A)
@@ -160,6 +165,7 @@ class Posture(Damping):
     def __init__(self, settings: config.PostureTask, model: Any, motion: Target, coordinates: IntArray) -> None:
         super().__init__(settings, model, motion, coordinates)
         self._asked = settings.gain * self.scale
+        self._configurations = Configurations(model)
 
     def update(self, q: Array, kinematics: ForwardKinematics, target: Any) -> None:
         """See `RowTask.update`."""
@@ -170,6 +176,11 @@ class Posture(Damping):
     def as_target(self, value: Any) -> Any:
         """A configuration (nq,)."""
         return as_vector("q", value, (self._model.nq,))
+
+    def fault(self, target: Any) -> str:
+        """See `RowTask.fault`."""
+        faults = self._configurations.read("q", target)[1]
+        return str(faults[0]) if faults else ""
 
 
 class Axis(RowTask):
@@ -209,6 +220,12 @@ class Axis(RowTask):
     def as_target(self, value: Any) -> Any:
         """A `Sample` of the point to look at, or a direction (3,) to align with."""
         return as_goal(value) if self._looks else as_vector("direction", value, (3,))
+
+    def fault(self, target: Any) -> str:
+        """See `RowTask.fault`."""
+        if not np.abs(target).max() <= FARTHEST:
+            return "NaN, infinity or too large"
+        return "" if _length(target) > _ALIGNED else "a direction of no length"
 
 
 class Manipulability(RowTask):

@@ -13,10 +13,11 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from qpavoid import config
-from qpavoid.errors import ConfigError, located
+from qpavoid.errors import ConfigError, NumericalError, located
 from qpavoid.geometry.cloud import Voxels, read_points
 from qpavoid.geometry.pairs import pair_array
 from qpavoid.geometry.solids import make_solids
+from qpavoid.kernels.motions import NEARLY
 from qpavoid.kinematics import support_masks
 from qpavoid.motion import Motion, Sample, Still, build_motion
 from qpavoid.problem import Array, IntArray
@@ -37,6 +38,8 @@ class Obstacle:
     """Whether its motion has to be evaluated at every tick."""
     graspable: bool = False
     """Whether `Controller.attach` may let the robot carry it."""
+    external: bool = False
+    """Whether its pose comes from the program that steps the controller, and has to be updated from the start."""
     source: Path = Path("obstacle")
     """File to name in errors, from whose folder the paths of meshes and points start."""
 
@@ -48,6 +51,7 @@ class Obstacle:
         position: ArrayLike,
         rotation: ArrayLike | None = None,
         graspable: bool = False,
+        external: bool = False,
     ) -> Obstacle:
         """An obstacle that stays, unless the program that steps the controller says where it is.
 
@@ -57,11 +61,21 @@ class Obstacle:
             position: world position of the shape's origin (3,) [m].
             rotation: its orientation (3, 3); along the world axes if left out.
             graspable: whether the robot may carry it.
+            external: whether its pose has to be updated by `Controller.step(obstacles=…)` from the start: the robot
+                stops where it is not. An obstacle that is given in `step` is external from then on.
 
         Raises:
-            ConfigError: wrong shape, NaN or infinity.
+            ConfigError: wrong shape, NaN or infinity, no rotation.
         """
-        return cls(name, shape, Still(Sample.at(position, rotation)), moves=False, graspable=graspable)
+        try:
+            sample = Sample.at(position, rotation)
+        except NumericalError as error:
+            raise ConfigError(f"obstacle {name!r}: {error}") from None
+        off = float(np.abs(sample.rotation.T @ sample.rotation - np.eye(3)).max())
+        if off > NEARLY or np.linalg.det(sample.rotation) < 0.0:
+            what = "left-handed" if np.linalg.det(sample.rotation) < 0.0 else f"|RᵀR - I| is {off:.2g}"
+            raise ConfigError(f"obstacle {name!r}: rotation: {what}; give a rotation (3, 3)")
+        return cls(name, shape, Still(sample), moves=False, graspable=graspable, external=external)
 
 
 @dataclass(frozen=True)
@@ -93,6 +107,15 @@ class Scene:
     def obstacle_names(self) -> list[str]:
         """Names of the obstacles."""
         return [obstacle.name for obstacle in self.obstacles]
+
+    def slack(self, hold: float) -> Array:
+        """By how much the safety distance of each pair is less than that of the scenario (m,) [m].
+
+        Args:
+            hold: safety distance of the scenario, between surfaces [m].
+        """
+        own = [self.robot.safety_distance(a, b, hold) for a, b in self.pair_names]
+        return hold - np.array(own, dtype=np.float64)
 
     @property
     def movable(self) -> int:
@@ -212,6 +235,7 @@ def build_obstacles(configs: Sequence[config.ObstacleConfig], source: Path) -> l
                 motion,
                 moves=not isinstance(c.motion, config.Fixed),
                 graspable=c.graspable or c.carried_by is not None,
+                external=c.source == "external",
                 source=source,
             )
         )

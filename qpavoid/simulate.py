@@ -163,7 +163,7 @@ class Recorder:
     def _note(self, t: float, solution: Solution) -> None:
         """Keep the status and reasons of a step where they differ from those before in more than amounts."""
         reasons = (*solution.reasons, *solution.stalled, *solution.assumptions)
-        keys = (solution.status, *[reason.key for reason in reasons])
+        keys = (solution.status, *[(*reason.key, reason.severity) for reason in reasons])
         eventful = solution.status is not Status.SOLVED or reasons
         if keys != self._keys and eventful and len(self._events) < _MOST_EVENTS:
             self._events.append([t, solution.status.value, [reason.as_dict() for reason in reasons]])
@@ -218,7 +218,7 @@ class Recorder:
             "stopped_by": stopped_by,
             "events": self._events,
             "robot": robot.name,
-            "notes": list(robot.notes),
+            "notes": [str(note) for note in robot.notes],
             "coordinates": robot.coordinate_names,
             "units": robot.coordinate_units,
             "velocity_limit": [v if np.isfinite(v) else None for v in bounds.velocity],

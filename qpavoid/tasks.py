@@ -47,6 +47,10 @@ class FrameTask:
         """A target that was given at run time, checked: a `Sample`, or a `Pose` that rests."""
         return as_goal(value)
 
+    def fault(self, target: Any) -> str:
+        """See `RowTask.fault`."""
+        return ""
+
 
 AnyTask = FrameTask | RowTask
 

@@ -97,7 +97,8 @@ def solo():
     shank = {"shape": {"type": "capsule", "radius": 0.015, "length": 0.16}, "position": (0.0, 0.0, -0.08)}
     shanks = [{"name": leg, "frame": f"{leg}_LOWER_LEG", **shank} for leg in ("FL", "FR", "HL", "HR")]
     urdf = EXAMPLES / "solo_description/robots/solo12.urdf"
-    return Robot.from_urdf(urdf, root_joint="free_flyer", bodies=[trunk, *shanks])
+    limits = {"velocity": {"root_joint": 10.0}}
+    return Robot.from_urdf(urdf, root_joint="free_flyer", bodies=[trunk, *shanks], limits=limits)
 
 
 def random_q(robot, rng, spread=1.0):
@@ -159,6 +160,7 @@ def make_layout(nv, frames=0, turns=(), pairs=0, obstacles=0, joints=1, **fields
         "task_support": np.ones((rows, nv)), "screws": screws, "results": np.zeros((pairs, 10)),
         "support": np.ones((pairs, nv)), "twists": np.zeros((obstacles + 1, 6)),
         "twist_row": np.full(pairs, obstacles), "margin": np.zeros(obstacles + 1),
+        "slack": np.zeros(pairs),
         "joint_poses": np.zeros((joints, 12)), "joint_reach": np.zeros(joints),
         "parents": np.maximum(np.arange(joints) - 1, 0), "column_joints": np.full(nv, joints - 1),
         "turning": np.ones((1, nv)), "sliding": np.zeros((1, nv)), "lever": 1.0,
@@ -168,8 +170,9 @@ def make_layout(nv, frames=0, turns=(), pairs=0, obstacles=0, joints=1, **fields
         "q_index": none, "v_index": none, "q_lower": np.zeros(0),
         "q_upper": np.zeros(0), "v_max": np.full(nv, np.inf), "v_step": np.full(nv, np.inf), "v_last": np.zeros(nv),
         "w_step": np.full(nv, np.inf), "w_last": np.zeros(nv), "jerked": False, "looks_ahead": True,
-        "damping": 0.0, "offset": 0.0, "hold": 0.1, "row_gain": 5.0, "recovery": 0.2, "switching": True, "d1": 0.1,
-        "d2": 0.3, "rate": 50.0, "dt": 0.01, "accelerated": False,
+        "damping": 0.0, "offset": 0.0, "hold": 0.1, "row_gain": 5.0, "recovery": 0.2, "beta": True, "d1": 0.1,
+        "task_switching": False, "retreat_speed": 0.0, "alpha_cap": 50.0, "d2": 0.3, "rate": 50.0, "dt": 0.01,
+        "accelerated": False,
     }  # fmt: skip
     shapes = {
         "poses": (frames, 12), "A": (rows, nv), "b": rows, "closest": (pairs, 10), "J": (pairs, nv), "drift": pairs,

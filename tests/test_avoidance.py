@@ -71,9 +71,9 @@ def test_beta_falls_with_the_distance():
 # --- rows ----------------------------------------------------------------------------------------------------
 
 
-def test_switching_row_by_hand():
+def test_beta_row_by_hand():
     """-(1 - β) ξ (d - d1) outside d1: at 0.18 half of -0.3, at 0.16 a quarter of -0.2; inside it ξ (d1 - d)."""
-    found = bound([0.24, 0.18, 0.16, 0.12, 0.11, 0.09], type="switching")
+    found = bound([0.24, 0.18, 0.16, 0.12, 0.11, 0.09], type="beta")
     np.testing.assert_allclose(found, [-0.6, -0.15, -0.05, 0.0, 0.05, 0.15], atol=1e-12)
 
 
@@ -88,35 +88,35 @@ def test_cbf_row_by_hand():
     np.testing.assert_allclose(bound([0.15, 0.0], type="cbf", d_safe=0.15), [0.0, 0.75], atol=1e-12)
 
 
-@pytest.mark.parametrize(("kind", "capped"), [("switching", True), ("damper", True), ("cbf", False)])
+@pytest.mark.parametrize(("kind", "capped"), [("beta", True), ("damper", True), ("cbf", False)])
 def test_recovery_speed_is_capped(kind, capped):
     """5 · (0.12 - d) reaches the cap of 0.2 m/s at d = 0.08, deep in penetration it is still 0.2."""
     found = bound([0.08, 0.05, -1.0], type=kind)
     np.testing.assert_allclose(found, [0.2] * 3 if capped else [0.2, 0.35, 5.6], atol=1e-12)
 
 
-@pytest.mark.parametrize("kind", ["switching", "damper", "cbf"])
+@pytest.mark.parametrize("kind", ["beta", "damper", "cbf"])
 def test_bound_is_continuous_and_falls_with_the_distance(kind):
     d = np.linspace(-0.1, D2, 34001)  # steps of 1e-5 m
     found = bound(d, type=kind)
     steps = np.diff(found)
     assert (steps <= 0.0).all()
-    slope = XI * (1.0 + np.pi) if kind == "switching" else XI  # of (1 - β) ξ h at most ξ + ξ π h / 2 (d2 - d1)
+    slope = XI * (1.0 + np.pi) if kind == "beta" else XI  # of (1 - β) ξ h at most ξ + ξ π h / 2 (d2 - d1)
     assert steps.min() >= -slope * 1e-5 - 1e-12
 
 
 @pytest.mark.parametrize("edge", [D1, D2])
-def test_switching_bound_is_continuous_where_its_branches_meet(edge):
+def test_beta_bound_is_continuous_where_its_branches_meet(edge):
     """At d1 the branch changes; at d2 β runs out and the row goes over into the plain damper."""
-    inside, outside = bound([edge - TINY, edge + TINY], type="switching")
+    inside, outside = bound([edge - TINY, edge + TINY], type="beta")
     assert inside == pytest.approx(outside, abs=4 * XI * TINY)
-    assert bound([D2], type="switching") == pytest.approx(bound([D2], type="damper"))
+    assert bound([D2], type="beta") == pytest.approx(bound([D2], type="damper"))
 
 
 def test_a_row_that_is_met_exactly_never_passes_what_it_holds():
     """ḋ = bound from either side: the distance settles at d1 and is not crossed."""
     dt = 0.01
-    for kind in ("switching", "damper", "cbf"):
+    for kind in ("beta", "damper", "cbf"):
         d = np.array([0.23, 0.05])
         for _ in range(2000):
             d = d + dt * bound(d, type=kind)
@@ -129,7 +129,7 @@ def test_offset_is_added_and_near_pairs_keep_their_order(panda):
     places = [(0.25, 0.0, 0.6), (9.0, 0.0, 0.0), (0.1, 0.3, 0.3)]
     panda = replace(panda, acceleration={})
     scene = build_scene(panda, [obstacle(f"o{i}", SPHERE, place) for i, place in enumerate(places)])
-    settings = Avoidance(d1=D1, d2=D2, offset=0.1, row={"type": "switching", "gain": XI})
+    settings = Avoidance(d1=D1, d2=D2, offset=0.1, row={"type": "beta", "gain": XI})
     bench = Bench(scene, avoidance=settings)
     for i, place in enumerate(places):
         bench.query.place_obstacle(i, Sample.at(place, linear=[0.1, 0.2, -0.3]))
@@ -152,7 +152,7 @@ def test_offset_is_added_and_near_pairs_keep_their_order(panda):
     np.testing.assert_array_equal(proximity.drift, rate[near])
 
 
-@pytest.mark.parametrize("kind", ["switching", "damper", "cbf"])
+@pytest.mark.parametrize("kind", ["beta", "task-switching", "damper", "cbf"])
 def test_no_pair_gives_no_row(kind, panda):
     bench = Bench(build_scene(panda), avoidance=Avoidance(row={"type": kind}))
     rows = bench.compute(panda.home, reach=-1.0)[1].avoidance

@@ -192,7 +192,7 @@ def test_capsules_sit_around_the_meshes_in_the_link_frame(meshes):
         assert np.max(point_segment(points, a, b).distance) < body.geometry.radius + 1e-9
 
 
-@pytest.mark.filterwarnings("ignore::qpavoid.geometry.bodies.MeshWarning")
+@pytest.mark.filterwarnings("ignore::qpavoid.notes.RobotWarning")
 def test_scaled_mesh_of_a_urdf_keeps_its_size(tmp_path):
     """A tetrahedron in mm with a scale of 0.001."""
     o, x, y, z = "0 0 0", "100 0 0", "0 100 0", "0 0 100"

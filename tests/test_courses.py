@@ -11,8 +11,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
-from qpavoid import Obstacle, Sample, Status, build_scene, config, kernels
+from qpavoid import Obstacle, ReasonKind, Sample, Status, build_scene, config, kernels
 from qpavoid.errors import NumericalError
+from qpavoid.kernels.motions import (
+    FAR,
+    FAST,
+    FINE,
+    LEFT_HANDED,
+    NO_ROTATION,
+    NORMALISED,
+    NOT_FINITE,
+    POSE,
+    REST,
+    SAMPLE,
+)
 from qpavoid.motion import END_TOLERANCE, Motion, Orbit, Still, build_motion
 from qpavoid.obstacles import courses
 from qpavoid.proximity import DistanceQuery
@@ -61,7 +73,7 @@ def corners(motion):
 
 def assert_samples(views, motions, t):
     for view, motion in zip(views, motions, strict=True):
-        for found, expected in zip(view, motion.sample(t), strict=True):
+        for found, expected in zip(view[:4], motion.sample(t)[:4], strict=True):
             np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
 
 
@@ -132,7 +144,7 @@ def test_a_motion_that_gives_nonsense_is_named_and_moves_nothing(panda):
     scene = [Obstacle("broken", SPHERE, Broken()), Obstacle("other", SPHERE, Pendulum())]
     controller = make_controller(panda, scene)
     solution = controller.step(panda.home, 0.5)
-    assert solution.status is Status.RELAXED and "foreseen of an obstacle 'broken': NaN" in solution.reasons[0]
+    assert solution.status is Status.RELAXED and solution.reasons[0].kind is ReasonKind.NO_BACKUP
     before = [controller.obstacle_pose(name).position for name in ("broken", "other")]
     with pytest.raises(NumericalError, match="'broken': NaN or infinity"):
         controller.step(panda.home, 1.5)
@@ -228,40 +240,94 @@ def test_numbers_that_cannot_be_true_change_nothing(value):
             np.testing.assert_array_equal(part, was)
 
 
+@pytest.mark.parametrize(
+    ("change", "how", "code"),
+    [
+        (lambda x: None, SAMPLE, FINE),
+        *[(lambda x, c=c: x.__setitem__(c, np.nan), SAMPLE, NOT_FINITE) for c in (0, 8, 10, 17)],
+        (lambda x: x.__setitem__(4, -np.inf), POSE, NOT_FINITE),
+        (lambda x: x.__setitem__(17, np.nan), POSE, FINE),  # of a bare pose, that is nothing that was given
+        (lambda x: x.__setitem__(12, np.inf), REST, FINE),
+        (lambda x: x.__setitem__(9, -101.0), POSE, FAR),
+        (lambda x: x.__setitem__(11, 1e300), SAMPLE, FAR),
+        (lambda x: x.__setitem__(13, 11.0), SAMPLE, FAST),
+        (lambda x: x.__setitem__(15, -11.0), SAMPLE, FAST),
+        (lambda x: x.__setitem__(slice(0, 9), 0.0), POSE, NO_ROTATION),
+        (lambda x: x.__imul__(np.r_[np.full(9, 0.5), np.ones(9)]), POSE, NO_ROTATION),
+        (lambda x: x.__imul__(np.r_[np.full(9, 1.001), np.ones(9)]), POSE, NO_ROTATION),
+        (lambda x: x.__imul__(np.r_[np.full(3, -1.0), np.ones(15)]), POSE, LEFT_HANDED),
+        (lambda x: x.__imul__(np.r_[np.full(9, 1.0004), np.ones(9)]), SAMPLE, NORMALISED),
+        (lambda x: x.__imul__(np.r_[np.full(9, 1.0 + 1e-7), np.ones(9)]), SAMPLE, FINE),
+    ],
+)  # fmt: skip
+def test_check_states_by_definition(change, how, code):
+    rng = np.random.default_rng(0)
+    states = random_states(rng, 5, True)
+    change(states[3])
+    before, which = states.copy(), np.array([1, 3, 0])
+    kind = np.array([SAMPLE, how, POSE])
+    codes, off = kernels.check_states(states, which, kind, 100.0, 10.0)
+    assert codes.tolist() == [FINE, code, FINE]
+    if code == NORMALISED:
+        R, was = (x[3, :9].reshape(3, 3).T for x in (states, before))
+        U, _, V = np.linalg.svd(was)
+        np.testing.assert_allclose(R, U @ V, atol=1e-15)  # the nearest rotation
+        assert off[1] == pytest.approx(np.abs(was.T @ was - np.eye(3)).max())
+        states[3, :9] = before[3, :9]
+    np.testing.assert_array_equal(states, before)
+
+
+@given(data=st.data())
+def test_check_states_normalises_what_is_nearly_a_rotation(data):
+    """Whatever is less than 1e-3 off in every entry of RᵀR."""
+    rng = np.random.default_rng(data.draw(st.integers(0, 10**6)))
+    states = random_states(rng, 1, True)
+    error = rng.normal(size=(3, 3))
+    states[0, :9] += (data.draw(st.floats(0.0, 1e-3)) * error / np.abs(error).max()).ravel()
+    was = states[0, :9].reshape(3, 3).T.copy()
+    off = np.abs(was.T @ was - np.eye(3)).max()
+    codes, found = kernels.check_states(states, np.array([0]), np.array([SAMPLE]), 100.0, 1e3)
+    assert found[0] == pytest.approx(off, abs=1e-15)
+    assert codes[0] == (NO_ROTATION if off > 1e-3 else NORMALISED if off > 1e-6 else FINE)
+    if codes[0] == NORMALISED:
+        R = states[0, :9].reshape(3, 3).T
+        np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-15)
+
+
 def random_news(rng, count=9):
-    """Arguments of `take_in`: some obstacles as bare poses, of which some are new, and one that is out of its mind."""
-    which = rng.permutation(count)[:6]
+    """Arguments of `take_in`: samples, bare poses of which some are first ones or of the same time, and one at rest."""
+    which = rng.permutation(count)[:7]
     news, last = random_states(rng, count, True), random_states(rng, count, True)
-    bad = which[0]
-    news[bad, rng.integers(12)] = rng.choice([np.nan, np.inf, -np.inf])
-    news[which[2], 15] = np.nan  # of a bare pose, that is nothing that was given
-    posed = np.array([False, False, True, True, True, False])
-    age = rng.integers(-1, 4, count)
-    age[which[3]], age[which[4]] = -1, 2
-    return [which, posed, news, age, last, random_states(rng, count, True), 0.01]
+    kind = np.array([SAMPLE, POSE, POSE, POSE, REST, SAMPLE, POSE])
+    times, stamps = rng.uniform(1.0, 2.0, 7), rng.uniform(0.0, 0.9, count)
+    stamps[which[1]], stamps[which[2]], stamps[which[0]] = np.nan, times[2] - 1e-6, np.nan
+    news[which[6], 9] += 1e4  # faster than anything
+    return [which, kind, times, news, stamps, last, random_states(rng, count, True), 1e-5, 1e3]
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_what_is_given_is_taken_in_with_the_twist_that_has_led_to_it(seed):
+def test_take_in_gives_bare_poses_the_twist_that_has_led_to_them(seed):
     rng = np.random.default_rng(seed)
-    which, posed, news, age, last, states, dt = args = random_news(rng)
-    given, ages, before, were = news.copy(), age.copy(), last.copy(), states.copy()
+    which, kind, times, news, stamps, last, states, _, _ = args = random_news(rng)
+    given, known, before, were = news.copy(), stamps.copy(), last.copy(), states.copy()
     fine = kernels.take_in(*args)
-    assert fine.tolist() == [False, True, True, True, True, True]
-    for i, bare in zip(which[1:], posed[1:], strict=True):
+    assert fine.tolist() == [True] * 6 + [False]
+    for k, i in enumerate(which[:6]):
         expected = given[i].copy()
-        if bare:
+        if kind[k] != SAMPLE:
             expected[12:] = 0.0
-            if ages[i] >= 0:
-                elapsed = dt * (ages[i] + 1)
-                R, R0 = (state[i, :9].reshape(3, 3).T for state in (given, before))
-                expected[12:15] = (given[i, 9:12] - before[i, 9:12]) / elapsed
-                expected[15:] = pin.log3(R @ R0.T) / elapsed
+        if k == 2:
+            expected[12:] = before[i, 12:]
+        elif k == 3:
+            elapsed = times[k] - known[i]
+            R, R0 = (state[i, :9].reshape(3, 3).T for state in (given, before))
+            expected[12:15] = (given[i, 9:12] - before[i, 9:12]) / elapsed
+            expected[15:] = pin.log3(R @ R0.T) / elapsed
         np.testing.assert_allclose(states[i], expected, rtol=1e-9, atol=1e-9)
         np.testing.assert_array_equal(last[i], states[i])
-        assert age[i] == 0
-    others = np.setdiff1d(np.arange(9), which[1:])
-    for now, was in ((age, ages), (last, before), (states, were)):
+        assert stamps[i] == times[k]
+    others = np.setdiff1d(np.arange(9), which[:6])
+    for now, was in ((stamps, known), (last, before), (states, were)):
         np.testing.assert_array_equal(now[others], was[others])
 
 

@@ -2,6 +2,7 @@
 
 import math
 import xml.etree.ElementTree as ElementTree
+from itertools import pairwise
 
 import coal
 import numpy as np
@@ -16,15 +17,16 @@ from scipy.spatial import ConvexHull
 from qpavoid import ConfigError, Robot, UnknownName
 from qpavoid.config import Box, Capsule, Hull, RobotConfig, Sphere
 from qpavoid.describe.add import Wishes, describe
-from qpavoid.describe.ends import end_effectors
 from qpavoid.describe.fit import cut, decompose, fit_piece, hull_volume, triangles
+from qpavoid.describe.home import BENT, ROOM, Limbs, find_home
 from qpavoid.describe.sampling import (
-    CLEAR,
+    D1,
     NEAR,
     PairDistances,
     Space,
     always_near,
-    clear_home,
+    robot_size,
+    safety_distances,
     sample_pairs,
     touching,
 )
@@ -33,6 +35,7 @@ from qpavoid.describe.srdf import MADE_BY, Semantics, find_srdf, read_srdf, srdf
 from qpavoid.describe.texts import description_files
 from qpavoid.describe.written import BLANK, seal, untouched, write_files
 from qpavoid.geometry.capsules import CapsuleFit, fit_capsule
+from qpavoid.geometry.ends import end_effectors
 from qpavoid.geometry.segments import point_segment
 from qpavoid.geometry.urdf import read_model
 from qpavoid.motion import rpy_to_matrix
@@ -173,11 +176,11 @@ def signed_distance(point, place, shape, at):
 
 
 def test_more_faithful_bodies_take_less_room(panda_described):
-    volumes = {kind: sum(v[0] for v in d.volume.values()) for kind, d in panda_described.items()}
-    hulls = sum(v[1] for v in panda_described["auto"].volume.values())
+    volumes = {kind: sum(link.volume for link in d.links.values()) for kind, d in panda_described.items()}
+    hulls = sum(link.hulls for link in panda_described["auto"].links.values())
     assert volumes["convex"] == pytest.approx(hulls)
     assert hulls < volumes["auto"] <= volumes["capsules"] <= volumes["capsule"] < 2.0 * hulls
-    assert all(taken <= 2.0 * hull for taken, hull in panda_described["auto"].volume.values())
+    assert all(link.volume <= 2.0 * link.hulls for link in panda_described["auto"].links.values())
 
 
 def test_single_links_may_be_another_kind():
@@ -216,7 +219,7 @@ def test_descent_finds_what_samples_miss(tmp_path):
     robot = chain(tmp_path, [ball("base", "link0", tip, 0.01), ball("tip", "link2", [0, 0, 0.25], 0.01)])
     assert touching(robot, np.array([1.2, -0.9]))
     distances, draws = PairDistances(robot), Space(robot).draw(np.random.default_rng(0), 10)
-    assert min(distances.all(q)[0] for q in draws) > NEAR
+    assert min(distances.all(q)[0] for q in draws) > NEAR * robot_size(robot)
     assert not sample_pairs(robot, samples=10).never[0]
 
 
@@ -246,23 +249,64 @@ def test_a_pair_that_cannot_part_is_always_near(tmp_path):
     assert len(always_near(robot, 50)) == 0
     held = chain(tmp_path, [ball("a", "link0", [0.0, 0.0, 0.26], 0.01), ball("b", "link2", [0, 0, -0.3], 0.01)],
                  limits={"position": {"joint1": (-0.01, 0.01), "joint2": (-0.01, 0.01)}})  # fmt: skip
-    assert len(always_near(held, 50)) == len(held.bodies.collisionPairs)
-    assert sample_pairs(held, 300).always.all()
+    sampled = sample_pairs(held, 300)  # near all along its range, by design, but never in touch: it is kept
+    assert not sampled.always.any() and sampled.contact[0] == 0.0
+    gap = np.median([touching(held, q, np.inf)[0][2] for q in sampled.poses])
+    assert safety_distances(sampled)[0] == pytest.approx(0.5 * gap, abs=1e-4) and gap < D1
+
+
+@pytest.mark.parametrize(("limit", "share"), [(0.4, 0.5), (2.0, 0.1)])
+def test_contact_is_a_share_of_the_samples(tmp_path, limit, share):
+    """A ball at the tip of two links that fold touches one on the base while |x| < a: its share is counted."""
+    limits = {"position": {"joint1": (-1e-6, 1e-6), "joint2": (-limit, limit)}}
+    robot = chain(tmp_path, [ball("a", "link0", [0, 0, 0.85], 0.04), ball("b", "link2", [0, 0, 0.25], 0.0119)],
+                  limits=limits)  # fmt: skip
+    half = 2.0 * math.asin(0.0519 / 2.0 / 0.25)  # chord of the arc that b's centre may be off
+    sampled = sample_pairs(robot, 2000)
+    assert sampled.contact[0] == pytest.approx(min(1.0, half / limit), abs=0.05)
+    assert sampled.contact[0] == pytest.approx(share, abs=0.06)
+    assert not sampled.always[0]
 
 
 def test_home_is_the_wish_or_near_it(tmp_path):
+    """Clear by 4/3 of the safety distance, or of the pair's own, and hardly farther from the wish than that takes."""
     robot = chain(tmp_path, [ball("base", "link0", [0, 0, 0.85]), ball("tip", "link2", [0, 0, 0.25])])
     assert touching(robot, robot.home)[0][2] < 0.0
-    good = np.array([0.0, 1.0])
-    q, d, wish = clear_home(robot, [robot.home, good])
-    assert wish == 1 and np.array_equal(q, good) and d >= CLEAR
-    q, d, wish = clear_home(robot, [robot.home])
-    assert wish is None and d >= CLEAR and not touching(robot, q)
-    assert np.linalg.norm(q - robot.home) < 1.0
-    bounds = robot.bounds()
-    assert np.all(q >= bounds.lower) and np.all(q <= bounds.upper)
+    d1, good = np.array([D1]), np.array([0.0, 1.0])
+    home = find_home(robot, [robot.home, good], [], d1)
+    assert home.wish == 1 and np.array_equal(home.q, good) and home.clearance >= ROOM * D1 and home.short == 0.0
+    for own in (D1, 0.003):
+        home = find_home(robot, [robot.home], [], np.array([own]))
+        assert home.wish is None and touching(robot, home.q, np.inf)[0][2] == home.clearance
+        assert ROOM * own <= home.clearance < ROOM * own + 0.02 and home.nearest == ("base", "tip")
+        assert np.linalg.norm(home.q - robot.home) < 1.0
+        bounds = robot.bounds()
+        assert np.all(home.q >= bounds.lower) and np.all(home.q <= bounds.upper)
 
 
+def test_home_is_bent(tmp_path):
+    """Stretched, links cannot move their tip along themselves: the smaller singular value is that of a closed form."""
+    robot = chain(tmp_path, [ball("base", "link0", [0, 0, 0.0])])
+    limbs = Limbs(robot, ["link2"])
+    for bend in (0.0, 0.7, -1.2):
+        J = np.array([[0.3 + 0.0 * bend, 0.0], [0.0, 0.0]])  # of the frame of link2, 0.3 m from joint1 and on joint2
+        (limb,) = limbs.at(np.array([0.2, bend]))
+        assert limb.value == pytest.approx(np.linalg.svd(J, compute_uv=False)[0], abs=1e-9)
+    tool = chain(tmp_path, [ball("base", "link0", [0, 0, 0.0])], 3)
+    q = np.array([0.3, 0.8, 0.1])
+    (limb,) = Limbs(tool, ["link3"]).at(q)
+    angles = np.cumsum(q)
+    along = 0.3 * np.array([[-np.cos(a), -np.sin(a)] for a in angles])
+    columns = np.array([along[0] + along[1], along[1], [0.0, 0.0]]).T
+    assert limb.value == pytest.approx(np.linalg.svd(columns, compute_uv=False)[1], abs=1e-9)
+    straight = find_home(tool, [np.zeros(3)], ["link3"], np.zeros(0))
+    assert straight.wish is None and not straight.singular and straight.conditioning["link3"].ratio >= BENT
+    assert np.count_nonzero(straight.q) == 1  # one bend is enough
+    pinned = find_home(tool, [np.zeros(3)], ["link3"], np.zeros(0), pinned=["joint2"])
+    assert pinned.singular == ["link3"] and pinned.q[1] == 0.0
+
+
+@pytest.mark.filterwarnings("ignore::qpavoid.notes.RobotWarning")
 def test_samples_keep_to_the_limits_and_the_root_stays():
     robot = Robot.from_urdf(EXAMPLES / "kinova_description/robots/kinova.urdf", root_joint="free_flyer")
     bounds = robot.bounds()
@@ -303,6 +347,31 @@ def test_known_ends_come_first_and_are_not_doubled():
     assert sorted(ends) == [
         "left_sole_link", "right_sole_link", "wrist_left_ft_tool_link", "wrist_right_ft_tool_link"
     ]  # fmt: skip
+
+
+def test_hands_of_a_dual_arm_are_its_ends(tmp_path):
+    """Two arms of seven joints below a waist, with a thumb of five joints and fingers of four, none called a finger."""
+    links, joints = ["base", "torso"], ["base torso"]
+    for side in "lr":
+        arm = ["torso", *(f"{side}_arm{i}" for i in range(1, 8))]
+        links += arm[1:]
+        joints += [f"{a} {b}" for a, b in pairwise(arm)]
+        for digit, count in (("th", 5), ("ff", 4), ("mf", 4), ("rf", 4), ("lf", 4)):
+            chain = [arm[-1], *(f"{side}_{digit}{i}" for i in range(count))]
+            links += chain[1:]
+            joints += [f"{a} {b}" for a, b in pairwise(chain)]
+    text = "".join(f'<link name="{link}"/>' for link in [*links, "l_tcp"])
+    for joint in joints:
+        parent, child = joint.split()
+        text += (
+            f'<joint name="{child}_joint" type="revolute"><parent link="{parent}"/><child link="{child}"/>'
+            '<origin xyz="0 0 .1"/><axis xyz="1 0 0"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint>'
+        )
+    text += '<joint name="flange" type="fixed"><parent link="l_arm7"/><child link="l_tcp"/></joint>'
+    (tmp_path / "dual.urdf").write_text(f'<robot name="dual">{text}</robot>')
+    model = read_model(tmp_path / "dual.urdf", "fixed")
+    assert end_effectors(model) == ["l_tcp", "r_arm7"]
+    assert end_effectors(model, ["l_arm7"]) == ["l_tcp", "r_arm7"]  # an SRDF names the link that carries the hand
 
 
 def test_srdf_is_read_back_as_written(tmp_path):
@@ -347,11 +416,11 @@ def test_the_written_robot_is_the_one_that_was_worked_out(panda_described, kind,
     described = panda_described[kind]
     write_files(description_files(described, tmp_path / "made"))
     robot = Robot.load(str(tmp_path / "made" / "robot.yaml"))
-    assert pairs(robot) == pairs(described.robot) and len(pairs(robot)) == described.counts["watched"]
+    assert pairs(robot) == pairs(described.robot) and len(pairs(robot)) == described.counts["active"]
     np.testing.assert_allclose(robot.home, described.robot.home, atol=1e-5)
     assert robot.end_effectors == ("panda_hand_tcp",)
-    assert not touching(robot, robot.home, CLEAR)
-    assert robot.always_touching == ()
+    assert not touching(robot, robot.home, D1)
+    assert robot.always_touching == () and robot.margins == described.robot.margins
     for mine, theirs in zip(robot.bodies.geometryObjects, described.robot.bodies.geometryObjects, strict=True):
         assert mine.name == theirs.name
         np.testing.assert_allclose(mine.placement.homogeneous, theirs.placement.homogeneous, atol=1e-12)
@@ -364,16 +433,19 @@ def test_an_srdf_is_honoured_and_its_pairs_are_kept(panda_described, tmp_path):
     links = {body.name: body.frame for body in described.config.bodies}
     assert not any(frozenset(links[b] for b in pair) in theirs for pair in pairs(described.robot))
     counts = described.counts
-    assert counts["all"] == sum(counts[k] for k in ("adjacent", "srdf", "always", "never", "watched"))
+    assert counts["all"] == sum(counts[k] for k in ("adjacent", "srdf", "always", "drawn in", "never", "active"))
     path = tmp_path / "made" / "panda.srdf"
     write_files(description_files(described, path.parent))
     assert {d.get("reason") for d in ElementTree.parse(path).iter("disable_collisions")} >= {"Adjacent", "Never"}
 
 
-def test_mimic_joints_are_held_where_they_belong(panda_described):
-    """panda_finger_joint2 follows joint1, which the SRDF's pose has at 1 mm, and is held with it."""
-    assert panda_described["auto"].config.lock == {"panda_finger_joint1": 0.001}
-    assert panda_described["auto"].robot.model.nv == 7
+def test_mimic_drivers_stay_free(panda_described):
+    """panda_finger_joint2 follows joint1, which stays a coordinate unless it is locked, and is where the SRDF says."""
+    described = panda_described["auto"]
+    assert described.config.lock == {} and described.robot.model.nv == 8
+    assert described.config.home["panda_finger_joint1"] == 0.001
+    locked = describe(PANDA, Wishes(lock=["panda_finger_joint1"], samples=10))
+    assert locked.config.lock == {"panda_finger_joint1": 0.001} and locked.robot.model.nv == 7
 
 
 def test_home_and_locks_may_be_wished():
@@ -397,7 +469,7 @@ def test_capsules_too_fat_for_the_home_pose_become_exact(tmp_path):
     described = describe(urdf, Wishes(samples=50))
     shapes = {body.name: body.shape.type for body in described.config.bodies}
     assert shapes["link0"] == shapes["link2"] == "cylinder"
-    assert any("exact where capsules" in note for note in described.notes)
+    assert any("exact bodies" in note.what and {"link0", "link2"} <= {*note.subject} for note in described.notes)
 
 
 def test_bodies_are_fitted_to_what_is_seen_where_there_is_nothing_else(tmp_path):
@@ -405,10 +477,10 @@ def test_bodies_are_fitted_to_what_is_seen_where_there_is_nothing_else(tmp_path)
     urdf.write_text(urdf.read_text().replace("collision>", "visual>"))
     described = describe(urdf, Wishes(samples=50))
     assert {type(body.shape) for body in described.config.bodies} <= {Box, Capsule}
-    assert any("no collision geometry" in note for note in described.notes)
+    assert any("no collision shape" in note.what for note in described.notes)
     urdf.write_text(urdf.read_text().replace("visual>", "nothing>"))
     described = describe(urdf, Wishes(samples=50))
-    assert described.config.bodies == [] and any("no geometry at all" in note for note in described.notes)
+    assert described.config.bodies == [] and any("no geometry at all" in note.what for note in described.notes)
     assert Robot.from_config(described.config, urdf).bodies.ngeoms == 0
 
 
@@ -436,6 +508,7 @@ def test_hulls_of_a_robot_yaml(panda_convex):
         Robot.from_urdf(PANDA, bodies=bodies)
 
 
+@pytest.mark.filterwarnings("ignore::qpavoid.notes.RobotWarning")
 def test_hull_of_a_round_flat_face():
     """qhull cuts the disc into a fan of triangles whose tip has more neighbours than a hull can hold."""
     robot = Robot.from_urdf(EXAMPLES / "centauro_description/urdf/centauro.urdf")

@@ -22,7 +22,7 @@ def least_on_the_way(log, controller, steps=10):
     return min(ruler.least_between(q, v, dt, t, steps) for q, v, t in zip(log.q, log.v, log.t, strict=True))
 
 
-@pytest.mark.parametrize("row", ["switching", "damper"])
+@pytest.mark.parametrize("row", ["beta", "task-switching", "damper"])
 @pytest.mark.parametrize("shape", [PLATE, BALL, BOX], ids=["plate", "ball", "box"])
 @pytest.mark.parametrize(("dt", "duration"), [(0.001, 0.8), (0.01, 2.0), (0.02, 2.0), (0.05, 3.0)])
 def test_no_period_and_no_speed_pass_the_safe_distance(row, shape, dt, duration):
@@ -40,7 +40,9 @@ def test_no_period_and_no_speed_pass_the_safe_distance(row, shape, dt, duration)
     assert least_on_the_way(log, controller, 10 if dt > 0.001 else 2) > HELD - 1e-3
     assert log.metrics()["peak_velocity"] > 1.0
     counts = log.metrics()["status_counts"]
-    assert counts["RELAXED"] == counts["STOPPED"] == 0
+    # rows with α ask for the stop at once, and at the margin may lack a few mm/s
+    assert counts["STOPPED"] == 0 and log.slack.max() <= (4e-3 if row == "task-switching" else 0.0)
+    assert counts["RELAXED"] <= (0.01 * len(log.t) if row == "task-switching" else 0)
     bounds = controller.scene.robot.bounds()
     change = np.abs(np.diff(log.v, axis=0, prepend=0.0 * log.v[:1]))
     assert (change <= dt * bounds.acceleration + 1e-9).all()

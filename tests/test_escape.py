@@ -390,8 +390,8 @@ def test_what_was_found_clear_is_looked_at_anew_when_obstacles_turn(tmp_path):
 
     start = Start(robot.home, np.zeros(2), np.zeros(2), 0.0, planner.flights.parted)
     for speed, clear in ((0.0, 1.5), (0.5, 0.25 / 0.5)):
-        for _ in range(200):  # what is foreseen is of the mean of what was told lately
-            controller._obstacles.observe(0.0, told(speed))
+        for k in range(200):  # what is foreseen is of the mean of what was told lately
+            controller._obstacles.observe(0.01 * (k - 199), told(speed))
         planner.flights.forget_foreseen()
         found, _ = planner._way_out(start)
         if speed == 0.0:

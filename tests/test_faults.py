@@ -5,7 +5,7 @@ import pinocchio as pin
 import pytest
 from closed_loop import Ruler, cartesian, drive, make_controller
 
-from qpavoid import Avoidance, NumericalError, Obstacle, Sample, Status
+from qpavoid import Avoidance, NumericalError, Obstacle, ReasonKind, Sample, Severity, Status
 from qpavoid.config import Box, Damper, Sensing, Sphere
 from qpavoid.obstacles.sensing import Pose
 
@@ -29,6 +29,11 @@ def with_(value, index, size=7):
     return bad
 
 
+def sample(**parts):
+    """A sample at (0.5, 0, 0.5), but for some parts, which may be anything."""
+    return Sample.at([0.5, 0.0, 0.5])._replace(**parts)
+
+
 def run(controller, q, ticks, calls=None):
     """A loop in which some ticks are called with other arguments; the velocities, and what was said at those ticks."""
     vs, said = [], {}
@@ -46,23 +51,34 @@ def run(controller, q, ticks, calls=None):
 
 
 @pytest.mark.parametrize(
-    ("call", "reason"),
+    ("call", "subject"),
     [
-        ({"q": np.full(7, NAN)}, "q: NaN or infinity at index 0"),
-        ({"q": with_(INF, 6)}, "q: NaN or infinity at index 6"),
-        ({"q": np.full(7, 1e200)}, "q: absurdly large"),
-        ({"v": with_(NAN, 2)}, "v: NaN or infinity at index 2"),
-        ({"v": with_(-INF, 0)}, "v: NaN or infinity at index 0"),
-        ({"t": NAN}, "t: nan"),
-        ({"t": INF}, "t: inf"),
-        ({"targets": {TOOL: Sample(np.array([0.5, NAN, 0.5]), np.eye(3), np.zeros(3), np.zeros(3))}}, TOOL),
-        ({"targets": {TOOL: Sample(np.array([0.5, 0.0, 0.5]), np.eye(3), np.full(3, INF), np.zeros(3))}}, TOOL),
+        ({"q": np.full(7, NAN)}, ("q",)),
+        ({"q": with_(INF, 6)}, ("q",)),
+        ({"q": np.full(7, 1e200)}, ("q", "panda_joint1")),
+        ({"q": with_(17.0, 3)}, ("q", "panda_joint4")),
+        ({"v": with_(NAN, 2)}, ("v",)),
+        ({"v": with_(-INF, 0)}, ("v",)),
+        ({"v": with_(2e3, 0)}, ("v",)),
+        ({"t": NAN}, ("t",)),
+        ({"t": INF}, ("t",)),
+        ({"t": 1.7e15}, ("t",)),
+        ({"t": 10**400}, ("t",)),
+        ({"targets": {TOOL: sample(position=np.array([0.5, NAN, 0.5]))}}, ("target", TOOL)),
+        ({"targets": {TOOL: sample(position=np.array([0.5, 2e6, 0.5]))}}, ("target", TOOL)),
+        ({"targets": {TOOL: sample(linear=np.full(3, INF))}}, ("target", TOOL)),
+        ({"targets": {TOOL: sample(angular=np.full(3, 2e3))}}, ("target", TOOL)),
+        ({"targets": {TOOL: sample(rotation=np.zeros((3, 3)))}}, ("target", TOOL)),
+        ({"targets": {TOOL: sample(rotation=np.diag([1.0, -1.0, 1.0]))}}, ("target", TOOL)),
+        ({"targets": {TOOL: Pose(np.array([0.5, 0.0, 0.5]), 0.5 * np.eye(3))}}, ("target", TOOL)),
     ],
 )
-def test_a_moving_robot_brakes_says_why_and_goes_on(panda, call, reason):
+def test_a_moving_robot_brakes_says_why_and_goes_on(panda, call, subject):
     """The stop is the start of a braking motion: every joint slowed alike, by no more than its acceleration."""
     vs, said, _ = run(panda_controller(panda), panda.home, 30, {12: call})
-    assert said[12].status is Status.STOPPED and reason in said[12].reasons[0]
+    assert said[12].status is Status.STOPPED
+    reason = said[12].reasons[0]
+    assert reason.kind is ReasonKind.IMPLAUSIBLE and reason.severity is Severity.ALARM and reason.subject == subject
     before, at, step = vs[11], vs[12], 0.01 * panda.bounds().acceleration
     assert np.abs(before).max() > 0.1
     shares = at / before
@@ -109,7 +125,13 @@ def test_a_blind_stop_ends_at_rest_inside_the_joint_limits(panda):
         ({"q": np.zeros(6)}, "q: shape"),
         ({"q": "home"}, "q: not"),
         ({"v": np.zeros((7, 1))}, "v: shape"),
-        ({"t": None}, "t: not a number"),
+        ({"t": "now"}, "t: not a number"),
+        ({"t": np.zeros(2)}, "t: not a number"),
+        ({"q": [10**400] * 7}, "q: not an array"),
+        ({"targets": [TOOL]}, "targets: give a mapping"),
+        ({"obstacles": "ball"}, "obstacles: give a mapping"),
+        ({"obstacles": {"ball": Sample.at([1, 0, 0], t="now")}}, "obstacle 'ball': t: not a number"),
+        ({"obstacles": {"ball": Sample.at([1, 0, 0], linear=[1, 0, 0], at_rest=True)}}, "obstacle 'ball': at_rest"),
         ({"targets": {TOOL: Sample(np.zeros(2), np.eye(3), np.zeros(3), np.zeros(3))}}, f"target '{TOOL}': position"),
         ({"targets": {TOOL: np.eye(4)}}, f"target '{TOOL}': neither"),
         ({"obstacles": {"ball": Sample(np.zeros(3), np.eye(4), np.zeros(3), np.zeros(3))}}, "obstacle 'ball': rot"),
@@ -140,16 +162,29 @@ def test_a_joint_outside_its_limits_is_brought_back(panda):
         assert left <= out[-1] + 1e-9
         assert (np.abs(tick.solution.v) <= bounds.velocity + 1e-9).all()
         out.append(left)
-        said = [line.split()[1] for line in tick.solution.assumed]  # "q: panda_joint1 is 0.1 rad …"
-        assert bool(said) == (left > 1e-6) and set(said) <= {"panda_joint1", "panda_joint4"}
+        said = {reason.subject: reason.amount for reason in tick.solution.assumptions}
+        assert all(reason.kind is ReasonKind.LIMIT_RECOVERY for reason in tick.solution.assumptions)
+        assert bool(said) == (left > 1e-6) and set(said) <= {("panda_joint1",), ("panda_joint4",)}
+        assert max(map(abs, said.values()), default=0.0) == pytest.approx(left, abs=1e-6)
     assert out[1] == pytest.approx(0.1) and out[-1] < 1e-6
 
 
-def test_a_configuration_in_degrees_is_said(panda):
-    solution = make_controller(panda, frame=TOOL).step(np.rad2deg(panda.home))
-    assert (np.abs(solution.v) <= panda.bounds().velocity).all()
-    said = "q: panda_joint2 is 43.24 rad or m below its lower limit, and sent back; is it in degrees?"
-    assert said in solution.assumed
+def test_a_configuration_in_degrees_is_a_stop(panda):
+    q, bounds = np.rad2deg(panda.home), panda.bounds()
+    solution = make_controller(panda, frame=TOOL).step(q)
+    assert solution.status is Status.STOPPED and not solution.v.any()
+    beyond = np.maximum(q - bounds.upper, bounds.lower - q)
+    expected = {("q", f"panda_joint{i + 1}"): beyond[i] for i in np.flatnonzero(beyond > 2 * np.pi)}
+    assert {reason.subject: reason.amount for reason in solution.reasons} == pytest.approx(expected)
+    assert len(expected) > 2 and {(r.kind, r.unit) for r in solution.reasons} == {(ReasonKind.IMPLAUSIBLE, "rad")}
+
+
+def test_a_turn_beyond_the_limits_is_the_border_of_what_is_believed(panda):
+    for beyond, status in ((2 * np.pi - 1e-6, Status.SOLVED), (2 * np.pi + 1e-6, Status.STOPPED)):
+        q = panda.home.copy()
+        q[1] = panda.bounds().upper[1] + beyond
+        solution = make_controller(panda).step(q)
+        assert (solution.status is Status.STOPPED) == (status is Status.STOPPED)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -204,7 +239,9 @@ def test_an_obstacle_without_news_moves_on_grows_and_stops_the_robot(tmp_path):
         age = 0.01 * (k - 1) if k < 100 else 0.0
         margin = 0.1 * max(age - 0.2, 0.0)
         if age > 0.2 + 1e-9:
-            assert f"ball: not seen for {age:.3f} s, margin {1e3 * margin:.0f} mm" in tick.solution.assumed
+            (stale,) = tick.solution.assumptions
+            assert stale.kind is ReasonKind.STALE and stale.subject == ("ball",) and stale.severity is Severity.WARNING
+            assert stale.amount == pytest.approx(age)
         gap = np.linalg.norm(tick.state.q - [0.5 - 0.001 * k, 0.0, 0.0]) - 0.1
         if len(tick.proximity.pair):
             assert gap > 0.0198
@@ -214,7 +251,9 @@ def test_an_obstacle_without_news_moves_on_grows_and_stops_the_robot(tmp_path):
         stopped.append(tick.solution.status is Status.STOPPED)
         assert stopped[-1] == (age > 0.5 + 1e-9)
         if stopped[-1]:
-            assert f"ball: not seen for {age:.3f} s" in tick.solution.reasons
+            (late,) = tick.solution.reasons
+            assert late.kind is ReasonKind.STALE and late.severity is Severity.ALARM
+            assert late.amount == pytest.approx(age)
     assert sum(stopped) == 48 and not stopped[100]
 
 

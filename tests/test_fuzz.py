@@ -30,7 +30,7 @@ from qpavoid.motion import build_motion
 if not hasattr(signal, "SIGALRM"):
     pytest.skip("a hang can only be stopped with SIGALRM", allow_module_level=True)
 
-pytestmark = pytest.mark.filterwarnings("ignore::qpavoid.geometry.urdf.MimicWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::qpavoid.notes.RobotWarning")
 
 LIMIT = 300
 """Seconds after which a test counts as hanging, however busy the machine is."""
@@ -239,11 +239,10 @@ CASES = [
     ("arm.urdf", urdf('xyz="1 0 0"', 'xyz="0 0 0"'), f"{J2}: axis xyz='0 0 0' has no length; give a direction"),
     ("arm.urdf", urdf('xyz="1 0 0"', 'xyz="1e-320 0 0"'), "has no length"),
     ("arm.urdf", urdf('<axis xyz="0 0 1"/>', "<axis/>"), "has no length"),
-    ("arm.urdf", urdf('lower="-2"', 'lower="3"'), r"joint 'j1': limit: needs lower <= upper, got 3, 2"),
     ("arm.urdf", urdf('lower="-2"', 'lower="nan"'), "limit lower='nan': must be finite"),
     ("arm.urdf", urdf('velocity="1.5"', 'velocity="-1"'), "limit velocity=-1: must not be negative"),
-    ("arm.urdf", urdf('radius="0.05"', 'radius="0"'), "link 'a': sphere radius='0': must be above 0"),
-    ("arm.urdf", urdf("0.1 0.1 0.2", "0.1 -1 0.2"), "link 'b': box size='0.1 -1 0.2': must be above 0"),
+    ("arm.urdf", urdf('radius="0.05"', 'radius="-1"'), "link 'a': sphere radius='-1': must not be negative"),
+    ("arm.urdf", urdf("0.1 0.1 0.2", "0.1 -1 0.2"), "link 'b': box size='0.1 -1 0.2': must not be negative"),
     ("arm.urdf", urdf('multiplier="2"', 'multiplier="inf"'), "joint 'j3': mimic multiplier='inf': must be finite"),
     ("arm.urdf", re.sub("revolute|prismatic|continuous", "fixed", URDF), "no joint of arm.urdf moves"),
     ("arm.urdf", urdf('box size="0.1 0.1 0.2"', f'mesh filename="{"A" * 5000}.stl"'), "File name too long| … "),
@@ -455,7 +454,7 @@ def stl(*triangles, count=None) -> bytes:
 CORNERS = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
 FACES = [CORNERS[[0, 2, 1]], CORNERS[[0, 1, 3]], CORNERS[[0, 3, 2]], CORNERS[[1, 2, 3]]]
 NAN = np.full((3, 3), np.nan)
-NOT_A_NUMBER, READER = "a corner is NaN, infinite or beyond 1e.09 m", "name the folder that holds the package"
+NOT_A_NUMBER, READER = "a corner is NaN, infinite or beyond 1e.09 m", "; export it again"
 MESHES = {
     "good.stl": (stl(*FACES), None),
     "one.stl": (stl(FACES[0]), None),
@@ -466,7 +465,7 @@ MESHES = {
     "inf.stl": (stl(np.diag([np.inf, 1, 1]), *FACES), NOT_A_NUMBER),
     "huge.stl": (stl(np.diag([3e38, 3e38, 3e38]), *FACES), NOT_A_NUMBER),
     "nan.obj": (b"v nan 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 2 3 4\n", NOT_A_NUMBER),
-    "all_nan.stl": (stl(NAN), "has no triangle|a corner is NaN|name the folder"),
+    "all_nan.stl": (stl(NAN), "has no triangle|a corner is NaN"),
     "empty.stl": (b"", READER),
     "none.stl": (stl(), READER),
     "garbage.stl": (bytes(range(256)) * 20, READER),

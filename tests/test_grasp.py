@@ -25,6 +25,7 @@ from qpavoid.config import Box, Capsule, Cylinder, HalfSpace, PointCloud, Sphere
 from qpavoid.geometry.bodies import make_shape
 
 TCP = "panda_hand_tcp"
+TCP_BODY = "panda_hand_0"
 BOX = Box(size=(0.06, 0.06, 0.24))
 POLE = Cylinder(radius=0.03, length=0.8)
 HOLD = 0.02
@@ -317,8 +318,14 @@ def test_wrong_calls_are_named_with_a_remedy(panda):
         controller.attach("box", "universe")
     with pytest.raises(ConfigError, match="not carried"):
         controller.release("box")
+    with pytest.raises(UnknownName, match="no body or obstacle 'nobody'"):
+        controller.allow_contact("box", [TCP_BODY, "nobody"])
+    with pytest.raises(UnknownName, match="no body or obstacle 3"):
+        controller.allow_contact("box", [3])
+    with pytest.raises(UnknownName, match="list of names"):
+        controller.allow_contact("box", 3)
     with pytest.raises(ConfigError, match="no pair"):
-        controller.allow_contact("box", ["nobody"])
+        controller.allow_contact("pole", "pole")
     controller.step(panda.home, obstacles={"box": Sample.at([5.0, 0, 0])})
     with pytest.raises(ConfigError, match="too far"):
         controller.attach("box", TCP)
@@ -333,11 +340,11 @@ def test_what_is_given_of_a_carried_box_is_not_read_and_that_is_said(panda):
     controller.attach("box", TCP)
     before = controller.obstacle_pose("box").position
     solution = controller.step(panda.home, obstacles={"box": Sample.at([0.0, 0.0, 3.0])})
-    assert solution.assumed == ("box: carried by the robot, what is given of it is not read",)
+    assert [reason.key for reason in solution.assumptions] == [("IGNORED", ("box",))]
     np.testing.assert_allclose(controller.obstacle_pose("box").position, before)
     for _ in range(20):
         solution = controller.step(panda.home)
-    assert solution.status is Status.SOLVED and solution.assumed == ()  # it is not late
+    assert solution.status is Status.SOLVED and solution.assumptions == ()  # it is not late
 
 
 def test_a_scene_serves_two_controllers_of_which_one_carries(panda):

@@ -319,7 +319,7 @@ def test_half_of_jerks_and_accelerations_bring_a_pair_to_rest_where_it_has_to_be
         closest[:, 0] = d
         x = make_layout(2, pairs=1, closest=closest, near=np.arange(1), drift=np.zeros(1), J=J, v_step=step,
             w_step=unit, v_last=v, w_last=w, accelerated=True, jerked=True, v_stop=np.array([0.0, -1e3]),
-            switching=False, row_gain=100.0, lower=-np.ones(2), upper=np.ones(2),
+            beta=False, row_gain=100.0, lower=-np.ones(2), upper=np.ones(2),
         )  # fmt: skip
         kernels.row_bounds(kernels.pack(x), 1, False)
         # the velocity along J that closes fastest, within the row and within what half of the limits allow

@@ -37,7 +37,7 @@ def within_limits(controller, vs, slack=1e-9):
     return np.max(np.abs(jumps) / (b.jerk * dt**2))
 
 
-@pytest.mark.parametrize("row", ["switching", "damper"])
+@pytest.mark.parametrize("row", ["beta", "task-switching", "damper"])
 @pytest.mark.parametrize("size", [[0.004, 0.6, 0.6], [0.2, 0.2, 0.2]], ids=["plate", "box"])
 @pytest.mark.parametrize(("dt", "duration"), [(0.002, 0.8), (0.01, 1.5), (0.05, 3.0)])
 def test_no_period_and_no_speed_pass_the_safe_distance(row, size, dt, duration):

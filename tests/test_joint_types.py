@@ -18,8 +18,8 @@ from qpavoid import (
     load_scenario,
     simulate,
 )
-from qpavoid.geometry.urdf import MimicWarning
 from qpavoid.kinematics import chains, longest_lever
+from qpavoid.notes import RobotWarning
 
 
 def body(name, frame):
@@ -39,11 +39,13 @@ ROBOTS = {
     "planar": {
         "urdf": "tiago_description/robots/tiago_no_hand.urdf",
         "root_joint": "planar",
+        "limits": {"velocity": {"root_joint": [3.0, 3.0, 3.0]}},
         "bodies": [body("hand", "arm_tool_link"), body("base", "base_link")],
     },
     "floating": {
         "urdf": "solo_description/robots/solo12.urdf",
         "root_joint": "free_flyer",
+        "limits": {"velocity": {"root_joint": 3.0}},
         "bodies": [body("trunk", "base_link"), body("foot", "FL_FOOT")],
     },
 }
@@ -217,6 +219,8 @@ def test_joints_that_cannot_be_read_as_followers_are_named(tmp_path):
         f'<robot name="arm">{link}<joint name="j1" type="revolute"><parent link="a"/><child link="b"/>{limit}</joint>'
         '<joint name="j2" type="continuous"><parent link="b"/><child link="c"/><mimic joint="j1"/></joint></robot>'
     )
-    with pytest.warns(MimicWarning, match="joints that mimic others move on their own, and should be locked"):
+    with pytest.warns(
+        RobotWarning, match=r"joint j2: should follow others \(mimic\), and move on their own.*hold them under `lock`"
+    ):
         robot = Robot.from_urdf(tmp_path / "arm.urdf", bodies=[])
     assert robot.model.nv == 2

@@ -300,16 +300,16 @@ def rows_at(d, **fields):
     return make_layout(7, pairs=count, obstacles=2, **{**given, **bounds, **fields})
 
 
-@pytest.mark.parametrize("switching", [True, False])
-def test_closing_speed_bound_by_its_definition(switching):
+@pytest.mark.parametrize("weighted", [True, False])
+def test_closing_speed_bound_by_its_definition(weighted):
     """-(1 - β) ξ (d - d1) outside d1, ξ (d1 - d) up to the cap inside it; d = d1 and d = d2 exactly as well."""
     d1, d2, gain = 0.1, 0.3, 5.0
     d = np.array([-1.0, 0.05, 0.08, d1, 0.15, 0.2, d2, 0.5])
     beta = np.array([1.0, 1.0, 1.0, 1.0, 0.5 + 0.25 * np.sqrt(2.0), 0.5, 0.0, 0.0])
     for cap in (0.2, np.inf):
         raw = gain * (d1 - d)
-        expected = np.minimum(np.where(raw > 0.0, raw, (1.0 - beta) * raw) if switching else raw, cap)
-        x = rows_at(d, row_gain=gain, recovery=cap, switching=switching)
+        expected = np.minimum(np.where(raw > 0.0, raw, (1.0 - beta) * raw) if weighted else raw, cap)
+        x = rows_at(d, row_gain=gain, recovery=cap, beta=weighted)
         run("row_bounds", x, len(d), False)
         np.testing.assert_allclose(x.least, expected, rtol=0, atol=1e-14)
         np.testing.assert_array_equal(x.d, d)
@@ -319,19 +319,33 @@ def test_offset_margin_and_drift_of_a_row():
     """The offset widens all distances, the margin of an obstacle narrows those to it, its drift counts as motion."""
     closest, margin, of = np.array([0.20, 0.20, 0.20, 0.02]), np.array([0.01, 0.04, 0.0]), np.array([0, 1, 2, 1])
     drift = np.array([0.1, -0.2, 0.0, 0.3])
-    x = rows_at(closest, offset=0.05, margin=margin, twist_row=of, drift=drift, switching=False)
+    x = rows_at(closest, offset=0.05, margin=margin, twist_row=of, drift=drift, beta=False)
     run("row_bounds", x, 4, True)
     np.testing.assert_allclose(x.d, [0.24, 0.21, 0.25, 0.03], rtol=0, atol=1e-15)
     np.testing.assert_allclose(x.least, [-0.7 - 0.1, -0.55 + 0.2, -0.75, 0.2 - 0.3], rtol=0, atol=1e-14)
 
 
+def test_slack_moves_the_safety_distance_of_a_pair():
+    """A pair with slack s has the row of one that is s farther away, but touches where it touches."""
+    d, slack = np.array([0.02, 0.06, 0.2]), np.array([0.09, 0.0, 0.05])
+    fields = {"offset": 0.01, "beta": False, "row_gain": 5.0, "hold": 0.1}
+    x, y = rows_at(d, slack=slack, **fields), rows_at(d + slack, **fields)
+    z = rows_at(d, **fields)
+    for layout in (x, y, z):
+        run("row_bounds", layout, 3, False)
+    np.testing.assert_allclose(x.d, y.d, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(x.least, y.least, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(x.touch, np.minimum(5.0 * (0.0 - d), x.least), rtol=0, atol=1e-14)
+    assert x.least[0] < z.least[0] and x.least[1] == z.least[1]
+
+
 def test_margins_are_those_of_the_near_pairs():
     """Row i belongs to pair near[i], not to pair i."""
-    x = rows_at(np.full(2, 0.2), switching=False)
+    x = rows_at(np.full(2, 0.2), beta=False)
     y = make_layout(7, pairs=4, obstacles=2, **{
         **{name: np.concatenate((getattr(x, name),) * 2) for name in ("closest", "drift", "J")},
         "near": np.array([1, 3, -1, -1]), "twist_row": np.array([0, 1, 0, 2]), "margin": np.array([9.0, 0.05, 0.0]),
-        "lower": x.lower, "upper": x.upper, "v_stop": x.v_stop, "switching": False,
+        "lower": x.lower, "upper": x.upper, "v_stop": x.v_stop, "beta": False,
     })  # fmt: skip
     run("row_bounds", y, 2, True)
     np.testing.assert_allclose(y.d[:2], [0.15, 0.2], rtol=0, atol=1e-15)
@@ -367,7 +381,7 @@ def test_a_row_never_asks_for_more_than_can_be_had(seed):
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_row_bounds_by_their_definition(seed):
-    """The switching row, closing no faster than half of the accelerations brake, less the drift; and touch at d = 0."""
+    """The beta row, closing no faster than half of the accelerations brake, less the drift; and touch at d = 0."""
     x = filled(seed)
     run("row_bounds", x, 30, True)
     raw = x.row_gain * (x.hold - x.d)
@@ -394,7 +408,7 @@ def test_half_of_the_accelerations_bring_a_pair_to_rest_where_it_has_to_be():
     way = []
     for _ in range(400):
         x = rows_at(
-            d, J=np.array([[0.5, -1.0]]), v_step=step, accelerated=True, v_stop=np.array([0.0, -1e3]), switching=False,
+            d, J=np.array([[0.5, -1.0]]), v_step=step, accelerated=True, v_stop=np.array([0.0, -1e3]), beta=False,
             row_gain=100.0, lower=-np.ones(2), upper=np.ones(2),
         )  # fmt: skip
         run("row_bounds", x, 1, False)

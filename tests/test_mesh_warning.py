@@ -7,7 +7,7 @@ from conftest import write_chain
 
 from qpavoid import Robot
 from qpavoid.files.shipped import robot_names
-from qpavoid.geometry.bodies import MeshWarning
+from qpavoid.notes import NoteKind, RobotWarning
 
 FACET = "facet normal 0 0 1\nouter loop\nvertex {}\nvertex {}\nvertex {}\nendloop\nendfacet\n"
 
@@ -22,10 +22,12 @@ def urdf(tmp_path):
 
 def test_meshes_warn_with_cost_and_remedy(urdf):
     with pytest.warns(
-        MeshWarning, match=r"4 triangle meshes .* 100 to 500 µs a pair .* set `bodies` to convex"
+        RobotWarning, match=r"4 triangle meshes .* 100 to 500 µs a pair .* set `bodies` to convex"
     ) as caught:
-        Robot.from_urdf(urdf, bodies="mesh")
+        robot = Robot.from_urdf(urdf, bodies="mesh")
     assert len(caught) == 1
+    meshes = [note.subject for note in robot.notes if note.kind is NoteKind.MESH]
+    assert meshes == [("link0_0", "link1_0", "link2_0", "link3_0")]
     assert caught[0].filename == __file__
 
 
@@ -41,5 +43,5 @@ def test_other_bodies_do_not_warn(urdf, tmp_path):
 @pytest.mark.parametrize("name", robot_names())
 def test_shipped_robots_do_not_warn(name):
     with warnings.catch_warnings():
-        warnings.simplefilter("error", MeshWarning)
+        warnings.simplefilter("error")
         Robot.load(name)

@@ -13,7 +13,7 @@ from qpavoid import Log
 from qpavoid.log import STATUSES
 from qpavoid.metrics import path_deviation
 from qpavoid.reason import Reason, ReasonKind, Severity
-from qpavoid.report import failed, metrics_table, outcome, to_json
+from qpavoid.report import failed, metrics_table, outcome, ratios_table, to_json
 
 DT = 0.1
 
@@ -79,7 +79,7 @@ def test_every_figure_of_a_run(log):
         "status_counts": {"SOLVED": 2, "RELAXED": 2, "STOPPED": 1},
         "relaxed_ticks": 2,
         "shortened_ticks": 2,
-        "time_stalled": pytest.approx(3 * DT),
+        "time_blocked": pytest.approx(3 * DT),
         "severity_counts": {"INFO": 1, "WARNING": 2, "ALARM": 1},
         "events": log.meta["events"],
         "tick_us": {"p50": pytest.approx(30.0), "p99": pytest.approx(97.6), "max": pytest.approx(100.0)},
@@ -164,7 +164,7 @@ def test_nan_velocity_is_not_hidden():
         ({"status_counts": {"SOLVED": 1, "RELAXED": 1, "STOPPED": 0}}, False, "1 relaxed, arrived"),
         ({"severity_counts": {"INFO": 0, "WARNING": 7, "ALARM": 0}}, False, "7 warning, arrived"),
         ({"severity_counts": {"INFO": 4, "WARNING": 3, "ALARM": 2}}, False, "2 alarm, 3 warning, 4 info, arrived"),
-        ({"time_stalled": 1.26}, False, "stalled 1.3 s, arrived"),
+        ({"time_blocked": 1.26}, False, "stalled 1.3 s, arrived"),
         ({"arrived": False}, False, "short of goal"),
         ({"collided": True}, True, "collided, arrived"),
         ({"status_counts": {"SOLVED": 1, "RELAXED": 0, "STOPPED": 1}}, True, "1 stopped, arrived"),
@@ -193,11 +193,26 @@ def test_table_holds_the_figures(log):
     assert max(map(cell_len, lines)) <= 80
 
 
+def test_ratios_are_those_of_the_figures(log):
+    """0.06 m over 0.03 m is 2.00; depths of penetration, and what is none to speak of, have no ratio; 80 columns."""
+    one = log.metrics() | {"scenario": "a_long_scenario", "solver": "eq10-literal", "min_distance": 0.06, "jitter": 9.0}
+    other = one | {"solver": "qp", "min_distance": 0.03, "jitter": 4.0, "time_in_collision": 0.0, "peak_velocity": 3.3}
+    deep = [one | {"scenario": "deep", "min_distance": -0.1}, other | {"scenario": "deep"}]
+    alone = one | {"scenario": "alone"}
+    console = Console(width=80, file=io.StringIO(), record=True)
+    console.print(ratios_table([one, other, *deep, alone], "eq10-literal", "qp"))
+    lines = console.export_text().splitlines()
+    ratios = [line.split() for line in lines if line.split()[:1] == ["ratio"]]
+    assert [row[1] for row in ratios] == ["2.00", "1.00"] and all(row[-1] == "2.25" for row in ratios)
+    assert ratios[0][-2] == f"{one['peak_velocity'] / 3.3:.2f}"
+    assert max(map(cell_len, lines)) <= 80 and "alone" not in console.export_text()
+
+
 @pytest.mark.parametrize("width", [80, 60, 48])
 def test_table_cuts_no_outcome_however_narrow(log, width):
     wide = log.metrics() | {"min_distance": -0.3, "time_in_collision": 12.5, "final_error": 0.23, "max_deviation": 0.5}
     runs = [
-        wide | {"solver": solver, "collided": collided, "time_stalled": stalled, "tick_us": {"p50": 1234.0}}
+        wide | {"solver": solver, "collided": collided, "time_blocked": stalled, "tick_us": {"p50": 1234.0}}
         for solver in ("tracking", "eq10-literal", "gradient-projection")
         for collided in (False, True)
         for stalled in (0.0, 12.3)

@@ -6,6 +6,7 @@ import pytest
 from conftest import EXAMPLES, look, obstacle, write_chain
 
 from qpavoid import ConfigError, Robot, UnknownName, build_scene, config
+from qpavoid.notes import NoteKind
 
 SPHERE = {"type": "sphere", "radius": 0.02}
 
@@ -90,7 +91,8 @@ def test_pairs_that_always_touch_are_dropped_and_noted(tmp_path, radius):
     folded = {f"joint{i}": 2.0 for i in (1, 2, 3)}
     robot = Robot.from_urdf(write_chain(tmp_path), bodies=bodies, home=folded)
     assert pairs_of(robot) == {frozenset(("b0", "b3"))}
-    assert [note.split()[1:4] for note in robot.notes] == [["b0", "-", "b2"], ["b1", "-", "b3"]]
+    pairs = [note for note in robot.notes if note.kind is NoteKind.PAIR]
+    assert [(note.subject, note.share) for note in pairs] == [(("b0", "b2"), 1.0), (("b1", "b3"), 1.0)]
     assert look(build_scene(robot), robot.home).distance[0] < 0.0
 
 

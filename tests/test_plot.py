@@ -66,12 +66,12 @@ def volume(faces):
 # --- one run ------------------------------------------------------------------------------------------------
 
 
-def test_distance_lines_are_the_logged_distances_plus_offset(sphere):
+def test_distance_lines_are_the_logged_distances(sphere):
     log = sphere[2]
     drawn = lines(distances_figure(log).axes[0])
     for i, body in enumerate(log.meta["bodies"]):
         assert_allclose(drawn[body].get_xdata(), log.t)
-        assert_allclose(drawn[body].get_ydata(), log.body_distance[:, i] + 0.10, atol=1e-15)
+        assert_allclose(drawn[body].get_ydata(), log.body_distance[:, i], atol=1e-15)
 
 
 def test_levels_lie_at_d1_d2_d_safe_and_collision(sphere, panda):
@@ -80,8 +80,12 @@ def test_levels_lie_at_d1_d2_d_safe_and_collision(sphere, panda):
         drawn = {line.get_ydata()[0] for name, line in lines(ax).items() if "$" in name or "collision" in name}
         return sorted(drawn), ax.get_ylabel()
 
-    assert heights(sphere[2]) == ([0.10, 0.12, 0.18, 0.36], "distance between axes [m]")
-    assert heights(sphere[1]) == ([0.10, 0.18, 0.36], "distance between axes [m]")  # eq10 has no QP rows
+    config = {**sphere[2].meta["config"]}
+    config["avoidance"] = {**config["avoidance"], "row": {"type": "damper", "d_safe": 0.12}}
+    surfaces = "distance between surfaces [m]"  # the offset of 0.1 m is taken off
+    assert heights(sphere[2]) == (pytest.approx([0.0, 0.08, 0.26]), surfaces)
+    held = replace(sphere[2], meta={**sphere[2].meta, "config": config})
+    assert heights(held) == (pytest.approx([0.0, 0.02, 0.08, 0.26]), surfaces)
     levels, label = heights(panda)
     avoidance = panda.meta["config"]["avoidance"]
     assert label == "distance between surfaces [m]"

@@ -16,6 +16,7 @@ from qpavoid import (
     Pose,
     Sample,
     Sensing,
+    Severity,
     Status,
     Voxels,
     build_scene,
@@ -271,7 +272,7 @@ def test_a_wall_of_points_is_not_passed(tmp_path, dt, speed):
     surface = Voxels.of(points, CLOUD.resolution).centers
     for k, tick in enumerate(
         drive(controller, np.array([-0.5, 0.03, 0.0]), round(2.5 / dt), target=[2.0, 0.1, 0.05],
-              obstacles=lambda t: {"camera": Points(points)} if t < 0.5 * dt else None)
+              obstacles=lambda t: {"camera": Points(points, at_rest=True)} if t < 0.5 * dt else None)
     ):  # fmt: skip
         after = tick.state.q + dt * tick.solution.v
         assert np.linalg.norm(surface - after, axis=1).min() - 0.05 - BALL > 0.02 - 1e-3
@@ -289,7 +290,7 @@ def test_velocities_do_not_chatter_along_a_wall_of_points(tmp_path):
     controller = make_controller(robot, [Obstacle.at("camera", CLOUD, [0, 0, 0])], "z")
     points, v = wall(width=1.6), []
     for tick in drive(controller, np.array([0.3, -0.5, 0.0]), 500, target=lambda t: [0.6, -0.5 + 0.2 * t, 0.0],
-                      obstacles=lambda t: {"camera": Points(points)} if t == 0.0 else None):  # fmt: skip
+                      obstacles=lambda t: {"camera": Points(points, at_rest=True)} if t == 0.0 else None):  # fmt: skip
         v.append(tick.solution.v)
         assert tick.solution.status is Status.SOLVED
     change = np.abs(np.diff(np.array(v)[100:], axis=0)) / 0.01
@@ -314,7 +315,7 @@ def test_pictures_replace_each_other(panda):
         given = None if picture is None else {"camera": Points(picture)}
         tick = controller.tick(q, obstacles=given)
         assert (len(tick.proximity.pair) > 0) == seen
-        assert tick.solution.assumed == ()
+        assert tick.solution.assumptions == ()
     prepared = Voxels.of(near, CLOUD.resolution)
     assert len(controller.tick(q, obstacles={"camera": Points(prepared)}).proximity.pair) > 0
 
@@ -336,15 +337,18 @@ def test_bad_pictures_are_said_and_never_believed(panda):
     near = np.full((10, 3), [0.45, 0.0, 0.5])
     some, all_bad = np.vstack((near, np.full((2, 3), np.nan))), np.full((10, 3), np.nan)
     seen = controller.tick(panda.home, obstacles={"camera": Points(some)})
-    assert seen.solution.assumed == ("camera: 2 of 12 points are NaN, infinite or more than 100 m away, dropped",)
+    (dropped,) = seen.solution.assumptions
+    assert dropped.key == ("POINTS_DROPPED", ("camera",)) and dropped.amount == 2
     distance = seen.proximity.distance.min()
     for _ in range(4):
         tick = controller.tick(panda.home, obstacles={"camera": Points(all_bad)})
-        assert "taken as not given" in tick.solution.assumed[0]
+        dropped = tick.solution.assumptions[0]
+        assert dropped.key == ("POINTS_DROPPED", ("camera",)) and dropped.amount == 10
+        assert dropped.severity is Severity.WARNING
         assert tick.proximity.distance.min() == pytest.approx(distance)  # the last good ones
     for _ in range(8):
         tick = controller.tick(panda.home)
-    assert tick.solution.status is Status.STOPPED and "camera: not seen for" in tick.solution.reasons[0]
+    assert tick.solution.status is Status.STOPPED and tick.solution.reasons[0].key == ("STALE", ("camera",))
     assert controller.tick(panda.home, obstacles={"camera": Points(near)}).solution.status is not Status.STOPPED
     for wrong in (np.zeros(3), "x", np.zeros((2, 4)), Voxels.of(near, 0.05)):
         with pytest.raises(NumericalError, match="camera"):

@@ -92,7 +92,7 @@ def test_a_run_gives_the_same_reasons_to_json_and_to_its_log(cli):
     assert all(reason.unit == "m/s" and reason.amount > 0.0 for reason in stalled)
     counts = {level.name: int(np.sum(log.severity == level)) for level in Severity}
     assert document["severity_counts"] == counts and counts["WARNING"] > 0
-    assert document["time_stalled"] == pytest.approx(0.01 * np.sum(log.stalled)) and log.stalled.any()
+    assert document["time_blocked"] == pytest.approx(0.01 * np.sum(log.stalled)) and log.stalled.any()
     assert (log.severity[log.stalled] >= Severity.WARNING).all()
 
 

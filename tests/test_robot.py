@@ -53,7 +53,10 @@ def test_bare_urdf_and_robot_yaml_give_the_same(tmp_path):
 
 def test_prefix_of_example_robot_data(tmp_path):
     path = tmp_path / "robot.yaml"
-    path.write_text("name: dog\nurdf: example-robot-data:go2_description/urdf/go2.urdf\nroot_joint: free_flyer\n")
+    path.write_text(
+        "name: dog\nurdf: example-robot-data:go2_description/urdf/go2.urdf\nroot_joint: free_flyer\n"
+        "visuals: false\nlimits: {velocity: {root_joint: [1, 1, 1, 2, 2, 2]}}\n"
+    )
     robot = Robot.load(str(path))
     assert (robot.model.nq, robot.model.nv) == (19, 18)
     assert robot.coordinate_names[5:7] == ["root_joint.5", robot.joint_names[1]]

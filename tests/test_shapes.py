@@ -334,7 +334,7 @@ def test_a_cut_surface_stops_the_robot_and_says_so(tmp_path):
     assert controller.step(np.array([0.0, 0.0, 0.0])).status is Status.SOLVED
 
 
-@pytest.mark.filterwarnings("ignore::qpavoid.geometry.bodies.MeshWarning")
+@pytest.mark.filterwarnings("ignore::qpavoid.notes.RobotWarning")
 def test_two_triangle_meshes_have_normals(tmp_path):
     """coal leaves the normal of two meshes unset: rows of `bodies: mesh` used to be zero."""
     write_stl(tmp_path / "part.stl", boards(((0, 0, 0.15), (0.04, 0.04, 0.16))))

@@ -38,7 +38,10 @@ def baxter_fingers():
 @pytest.fixture(scope="module")
 def tiago():
     """Continuous wheels (nq = 2, nv = 1), on a planar base (nq = 4, nv = 3)."""
-    return Robot.from_urdf(EXAMPLES / "tiago_description/robots/tiago.urdf", root_joint="planar", bodies=[])
+    limits = {"velocity": {"root_joint": 10.0}}
+    return Robot.from_urdf(
+        EXAMPLES / "tiago_description/robots/tiago.urdf", root_joint="planar", bodies=[], limits=limits
+    )
 
 
 DATA = {}

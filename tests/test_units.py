@@ -52,7 +52,10 @@ def test_lengths_are_the_coordinates_that_turn_nothing():
 def chain_run(folder, joint_type: str, root_joint: str) -> Log:
     """A few ticks of a chain that moves its last link along x."""
     write_chain(folder, joint_type=joint_type)
-    (folder / "robot.yaml").write_text(f"name: chain\nurdf: chain.urdf\nbodies: capsule\nroot_joint: {root_joint}\n")
+    limits = "" if root_joint == "fixed" else "limits: {velocity: {root_joint: 1.0}}\n"
+    (folder / "robot.yaml").write_text(
+        f"name: chain\nurdf: chain.urdf\nbodies: capsule\nroot_joint: {root_joint}\n{limits}"
+    )
     (folder / "scene.yaml").write_text(
         "robot: robot.yaml\n"
         "tasks: [{frame: link3, motion: {type: line, displacement: [0.1, 0, 0], speed: 0.1}}]\n"

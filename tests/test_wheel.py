@@ -75,6 +75,7 @@ def test_sdist_builds_the_same_wheel(built, python, tmp_path):
         names = {name.partition("/")[2] for name in archive.getnames()}
     assert modules() | {"pyproject.toml", "README.md", "LICENSE", "robots/panda/robot.yaml"} <= names
     assert {f"tests/{path.name}" for path in (ROOT / "tests").glob("test_*.py")} <= names
+    assert {f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")} <= names  # which tests read
     assert not any(name.startswith(("bench", ".git/", ".ci", "out/")) for name in names)
     options = ("--no-deps", "--no-build-isolation", "--quiet", "--wheel-dir")
     call(python, "-m", "pip", "wheel", *options, tmp_path, sdist, cwd=tmp_path)

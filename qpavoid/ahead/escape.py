@@ -190,7 +190,9 @@ class EscapePlanner:
             moves = np.flatnonzero(rates.any(axis=1) | (places != places[0]).any(axis=(0, 2)))
             moving = self._obstacles.moving[moves]
             speed, spin = rates[moves].T
-            turning = np.where(spin > 0.0, spin * self.flights.query.placing.reach[moving], 0.0)
+            # half-spaces have no end: of one that does not turn, 0 · ∞ counts as 0
+            radii, turning = self.flights.query.placing.reach[moving], np.zeros_like(spin)
+            np.multiply(spin, radii, out=turning, where=spin > 0.0)
             fastest = float(np.max(speed + turning, initial=0.0))
             self._ways = _Paths(first, moving, places[:, moves].copy(), 0.5 * _SPAN * speed, fastest)
         return self._ways

@@ -95,6 +95,7 @@ class Flights:
         still = self.still.leaning
         near = self._look(q, 0.0, still, Tally(Start(q, still, still, 0.0, self.parted), 1.0), 0.0)
         kernels.comes_too_near(*near, still, 1.0, 0.0)
+        kernels.least_apart(np.zeros((1, 1, 3)), np.zeros((1, 3)), np.zeros((1, 1)))
         self.ramps.towards(still, still, self._flee(near, Manner(0.1, still))[None])
         self.forget_foreseen()
 
@@ -188,7 +189,9 @@ class Flights:
         end, plan, tally = t + horizon + _BEYOND, list[Array](), Tally(start, horizon)
         near = self._look(q, t, v, tally, 0.0)
         left = self._none if given is None else given
-        while t < end - 1e-9:
+        for _ in range(int((horizon + _BEYOND) / self._dt) + 2):
+            if t >= end - 1e-9:
+                break
             count = self._ticks - round(t / self._dt) % self._ticks
             wanted, left = left[:count], left[count:]
             held = not len(wanted)

@@ -104,7 +104,7 @@ class Guard:
         self._bounds, self._rate = bounds, position_gain / dt
         self._acceleration, self._accelerated = bounds.acceleration, bool(np.isfinite(bounds.acceleration).any())
         self._jerked = bool(np.isfinite(bounds.jerk).any())
-        self._given = np.zeros(len(scene.pairs))
+        self._given, self._slack = np.zeros(len(scene.pairs)), scene.slack(hold)
         self._least = np.inf  # distance of any pair in the looks along the velocity under test [m]
         self._news, self._heard = np.zeros(len(scene.obstacles), dtype=bool), False
 
@@ -212,9 +212,11 @@ class Guard:
             t = 0.0
             while t < duration:
                 step = max(0.5 * gap, _FINEST, speed * left / (_MOST_POSES - looks)) / max(speed, 1e-9)
-                # the end of the tick is always looked at
-                step = min(step, self._dt - t if t < self._dt and not looks else duration - t)
-                t, left, looks = t + step, left - step, min(looks + 1, _MOST_POSES - 1)
+                # the end of the tick is always looked at, and the last of all poses is the end
+                until = self._dt if t < self._dt and not looks else duration
+                last = looks >= _MOST_POSES - 1 or step >= until - t
+                step = until - t if last else step
+                t, left, looks = until if last else t + step, left - step, min(looks + 1, _MOST_POSES - 1)
                 found, which = self._look(pin.integrate(self._model, start, t * along), now)
                 if not found >= worst:
                     worst, pair = found, which
@@ -243,10 +245,12 @@ class Guard:
 
         seen = [_Look(0.0, q, gap, -1)]
         while (t := seen[-1].t) < times[-1]:
-            looks = max(_MOST_POSES - len(seen), 1)
-            step = max(0.5 * min(max(seen[-1].left, 0.0), _FARTHEST), _FINEST, speed * (times[-1] - t) / looks) / speed
-            # the end of the tick is always looked at
-            seen.append(look(seen[-1], float(min(t + step, times[1] if len(seen) == 1 else times[-1]))))
+            looks = _MOST_POSES - len(seen)
+            step = max(0.5 * min(max(seen[-1].left, 0.0), _FARTHEST), _FINEST) / speed
+            step = max(step, (times[-1] - t) / max(looks, 1))
+            # the end of the tick is always looked at, and the last of all poses is the end
+            end = times[1] if len(seen) == 1 else times[-1]
+            seen.append(look(seen[-1], float(end if looks <= 1 else min(t + step, end))))
         found = [*seen[1:], look(seen[-2], 0.5 * (seen[-2].t + seen[-1].t))]  # it may turn back just before its end
         for before, here, after in zip(seen[:-2], seen[1:-1], seen[2:], strict=True):
             if not (before.left >= here.left <= after.left and here.left < _CLOSE):
@@ -311,7 +315,7 @@ class Guard:
         pairs = ahead.pairs
         if not len(pairs):
             return _FARTHEST, -1
-        there, here = ahead.found(pairs), now.found(pairs)
+        there, here = ahead.found(pairs) + self._slack[pairs], now.found(pairs) + self._slack[pairs]
         margins = ahead.placing.margin
         if margins.any():
             margin = margins[ahead.twist_row[pairs]]

@@ -25,7 +25,9 @@ _RESTING = 0.01
 _TIGHT = 1e-3
 """How close to its bound a row counts as being in the way [m/s]."""
 _EVERY = 5
-"""Ticks from one look at the progress to the next."""
+"""Control steps from one look at the progress to the next, while the tasks are not stalled."""
+_CAP = 1.1
+"""Time without progress that counts at the most, in `stalled_after`: what moves again is no longer stalled soon."""
 
 
 class ProgressWatch:
@@ -35,11 +37,12 @@ class ProgressWatch:
         self, config: Progress, dt: float, pair_names: tuple[tuple[str, str], ...], detours: Detours | None = None
     ) -> None:
         self._config, self._dt, self._names, self._detours = config, dt, pair_names, detours
+        self._most = _CAP * config.stalled_after / dt + _EVERY
         self.reset()
 
     def reset(self) -> None:
         """Forgets everything."""
-        self._clock, self._without = 0, 0
+        self._clock, self._without = 0, 0.0
         self._culprits: list[tuple[int, float]] = []
         if self._detours is not None:
             self._detours.reset()
@@ -56,7 +59,7 @@ class ProgressWatch:
             return problem
         redirected = detours.follow(problem, proximity, assembly, self._config.stalled_after)
         if redirected is None:
-            self._without = 0
+            self._without = 0.0
             return problem
         return redirected
 
@@ -69,16 +72,17 @@ class ProgressWatch:
         """
         A, given_up = problem.tracking.A, self._detours.given_up if self._detours is not None else ()
         if not len(A) or (problem.shortfall <= 0.0 and solution.share == 1.0):
-            self._without = 0
+            self._without = 0.0
             return given_up
         self._clock += 1
         if self._clock % _EVERY and not self.stalled:
             return given_up
+        since = 1 if self.stalled else _EVERY
         wanted, got = A @ problem.v0, A @ solution.v
         size = float(wanted @ wanted)
         resting = float(got @ got) < _RESTING**2
         stuck = resting and size > _SLOWEST**2 and float(got @ wanted) < _LEFT * size
-        self._without = max(self._without + (_EVERY if stuck else -_EVERY), 0)
+        self._without = min(max(self._without + (since if stuck else -since), 0), self._most)
         if not self.stalled:
             return given_up
         self._culprits = _culprits(problem, solution.v)

@@ -119,15 +119,19 @@ ENTRANTS = {
         law("potential-field", "tracking pulls, near pairs push: FIRAS at velocity level", "potential-field"),
         law("qp", "QP as each scenario has it, with a backup trajectory", "qp"),
         law(
-            "qp-no-backup", "QP with switching α/β rows, no backup trajectory", "qp", avoidance=_law_alone("switching")
+            "qp-task-switching",
+            "QP with the gains of eq. 10 in its rows, no backup trajectory",
+            "qp",
+            avoidance=_law_alone("task-switching"),
         ),
+        law("qp-no-backup", "QP with beta rows, no backup trajectory", "qp", avoidance=_law_alone("beta")),
         law("qp-damper", "QP with velocity damper rows, no backup trajectory", "qp", avoidance=_law_alone("damper")),
         law("qp-cbf", "QP with control barrier rows, no backup trajectory", "qp", avoidance=_law_alone("cbf")),
         law(
             "qp-detour",
-            "QP with switching α/β rows that tries detours round what stalls it, no backup trajectory",
+            "QP with beta rows that tries detours round what stalls it, no backup trajectory",
             "qp",
-            avoidance=_law_alone("switching"),
+            avoidance=_law_alone("beta"),
             progress={"detour": {}},
         ),
         law("qp:native", "QP, compiled active-set method", "qp:native", ("numba",)),

@@ -5,9 +5,20 @@ and read by `qpavoid.files.loading`; `qpavoid.scene` and `qpavoid.motion` turn t
 """
 
 from qpavoid.config.base import Block
-from qpavoid.config.control import Avoidance, Cbf, Damper, Detour, Escape, Limits, Progress, Sensing, Switching
+from qpavoid.config.control import (
+    Avoidance,
+    Beta,
+    Cbf,
+    Damper,
+    Detour,
+    Escape,
+    Limits,
+    Progress,
+    Sensing,
+    TaskSwitching,
+)
 from qpavoid.config.motion import Circle, Csv, Fixed, Line, Motion, Waypoints
-from qpavoid.config.robot import Body, Hull, JointLimits, RobotConfig
+from qpavoid.config.robot import Body, Hull, JointLimits, PairMargin, RobotConfig
 from qpavoid.config.scenario import ObstacleConfig, ScenarioConfig
 from qpavoid.config.shapes import (
     Box,
@@ -47,10 +58,11 @@ from qpavoid.config.tasks import (
 )
 
 __all__ = [
-    "AlignTask", "AnyTask", "Avoidance", "Block", "Body", "Box", "Capsule", "Cbf", "Circle", "ComTask", "Cone",
+    "AlignTask", "AnyTask", "Avoidance", "Beta", "Block", "Body", "Box", "Capsule", "Cbf", "Circle", "ComTask", "Cone",
     "Contact", "Csv", "Cylinder", "Damper", "DampingTask", "Detour", "Ellipsoid", "Eq10Solver", "Escape", "Fixed",
     "GradientProjectionSolver", "HalfSpace", "HqpSolver", "Hull", "JointLimits", "Limits", "Line", "LookAtTask",
-    "ManipulabilityTask", "Mesh", "Motion", "ObstacleConfig", "ObstacleShape", "PointCloud", "PostureTask",
-    "PotentialFieldSolver", "Progress", "QpSolver", "RelativeTask", "RobotConfig", "ScenarioConfig", "Sensing", "Shape",
-    "SolverConfig", "Sphere", "Switching", "Task", "TaskBlock", "TrackingSolver", "Waypoints", "expand_solver",
+    "ManipulabilityTask", "Mesh", "Motion", "ObstacleConfig", "ObstacleShape", "PairMargin", "PointCloud",
+    "PostureTask", "PotentialFieldSolver", "Progress", "QpSolver", "RelativeTask", "RobotConfig", "ScenarioConfig",
+    "Sensing", "Shape", "SolverConfig", "Sphere", "Task", "TaskBlock", "TaskSwitching", "TrackingSolver", "Waypoints",
+    "expand_solver",
 ]  # fmt: skip

@@ -2,19 +2,33 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
 from qpavoid.config.base import Block, NonNegative, Positive
 
 
-class Switching(Block):
-    """Row of the task-switching QP: ḋ >= -(1 - β(d)) ξ (d - d1); below d1 it backs away."""
+class Beta(Block):
+    """Velocity damper weighted with eq. 12: ḋ >= -(1 - β(d)) ξ (d - d1); below d1 it backs away."""
 
-    type: Literal["switching"] = "switching"
+    type: Literal["beta"] = "beta"
     gain: Positive = 5.0
     """ξ [1/s]."""
+
+
+class TaskSwitching(Block):
+    """Rate of eq. 10 as a lower bound: ḋ >= (1 - β)(1 - α) min(u, ẋ0) + β ẋ0, u that of tracking alone; below d1 it
+    backs away.
+    """
+
+    type: Literal["task-switching"] = "task-switching"
+    gain: Positive = 5.0
+    """ξ [1/s], of backing away below d1."""
+    retreat_speed: NonNegative = 0.0
+    """ẋ0 [m/s]; more than 0 asks pairs that cannot part, as of neighbouring links, for what no velocity gives."""
+    alpha_cap: Positive = 50.0
+    """Largest α; eq. 11 grows without bound as d goes to 0 [-]. At most 1 counts between two bodies of the robot."""
 
 
 class Damper(Block):
@@ -37,7 +51,7 @@ class Cbf(Block):
     """Distance that is held [m], measured as d1 is; left out: d1."""
 
 
-AvoidanceRow = Annotated[Switching | Damper | Cbf, Field(discriminator="type")]
+AvoidanceRow = Annotated[Beta | TaskSwitching | Damper | Cbf, Field(discriminator="type")]
 
 
 class Escape(Block):
@@ -72,7 +86,7 @@ class Avoidance(Block):
     offset: NonNegative = 0.0
     """Added to the distance between surfaces before d1, d2 and d_safe are compared with it [m]. The paper measures
     between axes: its figures want the sum of the two radii here."""
-    row: AvoidanceRow = Switching()
+    row: AvoidanceRow = Beta()
     """Form of the QP's avoidance rows."""
     recovery_speed: Positive = 0.2
     """Cap on the speed at which rows ask a pair that is too close to part [m/s]."""
@@ -86,7 +100,7 @@ class Avoidance(Block):
     @property
     def hold(self) -> float:
         """Distance at which a row lets a pair come no nearer [m]."""
-        return self.d1 if isinstance(self.row, Switching) or self.row.d_safe is None else self.row.d_safe
+        return self.d1 if isinstance(self.row, Beta | TaskSwitching) or self.row.d_safe is None else self.row.d_safe
 
     @model_validator(mode="after")
     def _ordered(self) -> Avoidance:
@@ -122,21 +136,35 @@ class Limits(Block):
 
 
 class Sensing(Block):
-    """What is made of obstacles that a program gives tick by tick, and then does not."""
+    """What is made of external obstacles that are not updated: those that a program gives in `step`."""
 
-    stale_after: Positive | None = None
-    """Time without news after which an obstacle's distances shrink by a growing margin [s]; left out: never, it goes on
-    at its last twist."""
+    stale_after: Positive | None = 0.1
+    """Age of the last update after which an obstacle's distances shrink by a growing margin [s], but no less than three
+    control periods; `null`: never, it goes on at its last twist."""
     margin_growth: NonNegative = 0.1
     """How fast that margin grows: a bound on how wrong the last twist may be [m/s]."""
-    stop_after: Positive | None = None
-    """Time without news after which the robot stops [s]; left out: never."""
+    stop_after: Positive | None = 0.5
+    """Age of the last update after which the robot stops [s], but no less than three control periods; left out: five
+    times `stale_after`; `null`: never."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _stop_left_out(cls, fields: Any) -> Any:
+        if isinstance(fields, dict) and "stale_after" in fields and "stop_after" not in fields:
+            stale = fields["stale_after"]
+            if stale is None or (isinstance(stale, int | float) and 0.0 < stale < _LONG):
+                return {**fields, "stop_after": None if stale is None else 5.0 * stale}
+        return fields
 
     @model_validator(mode="after")
     def _ordered(self) -> Sensing:
         if self.stop_after is not None and (self.stale_after is None or self.stop_after < self.stale_after):
             raise ValueError("stop_after needs a stale_after that is not longer")
         return self
+
+
+_LONG = 1e8
+"""Time of which five are still a number that a file may give [s]."""
 
 
 class Detour(Block):

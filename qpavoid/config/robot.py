@@ -43,8 +43,8 @@ class JointLimits(Block):
 
     position: dict[str, tuple[Number, Number]] = {}
     """Joint: [lower, upper] [rad or m]."""
-    velocity: dict[str, Positive] = {}
-    """Joint: largest speed [rad/s or m/s]."""
+    velocity: dict[str, Positive | list[Positive]] = {}
+    """Joint: largest speed [rad/s or m/s]; a list for a joint of several coordinates, such as `root_joint`."""
     acceleration: dict[str, Positive] = {}
     """Joint: largest acceleration [rad/s² or m/s²]; a URDF has no field for it."""
     jerk: dict[str, Positive] = {}
@@ -61,28 +61,45 @@ class JointLimits(Block):
         return self
 
 
+class PairMargin(Block):
+    """Safety distance of a pair of the robot's own bodies that are near each other by design."""
+
+    bodies: tuple[str, str]
+    """Their names, in either order."""
+    d1: Positive
+    """Safety distance [m], where it is less than that of the scenario."""
+
+
 class RobotConfig(Block):
     """A robot.yaml: everything that a URDF alone does not say."""
 
     name: str
     """Name for tables and figures."""
     urdf: str
-    """URDF, or MJCF (`.xml`): a path relative to this file, an absolute path, or `example-robot-data:PATH` below its
-    robots folder."""
+    """URDF (also in xacro), or MJCF (`.xml`): a path relative to this file, an absolute path, or
+    `example-robot-data:PATH` below its robots folder."""
     srdf: str | None = None
     """SRDF whose `disable_collisions` are honoured; found like `urdf`."""
     package_dirs: list[str] = []
-    """Folders in which `package://NAME/…` mesh paths are looked up, relative to this file."""
+    """Folders in which `package://NAME/…` mesh paths are looked up, relative to this file; `NAME=FOLDER` for the folder
+    of one package."""
+    allow_missing_meshes: bool = False
+    """Whether shapes whose mesh cannot be found are left out, with a warning; else the robot is refused."""
+    visuals: bool = True
+    """Whether links without a collision shape get what is meant to be seen of them, with a warning. A list of bodies
+    makes up for both."""
     root_joint: Literal["fixed", "planar", "free_flyer"] = "fixed"
     """How the root link is attached to the world."""
     end_effectors: list[str] = []
-    """Frames that are meant as tools."""
+    """Frames that are meant as tools; left out, the ends of its limbs."""
     bodies: Literal["convex", "capsule", "mesh"] | list[Body] = "convex"
     """Collision bodies: `convex` hulls of the URDF's collision geometry, one enclosing `capsule` for each piece of
     it, the triangle `mesh` as it is (slow: 100 to 500 µs a pair on average, some several ms, against about 1 µs for
     hulls and 0.1 µs for capsules), or a list of bodies."""
     disabled_pairs: list[tuple[str, str]] = []
     """Pairs of bodies never checked; `*` and `?` match as in file names."""
+    pair_margins: list[PairMargin] = []
+    """Pairs of bodies with a smaller safety distance of their own."""
     limits: JointLimits = JointLimits()
     home: dict[str, Number] = {}
     """Joint: position of the home pose [rad or m]; joints left out are at 0, or at the middle

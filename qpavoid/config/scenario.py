@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field, PrivateAttr, model_validator
 
@@ -30,9 +30,15 @@ class ObstacleConfig(Block):
     """Whether a frame of the robot may carry it for a while; costs pairs with the other obstacles."""
     carried_by: str | None = None
     """Frame of the robot that carries it from the start, where `motion` puts it at first."""
+    source: Literal["scene", "external"] = "scene"
+    """Where its pose comes from: `scene`, from `motion`, unless a program gives it in `step`; `external`, from such a
+    program from the start, without which the robot stops after `sensing.stop_after`; `motion` is then a `fixed` one,
+    where it is taken to be at first."""
 
     @model_validator(mode="after")
     def _can_be_carried(self) -> ObstacleConfig:
+        if self.source == "external" and not isinstance(self.motion, Fixed):
+            raise ValueError(f"an external obstacle has no motion of type {self.motion.type}; give `type: fixed`")
         whole = not isinstance(self.shape, HalfSpace | PointCloud)
         if isinstance(self.shape, Mesh):
             whole = self.shape.method == "convex"

@@ -77,7 +77,8 @@ class HqpSolver(Block):
 
     name: Literal["hqp"] = "hqp"
     backend: str = "auto"
-    """As of `qp`; `auto` and `native` are daqp."""
+    """Of the QP of each level, as of `qp`; `auto` and `native` are daqp for these, and compiled code where rows that
+    contradict each other are relaxed."""
     regularization: Annotated[float, Field(ge=1e-7, le=1e3)] = 1e-3
     """λ: cost, at each level, of leaving the velocity that the tasks alone would have [(rad/s)⁻²]. As of `qp`, it keeps
     joints from full speed for the last mm/s of a level that obstacles hold up; it gives nothing to later levels."""

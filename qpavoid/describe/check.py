@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -15,25 +17,22 @@ import pinocchio as pin
 
 from qpavoid.config import RobotConfig, Task
 from qpavoid.controller import Controller
-from qpavoid.describe.ends import end_effectors
-from qpavoid.describe.findings import Joint, Problem, Report
+from qpavoid.describe.findings import Joint, Report
+from qpavoid.describe.home import BENT, Limbs
 from qpavoid.describe.poses import mimics
-from qpavoid.describe.sampling import Space, touching
+from qpavoid.describe.reasons import unchecked
+from qpavoid.describe.sampling import D1, Space, touching
+from qpavoid.describe.shapes import Piece, pieces_of
 from qpavoid.errors import ConfigError, QpavoidError
 from qpavoid.files.loading import read_config
+from qpavoid.files.packages import absolute_entries, find_mesh, mesh_folders
 from qpavoid.files.safe_xml import read_robot_xml
 from qpavoid.files.shipped import find_robot
-from qpavoid.geometry.joints import frame_index
-from qpavoid.geometry.urdf import (
-    find_mesh,
-    find_resource,
-    is_mjcf,
-    mesh_folders,
-    mesh_names,
-    read_collision,
-    read_model,
-)
+from qpavoid.geometry.bodies import convert_bodies, triangle_meshes
+from qpavoid.geometry.ends import end_effectors
+from qpavoid.geometry.urdf import find_resource, is_mjcf, mesh_names, read_model, read_pieces
 from qpavoid.kinematics import MIMIC
+from qpavoid.notes import Note, NoteKind, RobotWarning, shortened
 from qpavoid.robot import Robot
 from qpavoid.scene import build_scene
 from qpavoid.tasks import build_tasks
@@ -50,13 +49,21 @@ _NARROW = 1e-3
 """Range [rad, m] below which a joint is better locked."""
 
 
-def check_robot(name_or_path: str, root: str = "fixed", package_dirs: Sequence[Path] = ()) -> Report:
-    """Looks over a URDF, an MJCF, a robot.yaml or a robot that ships.
+def check_robot(
+    name_or_path: str,
+    root: str = "fixed",
+    package_dirs: Sequence[str | Path] = (),
+    allow_missing_meshes: bool = False,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Report:
+    """Look over a URDF, an MJCF, a robot.yaml or a robot that ships.
 
     Args:
         name_or_path: which one.
         root: how its root link is attached to the world; a robot.yaml says so itself.
-        package_dirs: folders to look for meshes in; a robot.yaml names its own.
+        package_dirs: folders to look for meshes in, and `NAME=FOLDER`; before those that a robot.yaml names.
+        allow_missing_meshes: whether shapes whose mesh cannot be found are left out.
+        progress: called with what is done next.
 
     Raises:
         ConfigError, UnknownName: it cannot be read at all.
@@ -65,67 +72,90 @@ def check_robot(name_or_path: str, root: str = "fixed", package_dirs: Sequence[P
     if path.suffix in (".yaml", ".yml"):
         config = read_config(path, RobotConfig)
     else:
-        folders = [str(folder.resolve()) for folder in package_dirs]
-        config = RobotConfig(name=path.stem, urdf=path.name, root_joint=root, package_dirs=folders)  # type: ignore[arg-type]
+        config = RobotConfig(name=path.stem, urdf=path.name, root_joint=root)  # type: ignore[arg-type]
+    entries = [*absolute_entries([str(entry) for entry in package_dirs], Path.cwd()), *config.package_dirs]
+    missing = allow_missing_meshes or config.allow_missing_meshes
+    config = config.model_copy(update={"package_dirs": entries, "allow_missing_meshes": missing})
+    progress("reading the model")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RobotWarning)  # all notes of the robot are in the report
+        return _report(config, path, progress)
+
+
+def _report(config: RobotConfig, path: Path, progress: Callable[[str], None]) -> Report:
     urdf = find_resource(config.urdf, path.parent, f"{path}: urdf")
     model = read_model(urdf, config.root_joint)
     report = Report(config.name, str(path), model.nq, model.nv)
     report.frames = [f.name for f in model.frames if f.type in (pin.BODY, pin.OP_FRAME)]
     report.end_effectors = list(config.end_effectors) or end_effectors(model)
     report.without_mass = sum(inertia.mass <= 0.0 for inertia in list(model.inertias)[1:])
-    _look_at_geometry(report, config, path, urdf, model)
+    pieces = _look_at_geometry(report, config, path, urdf, model)
     robot = None
-    if not report.missing_meshes:
+    if report.usable:
+        progress("making the robot")
         begin = perf_counter()
         try:
             robot = Robot.from_config(config, path)
         except ConfigError as error:
-            report.problems.append(Problem("error", str(error), "mend what it names"))
+            report.notes.append(Note(NoteKind.FILE, (), str(error), "mend what it names", "error"))
         report.load_seconds = perf_counter() - begin
     report.joints = _joints(urdf, model if robot is None else robot.model, config, model)
     _judge_joints(report, config)
     if robot is not None:
-        _look_at_robot(report, robot)
+        report.notes += robot.notes
+        _look_at_robot(report, with_hulls(robot), pieces, progress)
     if report.without_mass:
-        report.problems.append(
-            Problem("note", f"{report.without_mass} moving links have no mass", "none is needed: inertias are not used")
-        )
+        what = f"{report.without_mass} moving links have no mass"
+        report.notes.append(Note(NoteKind.LINK, (), what, "none is needed: inertias are not used"))
     order = {"error": 0, "warning": 1, "note": 2}
-    report.problems.sort(key=lambda problem: order[problem.severity])
+    report.notes.sort(key=lambda note: order[note.severity])
     return report
+
+
+def with_hulls(robot: Robot) -> Robot:
+    """The robot with the convex hull of each triangle mesh in its place: meshes cost up to ms a pair; few run them."""
+    if not triangle_meshes(robot.bodies):
+        return robot
+    bodies = convert_bodies(robot.bodies, "convex")
+    for pair in robot.bodies.collisionPairs:
+        bodies.addCollisionPair(pair)
+    return replace(robot, bodies=bodies)
 
 
 # --- geometry -----------------------------------------------------------------------------------------------
 
 
-def _look_at_geometry(report: Report, config: RobotConfig, path: Path, urdf: Path, model: Any) -> None:
-    package_dirs = [str(path.parent / folder) for folder in config.package_dirs]
-    report.searched = mesh_folders(urdf, package_dirs)
+def _look_at_geometry(report: Report, config: RobotConfig, path: Path, urdf: Path, model: Any) -> list[Piece]:
+    packages = absolute_entries(config.package_dirs, path.parent)
+    report.searched = mesh_folders(urdf, packages)
     absent = {tag: _absent(urdf, tag, report.searched) for tag in ("collision", "visual")}
     report.missing_meshes = absent["collision"]
-    if report.missing_meshes:
-        report.problems.append(
-            Problem(
-                "error",
-                f"{len(report.missing_meshes)} collision meshes are missing, such as {report.missing_meshes[0]!r}; "
-                f"looked for in {_some(report.searched, 8)}",
-                "name the folder that holds the package with --package-dir (`package_dirs` of a robot.yaml), or set "
-                "ROS_PACKAGE_PATH",
-            )
+    if report.missing_meshes and not config.allow_missing_meshes:
+        what = (
+            f"{len(report.missing_meshes)} collision meshes are missing, such as {report.missing_meshes[0]!r}; "
+            f"looked for in {shortened(report.searched, 8)}"
         )
-        return
+        remedy = (
+            "name the folder that holds the package with --package-dir or --package NAME=FOLDER (`package_dirs` of a "
+            "robot.yaml), set ROS_PACKAGE_PATH, or go on without them: --allow-missing-meshes"
+        )
+        report.notes.append(Note(NoteKind.MESH, (), what, remedy, "error"))
+        return []
     if absent["visual"]:
-        report.problems.append(
-            Problem("note", f"{len(absent['visual'])} visual meshes are missing", "none is needed: they are not used")
-        )
+        what = f"{len(absent['visual'])} visual meshes are missing"
+        report.notes.append(Note(NoteKind.MESH, (), what, "none is needed where there are collision shapes"))
     try:
-        pieces = read_collision(urdf, model, package_dirs, path).geometryObjects
+        geometry = read_pieces(
+            urdf, model, packages, path, visuals=config.visuals, allow_missing=config.allow_missing_meshes
+        ).geometryObjects
     except ConfigError as error:
-        report.problems.append(Problem("error", str(error), "export that mesh again, or take it out"))
-        return
-    report.shapes = dict(Counter(_shape_name(piece.geometry) for piece in pieces))
-    meshes = [piece.geometry for piece in pieces if isinstance(piece.geometry, coal.BVHModelBase)]
+        remedy = "export that mesh again, or take it out"
+        report.notes.append(Note(NoteKind.MESH, (), str(error), remedy, "error"))
+        return []
+    report.shapes = dict(Counter(_shape_name(piece.geometry) for piece in geometry))
+    meshes = [piece.geometry for piece in geometry if isinstance(piece.geometry, coal.BVHModelBase)]
     report.triangles = sum(int(mesh.num_tris) for mesh in meshes)
+    return pieces_of(geometry, model)
 
 
 def _absent(urdf: Path, tag: str, folders: list[str]) -> list[str]:
@@ -167,6 +197,9 @@ def _joints(urdf: Path, model: Any, config: RobotConfig, whole: Any) -> list[Joi
         if led:
             joints.append(Joint(name, kind, leader, led=True))
             continue
+        if not model.existJointName(name):  # its limits leave it no range
+            joints.append(Joint(name, kind, leader, locked=True))
+            continue
         live = model.joints[model.getJointId(name)]
         velocity = _limit(float(np.max(model.velocityLimit[live.idx_v : live.idx_v + live.nv])))
         lower = upper = None
@@ -189,109 +222,86 @@ def _judge_joints(report: Report, config: RobotConfig) -> None:
         if joint.kind in _WIDE and joint.lower is not None and joint.upper is not None
     }
     example = "`limits: {%s: {%s: %s}}` in a robot.yaml"
-    for severity, what, names, remedy in (
-        ("warning", "no position limits",
+    for severity, kind, what, names, remedy in (
+        ("warning", NoteKind.LIMIT, "no position limits",
          [j.name for j in moving if j.kind in _WIDE and (j.name not in spans or j.lower == j.upper == 0.0)],
          example % ("position", "JOINT", "[-2.0, 2.0]")),
-        ("warning", "no velocity limit", [j.name for j in moving if j.velocity is None],
+        ("warning", NoteKind.LIMIT, "no velocity limit", [j.name for j in moving if j.velocity is None],
          example % ("velocity", "JOINT", "1.5")),
-        ("warning", "a velocity limit beyond what such joints do",
+        ("warning", NoteKind.LIMIT, "a velocity limit beyond what such joints do",
          [j.name for j in moving if j.velocity is not None and j.velocity > _FAST[j.kind]],
          example % ("velocity", "JOINT", "1.5")),
-        ("warning", "a range wider than such joints have",
+        ("warning", NoteKind.LIMIT, "a range wider than such joints have",
          [name for name, (joint, span) in spans.items() if span > _WIDE[joint.kind]],
          example % ("position", "JOINT", "[-2.0, 2.0]")),
-        ("warning", "hardly any range", [name for name, (_, span) in spans.items() if 0.0 < span < _NARROW],
+        ("warning", NoteKind.JOINT, "hardly any range",
+         [name for name, (_, span) in spans.items() if 0.0 < span < _NARROW],
          "`lock: {JOINT: 0.0}` in a robot.yaml"),
-        ("warning", "mimic joints that move on their own here", [j.name for j in moving if j.mimics],
+        ("warning", NoteKind.JOINT, "mimic joints that move on their own here", [j.name for j in moving if j.mimics],
          "`qpavoid robot add` holds them and those that they follow; or list them under `lock`"),
-        ("note", "no acceleration limit (a URDF has no field for it)",
+        ("note", NoteKind.LIMIT, "no acceleration limit (a URDF has no field for it)",
          [j.name for j in moving if j.name not in config.limits.acceleration],
          example % ("acceleration", "JOINT", "10.0")),
     ):  # fmt: skip
         if names:
-            report.problems.append(Problem(severity, f"{what}: {_some(names)}", remedy))  # type: ignore[arg-type]
-
-
-def _some(names: Sequence[str], most: int = 5) -> str:
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
+            report.notes.append(Note(kind, tuple(names), what, remedy, severity))  # type: ignore[arg-type]
 
 
 # --- the robot as it loads ----------------------------------------------------------------------------------
 
 
-def _look_at_robot(report: Report, robot: Robot) -> None:
+def _look_at_robot(report: Report, robot: Robot, pieces: Sequence[Piece], progress: Callable[[str], None]) -> None:
     report.nq, report.nv = robot.model.nq, robot.model.nv
     report.bodies, report.pairs = len(robot.bodies.geometryObjects), len(robot.bodies.collisionPairs)
     if not report.bodies:
-        report.problems.append(
-            Problem(
-                "error",
-                "it has no collision bodies: nothing would be avoided",
-                "`qpavoid robot add` fits them to what is meant to be seen; or list `bodies` in a robot.yaml",
-            )
-        )
-    report.home_collisions = touching(robot, robot.home)
-    if report.home_collisions:
-        pairs = [f"{a} - {b} ({1000 * d:.1f} mm)" for a, b, d in report.home_collisions]
-        report.problems.append(
-            Problem(
-                "warning",
-                f"{len(pairs)} pairs touch at the home pose: {_some(pairs)}",
-                "`qpavoid robot add` looks for a clear pose and leaner bodies; or set `home`, or `disabled_pairs` for "
-                "shapes that overlap by design",
-            )
-        )
-    if robot.always_touching:
-        pairs = [f"{a} - {b}" for a, b in robot.always_touching]
-        report.problems.append(
-            Problem("note", f"{len(pairs)} pairs touch in every configuration and are off: {_some(pairs)}", "none")
-        )
+        what = "it has no collision bodies: nothing would be avoided"
+        remedy = "`qpavoid robot add` fits them to what is meant to be seen; or list `bodies` in a robot.yaml"
+        report.notes.append(Note(NoteKind.SHAPE, (), what, remedy, "error"))
+    _look_at_home(report, robot)
+    progress("comparing with the geometry")
+    report.notes += [note for entry in unchecked(robot, pieces) if (note := entry.note()) is not None]
     if not report.end_effectors:
-        report.problems.append(
-            Problem("note", "no frame looks like a tool", "list the frames of your tools under `end_effectors`")
-        )
-    if stretched := [name for name in report.end_effectors if _is_stretched(robot, name)]:
-        report.problems.append(
-            Problem(
-                "note",
-                f"the home pose is singular: {_some(stretched)} cannot move in every direction there",
-                "start scenarios elsewhere (`q0`), or give a `home` with bent joints",
-            )
-        )
+        remedy = "list the frames of your tools under `end_effectors`"
+        report.notes.append(Note(NoteKind.FRAME, (), "no frame looks like a tool", remedy))
     feet = [name for name in report.end_effectors if "foot" in name.lower() or "sole" in name.lower()]
     if feet and not any(joint.kind in ("floating", "planar") for joint in report.joints):
-        report.problems.append(
-            Problem("note", f"it has feet ({_some(feet)}) and a fixed base", "`root_joint: free_flyer`, or --root")
-        )
+        what = f"it has feet ({shortened(feet)}) and a fixed base"
+        report.notes.append(Note(NoteKind.JOINT, (), what, "`root_joint: free_flyer`, or --root"))
+    progress("timing a control step")
     try:
         report.tick_us = tick_time(robot, report.end_effectors)
     except QpavoidError as error:
-        report.problems.append(Problem("error", f"a controller cannot be made: {error}", "mend what it names"))
+        what = f"a controller cannot be made: {error}"
+        report.notes.append(Note(NoteKind.FILE, (), what, "mend what it names", "error"))
         return
     if report.tick_us > _SLOW:
-        report.problems.append(
-            Problem(
-                "warning",
-                f"a control step takes {report.tick_us:.0f} µs with {report.pairs} pairs",
-                "`qpavoid robot add` finds pairs that never collide, and capsules; `lock` joints that you do not use",
-            )
-        )
+        what = f"a control step takes {report.tick_us:.0f} µs with {report.pairs} pairs"
+        remedy = "`qpavoid robot add` finds pairs that never collide, and capsules; `lock` joints that you do not use"
+        report.notes.append(Note(NoteKind.PAIR, (), what, remedy, "warning"))
 
 
-def _is_stretched(robot: Robot, frame: str) -> bool:
-    """Whether a frame on a limb of six joints or more has lost a direction of motion at home."""
-    if not robot.model.existFrame(frame):
-        return False
-    data, frame_id = robot.model.createData(), frame_index(robot.model, frame)
-    J = pin.computeFrameJacobian(robot.model, data, robot.home, frame_id, pin.LOCAL_WORLD_ALIGNED)
-    J = J[:, np.any(J != 0.0, axis=0)]
-    return J.shape[1] >= 6 and bool(np.linalg.svd(J, compute_uv=False)[5] < _SINGULAR)
-
-
-_SINGULAR = 1e-3
-"""Smallest singular value of a Jacobian [m or 1] below which a pose counts as singular."""
+def _look_at_home(report: Report, robot: Robot) -> None:
+    near = touching(robot, robot.home, np.inf)
+    report.clearance = near[0][2] if near else None
+    report.home_collisions = [pair for pair in near if pair[2] <= 0.0]
+    remedy = (
+        "`qpavoid robot add` looks for a clear pose and leaner bodies; or set `home`, or `disabled_pairs` for shapes "
+        "that overlap by design"
+    )
+    for a, b, d in report.home_collisions:
+        what = f"touch at the home pose ({1e3 * d:.1f} mm)"
+        report.notes.append(Note(NoteKind.PAIR, (a, b), what, remedy, "warning"))
+    close = [(a, b, d) for a, b, d in near if 0.0 < d < robot.safety_distance(a, b, D1)]
+    for a, b, d in close:
+        what = f"{1e3 * d:.1f} mm apart at the home pose, less than the default safety distance"
+        remedy = "another `home`, a smaller `d1`, or `pair_margins`; `qpavoid robot add` writes them"
+        report.notes.append(Note(NoteKind.PAIR, (a, b), what, remedy))
+    limbs = Limbs(robot, report.end_effectors)
+    report.conditioning = dict(zip(limbs.names, limbs.at(robot.home), strict=True))
+    if singular := [name for name, limb in report.conditioning.items() if limb.ratio < BENT]:
+        what = "the home pose is singular or nearly so: they cannot move well in every direction there"
+        remedy = "start scenarios elsewhere (`q0`), or give a `home` with bent joints"
+        report.notes.append(Note(NoteKind.HOME, tuple(singular), what, remedy))
 
 
 def tick_time(robot: Robot, frames: Sequence[str]) -> float:

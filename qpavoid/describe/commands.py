@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, get_args
@@ -17,10 +17,11 @@ from qpavoid.describe.check import check_robot
 from qpavoid.describe.findings import Joint, Report
 from qpavoid.describe.fit import Bodies
 from qpavoid.describe.sampling import SAMPLES, SEED
-from qpavoid.describe.texts import description_files, home_line, pairs_line, volume_line
+from qpavoid.describe.texts import description_files, home_line, note_lines, pairs_line, volume_line
 from qpavoid.describe.written import write_files
 from qpavoid.errors import ConfigError
 from qpavoid.files.shipped import find_robot
+from qpavoid.notes import Note
 from qpavoid.report import to_json
 from qpavoid.terminal import ERR, OUT
 
@@ -30,6 +31,12 @@ Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and 
 PackageDirs = Annotated[
     list[Path] | None, typer.Option("--package-dir", help="Folder in which package:// meshes are looked up.")
 ]
+Packages = Annotated[
+    list[str] | None, typer.Option("--package", metavar="NAME=FOLDER", help="Folder of one ROS package.")
+]
+MissingMeshes = Annotated[
+    bool, typer.Option("--allow-missing-meshes", help="Leave out shapes whose mesh cannot be found, and name them.")
+]
 RootJoint = Annotated[str, typer.Option("--root", help=f"How it stands: {', '.join(get_args(Root))}.")]
 
 
@@ -38,13 +45,17 @@ def check(
     robot: Annotated[str, typer.Argument(help="URDF, MJCF, robot.yaml, or the name of a robot that ships.")],
     root: RootJoint = "fixed",
     package_dir: PackageDirs = None,
+    package: Packages = None,
+    allow_missing_meshes: MissingMeshes = False,
     json: Json = False,
 ) -> None:
-    """Look a robot over: joints, limits, geometry, collisions at home, tick time; each problem with its remedy.
+    """Look a robot over: joints, limits, geometry, pairs, home pose, time of a step; each problem with its remedy.
 
     The exit status is 1 when it cannot be used as it is.
     """
-    report = check_robot(robot, _one_of(root, Root, "--root"), package_dir or ())
+    report = check_robot(
+        robot, _one_of(root, Root, "--root"), _entries(package_dir, package), allow_missing_meshes, Progress()
+    )
     if json:
         print(to_json({**asdict(report), "usable": report.usable}))
     else:
@@ -67,14 +78,22 @@ def _check_lines(report: Report) -> Iterator[str]:
     yield f"end effectors  {escape(', '.join(report.end_effectors) or 'none recognised')}"
     if report.tick_us is not None:
         yield f"control step   {report.tick_us:.0f} µs (median, tracks the end effectors, no obstacles)"
-    colours = {"error": "red", "warning": "yellow", "note": "dim"}
-    for problem in report.problems:
-        yield (
-            f"[{colours[problem.severity]}]{problem.severity:<14}[/] {escape(problem.what)}\n{'':15}→ "
-            f"{escape(problem.remedy)}"
-        )
-    if not report.problems:
+    if report.clearance is not None:
+        yield f"home           least distance {1e3 * report.clearance:.1f} mm"
+    for frame, limb in report.conditioning.items():
+        yield f"{'':14} {escape(frame)}: {limb}"
+    yield from _table(report.notes)
+    if not report.notes:
         yield "no problem found"
+
+
+def _table(notes: Sequence[Note]) -> Iterator[str]:
+    """What was left out, mended, replaced or assumed, coloured by severity."""
+    colours = {"error": "red", "warning": "yellow", "note": "dim"}
+    for line in note_lines(notes):
+        severity = line.partition(" ")[0]
+        colour = colours.get(severity)
+        yield f"[{colour}]{severity}[/]{escape(line.removeprefix(severity))}" if colour else escape(line)
 
 
 def _joint_text(joint: Joint) -> str:
@@ -101,6 +120,8 @@ def add(
         list[str] | None, typer.Option(metavar="JOINT=VALUE", help="Of a home pose to prefer [rad or m].")
     ] = None,
     package_dir: PackageDirs = None,
+    package: Packages = None,
+    allow_missing_meshes: MissingMeshes = False,
     srdf: Annotated[Path | None, typer.Option(help="SRDF to honour; one beside the URDF if left out.")] = None,
     samples: Annotated[int, typer.Option(min=1, max=1_000_000, help="Configurations drawn to judge pairs.")] = SAMPLES,
     seed: Annotated[int, typer.Option(min=0, help="Of the draw.")] = SEED,
@@ -113,12 +134,13 @@ def add(
     kind, by_link = _kinds(bodies or [])
     wishes = Wishes(
         name=name, bodies=kind, bodies_of=by_link, root=_one_of(root, Root, "--root"), lock=tuple(lock or ()),
-        home=_values(home or []), package_dirs=tuple(package_dir or ()), srdf=srdf, samples=samples, seed=seed,
+        home=_values(home or []), package_dirs=_entries(package_dir, package),
+        allow_missing_meshes=allow_missing_meshes, srdf=srdf, samples=samples, seed=seed,
     )  # fmt: skip
     urdf = find_robot(path)
     if urdf.suffix in (".yaml", ".yml"):
         raise ConfigError(f"{path}: is described already; give a URDF or MJCF")
-    described = describe(urdf, wishes)
+    described = describe(urdf, wishes, Progress())
     folder = out or Path(described.config.name)
     files = description_files(described, folder)
     if picture and (drawn := _picture(described)) is not None:
@@ -157,6 +179,17 @@ def _values(given: list[str]) -> dict[str, float]:
     return values
 
 
+def _entries(folders: list[Path] | None, packages: list[str] | None) -> tuple[str, ...]:
+    """Entries of `package_dirs`: packages by name first."""
+    for text in packages or []:
+        name, equals, folder = text.partition("=")
+        if not (name and equals and folder):
+            raise ConfigError(f"--package {text}: expected NAME=FOLDER, as in my_robot=~/src/my_robot")
+        if not Path(folder).is_dir():
+            raise ConfigError(f"--package {text}: no such folder {folder!r}")
+    return (*(packages or ()), *(str(folder) for folder in folders or ()))
+
+
 def _one_of(value: str, kind: Any, option: str) -> Any:
     if value not in get_args(kind):
         raise ConfigError(f"{option}: {value!r} is none of {', '.join(get_args(kind))}")
@@ -175,22 +208,27 @@ def _picture(described: Described) -> bytes | None:
 
 
 def _document(described: Described, outcome: dict[Path, str], seconds: float) -> dict[str, Any]:
-    bodies, hulls = (sum(volumes[i] for volumes in described.volume.values()) for i in (0, 1))
+    links, home = described.links.values(), described.home
     return {
         "name": described.config.name,
         "files": {str(path): what for path, what in outcome.items()},
         "bodies": len(described.robot.bodies.geometryObjects),
-        "bodies_volume": bodies,
-        "hulls_volume": hulls,
+        "bodies_volume": sum(link.volume for link in links),
+        "hulls_volume": sum(link.hulls for link in links),
+        "geometry_volume": sum(link.inside for link in links),
         "pairs": dict(described.counts),
+        "pair_margins": [own.model_dump() for own in described.config.pair_margins],
+        "left_out": [asdict(entry) for entry in described.left_out],
         "samples": described.wishes.samples,
         "seed": described.wishes.seed,
         "srdf": None if described.honoured is None else str(described.honoured),
         "end_effectors": list(described.config.end_effectors),
         "home": dict(described.config.home),
         "lock": dict(described.config.lock),
-        "clearance": described.clearance,
-        "notes": list(described.notes),
+        "clearance": home.clearance,
+        "nearest": home.nearest,
+        "conditioning": {frame: asdict(limb) for frame, limb in home.conditioning.items()},
+        "notes": [asdict(note) for note in described.notes],
         "seconds": seconds,
     }
 
@@ -201,8 +239,29 @@ def _report(described: Described, outcome: dict[Path, str], seconds: float) -> N
         f"pairs          {pairs_line(described)}",
         f"end effectors  {', '.join(described.config.end_effectors) or 'none recognised'}",
         f"home           {home_line(described)}",
-        *(f"note           {note}" for note in described.notes),
+    ):
+        OUT.print(line, highlight=False, markup=False, soft_wrap=True)
+    for line in _table(described.notes):
+        OUT.print(line, highlight=False, soft_wrap=True)
+    for line in (
         *(f"{what:<14} {path}" for path, what in outcome.items()),
         f"               in {seconds:.1f} s; in a scenario: `robot: {next(iter(outcome))}`",
     ):
         OUT.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+class Progress:
+    """Says on stderr what is done, as soon as it takes long and then every other second."""
+
+    def __init__(self) -> None:
+        self._next = time.perf_counter() + _PATIENCE
+
+    def __call__(self, what: str) -> None:
+        """What is done next."""
+        if time.perf_counter() >= self._next:
+            ERR.print(f"{what} …", style="dim", highlight=False, markup=False, soft_wrap=True)
+            self._next = time.perf_counter() + _PATIENCE
+
+
+_PATIENCE = 2.0
+"""Time between two lines [s]."""

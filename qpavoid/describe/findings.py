@@ -3,16 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
 
-
-@dataclass(frozen=True)
-class Problem:
-    """Something to know or to mend."""
-
-    severity: Literal["error", "warning", "note"]
-    what: str
-    remedy: str
+from qpavoid.describe.home import Conditioning
+from qpavoid.notes import Note
 
 
 @dataclass(frozen=True)
@@ -60,9 +53,14 @@ class Report:
     load_seconds: float | None = None
     tick_us: float | None = None
     """Median control step that tracks all end effectors, without obstacles [µs]."""
-    problems: list[Problem] = field(default_factory=list)
+    clearance: float | None = None
+    """Least distance of any pair at the home pose [m]; None: no pair."""
+    conditioning: dict[str, Conditioning] = field(default_factory=dict)
+    """Of the limb that ends at each end effector, at the home pose."""
+    notes: list[Note] = field(default_factory=list)
+    """What was left out, mended, replaced or assumed, and what is wrong; errors first."""
 
     @property
     def usable(self) -> bool:
         """Whether it can run as it is."""
-        return not any(problem.severity == "error" for problem in self.problems)
+        return not any(note.severity == "error" for note in self.notes)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Literal
 
 import coal
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
+from qpavoid.describe.volume import solid_volume
 from qpavoid.geometry.bodies import enclosing_capsule, hull_points
 from qpavoid.geometry.capsules import CapsuleFit, fit_capsule, outermost
+from qpavoid.geometry.segments import point_segment
 from qpavoid.problem import Array
 
 Bodies = Literal["auto", "capsule", "capsules", "convex"]
@@ -21,6 +24,12 @@ MOST = 4
 GROSS = 2.0
 """Volume of capsules, in units of the hull's, from which `auto` takes the hull instead, although a hull costs a pair
 twenty times what a capsule costs. A capsule around a cylinder takes 1.3 to 2, around a cube 2.7."""
+CONCAVE = 1.5
+"""Volume of a mesh's hull, in units of what the mesh encloses, from which `auto` compares several capsules [-]."""
+_FINE = 4000
+"""Triangles from which cuts are chosen on a coarser surface; what is cut, and enclosed, is the surface itself."""
+_GRID = 32
+"""Cells of the coarser surface along its longest side."""
 WORTH = 0.15
 """Part of the volume that a further capsule must save."""
 _CUTS = np.linspace(0.2, 0.8, 7)
@@ -29,12 +38,13 @@ _COARSE = 24
 """Directions that are tried for each capsule while cuts are compared."""
 
 
-def fit_piece(geometry: Any, how: Bodies) -> tuple[CapsuleFit, ...]:
+def fit_piece(geometry: Any, how: Bodies, inside: float | None = None) -> tuple[CapsuleFit, ...]:
     """Capsules that enclose a coal geometry entirely; none where its hull, or the primitive itself, is to stand for it.
 
     Args:
         geometry: as read from a URDF.
         how: which kind of shapes.
+        inside: `inside_volume` of the geometry, where it is known [m³].
 
     Returns:
         Capsules in the geometry's own frame.
@@ -45,9 +55,18 @@ def fit_piece(geometry: Any, how: Bodies) -> tuple[CapsuleFit, ...]:
         return ()
     one = enclosing_capsule(geometry)
     gross = GROSS * hull_volume(geometry)
-    if how == "capsule" or (how == "auto" and one.volume <= gross):
+    is_mesh = isinstance(geometry, coal.BVHModelBase)
+    lean = how == "capsule" or (how == "auto" and one.volume <= gross)
+    if how == "auto" and is_mesh:
+        inside = inside_volume(geometry) if inside is None else inside
+        hull = hull_volume(geometry)
+        if hull > CONCAVE * inside:  # several capsules may follow a bend that the hull spans
+            several = decompose(triangles(geometry), one)
+            if sum(fit.volume for fit in several) < min(hull, one.volume):
+                return several
+    if lean:
         return (one,)
-    if how == "auto" and not isinstance(geometry, coal.BVHModelBase | coal.ConvexBase):
+    if how == "auto" and not (is_mesh or isinstance(geometry, coal.ConvexBase)):
         return ()  # boxes and cylinders are exact as they are
     several = decompose(triangles(geometry), one)
     return () if how == "auto" and sum(fit.volume for fit in several) > gross else several
@@ -66,19 +85,44 @@ def decompose(surface: Array, whole: CapsuleFit, most: int = MOST) -> tuple[Caps
         most: number of capsules.
     """
     parts = [(surface, whole)]
-    cuts = [_best_cut(surface)]
+    cuts = [_halves(surface)]
     while len(parts) < most:
         savings = [part[1].volume - sum(fit.volume for _, fit in cut) for part, cut in zip(parts, cuts, strict=True)]
         best = int(np.argmax(savings))
         if savings[best] < WORTH * sum(fit.volume for _, fit in parts):
             break
         parts[best : best + 1] = cuts[best]
-        cuts[best : best + 1] = [_best_cut(half) for half, _ in cuts[best]]
+        cuts[best : best + 1] = [_halves(half) for half, _ in cuts[best]]
     return tuple(fit for _, fit in parts)
 
 
-def _best_cut(surface: Array) -> list[tuple[Array, CapsuleFit]]:
-    """The two halves with the least volume, each with its capsule."""
+def _halves(surface: Array) -> list[tuple[Array, CapsuleFit]]:
+    """The two halves with the least volume, each with its capsule; the whole where it cannot be cut."""
+    plane = _best_cut(_coarse(surface))
+    halves = [] if plane is None else [cut(surface, *plane, side) for side in (-1.0, 1.0)]
+    if not halves or not all(len(half) for half in halves):
+        return [(surface, _fit(surface))]
+    return [(half, _fit(half)) for half in halves]
+
+
+def _fit(surface: Array) -> CapsuleFit:
+    """A small capsule around a surface: of many corners, around the outermost, and then wider by what sticks out."""
+    points = _corners(surface)
+    if len(points) <= _MANY:
+        return fit_capsule(points)
+    fit = fit_capsule(outermost(points))
+    half = 0.5 * fit.length * fit.rotation[:, 2]
+    sticks_out = float(point_segment(points, fit.center - half, fit.center + half).distance.max()) - fit.radius
+    wider = replace(fit, radius=fit.radius + max(sticks_out, 0.0))
+    return wider if wider.volume <= _WIDER * fit.volume else fit_capsule(points)
+
+
+_MANY, _WIDER = 500, 1.05
+"""Corners from which the outermost are fitted first, and the volume that this may cost, in units of theirs [-]."""
+
+
+def _best_cut(surface: Array) -> tuple[Array, float] | None:
+    """Normal (3,) and height [m] of the plane whose halves have the least volume; None where none cuts."""
     points = _corners(surface)
     axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
     tried = []
@@ -88,11 +132,22 @@ def _best_cut(surface: Array) -> list[tuple[Array, CapsuleFit]]:
             halves = [cut(surface, axis, height, side) for side in (-1.0, 1.0)]
             if all(len(half) for half in halves):
                 volume = sum(fit_capsule(outermost(half.reshape(-1, 3)), _COARSE).volume for half in halves)
-                tried.append((volume, halves))
-    if not tried:
-        return [(surface, fit_capsule(points))]
-    _, halves = min(tried, key=lambda pair: pair[0])
-    return [(half, fit_capsule(_corners(half))) for half in halves]
+                tried.append((volume, axis, float(height)))
+    return min(tried, key=lambda found: found[0])[1:] if tried else None
+
+
+def _coarse(surface: Array) -> Array:
+    """A surface of many triangles with its corners drawn onto a grid, without the triangles that vanish or coincide."""
+    if len(surface) <= _FINE:
+        return surface
+    cell = float(np.ptp(surface.reshape(-1, 3), axis=0).max()) / _GRID
+    index = np.round(surface / cell).astype(np.int64)
+    index -= index.min(axis=(0, 1))
+    number = index @ [1, 1024, 1024 * 1024]
+    a, b, c = number.T
+    kept = index[(a != b) & (b != c) & (a != c)]
+    same = np.unique(np.sort(kept @ [1, 1024, 1024 * 1024], axis=1), axis=0, return_index=True)[1]
+    return np.asarray(cell * kept[np.sort(same)] + surface.min(axis=(0, 1))) if len(same) else surface[:_FINE]
 
 
 def cut(surface: Array, normal: Array, height: float, side: float) -> Array:
@@ -125,8 +180,7 @@ def cut(surface: Array, normal: Array, height: float, side: float) -> Array:
 def triangles(geometry: Any) -> Array:
     """Corners of the triangles of a coal geometry's surface, of its hull where it is no mesh (t, 3, 3) [m]."""
     if isinstance(geometry, coal.BVHModelBase):
-        corners = np.array(geometry.vertices())
-        index = [geometry.tri_indices(i) for i in range(geometry.num_tris)]
+        corners, index = np.array(geometry.vertices()), map(geometry.tri_indices, range(geometry.num_tris))
         return corners[np.array([(t[0], t[1], t[2]) for t in index], dtype=np.intp)]
     points = hull_points(geometry)
     return np.asarray(points[ConvexHull(points).simplices])
@@ -140,6 +194,13 @@ def hull_volume(geometry: Any) -> float:
         return float(ConvexHull(hull_points(geometry)).volume)
     except QhullError:
         return 0.0
+
+
+def inside_volume(geometry: Any) -> float:
+    """Volume of what a coal geometry encloses [m³]: of a mesh its own, not that of its hull."""
+    if isinstance(geometry, coal.BVHModelBase):
+        return min(solid_volume(triangles(geometry)), hull_volume(geometry))
+    return hull_volume(geometry)
 
 
 def _corners(surface: Array) -> Array:

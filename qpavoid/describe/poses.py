@@ -17,6 +17,7 @@ from qpavoid.files.safe_xml import read_robot_xml
 from qpavoid.geometry.joints import middle
 from qpavoid.geometry.urdf import is_mjcf
 from qpavoid.kinematics import MIMIC
+from qpavoid.notes import Note, NoteKind
 from qpavoid.problem import Array
 from qpavoid.robot import Robot
 
@@ -54,10 +55,18 @@ def joint_values(model: Any, q: Array) -> dict[str, float]:
     return values
 
 
-def locks(urdf: Path, model: Any, patterns: Sequence[str], semantics: Semantics, notes: list[str]) -> dict[str, float]:
-    """Joints that are held, and where: those the user names, and those that move together with others.
+def locks(
+    urdf: Path,
+    model: Any,
+    patterns: Sequence[str],
+    semantics: Semantics,
+    notes: list[Note],
+    wheels: Sequence[str] = (),
+) -> dict[str, float]:
+    """Joints that are held, and where: those the user names, wheels, and joints that could not follow another one.
 
-    A joint that mimics another would move on its own otherwise, which it cannot.
+    A joint that mimics another one follows it without a coordinate of its own, and the other one stays free. Where
+    Pinocchio cannot read the two so, they would move on their own, which they cannot, and both are held.
     """
     names = list(model.names)[1:]
     held = []
@@ -66,10 +75,20 @@ def locks(urdf: Path, model: Any, patterns: Sequence[str], semantics: Semantics,
         if not found:
             raise UnknownName(f"--lock: no joint {pattern!r}{nearest(pattern, names)}")
         held += found
+    if wheels := [name for name in wheels if name not in held]:
+        what = "locked: wheels of a mobile base, whose own coordinates move it"
+        notes.append(Note(NoteKind.JOINT, tuple(wheels), what, "take them out of `lock` to drive them"))
+    held += wheels
     followers = {name: source for name, source in mimics(urdf).items() if name in names}
-    coupled = [name for name in names if name in followers or name in {source[0] for source in followers.values()}]
+    apart = {name for name in followers if model.joints[model.getJointId(name)].shortname() != MIMIC}
+    coupled = [name for name in names if name in apart or name in {followers[other][0] for other in apart}]
     if coupled := [name for name in coupled if name not in held]:
-        notes.append(f"held at home, because they move together (mimic): {', '.join(coupled)}")
+        what = "locked: they move together (mimic), in a way that the model cannot hold"
+        notes.append(Note(NoteKind.JOINT, tuple(coupled), what, severity="warning"))
+    led = dict.fromkeys(source for name, (source, _, _) in followers.items() if name not in apart)
+    if drivers := [name for name in led if name not in (*held, *coupled)]:
+        what = "free, and moved for avoidance: others follow them (mimic), as fingers do"
+        notes.append(Note(NoteKind.JOINT, tuple(drivers), what, f"--lock {drivers[0]} where something else moves it"))
     state = next(iter(semantics.states.values()), {})
     start = joint_values(model, _posed(model, middle(model), state))
     values = {}

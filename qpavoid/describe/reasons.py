@@ -1,15 +1,57 @@
-"""Which pairs of bodies are not watched, and why: by links where that says it all, as an SRDF does."""
+"""Which pairs of bodies are not checked, why, and how often the robot's own geometry touches there."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
 
+import numpy as np
 import pinocchio as pin
 
-from qpavoid.describe.sampling import BoolArray, Sampled
+from qpavoid.config import PairMargin
+from qpavoid.describe.sampling import D1, SEED, BoolArray, Sampled, Space
+from qpavoid.describe.shapes import Piece
+from qpavoid.geometry.joints import frame_index
+from qpavoid.geometry.pairs import ALWAYS, contacts
+from qpavoid.notes import Note, NoteKind
+from qpavoid.problem import Array
 from qpavoid.robot import Robot
+
+Reason = Literal["adjacent", "srdf", "always", "drawn in", "never"]
+_POSES = 200
+"""Configurations in which the geometry of links that are not checked is looked at."""
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """Two links of which no pair of bodies is checked."""
+
+    links: tuple[str, str]
+    reason: Reason
+    bodies: float | None
+    """Share of random configurations in which their bodies touch, the pair that does so most [-]; None: not sampled."""
+    geometry: float
+    """The same of the file's own geometry, meshes as they are [-]."""
+
+    def note(self) -> Note | None:
+        """Say what may matter of it; None of what never touches, or always does as neighbours do."""
+        share, kind = self.geometry, NoteKind.PAIR
+        if self.reason == "always" and share < ALWAYS:
+            bodies = 100.0 * (self.bodies or 0.0)
+            what = f"not checked: their bodies touch in {bodies:.0f} % of configurations, their geometry more seldom"
+            remedy = f"leaner bodies: --bodies {self.links[0]}=convex, or of your own"
+            return Note(kind, self.links, what, remedy, "warning", share)
+        if self.reason == "always":
+            return Note(kind, self.links, "not checked: they overlap by design", share=share)
+        if self.reason == "drawn in":
+            return Note(kind, self.links, "not checked: they slide into each other by design", share=share)
+        if not 0.0 < share < ALWAYS:
+            return None
+        why, remedy = "one joint apart", "limit that joint so that they cannot"
+        if self.reason == "srdf":
+            why, remedy = "disabled by hand", "take them out of the SRDF or `disabled_pairs`"
+        return Note(kind, self.links, f"not checked ({why}), but can touch", remedy, share=share)
 
 
 def _pairs(robot: Robot) -> list[frozenset[str]]:
@@ -17,54 +59,160 @@ def _pairs(robot: Robot) -> list[frozenset[str]]:
     return [frozenset((names[pair.first], names[pair.second])) for pair in robot.bodies.collisionPairs]
 
 
-def pair_reasons(bare: Robot, robot: Robot, sampled: Sampled) -> dict[frozenset[str], str]:
-    """Why each pair of bodies that is not watched is not.
+def pair_reasons(bare: Robot, robot: Robot, sampled: Sampled, nested: BoolArray) -> dict[frozenset[str], Reason]:
+    """Why each pair of bodies that is not checked is not.
 
     Args:
         bare: the robot without an SRDF.
         robot: the robot with it.
         sampled: what became of its pairs.
+        nested: which of them slide into each other (m,).
     """
     names = [body.name for body in bare.bodies.geometryObjects]
-    every = [frozenset((a, b)) for i, a in enumerate(names) for b in names[:i]]
-    touching = {frozenset(pair) for pair in bare.always_touching}
-    checked = set(_pairs(bare))
-    kept = dict(zip(_pairs(robot), zip(sampled.always, sampled.never, strict=True), strict=True))
-    reasons = {}
-    for pair in every:
-        if pair in touching:
+    touching = {frozenset(pair[:2]) for pair in robot.always_touching}
+    checked = {*_pairs(bare), *(frozenset(pair[:2]) for pair in bare.always_touching)}
+    kept = {pair: i for i, pair in enumerate(_pairs(robot))}
+    reasons: dict[frozenset[str], Reason] = {}
+    for pair in [frozenset((a, b)) for i, a in enumerate(names) for b in names[:i]]:
+        index = kept.get(pair)
+        if pair in touching or (index is not None and sampled.always[index]):
             reasons[pair] = "always"
         elif pair not in checked:
             reasons[pair] = "adjacent"
-        elif pair not in kept:
+        elif index is None:
             reasons[pair] = "srdf"
-        elif any(kept[pair]):
-            reasons[pair] = "always" if kept[pair][0] else "never"
+        elif nested[index]:
+            reasons[pair] = "drawn in"
+        elif sampled.never[index]:
+            reasons[pair] = "never"
     return reasons
 
 
-_WHY = {"adjacent": "Adjacent", "always": "Default", "never": "Never"}
+_WHY = {"adjacent": "Adjacent", "always": "Default", "never": "Never", "drawn in": "Default"}
 
 
-def by_link(robot: Robot, reasons: Mapping[frozenset[str], str]) -> tuple[dict[frozenset[str], str], list[Any]]:
-    """What is not watched, by links where that says it all, and by bodies where it does not."""
-    link = {body.name: robot.model.frames[body.parentFrame].name for body in robot.bodies.geometryObjects}
-    pairs: dict[frozenset[str], list[str | None]] = {}
+def by_link(
+    robot: Robot, reasons: Mapping[frozenset[str], Reason]
+) -> tuple[dict[frozenset[str], Reason], list[tuple[str, str]]]:
+    """What is not checked, by links where that says it all, and by bodies where it does not."""
+    link = _links(robot)
+    pairs: dict[frozenset[str], list[Reason | None]] = {}
     names = list(link)
     for i, a in enumerate(names):
         for b in names[:i]:
             if link[a] != link[b]:
                 pairs.setdefault(frozenset((link[a], link[b])), []).append(reasons.get(frozenset((a, b))))
-    off = {links: _WHY.get(str(whys[0]), "User") for links, whys in pairs.items() if None not in whys}
+    order: tuple[Reason, ...] = ("drawn in", "always", "srdf", "adjacent", "never")
+    off = {
+        links: min((why for why in whys if why), key=order.index) for links, whys in pairs.items() if None not in whys
+    }
     single = [
-        tuple(sorted(pair))
+        (min(pair), max(pair))
         for pair, why in reasons.items()
-        if why in ("never", "always") and frozenset(link[body] for body in pair) not in off
+        if why in ("never", "always", "drawn in") and frozenset(link[body] for body in pair) not in off
     ]
     return off, sorted(single)
 
 
-def watching(robot: Robot, kept: BoolArray) -> Robot:
+def srdf_reason(reason: Reason) -> str:
+    """The reason as an SRDF gives it."""
+    return _WHY.get(reason, "User")
+
+
+def _links(robot: Robot) -> dict[str, str]:
+    return {body.name: robot.model.frames[body.parentFrame].name for body in robot.bodies.geometryObjects}
+
+
+def left_out(
+    robot: Robot, pieces: Sequence[Piece], off: Mapping[frozenset[str], Reason], shares: Mapping[frozenset[str], float]
+) -> list[LeftOut]:
+    """Look how often the geometry of links that are not checked touches, in random configurations.
+
+    Args:
+        robot: with its pairs.
+        pieces: geometry as the file has it.
+        off: two links that are not checked, and why.
+        shares: two bodies: share of configurations in which they touch [-].
+    """
+    # bodies enclose the geometry: where they never come near, it does not touch
+    of_geometry = geometry_contacts(robot, pieces, [links for links, reason in off.items() if reason != "never"])
+    link = _links(robot)
+    of_bodies: dict[frozenset[str], float] = {}
+    for pair, share in shares.items():
+        links = frozenset(link[body] for body in pair)
+        of_bodies[links] = max(of_bodies.get(links, 0.0), share)
+    return [
+        LeftOut((min(links), max(links)), reason, of_bodies.get(links), of_geometry.get(links, 0.0))
+        for links, reason in sorted(off.items(), key=lambda item: sorted(item[0]))
+    ]
+
+
+def unchecked(robot: Robot, pieces: Sequence[Piece]) -> list[LeftOut]:
+    """The links of a robot as it loads of which no pair of bodies is checked, and how often their geometry touches.
+
+    Args:
+        robot: with its pairs.
+        pieces: geometry as the file has it.
+    """
+    link, joint = _links(robot), {body.name: body.parentJoint for body in robot.bodies.geometryObjects}
+    checked = {frozenset(link[body] for body in pair) for pair in _pairs(robot)}
+    always = {frozenset((link[pair.a], link[pair.b])) for pair in robot.always_touching}
+    parents, off, names = robot.model.parents, dict[frozenset[str], Reason](), list(link)
+    for i, a in enumerate(names):
+        for b in names[:i]:
+            pair = frozenset((link[a], link[b]))
+            if joint[a] != joint[b] and pair not in checked and pair not in always:
+                adjacent = parents[joint[a]] == joint[b] or parents[joint[b]] == joint[a]
+                off[pair] = "adjacent" if adjacent else "srdf"
+    return left_out(robot, pieces, off, {})
+
+
+def geometry_contacts(
+    robot: Robot, pieces: Sequence[Piece], links: Iterable[frozenset[str]]
+) -> dict[frozenset[str], float]:
+    """Share of random configurations in which the geometry of two links touches; pairs that never move are left out.
+
+    Args:
+        robot: whose model moves the links.
+        pieces: geometry as the file has it.
+        links: pairs of links.
+    """
+    geometry, owners = pin.GeometryModel(), dict[str, list[int]]()
+    for number, piece in enumerate(pieces):
+        frame_id = frame_index(robot.model, piece.link)
+        frame = robot.model.frames[frame_id]
+        body = pin.GeometryObject(
+            f"{number}", frame.parentJoint, frame_id, frame.placement * piece.placement, piece.geometry
+        )
+        owners.setdefault(piece.link, []).append(geometry.addGeometryObject(body))
+    joints, pair_links = [body.parentJoint for body in geometry.geometryObjects], []
+    for pair in links:
+        a, b = sorted(pair)
+        for i in owners.get(a, []):
+            for j in owners.get(b, []):
+                if joints[i] != joints[j]:
+                    geometry.addCollisionPair(pin.CollisionPair(min(i, j), max(i, j)))
+                    pair_links.append(pair)
+    touching = contacts(robot.model, geometry, list(Space(robot).draw(np.random.default_rng(SEED), _POSES)))
+    found: dict[frozenset[str], BoolArray] = {}
+    for pair, column in zip(pair_links, touching.T, strict=True):
+        found[pair] = found.get(pair, np.zeros(len(column), dtype=bool)) | column
+    return {pair: float(column.mean()) for pair, column in found.items()}
+
+
+def contact_shares(robot: Robot, sampled: Sampled) -> dict[frozenset[str], float]:
+    """Two bodies: share of random configurations in which they touch [-], of pairs that were sampled."""
+    shares = dict(zip(_pairs(robot), sampled.contact.tolist(), strict=True))
+    return {**shares, **{frozenset((pair.a, pair.b)): pair.share for pair in robot.always_touching}}
+
+
+def own_margins(robot: Robot, d1: Array) -> list[PairMargin]:
+    """Safety distances (m,) of the pairs that get one of their own."""
+    bodies = [sorted(pair) for pair in _pairs(robot)]
+    return [PairMargin(bodies=(a, b), d1=float(own)) for (a, b), own in zip(bodies, d1, strict=True) if own < D1]
+
+
+def keeping(robot: Robot, kept: BoolArray) -> Robot:
     """The robot with some of its pairs only."""
     bodies = pin.GeometryModel(robot.bodies)
     pairs = list(robot.bodies.collisionPairs)

@@ -1,4 +1,4 @@
-"""What random configurations tell of a robot: pairs that always or never come near, a pose clear of collision."""
+"""What random configurations tell of a robot: how often each pair touches, how near it comes, how far it gets."""
 
 from __future__ import annotations
 
@@ -11,27 +11,51 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from qpavoid.config import Avoidance
-from qpavoid.geometry.pairs import pair_array
-from qpavoid.kinematics import support_masks
+from qpavoid.geometry.bodies import bounding_sphere
+from qpavoid.geometry.pairs import ALWAYS, pair_array
+from qpavoid.kinematics import columns, support_masks
 from qpavoid.memory import read_results, view_results
 from qpavoid.problem import Array, IntArray
 from qpavoid.robot import Robot
 
+BoolArray = NDArray[np.bool_]
 SAMPLES, SEED = 5000, 0
 NEAR = 0.02
-"""Distance [m] that a pair must keep from each other in every sample, and where descent from the nearest of them
-ends, to count as never colliding."""
-FAR = Avoidance().d1
-"""Distance [m] beyond which a pair must come in some sample: others could never keep the default margin. They are
-neighbours by design, and the joints' limits keep them apart, if anything does."""
-CLEAR = 0.005
-"""Least distance [m] of any pair at a home pose."""
+"""Distance, as a share of the robot's size, that a pair must keep in every sample, and where descent from the nearest
+of them ends, to count as never colliding [-]: 20 mm of an arm that reaches 1 m."""
+FAT = 0.03
+"""Distance, as a share of the robot's size, within which two capsules are in every sample if they are too fat [-]."""
+D1 = Avoidance().d1
+"""Safety distance of the pairs that have none of their own [m]."""
+_FIRST = 500
+"""Samples in which all pairs are computed; afterwards only those that may be at one end of the scale."""
 _SETTLE = 250
-"""Samples after which pairs that have been near and far are not looked at any more."""
+"""Samples after which it is decided again which ones these are."""
+_DOUBT = 0.1
+"""Share of samples by which a pair's contact may differ from `ALWAYS` and still come to reach it [-]."""
 _STEPS = 60
 """Of a descent."""
 _UNBOUNDED = np.pi
 """Range of coordinates without limits: joints that turn all the way round, and a root that never matters here."""
+
+
+def robot_size(robot: Robot) -> float:
+    """Half the diagonal of the largest box that the bodies fill in some configurations, never 0 [m].
+
+    About the reach of an arm, the height of a humanoid: what distances on this robot are large or small beside.
+    """
+    bodies = robot.bodies.geometryObjects
+    if not len(bodies):
+        return 1.0
+    centers, radii = zip(*(bounding_sphere(body.geometry) for body in bodies), strict=True)
+    radius = np.array(radii)[:, None]
+    data, geometry, diagonal = robot.model.createData(), robot.bodies.createData(), 0.0
+    for q in [robot.home, *Space(robot).draw(np.random.default_rng(SEED), 20)]:
+        pin.updateGeometryPlacements(robot.model, data, robot.bodies, geometry, q)
+        at = np.array([pose.act(center) for pose, center in zip(geometry.oMg, centers, strict=True)])
+        low, high = (at - radius).min(axis=0), (at + radius).max(axis=0)
+        diagonal = max(diagonal, float(np.linalg.norm(high - low)))
+    return max(0.5 * diagonal, 1e-3)
 
 
 class PairDistances:
@@ -45,6 +69,7 @@ class PairDistances:
         joints = np.array([body.parentJoint for body in self._bodies.geometryObjects], dtype=np.intp)
         masks = support_masks(robot.model)
         self._support = masks[joints[self.pairs[:, 1]]] - masks[joints[self.pairs[:, 0]]]
+        self._columns = columns(robot.model)
         self.all(robot.home)  # so that there is something to compare the view with
         view = view_results(self._geometry.distanceResults)
         self._view = view
@@ -69,8 +94,12 @@ class PairDistances:
         pin.updateGeometryPlacements(self.model, self.data, self._bodies, self._geometry)
         result = pin.computeDistance(self._bodies, self._geometry, index)
         normal, point = np.array(result.normal), np.array(result.getNearestPoint1())
-        screw = np.concatenate((normal, np.cross(point, normal)))
-        return float(result.min_distance), (screw @ self.data.J) * self._support[index]
+        row = (np.concatenate((normal, np.cross(point, normal))) @ self.data.J) * self._support[index]
+        return float(result.min_distance), np.bincount(self._columns, row, self.model.nv).astype(np.float64)
+
+    def moved_by(self, index: int) -> BoolArray:
+        """Coordinates (nv,) that change the distance of one pair."""
+        return np.bincount(self._columns, np.abs(self._support[index]), self.model.nv) > 0.0
 
 
 class Space:
@@ -80,13 +109,17 @@ class Space:
         bounds = robot.bounds()
         self.model = robot.model
         self._q, self._v = bounds.q_index, bounds.v_index
-        finite = np.isfinite(bounds.lower) & np.isfinite(bounds.upper)
+        finite = np.isfinite(bounds.lower) & np.isfinite(bounds.upper)  # a range without end is no range to draw from
         self._lower = np.where(finite, bounds.lower, -_UNBOUNDED)
         self._upper = np.where(finite, bounds.upper, _UNBOUNDED)
         free = np.ones(robot.model.nv, dtype=bool)
         free[self._v] = False
+        free[_points(robot.model)] = False
         self.free = free & np.array([n not in _root_names(robot) for n in robot.coordinate_names])
         """(nv,) coordinates without limits."""
+        self.moving = self.free.copy()
+        """(nv,) coordinates that configurations differ in."""
+        self.moving[self._v] = True
 
     def draw(self, random: np.random.Generator, count: int) -> Array:
         """Configurations (count, nq), even over the joints' ranges."""
@@ -107,6 +140,16 @@ class Space:
         return self.move(q, part * np.asarray(pin.difference(self.model, q, aim)))
 
 
+def _points(model: Any) -> IntArray:
+    """Coordinates in v of the joints whose range is a single point: they are held there."""
+    held = [
+        joint.idx_v
+        for joint in list(model.joints)[1:]
+        if joint.nq == joint.nv == 1 and model.lowerPositionLimit[joint.idx_q] == model.upperPositionLimit[joint.idx_q]
+    ]
+    return np.array(held, dtype=np.intp)
+
+
 def _root_names(robot: Robot) -> set[str]:
     model = robot.model
     if model.njoints > 1 and model.names[1] == "root_joint":
@@ -114,23 +157,30 @@ def _root_names(robot: Robot) -> set[str]:
     return set()
 
 
-BoolArray = NDArray[np.bool_]
-
-
 @dataclass(frozen=True)
 class Sampled:
-    """What became of each of a robot's pairs."""
+    """What random configurations show of each of a robot's m pairs."""
 
+    contact: Array
+    """(m,) share of the samples in which it touches [-]."""
     always: BoolArray
-    """(m,) were within `FAR` in every sample."""
+    """(m,) touches in at least `ALWAYS` of them."""
     never: BoolArray
-    """(m,) kept away from each other in every sample and in a descent from the nearest one."""
+    """(m,) keeps away in every sample and in a descent from the nearest one."""
     closest: Array
-    """(m,) nearest that was seen [m]; of pairs that were settled early, up to then."""
+    """(m,) least distance found [m]; of pairs that were settled early, up to then."""
+    typical: Array
+    """(m,) median of its distances where it does not touch [m]; infinite where it always does."""
+    poses: Array
+    """(k, nq) the first samples."""
+    touching: BoolArray
+    """(k, m) which pairs touch in them."""
+    near: float
+    """Distance that counts as away [m]."""
 
 
 def sample_pairs(robot: Robot, samples: int = SAMPLES, seed: int = SEED) -> Sampled:
-    """Looks which of a robot's pairs are always near and which never.
+    """Find which of a robot's pairs always touch and which never come near.
 
     Random configurations first; each pair that stayed apart in all of them is then led downhill from where it came
     closest, so that "never" does not rest on luck alone. It is still no proof: samples are finite, descents local.
@@ -141,43 +191,50 @@ def sample_pairs(robot: Robot, samples: int = SAMPLES, seed: int = SEED) -> Samp
         seed: of the draw.
     """
     distances, space, random = PairDistances(robot), Space(robot), np.random.default_rng(seed)
-    count = len(distances.pairs)
-    closest, farthest = np.full(count, np.inf), np.full(count, -np.inf)
-    at = np.zeros((count, robot.model.nq))
-    watched = np.ones(count, dtype=bool)
-    done = 0
-    while done < samples and watched.any():
+    near, count = NEAR * robot_size(robot), len(distances.pairs)
+    poses = space.draw(random, min(_FIRST, samples))
+    first = np.array([distances.all(q) for q in poses]).reshape(len(poses), count)
+    touching, done = first <= 0.0, len(poses)
+    closest, at = np.min(first, axis=0, initial=np.inf), poses[np.argmin(first, axis=0)]
+    hits, looks = touching.sum(axis=0), np.full(count, done)
+    unsettled = np.ones(count, dtype=bool)
+    while done < samples:
+        settled = unsettled & (closest < near) & (hits < (ALWAYS - _DOUBT) * looks)
+        distances.switch_off(np.flatnonzero(settled))
+        unsettled &= ~settled
+        if not unsettled.any():
+            break
         for q in space.draw(random, min(_SETTLE, samples - done)):
             d = distances.all(q)
-            nearer = watched & (d < closest)
+            nearer = unsettled & (d < closest)
             closest[nearer], at[nearer] = d[nearer], q
-            farthest = np.where(watched, np.maximum(farthest, d), farthest)
-        done += _SETTLE
-        settled = watched & (closest < NEAR) & (farthest >= FAR)
-        distances.switch_off(np.flatnonzero(settled))
-        watched &= ~settled
-    for index in np.flatnonzero(closest >= NEAR):
-        closest[index] = min(closest[index], _descend(distances, space, int(index), at[index]))
-    always = farthest < FAR
-    return Sampled(always, (closest >= NEAR) & ~always, closest)
+            hits += unsettled & (d <= 0.0)
+            looks += unsettled
+        done += min(_SETTLE, samples - done)
+    for index in np.flatnonzero(closest >= near):
+        closest[index] = min(closest[index], _descend(distances, space, int(index), at[index], near))
+    contact = hits / looks
+    free = np.where(touching, np.nan, first)
+    typical = np.array([np.nanmedian(d) if not np.isnan(d).all() else np.inf for d in free.T]).reshape(count)
+    return Sampled(contact, contact >= ALWAYS, closest >= near, closest, typical, poses, touching, near)
 
 
 def always_near(robot: Robot, samples: int, seed: int = SEED) -> IntArray:
-    """Pairs of bodies (k, 2) that are within `FAR` in every sample."""
-    distances = PairDistances(robot)
+    """Pairs of bodies (k, 2) that are within `FAT` of each other in every sample."""
+    distances, fat = PairDistances(robot), FAT * robot_size(robot)
     near = np.ones(len(distances.pairs), dtype=bool)
     for q in Space(robot).draw(np.random.default_rng(seed), samples if near.any() else 0):
-        near &= distances.all(q) < FAR
+        near &= distances.all(q) < fat
         distances.switch_off(np.flatnonzero(~near))
     return distances.pairs[near]
 
 
-def _descend(distances: PairDistances, space: Space, index: int, q: Array) -> float:
+def _descend(distances: PairDistances, space: Space, index: int, q: Array, near: float) -> float:
     """Least distance [m] found along a pair's gradient, with steps that shrink where they lead up."""
     (least, slope), step = distances.gradient(index, q), 0.3
     for _ in range(_STEPS):
         size = float(np.linalg.norm(slope))
-        if least < NEAR or size < 1e-9 or step < 1e-3:
+        if least < near or size < 1e-9 or step < 1e-3:
             break
         tried = space.move(q, -step / size * slope)
         d, slope_there = distances.gradient(index, tried)
@@ -188,38 +245,18 @@ def _descend(distances: PairDistances, space: Space, index: int, q: Array) -> fl
     return least
 
 
-def clear_home(
-    robot: Robot, wishes: Iterable[Array], samples: int = 2000, seed: int = SEED
-) -> tuple[Array, float, int | None]:
-    """A pose at which no pair is nearer than `CLEAR`, as close to a wished one as is found.
+def safety_distances(sampled: Sampled) -> Array:
+    """Safety distance (m,) of each pair [m]: the default one, less where the design leaves less room.
 
-    Args:
-        robot: with its pairs.
-        wishes: configurations to take if they are clear, the best first; at least one.
-        samples: configurations drawn, ever farther from the first wish.
-        seed: of the draw.
-
-    Returns:
-        The pose (nq,), its least distance [m] (infinite where there are no pairs), and which wish it is. Where nothing
-        is clear, the pose with the largest least distance.
+    A pair whose bodies are near each other nearly all along their joints' ranges could not keep the default distance
+    in most of them. Half of what it typically has leaves it as much to move in as to keep.
     """
-    distances, space = PairDistances(robot), Space(robot)
+    own = np.maximum(np.floor(0.5e4 * sampled.typical) / 1e4, 1e-4)
+    return np.where(sampled.typical < _CLOSE * D1, np.minimum(own, D1), D1)
 
-    def clearance(q: Array) -> float:
-        return float(np.min(distances.all(q), initial=np.inf))
 
-    wished = [np.asarray(q) for q in wishes]
-    for index, q in enumerate(wished):
-        if (d := clearance(q)) >= CLEAR:
-            return q, d, index
-    best, best_d = wished[0], clearance(wished[0])
-    for i, aim in enumerate(space.draw(np.random.default_rng(seed), samples)):
-        q = space.towards(wished[0], aim, (i + 1) / samples)
-        if (d := clearance(q)) >= CLEAR:
-            return q, d, None
-        if d > best_d:
-            best, best_d = q, d
-    return best, best_d, None
+_CLOSE = 4.0 / 3.0
+"""Typical distance of a pair, in units of the default safety distance, below which it gets one of its own [-]."""
 
 
 def touching(robot: Robot, q: Array, within: float = 0.0) -> list[tuple[str, str, float]]:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from functools import cached_property
 from typing import Any
 
 import coal
@@ -13,7 +14,7 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid.config import Body, Box, Capsule, Cylinder, Hull, Sphere
-from qpavoid.describe.fit import GROSS, Bodies, fit_piece, hull_volume
+from qpavoid.describe.fit import GROSS, Bodies, fit_piece, hull_volume, inside_volume
 from qpavoid.errors import UnknownName, nearest
 from qpavoid.geometry.bodies import hull_points
 from qpavoid.geometry.capsules import CapsuleFit, fit_capsule
@@ -31,6 +32,20 @@ class Piece:
     placement: Any
     """In the frame of its link."""
 
+    @cached_property
+    def inside(self) -> float:
+        """Volume that it encloses [m³]."""
+        return inside_volume(self.geometry)
+
+
+def pieces_of(geometry: Any, model: Any) -> list[Piece]:
+    """The pieces of a pinocchio geometry model's objects, each in the frame of its link."""
+    found = []
+    for piece in geometry:
+        frame = model.frames[piece.parentFrame]
+        found.append(Piece(piece.name, frame.name, piece.geometry, frame.placement.actInv(piece.placement)))
+    return found
+
 
 @dataclass(frozen=True)
 class LinkBodies:
@@ -41,6 +56,8 @@ class LinkBodies:
     """Of all of them, what overlaps counted twice [m³]."""
     hulls: float
     """Of the convex hulls of the link's pieces [m³]."""
+    inside: float
+    """Of what the link's pieces enclose, meshes as they are [m³]."""
 
 
 def kinds_of_links(pieces: Sequence[Piece], kind: Bodies, by_pattern: Mapping[str, Bodies]) -> dict[str, Bodies]:
@@ -70,7 +87,7 @@ def bodies_of_link(pieces: Sequence[Piece], link: str, kind: Bodies) -> LinkBodi
     `auto`, where it is not gross.
     """
     pieces = [piece for piece in pieces if piece.link == link]
-    fits = [fit_piece(piece.geometry, kind) for piece in pieces]
+    fits = [fit_piece(piece.geometry, kind, piece.inside) for piece in pieces]
     hulls = [hull_volume(piece.geometry) for piece in pieces]
     volume = sum(sum(c.volume for c in fit) if fit else hull for fit, hull in zip(fits, hulls, strict=True))
     shapes = []
@@ -83,7 +100,7 @@ def bodies_of_link(pieces: Sequence[Piece], link: str, kind: Bodies) -> LinkBodi
             shapes, volume = [capsule_fields(whole, pin.SE3.Identity())], whole.volume
     names = [link] if len(shapes) == 1 else [f"{link}_{index}" for index in range(len(shapes))]
     bodies = [Body(name=name, frame=link, **shape) for name, shape in zip(names, shapes, strict=True)]
-    return LinkBodies(tuple(bodies), volume, sum(hulls))
+    return LinkBodies(tuple(bodies), volume, sum(hulls), sum(piece.inside for piece in pieces))
 
 
 def _moved(points: Array, placement: Any) -> Array:

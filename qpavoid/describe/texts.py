@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os.path
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from shlex import quote
@@ -12,10 +13,10 @@ import yaml
 
 from qpavoid.config import Body
 from qpavoid.describe.add import Described, Wishes
-from qpavoid.describe.sampling import FAR, NEAR
 from qpavoid.describe.srdf import MADE_BY, srdf_text
 from qpavoid.describe.written import BLANK, seal
 from qpavoid.files.shipped import EXAMPLES, example_robot
+from qpavoid.notes import Note, NoteKind, shortened
 
 
 def description_files(described: Described, folder: Path) -> dict[Path, bytes]:
@@ -40,7 +41,9 @@ def _robot_yaml(described: Described, folder: Path, srdf: str) -> str:
     lines += [f"name: {_flow(config.name)}", f"urdf: {_flow(_reference(Path(config.urdf), folder))}"]
     lines.append(f"srdf: {_flow(srdf)}")
     if config.package_dirs:
-        lines.append(f"package_dirs: {_flow([_relative(Path(path), folder) for path in config.package_dirs])}")
+        lines.append(f"package_dirs: {_flow([_entry(entry, folder) for entry in config.package_dirs])}")
+    if config.allow_missing_meshes:
+        lines.append("allow_missing_meshes: true")
     if config.root_joint != "fixed":
         lines.append(f"root_joint: {config.root_joint}")
     lines.append(f"end_effectors: {_flow(list(config.end_effectors))}")
@@ -48,8 +51,14 @@ def _robot_yaml(described: Described, folder: Path, srdf: str) -> str:
     lines += ["bodies:" if config.bodies else "bodies: []"]
     lines += _body_lines(config.bodies, described)
     if config.disabled_pairs:
-        lines.append("disabled_pairs:   # of links that have other pairs which are watched; the rest is in the SRDF")
+        lines.append("disabled_pairs:   # of links that have other pairs which are checked; the rest is in the SRDF")
         lines += [f"  - {_flow(list(pair))}" for pair in config.disabled_pairs]
+    if config.pair_margins:
+        lines.append("pair_margins:   # of bodies that are near each other by design")
+        lines += [f"  - {_flow({'bodies': list(own.bodies), 'd1': own.d1})}" for own in config.pair_margins]
+    if config.limits.velocity:
+        lines.append("limits:   # assumed: the file gives no speed of these")
+        lines.append(f"  velocity: {_flow(dict(config.limits.velocity))}")
     for field, values in (("home", config.home), ("lock", config.lock)):
         if values:
             lines += [f"{field}:", *(f"  {_flow(joint)}: {value:g}" for joint, value in values.items())]
@@ -63,25 +72,41 @@ def _header(described: Described) -> list[str]:
         f"Pairs: {pairs_line(described)}.",
         f"Home: {home_line(described)}.",
     ]
-    return [*lines, *described.notes]
+    return [*lines, *note_lines(described.notes)]
 
 
 def pairs_line(described: Described) -> str:
-    """How many pairs are watched, and why the others are not."""
+    """How many pairs are checked, and why the others are not."""
     counts, wishes = described.counts, described.wishes
     honoured = "no SRDF came with it" if described.honoured is None else f"in {described.honoured.name}"
     return (
-        f"{counts['watched']} of {counts['all']} are watched; {counts['adjacent']} are adjacent, {counts['srdf']} off "
-        f"({honoured}), {counts['always']} always within {1000 * FAR:g} mm, {counts['never']} never within "
-        f"{1000 * NEAR:g} mm ({wishes.samples} samples, seed {wishes.seed}, descent from the nearest)"
+        f"{counts['active']} of {counts['all']} are checked, {len(described.config.pair_margins)} of them with a "
+        f"smaller safety distance; {counts['adjacent']} are adjacent, {counts['srdf']} disabled ({honoured}), "
+        f"{counts['always']} touch always, {counts['drawn in']} when drawn in, {counts['never']} come never within "
+        f"{1000 * described.near:.0f} mm ({wishes.samples} samples, seed {wishes.seed}, descent from the nearest)"
     )
 
 
 def home_line(described: Described) -> str:
-    """How clear the home pose is."""
-    if not described.counts["watched"]:
-        return "no pair is watched"
-    return f"least distance {1000 * described.clearance:.1f} mm"
+    """How clear the home pose is, and how well the limbs can move there."""
+    home = described.home
+    words = ["no pair is checked"]
+    if home.nearest is not None:
+        words = [f"least distance {1000 * home.clearance:.1f} mm ({' - '.join(home.nearest)})"]
+    return "; ".join([*words, *(f"{frame}: {limb}" for frame, limb in home.conditioning.items())])
+
+
+def note_lines(notes: Sequence[Note]) -> list[str]:
+    """The table of all that was left out, mended, replaced or assumed: a line each, and another for the remedy."""
+    order = {"error": 0, "warning": 1, "note": 2}
+    lines = []
+    for note in sorted(notes, key=lambda note: order[note.severity]):
+        share = "" if note.share is None else f"{100.0 * note.share:.0f} %"
+        names = " - ".join(note.subject) if note.kind is NoteKind.PAIR else shortened(note.subject)
+        lines.append(f"{note.severity:<8} {note.kind.value:<6} {share:>5}  {names}{': ' if names else ''}{note.what}")
+        if note.remedy:
+            lines.append(f"{'':24}→ {note.remedy}")
+    return lines
 
 
 def _command(described: Described, folder: Path) -> str:
@@ -94,7 +119,9 @@ def _command(described: Described, folder: Path) -> str:
     words += ["--root", wishes.root] if wishes.root != Wishes.root else []
     words += [word for joint in wishes.lock for word in ("--lock", joint)]
     words += [word for joint, value in wishes.home.items() for word in ("--home", f"{joint}={value:g}")]
-    words += [word for path in wishes.package_dirs for word in ("--package-dir", path.as_posix())]
+    for entry in map(str, wishes.package_dirs):
+        words += ["--package" if _PACKAGE.fullmatch(entry) else "--package-dir", entry]
+    words += ["--allow-missing-meshes"] if wishes.allow_missing_meshes else []
     words += ["--srdf", wishes.srdf.as_posix()] if wishes.srdf is not None else []
     words += ["--samples", str(wishes.samples)] if wishes.samples != Wishes.samples else []
     words += ["--seed", str(wishes.seed)] if wishes.seed != Wishes.seed else []
@@ -102,10 +129,14 @@ def _command(described: Described, folder: Path) -> str:
 
 
 def volume_line(described: Described) -> str:
-    """How many bodies there are, and what room they take beside the hulls of the meshes."""
-    bodies, hulls = (sum(volumes[i] for volumes in described.volume.values()) for i in (0, 1))
-    over = f", {bodies / hulls:.2f} times the {1000 * hulls:.2f} l of the meshes' convex hulls" if hulls > 0.0 else ""
-    return f"{len(described.config.bodies)}, {1000 * bodies:.2f} l{over}"
+    """How many bodies there are, and what room they take beside what the geometry encloses and its hulls."""
+    volume, inside, hulls = (
+        sum(getattr(link, name) for link in described.links.values()) for name in ("volume", "inside", "hulls")
+    )
+    over = ""
+    if inside > 0.0:
+        over = f", {volume / inside:.2f} times the {1e3 * inside:.2f} l of the geometry (hulls: {hulls / inside:.2f})"
+    return f"{len(described.config.bodies)}, {1e3 * volume:.2f} l{over}"
 
 
 def _body_lines(bodies: Sequence[Body], described: Described) -> list[str]:
@@ -117,8 +148,8 @@ def _body_lines(bodies: Sequence[Body], described: Described) -> list[str]:
             fields["position"] = list(body.position)
         if any(body.rpy):
             fields["rpy"] = list(body.rpy)
-        taken, hull = described.volume[body.frame]
-        comment = f"   # {taken / hull:.2f} of its hull" if hull > 0.0 and body.frame != last else ""
+        link = described.links[body.frame]
+        comment = f"   # {link.volume / link.inside:.2f} of it" if link.inside > 0.0 and body.frame != last else ""
         lines.append(f"  - {_flow(fields)}{comment}")
         last = body.frame
     return lines
@@ -135,6 +166,16 @@ def _reference(urdf: Path, folder: Path) -> str:
     if urdf.is_relative_to(robots):
         return f"{EXAMPLES}{urdf.relative_to(robots).as_posix()}"
     return _relative(urdf, folder)
+
+
+_PACKAGE = re.compile(r"([A-Za-z][\w.-]*)=(.+)", re.DOTALL)
+"""`NAME=FOLDER` of a package."""
+
+
+def _entry(entry: str, folder: Path) -> str:
+    """An entry of `package_dirs` with its folder relative to that of the robot.yaml."""
+    match = _PACKAGE.fullmatch(entry)
+    return f"{match[1]}={_relative(Path(match[2]), folder)}" if match else _relative(Path(entry), folder)
 
 
 def _relative(path: Path, folder: Path) -> str:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from pathlib import Path
+from xml.parsers import expat
 
 from qpavoid.errors import ConfigError
 from qpavoid.files.text import read_text
+from qpavoid.files.xacro import expand_xacro, is_xacro
 
 _LARGEST = 10_000_000
 """Size of a file [bytes]; humanoids take 200 000."""
@@ -17,7 +19,9 @@ _MOST_ATTRIBUTES = 100
 
 
 def read_robot_xml(path: Path, kind: str) -> ET.Element:
-    """The root of a URDF, SRDF or MJCF.
+    """The root of a URDF, SRDF or MJCF; a xacro file is expanded first.
+
+    Names keep the prefix that they are written with (`drake:capsule`), whether the file declares it or not.
 
     Args:
         path: the file.
@@ -28,19 +32,46 @@ def read_robot_xml(path: Path, kind: str) -> ET.Element:
     """
     text = read_text(path, _LARGEST)
     where = f"{path}: not a usable {kind}"
-    if "<!DOCTYPE" in text:  # before any parser: only a DOCTYPE can declare entities that grow or that read files
-        raise ConfigError(f"{where}: it has a <!DOCTYPE>; take it out, entities are not read")
-    # the C++ parsers take every file for UTF-8, whatever it says
-    parser = ET.XMLParser(target=_Builder(), encoding="utf-8")
+    _refuse_doctype(text, where)
+    if is_xacro(path, text):
+        text = expand_xacro(path)
+        _refuse_doctype(text, where)
     try:
-        parser.feed(text.encode())
-        root: ET.Element = parser.close()
-    except (ET.ParseError, ValueError) as error:
+        root = _parse(text)
+    except (expat.ExpatError, ValueError) as error:
         raise ConfigError(f"{where}: {error}") from None
     wanted = "mujoco" if kind == "MJCF" else "robot"
     if root.tag != wanted:
         raise ConfigError(f"{where}: its root is <{root.tag}>; must be <{wanted}>")
     return root
+
+
+def undeclared_prefixes(root: ET.Element) -> list[str]:
+    """Prefixes of elements and attributes that no xmlns attribute declares, each once."""
+    used: dict[str, None] = {}
+    declared = {"xml", "xmlns"}
+    for element in root.iter():
+        names = [name for name in (element.tag, *element.attrib) if ":" in name]
+        declared |= {name.removeprefix("xmlns:") for name in names if name.startswith("xmlns:")}
+        used |= {name.partition(":")[0]: None for name in names}
+    return [prefix for prefix in used if prefix not in declared]
+
+
+def _refuse_doctype(text: str, where: str) -> None:
+    if "<!DOCTYPE" in text:  # before any parser: only a DOCTYPE can declare entities that grow or that read files
+        raise ConfigError(f"{where}: it has a <!DOCTYPE>; take it out, entities are not read")
+
+
+def _parse(text: str) -> ET.Element:
+    """The tree of a text; prefixes are part of the names, as the C++ parsers have it."""
+    # those take every file for UTF-8, whatever it says
+    parser, builder = expat.ParserCreate("utf-8"), _Builder()
+    parser.StartElementHandler = builder.start
+    parser.EndElementHandler = builder.end
+    parser.CharacterDataHandler = builder.data
+    parser.buffer_text = True
+    parser.Parse(text.encode(), True)
+    return builder.close()
 
 
 class _Builder(ET.TreeBuilder):

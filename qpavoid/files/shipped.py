@@ -111,7 +111,7 @@ def find_setup(name: str) -> Path:
 
 
 def find_robot(name_or_path: str, folder: Path | None = None) -> Path:
-    """Path of a robot.yaml, URDF or MJCF, given by shipped name or by path (relative paths: from `folder` first).
+    """Path of a robot.yaml, URDF, xacro or MJCF, given by shipped name or by path (relative: from `folder` first).
 
     `example-robot-data:PATH` is a file of that package.
 
@@ -126,7 +126,7 @@ def find_robot(name_or_path: str, folder: Path | None = None) -> Path:
 
 
 def _looks_like_path(name: str) -> bool:
-    return "/" in name or "\\" in name or name.endswith((".yaml", ".yml", ".urdf", ".xml"))
+    return "/" in name or "\\" in name or name.endswith((".yaml", ".yml", ".urdf", ".xml", ".xacro"))
 
 
 def _find(name: str, kind: str, folder: Path, pattern: str, names: list[str]) -> Path:

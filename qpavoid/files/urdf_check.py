@@ -15,6 +15,8 @@ _MOST_LINKS, _MOST_MOVING, _MOST_SHAPES = 1000, 200, 300
 """Humanoids have 130, 101 and 112. Parsers recurse along a chain; memory grows with the cube of the joints that move,
 and the pairs with the square of the shapes."""
 
+DRAKE = "drake:"
+"""What elements of URDF are called by that begin with it: <drake:capsule>, <drake:ellipsoid>."""
 _NUMBERS = {
     "origin": ("xyz", "rpy", "quat_xyzw"),
     "axis": ("xyz",),
@@ -24,12 +26,13 @@ _NUMBERS = {
     "sphere": ("radius",),
     "cylinder": ("radius", "length"),
     "capsule": ("radius", "length"),
+    "ellipsoid": ("radii", "a", "b", "c"),
     "mesh": ("scale",),
     "mass": ("value",),
     "inertia": ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"),
 }
 """Element: its attributes that are numbers."""
-_SIZES = ("box", "sphere", "cylinder", "capsule")
+_SIZES = ("box", "sphere", "cylinder", "capsule", "ellipsoid")
 _TURNING = ("revolute", "continuous", "prismatic", "planar")
 
 
@@ -53,9 +56,9 @@ def check_urdf(path: Path) -> None:
         _check_tree(links, joints)
         for name, link in links.items():
             for part in (*link.findall("collision"), *link.findall("inertial")):
-                _check_numbers(part, f"link {name!r}")
+                check_numbers(part, f"link {name!r}")
         for name, joint in joints.items():
-            _check_numbers(joint, f"joint {name!r}")
+            check_numbers(joint, f"joint {name!r}")
             _check_joint(joint, f"joint {name!r}")
     except ValueError as fault:
         raise ConfigError(f"{path}: not a usable URDF: {fault}") from None
@@ -83,7 +86,7 @@ def check_mjcf(path: Path) -> None:
         for attribute in sorted(_MJCF_NUMBERS.intersection(element.keys())):
             place = f"{element.tag} {attribute}={element.get(attribute)!r:.60}"
             try:
-                finite = all(abs(value) <= LARGEST for value in _floats(element.get(attribute, ""), place))
+                finite = all(abs(value) <= LARGEST for value in floats(element.get(attribute, ""), place))
             except ValueError as fault:
                 raise ConfigError(f"{where}: {fault}") from None
             if not finite:
@@ -140,22 +143,33 @@ def _end(joint: ET.Element, tag: str, name: str, links: dict[str, ET.Element]) -
     return link
 
 
-def _check_numbers(part: ET.Element, owner: str) -> None:
+def check_numbers(part: ET.Element, owner: str) -> None:
+    """Makes sure that the numbers of an element and of those in it are finite, and none of a size negative.
+
+    Raises:
+        ValueError: naming the owner, the element and the attribute.
+    """
     for element in part.iter():
-        for attribute in _NUMBERS.get(element.tag, ()):
-            where = f"{owner}: {element.tag} {attribute}={element.get(attribute)!r}"
-            for value in _floats(element.get(attribute, ""), where):
+        tag = element.tag.removeprefix(DRAKE)
+        for attribute in _NUMBERS.get(tag, ()):
+            where = f"{owner}: {tag} {attribute}={element.get(attribute)!r}"
+            for value in floats(element.get(attribute, ""), where):
                 if not math.isfinite(value):
                     raise ValueError(f"{where}: must be finite")
-                if abs(value) > LARGEST and element.tag != "limit":  # where it means that there is none
+                if abs(value) > LARGEST and tag != "limit":  # where it means that there is none
                     raise ValueError(f"{where}: must be at most {LARGEST:g}")
-                if element.tag in _SIZES and value <= 0.0:
-                    raise ValueError(f"{where}: must be above 0")
-                if element.tag == "mesh" and value == 0.0:
+                if tag in _SIZES and value < 0.0:
+                    raise ValueError(f"{where}: must not be negative")
+                if tag == "mesh" and value == 0.0:
                     raise ValueError(f"{where}: must not be 0")
 
 
-def _floats(text: str, where: str) -> Iterator[float]:
+def floats(text: str, where: str) -> Iterator[float]:
+    """The numbers of an attribute.
+
+    Raises:
+        ValueError: one that is no number.
+    """
     for word in text.split():
         try:
             yield float(word)
@@ -165,13 +179,9 @@ def _floats(text: str, where: str) -> Iterator[float]:
 
 def _check_joint(joint: ET.Element, where: str) -> None:
     for axis in joint.findall("axis") if joint.get("type") in _TURNING else ():
-        if math.hypot(*_floats(axis.get("xyz", ""), where)) < 1e-6:
+        if math.hypot(*floats(axis.get("xyz", ""), where)) < 1e-6:
             raise ValueError(f"{where}: axis xyz={axis.get('xyz')!r} has no length; give a direction such as 0 0 1")
     for limit in joint.findall("limit"):
-        lower, upper, velocity = (
-            next(_floats(limit.get(attribute, ""), where), 0.0) for attribute in ("lower", "upper", "velocity")
-        )
-        if lower > upper:
-            raise ValueError(f"{where}: limit: needs lower <= upper, got {lower:g}, {upper:g}")
+        velocity = next(floats(limit.get("velocity", ""), where), 0.0)
         if velocity < 0.0:
             raise ValueError(f"{where}: limit velocity={velocity:g}: must not be negative")

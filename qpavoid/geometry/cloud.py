@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from qpavoid.errors import ConfigError, NumericalError
 from qpavoid.files.text import read_text
 from qpavoid.motion import Sample
-from qpavoid.problem import Array, IntArray
+from qpavoid.problem import Array, IntArray, as_numbers
 
 _BLOCK = 4
 """Voxels along the edge of a block."""
@@ -34,6 +34,10 @@ class Points(NamedTuple):
     leaves the tick nothing to do."""
     pose: Sample | None = None
     """Where the cloud's frame is, and how it moves; where it was if left out, which is the world at first."""
+    t: float | None = None
+    """Time stamp: when they were seen [s]; that of the pose, or the time of the control step, if left out."""
+    at_rest: bool = False
+    """Whether they stay there until others are given: they are never stale."""
 
 
 @dataclass(frozen=True)
@@ -66,10 +70,7 @@ class Voxels:
         Raises:
             NumericalError: wrong shape, or not numbers.
         """
-        try:
-            array = np.asarray(points, dtype=np.float64)
-        except (TypeError, ValueError):
-            raise NumericalError(f"points: not an array of numbers: {points!r:.60}") from None
+        array = as_numbers("points", points)
         if array.ndim != 2 or array.shape[1] != 3:
             raise NumericalError(f"points: shape {array.shape}, expected (n, 3)")
         good = np.abs(array).max(axis=1, initial=0.0) <= _FARTHEST  # False for NaN too

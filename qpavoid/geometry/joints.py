@@ -12,8 +12,9 @@ import pinocchio as pin
 from qpavoid.config import JointLimits
 from qpavoid.errors import ConfigError, UnknownName, nearest
 from qpavoid.geometry.pairs import pair_array
-from qpavoid.kinematics import MIMIC
+from qpavoid.kinematics import MIMIC, TRANSLATIONS
 from qpavoid.limits import JointBounds
+from qpavoid.notes import Note, NoteKind
 from qpavoid.problem import Array, IntArray
 
 _ABSURD = 1e9
@@ -31,7 +32,7 @@ def joint_bounds(model: Any) -> JointBounds:
     """Joint limits of a model in tangent space; a URDF says nothing of accelerations and jerks.
 
     Only joints with one coordinate in q and v have position limits. A velocity limit of 0, and a range from 0 to 0,
-    mean that the URDF gives none.
+    mean that the URDF gives none; see `fixed_by_limits` of ranges that are meant, `assume_speeds` of velocities.
     """
     lower, upper = np.array(model.lowerPositionLimit), np.array(model.upperPositionLimit)
     lower[lower <= -_ABSURD], upper[upper >= _ABSURD] = -np.inf, np.inf
@@ -73,8 +74,45 @@ def set_limits(model: Any, limits: JointLimits, path: Path) -> None:
         lower[joint.idx_q], upper[joint.idx_q] = low, high
     for name, speed in limits.velocity.items():
         joint = named(model, name, f"{path}: limits.velocity")
+        if isinstance(speed, list) and len(speed) != joint.nv:
+            raise ConfigError(
+                f"{path}: limits.velocity: joint {name!r}: {len(speed)} values for {joint.nv} coordinates"
+            )
         velocity[joint.idx_v : joint.idx_v + joint.nv] = speed
-    model.lowerPositionLimit, model.upperPositionLimit, model.velocityLimit = lower, upper, velocity
+    model.lowerPositionLimit, model.upperPositionLimit = lower, upper
+    _set_speeds(model, velocity)
+
+
+def _set_speeds(model: Any, velocity: Array) -> None:
+    """Sets the largest speeds (nv,) of both directions, of which a URDF has one and Pinocchio reads both as that."""
+    model.velocityLimit, model.lowerVelocityLimit = velocity, -velocity
+
+
+ASSUMED_SPEED = 1.0
+"""Largest speed of a coordinate for which none is given [rad/s or m/s], as in MoveIt's time parameterisation."""
+
+
+def assume_speeds(model: Any, notes: list[Note]) -> None:
+    """Gives a largest speed to every coordinate without one: to bases that float or roll, and where a file says 0.
+
+    Args:
+        model: Pinocchio model, changed in place.
+        notes: the joints are named in them.
+    """
+    velocity = np.array(model.velocityLimit)
+    given = (velocity > 0.0) & (velocity < _ABSURD)
+    names: dict[str, list[str]] = {}
+    for name, joint in zip(list(model.names)[1:], list(model.joints)[1:], strict=True):
+        part = slice(joint.idx_v, joint.idx_v + joint.nv)
+        if joint.shortname() != MIMIC and not given[part].all():
+            metres = TRANSLATIONS.get(joint.shortname(), 0)
+            units = ["m/s"] * bool(metres) + ["rad/s"] * (joint.nv > metres)
+            names.setdefault(" and ".join(f"{ASSUMED_SPEED:g} {unit}" for unit in units), []).append(name)
+    velocity[~given] = ASSUMED_SPEED
+    _set_speeds(model, velocity)
+    for speed, joints in names.items():
+        what = f"no velocity limit is given: {speed} {'is' if ' and ' not in speed else 'are'} assumed"
+        notes.append(Note(NoteKind.LIMIT, tuple(joints), what, "give it under `limits.velocity`", "warning"))
 
 
 def named(model: Any, name: str, where: str) -> Any:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import sys
 import tempfile
-import warnings
-from collections.abc import Iterator
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,14 +14,15 @@ from typing import Any
 import pinocchio as pin
 
 from qpavoid.errors import ConfigError
-from qpavoid.files.safe_xml import read_robot_xml
-from qpavoid.files.shipped import EXAMPLES, example_robot, example_robot_data
+from qpavoid.files.packages import mesh_folders
+from qpavoid.files.safe_xml import read_robot_xml, undeclared_prefixes
+from qpavoid.files.shipped import EXAMPLES, example_robot
 from qpavoid.files.urdf_check import check_mjcf, check_urdf
-
-
-class MimicWarning(UserWarning):
-    """Joints that should follow others do not: lock them."""
-
+from qpavoid.geometry.enclosed import without_enclosed
+from qpavoid.geometry.mjcf import check_elements, model_of_mjcf, shapes_of_mjcf
+from qpavoid.geometry.urdf_shapes import MISSING, Meshes, links_with_shapes, read_shapes
+from qpavoid.geometry.urdf_tree import tree_xml
+from qpavoid.notes import Note, NoteKind
 
 _ROOT_JOINTS = {
     "fixed": lambda: None,
@@ -70,56 +71,67 @@ def is_mjcf(path: Path) -> bool:
     return path.suffix == ".xml"
 
 
-def read_model(urdf: Path, root_joint: str) -> Any:
-    """Pinocchio model of a URDF or MJCF.
+def read_model(urdf: Path, root_joint: str, notes: list[Note] | None = None) -> Any:
+    """Pinocchio model of a URDF (also in xacro) or MJCF.
 
     Joints that mimic another one have no coordinate of their own. Where Pinocchio cannot read them so (they come before
-    the other one in the tree, or turn all the way round where that has limits), they move on their own, with a
-    `MimicWarning`.
+    the other one in the tree, or turn all the way round where that has limits), they move on their own.
 
     Args:
         urdf: the file.
         root_joint: `fixed`, `planar` or `free_flyer`.
+        notes: what was mended or left out is added to them.
 
     Raises:
-        ConfigError: not a usable file, with the parser's own reason.
+        ConfigError: not a usable file, with the parser's own reason, or one that it passes over.
     """
+    notes = [] if notes is None else notes
     kind = "MJCF" if is_mjcf(urdf) else "URDF"
     root = _ROOT_JOINTS[root_joint]()
+    xml = read_robot_xml(urdf, kind)
+    if kind == "MJCF":
+        check_mjcf(urdf)
+        check_elements(urdf, xml)
+    else:
+        check_urdf(urdf)
+        _name_prefixes(xml, notes)
+    model, reason = None, ""
     with _quiet_stderr() as printed:
         try:
-            if kind == "MJCF":
-                check_mjcf(urdf)
-                return _model_of_mjcf(urdf, root)
-            check_urdf(urdf)
-            return _model_of_urdf(urdf, root)
+            model = model_of_mjcf(urdf, root) if kind == "MJCF" else _model_of_urdf(tree_xml(xml, notes), root, notes)
         except (ValueError, RuntimeError, IndexError) as error:
             reason = _reason(error)
     first = next((line.split(":", 1)[1].strip() for line in printed if line.startswith("Error:")), "")
-    raise ConfigError(f"{urdf}: not a usable {kind}: {first or reason}")
-
-
-def _model_of_urdf(urdf: Path, root: Any) -> Any:
-    arguments = (str(urdf),) if root is None else (str(urdf), root)
-    try:
-        return pin.buildModelFromUrdf(*arguments, mimic=True)
-    except (ValueError, RuntimeError) as error:
-        reason = _reason(error)
-    model = pin.buildModelFromUrdf(*arguments, mimic=False)
-    warnings.warn(
-        f"{urdf}: joints that mimic others move on their own, and should be locked: {reason[-120:]}",
-        MimicWarning,
-        stacklevel=6,
-    )
+    if model is None or first:
+        raise ConfigError(f"{urdf}: not a usable {kind}: {first or reason}")
+    for link in xml.findall("link"):
+        if not model.existFrame(link.get("name", ""), pin.BODY):
+            raise ConfigError(f"{urdf}: not a usable {kind}: link {link.get('name')!r} was lost by the parser")
     return model
 
 
-def _model_of_mjcf(mjcf: Path, root: Any) -> Any:
-    with warnings.catch_warnings():  # of a change of name that older versions do not have
-        warnings.simplefilter("ignore", DeprecationWarning)
-        if root is None:
-            return pin.buildModelFromMJCF(str(mjcf))
-        return pin.buildModelFromMJCF(str(mjcf), root, "root_joint")[0]
+def _name_prefixes(root: ET.Element, notes: list[Note]) -> None:
+    if prefixes := undeclared_prefixes(root):
+        what = "prefix of XML that no xmlns attribute declares: it is read all the same, without what other tools add"
+        remedy = 'declare it in the root, as in xmlns:drake="http://drake.mit.edu"'
+        notes.append(Note(NoteKind.FILE, tuple(prefixes), what, remedy, "warning"))
+
+
+def _model_of_urdf(xml: str, root: Any, notes: list[Note]) -> Any:
+    arguments = (xml,) if root is None else (xml, root)
+    try:
+        return pin.buildModelFromXML(*arguments, mimic=True)
+    except (ValueError, RuntimeError) as error:
+        reason = _reason(error)
+    model = pin.buildModelFromXML(*arguments, mimic=False)
+    joints = tuple(joint.get("name", "") for joint in ET.fromstring(xml).iterfind("joint") if _mimics(joint))
+    what = f"should follow others (mimic), and move on their own: {reason[-120:]}"
+    notes.append(Note(NoteKind.JOINT, joints, what, "hold them under `lock`", "warning"))
+    return model
+
+
+def _mimics(joint: ET.Element) -> bool:
+    return joint.find("mimic") is not None and joint.get("type") != "fixed"
 
 
 def _reason(error: Exception) -> str:
@@ -129,13 +141,74 @@ def _reason(error: Exception) -> str:
     return " ".join(str(error).split()).rpartition("message: ")[2].rstrip(".")
 
 
-def read_pieces(urdf: Path, model: Any, package_dirs: list[str], path: Path) -> Any:
-    """Collision geometry of a URDF or MJCF, or what is meant to be seen where it has none; see `read_collision`."""
-    collision = read_collision(urdf, model, package_dirs, path)
-    return collision if collision.ngeoms else read_collision(urdf, model, package_dirs, path, visual=True)
+def read_pieces(
+    urdf: Path,
+    model: Any,
+    package_dirs: Sequence[str],
+    path: Path,
+    notes: list[Note] | None = None,
+    *,
+    visuals: bool = True,
+    allow_missing: bool = False,
+    enclosed: bool = False,
+) -> Any:
+    """Collision geometry of a URDF or MJCF; of links without any, what is meant to be seen of them.
+
+    A shape that lies inside another one of its link is left out: nothing can touch it.
+
+    Args:
+        urdf: the file.
+        model: its model.
+        package_dirs: folders to look for meshes in first, and `NAME=FOLDER`; see `mesh_folders`.
+        path: file to name in errors.
+        notes: what was left out or replaced is added to them.
+        visuals: whether links without collision geometry get what is meant to be seen.
+        allow_missing: whether shapes whose meshes are missing are left out.
+        enclosed: whether shapes inside others are kept.
+
+    Raises:
+        ConfigError: a shape that cannot be read or found.
+    """
+    notes = [] if notes is None else notes
+    pieces = read_collision(urdf, model, package_dirs, path, notes=notes, allow_missing=allow_missing)
+    if visuals:
+        _add_visuals(pieces, urdf, model, package_dirs, path, notes, allow_missing)
+    return pieces if enclosed else without_enclosed(pieces, notes)
 
 
-def read_collision(urdf: Path, model: Any, package_dirs: list[str], path: Path, visual: bool = False) -> Any:
+def _add_visuals(
+    pieces: Any, urdf: Path, model: Any, package_dirs: Sequence[str], path: Path, notes: list[Note], allow_missing: bool
+) -> None:
+    """Adds what is meant to be seen of the links that have no collision geometry."""
+    covered = {piece.parentFrame for piece in pieces.geometryObjects}
+    if is_mjcf(urdf):
+        seen = read_collision(urdf, model, package_dirs, path, visual=True)
+        found = [piece for piece in seen.geometryObjects if piece.parentFrame not in covered]
+    else:
+        root = read_robot_xml(urdf, "URDF")
+        seen_links = links_with_shapes(root, "visual")
+        links = [link for link in seen_links if model.getFrameId(link, pin.BODY) not in covered]
+        meshes = Meshes(mesh_folders(urdf, package_dirs), str(path), allow_missing, bool(covered))
+        with _quiet_stderr():
+            found = list(read_shapes(root, model, meshes, "visual", links, notes).geometryObjects)
+    for piece in found:
+        pieces.addGeometryObject(piece)
+    if found:
+        names = tuple(dict.fromkeys(model.frames[piece.parentFrame].name for piece in found))
+        what = "no collision shape: what is meant to be seen of it serves instead"
+        remedy = "list bodies of your own, or set `visuals: false` where nothing can be hit"
+        notes.append(Note(NoteKind.LINK, names, what, remedy, "warning"))
+
+
+def read_collision(
+    urdf: Path,
+    model: Any,
+    package_dirs: Sequence[str],
+    path: Path,
+    visual: bool = False,
+    notes: list[Note] | None = None,
+    allow_missing: bool = False,
+) -> Any:
     """Collision geometry of a URDF or MJCF, meshes as they are.
 
     What an MJCF fixes to its world (a floor) is no part of the robot and left out.
@@ -143,68 +216,26 @@ def read_collision(urdf: Path, model: Any, package_dirs: list[str], path: Path, 
     Args:
         urdf: the file.
         model: its model.
-        package_dirs: folders to look for meshes in first; see `mesh_folders`.
+        package_dirs: folders to look for meshes in first, and `NAME=FOLDER`; see `mesh_folders`.
         path: file to name in errors.
         visual: what is meant to be seen instead.
+        notes: what was left out or mended is added to them.
+        allow_missing: whether shapes whose meshes are missing are left out.
 
     Raises:
-        ConfigError: a mesh that cannot be found or read.
+        ConfigError: a shape that cannot be read or found.
     """
-    kind = pin.VISUAL if visual else pin.COLLISION
-    folders = mesh_folders(urdf, package_dirs)
-    _check_mesh_sizes(urdf, folders, path)
+    notes = [] if notes is None else notes
+    root = read_robot_xml(urdf, "MJCF" if is_mjcf(urdf) else "URDF")
     with _quiet_stderr():
+        if not is_mjcf(urdf):
+            meshes = Meshes(mesh_folders(urdf, package_dirs), str(path), allow_missing)
+            return read_shapes(root, model, meshes, "visual" if visual else "collision", None, notes)
         try:
-            if is_mjcf(urdf):
-                return _without_world(pin.buildGeomFromMJCF(model, str(urdf), kind))
-            return pin.buildGeomFromUrdf(model, str(urdf), kind, package_dirs=folders)
+            return shapes_of_mjcf(urdf, root, model, visual)
         except (ValueError, RuntimeError, IndexError) as error:
             reason = _reason(error)
-    raise ConfigError(
-        f"{path}: {urdf.name}: {reason}; name the folder that holds the package in `package_dirs` of a robot.yaml, "
-        "or set ROS_PACKAGE_PATH"
-    )
-
-
-def _without_world(geometry: Any) -> Any:
-    for name in [piece.name for piece in geometry.geometryObjects if piece.parentFrame == 0]:
-        geometry.removeGeometryObject(name)
-    return geometry
-
-
-def mesh_folders(urdf: Path, package_dirs: list[str]) -> list[str]:
-    """Where `package://` is looked up: given folders, above the file, example-robot-data, along ROS_PACKAGE_PATH."""
-    ros = [folder for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if folder]
-    above = [str(parent) for parent in urdf.resolve().parents]
-    return [*package_dirs, *above, str(example_robot_data()), *ros]
-
-
-def find_mesh(name: str, folders: list[str]) -> str | None:
-    """The file that a mesh of a URDF is in, or None.
-
-    Args:
-        name: as the URDF has it.
-        folders: see `mesh_folders`.
-    """
-    for scheme in ("package://", "model://"):
-        if name.startswith(scheme):
-            name = name.removeprefix(scheme).lstrip("/")  # some write three slashes
-    name = name.removeprefix("file://")
-    return next((found for folder in folders if os.path.isfile(found := os.path.join(folder, name))), None)
-
-
-_LARGEST_MESH = 100_000_000
-"""Size of a mesh [bytes]: the reader takes files into memory as a whole before it looks at them."""
-
-
-def _check_mesh_sizes(urdf: Path, folders: list[str], path: Path) -> None:
-    for name in mesh_names(urdf):
-        found = find_mesh(name, folders)
-        if found is not None and os.path.getsize(found) > _LARGEST_MESH:
-            raise ConfigError(
-                f"{path}: mesh {found}: {os.path.getsize(found)} bytes; at most {_LARGEST_MESH} are read, "
-                "make it coarser"
-            )
+    raise ConfigError(f"{path}: {urdf.name}: {reason}; {MISSING}")
 
 
 def mesh_names(urdf: Path, tag: str = "") -> list[str]:

@@ -8,7 +8,7 @@ from qpavoid.kernels.culling import candidates, in_one_alone
 from qpavoid.kernels.flights import ROUND_OFF, comes_too_near, least_apart, look_around, ramp
 from qpavoid.kernels.frames import damped_solution, frame_rows, projection_cost
 from qpavoid.kernels.layout import RowLayout
-from qpavoid.kernels.motions import Pieces, Placed, place_obstacles, sample_pieces, take_in
+from qpavoid.kernels.motions import Pieces, Placed, check_states, place_obstacles, sample_pieces, take_in
 from qpavoid.kernels.packing import pack
 from qpavoid.kernels.pairs import distance_rows, row_bounds
 from qpavoid.kernels.rotation import rotation_vector
@@ -26,6 +26,7 @@ __all__ = [
     "assemble",
     "bends",
     "candidates",
+    "check_states",
     "choose",
     "closest_call",
     "comes_too_near",

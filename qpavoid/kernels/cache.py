@@ -42,8 +42,9 @@ def _folder() -> Path:
     """Return the folder of this state of the sources."""
     sources = [(path.name, path.read_bytes()) for path in sorted(Path(__file__).parent.glob("*.py"))]
     digest = _digest(repr((numba.__version__, sys.implementation.cache_tag, sources)).encode())
-    parent = numba.config.CACHE_DIR or AppDirs("qpavoid", appauthor=False).user_cache_dir
-    return Path(parent) / f"kernels-{digest.hex()}"
+    user = AppDirs("qpavoid", appauthor=False).user_cache_dir
+    user = user if os.path.isabs(user) else os.devnull  # without a home there is none: nothing can be below this
+    return Path(numba.config.CACHE_DIR or user) / f"kernels-{digest.hex()}"
 
 
 def _digest(content: bytes) -> bytes:
@@ -75,7 +76,7 @@ class _Files:
     def save(self, key: Any, code: Any) -> None:
         """Write the code of a signature, all of it at once, where that is possible."""
         content = dumps((key, code))
-        with suppress(OSError):
+        try:
             self._folder.mkdir(parents=True, exist_ok=True)
             handle, temporary = tempfile.mkstemp(suffix=".tmp", dir=self._folder)
             try:
@@ -85,6 +86,8 @@ class _Files:
             except BaseException:
                 os.unlink(temporary)
                 raise
+        except OSError as error:
+            first_use.fail(error)
 
     def flush(self) -> None:
         """Delete the code of all signatures."""
@@ -138,7 +141,7 @@ class FirstUse:
     """What stderr says where a machine has no compiled kernels yet; nothing is said ever after."""
 
     def __init__(self, folder: Path) -> None:
-        self._folder, self._begin = folder, 0.0
+        self._folder, self._begin, self._failed = folder, 0.0, False
 
     def begin(self) -> None:
         """Say that kernels are compiled, the first time that any is in an incomplete folder."""
@@ -152,11 +155,16 @@ class FirstUse:
             return
         _say(f"compiled kernels in {perf_counter() - self._begin:.0f} s")
         self._begin = 0.0
-        try:
-            (self._folder / _COMPLETE).touch()
-        except OSError as error:
-            _say(f"they could not be kept for the next run: {error}; NUMBA_CACHE_DIR=DIR puts them elsewhere")
-        _make_room(self._folder.parent)
+        if not self._failed:
+            with suppress(OSError):
+                (self._folder / _COMPLETE).touch()
+            _make_room(self._folder.parent)
+
+    def fail(self, error: OSError) -> None:
+        """Say, once, that compiled kernels are not on disk for the next run."""
+        if not self._failed:
+            self._failed = True
+            _say(f"cannot keep compiled kernels for the next run: {error}; NUMBA_CACHE_DIR=DIR puts them elsewhere")
 
 
 def _say(line: str) -> None:

@@ -40,13 +40,13 @@ def look_around(
     for i in range(k):
         if not enabled[x.near[i]]:
             continue
-        distance = x.closest[i, 0]
-        nearest = np.minimum(nearest, distance)  # keeps NaN, unlike min
+        distance, slack = x.closest[i, 0], x.slack[x.near[i]]
+        nearest = np.minimum(nearest, distance + slack)  # keeps NaN, unlike min
         if not distance >= touch:
             enabled[x.near[i]] = False
             touching += 1
             continue
-        rest = min(rest, distance)
+        rest = min(rest, distance + slack)
         if n < i:
             x.near[n], x.drift[n] = x.near[i], x.drift[i]
             for c in range(10):

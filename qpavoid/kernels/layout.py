@@ -62,6 +62,8 @@ class RowLayout(NamedTuple):
     """(m,) row of `twists` that moves each pair's second body."""
     margin: Array
     """(o + 1,) taken off the distances to each obstacle, for what is not known of it [m]; the last one stays zero."""
+    slack: Array
+    """(m,) added to the distance of a pair whose own safety distance is less than `hold`: the difference [m]."""
     joint_poses: Array
     """(J, 12) world poses of all joints: rotation by columns, then origin [m]; row 0 is the world."""
     parents: IntArray
@@ -147,8 +149,14 @@ class RowLayout(NamedTuple):
     """ξ [1/s]."""
     recovery: float
     """Cap on the speed of parting that a row asks for [m/s]."""
-    switching: bool
+    beta: bool
     """Whether rows are weighted with 1 - β."""
+    task_switching: bool
+    """Whether rows have the rate of eq. 10, which depends on v0."""
+    retreat_speed: float
+    """ẋ0 of such rows [m/s]."""
+    alpha_cap: float
+    """Largest α of such rows [-]."""
     d1: float
     """[m]."""
     d2: float

@@ -13,6 +13,14 @@ from qpavoid.kernels.frames import _rotation_vector
 from qpavoid.kernels.packing import compiled
 from qpavoid.problem import Array, IntArray, Mask
 
+FINE, NORMALISED, NOT_FINITE, FAR, FAST, NO_ROTATION, LEFT_HANDED = range(7)
+"""What `check_states` finds."""
+EXACT, NEARLY = 1e-6, 1e-3
+"""|RᵀR - I| up to which a matrix is taken for a rotation as it is (those of 32 bits are 1e-7 off), and up to which it
+is replaced by the rotation next to it."""
+SAMPLE, POSE, REST = range(3)
+"""How an obstacle is given: with a twist, without one, at rest."""
+
 
 class Pieces(NamedTuple):
     """Motions of k bodies, cut into n pieces on which the state is a weighted sum of seven constant ones.
@@ -150,45 +158,114 @@ def place_obstacles(
 
 
 @compiled
-def take_in(which: IntArray, posed: Mask, news: Array, age: IntArray, last: Array, states: Array, dt: float) -> Mask:
-    """Take over the states of obstacles that are given from outside; a bare pose gets the twist that has led to it.
+def check_states(
+    states: Array, which: IntArray, kind: IntArray, farthest: float, fastest: float
+) -> tuple[IntArray, Array]:
+    """Find states that cannot be true, and normalise rotations that are nearly ones in place.
 
-    That is the difference of its last two poses, over the time between them; the first one counts as at rest.
+    R becomes ½ R (3 I - RᵀR), which squares its distance from the nearest rotation, four times over: from 1e-3 that
+    leaves nothing but round-off.
+
+    Args:
+        states: (o, 18).
+        which: numbers of those to look at (k,).
+        kind: how each is given (k,): SAMPLE, POSE or REST; of the latter two, twists are not looked at.
+        farthest: largest coordinate of a position [m].
+        fastest: largest component of a twist [m/s, rad/s].
+
+    Returns:
+        (k,) FINE, NORMALISED, or the first thing that is wrong; (k,) largest entry of |RᵀR - I|.
+    """
+    codes, off, gram, new = np.zeros(len(which), np.intp), np.zeros(len(which)), np.empty((3, 3)), np.empty(9)
+    for k in range(len(which)):
+        x, count = states[which[k]], 18 if kind[k] == SAMPLE else 12
+        total, far, fast = 0.0, 0.0, 0.0
+        for c in range(count):
+            total += abs(x[c])
+        if not total < np.inf:  # isfinite does not survive the reordering of sums
+            codes[k] = NOT_FINITE
+            continue
+        for c in range(9, 12):
+            far = max(far, abs(x[c]))
+        for c in range(12, count):
+            fast = max(fast, abs(x[c]))
+        if far > farthest or fast > fastest:
+            codes[k] = FAR if far > farthest else FAST
+            continue
+        _gram(x, gram)
+        for r in range(3):
+            for c in range(3):
+                off[k] = max(off[k], abs(gram[r, c] - (1.0 if r == c else 0.0)))
+        across = x[1] * x[5] - x[2] * x[4], x[2] * x[3] - x[0] * x[5], x[0] * x[4] - x[1] * x[3]
+        if across[0] * x[6] + across[1] * x[7] + across[2] * x[8] < 0.0:
+            codes[k] = LEFT_HANDED
+        elif not off[k] <= NEARLY:
+            codes[k] = NO_ROTATION
+        elif off[k] > EXACT:
+            codes[k] = NORMALISED
+            for _ in range(4):
+                _gram(x, gram)
+                for c in range(3):
+                    for r in range(3):
+                        new[3 * c + r] = 1.5 * x[3 * c + r]
+                        for i in range(3):
+                            new[3 * c + r] -= 0.5 * x[3 * i + r] * gram[i, c]
+                x[:9] = new
+    return codes, off
+
+
+@compiled
+def _gram(x: Array, gram: Array) -> None:
+    """RᵀR (3, 3) of a rotation by columns (9,)."""
+    for r in range(3):
+        for c in range(3):
+            gram[r, c] = x[3 * r] * x[3 * c] + x[3 * r + 1] * x[3 * c + 1] + x[3 * r + 2] * x[3 * c + 2]
+
+
+@compiled
+def take_in(
+    which: IntArray, kind: IntArray, times: Array, news: Array, stamps: Array, last: Array, states: Array,
+    shortest: float, fastest: float,
+) -> Mask:  # fmt: skip
+    """Take over checked states of obstacles that are given from outside; a bare pose gets the twist that has led to it.
+
+    That is the difference of its last two poses, over the time between their stamps; the first one counts as at rest,
+    and where no time lies between them the twist stays as it was.
 
     Args:
         which: numbers of the obstacles (k,).
-        posed: which of them are given without a twist (k,).
+        kind: how each is given (k,): SAMPLE, POSE or REST.
+        times: their time stamps (k,) [s].
         news: what is given, read where `which` says (o, 18); the twists of bare poses are overwritten.
-        age: ticks since each was given last, negative if it never was (o,); 0 afterwards.
+        stamps: time stamps of what was given last, NaN where nothing was (o,) [s]; overwritten.
         last: what was given last, with its twist (o, 18); overwritten.
-        states: (o, 18) overwritten with the same.
-        dt: length of a tick [s].
+        states: (o, 18) overwritten as well.
+        shortest: time between two poses below which no twist is estimated [s].
+        fastest: largest component of a twist that is estimated [m/s, rad/s].
 
     Returns:
-        Which of them are finite (k,); the others are left as they were.
+        Which of them were taken over (k,); not those whose poses are too far apart for `fastest`.
     """
-    fine, turn = np.empty(len(which), np.bool_), np.empty((3, 3))
+    fine, turn = np.ones(len(which), np.bool_), np.empty((3, 3))
     for k in range(len(which)):
         i = which[k]
-        new, old = news[i], last[i]
-        total = 0.0
-        for c in range(12 if posed[k] else 18):
-            total += abs(new[c])
-        fine[k] = total < np.inf  # isfinite does not survive the reordering of sums
-        if not fine[k]:
-            continue
-        if posed[k]:
+        new, old, since = news[i], last[i], times[k] - stamps[i]
+        if kind[k] != SAMPLE:
             new[12:] = 0.0
-            if age[i] >= 0:
-                share = 1.0 / (dt * (age[i] + 1))
-                for r in range(3):
-                    new[12 + r] = share * (new[9 + r] - old[9 + r])
-                    for c in range(3):
-                        turn[r, c] = new[r] * old[c] + new[3 + r] * old[3 + c] + new[6 + r] * old[6 + c]
-                angles = _rotation_vector(turn)
-                for r in range(3):
-                    new[15 + r] = share * angles[r]
-        old[:] = new
-        states[i] = new
-        age[i] = 0
+        if kind[k] == POSE and since > shortest:
+            for r in range(3):
+                new[12 + r] = (new[9 + r] - old[9 + r]) / since
+                for c in range(3):
+                    turn[r, c] = new[r] * old[c] + new[3 + r] * old[3 + c] + new[6 + r] * old[6 + c]
+            angles = _rotation_vector(turn)
+            for r in range(3):
+                new[15 + r] = angles[r] / since
+            for c in range(12, 18):
+                fine[k] = fine[k] and abs(new[c]) <= fastest
+        elif kind[k] == POSE and stamps[i] == stamps[i]:
+            new[12:] = old[12:]
+        if fine[k]:
+            old[:] = new
+            states[i] = new
+            stamps[i] = times[k]
     return fine

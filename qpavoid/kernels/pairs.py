@@ -12,6 +12,10 @@ from qpavoid.problem import Array, IntArray
 
 BRAKING_SHARE = 0.5
 """Share of the joints' accelerations on which a pair counts for braking; other pairs want some, too [-]."""
+OWN_CAP = 1.0
+"""Largest α of a pair of two bodies of the robot, which may be unable to part [-]."""
+TINY = 1e-300
+"""Distance that α takes for none: no division by zero [m]."""
 
 
 @compiled
@@ -74,7 +78,8 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
 
     A row never asks for more than can be had: of a pair that may still close, and whose obstacle does not come nearer,
     no more than a stop gives, so that the stop meets all such rows at once; of one that has to part, no more speed of
-    parting than the bounds allow, and where they do not allow any yet, no harder braking.
+    parting than the bounds allow, and where they do not allow any yet, no harder braking. Task-switching rows, which
+    extend to d2, ask beyond what the bounds allow for no more than a damper would.
 
     Args:
         x: reads what `distance_rows`, `velocity_bounds` and `stop_velocity` wrote; writes d, least, touch.
@@ -82,12 +87,14 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
         moving: whether any obstacle moves or has a margin.
     """
     for i in range(k):
-        d = x.closest[i, 0] + x.offset - x.margin[x.twist_row[x.near[i]]]
+        slack = x.slack[x.near[i]]
+        d = x.closest[i, 0] + x.offset - x.margin[x.twist_row[x.near[i]]] + slack
         value = x.row_gain * (x.hold - d)
         parting = value > 0.0
-        if x.switching and not parting:
-            share = min(max((d - x.d1) / (x.d2 - x.d1), 0.0), 1.0)
-            value *= 0.5 - 0.5 * np.cos(np.pi * share)
+        if x.beta and not parting:
+            value *= 1.0 - _beta(x, d)
+        elif x.task_switching:
+            value = max(_rate_of_eq10(x, i, d), value if parting else (x.hold - d) / x.dt)
         if x.accelerated and value < 0.0:
             braking = 0.0
             for c in range(len(x.v_step)):
@@ -100,24 +107,57 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
                 if x.jerked:
                     value = max(value, _room_for_jerk(x, i, value, 2.0 * braking, room))
         least = min(value, x.recovery) - x.drift[i]
-        if parting:
+        farther = x.task_switching and not parting
+        if parting or farther:
             most = 0.0
             for c in range(len(x.lower)):
                 if x.J[i, c] > 0.0:
                     most += x.J[i, c] * x.upper[c]
                 elif x.J[i, c] < 0.0:
                     most += x.J[i, c] * x.lower[c]
-            if x.drift[i] < 0.0:
+            if farther:
+                most = max(most, x.row_gain * (x.hold - d) - x.drift[i])
+            elif x.drift[i] < 0.0:
                 most = max(most, -x.drift[i])
             least = min(least, most)
-        elif x.accelerated and x.drift[i] >= 0.0:
+        if x.accelerated and x.drift[i] >= 0.0 and not parting:
             stop = 0.0
             for c in range(len(x.lower)):
                 stop += x.J[i, c] * x.v_stop[c]
             least = min(least, stop)
         x.d[i] = d
         x.least[i] = least
-        x.touch[i] = min(x.row_gain * (x.offset - d) - x.drift[i], least)
+        x.touch[i] = min(x.row_gain * (x.offset + slack - d) - x.drift[i], least)
+
+
+@compiled
+def _beta(x: Any, d: float) -> float:
+    """Compute β(d) of eq. 12, see `gains.beta`."""
+    return 0.5 + 0.5 * np.cos(np.pi * min(max((d - x.d1) / (x.d2 - x.d1), 0.0), 1.0))
+
+
+@compiled
+def _rate_of_eq10(x: Any, i: int, d: float) -> float:
+    """Compute the rate J_d q̇ [m/s] of near pair i that eq. 10 with the consistent bracket gives, undamped, J_d N != 0.
+
+    That is (1 - β)(1 - α) min(u, ẋ0) + β ẋ0, with u = J v0 + drift and α for u < 0 only. As a lower bound it asks of a
+    pair that parts by itself for no more than ẋ0. α > 1 asks a pair that closes in to part: of two bodies of the robot,
+    as of neighbouring links, the cap is 1, so that for ẋ0 = 0 rest meets all of them.
+
+    Args:
+        x: reads J, v0, drift, d1, d2, alpha_cap, retreat_speed, margin, near, twist_row.
+        i: number of the near pair.
+        d: its distance [m].
+    """
+    u = x.drift[i]
+    for c in range(len(x.v0)):
+        u += x.J[i, c] * x.v0[c]
+    rate, beta = min(u, x.retreat_speed), _beta(x, d)
+    if u < 0.0:
+        ratio = max(x.d2 - d, 0.0) / max(d, TINY)
+        own = x.twist_row[x.near[i]] == len(x.margin) - 1
+        rate *= 1.0 - min(ratio * ratio, min(x.alpha_cap, OWN_CAP) if own else x.alpha_cap)
+    return (1.0 - beta) * rate + beta * x.retreat_speed
 
 
 @compiled

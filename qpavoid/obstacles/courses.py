@@ -32,20 +32,21 @@ def as_samples(states: Array) -> list[Sample]:
 
 def put(view: Sample, sample: Sample) -> None:
     """Writes a sample into one of the views of `as_samples`."""
-    view[0][:], view[1][:], view[2][:], view[3][:] = sample
+    view[0][:], view[1][:], view[2][:], view[3][:] = sample[:4]
 
 
-def move_on(states: Array, t: float) -> None:
+def move_on(states: Array, t: float | Array) -> None:
     """Brings bodies to where they are t seconds later if they keep their twists about their origins, in place [s].
 
     Args:
         states: (k, 18).
-        t: [s].
+        t: one for all, or (k,) [s].
     """
+    t = np.broadcast_to(np.reshape(t, (-1, 1)), (len(states), 1))
     states[:, 9:12] += t * states[:, 12:15]
     turning = np.flatnonzero(states[:, 15:].any(axis=1))
     if len(turning):
-        turns = Rotation.from_rotvec(t * states[turning, 15:]).as_matrix()
+        turns = Rotation.from_rotvec(t[turning] * states[turning, 15:]).as_matrix()
         axes = states[turning, :9].reshape(-1, 3, 3)  # the columns of each rotation, as rows
         states[turning, :9] = np.matmul(axes, turns.swapaxes(1, 2)).reshape(-1, 9)
 

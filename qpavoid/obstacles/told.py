@@ -27,21 +27,27 @@ class Told(NamedTuple):
 
 
 class MeanTwists:
-    """Means of the twists that were told lately: what a sensor says once tells little of what will be in a second."""
+    """Means of the twists that were given lately: what a sensor says once tells little of what will be in a second."""
 
-    def __init__(self, count: int, dt: float) -> None:
-        """Has heard nothing of any obstacle; ticks last dt [s]."""
-        self.twists, self._heard, self._dt = np.zeros((count, 6)), np.zeros(count), dt
+    def __init__(self, count: int) -> None:
+        self.twists, self._counts = np.zeros((count, 6)), np.zeros(count)
 
-    def hear(self, which: IntArray, states: Array) -> None:
-        """Takes the states (o, 18) of some obstacles (k,) in: the mean is of all at first, then of the last ones."""
-        self._heard[which] += 1.0
-        share = np.maximum(1.0 / self._heard[which], self._dt / (_STEADY + self._dt))[:, None]
+    def add(self, which: IntArray, elapsed: Array, states: Array) -> None:
+        """Take in the twists of some obstacles: the mean is of all at first, then of the last ones.
+
+        Args:
+            which: numbers of the obstacles (k,).
+            elapsed: time since each was given last (k,), NaN where it never was [s].
+            states: of all obstacles (o, 18).
+        """
+        self._counts[which] += 1.0
+        elapsed = np.maximum(elapsed, 0.0)
+        share = np.fmax(1.0 / self._counts[which], elapsed / (_STEADY + elapsed))[:, None]
         self.twists[which] += share * (states[which, 12:] - self.twists[which])
 
     def forget(self, index: int) -> None:
-        """Has heard nothing of obstacle number `index`."""
-        self._heard[index], self.twists[index] = 0.0, 0.0
+        """Drop what is known of obstacle number `index`."""
+        self._counts[index], self.twists[index] = 0.0, 0.0
 
 
 def strayed(now: Told | None, before: Told | None, span: float, reach: Array) -> float:

@@ -60,19 +60,18 @@ def solver_styles(logs: Sequence[Log]) -> list[dict[str, Any]]:
 def compare_time_figure(logs: Sequence[Log]) -> Figure:
     """Smallest distance, deviation from the planned path, distance to the target and fastest joint over time."""
     meta = logs[0].meta
-    offset = meta["config"]["avoidance"]["offset"]
     figure = Figure(figsize=(9.0, 10.0), layout="constrained")
     distance, deviation, error, speed = figure.subplots(4, 1, sharex=True, height_ratios=(1.5, 1, 1, 1))
     for log, style in zip(logs, solver_styles(logs), strict=True):
         line = {**style, "linewidth": 1.7}
         to_target = np.linalg.norm(log.target - log.tool, axis=2)
-        distance.plot(log.t, log.min_distance + offset, **line)
+        distance.plot(log.t, log.min_distance, **line)
         deviation.plot(log.t, np.max(path_deviation(log), axis=1, initial=0.0), **line)
         error.plot(log.t, np.max(to_target, axis=1, initial=1e-3 * ERROR_FLOOR), **line)
         speed.plot(log.t, np.max(np.abs(log.v), axis=1, initial=0.0), **line)
     solvers = distance.get_legend_handles_labels()[0]
     levels = draw_levels(distance, logs[0], qp=any(map(is_qp, logs)))
-    label_distances(distance, offset, *(log.min_distance + offset for log in logs), name="smallest distance\n")
+    label_distances(distance, *(log.min_distance for log in logs), name="smallest distance\n")
     deviation.set_ylabel("deviation from the\nplanned path [m]")
     error.set_yscale("log")
     tolerance = meta["config"]["goal_tolerance"]

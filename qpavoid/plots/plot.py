@@ -146,8 +146,8 @@ def joints_figure(log: Log) -> Figure:
 def distances_figure(log: Log) -> Figure:
     """Distance of each body over time with d1, d2 and collision, and α, β below (Figs. 8, 11, 13 of the paper)."""
     avoidance = log.meta["config"]["avoidance"]
-    offset, reach = avoidance["offset"], 1.5 * avoidance["d2"]
-    distance = log.body_distance + offset
+    reach = round(1.5 * (avoidance["d2"] - avoidance["offset"]), 9)
+    distance = log.body_distance
     figure = Figure(figsize=(9.5, 7.0), layout="constrained")
     ax, gains = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
     drawn = np.flatnonzero(np.isfinite(distance).any(axis=0))
@@ -168,7 +168,7 @@ def distances_figure(log: Log) -> Figure:
     handles += draw_levels(ax, log, qp=is_qp(log))
     handles += _shade_status(ax, log)
     _plot_gains(gains, log)
-    label_distances(ax, offset, distance[:, near])
+    label_distances(ax, distance[:, near])
     add_legend(ax, handles)
     return figure
 

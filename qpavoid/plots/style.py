@@ -53,37 +53,39 @@ def add_legend(ax: Any, handles: Sequence[Any]) -> None:
 
 
 def draw_levels(ax: Any, log: Log, qp: bool) -> list[Any]:
-    """Draws d2, d1, collision and, for QPs, the distance that their rows hold.
+    """Draws d2, d1, collision and, for QPs, the distance that their rows hold, all between surfaces.
 
     Returns:
         The lines, for a legend.
     """
     avoidance = log.meta["config"]["avoidance"]
+    offset = avoidance["offset"]
     levels = [("$d_2$ = {:g} m", avoidance["d2"], D2, DASHES[1]), ("$d_1$ = {:g} m", avoidance["d1"], D1, DASHES[3])]
     d_safe = avoidance["row"].get("d_safe")
     if qp and d_safe is not None:
         levels.append(("$d_{{safe}}$ = {:g} m (QP rows)", d_safe, D_SAFE, DASHES[2]))
-    levels.append(("collision: {:g} m", avoidance["offset"], COLLISION, DASHES[0]))
+    levels.append(("collision", offset, COLLISION, DASHES[0]))
     return [
-        ax.axhline(d, color=colour, linestyle=dash, linewidth=1.1, zorder=2, label=label.format(d))
+        ax.axhline(
+            d - offset, color=colour, linestyle=dash, linewidth=1.1, zorder=2, label=label.format(round(d - offset, 9))
+        )
         for label, d, colour, dash in levels
     ]
 
 
-def label_distances(ax: Any, offset: float, *drawn: Array, name: str = "distance ") -> None:
-    """Names the axis of distances, shades collision, and makes room for it.
+def label_distances(ax: Any, *drawn: Array, name: str = "distance ") -> None:
+    """Names the axis of distances between surfaces, shades collision, and makes room for it.
 
     Args:
         ax: panel that has its lines already.
-        offset: distance between axes at which surfaces touch [m]; 0 where distances are between surfaces.
         drawn: the distances of the lines [m].
         name: what is shown.
     """
-    ax.set_ylabel(f"{name}between axes [m]" if offset > 0.0 else f"{name}between surfaces [m]")
+    ax.set_ylabel(f"{name}between surfaces [m]")
     add_grid(ax)
     finite = [d[np.isfinite(d)] for d in drawn]
-    lowest = min((float(np.min(d)) for d in finite if d.size), default=offset)
+    lowest = min((float(np.min(d)) for d in finite if d.size), default=0.0)
     bottom, top = ax.get_ylim()
-    bottom = min(lowest, offset) - 0.04 * (top - offset)
-    ax.axhspan(bottom, offset, color=COLLISION, alpha=0.08, linewidth=0, zorder=0)
+    bottom = min(lowest, 0.0) - 0.04 * top
+    ax.axhspan(bottom, 0.0, color=COLLISION, alpha=0.08, linewidth=0, zorder=0)
     ax.set_ylim(bottom, top)

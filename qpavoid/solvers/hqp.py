@@ -60,6 +60,10 @@ class Hqp(Qp):
         relaxed = relaxed if v is None else relaxed._replace(v=v)
         return relaxed_solution(relaxed, problem, *unsolved)
 
+    def tracked(self, problem: Problem) -> Array:
+        """The velocity (nv,) of the cascade without inequalities, v̂."""
+        return _cascade(problem, problem.levels or (np.arange(len(problem.tracking.b)),))[0]
+
     def _levels(
         self, problem: Problem, asked: Levels, alone: Array, least: Array, lower: Array, upper: Array
     ) -> tuple[Array | None, tuple[Reason, ...]]:

@@ -12,7 +12,11 @@ _LIMB = 3
 """Joints in a row that make a limb: two move a head, one turns a wheel or a finger."""
 _FINGER = 4
 """Joints of a finger at most: what branches into shorter chains is a hand."""
-_FINGERS = re.compile(r"hand|finger|thumb|grip|jaw", re.IGNORECASE)
+_DIGITS = 4, 5
+"""Chains from which on a branching is a hand even if they are longer, and how long: a thumb may have five joints."""
+_FINGERS = re.compile(
+    r"hand|finger|thumb|grip|jaw|knuckle|(?:^|[^a-z])(?:index|middle|ring|little|pinky)(?:[^a-z]|$)", re.IGNORECASE
+)
 """What fingers' joints are called, of which some hands have only one, and others chains longer than those of a leg."""
 _TOOL_WORDS = ("tcp", "tool", "end_effector", "ee", "grasp", "gripper", "palm", "hand", "sole", "foot", "tip")
 """Parts of a frame's name that make it the tool among those that move together, the best first."""
@@ -32,7 +36,8 @@ def end_effectors(model: Any, known: Sequence[str] = ()) -> list[str]:
     """
     frames = {f.name: f.parentJoint for f in model.frames if f.type in _LINKS}
     ends = [name for name in known if name in frames]
-    taken = {frames[name] for name in ends}
+    ends = [_tool_named(model, frames[name]) or name for name in ends]
+    taken = {joint for name in ends for joint in list(model.supports[frames[name]])[1:]}
     root = 1 if model.njoints > 1 and model.names[1] == "root_joint" else 0
     for least in (_LIMB, 1):
         joints = _ends(model, root, 0, least)
@@ -49,7 +54,8 @@ def _ends(model: Any, joint: int, above: int, least: int) -> list[int]:
     if not children:
         return [joint] if above >= least else []
     fingers = any(_FINGERS.search(model.names[child]) for child in children)
-    short = len(children) > 1 and all(_depth(model, child) <= _FINGER for child in children)
+    count, longest = len(children), max(_depth(model, child) for child in children)
+    short = count > 1 and longest <= (_DIGITS[1] if count >= _DIGITS[0] else _FINGER)
     if above >= _LIMB and (fingers or short):
         return [joint]
     if len(children) == 1:
@@ -65,10 +71,14 @@ def _depth(model: Any, joint: int) -> int:
 def _tool_frame(model: Any, joint: int) -> str | None:
     """The frame that is best called a tool among those that a joint carries: by name, else its own link."""
     names = [f.name for f in model.frames if f.parentJoint == joint and f.type in _LINKS]
-    if not names:
-        return None
+    return _tool_named(model, joint) or (str(names[0]) if names else None)
+
+
+def _tool_named(model: Any, joint: int) -> str | None:
+    """The frame that is called a tool among those that a joint carries, if there is one."""
+    names = [f.name for f in model.frames if f.parentJoint == joint and f.type in _LINKS]
     for word in _TOOL_WORDS:
         pattern = re.compile(rf"(?:^|[^a-z]){word}(?:[^a-z]|$)", re.IGNORECASE)
         if named := [name for name in names if pattern.search(name)]:
             return str(min(named, key=len))
-    return str(names[0])
+    return None

@@ -1,0 +1,232 @@
+"""A home pose to start from: within the limits, clear of collision, able to move its tools in every direction."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from qpavoid.describe.sampling import SEED, BoolArray, PairDistances, Space
+from qpavoid.geometry.joints import frame_index
+from qpavoid.kinematics import columns, support_masks
+from qpavoid.problem import Array
+from qpavoid.robot import Robot
+
+ROOM = 4.0 / 3.0
+"""Distance of a pair at home, in units of its safety distance: 40 mm where 30 mm are to be kept [-]."""
+BENT = 0.5
+"""Conditioning of a limb at home, in units of what it typically has, below which it counts as singular [-]."""
+_DRAWS = 200
+"""Configurations that tell what is typical, and tries at mending one fault."""
+_PATIENCE = 3000
+"""Tries in all."""
+_DIGITS = 2
+"""After the point, of positions that were drawn [rad or m]."""
+
+
+@dataclass(frozen=True)
+class Conditioning:
+    """How well a limb can move its end in every direction."""
+
+    value: float
+    """Smallest singular value of its Jacobian: of all six rows from six joints on, else of the three of the position;
+    directions that it can never move in are left out [m/rad or 1]."""
+    typical: float
+    """Median of the same over random configurations."""
+
+    @property
+    def ratio(self) -> float:
+        """Value in units of what is typical [-]."""
+        return self.value / self.typical
+
+    def __str__(self) -> str:
+        """One clause for people."""
+        return f"smallest singular value {self.value:.3f}, {self.ratio:.1f} times the typical one"
+
+
+class Limbs:
+    """Conditioning of the limbs that end at some frames."""
+
+    def __init__(self, robot: Robot, frames: Sequence[str], seed: int = SEED) -> None:
+        """Find which directions each limb moves in, and how well it typically does.
+
+        Args:
+            robot: the robot.
+            frames: ends of its limbs; those that do not exist or do not move are left out.
+            seed: of the random configurations.
+        """
+        self._model, self._data = robot.model, robot.model.createData()
+        self._masks, self._columns = support_masks(robot.model), columns(robot.model)
+        self.names: list[str] = []
+        self.columns: list[BoolArray] = []
+        """Which coordinates (nv,) move each limb's end relative to the root."""
+        self._frames: list[tuple[int, int, int]] = []
+        self._typical: list[float] = []
+        space = Space(robot)
+        draws = space.draw(np.random.default_rng(seed), _DRAWS)
+        for name in frames:
+            if not robot.model.existFrame(name):
+                continue
+            frame = frame_index(robot.model, name)
+            moved = np.any([self._jacobian(frame, q) != 0.0 for q in draws[:5]], axis=(0, 1)) & space.moving
+            rows = 6 if moved.sum() >= 6 else 3
+            values = np.median([self._values(frame, rows, moved, q) for q in draws], axis=0)
+            rank = int(np.sum(values > 1e-6 * max(values.max(initial=0.0), 1e-9)))
+            if rank:
+                self.names.append(name)
+                self.columns.append(moved)
+                self._frames.append((frame, rows, rank))
+                self._typical.append(float(values[rank - 1]))
+
+    def at(self, q: Array) -> list[Conditioning]:
+        """Conditioning of each limb in a configuration (nq,)."""
+        found = []
+        for (frame, rows, rank), moved, typical in zip(self._frames, self.columns, self._typical, strict=True):
+            found.append(Conditioning(float(self._values(frame, rows, moved, q)[rank - 1]), typical))
+        return found
+
+    def _jacobian(self, frame: int, q: Array) -> Array:
+        """(6, nv) of a frame's origin, along the world axes; joints that mimic others are moved by those."""
+        pin.computeJointJacobians(self._model, self._data, q)
+        pose = pin.updateFramePlacement(self._model, self._data, frame)
+        J = self._data.J.reshape(6, -1, order="F") * self._masks[self._model.frames[frame].parentJoint]
+        J[:3] += np.cross(J[3:], pose.translation, axisa=0, axisc=0)
+        folded = np.zeros((6, self._model.nv))
+        np.add.at(folded.T, self._columns, J.T)
+        return folded
+
+    def _values(self, frame: int, rows: int, moved: BoolArray, q: Array) -> Array:
+        return np.asarray(np.linalg.svd(self._jacobian(frame, q)[:rows, moved], compute_uv=False))
+
+
+@dataclass(frozen=True)
+class Home:
+    """A home pose, and what is to be known of it."""
+
+    q: Array
+    """(nq,)."""
+    clearance: float
+    """Least distance of any pair [m]; infinite where there are none."""
+    nearest: tuple[str, str] | None
+    """Bodies of that pair."""
+    short: float
+    """By how much the pair that lacks most is nearer than `ROOM` times its safety distance [m]; 0 where none is."""
+    conditioning: dict[str, Conditioning]
+    """Of the limb that ends at each frame."""
+    wish: int | None
+    """Which of the wishes it is; None: a pose that was found near the first one."""
+
+    @property
+    def singular(self) -> list[str]:
+        """Frames that cannot be moved well in every direction."""
+        return [name for name, value in self.conditioning.items() if value.ratio < BENT]
+
+
+class _Judge:
+    """What is wrong with a pose: faults of its m pairs, then of its limbs, each from 0 on."""
+
+    def __init__(self, robot: Robot, frames: Sequence[str], d1: Array) -> None:
+        self.distances, self.limbs = PairDistances(robot), Limbs(robot, frames)
+        self.need = ROOM * d1
+
+    def faults(self, q: Array) -> Array:
+        """Share of its needed distance that each pair lacks (m,), and of its needed conditioning each limb [-]."""
+        short = np.maximum(1.0 - self.distances.all(q) / self.need, 0.0) if len(self.need) else np.zeros(0)
+        short += _TOUCH * (short > 1.0)
+        return np.concatenate((short, [max(1.0 - limb.ratio / BENT, 0.0) for limb in self.limbs.at(q)]))
+
+    def movers(self, fault: int) -> BoolArray:
+        """Coordinates (nv,) that can mend a fault."""
+        pairs = len(self.need)
+        return self.distances.moved_by(fault) if fault < pairs else self.limbs.columns[fault - pairs]
+
+
+_TOUCH = 10.0
+"""Fault of a collision beside that of a pair that is merely near, or of a bend [-]."""
+
+
+def find_home(
+    robot: Robot,
+    wishes: Iterable[Array],
+    frames: Sequence[str],
+    d1: Array,
+    pinned: Iterable[str] = (),
+    seed: int = SEED,
+) -> Home:
+    """Find a pose at which every pair has room and no limb is singular, as close to a wished one as can be.
+
+    The first wish without a fault is taken. Where all have one, the worst fault of the best wish is mended by moving
+    the joints that it depends on, little by little, then the next; in the end every joint that need not have moved is
+    put back. Where not all can be mended, the pose with the fewest and smallest faults is taken.
+
+    Args:
+        robot: with its pairs.
+        wishes: configurations, the best first; at least one.
+        frames: ends of limbs that should move in every direction.
+        d1: safety distance of each pair (m,) [m].
+        pinned: joints that stay where the first wish has them.
+        seed: of the draw.
+    """
+    judge, space, wished = _Judge(robot, frames, d1), Space(robot), [np.asarray(q) for q in wishes]
+    held = np.array([name.partition(".")[0] in set(pinned) for name in robot.coordinate_names], dtype=bool)
+    faults = [float(judge.faults(q).sum()) for q in (wished[:1] if held.any() else wished)]
+    clear = [fault == 0.0 for fault in faults]
+    best = clear.index(True) if any(clear) else int(np.argmin(np.floor(np.array(faults) / _TOUCH)))
+    q = wished[best] if clear[best] else _mended(robot, judge, space, wished[best], ~held & space.moving, seed)
+    return _described(robot, judge, q, best if np.array_equal(q, wished[best]) else None)
+
+
+def _mended(robot: Robot, judge: _Judge, space: Space, start: Array, free: BoolArray, seed: int) -> Array:
+    """A pose near `start` with fewer faults, of which only free coordinates (nv,) differ."""
+    random, q, tries = np.random.default_rng(seed), start, 0
+    faults, hopeless = judge.faults(q), np.zeros(len(judge.faults(q)), dtype=bool)
+    while tries < _PATIENCE and np.any(faults[~hopeless] > 0.0):
+        worst = int(np.argmax(np.where(hopeless, -1.0, faults)))
+        mask, better = judge.movers(worst) & free, q
+        for i, aim in enumerate(space.draw(random, _DRAWS if mask.any() else 0)):
+            step = (i + 1) / _DRAWS * np.asarray(pin.difference(robot.model, q, aim))
+            tried = space.move(start, np.round(pin.difference(robot.model, start, space.move(q, step * mask)), _DIGITS))
+            there, tries = judge.faults(tried), tries + 1
+            if there.sum() < faults.sum() - 1e-9:
+                better, faults = tried, there
+                if faults[worst] == 0.0:
+                    break
+        hopeless[worst] = better is q
+        q = better
+    return _put_back(robot, judge, _nearer(robot, judge, space, q, start), start)
+
+
+def _nearer(robot: Robot, judge: _Judge, space: Space, q: Array, start: Array) -> Array:
+    """The pose nearest to where it started on the straight way there that has no more faults than q."""
+    step, total = np.asarray(pin.difference(robot.model, start, q)), judge.faults(q).sum()
+    for part in np.linspace(0.05, 0.95, 19):
+        tried = space.move(start, np.round(part * step, _DIGITS))
+        if judge.faults(tried).sum() <= total:
+            return tried
+    return q
+
+
+def _put_back(robot: Robot, judge: _Judge, q: Array, start: Array) -> Array:
+    """The pose with every joint where it started that need not have moved."""
+    total = judge.faults(q).sum()
+    for joint in list(robot.model.joints)[1:]:
+        part = slice(joint.idx_q, joint.idx_q + joint.nq)
+        tried = q.copy()
+        tried[part] = start[part]
+        if not np.array_equal(tried, q) and judge.faults(tried).sum() <= total:
+            q = tried
+    return q
+
+
+def _described(robot: Robot, judge: _Judge, q: Array, wish: int | None) -> Home:
+    d = judge.distances.all(q)
+    names = [body.name for body in robot.bodies.geometryObjects]
+    nearest = None
+    if len(d):
+        a, b = judge.distances.pairs[int(np.argmin(d))]
+        nearest = names[a], names[b]
+    conditioning = dict(zip(judge.limbs.names, judge.limbs.at(q), strict=True))
+    short = float(np.max(judge.need - d, initial=0.0))
+    return Home(q, float(np.min(d, initial=np.inf)), nearest, short, conditioning, wish)

@@ -1,0 +1,123 @@
+"""Folders of ROS packages: what `package://NAME/…` stands for, without ROS."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from qpavoid.files.shipped import example_robot_data
+
+_ENTRY = re.compile(r"(?P<name>[A-Za-z][\w.-]*)=(?P<folder>.+)", re.DOTALL)
+"""`NAME=FOLDER`; a folder that has such a name itself is taken as a folder."""
+_MANIFEST = "package.xml"
+_MOST_BESIDE = 1000
+"""Folders that are looked into for a package.xml, beside one another; workspaces have 300."""
+_NAME = re.compile(r"<name>\s*([\w.-]+)\s*</name>")
+_HEAD = 100_000
+"""Beginning of a package.xml in which its name stands [bytes]."""
+
+
+def absolute_entries(entries: Iterable[str], folder: Path) -> list[str]:
+    """Entries of `package_dirs` with relative folders counted from that of the file that names them.
+
+    Args:
+        entries: folders that hold packages, or `NAME=FOLDER`.
+        folder: of the file.
+    """
+    found = []
+    for entry in entries:
+        name, place = _split(entry, folder)
+        found.append(f"{name}={folder / place}" if name else str(folder / place))
+    return found
+
+
+def mesh_folders(urdf: Path, given: Iterable[str]) -> list[str]:
+    """Where `package://` is looked up, in order: what is given, above the file, example-robot-data, ROS_PACKAGE_PATH.
+
+    Packages whose package.xml has another name than their folder stand there as `NAME=FOLDER`: the one that the file
+    is in, those beside it, and those in the given folders and along ROS_PACKAGE_PATH.
+
+    Args:
+        urdf: the file that refers to packages.
+        given: absolute folders that hold packages, or `NAME=FOLDER`.
+    """
+    given = list(given)
+    ros = [folder for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if folder]
+    above = [str(parent) for parent in urdf.resolve().parents]
+    own = [folder for folder in above if os.path.isfile(os.path.join(folder, _MANIFEST))][:1]
+    holders = [entry for entry in given if not _split(entry)[0]] + [os.path.dirname(folder) for folder in own] + ros
+    named = [
+        f"{name}={folder}"
+        for folder in dict.fromkeys(folder for holder in holders for folder in _with_manifest(holder))
+        if (name := _manifest_name(folder)) and name != os.path.basename(folder)
+    ]
+    return list(dict.fromkeys([*given, *above, *named, str(example_robot_data()), *ros]))
+
+
+def find_mesh(name: str, entries: Iterable[str]) -> str | None:
+    """The file of a name such as `package://NAME/meshes/a.stl`, `file:///a.stl` or `meshes/a.stl`; None if absent.
+
+    Args:
+        name: as a URDF has it.
+        entries: see `mesh_folders`.
+    """
+    for scheme in ("package://", "model://"):
+        if name.startswith(scheme):
+            name = name.removeprefix(scheme).lstrip("/")  # some write three slashes
+    name = name.removeprefix("file://")
+    package, _, inside = name.partition("/")
+    for entry in entries:
+        mapped, folder = _split(entry)
+        if mapped and mapped != package:
+            continue
+        found = os.path.join(folder, inside if mapped else name)
+        if os.path.isfile(found):
+            return found
+    return None
+
+
+def find_package(name: str, entries: Iterable[str]) -> str | None:
+    """The folder of a package, or None.
+
+    Args:
+        name: of the package.
+        entries: see `mesh_folders`.
+    """
+    for entry in entries:
+        mapped, folder = _split(entry)
+        if mapped == name:
+            return folder
+        if not mapped and os.path.isdir(found := os.path.join(folder, name)):
+            return found
+    return None
+
+
+def _split(entry: str, folder: Path = Path()) -> tuple[str, str]:
+    """Name of a package, or nothing, and folder of an entry."""
+    match = _ENTRY.fullmatch(entry)
+    if match is None or os.path.isdir(folder / entry):
+        return "", entry
+    return match["name"], match["folder"]
+
+
+def _with_manifest(holder: str) -> Iterator[str]:
+    """A folder and those in it that have a package.xml."""
+    try:
+        inside = sorted(os.listdir(holder))[:_MOST_BESIDE]
+    except OSError:
+        return
+    for folder in (holder, *(os.path.join(holder, name) for name in inside)):
+        if os.path.isfile(os.path.join(folder, _MANIFEST)):
+            yield folder
+
+
+def _manifest_name(folder: str) -> str:
+    """Name that a package.xml gives, or nothing: by its text, since whatever else is in it does not matter here."""
+    try:
+        with open(os.path.join(folder, _MANIFEST), encoding="utf-8", errors="replace") as file:
+            match = _NAME.search(re.sub(r"<!--.*?-->", "", file.read(_HEAD), flags=re.DOTALL))
+    except OSError:
+        return ""
+    return "" if match is None else match[1]
