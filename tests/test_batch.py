@@ -171,6 +171,23 @@ def test_script_without_guard_is_told(tmp_path):
     assert 'if __name__ == "__main__":' in run.stderr.splitlines()[-1]
 
 
+def test_interrupt_does_not_wait_for_a_call_that_began_meanwhile(tmp_path):
+    """The next call begins as soon as one is done, whenever the interrupt of that is raised."""
+    done = tmp_path / "done"
+    long = f"__import__('time').sleep(100) or open({str(done)!r}, 'w')"
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    with Workers(1) as workers:
+        with pytest.raises(KeyboardInterrupt):
+            workers.map(eval, [("1",), (long,), (long,)], interrupt)
+        assert not done.exists()
+        # of a killed process, at most the call that finds it so is lost
+        assert sum(isinstance(a, WorkerDied) for a in workers.map(int, [()] * 4)) <= 1
+        assert workers.map(int, [()] * 2) == [0, 0]
+
+
 @pytest.mark.skipif(not hasattr(os, "killpg"), reason="process groups")
 def test_interrupt_ends_the_batch(tmp_path):
     script = tmp_path / "script.py"

@@ -11,9 +11,9 @@ import os
 import pickle
 import signal
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from functools import lru_cache
 from queue import SimpleQueue
 from threading import Lock
@@ -139,7 +139,8 @@ class Workers:
         if jobs is not None and jobs < 1:
             raise ValueError(f"jobs: {jobs}; at least one process is needed")
         # a pool for each process tells which call a dead process was at; one pool of all loses whatever is queued
-        pools = [_start() for _ in range(_cores() if jobs is None else jobs)]
+        self._pids: dict[ProcessPoolExecutor, Future[int]] = {}
+        pools = [self._start() for _ in range(_cores() if jobs is None else jobs)]
         self._count, self._idle = len(pools), SimpleQueue[ProcessPoolExecutor]()
         for pool in pools:
             self._idle.put(pool)
@@ -184,7 +185,8 @@ class Workers:
             try:
                 return pool.submit(call, *given).result()
             except BrokenProcessPool:
-                pool = _start()
+                del self._pids[pool]
+                pool = self._start()
                 return WorkerDied("its process ended before it was done: killed, out of memory or crashed")
             except Exception as error:
                 return error
@@ -197,30 +199,41 @@ class Workers:
                 for done, _ in enumerate(as_completed(futures), 1):
                     if progress is not None:
                         progress(done, len(futures))
-            except BaseException:  # Ctrl-C, which ends the processes too: do not begin what is left
-                threads.shutdown(cancel_futures=True)
+            except BaseException:  # Ctrl-C: do not begin what is left, nor wait for what began before that was known
+                threads.shutdown(wait=False, cancel_futures=True)
+                self._kill()
                 raise
         return [future.result() for future in futures]
+
+    def _start(self) -> ProcessPoolExecutor:
+        pool, pid = _start()
+        self._pids[pool] = pid
+        return pool
+
+    def _kill(self) -> None:
+        for pid in list(self._pids.values()):
+            with suppress(BrokenProcessPool, OSError):  # it has ended, as Ctrl-C in a terminal reaches it, too
+                os.kill(pid.result(), signal.SIGTERM)
 
 
 _SINGLE_THREADED = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "NUMBA")}
 _starting = Lock()
 
 
-def _start() -> ProcessPoolExecutor:
-    """A pool of one process, which ends without a word at Ctrl-C."""
+def _start() -> tuple[ProcessPoolExecutor, Future[int]]:
+    """Start a pool of one process, which ends without a word at Ctrl-C; and the id of the process, once it runs."""
     spawn = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(1, spawn, signal.signal, (signal.SIGINT, signal.SIG_DFL))
     with _starting:  # the number of threads must be in the environment when the process loads its libraries
         before = dict(os.environ)
         os.environ.update(_SINGLE_THREADED)
         try:
-            pool.submit(int)  # starts the process
+            pid = pool.submit(os.getpid)  # starts the process
         finally:
             for name in _SINGLE_THREADED:
                 os.environ.pop(name)
             os.environ.update({name: before[name] for name in _SINGLE_THREADED if name in before})
-    return pool
+    return pool, pid
 
 
 def _workers(jobs: int | Workers | None, most: int) -> AbstractContextManager[Workers]:
