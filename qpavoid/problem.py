@@ -97,18 +97,18 @@ class Contacts(NamedTuple):
 
     Z: Array
     """(nv, n) orthonormal basis of the velocities with which no contact moves."""
-    rest: Array
+    v_particular: Array
     """(nv,) the least velocity with J v = b: zero but for what frames have slid."""
     J: Array
     """(c, nv)."""
     b: Array
     """(c,) [m/s, rad/s]."""
 
-    def held(self, v: Array) -> Array:
+    def project(self, v: Array) -> Array:
         """The velocity (nv,) closest to v that holds the contacts; v itself where it does."""
         if np.abs(self.J @ v - self.b).max() <= CONTACT_TOLERANCE:
             return v
-        return np.asarray(self.rest + self.Z @ (self.Z.T @ v))
+        return np.asarray(self.v_particular + self.Z @ (self.Z.T @ v))
 
 
 CONTACT_TOLERANCE = 1e-6
@@ -133,7 +133,7 @@ class AvoidanceRows(NamedTuple):
     """Distance below which β is 1 [m]."""
     d2: float
     """Influence distance: α and β are 0 beyond it [m]."""
-    touch: Array
+    b_contact: Array
     """(k,) lower bound on J v that keeps the pair from touching: that of a row with no margin; at most `b` [m/s]."""
 
 
@@ -166,11 +166,11 @@ class Problem(NamedTuple):
     """What holds the contacts, where there are any; v0 does."""
     levels: tuple[IntArray, ...] = ()
     """Which rows of `tracking` belong to each priority, the first one first; empty where all have the same."""
-    jerked: bool = False
+    jerk_limited: bool = False
     """Whether `lower` and `upper` keep to jerk limits, beside those of accelerations."""
-    clear: bool = False
+    tracking_is_clear: bool = False
     """Whether v0 is safe and known to lead nowhere near anything, nor a stop from it."""
-    room: float = np.inf
+    position_margin: float = np.inf
     """What is left to the nearest position limit [rad, m]; negative where a coordinate is outside."""
 
 
@@ -219,7 +219,7 @@ class Solution(NamedTuple):
     """What was relaxed, or why the robot stops; empty when nothing was."""
     slack: Array | None = None
     """(k,) what each avoidance row gave way [m/s]; None when none did."""
-    share: float = 1.0
+    command_scale: float = 1.0
     """How much of the law's velocity is left after looking ahead; the rest is the velocity of a stop."""
     stalled: tuple[Reason, ...] = ()
     """What keeps the tasks from making progress, once they have made none for a while."""
@@ -238,12 +238,12 @@ class Solution(NamedTuple):
         found = [reason.severity for reason in (*self.reasons, *self.stalled, *self.assumptions)]
         return max(found) if found else None
 
-    def relaxed(self, *reasons: Reason) -> Solution:
+    def with_reasons(self, *reasons: Reason) -> Solution:
         """Return the same with more reasons, as RELAXED; a stop stays one."""
         status = self.status if self.status is Status.STOPPED else Status.RELAXED
         return self._replace(status=status, reasons=(*self.reasons, *reasons))
 
-    def timed(self, build_time: float, solve_time: float) -> Solution:
+    def with_times(self, build_time: float, solve_time: float) -> Solution:
         """Return the same with its times [s]."""
         return self._replace(build_time=build_time, solve_time=solve_time)
 
@@ -277,7 +277,7 @@ def as_vector(name: str, value: Any, shape: tuple[int, ...]) -> Array:
     return array
 
 
-def sane(v: Array) -> bool:
+def is_finite_and_bounded(v: Array) -> bool:
     """Whether a vector (n,) is finite and not absurdly large; for a few dozen numbers, quicker than numpy."""
     return hypot(*v.tolist()) < _MAX_NORM
 

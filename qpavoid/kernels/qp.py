@@ -71,7 +71,7 @@ def project_soft(
 
 
 @compiled
-def farthest(
+def max_clearance_velocity(
     h: float,
     closest: Array,
     J: Array,

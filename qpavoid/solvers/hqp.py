@@ -50,9 +50,9 @@ class Hqp(Qp):
             alone = np.zeros_like(alone)
         v, unsolved = self._levels(problem, asked, alone, rows.b, lower, upper)
         if v is not None:
-            return Solution(v).relaxed(*unsolved) if unsolved else Solution(v)
+            return Solution(v).with_reasons(*unsolved) if unsolved else Solution(v)
         P, q = kernels.projection_cost(problem.tracking.A, 1e-3, alone)
-        relaxed = self._give_way(P, q, problem)
+        relaxed = self._relax(P, q, problem)
         if isinstance(relaxed, Solution):
             return relaxed
         lower, upper = np.minimum(lower, relaxed.v), np.maximum(upper, relaxed.v)
@@ -114,7 +114,7 @@ def _attempt(
 def _start(problem: Problem) -> tuple[Array, Array]:
     """Basis (nv, n) of what contacts leave free, and a velocity (nv,) that holds them."""
     contacts, nv = problem.contacts, len(problem.lower)
-    return (np.eye(nv), np.zeros(nv)) if contacts is None else (contacts.Z, contacts.rest)
+    return (np.eye(nv), np.zeros(nv)) if contacts is None else (contacts.Z, contacts.v_particular)
 
 
 def _cascade(problem: Problem, levels: tuple[IntArray, ...]) -> tuple[Array, Levels]:

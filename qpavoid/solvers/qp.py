@@ -11,7 +11,7 @@ from qpavoid.reason import Reason, ReasonKind
 from qpavoid.solvers.analytic import tracking_velocity
 from qpavoid.solvers.backends import Backend, Daqp, make_backend, solve_daqp
 from qpavoid.solvers.reasons import relaxation_reasons
-from qpavoid.solvers.reduced import holding
+from qpavoid.solvers.reduced import in_contact_null_space
 from qpavoid.solvers.relaxation import Closest, Relaxed, by_back_end, closest, relax
 
 _GENTLE = 1.0
@@ -70,7 +70,7 @@ class Qp:
                 return Solution(answer)
         P, q = kernels.projection_cost(A, self.config.regularization, v_tracking)
         for backend in self._backends:
-            v = closest(holding(problem.contacts, backend), P, q, rows.J, rows.b, lower, upper)
+            v = closest(in_contact_null_space(problem.contacts, backend), P, q, rows.J, rows.b, lower, upper)
             if v is not None:
                 return Solution(v)
         return self._relaxed(P, q, problem)
@@ -91,15 +91,17 @@ class Qp:
         rows = problem.avoidance
         least = rows.b if slack is None else rows.b - slack
         P, q = kernels.projection_cost(problem.tracking.A, _GENTLE, tracking_velocity(problem))
-        return closest(holding(problem.contacts, solve_daqp), P, q, rows.J, least, problem.lower, problem.upper)
+        return closest(
+            in_contact_null_space(problem.contacts, solve_daqp), P, q, rows.J, least, problem.lower, problem.upper
+        )
 
     def _relaxed(self, P: Array, q: Array, problem: Problem) -> Solution:
-        relaxed = self._give_way(P, q, problem)
+        relaxed = self._relax(P, q, problem)
         if isinstance(relaxed, Solution):
             return relaxed
         return relaxed_solution(relaxed, problem)
 
-    def _give_way(self, P: Array, q: Array, problem: Problem) -> Relaxed | Solution:
+    def _relax(self, P: Array, q: Array, problem: Problem) -> Relaxed | Solution:
         """The least that has to give way; a stop where not even that helps."""
         rows = problem.avoidance
         unknown = np.flatnonzero(~np.isfinite(rows.b + rows.J.sum(axis=1)))
@@ -110,7 +112,7 @@ class Qp:
         relaxed = None
         if self._native and problem.contacts is None:
             relaxed = relax(problem, self._compiled(problem))
-        backend = holding(problem.contacts, solve_daqp)
+        backend = in_contact_null_space(problem.contacts, solve_daqp)
         if relaxed is None:
             relaxed = relax(problem, by_back_end(backend, P, q, tracking_velocity(problem)))
         if relaxed is not None:

@@ -31,7 +31,7 @@ def relaxation_reasons(relaxed: Relaxed, problem: Problem) -> tuple[Reason, ...]
     found = []
     for i in violated.tolist():
         pair, missing = problem.pair_names[rows.pair[i]], float(rows.d1 - rows.d[i])
-        touches = rows.b[i] - slack[i] < rows.touch[i] - _CONTACT
+        touches = rows.b[i] - slack[i] < rows.b_contact[i] - _CONTACT
         severity = Severity.ALARM if touches else Severity.WARNING if missing > 0.0 else Severity.INFO
         amount = float(slack[i])
         found.append(Reason.of(ReasonKind.ROW_RELAXED, *pair, amount=amount, unit="m/s", severity=severity))
@@ -39,7 +39,7 @@ def relaxation_reasons(relaxed: Relaxed, problem: Problem) -> tuple[Reason, ...]
             found.append(
                 Reason.of(ReasonKind.BELOW_SAFETY_DISTANCE, *pair, amount=missing, unit="m", severity=severity)
             )
-    kind = ReasonKind.JERK_RELAXED if problem.jerked else ReasonKind.ACCELERATION_RELAXED
+    kind = ReasonKind.JERK_RELAXED if problem.jerk_limited else ReasonKind.ACCELERATION_RELAXED
     passed = [
         Reason.of(kind, names[j], amount=float(excess[j]), unit=f"{units[j]}/s")
         for j in np.flatnonzero(excess > _USED).tolist()

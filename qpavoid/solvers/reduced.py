@@ -8,7 +8,7 @@ from qpavoid.problem import Array, Contacts
 from qpavoid.solvers.backends import Backend
 
 
-def holding(contacts: Contacts | None, backend: Backend) -> Backend:
+def in_contact_null_space(contacts: Contacts | None, backend: Backend) -> Backend:
     """A back end that answers with velocities that hold the contacts, as if there were no others.
 
     Variables beyond the nv velocities, such as slacks, are left as they are.
@@ -24,7 +24,7 @@ def holding(contacts: Contacts | None, backend: Backend) -> Backend:
     def solve(P: Array, q: Array, G: Array, h: Array, lower: Array, upper: Array) -> Array | None:
         more = len(q) - nv
         Z, start = np.zeros((nv + more, free + more)), np.zeros(nv + more)
-        Z[:nv, :free], Z[nv:, free:], start[:nv] = contacts.Z, np.eye(more), contacts.rest
+        Z[:nv, :free], Z[nv:, free:], start[:nv] = contacts.Z, np.eye(more), contacts.v_particular
         return solve_within(backend, Z, start, P, q, G, h, lower, upper)
 
     return solve

@@ -64,7 +64,7 @@ def relax(problem: Problem, solve: Closest) -> Relaxed | None:
     """
     rows, within = problem.avoidance, _Bounds(problem.lower, problem.upper)
     nothing, hard_rows = np.full(len(rows.d), -np.inf), np.zeros(len(rows.d))
-    touch = rows.touch - TOLERANCE
+    touch = rows.b_contact - TOLERANCE
     if problem.hard_lower is not problem.lower and solve(rows.J, touch, hard_rows, *within) is None:
         hard = _Bounds(problem.hard_lower, problem.hard_upper)
         touch = touch - _lexicographic_slack(rows, touch, nothing, hard, solve)[0]
