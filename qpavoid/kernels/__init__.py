@@ -1,4 +1,4 @@
-"""Array work of a tick, as loops that numba compiles at their first use and keeps on disk (`kernels.cache`)."""
+"""Array work of a control step: loops that numba compiles at their first use, and stores on disk (`kernels.cache`)."""
 
 from qpavoid.kernels.backup import ROUND_OFF, backup_rows, closes_below, min_sphere_distance, rate_limit
 from qpavoid.kernels.bounds import velocity_bounds
