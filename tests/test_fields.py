@@ -164,7 +164,7 @@ def test_potential_field_descends_its_potential_and_parts_each_pair_alone(seed, 
 
 @given(seeds, st.floats(0.05, 3.0), st.floats(0.1, 1e4))
 def test_self_motion_takes_no_joint_past_a_bound(seed, limit, gain):
-    """Joints that tracking leaves within bounds stay there, others go no further out, and the step fraction is the largest."""
+    """Joints that tracking leaves within bounds stay there, others go no further out, by the largest step fraction."""
     problem = random_problem(seed, limit=limit)
     v_tracking, lower, upper = tracking_velocity(problem), problem.lower, problem.upper
     v = make_solver(GradientProjectionSolver(gain=gain)).solve(problem).v

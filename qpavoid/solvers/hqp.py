@@ -2,8 +2,8 @@
 
 Inequalities have priority over all tasks and hold at every level (Kanoun, Lamiraux and Wieber 2011, "Kinematic control
 of redundant manipulators: generalizing the task-priority framework to inequality tasks"); each level is solved in a
-basis of the null space of the levels before it (Escande, Mansard and Wieber 2014, "Hierarchical quadratic programming: fast
-online humanoid-robot motion generation").
+basis of the null space of the levels before it (Escande, Mansard and Wieber 2014, "Hierarchical quadratic programming:
+fast online humanoid-robot motion generation").
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ class Hqp(Qp):
     null space of the last level, v is as near to v̂ as possible. Contacts are met by the basis of the first level.
 
     Where no velocity meets the inequalities, they are relaxed as those of `qp` are, and the cascade is solved within
-    the relaxed ones. A level whose QP neither the back end nor daqp solves keeps the velocity of the levels before it, and
-    is named in the reasons.
+    the relaxed ones. A level whose QP neither the back end nor daqp solves keeps the velocity of the levels before it,
+    and is named in the reasons.
     """
 
     def solve(self, problem: Problem) -> Solution:

@@ -21,9 +21,9 @@ class PotentialField:
     magnitude. Above the cap, U continues linearly, into penetration too.
 
     J_iᵀ maps repulsions to joint velocities, as it maps Khatib's forces to torques. So the repelling velocity is
-    -∂ΣU/∂q, descent of one potential (Choset et al. 2005, "Principles of Robot Motion", chapter 4): by itself it never adds to ΣU,
-    however many pairs act on a link, and it has no singularity. An inverse of each J_i would separate each pair at a
-    set speed, but the joints' speeds for that grow as the lever arm shrinks.
+    -∂ΣU/∂q, descent of one potential (Choset et al. 2005, "Principles of Robot Motion", chapter 4): by itself it never
+    adds to ΣU, however many pairs act on a link, and it has no singularity. An inverse of each J_i would separate each
+    pair at a set speed, but the joints' speeds for that grow as the lever arm shrinks.
 
     It ignores the task: where attraction and repulsion balance, the robot stalls.
     """

@@ -22,8 +22,8 @@ class GradientProjection:
     Jacobians of the distances, ∇h = -Σ c'(d_i) J_iᵀ is exact. The motion of obstacles is ignored.
 
     k is `gain`, or the part of it at which joints that J⁺ẋ keeps within their bounds stay there (Euler, Dubey and
-    Babcock 1989, "Self motion determination based on actuator velocity bounds for redundant manipulators"): clipped joint by
-    joint, the motion would leave the null space and move the tool.
+    Babcock 1989, "Self motion determination based on actuator velocity bounds for redundant manipulators"): clipped
+    joint by joint, the motion would leave the null space and move the tool.
     """
 
     bounded = False
