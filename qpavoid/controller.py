@@ -475,10 +475,10 @@ class Controller:
         self._assembly.remember(solution.v)
         if self._no_backup and len(self._obstacles.moving):
             assumptions += self._no_backup
-        if problem.room < -OUTSIDE:
+        if problem.position_margin < -OUTSIDE:
             assumptions += self._bounds.outside(q, problem.joint_names, problem.joint_units)
         solution = solution._replace(assumptions=assumptions) if assumptions else solution
-        solution = solution.timed(built - begin, perf_counter() - built)
+        solution = solution.with_times(built - begin, perf_counter() - built)
         return _Output(state, samples, proximity, problem, solution)
 
     def _read(

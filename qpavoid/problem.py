@@ -1,6 +1,6 @@
-"""Value types of one tick. numpy only: a problem can be recorded, replayed and benchmarked without a robot.
+"""Value types of a control step. numpy only: a problem can be recorded, replayed and benchmarked without a robot.
 
-They are named tuples, frozen and three times as quick to make as frozen dataclasses: a tick makes seven of them.
+They are named tuples, frozen and three times as quick to make as frozen dataclasses: a control step makes seven.
 
 Everything is expressed in the joint velocity v, shape (nv,) [rad/s or m/s].
 """
@@ -22,22 +22,22 @@ Array = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.intp]
 Mask = npt.NDArray[np.bool_]
 _MAX_NORM = 1e150
-"""Length that no vector of a robot has."""
+"""Norm from which a velocity counts as overflow [rad/s, m/s]: squares of smaller ones are finite."""
 
 
 class Status(str, Enum):
-    """How a tick ended."""
+    """Outcome of a control step."""
 
     SOLVED = "SOLVED"
-    """Every row and bound is met."""
+    """Every constraint is met."""
     RELAXED = "RELAXED"
-    """The rows contradict each other or the limits; `reasons` says which gave way and by how much."""
+    """The rows contradict each other or the limits; `reasons` names those that are relaxed, and by how much."""
     STOPPED = "STOPPED"
-    """No velocity can be answered for: the robot is braked to a standstill within its acceleration and jerk limits."""
+    """No velocity is known to be safe: the robot brakes to a standstill within its acceleration and jerk limits."""
 
 
 class State(NamedTuple):
-    """What is read from the robot: configuration q (nq,), velocity v (nv,), time t [s]."""
+    """Measured state of the robot: configuration q (nq,), velocity v (nv,), time t [s]."""
 
     q: Array
     v: Array
@@ -45,39 +45,39 @@ class State(NamedTuple):
 
 
 class Proximity(NamedTuple):
-    """Closest points of the k pairs within reach, and the rate of their distance.
+    """Witness points and distance rates of the k pairs within the influence distance.
 
-    For bodies (a, b) the distance changes at ḋ = n·(ṗ_b - ṗ_a) = J v + drift, n the unit normal from a to b, also in
-    penetration.
+    For bodies (a, b) the distance changes at ḋ = n·(ṗ_b - ṗ_a) = J v + `feedforward`, n the unit normal from a to b,
+    also in penetration.
     """
 
     pair: IntArray
-    """(k,) which of the scene's pairs, in increasing order."""
+    """(k,) index of each pair among those of the scene, in increasing order."""
     closest: Array
     """(k, 10) distance, normal and witness points of each pair; see the properties below."""
     J: Array
     """(k, nv) velocity Jacobian of the distances [m/rad or 1]."""
     feedforward: Array
-    """(k,) rate of these distances due to the obstacles' own motion [m/s]."""
+    """(k,) rate of these distances due to the motion of the obstacles [m/s]."""
 
     @property
     def distance(self) -> Array:
-        """(k,) signed distance between surfaces [m], negative in penetration."""
+        """Return the signed distance between surfaces (k,) [m], negative in penetration."""
         return self.closest[:, 0]
 
     @property
     def normal(self) -> Array:
-        """(k, 3) unit normal from body a to body b, world axes."""
+        """Return the unit normal from body a to body b (k, 3), world axes."""
         return self.closest[:, 1:4]
 
     @property
     def point_a(self) -> Array:
-        """(k, 3) witness point on body a, world [m]."""
+        """Return the witness point on body a (k, 3), world [m]."""
         return self.closest[:, 4:7]
 
     @property
     def point_b(self) -> Array:
-        """(k, 3) witness point on body b, world [m]."""
+        """Return the witness point on body b (k, 3), world [m]."""
         return self.closest[:, 7:10]
 
 
@@ -93,26 +93,30 @@ class Tracking(NamedTuple):
 
 
 class Contacts(NamedTuple):
-    """Rows J v = b of the frames that rest, which come before everything else, solved: v = rest + Z w."""
+    """Rows J v = b of the frames in contact, of the highest priority, solved: v = v_particular + Z w."""
 
     Z: Array
-    """(nv, n) orthonormal basis of the velocities with which no contact moves."""
-    rest: Array
-    """(nv,) the least velocity with J v = b: zero but for what frames have slid."""
+    """(nv, n) orthonormal basis of the null space of J: velocities at which no contact moves."""
+    v_particular: Array
+    """(nv,) the least velocity with J v = b: zero, or the correction of frames that have slid [rad/s or m/s]."""
     J: Array
-    """(c, nv)."""
+    """(c, nv) Jacobian of the frames in contact."""
     b: Array
-    """(c,) [m/s, rad/s]."""
+    """(c,) velocity of these frames that corrects their sliding [m/s, rad/s]."""
 
-    def held(self, v: Array) -> Array:
-        """The velocity (nv,) closest to v that holds the contacts; v itself where it does."""
+    def project(self, v: Array) -> Array:
+        """Return the velocity (nv,) closest to v with J v = b; v itself where it meets that to `CONTACT_TOLERANCE`.
+
+        Args:
+            v: velocity (nv,) [rad/s or m/s].
+        """
         if np.abs(self.J @ v - self.b).max() <= CONTACT_TOLERANCE:
             return v
-        return np.asarray(self.rest + self.Z @ (self.Z.T @ v))
+        return np.asarray(self.v_particular + self.Z @ (self.Z.T @ v))
 
 
 CONTACT_TOLERANCE = 1e-6
-"""Velocity of a contact up to which it counts as held [m/s, rad/s]."""
+"""Velocity of a contact up to which it counts as at rest [m/s, rad/s]: the tolerance of a QP, 0.001 mm in a second."""
 
 
 class AvoidanceRows(NamedTuple):
@@ -124,21 +128,21 @@ class AvoidanceRows(NamedTuple):
     pair: IntArray
     """(k,) index of the pair in `Problem.pair_names`, in increasing order."""
     d: Array
-    """(k,) [m]."""
+    """(k,) distance that the gains take [m]."""
     J: Array
-    """(k, nv)."""
+    """(k, nv) velocity Jacobian of the distances [m/rad or 1]."""
     b: Array
-    """(k,) lower bound on ḋ less the drift [m/s]."""
+    """(k,) lower bound on J v: that on ḋ minus the feed-forward [m/s]."""
     d1: float
     """Distance below which β is 1 [m]."""
     d2: float
     """Influence distance: α and β are 0 beyond it [m]."""
-    touch: Array
-    """(k,) lower bound on J v that keeps the pair from touching: that of a row with no margin; at most `b` [m/s]."""
+    b_contact: Array
+    """(k,) lower bound on J v that keeps the pair from contact: that of a row without a margin; at most `b` [m/s]."""
 
 
 class Problem(NamedTuple):
-    """Everything that a solver may know about a tick."""
+    """Everything that a solver may know about a control step."""
 
     tracking: Tracking
     avoidance: AvoidanceRows
@@ -151,7 +155,7 @@ class Problem(NamedTuple):
     hard_upper: Array
     """(nv,) upper bound from the same."""
     v_stop: Array
-    """(nv,) next velocity of a stop: all coordinates slowed alike within their acceleration and jerk limits."""
+    """(nv,) next velocity of a stop: all coordinates slowed by one factor within acceleration and jerk limits."""
     pair_names: Sequence[tuple[str, str]]
     """Names of the bodies of all m pairs."""
     joint_names: Sequence[str]
@@ -161,17 +165,17 @@ class Problem(NamedTuple):
     v_tracking: Array
     """(nv,) J⁺ẋ, the tracking law's velocity; NaN where λ is 0 and rows repeat each other."""
     violation: float
-    """By how much v0 violates the worst row or bound [m/s, rad/s]; not positive where it is safe, NaN with v0."""
+    """Largest violation of a row or bound by v_tracking [m/s, rad/s]; not positive where it is safe, NaN with it."""
     contacts: Contacts | None = None
-    """What holds the contacts, where there are any; v0 does."""
+    """Contacts of the robot, None without any; v_tracking meets them."""
     levels: tuple[IntArray, ...] = ()
-    """Which rows of `tracking` belong to each priority, the first one first; empty where all have the same."""
-    jerked: bool = False
-    """Whether `lower` and `upper` keep to jerk limits, beside those of accelerations."""
-    clear: bool = False
-    """Whether v0 is safe and known to lead nowhere near anything, nor a stop from it."""
-    room: float = np.inf
-    """What is left to the nearest position limit [rad, m]; negative where a coordinate is outside."""
+    """Indices of the rows of `tracking` of each priority, the first one first; empty where all have the same."""
+    jerk_limited: bool = False
+    """Whether `lower` and `upper` contain jerk limits, too."""
+    tracking_is_clear: bool = False
+    """Whether v_tracking is safe, and a bound shows that no pair comes too near along it and a stop from it."""
+    position_margin: float = np.inf
+    """Distance to the nearest position limit [rad, m]; negative where a coordinate is outside."""
 
 
 def make_problem(
@@ -183,7 +187,7 @@ def make_problem(
     hard: tuple[Array, Array] | None = None,
     v_stop: Array | None = None,
 ) -> Problem:
-    """A problem made by hand, or one whose rows were changed: works out v0 and its shortfall by their definitions.
+    """Make a problem by hand, or from changed rows: compute v_tracking and its violation by their definitions.
 
     Args:
         tracking: task rows.
@@ -191,8 +195,8 @@ def make_problem(
         lower: (nv,) lower bound on v.
         upper: (nv,) upper bound on v.
         pair_names: names of the bodies of all pairs.
-        hard: bounds without acceleration and jerk limits; `lower` and `upper` if left out.
-        v_stop: next velocity of a stop; as little as the bounds allow if left out.
+        hard: bounds (nv,), (nv,) without acceleration and jerk limits; `lower` and `upper` if left out.
+        v_stop: next velocity of a stop (nv,); the least that the bounds allow if left out.
     """
     A, b, damping = tracking
     gram = A @ A.T + damping**2 * np.eye(len(b))
@@ -210,46 +214,50 @@ def make_problem(
 
 
 class Solution(NamedTuple):
-    """What a solver commands, and what it had to give up for it."""
+    """Velocity that a solver commands, and what it relaxed for it."""
 
     v: Array
     """(nv,) joint velocity [rad/s or m/s]."""
     status: Status = Status.SOLVED
     reasons: tuple[Reason, ...] = ()
-    """What was relaxed, or why the robot stops; empty when nothing was."""
+    """What was relaxed, or why the robot stops; empty where neither."""
     slack: Array | None = None
-    """(k,) what each avoidance row gave way [m/s]; None when none did."""
-    share: float = 1.0
-    """How much of the law's velocity is left after looking ahead; the rest is the velocity of a stop."""
+    """(k,) violation of each avoidance row [m/s]; None where there is none."""
+    command_scale: float = 1.0
+    """Share of the solver's velocity in the command after the stop look-ahead; the remainder is that of a stop [-]."""
     stalled: tuple[Reason, ...] = ()
-    """What keeps the tasks from making progress, once they have made none for a while."""
+    """Why the tasks make no progress, once they have made none for a while."""
     assumptions: tuple[Reason, ...] = ()
-    """What the step took for granted, such as the twist of an obstacle that was given without one."""
+    """Assumptions of the step, such as the estimated twist of an obstacle that was given without one."""
     saturation: float = 0.0
-    """Largest change that the limits made to the law's raw velocity [rad/s or m/s]; 0 for laws that know limits."""
+    """Largest change of the solver's raw velocity by the limits [rad/s or m/s]; 0 of a `bounded` solver."""
     build_time: float = 0.0
     """Time to read the state and set up the problem [s]."""
     solve_time: float = 0.0
-    """Time to solve it and to look ahead [s]."""
+    """Time to solve it, look-ahead included [s]."""
 
     @property
     def severity(self) -> Severity | None:
-        """The worst severity of all reasons of the step; None where there is no reason."""
-        found = [reason.severity for reason in (*self.reasons, *self.stalled, *self.assumptions)]
-        return max(found) if found else None
+        """Return the worst severity of all reasons of the step; None without any."""
+        severities = [reason.severity for reason in (*self.reasons, *self.stalled, *self.assumptions)]
+        return max(severities) if severities else None
 
-    def relaxed(self, *reasons: Reason) -> Solution:
-        """Return the same with more reasons, as RELAXED; a stop stays one."""
+    def with_reasons(self, *reasons: Reason) -> Solution:
+        """Return the solution with more reasons, as RELAXED; STOPPED stays STOPPED.
+
+        Args:
+            reasons: added to those of the solution.
+        """
         status = self.status if self.status is Status.STOPPED else Status.RELAXED
         return self._replace(status=status, reasons=(*self.reasons, *reasons))
 
-    def timed(self, build_time: float, solve_time: float) -> Solution:
-        """Return the same with its times [s]."""
+    def with_times(self, build_time: float, solve_time: float) -> Solution:
+        """Return the solution with its times [s]; see the fields."""
         return self._replace(build_time=build_time, solve_time=solve_time)
 
 
 def as_numbers(name: str, value: Any) -> Array:
-    """Return `value` as a float array of whatever shape, and whatever its numbers are.
+    """Return `value` as a float array of any shape and any numbers, NaN and infinity included.
 
     Raises:
         NumericalError: text, complex numbers, or no numbers; names the argument.
@@ -264,7 +272,7 @@ def as_numbers(name: str, value: Any) -> Array:
 
 
 def as_vector(name: str, value: Any, shape: tuple[int, ...]) -> Array:
-    """`value` as a float array of `shape`, whatever its numbers are.
+    """Return `value` as a float array of `shape`, NaN and infinity included.
 
     Raises:
         NumericalError: wrong shape, or not numbers; names the argument.
@@ -277,13 +285,13 @@ def as_vector(name: str, value: Any, shape: tuple[int, ...]) -> Array:
     return array
 
 
-def sane(v: Array) -> bool:
-    """Whether a vector (n,) is finite and not absurdly large; for a few dozen numbers, quicker than numpy."""
+def is_finite_and_bounded(v: Array) -> bool:
+    """Return True if the norm of v (n,) is below `_MAX_NORM`; for a few dozen numbers, quicker than numpy."""
     return hypot(*v.tolist()) < _MAX_NORM
 
 
 def require_finite(name: str, value: Any, shape: tuple[int, ...]) -> Array:
-    """`value` as a float array of `shape`.
+    """Return `value` as a finite float array of `shape`.
 
     Raises:
         NumericalError: wrong shape, NaN or infinity; names the argument.
@@ -295,6 +303,6 @@ def require_finite(name: str, value: Any, shape: tuple[int, ...]) -> Array:
 
 
 def not_finite(array: Array) -> str:
-    """Say what is wrong with an array that is not `sane`, and where."""
+    """Return the fault of an array that is not `is_finite_and_bounded`, with the first five indices."""
     bad = np.argwhere(~np.isfinite(array)).ravel()[:5].tolist()
     return f"NaN or infinity at index {', '.join(map(str, bad))}" if bad else "too large"

@@ -1,4 +1,4 @@
-"""Reasons: what a control step relaxed, assumed or could not do, as data; prose is made of it for people alone."""
+"""Reasons: what a control step relaxed, assumed or could not do, as data; `str` makes a line of it for people."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 
 class Severity(IntEnum):
-    """How much a reason matters to a supervisor."""
+    """Weight of a reason for a supervisor."""
 
     INFO = 1
     """Noise or an estimate: no margin was used."""
@@ -18,7 +18,7 @@ class Severity(IntEnum):
 
 
 class ReasonKind(str, Enum):
-    """What happened. `subject` and `amount` of the `Reason` are as each kind says."""
+    """Kind of event, with the `subject` and `amount` of its `Reason`."""
 
     ROW_RELAXED = "ROW_RELAXED"
     """An avoidance row is violated: the pair, its slack [m/s]."""
@@ -35,7 +35,7 @@ class ReasonKind(str, Enum):
     """A joint passes its jerk limit, or its acceleration and jerk limits: the joint, the excess of its velocity
     [rad/s or m/s]."""
     LIMIT_RECOVERY = "LIMIT_RECOVERY"
-    """A joint is outside its position limits and sent back: the joint, how far [rad or m], negative below the lower."""
+    """A joint is outside its position limits and returns: the joint, the excess [rad or m], negative below."""
     AT_LOWER_LIMIT = "AT_LOWER_LIMIT"
     """A joint is kept from passing its lower position limit by a row or task: the joint, the bound on its velocity
     [rad/s or m/s]."""
@@ -44,14 +44,14 @@ class ReasonKind(str, Enum):
     AT_VELOCITY_LIMIT = "AT_VELOCITY_LIMIT"
     """A joint moves at its velocity limit where a row wants more: the joint, its velocity [rad/s or m/s]."""
     STALLED = "STALLED"
-    """The tasks make no progress: the pair in the way, by how much their velocity violates its row [m/s]; no pair where
-    several rows are in the way together."""
+    """The tasks make no progress: the pair that blocks them, the violation of its row by their velocity [m/s]; no pair
+    where several rows block them together."""
     OUT_OF_REACH = "OUT_OF_REACH"
-    """A target cannot be reached: the task, by how much [m]."""
+    """A target cannot be reached: the task, the missing distance [m]."""
     TARGET_OBSTRUCTED = "TARGET_OBSTRUCTED"
     """A target is too near to an obstacle: task and obstacle, what is missing to the safety distance [m]."""
     DETOUR_ENDED = "DETOUR_ENDED"
-    """The detours of a task ended without progress: the task, for how long they were tried [s]."""
+    """The detours of a task ended without progress: the task, the time spent on them [s]."""
     BACKUP = "BACKUP"
     """The backup trajectory replaces the tasks: from their velocity, none would stay clear of moving obstacles."""
     NO_BACKUP = "NO_BACKUP"
@@ -59,29 +59,29 @@ class ReasonKind(str, Enum):
     STALE = "STALE"
     """An obstacle was not updated in time: the obstacle, the age of its last update [s]."""
     NEVER_UPDATED = "NEVER_UPDATED"
-    """An external obstacle has not been given yet: the obstacle, since when [s]."""
+    """An external obstacle has not been given yet: the obstacle, the time since the start [s]."""
     ESTIMATED = "ESTIMATED"
     """A twist was estimated from the poses of an obstacle: the obstacle."""
     IGNORED = "IGNORED"
-    """An update was not used: of what."""
+    """An update was not used: its subject."""
     POINTS_DROPPED = "POINTS_DROPPED"
-    """Points of a cloud were not used: the cloud, how many [-]."""
+    """Points of a cloud were not used: the cloud, their number [-]."""
     IMPLAUSIBLE = "IMPLAUSIBLE"
-    """An argument cannot be true: its name."""
+    """An argument is implausible: its name."""
     NORMALISED = "NORMALISED"
-    """A rotation or quaternion was nearly one, and is normalised: of what, how far it was off [-]."""
+    """A matrix or quaternion that is nearly a rotation is normalised: its subject, its deviation [-]."""
     TIMING = "TIMING"
-    """Time went on by something else than the control period: `t`, by how much [s]."""
+    """Time did not advance by the control period: `t`, the difference [s]."""
     SOLVER_FAILED = "SOLVER_FAILED"
     """The solver gave no usable velocity; `detail` has its own words."""
     CONTACTS_INFEASIBLE = "CONTACTS_INFEASIBLE"
-    """The joint limits leave no velocity that holds the contacts."""
+    """No velocity within the joint limits meets the contacts: `contacts`."""
     PRIORITY_UNSOLVED = "PRIORITY_UNSOLVED"
     """No back end could solve the QP of a priority level: the level."""
 
     @property
     def severity(self) -> Severity:
-        """Severity of a reason of this kind, unless it gives its own."""
+        """Return the severity of a reason of this kind that has none of its own."""
         return _SEVERITIES.get(self, Severity.WARNING)
 
 
@@ -128,14 +128,14 @@ class Reason(NamedTuple):
 
     kind: ReasonKind
     subject: tuple[str, ...] = ()
-    """Names of what it is about: the bodies of a pair, a joint, a task, an obstacle, an argument."""
+    """Names: the bodies of a pair, a joint, a task, an obstacle, an argument."""
     amount: float | None = None
-    """How much, where the kind has an amount."""
+    """Amount in `unit`, where the kind has one."""
     unit: str = ""
     """Unit of `amount`: m, m/s, rad, rad/s, s or - ."""
     severity: Severity = Severity.WARNING
     detail: str = ""
-    """More for people; not for programs."""
+    """More for people, not for programs."""
 
     @classmethod
     def of(
@@ -151,7 +151,7 @@ class Reason(NamedTuple):
         return cls(kind, subject, amount, unit, kind.severity if severity is None else severity, detail)
 
     def __str__(self) -> str:
-        """Return one line for people."""
+        """Return one line for people: subject, kind, amount, detail."""
         parts = [_TEXTS[self.kind.value]]
         if self.amount is not None:
             parts.append(_quantity(self.amount, self.unit))
@@ -172,11 +172,12 @@ class Reason(NamedTuple):
 
     @property
     def key(self) -> tuple[str, tuple[str, ...]]:
-        """Kind and subject: the same reason in two steps has the same key, whatever its amount and severity."""
+        """Return kind and subject: of two steps, the same reason has the same key at any amount and severity."""
         return self.kind.value, self.subject
 
 
 def _quantity(amount: float, unit: str) -> str:
+    """Return an amount with its unit, lengths and speeds in mm."""
     if unit in ("m", "m/s"):
         return f"{1e3 * amount:.1f} m{unit}"
     if unit == "s":

@@ -153,9 +153,10 @@ def make_layout(nv, frames=0, turns=(), pairs=0, obstacles=0, joints=1, **fields
     row_wrenches[3 * frames :, 3:] = np.tile(np.eye(3), (len(turns), 1))
     none = np.zeros(0, dtype=np.intp)
     inputs = {
-        "J_world": np.zeros((6, nv), order="F"), "columns": np.arange(nv), "mimics": False, "mimicking": np.zeros(nv),
+        "J_world": np.zeros((6, nv), order="F"), "columns": np.arange(nv), "has_mimics": False,
+        "unfolded_row": np.zeros(nv),
         "frame_poses": np.zeros((frames, 12)),
-        "frame_ids": np.arange(frames), "targets": np.zeros((frames, 18)), "turns": np.array(turns, dtype=np.intp),
+        "frame_ids": np.arange(frames), "targets": np.zeros((frames, 18)), "oriented": np.array(turns, dtype=np.intp),
         "gain": np.ones(frames), "cap": np.full(frames + len(turns), np.inf), "scale": np.ones(rows),
         "task_support": np.ones((rows, nv)), "row_wrenches": row_wrenches, "results": np.zeros((pairs, 10)),
         "support": np.ones((pairs, nv)), "twists": np.zeros((obstacles + 1, 6)),
@@ -163,26 +164,27 @@ def make_layout(nv, frames=0, turns=(), pairs=0, obstacles=0, joints=1, **fields
         "slack": np.zeros(pairs),
         "joint_poses": np.zeros((joints, 12)), "joint_radius": np.zeros(joints),
         "parents": np.maximum(np.arange(joints) - 1, 0), "column_joints": np.full(nv, joints - 1),
-        "turning": np.ones((1, nv)), "sliding": np.zeros((1, nv)), "lever_arm": 1.0,
+        "chain_rotation": np.ones((1, nv)), "chain_translation": np.zeros((1, nv)), "lever_arm": 1.0,
         "bodies": np.zeros((pairs, 2), dtype=np.intp), "body_poses": np.zeros((1, 12)), "boxes": np.zeros((1, 6)),
         "convex": np.zeros(pairs, dtype=bool),
         "moved_by": np.zeros((pairs, 2), dtype=np.intp), "speeds": np.zeros(joints + obstacles),
         "q_index": none, "v_index": none, "q_lower": np.zeros(0),
         "q_upper": np.zeros(0), "v_max": np.full(nv, np.inf), "v_step": np.full(nv, np.inf), "v_prev": np.zeros(nv),
-        "dv_step": np.full(nv, np.inf), "dv_prev": np.zeros(nv), "jerked": False, "looks_ahead": True,
-        "damping": 0.0, "offset": 0.0, "hold": 0.1, "row_gain": 5.0, "recovery": 0.2, "beta": True, "d1": 0.1,
-        "task_switching": False, "retreat_speed": 0.0, "alpha_cap": 50.0, "d2": 0.3, "rate": 50.0, "dt": 0.01,
-        "accelerated": False,
+        "dv_step": np.full(nv, np.inf), "dv_prev": np.zeros(nv), "jerk_limited": False, "looks_ahead": True,
+        "damping": 0.0, "offset": 0.0, "safety_distance": 0.1, "row_gain": 5.0,
+        "recovery_speed": 0.2, "beta": True, "d1": 0.1,
+        "task_switching": False, "retreat_speed": 0.0, "alpha_cap": 50.0, "d2": 0.3, "position_rate": 50.0, "dt": 0.01,
+        "acceleration_limited": False,
     }  # fmt: skip
     shapes = {
         "poses": (frames, 12), "A": (rows, nv), "b": rows, "closest": (pairs, 10), "J": (pairs, nv),
         "feedforward": pairs,
-        "d": pairs, "least": pairs, "touch": pairs, "hard_lower": nv, "hard_upper": nv, "lower": nv, "upper": nv,
+        "d": pairs, "rhs": pairs, "rhs_contact": pairs, "hard_lower": nv, "hard_upper": nv, "lower": nv, "upper": nv,
         "v_stop": nv, "v_tracking": nv, "omega": (joints, 3),
     }  # fmt: skip
-    outputs = {"near": np.full(pairs, -1), **{name: np.full(shape, np.nan) for name, shape in shapes.items()}}
+    outputs = {"near_pairs": np.full(pairs, -1), **{name: np.full(shape, np.nan) for name, shape in shapes.items()}}
     given = {**inputs, **outputs, **fields}
-    if not given["accelerated"]:
+    if not given["acceleration_limited"]:
         given["hard_lower"], given["hard_upper"] = given["lower"], given["upper"]
     return RowLayout(**given)
 

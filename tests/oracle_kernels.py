@@ -5,7 +5,7 @@ Each takes a `RowLayout` as its memory and writes nothing.
 
 import numpy as np
 
-from qpavoid.kernels.stopping import speed_to_stop, way_to_stop
+from qpavoid.kernels.braking_bounds import speed_to_stop, stopping_distance
 
 # --- rows of the near pairs --------------------------------------------------------------------------------------
 
@@ -36,13 +36,13 @@ def velocity_bounds(x, q):
     limited = np.isfinite(x.v_step)
     step = np.where(limited, x.v_step, 1.0)
     stop = speed_to_stop(np.maximum(room, 0.0), step, x.dt)
-    slowed = np.maximum(x.rate * room, sign * x.v_prev - np.minimum(step, x.dv_step - sign * x.dv_prev))
-    speed = np.where(limited, np.where(room > 0.0, stop, slowed), x.rate * room)
+    slowed = np.maximum(x.position_rate * room, sign * x.v_prev - np.minimum(step, x.dv_step - sign * x.dv_prev))
+    speed = np.where(limited, np.where(room > 0.0, stop, slowed), x.position_rate * room)
     # on the way back from outside one limit, a coordinate can still brake for the other
     speed = np.where(limited & (room < 0.0), np.maximum(speed, -speed[::-1]), speed)
     hard = np.clip(speed, -x.v_max, x.v_max)
     inner = np.full((2, len(x.v_max)), np.inf)
-    if x.jerked:
+    if x.jerk_limited:
         inner = _within_jerk(x, room, sign)
         lower, upper = -inner[0], inner[1]
         hard[1] = np.where(room[1] < 0.0, np.maximum(hard[1], np.minimum(lower, x.v_max)), hard[1])
@@ -50,7 +50,7 @@ def velocity_bounds(x, q):
     hard_lower, hard_upper = -hard[0], hard[1]
     lower, upper = (np.clip(x.v_prev + s * x.v_step, hard_lower, hard_upper) for s in (-1.0, 1.0))
     bounds = np.clip(-inner[0], lower, upper), np.clip(inner[1], lower, upper)
-    return hard_lower, hard_upper, *(bounds if x.jerked else (lower, upper)), room.min(initial=np.inf)
+    return hard_lower, hard_upper, *(bounds if x.jerk_limited else (lower, upper)), room.min(initial=np.inf)
 
 
 def _within_jerk(x, room, sign):
@@ -69,10 +69,10 @@ def _change_to_stop(speed, high, most, room):
     """Largest change, no larger than `high`, after which a stop ends within `room`: by bisection."""
     most = np.broadcast_to(most, speed.shape)
     low, top = high - 1e3, high.copy()
-    fits = way_to_stop(speed + top, top, most)[0] <= room
+    fits = stopping_distance(speed + top, top, most)[0] <= room
     for _ in range(100):
         middle = 0.5 * (low + top)
-        over = way_to_stop(speed + middle, middle, most)[0] > room
+        over = stopping_distance(speed + middle, middle, most)[0] > room
         low, top = np.where(over, low, middle), np.where(over, middle, top)
     return np.where(fits, high, low)
 
@@ -96,14 +96,14 @@ def clearance_lower_bound(x, v, k, reach, horizon):
     carried = np.linalg.norm(origins, axis=1) + np.linalg.norm(twists[:, 3:], axis=1) * x.joint_radius
     speeds = np.concatenate((carried, x.speeds[joints:]))
     omega = np.concatenate((twists[:, 3:], x.twists[:, 3:]))
-    turning, sliding = ((chains @ np.abs(v)).max() for chains in (x.turning, x.sliding))
+    turning, sliding = ((chains @ np.abs(v)).max() for chains in (x.chain_rotation, x.chain_translation))
     bend = horizon**2 * turning * (turning * x.lever_arm + 2.0 * sliding)
-    others = reach + x.offset - x.hold - (carried.max() + speeds.max()) * horizon - bend
-    near = x.near[:k]
-    room = x.d[:k] - x.hold
+    others = reach + x.offset - x.safety_distance - (carried.max() + speeds.max()) * horizon - bend
+    near = x.near_pairs[:k]
+    room = x.d[:k] - x.safety_distance
     fastest = room - horizon * speeds[x.moved_by[near]].sum(axis=1) - bend
     approach = x.J[:k] @ v
-    closing = (np.abs(approach) if x.jerked else np.maximum(-approach, 0.0)) + np.maximum(-x.feedforward[:k], 0.0)
+    closing = (np.abs(approach) if x.jerk_limited else np.maximum(-approach, 0.0)) + np.maximum(-x.feedforward[:k], 0.0)
     bent = np.zeros(k)
     for side, sign in ((0, 1.0), (1, -1.0)):
         carrier, body = x.moved_by[near, side], x.bodies[near, side]

@@ -64,11 +64,11 @@ def test_without_constraints_in_the_way_nothing_moves():
     np.testing.assert_array_equal(x, [0.1, -0.2])
 
 
-@pytest.mark.parametrize("place", ["A", "v_tracking", "J", "least"])
+@pytest.mark.parametrize("place", ["A", "v_tracking", "J", "b"])
 def test_nan_is_no_answer(place):
     arguments = {
         "A": np.eye(3), "regularization": 1e-3, "v_tracking": np.ones(3), "J": np.ones((2, 3)),
-        "least": np.array([2.9, 0.0]), "lower": -np.ones(3), "upper": 0.99 * np.ones(3),
+        "b": np.array([2.9, 0.0]), "lower": -np.ones(3), "upper": 0.99 * np.ones(3),
     }  # fmt: skip
     arguments[place] = arguments[place].copy()
     arguments[place].flat[0] = np.nan

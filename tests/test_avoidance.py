@@ -21,11 +21,11 @@ def bound(d, **row):
     closest[:, 0] = d
     free = np.full(2, np.inf)
     x = make_layout(
-        2, pairs=len(d), closest=closest, near=np.arange(len(d)), feedforward=np.zeros(len(d)), J=np.ones((len(d), 2)),
-        lower=-free, upper=free, **row_form(settings),
+        2, pairs=len(d), closest=closest, near_pairs=np.arange(len(d)), feedforward=np.zeros(len(d)),
+        J=np.ones((len(d), 2)), lower=-free, upper=free, **row_form(settings),
     )  # fmt: skip
     kernels.row_bounds(kernels.pack(x), len(d), False)
-    return x.least
+    return x.rhs
 
 
 # --- eq. 11 --------------------------------------------------------------------------------------------------

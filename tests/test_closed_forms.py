@@ -11,7 +11,7 @@ from oracle import support
 
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.geometry.cores import cores, with_closed_form
-from qpavoid.kernels.distances import APART, closed_forms
+from qpavoid.kernels.distances import MIN_CORE_DISTANCE, closed_forms
 
 AT_ORIGIN = pin.SE3.Identity()
 
@@ -100,8 +100,10 @@ def test_cores_that_meet_and_poses_that_are_no_numbers_are_left_to_coal():
     for a, b in ((capsule, box), (box, capsule), (capsule, capsule), (coal.Sphere(0.1), box)):
         assert found(a, b) is None
         assert found(a, b, pin.SE3(np.eye(3), np.full(3, np.nan))) is None
-    touching = pin.SE3(np.eye(3), np.array([0.1 + 2.0 * APART, 0.0, 0.0]))
-    np.testing.assert_allclose(found(box, capsule, AT_ORIGIN, touching)[:2], [2.0 * APART - 0.1, 1.0], atol=1e-9)
+    touching = pin.SE3(np.eye(3), np.array([0.1 + 2.0 * MIN_CORE_DISTANCE, 0.0, 0.0]))
+    np.testing.assert_allclose(
+        found(box, capsule, AT_ORIGIN, touching)[:2], [2.0 * MIN_CORE_DISTANCE - 0.1, 1.0], atol=1e-9
+    )
 
 
 def test_which_pairs_have_one():

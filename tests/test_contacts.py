@@ -35,7 +35,7 @@ def random_contacts(rng, rows, nv, dependent=0):
 
 def problem_with(contacts, rng, k=4, low=-0.5, touch=None):
     """Random tasks, rows and bounds; v0 holds the contacts."""
-    nv = len(contacts.rest)
+    nv = len(contacts.v_particular)
     tracking = Tracking(rng.normal(size=(6, nv)), rng.normal(size=6), 0.05)
     b = rng.uniform(low, 0.2, k)
     rows = AvoidanceRows(
@@ -54,8 +54,10 @@ def test_the_basis_spans_what_moves_no_contact(rows, dependent):
     assert contacts.Z.shape == (20, 20 - rows)
     np.testing.assert_allclose(contacts.Z.T @ contacts.Z, np.eye(20 - rows), atol=1e-12)
     np.testing.assert_allclose(contacts.J @ contacts.Z, 0.0, atol=1e-11)
-    np.testing.assert_allclose(contacts.J @ contacts.rest, contacts.b, atol=1e-11)
-    np.testing.assert_allclose(contacts.rest, np.linalg.pinv(contacts.J) @ contacts.b, atol=1e-10)  # the least one
+    np.testing.assert_allclose(contacts.J @ contacts.v_particular, contacts.b, atol=1e-11)
+    np.testing.assert_allclose(
+        contacts.v_particular, np.linalg.pinv(contacts.J) @ contacts.b, atol=1e-10
+    )  # the least one
 
 
 def test_the_tracking_law_minimises_its_cost_among_what_holds_the_contacts():
@@ -64,7 +66,7 @@ def test_the_tracking_law_minimises_its_cost_among_what_holds_the_contacts():
     A, b = rng.normal(size=(6, 10)), rng.normal(size=6)
     v = tracking_within(contacts, A, b, 0.1)
     np.testing.assert_allclose(contacts.J @ v, contacts.b, atol=1e-11)
-    gradient = A.T @ (A @ v - b) + 0.01 * (v - contacts.rest)
+    gradient = A.T @ (A @ v - b) + 0.01 * (v - contacts.v_particular)
     np.testing.assert_allclose(contacts.Z.T @ gradient, 0.0, atol=1e-10)
 
 
@@ -196,7 +198,7 @@ def test_a_law_of_the_users_own_may_say_that_it_holds_them(solo):
 
         def solve(self, problem: Problem) -> Solution:
             assert isinstance(problem.contacts, Contacts)
-            return Solution(problem.contacts.held(problem.v_tracking))
+            return Solution(problem.contacts.project(problem.v_tracking))
 
     controller, q = standing(solo, solver=Own())
     assert controller.step(q).status is Status.SOLVED

@@ -174,9 +174,10 @@ def memory(rng, obstacles, loads, centred):
     """Of a scene that nobody has built: obstacle i has i % 3 bodies; five bodies before them are the robot's."""
     owner = np.concatenate([np.full(5, -1), np.repeat(np.arange(obstacles), np.arange(obstacles) % 3)])
     local = rng.normal(size=(len(owner), 3)) * (not centred)
-    return owner, kernels.Placed(
+    return owner, kernels.ObstacleArrays(
         states=np.zeros((obstacles, courses.STATE)), twists=np.zeros((obstacles + 1 + loads, 6)),
-        margin=np.zeros(obstacles + 1 + loads), speeds=np.zeros(obstacles), reach=rng.uniform(0.1, 1.0, obstacles),
+        margin=np.zeros(obstacles + 1 + loads), speeds=np.zeros(obstacles),
+        bounding_radius=rng.uniform(0.1, 1.0, obstacles),
         placements=rng.normal(size=(len(owner), 12)), local=local,
         centers=np.ones((len(owner), 5)),
     )  # fmt: skip
@@ -209,7 +210,7 @@ def test_what_distances_know_by_definition(loads, centred, turning):
             sample = courses.as_samples(states)[i]
             at_origin = pin.SE3(np.eye(3), sample.position).act(pin.Motion(sample.linear, sample.angular))
             np.testing.assert_allclose(x.twists[i], at_origin.vector, atol=1e-14)
-            speed = np.linalg.norm(sample.linear) + x.reach[i] * np.linalg.norm(sample.angular)
+            speed = np.linalg.norm(sample.linear) + x.bounding_radius[i] * np.linalg.norm(sample.angular)
             assert x.speeds[i] == pytest.approx(speed, abs=1e-14)
             assert x.margin[i] == margin[i] and (x.states[i] == states[i]).all()
         for g in geometries:

@@ -151,7 +151,7 @@ def test_farthest_is_the_minimum_that_daqp_finds():
     for _ in range(20):
         closest, J, feedforward = rng.uniform(0.0, 0.1, (5, 10)), rng.normal(size=(5, 3)), 0.1 * rng.normal(size=5)
         h, comfort, low_effort, leaning = 0.2, 0.1, 1e-4, rng.normal(size=3)
-        v, met = kernels.farthest(
+        v, met = kernels.max_clearance_velocity(
             h, closest, J, feedforward, comfort, 10.0, low_effort, leaning, -np.ones(3), np.ones(3)
         )
         P = np.diag([low_effort, low_effort, low_effort, 1.0])

@@ -18,7 +18,7 @@ from qpavoid.problem import AvoidanceRows, Tracking, make_problem
 from qpavoid.run.simulate import simulate
 from qpavoid.solvers.analytic import tracking_velocity
 from qpavoid.solvers.potential import repulsion
-from qpavoid.solvers.projection import clearance_slope, room
+from qpavoid.solvers.projection import clearance_slope, step_fraction
 
 NV, D1, D2 = 7, 0.02, 0.12
 LAWS = ("gradient-projection", "potential-field")
@@ -164,7 +164,7 @@ def test_potential_field_descends_its_potential_and_parts_each_pair_alone(seed, 
 
 @given(seeds, st.floats(0.05, 3.0), st.floats(0.1, 1e4))
 def test_self_motion_takes_no_joint_past_a_bound(seed, limit, gain):
-    """Joints that tracking leaves within bounds stay there, others go no further out, and no room is given away."""
+    """Joints that tracking leaves within bounds stay there, others go no further out, by the largest step fraction."""
     problem = random_problem(seed, limit=limit)
     v_tracking, lower, upper = tracking_velocity(problem), problem.lower, problem.upper
     v = make_solver(GradientProjectionSolver(gain=gain)).solve(problem).v
@@ -177,13 +177,13 @@ def test_self_motion_takes_no_joint_past_a_bound(seed, limit, gain):
 
 def test_room_by_hand():
     lower, upper, inf = np.array([-1.0, -1.0]), np.array([1.0, 1.0]), np.array([np.inf, np.inf])
-    assert room(np.zeros(2), np.array([0.5, -1.0]), lower, upper) == 1.0
-    assert room(np.array([0.5, 0.0]), np.array([2.0, 0.1]), lower, upper) == 0.25
-    assert room(np.array([1.5, 0.0]), np.array([0.1, 0.1]), lower, upper) == 0.0
-    assert room(np.array([1.5, 0.0]), np.array([-0.1, 0.1]), lower, upper) == 1.0
-    assert room(np.array([1.0, 0.0]), np.array([0.0, 2.0]), lower, upper) == 0.5
-    assert room(np.zeros(2), np.array([1e9, -1e-310]), -inf, inf) == 1.0
-    assert np.isnan(room(np.zeros(2), np.array([np.nan, 1.0]), lower, upper))
+    assert step_fraction(np.zeros(2), np.array([0.5, -1.0]), lower, upper) == 1.0
+    assert step_fraction(np.array([0.5, 0.0]), np.array([2.0, 0.1]), lower, upper) == 0.25
+    assert step_fraction(np.array([1.5, 0.0]), np.array([0.1, 0.1]), lower, upper) == 0.0
+    assert step_fraction(np.array([1.5, 0.0]), np.array([-0.1, 0.1]), lower, upper) == 1.0
+    assert step_fraction(np.array([1.0, 0.0]), np.array([0.0, 2.0]), lower, upper) == 0.5
+    assert step_fraction(np.zeros(2), np.array([1e9, -1e-310]), -inf, inf) == 1.0
+    assert np.isnan(step_fraction(np.zeros(2), np.array([np.nan, 1.0]), lower, upper))
 
 
 # --- what is degenerate -------------------------------------------------------------------------------------------

@@ -70,16 +70,16 @@ def test_margins_then_accelerations_then_contact_and_the_deepest_last(seed):
         return
     assert s.status is Status.RELAXED and s.reasons
     nothing = np.full(PAIRS, -np.inf)
-    if feasible(rows.J, rows.touch, x.lower, x.upper):
+    if feasible(rows.J, rows.b_contact, x.lower, x.upper):
         assert within  # margins come before accelerations
-        expected = least_slack(rows, rows.b, rows.touch, x.lower, x.upper)
+        expected = least_slack(rows, rows.b, rows.b_contact, x.lower, x.upper)
         np.testing.assert_allclose(s.slack, expected, atol=1e-3)
         return
-    contact = least_slack(rows, rows.touch, nothing, x.hard_lower, x.hard_upper)
-    assert (rows.J @ s.v >= rows.touch - contact - 1e-4).all()
+    contact = least_slack(rows, rows.b_contact, nothing, x.hard_lower, x.hard_upper)
+    assert (rows.J @ s.v >= rows.b_contact - contact - 1e-4).all()
     assert not within
     passed = np.maximum(np.maximum(s.v - x.upper, x.lower - s.v), 0.0)
-    assert np.sum((passed / (x.upper - x.lower)) ** 2) < 1.05 * least_excess(x, rows.touch - contact) + 1e-4
+    assert np.sum((passed / (x.upper - x.lower)) ** 2) < 1.05 * least_excess(x, rows.b_contact - contact) + 1e-4
 
 
 def least_excess(x, least):
@@ -99,8 +99,8 @@ def test_every_outcome_of_the_order_occurs():
     for seed in range(150):
         x = random_problem(seed)
         rows = x.avoidance
-        cases = (("met", rows.b, x.lower, x.upper), ("margins", rows.touch, x.lower, x.upper),
-                 ("accelerations", rows.touch, x.hard_lower, x.hard_upper))  # fmt: skip
+        cases = (("met", rows.b, x.lower, x.upper), ("margins", rows.b_contact, x.lower, x.upper),
+                 ("accelerations", rows.b_contact, x.hard_lower, x.hard_upper))  # fmt: skip
         kinds[next((name for name, *case in cases if feasible(rows.J, *case)), "contact")] += 1
     assert min(kinds.values()) >= 5, kinds
 

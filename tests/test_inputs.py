@@ -449,7 +449,7 @@ def test_the_look_ahead_is_that_of_the_law_that_takes_over(panda):
         controller = make_controller(panda, [BALL], TOOL, first)
         controller.solver = make_solver("qp")
         ticks = list(drive(controller, panda.home, 50, target=[0.35, 0.1, 0.5]))
-        looks.append(([tick.problem.clear for tick in ticks], [tick.solution.v for tick in ticks]))
+        looks.append(([tick.problem.tracking_is_clear for tick in ticks], [tick.solution.v for tick in ticks]))
     assert any(looks[0][0])
     for a, b in zip(*looks, strict=True):
         np.testing.assert_array_equal(a, b)
@@ -551,7 +551,7 @@ def test_guard_looks_at_a_bounded_number_of_poses_whatever_moves(tmp_path, speed
     monkeypatch.setattr(BrakingCheck, "_look", lambda self, *args: looks.append(1) or look(self, *args))
     query, guard = controller._query, controller._commander.guard
     tick = controller.tick(np.zeros(3), v=np.array([0.9, 0.0, 0.0]))
-    looks.clear()
+    looks.tracking_is_clear()
     way = guard._worst if jerk is None else guard._worst_of_stop
     way(controller._assembly, np.zeros(3), tick.solution.v, query, 0.2, speed)
     assert 0 < len(looks) <= 48 + 200 + 6 * 48

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from test_limits import Axes, random_joints
 
 from qpavoid import kernels
-from qpavoid.kernels.stopping import longest_way, way_to_stop
+from qpavoid.kernels.braking_bounds import max_stopping_distance, stopping_distance
 from qpavoid.model.limits import JointBounds, limit_layout
 
 SAFE = 0.02
@@ -29,7 +29,7 @@ def harder(v):
 
 
 def followed(v, w, most):
-    """Speeds of a stop, from v on, in the units of `kernels.stopping`."""
+    """Speeds of a stop, from v on, in the units of `kernels.braking_bounds`."""
     speeds = [v]
     while abs(v) > 1e-9 or abs(w) > 1.0:
         target = -np.sign(v) * min(harder(abs(v)), most)
@@ -58,11 +58,11 @@ many = settings(max_examples=400, deadline=None)
 def test_the_way_to_stop_by_hand():
     """From 3 with no change yet: 3, 2, then by 1.5 to 0.5, from which 0.5 leads to 0. From 1 with 2: 1, 2, 2, 1, 0."""
     assert followed(3.0, 0.0, 10.0) == pytest.approx([3.0, 2.0, 0.5, 0.0])
-    assert way_to_stop(3.0, 0.0, 10.0)[0] == pytest.approx(5.5)
+    assert stopping_distance(3.0, 0.0, 10.0)[0] == pytest.approx(5.5)
     assert followed(1.0, 2.0, 10.0) == pytest.approx([1.0, 2.0, 2.0, 1.0, 0.0])
-    assert way_to_stop(1.0, 2.0, 10.0)[0] == pytest.approx(6.0)
-    assert way_to_stop(10.0, 0.0, 0.5)[0] == pytest.approx(sum(np.arange(10.0, 0.0, -0.5)))  # no jerk to speak of
-    assert way_to_stop(-5.0, 1.0, 4.0) == (0.0, 0.0)
+    assert stopping_distance(1.0, 2.0, 10.0)[0] == pytest.approx(6.0)
+    assert stopping_distance(10.0, 0.0, 0.5)[0] == pytest.approx(sum(np.arange(10.0, 0.0, -0.5)))  # no jerk to speak of
+    assert stopping_distance(-5.0, 1.0, 4.0) == (0.0, 0.0)
 
 
 @many
@@ -70,7 +70,7 @@ def test_the_way_to_stop_by_hand():
 def test_the_way_to_stop_is_that_of_the_stop_followed_tick_by_tick(state):
     v, w, most = state
     expected = np.max(np.cumsum(followed(v, w, most)), initial=0.0)
-    found = way_to_stop(v, w, most)[0]
+    found = stopping_distance(v, w, most)[0]
     if v > 0.0 and -w - 1.0 > min(harder(v), most):  # braking too hard to come to rest without passing it
         assert found >= expected - 1e-9
         expected = np.sum(followed(v, -min(harder(v), most) - 1.0, most))
@@ -81,12 +81,14 @@ def test_the_way_to_stop_is_that_of_the_stop_followed_tick_by_tick(state):
 @given(moving(), st.floats(0.0, 2.0))
 def test_ways_grow_with_the_change_and_are_convex_in_it(state, more):
     v, w, most = state
-    (low, slope), (middle, _), (high, _) = (way_to_stop(v + s * more, w + s * more, most) for s in (0.0, 0.5, 1.0))
+    (low, slope), (middle, _), (high, _) = (
+        stopping_distance(v + s * more, w + s * more, most) for s in (0.0, 0.5, 1.0)
+    )
     scale = max(high, 1.0)
     assert low <= middle + 1e-12 * scale <= high + 2e-12 * scale
     assert middle <= 0.5 * (low + high) + 1e-9 * scale
     assert high >= low + more * slope - 1e-9 * scale  # the derivative of a convex function
-    assert high <= longest_way(v + more, w + more, most) * (1.0 + 1e-12) + 1e-12
+    assert high <= max_stopping_distance(v + more, w + more, most) * (1.0 + 1e-12) + 1e-12
 
 
 @many
@@ -299,7 +301,7 @@ def test_the_way_of_a_stop_is_the_stop_of_the_ticks(seed, place):
     expected = stops(x, q, v, w)
     way = np.full((1000, 7), np.nan)
     way[0] = v
-    count = kernels.stop_way(kernels.pack(x), q.copy(), w, way)
+    count = kernels.roll_out_stop(kernels.pack(x), q.copy(), w, way)
     assert abs(count - len(expected)) <= 1
     size = min(count, len(expected))
     np.testing.assert_allclose(way[:size], expected[:size], rtol=1e-9, atol=1e-9)
@@ -317,14 +319,14 @@ def test_half_of_jerks_and_accelerations_bring_a_pair_to_rest_where_it_has_to_be
     for _ in range(400):
         closest = np.zeros((1, 10))
         closest[:, 0] = d
-        x = make_layout(2, pairs=1, closest=closest, near=np.arange(1), feedforward=np.zeros(1), J=J, v_step=step,
-            dv_step=unit, v_prev=v, dv_prev=w, accelerated=True, jerked=True, v_stop=np.array([0.0, -1e3]),
-            beta=False, row_gain=100.0, lower=-np.ones(2), upper=np.ones(2),
+        x = make_layout(2, pairs=1, closest=closest, near_pairs=np.arange(1), feedforward=np.zeros(1), J=J, v_step=step,
+            dv_step=unit, v_prev=v, dv_prev=w, acceleration_limited=True, jerk_limited=True,
+            v_stop=np.array([0.0, -1e3]), beta=False, row_gain=100.0, lower=-np.ones(2), upper=np.ones(2),
         )  # fmt: skip
         kernels.row_bounds(kernels.pack(x), 1, False)
         # the velocity along J that closes fastest, within the row and within what half of the limits allow
         share = np.array([-1.0, 1.0]) / (J[0] @ [-1.0, 1.0]) * np.array([1.0, 1.0])
-        least = max(x.least[0], J[0] @ (v + np.maximum(w + unit * [-1.0, 1.0], 0.0) * [1.0, 1.0]) - 9.0)
+        least = max(x.rhs[0], J[0] @ (v + np.maximum(w + unit * [-1.0, 1.0], 0.0) * [1.0, 1.0]) - 9.0)
         following = share * max(least, J[0] @ v + max(J[0] @ w - 0.5 * np.abs(J[0]) @ unit, -0.5 * np.abs(J[0]) @ step))
         w, v = following - v, following
         changes.append(J[0] @ w)

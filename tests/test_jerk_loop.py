@@ -185,7 +185,7 @@ def test_jerk_gives_way_with_the_acceleration_or_never(tmp_path, gives_way):
     controller = make_controller(robot, [ball], "z", limits=limits)
     seen = {"ball": Sample.at([0.21, 0.0, 0.0], linear=[-6.0, 0.0, 0.0])}
     tick = controller.tick(np.zeros(3), 0.0, {"z": Sample.at([0.0, 0.0, 0.0])}, seen)
-    assert tick.problem.jerked and tick.solution.status is Status.RELAXED
+    assert tick.problem.jerk_limited and tick.solution.status is Status.RELAXED
     step = np.abs(tick.solution.v).max()
     if gives_way:
         assert step > 4.0 * 0.01

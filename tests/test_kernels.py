@@ -14,7 +14,7 @@ from qpavoid import kernels
 from qpavoid.kernels.packing import compiled
 
 SEEDS = range(8)
-OF_PAIRS = ("near", "closest", "J", "feedforward", "d", "least", "touch")
+OF_PAIRS = ("near", "closest", "J", "feedforward", "d", "rhs", "rhs_contact")
 """Outputs of which only what belongs to near pairs counts."""
 
 
@@ -25,7 +25,7 @@ def run(name, x, *args):
 
 def assert_same(found, expected, k):
     """Two layouts hold the same, of pairs the first k."""
-    for name in set(kernels.RowLayout._fields) - {"mimicking"}:
+    for name in set(kernels.RowLayout._fields) - {"unfolded_row"}:
         a, b = getattr(found, name), getattr(expected, name)
         if name in OF_PAIRS:
             a, b = a[:k], b[:k]
@@ -100,8 +100,8 @@ def random_layout(seed, frames=2, turns=(1,), pairs=9, nv=7, obstacles=3, joints
         "body_poses": poses_of(rotations(rng, 6), rng.normal(size=(6, 3)), 14 if views else 12),
         "boxes": rng.uniform(0.02, 0.2, (6, 6)),
         "convex": rng.random(pairs) < 0.8,
-        "turning": rng.integers(0, 2, (2, nv)).astype(float),
-        "sliding": rng.integers(0, 2, (2, nv)).astype(float),
+        "chain_rotation": rng.integers(0, 2, (2, nv)).astype(float),
+        "chain_translation": rng.integers(0, 2, (2, nv)).astype(float),
         "lever_arm": 0.8,
         "speeds": np.append(np.full(joints, np.nan), rng.uniform(0.0, 0.5, obstacles)),
         "q_index": limited + (0 if plain else 1),
@@ -112,14 +112,14 @@ def random_layout(seed, frames=2, turns=(1,), pairs=9, nv=7, obstacles=3, joints
         "v_step": v_step,
         "v_prev": rng.uniform(-5.0, 5.0, nv),
         "dv_prev": rng.uniform(-1.0, 1.0, nv) * np.minimum(v_step, 1.0),
-        "accelerated": bool(np.isfinite(v_step).any()),
+        "acceleration_limited": bool(np.isfinite(v_step).any()),
         "damping": 0.1,
         "offset": 0.03,
     }
     return make_layout(nv, frames, turns, pairs, obstacles, joints, **{**random, **fields})
 
 
-NO_LIMIT = {"v_step": np.full(7, np.inf), "accelerated": False}
+NO_LIMIT = {"v_step": np.full(7, np.inf), "acceleration_limited": False}
 
 
 def jerk(seed, nv=7, all_of_them=False):
@@ -128,7 +128,8 @@ def jerk(seed, nv=7, all_of_them=False):
     step = rng.uniform(0.01, 0.5, nv)
     some = np.array([all_of_them, True])[(rng.random(nv) < 0.7).astype(int)]
     return {"v_step": step, "dv_step": np.where(some, 10.0 ** -rng.uniform(0.0, 2.0, nv) * step, np.inf),
-            "dv_prev": rng.uniform(-1.0, 1.0, nv) * step, "accelerated": True, "jerked": True}  # fmt: skip
+            "dv_prev": rng.uniform(-1.0, 1.0, nv) * step, "acceleration_limited": True,
+            "jerk_limited": True}  # fmt: skip
 
 
 # --- candidates --------------------------------------------------------------------------------------------------
@@ -225,7 +226,7 @@ def test_rate_of_a_distance_is_that_of_the_witness_points_along_the_normal(seed,
     k = run("distance_rows", x, pairs, 0.5, moving)
     expected = [i for i in pairs if x.results[i, 0] < 0.5]
     assert 0 < len(expected) < len(pairs) < 40
-    assert x.near[:k].tolist() == expected
+    assert x.near_pairs[:k].tolist() == expected
     np.testing.assert_array_equal(x.closest[:k], x.results[expected])
     for j, i in enumerate(expected):
         n, p = x.results[i, 1:4], x.results[i, 4:7]
@@ -242,7 +243,7 @@ def test_a_pair_exactly_at_the_reach_is_not_near():
     results[:, 0] = 0.5, np.nextafter(0.5, 0.0), -0.5
     x = random_layout(0, pairs=3, results=gaps(results, 17))
     assert run("distance_rows", x, np.arange(3), 0.5, True) == 2
-    assert x.near[:2].tolist() == [1, 2]
+    assert x.near_pairs[:2].tolist() == [1, 2]
 
 
 def test_a_pair_whose_distance_is_not_a_number_is_near():
@@ -252,8 +253,8 @@ def test_a_pair_whose_distance_is_not_a_number_is_near():
     for fields in (NO_LIMIT, {}):
         x = random_layout(0, pairs=3, results=gaps(results, 17), **fields)
         k, worst, clear, _ = run("assemble", x, np.zeros(8), np.arange(3), 0.5, True)
-        assert x.near[:k].tolist() == [1, 2]
-        assert np.isnan(x.least[:k]).tolist() == [True, False] and np.isnan(worst) and not clear
+        assert x.near_pairs[:k].tolist() == [1, 2]
+        assert np.isnan(x.rhs[:k]).tolist() == [True, False] and np.isnan(worst) and not clear
 
 
 @pytest.mark.parametrize("views", [True, False])
@@ -282,7 +283,7 @@ def test_distance_rows_by_their_definition(pairs, views):
             x = random_layout(seed, pairs=pairs, nv=2 + seed, views=views)
             k = run("distance_rows", x, among, reach, True)
             near, J, feedforward = oracle.distance_rows(x, among, reach)
-            np.testing.assert_array_equal(x.near[:k], near)
+            np.testing.assert_array_equal(x.near_pairs[:k], near)
             np.testing.assert_allclose(x.J[:k], J, rtol=1e-12, atol=1e-12)
             np.testing.assert_allclose(x.feedforward[:k], feedforward, rtol=1e-12, atol=1e-12)
 
@@ -309,9 +310,9 @@ def test_closing_speed_bound_by_its_definition(weighted):
     for cap in (0.2, np.inf):
         raw = gain * (d1 - d)
         expected = np.minimum(np.where(raw > 0.0, raw, (1.0 - beta) * raw) if weighted else raw, cap)
-        x = rows_at(d, row_gain=gain, recovery=cap, beta=weighted)
+        x = rows_at(d, row_gain=gain, recovery_speed=cap, beta=weighted)
         run("row_bounds", x, len(d), False)
-        np.testing.assert_allclose(x.least, expected, rtol=0, atol=1e-14)
+        np.testing.assert_allclose(x.rhs, expected, rtol=0, atol=1e-14)
         np.testing.assert_array_equal(x.d, d)
 
 
@@ -322,21 +323,21 @@ def test_offset_margin_and_drift_of_a_row():
     x = rows_at(closest, offset=0.05, margin=margin, twist_row=of, feedforward=feedforward, beta=False)
     run("row_bounds", x, 4, True)
     np.testing.assert_allclose(x.d, [0.24, 0.21, 0.25, 0.03], rtol=0, atol=1e-15)
-    np.testing.assert_allclose(x.least, [-0.7 - 0.1, -0.55 + 0.2, -0.75, 0.2 - 0.3], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(x.rhs, [-0.7 - 0.1, -0.55 + 0.2, -0.75, 0.2 - 0.3], rtol=0, atol=1e-14)
 
 
 def test_slack_moves_the_safety_distance_of_a_pair():
     """A pair with slack s has the row of one that is s farther away, but touches where it touches."""
     d, slack = np.array([0.02, 0.06, 0.2]), np.array([0.09, 0.0, 0.05])
-    fields = {"offset": 0.01, "beta": False, "row_gain": 5.0, "hold": 0.1}
+    fields = {"offset": 0.01, "beta": False, "row_gain": 5.0, "safety_distance": 0.1}
     x, y = rows_at(d, slack=slack, **fields), rows_at(d + slack, **fields)
     z = rows_at(d, **fields)
     for layout in (x, y, z):
         run("row_bounds", layout, 3, False)
     np.testing.assert_allclose(x.d, y.d, rtol=0, atol=1e-15)
-    np.testing.assert_allclose(x.least, y.least, rtol=0, atol=1e-15)
-    np.testing.assert_allclose(x.touch, np.minimum(5.0 * (0.0 - d), x.least), rtol=0, atol=1e-14)
-    assert x.least[0] < z.least[0] and x.least[1] == z.least[1]
+    np.testing.assert_allclose(x.rhs, y.rhs, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(x.rhs_contact, np.minimum(5.0 * (0.0 - d), x.rhs), rtol=0, atol=1e-14)
+    assert x.rhs[0] < z.rhs[0] and x.rhs[1] == z.rhs[1]
 
 
 def test_margins_are_those_of_the_near_pairs():
@@ -371,12 +372,12 @@ def test_a_row_never_asks_for_more_than_can_be_had(seed):
     """To part at most as fast as the bounds allow; not to close no sooner than a stop would end it."""
     x = filled(seed)
     run("row_bounds", x, 30, True)
-    parting, receding = x.d < x.hold, x.feedforward >= 0.0
-    assert x.accelerated and (parting & receding).any() and (~parting & receding).any()
-    assert (x.J @ x.v_stop >= x.least - 1e-9)[~parting & receding].all()
+    parting, receding = x.d < x.safety_distance, x.feedforward >= 0.0
+    assert x.acceleration_limited and (parting & receding).any() and (~parting & receding).any()
+    assert (x.J @ x.v_stop >= x.rhs - 1e-9)[~parting & receding].all()
     most = np.array([largest(row, x.lower, x.upper) for row in x.J])
-    assert (most >= x.least - 1e-9)[parting & receding].all()
-    assert (np.maximum(most, -x.feedforward) >= x.least - 1e-9)[parting].all()
+    assert (most >= x.rhs - 1e-9)[parting & receding].all()
+    assert (np.maximum(most, -x.feedforward) >= x.rhs - 1e-9)[parting].all()
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -384,22 +385,24 @@ def test_row_bounds_by_their_definition(seed):
     """The beta row, closing no faster than half of the accelerations brake, less the drift; and touch at d = 0."""
     x = filled(seed)
     run("row_bounds", x, 30, True)
-    raw = x.row_gain * (x.hold - x.d)
+    raw = x.row_gain * (x.safety_distance - x.d)
     weight = 0.5 - 0.5 * np.cos(np.pi * np.clip((x.d - x.d1) / (x.d2 - x.d1), 0.0, 1.0))
     for i in range(30):
         J, feedforward = x.J[i], x.feedforward[i]
         if raw[i] > 0.0:
             most = largest(J, x.lower, x.upper)
             expected = min(
-                min(raw[i], x.recovery) - feedforward, most if feedforward >= 0.0 else max(most, -feedforward)
+                min(raw[i], x.recovery_speed) - feedforward, most if feedforward >= 0.0 else max(most, -feedforward)
             )
         else:
             half = 0.25 * np.sum(np.abs(J[J != 0.0]) * x.v_step[J != 0.0])
-            brake = half - np.sqrt(half**2 + 4.0 * half * (x.d[i] - x.hold) / x.dt) if half < np.inf else -np.inf
+            brake = (
+                half - np.sqrt(half**2 + 4.0 * half * (x.d[i] - x.safety_distance) / x.dt) if half < np.inf else -np.inf
+            )
             expected = max(weight[i] * raw[i], brake) - feedforward
             expected = expected if feedforward < 0.0 else min(expected, J @ x.v_stop)
-        assert x.least[i] == pytest.approx(expected, rel=1e-12, abs=1e-13)
-        assert x.touch[i] == pytest.approx(
+        assert x.rhs[i] == pytest.approx(expected, rel=1e-12, abs=1e-13)
+        assert x.rhs_contact[i] == pytest.approx(
             min(x.row_gain * (x.offset - x.d[i]) - feedforward, expected), rel=1e-12, abs=1e-13
         )
 
@@ -410,18 +413,18 @@ def test_half_of_the_accelerations_bring_a_pair_to_rest_where_it_has_to_be():
     way = []
     for _ in range(400):
         x = rows_at(
-            d, J=np.array([[0.5, -1.0]]), v_step=step, accelerated=True, v_stop=np.array([0.0, -1e3]), beta=False,
-            row_gain=100.0, lower=-np.ones(2), upper=np.ones(2),
+            d, J=np.array([[0.5, -1.0]]), v_step=step, acceleration_limited=True, v_stop=np.array([0.0, -1e3]),
+            beta=False, row_gain=100.0, lower=-np.ones(2), upper=np.ones(2),
         )  # fmt: skip
         run("row_bounds", x, 1, False)
-        slower = x.least[0] - v
-        v = x.least[0]
+        slower = x.rhs[0] - v
+        v = x.rhs[0]
         d = d + x.dt * v
         way.append((d[0], slower))
     distances, changes = np.array(way[1:]).T
     half = 0.5 * (0.05 + 0.2)
     assert (changes[:-1] <= 1.25 * half).all() and np.isclose(changes, half).sum() > 25
-    assert distances.min() >= x.hold - 1e-9 and distances[-1] == pytest.approx(x.hold, abs=1e-3)
+    assert distances.min() >= x.safety_distance - 1e-9 and distances[-1] == pytest.approx(x.safety_distance, abs=1e-3)
 
 
 RATES = np.zeros(7)
@@ -458,7 +461,7 @@ def test_speeds_where_joints_mimic_others():
         rng, x = np.random.default_rng(seed), filled(seed)
         columns, v = np.append(np.arange(5), [1, 3]), rng.normal(size=5)
         run("joint_speeds", x, v[columns])
-        y = random_layout(seed, pairs=30, columns=columns, mimics=True)
+        y = random_layout(seed, pairs=30, columns=columns, has_mimics=True)
         run("joint_speeds", y, v)
         np.testing.assert_allclose(y.speeds[:4], x.speeds[:4], rtol=1e-12)
 
@@ -470,12 +473,12 @@ def test_closest_call_is_below_what_the_fastest_points_leave(near, horizon):
     for seed in SEEDS:
         x = filled(seed, convex=np.zeros(30, dtype=bool))
         rates = np.random.default_rng(seed).uniform(-1.0, 1.0, x.A.shape[1])
-        turning, sliding = ((chain @ np.abs(rates)).max() for chain in (x.turning, x.sliding))
+        turning, sliding = ((chain @ np.abs(rates)).max() for chain in (x.chain_rotation, x.chain_translation))
         bend = horizon**2 * (turning**2 * x.lever_arm + 2.0 * turning * sliding)
         x.d[:] = np.random.default_rng(seed).uniform(0.05, 0.5, 30)
         found = run("clearance_lower_bound", x, rates, near, 0.5, horizon)
-        left = [x.d[i] - x.hold - horizon * x.speeds[x.moved_by[i]].sum() for i in range(near)]
-        others = 0.5 + x.offset - x.hold - horizon * (x.speeds[:4].max() + x.speeds.max())
+        left = [x.d[i] - x.safety_distance - horizon * x.speeds[x.moved_by[i]].sum() for i in range(near)]
+        others = 0.5 + x.offset - x.safety_distance - horizon * (x.speeds[:4].max() + x.speeds.max())
         exact = min([others, *left]) - bend
         assert found <= exact + 1e-14 and (found > 0.0) == (exact > 0.0)
         assert exact > 0.0 or found == pytest.approx(exact, abs=1e-14)
@@ -483,9 +486,9 @@ def test_closest_call_is_below_what_the_fastest_points_leave(near, horizon):
 
 def closing_along_normal(x, v, i, horizon, bend):
     """How far a near pair closes along its normal: the witness points, and the farthest corner of each box."""
-    pair, found = x.near[i], x.closest[i]
+    pair, found = x.near_pairs[i], x.closest[i]
     n, approach, bent = found[1:4], x.J[i] @ v, 0.0
-    closing = (abs(approach) if x.jerked else max(-approach, 0.0)) + max(-x.feedforward[i], 0.0)
+    closing = (abs(approach) if x.jerk_limited else max(-approach, 0.0)) + max(-x.feedforward[i], 0.0)
     for side, sign in ((0, 1.0), (1, -1.0)):
         carrier, body = x.moved_by[pair, side], x.bodies[pair, side]
         spin = np.vstack((x.omega, x.twists[:, 3:]))[carrier]
@@ -499,7 +502,7 @@ def closing_along_normal(x, v, i, horizon, bend):
     return horizon * closing + bent
 
 
-@pytest.mark.parametrize("fields", [{}, {"jerked": True}, {"views": False}])
+@pytest.mark.parametrize("fields", [{}, {"jerk_limited": True}, {"views": False}])
 @pytest.mark.parametrize("horizon", [0.01, 0.1])
 def test_of_convex_bodies_the_closest_call_looks_along_the_normal(horizon, fields):
     """Where the fastest points would use up a distance, it may be that they go another way."""
@@ -507,15 +510,15 @@ def test_of_convex_bodies_the_closest_call_looks_along_the_normal(horizon, field
     for seed in range(20):
         x = filled(seed, **fields)
         v = np.random.default_rng(seed).uniform(-0.3, 0.3, 7)
-        turning, sliding = ((chain @ np.abs(v)).max() for chain in (x.turning, x.sliding))
+        turning, sliding = ((chain @ np.abs(v)).max() for chain in (x.chain_rotation, x.chain_translation))
         bend = horizon**2 * (turning**2 * x.lever_arm + 2.0 * turning * sliding)
-        x.d[:] = x.hold + horizon * np.random.default_rng(seed).uniform(0.0, 2.0, 30)
+        x.d[:] = x.safety_distance + horizon * np.random.default_rng(seed).uniform(0.0, 2.0, 30)
         found = run("clearance_lower_bound", x, v, 30, 9.0, horizon)
         least = np.inf
         for i in range(30):
-            fastest = left = x.d[i] - x.hold - horizon * x.speeds[x.moved_by[x.near[i]]].sum() - bend
-            if left <= 0.0 and x.convex[x.near[i]]:
-                left = max(left, x.d[i] - x.hold - closing_along_normal(x, v, i, horizon, bend))
+            fastest = left = x.d[i] - x.safety_distance - horizon * x.speeds[x.moved_by[x.near_pairs[i]]].sum() - bend
+            if left <= 0.0 and x.convex[x.near_pairs[i]]:
+                left = max(left, x.d[i] - x.safety_distance - closing_along_normal(x, v, i, horizon, bend))
             better += left > fastest
             least = min(least, left)
         assert found == pytest.approx(least, rel=1e-12, abs=1e-13)
@@ -554,20 +557,20 @@ def test_the_way_of_the_tracking_velocity_is_clear_if_the_closest_call_until_its
         ticks = 1.0 + 0.5 * np.max(np.abs(x.v_tracking) / x.v_step)
         q = np.random.default_rng(seed).uniform(-1.0, 1.0, 8)
         expected = run("clearance_lower_bound", x, x.v_tracking, 30, 0.5, x.dt * ticks) > -2e-4
-        expected &= not (x.accelerated and run("leaves_position_limits", x, q, x.v_tracking, x.dt * ticks))
+        expected &= not (x.acceleration_limited and run("leaves_position_limits", x, q, x.v_tracking, x.dt * ticks))
         assert run("tracking_clear", x, q, 30, 0.5) == expected
         clear += expected
     assert 0 < clear < 40
 
 
-@pytest.mark.parametrize("fields", [{}, {"jerked": True}, {"views": False}])
+@pytest.mark.parametrize("fields", [{}, {"jerk_limited": True}, {"views": False}])
 @pytest.mark.parametrize("near", [0, 1, 30])
 def test_closest_call_by_its_definition(near, fields):
     """From far below to far above nothing left, with rates at which the ways of points curve."""
     left = []
     for seed in range(20):
         x, rng = filled(seed, **fields), np.random.default_rng(seed)
-        x.d[:] = x.hold + rng.uniform(0.0, 0.5, 30)
+        x.d[:] = x.safety_distance + rng.uniform(0.0, 0.5, 30)
         v, horizon = rng.uniform(-0.5, 0.5, 7), 10.0 ** rng.uniform(-3.0, -0.5)
         left.append(oracle.clearance_lower_bound(x, v, near, 0.8, horizon))
         assert run("clearance_lower_bound", x, v, near, 0.8, horizon) == pytest.approx(left[-1], rel=1e-12, abs=1e-13)
@@ -632,7 +635,7 @@ def test_columns_that_one_coordinate_moves_are_added_up(seed):
                   "results", "twists", "twist_row", "margin")
     }  # fmt: skip
 
-    x = random_layout(seed, nv=7, columns=columns, mimics=True, mimicking=np.zeros(9), **{**own, **shared})
+    x = random_layout(seed, nv=7, columns=columns, has_mimics=True, unfolded_row=np.zeros(9), **{**own, **shared})
     for layout in (alone, x):
         run("frame_rows", layout)
     np.testing.assert_allclose(x.A, alone.A @ fold, atol=1e-12)
@@ -686,7 +689,7 @@ def test_velocity_bounds_by_hand():
     x = make_layout(
         6, q_index=np.array([1, 2, 3, 6, 7]), v_index=np.array([0, 1, 2, 4, 5]),
         q_lower=np.array([-1.0, -1, -1, -inf, -1]), q_upper=np.array([1.0, 1, 1, 1, 1]),
-        v_max=np.array([2.0, 3.0, 4.0, inf, inf, 5.0]), rate=50.0,
+        v_max=np.array([2.0, 3.0, 4.0, inf, inf, 5.0]), position_rate=50.0,
     )  # fmt: skip
     assert run("velocity_bounds", x, q) == -3.0
     np.testing.assert_allclose(x.lower, [-2.0, -3.0, -4.0, -inf, -inf, 5.0])
@@ -699,15 +702,20 @@ def test_velocity_bounds_by_their_definition(seed, plain):
     """They never cross, and those with acceleration limits are never outside those without, from any state."""
     for nv in (2, 5, 30):
         q = np.random.default_rng(seed).uniform(-3, 3, nv + 1)
-        for fields in ({}, {"v_step": np.full(nv, np.inf), "accelerated": False}, jerk(seed, nv), jerk(seed, nv, True)):
+        for fields in (
+            {},
+            {"v_step": np.full(nv, np.inf), "acceleration_limited": False},
+            jerk(seed, nv),
+            jerk(seed, nv, True),
+        ):
             x = random_layout(seed, nv=nv, plain=plain, **fields)
-            names = "v_max", "v_step", "v_prev", "dv_step", "dv_prev", "accelerated", "jerked"
+            names = "v_max", "v_step", "v_prev", "dv_step", "dv_prev", "acceleration_limited", "jerk_limited"
             without = make_layout(nv, **{name: getattr(x, name) for name in names})
             for layout, at in ((x, q[:nv] if plain else q), (without, q)):
                 *expected, room = oracle.velocity_bounds(layout, at)
                 assert run("velocity_bounds", layout, at) == pytest.approx(room)
                 found = layout.hard_lower, layout.hard_upper, layout.lower, layout.upper
-                if not layout.accelerated:
+                if not layout.acceleration_limited:
                     expected[:2] = expected[2:]
                 np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
             assert (x.hard_lower <= x.lower).all() and (x.lower <= x.upper).all() and (x.upper <= x.hard_upper).all()
@@ -846,8 +854,8 @@ def test_tracking_shortfall_is_that_of_the_tracking_velocity_and_the_near_rows(n
     for seed in SEEDS:
         v, J, least, lower, upper = constraints(seed, 8)
 
-        def make(v=v, J=J, least=least, lower=lower, upper=upper):
-            return make_layout(7, pairs=8, v_tracking=v, J=J, least=least, lower=lower, upper=upper)._replace(
+        def make(v=v, J=J, rhs=least, lower=lower, upper=upper):
+            return make_layout(7, pairs=8, v_tracking=v, J=J, rhs=rhs, lower=lower, upper=upper)._replace(
                 lower=lower, upper=upper
             )
 
@@ -903,7 +911,7 @@ def test_a_tick_is_the_sum_of_its_parts(seed, fields):
         kernels.row_bounds(apart, k, moving)
         worst = kernels.tracking_violation(apart, k)
         found = kernels.assemble(packed, q[:7] if "plain" in fields else q, pairs, reach, moving)
-        clear = worst <= 0.0 and kernels.tracking_clear(apart, q[:7] if "plain" in fields else q, k, reach)
+        clear = worst <= 0.0 and kernels.is_tracking_clear(apart, q[:7] if "plain" in fields else q, k, reach)
         np.testing.assert_array_equal(found, (k, worst, clear, room))
         assert_same(x, y, k)
 
@@ -978,7 +986,7 @@ def test_a_look_around_keeps_what_is_watched_and_apart(seed):
     kept = [i for i in near if distance[i] >= touch]
     q = rng.normal(size=x.q_index.max(initial=0) + 1)
     k, touching, nearest, rest = run("backup_rows", x, q, pairs, reach, True, watched, touch)
-    assert x.near[:k].tolist() == kept and 0 < k < len(pairs)
+    assert x.near_pairs[:k].tolist() == kept and 0 < k < len(pairs)
     assert touching == len(near) - len(kept) > 0
     np.testing.assert_array_equal(x.closest[:k], x.results[kept])
     assert nearest == min(distance[near]) and rest == min(distance[kept])

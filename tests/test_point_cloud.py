@@ -24,7 +24,7 @@ from qpavoid import (
 )
 from qpavoid.config import PointCloud
 from qpavoid.control.distances import DistanceQuery
-from qpavoid.kernels.voxels import ALIKE
+from qpavoid.kernels.voxels import SAME_DIRECTION
 from qpavoid.model.cloud import ball_radius, read_points
 
 CLOUD = PointCloud()
@@ -188,7 +188,7 @@ def by_definition(point, distance, place, size, spacing):
     order, chosen = np.argsort(distance, kind="stable"), []
 
     def alike(i, j):
-        return abs(place[i, 0] - place[j, 0]) < spacing and np.linalg.norm(place[i, 1:] - place[j, 1:]) < ALIKE
+        return abs(place[i, 0] - place[j, 0]) < spacing and np.linalg.norm(place[i, 1:] - place[j, 1:]) < SAME_DIRECTION
 
     for i in order:
         if len(chosen) < (size + 1) // 2 and all(abs(place[i, 0] - place[j, 0]) >= spacing for j in chosen):
@@ -212,7 +212,7 @@ def test_nearest_voxels_of_bodies_by_their_definition(seed):
     first, point = np.zeros(6, dtype=np.intp), np.zeros(room, dtype=np.intp)
     distance, place = np.zeros(room), np.zeros((room, 4))
     reach = 0.2 if seed else np.inf
-    kernels.within_reach(
+    kernels.voxels_within(
         axes, radii, reach, voxels.centers, voxels.blocks, voxels.starts, first, point, distance, place
     )
     count, kept, slots = first[-1], kept0.copy(), np.zeros((5, 6), dtype=np.intp)

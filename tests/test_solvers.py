@@ -191,7 +191,7 @@ def test_contradicting_rows_relax_and_the_nearer_threat_gives_less(backend, d, v
     assert solution.status is Status.RELAXED
     assert solution.v[0] == pytest.approx(v, abs=1e-4)
     np.testing.assert_allclose(solution.slack, np.maximum(rows.b - rows.J @ solution.v, 0.0), atol=1e-9)
-    assert np.all(rows.J @ solution.v >= rows.touch - 1e-5)
+    assert np.all(rows.J @ solution.v >= rows.b_contact - 1e-5)
     given = [i for i in np.argsort(d, kind="stable") if solution.slack[i] > 5e-6]
     named = [reason for reason in solution.reasons if reason.kind is ReasonKind.ROW_RELAXED]
     assert [reason.subject for reason in named] == [(f"body{i}", f"obstacle{i}") for i in given]

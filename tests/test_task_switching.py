@@ -34,7 +34,7 @@ def rows(d, J, v_tracking, feedforward=0.0, own=False, **settings):
     closest[:, 0] = d
     free = np.full(J.shape[1], np.inf)
     x = make_layout(
-        J.shape[1], pairs=count, obstacles=1, closest=closest, near=np.arange(count), J=J,
+        J.shape[1], pairs=count, obstacles=1, closest=closest, near_pairs=np.arange(count), J=J,
         v_tracking=np.array(v_tracking), feedforward=np.full(count, feedforward),
         twist_row=np.full(count, 1 if own else 0), lower=-free, upper=free,
         **row_form(avoidance),
@@ -51,7 +51,7 @@ def test_row_by_hand():
     one = np.ones((1, 1))
 
     def bound(d, u, **settings):
-        return rows(np.array([d]), one, [u], **settings).least[0]
+        return rows(np.array([d]), one, [u], **settings).rhs[0]
 
     assert bound(0.24, -0.4) == pytest.approx(0.5 * 0.75 * -0.4)
     assert bound(0.24, 0.2) == pytest.approx(0.0)
@@ -70,14 +70,14 @@ def test_row_by_hand():
 
 def test_a_tick_uses_up_no_more_than_the_distance_that_is_left():
     """At 100 m/s, 0.2 m are gone in 2 ms; the row leaves the safety distance after 10 ms."""
-    found = rows(np.array([0.32]), np.ones((1, 1)), [-100.0]).least[0]
+    found = rows(np.array([0.32]), np.ones((1, 1)), [-100.0]).rhs[0]
     assert found == pytest.approx(-(0.32 - D1) / 0.01)
 
 
 def test_the_obstacles_velocity_counts_in_u_and_in_the_bound():
     """ḋ = J v + drift: a sphere that comes at 0.3 m/s on a robot at rest is an approach of 0.3 m/s."""
     x = rows(np.array([0.24]), np.ones((1, 1)), [0.0], feedforward=-0.3)
-    assert x.least[0] == pytest.approx(formula(0.24, -0.3) + 0.3)
+    assert x.rhs[0] == pytest.approx(formula(0.24, -0.3) + 0.3)
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -89,7 +89,7 @@ def test_row_by_its_formula(seed):
     rate = np.array(
         [formula(a, u, retreat=retreat, cap=cap) for a, u in zip(d, J @ v_tracking + feedforward, strict=True)]
     )
-    np.testing.assert_allclose(x.least, np.maximum(rate, (D1 - d) / 0.01) - feedforward, atol=1e-12)
+    np.testing.assert_allclose(x.rhs, np.maximum(rate, (D1 - d) / 0.01) - feedforward, atol=1e-12)
 
 
 # --- beside eq. 10 ------------------------------------------------------------------------------------------------
@@ -101,7 +101,7 @@ def both(seed, regularization):
     A, b, J = rng.normal(size=(3, NV)), 0.3 * rng.normal(size=3), rng.normal(size=(1, NV))
     d, retreat, cap = rng.uniform(D1, D2, 1), rng.choice([0.0, 0.1]), rng.choice([1.0, 50.0])
     v_tracking = np.linalg.pinv(A) @ b
-    least = rows(d, J, v_tracking, retreat_speed=retreat, alpha_cap=cap).least.copy()
+    least = rows(d, J, v_tracking, retreat_speed=retreat, alpha_cap=cap).rhs.copy()
     pair = AvoidanceRows(np.arange(1), d, J, least, D1, D2, least - 1.0)
     problem = make_problem(Tracking(A, b, 0.0), pair, np.full(NV, -1e3), np.full(NV, 1e3), [("hand", "fist")])
     eq10 = make_solver(Eq10Solver(damping=0.0, retreat_speed=retreat, alpha_cap=cap)).solve(problem)

@@ -53,7 +53,7 @@ class _StopAhead:
     def way(self, q: Array, v: Array, w: Array) -> Array:
         """See `kernels.stop_way`; a view of memory that the next call overwrites."""
         self._way[0] = v
-        return self._way[: kernels.stop_way(self._packed, q, w, self._way)]
+        return self._way[: kernels.roll_out_stop(self._packed, q, w, self._way)]
 
 
 class Assembly:
@@ -84,7 +84,7 @@ class Assembly:
         x = self._layout
         self._hard = (x.hard_lower, x.hard_upper) if limits.relax_acceleration else (x.lower, x.upper)
         self._packed = kernels.pack(self._layout)
-        self._stop, self._dt = _StopAhead(x) if x.jerked else None, dt
+        self._stop, self._dt = _StopAhead(x) if x.jerk_limited else None, dt
         robot = scene.robot
         self._names = scene.pair_names, tuple(robot.coordinate_names), tuple(robot.coordinate_units)
         self._targets = [(row[:3], row[3:12].reshape(3, 3), row[12:15], row[15:]) for row in self._layout.targets]
@@ -96,7 +96,7 @@ class Assembly:
         self._eye = np.eye(len(x.v_tracking))
         self._before, self._change = np.zeros_like(x.v_tracking), np.zeros_like(x.v_tracking)
         self._moving = False
-        self.limits_may_give_way = x.jerked or (contacts is not None and x.accelerated)
+        self.limits_may_give_way = x.jerk_limited or (contacts is not None and x.acceleration_limited)
         """Whether `beyond_limits` has to be asked: bounds alone do not keep to accelerations and jerks then."""
         self.kinematics = Kinematics(self._layout.J_world, self._layout.poses)
 
@@ -120,7 +120,7 @@ class Assembly:
         held = None
         if self._contacts is not None:
             held = self._contacts.update(self._forward)
-            x.v_prev[:] = held.held(x.v_prev)
+            x.v_prev[:] = held.project(x.v_prev)
         self._moving = query.placing.moving
         k, worst, clear, room = kernels.assemble(self._packed, q, query.pairs, reach, self._moving)
         proximity, rows = self._views.get(k) or self._view(k)
@@ -129,7 +129,7 @@ class Assembly:
         ):  # task rows repeat each other
             v_tracking = pseudo_inverse(x.A, 0.0) @ x.b
             along = self._along(rows, v_tracking)
-            rows.b[:], rows.touch[:] = along.b, along.touch
+            rows.b[:], rows.b_contact[:] = along.b, along.b_contact
         if held is not None:
             x.v_tracking[:] = tracking_within(held, x.A, x.b, x.damping)
             self._count_from_before()
@@ -138,13 +138,14 @@ class Assembly:
             worst = float(kernels.tracking_violation(self._packed, k))
         bounds = x.lower, x.upper, *self._hard, x.v_stop
         return proximity, Problem(
-            self._tracking, rows, *bounds, *self._names, x.v_tracking, worst, held, self._levels, x.jerked, clear, room
-        )
+            self._tracking, rows, *bounds, *self._names, x.v_tracking, worst, held, self._levels, x.jerk_limited,
+            clear, room,
+        )  # fmt: skip
 
     def look_ahead(self, looks_ahead: bool) -> None:
         """Tell kernels whether to look for velocities that lead nowhere near anything; see `RowLayout.looks_ahead`."""
         x = self._layout
-        looks_ahead = looks_ahead and self._contacts is None and not x.jerked
+        looks_ahead = looks_ahead and self._contacts is None and not x.jerk_limited
         if looks_ahead != x.looks_ahead:
             self._layout = x._replace(looks_ahead=looks_ahead)
             self._packed = kernels.pack(self._layout)
@@ -185,7 +186,7 @@ class Assembly:
     def _bend(self, ways: Array) -> float:
         """Bound what turning bodies add [m], where coordinates travel `ways` (nv,) in all."""
         x = self._layout
-        turned, slid = float(np.max(x.turning @ ways)), float(np.max(x.sliding @ ways))
+        turned, slid = float(np.max(x.chain_rotation @ ways)), float(np.max(x.chain_translation @ ways))
         return turned * (turned * x.lever_arm + 2.0 * slid)
 
     def stop(self, q: Array, v: Array) -> Stop:
@@ -210,19 +211,19 @@ class Assembly:
         kernels.joint_speeds(self._packed, across)
         aside = np.abs(parts) * x.speeds[: len(x.joint_poses)].max()
         if (np.abs(beside).max(axis=0) > _ROUND_OFF * x.v_step).any():
-            turned, slid = np.abs(beside) @ x.turning.T, np.abs(beside) @ x.sliding.T
+            turned, slid = np.abs(beside) @ x.chain_rotation.T, np.abs(beside) @ x.chain_translation.T
             aside += turned.max(axis=1) * x.lever_arm + slid.max(axis=1)
         return Stop(way, self._dt * np.abs(shares), self._dt * aside, self._dt * np.abs(way).sum(axis=0))
 
     def follow(self, v: Array, problem: Problem) -> Problem:
         """The problem of this tick with the velocity v (nv,) to follow in place of the tasks."""
         x = self._layout
-        x.v_tracking[:] = v if problem.contacts is None else problem.contacts.held(v)
+        x.v_tracking[:] = v if problem.contacts is None else problem.contacts.project(v)
         if x.task_switching:
             kernels.row_bounds(self._packed, len(problem.avoidance.d), self._moving)
         worst = float(kernels.tracking_violation(self._packed, len(problem.avoidance.d)))
         return problem._replace(
-            tracking=Tracking(self._eye, x.v_tracking, 0.0), violation=worst, levels=(), clear=False
+            tracking=Tracking(self._eye, x.v_tracking, 0.0), violation=worst, levels=(), tracking_is_clear=False
         )
 
     def eased(self, problem: Problem) -> Problem:
@@ -234,9 +235,9 @@ class Assembly:
         x, v_tracking = self._layout, problem.v_tracking
         if v_tracking[0] != v_tracking[0]:
             return problem
-        eased = v_tracking + kernels.easing_stop(x.v_prev - v_tracking, x.dv_prev, x.v_step, x.dv_step)
+        eased = v_tracking + kernels.jerk_limited_stop(x.v_prev - v_tracking, x.dv_prev, x.v_step, x.dv_step)
         if problem.contacts is not None:
-            eased = problem.contacts.held(eased)
+            eased = problem.contacts.project(eased)
         tracking = problem.tracking._replace(b=problem.tracking.b + problem.tracking.A @ (eased - v_tracking))
         rows = self._along(problem.avoidance, eased)
         worst = float(kernels.violation(eased, rows.J, rows.b, x.lower, x.upper))
@@ -263,7 +264,9 @@ class Assembly:
         x.b[:] = b
         rows = self._along(problem.avoidance, v_tracking)
         worst = float(kernels.violation(v_tracking, rows.J, rows.b, x.lower, x.upper))
-        return problem._replace(tracking=tracking, avoidance=rows, v_tracking=v_tracking, violation=worst, clear=False)
+        return problem._replace(
+            tracking=tracking, avoidance=rows, v_tracking=v_tracking, violation=worst, tracking_is_clear=False
+        )
 
     def prioritised(self, problem: Problem, tracked: Callable[[Problem], Array]) -> Problem:
         """The problem of this tick with rows for what a cascade tracks, which is not v0.
@@ -274,18 +277,18 @@ class Assembly:
         """
         if not self._layout.task_switching:
             return problem
-        return problem._replace(avoidance=self._along(problem.avoidance, tracked(problem)), clear=False)
+        return problem._replace(avoidance=self._along(problem.avoidance, tracked(problem)), tracking_is_clear=False)
 
     def _along(self, rows: AvoidanceRows, v: Array) -> AvoidanceRows:
         """Rows of this tick as they are where v (nv,) is tracked in place of v0; the same ones if that is no matter."""
         x, k = self._layout, len(rows.d)
         if not (x.task_switching and k):
             return rows
-        memory = x.v_tracking, x.least[:k], x.touch[:k]
+        memory = x.v_tracking, x.rhs[:k], x.rhs_contact[:k]
         kept = [array.copy() for array in memory]
         x.v_tracking[:] = v
         kernels.row_bounds(self._packed, k, self._moving)
-        along = rows._replace(b=x.least[:k].copy(), touch=x.touch[:k].copy())
+        along = rows._replace(b=x.rhs[:k].copy(), b_contact=x.rhs_contact[:k].copy())
         for array, values in zip(memory, kept, strict=True):
             array[:] = values
         return along
@@ -359,7 +362,7 @@ class Assembly:
 
     def _view(self, k: int) -> tuple[Proximity, AvoidanceRows]:
         x = self._layout
-        near = x.near[:k]
+        near = x.near_pairs[:k]
         proximity = Proximity(near, x.closest[:k], x.J[:k], x.feedforward[:k])
-        self._views[k] = proximity, AvoidanceRows(near, x.d[:k], x.J[:k], x.least[:k], x.d1, x.d2, x.touch[:k])
+        self._views[k] = proximity, AvoidanceRows(near, x.d[:k], x.J[:k], x.rhs[:k], x.d1, x.d2, x.rhs_contact[:k])
         return self._views[k]

@@ -24,9 +24,9 @@ def row_form(config: Avoidance) -> dict[str, Any]:
     row = config.row
     return {
         "offset": config.offset,
-        "hold": config.hold,
+        "safety_distance": config.hold,
         "row_gain": row.gain,
-        "recovery": np.inf if isinstance(row, Cbf) else config.recovery_speed,
+        "recovery_speed": np.inf if isinstance(row, Cbf) else config.recovery_speed,
         "beta": isinstance(row, Beta),
         "task_switching": isinstance(row, TaskSwitching),
         "retreat_speed": row.retreat_speed if isinstance(row, TaskSwitching) else 0.0,

@@ -83,7 +83,7 @@ class CloudProxies:
         axes = ((turned - pose.position) @ rotation).reshape(-1, 6)
         axes[off] = np.nan
         found = self._first, self._point, self._distance, self._place
-        kernels.within_reach(axes, self._radii, reach, voxels.centers, voxels.blocks, voxels.starts, *found)
+        kernels.voxels_within(axes, self._radii, reach, voxels.centers, voxels.blocks, voxels.starts, *found)
         for body in self._planes:
             if self._first[body] < self._first[body + 1]:
                 self._refine(body, poses[body], pose)

@@ -113,7 +113,7 @@ def tracking_within(contacts: Contacts, A: Array, b: Array, damping: float) -> A
         b: their right-hand sides (r,).
         damping: λ of the damped inverse [-].
     """
-    reduced, asked = A @ contacts.Z, b - A @ contacts.rest
+    reduced, asked = A @ contacts.Z, b - A @ contacts.v_particular
     if damping == 0.0:
         known = np.isfinite(asked).all() and np.isfinite(reduced).all()
         w = np.linalg.pinv(reduced, rcond=1e-10) @ asked if known else np.full(reduced.shape[1], np.nan)
@@ -121,7 +121,7 @@ def tracking_within(contacts: Contacts, A: Array, b: Array, damping: float) -> A
         gram = reduced.T @ reduced
         gram.ravel()[:: len(gram) + 1] += damping**2
         w = np.linalg.solve(gram, reduced.T @ asked)
-    return np.asarray(contacts.rest + contacts.Z @ w)
+    return np.asarray(contacts.v_particular + contacts.Z @ w)
 
 
 def _slid(pose: tuple[Array, Array], anchor: tuple[Array, Array]) -> Array:

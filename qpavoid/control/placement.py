@@ -61,12 +61,12 @@ class ObstaclePlacement:
         self.reach = reach
         """(o,) distance from each obstacle's origin to its farthest point; infinite of a half-space [m]."""
         self._planes = np.flatnonzero(np.isinf(reach)).tolist()
-        self._memory = kernels.Placed(
+        self._memory = kernels.ObstacleArrays(
             states=self.states,
             twists=self.twists,
             margin=self.margin,
             speeds=self.speeds[joints:],
-            reach=np.nan_to_num(reach, posinf=0.0),
+            bounding_radius=np.nan_to_num(reach, posinf=0.0),
             placements=read_poses([body.placement for body in bodies]) if placements is None else placements,
             local=spheres[:, :3].copy(),
             centers=np.ones((len(bodies), 5)),
@@ -100,7 +100,7 @@ class ObstaclePlacement:
             before = np.cumsum(count) - count
             self._geometries = (self._first[which] - before)[self._owners] + np.arange(len(self._owners))
         for i in self._planes:
-            self._memory.reach[i] = self._reach_of_plane(states[i]) if states[i, 15:].any() else 0.0
+            self._memory.bounding_radius[i] = self._reach_of_plane(states[i]) if states[i, 15:].any() else 0.0
         bad, moving = kernels.place_obstacles(self._memory, which, self._geometries, self._owners, states, margin)
         if bad >= 0:
             raise NumericalError(f"obstacle {self._names[bad]!r}: NaN or infinity in its pose or twist")
@@ -118,7 +118,7 @@ class ObstaclePlacement:
 
     def reaches(self, index: int, reach: float) -> None:
         """Takes another distance from an obstacle's origin to its farthest point [m]."""
-        self._memory.reach[index] = self.reach[index] = reach
+        self._memory.bounding_radius[index] = self.reach[index] = reach
 
     def _reach_of_plane(self, state: Array) -> float:
         """Distance from a half-space's origin to what the robot reaches, and may come to before it stands [m]."""

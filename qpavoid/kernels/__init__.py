@@ -1,40 +1,40 @@
-"""Array work of a tick, as loops that numba compiles at their first use and keeps on disk (`kernels.cache`)."""
+"""Array work of a control step: loops that numba compiles at their first use, and stores on disk (`kernels.cache`)."""
 
 from qpavoid.kernels.backup import ROUND_OFF, backup_rows, closes_below, min_sphere_distance, rate_limit
 from qpavoid.kernels.bounds import velocity_bounds
+from qpavoid.kernels.braking_bounds import speed_to_stop
+from qpavoid.kernels.braking_trajectory import jerk_limited_stop, roll_out_stop, stop_velocity
 from qpavoid.kernels.broadphase import candidates, sorted_setxor
 from qpavoid.kernels.cache import first_use
 from qpavoid.kernels.clearance import (
     TOLERANCE,
     clearance_lower_bound,
+    is_tracking_clear,
     joint_speeds,
     leaves_position_limits,
-    tracking_clear,
 )
 from qpavoid.kernels.layout import RowLayout
 from qpavoid.kernels.obstacles import (
+    ObstacleArrays,
     Pieces,
-    Placed,
     check_states,
     place_obstacles,
     sample_pieces,
     update_measured_states,
 )
 from qpavoid.kernels.packing import pack
-from qpavoid.kernels.qp import farthest, minimize, project, project_soft
+from qpavoid.kernels.qp import max_clearance_velocity, minimize, project, project_soft
 from qpavoid.kernels.rotation import rotation_vector
 from qpavoid.kernels.rows import distance_rows, row_bounds
 from qpavoid.kernels.step import assemble, tracking_violation, violation
-from qpavoid.kernels.stopping import speed_to_stop
-from qpavoid.kernels.stops import easing_stop, stop_velocity, stop_way
 from qpavoid.kernels.tasks import damped_solution, frame_rows, projection_cost
-from qpavoid.kernels.voxels import select_voxels, within_reach
+from qpavoid.kernels.voxels import select_voxels, voxels_within
 
 __all__ = [
     "ROUND_OFF",
     "TOLERANCE",
+    "ObstacleArrays",
     "Pieces",
-    "Placed",
     "RowLayout",
     "assemble",
     "backup_rows",
@@ -44,12 +44,13 @@ __all__ = [
     "closes_below",
     "damped_solution",
     "distance_rows",
-    "easing_stop",
-    "farthest",
     "first_use",
     "frame_rows",
+    "is_tracking_clear",
+    "jerk_limited_stop",
     "joint_speeds",
     "leaves_position_limits",
+    "max_clearance_velocity",
     "min_sphere_distance",
     "minimize",
     "pack",
@@ -58,6 +59,7 @@ __all__ = [
     "project_soft",
     "projection_cost",
     "rate_limit",
+    "roll_out_stop",
     "rotation_vector",
     "row_bounds",
     "sample_pieces",
@@ -65,11 +67,9 @@ __all__ = [
     "sorted_setxor",
     "speed_to_stop",
     "stop_velocity",
-    "stop_way",
-    "tracking_clear",
     "tracking_violation",
     "update_measured_states",
     "velocity_bounds",
     "violation",
-    "within_reach",
+    "voxels_within",
 ]

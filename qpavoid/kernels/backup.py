@@ -38,17 +38,17 @@ def backup_rows(
     k = distance_rows(x, pairs, reach, moving)
     n, touching, nearest, rest = 0, 0, reach, reach
     for i in range(k):
-        if not enabled[x.near[i]]:
+        if not enabled[x.near_pairs[i]]:
             continue
-        distance, slack = x.closest[i, 0], x.slack[x.near[i]]
+        distance, slack = x.closest[i, 0], x.slack[x.near_pairs[i]]
         nearest = np.minimum(nearest, distance + slack)  # keeps NaN, unlike min
         if not distance >= touch:
-            enabled[x.near[i]] = False
+            enabled[x.near_pairs[i]] = False
             touching += 1
             continue
         rest = min(rest, distance + slack)
         if n < i:
-            x.near[n], x.feedforward[n] = x.near[i], x.feedforward[i]
+            x.near_pairs[n], x.feedforward[n] = x.near_pairs[i], x.feedforward[i]
             for c in range(10):
                 x.closest[n, c] = x.closest[i, c]
             for c in range(x.J.shape[1]):

@@ -1,12 +1,12 @@
-"""Compiled kernels on disk: a folder for each state of their sources, so that code which is stale is never run.
+"""Compiled kernels on disk: a folder for each state of their sources, so that stale code is never run.
 
-numba's own cache takes the code of a function as fresh as long as the file of that function is, and so goes on with
-what the function took from other files that have changed since. Here, all of it is kept in one folder of the user's
-cache directory, whose name holds a digest of all kernel sources and of the versions that compiled them. Nothing is
-written beside the sources, so that an installation may be read-only, and nothing is deleted but other such folders.
+numba's own cache takes the code of a function as fresh as long as the file of that function is unchanged, and so runs
+what the function inlined from other files before they changed. Here, all code is in one folder of the user's cache
+directory, whose name has a digest of all kernel sources and of the versions that compiled them. Nothing is written
+beside the sources, so that an installation may be read-only, and nothing is deleted but other such folders.
 
-Processes may start at the same time, and the folder may vanish, be read-only or full: whatever cannot be read is
-compiled, and whatever cannot be written is compiled by the next process, too.
+Processes may start at the same time, and the folder may vanish, be read-only or full: code that cannot be read is
+compiled, and code that cannot be written is compiled by the next process, too.
 
 `NUMBA_CACHE_DIR` puts the folder elsewhere.
 """
@@ -30,10 +30,10 @@ from numba.core.caching import CompileResultCacheImpl, FunctionCache
 from numba.core.serialize import dumps
 from numba.misc.appdirs import AppDirs
 
-_MOST = 8
-"""Folders that are kept, those used last: a few checkouts and versions of numba side by side, 5 MB each."""
+_MAX_FOLDERS = 8
+"""Folders that are not deleted, those used last [-]: a few checkouts and versions of numba side by side, 5 MB each."""
 _DIGEST = 16
-"""Bytes of a digest; that of the content begins every file, as damaged machine code must not be run."""
+"""Bytes of a digest: collisions do not occur. A file begins with that of its content: damaged code must not be run."""
 _COMPLETE = "complete"
 """Empty file in a folder once the kernels of a controller are in it."""
 
@@ -48,33 +48,34 @@ def _folder() -> Path:
 
 
 def _digest(content: bytes) -> bytes:
+    """Return the digest of some bytes."""
     return blake2b(content, digest_size=_DIGEST).digest()
 
 
 class _Files:
-    """The code of one function in a folder, a file for each signature; takes the place of numba's index of files.
+    """Code of one function in a folder, a file for each signature; replaces numba's index of files.
 
-    Of two processes that add signatures to one index at the same time, either may end with an entry that leads to the
-    code of the other. Here a file is named after its signature, and holds it.
+    Of two processes that add signatures to one index at the same time, either may end with an entry that points to the
+    code of the other. Here a file is named after its signature, and contains it.
     """
 
     def __init__(self, folder: Path, name: str) -> None:
         self._folder, self._name = folder, name
 
     def load(self, key: Any) -> Any:
-        """Return the code of a signature, or None where there is none that can be read."""
+        """Return the code of a signature, or None if no readable file has it."""
         with suppress(OSError):
             content = self._path(key).read_bytes()
             if _digest(content[_DIGEST:]) == content[:_DIGEST]:
-                found, code = pickle.loads(content[_DIGEST:])
-                if found == key:
-                    self._count_as_used()
+                signature, code = pickle.loads(content[_DIGEST:])
+                if signature == key:
+                    self._mark_used()
                     return code
         first_use.begin()
         return None
 
     def save(self, key: Any, code: Any) -> None:
-        """Write the code of a signature, all of it at once, where that is possible."""
+        """Write the code of a signature, atomically; report an OSError to `first_use`."""
         content = dumps((key, code))
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
@@ -95,16 +96,18 @@ class _Files:
             with suppress(OSError):
                 path.unlink()
 
-    def _count_as_used(self) -> None:
+    def _mark_used(self) -> None:
+        """Set the time of last use of the folder."""
         with suppress(OSError):
             os.utime(self._folder / _COMPLETE)
 
     def _path(self, key: Any) -> Path:
+        """Return the file of a signature."""
         return self._folder / f"{self._name}.{_digest(repr(key).encode()).hex()}.code"
 
 
-class _Place:
-    """Where numba looks for the code of a function."""
+class _Locator:
+    """Location of the code of a function, in the form that numba expects."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self._py_file = function.__code__.co_filename
@@ -114,21 +117,23 @@ class _Place:
         return str(FOLDER)
 
     def get_source_stamp(self) -> str:
-        """Return what changes with the sources."""
+        """Return the name of the folder, which changes with the sources."""
         return FOLDER.name
 
     def ensure_cache_path(self) -> None:
-        """Leave it to `_Files.save` to make the folder."""
+        """Do nothing: `_Files.save` makes the folder."""
 
 
 class _Implementation(CompileResultCacheImpl):  # type: ignore[misc]
+    """numba's serialisation of compiled functions, with the locator of this module."""
+
     def __init__(self, function: Callable[..., Any]) -> None:
-        self._lineno, self._locator = function.__code__.co_firstlineno, _Place(function)
+        self._lineno, self._locator = function.__code__.co_firstlineno, _Locator(function)
         self._filename_base = f"{function.__module__.rpartition('.')[2]}.{function.__qualname__}-{self._lineno}"
 
 
 class KernelCache(FunctionCache):  # type: ignore[misc]
-    """The cache of one compiled function: numba's, with one folder for all sources."""
+    """Cache of one compiled function: numba's, with one folder for all sources."""
 
     _impl_class = _Implementation
 
@@ -138,49 +143,50 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
 
 
 class FirstUse:
-    """What stderr says where a machine has no compiled kernels yet; nothing is said ever after."""
+    """Messages on stderr while a machine compiles the kernels for the first time; none in later runs."""
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._begin, self._failed = folder, 0.0, False
 
     def begin(self) -> None:
-        """Say that kernels are compiled, the first time that any is in an incomplete folder."""
+        """Print that kernels are compiled, at the first one that is missing in an incomplete folder."""
         if not self._begin and not (self._folder / _COMPLETE).exists():
             self._begin = perf_counter()
-            _say("compiling kernels, once on this machine: about 20 s ...")
+            _print("compiling kernels, once on this machine: about 20 s ...")
 
     def end(self) -> None:
-        """Say how long it took, where `begin` said anything, and mark the folder as complete."""
+        """Print how long the compilation took, if `begin` printed, and mark the folder as complete."""
         if not self._begin:
             return
-        _say(f"compiled kernels in {perf_counter() - self._begin:.0f} s")
+        _print(f"compiled kernels in {perf_counter() - self._begin:.0f} s")
         self._begin = 0.0
         if not self._failed:
             with suppress(OSError):
                 (self._folder / _COMPLETE).touch()
-            _make_room(self._folder.parent)
+            _delete_old_folders(self._folder.parent)
 
     def fail(self, error: OSError) -> None:
-        """Say, once, that compiled kernels are not on disk for the next run."""
+        """Print, once, that compiled kernels are not on disk for the next run, and why."""
         if not self._failed:
             self._failed = True
-            _say(f"cannot keep compiled kernels for the next run: {error}; NUMBA_CACHE_DIR=DIR puts them elsewhere")
+            _print(f"cannot keep compiled kernels for the next run: {error}; NUMBA_CACHE_DIR=DIR puts them elsewhere")
 
 
-def _say(line: str) -> None:
+def _print(line: str) -> None:
+    """Print a line to stderr, if there is one."""
     if sys.stderr is not None:
         print(f"qpavoid: {line}", file=sys.stderr, flush=True)
 
 
-def _make_room(parent: Path) -> None:
-    """Delete the folders that were not used for longest, down to the most that are kept."""
+def _delete_old_folders(parent: Path) -> None:
+    """Delete the folders that were not used for the longest time, all but `_MAX_FOLDERS`."""
     with suppress(OSError):
         folders = sorted(parent.glob(f"kernels-*/{_COMPLETE}"), key=lambda path: path.stat().st_mtime)
-        for complete in folders[:-_MOST]:
+        for complete in folders[:-_MAX_FOLDERS]:
             shutil.rmtree(complete.parent, ignore_errors=True)
 
 
 FOLDER = _folder()
-"""Where the code of these sources is kept."""
+"""Folder with the code of these sources."""
 first_use = FirstUse(FOLDER)
-"""What there is to be said of the first compilation."""
+"""Messages about the first compilation."""

@@ -1,4 +1,4 @@
-"""How near anything may come on the way of a velocity, by bounds alone: no distance on the way is computed."""
+"""Lower bounds on the clearance along a velocity, from speeds alone: no distance ahead is computed."""
 
 from __future__ import annotations
 
@@ -10,28 +10,29 @@ from qpavoid.kernels.packing import compiled
 from qpavoid.problem import Array
 
 TOLERANCE = 2e-4
-"""How much nearer than its safe distance a pair may come along the way of a velocity [m]."""
+"""Distance by which a pair may come below its safety distance along a velocity [m]: rows are of first order, and
+distances curve within a control step."""
 
 
 @compiled
-def clearance_lower_bound(x: Any, v: Array, k: int, reach: float, horizon: float) -> float:
-    """Bound from below what is left of the safe distance of every pair on the straight way of v until `horizon`.
+def clearance_lower_bound(x: Any, v: Array, k: int, influence_distance: float, horizon: float) -> float:
+    """Bound from below the distance minus safety distance of every pair at constant v until `horizon`.
 
-    No distance falls faster than the fastest points of its two bodies move. A point that a joint carries moves at most
-    at the speed of the joint's origin plus its angular speed times the distance. It comes at most s h + ½ a h² far in
-    the time h, if it starts at speed s and its acceleration stays below a; at constant joint rates that is at most
-    Ω² R + 2 Ω V, with the sums Ω of the angular and V of the linear rates of the joints that carry it and the longest
-    lever R. Where that leaves nothing of a pair, `_left_along_normal` may.
+    No distance falls faster than the fastest points of its two bodies move. A point of a body moves at most at the
+    speed of its joint's origin plus the joint's angular speed times the distance from the origin. It moves at most
+    s h + ½ a h² in the time h, if it starts at speed s and its acceleration stays below a; at constant joint rates that
+    is at most Ω² R + 2 Ω V, with the sums Ω of the angular and V of the linear rates of the joints that move it and the
+    longest lever arm R. Of a pair of which that leaves nothing, `_clearance_along_normal` may be positive.
 
     Args:
-        x: reads what the tick found; writes the speeds and spins of the joints.
-        v: velocity (n,).
+        x: reads the results of the step; writes speeds and omega of the joints.
+        v: velocity (n,) [rad/s or m/s].
         k: number of near pairs.
-        reach: surface distance below which a pair is near; all others are at least so far apart [m].
+        influence_distance: surface distance below which a pair is near; all others are at least so far apart [m].
         horizon: h [s].
 
     Returns:
-        Least of distance - hold [m] on the way, or less; NaN where there is one.
+        Bound [m]; NaN where there is one.
     """
     speeds, joints = x.speeds, len(x.joint_poses)
     joint_speeds(x, v)
@@ -41,104 +42,107 @@ def clearance_lower_bound(x: Any, v: Array, k: int, reach: float, horizon: float
     any_fastest = fastest
     for i in range(joints, len(speeds)):
         any_fastest = np.maximum(any_fastest, speeds[i])
-    omega, slide = 0.0, 0.0
-    for chain in range(len(x.turning)):
-        turning, sliding = 0.0, 0.0
+    omega, linear = 0.0, 0.0
+    for chain in range(len(x.chain_rotation)):
+        rotation, translation = 0.0, 0.0
         for c in range(len(v)):
-            turning += x.turning[chain, c] * abs(v[c])
-            sliding += x.sliding[chain, c] * abs(v[c])
-        omega, slide = max(omega, turning), max(slide, sliding)
-    bend = horizon * horizon * omega * (omega * x.lever_arm + 2.0 * slide)
-    least = reach + x.offset - x.hold - (fastest + any_fastest) * horizon - bend
+            rotation += x.chain_rotation[chain, c] * abs(v[c])
+            translation += x.chain_translation[chain, c] * abs(v[c])
+        omega, linear = max(omega, rotation), max(linear, translation)
+    curvature = horizon * horizon * omega * (omega * x.lever_arm + 2.0 * linear)
+    bound = influence_distance + x.offset - x.safety_distance - (fastest + any_fastest) * horizon - curvature
     for i in range(k):
-        pair = x.near[i]
+        pair = x.near_pairs[i]
         closing = speeds[x.moved_by[pair, 0]] + speeds[x.moved_by[pair, 1]]
-        left = x.d[i] - x.hold - closing * horizon - bend
-        if left <= 0.0:
-            left = max(left, _left_along_normal(x, v, i, horizon, bend))
-        least = np.minimum(least, left)
-    return least
+        clearance = x.d[i] - x.safety_distance - closing * horizon - curvature
+        if clearance <= 0.0:
+            clearance = max(clearance, _clearance_along_normal(x, v, i, horizon, curvature))
+        bound = np.minimum(bound, clearance)
+    return bound
 
 
 @compiled
-def _left_along_normal(x: Any, v: Array, i: int, horizon: float, bend: float) -> float:
-    """Bound from below what is left of the safe distance of near pair i until `horizon`.
+def _clearance_along_normal(x: Any, v: Array, i: int, horizon: float, curvature: float) -> float:
+    """Bound from below the distance minus safety distance of near pair i until `horizon`, along its normal.
 
     Two convex bodies are at least as far apart as along any direction: as far along it as the nearest points of the
-    two. In the direction of the normal n, these move with the witness points, and with the turning of the bodies: x, of
-    a body that turns with ω, comes by (x - p)·(n × ω) closer in a second than the witness point p. Of the box around
-    the body, no point comes closer than |n × ω| along its edges says. An obstacle that turns bends its way by no more
-    than ½ ω h² times the speed of its fastest point. A stop within jerk limits may lead backwards, and an obstacle need
-    not move as long as the robot does.
+    two. In the direction of the normal n, these move with the witness points, and with the rotation of the bodies: a
+    point r of a body that turns at ω approaches by (r - p)·(n × ω) faster than the witness point p. Of the box around
+    the body, the corner where that is largest counts, which |n × ω| along its edges gives. The path of a point of an
+    obstacle that turns deviates from a line by no more than ½ ω h² times the speed of its fastest point. A stop within
+    jerk limits may lead backwards, so both signs of the closing speed count; an obstacle need not move as long as the
+    robot does, so that it recedes does not count.
 
     Args:
-        x: reads what the tick found, and the spins of the joints.
-        v: velocity (n,).
+        x: reads the results of the step, and omega of the joints.
+        v: velocity (n,) [rad/s or m/s].
         i: number of the near pair.
         horizon: h [s].
-        bend: what the curved ways of two bodies of the robot may add [m].
+        curvature: distance by which the paths of points of two bodies of the robot may deviate from lines [m].
 
     Returns:
-        Bound [m]; -∞ for a pair of bodies that are not convex, or that stands for others.
+        Bound [m]; -∞ for a pair of bodies that are not convex, or whose distance stands for other pairs.
     """
-    pair, found = x.near[i], x.closest[i]
+    pair, result = x.near_pairs[i], x.closest[i]
     if not x.convex[pair]:
         return -np.inf
     approach = 0.0
     for c in range(len(v)):
         approach += x.J[i, c] * v[c]
-    closing = (abs(approach) if x.jerked else max(-approach, 0.0)) + max(-x.feedforward[i], 0.0)
-    joints, bent = len(x.joint_poses), 0.0
+    closing = (abs(approach) if x.jerk_limited else max(-approach, 0.0)) + max(-x.feedforward[i], 0.0)
+    joints, deviation = len(x.joint_poses), 0.0
     for side in range(2):
-        carrier, body = x.moved_by[pair, side], x.bodies[pair, side]
-        spin = x.omega[carrier] if carrier < joints else x.twists[carrier - joints, 3:]
-        sign, n, p = 1.0 - 2.0 * side, found[1:4], found[4 + 3 * side : 7 + 3 * side]
+        mover, body = x.moved_by[pair, side], x.bodies[pair, side]
+        omega = x.omega[mover] if mover < joints else x.twists[mover - joints, 3:]
+        sign, n, p = 1.0 - 2.0 * side, result[1:4], result[4 + 3 * side : 7 + 3 * side]
         mx, my, mz = (
-            sign * (n[1] * spin[2] - n[2] * spin[1]),
-            sign * (n[2] * spin[0] - n[0] * spin[2]),
-            sign * (n[0] * spin[1] - n[1] * spin[0]),
+            sign * (n[1] * omega[2] - n[2] * omega[1]),
+            sign * (n[2] * omega[0] - n[0] * omega[2]),
+            sign * (n[0] * omega[1] - n[1] * omega[0]),
         )
-        pose, box, farther = x.body_poses[body], x.boxes[body], 0.0
+        pose, box, corner = x.body_poses[body], x.boxes[body], 0.0
         for a in range(3):
             rx, ry, rz = pose[3 * a], pose[3 * a + 1], pose[3 * a + 2]
-            along = rx * mx + ry * my + rz * mz
-            here = rx * (p[0] - pose[9]) + ry * (p[1] - pose[10]) + rz * (p[2] - pose[11])
-            farther += along * (box[a] - here) + abs(along) * box[3 + a]
-        closing += max(farther, 0.0)
-        if carrier >= joints:
-            turned = np.sqrt(spin[0] * spin[0] + spin[1] * spin[1] + spin[2] * spin[2]) * x.speeds[carrier]
-            bent += 0.5 * horizon * horizon * turned
+            edge = rx * mx + ry * my + rz * mz
+            witness = rx * (p[0] - pose[9]) + ry * (p[1] - pose[10]) + rz * (p[2] - pose[11])
+            corner += edge * (box[a] - witness) + abs(edge) * box[3 + a]
+        closing += max(corner, 0.0)
+        if mover >= joints:
+            acceleration = np.sqrt(omega[0] * omega[0] + omega[1] * omega[1] + omega[2] * omega[2]) * x.speeds[mover]
+            deviation += 0.5 * horizon * horizon * acceleration
         else:
-            bent += 0.5 * bend
-    return x.d[i] - x.hold - horizon * closing - bent
+            deviation += 0.5 * curvature
+    return x.d[i] - x.safety_distance - horizon * closing - deviation
 
 
 @compiled
 def leaves_position_limits(x: Any, q: Array, v: Array, horizon: float) -> bool:
-    """Return True if a coordinate would pass its position limit on the way of v, so that it brakes harder than others.
+    """Return True if a coordinate at constant v passes a position limit, so that it brakes harder than others.
 
     Args:
         x: reads the position limits.
         q: configuration (nq,).
-        v: velocity (n,).
-        horizon: time for which v leads on [s].
+        v: velocity (n,) [rad/s or m/s].
+        horizon: duration [s].
     """
     for i in range(len(x.q_index)):
-        ahead = q[x.q_index[i]] + horizon * v[x.v_index[i]]
-        if ahead < x.q_lower[i] or ahead > x.q_upper[i]:
+        end = q[x.q_index[i]] + horizon * v[x.v_index[i]]
+        if end < x.q_lower[i] or end > x.q_upper[i]:
             return True
     return False
 
 
 @compiled
 def joint_speeds(x: Any, v: Array) -> None:
-    """Write the largest speed of any point that each joint carries.
+    """Write the angular velocity of each joint, and the largest speed of any point of the bodies fixed to it.
 
-    That of its origin, plus its angular speed times the distance of the farthest point.
+    That is the speed of the joint's origin, plus its angular speed times the distance of the farthest point. The twist
+    of a joint at the world's origin is that of its parent plus its own columns of the Jacobian times their rates.
 
     Args:
-        x: reads J_world, joint_poses and joint_reach; writes spins and the first J of speeds.
-        v: velocity (n,).
+        x: reads J_world, joint_poses, parents, column_joints and joint_radius; writes omega (J, 3) [rad/s] and the
+            first J of speeds [m/s].
+        v: velocity (n,) [rad/s or m/s].
     """
     J, poses, twists = x.J_world, x.joint_poses, np.zeros((len(x.joint_poses), 6))
     c = 0
@@ -158,19 +162,22 @@ def joint_speeds(x: Any, v: Array) -> None:
 
 
 @compiled
-def tracking_clear(x: Any, q: Array, k: int, reach: float) -> bool:
-    """Return True if, by `clearance_lower_bound`, nothing comes too near on the way of v0 and a stop from it.
+def is_tracking_clear(x: Any, q: Array, k: int, influence_distance: float) -> bool:
+    """Return True if every pair keeps its safety distance along v_tracking and a stop from it, by bounds alone.
+
+    A stop takes s = max |v_j| / v_step_j steps, in which the robot moves ½ s dt times v at most: one step of v and that
+    make the horizon of `clearance_lower_bound`. False says nothing: the distances themselves have to be computed.
 
     Args:
-        x: reads what the tick found, v0 among it.
+        x: reads the results of the step, v_tracking included.
         q: configuration (nq,).
         k: number of near pairs.
-        reach: surface distance below which a pair is near [m].
+        influence_distance: surface distance below which a pair is near [m].
     """
-    slowing = 0.0
+    steps = 0.0
     for j in range(len(x.v_tracking)):
-        slowing = max(slowing, abs(x.v_tracking[j]) / x.v_step[j])
-    horizon = x.dt * (1.0 + 0.5 * slowing)
-    if slowing > 0.0 and leaves_position_limits(x, q, x.v_tracking, horizon):
+        steps = max(steps, abs(x.v_tracking[j]) / x.v_step[j])
+    horizon = x.dt * (1.0 + 0.5 * steps)
+    if steps > 0.0 and leaves_position_limits(x, q, x.v_tracking, horizon):
         return False
-    return clearance_lower_bound(x, x.v_tracking, k, reach, horizon) > -TOLERANCE
+    return clearance_lower_bound(x, x.v_tracking, k, influence_distance, horizon) > -TOLERANCE

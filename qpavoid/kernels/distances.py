@@ -1,7 +1,7 @@
 """Distances of spheres, capsules and boxes in closed form: exact, and several times as fast as an iteration.
 
-Bodies are cores with a radius around them: points and segments, or boxes. Of cores that are apart, the closest points
-are those of a convex function on a segment; where cores meet, and for all other shapes, coal is asked.
+Bodies are cores with a radius around them: points and segments, or boxes. Of disjoint cores, the witness points are at
+the minimum of a convex function on a segment; where cores meet, and for all other shapes, coal computes them.
 """
 
 from __future__ import annotations
@@ -11,34 +11,37 @@ import numpy as np
 from qpavoid.kernels.packing import compiled
 from qpavoid.problem import Array, IntArray, Mask
 
-APART = 1e-6
-"""Distance below which cores are left to coal [m]: the direction between them is lost to round-off."""
+MIN_CORE_DISTANCE = 1e-6
+"""Distance of cores below which coal computes the pair [m]: the direction between them is lost to round-off."""
 _PARALLEL = 1e-14
-"""1 - cos² of the angle below which segments count as parallel [-]."""
+"""1 - cos² of the angle below which segments count as parallel [-]: the round-off of a cosine, with some to spare."""
 
 
 @compiled
 def closed_forms(
-    poses: Array, cores: Array, bodies: IntArray, known: Mask, pairs: IntArray, results: Array, left: IntArray
+    poses: Array, cores: Array, bodies: IntArray, has_closed_form: Mask, pairs: IntArray, results: Array, met: IntArray
 ) -> int:
-    """Brings the results of pairs that have a closed form up to date.
+    """Update the results of pairs that have a closed form.
+
+    With witness points a and b of the cores, radii r and s, and the unit vector n from a to b, the distance is
+    |b - a| - r - s, the witness points of the bodies are a + r n and b - s n: in penetration, too.
 
     Args:
         poses: world poses of all bodies, rotation by columns and translation (g, 12).
         cores: radius, and half-sizes of the core along the axes of each body (g, 4), see `geometry.cores` [m].
         bodies: the two bodies of each pair (m, 2).
-        known: which pairs have a closed form (m,).
-        pairs: which ones to look at (c,).
+        has_closed_form: whether each pair has one (m,).
+        pairs: numbers of the pairs to update (c,).
         results: [distance, normal, point a, point b] (m, 10), in place.
-        left: overwritten with the pairs whose cores meet (m,).
+        met: out (m,), the first entries: the pairs whose cores meet, and whose results are not updated.
 
     Returns:
-        How many those are.
+        Number of pairs whose cores meet.
     """
-    a, b, apart = np.empty(3), np.empty(3), np.empty(3)
+    a, b, separation = np.empty(3), np.empty(3), np.empty(3)
     count = 0
     for k in pairs:
-        if not known[k]:
+        if not has_closed_form[k]:
             continue
         i, j = bodies[k, 0], bodies[k, 1]
         if _is_box(cores[i]):
@@ -49,36 +52,48 @@ def closed_forms(
             _two_segments(poses[i], cores[i, 3], poses[j], cores[j, 3], a, b)
         square = 0.0
         for c in range(3):
-            apart[c] = b[c] - a[c]
-            square += apart[c] * apart[c]
+            separation[c] = b[c] - a[c]
+            square += separation[c] * separation[c]
         distance = np.sqrt(square)
-        if not distance > APART:  # NaN, too
-            left[count] = k
+        if not distance > MIN_CORE_DISTANCE:  # NaN, too
+            met[count] = k
             count += 1
             continue
         r, s = cores[i, 0], cores[j, 0]
         result = results[k]
         result[0] = distance - (r + s)
         for c in range(3):
-            n = apart[c] / distance
+            n = separation[c] / distance
             result[1 + c], result[4 + c], result[7 + c] = n, a[c] + r * n, b[c] - s * n
     return count
 
 
 @compiled
 def _is_box(core: Array) -> bool:
+    """Return True if a core [radius, half-sizes] (4,) is a box, not a point or a segment along z."""
     return core[1] > 0.0
 
 
 @compiled
-def _clamp(x: float, most: float) -> float:
-    return min(max(x, -most), most)
+def _clamp(x: float, limit: float) -> float:
+    """Return x within ±limit."""
+    return min(max(x, -limit), limit)
 
 
 @compiled
 def _two_segments(one: Array, l1: float, two: Array, l2: float, a: Array, b: Array) -> None:
-    """Closest points of two segments ±l along the z axes of their poses (12,); the middle ones, where they are parallel
-    and there are many.
+    """Write the closest points of two segments along the z axes of their poses; the middle ones of parallel segments.
+
+    With p + s u, |s| <= l1 and q + t w, |t| <= l2, the distance is least at the unconstrained s, clamped, then the best
+    t for it, clamped, then the best s for that, clamped (Ericson 2005, "Real-Time Collision Detection", 5.1.9).
+
+    Args:
+        one: pose of the first segment (12,), rotation by columns, then centre [m].
+        l1: half of its length [m].
+        two: pose of the second segment (12,).
+        l2: half of its length [m].
+        a: out (3,): point on the first segment [m].
+        b: out (3,): point on the second segment [m].
     """
     cosine, along_1, along_2 = 0.0, 0.0, 0.0
     for c in range(3):
@@ -100,11 +115,18 @@ def _two_segments(one: Array, l1: float, two: Array, l2: float, a: Array, b: Arr
 
 @compiled
 def _segment_and_box(segment: Array, half: float, box: Array, core: Array, a: Array, b: Array) -> None:
-    """Closest points of a segment ±half along the z axis of its pose (12,), and of a box (12,) with half-sizes.
+    """Write the closest points of a segment along the z axis of its pose, and of a box.
 
-    The squared distance of the box from a point on the segment is convex along it, and its slope is a line between the
-    places where the segment passes a plane of a face; the middle of the places where it is least, if it is so on a
-    stretch.
+    The squared distance of the box from a point on the segment is convex along it, and its slope is linear between the
+    places where the segment passes the plane of a face. Where it is least on an interval, its middle is taken.
+
+    Args:
+        segment: pose of the segment (12,), rotation by columns, then centre [m].
+        half: half of its length [m].
+        box: pose of the box (12,).
+        core: radius and half-sizes of the box (4,) [m].
+        a: out (3,): point on the segment [m].
+        b: out (3,): point of the box [m].
     """
     p, u = np.empty(3), np.empty(3)
     for r in range(3):
@@ -112,7 +134,7 @@ def _segment_and_box(segment: Array, half: float, box: Array, core: Array, a: Ar
         for c in range(3):
             p[r] += box[3 * r + c] * (segment[9 + c] - box[9 + c])
             u[r] += box[3 * r + c] * segment[6 + c]
-    first, last = _least(p, u, core, half, False), _least(p, u, core, half, True)
+    first, last = _closest_place(p, u, core, half, False), _closest_place(p, u, core, half, True)
     s = 0.5 * (first + last)
     for c in range(3):
         a[c] = segment[9 + c] + s * segment[6 + c]
@@ -124,8 +146,16 @@ def _segment_and_box(segment: Array, half: float, box: Array, core: Array, a: Ar
 
 
 @compiled
-def _least(p: Array, u: Array, core: Array, half: float, last: bool) -> float:
-    """The first, or last, place on p + s u, |s| <= half, that is closest to a box."""
+def _closest_place(p: Array, u: Array, core: Array, half: float, last: bool) -> float:
+    """Compute the first, or last, s of p + s u, |s| <= half, that is closest to a box at the origin [m].
+
+    Args:
+        p: centre of the segment in the frame of the box (3,) [m].
+        u: its unit direction in that frame (3,).
+        core: radius and half-sizes of the box (4,) [m].
+        half: half of the segment's length [m].
+        last: whether the last one is computed.
+    """
     low, high = -half, half
     at_low, at_high = _slope(p, u, core, low), _slope(p, u, core, high)
     if at_low > 0.0 or (at_low == 0.0 and not last):
@@ -148,7 +178,7 @@ def _least(p: Array, u: Array, core: Array, half: float, last: bool) -> float:
 
 @compiled
 def _slope(p: Array, u: Array, core: Array, s: float) -> float:
-    """Of half the squared distance of a box from p + s u, with s."""
+    """Compute the derivative by s of half the squared distance of a box from p + s u [m]; see `_closest_place`."""
     slope = 0.0
     for r in range(3):
         x = p[r] + s * u[r]

@@ -1,6 +1,6 @@
-"""Memory of a tick: what the kernels read and write, laid out once when a controller is made.
+"""Memory of a control step: what the kernels read and write, laid out once when a controller is made.
 
-Arrays that look into the memory of Pinocchio and coal are views; outputs are overwritten by every tick.
+Arrays that look into the memory of Pinocchio and coal are views; outputs are overwritten by every step.
 """
 
 from __future__ import annotations
@@ -11,30 +11,30 @@ from qpavoid.problem import Array, IntArray, Mask
 
 
 class RowLayout(NamedTuple):
-    """Everything from which the rows and bounds of a tick are made, and where they go.
+    """Everything from which the rows and bounds of a control step are made, and where they go.
 
     n velocity coordinates, f tracked frames of which the first p have a position and t an orientation to follow,
     r >= 3 (p + t) task rows, m pairs, o obstacles, l coordinates with a position limit. The world Jacobian has e >= n
-    columns: those of joints that mimic another one are moved by its coordinate.
+    columns: those of joints that mimic another joint are moved by the coordinate of that joint.
     """
 
     J_world: Array
-    """(6, e) world Jacobian of all joints."""
+    """(6, e) world Jacobian of all joints, linear rows first, at the world's origin."""
     columns: IntArray
-    """(e,) which velocity coordinate moves each of its columns."""
-    mimics: bool
+    """(e,) velocity coordinate that moves each column of `J_world`."""
+    has_mimics: bool
     """Whether any coordinate moves several columns."""
-    mimicking: Array
+    unfolded_row: Array
     """(e,) scratch: one row before the columns of a coordinate are added up."""
     # --- tasks
     frame_poses: Array
     """(frames, 12) world poses of all frames of the model: rotation by columns, then position [m]."""
     frame_ids: IntArray
-    """(f,) the tracked ones."""
+    """(f,) the tracked ones among these."""
     targets: Array
     """(f, 18) position, rotation by rows, linear and angular velocity of each target [m, -, m/s, rad/s]."""
-    turns: IntArray
-    """(t,) which frames have an orientation to follow."""
+    oriented: IntArray
+    """(t,) numbers of the tracked frames that have an orientation to follow."""
     gain: Array
     """(f,) feedback gain [1/s]."""
     cap: Array
@@ -44,13 +44,13 @@ class RowLayout(NamedTuple):
     task_support: Array
     """(3 (p + t), e) scale of the columns that move each row's frame, 0 for the others."""
     row_wrenches: Array
-    """(3 (p + t), 6) directions of the rows; the moments of the linear ones are filled in by every tick."""
+    """(3 (p + t), 6) directions of the rows; the moments of the linear ones are filled in by every step."""
     poses: Array
     """(f, 12) out: poses of the tracked frames."""
     A: Array
     """(r, n) task rows; out: those of the frames, which come first."""
     b: Array
-    """(r,) their right-hand sides; likewise."""
+    """(r,) right-hand sides of `A`; out: those of the frames, which come first."""
     # --- pairs
     results: Array
     """(m, 10) [distance, normal, point a, point b] of all pairs."""
@@ -61,17 +61,17 @@ class RowLayout(NamedTuple):
     twist_row: IntArray
     """(m,) row of `twists` that moves each pair's second body."""
     margin: Array
-    """(o + 1,) taken off the distances to each obstacle, for what is not known of it [m]; the last one stays zero."""
+    """(o + 1,) taken off the distances to each obstacle, for its uncertainty [m]; the last one stays zero."""
     slack: Array
-    """(m,) added to the distance of a pair whose own safety distance is less than `hold`: the difference [m]."""
+    """(m,) added to the distance of a pair whose own safety distance is below `safety_distance`: the difference [m]."""
     joint_poses: Array
     """(J, 12) world poses of all joints: rotation by columns, then origin [m]; row 0 is the world."""
     parents: IntArray
-    """(J,) the joint that carries each joint, which comes before it; that of the world is the world."""
+    """(J,) parent joint of each joint, which comes before it; that of the world is the world."""
     column_joints: IntArray
-    """(e,) the joint that each column of the world Jacobian belongs to, in increasing order."""
+    """(e,) joint that each column of the world Jacobian belongs to, in increasing order."""
     joint_radius: Array
-    """(J,) distance from a joint's origin to the farthest point of a body that it carries [m]."""
+    """(J,) distance from a joint's origin to the farthest point of the bodies fixed to it [m]."""
     moved_by: IntArray
     """(m, 2) what moves the two bodies of each pair: number of a joint, or J plus that of an obstacle."""
     bodies: IntArray
@@ -81,17 +81,17 @@ class RowLayout(NamedTuple):
     boxes: Array
     """(g, 6) a box around each body, in its frame: centre and half its sizes [m]."""
     convex: Mask
-    """(m,) whether both bodies are convex, and their distance stands for nothing else."""
-    turning: Array
-    """(chains, n) how many angles each coordinate turns among those that move the end of a chain of joints."""
-    sliding: Array
+    """(m,) whether both bodies are convex, and their distance stands for no other pair's."""
+    chain_rotation: Array
+    """(chains, n) number of angles that each coordinate turns among those that move the end of a chain of joints."""
+    chain_translation: Array
     """(chains, n) the same for lengths."""
     omega: Array
     """(J, 3) out: angular velocity of each joint [rad/s]."""
     speeds: Array
-    """(J + o,) largest speed of any point that a joint carries, which is overwritten, or of an obstacle [m/s]."""
-    near: IntArray
-    """(m,) out: which pairs are near, in increasing order; here as below, as many as there are near ones count."""
+    """(J + o,) largest speed of any point: out for those fixed to a joint, given for those of an obstacle [m/s]."""
+    near_pairs: IntArray
+    """(m,) out: numbers of the k near pairs, in increasing order. Here as below, the first k entries count."""
     closest: Array
     """(m, 10) out: their results."""
     J: Array
@@ -100,29 +100,29 @@ class RowLayout(NamedTuple):
     """(m,) out: rate of their distances due to the obstacles [m/s]."""
     d: Array
     """(m,) out: distance that the gains take [m]."""
-    least: Array
+    rhs: Array
     """(m,) out: lower bound on J v [m/s]."""
-    touch: Array
-    """(m,) out: the same of rows without a margin, which only keep pairs from touching [m/s]."""
+    rhs_contact: Array
+    """(m,) out: the same of rows without a margin, which only keep pairs from contact [m/s]."""
     # --- limits
     q_index: IntArray
     """(l,) index in q of each limited coordinate."""
     v_index: IntArray
     """(l,) index in v of the same."""
     q_lower: Array
-    """(l,) [rad or m]."""
+    """(l,) lower position limit [rad or m]."""
     q_upper: Array
-    """(l,) [rad or m]."""
+    """(l,) upper position limit [rad or m]."""
     v_max: Array
-    """(n,) largest speed, infinite where there is none."""
+    """(n,) largest speed, infinite where there is none [rad/s or m/s]."""
     v_step: Array
-    """(n,) largest change of v in one tick; infinite where the acceleration has no limit."""
+    """(n,) largest change of v in a step; infinite where the acceleration has no limit [rad/s or m/s]."""
     v_prev: Array
-    """(n,) velocity of the tick before."""
+    """(n,) velocity of the previous step [rad/s or m/s]."""
     dv_step: Array
-    """(n,) largest change, from one tick to the next, of that change of v; infinite where the jerk has no limit."""
+    """(n,) largest difference of the changes of v in two successive steps; infinite where the jerk has no limit."""
     dv_prev: Array
-    """(n,) by how much v changed in the tick before, no more than `v_step`."""
+    """(n,) change of v in the previous step, no more than `v_step` [rad/s or m/s]."""
     hard_lower: Array
     """(n,) out: lower bound on v from position and velocity limits.
 
@@ -134,7 +134,7 @@ class RowLayout(NamedTuple):
     upper: Array
     """(n,) out: upper bound from the same."""
     v_stop: Array
-    """(n,) out: the next velocity of a stop: all coordinates slowed alike, as fast as their limits allow."""
+    """(n,) out: the next velocity of a stop: all coordinates slowed by one factor, as fast as their limits allow."""
     # --- answer of the tracking law
     v_tracking: Array
     """(n,) out: J⁺ẋ."""
@@ -143,33 +143,33 @@ class RowLayout(NamedTuple):
     """λ of the damped J⁺ [-]."""
     offset: float
     """Added to surface distances [m]."""
-    hold: float
+    safety_distance: float
     """Distance at which a row allows no more closing [m]."""
     row_gain: float
     """ξ [1/s]."""
-    recovery: float
-    """Cap on the speed of parting that a row asks for [m/s]."""
+    recovery_speed: float
+    """Cap on the speed of separation that a row asks for [m/s]."""
     beta: bool
     """Whether rows are weighted with 1 - β."""
     task_switching: bool
-    """Whether rows have the rate of eq. 10, which depends on v0."""
+    """Whether rows have the rate of eq. 10, which depends on `v_tracking`."""
     retreat_speed: float
     """ẋ0 of such rows [m/s]."""
     alpha_cap: float
     """Largest α of such rows [-]."""
     d1: float
-    """[m]."""
+    """Distance below which β is 1 [m]."""
     d2: float
-    """[m]."""
-    rate: float
-    """Share of the room to a position limit that may be used in a second [1/s]."""
+    """Influence distance [m]."""
+    position_rate: float
+    """Share of the distance to a position limit that may be used in a second [1/s]."""
     dt: float
-    """Length of a tick [s]."""
+    """Control period [s]."""
     lever_arm: float
     """Largest distance that any point can ever have from a joint that turns it [m]."""
-    accelerated: bool
+    acceleration_limited: bool
     """Whether any acceleration has a limit."""
-    jerked: bool
+    jerk_limited: bool
     """Whether any jerk has one."""
     looks_ahead: bool
-    """Whether the way of the tracking law's velocity is looked at, where that velocity is safe."""
+    """Whether a step bounds the clearance along `v_tracking`, where that velocity meets all rows and bounds."""

@@ -1,4 +1,4 @@
-"""Moving obstacles: where all of them are at a time, and what distances need to know of it.
+"""Obstacle states at a time, checks of states from outside, and the arrays that distances are computed from.
 
 A *state* is a row of 18: rotation by columns, position, linear and angular velocity, in world axes [-, m, m/s, rad/s].
 """
@@ -14,64 +14,66 @@ from qpavoid.kernels.tasks import _rotation_vector
 from qpavoid.problem import Array, IntArray, Mask
 
 FINE, NORMALISED, NOT_FINITE, FAR, FAST, NO_ROTATION, LEFT_HANDED = range(7)
-"""What `check_states` finds."""
+"""Codes of `check_states`."""
 EXACT, NEARLY = 1e-6, 1e-3
-"""|RᵀR - I| up to which a matrix is taken for a rotation as it is (those of 32 bits are 1e-7 off), and up to which it
-is replaced by the rotation next to it."""
+"""|RᵀR - I| up to which a matrix is taken for a rotation as it is (rotations in single precision are 1e-7 off), and up
+to which it is replaced by the nearest rotation (the rounding of a matrix that was typed with three digits) [-]."""
 SAMPLE, POSE, REST = range(3)
-"""How an obstacle is given: with a twist, without one, at rest."""
+"""Kind of an update: with a twist, without one, at rest."""
 
 
 class Pieces(NamedTuple):
-    """Motions of k bodies, cut into n pieces on which the state is a weighted sum of seven constant ones.
+    """Motions of k bodies, cut into n pieces on which the state is a weighted sum of seven constant terms.
 
-    With the share s of a piece's time, its rate s' and the angle φ of the piece, the weights are 1, s, sin sφ, cos sφ,
-    s', s'φ sin sφ, s'φ cos sφ. A body's first piece starts at -∞, and each lasts until the next one starts.
+    With the fraction s of a piece's time, its rate s' and the angle φ of the piece, the weights are 1, s, sin sφ,
+    cos sφ, s', s'φ sin sφ, s'φ cos sφ: lines and rotations at constant speed, or smooth from rest to rest. A body's
+    first piece starts at -∞, and each lasts until the next one starts.
     """
 
     bodies: IntArray
-    """(k,) row of the states that each body has."""
+    """(k,) row of each body in the states."""
     first: IntArray
-    """(k + 1,) first piece of each body, and n."""
+    """(k + 1,) first piece of each body; the last entry is n."""
     starts: Array
-    """(n,) [s]."""
+    """(n,) time at which each piece starts [s]."""
     clock: Array
-    """(n, 4) time from which s counts and in which it grows by 1, infinite at rest [s]; φ [rad]; 1 where s is smooth:
-    10 τ³ - 15 τ⁴ + 6 τ⁵ in place of τ."""
+    """(n, 4) time at which s is 0, and time in which it grows by 1, infinite at rest [s]; φ [rad]; 1 where s is smooth:
+    s = 10 τ³ - 15 τ⁴ + 6 τ⁵ in place of the fraction of time τ."""
     terms: Array
-    """(n, 7, 18) the constant states."""
+    """(n, 7, 18) the constant terms."""
 
 
-class Placed(NamedTuple):
-    """What the distances of g bodies know of o obstacles, of which the first c can be carried."""
+class ObstacleArrays(NamedTuple):
+    """States of o obstacles, of which the first c can be attached, as the distances of g bodies need them."""
 
     states: Array
-    """(o, 18)."""
+    """(o, 18) state of each obstacle."""
     twists: Array
-    """(o + 1 + c, 6) velocities at the world's origin; row o stays zero, the last c are negative."""
+    """(o + 1 + c, 6) twists at the world's origin, linear before angular [m/s, rad/s]; row o stays zero, the last c are
+    the negative twists of the first c."""
     margin: Array
-    """(o + 1 + c,) taken off the distances to each, in the same order but positive [m]."""
+    """(o + 1 + c,) taken off the distances to each, in the order of `twists` but never negative [m]."""
     speeds: Array
     """(o,) largest speed of any of its points [m/s]."""
-    reach: Array
-    """(o,) distance from its origin to its farthest point that matters [m]."""
+    bounding_radius: Array
+    """(o,) distance from its origin to its farthest point, 0 of a half-space that does not turn [m]."""
     placements: Array
     """(g, 12) poses of all bodies: rotation by columns, then position."""
     local: Array
     """(g, 3) centres of their bounding spheres in their own frames [m]."""
     centers: Array
-    """(g, 5) the same in the world, as rows [c, 1, -|c|²]; those that joints carry are not kept up to date."""
+    """(g, 5) the same in the world, as rows [c, 1, -|c|²]; those of the robot's bodies are not updated."""
 
 
 @compiled
 def sample_pieces(x: Pieces, t: float, tolerance: float, states: Array) -> None:
-    """Write where the bodies are.
+    """Write the states of the bodies of `x` at time t.
 
     Args:
         x: their motions.
         t: time [s].
-        tolerance: how early a piece ends [s].
-        states: out: rows of `bodies`; the others stay (o, 18).
+        tolerance: time before its start from which a piece counts [s]: t may be a sum that is rounded down.
+        states: out (o, 18): rows `x.bodies`; the others are not changed.
     """
     weights = np.empty(7)
     for k in range(len(x.bodies)):
@@ -100,17 +102,20 @@ def sample_pieces(x: Pieces, t: float, tolerance: float, states: Array) -> None:
 
 @compiled
 def place_obstacles(
-    x: Placed, which: IntArray, geometries: IntArray, owners: IntArray, states: Array, margin: Array
+    x: ObstacleArrays, numbers: IntArray, geometries: IntArray, owners: IntArray, states: Array, margin: Array
 ) -> tuple[int, bool]:
-    """Move some obstacles.
+    """Write the states of some obstacles, and what follows from them: twists, speeds, poses and sphere centres.
+
+    The twist at the world's origin is [v - ω × p, ω]; the largest speed of any point is |v| + |ω| R with the bounding
+    radius R.
 
     Args:
-        x: overwritten; as it was where a number is NaN or infinite.
-        which: numbers of the obstacles (k,).
+        x: overwritten; not changed where a number is NaN or infinite.
+        numbers: of the obstacles (k,).
         geometries: numbers of their bodies (b,).
-        owners: to which of the k each of these belongs (b,).
-        states: of all obstacles; read where `which` says (o, 18).
-        margin: to be taken off their distances, read where `which` says (o,) [m].
+        owners: index in `numbers` of the obstacle that each of these belongs to (b,).
+        states: of all obstacles (o, 18); rows `numbers` are read.
+        margin: taken off the distances to each obstacle (o,) [m]; entries `numbers` are read.
 
     Returns:
         Number of the first obstacle with NaN or infinity, -1 where there is none; whether any of all obstacles has a
@@ -118,13 +123,13 @@ def place_obstacles(
     """
     obstacles = len(x.states)
     negative = len(x.twists) - obstacles - 1
-    for i in which:
+    for i in numbers:
         total = 0.0
         for c in range(18):
             total += states[i, c]
         if not abs(total) < np.inf:  # isfinite does not survive the reordering of sums
             return i, True
-    for i in which:
+    for i in numbers:
         x.states[i] = states[i]
         state, twist = x.states[i], x.twists[i]
         px, py, pz = state[9], state[10], state[11]
@@ -136,16 +141,16 @@ def place_obstacles(
             x.margin[obstacles + 1 + i] = margin[i]
             for c in range(6):
                 x.twists[obstacles + 1 + i, c] = -twist[c]
-        turn = np.sqrt(wx * wx + wy * wy + wz * wz)
-        x.speeds[i] = np.sqrt(vx * vx + vy * vy + vz * vz) + turn * x.reach[i]
+        angular_speed = np.sqrt(wx * wx + wy * wy + wz * wz)
+        x.speeds[i] = np.sqrt(vx * vx + vy * vy + vz * vz) + angular_speed * x.bounding_radius[i]
     for n in range(len(geometries)):
-        g, state = geometries[n], x.states[which[owners[n]]]
+        g, state = geometries[n], x.states[numbers[owners[n]]]
         for c in range(12):
             x.placements[g, c] = state[c]
         length = 0.0
         for r in range(3):
-            turned = state[r] * x.local[g, 0] + state[3 + r] * x.local[g, 1] + state[6 + r] * x.local[g, 2]
-            x.centers[g, r] = turned + state[9 + r]
+            rotated = state[r] * x.local[g, 0] + state[3 + r] * x.local[g, 1] + state[6 + r] * x.local[g, 2]
+            x.centers[g, r] = rotated + state[9 + r]
             length += x.centers[g, r] ** 2
         x.centers[g, 4] = -length
     for i in range(obstacles):
@@ -159,26 +164,26 @@ def place_obstacles(
 
 @compiled
 def check_states(
-    states: Array, which: IntArray, kind: IntArray, farthest: float, fastest: float
+    states: Array, numbers: IntArray, kind: IntArray, max_position: float, max_twist: float
 ) -> tuple[IntArray, Array]:
-    """Find states that cannot be true, and normalise rotations that are nearly ones in place.
+    """Find states that are implausible, and normalise rotations that are nearly ones in place.
 
-    R becomes ½ R (3 I - RᵀR), which squares its distance from the nearest rotation, four times over: from 1e-3 that
-    leaves nothing but round-off.
+    R becomes ½ R (3 I - RᵀR), which squares its distance from the nearest rotation (Higham 2008, "Functions of
+    matrices", 8.3, Newton-Schulz), four times over: from 1e-3 that leaves nothing but round-off.
 
     Args:
         states: (o, 18).
-        which: numbers of those to look at (k,).
-        kind: how each is given (k,): SAMPLE, POSE or REST; of the latter two, twists are not looked at.
-        farthest: largest coordinate of a position [m].
-        fastest: largest component of a twist [m/s, rad/s].
+        numbers: of the states to check (k,).
+        kind: of each update (k,): SAMPLE, POSE or REST; of the latter two, twists are not checked.
+        max_position: largest coordinate of a position [m].
+        max_twist: largest component of a twist [m/s, rad/s].
 
     Returns:
-        (k,) FINE, NORMALISED, or the first thing that is wrong; (k,) largest entry of |RᵀR - I|.
+        (k,) FINE, NORMALISED, or the code of the first fault; (k,) largest entry of |RᵀR - I|.
     """
-    codes, off, gram, new = np.zeros(len(which), np.intp), np.zeros(len(which)), np.empty((3, 3)), np.empty(9)
-    for k in range(len(which)):
-        x, count = states[which[k]], 18 if kind[k] == SAMPLE else 12
+    codes, off, gram, new = np.zeros(len(numbers), np.intp), np.zeros(len(numbers)), np.empty((3, 3)), np.empty(9)
+    for k in range(len(numbers)):
+        x, count = states[numbers[k]], 18 if kind[k] == SAMPLE else 12
         total, far, fast = 0.0, 0.0, 0.0
         for c in range(count):
             total += abs(x[c])
@@ -189,15 +194,15 @@ def check_states(
             far = max(far, abs(x[c]))
         for c in range(12, count):
             fast = max(fast, abs(x[c]))
-        if far > farthest or fast > fastest:
-            codes[k] = FAR if far > farthest else FAST
+        if far > max_position or fast > max_twist:
+            codes[k] = FAR if far > max_position else FAST
             continue
         _gram(x, gram)
         for r in range(3):
             for c in range(3):
                 off[k] = max(off[k], abs(gram[r, c] - (1.0 if r == c else 0.0)))
-        across = x[1] * x[5] - x[2] * x[4], x[2] * x[3] - x[0] * x[5], x[0] * x[4] - x[1] * x[3]
-        if across[0] * x[6] + across[1] * x[7] + across[2] * x[8] < 0.0:
+        normal = x[1] * x[5] - x[2] * x[4], x[2] * x[3] - x[0] * x[5], x[0] * x[4] - x[1] * x[3]
+        if normal[0] * x[6] + normal[1] * x[7] + normal[2] * x[8] < 0.0:
             codes[k] = LEFT_HANDED
         elif not off[k] <= NEARLY:
             codes[k] = NO_ROTATION
@@ -216,7 +221,12 @@ def check_states(
 
 @compiled
 def _gram(x: Array, gram: Array) -> None:
-    """RᵀR (3, 3) of a rotation by columns (9,)."""
+    """Write RᵀR (3, 3) of a rotation by columns (9,).
+
+    Args:
+        x: rotation by columns, the first nine entries.
+        gram: out (3, 3).
+    """
     for r in range(3):
         for c in range(3):
             gram[r, c] = x[3 * r] * x[3 * c] + x[3 * r + 1] * x[3 * c + 1] + x[3 * r + 2] * x[3 * c + 2]
@@ -224,48 +234,48 @@ def _gram(x: Array, gram: Array) -> None:
 
 @compiled
 def update_measured_states(
-    which: IntArray, kind: IntArray, times: Array, news: Array, stamps: Array, last: Array, states: Array,
-    shortest: float, fastest: float,
+    numbers: IntArray, kind: IntArray, times: Array, updates: Array, stamps: Array, last: Array, states: Array,
+    min_interval: float, max_twist: float,
 ) -> Mask:  # fmt: skip
-    """Take over checked states of obstacles that are given from outside; a bare pose gets the twist that has led to it.
+    """Take over checked updates of obstacles; estimate the twist of a bare pose from the pose before it.
 
-    That is the difference of its last two poses, over the time between their stamps; the first one counts as at rest,
-    and where no time lies between them the twist stays as it was.
+    The estimate is the difference of the last two poses over the interval between their time stamps; the first pose
+    counts as at rest, and without an interval between them the twist stays as it was.
 
     Args:
-        which: numbers of the obstacles (k,).
-        kind: how each is given (k,): SAMPLE, POSE or REST.
-        times: their time stamps (k,) [s].
-        news: what is given, read where `which` says (o, 18); the twists of bare poses are overwritten.
-        stamps: time stamps of what was given last, NaN where nothing was (o,) [s]; overwritten.
-        last: what was given last, with its twist (o, 18); overwritten.
-        states: (o, 18) overwritten as well.
-        shortest: time between two poses below which no twist is estimated [s].
-        fastest: largest component of a twist that is estimated [m/s, rad/s].
+        numbers: of the obstacles (k,).
+        kind: of each update (k,): SAMPLE, POSE or REST.
+        times: time stamps of the updates (k,) [s].
+        updates: their states (o, 18), rows `numbers` are read; the twists of bare poses are overwritten.
+        stamps: time stamp of the last update of each obstacle (o,), NaN before the first one [s]; overwritten.
+        last: its state, with its twist (o, 18); overwritten.
+        states: out (o, 18): rows of the accepted updates.
+        min_interval: interval between two poses below which no twist is estimated [s].
+        max_twist: largest component of a twist that is estimated [m/s, rad/s].
 
     Returns:
-        Which of them were taken over (k,); not those whose poses are too far apart for `fastest`.
+        Whether each update is accepted (k,): not where its pose is too far from the last one for `max_twist`.
     """
-    fine, turn = np.ones(len(which), np.bool_), np.empty((3, 3))
-    for k in range(len(which)):
-        i = which[k]
-        new, old, since = news[i], last[i], times[k] - stamps[i]
+    accepted, rotation = np.ones(len(numbers), np.bool_), np.empty((3, 3))
+    for k in range(len(numbers)):
+        i = numbers[k]
+        new, old, interval = updates[i], last[i], times[k] - stamps[i]
         if kind[k] != SAMPLE:
             new[12:] = 0.0
-        if kind[k] == POSE and since > shortest:
+        if kind[k] == POSE and interval > min_interval:
             for r in range(3):
-                new[12 + r] = (new[9 + r] - old[9 + r]) / since
+                new[12 + r] = (new[9 + r] - old[9 + r]) / interval
                 for c in range(3):
-                    turn[r, c] = new[r] * old[c] + new[3 + r] * old[3 + c] + new[6 + r] * old[6 + c]
-            angles = _rotation_vector(turn)
+                    rotation[r, c] = new[r] * old[c] + new[3 + r] * old[3 + c] + new[6 + r] * old[6 + c]
+            angles = _rotation_vector(rotation)
             for r in range(3):
-                new[15 + r] = angles[r] / since
+                new[15 + r] = angles[r] / interval
             for c in range(12, 18):
-                fine[k] = fine[k] and abs(new[c]) <= fastest
+                accepted[k] = accepted[k] and abs(new[c]) <= max_twist
         elif kind[k] == POSE and stamps[i] == stamps[i]:
             new[12:] = old[12:]
-        if fine[k]:
+        if accepted[k]:
             old[:] = new
             states[i] = new
             stamps[i] = times[k]
-    return fine
+    return accepted

@@ -1,9 +1,9 @@
-"""How kernels are compiled, and the layout of a tick as they see it.
+"""Compilation of the kernels, and the layout of a control step in compiled code.
 
-The layout crosses from Python as one structure: passing its forty arrays one by one would cost more than the work.
+The layout crosses from Python as one structure: to pass its forty arrays one by one would cost more than the work.
 
-With `NUMBA_DISABLE_JIT=1` the same loops run as plain Python, slowly, for a debugger: then the layout is handed through
-as it is.
+With `NUMBA_DISABLE_JIT=1` the same loops run as plain Python, slowly, for a debugger: then the layout is
+passed as it is.
 """
 
 from __future__ import annotations
@@ -23,8 +23,11 @@ _F = TypeVar("_F", bound=Callable[..., Any])
 def compiled(function: _F) -> _F:
     """Compile a kernel at its first call with arguments of some types, or load its code from disk.
 
-    Sums may be taken in any order, so that they become vector instructions; NaN stays NaN. Infinities do, too, but
-    `np.isfinite` of a sum need not survive: compare with infinity.
+    Sums may be taken in any order, so that they become vector instructions. NaN and infinities are preserved, but the
+    compiler may drop `np.isfinite` of a sum: compare with infinity instead.
+
+    Args:
+        function: the loops; every function that they call is compiled as well.
     """
     kernel = njit(fastmath={"reassoc", "contract", "nsz"})(function)
     if not config.DISABLE_JIT:
@@ -33,15 +36,15 @@ def compiled(function: _F) -> _F:
 
 
 class PackedRows(structref.StructRefProxy):  # type: ignore[misc]
-    """A `RowLayout` as compiled code sees it."""
+    """A `RowLayout` in compiled code."""
 
 
 @structref.register
 class PackedRowsType(types.StructRef):  # type: ignore[misc]
-    """Its type, made of those of the fields."""
+    """Type of `PackedRows`, made of those of its fields."""
 
     def preprocess_fields(self, fields: Any) -> Any:
-        """Return the types of fields, not of the values that they happen to have."""
+        """Return the types of the fields, without the literal values that numba infers."""
         return tuple((name, types.unliteral(field)) for name, field in fields)
 
 
@@ -55,5 +58,5 @@ def _pack(fields: Any) -> Any:
 
 
 def pack(layout: RowLayout) -> Any:
-    """Return the layout in the form that the kernels take; it looks into the same memory."""
+    """Return the layout in the form that the kernels take; both look into the same memory."""
     return layout if config.DISABLE_JIT else _pack(tuple(layout))

@@ -1,8 +1,9 @@
 """A small strictly convex QP, solved in compiled code: the dual active-set method of Goldfarb and Idnani (1983).
 
-It starts at the unconstrained minimiser, which the tracking law gives for nothing, and adds violated constraints one
-by one, so that its work grows with the number of constraints that bind, not with the number there are. Calling a
-library costs several times what a problem of this size takes to solve.
+D. Goldfarb and A. Idnani, "A numerically stable dual method for solving strictly convex quadratic programs",
+Mathematical Programming 27. It starts at the unconstrained minimiser, which is the tracking law's velocity, and adds
+violated constraints one by one, so that its work grows with the number of constraints that bind, not with the number
+there are. A call of a library costs several times what a problem of this size takes to solve.
 """
 
 from __future__ import annotations
@@ -14,41 +15,56 @@ from qpavoid.kernels.packing import compiled
 from qpavoid.problem import Array, IntArray
 
 _TOLERANCE = 1e-10
-"""Violation of a constraint that counts as none [m/s, rad/s]."""
+"""Violation of a constraint that counts as none [m/s, rad/s]: two digits above the round-off of a row."""
 _ROUND_OFF = 1e-7
-"""How far off an active constraint a solution may lie after all [m/s, rad/s]."""
+"""Residual of an active constraint up to which a solution counts [m/s, rad/s]: below what any row or limit means."""
 _DEPENDENT = 1e-11
-"""Share of a constraint's normal, in the metric P⁻¹, below which the active ones are said to contain it."""
+"""Share of a constraint's normal, squared in the metric P⁻¹, below which it depends on the active ones [-]: round-off
+of the projection."""
 
 
 @compiled
 def project(
-    A: Array, regularization: float, v_tracking: Array, J: Array, least: Array, lower: Array, upper: Array
+    A: Array, regularization: float, v_tracking: Array, J: Array, b: Array, lower: Array, upper: Array
 ) -> tuple[Array, bool]:
-    """`project_soft` with no soft rows."""
-    return project_soft(A, regularization, v_tracking, J, least, lower, upper, np.zeros(len(least)))
-
-
-@compiled
-def project_soft(
-    A: Array, regularization: float, v_tracking: Array, J: Array, least: Array, lower: Array, upper: Array, soft: Array
-) -> tuple[Array, bool]:
-    """The velocity closest to v0 in the metric P = AᵀA + λ with J v >= least and lower <= v <= upper.
-
-    Rows may be soft: one falls short of its right-hand side at the cost of ½ (what it lacks)² / its softness.
+    """Compute the velocity of least tracking cost that meets all rows and bounds: `project_soft` without soft rows.
 
     Args:
         A: tracking rows (r, nv).
         regularization: λ.
-        v_tracking: wanted velocity (nv,).
+        v_tracking: velocity of least cost (nv,) [rad/s or m/s].
         J: avoidance rows (k, nv).
-        least: their right-hand sides (k,).
-        lower: lower bounds (nv,).
-        upper: upper bounds (nv,).
-        soft: softness of the rows (k,); 0 of those that have to be met.
+        b: their right-hand sides (k,) [m/s].
+        lower: lower bounds (nv,) [rad/s or m/s].
+        upper: upper bounds (nv,) [rad/s or m/s].
 
     Returns:
-        (nv,), and whether it is the answer; if not, no point meets all constraints, or round-off got in the way.
+        See `project_soft`.
+    """
+    return project_soft(A, regularization, v_tracking, J, b, lower, upper, np.zeros(len(b)))
+
+
+@compiled
+def project_soft(
+    A: Array, regularization: float, v_tracking: Array, J: Array, b: Array, lower: Array, upper: Array, soft: Array
+) -> tuple[Array, bool]:
+    """Compute the velocity closest to v_tracking in the metric P = AᵀA + λ I with J v >= b, lower <= v <= upper.
+
+    Rows may be soft: one is violated by s at the cost of ½ s² / its softness.
+
+    Args:
+        A: tracking rows (r, nv).
+        regularization: λ.
+        v_tracking: velocity of least cost (nv,) [rad/s or m/s].
+        J: avoidance rows (k, nv).
+        b: their right-hand sides (k,) [m/s].
+        lower: lower bounds (nv,) [rad/s or m/s].
+        upper: upper bounds (nv,) [rad/s or m/s].
+        soft: softness of the rows (k,); 0 of hard ones.
+
+    Returns:
+        v (nv,), and whether it is the minimiser; if not, no point meets all hard constraints, or round-off prevented
+        an answer.
     """
     rows, nv = A.shape
     P = np.zeros((nv, nv))
@@ -61,7 +77,7 @@ def project_soft(
     for i in range(nv):
         P[i, i] += regularization
     v = v_tracking.copy()
-    if not minimize(P, v, J, least, lower, upper, soft):
+    if not minimize(P, v, J, b, lower, upper, soft):
         return v, False
     for i in range(nv):
         v[i] = min(max(v[i], lower[i]), upper[i])
@@ -71,7 +87,7 @@ def project_soft(
 
 
 @compiled
-def farthest(
+def max_clearance_velocity(
     h: float,
     closest: Array,
     J: Array,
@@ -83,46 +99,54 @@ def farthest(
     lower: Array,
     upper: Array,
 ) -> tuple[Array, bool]:
-    """max s - ½ s²/c - ε/2c ‖w - v‖² over w and s, with d + h (J w + ḋ_obs) >= s, lower <= w <= upper, s <= c.
+    """Compute the velocity w of largest clearance s at the horizon, to first order.
+
+        max s - ½ s²/c - ε/2c ‖w - v‖²  over w and s,  with d + h (J w + ḋ_obs) >= s,  lower <= w <= upper,  s <= c.
+
+    Times c, that is a QP in (w, s) with the Hessian diag(ε, …, ε, 1) and the unconstrained minimiser (v, c).
 
     Args:
         h: horizon [s].
         closest: d first (k, 10) [m].
         J: velocity Jacobian of these distances (k, nv).
         feedforward: ḋ_obs (k,) [m/s].
-        comfort: c, where the slope of the objective in s has come to nothing.
-        deepest: s is not below its negative.
-        low_effort: ε.
-        v: (nv,).
-        lower: lower bounds (nv,).
-        upper: upper bounds (nv,).
+        comfort: c, clearance from which the objective no longer grows [m].
+        deepest: s is at least the negative of this [m].
+        low_effort: ε [m²/(rad/s)²].
+        v: velocity without a clearance to gain (nv,) [rad/s or m/s].
+        lower: lower bounds (nv,) [rad/s or m/s].
+        upper: upper bounds (nv,) [rad/s or m/s].
 
     Returns:
-        w (nv,), and whether it is the answer; if not, round-off got in the way, or s would lie too deep.
+        w (nv,), and whether it is the maximiser; if not, round-off prevented an answer, or s would be below -`deepest`.
     """
     k, n = J.shape
-    P, G, least = np.zeros((n + 1, n + 1)), np.empty((k, n + 1)), np.empty(k)
+    P, G, rhs = np.zeros((n + 1, n + 1)), np.empty((k, n + 1)), np.empty(k)
     x, low, high = np.empty(n + 1), np.empty(n + 1), np.empty(n + 1)
     for i in range(n):
         P[i, i], x[i], low[i], high[i] = low_effort, v[i], lower[i], upper[i]
     for j in range(k):
-        least[j] = -(closest[j, 0] + h * feedforward[j])
+        rhs[j] = -(closest[j, 0] + h * feedforward[j])
         for i in range(n):
             G[j, i] = h * J[j, i]
     P[n, n], x[n], low[n], high[n] = 1.0, comfort, -deepest, comfort
     G[:, n] = -1.0
-    met = minimize(P, x, G, least, low, high, np.zeros(k))
-    return x[:n], met
+    solved = minimize(P, x, G, rhs, low, high, np.zeros(k))
+    return x[:n], solved
 
 
 @compiled
 def minimize(P: Array, x: Array, G: Array, h: Array, lower: Array, upper: Array, soft: Array) -> bool:
-    """Moves x from the minimiser of ½ (x - x0)ᵀP (x - x0) to the one with G x >= h, lower <= x <= upper.
+    """Move x from the minimiser of ½ (x - x0)ᵀP (x - x0) to the one with G x >= h, lower <= x <= upper.
 
-    With the multiplier u, a row of softness c falls short by c u: in the dual, softness adds to the diagonal of S.
+    The most violated constraint p, with normal n_p, enters: with the normals N of the active constraints, W = P⁻¹N,
+    w_p = P⁻¹n_p and S = NᵀW, its primal direction is z = w_p - W r, with S r = Nᵀw_p, and its dual direction is -r on
+    the multipliers of the active ones. The step is the shorter of the one that meets the constraint,
+    violation / n_pᵀz, and the longest one that keeps all multipliers positive, after which a constraint leaves. A row
+    of softness c and multiplier u is violated by c u: in the dual, softness adds to the diagonal of S.
 
-    The active constraints' normals N and what they become, W = P⁻¹N, are kept, with a Cholesky factor of S = NᵀW: few
-    constraints bind at a time, so that this is less work than to keep an orthogonal basis of the whole space.
+    N and W are stored, with a Cholesky factor R of S: few constraints bind at a time, so that this is less work than to
+    update an orthogonal basis of the whole space.
 
     Args:
         P: positive definite (n, n); its lower triangle is read.
@@ -134,32 +158,32 @@ def minimize(P: Array, x: Array, G: Array, h: Array, lower: Array, upper: Array,
         soft: softness of the rows (m,); see `project_soft`.
 
     Returns:
-        Whether x now solves the problem; if not, it is infeasible or too badly conditioned.
+        Whether x now is the minimiser; if not, the problem is infeasible or too badly conditioned.
     """
     n, m = len(x), len(h)
     L = np.zeros((n, n))
     _factorise(P, L, n)
-    most = n + np.count_nonzero(soft)  # constraints that can be active at a time
-    N, W = np.zeros((most + 1, n)), np.zeros((most + 1, n))
-    S, R = np.zeros((most + 1, most + 1)), np.zeros((most + 1, most + 1))
-    active, u = np.empty(most + 1, np.intp), np.zeros(most + 1)
-    r, z, bound = np.empty(most + 1), np.empty(n), h.copy()
-    met = np.zeros(2 * n + m, np.bool_)  # active ones are, but for round-off
+    capacity = n + np.count_nonzero(soft)  # constraints that can be active at a time
+    N, W = np.zeros((capacity + 1, n)), np.zeros((capacity + 1, n))
+    S, R = np.zeros((capacity + 1, capacity + 1)), np.zeros((capacity + 1, capacity + 1))
+    active, u = np.empty(capacity + 1, np.intp), np.zeros(capacity + 1)
+    r, z, bound = np.empty(capacity + 1), np.empty(n), h.copy()
+    met = np.zeros(2 * n + m, np.bool_)  # the active ones, up to round-off
     count = 0
     for _ in range(10 * (n + m)):
         p, violation = _most_violated(x, G, bound, lower, upper, met)
         if violation <= _TOLERANCE:
-            off = 0.0
+            residual = 0.0
             for j in range(count):
-                off = max(off, abs(_slack(active[j], x, G, bound, lower, upper)))
-            return off <= _ROUND_OFF
+                residual = max(residual, abs(_slack(active[j], x, G, bound, lower, upper)))
+            return residual <= _ROUND_OFF
         if np.isnan(violation):
             return False
-        _enter(p, N[count], G)
+        _write_normal(p, N[count], G)
         _solve(L, N[count], W[count], n)
         u[count] = 0.0
-        give = soft[p - 2 * n] if p >= 2 * n else 0.0
-        square = _dot(N[count], W[count]) + give
+        softness = soft[p - 2 * n] if p >= 2 * n else 0.0
+        square = _dot(N[count], W[count]) + softness
         while True:
             for j in range(count):
                 S[count, j] = _dot(N[j], W[count])
@@ -168,14 +192,14 @@ def minimize(P: Array, x: Array, G: Array, h: Array, lower: Array, upper: Array,
             for j in range(count):
                 for i in range(n):
                     z[i] -= r[j] * W[j, i]
-            free = _dot(N[count], z) + give
+            curvature = _dot(N[count], z) + softness
             # the longest step that keeps all multipliers positive, and the one that reaches the constraint
             dual_step, leaving = np.inf, -1
             for j in range(count):
                 if r[j] > 0.0 and u[j] / r[j] < dual_step:
                     dual_step, leaving = u[j] / r[j], j
-            reachable = count < most and free > _DEPENDENT * square
-            step = min(dual_step, violation / free) if reachable else dual_step
+            reachable = count < capacity and curvature > _DEPENDENT * square
+            step = min(dual_step, violation / curvature) if reachable else dual_step
             if step == np.inf:
                 return False
             if reachable:
@@ -183,17 +207,17 @@ def minimize(P: Array, x: Array, G: Array, h: Array, lower: Array, upper: Array,
                     x[i] += step * z[i]
             for j in range(count):
                 u[j] -= step * r[j]
-                _settle(active[j], u[j], bound, h, soft, n)
+                _update_soft_row(active[j], u[j], bound, h, soft, n)
             u[count] += step
-            _settle(p, u[count], bound, h, soft, n)
-            if reachable and step == violation / free:
+            _update_soft_row(p, u[count], bound, h, soft, n)
+            if reachable and step == violation / curvature:
                 S[count, count] = square
                 _extend(S, R, count)
                 active[count], met[p] = p, True
                 count += 1
                 break
             met[active[leaving]] = False
-            _settle(active[leaving], 0.0, bound, h, soft, n)
+            _update_soft_row(active[leaving], 0.0, bound, h, soft, n)
             _drop(N, W, S, R, active, u, leaving, count)
             count -= 1
             violation = -_slack(p, x, G, bound, lower, upper)
@@ -201,14 +225,24 @@ def minimize(P: Array, x: Array, G: Array, h: Array, lower: Array, upper: Array,
 
 
 @compiled
-def _settle(p: int, multiplier: float, bound: Array, h: Array, soft: Array, n: int) -> None:
-    """Writes what a row asks for once its multiplier has made it give."""
+def _update_soft_row(p: int, multiplier: float, bound: Array, h: Array, soft: Array, n: int) -> None:
+    """Write the right-hand side of soft row p at its multiplier: h - softness times multiplier.
+
+    Args:
+        p: number of the constraint; bounds and hard rows are not changed.
+        multiplier: its multiplier.
+        bound: right-hand sides with their softness (m,); overwritten.
+        h: right-hand sides (m,).
+        soft: softness of the rows (m,).
+        n: number of variables.
+    """
     if p >= 2 * n:
         bound[p - 2 * n] = h[p - 2 * n] - soft[p - 2 * n] * multiplier
 
 
 @compiled
 def _dot(a: Array, b: Array) -> float:
+    """Compute aᵀb of two vectors (n,)."""
     total = 0.0
     for i in range(len(a)):
         total += a[i] * b[i]
@@ -217,14 +251,17 @@ def _dot(a: Array, b: Array) -> float:
 
 @compiled
 def _factorise(M: Array, L: Array, n: int) -> None:
-    """Writes the lower Cholesky factor of the first n rows and columns of M."""
+    """Write to L the lower Cholesky factor of the first n rows and columns of M; see `_extend`."""
     for i in range(n):
         _extend(M, L, i)
 
 
 @compiled
 def _extend(M: Array, L: Array, i: int) -> None:
-    """Writes row i of the Cholesky factor, on the diagonal the inverse of it; NaN where M is not positive definite."""
+    """Write row i of the Cholesky factor L of M, given the rows before; NaN where M is not positive definite.
+
+    The diagonal has the inverses: 1 / L_ii, as divisions are slow.
+    """
     for j in range(i):
         total = M[i, j]
         for c in range(j):
@@ -238,7 +275,7 @@ def _extend(M: Array, L: Array, i: int) -> None:
 
 @compiled
 def _solve(L: Array, b: Array, y: Array, n: int) -> None:
-    """Writes the solution of L Lᵀ y = b, of the first n rows and columns."""
+    """Write to y the solution of L Lᵀ y = b, of the first n rows and columns; the diagonal of L is inverted."""
     for i in range(n):
         total = b[i]
         for c in range(i):
@@ -251,8 +288,14 @@ def _solve(L: Array, b: Array, y: Array, n: int) -> None:
 
 
 @compiled
-def _enter(p: int, normal: Array, G: Array) -> None:
-    """Writes the normal of constraint p, pointing inwards."""
+def _write_normal(p: int, normal: Array, G: Array) -> None:
+    """Write the normal of constraint p, pointing inwards: n lower bounds, n upper bounds, then the rows.
+
+    Args:
+        p: number of the constraint.
+        normal: out (n,).
+        G: rows (m, n).
+    """
     n = len(normal)
     if p < 2 * n:
         normal[:] = 0.0
@@ -263,7 +306,20 @@ def _enter(p: int, normal: Array, G: Array) -> None:
 
 @compiled
 def _drop(N: Array, W: Array, S: Array, R: Array, active: IntArray, u: Array, leaving: int, count: int) -> None:
-    """Takes constraint number `leaving` out of the active set of `count`; what enters moves up with its multiplier."""
+    """Remove constraint number `leaving` from the `count` active ones, and update the factor R.
+
+    The constraint that is about to enter, number `count`, moves up with its multiplier.
+
+    Args:
+        N: normals (·, n).
+        W: P⁻¹ times these (·, n).
+        S: lower triangle of NᵀW.
+        R: its Cholesky factor, see `_extend`.
+        active: numbers of the active constraints.
+        u: their multipliers, then that of the entering one.
+        leaving: place of the constraint in `active`.
+        count: number of active constraints.
+    """
     for j in range(leaving, count):
         u[j], N[j], W[j] = u[j + 1], N[j + 1], W[j + 1]
     for j in range(leaving, count - 1):
@@ -275,7 +331,16 @@ def _drop(N: Array, W: Array, S: Array, R: Array, active: IntArray, u: Array, le
 
 @compiled
 def _slack(p: int, x: Array, G: Array, h: Array, lower: Array, upper: Array) -> float:
-    """How far inside constraint p the point x lies: n lower bounds, n upper bounds, then the rows; negative outside."""
+    """Compute the slack of constraint p at x, negative outside: n lower bounds, n upper bounds, then the rows.
+
+    Args:
+        p: number of the constraint.
+        x: point (n,).
+        G: rows (m, n).
+        h: right-hand sides (m,).
+        lower: lower bounds (n,).
+        upper: upper bounds (n,).
+    """
     n = len(x)
     if p < n:
         return x[p] - lower[p]
@@ -291,7 +356,19 @@ def _slack(p: int, x: Array, G: Array, h: Array, lower: Array, upper: Array) -> 
 def _most_violated(
     x: Array, G: Array, h: Array, lower: Array, upper: Array, met: npt.NDArray[np.bool_]
 ) -> tuple[int, float]:
-    """Which constraint x violates most, and by how much, without those that are met; NaN in a row shows."""
+    """Find the most violated constraint at x, the met ones left out, and its violation; NaN in a row is returned.
+
+    Args:
+        x: point (n,).
+        G: rows (m, n).
+        h: right-hand sides (m,).
+        lower: lower bounds (n,).
+        upper: upper bounds (n,).
+        met: constraints that are not considered (2 n + m,).
+
+    Returns:
+        Number of the constraint, and its violation, negative inside.
+    """
     n = len(x)
     worst, violation = -1, -np.inf
     for i in range(n):

@@ -1,4 +1,4 @@
-"""Rotations as vectors, in closed form: plain Python for tasks, compiled where a kernel calls it."""
+"""Rotation vectors in closed form: plain Python for tasks, compiled where a kernel calls it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,12 @@ from typing import Any
 def rotation_vector(R: Any) -> tuple[float, float, float]:
     """Compute the rotation vector [rad] of a rotation R[i][j], with an angle up to and including π.
 
-    By way of the quaternion, whose largest component is taken first, so that nothing is lost near half a turn.
+    The quaternion [cos ½θ, n sin ½θ] is read from R by its largest component first (Shepperd 1978, "Quaternion from
+    rotation matrix"), so that no digits are lost near half a turn; the vector is θ n. At half a turn, n and -n are the
+    same rotation: either may be returned.
+
+    Args:
+        R: rotation (3, 3), by rows.
     """
     trace = R[0][0] + R[1][1] + R[2][2]
     if trace >= max(R[0][0], R[1][1], R[2][2]):

@@ -1,4 +1,4 @@
-"""All rows and bounds of a tick in one call, and whether the tracking law meets them."""
+"""All rows and bounds of a control step in one call, and the violation of them by the tracking law."""
 
 from __future__ import annotations
 
@@ -7,56 +7,74 @@ from typing import Any
 import numpy as np
 
 from qpavoid.kernels.bounds import velocity_bounds
-from qpavoid.kernels.clearance import tracking_clear
+from qpavoid.kernels.braking_trajectory import stop_velocity
+from qpavoid.kernels.clearance import is_tracking_clear
 from qpavoid.kernels.packing import compiled
 from qpavoid.kernels.rows import distance_rows, row_bounds
-from qpavoid.kernels.stops import stop_velocity
 from qpavoid.kernels.tasks import damped_solution, frame_rows
 from qpavoid.problem import Array, IntArray
 
 
 @compiled
-def assemble(x: Any, q: Array, pairs: IntArray, reach: float, moving: bool) -> tuple[int, float, bool, float]:
-    """Write all rows and bounds of a tick, and the tracking law's velocity.
+def assemble(
+    x: Any, q: Array, pairs: IntArray, influence_distance: float, moving: bool
+) -> tuple[int, float, bool, float]:
+    """Write all rows and bounds of a control step, and the tracking law's velocity.
 
     Args:
-        x: memory of the tick; its outputs are overwritten.
+        x: memory of the step; its outputs are overwritten, see `RowLayout`.
         q: configuration (nq,).
-        pairs: those whose results are of this tick (c,), increasing.
-        reach: surface distance below which a pair is near [m].
+        pairs: those whose results are of this step (c,), increasing.
+        influence_distance: surface distance below which a pair is near [m].
         moving: whether any obstacle moves.
 
     Returns:
-        Number k of near pairs; by how much the tracking law's velocity violates the worst of rows and bounds
-        (negative inside, NaN where there is one); whether it is safe, checked, and its way surely clear; distance
-        to the nearest position limit [rad, m].
+        Number k of near pairs; largest violation of rows and bounds by the tracking law's velocity [m/s, rad/s]
+        (negative inside, NaN where there is one); whether that velocity is safe, its clearance is bounded
+        (`looks_ahead`) and the bound suffices; distance to the nearest position limit [rad, m].
     """
     frame_rows(x)
-    room = velocity_bounds(x, q)
+    margin = velocity_bounds(x, q)
     stop_velocity(x)
     damped_solution(x, x.v_tracking)
-    k = distance_rows(x, pairs, reach, moving)
+    k = distance_rows(x, pairs, influence_distance, moving)
     row_bounds(x, k, moving)
     worst = tracking_violation(x, k)
-    clear = x.looks_ahead and worst <= 0.0 and tracking_clear(x, q, k, reach)
-    return k, worst, clear, room
+    clear = x.looks_ahead and worst <= 0.0 and is_tracking_clear(x, q, k, influence_distance)
+    return k, worst, clear, margin
 
 
 @compiled
 def tracking_violation(x: Any, k: int) -> float:
-    """Compute `violation` of v0, with the first k rows."""
-    return violation(x.v_tracking, x.J[:k], x.least[:k], x.lower, x.upper)
+    """Compute the `violation` of the first k rows and the bounds by the tracking law's velocity [m/s, rad/s].
+
+    Args:
+        x: reads v_tracking, J, rhs, lower and upper.
+        k: number of near pairs.
+    """
+    return violation(x.v_tracking, x.J[:k], x.rhs[:k], x.lower, x.upper)
 
 
 @compiled
 def violation(v: Array, J: Array, b: Array, lower: Array, upper: Array) -> float:
-    """Compute the largest violation of J v >= b and lower <= v <= upper; negative inside, NaN where there is one."""
+    """Compute the largest violation of J v >= b and lower <= v <= upper by v [m/s, rad/s].
+
+    Args:
+        v: velocity (n,).
+        J: rows (k, n).
+        b: right-hand sides (k,).
+        lower: lower bounds (n,).
+        upper: upper bounds (n,).
+
+    Returns:
+        max(b - J v, v - upper, lower - v): negative inside, NaN where there is one.
+    """
     worst = -np.inf
     for i in range(len(v)):
         worst = np.maximum(worst, np.maximum(v[i] - upper[i], lower[i] - v[i]))  # keeps NaN, unlike max
     for k in range(len(b)):
-        short = b[k]
+        missing = b[k]
         for i in range(len(v)):
-            short -= J[k, i] * v[i]
-        worst = np.maximum(worst, short)
+            missing -= J[k, i] * v[i]
+        worst = np.maximum(worst, missing)
     return worst

@@ -11,8 +11,9 @@ from qpavoid.kernels.rotation import rotation_vector
 from qpavoid.kernels.rows import _fold
 from qpavoid.problem import Array
 
-WELL_CONDITIONED = 1e-6
-"""Ratio of the smallest to the largest pivot of J Jᵀ down to which J⁺ is taken from it without damping."""
+MIN_PIVOT_RATIO = 1e-6
+"""Ratio of the smallest to the largest pivot of J Jᵀ down to which J⁺ is taken from it without damping [-]: half of the
+digits of a double are left."""
 
 _rotation_vector = compiled(rotation_vector)
 
@@ -21,37 +22,41 @@ _rotation_vector = compiled(rotation_vector)
 def frame_rows(x: Any) -> None:
     """Write the rows A v = b of f frames that follow targets: feed-forward plus gain times error, capped and scaled.
 
-    The orientation error is the rotation vector of R_target Rᵀ. Three linear rows for each frame whose position counts
-    come first, then three angular rows for each whose orientation does; rows after these are left as they are.
+    A linear row has the direction e of a world axis: e·(v_p + ω × p) = [e, p × e]ᵀ J_world v with the frame's position
+    p, and b = ẋ_ref + K (x_ref - x). An angular row is e·ω with b = ω_ref + K e·θ, where θ is the rotation vector of
+    R_ref Rᵀ, see `rotation_vector`. The three right-hand sides of a frame are scaled down together to its largest
+    speed, then every row with the root of its weight. Three linear rows for each frame whose position counts come
+    first, then three angular rows for each whose orientation does; rows after these are not changed.
 
     Args:
-        x: reads frame_poses, targets and the layout of the tasks; writes poses, A, b.
+        x: reads J_world, frame_poses, frame_ids, targets, oriented, gain, cap, scale and task_support; writes poses
+            (f, 12), the moments of row_wrenches, and the first rows of A (r, n) and b (r,) [m/s, rad/s].
     """
     poses, targets, row_wrenches, support, A, b = x.poses, x.targets, x.row_wrenches, x.task_support, x.A, x.b
     J_world = np.ascontiguousarray(x.J_world)  # rows in one piece become vector instructions
     rows, columns = len(row_wrenches), J_world.shape[1]
-    moving = rows // 3 - len(x.turns)
+    positioned = rows // 3 - len(x.oriented)
     for f in range(len(poses)):
         for c in range(12):
             poses[f, c] = x.frame_poses[x.frame_ids[f], c]
-    for f in range(moving):
+    for f in range(positioned):
         r, px, py, pz = 3 * f, poses[f, 9], poses[f, 10], poses[f, 11]
         row_wrenches[r, 4], row_wrenches[r, 5] = pz, -py
         row_wrenches[r + 1, 3], row_wrenches[r + 1, 5] = -pz, px
         row_wrenches[r + 2, 3], row_wrenches[r + 2, 4] = py, -px
         for i in range(3):
             b[r + i] = targets[f, 12 + i] + x.gain[f] * (targets[f, i] - poses[f, 9 + i])
-    missing = np.empty((3, 3))
-    for n in range(len(x.turns)):
-        f = x.turns[n]
+    R_error = np.empty((3, 3))
+    for n in range(len(x.oriented)):
+        f = x.oriented[n]
         for i in range(3):
             for j in range(3):
-                missing[i, j] = 0.0
+                R_error[i, j] = 0.0
                 for c in range(3):
-                    missing[i, j] += targets[f, 3 + 3 * i + c] * poses[f, 3 * c + j]
-        errors = _rotation_vector(missing)
+                    R_error[i, j] += targets[f, 3 + 3 * i + c] * poses[f, 3 * c + j]
+        errors = _rotation_vector(R_error)
         for i in range(3):
-            b[3 * (moving + n) + i] = targets[f, 15 + i] + x.gain[f] * errors[i]
+            b[3 * (positioned + n) + i] = targets[f, 15 + i] + x.gain[f] * errors[i]
     for part in range(len(x.cap)):
         r = 3 * part
         speed = np.sqrt(b[r] * b[r] + b[r + 1] * b[r + 1] + b[r + 2] * b[r + 2])
@@ -60,7 +65,7 @@ def frame_rows(x: Any) -> None:
                 b[r + i] *= x.cap[part] / speed
     for r in range(rows):
         b[r] *= x.scale[r]
-        row = x.mimicking if x.mimics else A[r]
+        row = x.unfolded_row if x.has_mimics else A[r]
         lx, ly, lz, ax, ay, az = (
             row_wrenches[r, 0],
             row_wrenches[r, 1],
@@ -73,17 +78,20 @@ def frame_rows(x: Any) -> None:
             linear = lx * J_world[0, c] + ly * J_world[1, c] + lz * J_world[2, c]
             angular = ax * J_world[3, c] + ay * J_world[4, c] + az * J_world[5, c]
             row[c] = (linear + angular) * support[r, c]
-        if x.mimics:
+        if x.has_mimics:
             _fold(row, x.columns, A[r])
 
 
 @compiled
 def damped_solution(x: Any, v: Array) -> None:
-    """Write A⁺b with A⁺ = Aᵀ (A Aᵀ + λ²)⁻¹, by a Cholesky factorisation of the Gram matrix, row by row.
+    """Write v = A⁺b with A⁺ = Aᵀ (A Aᵀ + λ²)⁻¹, by a Cholesky factorisation of the Gram matrix, row by row.
+
+    L Lᵀ = A Aᵀ + λ² I; L y = b is solved as the rows of L are made, then Lᵀ z = y backwards, and v = Aᵀ z.
 
     Args:
         x: reads A (r, n), b (r,) and the damping λ.
-        v: out (n,); 0 where there are no rows, NaN where there is no damping and A Aᵀ is close to singular.
+        v: out (n,); 0 where there are no rows, NaN where there is no damping and A Aᵀ is close to singular
+            [rad/s or m/s].
     """
     A, b, damping = x.A, x.b, x.damping
     rows, nv = A.shape
@@ -101,7 +109,7 @@ def damped_solution(x: Any, v: Array) -> None:
                 dot -= L[i, c] * L[j, c]
             if i == j:
                 smallest, largest = min(smallest, dot), max(largest, dot)
-                if not dot > 0.0 or (damping == 0.0 and smallest < WELL_CONDITIONED * largest):
+                if not dot > 0.0 or (damping == 0.0 and smallest < MIN_PIVOT_RATIO * largest):
                     v[:] = np.nan
                     return
                 inverse[i] = 1.0 / np.sqrt(dot)
@@ -122,7 +130,16 @@ def damped_solution(x: Any, v: Array) -> None:
 
 @compiled
 def projection_cost(A: Array, regularization: float, v_tracking: Array) -> tuple[Array, Array]:
-    """Compute P = AᵀA + λ (n, n) and q = -P v0 (n,): ½ vᵀP v + qᵀv is smallest at v0."""
+    """Compute the cost ½ vᵀP v + qᵀv that is smallest at v_tracking: ½ ‖A (v - v_tracking)‖² + ½ λ ‖v - v_tracking‖².
+
+    Args:
+        A: task rows (r, n).
+        regularization: λ.
+        v_tracking: velocity of least cost (n,).
+
+    Returns:
+        P = AᵀA + λ I (n, n) and q = -P v_tracking (n,).
+    """
     rows, nv = A.shape
     P = np.empty((nv, nv))
     q = np.zeros(nv)

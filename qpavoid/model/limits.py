@@ -87,8 +87,8 @@ def limit_layout(joints: JointBounds, position_gain: float, dt: float) -> dict[s
     share `position_gain` of what is left to a position limit in one tick; a joint with one keeps to the speeds from
     which it can still brake (`kernels.speed_to_stop`), so that position, velocity and acceleration
     limits never contradict each other once they are met; where its jerk has a limit, too, it keeps to the velocities
-    from which a stop within all of these ends in time (`kernels.stopping`). A joint outside its limits is sent back, at
-    no more than its largest speed. Bounds never cross: from a state that no braking can save, the jerk limit gives
+    from which a stop within all of these ends in time (`kernels.braking_bounds`). A joint outside its limits returns
+    at no more than its largest speed. Bounds never cross: from a state that no braking can save, the jerk limit gives
     way, then that of the acceleration.
 
     Args:
@@ -97,7 +97,9 @@ def limit_layout(joints: JointBounds, position_gain: float, dt: float) -> dict[s
         dt: length of a tick [s].
     """
     nv = len(joints.velocity)
-    accelerated, jerked = (bool(np.isfinite(limits).any()) for limits in (joints.acceleration, joints.jerk))
+    acceleration_limited, jerk_limited = (
+        bool(np.isfinite(limits).any()) for limits in (joints.acceleration, joints.jerk)
+    )
     lower, upper = np.zeros(nv), np.zeros(nv)
     return {
         "q_index": joints.q_index,
@@ -110,14 +112,14 @@ def limit_layout(joints: JointBounds, position_gain: float, dt: float) -> dict[s
         "dv_step": joints.jerk * dt**2,
         "dv_prev": np.zeros(nv),
         "v_stop": np.zeros(nv),
-        "hard_lower": np.zeros(nv) if accelerated else lower,
-        "hard_upper": np.zeros(nv) if accelerated else upper,
+        "hard_lower": np.zeros(nv) if acceleration_limited else lower,
+        "hard_upper": np.zeros(nv) if acceleration_limited else upper,
         "lower": lower,
         "upper": upper,
-        "rate": position_gain / dt,
+        "position_rate": position_gain / dt,
         "dt": dt,
-        "accelerated": accelerated,
-        "jerked": jerked,
+        "acceleration_limited": acceleration_limited,
+        "jerk_limited": jerk_limited,
     }
 
 

@@ -142,7 +142,7 @@ class Recorder:
         values = {
             "t": state.t,
             "slack": 0.0 if solution.slack is None else float(np.max(solution.slack, initial=0.0)),
-            "share": solution.share,
+            "share": solution.command_scale,
             "stalled": bool(solution.stalled),
             "severity": solution.severity or 0,
             "saturation": solution.saturation,

@@ -17,7 +17,7 @@ from qpavoid.errors import NumericalError
 from qpavoid.kernels import TOLERANCE
 from qpavoid.model.limits import JointBounds, saturate
 from qpavoid.model.scene import Scene
-from qpavoid.problem import Array, Problem, Proximity, Solution, Status, sane
+from qpavoid.problem import Array, Problem, Proximity, Solution, Status, is_finite_and_bounded
 from qpavoid.reason import Reason, ReasonKind, Severity
 from qpavoid.safety.backup import BackupPlanner
 from qpavoid.safety.braking import BrakingCheck
@@ -123,11 +123,16 @@ class Arbiter:
                 problem = self.progress.redirect(problem, proximity, self._assembly, self.solver)
                 if problem.levels and isinstance(self.solver, Hqp):  # v0 is not a cascade's
                     problem = self._assembly.prioritised(problem, self.solver.tracked)
-                elif problem.jerked:
+                elif problem.jerk_limited:
                     problem = self._assembly.eased(problem)
             solution = self.solver.solve(problem)
             v = solution.v
-            usable = v.dtype == np.float64 and v.shape == self._v_shape and sane(v) and _well_formed(problem, solution)
+            usable = (
+                v.dtype == np.float64
+                and v.shape == self._v_shape
+                and is_finite_and_bounded(v)
+                and _well_formed(problem, solution)
+            )
         except Exception as error:  # a law of the user's own may raise anything; the robot must get a velocity
             raised = Reason.of(ReasonKind.SOLVER_FAILED, detail=f"it raised {type(error).__name__}: {error}")
             return _stop(problem, (raised,))
@@ -159,13 +164,13 @@ class Arbiter:
             return solution
         v, share, short, pair, distance = checked
         if short <= TOLERANCE:
-            return solution._replace(v=v, share=share)
+            return solution._replace(v=v, command_scale=share)
         names = self._scene.pair_names[pair]
         if short != short:
             return _stop(problem, (*solution.reasons, Reason.of(ReasonKind.UNKNOWN_DISTANCE, *names)))
         severity = Severity.ALARM if distance < 0.0 else Severity.WARNING
         missing = Reason.of(ReasonKind.PREDICTED_TOO_NEAR, *names, amount=short, unit="m", severity=severity)
-        return solution._replace(v=v, share=share).relaxed(missing)
+        return solution._replace(v=v, command_scale=share).with_reasons(missing)
 
     def _with_a_way_out(
         self, backup: BackupPlanner, q: Array, t: float, proximity: Proximity, problem: Problem, solution: Solution
@@ -174,10 +179,10 @@ class Arbiter:
             v = backup.check(q, solution.v, t, self._assembly.v_prev, self._assembly.dv_prev, proximity)
         except NumericalError as error:  # of what is to come; it is raised when it has come
             why = f"prediction of an {error}"
-            return solution.relaxed(Reason.of(ReasonKind.NO_BACKUP, severity=Severity.WARNING, detail=why))
+            return solution.with_reasons(Reason.of(ReasonKind.NO_BACKUP, severity=Severity.WARNING, detail=why))
         if v is None:
             return solution
-        return solution._replace(v=np.clip(v, problem.lower, problem.upper)).relaxed(Reason.of(ReasonKind.BACKUP))
+        return solution._replace(v=np.clip(v, problem.lower, problem.upper)).with_reasons(Reason.of(ReasonKind.BACKUP))
 
     def _with_limits_passed(self, problem: Problem, solution: Solution) -> Solution:
         """Says which accelerations and jerks pass their limits, where bounds had to: to get back from where a relaxed
@@ -193,7 +198,7 @@ class Arbiter:
             for j in np.flatnonzero(excess > _LIMIT_TOLERANCE).tolist()
             if (problem.joint_names[j],) not in named
         ]
-        return solution.relaxed(*passed) if passed else solution
+        return solution.with_reasons(*passed) if passed else solution
 
 
 def _well_formed(problem: Problem, solution: Solution) -> bool:

@@ -145,7 +145,7 @@ class BrakingCheck:
             reach: surface distance up to which they were looked for [m].
         """
         v, v_stop, rows = solution.v, problem.v_stop, problem.avoidance
-        if problem.clear and v.tobytes() == problem.v_tracking.tobytes():
+        if problem.tracking_is_clear and v.tobytes() == problem.v_tracking.tobytes():
             return None
         near = rows.pair
         stop = assembly.stop(q, v) if self._jerked else None

@@ -38,7 +38,9 @@ class Ramps:
         self._fastest = np.minimum(bounds.velocity, _UNLIMITED)
         if self.jerked:
             rest = np.zeros(len(bounds.jerk))
-            kernels.easing_stop(rest, rest, self.steps.v_step, self.steps.dv_step)  # no tick waits for the compiler
+            kernels.jerk_limited_stop(
+                rest, rest, self.steps.v_step, self.steps.dv_step
+            )  # no tick waits for the compiler
 
     def towards(self, v: Array, w: Array, wanted: Array, held: bool = False, meets: bool = False) -> Array:
         """The velocities of some ticks, as close to what is wanted as the limits allow.
@@ -71,7 +73,7 @@ class Ramps:
         v_step, dv_step = self.steps.v_step, (_PLANNED if held else 1.0) * self.steps.dv_step
         low, high, change = np.maximum(-v_step, w - dv_step), np.minimum(v_step, w + dv_step), target - v
         if held or ((change < low - kernels.ROUND_OFF) | (change > high + kernels.ROUND_OFF)).any():
-            change = change + kernels.easing_stop(rate - change, w - rate, v_step, dv_step)
+            change = change + kernels.jerk_limited_stop(rate - change, w - rate, v_step, dv_step)
         room = np.maximum(np.array([self._fastest + v, self._fastest - v]), 0.0)
         down, up = kernels.speed_to_stop(room, dv_step, 1.0)  # from any greater change it would pass its speed limit
         change = np.minimum(np.maximum(change, -down), up)

@@ -71,7 +71,7 @@ class ProgressWatch:
             solution: what is commanded.
         """
         A, given_up = problem.tracking.A, self._detours.given_up if self._detours is not None else ()
-        if not len(A) or (problem.violation <= 0.0 and solution.share == 1.0):
+        if not len(A) or (problem.violation <= 0.0 and solution.command_scale == 1.0):
             self._without = 0.0
             return given_up
         self._clock += 1

@@ -261,5 +261,7 @@ class Flights:
 def _farthest(near: Near, manner: BackupPolicy, comfort: float, lower: Array, upper: Array) -> Array | None:
     """v (nv,) with the largest s, see above, within its bounds (nv,); None where none is found."""
     (closest, J, feedforward), (h, leaning) = near, manner
-    v, met = kernels.farthest(h, closest, J, feedforward, comfort, _DEEPEST, _GENTLE, leaning, lower, upper)
+    v, met = kernels.max_clearance_velocity(
+        h, closest, J, feedforward, comfort, _DEEPEST, _GENTLE, leaning, lower, upper
+    )
     return v if met else None

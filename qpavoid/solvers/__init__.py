@@ -1,4 +1,4 @@
-"""The exchangeable part of a tick: Problem in, Solution out.
+"""Solvers, the exchangeable part of a control step: Problem in, Solution out.
 
 A solver is anything with `solve`; those that ship are listed in SOLVERS and chosen by name.
 """
@@ -22,13 +22,17 @@ from qpavoid.solvers.qp import Qp
 
 
 class Solver(Protocol):
-    """One law of control."""
+    """A control law: one velocity for each problem."""
 
     bounded: bool
     """Whether its velocity is within the problem's bounds by construction."""
 
     def solve(self, problem: Problem) -> Solution:
-        """Velocity for one tick; never raises on a well-formed problem."""
+        """Return the velocity of one control step; never raise on a well-formed problem.
+
+        Args:
+            problem: rows, bounds and tracking velocity of the step.
+        """
         ...
 
 
@@ -44,31 +48,34 @@ SOLVERS: dict[str, Callable[[Any], Solver]] = {
 
 
 def parse_solver(name: str, settings: SolverConfig | None = None) -> SolverConfig:
-    """Configuration of a short form such as `eq10` or `qp:proxqp`.
+    """Return the configuration of a short form such as `eq10` or `qp:proxqp`.
 
     Args:
         name: the short form.
-        settings: kept where they are of the same solver.
+        settings: used where they are of the same solver, but for what `name` says.
 
     Raises:
         ConfigError, UnknownName: there is no such solver, or it takes no back end.
     """
-    wanted = expand_solver(name)
-    if settings is not None and settings.name == wanted["name"]:
-        wanted = {**settings.model_dump(), **wanted}
+    fields = expand_solver(name)
+    if settings is not None and settings.name == fields["name"]:
+        fields = {**settings.model_dump(), **fields}
     try:
-        return TypeAdapter[SolverConfig](SolverConfig).validate_python(wanted)
+        return TypeAdapter[SolverConfig](SolverConfig).validate_python(fields)
     except ValidationError:
-        if wanted["name"] in SOLVERS:
-            raise ConfigError(f"solver {name!r}: {wanted['name']} takes no backend; only qp and hqp do") from None
-        raise UnknownName(f"unknown solver {name!r}{nearest(wanted['name'], SOLVERS)}") from None
+        if fields["name"] in SOLVERS:
+            raise ConfigError(f"solver {name!r}: {fields['name']} takes no backend; only qp and hqp do") from None
+        raise UnknownName(f"unknown solver {name!r}{nearest(fields['name'], SOLVERS)}") from None
 
 
 def make_solver(config: SolverConfig | str) -> Solver:
-    """The solver that a configuration block or a short form asks for.
+    """Return a new solver of a configuration block or a short form.
+
+    Args:
+        config: block of the scenario, or short form.
 
     Raises:
-        UnknownName, SolverNotInstalled: of the solver or the QP's back end.
+        ConfigError, UnknownName, SolverNotInstalled: of the solver or the QP's back end.
     """
     config = parse_solver(config) if isinstance(config, str) else config
     return SOLVERS[config.name](config)

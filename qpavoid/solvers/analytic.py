@@ -1,4 +1,4 @@
-"""Closed-form laws: tracking alone, and the task-switching law of eq. 10 in its two readings."""
+"""Closed-form solvers: tracking alone, and the task-switching law of eq. 10 in its two readings."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from qpavoid.config import Eq10Solver, TrackingSolver
 from qpavoid.problem import Array, Problem, Solution, Tracking
 from qpavoid.solvers import gains
 
-_VANISHING = 1e-12
-"""Squared length below which a projected row counts as zero: an absolute cut-off, since a relative one inverts
-round-off (J_d N is zero exactly when the tool tip is the key point of a 3-D task)."""
+_MIN_SQUARE = 1e-12
+"""Squared length below which a projected row counts as zero [m²/rad²]: an absolute cut-off, since a relative one
+inverts round-off (J_d N is zero exactly when the tool tip is the key point of a 3-D task)."""
 
 
 def pseudo_inverse(A: Array, damping: float) -> Array:
-    """Damped right inverse Aᵀ (A Aᵀ + λ²)⁻¹; for λ = 0 the Moore-Penrose inverse.
+    """Compute the damped right inverse Aᵀ (A Aᵀ + λ²)⁻¹; for λ = 0 the Moore-Penrose inverse.
 
     Args:
         A: matrix (r, nv).
@@ -31,7 +31,11 @@ def pseudo_inverse(A: Array, damping: float) -> Array:
 
 
 def tracking_velocity(problem: Problem) -> Array:
-    """Velocity (nv,) that tracks as if nothing else mattered: J⁺ẋ of the weighted rows."""
+    """Return the velocity (nv,) of the tracking law alone, J⁺ẋ of the weighted rows [rad/s or m/s].
+
+    Args:
+        problem: whose v_tracking it is; computed here where that is NaN for want of damping.
+    """
     v_tracking, tracking = problem.v_tracking, problem.tracking
     if v_tracking[0] == v_tracking[0]:
         return np.array(v_tracking)
@@ -42,7 +46,7 @@ def tracking_velocity(problem: Problem) -> Array:
 
 
 def null_space_part(row: Array, tracking: Tracking) -> Array:
-    """row N, N = I - J⁺J: the part of a row that the task leaves free. N is symmetric: it is that of a velocity, too.
+    """Project a row, or a velocity, to the null space of the task: row N with the symmetric N = I - J⁺J.
 
     Args:
         row: (nv,).
@@ -56,7 +60,7 @@ def null_space_part(row: Array, tracking: Tracking) -> Array:
 
 
 class TrackingOnly:
-    """q̇ = J⁺ẋ, damped least squares (Nakamura and Hanafusa 1986; Wampler 1986). The baseline: avoids nothing."""
+    """q̇ = J⁺ẋ, damped least squares (Nakamura and Hanafusa 1986; Wampler 1986): the baseline, without avoidance."""
 
     bounded = False
 
@@ -64,7 +68,7 @@ class TrackingOnly:
         self.config = config
 
     def solve(self, problem: Problem) -> Solution:
-        """J⁺ẋ."""
+        """Return J⁺ẋ; see `Solver.solve`."""
         return Solution(tracking_velocity(problem))
 
 
@@ -74,8 +78,8 @@ class Eq10:
         q̇ = (I - α J_d⁺J_d) J⁺ẋ + β (J_d N)⁺ (ẋ0 - w),  N = I - J⁺J.
 
     `eq10-literal` takes w = J_d J⁺ẋ as printed, which takes the primary motion away twice. `eq10` takes
-    w = J_d (I - α J_d⁺J_d) J⁺ẋ, what is left of it, and lets α act only while the primary motion closes in; α as
-    printed would pull an arm back that is already leaving. The projector is bounded and not damped, (J_d N)⁺ is.
+    w = J_d (I - α J_d⁺J_d) J⁺ẋ, the remaining part of it, and applies α only while the primary motion closes in; α as
+    printed would brake an arm that already recedes. The projector is bounded and not damped, (J_d N)⁺ is.
     """
 
     bounded = False
@@ -84,7 +88,7 @@ class Eq10:
         self.config = config
 
     def solve(self, problem: Problem) -> Solution:
-        """Eq. 10, or J⁺ẋ when nothing is in range."""
+        """Return the velocity of eq. 10, or J⁺ẋ without a pair in range; see `Solver.solve`."""
         rows, primary = problem.avoidance, tracking_velocity(problem)
         if rows.d.size == 0:
             return Solution(primary)
@@ -98,14 +102,14 @@ class Eq10:
             alpha = 0.0
         switched = primary - alpha * approach * _row_inverse(J_d, damping=0.0)
         J_dN = null_space_part(J_d, problem.tracking)
-        wanted = self.config.retreat_speed - (approach if literal else float(J_d @ switched))
-        retreat = float(gains.beta(d, rows.d1, rows.d2)[0]) * wanted * _row_inverse(J_dN, self.config.damping)
+        retreat_rate = self.config.retreat_speed - (approach if literal else float(J_d @ switched))
+        retreat = float(gains.beta(d, rows.d1, rows.d2)[0]) * retreat_rate * _row_inverse(J_dN, self.config.damping)
         return Solution(switched + retreat)
 
 
 def _row_inverse(row: Array, damping: float) -> Array:
-    """Damped inverse rowᵀ/(row·row + λ²) of a 1 x nv matrix; zero for a vanishing row."""
+    """Compute the damped inverse rowᵀ/(row·row + λ²) of a 1 x nv matrix; zero for a vanishing row."""
     square = float(row @ row)
-    if square < _VANISHING:
+    if square < _MIN_SQUARE:
         return np.zeros_like(row)
     return row / (square + damping**2)

@@ -8,14 +8,14 @@ from qpavoid.problem import Array
 
 
 def alpha(d: Array, d2: float) -> Array:
-    """How much of the approaching primary motion is taken away (eq. 11).
+    """Compute the share of the approaching primary motion that is removed (eq. 11).
 
     Args:
         d: distances (k,) [m].
         d2: influence distance [m].
 
     Returns:
-        (k,) 0 for d >= d2, ((d2 - d)/d)² below, infinite for d <= 0; callers cap it.
+        (k,) 0 for d >= d2, ((d2 - d)/d)² below, infinite for d <= 0 [-]; callers cap it.
     """
     with np.errstate(divide="ignore"):
         ratio = np.maximum(d2 - d, 0.0) / np.maximum(d, 0.0)
@@ -23,7 +23,7 @@ def alpha(d: Array, d2: float) -> Array:
 
 
 def beta(d: Array, d1: float, d2: float) -> Array:
-    """Weight of the avoiding task (eq. 12).
+    """Compute the weight of the avoidance task (eq. 12).
 
     Args:
         d: distances (k,) [m].
@@ -31,7 +31,7 @@ def beta(d: Array, d1: float, d2: float) -> Array:
         d2: distance above which it is 0 [m].
 
     Returns:
-        (k,) cosine blend from 1 at d1 to 0 at d2.
+        (k,) cosine blend from 1 at d1 to 0 at d2 [-].
     """
-    share = np.minimum(np.maximum((d - d1) / (d2 - d1), 0.0), 1.0)
-    return np.asarray(0.5 + 0.5 * np.cos(np.pi * share))
+    fraction = np.minimum(np.maximum((d - d1) / (d2 - d1), 0.0), 1.0)
+    return np.asarray(0.5 + 0.5 * np.cos(np.pi * fraction))

@@ -1,4 +1,4 @@
-"""Gradient projection: the tool tracks, and what that leaves free climbs away from obstacles."""
+"""Gradient projection: the tool tracks, and its null space ascends the clearance from obstacles."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ class GradientProjection:
 
         c(d) = 0 beyond d2,  (d2 - d)²/(2 (d2 - d1)) down to d1,  (d1 + d2)/2 - d below.
 
-    Its slope grows from 0 to 1, so that pairs come and go without a jump and nothing blows up in contact. With J_i, the
-    Jacobians of the distances, ∇h = -Σ c'(d_i) J_iᵀ is exact. Obstacles count by where they are, not by how they move.
+    Its slope grows from 0 to 1, so that there is no jump at d2, and the slope is bounded in contact. With J_i, the
+    Jacobians of the distances, ∇h = -Σ c'(d_i) J_iᵀ is exact. The motion of obstacles is ignored.
 
-    k is `gain`, or as much of it as keeps joints that J⁺ẋ leaves within their bounds there (Euler, Dubey and Babcock
-    1989, "Self motion determination based on actuator velocity bounds for redundant manipulators"): clipped joint by
-    joint, motion of the null space would no longer be one, and take the tool off its path.
+    k is `gain`, or the part of it at which joints that J⁺ẋ keeps within their bounds stay there (Euler, Dubey and
+    Babcock 1989, "Self motion determination based on actuator velocity bounds for redundant manipulators"): clipped
+    joint by joint, the motion would leave the null space and move the tool.
     """
 
     bounded = False
@@ -32,17 +32,17 @@ class GradientProjection:
         self.config = config
 
     def solve(self, problem: Problem) -> Solution:
-        """J⁺ẋ and the self-motion that adds clearance; J⁺ẋ itself when nothing is in range."""
+        """Return J⁺ẋ plus the self-motion that adds clearance; J⁺ẋ without a pair in range; see `Solver.solve`."""
         rows, primary = problem.avoidance, tracking_velocity(problem)
         if rows.d.size == 0:
             return Solution(primary)
         gradient = clearance_slope(rows.d, rows.d1, rows.d2) @ rows.J
         a = null_space_part(self.config.gain * gradient, problem.tracking)
-        return Solution(primary + room(primary, a, problem.lower, problem.upper) * a)
+        return Solution(primary + step_fraction(primary, a, problem.lower, problem.upper) * a)
 
 
 def clearance_slope(d: Array, d1: float, d2: float) -> Array:
-    """∂h/∂d (k,) of each pair: 0 from d2 on, 1 from d1 down, linear between [-].
+    """Compute ∂h/∂d (k,) of each pair: 0 from d2 on, 1 from d1 down, linear between [-].
 
     Args:
         d: distances (k,) [m].
@@ -52,17 +52,17 @@ def clearance_slope(d: Array, d1: float, d2: float) -> Array:
     return np.asarray(np.clip((d2 - d) / (d2 - d1), 0.0, 1.0))
 
 
-def room(v: Array, a: Array, lower: Array, upper: Array) -> float:
-    """Largest share s in [0, 1] of a with which v + s a passes no bound that v keeps, and none further that it passes.
+def step_fraction(v: Array, a: Array, lower: Array, upper: Array) -> float:
+    """Compute the largest s in [0, 1] at which v + s a violates no bound that v meets, and no other one more [-].
 
     Args:
         v: velocity (nv,).
-        a: what is added to it (nv,); where it is 0, bounds do not matter.
+        a: change of velocity (nv,); where it is 0, bounds are ignored.
         lower: lower bound (nv,), may be infinite.
-        upper: upper bound (nv,), likewise.
+        upper: upper bound (nv,), may be infinite.
     """
-    ahead = np.where(a > 0.0, upper, lower) - v
+    margin = np.where(a > 0.0, upper, lower) - v
     moving = a != 0.0
     with np.errstate(over="ignore"):
-        share = np.min(ahead[moving] / a[moving], initial=1.0)
-    return float(np.maximum(share, 0.0))
+        fraction = np.min(margin[moving] / a[moving], initial=1.0)
+    return float(np.maximum(fraction, 0.0))

@@ -11,11 +11,11 @@ from qpavoid.reason import Reason, ReasonKind
 from qpavoid.solvers.analytic import tracking_velocity
 from qpavoid.solvers.backends import Backend, Daqp, make_backend, solve_daqp
 from qpavoid.solvers.reasons import relaxation_reasons
-from qpavoid.solvers.reduced import holding
+from qpavoid.solvers.reduced import in_contact_null_space
 from qpavoid.solvers.relaxation import Closest, Relaxed, by_back_end, closest, relax
 
-_GENTLE = 1.0
-"""λ of a solution that moves the joints little [(rad/s)⁻²]."""
+_LOW_EFFORT = 1.0
+"""λ of a solution of low effort [(m/rad)²]: joint speeds count as much as the tool's speed."""
 
 
 class Qp:
@@ -25,12 +25,12 @@ class Qp:
     that is safe. As A v0 = b wherever the task can be met, the first term is the tracking cost ‖A v - b‖²;
     measuring λ from v0 rather than from 0 leaves tracking free of bias.
 
-    Where no velocity meets everything, margins give way, then acceleration limits, then contact, as little as they must
-    and the deepest threat least (`solvers.relaxation`): in compiled code with `native`, by daqp with every other back
-    end. An answer counts only if it verifies: a back end that fails or lies is replaced by daqp for that tick, and
-    where that fails too, the robot is told to stop.
+    Where no velocity meets all constraints, margins are relaxed, then acceleration limits, then contact of pairs, as
+    little as possible and the deepest pair least (`solvers.relaxation`): in compiled code with `native`, by daqp with
+    every other back end. An answer counts only if it verifies: of a back end that fails or returns no solution, daqp
+    solves the QP of that control step, and where that fails too, the solution is a stop.
 
-    Contacts are held exactly, whatever gives way: with v = rest + Z w, all of the above is solved for w
+    Contacts of the robot are met exactly: with v = v_particular + Z w, all of the above is solved for w
     (`solvers.reduced`), by daqp where the back end is `native`.
     """
 
@@ -46,11 +46,11 @@ class Qp:
 
     @property
     def _backends(self) -> tuple[Backend, ...]:
-        """The chosen back end, and daqp where that is another one."""
+        """Return the chosen back end, then daqp where that is another one."""
         return (self._backend,) if isinstance(self._backend, Daqp) else (self._backend, solve_daqp)
 
     def solve(self, problem: Problem) -> Solution:
-        """The closest safe velocity; relaxed where there is none; a stop where that fails too."""
+        """Return the closest safe velocity; relaxed where there is none; a stop where that fails too."""
         if problem.violation <= 0.0:
             return Solution(problem.v_tracking.copy())
         A, rows, lower, upper, v_tracking = (
@@ -70,37 +70,34 @@ class Qp:
                 return Solution(answer)
         P, q = kernels.projection_cost(A, self.config.regularization, v_tracking)
         for backend in self._backends:
-            v = closest(holding(problem.contacts, backend), P, q, rows.J, rows.b, lower, upper)
+            v = closest(in_contact_null_space(problem.contacts, backend), P, q, rows.J, rows.b, lower, upper)
             if v is not None:
                 return Solution(v)
-        return self._relaxed(P, q, problem)
+        relaxed = self._relax(P, q, problem)
+        return relaxed if isinstance(relaxed, Solution) else relaxed_solution(relaxed, problem)
 
     def low_effort(self, problem: Problem, slack: Array | None) -> Array | None:
-        """A solution with rows and bounds as they were met, that counts joint speeds as much as the task's.
+        """Compute a solution with the same slacks and bounds that weighs joint speeds as much as the task's.
 
-        The usual one may send joints through the null space of the task at full speed for a few mm/s of a row; how the
-        distances then change within a tick, no row knows.
+        The usual one may move joints through the null space of the task at full speed for a few mm/s of a row; rows do
+        not contain how distances then curve within a control step.
 
         Args:
             problem: rows and bounds.
-            slack: what rows gave way (k,) [m/s].
+            slack: violation of the rows (k,) [m/s]; None where there is none.
 
         Returns:
-            (nv,), or None where there is none.
+            (nv,), or None without a solution.
         """
         rows = problem.avoidance
-        least = rows.b if slack is None else rows.b - slack
-        P, q = kernels.projection_cost(problem.tracking.A, _GENTLE, tracking_velocity(problem))
-        return closest(holding(problem.contacts, solve_daqp), P, q, rows.J, least, problem.lower, problem.upper)
+        b = rows.b if slack is None else rows.b - slack
+        P, q = kernels.projection_cost(problem.tracking.A, _LOW_EFFORT, tracking_velocity(problem))
+        return closest(
+            in_contact_null_space(problem.contacts, solve_daqp), P, q, rows.J, b, problem.lower, problem.upper
+        )
 
-    def _relaxed(self, P: Array, q: Array, problem: Problem) -> Solution:
-        relaxed = self._give_way(P, q, problem)
-        if isinstance(relaxed, Solution):
-            return relaxed
-        return relaxed_solution(relaxed, problem)
-
-    def _give_way(self, P: Array, q: Array, problem: Problem) -> Relaxed | Solution:
-        """The least that has to give way; a stop where not even that helps."""
+    def _relax(self, P: Array, q: Array, problem: Problem) -> Relaxed | Solution:
+        """Relax as little as possible; return a stop where no relaxed problem is solved, or a distance is NaN."""
         rows = problem.avoidance
         unknown = np.flatnonzero(~np.isfinite(rows.b + rows.J.sum(axis=1)))
         if len(unknown):
@@ -110,7 +107,7 @@ class Qp:
         relaxed = None
         if self._native and problem.contacts is None:
             relaxed = relax(problem, self._compiled(problem))
-        backend = holding(problem.contacts, solve_daqp)
+        backend = in_contact_null_space(problem.contacts, solve_daqp)
         if relaxed is None:
             relaxed = relax(problem, by_back_end(backend, P, q, tracking_velocity(problem)))
         if relaxed is not None:
@@ -122,12 +119,12 @@ class Qp:
         return Solution(problem.v_stop.copy(), Status.STOPPED, (reason,))
 
     def _compiled(self, problem: Problem) -> Closest:
-        """Solves the QPs of a problem's tracking cost in compiled code."""
+        """Return a function that solves the QPs of a problem's tracking cost in compiled code."""
         A, v_tracking, plain = problem.tracking.A, tracking_velocity(problem), np.zeros((0, len(problem.lower)))
 
-        def solve(J: Array, least: Array, soft: Array, lower: Array, upper: Array) -> Array | None:
+        def solve(J: Array, b: Array, soft: Array, lower: Array, upper: Array) -> Array | None:
             cost = (plain, 1.0) if soft.any() else (A, self.config.regularization)
-            v, solved = kernels.project_soft(*cost, v_tracking, J, least, lower, upper, soft)
+            v, solved = kernels.project_soft(*cost, v_tracking, J, b, lower, upper, soft)
             return v if solved else None
 
         return solve
@@ -137,9 +134,9 @@ def relaxed_solution(relaxed: Relaxed, problem: Problem, *reasons: Reason) -> So
     """Return the solution with its reasons; SOLVED where nothing is relaxed by more than the tolerance of a QP.
 
     Args:
-        relaxed: the velocity, with what was relaxed for it.
-        problem: what it is a solution of.
-        reasons: more of them.
+        relaxed: the velocity, with its slacks.
+        problem: the one that it solves.
+        reasons: added to those of the relaxation.
     """
     reasons = (*relaxation_reasons(relaxed, problem), *reasons)
     if not reasons:
@@ -148,7 +145,7 @@ def relaxed_solution(relaxed: Relaxed, problem: Problem, *reasons: Reason) -> So
 
 
 def _warm_up() -> None:
-    """Call the back end `native`, without and with soft rows, so that no tick waits for the compiler."""
+    """Call the back end `native`, without and with soft rows, so that no control step waits for the compiler."""
     one, row = np.ones(1), np.ones((1, 1))
     arguments = row, 1.0, one, row, 2.0 * one, -3.0 * one, 3.0 * one
     kernels.project(*arguments)

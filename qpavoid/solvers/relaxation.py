@@ -1,12 +1,12 @@
-"""What gives way when rows and bounds contradict each other: margins, then accelerations, then contact.
+"""Relaxation of rows and bounds that contradict each other: margins first, then accelerations, then contact.
 
-Among pairs, the deepest threat gives way last: first, every pair is kept from touching, from the deepest on; then
-margins are restored as far as that allows, in the same order. Acceleration and jerk limits, one set of bounds, give way
-only where pairs would touch otherwise: given up for margins, a few mm/s cost jumps of a joint with a short lever
-between its velocity limits. Position and velocity limits never give way.
+Among pairs, the deepest one is relaxed last: first, every pair is kept from contact, from the deepest on; then margins
+are restored as far as that allows, in the same order. Acceleration and jerk limits, one set of bounds, are relaxed only
+where pairs would get into contact otherwise: relaxed for margins, a few mm/s would cost jumps of a joint with a short
+lever arm between its velocity limits. Position and velocity limits are never relaxed.
 
-Only a tick that has no safe velocity comes here. It takes longer than others, some tens of small QPs, for an answer
-that gives up no more than it must.
+Only a control step without a safe velocity needs this. It takes longer than others, some tens of small QPs, for slacks
+that are no larger than necessary.
 """
 
 from __future__ import annotations
@@ -21,59 +21,61 @@ from qpavoid.problem import Array, AvoidanceRows, IntArray, Problem
 from qpavoid.solvers.backends import Backend
 
 TOLERANCE = 1e-6
-"""Largest violation of a row [m/s] or bound [rad/s] with which an answer still counts as a solution."""
-_LEVEL = 2e-3
-"""Rows whose distances differ by less are threats of the same depth and share what has to be given up [m]."""
-_MOST_LEVELS = 4
-"""Levels that are relaxed one after the other; what is left shares by least squares, so that the time is bounded."""
+"""Largest violation of a row [m/s] or bound [rad/s] with which an answer counts as a solution: what back ends reach."""
+_LEVEL_WIDTH = 2e-3
+"""Difference of distances below which rows are of one level, whose slacks are shared [m]: pairs of one contact."""
+_MAX_LEVELS = 4
+"""Levels that are relaxed one after the other [-]; all further ones share by least squares: the time is bounded."""
 _SMALL = 1e-6
-"""Weight of the way to v0 beside that of what is given up."""
+"""Weight of ‖v - v_tracking‖² beside that of the squared slacks [m²/rad²]: small, with digits to spare."""
 
 Closest = Callable[[Array, Array, Array, Array, Array], "Array | None"]
-"""(J, least, soft, lower, upper) -> the velocity of least tracking cost with J v >= least within bounds; None without.
+"""(J, b, soft, lower, upper) -> the velocity of least tracking cost with J v >= b within bounds; None without any.
 
-A row of softness c > 0 may fall short by s at the cost of ½ s² / c; where there are such, the cost beside is
-½ ‖v - v0‖²: the tracking cost, flat in many directions, would leave too few digits."""
+A row of softness c > 0 may be violated by s at the cost of ½ s² / c; with such rows, the other cost is
+½ ‖v - v_tracking‖²: the tracking cost, flat in many directions, would leave too few digits."""
 
 
 class Relaxed(NamedTuple):
-    """A velocity and what was given up for it."""
+    """A velocity and the violations that it takes."""
 
     v: Array
-    """(n,)."""
+    """(n,) velocity [rad/s or m/s]."""
     slack: Array
-    """(k,) what each avoidance row gave way [m/s]."""
+    """(k,) violation of each avoidance row [m/s]."""
     excess: Array
-    """(n,) by how much each coordinate passes what its acceleration and jerk limits allow [rad/s or m/s]."""
+    """(n,) violation of the bounds from acceleration and jerk limits [rad/s or m/s]."""
 
 
 class _Bounds(NamedTuple):
+    """Bounds on v (nv,) [rad/s or m/s]."""
+
     lower: Array
     upper: Array
 
 
 def relax(problem: Problem, solve: Closest) -> Relaxed | None:
-    """The velocity that gives up least.
+    """Compute the velocity of least violations, in the order of this module.
 
     Args:
         problem: rows and bounds that no velocity meets.
         solve: solves its QPs.
 
     Returns:
-        None where those fail.
+        The velocity with its violations; None where those QPs fail.
     """
-    rows, within = problem.avoidance, _Bounds(problem.lower, problem.upper)
-    nothing, hard_rows = np.full(len(rows.d), -np.inf), np.zeros(len(rows.d))
-    touch = rows.touch - TOLERANCE
-    if problem.hard_lower is not problem.lower and solve(rows.J, touch, hard_rows, *within) is None:
+    rows, bounds = problem.avoidance, _Bounds(problem.lower, problem.upper)
+    no_floor, hard_rows = np.full(len(rows.d), -np.inf), np.zeros(len(rows.d))
+    b_contact = rows.b_contact - TOLERANCE
+    if problem.hard_lower is not problem.lower and solve(rows.J, b_contact, hard_rows, *bounds) is None:
         hard = _Bounds(problem.hard_lower, problem.hard_upper)
-        touch = touch - _lexicographic_slack(rows, touch, nothing, hard, solve)[0]
-        within = _least_excess(problem, touch, solve)
-    slack, first = _lexicographic_slack(rows, touch, nothing, within, solve)
-    touch = touch - slack
-    slack, second = _lexicographic_slack(rows, rows.b, touch, within, solve)
-    final = solve(rows.J, np.maximum(touch, rows.b - slack) - TOLERANCE, hard_rows, *within)
-    for v in (final, second, first):  # an earlier one gives up a little more, where round-off leaves no later one
+        b_contact = b_contact - _lexicographic_slack(rows, b_contact, no_floor, hard, solve)[0]
+        bounds = _widened_bounds(problem, b_contact, solve)
+    slack, first = _lexicographic_slack(rows, b_contact, no_floor, bounds, solve)
+    b_contact = b_contact - slack
+    slack, second = _lexicographic_slack(rows, rows.b, b_contact, bounds, solve)
+    final = solve(rows.J, np.maximum(b_contact, rows.b - slack) - TOLERANCE, hard_rows, *bounds)
+    for v in (final, second, first):  # an earlier one violates a little more, where round-off prevents a later one
         if v is not None:
             excess = np.maximum(np.maximum(v - problem.upper, problem.lower - v), 0.0)
             return Relaxed(v, np.maximum(rows.b - rows.J @ v, 0.0), excess)
@@ -81,7 +83,20 @@ def relax(problem: Problem, solve: Closest) -> Relaxed | None:
 
 
 def closest(backend: Backend, P: Array, q: Array, J: Array, b: Array, lower: Array, upper: Array) -> Array | None:
-    """Minimiser of ½ vᵀP v + qᵀv within rows and bounds; None when the back end fails or its answer does not verify."""
+    """Compute the minimiser of ½ vᵀP v + qᵀv with J v >= b, lower <= v <= upper, and verify it.
+
+    Args:
+        backend: solves the QP; whatever it raises counts as a failure.
+        P: positive definite (n, n).
+        q: (n,).
+        J: rows (k, n).
+        b: right-hand sides (k,).
+        lower: lower bounds (n,).
+        upper: upper bounds (n,).
+
+    Returns:
+        v (n,), clipped to the bounds; None where the back end fails or a violation is above `TOLERANCE`.
+    """
     try:
         v = backend(P, q, J, b, lower, upper)
     except Exception:  # whatever a library raises, the robot must get a velocity
@@ -92,26 +107,33 @@ def closest(backend: Backend, P: Array, q: Array, J: Array, b: Array, lower: Arr
 
 
 def by_back_end(backend: Backend, P: Array, q: Array, v_tracking: Array) -> Closest:
-    """Lets a back end solve the QPs of a tracking cost ½ vᵀP v + qᵀv: what soft rows lack becomes a variable."""
+    """Return a function that solves the QPs of a tracking cost by a back end: violations of soft rows become variables.
 
-    def solve(J: Array, least: Array, soft: Array, lower: Array, upper: Array) -> Array | None:
-        asking = least > -np.inf
-        hard, giving = np.flatnonzero(asking & (soft == 0.0)), np.flatnonzero(asking & (soft > 0.0))
-        n, count = len(q), len(giving)
+    Args:
+        backend: solves the QPs.
+        P: tracking cost ½ vᵀP v + qᵀv (n, n).
+        q: its linear part (n,).
+        v_tracking: velocity of least cost (n,) [rad/s or m/s].
+    """
+
+    def solve(J: Array, b: Array, soft: Array, lower: Array, upper: Array) -> Array | None:
+        finite = b > -np.inf
+        hard, relaxable = np.flatnonzero(finite & (soft == 0.0)), np.flatnonzero(finite & (soft > 0.0))
+        n, count = len(q), len(relaxable)
         if not count:
-            return closest(backend, P, q, J[hard], least[hard], lower, upper)
-        # a row lacks √(c / small) s, so that the weights are small and 1, whatever the softness c is
+            return closest(backend, P, q, J[hard], b[hard], lower, upper)
+        # a row is violated by √(c / small) s, so that the weights are small and 1, whatever the softness c is
         hessian, rows = np.zeros((n + count, n + count)), np.zeros((len(hard) + count, n + count))
         np.fill_diagonal(hessian[:n, :n], _SMALL)
         np.fill_diagonal(hessian[n:, n:], 1.0)
-        rows[: len(hard), :n], rows[len(hard) :, :n] = J[hard], J[giving]
-        rows[len(hard) :, n:] = np.diag(np.sqrt(soft[giving] / _SMALL))
+        rows[: len(hard), :n], rows[len(hard) :, :n] = J[hard], J[relaxable]
+        rows[len(hard) :, n:] = np.diag(np.sqrt(soft[relaxable] / _SMALL))
         answer = closest(
             backend,
             hessian,
             np.concatenate((-_SMALL * v_tracking, np.zeros(count))),
             rows,
-            np.concatenate((least[hard], least[giving])),
+            np.concatenate((b[hard], b[relaxable])),
             np.concatenate((lower, np.zeros(count))),
             np.concatenate((upper, np.full(count, np.inf))),
         )
@@ -120,63 +142,79 @@ def by_back_end(backend: Backend, P: Array, q: Array, v_tracking: Array) -> Clos
     return solve
 
 
-def _least_excess(x: Problem, least: Array, solve: Closest) -> _Bounds:
-    """Bounds widened just so far, in squares of their widths, that some v meets the rows J v >= least.
+def _widened_bounds(x: Problem, b: Array, solve: Closest) -> _Bounds:
+    """Widen the bounds as little as possible, in squares of their widths, for some v to meet the rows J v >= b.
 
-    Where nothing does, the velocity limits are all that is left.
+    Where none does, the bounds from position and velocity limits remain.
+
+    Args:
+        x: problem.
+        b: right-hand sides of its rows (k,) [m/s].
+        solve: solves the QP.
     """
-    J, room, eye = x.avoidance.J, np.maximum(x.upper - x.lower, 1e-9), np.eye(len(x.lower))
-    G, h = np.concatenate((J, eye, -eye)), np.concatenate((least, x.lower, -x.upper))
-    soft = np.concatenate((np.zeros(len(J)), _SMALL * room**2, _SMALL * room**2))
+    J, width, eye = x.avoidance.J, np.maximum(x.upper - x.lower, 1e-9), np.eye(len(x.lower))
+    G, h = np.concatenate((J, eye, -eye)), np.concatenate((b, x.lower, -x.upper))
+    soft = np.concatenate((np.zeros(len(J)), _SMALL * width**2, _SMALL * width**2))
     limited = np.isfinite(h) & np.isfinite(soft)
     v = solve(np.ascontiguousarray(G[limited]), h[limited], soft[limited], x.hard_lower, x.hard_upper)
     if v is None:
         return _Bounds(x.hard_lower, x.hard_upper)
-    # each side gives for itself: no joint gets room to jump the other way
+    # each side is widened by itself: no joint may jump in the other direction
     lower, upper = np.minimum(x.lower, v - TOLERANCE), np.maximum(x.upper, v + TOLERANCE)
     return _Bounds(np.maximum(lower, x.hard_lower), np.minimum(upper, x.hard_upper))
 
 
 def _lexicographic_slack(
-    rows: AvoidanceRows, b: Array, floor: Array, within: _Bounds, solve: Closest
+    rows: AvoidanceRows, b: Array, floor: Array, bounds: _Bounds, solve: Closest
 ) -> tuple[Array, Array | None]:
-    """Slack (k,) of the rows J v >= b, level by level from the deepest threat on, and a velocity that meets them so.
+    """Compute the least slacks of the rows J v >= b, level by level from the deepest on.
 
-    Each level gives only what those before it and the rows J v >= floor, which can be met, force it to.
+    The slacks of each level are the least that those before it and the rows J v >= floor, which are feasible, allow.
+    The first level that cannot be met is found by bisection, and its slacks minimised in the sum of squares.
+
+    Args:
+        rows: with J and the distances.
+        b: right-hand sides (k,) [m/s].
+        floor: right-hand sides that are not relaxed (k,), -∞ for none [m/s].
+        bounds: on v.
+        solve: solves the QPs.
+
+    Returns:
+        Slacks (k,) [m/s], and a velocity (nv,) that meets the relaxed rows; None where round-off prevents one.
     """
     slack, level = np.zeros(len(rows.d)), _levels(rows.d)
-    levels, nothing = int(np.max(level, initial=-1)) + 1, np.zeros(len(rows.d))
+    levels, hard_rows = int(np.max(level, initial=-1)) + 1, np.zeros(len(rows.d))
     best: Array | None = None
     done = 0
 
-    def asked(count: int) -> Array:
-        """Right-hand sides with the first `count` levels at their bounds, less their slack, the others at the floor."""
+    def rhs(count: int) -> Array:
+        """Return b - slack of the first `count` levels, the floor of all others."""
         return np.where(level < count, np.maximum(floor, b - slack), floor)
 
-    for attempt in range(_MOST_LEVELS + 1):
+    for attempt in range(_MAX_LEVELS + 1):
         low, high = done, levels + 1  # so many levels can be met, so many cannot
         while high - low > 1:
             middle = levels if high > levels else (low + high) // 2
-            v = solve(rows.J, asked(middle), nothing, *within)
+            v = solve(rows.J, rhs(middle), hard_rows, *bounds)
             low, high, best = (low, middle, best) if v is None else (middle, high, v)
         if low == levels:
             break
-        giving = (level == low) if attempt < _MOST_LEVELS else (level >= low)
-        done = low + 1 if attempt < _MOST_LEVELS else levels
-        soft = np.where(giving, _SMALL, 0.0)
-        v = solve(rows.J, np.where(giving, b, asked(low)), soft, *within)
-        if v is None:  # they give everything that the bounds could ever take
-            slack[giving] = np.inf
+        relaxed = (level == low) if attempt < _MAX_LEVELS else (level >= low)
+        done = low + 1 if attempt < _MAX_LEVELS else levels
+        soft = np.where(relaxed, _SMALL, 0.0)
+        v = solve(rows.J, np.where(relaxed, b, rhs(low)), soft, *bounds)
+        if v is None:  # their slacks are unlimited
+            slack[relaxed] = np.inf
         else:
-            slack[giving], best = np.maximum(b - rows.J @ v, 0.0)[giving] + TOLERANCE, v
+            slack[relaxed], best = np.maximum(b - rows.J @ v, 0.0)[relaxed] + TOLERANCE, v
     return slack, best
 
 
 def _levels(d: Array) -> IntArray:
-    """Level (k,) of each row, by depth, 0 the deepest: each holds what lies within `_LEVEL` of its deepest one."""
+    """Compute the level (k,) of each row by depth, 0 the deepest: rows within `_LEVEL_WIDTH` of its deepest one."""
     level, current, start = np.empty(len(d), dtype=np.intp), -1, -np.inf
     for i in np.argsort(d, kind="stable").tolist():
-        if current < 0 or d[i] - start > _LEVEL:
+        if current < 0 or d[i] - start > _LEVEL_WIDTH:
             current, start = current + 1, d[i]
         level[i] = current
     return level

@@ -192,7 +192,7 @@ def task_layout(tasks: Sequence[FrameTask], others: Sequence[RowTask], model: An
     return {
         "frame_ids": np.array([task.frame_id for task in tasks], dtype=np.intp),
         "targets": np.zeros((len(tasks), 18)),
-        "turns": turns,
+        "oriented": turns,
         "gain": np.array([task.settings.gain for task in tasks]),
         "cap": np.array([np.inf if cap is None else cap for cap in caps]),
         "scale": scale,

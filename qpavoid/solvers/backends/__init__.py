@@ -1,8 +1,8 @@
 """QP back ends behind one call: min ½ xᵀP x + qᵀx subject to G x >= h, lower <= x <= upper.
 
-daqp, proxqp and osqp are called without a wrapper, the last two with a workspace for each size that is kept and warm
-started; every other one goes through qpsolvers. All are asked for tight tolerances: what they return is a velocity,
-and a velocity that is off by 1e-2 rad/s is a fault even where the solver reports success.
+daqp, proxqp and osqp are called without a wrapper, the last two with a persistent, warm-started workspace for each
+size; every other one through qpsolvers. All have tight tolerances: the result is a velocity, and an error of 1e-2 rad/s
+is a fault even where the back end reports success.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Backend = Callable[[Array, Array, Array, Array, Array, Array], "Array | None"]
 """(P, q, G, h, lower, upper) -> x, or None where no solution was found.
 
 P (n, n) is symmetric and positive definite, G (m, n) C-contiguous; m may be 0 and change from call to call; bounds may
-be infinite. One of these belongs to one thread: it keeps memory between calls, but no call depends on another one.
+be infinite. A back end belongs to one thread: it has memory between calls, but no call depends on another one.
 """
 
 _NATIVE: dict[str, Callable[[], Backend]] = {
@@ -29,29 +29,32 @@ _NATIVE: dict[str, Callable[[], Backend]] = {
     "proxqp": lambda: Persistent(ProxqpWorkspace),
     "osqp": lambda: Persistent(OsqpWorkspace),
 }
-"""Back ends that are called without qpsolvers."""
+"""Back ends that are called without qpsolvers, by name."""
 
 _PACKAGES = {"jaxopt_osqp": "jaxopt", "mosek": "Mosek", "highs": "highspy", "gurobi": "gurobipy", "proxqp": "proxsuite",
              "qpoases": "qpoases", "hpipm": "hpipm-python"}  # fmt: skip
-"""Packages to install, where their name is not that of the back end."""
+"""Package to install of each back end whose package has another name."""
 _KNOWN = {
     *("clarabel", "cvxopt", "ecos", "gurobi", "highs", "hpipm", "jaxopt_osqp", "kvxopt", "mosek", "nppro", "osqp"),
     *("pdlp", "piqp", "proxqp", "pyqpmad", "qpalm", "qpax", "qpoases", "qpswift", "quadprog", "scs", "sip"),
 }
-"""Names that qpsolvers gives to back ends which may not be installed."""
+"""Names of the back ends that qpsolvers supports, installed or not."""
 
 
 def backend_names() -> list[str]:
-    """Back ends that can be used here, daqp first."""
+    """Return the names of the installed back ends, daqp first."""
     return ["daqp", *sorted({*_NATIVE, *qpsolvers.available_solvers} - {"daqp"})]
 
 
 def make_backend(name: str) -> Backend:
-    """A new back end of that name.
+    """Return a new back end.
+
+    Args:
+        name: one of `backend_names`.
 
     Raises:
         SolverNotInstalled: qpsolvers knows it, but its package is missing.
-        UnknownName: nobody knows it.
+        UnknownName: neither this package nor qpsolvers knows it.
     """
     if name in _NATIVE:
         return _NATIVE[name]()

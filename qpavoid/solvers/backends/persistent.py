@@ -1,4 +1,4 @@
-"""proxqp and osqp: set up once for each size, updated in place, started from the last solution of that size."""
+"""proxqp and osqp, set up once for each size, updated in place and started from the last solution of that size."""
 
 from __future__ import annotations
 
@@ -13,36 +13,36 @@ from scipy.sparse import csc_matrix
 
 from qpavoid.problem import Array
 
-_MOST = 64
-"""Number of workspaces that are kept; the one that was not used for longest goes first."""
+_MAX_WORKSPACES = 64
+"""Largest number of workspaces [-]; the one that was not used for the longest time is dropped first."""
 _RESIDUAL = 1e-8
-"""Largest residual of the optimality conditions with which a warm-started answer is taken."""
+"""Largest residual of the optimality conditions with which a warm-started answer is accepted."""
 _INFINITY = 1e20
-"""What both take for no bound."""
+"""Bound from which both take a side as unbounded [-]."""
 
 Answer = tuple[Array, Array]
 """x (n,) and the multipliers (m,) of G x >= h, not negative at a minimum."""
 
 
 class Workspace(Protocol):
-    """A solver's memory for one size; made from the first problem, which is then solved cold."""
+    """Memory of a back end for one size; made from the first problem, which is then solved cold."""
 
     def update(self, P: Array, q: Array, G: Array, h: Array, lower: Array, upper: Array) -> None:
-        """Puts another problem of the same size in its place."""
+        """Replace the problem by another one of the same size."""
         ...
 
     def solve(self) -> Answer | None:
-        """Solves what is in it; None where there is no solution."""
+        """Solve the problem; None without a solution."""
         ...
 
 
 class Persistent:
-    """A back end made of workspaces.
+    """Back end made of workspaces.
 
-    What an earlier problem left behind must never show in an answer, but a warm start can end at a point that is no
-    minimum and report success (proxqp 0.8, once in 1500 unrelated problems: a multiplier of the wrong sign, x off by
-    up to 1.8). Hence a warm-started answer has to meet the optimality conditions, which takes about 10 µs to see; else
-    its workspace is dropped and the problem solved cold.
+    An earlier problem must never influence an answer, but a warm start can end at a point that is no minimum and report
+    success (proxqp 0.8, once in 1500 unrelated problems: a multiplier of the wrong sign, x off by up to 1.8). Hence a
+    warm-started answer has to meet the optimality conditions, a check of about 10 µs; else its workspace is dropped and
+    the problem solved cold.
     """
 
     def __init__(self, make: Callable[..., Workspace]) -> None:
@@ -50,7 +50,7 @@ class Persistent:
         self._workspaces: dict[tuple[int, ...], Workspace] = {}
 
     def __call__(self, P: Array, q: Array, G: Array, h: Array, lower: Array, upper: Array) -> Array | None:
-        """Minimiser of ½ xᵀP x + qᵀx subject to G x >= h, lower <= x <= upper; None where none is found."""
+        """Compute the minimiser of ½ xᵀP x + qᵀx with G x >= h, lower <= x <= upper; None where none is found."""
         if not _well_formed(P, q, G, h, lower, upper):
             return None
         workspace = self._workspaces.pop(G.shape, None)
@@ -64,18 +64,18 @@ class Persistent:
         if answer is None:
             return None
         self._workspaces[G.shape] = workspace
-        if len(self._workspaces) > _MOST:
+        if len(self._workspaces) > _MAX_WORKSPACES:
             del self._workspaces[next(iter(self._workspaces))]
         return answer[0]
 
 
 def _well_formed(P: Array, q: Array, G: Array, h: Array, lower: Array, upper: Array) -> bool:
-    """Whether there is no NaN, on which both iterate to their limit, and no bound is above the other."""
+    """Return True without NaN, on which both iterate to their limit, and with lower <= upper."""
     return all(isfinite(np.vdot(a, a)) for a in (P, q, G, h)) and bool((lower <= upper).all())
 
 
 def residual(P: Array, q: Array, G: Array, h: Array, lower: Array, upper: Array, x: Array, y: Array) -> float:
-    """Natural residual of the optimality conditions, 0 at the minimum only.
+    """Compute the natural residual of the optimality conditions, 0 at the minimum only:
 
     max(‖x - clip(x - (P x + q - Gᵀy), lower, upper)‖∞, ‖min(y, G x - h)‖∞)
     """
@@ -87,7 +87,7 @@ class ProxqpWorkspace:
     """Proximal augmented Lagrangian method (Bambade et al. 2022), dense, with box constraints.
 
     The duality gap must be checked: without it, x was off by up to 1e-4 at residuals of 1e-9. PrimalDualLDLT is not
-    what `Automatic` picks for these sizes, and up to three times as quick.
+    what `Automatic` picks for these sizes, and up to three times as fast.
     """
 
     def __init__(self, P: Array, q: Array, G: Array, h: Array, lower: Array, upper: Array) -> None:
@@ -99,14 +99,15 @@ class ProxqpWorkspace:
         settings.check_duality_gap, settings.eps_duality_gap_abs, settings.eps_duality_gap_rel = True, 1e-12, 1e-13
         settings.max_iter, settings.max_iter_in = 100, 100
         above = np.full(self._rows, _INFINITY)
-        self._qp.init(P, q, None, None, *self._given(G, h, above), lower, upper)
+        self._qp.init(P, q, None, None, *self._rows_or_none(G, h, above), lower, upper)
 
-    def _given(self, *rows: Array | None) -> tuple[Array | None, ...]:
+    def _rows_or_none(self, *rows: Array | None) -> tuple[Array | None, ...]:
+        """Return the arguments; None in place of each, in a problem without rows."""
         return rows if self._rows else (None,) * len(rows)
 
     def update(self, P: Array, q: Array, G: Array, h: Array, lower: Array, upper: Array) -> None:
         """See `Workspace`."""
-        self._qp.update(P, q, None, None, *self._given(G, h, None), lower, upper, update_preconditioner=False)
+        self._qp.update(P, q, None, None, *self._rows_or_none(G, h, None), lower, upper, update_preconditioner=False)
 
     def solve(self) -> Answer | None:
         """See `Workspace`."""
@@ -120,8 +121,8 @@ class ProxqpWorkspace:
 class OsqpWorkspace:
     """Operator splitting (Stellato et al. 2020); bounds are the first rows of [I; G]. Polishing makes it exact.
 
-    There is one variable more, whose cost keeps it at its bound: where no row at all is active, polishing prints a line
-    on the process's output, whatever the settings are (osqp 1.1, osqp/osqp#785).
+    An additional variable is at its bound by its cost: where no row at all is active, polishing prints a line to the
+    output of the process, at any settings (osqp 1.1, osqp/osqp#785).
     """
 
     def __init__(self, P: Array, q: Array, G: Array, h: Array, lower: Array, upper: Array) -> None:
@@ -144,7 +145,7 @@ class OsqpWorkspace:
         self._qp.setup(P=cost, A=rows, **vectors, **settings, verbose=False)
 
     def _vectors(self, P: Array, q: Array, G: Array, h: Array, lower: Array, upper: Array) -> dict[str, Array]:
-        """Every entry that can change: upper triangle of P and all of [I; G], by columns."""
+        """Return every entry that can change: upper triangle of P and all of [I; G], by columns, q and the bounds."""
         n = self._n
         self._P[:n, :n], self._q[:n], self._data[:n, 1:] = P, q, G.T
         self._below[:n], self._below[n + 1 :], self._above[:n] = lower, h, upper

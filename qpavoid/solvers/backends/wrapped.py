@@ -1,4 +1,4 @@
-"""Every back end that qpsolvers finds installed."""
+"""All back ends that qpsolvers finds installed."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ _TIGHT: dict[str, dict[str, Any]] = {
     "scs": {"eps_abs": 1e-9, "eps_rel": 1e-10},
 }
 """Tolerances by back end; exact (active-set) ones need none. An error in x is about the root of twice the duality gap
-over P's smallest eigenvalue: with 1e-3 there, a gap of 1e-10 still leaves x off by 4e-4. Asked for 1e-15, clarabel was
-right on nearly all recorded problems and gave up on easy random ones."""
+over P's smallest eigenvalue: with 1e-3 there, a gap of 1e-10 still leaves x off by 4e-4. With 1e-15,
+clarabel was right on nearly all recorded problems and failed on easy random ones."""
 
 
 def through_qpsolvers(
     name: str, options: dict[str, Any] | None = None
 ) -> Callable[[Array, Array, Array, Array, Array, Array], Array | None]:
-    """The back end of that name in qpsolvers.
+    """Return a back end of qpsolvers.
 
     Args:
         name: as in `qpsolvers.available_solvers`.
-        options: given to the solver; tight tolerances if left out.
+        options: arguments of the back end; tight tolerances if left out.
     """
     options = _TIGHT.get(name, {}) if options is None else options
     sparse = name in qpsolvers.sparse_solvers and name not in qpsolvers.dense_solvers
 
     def solve(P: Array, q: Array, G: Array, h: Array, lower: Array, upper: Array) -> Array | None:
-        as_given = csc_matrix if sparse else np.asarray
-        rows = {"G": as_given(-G), "h": -h} if len(h) else {}
-        problem = qpsolvers.Problem(as_given(P), q, **rows, lb=lower, ub=upper)
+        convert = csc_matrix if sparse else np.asarray
+        rows = {"G": convert(-G), "h": -h} if len(h) else {}
+        problem = qpsolvers.Problem(convert(P), q, **rows, lb=lower, ub=upper)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # "no solution" is an answer here, not news for the terminal
+            warnings.simplefilter("ignore")  # "no solution" is an answer here, and not to be printed
             try:
                 solution = qpsolvers.solve_problem(problem, solver=name, **options)
             except qpsolvers.exceptions.QPError:
