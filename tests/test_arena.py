@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from qpavoid import Solution, load_scenario
-from qpavoid.arena.case import Case, Sensor, Sight
+from qpavoid.arena.case import Case, Sensor, SensorModel
+from qpavoid.arena.checker import Contact, Findings, check_run
 from qpavoid.arena.entrants import ENTRANTS, find_entrant
-from qpavoid.arena.referee import Contact, Findings, play
+from qpavoid.arena.mujoco_model import build
 from qpavoid.arena.rollout import Rollout, roll_out
 from qpavoid.arena.scores import COLUMNS, score
 from qpavoid.arena.trial import run_trial
-from qpavoid.arena.twin import build
 from qpavoid.arena.world import build_world
 from qpavoid.errors import ConfigError, UnknownName
-from qpavoid.run import simulate
+from qpavoid.run.simulate import simulate
 
 DT = 0.01
 
@@ -53,8 +53,8 @@ class Broken(Constant):
 
 def test_a_case_survives_json_and_its_key_tells_cases_apart():
     case = make_case(duration=1, sensor=Sensor(delay=0.05))
-    again = Case.from_json(case.to_json())
-    assert again == case and again.key == case.key and again.scenario.source == case.scenario.source
+    rerun = Case.from_json(case.to_json())
+    assert rerun == case and rerun.key == case.key and rerun.scenario.source == case.scenario.source
     others = [replace(case, seed=4), replace(case, sensor=Sensor()), make_case(duration=1.5)]
     assert len({case.key, *(other.key for other in others)}) == 4
 
@@ -63,21 +63,21 @@ def test_a_perfect_sensor_tells_what_moves_and_a_late_one_what_was():
     case = make_case("moving_sphere")
     world = build_world(case.scenario)
     (moving,) = [obstacle for obstacle in world.scene.obstacles if obstacle.moves]
-    seen = Sight(case, world.scene.obstacles).look(1.0)
+    seen = SensorModel(case, world.scene.obstacles).measure(1.0)
     assert list(seen) == [moving.name]
     assert np.array_equal(seen[moving.name].position, moving.motion.sample(1.0).position)
-    late = Sight(replace(case, sensor=Sensor(delay=0.25)), world.scene.obstacles)
-    assert np.array_equal(late.look(1.0)[moving.name].position, moving.motion.sample(0.75).position)
-    assert np.array_equal(late.look(0.1)[moving.name].position, moving.motion.sample(0.0).position)
+    late = SensorModel(replace(case, sensor=Sensor(delay=0.25)), world.scene.obstacles)
+    assert np.array_equal(late.measure(1.0)[moving.name].position, moving.motion.sample(0.75).position)
+    assert np.array_equal(late.measure(0.1)[moving.name].position, moving.motion.sample(0.0).position)
 
 
 def test_noise_has_the_stated_spread_and_is_the_same_for_all():
     case = make_case("moving_sphere", Sensor(position_noise=0.01, velocity_noise=0.05))
     world = build_world(case.scenario)
-    first, second = (Sight(case, world.scene.obstacles) for _ in range(2))
+    first, second = (SensorModel(case, world.scene.obstacles) for _ in range(2))
     errors = []
     for t in np.arange(0.0, 20.0, DT):
-        one, two = first.look(t), second.look(t)
+        one, two = first.measure(t), second.measure(t)
         for obstacle in world.scene.obstacles:
             truth, seen = obstacle.motion.sample(t), one[obstacle.name]
             assert np.array_equal(seen.position, two[obstacle.name].position)
@@ -107,18 +107,18 @@ def test_an_entrant_that_fails_is_held_and_every_tick_counts(how, said):
 
 def test_an_entrant_that_takes_for_ever_is_given_up():
     case = make_case(duration=1)
-    rollout = roll_out(case, Constant(np.zeros(6)), build_world(case.scenario), patience=1e-9)
+    rollout = roll_out(case, Constant(np.zeros(6)), build_world(case.scenario), time_budget=1e-9)
     assert rollout.failed.sum() == 100 and rollout.failure == "out of time"
 
 
 @pytest.mark.parametrize("name", ["ur5_pole", "moving_sphere", "crossing_arms"])
-@pytest.mark.parametrize("law", ["qp", "eq10", "tracking"])
-def test_the_loop_is_that_of_simulate(name, law):
+@pytest.mark.parametrize("solver", ["qp", "eq10", "tracking"])
+def test_the_loop_is_that_of_simulate(name, solver):
     case = make_case(name, duration=3)
     world = build_world(case.scenario)
-    entrant = ENTRANTS[law]
+    entrant = ENTRANTS[solver]
     rollout = roll_out(case, entrant.start(case, world), world)
-    log = simulate(load_scenario(name, ["duration=3"], law))  # one name means one thing, safety options included
+    log = simulate(load_scenario(name, ["duration=3"], solver))  # one name means one thing, safety options included
     assert rollout.q == pytest.approx(log.q, abs=1e-9)
     assert rollout.tool == pytest.approx(log.tool, abs=1e-9)
 
@@ -129,7 +129,7 @@ def test_distances_below_the_threshold_are_the_true_ones():
     rollout = roll_out(case, ENTRANTS["tracking"].start(case, world), world)
     twin = build(world.scene, world.q0)
     near = 0.05
-    findings = play(twin, rollout.t, rollout.v, case.scenario.limits, near)
+    findings = check_run(twin, rollout.t, rollout.v, case.scenario.limits, near)
     movable, below = np.flatnonzero(twin.movable), 0
     for k in range(0, len(rollout.t), 7):
         twin.place(findings.q[k], rollout.t[k])
@@ -213,7 +213,7 @@ def test_a_trial_tells_a_law_that_avoids_from_one_that_does_not():
 
 def test_entrants_are_what_they_say():
     for name, entrant in ENTRANTS.items():
-        assert entrant.name == name and entrant.says
+        assert entrant.name == name and entrant.description
     assert len({entrant.digest for entrant in ENTRANTS.values()}) == len(ENTRANTS)
     with pytest.raises(UnknownName, match="did you mean 'eq10'"):
         find_entrant("eq_10")

@@ -22,7 +22,7 @@ from matplotlib.text import Text
 from scipy.stats import binom, binomtest
 
 from qpavoid.arena import statistics
-from qpavoid.arena.coverage import gaps
+from qpavoid.arena.coverage import missing_results
 from qpavoid.arena.figures import safety_against_tracking, success_against_time
 from qpavoid.arena.report import report_of, rerun_line, write_report
 from qpavoid.arena.results import results_of
@@ -136,8 +136,8 @@ def test_estimates_lie_within_their_intervals_and_these_within_the_values(values
 @pytest.mark.parametrize("count", [6, 11, 40, 101])
 def test_the_interval_of_a_median_is_the_narrowest_that_the_sign_test_allows(count):
     low = int(median(np.arange(count, dtype=float)).low)
-    outside = 2.0 * binom.cdf(low, count, 0.5)
-    assert outside <= 1.0 - CONFIDENCE < 2.0 * binom.cdf(low + 1, count, 0.5)
+    outside_interval = 2.0 * binom.cdf(low, count, 0.5)
+    assert outside_interval <= 1.0 - CONFIDENCE < 2.0 * binom.cdf(low + 1, count, 0.5)
     assert median(np.arange(count, dtype=float)).high == count - 1 - low
 
 
@@ -472,7 +472,7 @@ def test_what_a_suite_asks_for_and_has_not_got_is_told():
     facts["failures"] = [
         {"family": "shelf", "seed": k, "entrant": who, "failure": "no\nway"} for who in (None, "hqp") for k in range(7)
     ]
-    assert list(gaps(results, facts)) == [
+    assert list(missing_results(results, facts)) == [
         "Nobody has run 2 of the 4 cases of field that the suite asks for.",
         "Nobody has run 4 of the 4 cases of shelf that the suite asks for.",
         "mink does not take part: it needs mink.",
@@ -481,12 +481,12 @@ def test_what_a_suite_asks_for_and_has_not_got_is_told():
         "shelf, seed 0, 1, 2, 3, 4, …: could not be run by hqp: `no way`",
     ]
     whole = {"families": ["field"], "first_seed": 3, "seeds": 2, "entrants": {"qp": entrants["qp"]}}
-    assert not list(gaps(results, whole)) and not list(gaps(results, {}))
+    assert not list(missing_results(results, whole)) and not list(missing_results(results, {}))
 
 
 def test_versions_that_differ_are_told():
     results = results_of(table([row("qp", version="2"), row("eq10", version="1")]))
-    assert [line for line in gaps(results, {}) if "different versions" in line and "eq10 1, qp 2" in line]
+    assert [line for line in missing_results(results, {}) if "different versions" in line and "eq10 1, qp 2" in line]
 
 
 def test_an_entrant_from_a_file_is_run_again_from_it(tmp_path):
@@ -500,12 +500,12 @@ def test_an_entrant_from_a_file_is_run_again_from_it(tmp_path):
 def test_a_folder_without_a_list_of_failures_keeps_its_facts(tmp_path):
     with Store(tmp_path) as store:
         store.runs.append(row())
-        store.describe({"title": "ObstacleEstimates", "entrants": {}})
+        store.describe({"title": "Facts", "entrants": {}})
     (tmp_path / "failures.jsonl").write_text('{"family": "field", "se')  # a sweep is writing it
     assert read_failures(tmp_path) == []
     (tmp_path / "failures.jsonl").unlink()
     write_report(tmp_path)
-    assert (tmp_path / "report.md").read_text(encoding="utf-8").startswith("# Arena: Told\n")
+    assert (tmp_path / "report.md").read_text(encoding="utf-8").startswith("# Arena: Facts\n")
 
 
 @pytest.mark.parametrize("times", [(60.0, 104.0, 143.0), (20.0, 90.0, 4000.0)])

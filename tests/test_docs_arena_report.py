@@ -36,7 +36,7 @@ def test_its_sections_are_those_of_the_report_in_their_order():
 
 def test_its_figures_are_those_of_the_tables():
     kinds = {"rate": "share", "low": "5th percentile"}
-    columns = [[column.heading, kinds.get(column.kind, column.kind), column.says] for column in (*SHOWN, *MORE)]
+    columns = [[column.heading, kinds.get(column.kind, column.kind), column.description] for column in (*SHOWN, *MORE)]
     assert rows_of("| figure |") == columns
 
 

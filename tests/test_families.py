@@ -15,12 +15,12 @@ from pydantic import TypeAdapter
 from qpavoid import ScenarioConfig
 from qpavoid.arena.case import Case
 from qpavoid.arena.families import Draw, Redraw, family_names, load_family, make_case
-from qpavoid.arena.families.clearance import STEP, Clearance
+from qpavoid.arena.families.clearance import MIN_ADVANCE, Clearance
+from qpavoid.arena.families.inverse_kinematics import FrameGoal, JointRanges, solve_inverse_kinematics
 from qpavoid.arena.families.parameters import Parameter
 from qpavoid.arena.families.planner import plan
-from qpavoid.arena.families.reach import Ranges, Want, configuration_at
 from qpavoid.arena.families.solvable import find_plan
-from qpavoid.arena.scores import to_keep
+from qpavoid.arena.scores import surface_safety_distance
 from qpavoid.arena.world import build_world
 from qpavoid.config.shipped import scenario_names, setup_names
 from qpavoid.errors import ConfigError, UnknownName
@@ -62,7 +62,7 @@ def test_a_case_starts_clear_and_is_told_how_it_is_solved(name):
             world.scene.robot.model, world.scene.robot.model.createData(), world.scene.geometry, data, world.q0
         )
         pin.computeDistances(world.scene.geometry, data)
-        assert min((r.min_distance for r in data.distanceResults), default=1.0) > to_keep(scenario)
+        assert min((r.min_distance for r in data.distanceResults), default=1.0) > surface_safety_distance(scenario)
         assert Case.from_json(made.to_json()).key == made.key
 
 
@@ -82,17 +82,17 @@ def test_cases_are_the_same_in_another_process():
 @pytest.mark.parametrize("name", [name for name in FAMILIES if name != "unreachable"])
 def test_mujoco_finds_the_plan_clear(name, monkeypatch):
     pytest.importorskip("mujoco")
-    from qpavoid.arena.referee import Watch
-    from qpavoid.arena.twin import build
+    from qpavoid.arena.checker import DistanceMonitor
+    from qpavoid.arena.mujoco_model import build
 
     plans = []
     monkeypatch.setattr("qpavoid.arena.families.solvable.plan", lambda *given: plans.append(plan(*given)) or plans[-1])
     scenario = make_case(load_family(name), 0).scenario
-    world, keep, found = build_world(scenario), to_keep(scenario), plans[-1]
+    world, keep, found = build_world(scenario), surface_safety_distance(scenario), plans[-1]
     twin = build(world.scene, world.q0)
-    watch, q = Watch(twin, near=keep), np.array(found.q[0])
+    watch, q = DistanceMonitor(twin, measured_below=keep), np.array(found.q[0])
     np.testing.assert_array_equal(q, world.q0)
-    watch.look(0.0)
+    watch.measure(0.0)
     speed = world.scene.robot.bounds().velocity
     for to, begin, end in zip(found.q[1:], found.t, found.t[1:], strict=False):
         v = (to - q) / (end - begin)
@@ -102,7 +102,7 @@ def test_mujoco_finds_the_plan_clear(name, monkeypatch):
     assert found.t[-1] <= (scenario.duration - 1.0 if name in TIMED else scenario.duration)
     watch.follow(q, 0.0 * q, found.t[-1], scenario.duration - found.t[-1])
     assert watch.distance >= keep - 1e-4
-    assert watch.looks > 50
+    assert watch.instants > 50
     data = world.scene.robot.model.createData()
     pin.framesForwardKinematics(world.scene.robot.model, data, q)
     for task in world.tools:
@@ -114,13 +114,15 @@ def test_mujoco_finds_the_plan_clear(name, monkeypatch):
 def test_goals_out_of_reach_are_attained_by_no_search(seed):
     made = case("unreachable", seed)
     world, random = build_world(made.scenario), np.random.default_rng(0)
-    robot, ranges = world.scene.robot, Ranges.of(world.scene.robot)
+    robot, ranges = world.scene.robot, JointRanges.of(world.scene.robot)
     clearance = Clearance(world, made.scenario.duration, 0.0)
     (task,) = world.tools
     goal = task.motion.sample(made.scenario.duration).position
     for _ in range(20):
         begin = random.uniform(ranges.lower, ranges.upper)
-        q = configuration_at(robot, [Want(task.frame_id, goal)], begin, ranges, made.scenario.goal_tolerance)
+        q = solve_inverse_kinematics(
+            robot, [FrameGoal(task.frame_id, goal)], begin, ranges, made.scenario.goal_tolerance
+        )
         assert q is None or clearance.at(q, 0.0) < 0.0
         assert q is None or "inside" in made.solved_by
 
@@ -145,8 +147,10 @@ def test_crossing_obstacles_meet_the_target(seed):
     there = np.array([target.sample(t).position for t in times])
     for obstacle in world.scene.obstacles:
         # constant speed there, smooth here: both are at the meeting point, though not at quite the same time
-        gaps = np.linalg.norm(there[:, None, :] - [[obstacle.motion.sample(t).position for t in times[::10]]], axis=2)
-        assert gaps.min() < 0.05 * 1.3 + 0.01
+        missing_results = np.linalg.norm(
+            there[:, None, :] - [[obstacle.motion.sample(t).position for t in times[::10]]], axis=2
+        )
+        assert missing_results.min() < 0.05 * 1.3 + 0.01
 
 
 @pytest.mark.parametrize("seed", [0, 2])
@@ -160,8 +164,8 @@ def test_two_tools_change_sides_and_meet_where_they_pass(seed):
         assert np.abs(apart[-1, 2]) > 0.01
         if name == "passing":
             at_rest = np.linalg.norm(np.diff(apart, axis=0), axis=1) < 1e-12
-            gaps = np.linalg.norm(apart[1:][at_rest], axis=1)
-            assert ((gaps >= 0.04 - 1e-9) & (gaps <= 0.12 + 1e-9)).any()
+            missing_results = np.linalg.norm(apart[1:][at_rest], axis=1)
+            assert ((missing_results >= 0.04 - 1e-9) & (missing_results <= 0.12 + 1e-9)).any()
 
 
 # --- drawing -----------------------------------------------------------------------------------------------
@@ -242,7 +246,7 @@ def scenario_of(robot, obstacles, duration=8.0, **fields):
 
 def planned(scenario):
     world = build_world(scenario)
-    clearance = Clearance(world, scenario.duration, to_keep(scenario))
+    clearance = Clearance(world, scenario.duration, surface_safety_distance(scenario))
     return find_plan(scenario, world, clearance, np.random.default_rng(0))
 
 
@@ -259,7 +263,7 @@ def test_a_plan_goes_through_the_opening_and_no_wall(gantry):
 
 
 def test_no_plan_where_there_is_none(gantry, monkeypatch):
-    monkeypatch.setattr("qpavoid.arena.families.planner.MOST_NODES", 1000)
+    monkeypatch.setattr("qpavoid.arena.families.planner.MAX_NODES", 1000)
     with pytest.raises(Redraw, match="no plan"):
         planned(scenario_of(gantry, [wall("all", -1.2, 1.2)]))
     with pytest.raises(Redraw, match="no plan"):  # 120 mm for a ball of 100 mm that keeps 20 mm on each side
@@ -300,8 +304,8 @@ def test_straight_motions_are_judged_by_their_nearest_point(gantry, moves):
         first, last = (q - motion.sample(t).position[:2] for q, t in ((a, ta), (b, tb)))
         share = np.clip(first @ (first - last) / ((first - last) @ (first - last)), 0.0, 1.0)
         least = np.linalg.norm(first + share * (last - first)) - 0.055
-        answers.append(clearance.clear_between(a, ta, b, tb))
-        assert least >= 0.01 if answers[-1] else least < 0.01 + STEP
+        answers.append(clearance.is_clear_between(a, ta, b, tb))
+        assert least >= 0.01 if answers[-1] else least < 0.01 + MIN_ADVANCE
     assert 50 < sum(answers) < 350
 
 
@@ -310,13 +314,13 @@ def test_straight_motions_are_judged_by_their_nearest_point(gantry, moves):
 def test_a_motion_that_is_passed_is_clear_at_every_place(seed):
     random = np.random.default_rng(seed)
     made = case("sphere_field" if seed % 2 else "head_on", seed % 3)
-    world, keep = build_world(made.scenario), to_keep(made.scenario)
+    world, keep = build_world(made.scenario), surface_safety_distance(made.scenario)
     clearance = Clearance(world, made.scenario.duration, keep)
     a = world.q0 + random.uniform(-0.2, 0.2, len(world.q0))
     b = a + random.uniform(-0.5, 0.5, len(a))
     ta, tb = sorted(random.uniform(0.0, made.scenario.duration, 2))
     least = min(clearance.at(a + s * (b - a), ta + s * (tb - ta)) for s in np.linspace(0.0, 1.0, 200))
-    if clearance.clear_between(a, ta, b, tb):
+    if clearance.is_clear_between(a, ta, b, tb):
         assert least >= keep
     else:
         assert least < clearance.least + 0.005
@@ -330,7 +334,7 @@ def test_no_point_moves_farther_than_its_levers_allow(name, gantry):
     )  # fmt: skip
     world = build_world(made)
     robot, random = world.scene.robot, np.random.default_rng(3)
-    lever_arm, ranges = Clearance(world, 1.0, 0.02).lever_arm, Ranges.of(robot)
+    lever_arm, ranges = Clearance(world, 1.0, 0.02).lever_arm, JointRanges.of(robot)
     data, longest = robot.model.createData(), 0.0
     for _ in range(300):
         q = random.uniform(ranges.lower, ranges.upper)
@@ -348,19 +352,19 @@ def test_no_point_moves_farther_than_its_levers_allow(name, gantry):
 
 
 def test_inverse_kinematics_attains_poses_within_limits(panda):
-    random, ranges, data = np.random.default_rng(1), Ranges.of(panda), panda.model.createData()
+    random, ranges, data = np.random.default_rng(1), JointRanges.of(panda), panda.model.createData()
     frame, found = panda.frame_id("panda_hand_tcp", "test"), 0
     for _ in range(20):
         pin.framesForwardKinematics(panda.model, data, random.uniform(0.7 * ranges.lower, 0.7 * ranges.upper))
-        want = Want(frame, data.oMf[frame].translation.copy(), data.oMf[frame].rotation.copy())
-        q = configuration_at(panda, [want], panda.home, ranges, 1e-4)
+        goal = FrameGoal(frame, data.oMf[frame].translation.copy(), data.oMf[frame].rotation.copy())
+        q = solve_inverse_kinematics(panda, [goal], panda.home, ranges, 1e-4)
         if q is None:
             continue
         found += 1
         assert ((ranges.lower <= q) & (q <= ranges.upper)).all()
         pin.framesForwardKinematics(panda.model, data, q)
-        assert np.linalg.norm(data.oMf[frame].translation - want.position) < 2e-4
-        assert np.linalg.norm(pin.log3(want.rotation @ data.oMf[frame].rotation.T)) < 2e-4
+        assert np.linalg.norm(data.oMf[frame].translation - goal.position) < 2e-4
+        assert np.linalg.norm(pin.log3(goal.rotation @ data.oMf[frame].rotation.T)) < 2e-4
     assert found >= 10
 
 
@@ -369,7 +373,9 @@ def test_a_plan_of_many_goals_takes_one_that_is_free(gantry):
     world = build_world(scenario)
     clearance = Clearance(world, 8.0, 0.02)
     goals = np.array([[0.0, 0.9], [-0.5, -0.9]])  # the second is on this side
-    found = plan(clearance, Ranges.of(world.scene.robot), world.q0, goals, np.ones(2), 8.0, np.random.default_rng(0))
+    found = plan(
+        clearance, JointRanges.of(world.scene.robot), world.q0, goals, np.ones(2), 8.0, np.random.default_rng(0)
+    )
     assert any(np.array_equal(found.q[-1], goal) for goal in goals)
 
 
@@ -501,7 +507,7 @@ def test_a_file_at_fault_is_told_so(family, text, change, error, said):
 )  # fmt: skip
 def test_a_family_that_makes_no_case_says_why(family, monkeypatch, text, change, code, error, said):
     monkeypatch.setattr("qpavoid.arena.families.solvable._TRIES", 5)
-    monkeypatch.setattr("qpavoid.arena.families.make.MOST_DRAWS", 10)
+    monkeypatch.setattr("qpavoid.arena.families.make.MAX_DRAWS", 10)
     loaded = family(text, *([change] if change else []), code=code)
     with pytest.raises(error, match=said) as raised:
         make_case(loaded, 0)

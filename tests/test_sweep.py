@@ -25,14 +25,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from qpavoid.arena import commands, store, sweep
+from qpavoid.arena.entrant_file import entrant_from_file
 from qpavoid.arena.entrants import ENTRANTS
 from qpavoid.arena.families import load_family, make_case
-from qpavoid.arena.own import own_entrant
-from qpavoid.arena.plan import cases_of, complete, missing_cases, missing_runs, runs_of
+from qpavoid.arena.plan import cases_of, is_complete, missing_cases, missing_runs, runs_of
 from qpavoid.arena.scores import COLUMNS, KEY
 from qpavoid.arena.store import Store, read_cases, read_runs
 from qpavoid.arena.suite import EntrantConfig, load_suite, origin
-from qpavoid.arena.summary import broken, summary
+from qpavoid.arena.summary import find_faults, summary
 from qpavoid.arena.trial import run_trial
 from qpavoid.arena.world import build_world
 from qpavoid.config.shipped import family_names, suite_names
@@ -276,7 +276,7 @@ def test_what_is_missing_is_what_is_not_there(tmp_path_factory, data):
     there = {(f"c{seed}", name) for seed, name in wanted if (seed, name, True) in done}
     runs = runs_of(suite, out)
     assert set(keys_of(runs, ("case", "entrant"))) == there and len(runs) == len(there)
-    assert complete(suite, out) == (not left and set(range(4)) <= made)
+    assert is_complete(suite, out) == (not left and set(range(4)) <= made)
 
 
 def test_settings_and_families_that_change_want_results_of_their_own(folder):
@@ -285,7 +285,7 @@ def test_settings_and_families_that_change_want_results_of_their_own(folder):
         return entrant.digest
 
     assert len({digests(), digests(solver="eq10"), digests(avoidance={"d2": 0.2}), digests(avoidance={"d2": 0.3})}) == 4
-    assert digests(says="other words") == digests()
+    assert digests(description="other words") == digests()
     before = origin(load_family(folder / "post.yaml"))
     assert origin(load_family(folder / "post.yaml")) == before
     (folder / "post.yaml").write_text(yaml.safe_dump({**POST, "scenario": {**POST["scenario"], "dt": 0.01}}))
@@ -374,17 +374,17 @@ def test_files_that_fail_are_told_with_their_name(tmp_path):
     for text, said in (("def f(:", "SyntaxError"), ("1 / 0", "ZeroDivisionError"), ("exit()", "SystemExit")):
         (tmp_path / "bad.py").write_text(text)
         with pytest.raises(ConfigError, match=rf"bad.py: cannot be run: {said}"):
-            own_entrant(tmp_path / "bad.py", "f")
+            entrant_from_file(tmp_path / "bad.py", "f")
 
 
 def test_the_digest_of_an_own_entrant_follows_its_text_and_not_its_place(folder):
-    first = own_entrant(folder / "laws.py", "Halved")
+    first = entrant_from_file(folder / "laws.py", "Halved")
     (folder / "elsewhere").mkdir()
     (folder / "elsewhere" / "laws.py").write_text(LAWS)
-    assert own_entrant(folder / "elsewhere" / "laws.py", "Halved").digest == first.digest
+    assert entrant_from_file(folder / "elsewhere" / "laws.py", "Halved").digest == first.digest
     (folder / "laws.py").write_text(LAWS.replace("0.5", "0.4"))
-    assert own_entrant(folder / "laws.py", "Halved").digest != first.digest
-    assert first.says == "A class with solve."
+    assert entrant_from_file(folder / "laws.py", "Halved").digest != first.digest
+    assert first.description == "A class with solve."
 
 
 @pytest.mark.parametrize(
@@ -397,12 +397,14 @@ def test_the_digest_of_an_own_entrant_follows_its_text_and_not_its_place(folder)
 )
 def test_a_law_that_fails_has_failed_and_says_why(folder, name, said):
     """A controller brakes where its law fails; the arena must not take that for what the law wants."""
-    row = run_trial(make_case(load_family(folder / "post.yaml"), 0), own_entrant(folder / "laws.py", name))
+    row = run_trial(make_case(load_family(folder / "post.yaml"), 0), entrant_from_file(folder / "laws.py", name))
     assert row.failed == row.stopped == 1.0 and not row.success and re.search(said, row.failure)
 
 
 def test_a_law_that_fails_now_and_then_goes_on(folder):
-    row = run_trial(make_case(load_family(folder / "post.yaml"), 0), own_entrant(folder / "laws.py", "now_and_then"))
+    row = run_trial(
+        make_case(load_family(folder / "post.yaml"), 0), entrant_from_file(folder / "laws.py", "now_and_then")
+    )
     assert 0.0 < row.failed < 1.0 and row.failure == "ValueError: not now" and row.path_length > 0.0
 
 
@@ -459,7 +461,7 @@ def test_what_cannot_be_set_up_or_takes_its_process_down_has_failed_and_is_not_l
         assert row["failed"] == (0.0 if row["entrant"] == "Still" else 1.0)
         assert said.get(row["entrant"], "") in row["failure"]
         assert row["stopped"] == row["failed"] and row["time_to_goal"] == 1.0
-    assert complete(suite, folder / "out")
+    assert is_complete(suite, folder / "out")
 
 
 def test_processes_that_dask_gives_up_are_replaced(folder, monkeypatch):
@@ -468,7 +470,7 @@ def test_processes_that_dask_gives_up_are_replaced(folder, monkeypatch):
     def too_long(*_):
         raise AssertionError("the sweep waits for a process that never comes")
 
-    monkeypatch.setitem(sweep._DASK, "distributed.deploy.lost-worker-timeout", "1 ms")
+    monkeypatch.setitem(sweep._DASK_CONFIG, "distributed.deploy.lost-worker-timeout", "1 ms")
     suite = load_suite(write_suite(folder, ["laws.py:Deadly", "laws.py:Still"], seeds=1))
     before = signal.signal(signal.SIGALRM, too_long)
     signal.alarm(120)
@@ -490,7 +492,7 @@ def test_a_case_that_cannot_be_made_is_told_and_the_others_run(folder, client):
     assert tally.done == 1 and tally.failed == 1
     (failure,) = map(json.loads, (folder / "out" / "failures.jsonl").read_text().splitlines())
     assert failure["family"] == "crowded" and failure["entrant"] is None and "crowded.yaml" in failure["failure"]
-    assert not complete(suite, folder / "out")
+    assert not is_complete(suite, folder / "out")
     assert read_runs(folder / "out")["family"].to_pylist() == ["post"]
 
 
@@ -602,8 +604,8 @@ def test_run_then_show_then_nothing_left_to_do(cli, folder, monkeypatch):
     assert [entry["entrant"] for entry in document["entrants"]] == ["tracking", "wide"]
     with monkeypatch.context() as patch:
         patch.setattr(sweep, "local_cluster", None)  # no process is started for it
-        again = cli("bench", "run", "mine.yaml")
-    assert again.status == 0 and "4 runs, 0 of them new" in again.stdout and "tracking" in again.stdout
+        rerun = cli("bench", "run", "mine.yaml")
+    assert rerun.status == 0 and "4 runs, 0 of them new" in rerun.stdout and "tracking" in rerun.stdout
     out = Path("out/bench/mine")
     shown = cli(
         "bench", "show", out, "--family", "post", "--seed", 1, "--entrant", "wide", "--scenario", "case.yaml", "--json"
@@ -639,7 +641,7 @@ def test_list_names_everything(cli):
     ],
 )
 def test_bad_input_is_a_line_and_exit_status_2(cli, monkeypatch, words, said):
-    monkeypatch.setattr(sweep, "_ANSWER_WITHIN", 0.5)
+    monkeypatch.setattr(sweep, "_CONNECT_TIMEOUT", 0.5)
     result = cli("bench", *words)
     lines = [line for line in result.lines if "does not take part" not in line]
     assert result.status == 2 and len(lines) == 1
@@ -697,7 +699,7 @@ def smoke_rows(folder, **changes):
 )
 def test_the_smoke_test_tells_what_is_broken(folder, changes, said):
     suite, rows, cases = smoke_rows(folder, **changes)
-    faults = list(broken(suite, pa.Table.from_pylist(rows, schema=store.RUNS.schema), cases))
+    faults = list(find_faults(suite, pa.Table.from_pylist(rows, schema=store.RUNS.schema), cases))
     assert len(faults) == len(said) and all(fault.startswith(start) for fault, start in zip(faults, said, strict=True))
 
 

@@ -17,7 +17,7 @@ from qpavoid.model.cloud import ball_radius
 pytest.importorskip("mujoco")
 pytest.importorskip("bench", reason="bench/ is in the repository only")
 
-from qpavoid.arena.twin import build
+from qpavoid.arena.mujoco_model import build
 
 TCP, HOLD = "panda_hand_tcp", 0.02
 

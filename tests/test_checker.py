@@ -11,7 +11,7 @@ import pytest
 from conftest import BOX, CAPSULE, CYLINDER, SPHERE, obstacle, random_q, random_scene, write_chain
 
 from qpavoid import Limits, Robot, ScenarioConfig, build_scene, load_scenario
-from qpavoid.run import simulate
+from qpavoid.run.simulate import simulate
 
 pytest.importorskip("mujoco")
 pytest.importorskip("bench", reason="bench/ is in the repository only")
@@ -22,8 +22,8 @@ from bench.safety.flight import Start, fly, joint_means, manners
 from bench.safety.referee import disagreement, feedforward, referee
 from bench.safety.trial import trials
 from bench.safety.verdict import judge
-from qpavoid.arena.referee import STEP, Watch
-from qpavoid.arena.twin import build, load
+from qpavoid.arena.checker import STEP, DistanceMonitor
+from qpavoid.arena.mujoco_model import build, load_model
 
 PLATE = BOX.model_copy(update={"size": (0.3, 0.2, 0.006)})
 
@@ -36,7 +36,7 @@ def robot(name):
 @cache
 def situation(solver):
     scenario = load_scenario("situation1")
-    return load(scenario), simulate(scenario, solver)
+    return load_model(scenario), simulate(scenario, solver)
 
 
 def scene_of(robot_path, tasks, obstacles, **fields):
@@ -149,7 +149,7 @@ def test_it_checks_the_joint_limits():
 
 def test_it_checks_accelerations():
     scenario = load_scenario("situation1", ["limits.acceleration=3.0", "duration=1.0"])
-    twin, log = load(scenario), simulate(scenario, "tracking")
+    twin, log = load_model(scenario), simulate(scenario, "tracking")
     v = np.zeros_like(log.v)
     v[5:, 1] = 0.05  # rad/s, within one tick of 0.01 s
     assert referee(twin, replace(log, v=v)).acceleration_excess == pytest.approx(5.0 - 3.0)
@@ -173,7 +173,7 @@ def test_it_catches_what_passes_between_two_ticks(tmp_path):
         dt=0.1,
         duration=0.4,
     )
-    twin, log = load(scenario), simulate(scenario, "tracking")
+    twin, log = load_model(scenario), simulate(scenario, "tracking")
     findings = referee(twin, log)
     assert log.min_distance.min() > 0.05
     assert [twin.scene.pair_names[contact.pair] for contact in findings.contacts] == [("link1_0", "plate")]
@@ -183,7 +183,7 @@ def test_it_catches_what_passes_between_two_ticks(tmp_path):
 @pytest.mark.parametrize("seed", [2, 9])
 def test_what_it_does_not_measure_again_does_not_matter(seed):
     scenario = draw(seed)
-    twin, log = load(scenario), simulate(scenario, "tracking")
+    twin, log = load_model(scenario), simulate(scenario, "tracking")
     findings = referee(twin, log)
     touched, smallest = set(), np.inf
     for q, t in zip(findings.q, log.t.tolist(), strict=True):
@@ -194,18 +194,18 @@ def test_what_it_does_not_measure_again_does_not_matter(seed):
     found = {contact.pair for contact in findings.contacts}
     assert touched and touched <= found
     assert smallest - STEP < findings.distance <= smallest + 1e-12
-    assert findings.looks >= len(log.t)
+    assert findings.instants >= len(log.t)
 
 
 def test_no_step_is_longer_than_it_says():
-    class Seen(Watch):
-        def look(self, t):
+    class Seen(DistanceMonitor):
+        def measure(self, t):
             centers.append(twin.poses()[0].copy())
-            super().look(t)
+            super().measure(t)
 
-    twin, centers = load(draw(9)), []
+    twin, centers = load_model(draw(9)), []
     watch = Seen(twin)
-    watch.look(0.0)
+    watch.measure(0.0)
     watch.follow(twin.q0, 0.5 * twin.scene.robot.bounds().velocity, 0.0, 0.05)
     assert len(centers) > 5
     assert np.linalg.norm(np.diff(centers, axis=0), axis=2).max() <= 1.05 * STEP
@@ -240,7 +240,7 @@ def test_verdicts(tmp_path, obstacles, why):
         avoidance={"d1": 0.02, "d2": 0.1},
         duration=4.0,
     )
-    twin, log = load(scenario), simulate(scenario, "tracking")
+    twin, log = load_model(scenario), simulate(scenario, "tracking")
     verdicts = judge(twin, scenario, log, referee(twin, log))
     assert [verdict.why for verdict in verdicts] == why, verdicts
     assert verdicts[-1].avoidable == (why[-1] == "avoidable")
@@ -248,17 +248,17 @@ def test_verdicts(tmp_path, obstacles, why):
 
 @pytest.mark.parametrize("acceleration", [None, 10.0])
 def test_flights_keep_to_the_limits(monkeypatch, acceleration):
-    flown, follow = [], Watch.follow
+    flown, follow = [], DistanceMonitor.follow
 
     def recorded(watch, q, v, t, dt):
         after = follow(watch, q, v, t, dt)
         flown.append((after, v))
         return after
 
-    monkeypatch.setattr(Watch, "follow", recorded)
+    monkeypatch.setattr(DistanceMonitor, "follow", recorded)
     limits = Limits(acceleration=acceleration)
     scenario = draw(9).model_copy(update={"limits": limits, "dt": 0.02})
-    twin = load(scenario)
+    twin = load_model(scenario)
     means = joint_means(twin, scenario)
     start = Start(twin.q0, np.zeros_like(twin.q0), 0.0, 1.2)
     for manner in list(manners(len(twin.q0)))[::3]:
@@ -287,7 +287,7 @@ def test_scenarios_can_be_drawn_again_and_begin_clear():
     assert len({scenario.dt for scenario in drawn}) > 3
     assert max(len(scenario.obstacles) for scenario in drawn) > 10
     for scenario in drawn:
-        twin = load(scenario)
+        twin = load_model(scenario)
         smallest = min(twin.distance(pair) for pair in range(len(twin.scene.pairs)))
         assert smallest > scenario.avoidance.d1 - 1e-6, scenario.title
         assert RANGES.d1[0] <= scenario.avoidance.d1 <= RANGES.d1[1]

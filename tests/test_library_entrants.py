@@ -12,8 +12,8 @@ import pytest
 from qpavoid import Sample, load_scenario
 from qpavoid.arena.case import Case, Sensor
 from qpavoid.arena.entrants import ENTRANTS, find_entrant
-from qpavoid.arena.outside.common import frame_tasks, one_period_ahead, parted_pairs
-from qpavoid.arena.outside.settings import PLACO_PYTHON
+from qpavoid.arena.libraries.common import frame_tasks, movable_pairs, target_after_step
+from qpavoid.arena.libraries.settings import PLACO_PYTHON
 from qpavoid.arena.rollout import roll_out
 from qpavoid.arena.trial import run_trial
 from qpavoid.arena.world import build_world
@@ -60,7 +60,7 @@ def targets_at(world, t):
 def true_distances(world, q, moved):
     """(k,) distances of the pairs that the robot can part, by coal, obstacles `moved` to where they are said to be."""
     scene = world.scene
-    geometry, pairs = pin.GeometryModel(scene.geometry), parted_pairs(scene).tolist()
+    geometry, pairs = pin.GeometryModel(scene.geometry), movable_pairs(scene).tolist()
     for number, obstacle in enumerate(scene.obstacles):
         if obstacle.name in moved:
             sample = moved[obstacle.name]
@@ -79,7 +79,7 @@ def seen_by(library, pilot, world):
     if library != "mink":
         return pilot.distances()
     found = pilot.distances()
-    return np.array([found.get((a, b), np.nan) for a, b in parted_pairs(world.scene).tolist()])
+    return np.array([found.get((a, b), np.nan) for a, b in movable_pairs(world.scene).tolist()])
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
@@ -127,18 +127,18 @@ def test_pink_tracks_as_we_do_with_the_damping_of_its_barrier_on_top():
     pytest.importorskip("pink")
     from pink.barriers import SelfCollisionBarrier
 
-    from qpavoid.arena.outside.settings import PINK
+    from qpavoid.arena.libraries.settings import PINK
 
     case, world, pilot = start("pink", "ur5_pole", "obstacles=[]")
     (task,), targets = world.tasks, targets_at(world, 1.0)
     v, model, dt = pilot.step(world.q0, 1.0, targets, {}).v, world.scene.robot.model, case.scenario.dt
     here = pin.SE3(pilot.frames()[0])
-    there = pin.SE3(one_period_ahead(task, targets[task.settings.label], here.homogeneous, dt))
+    there = pin.SE3(target_after_step(task, targets[task.settings.label], here.homogeneous, dt))
     # a translation of its frame task is that of a screw, so that turning counts: half the step times the turn
     J = pin.computeFrameJacobian(model, model.createData(), world.q0, task.frame_id, pin.ReferenceFrame.LOCAL)
     J = (pin.Jlog6(there.actInv(here)) @ J)[:3]
     e = pin.log6(here.actInv(there)).linear
-    rows = SelfCollisionBarrier(min(PINK["n_collision_pairs"], len(parted_pairs(world.scene))))
+    rows = SelfCollisionBarrier(min(PINK["n_collision_pairs"], len(movable_pairs(world.scene))))
     scale = PINK["cost"] * np.linalg.norm(rows.compute_jacobian(pilot.configuration))
     damping = case.scenario.tracking_damping**2 + PINK["safe_displacement_gain"] / scale**2
     damped = J.T @ J + damping * np.eye(model.nv)
@@ -153,12 +153,12 @@ def test_speed_caps_and_orientations_of_a_target_one_period_ahead():
     here = np.array(pin.SE3(pin.exp3(np.array([0.2, -0.4, 1.0])), np.array([0.1, 0.2, 0.3])).homogeneous)
     turn = np.array([0.3, 0.1, -0.2])
     target = Sample.at((0.4, 0.2, 0.7), pin.exp3(turn) @ here[:3, :3])
-    there = one_period_ahead(task, target, here, 0.01)
+    there = target_after_step(task, target, here, 0.01)
     assert (there[:3, 3] - here[:3, 3]) / 0.01 == pytest.approx(0.1 * np.array([0.6, 0.0, 0.8]))
     rate = pin.log3(there[:3, :3] @ here[:3, :3].T) / 0.01
     assert rate == pytest.approx(0.5 * turn / np.linalg.norm(turn))
     near = Sample.at(here[:3, 3] + 0.01, pin.exp3(0.1 * turn) @ here[:3, :3], linear=(0.01, 0.0, 0.0))
-    there = one_period_ahead(task, near, here, 0.01)
+    there = target_after_step(task, near, here, 0.01)
     assert (there[:3, 3] - here[:3, 3]) / 0.01 == pytest.approx([0.03, 0.02, 0.02])  # gain 2
     assert pin.log3(there[:3, :3] @ here[:3, :3].T) / 0.01 == pytest.approx(0.2 * turn)
 
@@ -175,8 +175,8 @@ def test_who_gets_out_of_the_way_of_an_obstacle_when_the_robot_rests(library):
     """Records what the libraries do: none knows the obstacle's velocity, mink does not back away, Pink does not see."""
     case, world, pilot = start(library, "ur5_pole")
     targets = {name: sample._replace(linear=np.zeros(3)) for name, sample in targets_at(world, 0.0).items()}
-    scene, count = world.scene, len(parted_pairs(world.scene))
-    hand = [i for i, (_, b) in enumerate(parted_pairs(scene).tolist()) if b >= len(scene.body_names)]
+    scene, count = world.scene, len(movable_pairs(world.scene))
+    hand = [i for i, (_, b) in enumerate(movable_pairs(scene).tolist()) if b >= len(scene.body_names)]
     assert hand and count > len(hand)
     distances, speeds = [], []
     (tool,) = world.tasks
@@ -212,7 +212,7 @@ def test_the_rows_of_pink_turn_round_in_penetration():
     steps = 1e-5 * np.eye(nv)
     change = [true_distances(world, world.q0 + e, seen) - true_distances(world, world.q0 - e, seen) for e in steps]
     slope = np.transpose(change) / 2e-5
-    distance, count = pilot.distances(), len(parted_pairs(world.scene))
+    distance, count = pilot.distances(), len(movable_pairs(world.scene))
     J = barriers.SelfCollisionBarrier(count).compute_jacobian(pilot.configuration)
     J = J[np.argsort(np.argpartition(-distance, -count))]  # its rows are in the order of its own selection
     moves = np.linalg.norm(slope, axis=1) > 1e-2
@@ -249,7 +249,7 @@ def test_a_process_that_is_killed_makes_failures_and_no_hang(placo):
 
 
 def test_a_process_that_does_not_answer_is_ended(placo, monkeypatch):
-    monkeypatch.setattr("qpavoid.arena.outside.placos.STEP_PATIENCE", 0.3)
+    monkeypatch.setattr("qpavoid.arena.libraries.placo_adapter.STEP_TIMEOUT", 0.3)
     _, world, pilot = start("placo", "ur5_pole")
     pilot.worker.process.send_signal(signal.SIGSTOP)
     with pytest.raises(RuntimeError, match=r"did not answer within 0\.3 s"):
