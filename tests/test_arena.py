@@ -1,4 +1,4 @@
-"""The arena's closed loop, its referee's distances and its scores, against closed forms and against `simulate`."""
+"""The arena's closed loop, its checker's distances and its scores, against closed forms and against `simulate`."""
 
 from dataclasses import replace
 
@@ -51,7 +51,8 @@ class Broken(Constant):
         return Solution(np.full(len(self.v), np.nan))
 
 
-def test_a_case_survives_json_and_its_key_tells_cases_apart():
+def test_case_json_round_trip():
+    """A case survives json and its key tells cases apart."""
     case = make_case(duration=1, sensor=Sensor(delay=0.05))
     rerun = Case.from_json(case.to_json())
     assert rerun == case and rerun.key == case.key and rerun.scenario.source == case.scenario.source
@@ -59,7 +60,8 @@ def test_a_case_survives_json_and_its_key_tells_cases_apart():
     assert len({case.key, *(other.key for other in others)}) == 4
 
 
-def test_a_perfect_sensor_tells_what_moves_and_a_late_one_what_was():
+def test_sensor_model_delay():
+    """A perfect sensor tells what moves and a late one what was."""
     case = make_case("moving_sphere")
     world = build_world(case.scenario)
     (moving,) = [obstacle for obstacle in world.scene.obstacles if obstacle.moves]
@@ -71,7 +73,8 @@ def test_a_perfect_sensor_tells_what_moves_and_a_late_one_what_was():
     assert np.array_equal(late.measure(0.1)[moving.name].position, moving.motion.sample(0.0).position)
 
 
-def test_noise_has_the_stated_spread_and_is_the_same_for_all():
+def test_sensor_model_noise():
+    """Noise has the stated spread and is the same for all."""
     case = make_case("moving_sphere", Sensor(position_noise=0.01, velocity_noise=0.05))
     world = build_world(case.scenario)
     first, second = (SensorModel(case, world.scene.obstacles) for _ in range(2))
@@ -87,7 +90,8 @@ def test_noise_has_the_stated_spread_and_is_the_same_for_all():
     assert spread[:3] == pytest.approx(0.01, rel=0.1) and spread[3:] == pytest.approx(0.05, rel=0.1)
 
 
-def test_velocities_are_followed_exactly():
+def test_rollout_follows_velocities_exactly():
+    """Velocities are followed exactly."""
     case = make_case(duration=1)
     world, v = build_world(case.scenario), np.array([0.1, -0.05, 0.02, 0.0, 0.3, -0.1])
     rollout = roll_out(case, Constant(v), world)
@@ -97,7 +101,8 @@ def test_velocities_are_followed_exactly():
 
 
 @pytest.mark.parametrize(("how", "said"), [("raises", "RuntimeError: no solution found"), ("nan", "NaN or infinity")])
-def test_an_entrant_that_fails_is_held_and_every_tick_counts(how, said):
+def test_rollout_counts_failures(how, said):
+    """An entrant that fails is held and every tick counts."""
     case = make_case(duration=1)
     world, v = build_world(case.scenario), np.full(6, 0.1)
     rollout = roll_out(case, Broken(v, how), world)
@@ -105,7 +110,7 @@ def test_an_entrant_that_fails_is_held_and_every_tick_counts(how, said):
     assert rollout.q[2:] == pytest.approx(np.tile(world.q0 + 2 * DT * v, (99, 1)), abs=1e-12)
 
 
-def test_an_entrant_that_takes_for_ever_is_given_up():
+def test_rollout_time_budget():
     case = make_case(duration=1)
     rollout = roll_out(case, Constant(np.zeros(6)), build_world(case.scenario), time_budget=1e-9)
     assert rollout.failed.sum() == 100 and rollout.failure == "out of time"
@@ -113,7 +118,8 @@ def test_an_entrant_that_takes_for_ever_is_given_up():
 
 @pytest.mark.parametrize("name", ["ur5_pole", "moving_sphere", "crossing_arms"])
 @pytest.mark.parametrize("solver", ["qp", "eq10", "tracking"])
-def test_the_loop_is_that_of_simulate(name, solver):
+def test_rollout_equals_simulate(name, solver):
+    """The loop is that of simulate."""
     case = make_case(name, duration=3)
     world = build_world(case.scenario)
     entrant = ENTRANTS[solver]
@@ -123,17 +129,18 @@ def test_the_loop_is_that_of_simulate(name, solver):
     assert rollout.tool == pytest.approx(log.tool, abs=1e-9)
 
 
-def test_distances_below_the_threshold_are_the_true_ones():
+def test_checker_distances_below_threshold_are_exact():
+    """Distances below the threshold are the true ones."""
     case = make_case(duration=4)
     world = build_world(case.scenario)
     rollout = roll_out(case, ENTRANTS["tracking"].start(case, world), world)
-    twin = build(world.scene, world.q0)
+    mujoco_model = build(world.scene, world.q0)
     near = 0.05
-    findings = check_run(twin, rollout.t, rollout.v, case.scenario.limits, near)
-    movable, below = np.flatnonzero(twin.movable), 0
+    findings = check_run(mujoco_model, rollout.t, rollout.v, case.scenario.limits, near)
+    movable, below = np.flatnonzero(mujoco_model.movable), 0
     for k in range(0, len(rollout.t), 7):
-        twin.place(findings.q[k], rollout.t[k])
-        smallest = min(twin.distance(pair) for pair in movable)
+        mujoco_model.place(findings.q[k], rollout.t[k])
+        smallest = min(mujoco_model.distance(pair) for pair in movable)
         if smallest < near:
             assert findings.nearest[k] == pytest.approx(smallest, abs=1e-9)
             below += 1
@@ -174,7 +181,7 @@ def test_scores_of_a_known_motion():
     assert set(row.row()) == set(COLUMNS)
 
 
-def test_jerks_count_as_violations_where_they_have_limits():
+def test_score_counts_jerk_violations():
     """Speeds that grow by 0.7 t² have a jerk of 1.4 rad/s³."""
     base, v = make_case(duration=2), np.zeros((201, 6))
     v[:, 0] = 0.7 * (DT * np.arange(201)) ** 2
@@ -186,7 +193,8 @@ def test_jerks_count_as_violations_where_they_have_limits():
         assert row.violations == pytest.approx(share, abs=1.5 / 201)
 
 
-def test_what_counts_as_success():
+def test_score_success():
+    """What counts as success."""
     case = make_case(duration=2)
     rest, v = np.zeros((201, 3)), np.zeros((201, 6))
     away = rest + np.array([0.1, 0.0, 0.0])
@@ -203,7 +211,8 @@ def test_what_counts_as_success():
     assert not score(replace(case, reachable=False), world, "x", "y", rollout, findings, 0.0).success
 
 
-def test_a_trial_tells_a_law_that_avoids_from_one_that_does_not():
+def test_trial_separates_avoidance_from_tracking():
+    """A trial tells a law that avoids from one that does not."""
     case = make_case()
     tracking, qp = (run_trial(case, ENTRANTS[name]) for name in ("tracking", "qp"))
     assert tracking.collided and tracking.min_distance < 0.0 and tracking.tracking_error < 1e-3
@@ -211,7 +220,8 @@ def test_a_trial_tells_a_law_that_avoids_from_one_that_does_not():
     assert tracking.case == qp.case and tracking.settings != qp.settings
 
 
-def test_entrants_are_what_they_say():
+def test_entrants_have_names_and_descriptions():
+    """Entrants are what they say."""
     for name, entrant in ENTRANTS.items():
         assert entrant.name == name and entrant.description
     assert len({entrant.digest for entrant in ENTRANTS.values()}) == len(ENTRANTS)
@@ -219,12 +229,14 @@ def test_entrants_are_what_they_say():
         find_entrant("eq_10")
 
 
-def test_cases_that_no_entrant_could_be_given_are_refused():
+def test_case_without_joints_is_refused():
+    """Cases that no entrant could be given are refused."""
     with pytest.raises(ConfigError, match=r"humanoid_reach.*neither contacts nor obstacles that are carried"):
         build_world(load_scenario("humanoid_reach"))
 
 
-def test_every_law_that_is_installed_runs():
+def test_every_installed_entrant_runs():
+    """Every law that is installed runs."""
     case = make_case(duration=0.2)
     for entrant in ENTRANTS.values():
         if not entrant.missing:

@@ -46,7 +46,7 @@ def test_families_are_no_scenarios():
 
 
 @pytest.mark.parametrize("name", FAMILIES)
-def test_a_case_starts_clear_and_is_told_how_it_is_solved(name):
+def test_case_starts_clear_with_proof_of_solution(name):
     family = load_family(name)
     for seed in (0, 1):
         made = case(name, seed)
@@ -80,7 +80,8 @@ def test_cases_are_the_same_in_another_process():
 
 
 @pytest.mark.parametrize("name", [name for name in FAMILIES if name != "unreachable"])
-def test_mujoco_finds_the_plan_clear(name, monkeypatch):
+def test_plan_is_clear_in_mujoco(name, monkeypatch):
+    """Mujoco finds the plan clear."""
     pytest.importorskip("mujoco")
     from qpavoid.arena.checker import DistanceMonitor
     from qpavoid.arena.mujoco_model import build
@@ -89,8 +90,8 @@ def test_mujoco_finds_the_plan_clear(name, monkeypatch):
     monkeypatch.setattr("qpavoid.arena.families.solvable.plan", lambda *given: plans.append(plan(*given)) or plans[-1])
     scenario = make_case(load_family(name), 0).scenario
     world, keep, found = build_world(scenario), surface_safety_distance(scenario), plans[-1]
-    twin = build(world.scene, world.q0)
-    watch, q = DistanceMonitor(twin, measured_below=keep), np.array(found.q[0])
+    mujoco_model = build(world.scene, world.q0)
+    watch, q = DistanceMonitor(mujoco_model, measured_below=keep), np.array(found.q[0])
     np.testing.assert_array_equal(q, world.q0)
     watch.measure(0.0)
     speed = world.scene.robot.bounds().velocity
@@ -111,7 +112,8 @@ def test_mujoco_finds_the_plan_clear(name, monkeypatch):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_goals_out_of_reach_are_attained_by_no_search(seed):
+def test_goals_out_of_reach_are_not_attained_by_search(seed):
+    """Goals out of reach are attained by no search."""
     made = case("unreachable", seed)
     world, random = build_world(made.scenario), np.random.default_rng(0)
     robot, ranges = world.scene.robot, JointRanges.of(world.scene.robot)
@@ -250,7 +252,8 @@ def planned(scenario):
     return find_plan(scenario, world, clearance, np.random.default_rng(0))
 
 
-def test_a_plan_goes_through_the_opening_and_no_wall(gantry):
+def test_plan_goes_through_opening(gantry):
+    """A plan goes through the opening and no wall."""
     found = planned(scenario_of(gantry, [wall("low", -1.2, 0.4), wall("high", 0.6, 1.2)]))
     crossing = [
         a + (b - a) * a[0] / (a[0] - b[0]) for a, b in zip(found.q, found.q[1:], strict=False) if a[0] * b[0] < 0
@@ -262,7 +265,8 @@ def test_a_plan_goes_through_the_opening_and_no_wall(gantry):
     assert found.length < 2.0  # shortcuts: the shortest is 1.4
 
 
-def test_no_plan_where_there_is_none(gantry, monkeypatch):
+def test_plan_is_none_without_solution(gantry, monkeypatch):
+    """No plan where there is none."""
     monkeypatch.setattr("qpavoid.arena.families.planner.MAX_NODES", 1000)
     with pytest.raises(Redraw, match="no plan"):
         planned(scenario_of(gantry, [wall("all", -1.2, 1.2)]))
@@ -273,7 +277,9 @@ def test_no_plan_where_there_is_none(gantry, monkeypatch):
         planned(scenario_of(gantry, [{**ball, "motion": {"type": "fixed", "position": [0.5, 0.0, 0.0]}}]))
 
 
-def test_a_plan_waits_for_a_door(gantry):
+def test_plan_in_space_time_waits_for_door(gantry):
+    """A plan waits for a door."""
+
     def opens(middle):
         return {"type": "waypoints", "times": [3.0, 4.0], "positions": [middle, [0.0, middle[1] + 0.5, 0.0]]}
 
@@ -290,7 +296,8 @@ def test_a_plan_waits_for_a_door(gantry):
 
 
 @pytest.mark.parametrize("moves", [False, True])
-def test_straight_motions_are_judged_by_their_nearest_point(gantry, moves):
+def test_clearance_between_is_that_of_the_nearest_point(gantry, moves):
+    """Straight motions are judged by their nearest point."""
     fixed = {"type": "fixed", "position": [0.0, 0.0, 0.0]}
     rolls = {"type": "line", "start": [0.0, -1.0, 0.0], "end": [0.0, 1.0, 0.0], "speed": 0.25}
     bead = {"name": "bead", "shape": {"type": "sphere", "radius": 0.005}, "motion": rolls if moves else fixed}
@@ -311,7 +318,8 @@ def test_straight_motions_are_judged_by_their_nearest_point(gantry, moves):
 
 @settings(max_examples=30)
 @given(seed=st.integers(0, 10_000))
-def test_a_motion_that_is_passed_is_clear_at_every_place(seed):
+def test_clearance_between_holds_at_every_sample(seed):
+    """A motion that is passed is clear at every place."""
     random = np.random.default_rng(seed)
     made = case("sphere_field" if seed % 2 else "head_on", seed % 3)
     world, keep = build_world(made.scenario), surface_safety_distance(made.scenario)
@@ -327,7 +335,8 @@ def test_a_motion_that_is_passed_is_clear_at_every_place(seed):
 
 
 @pytest.mark.parametrize("name", ["panda", "ur5", "gantry"])
-def test_no_point_moves_farther_than_its_levers_allow(name, gantry):
+def test_clearance_lever_arms_bound_travel(name, gantry):
+    """No point moves farther than its levers allow."""
     made = ScenarioConfig.model_validate(
         {"robot": str(gantry) if name == "gantry" else name, "duration": 1.0,
          "tasks": [{"frame": {"panda": "panda_hand_tcp", "ur5": "tool0", "gantry": "ball"}[name]}]}
@@ -368,7 +377,8 @@ def test_inverse_kinematics_attains_poses_within_limits(panda):
     assert found >= 10
 
 
-def test_a_plan_of_many_goals_takes_one_that_is_free(gantry):
+def test_plan_of_many_goals_ends_at_free_one(gantry):
+    """A plan of many goals takes one that is free."""
     scenario = scenario_of(gantry, [wall("low", -1.2, 0.4)])
     world = build_world(scenario)
     clearance = Clearance(world, 8.0, 0.02)
@@ -454,7 +464,8 @@ def test_one_file_is_a_family(family):
     assert all("RRT-Connect: " in m.solved_by for m in made)
 
 
-def test_a_function_beside_the_file_is_a_generator(family):
+def test_family_generator_from_file(family):
+    """A function beside the file is a generator."""
     made = [make_case(family(GENERATED), seed) for seed in range(4)]
     assert {len(m.scenario.obstacles) for m in made} <= {1, 2, 3}
     assert len({str(m.scenario.obstacles) for m in made}) == 4
@@ -480,7 +491,7 @@ def test_a_function_beside_the_file_is_a_generator(family):
         (GENERATED, ('"how many"', '""'), ConfigError, r"parameters.count.about"),
     ],
 )  # fmt: skip
-def test_a_file_at_fault_is_told_so(family, text, change, error, said):
+def test_family_file_errors_name_file_and_field(family, text, change, error, said):
     with pytest.raises(error, match=said) as raised:
         family(text, change)
     assert "own.yaml" in str(raised.value)
@@ -505,7 +516,8 @@ def test_a_file_at_fault_is_told_so(family, text, change, error, said):
         (TEMPLATE, ("{delay: $delay}", "{dealy: $delay}"), POSTS, ConfigError, r"did you mean 'delay'"),
     ],
 )  # fmt: skip
-def test_a_family_that_makes_no_case_says_why(family, monkeypatch, text, change, code, error, said):
+def test_family_without_case_names_cause(family, monkeypatch, text, change, code, error, said):
+    """A family that makes no case says why."""
     monkeypatch.setattr("qpavoid.arena.families.solvable._TRIES", 5)
     monkeypatch.setattr("qpavoid.arena.families.make.MAX_DRAWS", 10)
     loaded = family(text, *([change] if change else []), code=code)

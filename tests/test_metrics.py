@@ -226,7 +226,8 @@ def test_table_cuts_no_outcome_however_narrow(log, width):
         assert [word for word in words[start:] if word in said] == said
 
 
-def test_table_leaves_the_least_important_columns_out_and_says_how_many(log):
+def test_table_drops_columns_in_narrow_terminal(log):
+    """Table leaves the least important columns out and says how many."""
     runs, said = [log.metrics()], []
     for width in (100, 62, 52, 40):
         heading = "\n".join(printed(runs, width))

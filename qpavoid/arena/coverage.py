@@ -50,8 +50,8 @@ def _missing_families(results: Results, facts: Mapping[str, Any]) -> Iterator[st
     in_suite = (seeds >= first) & (seeds < first + count)
     for family in facts.get("families", ()):
         in_family = results.family == results.families.index(family) if family in results.families else np.False_
-        if (count_present := int(np.sum(in_suite & in_family))) < count:
-            yield f"No entrant has run {count - count_present} of the {count} cases of {family} that the suite asks for."
+        if (count_run := int(np.sum(in_suite & in_family))) < count:
+            yield f"No entrant has run {count - count_run} of the {count} cases of {family} that the suite asks for."
 
 
 def _failures(facts: Mapping[str, Any]) -> Iterator[str]:

@@ -47,7 +47,7 @@ COMPARISON_LIMITS = (
     "they move.",
     "Times are those of whole ticks, from state to velocity, on the machine above, with that many processes at once. "
     "Ratios of less than 1.5 mean little; `bench/tick` is where libraries are timed side by side.",
-    "Distances, contacts and limit violations are MuJoCo's, which plays the commanded velocities again with kinematics "
+    "Distances, contacts and limit violations are MuJoCo's, which runs the commanded velocities again with kinematics "
     "and distances of its own, at the ticks and between them.",
     "Not measured: drives, dynamics and forces; sensors, beyond the delay and noise of a family that says so; memory, "
     "and the time to set up; what a tick that comes late would do, for here every velocity is there in time.",

@@ -120,7 +120,7 @@ def score(
         entrant: who ran it.
         settings: digest of the entrant.
         rollout: what it did.
-        findings: what the referee says of that.
+        findings: result of the checker.
         seconds: what the run took [s].
     """
     scenario, ticks = case.scenario, len(rollout.t)

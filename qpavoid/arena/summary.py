@@ -101,7 +101,7 @@ def find_faults(suite: Suite, runs: pa.Table, cases: pa.Table) -> Iterator[str]:
             yield f"{name}: NaN"
     tracking = runs.filter(pc.equal(runs["entrant"], "tracking"))
     if len(tracking) and not pc.any(tracking["collided"]).as_py():
-        yield "tracking touches nothing: the families ask for no avoiding, or the referee sees no contact"
+        yield "tracking touches nothing: the families need no avoidance, or the checker finds no contact"
     if len(tracking) and (worst := pc.max(tracking["deviation"]).as_py()) > _MAX_BASELINE_DEVIATION:
         yield f"tracking is {1e3 * worst:.1f} mm off its path"
     static_cases = {case["case"] for case in cases.to_pylist() if _is_static(Case.from_json(case["json"]))}

@@ -28,7 +28,7 @@ def run_trial(case: Case, entrant: Entrant) -> Score:
 
     Raises:
         ConfigError, UnknownName: the case itself cannot be built.
-        ValueError: it cannot be judged, as the referee knows no counterpart of a joint or shape.
+        ValueError: it cannot be checked, as MuJoCo has no counterpart of a joint or shape.
     """
     begin = perf_counter()
     world = build_world(case.scenario)

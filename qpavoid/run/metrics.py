@@ -28,9 +28,9 @@ def run_metrics(log: Log) -> dict[str, Any]:
         time_in_collision [s]; time_below: threshold -> [s]; final_error [m]; max_deviation: largest distance of a tool
         from its planned path [m]; tracking_rmse: of the distance to the moving target [m]; peak_velocity: fastest
         joint [rad/s or m/s]; jitter: Σ|Δq̇| over joints and ticks [rad/s]; status_counts; relaxed_ticks;
-        shortened_ticks: steps scaled down by the stop look-ahead; time_blocked [s]; severity_counts: steps by the worst severity
-        of their reasons; events: the first changes of reasons, as [t, status, reasons as data]; tick_us: p50, p99 and
-        max of the tick's time [µs].
+        shortened_ticks: steps scaled down by the stop look-ahead; time_blocked: stalled [s]; severity_counts: steps by
+        the worst severity of their reasons; events: the first changes of reasons, as [t, status, reasons as data];
+        tick_us: p50, p99 and max of the computation time of a step [µs].
     """
     config, dt = log.meta["config"], log.meta["config"]["dt"]
     distance = log.min_distance
