@@ -116,7 +116,7 @@ class _Lap:
     def __init__(self) -> None:
         from qpavoid import Controller
 
-        self.controller, q = Controller.from_scenario(scenario(backup=None))  # flights are timed by bench.moving
+        self.controller, q = Controller.from_scenario(scenario(backup=None))  # bench.moving times backup rollouts
         self.t = [k * DT for k in range(LAP)]
         self.q, pairs, self.status = [], [], []
         for k in range(2 * LAP):  # the first lap gets into the swing of it
@@ -130,7 +130,7 @@ class _Lap:
         self.changes = sum(a != b for a, b in pairwise(pairs))
 
     def run(self, ticks: int) -> None:
-        """Ticks that nobody looks at."""
+        """Run control steps without timing them."""
         step, q, t = self.controller.step, self.q, self.t
         for k in range(ticks):
             step(q[k % LAP], t[k % LAP])

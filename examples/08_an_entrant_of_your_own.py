@@ -28,12 +28,12 @@ class RowByRow:
 
 def main() -> None:
     """Three cases by hand, as a sweep runs them: in a closed loop, judged by MuJoCo."""
+    from qpavoid.arena.entrant_file import entrant_from_file
     from qpavoid.arena.entrants import find_entrant
     from qpavoid.arena.families import load_family, make_case
-    from qpavoid.arena.own import own_entrant
     from qpavoid.arena.trial import run_trial
 
-    entrants = [find_entrant("tracking"), find_entrant("qp"), own_entrant(Path(__file__), "RowByRow")]
+    entrants = [find_entrant("tracking"), find_entrant("qp"), entrant_from_file(Path(__file__), "RowByRow")]
     for seed in range(3):
         case = make_case(load_family("situation1"), seed)
         for entrant in entrants:

@@ -52,15 +52,15 @@ Verbose = Annotated[bool, typer.Option("--verbose", help="List the files that we
 
 
 class Kind(str, Enum):
-    """What `list` can list."""
+    """Kinds of things that `list` can list."""
 
     robots = "robots"
     scenarios = "scenarios"
     solvers = "solvers"
 
 
-def _print_version(asked: bool) -> None:
-    if asked:
+def _print_version(is_asked: bool) -> None:
+    if is_asked:
         print(f"qpavoid {version('qpavoid')}")
         raise typer.Exit
 
@@ -145,7 +145,7 @@ def compare(
 
 
 class Schema(str, Enum):
-    """Files that have a schema."""
+    """Kinds of files that have a schema."""
 
     scenario = "scenario"
     robot = "robot"
@@ -164,7 +164,7 @@ def fields_(
 
 
 def _run_all(configs: list[ScenarioConfig], out: Path) -> tuple[list[Log], list[Path]]:
-    """Runs and saves one after the other; an interrupted run is saved as far as it came and is the last."""
+    """Run and save one scenario after the other, the last one as far as it came."""
     logs: list[Log] = []
     files = []
     for config in configs:  # faults of the last scenario show before the first one runs
@@ -183,17 +183,18 @@ def _run_all(configs: list[ScenarioConfig], out: Path) -> tuple[list[Log], list[
             logs.append(simulate(config, progress=update))
             files.append(logs[-1].save(out / f"{label.replace(' ', '_').replace(':', '-')}.npz"))
             if logs[-1].meta["stopped_by"]:
-                why = escape(f"{label}: broken off: {logs[-1].meta['stopped_by']}")
-                ERR.print(f"[red]{why}[/]", highlight=False)
+                message = escape(f"{label}: broken off: {logs[-1].meta['stopped_by']}")
+                ERR.print(f"[red]{message}[/]", highlight=False)
                 break
     return logs, files
 
 
-def _update(bar: Progress, job: TaskID, done: int, total: int) -> None:
-    bar.update(job, completed=done, total=total)
+def _update(bar: Progress, job: TaskID, count_done: int, total: int) -> None:
+    bar.update(job, completed=count_done, total=total)
 
 
 def _draw(logs: list[Log], out: Path, compare: bool) -> list[Path]:
+    """Write the figures of runs; without matplotlib, print how to install it and write none."""
     try:
         from qpavoid.viz import figures as plot
     except ModuleNotFoundError as missing:
@@ -214,6 +215,7 @@ def _draw(logs: list[Log], out: Path, compare: bool) -> list[Path]:
 
 
 def _print(metrics: list[dict[str, Any]], files: list[Path], out: Path, verbose: bool) -> None:
+    """Print tables of the figures, the first events, and where files were written."""
     for scenario in dict.fromkeys(run["scenario"] for run in metrics):
         runs = [run for run in metrics if run["scenario"] == scenario]
         OUT.print(metrics_table(runs, OUT.width))
@@ -234,7 +236,7 @@ def _show_warning(message: Warning | str, *_: Any) -> None:
 
 
 def main() -> None:
-    """Entry point: turns every expected error into one line and exit status 2."""
+    """Run the command line; turn every expected error into one line and exit status 2."""
     warnings.showwarning = _show_warning  # type: ignore[assignment]
     try:
         app()

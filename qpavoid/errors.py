@@ -16,15 +16,15 @@ class ConfigError(QpavoidError):
     """A file or a field of it cannot be used: missing, mistyped, out of range, wrong shape."""
 
     def __str__(self) -> str:
-        """One line that a terminal can show, of bounded length, whatever the file at fault holds."""
+        """Return one line of bounded length, whatever the file at fault holds."""
         text = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in super().__str__())
-        half = _LONGEST // 2
-        return text if len(text) <= _LONGEST else f"{text[:half]} … {text[-half:]}"
+        half = _MAX_LENGTH // 2
+        return text if len(text) <= _MAX_LENGTH else f"{text[:half]} … {text[-half:]}"
 
 
-_LONGEST = 2000
-"""Characters of a message; what a file holds may be of any length. It begins with the place and ends with the remedy,
-so the middle is left out."""
+_MAX_LENGTH = 2000
+"""Characters of a message; what a file holds may be of any length. It begins with the place and ends with the
+remedy, so the middle is left out."""
 
 
 class UnknownName(ConfigError):
@@ -36,12 +36,12 @@ class SolverNotInstalled(QpavoidError):
 
 
 class NumericalError(QpavoidError):
-    """NaN or infinity in a state or in a command: the tick's input is malformed."""
+    """NaN or infinity in a state or in a command: the input of the step is malformed."""
 
 
 @contextmanager
 def located(where: str) -> Iterator[None]:
-    """Puts the file and field that an error is about in front of its message."""
+    """Put the file and field that an error is about in front of its message."""
     try:
         yield
     except (ConfigError, SolverNotInstalled) as error:
@@ -49,7 +49,7 @@ def located(where: str) -> Iterator[None]:
 
 
 def nearest(name: str, valid: Iterable[str]) -> str:
-    """`; did you mean 'x'?` with the nearest valid name, or the list of the valid ones."""
+    """Suggest the nearest valid name as `; did you mean 'x'?`, or list the valid ones."""
     names = sorted(valid)
     close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
     if close:

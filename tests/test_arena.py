@@ -1,4 +1,4 @@
-"""The arena's closed loop, its referee's distances and its scores, against closed forms and against `simulate`."""
+"""The arena's closed loop, its checker's distances and its scores, against closed forms and against `simulate`."""
 
 from dataclasses import replace
 
@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from qpavoid import Solution, load_scenario
-from qpavoid.arena.case import Case, Sensor, Sight
+from qpavoid.arena.case import Case, Sensor, SensorModel
+from qpavoid.arena.checker import Contact, Findings, check_run
 from qpavoid.arena.entrants import ENTRANTS, find_entrant
-from qpavoid.arena.referee import Contact, Findings, play
+from qpavoid.arena.mujoco_model import build
 from qpavoid.arena.rollout import Rollout, roll_out
 from qpavoid.arena.scores import COLUMNS, score
 from qpavoid.arena.trial import run_trial
-from qpavoid.arena.twin import build
 from qpavoid.arena.world import build_world
 from qpavoid.errors import ConfigError, UnknownName
 from qpavoid.run.simulate import simulate
@@ -51,33 +51,36 @@ class Broken(Constant):
         return Solution(np.full(len(self.v), np.nan))
 
 
-def test_a_case_survives_json_and_its_key_tells_cases_apart():
+def test_case_json_round_trip():
+    """A case survives json and its key tells cases apart."""
     case = make_case(duration=1, sensor=Sensor(delay=0.05))
-    again = Case.from_json(case.to_json())
-    assert again == case and again.key == case.key and again.scenario.source == case.scenario.source
+    rerun = Case.from_json(case.to_json())
+    assert rerun == case and rerun.key == case.key and rerun.scenario.source == case.scenario.source
     others = [replace(case, seed=4), replace(case, sensor=Sensor()), make_case(duration=1.5)]
     assert len({case.key, *(other.key for other in others)}) == 4
 
 
-def test_a_perfect_sensor_tells_what_moves_and_a_late_one_what_was():
+def test_sensor_model_delay():
+    """A perfect sensor tells what moves and a late one what was."""
     case = make_case("moving_sphere")
     world = build_world(case.scenario)
     (moving,) = [obstacle for obstacle in world.scene.obstacles if obstacle.moves]
-    seen = Sight(case, world.scene.obstacles).look(1.0)
+    seen = SensorModel(case, world.scene.obstacles).measure(1.0)
     assert list(seen) == [moving.name]
     assert np.array_equal(seen[moving.name].position, moving.motion.sample(1.0).position)
-    late = Sight(replace(case, sensor=Sensor(delay=0.25)), world.scene.obstacles)
-    assert np.array_equal(late.look(1.0)[moving.name].position, moving.motion.sample(0.75).position)
-    assert np.array_equal(late.look(0.1)[moving.name].position, moving.motion.sample(0.0).position)
+    late = SensorModel(replace(case, sensor=Sensor(delay=0.25)), world.scene.obstacles)
+    assert np.array_equal(late.measure(1.0)[moving.name].position, moving.motion.sample(0.75).position)
+    assert np.array_equal(late.measure(0.1)[moving.name].position, moving.motion.sample(0.0).position)
 
 
-def test_noise_has_the_stated_spread_and_is_the_same_for_all():
+def test_sensor_model_noise():
+    """Noise has the stated spread and is the same for all."""
     case = make_case("moving_sphere", Sensor(position_noise=0.01, velocity_noise=0.05))
     world = build_world(case.scenario)
-    first, second = (Sight(case, world.scene.obstacles) for _ in range(2))
+    first, second = (SensorModel(case, world.scene.obstacles) for _ in range(2))
     errors = []
     for t in np.arange(0.0, 20.0, DT):
-        one, two = first.look(t), second.look(t)
+        one, two = first.measure(t), second.measure(t)
         for obstacle in world.scene.obstacles:
             truth, seen = obstacle.motion.sample(t), one[obstacle.name]
             assert np.array_equal(seen.position, two[obstacle.name].position)
@@ -87,7 +90,8 @@ def test_noise_has_the_stated_spread_and_is_the_same_for_all():
     assert spread[:3] == pytest.approx(0.01, rel=0.1) and spread[3:] == pytest.approx(0.05, rel=0.1)
 
 
-def test_velocities_are_followed_exactly():
+def test_rollout_follows_velocities_exactly():
+    """Velocities are followed exactly."""
     case = make_case(duration=1)
     world, v = build_world(case.scenario), np.array([0.1, -0.05, 0.02, 0.0, 0.3, -0.1])
     rollout = roll_out(case, Constant(v), world)
@@ -97,7 +101,8 @@ def test_velocities_are_followed_exactly():
 
 
 @pytest.mark.parametrize(("how", "said"), [("raises", "RuntimeError: no solution found"), ("nan", "NaN or infinity")])
-def test_an_entrant_that_fails_is_held_and_every_tick_counts(how, said):
+def test_rollout_counts_failures(how, said):
+    """An entrant that fails is held and every tick counts."""
     case = make_case(duration=1)
     world, v = build_world(case.scenario), np.full(6, 0.1)
     rollout = roll_out(case, Broken(v, how), world)
@@ -105,35 +110,37 @@ def test_an_entrant_that_fails_is_held_and_every_tick_counts(how, said):
     assert rollout.q[2:] == pytest.approx(np.tile(world.q0 + 2 * DT * v, (99, 1)), abs=1e-12)
 
 
-def test_an_entrant_that_takes_for_ever_is_given_up():
+def test_rollout_time_budget():
     case = make_case(duration=1)
-    rollout = roll_out(case, Constant(np.zeros(6)), build_world(case.scenario), patience=1e-9)
+    rollout = roll_out(case, Constant(np.zeros(6)), build_world(case.scenario), time_budget=1e-9)
     assert rollout.failed.sum() == 100 and rollout.failure == "out of time"
 
 
 @pytest.mark.parametrize("name", ["ur5_pole", "moving_sphere", "crossing_arms"])
-@pytest.mark.parametrize("law", ["qp", "eq10", "tracking"])
-def test_the_loop_is_that_of_simulate(name, law):
+@pytest.mark.parametrize("solver", ["qp", "eq10", "tracking"])
+def test_rollout_equals_simulate(name, solver):
+    """The loop is that of simulate."""
     case = make_case(name, duration=3)
     world = build_world(case.scenario)
-    entrant = ENTRANTS[law]
+    entrant = ENTRANTS[solver]
     rollout = roll_out(case, entrant.start(case, world), world)
-    log = simulate(load_scenario(name, ["duration=3"], law))  # one name means one thing, safety options included
+    log = simulate(load_scenario(name, ["duration=3"], solver))  # one name means one thing, safety options included
     assert rollout.q == pytest.approx(log.q, abs=1e-9)
     assert rollout.tool == pytest.approx(log.tool, abs=1e-9)
 
 
-def test_distances_below_the_threshold_are_the_true_ones():
+def test_checker_distances_below_threshold_are_exact():
+    """Distances below the threshold are the true ones."""
     case = make_case(duration=4)
     world = build_world(case.scenario)
     rollout = roll_out(case, ENTRANTS["tracking"].start(case, world), world)
-    twin = build(world.scene, world.q0)
+    mujoco_model = build(world.scene, world.q0)
     near = 0.05
-    findings = play(twin, rollout.t, rollout.v, case.scenario.limits, near)
-    movable, below = np.flatnonzero(twin.movable), 0
+    findings = check_run(mujoco_model, rollout.t, rollout.v, case.scenario.limits, near)
+    movable, below = np.flatnonzero(mujoco_model.movable), 0
     for k in range(0, len(rollout.t), 7):
-        twin.place(findings.q[k], rollout.t[k])
-        smallest = min(twin.distance(pair) for pair in movable)
+        mujoco_model.place(findings.q[k], rollout.t[k])
+        smallest = min(mujoco_model.distance(pair) for pair in movable)
         if smallest < near:
             assert findings.nearest[k] == pytest.approx(smallest, abs=1e-9)
             below += 1
@@ -174,7 +181,7 @@ def test_scores_of_a_known_motion():
     assert set(row.row()) == set(COLUMNS)
 
 
-def test_jerks_count_as_violations_where_they_have_limits():
+def test_score_counts_jerk_violations():
     """Speeds that grow by 0.7 t² have a jerk of 1.4 rad/s³."""
     base, v = make_case(duration=2), np.zeros((201, 6))
     v[:, 0] = 0.7 * (DT * np.arange(201)) ** 2
@@ -186,7 +193,8 @@ def test_jerks_count_as_violations_where_they_have_limits():
         assert row.violations == pytest.approx(share, abs=1.5 / 201)
 
 
-def test_what_counts_as_success():
+def test_score_success():
+    """What counts as success."""
     case = make_case(duration=2)
     rest, v = np.zeros((201, 3)), np.zeros((201, 6))
     away = rest + np.array([0.1, 0.0, 0.0])
@@ -203,7 +211,8 @@ def test_what_counts_as_success():
     assert not score(replace(case, reachable=False), world, "x", "y", rollout, findings, 0.0).success
 
 
-def test_a_trial_tells_a_law_that_avoids_from_one_that_does_not():
+def test_trial_separates_avoidance_from_tracking():
+    """A trial tells a law that avoids from one that does not."""
     case = make_case()
     tracking, qp = (run_trial(case, ENTRANTS[name]) for name in ("tracking", "qp"))
     assert tracking.collided and tracking.min_distance < 0.0 and tracking.tracking_error < 1e-3
@@ -211,20 +220,23 @@ def test_a_trial_tells_a_law_that_avoids_from_one_that_does_not():
     assert tracking.case == qp.case and tracking.settings != qp.settings
 
 
-def test_entrants_are_what_they_say():
+def test_entrants_have_names_and_descriptions():
+    """Entrants are what they say."""
     for name, entrant in ENTRANTS.items():
-        assert entrant.name == name and entrant.says
+        assert entrant.name == name and entrant.description
     assert len({entrant.digest for entrant in ENTRANTS.values()}) == len(ENTRANTS)
     with pytest.raises(UnknownName, match="did you mean 'eq10'"):
         find_entrant("eq_10")
 
 
-def test_cases_that_no_entrant_could_be_given_are_refused():
+def test_case_without_joints_is_refused():
+    """Cases that no entrant could be given are refused."""
     with pytest.raises(ConfigError, match=r"humanoid_reach.*neither contacts nor obstacles that are carried"):
         build_world(load_scenario("humanoid_reach"))
 
 
-def test_every_law_that_is_installed_runs():
+def test_every_installed_entrant_runs():
+    """Every law that is installed runs."""
     case = make_case(duration=0.2)
     for entrant in ENTRANTS.values():
         if not entrant.missing:

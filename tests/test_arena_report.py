@@ -22,7 +22,7 @@ from matplotlib.text import Text
 from scipy.stats import binom, binomtest
 
 from qpavoid.arena import statistics
-from qpavoid.arena.coverage import gaps
+from qpavoid.arena.coverage import missing_results
 from qpavoid.arena.figures import safety_against_tracking, success_against_time
 from qpavoid.arena.report import report_of, rerun_line, write_report
 from qpavoid.arena.results import results_of
@@ -99,7 +99,8 @@ def test_a_rate_as_in_print():
 
 
 @pytest.mark.parametrize("estimate", [mean, median])
-def test_nothing_gives_no_estimate(estimate):
+def test_estimates_of_nothing_are_nan(estimate):
+    """Nothing gives no estimate."""
     with pytest.raises(ValueError, match="no values"):
         estimate(np.zeros(0))
     with pytest.raises(ValueError, match="no trials"):
@@ -108,14 +109,16 @@ def test_nothing_gives_no_estimate(estimate):
 
 @pytest.mark.parametrize("count", [6, 20, 60])
 @pytest.mark.parametrize(("estimate", "truth"), [(mean, 1.0), (median, np.log(2.0))])
-def test_intervals_of_exponential_values_hold_the_truth_about_as_often_as_they_say(estimate, truth, count):
+def test_mean_interval_coverage_of_exponential_values(estimate, truth, count):
+    """Intervals of exponential values hold the truth about as often as they say."""
     draw = np.random.default_rng(count)
     held = [low <= truth <= high for _, low, high in (estimate(draw.exponential(size=count)) for _ in range(400))]
     least = 0.93 if estimate is median else 0.85  # the skew costs the mean of few something
     assert least <= np.mean(held) <= 0.995
 
 
-def test_the_interval_of_a_mean_is_as_wide_as_students_for_few_normal_values_and_as_the_normal_one_for_many():
+def test_mean_interval_width():
+    """The interval of a mean is as wide as students for few normal values and as the normal one for many."""
     draw = np.random.default_rng(1)
     few, many = draw.normal(size=(300, 8)), draw.normal(size=statistics._MANY)
     held = np.mean([low <= 0.0 <= high for _, low, high in map(mean, few)])
@@ -125,7 +128,8 @@ def test_the_interval_of_a_mean_is_as_wide_as_students_for_few_normal_values_and
 
 
 @given(st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=40))
-def test_estimates_lie_within_their_intervals_and_these_within_the_values(values):
+def test_estimates_lie_within_their_intervals(values):
+    """Estimates lie within their intervals and these within the values."""
     values = np.array(values)
     for estimate in (mean, median):
         middle, low, high = estimate(values)
@@ -136,13 +140,14 @@ def test_estimates_lie_within_their_intervals_and_these_within_the_values(values
 @pytest.mark.parametrize("count", [6, 11, 40, 101])
 def test_the_interval_of_a_median_is_the_narrowest_that_the_sign_test_allows(count):
     low = int(median(np.arange(count, dtype=float)).low)
-    outside = 2.0 * binom.cdf(low, count, 0.5)
-    assert outside <= 1.0 - CONFIDENCE < 2.0 * binom.cdf(low + 1, count, 0.5)
+    outside_interval = 2.0 * binom.cdf(low, count, 0.5)
+    assert outside_interval <= 1.0 - CONFIDENCE < 2.0 * binom.cdf(low + 1, count, 0.5)
     assert median(np.arange(count, dtype=float)).high == count - 1 - low
 
 
 @given(flags, st.randoms())
-def test_a_duel_is_fair_and_that_of_the_binomial_test(first, random):
+def test_duel_equals_binomial_test(first, random):
+    """A duel is fair and that of the binomial test."""
     second = np.array([random.random() < 0.5 for _ in first])
     first = np.array(first)
     there, back = duel(first, second), duel(second, first)
@@ -152,7 +157,7 @@ def test_a_duel_is_fair_and_that_of_the_binomial_test(first, random):
     assert not duel(first, first).decided
 
 
-def test_ranks_are_shared_by_those_that_cannot_be_told_from_the_first():
+def test_ranks_are_shared_without_significant_difference():
     success, names = np.zeros((20, 5), dtype=bool), ["never", "always", "nearly", "half", "less than half"]
     for i, won in enumerate((0, 20, 17, 10, 9)):
         success[:won, i] = True
@@ -161,13 +166,14 @@ def test_ranks_are_shared_by_those_that_cannot_be_told_from_the_first():
     assert list(found.values()) == [1, 1, 3, 3, 5]  # 3 of 20 apart: p = 0.25; 10 apart: p = 0.002
 
 
-def test_equal_success_is_put_in_order_by_tracking_but_shares_the_rank():
+def test_ranks_order_equal_success_by_tracking():
+    """Equal success is put in order by tracking but shares the rank."""
     error = np.tile([0.03, 0.01, 0.02], (9, 1))
     assert list(ranks(np.ones((9, 3), dtype=bool), error, ["a", "b", "c"]).items()) == [("b", 1), ("c", 1), ("a", 1)]
 
 
 @given(st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), min_size=1, max_size=15))
-def test_the_pareto_front_is_what_nobody_beats(points):
+def test_pareto_front_equals_brute_force(points):
     x, y = np.array(points, dtype=float).T
     beaten = [
         any((a <= c and b >= d) and (a < c or b > d) for a, b in zip(x, y, strict=True))
@@ -180,7 +186,8 @@ def test_the_pareto_front_is_what_nobody_beats(points):
 
 
 @given(st.randoms(use_true_random=False))
-def test_the_order_of_rows_changes_nothing(random):
+def test_results_are_independent_of_row_order(random):
+    """The order of rows changes nothing."""
     rows = grid(["c", "a", "b"])
     expected = results_of(table(rows))
     random.shuffle(rows)
@@ -194,7 +201,8 @@ def test_the_order_of_rows_changes_nothing(random):
             )
 
 
-def test_every_cell_is_that_of_its_case_and_entrant():
+def test_results_cell_matches_case_and_entrant():
+    """Every cell is that of its case and entrant."""
     rows = grid(["a", "b", "c"], cases=5)
     found = results_of(table(rows), ["c"])
     assert found.entrants == ("c", "a", "b")
@@ -205,7 +213,7 @@ def test_every_cell_is_that_of_its_case_and_entrant():
     assert [rows[0]["family"], rows[1]["family"]] == [found.families[i] for i in found.family[:2]]
 
 
-def test_duplicates_count_once_and_are_told():
+def test_results_count_duplicates_once():
     rows = grid(["a", "b"])
     once, twice = results_of(table(rows)), results_of(table(rows + rows[5:9]))
     assert twice.replaced == 4 and once.replaced == 0
@@ -214,7 +222,8 @@ def test_duplicates_count_once_and_are_told():
 
 
 @pytest.mark.parametrize("changed", [{"settings": "new"}, {"version": "2"}])
-def test_settings_and_versions_of_an_entrant_are_never_mixed(changed):
+def test_results_do_not_mix_settings_and_versions(changed):
+    """Settings and versions of an entrant are never mixed."""
     rows = grid(["a", "b"], cases=4)
     anew = [{**r, **changed, "tracking_error": 1.0} for r in rows if r["entrant"] == "a"][:3]
     found = results_of(table(rows + anew))
@@ -224,13 +233,13 @@ def test_settings_and_versions_of_an_entrant_are_never_mixed(changed):
     assert len(found.values("tracking_error", 1)) == 3
 
 
-def test_a_missing_cell_is_named_and_its_case_counts_for_nobody():
+def test_results_missing_cell_excludes_its_case():
     rows = grid(["a", "b"])
     gone = next(r for r in rows if r["entrant"] == "b" and r["family"] == "field 1")
     rows.remove(gone)
     found = sections(rows)
     points = found["What this was made on"].points
-    assert any(point == "b has not run 1 cases of field 1, which count for nobody." for point in points)
+    assert any(point == "b has not run 1 cases of field 1, which count for no entrant." for point in points)
     assert any("11 cases that every entrant has run" in point for point in points)
     assert "5 cases, on panda." in found["Family: field 1"].text
     left = np.mean([r["success"] for r in rows if r["entrant"] == "a" and r["case"] != gone["case"]])
@@ -247,7 +256,8 @@ def test_every_run_is_counted_in_the_rates_of_its_family():
             assert len(own) == 15 and cells[2] == f"{100 * np.mean(own):.0f}"
 
 
-def test_figures_that_are_no_numbers_stand_at_the_worst():
+def test_results_replace_non_finite_figures_by_the_worst():
+    """Figures that are no numbers stand at the worst."""
     rows = grid(["a", "b"], cases=4)
     worst = {name: max(r[name] for r in rows) for name in ("tracking_error", "jerk")}
     deepest = min(r["min_distance"] for r in rows)
@@ -261,7 +271,8 @@ def test_figures_that_are_no_numbers_stand_at_the_worst():
         assert "nan" not in str(texts(section))
 
 
-def test_no_runs_and_no_common_case_say_what_to_do(tmp_path):
+def test_report_without_common_case_names_remedy(tmp_path):
+    """No runs and no common case say what to do."""
     with pytest.raises(ConfigError, match="no runs to report; `qpavoid bench run` makes some"):
         list(report_of(table([row()]).slice(0, 0), {}))
     with pytest.raises(ConfigError, match="no case was run by all of a, b, b has run the fewest"):
@@ -345,7 +356,8 @@ def test_the_report_is_markdown_with_its_pictures_and_one_page(written):
     assert places == sorted(places)
 
 
-def test_the_page_nests_needs_no_network_and_carries_what_it_is_sorted_by(written):
+def test_report_page_is_self_contained(written):
+    """The page nests needs no network and carries what it is sorted by."""
     folder, _ = written
     text = (folder / "report.html").read_text()
     page = Page(text)
@@ -364,7 +376,8 @@ def test_the_page_nests_needs_no_network_and_carries_what_it_is_sorted_by(writte
         assert cell.get("class") == "text" or np.isfinite(float(cell["data-sort"]))
 
 
-def test_whatever_names_and_failures_hold_is_shown_as_it_is(written):
+def test_report_escapes_names_and_failures(written):
+    """Whatever names and failures hold is shown as it is."""
     folder, _ = written
     page = Page((folder / "report.html").read_text())
     assert not any(tag == "b" and attributes for tag, attributes in page.elements)
@@ -390,20 +403,22 @@ def test_tables_of_the_markdown_are_well_formed(written):
     assert tables == 2 + 2 + 1 + 2 * 2 + 1 + 1  # who, how; overall; beside; two families; worst; failures
 
 
-def test_who_took_no_part_and_what_was_not_made_is_told(written):
+def test_report_names_absent_entrants_and_failures(written):
     markdown = (written[0] / "report.md").read_text()
     assert "placo does not take part: it needs placo." in markdown
     assert f"- field 0, seed 99: could not be made: `{NASTY.replace('`', chr(39))}`\n" in markdown
 
 
-def test_the_same_results_make_the_same_report(written, tmp_path):
+def test_report_is_deterministic(written, tmp_path):
+    """The same results make the same report."""
     folder, files = written
     before = {file: file.read_bytes() for file in files}
     write_report(folder)
     assert {file: file.read_bytes() for file in files} == before
 
 
-def test_the_worst_runs_are_the_deepest_then_those_that_stop_shortest():
+def test_report_order_of_worst_runs():
+    """The worst runs are the deepest then those that stop shortest."""
     runs = [
         row(case="1", seed=1, success=False, collided=True, min_distance=-0.002, contacts=1),
         row(case="2", seed=2, success=False, final_error=0.5),
@@ -420,7 +435,8 @@ def test_the_worst_runs_are_the_deepest_then_those_that_stop_shortest():
     ]
 
 
-def test_the_line_that_runs_one_again_is_a_command(cli, tmp_path):
+def test_rerun_line_is_a_command(cli, tmp_path):
+    """The line that runs one again is a command."""
     run = row("my law", family="situation1", seed=7)
     line = rerun_line(run, tmp_path / "a folder")
     assert line == f"qpavoid bench show '{tmp_path / 'a folder'}' --family situation1 --seed 7 --entrant 'my law'"
@@ -428,13 +444,14 @@ def test_the_line_that_runs_one_again_is_a_command(cli, tmp_path):
     assert all(option in shown for option in ("--family", "--seed", "--entrant"))
 
 
-def test_failures_are_counted_with_what_they_said():
+def test_report_counts_failures():
+    """Failures are counted with what they said."""
     runs = [row(case=str(k), failure="" if k < 2 else f"said {k % 2}" if k < 7 else "said 0") for k in range(9)]
     (rows,) = texts(sections(runs)["Failures"])
     assert rows == [["qp", "5", "said 0"], ["qp", "2", "said 1"]]
 
 
-def test_figures_have_the_units_that_they_say():
+def test_report_units():
     """A column's scale is that from the unit of the score to the unit of its heading."""
     score_units = {"[mm]": ("[m]", 1e3), "[%]": ("", 100.0), "[µs]": ("[µs]", 1.0)}
     for column in (*SHOWN, *MORE):
@@ -454,7 +471,8 @@ def test_the_command_writes_the_report(cli, written):
 # --- what is not there ---------------------------------------------------------------------------------------
 
 
-def test_a_family_that_was_changed_does_not_count_twice():
+def test_results_count_changed_family_once():
+    """A family that was changed does not count twice."""
     before = [row(name, f"before {k}", seed=k, success=name == "qp") for k in range(3) for name in ("qp", "eq10")]
     after = [row(name, f"after {k}", seed=k, success=name == "eq10") for k in range(2) for name in ("qp", "eq10")]
     results = results_of(table([*before, *after]), ("qp", "eq10"))
@@ -464,7 +482,7 @@ def test_a_family_that_was_changed_does_not_count_twice():
     assert list(one_alone.missing()) == [("eq10", "field", 1)] and one_alone.replaced == 2
 
 
-def test_what_a_suite_asks_for_and_has_not_got_is_told():
+def test_report_names_missing_cases():
     results = results_of(table([row(name, str(k), seed=k) for k in (3, 4, 7) for name in ("qp", "pink")]))
     entrants = {name: {"name": name, "says": "", "settings": {}} for name in ("qp", "hqp")}
     facts = {"families": ["field", "shelf"], "first_seed": 3, "seeds": 4, "entrants": entrants}
@@ -472,24 +490,25 @@ def test_what_a_suite_asks_for_and_has_not_got_is_told():
     facts["failures"] = [
         {"family": "shelf", "seed": k, "entrant": who, "failure": "no\nway"} for who in (None, "hqp") for k in range(7)
     ]
-    assert list(gaps(results, facts)) == [
-        "Nobody has run 2 of the 4 cases of field that the suite asks for.",
-        "Nobody has run 4 of the 4 cases of shelf that the suite asks for.",
+    assert list(missing_results(results, facts)) == [
+        "No entrant has run 2 of the 4 cases of field that the suite asks for.",
+        "No entrant has run 4 of the 4 cases of shelf that the suite asks for.",
         "mink does not take part: it needs mink.",
         "hqp was to take part, and has no run.",
         "shelf, seed 0, 1, 2, 3, 4, …: could not be made: `no way`",
         "shelf, seed 0, 1, 2, 3, 4, …: could not be run by hqp: `no way`",
     ]
     whole = {"families": ["field"], "first_seed": 3, "seeds": 2, "entrants": {"qp": entrants["qp"]}}
-    assert not list(gaps(results, whole)) and not list(gaps(results, {}))
+    assert not list(missing_results(results, whole)) and not list(missing_results(results, {}))
 
 
-def test_versions_that_differ_are_told():
+def test_report_names_different_versions():
     results = results_of(table([row("qp", version="2"), row("eq10", version="1")]))
-    assert [line for line in gaps(results, {}) if "different versions" in line and "eq10 1, qp 2" in line]
+    assert [line for line in missing_results(results, {}) if "different versions" in line and "eq10 1, qp 2" in line]
 
 
-def test_an_entrant_from_a_file_is_run_again_from_it(tmp_path):
+def test_rerun_line_of_entrant_from_file(tmp_path):
+    """An entrant from a file is run again from it."""
     facts = {"entrants": {"of Mine": {"name": "Mine", "says": "", "settings": {"file": "my law.py", "digest": "0"}}}}
     runs = [row(name, success=False) for name in ("Mine", "qp")]
     worst = next(section for section in report_of(table(runs), facts, tmp_path) if section.title == "Worst runs")
@@ -500,12 +519,12 @@ def test_an_entrant_from_a_file_is_run_again_from_it(tmp_path):
 def test_a_folder_without_a_list_of_failures_keeps_its_facts(tmp_path):
     with Store(tmp_path) as store:
         store.runs.append(row())
-        store.describe({"title": "ObstacleEstimates", "entrants": {}})
+        store.describe({"title": "Facts", "entrants": {}})
     (tmp_path / "failures.jsonl").write_text('{"family": "field", "se')  # a sweep is writing it
     assert read_failures(tmp_path) == []
     (tmp_path / "failures.jsonl").unlink()
     write_report(tmp_path)
-    assert (tmp_path / "report.md").read_text(encoding="utf-8").startswith("# Arena: Told\n")
+    assert (tmp_path / "report.md").read_text(encoding="utf-8").startswith("# Arena: Facts\n")
 
 
 @pytest.mark.parametrize("times", [(60.0, 104.0, 143.0), (20.0, 90.0, 4000.0)])

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from qpavoid import ConfigError, Controller, NumericalError, SolverNotInstalled, UnknownName, load_scenario
-from qpavoid.run.simulate import simulate
 from qpavoid.run.batch import BatchError, WorkerDied, Workers, simulate_many, steps
 from qpavoid.run.log import STATUSES
+from qpavoid.run.simulate import simulate
 
 DIE = "__import__('os')._exit(3)"
 
@@ -65,9 +65,9 @@ def test_logs_are_those_of_single_runs_in_order(workers):
 
 def test_failing_scenarios_do_not_lose_the_others(workers):
     good = situation()
-    bad = good.model_copy(update={"robot": "nobody"})
+    bad = good.model_copy(update={"robot": "no_such_robot"})
     with pytest.raises(
-        BatchError, match=r"(?s)2 of 4 scenarios.*1: UnknownName: .*nobody.*3: ConfigError: .*none\.yaml"
+        BatchError, match=r"(?s)2 of 4 scenarios.*1: UnknownName: .*no_such_robot.*3: ConfigError: .*none\.yaml"
     ) as error:
         simulate_many([good, bad, good, "./none.yaml"], workers)
     first, none, second, also_none = error.value.logs
@@ -153,7 +153,8 @@ def test_processes_have_one_thread_and_this_one_is_left_alone(monkeypatch):
     assert dict(os.environ) == before
 
 
-def test_workers_that_cannot_work_say_so():
+def test_workers_start_failure_is_an_error():
+    """Workers that cannot work say so."""
     with pytest.raises(ValueError, match="at least one"):
         Workers(0)
     with Workers(1) as workers:
@@ -162,7 +163,7 @@ def test_workers_that_cannot_work_say_so():
         workers.map(int, [()])
 
 
-def test_script_without_guard_is_told(tmp_path):
+def test_script_without_main_guard_names_remedy(tmp_path):
     script = tmp_path / "script.py"
     script.write_text("from qpavoid.run.batch import simulate_many\nsimulate_many(['situation1'] * 50, jobs=1)\n")
     run = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=300, check=False)

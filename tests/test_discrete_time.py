@@ -186,8 +186,8 @@ def test_where_the_linearisation_is_too_kind_the_step_is_shortened_and_logged(sh
         )
         log = simulate(run)
         least[look_ahead] = least_on_the_way(log, Controller.from_scenario(run)[0])
-        shares[look_ahead] = log.share
-        assert log.metrics()["shortened_ticks"] == np.sum(log.share < 1.0)
+        shares[look_ahead] = log.command_scale
+        assert log.metrics()["shortened_ticks"] == np.sum(log.command_scale < 1.0)
     assert least[False] < alone and least[True] > SAFE - 5e-4
     assert (shares[False] == 1.0).all() and shares[True].min() < 1.0
 

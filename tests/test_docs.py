@@ -11,7 +11,8 @@ def blocks(kind):
     return re.findall(rf"```{kind}\n(.*?)```", PAGE, re.S)
 
 
-def test_the_page_prints_what_it_says(cli, tmp_path, capfd):
+def test_page_output_equals_commands(cli, tmp_path, capfd):
+    """The page prints what it says."""
     (scenario,) = blocks("yaml")
     (tmp_path / "reach.yaml").write_text(scenario)
     for block in blocks("console"):

@@ -42,7 +42,8 @@ def one_cluster(monkeypatch):
         yield
 
 
-def test_sweeps_of_the_page_print_what_it_says(cli, folder, one_cluster, capfd):
+def test_page_sweeps_output(cli, folder, one_cluster, capfd):
+    """Sweeps of the page print what it says."""
     said = [line for block in blocks(PAGE, "console") for line in block.splitlines()]
     for command, printed in zip(said, [*said[2:], "", ""], strict=False):
         if not command.startswith("$ qpavoid bench run suite.yaml"):

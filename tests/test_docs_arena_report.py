@@ -36,14 +36,16 @@ def test_its_sections_are_those_of_the_report_in_their_order():
 
 def test_its_figures_are_those_of_the_tables():
     kinds = {"rate": "share", "low": "5th percentile"}
-    columns = [[column.heading, kinds.get(column.kind, column.kind), column.says] for column in (*SHOWN, *MORE)]
+    columns = [[column.heading, kinds.get(column.kind, column.kind), column.description] for column in (*SHOWN, *MORE)]
     assert rows_of("| figure |") == columns
 
 
 def test_its_numbers_are_those_of_the_statistics():
     assert f"with {100 * CONFIDENCE:.0f} %" in PAGE and f"from {_MANY} runs on" in PAGE
     assert f"p is not below {1 - CONFIDENCE:.2f}" in PAGE
-    assert not duel(np.ones(5, dtype=bool), np.zeros(5, dtype=bool)).decided  # five cases tell nobody apart, six do
+    assert not duel(
+        np.ones(5, dtype=bool), np.zeros(5, dtype=bool)
+    ).decided  # five cases separate no two entrants, six do
     assert duel(np.ones(6, dtype=bool), np.zeros(6, dtype=bool)).decided
     draw = np.random.default_rng(0)
     held = [low <= 1.0 <= high for _, low, high in (mean(draw.exponential(size=6)) for _ in range(1000))]

@@ -15,8 +15,8 @@ SNIPPETS = re.findall(r"```python\n(.*?)```", PAGE, re.S)
 
 
 def test_the_table_lists_what_ships():
-    told = re.findall(r"^\| `(\w+)` \|", PAGE.split("## How a case")[0], re.M)
-    assert sorted(told) == family_names()
+    names = re.findall(r"^\| `(\w+)` \|", PAGE.split("## How a case")[0], re.M)
+    assert sorted(names) == family_names()
 
 
 @pytest.mark.parametrize("number", range(2))
@@ -29,12 +29,13 @@ def test_families_of_the_page_make_cases(number, tmp_path):
     assert all("RRT-Connect" in case.solved_by for case in made)
 
 
-def test_the_snippet_prints_what_solved_it(capsys):
+def test_page_snippet_output(capsys):
+    """The snippet prints what solved it."""
     exec(compile(SNIPPETS[0], "docs/arena_families.md", "exec"), {})
     assert re.match(rf"{len(family_names())} ur5 RRT-Connect", capsys.readouterr().out)
 
 
 @pytest.mark.parametrize(("name", "said"), [("panda", "Panda"), ("ur5", "UR5"), ("paper-dual-arm", "the paper's arm")])
 def test_arm_lengths_are_those_of_the_page(name, said):
-    (told,) = re.findall(rf"{said} (\d\.\d\d) m", PAGE)
-    assert arms(Robot.load(name))[0].length == pytest.approx(float(told), abs=0.006)
+    (length,) = re.findall(rf"{said} (\d\.\d\d) m", PAGE)
+    assert arms(Robot.load(name))[0].length == pytest.approx(float(length), abs=0.006)

@@ -86,7 +86,8 @@ def test_rows_side_by_side(cli):
         assert_said(row, run)
 
 
-def test_the_snippet_prints_what_the_page_says(capsys):
+def test_laws_page_snippet_output(capsys):
+    """The snippet prints what the page says."""
     (snippet,) = re.findall(r"```python\n(.*?)```", PAGE, re.S)
     (said,) = re.findall(r"```text\n(.*?)```", PAGE, re.S)
     exec(compile(snippet, "docs/laws.md", "exec"), {})

@@ -15,12 +15,12 @@ from pydantic import TypeAdapter
 from qpavoid import ScenarioConfig
 from qpavoid.arena.case import Case
 from qpavoid.arena.families import Draw, Redraw, family_names, load_family, make_case
-from qpavoid.arena.families.clearance import STEP, Clearance
+from qpavoid.arena.families.clearance import MIN_ADVANCE, Clearance
+from qpavoid.arena.families.inverse_kinematics import FrameGoal, JointRanges, solve_inverse_kinematics
 from qpavoid.arena.families.parameters import Parameter
 from qpavoid.arena.families.planner import plan
-from qpavoid.arena.families.reach import Ranges, Want, configuration_at
 from qpavoid.arena.families.solvable import find_plan
-from qpavoid.arena.scores import to_keep
+from qpavoid.arena.scores import surface_safety_distance
 from qpavoid.arena.world import build_world
 from qpavoid.config.shipped import scenario_names, setup_names
 from qpavoid.errors import ConfigError, UnknownName
@@ -46,7 +46,7 @@ def test_families_are_no_scenarios():
 
 
 @pytest.mark.parametrize("name", FAMILIES)
-def test_a_case_starts_clear_and_is_told_how_it_is_solved(name):
+def test_case_starts_clear_with_proof_of_solution(name):
     family = load_family(name)
     for seed in (0, 1):
         made = case(name, seed)
@@ -62,7 +62,7 @@ def test_a_case_starts_clear_and_is_told_how_it_is_solved(name):
             world.scene.robot.model, world.scene.robot.model.createData(), world.scene.geometry, data, world.q0
         )
         pin.computeDistances(world.scene.geometry, data)
-        assert min((r.min_distance for r in data.distanceResults), default=1.0) > to_keep(scenario)
+        assert min((r.min_distance for r in data.distanceResults), default=1.0) > surface_safety_distance(scenario)
         assert Case.from_json(made.to_json()).key == made.key
 
 
@@ -80,19 +80,20 @@ def test_cases_are_the_same_in_another_process():
 
 
 @pytest.mark.parametrize("name", [name for name in FAMILIES if name != "unreachable"])
-def test_mujoco_finds_the_plan_clear(name, monkeypatch):
+def test_plan_is_clear_in_mujoco(name, monkeypatch):
+    """Mujoco finds the plan clear."""
     pytest.importorskip("mujoco")
-    from qpavoid.arena.referee import Watch
-    from qpavoid.arena.twin import build
+    from qpavoid.arena.checker import DistanceMonitor
+    from qpavoid.arena.mujoco_model import build
 
     plans = []
     monkeypatch.setattr("qpavoid.arena.families.solvable.plan", lambda *given: plans.append(plan(*given)) or plans[-1])
     scenario = make_case(load_family(name), 0).scenario
-    world, keep, found = build_world(scenario), to_keep(scenario), plans[-1]
-    twin = build(world.scene, world.q0)
-    watch, q = Watch(twin, near=keep), np.array(found.q[0])
+    world, keep, found = build_world(scenario), surface_safety_distance(scenario), plans[-1]
+    mujoco_model = build(world.scene, world.q0)
+    watch, q = DistanceMonitor(mujoco_model, measured_below=keep), np.array(found.q[0])
     np.testing.assert_array_equal(q, world.q0)
-    watch.look(0.0)
+    watch.measure(0.0)
     speed = world.scene.robot.bounds().velocity
     for to, begin, end in zip(found.q[1:], found.t, found.t[1:], strict=False):
         v = (to - q) / (end - begin)
@@ -102,7 +103,7 @@ def test_mujoco_finds_the_plan_clear(name, monkeypatch):
     assert found.t[-1] <= (scenario.duration - 1.0 if name in TIMED else scenario.duration)
     watch.follow(q, 0.0 * q, found.t[-1], scenario.duration - found.t[-1])
     assert watch.distance >= keep - 1e-4
-    assert watch.looks > 50
+    assert watch.instants > 50
     data = world.scene.robot.model.createData()
     pin.framesForwardKinematics(world.scene.robot.model, data, q)
     for task in world.tools:
@@ -111,16 +112,19 @@ def test_mujoco_finds_the_plan_clear(name, monkeypatch):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_goals_out_of_reach_are_attained_by_no_search(seed):
+def test_goals_out_of_reach_are_not_attained_by_search(seed):
+    """Goals out of reach are attained by no search."""
     made = case("unreachable", seed)
     world, random = build_world(made.scenario), np.random.default_rng(0)
-    robot, ranges = world.scene.robot, Ranges.of(world.scene.robot)
+    robot, ranges = world.scene.robot, JointRanges.of(world.scene.robot)
     clearance = Clearance(world, made.scenario.duration, 0.0)
     (task,) = world.tools
     goal = task.motion.sample(made.scenario.duration).position
     for _ in range(20):
         begin = random.uniform(ranges.lower, ranges.upper)
-        q = configuration_at(robot, [Want(task.frame_id, goal)], begin, ranges, made.scenario.goal_tolerance)
+        q = solve_inverse_kinematics(
+            robot, [FrameGoal(task.frame_id, goal)], begin, ranges, made.scenario.goal_tolerance
+        )
         assert q is None or clearance.at(q, 0.0) < 0.0
         assert q is None or "inside" in made.solved_by
 
@@ -145,8 +149,10 @@ def test_crossing_obstacles_meet_the_target(seed):
     there = np.array([target.sample(t).position for t in times])
     for obstacle in world.scene.obstacles:
         # constant speed there, smooth here: both are at the meeting point, though not at quite the same time
-        gaps = np.linalg.norm(there[:, None, :] - [[obstacle.motion.sample(t).position for t in times[::10]]], axis=2)
-        assert gaps.min() < 0.05 * 1.3 + 0.01
+        missing_results = np.linalg.norm(
+            there[:, None, :] - [[obstacle.motion.sample(t).position for t in times[::10]]], axis=2
+        )
+        assert missing_results.min() < 0.05 * 1.3 + 0.01
 
 
 @pytest.mark.parametrize("seed", [0, 2])
@@ -160,8 +166,8 @@ def test_two_tools_change_sides_and_meet_where_they_pass(seed):
         assert np.abs(apart[-1, 2]) > 0.01
         if name == "passing":
             at_rest = np.linalg.norm(np.diff(apart, axis=0), axis=1) < 1e-12
-            gaps = np.linalg.norm(apart[1:][at_rest], axis=1)
-            assert ((gaps >= 0.04 - 1e-9) & (gaps <= 0.12 + 1e-9)).any()
+            missing_results = np.linalg.norm(apart[1:][at_rest], axis=1)
+            assert ((missing_results >= 0.04 - 1e-9) & (missing_results <= 0.12 + 1e-9)).any()
 
 
 # --- drawing -----------------------------------------------------------------------------------------------
@@ -242,11 +248,12 @@ def scenario_of(robot, obstacles, duration=8.0, **fields):
 
 def planned(scenario):
     world = build_world(scenario)
-    clearance = Clearance(world, scenario.duration, to_keep(scenario))
+    clearance = Clearance(world, scenario.duration, surface_safety_distance(scenario))
     return find_plan(scenario, world, clearance, np.random.default_rng(0))
 
 
-def test_a_plan_goes_through_the_opening_and_no_wall(gantry):
+def test_plan_goes_through_opening(gantry):
+    """A plan goes through the opening and no wall."""
     found = planned(scenario_of(gantry, [wall("low", -1.2, 0.4), wall("high", 0.6, 1.2)]))
     crossing = [
         a + (b - a) * a[0] / (a[0] - b[0]) for a, b in zip(found.q, found.q[1:], strict=False) if a[0] * b[0] < 0
@@ -258,8 +265,9 @@ def test_a_plan_goes_through_the_opening_and_no_wall(gantry):
     assert found.length < 2.0  # shortcuts: the shortest is 1.4
 
 
-def test_no_plan_where_there_is_none(gantry, monkeypatch):
-    monkeypatch.setattr("qpavoid.arena.families.planner.MOST_NODES", 1000)
+def test_plan_is_none_without_solution(gantry, monkeypatch):
+    """No plan where there is none."""
+    monkeypatch.setattr("qpavoid.arena.families.planner.MAX_NODES", 1000)
     with pytest.raises(Redraw, match="no plan"):
         planned(scenario_of(gantry, [wall("all", -1.2, 1.2)]))
     with pytest.raises(Redraw, match="no plan"):  # 120 mm for a ball of 100 mm that keeps 20 mm on each side
@@ -269,7 +277,9 @@ def test_no_plan_where_there_is_none(gantry, monkeypatch):
         planned(scenario_of(gantry, [{**ball, "motion": {"type": "fixed", "position": [0.5, 0.0, 0.0]}}]))
 
 
-def test_a_plan_waits_for_a_door(gantry):
+def test_plan_in_space_time_waits_for_door(gantry):
+    """A plan waits for a door."""
+
     def opens(middle):
         return {"type": "waypoints", "times": [3.0, 4.0], "positions": [middle, [0.0, middle[1] + 0.5, 0.0]]}
 
@@ -286,7 +296,8 @@ def test_a_plan_waits_for_a_door(gantry):
 
 
 @pytest.mark.parametrize("moves", [False, True])
-def test_straight_motions_are_judged_by_their_nearest_point(gantry, moves):
+def test_clearance_between_is_that_of_the_nearest_point(gantry, moves):
+    """Straight motions are judged by their nearest point."""
     fixed = {"type": "fixed", "position": [0.0, 0.0, 0.0]}
     rolls = {"type": "line", "start": [0.0, -1.0, 0.0], "end": [0.0, 1.0, 0.0], "speed": 0.25}
     bead = {"name": "bead", "shape": {"type": "sphere", "radius": 0.005}, "motion": rolls if moves else fixed}
@@ -300,37 +311,39 @@ def test_straight_motions_are_judged_by_their_nearest_point(gantry, moves):
         first, last = (q - motion.sample(t).position[:2] for q, t in ((a, ta), (b, tb)))
         share = np.clip(first @ (first - last) / ((first - last) @ (first - last)), 0.0, 1.0)
         least = np.linalg.norm(first + share * (last - first)) - 0.055
-        answers.append(clearance.clear_between(a, ta, b, tb))
-        assert least >= 0.01 if answers[-1] else least < 0.01 + STEP
+        answers.append(clearance.is_clear_between(a, ta, b, tb))
+        assert least >= 0.01 if answers[-1] else least < 0.01 + MIN_ADVANCE
     assert 50 < sum(answers) < 350
 
 
 @settings(max_examples=30)
 @given(seed=st.integers(0, 10_000))
-def test_a_motion_that_is_passed_is_clear_at_every_place(seed):
+def test_clearance_between_holds_at_every_sample(seed):
+    """A motion that is passed is clear at every place."""
     random = np.random.default_rng(seed)
     made = case("sphere_field" if seed % 2 else "head_on", seed % 3)
-    world, keep = build_world(made.scenario), to_keep(made.scenario)
+    world, keep = build_world(made.scenario), surface_safety_distance(made.scenario)
     clearance = Clearance(world, made.scenario.duration, keep)
     a = world.q0 + random.uniform(-0.2, 0.2, len(world.q0))
     b = a + random.uniform(-0.5, 0.5, len(a))
     ta, tb = sorted(random.uniform(0.0, made.scenario.duration, 2))
     least = min(clearance.at(a + s * (b - a), ta + s * (tb - ta)) for s in np.linspace(0.0, 1.0, 200))
-    if clearance.clear_between(a, ta, b, tb):
+    if clearance.is_clear_between(a, ta, b, tb):
         assert least >= keep
     else:
         assert least < clearance.least + 0.005
 
 
 @pytest.mark.parametrize("name", ["panda", "ur5", "gantry"])
-def test_no_point_moves_farther_than_its_levers_allow(name, gantry):
+def test_clearance_lever_arms_bound_travel(name, gantry):
+    """No point moves farther than its levers allow."""
     made = ScenarioConfig.model_validate(
         {"robot": str(gantry) if name == "gantry" else name, "duration": 1.0,
          "tasks": [{"frame": {"panda": "panda_hand_tcp", "ur5": "tool0", "gantry": "ball"}[name]}]}
     )  # fmt: skip
     world = build_world(made)
     robot, random = world.scene.robot, np.random.default_rng(3)
-    lever_arm, ranges = Clearance(world, 1.0, 0.02).lever_arm, Ranges.of(robot)
+    lever_arm, ranges = Clearance(world, 1.0, 0.02).lever_arm, JointRanges.of(robot)
     data, longest = robot.model.createData(), 0.0
     for _ in range(300):
         q = random.uniform(ranges.lower, ranges.upper)
@@ -348,28 +361,31 @@ def test_no_point_moves_farther_than_its_levers_allow(name, gantry):
 
 
 def test_inverse_kinematics_attains_poses_within_limits(panda):
-    random, ranges, data = np.random.default_rng(1), Ranges.of(panda), panda.model.createData()
+    random, ranges, data = np.random.default_rng(1), JointRanges.of(panda), panda.model.createData()
     frame, found = panda.frame_id("panda_hand_tcp", "test"), 0
     for _ in range(20):
         pin.framesForwardKinematics(panda.model, data, random.uniform(0.7 * ranges.lower, 0.7 * ranges.upper))
-        want = Want(frame, data.oMf[frame].translation.copy(), data.oMf[frame].rotation.copy())
-        q = configuration_at(panda, [want], panda.home, ranges, 1e-4)
+        goal = FrameGoal(frame, data.oMf[frame].translation.copy(), data.oMf[frame].rotation.copy())
+        q = solve_inverse_kinematics(panda, [goal], panda.home, ranges, 1e-4)
         if q is None:
             continue
         found += 1
         assert ((ranges.lower <= q) & (q <= ranges.upper)).all()
         pin.framesForwardKinematics(panda.model, data, q)
-        assert np.linalg.norm(data.oMf[frame].translation - want.position) < 2e-4
-        assert np.linalg.norm(pin.log3(want.rotation @ data.oMf[frame].rotation.T)) < 2e-4
+        assert np.linalg.norm(data.oMf[frame].translation - goal.position) < 2e-4
+        assert np.linalg.norm(pin.log3(goal.rotation @ data.oMf[frame].rotation.T)) < 2e-4
     assert found >= 10
 
 
-def test_a_plan_of_many_goals_takes_one_that_is_free(gantry):
+def test_plan_of_many_goals_ends_at_free_one(gantry):
+    """A plan of many goals takes one that is free."""
     scenario = scenario_of(gantry, [wall("low", -1.2, 0.4)])
     world = build_world(scenario)
     clearance = Clearance(world, 8.0, 0.02)
     goals = np.array([[0.0, 0.9], [-0.5, -0.9]])  # the second is on this side
-    found = plan(clearance, Ranges.of(world.scene.robot), world.q0, goals, np.ones(2), 8.0, np.random.default_rng(0))
+    found = plan(
+        clearance, JointRanges.of(world.scene.robot), world.q0, goals, np.ones(2), 8.0, np.random.default_rng(0)
+    )
     assert any(np.array_equal(found.q[-1], goal) for goal in goals)
 
 
@@ -448,7 +464,8 @@ def test_one_file_is_a_family(family):
     assert all("RRT-Connect: " in m.solved_by for m in made)
 
 
-def test_a_function_beside_the_file_is_a_generator(family):
+def test_family_generator_from_file(family):
+    """A function beside the file is a generator."""
     made = [make_case(family(GENERATED), seed) for seed in range(4)]
     assert {len(m.scenario.obstacles) for m in made} <= {1, 2, 3}
     assert len({str(m.scenario.obstacles) for m in made}) == 4
@@ -474,7 +491,7 @@ def test_a_function_beside_the_file_is_a_generator(family):
         (GENERATED, ('"how many"', '""'), ConfigError, r"parameters.count.about"),
     ],
 )  # fmt: skip
-def test_a_file_at_fault_is_told_so(family, text, change, error, said):
+def test_family_file_errors_name_file_and_field(family, text, change, error, said):
     with pytest.raises(error, match=said) as raised:
         family(text, change)
     assert "own.yaml" in str(raised.value)
@@ -499,9 +516,10 @@ def test_a_file_at_fault_is_told_so(family, text, change, error, said):
         (TEMPLATE, ("{delay: $delay}", "{dealy: $delay}"), POSTS, ConfigError, r"did you mean 'delay'"),
     ],
 )  # fmt: skip
-def test_a_family_that_makes_no_case_says_why(family, monkeypatch, text, change, code, error, said):
+def test_family_without_case_names_cause(family, monkeypatch, text, change, code, error, said):
+    """A family that makes no case says why."""
     monkeypatch.setattr("qpavoid.arena.families.solvable._TRIES", 5)
-    monkeypatch.setattr("qpavoid.arena.families.make.MOST_DRAWS", 10)
+    monkeypatch.setattr("qpavoid.arena.families.make.MAX_DRAWS", 10)
     loaded = family(text, *([change] if change else []), code=code)
     with pytest.raises(error, match=said) as raised:
         make_case(loaded, 0)

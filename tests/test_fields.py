@@ -336,4 +336,4 @@ def test_potential_field_creeps_toward_a_goal_near_an_obstacle():
 
 def test_entrants():
     assert [name for name in ENTRANTS if name in LAWS] == list(LAWS)
-    assert all(ENTRANTS[name].says for name in LAWS)
+    assert all(ENTRANTS[name].description for name in LAWS)

@@ -35,7 +35,8 @@ def test_module_needs_no_robot_library(module):
     assert done.returncode == 0, done.stderr
 
 
-def test_the_guard_would_notice():
+def test_import_check_detects_robot_libraries():
+    """The guard would notice."""
     done = import_alone("qpavoid.model.kinematics")
     assert done.returncode != 0
     assert "pinocchio" in done.stderr

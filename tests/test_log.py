@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from qpavoid import ConfigError, Controller, Log, ScenarioConfig, Severity, load_scenario
-from qpavoid.run.simulate import simulate
 from qpavoid.run.log import STATUSES
+from qpavoid.run.simulate import simulate
 from qpavoid.solvers.analytic import TrackingOnly
 
 ARRAYS = [f.name for f in fields(Log) if f.name != "meta"]
@@ -41,7 +41,8 @@ def test_arrays_have_the_documented_shapes(log):
     assert all(len(getattr(log, name)) == n for name in ARRAYS)
 
 
-def test_each_tick_follows_from_the_one_before(log):
+def test_log_steps_integrate_velocities(log):
+    """Each tick follows from the one before."""
     assert np.allclose(np.diff(log.q, axis=0), 0.01 * log.v[:-1], atol=1e-12)
 
 
@@ -67,7 +68,8 @@ def test_file_is_named_as_asked(log, tmp_path, name):
     assert log.save(tmp_path / name).name == name.removesuffix(".npz") + ".npz"
 
 
-def test_log_knows_what_made_it(log):
+def test_log_versions_and_configuration(log):
+    """Log knows what made it."""
     scenario = load_scenario("panda_line", SHORT)
     assert log.meta["config"] == scenario.model_dump(mode="json")
     assert log.meta["scenario"] == "panda_line"
@@ -150,7 +152,8 @@ def said(log: Log) -> list[tuple]:
     return [(reason["kind"], reason["subject"], reason["severity"]) for reason in reasons]
 
 
-def test_malformed_state_stops_the_robot_and_says_why(log, monkeypatch, tmp_path):
+def test_log_of_malformed_state_names_cause(log, monkeypatch, tmp_path):
+    """Malformed state stops the robot and says why."""
     tick = Controller.tick
 
     def lose_the_encoder(self, q, t=0.0):

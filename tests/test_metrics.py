@@ -51,7 +51,7 @@ def log():
         body_distance=[[0.3, 0.5], [0.1, 0.5], [0.2, -0.02], [0.4, -0.01], [0.05, 0.06]],
         closest_pair=[0, 0, 1, 1, 0],
         status=[STATUSES.index(s) for s in ("SOLVED", "RELAXED", "RELAXED", "STOPPED", "SOLVED")],
-        share=[1.0, 0.5, 1.0, 0.0, 1.0],
+        command_scale=[1.0, 0.5, 1.0, 0.0, 1.0],
         stalled=np.array([False, False, True, True, True]),
         severity=np.array([0, Severity.WARNING, Severity.WARNING, Severity.ALARM, Severity.INFO], dtype=np.int8),
         build_time=np.array([4, 5, 6, 7, 8]) * 1e-6,
@@ -226,7 +226,8 @@ def test_table_cuts_no_outcome_however_narrow(log, width):
         assert [word for word in words[start:] if word in said] == said
 
 
-def test_table_leaves_the_least_important_columns_out_and_says_how_many(log):
+def test_table_drops_columns_in_narrow_terminal(log):
+    """Table leaves the least important columns out and says how many."""
     runs, said = [log.metrics()], []
     for width in (100, 62, 52, 40):
         heading = "\n".join(printed(runs, width))

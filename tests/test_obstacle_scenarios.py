@@ -13,7 +13,7 @@ def carried():
     return {solver: simulate("carried_box", solver) for solver in ("tracking", "qp")}
 
 
-def test_the_load_decides_the_way(carried):
+def test_attached_object_changes_the_path(carried):
     """Tracking takes the box through the pole, with the hand itself clear of it; the QP takes both past it."""
     tracking, qp = (carried[solver].metrics() for solver in ("tracking", "qp"))
     assert tracking["collided"] and tracking["min_pair"] == ["box", "pole"]
@@ -21,7 +21,8 @@ def test_the_load_decides_the_way(carried):
     assert qp["final_error"] < 1e-3 and qp["status_counts"]["SOLVED"] == len(carried["qp"].t)
 
 
-def test_a_load_is_logged_where_the_robot_has_it(carried):
+def test_attached_object_is_logged_at_its_pose(carried):
+    """A load is logged where the robot has it."""
     log = carried["qp"]
     index = [o["name"] for o in log.meta["obstacles"]].index("box")
     away = np.einsum(
@@ -31,7 +32,8 @@ def test_a_load_is_logged_where_the_robot_has_it(carried):
     assert np.ptp(log.obstacle_position[:, index], axis=0).max() > 0.5
 
 
-def test_a_shelf_seen_as_points():
+def test_point_cloud_shelf_is_avoided():
+    """A shelf seen as points."""
     logs = {solver: simulate("shelf", solver) for solver in ("tracking", "qp")}
     assert logs["tracking"].metrics()["collided"]
     qp = logs["qp"].metrics()
@@ -39,7 +41,8 @@ def test_a_shelf_seen_as_points():
     assert any("shelf" in logs["qp"].meta["pairs"][pair] for pair in set(logs["qp"].closest_pair.tolist()))
 
 
-def test_figures_show_what_came_from_files(carried, tmp_path):
+def test_figures_of_shapes_from_files(carried, tmp_path):
+    """Figures show what came from files."""
     log = Log.load(carried["qp"].save(tmp_path / "run"))
     shelf = next(o for o in log.meta["obstacles"] if o["name"] == "shelf")
     faces = local_faces(shelf).reshape(-1, 3)
@@ -72,7 +75,8 @@ def test_faces_of_shapes_look_outwards(shape, extent):
         ("obstacles.0.motion.position=[3, 0, 0]", "too far to be carried"),
     ],
 )
-def test_what_cannot_be_carried_is_said_with_file_and_field(override, message):
+def test_attach_errors_name_file_and_field(override, message):
+    """What cannot be carried is said with file and field."""
     with pytest.raises(ConfigError, match=message) as caught:
         Controller.from_scenario(load_scenario("carried_box", [override]))
     assert "carried_box.yaml" in str(caught.value)

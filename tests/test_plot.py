@@ -10,8 +10,8 @@ from matplotlib.colors import to_hex
 from numpy.testing import assert_allclose
 
 from qpavoid import Log, Status, load_scenario
-from qpavoid.run.simulate import simulate
 from qpavoid.run.log import STATUSES
+from qpavoid.run.simulate import simulate
 
 pytest.importorskip("matplotlib")
 
@@ -101,7 +101,8 @@ def test_collision_and_every_coloured_body_are_in_view(sphere, panda):
             assert bottom <= np.min(line.get_ydata()) and np.max(line.get_ydata()) <= top
 
 
-def test_bodies_that_stay_far_are_grey_and_share_one_entry(panda):
+def test_distant_bodies_are_grey_with_one_entry(panda):
+    """Bodies that stay far are grey and share one entry."""
     limit = 1.5 * panda.meta["config"]["avoidance"]["d2"]
     distance = panda.body_distance.copy()
     distance[:, :3] = 2.0 * limit
@@ -339,7 +340,7 @@ def test_known_solvers_differ_in_colour_and_dash():
     assert len({str(dash) for _, dash in SOLVER_STYLES.values()}) == len(SOLVER_STYLES)
 
 
-def test_runs_that_are_alike_can_be_told_apart(sphere):
+def test_styles_of_equal_runs_differ(sphere):
     """Of two runs with one course, neither line is hidden: they differ in colour and dash, and dashes lie on top."""
     tracking, eq10, qp, proxqp = sphere
     for logs in ([qp, qp], [proxqp, qp], [qp, proxqp, proxqp, tracking, eq10, proxqp, qp]):
@@ -378,7 +379,8 @@ def test_path_views_show_two_planes_of_the_tool_path_at_one_scale(sphere):
         assert_allclose(np.ptp(circle, axis=0), 0.10, rtol=0.01)  # the fist, 0.05 m in radius
 
 
-def test_arm_at_rest_is_shown_where_it_is_the_obstacle(arms):
+def test_path_shows_arm_that_is_the_obstacle(arms):
+    """Arm at rest is shown where it is the obstacle."""
     assert len(path_figure([arms], solver_styles([arms])).axes[0].patches) > 0
 
 

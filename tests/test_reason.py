@@ -124,7 +124,7 @@ def test_a_margin_that_is_used_warns_and_contact_alarms(tmp_path):
     assert hit.severity is Severity.ALARM and [row.severity for row in rows] == [Severity.ALARM]
 
 
-def test_far_from_its_safety_distance_a_relaxed_row_informs_and_so_do_the_joints_that_limit_it(tmp_path):
+def test_relaxed_row_far_from_safety_distance_informs(tmp_path):
     """At 90 mm of 100, from a ball at 1.4 m/s, which the tool's 1 m/s cannot quite leave: nothing touches for long."""
     robot = cartesian(tmp_path, axes="x", acceleration=None)
     controller = make_controller(

@@ -148,7 +148,7 @@ POSTURES = ("", "q0=[-1.1603, 0.6168, 0.3794, -0.7141, 1.9936, -1.5551, -1.7847,
 
 @pytest.mark.parametrize("posture", POSTURES, ids=["elbow high", "elbow low"])
 @pytest.mark.parametrize(("dx", "dz"), SHIFTS)
-def test_small_shifts_of_the_sphere_across_the_path(posture, dx, dz):
+def test_solvers_with_shifted_sphere(posture, dx, dz):
     """No contact in any of the 40 runs, and all arrive; eq. 10 is as good here."""
     center = [0.39644872 + dx, 0.41090125, 0.74741443 + dz]
     overrides = [f"obstacles.0.motion.position={center}", *[posture] * bool(posture)]

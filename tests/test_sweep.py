@@ -25,14 +25,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from qpavoid.arena import commands, store, sweep
+from qpavoid.arena.entrant_file import entrant_from_file
 from qpavoid.arena.entrants import ENTRANTS
 from qpavoid.arena.families import load_family, make_case
-from qpavoid.arena.own import own_entrant
-from qpavoid.arena.plan import cases_of, complete, missing_cases, missing_runs, runs_of
+from qpavoid.arena.plan import cases_of, is_complete, missing_cases, missing_runs, runs_of
 from qpavoid.arena.scores import COLUMNS, KEY
 from qpavoid.arena.store import Store, read_cases, read_runs
 from qpavoid.arena.suite import EntrantConfig, load_suite, origin
-from qpavoid.arena.summary import broken, summary
+from qpavoid.arena.summary import find_faults, summary
 from qpavoid.arena.trial import run_trial
 from qpavoid.arena.world import build_world
 from qpavoid.config.shipped import family_names, suite_names
@@ -110,18 +110,18 @@ class Picky:
 
 class Mistyped:
     def solve(self, problem):
-        return Solution(problem.v00)
+        return Solution(problem.v_tracking_)
 
 def short(problem):
-    return problem.v0[:3]
+    return problem.v_tracking[:3]
 
 def nan(problem):
-    return np.nan * problem.v0
+    return np.nan * problem.v_tracking
 
 def now_and_then(problem):
-    if problem.v0[0] > 0.0:
+    if problem.v_tracking[0] > 0.0:
         raise ValueError("not now")
-    return problem.v0
+    return problem.v_tracking
 
 NUMBER = 7
 '''
@@ -175,7 +175,7 @@ def row_of(**fields):
 
 @settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 @given(steps=st.lists(st.sampled_from(["row", "again", "fold", "killed", "torn", "renamed"]), max_size=25))
-def test_rows_survive_whatever_ends_the_writer(tmp_path_factory, steps):
+def test_store_rows_survive_killed_writer(tmp_path_factory, steps):
     """Against a dictionary: rows, Parquet files in between, ends of all kinds; each row is read once, in order."""
     out, model = tmp_path_factory.mktemp("out"), {}
     writer = Store(out)
@@ -204,7 +204,8 @@ def test_rows_survive_whatever_ends_the_writer(tmp_path_factory, steps):
     assert read_runs(out)["case"].to_pylist() == list(model)
 
 
-def test_a_row_comes_back_as_it_was(tmp_path):
+def test_store_row_round_trip(tmp_path):
+    """A row comes back as it was."""
     row = row_of(family="a – b", seed=2**40, success=True, min_distance=float("inf"), jerk=0.1 + 0.2, failure='"\n\\')
     for fold in (False, True):
         with Store(tmp_path / str(fold)) as writer:
@@ -214,7 +215,8 @@ def test_a_row_comes_back_as_it_was(tmp_path):
         assert read_runs(tmp_path / str(fold)).to_pylist() == [row]
 
 
-def test_many_rows_become_few_files(tmp_path, monkeypatch):
+def test_store_folds_rows_into_few_files(tmp_path, monkeypatch):
+    """Many rows become few files."""
     monkeypatch.setattr(store, "FOLD", 10)
     with Store(tmp_path) as writer:
         for n in range(35):
@@ -225,7 +227,8 @@ def test_many_rows_become_few_files(tmp_path, monkeypatch):
     assert len(list((tmp_path / "runs").iterdir())) == 4
 
 
-def test_one_writer_a_folder(tmp_path):
+def test_store_has_one_writer(tmp_path):
+    """One writer a folder."""
     with Store(tmp_path), pytest.raises(ConfigError, match=rf"process {os.getpid()} on .* writes here; .*--out"):
         Store(tmp_path)
     with Store(tmp_path):
@@ -251,7 +254,7 @@ def test_folders_that_cannot_be_read(tmp_path):
 
 @settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 @given(data=st.data())
-def test_what_is_missing_is_what_is_not_there(tmp_path_factory, data):
+def test_plan_missing_runs_equal_set_difference(tmp_path_factory, data):
     """Against loops over sets, with rows of other versions, settings and cases about."""
     folder = tmp_path_factory.mktemp("suite")
     (folder / "post.yaml").write_text(yaml.safe_dump(POST))
@@ -276,16 +279,18 @@ def test_what_is_missing_is_what_is_not_there(tmp_path_factory, data):
     there = {(f"c{seed}", name) for seed, name in wanted if (seed, name, True) in done}
     runs = runs_of(suite, out)
     assert set(keys_of(runs, ("case", "entrant"))) == there and len(runs) == len(there)
-    assert complete(suite, out) == (not left and set(range(4)) <= made)
+    assert is_complete(suite, out) == (not left and set(range(4)) <= made)
 
 
-def test_settings_and_families_that_change_want_results_of_their_own(folder):
+def test_digest_changes_with_settings_and_families(folder):
+    """Settings and families that change want results of their own."""
+
     def digests(**fields):
         entrant = EntrantConfig.model_validate({"name": "mine", "solver": "qp", **fields}).entrant()
         return entrant.digest
 
     assert len({digests(), digests(solver="eq10"), digests(avoidance={"d2": 0.2}), digests(avoidance={"d2": 0.3})}) == 4
-    assert digests(says="other words") == digests()
+    assert digests(description="other words") == digests()
     before = origin(load_family(folder / "post.yaml"))
     assert origin(load_family(folder / "post.yaml")) == before
     (folder / "post.yaml").write_text(yaml.safe_dump({**POST, "scenario": {**POST["scenario"], "dt": 0.01}}))
@@ -314,7 +319,8 @@ def test_the_full_suite_is_everything():
     assert {entrant.name for entrant in suite.entrants + suite.absent} == set(ENTRANTS)
 
 
-def test_a_law_with_settings_of_its_own_changes_these_and_no_others(folder):
+def test_entrant_config_changes_only_its_settings(folder):
+    """A law with settings of its own changes these and no others."""
     path = write_suite(
         folder, [{"name": "wide", "solver": {"name": "qp", "backend": "daqp"}, "avoidance": {"d2": 0.3}}]
     )
@@ -325,7 +331,8 @@ def test_a_law_with_settings_of_its_own_changes_these_and_no_others(folder):
     assert entrant.name == "wide" and entrant.settings["avoidance"] == {"d2": 0.3}
 
 
-def test_who_takes_part(folder, monkeypatch):
+def test_suite_selects_entrants(folder, monkeypatch):
+    """Who takes part."""
     monkeypatch.setitem(ENTRANTS, "absent", replace(ENTRANTS["qp"], name="absent", packages=("no_such_package",)))
     wide = {"name": "wide", "solver": "qp", "avoidance": {"d2": 0.3}}
     path = write_suite(folder, ["tracking", "absent", wide, "laws.py:Halved"])
@@ -360,7 +367,7 @@ def test_who_takes_part(folder, monkeypatch):
         ({"seeds": 0}, {}, r"seeds: .*greater than or equal to 1"),
     ],
 )
-def test_bad_suites_are_told_in_a_line(folder, fields, options, said):
+def test_suite_errors_are_one_line(folder, fields, options, said):
     with pytest.raises(ConfigError, match=said):
         load_suite(write_suite(folder, **fields), **options)
 
@@ -370,53 +377,57 @@ def test_no_such_suite():
         load_suite("smok")
 
 
-def test_files_that_fail_are_told_with_their_name(tmp_path):
+def test_entrant_file_errors_name_file(tmp_path):
     for text, said in (("def f(:", "SyntaxError"), ("1 / 0", "ZeroDivisionError"), ("exit()", "SystemExit")):
         (tmp_path / "bad.py").write_text(text)
         with pytest.raises(ConfigError, match=rf"bad.py: cannot be run: {said}"):
-            own_entrant(tmp_path / "bad.py", "f")
+            entrant_from_file(tmp_path / "bad.py", "f")
 
 
-def test_the_digest_of_an_own_entrant_follows_its_text_and_not_its_place(folder):
-    first = own_entrant(folder / "laws.py", "Halved")
+def test_entrant_from_file_digest_depends_on_text_only(folder):
+    """The digest of an own entrant follows its text and not its place."""
+    first = entrant_from_file(folder / "laws.py", "Halved")
     (folder / "elsewhere").mkdir()
     (folder / "elsewhere" / "laws.py").write_text(LAWS)
-    assert own_entrant(folder / "elsewhere" / "laws.py", "Halved").digest == first.digest
+    assert entrant_from_file(folder / "elsewhere" / "laws.py", "Halved").digest == first.digest
     (folder / "laws.py").write_text(LAWS.replace("0.5", "0.4"))
-    assert own_entrant(folder / "laws.py", "Halved").digest != first.digest
-    assert first.says == "A class with solve."
+    assert entrant_from_file(folder / "laws.py", "Halved").digest != first.digest
+    assert first.description == "A class with solve."
 
 
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("Mistyped", "AttributeError: 'Problem' object has no attribute 'v00'"),
+        ("Mistyped", "AttributeError: 'Problem' object has no attribute 'v_tracking_'"),
         ("short", r"NumericalError: its velocity: shape \(3,\), expected \(6,\)"),
         ("nan", "NumericalError: its velocity: NaN or infinity"),
     ],
 )
-def test_a_law_that_fails_has_failed_and_says_why(folder, name, said):
+def test_entrant_from_file_failure_names_cause(folder, name, said):
     """A controller brakes where its law fails; the arena must not take that for what the law wants."""
-    row = run_trial(make_case(load_family(folder / "post.yaml"), 0), own_entrant(folder / "laws.py", name))
+    row = run_trial(make_case(load_family(folder / "post.yaml"), 0), entrant_from_file(folder / "laws.py", name))
     assert row.failed == row.stopped == 1.0 and not row.success and re.search(said, row.failure)
 
 
-def test_a_law_that_fails_now_and_then_goes_on(folder):
-    row = run_trial(make_case(load_family(folder / "post.yaml"), 0), own_entrant(folder / "laws.py", "now_and_then"))
+def test_entrant_from_file_continues_after_failure(folder):
+    """A law that fails now and then goes on."""
+    row = run_trial(
+        make_case(load_family(folder / "post.yaml"), 0), entrant_from_file(folder / "laws.py", "now_and_then")
+    )
     assert 0.0 < row.failed < 1.0 and row.failure == "ValueError: not now" and row.path_length > 0.0
 
 
 # --- sweeps ------------------------------------------------------------------------------------------------------
 
 
-def test_rows_are_those_of_single_runs_and_later_sweeps_only_add(folder, client):
+def test_sweep_rows_equal_single_runs(folder, client):
     """Also what shows that own entrants of every kind run: from text that was sent, in other processes."""
     own = [f"laws.py:{name}" for name in ("Halved", "solution", "velocity", "Still", "pilot")]
     path, out = write_suite(folder, ["tracking", "qp", *own], seeds=1), folder / "out"
-    suite, told = load_suite(path), []
-    tally = swept(suite, out, client, told.append)
+    suite, reports = load_suite(path), []
+    tally = swept(suite, out, client, reports.append)
     assert tally.done == tally.total == 7 and tally.failed == 0
-    assert [t.done for t in told if t.stage == "runs"] == list(range(8))
+    assert [t.done for t in reports if t.stage == "runs"] == list(range(8))
     runs = {row["entrant"]: row for row in read_runs(out).to_pylist()}
     case = make_case(load_family(folder / "post.yaml"), 0)
     timed = {"tick_p50", "tick_p99", "seconds"}
@@ -442,12 +453,13 @@ def test_rows_are_those_of_single_runs_and_later_sweeps_only_add(folder, client)
     after = read_runs(out)
     assert after.to_pylist()[: len(before)] == before and len(set(keys_of(after))) == len(after) == 12
     assert len(runs_of(suite, out)) == 7 and len(runs_of(more, out)) == 6  # of the text that Halved had, and has now
-    told = json.loads((out / "suite.json").read_text())
-    assert {"tracking", "eq10", "Halved", "pilot"} <= {entry["name"] for entry in told["entrants"].values()}
-    assert told["versions"]["qpavoid"] and told["machine"]["cpu"]
+    facts = json.loads((out / "suite.json").read_text())
+    assert {"tracking", "eq10", "Halved", "pilot"} <= {entry["name"] for entry in facts["entrants"].values()}
+    assert facts["versions"]["qpavoid"] and facts["machine"]["cpu"]
 
 
-def test_what_cannot_be_set_up_or_takes_its_process_down_has_failed_and_is_not_lost(folder, client):
+def test_sweep_keeps_runs_of_dead_processes(folder, client):
+    """What cannot be set up or takes its process down has failed and is not lost."""
     suite = load_suite(write_suite(folder, ["laws.py:Picky", "laws.py:Deadly", "laws.py:Still"], seeds=2))
     tally = swept(suite, folder / "out", client)
     assert tally.done == tally.total == 6 and tally.failed == 0
@@ -459,16 +471,16 @@ def test_what_cannot_be_set_up_or_takes_its_process_down_has_failed_and_is_not_l
         assert row["failed"] == (0.0 if row["entrant"] == "Still" else 1.0)
         assert said.get(row["entrant"], "") in row["failure"]
         assert row["stopped"] == row["failed"] and row["time_to_goal"] == 1.0
-    assert complete(suite, folder / "out")
+    assert is_complete(suite, folder / "out")
 
 
-def test_processes_that_dask_gives_up_are_replaced(folder, monkeypatch):
+def test_sweep_replaces_lost_processes(folder, monkeypatch):
     """As when a machine is so busy that they take too long to start again; otherwise the sweep waits for ever."""
 
     def too_long(*_):
         raise AssertionError("the sweep waits for a process that never comes")
 
-    monkeypatch.setitem(sweep._DASK, "distributed.deploy.lost-worker-timeout", "1 ms")
+    monkeypatch.setitem(sweep._DASK_CONFIG, "distributed.deploy.lost-worker-timeout", "1 ms")
     suite = load_suite(write_suite(folder, ["laws.py:Deadly", "laws.py:Still"], seeds=1))
     before = signal.signal(signal.SIGALRM, too_long)
     signal.alarm(120)
@@ -480,7 +492,7 @@ def test_processes_that_dask_gives_up_are_replaced(folder, monkeypatch):
         signal.signal(signal.SIGALRM, before)
 
 
-def test_a_case_that_cannot_be_made_is_told_and_the_others_run(folder, client):
+def test_sweep_continues_after_case_failure(folder, client):
     (post,) = POST["scenario"]["obstacles"]
     around = {**post, "motion": {"type": "fixed", "position": [0.0, 0.0, 0.5]}}  # the arm itself: no draw will do
     crowded = {**POST, "scenario": {**POST["scenario"], "obstacles": [post, {**around, "name": "around"}]}}
@@ -490,7 +502,7 @@ def test_a_case_that_cannot_be_made_is_told_and_the_others_run(folder, client):
     assert tally.done == 1 and tally.failed == 1
     (failure,) = map(json.loads, (folder / "out" / "failures.jsonl").read_text().splitlines())
     assert failure["family"] == "crowded" and failure["entrant"] is None and "crowded.yaml" in failure["failure"]
-    assert not complete(suite, folder / "out")
+    assert not is_complete(suite, folder / "out")
     assert read_runs(folder / "out")["family"].to_pylist() == ["post"]
 
 
@@ -528,7 +540,8 @@ def until(true, seconds=300.0):
         time.sleep(0.02)
 
 
-def test_a_cluster_loses_a_worker_half_way(folder, cluster):
+def test_sweep_survives_lost_worker(folder, cluster):
+    """A cluster loses a worker half way."""
     address, workers, scheduler = cluster
     suite, out = load_suite(write_suite(folder, ["tracking", "laws.py:Slow"], seeds=6)), folder / "out"
 
@@ -593,7 +606,8 @@ def test_killed_then_interrupted_then_finished(folder, client):
 # --- the commands ------------------------------------------------------------------------------------------------
 
 
-def test_run_then_show_then_nothing_left_to_do(cli, folder, monkeypatch):
+def test_bench_run_show_and_resume(cli, folder, monkeypatch):
+    """Run then show then nothing left to do."""
     write_suite(folder, ["tracking", {"name": "wide", "solver": "qp", "avoidance": {"d2": 0.3}}], seeds=2)
     first = cli("bench", "run", "mine.yaml", "--json", "--jobs", "1")
     assert first.status == 0
@@ -602,8 +616,8 @@ def test_run_then_show_then_nothing_left_to_do(cli, folder, monkeypatch):
     assert [entry["entrant"] for entry in document["entrants"]] == ["tracking", "wide"]
     with monkeypatch.context() as patch:
         patch.setattr(sweep, "local_cluster", None)  # no process is started for it
-        again = cli("bench", "run", "mine.yaml")
-    assert again.status == 0 and "4 runs, 0 of them new" in again.stdout and "tracking" in again.stdout
+        rerun = cli("bench", "run", "mine.yaml")
+    assert rerun.status == 0 and "4 runs, 0 of them new" in rerun.stdout and "tracking" in rerun.stdout
     out = Path("out/bench/mine")
     shown = cli(
         "bench", "show", out, "--family", "post", "--seed", 1, "--entrant", "wide", "--scenario", "case.yaml", "--json"
@@ -613,8 +627,8 @@ def test_run_then_show_then_nothing_left_to_do(cli, folder, monkeypatch):
     (row,) = [row for row in read_runs(out).to_pylist() if row["entrant"] == "wide" and row["seed"] == 1]
     assert all(run[name] == row[name] for name in (*KEY, "success", "collided", "contacts"))
     assert cli("run", "case.yaml", "--no-figures").status in (0, 1)
-    told = cli("bench", "show", out, "--family", "post", "--seed", 1, "--entrant", "wide").stdout.splitlines()
-    assert {line.split()[0] for line in told} == {"solved_by", *COLUMNS}
+    lines = cli("bench", "show", out, "--family", "post", "--seed", 1, "--entrant", "wide").stdout.splitlines()
+    assert {line.split()[0] for line in lines} == {"solved_by", *COLUMNS}
     assert cli("bench", "show", out, "--family", "post", "--seed", 7, "--json").lines == [
         f"error: {out}: post has no seed 7; there are 2 from 0 to 1"
     ]
@@ -639,21 +653,23 @@ def test_list_names_everything(cli):
     ],
 )
 def test_bad_input_is_a_line_and_exit_status_2(cli, monkeypatch, words, said):
-    monkeypatch.setattr(sweep, "_ANSWER_WITHIN", 0.5)
+    monkeypatch.setattr(sweep, "_CONNECT_TIMEOUT", 0.5)
     result = cli("bench", *words)
     lines = [line for line in result.lines if "does not take part" not in line]
     assert result.status == 2 and len(lines) == 1
     assert re.search(said, lines[0])
 
 
-def test_without_the_extra_the_bench_says_what_to_install(cli, monkeypatch):
+def test_bench_without_extra_names_remedy(cli, monkeypatch):
+    """Without the extra the bench says what to install."""
     monkeypatch.setattr(commands, "find_spec", lambda name: None if name in ("pyarrow", "distributed") else True)
     result = cli("bench", "list")
     assert result.status == 2
     assert result.lines == ["error: qpavoid bench needs distributed, pyarrow: pip install 'qpavoid[arena]'"]
 
 
-def test_the_rest_of_the_command_line_brings_nothing_of_the_arena_in():
+def test_cli_does_not_import_arena_dependencies():
+    """The rest of the command line brings nothing of the arena in."""
     code = (
         "import sys, qpavoid.cli; "
         "sys.exit(bool({'dask', 'distributed', 'pyarrow', 'mujoco', 'matplotlib'} & sys.modules.keys()))"
@@ -695,9 +711,10 @@ def smoke_rows(folder, **changes):
         ({"qp1": {"jerk": np.nan}}, ["jerk: NaN"]),
     ],
 )
-def test_the_smoke_test_tells_what_is_broken(folder, changes, said):
+def test_find_faults_names_faults(folder, changes, said):
+    """The smoke test tells what is broken."""
     suite, rows, cases = smoke_rows(folder, **changes)
-    faults = list(broken(suite, pa.Table.from_pylist(rows, schema=store.RUNS.schema), cases))
+    faults = list(find_faults(suite, pa.Table.from_pylist(rows, schema=store.RUNS.schema), cases))
     assert len(faults) == len(said) and all(fault.startswith(start) for fault, start in zip(faults, said, strict=True))
 
 

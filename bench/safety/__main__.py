@@ -12,7 +12,7 @@ from bench.safety import report
 from bench.safety.campaign import draw
 from bench.safety.trial import Trial, as_named, examine, trials
 from qpavoid import Workers
-from qpavoid.arena.twin import load
+from qpavoid.arena.mujoco_model import load_model
 from qpavoid.run.log import STATUSES
 
 RESULTS = Path(__file__).parents[1] / "results"
@@ -63,7 +63,7 @@ def campaign(seeds: Sequence[int], solvers: list[str], jobs: int | None = None) 
 def describe(seed: int, solver: str) -> None:
     """Runs one seed and prints its scene, what the referee saw, and all verdicts."""
     scenario = draw(seed)
-    twin = load(scenario)
+    twin = load_model(scenario)
     scenario = as_named(scenario, solver)
     trial, log, findings, verdicts = examine(seed, scenario, twin, solver)
     avoidance = scenario.avoidance

@@ -13,8 +13,8 @@ import pinocchio as pin
 
 from bench.safety.obstacles import draw_obstacle
 from qpavoid import Robot, ScenarioConfig
-from qpavoid.arena.families.room import Placed, bodies_at, gap
-from qpavoid.arena.families.ways import Way
+from qpavoid.arena.families.free_space import PlacedShape, min_distance, placed_bodies
+from qpavoid.arena.families.tool_path import ToolPath
 from qpavoid.config import Fixed, ObstacleConfig
 from qpavoid.geometry.bodies import make_shape
 from qpavoid.model.scene import build_obstacles
@@ -115,10 +115,10 @@ def draw(seed: int, ranges: Ranges = RANGES) -> ScenarioConfig:
         tasks.append(task)
         ways.append(way)
     duration = float(np.clip(max(way.end for way in ways) + 2.0, *ranges.duration))
-    midway = bodies_at(robot, start + random.uniform() * (goal - start))
+    midway = placed_bodies(robot, start + random.uniform() * (goal - start))
     targets = np.array([place.getTranslation() for joint, _, place in midway if joint > 0])
     roots = [(coal.Sphere(radius), coal.Transform3s(np.eye(3), np.array(at))) for *at, radius in kind.roots]
-    roots += [(shape, place) for joint, shape, place in bodies_at(robot, start) if joint > 0 and held[joint - 1]]
+    roots += [(shape, place) for joint, shape, place in placed_bodies(robot, start) if joint > 0 and held[joint - 1]]
     if random.random() < ranges.root_share:
         roots = []
     obstacles: list[dict[str, Any]] = []
@@ -179,7 +179,7 @@ def _goal(robot: Robot, random: np.random.Generator, d1: float, start: Array, he
 
 def _task(
     robot: Robot, random: np.random.Generator, tool: str, start: Array, goal: Array, ranges: Ranges
-) -> tuple[dict[str, Any], Way]:
+) -> tuple[dict[str, Any], ToolPath]:
     """A straight line of a tool from where it is at the start to where it is at the goal."""
     model = robot.model
     data, frame = model.createData(), model.getFrameId(tool)
@@ -197,7 +197,7 @@ def _task(
     if pose:
         motion["rpys"] = [pin.rpy.matrixToRpy(rotation).tolist() for rotation, _ in (here, there)]
     task = {"frame": tool, "type": "pose" if pose else "position", "motion": motion}
-    return {**task, "max_speed": 0.5, "max_turn_rate": 1.5}, Way(here[1], there[1], begin, end)
+    return {**task, "max_speed": 0.5, "max_turn_rate": 1.5}, ToolPath(here[1], there[1], begin, end)
 
 
 def _frames(model: Any, data: Any, frame: int, *configurations: Array) -> Any:
@@ -221,10 +221,12 @@ def _has_room(
     config = ObstacleConfig.model_validate(obstacle)
     motion, shape = build_obstacles([config], FOLDER)[0].motion, make_shape(config.shape)
 
-    def apart(t: float, others: list[Placed]) -> bool:
+    def apart(t: float, others: list[PlacedShape]) -> bool:
         pose = motion.sample(t)
-        return gap(shape, coal.Transform3s(pose.rotation, pose.position), others) > d1
+        return min_distance(shape, coal.Transform3s(pose.rotation, pose.position), others) > d1
 
     still = isinstance(config.motion, Fixed)
-    robots = [(body, place) for q in ((start, goal) if still else (start,)) for _, body, place in bodies_at(robot, q)]
+    robots = [
+        (body, place) for q in ((start, goal) if still else (start,)) for _, body, place in placed_bodies(robot, q)
+    ]
     return apart(0.0, robots) and all(apart(t, roots) for t in ((0.0,) if still else np.arange(0.0, duration, 0.1)))

@@ -11,8 +11,8 @@ import numpy as np
 from scipy.optimize import linprog
 
 from qpavoid import ScenarioConfig
-from qpavoid.arena.referee import Watch
-from qpavoid.arena.twin import Twin
+from qpavoid.arena.checker import DistanceMonitor
+from qpavoid.arena.mujoco_model import MujocoModel
 from qpavoid.problem import Array
 
 PERIOD = 0.02
@@ -109,7 +109,7 @@ class Flight:
     """Smallest distance on it [m]."""
 
 
-def joint_means(twin: Twin, scenario: ScenarioConfig) -> Means:
+def joint_means(twin: MujocoModel, scenario: ScenarioConfig) -> Means:
     """What a scenario lets the joints do."""
     bounds = twin.scene.robot.bounds().within(scenario.limits)
     lower, upper = np.full_like(bounds.velocity, -np.inf), np.full_like(bounds.velocity, np.inf)
@@ -127,16 +127,16 @@ def manners(count: int) -> Iterator[Manner]:
         yield Manner(f"fleeing, leaning {i},", HORIZONS[0], LEAN * direction / np.linalg.norm(direction))
 
 
-def fly(twin: Twin, means: Means, start: Start, dt: float, manner: Manner, pairs: Any) -> Flight:
+def fly(twin: MujocoModel, means: Means, start: Start, dt: float, manner: Manner, pairs: Any) -> Flight:
     """Flees with ticks of dt [s], to the end or to the first contact of one of the pairs (m,)."""
     q, v, t, _ = start
     twin.place(q, t)
-    watch = Watch(twin)
-    watch.look(t)
+    watch = DistanceMonitor(twin)
+    watch.measure(t)
     pairs = pairs.copy()
     pairs[[contact.pair for contact in watch.contacts]] = False
-    watch = Watch(twin, pairs)
-    watch.look(t)
+    watch = DistanceMonitor(twin, pairs)
+    watch.measure(t)
     ticks = int(np.ceil(PERIOD / dt - 1e-9))
     while t < start.until - 1e-9:
         box, begin, before, last = means.box(q, v, ticks * dt), t, q, v
@@ -153,7 +153,7 @@ def fly(twin: Twin, means: Means, start: Start, dt: float, manner: Manner, pairs
     return Flight(None, t, q, v, watch.distance)
 
 
-def near_rows(twin: Twin, q: Array, t: float, pairs: Any, reach: float) -> Rows:
+def near_rows(twin: MujocoModel, q: Array, t: float, pairs: Any, reach: float) -> Rows:
     """Rows of those of the pairs (m,) that are nearer than `reach` [m], all by MuJoCo."""
     twin.place(q, t)
     scene, model, data = twin.scene, twin.model, twin.data

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from qpavoid.arena.families import ways
-from qpavoid.arena.families.ways import Way, line
+from qpavoid.arena.families import tool_path
+from qpavoid.arena.families.tool_path import ToolPath, line
 from qpavoid.problem import Array
 
 if TYPE_CHECKING:
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def draw_obstacle(
-    random: np.random.Generator, name: str, moving: bool, way: Way, bodies: Array, ranges: Ranges
+    random: np.random.Generator, name: str, moving: bool, way: ToolPath, bodies: Array, ranges: Ranges
 ) -> dict[str, Any]:
     """An obstacle as a scenario file has it; whether there is room for it at the start is not looked at.
 
@@ -51,39 +51,39 @@ def _shape(random: np.random.Generator, ranges: Ranges) -> dict[str, Any]:
             return {"type": "box", "size": [sides[0], sides[1], random.uniform(*ranges.thickness)]}
 
 
-def _beside(random: np.random.Generator, way: Way, bodies: Array) -> Array:
+def _beside(random: np.random.Generator, way: ToolPath, bodies: Array) -> Array:
     """Somewhere near the tool's way, two times in three, else near the robot, (3,) [m]."""
     near_way = random.random() < 2.0 / 3.0
     point = way.point(random.uniform(-0.1, 1.1)) if near_way else bodies[random.integers(len(bodies))]
     return np.asarray(point + random.uniform(0.0, 0.35) * _direction(random))
 
 
-def _crossing(random: np.random.Generator, way: Way, bodies: Array, ranges: Ranges) -> dict[str, Any]:
+def _crossing(random: np.random.Generator, way: ToolPath, bodies: Array, ranges: Ranges) -> dict[str, Any]:
     """A line through the tool's way, at the time when the tool is there."""
     speed, share, direction = random.uniform(*ranges.obstacle_speed), random.uniform(0.2, 1.0), _direction(random)
-    return ways.crossing(way, share, direction, random.uniform(0.0, 0.05) * _direction(random), speed)
+    return tool_path.crossing(way, share, direction, random.uniform(0.0, 0.05) * _direction(random), speed)
 
 
-def _at_the_arm(random: np.random.Generator, way: Way, bodies: Array, ranges: Ranges) -> dict[str, Any]:
+def _at_the_arm(random: np.random.Generator, way: ToolPath, bodies: Array, ranges: Ranges) -> dict[str, Any]:
     """A line through a part of the robot."""
     speed, direction = random.uniform(*ranges.obstacle_speed), _direction(random)
     point = bodies[random.integers(len(bodies))] + random.uniform(0.0, 0.1) * _direction(random)
-    return line(point - random.uniform(0.3, 1.0) * direction, point + ways.BEYOND * direction, speed)
+    return line(point - random.uniform(0.3, 1.0) * direction, point + tool_path.OVERSHOOT * direction, speed)
 
 
-def _head_on(random: np.random.Generator, way: Way, bodies: Array, ranges: Ranges) -> dict[str, Any]:
+def _head_on(random: np.random.Generator, way: ToolPath, bodies: Array, ranges: Ranges) -> dict[str, Any]:
     """Along the tool's way, towards it."""
     aside = random.uniform(0.0, 0.03) * _direction(random)
-    return ways.head_on(way, random.uniform(0.2, 0.6), aside, random.uniform(*ranges.obstacle_speed))
+    return tool_path.head_on(way, random.uniform(0.2, 0.6), aside, random.uniform(*ranges.obstacle_speed))
 
 
-def _chasing(random: np.random.Generator, way: Way, bodies: Array, ranges: Ranges) -> dict[str, Any]:
+def _chasing(random: np.random.Generator, way: ToolPath, bodies: Array, ranges: Ranges) -> dict[str, Any]:
     """Along the tool's way from behind, and on past the goal."""
     aside = random.uniform(0.0, 0.03) * _direction(random)
-    return ways.chasing(way, random.uniform(0.2, 0.6), aside, random.uniform(*ranges.obstacle_speed))
+    return tool_path.chasing(way, random.uniform(0.2, 0.6), aside, random.uniform(*ranges.obstacle_speed))
 
 
-def _circling(random: np.random.Generator, way: Way, bodies: Array, ranges: Ranges) -> dict[str, Any]:
+def _circling(random: np.random.Generator, way: ToolPath, bodies: Array, ranges: Ranges) -> dict[str, Any]:
     """Round and round, near the tool's way or the robot."""
     radius = random.uniform(0.05, 0.3)
     return {

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from qpavoid import Limits, Log
-from qpavoid.arena.referee import Findings, play
-from qpavoid.arena.twin import Twin
+from qpavoid.arena.checker import Findings, check_run
+from qpavoid.arena.mujoco_model import MujocoModel
 
 
-def referee(twin: Twin, log: Log) -> Findings:
+def referee(twin: MujocoModel, log: Log) -> Findings:
     """Plays a log's velocities from the twin's start.
 
     Raises:
@@ -17,7 +17,7 @@ def referee(twin: Twin, log: Log) -> Findings:
     """
     if [list(pair) for pair in twin.scene.pair_names] != log.meta["pairs"]:
         raise ValueError("the log's pairs are not the twin's: it is of another scene")
-    return play(twin, log.t, log.v, Limits.model_validate(log.meta["config"]["limits"]))
+    return check_run(twin, log.t, log.v, Limits.model_validate(log.meta["config"]["limits"]))
 
 
 def drift(log: Log, findings: Findings) -> float:
@@ -25,7 +25,7 @@ def drift(log: Log, findings: Findings) -> float:
     return float(np.max(np.abs(findings.q - log.q), initial=0.0))
 
 
-def disagreement(twin: Twin, log: Log, findings: Findings) -> float:
+def disagreement(twin: MujocoModel, log: Log, findings: Findings) -> float:
     """Largest difference between the log's smallest distance and MuJoCo's of that pair, at ticks without contact [m].
 
     In deep penetration the two mean different things.

@@ -16,7 +16,7 @@ import numpy as np
 from bench.safety.campaign import KINDS, RANGES
 from bench.safety.trial import Trial
 from bench.safety.verdict import AHEAD, RESOLUTION
-from qpavoid.arena.referee import MOST_LOOKS, STEP
+from qpavoid.arena.checker import MAX_INSTANTS, STEP
 from qpavoid.run.machine import cpu, versions
 
 PACKAGES = ("qpavoid", "mujoco", "pin", "coal", "daqp", "numpy", "scipy", "numba")
@@ -61,7 +61,7 @@ def _sections(found: list[Trial], failures: dict[int, str], solvers: Sequence[st
         "velocity that the controller is told: no delay, no noise, no dynamics. Joint placements, collision shapes and "
         "the obstacles' motions come from the same description on both sides, so an error in those is seen by neither. "
         f"What two bodies that both move touch and leave between two looks is at most {1e3 * STEP:g} mm deep, and may "
-        f"be missed (a tick has at most {MOST_LOOKS} looks). `eq10` and `tracking` are scaled to the joints' limits "
+        f"be missed (a tick has at most {MAX_INSTANTS} looks). `eq10` and `tracking` are scaled to the joints' limits "
         "afterwards. Runs are short: one that has not arrived when it ends is not lost.",
         "",
         "**Avoidable or not.** The robot is taken back to the last tick at which the pair that touched was farther "

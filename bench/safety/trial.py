@@ -12,10 +12,10 @@ from bench.safety.campaign import draw
 from bench.safety.referee import disagreement, drift, referee
 from bench.safety.verdict import Verdict, judge, last_way_out
 from qpavoid import Log, ScenarioConfig, Status
-from qpavoid.arena.referee import Findings
-from qpavoid.arena.twin import Twin, load
-from qpavoid.run.simulate import simulate
+from qpavoid.arena.checker import Findings
+from qpavoid.arena.mujoco_model import MujocoModel, load_model
 from qpavoid.run.log import STATUSES
+from qpavoid.run.simulate import simulate
 
 ALONE = "-alone"
 """What the name of a solver ends with that keeps no way out at hand."""
@@ -99,7 +99,7 @@ class Trial:
 def trials(seed: int, solvers: Sequence[str]) -> list[Trial]:
     """The scenario of a seed with several solvers."""
     scenario = draw(seed)
-    twin = load(scenario)
+    twin = load_model(scenario)
     return [examine(seed, as_named(scenario, solver), twin, solver)[0] for solver in solvers]
 
 
@@ -112,7 +112,7 @@ def as_named(scenario: ScenarioConfig, solver: str) -> ScenarioConfig:
 
 
 def examine(
-    seed: int, scenario: ScenarioConfig, twin: Twin, solver: str
+    seed: int, scenario: ScenarioConfig, twin: MujocoModel, solver: str
 ) -> tuple[Trial, Log, Findings, tuple[Verdict, ...]]:
     """One run, with everything that its row was made of."""
     begin = perf_counter()
@@ -155,7 +155,7 @@ def examine(
         speed_excess=findings.speed_excess,
         position_excess=findings.position_excess,
         acceleration_excess=findings.acceleration_excess,
-        looks=findings.looks,
+        looks=findings.instants,
         seconds=perf_counter() - begin,
         failure=log.meta["stopped_by"] or "",
     )

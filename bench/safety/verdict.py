@@ -25,8 +25,8 @@ import numpy as np
 
 from bench.safety.flight import REACH, Flight, Means, Start, fly, joint_means, largest, manners, near_rows
 from qpavoid import Log, ScenarioConfig
-from qpavoid.arena.referee import Contact, Findings
-from qpavoid.arena.twin import Twin
+from qpavoid.arena.checker import Contact, Findings
+from qpavoid.arena.mujoco_model import MujocoModel
 
 AFTER = 0.5
 """Flights must stay clear for so long after the contact in question [s]."""
@@ -62,7 +62,7 @@ class Verdict:
         return self.why in ("avoidable", "unproven")
 
 
-def judge(twin: Twin, scenario: ScenarioConfig, log: Log, findings: Findings) -> tuple[Verdict, ...]:
+def judge(twin: MujocoModel, scenario: ScenarioConfig, log: Log, findings: Findings) -> tuple[Verdict, ...]:
     """Verdicts on the contacts of a run in the order of time, up to the first that is avoidable."""
     verdicts: list[Verdict] = []
     excused = ~twin.movable
@@ -75,7 +75,7 @@ def judge(twin: Twin, scenario: ScenarioConfig, log: Log, findings: Findings) ->
 
 
 def _judge(
-    twin: Twin, scenario: ScenarioConfig, log: Log, findings: Findings, contact: Contact, excused: Any
+    twin: MujocoModel, scenario: ScenarioConfig, log: Log, findings: Findings, contact: Contact, excused: Any
 ) -> Verdict:
     names = " - ".join(twin.scene.pair_names[contact.pair])
     if not twin.movable[contact.pair]:
@@ -100,7 +100,9 @@ def _judge(
         watched[last.touched] = False
 
 
-def last_way_out(twin: Twin, scenario: ScenarioConfig, log: Log, findings: Findings, verdict: Verdict) -> LastWayOut:
+def last_way_out(
+    twin: MujocoModel, scenario: ScenarioConfig, log: Log, findings: Findings, verdict: Verdict
+) -> LastWayOut:
     """When it was too late for every flight, by bisection between coming into range and the contact.
 
     Flights watch the pair that touched and all that had not touched before it.
@@ -123,7 +125,7 @@ def last_way_out(twin: Twin, scenario: ScenarioConfig, log: Log, findings: Findi
     return LastWayOut(contact.time - float(log.t[low]), twin.distance(contact.pair), int(log.status[low]))
 
 
-def _in_range(twin: Twin, scenario: ScenarioConfig, log: Log, findings: Findings, contact: Contact) -> int:
+def _in_range(twin: MujocoModel, scenario: ScenarioConfig, log: Log, findings: Findings, contact: Contact) -> int:
     """The last tick before a contact at which the pair was out of range; 0 if there is none."""
     reach = scenario.avoidance.d2 - scenario.avoidance.offset
     for k in range(int(np.searchsorted(log.t, contact.time)) - 1, 0, -1):
@@ -133,7 +135,7 @@ def _in_range(twin: Twin, scenario: ScenarioConfig, log: Log, findings: Findings
     return 0
 
 
-def certify(twin: Twin, means: Means, flight: Flight, watched: Any) -> tuple[str, str]:
+def certify(twin: MujocoModel, means: Means, flight: Flight, watched: Any) -> tuple[str, str]:
     """Why a flight among the watched pairs (m,) had to end in contact, and the figures that prove it, if they do."""
     rows = near_rows(twin, flight.q, flight.t, watched, REACH)
     box, names = means.box(flight.q, flight.v, AHEAD), twin.scene.pair_names

@@ -1,4 +1,4 @@
-"""One scenario of the arena: what is run, by what the obstacles are seen, and what is known of its solution."""
+"""Benchmark cases: a scenario, the sensor of its obstacles, and the proof of its solution."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from qpavoid.model.trajectory import Sample
 
 
 class Sensor(Block):
-    """How obstacles are seen: late, and not quite where they are. The referee knows where they really are."""
+    """Delay and noise of the measured obstacle states; the checker uses the true ones."""
 
     delay: NonNegative = 0.0
-    """Age of what is seen [s]."""
+    """Age of a measurement [s]."""
     position_noise: NonNegative = 0.0
     """Standard deviation of each coordinate of a position [m]."""
     velocity_noise: NonNegative = 0.0
@@ -28,7 +28,7 @@ class Sensor(Block):
 
     @property
     def perfect(self) -> bool:
-        """Whether everything is seen as it is."""
+        """Return True if there is neither delay nor noise."""
         return not (self.delay or self.position_noise or self.velocity_noise)
 
 
@@ -39,25 +39,26 @@ class Case:
     family: str
     seed: int
     scenario: ScenarioConfig
-    """Without a solver of its own: entrants bring theirs."""
+    """Scenario without a solver of its own: entrants bring theirs."""
     sensor: Sensor
     reachable: bool
     """Whether the goals can be reached; where not, a run succeeds that stays clear and comes to rest."""
     solved_by: str
-    """How it is known that a solution exists, in words: by which check, with what result."""
+    """Check by which a solution is known to exist, and its result, in words."""
 
     @property
     def key(self) -> str:
-        """Digest of all that makes the run, wherever the family's file lies."""
-        return hashlib.sha256(self._text().encode()).hexdigest()[:16]
+        """Return a digest of all that makes the run, wherever the family's file lies."""
+        return hashlib.sha256(self._to_text().encode()).hexdigest()[:16]
 
     def to_json(self) -> str:
-        """The same as text."""
-        return self._text(source=str(self.scenario.source))
+        """Return the case as JSON text."""
+        return self._to_text(source=str(self.scenario.source))
 
-    def _text(self, **more: str) -> str:
+    def _to_text(self, **extra_fields: str) -> str:
+        """Return the case as JSON text with sorted keys, and further fields."""
         fields = {
-            **more,
+            **extra_fields,
             "family": self.family,
             "seed": self.seed,
             "scenario": self.scenario.model_dump(mode="json"),
@@ -69,24 +70,27 @@ class Case:
 
     @classmethod
     def from_json(cls, text: str) -> Case:
-        """The case that `to_json` wrote."""
+        """Read a case from the text that `to_json` wrote."""
         fields: dict[str, Any] = json.loads(text)
         source = Path(fields.pop("source"))
         scenario = ScenarioConfig.model_validate(fields.pop("scenario")).read_from(source)
         return cls(scenario=scenario, sensor=Sensor.model_validate(fields.pop("sensor")), **fields)
 
 
-class Sight:
-    """What a sensor tells of the obstacles of a case, tick by tick; the same for every entrant."""
+class SensorModel:
+    """Measurements of a case's obstacles, step by step; the same for every entrant."""
 
     def __init__(self, case: Case, obstacles: tuple[Obstacle, ...]) -> None:
-        """Draws noise from the seed of the case."""
+        """Seed the noise with the seed of the case."""
         self._sensor, self._obstacles = case.sensor, obstacles
         self._random = np.random.default_rng([case.seed, 1])
 
-    def look(self, t: float) -> dict[str, Sample]:
-        """Where obstacles seem to be at t [s], and how they seem to move; none of those that rest in plain sight."""
-        sensor, seen = self._sensor, {}
+    def measure(self, t: float) -> dict[str, Sample]:
+        """Return measured states of the obstacles at t [s], by name.
+
+        Static obstacles that are measured exactly are left out.
+        """
+        sensor, measured = self._sensor, {}
         for obstacle in self._obstacles:
             if sensor.perfect and not obstacle.moves:
                 continue
@@ -95,5 +99,5 @@ class Sight:
                 noise = self._random.normal(size=(2, 3))
                 linear = sample.linear + sensor.velocity_noise * noise[1] if obstacle.moves else sample.linear
                 sample = sample._replace(position=sample.position + sensor.position_noise * noise[0], linear=linear)
-            seen[obstacle.name] = sample
-        return seen
+            measured[obstacle.name] = sample
+        return measured

@@ -1,4 +1,7 @@
-"""Command line: `qpavoid bench run | smoke | report | show | list`. What it stands on is imported when it is needed."""
+"""Command line: `qpavoid bench run | smoke | report | show | list`.
+
+Dependencies of a command are imported when it runs.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer(no_args_is_help=True, help="Compare laws on families of scenarios: the arena.")
 
-_NEEDED = ("distributed", "pyarrow", "mujoco", "jinja2", "matplotlib")
+_PACKAGES = ("distributed", "pyarrow", "mujoco", "jinja2", "matplotlib")
 
 Name = Annotated[str, typer.Argument(metavar="SUITE", help="Shipped name or path of a YAML file.")]
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of results.")]
@@ -33,8 +36,8 @@ Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and 
 
 @app.callback()
 def arena() -> None:
-    """Compare laws on families of scenarios: the arena."""
-    missing = [package for package in _NEEDED if find_spec(package) is None]
+    """Compare solvers on families of scenarios."""
+    missing = [package for package in _PACKAGES if find_spec(package) is None]
     if missing:
         raise ConfigError(f"qpavoid bench needs {', '.join(missing)}: pip install 'qpavoid[arena]'")
 
@@ -67,9 +70,9 @@ def run(
     names = [] if solvers is None else names_of("--solvers", solvers)
     chosen = load_suite(suite, names, entrant or (), seeds)
     folder = out or Path("out") / "bench" / chosen.name
-    tally = _swept(chosen, folder, cluster, jobs)
+    tally = _run_sweep(chosen, folder, cluster, jobs)
     for failure in _failures(folder):
-        _complain(failure)
+        _print_error(failure)
     _print(chosen, runs_of(chosen, folder, FIGURES), folder, tally, json)
     raise typer.Exit(1 if tally.failed else 0)
 
@@ -83,17 +86,17 @@ def smoke(
     """Run a few cases of everything, and say what is broken: exit status 1 if anything is."""
     from qpavoid.arena.plan import cases_of, runs_of
     from qpavoid.arena.suite import load_suite
-    from qpavoid.arena.summary import broken
+    from qpavoid.arena.summary import find_faults
 
     chosen = load_suite("smoke")
     with ExitStack() as stack:
         folder = out or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="qpavoid-smoke-")))
-        tally = _swept(chosen, folder, None, jobs)
+        tally = _run_sweep(chosen, folder, None, jobs)
         runs = runs_of(chosen, folder)
-        faults = [*_failures(folder), *broken(chosen, runs, cases_of(chosen, folder, ["case", "json"]))]
+        faults = [*_failures(folder), *find_faults(chosen, runs, cases_of(chosen, folder, ["case", "json"]))]
     _print(chosen, runs, out, tally, json, {"broken": faults})
     for fault in faults:
-        _complain(f"broken: {fault}")
+        _print_error(f"broken: {fault}")
     raise typer.Exit(1 if faults else 0)
 
 
@@ -116,7 +119,7 @@ def show(
     json: Json = False,
 ) -> None:
     """Show a case of a folder, and run it once more with one entrant."""
-    from qpavoid.arena.show import again, find_case, write_scenario
+    from qpavoid.arena.show import find_case, rerun, write_scenario
 
     case = find_case(folder, family, seed)
     fields: dict[str, Any] = {"family": family, "seed": seed, "case": case.key, "solved_by": case.solved_by}
@@ -124,7 +127,7 @@ def show(
         write_scenario(case, scenario)
         fields["scenario"] = str(scenario)
     if entrant is not None:
-        fields["run"] = again(case, entrant, folder)
+        fields["run"] = rerun(case, entrant, folder)
     if json:
         print(to_json(fields))
         return
@@ -145,80 +148,88 @@ def list_(json: Json = False) -> None:
     suites = {name: read_config(find_suite(name), SuiteConfig).title for name in suite_names()}
     families = {name: load_family(name).config.title for name in family_names()}
     if json:
-        entrants = {e.name: {"says": e.says, "missing": list(e.missing)} for e in ENTRANTS.values()}
+        entrants = {e.name: {"says": e.description, "missing": list(e.missing)} for e in ENTRANTS.values()}
         print(to_json({"suites": suites, "families": families, "entrants": entrants}))
         return
-    says = {e.name: e.says + f" (needs {', '.join(e.missing)})" * bool(e.missing) for e in ENTRANTS.values()}
-    for heading, entries in {"suites": suites, "families": families, "entrants": says}.items():
+    description = {
+        e.name: e.description + f" (needs {', '.join(e.missing)})" * bool(e.missing) for e in ENTRANTS.values()
+    }
+    for heading, entries in {"suites": suites, "families": families, "entrants": description}.items():
         OUT.print(f"[bold]{heading}[/]")
         for name, text in entries.items():
             OUT.print(f"  {name:22} {text}", highlight=False, soft_wrap=True, markup=False)
 
 
-def _swept(suite: Suite, folder: Path, cluster: str | None, jobs: int | None) -> Tally:
-    """Runs a suite, with bars.
+def _run_sweep(suite: Suite, folder: Path, cluster: str | None, jobs: int | None) -> Tally:
+    """Run a suite, with progress bars.
 
     Raises:
         Exit: it was interrupted, or the cluster went away.
     """
-    from qpavoid.arena.plan import complete
+    from qpavoid.arena.plan import is_complete
     from qpavoid.arena.store import Store
     from qpavoid.arena.sweep import ClusterLost, Tally, local_cluster, remote_cluster, sweep
 
     for entrant in suite.absent:
-        _complain(f"{entrant.name} does not take part: it needs {', '.join(entrant.missing)}")
+        _print_error(f"{entrant.name} does not take part: it needs {', '.join(entrant.missing)}")
     last: Tally | None = None
     with terminate_like_interrupt(), Store(folder) as store, progress() as bar:
         bars = {stage: bar.add_task(stage, total=None, visible=False) for stage in ("cases", "runs")}
 
-        def tell(tally: Tally) -> None:
+        def report_progress(tally: Tally) -> None:
             nonlocal last
             last = tally
-            said = f"{tally.stage}, {tally.collided} collided" if tally.collided else tally.stage
+            lines = f"{tally.stage}, {tally.collided} collided" if tally.collided else tally.stage
             task, visible = bars[tally.stage], tally.total > 0
-            bar.update(task, completed=tally.done, total=tally.total, description=said, visible=visible)
+            bar.update(task, completed=tally.done, total=tally.total, description=lines, visible=visible)
 
-        if complete(suite, folder):
+        if is_complete(suite, folder):
             return Tally("runs", 0, 0, 0, 0)
         try:
             with remote_cluster(cluster) if cluster is not None else local_cluster(jobs) as client:
-                return sweep(suite, store, client, tell)
+                return sweep(suite, store, client, report_progress)
         except (KeyboardInterrupt, ClusterLost) as reason:
-            why = "interrupted" if isinstance(reason, KeyboardInterrupt) else str(reason)
+            cause = "interrupted" if isinstance(reason, KeyboardInterrupt) else str(reason)
             done = "nothing" if last is None else f"{last.done} of {last.total} {last.stage}"
-            _complain(f"{why}: {done} done, all that is done is kept in {folder}; the same command goes on")
+            _print_error(f"{cause}: {done} done, all that is done is kept in {folder}; the same command goes on")
             raise typer.Exit(1) from None
 
 
 def _failures(folder: Path) -> list[str]:
-    """What the last sweep could not make or run, a line each."""
+    """List what the last sweep could not make or run, a line each."""
     from qpavoid.arena.store import read_failures
 
-    said = []
+    lines = []
     for f in read_failures(folder):
-        what = "the case could not be made" if f["entrant"] is None else f"{f['entrant']} could not be run"
-        said.append(f"{f['family']}, seed {f['seed']}: {what}: {f['failure']}")
-    return said
+        message = "the case could not be made" if f["entrant"] is None else f"{f['entrant']} could not be run"
+        lines.append(f"{f['family']}, seed {f['seed']}: {message}: {f['failure']}")
+    return lines
 
 
 def _print(
-    suite: Suite, runs: pa.Table, folder: Path | None, tally: Tally, json: bool, more: dict[str, Any] | None = None
+    suite: Suite,
+    runs: pa.Table,
+    folder: Path | None,
+    tally: Tally,
+    json: bool,
+    extra_fields: dict[str, Any] | None = None,
 ) -> None:
+    """Print the summary of a suite, as a table or as JSON."""
     from qpavoid.arena.summary import summary, summary_table
 
     if json:
         fields = {"suite": suite.name, "folder": folder and str(folder), "new": tally.done, "runs": len(runs)}
-        print(to_json({**fields, "failed": tally.failed, **(more or {}), "entrants": summary(runs)}))
+        print(to_json({**fields, "failed": tally.failed, **(extra_fields or {}), "entrants": summary(runs)}))
         return
     OUT.print(summary_table(runs, f"{suite.name}: {suite.title}"))
     for row in summary(runs):
         if row["failed"]:
-            _complain(f"{row['entrant']} failed in {row['failed']} of {row['runs']} runs: {row['failure']}")
+            _print_error(f"{row['entrant']} failed in {row['failed']} of {row['runs']} runs: {row['failure']}")
     if folder is not None:
         OUT.print(
             f"{folder}: {len(runs)} runs, {tally.done} of them new", highlight=False, soft_wrap=True, markup=False
         )
 
 
-def _complain(what: str) -> None:
-    ERR.print(what, highlight=False, soft_wrap=True, markup=False)
+def _print_error(message: str) -> None:
+    ERR.print(message, highlight=False, soft_wrap=True, markup=False)

@@ -1,4 +1,4 @@
-"""Who takes part: laws of this library with their settings, other libraries, and what users bring."""
+"""Entrants: solvers of this library with their settings, other libraries, and users' own."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from importlib.metadata import PackageNotFoundError, distribution
 from typing import Any
 
 from qpavoid.arena.case import Case
-from qpavoid.arena.outside.settings import MINK, PINK, PLACO, PLACO_PYTHON
+from qpavoid.arena.libraries.settings import MINK, PINK, PLACO, PLACO_PYTHON
 from qpavoid.arena.pilot import Pilot
 from qpavoid.arena.world import World
 from qpavoid.config import ScenarioConfig, SolverConfig
@@ -26,43 +26,49 @@ class Entrant:
     """One column of the report."""
 
     name: str
-    says: str
-    """What it is, in a line."""
+    description: str
+    """Description in a line."""
     start: Callable[[Case, World], Pilot]
-    """Sets it up for a case."""
+    """Function that sets the entrant up for a case."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """What tells it from others of its kind; changes of it make results of their own."""
+    """Settings that distinguish it from others of its kind; changes of them make results of their own."""
     packages: tuple[str, ...] = ()
-    """What it runs on, as `pip install` knows it; where one is not installed, it does not take part."""
-    elsewhere: str = ""
+    """Packages that it needs, as `pip install` knows them; where one is not installed, it does not take part."""
+    interpreter_variable: str = ""
     """Environment variable that may name another Python interpreter that has its packages."""
 
     @property
     def digest(self) -> str:
-        """Of its name and settings."""
+        """Return a digest of its name and settings."""
         text = json.dumps([self.name, dict(self.settings)], sort_keys=True, default=str)
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Those of its packages that are not installed."""
-        if self.elsewhere and os.environ.get(self.elsewhere):
+        """Return those of its packages that are not installed."""
+        if self.interpreter_variable and os.environ.get(self.interpreter_variable):
             return ()
         return tuple(package for package in self.packages if not _installed(package))
 
     @property
     def remedy(self) -> str:
-        """How to get what is missing."""
-        instead = f", or set {self.elsewhere} to the Python interpreter that has it" if self.elsewhere else ""
+        """Return the command that installs what is missing."""
+        instead = (
+            f", or set {self.interpreter_variable} to the Python interpreter that has it"
+            if self.interpreter_variable
+            else ""
+        )
         return f"pip install {' '.join(self.missing)}{instead}"
 
 
-def law(name: str, says: str, solver: str | SolverConfig, packages: tuple[str, ...] = (), **changes: Any) -> Entrant:
-    """A solver of this library, within a `Controller`.
+def solver_entrant(
+    name: str, description: str, solver: str | SolverConfig, packages: tuple[str, ...] = (), **changes: Any
+) -> Entrant:
+    """Return an entrant that runs a solver of this library within a `Controller`.
 
     Args:
         name: of the entrant.
-        says: what it is, in a line.
+        description: what it is, in a line.
         solver: as in `eq10` or `qp:proxqp`, or with its settings.
         packages: what its back end needs.
         changes: blocks of the scenario that it has its own way, as in `avoidance={"row": {"type": "cbf"}}`; what is
@@ -80,69 +86,84 @@ def law(name: str, says: str, solver: str | SolverConfig, packages: tuple[str, .
         return Controller(world.scene, world.tasks, make_solver(x.solver), x.dt, *blocks)
 
     settings = {"solver": solver if isinstance(solver, str) else solver.model_dump(), **changes}
-    return Entrant(name, says, start, settings, packages)
+    return Entrant(name, description, start, settings, packages)
 
 
-def outside(
-    name: str, says: str, module: str, settings: Mapping[str, Any], packages: tuple[str, ...], elsewhere: str = ""
+def library_entrant(
+    name: str,
+    description: str,
+    module: str,
+    settings: Mapping[str, Any],
+    packages: tuple[str, ...],
+    interpreter_variable: str = "",
 ) -> Entrant:
-    """Another library, through its adapter.
+    """Return an entrant that runs another library through its adapter.
 
     Args:
         name: of the entrant.
-        says: what it is, in a line.
-        module: of the adapter, in `qpavoid.arena.outside`; read when the entrant is first started.
+        description: what it is, in a line.
+        module: of the adapter, in `qpavoid.arena.libraries`; read when the entrant is first started.
         settings: how it is set.
         packages: what it runs on.
-        elsewhere: environment variable that may name another Python interpreter that has them.
+        interpreter_variable: environment variable that may name another Python interpreter that has them.
     """
 
     def start(case: Case, world: World) -> Pilot:
-        pilot: Pilot = import_module(f"qpavoid.arena.outside.{module}").Pilot(case, world)
+        pilot: Pilot = import_module(f"qpavoid.arena.libraries.{module}").Pilot(case, world)
         return pilot
 
-    return Entrant(name, says, start, settings, packages, elsewhere)
+    return Entrant(name, description, start, settings, packages, interpreter_variable)
 
 
-def _law_alone(row: str) -> dict[str, Any]:
-    """Avoidance rows of one kind, and no backup trajectory."""
+def _without_backup(row: str) -> dict[str, Any]:
+    """Return avoidance fields with rows of one kind and no backup trajectory."""
     return {"row": {"type": row}, "backup": None}
 
 
 ENTRANTS = {
     entrant.name: entrant
     for entrant in (
-        law("tracking", "damped least squares on the task, no avoidance: the baseline", "tracking"),
-        law("eq10", "task switching, eq. 10 with the consistent bracket", "eq10"),
-        law("eq10-literal", "task switching, eq. 10 as printed", "eq10-literal"),
-        law("gradient-projection", "tracking, clearance climbed in its null space", "gradient-projection"),
-        law("potential-field", "tracking pulls, near pairs push: FIRAS at velocity level", "potential-field"),
-        law("qp", "QP as each scenario has it, with a backup trajectory", "qp"),
-        law(
+        solver_entrant("tracking", "damped least squares on the task, no avoidance: the baseline", "tracking"),
+        solver_entrant("eq10", "task switching, eq. 10 with the consistent bracket", "eq10"),
+        solver_entrant("eq10-literal", "task switching, eq. 10 as printed", "eq10-literal"),
+        solver_entrant("gradient-projection", "tracking, clearance climbed in its null space", "gradient-projection"),
+        solver_entrant(
+            "potential-field", "tracking pulls, near pairs push: FIRAS at velocity level", "potential-field"
+        ),
+        solver_entrant("qp", "QP as each scenario has it, with a backup trajectory", "qp"),
+        solver_entrant(
             "qp-task-switching",
             "QP with the gains of eq. 10 in its rows, no backup trajectory",
             "qp",
-            avoidance=_law_alone("task-switching"),
+            avoidance=_without_backup("task-switching"),
         ),
-        law("qp-no-backup", "QP with beta rows, no backup trajectory", "qp", avoidance=_law_alone("beta")),
-        law("qp-damper", "QP with velocity damper rows, no backup trajectory", "qp", avoidance=_law_alone("damper")),
-        law("qp-cbf", "QP with control barrier rows, no backup trajectory", "qp", avoidance=_law_alone("cbf")),
-        law(
+        solver_entrant(
+            "qp-no-backup", "QP with beta rows, no backup trajectory", "qp", avoidance=_without_backup("beta")
+        ),
+        solver_entrant(
+            "qp-damper", "QP with velocity damper rows, no backup trajectory", "qp", avoidance=_without_backup("damper")
+        ),
+        solver_entrant(
+            "qp-cbf", "QP with control barrier rows, no backup trajectory", "qp", avoidance=_without_backup("cbf")
+        ),
+        solver_entrant(
             "qp-detour",
             "QP with beta rows that tries detours round what stalls it, no backup trajectory",
             "qp",
-            avoidance=_law_alone("beta"),
+            avoidance=_without_backup("beta"),
             progress={"detour": {}},
         ),
-        law("qp:native", "QP, compiled active-set method", "qp:native", ("numba",)),
-        law("qp:daqp", "QP, back end daqp", "qp:daqp"),
-        law("qp:proxqp", "QP, back end ProxQP", "qp:proxqp"),
-        law("qp:osqp", "QP, back end OSQP", "qp:osqp"),
-        law("qp:quadprog", "QP, back end quadprog", "qp:quadprog", ("quadprog",)),
-        law("hqp", "strict priorities, a cascade of QPs, with a backup trajectory", "hqp"),
-        outside("pink", "Pink, with its barrier between collision bodies", "pinks", PINK, ("pin-pink",)),
-        outside("mink", "mink, with its limit on collisions", "minks", MINK, ("mink", "mujoco")),
-        outside("placo", "placo, with its constraint on self-collisions", "placos", PLACO, ("placo",), PLACO_PYTHON),
+        solver_entrant("qp:native", "QP, compiled active-set method", "qp:native", ("numba",)),
+        solver_entrant("qp:daqp", "QP, back end daqp", "qp:daqp"),
+        solver_entrant("qp:proxqp", "QP, back end ProxQP", "qp:proxqp"),
+        solver_entrant("qp:osqp", "QP, back end OSQP", "qp:osqp"),
+        solver_entrant("qp:quadprog", "QP, back end quadprog", "qp:quadprog", ("quadprog",)),
+        solver_entrant("hqp", "strict priorities, a cascade of QPs, with a backup trajectory", "hqp"),
+        library_entrant("pink", "Pink, with its barrier between collision bodies", "pink_adapter", PINK, ("pin-pink",)),
+        library_entrant("mink", "mink, with its limit on collisions", "mink_adapter", MINK, ("mink", "mujoco")),
+        library_entrant(
+            "placo", "placo, with its constraint on self-collisions", "placo_adapter", PLACO, ("placo",), PLACO_PYTHON
+        ),
     )
 }
 """Those that ship, in the order of the report. One with the name of a solver is that solver in each scenario as it
@@ -150,7 +171,7 @@ is, safety options included; variants have names of their own."""
 
 
 def find_entrant(name: str) -> Entrant:
-    """One that ships.
+    """Return a shipped entrant that is installed.
 
     Raises:
         UnknownName: there is none of that name.
@@ -165,6 +186,7 @@ def find_entrant(name: str) -> Entrant:
 
 
 def _installed(package: str) -> bool:
+    """Return True if a package is installed."""
     try:
         distribution(package)
     except PackageNotFoundError:

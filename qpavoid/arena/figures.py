@@ -1,4 +1,4 @@
-"""Pictures of the arena's report: what safety costs in tracking and in time, and who succeeds where."""
+"""Figures of the arena's report: safety and success against error, time and family."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from qpavoid.arena.statistics import Interval, mean, pareto, rate
 from qpavoid.problem import Array
 from qpavoid.viz.style import COLOURS, add_grid
 
-_LINE = 0.24
-"""Least distance of two labels [in]."""
+_LABEL_HEIGHT = 0.24
+"""Smallest distance of two labels [in]: a line of their font and some space."""
 _MARKERS = "osD^v<>"
-"""With the colours, enough for 49 entrants to look different."""
+"""Markers; with the colours, enough for 49 entrants to look different."""
 
 
 def safety_against_tracking(results: Results) -> Figure:
-    """Share of runs without contact over the mean tracking error."""
+    """Draw the rate of runs without contact over the mean tracking error."""
     x = [mean(1e3 * results.values("tracking_error", i)) for i in range(len(results.entrants))]
-    y = [_share(~results.values("collided", i).astype(bool)) for i in range(len(results.entrants))]
+    y = [_success_rate(~results.values("collided", i).astype(bool)) for i in range(len(results.entrants))]
     return _scatter(results, x, y, "mean tracking error [mm]", "runs without contact [%]")
 
 
 def success_against_time(results: Results) -> Figure:
-    """Share of runs that succeed over the median time of a tick."""
+    """Draw the rate of runs that succeed over the median time of a control step."""
     x = [_quartiles(results.values("tick_p50", i)) for i in range(len(results.entrants))]
-    y = [_share(results.values("success", i).astype(bool)) for i in range(len(results.entrants))]
+    y = [_success_rate(results.values("success", i).astype(bool)) for i in range(len(results.entrants))]
     figure = _scatter(results, x, y, "median tick [µs], with quartiles over runs", "runs that succeed [%]")
     axis = figure.axes[0]
     axis.set_xscale("log")
@@ -41,15 +41,15 @@ def success_against_time(results: Results) -> Figure:
 
 
 def success_by_family(results: Results) -> Figure:
-    """Entrants, best first, by families: share of runs that succeed."""
+    """Draw the rate of runs that succeed by entrant, best first, and family."""
     families = results.families
     entrants = tuple(results.ranking())
     order = [results.entrants.index(name) for name in entrants]
     share = np.full((len(entrants), len(families)), np.nan)
     for j in range(len(families)):
-        won = results.table("success", j)
-        if len(won):
-            share[:, j] = 100.0 * won.mean(axis=0)[order]
+        success = results.table("success", j)
+        if len(success):
+            share[:, j] = 100.0 * success.mean(axis=0)[order]
     figure = Figure(figsize=(1.8 + 0.62 * len(families), 1.6 + 0.34 * len(entrants)), layout="constrained")
     ax = figure.subplots()
     image = ax.imshow(share, cmap="viridis", vmin=0.0, vmax=100.0, aspect="auto")
@@ -63,19 +63,24 @@ def success_by_family(results: Results) -> Figure:
     return figure
 
 
-def _share(flags: Any) -> Interval:
+def _success_rate(flags: Any) -> Interval:
+    """Return a rate with its interval [%]."""
     return Interval(*(100.0 * value for value in rate(int(flags.sum()), len(flags))))
 
 
 def _quartiles(values: Array) -> Interval:
+    """Return the median of values (n,) with their quartiles."""
     low, middle, high = np.quantile(values, [0.25, 0.5, 0.75])
     return Interval(float(middle), float(low), float(high))
 
 
-def _scatter(results: Results, x: list[Interval], y: list[Interval], across: str, up: str) -> Figure:
-    """A point each with its intervals; those that nobody beats in both are full, and joined."""
+def _scatter(results: Results, x: list[Interval], y: list[Interval], x_label: str, y_label: str) -> Figure:
+    """Draw a point for each entrant with its intervals.
+
+    Points of the Pareto front are full, and joined by a line.
+    """
     count = len(results.entrants)
-    figure = Figure(figsize=(9.0, max(5.6, 1.2 + _LINE * count)), layout="constrained")
+    figure = Figure(figsize=(9.0, max(5.6, 1.2 + _LABEL_HEIGHT * count)), layout="constrained")
     ax = figure.subplots()
     xs, ys = np.array([point.value for point in x]), np.array([point.value for point in y])
     front = pareto(xs, ys)
@@ -88,27 +93,30 @@ def _scatter(results: Results, x: list[Interval], y: list[Interval], across: str
             "ms": 6,
             "elinewidth": 0.8,
         }
-        ax.errorbar(xs[i], ys[i], yerr=_bar(y[i]), xerr=_bar(x[i]), **style)
+        ax.errorbar(xs[i], ys[i], yerr=_error_bar(y[i]), xerr=_error_bar(x[i]), **style)
     best = np.flatnonzero(front)[np.argsort(xs[front])]
     ax.step(xs[best], ys[best], where="post", color="#333333", linewidth=0.8, linestyle=(0, (4, 3)), zorder=0)
-    ax.set_xlabel(across)
-    ax.set_ylabel(up)
+    ax.set_xlabel(x_label)
+    ax.set_ylabel(y_label)
     add_grid(ax)
     ax.margins(x=0.04, y=0.08)
     _label(ax, results.entrants, xs, ys)
     return figure
 
 
-def _bar(interval: Interval) -> Array:
-    """(2, 1) what the interval reaches down and up; round-off may turn nothing into less."""
+def _error_bar(interval: Interval) -> Array:
+    """Return the extents (2, 1) of an interval below and above its value.
+
+    Round-off is clipped to 0.
+    """
     value, low, high = interval
     return np.array([[max(value - low, 0.0)], [max(high - value, 0.0)]])
 
 
 def _label(ax: Any, names: tuple[str, ...], xs: Array, ys: Array) -> None:
-    """Names at the right-hand edge, spread so that none covers another, with a thin line to each point."""
+    """Write names at the right-hand edge without overlap, with a thin line to each point."""
     bottom, top = ax.get_ylim()
-    gap = _LINE / ax.figure.get_figheight()
+    gap = _LABEL_HEIGHT / ax.figure.get_figheight()
     order = np.argsort(ys, kind="stable")
     heights = (ys[order] - bottom) / (top - bottom)
     for i in range(1, len(heights)):

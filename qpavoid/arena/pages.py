@@ -1,4 +1,4 @@
-"""Writes the sections of a report: Markdown with pictures beside it, and one page of HTML with everything in it."""
+"""Report writers: Markdown with figures beside it, and one self-contained page of HTML."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from qpavoid.arena.tables import Cell, Section
 
 
 def write_markdown(folder: Path, title: str, sections: Sequence[Section]) -> list[Path]:
-    """Writes report.md and its pictures."""
-    written, lines = [], [f"# {title}", ""]
+    """Write report.md and its figures."""
+    paths, lines = [], [f"# {title}", ""]
     for section in sections:
         lines += [f"## {section.title}", ""]
         for text in section.text:
@@ -26,22 +26,23 @@ def write_markdown(folder: Path, title: str, sections: Sequence[Section]) -> lis
         for name, caption, figure in section.pictures:
             path = folder / f"report-{name}.png"
             figure.savefig(path, dpi=110)
-            written.append(path)
+            paths.append(path)
             lines += [f"![{caption}]({path.name})", ""]
         for table in section.tables:
-            lines += [_row(table.headings), _row(["---"] * len(table.headings))]
-            lines += [_row([_markdown(cell) for cell in row]) for row in table.rows] + [""]
+            lines += [_markdown_row(table.headings), _markdown_row(["---"] * len(table.headings))]
+            lines += [_markdown_row([_escape_cell(cell) for cell in row]) for row in table.rows] + [""]
     path = folder / "report.md"
     path.write_text("\n".join(lines), encoding="utf-8")
-    return [path, *written]
+    return [path, *paths]
 
 
-def _row(cells: Sequence[str]) -> str:
+def _markdown_row(cells: Sequence[str]) -> str:
+    """Return a row of a Markdown table."""
     return "| " + " | ".join(cells) + " |"
 
 
-def _markdown(cell: Cell) -> str:
-    """Text that means what it says within a table."""
+def _escape_cell(cell: Cell) -> str:
+    """Escape a cell's text so that a Markdown table shows it as it is."""
     text = " ".join(cell.text.split())
     if cell.code:
         return f"`{text.replace('|', chr(92) + '|')}`"
@@ -50,10 +51,10 @@ def _markdown(cell: Cell) -> str:
 
 
 def write_page(folder: Path, title: str, sections: Sequence[Section]) -> Path:
-    """Writes report.html, which needs nothing but itself."""
+    """Write report.html, which needs no other file."""
     templates = Environment(loader=PackageLoader("qpavoid.arena", "."), autoescape=True, trim_blocks=True)
     templates.filters["svg"] = _svg
-    templates.filters["inline"] = _inline
+    templates.filters["inline"] = _to_html
     page = templates.get_template("page.html.j2").render(title=title, sections=sections)
     path = folder / "report.html"
     path.write_text(page, encoding="utf-8")
@@ -61,7 +62,7 @@ def write_page(folder: Path, title: str, sections: Sequence[Section]) -> Path:
 
 
 def _svg(figure: Any) -> Markup:
-    """A figure as an element of a page."""
+    """Return a figure as an SVG element of a page."""
     buffer = io.StringIO()
     with matplotlib.rc_context({"svg.hashsalt": "qpavoid"}):  # the same picture, the same text
         figure.savefig(buffer, format="svg", metadata={"Date": None})
@@ -69,13 +70,16 @@ def _svg(figure: Any) -> Markup:
     return Markup(text[text.index("<svg") :])
 
 
-def _inline(text: str) -> Markup:
-    """Text of the Markdown report with its `code` and **stress** as HTML."""
+def _to_html(text: str) -> Markup:
+    """Convert text of the Markdown report with its `code` and **stress** to HTML."""
     pieces = text.split("`")
-    return Markup("").join(Markup("<code>{}</code>").format(p) if i % 2 else _stressed(p) for i, p in enumerate(pieces))
+    return Markup("").join(
+        Markup("<code>{}</code>").format(p) if i % 2 else _emphasize(p) for i, p in enumerate(pieces)
+    )
 
 
-def _stressed(text: str) -> Markup:
+def _emphasize(text: str) -> Markup:
+    """Convert **stress** to HTML."""
     parts = text.split("**")
     return Markup("").join(
         Markup("<b>{}</b>").format(p) if i % 2 else Markup("{}").format(p) for i, p in enumerate(parts)

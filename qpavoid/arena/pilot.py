@@ -1,4 +1,4 @@
-"""What takes part in the arena: anything that turns state, targets and obstacles into a joint velocity."""
+"""Protocol of entrants: anything that turns state, targets and obstacles into a velocity."""
 
 from __future__ import annotations
 
@@ -10,13 +10,16 @@ from qpavoid.problem import Array, Solution
 
 
 class Pilot(Protocol):
-    """One entrant, set up for one case. A `Controller` is one; other libraries come in through adapters.
+    """One entrant, set up for one case.
+
+    A `Controller` is one; other libraries come in through adapters. A pilot that works in another process gives the
+    time of its last step there in an attribute `seconds` [s].
 
     One that works in another process says in an attribute `seconds` what its last step took there [s].
     """
 
     def step(self, q: Array, t: float, targets: Mapping[str, Sample], obstacles: Mapping[str, Sample]) -> Solution:
-        """Velocity for the next dt.
+        """Compute the velocity for the next control period.
 
         Args:
             q: configuration (nq,) in the order of the scene's model.

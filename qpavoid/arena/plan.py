@@ -1,4 +1,7 @@
-"""What a suite wants of a results folder, what of it is there, and what is missing: joins of tables, no loops."""
+"""Cases and runs that a suite asks of a results folder: present and missing ones.
+
+All of these are joins of tables, without loops.
+"""
 
 from __future__ import annotations
 
@@ -15,22 +18,25 @@ from qpavoid.arena.suite import Suite, origin
 
 
 def missing_cases(suite: Suite, folder: Path) -> pa.Table:
-    """Cases of a suite that are not made: (family, seed, origin), family by family."""
+    """Return cases of a suite that are not made: (family, seed, origin), family by family."""
     wanted = _wanted_cases(suite)
-    return wanted.take(_which(wanted, read_cases(folder, CASES.key), CASES.key, "left anti"))
+    return wanted.take(_join_indices(wanted, read_cases(folder, CASES.key), CASES.key, "left anti"))
 
 
 def cases_of(suite: Suite, folder: Path, columns: Sequence[str] = ("case",)) -> pa.Table:
-    """Cases of a suite that are made, family by family: their digests, or other columns of `store.CASES`."""
+    """Return cases of a suite that are made, family by family.
+
+    Columns are their digests, or other columns of `store.CASES`.
+    """
     cases, wanted = read_cases(folder, [*CASES.key, *columns]), _wanted_cases(suite)
-    ours = wanted.append_column("order", pa.array(np.arange(len(wanted))))
-    there = cases.select(CASES.key).append_column("at", pa.array(np.arange(len(cases))))
-    at = ours.join(there, keys=list(CASES.key), join_type="inner").sort_by("order")["at"]
-    return cases.select(columns).take(at)
+    wanted_in_order = wanted.append_column("order", pa.array(np.arange(len(wanted))))
+    present = cases.select(CASES.key).append_column("at", pa.array(np.arange(len(cases))))
+    positions = wanted_in_order.join(present, keys=list(CASES.key), join_type="inner").sort_by("order")["at"]
+    return cases.select(columns).take(positions)
 
 
 def missing_runs(suite: Suite, folder: Path, cases: pa.Table) -> pa.Table:
-    """Runs of a suite that are not done: (case, entrant), case by case.
+    """Return runs of a suite that are not done: (case, entrant), case by case.
 
     Args:
         suite: what is wanted.
@@ -38,16 +44,16 @@ def missing_runs(suite: Suite, folder: Path, cases: pa.Table) -> pa.Table:
         cases: of the suite; column `case`.
     """
     wanted = _wanted_runs(suite, cases)
-    return wanted.take(_which(wanted, read_runs(folder, KEY), KEY, "left anti")).select(["case", "entrant"])
+    return wanted.take(_join_indices(wanted, read_runs(folder, KEY), KEY, "left anti")).select(["case", "entrant"])
 
 
-def complete(suite: Suite, folder: Path) -> bool:
-    """Whether everything that a suite wants is there."""
+def is_complete(suite: Suite, folder: Path) -> bool:
+    """Return True if all cases and runs of a suite are there."""
     return not len(missing_cases(suite, folder)) and not len(missing_runs(suite, folder, cases_of(suite, folder)))
 
 
 def runs_of(suite: Suite, folder: Path, columns: Sequence[str] | None = None) -> pa.Table:
-    """Runs of a suite that are done: of its cases, its entrants and this version alone.
+    """Return runs of a suite that are done: of its cases, its entrants and this version.
 
     Args:
         suite: what is wanted.
@@ -55,10 +61,11 @@ def runs_of(suite: Suite, folder: Path, columns: Sequence[str] | None = None) ->
         columns: of `scores.Score`, beside those of `scores.KEY`; all if left out.
     """
     runs = read_runs(folder, columns and list(dict.fromkeys((*KEY, *columns))))
-    return runs.take(_which(runs, _wanted_runs(suite, cases_of(suite, folder)), KEY, "left semi"))
+    return runs.take(_join_indices(runs, _wanted_runs(suite, cases_of(suite, folder)), KEY, "left semi"))
 
 
 def _wanted_cases(suite: Suite) -> pa.Table:
+    """Return keys of all cases of a suite."""
     count, families = len(suite.seeds), suite.families
     return pa.table(
         {
@@ -70,6 +77,7 @@ def _wanted_cases(suite: Suite) -> pa.Table:
 
 
 def _wanted_runs(suite: Suite, cases: pa.Table) -> pa.Table:
+    """Return keys of all runs of a suite."""
     count, entrants = len(cases), suite.entrants
     return pa.table(
         {
@@ -81,7 +89,7 @@ def _wanted_runs(suite: Suite, cases: pa.Table) -> pa.Table:
     )
 
 
-def _which(rows: pa.Table, others: pa.Table, key: Sequence[str], how: str) -> pa.Array:
-    """Indices of the rows whose key the others have ("left semi") or have not ("left anti"), in order."""
+def _join_indices(rows: pa.Table, other_rows: pa.Table, key: Sequence[str], how: str) -> pa.Array:
+    """Return indices of rows with a key in `other_rows` ("left semi") or not ("left anti")."""
     keys = rows.select(key).append_column("order", pa.array(np.arange(len(rows))))
-    return keys.join(others.select(key), keys=list(key), join_type=how)["order"].combine_chunks().sort()
+    return keys.join(other_rows.select(key), keys=list(key), join_type=how)["order"].combine_chunks().sort()

@@ -1,4 +1,4 @@
-"""The report of a results folder: what was compared, within which limits, and what came out."""
+"""Report of a results folder: entrants, limits of the comparison, and results."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ import numpy as np
 import pyarrow as pa
 
 from qpavoid.arena import figures
-from qpavoid.arena.coverage import gaps
+from qpavoid.arena.coverage import missing_results
 from qpavoid.arena.entrants import ENTRANTS
 from qpavoid.arena.families import load_family
 from qpavoid.arena.pages import write_markdown, write_page
 from qpavoid.arena.results import Results, results_of
 from qpavoid.arena.statistics import CONFIDENCE, duel, mean
 from qpavoid.arena.store import read_failures, read_runs
-from qpavoid.arena.suite import facts_of
+from qpavoid.arena.suite import describe_entrants
 from qpavoid.arena.tables import (
     COLUMNS,
     MORE,
@@ -34,7 +34,7 @@ from qpavoid.arena.tables import (
 )
 from qpavoid.errors import ConfigError, QpavoidError
 
-LIMITS = (
+COMPARISON_LIMITS = (
     "Velocities are followed exactly: no delay, no tracking error of a drive, no dynamics. What a real arm adds is the "
     "same for all, and in none of the figures.",
     "All entrants of this library see the same problem, tick by tick: the same kinematics, distances, task gains, d1 "
@@ -47,7 +47,7 @@ LIMITS = (
     "they move.",
     "Times are those of whole ticks, from state to velocity, on the machine above, with that many processes at once. "
     "Ratios of less than 1.5 mean little; `bench/tick` is where libraries are timed side by side.",
-    "Distances, contacts and limit violations are MuJoCo's, which plays the commanded velocities again with kinematics "
+    "Distances, contacts and limit violations are MuJoCo's, which runs the commanded velocities again with kinematics "
     "and distances of its own, at the ticks and between them.",
     "Not measured: drives, dynamics and forces; sensors, beyond the delay and noise of a family that says so; memory, "
     "and the time to set up; what a tick that comes late would do, for here every velocity is there in time.",
@@ -55,19 +55,19 @@ LIMITS = (
 
 
 def write_report(folder: Path) -> list[Path]:
-    """Writes report.md with its pictures, and report.html, into a folder of results.
+    """Write report.md with its figures, and report.html, into a folder of results.
 
     Raises:
         ConfigError: the folder holds no results, or none that all entrants have.
     """
-    facts = _facts(folder)
+    facts = _read_facts(folder)
     sections = tuple(report_of(read_runs(folder), facts, folder))
     title = f"Arena: {facts.get('title') or folder.name}"
     return [*write_markdown(folder, title, sections), write_page(folder, title, sections)]
 
 
 def report_of(runs: pa.Table, facts: dict[str, Any], folder: Path = Path("DIR")) -> Iterator[Section]:
-    """The report's sections.
+    """Yield the sections of a report.
 
     Args:
         runs: rows of `scores.Score`.
@@ -87,20 +87,20 @@ def report_of(runs: pa.Table, facts: dict[str, Any], folder: Path = Path("DIR"))
             f"{folder}: no case was run by all of {', '.join(results.entrants)}, {least} has run the fewest "
             f"({min(counts)} of {len(results.cell)}); let the suite end first"
         )
-    yield _made_on(results, runs, facts)
-    yield Section("Limits of the comparison", points=LIMITS)
-    yield _taking_part(results, facts)
-    yield _definitions()
-    yield _overall(results)
-    yield _duels(results)
+    yield _provenance_section(results, runs, facts)
+    yield Section("Limits of the comparison", points=COMPARISON_LIMITS)
+    yield _entrants_section(results, facts)
+    yield _definitions_section()
+    yield _overall_section(results)
+    yield _comparison_section(results)
     for index, name in enumerate(results.families):
-        yield _family(results, index, name)
-    yield _worst(results, facts, folder)
-    yield _failures(results)
+        yield _family_section(results, index, name)
+    yield _worst_runs_section(results, facts, folder)
+    yield _failures_section(results)
 
 
-def _facts(folder: Path) -> dict[str, Any]:
-    """What suite.json says, and what the last sweep could not make or run."""
+def _read_facts(folder: Path) -> dict[str, Any]:
+    """Read suite.json and the failures of the last sweep."""
     try:
         facts = json.loads((folder / "suite.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -108,11 +108,12 @@ def _facts(folder: Path) -> dict[str, Any]:
     return {**facts, "failures": read_failures(folder)}
 
 
-def _made_on(results: Results, runs: pa.Table, facts: dict[str, Any]) -> Section:
+def _provenance_section(results: Results, runs: pa.Table, facts: dict[str, Any]) -> Section:
+    """List versions, machine, numbers of runs, and gaps."""
     points = [
-        f"{what.capitalize()}: " + ", ".join(f"{name} {value}" for name, value in facts[what].items()) + "."
-        for what in ("versions", "machine")
-        if facts.get(what)
+        f"{section.capitalize()}: " + ", ".join(f"{name} {value}" for name, value in facts[section].items()) + "."
+        for section in ("versions", "machine")
+        if facts.get(section)
     ]
     if "workers" in facts:
         points.append(f"Processes at once, in the last sweep: {facts['workers']}.")
@@ -120,35 +121,38 @@ def _made_on(results: Results, runs: pa.Table, facts: dict[str, Any]) -> Section
         f"{len(runs)} runs: {len(results.entrants)} entrants, {len(results.families)} families, {len(results.cell)} "
         f"cases. All figures are of the {int(results.common.sum())} cases that every entrant has run."
     )
-    points += gaps(results, facts)
+    points += missing_results(results, facts)
     return Section("What this was made on", points=tuple(points))
 
 
-def _taking_part(results: Results, facts: dict[str, Any]) -> Section:
-    said = {**facts_of(ENTRANTS.values()), **facts.get("entrants", {})}
+def _entrants_section(results: Results, facts: dict[str, Any]) -> Section:
+    """List entrants with their descriptions and settings."""
+    entrant_facts = {**describe_entrants(ENTRANTS.values()), **facts.get("entrants", {})}
     rows = []
     for name, digest in zip(results.entrants, results.settings, strict=True):
-        entry = said.get(digest, {"says": "", "settings": {}})
-        settings = ", ".join(f"{key}: {_plain(value)}" for key, value in entry["settings"].items())
+        entry = entrant_facts.get(digest, {"says": "", "settings": {}})
+        settings = ", ".join(f"{key}: {_json_text(value)}" for key, value in entry["settings"].items())
         rows.append((text_cell(name), text_cell(entry["says"]), text_cell(settings)))
     return Section("Who takes part", tables=(Table(("entrant", "what it is", "its own settings"), tuple(rows)),))
 
 
-def _definitions() -> Section:
+def _definitions_section() -> Section:
+    """Define the figures and the ranking."""
     text = (
         f"Ranges with figures hold the true value with {100 * CONFIDENCE:.0f} % over further seeds: of rates that of "
         "Wilson, of means the bootstrap's, of medians that of the sign test. A run that fails counts at its limit and "
         "is never left out: an entrant that raises is held for that tick, and its run goes on.",
-        "**Ranking.** By the share of runs that succeed; where that is the same, by the mean tracking error. Whoever "
-        "cannot be told from the first of a rank by McNemar's exact test over the same cases, at "
-        f"{100 * (1 - CONFIDENCE):.0f} %, shares it. With few cases, little can be told apart.",
+        "**Ranking.** By the share of runs that succeed; where that is the same, by the mean tracking error. "
+        "Entrants that McNemar's exact test over the same cases cannot separate from the first of a rank, at "
+        f"{100 * (1 - CONFIDENCE):.0f} %, share it. With few cases, the test separates little.",
     )
-    rows = tuple((text_cell(column.heading), text_cell(column.says)) for column in (*COLUMNS, *MORE))
+    rows = tuple((text_cell(column.heading), text_cell(column.description)) for column in (*COLUMNS, *MORE))
     return Section("How it is scored", text, tables=(Table(("figure", "what it is"), rows),))
 
 
-def _overall(results: Results) -> Section:
-    both = "full points are beaten by nobody in both"
+def _overall_section(results: Results) -> Section:
+    """Tabulate and draw the results of all families."""
+    both = "full points are beaten by no other one in both"
     pictures = (
         ("tracking", f"Safety against tracking: {both}.", figures.safety_against_tracking(results)),
         ("speed", f"Success against the time of a tick: {both}.", figures.success_against_time(results)),
@@ -157,8 +161,9 @@ def _overall(results: Results) -> Section:
     return Section("Overall", tables=score_tables(results), pictures=pictures)
 
 
-def _family(results: Results, index: int, name: str) -> Section:
-    text, robots = _about(name), np.unique(results.values("robot", 0, index).astype(str)).tolist()
+def _family_section(results: Results, index: int, name: str) -> Section:
+    """Tabulate the results of one family."""
+    text, robots = _family_text(name), np.unique(results.values("robot", 0, index).astype(str)).tolist()
     count = int(np.sum(results.common & (results.family == index)))
     if not count:
         return Section(f"Family: {name}", (*text, "No case that all have run."))
@@ -166,8 +171,8 @@ def _family(results: Results, index: int, name: str) -> Section:
     return Section(f"Family: {name}", text, tables=score_tables(results, index))
 
 
-def _about(name: str) -> tuple[str, ...]:
-    """What a family is about, where its file is still at hand."""
+def _family_text(name: str) -> tuple[str, ...]:
+    """Return title and purpose of a family, if its file can be read."""
     try:
         config = load_family(name).config
     except QpavoidError:
@@ -175,8 +180,8 @@ def _about(name: str) -> tuple[str, ...]:
     return (f"{config.title}. {config.about}",)
 
 
-def _duels(results: Results) -> Section:
-    """Everybody against the first of the ranking."""
+def _comparison_section(results: Results) -> Section:
+    """Compare every entrant with the first of the ranking."""
     success, tracking = results.table("success").astype(bool), results.table("tracking_error")
     first = next(iter(results.ranking()))
     best = results.entrants.index(first)
@@ -184,8 +189,8 @@ def _duels(results: Results) -> Section:
     for i, name in enumerate(results.entrants):
         if i != best:
             d = duel(success[:, best], success[:, i])
-            more = interval_cell(mean(tracking[:, i] - tracking[:, best]), 1e3, 1)
-            cells = count_cell(d.only_first), count_cell(d.only_second), Cell(f"{d.p:.2g}", d.p), more
+            difference = interval_cell(mean(tracking[:, i] - tracking[:, best]), 1e3, 1)
+            cells = count_cell(d.only_first), count_cell(d.only_second), Cell(f"{d.p:.2g}", d.p), difference
             rows.append((text_cell(name), *cells))
     headings = ("entrant", f"only {first} succeeds", "only this one does", "p of no difference", "more tracking [mm]")
     text = (
@@ -195,29 +200,31 @@ def _duels(results: Results) -> Section:
     return Section("Beside the best", text, tables=(Table(headings, tuple(rows)),) if rows else ())
 
 
-_LISTED = 3
+_MAX_ROWS = 3
 
 
-def _worst(results: Results, facts: dict[str, Any], folder: Path) -> Section:
-    rows, told = [], facts.get("entrants", {})
+def _worst_runs_section(results: Results, facts: dict[str, Any], folder: Path) -> Section:
+    """List the worst runs of each entrant."""
+    rows, entrant_facts = [], facts.get("entrants", {})
     for entrant, name in enumerate(results.entrants):
-        file = told.get(results.settings[entrant], {"settings": {}})["settings"].get("file", "")
+        file = entrant_facts.get(results.settings[entrant], {"settings": {}})["settings"].get("file", "")
         index = results.rows_of(entrant)
         index = index[~results.columns["success"][index].astype(bool)]
         collided, distance, error = (results.columns[c][index] for c in ("collided", "min_distance", "final_error"))
-        worst = index[np.lexsort((-error, np.where(collided, distance, 0.0), ~collided.astype(bool)))[:_LISTED]]
+        worst = index[np.lexsort((-error, np.where(collided, distance, 0.0), ~collided.astype(bool)))[:_MAX_ROWS]]
         for row in (results.row(i) for i in worst.tolist()):
-            where = text_cell(row["family"]), count_cell(row["seed"]), text_cell(row["robot"])
-            again = Cell(rerun_line(row, folder, file), name, code=True)
-            rows.append((text_cell(name), *where, text_cell(_went_wrong(row)), again))
+            place = text_cell(row["family"]), count_cell(row["seed"]), text_cell(row["robot"])
+            command = Cell(rerun_line(row, folder, file), name, code=True)
+            rows.append((text_cell(name), *place, text_cell(_failure_text(row)), command))
     headings = ("entrant", "family", "seed", "robot", "what went wrong", "run it again")
     text = (
-        f"The {_LISTED} worst runs of each entrant that did not succeed: deepest contacts first, then by final error.",
+        f"The {_MAX_ROWS} worst runs of each entrant without success: deepest contacts first, then by final error.",
     )
     return Section("Worst runs", text if rows else ("None.",), tables=(Table(headings, tuple(rows)),) if rows else ())
 
 
-def _went_wrong(row: dict[str, Any]) -> str:
+def _failure_text(row: dict[str, Any]) -> str:
+    """Describe how a run failed."""
     if row["collided"]:
         return f"{row['contacts']} contacts, {max(0.0, -1e3 * row['min_distance']):.1f} mm deep"
     if row["reachable"]:
@@ -226,7 +233,7 @@ def _went_wrong(row: dict[str, Any]) -> str:
 
 
 def rerun_line(row: dict[str, Any], folder: Path, file: str = "") -> str:
-    """The command that runs one row once more.
+    """Return the command that runs one row once more.
 
     Args:
         row: the run.
@@ -238,16 +245,17 @@ def rerun_line(row: dict[str, Any], folder: Path, file: str = "") -> str:
     return shlex.join(map(str, ("qpavoid", "bench", "show", folder, *case, "--entrant", entrant)))
 
 
-def _failures(results: Results) -> Section:
-    """What entrants said when they failed, with how often."""
+def _failures_section(results: Results) -> Section:
+    """List the first failures of entrants, with their counts."""
     rows = []
     for entrant, name in enumerate(results.entrants):
-        said = results.columns["failure"][results.rows_of(entrant)]
-        often = Counter(sorted(said[said != ""])).most_common(_LISTED)
+        entrant_facts = results.columns["failure"][results.rows_of(entrant)]
+        often = Counter(sorted(entrant_facts[entrant_facts != ""])).most_common(_MAX_ROWS)
         rows += [(text_cell(name), count_cell(count), text_cell(text)) for text, count in often]
     headings = ("entrant", "runs", "the first thing that it said")
     return Section("Failures", () if rows else ("None.",), tables=(Table(headings, tuple(rows)),) if rows else ())
 
 
-def _plain(value: Any) -> str:
+def _json_text(value: Any) -> str:
+    """Return a value as JSON without quotes."""
     return json.dumps(value, ensure_ascii=False).replace('"', "")

@@ -1,4 +1,4 @@
-"""Results as a report wants them: a cell for each case and entrant, none of them dropped without a word."""
+"""Results as a report needs them: a cell for each case and entrant, none dropped silently."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ class Results:
 
     entrants: tuple[str, ...]
     settings: tuple[str, ...]
-    """Digest of each."""
+    """Digest of each entrant's settings."""
     versions: tuple[str, ...]
-    """Of qpavoid, with which each ran."""
+    """Version of qpavoid with which each ran."""
     families: tuple[str, ...]
     columns: dict[str, Any]
     """Column of `scores.Score` -> (n,) its values."""
@@ -33,25 +33,25 @@ class Results:
     family: IntArray
     """(cases,) index of the family."""
     replaced: int
-    """Rows of older versions or settings of an entrant, or of older cases, which count for nothing."""
+    """Rows of older versions or settings of an entrant, or of older cases, which do not count."""
     bounded: int
-    """Figures that were not finite, and stand at the worst of all runs."""
+    """Number of figures that were not finite, and were replaced by the worst of all runs."""
 
     @cached_property
     def common(self) -> Any:
-        """(cases,) whether every entrant has run it: what rankings and figures are made of."""
+        """Return for each case (cases,) whether every entrant has run it."""
         return (self.cell >= 0).all(axis=1)
 
     def values(self, column: str, entrant: int, family: int | None = None) -> Array:
-        """(n,) of one entrant in the cases that all have run, of one family or of all."""
+        """Return values (n,) of one entrant in the common cases, of one family or of all."""
         return np.asarray(self.columns[column][self._common_rows[family][:, entrant]])
 
     def table(self, column: str, family: int | None = None) -> Array:
-        """(cases, entrants) of the cases that all have run."""
+        """Return values (cases, entrants) of the common cases, of one family or of all."""
         return np.asarray(self.columns[column][self._common_rows[family]])
 
     def missing(self) -> Iterator[tuple[str, str, int]]:
-        """(entrant, family, number of cases) that somebody else has run and this entrant has not."""
+        """Yield (entrant, family, number of cases) of cases that only other entrants have run."""
         for i, entrant in enumerate(self.entrants):
             for j, family in enumerate(self.families):
                 count = int(np.sum((self.cell[:, i] < 0) & (self.family == j)))
@@ -59,85 +59,88 @@ class Results:
                     yield entrant, family, count
 
     def rows_of(self, entrant: int) -> IntArray:
-        """(n,) all its rows, whoever else has run these cases."""
+        """Return indices (n,) of all rows of an entrant, in common cases or not."""
         rows = self.cell[:, entrant]
         return np.asarray(rows[rows >= 0])
 
     def row(self, index: int) -> dict[str, Any]:
-        """One run, by its column."""
+        """Return one run, by column."""
         return {name: values[index] for name, values in self.columns.items()}
 
     def ranking(self, family: int | None = None) -> dict[str, int]:
-        """Rank by name, best first: by success, then by tracking error (see `statistics.ranks`)."""
+        """Rank entrants by name, best first: by success, then by tracking error."""
         success = self.table("success", family).astype(bool)
         return ranks(success, self.table("tracking_error", family), self.entrants)
 
     @cached_property
     def _common_rows(self) -> dict[int | None, IntArray]:
-        """Family, None for all -> (cases, entrants) rows of the cases that all have run."""
+        """Return rows (cases, entrants) of the common cases by family, None for all."""
         rows, family = self.cell[self.common], self.family[self.common]
         return {None: rows, **{j: rows[family == j] for j in range(len(self.families))}}
 
 
 def results_of(runs: pa.Table, order: Sequence[str] = ()) -> Results:
-    """Results of a table of runs.
+    """Arrange a table of runs by case and entrant.
 
-    An entrant is what its last row says that it is: rows under the same name with other settings, or of another version
-    of this library, are not mixed with these. Likewise a seed of a family is the case that was run last, so that a
-    family that has been changed does not count twice.
+    An entrant is as its last row has it: rows under the same name with other settings, or of another version of this
+    library, are not mixed with these. The case of a seed of a family is the one that was run last, so that a family
+    that has been changed does not count twice.
 
     Args:
         runs: columns as in `scores.COLUMNS`, at least one row, in the order in which they were done.
         order: entrants that come first, in this order; the others follow by name.
     """
-    given = len(runs)
-    runs = _newest(runs, ("entrant",), [name for name in KEY if name != "case"])
-    runs = _newest(runs, ("family", "seed"), ("case",))
+    count_all = len(runs)
+    runs = _latest_rows(runs, ("entrant",), [name for name in KEY if name != "case"])
+    runs = _latest_rows(runs, ("family", "seed"), ("case",))
     columns = {name: runs[name].to_numpy(zero_copy_only=False) for name in runs.column_names}
-    bounded = sum(_bound(columns, name) for name, kind in COLUMNS.items() if kind == "float")
-    who, names = _coded(runs["entrant"], order)
-    case, cases = _coded(runs["case"])
-    family, families = _coded(runs["family"])
+    bounded = sum(_replace_non_finite(columns, name) for name, kind in COLUMNS.items() if kind == "float")
+    entrant, names = _encode(runs["entrant"], order)
+    case, cases = _encode(runs["case"])
+    family, families = _encode(runs["family"])
     cell = np.full((len(cases), len(names)), -1, dtype=np.intp)
-    cell[case, who] = np.arange(len(runs))
+    cell[case, entrant] = np.arange(len(runs))
     family_of = np.empty(len(cases), dtype=np.intp)
     family_of[case] = family
-    some = cell.max(axis=0)
-    settings, versions = (tuple(columns[name][some].tolist()) for name in ("settings", "version"))
-    kept = int(np.sum(cell >= 0))
-    return Results(names, settings, versions, families, columns, cell, family_of, given - kept, bounded)
+    last_row = cell.max(axis=0)
+    settings, versions = (tuple(columns[name][last_row].tolist()) for name in ("settings", "version"))
+    count_kept = int(np.sum(cell >= 0))
+    return Results(names, settings, versions, families, columns, cell, family_of, count_all - count_kept, bounded)
 
 
-def _newest(runs: pa.Table, of: Sequence[str], what: Sequence[str]) -> pa.Table:
-    """The rows in which the columns `what` are as in the last row that has the same columns `of`."""
-    place, values = _coded(_joined(runs, of))
-    said, _ = _coded(_joined(runs, what))
+def _latest_rows(runs: pa.Table, key: Sequence[str], columns: Sequence[str]) -> pa.Table:
+    """Keep rows whose `columns` are as in the last row with the same `key` columns."""
+    place, values = _encode(_join_columns(runs, key))
+    value, _ = _encode(_join_columns(runs, columns))
     last = np.empty(len(values), dtype=np.intp)
     last[place] = np.arange(len(runs))  # of several numpy keeps the last
-    return runs.filter(pa.array(said == said[last[place]]))
+    return runs.filter(pa.array(value == value[last[place]]))
 
 
-def _joined(runs: pa.Table, columns: Sequence[str]) -> pa.ChunkedArray:
-    """Columns as one of text."""
+def _join_columns(runs: pa.Table, columns: Sequence[str]) -> pa.ChunkedArray:
+    """Join columns into one of text."""
     return pc.binary_join_element_wise(*(runs[name].cast("string") for name in columns), "\0")
 
 
-def _coded(column: pa.ChunkedArray, first: Sequence[str] = ()) -> tuple[IntArray, tuple[str, ...]]:
-    """(n,) index of each value among the distinct ones, and those: `first` as far as they occur, then by name."""
+def _encode(column: pa.ChunkedArray, first: Sequence[str] = ()) -> tuple[IntArray, tuple[str, ...]]:
+    """Return the index (n,) of each value among the distinct ones, and these.
+
+    Distinct values are ordered: `first` as far as they occur, then by name.
+    """
     coded = pc.dictionary_encode(column).combine_chunks()
-    found = coded.dictionary.to_pylist()
-    values = (*(name for name in first if name in found), *sorted(set(found).difference(first)))
+    distinct = coded.dictionary.to_pylist()
+    values = (*(name for name in first if name in distinct), *sorted(set(distinct).difference(first)))
     place = {value: i for i, value in enumerate(values)}
-    return np.array([place[value] for value in found], dtype=np.intp)[coded.indices.to_numpy()], values
+    return np.array([place[value] for value in distinct], dtype=np.intp)[coded.indices.to_numpy()], values
 
 
-def _bound(columns: dict[str, Any], name: str) -> int:
-    """Puts figures that are not finite at the worst of their column; gives how many these were."""
+def _replace_non_finite(columns: dict[str, Any], name: str) -> int:
+    """Replace non-finite figures of a column by the worst finite one; return their number."""
     values = columns[name]
     if name == "min_distance":  # the one of which less is worse; infinite where there is nothing to touch
-        wrong, worst = ~(values > -np.inf), np.min
+        is_invalid, worst = ~(values > -np.inf), np.min
     else:
-        wrong, worst = ~np.isfinite(values), np.max
-    if wrong.any():
-        columns[name] = np.where(wrong, worst(values[np.isfinite(values)], initial=0.0), values)
-    return int(wrong.sum())
+        is_invalid, worst = ~np.isfinite(values), np.max
+    if is_invalid.any():
+        columns[name] = np.where(is_invalid, worst(values[np.isfinite(values)], initial=0.0), values)
+    return int(is_invalid.sum())

@@ -1,4 +1,4 @@
-"""The closed loop of the arena: one entrant in one case, with velocities that are followed exactly."""
+"""Closed loop of the arena: one entrant in one case, with velocities followed exactly."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from time import perf_counter
 import numpy as np
 import pinocchio as pin
 
-from qpavoid.arena.case import Case, Sight
+from qpavoid.arena.case import Case, SensorModel
 from qpavoid.arena.pilot import Pilot
 from qpavoid.arena.world import World
 from qpavoid.model.trajectory import Sample
@@ -19,40 +19,40 @@ from qpavoid.run.log import STATUSES
 
 @dataclass(frozen=True)
 class Rollout:
-    """What an entrant did; N ticks, k tools."""
+    """Record of an entrant in a case; N steps, k tools."""
 
     t: Array
-    """(N,) [s]."""
+    """(N,) time [s]."""
     q: Array
-    """(N, nq)."""
+    """(N, nq) configuration [rad or m]."""
     v: Array
-    """(N, nv) [rad/s or m/s]."""
+    """(N, nv) commanded velocity [rad/s or m/s]."""
     tool: Array
-    """(N, k, 3) where the frames of the tasks were [m]."""
+    """(N, k, 3) positions of the tasks' frames [m]."""
     target: Array
-    """(N, k, 3) where they were meant to be [m]."""
+    """(N, k, 3) positions of their targets [m]."""
     status: IntArray
     """(N,) indices into `qpavoid.run.log.STATUSES`."""
     failed: Array
     """(N,) 1 where the entrant raised or gave no finite velocity, else 0."""
     tick: Array
-    """(N,) time that it took [s]; where a pilot works in another process, what it says of that."""
+    """(N,) computation time of the step [s]; of a pilot in another process, as that process measured it."""
     failure: str
-    """The first thing that it said when it failed."""
+    """Message of the first failure; empty without one."""
 
 
-def roll_out(case: Case, pilot: Pilot, world: World, patience: float = np.inf) -> Rollout:
-    """Runs a case to its end. Where the entrant fails, the robot is held for that tick.
+def roll_out(case: Case, pilot: Pilot, world: World, time_budget: float = np.inf) -> Rollout:
+    """Run a case to its end; where the entrant fails, the robot stays still for that step.
 
     Args:
         case: what is run.
         pilot: who runs it.
         world: of the same case.
-        patience: time that the entrant may take in all [s]; after that, it fails at every tick.
+        time_budget: time that the entrant may take in all [s]; after that, it fails at every tick.
     """
     model, dt = world.scene.robot.model, case.scenario.dt
     data, count = model.createData(), round(case.scenario.duration / dt) + 1
-    tools, sight = world.tools, Sight(case, world.scene.obstacles)
+    tools, sensor = world.tools, SensorModel(case, world.scene.obstacles)
     shapes = {"q": (model.nq,), "v": (model.nv,), "tool": (len(tools), 3), "target": (len(tools), 3)}
     out = {name: np.zeros((count, *shape)) for name, shape in shapes.items()}
     failed, tick, status, failure = np.zeros(count), np.zeros(count), np.zeros(count, dtype=np.intp), ""
@@ -63,14 +63,14 @@ def roll_out(case: Case, pilot: Pilot, world: World, patience: float = np.inf) -
         out["q"][k] = q
         out["tool"][k] = [data.oMf[task.frame_id].translation for task in tools]
         out["target"][k] = [targets[task.settings.label].position for task in tools]
-        seen = sight.look(k * dt)
+        measured = sensor.measure(k * dt)
         begin = perf_counter()
-        patient = tick.sum() < patience
-        solution, said = _asked(pilot, q, k * dt, targets, seen) if patient else (None, "out of time")
+        in_time = tick.sum() < time_budget
+        solution, message = _ask_pilot(pilot, q, k * dt, targets, measured) if in_time else (None, "out of time")
         elapsed = perf_counter() - begin
-        tick[k] = getattr(pilot, "seconds", elapsed) if patient else elapsed
+        tick[k] = getattr(pilot, "seconds", elapsed) if in_time else elapsed
         if solution is None:
-            failed[k], failure = 1.0, failure or said
+            failed[k], failure = 1.0, failure or message
         else:
             out["v"][k] = solution.v
         status[k] = STATUSES.index(Status.STOPPED if solution is None else solution.status)
@@ -80,12 +80,12 @@ def roll_out(case: Case, pilot: Pilot, world: World, patience: float = np.inf) -
     )
 
 
-def _asked(
-    pilot: Pilot, q: Array, t: float, targets: Mapping[str, Sample], seen: Mapping[str, Sample]
+def _ask_pilot(
+    pilot: Pilot, q: Array, t: float, targets: Mapping[str, Sample], measured: Mapping[str, Sample]
 ) -> tuple[Solution | None, str]:
-    """What the entrant answers; None and why, where it does not."""
+    """Return the entrant's solution; None and the reason if it has none."""
     try:
-        solution = pilot.step(q.copy(), t, targets, seen)
+        solution = pilot.step(q.copy(), t, targets, measured)
         if np.isfinite(solution.v).all():
             return solution, ""
         return None, "NaN or infinity in its velocity"

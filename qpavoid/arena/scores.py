@@ -1,4 +1,4 @@
-"""The figures of one run by which entrants are compared; a row of the results."""
+"""Figures of one run by which entrants are compared; a row of the results."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from qpavoid.arena.case import Case
-from qpavoid.arena.referee import Findings
+from qpavoid.arena.checker import Findings
 from qpavoid.arena.rollout import Rollout
 from qpavoid.arena.world import World
 from qpavoid.config import ScenarioConfig
@@ -17,17 +17,20 @@ from qpavoid.geometry.segments import point_segment
 from qpavoid.problem import Array, Status
 from qpavoid.run.log import STATUSES
 
-RESTING = 1e-3
-"""Speed of a tool below which it rests [m/s]."""
-SETTLE = 1.0
-"""A run that has not arrived is stuck when its tools have rested for so long at its end [s]."""
-_CORNERS = 500
+REST_SPEED = 1e-3
+"""Speed of a tool below which it is at rest [m/s]."""
+REST_DURATION = 1.0
+"""Time for which tools are at rest at the end of a run that is stuck [s]."""
+_MAX_CORNERS = 500
 _ROUND_OFF = 1e-6
 
 
 @dataclass(frozen=True)
 class Score:
-    """One run. Distances and limits are the referee's; a failure counts at its limit, and every run has all figures."""
+    """Figures of one run.
+
+    Distances and limits are the checker's; a failure counts at its limit, and every run has all figures.
+    """
 
     family: str
     seed: int
@@ -36,35 +39,35 @@ class Score:
     """`Case.key`: digest of the scenario."""
     entrant: str
     settings: str
-    """Digest of what the entrant is and how it is set."""
+    """Digest of the entrant and its settings."""
     version: str
-    """Of qpavoid."""
+    """Version of qpavoid."""
     reachable: bool
     """Whether the goals can be reached."""
     success: bool
     """No contact, and all goals reached; where they cannot be, at rest at the end."""
     collided: bool
-    """Something touched."""
+    """At least one pair touched."""
     contacts: int
-    """Pairs that touched."""
+    """Number of pairs that touched."""
     min_distance: float
-    """Smallest of the pairs that the robot can part [m]."""
+    """Smallest distance of the pairs that the robot can move [m]."""
     d1: float
-    """The distance between surfaces that was to be kept [m]."""
+    """Safety distance between surfaces [m]."""
     below_d1: float
-    """Share of the time with something nearer than d1 [-]."""
+    """Fraction of the time with a distance below d1 [-]."""
     arrived: bool
     """Every tool ended within the goal tolerance."""
     final_error: float
-    """Of the worst tool [m]."""
+    """Distance of the worst tool from its goal at the end [m]."""
     tracking_error: float
     """Root mean square of the distances between tools and their moving targets [m]."""
     deviation: float
     """Largest distance of a tool from the path of its target [m]."""
     path_length: float
-    """Of the tools together, over that of their targets [-]."""
+    """Length of the tools' paths together, over that of their targets [-]."""
     time_to_goal: float
-    """After which every tool stayed within the goal tolerance, over the duration; 1 where that was never [-]."""
+    """Time after which every tool stayed within the goal tolerance, over the duration; 1 where that was never [-]."""
     stuck: bool
     """Not arrived, no contact, and the tools rested for the last second."""
     jerk: float
@@ -72,44 +75,44 @@ class Score:
     jitter: float
     """Σ|Δq̇| over joints and ticks, per second [rad/s² or m/s²]."""
     peak_velocity: float
-    """Of the fastest joint, over its limit [-]."""
+    """Largest velocity of a joint, over its limit [-]."""
     violations: float
-    """Share of ticks that pass a velocity, position, acceleration or jerk limit [-]."""
+    """Fraction of steps that exceed a velocity, position, acceleration or jerk limit [-]."""
     relaxed: float
-    """Share of ticks that gave something up [-]."""
+    """Fraction of steps whose constraints were relaxed [-]."""
     stopped: float
-    """Share of ticks in which the robot was braked or held, the entrant's failures among them [-]."""
+    """Fraction of steps in which the robot was braked or at rest, the entrant's failures among them [-]."""
     failed: float
-    """Share of ticks in which the entrant raised, or gave no finite velocity [-]."""
+    """Fraction of steps in which the entrant raised, or gave no finite velocity [-]."""
     failure: str
-    """The first thing that it said then; empty if it never did."""
+    """Message of the first failure; empty without one."""
     tick_p50: float
-    """Median time of a tick [µs]."""
+    """Median computation time of a step [µs]."""
     tick_p99: float
-    """[µs]."""
+    """99th percentile of the computation time of a step [µs]."""
     ticks: int
     dt: float
-    """[s]."""
+    """Control period [s]."""
     duration: float
-    """[s]."""
+    """Duration of the run [s]."""
     seconds: float
-    """What the run took, referee included [s]."""
+    """Time that the run took to compute, checker included [s]."""
 
     def row(self) -> dict[str, Any]:
-        """As a row of a table."""
+        """Return the figures as a row of a table."""
         return asdict(self)
 
 
 COLUMNS = {field.name: str(field.type) for field in fields(Score)}
-"""Column: `str`, `int`, `float` or `bool`."""
+"""Type of each column: `str`, `int`, `float` or `bool`."""
 KEY = ("case", "entrant", "settings", "version")
-"""Columns that tell one run from another."""
+"""Columns that identify a run."""
 
 
 def score(
     case: Case, world: World, entrant: str, settings: str, rollout: Rollout, findings: Findings, seconds: float
 ) -> Score:
-    """The figures of a run.
+    """Compute the figures of a run.
 
     Args:
         case: what was run.
@@ -117,16 +120,16 @@ def score(
         entrant: who ran it.
         settings: digest of the entrant.
         rollout: what it did.
-        findings: what the referee says of that.
+        findings: result of the checker.
         seconds: what the run took [s].
     """
     scenario, ticks = case.scenario, len(rollout.t)
     error = np.linalg.norm(rollout.target - rollout.tool, axis=2).max(axis=1, initial=0.0)
     goal_error = np.linalg.norm(rollout.target[-1] - rollout.tool, axis=2).max(axis=1, initial=0.0)
-    away = np.flatnonzero(goal_error > scenario.goal_tolerance)
+    outside_tolerance = np.flatnonzero(goal_error > scenario.goal_tolerance)
     arrived = bool(goal_error[-1] <= scenario.goal_tolerance)
-    settled = rollout.tool[-1 - min(ticks - 1, round(SETTLE / scenario.dt)) :]
-    rests = bool(np.ptp(settled, axis=0).max(initial=0.0) <= RESTING * SETTLE)
+    settled = rollout.tool[-1 - min(ticks - 1, round(REST_DURATION / scenario.dt)) :]
+    rests = bool(np.ptp(settled, axis=0).max(initial=0.0) <= REST_SPEED * REST_DURATION)
     change = np.diff(rollout.v, axis=0)
     limit = world.scene.robot.bounds().velocity
     return Score(
@@ -142,21 +145,21 @@ def score(
         collided=bool(findings.contacts),
         contacts=len(findings.contacts),
         min_distance=findings.distance,
-        d1=to_keep(scenario),
-        below_d1=float(np.mean(findings.nearest < to_keep(scenario))),
+        d1=surface_safety_distance(scenario),
+        below_d1=float(np.mean(findings.nearest < surface_safety_distance(scenario))),
         arrived=arrived,
         final_error=float(goal_error[-1]),
         tracking_error=float(np.sqrt(np.mean(error**2))),
-        deviation=_deviation(rollout),
-        path_length=_length(rollout.tool) / max(_length(rollout.target), 1e-9),
-        time_to_goal=(int(away[-1]) + 1 if len(away) else 0) / ticks if arrived else 1.0,
+        deviation=_max_deviation(rollout),
+        path_length=_path_length(rollout.tool) / max(_path_length(rollout.target), 1e-9),
+        time_to_goal=(int(outside_tolerance[-1]) + 1 if len(outside_tolerance) else 0) / ticks if arrived else 1.0,
         stuck=case.reachable and not arrived and not findings.contacts and rests,
         jerk=float(np.sqrt(np.mean(np.square(np.diff(change, axis=0))))) / scenario.dt**2,
         jitter=float(np.abs(change).sum()) / scenario.duration,
         peak_velocity=float(np.max(np.abs(rollout.v) / limit, initial=0.0)),
-        violations=float(np.mean(_violating(world, scenario, rollout, findings))),
-        relaxed=_share(rollout, Status.RELAXED),
-        stopped=_share(rollout, Status.STOPPED),
+        violations=float(np.mean(_violates_limits(world, scenario, rollout, findings))),
+        relaxed=_status_share(rollout, Status.RELAXED),
+        stopped=_status_share(rollout, Status.STOPPED),
         failed=float(np.mean(rollout.failed)),
         failure=rollout.failure,
         tick_p50=1e6 * float(np.median(rollout.tick)),
@@ -168,23 +171,24 @@ def score(
     )
 
 
-def to_keep(scenario: ScenarioConfig) -> float:
-    """The distance between surfaces below which avoiding is meant to have taken over entirely: d1 [m]."""
+def surface_safety_distance(scenario: ScenarioConfig) -> float:
+    """Return d1 between surfaces, below which avoidance has taken over entirely [m]."""
     return scenario.avoidance.d1 - scenario.avoidance.offset
 
 
-def _share(rollout: Rollout, status: Status) -> float:
+def _status_share(rollout: Rollout, status: Status) -> float:
+    """Return the fraction of steps with a status."""
     return float(np.mean(rollout.status == STATUSES.index(status)))
 
 
-def _length(path: Array) -> float:
-    """Of all tools' paths (N, k, 3) together [m]."""
+def _path_length(path: Array) -> float:
+    """Return the length of all tools' paths (N, k, 3) together [m]."""
     return float(np.linalg.norm(np.diff(path, axis=0), axis=2).sum())
 
 
-def _deviation(rollout: Rollout) -> float:
-    """Largest distance of a tool from the path that its target draws, at whatever time [m]."""
-    worst, corners = 0.0, np.unique(np.linspace(0, len(rollout.t) - 1, _CORNERS).astype(int))
+def _max_deviation(rollout: Rollout) -> float:
+    """Return the largest distance of a tool from the path that its target draws [m]."""
+    worst, corners = 0.0, np.unique(np.linspace(0, len(rollout.t) - 1, _MAX_CORNERS).astype(int))
     for tool, target in zip(rollout.tool.swapaxes(0, 1), rollout.target[corners].swapaxes(0, 1), strict=True):
         nearest = np.full(len(tool), np.inf)
         for start, end in zip(target, np.concatenate((target[1:], target[-1:])), strict=True):
@@ -193,8 +197,8 @@ def _deviation(rollout: Rollout) -> float:
     return worst
 
 
-def _violating(world: World, scenario: ScenarioConfig, rollout: Rollout, findings: Findings) -> Array:
-    """(N,) whether a tick passes a velocity, position, acceleration or jerk limit by more than round-off."""
+def _violates_limits(world: World, scenario: ScenarioConfig, rollout: Rollout, findings: Findings) -> Array:
+    """Return for each step (N,) whether it exceeds a limit by more than round-off."""
     bounds = world.scene.robot.bounds().within(scenario.limits)
     q = findings.q[:, bounds.q_index]
     acceleration = np.diff(rollout.v, axis=0, prepend=0.0) / scenario.dt

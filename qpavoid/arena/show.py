@@ -1,4 +1,4 @@
-"""One case of a results folder, looked at closely: as a scenario, and run once more."""
+"""One case of a results folder: as a scenario, and run once more."""
 
 from __future__ import annotations
 
@@ -18,25 +18,28 @@ from qpavoid.errors import ConfigError, UnknownName, nearest
 
 
 def find_case(folder: Path, family: str, seed: int) -> Case:
-    """The case of a family and seed, the one that was made last where there are several.
+    """Return the case of a family and seed, the last one made where there are several.
 
     Raises:
         UnknownName: the folder has no such family.
         ConfigError: it has no case of that seed, or no results.
     """
     cases = read_cases(folder)
-    there = cases.filter(pc.equal(cases["family"], family))
-    if not len(there):
+    in_family = cases.filter(pc.equal(cases["family"], family))
+    if not len(in_family):
         raise UnknownName(f"{folder}: no family {family!r}{nearest(family, pc.unique(cases['family']).to_pylist())}")
-    texts = there.filter(pc.equal(there["seed"], seed))["json"].to_pylist()
+    texts = in_family.filter(pc.equal(in_family["seed"], seed))["json"].to_pylist()
     if not texts:
-        low, high = pc.min_max(there["seed"]).as_py().values()
-        raise ConfigError(f"{folder}: {family} has no seed {seed}; there are {len(there)} from {low} to {high}")
+        low, high = pc.min_max(in_family["seed"]).as_py().values()
+        raise ConfigError(f"{folder}: {family} has no seed {seed}; there are {len(in_family)} from {low} to {high}")
     return Case.from_json(texts[-1])
 
 
 def write_scenario(case: Case, path: Path) -> None:
-    """Writes a case as a scenario file. Relative paths in it start from the folder of the family's file."""
+    """Write a case as a scenario file.
+
+    Relative paths in it start from the folder of the family's file.
+    """
     text = yaml.safe_dump(case.scenario.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
     try:
         path.write_text(text, encoding="utf-8")
@@ -44,8 +47,8 @@ def write_scenario(case: Case, path: Path) -> None:
         raise ConfigError(f"--scenario {path}: {error.strerror}; give a file that can be written") from None
 
 
-def again(case: Case, entrant: str, folder: Path) -> dict[str, Any]:
-    """The figures of an entrant in a case, run anew.
+def rerun(case: Case, entrant: str, folder: Path) -> dict[str, Any]:
+    """Run an entrant in a case once more and return its figures.
 
     Args:
         case: what is run.
@@ -55,14 +58,14 @@ def again(case: Case, entrant: str, folder: Path) -> dict[str, Any]:
     Raises:
         ConfigError, UnknownName: there is no such entrant.
     """
-    found = _of_suite(entrant, folder)
-    return run_trial(case, found.entrant() if found else find_any(entrant)).row()
+    config = _suite_entrant(entrant, folder)
+    return run_trial(case, config.entrant() if config else find_any(entrant)).row()
 
 
-def _of_suite(name: str, folder: Path) -> EntrantConfig | None:
-    """A law with settings of its own, by what suite.json tells of it."""
-    told = json.loads((folder / "suite.json").read_text(encoding="utf-8"))["entrants"].values()
-    fields = [entry for entry in told if entry["name"] == name and "solver" in entry["settings"]]
+def _suite_entrant(name: str, folder: Path) -> EntrantConfig | None:
+    """Return a solver with settings of its own as suite.json has it; None if there is none."""
+    entrants = json.loads((folder / "suite.json").read_text(encoding="utf-8"))["entrants"].values()
+    fields = [entry for entry in entrants if entry["name"] == name and "solver" in entry["settings"]]
     if name in ENTRANTS or not fields:
         return None
-    return EntrantConfig(name=name, says=fields[-1]["says"], **fields[-1]["settings"])
+    return EntrantConfig(name=name, description=fields[-1]["says"], **fields[-1]["settings"])

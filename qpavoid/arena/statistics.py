@@ -1,4 +1,4 @@
-"""What a sample of runs allows to say: intervals, tests over the same cases, ranks, Pareto fronts."""
+"""Statistics of a sample of runs: intervals, paired tests, ranks, Pareto fronts."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from scipy.stats import binom
 from qpavoid.problem import Array
 
 CONFIDENCE = 0.95
-"""Of all intervals and tests."""
+"""Confidence of all intervals and tests."""
 _Z = float(ndtri(0.5 + 0.5 * CONFIDENCE))
 _RESAMPLES = 2000
 _MANY = 3000
-"""Sample size from which the mean is taken to be normal, and nothing is resampled."""
+"""Sample size from which the mean is taken to be normal, without resampling."""
 Flags = npt.NDArray[np.bool_]
 
 
 class Interval(NamedTuple):
-    """An estimate and the range that holds the true value with `CONFIDENCE`."""
+    """An estimate and the range that contains the true value with `CONFIDENCE`."""
 
     value: float
     low: float
@@ -31,7 +31,7 @@ class Interval(NamedTuple):
 
 
 def rate(successes: int, trials: int) -> Interval:
-    """Share of successes with the interval of Wilson (1927), which keeps within 0 and 1 and never has no width.
+    """Return the success rate with Wilson's interval (1927), within 0 and 1 and never empty.
 
     Raises:
         ValueError: no trials.
@@ -46,7 +46,7 @@ def rate(successes: int, trials: int) -> Interval:
 
 
 def mean(values: Array) -> Interval:
-    """Mean of values (n,) with a bootstrap interval, the same at every call.
+    """Return the mean of values (n,) with a bootstrap interval, the same at every call.
 
     Percentiles of the means of resamples, as far out as Student's t asks for, so that few values give a range that is
     wide enough (the expanded percentile interval: Hesterberg, The American Statistician 69, 2015). Of the differences
@@ -64,19 +64,19 @@ def mean(values: Array) -> Interval:
     if count >= _MANY:
         half = _Z * float(np.std(values, ddof=1)) / float(np.sqrt(count))
         return Interval(middle, middle - half, middle + half)
-    reach = float(stdtrit(count - 1, 0.5 + 0.5 * CONFIDENCE) * np.sqrt(count / (count - 1)))
-    low, high = np.quantile(_resamples(count) @ values, [ndtr(-reach), ndtr(reach)])
+    half_width = float(stdtrit(count - 1, 0.5 + 0.5 * CONFIDENCE) * np.sqrt(count / (count - 1)))
+    low, high = np.quantile(_resamples(count) @ values, [ndtr(-half_width), ndtr(half_width)])
     return Interval(middle, min(float(low), middle), max(float(high), middle))  # round-off, where all are the same
 
 
 @lru_cache(maxsize=8)
 def _resamples(count: int) -> Array:
-    """(resamples, count) weights of values in the means of samples drawn anew from them; drawn once a size."""
+    """Return weights (resamples, count) of values in means of bootstrap samples."""
     return np.random.default_rng(0).multinomial(count, np.full(count, 1.0 / count), size=_RESAMPLES) / count
 
 
 def median(values: Array) -> Interval:
-    """Median of values (n,) with the interval between two of them that holds it whatever they are drawn from.
+    """Return the median of values (n,) with its distribution-free interval (sign test).
 
     By signs: the number of values below the median is binomial (Conover, Practical Nonparametric Statistics, 3.2). Of
     fewer than six values, it reaches from the least to the greatest, and holds less than it should.
@@ -96,25 +96,27 @@ class Duel(NamedTuple):
     """Two entrants in the same cases."""
 
     only_first: int
-    """Cases in which the first one succeeds and the second does not."""
+    """Number of cases in which the first entrant succeeds and the second does not."""
     only_second: int
     p: float
     """Probability of a difference of at least this size if there were none: McNemar's exact test (1947)."""
 
     @property
     def decided(self) -> bool:
-        """Whether chance is a poor explanation."""
+        """Return True if chance is a poor explanation of the difference."""
         return self.p < 1.0 - CONFIDENCE
 
 
 def duel(first: Flags, second: Flags) -> Duel:
-    """Compares successes (n,) case by case."""
+    """Compare successes (n,) of two entrants case by case."""
     won, lost = int(np.sum(first & ~second)), int(np.sum(second & ~first))
     return Duel(won, lost, min(1.0, 2.0 * float(bdtr(min(won, lost), won + lost, 0.5))))
 
 
 def ranks(success: Flags, error: Array, names: Sequence[str]) -> dict[str, int]:
-    """Rank by name, by number of successes; whoever cannot be told from the first of a rank shares it.
+    """Rank entrants by number of successes.
+
+    Entrants that McNemar's test cannot separate from the first of a rank share the rank.
 
     Each is tested against the first of the rank above alone, not against all: the order has no cycles, and the tests,
     one an entrant, are not corrected for their number.
@@ -139,7 +141,10 @@ def ranks(success: Flags, error: Array, names: Sequence[str]) -> dict[str, int]:
 
 
 def pareto(x: Array, y: Array) -> Flags:
-    """(n,) whether no other point has both a smaller x and a larger y, one of them at least as good and one better."""
+    """Return for each point (n,) whether no other one has smaller x and larger y.
+
+    Of two points with one coordinate equal, the other coordinate decides.
+    """
     no_worse = (x[None, :] <= x[:, None]) & (y[None, :] >= y[:, None])
     better = (x[None, :] < x[:, None]) | (y[None, :] > y[:, None])
     return np.asarray(~np.any(no_worse & better, axis=1))

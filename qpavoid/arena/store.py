@@ -1,4 +1,4 @@
-"""The results of a sweep: a folder of Parquet files that grows, and loses nothing when its writer is killed.
+"""Results of a sweep: a growing folder of Parquet files that survives a killed writer.
 
     runs/*.parquet     a row each run, columns as in `scores.Score`
     cases/*.parquet    a row each case that was made: family, seed, where it came from, its digest, itself as JSON
@@ -8,7 +8,7 @@
 
 A row is in its journal, flushed, before anything else begins. A journal becomes a Parquet file when it has grown long,
 when a sweep ends and when the next one begins: the file is written beside, renamed, and only then is the journal
-removed. Whoever is killed in between leaves rows in both: the file is named after its content, so that it is not
+removed. A writer that is killed in between leaves rows in both: the file is named after its content, so that it is not
 written again, and what is in both is read once.
 """
 
@@ -38,12 +38,12 @@ _TYPES = {"str": pa.string(), "int": pa.int64(), "float": pa.float64(), "bool": 
 
 
 class Kind(NamedTuple):
-    """One of the tables of a folder."""
+    """Schema and key of one of the tables of a folder."""
 
     name: str
     schema: pa.Schema
     key: tuple[str, ...]
-    """Columns that tell one row from another."""
+    """Columns that identify a row."""
 
 
 RUNS = Kind("runs", pa.schema([(name, _TYPES[kind]) for name, kind in COLUMNS.items()]), KEY)
@@ -52,11 +52,13 @@ CASES = Kind(
     pa.schema([("seed", pa.int64()), *((name, pa.string()) for name in ("family", "origin", "case", "json"))]),
     ("family", "seed", "origin"),
 )
-"""`origin` is the digest of the family and the version that made the case, `case` is `Case.key`."""
+"""Table of cases. `origin` is the digest of the family and the version that made the case, `case` is `Case.key`."""
 
 
 def read_runs(folder: Path, columns: Sequence[str] | None = None) -> pa.Table:
-    """All runs of a folder, each once, in the order in which they were done; also while a sweep is going on there.
+    """Read all runs of a folder, each once, in the order in which they were done.
+
+    A sweep may be going on in the folder.
 
     Args:
         folder: of results.
@@ -69,7 +71,9 @@ def read_runs(folder: Path, columns: Sequence[str] | None = None) -> pa.Table:
 
 
 def read_cases(folder: Path, columns: Sequence[str] | None = None) -> pa.Table:
-    """All cases of a folder, each once: family, seed, origin, case, json (see `Case.from_json`).
+    """Read all cases of a folder, each once.
+
+    Columns: family, seed, origin, case, json (see `Case.from_json`).
 
     Raises:
         ConfigError: as `read_runs`.
@@ -78,7 +82,10 @@ def read_cases(folder: Path, columns: Sequence[str] | None = None) -> pa.Table:
 
 
 def read_failures(folder: Path) -> list[dict[str, Any]]:
-    """What the last sweep could not make or run: family, seed, entrant (None: the case could not be made), failure."""
+    """Read what the last sweep could not make or run.
+
+    Fields: family, seed, entrant (None: the case could not be made), failure.
+    """
     try:
         return list(_rows((folder / "failures.jsonl").read_bytes()))
     except FileNotFoundError:
@@ -88,29 +95,29 @@ def read_failures(folder: Path) -> list[dict[str, Any]]:
 def _read(folder: Path, kind: Kind, columns: Sequence[str] | None = None) -> pa.Table:
     if not any((folder / name).exists() for name in (kind.name, f"{kind.name}.jsonl")):
         raise ConfigError(f"{folder}: no results here; give a folder that `qpavoid bench run … --out` wrote")
-    journal = _journalled(folder / f"{kind.name}.jsonl", kind)  # first: what moves meanwhile is seen twice, not never
+    journal = _journal_rows(folder / f"{kind.name}.jsonl", kind)  # first: what moves meanwhile is seen twice, not never
     parts = sorted(map(str, (folder / kind.name).glob("*.parquet")))
-    chosen = None if columns is None else list(columns)
+    selected = None if columns is None else list(columns)
     try:
-        table = ds.dataset(parts, schema=kind.schema, format="parquet").to_table(chosen) if parts else None
+        table = ds.dataset(parts, schema=kind.schema, format="parquet").to_table(selected) if parts else None
     except (pa.ArrowException, OSError) as error:
         remedy = "move the damaged file away, and its rows are made again by the same sweep"
         raise ConfigError(f"{folder / kind.name}: {error}; {remedy}") from None
     if table is None or len(journal):
-        journal = journal if chosen is None else journal.select(chosen)
+        journal = journal if selected is None else journal.select(selected)
         table = journal if table is None else pa.concat_tables([table, journal])
-    return _each_once(table, kind.key)
+    return _drop_duplicates(table, kind.key)
 
 
-def _each_once(table: pa.Table, key: Sequence[str]) -> pa.Table:
-    """The first row of each key, in the order of the table."""
+def _drop_duplicates(table: pa.Table, key: Sequence[str]) -> pa.Table:
+    """Keep the first row of each key, in the order of the table."""
     order = pa.array(np.arange(len(table)))
     first = table.select(key).append_column("order", order).group_by(list(key)).aggregate([("order", "min")])
     return table if len(first) == len(table) else table.take(first["order_min"].combine_chunks().sort())
 
 
-def _journalled(path: Path, kind: Kind) -> pa.Table:
-    """Rows of a journal. A line that was not written to its end is none: what it told of is done again."""
+def _journal_rows(path: Path, kind: Kind) -> pa.Table:
+    """Read the rows of a journal; a last line without an end is dropped and done once more."""
     try:
         data = path.read_bytes()
     except FileNotFoundError:
@@ -129,7 +136,7 @@ def _rows(data: bytes) -> Iterator[dict[str, Any]]:
 
 
 class Journal:
-    """Rows on their way into Parquet files."""
+    """Rows that are not in a Parquet file yet."""
 
     def __init__(self, folder: Path, kind: Kind) -> None:
         self._parts, self._path, self._kind = folder / kind.name, folder / f"{kind.name}.jsonl", kind
@@ -137,7 +144,7 @@ class Journal:
         self.fold()
 
     def append(self, row: Mapping[str, Any]) -> None:
-        """Writes a row; it survives the end of this process, however it ends."""
+        """Write a row, which survives any end of this process."""
         self._file.write(json.dumps(row).encode() + b"\n")
         self._file.flush()
         self._count += 1
@@ -145,9 +152,9 @@ class Journal:
             self.fold()
 
     def fold(self) -> None:
-        """Turns the journal into a Parquet file, and begins a new one."""
+        """Turn the journal into a Parquet file, and begin a new one."""
         self.close()
-        table = _journalled(self._path, self._kind)
+        table = _journal_rows(self._path, self._kind)
         if len(table):
             self._write(table, hashlib.sha256(self._path.read_bytes()).hexdigest()[:16])
         self._path.unlink(missing_ok=True)
@@ -165,16 +172,19 @@ class Journal:
         beside.replace(self._parts / f"{len(parts):06d}-{digest}.parquet")
 
     def close(self) -> None:
-        """No more rows; what is in the journal stays there."""
+        """Close the journal; its rows stay there."""
         if hasattr(self, "_file"):
             self._file.close()
 
 
 class Store:
-    """The one writer of a folder. Rows of earlier sweeps that are still in journals become Parquet at once."""
+    """The one writer of a folder.
+
+    Rows of earlier sweeps that are still in journals become Parquet at once.
+    """
 
     def __init__(self, folder: Path) -> None:
-        """Opens a folder, new or not.
+        """Open a folder, new or not.
 
         Raises:
             ConfigError: it cannot be written, or something else writes it.
@@ -191,19 +201,21 @@ class Store:
     def __enter__(self) -> Store:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
         with self._lock, self._failures:
             for journal in (self.cases, self.runs):
                 journal.fold()
                 journal.close()
 
-    def fail(self, what: Mapping[str, Any]) -> None:
-        """Notes what could not be made or run."""
-        self._failures.write(json.dumps(what) + "\n")
+    def fail(self, failure: Mapping[str, Any]) -> None:
+        """Record what could not be made or run."""
+        self._failures.write(json.dumps(failure) + "\n")
         self._failures.flush()
 
     def describe(self, facts: Mapping[str, Any]) -> None:
-        """Writes suite.json: facts of this sweep; of its `entrants`, those of earlier sweeps are kept."""
+        """Write suite.json: facts of this sweep; `entrants` of earlier sweeps stay in it."""
         path = self.folder / "suite.json"
         try:
             before = json.loads(path.read_text(encoding="utf-8"))["entrants"]
@@ -216,7 +228,7 @@ class Store:
 
 
 def _locked(folder: Path) -> Any:
-    """The lock of a folder, held until it is closed or this process ends in any way.
+    """Lock a folder until the lock is closed or this process ends in any way.
 
     Raises:
         ConfigError: another process holds it.

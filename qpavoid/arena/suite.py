@@ -1,4 +1,4 @@
-"""A suite: which entrants run in which families, with which seeds; a YAML file each."""
+"""Suites: entrants, families and seeds that run together; a YAML file each."""
 
 from __future__ import annotations
 
@@ -12,52 +12,54 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from qpavoid.arena.entrants import ENTRANTS, Entrant, find_entrant, law
+from qpavoid.arena.entrant_file import entrant_from_file
+from qpavoid.arena.entrants import ENTRANTS, Entrant, find_entrant, solver_entrant
 from qpavoid.arena.families import Family, load_family
-from qpavoid.arena.own import own_entrant
 from qpavoid.config import Avoidance, Limits, Progress, Sensing, SolverConfig
 from qpavoid.config.base import Block
 from qpavoid.config.loading import read_config
 from qpavoid.config.shipped import find_suite
 from qpavoid.errors import ConfigError, located
 
-MOST_SEEDS = 1_000_000
+MAX_SEEDS = 1_000_000
 
 
 class EntrantConfig(Block):
-    """A law of this library with settings of one's own."""
+    """A solver of this library with settings of one's own."""
 
     name: Annotated[str, Field(min_length=1)]
-    """Under which it appears."""
-    says: str = ""
-    """What it is, in a line."""
+    """Name under which it appears."""
+    description: str = ""
+    """Description in a line."""
     solver: SolverConfig
-    """As in a scenario."""
+    """Solver, as in a scenario."""
     avoidance: Avoidance | None = None
-    """Fields that it has its own way, whatever the scenario says; likewise the blocks below."""
+    """Fields that replace those of every scenario; the blocks below do the same."""
     limits: Limits | None = None
     sensing: Sensing | None = None
     progress: Progress | None = None
 
     def entrant(self) -> Entrant:
-        """Who takes part."""
-        said = self.model_dump(exclude_unset=True)
-        changes = {block: said[block] for block in ("avoidance", "limits", "sensing", "progress") if said.get(block)}
-        return law(self.name, self.says or self.solver.label, self.solver, **changes)
+        """Return the entrant that it configures."""
+        fields = self.model_dump(exclude_unset=True)
+        changes = {
+            block: fields[block] for block in ("avoidance", "limits", "sensing", "progress") if fields.get(block)
+        }
+        return solver_entrant(self.name, self.description or self.solver.label, self.solver, **changes)
 
 
 class SuiteConfig(Block):
     """A file of tasks/suites/."""
 
     title: Annotated[str, Field(min_length=1)]
-    """What it is, in a few words."""
+    """Title in a few words."""
     about: str = ""
-    """What it is for."""
+    """Purpose of the suite."""
     families: Annotated[list[str], Field(min_length=1)]
     """Shipped names, or paths of YAML files, from this file's folder."""
     entrants: Annotated[list[str | EntrantConfig], Field(min_length=1)]
-    """Shipped names, `my_law.py:MyLaw` from this file's folder, or laws with settings of their own."""
-    seeds: Annotated[int, Field(ge=1, le=MOST_SEEDS)] = 10
+    """Shipped names, `my_law.py:MyLaw` from this file's folder, or solvers with settings of their own."""
+    seeds: Annotated[int, Field(ge=1, le=MAX_SEEDS)] = 10
     """Cases of each family [-]."""
     first_seed: Annotated[int, Field(ge=0)] = 0
     """Seed of the first one."""
@@ -73,18 +75,18 @@ class Suite:
     entrants: tuple[Entrant, ...]
     seeds: range
     absent: tuple[Entrant, ...]
-    """Those of the file that cannot take part, because what they run on is not installed."""
+    """Entrants of the file that cannot take part, because their packages are not installed."""
 
 
 def load_suite(
     name_or_path: str | Path, solvers: Sequence[str] = (), more: Sequence[str] = (), seeds: int | None = None
 ) -> Suite:
-    """Reads a suite.
+    """Read a suite.
 
     Args:
         name_or_path: shipped name or path of a YAML file. Python files that it names are run.
         solvers: these entrants in place of its own; names of its own or shipped ones, or `my_law.py:MyLaw`.
-        more: further entrants, likewise.
+        more: further entrants, as shipped names or `my_law.py:MyLaw`.
         seeds: number of seeds in place of its own.
 
     Raises:
@@ -95,42 +97,45 @@ def load_suite(
     families = []
     for i, family in enumerate(config.families):
         with located(f"{path}: families.{i}"):
-            beside = path.parent / family
-            families.append(load_family(beside if beside.is_file() else family))
+            local_path = path.parent / family
+            families.append(load_family(local_path if local_path.is_file() else family))
     own: dict[str, Entrant] = {}
     for i, entry in enumerate(config.entrants):
         with located(f"{path}: entrants.{i}"):
             entrant = entry.entrant() if isinstance(entry, EntrantConfig) else _entrant(entry, path.parent)
-            _add(own, entrant)
+            _add_entrant(own, entrant)
     absent = tuple(entrant for entrant in own.values() if entrant.missing)
     chosen = {name: entrant for name, entrant in own.items() if not entrant.missing}
     with located("--solvers"):
         if solvers:
             chosen = {}
             for name in solvers:
-                _add(chosen, own[name] if name in own and not own[name].missing else find_any(name))
+                _add_entrant(chosen, own[name] if name in own and not own[name].missing else find_any(name))
             absent = ()
     with located("--entrant"):
         for name in more:
-            _add(chosen, find_any(name))
+            _add_entrant(chosen, find_any(name))
     if not chosen:
         missing = ", ".join(f"{entrant.name} needs {', '.join(entrant.missing)}" for entrant in absent)
         raise ConfigError(f"{path}: entrants: none can take part: {missing}")
     names = [family.name for family in families]
-    if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise ConfigError(f"{path}: families: {twice[0]!r} is there twice; leave one out, or rename its file")
+    if duplicates := sorted({name for name in names if names.count(name) > 1}):
+        raise ConfigError(f"{path}: families: {duplicates[0]!r} is there twice; leave one out, or rename its file")
     return Suite(
         name=path.stem,
         title=config.title,
         families=tuple(families),
         entrants=tuple(chosen.values()),
-        seeds=range(config.first_seed, config.first_seed + _seeds(config.seeds if seeds is None else seeds)),
+        seeds=range(config.first_seed, config.first_seed + _check_seeds(config.seeds if seeds is None else seeds)),
         absent=absent,
     )
 
 
 def origin(family: Family) -> str:
-    """Digest of what a family's cases are made of: its file, what that refers to, and the version that makes them."""
+    """Return a digest of what a family's cases are made of.
+
+    These are its file, what that refers to, and the version that makes the cases.
+    """
     generator = (family.config.generator or "").rpartition(":")[0]
     text = (family.path.parent / generator).read_text(encoding="utf-8") if generator else ""
     fields: list[Any] = [version("qpavoid"), family.config.model_dump(mode="json"), family.templates, text]
@@ -138,7 +143,7 @@ def origin(family: Family) -> str:
 
 
 def find_any(name: str) -> Entrant:
-    """An entrant that ships and is installed, by name, or one of a user's own, as `my_law.py:MyLaw`.
+    """Return a shipped entrant by name, or a user's own as `my_law.py:MyLaw`.
 
     Raises:
         ConfigError, UnknownName: there is none.
@@ -146,26 +151,28 @@ def find_any(name: str) -> Entrant:
     return find_entrant(name) if name in ENTRANTS else _entrant(name, Path())
 
 
-def facts_of(entrants: Iterable[Entrant]) -> dict[str, Any]:
-    """What a report says of entrants, by their digests."""
-    return {e.digest: {"name": e.name, "says": e.says, "settings": dict(e.settings)} for e in entrants}
+def describe_entrants(entrants: Iterable[Entrant]) -> dict[str, Any]:
+    """Return the facts of entrants that a report needs, by their digests."""
+    return {e.digest: {"name": e.name, "says": e.description, "settings": dict(e.settings)} for e in entrants}
 
 
-def _seeds(count: int) -> int:
-    if not 1 <= count <= MOST_SEEDS:
-        raise ConfigError(f"--seeds {count}: give 1 to {MOST_SEEDS}")
+def _check_seeds(count: int) -> int:
+    """Return a number of seeds, or raise ConfigError if it is out of range."""
+    if not 1 <= count <= MAX_SEEDS:
+        raise ConfigError(f"--seeds {count}: give 1 to {MAX_SEEDS}")
     return count
 
 
 def _entrant(name: str, folder: Path) -> Entrant:
-    """By shipped name, installed or not, or from a file."""
+    """Return an entrant by shipped name, installed or not, or from a file."""
     file, _, inside = name.rpartition(":")
     if file.endswith(".py"):
-        return own_entrant(folder / file, inside)
+        return entrant_from_file(folder / file, inside)
     return ENTRANTS[name] if name in ENTRANTS else find_entrant(name)
 
 
-def _add(chosen: dict[str, Entrant], entrant: Entrant) -> None:
+def _add_entrant(chosen: dict[str, Entrant], entrant: Entrant) -> None:
+    """Add an entrant under its name, or raise ConfigError if the name is taken."""
     if entrant.name in chosen:
         raise ConfigError(f"{entrant.name!r} is there twice; leave one out, or give it another name")
     chosen[entrant.name] = entrant

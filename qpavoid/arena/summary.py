@@ -1,4 +1,4 @@
-"""What came out of a sweep at a glance, and whether it can be true; the report tells the rest."""
+"""Summary of a sweep, and consistency checks of its results."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from qpavoid.arena.suite import Suite
 from qpavoid.config import Fixed
 
 FIGURES = ("entrant", "success", "collided", "min_distance", "tick_p50", "failed", "failure")
-"""Columns of which the summary is made."""
+"""Columns that the summary needs."""
 
 
 def summary(runs: pa.Table) -> list[dict[str, Any]]:
-    """A row each entrant, in the order in which they first appear.
+    """Summarize runs, a row each entrant, in the order in which they first appear.
 
     Args:
         runs: rows of `scores.Score`, FIGURES of them at least.
@@ -48,14 +48,14 @@ def summary(runs: pa.Table) -> list[dict[str, Any]]:
     )
     columns = ["entrant", "entrant_count", *(f"{name}_{how}" for name, how in means), "tick_p50_approximate_median"]
     names = ["entrant", "runs", "success", "collided", "min_distance", "failed", "tick_p50"]
-    said = runs.filter(pc.greater(runs["failed"], 0.0)).group_by("entrant", use_threads=False)
-    first = {row["entrant"]: row["failure_first"] for row in said.aggregate([("failure", "first")]).to_pylist()}
+    failing_runs = runs.filter(pc.greater(runs["failed"], 0.0)).group_by("entrant", use_threads=False)
+    first = {row["entrant"]: row["failure_first"] for row in failing_runs.aggregate([("failure", "first")]).to_pylist()}
     rows: list[dict[str, Any]] = table.select(columns).rename_columns(names).to_pylist()
     return [{**row, "failure": first.get(row["entrant"], "")} for row in rows]
 
 
 def summary_table(runs: pa.Table, title: str) -> Table:
-    """The same for a terminal."""
+    """Lay out the summary of runs for a terminal."""
     table = Table(title=escape(title), title_justify="left", title_style="", box=box.SIMPLE_HEAD, pad_edge=False)
     table.add_column("entrant", no_wrap=True)
     for heading in ("runs", "success\n[%]", "collided\n[%]", "min dist\n[mm]", "tick\n[µs]", "failed\n[runs]"):
@@ -73,8 +73,8 @@ def summary_table(runs: pa.Table, title: str) -> Table:
     return table
 
 
-def broken(suite: Suite, runs: pa.Table, cases: pa.Table) -> Iterator[str]:
-    """What must hold whatever the laws are worth, and does not.
+def find_faults(suite: Suite, runs: pa.Table, cases: pa.Table) -> Iterator[str]:
+    """Yield what must hold whatever the solvers are worth, and does not.
 
     - every entrant has a row for every case, and no figure is NaN;
     - no entrant fails at every tick of a run, nor at any tick in all of its runs;
@@ -101,18 +101,19 @@ def broken(suite: Suite, runs: pa.Table, cases: pa.Table) -> Iterator[str]:
             yield f"{name}: NaN"
     tracking = runs.filter(pc.equal(runs["entrant"], "tracking"))
     if len(tracking) and not pc.any(tracking["collided"]).as_py():
-        yield "tracking touches nothing: the families ask for no avoiding, or the referee sees no contact"
-    if len(tracking) and (worst := pc.max(tracking["deviation"]).as_py()) > _OFF_THE_PATH:
+        yield "tracking touches nothing: the families need no avoidance, or the checker finds no contact"
+    if len(tracking) and (worst := pc.max(tracking["deviation"]).as_py()) > _MAX_BASELINE_DEVIATION:
         yield f"tracking is {1e3 * worst:.1f} mm off its path"
-    resting = {case["case"] for case in cases.to_pylist() if _rests(Case.from_json(case["json"]))}
+    static_cases = {case["case"] for case in cases.to_pylist() if _is_static(Case.from_json(case["json"]))}
     for row in rows:
-        if row["entrant"] == "qp" and row["collided"] and row["case"] in resting:
+        if row["entrant"] == "qp" and row["collided"] and row["case"] in static_cases:
             yield f"qp touches something in {row['family']}, seed {row['seed']}, where all obstacles rest"
 
 
-_OFF_THE_PATH = 0.02
-"""Of the tracking law, whose damping costs it something [m]."""
+_MAX_BASELINE_DEVIATION = 0.02
+"""Largest deviation of the `tracking` solver, whose damping lets it lag by some millimetres [m]."""
 
 
-def _rests(case: Case) -> bool:
+def _is_static(case: Case) -> bool:
+    """Return True if all obstacles of a case rest and are measured exactly."""
     return case.sensor.perfect and all(isinstance(obstacle.motion, Fixed) for obstacle in case.scenario.obstacles)

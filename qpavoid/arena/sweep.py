@@ -1,8 +1,8 @@
-"""Runs a suite: makes the cases that are not there yet, then all runs that are not there yet, on a Dask cluster.
+"""Sweeps: make the missing cases of a suite, then do its missing runs, on a Dask cluster.
 
 The same code runs on the cores of this machine and on a cluster of many: only the client differs. A task whose worker
-dies is done again, in the end with nothing else beside it that could have brought the worker down; a task has one
-answer, whoever gave it, and each answer is in the results folder before the next one is looked at.
+dies is done once more, in the end with nothing else beside it that could have brought the worker down; a task has one
+answer, whichever worker gave it, and each answer is in the results folder before the next one is read.
 """
 
 from __future__ import annotations
@@ -27,25 +27,25 @@ from tornado.ioloop import PeriodicCallback
 from qpavoid.arena.case import Case
 from qpavoid.arena.entrants import Entrant
 from qpavoid.arena.families import Family, load_family, make_case
+from qpavoid.arena.mujoco_model import build
 from qpavoid.arena.plan import cases_of, missing_cases, missing_runs
 from qpavoid.arena.store import Journal, Store, read_cases
-from qpavoid.arena.suite import Suite, facts_of, origin
-from qpavoid.arena.trial import held, run_trial
-from qpavoid.arena.twin import build
+from qpavoid.arena.suite import Suite, describe_entrants, origin
+from qpavoid.arena.trial import failing_entrant, run_trial
 from qpavoid.arena.world import build_world
 from qpavoid.errors import ConfigError, QpavoidError
 from qpavoid.run.machine import machine, versions
 
-_ANSWER_WITHIN = 10.0
+_CONNECT_TIMEOUT = 10.0
 """Time in which a scheduler has to answer, and a first worker to be there [s]."""
-_LOOK_FOR_LOST = 2.0
-"""Time between looks at whether all processes of this machine are there [s]."""
+_REPLACE_PERIOD = 2.0
+"""Time between checks whether all processes of this machine are alive [s]."""
 _KILLED = "the processes that ran it ended before it was done, each time: killed, out of memory or crashed"
-_GONE = "the scheduler went away"
+_SCHEDULER_LOST = "the scheduler went away"
 _SINGLE_THREADED = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "NUMBA")}
-_DEAF = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
-"""Run by a worker as it starts: a terminal sends Ctrl-C to it as well, and it is for the sweep to end its workers."""
-_DASK = {
+_IGNORE_INTERRUPT = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
+"""Run by a worker as it starts: a terminal sends Ctrl-C to workers as well, which the sweep has to end itself."""
+_DASK_CONFIG = {
     "distributed.scheduler.allowed-failures": 0,  # whose worker died is tried again by us, alone
     "distributed.admin.low-level-log-length": 0,  # the scheduler's memory stays flat
     "distributed.deploy.lost-worker-timeout": "60 s",  # on a busy machine it takes long to start again
@@ -53,88 +53,93 @@ _DASK = {
 
 
 class ClusterLost(QpavoidError):
-    """The scheduler went away; what was done is kept."""
+    """The scheduler went away; finished runs are kept."""
 
 
 class Tally(NamedTuple):
-    """How far a sweep is."""
+    """Progress of a sweep."""
 
     stage: str
     """`cases` or `runs`."""
     done: int
     total: int
-    """Of those that were not there before."""
+    """Number of those that were not there before."""
     collided: int
-    """Runs with a contact among them."""
+    """Number of runs with a contact."""
     failed: int
-    """Of which there is no row: they are in failures.jsonl."""
+    """Number without a row: they are in failures.jsonl."""
 
 
 @contextmanager
 def local_cluster(jobs: int | None = None) -> Iterator[Client]:
-    """Processes of one thread each on this machine, one a core if `jobs` is left out."""
+    """Start processes of one thread each on this machine, one a core if `jobs` is left out."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     count = cores if jobs is None else jobs
     with (
-        _quiet(),
-        dask.config.set(_DASK),
+        _silenced_dask_log(),
+        dask.config.set(_DASK_CONFIG),
         LocalCluster(
             n_workers=count,
             threads_per_worker=1,
             scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
             silence_logs=logging.CRITICAL,
             env=_SINGLE_THREADED,
-            preload=[_DEAF],
+            preload=[_IGNORE_INTERRUPT],
         ) as cluster,
         Client(cluster) as client,
     ):
         # Dask gives a worker up that is not back in time, or that dies again as it starts, and replaces it when asked
-        asking = PeriodicCallback(lambda: cluster.scale(count), 1e3 * _LOOK_FOR_LOST)
-        cluster.periodic_callbacks["lost workers"] = asking  # stopped when the cluster is closed
-        cluster.loop.add_callback(asking.start)
+        replacement = PeriodicCallback(lambda: cluster.scale(count), 1e3 * _REPLACE_PERIOD)
+        cluster.periodic_callbacks["lost workers"] = replacement  # stopped when the cluster is closed
+        cluster.loop.add_callback(replacement.start)
         yield client
 
 
 @contextmanager
 def remote_cluster(address: str) -> Iterator[Client]:
-    """A Dask cluster that runs already.
+    """Connect to a Dask cluster that runs already.
 
     Raises:
         ConfigError: no scheduler or no worker answers, or one is of another version of qpavoid.
     """
-    with _quiet():
+    with _silenced_dask_log():
         try:
-            client = Client(address, timeout=_ANSWER_WITHIN)
+            client = Client(address, timeout=_CONNECT_TIMEOUT)
         except (OSError, ValueError, TypeError) as error:  # TimeoutError among them
             start = "start one with `dask scheduler`, and give the address that it prints, as in tcp://host:8786"
-            said = " ".join(str(error).split()) or type(error).__name__
-            raise ConfigError(f"--cluster {address}: no scheduler answers: {said:.200}; {start}") from None
+            message = " ".join(str(error).split()) or type(error).__name__
+            raise ConfigError(f"--cluster {address}: no scheduler answers: {message:.200}; {start}") from None
         with client:
             _check_workers(client, address)
             yield client
 
 
 def _check_workers(client: Client, address: str) -> None:
+    """Check that there is a worker, and that all have this version of qpavoid."""
     try:
-        client.wait_for_workers(1, timeout=_ANSWER_WITHIN)
+        client.wait_for_workers(1, timeout=_CONNECT_TIMEOUT)
     except TimeoutError:
         raise ConfigError(f"--cluster {address}: no worker there; start some with `dask worker {address}`") from None
-    for worker, found in client.run(version, "qpavoid", on_error="return").items():
-        if found != version("qpavoid"):
-            said = f"qpavoid {found}" if isinstance(found, str) else f"no qpavoid ({type(found).__name__}: {found})"
+    for worker, worker_version in client.run(version, "qpavoid", on_error="return").items():
+        if worker_version != version("qpavoid"):
+            message = (
+                f"qpavoid {worker_version}"
+                if isinstance(worker_version, str)
+                else f"no qpavoid ({type(worker_version).__name__}: {worker_version})"
+            )
             raise ConfigError(
-                f"--cluster {address}: worker {worker} has {said}, here it is {version('qpavoid')}; install the same"
+                f"--cluster {address}: worker {worker} has {message}, here it is {version('qpavoid')}; install the same"
             )
 
 
-def sweep(suite: Suite, store: Store, client: Client, tell: Callable[[Tally], None]) -> Tally:
-    """Makes and runs whatever of a suite is not in the store yet.
+def sweep(suite: Suite, store: Store, client: Client, report_progress: Callable[[Tally], None]) -> Tally:
+    """Make and run whatever of a suite is not in the store yet.
 
     Args:
         suite: what is to be there in the end.
         store: where results go.
         client: who does the work.
-        tell: hears how far it is, after every answer.
+        report_progress: called with the progress after every answer.
 
     Returns:
         How it ended: runs, and what failed of cases and runs.
@@ -143,52 +148,65 @@ def sweep(suite: Suite, store: Store, client: Client, tell: Callable[[Tally], No
         ClusterLost: the scheduler went away.
     """
     store.describe(_facts(suite, client))
-    lost = _make_cases(suite, store, client, tell).failed
-    todo = missing_runs(suite, store.folder, cases_of(suite, store.folder))
+    failed_cases = _make_cases(suite, store, client, report_progress).failed
+    missing = missing_runs(suite, store.folder, cases_of(suite, store.folder))
 
-    def about(unit: _Unit) -> dict[str, Any]:
-        case = Case.from_json(unit[0])
-        return {"family": case.family, "seed": case.seed, "entrant": unit[1].name}
+    def describe(pending_run: _PendingRun) -> dict[str, Any]:
+        case = Case.from_json(pending_run[0])
+        return {"family": case.family, "seed": case.seed, "entrant": pending_run[1].name}
 
-    answers = _run_all(client, _units(suite, todo, store.folder))
-    tally = _collect("runs", len(todo), answers, store.runs, store.fail, about, tell)
-    return tally._replace(failed=tally.failed + lost)
+    answers = _run_all(client, _pending_runs(suite, missing, store.folder))
+    tally = _collect("runs", len(missing), answers, store.runs, store.fail, describe, report_progress)
+    return tally._replace(failed=tally.failed + failed_cases)
 
 
-def _make_cases(suite: Suite, store: Store, client: Client, tell: Callable[[Tally], None]) -> Tally:
-    todo = missing_cases(suite, store.folder)
+def _make_cases(suite: Suite, store: Store, client: Client, report_progress: Callable[[Tally], None]) -> Tally:
+    missing = missing_cases(suite, store.folder)
     paths = {family.name: str(family.path.resolve()) for family in suite.families}
-    calls = ((paths[row["family"]], row["origin"], row["seed"]) for row in _each(todo))
+    calls = ((paths[row["family"]], row["origin"], row["seed"]) for row in _iterate_rows(missing))
 
-    def about(call: tuple[str, str, int]) -> dict[str, Any]:
+    def describe(call: tuple[str, str, int]) -> dict[str, Any]:
         return {"family": Path(call[0]).stem, "seed": call[2], "entrant": None}
 
-    return _collect("cases", len(todo), _answers(client, _make, calls), store.cases, store.fail, about, tell)
+    return _collect(
+        "cases",
+        len(missing),
+        _submit_with_retry(client, _make_case, calls),
+        store.cases,
+        store.fail,
+        describe,
+        report_progress,
+    )
 
 
-def _each(table: pa.Table) -> Iterator[dict[str, Any]]:
+def _iterate_rows(table: pa.Table) -> Iterator[dict[str, Any]]:
     for batch in table.to_batches(max_chunksize=1000):
         yield from batch.to_pylist()
 
 
-_Unit = tuple[str, Entrant]
-"""A run that is to be done: the case as JSON, and who runs it."""
+_PendingRun = tuple[str, Entrant]
+"""A run that is to be done: the case as JSON, and its entrant."""
 
 
-def _units(suite: Suite, todo: pa.Table, folder: Path) -> Iterator[_Unit]:
+def _pending_runs(suite: Suite, missing: pa.Table, folder: Path) -> Iterator[_PendingRun]:
     entrants = {entrant.name: entrant for entrant in suite.entrants}
     cases = read_cases(folder)
-    for batch in todo.to_batches(max_chunksize=1000):
+    for batch in missing.to_batches(max_chunksize=1000):
         texts = cases["json"].take(pc.index_in(batch["case"], cases["case"]))
         yield from zip(texts.to_pylist(), (entrants[name] for name in batch["entrant"].to_pylist()), strict=True)
 
 
-def _run_all(client: Client, units: Iterable[_Unit]) -> Iterator[tuple[_Unit, Any]]:
-    """Runs with their rows, or what was raised; one that takes its process down counts as one that never moves."""
+def _run_all(client: Client, pending_runs: Iterable[_PendingRun]) -> Iterator[tuple[_PendingRun, Any]]:
+    """Yield runs with their rows or exceptions.
+
+    A run that takes its process down counts as one in which the robot never moves.
+    """
     ours = version("qpavoid")
-    for (text, entrant, _), answer in _answers(client, _run, ((*unit, ours) for unit in units)):
+    for (text, entrant, _), answer in _submit_with_retry(
+        client, _run_case, ((*pending_run, ours) for pending_run in pending_runs)
+    ):
         if isinstance(answer, KilledWorker):
-            ((_, answer),) = _answers(client, _run, [(text, held(entrant, _KILLED), ours)])
+            ((_, answer),) = _submit_with_retry(client, _run_case, [(text, failing_entrant(entrant, _KILLED), ours)])
         yield (text, entrant), answer
 
 
@@ -198,29 +216,29 @@ def _collect(
     answers: Iterable[tuple[Any, Any]],
     journal: Journal,
     fail: Callable[[dict[str, Any]], None],
-    about: Callable[[Any], dict[str, Any]],
-    tell: Callable[[Tally], None],
+    describe: Callable[[Any], dict[str, Any]],
+    report_progress: Callable[[Tally], None],
 ) -> Tally:
-    """Writes down every answer as it comes: rows into a journal, and what was raised with what it is about."""
+    """Record every answer as it comes: rows in a journal, exceptions as failures."""
     tally = Tally(stage, 0, total, 0, 0)
-    tell(tally)
+    report_progress(tally)
     for call, answer in answers:
         failed, collided = isinstance(answer, BaseException), False
         if failed:
-            fail({**about(call), "failure": f"{type(answer).__name__}: {answer}"[:500]})
+            fail({**describe(call), "failure": f"{type(answer).__name__}: {answer}"[:500]})
         else:
             journal.append(answer)
             collided = answer.get("collided", False)
         tally = Tally(stage, tally.done + 1, total, tally.collided + collided, tally.failed + failed)
-        tell(tally)
+        report_progress(tally)
     return tally
 
 
 # --- what workers do ---------------------------------------------------------------------------------------
 
 
-def _make(path: str, of: str, seed: int) -> dict[str, Any]:
-    """Makes a case, and sees to it that it can be judged: a row of `store.CASES`."""
+def _make_case(path: str, of: str, seed: int) -> dict[str, Any]:
+    """Make a case and check that MuJoCo can model it: a row of `store.CASES`."""
     family = _family(path, of)
     case = make_case(family, seed)
     world = build_world(case.scenario)
@@ -236,8 +254,8 @@ def _family(path: str, of: str) -> Family:
     return family
 
 
-def _run(case: str, entrant: Entrant, of: str) -> dict[str, Any]:
-    """Runs a case: a row of `store.RUNS`."""
+def _run_case(case: str, entrant: Entrant, of: str) -> dict[str, Any]:
+    """Run a case: a row of `store.RUNS`."""
     if version("qpavoid") != of:
         raise ConfigError(f"this worker has qpavoid {version('qpavoid')} in place of {of}; install the same")
     if entrant.missing:
@@ -248,67 +266,73 @@ def _run(case: str, entrant: Entrant, of: str) -> dict[str, Any]:
 # --- Dask --------------------------------------------------------------------------------------------------
 
 
-def _answers(
+def _submit_with_retry(
     client: Client, function: Callable[..., Any], calls: Iterable[tuple[Any, ...]]
 ) -> Iterator[tuple[tuple[Any, ...], Any]]:
-    """Each call with what it returned or raised, as they come; at the end, one by one, those whose workers died."""
+    """Yield each call with its result or exception, as they come.
+
+    Calls whose workers died are done once more at the end, one by one.
+    """
     killed = []
-    for call, answer in _together(client, function, calls):
+    for call, answer in _submit_all(client, function, calls):
         if isinstance(answer, KilledWorker):
             killed.append(call)
         else:
             yield call, answer
     for call in killed:
-        yield from _together(client, function, [call])
+        yield from _submit_all(client, function, [call])
 
 
-def _together(
+def _submit_all(
     client: Client, function: Callable[..., Any], calls: Iterable[tuple[Any, ...]]
 ) -> Iterator[tuple[tuple[Any, ...], Any]]:
-    """Each call with what it returned or raised, as they come.
+    """Yield each call with its result or exception, as they come.
 
     No more are under way than there are threads, however many there are in all: none waits at a worker behind one that
     brings it down.
     """
     calls = iter(calls)
-    under_way: dict[str, tuple[Any, ...]] = {}
+    pending: dict[str, tuple[Any, ...]] = {}
     futures = as_completed(with_results=True, raise_errors=False)
 
     def refill() -> None:
-        free = max(_threads(client) - len(under_way), not under_way)
+        free = max(_threads(client) - len(pending), not pending)
         for call in itertools.islice(calls, free):
             future = client.submit(function, *call, key=f"{function.__name__}-{uuid4().hex}", pure=False)
-            under_way[future.key] = call
+            pending[future.key] = call
             futures.add(future)
 
     refill()
     for future, answer in futures:
-        call = under_way.pop(future.key)
+        call = pending.pop(future.key)
         if future.cancelled():
-            raise ClusterLost(_GONE)
+            raise ClusterLost(_SCHEDULER_LOST)
         yield call, answer[1] if future.status == "error" else answer
         del future
         refill()
 
 
 def _threads(client: Client) -> int:
-    """How many tasks can run at a time, on all workers that are there now."""
+    """Return the number of tasks that can run at a time, on all current workers."""
     try:
         return sum(client.nthreads().values())
     except OSError:  # of a connection that is closed
-        raise ClusterLost(_GONE) from None
+        raise ClusterLost(_SCHEDULER_LOST) from None
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
-    """Dask's log tells of every worker that dies, and of every connection that closes; what matters is told by us."""
+def _silenced_dask_log() -> Iterator[None]:
+    """Silence Dask's log, which reports every dead worker and closed connection.
+
+    The sweep reports those that matter.
+    """
     log = logging.getLogger("distributed")
-    before = log.level
+    level_before = log.level
     log.setLevel(logging.CRITICAL)
     try:
         yield
     finally:
-        log.setLevel(before)
+        log.setLevel(level_before)
 
 
 def _facts(suite: Suite, client: Client) -> dict[str, Any]:
@@ -318,7 +342,7 @@ def _facts(suite: Suite, client: Client) -> dict[str, Any]:
         "families": [family.name for family in suite.families],
         "seeds": len(suite.seeds),
         "first_seed": suite.seeds.start,
-        "entrants": facts_of(suite.entrants),
+        "entrants": describe_entrants(suite.entrants),
         "absent": {entrant.name: list(entrant.missing) for entrant in suite.absent},
         "versions": versions(),
         "machine": machine(),

@@ -1,4 +1,4 @@
-"""Tables of the arena's report: which figures they show, of which runs, with which intervals."""
+"""Tables of the arena's report: figures, families and intervals."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ class Column(NamedTuple):
     """One figure of a table."""
 
     name: str
-    """Of `scores.Score`."""
+    """Name of the figure in `scores.Score`."""
     heading: str
-    """With its unit."""
+    """Heading with its unit."""
     scale: float
-    """From the score's unit to the table's."""
+    """Factor from the score's unit to the table's."""
     digits: int
     kind: str
     """`rate`, `mean` and `median` come with an interval; `low`, what 95 % of the runs are above, without."""
-    says: str
+    description: str
 
 
 COLUMNS = (
@@ -58,14 +58,14 @@ MORE = (
 
 
 class Cell(NamedTuple):
-    """What a table shows, and what it is sorted by."""
+    """Text of a cell, and the value that it is sorted by."""
 
     text: str
     sort: float | str
     span: str = ""
-    """The range behind a figure."""
+    """Interval of a figure."""
     code: bool = False
-    """Whether it is to be typed as it stands."""
+    """Whether the text is shown as code."""
 
 
 @dataclass(frozen=True)
@@ -85,11 +85,14 @@ class Section:
     points: tuple[str, ...] = ()
     tables: tuple[Table, ...] = ()
     pictures: tuple[tuple[str, str, Any], ...] = ()
-    """Name, caption, figure."""
+    """Name, caption and figure of each picture."""
 
 
 def score_tables(results: Results, family: int | None = None) -> tuple[Table, ...]:
-    """What matters most, and the rest; entrants in the order of their ranks, of one family or of all."""
+    """Tabulate the main figures, and the further ones, of one family or of all.
+
+    Entrants are in the order of their ranks.
+    """
     place = results.ranking(family)
     return tuple(_score_table(results, columns, place, family) for columns in (COLUMNS, MORE))
 
@@ -117,7 +120,7 @@ def _cell(values: Array, column: Column) -> Cell:
 
 
 def interval_cell(interval: Interval, scale: float, digits: int) -> Cell:
-    """A figure and its range."""
+    """Return a cell with a figure and its interval."""
     value, low, high = (_shown(scale * side, digits) for side in interval)
     return Cell(value, interval.value, f"{low} – {high}")
 
@@ -127,10 +130,10 @@ def _shown(value: float, digits: int) -> str:
 
 
 def text_cell(text: str) -> Cell:
-    """A cell that is sorted by what it shows."""
+    """Return a cell that is sorted by its text."""
     return Cell(text, text)
 
 
 def count_cell(count: int) -> Cell:
-    """A cell that holds a number of something."""
+    """Return a cell with a number of something."""
     return Cell(str(count), count)

@@ -1,4 +1,4 @@
-"""What a case consists of once it is built: the scene, what is to be followed, and where the robot starts."""
+"""A case, built: scene, tasks, and configuration at the start."""
 
 from __future__ import annotations
 
@@ -20,35 +20,35 @@ class World(NamedTuple):
     scene: Scene
     tasks: tuple[AnyTask, ...]
     q0: Array
-    """(nq,) where the robot starts."""
+    """(nq,) configuration at the start."""
 
     @property
     def tools(self) -> list[FrameTask]:
-        """Tasks whose frames have a position to follow."""
+        """Return the tasks whose frames have a position to follow."""
         return [task for task in self.tasks if isinstance(task, FrameTask) and task.moves]
 
 
 def build_world(scenario: ScenarioConfig) -> World:
-    """The world of a scenario.
+    """Build the world of a scenario.
 
     Raises:
         ConfigError, UnknownName: naming file, field and remedy.
     """
     source = scenario.source
     with located(f"{source}: robot"):
-        robot = _loaded(scenario.robot, source.parent)
+        robot = _load_robot(scenario.robot, source.parent)
     q0 = robot.configuration(scenario.q0, f"{source}: q0")
-    return world_of(scenario, *robot.lock(scenario.lock, q0, f"{source}: lock"))
+    return build_world_of(scenario, *robot.lock(scenario.lock, q0, f"{source}: lock"))
 
 
 @lru_cache(maxsize=16)
-def _loaded(name: str, folder: Path) -> Robot:
-    """Sweeps run the same few robots again and again; reading the meshes of a humanoid takes longer than a run."""
+def _load_robot(name: str, folder: Path) -> Robot:
+    """Load a robot once a process: a humanoid's meshes take longer to read than a run takes."""
     return Robot.load(name, folder)
 
 
-def world_of(scenario: ScenarioConfig, robot: Robot, q0: Array) -> World:
-    """The same, of a robot that is loaded, its joints locked.
+def build_world_of(scenario: ScenarioConfig, robot: Robot, q0: Array) -> World:
+    """Build the world of a scenario with a robot that is loaded, its joints locked.
 
     Raises:
         ConfigError, UnknownName: naming file, field and remedy.

@@ -1,4 +1,6 @@
-"""Many scenarios, or many states of one, on all cores: one process a core, one thread in each.
+"""Run many scenarios, or many states of one, on all cores.
+
+One process a core, one thread in each.
 
 Processes are started afresh ("spawn"), so a script that calls these needs the usual `if __name__ == "__main__":`.
 Starting them takes about a second, as long as ten thousand ticks: keep `Workers` where calls follow each other.
@@ -32,7 +34,7 @@ from qpavoid.run.simulate import simulate
 
 
 class WorkerDied(QpavoidError):
-    """The process that did the work ended before it answered: killed, out of memory, crashed."""
+    """A worker process ended before its call was done: killed, out of memory, crashed."""
 
 
 class BatchError(QpavoidError):
@@ -40,15 +42,15 @@ class BatchError(QpavoidError):
 
     def __init__(self, logs: list[Log | None], errors: dict[int, Exception]) -> None:
         self.logs = logs
-        """In the order of the input; None where there is none."""
+        """Log of each scenario in the order of the input; None where there is none."""
         self.errors = errors
-        """What went wrong, by index in the input."""
+        """Error of each scenario that could not be run, by its index in the input."""
         lines = [f"  {i}: {type(error).__name__}: {error}" for i, error in errors.items()]
         super().__init__("\n".join([f"{len(errors)} of {len(logs)} scenarios could not be run:", *lines]))
 
 
 class Steps(NamedTuple):
-    """What a controller commands in n states."""
+    """Velocities that a controller commands in n states."""
 
     v: Array
     """(n, nv) joint velocities [rad/s or m/s]."""
@@ -61,7 +63,7 @@ def simulate_many(
     jobs: int | Workers | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Log]:
-    """Runs scenarios, each as `simulate` does.
+    """Run scenarios, each as `simulate` does.
 
     Args:
         scenarios: configurations, shipped names or paths.
@@ -84,7 +86,7 @@ def simulate_many(
 
 
 def steps(scenario: ScenarioConfig | str, q: Array, t: float | Array = 0.0, jobs: int | Workers | None = None) -> Steps:
-    """One tick in each of n states of a scenario that have nothing to do with each other; the robot is at rest in all.
+    """Compute a control step in each of n independent states, the robot at rest in all.
 
     Args:
         scenario: configuration, shipped name or path.
@@ -111,6 +113,7 @@ def steps(scenario: ScenarioConfig | str, q: Array, t: float | Array = 0.0, jobs
 
 
 def _steps(scenario: bytes, q: Array, t: Array) -> Steps:
+    """Compute one control step in each of the states q (n, nq) at times t (n,) [s]."""
     controller = _controller(scenario)
     solutions = []
     for state in zip(q, t.tolist(), strict=True):
@@ -122,7 +125,7 @@ def _steps(scenario: bytes, q: Array, t: Array) -> Steps:
 
 @lru_cache(maxsize=1)
 def _controller(scenario: bytes) -> Controller:
-    """A process builds the scenario that it keeps getting once."""
+    """Build the controller of a pickled scenario, once for all calls of a batch."""
     return Controller.from_scenario(pickle.loads(scenario))[0]
 
 
@@ -130,7 +133,7 @@ class Workers:
     """Processes that wait for work, until `close` or the end of the `with` block."""
 
     def __init__(self, jobs: int | None = None) -> None:
-        """Starts `jobs` processes, one a core if left out.
+        """Start `jobs` processes, one a core if left out.
 
         Raises:
             ValueError: no job at all.
@@ -149,8 +152,8 @@ class Workers:
                 started.result()
         except BrokenProcessPool:
             self.close()
-            guard = 'a script that starts processes needs `if __name__ == "__main__":` around what it does'
-            raise WorkerDied(f"a process ended while it started; {guard}") from None
+            remedy = 'a script that starts processes needs `if __name__ == "__main__":` around what it does'
+            raise WorkerDied(f"a process ended while it started; {remedy}") from None
 
     def __len__(self) -> int:
         return self._count
@@ -162,7 +165,7 @@ class Workers:
         self.close()
 
     def close(self) -> None:
-        """Ends the processes."""
+        """End the processes."""
         self._count = 0
         while not self._idle.empty():
             self._idle.get().shutdown()
@@ -173,17 +176,17 @@ class Workers:
         arguments: Sequence[tuple[Any, ...]],
         progress: Callable[[int, int], None] | None = None,
     ) -> list[Any]:
-        """Calls a function of some module with each of several arguments.
+        """Call a function of some module with each of several arguments.
 
         Returns:
             What it returned, or the exception that it raised, in the order of the arguments. A process that dies
             takes its own call with it (`WorkerDied`), no other, and is replaced.
         """
 
-        def run(given: tuple[Any, ...]) -> Any:
+        def run(call_arguments: tuple[Any, ...]) -> Any:
             pool = self._idle.get()
             try:
-                return pool.submit(call, *given).result()
+                return pool.submit(call, *call_arguments).result()
             except BrokenProcessPool:
                 del self._pids[pool]
                 pool = self._start()
@@ -194,11 +197,11 @@ class Workers:
                 self._idle.put(pool)
 
         with ThreadPoolExecutor(len(self)) as threads:
-            futures = [threads.submit(run, given) for given in arguments]
+            futures = [threads.submit(run, call_arguments) for call_arguments in arguments]
             try:
-                for done, _ in enumerate(as_completed(futures), 1):
+                for count_done, _ in enumerate(as_completed(futures), 1):
                     if progress is not None:
-                        progress(done, len(futures))
+                        progress(count_done, len(futures))
             except BaseException:  # Ctrl-C: do not begin what is left, nor wait for what began before that was known
                 threads.shutdown(wait=False, cancel_futures=True)
                 self._kill()
@@ -221,28 +224,28 @@ _starting = Lock()
 
 
 def _start() -> tuple[ProcessPoolExecutor, Future[int]]:
-    """Start a pool of one process, which ends without a word at Ctrl-C; and the id of the process, once it runs."""
+    """Start a pool of one process, which ends without a message at Ctrl-C; and the id of the process, once it runs."""
     spawn = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(1, spawn, signal.signal, (signal.SIGINT, signal.SIG_DFL))
     with _starting:  # the number of threads must be in the environment when the process loads its libraries
-        before = dict(os.environ)
+        environment = dict(os.environ)
         os.environ.update(_SINGLE_THREADED)
         try:
             pid = pool.submit(os.getpid)  # starts the process
         finally:
             for name in _SINGLE_THREADED:
                 os.environ.pop(name)
-            os.environ.update({name: before[name] for name in _SINGLE_THREADED if name in before})
+            os.environ.update({name: environment[name] for name in _SINGLE_THREADED if name in environment})
     return pool, pid
 
 
-def _workers(jobs: int | Workers | None, most: int) -> AbstractContextManager[Workers]:
-    """Workers for at most that many calls; those that are kept stay open."""
+def _workers(jobs: int | Workers | None, count: int) -> AbstractContextManager[Workers]:
+    """Return workers for at most `count` calls; a `Workers` that the caller owns stays open."""
     if isinstance(jobs, Workers):
         return nullcontext(jobs)
-    return Workers(min(_cores() if jobs is None else jobs, max(most, 1)))
+    return Workers(min(_cores() if jobs is None else jobs, max(count, 1)))
 
 
 def _cores() -> int:
-    """Cores that this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

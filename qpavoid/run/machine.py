@@ -1,4 +1,4 @@
-"""On what results were made: versions and hardware, for the head of a report."""
+"""Versions and hardware that results were made on, for the head of a report."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ PACKAGES = (
     "qpavoid", "numpy", "scipy", "pin", "coal", "numba", "mujoco", "daqp", "proxsuite", "osqp", "quadprog", "qpsolvers",
     "pin-pink", "mink", "placo", "distributed", "pyarrow",
 )  # fmt: skip
-"""Whose versions are told, where they are installed."""
+"""Packages whose versions a report lists, where they are installed."""
 
 
 def machine() -> dict[str, Any]:
-    """Processor, cores, system and interpreter of the machine that this runs on."""
+    """Describe this machine: processor, cores, system and interpreter."""
     return {
         "cpu": cpu(),
         "cores": os.cpu_count(),
@@ -27,7 +27,7 @@ def machine() -> dict[str, Any]:
 
 
 def versions(packages: Iterable[str] = PACKAGES) -> dict[str, str]:
-    """Version by package, of those that are installed."""
+    """Return the version of each package that is installed."""
     found = {}
     for package in packages:
         try:
@@ -38,7 +38,7 @@ def versions(packages: Iterable[str] = PACKAGES) -> dict[str, str]:
 
 
 def cpu() -> str:
-    """Name of the processor."""
+    """Return the name of the processor."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

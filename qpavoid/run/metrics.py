@@ -14,12 +14,12 @@ if TYPE_CHECKING:
     from qpavoid.run.log import Log
 
 
-_MOST_EVENTS = 20
-"""Number of changes of reasons that are among the figures of a run."""
+_MAX_EVENTS = 20
+"""Number of changes of reasons that are among the figures of a run: what a reader of JSON can take in."""
 
 
 def run_metrics(log: Log) -> dict[str, Any]:
-    """The figures by which runs are compared.
+    """Compute the figures by which runs are compared.
 
     Returns:
         scenario, solver; completed: ran for its whole duration; arrived: so it did, and every task that is measured in
@@ -28,9 +28,9 @@ def run_metrics(log: Log) -> dict[str, Any]:
         time_in_collision [s]; time_below: threshold -> [s]; final_error [m]; max_deviation: largest distance of a tool
         from its planned path [m]; tracking_rmse: of the distance to the moving target [m]; peak_velocity: fastest
         joint [rad/s or m/s]; jitter: Σ|Δq̇| over joints and ticks [rad/s]; status_counts; relaxed_ticks;
-        shortened_ticks: drawn back after looking ahead; time_blocked [s]; severity_counts: steps by the worst severity
-        of their reasons; events: the first changes of reasons, as [t, status, reasons as data]; tick_us: p50, p99 and
-        max of the tick's time [µs].
+        shortened_ticks: steps scaled down by the stop look-ahead; time_blocked: stalled [s]; severity_counts: steps by
+        the worst severity of their reasons; events: the first changes of reasons, as [t, status, reasons as data];
+        tick_us: p50, p99 and max of the computation time of a step [µs].
     """
     config, dt = log.meta["config"], log.meta["config"]["dt"]
     distance = log.min_distance
@@ -39,12 +39,12 @@ def run_metrics(log: Log) -> dict[str, Any]:
     statuses = [status.value for status in Status]
     counts = {name: int(np.sum(log.status == code)) for code, name in enumerate(statuses)}
     tick_us = 1e6 * (log.build_time + log.solve_time)
-    others = {
+    other_tasks = {
         name: [float(log.task_error[-1, i]), unit]
         for i, (name, unit) in enumerate(log.meta.get("tasks", []))
         if len(log.task_error)
     }
-    metres = [value for value, unit in others.values() if unit == "m"]
+    metres = [value for value, unit in other_tasks.values() if unit == "m"]
     final_error = float(np.max([*error[-1], *metres])) if len(error) and (error.shape[1] or metres) else float("nan")
     return {
         "scenario": log.meta["scenario"],
@@ -57,17 +57,17 @@ def run_metrics(log: Log) -> dict[str, Any]:
         "time_in_collision": dt * float(np.sum(distance < 0.0)),
         "time_below": {str(limit): dt * float(np.sum(distance < limit)) for limit in config["thresholds"]},
         "final_error": final_error,
-        "task_errors": others,
+        "task_errors": other_tasks,
         "max_deviation": float(np.max(path_deviation(log), initial=0.0)),
         "tracking_rmse": float(np.sqrt(np.mean(error**2))) if error.size else float("nan"),
         "peak_velocity": float(np.max(np.abs(log.v), initial=0.0)),
         "jitter": float(np.sum(np.abs(np.diff(log.v, axis=0)))),
         "status_counts": counts,
         "relaxed_ticks": counts[Status.RELAXED.value],
-        "shortened_ticks": int(np.sum(log.share < 1.0)),
+        "shortened_ticks": int(np.sum(log.command_scale < 1.0)),
         "time_blocked": dt * float(np.sum(log.stalled)),
         "severity_counts": {level.name: int(np.sum(log.severity == level)) for level in Severity},
-        "events": log.meta["events"][:_MOST_EVENTS],
+        "events": log.meta["events"][:_MAX_EVENTS],
         "tick_us": {
             "p50": float(np.median(tick_us)) if len(tick_us) else float("nan"),
             "p99": float(np.quantile(tick_us, 0.99)) if len(tick_us) else float("nan"),
@@ -77,7 +77,7 @@ def run_metrics(log: Log) -> dict[str, Any]:
 
 
 def path_deviation(log: Log, corners: int = 500) -> Array:
-    """Distance of each tool from the path that its target draws, at whatever time.
+    """Compute the distance of each tool from the path that its target draws, at whatever time.
 
     Args:
         log: the run.

@@ -22,8 +22,8 @@ _COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
     ("tick\n[µs]", lambda run: f"{run['tick_us']['p50']:.0f}"),
 )
 """Heading and cell of each column between solver and outcome, the most important first."""
-_OUTCOME = 13
-"""Width of the outcome below which columns are left out [characters]."""
+_OUTCOME_WIDTH = 13
+"""Width of the outcome below which columns are left out [characters]: `short of goal` on one line."""
 
 
 def metrics_table(runs: Sequence[dict[str, Any]], width: int = 80) -> Table:
@@ -34,13 +34,13 @@ def metrics_table(runs: Sequence[dict[str, Any]], width: int = 80) -> Table:
         width: of the terminal [characters].
     """
     cells = [[cell(run) for _, cell in _COLUMNS] for run in runs]
-    used, shown = 2 + max(cell_len(run["solver"]) for run in (*runs, {"solver": "solver"})), 0
+    width_used, count_shown = 2 + max(cell_len(run["solver"]) for run in (*runs, {"solver": "solver"})), 0
     for (heading, _), *column in zip(_COLUMNS, *cells, strict=True):
-        used += 1 + max(map(cell_len, (*heading.split("\n"), *column)))
-        if used + 1 + _OUTCOME > width:
+        width_used += 1 + max(map(cell_len, (*heading.split("\n"), *column)))
+        if width_used + 1 + _OUTCOME_WIDTH > width:
             break
-        shown += 1
-    hidden = len(_COLUMNS) - shown
+        count_shown += 1
+    hidden = len(_COLUMNS) - count_shown
     more = f"; {hidden} more column{'s' * (hidden > 1)} in a wider terminal" if hidden else ""
     table = Table(
         title=f"[bold]{escape(runs[0]['scenario'])}[/] (distances between surfaces{more})",
@@ -51,11 +51,11 @@ def metrics_table(runs: Sequence[dict[str, Any]], width: int = 80) -> Table:
         padding=0,  # columns are a blank apart, which leaves the outcome its room
     )
     table.add_column("solver", no_wrap=True)
-    for heading, _ in _COLUMNS[:shown]:
+    for heading, _ in _COLUMNS[:count_shown]:
         table.add_column(escape(heading), justify="right", no_wrap=True)
     table.add_column("outcome")
     for run, row in zip(runs, cells, strict=True):
-        table.add_row(run["solver"], *row[:shown], outcome(run))
+        table.add_row(run["solver"], *row[:count_shown], outcome(run))
     return table
 
 
@@ -65,36 +65,36 @@ _RATIOS = (
     ("dev\n[mm]", "max_deviation", 1e3, ".1f"), ("peak q̇\n[rad/s]", "peak_velocity", 1.0, ".2f"),
     ("Σ|Δq̇|\n[rad/s]", "jitter", 1.0, ".1f"),
 )  # fmt: skip
-"""Heading, name, unit and format of the figures that are set against each other."""
-_NOTHING = 0.05
-"""Figures no larger than this, in their unit, have no ratio."""
+"""Heading, name, unit and format of the figures of which the ratios table shows ratios."""
+_MIN_RATIO_VALUE = 0.05
+"""Figures no larger than this, in their unit, have no ratio: they are round-off or nearly nothing."""
 
 
-def ratios_table(runs: Sequence[dict[str, Any]], over: str, under: str) -> Table:
-    """Figures of two solvers, scenario by scenario, and those of the first over those of the second.
+def ratios_table(runs: Sequence[dict[str, Any]], numerator: str, denominator: str) -> Table:
+    """Lay out figures of two solvers and the ratios of the first to the second.
 
     Args:
         runs: results of `Log.metrics` of all scenarios.
-        over: solver whose figures stand above the line.
-        under: the other one.
+        numerator: solver whose figures stand above the line.
+        denominator: the other one.
     """
     table = Table(
-        title=f"[bold]{escape(over)} / {escape(under)}[/]", title_justify="left", title_style="",
+        title=f"[bold]{escape(numerator)} / {escape(denominator)}[/]", title_justify="left", title_style="",
         box=box.SIMPLE_HEAD, pad_edge=False, padding=0,
     )  # fmt: skip
     table.add_column("scenario", no_wrap=True)
     table.add_column("", no_wrap=True)
     for heading, *_ in _RATIOS:
         table.add_column(escape(heading), justify="right", no_wrap=True)
-    found = {(run["scenario"], run["solver"]): run for run in runs}
+    run_of = {(run["scenario"], run["solver"]): run for run in runs}
     for scenario in dict.fromkeys(run["scenario"] for run in runs):
-        if (scenario, over) not in found or (scenario, under) not in found:
+        if (scenario, numerator) not in run_of or (scenario, denominator) not in run_of:
             continue
         values = [
             [None if run[name] is None else unit * run[name] for _, name, unit, _ in _RATIOS]
-            for run in (found[scenario, over], found[scenario, under])
+            for run in (run_of[scenario, numerator], run_of[scenario, denominator])
         ]
-        for first, solver, figures in zip((scenario, ""), (over, under), values, strict=True):
+        for first, solver, figures in zip((scenario, ""), (numerator, denominator), values, strict=True):
             cells = (
                 "-" if value is None else f"{value:{form}}" for value, (*_, form) in zip(figures, _RATIOS, strict=True)
             )
@@ -106,55 +106,56 @@ def ratios_table(runs: Sequence[dict[str, Any]], over: str, under: str) -> Table
 
 
 def _ratio(a: float | None, b: float | None) -> str:
-    """a / b; nothing where one of them is none to speak of, or a depth of penetration."""
-    return f"{a / b:.2f}" if a is not None and b is not None and min(a, b) > _NOTHING else ""
+    """Format a / b; empty where one of them is nearly zero, or a depth of penetration."""
+    return f"{a / b:.2f}" if a is not None and b is not None and min(a, b) > _MIN_RATIO_VALUE else ""
 
 
 def outcome(run: dict[str, Any]) -> str:
     """Say how a run went: how many steps stopped and relaxed, and how many have each severity as their worst."""
     counts, levels = run["status_counts"], run["severity_counts"]
-    said = []
+    parts = []
     if run["collided"]:
-        said.append("[red]collided[/]")
+        parts.append("[red]collided[/]")
     if counts["STOPPED"]:
-        said.append(f"[red]{counts['STOPPED']} stopped[/]")
+        parts.append(f"[red]{counts['STOPPED']} stopped[/]")
     if counts["RELAXED"]:
-        said.append(f"[yellow]{counts['RELAXED']} relaxed[/]")
+        parts.append(f"[yellow]{counts['RELAXED']} relaxed[/]")
     for level, word, style in (("ALARM", "alarm", "red"), ("WARNING", "warning", "yellow"), ("INFO", "info", "dim")):
         if levels[level]:
-            said.append(f"[{style}]{levels[level]} {word}[/]")
+            parts.append(f"[{style}]{levels[level]} {word}[/]")
     if run["time_blocked"] > 0.0:
-        said.append(f"[yellow]stalled {run['time_blocked']:.1f} s[/]")
+        parts.append(f"[yellow]stalled {run['time_blocked']:.1f} s[/]")
     if not run["completed"]:
-        said.append("[red]broken off[/]")
-    said.append("[green]arrived[/]" if run["arrived"] else "[yellow]short of goal[/]")
-    return ", ".join(said)
+        parts.append("[red]broken off[/]")
+    parts.append("[green]arrived[/]" if run["arrived"] else "[yellow]short of goal[/]")
+    return ", ".join(parts)
 
 
-_WIDEST = 200
-"""Characters of a line of events."""
+_MAX_LINE = 200
+"""Characters of a line of events: two to three lines of a terminal."""
 
 
-def events(run: dict[str, Any], most: int = 4) -> list[str]:
+def events(run: dict[str, Any], max_events: int = 4) -> list[str]:
     """List the first events of a run, a line each: time, status, reasons."""
     lines = [
         f"{t:.3f} s {status}: {'; '.join(reason['text'] for reason in reasons)}"
-        for t, status, reasons in run["events"][:most]
+        for t, status, reasons in run["events"][:max_events]
     ]
-    return [line if len(line) <= _WIDEST else f"{line[: _WIDEST - 2]} …" for line in lines]
+    return [line if len(line) <= _MAX_LINE else f"{line[: _MAX_LINE - 2]} …" for line in lines]
 
 
 def failed(run: dict[str, Any]) -> bool:
-    """Whether a run ended in a defined failure: a collision, a stop, or before its time."""
+    """Return True if a run collided, stopped or ended before its time."""
     return bool(run["collided"] or run["status_counts"]["STOPPED"] or not run["completed"])
 
 
 def to_json(document: Any) -> str:
-    """Strict JSON: NaN and infinity, which JSON has no word for, become null."""
+    """Serialize strictly: NaN and infinity, for which JSON has no notation, become null."""
     return json.dumps(_without_nan(document), indent=2, allow_nan=False)
 
 
 def _without_nan(value: Any) -> Any:
+    """Return a document with None in place of NaN and infinity."""
     if isinstance(value, dict):
         return {key: _without_nan(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

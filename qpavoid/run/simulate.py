@@ -1,4 +1,4 @@
-"""Closed loop: runs a scenario tick by tick and records it."""
+"""Closed loop: run a scenario step by step and record it."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from qpavoid.problem import Array, Solution, Status
 from qpavoid.run.log import STATUSES, Log, versions
 from qpavoid.solvers import gains, parse_solver
 
-_MOST_EVENTS = 1000
-"""Number of events that a log keeps."""
+_MAX_EVENTS = 1000
+"""Number of events that a log keeps: a run that changes its reasons at every step would fill memory."""
 
 
 class StartWarning(UserWarning):
-    """The initial configuration is in collision or outside its limits; the run goes on from there."""
+    """The initial configuration is in collision or outside its limits."""
 
 
 def simulate(
@@ -35,7 +35,7 @@ def simulate(
     solver: str | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Log:
-    """Runs a scenario with velocities that are followed exactly: q ⊕ v dt.
+    """Run a scenario with velocities that are followed exactly: q ⊕ v dt.
 
     A run that is interrupted from the keyboard, or in which the loop itself fails, gives the log of what it did;
     `meta["completed"]` is then false and `meta["stopped_by"]` says why.
@@ -78,12 +78,13 @@ def simulate(
 
 
 def _check_start(controller: Controller, q: Array, scenario: ScenarioConfig) -> None:
+    """Warn of joints outside their limits and of pairs that overlap at the start."""
     robot, source = controller.scene.robot, scenario.source
-    bounds, here = robot.bounds(), q[robot.bounds().q_index]
-    for i in np.flatnonzero((here < bounds.lower) | (here > bounds.upper)):
+    bounds, q_now = robot.bounds(), q[robot.bounds().q_index]
+    for i in np.flatnonzero((q_now < bounds.lower) | (q_now > bounds.upper)):
         joint = robot.coordinate_names[bounds.v_index[i]]
         warnings.warn(
-            f"{source}: q0: {joint} = {here[i]:g} lies outside its limits [{bounds.lower[i]:g}, {bounds.upper[i]:g}] "
+            f"{source}: q0: {joint} = {q_now[i]:g} lies outside its limits [{bounds.lower[i]:g}, {bounds.upper[i]:g}] "
             "[rad or m]",
             StartWarning,
             stacklevel=3,
@@ -97,13 +98,13 @@ def _check_start(controller: Controller, q: Array, scenario: ScenarioConfig) -> 
 
 
 class Recorder:
-    """Writes ticks into arrays laid out beforehand; whatever was written can be taken as a log at any time."""
+    """Store steps in arrays laid out beforehand, to be taken as a log at any time."""
 
     def __init__(self, controller: Controller, scenario: ScenarioConfig, ticks: int) -> None:
-        """Lays the arrays out for at most `ticks` ticks."""
+        """Lay the arrays out for at most `ticks` steps."""
         scene, model = controller.scene, controller.scene.robot.model
         self._scene, self._scenario = scene, scenario
-        self._frames, self._others = in_order(controller.tasks)
+        self._frames, self._other_tasks = in_order(controller.tasks)
         self._controller = controller
         self._data, self._query = model.createData(), DistanceQuery(scene)  # distances of all pairs, near or not
         self._ends, self._radii = _drawing_axes(scene.robot.bodies)
@@ -111,8 +112,8 @@ class Recorder:
         shapes: dict[str, tuple[int, ...]] = {
             "t": (), "q": (model.nq,), "v": (model.nv,),
             "target": (tasks, 3), "tool": (tasks, 3), "tool_rotation": (tasks, 3, 3), "turn_error": (tasks,),
-            "task_error": (len(self._others),),
-            "body_distance": (bodies,), "alpha": (), "beta": (), "slack": (), "share": (), "saturation": (),
+            "task_error": (len(self._other_tasks),),
+            "body_distance": (bodies,), "alpha": (), "beta": (), "slack": (), "command_scale": (), "saturation": (),
             "build_time": (), "solve_time": (),
             "body_ends": (bodies, 2, 3), "obstacle_position": (obstacles, 3), "obstacle_rotation": (obstacles, 3, 3),
         }  # fmt: skip
@@ -126,7 +127,7 @@ class Recorder:
         self._count = 0
 
     def add(self, tick: Tick) -> None:
-        """Writes one tick."""
+        """Store one step."""
         rows = {name: array[self._count] for name, array in self._arrays.items() if array.ndim > 1}
         scalars = {name: array for name, array in self._arrays.items() if array.ndim == 1}
         state, solution, rows_avoid = tick.state, tick.solution, tick.problem.avoidance
@@ -142,7 +143,7 @@ class Recorder:
         values = {
             "t": state.t,
             "slack": 0.0 if solution.slack is None else float(np.max(solution.slack, initial=0.0)),
-            "share": solution.command_scale,
+            "command_scale": solution.command_scale,
             "stalled": bool(solution.stalled),
             "severity": solution.severity or 0,
             "saturation": solution.saturation,
@@ -157,32 +158,33 @@ class Recorder:
         for name, value in values.items():
             scalars[name][self._count] = value
         self._count += 1
-        self._note(state.t, solution)
+        self._record_events(state.t, solution)
 
-    def _note(self, t: float, solution: Solution) -> None:
-        """Keep the status and reasons of a step where they differ from those before in more than amounts."""
+    def _record_events(self, t: float, solution: Solution) -> None:
+        """Store status and reasons where they differ from the previous ones in kind."""
         reasons = (*solution.reasons, *solution.stalled, *solution.assumptions)
         keys = (solution.status, *[(*reason.key, reason.severity) for reason in reasons])
         eventful = solution.status is not Status.SOLVED or reasons
-        if keys != self._keys and eventful and len(self._events) < _MOST_EVENTS:
+        if keys != self._keys and eventful and len(self._events) < _MAX_EVENTS:
             self._events.append([t, solution.status.value, [reason.as_dict() for reason in reasons]])
         self._keys = keys
 
     def _write_bodies(self, tick: Tick, rows: dict[str, Array]) -> None:
+        """Store the distances of all pairs, and the poses of bodies and obstacles."""
         scene = self._scene
         pin.forwardKinematics(scene.robot.model, self._data, tick.state.q)
         self._controller.sync_attachments(self._query)
-        bearer = np.arange(len(scene.geometry.geometryObjects))
+        counted_body = np.arange(len(scene.geometry.geometryObjects))
         for i, obstacle in enumerate(scene.obstacles):
-            carried = i in self._query.carried
+            is_attached = i in self._query.carried
             sample = (
                 self._controller.obstacle_pose(obstacle.name, tick.state.q)
-                if carried
+                if is_attached
                 else obstacle.motion.sample(tick.state.t)
             )
             rows["obstacle_position"][i], rows["obstacle_rotation"][i] = sample.position, sample.rotation
-            if carried:
-                bearer[np.flatnonzero(scene.obstacle_of == i)] = _bearer(scene, self._query.carried[i])
+            if is_attached:
+                counted_body[np.flatnonzero(scene.obstacle_of == i)] = _attachment_body(scene, self._query.carried[i])
             elif obstacle.moves:
                 self._query.place_obstacle(i, sample)
         self._query.compute(self._data, np.inf)
@@ -192,15 +194,15 @@ class Recorder:
         if np.isfinite(distance).any():
             self._arrays["closest_pair"][self._count] = np.argmin(distance)
         nearest = np.full(len(scene.geometry.geometryObjects), np.inf)
-        np.minimum.at(nearest, bearer[scene.pairs[:, 0]], distance)
-        np.minimum.at(nearest, bearer[scene.pairs[:, 1]], distance)
+        np.minimum.at(nearest, counted_body[scene.pairs[:, 0]], distance)
+        np.minimum.at(nearest, counted_body[scene.pairs[:, 1]], distance)
         rows["body_distance"][:] = nearest[: rows["body_distance"].shape[0]]
         for i, body in enumerate(scene.robot.bodies.geometryObjects):
             joint = self._data.oMi[body.parentJoint]
             rows["body_ends"][i] = self._ends[i] @ joint.rotation.T + joint.translation
 
     def log(self, stopped_by: str | None = None) -> Log:
-        """What was written so far.
+        """Return the steps stored so far as a log.
 
         Args:
             stopped_by: why the run ended before its time, if it did.
@@ -226,10 +228,10 @@ class Recorder:
                 for v, lower, upper in zip(bounds.v_index, bounds.lower.tolist(), bounds.upper.tolist(), strict=True)
             ],
             "frames": [task.settings.label for task in self._frames],
-            "tasks": [[task.settings.label, task.unit] for task in self._others],
+            "tasks": [[task.settings.label, task.unit] for task in self._other_tasks],
             "bodies": scene.body_names,
             "body_radii": self._radii,
-            "obstacles": [_described(scene, i) for i in range(len(scene.obstacles))],
+            "obstacles": [_describe_obstacle(scene, i) for i in range(len(scene.obstacles))],
             "pairs": [list(pair) for pair in scene.pair_names],
             "versions": versions(),
         }
@@ -237,34 +239,40 @@ class Recorder:
         return Log(**arrays, meta=meta)
 
 
-def _bearer(scene: Scene, joint: int) -> int:
-    """The body to which distances of a load count: the first on the joint that carries it, or on one above."""
+def _attachment_body(scene: Scene, joint: int) -> int:
+    """Return the body that counts an attached object's distances.
+
+    It is the first body on the joint that the object is attached to, or on one above.
+    """
     joints, parents = [body.parentJoint for body in scene.robot.bodies.geometryObjects], scene.robot.model.parents
     while joint and joint not in joints:
         joint = int(parents[joint])
     return joints.index(joint) if joint in joints else 0
 
 
-_MOST_DRAWN = 2000
-"""Triangles or voxels of an obstacle that a log keeps for its figures."""
+_MAX_FACES = 2000
+"""Triangles or voxels of an obstacle that a log keeps for its figures: a panel shows no more."""
 
 
-def _described(scene: Scene, index: int) -> dict[str, Any]:
-    """Name and shape of an obstacle, and what figures need of those that come from files."""
+def _describe_obstacle(scene: Scene, index: int) -> dict[str, Any]:
+    """Return name and shape of an obstacle, and triangles or voxels that come from files."""
     obstacle = scene.obstacles[index]
     described: dict[str, Any] = {"name": obstacle.name, "shape": obstacle.shape.model_dump(mode="json")}
     if isinstance(obstacle.shape, Mesh):
         solids = [scene.geometry.geometryObjects[int(g)].geometry for g in np.flatnonzero(scene.obstacle_of == index)]
         triangles = np.concatenate([drawn_triangles(solid) for solid in solids])
-        described["triangles"] = np.round(triangles[:: -(-len(triangles) // _MOST_DRAWN)], 5).tolist()
+        described["triangles"] = np.round(triangles[:: -(-len(triangles) // _MAX_FACES)], 5).tolist()
     elif isinstance(obstacle.shape, PointCloud):
         centers = scene.clouds[index].centers
-        described["voxels"] = np.round(centers[:: -(-len(centers) // _MOST_DRAWN) or 1], 5).tolist()
+        described["voxels"] = np.round(centers[:: -(-len(centers) // _MAX_FACES) or 1], 5).tolist()
     return described
 
 
 def _drawing_axes(bodies: Any) -> tuple[Array, list[float]]:
-    """Axis ends in the parent joint's frame (b, 2, 3) and radius of each body, or of the capsule around it."""
+    """Return axis ends (b, 2, 3) in the parent joint's frame and radius of each body.
+
+    A body that is no capsule is drawn as the capsule around it.
+    """
     ends, radii = np.empty((len(bodies.geometryObjects), 2, 3)), []
     for i, body in enumerate(bodies.geometryObjects):
         fit = enclosing_capsule(body.geometry)

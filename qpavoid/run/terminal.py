@@ -1,4 +1,4 @@
-"""What commands share: progress on stderr, and a polite end."""
+"""Progress bars on stderr, termination and lists of names, as all commands have them."""
 
 from __future__ import annotations
 
@@ -17,37 +17,37 @@ ERR = Console(stderr=True)
 
 
 def progress() -> Progress:
-    """Bars on stderr: what, how far, how many, how long still."""
+    """Make progress bars on stderr: job, bar, count, remaining time."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
         TimeRemainingColumn(),
         console=ERR,
-        speed_estimate_period=_REMEMBERED,
+        speed_estimate_period=_SPEED_WINDOW,
     )
 
 
-_REMEMBERED = 300.0
-"""The time that is left is worked out from what was done within so many seconds [s]."""
+_SPEED_WINDOW = 300.0
+"""Window over which the remaining time is estimated [s]: runs of a sweep differ by minutes."""
 
 
 @contextmanager
 def terminate_like_interrupt() -> Iterator[None]:
-    """A polite kill ends a run as Ctrl-C does: what was recorded is kept."""
+    """End a run at SIGTERM as at Ctrl-C: the steps recorded so far are saved."""
 
     def interrupt(*_: Any) -> None:
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGTERM, interrupt)
+    handler_before = signal.signal(signal.SIGTERM, interrupt)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        signal.signal(signal.SIGTERM, handler_before)
 
 
 def names_of(option: str, text: str) -> list[str]:
-    """Names with commas between them.
+    """Split a list of names at its commas.
 
     Raises:
         ConfigError: there is none.

@@ -1,4 +1,4 @@
-"""Writes the figures of runs, and draws those of one run over time. Needs matplotlib: `pip install qpavoid[plots]`.
+"""Figures of runs. Needs matplotlib: `pip install qpavoid[plots]`.
 
 Every `*_figure` function returns a `matplotlib.figure.Figure` of its own: no display and no global state is used, so
 they work headless and in threads.
@@ -34,15 +34,15 @@ from qpavoid.viz.style import (
 
 DPI = 130
 ALPHA_SHOWN = 100.0
-"""α is drawn up to here: it grows without bound as the distance goes to 0."""
+"""Upper end of the axis of α, which grows without bound as the distance goes to 0."""
 _STATUS_COLOUR = {Status.RELAXED: "#F5C242", Status.STOPPED: "#C62F2F"}
 _GREY = "#B8B8B8"
-_NAMED = 2 * len(COLOURS)
+_MAX_NAMED_LINES = 2 * len(COLOURS)
 """Lines of a panel that have a colour and a name; the legend of more would run out of the panel."""
 
 
 def plot_run(log: Log, folder: str | Path) -> list[Path]:
-    """Writes the figures of one run: motion, joints, distances, speeds.
+    """Write the figures of one run: motion, joints, distances, speeds.
 
     Returns:
         The files, `<scenario>_<solver>_<figure>.png`, in that order.
@@ -55,7 +55,7 @@ def plot_run(log: Log, folder: str | Path) -> list[Path]:
 
 
 def plot_compare(logs: Sequence[Log], folder: str | Path) -> list[Path]:
-    """Writes the figures that lay several runs of one scenario over each other: time and path.
+    """Write the figures that lay several runs of one scenario over each other: time and path.
 
     Returns:
         The files, `<scenario>_compare_<figure>.png`, in that order.
@@ -71,6 +71,7 @@ def plot_compare(logs: Sequence[Log], folder: str | Path) -> list[Path]:
 
 
 def _save(figures: dict[str, Figure], folder: str | Path, stem: str) -> list[Path]:
+    """Write figures as `<stem>_<name>.png` into a folder; the folder is made where it is missing."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
@@ -89,7 +90,7 @@ def _title(log: Log) -> str:
 
 
 def position_names(log: Log) -> list[str]:
-    """A name for each of the nq coordinates of q.
+    """Name each of the nq coordinates of q.
 
     Where nq > nv, joints with several velocities are taken to have one coordinate more (a quaternion, or the sine and
     cosine of a planar joint), and, if the count asks for it, joints without limits to be cosine and sine; whatever
@@ -102,17 +103,17 @@ def position_names(log: Log) -> list[str]:
     counts = Counter(name if name in limited else name.rpartition(".")[0] or name for name in names)
     for circle in (("",), (".cos", ".sin")):
         parts = {1: circle, 6: (".x", ".y", ".z", ".qx", ".qy", ".qz", ".qw")}
-        found = []
+        names_found = []
         for joint, count in counts.items():
-            several = parts.get(count, tuple(f".{i}" for i in range(count + 1)))
-            found += [joint] if joint in limited else [joint + part for part in several]
-        if len(found) == log.q.shape[1]:
-            return found
+            suffixes = parts.get(count, tuple(f".{i}" for i in range(count + 1)))
+            names_found += [joint] if joint in limited else [joint + part for part in suffixes]
+        if len(names_found) == log.q.shape[1]:
+            return names_found
     return [f"q[{i}]" for i in range(log.q.shape[1])]
 
 
 def joints_figure(log: Log) -> Figure:
-    """Coordinates of q over time, a panel each, with position limits (Figs. 7 and 14 of the paper)."""
+    """Draw q over time, a panel each, with position limits (Figs. 7, 14 of the paper)."""
     names = position_names(log)
     limits = {name: (lower, upper) for name, lower, upper in log.meta["position_limits"]}
     columns = 4 if len(names) <= 16 else 6
@@ -144,18 +145,18 @@ def joints_figure(log: Log) -> Figure:
 
 
 def distances_figure(log: Log) -> Figure:
-    """Distance of each body over time with d1, d2 and collision, and α, β below (Figs. 8, 11, 13 of the paper)."""
+    """Draw body distances, d1, d2, α and β over time (Figs. 8, 11, 13 of the paper)."""
     avoidance = log.meta["config"]["avoidance"]
-    reach = round(1.5 * (avoidance["d2"] - avoidance["offset"]), 9)
+    upper_distance = round(1.5 * (avoidance["d2"] - avoidance["offset"]), 9)
     distance = log.body_distance
     figure = Figure(figsize=(9.5, 7.0), layout="constrained")
     ax, gains = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
     drawn = np.flatnonzero(np.isfinite(distance).any(axis=0))
     nearest = np.min(distance, axis=0, initial=np.inf)
-    near = drawn if len(drawn) <= len(COLOURS) else drawn[nearest[drawn] < reach]
-    rest = f"never within {reach:g} m"
-    if len(near) > _NAMED:
-        near, rest = np.sort(near[np.argsort(nearest[near], kind="stable")[:_NAMED]]), "farther away"
+    near = drawn if len(drawn) <= len(COLOURS) else drawn[nearest[drawn] < upper_distance]
+    rest = f"never within {upper_distance:g} m"
+    if len(near) > _MAX_NAMED_LINES:
+        near, rest = np.sort(near[np.argsort(nearest[near], kind="stable")[:_MAX_NAMED_LINES]]), "farther away"
     far = [i for i in drawn if i not in near]
     for i in far:
         ax.plot(log.t, distance[:, i], color=_GREY, linewidth=0.7, zorder=1)
@@ -190,10 +191,13 @@ def _plot_gains(ax: Any, log: Log) -> None:
 
 
 def speeds_figure(log: Log) -> Figure:
-    """Joint velocities over time; limits of the joints that use more than 80 % of theirs; ticks not SOLVED shaded."""
+    """Draw joint velocities over time; shade steps that are not SOLVED.
+
+    Limits are drawn of joints that use more than 80 % of theirs.
+    """
     names, limits = log.meta["coordinates"], log.meta["velocity_limit"]
     peak = np.max(np.abs(log.v), axis=0, initial=0.0)
-    fastest = np.sort(np.argsort(-peak)[:_NAMED])
+    fastest = np.sort(np.argsort(-peak)[:_MAX_NAMED_LINES])
     figure = Figure(figsize=(9.5, 4.5), layout="constrained")
     ax = figure.add_subplot()
     rest = [i for i in range(len(names)) if i not in fastest]
@@ -224,7 +228,7 @@ def _style(rank: int) -> dict[str, Any]:
 
 
 def _shade_status(ax: Any, log: Log) -> list[Any]:
-    """Shades ticks that were relaxed or stopped; gives a legend entry for each status that occurs."""
+    """Shade steps that were relaxed or stopped; return their legend entries."""
     handles = []
     dt = log.meta["config"]["dt"]
     for status, colour in _STATUS_COLOUR.items():

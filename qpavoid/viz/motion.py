@@ -16,8 +16,12 @@ from qpavoid.geometry.segments import point_segment, segment_segment
 from qpavoid.problem import Array, IntArray
 from qpavoid.run.log import Log
 
-MOVING, RESTING, HIT, OBSTACLE, TOOL_PATH = "#6BA3D6", "#C4C4C4", "#C62F2F", "#E69F00", "#007A56"
-GROUND = "#EFE3C8"
+MOVING_COLOUR = "#6BA3D6"
+AT_REST_COLOUR = "#C4C4C4"
+COLLISION_COLOUR = "#C62F2F"
+OBSTACLE_COLOUR = "#E69F00"
+TOOL_PATH_COLOUR = "#007A56"
+GROUND_COLOUR = "#EFE3C8"
 PANELS = 6
 _PANEL = np.array([3.0, 2.9])  # largest width and height of a panel on paper [in]
 _TICK = 0.35  # of an axis on paper for each of its numbers, which would overlap otherwise [in]
@@ -26,7 +30,7 @@ _PATCHES = 200  # of each obstacle, of which it is judged what it hides
 
 
 def motion_figure(log: Log) -> Figure:
-    """Bodies, obstacles, planned path and the tool's path so far, at up to six instants with one view and scale.
+    """Draw bodies, obstacles and paths at up to six instants with one view and scale.
 
     Bodies are drawn as the capsules of the log, which enclose whatever shape the robot's bodies have.
     """
@@ -43,9 +47,9 @@ def motion_figure(log: Log) -> Figure:
     # Size of the drawn box on paper. An Axes3D is a square of 0.97 times the box's diagonal, mostly empty: the squares
     # overlap, so that the boxes lie side by side.
     right = np.array([-np.sin(np.radians(azimuth)), np.cos(np.radians(azimuth)), 0.0])
-    seen = np.array([np.abs(right) @ size, np.abs(np.cross(towards, right)) @ size])
-    scale = min(_PANEL / seen)
-    cell_width, cell_height = scale * seen + (1.1, 0.95)
+    extent = np.array([np.abs(right) @ size, np.abs(np.cross(towards, right)) @ size])
+    scale = min(_PANEL / extent)
+    cell_width, cell_height = scale * extent + (1.1, 0.95)
     square = 0.97 * scale * float(np.linalg.norm(size))
     columns = min(len(ticks), 3)
     rows = -(-len(ticks) // columns)
@@ -57,13 +61,13 @@ def motion_figure(log: Log) -> Figure:
         y = 0.45 + (rows - row - 0.55) * cell_height
         box = ((x - square / 2) / width, (y - square / 2) / height, square / width, square / height)
         ax: Any = figure.add_axes(box, projection="3d", proj_type="ortho", computed_zorder=False)
-        ax.patch.set_visible(False)
+        ax.patch.set_extent(False)
         ax.view_init(elevation, azimuth)
         _draw(ax, log, int(tick), towards, lower, upper)
         ax.set(xlim=(lower[0], upper[0]), ylim=(lower[1], upper[1]), zlim=(lower[2], upper[2]))
         ax.set_box_aspect(size)
         title = f"t = {log.t[tick]:.2f} s" + (" (closest)" if tick == closest else "")
-        ax.set_title(title, fontsize=10, y=0.5 + (0.5 * scale * seen[1] + 0.36) / square, pad=0)
+        ax.set_title(title, fontsize=10, y=0.5 + (0.5 * scale * extent[1] + 0.36) / square, pad=0)
         for k, axis in enumerate((ax.xaxis, ax.yaxis, ax.zaxis)):
             on_paper = scale * size[k] * np.sqrt(1.0 - towards[k] ** 2)
             axis.set_major_locator(MaxNLocator(int(np.clip(on_paper / _TICK, 1, 4)), steps=[1, 2, 5, 10]))
@@ -76,7 +80,7 @@ def motion_figure(log: Log) -> Figure:
 
 
 def instants(log: Log) -> IntArray:
-    """Ticks to draw: the first, the last, the closest approach, and others spread evenly over time and motion.
+    """Choose steps to draw: first, last, closest approach, and others evenly spread.
 
     Returns:
         (m,) increasing, m <= PANELS.
@@ -95,7 +99,7 @@ def instants(log: Log) -> IntArray:
 
 
 def moving_bodies(log: Log) -> Any:
-    """(b,) whether each body moves by more than 1 mm in the run."""
+    """Return for each body (b,) whether it moves by more than 1 mm in the run."""
     return np.any(np.ptp(log.body_ends, axis=0) > 1e-3, axis=(1, 2)) if len(log.t) else np.zeros(0, bool)
 
 
@@ -103,7 +107,10 @@ def moving_bodies(log: Log) -> Any:
 
 
 def shape_faces(shape: dict[str, Any]) -> Array:
-    """Outward quadrilaterals (m, 4, 3) of a shape of the log in its own frame [m]; of a half-space, of its plane."""
+    """Return outward quadrilaterals (m, 4, 3) of a shape in its own frame [m].
+
+    Of a half-space they are a square of its plane.
+    """
     if shape["type"] == "box":
         return _box_faces(np.array(shape["size"]))
     if shape["type"] == "ellipsoid":
@@ -125,7 +132,7 @@ def shape_faces(shape: dict[str, Any]) -> Array:
 
 
 def capsule_faces(ends: Array, radius: float) -> Array:
-    """Outward quadrilaterals (m, 4, 3) of the capsule about a segment (2, 3) in world axes [m]."""
+    """Return outward quadrilaterals (m, 4, 3) of a capsule about a segment (2, 3) [m]."""
     axis = ends[1] - ends[0]
     length = float(np.linalg.norm(axis))
     z = axis / length if length > 1e-9 else np.array([0.0, 0.0, 1.0])
@@ -137,6 +144,7 @@ def capsule_faces(ends: Array, radius: float) -> Array:
 
 
 def _revolve(radius: Array, height: Array) -> Array:
+    """Return quadrilaterals (m, 4, 3) of a profile of radius and height revolved about z."""
     angle = np.linspace(0.0, 2.0 * np.pi, _AROUND + 1)
     grid = np.stack(
         [np.outer(radius, np.cos(angle)), np.outer(radius, np.sin(angle)), np.outer(height, np.ones_like(angle))], -1
@@ -147,6 +155,7 @@ def _revolve(radius: Array, height: Array) -> Array:
 
 def _box_faces(size: Array, cuts: int = 6) -> Array:
     # Cut up, because faces are painted from back to front by their middle.
+    """Return quadrilaterals (m, 4, 3) of a box of full side lengths `size` (3,) [m], `cuts` by `cuts` a side."""
     u, v = np.meshgrid(np.linspace(-1, 1, cuts + 1), np.linspace(-1, 1, cuts + 1), indexing="ij")
     faces = []
     for axis in range(3):
@@ -159,11 +168,11 @@ def _box_faces(size: Array, cuts: int = 6) -> Array:
 
 
 _PLANE = 4.0
-"""Side of what is drawn of the plane of a half-space [m]."""
+"""Side of the square that is drawn of the plane of a half-space [m]: twice the span of a large arm."""
 
 
 def local_faces(obstacle: dict[str, Any]) -> Array:
-    """Outward quadrilaterals (m, 4, 3) of an obstacle of the log in its own frame [m]."""
+    """Return outward quadrilaterals (m, 4, 3) of an obstacle of the log in its own frame [m]."""
     if "triangles" in obstacle:
         triangles = np.array(obstacle["triangles"]).reshape(-1, 3, 3)
         return triangles[:, [0, 1, 2, 2]]
@@ -174,13 +183,13 @@ def local_faces(obstacle: dict[str, Any]) -> Array:
 
 
 def obstacle_faces(log: Log, index: int, tick: int) -> Array:
-    """Outward quadrilaterals (m, 4, 3) of an obstacle at a tick, in world axes [m]."""
+    """Return outward quadrilaterals (m, 4, 3) of an obstacle at a step, in world axes [m]."""
     faces = local_faces(log.meta["obstacles"][index])
     return np.asarray(faces @ log.obstacle_rotation[tick, index].T + log.obstacle_position[tick, index])
 
 
-def endless(log: Log, index: int) -> bool:
-    """Whether an obstacle is a half-space: it has no size and no middle."""
+def is_endless(log: Log, index: int) -> bool:
+    """Return True if an obstacle is a half-space, which has neither size nor middle."""
     return bool(log.meta["obstacles"][index]["shape"]["type"] == "half_space")
 
 
@@ -188,13 +197,13 @@ def endless(log: Log, index: int) -> bool:
 
 
 def towards_viewer(elevation: float, azimuth: float) -> Array:
-    """Unit vector (3,) from what is seen to the viewer; angles in degrees."""
+    """Return the unit vector (3,) from the scene to the viewer; angles in degrees."""
     e, a = np.radians([elevation, azimuth])
     return np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
 
 
 def view_angles(log: Log) -> tuple[float, float]:
-    """Elevation and azimuth [deg] from which the planned path looks long, and path, robot and obstacles are seen best.
+    """Choose elevation and azimuth [deg] that hide least of path, robot and obstacles.
 
     Each candidate is scored by the share of points of interest that nothing else hides, times how much of the path's
     extent is not foreshortened. None looks straight along an axis, which would take the depth away. Only what all
@@ -204,31 +213,33 @@ def view_angles(log: Log) -> tuple[float, float]:
     spread = path - path.mean(axis=0)
     size = np.linalg.norm(spread)
     bodies, thickness = log.body_ends[0], np.array(log.meta["body_radii"])
-    middles, patches, radii, alien = _screens(log)
+    middles, patches, radii, is_foreign = _occluders(log)
     points = np.concatenate([path, bodies.mean(axis=1), bodies[:, 1], middles])[:, None]
     own = point_segment(points, bodies[:, 0], bodies[:, 1]).distance < 1.3 * thickness
     to_patches = patches - points
     squared = np.sum(to_patches**2, axis=2)
-    screens = squared > (1.3 * radii) ** 2
-    screens[len(points) - len(middles) :] &= alien
+    is_screen = squared > (1.3 * radii) ** 2
+    is_screen[len(points) - len(middles) :] &= is_foreign
     best, best_score = (20.0, -45.0), -1.0
     for elevation in (20.0, 35.0):
         for azimuth in (-25.0, 25.0, -45.0, 45.0, -65.0, 65.0, -115.0, 115.0, -135.0, 135.0, -155.0, 155.0):
             towards = towards_viewer(elevation, azimuth)
             ray = segment_segment(points, points + 10.0 * towards, bodies[:, 0], bodies[:, 1]).distance
             along = to_patches @ towards
-            behind = screens & (along > 0.0) & (squared - along**2 < radii**2)
-            hidden = np.any((ray < thickness) & ~own, axis=1) | np.any(behind, axis=1)
-            seen = 1.0 - float(np.mean(hidden))
+            is_hidden = is_screen & (along > 0.0) & (squared - along**2 < radii**2)
+            hidden = np.any((ray < thickness) & ~own, axis=1) | np.any(is_hidden, axis=1)
+            visible_fraction = 1.0 - float(np.mean(hidden))
             length = float(np.linalg.norm(spread - np.outer(spread @ towards, towards)) / size) if size > 1e-6 else 1.0
-            score = seen**2 * length * (0.94 if abs(azimuth) > 90.0 else 1.0)  # rather from before the robot
+            score = (
+                visible_fraction**2 * length * (0.94 if abs(azimuth) > 90.0 else 1.0)
+            )  # rather from before the robot
             if score > best_score + 1e-9:
                 best, best_score = (elevation, azimuth), score
     return best
 
 
-def _screens(log: Log) -> tuple[Array, Array, Array, Any]:
-    """Obstacles as what may hide other things: patches of their surface, at some instants.
+def _occluders(log: Log) -> tuple[Array, Array, Array, Any]:
+    """Sample patches of the obstacles' surfaces, which may hide other things.
 
     Returns:
         middles (n, 3) [m] of the obstacles, patches (m, 3) [m], radius of each (m,) [m], and (n, m) whether a patch is
@@ -236,15 +247,15 @@ def _screens(log: Log) -> tuple[Array, Array, Array, Any]:
     """
     rng, ticks = np.random.default_rng(0), np.linspace(0, len(log.t) - 1, PANELS).astype(int)
     middles, patches, radii, owner = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros(0)], [np.zeros(0, int)]
-    sized = [i for i in range(len(log.meta["obstacles"])) if not endless(log, i)]
+    sized = [i for i in range(len(log.meta["obstacles"])) if not is_endless(log, i)]
     for i in sized:
         faces = local_faces(log.meta["obstacles"][i])
         area = 0.5 * np.linalg.norm(np.cross(faces[:, 2] - faces[:, 0], faces[:, 3] - faces[:, 1]), axis=1)
         if not area.sum() > 0.0:
             continue
-        drawn = faces[rng.choice(len(faces), _PATCHES, p=area / area.sum())].mean(axis=1)
+        patch_centers = faces[rng.choice(len(faces), _PATCHES, p=area / area.sum())].mean(axis=1)
         for tick in ticks if np.ptp(log.obstacle_position[:, i], axis=0).any() else ticks[:1]:
-            patches.append(drawn @ log.obstacle_rotation[tick, i].T + log.obstacle_position[tick, i])
+            patches.append(patch_centers @ log.obstacle_rotation[tick, i].T + log.obstacle_position[tick, i])
             middles.append(np.mean(patches[-1], axis=0, keepdims=True))
             # Patches drawn at random overlap: of 2.5 times the area in all, they leave 8 % of it free.
             radii.append(np.full(_PATCHES, np.sqrt(2.5 * area.sum() / _PATCHES / np.pi)))
@@ -254,10 +265,11 @@ def _screens(log: Log) -> tuple[Array, Array, Array, Any]:
 
 
 def _limits(log: Log, ticks: IntArray) -> tuple[Array, Array]:
+    """Return corners (3,), (3,) of the box that holds robot, obstacles and paths at some steps [m]."""
     radii = np.array(log.meta["body_radii"]).reshape(-1, 1, 1)
     points = [log.target.reshape(-1, 3), log.tool.reshape(-1, 3)]
     points += [(log.body_ends[ticks] + sign * radii).reshape(-1, 3) for sign in (-1.0, 1.0)]
-    sized = [i for i in range(len(log.meta["obstacles"])) if not endless(log, i)]
+    sized = [i for i in range(len(log.meta["obstacles"])) if not is_endless(log, i)]
     points += [obstacle_faces(log, i, t).reshape(-1, 3) for i in sized for t in ticks]
     cloud = np.concatenate(points)
     cloud = cloud[np.isfinite(cloud).all(axis=1)]
@@ -271,17 +283,18 @@ def _limits(log: Log, ticks: IntArray) -> tuple[Array, Array]:
 
 
 def _draw(ax: Any, log: Log, tick: int, towards: Array, lower: Array, upper: Array) -> None:
+    """Draw one step, seen from the direction `towards` (3,), within two corners (3,) [m]."""
     moving, touching = moving_bodies(log), log.body_distance[tick] < 0.0
     surfaces = []
     for i, radius in enumerate(log.meta["body_radii"]):
         # A little thicker when hit: neighbours share the ball at their joint, and its colour would be patchy.
         faces = capsule_faces(log.body_ends[tick, i], 1.06 * radius if touching[i] else radius)
-        surfaces.append((faces, HIT if touching[i] else MOVING if moving[i] else RESTING))
+        surfaces.append((faces, COLLISION_COLOUR if touching[i] else MOVING_COLOUR if moving[i] else AT_REST_COLOUR))
     for i in range(len(log.meta["obstacles"])):
         faces = obstacle_faces(log, i, tick)
-        if endless(log, i):
+        if is_endless(log, i):
             faces = faces[((faces >= lower) & (faces <= upper)).all(axis=(1, 2))]
-        surfaces.append((faces, GROUND if endless(log, i) else OBSTACLE))
+        surfaces.append((faces, GROUND_COLOUR if is_endless(log, i) else OBSTACLE_COLOUR))
     if surfaces:
         # One collection for all: matplotlib sorts faces by depth within a collection only.
         faces = np.concatenate([faces for faces, _ in surfaces])
@@ -292,18 +305,18 @@ def _draw(ax: Any, log: Log, tick: int, towards: Array, lower: Array, upper: Arr
     # Paths lie on top of the bodies, so that no part of them is hidden.
     for k in range(log.tool.shape[1]):
         ax.plot(*log.target[:, k].T, color="black", linestyle=(0, (4, 2)), linewidth=1.0, zorder=2)
-        ax.plot(*log.tool[: tick + 1, k].T, color=TOOL_PATH, linewidth=1.8, zorder=3)
-        ax.plot(*log.tool[tick, k, :, None], color=TOOL_PATH, marker="o", markersize=4, zorder=4)
+        ax.plot(*log.tool[: tick + 1, k].T, color=TOOL_PATH_COLOUR, linewidth=1.8, zorder=3)
+        ax.plot(*log.tool[tick, k, :, None], color=TOOL_PATH_COLOUR, marker="o", markersize=4, zorder=4)
 
 
 def normals(faces: Array) -> Array:
-    """Unit normals (m, 3) of quadrilaterals (m, 4, 3)."""
-    across = np.cross(faces[:, 2] - faces[:, 0], faces[:, 3] - faces[:, 1])
-    return np.asarray(across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-15))
+    """Return unit normals (m, 3) of quadrilaterals (m, 4, 3)."""
+    normal = np.cross(faces[:, 2] - faces[:, 0], faces[:, 3] - faces[:, 1])
+    return np.asarray(normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-15))
 
 
 def shade(faces: Array, colour: str, towards: Array) -> Array:
-    """Colours (m, 3) of faces (m, 4, 3) lit from the viewer's side and from above."""
+    """Return colours (m, 3) of faces (m, 4, 3) lit from the viewer's side and from above."""
     light = towards + np.array([0.0, 0.0, 0.7])
     brightness = 0.55 + 0.5 * np.clip(normals(faces) @ (light / np.linalg.norm(light)), 0.0, 1.0)
     return np.asarray(np.clip(brightness[:, None] * to_rgb(colour), 0.0, 1.0))
@@ -312,11 +325,11 @@ def shade(faces: Array, colour: str, towards: Array) -> Array:
 def _legend(log: Log, ticks: IntArray) -> list[Any]:
     moving = moving_bodies(log)
     entries = [
-        (moving.any(), Patch(color=MOVING, label="moving bodies")),
-        ((~moving).any(), Patch(color=RESTING, label="bodies at rest")),
-        ((log.body_distance[ticks] < 0.0).any(), Patch(color=HIT, label="bodies in collision")),
-        (log.meta["obstacles"], Patch(color=OBSTACLE, label="obstacle")),
+        (moving.any(), Patch(color=MOVING_COLOUR, label="moving bodies")),
+        ((~moving).any(), Patch(color=AT_REST_COLOUR, label="bodies at rest")),
+        ((log.body_distance[ticks] < 0.0).any(), Patch(color=COLLISION_COLOUR, label="bodies in collision")),
+        (log.meta["obstacles"], Patch(color=OBSTACLE_COLOUR, label="obstacle")),
         (True, Line2D([], [], color="black", linestyle=(0, (4, 2)), linewidth=1.0, label="planned path")),
-        (True, Line2D([], [], color=TOOL_PATH, marker="o", markersize=4, label="tool and its path so far")),
+        (True, Line2D([], [], color=TOOL_PATH_COLOUR, marker="o", markersize=4, label="tool and its path so far")),
     ]
-    return [handle for shown, handle in entries if shown]
+    return [handle for is_present, handle in entries if is_present]

@@ -1,4 +1,4 @@
-"""What the figures share: colours, units, grids, legends, and the levels of distance."""
+"""Common parts of the figures: colours, units, grids, legends, and the levels of distance."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ COLLISION, D1, D2, D_SAFE = "#C62F2F", "#7A4B9A", "#8A8A8A", "#00695C"
 
 
 def units(log: Log, per: str = "") -> str:
-    """What the coordinates are measured in: `rad`, `m`, or `rad or m` where a robot has both.
+    """Return the unit of the coordinates: `rad`, `m`, or `rad or m` where a robot has both.
 
     Args:
         log: the run.
@@ -35,25 +35,25 @@ def units(log: Log, per: str = "") -> str:
 
 
 def is_qp(log: Log) -> bool:
-    """Whether the solver has rows of its own that hold a distance."""
+    """Return True if the solver has constraint rows of its own that keep a distance."""
     return str(log.meta["solver"]).partition(":")[0] in ("qp", "hqp")
 
 
 def add_grid(ax: Any) -> None:
-    """Pale grid behind the lines, which reach from edge to edge."""
+    """Add a pale grid behind the lines, which run from edge to edge."""
     ax.grid(True, color="#E4E4E4", linewidth=0.6)
     ax.set_axisbelow(True)
     ax.margins(x=0.0)
 
 
 def add_legend(ax: Any, handles: Sequence[Any]) -> None:
-    """Adds a legend beside the panel, where it hides nothing."""
+    """Add a legend beside the panel, where it hides nothing."""
     style = {"fontsize": 8, "frameon": False, "borderaxespad": 0.0}
     ax.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.01, 1.0), **style)
 
 
 def draw_levels(ax: Any, log: Log, qp: bool) -> list[Any]:
-    """Draws d2, d1, collision and, for QPs, the distance that their rows hold, all between surfaces.
+    """Draw d2, d1, collision and the distance that QP rows keep, all between surfaces.
 
     Returns:
         The lines, for a legend.
@@ -73,17 +73,17 @@ def draw_levels(ax: Any, log: Log, qp: bool) -> list[Any]:
     ]
 
 
-def label_distances(ax: Any, *drawn: Array, name: str = "distance ") -> None:
-    """Names the axis of distances between surfaces, shades collision, and makes room for it.
+def label_distances(ax: Any, *distances: Array, name: str = "distance ") -> None:
+    """Label and extend the axis of distances between surfaces, and shade collision.
 
     Args:
         ax: panel that has its lines already.
-        drawn: the distances of the lines [m].
+        distances: the distances of the lines [m].
         name: what is shown.
     """
     ax.set_ylabel(f"{name}between surfaces [m]")
     add_grid(ax)
-    finite = [d[np.isfinite(d)] for d in drawn]
+    finite = [d[np.isfinite(d)] for d in distances]
     lowest = min((float(np.min(d)) for d in finite if d.size), default=0.0)
     bottom, top = ax.get_ylim()
     bottom = min(lowest, 0.0) - 0.04 * top

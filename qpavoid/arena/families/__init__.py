@@ -1,4 +1,4 @@
-"""Families of scenarios: what varies stands in a YAML file each, and every case is known to have a solution."""
+"""Families of scenarios: parameters in a YAML file each, and cases with known solutions."""
 
 from qpavoid.arena.families.family import Family, load_family
 from qpavoid.arena.families.make import make_case

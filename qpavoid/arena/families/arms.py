@@ -1,4 +1,4 @@
-"""What generators need of a robot: its arms, and postures with the tools at given places."""
+"""Arms of a robot, and postures with the tools at given places, for generators."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
+from qpavoid.arena.families.inverse_kinematics import FrameGoal, JointRanges, solve_inverse_kinematics
 from qpavoid.arena.families.parameters import Redraw
-from qpavoid.arena.families.reach import Ranges, Want, configuration_at
-from qpavoid.arena.families.ways import Way
+from qpavoid.arena.families.tool_path import ToolPath
 from qpavoid.errors import ConfigError
 from qpavoid.model.robot import Robot
 from qpavoid.problem import Array
 from qpavoid.safety.reach import arm
 
-REST = 3.0
+REST_TIME = 3.0
 """Time from the end of the planned motion to that of the run [s]."""
-_PRECISE = 1e-4
-"""How far a tool may be from where it was put [m]."""
+_TOLERANCE = 1e-4
+"""Largest distance of a tool from its place in a posture [m]."""
 _MAX_SPEED = 0.5
 """Cap on the speed that tasks command [m/s]."""
 
@@ -29,19 +29,21 @@ class Arm(NamedTuple):
     """A tool and the joints that move it and no other tool."""
 
     tool: str
-    """Its frame."""
+    """Name of the tool's frame."""
     home: Array
-    """(3,) where the tool is at home [m]."""
+    """(3,) position of the tool at home [m]."""
     length: float
-    """Of the links between the first of these joints and the tool, in a row [m]."""
+    """Length of the links between the first of these joints and the tool, in a row [m]."""
 
-    def at(self, forward: float, left: float, up: float) -> Array:
-        """(3,) a place given from the tool's home, in arm lengths along the world axes x, y, z [m]."""
-        return self.home + self.length * np.array([forward, left, up])
+    def place(self, forward: float, to_left: float, upward: float) -> Array:
+        """Return a place (3,) [m] given from the tool's home, in arm lengths along world x, y, z."""
+        return self.home + self.length * np.array([forward, to_left, upward])
 
 
 def arms(robot: Robot) -> list[Arm]:
-    """The arms of a robot, those at the left first. A tool that moves only with others has none.
+    """Return the arms of a robot, left ones first.
+
+    A tool that moves only with others has none.
 
     Raises:
         ConfigError: there is none.
@@ -50,49 +52,51 @@ def arms(robot: Robot) -> list[Arm]:
     pin.framesForwardKinematics(model, data, robot.home)
     frames = {tool: robot.frame_id(tool, "end_effectors") for tool in robot.end_effectors}
     chains = {tool: list(model.supports[model.frames[frame].parentJoint]) for tool, frame in frames.items()}
-    found = []
+    arms_found = []
     for tool, chain in chains.items():
-        others = {joint for other, joints in chains.items() if other != tool for joint in joints}
-        own = [place for place, joint in enumerate(chain) if joint > 0 and joint not in others]
-        if own:
-            length = arm(robot, frames[tool], own[0])[1]
-            found.append(Arm(tool, np.array(data.oMf[frames[tool]].translation), length))
-    if not found:
+        shared_joints = {joint for other, joints in chains.items() if other != tool for joint in joints}
+        own_places = [place for place, joint in enumerate(chain) if joint > 0 and joint not in shared_joints]
+        if own_places:
+            length = arm(robot, frames[tool], own_places[0])[1]
+            arms_found.append(Arm(tool, np.array(data.oMf[frames[tool]].translation), length))
+    if not arms_found:
         raise ConfigError(f"{robot.name} has no tool that moves; give `end_effectors` in its robot.yaml")
-    return sorted(found, key=lambda one: -one.home[1])
+    return sorted(arms_found, key=lambda one: -one.home[1])
 
 
-def posture(robot: Robot, places: Mapping[str, ArrayLike], near: Array | None = None) -> Array:
-    """A configuration (nv,) with tools at some places (3,) [m], as near to another one, or home, as a search gets.
+def posture(robot: Robot, places: Mapping[str, ArrayLike], q_near: Array | None = None) -> Array:
+    """Find a configuration (nv,) with tools at some places (3,) [m], near `q_near` or home.
 
     Raises:
         Redraw: the search found none.
     """
-    wants = [Want(robot.frame_id(tool, "tool"), np.asarray(place, dtype=float)) for tool, place in places.items()]
-    q = configuration_at(robot, wants, robot.home if near is None else near, Ranges.of(robot), _PRECISE)
+    goals = [FrameGoal(robot.frame_id(tool, "tool"), np.asarray(place, dtype=float)) for tool, place in places.items()]
+    q = solve_inverse_kinematics(
+        robot, goals, robot.home if q_near is None else q_near, JointRanges.of(robot), _TOLERANCE
+    )
     if q is None:
         raise Redraw("no posture has the tools where the run begins")
     return q
 
 
-def named(robot: Robot, q: Array) -> dict[str, float]:
-    """A configuration (nv,) as `q0` has it: joint: value."""
+def joint_values(robot: Robot, q: Array) -> dict[str, float]:
+    """Return a configuration (nv,) as `q0` of a scenario has it: joint: value."""
     return dict(zip(robot.joint_names, q.tolist(), strict=True))
 
 
-def follow(tool: str, motion: Mapping[str, Any]) -> dict[str, Any]:
-    """A task: a tool's position follows a motion."""
+def position_task(tool: str, motion: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a task block: the position of a tool follows a motion."""
     return {"frame": tool, "type": "position", "motion": dict(motion), "max_speed": _MAX_SPEED}
 
 
-def set_out(start: Array, goal: Array, speed: float, begin: float = 0.5) -> Way:
-    """The straight way of a tool at a mean speed [m/s]."""
-    return Way(start, goal, begin, begin + max(float(np.linalg.norm(goal - start)), 0.01) / speed)
+def straight_path(start: Array, goal: Array, speed: float, begin: float = 0.5) -> ToolPath:
+    """Return the straight path of a tool at a mean speed [m/s]."""
+    return ToolPath(start, goal, begin, begin + max(float(np.linalg.norm(goal - start)), 0.01) / speed)
 
 
-def run(
-    robot: Robot, q: Array, tasks: list[dict[str, Any]], obstacles: list[dict[str, Any]], rest: float = REST
+def scenario_fields(
+    robot: Robot, q: Array, tasks: list[dict[str, Any]], obstacles: list[dict[str, Any]], rest_time: float = REST_TIME
 ) -> dict[str, Any]:
-    """Fields of a scenario that begins at q (nv,) and ends some time [s] after its tasks' waypoints."""
+    """Return fields of a scenario that begins at q (nv,) and ends after its tasks' waypoints."""
     end = max(task["motion"]["times"][-1] for task in tasks)
-    return {"q0": named(robot, q), "tasks": tasks, "obstacles": obstacles, "duration": round(end + rest, 1)}
+    return {"q0": joint_values(robot, q), "tasks": tasks, "obstacles": obstacles, "duration": round(end + rest_time, 1)}

@@ -1,4 +1,4 @@
-"""A family of scenarios: one YAML file that says what varies, within which ranges, and how a scenario is made of it."""
+"""Families of scenarios: one YAML file with parameters, their ranges and a template."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from qpavoid.errors import ConfigError, UnknownName, nearest
 from qpavoid.model.robot import Robot
 
 Generator = Callable[[Draw, Robot], Mapping[str, Any]]
-"""Fields of a scenario, from draws and the robot: its locked joints are gone, its home is the setup's q0."""
+"""Function from draws and the robot to fields of a scenario; the robot's locked joints are gone, its home is the
+setup's q0."""
 
 GENERATORS: dict[str, Generator] = {
     "sphere_field": statics.sphere_field,
@@ -36,41 +37,41 @@ GENERATORS: dict[str, Generator] = {
     "random_walk": moving.random_walk,
     "unreachable": targets.unreachable,
 }
-"""Those that ship."""
+"""Generators that ship."""
 
 _NAME = re.compile(r"\$(\w+)")
-_WHO = ("robot", "q0", "lock")
-"""Fields of a scenario that say who takes part; they stand in `robots`."""
+_ROBOT_FIELDS = ("robot", "q0", "lock")
+"""Fields of a scenario that belong to its robot; they stand in `robots`."""
 
 
 class FamilyConfig(Block):
     """A file of tasks/families/."""
 
     title: Annotated[str, Field(min_length=1)]
-    """What it is, in a few words."""
+    """Title in a few words."""
     about: Annotated[str, Field(min_length=1)]
-    """What it asks of a controller."""
+    """Difficulty that it poses to a controller."""
     robots: Annotated[list[str | dict[str, Any]], Field(min_length=1)]
-    """Who takes part, one a seed in turn: a setup or a robot by name, or fields of a scenario, `robot` among them."""
+    """Robots, one a seed in turn: a setup or a robot by name, or fields of a scenario, `robot` among them."""
     parameters: dict[str, Parameter] = Field(default_factory=dict)
-    """What varies."""
+    """Parameters and their ranges."""
     scenario: dict[str, Any] = Field(default_factory=dict)
     """Fields of a scenario, in which "$name" stands for the value of a parameter."""
     generator: str | None = None
-    """Who works out the fields that are missing: one that ships, or `file.py:function` beside this file."""
+    """Function that computes the missing fields: one that ships, or `file.py:function` beside this file."""
     sensor: dict[str, Any] = Field(default_factory=dict)
-    """How obstacles are seen: fields of `qpavoid.arena.case.Sensor`, "$name" as above."""
+    """Delay and noise of measured obstacle states: fields of `qpavoid.arena.case.Sensor`, "$name" as above."""
     reachable: bool = True
     """Whether the goals can be reached; it is checked, whichever it is."""
 
     @model_validator(mode="after")
-    def _who(self) -> FamilyConfig:
+    def _check_robots(self) -> FamilyConfig:
         for index, entry in enumerate(self.robots):
             if isinstance(entry, dict) and not isinstance(entry.get("robot"), str):
                 raise ValueError(f"robots.{index}: needs a field `robot`")
-        stated = [key for key in _WHO if key in self.scenario]
-        if stated:
-            raise ValueError(f"scenario: `{stated[0]}` belongs into `robots`, which may hold such fields")
+        misplaced = [key for key in _ROBOT_FIELDS if key in self.scenario]
+        if misplaced:
+            raise ValueError(f"scenario: `{misplaced[0]}` belongs into `robots`, which may hold such fields")
         return self
 
 
@@ -85,21 +86,21 @@ class Family:
     """Fields of a scenario for each robot: of its setup, of `scenario`, of its own entry; later ones count."""
     generator: Generator | None
     in_template: frozenset[str]
-    """Parameters that stand in one of them, or in `sensor`."""
+    """Parameters that occur in a template, or in `sensor`."""
 
-    def filled(self, template: Any, draw: Draw) -> Any:
-        """A template with values in the places of "$name"."""
+    def fill(self, template: Any, draw: Draw) -> Any:
+        """Return a template with values in the places of "$name"."""
         if isinstance(template, dict):
-            return {key: self.filled(value, draw) for key, value in template.items()}
+            return {key: self.fill(value, draw) for key, value in template.items()}
         if isinstance(template, list):
-            return [self.filled(value, draw) for value in template]
+            return [self.fill(value, draw) for value in template]
         if isinstance(template, str) and (match := _NAME.fullmatch(template)):
             return draw(match[1])
         return template
 
 
 def load_family(name_or_path: str | Path) -> Family:
-    """Reads a family.
+    """Read a family.
 
     Args:
         name_or_path: shipped name or path of a YAML file. A generator that it names in a Python file is run.
@@ -110,34 +111,36 @@ def load_family(name_or_path: str | Path) -> Family:
     path = find_family(name_or_path)
     config = read_config(path, FamilyConfig)
     layers = {"scenario": config.scenario, "robots": config.robots, "sensor": config.sensor}
-    used = {name: where for key, layer in layers.items() for name, where in _names(layer, key)}
-    for name, where in used.items():
+    locations = {name: location for key, layer in layers.items() for name, location in _names(layer, key)}
+    for name, location in locations.items():
         if name not in config.parameters:
-            raise UnknownName(f"{path}: {where}: unknown parameter '${name}'{nearest(name, config.parameters)}")
-    unused = sorted(config.parameters.keys() - used)
-    if unused and config.generator is None:
-        raise ConfigError(f"{path}: parameters.{unused[0]}: stands nowhere as ${unused[0]}; use it, or leave it out")
+            raise UnknownName(f"{path}: {location}: unknown parameter '${name}'{nearest(name, config.parameters)}")
+    unused_names = sorted(config.parameters.keys() - locations)
+    if unused_names and config.generator is None:
+        raise ConfigError(
+            f"{path}: parameters.{unused_names[0]}: stands nowhere as ${unused_names[0]}; use it, or leave it out"
+        )
     return Family(
         name=path.stem,
         path=path,
         config=config,
         templates=tuple(_template(entry, config, path, f"{path}: robots.{i}") for i, entry in enumerate(config.robots)),
         generator=None if config.generator is None else _generator(config.generator, path),
-        in_template=frozenset(used),
+        in_template=frozenset(locations),
     )
 
 
-def _names(template: Any, where: str) -> Iterator[tuple[str, str]]:
-    """Parameters in a template, and where."""
+def _names(template: Any, location: str) -> Iterator[tuple[str, str]]:
+    """Yield parameters in a template, and their places in it."""
     if isinstance(template, dict | list):
         for key, value in template.items() if isinstance(template, dict) else enumerate(template):
-            yield from _names(value, f"{where}.{key}")
+            yield from _names(value, f"{location}.{key}")
     elif isinstance(template, str) and template.startswith("$"):
-        yield template[1:], where
+        yield template[1:], location
 
 
-def _template(entry: str | dict[str, Any], config: FamilyConfig, path: Path, where: str) -> dict[str, Any]:
-    """Fields of a scenario for a robot."""
+def _template(entry: str | dict[str, Any], config: FamilyConfig, path: Path, location: str) -> dict[str, Any]:
+    """Return fields of a scenario for a robot."""
     if isinstance(entry, str) and entry in setup_names():
         return {**read_mapping(find_setup(entry)), **config.scenario}
     fields = {"robot": entry} if isinstance(entry, str) else entry
@@ -145,13 +148,14 @@ def _template(entry: str | dict[str, Any], config: FamilyConfig, path: Path, whe
         if not fields["robot"].startswith("$"):
             find_robot(fields["robot"], path.parent)
     except UnknownName as error:
-        raise UnknownName(f"{where}: {error}; or a setup: {', '.join(setup_names())}") from None
+        raise UnknownName(f"{location}: {error}; or a setup: {', '.join(setup_names())}") from None
     except ConfigError as error:
-        raise ConfigError(f"{where}: {error}") from None
+        raise ConfigError(f"{location}: {error}") from None
     return {**config.scenario, **fields}
 
 
 def _generator(name: str, path: Path) -> Generator:
+    """Return a generator by shipped name, or from a file."""
     file, colon, function = name.rpartition(":")
     if not colon:
         if name not in GENERATORS:
@@ -169,9 +173,9 @@ def _generator(name: str, path: Path) -> Generator:
         spec.loader.exec_module(module)
     except Exception as error:  # whatever a reader's file does
         raise ConfigError(f"{path}: generator: {source}: {type(error).__name__}: {error}") from error
-    found = getattr(module, function, None)
-    if not callable(found):
+    function_found = getattr(module, function, None)
+    if not callable(function_found):
         functions = [key for key, value in vars(module).items() if callable(value) and not key.startswith("_")]
         raise UnknownName(f"{path}: generator: {source} has no function {function!r}{nearest(function, functions)}")
-    made: Generator = found
-    return made
+    generator: Generator = function_found
+    return generator

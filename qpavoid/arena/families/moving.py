@@ -1,4 +1,4 @@
-"""Generators of obstacles that move while a tool is on its way: across it, against it, behind it, at random."""
+"""Generators of obstacles that cross, meet or follow a tool's path, or move at random."""
 
 from __future__ import annotations
 
@@ -7,48 +7,51 @@ from typing import Any
 
 import numpy as np
 
-from qpavoid.arena.families import ways
-from qpavoid.arena.families.arms import REST, Arm, follow, run
+from qpavoid.arena.families import tool_path
+from qpavoid.arena.families.arms import REST_TIME, Arm, position_task, scenario_fields
 from qpavoid.arena.families.parameters import Draw
-from qpavoid.arena.families.statics import sweep
-from qpavoid.arena.families.ways import Way, along, timed
+from qpavoid.arena.families.statics import sideways_path
+from qpavoid.arena.families.tool_path import ToolPath, path_motion, waypoint_motion
 from qpavoid.model.robot import Robot
 from qpavoid.problem import Array
 
-Motion = Callable[[Draw, Arm, Way], dict[str, Any]]
+MotionGenerator = Callable[[Draw, Arm, ToolPath], dict[str, Any]]
 
 
 def crossing(draw: Draw, robot: Robot) -> dict[str, Any]:
-    """Obstacles cross the tool's way, each at some `share` of its time and in some `direction`, `aside` of it."""
-    return _among(draw, robot, _crossing)
+    """Make obstacles cross the tool's path, each at some `share` of its time and `direction`.
+
+    Each misses the tool by `aside`.
+    """
+    return _scenario_among(draw, robot, _crossing)
 
 
 def head_on(draw: Draw, robot: Robot) -> dict[str, Any]:
-    """Obstacles come along the tool's way from `away` beyond its goal, `aside` of it."""
-    return _among(draw, robot, _head_on)
+    """Make obstacles come along the tool's path from `away` beyond its goal, `aside` of it."""
+    return _scenario_among(draw, robot, _head_on)
 
 
 def chasing(draw: Draw, robot: Robot) -> dict[str, Any]:
-    """Obstacles come along the tool's way from `away` behind its start, `aside` of it."""
-    return _among(draw, robot, _chasing)
+    """Make obstacles come along the tool's path from `away` behind its start, `aside` of it."""
+    return _scenario_among(draw, robot, _chasing)
 
 
 def random_walk(draw: Draw, robot: Robot) -> dict[str, Any]:
-    """Obstacles wander about the tool's way: straight from one place to the next, `aside` of it, for the whole run."""
-    return _among(draw, robot, _random_walk)
+    """Make obstacles wander about the tool's path, `aside` of it, for the whole run."""
+    return _scenario_among(draw, robot, _random_walk)
 
 
-def _among(draw: Draw, robot: Robot, motion: Motion) -> dict[str, Any]:
-    """A tool's way among `count` obstacles, each of some `shape` and `radius`."""
-    one, way, q = sweep(draw, robot)
+def _scenario_among(draw: Draw, robot: Robot, motion: MotionGenerator) -> dict[str, Any]:
+    """Put a tool's path among `count` obstacles, each of some `shape` and `radius`."""
+    arm, path, q = sideways_path(draw, robot)
     obstacles = [
-        {"name": f"mover{i}", "shape": _shape(draw), "motion": motion(draw, one, way)} for i in range(draw("count"))
+        {"name": f"mover{i}", "shape": _shape(draw), "motion": motion(draw, arm, path)} for i in range(draw("count"))
     ]
-    return run(robot, q, [follow(one.tool, along(way))], obstacles)
+    return scenario_fields(robot, q, [position_task(arm.tool, path_motion(path))], obstacles)
 
 
 def _shape(draw: Draw) -> dict[str, Any]:
-    """A ball, or a capsule or cube of about its size."""
+    """Draw a ball, or a capsule or cube of about its size."""
     radius = draw("radius")
     match draw("shape"):
         case "capsule":
@@ -59,31 +62,31 @@ def _shape(draw: Draw) -> dict[str, Any]:
             return {"type": "sphere", "radius": radius}
 
 
-def _crossing(draw: Draw, one: Arm, way: Way) -> dict[str, Any]:
+def _crossing(draw: Draw, arm: Arm, path: ToolPath) -> dict[str, Any]:
     direction = np.array(draw("direction"))
-    return ways.crossing(way, draw("share"), direction, _aside(draw, one), draw("obstacle_speed"))
+    return tool_path.crossing(path, draw("share"), direction, _offset(draw, arm), draw("obstacle_speed"))
 
 
-def _head_on(draw: Draw, one: Arm, way: Way) -> dict[str, Any]:
-    return ways.head_on(way, one.length * draw("away"), _aside(draw, one), draw("obstacle_speed"))
+def _head_on(draw: Draw, arm: Arm, path: ToolPath) -> dict[str, Any]:
+    return tool_path.head_on(path, arm.length * draw("away"), _offset(draw, arm), draw("obstacle_speed"))
 
 
-def _chasing(draw: Draw, one: Arm, way: Way) -> dict[str, Any]:
-    return ways.chasing(way, one.length * draw("away"), _aside(draw, one), draw("obstacle_speed"))
+def _chasing(draw: Draw, arm: Arm, path: ToolPath) -> dict[str, Any]:
+    return tool_path.chasing(path, arm.length * draw("away"), _offset(draw, arm), draw("obstacle_speed"))
 
 
-def _random_walk(draw: Draw, one: Arm, way: Way) -> dict[str, Any]:
-    points, times = [_beside(draw, one, way)], [0.0]
-    while times[-1] < way.end + REST:
-        points.append(_beside(draw, one, way))
+def _random_walk(draw: Draw, arm: Arm, path: ToolPath) -> dict[str, Any]:
+    points, times = [_random_point(draw, arm, path)], [0.0]
+    while times[-1] < path.end + REST_TIME:
+        points.append(_random_point(draw, arm, path))
         length = float(np.linalg.norm(points[-1] - points[-2]))
         times.append(times[-1] + max(length / draw("obstacle_speed"), 0.1))
-    return timed(points, times, "constant")
+    return waypoint_motion(points, times, "constant")
 
 
-def _aside(draw: Draw, one: Arm) -> Array:
-    return np.asarray(one.length * draw("aside") * np.array(draw("direction")))
+def _offset(draw: Draw, arm: Arm) -> Array:
+    return np.asarray(arm.length * draw("aside") * np.array(draw("direction")))
 
 
-def _beside(draw: Draw, one: Arm, way: Way) -> Array:
-    return way.point(draw("along")) + _aside(draw, one)
+def _random_point(draw: Draw, arm: Arm, path: ToolPath) -> Array:
+    return path.point(draw("along")) + _offset(draw, arm)

@@ -11,7 +11,7 @@ from qpavoid.safety.reach import arm, clearance
 
 
 def out_of_reach(world: World, task: FrameTask, t: float, tolerance: float) -> str:
-    """Why a target cannot be attained, in words; empty where that is not certain.
+    """Prove that a target cannot be attained, in words; return "" where that is not certain.
 
     Args:
         world: where the task is.
@@ -34,7 +34,10 @@ def out_of_reach(world: World, task: FrameTask, t: float, tolerance: float) -> s
 
 
 def _shell(robot: Robot, frame_id: int) -> float:
-    """How far a frame's origin is from the nearest body that moves with it [m]; inf if there is none."""
+    """Return the distance of a frame's origin from the nearest body that moves with it [m].
+
+    It is inf if there is none.
+    """
     frame = robot.model.frames[frame_id]
     mates = [body for body in robot.bodies.geometryObjects if body.parentJoint == frame.parentJoint]
     return max(clearance(frame.placement.translation, [(body.geometry, body.placement) for body in mates]), 0.0)

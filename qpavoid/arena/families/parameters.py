@@ -1,4 +1,4 @@
-"""Parameters of a family: the ranges that its file states, and what is drawn from them."""
+"""Parameters of a family: ranges that its file states, and draws from them."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from qpavoid.problem import Array
 
 
 class ParameterBlock(Block):
-    """What all parameters share."""
+    """Common fields of all parameters."""
 
     about: Annotated[str, Field(min_length=1)]
-    """What it is, with its unit."""
+    """Meaning of the parameter, with its unit."""
 
 
 class Uniform(ParameterBlock):
@@ -31,12 +31,12 @@ class Uniform(ParameterBlock):
     """Whole numbers only, both ends included."""
 
     @model_validator(mode="after")
-    def _rises(self) -> Uniform:
+    def _check_range(self) -> Uniform:
         _check(self.range, self.whole)
         return self
 
     def draw(self, random: np.random.Generator) -> float:
-        """A value of the range."""
+        """Draw a value of the range."""
         low, high = self.range
         return int(random.integers(int(low), int(high) + 1)) if self.whole else float(random.uniform(low, high))
 
@@ -51,12 +51,12 @@ class LogUniform(ParameterBlock):
     """Whole numbers only, both ends included."""
 
     @model_validator(mode="after")
-    def _rises(self) -> LogUniform:
+    def _check_range(self) -> LogUniform:
         _check(self.range, self.whole)
         return self
 
     def draw(self, random: np.random.Generator) -> float:
-        """A value of the range."""
+        """Draw a value of the range."""
         low, high = self.range
         value = float(np.exp(random.uniform(np.log(low), np.log(high + self.whole))))
         return min(int(value), int(high)) if self.whole else value
@@ -70,7 +70,7 @@ class Choice(ParameterBlock):
     """The values: anything that a file can hold."""
 
     def draw(self, random: np.random.Generator) -> Any:
-        """One of the values."""
+        """Draw one of the values."""
         return self.of[int(random.integers(len(self.of)))]
 
 
@@ -80,7 +80,7 @@ class Direction(ParameterBlock):
     type: Literal["direction"]
 
     def draw(self, random: np.random.Generator) -> list[float]:
-        """A unit vector."""
+        """Draw a unit vector."""
         vector = random.normal(size=3)
         return [float(value) for value in vector / np.linalg.norm(vector)]
 
@@ -97,51 +97,51 @@ def _check(limits: tuple[float, float], whole: bool) -> None:
 
 
 class Redraw(Exception):
-    """Raised by a generator whose draw makes no scenario: another one is taken."""
+    """Raised by a generator whose draw makes no scenario: another draw follows."""
 
 
 class Draw:
-    """One draw of a family: gives values of its parameters by name.
+    """One draw of a family: values of its parameters by name.
 
     Each parameter has a stream of random numbers of its own, made from seed, number of the draw and its name: adding
     one leaves the others as they are.
     """
 
-    def __init__(self, parameters: Mapping[str, Parameter], seed: int, number: int, once: frozenset[str]) -> None:
-        """Draws nothing yet.
+    def __init__(self, parameters: Mapping[str, Parameter], seed: int, number: int, constant: frozenset[str]) -> None:
+        """Seed the draw; values are drawn when they are asked for.
 
         Args:
             parameters: what can be drawn.
             seed: of the case.
             number: of the draw, from 0; one that makes no case is followed by another one.
-            once: those that keep the value of their first draw: a template has them.
+            constant: those that keep the value of their first draw: a template has them.
         """
-        self._parameters, self._key, self._once = parameters, (seed, number), once
+        self._parameters, self._key, self._constant = parameters, (seed, number), constant
         self._streams: dict[str, np.random.Generator] = {}
-        self._kept: dict[str, Any] = {}
+        self._values: dict[str, Any] = {}
 
     def __call__(self, name: str) -> Any:
-        """A value: of a parameter that stands in the family's template always the same, of others a new one each time.
+        """Draw a value: always the same of a template's parameter, a new one of others.
 
         Raises:
             UnknownName: the family has no such parameter.
         """
-        if name in self._kept:
-            return self._kept[name]
+        if name in self._values:
+            return self._values[name]
         if name not in self._parameters:
             raise UnknownName(f"unknown parameter {name!r}{nearest(name, self._parameters)}")
         if name not in self._streams:
             self._streams[name] = np.random.default_rng([*self._key, crc32(name.encode())])
         value = self._parameters[name].draw(self._streams[name])
-        if name in self._once:
-            self._kept[name] = value
+        if name in self._constant:
+            self._values[name] = value
         return value
 
     def vector(self, *names: str) -> Array:
-        """Values of several parameters, (len(names),)."""
+        """Draw values (len(names),) of several parameters."""
         return np.array([self(name) for name in names], dtype=np.float64)
 
     @property
-    def drawn(self) -> frozenset[str]:
-        """Names of the parameters that were asked for."""
+    def names_drawn(self) -> frozenset[str]:
+        """Return the names of the parameters that were drawn."""
         return frozenset(self._streams)

@@ -1,33 +1,33 @@
-"""Whether a scenario has a solution at all, or, of one whose goals are meant to be out of reach, whether they are."""
+"""Proof that a scenario has a solution, or that its goals are out of reach as intended."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from qpavoid.arena.families.clearance import Clearance
+from qpavoid.arena.families.inverse_kinematics import FrameGoal, JointRanges, solve_inverse_kinematics
 from qpavoid.arena.families.out_of_reach import out_of_reach
 from qpavoid.arena.families.parameters import Redraw
 from qpavoid.arena.families.planner import Plan, plan
-from qpavoid.arena.families.reach import Ranges, Want, configuration_at
-from qpavoid.arena.scores import to_keep
+from qpavoid.arena.scores import surface_safety_distance
 from qpavoid.arena.world import World
 from qpavoid.config import ScenarioConfig
 from qpavoid.control.tasks.frames import FrameTask
 from qpavoid.errors import ConfigError
 from qpavoid.problem import Array
 
-_MOST_GOALS, _TRIES = 6, 40
-"""Configurations that attain the goal: how many are wanted, how many searches are made."""
-_PRECISE = 0.2
-"""Share of the goal's tolerance that they use [-]."""
-_HOLD = 1.0
-"""Where obstacles move, how long before the end the goal is attained, and held [s]."""
-_SPEED_SHARE, _FASTEST = 0.5, 1.5
-"""Share of the joints' speed limits that plans use [-], and what they use at most [rad/s or m/s]."""
+_MAX_GOALS, _TRIES = 6, 40
+"""Configurations that attain the goal: largest number, and number of searches."""
+_GOAL_PRECISION = 0.2
+"""Fraction of the goal's tolerance within which they attain it [-]."""
+_GOAL_TIME = 1.0
+"""Time before the end for which a plan is at the goal, where obstacles move [s]."""
+_SPEED_FRACTION, _MAX_SPEED = 0.5, 1.5
+"""Fraction of the joints' speed limits that plans use [-], and their largest speed [rad/s or m/s]."""
 
 
 def solved_by(scenario: ScenarioConfig, world: World, reachable: bool, random: np.random.Generator) -> str:
-    """How it is known that a scenario is what it should be, in words.
+    """Describe the proof that a scenario is as intended.
 
     Args:
         scenario: what is run.
@@ -41,71 +41,77 @@ def solved_by(scenario: ScenarioConfig, world: World, reachable: bool, random: n
     """
     if not world.tools:
         raise ConfigError(f"{scenario.source}: tasks: none is that of a frame with a position; give one")
-    clearance = Clearance(world, scenario.duration, to_keep(scenario))
-    if not clearance.clear(world.q0, 0.0):
+    clearance = Clearance(world, scenario.duration, surface_safety_distance(scenario))
+    if not clearance.is_clear(world.q0, 0.0):
         raise Redraw("the start is too near to something")
-    if not clearance.roots_clear(world.q0):
+    if not clearance.immovable_pairs_are_clear(world.q0):
         raise Redraw("an obstacle comes too near to what cannot move")
     if reachable:
-        found = find_plan(scenario, world, clearance, random)
+        motion, d1 = find_plan(scenario, world, clearance, random), surface_safety_distance(scenario)
         return (
-            f"RRT-Connect{' in space and time' * clearance.timed}: path of {found.length:.1f} rad in "
-            f"{found.t[-1]:.1f} s, {found.nodes} nodes, clear by {1e3 * to_keep(scenario):.0f} mm"
+            f"RRT-Connect{' in space and time' * clearance.depends_on_time}: path of {motion.length:.1f} rad in "
+            f"{motion.t[-1]:.1f} s, {motion.nodes} nodes, clear by {1e3 * d1:.0f} mm"
         )
     for task in world.tools:
-        why = out_of_reach(world, task, scenario.duration, scenario.goal_tolerance)
-        if why:
-            return why
+        proof = out_of_reach(world, task, scenario.duration, scenario.goal_tolerance)
+        if proof:
+            return proof
     raise Redraw("no goal is out of reach")
 
 
 def find_plan(scenario: ScenarioConfig, world: World, clearance: Clearance, random: np.random.Generator) -> Plan:
-    """A motion from the start to where all frames attain their targets, always clear. It can rest at its last node
-    until the end of the run.
+    """Plan a clear motion from the start to where all frames attain their targets.
+
+    The robot can rest at the last node until the end of the run.
 
     Raises:
         Redraw: none was found.
     """
-    ranges, bounds = Ranges.of(world.scene.robot), world.scene.robot.bounds().within(scenario.limits)
-    latest = max(scenario.duration - _HOLD, 0.0) if clearance.timed else scenario.duration
+    ranges, bounds = JointRanges.of(world.scene.robot), world.scene.robot.bounds().within(scenario.limits)
+    latest = max(scenario.duration - _GOAL_TIME, 0.0) if clearance.depends_on_time else scenario.duration
     goals = _goals(scenario, world, ranges, clearance, latest, random)
-    speed = np.minimum(_SPEED_SHARE * bounds.velocity, _FASTEST)
-    found = plan(clearance, ranges, world.q0, goals, speed, latest, random)
-    if found is None:
+    speed = np.minimum(_SPEED_FRACTION * bounds.velocity, _MAX_SPEED)
+    motion = plan(clearance, ranges, world.q0, goals, speed, latest, random)
+    if motion is None:
         raise Redraw("no plan was found")
-    return found
+    return motion
 
 
 def _goals(
     scenario: ScenarioConfig,
     world: World,
-    ranges: Ranges,
+    ranges: JointRanges,
     clearance: Clearance,
-    since: float,
+    t_from: float,
     random: np.random.Generator,
 ) -> Array:
-    """(g, nv) configurations that attain the targets of the end, clear of everything from some time on [s]; those near
-    the start first.
+    """Find configurations (g, nv) at the final targets, clear from `t_from` [s] on.
+
+    Those near the start come first.
+
+    Those near the start come first.
     """
     robot, end = world.scene.robot, scenario.duration
-    wants = []
+    goals = []
     for task in world.tasks:
         if isinstance(task, FrameTask):
-            there = task.motion.sample(end)
-            wants.append(
-                Want(task.frame_id, there.position if task.moves else None, there.rotation if task.turns else None)
+            target = task.motion.sample(end)
+            goals.append(
+                FrameGoal(
+                    task.frame_id, target.position if task.moves else None, target.rotation if task.turns else None
+                )
             )
-    found: list[Array] = []
-    attained = False
+    motion: list[Array] = []
+    configurations = False
     for number in range(_TRIES):
         spread = number / _TRIES
         begin = world.q0 + spread * (random.uniform(ranges.lower, ranges.upper) - world.q0)
-        q = configuration_at(robot, wants, begin, ranges, _PRECISE * scenario.goal_tolerance)
-        attained |= q is not None
-        if q is not None and clearance.clear_between(q, since, q, end):
-            found.append(q)
-            if len(found) == _MOST_GOALS:
+        q = solve_inverse_kinematics(robot, goals, begin, ranges, _GOAL_PRECISION * scenario.goal_tolerance)
+        configurations |= q is not None
+        if q is not None and clearance.is_clear_between(q, t_from, q, end):
+            motion.append(q)
+            if len(motion) == _MAX_GOALS:
                 break
-    if not found:
-        raise Redraw("nothing that attains the goal is clear" if attained else "the goal is not attained")
-    return np.array(found)
+    if not motion:
+        raise Redraw("nothing that attains the goal is clear" if configurations else "the goal is not attained")
+    return np.array(motion)

@@ -1,4 +1,4 @@
-"""placo, through a process of its own: it needs an older pinocchio than this library does."""
+"""placo, through a process of its own: it needs an older pinocchio than this library."""
 
 from __future__ import annotations
 
@@ -19,9 +19,15 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid.arena.case import Case
-from qpavoid.arena.outside.common import between, frame_tasks, one_period_ahead, parted_pairs, pieces
-from qpavoid.arena.outside.settings import PLACO, PLACO_PYTHON
-from qpavoid.arena.twin import hinge_or_slide
+from qpavoid.arena.libraries.common import (
+    frame_tasks,
+    movable_pairs,
+    obstacle_geometries,
+    surface_distances,
+    target_after_step,
+)
+from qpavoid.arena.libraries.settings import PLACO, PLACO_PYTHON
+from qpavoid.arena.mujoco_model import hinge_or_slide
 from qpavoid.arena.world import World
 from qpavoid.config import Limits
 from qpavoid.control.tasks.frames import FrameTask
@@ -31,36 +37,39 @@ from qpavoid.model.trajectory import Sample
 from qpavoid.problem import Array, Solution
 
 WORKER = Path(__file__).with_name("placo_worker.py")
-START_PATIENCE = 120.0
-"""For its imports and set-up [s]."""
-STEP_PATIENCE = 10.0
-"""For one answer [s]; then the process is ended, and every later tick fails."""
-_UNLIMITED = 1e6
-"""Stands in the URDF for a limit that a joint has not [rad, m or their rates]."""
+START_TIMEOUT = 120.0
+"""Time for imports and set-up of the process [s]."""
+STEP_TIMEOUT = 10.0
+"""Time for one answer [s]; after that the process is ended, and every later step fails."""
+_NO_LIMIT = 1e6
+"""Value in the URDF of a limit that a joint does not have [rad, m or their rates]."""
 
 
 class Pilot:
-    """Obstacles are bodies that no joint moves; placo's constraint knows no motion of theirs."""
+    """placo's solver for one case; obstacles are bodies that no joint moves.
+
+    Its constraint knows no motion of obstacles.
+    """
 
     seconds: float
-    """What the last step took in placo's process, and for its targets: without the way there and back [s]."""
+    """Time that the last step took in placo's process and for its targets, without the transport [s]."""
 
     def __init__(self, case: Case, world: World) -> None:
-        """Starts the process.
+        """Start the process and set placo up in it.
 
         Raises:
             ConfigError: the case has something that it cannot be given, or the interpreter has no placo.
         """
         scenario, scene = case.scenario, world.scene
-        self._followed = frame_tasks(case, world, "placo")
-        self._dt, self._pieces = scenario.dt, pieces(scene)
-        margin, trigger = between(scenario.avoidance)
+        self._frame_tasks = frame_tasks(case, world, "placo")
+        self._dt, self._geometries = scenario.dt, obstacle_geometries(scene)
+        margin, trigger = surface_distances(scenario.avoidance)
         setup = {
-            "urdf": write_urdf(scene, self._followed, scenario.limits),
+            "urdf": write_urdf(scene, self._frame_tasks, scenario.limits),
             "joints": list(scene.robot.model.names)[1:],
             "bodies": describe_bodies(scene, str(scenario.source)),
-            "pairs": parted_pairs(scene).tolist(),
-            "tasks": [_described(task) for task in self._followed],
+            "pairs": movable_pairs(scene).tolist(),
+            "tasks": [_describe_task(task) for task in self._frame_tasks],
             "dt": scenario.dt,
             "regularization": scenario.tracking_damping**2,
             "margin": margin,
@@ -69,8 +78,8 @@ class Pilot:
         }
         self.worker = Worker(os.environ.get(PLACO_PYTHON) or sys.executable)
         try:
-            self.worker.ask("setup", setup, START_PATIENCE)
-        except Ended as error:
+            self.worker.ask("setup", setup, START_TIMEOUT)
+        except WorkerEnded as error:
             raise ConfigError(
                 f"{self.worker.python} cannot run placo: {error}; set {PLACO_PYTHON} to the Python interpreter of an "
                 "environment with placo"
@@ -79,54 +88,56 @@ class Pilot:
             raise ConfigError(f"{scenario.source}: placo cannot be set up: {error}") from error
 
     def step(self, q: Array, t: float, targets: Mapping[str, Sample], obstacles: Mapping[str, Sample]) -> Solution:
-        """Velocity for the next dt.
+        """Compute the velocity for the next control period.
 
         Raises:
             RuntimeError: placo found none, or its process has ended; the robot is held then.
         """
         begin, self.seconds = perf_counter(), 0.0
         try:
-            poses, placing = self.worker.ask("place", {"q": q, "bodies": self._moved(obstacles)}, STEP_PATIENCE)
-            here = perf_counter()
+            poses, place_time = self.worker.ask(
+                "place", {"q": q, "bodies": self._obstacle_poses(obstacles)}, STEP_TIMEOUT
+            )
+            pose = perf_counter()
             there = [
-                one_period_ahead(task, targets[task.settings.label], pose, self._dt)
-                for task, pose in zip(self._followed, poses, strict=True)
+                target_after_step(task, targets[task.settings.label], pose, self._dt)
+                for task, pose in zip(self._frame_tasks, poses, strict=True)
             ]
-            here = perf_counter() - here
-            v, solving = self.worker.ask("solve", there, STEP_PATIENCE)
+            pose = perf_counter() - pose
+            v, solve_time = self.worker.ask("solve", there, STEP_TIMEOUT)
         except Exception:
             self.seconds = perf_counter() - begin
             raise
-        self.seconds = placing + here + solving
+        self.seconds = place_time + pose + solve_time
         return Solution(np.asarray(v))
 
-    def _moved(self, obstacles: Mapping[str, Sample]) -> dict[int, Array]:
-        """(4, 4) where each piece of the obstacles is, by its number."""
+    def _obstacle_poses(self, obstacles: Mapping[str, Sample]) -> dict[int, Array]:
+        """Return the pose (4, 4) of each geometry of the obstacles, by its number."""
         return {
-            piece: pin.SE3(seen.rotation, seen.position).homogeneous
-            for name, seen in obstacles.items()
-            for piece in self._pieces[name]
+            piece: pin.SE3(sample.rotation, sample.position).homogeneous
+            for name, sample in obstacles.items()
+            for piece in self._geometries[name]
         }
 
     def frames(self, q: Array, obstacles: Mapping[str, Sample]) -> Array:
-        """(f, 4, 4) where placo has the frames of the tasks."""
-        poses, _ = self.worker.ask("place", {"q": q, "bodies": self._moved(obstacles)}, STEP_PATIENCE)
+        """Return the poses (f, 4, 4) of the tasks' frames by placo."""
+        poses, _ = self.worker.ask("place", {"q": q, "bodies": self._obstacle_poses(obstacles)}, STEP_TIMEOUT)
         return np.asarray(poses)
 
     def distances(self) -> Array:
-        """(k,) what placo takes for the distances of the pairs [m]."""
-        return np.asarray(self.worker.ask("distances", None, STEP_PATIENCE)[0])
+        """Return the distances (k,) of the pairs by placo [m]."""
+        return np.asarray(self.worker.ask("distances", None, STEP_TIMEOUT)[0])
 
 
-class Ended(RuntimeError):
-    """The other process is gone."""
+class WorkerEnded(RuntimeError):
+    """The process of placo has ended."""
 
 
 class Worker:
-    """The other process, and the connection to it. It ends with this object."""
+    """Process of placo and the connection to it; it ends with this object."""
 
     def __init__(self, python: str) -> None:
-        """Starts it by the interpreter `python`.
+        """Start the process with the interpreter `python`.
 
         Raises:
             ConfigError: there is no such interpreter.
@@ -147,40 +158,40 @@ class Worker:
             raise ConfigError(f"{PLACO_PYTHON}: {python} cannot be run: {error.strerror}") from error
         finally:
             there.close()
-        weakref.finalize(self, _end, self.process, self._connection)
+        weakref.finalize(self, _close, self.process, self._connection)
 
-    def ask(self, command: str, argument: Any, patience: float) -> tuple[Any, float]:
-        """What it answers, and how long it took over that [s].
+    def ask(self, command: str, argument: Any, timeout: float) -> tuple[Any, float]:
+        """Return the answer to a command, and the time that it took [s].
 
         Raises:
-            Ended: it has ended, or does not answer within `patience` [s] and has been ended for that.
+            WorkerEnded: it has ended, or does not answer within `timeout` [s] and has been ended for that.
             RuntimeError: it raised.
         """
         try:
             self._connection.send_bytes(pickle.dumps((command, argument), protocol=4))
-            if not self._connection.poll(patience):
-                _end(self.process, self._connection)
-                raise Ended(f"the process did not answer within {patience:g} s, and was ended")
-            answer, said, seconds = pickle.loads(self._connection.recv_bytes())
+            if not self._connection.poll(timeout):
+                _close(self.process, self._connection)
+                raise WorkerEnded(f"the process did not answer within {timeout:g} s, and was ended")
+            answer, message, seconds = pickle.loads(self._connection.recv_bytes())
         except (EOFError, OSError) as error:
-            raise Ended(f"the process has ended, with code {self.process.wait(STEP_PATIENCE)}") from error
-        if said:
-            raise RuntimeError(said)
+            raise WorkerEnded(f"the process has ended, with code {self.process.wait(STEP_TIMEOUT)}") from error
+        if message:
+            raise RuntimeError(message)
         return answer, seconds
 
 
-def _end(process: subprocess.Popen[bytes], connection: Connection) -> None:
+def _close(process: subprocess.Popen[bytes], connection: Connection) -> None:
     connection.close()
     process.kill()
     process.wait()
 
 
-def _described(task: FrameTask) -> tuple[bool, bool, float, float]:
+def _describe_task(task: FrameTask) -> tuple[bool, bool, float, float]:
     return task.moves, task.turns, task.settings.weight, task.settings.orientation_weight
 
 
 def describe_bodies(scene: Scene, source: str) -> list[tuple[int, str, Any, Array]]:
-    """Joint, shape, sizes and placement (4, 4) of each geometry.
+    """Return joint, shape, sizes and placement (4, 4) of each geometry.
 
     Raises:
         ConfigError: a shape that cannot be described.
@@ -211,20 +222,23 @@ def _shape(body: Any, source: str) -> tuple[str, Any]:
 
 
 def write_urdf(scene: Scene, tasks: list[FrameTask], limits: Limits) -> str:
-    """Joints of a robot and frames of its tasks, without geometry: one link a joint, one on a fixed joint a frame."""
+    """Write joints of a robot and frames of its tasks as URDF, without geometry.
+
+    It has one link a joint, and one on a fixed joint a frame.
+    """
     model, bounds = scene.robot.model, scene.robot.bounds().within(limits)
     ranges = dict(zip(bounds.q_index.tolist(), np.stack((bounds.lower, bounds.upper), axis=1).tolist(), strict=True))
     lines = ['<robot name="robot">', *(f'<link name="link {joint}"/>' for joint in range(model.njoints))]
     for index in range(1, model.njoints):
         joint = model.joints[index]
         slides, axis = hinge_or_slide(model, index)
-        low, high = ranges.get(joint.idx_q, (-_UNLIMITED, _UNLIMITED))
+        low, high = ranges.get(joint.idx_q, (-_NO_LIMIT, _NO_LIMIT))
         lines.append(
             f'<joint name="{model.names[index]}" type="{"prismatic" if slides else "revolute"}">'
             f'<parent link="link {model.parents[index]}"/><child link="link {index}"/>'
             f'{_origin(model.jointPlacements[index])}<axis xyz="{_numbers(axis)}"/>'
-            f'<limit lower="{_finite(low)!r}" upper="{_finite(high)!r}" '
-            f'velocity="{_finite(bounds.velocity[joint.idx_v])!r}" effort="1"/></joint>'
+            f'<limit lower="{_finite_limit(low)!r}" upper="{_finite_limit(high)!r}" '
+            f'velocity="{_finite_limit(bounds.velocity[joint.idx_v])!r}" effort="1"/></joint>'
         )
     for number, task in enumerate(tasks):
         frame = model.frames[task.frame_id]
@@ -236,8 +250,8 @@ def write_urdf(scene: Scene, tasks: list[FrameTask], limits: Limits) -> str:
     return "\n".join([*lines, "</robot>"])
 
 
-def _finite(limit: float) -> float:
-    return float(np.clip(limit, -_UNLIMITED, _UNLIMITED))
+def _finite_limit(limit: float) -> float:
+    return float(np.clip(limit, -_NO_LIMIT, _NO_LIMIT))
 
 
 def _origin(placement: Any) -> str:

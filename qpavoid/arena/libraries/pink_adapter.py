@@ -13,39 +13,50 @@ from pink.limits import AccelerationLimit, ConfigurationLimit, VelocityLimit
 from pink.tasks import FrameTask
 
 from qpavoid.arena.case import Case
-from qpavoid.arena.outside.common import between, costs, frame_tasks, one_period_ahead, parted_pairs, pieces
-from qpavoid.arena.outside.settings import PINK
+from qpavoid.arena.libraries.common import (
+    frame_tasks,
+    movable_pairs,
+    obstacle_geometries,
+    surface_distances,
+    target_after_step,
+    task_costs,
+)
+from qpavoid.arena.libraries.settings import PINK
 from qpavoid.arena.world import World
 from qpavoid.model.trajectory import Sample
 from qpavoid.problem import Array, Solution
 
 
 class Pilot:
-    """Obstacles are geometries of the collision model that no joint moves; their placements are set at every tick.
+    """Pink's solver for one case; obstacles are geometries that no joint moves.
+
+    Their placements are set at every step.
 
     The barrier knows no motion of obstacles, and keeps its rows for as long as q stays the same to `np.allclose`:
     a robot at rest does not see what comes. It is used as it is.
     """
 
     def __init__(self, case: Case, world: World) -> None:
-        """Works on copies: Pink hangs attributes on the model, and the scene's geometry is the referee's.
+        """Set Pink up on copies of model and geometry.
+
+        Pink adds attributes to the model, and the checker uses the scene's geometry.
 
         Raises:
             ConfigError: the case has something that it cannot be given.
         """
         scenario, scene = case.scenario, world.scene
-        self._followed = frame_tasks(case, world, "Pink")
-        self._dt, self._pieces = scenario.dt, pieces(scene)
+        self._frame_tasks = frame_tasks(case, world, "Pink")
+        self._dt, self._geometries = scenario.dt, obstacle_geometries(scene)
         self._damping = (PINK["cost"] * scenario.tracking_damping) ** 2
         model, geometry = scene.robot.model.copy(), pin.GeometryModel(scene.geometry)
         geometry.removeAllCollisionPairs()
-        pairs = parted_pairs(scene).tolist()
+        pairs = movable_pairs(scene).tolist()
         for a, b in pairs:
             geometry.addCollisionPair(pin.CollisionPair(a, b))
         self.configuration = pink.Configuration(model, model.createData(), world.q0, collision_model=geometry)
         self._tasks = []
-        for task in self._followed:
-            position, orientation = costs(task)
+        for task in self._frame_tasks:
+            position, orientation = task_costs(task)
             frame = scene.robot.model.frames[task.frame_id].name
             self._tasks.append(FrameTask(frame, PINK["cost"] * position, PINK["cost"] * orientation))
         bounds = scene.robot.bounds().within(scenario.limits)
@@ -60,28 +71,28 @@ class Pilot:
                 min(PINK["n_collision_pairs"], len(pairs)),
                 gain=PINK["gain"],
                 safe_displacement_gain=PINK["safe_displacement_gain"],
-                d_min=between(scenario.avoidance)[0],
+                d_min=surface_distances(scenario.avoidance)[0],
             )
             self._barriers = [barrier]
 
     def step(self, q: Array, t: float, targets: Mapping[str, Sample], obstacles: Mapping[str, Sample]) -> Solution:
-        """Velocity for the next dt.
+        """Compute the velocity for the next control period.
 
         Raises:
             NoSolutionFound, NotWithinConfigurationLimits: by Pink; the robot is held then.
         """
         configuration, bodies = self.configuration, self.configuration.collision_model.geometryObjects
-        for name, seen in obstacles.items():
-            for piece in self._pieces[name]:
-                bodies[piece].placement = pin.SE3(seen.rotation, seen.position)
+        for name, sample in obstacles.items():
+            for piece in self._geometries[name]:
+                bodies[piece].placement = pin.SE3(sample.rotation, sample.position)
         configuration.update(q)
-        for task, followed in zip(self._tasks, self._followed, strict=True):
-            here = configuration.get_transform_frame_to_world(task.frame).homogeneous
-            target = targets[followed.settings.label]
-            task.set_target(pin.SE3(one_period_ahead(followed, target, here, self._dt)))
-        held = np.zeros(configuration.model.nv)
+        for task, task_config in zip(self._tasks, self._frame_tasks, strict=True):
+            pose = configuration.get_transform_frame_to_world(task.frame).homogeneous
+            target = targets[task_config.settings.label]
+            task.set_target(pin.SE3(target_after_step(task_config, target, pose, self._dt)))
+        v = np.zeros(configuration.model.nv)
         try:
-            held = pink.solve_ik(
+            v = pink.solve_ik(
                 configuration,
                 self._tasks,
                 self._dt,
@@ -92,14 +103,14 @@ class Pilot:
             )
         finally:
             if self._accelerations is not None:
-                self._accelerations.set_last_integration(held, self._dt)
-        return Solution(np.asarray(held))
+                self._accelerations.set_last_integration(v, self._dt)
+        return Solution(np.asarray(v))
 
     def frames(self) -> Array:
-        """(f, 4, 4) where Pink has the frames of the tasks."""
+        """Return the poses (f, 4, 4) of the tasks' frames by Pink."""
         poses = [self.configuration.get_transform_frame_to_world(task.frame).homogeneous for task in self._tasks]
         return np.array(poses)
 
     def distances(self) -> Array:
-        """(k,) what Pink takes for the distances of the pairs [m]."""
+        """Return the distances (k,) of the pairs by Pink [m]."""
         return np.array([result.min_distance for result in self.configuration.collision_data.distanceResults])

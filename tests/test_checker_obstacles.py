@@ -1,4 +1,4 @@
-"""MuJoCo as referee of what this project treats in a way of its own: clouds, loads, decomposed meshes, half-spaces."""
+"""MuJoCo as independent checker of clouds, attached objects, decomposed meshes and half-spaces."""
 
 from dataclasses import replace
 
@@ -17,19 +17,19 @@ from qpavoid.model.cloud import ball_radius
 pytest.importorskip("mujoco")
 pytest.importorskip("bench", reason="bench/ is in the repository only")
 
-from qpavoid.arena.twin import build
+from qpavoid.arena.mujoco_model import build
 
 TCP, HOLD = "panda_hand_tcp", 0.02
 
 
-def played(controller, twin, ticks, target, given=None):
-    """Least distance of every pair of the twin on the way, looked at five times in each tick."""
-    least = np.full(len(twin.scene.pairs), np.inf)
-    for tick in drive(controller, controller.scene.robot.home.copy(), ticks, target=target, obstacles=given):
+def smallest_distances(controller, mujoco_model, ticks, target, updates=None):
+    """Return the smallest distance of every pair in a closed loop, checked five times in each step."""
+    least = np.full(len(mujoco_model.scene.pairs), np.inf)
+    for tick in drive(controller, controller.scene.robot.home.copy(), ticks, target=target, obstacles=updates):
         assert tick.solution.status is Status.SOLVED, tick.solution.reasons
         for share in (0.2, 0.4, 0.6, 0.8, 1.0):
-            twin.place(twin.integrate(tick.state.q, tick.solution.v, share * controller.dt), 0.0)
-            least = np.minimum(least, [twin.distance(pair) for pair in range(len(least))])
+            mujoco_model.place(mujoco_model.integrate(tick.state.q, tick.solution.v, share * controller.dt), 0.0)
+            least = np.minimum(least, [mujoco_model.distance(pair) for pair in range(len(least))])
     return least
 
 
@@ -43,22 +43,24 @@ def test_distances_to_the_new_shapes(panda, tmp_path):
     mesh = Mesh(path=str(write_stl(tmp_path / "shelf.stl", boards(*SHELF))))
     shapes = [Ellipsoid(radii=(0.1, 0.2, 0.1)), HalfSpace(), mesh]
     scene = build_scene(panda, [Obstacle.at(f"o{i}", s, [0.5, 0.1, 0.2 * i - 0.2]) for i, s in enumerate(shapes)])
-    twin, rng, count = build(scene, panda.home), np.random.default_rng(0), 0
+    mujoco_model, rng, count = build(scene, panda.home), np.random.default_rng(0), 0
     for _ in range(8):
         q = random_q(panda, rng)
-        twin.place(q, 0.0)
+        mujoco_model.place(q, 0.0)
         model, data = panda.model, scene.geometry.createData()
         pin.updateGeometryPlacements(model, model.createData(), scene.geometry, data, q)
         pin.computeDistances(scene.geometry, data)
         for pair, result in enumerate(data.distanceResults):
             if result.min_distance > 0.0:
-                assert twin.distance(pair) == pytest.approx(result.min_distance, abs=2e-4), scene.pair_names[pair]
+                assert mujoco_model.distance(pair) == pytest.approx(result.min_distance, abs=2e-4), scene.pair_names[
+                    pair
+                ]
                 count += 1
     assert count > 150
 
 
-def test_a_cloud_against_all_its_voxels(panda):
-    """The referee has a ball for every voxel, and knows nothing of slots."""
+def test_cloud_distance_equals_all_voxels(panda):
+    """The checker has a sphere for every voxel, and no proxy spheres."""
     rng, tool = np.random.default_rng(1), tool_at(panda).translation
     points = tool + np.array([0.0, 0.28, 0.0]) + rng.uniform(-1, 1, (400, 3)) * [0.15, 0.004, 0.15]
     shape = PointCloud(resolution=0.03)
@@ -66,17 +68,21 @@ def test_a_cloud_against_all_its_voxels(panda):
         panda, [Obstacle.at("camera", shape, [0, 0, 0])], TCP, avoidance=Avoidance(d1=HOLD, d2=0.1)
     )
     centers, ball = Voxels.of(points, shape.resolution).centers, Sphere(radius=ball_radius(shape.resolution))
-    twin = build(build_scene(panda, [Obstacle.at(f"v{i}", ball, c) for i, c in enumerate(centers)]), panda.home)
-    of_voxels = twin.scene.pairs[:, 1] >= twin.bodies
+    mujoco_model = build(build_scene(panda, [Obstacle.at(f"v{i}", ball, c) for i, c in enumerate(centers)]), panda.home)
+    of_voxels = mujoco_model.scene.pairs[:, 1] >= mujoco_model.bodies
     assert len(centers) > 60
-    least = played(
-        controller, twin, 90, lambda t: tool + np.array([0.0, 0.5 * t, 0.0]), lambda t: {"camera": Points(points)}
+    least = smallest_distances(
+        controller,
+        mujoco_model,
+        90,
+        lambda t: tool + np.array([0.0, 0.5 * t, 0.0]),
+        lambda t: {"camera": Points(points)},
     )
     assert HOLD - 1e-3 < least[of_voxels].min() < 0.08
 
 
-def test_a_load_as_a_body_of_another_robot(panda):
-    """The referee's robot has the box welded to its hand, by its own description."""
+def test_attached_object_equals_body_of_robot(panda):
+    """The checker's robot has the box welded to its hand, by its own description."""
     tool = tool_at(panda)
     held = tool * pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.14]))
     box, pole = Box(size=(0.06, 0.06, 0.24)), Capsule(radius=0.025, length=0.16)
@@ -86,16 +92,16 @@ def test_a_load_as_a_body_of_another_robot(panda):
     controller = make_controller(panda, [load, Obstacle.at("pole", pole, at)], TCP, avoidance=avoidance)
     controller.attach("box", TCP, panda.home)
     welded = _with_body(panda, "box", box, pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.14])))
-    twin = build(build_scene(welded, [Obstacle.at("pole", pole, at)]), panda.home)
-    pair = twin.scene.pair_names.index(("box", "pole"))
+    mujoco_model = build(build_scene(welded, [Obstacle.at("pole", pole, at)]), panda.home)
+    pair = mujoco_model.scene.pair_names.index(("box", "pole"))
     start = tool.translation
 
     def way(t):
         return start + np.array([0.0, min(0.3 * t, 0.4), 0.0])
 
-    assert HOLD - 1e-3 < played(controller, twin, 150, way)[pair] < HOLD + 0.03
+    assert HOLD - 1e-3 < smallest_distances(controller, mujoco_model, 150, way)[pair] < HOLD + 0.03
     alone = make_controller(panda, [Obstacle.at("pole", pole, at)], TCP, avoidance=avoidance)
-    assert played(alone, twin, 150, way)[pair] < 0.0
+    assert smallest_distances(alone, mujoco_model, 150, way)[pair] < 0.0
 
 
 def _with_body(robot: Robot, name, shape, inside):
@@ -107,8 +113,8 @@ def _with_body(robot: Robot, name, shape, inside):
     return replace(robot, bodies=bodies)
 
 
-def test_a_shelf_as_a_mesh_against_its_boards(panda, tmp_path):
-    """The referee has five boxes."""
+def test_decomposed_mesh_equals_its_boards(panda, tmp_path):
+    """The checker has five boxes."""
     tool = tool_at(panda).translation
     place = tool + np.array([0.28, 0.0, -0.35])
     turn = pin.rpy.rpyToMatrix(0, 0, np.pi / 2)
@@ -119,7 +125,9 @@ def test_a_shelf_as_a_mesh_against_its_boards(panda, tmp_path):
     pieces = [
         Obstacle.at(f"b{i}", Box(size=size), place + turn @ np.array(c), turn) for i, (c, size) in enumerate(SHELF)
     ]
-    twin = build(build_scene(panda, pieces), panda.home)
-    of_boards = twin.scene.pairs[:, 1] >= twin.bodies
-    least = played(controller, twin, 120, lambda t: tool + np.array([min(0.3 * t, 0.2), 0.0, 0.2 * np.sin(3.0 * t)]))
+    mujoco_model = build(build_scene(panda, pieces), panda.home)
+    of_boards = mujoco_model.scene.pairs[:, 1] >= mujoco_model.bodies
+    least = smallest_distances(
+        controller, mujoco_model, 120, lambda t: tool + np.array([min(0.3 * t, 0.2), 0.0, 0.2 * np.sin(3.0 * t)])
+    )
     assert HOLD - 1e-3 < least[of_boards].min() < 0.05

@@ -1,4 +1,4 @@
-"""Whether there is room for an obstacle."""
+"""Free space for an obstacle: distances of a shape from bodies and obstacles."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import pinocchio as pin
 from qpavoid.model.robot import Robot
 from qpavoid.problem import Array
 
-Placed = tuple[Any, Any]
-"""A coal shape and its place."""
+PlacedShape = tuple[Any, Any]
+"""A coal shape and its placement."""
 
 
-def bodies_at(robot: Robot, q: Array) -> list[tuple[int, Any, Any]]:
-    """Joint, shape and place of each of a robot's bodies at q (nq,)."""
+def placed_bodies(robot: Robot, q: Array) -> list[tuple[int, Any, Any]]:
+    """Return joint, shape and placement of each body of a robot at q (nq,)."""
     data = robot.bodies.createData()
     pin.updateGeometryPlacements(robot.model, robot.model.createData(), robot.bodies, data, q)
     return [
@@ -26,14 +26,14 @@ def bodies_at(robot: Robot, q: Array) -> list[tuple[int, Any, Any]]:
     ]
 
 
-def placed(geometry: Any) -> Placed:
-    """A geometry in the frame that it is fixed to."""
+def as_placed_shape(geometry: Any) -> PlacedShape:
+    """Return a geometry's shape and its placement in the frame that it is fixed to."""
     place = geometry.placement
     return geometry.geometry, coal.Transform3s(place.rotation, place.translation)
 
 
-def gap(shape: Any, here: Any, others: Sequence[Placed]) -> float:
-    """Smallest distance of a shape from others in their places [m], negative inside; inf from none."""
+def min_distance(shape: Any, placement: Any, other_shapes: Sequence[PlacedShape]) -> float:
+    """Return the smallest distance of a shape from others [m]; negative inside, inf from none."""
     request = coal.DistanceRequest()
-    distances = (coal.distance(shape, here, *other, request, coal.DistanceResult()) for other in others)
+    distances = (coal.distance(shape, placement, *other, request, coal.DistanceResult()) for other in other_shapes)
     return min(distances, default=np.inf)

@@ -20,7 +20,7 @@ import placo
 
 
 class Robot:
-    """placo's solver, set up for one case. All poses are (4, 4)."""
+    """placo's solver, set up for one case; all poses are (4, 4)."""
 
     def __init__(self, setup: dict[str, Any]) -> None:
         self.robot = placo.RobotWrapper("", 0, setup["urdf"])
@@ -43,7 +43,7 @@ class Robot:
             avoid.self_collisions_margin, avoid.self_collisions_trigger = setup["margin"], setup["trigger"]
 
     def _task(self, frame: str, moves: bool, turns: bool, weight: float, orientation_weight: float) -> Any:
-        """A setter of the pose that a frame should have."""
+        """Add a frame task; return a setter of its target pose."""
         if moves and turns:
             task = self.solver.add_frame_task(frame, np.eye(4))
             task.configure(frame, "soft", weight, orientation_weight)
@@ -57,7 +57,10 @@ class Robot:
         return lambda pose: setattr(task, "R_world_frame", pose[:3, :3])
 
     def _add_bodies(self, setup: dict[str, Any], joints: list[int]) -> None:
-        """placo has no interface for obstacles: they are bodies of its collision model that no joint moves."""
+        """Add obstacles as bodies of the collision model that no joint moves.
+
+        placo has no interface for obstacles.
+        """
         geometry = self.robot.collision_model
         for number, (joint, kind, sizes, placement) in enumerate(setup["bodies"]):
             body = pin.GeometryObject(f"body {number}", joints[joint], pin.SE3(placement), shape(kind, sizes))
@@ -66,31 +69,34 @@ class Robot:
             geometry.addCollisionPair(pin.CollisionPair(a, b))
         self._pairs = setup["pairs"]
 
-    def place(self, asked: dict[str, Any]) -> Any:
-        """Puts the robot to `q` (nv,), and bodies to where they are; gives the frames (f, 4, 4)."""
+    def place(self, state: dict[str, Any]) -> Any:
+        """Put the robot to `q` (nv,) and bodies to their poses; return the frames (f, 4, 4)."""
         bodies = self.robot.collision_model.geometryObjects
-        for number, placement in asked["bodies"].items():
+        for number, placement in state["bodies"].items():
             bodies[number].placement = pin.SE3(placement)
         q = self.robot.state.q.copy()
-        q[self._q_index] = asked["q"]
+        q[self._q_index] = state["q"]
         self.robot.state.q = q
         self.robot.update_kinematics()
         return np.array([self.robot.get_T_world_frame(frame) for frame in self._frames])
 
     def solve(self, poses: Any) -> Any:
-        """Velocity (nv,) towards poses (f, 4, 4) of the frames; placo gives a displacement."""
+        """Compute the velocity (nv,) towards poses (f, 4, 4) of the frames."""
         for set_pose, pose in zip(self._tasks, poses, strict=True):
             set_pose(pose)
         return np.asarray(self.solver.solve(False))[self._v_index] / self._dt
 
     def distances(self, _: None) -> Any:
-        """(k,) what placo takes for the distances of the pairs."""
-        found = {(near.objA, near.objB): near.min_distance for near in self.robot.distances()}
-        return np.array([found[a, b] for a, b in self._pairs])
+        """Return the distances (k,) of the pairs by placo [m]."""
+        distances_by_pair = {(near.objA, near.objB): near.min_distance for near in self.robot.distances()}
+        return np.array([distances_by_pair[a, b] for a, b in self._pairs])
 
 
 def shape(kind: str, sizes: Any) -> Any:
-    """A coal shape, by its name and what its constructor takes; a hull by its points (n, 3)."""
+    """Return a coal shape by its name and the arguments of its constructor.
+
+    A hull is given by its points (n, 3).
+    """
     if kind != "Convex":
         return getattr(coal, kind)(*sizes)
     points = coal.StdVec_Vec3s()
@@ -99,7 +105,7 @@ def shape(kind: str, sizes: Any) -> Any:
 
 
 def main() -> None:
-    """Answers requests until the other end is closed."""
+    """Answer requests until the other end is closed."""
     connection, robot = Connection(int(sys.argv[1])), None
     while True:
         try:
@@ -112,10 +118,10 @@ def main() -> None:
                 robot, answer = Robot(argument), None
             else:
                 answer = getattr(robot, command)(argument)
-            said = ""
-        except Exception as error:  # whatever placo raises is told to the other end
-            answer, said = None, f"{type(error).__name__}: {error}"
-        connection.send_bytes(pickle.dumps((answer, said, perf_counter() - begin), protocol=4))
+            message = ""
+        except Exception as error:  # whatever placo raises is an answer
+            answer, message = None, f"{type(error).__name__}: {error}"
+        connection.send_bytes(pickle.dumps((answer, message, perf_counter() - begin), protocol=4))
 
 
 if __name__ == "__main__":

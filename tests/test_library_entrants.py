@@ -12,8 +12,8 @@ import pytest
 from qpavoid import Sample, load_scenario
 from qpavoid.arena.case import Case, Sensor
 from qpavoid.arena.entrants import ENTRANTS, find_entrant
-from qpavoid.arena.outside.common import frame_tasks, one_period_ahead, parted_pairs
-from qpavoid.arena.outside.settings import PLACO_PYTHON
+from qpavoid.arena.libraries.common import frame_tasks, movable_pairs, target_after_step
+from qpavoid.arena.libraries.settings import PLACO_PYTHON
 from qpavoid.arena.rollout import roll_out
 from qpavoid.arena.trial import run_trial
 from qpavoid.arena.world import build_world
@@ -60,7 +60,7 @@ def targets_at(world, t):
 def true_distances(world, q, moved):
     """(k,) distances of the pairs that the robot can part, by coal, obstacles `moved` to where they are said to be."""
     scene = world.scene
-    geometry, pairs = pin.GeometryModel(scene.geometry), parted_pairs(scene).tolist()
+    geometry, pairs = pin.GeometryModel(scene.geometry), movable_pairs(scene).tolist()
     for number, obstacle in enumerate(scene.obstacles):
         if obstacle.name in moved:
             sample = moved[obstacle.name]
@@ -79,11 +79,12 @@ def seen_by(library, pilot, world):
     if library != "mink":
         return pilot.distances()
     found = pilot.distances()
-    return np.array([found.get((a, b), np.nan) for a, b in parted_pairs(world.scene).tolist()])
+    return np.array([found.get((a, b), np.nan) for a, b in movable_pairs(world.scene).tolist()])
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
-def test_frames_and_distances_are_ours(library, name):
+def test_adapter_frames_and_distances_equal_scene(library, name):
+    """Frames and distances are ours."""
     _, world, pilot = start(library, name)
     model, t = world.scene.robot.model, 2.5
     q = pin.integrate(model, world.q0, 0.1 * np.random.default_rng(1).uniform(-1.0, 1.0, model.nv))
@@ -111,7 +112,8 @@ def test_obstacles_that_move_reach_the_library(library):
 
 @pytest.mark.parametrize("kind", ["position", "pose"])
 @pytest.mark.parametrize("library", ["mink", "placo"])
-def test_with_nothing_near_the_velocity_is_that_of_our_tracking_law(library, kind):
+def test_adapter_velocity_equals_tracking_without_obstacles(library, kind):
+    """With nothing near the velocity is that of our tracking law."""
     if ENTRANTS[library].missing:
         pytest.skip(f"{library} is not installed")
     case, world, pilot = start(library, "ur5_pole", "obstacles=[]", f"tasks.0.type={kind}")
@@ -123,22 +125,23 @@ def test_with_nothing_near_the_velocity_is_that_of_our_tracking_law(library, kin
         assert pilot.step(world.q0, t, targets, {}).v == pytest.approx(v, abs=1e-6)
 
 
-def test_pink_tracks_as_we_do_with_the_damping_of_its_barrier_on_top():
+def test_pink_equals_tracking_with_barrier_damping():
+    """Pink tracks as we do with the damping of its barrier on top."""
     pytest.importorskip("pink")
     from pink.barriers import SelfCollisionBarrier
 
-    from qpavoid.arena.outside.settings import PINK
+    from qpavoid.arena.libraries.settings import PINK
 
     case, world, pilot = start("pink", "ur5_pole", "obstacles=[]")
     (task,), targets = world.tasks, targets_at(world, 1.0)
     v, model, dt = pilot.step(world.q0, 1.0, targets, {}).v, world.scene.robot.model, case.scenario.dt
     here = pin.SE3(pilot.frames()[0])
-    there = pin.SE3(one_period_ahead(task, targets[task.settings.label], here.homogeneous, dt))
+    there = pin.SE3(target_after_step(task, targets[task.settings.label], here.homogeneous, dt))
     # a translation of its frame task is that of a screw, so that turning counts: half the step times the turn
     J = pin.computeFrameJacobian(model, model.createData(), world.q0, task.frame_id, pin.ReferenceFrame.LOCAL)
     J = (pin.Jlog6(there.actInv(here)) @ J)[:3]
     e = pin.log6(here.actInv(there)).linear
-    rows = SelfCollisionBarrier(min(PINK["n_collision_pairs"], len(parted_pairs(world.scene))))
+    rows = SelfCollisionBarrier(min(PINK["n_collision_pairs"], len(movable_pairs(world.scene))))
     scale = PINK["cost"] * np.linalg.norm(rows.compute_jacobian(pilot.configuration))
     damping = case.scenario.tracking_damping**2 + PINK["safe_displacement_gain"] / scale**2
     damped = J.T @ J + damping * np.eye(model.nv)
@@ -153,17 +156,18 @@ def test_speed_caps_and_orientations_of_a_target_one_period_ahead():
     here = np.array(pin.SE3(pin.exp3(np.array([0.2, -0.4, 1.0])), np.array([0.1, 0.2, 0.3])).homogeneous)
     turn = np.array([0.3, 0.1, -0.2])
     target = Sample.at((0.4, 0.2, 0.7), pin.exp3(turn) @ here[:3, :3])
-    there = one_period_ahead(task, target, here, 0.01)
+    there = target_after_step(task, target, here, 0.01)
     assert (there[:3, 3] - here[:3, 3]) / 0.01 == pytest.approx(0.1 * np.array([0.6, 0.0, 0.8]))
     rate = pin.log3(there[:3, :3] @ here[:3, :3].T) / 0.01
     assert rate == pytest.approx(0.5 * turn / np.linalg.norm(turn))
     near = Sample.at(here[:3, 3] + 0.01, pin.exp3(0.1 * turn) @ here[:3, :3], linear=(0.01, 0.0, 0.0))
-    there = one_period_ahead(task, near, here, 0.01)
+    there = target_after_step(task, near, here, 0.01)
     assert (there[:3, 3] - here[:3, 3]) / 0.01 == pytest.approx([0.03, 0.02, 0.02])  # gain 2
     assert pin.log3(there[:3, :3] @ here[:3, :3].T) / 0.01 == pytest.approx(0.2 * turn)
 
 
-def test_an_obstacle_that_rests_is_kept_clear_of(library):
+def test_adapter_avoids_static_obstacle(library):
+    """An obstacle that rests is kept clear of."""
     score = run_trial(make_case("ur5_pole", "duration=5"), ENTRANTS[library])
     assert score.failed == 0.0 and score.violations == 0.0 and not score.collided
     assert run_trial(make_case("ur5_pole", "duration=5"), ENTRANTS["tracking"]).collided
@@ -171,12 +175,12 @@ def test_an_obstacle_that_rests_is_kept_clear_of(library):
     assert score.min_distance > score.d1 - (0.005 if library == "mink" else 1e-3)
 
 
-def test_who_gets_out_of_the_way_of_an_obstacle_when_the_robot_rests(library):
+def test_adapter_evasion_of_robot_at_rest(library):
     """Records what the libraries do: none knows the obstacle's velocity, mink does not back away, Pink does not see."""
     case, world, pilot = start(library, "ur5_pole")
     targets = {name: sample._replace(linear=np.zeros(3)) for name, sample in targets_at(world, 0.0).items()}
-    scene, count = world.scene, len(parted_pairs(world.scene))
-    hand = [i for i, (_, b) in enumerate(parted_pairs(scene).tolist()) if b >= len(scene.body_names)]
+    scene, count = world.scene, len(movable_pairs(world.scene))
+    hand = [i for i, (_, b) in enumerate(movable_pairs(scene).tolist()) if b >= len(scene.body_names)]
     assert hand and count > len(hand)
     distances, speeds = [], []
     (tool,) = world.tasks
@@ -200,7 +204,7 @@ def test_who_gets_out_of_the_way_of_an_obstacle_when_the_robot_rests(library):
         assert np.abs(v).max() > 0.05
 
 
-def test_the_rows_of_pink_turn_round_in_penetration():
+def test_pink_rows_change_sign_in_penetration():
     """Records it: the docs say so."""
     barriers = pytest.importorskip("pink.barriers")
     _, world, pilot = start("pink", "ur5_pole")
@@ -212,7 +216,7 @@ def test_the_rows_of_pink_turn_round_in_penetration():
     steps = 1e-5 * np.eye(nv)
     change = [true_distances(world, world.q0 + e, seen) - true_distances(world, world.q0 - e, seen) for e in steps]
     slope = np.transpose(change) / 2e-5
-    distance, count = pilot.distances(), len(parted_pairs(world.scene))
+    distance, count = pilot.distances(), len(movable_pairs(world.scene))
     J = barriers.SelfCollisionBarrier(count).compute_jacobian(pilot.configuration)
     J = J[np.argsort(np.argpartition(-distance, -count))]  # its rows are in the order of its own selection
     moves = np.linalg.norm(slope, axis=1) > 1e-2
@@ -222,7 +226,8 @@ def test_the_rows_of_pink_turn_round_in_penetration():
     assert along[~inside] == pytest.approx(1.0, abs=0.01)
 
 
-def test_pink_refuses_to_go_on_beyond_a_limit():
+def test_pink_raises_beyond_position_limit():
+    """Pink refuses to go on beyond a limit."""
     exceptions = pytest.importorskip("pink.exceptions")
     _, world, pilot = start("pink", "ur5_pole")
     beyond = world.q0.copy()
@@ -232,7 +237,8 @@ def test_pink_refuses_to_go_on_beyond_a_limit():
     assert np.isfinite(pilot.step(world.q0, 0.0, targets_at(world, 0.0), {}).v).all()
 
 
-def test_a_process_that_is_killed_makes_failures_and_no_hang(placo):
+def test_placo_killed_process_fails_without_hang(placo):
+    """A process that is killed makes failures and no hang."""
     case = make_case("ur5_pole", "duration=1")
     world = build_world(case.scenario)
     pilot = ENTRANTS["placo"].start(case, world)
@@ -248,8 +254,9 @@ def test_a_process_that_is_killed_makes_failures_and_no_hang(placo):
     assert "has ended" in rollout.failure and not rollout.v[40:].any()
 
 
-def test_a_process_that_does_not_answer_is_ended(placo, monkeypatch):
-    monkeypatch.setattr("qpavoid.arena.outside.placos.STEP_PATIENCE", 0.3)
+def test_placo_silent_process_is_ended(placo, monkeypatch):
+    """A process that does not answer is ended."""
+    monkeypatch.setattr("qpavoid.arena.libraries.placo_adapter.STEP_TIMEOUT", 0.3)
     _, world, pilot = start("placo", "ur5_pole")
     pilot.worker.process.send_signal(signal.SIGSTOP)
     with pytest.raises(RuntimeError, match=r"did not answer within 0\.3 s"):
@@ -260,7 +267,8 @@ def test_a_process_that_does_not_answer_is_ended(placo, monkeypatch):
         pilot.step(world.q0, 0.0, targets_at(world, 0.0), {})
 
 
-def test_the_process_ends_with_its_pilot(placo):
+def test_placo_process_ends_with_pilot(placo):
+    """The process ends with its pilot."""
     _, _, pilot = start("placo", "ur5_pole")
     process = pilot.worker.process
     assert process.poll() is None
@@ -268,7 +276,8 @@ def test_the_process_ends_with_its_pilot(placo):
     assert process.poll() is not None
 
 
-def test_the_time_of_a_tick_is_that_in_the_other_process(placo):
+def test_placo_step_time_is_that_of_its_process(placo):
+    """The time of a tick is that in the other process."""
     case = make_case("ur5_pole", "duration=0.5")
     world = build_world(case.scenario)
     pilot = ENTRANTS["placo"].start(case, world)
@@ -284,7 +293,7 @@ def test_the_time_of_a_tick_is_that_in_the_other_process(placo):
     assert np.all(roll_out(case, Slow(), world).tick == 123.0)
 
 
-def test_an_interpreter_without_placo_is_told_apart(monkeypatch):
+def test_placo_interpreter_without_placo_names_remedy(monkeypatch):
     case, world = make_case("ur5_pole"), world_of("ur5_pole")
     monkeypatch.setenv(PLACO_PYTHON, "/nowhere/python")
     assert not ENTRANTS["placo"].missing
@@ -295,14 +304,16 @@ def test_an_interpreter_without_placo_is_told_apart(monkeypatch):
         ENTRANTS["placo"].start(case, world)
 
 
-def test_what_is_missing_and_how_to_get_it(monkeypatch):
+def test_entrant_missing_packages_and_remedy(monkeypatch):
+    """What is missing and how to get it."""
     monkeypatch.delenv(PLACO_PYTHON, raising=False)
     if ENTRANTS["placo"].missing:
         with pytest.raises(ConfigError, match=r"needs placo: pip install placo, or set QPAVOID_PLACO_PYTHON"):
             find_entrant("placo")
 
 
-def test_what_an_adapter_does_not_know_is_refused_at_the_start():
+def test_adapter_refuses_unsupported_case():
+    """What an adapter does not know is refused at the start."""
     posture = make_case("ur5_pole", "tasks=[{frame: tool0}, {type: posture}]")
     with pytest.raises(ConfigError, match=r"adapter of Pink knows no tasks other than `position`, `pose`"):
         frame_tasks(posture, build_world(posture.scenario), "Pink")

@@ -1,4 +1,4 @@
-"""An entrant that a user brings in a file of their own."""
+"""Entrants from users' Python files."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from qpavoid.errors import ConfigError, UnknownName, nearest
 from qpavoid.model.trajectory import Sample
 from qpavoid.problem import Array, Problem, Solution, require_finite
 
-_LARGEST = 10_000_000
-"""Size of a Python file [bytes]."""
-_KINDS = (
+_MAX_FILE_SIZE = 10_000_000
+"""Largest Python file that is read [bytes]: more is no source file."""
+_ACCEPTED = (
     "give a class with `solve(problem)`, made without arguments; a function of a problem; or, made from (case, world), "
     "what has `step(q, t, targets, obstacles)`"
 )
 
 
-def own_entrant(path: Path, name: str) -> Entrant:
-    """The entrant that stands in a Python file; the file is run.
+def entrant_from_file(path: Path, name: str) -> Entrant:
+    """Return the entrant of a Python file; the file is run.
 
     It may be one of
 
@@ -50,76 +50,85 @@ def own_entrant(path: Path, name: str) -> Entrant:
     Raises:
         ConfigError, UnknownName: the file cannot be read or run, or there is no such entrant in it.
     """
-    text = read_text(path, _LARGEST)
-    found = _find(text, path.name, name)
-    if _kind(found) is None:
-        raise ConfigError(f"{path}:{name}: cannot take part; {_KINDS}")
-    says = (inspect.getdoc(found) or f"from {path.name}").partition("\n")[0]
+    text = read_text(path, _MAX_FILE_SIZE)
+    candidate = _load_attribute(text, path.name, name)
+    if _classify(candidate) is None:
+        raise ConfigError(f"{path}:{name}: cannot take part; {_ACCEPTED}")
+    description = (inspect.getdoc(candidate) or f"from {path.name}").partition("\n")[0]
     digest = hashlib.sha256(text.encode()).hexdigest()[:16]
-    return Entrant(name, says, partial(_start, text, path.name, name), {"file": path.name, "digest": digest})
+    return Entrant(
+        name, description, partial(_start_pilot, text, path.name, name), {"file": path.name, "digest": digest}
+    )
 
 
-def _start(text: str, file: str, name: str, case: Case, world: World) -> Pilot:
-    found = _find(text, file, name)
-    kind = _kind(found)
+def _start_pilot(text: str, file: str, name: str, case: Case, world: World) -> Pilot:
+    """Set the entrant of a file's text up for a case."""
+    candidate = _load_attribute(text, file, name)
+    kind = _classify(candidate)
     if kind == "pilot":
-        pilot: Pilot = found(case, world)
+        pilot: Pilot = candidate(case, world)
         return pilot
-    solver = found() if kind == "solver" else None
+    solver = candidate() if kind == "solver" else None
     controller, _ = Controller.from_scenario(case.scenario)
-    return _LawPilot(controller, solver.solve if solver else found, getattr(solver, "bounded", False))
+    return _SolverPilot(controller, solver.solve if solver else candidate, getattr(solver, "bounded", False))
 
 
-def _kind(found: Any) -> str | None:
-    """`solver`, `law` (a function of a problem) or `pilot`; None: neither."""
-    if inspect.isclass(found):
-        return "solver" if hasattr(found, "solve") else "pilot" if hasattr(found, "step") else None
-    if not inspect.isfunction(found):
+def _classify(candidate: Any) -> str | None:
+    """Return `solver`, `law` (a function of a problem), `pilot` or None for none of these."""
+    if inspect.isclass(candidate):
+        return "solver" if hasattr(candidate, "solve") else "pilot" if hasattr(candidate, "step") else None
+    if not inspect.isfunction(candidate):
         return None
-    needed = [p for p in inspect.signature(found).parameters.values() if p.default is p.empty]
-    return {1: "law", 2: "pilot"}.get(len(needed))
+    required = [p for p in inspect.signature(candidate).parameters.values() if p.default is p.empty]
+    return {1: "law", 2: "pilot"}.get(len(required))
 
 
-class _LawPilot:
-    """A law in its controller; what it raises is a failure of the entrant, not the braking stop that it ends in."""
+class _SolverPilot:
+    """A user's solver in a controller.
 
-    def __init__(self, controller: Controller, law: Callable[[Problem], Any], bounded: bool) -> None:
+    An exception of the solver is a failure of the entrant, not the braking stop that the controller makes of it.
+    """
+
+    def __init__(self, controller: Controller, solve: Callable[[Problem], Any], bounded: bool) -> None:
         self.bounded = bounded
-        self._controller, self._law = controller, law
-        self._raised: Exception | None = None
+        self._controller, self._solve = controller, solve
+        self._error: Exception | None = None
         controller.solver = self
 
     def solve(self, problem: Problem) -> Solution:
-        """What the law says, which may be a velocity alone."""
+        """Return the solver's solution, which may be a velocity alone."""
         try:
-            answer = self._law(problem)
+            answer = self._solve(problem)
             solution = answer if isinstance(answer, Solution) else Solution(np.asarray(answer, dtype=np.float64))
             require_finite("its velocity", solution.v, problem.lower.shape)
         except Exception as error:  # whatever a user's law does
-            self._raised = error
+            self._error = error
             raise
         return solution
 
     def step(self, q: Array, t: float, targets: Mapping[str, Sample], obstacles: Mapping[str, Sample]) -> Solution:
-        """Velocity to follow until the next tick."""
-        self._raised = None
+        """Compute the velocity to follow until the next step."""
+        self._error = None
         solution = self._controller.step(q, t, targets, obstacles)
-        if self._raised is not None:
-            raise self._raised
+        if self._error is not None:
+            raise self._error
         return solution
 
 
-def _find(text: str, file: str, name: str) -> Any:
-    module = _module(text, file)
+def _load_attribute(text: str, file: str, name: str) -> Any:
+    """Return a class or function of a file's text by its name."""
+    module = _load_module(text, file)
     if not hasattr(module, name):
-        own = [key for key, value in vars(module).items() if getattr(value, "__module__", None) == module.__name__]
-        raise UnknownName(f"{file}: there is no {name!r} in it{nearest(name, own)}")
+        own_names = [
+            key for key, value in vars(module).items() if getattr(value, "__module__", None) == module.__name__
+        ]
+        raise UnknownName(f"{file}: there is no {name!r} in it{nearest(name, own_names)}")
     return getattr(module, name)
 
 
 @lru_cache(maxsize=32)
-def _module(text: str, file: str) -> ModuleType:
-    """The module of a file's text: the same in every process, wherever the file lies."""
+def _load_module(text: str, file: str) -> ModuleType:
+    """Run a file's text as a module: the same in every process, wherever the file lies."""
     module = ModuleType(f"qpavoid_entrant_{hashlib.sha256(text.encode()).hexdigest()[:16]}")
     sys.modules[module.__name__] = module  # dataclasses and pickle look for it there
     try:

@@ -1,4 +1,4 @@
-"""The referee of the safety campaign: MuJoCo's distances, contacts between ticks, verdicts, and a small campaign."""
+"""The independent checker and the safety campaign: MuJoCo's distances, contacts between ticks, verdicts, and a small campaign."""
 
 from dataclasses import replace
 from functools import cache
@@ -22,8 +22,8 @@ from bench.safety.flight import Start, fly, joint_means, manners
 from bench.safety.referee import disagreement, feedforward, referee
 from bench.safety.trial import trials
 from bench.safety.verdict import judge
-from qpavoid.arena.referee import STEP, Watch
-from qpavoid.arena.twin import build, load
+from qpavoid.arena.checker import STEP, DistanceMonitor
+from qpavoid.arena.mujoco_model import build, load_model
 
 PLATE = BOX.model_copy(update={"size": (0.3, 0.2, 0.006)})
 
@@ -36,7 +36,7 @@ def robot(name):
 @cache
 def situation(solver):
     scenario = load_scenario("situation1")
-    return load(scenario), simulate(scenario, solver)
+    return load_model(scenario), simulate(scenario, solver)
 
 
 def scene_of(robot_path, tasks, obstacles, **fields):
@@ -44,7 +44,7 @@ def scene_of(robot_path, tasks, obstacles, **fields):
     return ScenarioConfig.model_validate(config).read_from(Path("handmade.yaml"))
 
 
-# --- the twin ----------------------------------------------------------------------------------------------
+# --- the MuJoCo model ----------------------------------------------------------------------------------------------
 
 
 def coal_distances(scene, q):
@@ -67,12 +67,12 @@ def test_distances_are_those_of_coal(name):
         shapes = zip([SPHERE, CAPSULE, BOX, CYLINDER, PLATE] * 3, near, strict=True)
         obstacles = [obstacle(f"o{i}", shape, at, rng.uniform(-3.0, 3.0, 3)) for i, (shape, at) in enumerate(shapes)]
         scene = build_scene(robot(name), obstacles)
-        twin, bodies = build(scene, robot(name).home), scene.geometry.geometryObjects
-        twin.place(q, 0.0)
+        mujoco_model, bodies = build(scene, robot(name).home), scene.geometry.geometryObjects
+        mujoco_model.place(q, 0.0)
         for pair, d in enumerate(coal_distances(scene, q)):
-            radii = [bodies[body].geometry.radius for body in scene.pairs[pair].tolist() if body < twin.bodies]
+            radii = [bodies[body].geometry.radius for body in scene.pairs[pair].tolist() if body < mujoco_model.bodies]
             if d > -0.9 * min(radii):  # MuJoCo's depth means something else once the axis of a capsule is inside a box
-                assert twin.distance(pair) == pytest.approx(d, abs=1e-4), scene.pair_names[pair]
+                assert mujoco_model.distance(pair) == pytest.approx(d, abs=1e-4), scene.pair_names[pair]
                 apart, inside = apart + (d > 0.0), inside + (d < 0.0)
     assert apart > 300 and inside > 30
 
@@ -81,12 +81,12 @@ def test_hulls_are_those_of_coal(panda_convex):
     rng = np.random.default_rng(2)
     robot, _ = panda_convex.lock(["panda_finger*"], panda_convex.home, "test")  # one of them mimics the other one
     scene = random_scene(robot, rng, [SPHERE, BOX, CAPSULE])
-    twin = build(scene, robot.home)
+    mujoco_model = build(scene, robot.home)
     for _ in range(5):
         q = random_q(robot, rng)
-        twin.place(q, 0.0)
+        mujoco_model.place(q, 0.0)
         expected = coal_distances(scene, q)
-        got = np.array([twin.distance(pair) for pair in range(len(expected))])
+        got = np.array([mujoco_model.distance(pair) for pair in range(len(expected))])
         np.testing.assert_allclose(got[expected > 0.0], expected[expected > 0.0], atol=1e-4)
 
 
@@ -95,16 +95,17 @@ def test_a_floating_base_is_refused(solo):
         build(random_scene(solo, np.random.default_rng(0), [SPHERE]), solo.home)
 
 
-# --- the referee --------------------------------------------------------------------------------------------
+# --- the checker --------------------------------------------------------------------------------------------
 
 
-def test_it_finds_the_collision_of_situation_1_and_its_depth():
-    twin, log = situation("tracking")
-    findings = referee(twin, log)
-    names = [twin.scene.pair_names[contact.pair] for contact in findings.contacts]
+def test_checker_collision_depth_of_situation_1():
+    """It finds the collision of situation 1 and its depth."""
+    mujoco_model, log = situation("tracking")
+    findings = referee(mujoco_model, log)
+    names = [mujoco_model.scene.pair_names[contact.pair] for contact in findings.contacts]
     assert names == [("left_hand", "fist")]
     # the depth by hand: radii less the distance of the sphere's centre from the hand's axis
-    model, k = twin.scene.robot.model, round(findings.time / 0.01)
+    model, k = mujoco_model.scene.robot.model, round(findings.time / 0.01)
     data = model.createData()
     pin.framesForwardKinematics(model, data, log.q[k])
     wrist = data.oMf[model.getFrameId("left_link7")]
@@ -117,52 +118,58 @@ def test_it_finds_the_collision_of_situation_1_and_its_depth():
     assert findings.contacts[0].time < findings.time
 
 
-def test_it_sees_none_where_there_is_none():
-    twin, log = situation("qp")
-    findings = referee(twin, log)
+def test_checker_finds_no_false_contact():
+    """It sees none where there is none."""
+    mujoco_model, log = situation("qp")
+    findings = referee(mujoco_model, log)
     assert findings.contacts == ()
     assert findings.distance == pytest.approx(0.02, abs=1e-3)
     assert findings.distance == pytest.approx(log.min_distance.min(), abs=1e-4)
-    assert disagreement(twin, log, findings) < 1e-6 and feedforward(log, findings) < 1e-9
+    assert disagreement(mujoco_model, log, findings) < 1e-6 and feedforward(log, findings) < 1e-9
 
 
-def test_it_plays_velocities_and_does_not_believe_the_configurations():
-    twin, log = situation("tracking")
+def test_checker_integrates_velocities_itself():
+    """It integrates the velocities and ignores the logged configurations."""
+    mujoco_model, log = situation("tracking")
     moved = replace(log, q=log.q + 0.1)
-    findings, told = referee(twin, log), referee(twin, moved)
-    assert told.contacts == findings.contacts
-    assert feedforward(moved, told) == pytest.approx(0.1)
+    findings, moved_findings = referee(mujoco_model, log), referee(mujoco_model, moved)
+    assert moved_findings.contacts == findings.contacts
+    assert feedforward(moved, moved_findings) == pytest.approx(0.1)
 
 
-def test_it_checks_the_joint_limits():
-    twin, log = situation("qp")
-    bounds = twin.scene.robot.bounds()
-    assert referee(twin, log).speed_excess <= 0.0
+def test_checker_joint_limits():
+    """It checks the joint limits."""
+    mujoco_model, log = situation("qp")
+    bounds = mujoco_model.scene.robot.bounds()
+    assert referee(mujoco_model, log).speed_excess <= 0.0
     fast = log.v.copy()
     fast[10:20, 2] = bounds.velocity[2] + 0.5
-    assert referee(twin, replace(log, v=fast)).speed_excess == pytest.approx(0.5)
+    assert referee(mujoco_model, replace(log, v=fast)).speed_excess == pytest.approx(0.5)
     steady = np.zeros_like(log.v)
     steady[:, 0] = 1.0  # rad/s, for 12.99 s
-    excess = twin.q0[0] + 13.0 - bounds.upper[0]
-    assert referee(twin, replace(log, v=steady)).position_excess == pytest.approx(excess, abs=0.02)
+    excess = mujoco_model.q0[0] + 13.0 - bounds.upper[0]
+    assert referee(mujoco_model, replace(log, v=steady)).position_excess == pytest.approx(excess, abs=0.02)
 
 
-def test_it_checks_accelerations():
+def test_checker_accelerations():
+    """It checks accelerations."""
     scenario = load_scenario("situation1", ["limits.acceleration=3.0", "duration=1.0"])
-    twin, log = load(scenario), simulate(scenario, "tracking")
+    mujoco_model, log = load_model(scenario), simulate(scenario, "tracking")
     v = np.zeros_like(log.v)
     v[5:, 1] = 0.05  # rad/s, within one tick of 0.01 s
-    assert referee(twin, replace(log, v=v)).acceleration_excess == pytest.approx(5.0 - 3.0)
+    assert referee(mujoco_model, replace(log, v=v)).acceleration_excess == pytest.approx(5.0 - 3.0)
     assert referee(*situation("tracking")).acceleration_excess == -np.inf
 
 
-def test_it_refuses_the_log_of_another_scene():
-    twin, _ = situation("qp")
+def test_checker_refuses_log_of_another_scene():
+    """It refuses the log of another scene."""
+    mujoco_model, _ = situation("qp")
     with pytest.raises(ValueError, match="another scene"):
-        referee(twin, simulate(load_scenario("situation2", ["duration=0.1"])))
+        referee(mujoco_model, simulate(load_scenario("situation2", ["duration=0.1"])))
 
 
-def test_it_catches_what_passes_between_two_ticks(tmp_path):
+def test_checker_finds_contact_between_steps(tmp_path):
+    """It catches what passes between two ticks."""
     # a plate of 6 mm at 3 m/s goes through a rod of 60 mm while the controller does not look
     plate = {"type": "box", "size": [0.2, 0.006, 0.2]}
     line = {"type": "line", "start": [0.0, -0.45, 0.55], "end": [0.0, 0.45, 0.55], "speed": 3.0}
@@ -173,40 +180,43 @@ def test_it_catches_what_passes_between_two_ticks(tmp_path):
         dt=0.1,
         duration=0.4,
     )
-    twin, log = load(scenario), simulate(scenario, "tracking")
-    findings = referee(twin, log)
+    mujoco_model, log = load_model(scenario), simulate(scenario, "tracking")
+    findings = referee(mujoco_model, log)
     assert log.min_distance.min() > 0.05
-    assert [twin.scene.pair_names[contact.pair] for contact in findings.contacts] == [("link1_0", "plate")]
+    assert [mujoco_model.scene.pair_names[contact.pair] for contact in findings.contacts] == [("link1_0", "plate")]
     assert findings.contacts[0].time == pytest.approx((0.45 - 0.033) / 3.0, abs=STEP)
 
 
 @pytest.mark.parametrize("seed", [2, 9])
-def test_what_it_does_not_measure_again_does_not_matter(seed):
+def test_checker_skipped_pairs_do_not_matter(seed):
+    """What it does not measure again does not matter."""
     scenario = draw(seed)
-    twin, log = load(scenario), simulate(scenario, "tracking")
-    findings = referee(twin, log)
+    mujoco_model, log = load_model(scenario), simulate(scenario, "tracking")
+    findings = referee(mujoco_model, log)
     touched, smallest = set(), np.inf
     for q, t in zip(findings.q, log.t.tolist(), strict=True):
-        twin.place(q, t)
-        distances = np.array([twin.distance(pair) for pair in range(len(twin.scene.pairs))])
+        mujoco_model.place(q, t)
+        distances = np.array([mujoco_model.distance(pair) for pair in range(len(mujoco_model.scene.pairs))])
         touched |= set(np.flatnonzero(distances < 0.0).tolist())
-        smallest = min(smallest, distances[twin.movable].min())
+        smallest = min(smallest, distances[mujoco_model.movable].min())
     found = {contact.pair for contact in findings.contacts}
     assert touched and touched <= found
     assert smallest - STEP < findings.distance <= smallest + 1e-12
-    assert findings.looks >= len(log.t)
+    assert findings.instants >= len(log.t)
 
 
-def test_no_step_is_longer_than_it_says():
-    class Seen(Watch):
-        def look(self, t):
-            centers.append(twin.poses()[0].copy())
-            super().look(t)
+def test_checker_travel_between_instants():
+    """No step is longer than it says."""
 
-    twin, centers = load(draw(9)), []
-    watch = Seen(twin)
-    watch.look(0.0)
-    watch.follow(twin.q0, 0.5 * twin.scene.robot.bounds().velocity, 0.0, 0.05)
+    class Seen(DistanceMonitor):
+        def measure(self, t):
+            centers.append(mujoco_model.poses()[0].copy())
+            super().measure(t)
+
+    mujoco_model, centers = load_model(draw(9)), []
+    watch = Seen(mujoco_model)
+    watch.measure(0.0)
+    watch.follow(mujoco_model.q0, 0.5 * mujoco_model.scene.robot.bounds().velocity, 0.0, 0.05)
     assert len(centers) > 5
     assert np.linalg.norm(np.diff(centers, axis=0), axis=2).max() <= 1.05 * STEP
 
@@ -240,31 +250,31 @@ def test_verdicts(tmp_path, obstacles, why):
         avoidance={"d1": 0.02, "d2": 0.1},
         duration=4.0,
     )
-    twin, log = load(scenario), simulate(scenario, "tracking")
-    verdicts = judge(twin, scenario, log, referee(twin, log))
+    mujoco_model, log = load_model(scenario), simulate(scenario, "tracking")
+    verdicts = judge(mujoco_model, scenario, log, referee(mujoco_model, log))
     assert [verdict.why for verdict in verdicts] == why, verdicts
     assert verdicts[-1].avoidable == (why[-1] == "avoidable")
 
 
 @pytest.mark.parametrize("acceleration", [None, 10.0])
-def test_flights_keep_to_the_limits(monkeypatch, acceleration):
-    flown, follow = [], Watch.follow
+def test_backup_rollouts_respect_limits(monkeypatch, acceleration):
+    steps, follow = [], DistanceMonitor.follow
 
     def recorded(watch, q, v, t, dt):
         after = follow(watch, q, v, t, dt)
-        flown.append((after, v))
+        steps.append((after, v))
         return after
 
-    monkeypatch.setattr(Watch, "follow", recorded)
+    monkeypatch.setattr(DistanceMonitor, "follow", recorded)
     limits = Limits(acceleration=acceleration)
     scenario = draw(9).model_copy(update={"limits": limits, "dt": 0.02})
-    twin = load(scenario)
-    means = joint_means(twin, scenario)
-    start = Start(twin.q0, np.zeros_like(twin.q0), 0.0, 1.2)
-    for manner in list(manners(len(twin.q0)))[::3]:
-        flown.clear()
-        fly(twin, means, start, scenario.dt, manner, twin.movable)
-        q, v = (np.array(array) for array in zip(*flown, strict=True))
+    mujoco_model = load_model(scenario)
+    means = joint_means(mujoco_model, scenario)
+    start = Start(mujoco_model.q0, np.zeros_like(mujoco_model.q0), 0.0, 1.2)
+    for manner in list(manners(len(mujoco_model.q0)))[::3]:
+        steps.clear()
+        fly(mujoco_model, means, start, scenario.dt, manner, mujoco_model.movable)
+        q, v = (np.array(array) for array in zip(*steps, strict=True))
         assert np.all(np.abs(v) <= means.speed + 1e-9)
         assert np.all((q >= means.lower - 1e-6) & (q <= means.upper + 1e-6))
         change = np.abs(np.diff(v, axis=0, prepend=0.0))
@@ -272,8 +282,8 @@ def test_flights_keep_to_the_limits(monkeypatch, acceleration):
 
 
 def test_standing_still_proves_that_a_static_obstacle_is_avoidable():
-    scenario, (twin, log) = load_scenario("situation1"), situation("tracking")
-    (verdict,) = judge(twin, scenario, log, referee(twin, log))
+    scenario, (mujoco_model, log) = load_scenario("situation1"), situation("tracking")
+    (verdict,) = judge(mujoco_model, scenario, log, referee(mujoco_model, log))
     assert verdict.why == "avoidable" and "standing still" in verdict.detail
 
 
@@ -287,8 +297,8 @@ def test_scenarios_can_be_drawn_again_and_begin_clear():
     assert len({scenario.dt for scenario in drawn}) > 3
     assert max(len(scenario.obstacles) for scenario in drawn) > 10
     for scenario in drawn:
-        twin = load(scenario)
-        smallest = min(twin.distance(pair) for pair in range(len(twin.scene.pairs)))
+        mujoco_model = load_model(scenario)
+        smallest = min(mujoco_model.distance(pair) for pair in range(len(mujoco_model.scene.pairs)))
         assert smallest > scenario.avoidance.d1 - 1e-6, scenario.title
         assert RANGES.d1[0] <= scenario.avoidance.d1 <= RANGES.d1[1]
         assert RANGES.duration[0] <= scenario.duration <= RANGES.duration[1]
@@ -308,7 +318,7 @@ def test_qp_has_no_avoidable_collision():
 
 
 @pytest.mark.parametrize("seed", [13, 79, 99, 122, 912, 957])
-def test_qp_collisions_that_were_found_and_mended(seed):
+def test_qp_regressions_of_collisions(seed):
     """Margins bought with jumps of a wrist, ways that bend, a stop that let an obstacle come on."""
     (trial,) = trials(seed, ("qp",))
     assert not trial.avoidable, trial.judged
@@ -317,8 +327,8 @@ def test_qp_collisions_that_were_found_and_mended(seed):
 @pytest.mark.parametrize(
     ("seed", "blind"), [(265, True), (419, True), (309, False), (488, False), (559, False), (670, False)]
 )
-def test_foresight_gets_out_of_traps(seed, blind):
-    """Obstacles that close in from several sides, on a robot that follows its task until it is too late to flee.
+def test_backup_evades_closing_obstacles(seed, blind):
+    """Obstacles that close in from several sides, on a robot that follows its task until it is too late to evade.
 
     Without it all are hit (bench/results/safety.md); the referee takes up to a minute to say that they need not be.
     """
@@ -328,8 +338,8 @@ def test_foresight_gets_out_of_traps(seed, blind):
 
 
 @pytest.mark.parametrize("seed", [768, 1084])
-def test_where_one_contact_cannot_be_helped_the_others_are_kept_off(seed):
-    """Foresight had given up on all pairs once one of them was to touch in every flight."""
+def test_backup_avoids_contacts_beside_unavoidable_one(seed):
+    """A pair that touches in every rollout must not make the planner ignore the other pairs."""
     (trial,) = trials(seed, ("qp",))
     assert trial.collided and not trial.avoidable, trial.judged
 

@@ -1,4 +1,4 @@
-"""Inverse kinematics: configurations in which frames are where they are meant to be."""
+"""Inverse kinematics: configurations in which frames have given poses."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from qpavoid.errors import ConfigError
 from qpavoid.model.robot import Robot
 from qpavoid.problem import Array
 
-_STEPS, _LONGEST, _DAMPING = 80, 0.4, 1e-3
-"""Of one search: steps, largest step of a joint [rad or m], damping of the pseudo-inverse [-]."""
+_STEPS, _MAX_STEP, _DAMPING = 80, 0.4, 1e-3
+"""Settings of a search: steps, largest step of a joint [rad or m], damping of the pseudo-inverse [-]."""
 
 
-class Want(NamedTuple):
-    """Where a frame is to be."""
+class FrameGoal(NamedTuple):
+    """Position and rotation that a frame is to have."""
 
     frame: int
     position: Array | None
@@ -25,15 +25,15 @@ class Want(NamedTuple):
     """(3, 3); None: any."""
 
 
-class Ranges(NamedTuple):
-    """Where joints may be, (nv,) each; those without limits turn half a turn either way."""
+class JointRanges(NamedTuple):
+    """Ranges of joints, (nv,) each; those without limits have half a turn either way."""
 
     lower: Array
     upper: Array
 
     @classmethod
-    def of(cls, robot: Robot) -> Ranges:
-        """Position limits of a robot.
+    def of(cls, robot: Robot) -> JointRanges:
+        """Return the ranges of a robot from its position limits.
 
         Raises:
             ConfigError: a joint with other than one coordinate that is an angle or a length.
@@ -49,40 +49,42 @@ class Ranges(NamedTuple):
         return cls(np.maximum(lower, -np.pi), np.minimum(upper, np.pi))
 
 
-def configuration_at(robot: Robot, wants: list[Want], q: Array, ranges: Ranges, tolerance: float) -> Array | None:
-    """A configuration (nv,) within limits that attains what is wanted, near q; None if the search ends elsewhere.
+def solve_inverse_kinematics(
+    robot: Robot, goals: list[FrameGoal], q: Array, ranges: JointRanges, tolerance: float
+) -> Array | None:
+    """Find q (nv,) within limits that attains the goals; None if the search ends elsewhere.
 
     Damped least squares with joints kept within their ranges.
 
     Args:
         robot: whose joints have one coordinate each.
-        wants: of frames.
+        goals: of frames.
         q: where the search begins (nv,).
         ranges: of the joints.
         tolerance: distance that is good enough [m]; orientations as many rad.
     """
     model, data = robot.model, robot.model.createData()
     for _ in range(_STEPS):
-        error, J = _errors(model, data, wants, q)
+        error, J = _errors(model, data, goals, q)
         if np.abs(error).max() < tolerance:
             return q
         step = J.T @ np.linalg.solve(J @ J.T + _DAMPING * np.eye(len(error)), error)
-        step *= min(1.0, _LONGEST / max(np.abs(step).max(), 1e-12))
+        step *= min(1.0, _MAX_STEP / max(np.abs(step).max(), 1e-12))
         q = np.clip(q + step, ranges.lower, ranges.upper)
     return None
 
 
-def _errors(model: Any, data: Any, wants: list[Want], q: Array) -> tuple[Array, Array]:
-    """What is missing (m,) and its Jacobian (m, nv)."""
+def _errors(model: Any, data: Any, goals: list[FrameGoal], q: Array) -> tuple[Array, Array]:
+    """Return the errors (m,) of the goals and their Jacobian (m, nv)."""
     pin.computeJointJacobians(model, data, q)
     errors, rows = [], []
-    for want in wants:
-        pose = pin.updateFramePlacement(model, data, want.frame)
-        J = pin.getFrameJacobian(model, data, want.frame, pin.LOCAL_WORLD_ALIGNED)
-        if want.position is not None:
-            errors.append(want.position - pose.translation)
+    for goal in goals:
+        pose = pin.updateFramePlacement(model, data, goal.frame)
+        J = pin.getFrameJacobian(model, data, goal.frame, pin.LOCAL_WORLD_ALIGNED)
+        if goal.position is not None:
+            errors.append(goal.position - pose.translation)
             rows.append(J[:3])
-        if want.rotation is not None:
-            errors.append(pin.log3(want.rotation @ pose.rotation.T))
+        if goal.rotation is not None:
+            errors.append(pin.log3(goal.rotation @ pose.rotation.T))
             rows.append(J[3:])
     return np.concatenate(errors), np.concatenate(rows)

@@ -1,4 +1,7 @@
-"""A scene in MuJoCo: the same joints, bodies and obstacles, with MuJoCo's own kinematics and distances."""
+"""MuJoCo model of a scene: the same joints, bodies and obstacles.
+
+Kinematics and distances are MuJoCo's own.
+"""
 
 from __future__ import annotations
 
@@ -15,17 +18,20 @@ from qpavoid import Robot, Sample, ScenarioConfig, Scene, build_scene
 from qpavoid.model.scene import build_obstacles
 from qpavoid.problem import Array, IntArray
 
-FAR = 100.0
-"""Distances are looked for up to here [m]."""
+MAX_DISTANCE = 100.0
+"""Largest distance that MuJoCo looks for [m]: beyond any scene."""
 
 
 @dataclass(frozen=True)
-class Twin:
-    """A scene and its MuJoCo twin. Configurations and velocities go in and out in the scene's order."""
+class MujocoModel:
+    """A scene and its MuJoCo model.
+
+    Configurations and velocities go in and out in the scene's order.
+    """
 
     scene: Scene
     q0: Array
-    """(nq,) where the robot starts."""
+    """(nq,) configuration at the start."""
     model: Any
     data: Any
     geoms: IntArray
@@ -35,15 +41,15 @@ class Twin:
     v_index: IntArray
     """(nv,) place in qvel of each coordinate."""
     bodies: int
-    """How many of the geometries are the robot's; the obstacles come after them."""
+    """Number of geometries of the robot; those of obstacles come after them."""
 
     @property
     def movable(self) -> Any:
-        """(m,) whether the robot can change the distance of a pair at all: false for its fixed base."""
+        """Return for each pair (m,) whether the robot can change its distance at all."""
         return np.any(self.scene.support != 0.0, axis=1)
 
     def place(self, q: Array, t: float) -> None:
-        """Puts the robot to q (nv,) and the obstacles to where they are at t [s]."""
+        """Put the robot to q (nv,) and the obstacles to their poses at t [s]."""
         self.data.qpos[self.q_index] = q
         for i, obstacle in enumerate(self.scene.obstacles):
             if obstacle.moves:
@@ -51,38 +57,40 @@ class Twin:
         mujoco.mj_kinematics(self.model, self.data)
 
     def integrate(self, q: Array, v: Array, dt: float) -> Array:
-        """q (nv,) after v (nv,) for dt [s], by MuJoCo's integration."""
+        """Integrate v (nv,) from q (nv,) over dt [s] by MuJoCo; return q (nv,)."""
         position, velocity = np.zeros(self.model.nq), np.zeros(self.model.nv)
         position[self.q_index], velocity[self.v_index] = q, v
         mujoco.mj_integratePos(self.model, position, velocity, dt)
         return position[self.q_index]
 
     def poses(self) -> tuple[Array, Array]:
-        """Centres (g, 3) [m] and axes (g, 9) of the geometries where they are now."""
+        """Return centres (g, 3) [m] and axes (g, 9) of the geometries in the current pose."""
         return self.data.geom_xpos[self.geoms], self.data.geom_xmat[self.geoms]
 
     def distance(self, pair: int, ends: Array | None = None) -> float:
-        """Signed distance of a pair where it is now [m]; its witness points go to `ends` (6,)."""
+        """Return the signed distance of a pair [m]; its witness points go to `ends` (6,)."""
         a, b = self.geoms[self.scene.pairs[pair]]
-        return float(mujoco.mj_geomDistance(self.model, self.data, a, b, FAR, np.empty(6) if ends is None else ends))
+        return float(
+            mujoco.mj_geomDistance(self.model, self.data, a, b, MAX_DISTANCE, np.empty(6) if ends is None else ends)
+        )
 
 
 def place_mocap(data: Any, index: int, sample: Sample) -> None:
-    """Puts an obstacle, by its number, to where it is; MuJoCo's kinematics come after that."""
+    """Put an obstacle, by its number, to a pose; call MuJoCo's kinematics afterwards."""
     data.mocap_pos[index] = sample.position
     mujoco.mju_mat2Quat(data.mocap_quat[index], np.ascontiguousarray(sample.rotation).ravel())
 
 
-def load(scenario: ScenarioConfig) -> Twin:
-    """The twin of a scenario."""
+def load_model(scenario: ScenarioConfig) -> MujocoModel:
+    """Build the MuJoCo model of a scenario."""
     source = scenario.source
     robot = Robot.load(scenario.robot, source.parent)
     robot, q0 = robot.lock(scenario.lock, robot.configuration(scenario.q0, str(source)), str(source))
     return build(build_scene(robot, build_obstacles(scenario.obstacles, source)), q0)
 
 
-def build(scene: Scene, q0: Array, frames: Sequence[int] = ()) -> Twin:
-    """Writes the scene as MJCF: one MuJoCo body a joint, one mocap body an obstacle.
+def build(scene: Scene, q0: Array, frames: Sequence[int] = ()) -> MujocoModel:
+    """Build the MuJoCo model of a scene: one body a joint, one mocap body an obstacle.
 
     Args:
         scene: what is written.
@@ -94,11 +102,11 @@ def build(scene: Scene, q0: Array, frames: Sequence[int] = ()) -> Twin:
     """
     spec, robot = mujoco.MjSpec(), scene.robot.model
     spec.compiler.degree = False
-    # the default, 1e-6, is of the size of what is to be told apart in penetration
+    # the default, 1e-6, is of the size of the penetrations to be compared
     spec.option.ccd_tolerance, spec.option.ccd_iterations = 1e-9, 200
     bounds = scene.robot.bounds()
-    room = np.clip(np.stack((bounds.lower, bounds.upper), axis=1), -mujoco.mjMAXVAL, mujoco.mjMAXVAL)
-    ranges = dict(zip(bounds.q_index.tolist(), room, strict=True))
+    ranges_by_joint = np.clip(np.stack((bounds.lower, bounds.upper), axis=1), -mujoco.mjMAXVAL, mujoco.mjMAXVAL)
+    ranges = dict(zip(bounds.q_index.tolist(), ranges_by_joint, strict=True))
     bodies = [spec.worldbody]
     for i in range(1, robot.njoints):
         placement = robot.jointPlacements[i]
@@ -124,7 +132,7 @@ def build(scene: Scene, q0: Array, frames: Sequence[int] = ()) -> Twin:
             _add_geom(spec, obstacles[scene.obstacle_of[i]], geometry, pin.SE3.Identity())
     model = spec.compile()
     joints = [model.joint(name) for name in list(robot.names)[1:]]
-    twin = Twin(
+    mujoco_model = MujocoModel(
         scene=scene,
         q0=np.array(q0),
         model=model,
@@ -135,13 +143,13 @@ def build(scene: Scene, q0: Array, frames: Sequence[int] = ()) -> Twin:
         bodies=first,
     )
     for i, obstacle in enumerate(scene.obstacles):
-        place_mocap(twin.data, i, obstacle.motion.sample(0.0))
-    twin.place(twin.q0, 0.0)
-    return twin
+        place_mocap(mujoco_model.data, i, obstacle.motion.sample(0.0))
+    mujoco_model.place(mujoco_model.q0, 0.0)
+    return mujoco_model
 
 
 def hinge_or_slide(model: Any, index: int) -> tuple[bool, Array]:
-    """Whether a joint slides, and its axis (3,) in its own frame.
+    """Return True for a slide, False for a hinge, and the joint's axis (3,) in its own frame.
 
     Raises:
         ValueError: it is neither a hinge nor a slide.
@@ -156,6 +164,7 @@ def hinge_or_slide(model: Any, index: int) -> tuple[bool, Array]:
 
 
 def _add_geom(spec: Any, body: Any, geometry: Any, placement: Any) -> None:
+    """Add a geometry to a body of the MuJoCo model."""
     kinds, shape = mujoco.mjtGeom, geometry.geometry
     place = {"name": geometry.name, "pos": placement.translation, "quat": _quaternion(placement.rotation)}
     match shape:
@@ -172,7 +181,11 @@ def _add_geom(spec: Any, body: Any, geometry: Any, placement: Any) -> None:
         case coal.Ellipsoid():
             body.add_geom(type=kinds.mjGEOM_ELLIPSOID, size=_three(*shape.radii), **place)
         case coal.Halfspace():
-            body.add_geom(type=kinds.mjGEOM_BOX, size=_three(_WIDE, _WIDE, _WIDE), **_sunk(place))
+            body.add_geom(
+                type=kinds.mjGEOM_BOX,
+                size=_three(_HALF_SPACE_SIDE, _HALF_SPACE_SIDE, _HALF_SPACE_SIDE),
+                **_below_plane(place),
+            )
         case coal.ConvexBase():
             mesh = spec.add_mesh(name=geometry.name, uservert=np.array(shape.points()).ravel())
             mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
@@ -181,23 +194,24 @@ def _add_geom(spec: Any, body: Any, geometry: Any, placement: Any) -> None:
             raise ValueError(f"body {geometry.name!r}: {type(shape).__name__} has no counterpart")
 
 
-_WIDE = 20.0
-"""Half the side of the box that stands for a half-space: MuJoCo tells no distance to planes [m]."""
+_HALF_SPACE_SIDE = 20.0
+"""Half the side of the box that stands for a half-space [m]: MuJoCo computes no distance to planes."""
 
 
-def _sunk(place: dict[str, Any]) -> dict[str, Any]:
-    """The same place, for a box whose top face is the plane."""
+def _below_plane(place: dict[str, Any]) -> dict[str, Any]:
+    """Return the placement of a box whose top face is the plane of that placement."""
     up = np.empty(9)
     mujoco.mju_quat2Mat(up, place["quat"])
-    return {**place, "pos": np.asarray(place["pos"]) - _WIDE * up[2::3]}
+    return {**place, "pos": np.asarray(place["pos"]) - _HALF_SPACE_SIDE * up[2::3]}
 
 
 def _three(*sizes: float) -> Sequence[float]:
+    """Return up to three sizes, filled up with zeros."""
     return [*sizes, 0.0, 0.0][:3]
 
 
 def _quaternion(rotation: Array) -> Array:
-    """(4,) w first, from (3, 3)."""
+    """Return the quaternion (4,), w first, of a rotation (3, 3)."""
     quaternion = np.empty(4)
     mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(rotation).ravel())
     return quaternion

@@ -1,4 +1,7 @@
-"""How each library is set; read by its adapter and printed in the report. Nothing here needs the library."""
+"""Settings of each library; read by its adapter and printed in the report.
+
+Nothing here needs the library.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +31,7 @@ MINK: dict[str, Any] = {
     "minimum_distance_from_collisions": "d1",
     "collision_detection_distance": "d2",
 }
-"""The rest of its limits is at its defaults: gains 0.85 for pairs and 0.95 for joints."""
+"""Settings of mink; other parameters of its limits are at its defaults: gains 0.85 for pairs and 0.95 for joints."""
 
 PLACO: dict[str, Any] = {
     **_SHARED,
@@ -36,7 +39,7 @@ PLACO: dict[str, Any] = {
     "self_collisions_trigger": "d2",
     "priority": "hard",
 }
-"""Its tasks are soft, its joint limits and velocity limits on."""
+"""Settings of placo: soft tasks, hard joint and velocity limits."""
 
 PLACO_PYTHON = "QPAVOID_PLACO_PYTHON"
-"""Environment variable that names the Python interpreter that has placo; left out: this one."""
+"""Environment variable that names the Python interpreter that has placo; this one if not set."""
