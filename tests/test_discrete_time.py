@@ -8,7 +8,7 @@ from conftest import moved
 
 from qpavoid import Avoidance, Controller, Obstacle, ReasonKind, Sample, Severity, Status
 from qpavoid.config import Box, Damper, Sphere
-from qpavoid.run import simulate
+from qpavoid.run.simulate import simulate
 from qpavoid.safety.braking import TOLERANCE
 
 PLATE = {"type": "box", "size": [0.004, 0.6, 0.6]}
@@ -113,7 +113,7 @@ def test_what_the_guard_lets_through_is_clear_by_brute_force(panda):
             if k % 30 == 0:
                 command = rng.uniform(-1.0, 1.0, 7) * bounds.velocity
             s = controller.filter(q, command)
-            drawn_back += s.share < 1.0
+            drawn_back += s.command_scale < 1.0
             way = braking(q, s.v, step, 0.01) if k % 4 == 0 else []
             if way and (bounds.lower < way[-1]).all() and (way[-1] < bounds.upper).all():
                 looked += 1
@@ -186,8 +186,8 @@ def test_where_the_linearisation_is_too_kind_the_step_is_shortened_and_logged(sh
         )
         log = simulate(run)
         least[look_ahead] = least_on_the_way(log, Controller.from_scenario(run)[0])
-        shares[look_ahead] = log.share
-        assert log.metrics()["shortened_ticks"] == np.sum(log.share < 1.0)
+        shares[look_ahead] = log.command_scale
+        assert log.metrics()["shortened_ticks"] == np.sum(log.command_scale < 1.0)
     assert least[False] < alone and least[True] > SAFE - 5e-4
     assert (shares[False] == 1.0).all() and shares[True].min() < 1.0
 

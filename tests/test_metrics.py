@@ -51,7 +51,7 @@ def log():
         body_distance=[[0.3, 0.5], [0.1, 0.5], [0.2, -0.02], [0.4, -0.01], [0.05, 0.06]],
         closest_pair=[0, 0, 1, 1, 0],
         status=[STATUSES.index(s) for s in ("SOLVED", "RELAXED", "RELAXED", "STOPPED", "SOLVED")],
-        share=[1.0, 0.5, 1.0, 0.0, 1.0],
+        command_scale=[1.0, 0.5, 1.0, 0.0, 1.0],
         stalled=np.array([False, False, True, True, True]),
         severity=np.array([0, Severity.WARNING, Severity.WARNING, Severity.ALARM, Severity.INFO], dtype=np.int8),
         build_time=np.array([4, 5, 6, 7, 8]) * 1e-6,

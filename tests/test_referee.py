@@ -11,7 +11,7 @@ import pytest
 from conftest import BOX, CAPSULE, CYLINDER, SPHERE, obstacle, random_q, random_scene, write_chain
 
 from qpavoid import Limits, Robot, ScenarioConfig, build_scene, load_scenario
-from qpavoid.run import simulate
+from qpavoid.run.simulate import simulate
 
 pytest.importorskip("mujoco")
 pytest.importorskip("bench", reason="bench/ is in the repository only")
@@ -19,7 +19,7 @@ pytest.importorskip("bench", reason="bench/ is in the repository only")
 from bench.safety import report
 from bench.safety.campaign import FOLDER, KINDS, RANGES, draw
 from bench.safety.flight import Start, fly, joint_means, manners
-from bench.safety.referee import disagreement, feedforward, referee
+from bench.safety.referee import disagreement, drift, referee
 from bench.safety.trial import trials
 from bench.safety.verdict import judge
 from qpavoid.arena.referee import STEP, Watch
@@ -123,7 +123,7 @@ def test_it_sees_none_where_there_is_none():
     assert findings.contacts == ()
     assert findings.distance == pytest.approx(0.02, abs=1e-3)
     assert findings.distance == pytest.approx(log.min_distance.min(), abs=1e-4)
-    assert disagreement(twin, log, findings) < 1e-6 and feedforward(log, findings) < 1e-9
+    assert disagreement(twin, log, findings) < 1e-6 and drift(log, findings) < 1e-9
 
 
 def test_it_plays_velocities_and_does_not_believe_the_configurations():
@@ -131,7 +131,7 @@ def test_it_plays_velocities_and_does_not_believe_the_configurations():
     moved = replace(log, q=log.q + 0.1)
     findings, told = referee(twin, log), referee(twin, moved)
     assert told.contacts == findings.contacts
-    assert feedforward(moved, told) == pytest.approx(0.1)
+    assert drift(moved, told) == pytest.approx(0.1)
 
 
 def test_it_checks_the_joint_limits():
@@ -304,7 +304,7 @@ def test_qp_has_no_avoidable_collision():
     found = small_campaign("qp", 15)
     assert {(trial.seed, trial.judged) for trial in found if trial.avoidable} == set()
     assert all(trial.speed_excess < 1e-9 and trial.position_excess < 1e-9 for trial in found)
-    assert all(trial.disagreement < 1e-6 and trial.feedforward < 1e-6 and not trial.failure for trial in found)
+    assert all(trial.disagreement < 1e-6 and trial.drift < 1e-6 and not trial.failure for trial in found)
 
 
 @pytest.mark.parametrize("seed", [13, 79, 99, 122, 912, 957])

@@ -21,7 +21,7 @@ from qpavoid.run.metrics import run_metrics
 
 STATUSES = tuple(Status)
 """Status of each code in `Log.status`."""
-_FORMAT = 4
+_FORMAT = 5
 _LARGEST = 2_000_000_000
 """What a log may take in memory [bytes]; a small file can unpack to a thousand times its size."""
 _SHAPES = {
@@ -29,7 +29,7 @@ _SHAPES = {
     "target": "N k 3", "tool": "N k 3", "tool_rotation": "N k 3 3", "turn_error": "N k",
     "task_error": "N s",
     "body_distance": "N b", "closest_pair": "N", "alpha": "N", "beta": "N", "status": "N",
-    "slack": "N", "saturation": "N", "build_time": "N", "solve_time": "N", "share": "N", "stalled": "N",
+    "slack": "N", "saturation": "N", "build_time": "N", "solve_time": "N", "command_scale": "N", "stalled": "N",
     "severity": "N",
     "body_ends": "N b 2 3", "obstacle_position": "N o 3", "obstacle_rotation": "N o 3 3",
 }  # fmt: skip
@@ -74,7 +74,7 @@ class Log:
     """(N,) index in STATUSES."""
     slack: Array
     """(N,) largest slack of an avoidance row [m/s]."""
-    share: Array
+    command_scale: Array
     """(N,) share of the law's velocity that was left after looking ahead; the rest was a stop's."""
     stalled: npt.NDArray[np.bool_]
     """(N,) whether the tasks made no progress."""

@@ -64,7 +64,7 @@ def run_metrics(log: Log) -> dict[str, Any]:
         "jitter": float(np.sum(np.abs(np.diff(log.v, axis=0)))),
         "status_counts": counts,
         "relaxed_ticks": counts[Status.RELAXED.value],
-        "shortened_ticks": int(np.sum(log.share < 1.0)),
+        "shortened_ticks": int(np.sum(log.command_scale < 1.0)),
         "time_blocked": dt * float(np.sum(log.stalled)),
         "severity_counts": {level.name: int(np.sum(log.severity == level)) for level in Severity},
         "events": log.meta["events"][:_MOST_EVENTS],

@@ -112,7 +112,7 @@ class Recorder:
             "t": (), "q": (model.nq,), "v": (model.nv,),
             "target": (tasks, 3), "tool": (tasks, 3), "tool_rotation": (tasks, 3, 3), "turn_error": (tasks,),
             "task_error": (len(self._others),),
-            "body_distance": (bodies,), "alpha": (), "beta": (), "slack": (), "share": (), "saturation": (),
+            "body_distance": (bodies,), "alpha": (), "beta": (), "slack": (), "command_scale": (), "saturation": (),
             "build_time": (), "solve_time": (),
             "body_ends": (bodies, 2, 3), "obstacle_position": (obstacles, 3), "obstacle_rotation": (obstacles, 3, 3),
         }  # fmt: skip
@@ -142,7 +142,7 @@ class Recorder:
         values = {
             "t": state.t,
             "slack": 0.0 if solution.slack is None else float(np.max(solution.slack, initial=0.0)),
-            "share": solution.share,
+            "command_scale": solution.command_scale,
             "stalled": bool(solution.stalled),
             "severity": solution.severity or 0,
             "saturation": solution.saturation,

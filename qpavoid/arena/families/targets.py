@@ -11,7 +11,7 @@ from qpavoid.arena.families.parameters import Draw
 from qpavoid.arena.families.statics import fixed, sweep
 from qpavoid.arena.families.ways import along
 from qpavoid.model.robot import Robot
-from qpavoid.safety.reach import arm
+from qpavoid.safety.reachability import arm
 
 _REST = 8.0
 """Time to come to rest in, after the planned motion [s]."""

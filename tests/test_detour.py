@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from qpavoid import Avoidance, Obstacle, ReasonKind, Robot, Sample
 from qpavoid.config import Box, Detour, Progress, Sphere
-from qpavoid.safety.reach import arm, too_near
+from qpavoid.safety.reachability import arm, too_near
 
 DT, KEEP, RADIUS = 0.01, 0.03, 0.05
 QUICK = {"speed": 0.2, "longest": 2.0, "patience": 20.0}
