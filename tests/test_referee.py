@@ -18,8 +18,8 @@ pytest.importorskip("bench", reason="bench/ is in the repository only")
 
 from bench.safety import report
 from bench.safety.campaign import FOLDER, KINDS, RANGES, draw
-from bench.safety.flight import Start, fly, joint_means, manners
 from bench.safety.referee import disagreement, drift, referee
+from bench.safety.rollout import Start, evade, joint_limits, policies
 from bench.safety.trial import trials
 from bench.safety.verdict import judge
 from qpavoid.arena.referee import STEP, Watch
@@ -259,11 +259,11 @@ def test_flights_keep_to_the_limits(monkeypatch, acceleration):
     limits = Limits(acceleration=acceleration)
     scenario = draw(9).model_copy(update={"limits": limits, "dt": 0.02})
     twin = load(scenario)
-    means = joint_means(twin, scenario)
+    means = joint_limits(twin, scenario)
     start = Start(twin.q0, np.zeros_like(twin.q0), 0.0, 1.2)
-    for manner in list(manners(len(twin.q0)))[::3]:
+    for policy in list(policies(len(twin.q0)))[::3]:
         flown.clear()
-        fly(twin, means, start, scenario.dt, manner, twin.movable)
+        evade(twin, means, start, scenario.dt, policy, twin.movable)
         q, v = (np.array(array) for array in zip(*flown, strict=True))
         assert np.all(np.abs(v) <= means.speed + 1e-9)
         assert np.all((q >= means.lower - 1e-6) & (q <= means.upper + 1e-6))
