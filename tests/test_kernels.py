@@ -382,7 +382,7 @@ def test_row_bounds_are_feasible(seed):
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_row_bounds_by_their_definition(seed):
-    """The beta row, closing no faster than half of the accelerations brake, less the feed-forward; rhs_contact at d = 0."""
+    """The beta row, closing at half of the accelerations at most, less the feed-forward; rhs_contact at d = 0."""
     x = filled(seed)
     run("row_bounds", x, 30, True)
     raw = x.row_gain * (x.safety_distance - x.d)
@@ -469,7 +469,7 @@ def test_joint_speeds_with_mimic_joints():
 @pytest.mark.parametrize("near", [0, 1, 30])
 @pytest.mark.parametrize("horizon", [0.0, 0.01, 0.1])
 def test_clearance_lower_bound_with_the_fastest_points(near, horizon):
-    """Of the near pairs at their own distances, of all others at the influence distance, less the curvature of paths."""
+    """Of the near pairs at their own distances, of all others at the influence distance, less the curvature."""
     for seed in SEEDS:
         x = filled(seed, convex=np.zeros(30, dtype=bool))
         rates = np.random.default_rng(seed).uniform(-1.0, 1.0, x.A.shape[1])
@@ -972,7 +972,7 @@ def test_plain_python_gives_the_velocities_of_the_compiled_kernels(tmp_path):
     assert sum(fast[name + " rows"].size for name in scenarios) > 0
 
 
-# --- backup trajectories -----------------------------------------------------------------------------------------------------
+# --- backup trajectories -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("seed", SEEDS)
