@@ -14,7 +14,7 @@ from qpavoid import kernels
 from qpavoid.kernels.packing import compiled
 
 SEEDS = range(8)
-OF_PAIRS = ("near", "closest", "J", "feedforward", "d", "rhs", "rhs_contact")
+OF_PAIRS = ("near_pairs", "closest", "J", "feedforward", "d", "rhs", "rhs_contact")
 """Outputs of which only what belongs to near pairs counts."""
 
 
@@ -296,7 +296,12 @@ def rows_at(d, **fields):
     count = len(d)
     closest = np.zeros((count, 10))
     closest[:, 0] = d
-    given = {"closest": closest, "near": np.arange(count), "feedforward": np.zeros(count), "J": np.ones((count, 7))}
+    given = {
+        "closest": closest,
+        "near_pairs": np.arange(count),
+        "feedforward": np.zeros(count),
+        "J": np.ones((count, 7)),
+    }
     bounds = {"lower": np.full(7, -np.inf), "upper": np.full(7, np.inf), "v_stop": np.zeros(7)}
     return make_layout(7, pairs=count, obstacles=2, **{**given, **bounds, **fields})
 
@@ -345,7 +350,7 @@ def test_margins_are_those_of_the_near_pairs():
     x = rows_at(np.full(2, 0.2), beta=False)
     y = make_layout(7, pairs=4, obstacles=2, **{
         **{name: np.concatenate((getattr(x, name),) * 2) for name in ("closest", "feedforward", "J")},
-        "near": np.array([1, 3, -1, -1]), "twist_row": np.array([0, 1, 0, 2]), "margin": np.array([9.0, 0.05, 0.0]),
+        "near_pairs": np.array([1, 3, -1, -1]), "twist_row": np.array([0, 1, 0, 2]), "margin": np.array([9.0, 0.05, 0.0]),
         "lower": x.lower, "upper": x.upper, "v_stop": x.v_stop, "beta": False,
     })  # fmt: skip
     run("row_bounds", y, 2, True)
