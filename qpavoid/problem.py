@@ -105,7 +105,9 @@ class Contacts(NamedTuple):
     """(c,) velocity of these frames that corrects their sliding [m/s, rad/s]."""
 
     def project(self, v: Array) -> Array:
-        """Return the velocity (nv,) closest to v with J v = b; v itself where it meets that to `CONTACT_TOLERANCE`.
+        """Return the velocity (nv,) closest to v with J v = b.
+
+        That is v itself where it meets the rows to `CONTACT_TOLERANCE`.
 
         Args:
             v: velocity (nv,) [rad/s or m/s].
@@ -187,7 +189,9 @@ def make_problem(
     hard: tuple[Array, Array] | None = None,
     v_stop: Array | None = None,
 ) -> Problem:
-    """Make a problem by hand, or from changed rows: compute v_tracking and its violation by their definitions.
+    """Make a problem by hand, or from changed rows.
+
+    v_tracking and its violation are computed by their definitions.
 
     Args:
         tracking: task rows.

@@ -30,7 +30,7 @@ def random_problem(seed, feasible, repeated):
 
 @settings(deadline=None, max_examples=300)
 @given(seeds, st.booleans())
-def test_feasible_problems_are_solved_as_quadprog_solves_them(seed, repeated):
+def test_minimize_agrees_with_quadprog(seed, repeated):
     P, x0, G, h, lower, upper = random_problem(seed, True, repeated)
     x = x0.copy()
     assert minimize(P, x, G, h, lower, upper, np.zeros(len(h)))
@@ -39,14 +39,14 @@ def test_feasible_problems_are_solved_as_quadprog_solves_them(seed, repeated):
     bounds = np.concatenate((h, np.maximum(lower, -1e6), -upper))
     try:
         reference = quadprog.solve_qp(P, P @ x0, constraints.T.copy(), bounds)[0]
-    except ValueError:  # quadprog gives up on some problems with rows that repeat each other
+    except ValueError:  # quadprog fails on some problems with rows that repeat each other
         return
     np.testing.assert_allclose(x, reference, atol=1e-7)
 
 
 @settings(deadline=None, max_examples=200)
 @given(seeds)
-def test_no_answer_means_that_there_is_none(seed):
+def test_minimize_fails_only_on_infeasible_problems(seed):
     from scipy.optimize import linprog
 
     P, x0, G, h, lower, upper = random_problem(seed, False, False)
@@ -58,14 +58,14 @@ def test_no_answer_means_that_there_is_none(seed):
         assert programme.status == 2
 
 
-def test_without_constraints_in_the_way_nothing_moves():
+def test_minimize_keeps_a_feasible_minimiser():
     x = np.array([0.1, -0.2])
     assert minimize(np.eye(2), x, np.ones((1, 2)), np.array([-5.0]), -np.ones(2), np.ones(2), np.zeros(1))
     np.testing.assert_array_equal(x, [0.1, -0.2])
 
 
 @pytest.mark.parametrize("place", ["A", "v_tracking", "J", "b"])
-def test_nan_is_no_answer(place):
+def test_project_rejects_nan(place):
     arguments = {
         "A": np.eye(3), "regularization": 1e-3, "v_tracking": np.ones(3), "J": np.ones((2, 3)),
         "b": np.array([2.9, 0.0]), "lower": -np.ones(3), "upper": 0.99 * np.ones(3),
@@ -77,7 +77,7 @@ def test_nan_is_no_answer(place):
 
 @settings(derandomize=True, deadline=None, max_examples=300)
 @given(seeds)
-def test_soft_rows_lack_what_costs_least(seed):
+def test_soft_rows_have_the_slack_of_least_cost(seed):
     """Against quadprog, to which what a row lacks is a variable of its own."""
     rng = np.random.default_rng(seed)
     n, m = rng.integers(1, 7), rng.integers(1, 12)

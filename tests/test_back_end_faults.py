@@ -70,7 +70,7 @@ def test_when_every_back_end_fails_the_robot_brakes_and_recovers(panda, fault, m
     np.testing.assert_allclose(tick(controller).solution.v, tick(good).solution.v, atol=1e-12)
 
 
-def test_a_wrong_optimum_that_is_called_one_is_safe_all_the_same(panda):
+def test_a_wrong_optimum_is_safe(panda):
     """Whatever a back end returns as solved was checked against every row and bound."""
     honest, tick = hard_tick(panda)
     rng = np.random.default_rng(0)
@@ -113,7 +113,7 @@ class Law:
     ],
 )
 @pytest.mark.parametrize("progress", [Progress(), Progress(stalled_after=0.02, detour=Detour())])
-def test_a_users_law_that_fails_stops_the_robot_with_the_reason(panda, fault, progress):
+def test_a_failing_user_solver_stops_the_robot_with_the_reason(panda, fault, progress):
     law = Law()
     controller = panda_controller(panda, law, progress=progress)
     vs = []
@@ -131,7 +131,7 @@ def test_a_users_law_that_fails_stops_the_robot_with_the_reason(panda, fault, pr
     assert (np.abs(np.diff(vs, axis=0)) <= 0.01 * panda.bounds().acceleration + 1e-9).all()
 
 
-def test_a_users_law_never_passes_the_limits(panda):
+def test_a_user_solver_never_passes_the_limits(panda):
     law = Law()
     controller = panda_controller(panda, law)
     law.fault = lambda p: Solution(np.full(7, 1e6))

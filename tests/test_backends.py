@@ -62,7 +62,7 @@ def assert_minimum(name: str, answer: np.ndarray | None, qp: QP, reference: np.n
 
 
 @pytest.mark.parametrize("name", BACKENDS)
-def test_the_minimum_whatever_size_came_before(name):
+def test_back_ends_find_the_minimum_after_any_size(name):
     random, solve = np.random.default_rng(1), make_backend(name)
     for _ in range(150):
         qp = make_qp(random, int(random.choice([7, 14, 35])), int(random.integers(0, 31)))
@@ -83,7 +83,7 @@ def test_a_slowly_changing_problem_is_followed(name):
 
 @pytest.mark.parametrize("name", BACKENDS)
 @pytest.mark.parametrize("free_first", [False, True])
-def test_nothing_of_a_very_different_problem_shows(name, free_first):
+def test_back_ends_forget_a_very_different_problem(name, free_first):
     """The answer is the one that a fresh back end gives, also where bounds of the old active set are now infinite."""
     random = np.random.default_rng(3)
     for _ in range(25):
@@ -96,7 +96,7 @@ def test_nothing_of_a_very_different_problem_shows(name, free_first):
 
 
 @pytest.mark.parametrize("name", BACKENDS)
-def test_an_infeasible_problem_gives_none_and_leaves_nothing_behind(name):
+def test_back_ends_return_none_for_an_infeasible_problem(name):
     random, solve = np.random.default_rng(4), make_backend(name)
     for _ in range(10):
         good, bad = make_qp(random, 7, 6), contradicting(make_qp(random, 7, 6))
@@ -142,7 +142,7 @@ def test_locked_coordinates_stay(name):
 
 @pytest.mark.parametrize("name", NATIVE)
 @pytest.mark.parametrize("field", ["P", "q", "G", "h"])
-def test_nan_ends_and_is_forgotten(name, field):
+def test_back_ends_reject_and_forget_nan(name, field):
     random, solve = np.random.default_rng(8), make_backend(name)
     for _ in range(3):
         good, bad = make_qp(random, 7, 4), make_qp(random, 7, 4)
@@ -207,7 +207,7 @@ def test_the_residual_is_zero_at_the_minimum_only():
 
 
 @pytest.mark.parametrize("make", [ProxqpWorkspace, OsqpWorkspace])
-def test_workspaces_prove_their_answers(make):
+def test_workspaces_verify_their_answers(make):
     random = np.random.default_rng(11)
     first = make_qp(random, 7, 5)
     workspace = make(*first)
@@ -238,7 +238,7 @@ class Scripted:
 
 
 @pytest.mark.parametrize(("later", "made"), [("right", 1), ("wrong", 5), ("none", 5)])
-def test_a_warm_start_that_fails_or_lies_is_solved_again_cold(later, made):
+def test_a_wrong_warm_start_is_solved_again_cold(later, made):
     Scripted.made, Scripted.later = 0, later
     random, solve = np.random.default_rng(12), Persistent(Scripted)
     for _ in range(5):

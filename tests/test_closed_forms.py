@@ -58,7 +58,7 @@ def certify(result, a, b, at_a, at_b, tolerance=1e-12):
         assert way @ point == pytest.approx(support(body, at)(way[None])[0], abs=tolerance)
 
 
-def test_they_agree_with_coal_and_nothing_is_closer():
+def test_closed_forms_agree_with_coal():
     rng, apart = np.random.default_rng(0), 0
     for i in range(1500):
         a, b = make(rng), make(rng, 2)
@@ -77,7 +77,7 @@ def test_they_agree_with_coal_and_nothing_is_closer():
 
 @settings(max_examples=300, deadline=None)
 @given(st.integers(0, 10**6), st.sampled_from([0.0, 1e-17, 1e-9, 1e-6, 1e-3]), st.booleans())
-def test_nearly_parallel_ones_are_as_exact(seed, tilt, box):
+def test_closed_forms_of_nearly_parallel_segments_are_exact(seed, tilt, box):
     rng = np.random.default_rng(seed)
     a, b = coal.Capsule(0.05, rng.uniform(0.1, 1.0)), coal.Capsule(0.05, rng.uniform(0.1, 1.0))
     if box:
@@ -86,7 +86,7 @@ def test_nearly_parallel_ones_are_as_exact(seed, tilt, box):
     certify(found(a, b, at_a), a, b, at_a, AT_ORIGIN, tolerance=1e-9)
 
 
-def test_where_many_points_are_closest_the_middle_ones_are_taken():
+def test_closed_forms_take_the_middle_of_closest_intervals():
     one, two, box = coal.Capsule(0.1, 1.0), coal.Capsule(0.1, 0.4), coal.Box(0.6, 0.6, 0.6)
     beside = pin.SE3(np.eye(3), np.array([0.7, 0.0, 0.4]))
     # the one reaches from -0.5 to 0.5, the other from 0.2 to 0.6: they are beside each other from 0.2 to 0.5
@@ -95,7 +95,7 @@ def test_where_many_points_are_closest_the_middle_ones_are_taken():
     np.testing.assert_allclose(found(two, box, beside, AT_ORIGIN)[[0, 6, 9]], [0.3, 0.25, 0.25], atol=1e-15)
 
 
-def test_cores_that_meet_and_poses_that_are_no_numbers_are_left_to_coal():
+def test_closed_forms_skip_meeting_cores_and_nan():
     capsule, box = coal.Capsule(0.1, 0.4), coal.Box(0.2, 0.2, 0.2)
     for a, b in ((capsule, box), (box, capsule), (capsule, capsule), (coal.Sphere(0.1), box)):
         assert found(a, b) is None
@@ -106,7 +106,7 @@ def test_cores_that_meet_and_poses_that_are_no_numbers_are_left_to_coal():
     )
 
 
-def test_which_pairs_have_one():
+def test_closed_forms_exist_of_spheres_capsules_and_boxes():
     bodies = [coal.Sphere(0.1), coal.Capsule(0.1, 0.2), coal.Box(0.1, 0.2, 0.3), coal.Cylinder(0.1, 0.2)]
     pairs = np.array([[i, j] for i in range(4) for j in range(4)])
     table = cores([*bodies, coal.Box(0.1, 0.0, 0.3)])

@@ -64,7 +64,7 @@ def test_potential_field_by_hand():
 
 
 @given(st.floats(0.001, 0.119))
-def test_push_is_firas(d):
+def test_repulsion_is_firas(d):
     """f(d) = η (1/d - 1/d2)/d² (Khatib 1986), with the η for which it is 0.7 at d1."""
     eta = 0.7 * D1**2 / (1 / D1 - 1 / D2)
     (push,) = repulsion(np.array([d]), D1, D2, 0.7, np.inf)
@@ -72,7 +72,7 @@ def test_push_is_firas(d):
 
 
 @given(distances, distances)
-def test_pushes_are_bounded_and_grow_as_pairs_come_nearer(a, b):
+def test_repulsion_is_bounded_and_decreases_with_distance(a, b):
     d = np.array([max(a, b), min(a, b)])
     for push, most in ((clearance_slope(d, D1, D2), 1.0), (repulsion(d, D1, D2, 0.5, 3.0), 3.0)):
         assert 0.0 <= push[0] <= push[1] <= most
@@ -130,7 +130,7 @@ def test_gradients_are_those_of_the_clearance_and_of_the_potential(panda, seed):
 
 
 @given(seeds, st.sampled_from([0.0, 0.01, 0.1]), st.floats(0.0, 100.0))
-def test_gradient_projection_leaves_the_task_alone(seed, damping, gain):
+def test_gradient_projection_keeps_the_task_velocity(seed, damping, gain):
     """A N = λ² (A Aᵀ + λ²)⁻¹ A, whose singular values λ² σ/(σ² + λ²) are at most λ/2."""
     problem = random_problem(seed, damping=damping, limit=1e6)
     rows, A = problem.avoidance, problem.tracking.A
@@ -142,7 +142,7 @@ def test_gradient_projection_leaves_the_task_alone(seed, damping, gain):
 
 
 @given(seeds, st.sampled_from([0.0, 0.01, 0.1]), st.floats(0.1, 5.0))
-def test_self_motion_climbs_the_clearance(seed, damping, limit):
+def test_self_motion_ascends_the_clearance(seed, damping, limit):
     problem = random_problem(seed, damping=damping, limit=limit)
     rows = problem.avoidance
     gradient = clearance_slope(rows.d, D1, D2) @ rows.J
@@ -150,7 +150,7 @@ def test_self_motion_climbs_the_clearance(seed, damping, limit):
 
 
 @given(seeds, st.integers(1, 5))
-def test_potential_field_descends_its_potential_and_parts_each_pair_alone(seed, pairs):
+def test_potential_field_descends_its_potential(seed, pairs):
     problem = random_problem(seed, pairs)
     rows = problem.avoidance
     push = repulsion(rows.d, D1, D2, 1.0, 5.0)
@@ -175,7 +175,7 @@ def test_self_motion_takes_no_joint_past_a_bound(seed, limit, gain):
         assert heading[a != 0.0].min() <= 1e-9  # one of them is where it may not go on
 
 
-def test_room_by_hand():
+def test_step_fraction_by_hand():
     lower, upper, inf = np.array([-1.0, -1.0]), np.array([1.0, 1.0]), np.array([np.inf, np.inf])
     assert step_fraction(np.zeros(2), np.array([0.5, -1.0]), lower, upper) == 1.0
     assert step_fraction(np.array([0.5, 0.0]), np.array([2.0, 0.1]), lower, upper) == 0.25
@@ -191,7 +191,7 @@ def test_room_by_hand():
 
 @pytest.mark.parametrize("name", LAWS)
 @given(seed=seeds, damping=st.sampled_from([0.0, 0.01]))
-def test_with_nothing_in_range_they_are_tracking_bit_for_bit(name, seed, damping):
+def test_baselines_without_near_pairs_are_tracking_bit_for_bit(name, seed, damping):
     problem = random_problem(seed, 0, damping=damping)
     assert np.array_equal(make_solver(name).solve(problem).v, make_solver("tracking").solve(problem).v)
 
@@ -261,7 +261,7 @@ def test_far_from_everything_they_track(name):
     assert np.array_equal(run("situation2", name, *far).v, run("situation2", "tracking", *far).v)
 
 
-def test_gradient_projection_keeps_to_its_path_whatever_stands_there():
+def test_gradient_projection_keeps_to_its_path_through_obstacles():
     """A sphere in the middle of it: the tool goes through to the goal, as tracking does; only the elbow steps aside."""
     ours, theirs = (run("situation1", name).metrics() for name in ("gradient-projection", "tracking"))
     assert ours["min_distance"] == pytest.approx(theirs["min_distance"], abs=1e-3) and ours["collided"]
@@ -270,7 +270,7 @@ def test_gradient_projection_keeps_to_its_path_whatever_stands_there():
     assert aside > 0.1
 
 
-def test_gradient_projection_clears_what_links_can_clear():
+def test_gradient_projection_clears_obstacles_with_its_links():
     """Past the box and the ball it is the hand that is in the way: it turns aside, while the tool goes on."""
     ours, theirs = (run("panda_line", name).metrics() for name in ("gradient-projection", "tracking"))
     assert theirs["collided"] and not ours["collided"]
@@ -299,7 +299,7 @@ def test_potential_field_keeps_half_of_the_safe_distance(scenario):
     assert run(scenario, "potential-field").metrics()["min_distance"] > 0.5 * asked
 
 
-def test_of_a_velocity_that_is_given_nothing_is_free(panda):
+def test_baselines_keep_a_filtered_velocity(panda):
     """`filter` fixes all joints: no self-motion is left, while the field pushes whatever it is given."""
     scene = build_scene(panda, [obstacle("ball", SPHERE, (0.45, 0.0, 0.75))])
     v = {name: Controller(scene, [], name, avoidance=Avoidance(d1=D1, d2=0.4)) for name in LAWS}
@@ -309,7 +309,7 @@ def test_of_a_velocity_that_is_given_nothing_is_free(panda):
 
 
 @pytest.mark.parametrize(("dt", "settles"), [(0.01, True), (0.05, False)])
-def test_potential_field_stalls_where_pull_and_push_balance_or_shakes_there(tmp_path, dt, settles):
+def test_potential_field_stalls_or_oscillates_at_its_balance(tmp_path, dt, settles):
     """Head on, on one joint: K (goal - x) = f(d). A step of dt multiplies what is left by 1 - dt (K + |f'|)."""
     robot = cartesian(tmp_path, "x", acceleration=None)
     wall = obstacle("ball", Sphere(radius=0.1), (0.5, 0.0, 0.0))  # the tool is a ball of 0.05

@@ -42,7 +42,7 @@ def costs(problem, v):
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_nothing_binds_and_it_is_the_cascade_of_null_space_projections(seed):
+def test_hqp_without_active_rows_is_the_null_space_cascade(seed):
     """v += (A_p N)⁺ (b_p - A_p v), N the projector on what levels before leave free (Siciliano and Slotine 1991)."""
     problem = random_problem(seed, bound=1e3)
     v, stacked = np.zeros(NV), np.zeros((0, NV))
@@ -54,11 +54,11 @@ def test_nothing_binds_and_it_is_the_cascade_of_null_space_projections(seed):
     solution = make_solver("hqp").solve(problem)
     assert solution.status is Status.SOLVED
     np.testing.assert_allclose(solution.v, v, atol=1e-9)
-    assert costs(problem, v)[0] < 1e-9 < costs(problem, v)[1]  # the row that repeats another one has to give way
+    assert costs(problem, v)[0] < 1e-9 < costs(problem, v)[1]  # the row that repeats another one cannot be met
 
 
 def cascade(problem):
-    """Lexicographic optimum by QPs in all of v, each level before held by equalities; None where daqp gives up."""
+    """Lexicographic optimum by QPs in all of v, each level before kept by equalities; None where daqp fails."""
     rows = problem.avoidance
     E, e, v = np.zeros((0, NV)), np.zeros(0), np.zeros(NV)
     for level in problem.levels:
@@ -74,7 +74,7 @@ def cascade(problem):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_rows_and_bounds_bind(backend):
+def test_hqp_with_active_rows_and_bounds_is_the_lexicographic_optimum(backend):
     """Every level is as good as in the plain cascade, and no better: the levels before it would have had to give."""
     solver, binding, later = Hqp(HqpSolver(backend=backend, regularization=SMALL)), 0, 0
     for seed in range(30):
@@ -95,7 +95,7 @@ def test_rows_and_bounds_bind(backend):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_a_weighted_qp_comes_to_it_as_the_ratio_of_weights_grows(seed):
+def test_a_weighted_qp_converges_to_the_hqp(seed):
     problem = random_problem(seed, bound=0.8, k=3)
     best = costs(problem, Hqp(HqpSolver(regularization=SMALL)).solve(problem).v)
     far = []
@@ -109,7 +109,7 @@ def test_a_weighted_qp_comes_to_it_as_the_ratio_of_weights_grows(seed):
     assert far[2] < max(0.1 * far[0], 1e-4)
 
 
-def test_later_levels_change_nothing_of_earlier_ones():
+def test_later_levels_keep_the_optimum_of_earlier_ones():
     for seed in range(10):
         problem = random_problem(seed, bound=0.6, k=3)
         alone = problem._replace(levels=problem.levels[:1])
@@ -127,7 +127,7 @@ def _rows(solution):
     ]
 
 
-def test_contradicting_rows_give_way_as_those_of_the_qp():
+def test_contradicting_rows_relax_as_those_of_the_qp():
     """The same pairs by the same amounts; tasks then keep their order within what is left."""
     relaxed = 0
     for seed in range(15):
@@ -144,7 +144,7 @@ def test_contradicting_rows_give_way_as_those_of_the_qp():
     assert relaxed >= 5
 
 
-def test_a_level_that_no_back_end_can_solve_is_named_and_the_levels_before_it_hold(monkeypatch):
+def test_an_unsolved_level_is_named_and_keeps_the_levels_before(monkeypatch):
     problem = random_problem(0, bound=0.6, k=3)
     solver, first = Hqp(HqpSolver(regularization=SMALL)), Hqp(HqpSolver(regularization=SMALL))
     expected = first.solve(problem._replace(levels=problem.levels[:1]))
@@ -162,7 +162,7 @@ def test_a_level_that_no_back_end_can_solve_is_named_and_the_levels_before_it_ho
     assert costs(problem, solution.v)[0] == pytest.approx(costs(problem, expected.v)[0], abs=1e-5)
 
 
-def test_what_is_not_finite_stops_the_robot():
+def test_hqp_stops_at_nan():
     problem = random_problem(0, k=2)
     J = problem.avoidance.J.copy()
     J[1, 0] = np.nan
@@ -176,7 +176,7 @@ def test_what_is_not_finite_stops_the_robot():
     assert np.isfinite(make_solver("hqp").solve(problem._replace(tracking=problem.tracking._replace(b=b))).v).all()
 
 
-def test_one_level_without_threats_is_the_tracking_velocity_bit_for_bit():
+def test_one_safe_level_is_the_tracking_velocity_bit_for_bit():
     problem = random_problem(1, damping=0.05)._replace(levels=())
     solution = make_solver("hqp").solve(problem)
     np.testing.assert_array_equal(solution.v, problem.v_tracking)
@@ -219,7 +219,7 @@ def test_the_order_of_priorities_is_that_of_the_file(panda, order):
     np.testing.assert_allclose(A[first] @ v, b[first], atol=1e-6)
 
 
-def test_it_keeps_clear_and_arrives(panda):
+def test_hqp_keeps_clear_and_arrives(panda):
     controller, q = panda_controller(panda, "hqp"), panda.home
     goal = Sample.at([0.55, 0.38, 0.45])
     worst = np.inf
@@ -238,7 +238,7 @@ def test_a_safe_command_comes_back_bit_for_bit(panda):
     np.testing.assert_array_equal(controller.filter(panda.home, wish).v, wish)
 
 
-def test_named_in_a_file_and_on_the_command_line():
+def test_hqp_is_selected_by_file_and_command_line():
     assert isinstance(make_solver("hqp"), Hqp)
     assert parse_solver("hqp:proxqp").label == "hqp:proxqp"
     assert load_scenario("panda_line", solver="hqp").solver == HqpSolver()

@@ -108,7 +108,7 @@ def test_a_controller_ends_the_first_use():
     assert (FOLDER / "complete").exists() and any(FOLDER.glob("tick.assemble-*.code"))
 
 
-def test_a_cache_that_cannot_be_written_is_named_and_done_without(installed, tmp_path):
+def test_an_unwritable_cache_is_named_and_optional(installed, tmp_path):
     nowhere = tmp_path / "file"
     nowhere.touch()
     for _ in range(2):
@@ -127,7 +127,7 @@ def test_damaged_code_is_not_run(installed, tmp_path):
     assert run(installed, tmp_path)[0] == [21, 1]
 
 
-def test_processes_that_start_at_once_do_not_take_each_others_code(installed, tmp_path):
+def test_concurrent_processes_do_not_mix_their_code(installed, tmp_path):
     """Each compiles the same function for other types first; afterwards the code of all of them is there."""
     script = """
 import numpy as np
@@ -146,7 +146,7 @@ print(sum(alone.stats.cache_hits.values()))
     assert run(installed, tmp_path, script.format(number=0))[0] == [4]
 
 
-def test_old_folders_go_once_there_are_many_and_nothing_else_does(installed, tmp_path):
+def test_only_old_folders_are_deleted(installed, tmp_path):
     for age in range(10):
         folder = tmp_path / f"kernels-{age}"
         folder.mkdir()
@@ -159,7 +159,7 @@ def test_old_folders_go_once_there_are_many_and_nothing_else_does(installed, tmp
     assert len(left) == 8 and {f"kernels-{age}" for age in range(7)} < left
 
 
-def test_functions_of_others_are_kept_where_numba_keeps_them(tmp_path, monkeypatch):
+def test_functions_of_other_packages_use_the_cache_of_numba(tmp_path, monkeypatch):
     (tmp_path / "theirs.py").write_text("def double(x):\n    return 2 * x\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     import theirs

@@ -14,7 +14,7 @@ from qpavoid import kernels
 from qpavoid.kernels.packing import compiled
 
 SEEDS = range(8)
-OF_PAIRS = ("near", "closest", "J", "feedforward", "d", "rhs", "rhs_contact")
+OF_PAIRS = ("near_pairs", "closest", "J", "feedforward", "d", "rhs", "rhs_contact")
 """Outputs of which only what belongs to near pairs counts."""
 
 
@@ -24,7 +24,7 @@ def run(name, x, *args):
 
 
 def assert_same(found, expected, k):
-    """Two layouts hold the same, of pairs the first k."""
+    """Compare two layouts, of pairs the first k."""
     for name in set(kernels.RowLayout._fields) - {"unfolded_row"}:
         a, b = getattr(found, name), getattr(expected, name)
         if name in OF_PAIRS:
@@ -51,7 +51,7 @@ def poses_of(R, p, columns=12):
 
 
 def random_layout(seed, frames=2, turns=(1,), pairs=9, nv=7, obstacles=3, joints=4, views=True, plain=False, **fields):
-    """Memory of a tick of a robot that nobody has built: any number in any place that the layout allows.
+    """Memory of a control step of no existing robot: any number in any place that the layout allows.
 
     Args:
         seed: of the random numbers.
@@ -164,7 +164,7 @@ def found_by(args):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_candidates_are_the_pairs_whose_spheres_are_within_reach(seed):
+def test_candidates_are_the_pairs_whose_spheres_are_near(seed):
     args, expected, centers = spheres(seed)
     assert 0 < len(expected) < (args[4] >= 0).sum()
     assert found_by(args) == expected
@@ -201,7 +201,7 @@ def test_candidates_of_few_and_many_bodies(seed):
         assert found_by(args) == expected
 
 
-def test_what_is_in_one_of_two_alone():
+def test_sorted_setxor_is_the_symmetric_difference():
     rng = np.random.default_rng(0)
     for _ in range(100):
         a, b = (np.flatnonzero(rng.random(rng.integers(0, 30)) < rng.random()) for _ in range(2))
@@ -238,7 +238,7 @@ def test_rate_of_a_distance_is_that_of_the_witness_points_along_the_normal(seed,
         assert x.feedforward[j] == pytest.approx(speed(x.twists[x.twist_row[i]]), abs=1e-13)
 
 
-def test_a_pair_exactly_at_the_reach_is_not_near():
+def test_distance_rows_exclude_a_pair_at_the_influence_distance():
     results = np.random.default_rng(0).normal(size=(3, 10))
     results[:, 0] = 0.5, np.nextafter(0.5, 0.0), -0.5
     x = random_layout(0, pairs=3, results=gaps(results, 17))
@@ -246,7 +246,7 @@ def test_a_pair_exactly_at_the_reach_is_not_near():
     assert x.near_pairs[:2].tolist() == [1, 2]
 
 
-def test_a_pair_whose_distance_is_not_a_number_is_near():
+def test_distance_rows_include_a_nan_distance():
     """And no bound is made up for it: what is left is NaN, which no velocity meets."""
     results = np.random.default_rng(0).normal(size=(3, 10))
     results[:, 0] = 9.0, np.nan, 0.2
@@ -264,7 +264,7 @@ def test_no_pair_near(views):
     assert run("distance_rows", x, np.arange(0), np.inf, True) == 0
 
 
-def test_an_obstacle_that_comes_to_rest_leaves_no_drift():
+def test_distance_rows_have_no_feedforward_of_an_obstacle_at_rest():
     x = random_layout(0)
     packed = kernels.pack(x)
     drifts = []
@@ -296,7 +296,12 @@ def rows_at(d, **fields):
     count = len(d)
     closest = np.zeros((count, 10))
     closest[:, 0] = d
-    given = {"closest": closest, "near": np.arange(count), "feedforward": np.zeros(count), "J": np.ones((count, 7))}
+    given = {
+        "closest": closest,
+        "near_pairs": np.arange(count),
+        "feedforward": np.zeros(count),
+        "J": np.ones((count, 7)),
+    }
     bounds = {"lower": np.full(7, -np.inf), "upper": np.full(7, np.inf), "v_stop": np.zeros(7)}
     return make_layout(7, pairs=count, obstacles=2, **{**given, **bounds, **fields})
 
@@ -316,7 +321,7 @@ def test_closing_speed_bound_by_its_definition(weighted):
         np.testing.assert_array_equal(x.d, d)
 
 
-def test_offset_margin_and_drift_of_a_row():
+def test_row_bounds_with_offset_margin_and_feedforward():
     """The offset widens all distances, the margin of an obstacle narrows those to it, its drift counts as motion."""
     closest, margin, of = np.array([0.20, 0.20, 0.20, 0.02]), np.array([0.01, 0.04, 0.0]), np.array([0, 1, 2, 1])
     feedforward = np.array([0.1, -0.2, 0.0, 0.3])
@@ -345,7 +350,7 @@ def test_margins_are_those_of_the_near_pairs():
     x = rows_at(np.full(2, 0.2), beta=False)
     y = make_layout(7, pairs=4, obstacles=2, **{
         **{name: np.concatenate((getattr(x, name),) * 2) for name in ("closest", "feedforward", "J")},
-        "near": np.array([1, 3, -1, -1]), "twist_row": np.array([0, 1, 0, 2]), "margin": np.array([9.0, 0.05, 0.0]),
+        "near_pairs": np.array([1, 3, -1, -1]), "twist_row": np.array([0, 1, 0, 2]), "margin": np.array([9.0, 0.05, 0.0]),
         "lower": x.lower, "upper": x.upper, "v_stop": x.v_stop, "beta": False,
     })  # fmt: skip
     run("row_bounds", y, 2, True)
@@ -368,7 +373,7 @@ def largest(row, lower, upper):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_row_never_asks_for_more_than_can_be_had(seed):
+def test_row_bounds_are_feasible(seed):
     """To part at most as fast as the bounds allow; not to close no sooner than a stop would end it."""
     x = filled(seed)
     run("row_bounds", x, 30, True)
@@ -382,7 +387,7 @@ def test_a_row_never_asks_for_more_than_can_be_had(seed):
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_row_bounds_by_their_definition(seed):
-    """The beta row, closing no faster than half of the accelerations brake, less the drift; and touch at d = 0."""
+    """The beta row, closing at half of the accelerations at most, less the feed-forward; rhs_contact at d = 0."""
     x = filled(seed)
     run("row_bounds", x, 30, True)
     raw = x.row_gain * (x.safety_distance - x.d)
@@ -407,7 +412,7 @@ def test_row_bounds_by_their_definition(seed):
         )
 
 
-def test_half_of_the_accelerations_bring_a_pair_to_rest_where_it_has_to_be():
+def test_row_bounds_brake_a_pair_at_the_safety_distance():
     """Each tick closes as fast as its row allows, slowed by half of the acceleration, at the end by a bit more."""
     step, d, v = np.array([0.1, 0.2]), np.array([0.9]), 0.0
     way = []
@@ -428,14 +433,14 @@ def test_half_of_the_accelerations_bring_a_pair_to_rest_where_it_has_to_be():
 
 
 RATES = np.zeros(7)
-"""Velocity of a robot at rest: what curved ways may add is nothing then."""
+"""Velocity of a robot at rest: its paths have no curvature."""
 
 
 # --- looking ahead -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_no_point_that_a_joint_carries_is_faster_than_it_is_said_to_be(seed):
+def test_joint_speeds_bound_the_speed_of_every_point(seed):
     """Nor is the bound a loose one: at most √2 too large, and exact for a joint that does not turn."""
     rng, x = np.random.default_rng(seed), filled(seed)
     v = rng.normal(size=7)
@@ -455,7 +460,7 @@ def test_no_point_that_a_joint_carries_is_faster_than_it_is_said_to_be(seed):
     np.testing.assert_allclose(y.speeds[:4], np.linalg.norm(twists[:, :3], axis=1), rtol=1e-13)
 
 
-def test_speeds_where_joints_mimic_others():
+def test_joint_speeds_with_mimic_joints():
     """One coordinate moves several columns of the Jacobian: as many as have its number."""
     for seed in SEEDS:
         rng, x = np.random.default_rng(seed), filled(seed)
@@ -468,8 +473,8 @@ def test_speeds_where_joints_mimic_others():
 
 @pytest.mark.parametrize("near", [0, 1, 30])
 @pytest.mark.parametrize("horizon", [0.0, 0.01, 0.1])
-def test_closest_call_is_below_what_the_fastest_points_leave(near, horizon):
-    """Of the near pairs at their own distances, of all others at the reach, less what curved ways may add."""
+def test_clearance_lower_bound_with_the_fastest_points(near, horizon):
+    """Of the near pairs at their own distances, of all others at the influence distance, less the curvature."""
     for seed in SEEDS:
         x = filled(seed, convex=np.zeros(30, dtype=bool))
         rates = np.random.default_rng(seed).uniform(-1.0, 1.0, x.A.shape[1])
@@ -485,7 +490,7 @@ def test_closest_call_is_below_what_the_fastest_points_leave(near, horizon):
 
 
 def closing_along_normal(x, v, i, horizon, bend):
-    """How far a near pair closes along its normal: the witness points, and the farthest corner of each box."""
+    """Closing distance of a near pair along its normal: the witness points, and the farthest corner of each box."""
     pair, found = x.near_pairs[i], x.closest[i]
     n, approach, bent = found[1:4], x.J[i] @ v, 0.0
     closing = (abs(approach) if x.jerk_limited else max(-approach, 0.0)) + max(-x.feedforward[i], 0.0)
@@ -504,7 +509,7 @@ def closing_along_normal(x, v, i, horizon, bend):
 
 @pytest.mark.parametrize("fields", [{}, {"jerk_limited": True}, {"views": False}])
 @pytest.mark.parametrize("horizon", [0.01, 0.1])
-def test_of_convex_bodies_the_closest_call_looks_along_the_normal(horizon, fields):
+def test_clearance_lower_bound_of_convex_bodies_along_the_normal(horizon, fields):
     """Where the fastest points would use up a distance, it may be that they go another way."""
     better = 0
     for seed in range(20):
@@ -525,7 +530,7 @@ def test_of_convex_bodies_the_closest_call_looks_along_the_normal(horizon, field
     assert better > 20
 
 
-def test_a_way_bends_where_a_joint_would_pass_its_limit():
+def test_leaves_position_limits_by_hand():
     """Coordinate 1 of v is number 2 of q: 0.5 rad/s for 0.3 s is 0.15 rad; 0.1 rad of room are left on either side."""
     x = make_layout(3, q_index=np.array([2]), v_index=np.array([1]), q_lower=np.array([-0.1]), q_upper=np.array([0.1]))
     q = np.array([9.0, 9.0, 0.0, 9.0])
@@ -534,7 +539,7 @@ def test_a_way_bends_where_a_joint_would_pass_its_limit():
 
 
 @pytest.mark.parametrize("near", [0, 1, 30])
-def test_closest_call_does_not_lose_nan(near):
+def test_clearance_lower_bound_preserves_nan(near):
     for column in range(7):
         x = filled(0)
         x.J_world[column % 6, column] = np.nan
@@ -548,7 +553,7 @@ def test_closest_call_does_not_lose_nan(near):
 
 
 @pytest.mark.parametrize("fields", [{}, NO_LIMIT])
-def test_the_way_of_the_tracking_velocity_is_clear_if_the_closest_call_until_its_stop_is(fields):
+def test_is_tracking_clear_by_the_clearance_bound_until_its_stop(fields):
     clear = 0
     for seed in range(40):
         x = filled(seed, 30, **fields)
@@ -565,7 +570,7 @@ def test_the_way_of_the_tracking_velocity_is_clear_if_the_closest_call_until_its
 
 @pytest.mark.parametrize("fields", [{}, {"jerk_limited": True}, {"views": False}])
 @pytest.mark.parametrize("near", [0, 1, 30])
-def test_closest_call_by_its_definition(near, fields):
+def test_clearance_lower_bound_by_its_definition(near, fields):
     """From far below to far above nothing left, with rates at which the ways of points curve."""
     left = []
     for seed in range(20):
@@ -585,7 +590,7 @@ FRAMES = [(1, []), (1, [0]), (2, [1]), (4, []), (4, [0, 2]), (4, [0, 1, 2, 3])]
 
 
 @pytest.mark.parametrize(("count", "turns"), FRAMES)
-def test_rows_of_frames_by_their_definition(count, turns):
+def test_frame_rows_by_their_definition(count, turns):
     """Velocity of a point p of a body: J_v + J_ω × p; b = v_ref + K (x_ref - x), with log(R_ref Rᵀ) for turns.
 
     A command faster than its cap is shortened to it; then everything is scaled.
@@ -608,7 +613,7 @@ def test_rows_of_frames_by_their_definition(count, turns):
         np.testing.assert_array_equal(x.poses, x.frame_poses[x.frame_ids])
 
 
-def test_caps_at_their_edges():
+def test_frame_rows_at_the_edges_of_caps():
     """A command at rest stays at rest, one just at its cap is left alone, and NaN is not capped away."""
     for speed, expected in ((0.0, 0.0), (0.5, 0.5), (2.0, 0.5), (np.nan, np.nan)):
         targets = np.zeros((1, 18))
@@ -623,7 +628,7 @@ AXES = [(1, 0, 0), (0, -1, 0), (0, 0, 1), (1, 1, 0), (1, -2, 3), (-3, 1e-9, 1e-5
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_columns_that_one_coordinate_moves_are_added_up(seed):
+def test_rows_add_up_the_columns_of_a_mimicked_joint(seed):
     """Against rows of a robot whose joints all move on their own."""
     columns = np.array([0, 1, 2, 2, 3, 4, 5, 1, 6])
     fold = np.eye(7)[columns]
@@ -646,7 +651,7 @@ def test_columns_that_one_coordinate_moves_are_added_up(seed):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_orientations_alone_and_rows_of_other_tasks(seed):
+def test_frame_rows_of_orientations_alone_keep_other_rows(seed):
     """Of three frames the last one only turns; three rows after those of the frames are left as they are."""
     whole = random_layout(seed, frames=3, turns=(0, 2))
     kept = np.r_[0:6, 9:15]
@@ -681,8 +686,8 @@ def test_rotation_vector_at_all_angles(axis, rotation_vector):
 def test_velocity_bounds_by_hand():
     """dt = 0.01 s and half of what is left: 50 (q_lim - q), but not beyond v_max = 2, 3, 4, ∞, ∞ and 5.
 
-    In turn: room on both sides; 0.01 rad short of the upper limit; 0.02 rad beyond it; no position limit; no speed
-    limit; far below the lower limit, sent back at full speed.
+    In turn: room on both sides; 0.01 rad below the upper limit; 0.02 rad beyond it; no position limit; no speed
+    limit; far below the lower limit, which returns at full speed.
     """
     inf = np.inf
     q = np.array([9.0, 0.0, 0.99, 1.02, 9.0, 9.0, 0.3, -4.0])  # q[0], q[4] and q[5] have no limits in this chart
@@ -723,8 +728,8 @@ def test_velocity_bounds_by_their_definition(seed, plain):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_stop_slows_all_coordinates_alike_and_as_fast_as_it_can(seed):
-    """v_stop = s v_last, the largest change being exactly one step of its coordinate; 0 once that is within reach."""
+def test_stop_velocity_is_the_fastest_by_one_factor(seed):
+    """v_stop = s v_prev, the largest change being exactly one step of its coordinate; 0 once that is possible."""
     x = random_layout(seed, plain=True)
     x.lower[:], x.upper[:] = -np.inf, np.inf
     run("stop_velocity", x)
@@ -734,12 +739,12 @@ def test_a_stop_slows_all_coordinates_alike_and_as_fast_as_it_can(seed):
     assert np.max(np.abs(x.v_prev - x.v_stop) / x.v_step) == pytest.approx(1.0, rel=1e-12)
     y = random_layout(seed, plain=True, v_prev=0.5 * np.minimum(x.v_step, 1.0))
     y.lower[:], y.upper[:] = -np.inf, np.inf
-    y.lower[1], y.upper[2] = 0.2, -0.3  # a coordinate that is sent back goes on moving
+    y.lower[1], y.upper[2] = 0.2, -0.3  # a coordinate that returns to its limits goes on moving
     run("stop_velocity", y)
     np.testing.assert_array_equal(y.v_stop, [0.0, 0.2, -0.3, 0.0, 0.0, 0.0, 0.0])
 
 
-def test_without_acceleration_limits_a_stop_is_a_standstill_where_the_bounds_allow_it():
+def test_stop_velocity_without_acceleration_limits_is_a_standstill():
     x = random_layout(0, **NO_LIMIT)
     x.lower[:], x.upper[:] = -1.0, 1.0
     x.lower[1], x.upper[2] = 0.2, -0.3
@@ -786,7 +791,7 @@ def test_damped_solution_minimises_error_and_effort():
 
 @pytest.mark.parametrize("shrink", [0.0, 1e-12, 1e-8, 1e-4])
 @pytest.mark.parametrize("which", [0, 1, -1])
-def test_rows_that_are_nearly_dependent_have_no_undamped_solution(shrink, which):
+def test_damped_solution_of_nearly_dependent_rows_is_nan(shrink, which):
     """Pivots of A Aᵀ that differ by more than 1e6; with damping there always is a solution."""
     for count in (3, 6, 9):
         for damping in (0.0, 0.1):
@@ -802,7 +807,7 @@ def test_rows_that_are_nearly_dependent_have_no_undamped_solution(shrink, which)
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.1])
-def test_damped_solution_does_not_lose_nan(damping):
+def test_damped_solution_preserves_nan(damping):
     for count in (3, 6):
         for i in range(count):
             x = rows(0, count, damping=damping)
@@ -820,7 +825,7 @@ def constraints(seed, pairs, nv=7):
 
 
 @pytest.mark.parametrize("pairs", [0, 1, 20])
-def test_shortfall_is_the_largest_violation(pairs):
+def test_violation_is_the_largest_of_rows_and_bounds(pairs):
     for seed in SEEDS:
         v, J, b, lower, upper = args = constraints(seed, pairs)
         upper[2] = np.inf
@@ -837,7 +842,7 @@ def test_shortfall_is_the_largest_violation(pairs):
 
 @pytest.mark.parametrize("pairs", [0, 1, 20])
 @pytest.mark.parametrize("argument", ["v", "J", "b", "lower", "upper"])
-def test_shortfall_does_not_lose_nan(argument, pairs):
+def test_violation_preserves_nan(argument, pairs):
     """Wherever it stands: in the first, a middle or the last entry."""
     index = ["v", "J", "b", "lower", "upper"].index(argument)
     for place in (0, -1, 3):
@@ -850,7 +855,7 @@ def test_shortfall_does_not_lose_nan(argument, pairs):
 
 
 @pytest.mark.parametrize("near", [0, 1, 5])
-def test_tracking_shortfall_is_that_of_the_tracking_velocity_and_the_near_rows(near):
+def test_tracking_violation_is_that_of_the_near_rows(near):
     for seed in SEEDS:
         v, J, least, lower, upper = constraints(seed, 8)
 
@@ -894,7 +899,7 @@ def moments(seed, x, ticks=6):
 
 @pytest.mark.parametrize("fields", [{}, NO_LIMIT, {"plain": True}, {"views": False, "damping": 0.0}])
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_tick_is_the_sum_of_its_parts(seed, fields):
+def test_assemble_is_the_sum_of_its_parts(seed, fields):
     """Whatever the ticks before have left in memory."""
     x = random_layout(seed, pairs=40, **fields)
     packed = kernels.pack(x)
@@ -918,7 +923,7 @@ def test_a_tick_is_the_sum_of_its_parts(seed, fields):
 
 @pytest.mark.parametrize("fields", [{}, NO_LIMIT, {"plain": True}, {"views": False}])
 @pytest.mark.parametrize("seed", SEEDS)
-def test_the_tracking_velocity_of_a_tick_is_the_best_of_its_rows(seed, fields):
+def test_assemble_tracking_velocity_is_optimal(seed, fields):
     counts = []
     for q, pairs, reach, moving in moments(seed, random_layout(seed, pairs=40)):
         x = random_layout(seed, pairs=40, frames=3, turns=(0, 2), **fields)
@@ -972,11 +977,11 @@ def test_plain_python_gives_the_velocities_of_the_compiled_kernels(tmp_path):
     assert sum(fast[name + " rows"].size for name in scenarios) > 0
 
 
-# --- flights -----------------------------------------------------------------------------------------------------
+# --- backup trajectories -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_look_around_keeps_what_is_watched_and_apart(seed):
+def test_backup_rows_are_those_of_enabled_pairs_without_contact(seed):
     rng = np.random.default_rng(seed)
     x, pairs = random_layout(seed, pairs=40), chosen(40, seed)
     watched = rng.random(40) < 0.7
@@ -999,7 +1004,7 @@ def test_a_look_around_keeps_what_is_watched_and_apart(seed):
     np.testing.assert_array_equal([x.lower, x.upper], [whole.lower, whole.upper])
 
 
-def test_a_distance_that_is_no_number_touches():
+def test_backup_rows_take_nan_for_contact():
     results = np.random.default_rng(0).normal(size=(3, 10))
     results[1, 0] = np.nan
     x = random_layout(0, pairs=3, results=gaps(results, 17))
@@ -1009,7 +1014,7 @@ def test_a_distance_that_is_no_number_touches():
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_what_comes_too_near(seed):
+def test_closes_below_by_its_definition(seed):
     rng = np.random.default_rng(seed)
     k = 5 * seed
     closest, J, feedforward, v = (
@@ -1024,7 +1029,7 @@ def test_what_comes_too_near(seed):
 
 
 @pytest.mark.parametrize("meets", [False, True])
-def test_a_ramp_changes_no_faster_than_it_may_and_ends_where_it_meets(meets):
+def test_rate_limit_keeps_to_the_largest_change(meets):
     wanted = np.array([[0.35, -0.1, 5.0]] * 6)
     rate_limit = kernels.rate_limit(np.zeros(3), wanted, np.array([0.1, 0.1, np.inf]), meets)
     expected = [[min(0.1 * (i + 1), 0.35), -0.1, 5.0] for i in range(4 if meets else 6)]
@@ -1033,7 +1038,7 @@ def test_a_ramp_changes_no_faster_than_it_may_and_ends_where_it_meets(meets):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_ramps_and_paths_by_their_definitions(seed):
+def test_rate_limit_and_min_sphere_distance_by_their_definitions(seed):
     rng = np.random.default_rng(seed)
     v, wanted, step = rng.normal(size=5), rng.normal(size=(9, 5)), rng.uniform(0.1, 2.0, 5)
     found = kernels.rate_limit(v, wanted, step, False)
@@ -1049,6 +1054,6 @@ def test_ramps_and_paths_by_their_definitions(seed):
     assert least == pytest.approx(min(brute, default=np.inf))
 
 
-def test_paths_that_are_no_numbers_are_not_far():
+def test_min_sphere_distance_preserves_nan():
     paths = np.array([[[3.0, 0.0, 0.0]], [[np.nan, 0.0, 0.0]], [[4.0, 0.0, 0.0]]])
     assert not kernels.min_sphere_distance(paths, np.zeros((1, 3)), np.ones((1, 1))) > 0.0

@@ -77,7 +77,7 @@ def test_the_next_configuration_stays_inside(joints, place, choice, dt, gain, sc
 
 @fast
 @given(bounds(), vector(1e-3, 5.0), st.sampled_from([-1.0, 1.0]), period, share)
-def test_outside_its_limits_a_joint_is_sent_back_without_overshoot(joints, beyond, side, dt, gain):
+def test_a_joint_outside_its_limits_returns_without_overshoot(joints, beyond, side, dt, gain):
     edge = joints.upper if side > 0 else joints.lower
     q = edge + side * beyond
     lower, upper = bounds_at(joints, q, gain, dt)
@@ -119,7 +119,7 @@ def test_saturate_keeps_the_direction_while_only_speeds_are_exceeded(v, v_max):
 
 @fast
 @given(vector(-1.0, 1.0), vector(0.01, 5.0))
-def test_saturate_leaves_alone_what_is_inside(place, v_max):
+def test_saturate_keeps_a_velocity_within_the_bounds(place, v_max):
     v = place * v_max
     within, change = saturate(v, -v_max, v_max, v_max)
     np.testing.assert_allclose(within, v, rtol=1e-15)
@@ -243,7 +243,7 @@ def random_joints(rng, count):
 
 
 @pytest.mark.parametrize("dt", [0.001, 0.01, 0.05])
-def test_no_limit_is_left_in_a_hundred_thousand_ticks(dt):
+def test_no_limit_is_passed_in_a_hundred_thousand_steps(dt):
     """500 joints, 200 ticks each, driven into their limits, to and fro, or at random."""
     joints, q = random_joints(np.random.default_rng(1), 500)
     axes, rng, v_prev = Axes(joints, 0.5, dt), np.random.default_rng(2), np.zeros(500)
@@ -262,7 +262,7 @@ def test_no_limit_is_left_in_a_hundred_thousand_ticks(dt):
     assert reached.mean() > 0.05  # pushed right to a limit, and no farther
 
 
-def test_from_a_state_that_no_braking_saves_the_relax_acceleration():
+def test_a_state_that_no_braking_saves_relaxes_the_acceleration():
     """Position and speed are kept, and the bounds do not cross."""
     joints, q = random_joints(np.random.default_rng(3), 500)
     rng, dt = np.random.default_rng(4), 0.01
@@ -281,7 +281,7 @@ def test_from_a_state_that_no_braking_saves_the_relax_acceleration():
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
-def test_outside_its_position_limits_a_joint_is_braked_and_sent_back(side):
+def test_a_joint_outside_its_position_limits_brakes_and_returns(side):
     """With no more than its acceleration, from any speed within its limits; then it stays inside."""
     joints, _ = random_joints(np.random.default_rng(5), 500)
     joints = replace(joints, acceleration=10.0 ** np.random.default_rng(6).uniform(0, 2, 500))

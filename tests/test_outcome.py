@@ -9,7 +9,7 @@ from qpavoid import Obstacle, ReasonKind, Sample, Status
 from qpavoid.config import Box, Capsule, Sphere
 
 
-def test_a_joint_limit_in_the_way_is_named(tmp_path):
+def test_a_limiting_joint_is_named(tmp_path):
     """A ball comes at 0.3 m/s, and the tool stands at the limit of the only joint that leads away from it."""
     robot = cartesian(tmp_path, axes="x", acceleration=None)
     controller = make_controller(robot, [Obstacle.at("ball", Sphere(radius=0.05), [0.0, 0, 0])], "x")
@@ -31,7 +31,7 @@ ROBOTS = ("panda", "paper", "solo")
 
 @pytest.mark.parametrize("name", ROBOTS)
 @pytest.mark.parametrize("solver", ["qp", "qp:daqp"])
-def test_whatever_the_state_a_tick_ends_in_a_velocity(name, solver, request):
+def test_a_step_from_any_state_ends_in_a_velocity(name, solver, request):
     """Deep penetration, limits violated, any velocity before, obstacles at any speed: 400 ticks a robot."""
     robot = request.getfixturevalue(name)
     rng, bounds, nv = np.random.default_rng(3), robot.bounds(), robot.model.nv

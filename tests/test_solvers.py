@@ -184,7 +184,7 @@ def squeezed(d: tuple[float, float]) -> Problem:
 @pytest.mark.parametrize(
     ("d", "v"), [((0.145, 0.175), 0.175), ((0.175, 0.145), -0.175), ((0.15, 0.15), 0.0), ((0.0, 0.02), 0.1)]
 )
-def test_contradicting_rows_relax_and_the_nearer_threat_gives_less(backend, d, v):
+def test_contradicting_rows_relax_the_nearer_pair_less(backend, d, v):
     """Nothing, in fact, unless the other pair would touch for it; threats of the same depth share."""
     problem = squeezed(d)
     rows, solution = problem.avoidance, make_solver(f"qp:{backend}").solve(problem)
@@ -200,9 +200,9 @@ def test_contradicting_rows_relax_and_the_nearer_threat_gives_less(backend, d, v
 
 @pytest.mark.parametrize("backend", EXACT)  # proxqp and osqp are not exact enough to find the least excess
 @pytest.mark.parametrize(("feedforward", "v"), [(0.0, 0.1), (-1.0, 0.95), (-4.0, 2.0)])
-def test_acceleration_limits_give_way_before_pairs_touch_and_other_limits_never(backend, feedforward, v):
-    """Accelerations leave 0.1, speeds 2. An obstacle at rest costs margin only; from one that comes at 1 m/s the arm
-    flees just fast enough not to touch it, 1 - ξ d; from one at 4 m/s as fast as it can."""
+def test_acceleration_limits_relax_before_contact_and_other_limits_never(backend, feedforward, v):
+    """Accelerations leave 0.1, speeds 2. An obstacle at rest costs margin only; from one at 1 m/s the arm
+    retreats just fast enough to avoid contact, 1 - ξ d; from one at 4 m/s as fast as it can."""
     J = np.zeros((1, NV))
     J[0, 2] = 1.0
     solution = make_solver(f"qp:{backend}").solve(threatened(J, np.array([0.01]), feedforward, free=0.1))
@@ -221,7 +221,7 @@ def test_acceleration_limits_give_way_before_pairs_touch_and_other_limits_never(
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_rows_beyond_the_velocity_limits_relax_and_limits_hold(backend):
+def test_rows_beyond_the_velocity_limits_relax(backend):
     problem = random_problem(6, pairs=1, damping=0.01)
     J = np.zeros((1, NV))
     J[0, 2] = 0.5
@@ -253,7 +253,7 @@ ANSWERS = [lambda *_: None, lambda *_: np.full(NV, np.nan), lambda *_: np.full(N
 
 
 @pytest.mark.parametrize("answer", ANSWERS)
-def test_a_back_end_that_fails_or_lies_is_replaced_and_ends_in_a_stop_where_that_fails_too(answer, monkeypatch):
+def test_a_failing_or_wrong_back_end_is_replaced_then_stops(answer, monkeypatch):
     problem = random_problem(7, pairs=2, damping=0.01)
     rows = problem.avoidance
     problem = with_rows(problem, b=rows.J @ tracking_velocity(problem) + 1.0)._replace(v_stop=np.full(NV, 0.05))

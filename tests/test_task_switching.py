@@ -68,7 +68,7 @@ def test_row_by_hand():
     assert bound(0.13, -1.0, own=True) == pytest.approx(0.0)  # two bodies of the robot are not
 
 
-def test_a_tick_uses_up_no_more_than_the_distance_that_is_left():
+def test_eq10_row_uses_up_no_more_than_the_distance_in_a_step():
     """At 100 m/s, 0.2 m are gone in 2 ms; the row leaves the safety distance after 10 ms."""
     found = rows(np.array([0.32]), np.ones((1, 1)), [-100.0]).rhs[0]
     assert found == pytest.approx(-(0.32 - D1) / 0.01)
@@ -154,7 +154,7 @@ def test_the_robots_own_pairs_never_make_it_infeasible(name, frame):
     assert close > 50
 
 
-def test_what_comes_towards_a_body_that_cannot_move_is_no_contradiction(tmp_path):
+def test_an_obstacle_towards_a_fixed_body_is_no_contradiction(tmp_path):
     """A tool on one rail, along x; a ball comes along z from 0.3 m: only below the safety distance is it said."""
     robot = cartesian(tmp_path, axes="x")
     ball = Obstacle.at("ball", Sphere(radius=0.05), [0.0, 0.0, 1.0])

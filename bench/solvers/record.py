@@ -1,7 +1,7 @@
-"""QPs of real runs: everything that the `qp` solver hands to its back end, in the order of the ticks.
+"""QPs of real runs: all that the `qp` solver passes to its back end, in the order of the control steps.
 
-Ticks at which tracking alone is safe need no QP and leave none. A tick without a velocity that meets everything leaves
-several: the one without a solution, those that find out what has to give way, and the one with that given up.
+Steps in which tracking alone is safe have no QP. A step without a velocity that meets all constraints has several: the
+one without a solution, those that compute the slacks, and the one with relaxed rows.
 """
 
 from __future__ import annotations

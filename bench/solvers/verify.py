@@ -37,7 +37,7 @@ class Truth(NamedTuple):
     edge: bool = False
     """Rows can be met with less than `EDGE` to spare, below what solvers can tell: no answer is right too."""
     open: bool = False
-    """Neither minimum nor contradiction could be shown; such a QP judges nobody."""
+    """Neither minimum nor contradiction could be shown; answers to such a QP are not judged."""
 
 
 class Judgement(NamedTuple):

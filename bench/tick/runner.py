@@ -215,7 +215,7 @@ def _measure(
 
 
 def _bound(timed: Iterable[str], processes: dict[str, Process]) -> Array:
-    """(T,) ticks at which something binds, told by qpavoid if it was timed; else NaN."""
+    """Return whether a constraint binds at each tick (T,), as reported by qpavoid; NaN if it was not timed."""
     for name in timed:
         if name == "qpavoid":
             return np.array(processes[name].ask("bound")["bound"], dtype=np.float64)

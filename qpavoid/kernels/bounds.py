@@ -16,7 +16,7 @@ _max_stopping_distance = compiled(max_stopping_distance)
 
 @compiled
 def velocity_bounds(x: Any, q: Array) -> float:
-    """Write the bounds on v from the joint limits, and return the distance to the nearest position limit.
+    """Write the bounds on v from the joint limits; return the distance to the nearest one.
 
     Position and velocity limits make hard_lower and hard_upper: ±v_max, and towards a position limit at most the speed
     from which the coordinate can still brake, `speed_to_stop`; without an acceleration limit, `position_rate` times the
@@ -65,9 +65,10 @@ def velocity_bounds(x: Any, q: Array) -> float:
 
 @compiled
 def _jerk_limited_bounds(x: Any, q: Array) -> None:
-    """Write to lower and upper the bounds on v between which the stops of `kernels.braking_bounds` end within limits.
+    """Write to lower and upper the bounds on v within jerk limits.
 
-    The bounds never cross, as the stop's own next velocity is between them from any state. Of a coordinate outside its
+    From velocities between them, the stops of `kernels.braking_bounds` end within the position and velocity limits.
+    They never cross, as the stop's own next velocity is between them from any state. Of a coordinate outside its
     position limits, the hard bounds that demand its return are relaxed to what it needs to stop before the opposite
     limit; once it returns, it does not turn round again.
 

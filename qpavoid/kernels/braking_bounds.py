@@ -88,7 +88,9 @@ def stopping_distance(v: Any, w: Any, w_max: Any) -> tuple[Any, Any]:
 
 
 def max_stopping_distance(v: Any, w: Any, w_max: Any) -> Any:
-    """Compute a quick upper bound (...) of `stopping_distance`: up to the largest speed, and from there to 0.
+    """Compute a quick upper bound (...) of `stopping_distance`.
+
+    It adds the distances up to the largest speed, and from there to 0.
 
     Args:
         v: speed (...) [changes of the change of v].

@@ -14,11 +14,11 @@ from qpavoid.problem import Array
 
 @compiled
 def stop_velocity(x: Any) -> None:
-    """Write to v_stop the next velocity of a stop: v_prev times one factor, so that no distance closes faster.
+    """Write to v_stop the next velocity of a stop: v_prev times one factor.
 
-    With s = max |v_j| / v_step_j, the number of steps to a standstill, the factor is 1 - 1 / s, or 0 from less than a
-    step on; it is 0 without acceleration limits. With jerk limits, see `jerk_limited_stop`. Bounds of position and
-    velocity come first: the result is clipped to them.
+    So no distance closes faster. With s = max |v_j| / v_step_j, the number of steps to a standstill, the factor is 1 -
+    1 / s, or 0 from less than a step on; it is 0 without acceleration limits. With jerk limits, see
+    `jerk_limited_stop`. Bounds of position and velocity come first: the result is clipped to them.
 
     Args:
         x: reads v_prev, dv_prev, v_step, dv_step, lower and upper; writes v_stop (n,) [rad/s or m/s].

@@ -16,13 +16,14 @@ distances curve within a control step."""
 
 @compiled
 def clearance_lower_bound(x: Any, v: Array, k: int, influence_distance: float, horizon: float) -> float:
-    """Bound from below the distance minus safety distance of every pair at constant v until `horizon`.
+    """Bound the clearance of all pairs from below, at constant v until `horizon`.
 
-    No distance falls faster than the fastest points of its two bodies move. A point of a body moves at most at the
-    speed of its joint's origin plus the joint's angular speed times the distance from the origin. It moves at most
-    s h + ½ a h² in the time h, if it starts at speed s and its acceleration stays below a; at constant joint rates that
-    is at most Ω² R + 2 Ω V, with the sums Ω of the angular and V of the linear rates of the joints that move it and the
-    longest lever arm R. Of a pair of which that leaves nothing, `_clearance_along_normal` may be positive.
+    The clearance is the distance minus the safety distance. No distance falls faster than the fastest points of its two
+    bodies move. A point of a body moves at most at the speed of its joint's origin plus the joint's angular speed times
+    the distance from the origin. It moves at most s h + ½ a h² in the time h, if it starts at speed s and its
+    acceleration stays below a; at constant joint rates that is at most Ω² R + 2 Ω V, with the sums Ω of the angular and
+    V of the linear rates of the joints that move it and the longest lever arm R. Of a pair of which that leaves
+    nothing, `_clearance_along_normal` may be positive.
 
     Args:
         x: reads the results of the step; writes speeds and omega of the joints.
@@ -63,15 +64,15 @@ def clearance_lower_bound(x: Any, v: Array, k: int, influence_distance: float, h
 
 @compiled
 def _clearance_along_normal(x: Any, v: Array, i: int, horizon: float, curvature: float) -> float:
-    """Bound from below the distance minus safety distance of near pair i until `horizon`, along its normal.
+    """Bound the clearance of near pair i from below until `horizon`, along its normal.
 
-    Two convex bodies are at least as far apart as along any direction: as far along it as the nearest points of the
-    two. In the direction of the normal n, these move with the witness points, and with the rotation of the bodies: a
-    point r of a body that turns at ω approaches by (r - p)·(n × ω) faster than the witness point p. Of the box around
-    the body, the corner where that is largest counts, which |n × ω| along its edges gives. The path of a point of an
-    obstacle that turns deviates from a line by no more than ½ ω h² times the speed of its fastest point. A stop within
-    jerk limits may lead backwards, so both signs of the closing speed count; an obstacle need not move as long as the
-    robot does, so that it recedes does not count.
+    The clearance is the distance minus the safety distance. Two convex bodies are at least as far apart as along
+    any direction: as far along it as the nearest points of the two. In the direction of the normal n, these move with
+    the witness points, and with the rotation of the bodies: a point r of a body that turns at ω approaches by
+    (r - p)·(n × ω) faster than the witness point p. Of the box around the body, the corner where that is largest counts,
+    which |n × ω| along its edges gives. The path of a point of an obstacle that turns deviates from a line by no more
+    than ½ ω h² times the speed of its fastest point. A stop within jerk limits may lead backwards, so both signs of the
+    closing speed count; an obstacle need not move as long as the robot does, so that it recedes does not count.
 
     Args:
         x: reads the results of the step, and omega of the joints.
@@ -117,7 +118,9 @@ def _clearance_along_normal(x: Any, v: Array, i: int, horizon: float, curvature:
 
 @compiled
 def leaves_position_limits(x: Any, q: Array, v: Array, horizon: float) -> bool:
-    """Return True if a coordinate at constant v passes a position limit, so that it brakes harder than others.
+    """Return True if a coordinate at constant v passes a position limit until `horizon`.
+
+    Then it brakes harder than the others, and a stop is no multiple of v.
 
     Args:
         x: reads the position limits.
@@ -134,10 +137,10 @@ def leaves_position_limits(x: Any, q: Array, v: Array, horizon: float) -> bool:
 
 @compiled
 def joint_speeds(x: Any, v: Array) -> None:
-    """Write the angular velocity of each joint, and the largest speed of any point of the bodies fixed to it.
+    """Write the angular velocity of each joint, and the largest speed of its points.
 
-    That is the speed of the joint's origin, plus its angular speed times the distance of the farthest point. The twist
-    of a joint at the world's origin is that of its parent plus its own columns of the Jacobian times their rates.
+    The latter is the speed of the joint's origin, plus its angular speed times the distance of the farthest point. The
+    twist of a joint at the world's origin is that of its parent plus its own columns of the Jacobian times their rates.
 
     Args:
         x: reads J_world, joint_poses, parents, column_joints and joint_radius; writes omega (J, 3) [rad/s] and the
@@ -163,10 +166,11 @@ def joint_speeds(x: Any, v: Array) -> None:
 
 @compiled
 def is_tracking_clear(x: Any, q: Array, k: int, influence_distance: float) -> bool:
-    """Return True if every pair keeps its safety distance along v_tracking and a stop from it, by bounds alone.
+    """Return True if bounds show that v_tracking and a stop from it are clear.
 
-    A stop takes s = max |v_j| / v_step_j steps, in which the robot moves ½ s dt times v at most: one step of v and that
-    make the horizon of `clearance_lower_bound`. False says nothing: the distances themselves have to be computed.
+    Clear is what keeps the safety distance of every pair, up to `TOLERANCE`. A stop takes s = max |v_j| / v_step_j
+    steps, in which the robot moves ½ s dt times v at most: one step of v and that make the horizon of
+    `clearance_lower_bound`. False says nothing: the distances themselves have to be computed.
 
     Args:
         x: reads the results of the step, v_tracking included.

@@ -82,10 +82,11 @@ def _clamp(x: float, limit: float) -> float:
 
 @compiled
 def _two_segments(one: Array, l1: float, two: Array, l2: float, a: Array, b: Array) -> None:
-    """Write the closest points of two segments along the z axes of their poses; the middle ones of parallel segments.
+    """Write the closest points of two segments along the z axes of their poses.
 
-    With p + s u, |s| <= l1 and q + t w, |t| <= l2, the distance is least at the unconstrained s, clamped, then the best
-    t for it, clamped, then the best s for that, clamped (Ericson 2005, "Real-Time Collision Detection", 5.1.9).
+    Of parallel segments, these are the middle ones. With p + s u, |s| <= l1 and q + t w, |t| <= l2, the distance is
+    least at the unconstrained s, clamped, then the best t for it, clamped, then the best s for that, clamped (Ericson
+    2005, "Real-Time Collision Detection", 5.1.9).
 
     Args:
         one: pose of the first segment (12,), rotation by columns, then centre [m].
@@ -178,7 +179,7 @@ def _closest_place(p: Array, u: Array, core: Array, half: float, last: bool) -> 
 
 @compiled
 def _slope(p: Array, u: Array, core: Array, s: float) -> float:
-    """Compute the derivative by s of half the squared distance of a box from p + s u [m]; see `_closest_place`."""
+    """Compute d/ds of half the squared distance of a box from p + s u [m]."""
     slope = 0.0
     for r in range(3):
         x = p[r] + s * u[r]

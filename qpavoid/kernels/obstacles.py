@@ -104,7 +104,7 @@ def sample_pieces(x: Pieces, t: float, tolerance: float, states: Array) -> None:
 def place_obstacles(
     x: ObstacleArrays, numbers: IntArray, geometries: IntArray, owners: IntArray, states: Array, margin: Array
 ) -> tuple[int, bool]:
-    """Write the states of some obstacles, and what follows from them: twists, speeds, poses and sphere centres.
+    """Write the states of some obstacles, with twists, speeds, poses and sphere centres.
 
     The twist at the world's origin is [v - ω × p, ω]; the largest speed of any point is |v| + |ω| R with the bounding
     radius R.

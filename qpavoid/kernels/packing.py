@@ -54,6 +54,7 @@ structref.define_constructor(PackedRows, PackedRowsType, list(RowLayout._fields)
 
 @compiled
 def _pack(fields: Any) -> Any:
+    """Return a structure of the fields of a layout."""
     return PackedRows(*fields)
 
 

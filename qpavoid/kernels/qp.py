@@ -27,7 +27,7 @@ of the projection."""
 def project(
     A: Array, regularization: float, v_tracking: Array, J: Array, b: Array, lower: Array, upper: Array
 ) -> tuple[Array, bool]:
-    """Compute the velocity of least tracking cost that meets all rows and bounds: `project_soft` without soft rows.
+    """Compute the feasible velocity of least cost: `project_soft` without soft rows.
 
     Args:
         A: tracking rows (r, nv).
@@ -48,9 +48,10 @@ def project(
 def project_soft(
     A: Array, regularization: float, v_tracking: Array, J: Array, b: Array, lower: Array, upper: Array, soft: Array
 ) -> tuple[Array, bool]:
-    """Compute the velocity closest to v_tracking in the metric P = AᵀA + λ I with J v >= b, lower <= v <= upper.
+    """Compute the velocity closest to v_tracking that meets all hard rows and bounds.
 
-    Rows may be soft: one is violated by s at the cost of ½ s² / its softness.
+    It minimises ½ (v - v_tracking)ᵀP (v - v_tracking), P = AᵀA + λ I, with J v >= b, lower <= v <= upper. Rows may be
+    soft: one is violated by s at the cost of ½ s² / its softness.
 
     Args:
         A: tracking rows (r, nv).
@@ -258,9 +259,9 @@ def _factorise(M: Array, L: Array, n: int) -> None:
 
 @compiled
 def _extend(M: Array, L: Array, i: int) -> None:
-    """Write row i of the Cholesky factor L of M, given the rows before; NaN where M is not positive definite.
+    """Write row i of the Cholesky factor L of M, given the rows before.
 
-    The diagonal has the inverses: 1 / L_ii, as divisions are slow.
+    It is NaN where M is not positive definite. The diagonal has the inverses: 1 / L_ii, as divisions are slow.
     """
     for j in range(i):
         total = M[i, j]
@@ -275,7 +276,7 @@ def _extend(M: Array, L: Array, i: int) -> None:
 
 @compiled
 def _solve(L: Array, b: Array, y: Array, n: int) -> None:
-    """Write to y the solution of L Lᵀ y = b, of the first n rows and columns; the diagonal of L is inverted."""
+    """Solve L Lᵀ y = b of the first n rows and columns; the diagonal of L is inverted."""
     for i in range(n):
         total = b[i]
         for c in range(i):
@@ -331,7 +332,9 @@ def _drop(N: Array, W: Array, S: Array, R: Array, active: IntArray, u: Array, le
 
 @compiled
 def _slack(p: int, x: Array, G: Array, h: Array, lower: Array, upper: Array) -> float:
-    """Compute the slack of constraint p at x, negative outside: n lower bounds, n upper bounds, then the rows.
+    """Compute the slack of constraint p at x, negative outside.
+
+    Constraints are numbered: n lower bounds, n upper bounds, then the rows.
 
     Args:
         p: number of the constraint.
@@ -356,7 +359,7 @@ def _slack(p: int, x: Array, G: Array, h: Array, lower: Array, upper: Array) -> 
 def _most_violated(
     x: Array, G: Array, h: Array, lower: Array, upper: Array, met: npt.NDArray[np.bool_]
 ) -> tuple[int, float]:
-    """Find the most violated constraint at x, the met ones left out, and its violation; NaN in a row is returned.
+    """Find the most violated constraint at x, and its violation; NaN in a row is returned.
 
     Args:
         x: point (n,).

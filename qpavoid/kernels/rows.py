@@ -156,11 +156,12 @@ def _beta(x: Any, d: float) -> float:
 
 @compiled
 def _rate_of_eq10(x: Any, i: int, d: float) -> float:
-    """Compute the rate J_d q̇ [m/s] of near pair i that eq. 10 with the consistent bracket gives, undamped, J_d N != 0.
+    """Compute the distance rate of near pair i by eq. 10 with the consistent bracket [m/s].
 
-    That is (1 - β)(1 - α) min(u, ẋ0) + β ẋ0, with u = J v_tracking + ḋ_obs and α for u < 0 only. As a lower bound it
-    asks of a pair that separates by itself for no more than ẋ0. α > 1 asks a pair that closes to separate: of two
-    bodies of the robot, as of neighbouring links, the cap is 1, so that for ẋ0 = 0 rest meets all of them.
+    Undamped, and for J_d N != 0, J_d q̇ is (1 - β)(1 - α) min(u, ẋ0) + β ẋ0, with u = J v_tracking + ḋ_obs and α for u
+    < 0 only. As a lower bound it asks of a pair that separates by itself for no more than ẋ0. α > 1 asks a pair that
+    closes to separate: of two bodies of the robot, as of neighbouring links, the cap is 1, so that for ẋ0 = 0 rest
+    meets all of them.
 
     Args:
         x: reads J, v_tracking, feedforward, d1, d2, alpha_cap, retreat_speed, margin, near_pairs, twist_row.
@@ -180,10 +181,11 @@ def _rate_of_eq10(x: Any, i: int, d: float) -> float:
 
 @compiled
 def _jerk_limited_closing(x: Any, i: int, rate: float, step: float, clearance: float) -> float:
-    """Compute the bound of closing pair i from which a share of its joints' jerks, too, brings it to rest in time.
+    """Compute the row bound at which closing pair i can stop within jerk limits, too.
 
-    The closing speed of the previous step, -(J v_prev + ḋ_obs), and its change, -J dv_prev, are braked as a coordinate
-    is within jerk limits: see `kernels.braking_bounds`.
+    A share of the joints' jerks, all at work on the pair, brings it to rest within the distance. The closing speed
+    of the previous step, -(J v_prev + ḋ_obs), and its change, -J dv_prev, are braked as a coordinate is within jerk
+    limits: see `kernels.braking_bounds`.
 
     Args:
         x: reads J, feedforward, v_prev, dv_prev, dv_step.

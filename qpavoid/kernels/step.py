@@ -46,7 +46,7 @@ def assemble(
 
 @compiled
 def tracking_violation(x: Any, k: int) -> float:
-    """Compute the `violation` of the first k rows and the bounds by the tracking law's velocity [m/s, rad/s].
+    """Compute the `violation` by v_tracking of the first k rows and the bounds [m/s, rad/s].
 
     Args:
         x: reads v_tracking, J, rhs, lower and upper.

@@ -20,13 +20,14 @@ _rotation_vector = compiled(rotation_vector)
 
 @compiled
 def frame_rows(x: Any) -> None:
-    """Write the rows A v = b of f frames that follow targets: feed-forward plus gain times error, capped and scaled.
+    """Write the rows A v = b of f frames that follow targets.
 
-    A linear row has the direction e of a world axis: e·(v_p + ω × p) = [e, p × e]ᵀ J_world v with the frame's position
-    p, and b = ẋ_ref + K (x_ref - x). An angular row is e·ω with b = ω_ref + K e·θ, where θ is the rotation vector of
-    R_ref Rᵀ, see `rotation_vector`. The three right-hand sides of a frame are scaled down together to its largest
-    speed, then every row with the root of its weight. Three linear rows for each frame whose position counts come
-    first, then three angular rows for each whose orientation does; rows after these are not changed.
+    The right-hand side is feed-forward plus gain times error, capped and scaled. A linear row has the direction e of a
+    world axis: e·(v_p + ω × p) = [e, p × e]ᵀ J_world v with the frame's position p, and b = ẋ_ref + K (x_ref - x). An
+    angular row is e·ω with b = ω_ref + K e·θ, where θ is the rotation vector of R_ref Rᵀ, see `rotation_vector`. The
+    three right-hand sides of a frame are scaled down together to its largest speed, then every row with the root of its
+    weight. Three linear rows for each frame whose position counts come first, then three angular rows for each whose
+    orientation does; rows after these are not changed.
 
     Args:
         x: reads J_world, frame_poses, frame_ids, targets, oriented, gain, cap, scale and task_support; writes poses
@@ -84,9 +85,10 @@ def frame_rows(x: Any) -> None:
 
 @compiled
 def damped_solution(x: Any, v: Array) -> None:
-    """Write v = A⁺b with A⁺ = Aᵀ (A Aᵀ + λ²)⁻¹, by a Cholesky factorisation of the Gram matrix, row by row.
+    """Write v = A⁺b with the damped inverse A⁺ = Aᵀ (A Aᵀ + λ²)⁻¹.
 
-    L Lᵀ = A Aᵀ + λ² I; L y = b is solved as the rows of L are made, then Lᵀ z = y backwards, and v = Aᵀ z.
+    By a Cholesky factorisation of the Gram matrix, row by row: L Lᵀ = A Aᵀ + λ² I; L y = b is solved as the rows of L
+    are made, then Lᵀ z = y backwards, and v = Aᵀ z.
 
     Args:
         x: reads A (r, n), b (r,) and the damping λ.
@@ -130,7 +132,9 @@ def damped_solution(x: Any, v: Array) -> None:
 
 @compiled
 def projection_cost(A: Array, regularization: float, v_tracking: Array) -> tuple[Array, Array]:
-    """Compute the cost ½ vᵀP v + qᵀv that is smallest at v_tracking: ½ ‖A (v - v_tracking)‖² + ½ λ ‖v - v_tracking‖².
+    """Compute the cost ½ vᵀP v + qᵀv that is smallest at v_tracking.
+
+    But for a constant it is ½ ‖A (v - v_tracking)‖² + ½ λ ‖v - v_tracking‖².
 
     Args:
         A: task rows (r, n).

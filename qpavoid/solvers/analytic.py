@@ -60,7 +60,10 @@ def null_space_part(row: Array, tracking: Tracking) -> Array:
 
 
 class TrackingOnly:
-    """q̇ = J⁺ẋ, damped least squares (Nakamura and Hanafusa 1986; Wampler 1986): the baseline, without avoidance."""
+    """q̇ = J⁺ẋ, damped least squares: the baseline, without avoidance.
+
+    Nakamura and Hanafusa 1986; Wampler 1986.
+    """
 
     bounded = False
 

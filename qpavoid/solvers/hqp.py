@@ -29,7 +29,7 @@ _MIN_SINGULAR_VALUE = 1e-12
 class Hqp(Qp):
     """Hierarchical QP: for each priority p in turn, among the optima of all before it,
 
-        min ‖A_p v - b_p‖² + λ ‖v - v̂‖²  s.t.  J v >= b,  lower <= v <= upper.
+        min ‖A_p v - b_p‖² + λ ‖v - v̂‖²  s.t. J v >= b,  lower <= v <= upper.
 
     v̂ is the same cascade without the inequalities, v̂ += Z (A_p Z)⁺ (b_p - A_p v̂) with a basis Z of the null space of
     the levels before (Siciliano and Slotine 1991), each inverse damped as J⁺ is: the answer wherever it is safe. In the
@@ -41,7 +41,7 @@ class Hqp(Qp):
     """
 
     def solve(self, problem: Problem) -> Solution:
-        """Return the lexicographically best safe velocity; relaxed where there is none; a stop where that fails too."""
+        """Return the lexicographic optimum; relaxed without one; a stop where that fails too."""
         if problem.violation <= 0.0 and not problem.levels:
             return Solution(problem.v_tracking.copy())
         levels = problem.levels or (np.arange(len(problem.tracking.b)),)
@@ -109,7 +109,7 @@ class Hqp(Qp):
     def _solve(
         self, Z: Array, v: Array, P: Array, q: Array, J: Array, b: Array, lower: Array, upper: Array, met: bool
     ) -> Array | None:
-        """Solve one level among v + Z w by the first back end that can; v is feasible if the inequalities are `met`."""
+        """Solve one level among v + Z w; v is feasible if the inequalities are `met`."""
         if met:
             b, lower, upper = np.minimum(b, J @ v), np.minimum(lower, v), np.maximum(upper, v)
         for backend in self._backends:

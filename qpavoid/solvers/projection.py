@@ -32,7 +32,7 @@ class GradientProjection:
         self.config = config
 
     def solve(self, problem: Problem) -> Solution:
-        """Return J⁺ẋ plus the self-motion that adds clearance; J⁺ẋ without a pair in range; see `Solver.solve`."""
+        """Return J⁺ẋ plus the self-motion that adds clearance; see `Solver.solve`."""
         rows, primary = problem.avoidance, tracking_velocity(problem)
         if rows.d.size == 0:
             return Solution(primary)
@@ -53,7 +53,7 @@ def clearance_slope(d: Array, d1: float, d2: float) -> Array:
 
 
 def step_fraction(v: Array, a: Array, lower: Array, upper: Array) -> float:
-    """Compute the largest s in [0, 1] at which v + s a violates no bound that v meets, and no other one more [-].
+    """Compute the largest s in [0, 1] at which v + s a violates no bound more than v [-].
 
     Args:
         v: velocity (nv,).

@@ -19,7 +19,7 @@ _LOW_EFFORT = 1.0
 
 
 class Qp:
-    """min ‖A (v - v0)‖² + λ ‖v - v0‖²  s.t.  J v >= b,  lower <= v <= upper.
+    """min ‖A (v - v0)‖² + λ ‖v - v0‖²  s.t. J v >= b,  lower <= v <= upper.
 
     v0 = J⁺ẋ is the tracking law's velocity, so the answer is the safe velocity closest to it, and v0 itself whenever
     that is safe. As A v0 = b wherever the task can be met, the first term is the tracking cost ‖A v - b‖²;
@@ -131,7 +131,9 @@ class Qp:
 
 
 def relaxed_solution(relaxed: Relaxed, problem: Problem, *reasons: Reason) -> Solution:
-    """Return the solution with its reasons; SOLVED where nothing is relaxed by more than the tolerance of a QP.
+    """Return the solution with its reasons.
+
+    It is SOLVED where nothing is relaxed by more than the tolerance of a QP.
 
     Args:
         relaxed: the velocity, with its slacks.
@@ -145,7 +147,7 @@ def relaxed_solution(relaxed: Relaxed, problem: Problem, *reasons: Reason) -> So
 
 
 def _warm_up() -> None:
-    """Call the back end `native`, without and with soft rows, so that no control step waits for the compiler."""
+    """Call the back end `native`: no control step waits for the compiler."""
     one, row = np.ones(1), np.ones((1, 1))
     arguments = row, 1.0, one, row, 2.0 * one, -3.0 * one, 3.0 * one
     kernels.project(*arguments)

@@ -107,7 +107,9 @@ def closest(backend: Backend, P: Array, q: Array, J: Array, b: Array, lower: Arr
 
 
 def by_back_end(backend: Backend, P: Array, q: Array, v_tracking: Array) -> Closest:
-    """Return a function that solves the QPs of a tracking cost by a back end: violations of soft rows become variables.
+    """Return a function that solves the QPs of a tracking cost by a back end.
+
+    Violations of soft rows become variables.
 
     Args:
         backend: solves the QPs.
@@ -143,9 +145,10 @@ def by_back_end(backend: Backend, P: Array, q: Array, v_tracking: Array) -> Clos
 
 
 def _widened_bounds(x: Problem, b: Array, solve: Closest) -> _Bounds:
-    """Widen the bounds as little as possible, in squares of their widths, for some v to meet the rows J v >= b.
+    """Widen the bounds as little as possible for some v to meet the rows J v >= b.
 
-    Where none does, the bounds from position and velocity limits remain.
+    Excesses are minimised in squares, relative to the widths. Where no v meets the rows, the bounds from position and
+    velocity limits remain.
 
     Args:
         x: problem.
@@ -211,7 +214,13 @@ def _lexicographic_slack(
 
 
 def _levels(d: Array) -> IntArray:
-    """Compute the level (k,) of each row by depth, 0 the deepest: rows within `_LEVEL_WIDTH` of its deepest one."""
+    """Compute the level (k,) of each row by depth, 0 the deepest.
+
+    A level has the rows within `_LEVEL_WIDTH` of its deepest one.
+
+    Args:
+        d: distances (k,) [m].
+    """
     level, current, start = np.empty(len(d), dtype=np.intp), -1, -np.inf
     for i in np.argsort(d, kind="stable").tolist():
         if current < 0 or d[i] - start > _LEVEL_WIDTH:

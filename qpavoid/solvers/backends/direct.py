@@ -29,7 +29,7 @@ class Daqp:
         self._sense = np.zeros(size, dtype=ctypes.c_int)
 
     def __call__(self, P: Array, q: Array, G: Array, h: Array, lower: Array, upper: Array) -> Array | None:
-        """Compute the minimiser of ½ xᵀP x + qᵀx with G x >= h, lower <= x <= upper; None where daqp finds none."""
+        """Compute the solution of a QP, see `Backend`; None where daqp finds none."""
         n, size = len(q), len(q) + len(h)
         if size > len(self._sense):
             self._allocate(2 * size)

@@ -50,7 +50,7 @@ class Persistent:
         self._workspaces: dict[tuple[int, ...], Workspace] = {}
 
     def __call__(self, P: Array, q: Array, G: Array, h: Array, lower: Array, upper: Array) -> Array | None:
-        """Compute the minimiser of ½ xᵀP x + qᵀx with G x >= h, lower <= x <= upper; None where none is found."""
+        """Compute the solution of a QP, see `Backend`; None where none is found."""
         if not _well_formed(P, q, G, h, lower, upper):
             return None
         workspace = self._workspaces.pop(G.shape, None)
@@ -119,10 +119,10 @@ class ProxqpWorkspace:
 
 
 class OsqpWorkspace:
-    """Operator splitting (Stellato et al. 2020); bounds are the first rows of [I; G]. Polishing makes it exact.
+    """Operator splitting (Stellato et al. 2020) with polishing, which makes it exact.
 
-    An additional variable is at its bound by its cost: where no row at all is active, polishing prints a line to the
-    output of the process, at any settings (osqp 1.1, osqp/osqp#785).
+    Bounds are the first rows of [I; G].     An additional variable is at its bound by its cost: where no row at all is
+    active, polishing prints a line to the output of the process, at any settings (osqp 1.1, osqp/osqp#785).
     """
 
     def __init__(self, P: Array, q: Array, G: Array, h: Array, lower: Array, upper: Array) -> None:
@@ -145,7 +145,7 @@ class OsqpWorkspace:
         self._qp.setup(P=cost, A=rows, **vectors, **settings, verbose=False)
 
     def _vectors(self, P: Array, q: Array, G: Array, h: Array, lower: Array, upper: Array) -> dict[str, Array]:
-        """Return every entry that can change: upper triangle of P and all of [I; G], by columns, q and the bounds."""
+        """Return all entries that can change: upper P and [I; G] by columns, q, bounds."""
         n = self._n
         self._P[:n, :n], self._q[:n], self._data[:n, 1:] = P, q, G.T
         self._below[:n], self._below[n + 1 :], self._above[:n] = lower, h, upper
