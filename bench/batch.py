@@ -11,7 +11,7 @@ from time import perf_counter
 import numpy as np
 
 from qpavoid import Controller, ScenarioConfig, Workers, load_scenario, simulate_many, steps
-from qpavoid.run import simulate
+from qpavoid.run.simulate import simulate
 from qpavoid.run.machine import cpu
 
 RESULTS = Path(__file__).parent / "results" / "batch.md"

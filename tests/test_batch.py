@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from qpavoid import ConfigError, Controller, NumericalError, SolverNotInstalled, UnknownName, load_scenario
-from qpavoid.run import simulate
+from qpavoid.run.simulate import simulate
 from qpavoid.run.batch import BatchError, WorkerDied, Workers, simulate_many, steps
 from qpavoid.run.log import STATUSES
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from qpavoid import ConfigError, Controller, Log, ScenarioConfig, Severity, load_scenario
-from qpavoid.run import simulate
+from qpavoid.run.simulate import simulate
 from qpavoid.run.log import STATUSES
 from qpavoid.solvers.analytic import TrackingOnly
 

@@ -10,7 +10,7 @@ from matplotlib.colors import to_hex
 from numpy.testing import assert_allclose
 
 from qpavoid import Log, Status, load_scenario
-from qpavoid.run import simulate
+from qpavoid.run.simulate import simulate
 from qpavoid.run.log import STATUSES
 
 pytest.importorskip("matplotlib")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -11,21 +11,18 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from qpavoid.config import Body, Hull, RobotConfig
+from qpavoid.config import RobotConfig
 from qpavoid.config.loading import read_mapping, validate
 from qpavoid.config.shipped import find_robot
 from qpavoid.errors import ConfigError, UnknownName, nearest
-from qpavoid.geometry.bodies import check_meshes, convert_bodies, make_shape, triangle_meshes
 from qpavoid.model.end_effectors import end_effectors
 from qpavoid.model.joints import assume_speeds, frame_index, joint_bounds, middle, set_joints, set_limits, without
 from qpavoid.model.kinematics import TRANSLATIONS
 from qpavoid.model.limits import JointBounds
 from qpavoid.model.notes import Note, NoteKind, merged, warn_of
-from qpavoid.model.packages import absolute_entries
 from qpavoid.model.pairs import TouchingPair, add_self_pairs, drop_always_touching
-from qpavoid.model.plausibility import name_implausible_sizes
-from qpavoid.model.trajectory import rpy_to_matrix
-from qpavoid.model.urdf import find_resource, honour_srdf, is_mjcf, read_model, read_pieces
+from qpavoid.model.robot_bodies import pair_margins, robot_bodies
+from qpavoid.model.urdf import find_resource, honour_srdf, is_mjcf, read_model
 from qpavoid.model.urdf_tree import fixed_by_limits
 from qpavoid.model.xml_file import read_robot_xml
 from qpavoid.problem import Array
@@ -235,7 +232,7 @@ def _build(config: RobotConfig, path: Path) -> Robot:
     urdf = find_resource(config.urdf, path.parent, f"{path}: urdf")
     model = read_model(urdf, config.root_joint, notes)
     ends = _end_effectors(model, config.end_effectors, path, notes)
-    bodies = _bodies(config, urdf, model, path, notes)
+    bodies = robot_bodies(config, urdf, model, path, notes)
     set_limits(model, config.limits, path)
     home = set_joints(model, middle(model), config.home, f"{path}: home")
     fixed = {**_fixed(urdf, config, notes), **config.lock}
@@ -264,22 +261,11 @@ def _build(config: RobotConfig, path: Path) -> Robot:
         ends,
         str(path),
         tuple(always_touching),
-        _margins(config, bodies, path),
+        pair_margins(config, bodies, path),
         config.limits.acceleration,
         config.limits.jerk,
         tuple(notes),
     )
-
-
-def _margins(config: RobotConfig, bodies: Any, path: Path) -> dict[frozenset[str], float]:
-    """Safety distances of pairs of bodies [m]."""
-    names = [body.name for body in bodies.geometryObjects]
-    for index, own in enumerate(config.pair_margins):
-        for name in own.bodies:
-            if name not in names:
-                where = f"{path}: pair_margins.{index}.bodies"
-                raise UnknownName(f"{where}: no body {name!r}{nearest(name, names)}")
-    return {frozenset(own.bodies): own.d1 for own in config.pair_margins}
 
 
 def _end_effectors(model: Any, given: Sequence[str], path: Path, notes: list[Note]) -> tuple[str, ...]:
@@ -310,71 +296,3 @@ def _fixed(urdf: Path, config: RobotConfig, notes: list[Note]) -> dict[str, floa
             Note(NoteKind.JOINT, (name,), what, "give its range under `limits.position` if it moves", "warning")
         )
     return fixed
-
-
-def _bodies(config: RobotConfig, urdf: Path, model: Any, path: Path, notes: list[Note]) -> Any:
-    package_dirs = absolute_entries(config.package_dirs, path.parent)
-
-    def read(enclosed: bool, collected: list[Note]) -> Any:
-        return read_pieces(
-            urdf, model, package_dirs, path, collected,
-            visuals=config.visuals, allow_missing=config.allow_missing_meshes, enclosed=enclosed,
-        )  # fmt: skip
-
-    if not isinstance(config.bodies, str):
-        hulls = _hulls(config.bodies, lambda: read(True, []), path)  # what is not listed is left out on purpose
-        return _listed_bodies(config.bodies, model, hulls, path)
-    pieces = read(False, notes)
-    check_meshes(pieces, str(path))
-    name_implausible_sizes(model, pieces, notes)
-    bodies = convert_bodies(pieces, config.bodies)
-    if meshes := triangle_meshes(bodies):
-        what = (
-            f"{len(meshes)} triangle meshes cost 100 to 500 µs a pair at every tick, some pairs several ms, convex "
-            "hulls about 1 µs, capsules 0.1 µs"
-        )
-        remedy = "set `bodies` to convex or capsule"
-        notes.append(Note(NoteKind.MESH, tuple(meshes), what, remedy, "warning"))
-    return bodies
-
-
-def _hulls(configs: Sequence[Body], read: Callable[[], Any], path: Path) -> dict[str, Any]:
-    """Hulls of the pieces of geometry that bodies name."""
-    wanted = {body.shape.geometry: index for index, body in enumerate(configs) if isinstance(body.shape, Hull)}
-    if not wanted:
-        return {}
-    pieces = {piece.name: piece for piece in read().geometryObjects}
-    chosen = pin.GeometryModel()
-    for name, index in wanted.items():
-        if name not in pieces:
-            raise UnknownName(
-                f"{path}: bodies.{index}.shape.geometry: no collision geometry {name!r}{nearest(name, pieces)}"
-            )
-        chosen.addGeometryObject(pieces[name])
-    check_meshes(chosen, str(path))
-    return {hull.name: hull for hull in convert_bodies(chosen, "convex").geometryObjects}
-
-
-def _listed_bodies(configs: Sequence[Body], model: Any, hulls: Mapping[str, Any], path: Path) -> Any:
-    bodies = pin.GeometryModel()
-    for index, body in enumerate(configs):
-        if not model.existFrame(body.frame):
-            frames = [f.name for f in model.frames if f.type == pin.BODY]
-            raise UnknownName(f"{path}: bodies.{index}.frame: no frame {body.frame!r}{nearest(body.frame, frames)}")
-        if bodies.existGeometryName(body.name):
-            raise ConfigError(f"{path}: bodies.{index}.name: {body.name!r} is given twice: names must differ")
-        frame_id = frame_index(model, body.frame)
-        frame = model.frames[frame_id]
-        placement = frame.placement * pin.SE3(rpy_to_matrix(body.rpy), np.array(body.position))
-        if isinstance(body.shape, Hull):
-            hull = hulls[body.shape.geometry]
-            geometry, placement = hull.geometry, placement * _in_link(hull, model)
-        else:
-            geometry = make_shape(body.shape)
-        bodies.addGeometryObject(pin.GeometryObject(body.name, frame.parentJoint, frame_id, placement, geometry))
-    return bodies
-
-
-def _in_link(body: Any, model: Any) -> Any:
-    """Placement of a body in the frame of its link."""
-    return model.frames[body.parentFrame].placement.actInv(body.placement)
