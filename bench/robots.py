@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from qpavoid.config.shipped import example_robot_data
-from qpavoid.model.notes import shortened
+from qpavoid.model.notes import abbreviate
 
 ROBOTS = example_robot_data() / "example-robot-data" / "robots"
 OUT = Path(__file__).parent.parent / "docs" / "robots.md"
@@ -92,7 +92,7 @@ def row(urdf: Path, folder: Path) -> tuple[str, bool]:
 
 def _problem(report: dict[str, Any]) -> str:
     note = report["notes"][0]
-    names = f"{shortened(note['subject'], 5)}: " if note["subject"] else ""
+    names = f"{abbreviate(note['subject'], 5)}: " if note["subject"] else ""
     return f"{note['severity']}: {names}{note['what']}"
 
 

@@ -25,10 +25,10 @@ from qpavoid import (
 from qpavoid.config import PointCloud
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.kernels.voxels import ALIKE
-from qpavoid.model.cloud import ball_radius, read_points
+from qpavoid.model.cloud import read_points, voxel_radius
 
 CLOUD = PointCloud()
-BALL = ball_radius(CLOUD.resolution)
+BALL = voxel_radius(CLOUD.resolution)
 
 
 def scattered(rng, count=400, spread=0.8):
@@ -80,7 +80,7 @@ def test_every_point_lies_in_the_ball_of_a_voxel(resolution):
     assert len(voxels.centers) == len(expected) == len(np.unique(voxels.keys))
     np.testing.assert_allclose(np.unique(voxels.centers, axis=0), (expected + 0.5) * resolution, atol=1e-9)
     nearest = np.min(np.linalg.norm(points[:300, None] - voxels.centers, axis=2), axis=1)
-    assert nearest.max() <= ball_radius(resolution)
+    assert nearest.max() <= voxel_radius(resolution)
 
 
 def test_blocks_hold_their_voxels():

@@ -17,10 +17,10 @@ from qpavoid.config.loading import read_config
 from qpavoid.config.shipped import data_folder, find_robot
 from qpavoid.model.packages import find_mesh
 from qpavoid.run.simulate import simulate
-from qpavoid.setup.add import Wishes, describe
+from qpavoid.setup.add import DescribeOptions, describe
 from qpavoid.setup.check import check_robot
 from qpavoid.setup.sampling import touching
-from qpavoid.setup.written import untouched
+from qpavoid.setup.written import is_sealed
 
 MADE = ("baxter", "g1", "tiago", "ur5")
 """Robots that ship as `robot add` wrote them."""
@@ -230,7 +230,7 @@ def test_a_second_run_writes_the_same_bytes_and_says_so(cli, tmp_path):
     assert set(first["files"].values()) == {"written"}
     before = {path.name: path.read_bytes() for path in (tmp_path / "chain").iterdir()}
     assert {"robot.yaml", "chain.srdf"} <= before.keys()
-    assert all(untouched(content) for content in before.values())
+    assert all(is_sealed(content) for content in before.values())
     second = json.loads(cli("robot", "add", "chain.urdf", "--json").stdout)
     assert set(second["files"].values()) == {"unchanged"}
     assert {path.name: path.read_bytes() for path in (tmp_path / "chain").iterdir()} == before
@@ -255,7 +255,7 @@ def test_an_edited_file_is_left_alone_unless_told_otherwise(cli, tmp_path):
     assert result.status == 2 and "edited since it was written" in result.stderr and "--force" in result.stderr
     assert path.read_text() == edited
     assert cli("robot", "add", "chain.urdf", "--no-picture", "--force").status == 0
-    assert untouched(path.read_bytes())
+    assert is_sealed(path.read_bytes())
 
 
 def test_the_written_command_writes_the_same_again(cli, tmp_path):
@@ -319,7 +319,7 @@ def test_an_added_robot_runs_at_once(cli, tmp_path):
 @pytest.mark.parametrize("name", MADE)
 def test_shipped_robots_are_as_they_were_written_and_ready(name):
     path = find_robot(name)
-    assert untouched(path.read_bytes()) and untouched((path.parent / f"{name}.srdf").read_bytes())
+    assert is_sealed(path.read_bytes()) and is_sealed((path.parent / f"{name}.srdf").read_bytes())
     robot = Robot.load(name)
     assert not touching(robot, robot.home, 0.005)
     assert robot.end_effectors and robot.always_touching == ()
@@ -331,7 +331,7 @@ def test_a_shipped_robot_comes_out_the_same_again():
     """Digits may differ where another machine rounds otherwise."""
     shipped = read_config(find_robot("ur5"), RobotConfig)
     home = {name: value for name, value in shipped.home.items() if value}
-    made = describe(EXAMPLES / "ur_description/urdf/ur5_robot.urdf", Wishes(name="ur5", home=home)).config
+    made = describe(EXAMPLES / "ur_description/urdf/ur5_robot.urdf", DescribeOptions(name="ur5", home=home)).config
     assert made.home == shipped.home and made.end_effectors == shipped.end_effectors
     assert made.disabled_pairs == shipped.disabled_pairs
     for mine, theirs in zip(made.bodies, shipped.bodies, strict=True):

@@ -14,8 +14,8 @@ from bench.safety.verdict import Verdict, judge, last_way_out
 from qpavoid import Log, ScenarioConfig, Status
 from qpavoid.arena.referee import Findings
 from qpavoid.arena.twin import Twin, load
-from qpavoid.run.simulate import simulate
 from qpavoid.run.log import STATUSES
+from qpavoid.run.simulate import simulate
 
 ALONE = "-alone"
 """What the name of a solver ends with that keeps no way out at hand."""
@@ -108,7 +108,7 @@ def as_named(scenario: ScenarioConfig, solver: str) -> ScenarioConfig:
     if not solver.endswith(ALONE):
         return scenario
     avoidance = scenario.avoidance.model_copy(update={"backup": None})
-    return scenario.model_copy(update={"avoidance": avoidance}).read_from(scenario.source)
+    return scenario.model_copy(update={"avoidance": avoidance}).with_source(scenario.source)
 
 
 def examine(

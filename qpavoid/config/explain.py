@@ -10,7 +10,7 @@ from pydantic_core import ErrorDetails
 
 from qpavoid.errors import nearest
 
-_FAULTS_TOLD = 5
+_MAX_FAULTS = 5
 _NUMBER = "give a number alone, in m, rad, kg and s"
 _REMEDIES = {
     "float_parsing": _NUMBER,
@@ -27,9 +27,9 @@ def explain(error: ValidationError, model: type[BaseModel], data: dict[str, Any]
     # Of a field that may be a list or a mapping, pydantic reports both; the one that was meant got deeper.
     above = {field[:depth] for field, _ in faults for depth in range(len(field))}
     deepest = [(field, fault) for field, fault in faults if field not in above]
-    more = f"; and {len(deepest) - _FAULTS_TOLD} more" if len(deepest) > _FAULTS_TOLD else ""
-    told = [(".".join(field), _fault(fault, model)) for field, fault in deepest[:_FAULTS_TOLD]]
-    return "; ".join(f"{field}: {what}" if field else what for field, what in told) + more
+    more = f"; and {len(deepest) - _MAX_FAULTS} more" if len(deepest) > _MAX_FAULTS else ""
+    clauses = [(".".join(field), _fault(fault, model)) for field, fault in deepest[:_MAX_FAULTS]]
+    return "; ".join(f"{field}: {clause}" if field else clause for field, clause in clauses) + more
 
 
 def _field(loc: tuple[int | str, ...], kind: str, data: Any) -> list[str]:

@@ -25,16 +25,16 @@ def schema_of(root: type[BaseModel]) -> dict[str, Any]:
 
 def page() -> str:
     """Markdown: a table of fields for each block of a scenario and of a robot.yaml, outer ones first."""
-    lines, seen = _HEAD.splitlines(), set[str]()
+    lines, visited_names = _HEAD.splitlines(), set[str]()
     for root in (ScenarioConfig, RobotConfig):
         schema = schema_of(root)
-        blocks, waiting = {root.__name__: schema, **schema.get("$defs", {})}, [root.__name__]
-        while waiting:
-            name = waiting.pop(0)
-            if name not in seen and "properties" in blocks[name]:
+        blocks, queue = {root.__name__: schema, **schema.get("$defs", {})}, [root.__name__]
+        while queue:
+            name = queue.pop(0)
+            if name not in visited_names and "properties" in blocks[name]:
                 lines += _section(name, blocks)
-                waiting += [ref for spec in blocks[name]["properties"].values() for ref in _refs(spec, blocks)]
-            seen.add(name)
+                queue += [ref for spec in blocks[name]["properties"].values() for ref in _refs(spec, blocks)]
+            visited_names.add(name)
     return "\n".join(lines)
 
 
@@ -53,7 +53,7 @@ def _section(name: str, blocks: dict[str, Any]) -> list[str]:
     if block["properties"]:
         lines += ["| field | what it may be | left out | meaning |", "|---|---|---|---|"]
     for field, spec in block["properties"].items():
-        default = "required" if field in block.get("required", ()) else _said(spec.get("default"))
+        default = "required" if field in block.get("required", ()) else _default_text(spec.get("default"))
         kind, meaning = _kind(spec, blocks), _flat(spec.get("description", ""))
         lines.append(f"| `{field}` | {kind} | {default} | {meaning} |")
     return lines
@@ -117,7 +117,7 @@ def _tags(spec: Any) -> Iterator[tuple[str, str]]:
         yield from _tags(each)
 
 
-def _said(default: Any) -> str:
+def _default_text(default: Any) -> str:
     """A default as a YAML file would give it."""
     if isinstance(default, dict) and ("name" in default or "type" in default):
         return f"`{default.get('name') or default['type']}`"

@@ -34,7 +34,7 @@ def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), solve
         ConfigError, UnknownName: naming file, field and remedy.
     """
     path = find_scenario(name_or_path)
-    return read_config(path, ScenarioConfig, overrides, solver).read_from(path)
+    return read_config(path, ScenarioConfig, overrides, solver).with_source(path)
 
 
 def read_config(path: Path, model: type[Config], overrides: Sequence[str] = (), solver: str | None = None) -> Config:
@@ -45,8 +45,10 @@ def read_config(path: Path, model: type[Config], overrides: Sequence[str] = (), 
     """
     data = read_mapping(path)
     if solver is not None:
-        wanted, kept = _solver_mapping(solver), _solver_mapping(data.get("solver"))
-        data["solver"] = {**kept, **wanted} if kept.get("name") == wanted["name"] else wanted
+        chosen_solver, settings = _solver_mapping(solver), _solver_mapping(data.get("solver"))
+        data["solver"] = (
+            {**settings, **chosen_solver} if settings.get("name") == chosen_solver["name"] else chosen_solver
+        )
     for override in overrides:
         _set(data, override, path)
     return validate(data, model, path)

@@ -15,8 +15,8 @@ EXAMPLES = "example-robot-data:"
 
 def data_folder(kind: str) -> Path:
     """The folder `robots` or `tasks`: packaged in a wheel, beside the package in a checkout."""
-    packaged = _PACKAGE / "_data" / kind
-    return packaged if packaged.is_dir() else _PACKAGE.parent / kind
+    folder_in_wheel = _PACKAGE / "_data" / kind
+    return folder_in_wheel if folder_in_wheel.is_dir() else _PACKAGE.parent / kind
 
 
 def robot_names() -> list[str]:

@@ -29,9 +29,9 @@ class TaskBlock(Block):
     @property
     def label(self) -> str:
         """Its name, given or taken."""
-        return self.name or self.taken_name()
+        return self.name or self.default_name()
 
-    def taken_name(self) -> str:
+    def default_name(self) -> str:
         """The name where none is given."""
         return str(getattr(self, "type"))  # noqa: B009
 
@@ -54,7 +54,7 @@ class Task(TaskBlock):
     max_turn_rate: Positive | None = None
     """Cap on the commanded angular speed [rad/s]; left out: no cap."""
 
-    def taken_name(self) -> str:
+    def default_name(self) -> str:
         """That of the frame."""
         return self.frame
 

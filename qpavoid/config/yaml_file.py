@@ -60,12 +60,12 @@ class _Loader(yaml.SafeLoader):
         return self._sizes[event.anchor]
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen: set[str] = set()
+        keys_so_far: set[str] = set()
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode):  # others are refused as keys anyway
-                if key.value in seen:
+                if key.value in keys_so_far:
                     raise _fault(f"key {key.value!r} is given twice", key)
-                seen.add(key.value)
+                keys_so_far.add(key.value)
         return super().construct_mapping(node, deep)
 
 
@@ -77,5 +77,5 @@ def _check_scalar(node: yaml.ScalarNode, event: Any) -> None:
         raise _fault("text with a NUL or half a character pair", event)
 
 
-def _fault(what: str, place: Any) -> yaml.MarkedYAMLError:
-    return yaml.MarkedYAMLError(problem=what, problem_mark=place.start_mark)
+def _fault(clause: str, place: Any) -> yaml.MarkedYAMLError:
+    return yaml.MarkedYAMLError(problem=clause, problem_mark=place.start_mark)

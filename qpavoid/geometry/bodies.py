@@ -12,7 +12,7 @@ import pinocchio as pin
 from qpavoid.config import Box, Capsule, Cone, Cylinder, Ellipsoid, Shape, Sphere
 from qpavoid.config.base import LARGEST
 from qpavoid.errors import ConfigError
-from qpavoid.geometry.cache import cached
+from qpavoid.geometry.cache import load_or_make
 from qpavoid.geometry.capsules import CapsuleFit, fit_capsule, half_sphere
 from qpavoid.problem import Array
 
@@ -93,7 +93,7 @@ def enclosing_capsule(geometry: Any) -> CapsuleFit:
     if isinstance(geometry, coal.Capsule):
         return CapsuleFit(np.zeros(3), np.eye(3), geometry.radius, 2.0 * geometry.halfLength)
     points = hull_points(geometry)
-    return cached("capsule", points, lambda: fit_capsule(points), _pack_fit, _unpack_fit)
+    return load_or_make("capsule", points, lambda: fit_capsule(points), _pack_fit, _unpack_fit)
 
 
 def bounding_sphere(geometry: Any) -> tuple[Array, float]:
@@ -132,7 +132,7 @@ def _convex_hull(mesh: Any) -> tuple[Any, Any]:
     low, high = local.min(axis=0), local.max(axis=0)
     size = high - low
     if size.min() > 1e-6 * size.max():
-        return cached("hull", points, lambda: run_qhull(mesh), _pack_hull, _unpack_hull), pin.SE3.Identity()
+        return load_or_make("hull", points, lambda: run_qhull(mesh), _pack_hull, _unpack_hull), pin.SE3.Identity()
     middle = center + axes.T @ (0.5 * (low + high))
     return coal.Box(*np.maximum(size, _THINNEST)), pin.SE3(np.ascontiguousarray(axes.T), middle)
 
@@ -200,5 +200,5 @@ def hull_points(geometry: Any) -> Array:
 def rim(radius: float, z: float) -> Array:
     """Corners (48, 3) of a polygon around a circle about the z axis."""
     angle = np.linspace(0.0, 2.0 * np.pi, 48, endpoint=False)
-    around = radius / np.cos(np.pi / 48)
-    return np.column_stack((around * np.cos(angle), around * np.sin(angle), np.full(48, z)))
+    circumradius = radius / np.cos(np.pi / 48)
+    return np.column_stack((circumradius * np.cos(angle), circumradius * np.sin(angle), np.full(48, z)))

@@ -39,7 +39,7 @@ _OURS = re.compile(r"(?:hull|capsule)-[0-9a-f]{32}\.")
 _T = TypeVar("_T")
 
 
-def cached(
+def load_or_make(
     kind: str, points: Array, make: Callable[[], _T], pack: Callable[[_T], bytes], unpack: Callable[[Path], _T]
 ) -> _T:
     """A result from the cache, or else made and put there.

@@ -51,7 +51,7 @@ def fit_capsule(points: Array, directions: int = 250) -> CapsuleFit:
     principal = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
     rotations = _rotations_to(np.concatenate((principal, half_sphere(directions))))
     if len(points) > _MANY:  # the outermost points tell which axes are worth trying with all of them
-        best = np.argsort(_tried_along(outermost(points), rotations)[0].min(axis=0))
+        best = np.argsort(_tried_along(extreme_points(points), rotations)[0].min(axis=0))
         rotations = rotations[best[:_PROMISING]]
     volume, fits, center = _tried_along(points, rotations)
     wider, axis = np.unravel_index(np.argmin(volume), volume.shape)
@@ -83,12 +83,12 @@ def _fit_along(height: Array, off_axis: Array, radius: Array) -> Array:
         off_axis: their squared distances from it (k, n).
         radius: of the capsules (k,).
     """
-    reach = np.sqrt(np.maximum(radius[:, None] ** 2 - off_axis, 0.0))
-    low, high = np.min(height + reach, axis=1), np.max(height - reach, axis=1)
+    half_chord = np.sqrt(np.maximum(radius[:, None] ** 2 - off_axis, 0.0))
+    low, high = np.min(height + half_chord, axis=1), np.max(height - half_chord, axis=1)
     return np.column_stack((radius, np.maximum(high - low, 0.0), 0.5 * (low + high)))
 
 
-def outermost(points: Array) -> Array:
+def extreme_points(points: Array) -> Array:
     """Those of many points (n, 3) that reach farthest along 120 fixed directions."""
     return np.asarray(points[np.unique(np.argmax(_ROUND @ points.T, axis=1))])
 
@@ -119,6 +119,6 @@ def _enclosing_circles(points: Array) -> tuple[Array, Array]:
     center = 0.5 * (points.min(axis=1) + points.max(axis=1))
     every = np.arange(len(points))
     for step in range(1, 60):
-        farthest = np.argmax(np.sum((points - center[:, None]) ** 2, axis=2), axis=1)
-        center = center + (points[every, farthest] - center) / (step + 1)
+        index_of_farthest = np.argmax(np.sum((points - center[:, None]) ** 2, axis=2), axis=1)
+        center = center + (points[every, index_of_farthest] - center) / (step + 1)
     return center, np.sqrt(np.max(np.sum((points - center[:, None]) ** 2, axis=2), axis=1))

@@ -31,7 +31,7 @@ def _core(geometry: Any) -> tuple[float, ...]:
     return (np.nan,) * 4
 
 
-def with_closed_form(table: Array, bodies: IntArray) -> Mask:
+def has_closed_form(table: Array, bodies: IntArray) -> Mask:
     """Which pairs (m,) of bodies (m, 2) have one: two cores of these, of which one at most is a box."""
     known, box = ~np.isnan(table[:, 0]), table[:, 1] > 0.0
     return np.asarray(known[bodies].all(axis=1) & ~box[bodies].all(axis=1))

@@ -73,9 +73,9 @@ class Voxels:
         array = as_numbers("points", points)
         if array.ndim != 2 or array.shape[1] != 3:
             raise NumericalError(f"points: shape {array.shape}, expected (n, 3)")
-        good = np.abs(array).max(axis=1, initial=0.0) <= _FARTHEST  # False for NaN too
-        kept = array if good.all() else array[good]
-        voxel = np.floor(kept / resolution).astype(np.int64)
+        is_finite = np.abs(array).max(axis=1, initial=0.0) <= _FARTHEST  # False for NaN too
+        finite = array if is_finite.all() else array[is_finite]
+        voxel = np.floor(finite / resolution).astype(np.int64)
         keys = np.unique(_key(voxel // _BLOCK) * _BLOCK**3 + _within(voxel % _BLOCK))
         corner = _BLOCK * _unkey(keys // _BLOCK**3) + _unwithin(keys % _BLOCK**3)
         centers = (corner + 0.5) * resolution
@@ -85,7 +85,9 @@ class Voxels:
         if len(starts):
             low, high = np.minimum.reduceat(centers, starts), np.maximum.reduceat(centers, starts)
             blocks[:, :3], blocks[:, 3] = 0.5 * (low + high), 0.5 * np.linalg.norm(high - low, axis=1)
-        return cls(resolution, centers, keys, blocks, np.append(starts, len(keys)), len(array) - len(kept), len(array))
+        return cls(
+            resolution, centers, keys, blocks, np.append(starts, len(keys)), len(array) - len(finite), len(array)
+        )
 
     @classmethod
     def of_octree(cls, tree: Any, resolution: float | None = None) -> Voxels:
@@ -104,7 +106,7 @@ class Voxels:
         return cls.of(np.concatenate(points), edge)
 
 
-def ball_radius(resolution: float) -> float:
+def voxel_radius(resolution: float) -> float:
     """Radius of the ball around a voxel [m]."""
     return float(0.5 * np.sqrt(3.0) * resolution)
 

@@ -16,7 +16,7 @@ _ROUND_OFF = 1e-6
 """How far a point may stand out and count as inside [m]: meshes have single precision."""
 
 
-def without_enclosed(pieces: Any, notes: list[Note]) -> Any:
+def remove_enclosed(pieces: Any, notes: list[Note]) -> Any:
     """The shapes of a geometry model without those inside others of their link, in their order.
 
     What touches an enclosed shape has gone through the one around it, so that distances stay as they are as long as
@@ -30,22 +30,22 @@ def without_enclosed(pieces: Any, notes: list[Note]) -> Any:
     links: dict[int, list[int]] = {}
     for i, piece in enumerate(objects):
         links.setdefault(piece.parentFrame, []).append(i)
-    kept = pin.GeometryModel()
-    inside: dict[int, int] = {}
+    result = pin.GeometryModel()
+    enclosed_by: dict[int, int] = {}
     for members in links.values():
         for i in members:
-            others = (j for j in members if j != i and inside.get(j) != i and j not in inside)
-            around = next((j for j in others if _encloses(objects[j], objects[i])), None)
-            if around is not None:
-                inside[i] = around
-        _name_mixture([objects[i] for i in members if i not in inside], notes)
+            candidates = (j for j in members if j != i and enclosed_by.get(j) != i and j not in enclosed_by)
+            enclosing = next((j for j in candidates if _encloses(objects[j], objects[i])), None)
+            if enclosing is not None:
+                enclosed_by[i] = enclosing
+        _name_mixture([objects[i] for i in members if i not in enclosed_by], notes)
     for i, piece in enumerate(objects):
-        if i in inside:
-            what = f"left out: it lies inside {objects[inside[i]].name}, a shape of the same link"
-            notes.append(Note(NoteKind.SHAPE, (piece.name,), what))
+        if i in enclosed_by:
+            clause = f"left out: it lies inside {objects[enclosed_by[i]].name}, a shape of the same link"
+            notes.append(Note(NoteKind.SHAPE, (piece.name,), clause))
         else:
-            kept.addGeometryObject(piece)
-    return kept
+            result.addGeometryObject(piece)
+    return result
 
 
 def _name_mixture(pieces: list[Any], notes: list[Note]) -> None:
@@ -53,8 +53,8 @@ def _name_mixture(pieces: list[Any], notes: list[Note]) -> None:
     meshes = [piece for piece in pieces if isinstance(piece.geometry, coal.BVHModelBase)]
     if meshes and len(meshes) < len(pieces):
         names = tuple(piece.name for piece in pieces)
-        what = "meshes and simple shapes of one link, none inside another: all count"
-        notes.append(Note(NoteKind.SHAPE, names, what, "list `bodies` where one set is meant to replace the other"))
+        clause = "meshes and simple shapes of one link, none inside another: all count"
+        notes.append(Note(NoteKind.SHAPE, names, clause, "list `bodies` where one set is meant to replace the other"))
 
 
 def _encloses(outer: Any, inner: Any) -> bool:
@@ -86,8 +86,8 @@ def _depth(shape: Any, points: Array) -> Array:
     if isinstance(shape, coal.Ellipsoid):
         scaled = np.linalg.norm(points / shape.radii, axis=1)
         return np.asarray((1.0 - scaled) * np.min(shape.radii))
-    beyond = np.abs(points[:, 2]) - shape.halfLength
-    across = np.linalg.norm(points[:, :2], axis=1)
+    height_excess = np.abs(points[:, 2]) - shape.halfLength
+    radius = np.linalg.norm(points[:, :2], axis=1)
     if isinstance(shape, coal.Cylinder):
-        return np.asarray(np.minimum(shape.radius - across, -beyond))
-    return np.asarray(shape.radius - np.hypot(across, np.maximum(beyond, 0.0)))
+        return np.asarray(np.minimum(shape.radius - radius, -height_excess))
+    return np.asarray(shape.radius - np.hypot(radius, np.maximum(height_excess, 0.0)))

@@ -24,7 +24,7 @@ _LINKS = (pin.BODY, pin.OP_FRAME)
 _NO_TOOLS = re.compile(r"head|eye|camera|neck|wheel|caster|laser|imu|lidar|sensor|optical", re.IGNORECASE)
 
 
-def end_effectors(model: Any, known: Sequence[str] = ()) -> list[str]:
+def end_effectors(model: Any, srdf_ends: Sequence[str] = ()) -> list[str]:
     """Names of frames at the ends of a robot's limbs: those that are known, then others in the order of the joints.
 
     A limb is a chain of at least three joints since the last branch; where it branches into fingers, its hand is the
@@ -32,16 +32,16 @@ def end_effectors(model: Any, known: Sequence[str] = ()) -> list[str]:
 
     Args:
         model: pinocchio model.
-        known: frames that an SRDF calls end effectors; those that do not exist are left out.
+        srdf_ends: frames that an SRDF calls end effectors; those that do not exist are left out.
     """
     frames = {f.name: f.parentJoint for f in model.frames if f.type in _LINKS}
-    ends = [name for name in known if name in frames]
+    ends = [name for name in srdf_ends if name in frames]
     ends = [_tool_named(model, frames[name]) or name for name in ends]
-    taken = {joint for name in ends for joint in list(model.supports[frames[name]])[1:]}
+    used_joints = {joint for name in ends for joint in list(model.supports[frames[name]])[1:]}
     root = 1 if model.njoints > 1 and model.names[1] == "root_joint" else 0
     for least in (_LIMB, 1):
         joints = _ends(model, root, 0, least)
-        tools = [_tool_frame(model, joint) for joint in joints if joint not in taken]
+        tools = [_tool_frame(model, joint) for joint in joints if joint not in used_joints]
         ends += [name for name in tools if name is not None and not _NO_TOOLS.search(name)]
         if ends:
             break
@@ -55,8 +55,8 @@ def _ends(model: Any, joint: int, above: int, least: int) -> list[int]:
         return [joint] if above >= least else []
     fingers = any(_FINGERS.search(model.names[child]) for child in children)
     count, longest = len(children), max(_depth(model, child) for child in children)
-    short = count > 1 and longest <= (_DIGITS[1] if count >= _DIGITS[0] else _FINGER)
-    if above >= _LIMB and (fingers or short):
+    has_short_chains = count > 1 and longest <= (_DIGITS[1] if count >= _DIGITS[0] else _FINGER)
+    if above >= _LIMB and (fingers or has_short_chains):
         return [joint]
     if len(children) == 1:
         return _ends(model, children[0], above + 1, least)

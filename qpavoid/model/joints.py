@@ -32,7 +32,7 @@ def joint_bounds(model: Any) -> JointBounds:
     """Joint limits of a model in tangent space; a URDF says nothing of accelerations and jerks.
 
     Only joints with one coordinate in q and v have position limits. A velocity limit of 0, and a range from 0 to 0,
-    mean that the URDF gives none; see `fixed_by_limits` of ranges that are meant, `assume_speeds` of velocities.
+    mean that the URDF gives none; see `joints_fixed_by_limits` of ranges that are meant, `assume_speeds` of velocities.
     """
     lower, upper = np.array(model.lowerPositionLimit), np.array(model.upperPositionLimit)
     lower[lower <= -_MAX_NORM], upper[upper >= _MAX_NORM] = -np.inf, np.inf
@@ -65,15 +65,15 @@ def set_limits(model: Any, limits: JointLimits, path: Path) -> None:
     velocity = np.array(model.velocityLimit)
     for kind in ("position", "velocity", "acceleration", "jerk"):
         for name in getattr(limits, kind):
-            if named(model, name, f"{path}: limits.{kind}").shortname() == MIMIC:
+            if find_joint(model, name, f"{path}: limits.{kind}").shortname() == MIMIC:
                 raise ConfigError(f"{path}: limits.{kind}: {_follows(model, name)}; limit that one")
     for name, (low, high) in limits.position.items():
-        joint = named(model, name, f"{path}: limits.position")
+        joint = find_joint(model, name, f"{path}: limits.position")
         if joint.nq != 1:
             raise ConfigError(f"{path}: limits.position: joint {name!r} turns all the way round; leave it out")
         lower[joint.idx_q], upper[joint.idx_q] = low, high
     for name, speed in limits.velocity.items():
-        joint = named(model, name, f"{path}: limits.velocity")
+        joint = find_joint(model, name, f"{path}: limits.velocity")
         if isinstance(speed, list) and len(speed) != joint.nv:
             raise ConfigError(
                 f"{path}: limits.velocity: joint {name!r}: {len(speed)} values for {joint.nv} coordinates"
@@ -100,22 +100,22 @@ def assume_speeds(model: Any, notes: list[Note]) -> None:
         notes: the joints are named in them.
     """
     velocity = np.array(model.velocityLimit)
-    given = (velocity > 0.0) & (velocity < _MAX_NORM)
+    has_limit = (velocity > 0.0) & (velocity < _MAX_NORM)
     names: dict[str, list[str]] = {}
     for name, joint in zip(list(model.names)[1:], list(model.joints)[1:], strict=True):
         part = slice(joint.idx_v, joint.idx_v + joint.nv)
-        if joint.shortname() != MIMIC and not given[part].all():
+        if joint.shortname() != MIMIC and not has_limit[part].all():
             metres = TRANSLATIONS.get(joint.shortname(), 0)
             units = ["m/s"] * bool(metres) + ["rad/s"] * (joint.nv > metres)
             names.setdefault(" and ".join(f"{ASSUMED_SPEED:g} {unit}" for unit in units), []).append(name)
-    velocity[~given] = ASSUMED_SPEED
+    velocity[~has_limit] = ASSUMED_SPEED
     _set_speeds(model, velocity)
     for speed, joints in names.items():
-        what = f"no velocity limit is given: {speed} {'is' if ' and ' not in speed else 'are'} assumed"
-        notes.append(Note(NoteKind.LIMIT, tuple(joints), what, "give it under `limits.velocity`", "warning"))
+        clause = f"no velocity limit is given: {speed} {'is' if ' and ' not in speed else 'are'} assumed"
+        notes.append(Note(NoteKind.LIMIT, tuple(joints), clause, "give it under `limits.velocity`", "warning"))
 
 
-def named(model: Any, name: str, where: str) -> Any:
+def find_joint(model: Any, name: str, where: str) -> Any:
     """The joint of a name.
 
     Raises:
@@ -127,7 +127,7 @@ def named(model: Any, name: str, where: str) -> Any:
     return model.joints[model.getJointId(name)]
 
 
-def middle(model: Any) -> Array:
+def middle_configuration(model: Any) -> Array:
     """Neutral configuration (nq,), with bounded joints at the middle of their range where 0 is outside it."""
     q = pin.neutral(model)
     for joint in list(model.joints)[1:]:
@@ -150,7 +150,7 @@ def set_joints(model: Any, q: Array, values: Mapping[str, float], where: str) ->
         ConfigError, UnknownName: a joint with more than one angle, in conflict with another one, or unknown.
     """
     q = q.copy()
-    mimics = [name for name in values if named(model, name, where).shortname() == MIMIC]
+    mimics = [name for name in values if find_joint(model, name, where).shortname() == MIMIC]
     for name, value in values.items():
         joint = model.joints[model.getJointId(name)]
         if name in mimics:
@@ -163,9 +163,11 @@ def set_joints(model: Any, q: Array, values: Mapping[str, float], where: str) ->
             raise ConfigError(f"{where}: joint {name!r} has {joint.nq} coordinates; give q0 as a list of all of q")
     for name in mimics:
         joint = model.joints[model.getJointId(name)]
-        there = joint.extract().scaling * q[joint.idx_q] + joint.extract().offset
-        if abs(values[name] - there) > _SAME:
-            raise ConfigError(f"{where}: {_follows(model, name)}, to {there:g} and not {values[name]:g}; leave it out")
+        expected = joint.extract().scaling * q[joint.idx_q] + joint.extract().offset
+        if abs(values[name] - expected) > _SAME:
+            raise ConfigError(
+                f"{where}: {_follows(model, name)}, to {expected:g} and not {values[name]:g}; leave it out"
+            )
     return q
 
 
@@ -175,16 +177,18 @@ def _follows(model: Any, name: str) -> str:
     return f"joint {name!r} follows {model.names[leader]!r} (mimic)"
 
 
-def without(model: Any, bodies: Any, locked: Sequence[str], q: Array, where: str) -> tuple[Any, Any, IntArray]:
+def remove_joints(
+    model: Any, bodies: Any, joint_names: Sequence[str], q: Array, where: str
+) -> tuple[Any, Any, IntArray]:
     """Model and bodies without the locked joints, and which coordinates of q are left."""
-    ids = [named(model, name, where).id for name in locked]
+    ids = [find_joint(model, name, where).id for name in joint_names]
     for joint, leader in zip(list(model.mimicking_joints), list(model.mimicked_joints), strict=True):
         if leader in ids and joint not in ids:
             ids.append(joint)
         elif joint in ids and leader not in ids:
             raise ConfigError(f"{where}: {_follows(model, model.names[joint])}; lock that one")
-    kept = [joint for joint in list(model.joints)[1:] if joint.id not in ids]
-    index = np.array([i for joint in kept for i in range(joint.idx_q, joint.idx_q + joint.nq)], dtype=np.intp)
+    free_joints = [joint for joint in list(model.joints)[1:] if joint.id not in ids]
+    index = np.array([i for joint in free_joints for i in range(joint.idx_q, joint.idx_q + joint.nq)], dtype=np.intp)
     model, bodies = pin.buildReducedModel(model, bodies, ids, q)
     joints = [body.parentJoint for body in bodies.geometryObjects]
     for a, b in pair_array(bodies).tolist():

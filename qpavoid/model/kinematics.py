@@ -103,7 +103,7 @@ def chains(model: Any) -> tuple[Array, Array]:
     turns, rates = np.ones(model.nvExtended), np.ones(model.nvExtended)
     for i, joint in enumerate(list(model.joints)[1:], start=1):
         start = joint.idx_vExtended
-        turns[start : start + lengths(model, i)] = 0.0
+        turns[start : start + translation_count(model, i)] = 0.0
         if joint.shortname() == MIMIC:
             rates[start] = abs(joint.extract().scaling)
     ends = np.setdiff1d(np.arange(1, model.njoints), list(model.parents))
@@ -112,7 +112,7 @@ def chains(model: Any) -> tuple[Array, Array]:
     return (support * turns) @ fold, (support * (1.0 - turns)) @ fold
 
 
-def lengths(model: Any, joint: int) -> int:
+def translation_count(model: Any, joint: int) -> int:
     """How many of the velocity coordinates of a joint are lengths; they come before its angles."""
     name = model.joints[joint].shortname()
     if name != MIMIC:
@@ -133,18 +133,18 @@ def max_lever_arm(model: Any, joint_radius: Array) -> float:
         joint_radius: distance from each joint's origin to the farthest point that it carries (njoints,) [m].
     """
     lever_arm = np.zeros(model.njoints)  # from the first joint that turns to the origin of each one
-    turned = np.zeros(model.njoints, dtype=bool)
+    turns_below = np.zeros(model.njoints, dtype=bool)
     lower, upper = np.abs(model.lowerPositionLimit), np.abs(model.upperPositionLimit)
     for i, joint in enumerate(list(model.joints)[1:], start=1):
-        parent, slides = model.parents[i], lengths(model, i)
-        if turned[parent]:
-            slid = slice(joint.idx_q, joint.idx_q + slides)
-            slide = float(np.maximum(lower[slid], upper[slid]).sum())
+        parent, slides = model.parents[i], translation_count(model, i)
+        if turns_below[parent]:
+            coordinates = slice(joint.idx_q, joint.idx_q + slides)
+            slide = float(np.maximum(lower[coordinates], upper[coordinates]).sum())
             if slides and joint.shortname() == MIMIC:
                 slide = abs(joint.extract().scaling) * slide + abs(joint.extract().offset)
             lever_arm[i] = lever_arm[parent] + float(np.linalg.norm(model.jointPlacements[i].translation)) + slide
-        turned[i] = turned[parent] or joint.nvExtended > slides
-    return float(np.max((lever_arm + joint_radius)[turned], initial=0.0))
+        turns_below[i] = turns_below[parent] or joint.nvExtended > slides
+    return float(np.max((lever_arm + joint_radius)[turns_below], initial=0.0))
 
 
 def support_masks(model: Any) -> Array:

@@ -45,10 +45,10 @@ class JointBounds:
             ConfigError: a coordinate has a jerk limit, and none of its acceleration.
         """
         acceleration, jerk = _or(self.acceleration, config.acceleration), _or(self.jerk, config.jerk)
-        lacking = np.isfinite(jerk) & np.isinf(acceleration)
-        if lacking.any():
+        missing = np.isfinite(jerk) & np.isinf(acceleration)
+        if missing.any():
             raise ConfigError(
-                f"limits.jerk: {lacking.sum()} of {len(jerk)} coordinates have no acceleration limit, which a jerk "
+                f"limits.jerk: {missing.sum()} of {len(jerk)} coordinates have no acceleration limit, which a jerk "
                 "limit needs; give limits.acceleration"
             )
         return replace(
@@ -67,17 +67,17 @@ class JointBounds:
             units: their units, rad or m.
         """
         below, above = self.lower - q[self.q_index], q[self.q_index] - self.upper
-        found = []
+        reasons = []
         for i in np.flatnonzero(np.maximum(below, above) > OUTSIDE).tolist():
             amount, j = float(-below[i] if below[i] > 0.0 else above[i]), int(self.v_index[i])
             hint = "is it in degrees?" if abs(amount) > _TURN else ""
-            found.append(Reason.of(ReasonKind.LIMIT_RECOVERY, names[j], amount=amount, unit=units[j], detail=hint))
-        return tuple(found)
+            reasons.append(Reason.of(ReasonKind.LIMIT_RECOVERY, names[j], amount=amount, unit=units[j], detail=hint))
+        return tuple(reasons)
 
 
-def _or(limits: Array, given: float | None) -> Array:
+def _or(limits: Array, default: float | None) -> Array:
     """The limits (nv,) of a robot, and what a scenario gives to the coordinates that have none."""
-    return np.where(np.isfinite(limits), limits, np.inf if given is None else given)
+    return np.where(np.isfinite(limits), limits, np.inf if default is None else default)
 
 
 def limit_layout(joints: JointBounds, position_gain: float, dt: float) -> dict[str, Any]:

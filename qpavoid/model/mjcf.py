@@ -47,9 +47,9 @@ def shapes_of_mjcf(mjcf: Path, root: ET.Element, model: Any, visual: bool) -> An
     Raises:
         ConfigError: a geom that Pinocchio does not read, or a plane that would move, naming the body.
     """
-    read = {kind: pin.buildGeomFromMJCF(model, str(mjcf), kind) for kind in (pin.COLLISION, pin.VISUAL)}
-    _check_every_geom(mjcf, root, model, read.values())
-    geometry = read[pin.VISUAL if visual else pin.COLLISION]
+    geometries = {kind: pin.buildGeomFromMJCF(model, str(mjcf), kind) for kind in (pin.COLLISION, pin.VISUAL)}
+    _check_every_geom(mjcf, root, model, geometries.values())
+    geometry = geometries[pin.VISUAL if visual else pin.COLLISION]
     for name in [piece.name for piece in geometry.geometryObjects if piece.parentFrame == 0]:
         geometry.removeGeometryObject(name)
     return geometry
@@ -66,14 +66,16 @@ def check_elements(mjcf: Path, root: ET.Element) -> None:
             raise ConfigError(f"{mjcf}: not a usable MJCF: what is in a <{tag}> would be lost; {_ANEW}")
 
 
-def _check_every_geom(mjcf: Path, root: ET.Element, model: Any, read: Any) -> None:
-    pieces = {piece.name: piece for geometry in read for piece in geometry.geometryObjects if piece.parentFrame != 0}
-    found = Counter(model.frames[piece.parentFrame].name for piece in pieces.values())
+def _check_every_geom(mjcf: Path, root: ET.Element, model: Any, geometries: Any) -> None:
+    pieces = {
+        piece.name: piece for geometry in geometries for piece in geometry.geometryObjects if piece.parentFrame != 0
+    }
+    counts = Counter(model.frames[piece.parentFrame].name for piece in pieces.values())
     for body, count in _geoms(root):
-        if found[body] < count:
+        if counts[body] < count:
             raise ConfigError(
-                f"{mjcf}: not a usable MJCF: body {body!r}: {found[body]} of its {count} geoms can be read; give every "
-                f"body and geom a name of its own, or {_ANEW}"
+                f"{mjcf}: not a usable MJCF: body {body!r}: {counts[body]} of its {count} geoms can be read; give "
+                f"every body and geom a name of its own, or {_ANEW}"
             )
     for piece in pieces.values():
         if isinstance(piece.geometry, coal.Halfspace | coal.Plane):

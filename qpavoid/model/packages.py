@@ -26,14 +26,14 @@ def absolute_entries(entries: Iterable[str], folder: Path) -> list[str]:
         entries: folders that hold packages, or `NAME=FOLDER`.
         folder: of the file.
     """
-    found = []
+    result = []
     for entry in entries:
         name, place = _split(entry, folder)
-        found.append(f"{name}={folder / place}" if name else str(folder / place))
-    return found
+        result.append(f"{name}={folder / place}" if name else str(folder / place))
+    return result
 
 
-def mesh_folders(urdf: Path, given: Iterable[str]) -> list[str]:
+def mesh_folders(urdf: Path, entries: Iterable[str]) -> list[str]:
     """Where `package://` is looked up, in order: what is given, above the file, example-robot-data, ROS_PACKAGE_PATH.
 
     Packages whose package.xml has another name than their folder stand there as `NAME=FOLDER`: the one that the file
@@ -41,19 +41,19 @@ def mesh_folders(urdf: Path, given: Iterable[str]) -> list[str]:
 
     Args:
         urdf: the file that refers to packages.
-        given: absolute folders that hold packages, or `NAME=FOLDER`.
+        entries: absolute folders that hold packages, or `NAME=FOLDER`.
     """
-    given = list(given)
+    entries = list(entries)
     ros = [folder for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if folder]
     above = [str(parent) for parent in urdf.resolve().parents]
     own = [folder for folder in above if os.path.isfile(os.path.join(folder, _MANIFEST))][:1]
-    holders = [entry for entry in given if not _split(entry)[0]] + [os.path.dirname(folder) for folder in own] + ros
-    named = [
+    holders = [entry for entry in entries if not _split(entry)[0]] + [os.path.dirname(folder) for folder in own] + ros
+    names_of_manifests = [
         f"{name}={folder}"
         for folder in dict.fromkeys(folder for holder in holders for folder in _with_manifest(holder))
         if (name := _manifest_name(folder)) and name != os.path.basename(folder)
     ]
-    return list(dict.fromkeys([*given, *above, *named, str(example_robot_data()), *ros]))
+    return list(dict.fromkeys([*entries, *above, *names_of_manifests, str(example_robot_data()), *ros]))
 
 
 def find_mesh(name: str, entries: Iterable[str]) -> str | None:
@@ -72,9 +72,9 @@ def find_mesh(name: str, entries: Iterable[str]) -> str | None:
         mapped, folder = _split(entry)
         if mapped and mapped != package:
             continue
-        found = os.path.join(folder, inside if mapped else name)
-        if os.path.isfile(found):
-            return found
+        result = os.path.join(folder, inside if mapped else name)
+        if os.path.isfile(result):
+            return result
     return None
 
 
@@ -89,8 +89,8 @@ def find_package(name: str, entries: Iterable[str]) -> str | None:
         mapped, folder = _split(entry)
         if mapped == name:
             return folder
-        if not mapped and os.path.isdir(found := os.path.join(folder, name)):
-            return found
+        if not mapped and os.path.isdir(result := os.path.join(folder, name)):
+            return result
     return None
 
 

@@ -28,27 +28,27 @@ def add_self_pairs(model: Any, bodies: Any, disabled: Iterable[tuple[str, str]],
         UnknownName: a pattern that matches no body.
     """
     names = [body.name for body in bodies.geometryObjects]
-    off: set[frozenset[int]] = set()
+    disabled_pairs: set[frozenset[int]] = set()
     for pattern_a, pattern_b in disabled:
         matches = [_matching(pattern, names, origin) for pattern in (pattern_a, pattern_b)]
-        off |= {frozenset((i, j)) for i in matches[0] for j in matches[1]}
+        disabled_pairs |= {frozenset((i, j)) for i in matches[0] for j in matches[1]}
     joints = [body.parentJoint for body in bodies.geometryObjects]
     for i in range(len(names)):
         for j in range(i + 1, len(names)):
             a, b = joints[i], joints[j]
             adjacent = a == b or model.parents[a] == b or model.parents[b] == a
-            if not adjacent and frozenset((i, j)) not in off:
+            if not adjacent and frozenset((i, j)) not in disabled_pairs:
                 bodies.addCollisionPair(pin.CollisionPair(i, j))
 
 
 def _matching(pattern: str, names: list[str], origin: str) -> list[int]:
-    found = [i for i, name in enumerate(names) if fnmatchcase(name, pattern)]
-    if not found:
+    matches = [i for i, name in enumerate(names) if fnmatchcase(name, pattern)]
+    if not matches:
         raise UnknownName(f"{origin}: disabled_pairs: no body {pattern!r}{nearest(pattern, names)}")
-    return found
+    return matches
 
 
-ALWAYS = 0.95
+ALWAYS_TOUCHING = 0.95
 """Share of random configurations from which on two bodies that touch in them do so by design: a row that is violated in
 nearly every configuration keeps nothing apart. The rest is left to configurations in which a joint is at its limits."""
 
@@ -63,8 +63,8 @@ class TouchingPair(NamedTuple):
 
     def note(self) -> Note:
         """Say that the pair is not checked."""
-        what = f"not checked: its bodies touch in {100.0 * self.share:.0f} % of random configurations"
-        return Note(NoteKind.PAIR, (self.a, self.b), what, share=self.share)
+        clause = f"not checked: its bodies touch in {100.0 * self.share:.0f} % of random configurations"
+        return Note(NoteKind.PAIR, (self.a, self.b), clause, share=self.share)
 
 
 def drop_always_touching(model: Any, bodies: Any, joints: JointBounds, samples: int = 200) -> list[TouchingPair]:
@@ -88,12 +88,12 @@ def drop_always_touching(model: Any, bodies: Any, joints: JointBounds, samples: 
         q = pin.integrate(model, neutral, random.uniform(-np.pi, np.pi, model.nv) * _turns(model))
         q[joints.q_index[finite]] = random.uniform(joints.lower[finite], joints.upper[finite])
         poses.append(q)
-    share = contacts(model, bodies, poses, ALWAYS).mean(axis=0)
-    removed = np.flatnonzero(share >= ALWAYS).tolist()
+    share = find_contacts(model, bodies, poses, ALWAYS_TOUCHING).mean(axis=0)
+    indices = np.flatnonzero(share >= ALWAYS_TOUCHING).tolist()
     pairs, names = pair_array(bodies).tolist(), [body.name for body in bodies.geometryObjects]
-    for index in removed:
+    for index in indices:
         bodies.removeCollisionPair(pin.CollisionPair(*pairs[index]))
-    return [TouchingPair(names[pairs[i][0]], names[pairs[i][1]], float(share[i])) for i in removed]
+    return [TouchingPair(names[pairs[i][0]], names[pairs[i][1]], float(share[i])) for i in indices]
 
 
 def _turns(model: Any) -> Array:
@@ -105,7 +105,7 @@ def _turns(model: Any) -> Array:
     return turns
 
 
-def contacts(model: Any, bodies: Any, poses: Sequence[Array], at_least: float = 0.0) -> Mask:
+def find_contacts(model: Any, bodies: Any, poses: Sequence[Array], at_least: float = 0.0) -> Mask:
     """Find in which configurations the bodies of each pair touch (k, m).
 
     Args:
@@ -115,19 +115,19 @@ def contacts(model: Any, bodies: Any, poses: Sequence[Array], at_least: float = 
         at_least: share of the configurations; a pair that cannot come to it any more is not looked at further.
     """
     model_data, data, count = model.createData(), bodies.createData(), len(bodies.collisionPairs)
-    found, active = np.zeros((len(poses), count), dtype=bool), np.arange(count)
+    touches, active = np.zeros((len(poses), count), dtype=bool), np.arange(count)
     for number, q in enumerate(poses):
         pin.updateGeometryPlacements(model, model_data, bodies, data, q)
         pin.computeCollisions(bodies, data, False)
-        found[number, active] = [data.collisionResults[int(i)].isCollision() for i in active]
-        apart = number + 1 - found[: number + 1, active].sum(axis=0)
-        hopeless = apart > (1.0 - at_least) * len(poses)
-        for i in active[hopeless].tolist():
+        touches[number, active] = [data.collisionResults[int(i)].isCollision() for i in active]
+        separations = number + 1 - touches[: number + 1, active].sum(axis=0)
+        below_share = separations > (1.0 - at_least) * len(poses)
+        for i in active[below_share].tolist():
             data.deactivateCollisionPair(i)
-        active = active[~hopeless]
+        active = active[~below_share]
         if not len(active):
             break
-    return found
+    return touches
 
 
 def pair_array(bodies: Any) -> IntArray:

@@ -16,14 +16,22 @@ from qpavoid.config.loading import read_mapping, validate
 from qpavoid.config.shipped import find_robot
 from qpavoid.errors import ConfigError, UnknownName, nearest
 from qpavoid.model.end_effectors import end_effectors
-from qpavoid.model.joints import assume_speeds, frame_index, joint_bounds, middle, set_joints, set_limits, without
+from qpavoid.model.joints import (
+    assume_speeds,
+    frame_index,
+    joint_bounds,
+    middle_configuration,
+    remove_joints,
+    set_joints,
+    set_limits,
+)
 from qpavoid.model.kinematics import TRANSLATIONS
 from qpavoid.model.limits import JointBounds
-from qpavoid.model.notes import Note, NoteKind, merged, warn_of
+from qpavoid.model.notes import Note, NoteKind, issue_warning, merge_notes
 from qpavoid.model.pairs import TouchingPair, add_self_pairs, drop_always_touching
 from qpavoid.model.robot_bodies import pair_margins, robot_bodies
-from qpavoid.model.urdf import find_resource, honour_srdf, is_mjcf, read_model
-from qpavoid.model.urdf_tree import fixed_by_limits
+from qpavoid.model.urdf import apply_srdf, find_resource, is_mjcf, read_model
+from qpavoid.model.urdf_tree import joints_fixed_by_limits
 from qpavoid.model.xml_file import read_robot_xml
 from qpavoid.problem import Array
 
@@ -79,8 +87,8 @@ class Robot:
             ConfigError, UnknownName: naming file, field and remedy.
         """
         path = find_robot(str(name_or_path), folder)
-        given = read_mapping(path) if path.suffix in (".yaml", ".yml") else _fields_of_urdf(path)
-        config = validate({**given, **fields}, RobotConfig, path)
+        file_fields = read_mapping(path) if path.suffix in (".yaml", ".yml") else _fields_of_urdf(path)
+        config = validate({**file_fields, **fields}, RobotConfig, path)
         if packages:
             entries = [*(f"{name}={place}" for name, place in packages.items()), *config.package_dirs]
             config = config.model_copy(update={"package_dirs": entries})
@@ -197,7 +205,7 @@ class Robot:
         locked = self.matching(patterns, where)
         if not locked:
             return self, q
-        model, bodies, index = without(self.model, self.bodies, locked, q, where)
+        model, bodies, index = remove_joints(self.model, self.bodies, locked, q, where)
         return replace(self, model=model, bodies=bodies, home=self.home[index]), q[index]
 
     def matching(self, patterns: Sequence[str], where: str) -> list[str]:
@@ -208,10 +216,10 @@ class Robot:
         """
         matched = []
         for pattern in patterns:
-            found = [name for name in self.joint_names if fnmatchcase(name, pattern)]
-            if not found:
+            matches = [name for name in self.joint_names if fnmatchcase(name, pattern)]
+            if not matches:
                 raise UnknownName(f"{where}: {self.name} has no joint {pattern!r}{nearest(pattern, self.joint_names)}")
-            matched += [name for name in found if name not in matched]
+            matched += [name for name in matches if name not in matched]
         return matched
 
     def _joints(self) -> Iterator[tuple[str, Any]]:
@@ -234,11 +242,11 @@ def _build(config: RobotConfig, path: Path) -> Robot:
     ends = _end_effectors(model, config.end_effectors, path, notes)
     bodies = robot_bodies(config, urdf, model, path, notes)
     set_limits(model, config.limits, path)
-    home = set_joints(model, middle(model), config.home, f"{path}: home")
+    home = set_joints(model, middle_configuration(model), config.home, f"{path}: home")
     fixed = {**_fixed(urdf, config, notes), **config.lock}
     home = set_joints(model, home, fixed, f"{path}: lock")
     if fixed:
-        model, bodies, index = without(model, bodies, list(fixed), home, f"{path}: lock")
+        model, bodies, index = remove_joints(model, bodies, list(fixed), home, f"{path}: lock")
         home = home[index]
     if model.nv == 0:
         raise ConfigError(f"{path}: no joint of {urdf.name} moves; give at least one that is neither fixed nor locked")
@@ -249,10 +257,10 @@ def _build(config: RobotConfig, path: Path) -> Robot:
         )
     add_self_pairs(model, bodies, config.disabled_pairs, str(path))
     if config.srdf is not None:
-        honour_srdf(model, bodies, find_resource(config.srdf, path.parent, f"{path}: srdf"))
+        apply_srdf(model, bodies, find_resource(config.srdf, path.parent, f"{path}: srdf"))
     always_touching = drop_always_touching(model, bodies, joint_bounds(model))
-    notes = merged([*notes, *(pair.note() for pair in always_touching)])
-    warn_of(notes, str(path))
+    notes = merge_notes([*notes, *(pair.note() for pair in always_touching)])
+    issue_warning(notes, str(path))
     return Robot(
         config.name,
         model,
@@ -268,31 +276,34 @@ def _build(config: RobotConfig, path: Path) -> Robot:
     )
 
 
-def _end_effectors(model: Any, given: Sequence[str], path: Path, notes: list[Note]) -> tuple[str, ...]:
+def _end_effectors(model: Any, frames_of_config: Sequence[str], path: Path, notes: list[Note]) -> tuple[str, ...]:
     """The frames that are given as end effectors, or those at the ends of the limbs."""
-    for name in given:
+    for name in frames_of_config:
         if not model.existFrame(name):
             frames = [f.name for f in model.frames]
             raise UnknownName(f"{path}: end_effectors: no frame {name!r}{nearest(name, frames)}")
-    found = tuple(given or end_effectors(model))
-    if found and not given:
-        what = "taken as end effectors, since limbs end there"
-        notes.append(Note(NoteKind.FRAME, found, what, "list those that you mean under `end_effectors`"))
-    return found
+    ends = tuple(frames_of_config or end_effectors(model))
+    if ends and not frames_of_config:
+        clause = "taken as end effectors, since limbs end there"
+        notes.append(Note(NoteKind.FRAME, ends, clause, "list those that you mean under `end_effectors`"))
+    return ends
 
 
 def _fixed(urdf: Path, config: RobotConfig, notes: list[Note]) -> dict[str, float]:
-    """Joints that the file's own limits leave no range, unless the robot.yaml gives one; see `fixed_by_limits`."""
+    """Find the joints whose limits in the file leave no range, unless the robot.yaml gives one.
+
+    See `joints_fixed_by_limits`.
+    """
     if is_mjcf(urdf):
         return {}
     fixed = {
         name: value
-        for name, value in fixed_by_limits(read_robot_xml(urdf, "URDF"), notes).items()
+        for name, value in joints_fixed_by_limits(read_robot_xml(urdf, "URDF"), notes).items()
         if name not in config.limits.position and name not in config.lock
     }
     for name, value in fixed.items():
-        what = f"locked at {value:g}, which is its lower and its upper limit"
+        clause = f"locked at {value:g}, which is its lower and its upper limit"
         notes.append(
-            Note(NoteKind.JOINT, (name,), what, "give its range under `limits.position` if it moves", "warning")
+            Note(NoteKind.JOINT, (name,), clause, "give its range under `limits.position` if it moves", "warning")
         )
     return fixed

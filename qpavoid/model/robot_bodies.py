@@ -15,7 +15,7 @@ from qpavoid.geometry.bodies import check_meshes, convert_bodies, make_shape, tr
 from qpavoid.model.joints import frame_index
 from qpavoid.model.notes import Note, NoteKind
 from qpavoid.model.packages import absolute_entries
-from qpavoid.model.plausibility import name_implausible_sizes
+from qpavoid.model.plausibility import note_implausible_sizes
 from qpavoid.model.trajectory import rpy_to_matrix
 from qpavoid.model.urdf import read_pieces
 
@@ -35,9 +35,9 @@ def robot_bodies(config: RobotConfig, urdf: Path, model: Any, path: Path, notes:
     """
     package_dirs = absolute_entries(config.package_dirs, path.parent)
 
-    def read(enclosed: bool, collected: list[Note]) -> Any:
+    def read(enclosed: bool, notes_of_pieces: list[Note]) -> Any:
         return read_pieces(
-            urdf, model, package_dirs, path, collected,
+            urdf, model, package_dirs, path, notes_of_pieces,
             visuals=config.visuals, allow_missing=config.allow_missing_meshes, enclosed=enclosed,
         )  # fmt: skip
 
@@ -46,33 +46,33 @@ def robot_bodies(config: RobotConfig, urdf: Path, model: Any, path: Path, notes:
         return _listed_bodies(config.bodies, model, hulls, path)
     pieces = read(False, notes)
     check_meshes(pieces, str(path))
-    name_implausible_sizes(model, pieces, notes)
+    note_implausible_sizes(model, pieces, notes)
     bodies = convert_bodies(pieces, config.bodies)
     if meshes := triangle_meshes(bodies):
-        what = (
+        clause = (
             f"{len(meshes)} triangle meshes cost 100 to 500 µs a pair at every tick, some pairs several ms, convex "
             "hulls about 1 µs, capsules 0.1 µs"
         )
         remedy = "set `bodies` to convex or capsule"
-        notes.append(Note(NoteKind.MESH, tuple(meshes), what, remedy, "warning"))
+        notes.append(Note(NoteKind.MESH, tuple(meshes), clause, remedy, "warning"))
     return bodies
 
 
 def _hulls(configs: Sequence[Body], read: Callable[[], Any], path: Path) -> dict[str, Any]:
     """Hulls of the pieces of geometry that bodies name."""
-    wanted = {body.shape.geometry: index for index, body in enumerate(configs) if isinstance(body.shape, Hull)}
-    if not wanted:
+    indices = {body.shape.geometry: index for index, body in enumerate(configs) if isinstance(body.shape, Hull)}
+    if not indices:
         return {}
     pieces = {piece.name: piece for piece in read().geometryObjects}
-    chosen = pin.GeometryModel()
-    for name, index in wanted.items():
+    selection = pin.GeometryModel()
+    for name, index in indices.items():
         if name not in pieces:
             raise UnknownName(
                 f"{path}: bodies.{index}.shape.geometry: no collision geometry {name!r}{nearest(name, pieces)}"
             )
-        chosen.addGeometryObject(pieces[name])
-    check_meshes(chosen, str(path))
-    return {hull.name: hull for hull in convert_bodies(chosen, "convex").geometryObjects}
+        selection.addGeometryObject(pieces[name])
+    check_meshes(selection, str(path))
+    return {hull.name: hull for hull in convert_bodies(selection, "convex").geometryObjects}
 
 
 def _listed_bodies(configs: Sequence[Body], model: Any, hulls: Mapping[str, Any], path: Path) -> Any:

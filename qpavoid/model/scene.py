@@ -23,7 +23,7 @@ from qpavoid.model.solids import make_solids
 from qpavoid.model.trajectory import Motion, Sample, Still, build_motion
 from qpavoid.problem import Array, IntArray
 
-FAR = 1e4
+PARKING_DISTANCE = 1e4
 """Where the balls of a cloud wait that stand for no voxel [m]."""
 
 
@@ -73,8 +73,8 @@ class Obstacle:
             raise ConfigError(f"obstacle {name!r}: {error}") from None
         off = float(np.abs(sample.rotation.T @ sample.rotation - np.eye(3)).max())
         if off > NEARLY or np.linalg.det(sample.rotation) < 0.0:
-            what = "left-handed" if np.linalg.det(sample.rotation) < 0.0 else f"|RᵀR - I| is {off:.2g}"
-            raise ConfigError(f"obstacle {name!r}: rotation: {what}; give a rotation (3, 3)")
+            clause = "left-handed" if np.linalg.det(sample.rotation) < 0.0 else f"|RᵀR - I| is {off:.2g}"
+            raise ConfigError(f"obstacle {name!r}: rotation: {clause}; give a rotation (3, 3)")
         return cls(name, shape, Still(sample), moves=False, graspable=graspable, external=external)
 
 
@@ -114,8 +114,8 @@ class Scene:
         Args:
             hold: safety distance of the scenario, between surfaces [m].
         """
-        own = [self.robot.safety_distance(a, b, hold) for a, b in self.pair_names]
-        return hold - np.array(own, dtype=np.float64)
+        distances = [self.robot.safety_distance(a, b, hold) for a, b in self.pair_names]
+        return hold - np.array(distances, dtype=np.float64)
 
     @property
     def movable(self) -> int:
@@ -156,19 +156,22 @@ def build_scene(robot: Robot, obstacles: Sequence[Obstacle] = ()) -> Scene:
         first = len(names)
         if isinstance(shape, config.PointCloud):
             clouds[number] = _points(shape, folder, where)
-            solids, placement = solids * (movable * shape.nearest), pin.SE3(np.eye(3), np.array([FAR, 0.0, 0.0]))
+            solids, placement = (
+                solids * (movable * shape.nearest),
+                pin.SE3(np.eye(3), np.array([PARKING_DISTANCE, 0.0, 0.0])),
+            )
         for solid in solids:
             piece = f"{obstacle.name}[{len(names) - first}]" if len(solids) > 1 else obstacle.name
             index = geometry.addGeometryObject(pin.GeometryObject(piece, 0, 0, placement, solid))
             names.append(obstacle.name)
             obstacle_of.append(number)
-            others = range(min(index, movable))
+            partners = range(min(index, movable))
             if isinstance(shape, config.PointCloud):
-                others = range((index - first) // shape.nearest, (index - first) // shape.nearest + 1)
-            for other in others:
-                fixed = other < bodies and geometry.geometryObjects[other].parentJoint == 0
+                partners = range((index - first) // shape.nearest, (index - first) // shape.nearest + 1)
+            for partner in partners:
+                fixed = partner < bodies and geometry.geometryObjects[partner].parentJoint == 0
                 if not (fixed and isinstance(shape, config.HalfSpace)):
-                    geometry.addCollisionPair(pin.CollisionPair(other, index))
+                    geometry.addCollisionPair(pin.CollisionPair(partner, index))
     _without_cylinders_among_spheres(geometry)
     pairs = pair_array(geometry)
     pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]  # in the order in which bounding spheres are compared

@@ -15,7 +15,7 @@ from qpavoid.config.base import LARGEST
 from qpavoid.errors import ConfigError
 from qpavoid.geometry.bodies import MeshWarning, make_shape, run_qhull
 from qpavoid.geometry.decompose import decompose
-from qpavoid.model.cloud import ball_radius
+from qpavoid.model.cloud import voxel_radius
 from qpavoid.model.urdf import find_resource
 from qpavoid.problem import Array, IntArray
 
@@ -41,7 +41,7 @@ def make_solids(shape: ObstacleShape, folder: Path, where: str) -> list[Any]:
     if isinstance(shape, HalfSpace):
         return [coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0)]
     if isinstance(shape, PointCloud):
-        return [coal.Sphere(ball_radius(shape.resolution))]
+        return [coal.Sphere(voxel_radius(shape.resolution))]
     if not isinstance(shape, Mesh):
         return [make_shape(shape)]
     mesh = read_mesh(shape, folder, f"{where}.path")
@@ -92,7 +92,7 @@ def corners(mesh: Any) -> tuple[Array, IntArray]:
     return np.array(mesh.vertices()), np.array(triangles, dtype=np.intp)
 
 
-def drawn_triangles(geometry: Any) -> Array:
+def surface_triangles(geometry: Any) -> Array:
     """Triangles (t, 3, 3) of a mesh or a hull, looking outwards as far as the file's do."""
     if isinstance(geometry, coal.BVHModelBase):
         vertices, triangles = corners(geometry)

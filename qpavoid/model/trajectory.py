@@ -128,8 +128,8 @@ class Polyline:
         position, linear = start.position + s * piece.displacement, rate * piece.displacement
         if piece.angle == 0.0:
             return Sample(position, start.rotation, linear, start.angular)
-        angle, (once, twice) = s * piece.angle, piece.turned
-        rotation = start.rotation + math.sin(angle) * once + (1.0 - math.cos(angle)) * twice
+        angle, (first_product, second_product) = s * piece.angle, piece.turned
+        rotation = start.rotation + math.sin(angle) * first_product + (1.0 - math.cos(angle)) * second_product
         return Sample(position, rotation, linear, rate * piece.angle * piece.axis)
 
 
@@ -197,19 +197,19 @@ def rpy_to_matrix(rpy: ArrayLike) -> Array:
 def _polyline(
     times: Sequence[float], positions: Sequence[ArrayLike], rotations: Sequence[Array], smooth: bool = False
 ) -> Polyline:
-    rests = [Sample.at(p, r) for p, r in zip(positions, rotations, strict=True)]
+    samples = [Sample.at(p, r) for p, r in zip(positions, rotations, strict=True)]
     pieces = []
-    for (t0, a), (t1, b) in pairwise(zip(times, rests, strict=True)):
+    for (t0, a), (t1, b) in pairwise(zip(times, samples, strict=True)):
         if not np.linalg.norm(b.position - a.position) <= LARGEST * (t1 - t0):
             raise ConfigError(f"motion: from t = {t0:g} to {t1:g} it moves faster than {LARGEST:g} m/s; give it time")
         turn = pin.AngleAxis(b.rotation @ a.rotation.T)
         # Two roundings of the same orientation are no turn.
         angle = turn.angle if turn.angle > 1e-12 else 0.0
         axis = np.array(turn.axis)
-        once = pin.skew(axis) @ a.rotation
-        turned = (once, pin.skew(axis) @ once)
+        first_product = pin.skew(axis) @ a.rotation
+        turned = (first_product, pin.skew(axis) @ first_product)
         pieces.append(Piece(t0, t1 - t0, a, b.position - a.position, angle, axis, turned))
-    return Polyline(tuple(times), rests[0], rests[-1], tuple(pieces), smooth)
+    return Polyline(tuple(times), samples[0], samples[-1], tuple(pieces), smooth)
 
 
 def _line(config: Line, start: Sample | None, rotation: Array) -> Polyline:
@@ -241,9 +241,9 @@ def _orbit(config: Circle, start: Sample | None, rotation: Array) -> Orbit:
 # --- small checks and conversions ---------------------------------------------------------------------------
 
 
-def _position(given: tuple[float, float, float] | None, start: Sample | None, field: str) -> Array:
-    if given is not None:
-        return np.array(given)
+def _position(value: tuple[float, float, float] | None, start: Sample | None, field: str) -> Array:
+    if value is not None:
+        return np.array(value)
     if start is None:
         raise ConfigError(f"motion.{field} is missing; only a task can take it from its frame")
     return start.position

@@ -15,7 +15,7 @@ import pinocchio as pin
 
 from qpavoid.config.shipped import EXAMPLES, example_robot
 from qpavoid.errors import ConfigError
-from qpavoid.model.enclosed_shapes import without_enclosed
+from qpavoid.model.enclosed_shapes import remove_enclosed
 from qpavoid.model.mjcf import check_elements, model_of_mjcf, shapes_of_mjcf
 from qpavoid.model.notes import Note, NoteKind
 from qpavoid.model.packages import mesh_folders
@@ -42,11 +42,11 @@ def find_resource(value: str, folder: Path, where: str) -> Path:
     Raises:
         ConfigError: there is no such file.
     """
-    found = example_robot(value) if value.startswith(EXAMPLES) else folder / value
-    if not os.path.isfile(found):  # False where the name is one that no file can have; Path.is_file may raise
+    result = example_robot(value) if value.startswith(EXAMPLES) else folder / value
+    if not os.path.isfile(result):  # False where the name is one that no file can have; Path.is_file may raise
         remedy = f"give a path relative to this file or {EXAMPLES}PATH"
         raise ConfigError(f"{where}: no such file {value!r}; {remedy}")
-    return found
+    return result
 
 
 @contextmanager
@@ -54,14 +54,14 @@ def _quiet_stderr() -> Iterator[list[str]]:
     """Catches what C++ parsers print on the process's error stream, so that one line can say it instead."""
     lines: list[str] = []
     sys.stderr.flush()
-    saved = os.dup(2)
+    stderr_copy = os.dup(2)
     with tempfile.TemporaryFile() as file:
         os.dup2(file.fileno(), 2)
         try:
             yield lines
         finally:
-            os.dup2(saved, 2)
-            os.close(saved)
+            os.dup2(stderr_copy, 2)
+            os.close(stderr_copy)
             file.seek(0)
             lines += file.read().decode(errors="replace").splitlines()
 
@@ -96,12 +96,12 @@ def read_model(urdf: Path, root_joint: str, notes: list[Note] | None = None) -> 
         check_urdf(urdf)
         _name_prefixes(xml, notes)
     model, reason = None, ""
-    with _quiet_stderr() as printed:
+    with _quiet_stderr() as messages:
         try:
             model = model_of_mjcf(urdf, root) if kind == "MJCF" else _model_of_urdf(tree_xml(xml, notes), root, notes)
         except (ValueError, RuntimeError, IndexError) as error:
             reason = _reason(error)
-    first = next((line.split(":", 1)[1].strip() for line in printed if line.startswith("Error:")), "")
+    first = next((line.split(":", 1)[1].strip() for line in messages if line.startswith("Error:")), "")
     if model is None or first:
         raise ConfigError(f"{urdf}: not a usable {kind}: {first or reason}")
     for link in xml.findall("link"):
@@ -112,9 +112,9 @@ def read_model(urdf: Path, root_joint: str, notes: list[Note] | None = None) -> 
 
 def _name_prefixes(root: ET.Element, notes: list[Note]) -> None:
     if prefixes := undeclared_prefixes(root):
-        what = "prefix of XML that no xmlns attribute declares: it is read all the same, without what other tools add"
+        clause = "prefix of XML that no xmlns attribute declares: it is read all the same, without what other tools add"
         remedy = 'declare it in the root, as in xmlns:drake="http://drake.mit.edu"'
-        notes.append(Note(NoteKind.FILE, tuple(prefixes), what, remedy, "warning"))
+        notes.append(Note(NoteKind.FILE, tuple(prefixes), clause, remedy, "warning"))
 
 
 def _model_of_urdf(xml: str, root: Any, notes: list[Note]) -> Any:
@@ -125,8 +125,8 @@ def _model_of_urdf(xml: str, root: Any, notes: list[Note]) -> Any:
         reason = _reason(error)
     model = pin.buildModelFromXML(*arguments, mimic=False)
     joints = tuple(joint.get("name", "") for joint in ET.fromstring(xml).iterfind("joint") if _mimics(joint))
-    what = f"should follow others (mimic), and move on their own: {reason[-120:]}"
-    notes.append(Note(NoteKind.JOINT, joints, what, "hold them under `lock`", "warning"))
+    clause = f"should follow others (mimic), and move on their own: {reason[-120:]}"
+    notes.append(Note(NoteKind.JOINT, joints, clause, "hold them under `lock`", "warning"))
     return model
 
 
@@ -173,31 +173,31 @@ def read_pieces(
     pieces = read_collision(urdf, model, package_dirs, path, notes=notes, allow_missing=allow_missing)
     if visuals:
         _add_visuals(pieces, urdf, model, package_dirs, path, notes, allow_missing)
-    return pieces if enclosed else without_enclosed(pieces, notes)
+    return pieces if enclosed else remove_enclosed(pieces, notes)
 
 
 def _add_visuals(
     pieces: Any, urdf: Path, model: Any, package_dirs: Sequence[str], path: Path, notes: list[Note], allow_missing: bool
 ) -> None:
     """Adds what is meant to be seen of the links that have no collision geometry."""
-    covered = {piece.parentFrame for piece in pieces.geometryObjects}
+    links_with_collision = {piece.parentFrame for piece in pieces.geometryObjects}
     if is_mjcf(urdf):
-        seen = read_collision(urdf, model, package_dirs, path, visual=True)
-        found = [piece for piece in seen.geometryObjects if piece.parentFrame not in covered]
+        visual_model = read_collision(urdf, model, package_dirs, path, visual=True)
+        result = [piece for piece in visual_model.geometryObjects if piece.parentFrame not in links_with_collision]
     else:
         root = read_robot_xml(urdf, "URDF")
-        seen_links = links_with_shapes(root, "visual")
-        links = [link for link in seen_links if model.getFrameId(link, pin.BODY) not in covered]
-        meshes = Meshes(mesh_folders(urdf, package_dirs), str(path), allow_missing, bool(covered))
+        visual_links = links_with_shapes(root, "visual")
+        links = [link for link in visual_links if model.getFrameId(link, pin.BODY) not in links_with_collision]
+        meshes = Meshes(mesh_folders(urdf, package_dirs), str(path), allow_missing, bool(links_with_collision))
         with _quiet_stderr():
-            found = list(read_shapes(root, model, meshes, "visual", links, notes).geometryObjects)
-    for piece in found:
+            result = list(read_shapes(root, model, meshes, "visual", links, notes).geometryObjects)
+    for piece in result:
         pieces.addGeometryObject(piece)
-    if found:
-        names = tuple(dict.fromkeys(model.frames[piece.parentFrame].name for piece in found))
-        what = "no collision shape: what is meant to be seen of it serves instead"
+    if result:
+        names = tuple(dict.fromkeys(model.frames[piece.parentFrame].name for piece in result))
+        clause = "no collision shape: what is meant to be seen of it serves instead"
         remedy = "list bodies of your own, or set `visuals: false` where nothing can be hit"
-        notes.append(Note(NoteKind.LINK, names, what, remedy, "warning"))
+        notes.append(Note(NoteKind.LINK, names, clause, remedy, "warning"))
 
 
 def read_collision(
@@ -252,7 +252,7 @@ def mesh_names(urdf: Path, tag: str = "") -> list[str]:
     return list(dict.fromkeys(name for name in names if name))
 
 
-def honour_srdf(model: Any, bodies: Any, srdf: Path) -> None:
+def apply_srdf(model: Any, bodies: Any, srdf: Path) -> None:
     """Removes the pairs that an SRDF disables.
 
     Args:

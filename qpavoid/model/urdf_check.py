@@ -46,13 +46,13 @@ def check_urdf(path: Path) -> None:
     try:
         links, joints = _named(root, "link"), _named(root, "joint")
         moving = [joint for joint in joints.values() if joint.get("type") != "fixed"]
-        for found, most, what in (
+        for count, most, noun in (
             (len(links), _MOST_LINKS, "links"),
             (len(moving), _MOST_MOVING, "joints that move"),
             (len(root.findall("link/collision")), _MOST_SHAPES, "collision shapes"),
         ):
-            if found > most:
-                raise ValueError(f"{found} {what}; at most {most} are read")
+            if count > most:
+                raise ValueError(f"{count} {noun}; at most {most} are read")
         _check_tree(links, joints)
         for name, link in links.items():
             for part in (*link.findall("collision"), *link.findall("inertial")):
@@ -74,12 +74,12 @@ def check_mjcf(path: Path) -> None:
     where = f"{path}: not a usable MJCF"
     if root.find(".//include") is not None:
         raise ConfigError(f"{where}: it has an <include>; save it as one file, for example with mj_saveLastXML")
-    for tag, most, what in (
+    for tag, most, noun in (
         ("body", _MOST_LINKS, "bodies"), ("joint", _MOST_MOVING, "joints"), ("geom", _MOST_SHAPES, "shapes"),
     ):  # fmt: skip
-        found = len(root.findall(f"worldbody//{tag}"))
-        if found > most:
-            raise ConfigError(f"{where}: {found} {what}; at most {most} are read")
+        count = len(root.findall(f"worldbody//{tag}"))
+        if count > most:
+            raise ConfigError(f"{where}: {count} {noun}; at most {most} are read")
     if root.find("worldbody//body") is None:
         raise ConfigError(f"{where}: its worldbody has no body")
     for element in root.iter():
@@ -101,15 +101,15 @@ _MJCF_NUMBERS = {
 
 
 def _named(root: ET.Element, tag: str) -> dict[str, ET.Element]:
-    found: dict[str, ET.Element] = {}
+    result: dict[str, ET.Element] = {}
     for element in root.findall(tag):
         name = element.get("name")
         if not name:
             raise ValueError(f"a {tag} has no name; give it one")
-        if name in found:
+        if name in result:
             raise ValueError(f"{tag} {name!r} is given twice; names must differ")
-        found[name] = element
-    return found
+        result[name] = element
+    return result
 
 
 def _check_tree(links: dict[str, ET.Element], joints: dict[str, ET.Element]) -> None:

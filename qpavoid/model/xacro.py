@@ -49,13 +49,13 @@ def _packages_found(substitution_args: Any, path: Path) -> Iterator[None]:
     entries = mesh_folders(path, [])
 
     def find(name: str) -> str:
-        found = find_package(name, entries)
-        if found is None:
+        folder = find_package(name, entries)
+        if folder is None:
             try:
-                found = str(original(name))
+                folder = str(original(name))
             except ImportError:
                 raise LookupError(f"no package {name!r} beside the file or along ROS_PACKAGE_PATH") from None
-        return found
+        return folder
 
     substitution_args._eval_find = find
     try:

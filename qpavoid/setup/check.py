@@ -24,16 +24,16 @@ from qpavoid.errors import ConfigError, QpavoidError
 from qpavoid.geometry.bodies import convert_bodies, triangle_meshes
 from qpavoid.model.end_effectors import end_effectors
 from qpavoid.model.kinematics import MIMIC
-from qpavoid.model.notes import Note, NoteKind, RobotWarning, shortened
+from qpavoid.model.notes import Note, NoteKind, RobotWarning, abbreviate
 from qpavoid.model.packages import absolute_entries, find_mesh, mesh_folders
 from qpavoid.model.robot import Robot
 from qpavoid.model.scene import build_scene
 from qpavoid.model.urdf import find_resource, is_mjcf, mesh_names, read_model, read_pieces
 from qpavoid.model.xml_file import read_robot_xml
 from qpavoid.setup.findings import Joint, Report
-from qpavoid.setup.home import BENT, Limbs
+from qpavoid.setup.home import MIN_CONDITIONING, Limbs
 from qpavoid.setup.poses import mimics
-from qpavoid.setup.reasons import unchecked
+from qpavoid.setup.reasons import find_unchecked
 from qpavoid.setup.sampling import D1, Space, touching
 from qpavoid.setup.shapes import Piece, pieces_of
 
@@ -105,8 +105,8 @@ def _report(config: RobotConfig, path: Path, progress: Callable[[str], None]) ->
         report.notes += robot.notes
         _look_at_robot(report, with_hulls(robot), pieces, progress)
     if report.without_mass:
-        what = f"{report.without_mass} moving links have no mass"
-        report.notes.append(Note(NoteKind.LINK, (), what, "none is needed: inertias are not used"))
+        clause = f"{report.without_mass} moving links have no mass"
+        report.notes.append(Note(NoteKind.LINK, (), clause, "none is needed: inertias are not used"))
     order = {"error": 0, "warning": 1, "note": 2}
     report.notes.sort(key=lambda note: order[note.severity])
     return report
@@ -131,19 +131,19 @@ def _look_at_geometry(report: Report, config: RobotConfig, path: Path, urdf: Pat
     absent = {tag: _absent(urdf, tag, report.searched) for tag in ("collision", "visual")}
     report.missing_meshes = absent["collision"]
     if report.missing_meshes and not config.allow_missing_meshes:
-        what = (
+        clause = (
             f"{len(report.missing_meshes)} collision meshes are missing, such as {report.missing_meshes[0]!r}; "
-            f"looked for in {shortened(report.searched, 8)}"
+            f"looked for in {abbreviate(report.searched, 8)}"
         )
         remedy = (
             "name the folder that holds the package with --package-dir or --package NAME=FOLDER (`package_dirs` of a "
             "robot.yaml), set ROS_PACKAGE_PATH, or go on without them: --allow-missing-meshes"
         )
-        report.notes.append(Note(NoteKind.MESH, (), what, remedy, "error"))
+        report.notes.append(Note(NoteKind.MESH, (), clause, remedy, "error"))
         return []
     if absent["visual"]:
-        what = f"{len(absent['visual'])} visual meshes are missing"
-        report.notes.append(Note(NoteKind.MESH, (), what, "none is needed where there are collision shapes"))
+        clause = f"{len(absent['visual'])} visual meshes are missing"
+        report.notes.append(Note(NoteKind.MESH, (), clause, "none is needed where there are collision shapes"))
     try:
         geometry = read_pieces(
             urdf, model, packages, path, visuals=config.visuals, allow_missing=config.allow_missing_meshes
@@ -184,17 +184,17 @@ _KINDS = {
 def _joints(urdf: Path, model: Any, config: RobotConfig, whole: Any) -> list[Joint]:
     """All joints: those that move with the limits that hold, those that are locked, and those that never moved."""
     followers = {name: source for name, (source, _, _) in mimics(urdf).items()}
-    written = [] if is_mjcf(urdf) else read_robot_xml(urdf, "URDF").findall("joint")
-    kinds = {joint.get("name", ""): joint.get("type", "") for joint in written}
+    elements = [] if is_mjcf(urdf) else read_robot_xml(urdf, "URDF").findall("joint")
+    kinds = {joint.get("name", ""): joint.get("type", "") for joint in elements}
     joints = []
     for name, joint in zip(list(whole.names)[1:], list(whole.joints)[1:], strict=True):
         kind, leader = _KINDS.get(joint.shortname(), "revolute"), followers.get(name)
-        led = joint.shortname() == MIMIC
-        kind = kinds[name] if led else kind
-        if name in config.lock or (led and leader in config.lock):
+        is_follower = joint.shortname() == MIMIC
+        kind = kinds[name] if is_follower else kind
+        if name in config.lock or (is_follower and leader in config.lock):
             joints.append(Joint(name, kind, leader, locked=True))
             continue
-        if led:
+        if is_follower:
             joints.append(Joint(name, kind, leader, led=True))
             continue
         if not model.existJointName(name):  # its limits leave it no range
@@ -222,7 +222,7 @@ def _judge_joints(report: Report, config: RobotConfig) -> None:
         if joint.kind in _WIDE and joint.lower is not None and joint.upper is not None
     }
     example = "`limits: {%s: {%s: %s}}` in a robot.yaml"
-    for severity, kind, what, names, remedy in (
+    for severity, kind, clause, names, remedy in (
         ("warning", NoteKind.LIMIT, "no position limits",
          [j.name for j in moving if j.kind in _WIDE and (j.name not in spans or j.lower == j.upper == 0.0)],
          example % ("position", "JOINT", "[-2.0, 2.0]")),
@@ -244,7 +244,7 @@ def _judge_joints(report: Report, config: RobotConfig) -> None:
          example % ("acceleration", "JOINT", "10.0")),
     ):  # fmt: skip
         if names:
-            report.notes.append(Note(kind, tuple(names), what, remedy, severity))  # type: ignore[arg-type]
+            report.notes.append(Note(kind, tuple(names), clause, remedy, severity))  # type: ignore[arg-type]
 
 
 # --- the robot as it loads ----------------------------------------------------------------------------------
@@ -254,54 +254,54 @@ def _look_at_robot(report: Report, robot: Robot, pieces: Sequence[Piece], progre
     report.nq, report.nv = robot.model.nq, robot.model.nv
     report.bodies, report.pairs = len(robot.bodies.geometryObjects), len(robot.bodies.collisionPairs)
     if not report.bodies:
-        what = "it has no collision bodies: nothing would be avoided"
+        clause = "it has no collision bodies: nothing would be avoided"
         remedy = "`qpavoid robot add` fits them to what is meant to be seen; or list `bodies` in a robot.yaml"
-        report.notes.append(Note(NoteKind.SHAPE, (), what, remedy, "error"))
+        report.notes.append(Note(NoteKind.SHAPE, (), clause, remedy, "error"))
     _look_at_home(report, robot)
     progress("comparing with the geometry")
-    report.notes += [note for entry in unchecked(robot, pieces) if (note := entry.note()) is not None]
+    report.notes += [note for entry in find_unchecked(robot, pieces) if (note := entry.note()) is not None]
     if not report.end_effectors:
         remedy = "list the frames of your tools under `end_effectors`"
         report.notes.append(Note(NoteKind.FRAME, (), "no frame looks like a tool", remedy))
     feet = [name for name in report.end_effectors if "foot" in name.lower() or "sole" in name.lower()]
     if feet and not any(joint.kind in ("floating", "planar") for joint in report.joints):
-        what = f"it has feet ({shortened(feet)}) and a fixed base"
-        report.notes.append(Note(NoteKind.JOINT, (), what, "`root_joint: free_flyer`, or --root"))
+        clause = f"it has feet ({abbreviate(feet)}) and a fixed base"
+        report.notes.append(Note(NoteKind.JOINT, (), clause, "`root_joint: free_flyer`, or --root"))
     progress("timing a control step")
     try:
         report.tick_us = tick_time(robot, report.end_effectors)
     except QpavoidError as error:
-        what = f"a controller cannot be made: {error}"
-        report.notes.append(Note(NoteKind.FILE, (), what, "mend what it names", "error"))
+        clause = f"a controller cannot be made: {error}"
+        report.notes.append(Note(NoteKind.FILE, (), clause, "mend what it names", "error"))
         return
     if report.tick_us > _SLOW:
-        what = f"a control step takes {report.tick_us:.0f} µs with {report.pairs} pairs"
+        clause = f"a control step takes {report.tick_us:.0f} µs with {report.pairs} pairs"
         remedy = "`qpavoid robot add` finds pairs that never collide, and capsules; `lock` joints that you do not use"
-        report.notes.append(Note(NoteKind.PAIR, (), what, remedy, "warning"))
+        report.notes.append(Note(NoteKind.PAIR, (), clause, remedy, "warning"))
 
 
 def _look_at_home(report: Report, robot: Robot) -> None:
-    near = touching(robot, robot.home, np.inf)
-    report.clearance = near[0][2] if near else None
-    report.home_collisions = [pair for pair in near if pair[2] <= 0.0]
+    pairs_at_home = touching(robot, robot.home, np.inf)
+    report.clearance = pairs_at_home[0][2] if pairs_at_home else None
+    report.home_collisions = [pair for pair in pairs_at_home if pair[2] <= 0.0]
     remedy = (
         "`qpavoid robot add` looks for a clear pose and leaner bodies; or set `home`, or `disabled_pairs` for shapes "
         "that overlap by design"
     )
     for a, b, d in report.home_collisions:
-        what = f"touch at the home pose ({1e3 * d:.1f} mm)"
-        report.notes.append(Note(NoteKind.PAIR, (a, b), what, remedy, "warning"))
-    close = [(a, b, d) for a, b, d in near if 0.0 < d < robot.safety_distance(a, b, D1)]
+        clause = f"touch at the home pose ({1e3 * d:.1f} mm)"
+        report.notes.append(Note(NoteKind.PAIR, (a, b), clause, remedy, "warning"))
+    close = [(a, b, d) for a, b, d in pairs_at_home if 0.0 < d < robot.safety_distance(a, b, D1)]
     for a, b, d in close:
-        what = f"{1e3 * d:.1f} mm apart at the home pose, less than the default safety distance"
+        clause = f"{1e3 * d:.1f} mm apart at the home pose, less than the default safety distance"
         remedy = "another `home`, a smaller `d1`, or `pair_margins`; `qpavoid robot add` writes them"
-        report.notes.append(Note(NoteKind.PAIR, (a, b), what, remedy))
+        report.notes.append(Note(NoteKind.PAIR, (a, b), clause, remedy))
     limbs = Limbs(robot, report.end_effectors)
     report.conditioning = dict(zip(limbs.names, limbs.at(robot.home), strict=True))
-    if singular := [name for name, limb in report.conditioning.items() if limb.ratio < BENT]:
-        what = "the home pose is singular or nearly so: they cannot move well in every direction there"
+    if singular := [name for name, limb in report.conditioning.items() if limb.ratio < MIN_CONDITIONING]:
+        clause = "the home pose is singular or nearly so: they cannot move well in every direction there"
         remedy = "start scenarios elsewhere (`q0`), or give a `home` with bent joints"
-        report.notes.append(Note(NoteKind.HOME, tuple(singular), what, remedy))
+        report.notes.append(Note(NoteKind.HOME, tuple(singular), clause, remedy))
 
 
 def tick_time(robot: Robot, frames: Sequence[str]) -> float:

@@ -10,27 +10,27 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from qpavoid.geometry.bodies import enclosing_capsule, hull_points
-from qpavoid.geometry.capsules import CapsuleFit, fit_capsule, outermost
+from qpavoid.geometry.capsules import CapsuleFit, extreme_points, fit_capsule
 from qpavoid.geometry.segments import point_segment
 from qpavoid.problem import Array
 from qpavoid.setup.volume import solid_volume
 
 Bodies = Literal["auto", "capsule", "capsules", "convex"]
-"""`auto`: the leanest of the others for each piece; `capsule`: one each; `capsules`: as many as pay, up to `MOST`;
-`convex`: hulls of meshes, primitives as they are."""
+"""`auto`: the leanest of the others for each piece; `capsule`: one each; `capsules`: up to `MAX_CAPSULES`, while each
+further one saves enough; `convex`: hulls of meshes, primitives as they are."""
 
-MOST = 4
+MAX_CAPSULES = 4
 """Capsules that one piece is cut into at most."""
-GROSS = 2.0
+MAX_VOLUME_RATIO = 2.0
 """Volume of capsules, in units of the hull's, from which `auto` takes the hull instead, although a hull costs a pair
 twenty times what a capsule costs. A capsule around a cylinder takes 1.3 to 2, around a cube 2.7."""
-CONCAVE = 1.5
+MIN_CONCAVITY = 1.5
 """Volume of a mesh's hull, in units of what the mesh encloses, from which `auto` compares several capsules [-]."""
 _FINE = 4000
 """Triangles from which cuts are chosen on a coarser surface; what is cut, and enclosed, is the surface itself."""
 _GRID = 32
 """Cells of the coarser surface along its longest side."""
-WORTH = 0.15
+MIN_SAVING = 0.15
 """Part of the volume that a further capsule must save."""
 _CUTS = np.linspace(0.2, 0.8, 7)
 """Where cuts are tried along each principal axis, in parts of the extent."""
@@ -54,13 +54,13 @@ def fit_piece(geometry: Any, how: Bodies, inside: float | None = None) -> tuple[
     if how == "convex":
         return ()
     one = enclosing_capsule(geometry)
-    gross = GROSS * hull_volume(geometry)
+    gross = MAX_VOLUME_RATIO * hull_volume(geometry)
     is_mesh = isinstance(geometry, coal.BVHModelBase)
     lean = how == "capsule" or (how == "auto" and one.volume <= gross)
     if how == "auto" and is_mesh:
         inside = inside_volume(geometry) if inside is None else inside
         hull = hull_volume(geometry)
-        if hull > CONCAVE * inside:  # several capsules may follow a bend that the hull spans
+        if hull > MIN_CONCAVITY * inside:  # several capsules may follow a bend that the hull spans
             several = decompose(triangles(geometry), one)
             if sum(fit.volume for fit in several) < min(hull, one.volume):
                 return several
@@ -72,7 +72,7 @@ def fit_piece(geometry: Any, how: Bodies, inside: float | None = None) -> tuple[
     return () if how == "auto" and sum(fit.volume for fit in several) > gross else several
 
 
-def decompose(surface: Array, whole: CapsuleFit, most: int = MOST) -> tuple[CapsuleFit, ...]:
+def decompose(surface: Array, whole: CapsuleFit, most: int = MAX_CAPSULES) -> tuple[CapsuleFit, ...]:
     """Capsules that enclose a body together, fewer than `most` where more would not pay.
 
     The piece whose cut saves most is cut in two by a plane across one of its principal axes, again and again.
@@ -89,7 +89,7 @@ def decompose(surface: Array, whole: CapsuleFit, most: int = MOST) -> tuple[Caps
     while len(parts) < most:
         savings = [part[1].volume - sum(fit.volume for _, fit in cut) for part, cut in zip(parts, cuts, strict=True)]
         best = int(np.argmax(savings))
-        if savings[best] < WORTH * sum(fit.volume for _, fit in parts):
+        if savings[best] < MIN_SAVING * sum(fit.volume for _, fit in parts):
             break
         parts[best : best + 1] = cuts[best]
         cuts[best : best + 1] = [_halves(half) for half, _ in cuts[best]]
@@ -110,7 +110,7 @@ def _fit(surface: Array) -> CapsuleFit:
     points = _corners(surface)
     if len(points) <= _MANY:
         return fit_capsule(points)
-    fit = fit_capsule(outermost(points))
+    fit = fit_capsule(extreme_points(points))
     half = 0.5 * fit.length * fit.rotation[:, 2]
     sticks_out = float(point_segment(points, fit.center - half, fit.center + half).distance.max()) - fit.radius
     wider = replace(fit, radius=fit.radius + max(sticks_out, 0.0))
@@ -125,15 +125,15 @@ def _best_cut(surface: Array) -> tuple[Array, float] | None:
     """Normal (3,) and height [m] of the plane whose halves have the least volume; None where none cuts."""
     points = _corners(surface)
     axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
-    tried = []
+    candidates = []
     for axis in axes:
         low, high = (points @ axis).min(), (points @ axis).max()
         for height in low + _CUTS * (high - low):
             halves = [cut(surface, axis, height, side) for side in (-1.0, 1.0)]
             if all(len(half) for half in halves):
-                volume = sum(fit_capsule(outermost(half.reshape(-1, 3)), _COARSE).volume for half in halves)
-                tried.append((volume, axis, float(height)))
-    return min(tried, key=lambda found: found[0])[1:] if tried else None
+                volume = sum(fit_capsule(extreme_points(half.reshape(-1, 3)), _COARSE).volume for half in halves)
+                candidates.append((volume, axis, float(height)))
+    return min(candidates, key=lambda candidate: candidate[0])[1:] if candidates else None
 
 
 def _coarse(surface: Array) -> Array:
@@ -145,9 +145,9 @@ def _coarse(surface: Array) -> Array:
     index -= index.min(axis=(0, 1))
     number = index @ [1, 1024, 1024 * 1024]
     a, b, c = number.T
-    kept = index[(a != b) & (b != c) & (a != c)]
-    same = np.unique(np.sort(kept @ [1, 1024, 1024 * 1024], axis=1), axis=0, return_index=True)[1]
-    return np.asarray(cell * kept[np.sort(same)] + surface.min(axis=(0, 1))) if len(same) else surface[:_FINE]
+    parts = index[(a != b) & (b != c) & (a != c)]
+    same = np.unique(np.sort(parts @ [1, 1024, 1024 * 1024], axis=1), axis=0, return_index=True)[1]
+    return np.asarray(cell * parts[np.sort(same)] + surface.min(axis=(0, 1))) if len(same) else surface[:_FINE]
 
 
 def cut(surface: Array, normal: Array, height: float, side: float) -> Array:
@@ -160,21 +160,21 @@ def cut(surface: Array, normal: Array, height: float, side: float) -> Array:
         side: 1 keeps what is above, -1 what is below.
     """
     above = side * (surface @ normal - height)
-    kept = [surface[(above >= 0.0).all(axis=1)]]
-    across = (above > 0.0).any(axis=1) & (above < 0.0).any(axis=1)
-    corners, heights = surface[across], above[across]
+    parts = [surface[(above >= 0.0).all(axis=1)]]
+    is_cut = (above > 0.0).any(axis=1) & (above < 0.0).any(axis=1)
+    corners, heights = surface[is_cut], above[is_cut]
     for turn in range(3):  # each corner in turn is looked at as the one that is alone on its side
         order = [turn, (turn + 1) % 3, (turn + 2) % 3]
         a, b, c = (corners[:, k] for k in order)
         h_a, h_b, h_c = (heights[:, k] for k in order)
-        alone = (h_a > 0.0) & (h_b <= 0.0) & (h_c <= 0.0)
-        rest = (h_a < 0.0) & (h_b > 0.0) & (h_c > 0.0)
+        is_single = (h_a > 0.0) & (h_b <= 0.0) & (h_c <= 0.0)
+        is_double = (h_a < 0.0) & (h_b > 0.0) & (h_c > 0.0)
         with np.errstate(divide="ignore", invalid="ignore"):
             ab = a + (h_a / (h_a - h_b))[:, None] * (b - a)
             ac = a + (h_a / (h_a - h_c))[:, None] * (c - a)
-        kept.append(np.stack((a, ab, ac), axis=1)[alone])
-        kept += [np.stack((ab, b, c), axis=1)[rest], np.stack((ab, c, ac), axis=1)[rest]]
-    return np.concatenate(kept)
+        parts.append(np.stack((a, ab, ac), axis=1)[is_single])
+        parts += [np.stack((ab, b, c), axis=1)[is_double], np.stack((ab, c, ac), axis=1)[is_double]]
+    return np.concatenate(parts)
 
 
 def triangles(geometry: Any) -> Array:

@@ -14,9 +14,9 @@ from qpavoid.model.robot import Robot
 from qpavoid.problem import Array
 from qpavoid.setup.sampling import SEED, BoolArray, PairDistances, Space
 
-ROOM = 4.0 / 3.0
+HOME_CLEARANCE = 4.0 / 3.0
 """Distance of a pair at home, in units of its safety distance: 40 mm where 30 mm are to be kept [-]."""
-BENT = 0.5
+MIN_CONDITIONING = 0.5
 """Conditioning of a limb at home, in units of what it typically has, below which it counts as singular [-]."""
 _DRAWS = 200
 """Configurations that tell what is typical, and tries at mending one fault."""
@@ -82,10 +82,10 @@ class Limbs:
 
     def at(self, q: Array) -> list[Conditioning]:
         """Conditioning of each limb in a configuration (nq,)."""
-        found = []
+        result = []
         for (frame, rows, rank), moved, typical in zip(self._frames, self.columns, self._typical, strict=True):
-            found.append(Conditioning(float(self._values(frame, rows, moved, q)[rank - 1]), typical))
-        return found
+            result.append(Conditioning(float(self._values(frame, rows, moved, q)[rank - 1]), typical))
+        return result
 
     def _jacobian(self, frame: int, q: Array) -> Array:
         """(6, nv) of a frame's origin, along the world axes; joints that mimic others are moved by those."""
@@ -93,9 +93,9 @@ class Limbs:
         pose = pin.updateFramePlacement(self._model, self._data, frame)
         J = self._data.J.reshape(6, -1, order="F") * self._masks[self._model.frames[frame].parentJoint]
         J[:3] += np.cross(J[3:], pose.translation, axisa=0, axisc=0)
-        folded = np.zeros((6, self._model.nv))
-        np.add.at(folded.T, self._columns, J.T)
-        return folded
+        result_jacobian = np.zeros((6, self._model.nv))
+        np.add.at(result_jacobian.T, self._columns, J.T)
+        return result_jacobian
 
     def _values(self, frame: int, rows: int, moved: BoolArray, q: Array) -> Array:
         return np.asarray(np.linalg.svd(self._jacobian(frame, q)[:rows, moved], compute_uv=False))
@@ -111,17 +111,17 @@ class Home:
     """Least distance of any pair [m]; infinite where there are none."""
     nearest: tuple[str, str] | None
     """Bodies of that pair."""
-    short: float
-    """By how much the pair that lacks most is nearer than `ROOM` times its safety distance [m]; 0 where none is."""
+    deficit: float
+    """Largest distance that a pair lacks to `HOME_CLEARANCE` times its safety distance [m]; 0 where none lacks any."""
     conditioning: dict[str, Conditioning]
     """Of the limb that ends at each frame."""
-    wish: int | None
+    preference: int | None
     """Which of the wishes it is; None: a pose that was found near the first one."""
 
     @property
     def singular(self) -> list[str]:
         """Frames that cannot be moved well in every direction."""
-        return [name for name, value in self.conditioning.items() if value.ratio < BENT]
+        return [name for name, value in self.conditioning.items() if value.ratio < MIN_CONDITIONING]
 
 
 class _Judge:
@@ -129,13 +129,13 @@ class _Judge:
 
     def __init__(self, robot: Robot, frames: Sequence[str], d1: Array) -> None:
         self.distances, self.limbs = PairDistances(robot), Limbs(robot, frames)
-        self.need = ROOM * d1
+        self.need = HOME_CLEARANCE * d1
 
     def faults(self, q: Array) -> Array:
         """Share of its needed distance that each pair lacks (m,), and of its needed conditioning each limb [-]."""
-        short = np.maximum(1.0 - self.distances.all(q) / self.need, 0.0) if len(self.need) else np.zeros(0)
-        short += _TOUCH * (short > 1.0)
-        return np.concatenate((short, [max(1.0 - limb.ratio / BENT, 0.0) for limb in self.limbs.at(q)]))
+        deficit = np.maximum(1.0 - self.distances.all(q) / self.need, 0.0) if len(self.need) else np.zeros(0)
+        deficit += _TOUCH * (deficit > 1.0)
+        return np.concatenate((deficit, [max(1.0 - limb.ratio / MIN_CONDITIONING, 0.0) for limb in self.limbs.at(q)]))
 
     def movers(self, fault: int) -> BoolArray:
         """Coordinates (nv,) that can mend a fault."""
@@ -149,7 +149,7 @@ _TOUCH = 10.0
 
 def find_home(
     robot: Robot,
-    wishes: Iterable[Array],
+    preferences: Iterable[Array],
     frames: Sequence[str],
     d1: Array,
     pinned: Iterable[str] = (),
@@ -163,38 +163,44 @@ def find_home(
 
     Args:
         robot: with its pairs.
-        wishes: configurations, the best first; at least one.
+        preferences: configurations, the best first; at least one.
         frames: ends of limbs that should move in every direction.
         d1: safety distance of each pair (m,) [m].
         pinned: joints that stay where the first wish has them.
         seed: of the draw.
     """
-    judge, space, wished = _Judge(robot, frames, d1), Space(robot), [np.asarray(q) for q in wishes]
-    held = np.array([name.partition(".")[0] in set(pinned) for name in robot.coordinate_names], dtype=bool)
-    faults = [float(judge.faults(q).sum()) for q in (wished[:1] if held.any() else wished)]
-    clear = [fault == 0.0 for fault in faults]
-    best = clear.index(True) if any(clear) else int(np.argmin(np.floor(np.array(faults) / _TOUCH)))
-    q = wished[best] if clear[best] else _mended(robot, judge, space, wished[best], ~held & space.moving, seed)
-    return _described(robot, judge, q, best if np.array_equal(q, wished[best]) else None)
+    judge, space, poses = _Judge(robot, frames, d1), Space(robot), [np.asarray(q) for q in preferences]
+    is_pinned = np.array([name.partition(".")[0] in set(pinned) for name in robot.coordinate_names], dtype=bool)
+    faults = [float(judge.faults(q).sum()) for q in (poses[:1] if is_pinned.any() else poses)]
+    is_faultless = [fault == 0.0 for fault in faults]
+    best = is_faultless.index(True) if any(is_faultless) else int(np.argmin(np.floor(np.array(faults) / _TOUCH)))
+    q = (
+        poses[best]
+        if is_faultless[best]
+        else _mended(robot, judge, space, poses[best], ~is_pinned & space.moving, seed)
+    )
+    return _described(robot, judge, q, best if np.array_equal(q, poses[best]) else None)
 
 
 def _mended(robot: Robot, judge: _Judge, space: Space, start: Array, free: BoolArray, seed: int) -> Array:
     """A pose near `start` with fewer faults, of which only free coordinates (nv,) differ."""
-    random, q, tries = np.random.default_rng(seed), start, 0
-    faults, hopeless = judge.faults(q), np.zeros(len(judge.faults(q)), dtype=bool)
-    while tries < _PATIENCE and np.any(faults[~hopeless] > 0.0):
-        worst = int(np.argmax(np.where(hopeless, -1.0, faults)))
-        mask, better = judge.movers(worst) & free, q
-        for i, aim in enumerate(space.draw(random, _DRAWS if mask.any() else 0)):
-            step = (i + 1) / _DRAWS * np.asarray(pin.difference(robot.model, q, aim))
-            tried = space.move(start, np.round(pin.difference(robot.model, start, space.move(q, step * mask)), _DIGITS))
-            there, tries = judge.faults(tried), tries + 1
-            if there.sum() < faults.sum() - 1e-9:
-                better, faults = tried, there
+    random, q, evaluations = np.random.default_rng(seed), start, 0
+    faults, is_unfixable = judge.faults(q), np.zeros(len(judge.faults(q)), dtype=bool)
+    while evaluations < _PATIENCE and np.any(faults[~is_unfixable] > 0.0):
+        worst = int(np.argmax(np.where(is_unfixable, -1.0, faults)))
+        mask, best_pose = judge.movers(worst) & free, q
+        for i, target in enumerate(space.draw(random, _DRAWS if mask.any() else 0)):
+            step = (i + 1) / _DRAWS * np.asarray(pin.difference(robot.model, q, target))
+            candidate = space.move(
+                start, np.round(pin.difference(robot.model, start, space.move(q, step * mask)), _DIGITS)
+            )
+            candidate_faults, evaluations = judge.faults(candidate), evaluations + 1
+            if candidate_faults.sum() < faults.sum() - 1e-9:
+                best_pose, faults = candidate, candidate_faults
                 if faults[worst] == 0.0:
                     break
-        hopeless[worst] = better is q
-        q = better
+        is_unfixable[worst] = best_pose is q
+        q = best_pose
     return _put_back(robot, judge, _nearer(robot, judge, space, q, start), start)
 
 
@@ -202,9 +208,9 @@ def _nearer(robot: Robot, judge: _Judge, space: Space, q: Array, start: Array) -
     """The pose nearest to where it started on the straight way there that has no more faults than q."""
     step, total = np.asarray(pin.difference(robot.model, start, q)), judge.faults(q).sum()
     for part in np.linspace(0.05, 0.95, 19):
-        tried = space.move(start, np.round(part * step, _DIGITS))
-        if judge.faults(tried).sum() <= total:
-            return tried
+        candidate = space.move(start, np.round(part * step, _DIGITS))
+        if judge.faults(candidate).sum() <= total:
+            return candidate
     return q
 
 
@@ -213,14 +219,14 @@ def _put_back(robot: Robot, judge: _Judge, q: Array, start: Array) -> Array:
     total = judge.faults(q).sum()
     for joint in list(robot.model.joints)[1:]:
         part = slice(joint.idx_q, joint.idx_q + joint.nq)
-        tried = q.copy()
-        tried[part] = start[part]
-        if not np.array_equal(tried, q) and judge.faults(tried).sum() <= total:
-            q = tried
+        candidate = q.copy()
+        candidate[part] = start[part]
+        if not np.array_equal(candidate, q) and judge.faults(candidate).sum() <= total:
+            q = candidate
     return q
 
 
-def _described(robot: Robot, judge: _Judge, q: Array, wish: int | None) -> Home:
+def _described(robot: Robot, judge: _Judge, q: Array, preference: int | None) -> Home:
     d = judge.distances.all(q)
     names = [body.name for body in robot.bodies.geometryObjects]
     nearest = None
@@ -228,5 +234,5 @@ def _described(robot: Robot, judge: _Judge, q: Array, wish: int | None) -> Home:
         a, b = judge.distances.pairs[int(np.argmin(d))]
         nearest = names[a], names[b]
     conditioning = dict(zip(judge.limbs.names, judge.limbs.at(q), strict=True))
-    short = float(np.max(judge.need - d, initial=0.0))
-    return Home(q, float(np.min(d, initial=np.inf)), nearest, short, conditioning, wish)
+    deficit = float(np.max(judge.need - d, initial=0.0))
+    return Home(q, float(np.min(d, initial=np.inf)), nearest, deficit, conditioning, preference)

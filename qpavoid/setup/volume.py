@@ -47,8 +47,8 @@ def _is_closed(surface: Array, same: float) -> bool:
     edges = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
     edges = edges[edges[:, 0] != edges[:, 1]]
     count = int(corners.max()) + 1
-    there, back = np.sort(edges @ [count, 1]), np.sort(edges @ [1, count])
-    return bool(np.array_equal(there, back))
+    forward_edges, backward_edges = np.sort(edges @ [count, 1]), np.sort(edges @ [1, count])
+    return bool(np.array_equal(forward_edges, backward_edges))
 
 
 def _filled(surface: Array, size: float) -> float:

@@ -40,17 +40,17 @@ def wheel_joints(model: Any, pieces: Sequence[Piece]) -> list[str]:
         lowest, highest = min(lowest, low), max(highest, high)
         if isinstance(piece.geometry, coal.Cylinder | coal.Sphere):
             round_ones[frame.parentJoint] = min(low, round_ones.get(frame.parentJoint, np.inf))
-    found = []
+    wheel_names = []
     for joint in list(model.joints)[1:]:
         if not _turns_round(model, joint):
             continue
         links = [frame.name for frame in model.frames if frame.parentJoint == joint.id and frame.type == pin.BODY]
-        named = any(_NAMES.search(name) for name in (model.names[joint.id], *links))
+        has_name = any(_NAMES.search(name) for name in (model.names[joint.id], *links))
         axis = _axis(model, data, joint)
-        stands = round_ones.get(joint.id, np.inf) <= lowest + _GROUND * (highest - lowest)
-        if named or (stands and abs(axis[2]) < 0.1 and not model.children[joint.id]):
-            found.append(str(model.names[joint.id]))
-    return found
+        is_on_ground = round_ones.get(joint.id, np.inf) <= lowest + _GROUND * (highest - lowest)
+        if has_name or (is_on_ground and abs(axis[2]) < 0.1 and not model.children[joint.id]):
+            wheel_names.append(str(model.names[joint.id]))
+    return wheel_names
 
 
 def _heights(piece: Piece, link: Any) -> tuple[float, float]:
@@ -58,8 +58,8 @@ def _heights(piece: Piece, link: Any) -> tuple[float, float]:
     center, half = bounding_box(piece.geometry)
     pose = link * piece.placement
     middle = float(pose.act(center)[2])
-    reach = float(np.abs(pose.rotation[2]) @ half)
-    return middle - reach, middle + reach
+    half_height = float(np.abs(pose.rotation[2]) @ half)
+    return middle - half_height, middle + half_height
 
 
 def _turns_round(model: Any, joint: Any) -> bool:

@@ -23,7 +23,7 @@ def seal(content: bytes) -> bytes:
     return content.replace(BLANK.encode(), b"sha256 " + sha256(content).hexdigest()[:_DIGITS].encode(), 1)
 
 
-def untouched(content: bytes) -> bool:
+def is_sealed(content: bytes) -> bool:
     """Whether a content is as `seal` left it."""
     return seal(_SEAL.sub(BLANK.encode(), content, count=1)) == content and _SEAL.search(content) is not None
 
@@ -50,7 +50,7 @@ def write_files(contents: Mapping[Path, bytes], force: bool = False) -> dict[Pat
             continue
         except OSError as error:
             raise ConfigError(f"{path}: {error.strerror}; give another folder with --out") from None
-        if not (force or before == content or untouched(before)):
+        if not (force or before == content or is_sealed(before)):
             raise ConfigError(
                 f"{path}: edited since it was written, or written by hand: left as it is; --force overwrites it, "
                 "--out DIR writes elsewhere"

@@ -72,7 +72,7 @@ def _scenario(family: Family, template: dict[str, Any], draw: Draw, seed: int) -
         fields.update(made)
         if "q0" in made and isinstance(stated.get("q0"), dict):
             fields["q0"] = {**stated["q0"], **made["q0"]}
-    return validate(_plain(fields), ScenarioConfig, family.path).read_from(family.path)
+    return validate(_plain(fields), ScenarioConfig, family.path).with_source(family.path)
 
 
 def _made(family: Family, stated: dict[str, Any], draw: Draw) -> dict[str, Any]:
