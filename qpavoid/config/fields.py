@@ -14,7 +14,10 @@ _LARGE = 1e8
 
 
 def schema_of(root: type[BaseModel]) -> dict[str, Any]:
-    """JSON Schema of a block and all that it may hold; what tells one kind of block from others is required."""
+    """Make the JSON Schema of a block and all that it may hold.
+
+    The tag that distinguishes blocks of a union is required.
+    """
     schema = root.model_json_schema()
     for name, tag in _tags(schema):
         block = schema["$defs"][name]
@@ -24,7 +27,10 @@ def schema_of(root: type[BaseModel]) -> dict[str, Any]:
 
 
 def page() -> str:
-    """Markdown: a table of fields for each block of a scenario and of a robot.yaml, outer ones first."""
+    """Write the page of all fields in Markdown.
+
+    One table for each block of a scenario and of a robot.yaml, outer ones first.
+    """
     lines, visited_names = _HEAD.splitlines(), set[str]()
     for root in (ScenarioConfig, RobotConfig):
         schema = schema_of(root)
@@ -60,7 +66,7 @@ def _section(name: str, blocks: dict[str, Any]) -> list[str]:
 
 
 def _kind(spec: dict[str, Any], blocks: dict[str, Any]) -> str:
-    """What a value may be, in words."""
+    """Say in words what a value may be."""
     if "$ref" in spec:
         name = spec["$ref"].rsplit("/", 1)[-1]
         return f"[{name}](#{name.lower()})" if "properties" in blocks[name] else _kind(blocks[name], blocks)
@@ -93,7 +99,7 @@ def _number(spec: dict[str, Any]) -> str:
 
 
 def _refs(spec: Any, blocks: dict[str, Any]) -> Iterator[str]:
-    """Names of the blocks that a field may hold."""
+    """Yield the names of the blocks that a field may hold."""
     if isinstance(spec, dict):
         for key, value in spec.items():
             if key == "$ref":
@@ -109,7 +115,7 @@ def _refs(spec: Any, blocks: dict[str, Any]) -> Iterator[str]:
 
 
 def _tags(spec: Any) -> Iterator[tuple[str, str]]:
-    """Blocks that are told from others by one of their fields, and which field that is."""
+    """Yield each block of a union with the field that distinguishes it."""
     if isinstance(spec, dict) and "discriminator" in spec:
         for ref in spec["discriminator"]["mapping"].values():
             yield ref.rsplit("/", 1)[-1], spec["discriminator"]["propertyName"]
@@ -118,7 +124,7 @@ def _tags(spec: Any) -> Iterator[tuple[str, str]]:
 
 
 def _default_text(default: Any) -> str:
-    """A default as a YAML file would give it."""
+    """Write a default as a YAML file would give it."""
     if isinstance(default, dict) and ("name" in default or "type" in default):
         return f"`{default.get('name') or default['type']}`"
     if isinstance(default, dict):

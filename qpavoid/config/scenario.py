@@ -90,7 +90,7 @@ class ScenarioConfig(Block):
         return self._source
 
     def with_source(self, source: Path) -> ScenarioConfig:
-        """The same scenario, as if it had been read from `source`."""
+        """Return the same scenario, as if it had been read from `source`."""
         copy = self.model_copy()
         copy._source = source
         return copy

@@ -32,7 +32,7 @@ class TaskBlock(Block):
         return self.name or self.default_name()
 
     def default_name(self) -> str:
-        """The name where none is given."""
+        """Return the name of a task that gives none."""
         return str(getattr(self, "type"))  # noqa: B009
 
 
@@ -55,7 +55,7 @@ class Task(TaskBlock):
     """Cap on the commanded angular speed [rad/s]; left out: no cap."""
 
     def default_name(self) -> str:
-        """That of the frame."""
+        """Return the name of a task that gives none."""
         return self.frame
 
 

@@ -15,7 +15,7 @@ _DIGITS = 300
 
 
 def parse_yaml(text: str) -> Any:
-    """What a YAML text says.
+    """Parse a YAML text.
 
     Raises:
         ValueError: not valid, a key given twice, or too deep, too long, or endless.

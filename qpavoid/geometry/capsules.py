@@ -34,7 +34,7 @@ class CapsuleFit:
 
 
 def fit_capsule(points: Array, directions: int = 250) -> CapsuleFit:
-    """A small capsule that encloses all points.
+    """Fit a small capsule that encloses all points.
 
     Tries the points' principal axes and a spiral of directions over the half sphere, all at once; for each, the axis
     runs through the centre of the smallest circle around the projected points, and the caps are drawn in as far as
@@ -62,7 +62,10 @@ def fit_capsule(points: Array, directions: int = 250) -> CapsuleFit:
 
 
 def _tried_along(points: Array, rotations: Array) -> tuple[Array, Array, Array]:
-    """Capsules along k axes, of several radii each: volumes (w, k), fits (w, k, 3) and the axes' centres (k, 2)."""
+    """Fit capsules along k axes, of several radii each.
+
+    Returns volumes (w, k), fits (w, k, 3) and the axes' centres (k, 2).
+    """
     local = points @ rotations
     center, narrowest = _enclosing_circles(local[..., :2])
     off_axis = np.sum((local[..., :2] - center[:, None]) ** 2, axis=2)
@@ -73,7 +76,9 @@ def _tried_along(points: Array, rotations: Array) -> tuple[Array, Array, Array]:
 
 
 def _fit_along(height: Array, off_axis: Array, radius: Array) -> Array:
-    """Shortest capsules of given radii around points along given axes: rows [radius, length, height of the middle].
+    """Fit the shortest capsules of given radii around points along given axes.
+
+    Rows are [radius, length, height of the middle].
 
     Each point lets the caps' centres come no nearer to the far side than its reach; where they would cross, a ball
     about their middle encloses everything.
@@ -89,12 +94,12 @@ def _fit_along(height: Array, off_axis: Array, radius: Array) -> Array:
 
 
 def extreme_points(points: Array) -> Array:
-    """Those of many points (n, 3) that reach farthest along 120 fixed directions."""
+    """Return those of many points (n, 3) that lie farthest along 120 fixed directions."""
     return np.asarray(points[np.unique(np.argmax(_ROUND @ points.T, axis=1))])
 
 
 def half_sphere(count: int) -> Array:
-    """Evenly spread unit vectors with z >= 0 (count, 3): a golden-angle spiral."""
+    """Return evenly spread unit vectors with z >= 0 (count, 3): a golden-angle spiral."""
     i = np.arange(count) + 0.5
     z, angle = i / count, np.pi * (1.0 + np.sqrt(5.0)) * i
     r = np.sqrt(1.0 - z * z)
@@ -105,14 +110,16 @@ _ROUND = np.concatenate([side * half_sphere(60) for side in (1.0, -1.0)])
 
 
 def _rotations_to(axes: Array) -> Array:
-    """Rotations (k, 3, 3) whose z columns are the unit vectors `axes` (k, 3)."""
+    """Return rotations (k, 3, 3) whose z columns are the unit vectors `axes` (k, 3)."""
     x = np.cross(np.eye(3)[np.argmin(np.abs(axes), axis=1)], axes)
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     return np.stack((x, np.cross(axes, x), axes), axis=2)
 
 
 def _enclosing_circles(points: Array) -> tuple[Array, Array]:
-    """Nearly smallest circle around each set of 2-D points (k, n, 2): centres (k, 2) and radii (k,).
+    """Find a nearly smallest circle around each set of 2-D points (k, n, 2).
+
+    Returns centres (k, 2) and radii (k,).
 
     Badoiu and Clarkson's iteration for the centre; the radius is then exact for that centre.
     """

@@ -23,7 +23,7 @@ _THIN = 1e-9
 
 
 def decompose(vertices: Array, triangles: IntArray, max_pieces: int, tolerance: float) -> list[Array]:
-    """Corners of convex pieces whose union encloses every triangle of a mesh.
+    """Cover a mesh with convex pieces whose union encloses every triangle of it.
 
     Args:
         vertices: (n, 3) [m].
@@ -58,7 +58,7 @@ class _Volume:
 
 
 def _parts(vertices: Array, triangles: IntArray, weld_distance: float) -> list[Array]:
-    """Corners (t, 3, 3) of the triangles of each part of a mesh that touches no other."""
+    """Split a mesh into the parts that touch no other; triangles (t, 3, 3) of each."""
     _, same = np.unique(np.round(vertices / weld_distance), axis=0, return_inverse=True)
     corners = same.ravel()[triangles]
     edges = np.concatenate((corners[:, :2], corners[:, 1:]))
@@ -71,12 +71,12 @@ def _parts(vertices: Array, triangles: IntArray, weld_distance: float) -> list[A
 
 
 def _signed_volume(triangles: Array) -> float:
-    """Volume of a closed part; negative where its faces look inwards."""
+    """Return the volume of a closed part; negative where its faces look inwards."""
     return float(np.einsum("ij,ij->", triangles[:, 0] - triangles[0, 0], _normals(triangles)))
 
 
 def _cells(triangles: Array) -> list[Array]:
-    """The triangles (t, 3, 3) of a part cut up along all three axes."""
+    """Cut the triangles (t, 3, 3) of a part along all three axes."""
     cells = [triangles]
     for axis in range(3):
         coordinates = triangles[..., axis].ravel()
@@ -94,7 +94,10 @@ def _cells(triangles: Array) -> list[Array]:
 
 
 def _planes(coordinates: Array, close: float) -> list[float]:
-    """Where to cut along an axis: at the corners' own coordinates (n,), sorted, where these are few, else evenly."""
+    """Choose the planes of the cuts along an axis.
+
+    At the corners' own coordinates (n,), sorted, where these are few, else evenly.
+    """
     distinct = coordinates[np.diff(coordinates, prepend=-np.inf) > close].tolist()
     if len(distinct) > _CUTS + 1:
         distinct = np.linspace(coordinates[0], coordinates[-1], _CUTS + 1).tolist()
@@ -103,7 +106,7 @@ def _planes(coordinates: Array, close: float) -> list[float]:
 
 
 def _cut(triangles: Array, axis: int, plane: float, close: float) -> tuple[Array, Array]:
-    """The triangles (t, 3, 3) below and above a plane; those that it crosses are cut into three.
+    """Cut triangles (t, 3, 3) at a plane; return those below and those above it.
 
     Corners closer to the plane than `close` count as lying in it, and stay where they are.
     """
@@ -139,7 +142,7 @@ def _normals(triangles: Array) -> Array:
 
 
 def _merge(pieces: list[Array], volume: _Volume, max_pieces: int, allowance: float) -> list[Array]:
-    """Puts neighbours together, the pair that adds least volume first."""
+    """Merge neighbours, the pair that adds least volume first."""
     points_of: dict[int, Array] = dict(enumerate(pieces))
     own = {i: volume(points) for i, points in points_of.items()}
     boxes = {i: (points.min(axis=0), points.max(axis=0)) for i, points in points_of.items()}

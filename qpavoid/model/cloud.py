@@ -61,7 +61,9 @@ class Voxels:
 
     @classmethod
     def of(cls, points: ArrayLike, resolution: float) -> Voxels:
-        """Sorts points; takes some ms for 10 000, which a thread of the camera may spend.
+        """Sort points into voxels and blocks.
+
+        It takes some ms for 10 000, which a thread of the camera may spend.
 
         Args:
             points: (n, 3) [m]; n may be 0.
@@ -91,7 +93,7 @@ class Voxels:
 
     @classmethod
     def of_octree(cls, tree: Any, resolution: float | None = None) -> Voxels:
-        """The occupied leaves of a coal octree, large ones cut into voxels.
+        """Make voxels of the occupied leaves of a coal octree, large ones cut up.
 
         Args:
             tree: `coal.OcTree`, such as `coal.makeOctree` or `coal.MeshLoader().loadOctree` gives.
@@ -107,12 +109,12 @@ class Voxels:
 
 
 def voxel_radius(resolution: float) -> float:
-    """Radius of the ball around a voxel [m]."""
+    """Return the radius of a voxel's circumscribed sphere [m]."""
     return float(0.5 * np.sqrt(3.0) * resolution)
 
 
 def read_points(path: Path, where: str) -> Array:
-    """Points (n, 3) of a file [m].
+    """Read points (n, 3) [m] from a file.
 
     Args:
         path: `.npy` with an array (n, 3), or `.csv` with the header `x,y,z`.

@@ -17,7 +17,7 @@ _ROUND_OFF = 1e-6
 
 
 def remove_enclosed(pieces: Any, notes: list[Note]) -> Any:
-    """The shapes of a geometry model without those inside others of their link, in their order.
+    """Remove the shapes of a geometry model that lie inside others of their link.
 
     What touches an enclosed shape has gone through the one around it, so that distances stay as they are as long as
     they are positive. Files that have a mesh and a simple shape around it for each link need half of them.
@@ -49,7 +49,10 @@ def remove_enclosed(pieces: Any, notes: list[Note]) -> Any:
 
 
 def _name_mixture(pieces: list[Any], notes: list[Note]) -> None:
-    """Names the shapes of a link that has meshes beside simple shapes: often one set is meant to replace the other."""
+    """Note the shapes of a link that has meshes beside simple shapes.
+
+    Often one set is meant to replace the other.
+    """
     meshes = [piece for piece in pieces if isinstance(piece.geometry, coal.BVHModelBase)]
     if meshes and len(meshes) < len(pieces):
         names = tuple(piece.name for piece in pieces)
@@ -58,7 +61,7 @@ def _name_mixture(pieces: list[Any], notes: list[Note]) -> None:
 
 
 def _encloses(outer: Any, inner: Any) -> bool:
-    """Whether a piece lies inside another one, or is the same."""
+    """Return True if a piece lies inside another one, or is the same."""
     placement = outer.placement.actInv(inner.placement)
     if _same(outer, inner) and placement.isIdentity(_ROUND_OFF):
         return True
@@ -78,7 +81,10 @@ def _same(a: Any, b: Any) -> bool:
 
 
 def _depth(shape: Any, points: Array) -> Array:
-    """How far points (n, 3) are inside a shape, at most; negative outside (n,) [m]."""
+    """Return a lower bound on the depth of points (n, 3) inside a shape (n,) [m].
+
+    Negative outside.
+    """
     if isinstance(shape, coal.Box):
         return np.asarray((shape.halfSide - np.abs(points)).min(axis=1))
     if isinstance(shape, coal.Sphere):

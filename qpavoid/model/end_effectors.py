@@ -25,7 +25,9 @@ _NO_TOOLS = re.compile(r"head|eye|camera|neck|wheel|caster|laser|imu|lidar|senso
 
 
 def end_effectors(model: Any, srdf_ends: Sequence[str] = ()) -> list[str]:
-    """Names of frames at the ends of a robot's limbs: those that are known, then others in the order of the joints.
+    """Find the frames at the ends of a robot's limbs.
+
+    First those that an SRDF names, then others in the order of the joints.
 
     A limb is a chain of at least three joints since the last branch; where it branches into fingers, its hand is the
     end. Where no limb is that long, every end counts.
@@ -49,7 +51,10 @@ def end_effectors(model: Any, srdf_ends: Sequence[str] = ()) -> list[str]:
 
 
 def _ends(model: Any, joint: int, above: int, least: int) -> list[int]:
-    """Joints that carry the ends of the tree below `joint`, which has `above` joints in a row above it."""
+    """Find the joints that carry the ends of the tree below `joint`.
+
+    There are `above` joints in a row above it.
+    """
     children = list(model.children[joint])
     if not children:
         return [joint] if above >= least else []
@@ -64,18 +69,18 @@ def _ends(model: Any, joint: int, above: int, least: int) -> list[int]:
 
 
 def _depth(model: Any, joint: int) -> int:
-    """Joints in the longest chain that begins with a joint."""
+    """Count the joints in the longest chain that begins with a joint."""
     return 1 + max((_depth(model, child) for child in model.children[joint]), default=0)
 
 
 def _tool_frame(model: Any, joint: int) -> str | None:
-    """The frame that is best called a tool among those that a joint carries: by name, else its own link."""
+    """Find the frame of a joint that is best called a tool: by name, else its own link."""
     names = [f.name for f in model.frames if f.parentJoint == joint and f.type in _LINKS]
     return _tool_named(model, joint) or (str(names[0]) if names else None)
 
 
 def _tool_named(model: Any, joint: int) -> str | None:
-    """The frame that is called a tool among those that a joint carries, if there is one."""
+    """Find the frame of a joint whose name is that of a tool, if there is one."""
     names = [f.name for f in model.frames if f.parentJoint == joint and f.type in _LINKS]
     for word in _TOOL_WORDS:
         pattern = re.compile(rf"(?:^|[^a-z]){word}(?:[^a-z]|$)", re.IGNORECASE)

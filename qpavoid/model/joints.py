@@ -24,12 +24,17 @@ _SAME = 1e-6
 
 
 def frame_index(model: Any, name: str) -> int:
-    """Index of an existing frame; that of the link where a joint has the same name."""
+    """Return the index of an existing frame.
+
+    Where a joint has the same name, it is that of the link.
+    """
     return int(model.getFrameId(name, pin.BODY) if model.existFrame(name, pin.BODY) else model.getFrameId(name))
 
 
 def joint_bounds(model: Any) -> JointBounds:
-    """Joint limits of a model in tangent space; a URDF says nothing of accelerations and jerks.
+    """Read the joint limits of a model, in tangent space.
+
+    A URDF has no fields for accelerations and jerks.
 
     Only joints with one coordinate in q and v have position limits. A velocity limit of 0, and a range from 0 to 0,
     mean that the URDF gives none; see `joints_fixed_by_limits` of ranges that are meant, `assume_speeds` of velocities.
@@ -56,7 +61,7 @@ def joint_bounds(model: Any) -> JointBounds:
 
 
 def set_limits(model: Any, limits: JointLimits, path: Path) -> None:
-    """Takes over the position and velocity limits that a robot.yaml gives.
+    """Set the position and velocity limits that a robot.yaml gives.
 
     Raises:
         ConfigError, UnknownName: of a joint that mimics another one, has no position limits, or is unknown.
@@ -84,7 +89,10 @@ def set_limits(model: Any, limits: JointLimits, path: Path) -> None:
 
 
 def _set_speeds(model: Any, velocity: Array) -> None:
-    """Sets the largest speeds (nv,) of both directions, of which a URDF has one and Pinocchio reads both as that."""
+    """Set the largest speeds (nv,) of both directions.
+
+    A URDF has one number, and Pinocchio reads it as both.
+    """
     model.velocityLimit, model.lowerVelocityLimit = velocity, -velocity
 
 
@@ -93,7 +101,9 @@ ASSUMED_SPEED = 1.0
 
 
 def assume_speeds(model: Any, notes: list[Note]) -> None:
-    """Gives a largest speed to every coordinate without one: to bases that float or roll, and where a file says 0.
+    """Give a largest speed to every coordinate without one.
+
+    Bases that float or roll have none, nor have joints of which the file says 0.
 
     Args:
         model: Pinocchio model, changed in place.
@@ -116,7 +126,7 @@ def assume_speeds(model: Any, notes: list[Note]) -> None:
 
 
 def find_joint(model: Any, name: str, where: str) -> Any:
-    """The joint of a name.
+    """Return the joint of a name.
 
     Raises:
         UnknownName: there is none; with the nearest one.
@@ -128,7 +138,10 @@ def find_joint(model: Any, name: str, where: str) -> Any:
 
 
 def middle_configuration(model: Any) -> Array:
-    """Neutral configuration (nq,), with bounded joints at the middle of their range where 0 is outside it."""
+    """Return the neutral configuration (nq,), moved into the joint limits.
+
+    A bounded joint whose range leaves 0 out stands at the middle of its range.
+    """
     q = pin.neutral(model)
     for joint in list(model.joints)[1:]:
         lower, upper = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
@@ -138,7 +151,7 @@ def middle_configuration(model: Any) -> Array:
 
 
 def set_joints(model: Any, q: Array, values: Mapping[str, float], where: str) -> Array:
-    """The configuration q (nq,) with some joints elsewhere.
+    """Return the configuration q (nq,) with other values of some joints.
 
     Args:
         model: pinocchio model.
@@ -180,7 +193,10 @@ def _follows(model: Any, name: str) -> str:
 def remove_joints(
     model: Any, bodies: Any, joint_names: Sequence[str], q: Array, where: str
 ) -> tuple[Any, Any, IntArray]:
-    """Model and bodies without the locked joints, and which coordinates of q are left."""
+    """Fix some joints where q has them.
+
+    Returns the smaller model and its bodies, and the indices in q of the remaining coordinates.
+    """
     ids = [find_joint(model, name, where).id for name in joint_names]
     for joint, leader in zip(list(model.mimicking_joints), list(model.mimicked_joints), strict=True):
         if leader in ids and joint not in ids:

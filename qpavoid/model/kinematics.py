@@ -50,7 +50,7 @@ class ForwardKinematics:
     """Joint placements, world Jacobian and the poses of some frames, in data that every call overwrites."""
 
     def __init__(self, model: Any, frame_ids: Sequence[int] = ()) -> None:
-        """Lays the memory out.
+        """Allocate the memory of all results.
 
         Args:
             model: pinocchio model.
@@ -69,7 +69,10 @@ class ForwardKinematics:
         """(njoints, 12) world poses of all joints."""
 
     def compute(self, q: Array) -> None:
-        """Brings everything to a configuration q (nq,); `data` then holds the joint placements."""
+        """Compute everything at a configuration q (nq,).
+
+        `data` then holds the joint placements.
+        """
         model, data = self._model, self.data
         pin.computeJointJacobians(model, data, q)
         for frame_id in self._ids:
@@ -81,7 +84,7 @@ class ForwardKinematics:
 
 
 def columns(model: Any) -> IntArray:
-    """Which velocity coordinate moves each of the e columns of the world Jacobian (e,)."""
+    """Return the velocity coordinate that moves each column of the world Jacobian (e,)."""
     index = np.zeros(model.nvExtended, dtype=np.intp)
     for joint in list(model.joints)[1:]:
         width = joint.nvExtended
@@ -90,13 +93,15 @@ def columns(model: Any) -> IntArray:
 
 
 def column_joints(model: Any) -> IntArray:
-    """Which joint each of the e columns of the world Jacobian belongs to (e,)."""
+    """Return the joint of each column of the world Jacobian (e,)."""
     widths = [joint.nvExtended for joint in list(model.joints)[1:]]  # that of the world counts for nothing
     return np.repeat(np.arange(1, model.njoints), widths)
 
 
 def chains(model: Any) -> tuple[Array, Array]:
-    """How far each coordinate turns, and slides, the end of each chain of joints: twice (chains, nv).
+    """Return the rotation and the translation of each chain's end: twice (chains, nv).
+
+    They are per unit of each velocity coordinate.
 
     One angle or length of a chain for each coordinate, as a rule; more where a joint mimics another one.
     """
@@ -113,7 +118,7 @@ def chains(model: Any) -> tuple[Array, Array]:
 
 
 def translation_count(model: Any, joint: int) -> int:
-    """How many of the velocity coordinates of a joint are lengths; they come before its angles."""
+    """Count the velocity coordinates of a joint that are lengths; they precede its angles."""
     name = model.joints[joint].shortname()
     if name != MIMIC:
         return TRANSLATIONS.get(name, 0)
@@ -123,7 +128,7 @@ def translation_count(model: Any, joint: int) -> int:
 
 
 def max_lever_arm(model: Any, joint_radius: Array) -> float:
-    """Largest distance that any point of a body can ever have from a joint that turns it [m].
+    """Bound the distance of any point of a body from a joint that turns it [m].
 
     Lengths of the links in between, one after the other, with what joints can slide; infinite where one can slide
     without a limit.
@@ -148,7 +153,10 @@ def max_lever_arm(model: Any, joint_radius: Array) -> float:
 
 
 def support_masks(model: Any) -> Array:
-    """Which columns of the world Jacobian move which joint: (njoints, e) of 0 and 1, row 0 (the world) all 0."""
+    """Return which columns of the world Jacobian move which joint (njoints, e).
+
+    Entries are 0 and 1; row 0, the world, is all 0.
+    """
     mask = np.zeros((model.njoints, model.nvExtended))
     for joint in range(1, model.njoints):
         for ancestor in list(model.supports[joint])[1:]:  # without the world, which supports everything

@@ -39,7 +39,7 @@ class JointBounds:
     """(nv,) largest jerk [rad/s³ or m/s³], infinite where there is none."""
 
     def within(self, config: Limits) -> JointBounds:
-        """The share of the limits that a scenario allows to be used.
+        """Return the part of the limits that a scenario allows to be used.
 
         Raises:
             ConfigError: a coordinate has a jerk limit, and none of its acceleration.
@@ -59,7 +59,9 @@ class JointBounds:
         )
 
     def outside(self, q: Array, names: Sequence[str], units: Sequence[str]) -> tuple[Reason, ...]:
-        """List which coordinates are outside their position limits, and how far, negative below the lower one.
+        """List the coordinates outside their position limits.
+
+        The amount is negative below the lower limit.
 
         Args:
             q: configuration (nq,).
@@ -76,12 +78,12 @@ class JointBounds:
 
 
 def _or(limits: Array, default: float | None) -> Array:
-    """The limits (nv,) of a robot, and what a scenario gives to the coordinates that have none."""
+    """Return the limits (nv,) of a robot, with a default where it has none."""
     return np.where(np.isfinite(limits), limits, np.inf if default is None else default)
 
 
 def limit_layout(joints: JointBounds, position_gain: float, dt: float) -> dict[str, Any]:
-    """Arrays of the bounds lower <= v <= upper, as `RowLayout` has them.
+    """Make the arrays of the bounds lower <= v <= upper, as `RowLayout` has them.
 
     The bounds keep the next configuration inside its limits. A joint without an acceleration limit uses at most a
     share `position_gain` of what is left to a position limit in one tick; a joint with one keeps to the speeds from
@@ -122,7 +124,7 @@ def limit_layout(joints: JointBounds, position_gain: float, dt: float) -> dict[s
 
 
 def saturate(v: Array, lower: Array, upper: Array, v_max: Array) -> tuple[Array, float]:
-    """Brings a raw velocity within the limits.
+    """Scale, then clip a raw velocity to the limits.
 
     First one factor for all joints, so that the direction is kept while only speeds are exceeded; then each joint
     is clipped to what its position limit leaves.

@@ -34,7 +34,9 @@ def model_of_mjcf(mjcf: Path, root: Any) -> Any:
 
 
 def shapes_of_mjcf(mjcf: Path, root: ET.Element, model: Any, visual: bool) -> Any:
-    """Geometry model of the geoms that collide (contype or conaffinity is not 0), or that are meant to be seen.
+    """Read the geoms that collide, or the visual ones, into a geometry model.
+
+    A geom collides if its contype or conaffinity is not 0.
 
     What the file fixes to its world (a floor) is no part of the robot and left out.
 
@@ -56,7 +58,7 @@ def shapes_of_mjcf(mjcf: Path, root: ET.Element, model: Any, visual: bool) -> An
 
 
 def check_elements(mjcf: Path, root: ET.Element) -> None:
-    """Makes sure that an MJCF has no element that Pinocchio passes over.
+    """Check that an MJCF has no element that Pinocchio passes over.
 
     Raises:
         ConfigError: naming it.
@@ -83,6 +85,6 @@ def _check_every_geom(mjcf: Path, root: ET.Element, model: Any, geometries: Any)
 
 
 def _geoms(root: ET.Element) -> Iterator[tuple[str, int]]:
-    """Name of every body, and how many geoms it has."""
+    """Yield the name of every body and the number of its geoms."""
     for body in root.iterfind("worldbody//body"):
         yield body.get("name", ""), len(body.findall("geom"))

@@ -51,7 +51,7 @@ class Note:
     """Of a pair: share of random configurations in which it touches [-]; None where that was not looked at."""
 
     def __str__(self) -> str:
-        """One line: kind, names, clause, remedy."""
+        """Return one line: kind, names, clause, remedy."""
         names = " - ".join(self.subject) if self.kind is NoteKind.PAIR else abbreviate(self.subject)
         remedy = f"; {self.remedy}" if self.remedy else ""
         return f"{self.kind.value} {names}: {self.what}{remedy}"
@@ -66,13 +66,16 @@ _PACKAGE = __name__.partition(".")[0]
 
 
 def abbreviate(names: Sequence[str], most: int = 6) -> str:
-    """The first names of a list, and how many more there are."""
+    """Join the first names of a list, with the number of further ones."""
     suffix = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + suffix
 
 
 def merge_notes(notes: Iterable[Note]) -> list[Note]:
-    """Notes with one for all that say the same of different subjects, in the order of the first; pairs stay apart."""
+    """Merge the notes that differ in their subjects alone, in the order of the first.
+
+    Notes of pairs are not merged.
+    """
     subjects: dict[Note, list[str]] = {}
     for note in notes:
         key = note if note.kind is NoteKind.PAIR else replace(note, subject=())
@@ -95,7 +98,7 @@ def issue_warning(notes: Iterable[Note], where: str) -> None:
 
 
 def _levels_to_caller() -> int:
-    """How many frames above `issue_warning` the first one outside this package is."""
+    """Count the frames from `issue_warning` up to the first one outside this package."""
     frame, levels = sys._getframe(1), 1
     while frame.f_back is not None and str(frame.f_globals.get("__name__", "")).partition(".")[0] == _PACKAGE:
         frame, levels = frame.f_back, levels + 1

@@ -20,7 +20,9 @@ _HEAD = 100_000
 
 
 def absolute_entries(entries: Iterable[str], folder: Path) -> list[str]:
-    """Entries of `package_dirs` with relative folders counted from that of the file that names them.
+    """Make the folders of `package_dirs` absolute.
+
+    Relative ones are counted from the folder of the file that names them.
 
     Args:
         entries: folders that hold packages, or `NAME=FOLDER`.
@@ -34,7 +36,9 @@ def absolute_entries(entries: Iterable[str], folder: Path) -> list[str]:
 
 
 def mesh_folders(urdf: Path, entries: Iterable[str]) -> list[str]:
-    """Where `package://` is looked up, in order: what is given, above the file, example-robot-data, ROS_PACKAGE_PATH.
+    """List the folders in which `package://` is looked up, in order.
+
+    The given ones, those above the file, example-robot-data, and ROS_PACKAGE_PATH.
 
     Packages whose package.xml has another name than their folder stand there as `NAME=FOLDER`: the one that the file
     is in, those beside it, and those in the given folders and along ROS_PACKAGE_PATH.
@@ -57,7 +61,9 @@ def mesh_folders(urdf: Path, entries: Iterable[str]) -> list[str]:
 
 
 def find_mesh(name: str, entries: Iterable[str]) -> str | None:
-    """The file of a name such as `package://NAME/meshes/a.stl`, `file:///a.stl` or `meshes/a.stl`; None if absent.
+    """Find the file of a mesh name; None if it is absent.
+
+    Names are such as `package://NAME/meshes/a.stl`, `file:///a.stl` or `meshes/a.stl`.
 
     Args:
         name: as a URDF has it.
@@ -79,7 +85,7 @@ def find_mesh(name: str, entries: Iterable[str]) -> str | None:
 
 
 def find_package(name: str, entries: Iterable[str]) -> str | None:
-    """The folder of a package, or None.
+    """Find the folder of a package; None if it is absent.
 
     Args:
         name: of the package.
@@ -95,7 +101,7 @@ def find_package(name: str, entries: Iterable[str]) -> str | None:
 
 
 def _split(entry: str, folder: Path = Path()) -> tuple[str, str]:
-    """Name of a package, or nothing, and folder of an entry."""
+    """Split an entry into the name of a package, or nothing, and a folder."""
     match = _ENTRY.fullmatch(entry)
     if match is None or os.path.isdir(folder / entry):
         return "", entry
@@ -103,7 +109,7 @@ def _split(entry: str, folder: Path = Path()) -> tuple[str, str]:
 
 
 def _with_manifest(holder: str) -> Iterator[str]:
-    """A folder and those in it that have a package.xml."""
+    """Yield a folder and those in it that have a package.xml."""
     try:
         inside = sorted(os.listdir(holder))[:_MOST_BESIDE]
     except OSError:
@@ -114,7 +120,10 @@ def _with_manifest(holder: str) -> Iterator[str]:
 
 
 def _manifest_name(folder: str) -> str:
-    """Name that a package.xml gives, or nothing: by its text, since whatever else is in it does not matter here."""
+    """Read the name that a package.xml gives, or nothing.
+
+    By its text: nothing else in the file matters here.
+    """
     try:
         with open(os.path.join(folder, _MANIFEST), encoding="utf-8", errors="replace") as file:
             match = _NAME.search(re.sub(r"<!--.*?-->", "", file.read(_HEAD), flags=re.DOTALL))

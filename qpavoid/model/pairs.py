@@ -16,7 +16,7 @@ from qpavoid.problem import Array, IntArray, Mask
 
 
 def add_self_pairs(model: Any, bodies: Any, disabled: Iterable[tuple[str, str]], origin: str) -> None:
-    """Adds every pair of bodies to `bodies` that is not rigidly connected, adjacent or disabled.
+    """Add every pair of bodies that is not rigidly connected, adjacent or disabled.
 
     Args:
         model: pinocchio model.
@@ -62,7 +62,7 @@ class TouchingPair(NamedTuple):
     """Share of random configurations in which they touch [-]."""
 
     def note(self) -> Note:
-        """Say that the pair is not checked."""
+        """Return a note that the pair is not checked."""
         clause = f"not checked: its bodies touch in {100.0 * self.share:.0f} % of random configurations"
         return Note(NoteKind.PAIR, (self.a, self.b), clause, share=self.share)
 
@@ -97,7 +97,7 @@ def drop_always_touching(model: Any, bodies: Any, joints: JointBounds, samples: 
 
 
 def _turns(model: Any) -> Array:
-    """(nv,) 1 for coordinates that move, 0 for joints whose range is a point."""
+    """Return 1 for coordinates that move, 0 for joints whose range is a point (nv,)."""
     turns = np.ones(model.nv)
     for joint in list(model.joints)[1:]:
         if joint.nq == joint.nv == 1 and model.lowerPositionLimit[joint.idx_q] == model.upperPositionLimit[joint.idx_q]:
@@ -106,7 +106,7 @@ def _turns(model: Any) -> Array:
 
 
 def find_contacts(model: Any, bodies: Any, poses: Sequence[Array], at_least: float = 0.0) -> Mask:
-    """Find in which configurations the bodies of each pair touch (k, m).
+    """Find the configurations in which the bodies of each pair touch (k, m).
 
     Args:
         model: pinocchio model.
@@ -131,5 +131,5 @@ def find_contacts(model: Any, bodies: Any, poses: Sequence[Array], at_least: flo
 
 
 def pair_array(bodies: Any) -> IntArray:
-    """(m, 2) indices of the bodies of each pair."""
+    """Return the indices of the bodies of each pair (m, 2)."""
     return np.array([(p.first, p.second) for p in bodies.collisionPairs], dtype=np.intp).reshape(-1, 2)

@@ -18,7 +18,7 @@ _MILLIMETRES = 'if it is in millimetres give it scale="0.001 0.001 0.001"'
 
 
 def note_implausible_sizes(model: Any, pieces: Any, notes: list[Note]) -> None:
-    """Adds notes of shapes and joint offsets of more than 20 m, and of meshes of less than 1 mm.
+    """Note shapes and joint offsets of more than 20 m, and meshes of less than 1 mm.
 
     Args:
         model: Pinocchio model.

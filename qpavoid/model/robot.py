@@ -71,7 +71,7 @@ class Robot:
         packages: Mapping[str, str | Path] | None = None,
         **fields: Any,
     ) -> Robot:
-        """The robot of a shipped name, a robot.yaml, a URDF (also in xacro) or an MJCF (`.xml`).
+        """Load a robot: a shipped name, a robot.yaml, a URDF (also in xacro) or an MJCF.
 
         What of it was left out, mended, replaced or assumed is in its `notes`, and the serious part in one
         `RobotWarning`.
@@ -96,7 +96,7 @@ class Robot:
 
     @classmethod
     def from_config(cls, config: RobotConfig, path: Path) -> Robot:
-        """A robot from what a robot.yaml says.
+        """Build a robot from the fields of a robot.yaml.
 
         Args:
             config: its fields.
@@ -109,7 +109,7 @@ class Robot:
 
     @classmethod
     def from_urdf(cls, path: str | Path, **fields: Any) -> Robot:
-        """A robot from a bare URDF or MJCF.
+        """Build a robot from a bare URDF or MJCF.
 
         Args:
             path: the file.
@@ -144,11 +144,14 @@ class Robot:
         return units
 
     def safety_distance(self, a: str, b: str, d1: float) -> float:
-        """Safety distance of two of its bodies where that of the scenario is d1 [m]."""
+        """Return the safety distance of two of its bodies [m].
+
+        It is d1, the scenario's, unless the pair has a smaller one.
+        """
         return min(d1, self.margins.get(frozenset((a, b)), d1))
 
     def bounds(self) -> JointBounds:
-        """Joint limits in tangent space; see `joint_bounds`."""
+        """Return the joint limits in tangent space; see `joint_bounds`."""
         acceleration, jerk = (
             np.array([limits.get(name, np.inf) for name, joint in self._joints() for _ in range(joint.nv)])
             for limits in (self.acceleration, self.jerk)
@@ -156,7 +159,7 @@ class Robot:
         return replace(joint_bounds(self.model), acceleration=acceleration, jerk=jerk)
 
     def configuration(self, values: Sequence[float] | Mapping[str, float], where: str) -> Array:
-        """A full configuration from a scenario's `q0`.
+        """Return the full configuration of a scenario's `q0`.
 
         Args:
             values: all nq numbers, or joint: value over the home pose.
@@ -189,7 +192,7 @@ class Robot:
         return frame_index(self.model, name)
 
     def lock(self, patterns: Sequence[str], q: Array, where: str) -> tuple[Robot, Array]:
-        """The robot with some joints held where they are, as if they were fixed.
+        """Return the robot with some joints fixed at a configuration.
 
         Args:
             patterns: joint names; `*` and `?` match as in file names.
@@ -209,7 +212,9 @@ class Robot:
         return replace(self, model=model, bodies=bodies, home=self.home[index]), q[index]
 
     def matching(self, patterns: Sequence[str], where: str) -> list[str]:
-        """Joints whose names match one of some patterns, in their order; `*` and `?` match as in file names.
+        """List the joints that match some patterns, in their order.
+
+        `*` and `?` match as in file names.
 
         Raises:
             UnknownName: a pattern without a joint.
@@ -231,7 +236,7 @@ _MOST_BODIES = 300
 
 
 def _fields_of_urdf(path: Path) -> dict[str, Any]:
-    """Fields of the robot.yaml that a bare URDF or MJCF stands for."""
+    """Return the fields of the robot.yaml that a bare URDF or MJCF stands for."""
     return {"name": Path(path.name.removesuffix(".xacro")).stem, "urdf": path.name}
 
 
@@ -277,7 +282,7 @@ def _build(config: RobotConfig, path: Path) -> Robot:
 
 
 def _end_effectors(model: Any, frames_of_config: Sequence[str], path: Path, notes: list[Note]) -> tuple[str, ...]:
-    """The frames that are given as end effectors, or those at the ends of the limbs."""
+    """Return the listed end effectors, or those at the ends of the limbs."""
     for name in frames_of_config:
         if not model.existFrame(name):
             frames = [f.name for f in model.frames]

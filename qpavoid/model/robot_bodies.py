@@ -59,7 +59,7 @@ def robot_bodies(config: RobotConfig, urdf: Path, model: Any, path: Path, notes:
 
 
 def _hulls(configs: Sequence[Body], read: Callable[[], Any], path: Path) -> dict[str, Any]:
-    """Hulls of the pieces of geometry that bodies name."""
+    """Make the hulls of the pieces of geometry that bodies name."""
     indices = {body.shape.geometry: index for index, body in enumerate(configs) if isinstance(body.shape, Hull)}
     if not indices:
         return {}
@@ -101,7 +101,7 @@ def _in_link(body: Any, model: Any) -> Any:
 
 
 def pair_margins(config: RobotConfig, bodies: Any, path: Path) -> dict[frozenset[str], float]:
-    """Safety distances of pairs of bodies [m]."""
+    """Return the safety distances of pairs of bodies that have one of their own [m]."""
     names = [body.name for body in bodies.geometryObjects]
     for index, own in enumerate(config.pair_margins):
         for name in own.bodies:

@@ -53,7 +53,9 @@ class Obstacle:
         graspable: bool = False,
         external: bool = False,
     ) -> Obstacle:
-        """An obstacle that stays, unless the program that steps the controller says where it is.
+        """Make an obstacle at a pose.
+
+        It stays there unless the program that steps the controller updates its pose.
 
         Args:
             name: by which pairs, logs and `Controller.step(obstacles=…)` know it.
@@ -109,7 +111,7 @@ class Scene:
         return [obstacle.name for obstacle in self.obstacles]
 
     def slack(self, hold: float) -> Array:
-        """By how much the safety distance of each pair is less than that of the scenario (m,) [m].
+        """Return how much smaller each pair's safety distance is than the scenario's (m,) [m].
 
         Args:
             hold: safety distance of the scenario, between surfaces [m].
@@ -124,7 +126,7 @@ class Scene:
 
 
 def build_scene(robot: Robot, obstacles: Sequence[Obstacle] = ()) -> Scene:
-    """Lays out the pairs of a robot with itself and with every obstacle.
+    """Lay out the pairs of a robot with itself and with every obstacle.
 
     Args:
         robot: the robot with its own pairs.
@@ -193,7 +195,7 @@ def build_scene(robot: Robot, obstacles: Sequence[Obstacle] = ()) -> Scene:
 
 
 def _without_cylinders_among_spheres(geometry: Any) -> None:
-    """Where there are cylinders, spheres become capsules of no length.
+    """Replace spheres by capsules of no length where there are cylinders.
 
     coal 3.0 has a formula of its own for spheres and cylinders, which is wrong by centimetres once the centre of the
     sphere is inside; for capsules it iterates.
@@ -218,7 +220,7 @@ def _points(shape: config.PointCloud, folder: Path, where: str) -> Voxels:
 
 
 def build_obstacles(configs: Sequence[config.ObstacleConfig], source: Path) -> list[Obstacle]:
-    """Obstacles of a scenario.
+    """Build the obstacles of a scenario.
 
     Args:
         configs: the scenario's `obstacles`.

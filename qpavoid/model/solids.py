@@ -28,7 +28,7 @@ _THINNEST = 1e-4
 
 
 def make_solids(shape: ObstacleShape, folder: Path, where: str) -> list[Any]:
-    """coal geometries, all in the obstacle's own frame.
+    """Make the coal geometries of an obstacle, all in the obstacle's own frame.
 
     Args:
         shape: of a point cloud, the ball that stands for one of its voxels.
@@ -65,7 +65,7 @@ def make_solids(shape: ObstacleShape, folder: Path, where: str) -> list[Any]:
 
 
 def read_mesh(shape: Mesh, folder: Path, where: str) -> Any:
-    """The triangle mesh of a file, as coal has it.
+    """Read a triangle mesh from a file into a coal geometry.
 
     Raises:
         ConfigError: no such file, too large, not a mesh, or corners that are no numbers.
@@ -93,7 +93,10 @@ def corners(mesh: Any) -> tuple[Array, IntArray]:
 
 
 def surface_triangles(geometry: Any) -> Array:
-    """Triangles (t, 3, 3) of a mesh or a hull, looking outwards as far as the file's do."""
+    """Return the triangles (t, 3, 3) of a mesh or a hull.
+
+    They face outwards as far as the file's do.
+    """
     if isinstance(geometry, coal.BVHModelBase):
         vertices, triangles = corners(geometry)
         return np.asarray(vertices[triangles])
@@ -107,7 +110,10 @@ def surface_triangles(geometry: Any) -> Array:
 
 
 def hull_of(points: Array) -> Any:
-    """coal's convex hull of points (n, 3); what is flat becomes 0.1 mm thick."""
+    """Make coal's convex hull of points (n, 3).
+
+    A flat set of points becomes 0.1 mm thick.
+    """
     axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
     for axis in axes:
         if np.ptp(points @ axis) < _THINNEST:

@@ -55,7 +55,7 @@ class Sample(NamedTuple):
         t: float | None = None,
         at_rest: bool = False,
     ) -> Sample:
-        """Make read-only copies of what is given, checked; identity and zero for what is not.
+        """Make a sample of read-only copies; what is left out is the identity, or zero.
 
         Raises:
             NumericalError: an entry has the wrong shape, or holds what is not a finite number.
@@ -186,7 +186,10 @@ def build_motion(config: MotionConfig, start: Sample | None = None, folder: Path
 
 
 def rpy_to_matrix(rpy: ArrayLike) -> Array:
-    """R (3, 3) = Rz(yaw) Ry(pitch) Rx(roll), from (roll, pitch, yaw) about fixed axes x, y, z [rad]."""
+    """Return R (3, 3) = Rz(yaw) Ry(pitch) Rx(roll).
+
+    Roll, pitch and yaw [rad] turn about the fixed axes x, y, z.
+    """
     matrix: Array = pin.rpy.rpyToMatrix(np.asarray(rpy, dtype=float))
     return matrix
 

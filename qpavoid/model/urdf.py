@@ -32,7 +32,7 @@ _ROOT_JOINTS = {
 
 
 def find_resource(value: str, folder: Path, where: str) -> Path:
-    """A URDF, SRDF or mesh that a file names.
+    """Find a URDF, SRDF or mesh that a file names.
 
     Args:
         value: path relative to the file, or `example-robot-data:PATH`.
@@ -51,7 +51,10 @@ def find_resource(value: str, folder: Path, where: str) -> Path:
 
 @contextmanager
 def _quiet_stderr() -> Iterator[list[str]]:
-    """Catches what C++ parsers print on the process's error stream, so that one line can say it instead."""
+    """Catch what C++ parsers print on the process's error stream.
+
+    One line of an error can then say it instead.
+    """
     lines: list[str] = []
     sys.stderr.flush()
     stderr_copy = os.dup(2)
@@ -67,12 +70,12 @@ def _quiet_stderr() -> Iterator[list[str]]:
 
 
 def is_mjcf(path: Path) -> bool:
-    """Whether a robot's file is an MJCF, by its name."""
+    """Return True if a robot's file is an MJCF, by its name."""
     return path.suffix == ".xml"
 
 
 def read_model(urdf: Path, root_joint: str, notes: list[Note] | None = None) -> Any:
-    """Pinocchio model of a URDF (also in xacro) or MJCF.
+    """Read the Pinocchio model of a URDF (also in xacro) or MJCF.
 
     Joints that mimic another one have no coordinate of their own. Where Pinocchio cannot read them so (they come before
     the other one in the tree, or turn all the way round where that has limits), they move on their own.
@@ -135,7 +138,10 @@ def _mimics(joint: ET.Element) -> bool:
 
 
 def _reason(error: Exception) -> str:
-    """The last part of what pinocchio says: before it comes where in its own source it was said."""
+    """Return the last part of a message of Pinocchio's.
+
+    What precedes it is a place in its own source.
+    """
     if isinstance(error, IndexError):  # of a look-up in C++, without a name
         return "it refers to a class, mesh or other name that it does not define"
     return " ".join(str(error).split()).rpartition("message: ")[2].rstrip(".")
@@ -152,7 +158,7 @@ def read_pieces(
     allow_missing: bool = False,
     enclosed: bool = False,
 ) -> Any:
-    """Collision geometry of a URDF or MJCF; of links without any, what is meant to be seen of them.
+    """Read the collision geometry of a URDF or MJCF; visual geometry of links without any.
 
     A shape that lies inside another one of its link is left out: nothing can touch it.
 
@@ -179,7 +185,7 @@ def read_pieces(
 def _add_visuals(
     pieces: Any, urdf: Path, model: Any, package_dirs: Sequence[str], path: Path, notes: list[Note], allow_missing: bool
 ) -> None:
-    """Adds what is meant to be seen of the links that have no collision geometry."""
+    """Add the visual geometry of the links that have no collision geometry."""
     links_with_collision = {piece.parentFrame for piece in pieces.geometryObjects}
     if is_mjcf(urdf):
         visual_model = read_collision(urdf, model, package_dirs, path, visual=True)
@@ -209,7 +215,7 @@ def read_collision(
     notes: list[Note] | None = None,
     allow_missing: bool = False,
 ) -> Any:
-    """Collision geometry of a URDF or MJCF, meshes as they are.
+    """Read the collision geometry of a URDF or MJCF, meshes as they are.
 
     What an MJCF fixes to its world (a floor) is no part of the robot and left out.
 
@@ -239,7 +245,7 @@ def read_collision(
 
 
 def mesh_names(urdf: Path, tag: str = "") -> list[str]:
-    """Names of the mesh files of a URDF or MJCF, each once.
+    """List the mesh files of a URDF or MJCF, each once.
 
     Args:
         urdf: the file.
@@ -253,7 +259,7 @@ def mesh_names(urdf: Path, tag: str = "") -> list[str]:
 
 
 def apply_srdf(model: Any, bodies: Any, srdf: Path) -> None:
-    """Removes the pairs that an SRDF disables.
+    """Remove the pairs that an SRDF disables.
 
     Args:
         model: pinocchio model.

@@ -37,7 +37,7 @@ _TURNING = ("revolute", "continuous", "prismatic", "planar")
 
 
 def check_urdf(path: Path) -> None:
-    """Reads a URDF and says what is wrong with it.
+    """Check a URDF before Pinocchio reads it.
 
     Raises:
         ConfigError: naming file, link or joint, element and remedy.
@@ -65,7 +65,7 @@ def check_urdf(path: Path) -> None:
 
 
 def check_mjcf(path: Path) -> None:
-    """Reads an MJCF and says what is wrong with it.
+    """Check an MJCF before Pinocchio reads it.
 
     Raises:
         ConfigError: naming file, element and remedy.
@@ -113,7 +113,7 @@ def _named(root: ET.Element, tag: str) -> dict[str, ET.Element]:
 
 
 def _check_tree(links: dict[str, ET.Element], joints: dict[str, ET.Element]) -> None:
-    """Every link but one has one joint above it, and all hang from that one."""
+    """Check that every link but one has one joint above it, and that all form one tree."""
     above: dict[str, str] = {}
     for name, joint in joints.items():
         parent, child = (_end(joint, tag, name, links) for tag in ("parent", "child"))
@@ -144,7 +144,9 @@ def _end(joint: ET.Element, tag: str, name: str, links: dict[str, ET.Element]) -
 
 
 def check_numbers(part: ET.Element, owner: str) -> None:
-    """Makes sure that the numbers of an element and of those in it are finite, and none of a size negative.
+    """Check that the numbers of an element and of those in it are finite.
+
+    None of a size may be negative.
 
     Raises:
         ValueError: naming the owner, the element and the attribute.
@@ -165,7 +167,7 @@ def check_numbers(part: ET.Element, owner: str) -> None:
 
 
 def floats(text: str, where: str) -> Iterator[float]:
-    """The numbers of an attribute.
+    """Yield the numbers of an attribute.
 
     Raises:
         ValueError: one that is no number.

@@ -44,7 +44,7 @@ class Meshes:
 
 
 def links_with_shapes(root: ET.Element, tag: str) -> list[str]:
-    """Names of the links that have at least one shape.
+    """List the names of the links that have at least one shape.
 
     Args:
         root: of a URDF.
@@ -60,7 +60,7 @@ def links_with_shapes(root: ET.Element, tag: str) -> list[str]:
 def read_shapes(
     root: ET.Element, model: Any, meshes: Meshes, tag: str, links: Iterable[str] | None, notes: list[Note]
 ) -> Any:
-    """Geometry model of the shapes of a URDF.
+    """Read the shapes of a URDF into a geometry model.
 
     A shape is called by its link and its index in it, as in `hand_0`; where one element has several, the others carry
     a second index.
@@ -140,7 +140,7 @@ def _children(part: ET.Element) -> Iterator[ET.Element]:
 
 
 def _name_strays(link: ET.Element, tag: str, notes: list[Note]) -> None:
-    """Names the shapes that stand elsewhere in a link than directly below it: nothing reads them."""
+    """Note the shapes that no parser reads: those not directly below their link."""
     count = len([part for part in link.iter(tag) if part.find("geometry") is not None])
     count -= len([part for part in link.findall(tag) if part.find("geometry") is not None])
     if count and tag == "collision":
@@ -155,7 +155,7 @@ _UNSCALED = (1.0, 1.0, 1.0)
 
 
 def _make(element: ET.Element, where: str, name: str, tag: str, meshes: Meshes, notes: list[Note]) -> Made | None:
-    """The geometry of a shape element; None where it is left out."""
+    """Make the geometry of a shape element; None where the shape is left out."""
     kind = element.tag.removeprefix(DRAKE)
     if kind == "mesh":
         return _make_mesh(element, where, name, meshes, notes)
@@ -219,7 +219,10 @@ def _make_mesh(element: ET.Element, where: str, name: str, meshes: Meshes, notes
 
 
 def _pointer(path: str) -> str:
-    """What is wrong with a file that only stands for one in a store of large files; nothing of another one."""
+    """Explain a file that only stands for one in a store of large files.
+
+    Empty for any other file.
+    """
     with open(path, "rb") as file:
         if file.read(40).startswith(b"version https://git-lfs"):
             return "it is a pointer of Git LFS and no mesh; run `git lfs pull`"

@@ -20,7 +20,7 @@ _INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 def tree_xml(root: ET.Element, notes: list[Note]) -> str:
-    """A URDF without shapes, materials and elements of other tools.
+    """Write a URDF without shapes, materials and elements of other tools.
 
     The parser behind Pinocchio leaves a link at its first fault, whatever comes after it in the link: of an inertial, a
     visual, a collision. Shapes are therefore read apart from it (`read_shapes`).
@@ -41,7 +41,7 @@ def tree_xml(root: ET.Element, notes: list[Note]) -> str:
 
 
 def origin(element: ET.Element, where: str) -> Any:
-    """Placement (SE3) that the <origin> of an element says; the identity where it has none.
+    """Read the placement (SE3) of an element's <origin>; the identity where it has none.
 
     Raises:
         ValueError: not three numbers (four of a quaternion), naming the element.
@@ -62,7 +62,7 @@ def origin(element: ET.Element, where: str) -> Any:
 
 
 def vector(element: ET.Element, attribute: str, size: int, where: str, default: Sequence[float]) -> list[float]:
-    """Numbers of an attribute.
+    """Read the numbers of an attribute.
 
     Args:
         element: that has it.
@@ -87,7 +87,7 @@ def vector(element: ET.Element, attribute: str, size: int, where: str, default: 
 
 
 def joints_fixed_by_limits(root: ET.Element, notes: list[Note]) -> dict[str, float]:
-    """Joints whose lower limit is their upper one, and where that is [rad or m]: they do not move.
+    """Find the joints whose lower limit is their upper one, with that value [rad or m].
 
     Where every range of a file goes from 0 to 0, as some exporters write it unless asked for another one, it says
     nothing, and no joint is fixed; nor is one that mimics another.
@@ -110,7 +110,7 @@ def joints_fixed_by_limits(root: ET.Element, notes: list[Note]) -> dict[str, flo
 
 
 def _range(limit: ET.Element) -> tuple[float, float] | None:
-    """Lower and upper limit, 0 where one is left out; None where both are."""
+    """Read the lower and upper limit, 0 where one is left out; None where both are."""
     if limit.get("lower") is None and limit.get("upper") is None:
         return None
     lower, upper = (next(floats(limit.get(side, ""), f"limit {side}"), 0.0) for side in ("lower", "upper"))
@@ -180,7 +180,10 @@ def _add_origin(element: ET.Element, source: ET.Element, placement: Any) -> None
 
 
 def _add_limit(element: ET.Element, joint: ET.Element, notes: list[Note]) -> None:
-    """The limit of a joint, with 0 for speeds and efforts that are left out, and a range in its order."""
+    """Add the limit of a joint, its range in order.
+
+    Speeds and efforts that are left out become 0.
+    """
     name, limit = joint.get("name", ""), joint.find("limit")
     limited = joint.get("type") in _LIMITED
     if limit is None:

@@ -12,12 +12,15 @@ from qpavoid.model.packages import find_package, mesh_folders
 
 
 def is_xacro(path: Path, text: str) -> bool:
-    """Whether a robot's file has to be expanded: by its name, or since it holds elements of xacro."""
+    """Return True if a robot's file has to be expanded.
+
+    By its name, or since it holds elements of xacro.
+    """
     return path.suffix == ".xacro" or "<xacro:" in text
 
 
 def expand_xacro(path: Path) -> str:
-    """The URDF that a xacro file stands for, with the default of every argument.
+    """Expand a xacro file to a URDF, with the default of every argument.
 
     `$(find NAME)` is looked up as `package://NAME` is, then by ROS where that is installed.
 
@@ -44,7 +47,10 @@ def expand_xacro(path: Path) -> str:
 
 @contextmanager
 def _packages_found(substitution_args: Any, path: Path) -> Iterator[None]:
-    """Lets `$(find NAME)` find packages without ROS: xacro asks only its index of installed packages."""
+    """Let `$(find NAME)` find packages without ROS.
+
+    xacro asks only its own index of installed packages.
+    """
     original = substitution_args._eval_find
     entries = mesh_folders(path, [])
 

@@ -19,7 +19,7 @@ _MOST_ATTRIBUTES = 100
 
 
 def read_robot_xml(path: Path, kind: str) -> ET.Element:
-    """The root of a URDF, SRDF or MJCF; a xacro file is expanded first.
+    """Read the root of a URDF, SRDF or MJCF; a xacro file is expanded first.
 
     Names keep the prefix that they are written with (`drake:capsule`), whether the file declares it or not.
 
@@ -47,7 +47,7 @@ def read_robot_xml(path: Path, kind: str) -> ET.Element:
 
 
 def undeclared_prefixes(root: ET.Element) -> list[str]:
-    """Prefixes of elements and attributes that no xmlns attribute declares, each once."""
+    """List the prefixes that no xmlns attribute declares, each once."""
     prefixes: dict[str, None] = {}
     declared = {"xml", "xmlns"}
     for element in root.iter():
@@ -63,7 +63,7 @@ def _refuse_doctype(text: str, where: str) -> None:
 
 
 def _parse(text: str) -> ET.Element:
-    """The tree of a text; prefixes are part of the names, as the C++ parsers have it."""
+    """Parse a text; prefixes are part of the names, as the C++ parsers have it."""
     # those take every file for UTF-8, whatever it says
     parser, builder = expat.ParserCreate("utf-8"), _Builder()
     parser.StartElementHandler = builder.start

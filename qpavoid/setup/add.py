@@ -120,7 +120,7 @@ def _silent(_: str) -> None:
 def describe(
     urdf: Path, options: DescribeOptions | None = None, progress: Callable[[str], None] = _silent
 ) -> Description:
-    """Work out what a robot.yaml has to say of a URDF or MJCF.
+    """Work out the robot.yaml of a URDF or MJCF.
 
     Args:
         urdf: the file.
@@ -207,7 +207,7 @@ def _describe(urdf: Path, options: DescribeOptions, progress: Callable[[str], No
 
 
 def _semantics(srdf: Path | None, model: Any, options: DescribeOptions) -> Semantics:
-    """What an SRDF says, with the home pose that the user prefers as its first one."""
+    """Read an SRDF, with the home pose that the user prefers as its first one."""
     semantics = Semantics() if srdf is None else read_srdf(srdf)
     for name, value in options.home.items():
         if not model.existJointName(name):
@@ -225,7 +225,9 @@ def _known(pair: frozenset[str], model: Any) -> bool:
 
 
 def _assumed_speeds(model: Any, robot_model: Any) -> dict[str, float | list[float]]:
-    """Largest speeds that the robot has though its file gives none: written out, so that they can be seen and mended.
+    """List the largest speeds that the robot has and its file does not give.
+
+    They are written out, so that a user sees them and can change them.
 
     Args:
         model: as the file has it.
@@ -246,7 +248,7 @@ def _wheels(model: Any, pieces: Sequence[Piece], options: DescribeOptions) -> li
 
 
 def _notes_of_home(robot: Robot, home: Home, options: DescribeOptions) -> Iterator[Note]:
-    """Say where the home pose comes from, if it is none of the wishes, and what is wrong with it."""
+    """Yield notes on the origin of the home pose, and on what is wrong with it."""
     kind = NoteKind.HOME
     if home.clearance <= 0.0:
         remedy = (
@@ -270,7 +272,7 @@ def _notes_of_home(robot: Robot, home: Home, options: DescribeOptions) -> Iterat
 def _pieces(
     urdf: Path, model: Any, packages: Sequence[str], options: DescribeOptions, notes: list[Note]
 ) -> list[Piece]:
-    """Collision geometry; of links without any, what is meant to be seen of them."""
+    """Read the collision geometry; visual geometry of links without any."""
     geometry = read_pieces(urdf, model, packages, urdf, notes, allow_missing=options.allow_missing_meshes)
     if not geometry.ngeoms:
         clause = "has no geometry at all: nothing is checked"
@@ -288,7 +290,7 @@ def _links(
     notes: list[Note],
     progress: Callable[[str], None],
 ) -> tuple[dict[str, LinkBodies], Robot]:
-    """Bodies of every link, and the robot with them.
+    """Fit the bodies of every link, and build the robot with them.
 
     `auto` takes exact ones where capsules would be too near at home or everywhere.
     """
@@ -325,7 +327,7 @@ def _links(
 
 
 def _too_fat(robot: Robot, home: Array, seed: int) -> set[str]:
-    """Links of the pairs that are too near at the home pose, or in every one of a few random poses."""
+    """Find the links of pairs that are too near at home, or in each of a few random poses."""
     names = [body.name for body in robot.bodies.geometryObjects]
     near = [names[i] for pair in pairs_always_near(robot, _FEW, seed) for i in pair]
     near += [body for pair in robot.always_touching for body in pair[:2]]

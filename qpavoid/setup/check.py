@@ -113,7 +113,10 @@ def _report(config: RobotConfig, path: Path, progress: Callable[[str], None]) ->
 
 
 def with_hulls(robot: Robot) -> Robot:
-    """The robot with the convex hull of each triangle mesh in its place: meshes cost up to ms a pair; few run them."""
+    """Replace each triangle mesh by its convex hull.
+
+    Meshes cost up to ms a pair; few robots are run with them.
+    """
     if not triangle_meshes(robot.bodies):
         return robot
     bodies = convert_bodies(robot.bodies, "convex")
@@ -182,7 +185,7 @@ _KINDS = {
 
 
 def _joints(urdf: Path, model: Any, config: RobotConfig, whole: Any) -> list[Joint]:
-    """All joints: those that move with the limits that hold, those that are locked, and those that never moved."""
+    """List all joints: those that move, with the limits in force, locked and fixed ones."""
     followers = {name: source for name, (source, _, _) in mimics(urdf).items()}
     elements = [] if is_mjcf(urdf) else read_robot_xml(urdf, "URDF").findall("joint")
     kinds = {joint.get("name", ""): joint.get("type", "") for joint in elements}
@@ -305,7 +308,10 @@ def _look_at_home(report: Report, robot: Robot) -> None:
 
 
 def tick_time(robot: Robot, frames: Sequence[str]) -> float:
-    """Median time of a control step that holds frames where they are at home, from configurations near it [µs]."""
+    """Time a control step near the home pose; the median [µs].
+
+    Its tasks keep all end effectors where they are at home.
+    """
     known = [frame for frame in frames if robot.model.existFrame(frame)]
     tasks = build_tasks([Task(frame=frame) for frame in known], robot, robot.home)
     controller = Controller(build_scene(robot), tasks)

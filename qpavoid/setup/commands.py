@@ -88,7 +88,7 @@ def _check_lines(report: Report) -> Iterator[str]:
 
 
 def _table(notes: Sequence[Note]) -> Iterator[str]:
-    """What was left out, mended, replaced or assumed, coloured by severity."""
+    """Yield the lines of the table of notes, coloured by severity."""
     colours = {"error": "red", "warning": "yellow", "note": "dim"}
     for line in note_lines(notes):
         severity = line.partition(" ")[0]
@@ -180,7 +180,7 @@ def _values(texts: list[str]) -> dict[str, float]:
 
 
 def _entries(folders: list[Path] | None, packages: list[str] | None) -> tuple[str, ...]:
-    """Entries of `package_dirs`: packages by name first."""
+    """List the entries of `package_dirs`, packages by name first."""
     for text in packages or []:
         name, equals, folder = text.partition("=")
         if not (name and equals and folder):
@@ -257,7 +257,7 @@ class Progress:
         self._next = time.perf_counter() + _PATIENCE
 
     def __call__(self, what: str) -> None:
-        """What is done next."""
+        """Print the next step, unless a line was printed just before."""
         if time.perf_counter() >= self._next:
             ERR.print(f"{what} …", style="dim", highlight=False, markup=False, soft_wrap=True)
             self._next = time.perf_counter() + _PATIENCE

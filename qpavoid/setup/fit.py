@@ -39,7 +39,9 @@ _COARSE = 24
 
 
 def fit_piece(geometry: Any, how: Bodies, inside: float | None = None) -> tuple[CapsuleFit, ...]:
-    """Capsules that enclose a coal geometry entirely; none where its hull, or the primitive itself, is to stand for it.
+    """Fit capsules that enclose a coal geometry entirely.
+
+    None where its hull, or the primitive itself, is to stand for it.
 
     Args:
         geometry: as read from a URDF.
@@ -73,7 +75,7 @@ def fit_piece(geometry: Any, how: Bodies, inside: float | None = None) -> tuple[
 
 
 def decompose(surface: Array, whole: CapsuleFit, most: int = MAX_CAPSULES) -> tuple[CapsuleFit, ...]:
-    """Capsules that enclose a body together, fewer than `most` where more would not pay.
+    """Cover a body with capsules, fewer than `most` where more would not pay.
 
     The piece whose cut saves most is cut in two by a plane across one of its principal axes, again and again.
     Triangles are cut exactly, so that each capsule encloses the whole part of the surface on its side; what is inside
@@ -97,7 +99,10 @@ def decompose(surface: Array, whole: CapsuleFit, most: int = MAX_CAPSULES) -> tu
 
 
 def _halves(surface: Array) -> list[tuple[Array, CapsuleFit]]:
-    """The two halves with the least volume, each with its capsule; the whole where it cannot be cut."""
+    """Cut a surface into the two halves with the least volume, each with its capsule.
+
+    The whole where it cannot be cut.
+    """
     plane = _best_cut(_coarse(surface))
     halves = [] if plane is None else [cut(surface, *plane, side) for side in (-1.0, 1.0)]
     if not halves or not all(len(half) for half in halves):
@@ -106,7 +111,10 @@ def _halves(surface: Array) -> list[tuple[Array, CapsuleFit]]:
 
 
 def _fit(surface: Array) -> CapsuleFit:
-    """A small capsule around a surface: of many corners, around the outermost, and then wider by what sticks out."""
+    """Fit a small capsule around a surface.
+
+    Of many corners, around the extreme ones, then widened by what sticks out.
+    """
     points = _corners(surface)
     if len(points) <= _MANY:
         return fit_capsule(points)
@@ -122,7 +130,10 @@ _MANY, _WIDER = 500, 1.05
 
 
 def _best_cut(surface: Array) -> tuple[Array, float] | None:
-    """Normal (3,) and height [m] of the plane whose halves have the least volume; None where none cuts."""
+    """Find normal (3,) and height [m] of the plane whose halves have the least volume.
+
+    None where no plane cuts.
+    """
     points = _corners(surface)
     axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
     candidates = []
@@ -137,7 +148,10 @@ def _best_cut(surface: Array) -> tuple[Array, float] | None:
 
 
 def _coarse(surface: Array) -> Array:
-    """A surface of many triangles with its corners drawn onto a grid, without the triangles that vanish or coincide."""
+    """Coarsen a surface of many triangles: corners on a grid.
+
+    Triangles that vanish or coincide are left out.
+    """
     if len(surface) <= _FINE:
         return surface
     cell = float(np.ptp(surface.reshape(-1, 3), axis=0).max()) / _GRID
@@ -151,7 +165,9 @@ def _coarse(surface: Array) -> Array:
 
 
 def cut(surface: Array, normal: Array, height: float, side: float) -> Array:
-    """The part of a surface on one side of the plane normalᵀx = height, triangles cut at the plane (t, 3, 3).
+    """Return the part of a surface on one side of the plane normalᵀx = height (t, 3, 3).
+
+    Triangles are cut at the plane.
 
     Args:
         surface: (t, 3, 3) corners of triangles [m].
@@ -178,7 +194,10 @@ def cut(surface: Array, normal: Array, height: float, side: float) -> Array:
 
 
 def triangles(geometry: Any) -> Array:
-    """Corners of the triangles of a coal geometry's surface, of its hull where it is no mesh (t, 3, 3) [m]."""
+    """Return the triangles of a coal geometry's surface (t, 3, 3) [m].
+
+    Those of its hull where it is no mesh.
+    """
     if isinstance(geometry, coal.BVHModelBase):
         corners, index = np.array(geometry.vertices()), map(geometry.tri_indices, range(geometry.num_tris))
         return corners[np.array([(t[0], t[1], t[2]) for t in index], dtype=np.intp)]
@@ -187,7 +206,7 @@ def triangles(geometry: Any) -> Array:
 
 
 def hull_volume(geometry: Any) -> float:
-    """Volume of the convex hull of a coal geometry [m³]; 0 where it is flat."""
+    """Compute the volume of the convex hull of a coal geometry [m³]; 0 where it is flat."""
     if isinstance(geometry, coal.ShapeBase) and not isinstance(geometry, coal.ConvexBase):
         return float(geometry.computeVolume())
     try:
@@ -197,14 +216,20 @@ def hull_volume(geometry: Any) -> float:
 
 
 def inside_volume(geometry: Any) -> float:
-    """Volume of what a coal geometry encloses [m³]: of a mesh its own, not that of its hull."""
+    """Compute the volume that a coal geometry encloses [m³].
+
+    Of a mesh its own, not that of its hull.
+    """
     if isinstance(geometry, coal.BVHModelBase):
         return min(solid_volume(triangles(geometry)), hull_volume(geometry))
     return hull_volume(geometry)
 
 
 def _corners(surface: Array) -> Array:
-    """The corners of the hull of a surface, or all of its points where it is flat (n, 3)."""
+    """Return the corners of the hull of a surface (n, 3).
+
+    All of its points where it is flat.
+    """
     points = surface.reshape(-1, 3)
     try:
         return np.asarray(points[ConvexHull(points).vertices])

@@ -42,7 +42,7 @@ class Conditioning:
         return self.value / self.typical
 
     def __str__(self) -> str:
-        """One clause for people."""
+        """Return one clause for people."""
         return f"smallest singular value {self.value:.3f}, {self.ratio:.1f} times the typical one"
 
 
@@ -50,7 +50,7 @@ class Limbs:
     """Conditioning of the limbs that end at some frames."""
 
     def __init__(self, robot: Robot, frames: Sequence[str], seed: int = SEED) -> None:
-        """Find which directions each limb moves in, and how well it typically does.
+        """Find the directions that each limb moves in, and its typical conditioning.
 
         Args:
             robot: the robot.
@@ -81,14 +81,17 @@ class Limbs:
                 self._typical.append(float(values[rank - 1]))
 
     def at(self, q: Array) -> list[Conditioning]:
-        """Conditioning of each limb in a configuration (nq,)."""
+        """Compute the conditioning of each limb in a configuration (nq,)."""
         result = []
         for (frame, rows, rank), moved, typical in zip(self._frames, self.columns, self._typical, strict=True):
             result.append(Conditioning(float(self._values(frame, rows, moved, q)[rank - 1]), typical))
         return result
 
     def _jacobian(self, frame: int, q: Array) -> Array:
-        """(6, nv) of a frame's origin, along the world axes; joints that mimic others are moved by those."""
+        """Compute the Jacobian (6, nv) of a frame's origin, along the world axes.
+
+        Columns of joints that mimic others are added to theirs.
+        """
         pin.computeJointJacobians(self._model, self._data, q)
         pose = pin.updateFramePlacement(self._model, self._data, frame)
         J = self._data.J.reshape(6, -1, order="F") * self._masks[self._model.frames[frame].parentJoint]
@@ -132,13 +135,16 @@ class _Judge:
         self.need = HOME_CLEARANCE * d1
 
     def faults(self, q: Array) -> Array:
-        """Share of its needed distance that each pair lacks (m,), and of its needed conditioning each limb [-]."""
+        """Compute what each pair (m,) lacks of its distance, then each limb of its conditioning.
+
+        As a share of what is needed [-].
+        """
         deficit = np.maximum(1.0 - self.distances.all(q) / self.need, 0.0) if len(self.need) else np.zeros(0)
         deficit += _TOUCH * (deficit > 1.0)
         return np.concatenate((deficit, [max(1.0 - limb.ratio / MIN_CONDITIONING, 0.0) for limb in self.limbs.at(q)]))
 
     def movers(self, fault: int) -> BoolArray:
-        """Coordinates (nv,) that can mend a fault."""
+        """Return the coordinates (nv,) that can mend a fault."""
         pairs = len(self.need)
         return self.distances.moved_by(fault) if fault < pairs else self.limbs.columns[fault - pairs]
 
@@ -155,7 +161,7 @@ def find_home(
     pinned: Iterable[str] = (),
     seed: int = SEED,
 ) -> Home:
-    """Find a pose at which every pair has room and no limb is singular, as close to a wished one as can be.
+    """Find a pose near a preferred one with clear pairs and no singular limb.
 
     The first wish without a fault is taken. Where all have one, the worst fault of the best wish is mended by moving
     the joints that it depends on, little by little, then the next; in the end every joint that need not have moved is
@@ -183,7 +189,7 @@ def find_home(
 
 
 def _mended(robot: Robot, judge: _Judge, space: Space, start: Array, free: BoolArray, seed: int) -> Array:
-    """A pose near `start` with fewer faults, of which only free coordinates (nv,) differ."""
+    """Find a pose near `start` with fewer faults; only free coordinates (nv,) differ."""
     random, q, evaluations = np.random.default_rng(seed), start, 0
     faults, is_unfixable = judge.faults(q), np.zeros(len(judge.faults(q)), dtype=bool)
     while evaluations < _PATIENCE and np.any(faults[~is_unfixable] > 0.0):
@@ -205,7 +211,7 @@ def _mended(robot: Robot, judge: _Judge, space: Space, start: Array, free: BoolA
 
 
 def _nearer(robot: Robot, judge: _Judge, space: Space, q: Array, start: Array) -> Array:
-    """The pose nearest to where it started on the straight way there that has no more faults than q."""
+    """Move back towards `start` on the straight line as long as no fault is added."""
     step, total = np.asarray(pin.difference(robot.model, start, q)), judge.faults(q).sum()
     for part in np.linspace(0.05, 0.95, 19):
         candidate = space.move(start, np.round(part * step, _DIGITS))
@@ -215,7 +221,7 @@ def _nearer(robot: Robot, judge: _Judge, space: Space, q: Array, start: Array) -
 
 
 def _put_back(robot: Robot, judge: _Judge, q: Array, start: Array) -> Array:
-    """The pose with every joint where it started that need not have moved."""
+    """Restore every joint of `start` whose move was not needed."""
     total = judge.faults(q).sum()
     for joint in list(robot.model.joints)[1:]:
         part = slice(joint.idx_q, joint.idx_q + joint.nq)

@@ -34,7 +34,7 @@ _GRID = 250
 
 
 def bodies_picture(description: Description) -> bytes:
-    """A PNG of the robot at its home pose, sealed.
+    """Draw the robot at its home pose: a PNG, sealed.
 
     Args:
         description: what `robot add` worked out.
@@ -69,7 +69,10 @@ def bodies_picture(description: Description) -> bytes:
 
 
 def _paint(ax: Any, layers: list[tuple[Array, str]], opacity: float, towards: Array, order: int) -> None:
-    """Draws solid faces, or of translucent ones those that face the viewer (meshes may be inside out)."""
+    """Draw solid faces; of translucent ones those that face the viewer.
+
+    Meshes may be inside out.
+    """
     faces = np.concatenate([layer for layer, _ in layers])
     colours = np.concatenate([shade(layer, colour, towards) for layer, colour in layers])
     front = (normals(faces) @ towards > 0.0) | (opacity == 1.0)
@@ -79,7 +82,10 @@ def _paint(ax: Any, layers: list[tuple[Array, str]], opacity: float, towards: Ar
 
 
 def _surfaces(description: Description) -> tuple[Array, Array, Array]:
-    """Quadrilaterals (m, 4, 3) of the geometry, of capsules and spheres, and of exact bodies, at home [m]."""
+    """Return quadrilaterals (m, 4, 3) of geometry, capsules and exact bodies at home [m].
+
+    Spheres count as capsules.
+    """
     robot = description.robot
     data = robot.model.createData()
     pin.framesForwardKinematics(robot.model, data, robot.home)
@@ -132,7 +138,10 @@ def _as_quads(corners: Array) -> Array:
 
 
 def _coarser(faces: Array, cell: float) -> Array:
-    """Faces with corners drawn onto a grid, without those that vanish or are there twice: enough for a picture."""
+    """Coarsen faces for a picture: corners on a grid.
+
+    Faces that vanish or coincide are left out.
+    """
     if not len(faces):
         return faces
     index = np.round(faces / cell).astype(np.int64)

@@ -26,7 +26,10 @@ _DIGITS = 5
 
 
 def home_candidates(robot: Robot, semantics: Semantics) -> list[Array]:
-    """Named poses of the SRDF, then the middle of the joints' ranges; rounded, and within the limits."""
+    """List candidate home poses: those of the SRDF, then the middle of the ranges.
+
+    They are rounded, and within the limits.
+    """
     states: list[Mapping[str, float]] = [*semantics.states.values(), {}]
     return [_posed(robot.model, robot.home, state) for state in states]
 
@@ -45,7 +48,7 @@ def _posed(model: Any, q: Array, state: Mapping[str, float]) -> Array:
 
 
 def joint_values(model: Any, q: Array) -> dict[str, float]:
-    """Position of every joint that one number describes [rad or m]."""
+    """Return the position of every joint that one number describes [rad or m]."""
     values = {}
     for name, joint in zip(list(model.names)[1:], list(model.joints)[1:], strict=True):
         if joint.nq == 1:
@@ -63,7 +66,9 @@ def joint_locks(
     notes: list[Note],
     wheels: Sequence[str] = (),
 ) -> dict[str, float]:
-    """Joints that are held, and where: those the user names, wheels, and joints that could not follow another one.
+    """Find the joints to lock, with their positions.
+
+    Those that the user names, wheels, and joints that could not follow another one.
 
     A joint that mimics another one follows it without a coordinate of its own, and the other one stays free. Where
     Pinocchio cannot read the two so, they would move on their own, which they cannot, and both are held.
@@ -103,7 +108,7 @@ def joint_locks(
 
 
 def mimics(urdf: Path) -> dict[str, tuple[str, float, float]]:
-    """Joint: the one that it follows, multiplier and offset."""
+    """Read the mimic joints: the joint that each follows, multiplier and offset."""
     if is_mjcf(urdf):
         return {}
     result: dict[str, tuple[str, float, float]] = {}

@@ -35,7 +35,10 @@ class UncheckedLinks:
     """The same of the file's own geometry, meshes as they are [-]."""
 
     def note(self) -> Note | None:
-        """Say what may matter of it; None of what never touches, or always does as neighbours do."""
+        """Return a note of what may matter.
+
+        None of pairs that never touch, or always do as neighbours do.
+        """
         share, kind = self.geometry, NoteKind.PAIR
         if self.reason == "always" and share < ALWAYS_TOUCHING:
             bodies = 100.0 * (self.bodies or 0.0)
@@ -62,7 +65,7 @@ def _pairs(robot: Robot) -> list[frozenset[str]]:
 def pair_reasons(
     bare: Robot, robot: Robot, pair_samples: PairSamples, is_nested: BoolArray
 ) -> dict[frozenset[str], Reason]:
-    """Why each pair of bodies that is not checked is not.
+    """Explain why each pair of bodies that is not checked is not.
 
     Args:
         bare: the robot without an SRDF.
@@ -96,7 +99,7 @@ _WHY = {"adjacent": "Adjacent", "always": "Default", "never": "Never", "drawn in
 def by_link(
     robot: Robot, reasons: Mapping[frozenset[str], Reason]
 ) -> tuple[dict[frozenset[str], Reason], list[tuple[str, str]]]:
-    """What is not checked, by links where that says it all, and by bodies where it does not."""
+    """Sort unchecked pairs: by links where that describes them, else by bodies."""
     link = _links(robot)
     pairs: dict[frozenset[str], list[Reason | None]] = {}
     names = list(link)
@@ -117,7 +120,7 @@ def by_link(
 
 
 def srdf_reason(reason: Reason) -> str:
-    """The reason as an SRDF gives it."""
+    """Return the reason as an SRDF gives it."""
     return _WHY.get(reason, "User")
 
 
@@ -131,7 +134,7 @@ def measure_unchecked(
     disabled: Mapping[frozenset[str], Reason],
     shares: Mapping[frozenset[str], float],
 ) -> list[UncheckedLinks]:
-    """Look how often the geometry of links that are not checked touches, in random configurations.
+    """Sample how often the geometry of links that are not checked touches.
 
     Args:
         robot: with its pairs.
@@ -153,7 +156,9 @@ def measure_unchecked(
 
 
 def find_unchecked(robot: Robot, pieces: Sequence[Piece]) -> list[UncheckedLinks]:
-    """The links of a robot as it loads of which no pair of bodies is checked, and how often their geometry touches.
+    """Find the links of a robot of which no pair of bodies is checked.
+
+    Also how often their geometry touches.
 
     Args:
         robot: with its pairs.
@@ -175,7 +180,9 @@ def find_unchecked(robot: Robot, pieces: Sequence[Piece]) -> list[UncheckedLinks
 def geometry_contacts(
     robot: Robot, pieces: Sequence[Piece], links: Iterable[frozenset[str]]
 ) -> dict[frozenset[str], float]:
-    """Share of random configurations in which the geometry of two links touches; pairs that never move are left out.
+    """Sample how often the geometry of two links touches, as a share [-].
+
+    Pairs that never move relative to each other are left out.
 
     Args:
         robot: whose model moves the links.
@@ -206,19 +213,22 @@ def geometry_contacts(
 
 
 def shares_of_contact(robot: Robot, pair_samples: PairSamples) -> dict[frozenset[str], float]:
-    """Two bodies: share of random configurations in which they touch [-], of pairs that were sampled."""
+    """Return the share of configurations in which each pair touches [-].
+
+    Only of pairs that were sampled.
+    """
     shares = dict(zip(_pairs(robot), pair_samples.contact.tolist(), strict=True))
     return {**shares, **{frozenset((pair.a, pair.b)): pair.share for pair in robot.always_touching}}
 
 
 def own_margins(robot: Robot, d1: Array) -> list[PairMargin]:
-    """Safety distances (m,) of the pairs that get one of their own."""
+    """Return the pairs with a safety distance of their own, from that of each pair (m,)."""
     bodies = [sorted(pair) for pair in _pairs(robot)]
     return [PairMargin(bodies=(a, b), d1=float(own)) for (a, b), own in zip(bodies, d1, strict=True) if own < D1]
 
 
 def with_pairs(robot: Robot, mask: BoolArray) -> Robot:
-    """The robot with some of its pairs only."""
+    """Return the robot with some of its pairs only."""
     bodies = pin.GeometryModel(robot.bodies)
     pairs = list(robot.bodies.collisionPairs)
     bodies.removeAllCollisionPairs()

@@ -40,7 +40,9 @@ _UNBOUNDED = np.pi
 
 
 def robot_size(robot: Robot) -> float:
-    """Half the diagonal of the largest box that the bodies fill in some configurations, never 0 [m].
+    """Estimate the size of a robot [m], never 0.
+
+    Half the diagonal of the largest box that the bodies fill in some configurations.
 
     About the reach of an arm, the height of a humanoid: what distances on this robot are large or small beside.
     """
@@ -75,7 +77,10 @@ class PairDistances:
         self._view = view
 
     def all(self, q: Array) -> Array:
-        """Distances (m,) [m] of the pairs that are switched on; of the others, what they were last."""
+        """Compute the distances (m,) of the active pairs [m].
+
+        Others keep the value of the last call in which they were active.
+        """
         pin.updateGeometryPlacements(self.model, self.data, self._bodies, self._geometry, q)
         pin.computeDistances(self._bodies, self._geometry)
         results = getattr(self, "_view", None)
@@ -84,12 +89,12 @@ class PairDistances:
         return np.array(results[:, 0]) if len(results) else np.zeros(0)
 
     def deactivate(self, pairs: Iterable[int]) -> None:
-        """Leaves pairs out from now on."""
+        """Deactivate pairs from now on."""
         for index in pairs:
             self._geometry.deactivateCollisionPair(int(index))
 
     def gradient(self, index: int, q: Array) -> tuple[float, Array]:
-        """Distance of one pair [m] and its gradient (nv,)."""
+        """Compute the distance of one pair [m] and its gradient (nv,)."""
         pin.computeJointJacobians(self.model, self.data, q)
         pin.updateGeometryPlacements(self.model, self.data, self._bodies, self._geometry)
         result = pin.computeDistance(self._bodies, self._geometry, index)
@@ -98,7 +103,7 @@ class PairDistances:
         return float(result.min_distance), np.bincount(self._columns, row, self.model.nv).astype(np.float64)
 
     def moved_by(self, index: int) -> BoolArray:
-        """Coordinates (nv,) that change the distance of one pair."""
+        """Return the coordinates (nv,) that change the distance of one pair."""
         return np.bincount(self._columns, np.abs(self._support[index]), self.model.nv) > 0.0
 
 
@@ -122,7 +127,7 @@ class Space:
         self.moving[self._v] = True
 
     def draw(self, random: np.random.Generator, count: int) -> Array:
-        """Configurations (count, nq), even over the joints' ranges."""
+        """Draw configurations (count, nq), uniform over the joints' ranges."""
         turns = random.uniform(-_UNBOUNDED, _UNBOUNDED, (count, self.model.nv)) * self.free
         neutral = pin.neutral(self.model)
         q = np.array([pin.integrate(self.model, neutral, turn) for turn in turns]).reshape(count, self.model.nq)
@@ -130,18 +135,18 @@ class Space:
         return q
 
     def move(self, q: Array, step: Array) -> Array:
-        """q ⊕ step, kept within the limits."""
+        """Return q ⊕ step, clipped to the limits."""
         moved = np.asarray(pin.integrate(self.model, q, step))
         moved[self._q] = np.clip(moved[self._q], self._lower, self._upper)
         return moved
 
     def towards(self, q: Array, target: Array, part: float) -> Array:
-        """The configuration at a part of the way from q to another."""
+        """Interpolate from q to another configuration."""
         return self.move(q, part * np.asarray(pin.difference(self.model, q, target)))
 
 
 def _points(model: Any) -> IntArray:
-    """Coordinates in v of the joints whose range is a single point: they are held there."""
+    """Find the coordinates in v of the joints whose range is a single point."""
     indices = [
         joint.idx_v
         for joint in list(model.joints)[1:]
@@ -220,7 +225,7 @@ def sample_pairs(robot: Robot, samples: int = SAMPLES, seed: int = SEED) -> Pair
 
 
 def pairs_always_near(robot: Robot, samples: int, seed: int = SEED) -> IntArray:
-    """Pairs of bodies (k, 2) that are within `ALWAYS_NEAR` of each other in every sample."""
+    """Find the pairs of bodies (k, 2) within `ALWAYS_NEAR` of each other in every sample."""
     distances, fat = PairDistances(robot), ALWAYS_NEAR * robot_size(robot)
     near = np.ones(len(distances.pairs), dtype=bool)
     for q in Space(robot).draw(np.random.default_rng(seed), samples if near.any() else 0):
@@ -230,7 +235,10 @@ def pairs_always_near(robot: Robot, samples: int, seed: int = SEED) -> IntArray:
 
 
 def _descend(distances: PairDistances, space: Space, index: int, q: Array, near: float) -> float:
-    """Least distance [m] found along a pair's gradient, with steps that shrink where they lead up."""
+    """Descend along a pair's gradient; return the least distance [m].
+
+    Steps shrink where they lead up.
+    """
     (least, slope), step = distances.gradient(index, q), 0.3
     for _ in range(_STEPS):
         size = float(np.linalg.norm(slope))
@@ -246,7 +254,9 @@ def _descend(distances: PairDistances, space: Space, index: int, q: Array, near:
 
 
 def safety_distances(sampled: PairSamples) -> Array:
-    """Safety distance (m,) of each pair [m]: the default one, less where the design leaves less room.
+    """Choose the safety distance (m,) of each pair [m].
+
+    The default one, less where the design leaves less clearance.
 
     A pair whose bodies are near each other nearly all along their joints' ranges could not keep the default distance
     in most of them. Half of what it typically has leaves it as much to move in as to keep.
@@ -260,7 +270,10 @@ _CLOSE = 4.0 / 3.0
 
 
 def touching(robot: Robot, q: Array, within: float = 0.0) -> list[tuple[str, str, float]]:
-    """Pairs of a robot's own bodies nearer than a distance, the nearest first, with their distance [m]."""
+    """List the pairs of a robot's own bodies nearer than a distance, the nearest first.
+
+    With their distance [m].
+    """
     names = [body.name for body in robot.bodies.geometryObjects]
     distances = PairDistances(robot)
     d = distances.all(q)

@@ -39,7 +39,7 @@ class Piece:
 
 
 def pieces_of(geometry: Any, model: Any) -> list[Piece]:
-    """The pieces of a pinocchio geometry model's objects, each in the frame of its link."""
+    """List the pieces of a geometry model's objects, each in the frame of its link."""
     result = []
     for piece in geometry:
         frame = model.frames[piece.parentFrame]
@@ -61,7 +61,7 @@ class LinkBodies:
 
 
 def kinds_of_links(pieces: Sequence[Piece], kind: Bodies, by_pattern: Mapping[str, Bodies]) -> dict[str, Bodies]:
-    """Which kind of bodies each link with geometry gets.
+    """Choose the kind of bodies of each link with geometry.
 
     Args:
         pieces: of all links.
@@ -81,7 +81,7 @@ def kinds_of_links(pieces: Sequence[Piece], kind: Bodies, by_pattern: Mapping[st
 
 
 def bodies_of_link(pieces: Sequence[Piece], link: str, kind: Bodies) -> LinkBodies:
-    """Bodies that enclose all pieces of a link.
+    """Fit bodies that enclose all pieces of a link.
 
     One capsule around all pieces takes the place of several shapes where it takes no more room than they do, or, in
     `auto`, where it is not gross.
@@ -108,7 +108,7 @@ def _moved(points: Array, placement: Any) -> Array:
 
 
 def capsule_fields(fit: CapsuleFit, placement: Any) -> dict[str, Any]:
-    """Fields of a `Body` that encloses a capsule, with five digits after the point.
+    """Return the fields of a `Body` that encloses a capsule, with five decimals.
 
     The radius makes up for the rounding of everything else, so that what was enclosed stays so.
 
@@ -135,7 +135,7 @@ _DIGITS = 5
 
 
 def _exact_fields(piece: Piece) -> dict[str, Any]:
-    """Fields of a `Body` that is a primitive as it is, or the hull of a mesh."""
+    """Return the fields of a `Body` that is a primitive, or the hull of a mesh."""
     geometry, placement = piece.geometry, piece.placement
     if isinstance(geometry, coal.Box):
         x, y, z = (_up(2.0 * half) for half in geometry.halfSide)
@@ -150,5 +150,5 @@ def _exact_fields(piece: Piece) -> dict[str, Any]:
 
 
 def _up(size: float) -> float:
-    """A size rounded up, but for rounding errors."""
+    """Round a size up, but for rounding errors."""
     return float(math.ceil(size * 10**_DIGITS - 1e-6) / 10**_DIGITS)

@@ -49,7 +49,7 @@ def nested_pairs(robot: Robot, pair_samples: PairSamples) -> BoolArray:
 
 
 def _joint_poses(model: Any, samples: Array) -> Array:
-    """Homogeneous world poses (k, joints, 4, 4) of all joints in some configurations (k, nq)."""
+    """Compute world poses (k, joints, 4, 4) of all joints in configurations (k, nq)."""
     data, poses = model.createData(), []
     for q in samples:
         pin.forwardKinematics(model, data, q)
@@ -58,7 +58,10 @@ def _joint_poses(model: Any, samples: Array) -> Array:
 
 
 def _along_line(frames: Array, origins: Array) -> Array | None:
-    """Place (k,) of some origins along the straight line that they keep to as seen from some frames [m], if they do."""
+    """Return the place (k,) of origins along a straight line, as seen from frames [m].
+
+    None if they do not keep to one.
+    """
     offset = origins[:, :3, 3] - frames[:, :3, 3]
     in_frame = np.einsum("kij,ki->kj", frames[:, :3, :3], offset)
     centred = in_frame - in_frame.mean(axis=0)
@@ -69,7 +72,7 @@ def _along_line(frames: Array, origins: Array) -> Array | None:
 
 
 def _decides(extension: Array, touching: BoolArray) -> bool:
-    """Whether a threshold of the extension (k,) separates the samples that touch (k,) from the others."""
+    """Return True if a threshold of the extension (k,) separates touching samples (k,)."""
     in_order = touching[np.argsort(extension)]
     below = np.concatenate(([0], np.cumsum(in_order)))
     count, total = np.arange(len(in_order) + 1), int(below[-1])

@@ -20,7 +20,7 @@ from qpavoid.setup.written import BLANK, seal
 
 
 def description_files(description: Description, folder: Path) -> dict[Path, bytes]:
-    """The files of a description, sealed.
+    """Write the files of a description, sealed.
 
     Args:
         description: what they say.
@@ -76,7 +76,7 @@ def _header(description: Description) -> list[str]:
 
 
 def pairs_line(description: Description) -> str:
-    """How many pairs are checked, and why the others are not."""
+    """Summarise how many pairs are checked, and why the others are not."""
     counts, options = description.counts, description.options
     srdf_of_file = "no SRDF came with it" if description.honoured is None else f"in {description.honoured.name}"
     return (
@@ -88,7 +88,7 @@ def pairs_line(description: Description) -> str:
 
 
 def home_line(description: Description) -> str:
-    """How clear the home pose is, and how well the limbs can move there."""
+    """Summarise the clearance of the home pose, and the conditioning of the limbs there."""
     home = description.home
     words = ["no pair is checked"]
     if home.nearest is not None:
@@ -97,7 +97,7 @@ def home_line(description: Description) -> str:
 
 
 def note_lines(notes: Sequence[Note]) -> list[str]:
-    """The table of all that was left out, mended, replaced or assumed: a line each, and another for the remedy."""
+    """Write the table of notes: a line each, and another for the remedy."""
     order = {"error": 0, "warning": 1, "note": 2}
     lines = []
     for note in sorted(notes, key=lambda note: order[note.severity]):
@@ -110,7 +110,7 @@ def note_lines(notes: Sequence[Note]) -> list[str]:
 
 
 def _command(description: Description, folder: Path) -> str:
-    """The command that writes the same again."""
+    """Write the command that makes the same files."""
     options = description.options
     words = ["qpavoid robot add", _reference(description.urdf, Path()), "--name", description.config.name]
     words += ["--out", folder.as_posix()] if folder != Path(description.config.name) else []
@@ -129,7 +129,7 @@ def _command(description: Description, folder: Path) -> str:
 
 
 def volume_line(description: Description) -> str:
-    """How many bodies there are, and what room they take beside what the geometry encloses and its hulls."""
+    """Summarise the bodies: number, and volume beside that of the geometry and its hulls."""
     volume, inside, hulls = (
         sum(getattr(link, name) for link in description.links.values()) for name in ("volume", "inside", "hulls")
     )
@@ -161,7 +161,7 @@ def _flow(value: Any) -> str:
 
 
 def _reference(urdf: Path, folder: Path) -> str:
-    """The URDF as a robot.yaml names it."""
+    """Write the path of the URDF as a robot.yaml names it."""
     robots = example_robot("").resolve()
     if urdf.is_relative_to(robots):
         return f"{EXAMPLES}{urdf.relative_to(robots).as_posix()}"
@@ -173,7 +173,7 @@ _PACKAGE = re.compile(r"([A-Za-z][\w.-]*)=(.+)", re.DOTALL)
 
 
 def _entry(entry: str, folder: Path) -> str:
-    """An entry of `package_dirs` with its folder relative to that of the robot.yaml."""
+    """Write an entry of `package_dirs`, its folder relative to that of the robot.yaml."""
     match = _PACKAGE.fullmatch(entry)
     return f"{match[1]}={_relative(Path(match[2]), folder)}" if match else _relative(Path(entry), folder)
 

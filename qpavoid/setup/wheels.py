@@ -54,7 +54,7 @@ def wheel_joints(model: Any, pieces: Sequence[Piece]) -> list[str]:
 
 
 def _heights(piece: Piece, link: Any) -> tuple[float, float]:
-    """Lowest and highest point of a box around a piece in the world [m]."""
+    """Return the lowest and highest point of a box around a piece in the world [m]."""
     center, half = bounding_box(piece.geometry)
     pose = link * piece.placement
     middle = float(pose.act(center)[2])
@@ -63,7 +63,7 @@ def _heights(piece: Piece, link: Any) -> tuple[float, float]:
 
 
 def _turns_round(model: Any, joint: Any) -> bool:
-    """Whether a joint turns all the way round: has an angle, and no limits."""
+    """Return True if a joint is continuous: it has an angle, and no limits."""
     name = joint.shortname()
     if name.startswith("JointModelRUB") or name == "JointModelRevoluteUnboundedUnaligned":
         return True
@@ -73,6 +73,6 @@ def _turns_round(model: Any, joint: Any) -> bool:
 
 
 def _axis(model: Any, data: Any, joint: Any) -> Any:
-    """Axis of a revolute joint in the world (3,)."""
+    """Return the axis of a revolute joint in the world (3,)."""
     pin.computeJointJacobians(model, data, pin.neutral(model))
     return data.J.reshape(6, -1, order="F")[3:, joint.idx_vExtended]

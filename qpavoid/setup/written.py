@@ -19,17 +19,17 @@ _SEAL = re.compile(rb"sha256 [0-9a-f]{%d}" % _DIGITS)
 
 
 def seal(content: bytes) -> bytes:
-    """Puts the digest of a content in the place of its `BLANK`."""
+    """Put the digest of a content in the place of its `BLANK`."""
     return content.replace(BLANK.encode(), b"sha256 " + sha256(content).hexdigest()[:_DIGITS].encode(), 1)
 
 
 def is_sealed(content: bytes) -> bool:
-    """Whether a content is as `seal` left it."""
+    """Return True if a content is as `seal` left it."""
     return seal(_SEAL.sub(BLANK.encode(), content, count=1)) == content and _SEAL.search(content) is not None
 
 
 def write_files(contents: Mapping[Path, bytes], force: bool = False) -> dict[Path, str]:
-    """Writes all files, or none.
+    """Write all files, or none.
 
     Args:
         contents: what each is to hold, sealed.
