@@ -375,7 +375,7 @@ def test_the_closest_call_counts_voxels_that_have_no_slot(panda, tmp_path):
     rng = np.random.default_rng(9)
     points = scattered(rng, 300, 0.7)
     scene = cloud_scene(panda, points, tmp=tmp_path)
-    bench, hold, ruler = Bench(scene), Avoidance().hold, Ruler(scene)
+    bench, hold, ruler = Bench(scene), Avoidance().safety_distance, Ruler(scene)
     for _ in range(15):
         q, v = random_q(panda, rng), rng.uniform(-1.0, 1.0, 7)
         near = len(bench.compute(q, reach=0.3)[0].pair)

@@ -122,12 +122,12 @@ def test_limits_that_cannot_be_meant(tmp_path):
         text = text.replace(old, new, 1)
     urdf.write_text(text)
     report = check_robot(str(urdf))
-    told = problems(report, "warning")
-    assert "joint1: locked at 0, which is its lower and its upper limit" in told
-    assert "joint2: a velocity limit beyond what such joints do →" in told
-    assert "joint2: a range wider than such joints have →" in told
-    assert "joint3: hardly any range → `lock" in told
-    assert "joint4" not in told
+    text = problems(report, "warning")
+    assert "joint1: locked at 0, which is its lower and its upper limit" in text
+    assert "joint2: a velocity limit beyond what such joints do →" in text
+    assert "joint2: a range wider than such joints have →" in text
+    assert "joint3: hardly any range → `lock" in text
+    assert "joint4" not in text
     assert report.usable
 
 
@@ -138,13 +138,13 @@ def test_mimic_mass_feet_and_home_collisions_are_told(tmp_path):
         .replace("link3", "left_foot")
     )  # fmt: skip
     report = check_robot(str(urdf))
-    told = problems(report)
+    text = problems(report)
     joints = {joint.name: joint for joint in report.joints}
     assert joints["joint3"].led and joints["joint3"].mimics == "joint1" and joints["joint3"].kind == "revolute"
-    assert report.nv == 2 and "joint3" not in told
-    assert "3 moving links have no mass → none is needed" in told
-    assert "it has feet (left_foot) and a fixed base → `root_joint: free_flyer`" in told
-    assert [(a, b) for a, b, _ in report.home_collisions] or "its bodies touch in 100 % of" in told
+    assert report.nv == 2 and "joint3" not in text
+    assert "3 moving links have no mass → none is needed" in text
+    assert "it has feet (left_foot) and a fixed base → `root_joint: free_flyer`" in text
+    assert [(a, b) for a, b, _ in report.home_collisions] or "its bodies touch in 100 % of" in text
     assert check_robot(str(urdf), root="free_flyer").nv == 8
 
 
@@ -234,7 +234,7 @@ def test_a_second_run_writes_the_same_bytes_and_says_so(cli, tmp_path):
     second = json.loads(cli("robot", "add", "chain.urdf", "--json").stdout)
     assert set(second["files"].values()) == {"unchanged"}
     assert {path.name: path.read_bytes() for path in (tmp_path / "chain").iterdir()} == before
-    assert cli("robot", "add", "chain.urdf", "--seed", "1").stdout.count("updated") >= 1  # nobody edited it
+    assert cli("robot", "add", "chain.urdf", "--seed", "1").stdout.count("updated") >= 1  # no one edited it
 
 
 def test_a_run_into_the_folder_of_the_urdf_does_not_honour_its_own_srdf(cli, tmp_path):

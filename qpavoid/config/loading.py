@@ -1,4 +1,4 @@
-"""Reads robot and scenario files, applies `--set` overrides, and says what is wrong in one line."""
+"""Robot and scenario files: reading, `--set` overrides, and errors in one line."""
 
 from __future__ import annotations
 

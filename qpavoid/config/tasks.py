@@ -1,4 +1,4 @@
-"""What a robot is to do, and which of its frames rest on the ground meanwhile.
+"""Tasks of a robot, and frames that stay in contact with the ground.
 
 Every task is rows A v = b with a `weight`, for laws that weigh tasks against each other (`qp`), and a `priority`, for
 those that keep strict order (`hqp`).
@@ -164,7 +164,7 @@ AnyTask = Annotated[
 
 
 class Contact(Block):
-    """A frame that stays where it is, whatever else has to give way: a foot on the ground."""
+    """A frame that stays where it is, with priority over all tasks: a foot on the ground."""
 
     frame: str
     """Frame that rests."""

@@ -1,4 +1,4 @@
-"""Reads the text of a file that may be anything: a folder, a pipe, a device, an image of a disk."""
+"""The text of a file that may be anything: a folder, a pipe, a device, an image of a disk."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""YAML from anybody: what would hang, fill the memory or mean two things is a fault, with its line and column."""
+"""YAML of unknown origin: what would hang, fill the memory or mean two things is a fault, with its line and column."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 import yaml
 
 _DEEPEST = 50
-"""Levels of nesting; PyYAML calls itself at each, and Python gives up at some hundreds."""
+"""Levels of nesting; PyYAML recurses at each, and Python stops at some hundreds."""
 _MOST = 50_000
 """Values in all, those that aliases stand for counted each time: ten lines of aliases can stand for a billion."""
 _DIGITS = 300

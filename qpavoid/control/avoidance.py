@@ -24,7 +24,7 @@ def row_form(config: Avoidance) -> dict[str, Any]:
     row = config.row
     return {
         "offset": config.offset,
-        "hold": config.hold,
+        "hold": config.safety_distance,
         "row_gain": row.gain,
         "recovery": np.inf if isinstance(row, Cbf) else config.recovery_speed,
         "beta": isinstance(row, Beta),

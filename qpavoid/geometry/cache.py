@@ -1,7 +1,7 @@
 """A disk cache for what is slow to make of a mesh: its convex hull, and the capsule around it.
 
 Every result is one file in the user's cache directory, named after a digest of all that it depends on. The cache may
-vanish, be damaged, read-only or full at any time: then a result is made anew, and nobody is told.
+vanish, be damaged, read-only or full at any time: then a result is made anew, without a message.
 
 `QPAVOID_CACHE=0` switches it off, `QPAVOID_CACHE=DIR` puts it elsewhere.
 """
@@ -33,7 +33,7 @@ _DIGEST = 16
 """Bytes of a digest; one of the content ends every file."""
 _LARGEST = 100_000_000
 """Size that all files together are kept below [bytes]; the hulls of a humanoid take 3 million."""
-_OURS = re.compile(r"(?:hull|capsule)-[0-9a-f]{32}\.")
+_FILE_NAMES = re.compile(r"(?:hull|capsule)-[0-9a-f]{32}\.")
 """Names that may be deleted; the directory may hold other things."""
 
 _T = TypeVar("_T")
@@ -117,7 +117,7 @@ def _write(path: Path, content: bytes) -> None:
 def _make_room(folder: Path) -> None:
     """Delete the files that were unused for longest, down to half of what is allowed."""
     with os.scandir(folder) as entries:
-        files = [(entry.stat(), entry.path) for entry in entries if _OURS.match(entry.name)]
+        files = [(entry.stat(), entry.path) for entry in entries if _FILE_NAMES.match(entry.name)]
     size = sum(stat.st_size for stat, _ in files)
     if size <= _LARGEST:
         return

@@ -17,10 +17,10 @@ from qpavoid.model.notes import Note, NoteKind
 from qpavoid.model.pairs import pair_array
 from qpavoid.problem import Array, IntArray
 
-_MAX_NORM = 1e9
-"""Speed [rad/s or m/s] or position [rad or m] from which a limit is a way of saying that there is none."""
-_SAME = 1e-6
-"""How far a joint may be given from where the one that it mimics takes it [rad or m]."""
+_NO_LIMIT = 1e9
+"""Speed [rad/s or m/s] or position [rad or m] from which a limit means that there is none, as files write it."""
+_MIMIC_TOLERANCE = 1e-6
+"""Difference of a joint's value from the one that its mimic relation gives, up to which they agree [rad or m]."""
 
 
 def frame_index(model: Any, name: str) -> int:
@@ -40,7 +40,7 @@ def joint_bounds(model: Any) -> JointBounds:
     mean that the URDF gives none; see `joints_fixed_by_limits` of ranges that are meant, `assume_speeds` of velocities.
     """
     lower, upper = np.array(model.lowerPositionLimit), np.array(model.upperPositionLimit)
-    lower[lower <= -_MAX_NORM], upper[upper >= _MAX_NORM] = -np.inf, np.inf
+    lower[lower <= -_NO_LIMIT], upper[upper >= _NO_LIMIT] = -np.inf, np.inf
     q_index, v_index = [], []
     for joint in list(model.joints)[1:]:
         low, high = lower[joint.idx_q], upper[joint.idx_q]
@@ -50,7 +50,7 @@ def joint_bounds(model: Any) -> JointBounds:
     q_indices = np.array(q_index, dtype=np.intp)
     velocity = np.array(model.velocityLimit)
     return JointBounds(
-        velocity=np.where((velocity > 0.0) & (velocity < _MAX_NORM), velocity, np.inf),
+        velocity=np.where((velocity > 0.0) & (velocity < _NO_LIMIT), velocity, np.inf),
         q_index=q_indices,
         v_index=np.array(v_index, dtype=np.intp),
         lower=lower[q_indices],
@@ -75,7 +75,7 @@ def set_limits(model: Any, limits: JointLimits, path: Path) -> None:
     for name, (low, high) in limits.position.items():
         joint = find_joint(model, name, f"{path}: limits.position")
         if joint.nq != 1:
-            raise ConfigError(f"{path}: limits.position: joint {name!r} turns all the way round; leave it out")
+            raise ConfigError(f"{path}: limits.position: joint {name!r} is continuous; leave it out")
         lower[joint.idx_q], upper[joint.idx_q] = low, high
     for name, speed in limits.velocity.items():
         joint = find_joint(model, name, f"{path}: limits.velocity")
@@ -110,7 +110,7 @@ def assume_speeds(model: Any, notes: list[Note]) -> None:
         notes: the joints are named in them.
     """
     velocity = np.array(model.velocityLimit)
-    has_limit = (velocity > 0.0) & (velocity < _MAX_NORM)
+    has_limit = (velocity > 0.0) & (velocity < _NO_LIMIT)
     names: dict[str, list[str]] = {}
     for name, joint in zip(list(model.names)[1:], list(model.joints)[1:], strict=True):
         part = slice(joint.idx_v, joint.idx_v + joint.nv)
@@ -177,7 +177,7 @@ def set_joints(model: Any, q: Array, values: Mapping[str, float], where: str) ->
     for name in mimics:
         joint = model.joints[model.getJointId(name)]
         expected = joint.extract().scaling * q[joint.idx_q] + joint.extract().offset
-        if abs(values[name] - expected) > _SAME:
+        if abs(values[name] - expected) > _MIMIC_TOLERANCE:
             raise ConfigError(
                 f"{where}: {_follows(model, name)}, to {expected:g} and not {values[name]:g}; leave it out"
             )

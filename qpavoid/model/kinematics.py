@@ -26,7 +26,7 @@ MIMIC = "JointModelMimic"
 
 
 class Kinematics(NamedTuple):
-    """Where the tracked frames are, and how everything moves with v, until the next tick overwrites it."""
+    """Where the tracked frames are, and how everything moves with v, until the next control step overwrites it."""
 
     J: Array
     """(6, e) world Jacobian: column j is the twist of joint j [linear velocity of the body point at the world

@@ -1,4 +1,4 @@
-"""Joint limits as bounds on the joint velocity of one tick."""
+"""Joint limits as bounds on the joint velocity of one control step."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from qpavoid.problem import Array, IntArray
 from qpavoid.reason import Reason, ReasonKind
 
 OUTSIDE = 1e-6
-"""How far beyond a position limit a coordinate counts as outside it [rad, m]."""
+"""Excess over a position limit from which a coordinate counts as outside it: above rounding errors [rad or m]."""
 _TURN = 2.0 * np.pi
-"""Farther than this beyond its limit nothing is that was measured in radians [rad]."""
+"""Excess above which q is probably in degrees: a turn, which no joint exceeds its limit by [rad]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,17 +86,17 @@ def limit_layout(joints: JointBounds, position_gain: float, dt: float) -> dict[s
     """Make the arrays of the bounds lower <= v <= upper, as `RowLayout` has them.
 
     The bounds keep the next configuration inside its limits. A joint without an acceleration limit uses at most a
-    share `position_gain` of what is left to a position limit in one tick; a joint with one keeps to the speeds from
-    which it can still brake (`kernels.speed_to_stop`), so that position, velocity and acceleration
+    share `position_gain` of the margin to a position limit in one control period; a joint with one keeps to the speeds
+    from which it can still brake (`kernels.speed_to_stop`), so that position, velocity and acceleration
     limits never contradict each other once they are met; where its jerk has a limit, too, it keeps to the velocities
-    from which a stop within all of these ends in time (`kernels.stopping`). A joint outside its limits is sent back, at
-    no more than its largest speed. Bounds never cross: from a state that no braking can save, the jerk limit gives
-    way, then that of the acceleration.
+    from which a stop within all of these ends in time (`kernels.stopping`). A joint outside its limits moves back, at
+    no more than its largest speed. Bounds never cross: from a state that no braking can save, the jerk limit is
+    relaxed, then that of the acceleration.
 
     Args:
         joints: the robot's limits.
-        position_gain: share of the room to a position limit that one tick may use [-].
-        dt: length of a tick [s].
+        position_gain: share of the margin to a position limit that one control period may use [-].
+        dt: control period [s].
     """
     nv = len(joints.velocity)
     accelerated, jerked = (bool(np.isfinite(limits).any()) for limits in (joints.acceleration, joints.jerk))

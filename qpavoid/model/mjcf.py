@@ -1,4 +1,4 @@
-"""Reads MJCF files through Pinocchio, and makes sure that no geom of a body is lost on the way."""
+"""MJCF files, read through Pinocchio with a check that no geom of a body is lost."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _ANEW = "save it as one plain file, for example with mj_saveLastXML"
 
 
 def model_of_mjcf(mjcf: Path, root: Any) -> Any:
-    """Pinocchio model of an MJCF.
+    """Read the Pinocchio model of an MJCF.
 
     Args:
         mjcf: the file.

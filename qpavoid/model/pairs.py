@@ -50,7 +50,7 @@ def _matching(pattern: str, names: list[str], origin: str) -> list[int]:
 
 ALWAYS_TOUCHING = 0.95
 """Share of random configurations from which on two bodies that touch in them do so by design: a row that is violated in
-nearly every configuration keeps nothing apart. The rest is left to configurations in which a joint is at its limits."""
+nearly every configuration protects nothing. The remaining 5 % leave out configurations with a joint at its limits."""
 
 
 class TouchingPair(NamedTuple):
@@ -70,12 +70,12 @@ class TouchingPair(NamedTuple):
 def drop_always_touching(model: Any, bodies: Any, joints: JointBounds, samples: int = 200) -> list[TouchingPair]:
     """Remove the pairs that touch in nearly every one of many random configurations.
 
-    Those are neighbours whose shapes overlap at the joint, not a threat.
+    Those are neighbours whose shapes overlap at the joint by design.
 
     Args:
         model: pinocchio model.
         bodies: its collision bodies with their pairs, changed in place.
-        joints: position limits, within which configurations are drawn; joints without are turned all the way round.
+        joints: position limits, within which configurations are drawn; joints without are drawn over a full turn.
         samples: how many configurations are drawn, always the same ones.
 
     Returns:
@@ -112,7 +112,7 @@ def find_contacts(model: Any, bodies: Any, poses: Sequence[Array], at_least: flo
         model: pinocchio model.
         bodies: collision bodies with their m pairs.
         poses: k configurations (nq,).
-        at_least: share of the configurations; a pair that cannot come to it any more is not looked at further.
+        at_least: share of the configurations; a pair that can no longer attain it is not computed further.
     """
     model_data, data, count = model.createData(), bodies.createData(), len(bodies.collisionPairs)
     touches, active = np.zeros((len(poses), count), dtype=bool), np.arange(count)

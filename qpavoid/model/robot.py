@@ -38,7 +38,7 @@ from qpavoid.problem import Array
 
 @dataclass(frozen=True)
 class Robot:
-    """What qpavoid knows of a robot; nothing in it changes while it runs."""
+    """Model, bodies, pairs, limits and home pose of a robot; immutable."""
 
     name: str
     model: Any
@@ -52,13 +52,13 @@ class Robot:
     source: str
     """File that it was read from, for messages."""
     always_touching: tuple[TouchingPair, ...] = ()
-    """Pairs of bodies that were switched off at loading, because they touch in nearly every configuration."""
+    """Pairs of bodies that were disabled at loading, because they touch in nearly every configuration."""
     margins: Mapping[frozenset[str], float] = field(default_factory=dict)
     """Two bodies: safety distance of their own, where it is less than the scenario's [m]."""
     acceleration: Mapping[str, float] = field(default_factory=dict)
     """Joint: largest acceleration [rad/s² or m/s²]; joints left out have no such limit."""
     jerk: Mapping[str, float] = field(default_factory=dict)
-    """Joint: largest jerk [rad/s³ or m/s³]; likewise."""
+    """Joint: largest jerk [rad/s³ or m/s³]; joints left out have no such limit."""
     notes: tuple[Note, ...] = ()
     """What was left out, mended, replaced or assumed at loading."""
 
@@ -181,7 +181,7 @@ class Robot:
         return np.array(values, dtype=np.float64)
 
     def frame_id(self, name: str, where: str) -> int:
-        """Index of a frame.
+        """Return the index of a frame.
 
         Raises:
             UnknownName: with the nearest frame.
@@ -196,7 +196,7 @@ class Robot:
 
         Args:
             patterns: joint names; `*` and `?` match as in file names.
-            q: configuration (nq,) at which they are held.
+            q: configuration (nq,) at which they are fixed.
             where: file and field to name in errors.
 
         Returns:
@@ -231,7 +231,7 @@ class Robot:
         return zip(self.joint_names, list(self.model.joints)[1:], strict=True)
 
 
-_MOST_BODIES = 300
+_MAX_BODIES = 300
 """Time and memory grow with the square: 45 000 pairs of 300 bodies take ten seconds. Humanoids have 112."""
 
 
@@ -256,9 +256,9 @@ def _build(config: RobotConfig, path: Path) -> Robot:
     if model.nv == 0:
         raise ConfigError(f"{path}: no joint of {urdf.name} moves; give at least one that is neither fixed nor locked")
     assume_speeds(model, notes)
-    if len(bodies.geometryObjects) > _MOST_BODIES:
+    if len(bodies.geometryObjects) > _MAX_BODIES:
         raise ConfigError(
-            f"{path}: {len(bodies.geometryObjects)} bodies; at most {_MOST_BODIES} are read: list fewer under `bodies`"
+            f"{path}: {len(bodies.geometryObjects)} bodies; at most {_MAX_BODIES} are read: list fewer under `bodies`"
         )
     add_self_pairs(model, bodies, config.disabled_pairs, str(path))
     if config.srdf is not None:

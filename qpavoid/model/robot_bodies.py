@@ -96,7 +96,7 @@ def _listed_bodies(configs: Sequence[Body], model: Any, hulls: Mapping[str, Any]
 
 
 def _in_link(body: Any, model: Any) -> Any:
-    """Placement of a body in the frame of its link."""
+    """Return the placement of a body in the frame of its link."""
     return model.frames[body.parentFrame].placement.actInv(body.placement)
 
 

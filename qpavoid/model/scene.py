@@ -1,4 +1,4 @@
-"""A scene: a robot among obstacles, with every pair that has to be watched. Built once."""
+"""A scene: a robot among obstacles, with every pair that has to be checked. Built once."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from qpavoid.model.trajectory import Motion, Sample, Still, build_motion
 from qpavoid.problem import Array, IntArray
 
 PARKING_DISTANCE = 1e4
-"""Where the balls of a cloud wait that stand for no voxel [m]."""
+"""Position of the proxy spheres of a cloud that stand for no voxel: beyond any influence distance [m]."""
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,9 @@ class Obstacle:
     shape: config.ObstacleShape
     motion: Motion
     moves: bool = True
-    """Whether its motion has to be evaluated at every tick."""
+    """Whether its motion has to be evaluated at every control step."""
     graspable: bool = False
-    """Whether `Controller.attach` may let the robot carry it."""
+    """Whether `Controller.attach` may attach it to the robot."""
     external: bool = False
     """Whether its pose comes from the program that steps the controller, and has to be updated from the start."""
     source: Path = Path("obstacle")
@@ -62,7 +62,7 @@ class Obstacle:
             shape: its shape; files are looked for in the working directory.
             position: world position of the shape's origin (3,) [m].
             rotation: its orientation (3, 3); along the world axes if left out.
-            graspable: whether the robot may carry it.
+            graspable: whether it may be attached to the robot.
             external: whether its pose has to be updated by `Controller.step(obstacles=…)` from the start: the robot
                 stops where it is not. An obstacle that is given in `step` is external from then on.
 
@@ -86,11 +86,11 @@ class Scene:
 
     robot: Robot
     obstacles: tuple[Obstacle, ...]
-    """Those that can be carried first."""
+    """Those that can be attached first."""
     geometry: Any
     """pinocchio geometry model: the robot's bodies, then the pieces of the obstacles in their order."""
     pairs: IntArray
-    """(m, 2) geometry indices; the first of a pair belongs to the robot, or is an obstacle that it may carry."""
+    """(m, 2) geometry indices; the first of a pair belongs to the robot, or may be attached to it."""
     pair_names: tuple[tuple[str, str], ...]
     """Names of the bodies of each pair."""
     support: Array
@@ -110,14 +110,14 @@ class Scene:
         """Names of the obstacles."""
         return [obstacle.name for obstacle in self.obstacles]
 
-    def slack(self, hold: float) -> Array:
+    def slack(self, safety_distance: float) -> Array:
         """Return how much smaller each pair's safety distance is than the scenario's (m,) [m].
 
         Args:
-            hold: safety distance of the scenario, between surfaces [m].
+            safety_distance: that of the scenario, between surfaces [m].
         """
-        distances = [self.robot.safety_distance(a, b, hold) for a, b in self.pair_names]
-        return hold - np.array(distances, dtype=np.float64)
+        distances = [self.robot.safety_distance(a, b, safety_distance) for a, b in self.pair_names]
+        return safety_distance - np.array(distances, dtype=np.float64)
 
     @property
     def movable(self) -> int:
@@ -130,11 +130,11 @@ def build_scene(robot: Robot, obstacles: Sequence[Obstacle] = ()) -> Scene:
 
     Args:
         robot: the robot with its own pairs.
-        obstacles: the obstacles; each is paired with every body of the robot, and with those that it may carry.
+        obstacles: the obstacles; each is paired with every body of the robot, and with those that may be attached.
             Half-spaces have no pair with bodies that no joint moves: a base stands on the ground.
 
     Raises:
-        ConfigError: an obstacle that has the name of a body or that cannot be carried, a mesh or points that cannot be
+        ConfigError: an obstacle that has the name of a body or that cannot be attached, a mesh or points that cannot be
             read.
     """
     obstacles = sorted(obstacles, key=lambda obstacle: not obstacle.graspable)

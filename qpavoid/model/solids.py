@@ -87,7 +87,7 @@ def read_mesh(shape: Mesh, folder: Path, where: str) -> Any:
 
 
 def corners(mesh: Any) -> tuple[Array, IntArray]:
-    """Corners (n, 3) [m] and triangles (t, 3) of a coal mesh."""
+    """Return the corners (n, 3) [m] and triangles (t, 3) of a coal mesh."""
     triangles = [[mesh.tri_indices(i)[k] for k in range(3)] for i in range(mesh.num_tris)]
     return np.array(mesh.vertices()), np.array(triangles, dtype=np.intp)
 

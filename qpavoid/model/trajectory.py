@@ -257,7 +257,7 @@ def _rotation(rpy: tuple[float, float, float] | None, initial: Array) -> Array:
 
 
 def _direction(vector: tuple[float, float, float], field: str) -> Array:
-    """Unit vector (3,) along `vector`."""
+    """Return the unit vector (3,) along `vector`."""
     norm = math.hypot(*vector)
     if norm < 1e-9:
         raise ConfigError(f"motion.{field} has no length; give a direction such as [0, 0, 1]")

@@ -1,4 +1,4 @@
-"""Reads URDF and MJCF files: the model, and the collision geometry with its meshes."""
+"""URDF and MJCF files: the model, and the collision geometry with its meshes."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def read_model(urdf: Path, root_joint: str, notes: list[Note] | None = None) -> 
     """Read the Pinocchio model of a URDF (also in xacro) or MJCF.
 
     Joints that mimic another one have no coordinate of their own. Where Pinocchio cannot read them so (they come before
-    the other one in the tree, or turn all the way round where that has limits), they move on their own.
+    the other one in the tree, or are continuous where that has limits), they move on their own.
 
     Args:
         urdf: the file.
@@ -168,7 +168,7 @@ def read_pieces(
         package_dirs: folders to look for meshes in first, and `NAME=FOLDER`; see `mesh_folders`.
         path: file to name in errors.
         notes: what was left out or replaced is added to them.
-        visuals: whether links without collision geometry get what is meant to be seen.
+        visuals: whether links without collision geometry get their visual geometry.
         allow_missing: whether shapes whose meshes are missing are left out.
         enclosed: whether shapes inside others are kept.
 
@@ -224,7 +224,7 @@ def read_collision(
         model: its model.
         package_dirs: folders to look for meshes in first, and `NAME=FOLDER`; see `mesh_folders`.
         path: file to name in errors.
-        visual: what is meant to be seen instead.
+        visual: whether visual geometry is read instead.
         notes: what was left out or mended is added to them.
         allow_missing: whether shapes whose meshes are missing are left out.
 

@@ -134,7 +134,7 @@ def _add_part(
 
 
 def _children(part: ET.Element) -> Iterator[ET.Element]:
-    """The shapes of a <collision> or <visual>."""
+    """Yield the shapes of a <collision> or <visual>."""
     for element_of_shapes in part.findall("geometry"):
         yield from element_of_shapes
 
@@ -180,7 +180,7 @@ def _radius_and_length(element: ET.Element, where: str) -> list[float]:
 
 
 def _radii(element: ET.Element, where: str) -> list[float]:
-    """Half axes of an ellipsoid: `radii`, or `a`, `b`, `c` as in Drake."""
+    """Read the half axes of an ellipsoid: `radii`, or `a`, `b`, `c` as in Drake."""
     if element.get("a") is not None:
         return [vector(element, attribute, 1, where, ())[0] for attribute in "abc"]
     return vector(element, "radii", 3, where, ())

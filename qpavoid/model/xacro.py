@@ -1,4 +1,4 @@
-"""Expands xacro files, the macro language that most URDFs of ROS are written in."""
+"""Expansion of xacro files, the macro language that most URDFs of ROS are written in."""
 
 from __future__ import annotations
 

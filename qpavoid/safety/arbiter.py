@@ -67,7 +67,7 @@ class Arbiter:
         self._scene, self.solver, self._assembly, self._query = scene, solver, assembly, query
         self._bounds, self._avoidance, self._limits = bounds, avoidance, limits
         self._v_shape = (scene.robot.model.nv,)
-        self._reach, keep = avoidance.d2 - avoidance.offset, avoidance.hold - avoidance.offset
+        self._reach, keep = avoidance.d2 - avoidance.offset, avoidance.safety_distance - avoidance.offset
         self.guard = BrakingCheck(scene, bounds, limits.position_gain, keep, dt)
         detours = Detours(progress.detour, dt, scene, frames, query, keep) if progress.detour else None
         self.progress = ProgressWatch(progress, dt, scene.pair_names, detours)

@@ -83,7 +83,7 @@ class Flights:
         """How it gets from one velocity to another."""
         self.lever_arm = max(1.0, max_lever_arm(model, self.query.max_extension()))
         """Farther than this no point of the robot moves when a joint moves by 1 [m/rad, 1]."""
-        self.enough = Value(settings.horizon, settings.safe * (avoidance.hold - avoidance.offset))
+        self.enough = Value(settings.horizon, settings.safe * (avoidance.safety_distance - avoidance.offset))
         """What a flight is worth that need not be any better."""
         self.still = BackupPolicy(0.0, np.zeros(model.nv))
         """Standing still."""

@@ -1,4 +1,4 @@
-"""Makes a robot.yaml and an SRDF of a bare URDF: bodies, pairs, a home pose, end effectors."""
+"""A robot.yaml and an SRDF for a bare URDF: bodies, pairs, a home pose, end effectors."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ Root = Literal["fixed", "planar", "free_flyer"]
 
 @dataclass(frozen=True)
 class DescribeOptions:
-    """What the user of `robot add` chose."""
+    """Options of `robot add`."""
 
     name: str | None = None
     """Of the robot; that of the file if left out."""
@@ -303,7 +303,7 @@ def _links(
     while True:
         listed = [body for link in links.values() for body in link.bodies]
         robot = Robot.from_config(config.model_copy(update={"bodies": listed}), Path(config.urdf))
-        oversized = _too_fat(robot, home_candidates(robot, semantics)[0], options.seed)
+        oversized = _oversized(robot, home_candidates(robot, semantics)[0], options.seed)
         replacements = {link: bodies_of_link(pieces, link, "convex") for link in oversized if kinds[link] == "auto"}
         if all(links[link] == bodies for link, bodies in replacements.items()):
             break
@@ -326,21 +326,21 @@ def _links(
     return links, robot
 
 
-def _too_fat(robot: Robot, home: Array, seed: int) -> set[str]:
+def _oversized(robot: Robot, home: Array, seed: int) -> set[str]:
     """Find the links of pairs that are too near at home, or in each of a few random poses."""
     names = [body.name for body in robot.bodies.geometryObjects]
-    near = [names[i] for pair in pairs_always_near(robot, _FEW, seed) for i in pair]
+    near = [names[i] for pair in pairs_always_near(robot, _POSES, seed) for i in pair]
     near += [body for pair in robot.always_touching for body in pair[:2]]
     near += [
         body
-        for a, b, _ in touching(robot, home, min(_CLEAR * robot_size(robot), HOME_CLEARANCE * D1))
+        for a, b, _ in touching(robot, home, min(_HOME_NEAR * robot_size(robot), HOME_CLEARANCE * D1))
         for body in (a, b)
     ]
     link = {body.name: robot.model.frames[body.parentFrame].name for body in robot.bodies.geometryObjects}
     return {link[body] for body in near}
 
 
-_CLEAR = 0.04
-"""Distance at the wished home pose, as a share of the robot's size, within which capsules are too fat [-]."""
-_FEW = 200
-"""Random poses that tell whether capsules are too fat."""
+_HOME_NEAR = 0.04
+"""Distance at the preferred home pose, as a share of the robot's size, within which capsules are oversized [-]."""
+_POSES = 200
+"""Random poses in which oversized capsules show."""

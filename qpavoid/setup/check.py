@@ -1,4 +1,4 @@
-"""Looks a robot over before it is used: what it is made of, what is wrong with it, and what to do about it."""
+"""The check of a robot before it is used: its parts, its faults, and their remedies."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ from qpavoid.setup.reasons import find_unchecked
 from qpavoid.setup.sampling import D1, Space, touching
 from qpavoid.setup.shapes import Piece, pieces_of
 
-_TICKS, _PATIENCE = 300, 5.0
+_MAX_STEPS, _MAX_SECONDS = 300, 5.0
 """Timed for the median, as far as they take no longer than so many seconds."""
-_SLOW = 1000.0
+_SLOW_STEP = 1000.0
 """Median tick from which it is worth a word [µs]."""
-_FAST = {"revolute": 50.0, "continuous": 50.0, "prismatic": 10.0}
+_MAX_SPEED = {"revolute": 50.0, "continuous": 50.0, "prismatic": 10.0}
 """Speed limits [rad/s, m/s] above which one is hardly meant."""
-_WIDE = {"revolute": 8.0 * math.pi, "prismatic": 20.0}
+_MAX_RANGE = {"revolute": 8.0 * math.pi, "prismatic": 20.0}
 """Ranges [rad, m] above which one is hardly meant."""
-_NARROW = 1e-3
+_MIN_RANGE = 1e-3
 """Range [rad, m] below which a joint is better locked."""
 
 
@@ -89,7 +89,7 @@ def _report(config: RobotConfig, path: Path, progress: Callable[[str], None]) ->
     report.frames = [f.name for f in model.frames if f.type in (pin.BODY, pin.OP_FRAME)]
     report.end_effectors = list(config.end_effectors) or end_effectors(model)
     report.without_mass = sum(inertia.mass <= 0.0 for inertia in list(model.inertias)[1:])
-    pieces = _look_at_geometry(report, config, path, urdf, model)
+    pieces = _check_geometry(report, config, path, urdf, model)
     robot = None
     if report.usable:
         progress("making the robot")
@@ -100,10 +100,10 @@ def _report(config: RobotConfig, path: Path, progress: Callable[[str], None]) ->
             report.notes.append(Note(NoteKind.FILE, (), str(error), "mend what it names", "error"))
         report.load_seconds = perf_counter() - begin
     report.joints = _joints(urdf, model if robot is None else robot.model, config, model)
-    _judge_joints(report, config)
+    _check_joints(report, config)
     if robot is not None:
         report.notes += robot.notes
-        _look_at_robot(report, with_hulls(robot), pieces, progress)
+        _check_built_robot(report, with_hulls(robot), pieces, progress)
     if report.without_mass:
         clause = f"{report.without_mass} moving links have no mass"
         report.notes.append(Note(NoteKind.LINK, (), clause, "none is needed: inertias are not used"))
@@ -128,7 +128,7 @@ def with_hulls(robot: Robot) -> Robot:
 # --- geometry -----------------------------------------------------------------------------------------------
 
 
-def _look_at_geometry(report: Report, config: RobotConfig, path: Path, urdf: Path, model: Any) -> list[Piece]:
+def _check_geometry(report: Report, config: RobotConfig, path: Path, urdf: Path, model: Any) -> list[Piece]:
     packages = absolute_entries(config.package_dirs, path.parent)
     report.searched = mesh_folders(urdf, packages)
     absent = {tag: _absent(urdf, tag, report.searched) for tag in ("collision", "visual")}
@@ -217,28 +217,28 @@ def _limit(value: float) -> float | None:
     return value if abs(value) < 1e9 else None
 
 
-def _judge_joints(report: Report, config: RobotConfig) -> None:
-    moving = [joint for joint in report.joints if joint.kind in _FAST and not (joint.locked or joint.led)]
+def _check_joints(report: Report, config: RobotConfig) -> None:
+    moving = [joint for joint in report.joints if joint.kind in _MAX_SPEED and not (joint.locked or joint.led)]
     spans = {
         joint.name: (joint, joint.upper - joint.lower)
         for joint in moving
-        if joint.kind in _WIDE and joint.lower is not None and joint.upper is not None
+        if joint.kind in _MAX_RANGE and joint.lower is not None and joint.upper is not None
     }
     example = "`limits: {%s: {%s: %s}}` in a robot.yaml"
     for severity, kind, clause, names, remedy in (
         ("warning", NoteKind.LIMIT, "no position limits",
-         [j.name for j in moving if j.kind in _WIDE and (j.name not in spans or j.lower == j.upper == 0.0)],
+         [j.name for j in moving if j.kind in _MAX_RANGE and (j.name not in spans or j.lower == j.upper == 0.0)],
          example % ("position", "JOINT", "[-2.0, 2.0]")),
         ("warning", NoteKind.LIMIT, "no velocity limit", [j.name for j in moving if j.velocity is None],
          example % ("velocity", "JOINT", "1.5")),
         ("warning", NoteKind.LIMIT, "a velocity limit beyond what such joints do",
-         [j.name for j in moving if j.velocity is not None and j.velocity > _FAST[j.kind]],
+         [j.name for j in moving if j.velocity is not None and j.velocity > _MAX_SPEED[j.kind]],
          example % ("velocity", "JOINT", "1.5")),
         ("warning", NoteKind.LIMIT, "a range wider than such joints have",
-         [name for name, (joint, span) in spans.items() if span > _WIDE[joint.kind]],
+         [name for name, (joint, span) in spans.items() if span > _MAX_RANGE[joint.kind]],
          example % ("position", "JOINT", "[-2.0, 2.0]")),
         ("warning", NoteKind.JOINT, "hardly any range",
-         [name for name, (_, span) in spans.items() if 0.0 < span < _NARROW],
+         [name for name, (_, span) in spans.items() if 0.0 < span < _MIN_RANGE],
          "`lock: {JOINT: 0.0}` in a robot.yaml"),
         ("warning", NoteKind.JOINT, "mimic joints that move on their own here", [j.name for j in moving if j.mimics],
          "`qpavoid robot add` holds them and those that they follow; or list them under `lock`"),
@@ -253,14 +253,14 @@ def _judge_joints(report: Report, config: RobotConfig) -> None:
 # --- the robot as it loads ----------------------------------------------------------------------------------
 
 
-def _look_at_robot(report: Report, robot: Robot, pieces: Sequence[Piece], progress: Callable[[str], None]) -> None:
+def _check_built_robot(report: Report, robot: Robot, pieces: Sequence[Piece], progress: Callable[[str], None]) -> None:
     report.nq, report.nv = robot.model.nq, robot.model.nv
     report.bodies, report.pairs = len(robot.bodies.geometryObjects), len(robot.bodies.collisionPairs)
     if not report.bodies:
         clause = "it has no collision bodies: nothing would be avoided"
         remedy = "`qpavoid robot add` fits them to what is meant to be seen; or list `bodies` in a robot.yaml"
         report.notes.append(Note(NoteKind.SHAPE, (), clause, remedy, "error"))
-    _look_at_home(report, robot)
+    _check_home(report, robot)
     progress("comparing with the geometry")
     report.notes += [note for entry in find_unchecked(robot, pieces) if (note := entry.note()) is not None]
     if not report.end_effectors:
@@ -277,13 +277,13 @@ def _look_at_robot(report: Report, robot: Robot, pieces: Sequence[Piece], progre
         clause = f"a controller cannot be made: {error}"
         report.notes.append(Note(NoteKind.FILE, (), clause, "mend what it names", "error"))
         return
-    if report.tick_us > _SLOW:
+    if report.tick_us > _SLOW_STEP:
         clause = f"a control step takes {report.tick_us:.0f} µs with {report.pairs} pairs"
         remedy = "`qpavoid robot add` finds pairs that never collide, and capsules; `lock` joints that you do not use"
         report.notes.append(Note(NoteKind.PAIR, (), clause, remedy, "warning"))
 
 
-def _look_at_home(report: Report, robot: Robot) -> None:
+def _check_home(report: Report, robot: Robot) -> None:
     pairs_at_home = touching(robot, robot.home, np.inf)
     report.clearance = pairs_at_home[0][2] if pairs_at_home else None
     report.home_collisions = [pair for pair in pairs_at_home if pair[2] <= 0.0]
@@ -316,12 +316,12 @@ def tick_time(robot: Robot, frames: Sequence[str]) -> float:
     tasks = build_tasks([Task(frame=frame) for frame in known], robot, robot.home)
     controller = Controller(build_scene(robot), tasks)
     space, random = Space(robot), np.random.default_rng(0)
-    states = [space.move(robot.home, random.normal(0.0, 0.05, robot.model.nv)) for _ in range(_TICKS)]
+    states = [space.move(robot.home, random.normal(0.0, 0.05, robot.model.nv)) for _ in range(_MAX_STEPS)]
     times = []
     for q in states:
         begin = perf_counter()
         controller.step(q)
         times.append(perf_counter() - begin)
-        if sum(times) > _PATIENCE:
+        if sum(times) > _MAX_SECONDS:
             break
     return 1e6 * float(np.median(times))

@@ -20,7 +20,7 @@ MIN_CONDITIONING = 0.5
 """Conditioning of a limb at home, in units of what it typically has, below which it counts as singular [-]."""
 _DRAWS = 200
 """Configurations that tell what is typical, and tries at mending one fault."""
-_PATIENCE = 3000
+_MAX_TRIES = 3000
 """Tries in all."""
 _DIGITS = 2
 """After the point, of positions that were drawn [rad or m]."""
@@ -106,7 +106,7 @@ class Limbs:
 
 @dataclass(frozen=True)
 class Home:
-    """A home pose, and what is to be known of it."""
+    """A home pose, its clearance and its conditioning."""
 
     q: Array
     """(nq,)."""
@@ -119,7 +119,7 @@ class Home:
     conditioning: dict[str, Conditioning]
     """Of the limb that ends at each frame."""
     preference: int | None
-    """Which of the wishes it is; None: a pose that was found near the first one."""
+    """Index of the preferred pose that it is; None: a pose near the first of them."""
 
     @property
     def singular(self) -> list[str]:
@@ -127,8 +127,8 @@ class Home:
         return [name for name, value in self.conditioning.items() if value.ratio < MIN_CONDITIONING]
 
 
-class _Judge:
-    """What is wrong with a pose: faults of its m pairs, then of its limbs, each from 0 on."""
+class _PoseCriteria:
+    """Faults of a pose: of its m pairs, then of its limbs, each 0 or more."""
 
     def __init__(self, robot: Robot, frames: Sequence[str], d1: Array) -> None:
         self.distances, self.limbs = PairDistances(robot), Limbs(robot, frames)
@@ -140,7 +140,7 @@ class _Judge:
         As a share of what is needed [-].
         """
         deficit = np.maximum(1.0 - self.distances.all(q) / self.need, 0.0) if len(self.need) else np.zeros(0)
-        deficit += _TOUCH * (deficit > 1.0)
+        deficit += _CONTACT_FAULT * (deficit > 1.0)
         return np.concatenate((deficit, [max(1.0 - limb.ratio / MIN_CONDITIONING, 0.0) for limb in self.limbs.at(q)]))
 
     def movers(self, fault: int) -> BoolArray:
@@ -149,7 +149,7 @@ class _Judge:
         return self.distances.moved_by(fault) if fault < pairs else self.limbs.columns[fault - pairs]
 
 
-_TOUCH = 10.0
+_CONTACT_FAULT = 10.0
 """Fault of a collision beside that of a pair that is merely near, or of a bend [-]."""
 
 
@@ -163,82 +163,84 @@ def find_home(
 ) -> Home:
     """Find a pose near a preferred one with clear pairs and no singular limb.
 
-    The first wish without a fault is taken. Where all have one, the worst fault of the best wish is mended by moving
-    the joints that it depends on, little by little, then the next; in the end every joint that need not have moved is
-    put back. Where not all can be mended, the pose with the fewest and smallest faults is taken.
+    The first preferred pose without a fault is taken. Where all have one, the worst fault of the best is mended by
+    moving the joints that it depends on, little by little, then the next; in the end every joint that need not have
+    moved is restored. Where not all can be mended, the pose with the fewest and smallest faults is taken.
 
     Args:
         robot: with its pairs.
         preferences: configurations, the best first; at least one.
         frames: ends of limbs that should move in every direction.
         d1: safety distance of each pair (m,) [m].
-        pinned: joints that stay where the first wish has them.
+        pinned: joints that stay where the first preferred pose has them.
         seed: of the draw.
     """
-    judge, space, poses = _Judge(robot, frames, d1), Space(robot), [np.asarray(q) for q in preferences]
+    criteria, space, poses = _PoseCriteria(robot, frames, d1), Space(robot), [np.asarray(q) for q in preferences]
     is_pinned = np.array([name.partition(".")[0] in set(pinned) for name in robot.coordinate_names], dtype=bool)
-    faults = [float(judge.faults(q).sum()) for q in (poses[:1] if is_pinned.any() else poses)]
+    faults = [float(criteria.faults(q).sum()) for q in (poses[:1] if is_pinned.any() else poses)]
     is_faultless = [fault == 0.0 for fault in faults]
-    best = is_faultless.index(True) if any(is_faultless) else int(np.argmin(np.floor(np.array(faults) / _TOUCH)))
+    best = (
+        is_faultless.index(True) if any(is_faultless) else int(np.argmin(np.floor(np.array(faults) / _CONTACT_FAULT)))
+    )
     q = (
         poses[best]
         if is_faultless[best]
-        else _mended(robot, judge, space, poses[best], ~is_pinned & space.moving, seed)
+        else _repair(robot, criteria, space, poses[best], ~is_pinned & space.moving, seed)
     )
-    return _described(robot, judge, q, best if np.array_equal(q, poses[best]) else None)
+    return _home_of(robot, criteria, q, best if np.array_equal(q, poses[best]) else None)
 
 
-def _mended(robot: Robot, judge: _Judge, space: Space, start: Array, free: BoolArray, seed: int) -> Array:
+def _repair(robot: Robot, criteria: _PoseCriteria, space: Space, start: Array, free: BoolArray, seed: int) -> Array:
     """Find a pose near `start` with fewer faults; only free coordinates (nv,) differ."""
     random, q, evaluations = np.random.default_rng(seed), start, 0
-    faults, is_unfixable = judge.faults(q), np.zeros(len(judge.faults(q)), dtype=bool)
-    while evaluations < _PATIENCE and np.any(faults[~is_unfixable] > 0.0):
+    faults, is_unfixable = criteria.faults(q), np.zeros(len(criteria.faults(q)), dtype=bool)
+    while evaluations < _MAX_TRIES and np.any(faults[~is_unfixable] > 0.0):
         worst = int(np.argmax(np.where(is_unfixable, -1.0, faults)))
-        mask, best_pose = judge.movers(worst) & free, q
+        mask, best_pose = criteria.movers(worst) & free, q
         for i, target in enumerate(space.draw(random, _DRAWS if mask.any() else 0)):
             step = (i + 1) / _DRAWS * np.asarray(pin.difference(robot.model, q, target))
             candidate = space.move(
                 start, np.round(pin.difference(robot.model, start, space.move(q, step * mask)), _DIGITS)
             )
-            candidate_faults, evaluations = judge.faults(candidate), evaluations + 1
+            candidate_faults, evaluations = criteria.faults(candidate), evaluations + 1
             if candidate_faults.sum() < faults.sum() - 1e-9:
                 best_pose, faults = candidate, candidate_faults
                 if faults[worst] == 0.0:
                     break
         is_unfixable[worst] = best_pose is q
         q = best_pose
-    return _put_back(robot, judge, _nearer(robot, judge, space, q, start), start)
+    return _restore_joints(robot, criteria, _move_back(robot, criteria, space, q, start), start)
 
 
-def _nearer(robot: Robot, judge: _Judge, space: Space, q: Array, start: Array) -> Array:
+def _move_back(robot: Robot, criteria: _PoseCriteria, space: Space, q: Array, start: Array) -> Array:
     """Move back towards `start` on the straight line as long as no fault is added."""
-    step, total = np.asarray(pin.difference(robot.model, start, q)), judge.faults(q).sum()
+    step, total = np.asarray(pin.difference(robot.model, start, q)), criteria.faults(q).sum()
     for part in np.linspace(0.05, 0.95, 19):
         candidate = space.move(start, np.round(part * step, _DIGITS))
-        if judge.faults(candidate).sum() <= total:
+        if criteria.faults(candidate).sum() <= total:
             return candidate
     return q
 
 
-def _put_back(robot: Robot, judge: _Judge, q: Array, start: Array) -> Array:
+def _restore_joints(robot: Robot, criteria: _PoseCriteria, q: Array, start: Array) -> Array:
     """Restore every joint of `start` whose move was not needed."""
-    total = judge.faults(q).sum()
+    total = criteria.faults(q).sum()
     for joint in list(robot.model.joints)[1:]:
         part = slice(joint.idx_q, joint.idx_q + joint.nq)
         candidate = q.copy()
         candidate[part] = start[part]
-        if not np.array_equal(candidate, q) and judge.faults(candidate).sum() <= total:
+        if not np.array_equal(candidate, q) and criteria.faults(candidate).sum() <= total:
             q = candidate
     return q
 
 
-def _described(robot: Robot, judge: _Judge, q: Array, preference: int | None) -> Home:
-    d = judge.distances.all(q)
+def _home_of(robot: Robot, criteria: _PoseCriteria, q: Array, preference: int | None) -> Home:
+    d = criteria.distances.all(q)
     names = [body.name for body in robot.bodies.geometryObjects]
     nearest = None
     if len(d):
-        a, b = judge.distances.pairs[int(np.argmin(d))]
+        a, b = criteria.distances.pairs[int(np.argmin(d))]
         nearest = names[a], names[b]
-    conditioning = dict(zip(judge.limbs.names, judge.limbs.at(q), strict=True))
-    deficit = float(np.max(judge.need - d, initial=0.0))
+    conditioning = dict(zip(criteria.limbs.names, criteria.limbs.at(q), strict=True))
+    deficit = float(np.max(criteria.need - d, initial=0.0))
     return Home(q, float(np.min(d, initial=np.inf)), nearest, deficit, conditioning, preference)

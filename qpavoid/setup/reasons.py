@@ -1,4 +1,4 @@
-"""Which pairs of bodies are not checked, why, and how often the robot's own geometry touches there."""
+"""Pairs of bodies that are not checked: the reasons, and how often the robot's own geometry touches there."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What random configurations tell of a robot: how often each pair touches, how near it comes, how far it gets."""
+"""Statistics over random configurations: how often each pair touches, its least distance, the size of the robot."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ BoolArray = NDArray[np.bool_]
 SAMPLES, SEED = 5000, 0
 NEVER_NEAR = 0.02
 """Distance, as a share of the robot's size, that a pair must keep in every sample, and where descent from the nearest
-of them ends, to count as never colliding [-]: 20 mm of an arm that reaches 1 m."""
+of them ends, to count as never colliding [-]: 20 mm of an arm with a maximal extension of 1 m."""
 ALWAYS_NEAR = 0.03
-"""Distance, as a share of the robot's size, within which two capsules are in every sample if they are too fat [-]."""
+"""Distance, as a share of the robot's size, within which two capsules are in every sample if they are oversized [-]."""
 D1 = Avoidance().d1
 """Safety distance of the pairs that have none of their own [m]."""
 _FIRST = 500
@@ -36,7 +36,7 @@ _DOUBT = 0.1
 _STEPS = 60
 """Of a descent."""
 _UNBOUNDED = np.pi
-"""Range of coordinates without limits: joints that turn all the way round, and a root that never matters here."""
+"""Half the range of coordinates without limits: continuous joints, and a root, whose pose does not matter here."""
 
 
 def robot_size(robot: Robot) -> float:
@@ -44,7 +44,7 @@ def robot_size(robot: Robot) -> float:
 
     Half the diagonal of the largest box that the bodies fill in some configurations.
 
-    About the reach of an arm, the height of a humanoid: what distances on this robot are large or small beside.
+    About the maximal extension of an arm, the height of a humanoid: the scale of distances on this robot.
     """
     bodies = robot.bodies.geometryObjects
     if not len(bodies):
@@ -164,7 +164,7 @@ def _root_names(robot: Robot) -> set[str]:
 
 @dataclass(frozen=True)
 class PairSamples:
-    """What random configurations show of each of a robot's m pairs."""
+    """Statistics of each of a robot's m pairs over random configurations."""
 
     contact: Array
     """(m,) share of the samples in which it touches [-]."""

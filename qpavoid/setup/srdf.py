@@ -1,4 +1,4 @@
-"""What an SRDF says of a robot, and how one is written."""
+"""SRDF files: reading and writing."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def find_srdf(urdf: Path) -> Path | None:
 
     That whose name has most in common with the URDF's.
 
-    Those that `robot add` wrote are left out: it would be told what it said before.
+    Those that `robot add` wrote are left out: they hold its own results.
     """
     folders = (urdf.parent, urdf.parent / "srdf", urdf.parent.parent / "srdf")
     found = [path for folder in folders for path in sorted(folder.glob("*.srdf")) if not _ours(path)]

@@ -18,13 +18,13 @@ _GROUND = 0.02
 """Height above the robot's lowest point, as a share of its own, up to which a shape stands on the ground [-]."""
 
 _ENDLESS = 1e9
-"""Position from which a limit is a way of saying that there is none [rad]."""
+"""Position from which a limit means that there is none, as files write it [rad]."""
 
 
 def wheel_joints(model: Any, pieces: Sequence[Piece]) -> list[str]:
     """Find the joints of wheels and casters of a mobile base.
 
-    Those that turn all the way round and bear such a name, they or their link; and those with a horizontal axis whose
+    Those that are continuous and bear such a name, they or their link; and those with a horizontal axis whose
     link is a cylinder or ball that stands on the ground.
 
     Args:
@@ -42,7 +42,7 @@ def wheel_joints(model: Any, pieces: Sequence[Piece]) -> list[str]:
             round_ones[frame.parentJoint] = min(low, round_ones.get(frame.parentJoint, np.inf))
     wheel_names = []
     for joint in list(model.joints)[1:]:
-        if not _turns_round(model, joint):
+        if not _is_continuous(model, joint):
             continue
         links = [frame.name for frame in model.frames if frame.parentJoint == joint.id and frame.type == pin.BODY]
         has_name = any(_NAMES.search(name) for name in (model.names[joint.id], *links))
@@ -62,7 +62,7 @@ def _heights(piece: Piece, link: Any) -> tuple[float, float]:
     return middle - half_height, middle + half_height
 
 
-def _turns_round(model: Any, joint: Any) -> bool:
+def _is_continuous(model: Any, joint: Any) -> bool:
     """Return True if a joint is continuous: it has an angle, and no limits."""
     name = joint.shortname()
     if name.startswith("JointModelRUB") or name == "JointModelRevoluteUnboundedUnaligned":

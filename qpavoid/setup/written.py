@@ -1,4 +1,4 @@
-"""Files that are written again only as long as nobody else has touched them.
+"""Files that are written again only if they were not edited.
 
 Each carries the digest of its own content, so that an edit shows.
 """
@@ -39,7 +39,7 @@ def write_files(contents: Mapping[Path, bytes], force: bool = False) -> dict[Pat
         For each file `written`, `unchanged` or `updated`.
 
     Raises:
-        ConfigError: a file was edited since it was written, or is somebody else's; or it cannot be written.
+        ConfigError: a file was edited since it was written, or was not written by it; or it cannot be written.
     """
     outcome = {}
     for path, content in contents.items():
