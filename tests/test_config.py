@@ -317,7 +317,7 @@ def test_bad_field_given_to_from_urdf_is_a_config_error():
         Robot.from_urdf(SHIPPED / ROBOT["urdf"], bodies="convx")
 
 
-def test_several_faults_are_told_at_once_but_not_without_end(load):
+def test_several_faults_are_named_at_once_up_to_a_number(load):
     with pytest.raises(ConfigError) as error:
         load("q0", [NAN] * 14)
     assert message(error).count("finite") == 5

@@ -15,6 +15,7 @@ from qpavoid import Robot, load_scenario
 from qpavoid.config import RobotConfig
 from qpavoid.config.loading import read_config
 from qpavoid.config.shipped import data_folder, find_robot
+from qpavoid.model.notes import NoteKind
 from qpavoid.model.packages import find_mesh
 from qpavoid.run.simulate import simulate
 from qpavoid.setup.add import DescribeOptions, describe
@@ -131,7 +132,7 @@ def test_limits_that_cannot_be_meant(tmp_path):
     assert report.usable
 
 
-def test_mimic_mass_feet_and_home_collisions_are_told(tmp_path):
+def test_check_names_mimic_joints_masses_feet_and_home_collisions(tmp_path):
     urdf = write_chain(tmp_path, 3, shape='<sphere radius="0.35"/>')
     urdf.write_text(
         urdf.read_text().replace('<child link="link3"/>', '<child link="link3"/><mimic joint="joint1"/>')
@@ -244,7 +245,7 @@ def test_a_run_into_the_folder_of_the_urdf_does_not_honour_its_own_srdf(cli, tmp
         assert document["srdf"] is None and set(document["files"].values()) == {outcome}
 
 
-def test_an_edited_file_is_left_alone_unless_told_otherwise(cli, tmp_path):
+def test_edited_file_is_overwritten_only_by_force(cli, tmp_path):
     write_chain(tmp_path)
     cli("robot", "add", "chain.urdf", "--no-picture")
     path = tmp_path / "chain" / "robot.yaml"
@@ -256,6 +257,20 @@ def test_an_edited_file_is_left_alone_unless_told_otherwise(cli, tmp_path):
     assert path.read_text() == edited
     assert cli("robot", "add", "chain.urdf", "--no-picture", "--force").status == 0
     assert is_sealed(path.read_bytes())
+
+
+@pytest.mark.parametrize(("root", "size"), [("planar", 3), ("free_flyer", 6)])
+def test_added_base_has_the_speed_limit_that_was_assumed(cli, tmp_path, root, size):
+    """A URDF gives no speed of a base: `add` writes the assumed one, which then is no assumption any more."""
+    write_chain(tmp_path)
+    bare = Robot.from_urdf(tmp_path / "chain.urdf", root_joint=root)
+    assert any("root_joint" in note.subject for note in bare.notes if note.kind is NoteKind.LIMIT)
+    assert cli("robot", "add", "chain.urdf", "--root", root, "--no-picture").status == 0
+    path = tmp_path / "chain" / "robot.yaml"
+    assert yaml.safe_load(path.read_text())["limits"] == {"velocity": {"root_joint": [1.0] * size}}
+    added = Robot.load(path)
+    np.testing.assert_array_equal(added.bounds().velocity, bare.bounds().velocity)
+    assert not any("root_joint" in note.subject for note in added.notes)
 
 
 def test_the_written_command_writes_the_same_again(cli, tmp_path):
