@@ -30,7 +30,7 @@ LOADED = {
 
 
 def main() -> None:
-    """Parses the options, measures, writes bench/results/meshes.md and prints it."""
+    """Parse the options, measure, write bench/results/meshes.md and print it."""
     parser = argparse.ArgumentParser(prog="python -m bench.meshes", description=__doc__)
     parser.add_argument("--steps", type=int, default=30, help="configurations of the swing (30)")
     parser.add_argument("--rounds", type=int, default=3, help="times that the swing is gone through (3)")
@@ -90,7 +90,7 @@ def _distances(name: str, steps: int, rounds: int) -> list[str]:
 
 
 def _time(robot: Robot, pairs: list[tuple[int, int]], steps: int, rounds: int) -> float:
-    """What the distances of these pairs take at a step of the swing, on average [s]."""
+    """Time the distances of some pairs at a step of the swing; the mean [s]."""
     geometry = pin.GeometryModel(robot.bodies)
     geometry.removeAllCollisionPairs()
     for a, b in pairs:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from qpavoid.config.shipped import example_robot_data
-from qpavoid.model.notes import shortened
+from qpavoid.model.notes import abbreviate
 
 ROBOTS = example_robot_data() / "example-robot-data" / "robots"
 OUT = Path(__file__).parent.parent / "docs" / "robots.md"
@@ -46,7 +46,7 @@ pinocchio {pin}, coal {coal}; a machine with 2 cores that was busy with other th
 
 
 def run(*arguments: str) -> tuple[dict[str, Any] | None, str]:
-    """The document that a `robot` command printed, or None and what it said instead."""
+    """Run a `robot` command; return its document, or None and its last words on stderr."""
     command = [sys.executable, "-m", "qpavoid", "robot", *arguments, "--json"]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT, check=False)
@@ -61,7 +61,7 @@ def run(*arguments: str) -> tuple[dict[str, Any] | None, str]:
 
 
 def row(urdf: Path, folder: Path) -> tuple[str, bool]:
-    """A robot's row of the table, and whether every command ended as it should."""
+    """Return a robot's row of the table, and True if every command ended as it should."""
     name = urdf.relative_to(ROBOTS).as_posix()
     checked, why = run("check", str(urdf))
     added, why_not = run("add", str(urdf), "--out", str(folder / name), "--no-picture")
@@ -92,7 +92,7 @@ def row(urdf: Path, folder: Path) -> tuple[str, bool]:
 
 def _problem(report: dict[str, Any]) -> str:
     note = report["notes"][0]
-    names = f"{shortened(note['subject'], 5)}: " if note["subject"] else ""
+    names = f"{abbreviate(note['subject'], 5)}: " if note["subject"] else ""
     return f"{note['severity']}: {names}{note['what']}"
 
 

@@ -175,7 +175,7 @@ class Controller:
             scene, law, self._assembly, self._query, self._obstacles, self._bounds,
             [task for task in frames if task.moves], self.avoidance, self.limits, progress or Progress(), dt,
         )  # fmt: skip
-        hold = self.avoidance.hold - self.avoidance.offset
+        hold = self.avoidance.safety_distance - self.avoidance.offset
         self._grasps = Attachments(scene, (self._query, *self._commander.queries), self._assembly, hold)
         self._warm_up()
         kernels.first_use.end()

@@ -42,13 +42,13 @@ def scenario(robot, motion, obstacles=(), frame=None, **fields):
     task = {"frame": frame or "panda_hand_tcp", "motion": motion, **fields.pop("task", {})}
     return ScenarioConfig.model_validate(
         {"robot": robot, "tasks": [task], "obstacles": list(obstacles), "duration": 3.0, **fields}
-    ).read_from(SHIPPED)
+    ).with_source(SHIPPED)
 
 
 def changed(name, **fields):
     """A shipped scenario with other fields."""
     base = load_scenario(name)
-    return ScenarioConfig.model_validate({**base.model_dump(mode="json"), **fields}).read_from(base.source)
+    return ScenarioConfig.model_validate({**base.model_dump(mode="json"), **fields}).with_source(base.source)
 
 
 def drive(controller, q, ticks, *, target=None, obstacles=None, start=0, hold=None):

@@ -120,7 +120,7 @@ def test_backup_is_bitwise_neutral_among_static_obstacles():
     base = load_scenario("ur5_pole", ["duration=3"])
     assert all(o.motion.type == "fixed" for o in base.obstacles)
     without = base.model_copy(update={"avoidance": base.avoidance.model_copy(update={"backup": None})})
-    (one, q), (two, _) = Controller.from_scenario(base), Controller.from_scenario(without.read_from(base.source))
+    (one, q), (two, _) = Controller.from_scenario(base), Controller.from_scenario(without.with_source(base.source))
     for k in range(300):
         v = one.step(q, k * base.dt).v
         assert np.array_equal(v, two.step(q, k * base.dt).v)

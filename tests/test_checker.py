@@ -41,7 +41,7 @@ def situation(solver):
 
 def scene_of(robot_path, tasks, obstacles, **fields):
     config = {"robot": str(robot_path), "tasks": tasks, "obstacles": obstacles, **fields}
-    return ScenarioConfig.model_validate(config).read_from(Path("handmade.yaml"))
+    return ScenarioConfig.model_validate(config).with_source(Path("handmade.yaml"))
 
 
 # --- the MuJoCo model ----------------------------------------------------------------------------------------------

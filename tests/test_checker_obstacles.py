@@ -12,7 +12,7 @@ from test_shapes import SHELF, boards, write_stl
 from qpavoid import Avoidance, Obstacle, Points, Robot, Status, Voxels, build_scene
 from qpavoid.config import Box, Capsule, Ellipsoid, HalfSpace, Mesh, PointCloud, Sphere
 from qpavoid.geometry.bodies import make_shape
-from qpavoid.model.cloud import ball_radius
+from qpavoid.model.cloud import voxel_radius
 
 pytest.importorskip("mujoco")
 pytest.importorskip("bench", reason="bench/ is in the repository only")
@@ -67,7 +67,7 @@ def test_cloud_distance_equals_all_voxels(panda):
     controller = make_controller(
         panda, [Obstacle.at("camera", shape, [0, 0, 0])], TCP, avoidance=Avoidance(d1=HOLD, d2=0.1)
     )
-    centers, ball = Voxels.of(points, shape.resolution).centers, Sphere(radius=ball_radius(shape.resolution))
+    centers, ball = Voxels.of(points, shape.resolution).centers, Sphere(radius=voxel_radius(shape.resolution))
     mujoco_model = build(build_scene(panda, [Obstacle.at(f"v{i}", ball, c) for i, c in enumerate(centers)]), panda.home)
     of_voxels = mujoco_model.scene.pairs[:, 1] >= mujoco_model.bodies
     assert len(centers) > 60

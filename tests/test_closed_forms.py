@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from oracle import support
 
 from qpavoid.control.distances import DistanceQuery
-from qpavoid.geometry.cores import cores, with_closed_form
+from qpavoid.geometry.cores import cores, has_closed_form
 from qpavoid.kernels.distances import MIN_CORE_DISTANCE, closed_forms
 
 AT_ORIGIN = pin.SE3.Identity()
@@ -20,7 +20,7 @@ def found(a, b, at_a=AT_ORIGIN, at_b=AT_ORIGIN):
     """[distance, normal, point a, point b] of two bodies; None where their cores meet."""
     poses = np.array([np.concatenate((at.rotation.ravel(order="F"), at.translation)) for at in (at_a, at_b)])
     table, bodies, results = cores([a, b]), np.array([[0, 1]]), np.full((1, 10), np.nan)
-    known, left = with_closed_form(table, bodies), np.zeros(1, dtype=np.intp)
+    known, left = has_closed_form(table, bodies), np.zeros(1, dtype=np.intp)
     assert known.all()
     count = closed_forms(poses, table, bodies, known, np.array([0]), results, left)
     return None if count else results[0]
@@ -110,10 +110,10 @@ def test_closed_forms_exist_of_spheres_capsules_and_boxes():
     bodies = [coal.Sphere(0.1), coal.Capsule(0.1, 0.2), coal.Box(0.1, 0.2, 0.3), coal.Cylinder(0.1, 0.2)]
     pairs = np.array([[i, j] for i in range(4) for j in range(4)])
     table = cores([*bodies, coal.Box(0.1, 0.0, 0.3)])
-    known = with_closed_form(table, pairs).reshape(4, 4)
+    known = has_closed_form(table, pairs).reshape(4, 4)
     expected = [[True, True, True, False], [True, True, True, False], [True, True, False, False], [False] * 4]
     np.testing.assert_array_equal(known, expected)
-    assert not with_closed_form(table, np.array([[0, 4]]))[0]  # a box without an inside
+    assert not has_closed_form(table, np.array([[0, 4]]))[0]  # a box without an inside
 
 
 @pytest.mark.parametrize("copies", [False, True], ids=["views", "copies"])

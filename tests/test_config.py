@@ -1,4 +1,4 @@
-"""Scenario and robot files: what they may say, and what a user is told when they say something else."""
+"""Scenario and robot files: what they may say, and the errors when they say something else."""
 
 import copy
 import re
@@ -182,7 +182,7 @@ def test_key_that_resembles_nothing_gets_the_list_of_the_block_it_is_in(load):
 
 
 @pytest.mark.parametrize(
-    ("path", "value", "told"),
+    ("path", "value", "expected"),
     [
         ("solver", "eq11", "solver: unknown name 'eq11'; did you mean 'eq10'?"),
         ("solver.name", "pq", "solver: unknown name 'pq'; did you mean 'qp'?"),
@@ -194,10 +194,10 @@ def test_key_that_resembles_nothing_gets_the_list_of_the_block_it_is_in(load):
         ("solver", "eq10:daqp", "solver.backend: unknown key; valid are alpha_cap, damping, name, retreat_speed"),
     ],
 )
-def test_unknown_member_of_a_union(load, path, value, told):
+def test_unknown_member_of_a_union(load, path, value, expected):
     with pytest.raises(ConfigError) as error:
         load(path, value)
-    assert message(error).endswith(f"scene.yaml: {told}")
+    assert message(error).endswith(f"scene.yaml: {expected}")
 
 
 def test_settings_of_another_member_are_unknown_keys(load):
@@ -211,7 +211,7 @@ NAN, INF = float("nan"), float("inf")
 
 
 @pytest.mark.parametrize(
-    ("path", "value", "field", "told"),
+    ("path", "value", "field", "expected"),
     [
         ("duration", "long", "duration", "valid number"),
         ("duration", "8 s", "duration", "got '8 s': give a number alone, in m, rad, kg and s"),
@@ -269,12 +269,12 @@ NAN, INF = float("nan"), float("inf")
         ),
     ],
 )
-def test_bad_value_names_file_and_field(load, path, value, field, told):
+def test_bad_value_names_file_and_field(load, path, value, field, expected):
     with pytest.raises(ConfigError) as error:
         load(path, value)
     assert f"scene.yaml: {field}: " in message(error)
-    assert told in message(error)
-    assert ";" not in message(error).split("scene.yaml")[1], "more than one fault told for a single one"
+    assert expected in message(error)
+    assert ";" not in message(error).split("scene.yaml")[1], "more than one fault named for a single one"
 
 
 @pytest.mark.parametrize(
@@ -291,11 +291,11 @@ def test_obstacle_without_a_place(load, motion, missing):
 
 
 @pytest.mark.parametrize(
-    ("path", "told"),
+    ("path", "expected"),
     [("obstacles", "obstacle 'fist' is given twice"), ("tasks", "task 'left_tool' is given twice")],
 )
-def test_names_must_differ(load, path, told):
-    with pytest.raises(ConfigError, match=told):
+def test_names_must_differ(load, path, expected):
+    with pytest.raises(ConfigError, match=expected):
         load(path, SCENARIO[path] * 2)
 
 
@@ -317,7 +317,7 @@ def test_bad_field_given_to_from_urdf_is_a_config_error():
         Robot.from_urdf(SHIPPED / ROBOT["urdf"], bodies="convx")
 
 
-def test_several_faults_are_told_at_once_but_not_without_end(load):
+def test_several_faults_are_named_at_once_up_to_a_number(load):
     with pytest.raises(ConfigError) as error:
         load("q0", [NAN] * 14)
     assert message(error).count("finite") == 5
@@ -328,7 +328,7 @@ def test_several_faults_are_told_at_once_but_not_without_end(load):
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "expected"),
     [
         (b"", "must be a mapping of fields, got NoneType"),
         (b"# only a comment\n", "must be a mapping of fields, got NoneType"),
@@ -342,10 +342,10 @@ def test_several_faults_are_told_at_once_but_not_without_end(load):
         (b"robot: panda\n1: 2\n", "1: Keys should be strings"),
     ],
 )
-def test_files_that_are_no_scenario(tmp_path, content, told):
+def test_files_that_are_no_scenario(tmp_path, content, expected):
     file = tmp_path / "scene.yaml"
     file.write_bytes(content)
-    with pytest.raises(ConfigError, match=re.escape(told)) as error:
+    with pytest.raises(ConfigError, match=re.escape(expected)) as error:
         load_scenario(file)
     assert message(error).startswith(f"{file}: ")
 
@@ -409,7 +409,7 @@ def test_set_below_a_solver_in_short_form(load):
 
 
 @pytest.mark.parametrize(
-    ("override", "told"),
+    ("override", "expected"),
     [
         ("avoidance.d2", "expected path=value"),
         ("=3", "expected path=value"),
@@ -425,10 +425,10 @@ def test_set_below_a_solver_in_short_form(load):
         ("avoidance.d2=.nan", "avoidance.d2: Input should be a finite number"),
     ],
 )
-def test_bad_set(load, override, told):
+def test_bad_set(load, override, expected):
     with pytest.raises(ConfigError) as error:
         load("title", "", override)
-    assert told in message(error)
+    assert expected in message(error)
 
 
 # --solver
@@ -459,9 +459,9 @@ def test_solver_given_in_file_option_or_call_is_the_same(tmp_path, name):
     assert np.array_equal(v, simulate(load_scenario(file), solver=name).v)
 
 
-@pytest.mark.parametrize(("name", "told"), [("eq11", "did you mean 'eq10'"), ("eq10:daqp", "backend")])
-def test_parse_solver_says_what_is_wrong(name, told):
-    with pytest.raises(ConfigError, match=told):
+@pytest.mark.parametrize(("name", "expected"), [("eq11", "did you mean 'eq10'"), ("eq10:daqp", "backend")])
+def test_parse_solver_says_what_is_wrong(name, expected):
+    with pytest.raises(ConfigError, match=expected):
         parse_solver(name)
 
 

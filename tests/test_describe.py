@@ -21,15 +21,15 @@ from qpavoid.geometry.segments import point_segment
 from qpavoid.model.end_effectors import end_effectors
 from qpavoid.model.trajectory import rpy_to_matrix
 from qpavoid.model.urdf import read_model
-from qpavoid.setup.add import Wishes, describe
+from qpavoid.setup.add import DescribeOptions, describe
 from qpavoid.setup.fit import cut, decompose, fit_piece, hull_volume, triangles
-from qpavoid.setup.home import BENT, ROOM, Limbs, find_home
+from qpavoid.setup.home import HOME_CLEARANCE, MIN_CONDITIONING, Limbs, find_home
 from qpavoid.setup.sampling import (
     D1,
-    NEAR,
+    NEVER_NEAR,
     PairDistances,
     Space,
-    always_near,
+    pairs_always_near,
     robot_size,
     safety_distances,
     sample_pairs,
@@ -38,7 +38,7 @@ from qpavoid.setup.sampling import (
 from qpavoid.setup.shapes import capsule_fields
 from qpavoid.setup.srdf import MADE_BY, Semantics, find_srdf, read_srdf, srdf_text
 from qpavoid.setup.texts import description_files
-from qpavoid.setup.written import BLANK, seal, untouched, write_files
+from qpavoid.setup.written import BLANK, is_sealed, seal, write_files
 
 PANDA = EXAMPLES / "panda_description/urdf/panda.urdf"
 
@@ -148,7 +148,7 @@ def test_what_is_written_encloses_what_was_fitted(axis, center, radius, length, 
 @pytest.fixture(scope="module")
 def panda_described():
     kinds = ("auto", "capsule", "capsules", "convex")
-    return {kind: describe(PANDA, Wishes(bodies=kind, samples=300)) for kind in kinds}
+    return {kind: describe(PANDA, DescribeOptions(bodies=kind, samples=300)) for kind in kinds}
 
 
 @pytest.mark.parametrize("kind", ["auto", "capsule", "capsules", "convex"])
@@ -184,12 +184,12 @@ def test_more_faithful_bodies_take_less_room(panda_described):
 
 
 def test_single_links_may_be_another_kind():
-    described = describe(PANDA, Wishes(bodies="capsule", bodies_of={"panda_link[02]": "convex"}, samples=10))
+    described = describe(PANDA, DescribeOptions(bodies="capsule", bodies_of={"panda_link[02]": "convex"}, samples=10))
     shapes = {body.name: type(body.shape) for body in described.config.bodies}
     assert shapes["panda_link0"] is shapes["panda_link2"] is Hull
     assert shapes["panda_link1"] is Capsule
     with pytest.raises(UnknownName, match=r"--bodies: no link 'panda_lnk0' with geometry; did you mean 'panda_link"):
-        describe(PANDA, Wishes(bodies_of={"panda_lnk0": "convex"}))
+        describe(PANDA, DescribeOptions(bodies_of={"panda_lnk0": "convex"}))
 
 
 # --- pairs ----------------------------------------------------------------------------------------------------
@@ -219,7 +219,7 @@ def test_descent_finds_what_samples_miss(tmp_path):
     robot = chain(tmp_path, [ball("base", "link0", tip, 0.01), ball("tip", "link2", [0, 0, 0.25], 0.01)])
     assert touching(robot, np.array([1.2, -0.9]))
     distances, draws = PairDistances(robot), Space(robot).draw(np.random.default_rng(0), 10)
-    assert min(distances.all(q)[0] for q in draws) > NEAR * robot_size(robot)
+    assert min(distances.all(q)[0] for q in draws) > NEVER_NEAR * robot_size(robot)
     assert not sample_pairs(robot, samples=10).never[0]
 
 
@@ -246,7 +246,7 @@ def test_a_pair_that_cannot_part_is_always_near(tmp_path):
     side = [ball("a", "link0", [0, 0, 0.28], 0.1), ball("b", "link2", [0, 0, -0.25], 0.03)]
     robot = chain(tmp_path, side)
     # b turns about link2's joint at 0.25 m from it; with limits of ±2 rad it comes away from a
-    assert len(always_near(robot, 50)) == 0
+    assert len(pairs_always_near(robot, 50)) == 0
     held = chain(tmp_path, [ball("a", "link0", [0.0, 0.0, 0.26], 0.01), ball("b", "link2", [0, 0, -0.3], 0.01)],
                  limits={"position": {"joint1": (-0.01, 0.01), "joint2": (-0.01, 0.01)}})  # fmt: skip
     sampled = sample_pairs(held, 300)  # near all along its range, by design, but never in touch: it is kept
@@ -274,11 +274,13 @@ def test_home_is_the_wish_or_near_it(tmp_path):
     assert touching(robot, robot.home)[0][2] < 0.0
     d1, good = np.array([D1]), np.array([0.0, 1.0])
     home = find_home(robot, [robot.home, good], [], d1)
-    assert home.wish == 1 and np.array_equal(home.q, good) and home.clearance >= ROOM * D1 and home.short == 0.0
+    assert (
+        home.wish == 1 and np.array_equal(home.q, good) and home.clearance >= HOME_CLEARANCE * D1 and home.short == 0.0
+    )
     for own in (D1, 0.003):
         home = find_home(robot, [robot.home], [], np.array([own]))
         assert home.wish is None and touching(robot, home.q, np.inf)[0][2] == home.clearance
-        assert ROOM * own <= home.clearance < ROOM * own + 0.02 and home.nearest == ("base", "tip")
+        assert HOME_CLEARANCE * own <= home.clearance < HOME_CLEARANCE * own + 0.02 and home.nearest == ("base", "tip")
         assert np.linalg.norm(home.q - robot.home) < 1.0
         bounds = robot.bounds()
         assert np.all(home.q >= bounds.lower) and np.all(home.q <= bounds.upper)
@@ -300,7 +302,7 @@ def test_home_is_bent(tmp_path):
     columns = np.array([along[0] + along[1], along[1], [0.0, 0.0]]).T
     assert limb.value == pytest.approx(np.linalg.svd(columns, compute_uv=False)[1], abs=1e-9)
     straight = find_home(tool, [np.zeros(3)], ["link3"], np.zeros(0))
-    assert straight.wish is None and not straight.singular and straight.conditioning["link3"].ratio >= BENT
+    assert straight.wish is None and not straight.singular and straight.conditioning["link3"].ratio >= MIN_CONDITIONING
     assert np.count_nonzero(straight.q) == 1  # one bend is enough
     pinned = find_home(tool, [np.zeros(3)], ["link3"], np.zeros(0), pinned=["joint2"])
     assert pinned.singular == ["link3"] and pinned.q[1] == 0.0
@@ -444,29 +446,29 @@ def test_mimic_drivers_stay_free(panda_described):
     described = panda_described["auto"]
     assert described.config.lock == {} and described.robot.model.nv == 8
     assert described.config.home["panda_finger_joint1"] == 0.001
-    locked = describe(PANDA, Wishes(lock=["panda_finger_joint1"], samples=10))
+    locked = describe(PANDA, DescribeOptions(lock=["panda_finger_joint1"], samples=10))
     assert locked.config.lock == {"panda_finger_joint1": 0.001} and locked.robot.model.nv == 7
 
 
 def test_home_and_locks_may_be_wished():
     urdf = EXAMPLES / "ur_description/urdf/ur5_robot.urdf"
-    wishes = Wishes(home={"elbow_joint": 1.57, "wrist_3_joint": 0.5}, lock=["wrist_3*"], samples=10)
+    wishes = DescribeOptions(home={"elbow_joint": 1.57, "wrist_3_joint": 0.5}, lock=["wrist_3*"], samples=10)
     config = describe(urdf, wishes).config
     assert config.home["elbow_joint"] == 1.57 and config.lock == {"wrist_3_joint": 0.5}
     with pytest.raises(UnknownName, match=r"--home: no joint 'elbow'; did you mean 'elbow_joint'"):
-        describe(urdf, Wishes(home={"elbow": 1.0}))
+        describe(urdf, DescribeOptions(home={"elbow": 1.0}))
     with pytest.raises(UnknownName, match=r"--lock: no joint 'wrist_9'"):
-        describe(urdf, Wishes(lock=["wrist_9"]))
+        describe(urdf, DescribeOptions(lock=["wrist_9"]))
 
 
 def test_capsules_too_fat_for_the_home_pose_become_exact(tmp_path):
     """Two discs, 8 cm apart: the capsules around them are 20 cm thick."""
     urdf = write_chain(tmp_path, 2, shape='<cylinder radius="0.1" length="0.12"/>')
-    described = describe(urdf, Wishes(samples=50))
+    described = describe(urdf, DescribeOptions(samples=50))
     assert all(isinstance(body.shape, Capsule) for body in described.config.bodies)
     close = urdf.read_text().replace('xyz="0 0 0.3"', 'xyz="0 0 0.08"')
     urdf.write_text(close.replace('length="0.12"', 'length="0.12"'))
-    described = describe(urdf, Wishes(samples=50))
+    described = describe(urdf, DescribeOptions(samples=50))
     shapes = {body.name: body.shape.type for body in described.config.bodies}
     assert shapes["link0"] == shapes["link2"] == "cylinder"
     assert any("exact bodies" in note.what and {"link0", "link2"} <= {*note.subject} for note in described.notes)
@@ -475,11 +477,11 @@ def test_capsules_too_fat_for_the_home_pose_become_exact(tmp_path):
 def test_bodies_are_fitted_to_what_is_seen_where_there_is_nothing_else(tmp_path):
     urdf = write_chain(tmp_path, shape='<box size="0.1 0.1 0.2"/>')
     urdf.write_text(urdf.read_text().replace("collision>", "visual>"))
-    described = describe(urdf, Wishes(samples=50))
+    described = describe(urdf, DescribeOptions(samples=50))
     assert {type(body.shape) for body in described.config.bodies} <= {Box, Capsule}
     assert any("no collision shape" in note.what for note in described.notes)
     urdf.write_text(urdf.read_text().replace("visual>", "nothing>"))
-    described = describe(urdf, Wishes(samples=50))
+    described = describe(urdf, DescribeOptions(samples=50))
     assert described.config.bodies == [] and any("no geometry at all" in note.what for note in described.notes)
     assert Robot.from_config(described.config, urdf).bodies.ngeoms == 0
 
@@ -487,7 +489,7 @@ def test_bodies_are_fitted_to_what_is_seen_where_there_is_nothing_else(tmp_path)
 def test_a_link_with_the_name_of_a_joint(tmp_path):
     urdf = write_chain(tmp_path)
     urdf.write_text(urdf.read_text().replace('joint name="joint2"', 'joint name="link2"'))
-    robot = Robot.from_config(describe(urdf, Wishes(samples=20)).config, urdf)
+    robot = Robot.from_config(describe(urdf, DescribeOptions(samples=20)).config, urdf)
     assert robot.model.frames[robot.frame_id("link2", "here")].type == pin.BODY
 
 
@@ -521,10 +523,10 @@ def test_hull_of_a_round_flat_face():
 @given(st.binary(max_size=60), st.binary(max_size=60), st.integers(0, 200))
 def test_every_edit_of_a_sealed_file_shows(before, after, at):
     content = seal(before + BLANK.encode() + after)
-    assert untouched(content)
+    assert is_sealed(content)
     at %= len(content)
-    assert not untouched(content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :])
-    assert not untouched(content[:-1])
+    assert not is_sealed(content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :])
+    assert not is_sealed(content[:-1])
 
 
 def test_all_files_are_written_or_none(tmp_path):
@@ -543,9 +545,9 @@ def test_all_files_are_written_or_none(tmp_path):
 
 
 def test_describing_twice_is_the_same(tmp_path):
-    one, two = (description_files(describe(PANDA, Wishes(samples=200)), tmp_path) for _ in range(2))
+    one, two = (description_files(describe(PANDA, DescribeOptions(samples=200)), tmp_path) for _ in range(2))
     assert one == two
-    assert all(untouched(content) for content in one.values())
+    assert all(is_sealed(content) for content in one.values())
 
 
 def test_a_config_that_is_written_reads_back_with_its_units(panda_described):

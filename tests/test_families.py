@@ -243,7 +243,7 @@ def scenario_of(robot, obstacles, duration=8.0, **fields):
         "tasks": [{"frame": "ball", "motion": {"type": "line", "displacement": [1.0, 0.0, 0.0], "speed": 0.2}}],
         "avoidance": {"d1": 0.02, "d2": 0.1}, **fields,
     }  # fmt: skip
-    return ScenarioConfig.model_validate(config).read_from(Path("handmade.yaml"))
+    return ScenarioConfig.model_validate(config).with_source(Path("handmade.yaml"))
 
 
 def planned(scenario):

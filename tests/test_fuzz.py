@@ -261,16 +261,16 @@ CASES = [
     ("path.csv", "0,0,0,0\n" * 3_000_000, "24000000 bytes; at most 20000000 are read"),
 ]
 ONE_BY_ONE = [
-    pytest.param(name, content, told, id=f"{name}-{i}")
-    for i, (names, content, told) in enumerate(CASES)
+    pytest.param(name, content, expected, id=f"{name}-{i}")
+    for i, (names, content, expected) in enumerate(CASES)
     for name in ((names,) if isinstance(names, str) else names)
 ]
 
 
-@pytest.mark.parametrize(("name", "content", "told"), ONE_BY_ONE)
-def test_file_is_refused(name, content, told, tmp_path):
+@pytest.mark.parametrize(("name", "content", "expected"), ONE_BY_ONE)
+def test_file_is_refused(name, content, expected, tmp_path):
     (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
-    assert re.search(told, refusal(name, tmp_path))
+    assert re.search(expected, refusal(name, tmp_path))
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -310,7 +310,7 @@ def test_aliases_and_marks_that_do_no_harm_are_read(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("override", "told"),
+    ("override", "expected"),
     [
         ("tags=" + "[" * 5000, "is not a YAML value"),
         ("tags=&a [*a]", "is not a YAML value"),
@@ -321,8 +321,8 @@ def test_aliases_and_marks_that_do_no_harm_are_read(tmp_path):
         ("obstacles.0.shape.size=[1e308, 1, 1]", "less than or equal to 1000000000"),
     ],
 )
-def test_bad_set(override, told):
-    with pytest.raises(ConfigError, match=told) as error:
+def test_bad_set(override, expected):
+    with pytest.raises(ConfigError, match=expected) as error:
         load_scenario("panda_line", [override])
     assert str(error.value).isprintable()
 
@@ -367,7 +367,7 @@ def arrays(tmp_path_factory):
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "expected"),
     [
         ({"q": np.zeros(3)}, r"q has shape \(3,\); must be \(N nq\)"),
         ({"v": np.zeros((2, 7))}, r"v has shape \(2, 7\); must be \(N nv\)"),
@@ -382,9 +382,9 @@ def arrays(tmp_path_factory):
         ({"meta": np.array("[" * 100_000)}, "recursion"),
     ],
 )
-def test_log_whose_parts_do_not_belong_together(changes, told, arrays, tmp_path):
+def test_log_whose_parts_do_not_belong_together(changes, expected, arrays, tmp_path):
     np.savez(tmp_path / "run.npz", **{**arrays, **changes})
-    assert re.search(told, refusal("run.npz", tmp_path))
+    assert re.search(expected, refusal("run.npz", tmp_path))
 
 
 def test_every_array_of_a_log_is_looked_at(arrays, tmp_path):
@@ -394,7 +394,7 @@ def test_every_array_of_a_log_is_looked_at(arrays, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "expected"),
     [
         ({"scenario": None}, "scenario is missing"),
         ({"pairs": None}, "pairs is missing"),
@@ -403,10 +403,10 @@ def test_every_array_of_a_log_is_looked_at(arrays, tmp_path):
         ({"format": [1]}, "written by another version"),
     ],
 )
-def test_log_whose_description_is_incomplete(changes, told, arrays, tmp_path):
+def test_log_whose_description_is_incomplete(changes, expected, arrays, tmp_path):
     meta = np.array(json.dumps({**json.loads(str(arrays["meta"])), **changes}))
     np.savez(tmp_path / "run.npz", **{**arrays, "meta": meta})
-    assert re.search(told, refusal("run.npz", tmp_path))
+    assert re.search(expected, refusal("run.npz", tmp_path))
 
 
 @pytest.mark.parametrize(
@@ -514,10 +514,10 @@ def mesh_answers(tmp_path_factory):
 @pytest.mark.parametrize("name", [*MESHES, "big.stl"])
 @pytest.mark.parametrize("kind", ["convex", "capsule", "mesh"])
 def test_mesh_is_read_or_refused(name, kind, mesh_answers):
-    told = "200000000 bytes; at most 100000000 are read" if name == "big.stl" else MESHES[name][1]
+    expected = "200000000 bytes; at most 100000000 are read" if name == "big.stl" else MESHES[name][1]
     answer = mesh_answers[f"{name} {kind}"]
-    if told is None:
+    if expected is None:
         assert answer is None
     else:
-        assert re.search(told, answer)
+        assert re.search(expected, answer)
         assert name in answer and "\n" not in answer

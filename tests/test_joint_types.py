@@ -184,7 +184,7 @@ def test_fingers_close_together():
 
 
 @pytest.mark.parametrize(
-    ("fields", "told"),
+    ("fields", "expected"),
     [
         (
             {"home": {"l_gripper_l_finger_joint": 0.02, "l_gripper_r_finger_joint": 0.01}},
@@ -197,8 +197,8 @@ def test_fingers_close_together():
         ({"limits": {"velocity": {"l_gripper_r_finger_joint": 0.1}}}, "limits.velocity: joint .*; limit that one"),
     ],
 )
-def test_a_joint_that_follows_has_nothing_of_its_own(fields, told):
-    with pytest.raises(ConfigError, match=told):
+def test_a_joint_that_follows_has_nothing_of_its_own(fields, expected):
+    with pytest.raises(ConfigError, match=expected):
         load("mimic", **fields)
 
 

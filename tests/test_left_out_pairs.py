@@ -12,7 +12,7 @@ from conftest import EXAMPLES
 from qpavoid import Controller, Robot, Sample, build_scene, build_tasks
 from qpavoid.config import Task
 from qpavoid.model.notes import NoteKind
-from qpavoid.setup.add import Wishes, describe
+from qpavoid.setup.add import DescribeOptions, describe
 from qpavoid.setup.check import check_robot
 from qpavoid.setup.home import BENT, ROOM
 from qpavoid.setup.sampling import D1, touching
@@ -137,7 +137,7 @@ def tiny(text, scale):
 def made(tmp_path, name, text=None, **wishes):
     path = tmp_path / f"{name}.urdf"
     path.write_text(ROBOTS[name] if text is None else text)
-    return path, describe(path, Wishes(samples=2000, **wishes))
+    return path, describe(path, DescribeOptions(samples=2000, **wishes))
 
 
 def nothing_unseen(path, described, samples, folders=()):
@@ -318,7 +318,7 @@ def test_robots_of_packages(path):
     from qpavoid.model.packages import mesh_folders
 
     assert check_robot(path).usable
-    described = describe(Path(path), Wishes())
+    described = describe(Path(path), DescribeOptions())
     nothing_unseen(path, described, 100, [entry for entry in mesh_folders(Path(path), []) if "=" not in entry])
 
 
@@ -336,5 +336,5 @@ def test_robots_of_packages(path):
 def test_robots_of_example_robot_data(name):
     from qpavoid.model.packages import mesh_folders
 
-    described = describe(EXAMPLES / name, Wishes())
+    described = describe(EXAMPLES / name, DescribeOptions())
     nothing_unseen(EXAMPLES / name, described, 200, [e for e in mesh_folders(EXAMPLES / name, []) if "=" not in e])

@@ -310,7 +310,7 @@ def test_xacro_without_its_package_says_what_to_install(tmp_path, monkeypatch):
 # --- limits --------------------------------------------------------------------------------------------------------
 
 
-def test_limits_the_wrong_way_round_are_turned(tmp_path):
+def test_limits_in_reverse_order_are_swapped(tmp_path):
     robot, (message,) = load(write(tmp_path, arm(limits='lower="0" upper="-1" velocity="1" effort="1"')))
     bounds = robot.bounds()
     np.testing.assert_array_equal([bounds.lower[1], bounds.upper[1]], [-1.0, 0.0])

@@ -146,7 +146,7 @@ def crossing(left, right):
         "tracking_damping": 0.05,
         "duration": 10.0,
     }
-    scenario = ScenarioConfig.model_validate(fields).read_from(SHIPPED)
+    scenario = ScenarioConfig.model_validate(fields).with_source(SHIPPED)
     controller, q = Controller.from_scenario(scenario)
     ruler, least, blocked, ticks = Ruler(controller.scene), np.inf, set(), []
     for tick in drive(controller, q, 1000):

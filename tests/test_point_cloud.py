@@ -25,10 +25,10 @@ from qpavoid import (
 from qpavoid.config import PointCloud
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.kernels.voxels import SAME_DIRECTION
-from qpavoid.model.cloud import ball_radius, read_points
+from qpavoid.model.cloud import read_points, voxel_radius
 
 CLOUD = PointCloud()
-BALL = ball_radius(CLOUD.resolution)
+BALL = voxel_radius(CLOUD.resolution)
 
 
 def scattered(rng, count=400, spread=0.8):
@@ -80,7 +80,7 @@ def test_every_point_lies_in_the_ball_of_a_voxel(resolution):
     assert len(voxels.centers) == len(expected) == len(np.unique(voxels.keys))
     np.testing.assert_allclose(np.unique(voxels.centers, axis=0), (expected + 0.5) * resolution, atol=1e-9)
     nearest = np.min(np.linalg.norm(points[:300, None] - voxels.centers, axis=2), axis=1)
-    assert nearest.max() <= ball_radius(resolution)
+    assert nearest.max() <= voxel_radius(resolution)
 
 
 def test_blocks_hold_their_voxels():
@@ -375,7 +375,7 @@ def test_the_closest_call_counts_voxels_that_have_no_slot(panda, tmp_path):
     rng = np.random.default_rng(9)
     points = scattered(rng, 300, 0.7)
     scene = cloud_scene(panda, points, tmp=tmp_path)
-    bench, hold, ruler = Bench(scene), Avoidance().hold, Ruler(scene)
+    bench, hold, ruler = Bench(scene), Avoidance().safety_distance, Ruler(scene)
     for _ in range(15):
         q, v = random_q(panda, rng), rng.uniform(-1.0, 1.0, 7)
         near = len(bench.compute(q, reach=0.3)[0].pair)

@@ -237,7 +237,7 @@ def test_nothing_comes_nearer_than_the_closest_call_says(name, request):
     robot = request.getfixturevalue(name)
     rng = np.random.default_rng(19)
     scene = random_scene(robot, rng, [SPHERE, CAPSULE, BOX, CYLINDER])
-    bench, hold = Bench(scene), Avoidance().hold
+    bench, hold = Bench(scene), Avoidance().safety_distance
     for trial in range(40):
         q, v = random_q(robot, rng), 0.1 ** (trial % 3) * rng.uniform(-1.0, 1.0, robot.model.nv)
         samples = {}

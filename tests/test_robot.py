@@ -1,4 +1,4 @@
-"""Robots from files: what is read, what is locked, and how a mistake is told."""
+"""Robots from files: what is read, what is locked, and how a mistake is reported."""
 
 import numpy as np
 import pinocchio as pin

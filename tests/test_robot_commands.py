@@ -15,12 +15,13 @@ from qpavoid import Robot, load_scenario
 from qpavoid.config import RobotConfig
 from qpavoid.config.loading import read_config
 from qpavoid.config.shipped import data_folder, find_robot
+from qpavoid.model.notes import NoteKind
 from qpavoid.model.packages import find_mesh
 from qpavoid.run.simulate import simulate
-from qpavoid.setup.add import Wishes, describe
+from qpavoid.setup.add import DescribeOptions, describe
 from qpavoid.setup.check import check_robot
 from qpavoid.setup.sampling import touching
-from qpavoid.setup.written import untouched
+from qpavoid.setup.written import is_sealed
 
 MADE = ("baxter", "g1", "tiago", "ur5")
 """Robots that ship as `robot add` wrote them."""
@@ -122,29 +123,29 @@ def test_limits_that_cannot_be_meant(tmp_path):
         text = text.replace(old, new, 1)
     urdf.write_text(text)
     report = check_robot(str(urdf))
-    told = problems(report, "warning")
-    assert "joint1: locked at 0, which is its lower and its upper limit" in told
-    assert "joint2: a velocity limit beyond what such joints do →" in told
-    assert "joint2: a range wider than such joints have →" in told
-    assert "joint3: hardly any range → `lock" in told
-    assert "joint4" not in told
+    text = problems(report, "warning")
+    assert "joint1: locked at 0, which is its lower and its upper limit" in text
+    assert "joint2: a velocity limit beyond what such joints do →" in text
+    assert "joint2: a range wider than such joints have →" in text
+    assert "joint3: hardly any range → `lock" in text
+    assert "joint4" not in text
     assert report.usable
 
 
-def test_mimic_mass_feet_and_home_collisions_are_told(tmp_path):
+def test_check_names_mimic_joints_masses_feet_and_home_collisions(tmp_path):
     urdf = write_chain(tmp_path, 3, shape='<sphere radius="0.35"/>')
     urdf.write_text(
         urdf.read_text().replace('<child link="link3"/>', '<child link="link3"/><mimic joint="joint1"/>')
         .replace("link3", "left_foot")
     )  # fmt: skip
     report = check_robot(str(urdf))
-    told = problems(report)
+    text = problems(report)
     joints = {joint.name: joint for joint in report.joints}
     assert joints["joint3"].led and joints["joint3"].mimics == "joint1" and joints["joint3"].kind == "revolute"
-    assert report.nv == 2 and "joint3" not in told
-    assert "3 moving links have no mass → none is needed" in told
-    assert "it has feet (left_foot) and a fixed base → `root_joint: free_flyer`" in told
-    assert [(a, b) for a, b, _ in report.home_collisions] or "its bodies touch in 100 % of" in told
+    assert report.nv == 2 and "joint3" not in text
+    assert "3 moving links have no mass → none is needed" in text
+    assert "it has feet (left_foot) and a fixed base → `root_joint: free_flyer`" in text
+    assert [(a, b) for a, b, _ in report.home_collisions] or "its bodies touch in 100 % of" in text
     assert check_robot(str(urdf), root="free_flyer").nv == 8
 
 
@@ -230,11 +231,11 @@ def test_a_second_run_writes_the_same_bytes_and_says_so(cli, tmp_path):
     assert set(first["files"].values()) == {"written"}
     before = {path.name: path.read_bytes() for path in (tmp_path / "chain").iterdir()}
     assert {"robot.yaml", "chain.srdf"} <= before.keys()
-    assert all(untouched(content) for content in before.values())
+    assert all(is_sealed(content) for content in before.values())
     second = json.loads(cli("robot", "add", "chain.urdf", "--json").stdout)
     assert set(second["files"].values()) == {"unchanged"}
     assert {path.name: path.read_bytes() for path in (tmp_path / "chain").iterdir()} == before
-    assert cli("robot", "add", "chain.urdf", "--seed", "1").stdout.count("updated") >= 1  # nobody edited it
+    assert cli("robot", "add", "chain.urdf", "--seed", "1").stdout.count("updated") >= 1  # no one edited it
 
 
 def test_a_run_into_the_folder_of_the_urdf_does_not_honour_its_own_srdf(cli, tmp_path):
@@ -244,7 +245,7 @@ def test_a_run_into_the_folder_of_the_urdf_does_not_honour_its_own_srdf(cli, tmp
         assert document["srdf"] is None and set(document["files"].values()) == {outcome}
 
 
-def test_an_edited_file_is_left_alone_unless_told_otherwise(cli, tmp_path):
+def test_edited_file_is_overwritten_only_by_force(cli, tmp_path):
     write_chain(tmp_path)
     cli("robot", "add", "chain.urdf", "--no-picture")
     path = tmp_path / "chain" / "robot.yaml"
@@ -255,7 +256,21 @@ def test_an_edited_file_is_left_alone_unless_told_otherwise(cli, tmp_path):
     assert result.status == 2 and "edited since it was written" in result.stderr and "--force" in result.stderr
     assert path.read_text() == edited
     assert cli("robot", "add", "chain.urdf", "--no-picture", "--force").status == 0
-    assert untouched(path.read_bytes())
+    assert is_sealed(path.read_bytes())
+
+
+@pytest.mark.parametrize(("root", "size"), [("planar", 3), ("free_flyer", 6)])
+def test_added_base_has_the_speed_limit_that_was_assumed(cli, tmp_path, root, size):
+    """A URDF gives no speed of a base: `add` writes the assumed one, which then is no assumption any more."""
+    write_chain(tmp_path)
+    bare = Robot.from_urdf(tmp_path / "chain.urdf", root_joint=root)
+    assert any("root_joint" in note.subject for note in bare.notes if note.kind is NoteKind.LIMIT)
+    assert cli("robot", "add", "chain.urdf", "--root", root, "--no-picture").status == 0
+    path = tmp_path / "chain" / "robot.yaml"
+    assert yaml.safe_load(path.read_text())["limits"] == {"velocity": {"root_joint": [1.0] * size}}
+    added = Robot.load(path)
+    np.testing.assert_array_equal(added.bounds().velocity, bare.bounds().velocity)
+    assert not any("root_joint" in note.subject for note in added.notes)
 
 
 def test_the_written_command_writes_the_same_again(cli, tmp_path):
@@ -319,7 +334,7 @@ def test_an_added_robot_runs_at_once(cli, tmp_path):
 @pytest.mark.parametrize("name", MADE)
 def test_shipped_robots_are_as_they_were_written_and_ready(name):
     path = find_robot(name)
-    assert untouched(path.read_bytes()) and untouched((path.parent / f"{name}.srdf").read_bytes())
+    assert is_sealed(path.read_bytes()) and is_sealed((path.parent / f"{name}.srdf").read_bytes())
     robot = Robot.load(name)
     assert not touching(robot, robot.home, 0.005)
     assert robot.end_effectors and robot.always_touching == ()
@@ -331,7 +346,7 @@ def test_a_shipped_robot_comes_out_the_same_again():
     """Digits may differ where another machine rounds otherwise."""
     shipped = read_config(find_robot("ur5"), RobotConfig)
     home = {name: value for name, value in shipped.home.items() if value}
-    made = describe(EXAMPLES / "ur_description/urdf/ur5_robot.urdf", Wishes(name="ur5", home=home)).config
+    made = describe(EXAMPLES / "ur_description/urdf/ur5_robot.urdf", DescribeOptions(name="ur5", home=home)).config
     assert made.home == shipped.home and made.end_effectors == shipped.end_effectors
     assert made.disabled_pairs == shipped.disabled_pairs
     for mine, theirs in zip(made.bodies, shipped.bodies, strict=True):

@@ -309,7 +309,7 @@ def test_intersecting_axes_still_have_a_normal(name: str) -> None:
     assert np.linalg.norm(normal) == pytest.approx(1.0, abs=TOL)
     np.testing.assert_allclose([normal[0] @ (b - a), normal[0] @ (d - c)], 0.0, atol=TOL)
     np.testing.assert_allclose(point_b - point_a, -0.3 * normal, rtol=0, atol=TOL)
-    # A way out: moving b along the normal by the depth just separates the bodies.
+    # Moving b along the normal by the depth just separates the bodies.
     freed = capsule_distances(ends_a, radius_a, ends_b + 0.3 * normal[:, None], radius_b)
     np.testing.assert_allclose(freed.distance, 0.0, atol=TOL)
     np.testing.assert_allclose(freed.normal, normal, rtol=0, atol=TOL)

@@ -138,7 +138,7 @@ def test_half_spaces_and_convex_hulls(panda_convex):
 
 @given(strategies.floats(-0.9, 0.9), strategies.floats(0.0, np.pi / 2))
 def test_a_capsule_flat_on_a_plane_is_a_tie_without_a_wrong_side(panda, height, tilt):
-    """Level, every point along the axis is nearest: any may be told, and distance and normal are the same."""
+    """Level, every point along the axis is nearest: any may be returned, and distance and normal are the same."""
     capsule, floor = coal.Capsule(0.05, 0.3), coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0)
     rotation = pin.rpy.rpyToMatrix(tilt, 0.0, 0.0)
     result = coal.DistanceResult()
@@ -218,7 +218,7 @@ def test_what_passes_close_by_is_known_not_to_come_nearer(panda, shape):
     """Along the normals the bound is close enough to tell, where the fastest points of the bodies would not be."""
     rng = np.random.default_rng(20)
     scene = build_scene(panda, [obstacle("it", shape, (9.0, 0.0, 0.0))])
-    bench, told, close = Bench(scene), 0, 0
+    bench, warned, close = Bench(scene), 0, 0
     for _ in range(3000):
         q, v = random_q(panda, rng), rng.uniform(-0.5, 0.5, 7)
         sample = Sample.at(
@@ -227,23 +227,23 @@ def test_what_passes_close_by_is_known_not_to_come_nearer(panda, shape):
         )  # fmt: skip
         bench.query.place_obstacle(0, sample)
         proximity = bench.compute(q, reach=0.1)[0]
-        gap = proximity.distance.min(initial=np.inf) - Avoidance().hold
+        gap = proximity.distance.min(initial=np.inf) - Avoidance().safety_distance
         if not 0.0 < gap < 0.01:
             continue
         close += 1
         least = bench.assembly.clearance_lower_bound(v, len(proximity.pair), 0.1, 0.02)
-        told += least > 0.0
+        warned += least > 0.0
         for t in (0.005, 0.01, 0.02):
             found = look(scene, pin.integrate(panda.model, q, t * v), {0: moved(sample, t)}, 0.1)
-            assert found.distance.min(initial=0.1) - Avoidance().hold >= least - 1e-9
-    assert close > 10 and told > 0.1 * close
+            assert found.distance.min(initial=0.1) - Avoidance().safety_distance >= least - 1e-9
+    assert close > 10 and warned > 0.1 * close
 
 
 @pytest.mark.parametrize("turning", [0.0, 0.8])
 def test_the_closest_call_holds_for_half_spaces_that_move_and_turn(panda, turning):
     rng = np.random.default_rng(9)
     scene = build_scene(panda, [obstacle("wall", FLOOR, (0, 0, -0.3))])
-    bench, hold = Bench(scene), Avoidance().hold
+    bench, hold = Bench(scene), Avoidance().safety_distance
     for _ in range(20):
         q, v = random_q(panda, rng), rng.uniform(-1, 1, 7)
         bench.compute(q, reach=0.3)
@@ -269,9 +269,9 @@ def test_full_speed_towards_the_ground_stops_short_of_it(tmp_path, angular):
     """Also where the ground tips towards the robot: the look ahead takes both into account, and ends."""
     robot = cartesian(tmp_path, speed=2.0, acceleration=4.0, shape=BODIES["capsule"])
     controller = make_controller(robot, [Obstacle.at("ground", FLOOR, [0, 0, -1.0])], "z", task={"gain": 20.0})
-    told = None if angular is None else {"ground": Sample.at([0, 0, -1.0], angular=angular)}
+    updates = None if angular is None else {"ground": Sample.at([0, 0, -1.0], angular=angular)}
     for tick in drive(
-        controller, np.zeros(3), 150, target=[0, 0, -3.0], obstacles=None if told is None else lambda t: told
+        controller, np.zeros(3), 150, target=[0, 0, -3.0], obstacles=None if updates is None else lambda t: updates
     ):
         bottom = tick.state.q[2] + 0.01 * tick.solution.v[2] - 0.15
         assert bottom + 1.0 > 0.02 - 1e-3

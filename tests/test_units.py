@@ -1,4 +1,4 @@
-"""Lengths and angles among the coordinates are told apart, in the robot, the log and the figures."""
+"""Lengths and angles among the coordinates are distinguished in the robot, the log and the figures."""
 
 import numpy as np
 import pinocchio as pin

@@ -145,7 +145,7 @@ def draw(seed: int, ranges: Ranges = RANGES) -> ScenarioConfig:
     }
     if random.random() < ranges.accelerated_share:
         config["limits"] = {"acceleration": random.uniform(*ranges.acceleration)}
-    return ScenarioConfig.model_validate(config).read_from(FOLDER / f"seed-{seed}.yaml")
+    return ScenarioConfig.model_validate(config).with_source(FOLDER / f"seed-{seed}.yaml")
 
 
 @cache

@@ -108,7 +108,7 @@ def as_named(scenario: ScenarioConfig, solver: str) -> ScenarioConfig:
     if not solver.endswith(ALONE):
         return scenario
     avoidance = scenario.avoidance.model_copy(update={"backup": None})
-    return scenario.model_copy(update={"avoidance": avoidance}).read_from(scenario.source)
+    return scenario.model_copy(update={"avoidance": avoidance}).with_source(scenario.source)
 
 
 def examine(

@@ -145,7 +145,7 @@ def _panda() -> ScenarioConfig:
             "avoidance": {"d1": 0.02, "d2": 0.15},
             "duration": 12,
         }
-    ).read_from(Path("panda_20"))
+    ).with_source(Path("panda_20"))
 
 
 def _squeezed() -> ScenarioConfig:
@@ -171,7 +171,7 @@ def _squeezed() -> ScenarioConfig:
             "avoidance": {"d1": 0.03, "d2": 0.15},
             "duration": 4,
         }
-    ).read_from(Path("squeezed"))
+    ).with_source(Path("squeezed"))
 
 
 def _both_arms() -> ScenarioConfig:
@@ -185,7 +185,7 @@ def _both_arms() -> ScenarioConfig:
     }
     limits = {"saturate": True}
     changed = {"tasks": [*base["tasks"], right], "obstacles": [ball], "lock": [], "limits": limits, "duration": 11}
-    return ScenarioConfig.model_validate({**base, "tracking_damping": 0.01, **changed}).read_from(Path("both_arms"))
+    return ScenarioConfig.model_validate({**base, "tracking_damping": 0.01, **changed}).with_source(Path("both_arms"))
 
 
 def _humanoid(every: int) -> Run:

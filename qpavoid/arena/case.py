@@ -73,7 +73,7 @@ class Case:
         """Read a case from the text that `to_json` wrote."""
         fields: dict[str, Any] = json.loads(text)
         source = Path(fields.pop("source"))
-        scenario = ScenarioConfig.model_validate(fields.pop("scenario")).read_from(source)
+        scenario = ScenarioConfig.model_validate(fields.pop("scenario")).with_source(source)
         return cls(scenario=scenario, sensor=Sensor.model_validate(fields.pop("sensor")), **fields)
 
 

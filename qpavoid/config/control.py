@@ -1,4 +1,4 @@
-"""Avoidance, joint limits, obstacles without news and tasks without progress."""
+"""Avoidance, joint limits, obstacles that are not updated and tasks without progress."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class TaskSwitching(Block):
     gain: Positive = 5.0
     """ξ [1/s], of backing away below d1."""
     retreat_speed: NonNegative = 0.0
-    """ẋ0 [m/s]; more than 0 asks pairs that cannot part, as of neighbouring links, for what no velocity gives."""
+    """ẋ0 [m/s]; more than 0 asks pairs that cannot separate, as of neighbouring links, for what no velocity gives."""
     alpha_cap: Positive = 50.0
     """Largest α; eq. 11 grows without bound as d goes to 0 [-]. At most 1 counts between two bodies of the robot."""
 
@@ -38,7 +38,7 @@ class Damper(Block):
     gain: Positive = 5.0
     """ξ [1/s]."""
     d_safe: Positive | None = None
-    """Distance that is held [m], measured as d1 is; left out: d1."""
+    """Safety distance [m], measured as d1 is; left out: d1."""
 
 
 class Cbf(Block):
@@ -48,7 +48,7 @@ class Cbf(Block):
     gain: Positive = 5.0
     """γ [1/s]."""
     d_safe: Positive | None = None
-    """Distance that is held [m], measured as d1 is; left out: d1."""
+    """Safety distance [m], measured as d1 is; left out: d1."""
 
 
 AvoidanceRow = Annotated[Beta | TaskSwitching | Damper | Cbf, Field(discriminator="type")]
@@ -78,7 +78,7 @@ class Backup(Block):
 
 
 class Avoidance(Block):
-    """When and how the robot keeps clear."""
+    """Avoidance of collisions: distances, rows, and what checks the command."""
 
     d1: float = 0.03
     """Distance below which avoiding has taken over entirely (eq. 12) [m]."""
@@ -92,15 +92,15 @@ class Avoidance(Block):
     recovery_speed: Positive = 0.2
     """Cap on the speed at which rows ask a pair that is too close to part [m/s]."""
     look_ahead: bool = True
-    """Whether a velocity of the QP is followed ahead, over its tick and the stop after it, and drawn back where that
-    leads nearer than the safe distance."""
+    """Whether a velocity of the QP is checked over its control period and the braking trajectory after it, and reduced
+    where that leads nearer than the safety distance."""
 
     backup: Backup | None = Backup()
-    """Backup trajectories among moving obstacles; `null`: none."""
+    """The backup trajectory where obstacles move; `null`: none is kept."""
 
     @property
-    def hold(self) -> float:
-        """Distance at which a row lets a pair come no nearer [m]."""
+    def safety_distance(self) -> float:
+        """Distance below which no row lets a pair come [m]."""
         return self.d1 if isinstance(self.row, Beta | TaskSwitching) or self.row.d_safe is None else self.row.d_safe
 
     @model_validator(mode="after")
@@ -119,8 +119,8 @@ class Limits(Block):
     """Joint limits as bounds on the velocity."""
 
     position_gain: Annotated[float, Field(gt=0, le=1)] = 0.5
-    """Share of the range left to a position limit that one tick may use [-]; joints with an acceleration limit keep to
-    the speeds from which they can brake instead."""
+    """Share of the margin to a position limit that one control period may use [-]; joints with an acceleration limit
+    keep to the speeds from which they can brake instead."""
     velocity_scale: Annotated[float, Field(gt=0, le=1)] = 1.0
     """Share of the velocity limits that may be used [-]."""
     acceleration: Positive | None = None
@@ -133,17 +133,17 @@ class Limits(Block):
     relax_acceleration: bool = True
     """Whether the QP passes acceleration and jerk limits before it lets a pair come too near; false: it never does."""
     saturate: bool = True
-    """Whether the laws that know no limits (all but the QP) are scaled and clipped to them afterwards."""
+    """Whether the solvers that know no limits (all but the QP) are scaled and clipped to them afterwards."""
 
 
 class Sensing(Block):
-    """What is made of external obstacles that are not updated: those that a program gives in `step`."""
+    """Treatment of external obstacles that are not updated: those that a program gives in `step`."""
 
     stale_after: Positive | None = 0.1
     """Age of the last update after which an obstacle's distances shrink by a growing margin [s], but no less than three
     control periods; `null`: never, it goes on at its last twist."""
     margin_growth: NonNegative = 0.1
-    """How fast that margin grows: a bound on how wrong the last twist may be [m/s]."""
+    """How fast that margin grows: a bound on the error of the last twist [m/s]."""
     stop_after: Positive | None = 0.5
     """Age of the last update after which the robot stops [s], but no less than three control periods; left out: five
     times `stale_after`; `null`: never."""
@@ -169,24 +169,24 @@ _LONG = 1e8
 
 
 class Detour(Block):
-    """Ways round what blocks a task, by circulation along its tangent, until its goal is reached or given up."""
+    """Detour around what blocks a task, by circulation along its tangent, until its goal is reached or abandoned."""
 
     speed: Positive = 0.1
     """Speed along the tangent, added to the task's [m/s]."""
     settle: NonNegative = 0.3
-    """Time for which the way has to be free before the detour ends [s]."""
+    """Time for which the path has to be free before the detour ends [s]."""
     longest: Positive = 15.0
-    """Time after which a way has ended [s]; the other side is tried next."""
+    """Time after which a detour has ended [s]; the other side is tried next."""
     tries: Annotated[int, Field(ge=1)] = 4
-    """Ways that bring the tool no nearer to its goal than before, after which the goal is given up [-]."""
+    """Detours that bring the tool no nearer to its goal than before, after which the goal is abandoned [-]."""
     patience: Positive = 40.0
-    """Time with something in the way, on such ways and back, after which no way is gone on with, or begun [s]."""
+    """Time with an obstructed path, on such detours and back, after which no detour is continued or begun [s]."""
 
 
 class Progress(Block):
     """When a task counts as stalled, and what is done about it."""
 
     stalled_after: Positive = 1.0
-    """Time without progress after which it is said [s]."""
+    """Time without progress after which a task counts as stalled [s]."""
     detour: Detour | None = None
-    """Way round; left out: none is tried."""
+    """Detour; left out: none is tried."""

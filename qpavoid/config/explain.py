@@ -10,7 +10,7 @@ from pydantic_core import ErrorDetails
 
 from qpavoid.errors import nearest
 
-_FAULTS_TOLD = 5
+_MAX_FAULTS = 5
 _NUMBER = "give a number alone, in m, rad, kg and s"
 _REMEDIES = {
     "float_parsing": _NUMBER,
@@ -22,18 +22,21 @@ _REMEDIES = {
 
 
 def explain(error: ValidationError, model: type[BaseModel], data: dict[str, Any]) -> str:
-    """All faults of a file in one line: field, what is wrong, nearest valid key."""
+    """Explain all faults of a file in one line: field, fault, nearest valid key."""
     faults = [(tuple(_field(fault["loc"], fault["type"], data)), fault) for fault in error.errors()]
     # Of a field that may be a list or a mapping, pydantic reports both; the one that was meant got deeper.
     above = {field[:depth] for field, _ in faults for depth in range(len(field))}
     deepest = [(field, fault) for field, fault in faults if field not in above]
-    more = f"; and {len(deepest) - _FAULTS_TOLD} more" if len(deepest) > _FAULTS_TOLD else ""
-    told = [(".".join(field), _fault(fault, model)) for field, fault in deepest[:_FAULTS_TOLD]]
-    return "; ".join(f"{field}: {what}" if field else what for field, what in told) + more
+    more = f"; and {len(deepest) - _MAX_FAULTS} more" if len(deepest) > _MAX_FAULTS else ""
+    clauses = [(".".join(field), _fault(fault, model)) for field, fault in deepest[:_MAX_FAULTS]]
+    return "; ".join(f"{field}: {clause}" if field else clause for field, clause in clauses) + more
 
 
 def _field(loc: tuple[int | str, ...], kind: str, data: Any) -> list[str]:
-    """The keys and indices of the file among a location's parts; pydantic also names the members of unions."""
+    """List the keys and indices of the file in a location.
+
+    pydantic's locations also name the members of unions.
+    """
     field = []
     for part in loc:
         try:
@@ -46,7 +49,7 @@ def _field(loc: tuple[int | str, ...], kind: str, data: Any) -> list[str]:
 
 
 def _fault(fault: ErrorDetails, model: type[BaseModel]) -> str:
-    """What is wrong, in words."""
+    """Say in words what is wrong."""
     kind, loc, context = fault["type"], fault["loc"], fault.get("ctx", {})
     if kind == "extra_forbidden":
         keys = {key for block in _blocks_at(model, loc[:-1]) for key in block.model_fields}
@@ -68,7 +71,10 @@ def _fault(fault: ErrorDetails, model: type[BaseModel]) -> str:
 
 
 def _blocks_at(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[type[BaseModel]]:
-    """The blocks that may stand at a location, in which the chosen member of a union is named by its tag."""
+    """List the blocks that may stand at a location.
+
+    The chosen member of a union is named by its tag.
+    """
     blocks = [model]
     for part in loc:
         fields = [block.model_fields[str(part)] for block in blocks if part in block.model_fields]
@@ -78,13 +84,13 @@ def _blocks_at(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[type[
 
 
 def _blocks(annotation: Any) -> list[type[BaseModel]]:
-    """Every block inside an annotation."""
+    """List every block inside an annotation."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return [block for inner in typing.get_args(annotation) for block in _blocks(inner)]
 
 
 def _tags(block: type[BaseModel]) -> set[str]:
-    """Names by which a block is chosen from a union: its literal `type` or `name`."""
+    """Return the tags that choose a block from a union: its literal `type` or `name`."""
     fields = [block.model_fields[key] for key in ("type", "name") if key in block.model_fields]
     return {tag for field in fields for tag in typing.get_args(field.annotation) if isinstance(tag, str)}

@@ -14,7 +14,10 @@ _LARGE = 1e8
 
 
 def schema_of(root: type[BaseModel]) -> dict[str, Any]:
-    """JSON Schema of a block and all that it may hold; what tells one kind of block from others is required."""
+    """Make the JSON Schema of a block and all that it may hold.
+
+    The tag that distinguishes blocks of a union is required.
+    """
     schema = root.model_json_schema()
     for name, tag in _tags(schema):
         block = schema["$defs"][name]
@@ -24,17 +27,20 @@ def schema_of(root: type[BaseModel]) -> dict[str, Any]:
 
 
 def page() -> str:
-    """Markdown: a table of fields for each block of a scenario and of a robot.yaml, outer ones first."""
-    lines, seen = _HEAD.splitlines(), set[str]()
+    """Write the page of all fields in Markdown.
+
+    One table for each block of a scenario and of a robot.yaml, outer ones first.
+    """
+    lines, visited_names = _HEAD.splitlines(), set[str]()
     for root in (ScenarioConfig, RobotConfig):
         schema = schema_of(root)
-        blocks, waiting = {root.__name__: schema, **schema.get("$defs", {})}, [root.__name__]
-        while waiting:
-            name = waiting.pop(0)
-            if name not in seen and "properties" in blocks[name]:
+        blocks, queue = {root.__name__: schema, **schema.get("$defs", {})}, [root.__name__]
+        while queue:
+            name = queue.pop(0)
+            if name not in visited_names and "properties" in blocks[name]:
                 lines += _section(name, blocks)
-                waiting += [ref for spec in blocks[name]["properties"].values() for ref in _refs(spec, blocks)]
-            seen.add(name)
+                queue += [ref for spec in blocks[name]["properties"].values() for ref in _refs(spec, blocks)]
+            visited_names.add(name)
     return "\n".join(lines)
 
 
@@ -53,14 +59,14 @@ def _section(name: str, blocks: dict[str, Any]) -> list[str]:
     if block["properties"]:
         lines += ["| field | what it may be | left out | meaning |", "|---|---|---|---|"]
     for field, spec in block["properties"].items():
-        default = "required" if field in block.get("required", ()) else _said(spec.get("default"))
+        default = "required" if field in block.get("required", ()) else _default_text(spec.get("default"))
         kind, meaning = _kind(spec, blocks), _flat(spec.get("description", ""))
         lines.append(f"| `{field}` | {kind} | {default} | {meaning} |")
     return lines
 
 
 def _kind(spec: dict[str, Any], blocks: dict[str, Any]) -> str:
-    """What a value may be, in words."""
+    """Say in words what a value may be."""
     if "$ref" in spec:
         name = spec["$ref"].rsplit("/", 1)[-1]
         return f"[{name}](#{name.lower()})" if "properties" in blocks[name] else _kind(blocks[name], blocks)
@@ -93,7 +99,7 @@ def _number(spec: dict[str, Any]) -> str:
 
 
 def _refs(spec: Any, blocks: dict[str, Any]) -> Iterator[str]:
-    """Names of the blocks that a field may hold."""
+    """Yield the names of the blocks that a field may hold."""
     if isinstance(spec, dict):
         for key, value in spec.items():
             if key == "$ref":
@@ -109,7 +115,7 @@ def _refs(spec: Any, blocks: dict[str, Any]) -> Iterator[str]:
 
 
 def _tags(spec: Any) -> Iterator[tuple[str, str]]:
-    """Blocks that are told from others by one of their fields, and which field that is."""
+    """Yield each block of a union with the field that distinguishes it."""
     if isinstance(spec, dict) and "discriminator" in spec:
         for ref in spec["discriminator"]["mapping"].values():
             yield ref.rsplit("/", 1)[-1], spec["discriminator"]["propertyName"]
@@ -117,8 +123,8 @@ def _tags(spec: Any) -> Iterator[tuple[str, str]]:
         yield from _tags(each)
 
 
-def _said(default: Any) -> str:
-    """A default as a YAML file would give it."""
+def _default_text(default: Any) -> str:
+    """Write a default as a YAML file would give it."""
     if isinstance(default, dict) and ("name" in default or "type" in default):
         return f"`{default.get('name') or default['type']}`"
     if isinstance(default, dict):

@@ -1,4 +1,4 @@
-"""Reads robot and scenario files, applies `--set` overrides, and says what is wrong in one line."""
+"""Robot and scenario files: reading, `--set` overrides, and errors in one line."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _LARGEST = 1_000_000
 
 
 def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), solver: str | None = None) -> ScenarioConfig:
-    """Reads a scenario.
+    """Read a scenario.
 
     Args:
         name_or_path: shipped name or path of a YAML file.
@@ -34,26 +34,28 @@ def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), solve
         ConfigError, UnknownName: naming file, field and remedy.
     """
     path = find_scenario(name_or_path)
-    return read_config(path, ScenarioConfig, overrides, solver).read_from(path)
+    return read_config(path, ScenarioConfig, overrides, solver).with_source(path)
 
 
 def read_config(path: Path, model: type[Config], overrides: Sequence[str] = (), solver: str | None = None) -> Config:
-    """Reads a YAML file into `model`.
+    """Read a YAML file into `model`.
 
     Raises:
         ConfigError: unreadable file, bad YAML, unknown key (with the nearest valid one) or bad value.
     """
     data = read_mapping(path)
     if solver is not None:
-        wanted, kept = _solver_mapping(solver), _solver_mapping(data.get("solver"))
-        data["solver"] = {**kept, **wanted} if kept.get("name") == wanted["name"] else wanted
+        chosen_solver, settings = _solver_mapping(solver), _solver_mapping(data.get("solver"))
+        data["solver"] = (
+            {**settings, **chosen_solver} if settings.get("name") == chosen_solver["name"] else chosen_solver
+        )
     for override in overrides:
         _set(data, override, path)
     return validate(data, model, path)
 
 
 def validate(data: dict[str, Any], model: type[Config], path: Path) -> Config:
-    """`data` as a configuration.
+    """Validate fields as a configuration.
 
     Args:
         data: fields of a file, or what stands for one.
@@ -70,13 +72,13 @@ def validate(data: dict[str, Any], model: type[Config], path: Path) -> Config:
 
 
 def _solver_mapping(value: Any) -> dict[str, Any]:
-    """The mapping that a solver's short form stands for."""
+    """Expand a solver's short form to a mapping."""
     expanded = expand_solver("qp" if value is None else value)
     return dict(expanded) if isinstance(expanded, dict) else {}
 
 
 def read_mapping(path: Path) -> dict[str, Any]:
-    """The fields of a YAML file, as they stand there.
+    """Read the fields of a YAML file as they stand there.
 
     Raises:
         ConfigError: unreadable file, bad YAML, or something else than a mapping.
@@ -92,7 +94,10 @@ def read_mapping(path: Path) -> dict[str, Any]:
 
 
 def _set(data: dict[str, Any], override: str, path: Path) -> None:
-    """Applies `a.b.0.c=value` in place; missing mappings on the way are made, so that defaults can be set."""
+    """Apply `a.b.0.c=value` in place.
+
+    Missing mappings along the path are made, so that defaults can be set.
+    """
     where, equals, text = override.partition("=")
     if not equals or not where:
         raise ConfigError(f"--set {override!r}: expected path=value, as in avoidance.d2=0.30")

@@ -89,8 +89,8 @@ class ScenarioConfig(Block):
         """The file that it was read from: named in messages, and the folder that relative paths start from."""
         return self._source
 
-    def read_from(self, source: Path) -> ScenarioConfig:
-        """The same scenario, as if it had been read from `source`."""
+    def with_source(self, source: Path) -> ScenarioConfig:
+        """Return the same scenario, as if it had been read from `source`."""
         copy = self.model_copy()
         copy._source = source
         return copy
@@ -105,14 +105,14 @@ class ScenarioConfig(Block):
 
     @model_validator(mode="after")
     def _unique(self) -> ScenarioConfig:
-        for what, names in (
+        for clause, names in (
             ("obstacle", [o.name for o in self.obstacles]),
             ("task", [t.label for t in self.tasks]),
             ("contact frame", [c.frame for c in self.contacts]),
         ):
             twice = sorted({n for n in names if names.count(n) > 1})
             if twice:
-                raise ValueError(f"{what} {twice[0]!r} is given twice: names must differ")
+                raise ValueError(f"{clause} {twice[0]!r} is given twice: names must differ")
         for obstacle in self.obstacles:
             if isinstance(obstacle.motion, Fixed) and obstacle.motion.position is None:
                 raise ValueError(f"obstacle {obstacle.name!r}: motion.position is missing")

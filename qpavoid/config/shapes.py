@@ -79,7 +79,7 @@ class Mesh(Block):
     """Length of the file's unit [m]."""
     method: Literal["convex", "decomposed", "surface"] = "decomposed"
     """`convex`: its hull. `decomposed`: hulls of pieces, which enclose it together. `surface`: the triangles,
-    100 to 500 µs a pair at every tick; once a body cuts through them, no side is the way out: the robot stops."""
+    100 to 500 µs a pair at every control step; once a body cuts through them, no direction is safe: the robot stops."""
     max_pieces: Annotated[int, Field(ge=1, le=64)] = 16
     """Of `decomposed`: most pieces [-]; each is a body of its own, with its pairs."""
     tolerance: Annotated[float, Field(gt=0, le=1)] = 0.02

@@ -14,33 +14,36 @@ EXAMPLES = "example-robot-data:"
 
 
 def data_folder(kind: str) -> Path:
-    """The folder `robots` or `tasks`: packaged in a wheel, beside the package in a checkout."""
-    packaged = _PACKAGE / "_data" / kind
-    return packaged if packaged.is_dir() else _PACKAGE.parent / kind
+    """Return the folder `robots` or `tasks`.
+
+    It is packaged in a wheel, and beside the package in a checkout.
+    """
+    folder_in_wheel = _PACKAGE / "_data" / kind
+    return folder_in_wheel if folder_in_wheel.is_dir() else _PACKAGE.parent / kind
 
 
 def robot_names() -> list[str]:
-    """Names of the robots that ship."""
+    """List the names of the robots that ship."""
     return sorted(p.parent.name for p in data_folder("robots").glob("*/robot.yaml"))
 
 
 def scenario_names() -> list[str]:
-    """Names of the scenarios that ship."""
+    """List the names of the scenarios that ship."""
     return sorted(p.stem for p in data_folder("tasks").glob("*.yaml"))
 
 
 def family_names() -> list[str]:
-    """Names of the families of scenarios that ship."""
+    """List the names of the families of scenarios that ship."""
     return sorted(p.stem for p in _families().glob("*.yaml"))
 
 
 def suite_names() -> list[str]:
-    """Names of the suites of the arena that ship."""
+    """List the names of the suites of the arena that ship."""
     return sorted(p.stem for p in _suites().glob("*.yaml"))
 
 
 def setup_names() -> list[str]:
-    """Names of the robots that are set up for families: a posture, and what is held."""
+    """List the robots that are set up for families: a posture, and locked joints."""
     return sorted(p.stem for p in (_families() / "setups").glob("*.yaml"))
 
 
@@ -53,7 +56,7 @@ def _suites() -> Path:
 
 
 def example_robot_data() -> Path:
-    """Share folder of example-robot-data (a package of files without a Python module).
+    """Return the share folder of example-robot-data, a package of files without a module.
 
     Raises:
         ConfigError: the package is not installed.
@@ -66,7 +69,7 @@ def example_robot_data() -> Path:
 
 
 def example_robot(name: str) -> Path:
-    """The file that `example-robot-data:PATH` stands for, whether it exists or not.
+    """Return the file that `example-robot-data:PATH` stands for, even if it is absent.
 
     Raises:
         ConfigError: the package is not installed.
@@ -75,7 +78,7 @@ def example_robot(name: str) -> Path:
 
 
 def find_scenario(name_or_path: str | Path) -> Path:
-    """Path of a scenario file, given by shipped name or by path.
+    """Find the path of a scenario file, given by shipped name or by path.
 
     Raises:
         ConfigError, UnknownName: there is none.
@@ -84,7 +87,7 @@ def find_scenario(name_or_path: str | Path) -> Path:
 
 
 def find_family(name_or_path: str | Path) -> Path:
-    """Path of the file of a family of scenarios, given by shipped name or by path.
+    """Find the path of the file of a family of scenarios, given by shipped name or by path.
 
     Raises:
         ConfigError, UnknownName: there is none.
@@ -93,7 +96,7 @@ def find_family(name_or_path: str | Path) -> Path:
 
 
 def find_suite(name_or_path: str | Path) -> Path:
-    """Path of the file of a suite of the arena, given by shipped name or by path.
+    """Find the path of the file of a suite of the arena, given by shipped name or by path.
 
     Raises:
         ConfigError, UnknownName: there is none.
@@ -102,7 +105,7 @@ def find_suite(name_or_path: str | Path) -> Path:
 
 
 def find_setup(name: str) -> Path:
-    """Path of a shipped setup.
+    """Find the path of a shipped setup.
 
     Raises:
         UnknownName: there is none.
@@ -111,7 +114,9 @@ def find_setup(name: str) -> Path:
 
 
 def find_robot(name_or_path: str, folder: Path | None = None) -> Path:
-    """Path of a robot.yaml, URDF, xacro or MJCF, given by shipped name or by path (relative: from `folder` first).
+    """Find a robot.yaml, URDF, xacro or MJCF, by shipped name or by path.
+
+    A relative path is looked up in `folder` first.
 
     `example-robot-data:PATH` is a file of that package.
 

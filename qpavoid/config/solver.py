@@ -90,7 +90,7 @@ class HqpSolver(Block):
 
 
 def expand_solver(value: Any) -> Any:
-    """`qp:proxqp` -> {name: qp, backend: proxqp}; `eq10` -> {name: eq10}."""
+    """Expand a short form: `qp:proxqp` to {name: qp, backend: proxqp}, `eq10` to {name: eq10}."""
     if not isinstance(value, str):
         return value
     name, _, backend = value.partition(":")

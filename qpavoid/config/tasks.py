@@ -1,4 +1,4 @@
-"""What a robot is to do, and which of its frames rest on the ground meanwhile.
+"""Tasks of a robot, and frames that stay in contact with the ground.
 
 Every task is rows A v = b with a `weight`, for laws that weigh tasks against each other (`qp`), and a `priority`, for
 those that keep strict order (`hqp`).
@@ -29,10 +29,10 @@ class TaskBlock(Block):
     @property
     def label(self) -> str:
         """Its name, given or taken."""
-        return self.name or self.taken_name()
+        return self.name or self.default_name()
 
-    def taken_name(self) -> str:
-        """The name where none is given."""
+    def default_name(self) -> str:
+        """Return the name of a task that gives none."""
         return str(getattr(self, "type"))  # noqa: B009
 
 
@@ -54,8 +54,8 @@ class Task(TaskBlock):
     max_turn_rate: Positive | None = None
     """Cap on the commanded angular speed [rad/s]; left out: no cap."""
 
-    def taken_name(self) -> str:
-        """That of the frame."""
+    def default_name(self) -> str:
+        """Return the name of a task that gives none."""
         return self.frame
 
 
@@ -164,7 +164,7 @@ AnyTask = Annotated[
 
 
 class Contact(Block):
-    """A frame that stays where it is, whatever else has to give way: a foot on the ground."""
+    """A frame that stays where it is, with priority over all tasks: a foot on the ground."""
 
     frame: str
     """Frame that rests."""

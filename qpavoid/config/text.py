@@ -1,4 +1,4 @@
-"""Reads the text of a file that may be anything: a folder, a pipe, a device, an image of a disk."""
+"""The text of a file that may be anything: a folder, a pipe, a device, an image of a disk."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from qpavoid.errors import ConfigError
 
 
 def read_text(path: Path, largest: int, where: str = "") -> str:
-    """The text of a UTF-8 file, with or without a byte order mark.
+    """Read a UTF-8 file, with or without a byte order mark.
 
     Args:
         path: the file.

@@ -1,4 +1,4 @@
-"""YAML from anybody: what would hang, fill the memory or mean two things is a fault, with its line and column."""
+"""YAML of unknown origin: what would hang, fill the memory or mean two things is a fault, with its line and column."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 import yaml
 
 _DEEPEST = 50
-"""Levels of nesting; PyYAML calls itself at each, and Python gives up at some hundreds."""
+"""Levels of nesting; PyYAML recurses at each, and Python stops at some hundreds."""
 _MOST = 50_000
 """Values in all, those that aliases stand for counted each time: ten lines of aliases can stand for a billion."""
 _DIGITS = 300
@@ -15,7 +15,7 @@ _DIGITS = 300
 
 
 def parse_yaml(text: str) -> Any:
-    """What a YAML text says.
+    """Parse a YAML text.
 
     Raises:
         ValueError: not valid, a key given twice, or too deep, too long, or endless.
@@ -60,12 +60,12 @@ class _Loader(yaml.SafeLoader):
         return self._sizes[event.anchor]
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen: set[str] = set()
+        keys_so_far: set[str] = set()
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode):  # others are refused as keys anyway
-                if key.value in seen:
+                if key.value in keys_so_far:
                     raise _fault(f"key {key.value!r} is given twice", key)
-                seen.add(key.value)
+                keys_so_far.add(key.value)
         return super().construct_mapping(node, deep)
 
 
@@ -77,5 +77,5 @@ def _check_scalar(node: yaml.ScalarNode, event: Any) -> None:
         raise _fault("text with a NUL or half a character pair", event)
 
 
-def _fault(what: str, place: Any) -> yaml.MarkedYAMLError:
-    return yaml.MarkedYAMLError(problem=what, problem_mark=place.start_mark)
+def _fault(clause: str, place: Any) -> yaml.MarkedYAMLError:
+    return yaml.MarkedYAMLError(problem=clause, problem_mark=place.start_mark)

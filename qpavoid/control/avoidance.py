@@ -24,7 +24,7 @@ def row_form(config: Avoidance) -> dict[str, Any]:
     row = config.row
     return {
         "offset": config.offset,
-        "safety_distance": config.hold,
+        "safety_distance": config.safety_distance,
         "row_gain": row.gain,
         "recovery_speed": np.inf if isinstance(row, Cbf) else config.recovery_speed,
         "beta": isinstance(row, Beta),

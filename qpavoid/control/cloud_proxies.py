@@ -14,8 +14,8 @@ from scipy.spatial import ConvexHull
 
 from qpavoid import kernels
 from qpavoid.geometry.bodies import enclosing_capsule, hull_points
-from qpavoid.model.cloud import Voxels, ball_radius
-from qpavoid.model.scene import FAR
+from qpavoid.model.cloud import Voxels, voxel_radius
+from qpavoid.model.scene import PARKING_DISTANCE
 from qpavoid.model.trajectory import Sample
 from qpavoid.problem import Array, IntArray
 
@@ -40,7 +40,7 @@ class CloudProxies:
         """
         count = len(bodies)
         self.geometries = geometries.reshape(count, nearest)
-        self._ball = ball_radius(resolution)
+        self._ball = voxel_radius(resolution)
         self._bodies = bodies
         fits = [enclosing_capsule(body) for body in bodies]
         half = [0.5 * fit.length * fit.rotation[:, 2] for fit in fits]
@@ -88,7 +88,7 @@ class CloudProxies:
             if self._first[body] < self._first[body + 1]:
                 self._refine(body, poses[body], pose)
         kernels.select_voxels(*found, self._spacing, voxels.keys, self._slots, self._kept)
-        places = np.full((*self._slots.shape, 3), FAR)
+        places = np.full((*self._slots.shape, 3), PARKING_DISTANCE)
         taken = self._slots >= 0
         places[taken] = voxels.centers[self._slots[taken]] @ rotation.T + pose.position
         return places

@@ -17,7 +17,7 @@ from qpavoid.control.broadphase import Cull
 from qpavoid.control.cloud_proxies import CloudProxies
 from qpavoid.control.placement import ObstaclePlacement
 from qpavoid.geometry.bodies import bounding_box, bounding_sphere
-from qpavoid.geometry.cores import cores, with_closed_form
+from qpavoid.geometry.cores import cores, has_closed_form
 from qpavoid.kernels.distances import closed_forms
 from qpavoid.model.cloud import Voxels
 from qpavoid.model.scene import Scene
@@ -76,7 +76,7 @@ class DistanceQuery:
         self.twist_row: IntArray = np.zeros(len(scene.pairs), dtype=np.intp)
         """(m,) row of `twists` that moves each pair."""
         self._cores = cores([body.geometry for body in bodies])
-        self._known = with_closed_form(self._cores, scene.pairs)
+        self._known = has_closed_form(self._cores, scene.pairs)
         self._others = bool(len(self._known)) and not self._known.all()
         self._met, self._request = np.zeros(len(scene.pairs), dtype=np.intp), coal.DistanceRequest()
         self._request.gjk_tolerance = _TOLERANCE

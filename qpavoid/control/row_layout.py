@@ -60,7 +60,7 @@ def lay_out(
         twists=query.placing.twists,
         twist_row=query.twist_row,
         margin=query.placing.margin,
-        slack=scene.slack(avoidance.hold - avoidance.offset),
+        slack=scene.slack(avoidance.safety_distance - avoidance.offset),
         joint_poses=kinematics.joint_poses,
         parents=np.array(list(model.parents), dtype=np.intp),
         column_joints=column_joints(model),

@@ -12,7 +12,7 @@ import pinocchio as pin
 from qpavoid.config import Box, Capsule, Cone, Cylinder, Ellipsoid, Shape, Sphere
 from qpavoid.config.base import LARGEST
 from qpavoid.errors import ConfigError
-from qpavoid.geometry.cache import cached
+from qpavoid.geometry.cache import load_or_make
 from qpavoid.geometry.capsules import CapsuleFit, fit_capsule, half_sphere
 from qpavoid.problem import Array
 
@@ -22,7 +22,7 @@ class MeshWarning(UserWarning):
 
 
 def make_shape(shape: Shape) -> Any:
-    """coal geometry of a configured primitive."""
+    """Make the coal geometry of a configured primitive."""
     if isinstance(shape, Sphere):
         return coal.Sphere(shape.radius)
     if isinstance(shape, Capsule):
@@ -38,7 +38,7 @@ def make_shape(shape: Shape) -> Any:
 
 
 def convert_bodies(bodies: Any, kind: str) -> Any:
-    """A geometry model whose triangle meshes are replaced.
+    """Replace the triangle meshes of a geometry model.
 
     Args:
         bodies: pinocchio geometry model as read from a URDF.
@@ -62,7 +62,9 @@ def convert_bodies(bodies: Any, kind: str) -> Any:
 
 
 def check_meshes(bodies: Any, origin: str) -> None:
-    """Makes sure that meshes have corners and that all are numbers: hulls and distances need them.
+    """Check that meshes have corners and that all are numbers.
+
+    Hulls and distances need them.
 
     Args:
         bodies: pinocchio geometry model as read from a URDF.
@@ -82,22 +84,28 @@ def check_meshes(bodies: Any, origin: str) -> None:
 
 
 def triangle_meshes(bodies: Any) -> list[str]:
-    """Names of the bodies of a pinocchio geometry model that are triangle meshes."""
+    """List the bodies of a Pinocchio geometry model that are triangle meshes."""
     return [body.name for body in bodies.geometryObjects if isinstance(body.geometry, coal.BVHModelBase)]
 
 
 def enclosing_capsule(geometry: Any) -> CapsuleFit:
-    """The capsule around a coal shape, in the shape's own frame; spheres and capsules are their own."""
+    """Fit a capsule around a coal shape, in the shape's own frame.
+
+    Spheres and capsules are their own.
+    """
     if isinstance(geometry, coal.Sphere):
         return CapsuleFit(np.zeros(3), np.eye(3), geometry.radius, 0.0)
     if isinstance(geometry, coal.Capsule):
         return CapsuleFit(np.zeros(3), np.eye(3), geometry.radius, 2.0 * geometry.halfLength)
     points = hull_points(geometry)
-    return cached("capsule", points, lambda: fit_capsule(points), _pack_fit, _unpack_fit)
+    return load_or_make("capsule", points, lambda: fit_capsule(points), _pack_fit, _unpack_fit)
 
 
 def bounding_sphere(geometry: Any) -> tuple[Array, float]:
-    """Centre (3,) in the shape's own frame and radius [m] of a ball around a coal shape; infinite of a half-space."""
+    """Return centre (3,) and radius of a sphere around a coal shape, in its frame [m].
+
+    The radius is infinite for a half-space.
+    """
     if isinstance(geometry, coal.Halfspace):
         return np.zeros(3), np.inf
     if isinstance(geometry, coal.Ellipsoid):
@@ -111,7 +119,10 @@ def bounding_sphere(geometry: Any) -> tuple[Array, float]:
 
 
 def bounding_box(geometry: Any) -> tuple[Array, Array]:
-    """Centre (3,) in the shape's own frame and half the sizes (3,) [m] of a box around it; endless of a plane."""
+    """Return centre (3,) and half sizes (3,) of a box around a shape, in its frame [m].
+
+    A half-space gets a very large one.
+    """
     if isinstance(geometry, coal.Halfspace):
         return np.zeros(3), np.full(3, _ENDLESS)
     geometry.computeLocalAABB()
@@ -120,7 +131,9 @@ def bounding_box(geometry: Any) -> tuple[Array, Array]:
 
 
 def _convex_hull(mesh: Any) -> tuple[Any, Any]:
-    """Hull of a mesh and its placement in the mesh's frame; a thin box where the mesh is flat.
+    """Return the hull of a mesh, and its placement in the mesh's frame.
+
+    A thin box stands for a flat mesh.
 
     A flat point set has no hull with an inside, and qhull ends the process over it.
     """
@@ -132,13 +145,16 @@ def _convex_hull(mesh: Any) -> tuple[Any, Any]:
     low, high = local.min(axis=0), local.max(axis=0)
     size = high - low
     if size.min() > 1e-6 * size.max():
-        return cached("hull", points, lambda: run_qhull(mesh), _pack_hull, _unpack_hull), pin.SE3.Identity()
+        return load_or_make("hull", points, lambda: run_qhull(mesh), _pack_hull, _unpack_hull), pin.SE3.Identity()
     middle = center + axes.T @ (0.5 * (low + high))
     return coal.Box(*np.maximum(size, _THINNEST)), pin.SE3(np.ascontiguousarray(axes.T), middle)
 
 
 def run_qhull(mesh: Any) -> Any:
-    """coal's convex hull of the vertices of a mesh that are not all in one plane: qhull ends the process over those."""
+    """Make coal's convex hull of the vertices of a mesh that are not all in one plane.
+
+    qhull ends the process over those.
+    """
     try:
         mesh.buildConvexHull(True, "Qt")
     except RuntimeError:
@@ -149,7 +165,10 @@ def run_qhull(mesh: Any) -> Any:
 
 
 def _pack_hull(hull: Any) -> bytes:
-    """In coal's own format: putting a hull together from points and triangles takes as long as finding it."""
+    """Serialise a hull in coal's own format.
+
+    Making a hull of points and triangles takes as long as finding it.
+    """
     buffer = pin.serialization.StreamBuffer()
     hull.saveToBuffer(buffer)
     return bytes(buffer.tobytes())
@@ -179,7 +198,7 @@ _THINNEST = 1e-4
 
 
 def hull_points(geometry: Any) -> Array:
-    """Points whose hull encloses the shape (n, 3)."""
+    """Return points whose hull encloses the shape (n, 3) [m]."""
     if isinstance(geometry, coal.BVHModelBase):
         hull, _ = _convex_hull(geometry)  # fine meshes have a hundred times the points of their hulls
         return np.array(hull.points() if isinstance(hull, coal.ConvexBase) else geometry.vertices())
@@ -198,7 +217,7 @@ def hull_points(geometry: Any) -> Array:
 
 
 def rim(radius: float, z: float) -> Array:
-    """Corners (48, 3) of a polygon around a circle about the z axis."""
+    """Return the corners (48, 3) of a polygon around a circle about the z axis [m]."""
     angle = np.linspace(0.0, 2.0 * np.pi, 48, endpoint=False)
-    around = radius / np.cos(np.pi / 48)
-    return np.column_stack((around * np.cos(angle), around * np.sin(angle), np.full(48, z)))
+    circumradius = radius / np.cos(np.pi / 48)
+    return np.column_stack((circumradius * np.cos(angle), circumradius * np.sin(angle), np.full(48, z)))

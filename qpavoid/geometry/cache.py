@@ -1,7 +1,7 @@
 """A disk cache for what is slow to make of a mesh: its convex hull, and the capsule around it.
 
 Every result is one file in the user's cache directory, named after a digest of all that it depends on. The cache may
-vanish, be damaged, read-only or full at any time: then a result is made anew, and nobody is told.
+vanish, be damaged, read-only or full at any time: then a result is made anew, without a message.
 
 `QPAVOID_CACHE=0` switches it off, `QPAVOID_CACHE=DIR` puts it elsewhere.
 """
@@ -33,16 +33,16 @@ _DIGEST = 16
 """Bytes of a digest; one of the content ends every file."""
 _LARGEST = 100_000_000
 """Size that all files together are kept below [bytes]; the hulls of a humanoid take 3 million."""
-_OURS = re.compile(r"(?:hull|capsule)-[0-9a-f]{32}\.")
+_FILE_NAMES = re.compile(r"(?:hull|capsule)-[0-9a-f]{32}\.")
 """Names that may be deleted; the directory may hold other things."""
 
 _T = TypeVar("_T")
 
 
-def cached(
+def load_or_make(
     kind: str, points: Array, make: Callable[[], _T], pack: Callable[[_T], bytes], unpack: Callable[[Path], _T]
 ) -> _T:
-    """A result from the cache, or else made and put there.
+    """Load a result from the cache, or make it and put it there.
 
     Args:
         kind: `hull` or `capsule`.
@@ -70,7 +70,7 @@ def cached(
 
 
 def cache_folder() -> Path | None:
-    """Where results are kept; None where they are not."""
+    """Return the folder that holds results; None where the cache is off."""
     chosen = os.environ.get("QPAVOID_CACHE", "")
     if chosen:
         return None if chosen == "0" else Path(chosen)
@@ -90,12 +90,18 @@ def _digest(content: bytes) -> bytes:
 
 
 def _intact(content: bytes) -> bool:
-    """Whether a file is as it was written: coal takes what it reads for a hull, whatever it is."""
+    """Return True if a file is as it was written.
+
+    coal takes what it reads for a hull, whatever it is.
+    """
     return len(content) > _DIGEST and _digest(content[:-_DIGEST]) == content[-_DIGEST:]
 
 
 def _write(path: Path, content: bytes) -> None:
-    """Puts a whole file in its place at once, so that other processes see all of it or none."""
+    """Put a whole file in its place at once.
+
+    Other processes see all of it or none.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(prefix=path.stem + ".", suffix=".tmp", dir=path.parent)
     try:
@@ -109,9 +115,9 @@ def _write(path: Path, content: bytes) -> None:
 
 
 def _make_room(folder: Path) -> None:
-    """Deletes the files that were not used for longest, down to half of what is allowed."""
+    """Delete the files that were unused for longest, down to half of what is allowed."""
     with os.scandir(folder) as entries:
-        files = [(entry.stat(), entry.path) for entry in entries if _OURS.match(entry.name)]
+        files = [(entry.stat(), entry.path) for entry in entries if _FILE_NAMES.match(entry.name)]
     size = sum(stat.st_size for stat, _ in files)
     if size <= _LARGEST:
         return

@@ -34,7 +34,7 @@ class CapsuleFit:
 
 
 def fit_capsule(points: Array, directions: int = 250) -> CapsuleFit:
-    """A small capsule that encloses all points.
+    """Fit a small capsule that encloses all points.
 
     Tries the points' principal axes and a spiral of directions over the half sphere, all at once; for each, the axis
     runs through the centre of the smallest circle around the projected points, and the caps are drawn in as far as
@@ -51,7 +51,7 @@ def fit_capsule(points: Array, directions: int = 250) -> CapsuleFit:
     principal = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
     rotations = _rotations_to(np.concatenate((principal, half_sphere(directions))))
     if len(points) > _MANY:  # the outermost points tell which axes are worth trying with all of them
-        best = np.argsort(_tried_along(outermost(points), rotations)[0].min(axis=0))
+        best = np.argsort(_tried_along(extreme_points(points), rotations)[0].min(axis=0))
         rotations = rotations[best[:_PROMISING]]
     volume, fits, center = _tried_along(points, rotations)
     wider, axis = np.unravel_index(np.argmin(volume), volume.shape)
@@ -62,7 +62,10 @@ def fit_capsule(points: Array, directions: int = 250) -> CapsuleFit:
 
 
 def _tried_along(points: Array, rotations: Array) -> tuple[Array, Array, Array]:
-    """Capsules along k axes, of several radii each: volumes (w, k), fits (w, k, 3) and the axes' centres (k, 2)."""
+    """Fit capsules along k axes, of several radii each.
+
+    Returns volumes (w, k), fits (w, k, 3) and the axes' centres (k, 2).
+    """
     local = points @ rotations
     center, narrowest = _enclosing_circles(local[..., :2])
     off_axis = np.sum((local[..., :2] - center[:, None]) ** 2, axis=2)
@@ -73,7 +76,9 @@ def _tried_along(points: Array, rotations: Array) -> tuple[Array, Array, Array]:
 
 
 def _fit_along(height: Array, off_axis: Array, radius: Array) -> Array:
-    """Shortest capsules of given radii around points along given axes: rows [radius, length, height of the middle].
+    """Fit the shortest capsules of given radii around points along given axes.
+
+    Rows are [radius, length, height of the middle].
 
     Each point lets the caps' centres come no nearer to the far side than its reach; where they would cross, a ball
     about their middle encloses everything.
@@ -83,18 +88,18 @@ def _fit_along(height: Array, off_axis: Array, radius: Array) -> Array:
         off_axis: their squared distances from it (k, n).
         radius: of the capsules (k,).
     """
-    reach = np.sqrt(np.maximum(radius[:, None] ** 2 - off_axis, 0.0))
-    low, high = np.min(height + reach, axis=1), np.max(height - reach, axis=1)
+    half_chord = np.sqrt(np.maximum(radius[:, None] ** 2 - off_axis, 0.0))
+    low, high = np.min(height + half_chord, axis=1), np.max(height - half_chord, axis=1)
     return np.column_stack((radius, np.maximum(high - low, 0.0), 0.5 * (low + high)))
 
 
-def outermost(points: Array) -> Array:
-    """Those of many points (n, 3) that reach farthest along 120 fixed directions."""
+def extreme_points(points: Array) -> Array:
+    """Return those of many points (n, 3) that lie farthest along 120 fixed directions."""
     return np.asarray(points[np.unique(np.argmax(_ROUND @ points.T, axis=1))])
 
 
 def half_sphere(count: int) -> Array:
-    """Evenly spread unit vectors with z >= 0 (count, 3): a golden-angle spiral."""
+    """Return evenly spread unit vectors with z >= 0 (count, 3): a golden-angle spiral."""
     i = np.arange(count) + 0.5
     z, angle = i / count, np.pi * (1.0 + np.sqrt(5.0)) * i
     r = np.sqrt(1.0 - z * z)
@@ -105,20 +110,22 @@ _ROUND = np.concatenate([side * half_sphere(60) for side in (1.0, -1.0)])
 
 
 def _rotations_to(axes: Array) -> Array:
-    """Rotations (k, 3, 3) whose z columns are the unit vectors `axes` (k, 3)."""
+    """Return rotations (k, 3, 3) whose z columns are the unit vectors `axes` (k, 3)."""
     x = np.cross(np.eye(3)[np.argmin(np.abs(axes), axis=1)], axes)
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     return np.stack((x, np.cross(axes, x), axes), axis=2)
 
 
 def _enclosing_circles(points: Array) -> tuple[Array, Array]:
-    """Nearly smallest circle around each set of 2-D points (k, n, 2): centres (k, 2) and radii (k,).
+    """Find a nearly smallest circle around each set of 2-D points (k, n, 2).
+
+    Returns centres (k, 2) and radii (k,).
 
     Badoiu and Clarkson's iteration for the centre; the radius is then exact for that centre.
     """
     center = 0.5 * (points.min(axis=1) + points.max(axis=1))
     every = np.arange(len(points))
     for step in range(1, 60):
-        farthest = np.argmax(np.sum((points - center[:, None]) ** 2, axis=2), axis=1)
-        center = center + (points[every, farthest] - center) / (step + 1)
+        index_of_farthest = np.argmax(np.sum((points - center[:, None]) ** 2, axis=2), axis=1)
+        center = center + (points[every, index_of_farthest] - center) / (step + 1)
     return center, np.sqrt(np.max(np.sum((points - center[:, None]) ** 2, axis=2), axis=1))

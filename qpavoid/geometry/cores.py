@@ -12,7 +12,7 @@ from qpavoid.problem import Array, IntArray, Mask
 
 
 def cores(geometries: Sequence[Any]) -> Array:
-    """Radius and half-sizes of the core along the axes of each geometry (g, 4) [m].
+    """Return the radius and the core's half sizes along the axes of each geometry (g, 4) [m].
 
     A sphere is a point, and a capsule a segment along z, with a radius around it; a box is a core without one. Rows of
     all other shapes are NaN.
@@ -31,7 +31,10 @@ def _core(geometry: Any) -> tuple[float, ...]:
     return (np.nan,) * 4
 
 
-def with_closed_form(table: Array, bodies: IntArray) -> Mask:
-    """Which pairs (m,) of bodies (m, 2) have one: two cores of these, of which one at most is a box."""
+def has_closed_form(table: Array, bodies: IntArray) -> Mask:
+    """Find the pairs (m,) of bodies (m, 2) whose distance has a closed form.
+
+    Both have a core, and one at most is a box.
+    """
     known, box = ~np.isnan(table[:, 0]), table[:, 1] > 0.0
     return np.asarray(known[bodies].all(axis=1) & ~box[bodies].all(axis=1))

@@ -62,7 +62,9 @@ class CapsuleDistances(NamedTuple):
 
 
 def point_segment(p: Array, a: Array, b: Array) -> PointSegment:
-    """Closest point of the segment ab to p: eq. 2 with the projection clamped to the segment.
+    """Find the closest point of the segment ab to p.
+
+    Eq. 2, with the projection clamped to the segment.
 
     Takes points [m] of shape (..., 3). The distance contains the axial part beyond an end, which eq. 2 leaves
     out. A segment of zero length is the point a.
@@ -75,7 +77,7 @@ def point_segment(p: Array, a: Array, b: Array) -> PointSegment:
 
 
 def line_parameters(a: Array, b: Array, c: Array, d: Array) -> LineParameters:
-    """Parameters m, n [-] of the closest points of the infinite lines ab and cd (eqs. 6, 7).
+    """Find the parameters m, n [-] of the closest points of the lines ab and cd (eqs. 6, 7).
 
     Takes points [m] of shape (..., 3). Both are NaN where they are not unique: for parallel lines and for a
     segment of zero length.
@@ -93,7 +95,9 @@ def line_parameters(a: Array, b: Array, c: Array, d: Array) -> LineParameters:
 
 
 def segment_segment(a: Array, b: Array, c: Array, d: Array) -> SegmentSegment:
-    """Axis distance of the segments ab and cd with its witness points (eqs. 3-7, Fig. 4).
+    """Find the distance of the segments ab and cd, with its witness points (eqs. 3-7).
+
+    See Fig. 4.
 
     Takes points [m] of shape (..., 3). Where m and n both lie in [0, 1] they give the minimum; where one does
     not, or the axes are parallel or of zero length, it is the best of the four cases end point to segment.
@@ -118,7 +122,9 @@ def segment_segment(a: Array, b: Array, c: Array, d: Array) -> SegmentSegment:
 
 
 def capsule_distances(ends_a: Array, radii_a: Array, ends_b: Array, radii_b: Array) -> CapsuleDistances:
-    """Signed surface distances of m pairs of capsules, all at once; a sphere is a capsule with equal ends.
+    """Compute signed surface distances of m pairs of capsules, all at once.
+
+    A sphere is a capsule with equal ends.
 
     Takes the axes' ends [m], (m, 2, 3), and the radii [m], (m,), of both bodies. The paper's d_m is
     `distance + radii_a + radii_b`. Where the axes intersect (to TOUCHING) the normal is their common
@@ -146,7 +152,10 @@ def capsule_distances(ends_a: Array, radii_a: Array, ends_b: Array, radii_b: Arr
 
 
 def _common_perpendicular(u: Array, v: Array) -> Array:
-    """Unit vectors perpendicular to u and v, (k, 3): some perpendicular of parallel ones, z of two points."""
+    """Return unit vectors perpendicular to u and v (k, 3).
+
+    Some perpendicular of parallel ones; z where both are points.
+    """
     cross = _cross(u, v)
     longer = np.where((_norm(u) >= _norm(v))[:, None], u, v)
     # The coordinate axis furthest from the capsule's own gives the best conditioned perpendicular.
@@ -158,22 +167,25 @@ def _common_perpendicular(u: Array, v: Array) -> Array:
 
 
 def _parallel(u: Array, v: Array, cross: Array) -> NDArray[np.bool_]:
-    """Whether the sine of the angle between u and v is at most PARALLEL; true also for a zero vector."""
+    """Return True if the sine of the angle between u and v is at most PARALLEL.
+
+    True also for a zero vector.
+    """
     parallel: NDArray[np.bool_] = _dot(cross, cross) <= PARALLEL**2 * _dot(u, u) * _dot(v, v)
     return parallel
 
 
 def _cross(x: Array, y: Array) -> Array:
-    """Vector product over the last axis."""
+    """Return the vector product over the last axis."""
     return np.asarray(np.cross(x, y), dtype=np.float64)
 
 
 def _dot(x: Array, y: Array) -> Array:
-    """Scalar product over the last axis."""
+    """Return the scalar product over the last axis."""
     product: Array = np.einsum("...i,...i->...", x, y)
     return product
 
 
 def _norm(x: Array) -> Array:
-    """Euclidean length over the last axis."""
+    """Return the Euclidean length over the last axis."""
     return np.sqrt(_dot(x, x))

@@ -1,6 +1,6 @@
-"""Points as from a depth camera: read, cleaned and sorted into voxels and blocks, so that a tick finds the near ones.
+"""Points as from a depth camera: read, cleaned and sorted into voxels and blocks, so that queries find the near ones.
 
-A voxel that holds a point counts as the ball around it, whatever number of points it holds: how dense and how noisy a
+A voxel that holds a point counts as the sphere around it, whatever number of points it holds: how dense and how noisy a
 camera is makes no difference to what is kept clear, and the same voxels come back from one picture to the next.
 """
 
@@ -20,22 +20,22 @@ from qpavoid.problem import Array, IntArray, as_numbers
 
 _BLOCK = 4
 """Voxels along the edge of a block."""
-_FARTHEST = 1e2
-"""How far from the cloud's origin a point may lie [m]; those beyond are dropped, as if they were not finite."""
+_MAX_DISTANCE = 1e2
+"""Largest distance of a point from the cloud's origin [m]; no depth camera measures farther, and others are dropped."""
 _LARGEST, _MOST_POINTS = 200_000_000, 5_000_000
 """Of a file [bytes], and points of it."""
 
 
 class Points(NamedTuple):
-    """What a camera saw: takes the place of all points of a cloud that were given before."""
+    """A measurement of a camera: replaces all earlier points of a cloud."""
 
     points: ArrayLike | Voxels
     """(n, 3) in the cloud's frame [m]; points with NaN or infinity are dropped. Or `Voxels` made beforehand, which
-    leaves the tick nothing to do."""
+    saves the control step the work."""
     pose: Sample | None = None
     """Where the cloud's frame is, and how it moves; where it was if left out, which is the world at first."""
     t: float | None = None
-    """Time stamp: when they were seen [s]; that of the pose, or the time of the control step, if left out."""
+    """Time stamp of the measurement [s]; that of the pose, or the time of the control step, if left out."""
     at_rest: bool = False
     """Whether they stay there until others are given: they are never stale."""
 
@@ -51,17 +51,19 @@ class Voxels:
     keys: IntArray
     """(m,) number of each voxel, the same in every cloud of this resolution."""
     blocks: Array
-    """(b, 4) ball around the voxels' centres of each block: its centre and radius [m]."""
+    """(b, 4) sphere around the voxels' centres of each block: its centre and radius [m]."""
     starts: IntArray
     """(b + 1,) where each block begins in `centers`."""
     dropped: int = 0
-    """How many points were NaN, infinite or absurdly far away."""
+    """Number of points that were NaN, infinite or farther away than 100 m."""
     given: int = 0
-    """How many points there were in all."""
+    """Number of points in all."""
 
     @classmethod
     def of(cls, points: ArrayLike, resolution: float) -> Voxels:
-        """Sorts points; takes some ms for 10 000, which a thread of the camera may spend.
+        """Sort points into voxels and blocks.
+
+        It takes some ms for 10 000, which a thread of the camera may spend.
 
         Args:
             points: (n, 3) [m]; n may be 0.
@@ -73,9 +75,9 @@ class Voxels:
         array = as_numbers("points", points)
         if array.ndim != 2 or array.shape[1] != 3:
             raise NumericalError(f"points: shape {array.shape}, expected (n, 3)")
-        good = np.abs(array).max(axis=1, initial=0.0) <= _FARTHEST  # False for NaN too
-        kept = array if good.all() else array[good]
-        voxel = np.floor(kept / resolution).astype(np.int64)
+        is_finite = np.abs(array).max(axis=1, initial=0.0) <= _MAX_DISTANCE  # False for NaN too
+        finite = array if is_finite.all() else array[is_finite]
+        voxel = np.floor(finite / resolution).astype(np.int64)
         keys = np.unique(_key(voxel // _BLOCK) * _BLOCK**3 + _within(voxel % _BLOCK))
         corner = _BLOCK * _unkey(keys // _BLOCK**3) + _unwithin(keys % _BLOCK**3)
         centers = (corner + 0.5) * resolution
@@ -85,11 +87,13 @@ class Voxels:
         if len(starts):
             low, high = np.minimum.reduceat(centers, starts), np.maximum.reduceat(centers, starts)
             blocks[:, :3], blocks[:, 3] = 0.5 * (low + high), 0.5 * np.linalg.norm(high - low, axis=1)
-        return cls(resolution, centers, keys, blocks, np.append(starts, len(keys)), len(array) - len(kept), len(array))
+        return cls(
+            resolution, centers, keys, blocks, np.append(starts, len(keys)), len(array) - len(finite), len(array)
+        )
 
     @classmethod
     def of_octree(cls, tree: Any, resolution: float | None = None) -> Voxels:
-        """The occupied leaves of a coal octree, large ones cut into voxels.
+        """Make voxels of the occupied leaves of a coal octree, large ones cut up.
 
         Args:
             tree: `coal.OcTree`, such as `coal.makeOctree` or `coal.MeshLoader().loadOctree` gives.
@@ -104,13 +108,13 @@ class Voxels:
         return cls.of(np.concatenate(points), edge)
 
 
-def ball_radius(resolution: float) -> float:
-    """Radius of the ball around a voxel [m]."""
+def voxel_radius(resolution: float) -> float:
+    """Return the radius of a voxel's circumscribed sphere [m]."""
     return float(0.5 * np.sqrt(3.0) * resolution)
 
 
 def read_points(path: Path, where: str) -> Array:
-    """Points (n, 3) of a file [m].
+    """Read points (n, 3) [m] from a file.
 
     Args:
         path: `.npy` with an array (n, 3), or `.csv` with the header `x,y,z`.

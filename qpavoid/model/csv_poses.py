@@ -21,7 +21,9 @@ _LARGEST_CSV, _MOST_ROWS = 20_000_000, 100_000
 
 
 def read_poses(path: Path, initial: Array) -> tuple[list[float], list[Array], list[Array]]:
-    """Times [s], positions (3,) [m] and rotations (3, 3) of a file; without quaternions, each rotation is `initial`.
+    """Read times [s], positions (3,) [m] and rotations (3, 3) of a file.
+
+    Without quaternions, each rotation is `initial`.
 
     Raises:
         ConfigError: naming file, line and column.
@@ -71,7 +73,10 @@ def _number(cell: str, where: str) -> float:
 
 
 def _unit_quaternion_matrix(quaternion: list[float], where: str) -> Array:
-    """(3, 3) from (qx, qy, qz, qw), which need not have unit length: files hold rounded numbers."""
+    """Return the rotation (3, 3) of (qx, qy, qz, qw).
+
+    It need not have unit length: files hold rounded numbers.
+    """
     norm = math.hypot(*quaternion)
     if norm < 1e-6:
         raise ConfigError(f"{where}, qx,qy,qz,qw: the quaternion is zero; no turn is 0,0,0,1")

@@ -16,8 +16,8 @@ _ROUND_OFF = 1e-6
 """How far a point may stand out and count as inside [m]: meshes have single precision."""
 
 
-def without_enclosed(pieces: Any, notes: list[Note]) -> Any:
-    """The shapes of a geometry model without those inside others of their link, in their order.
+def remove_enclosed(pieces: Any, notes: list[Note]) -> Any:
+    """Remove the shapes of a geometry model that lie inside others of their link.
 
     What touches an enclosed shape has gone through the one around it, so that distances stay as they are as long as
     they are positive. Files that have a mesh and a simple shape around it for each link need half of them.
@@ -30,35 +30,38 @@ def without_enclosed(pieces: Any, notes: list[Note]) -> Any:
     links: dict[int, list[int]] = {}
     for i, piece in enumerate(objects):
         links.setdefault(piece.parentFrame, []).append(i)
-    kept = pin.GeometryModel()
-    inside: dict[int, int] = {}
+    result = pin.GeometryModel()
+    enclosed_by: dict[int, int] = {}
     for members in links.values():
         for i in members:
-            others = (j for j in members if j != i and inside.get(j) != i and j not in inside)
-            around = next((j for j in others if _encloses(objects[j], objects[i])), None)
-            if around is not None:
-                inside[i] = around
-        _name_mixture([objects[i] for i in members if i not in inside], notes)
+            candidates = (j for j in members if j != i and enclosed_by.get(j) != i and j not in enclosed_by)
+            enclosing = next((j for j in candidates if _encloses(objects[j], objects[i])), None)
+            if enclosing is not None:
+                enclosed_by[i] = enclosing
+        _name_mixture([objects[i] for i in members if i not in enclosed_by], notes)
     for i, piece in enumerate(objects):
-        if i in inside:
-            what = f"left out: it lies inside {objects[inside[i]].name}, a shape of the same link"
-            notes.append(Note(NoteKind.SHAPE, (piece.name,), what))
+        if i in enclosed_by:
+            clause = f"left out: it lies inside {objects[enclosed_by[i]].name}, a shape of the same link"
+            notes.append(Note(NoteKind.SHAPE, (piece.name,), clause))
         else:
-            kept.addGeometryObject(piece)
-    return kept
+            result.addGeometryObject(piece)
+    return result
 
 
 def _name_mixture(pieces: list[Any], notes: list[Note]) -> None:
-    """Names the shapes of a link that has meshes beside simple shapes: often one set is meant to replace the other."""
+    """Note the shapes of a link that has meshes beside simple shapes.
+
+    Often one set is meant to replace the other.
+    """
     meshes = [piece for piece in pieces if isinstance(piece.geometry, coal.BVHModelBase)]
     if meshes and len(meshes) < len(pieces):
         names = tuple(piece.name for piece in pieces)
-        what = "meshes and simple shapes of one link, none inside another: all count"
-        notes.append(Note(NoteKind.SHAPE, names, what, "list `bodies` where one set is meant to replace the other"))
+        clause = "meshes and simple shapes of one link, none inside another: all count"
+        notes.append(Note(NoteKind.SHAPE, names, clause, "list `bodies` where one set is meant to replace the other"))
 
 
 def _encloses(outer: Any, inner: Any) -> bool:
-    """Whether a piece lies inside another one, or is the same."""
+    """Return True if a piece lies inside another one, or is the same."""
     placement = outer.placement.actInv(inner.placement)
     if _same(outer, inner) and placement.isIdentity(_ROUND_OFF):
         return True
@@ -78,7 +81,10 @@ def _same(a: Any, b: Any) -> bool:
 
 
 def _depth(shape: Any, points: Array) -> Array:
-    """How far points (n, 3) are inside a shape, at most; negative outside (n,) [m]."""
+    """Return a lower bound on the depth of points (n, 3) inside a shape (n,) [m].
+
+    Negative outside.
+    """
     if isinstance(shape, coal.Box):
         return np.asarray((shape.halfSide - np.abs(points)).min(axis=1))
     if isinstance(shape, coal.Sphere):
@@ -86,8 +92,8 @@ def _depth(shape: Any, points: Array) -> Array:
     if isinstance(shape, coal.Ellipsoid):
         scaled = np.linalg.norm(points / shape.radii, axis=1)
         return np.asarray((1.0 - scaled) * np.min(shape.radii))
-    beyond = np.abs(points[:, 2]) - shape.halfLength
-    across = np.linalg.norm(points[:, :2], axis=1)
+    height_excess = np.abs(points[:, 2]) - shape.halfLength
+    radius = np.linalg.norm(points[:, :2], axis=1)
     if isinstance(shape, coal.Cylinder):
-        return np.asarray(np.minimum(shape.radius - across, -beyond))
-    return np.asarray(shape.radius - np.hypot(across, np.maximum(beyond, 0.0)))
+        return np.asarray(np.minimum(shape.radius - radius, -height_excess))
+    return np.asarray(shape.radius - np.hypot(radius, np.maximum(height_excess, 0.0)))

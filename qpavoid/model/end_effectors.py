@@ -24,24 +24,26 @@ _LINKS = (pin.BODY, pin.OP_FRAME)
 _NO_TOOLS = re.compile(r"head|eye|camera|neck|wheel|caster|laser|imu|lidar|sensor|optical", re.IGNORECASE)
 
 
-def end_effectors(model: Any, known: Sequence[str] = ()) -> list[str]:
-    """Names of frames at the ends of a robot's limbs: those that are known, then others in the order of the joints.
+def end_effectors(model: Any, srdf_ends: Sequence[str] = ()) -> list[str]:
+    """Find the frames at the ends of a robot's limbs.
+
+    First those that an SRDF names, then others in the order of the joints.
 
     A limb is a chain of at least three joints since the last branch; where it branches into fingers, its hand is the
     end. Where no limb is that long, every end counts.
 
     Args:
         model: pinocchio model.
-        known: frames that an SRDF calls end effectors; those that do not exist are left out.
+        srdf_ends: frames that an SRDF calls end effectors; those that do not exist are left out.
     """
     frames = {f.name: f.parentJoint for f in model.frames if f.type in _LINKS}
-    ends = [name for name in known if name in frames]
+    ends = [name for name in srdf_ends if name in frames]
     ends = [_tool_named(model, frames[name]) or name for name in ends]
-    taken = {joint for name in ends for joint in list(model.supports[frames[name]])[1:]}
+    used_joints = {joint for name in ends for joint in list(model.supports[frames[name]])[1:]}
     root = 1 if model.njoints > 1 and model.names[1] == "root_joint" else 0
     for least in (_LIMB, 1):
         joints = _ends(model, root, 0, least)
-        tools = [_tool_frame(model, joint) for joint in joints if joint not in taken]
+        tools = [_tool_frame(model, joint) for joint in joints if joint not in used_joints]
         ends += [name for name in tools if name is not None and not _NO_TOOLS.search(name)]
         if ends:
             break
@@ -49,14 +51,17 @@ def end_effectors(model: Any, known: Sequence[str] = ()) -> list[str]:
 
 
 def _ends(model: Any, joint: int, above: int, least: int) -> list[int]:
-    """Joints that carry the ends of the tree below `joint`, which has `above` joints in a row above it."""
+    """Find the joints that carry the ends of the tree below `joint`.
+
+    There are `above` joints in a row above it.
+    """
     children = list(model.children[joint])
     if not children:
         return [joint] if above >= least else []
     fingers = any(_FINGERS.search(model.names[child]) for child in children)
     count, longest = len(children), max(_depth(model, child) for child in children)
-    short = count > 1 and longest <= (_DIGITS[1] if count >= _DIGITS[0] else _FINGER)
-    if above >= _LIMB and (fingers or short):
+    has_short_chains = count > 1 and longest <= (_DIGITS[1] if count >= _DIGITS[0] else _FINGER)
+    if above >= _LIMB and (fingers or has_short_chains):
         return [joint]
     if len(children) == 1:
         return _ends(model, children[0], above + 1, least)
@@ -64,18 +69,18 @@ def _ends(model: Any, joint: int, above: int, least: int) -> list[int]:
 
 
 def _depth(model: Any, joint: int) -> int:
-    """Joints in the longest chain that begins with a joint."""
+    """Count the joints in the longest chain that begins with a joint."""
     return 1 + max((_depth(model, child) for child in model.children[joint]), default=0)
 
 
 def _tool_frame(model: Any, joint: int) -> str | None:
-    """The frame that is best called a tool among those that a joint carries: by name, else its own link."""
+    """Find the frame of a joint that is best called a tool: by name, else its own link."""
     names = [f.name for f in model.frames if f.parentJoint == joint and f.type in _LINKS]
     return _tool_named(model, joint) or (str(names[0]) if names else None)
 
 
 def _tool_named(model: Any, joint: int) -> str | None:
-    """The frame that is called a tool among those that a joint carries, if there is one."""
+    """Find the frame of a joint whose name is that of a tool, if there is one."""
     names = [f.name for f in model.frames if f.parentJoint == joint and f.type in _LINKS]
     for word in _TOOL_WORDS:
         pattern = re.compile(rf"(?:^|[^a-z]){word}(?:[^a-z]|$)", re.IGNORECASE)

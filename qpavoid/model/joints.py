@@ -17,25 +17,30 @@ from qpavoid.model.notes import Note, NoteKind
 from qpavoid.model.pairs import pair_array
 from qpavoid.problem import Array, IntArray
 
-_MAX_NORM = 1e9
-"""Speed [rad/s or m/s] or position [rad or m] from which a limit is a way of saying that there is none."""
-_SAME = 1e-6
-"""How far a joint may be given from where the one that it mimics takes it [rad or m]."""
+_NO_LIMIT = 1e9
+"""Speed [rad/s or m/s] or position [rad or m] from which a limit means that there is none, as files write it."""
+_MIMIC_TOLERANCE = 1e-6
+"""Difference of a joint's value from the one that its mimic relation gives, up to which they agree [rad or m]."""
 
 
 def frame_index(model: Any, name: str) -> int:
-    """Index of an existing frame; that of the link where a joint has the same name."""
+    """Return the index of an existing frame.
+
+    Where a joint has the same name, it is that of the link.
+    """
     return int(model.getFrameId(name, pin.BODY) if model.existFrame(name, pin.BODY) else model.getFrameId(name))
 
 
 def joint_bounds(model: Any) -> JointBounds:
-    """Joint limits of a model in tangent space; a URDF says nothing of accelerations and jerks.
+    """Read the joint limits of a model, in tangent space.
+
+    A URDF has no fields for accelerations and jerks.
 
     Only joints with one coordinate in q and v have position limits. A velocity limit of 0, and a range from 0 to 0,
-    mean that the URDF gives none; see `fixed_by_limits` of ranges that are meant, `assume_speeds` of velocities.
+    mean that the URDF gives none; see `joints_fixed_by_limits` of ranges that are meant, `assume_speeds` of velocities.
     """
     lower, upper = np.array(model.lowerPositionLimit), np.array(model.upperPositionLimit)
-    lower[lower <= -_MAX_NORM], upper[upper >= _MAX_NORM] = -np.inf, np.inf
+    lower[lower <= -_NO_LIMIT], upper[upper >= _NO_LIMIT] = -np.inf, np.inf
     q_index, v_index = [], []
     for joint in list(model.joints)[1:]:
         low, high = lower[joint.idx_q], upper[joint.idx_q]
@@ -45,7 +50,7 @@ def joint_bounds(model: Any) -> JointBounds:
     q_indices = np.array(q_index, dtype=np.intp)
     velocity = np.array(model.velocityLimit)
     return JointBounds(
-        velocity=np.where((velocity > 0.0) & (velocity < _MAX_NORM), velocity, np.inf),
+        velocity=np.where((velocity > 0.0) & (velocity < _NO_LIMIT), velocity, np.inf),
         q_index=q_indices,
         v_index=np.array(v_index, dtype=np.intp),
         lower=lower[q_indices],
@@ -56,7 +61,7 @@ def joint_bounds(model: Any) -> JointBounds:
 
 
 def set_limits(model: Any, limits: JointLimits, path: Path) -> None:
-    """Takes over the position and velocity limits that a robot.yaml gives.
+    """Set the position and velocity limits that a robot.yaml gives.
 
     Raises:
         ConfigError, UnknownName: of a joint that mimics another one, has no position limits, or is unknown.
@@ -65,15 +70,15 @@ def set_limits(model: Any, limits: JointLimits, path: Path) -> None:
     velocity = np.array(model.velocityLimit)
     for kind in ("position", "velocity", "acceleration", "jerk"):
         for name in getattr(limits, kind):
-            if named(model, name, f"{path}: limits.{kind}").shortname() == MIMIC:
+            if find_joint(model, name, f"{path}: limits.{kind}").shortname() == MIMIC:
                 raise ConfigError(f"{path}: limits.{kind}: {_follows(model, name)}; limit that one")
     for name, (low, high) in limits.position.items():
-        joint = named(model, name, f"{path}: limits.position")
+        joint = find_joint(model, name, f"{path}: limits.position")
         if joint.nq != 1:
-            raise ConfigError(f"{path}: limits.position: joint {name!r} turns all the way round; leave it out")
+            raise ConfigError(f"{path}: limits.position: joint {name!r} is continuous; leave it out")
         lower[joint.idx_q], upper[joint.idx_q] = low, high
     for name, speed in limits.velocity.items():
-        joint = named(model, name, f"{path}: limits.velocity")
+        joint = find_joint(model, name, f"{path}: limits.velocity")
         if isinstance(speed, list) and len(speed) != joint.nv:
             raise ConfigError(
                 f"{path}: limits.velocity: joint {name!r}: {len(speed)} values for {joint.nv} coordinates"
@@ -84,7 +89,10 @@ def set_limits(model: Any, limits: JointLimits, path: Path) -> None:
 
 
 def _set_speeds(model: Any, velocity: Array) -> None:
-    """Sets the largest speeds (nv,) of both directions, of which a URDF has one and Pinocchio reads both as that."""
+    """Set the largest speeds (nv,) of both directions.
+
+    A URDF has one number, and Pinocchio reads it as both.
+    """
     model.velocityLimit, model.lowerVelocityLimit = velocity, -velocity
 
 
@@ -93,30 +101,32 @@ ASSUMED_SPEED = 1.0
 
 
 def assume_speeds(model: Any, notes: list[Note]) -> None:
-    """Gives a largest speed to every coordinate without one: to bases that float or roll, and where a file says 0.
+    """Give a largest speed to every coordinate without one.
+
+    Bases that float or roll have none, nor have joints of which the file says 0.
 
     Args:
         model: Pinocchio model, changed in place.
         notes: the joints are named in them.
     """
     velocity = np.array(model.velocityLimit)
-    given = (velocity > 0.0) & (velocity < _MAX_NORM)
+    has_limit = (velocity > 0.0) & (velocity < _NO_LIMIT)
     names: dict[str, list[str]] = {}
     for name, joint in zip(list(model.names)[1:], list(model.joints)[1:], strict=True):
         part = slice(joint.idx_v, joint.idx_v + joint.nv)
-        if joint.shortname() != MIMIC and not given[part].all():
+        if joint.shortname() != MIMIC and not has_limit[part].all():
             metres = TRANSLATIONS.get(joint.shortname(), 0)
             units = ["m/s"] * bool(metres) + ["rad/s"] * (joint.nv > metres)
             names.setdefault(" and ".join(f"{ASSUMED_SPEED:g} {unit}" for unit in units), []).append(name)
-    velocity[~given] = ASSUMED_SPEED
+    velocity[~has_limit] = ASSUMED_SPEED
     _set_speeds(model, velocity)
     for speed, joints in names.items():
-        what = f"no velocity limit is given: {speed} {'is' if ' and ' not in speed else 'are'} assumed"
-        notes.append(Note(NoteKind.LIMIT, tuple(joints), what, "give it under `limits.velocity`", "warning"))
+        clause = f"no velocity limit is given: {speed} {'is' if ' and ' not in speed else 'are'} assumed"
+        notes.append(Note(NoteKind.LIMIT, tuple(joints), clause, "give it under `limits.velocity`", "warning"))
 
 
-def named(model: Any, name: str, where: str) -> Any:
-    """The joint of a name.
+def find_joint(model: Any, name: str, where: str) -> Any:
+    """Return the joint of a name.
 
     Raises:
         UnknownName: there is none; with the nearest one.
@@ -127,8 +137,11 @@ def named(model: Any, name: str, where: str) -> Any:
     return model.joints[model.getJointId(name)]
 
 
-def middle(model: Any) -> Array:
-    """Neutral configuration (nq,), with bounded joints at the middle of their range where 0 is outside it."""
+def middle_configuration(model: Any) -> Array:
+    """Return the neutral configuration (nq,), moved into the joint limits.
+
+    A bounded joint whose range leaves 0 out stands at the middle of its range.
+    """
     q = pin.neutral(model)
     for joint in list(model.joints)[1:]:
         lower, upper = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
@@ -138,7 +151,7 @@ def middle(model: Any) -> Array:
 
 
 def set_joints(model: Any, q: Array, values: Mapping[str, float], where: str) -> Array:
-    """The configuration q (nq,) with some joints elsewhere.
+    """Return the configuration q (nq,) with other values of some joints.
 
     Args:
         model: pinocchio model.
@@ -150,7 +163,7 @@ def set_joints(model: Any, q: Array, values: Mapping[str, float], where: str) ->
         ConfigError, UnknownName: a joint with more than one angle, in conflict with another one, or unknown.
     """
     q = q.copy()
-    mimics = [name for name in values if named(model, name, where).shortname() == MIMIC]
+    mimics = [name for name in values if find_joint(model, name, where).shortname() == MIMIC]
     for name, value in values.items():
         joint = model.joints[model.getJointId(name)]
         if name in mimics:
@@ -163,9 +176,11 @@ def set_joints(model: Any, q: Array, values: Mapping[str, float], where: str) ->
             raise ConfigError(f"{where}: joint {name!r} has {joint.nq} coordinates; give q0 as a list of all of q")
     for name in mimics:
         joint = model.joints[model.getJointId(name)]
-        there = joint.extract().scaling * q[joint.idx_q] + joint.extract().offset
-        if abs(values[name] - there) > _SAME:
-            raise ConfigError(f"{where}: {_follows(model, name)}, to {there:g} and not {values[name]:g}; leave it out")
+        expected = joint.extract().scaling * q[joint.idx_q] + joint.extract().offset
+        if abs(values[name] - expected) > _MIMIC_TOLERANCE:
+            raise ConfigError(
+                f"{where}: {_follows(model, name)}, to {expected:g} and not {values[name]:g}; leave it out"
+            )
     return q
 
 
@@ -175,16 +190,21 @@ def _follows(model: Any, name: str) -> str:
     return f"joint {name!r} follows {model.names[leader]!r} (mimic)"
 
 
-def without(model: Any, bodies: Any, locked: Sequence[str], q: Array, where: str) -> tuple[Any, Any, IntArray]:
-    """Model and bodies without the locked joints, and which coordinates of q are left."""
-    ids = [named(model, name, where).id for name in locked]
+def remove_joints(
+    model: Any, bodies: Any, joint_names: Sequence[str], q: Array, where: str
+) -> tuple[Any, Any, IntArray]:
+    """Fix some joints where q has them.
+
+    Returns the smaller model and its bodies, and the indices in q of the remaining coordinates.
+    """
+    ids = [find_joint(model, name, where).id for name in joint_names]
     for joint, leader in zip(list(model.mimicking_joints), list(model.mimicked_joints), strict=True):
         if leader in ids and joint not in ids:
             ids.append(joint)
         elif joint in ids and leader not in ids:
             raise ConfigError(f"{where}: {_follows(model, model.names[joint])}; lock that one")
-    kept = [joint for joint in list(model.joints)[1:] if joint.id not in ids]
-    index = np.array([i for joint in kept for i in range(joint.idx_q, joint.idx_q + joint.nq)], dtype=np.intp)
+    free_joints = [joint for joint in list(model.joints)[1:] if joint.id not in ids]
+    index = np.array([i for joint in free_joints for i in range(joint.idx_q, joint.idx_q + joint.nq)], dtype=np.intp)
     model, bodies = pin.buildReducedModel(model, bodies, ids, q)
     joints = [body.parentJoint for body in bodies.geometryObjects]
     for a, b in pair_array(bodies).tolist():

@@ -26,7 +26,7 @@ MIMIC = "JointModelMimic"
 
 
 class Kinematics(NamedTuple):
-    """Where the tracked frames are, and how everything moves with v, until the next tick overwrites it."""
+    """Where the tracked frames are, and how everything moves with v, until the next control step overwrites it."""
 
     J: Array
     """(6, e) world Jacobian: column j is the twist of joint j [linear velocity of the body point at the world
@@ -50,7 +50,7 @@ class ForwardKinematics:
     """Joint placements, world Jacobian and the poses of some frames, in data that every call overwrites."""
 
     def __init__(self, model: Any, frame_ids: Sequence[int] = ()) -> None:
-        """Lays the memory out.
+        """Allocate the memory of all results.
 
         Args:
             model: pinocchio model.
@@ -69,7 +69,10 @@ class ForwardKinematics:
         """(njoints, 12) world poses of all joints."""
 
     def compute(self, q: Array) -> None:
-        """Brings everything to a configuration q (nq,); `data` then holds the joint placements."""
+        """Compute everything at a configuration q (nq,).
+
+        `data` then holds the joint placements.
+        """
         model, data = self._model, self.data
         pin.computeJointJacobians(model, data, q)
         for frame_id in self._ids:
@@ -81,7 +84,7 @@ class ForwardKinematics:
 
 
 def columns(model: Any) -> IntArray:
-    """Which velocity coordinate moves each of the e columns of the world Jacobian (e,)."""
+    """Return the velocity coordinate that moves each column of the world Jacobian (e,)."""
     index = np.zeros(model.nvExtended, dtype=np.intp)
     for joint in list(model.joints)[1:]:
         width = joint.nvExtended
@@ -90,20 +93,22 @@ def columns(model: Any) -> IntArray:
 
 
 def column_joints(model: Any) -> IntArray:
-    """Which joint each of the e columns of the world Jacobian belongs to (e,)."""
+    """Return the joint of each column of the world Jacobian (e,)."""
     widths = [joint.nvExtended for joint in list(model.joints)[1:]]  # that of the world counts for nothing
     return np.repeat(np.arange(1, model.njoints), widths)
 
 
 def chains(model: Any) -> tuple[Array, Array]:
-    """How far each coordinate turns, and slides, the end of each chain of joints: twice (chains, nv).
+    """Return the rotation and the translation of each chain's end: twice (chains, nv).
+
+    They are per unit of each velocity coordinate.
 
     One angle or length of a chain for each coordinate, as a rule; more where a joint mimics another one.
     """
     turns, rates = np.ones(model.nvExtended), np.ones(model.nvExtended)
     for i, joint in enumerate(list(model.joints)[1:], start=1):
         start = joint.idx_vExtended
-        turns[start : start + lengths(model, i)] = 0.0
+        turns[start : start + translation_count(model, i)] = 0.0
         if joint.shortname() == MIMIC:
             rates[start] = abs(joint.extract().scaling)
     ends = np.setdiff1d(np.arange(1, model.njoints), list(model.parents))
@@ -112,8 +117,8 @@ def chains(model: Any) -> tuple[Array, Array]:
     return (support * turns) @ fold, (support * (1.0 - turns)) @ fold
 
 
-def lengths(model: Any, joint: int) -> int:
-    """How many of the velocity coordinates of a joint are lengths; they come before its angles."""
+def translation_count(model: Any, joint: int) -> int:
+    """Count the velocity coordinates of a joint that are lengths; they precede its angles."""
     name = model.joints[joint].shortname()
     if name != MIMIC:
         return TRANSLATIONS.get(name, 0)
@@ -123,7 +128,7 @@ def lengths(model: Any, joint: int) -> int:
 
 
 def max_lever_arm(model: Any, joint_radius: Array) -> float:
-    """Largest distance that any point of a body can ever have from a joint that turns it [m].
+    """Bound the distance of any point of a body from a joint that turns it [m].
 
     Lengths of the links in between, one after the other, with what joints can slide; infinite where one can slide
     without a limit.
@@ -133,22 +138,25 @@ def max_lever_arm(model: Any, joint_radius: Array) -> float:
         joint_radius: distance from each joint's origin to the farthest point that it carries (njoints,) [m].
     """
     lever_arm = np.zeros(model.njoints)  # from the first joint that turns to the origin of each one
-    turned = np.zeros(model.njoints, dtype=bool)
+    turns_below = np.zeros(model.njoints, dtype=bool)
     lower, upper = np.abs(model.lowerPositionLimit), np.abs(model.upperPositionLimit)
     for i, joint in enumerate(list(model.joints)[1:], start=1):
-        parent, slides = model.parents[i], lengths(model, i)
-        if turned[parent]:
-            slid = slice(joint.idx_q, joint.idx_q + slides)
-            slide = float(np.maximum(lower[slid], upper[slid]).sum())
+        parent, slides = model.parents[i], translation_count(model, i)
+        if turns_below[parent]:
+            coordinates = slice(joint.idx_q, joint.idx_q + slides)
+            slide = float(np.maximum(lower[coordinates], upper[coordinates]).sum())
             if slides and joint.shortname() == MIMIC:
                 slide = abs(joint.extract().scaling) * slide + abs(joint.extract().offset)
             lever_arm[i] = lever_arm[parent] + float(np.linalg.norm(model.jointPlacements[i].translation)) + slide
-        turned[i] = turned[parent] or joint.nvExtended > slides
-    return float(np.max((lever_arm + joint_radius)[turned], initial=0.0))
+        turns_below[i] = turns_below[parent] or joint.nvExtended > slides
+    return float(np.max((lever_arm + joint_radius)[turns_below], initial=0.0))
 
 
 def support_masks(model: Any) -> Array:
-    """Which columns of the world Jacobian move which joint: (njoints, e) of 0 and 1, row 0 (the world) all 0."""
+    """Return which columns of the world Jacobian move which joint (njoints, e).
+
+    Entries are 0 and 1; row 0, the world, is all 0.
+    """
     mask = np.zeros((model.njoints, model.nvExtended))
     for joint in range(1, model.njoints):
         for ancestor in list(model.supports[joint])[1:]:  # without the world, which supports everything

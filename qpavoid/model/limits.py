@@ -1,4 +1,4 @@
-"""Joint limits as bounds on the joint velocity of one tick."""
+"""Joint limits as bounds on the joint velocity of one control step."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from qpavoid.problem import Array, IntArray
 from qpavoid.reason import Reason, ReasonKind
 
 OUTSIDE = 1e-6
-"""How far beyond a position limit a coordinate counts as outside it [rad, m]."""
+"""Excess over a position limit from which a coordinate counts as outside it: above rounding errors [rad or m]."""
 _TURN = 2.0 * np.pi
-"""Farther than this beyond its limit nothing is that was measured in radians [rad]."""
+"""Excess above which q is probably in degrees: a turn, which no joint exceeds its limit by [rad]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,16 +39,16 @@ class JointBounds:
     """(nv,) largest jerk [rad/s³ or m/s³], infinite where there is none."""
 
     def within(self, config: Limits) -> JointBounds:
-        """The share of the limits that a scenario allows to be used.
+        """Return the part of the limits that a scenario allows to be used.
 
         Raises:
             ConfigError: a coordinate has a jerk limit, and none of its acceleration.
         """
         acceleration, jerk = _or(self.acceleration, config.acceleration), _or(self.jerk, config.jerk)
-        lacking = np.isfinite(jerk) & np.isinf(acceleration)
-        if lacking.any():
+        missing = np.isfinite(jerk) & np.isinf(acceleration)
+        if missing.any():
             raise ConfigError(
-                f"limits.jerk: {lacking.sum()} of {len(jerk)} coordinates have no acceleration limit, which a jerk "
+                f"limits.jerk: {missing.sum()} of {len(jerk)} coordinates have no acceleration limit, which a jerk "
                 "limit needs; give limits.acceleration"
             )
         return replace(
@@ -59,7 +59,9 @@ class JointBounds:
         )
 
     def outside(self, q: Array, names: Sequence[str], units: Sequence[str]) -> tuple[Reason, ...]:
-        """List which coordinates are outside their position limits, and how far, negative below the lower one.
+        """List the coordinates outside their position limits.
+
+        The amount is negative below the lower limit.
 
         Args:
             q: configuration (nq,).
@@ -67,34 +69,34 @@ class JointBounds:
             units: their units, rad or m.
         """
         below, above = self.lower - q[self.q_index], q[self.q_index] - self.upper
-        found = []
+        reasons = []
         for i in np.flatnonzero(np.maximum(below, above) > OUTSIDE).tolist():
             amount, j = float(-below[i] if below[i] > 0.0 else above[i]), int(self.v_index[i])
             hint = "is it in degrees?" if abs(amount) > _TURN else ""
-            found.append(Reason.of(ReasonKind.LIMIT_RECOVERY, names[j], amount=amount, unit=units[j], detail=hint))
-        return tuple(found)
+            reasons.append(Reason.of(ReasonKind.LIMIT_RECOVERY, names[j], amount=amount, unit=units[j], detail=hint))
+        return tuple(reasons)
 
 
-def _or(limits: Array, given: float | None) -> Array:
-    """The limits (nv,) of a robot, and what a scenario gives to the coordinates that have none."""
-    return np.where(np.isfinite(limits), limits, np.inf if given is None else given)
+def _or(limits: Array, default: float | None) -> Array:
+    """Return the limits (nv,) of a robot, with a default where it has none."""
+    return np.where(np.isfinite(limits), limits, np.inf if default is None else default)
 
 
 def limit_layout(joints: JointBounds, position_gain: float, dt: float) -> dict[str, Any]:
-    """Arrays of the bounds lower <= v <= upper, as `RowLayout` has them.
+    """Make the arrays of the bounds lower <= v <= upper, as `RowLayout` has them.
 
     The bounds keep the next configuration inside its limits. A joint without an acceleration limit uses at most a
-    share `position_gain` of what is left to a position limit in one tick; a joint with one keeps to the speeds from
-    which it can still brake (`kernels.speed_to_stop`), so that position, velocity and acceleration
+    share `position_gain` of the margin to a position limit in one control period; a joint with one keeps to the speeds
+    from which it can still brake (`kernels.speed_to_stop`), so that position, velocity and acceleration
     limits never contradict each other once they are met; where its jerk has a limit, too, it keeps to the velocities
-    from which a stop within all of these ends in time (`kernels.braking_bounds`). A joint outside its limits returns
-    at no more than its largest speed. Bounds never cross: from a state that no braking can save, the jerk limit gives
-    way, then that of the acceleration.
+    from which a stop within all of these ends in time (`kernels.braking_bounds`). A joint outside its limits moves back, at
+    no more than its largest speed. Bounds never cross: from a state that no braking can save, the jerk limit is
+    relaxed, then that of the acceleration.
 
     Args:
         joints: the robot's limits.
-        position_gain: share of the room to a position limit that one tick may use [-].
-        dt: length of a tick [s].
+        position_gain: share of the margin to a position limit that one control period may use [-].
+        dt: control period [s].
     """
     nv = len(joints.velocity)
     acceleration_limited, jerk_limited = (
@@ -124,7 +126,7 @@ def limit_layout(joints: JointBounds, position_gain: float, dt: float) -> dict[s
 
 
 def saturate(v: Array, lower: Array, upper: Array, v_max: Array) -> tuple[Array, float]:
-    """Brings a raw velocity within the limits.
+    """Scale, then clip a raw velocity to the limits.
 
     First one factor for all joints, so that the direction is kept while only speeds are exceeded; then each joint
     is clipped to what its position limit leaves.

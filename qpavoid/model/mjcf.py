@@ -1,4 +1,4 @@
-"""Reads MJCF files through Pinocchio, and makes sure that no geom of a body is lost on the way."""
+"""MJCF files, read through Pinocchio with a check that no geom of a body is lost."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _ANEW = "save it as one plain file, for example with mj_saveLastXML"
 
 
 def model_of_mjcf(mjcf: Path, root: Any) -> Any:
-    """Pinocchio model of an MJCF.
+    """Read the Pinocchio model of an MJCF.
 
     Args:
         mjcf: the file.
@@ -34,7 +34,9 @@ def model_of_mjcf(mjcf: Path, root: Any) -> Any:
 
 
 def shapes_of_mjcf(mjcf: Path, root: ET.Element, model: Any, visual: bool) -> Any:
-    """Geometry model of the geoms that collide (contype or conaffinity is not 0), or that are meant to be seen.
+    """Read the geoms that collide, or the visual ones, into a geometry model.
+
+    A geom collides if its contype or conaffinity is not 0.
 
     What the file fixes to its world (a floor) is no part of the robot and left out.
 
@@ -47,16 +49,16 @@ def shapes_of_mjcf(mjcf: Path, root: ET.Element, model: Any, visual: bool) -> An
     Raises:
         ConfigError: a geom that Pinocchio does not read, or a plane that would move, naming the body.
     """
-    read = {kind: pin.buildGeomFromMJCF(model, str(mjcf), kind) for kind in (pin.COLLISION, pin.VISUAL)}
-    _check_every_geom(mjcf, root, model, read.values())
-    geometry = read[pin.VISUAL if visual else pin.COLLISION]
+    geometries = {kind: pin.buildGeomFromMJCF(model, str(mjcf), kind) for kind in (pin.COLLISION, pin.VISUAL)}
+    _check_every_geom(mjcf, root, model, geometries.values())
+    geometry = geometries[pin.VISUAL if visual else pin.COLLISION]
     for name in [piece.name for piece in geometry.geometryObjects if piece.parentFrame == 0]:
         geometry.removeGeometryObject(name)
     return geometry
 
 
 def check_elements(mjcf: Path, root: ET.Element) -> None:
-    """Makes sure that an MJCF has no element that Pinocchio passes over.
+    """Check that an MJCF has no element that Pinocchio passes over.
 
     Raises:
         ConfigError: naming it.
@@ -66,14 +68,16 @@ def check_elements(mjcf: Path, root: ET.Element) -> None:
             raise ConfigError(f"{mjcf}: not a usable MJCF: what is in a <{tag}> would be lost; {_ANEW}")
 
 
-def _check_every_geom(mjcf: Path, root: ET.Element, model: Any, read: Any) -> None:
-    pieces = {piece.name: piece for geometry in read for piece in geometry.geometryObjects if piece.parentFrame != 0}
-    found = Counter(model.frames[piece.parentFrame].name for piece in pieces.values())
+def _check_every_geom(mjcf: Path, root: ET.Element, model: Any, geometries: Any) -> None:
+    pieces = {
+        piece.name: piece for geometry in geometries for piece in geometry.geometryObjects if piece.parentFrame != 0
+    }
+    counts = Counter(model.frames[piece.parentFrame].name for piece in pieces.values())
     for body, count in _geoms(root):
-        if found[body] < count:
+        if counts[body] < count:
             raise ConfigError(
-                f"{mjcf}: not a usable MJCF: body {body!r}: {found[body]} of its {count} geoms can be read; give every "
-                f"body and geom a name of its own, or {_ANEW}"
+                f"{mjcf}: not a usable MJCF: body {body!r}: {counts[body]} of its {count} geoms can be read; give "
+                f"every body and geom a name of its own, or {_ANEW}"
             )
     for piece in pieces.values():
         if isinstance(piece.geometry, coal.Halfspace | coal.Plane):
@@ -81,6 +85,6 @@ def _check_every_geom(mjcf: Path, root: ET.Element, model: Any, read: Any) -> No
 
 
 def _geoms(root: ET.Element) -> Iterator[tuple[str, int]]:
-    """Name of every body, and how many geoms it has."""
+    """Yield the name of every body and the number of its geoms."""
     for body in root.iterfind("worldbody//body"):
         yield body.get("name", ""), len(body.findall("geom"))

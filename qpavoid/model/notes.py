@@ -51,8 +51,8 @@ class Note:
     """Of a pair: share of random configurations in which it touches [-]; None where that was not looked at."""
 
     def __str__(self) -> str:
-        """One line: kind, names, clause, remedy."""
-        names = " - ".join(self.subject) if self.kind is NoteKind.PAIR else shortened(self.subject)
+        """Return one line: kind, names, clause, remedy."""
+        names = " - ".join(self.subject) if self.kind is NoteKind.PAIR else abbreviate(self.subject)
         remedy = f"; {self.remedy}" if self.remedy else ""
         return f"{self.kind.value} {names}: {self.what}{remedy}"
 
@@ -61,22 +61,29 @@ class RobotWarning(UserWarning):
     """A robot was loaded, and something of it left out, mended, replaced or assumed; see `Robot.notes`."""
 
 
-def shortened(names: Sequence[str], most: int = 6) -> str:
-    """The first names of a list, and how many more there are."""
-    rest = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + rest
+_PACKAGE = __name__.partition(".")[0]
+"""Name of the package, whose own lines a warning must not be attributed to."""
 
 
-def merged(notes: Iterable[Note]) -> list[Note]:
-    """Notes with one for all that say the same of different subjects, in the order of the first; pairs stay apart."""
-    alike: dict[Note, list[str]] = {}
+def abbreviate(names: Sequence[str], most: int = 6) -> str:
+    """Join the first names of a list, with the number of further ones."""
+    suffix = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + suffix
+
+
+def merge_notes(notes: Iterable[Note]) -> list[Note]:
+    """Merge the notes that differ in their subjects alone, in the order of the first.
+
+    Notes of pairs are not merged.
+    """
+    subjects: dict[Note, list[str]] = {}
     for note in notes:
         key = note if note.kind is NoteKind.PAIR else replace(note, subject=())
-        alike.setdefault(key, []).extend(note.subject)
-    return [replace(note, subject=tuple(dict.fromkeys(subject))) for note, subject in alike.items()]
+        subjects.setdefault(key, []).extend(note.subject)
+    return [replace(note, subject=tuple(dict.fromkeys(subject))) for note, subject in subjects.items()]
 
 
-def warn_of(notes: Iterable[Note], where: str) -> None:
+def issue_warning(notes: Iterable[Note], where: str) -> None:
     """Issue one `RobotWarning` that names the notes which are warnings; none where there are none.
 
     It is attributed to the line outside this package that asked for the robot.
@@ -91,8 +98,8 @@ def warn_of(notes: Iterable[Note], where: str) -> None:
 
 
 def _levels_to_caller() -> int:
-    """How many frames above `warn_of` the first one outside this package is."""
+    """Count the frames from `issue_warning` up to the first one outside this package."""
     frame, levels = sys._getframe(1), 1
-    while frame.f_back is not None and str(frame.f_globals.get("__name__", "")).partition(".")[0] == __package__:
+    while frame.f_back is not None and str(frame.f_globals.get("__name__", "")).partition(".")[0] == _PACKAGE:
         frame, levels = frame.f_back, levels + 1
     return levels

@@ -20,44 +20,50 @@ _HEAD = 100_000
 
 
 def absolute_entries(entries: Iterable[str], folder: Path) -> list[str]:
-    """Entries of `package_dirs` with relative folders counted from that of the file that names them.
+    """Make the folders of `package_dirs` absolute.
+
+    Relative ones are counted from the folder of the file that names them.
 
     Args:
         entries: folders that hold packages, or `NAME=FOLDER`.
         folder: of the file.
     """
-    found = []
+    result = []
     for entry in entries:
         name, place = _split(entry, folder)
-        found.append(f"{name}={folder / place}" if name else str(folder / place))
-    return found
+        result.append(f"{name}={folder / place}" if name else str(folder / place))
+    return result
 
 
-def mesh_folders(urdf: Path, given: Iterable[str]) -> list[str]:
-    """Where `package://` is looked up, in order: what is given, above the file, example-robot-data, ROS_PACKAGE_PATH.
+def mesh_folders(urdf: Path, entries: Iterable[str]) -> list[str]:
+    """List the folders in which `package://` is looked up, in order.
+
+    The given ones, those above the file, example-robot-data, and ROS_PACKAGE_PATH.
 
     Packages whose package.xml has another name than their folder stand there as `NAME=FOLDER`: the one that the file
     is in, those beside it, and those in the given folders and along ROS_PACKAGE_PATH.
 
     Args:
         urdf: the file that refers to packages.
-        given: absolute folders that hold packages, or `NAME=FOLDER`.
+        entries: absolute folders that hold packages, or `NAME=FOLDER`.
     """
-    given = list(given)
+    entries = list(entries)
     ros = [folder for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if folder]
     above = [str(parent) for parent in urdf.resolve().parents]
     own = [folder for folder in above if os.path.isfile(os.path.join(folder, _MANIFEST))][:1]
-    holders = [entry for entry in given if not _split(entry)[0]] + [os.path.dirname(folder) for folder in own] + ros
-    named = [
+    holders = [entry for entry in entries if not _split(entry)[0]] + [os.path.dirname(folder) for folder in own] + ros
+    names_of_manifests = [
         f"{name}={folder}"
         for folder in dict.fromkeys(folder for holder in holders for folder in _with_manifest(holder))
         if (name := _manifest_name(folder)) and name != os.path.basename(folder)
     ]
-    return list(dict.fromkeys([*given, *above, *named, str(example_robot_data()), *ros]))
+    return list(dict.fromkeys([*entries, *above, *names_of_manifests, str(example_robot_data()), *ros]))
 
 
 def find_mesh(name: str, entries: Iterable[str]) -> str | None:
-    """The file of a name such as `package://NAME/meshes/a.stl`, `file:///a.stl` or `meshes/a.stl`; None if absent.
+    """Find the file of a mesh name; None if it is absent.
+
+    Names are such as `package://NAME/meshes/a.stl`, `file:///a.stl` or `meshes/a.stl`.
 
     Args:
         name: as a URDF has it.
@@ -72,14 +78,14 @@ def find_mesh(name: str, entries: Iterable[str]) -> str | None:
         mapped, folder = _split(entry)
         if mapped and mapped != package:
             continue
-        found = os.path.join(folder, inside if mapped else name)
-        if os.path.isfile(found):
-            return found
+        result = os.path.join(folder, inside if mapped else name)
+        if os.path.isfile(result):
+            return result
     return None
 
 
 def find_package(name: str, entries: Iterable[str]) -> str | None:
-    """The folder of a package, or None.
+    """Find the folder of a package; None if it is absent.
 
     Args:
         name: of the package.
@@ -89,13 +95,13 @@ def find_package(name: str, entries: Iterable[str]) -> str | None:
         mapped, folder = _split(entry)
         if mapped == name:
             return folder
-        if not mapped and os.path.isdir(found := os.path.join(folder, name)):
-            return found
+        if not mapped and os.path.isdir(result := os.path.join(folder, name)):
+            return result
     return None
 
 
 def _split(entry: str, folder: Path = Path()) -> tuple[str, str]:
-    """Name of a package, or nothing, and folder of an entry."""
+    """Split an entry into the name of a package, or nothing, and a folder."""
     match = _ENTRY.fullmatch(entry)
     if match is None or os.path.isdir(folder / entry):
         return "", entry
@@ -103,7 +109,7 @@ def _split(entry: str, folder: Path = Path()) -> tuple[str, str]:
 
 
 def _with_manifest(holder: str) -> Iterator[str]:
-    """A folder and those in it that have a package.xml."""
+    """Yield a folder and those in it that have a package.xml."""
     try:
         inside = sorted(os.listdir(holder))[:_MOST_BESIDE]
     except OSError:
@@ -114,7 +120,10 @@ def _with_manifest(holder: str) -> Iterator[str]:
 
 
 def _manifest_name(folder: str) -> str:
-    """Name that a package.xml gives, or nothing: by its text, since whatever else is in it does not matter here."""
+    """Read the name that a package.xml gives, or nothing.
+
+    By its text: nothing else in the file matters here.
+    """
     try:
         with open(os.path.join(folder, _MANIFEST), encoding="utf-8", errors="replace") as file:
             match = _NAME.search(re.sub(r"<!--.*?-->", "", file.read(_HEAD), flags=re.DOTALL))

@@ -16,7 +16,7 @@ from qpavoid.problem import Array, IntArray, Mask
 
 
 def add_self_pairs(model: Any, bodies: Any, disabled: Iterable[tuple[str, str]], origin: str) -> None:
-    """Adds every pair of bodies to `bodies` that is not rigidly connected, adjacent or disabled.
+    """Add every pair of bodies that is not rigidly connected, adjacent or disabled.
 
     Args:
         model: pinocchio model.
@@ -28,29 +28,29 @@ def add_self_pairs(model: Any, bodies: Any, disabled: Iterable[tuple[str, str]],
         UnknownName: a pattern that matches no body.
     """
     names = [body.name for body in bodies.geometryObjects]
-    off: set[frozenset[int]] = set()
+    disabled_pairs: set[frozenset[int]] = set()
     for pattern_a, pattern_b in disabled:
         matches = [_matching(pattern, names, origin) for pattern in (pattern_a, pattern_b)]
-        off |= {frozenset((i, j)) for i in matches[0] for j in matches[1]}
+        disabled_pairs |= {frozenset((i, j)) for i in matches[0] for j in matches[1]}
     joints = [body.parentJoint for body in bodies.geometryObjects]
     for i in range(len(names)):
         for j in range(i + 1, len(names)):
             a, b = joints[i], joints[j]
             adjacent = a == b or model.parents[a] == b or model.parents[b] == a
-            if not adjacent and frozenset((i, j)) not in off:
+            if not adjacent and frozenset((i, j)) not in disabled_pairs:
                 bodies.addCollisionPair(pin.CollisionPair(i, j))
 
 
 def _matching(pattern: str, names: list[str], origin: str) -> list[int]:
-    found = [i for i, name in enumerate(names) if fnmatchcase(name, pattern)]
-    if not found:
+    matches = [i for i, name in enumerate(names) if fnmatchcase(name, pattern)]
+    if not matches:
         raise UnknownName(f"{origin}: disabled_pairs: no body {pattern!r}{nearest(pattern, names)}")
-    return found
+    return matches
 
 
-ALWAYS = 0.95
+ALWAYS_TOUCHING = 0.95
 """Share of random configurations from which on two bodies that touch in them do so by design: a row that is violated in
-nearly every configuration keeps nothing apart. The rest is left to configurations in which a joint is at its limits."""
+nearly every configuration protects nothing. The remaining 5 % leave out configurations with a joint at its limits."""
 
 
 class TouchingPair(NamedTuple):
@@ -62,20 +62,20 @@ class TouchingPair(NamedTuple):
     """Share of random configurations in which they touch [-]."""
 
     def note(self) -> Note:
-        """Say that the pair is not checked."""
-        what = f"not checked: its bodies touch in {100.0 * self.share:.0f} % of random configurations"
-        return Note(NoteKind.PAIR, (self.a, self.b), what, share=self.share)
+        """Return a note that the pair is not checked."""
+        clause = f"not checked: its bodies touch in {100.0 * self.share:.0f} % of random configurations"
+        return Note(NoteKind.PAIR, (self.a, self.b), clause, share=self.share)
 
 
 def drop_always_touching(model: Any, bodies: Any, joints: JointBounds, samples: int = 200) -> list[TouchingPair]:
     """Remove the pairs that touch in nearly every one of many random configurations.
 
-    Those are neighbours whose shapes overlap at the joint, not a threat.
+    Those are neighbours whose shapes overlap at the joint by design.
 
     Args:
         model: pinocchio model.
         bodies: its collision bodies with their pairs, changed in place.
-        joints: position limits, within which configurations are drawn; joints without are turned all the way round.
+        joints: position limits, within which configurations are drawn; joints without are drawn over a full turn.
         samples: how many configurations are drawn, always the same ones.
 
     Returns:
@@ -88,16 +88,16 @@ def drop_always_touching(model: Any, bodies: Any, joints: JointBounds, samples: 
         q = pin.integrate(model, neutral, random.uniform(-np.pi, np.pi, model.nv) * _turns(model))
         q[joints.q_index[finite]] = random.uniform(joints.lower[finite], joints.upper[finite])
         poses.append(q)
-    share = contacts(model, bodies, poses, ALWAYS).mean(axis=0)
-    removed = np.flatnonzero(share >= ALWAYS).tolist()
+    share = find_contacts(model, bodies, poses, ALWAYS_TOUCHING).mean(axis=0)
+    indices = np.flatnonzero(share >= ALWAYS_TOUCHING).tolist()
     pairs, names = pair_array(bodies).tolist(), [body.name for body in bodies.geometryObjects]
-    for index in removed:
+    for index in indices:
         bodies.removeCollisionPair(pin.CollisionPair(*pairs[index]))
-    return [TouchingPair(names[pairs[i][0]], names[pairs[i][1]], float(share[i])) for i in removed]
+    return [TouchingPair(names[pairs[i][0]], names[pairs[i][1]], float(share[i])) for i in indices]
 
 
 def _turns(model: Any) -> Array:
-    """(nv,) 1 for coordinates that move, 0 for joints whose range is a point."""
+    """Return 1 for coordinates that move, 0 for joints whose range is a point (nv,)."""
     turns = np.ones(model.nv)
     for joint in list(model.joints)[1:]:
         if joint.nq == joint.nv == 1 and model.lowerPositionLimit[joint.idx_q] == model.upperPositionLimit[joint.idx_q]:
@@ -105,31 +105,31 @@ def _turns(model: Any) -> Array:
     return turns
 
 
-def contacts(model: Any, bodies: Any, poses: Sequence[Array], at_least: float = 0.0) -> Mask:
-    """Find in which configurations the bodies of each pair touch (k, m).
+def find_contacts(model: Any, bodies: Any, poses: Sequence[Array], at_least: float = 0.0) -> Mask:
+    """Find the configurations in which the bodies of each pair touch (k, m).
 
     Args:
         model: pinocchio model.
         bodies: collision bodies with their m pairs.
         poses: k configurations (nq,).
-        at_least: share of the configurations; a pair that cannot come to it any more is not looked at further.
+        at_least: share of the configurations; a pair that can no longer attain it is not computed further.
     """
     model_data, data, count = model.createData(), bodies.createData(), len(bodies.collisionPairs)
-    found, active = np.zeros((len(poses), count), dtype=bool), np.arange(count)
+    touches, active = np.zeros((len(poses), count), dtype=bool), np.arange(count)
     for number, q in enumerate(poses):
         pin.updateGeometryPlacements(model, model_data, bodies, data, q)
         pin.computeCollisions(bodies, data, False)
-        found[number, active] = [data.collisionResults[int(i)].isCollision() for i in active]
-        apart = number + 1 - found[: number + 1, active].sum(axis=0)
-        hopeless = apart > (1.0 - at_least) * len(poses)
-        for i in active[hopeless].tolist():
+        touches[number, active] = [data.collisionResults[int(i)].isCollision() for i in active]
+        separations = number + 1 - touches[: number + 1, active].sum(axis=0)
+        below_share = separations > (1.0 - at_least) * len(poses)
+        for i in active[below_share].tolist():
             data.deactivateCollisionPair(i)
-        active = active[~hopeless]
+        active = active[~below_share]
         if not len(active):
             break
-    return found
+    return touches
 
 
 def pair_array(bodies: Any) -> IntArray:
-    """(m, 2) indices of the bodies of each pair."""
+    """Return the indices of the bodies of each pair (m, 2)."""
     return np.array([(p.first, p.second) for p in bodies.collisionPairs], dtype=np.intp).reshape(-1, 2)

@@ -17,8 +17,8 @@ _SMALLEST = 1e-3
 _MILLIMETRES = 'if it is in millimetres give it scale="0.001 0.001 0.001"'
 
 
-def name_implausible_sizes(model: Any, pieces: Any, notes: list[Note]) -> None:
-    """Adds notes of shapes and joint offsets of more than 20 m, and of meshes of less than 1 mm.
+def note_implausible_sizes(model: Any, pieces: Any, notes: list[Note]) -> None:
+    """Note shapes and joint offsets of more than 20 m, and meshes of less than 1 mm.
 
     Args:
         model: Pinocchio model.
@@ -34,11 +34,11 @@ def name_implausible_sizes(model: Any, pieces: Any, notes: list[Note]) -> None:
         if size > _LARGEST:
             notes.append(Note(kind, (piece.name,), f"is {size:.4g} m across", remedy, "warning"))
         elif mesh and size < _SMALLEST:
-            what = f"is {1000 * size:.3g} mm across"
-            notes.append(Note(kind, (piece.name,), what, "if it is in metres take its scale out", "warning"))
+            clause = f"is {1000 * size:.3g} mm across"
+            notes.append(Note(kind, (piece.name,), clause, "if it is in metres take its scale out", "warning"))
     placements = list(model.jointPlacements)
     for joint, placement in zip(list(model.names)[1:], placements[1:], strict=True):
         offset = float(np.linalg.norm(placement.translation))
         if offset > _LARGEST:
-            what = f"stands {offset:.4g} m from the joint before it"
-            notes.append(Note(NoteKind.JOINT, (joint,), what, "origins are in metres", "warning"))
+            clause = f"stands {offset:.4g} m from the joint before it"
+            notes.append(Note(NoteKind.JOINT, (joint,), clause, "origins are in metres", "warning"))

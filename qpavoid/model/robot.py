@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -11,29 +11,34 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from qpavoid.config import Body, Hull, RobotConfig
+from qpavoid.config import RobotConfig
 from qpavoid.config.loading import read_mapping, validate
 from qpavoid.config.shipped import find_robot
 from qpavoid.errors import ConfigError, UnknownName, nearest
-from qpavoid.geometry.bodies import check_meshes, convert_bodies, make_shape, triangle_meshes
 from qpavoid.model.end_effectors import end_effectors
-from qpavoid.model.joints import assume_speeds, frame_index, joint_bounds, middle, set_joints, set_limits, without
+from qpavoid.model.joints import (
+    assume_speeds,
+    frame_index,
+    joint_bounds,
+    middle_configuration,
+    remove_joints,
+    set_joints,
+    set_limits,
+)
 from qpavoid.model.kinematics import TRANSLATIONS
 from qpavoid.model.limits import JointBounds
-from qpavoid.model.notes import Note, NoteKind, merged, warn_of
-from qpavoid.model.packages import absolute_entries
+from qpavoid.model.notes import Note, NoteKind, issue_warning, merge_notes
 from qpavoid.model.pairs import TouchingPair, add_self_pairs, drop_always_touching
-from qpavoid.model.plausibility import name_implausible_sizes
-from qpavoid.model.trajectory import rpy_to_matrix
-from qpavoid.model.urdf import find_resource, honour_srdf, is_mjcf, read_model, read_pieces
-from qpavoid.model.urdf_tree import fixed_by_limits
+from qpavoid.model.robot_bodies import pair_margins, robot_bodies
+from qpavoid.model.urdf import apply_srdf, find_resource, is_mjcf, read_model
+from qpavoid.model.urdf_tree import joints_fixed_by_limits
 from qpavoid.model.xml_file import read_robot_xml
 from qpavoid.problem import Array
 
 
 @dataclass(frozen=True)
 class Robot:
-    """What qpavoid knows of a robot; nothing in it changes while it runs."""
+    """Model, bodies, pairs, limits and home pose of a robot; immutable."""
 
     name: str
     model: Any
@@ -47,13 +52,13 @@ class Robot:
     source: str
     """File that it was read from, for messages."""
     always_touching: tuple[TouchingPair, ...] = ()
-    """Pairs of bodies that were switched off at loading, because they touch in nearly every configuration."""
+    """Pairs of bodies that were disabled at loading, because they touch in nearly every configuration."""
     margins: Mapping[frozenset[str], float] = field(default_factory=dict)
     """Two bodies: safety distance of their own, where it is less than the scenario's [m]."""
     acceleration: Mapping[str, float] = field(default_factory=dict)
     """Joint: largest acceleration [rad/s² or m/s²]; joints left out have no such limit."""
     jerk: Mapping[str, float] = field(default_factory=dict)
-    """Joint: largest jerk [rad/s³ or m/s³]; likewise."""
+    """Joint: largest jerk [rad/s³ or m/s³]; joints left out have no such limit."""
     notes: tuple[Note, ...] = ()
     """What was left out, mended, replaced or assumed at loading."""
 
@@ -66,7 +71,7 @@ class Robot:
         packages: Mapping[str, str | Path] | None = None,
         **fields: Any,
     ) -> Robot:
-        """The robot of a shipped name, a robot.yaml, a URDF (also in xacro) or an MJCF (`.xml`).
+        """Load a robot: a shipped name, a robot.yaml, a URDF (also in xacro) or an MJCF.
 
         What of it was left out, mended, replaced or assumed is in its `notes`, and the serious part in one
         `RobotWarning`.
@@ -82,8 +87,8 @@ class Robot:
             ConfigError, UnknownName: naming file, field and remedy.
         """
         path = find_robot(str(name_or_path), folder)
-        given = read_mapping(path) if path.suffix in (".yaml", ".yml") else _fields_of_urdf(path)
-        config = validate({**given, **fields}, RobotConfig, path)
+        file_fields = read_mapping(path) if path.suffix in (".yaml", ".yml") else _fields_of_urdf(path)
+        config = validate({**file_fields, **fields}, RobotConfig, path)
         if packages:
             entries = [*(f"{name}={place}" for name, place in packages.items()), *config.package_dirs]
             config = config.model_copy(update={"package_dirs": entries})
@@ -91,7 +96,7 @@ class Robot:
 
     @classmethod
     def from_config(cls, config: RobotConfig, path: Path) -> Robot:
-        """A robot from what a robot.yaml says.
+        """Build a robot from the fields of a robot.yaml.
 
         Args:
             config: its fields.
@@ -104,7 +109,7 @@ class Robot:
 
     @classmethod
     def from_urdf(cls, path: str | Path, **fields: Any) -> Robot:
-        """A robot from a bare URDF or MJCF.
+        """Build a robot from a bare URDF or MJCF.
 
         Args:
             path: the file.
@@ -139,11 +144,14 @@ class Robot:
         return units
 
     def safety_distance(self, a: str, b: str, d1: float) -> float:
-        """Safety distance of two of its bodies where that of the scenario is d1 [m]."""
+        """Return the safety distance of two of its bodies [m].
+
+        It is d1, the scenario's, unless the pair has a smaller one.
+        """
         return min(d1, self.margins.get(frozenset((a, b)), d1))
 
     def bounds(self) -> JointBounds:
-        """Joint limits in tangent space; see `joint_bounds`."""
+        """Return the joint limits in tangent space; see `joint_bounds`."""
         acceleration, jerk = (
             np.array([limits.get(name, np.inf) for name, joint in self._joints() for _ in range(joint.nv)])
             for limits in (self.acceleration, self.jerk)
@@ -151,7 +159,7 @@ class Robot:
         return replace(joint_bounds(self.model), acceleration=acceleration, jerk=jerk)
 
     def configuration(self, values: Sequence[float] | Mapping[str, float], where: str) -> Array:
-        """A full configuration from a scenario's `q0`.
+        """Return the full configuration of a scenario's `q0`.
 
         Args:
             values: all nq numbers, or joint: value over the home pose.
@@ -173,7 +181,7 @@ class Robot:
         return np.array(values, dtype=np.float64)
 
     def frame_id(self, name: str, where: str) -> int:
-        """Index of a frame.
+        """Return the index of a frame.
 
         Raises:
             UnknownName: with the nearest frame.
@@ -184,11 +192,11 @@ class Robot:
         return frame_index(self.model, name)
 
     def lock(self, patterns: Sequence[str], q: Array, where: str) -> tuple[Robot, Array]:
-        """The robot with some joints held where they are, as if they were fixed.
+        """Return the robot with some joints fixed at a configuration.
 
         Args:
             patterns: joint names; `*` and `?` match as in file names.
-            q: configuration (nq,) at which they are held.
+            q: configuration (nq,) at which they are fixed.
             where: file and field to name in errors.
 
         Returns:
@@ -200,33 +208,35 @@ class Robot:
         locked = self.matching(patterns, where)
         if not locked:
             return self, q
-        model, bodies, index = without(self.model, self.bodies, locked, q, where)
+        model, bodies, index = remove_joints(self.model, self.bodies, locked, q, where)
         return replace(self, model=model, bodies=bodies, home=self.home[index]), q[index]
 
     def matching(self, patterns: Sequence[str], where: str) -> list[str]:
-        """Joints whose names match one of some patterns, in their order; `*` and `?` match as in file names.
+        """List the joints that match some patterns, in their order.
+
+        `*` and `?` match as in file names.
 
         Raises:
             UnknownName: a pattern without a joint.
         """
         matched = []
         for pattern in patterns:
-            found = [name for name in self.joint_names if fnmatchcase(name, pattern)]
-            if not found:
+            matches = [name for name in self.joint_names if fnmatchcase(name, pattern)]
+            if not matches:
                 raise UnknownName(f"{where}: {self.name} has no joint {pattern!r}{nearest(pattern, self.joint_names)}")
-            matched += [name for name in found if name not in matched]
+            matched += [name for name in matches if name not in matched]
         return matched
 
     def _joints(self) -> Iterator[tuple[str, Any]]:
         return zip(self.joint_names, list(self.model.joints)[1:], strict=True)
 
 
-_MOST_BODIES = 300
+_MAX_BODIES = 300
 """Time and memory grow with the square: 45 000 pairs of 300 bodies take ten seconds. Humanoids have 112."""
 
 
 def _fields_of_urdf(path: Path) -> dict[str, Any]:
-    """Fields of the robot.yaml that a bare URDF or MJCF stands for."""
+    """Return the fields of the robot.yaml that a bare URDF or MJCF stands for."""
     return {"name": Path(path.name.removesuffix(".xacro")).stem, "urdf": path.name}
 
 
@@ -235,27 +245,27 @@ def _build(config: RobotConfig, path: Path) -> Robot:
     urdf = find_resource(config.urdf, path.parent, f"{path}: urdf")
     model = read_model(urdf, config.root_joint, notes)
     ends = _end_effectors(model, config.end_effectors, path, notes)
-    bodies = _bodies(config, urdf, model, path, notes)
+    bodies = robot_bodies(config, urdf, model, path, notes)
     set_limits(model, config.limits, path)
-    home = set_joints(model, middle(model), config.home, f"{path}: home")
+    home = set_joints(model, middle_configuration(model), config.home, f"{path}: home")
     fixed = {**_fixed(urdf, config, notes), **config.lock}
     home = set_joints(model, home, fixed, f"{path}: lock")
     if fixed:
-        model, bodies, index = without(model, bodies, list(fixed), home, f"{path}: lock")
+        model, bodies, index = remove_joints(model, bodies, list(fixed), home, f"{path}: lock")
         home = home[index]
     if model.nv == 0:
         raise ConfigError(f"{path}: no joint of {urdf.name} moves; give at least one that is neither fixed nor locked")
     assume_speeds(model, notes)
-    if len(bodies.geometryObjects) > _MOST_BODIES:
+    if len(bodies.geometryObjects) > _MAX_BODIES:
         raise ConfigError(
-            f"{path}: {len(bodies.geometryObjects)} bodies; at most {_MOST_BODIES} are read: list fewer under `bodies`"
+            f"{path}: {len(bodies.geometryObjects)} bodies; at most {_MAX_BODIES} are read: list fewer under `bodies`"
         )
     add_self_pairs(model, bodies, config.disabled_pairs, str(path))
     if config.srdf is not None:
-        honour_srdf(model, bodies, find_resource(config.srdf, path.parent, f"{path}: srdf"))
+        apply_srdf(model, bodies, find_resource(config.srdf, path.parent, f"{path}: srdf"))
     always_touching = drop_always_touching(model, bodies, joint_bounds(model))
-    notes = merged([*notes, *(pair.note() for pair in always_touching)])
-    warn_of(notes, str(path))
+    notes = merge_notes([*notes, *(pair.note() for pair in always_touching)])
+    issue_warning(notes, str(path))
     return Robot(
         config.name,
         model,
@@ -264,117 +274,41 @@ def _build(config: RobotConfig, path: Path) -> Robot:
         ends,
         str(path),
         tuple(always_touching),
-        _margins(config, bodies, path),
+        pair_margins(config, bodies, path),
         config.limits.acceleration,
         config.limits.jerk,
         tuple(notes),
     )
 
 
-def _margins(config: RobotConfig, bodies: Any, path: Path) -> dict[frozenset[str], float]:
-    """Safety distances of pairs of bodies [m]."""
-    names = [body.name for body in bodies.geometryObjects]
-    for index, own in enumerate(config.pair_margins):
-        for name in own.bodies:
-            if name not in names:
-                where = f"{path}: pair_margins.{index}.bodies"
-                raise UnknownName(f"{where}: no body {name!r}{nearest(name, names)}")
-    return {frozenset(own.bodies): own.d1 for own in config.pair_margins}
-
-
-def _end_effectors(model: Any, given: Sequence[str], path: Path, notes: list[Note]) -> tuple[str, ...]:
-    """The frames that are given as end effectors, or those at the ends of the limbs."""
-    for name in given:
+def _end_effectors(model: Any, frames_of_config: Sequence[str], path: Path, notes: list[Note]) -> tuple[str, ...]:
+    """Return the listed end effectors, or those at the ends of the limbs."""
+    for name in frames_of_config:
         if not model.existFrame(name):
             frames = [f.name for f in model.frames]
             raise UnknownName(f"{path}: end_effectors: no frame {name!r}{nearest(name, frames)}")
-    found = tuple(given or end_effectors(model))
-    if found and not given:
-        what = "taken as end effectors, since limbs end there"
-        notes.append(Note(NoteKind.FRAME, found, what, "list those that you mean under `end_effectors`"))
-    return found
+    ends = tuple(frames_of_config or end_effectors(model))
+    if ends and not frames_of_config:
+        clause = "taken as end effectors, since limbs end there"
+        notes.append(Note(NoteKind.FRAME, ends, clause, "list those that you mean under `end_effectors`"))
+    return ends
 
 
 def _fixed(urdf: Path, config: RobotConfig, notes: list[Note]) -> dict[str, float]:
-    """Joints that the file's own limits leave no range, unless the robot.yaml gives one; see `fixed_by_limits`."""
+    """Find the joints whose limits in the file leave no range, unless the robot.yaml gives one.
+
+    See `joints_fixed_by_limits`.
+    """
     if is_mjcf(urdf):
         return {}
     fixed = {
         name: value
-        for name, value in fixed_by_limits(read_robot_xml(urdf, "URDF"), notes).items()
+        for name, value in joints_fixed_by_limits(read_robot_xml(urdf, "URDF"), notes).items()
         if name not in config.limits.position and name not in config.lock
     }
     for name, value in fixed.items():
-        what = f"locked at {value:g}, which is its lower and its upper limit"
+        clause = f"locked at {value:g}, which is its lower and its upper limit"
         notes.append(
-            Note(NoteKind.JOINT, (name,), what, "give its range under `limits.position` if it moves", "warning")
+            Note(NoteKind.JOINT, (name,), clause, "give its range under `limits.position` if it moves", "warning")
         )
     return fixed
-
-
-def _bodies(config: RobotConfig, urdf: Path, model: Any, path: Path, notes: list[Note]) -> Any:
-    package_dirs = absolute_entries(config.package_dirs, path.parent)
-
-    def read(enclosed: bool, collected: list[Note]) -> Any:
-        return read_pieces(
-            urdf, model, package_dirs, path, collected,
-            visuals=config.visuals, allow_missing=config.allow_missing_meshes, enclosed=enclosed,
-        )  # fmt: skip
-
-    if not isinstance(config.bodies, str):
-        hulls = _hulls(config.bodies, lambda: read(True, []), path)  # what is not listed is left out on purpose
-        return _listed_bodies(config.bodies, model, hulls, path)
-    pieces = read(False, notes)
-    check_meshes(pieces, str(path))
-    name_implausible_sizes(model, pieces, notes)
-    bodies = convert_bodies(pieces, config.bodies)
-    if meshes := triangle_meshes(bodies):
-        what = (
-            f"{len(meshes)} triangle meshes cost 100 to 500 µs a pair at every tick, some pairs several ms, convex "
-            "hulls about 1 µs, capsules 0.1 µs"
-        )
-        remedy = "set `bodies` to convex or capsule"
-        notes.append(Note(NoteKind.MESH, tuple(meshes), what, remedy, "warning"))
-    return bodies
-
-
-def _hulls(configs: Sequence[Body], read: Callable[[], Any], path: Path) -> dict[str, Any]:
-    """Hulls of the pieces of geometry that bodies name."""
-    wanted = {body.shape.geometry: index for index, body in enumerate(configs) if isinstance(body.shape, Hull)}
-    if not wanted:
-        return {}
-    pieces = {piece.name: piece for piece in read().geometryObjects}
-    chosen = pin.GeometryModel()
-    for name, index in wanted.items():
-        if name not in pieces:
-            raise UnknownName(
-                f"{path}: bodies.{index}.shape.geometry: no collision geometry {name!r}{nearest(name, pieces)}"
-            )
-        chosen.addGeometryObject(pieces[name])
-    check_meshes(chosen, str(path))
-    return {hull.name: hull for hull in convert_bodies(chosen, "convex").geometryObjects}
-
-
-def _listed_bodies(configs: Sequence[Body], model: Any, hulls: Mapping[str, Any], path: Path) -> Any:
-    bodies = pin.GeometryModel()
-    for index, body in enumerate(configs):
-        if not model.existFrame(body.frame):
-            frames = [f.name for f in model.frames if f.type == pin.BODY]
-            raise UnknownName(f"{path}: bodies.{index}.frame: no frame {body.frame!r}{nearest(body.frame, frames)}")
-        if bodies.existGeometryName(body.name):
-            raise ConfigError(f"{path}: bodies.{index}.name: {body.name!r} is given twice: names must differ")
-        frame_id = frame_index(model, body.frame)
-        frame = model.frames[frame_id]
-        placement = frame.placement * pin.SE3(rpy_to_matrix(body.rpy), np.array(body.position))
-        if isinstance(body.shape, Hull):
-            hull = hulls[body.shape.geometry]
-            geometry, placement = hull.geometry, placement * _in_link(hull, model)
-        else:
-            geometry = make_shape(body.shape)
-        bodies.addGeometryObject(pin.GeometryObject(body.name, frame.parentJoint, frame_id, placement, geometry))
-    return bodies
-
-
-def _in_link(body: Any, model: Any) -> Any:
-    """Placement of a body in the frame of its link."""
-    return model.frames[body.parentFrame].placement.actInv(body.placement)

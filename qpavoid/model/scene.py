@@ -1,4 +1,4 @@
-"""A scene: a robot among obstacles, with every pair that has to be watched. Built once."""
+"""A scene: a robot among obstacles, with every pair that has to be checked. Built once."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from qpavoid.model.solids import make_solids
 from qpavoid.model.trajectory import Motion, Sample, Still, build_motion
 from qpavoid.problem import Array, IntArray
 
-FAR = 1e4
-"""Where the balls of a cloud wait that stand for no voxel [m]."""
+PARKING_DISTANCE = 1e4
+"""Position of the proxy spheres of a cloud that stand for no voxel: beyond any influence distance [m]."""
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,9 @@ class Obstacle:
     shape: config.ObstacleShape
     motion: Motion
     moves: bool = True
-    """Whether its motion has to be evaluated at every tick."""
+    """Whether its motion has to be evaluated at every control step."""
     graspable: bool = False
-    """Whether `Controller.attach` may let the robot carry it."""
+    """Whether `Controller.attach` may attach it to the robot."""
     external: bool = False
     """Whether its pose comes from the program that steps the controller, and has to be updated from the start."""
     source: Path = Path("obstacle")
@@ -53,14 +53,16 @@ class Obstacle:
         graspable: bool = False,
         external: bool = False,
     ) -> Obstacle:
-        """An obstacle that stays, unless the program that steps the controller says where it is.
+        """Make an obstacle at a pose.
+
+        It stays there unless the program that steps the controller updates its pose.
 
         Args:
             name: by which pairs, logs and `Controller.step(obstacles=…)` know it.
             shape: its shape; files are looked for in the working directory.
             position: world position of the shape's origin (3,) [m].
             rotation: its orientation (3, 3); along the world axes if left out.
-            graspable: whether the robot may carry it.
+            graspable: whether it may be attached to the robot.
             external: whether its pose has to be updated by `Controller.step(obstacles=…)` from the start: the robot
                 stops where it is not. An obstacle that is given in `step` is external from then on.
 
@@ -73,8 +75,8 @@ class Obstacle:
             raise ConfigError(f"obstacle {name!r}: {error}") from None
         off = float(np.abs(sample.rotation.T @ sample.rotation - np.eye(3)).max())
         if off > NEARLY or np.linalg.det(sample.rotation) < 0.0:
-            what = "left-handed" if np.linalg.det(sample.rotation) < 0.0 else f"|RᵀR - I| is {off:.2g}"
-            raise ConfigError(f"obstacle {name!r}: rotation: {what}; give a rotation (3, 3)")
+            clause = "left-handed" if np.linalg.det(sample.rotation) < 0.0 else f"|RᵀR - I| is {off:.2g}"
+            raise ConfigError(f"obstacle {name!r}: rotation: {clause}; give a rotation (3, 3)")
         return cls(name, shape, Still(sample), moves=False, graspable=graspable, external=external)
 
 
@@ -84,11 +86,11 @@ class Scene:
 
     robot: Robot
     obstacles: tuple[Obstacle, ...]
-    """Those that can be carried first."""
+    """Those that can be attached first."""
     geometry: Any
     """pinocchio geometry model: the robot's bodies, then the pieces of the obstacles in their order."""
     pairs: IntArray
-    """(m, 2) geometry indices; the first of a pair belongs to the robot, or is an obstacle that it may carry."""
+    """(m, 2) geometry indices; the first of a pair belongs to the robot, or may be attached to it."""
     pair_names: tuple[tuple[str, str], ...]
     """Names of the bodies of each pair."""
     support: Array
@@ -108,14 +110,14 @@ class Scene:
         """Names of the obstacles."""
         return [obstacle.name for obstacle in self.obstacles]
 
-    def slack(self, hold: float) -> Array:
-        """By how much the safety distance of each pair is less than that of the scenario (m,) [m].
+    def slack(self, safety_distance: float) -> Array:
+        """Return how much smaller each pair's safety distance is than the scenario's (m,) [m].
 
         Args:
-            hold: safety distance of the scenario, between surfaces [m].
+            safety_distance: that of the scenario, between surfaces [m].
         """
-        own = [self.robot.safety_distance(a, b, hold) for a, b in self.pair_names]
-        return hold - np.array(own, dtype=np.float64)
+        distances = [self.robot.safety_distance(a, b, safety_distance) for a, b in self.pair_names]
+        return safety_distance - np.array(distances, dtype=np.float64)
 
     @property
     def movable(self) -> int:
@@ -124,15 +126,15 @@ class Scene:
 
 
 def build_scene(robot: Robot, obstacles: Sequence[Obstacle] = ()) -> Scene:
-    """Lays out the pairs of a robot with itself and with every obstacle.
+    """Lay out the pairs of a robot with itself and with every obstacle.
 
     Args:
         robot: the robot with its own pairs.
-        obstacles: the obstacles; each is paired with every body of the robot, and with those that it may carry.
+        obstacles: the obstacles; each is paired with every body of the robot, and with those that may be attached.
             Half-spaces have no pair with bodies that no joint moves: a base stands on the ground.
 
     Raises:
-        ConfigError: an obstacle that has the name of a body or that cannot be carried, a mesh or points that cannot be
+        ConfigError: an obstacle that has the name of a body or that cannot be attached, a mesh or points that cannot be
             read.
     """
     obstacles = sorted(obstacles, key=lambda obstacle: not obstacle.graspable)
@@ -156,19 +158,22 @@ def build_scene(robot: Robot, obstacles: Sequence[Obstacle] = ()) -> Scene:
         first = len(names)
         if isinstance(shape, config.PointCloud):
             clouds[number] = _points(shape, folder, where)
-            solids, placement = solids * (movable * shape.nearest), pin.SE3(np.eye(3), np.array([FAR, 0.0, 0.0]))
+            solids, placement = (
+                solids * (movable * shape.nearest),
+                pin.SE3(np.eye(3), np.array([PARKING_DISTANCE, 0.0, 0.0])),
+            )
         for solid in solids:
             piece = f"{obstacle.name}[{len(names) - first}]" if len(solids) > 1 else obstacle.name
             index = geometry.addGeometryObject(pin.GeometryObject(piece, 0, 0, placement, solid))
             names.append(obstacle.name)
             obstacle_of.append(number)
-            others = range(min(index, movable))
+            partners = range(min(index, movable))
             if isinstance(shape, config.PointCloud):
-                others = range((index - first) // shape.nearest, (index - first) // shape.nearest + 1)
-            for other in others:
-                fixed = other < bodies and geometry.geometryObjects[other].parentJoint == 0
+                partners = range((index - first) // shape.nearest, (index - first) // shape.nearest + 1)
+            for partner in partners:
+                fixed = partner < bodies and geometry.geometryObjects[partner].parentJoint == 0
                 if not (fixed and isinstance(shape, config.HalfSpace)):
-                    geometry.addCollisionPair(pin.CollisionPair(other, index))
+                    geometry.addCollisionPair(pin.CollisionPair(partner, index))
     _without_cylinders_among_spheres(geometry)
     pairs = pair_array(geometry)
     pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]  # in the order in which bounding spheres are compared
@@ -190,7 +195,7 @@ def build_scene(robot: Robot, obstacles: Sequence[Obstacle] = ()) -> Scene:
 
 
 def _without_cylinders_among_spheres(geometry: Any) -> None:
-    """Where there are cylinders, spheres become capsules of no length.
+    """Replace spheres by capsules of no length where there are cylinders.
 
     coal 3.0 has a formula of its own for spheres and cylinders, which is wrong by centimetres once the centre of the
     sphere is inside; for capsules it iterates.
@@ -215,7 +220,7 @@ def _points(shape: config.PointCloud, folder: Path, where: str) -> Voxels:
 
 
 def build_obstacles(configs: Sequence[config.ObstacleConfig], source: Path) -> list[Obstacle]:
-    """Obstacles of a scenario.
+    """Build the obstacles of a scenario.
 
     Args:
         configs: the scenario's `obstacles`.

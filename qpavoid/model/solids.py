@@ -15,7 +15,7 @@ from qpavoid.config.base import LARGEST
 from qpavoid.errors import ConfigError
 from qpavoid.geometry.bodies import MeshWarning, make_shape, run_qhull
 from qpavoid.geometry.decompose import decompose
-from qpavoid.model.cloud import ball_radius
+from qpavoid.model.cloud import voxel_radius
 from qpavoid.model.urdf import find_resource
 from qpavoid.problem import Array, IntArray
 
@@ -28,7 +28,7 @@ _THINNEST = 1e-4
 
 
 def make_solids(shape: ObstacleShape, folder: Path, where: str) -> list[Any]:
-    """coal geometries, all in the obstacle's own frame.
+    """Make the coal geometries of an obstacle, all in the obstacle's own frame.
 
     Args:
         shape: of a point cloud, the ball that stands for one of its voxels.
@@ -41,7 +41,7 @@ def make_solids(shape: ObstacleShape, folder: Path, where: str) -> list[Any]:
     if isinstance(shape, HalfSpace):
         return [coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0)]
     if isinstance(shape, PointCloud):
-        return [coal.Sphere(ball_radius(shape.resolution))]
+        return [coal.Sphere(voxel_radius(shape.resolution))]
     if not isinstance(shape, Mesh):
         return [make_shape(shape)]
     mesh = read_mesh(shape, folder, f"{where}.path")
@@ -65,7 +65,7 @@ def make_solids(shape: ObstacleShape, folder: Path, where: str) -> list[Any]:
 
 
 def read_mesh(shape: Mesh, folder: Path, where: str) -> Any:
-    """The triangle mesh of a file, as coal has it.
+    """Read a triangle mesh from a file into a coal geometry.
 
     Raises:
         ConfigError: no such file, too large, not a mesh, or corners that are no numbers.
@@ -87,13 +87,16 @@ def read_mesh(shape: Mesh, folder: Path, where: str) -> Any:
 
 
 def corners(mesh: Any) -> tuple[Array, IntArray]:
-    """Corners (n, 3) [m] and triangles (t, 3) of a coal mesh."""
+    """Return the corners (n, 3) [m] and triangles (t, 3) of a coal mesh."""
     triangles = [[mesh.tri_indices(i)[k] for k in range(3)] for i in range(mesh.num_tris)]
     return np.array(mesh.vertices()), np.array(triangles, dtype=np.intp)
 
 
-def drawn_triangles(geometry: Any) -> Array:
-    """Triangles (t, 3, 3) of a mesh or a hull, looking outwards as far as the file's do."""
+def surface_triangles(geometry: Any) -> Array:
+    """Return the triangles (t, 3, 3) of a mesh or a hull.
+
+    They face outwards as far as the file's do.
+    """
     if isinstance(geometry, coal.BVHModelBase):
         vertices, triangles = corners(geometry)
         return np.asarray(vertices[triangles])
@@ -107,7 +110,10 @@ def drawn_triangles(geometry: Any) -> Array:
 
 
 def hull_of(points: Array) -> Any:
-    """coal's convex hull of points (n, 3); what is flat becomes 0.1 mm thick."""
+    """Make coal's convex hull of points (n, 3).
+
+    A flat set of points becomes 0.1 mm thick.
+    """
     axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
     for axis in axes:
         if np.ptp(points @ axis) < _THINNEST:

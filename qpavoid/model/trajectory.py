@@ -55,7 +55,7 @@ class Sample(NamedTuple):
         t: float | None = None,
         at_rest: bool = False,
     ) -> Sample:
-        """Make read-only copies of what is given, checked; identity and zero for what is not.
+        """Make a sample of read-only copies; what is left out is the identity, or zero.
 
         Raises:
             NumericalError: an entry has the wrong shape, or holds what is not a finite number.
@@ -128,8 +128,8 @@ class Polyline:
         position, linear = start.position + s * piece.displacement, rate * piece.displacement
         if piece.angle == 0.0:
             return Sample(position, start.rotation, linear, start.angular)
-        angle, (once, twice) = s * piece.angle, piece.turned
-        rotation = start.rotation + math.sin(angle) * once + (1.0 - math.cos(angle)) * twice
+        angle, (first_product, second_product) = s * piece.angle, piece.turned
+        rotation = start.rotation + math.sin(angle) * first_product + (1.0 - math.cos(angle)) * second_product
         return Sample(position, rotation, linear, rate * piece.angle * piece.axis)
 
 
@@ -186,7 +186,10 @@ def build_motion(config: MotionConfig, start: Sample | None = None, folder: Path
 
 
 def rpy_to_matrix(rpy: ArrayLike) -> Array:
-    """R (3, 3) = Rz(yaw) Ry(pitch) Rx(roll), from (roll, pitch, yaw) about fixed axes x, y, z [rad]."""
+    """Return R (3, 3) = Rz(yaw) Ry(pitch) Rx(roll).
+
+    Roll, pitch and yaw [rad] turn about the fixed axes x, y, z.
+    """
     matrix: Array = pin.rpy.rpyToMatrix(np.asarray(rpy, dtype=float))
     return matrix
 
@@ -197,19 +200,19 @@ def rpy_to_matrix(rpy: ArrayLike) -> Array:
 def _polyline(
     times: Sequence[float], positions: Sequence[ArrayLike], rotations: Sequence[Array], smooth: bool = False
 ) -> Polyline:
-    rests = [Sample.at(p, r) for p, r in zip(positions, rotations, strict=True)]
+    samples = [Sample.at(p, r) for p, r in zip(positions, rotations, strict=True)]
     pieces = []
-    for (t0, a), (t1, b) in pairwise(zip(times, rests, strict=True)):
+    for (t0, a), (t1, b) in pairwise(zip(times, samples, strict=True)):
         if not np.linalg.norm(b.position - a.position) <= LARGEST * (t1 - t0):
             raise ConfigError(f"motion: from t = {t0:g} to {t1:g} it moves faster than {LARGEST:g} m/s; give it time")
         turn = pin.AngleAxis(b.rotation @ a.rotation.T)
         # Two roundings of the same orientation are no turn.
         angle = turn.angle if turn.angle > 1e-12 else 0.0
         axis = np.array(turn.axis)
-        once = pin.skew(axis) @ a.rotation
-        turned = (once, pin.skew(axis) @ once)
+        first_product = pin.skew(axis) @ a.rotation
+        turned = (first_product, pin.skew(axis) @ first_product)
         pieces.append(Piece(t0, t1 - t0, a, b.position - a.position, angle, axis, turned))
-    return Polyline(tuple(times), rests[0], rests[-1], tuple(pieces), smooth)
+    return Polyline(tuple(times), samples[0], samples[-1], tuple(pieces), smooth)
 
 
 def _line(config: Line, start: Sample | None, rotation: Array) -> Polyline:
@@ -241,9 +244,9 @@ def _orbit(config: Circle, start: Sample | None, rotation: Array) -> Orbit:
 # --- small checks and conversions ---------------------------------------------------------------------------
 
 
-def _position(given: tuple[float, float, float] | None, start: Sample | None, field: str) -> Array:
-    if given is not None:
-        return np.array(given)
+def _position(value: tuple[float, float, float] | None, start: Sample | None, field: str) -> Array:
+    if value is not None:
+        return np.array(value)
     if start is None:
         raise ConfigError(f"motion.{field} is missing; only a task can take it from its frame")
     return start.position
@@ -254,7 +257,7 @@ def _rotation(rpy: tuple[float, float, float] | None, initial: Array) -> Array:
 
 
 def _direction(vector: tuple[float, float, float], field: str) -> Array:
-    """Unit vector (3,) along `vector`."""
+    """Return the unit vector (3,) along `vector`."""
     norm = math.hypot(*vector)
     if norm < 1e-9:
         raise ConfigError(f"motion.{field} has no length; give a direction such as [0, 0, 1]")

@@ -1,4 +1,4 @@
-"""Reads URDF and MJCF files: the model, and the collision geometry with its meshes."""
+"""URDF and MJCF files: the model, and the collision geometry with its meshes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import pinocchio as pin
 
 from qpavoid.config.shipped import EXAMPLES, example_robot
 from qpavoid.errors import ConfigError
-from qpavoid.model.enclosed_shapes import without_enclosed
+from qpavoid.model.enclosed_shapes import remove_enclosed
 from qpavoid.model.mjcf import check_elements, model_of_mjcf, shapes_of_mjcf
 from qpavoid.model.notes import Note, NoteKind
 from qpavoid.model.packages import mesh_folders
@@ -32,7 +32,7 @@ _ROOT_JOINTS = {
 
 
 def find_resource(value: str, folder: Path, where: str) -> Path:
-    """A URDF, SRDF or mesh that a file names.
+    """Find a URDF, SRDF or mesh that a file names.
 
     Args:
         value: path relative to the file, or `example-robot-data:PATH`.
@@ -42,40 +42,43 @@ def find_resource(value: str, folder: Path, where: str) -> Path:
     Raises:
         ConfigError: there is no such file.
     """
-    found = example_robot(value) if value.startswith(EXAMPLES) else folder / value
-    if not os.path.isfile(found):  # False where the name is one that no file can have; Path.is_file may raise
+    result = example_robot(value) if value.startswith(EXAMPLES) else folder / value
+    if not os.path.isfile(result):  # False where the name is one that no file can have; Path.is_file may raise
         remedy = f"give a path relative to this file or {EXAMPLES}PATH"
         raise ConfigError(f"{where}: no such file {value!r}; {remedy}")
-    return found
+    return result
 
 
 @contextmanager
 def _quiet_stderr() -> Iterator[list[str]]:
-    """Catches what C++ parsers print on the process's error stream, so that one line can say it instead."""
+    """Catch what C++ parsers print on the process's error stream.
+
+    One line of an error can then say it instead.
+    """
     lines: list[str] = []
     sys.stderr.flush()
-    saved = os.dup(2)
+    stderr_copy = os.dup(2)
     with tempfile.TemporaryFile() as file:
         os.dup2(file.fileno(), 2)
         try:
             yield lines
         finally:
-            os.dup2(saved, 2)
-            os.close(saved)
+            os.dup2(stderr_copy, 2)
+            os.close(stderr_copy)
             file.seek(0)
             lines += file.read().decode(errors="replace").splitlines()
 
 
 def is_mjcf(path: Path) -> bool:
-    """Whether a robot's file is an MJCF, by its name."""
+    """Return True if a robot's file is an MJCF, by its name."""
     return path.suffix == ".xml"
 
 
 def read_model(urdf: Path, root_joint: str, notes: list[Note] | None = None) -> Any:
-    """Pinocchio model of a URDF (also in xacro) or MJCF.
+    """Read the Pinocchio model of a URDF (also in xacro) or MJCF.
 
     Joints that mimic another one have no coordinate of their own. Where Pinocchio cannot read them so (they come before
-    the other one in the tree, or turn all the way round where that has limits), they move on their own.
+    the other one in the tree, or are continuous where that has limits), they move on their own.
 
     Args:
         urdf: the file.
@@ -96,12 +99,12 @@ def read_model(urdf: Path, root_joint: str, notes: list[Note] | None = None) -> 
         check_urdf(urdf)
         _name_prefixes(xml, notes)
     model, reason = None, ""
-    with _quiet_stderr() as printed:
+    with _quiet_stderr() as messages:
         try:
             model = model_of_mjcf(urdf, root) if kind == "MJCF" else _model_of_urdf(tree_xml(xml, notes), root, notes)
         except (ValueError, RuntimeError, IndexError) as error:
             reason = _reason(error)
-    first = next((line.split(":", 1)[1].strip() for line in printed if line.startswith("Error:")), "")
+    first = next((line.split(":", 1)[1].strip() for line in messages if line.startswith("Error:")), "")
     if model is None or first:
         raise ConfigError(f"{urdf}: not a usable {kind}: {first or reason}")
     for link in xml.findall("link"):
@@ -112,9 +115,9 @@ def read_model(urdf: Path, root_joint: str, notes: list[Note] | None = None) -> 
 
 def _name_prefixes(root: ET.Element, notes: list[Note]) -> None:
     if prefixes := undeclared_prefixes(root):
-        what = "prefix of XML that no xmlns attribute declares: it is read all the same, without what other tools add"
+        clause = "prefix of XML that no xmlns attribute declares: it is read all the same, without what other tools add"
         remedy = 'declare it in the root, as in xmlns:drake="http://drake.mit.edu"'
-        notes.append(Note(NoteKind.FILE, tuple(prefixes), what, remedy, "warning"))
+        notes.append(Note(NoteKind.FILE, tuple(prefixes), clause, remedy, "warning"))
 
 
 def _model_of_urdf(xml: str, root: Any, notes: list[Note]) -> Any:
@@ -125,8 +128,8 @@ def _model_of_urdf(xml: str, root: Any, notes: list[Note]) -> Any:
         reason = _reason(error)
     model = pin.buildModelFromXML(*arguments, mimic=False)
     joints = tuple(joint.get("name", "") for joint in ET.fromstring(xml).iterfind("joint") if _mimics(joint))
-    what = f"should follow others (mimic), and move on their own: {reason[-120:]}"
-    notes.append(Note(NoteKind.JOINT, joints, what, "hold them under `lock`", "warning"))
+    clause = f"should follow others (mimic), and move on their own: {reason[-120:]}"
+    notes.append(Note(NoteKind.JOINT, joints, clause, "hold them under `lock`", "warning"))
     return model
 
 
@@ -135,7 +138,10 @@ def _mimics(joint: ET.Element) -> bool:
 
 
 def _reason(error: Exception) -> str:
-    """The last part of what pinocchio says: before it comes where in its own source it was said."""
+    """Return the last part of a message of Pinocchio's.
+
+    What precedes it is a place in its own source.
+    """
     if isinstance(error, IndexError):  # of a look-up in C++, without a name
         return "it refers to a class, mesh or other name that it does not define"
     return " ".join(str(error).split()).rpartition("message: ")[2].rstrip(".")
@@ -152,7 +158,7 @@ def read_pieces(
     allow_missing: bool = False,
     enclosed: bool = False,
 ) -> Any:
-    """Collision geometry of a URDF or MJCF; of links without any, what is meant to be seen of them.
+    """Read the collision geometry of a URDF or MJCF; visual geometry of links without any.
 
     A shape that lies inside another one of its link is left out: nothing can touch it.
 
@@ -162,7 +168,7 @@ def read_pieces(
         package_dirs: folders to look for meshes in first, and `NAME=FOLDER`; see `mesh_folders`.
         path: file to name in errors.
         notes: what was left out or replaced is added to them.
-        visuals: whether links without collision geometry get what is meant to be seen.
+        visuals: whether links without collision geometry get their visual geometry.
         allow_missing: whether shapes whose meshes are missing are left out.
         enclosed: whether shapes inside others are kept.
 
@@ -173,31 +179,31 @@ def read_pieces(
     pieces = read_collision(urdf, model, package_dirs, path, notes=notes, allow_missing=allow_missing)
     if visuals:
         _add_visuals(pieces, urdf, model, package_dirs, path, notes, allow_missing)
-    return pieces if enclosed else without_enclosed(pieces, notes)
+    return pieces if enclosed else remove_enclosed(pieces, notes)
 
 
 def _add_visuals(
     pieces: Any, urdf: Path, model: Any, package_dirs: Sequence[str], path: Path, notes: list[Note], allow_missing: bool
 ) -> None:
-    """Adds what is meant to be seen of the links that have no collision geometry."""
-    covered = {piece.parentFrame for piece in pieces.geometryObjects}
+    """Add the visual geometry of the links that have no collision geometry."""
+    links_with_collision = {piece.parentFrame for piece in pieces.geometryObjects}
     if is_mjcf(urdf):
-        seen = read_collision(urdf, model, package_dirs, path, visual=True)
-        found = [piece for piece in seen.geometryObjects if piece.parentFrame not in covered]
+        visual_model = read_collision(urdf, model, package_dirs, path, visual=True)
+        result = [piece for piece in visual_model.geometryObjects if piece.parentFrame not in links_with_collision]
     else:
         root = read_robot_xml(urdf, "URDF")
-        seen_links = links_with_shapes(root, "visual")
-        links = [link for link in seen_links if model.getFrameId(link, pin.BODY) not in covered]
-        meshes = Meshes(mesh_folders(urdf, package_dirs), str(path), allow_missing, bool(covered))
+        visual_links = links_with_shapes(root, "visual")
+        links = [link for link in visual_links if model.getFrameId(link, pin.BODY) not in links_with_collision]
+        meshes = Meshes(mesh_folders(urdf, package_dirs), str(path), allow_missing, bool(links_with_collision))
         with _quiet_stderr():
-            found = list(read_shapes(root, model, meshes, "visual", links, notes).geometryObjects)
-    for piece in found:
+            result = list(read_shapes(root, model, meshes, "visual", links, notes).geometryObjects)
+    for piece in result:
         pieces.addGeometryObject(piece)
-    if found:
-        names = tuple(dict.fromkeys(model.frames[piece.parentFrame].name for piece in found))
-        what = "no collision shape: what is meant to be seen of it serves instead"
+    if result:
+        names = tuple(dict.fromkeys(model.frames[piece.parentFrame].name for piece in result))
+        clause = "no collision shape: what is meant to be seen of it serves instead"
         remedy = "list bodies of your own, or set `visuals: false` where nothing can be hit"
-        notes.append(Note(NoteKind.LINK, names, what, remedy, "warning"))
+        notes.append(Note(NoteKind.LINK, names, clause, remedy, "warning"))
 
 
 def read_collision(
@@ -209,7 +215,7 @@ def read_collision(
     notes: list[Note] | None = None,
     allow_missing: bool = False,
 ) -> Any:
-    """Collision geometry of a URDF or MJCF, meshes as they are.
+    """Read the collision geometry of a URDF or MJCF, meshes as they are.
 
     What an MJCF fixes to its world (a floor) is no part of the robot and left out.
 
@@ -218,7 +224,7 @@ def read_collision(
         model: its model.
         package_dirs: folders to look for meshes in first, and `NAME=FOLDER`; see `mesh_folders`.
         path: file to name in errors.
-        visual: what is meant to be seen instead.
+        visual: whether visual geometry is read instead.
         notes: what was left out or mended is added to them.
         allow_missing: whether shapes whose meshes are missing are left out.
 
@@ -239,7 +245,7 @@ def read_collision(
 
 
 def mesh_names(urdf: Path, tag: str = "") -> list[str]:
-    """Names of the mesh files of a URDF or MJCF, each once.
+    """List the mesh files of a URDF or MJCF, each once.
 
     Args:
         urdf: the file.
@@ -252,8 +258,8 @@ def mesh_names(urdf: Path, tag: str = "") -> list[str]:
     return list(dict.fromkeys(name for name in names if name))
 
 
-def honour_srdf(model: Any, bodies: Any, srdf: Path) -> None:
-    """Removes the pairs that an SRDF disables.
+def apply_srdf(model: Any, bodies: Any, srdf: Path) -> None:
+    """Remove the pairs that an SRDF disables.
 
     Args:
         model: pinocchio model.

@@ -37,7 +37,7 @@ _TURNING = ("revolute", "continuous", "prismatic", "planar")
 
 
 def check_urdf(path: Path) -> None:
-    """Reads a URDF and says what is wrong with it.
+    """Check a URDF before Pinocchio reads it.
 
     Raises:
         ConfigError: naming file, link or joint, element and remedy.
@@ -46,13 +46,13 @@ def check_urdf(path: Path) -> None:
     try:
         links, joints = _named(root, "link"), _named(root, "joint")
         moving = [joint for joint in joints.values() if joint.get("type") != "fixed"]
-        for found, most, what in (
+        for count, most, noun in (
             (len(links), _MOST_LINKS, "links"),
             (len(moving), _MOST_MOVING, "joints that move"),
             (len(root.findall("link/collision")), _MOST_SHAPES, "collision shapes"),
         ):
-            if found > most:
-                raise ValueError(f"{found} {what}; at most {most} are read")
+            if count > most:
+                raise ValueError(f"{count} {noun}; at most {most} are read")
         _check_tree(links, joints)
         for name, link in links.items():
             for part in (*link.findall("collision"), *link.findall("inertial")):
@@ -65,7 +65,7 @@ def check_urdf(path: Path) -> None:
 
 
 def check_mjcf(path: Path) -> None:
-    """Reads an MJCF and says what is wrong with it.
+    """Check an MJCF before Pinocchio reads it.
 
     Raises:
         ConfigError: naming file, element and remedy.
@@ -74,12 +74,12 @@ def check_mjcf(path: Path) -> None:
     where = f"{path}: not a usable MJCF"
     if root.find(".//include") is not None:
         raise ConfigError(f"{where}: it has an <include>; save it as one file, for example with mj_saveLastXML")
-    for tag, most, what in (
+    for tag, most, noun in (
         ("body", _MOST_LINKS, "bodies"), ("joint", _MOST_MOVING, "joints"), ("geom", _MOST_SHAPES, "shapes"),
     ):  # fmt: skip
-        found = len(root.findall(f"worldbody//{tag}"))
-        if found > most:
-            raise ConfigError(f"{where}: {found} {what}; at most {most} are read")
+        count = len(root.findall(f"worldbody//{tag}"))
+        if count > most:
+            raise ConfigError(f"{where}: {count} {noun}; at most {most} are read")
     if root.find("worldbody//body") is None:
         raise ConfigError(f"{where}: its worldbody has no body")
     for element in root.iter():
@@ -101,19 +101,19 @@ _MJCF_NUMBERS = {
 
 
 def _named(root: ET.Element, tag: str) -> dict[str, ET.Element]:
-    found: dict[str, ET.Element] = {}
+    result: dict[str, ET.Element] = {}
     for element in root.findall(tag):
         name = element.get("name")
         if not name:
             raise ValueError(f"a {tag} has no name; give it one")
-        if name in found:
+        if name in result:
             raise ValueError(f"{tag} {name!r} is given twice; names must differ")
-        found[name] = element
-    return found
+        result[name] = element
+    return result
 
 
 def _check_tree(links: dict[str, ET.Element], joints: dict[str, ET.Element]) -> None:
-    """Every link but one has one joint above it, and all hang from that one."""
+    """Check that every link but one has one joint above it, and that all form one tree."""
     above: dict[str, str] = {}
     for name, joint in joints.items():
         parent, child = (_end(joint, tag, name, links) for tag in ("parent", "child"))
@@ -144,7 +144,9 @@ def _end(joint: ET.Element, tag: str, name: str, links: dict[str, ET.Element]) -
 
 
 def check_numbers(part: ET.Element, owner: str) -> None:
-    """Makes sure that the numbers of an element and of those in it are finite, and none of a size negative.
+    """Check that the numbers of an element and of those in it are finite.
+
+    None of a size may be negative.
 
     Raises:
         ValueError: naming the owner, the element and the attribute.
@@ -165,7 +167,7 @@ def check_numbers(part: ET.Element, owner: str) -> None:
 
 
 def floats(text: str, where: str) -> Iterator[float]:
-    """The numbers of an attribute.
+    """Yield the numbers of an attribute.
 
     Raises:
         ValueError: one that is no number.

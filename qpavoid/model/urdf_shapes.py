@@ -44,7 +44,7 @@ class Meshes:
 
 
 def links_with_shapes(root: ET.Element, tag: str) -> list[str]:
-    """Names of the links that have at least one shape.
+    """List the names of the links that have at least one shape.
 
     Args:
         root: of a URDF.
@@ -60,7 +60,7 @@ def links_with_shapes(root: ET.Element, tag: str) -> list[str]:
 def read_shapes(
     root: ET.Element, model: Any, meshes: Meshes, tag: str, links: Iterable[str] | None, notes: list[Note]
 ) -> Any:
-    """Geometry model of the shapes of a URDF.
+    """Read the shapes of a URDF into a geometry model.
 
     A shape is called by its link and its index in it, as in `hand_0`; where one element has several, the others carry
     a second index.
@@ -76,12 +76,12 @@ def read_shapes(
     Raises:
         ConfigError: a shape that cannot be read, or whose mesh is missing, naming link and element.
     """
-    wanted = None if links is None else set(links)
+    selection = None if links is None else set(links)
     geometry = pin.GeometryModel()
     of_model = {link.get("name", ""): link for link in root.findall("link")}
     for name in sorted(of_model, key=lambda name: model.getFrameId(name, pin.BODY)):  # as Pinocchio has them
         link = of_model[name]
-        if wanted is not None and name not in wanted:
+        if selection is not None and name not in selection:
             continue
         _name_strays(link, tag, notes)
         for index, part in enumerate(link.findall(tag)):
@@ -91,8 +91,8 @@ def read_shapes(
             except ValueError as fault:
                 if not meshes.allow_faults:
                     raise ConfigError(f"{meshes.where}: {fault}") from None
-                what = f"left out: {str(fault).removeprefix(f'{where}: ')}"
-                notes.append(Note(NoteKind.SHAPE, (f"{name}_{index}",), what, severity="warning"))
+                clause = f"left out: {str(fault).removeprefix(f'{where}: ')}"
+                notes.append(Note(NoteKind.SHAPE, (f"{name}_{index}",), clause, severity="warning"))
     return geometry
 
 
@@ -110,18 +110,22 @@ def _add_part(
     placement = origin(part, where)
     shapes = list(_children(part))
     if not shapes:
-        what = f"left out: its <{part.tag}> has no shape"
-        notes.append(Note(NoteKind.SHAPE, (name,), what, "give it one, or take the element out", "warning"))
+        clause = f"left out: its <{part.tag}> has no shape"
+        notes.append(Note(NoteKind.SHAPE, (name,), clause, "give it one, or take the element out", "warning"))
     frame_id = model.getFrameId(link.get("name", ""), pin.BODY)
     frame = model.frames[frame_id]
-    rounded = {capsule.get("name") for capsule in link.iterfind("collision_checking/capsule")}
+    capsule_names = {capsule.get("name") for capsule in link.iterfind("collision_checking/capsule")}
     for i, element in enumerate(shapes):
         shape = name if i == 0 else f"{name}_{i}"
-        if element.tag == "cylinder" and part.tag == "collision" and part.get("name", link.get("name")) in rounded:
+        if (
+            element.tag == "cylinder"
+            and part.tag == "collision"
+            and part.get("name", link.get("name")) in capsule_names
+        ):
             element = ET.Element("capsule", element.attrib)  # an extension of Pinocchio's
-        made = _make(element, where, shape, part.tag, meshes, notes)
-        if made is not None:
-            made_of, path, scale = made
+        shape_of_element = _make(element, where, shape, part.tag, meshes, notes)
+        if shape_of_element is not None:
+            made_of, path, scale = shape_of_element
             geometry.addGeometryObject(
                 pin.GeometryObject(
                     shape, frame.parentJoint, frame_id, frame.placement * placement, made_of, path, np.array(scale)
@@ -130,19 +134,19 @@ def _add_part(
 
 
 def _children(part: ET.Element) -> Iterator[ET.Element]:
-    """The shapes of a <collision> or <visual>."""
-    for found in part.findall("geometry"):
-        yield from found
+    """Yield the shapes of a <collision> or <visual>."""
+    for element_of_shapes in part.findall("geometry"):
+        yield from element_of_shapes
 
 
 def _name_strays(link: ET.Element, tag: str, notes: list[Note]) -> None:
-    """Names the shapes that stand elsewhere in a link than directly below it: nothing reads them."""
-    strays = len([part for part in link.iter(tag) if part.find("geometry") is not None])
-    strays -= len([part for part in link.findall(tag) if part.find("geometry") is not None])
-    if strays and tag == "collision":
-        what = f"{strays} of its <{tag}> elements are left out: they stand within another element"
+    """Note the shapes that no parser reads: those not directly below their link."""
+    count = len([part for part in link.iter(tag) if part.find("geometry") is not None])
+    count -= len([part for part in link.findall(tag) if part.find("geometry") is not None])
+    if count and tag == "collision":
+        clause = f"{count} of its <{tag}> elements are left out: they stand within another element"
         remedy = "put them directly below the link"
-        notes.append(Note(NoteKind.SHAPE, (link.get("name", ""),), what, remedy, "warning"))
+        notes.append(Note(NoteKind.SHAPE, (link.get("name", ""),), clause, remedy, "warning"))
 
 
 Made = tuple[Any, str, Sequence[float]]
@@ -151,7 +155,7 @@ _UNSCALED = (1.0, 1.0, 1.0)
 
 
 def _make(element: ET.Element, where: str, name: str, tag: str, meshes: Meshes, notes: list[Note]) -> Made | None:
-    """The geometry of a shape element; None where it is left out."""
+    """Make the geometry of a shape element; None where the shape is left out."""
     kind = element.tag.removeprefix(DRAKE)
     if kind == "mesh":
         return _make_mesh(element, where, name, meshes, notes)
@@ -161,12 +165,12 @@ def _make(element: ET.Element, where: str, name: str, tag: str, meshes: Meshes, 
     sizes_of, make = _PRIMITIVES[kind]
     sizes = sizes_of(element, where)
     if not any(sizes):
-        what = f"left out: its <{element.tag}> has no size"
-        notes.append(Note(NoteKind.SHAPE, (name,), what, "give it one, or take it out", "warning"))
+        clause = f"left out: its <{element.tag}> has no size"
+        notes.append(Note(NoteKind.SHAPE, (name,), clause, "give it one, or take it out", "warning"))
         return None
     if not all(sizes) and not (kind == "capsule" and sizes[0]):  # a capsule without length is a ball
-        what = f"a size of 0 of its <{element.tag}> is taken as {THINNEST:g} m"
-        notes.append(Note(NoteKind.SHAPE, (name,), what, "give it one", "warning"))
+        clause = f"a size of 0 of its <{element.tag}> is taken as {THINNEST:g} m"
+        notes.append(Note(NoteKind.SHAPE, (name,), clause, "give it one", "warning"))
         sizes = [max(size, THINNEST) for size in sizes]
     return make(*sizes), "", _UNSCALED
 
@@ -176,7 +180,7 @@ def _radius_and_length(element: ET.Element, where: str) -> list[float]:
 
 
 def _radii(element: ET.Element, where: str) -> list[float]:
-    """Half axes of an ellipsoid: `radii`, or `a`, `b`, `c` as in Drake."""
+    """Read the half axes of an ellipsoid: `radii`, or `a`, `b`, `c` as in Drake."""
     if element.get("a") is not None:
         return [vector(element, attribute, 1, where, ())[0] for attribute in "abc"]
     return vector(element, "radii", 3, where, ())
@@ -201,8 +205,8 @@ def _make_mesh(element: ET.Element, where: str, name: str, meshes: Meshes, notes
     if path is None:
         if not (meshes.allow_missing or meshes.allow_faults):
             raise ValueError(f"{where}: mesh {file} could not be found; {MISSING}")
-        what = f"left out: a mesh in {os.path.dirname(file) or 'the folder of the file'} is missing"
-        notes.append(Note(NoteKind.MESH, (name,), what, _PACKAGES, "warning"))
+        clause = f"left out: a mesh in {os.path.dirname(file) or 'the folder of the file'} is missing"
+        notes.append(Note(NoteKind.MESH, (name,), clause, _PACKAGES, "warning"))
         return None
     size = os.path.getsize(path)
     if size > _LARGEST_MESH:
@@ -215,7 +219,10 @@ def _make_mesh(element: ET.Element, where: str, name: str, meshes: Meshes, notes
 
 
 def _pointer(path: str) -> str:
-    """What is wrong with a file that only stands for one in a store of large files; nothing of another one."""
+    """Explain a file that only stands for one in a store of large files.
+
+    Empty for any other file.
+    """
     with open(path, "rb") as file:
         if file.read(40).startswith(b"version https://git-lfs"):
             return "it is a pointer of Git LFS and no mesh; run `git lfs pull`"

@@ -20,7 +20,7 @@ _INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 def tree_xml(root: ET.Element, notes: list[Note]) -> str:
-    """A URDF without shapes, materials and elements of other tools.
+    """Write a URDF without shapes, materials and elements of other tools.
 
     The parser behind Pinocchio leaves a link at its first fault, whatever comes after it in the link: of an inertial, a
     visual, a collision. Shapes are therefore read apart from it (`read_shapes`).
@@ -41,28 +41,28 @@ def tree_xml(root: ET.Element, notes: list[Note]) -> str:
 
 
 def origin(element: ET.Element, where: str) -> Any:
-    """Placement (SE3) that the <origin> of an element says; the identity where it has none.
+    """Read the placement (SE3) of an element's <origin>; the identity where it has none.
 
     Raises:
         ValueError: not three numbers (four of a quaternion), naming the element.
     """
-    found = element.find("origin")
-    if found is None:
+    child = element.find("origin")
+    if child is None:
         return pin.SE3.Identity()
-    position = vector(found, "xyz", 3, where, (0.0, 0.0, 0.0))
-    if found.get("quat_xyzw") is None:
-        roll, pitch, yaw = vector(found, "rpy", 3, where, (0.0, 0.0, 0.0))
+    position = vector(child, "xyz", 3, where, (0.0, 0.0, 0.0))
+    if child.get("quat_xyzw") is None:
+        roll, pitch, yaw = vector(child, "rpy", 3, where, (0.0, 0.0, 0.0))
         return pin.SE3(rpy_to_matrix((roll, pitch, yaw)), np.array(position))
-    if found.get("rpy") is not None:
+    if child.get("rpy") is not None:
         raise ValueError(f"{where}: origin has both rpy and quat_xyzw; give one")
-    quaternion = np.array(vector(found, "quat_xyzw", 4, where, ()))
+    quaternion = np.array(vector(child, "quat_xyzw", 4, where, ()))
     if np.linalg.norm(quaternion) < 1e-6:
-        raise ValueError(f"{where}: origin quat_xyzw={found.get('quat_xyzw')!r} has no length")
+        raise ValueError(f"{where}: origin quat_xyzw={child.get('quat_xyzw')!r} has no length")
     return pin.SE3(pin.Quaternion(quaternion / np.linalg.norm(quaternion)), np.array(position))
 
 
 def vector(element: ET.Element, attribute: str, size: int, where: str, default: Sequence[float]) -> list[float]:
-    """Numbers of an attribute.
+    """Read the numbers of an attribute.
 
     Args:
         element: that has it.
@@ -80,14 +80,14 @@ def vector(element: ET.Element, attribute: str, size: int, where: str, default: 
         if default:
             return list(default)
         raise ValueError(f"{place} is missing; give it {size} number{'s' * (size > 1)}")
-    found = list(floats(text, f"{place}={text!r}"))
-    if len(found) != size:
-        raise ValueError(f"{place}={text!r}: {len(found)} numbers; give {size}")
-    return found
+    numbers = list(floats(text, f"{place}={text!r}"))
+    if len(numbers) != size:
+        raise ValueError(f"{place}={text!r}: {len(numbers)} numbers; give {size}")
+    return numbers
 
 
-def fixed_by_limits(root: ET.Element, notes: list[Note]) -> dict[str, float]:
-    """Joints whose lower limit is their upper one, and where that is [rad or m]: they do not move.
+def joints_fixed_by_limits(root: ET.Element, notes: list[Note]) -> dict[str, float]:
+    """Find the joints whose lower limit is their upper one, with that value [rad or m].
 
     Where every range of a file goes from 0 to 0, as some exporters write it unless asked for another one, it says
     nothing, and no joint is fixed; nor is one that mimics another.
@@ -103,14 +103,14 @@ def fixed_by_limits(root: ET.Element, notes: list[Note]) -> dict[str, float]:
             ranges[joint.get("name", "")] = _range(limit)
     if all(limits in (None, (0.0, 0.0)) for limits in ranges.values()):
         if empty := tuple(name for name, limits in ranges.items() if limits is not None):
-            what = "every range of the file is [0, 0], which says nothing: they move without position limits"
-            notes.append(Note(NoteKind.LIMIT, empty, what, "give their ranges under `limits.position`", "warning"))
+            clause = "every range of the file is [0, 0], which says nothing: they move without position limits"
+            notes.append(Note(NoteKind.LIMIT, empty, clause, "give their ranges under `limits.position`", "warning"))
         return {}
     return {name: limits[0] for name, limits in ranges.items() if limits is not None and limits[0] == limits[1]}
 
 
 def _range(limit: ET.Element) -> tuple[float, float] | None:
-    """Lower and upper limit, 0 where one is left out; None where both are."""
+    """Read the lower and upper limit, 0 where one is left out; None where both are."""
     if limit.get("lower") is None and limit.get("upper") is None:
         return None
     lower, upper = (next(floats(limit.get(side, ""), f"limit {side}"), 0.0) for side in ("lower", "upper"))
@@ -119,7 +119,7 @@ def _range(limit: ET.Element) -> tuple[float, float] | None:
 
 def _add_link(robot: ET.Element, link: ET.Element, notes: list[Note]) -> None:
     name = link.get("name", "")
-    added = ET.SubElement(robot, "link", name=name)
+    element = ET.SubElement(robot, "link", name=name)
     inertial = link.find("inertial")
     if inertial is None:
         return
@@ -127,8 +127,8 @@ def _add_link(robot: ET.Element, link: ET.Element, notes: list[Note]) -> None:
         placement = origin(inertial, f"link {name!r}: inertial")
         mass = vector(_child(inertial, "mass"), "value", 1, "inertial", ())[0]
     except ValueError as fault:
-        what = f"its inertial is left out: {str(fault).removeprefix(f'link {name!r}: ')}"
-        notes.append(Note(NoteKind.LINK, (name,), what, "none is needed unless torques are asked for"))
+        clause = f"its inertial is left out: {str(fault).removeprefix(f'link {name!r}: ')}"
+        notes.append(Note(NoteKind.LINK, (name,), clause, "none is needed unless torques are asked for"))
         return
     inertia = inertial.find("inertia")
     try:
@@ -136,50 +136,54 @@ def _add_link(robot: ET.Element, link: ET.Element, notes: list[Note]) -> None:
             raise ValueError("inertia is missing")
         moments = [vector(inertia, moment, 1, "inertial", ())[0] for moment in _INERTIA]
     except ValueError as fault:
-        what = f"its mass counts as a point's: {str(fault).removeprefix('inertial: ')}"
-        notes.append(Note(NoteKind.LINK, (name,), what, "none is needed unless torques are asked for"))
+        clause = f"its mass counts as a point's: {str(fault).removeprefix('inertial: ')}"
+        notes.append(Note(NoteKind.LINK, (name,), clause, "none is needed unless torques are asked for"))
         moments = [0.0] * len(_INERTIA)
-    kept = ET.SubElement(added, "inertial")
-    _add_origin(kept, inertial, placement)
-    ET.SubElement(kept, "mass", value=repr(mass))
-    ET.SubElement(kept, "inertia", dict(zip(_INERTIA, map(repr, moments), strict=True)))
+    inertial_copy = ET.SubElement(element, "inertial")
+    _add_origin(inertial_copy, inertial, placement)
+    ET.SubElement(inertial_copy, "mass", value=repr(mass))
+    ET.SubElement(inertial_copy, "inertia", dict(zip(_INERTIA, map(repr, moments), strict=True)))
 
 
 def _child(element: ET.Element, tag: str) -> ET.Element:
-    found = element.find(tag)
-    if found is None:
+    child = element.find(tag)
+    if child is None:
         raise ValueError(f"{element.tag}: {tag} is missing")
-    return found
+    return child
 
 
 def _add_joint(robot: ET.Element, joint: ET.Element, notes: list[Note]) -> None:
     name, kind = joint.get("name", ""), joint.get("type", "")
     where = f"joint {name!r}"
-    added = ET.SubElement(robot, "joint", name=name, type=kind)
+    element = ET.SubElement(robot, "joint", name=name, type=kind)
     for tag in ("parent", "child"):
-        ET.SubElement(added, tag, link=_child(joint, tag).get("link", ""))
-    _add_origin(added, joint, origin(joint, where))
+        ET.SubElement(element, tag, link=_child(joint, tag).get("link", ""))
+    _add_origin(element, joint, origin(joint, where))
     for axis in joint.findall("axis")[:1]:
-        ET.SubElement(added, "axis", xyz=" ".join(map(repr, vector(axis, "xyz", 3, where, (1.0, 0.0, 0.0)))))
+        ET.SubElement(element, "axis", xyz=" ".join(map(repr, vector(axis, "xyz", 3, where, (1.0, 0.0, 0.0)))))
     for tag, attributes in (("mimic", ("joint", "multiplier", "offset")), ("dynamics", ("damping", "friction"))):
-        for found in joint.findall(tag)[:1]:
-            given = {attribute: found.get(attribute) for attribute in attributes}
-            ET.SubElement(added, tag, {attribute: text for attribute, text in given.items() if text is not None})
-    _add_limit(added, joint, notes)
+        for child in joint.findall(tag)[:1]:
+            values = {attribute: child.get(attribute) for attribute in attributes}
+            ET.SubElement(element, tag, {key: text for key, text in values.items() if text is not None})
+    _add_limit(element, joint, notes)
 
 
-def _add_origin(added: ET.Element, element: ET.Element, placement: Any) -> None:
-    found = element.find("origin")
-    if found is None:
+def _add_origin(element: ET.Element, source: ET.Element, placement: Any) -> None:
+    """Add the <origin> of a source element to another one, a quaternion as roll, pitch, yaw."""
+    child = source.find("origin")
+    if child is None:
         return
-    rpy = found.get("rpy", "0 0 0")
-    if found.get("quat_xyzw") is not None:
+    rpy = child.get("rpy", "0 0 0")
+    if child.get("quat_xyzw") is not None:
         rpy = " ".join(map(repr, pin.rpy.matrixToRpy(placement.rotation).tolist()))
-    ET.SubElement(added, "origin", xyz=found.get("xyz", "0 0 0"), rpy=rpy)
+    ET.SubElement(element, "origin", xyz=child.get("xyz", "0 0 0"), rpy=rpy)
 
 
-def _add_limit(added: ET.Element, joint: ET.Element, notes: list[Note]) -> None:
-    """The limit of a joint, with 0 for speeds and efforts that are left out, and a range in its order."""
+def _add_limit(element: ET.Element, joint: ET.Element, notes: list[Note]) -> None:
+    """Add the limit of a joint, its range in order.
+
+    Speeds and efforts that are left out become 0.
+    """
     name, limit = joint.get("name", ""), joint.find("limit")
     limited = joint.get("type") in _LIMITED
     if limit is None:
@@ -187,19 +191,19 @@ def _add_limit(added: ET.Element, joint: ET.Element, notes: list[Note]) -> None:
         if not limited:
             return
     where = f"joint {name!r}"
-    given = {
+    values = {
         attribute: vector(limit, attribute, 1, where, (0.0,))[0]
         for attribute in ("lower", "upper", "velocity", "effort")
         if limit.get(attribute) is not None
     }
-    fields = {"velocity": 0.0, "effort": 0.0, **given}
+    fields = {"velocity": 0.0, "effort": 0.0, **values}
     remedy = "give its range under `limits.position`"
     limits = _range(limit)
     if limited and limits is None:
-        what = "has no <limit> lower and upper: it moves without position limits"
-        notes.append(Note(NoteKind.LIMIT, (name,), what, remedy, "warning"))
+        clause = "has no <limit> lower and upper: it moves without position limits"
+        notes.append(Note(NoteKind.LIMIT, (name,), clause, remedy, "warning"))
     elif limited and limits is not None and limits[0] > limits[1]:
-        what = f"its lower limit {limits[0]:g} is above its upper one {limits[1]:g}: taken the other way round"
-        notes.append(Note(NoteKind.LIMIT, (name,), what, remedy, "warning"))
+        clause = f"its lower limit {limits[0]:g} is above its upper one {limits[1]:g}: the two are swapped"
+        notes.append(Note(NoteKind.LIMIT, (name,), clause, remedy, "warning"))
         fields["lower"], fields["upper"] = limits[1], limits[0]
-    ET.SubElement(added, "limit", {key: repr(value) for key, value in fields.items() if math.isfinite(value)})
+    ET.SubElement(element, "limit", {key: repr(value) for key, value in fields.items() if math.isfinite(value)})

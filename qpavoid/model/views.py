@@ -19,7 +19,7 @@ RESULT = 10
 
 
 def _view(addresses: list[int], fields: int, writeable: bool = False) -> Array | None:
-    """Rows of `fields` doubles that begin at equally spaced addresses (n, fields), without a copy.
+    """View memory as rows of `fields` doubles at equally spaced addresses (n, fields).
 
     The view is valid as long as the C++ vector that it looks into lives and is not resized.
     """
@@ -37,25 +37,28 @@ def _address(array: Array) -> int:
 
 
 def read_poses(poses: Any) -> Array:
-    """World poses through the accessors: rotation by columns, then translation (n, 12)."""
+    """Read world poses through the accessors (n, 12).
+
+    Rotation by columns, then translation.
+    """
     rows = [np.concatenate((pose.rotation.ravel(order="F"), pose.translation)) for pose in poses]
     return np.array(rows).reshape(-1, 12)
 
 
 def view_poses(poses: Any, writeable: bool = False) -> Array | None:
-    """The same as a view, or None where it does not agree with the accessors."""
+    """View what `read_poses` reads; None where the view disagrees with the accessors."""
     view = _view([_address(pose.rotation) for pose in poses], 12, writeable)
     return view if view is not None and np.array_equal(view, read_poses(poses)) else None
 
 
 def read_results(results: Any) -> Array:
-    """Distance results through the accessors (m, RESULT)."""
+    """Read distance results through the accessors (m, RESULT)."""
     rows = [(r.min_distance, *r.normal, *r.getNearestPoint1(), *r.getNearestPoint2()) for r in results]
     return np.array(rows, dtype=np.float64).reshape(-1, RESULT)
 
 
 def view_results(results: Any) -> Array | None:
-    """The same as a view, or None where it does not agree with the accessors."""
+    """View what `read_results` reads; None where the view disagrees with the accessors."""
     # the distance stands before the normal
     view = _view([_address(result.normal) - 8 for result in results], RESULT, writeable=True)
     agrees = view is not None and np.array_equal(view, read_results(results), equal_nan=True)

@@ -1,4 +1,4 @@
-"""Expands xacro files, the macro language that most URDFs of ROS are written in."""
+"""Expansion of xacro files, the macro language that most URDFs of ROS are written in."""
 
 from __future__ import annotations
 
@@ -12,12 +12,15 @@ from qpavoid.model.packages import find_package, mesh_folders
 
 
 def is_xacro(path: Path, text: str) -> bool:
-    """Whether a robot's file has to be expanded: by its name, or since it holds elements of xacro."""
+    """Return True if a robot's file has to be expanded.
+
+    By its name, or since it holds elements of xacro.
+    """
     return path.suffix == ".xacro" or "<xacro:" in text
 
 
 def expand_xacro(path: Path) -> str:
-    """The URDF that a xacro file stands for, with the default of every argument.
+    """Expand a xacro file to a URDF, with the default of every argument.
 
     `$(find NAME)` is looked up as `package://NAME` is, then by ROS where that is installed.
 
@@ -44,18 +47,21 @@ def expand_xacro(path: Path) -> str:
 
 @contextmanager
 def _packages_found(substitution_args: Any, path: Path) -> Iterator[None]:
-    """Lets `$(find NAME)` find packages without ROS: xacro asks only its index of installed packages."""
+    """Let `$(find NAME)` find packages without ROS.
+
+    xacro asks only its own index of installed packages.
+    """
     original = substitution_args._eval_find
     entries = mesh_folders(path, [])
 
     def find(name: str) -> str:
-        found = find_package(name, entries)
-        if found is None:
+        folder = find_package(name, entries)
+        if folder is None:
             try:
-                found = str(original(name))
+                folder = str(original(name))
             except ImportError:
                 raise LookupError(f"no package {name!r} beside the file or along ROS_PACKAGE_PATH") from None
-        return found
+        return folder
 
     substitution_args._eval_find = find
     try:

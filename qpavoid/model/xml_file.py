@@ -19,7 +19,7 @@ _MOST_ATTRIBUTES = 100
 
 
 def read_robot_xml(path: Path, kind: str) -> ET.Element:
-    """The root of a URDF, SRDF or MJCF; a xacro file is expanded first.
+    """Read the root of a URDF, SRDF or MJCF; a xacro file is expanded first.
 
     Names keep the prefix that they are written with (`drake:capsule`), whether the file declares it or not.
 
@@ -40,21 +40,21 @@ def read_robot_xml(path: Path, kind: str) -> ET.Element:
         root = _parse(text)
     except (expat.ExpatError, ValueError) as error:
         raise ConfigError(f"{where}: {error}") from None
-    wanted = "mujoco" if kind == "MJCF" else "robot"
-    if root.tag != wanted:
-        raise ConfigError(f"{where}: its root is <{root.tag}>; must be <{wanted}>")
+    expected_tag = "mujoco" if kind == "MJCF" else "robot"
+    if root.tag != expected_tag:
+        raise ConfigError(f"{where}: its root is <{root.tag}>; must be <{expected_tag}>")
     return root
 
 
 def undeclared_prefixes(root: ET.Element) -> list[str]:
-    """Prefixes of elements and attributes that no xmlns attribute declares, each once."""
-    used: dict[str, None] = {}
+    """List the prefixes that no xmlns attribute declares, each once."""
+    prefixes: dict[str, None] = {}
     declared = {"xml", "xmlns"}
     for element in root.iter():
         names = [name for name in (element.tag, *element.attrib) if ":" in name]
         declared |= {name.removeprefix("xmlns:") for name in names if name.startswith("xmlns:")}
-        used |= {name.partition(":")[0]: None for name in names}
-    return [prefix for prefix in used if prefix not in declared]
+        prefixes |= {name.partition(":")[0]: None for name in names}
+    return [prefix for prefix in prefixes if prefix not in declared]
 
 
 def _refuse_doctype(text: str, where: str) -> None:
@@ -63,7 +63,7 @@ def _refuse_doctype(text: str, where: str) -> None:
 
 
 def _parse(text: str) -> ET.Element:
-    """The tree of a text; prefixes are part of the names, as the C++ parsers have it."""
+    """Parse a text; prefixes are part of the names, as the C++ parsers have it."""
     # those take every file for UTF-8, whatever it says
     parser, builder = expat.ParserCreate("utf-8"), _Builder()
     parser.StartElementHandler = builder.start

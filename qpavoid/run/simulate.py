@@ -16,8 +16,8 @@ from qpavoid.control.tasks.frames import in_order
 from qpavoid.controller import Controller, Tick
 from qpavoid.errors import ConfigError, NumericalError
 from qpavoid.geometry.bodies import enclosing_capsule
-from qpavoid.model.scene import FAR, Scene
-from qpavoid.model.solids import drawn_triangles
+from qpavoid.model.scene import PARKING_DISTANCE, Scene
+from qpavoid.model.solids import surface_triangles
 from qpavoid.problem import Array, Solution, Status
 from qpavoid.run.log import STATUSES, Log, versions
 from qpavoid.solvers import gains, parse_solver
@@ -190,7 +190,7 @@ class Recorder:
         self._query.compute(self._data, np.inf)
         distance, pairs = np.full(len(scene.pairs), np.inf), self._query.pairs
         distance[pairs] = self._query.results[pairs, 0]
-        distance[distance > 0.5 * FAR] = np.inf
+        distance[distance > 0.5 * PARKING_DISTANCE] = np.inf
         if np.isfinite(distance).any():
             self._arrays["closest_pair"][self._count] = np.argmin(distance)
         nearest = np.full(len(scene.geometry.geometryObjects), np.inf)
@@ -260,7 +260,7 @@ def _describe_obstacle(scene: Scene, index: int) -> dict[str, Any]:
     described: dict[str, Any] = {"name": obstacle.name, "shape": obstacle.shape.model_dump(mode="json")}
     if isinstance(obstacle.shape, Mesh):
         solids = [scene.geometry.geometryObjects[int(g)].geometry for g in np.flatnonzero(scene.obstacle_of == index)]
-        triangles = np.concatenate([drawn_triangles(solid) for solid in solids])
+        triangles = np.concatenate([surface_triangles(solid) for solid in solids])
         described["triangles"] = np.round(triangles[:: -(-len(triangles) // _MAX_FACES)], 5).tolist()
     elif isinstance(obstacle.shape, PointCloud):
         centers = scene.clouds[index].centers

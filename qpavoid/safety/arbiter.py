@@ -69,7 +69,7 @@ class Arbiter:
         self._bounds, self._avoidance, self._limits = bounds, avoidance, limits
         self._v_shape = (scene.robot.model.nv,)
         self._influence_distance = avoidance.d2 - avoidance.offset
-        safety_distance = avoidance.hold - avoidance.offset
+        safety_distance = avoidance.safety_distance - avoidance.offset
         self.braking = BrakingCheck(scene, bounds, limits.position_gain, safety_distance, dt)
         detours = Detours(progress.detour, dt, scene, frames, query, safety_distance) if progress.detour else None
         self.progress = ProgressMonitor(progress, dt, scene.pair_names, detours)

@@ -94,7 +94,7 @@ class BackupRollouts:
         self.lever_arm = max(1.0, max_lever_arm(model, self.query.max_extension()))
         """Bound on the distance that a point of the robot moves when a joint moves by 1 [m/rad, 1]."""
         self.sufficient_score = BackupScore(
-            settings.horizon, settings.distance_scale * (avoidance.hold - avoidance.offset)
+            settings.horizon, settings.distance_scale * (avoidance.safety_distance - avoidance.offset)
         )
         """Score from which on a backup trajectory need not be improved."""
         self.stop_policy = BackupPolicy(0.0, np.zeros(model.nv))

@@ -1,4 +1,4 @@
-"""Makes a robot.yaml and an SRDF of a bare URDF: bodies, pairs, a home pose, end effectors."""
+"""A robot.yaml and an SRDF for a bare URDF: bodies, pairs, a home pose, end effectors."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ from qpavoid.errors import ConfigError, UnknownName, nearest
 from qpavoid.geometry.bodies import check_meshes
 from qpavoid.model.end_effectors import end_effectors
 from qpavoid.model.kinematics import MIMIC
-from qpavoid.model.notes import Note, NoteKind, RobotWarning, merged
+from qpavoid.model.notes import Note, NoteKind, RobotWarning, merge_notes
 from qpavoid.model.packages import absolute_entries
-from qpavoid.model.plausibility import name_implausible_sizes
+from qpavoid.model.plausibility import note_implausible_sizes
 from qpavoid.model.robot import Robot
 from qpavoid.model.urdf import read_model, read_pieces
 from qpavoid.problem import Array
-from qpavoid.setup.fit import GROSS, Bodies
-from qpavoid.setup.home import ROOM, Home, find_home
-from qpavoid.setup.poses import joint_values, locks, wished_homes
+from qpavoid.setup.fit import MAX_VOLUME_RATIO, Bodies
+from qpavoid.setup.home import HOME_CLEARANCE, Home, find_home
+from qpavoid.setup.poses import home_candidates, joint_locks, joint_values
 from qpavoid.setup.reasons import (
-    LeftOut,
     Reason,
+    UncheckedLinks,
     by_link,
-    contact_shares,
-    keeping,
-    left_out,
+    measure_unchecked,
     own_margins,
     pair_reasons,
+    shares_of_contact,
     srdf_reason,
+    with_pairs,
 )
 from qpavoid.setup.sampling import (
     D1,
     SAMPLES,
     SEED,
-    always_near,
+    pairs_always_near,
     robot_size,
     safety_distances,
     sample_pairs,
@@ -47,15 +47,15 @@ from qpavoid.setup.sampling import (
 )
 from qpavoid.setup.shapes import LinkBodies, Piece, bodies_of_link, kinds_of_links, pieces_of
 from qpavoid.setup.srdf import Semantics, find_srdf, read_srdf
-from qpavoid.setup.telescope import drawn_in
+from qpavoid.setup.telescope import nested_pairs
 from qpavoid.setup.wheels import wheel_joints
 
 Root = Literal["fixed", "planar", "free_flyer"]
 
 
 @dataclass(frozen=True)
-class Wishes:
-    """What the user of `robot add` chose."""
+class DescribeOptions:
+    """Options of `robot add`."""
 
     name: str | None = None
     """Of the robot; that of the file if left out."""
@@ -82,7 +82,7 @@ class Wishes:
 
 
 @dataclass(frozen=True)
-class Described:
+class Description:
     """A robot's description, with how it came about."""
 
     config: RobotConfig
@@ -91,7 +91,7 @@ class Described:
     """As it is with that description."""
     urdf: Path
     """The file that it was made of."""
-    wishes: Wishes
+    options: DescribeOptions
     """What the user chose."""
     pieces: Sequence[Piece]
     """What the bodies enclose."""
@@ -105,7 +105,7 @@ class Described:
     """Pairs: all, adjacent, srdf, always, drawn in, never, active."""
     near: float
     """Distance that counts as never coming near [m]."""
-    left_out: Sequence[LeftOut]
+    measure_unchecked: Sequence[UncheckedLinks]
     """Links that are not checked against each other."""
     home: Home
     """The home pose."""
@@ -117,66 +117,68 @@ def _silent(_: str) -> None:
     """Say nothing of the progress."""
 
 
-def describe(urdf: Path, wishes: Wishes | None = None, progress: Callable[[str], None] = _silent) -> Described:
-    """Work out what a robot.yaml has to say of a URDF or MJCF.
+def describe(
+    urdf: Path, options: DescribeOptions | None = None, progress: Callable[[str], None] = _silent
+) -> Description:
+    """Work out the robot.yaml of a URDF or MJCF.
 
     Args:
         urdf: the file.
-        wishes: what the user chose.
+        options: what the user chose.
         progress: called with what is done next.
 
     Raises:
         ConfigError, UnknownName: naming file, field and remedy.
     """
-    wishes = wishes or Wishes()
+    options = options or DescribeOptions()
     urdf = urdf.resolve()
     progress("reading the model")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RobotWarning)  # all notes of the robot are in the description
-        return _describe(urdf, wishes, progress)
+        return _describe(urdf, options, progress)
 
 
-def _describe(urdf: Path, wishes: Wishes, progress: Callable[[str], None]) -> Described:
-    model = read_model(urdf, wishes.root)
-    honoured = wishes.srdf or find_srdf(urdf)
-    semantics = _semantics(honoured, model, wishes)
+def _describe(urdf: Path, options: DescribeOptions, progress: Callable[[str], None]) -> Description:
+    model = read_model(urdf, options.root)
+    honoured = options.srdf or find_srdf(urdf)
+    semantics = _semantics(honoured, model, options)
     notes: list[Note] = []
-    packages = absolute_entries([str(entry) for entry in wishes.package_dirs], Path.cwd())
-    pieces = _pieces(urdf, model, packages, wishes, notes)
+    packages = absolute_entries([str(entry) for entry in options.package_dirs], Path.cwd())
+    pieces = _pieces(urdf, model, packages, options, notes)
     bare = RobotConfig(
-        name=wishes.name or urdf.stem,
+        name=options.name or urdf.stem,
         urdf=str(urdf),
-        root_joint=wishes.root,
+        root_joint=options.root,
         package_dirs=packages,
-        allow_missing_meshes=wishes.allow_missing_meshes,
-        lock=locks(urdf, model, wishes.lock, semantics, notes, _wheels(model, pieces, wishes)),
+        allow_missing_meshes=options.allow_missing_meshes,
+        lock=joint_locks(urdf, model, options.lock, semantics, notes, _wheels(model, pieces, options)),
         end_effectors=end_effectors(model, semantics.end_effectors),
     )
-    given = bare.model_copy(update={"srdf": None if honoured is None else str(honoured.resolve())})
-    links, robot = _links(pieces, given, semantics, wishes, notes, progress)
+    config_with_srdf = bare.model_copy(update={"srdf": None if honoured is None else str(honoured.resolve())})
+    links, robot = _links(pieces, config_with_srdf, semantics, options, notes, progress)
     bodies = {"bodies": [body for link in links.values() for body in link.bodies]}
-    everything = robot if honoured is None else Robot.from_config(bare.model_copy(update=bodies), urdf)
+    robot_without_srdf = robot if honoured is None else Robot.from_config(bare.model_copy(update=bodies), urdf)
     progress(f"sampling {len(robot.bodies.collisionPairs)} pairs")
-    sampled = sample_pairs(robot, wishes.samples, wishes.seed)
-    nested = drawn_in(robot, sampled)
-    reasons = pair_reasons(everything, robot, sampled, nested)
+    sampled = sample_pairs(robot, options.samples, options.seed)
+    is_nested = nested_pairs(robot, sampled)
+    reasons = pair_reasons(robot_without_srdf, robot, sampled, is_nested)
     disabled, single = by_link(robot, reasons)
-    kept = ~sampled.never & ~sampled.always & ~nested
-    active, d1 = keeping(robot, kept), safety_distances(sampled)[kept]
+    active_mask = ~sampled.never & ~sampled.always & ~is_nested
+    active, d1 = with_pairs(robot, active_mask), safety_distances(sampled)[active_mask]
     progress("looking for a home pose")
-    home = find_home(active, wished_homes(active, semantics), bare.end_effectors, d1, wishes.home, wishes.seed)
+    home = find_home(active, home_candidates(active, semantics), bare.end_effectors, d1, options.home, options.seed)
     progress("comparing with the geometry")
-    shares = contact_shares(robot, sampled)
-    out = left_out(active, pieces, disabled, shares)
-    notes += [note for entry in out if (note := entry.note()) is not None]
-    notes += _notes_of_home(active, home, wishes)
+    shares = shares_of_contact(robot, sampled)
+    links_unchecked = measure_unchecked(active, pieces, disabled, shares)
+    notes += [note for entry in links_unchecked if (note := entry.note()) is not None]
+    notes += _notes_of_home(active, home, options)
     if not bare.end_effectors:
         remedy = "list the frames of your tools under `end_effectors`"
         notes.append(Note(NoteKind.FRAME, (), "no end effector was recognised", remedy))
     counts = {kind: list(reasons.values()).count(kind) for kind in get_args(Reason)}
-    every = robot.bodies.ngeoms * (robot.bodies.ngeoms - 1) // 2
+    pair_count = robot.bodies.ngeoms * (robot.bodies.ngeoms - 1) // 2
     margins = own_margins(active, d1)
-    return Described(
+    return Description(
         config=bare.model_copy(
             update={
                 **bodies,
@@ -188,7 +190,7 @@ def _describe(urdf: Path, wishes: Wishes, progress: Callable[[str], None]) -> De
         ),
         robot=replace(active, home=home.q),
         urdf=urdf,
-        wishes=wishes,
+        options=options,
         pieces=pieces,
         honoured=honoured,
         disabled={
@@ -196,18 +198,18 @@ def _describe(urdf: Path, wishes: Wishes, progress: Callable[[str], None]) -> De
             **{pair: why for pair, why in semantics.disabled.items() if _known(pair, model)},
         },
         links=links,
-        counts={"all": every, **counts, "active": every - sum(counts.values())},
+        counts={"all": pair_count, **counts, "active": pair_count - sum(counts.values())},
         near=sampled.near,
-        left_out=out,
+        measure_unchecked=links_unchecked,
         home=home,
-        notes=tuple(dict.fromkeys(merged([*robot.notes, *notes]))),
+        notes=tuple(dict.fromkeys(merge_notes([*robot.notes, *notes]))),
     )
 
 
-def _semantics(srdf: Path | None, model: Any, wishes: Wishes) -> Semantics:
-    """What an SRDF says, with the home pose that the user prefers as its first one."""
+def _semantics(srdf: Path | None, model: Any, options: DescribeOptions) -> Semantics:
+    """Read an SRDF, with the home pose that the user prefers as its first one."""
     semantics = Semantics() if srdf is None else read_srdf(srdf)
-    for name, value in wishes.home.items():
+    for name, value in options.home.items():
         if not model.existJointName(name):
             raise UnknownName(f"--home: no joint {name!r}{nearest(name, list(model.names)[1:])}")
         joint = model.joints[model.getJointId(name)]
@@ -215,36 +217,38 @@ def _semantics(srdf: Path | None, model: Any, wishes: Wishes) -> Semantics:
             low, high = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
             if low < high and not low <= value <= high:
                 raise ConfigError(f"--home: {name} = {value:g} lies outside its limits [{low:g}, {high:g}] [rad or m]")
-    return replace(semantics, states={"--home": wishes.home, **semantics.states}) if wishes.home else semantics
+    return replace(semantics, states={"--home": options.home, **semantics.states}) if options.home else semantics
 
 
 def _known(pair: frozenset[str], model: Any) -> bool:
     return all(model.existFrame(link) for link in pair)
 
 
-def _assumed_speeds(model: Any, used: Any) -> dict[str, float | list[float]]:
-    """Largest speeds that the robot has though its file gives none: written out, so that they can be seen and mended.
+def _assumed_speeds(model: Any, robot_model: Any) -> dict[str, float | list[float]]:
+    """List the largest speeds that the robot has and its file does not give.
+
+    They are written out, so that a user sees them and can change them.
 
     Args:
         model: as the file has it.
-        used: the robot's.
+        robot_model: the robot's.
     """
-    assumed: dict[str, float | list[float]] = {}
-    for name, joint in zip(list(used.names)[1:], list(used.joints)[1:], strict=True):
+    speeds_by_joint: dict[str, float | list[float]] = {}
+    for name, joint in zip(list(robot_model.names)[1:], list(robot_model.joints)[1:], strict=True):
         of_file = model.joints[model.getJointId(name)]
-        given = np.array(model.velocityLimit[of_file.idx_v : of_file.idx_v + of_file.nv])
-        speeds = np.array(used.velocityLimit[joint.idx_v : joint.idx_v + joint.nv])
-        if joint.shortname() != MIMIC and np.any((given != speeds) & np.isfinite(speeds)):
-            assumed[name] = float(speeds[0]) if joint.nv == 1 else speeds.tolist()
-    return assumed
+        config_with_srdf = np.array(model.velocityLimit[of_file.idx_v : of_file.idx_v + of_file.nv])
+        speeds = np.array(robot_model.velocityLimit[joint.idx_v : joint.idx_v + joint.nv])
+        if joint.shortname() != MIMIC and np.any((config_with_srdf != speeds) & np.isfinite(speeds)):
+            speeds_by_joint[name] = float(speeds[0]) if joint.nv == 1 else speeds.tolist()
+    return speeds_by_joint
 
 
-def _wheels(model: Any, pieces: Sequence[Piece], wishes: Wishes) -> list[str]:
-    return [] if wishes.root == "fixed" else wheel_joints(model, pieces)
+def _wheels(model: Any, pieces: Sequence[Piece], options: DescribeOptions) -> list[str]:
+    return [] if options.root == "fixed" else wheel_joints(model, pieces)
 
 
-def _notes_of_home(robot: Robot, home: Home, wishes: Wishes) -> Iterator[Note]:
-    """Say where the home pose comes from, if it is none of the wishes, and what is wrong with it."""
+def _notes_of_home(robot: Robot, home: Home, options: DescribeOptions) -> Iterator[Note]:
+    """Yield notes on the origin of the home pose, and on what is wrong with it."""
     kind = NoteKind.HOME
     if home.clearance <= 0.0:
         remedy = (
@@ -252,27 +256,29 @@ def _notes_of_home(robot: Robot, home: Home, wishes: Wishes) -> Iterator[Note]:
             "bodies with --bodies LINK=convex"
         )
         yield Note(kind, home.nearest or (), "no pose clear of collision was found", remedy, "warning")
-    elif home.short > 0.0:
-        what = f"nearest pair, {1e3 * home.clearance:.1f} mm apart: no pose with room to move was found"
-        yield Note(kind, home.nearest or (), what, "give a pose with --home JOINT=VALUE", "warning")
-    if home.wish is None:
-        start = "the one that was wished" if wishes.home else "the SRDF's poses and the middle of the joints' ranges"
-        what = f"drawn near {start}, where pairs are too near or a limb is singular"
-        moved = tuple(name for name, value in joint_values(robot.model, home.q).items() if value)
-        yield Note(kind, moved, what, "--home JOINT=VALUE")
+    elif home.deficit > 0.0:
+        clause = f"nearest pair, {1e3 * home.clearance:.1f} mm apart: no pose with room to move was found"
+        yield Note(kind, home.nearest or (), clause, "give a pose with --home JOINT=VALUE", "warning")
+    if home.preference is None:
+        start = "the one that was wished" if options.home else "the SRDF's poses and the middle of the joints' ranges"
+        clause = f"drawn near {start}, where pairs are too near or a limb is singular"
+        moved_joints = tuple(name for name, value in joint_values(robot.model, home.q).items() if value)
+        yield Note(kind, moved_joints, clause, "--home JOINT=VALUE")
     if home.singular:
-        what = "cannot move well in every direction there: singular, or nearly so"
-        yield Note(kind, tuple(home.singular), what, "bend it with --home")
+        clause = "cannot move well in every direction there: singular, or nearly so"
+        yield Note(kind, tuple(home.singular), clause, "bend it with --home")
 
 
-def _pieces(urdf: Path, model: Any, packages: Sequence[str], wishes: Wishes, notes: list[Note]) -> list[Piece]:
-    """Collision geometry; of links without any, what is meant to be seen of them."""
-    geometry = read_pieces(urdf, model, packages, urdf, notes, allow_missing=wishes.allow_missing_meshes)
+def _pieces(
+    urdf: Path, model: Any, packages: Sequence[str], options: DescribeOptions, notes: list[Note]
+) -> list[Piece]:
+    """Read the collision geometry; visual geometry of links without any."""
+    geometry = read_pieces(urdf, model, packages, urdf, notes, allow_missing=options.allow_missing_meshes)
     if not geometry.ngeoms:
-        what = "has no geometry at all: nothing is checked"
-        notes.append(Note(NoteKind.SHAPE, (urdf.name,), what, "list `bodies`", "warning"))
+        clause = "has no geometry at all: nothing is checked"
+        notes.append(Note(NoteKind.SHAPE, (urdf.name,), clause, "list `bodies`", "warning"))
     check_meshes(geometry, str(urdf))
-    name_implausible_sizes(model, geometry, notes)
+    note_implausible_sizes(model, geometry, notes)
     return pieces_of(geometry.geometryObjects, model)
 
 
@@ -280,53 +286,61 @@ def _links(
     pieces: Sequence[Piece],
     config: RobotConfig,
     semantics: Semantics,
-    wishes: Wishes,
+    options: DescribeOptions,
     notes: list[Note],
     progress: Callable[[str], None],
 ) -> tuple[dict[str, LinkBodies], Robot]:
-    """Bodies of every link, and the robot with them.
+    """Fit the bodies of every link, and build the robot with them.
 
     `auto` takes exact ones where capsules would be too near at home or everywhere.
     """
-    kinds = kinds_of_links(pieces, wishes.bodies, wishes.bodies_of)
-    fitted = {}
+    kinds = kinds_of_links(pieces, options.bodies, options.bodies_of)
+    initial = {}
     for number, (link, kind) in enumerate(kinds.items(), start=1):
         progress(f"fitting bodies to link {number} of {len(kinds)}: {link}")
-        fitted[link] = bodies_of_link(pieces, link, kind)
-    links = dict(fitted)
+        initial[link] = bodies_of_link(pieces, link, kind)
+    links = dict(initial)
     while True:
         listed = [body for link in links.values() for body in link.bodies]
         robot = Robot.from_config(config.model_copy(update={"bodies": listed}), Path(config.urdf))
-        fat = _too_fat(robot, wished_homes(robot, semantics)[0], wishes.seed)
-        mended = {link: bodies_of_link(pieces, link, "convex") for link in fat if kinds[link] == "auto"}
-        if all(links[link] == bodies for link, bodies in mended.items()):
+        oversized = _oversized(robot, home_candidates(robot, semantics)[0], options.seed)
+        replacements = {link: bodies_of_link(pieces, link, "convex") for link in oversized if kinds[link] == "auto"}
+        if all(links[link] == bodies for link, bodies in replacements.items()):
             break
-        links.update(mended)
-    if exact := [link for link in links if links[link] != fitted[link]]:
-        what = "exact bodies, because capsules would be too near at home or everywhere"
-        notes.append(Note(NoteKind.SHAPE, tuple(exact), what))
-    gross = {link: found for link, found in links.items() if found.volume > GROSS * found.inside > 0.0}
+        links.update(replacements)
+    if exact_links := [link for link in links if links[link] != initial[link]]:
+        clause = "exact bodies, because capsules would be too near at home or everywhere"
+        notes.append(Note(NoteKind.SHAPE, tuple(exact_links), clause))
+    gross = {
+        link: link_bodies
+        for link, link_bodies in links.items()
+        if link_bodies.volume > MAX_VOLUME_RATIO * link_bodies.inside > 0.0
+    }
     if worst := sorted(gross, key=lambda link: -gross[link].volume):
         first = gross[worst[0]]
-        what = (
-            f"bodies of more than {GROSS:g} times what their geometry encloses, {1e3 * first.volume:.3g} l around "
-            f"{1e3 * first.inside:.3g} l of the first: concave, or no closed surface"
+        clause = (
+            f"bodies of more than {MAX_VOLUME_RATIO:g} times what their geometry encloses, {1e3 * first.volume:.3g} l "
+            f"around {1e3 * first.inside:.3g} l of the first: concave, or no closed surface"
         )
-        notes.append(Note(NoteKind.SHAPE, tuple(worst), what, f"--bodies {worst[0]}=capsules, or bodies of your own"))
+        notes.append(Note(NoteKind.SHAPE, tuple(worst), clause, f"--bodies {worst[0]}=capsules, or bodies of your own"))
     return links, robot
 
 
-def _too_fat(robot: Robot, home: Array, seed: int) -> set[str]:
-    """Links of the pairs that are too near at the home pose, or in every one of a few random poses."""
+def _oversized(robot: Robot, home: Array, seed: int) -> set[str]:
+    """Find the links of pairs that are too near at home, or in each of a few random poses."""
     names = [body.name for body in robot.bodies.geometryObjects]
-    near = [names[i] for pair in always_near(robot, _FEW, seed) for i in pair]
+    near = [names[i] for pair in pairs_always_near(robot, _POSES, seed) for i in pair]
     near += [body for pair in robot.always_touching for body in pair[:2]]
-    near += [body for a, b, _ in touching(robot, home, min(_CLEAR * robot_size(robot), ROOM * D1)) for body in (a, b)]
+    near += [
+        body
+        for a, b, _ in touching(robot, home, min(_HOME_NEAR * robot_size(robot), HOME_CLEARANCE * D1))
+        for body in (a, b)
+    ]
     link = {body.name: robot.model.frames[body.parentFrame].name for body in robot.bodies.geometryObjects}
     return {link[body] for body in near}
 
 
-_CLEAR = 0.04
-"""Distance at the wished home pose, as a share of the robot's size, within which capsules are too fat [-]."""
-_FEW = 200
-"""Random poses that tell whether capsules are too fat."""
+_HOME_NEAR = 0.04
+"""Distance at the preferred home pose, as a share of the robot's size, within which capsules are oversized [-]."""
+_POSES = 200
+"""Random poses in which oversized capsules show."""

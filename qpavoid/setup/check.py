@@ -1,4 +1,4 @@
-"""Looks a robot over before it is used: what it is made of, what is wrong with it, and what to do about it."""
+"""The check of a robot before it is used: its parts, its faults, and their remedies."""
 
 from __future__ import annotations
 
@@ -24,28 +24,28 @@ from qpavoid.errors import ConfigError, QpavoidError
 from qpavoid.geometry.bodies import convert_bodies, triangle_meshes
 from qpavoid.model.end_effectors import end_effectors
 from qpavoid.model.kinematics import MIMIC
-from qpavoid.model.notes import Note, NoteKind, RobotWarning, shortened
+from qpavoid.model.notes import Note, NoteKind, RobotWarning, abbreviate
 from qpavoid.model.packages import absolute_entries, find_mesh, mesh_folders
 from qpavoid.model.robot import Robot
 from qpavoid.model.scene import build_scene
 from qpavoid.model.urdf import find_resource, is_mjcf, mesh_names, read_model, read_pieces
 from qpavoid.model.xml_file import read_robot_xml
 from qpavoid.setup.findings import Joint, Report
-from qpavoid.setup.home import BENT, Limbs
+from qpavoid.setup.home import MIN_CONDITIONING, Limbs
 from qpavoid.setup.poses import mimics
-from qpavoid.setup.reasons import unchecked
+from qpavoid.setup.reasons import find_unchecked
 from qpavoid.setup.sampling import D1, Space, touching
 from qpavoid.setup.shapes import Piece, pieces_of
 
-_TICKS, _PATIENCE = 300, 5.0
+_MAX_STEPS, _MAX_SECONDS = 300, 5.0
 """Timed for the median, as far as they take no longer than so many seconds."""
-_SLOW = 1000.0
+_SLOW_STEP = 1000.0
 """Median tick from which it is worth a word [µs]."""
-_FAST = {"revolute": 50.0, "continuous": 50.0, "prismatic": 10.0}
+_MAX_SPEED = {"revolute": 50.0, "continuous": 50.0, "prismatic": 10.0}
 """Speed limits [rad/s, m/s] above which one is hardly meant."""
-_WIDE = {"revolute": 8.0 * math.pi, "prismatic": 20.0}
+_MAX_RANGE = {"revolute": 8.0 * math.pi, "prismatic": 20.0}
 """Ranges [rad, m] above which one is hardly meant."""
-_NARROW = 1e-3
+_MIN_RANGE = 1e-3
 """Range [rad, m] below which a joint is better locked."""
 
 
@@ -89,7 +89,7 @@ def _report(config: RobotConfig, path: Path, progress: Callable[[str], None]) ->
     report.frames = [f.name for f in model.frames if f.type in (pin.BODY, pin.OP_FRAME)]
     report.end_effectors = list(config.end_effectors) or end_effectors(model)
     report.without_mass = sum(inertia.mass <= 0.0 for inertia in list(model.inertias)[1:])
-    pieces = _look_at_geometry(report, config, path, urdf, model)
+    pieces = _check_geometry(report, config, path, urdf, model)
     robot = None
     if report.usable:
         progress("making the robot")
@@ -100,20 +100,23 @@ def _report(config: RobotConfig, path: Path, progress: Callable[[str], None]) ->
             report.notes.append(Note(NoteKind.FILE, (), str(error), "mend what it names", "error"))
         report.load_seconds = perf_counter() - begin
     report.joints = _joints(urdf, model if robot is None else robot.model, config, model)
-    _judge_joints(report, config)
+    _check_joints(report, config)
     if robot is not None:
         report.notes += robot.notes
-        _look_at_robot(report, with_hulls(robot), pieces, progress)
+        _check_built_robot(report, with_hulls(robot), pieces, progress)
     if report.without_mass:
-        what = f"{report.without_mass} moving links have no mass"
-        report.notes.append(Note(NoteKind.LINK, (), what, "none is needed: inertias are not used"))
+        clause = f"{report.without_mass} moving links have no mass"
+        report.notes.append(Note(NoteKind.LINK, (), clause, "none is needed: inertias are not used"))
     order = {"error": 0, "warning": 1, "note": 2}
     report.notes.sort(key=lambda note: order[note.severity])
     return report
 
 
 def with_hulls(robot: Robot) -> Robot:
-    """The robot with the convex hull of each triangle mesh in its place: meshes cost up to ms a pair; few run them."""
+    """Replace each triangle mesh by its convex hull.
+
+    Meshes cost up to ms a pair; few robots are run with them.
+    """
     if not triangle_meshes(robot.bodies):
         return robot
     bodies = convert_bodies(robot.bodies, "convex")
@@ -125,25 +128,25 @@ def with_hulls(robot: Robot) -> Robot:
 # --- geometry -----------------------------------------------------------------------------------------------
 
 
-def _look_at_geometry(report: Report, config: RobotConfig, path: Path, urdf: Path, model: Any) -> list[Piece]:
+def _check_geometry(report: Report, config: RobotConfig, path: Path, urdf: Path, model: Any) -> list[Piece]:
     packages = absolute_entries(config.package_dirs, path.parent)
     report.searched = mesh_folders(urdf, packages)
     absent = {tag: _absent(urdf, tag, report.searched) for tag in ("collision", "visual")}
     report.missing_meshes = absent["collision"]
     if report.missing_meshes and not config.allow_missing_meshes:
-        what = (
+        clause = (
             f"{len(report.missing_meshes)} collision meshes are missing, such as {report.missing_meshes[0]!r}; "
-            f"looked for in {shortened(report.searched, 8)}"
+            f"looked for in {abbreviate(report.searched, 8)}"
         )
         remedy = (
             "name the folder that holds the package with --package-dir or --package NAME=FOLDER (`package_dirs` of a "
             "robot.yaml), set ROS_PACKAGE_PATH, or go on without them: --allow-missing-meshes"
         )
-        report.notes.append(Note(NoteKind.MESH, (), what, remedy, "error"))
+        report.notes.append(Note(NoteKind.MESH, (), clause, remedy, "error"))
         return []
     if absent["visual"]:
-        what = f"{len(absent['visual'])} visual meshes are missing"
-        report.notes.append(Note(NoteKind.MESH, (), what, "none is needed where there are collision shapes"))
+        clause = f"{len(absent['visual'])} visual meshes are missing"
+        report.notes.append(Note(NoteKind.MESH, (), clause, "none is needed where there are collision shapes"))
     try:
         geometry = read_pieces(
             urdf, model, packages, path, visuals=config.visuals, allow_missing=config.allow_missing_meshes
@@ -182,19 +185,19 @@ _KINDS = {
 
 
 def _joints(urdf: Path, model: Any, config: RobotConfig, whole: Any) -> list[Joint]:
-    """All joints: those that move with the limits that hold, those that are locked, and those that never moved."""
+    """List all joints: those that move, with the limits in force, locked and fixed ones."""
     followers = {name: source for name, (source, _, _) in mimics(urdf).items()}
-    written = [] if is_mjcf(urdf) else read_robot_xml(urdf, "URDF").findall("joint")
-    kinds = {joint.get("name", ""): joint.get("type", "") for joint in written}
+    elements = [] if is_mjcf(urdf) else read_robot_xml(urdf, "URDF").findall("joint")
+    kinds = {joint.get("name", ""): joint.get("type", "") for joint in elements}
     joints = []
     for name, joint in zip(list(whole.names)[1:], list(whole.joints)[1:], strict=True):
         kind, leader = _KINDS.get(joint.shortname(), "revolute"), followers.get(name)
-        led = joint.shortname() == MIMIC
-        kind = kinds[name] if led else kind
-        if name in config.lock or (led and leader in config.lock):
+        is_follower = joint.shortname() == MIMIC
+        kind = kinds[name] if is_follower else kind
+        if name in config.lock or (is_follower and leader in config.lock):
             joints.append(Joint(name, kind, leader, locked=True))
             continue
-        if led:
+        if is_follower:
             joints.append(Joint(name, kind, leader, led=True))
             continue
         if not model.existJointName(name):  # its limits leave it no range
@@ -214,28 +217,28 @@ def _limit(value: float) -> float | None:
     return value if abs(value) < 1e9 else None
 
 
-def _judge_joints(report: Report, config: RobotConfig) -> None:
-    moving = [joint for joint in report.joints if joint.kind in _FAST and not (joint.locked or joint.led)]
+def _check_joints(report: Report, config: RobotConfig) -> None:
+    moving = [joint for joint in report.joints if joint.kind in _MAX_SPEED and not (joint.locked or joint.led)]
     spans = {
         joint.name: (joint, joint.upper - joint.lower)
         for joint in moving
-        if joint.kind in _WIDE and joint.lower is not None and joint.upper is not None
+        if joint.kind in _MAX_RANGE and joint.lower is not None and joint.upper is not None
     }
     example = "`limits: {%s: {%s: %s}}` in a robot.yaml"
-    for severity, kind, what, names, remedy in (
+    for severity, kind, clause, names, remedy in (
         ("warning", NoteKind.LIMIT, "no position limits",
-         [j.name for j in moving if j.kind in _WIDE and (j.name not in spans or j.lower == j.upper == 0.0)],
+         [j.name for j in moving if j.kind in _MAX_RANGE and (j.name not in spans or j.lower == j.upper == 0.0)],
          example % ("position", "JOINT", "[-2.0, 2.0]")),
         ("warning", NoteKind.LIMIT, "no velocity limit", [j.name for j in moving if j.velocity is None],
          example % ("velocity", "JOINT", "1.5")),
         ("warning", NoteKind.LIMIT, "a velocity limit beyond what such joints do",
-         [j.name for j in moving if j.velocity is not None and j.velocity > _FAST[j.kind]],
+         [j.name for j in moving if j.velocity is not None and j.velocity > _MAX_SPEED[j.kind]],
          example % ("velocity", "JOINT", "1.5")),
         ("warning", NoteKind.LIMIT, "a range wider than such joints have",
-         [name for name, (joint, span) in spans.items() if span > _WIDE[joint.kind]],
+         [name for name, (joint, span) in spans.items() if span > _MAX_RANGE[joint.kind]],
          example % ("position", "JOINT", "[-2.0, 2.0]")),
         ("warning", NoteKind.JOINT, "hardly any range",
-         [name for name, (_, span) in spans.items() if 0.0 < span < _NARROW],
+         [name for name, (_, span) in spans.items() if 0.0 < span < _MIN_RANGE],
          "`lock: {JOINT: 0.0}` in a robot.yaml"),
         ("warning", NoteKind.JOINT, "mimic joints that move on their own here", [j.name for j in moving if j.mimics],
          "`qpavoid robot add` holds them and those that they follow; or list them under `lock`"),
@@ -244,78 +247,81 @@ def _judge_joints(report: Report, config: RobotConfig) -> None:
          example % ("acceleration", "JOINT", "10.0")),
     ):  # fmt: skip
         if names:
-            report.notes.append(Note(kind, tuple(names), what, remedy, severity))  # type: ignore[arg-type]
+            report.notes.append(Note(kind, tuple(names), clause, remedy, severity))  # type: ignore[arg-type]
 
 
 # --- the robot as it loads ----------------------------------------------------------------------------------
 
 
-def _look_at_robot(report: Report, robot: Robot, pieces: Sequence[Piece], progress: Callable[[str], None]) -> None:
+def _check_built_robot(report: Report, robot: Robot, pieces: Sequence[Piece], progress: Callable[[str], None]) -> None:
     report.nq, report.nv = robot.model.nq, robot.model.nv
     report.bodies, report.pairs = len(robot.bodies.geometryObjects), len(robot.bodies.collisionPairs)
     if not report.bodies:
-        what = "it has no collision bodies: nothing would be avoided"
+        clause = "it has no collision bodies: nothing would be avoided"
         remedy = "`qpavoid robot add` fits them to what is meant to be seen; or list `bodies` in a robot.yaml"
-        report.notes.append(Note(NoteKind.SHAPE, (), what, remedy, "error"))
-    _look_at_home(report, robot)
+        report.notes.append(Note(NoteKind.SHAPE, (), clause, remedy, "error"))
+    _check_home(report, robot)
     progress("comparing with the geometry")
-    report.notes += [note for entry in unchecked(robot, pieces) if (note := entry.note()) is not None]
+    report.notes += [note for entry in find_unchecked(robot, pieces) if (note := entry.note()) is not None]
     if not report.end_effectors:
         remedy = "list the frames of your tools under `end_effectors`"
         report.notes.append(Note(NoteKind.FRAME, (), "no frame looks like a tool", remedy))
     feet = [name for name in report.end_effectors if "foot" in name.lower() or "sole" in name.lower()]
     if feet and not any(joint.kind in ("floating", "planar") for joint in report.joints):
-        what = f"it has feet ({shortened(feet)}) and a fixed base"
-        report.notes.append(Note(NoteKind.JOINT, (), what, "`root_joint: free_flyer`, or --root"))
+        clause = f"it has feet ({abbreviate(feet)}) and a fixed base"
+        report.notes.append(Note(NoteKind.JOINT, (), clause, "`root_joint: free_flyer`, or --root"))
     progress("timing a control step")
     try:
         report.tick_us = tick_time(robot, report.end_effectors)
     except QpavoidError as error:
-        what = f"a controller cannot be made: {error}"
-        report.notes.append(Note(NoteKind.FILE, (), what, "mend what it names", "error"))
+        clause = f"a controller cannot be made: {error}"
+        report.notes.append(Note(NoteKind.FILE, (), clause, "mend what it names", "error"))
         return
-    if report.tick_us > _SLOW:
-        what = f"a control step takes {report.tick_us:.0f} µs with {report.pairs} pairs"
+    if report.tick_us > _SLOW_STEP:
+        clause = f"a control step takes {report.tick_us:.0f} µs with {report.pairs} pairs"
         remedy = "`qpavoid robot add` finds pairs that never collide, and capsules; `lock` joints that you do not use"
-        report.notes.append(Note(NoteKind.PAIR, (), what, remedy, "warning"))
+        report.notes.append(Note(NoteKind.PAIR, (), clause, remedy, "warning"))
 
 
-def _look_at_home(report: Report, robot: Robot) -> None:
-    near = touching(robot, robot.home, np.inf)
-    report.clearance = near[0][2] if near else None
-    report.home_collisions = [pair for pair in near if pair[2] <= 0.0]
+def _check_home(report: Report, robot: Robot) -> None:
+    pairs_at_home = touching(robot, robot.home, np.inf)
+    report.clearance = pairs_at_home[0][2] if pairs_at_home else None
+    report.home_collisions = [pair for pair in pairs_at_home if pair[2] <= 0.0]
     remedy = (
         "`qpavoid robot add` looks for a clear pose and leaner bodies; or set `home`, or `disabled_pairs` for shapes "
         "that overlap by design"
     )
     for a, b, d in report.home_collisions:
-        what = f"touch at the home pose ({1e3 * d:.1f} mm)"
-        report.notes.append(Note(NoteKind.PAIR, (a, b), what, remedy, "warning"))
-    close = [(a, b, d) for a, b, d in near if 0.0 < d < robot.safety_distance(a, b, D1)]
+        clause = f"touch at the home pose ({1e3 * d:.1f} mm)"
+        report.notes.append(Note(NoteKind.PAIR, (a, b), clause, remedy, "warning"))
+    close = [(a, b, d) for a, b, d in pairs_at_home if 0.0 < d < robot.safety_distance(a, b, D1)]
     for a, b, d in close:
-        what = f"{1e3 * d:.1f} mm apart at the home pose, less than the default safety distance"
+        clause = f"{1e3 * d:.1f} mm apart at the home pose, less than the default safety distance"
         remedy = "another `home`, a smaller `d1`, or `pair_margins`; `qpavoid robot add` writes them"
-        report.notes.append(Note(NoteKind.PAIR, (a, b), what, remedy))
+        report.notes.append(Note(NoteKind.PAIR, (a, b), clause, remedy))
     limbs = Limbs(robot, report.end_effectors)
     report.conditioning = dict(zip(limbs.names, limbs.at(robot.home), strict=True))
-    if singular := [name for name, limb in report.conditioning.items() if limb.ratio < BENT]:
-        what = "the home pose is singular or nearly so: they cannot move well in every direction there"
+    if singular := [name for name, limb in report.conditioning.items() if limb.ratio < MIN_CONDITIONING]:
+        clause = "the home pose is singular or nearly so: they cannot move well in every direction there"
         remedy = "start scenarios elsewhere (`q0`), or give a `home` with bent joints"
-        report.notes.append(Note(NoteKind.HOME, tuple(singular), what, remedy))
+        report.notes.append(Note(NoteKind.HOME, tuple(singular), clause, remedy))
 
 
 def tick_time(robot: Robot, frames: Sequence[str]) -> float:
-    """Median time of a control step that holds frames where they are at home, from configurations near it [µs]."""
+    """Time a control step near the home pose; the median [µs].
+
+    Its tasks keep all end effectors where they are at home.
+    """
     known = [frame for frame in frames if robot.model.existFrame(frame)]
     tasks = build_tasks([Task(frame=frame) for frame in known], robot, robot.home)
     controller = Controller(build_scene(robot), tasks)
     space, random = Space(robot), np.random.default_rng(0)
-    states = [space.move(robot.home, random.normal(0.0, 0.05, robot.model.nv)) for _ in range(_TICKS)]
+    states = [space.move(robot.home, random.normal(0.0, 0.05, robot.model.nv)) for _ in range(_MAX_STEPS)]
     times = []
     for q in states:
         begin = perf_counter()
         controller.step(q)
         times.append(perf_counter() - begin)
-        if sum(times) > _PATIENCE:
+        if sum(times) > _MAX_SECONDS:
             break
     return 1e6 * float(np.median(times))

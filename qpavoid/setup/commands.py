@@ -17,7 +17,7 @@ from qpavoid.errors import ConfigError
 from qpavoid.model.notes import Note
 from qpavoid.run.report import to_json
 from qpavoid.run.terminal import ERR, OUT
-from qpavoid.setup.add import Described, Root, Wishes, describe
+from qpavoid.setup.add import DescribeOptions, Description, Root, describe
 from qpavoid.setup.check import check_robot
 from qpavoid.setup.findings import Joint, Report
 from qpavoid.setup.fit import Bodies
@@ -88,7 +88,7 @@ def _check_lines(report: Report) -> Iterator[str]:
 
 
 def _table(notes: Sequence[Note]) -> Iterator[str]:
-    """What was left out, mended, replaced or assumed, coloured by severity."""
+    """Yield the lines of the table of notes, coloured by severity."""
     colours = {"error": "red", "warning": "yellow", "note": "dim"}
     for line in note_lines(notes):
         severity = line.partition(" ")[0]
@@ -132,7 +132,7 @@ def add(
     """Write a robot.yaml with collision bodies, pairs, a home pose and end effectors."""
     begin = time.perf_counter()
     kind, by_link = _kinds(bodies or [])
-    wishes = Wishes(
+    options = DescribeOptions(
         name=name, bodies=kind, bodies_of=by_link, root=_one_of(root, Root, "--root"), lock=tuple(lock or ()),
         home=_values(home or []), package_dirs=_entries(package_dir, package),
         allow_missing_meshes=allow_missing_meshes, srdf=srdf, samples=samples, seed=seed,
@@ -140,23 +140,23 @@ def add(
     urdf = find_robot(path)
     if urdf.suffix in (".yaml", ".yml"):
         raise ConfigError(f"{path}: is described already; give a URDF or MJCF")
-    described = describe(urdf, wishes, Progress())
-    folder = out or Path(described.config.name)
-    files = description_files(described, folder)
-    if picture and (drawn := _picture(described)) is not None:
-        files[folder / "bodies.png"] = drawn
+    description = describe(urdf, options, Progress())
+    folder = out or Path(description.config.name)
+    files = description_files(description, folder)
+    if picture and (picture_bytes := _picture(description)) is not None:
+        files[folder / "bodies.png"] = picture_bytes
     outcome = write_files(files, force)
     seconds = time.perf_counter() - begin
     if json:
-        print(to_json(_document(described, outcome, seconds)))
+        print(to_json(_document(description, outcome, seconds)))
     else:
-        _report(described, outcome, seconds)
+        _report(description, outcome, seconds)
 
 
-def _kinds(given: list[str]) -> tuple[Bodies, dict[str, Bodies]]:
+def _kinds(texts: list[str]) -> tuple[Bodies, dict[str, Bodies]]:
     kind: Bodies = "auto"
     by_link: dict[str, Bodies] = {}
-    for text in given:
+    for text in texts:
         link, equals, value = text.rpartition("=")
         chosen = _one_of(value, Bodies, f"--bodies {text}")
         if equals:
@@ -166,9 +166,9 @@ def _kinds(given: list[str]) -> tuple[Bodies, dict[str, Bodies]]:
     return kind, by_link
 
 
-def _values(given: list[str]) -> dict[str, float]:
+def _values(texts: list[str]) -> dict[str, float]:
     values = {}
-    for text in given:
+    for text in texts:
         joint, equals, value = text.rpartition("=")
         try:
             values[joint] = float(value)
@@ -180,7 +180,7 @@ def _values(given: list[str]) -> dict[str, float]:
 
 
 def _entries(folders: list[Path] | None, packages: list[str] | None) -> tuple[str, ...]:
-    """Entries of `package_dirs`: packages by name first."""
+    """List the entries of `package_dirs`, packages by name first."""
     for text in packages or []:
         name, equals, folder = text.partition("=")
         if not (name and equals and folder):
@@ -196,7 +196,7 @@ def _one_of(value: str, kind: Any, option: str) -> Any:
     return value
 
 
-def _picture(described: Described) -> bytes | None:
+def _picture(description: Description) -> bytes | None:
     try:
         from qpavoid.setup.picture import bodies_picture
     except ModuleNotFoundError as missing:
@@ -204,44 +204,44 @@ def _picture(described: Described) -> bytes | None:
             raise
         ERR.print("no picture: matplotlib is missing; pip install 'qpavoid\\[plots]'", highlight=False)
         return None
-    return bodies_picture(described)
+    return bodies_picture(description)
 
 
-def _document(described: Described, outcome: dict[Path, str], seconds: float) -> dict[str, Any]:
-    links, home = described.links.values(), described.home
+def _document(description: Description, outcome: dict[Path, str], seconds: float) -> dict[str, Any]:
+    links, home = description.links.values(), description.home
     return {
-        "name": described.config.name,
+        "name": description.config.name,
         "files": {str(path): what for path, what in outcome.items()},
-        "bodies": len(described.robot.bodies.geometryObjects),
+        "bodies": len(description.robot.bodies.geometryObjects),
         "bodies_volume": sum(link.volume for link in links),
         "hulls_volume": sum(link.hulls for link in links),
         "geometry_volume": sum(link.inside for link in links),
-        "pairs": dict(described.counts),
-        "pair_margins": [own.model_dump() for own in described.config.pair_margins],
-        "left_out": [asdict(entry) for entry in described.left_out],
-        "samples": described.wishes.samples,
-        "seed": described.wishes.seed,
-        "srdf": None if described.honoured is None else str(described.honoured),
-        "end_effectors": list(described.config.end_effectors),
-        "home": dict(described.config.home),
-        "lock": dict(described.config.lock),
+        "pairs": dict(description.counts),
+        "pair_margins": [own.model_dump() for own in description.config.pair_margins],
+        "left_out": [asdict(entry) for entry in description.measure_unchecked],
+        "samples": description.options.samples,
+        "seed": description.options.seed,
+        "srdf": None if description.honoured is None else str(description.honoured),
+        "end_effectors": list(description.config.end_effectors),
+        "home": dict(description.config.home),
+        "lock": dict(description.config.lock),
         "clearance": home.clearance,
         "nearest": home.nearest,
         "conditioning": {frame: asdict(limb) for frame, limb in home.conditioning.items()},
-        "notes": [asdict(note) for note in described.notes],
+        "notes": [asdict(note) for note in description.notes],
         "seconds": seconds,
     }
 
 
-def _report(described: Described, outcome: dict[Path, str], seconds: float) -> None:
+def _report(description: Description, outcome: dict[Path, str], seconds: float) -> None:
     for line in (
-        f"bodies         {volume_line(described)}",
-        f"pairs          {pairs_line(described)}",
-        f"end effectors  {', '.join(described.config.end_effectors) or 'none recognised'}",
-        f"home           {home_line(described)}",
+        f"bodies         {volume_line(description)}",
+        f"pairs          {pairs_line(description)}",
+        f"end effectors  {', '.join(description.config.end_effectors) or 'none recognised'}",
+        f"home           {home_line(description)}",
     ):
         OUT.print(line, highlight=False, markup=False, soft_wrap=True)
-    for line in _table(described.notes):
+    for line in _table(description.notes):
         OUT.print(line, highlight=False, soft_wrap=True)
     for line in (
         *(f"{what:<14} {path}" for path, what in outcome.items()),
@@ -257,7 +257,7 @@ class Progress:
         self._next = time.perf_counter() + _PATIENCE
 
     def __call__(self, what: str) -> None:
-        """What is done next."""
+        """Print the next step, unless a line was printed just before."""
         if time.perf_counter() >= self._next:
             ERR.print(f"{what} …", style="dim", highlight=False, markup=False, soft_wrap=True)
             self._next = time.perf_counter() + _PATIENCE

@@ -1,4 +1,4 @@
-"""What a look at a robot finds."""
+"""The report of `robot check`."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Joint:
 
 @dataclass
 class Report:
-    """What `robot check` found."""
+    """Findings of `robot check`."""
 
     name: str
     source: str

@@ -10,27 +10,27 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from qpavoid.geometry.bodies import enclosing_capsule, hull_points
-from qpavoid.geometry.capsules import CapsuleFit, fit_capsule, outermost
+from qpavoid.geometry.capsules import CapsuleFit, extreme_points, fit_capsule
 from qpavoid.geometry.segments import point_segment
 from qpavoid.problem import Array
 from qpavoid.setup.volume import solid_volume
 
 Bodies = Literal["auto", "capsule", "capsules", "convex"]
-"""`auto`: the leanest of the others for each piece; `capsule`: one each; `capsules`: as many as pay, up to `MOST`;
-`convex`: hulls of meshes, primitives as they are."""
+"""`auto`: the leanest of the others for each piece; `capsule`: one each; `capsules`: up to `MAX_CAPSULES`, while each
+further one saves enough; `convex`: hulls of meshes, primitives as they are."""
 
-MOST = 4
+MAX_CAPSULES = 4
 """Capsules that one piece is cut into at most."""
-GROSS = 2.0
+MAX_VOLUME_RATIO = 2.0
 """Volume of capsules, in units of the hull's, from which `auto` takes the hull instead, although a hull costs a pair
 twenty times what a capsule costs. A capsule around a cylinder takes 1.3 to 2, around a cube 2.7."""
-CONCAVE = 1.5
+MIN_CONCAVITY = 1.5
 """Volume of a mesh's hull, in units of what the mesh encloses, from which `auto` compares several capsules [-]."""
 _FINE = 4000
 """Triangles from which cuts are chosen on a coarser surface; what is cut, and enclosed, is the surface itself."""
 _GRID = 32
 """Cells of the coarser surface along its longest side."""
-WORTH = 0.15
+MIN_SAVING = 0.15
 """Part of the volume that a further capsule must save."""
 _CUTS = np.linspace(0.2, 0.8, 7)
 """Where cuts are tried along each principal axis, in parts of the extent."""
@@ -39,7 +39,9 @@ _COARSE = 24
 
 
 def fit_piece(geometry: Any, how: Bodies, inside: float | None = None) -> tuple[CapsuleFit, ...]:
-    """Capsules that enclose a coal geometry entirely; none where its hull, or the primitive itself, is to stand for it.
+    """Fit capsules that enclose a coal geometry entirely.
+
+    None where its hull, or the primitive itself, is to stand for it.
 
     Args:
         geometry: as read from a URDF.
@@ -54,13 +56,13 @@ def fit_piece(geometry: Any, how: Bodies, inside: float | None = None) -> tuple[
     if how == "convex":
         return ()
     one = enclosing_capsule(geometry)
-    gross = GROSS * hull_volume(geometry)
+    gross = MAX_VOLUME_RATIO * hull_volume(geometry)
     is_mesh = isinstance(geometry, coal.BVHModelBase)
     lean = how == "capsule" or (how == "auto" and one.volume <= gross)
     if how == "auto" and is_mesh:
         inside = inside_volume(geometry) if inside is None else inside
         hull = hull_volume(geometry)
-        if hull > CONCAVE * inside:  # several capsules may follow a bend that the hull spans
+        if hull > MIN_CONCAVITY * inside:  # several capsules may follow a bend that the hull spans
             several = decompose(triangles(geometry), one)
             if sum(fit.volume for fit in several) < min(hull, one.volume):
                 return several
@@ -72,8 +74,8 @@ def fit_piece(geometry: Any, how: Bodies, inside: float | None = None) -> tuple[
     return () if how == "auto" and sum(fit.volume for fit in several) > gross else several
 
 
-def decompose(surface: Array, whole: CapsuleFit, most: int = MOST) -> tuple[CapsuleFit, ...]:
-    """Capsules that enclose a body together, fewer than `most` where more would not pay.
+def decompose(surface: Array, whole: CapsuleFit, most: int = MAX_CAPSULES) -> tuple[CapsuleFit, ...]:
+    """Cover a body with capsules, fewer than `most` where more would not pay.
 
     The piece whose cut saves most is cut in two by a plane across one of its principal axes, again and again.
     Triangles are cut exactly, so that each capsule encloses the whole part of the surface on its side; what is inside
@@ -89,7 +91,7 @@ def decompose(surface: Array, whole: CapsuleFit, most: int = MOST) -> tuple[Caps
     while len(parts) < most:
         savings = [part[1].volume - sum(fit.volume for _, fit in cut) for part, cut in zip(parts, cuts, strict=True)]
         best = int(np.argmax(savings))
-        if savings[best] < WORTH * sum(fit.volume for _, fit in parts):
+        if savings[best] < MIN_SAVING * sum(fit.volume for _, fit in parts):
             break
         parts[best : best + 1] = cuts[best]
         cuts[best : best + 1] = [_halves(half) for half, _ in cuts[best]]
@@ -97,7 +99,10 @@ def decompose(surface: Array, whole: CapsuleFit, most: int = MOST) -> tuple[Caps
 
 
 def _halves(surface: Array) -> list[tuple[Array, CapsuleFit]]:
-    """The two halves with the least volume, each with its capsule; the whole where it cannot be cut."""
+    """Cut a surface into the two halves with the least volume, each with its capsule.
+
+    The whole where it cannot be cut.
+    """
     plane = _best_cut(_coarse(surface))
     halves = [] if plane is None else [cut(surface, *plane, side) for side in (-1.0, 1.0)]
     if not halves or not all(len(half) for half in halves):
@@ -106,11 +111,14 @@ def _halves(surface: Array) -> list[tuple[Array, CapsuleFit]]:
 
 
 def _fit(surface: Array) -> CapsuleFit:
-    """A small capsule around a surface: of many corners, around the outermost, and then wider by what sticks out."""
+    """Fit a small capsule around a surface.
+
+    Of many corners, around the extreme ones, then widened by what sticks out.
+    """
     points = _corners(surface)
     if len(points) <= _MANY:
         return fit_capsule(points)
-    fit = fit_capsule(outermost(points))
+    fit = fit_capsule(extreme_points(points))
     half = 0.5 * fit.length * fit.rotation[:, 2]
     sticks_out = float(point_segment(points, fit.center - half, fit.center + half).distance.max()) - fit.radius
     wider = replace(fit, radius=fit.radius + max(sticks_out, 0.0))
@@ -122,22 +130,28 @@ _MANY, _WIDER = 500, 1.05
 
 
 def _best_cut(surface: Array) -> tuple[Array, float] | None:
-    """Normal (3,) and height [m] of the plane whose halves have the least volume; None where none cuts."""
+    """Find normal (3,) and height [m] of the plane whose halves have the least volume.
+
+    None where no plane cuts.
+    """
     points = _corners(surface)
     axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
-    tried = []
+    candidates = []
     for axis in axes:
         low, high = (points @ axis).min(), (points @ axis).max()
         for height in low + _CUTS * (high - low):
             halves = [cut(surface, axis, height, side) for side in (-1.0, 1.0)]
             if all(len(half) for half in halves):
-                volume = sum(fit_capsule(outermost(half.reshape(-1, 3)), _COARSE).volume for half in halves)
-                tried.append((volume, axis, float(height)))
-    return min(tried, key=lambda found: found[0])[1:] if tried else None
+                volume = sum(fit_capsule(extreme_points(half.reshape(-1, 3)), _COARSE).volume for half in halves)
+                candidates.append((volume, axis, float(height)))
+    return min(candidates, key=lambda candidate: candidate[0])[1:] if candidates else None
 
 
 def _coarse(surface: Array) -> Array:
-    """A surface of many triangles with its corners drawn onto a grid, without the triangles that vanish or coincide."""
+    """Coarsen a surface of many triangles: corners on a grid.
+
+    Triangles that vanish or coincide are left out.
+    """
     if len(surface) <= _FINE:
         return surface
     cell = float(np.ptp(surface.reshape(-1, 3), axis=0).max()) / _GRID
@@ -145,13 +159,15 @@ def _coarse(surface: Array) -> Array:
     index -= index.min(axis=(0, 1))
     number = index @ [1, 1024, 1024 * 1024]
     a, b, c = number.T
-    kept = index[(a != b) & (b != c) & (a != c)]
-    same = np.unique(np.sort(kept @ [1, 1024, 1024 * 1024], axis=1), axis=0, return_index=True)[1]
-    return np.asarray(cell * kept[np.sort(same)] + surface.min(axis=(0, 1))) if len(same) else surface[:_FINE]
+    parts = index[(a != b) & (b != c) & (a != c)]
+    same = np.unique(np.sort(parts @ [1, 1024, 1024 * 1024], axis=1), axis=0, return_index=True)[1]
+    return np.asarray(cell * parts[np.sort(same)] + surface.min(axis=(0, 1))) if len(same) else surface[:_FINE]
 
 
 def cut(surface: Array, normal: Array, height: float, side: float) -> Array:
-    """The part of a surface on one side of the plane normalᵀx = height, triangles cut at the plane (t, 3, 3).
+    """Return the part of a surface on one side of the plane normalᵀx = height (t, 3, 3).
+
+    Triangles are cut at the plane.
 
     Args:
         surface: (t, 3, 3) corners of triangles [m].
@@ -160,25 +176,28 @@ def cut(surface: Array, normal: Array, height: float, side: float) -> Array:
         side: 1 keeps what is above, -1 what is below.
     """
     above = side * (surface @ normal - height)
-    kept = [surface[(above >= 0.0).all(axis=1)]]
-    across = (above > 0.0).any(axis=1) & (above < 0.0).any(axis=1)
-    corners, heights = surface[across], above[across]
+    parts = [surface[(above >= 0.0).all(axis=1)]]
+    is_cut = (above > 0.0).any(axis=1) & (above < 0.0).any(axis=1)
+    corners, heights = surface[is_cut], above[is_cut]
     for turn in range(3):  # each corner in turn is looked at as the one that is alone on its side
         order = [turn, (turn + 1) % 3, (turn + 2) % 3]
         a, b, c = (corners[:, k] for k in order)
         h_a, h_b, h_c = (heights[:, k] for k in order)
-        alone = (h_a > 0.0) & (h_b <= 0.0) & (h_c <= 0.0)
-        rest = (h_a < 0.0) & (h_b > 0.0) & (h_c > 0.0)
+        is_single = (h_a > 0.0) & (h_b <= 0.0) & (h_c <= 0.0)
+        is_double = (h_a < 0.0) & (h_b > 0.0) & (h_c > 0.0)
         with np.errstate(divide="ignore", invalid="ignore"):
             ab = a + (h_a / (h_a - h_b))[:, None] * (b - a)
             ac = a + (h_a / (h_a - h_c))[:, None] * (c - a)
-        kept.append(np.stack((a, ab, ac), axis=1)[alone])
-        kept += [np.stack((ab, b, c), axis=1)[rest], np.stack((ab, c, ac), axis=1)[rest]]
-    return np.concatenate(kept)
+        parts.append(np.stack((a, ab, ac), axis=1)[is_single])
+        parts += [np.stack((ab, b, c), axis=1)[is_double], np.stack((ab, c, ac), axis=1)[is_double]]
+    return np.concatenate(parts)
 
 
 def triangles(geometry: Any) -> Array:
-    """Corners of the triangles of a coal geometry's surface, of its hull where it is no mesh (t, 3, 3) [m]."""
+    """Return the triangles of a coal geometry's surface (t, 3, 3) [m].
+
+    Those of its hull where it is no mesh.
+    """
     if isinstance(geometry, coal.BVHModelBase):
         corners, index = np.array(geometry.vertices()), map(geometry.tri_indices, range(geometry.num_tris))
         return corners[np.array([(t[0], t[1], t[2]) for t in index], dtype=np.intp)]
@@ -187,7 +206,7 @@ def triangles(geometry: Any) -> Array:
 
 
 def hull_volume(geometry: Any) -> float:
-    """Volume of the convex hull of a coal geometry [m³]; 0 where it is flat."""
+    """Compute the volume of the convex hull of a coal geometry [m³]; 0 where it is flat."""
     if isinstance(geometry, coal.ShapeBase) and not isinstance(geometry, coal.ConvexBase):
         return float(geometry.computeVolume())
     try:
@@ -197,14 +216,20 @@ def hull_volume(geometry: Any) -> float:
 
 
 def inside_volume(geometry: Any) -> float:
-    """Volume of what a coal geometry encloses [m³]: of a mesh its own, not that of its hull."""
+    """Compute the volume that a coal geometry encloses [m³].
+
+    Of a mesh its own, not that of its hull.
+    """
     if isinstance(geometry, coal.BVHModelBase):
         return min(solid_volume(triangles(geometry)), hull_volume(geometry))
     return hull_volume(geometry)
 
 
 def _corners(surface: Array) -> Array:
-    """The corners of the hull of a surface, or all of its points where it is flat (n, 3)."""
+    """Return the corners of the hull of a surface (n, 3).
+
+    All of its points where it is flat.
+    """
     points = surface.reshape(-1, 3)
     try:
         return np.asarray(points[ConvexHull(points).vertices])

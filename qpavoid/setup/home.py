@@ -14,13 +14,13 @@ from qpavoid.model.robot import Robot
 from qpavoid.problem import Array
 from qpavoid.setup.sampling import SEED, BoolArray, PairDistances, Space
 
-ROOM = 4.0 / 3.0
+HOME_CLEARANCE = 4.0 / 3.0
 """Distance of a pair at home, in units of its safety distance: 40 mm where 30 mm are to be kept [-]."""
-BENT = 0.5
+MIN_CONDITIONING = 0.5
 """Conditioning of a limb at home, in units of what it typically has, below which it counts as singular [-]."""
 _DRAWS = 200
 """Configurations that tell what is typical, and tries at mending one fault."""
-_PATIENCE = 3000
+_MAX_TRIES = 3000
 """Tries in all."""
 _DIGITS = 2
 """After the point, of positions that were drawn [rad or m]."""
@@ -42,7 +42,7 @@ class Conditioning:
         return self.value / self.typical
 
     def __str__(self) -> str:
-        """One clause for people."""
+        """Return one clause for people."""
         return f"smallest singular value {self.value:.3f}, {self.ratio:.1f} times the typical one"
 
 
@@ -50,7 +50,7 @@ class Limbs:
     """Conditioning of the limbs that end at some frames."""
 
     def __init__(self, robot: Robot, frames: Sequence[str], seed: int = SEED) -> None:
-        """Find which directions each limb moves in, and how well it typically does.
+        """Find the directions that each limb moves in, and its typical conditioning.
 
         Args:
             robot: the robot.
@@ -81,21 +81,24 @@ class Limbs:
                 self._typical.append(float(values[rank - 1]))
 
     def at(self, q: Array) -> list[Conditioning]:
-        """Conditioning of each limb in a configuration (nq,)."""
-        found = []
+        """Compute the conditioning of each limb in a configuration (nq,)."""
+        result = []
         for (frame, rows, rank), moved, typical in zip(self._frames, self.columns, self._typical, strict=True):
-            found.append(Conditioning(float(self._values(frame, rows, moved, q)[rank - 1]), typical))
-        return found
+            result.append(Conditioning(float(self._values(frame, rows, moved, q)[rank - 1]), typical))
+        return result
 
     def _jacobian(self, frame: int, q: Array) -> Array:
-        """(6, nv) of a frame's origin, along the world axes; joints that mimic others are moved by those."""
+        """Compute the Jacobian (6, nv) of a frame's origin, along the world axes.
+
+        Columns of joints that mimic others are added to theirs.
+        """
         pin.computeJointJacobians(self._model, self._data, q)
         pose = pin.updateFramePlacement(self._model, self._data, frame)
         J = self._data.J.reshape(6, -1, order="F") * self._masks[self._model.frames[frame].parentJoint]
         J[:3] += np.cross(J[3:], pose.translation, axisa=0, axisc=0)
-        folded = np.zeros((6, self._model.nv))
-        np.add.at(folded.T, self._columns, J.T)
-        return folded
+        result_jacobian = np.zeros((6, self._model.nv))
+        np.add.at(result_jacobian.T, self._columns, J.T)
+        return result_jacobian
 
     def _values(self, frame: int, rows: int, moved: BoolArray, q: Array) -> Array:
         return np.asarray(np.linalg.svd(self._jacobian(frame, q)[:rows, moved], compute_uv=False))
@@ -103,7 +106,7 @@ class Limbs:
 
 @dataclass(frozen=True)
 class Home:
-    """A home pose, and what is to be known of it."""
+    """A home pose, its clearance and its conditioning."""
 
     q: Array
     """(nq,)."""
@@ -111,122 +114,133 @@ class Home:
     """Least distance of any pair [m]; infinite where there are none."""
     nearest: tuple[str, str] | None
     """Bodies of that pair."""
-    short: float
-    """By how much the pair that lacks most is nearer than `ROOM` times its safety distance [m]; 0 where none is."""
+    deficit: float
+    """Largest distance that a pair lacks to `HOME_CLEARANCE` times its safety distance [m]; 0 where none lacks any."""
     conditioning: dict[str, Conditioning]
     """Of the limb that ends at each frame."""
-    wish: int | None
-    """Which of the wishes it is; None: a pose that was found near the first one."""
+    preference: int | None
+    """Index of the preferred pose that it is; None: a pose near the first of them."""
 
     @property
     def singular(self) -> list[str]:
         """Frames that cannot be moved well in every direction."""
-        return [name for name, value in self.conditioning.items() if value.ratio < BENT]
+        return [name for name, value in self.conditioning.items() if value.ratio < MIN_CONDITIONING]
 
 
-class _Judge:
-    """What is wrong with a pose: faults of its m pairs, then of its limbs, each from 0 on."""
+class _PoseCriteria:
+    """Faults of a pose: of its m pairs, then of its limbs, each 0 or more."""
 
     def __init__(self, robot: Robot, frames: Sequence[str], d1: Array) -> None:
         self.distances, self.limbs = PairDistances(robot), Limbs(robot, frames)
-        self.need = ROOM * d1
+        self.need = HOME_CLEARANCE * d1
 
     def faults(self, q: Array) -> Array:
-        """Share of its needed distance that each pair lacks (m,), and of its needed conditioning each limb [-]."""
-        short = np.maximum(1.0 - self.distances.all(q) / self.need, 0.0) if len(self.need) else np.zeros(0)
-        short += _TOUCH * (short > 1.0)
-        return np.concatenate((short, [max(1.0 - limb.ratio / BENT, 0.0) for limb in self.limbs.at(q)]))
+        """Compute what each pair (m,) lacks of its distance, then each limb of its conditioning.
+
+        As a share of what is needed [-].
+        """
+        deficit = np.maximum(1.0 - self.distances.all(q) / self.need, 0.0) if len(self.need) else np.zeros(0)
+        deficit += _CONTACT_FAULT * (deficit > 1.0)
+        return np.concatenate((deficit, [max(1.0 - limb.ratio / MIN_CONDITIONING, 0.0) for limb in self.limbs.at(q)]))
 
     def movers(self, fault: int) -> BoolArray:
-        """Coordinates (nv,) that can mend a fault."""
+        """Return the coordinates (nv,) that can mend a fault."""
         pairs = len(self.need)
         return self.distances.moved_by(fault) if fault < pairs else self.limbs.columns[fault - pairs]
 
 
-_TOUCH = 10.0
+_CONTACT_FAULT = 10.0
 """Fault of a collision beside that of a pair that is merely near, or of a bend [-]."""
 
 
 def find_home(
     robot: Robot,
-    wishes: Iterable[Array],
+    preferences: Iterable[Array],
     frames: Sequence[str],
     d1: Array,
     pinned: Iterable[str] = (),
     seed: int = SEED,
 ) -> Home:
-    """Find a pose at which every pair has room and no limb is singular, as close to a wished one as can be.
+    """Find a pose near a preferred one with clear pairs and no singular limb.
 
-    The first wish without a fault is taken. Where all have one, the worst fault of the best wish is mended by moving
-    the joints that it depends on, little by little, then the next; in the end every joint that need not have moved is
-    put back. Where not all can be mended, the pose with the fewest and smallest faults is taken.
+    The first preferred pose without a fault is taken. Where all have one, the worst fault of the best is mended by
+    moving the joints that it depends on, little by little, then the next; in the end every joint that need not have
+    moved is restored. Where not all can be mended, the pose with the fewest and smallest faults is taken.
 
     Args:
         robot: with its pairs.
-        wishes: configurations, the best first; at least one.
+        preferences: configurations, the best first; at least one.
         frames: ends of limbs that should move in every direction.
         d1: safety distance of each pair (m,) [m].
-        pinned: joints that stay where the first wish has them.
+        pinned: joints that stay where the first preferred pose has them.
         seed: of the draw.
     """
-    judge, space, wished = _Judge(robot, frames, d1), Space(robot), [np.asarray(q) for q in wishes]
-    held = np.array([name.partition(".")[0] in set(pinned) for name in robot.coordinate_names], dtype=bool)
-    faults = [float(judge.faults(q).sum()) for q in (wished[:1] if held.any() else wished)]
-    clear = [fault == 0.0 for fault in faults]
-    best = clear.index(True) if any(clear) else int(np.argmin(np.floor(np.array(faults) / _TOUCH)))
-    q = wished[best] if clear[best] else _mended(robot, judge, space, wished[best], ~held & space.moving, seed)
-    return _described(robot, judge, q, best if np.array_equal(q, wished[best]) else None)
+    criteria, space, poses = _PoseCriteria(robot, frames, d1), Space(robot), [np.asarray(q) for q in preferences]
+    is_pinned = np.array([name.partition(".")[0] in set(pinned) for name in robot.coordinate_names], dtype=bool)
+    faults = [float(criteria.faults(q).sum()) for q in (poses[:1] if is_pinned.any() else poses)]
+    is_faultless = [fault == 0.0 for fault in faults]
+    best = (
+        is_faultless.index(True) if any(is_faultless) else int(np.argmin(np.floor(np.array(faults) / _CONTACT_FAULT)))
+    )
+    q = (
+        poses[best]
+        if is_faultless[best]
+        else _repair(robot, criteria, space, poses[best], ~is_pinned & space.moving, seed)
+    )
+    return _home_of(robot, criteria, q, best if np.array_equal(q, poses[best]) else None)
 
 
-def _mended(robot: Robot, judge: _Judge, space: Space, start: Array, free: BoolArray, seed: int) -> Array:
-    """A pose near `start` with fewer faults, of which only free coordinates (nv,) differ."""
-    random, q, tries = np.random.default_rng(seed), start, 0
-    faults, hopeless = judge.faults(q), np.zeros(len(judge.faults(q)), dtype=bool)
-    while tries < _PATIENCE and np.any(faults[~hopeless] > 0.0):
-        worst = int(np.argmax(np.where(hopeless, -1.0, faults)))
-        mask, better = judge.movers(worst) & free, q
-        for i, aim in enumerate(space.draw(random, _DRAWS if mask.any() else 0)):
-            step = (i + 1) / _DRAWS * np.asarray(pin.difference(robot.model, q, aim))
-            tried = space.move(start, np.round(pin.difference(robot.model, start, space.move(q, step * mask)), _DIGITS))
-            there, tries = judge.faults(tried), tries + 1
-            if there.sum() < faults.sum() - 1e-9:
-                better, faults = tried, there
+def _repair(robot: Robot, criteria: _PoseCriteria, space: Space, start: Array, free: BoolArray, seed: int) -> Array:
+    """Find a pose near `start` with fewer faults; only free coordinates (nv,) differ."""
+    random, q, evaluations = np.random.default_rng(seed), start, 0
+    faults, is_unfixable = criteria.faults(q), np.zeros(len(criteria.faults(q)), dtype=bool)
+    while evaluations < _MAX_TRIES and np.any(faults[~is_unfixable] > 0.0):
+        worst = int(np.argmax(np.where(is_unfixable, -1.0, faults)))
+        mask, best_pose = criteria.movers(worst) & free, q
+        for i, target in enumerate(space.draw(random, _DRAWS if mask.any() else 0)):
+            step = (i + 1) / _DRAWS * np.asarray(pin.difference(robot.model, q, target))
+            candidate = space.move(
+                start, np.round(pin.difference(robot.model, start, space.move(q, step * mask)), _DIGITS)
+            )
+            candidate_faults, evaluations = criteria.faults(candidate), evaluations + 1
+            if candidate_faults.sum() < faults.sum() - 1e-9:
+                best_pose, faults = candidate, candidate_faults
                 if faults[worst] == 0.0:
                     break
-        hopeless[worst] = better is q
-        q = better
-    return _put_back(robot, judge, _nearer(robot, judge, space, q, start), start)
+        is_unfixable[worst] = best_pose is q
+        q = best_pose
+    return _restore_joints(robot, criteria, _move_back(robot, criteria, space, q, start), start)
 
 
-def _nearer(robot: Robot, judge: _Judge, space: Space, q: Array, start: Array) -> Array:
-    """The pose nearest to where it started on the straight way there that has no more faults than q."""
-    step, total = np.asarray(pin.difference(robot.model, start, q)), judge.faults(q).sum()
+def _move_back(robot: Robot, criteria: _PoseCriteria, space: Space, q: Array, start: Array) -> Array:
+    """Move back towards `start` on the straight line as long as no fault is added."""
+    step, total = np.asarray(pin.difference(robot.model, start, q)), criteria.faults(q).sum()
     for part in np.linspace(0.05, 0.95, 19):
-        tried = space.move(start, np.round(part * step, _DIGITS))
-        if judge.faults(tried).sum() <= total:
-            return tried
+        candidate = space.move(start, np.round(part * step, _DIGITS))
+        if criteria.faults(candidate).sum() <= total:
+            return candidate
     return q
 
 
-def _put_back(robot: Robot, judge: _Judge, q: Array, start: Array) -> Array:
-    """The pose with every joint where it started that need not have moved."""
-    total = judge.faults(q).sum()
+def _restore_joints(robot: Robot, criteria: _PoseCriteria, q: Array, start: Array) -> Array:
+    """Restore every joint of `start` whose move was not needed."""
+    total = criteria.faults(q).sum()
     for joint in list(robot.model.joints)[1:]:
         part = slice(joint.idx_q, joint.idx_q + joint.nq)
-        tried = q.copy()
-        tried[part] = start[part]
-        if not np.array_equal(tried, q) and judge.faults(tried).sum() <= total:
-            q = tried
+        candidate = q.copy()
+        candidate[part] = start[part]
+        if not np.array_equal(candidate, q) and criteria.faults(candidate).sum() <= total:
+            q = candidate
     return q
 
 
-def _described(robot: Robot, judge: _Judge, q: Array, wish: int | None) -> Home:
-    d = judge.distances.all(q)
+def _home_of(robot: Robot, criteria: _PoseCriteria, q: Array, preference: int | None) -> Home:
+    d = criteria.distances.all(q)
     names = [body.name for body in robot.bodies.geometryObjects]
     nearest = None
     if len(d):
-        a, b = judge.distances.pairs[int(np.argmin(d))]
+        a, b = criteria.distances.pairs[int(np.argmin(d))]
         nearest = names[a], names[b]
-    conditioning = dict(zip(judge.limbs.names, judge.limbs.at(q), strict=True))
-    short = float(np.max(judge.need - d, initial=0.0))
-    return Home(q, float(np.min(d, initial=np.inf)), nearest, short, conditioning, wish)
+    conditioning = dict(zip(criteria.limbs.names, criteria.limbs.at(q), strict=True))
+    deficit = float(np.max(criteria.need - d, initial=0.0))
+    return Home(q, float(np.min(d, initial=np.inf)), nearest, deficit, conditioning, preference)

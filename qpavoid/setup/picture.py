@@ -18,7 +18,7 @@ from qpavoid.config import Body, Hull
 from qpavoid.geometry.bodies import hull_points
 from qpavoid.model.joints import frame_index
 from qpavoid.problem import Array
-from qpavoid.setup.add import Described
+from qpavoid.setup.add import Description
 from qpavoid.setup.fit import triangles
 from qpavoid.setup.texts import volume_line
 from qpavoid.setup.written import BLANK, seal
@@ -33,19 +33,19 @@ _GRID = 250
 """Cells along the longest side of a robot: corners of meshes in one cell are drawn as one."""
 
 
-def bodies_picture(described: Described) -> bytes:
-    """A PNG of the robot at its home pose, sealed.
+def bodies_picture(description: Description) -> bytes:
+    """Draw the robot at its home pose: a PNG, sealed.
 
     Args:
-        described: what `robot add` worked out.
+        description: what `robot add` worked out.
     """
-    meshes, capsules, exact = _surfaces(described)
+    meshes, capsules, exact = _surfaces(description)
     cloud = np.concatenate([faces.reshape(-1, 3) for faces in (meshes, capsules, exact)])
     lower, upper = (cloud.min(axis=0), cloud.max(axis=0)) if len(cloud) else (-np.ones(3), np.ones(3))
     size = np.maximum(upper - lower, 0.1 * float(np.max(upper - lower)) + 1e-6)
     meshes = _coarser(meshes, float(np.max(size)) / _GRID)
     figure = Figure(figsize=(11.0, 7.0), dpi=110)
-    figure.suptitle(f"{described.config.name}; bodies: {volume_line(described)}", fontsize=10)
+    figure.suptitle(f"{description.config.name}; bodies: {volume_line(description)}", fontsize=10)
     for index, (elevation, azimuth) in enumerate(_VIEWS):
         ax: Any = figure.add_axes(
             (0.5 * index - 0.05, 0.02, 0.6, 0.98), projection="3d", proj_type="ortho", computed_zorder=False
@@ -69,7 +69,10 @@ def bodies_picture(described: Described) -> bytes:
 
 
 def _paint(ax: Any, layers: list[tuple[Array, str]], opacity: float, towards: Array, order: int) -> None:
-    """Draws solid faces, or of translucent ones those that face the viewer (meshes may be inside out)."""
+    """Draw solid faces; of translucent ones those that face the viewer.
+
+    Meshes may be inside out.
+    """
     faces = np.concatenate([layer for layer, _ in layers])
     colours = np.concatenate([shade(layer, colour, towards) for layer, colour in layers])
     front = (normals(faces) @ towards > 0.0) | (opacity == 1.0)
@@ -78,28 +81,31 @@ def _paint(ax: Any, layers: list[tuple[Array, str]], opacity: float, towards: Ar
         ax.add_collection3d(Poly3DCollection(faces[front], facecolors=rgba, edgecolors="none", zorder=order))
 
 
-def _surfaces(described: Described) -> tuple[Array, Array, Array]:
-    """Quadrilaterals (m, 4, 3) of the geometry, of capsules and spheres, and of exact bodies, at home [m]."""
-    robot = described.robot
+def _surfaces(description: Description) -> tuple[Array, Array, Array]:
+    """Return quadrilaterals (m, 4, 3) of geometry, capsules and exact bodies at home [m].
+
+    Spheres count as capsules.
+    """
+    robot = description.robot
     data = robot.model.createData()
     pin.framesForwardKinematics(robot.model, data, robot.home)
 
-    def placed(faces: Array, link: str, placement: Any) -> Array:
+    def in_world(faces: Array, link: str, placement: Any) -> Array:
         pose = data.oMf[frame_index(robot.model, link)] * placement
         return np.asarray(faces @ pose.rotation.T + pose.translation)
 
-    meshes = [placed(_piece_faces(piece.geometry), piece.link, piece.placement) for piece in described.pieces]
-    pieces = {piece.name: piece for piece in described.pieces}
+    meshes = [in_world(_piece_faces(piece.geometry), piece.link, piece.placement) for piece in description.pieces]
+    pieces = {piece.name: piece for piece in description.pieces}
     capsules: list[Array] = []
     exact: list[Array] = []
-    for body, live in zip(described.config.bodies, robot.bodies.geometryObjects, strict=True):
+    for body, live in zip(description.config.bodies, robot.bodies.geometryObjects, strict=True):
         assert isinstance(body, Body)
         in_link = robot.model.frames[live.parentFrame].placement.actInv(live.placement)
         if isinstance(body.shape, Hull):
             piece = pieces[body.shape.geometry]
-            exact.append(placed(_hull_faces(hull_points(piece.geometry)), piece.link, piece.placement))
+            exact.append(in_world(_hull_faces(hull_points(piece.geometry)), piece.link, piece.placement))
             continue
-        faces = placed(shape_faces(body.shape.model_dump()), body.frame, in_link)
+        faces = in_world(shape_faces(body.shape.model_dump()), body.frame, in_link)
         (capsules if body.shape.type in ("capsule", "sphere") else exact).append(faces)
     none = np.zeros((0, 4, 3))
     return np.concatenate([none, *meshes]), np.concatenate([none, *capsules]), np.concatenate([none, *exact])
@@ -132,7 +138,10 @@ def _as_quads(corners: Array) -> Array:
 
 
 def _coarser(faces: Array, cell: float) -> Array:
-    """Faces with corners drawn onto a grid, without those that vanish or are there twice: enough for a picture."""
+    """Coarsen faces for a picture: corners on a grid.
+
+    Faces that vanish or coincide are left out.
+    """
     if not len(faces):
         return faces
     index = np.round(faces / cell).astype(np.int64)

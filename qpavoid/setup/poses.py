@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from qpavoid.errors import ConfigError, UnknownName, nearest
-from qpavoid.model.joints import middle
+from qpavoid.model.joints import middle_configuration
 from qpavoid.model.kinematics import MIMIC
 from qpavoid.model.notes import Note, NoteKind
 from qpavoid.model.robot import Robot
@@ -25,8 +25,11 @@ _DIGITS = 5
 """After the point, of positions in files [rad or m]."""
 
 
-def wished_homes(robot: Robot, semantics: Semantics) -> list[Array]:
-    """Named poses of the SRDF, then the middle of the joints' ranges; rounded, and within the limits."""
+def home_candidates(robot: Robot, semantics: Semantics) -> list[Array]:
+    """List candidate home poses: those of the SRDF, then the middle of the ranges.
+
+    They are rounded, and within the limits.
+    """
     states: list[Mapping[str, float]] = [*semantics.states.values(), {}]
     return [_posed(robot.model, robot.home, state) for state in states]
 
@@ -45,7 +48,7 @@ def _posed(model: Any, q: Array, state: Mapping[str, float]) -> Array:
 
 
 def joint_values(model: Any, q: Array) -> dict[str, float]:
-    """Position of every joint that one number describes [rad or m]."""
+    """Return the position of every joint that one number describes [rad or m]."""
     values = {}
     for name, joint in zip(list(model.names)[1:], list(model.joints)[1:], strict=True):
         if joint.nq == 1:
@@ -55,7 +58,7 @@ def joint_values(model: Any, q: Array) -> dict[str, float]:
     return values
 
 
-def locks(
+def joint_locks(
     urdf: Path,
     model: Any,
     patterns: Sequence[str],
@@ -63,36 +66,38 @@ def locks(
     notes: list[Note],
     wheels: Sequence[str] = (),
 ) -> dict[str, float]:
-    """Joints that are held, and where: those the user names, wheels, and joints that could not follow another one.
+    """Find the joints to lock, with their positions.
+
+    Those that the user names, wheels, and joints that could not follow another one.
 
     A joint that mimics another one follows it without a coordinate of its own, and the other one stays free. Where
     Pinocchio cannot read the two so, they would move on their own, which they cannot, and both are held.
     """
     names = list(model.names)[1:]
-    held = []
+    lock_names = []
     for pattern in patterns:
-        found = [name for name in names if fnmatchcase(name, pattern)]
-        if not found:
+        result = [name for name in names if fnmatchcase(name, pattern)]
+        if not result:
             raise UnknownName(f"--lock: no joint {pattern!r}{nearest(pattern, names)}")
-        held += found
-    if wheels := [name for name in wheels if name not in held]:
-        what = "locked: wheels of a mobile base, whose own coordinates move it"
-        notes.append(Note(NoteKind.JOINT, tuple(wheels), what, "take them out of `lock` to drive them"))
-    held += wheels
+        lock_names += result
+    if wheels := [name for name in wheels if name not in lock_names]:
+        clause = "locked: wheels of a mobile base, whose own coordinates move it"
+        notes.append(Note(NoteKind.JOINT, tuple(wheels), clause, "take them out of `lock` to drive them"))
+    lock_names += wheels
     followers = {name: source for name, source in mimics(urdf).items() if name in names}
-    apart = {name for name in followers if model.joints[model.getJointId(name)].shortname() != MIMIC}
-    coupled = [name for name in names if name in apart or name in {followers[other][0] for other in apart}]
-    if coupled := [name for name in coupled if name not in held]:
-        what = "locked: they move together (mimic), in a way that the model cannot hold"
-        notes.append(Note(NoteKind.JOINT, tuple(coupled), what, severity="warning"))
-    led = dict.fromkeys(source for name, (source, _, _) in followers.items() if name not in apart)
-    if drivers := [name for name in led if name not in (*held, *coupled)]:
-        what = "free, and moved for avoidance: others follow them (mimic), as fingers do"
-        notes.append(Note(NoteKind.JOINT, tuple(drivers), what, f"--lock {drivers[0]} where something else moves it"))
+    uncoupled = {name for name in followers if model.joints[model.getJointId(name)].shortname() != MIMIC}
+    coupled = [name for name in names if name in uncoupled or name in {followers[other][0] for other in uncoupled}]
+    if coupled := [name for name in coupled if name not in lock_names]:
+        clause = "locked: they move together (mimic), in a way that the model cannot hold"
+        notes.append(Note(NoteKind.JOINT, tuple(coupled), clause, severity="warning"))
+    leaders = dict.fromkeys(source for name, (source, _, _) in followers.items() if name not in uncoupled)
+    if drivers := [name for name in leaders if name not in (*lock_names, *coupled)]:
+        clause = "free, and moved for avoidance: others follow them (mimic), as fingers do"
+        notes.append(Note(NoteKind.JOINT, tuple(drivers), clause, f"--lock {drivers[0]} where something else moves it"))
     state = next(iter(semantics.states.values()), {})
-    start = joint_values(model, _posed(model, middle(model), state))
+    start = joint_values(model, _posed(model, middle_configuration(model), state))
     values = {}
-    for name in [*held, *coupled]:
+    for name in [*lock_names, *coupled]:
         if model.joints[model.getJointId(name)].shortname() == MIMIC:
             continue  # it is held with the one that it follows
         if name not in start:
@@ -103,13 +108,13 @@ def locks(
 
 
 def mimics(urdf: Path) -> dict[str, tuple[str, float, float]]:
-    """Joint: the one that it follows, multiplier and offset."""
+    """Read the mimic joints: the joint that each follows, multiplier and offset."""
     if is_mjcf(urdf):
         return {}
-    found: dict[str, tuple[str, float, float]] = {}
+    result: dict[str, tuple[str, float, float]] = {}
     for joint in read_robot_xml(urdf, "URDF").iter("joint"):
         mimic: ET.Element | None = joint.find("mimic")
         if mimic is not None:
             numbers = float(mimic.get("multiplier", "1")), float(mimic.get("offset", "0"))
-            found[joint.get("name", "")] = (mimic.get("joint", ""), *numbers)
-    return found
+            result[joint.get("name", "")] = (mimic.get("joint", ""), *numbers)
+    return result

@@ -1,4 +1,4 @@
-"""Which pairs of bodies are not checked, why, and how often the robot's own geometry touches there."""
+"""Pairs of bodies that are not checked: the reasons, and how often the robot's own geometry touches there."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import pinocchio as pin
 from qpavoid.config import PairMargin
 from qpavoid.model.joints import frame_index
 from qpavoid.model.notes import Note, NoteKind
-from qpavoid.model.pairs import ALWAYS, contacts
+from qpavoid.model.pairs import ALWAYS_TOUCHING, find_contacts
 from qpavoid.model.robot import Robot
 from qpavoid.problem import Array
-from qpavoid.setup.sampling import D1, SEED, BoolArray, Sampled, Space
+from qpavoid.setup.sampling import D1, SEED, BoolArray, PairSamples, Space
 from qpavoid.setup.shapes import Piece
 
 Reason = Literal["adjacent", "srdf", "always", "drawn in", "never"]
@@ -24,7 +24,7 @@ _POSES = 200
 
 
 @dataclass(frozen=True)
-class LeftOut:
+class UncheckedLinks:
     """Two links of which no pair of bodies is checked."""
 
     links: tuple[str, str]
@@ -35,18 +35,21 @@ class LeftOut:
     """The same of the file's own geometry, meshes as they are [-]."""
 
     def note(self) -> Note | None:
-        """Say what may matter of it; None of what never touches, or always does as neighbours do."""
+        """Return a note of what may matter.
+
+        None of pairs that never touch, or always do as neighbours do.
+        """
         share, kind = self.geometry, NoteKind.PAIR
-        if self.reason == "always" and share < ALWAYS:
+        if self.reason == "always" and share < ALWAYS_TOUCHING:
             bodies = 100.0 * (self.bodies or 0.0)
-            what = f"not checked: their bodies touch in {bodies:.0f} % of configurations, their geometry more seldom"
+            clause = f"not checked: their bodies touch in {bodies:.0f} % of configurations, their geometry more seldom"
             remedy = f"leaner bodies: --bodies {self.links[0]}=convex, or of your own"
-            return Note(kind, self.links, what, remedy, "warning", share)
+            return Note(kind, self.links, clause, remedy, "warning", share)
         if self.reason == "always":
             return Note(kind, self.links, "not checked: they overlap by design", share=share)
         if self.reason == "drawn in":
             return Note(kind, self.links, "not checked: they slide into each other by design", share=share)
-        if not 0.0 < share < ALWAYS:
+        if not 0.0 < share < ALWAYS_TOUCHING:
             return None
         why, remedy = "one joint apart", "limit that joint so that they cannot"
         if self.reason == "srdf":
@@ -59,31 +62,33 @@ def _pairs(robot: Robot) -> list[frozenset[str]]:
     return [frozenset((names[pair.first], names[pair.second])) for pair in robot.bodies.collisionPairs]
 
 
-def pair_reasons(bare: Robot, robot: Robot, sampled: Sampled, nested: BoolArray) -> dict[frozenset[str], Reason]:
-    """Why each pair of bodies that is not checked is not.
+def pair_reasons(
+    bare: Robot, robot: Robot, pair_samples: PairSamples, is_nested: BoolArray
+) -> dict[frozenset[str], Reason]:
+    """Explain why each pair of bodies that is not checked is not.
 
     Args:
         bare: the robot without an SRDF.
         robot: the robot with it.
-        sampled: what became of its pairs.
-        nested: which of them slide into each other (m,).
+        pair_samples: what became of its pairs.
+        is_nested: which of them slide into each other (m,).
     """
     names = [body.name for body in bare.bodies.geometryObjects]
     touching = {frozenset(pair[:2]) for pair in robot.always_touching}
     checked = {*_pairs(bare), *(frozenset(pair[:2]) for pair in bare.always_touching)}
-    kept = {pair: i for i, pair in enumerate(_pairs(robot))}
+    mask = {pair: i for i, pair in enumerate(_pairs(robot))}
     reasons: dict[frozenset[str], Reason] = {}
     for pair in [frozenset((a, b)) for i, a in enumerate(names) for b in names[:i]]:
-        index = kept.get(pair)
-        if pair in touching or (index is not None and sampled.always[index]):
+        index = mask.get(pair)
+        if pair in touching or (index is not None and pair_samples.always[index]):
             reasons[pair] = "always"
         elif pair not in checked:
             reasons[pair] = "adjacent"
         elif index is None:
             reasons[pair] = "srdf"
-        elif nested[index]:
+        elif is_nested[index]:
             reasons[pair] = "drawn in"
-        elif sampled.never[index]:
+        elif pair_samples.never[index]:
             reasons[pair] = "never"
     return reasons
 
@@ -94,7 +99,7 @@ _WHY = {"adjacent": "Adjacent", "always": "Default", "never": "Never", "drawn in
 def by_link(
     robot: Robot, reasons: Mapping[frozenset[str], Reason]
 ) -> tuple[dict[frozenset[str], Reason], list[tuple[str, str]]]:
-    """What is not checked, by links where that says it all, and by bodies where it does not."""
+    """Sort unchecked pairs: by links where that describes them, else by bodies."""
     link = _links(robot)
     pairs: dict[frozenset[str], list[Reason | None]] = {}
     names = list(link)
@@ -103,19 +108,19 @@ def by_link(
             if link[a] != link[b]:
                 pairs.setdefault(frozenset((link[a], link[b])), []).append(reasons.get(frozenset((a, b))))
     order: tuple[Reason, ...] = ("drawn in", "always", "srdf", "adjacent", "never")
-    off = {
+    disabled = {
         links: min((why for why in whys if why), key=order.index) for links, whys in pairs.items() if None not in whys
     }
     single = [
         (min(pair), max(pair))
         for pair, why in reasons.items()
-        if why in ("never", "always", "drawn in") and frozenset(link[body] for body in pair) not in off
+        if why in ("never", "always", "drawn in") and frozenset(link[body] for body in pair) not in disabled
     ]
-    return off, sorted(single)
+    return disabled, sorted(single)
 
 
 def srdf_reason(reason: Reason) -> str:
-    """The reason as an SRDF gives it."""
+    """Return the reason as an SRDF gives it."""
     return _WHY.get(reason, "User")
 
 
@@ -123,32 +128,37 @@ def _links(robot: Robot) -> dict[str, str]:
     return {body.name: robot.model.frames[body.parentFrame].name for body in robot.bodies.geometryObjects}
 
 
-def left_out(
-    robot: Robot, pieces: Sequence[Piece], off: Mapping[frozenset[str], Reason], shares: Mapping[frozenset[str], float]
-) -> list[LeftOut]:
-    """Look how often the geometry of links that are not checked touches, in random configurations.
+def measure_unchecked(
+    robot: Robot,
+    pieces: Sequence[Piece],
+    disabled: Mapping[frozenset[str], Reason],
+    shares: Mapping[frozenset[str], float],
+) -> list[UncheckedLinks]:
+    """Sample how often the geometry of links that are not checked touches.
 
     Args:
         robot: with its pairs.
         pieces: geometry as the file has it.
-        off: two links that are not checked, and why.
+        disabled: two links that are not checked, and why.
         shares: two bodies: share of configurations in which they touch [-].
     """
     # bodies enclose the geometry: where they never come near, it does not touch
-    of_geometry = geometry_contacts(robot, pieces, [links for links, reason in off.items() if reason != "never"])
+    of_geometry = geometry_contacts(robot, pieces, [links for links, reason in disabled.items() if reason != "never"])
     link = _links(robot)
     of_bodies: dict[frozenset[str], float] = {}
     for pair, share in shares.items():
         links = frozenset(link[body] for body in pair)
         of_bodies[links] = max(of_bodies.get(links, 0.0), share)
     return [
-        LeftOut((min(links), max(links)), reason, of_bodies.get(links), of_geometry.get(links, 0.0))
-        for links, reason in sorted(off.items(), key=lambda item: sorted(item[0]))
+        UncheckedLinks((min(links), max(links)), reason, of_bodies.get(links), of_geometry.get(links, 0.0))
+        for links, reason in sorted(disabled.items(), key=lambda item: sorted(item[0]))
     ]
 
 
-def unchecked(robot: Robot, pieces: Sequence[Piece]) -> list[LeftOut]:
-    """The links of a robot as it loads of which no pair of bodies is checked, and how often their geometry touches.
+def find_unchecked(robot: Robot, pieces: Sequence[Piece]) -> list[UncheckedLinks]:
+    """Find the links of a robot of which no pair of bodies is checked.
+
+    Also how often their geometry touches.
 
     Args:
         robot: with its pairs.
@@ -157,20 +167,22 @@ def unchecked(robot: Robot, pieces: Sequence[Piece]) -> list[LeftOut]:
     link, joint = _links(robot), {body.name: body.parentJoint for body in robot.bodies.geometryObjects}
     checked = {frozenset(link[body] for body in pair) for pair in _pairs(robot)}
     always = {frozenset((link[pair.a], link[pair.b])) for pair in robot.always_touching}
-    parents, off, names = robot.model.parents, dict[frozenset[str], Reason](), list(link)
+    parents, disabled, names = robot.model.parents, dict[frozenset[str], Reason](), list(link)
     for i, a in enumerate(names):
         for b in names[:i]:
             pair = frozenset((link[a], link[b]))
             if joint[a] != joint[b] and pair not in checked and pair not in always:
                 adjacent = parents[joint[a]] == joint[b] or parents[joint[b]] == joint[a]
-                off[pair] = "adjacent" if adjacent else "srdf"
-    return left_out(robot, pieces, off, {})
+                disabled[pair] = "adjacent" if adjacent else "srdf"
+    return measure_unchecked(robot, pieces, disabled, {})
 
 
 def geometry_contacts(
     robot: Robot, pieces: Sequence[Piece], links: Iterable[frozenset[str]]
 ) -> dict[frozenset[str], float]:
-    """Share of random configurations in which the geometry of two links touches; pairs that never move are left out.
+    """Sample how often the geometry of two links touches, as a share [-].
+
+    Pairs that never move relative to each other are left out.
 
     Args:
         robot: whose model moves the links.
@@ -193,31 +205,34 @@ def geometry_contacts(
                 if joints[i] != joints[j]:
                     geometry.addCollisionPair(pin.CollisionPair(min(i, j), max(i, j)))
                     pair_links.append(pair)
-    touching = contacts(robot.model, geometry, list(Space(robot).draw(np.random.default_rng(SEED), _POSES)))
-    found: dict[frozenset[str], BoolArray] = {}
+    touching = find_contacts(robot.model, geometry, list(Space(robot).draw(np.random.default_rng(SEED), _POSES)))
+    touches: dict[frozenset[str], BoolArray] = {}
     for pair, column in zip(pair_links, touching.T, strict=True):
-        found[pair] = found.get(pair, np.zeros(len(column), dtype=bool)) | column
-    return {pair: float(column.mean()) for pair, column in found.items()}
+        touches[pair] = touches.get(pair, np.zeros(len(column), dtype=bool)) | column
+    return {pair: float(column.mean()) for pair, column in touches.items()}
 
 
-def contact_shares(robot: Robot, sampled: Sampled) -> dict[frozenset[str], float]:
-    """Two bodies: share of random configurations in which they touch [-], of pairs that were sampled."""
-    shares = dict(zip(_pairs(robot), sampled.contact.tolist(), strict=True))
+def shares_of_contact(robot: Robot, pair_samples: PairSamples) -> dict[frozenset[str], float]:
+    """Return the share of configurations in which each pair touches [-].
+
+    Only of pairs that were sampled.
+    """
+    shares = dict(zip(_pairs(robot), pair_samples.contact.tolist(), strict=True))
     return {**shares, **{frozenset((pair.a, pair.b)): pair.share for pair in robot.always_touching}}
 
 
 def own_margins(robot: Robot, d1: Array) -> list[PairMargin]:
-    """Safety distances (m,) of the pairs that get one of their own."""
+    """Return the pairs with a safety distance of their own, from that of each pair (m,)."""
     bodies = [sorted(pair) for pair in _pairs(robot)]
     return [PairMargin(bodies=(a, b), d1=float(own)) for (a, b), own in zip(bodies, d1, strict=True) if own < D1]
 
 
-def keeping(robot: Robot, kept: BoolArray) -> Robot:
-    """The robot with some of its pairs only."""
+def with_pairs(robot: Robot, mask: BoolArray) -> Robot:
+    """Return the robot with some of its pairs only."""
     bodies = pin.GeometryModel(robot.bodies)
     pairs = list(robot.bodies.collisionPairs)
     bodies.removeAllCollisionPairs()
-    for pair, keep in zip(pairs, kept, strict=True):
-        if keep:
+    for pair, is_kept in zip(pairs, mask, strict=True):
+        if is_kept:
             bodies.addCollisionPair(pair)
     return replace(robot, bodies=bodies)

@@ -1,4 +1,4 @@
-"""What random configurations tell of a robot: how often each pair touches, how near it comes, how far it gets."""
+"""Statistics over random configurations: how often each pair touches, its least distance, the size of the robot."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from numpy.typing import NDArray
 from qpavoid.config import Avoidance
 from qpavoid.geometry.bodies import bounding_sphere
 from qpavoid.model.kinematics import columns, support_masks
-from qpavoid.model.pairs import ALWAYS, pair_array
+from qpavoid.model.pairs import ALWAYS_TOUCHING, pair_array
 from qpavoid.model.robot import Robot
 from qpavoid.model.views import read_results, view_results
 from qpavoid.problem import Array, IntArray
 
 BoolArray = NDArray[np.bool_]
 SAMPLES, SEED = 5000, 0
-NEAR = 0.02
+NEVER_NEAR = 0.02
 """Distance, as a share of the robot's size, that a pair must keep in every sample, and where descent from the nearest
-of them ends, to count as never colliding [-]: 20 mm of an arm that reaches 1 m."""
-FAT = 0.03
-"""Distance, as a share of the robot's size, within which two capsules are in every sample if they are too fat [-]."""
+of them ends, to count as never colliding [-]: 20 mm of an arm with a maximal extension of 1 m."""
+ALWAYS_NEAR = 0.03
+"""Distance, as a share of the robot's size, within which two capsules are in every sample if they are oversized [-]."""
 D1 = Avoidance().d1
 """Safety distance of the pairs that have none of their own [m]."""
 _FIRST = 500
@@ -32,17 +32,19 @@ _FIRST = 500
 _SETTLE = 250
 """Samples after which it is decided again which ones these are."""
 _DOUBT = 0.1
-"""Share of samples by which a pair's contact may differ from `ALWAYS` and still come to reach it [-]."""
+"""Share of samples by which a pair's contact may differ from `ALWAYS_TOUCHING` and still come to reach it [-]."""
 _STEPS = 60
 """Of a descent."""
 _UNBOUNDED = np.pi
-"""Range of coordinates without limits: joints that turn all the way round, and a root that never matters here."""
+"""Half the range of coordinates without limits: continuous joints, and a root, whose pose does not matter here."""
 
 
 def robot_size(robot: Robot) -> float:
-    """Half the diagonal of the largest box that the bodies fill in some configurations, never 0 [m].
+    """Estimate the size of a robot [m], never 0.
 
-    About the reach of an arm, the height of a humanoid: what distances on this robot are large or small beside.
+    Half the diagonal of the largest box that the bodies fill in some configurations.
+
+    About the maximal extension of an arm, the height of a humanoid: the scale of distances on this robot.
     """
     bodies = robot.bodies.geometryObjects
     if not len(bodies):
@@ -75,7 +77,10 @@ class PairDistances:
         self._view = view
 
     def all(self, q: Array) -> Array:
-        """Distances (m,) [m] of the pairs that are switched on; of the others, what they were last."""
+        """Compute the distances (m,) of the active pairs [m].
+
+        Others keep the value of the last call in which they were active.
+        """
         pin.updateGeometryPlacements(self.model, self.data, self._bodies, self._geometry, q)
         pin.computeDistances(self._bodies, self._geometry)
         results = getattr(self, "_view", None)
@@ -83,13 +88,13 @@ class PairDistances:
             results = read_results(self._geometry.distanceResults)
         return np.array(results[:, 0]) if len(results) else np.zeros(0)
 
-    def switch_off(self, pairs: Iterable[int]) -> None:
-        """Leaves pairs out from now on."""
+    def deactivate(self, pairs: Iterable[int]) -> None:
+        """Deactivate pairs from now on."""
         for index in pairs:
             self._geometry.deactivateCollisionPair(int(index))
 
     def gradient(self, index: int, q: Array) -> tuple[float, Array]:
-        """Distance of one pair [m] and its gradient (nv,)."""
+        """Compute the distance of one pair [m] and its gradient (nv,)."""
         pin.computeJointJacobians(self.model, self.data, q)
         pin.updateGeometryPlacements(self.model, self.data, self._bodies, self._geometry)
         result = pin.computeDistance(self._bodies, self._geometry, index)
@@ -98,7 +103,7 @@ class PairDistances:
         return float(result.min_distance), np.bincount(self._columns, row, self.model.nv).astype(np.float64)
 
     def moved_by(self, index: int) -> BoolArray:
-        """Coordinates (nv,) that change the distance of one pair."""
+        """Return the coordinates (nv,) that change the distance of one pair."""
         return np.bincount(self._columns, np.abs(self._support[index]), self.model.nv) > 0.0
 
 
@@ -122,7 +127,7 @@ class Space:
         self.moving[self._v] = True
 
     def draw(self, random: np.random.Generator, count: int) -> Array:
-        """Configurations (count, nq), even over the joints' ranges."""
+        """Draw configurations (count, nq), uniform over the joints' ranges."""
         turns = random.uniform(-_UNBOUNDED, _UNBOUNDED, (count, self.model.nv)) * self.free
         neutral = pin.neutral(self.model)
         q = np.array([pin.integrate(self.model, neutral, turn) for turn in turns]).reshape(count, self.model.nq)
@@ -130,24 +135,24 @@ class Space:
         return q
 
     def move(self, q: Array, step: Array) -> Array:
-        """q ⊕ step, kept within the limits."""
+        """Return q ⊕ step, clipped to the limits."""
         moved = np.asarray(pin.integrate(self.model, q, step))
         moved[self._q] = np.clip(moved[self._q], self._lower, self._upper)
         return moved
 
-    def towards(self, q: Array, aim: Array, part: float) -> Array:
-        """The configuration at a part of the way from q to another."""
-        return self.move(q, part * np.asarray(pin.difference(self.model, q, aim)))
+    def towards(self, q: Array, target: Array, part: float) -> Array:
+        """Interpolate from q to another configuration."""
+        return self.move(q, part * np.asarray(pin.difference(self.model, q, target)))
 
 
 def _points(model: Any) -> IntArray:
-    """Coordinates in v of the joints whose range is a single point: they are held there."""
-    held = [
+    """Find the coordinates in v of the joints whose range is a single point."""
+    indices = [
         joint.idx_v
         for joint in list(model.joints)[1:]
         if joint.nq == joint.nv == 1 and model.lowerPositionLimit[joint.idx_q] == model.upperPositionLimit[joint.idx_q]
     ]
-    return np.array(held, dtype=np.intp)
+    return np.array(indices, dtype=np.intp)
 
 
 def _root_names(robot: Robot) -> set[str]:
@@ -158,13 +163,13 @@ def _root_names(robot: Robot) -> set[str]:
 
 
 @dataclass(frozen=True)
-class Sampled:
-    """What random configurations show of each of a robot's m pairs."""
+class PairSamples:
+    """Statistics of each of a robot's m pairs over random configurations."""
 
     contact: Array
     """(m,) share of the samples in which it touches [-]."""
     always: BoolArray
-    """(m,) touches in at least `ALWAYS` of them."""
+    """(m,) touches in at least `ALWAYS_TOUCHING` of them."""
     never: BoolArray
     """(m,) keeps away in every sample and in a descent from the nearest one."""
     closest: Array
@@ -179,7 +184,7 @@ class Sampled:
     """Distance that counts as away [m]."""
 
 
-def sample_pairs(robot: Robot, samples: int = SAMPLES, seed: int = SEED) -> Sampled:
+def sample_pairs(robot: Robot, samples: int = SAMPLES, seed: int = SEED) -> PairSamples:
     """Find which of a robot's pairs always touch and which never come near.
 
     Random configurations first; each pair that stayed apart in all of them is then led downhill from where it came
@@ -191,62 +196,67 @@ def sample_pairs(robot: Robot, samples: int = SAMPLES, seed: int = SEED) -> Samp
         seed: of the draw.
     """
     distances, space, random = PairDistances(robot), Space(robot), np.random.default_rng(seed)
-    near, count = NEAR * robot_size(robot), len(distances.pairs)
+    near, count = NEVER_NEAR * robot_size(robot), len(distances.pairs)
     poses = space.draw(random, min(_FIRST, samples))
     first = np.array([distances.all(q) for q in poses]).reshape(len(poses), count)
     touching, done = first <= 0.0, len(poses)
     closest, at = np.min(first, axis=0, initial=np.inf), poses[np.argmin(first, axis=0)]
-    hits, looks = touching.sum(axis=0), np.full(count, done)
-    unsettled = np.ones(count, dtype=bool)
+    contact_counts, sample_counts = touching.sum(axis=0), np.full(count, done)
+    is_open = np.ones(count, dtype=bool)
     while done < samples:
-        settled = unsettled & (closest < near) & (hits < (ALWAYS - _DOUBT) * looks)
-        distances.switch_off(np.flatnonzero(settled))
-        unsettled &= ~settled
-        if not unsettled.any():
+        is_settled = is_open & (closest < near) & (contact_counts < (ALWAYS_TOUCHING - _DOUBT) * sample_counts)
+        distances.deactivate(np.flatnonzero(is_settled))
+        is_open &= ~is_settled
+        if not is_open.any():
             break
         for q in space.draw(random, min(_SETTLE, samples - done)):
             d = distances.all(q)
-            nearer = unsettled & (d < closest)
+            nearer = is_open & (d < closest)
             closest[nearer], at[nearer] = d[nearer], q
-            hits += unsettled & (d <= 0.0)
-            looks += unsettled
+            contact_counts += is_open & (d <= 0.0)
+            sample_counts += is_open
         done += min(_SETTLE, samples - done)
     for index in np.flatnonzero(closest >= near):
         closest[index] = min(closest[index], _descend(distances, space, int(index), at[index], near))
-    contact = hits / looks
+    contact = contact_counts / sample_counts
     free = np.where(touching, np.nan, first)
     typical = np.array([np.nanmedian(d) if not np.isnan(d).all() else np.inf for d in free.T]).reshape(count)
-    return Sampled(contact, contact >= ALWAYS, closest >= near, closest, typical, poses, touching, near)
+    return PairSamples(contact, contact >= ALWAYS_TOUCHING, closest >= near, closest, typical, poses, touching, near)
 
 
-def always_near(robot: Robot, samples: int, seed: int = SEED) -> IntArray:
-    """Pairs of bodies (k, 2) that are within `FAT` of each other in every sample."""
-    distances, fat = PairDistances(robot), FAT * robot_size(robot)
+def pairs_always_near(robot: Robot, samples: int, seed: int = SEED) -> IntArray:
+    """Find the pairs of bodies (k, 2) within `ALWAYS_NEAR` of each other in every sample."""
+    distances, fat = PairDistances(robot), ALWAYS_NEAR * robot_size(robot)
     near = np.ones(len(distances.pairs), dtype=bool)
     for q in Space(robot).draw(np.random.default_rng(seed), samples if near.any() else 0):
         near &= distances.all(q) < fat
-        distances.switch_off(np.flatnonzero(~near))
+        distances.deactivate(np.flatnonzero(~near))
     return distances.pairs[near]
 
 
 def _descend(distances: PairDistances, space: Space, index: int, q: Array, near: float) -> float:
-    """Least distance [m] found along a pair's gradient, with steps that shrink where they lead up."""
+    """Descend along a pair's gradient; return the least distance [m].
+
+    Steps shrink where they lead up.
+    """
     (least, slope), step = distances.gradient(index, q), 0.3
     for _ in range(_STEPS):
         size = float(np.linalg.norm(slope))
         if least < near or size < 1e-9 or step < 1e-3:
             break
-        tried = space.move(q, -step / size * slope)
-        d, slope_there = distances.gradient(index, tried)
+        candidate = space.move(q, -step / size * slope)
+        d, slope_there = distances.gradient(index, candidate)
         if d < least:
-            q, least, slope, step = tried, d, slope_there, 1.3 * step
+            q, least, slope, step = candidate, d, slope_there, 1.3 * step
         else:
             step *= 0.4
     return least
 
 
-def safety_distances(sampled: Sampled) -> Array:
-    """Safety distance (m,) of each pair [m]: the default one, less where the design leaves less room.
+def safety_distances(sampled: PairSamples) -> Array:
+    """Choose the safety distance (m,) of each pair [m].
+
+    The default one, less where the design leaves less clearance.
 
     A pair whose bodies are near each other nearly all along their joints' ranges could not keep the default distance
     in most of them. Half of what it typically has leaves it as much to move in as to keep.
@@ -260,7 +270,10 @@ _CLOSE = 4.0 / 3.0
 
 
 def touching(robot: Robot, q: Array, within: float = 0.0) -> list[tuple[str, str, float]]:
-    """Pairs of a robot's own bodies nearer than a distance, the nearest first, with their distance [m]."""
+    """List the pairs of a robot's own bodies nearer than a distance, the nearest first.
+
+    With their distance [m].
+    """
     names = [body.name for body in robot.bodies.geometryObjects]
     distances = PairDistances(robot)
     d = distances.all(q)

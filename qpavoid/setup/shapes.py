@@ -18,7 +18,7 @@ from qpavoid.errors import UnknownName, nearest
 from qpavoid.geometry.bodies import hull_points
 from qpavoid.geometry.capsules import CapsuleFit, fit_capsule
 from qpavoid.problem import Array
-from qpavoid.setup.fit import GROSS, Bodies, fit_piece, hull_volume, inside_volume
+from qpavoid.setup.fit import MAX_VOLUME_RATIO, Bodies, fit_piece, hull_volume, inside_volume
 
 
 @dataclass(frozen=True)
@@ -39,12 +39,12 @@ class Piece:
 
 
 def pieces_of(geometry: Any, model: Any) -> list[Piece]:
-    """The pieces of a pinocchio geometry model's objects, each in the frame of its link."""
-    found = []
+    """List the pieces of a geometry model's objects, each in the frame of its link."""
+    result = []
     for piece in geometry:
         frame = model.frames[piece.parentFrame]
-        found.append(Piece(piece.name, frame.name, piece.geometry, frame.placement.actInv(piece.placement)))
-    return found
+        result.append(Piece(piece.name, frame.name, piece.geometry, frame.placement.actInv(piece.placement)))
+    return result
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class LinkBodies:
 
 
 def kinds_of_links(pieces: Sequence[Piece], kind: Bodies, by_pattern: Mapping[str, Bodies]) -> dict[str, Bodies]:
-    """Which kind of bodies each link with geometry gets.
+    """Choose the kind of bodies of each link with geometry.
 
     Args:
         pieces: of all links.
@@ -73,15 +73,15 @@ def kinds_of_links(pieces: Sequence[Piece], kind: Bodies, by_pattern: Mapping[st
     """
     kinds = {piece.link: kind for piece in pieces}
     for pattern, chosen in by_pattern.items():
-        found = [link for link in kinds if fnmatchcase(link, pattern)]
-        if not found:
+        result = [link for link in kinds if fnmatchcase(link, pattern)]
+        if not result:
             raise UnknownName(f"--bodies: no link {pattern!r} with geometry{nearest(pattern, kinds)}")
-        kinds.update(dict.fromkeys(found, chosen))
+        kinds.update(dict.fromkeys(result, chosen))
     return kinds
 
 
 def bodies_of_link(pieces: Sequence[Piece], link: str, kind: Bodies) -> LinkBodies:
-    """Bodies that enclose all pieces of a link.
+    """Fit bodies that enclose all pieces of a link.
 
     One capsule around all pieces takes the place of several shapes where it takes no more room than they do, or, in
     `auto`, where it is not gross.
@@ -96,7 +96,7 @@ def bodies_of_link(pieces: Sequence[Piece], link: str, kind: Bodies) -> LinkBodi
     if len(shapes) > 1 and kind != "convex":
         points = [_moved(hull_points(piece.geometry), piece.placement) for piece in pieces]
         whole = fit_capsule(np.concatenate(points))
-        if whole.volume <= max(volume, GROSS * sum(hulls) if kind == "auto" else 0.0):
+        if whole.volume <= max(volume, MAX_VOLUME_RATIO * sum(hulls) if kind == "auto" else 0.0):
             shapes, volume = [capsule_fields(whole, pin.SE3.Identity())], whole.volume
     names = [link] if len(shapes) == 1 else [f"{link}_{index}" for index in range(len(shapes))]
     bodies = [Body(name=name, frame=link, **shape) for name, shape in zip(names, shapes, strict=True)]
@@ -108,7 +108,7 @@ def _moved(points: Array, placement: Any) -> Array:
 
 
 def capsule_fields(fit: CapsuleFit, placement: Any) -> dict[str, Any]:
-    """Fields of a `Body` that encloses a capsule, with five digits after the point.
+    """Return the fields of a `Body` that encloses a capsule, with five decimals.
 
     The radius makes up for the rounding of everything else, so that what was enclosed stays so.
 
@@ -123,8 +123,8 @@ def capsule_fields(fit: CapsuleFit, placement: Any) -> dict[str, Any]:
     length = round(fit.length, _DIGITS)
     if length == 0.0:
         pitch = yaw = 0.0
-    turned = np.array([math.cos(yaw) * math.sin(pitch), math.sin(yaw) * math.sin(pitch), math.cos(pitch)])
-    shift = np.linalg.norm(position - center) + 0.5 * np.linalg.norm(length * turned - fit.length * axis)
+    axis_rounded = np.array([math.cos(yaw) * math.sin(pitch), math.sin(yaw) * math.sin(pitch), math.cos(pitch)])
+    shift = np.linalg.norm(position - center) + 0.5 * np.linalg.norm(length * axis_rounded - fit.length * axis)
     radius = math.ceil((fit.radius + float(shift)) * 10**_DIGITS) / 10**_DIGITS
     shape = Capsule(radius=radius, length=length) if length > 0.0 else Sphere(radius=radius)
     return {"shape": shape, "position": tuple(position.tolist()), "rpy": (0.0, pitch, yaw)}
@@ -135,7 +135,7 @@ _DIGITS = 5
 
 
 def _exact_fields(piece: Piece) -> dict[str, Any]:
-    """Fields of a `Body` that is a primitive as it is, or the hull of a mesh."""
+    """Return the fields of a `Body` that is a primitive, or the hull of a mesh."""
     geometry, placement = piece.geometry, piece.placement
     if isinstance(geometry, coal.Box):
         x, y, z = (_up(2.0 * half) for half in geometry.halfSide)
@@ -150,5 +150,5 @@ def _exact_fields(piece: Piece) -> dict[str, Any]:
 
 
 def _up(size: float) -> float:
-    """A size rounded up, but for rounding errors."""
+    """Round a size up, but for rounding errors."""
     return float(math.ceil(size * 10**_DIGITS - 1e-6) / 10**_DIGITS)

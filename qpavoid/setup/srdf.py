@@ -1,4 +1,4 @@
-"""What an SRDF says of a robot, and how one is written."""
+"""SRDF files: reading and writing."""
 
 from __future__ import annotations
 
@@ -29,9 +29,11 @@ _HOMES = ("home", "ready", "default", "standing", "half_sitting", "neutral")
 
 
 def find_srdf(urdf: Path) -> Path | None:
-    """The SRDF beside a URDF, or in `srdf/` beside its folder: the one whose name has most in common with it.
+    """Find the SRDF beside a URDF, or in `srdf/` beside its folder.
 
-    Those that `robot add` wrote are left out: it would be told what it said before.
+    That whose name has most in common with the URDF's.
+
+    Those that `robot add` wrote are left out: they hold its own results.
     """
     folders = (urdf.parent, urdf.parent / "srdf", urdf.parent.parent / "srdf")
     found = [path for folder in folders for path in sorted(folder.glob("*.srdf")) if not _ours(path)]
@@ -46,7 +48,7 @@ def _ours(path: Path) -> bool:
 
 
 def read_srdf(path: Path) -> Semantics:
-    """What an SRDF says; what cannot be understood is left out.
+    """Read an SRDF; what cannot be understood is left out.
 
     Raises:
         ConfigError: not a usable SRDF.
@@ -78,7 +80,7 @@ def _number(text: str) -> float | None:
 
 
 def srdf_text(robot: str, comment: str, disabled: Mapping[frozenset[str], str], ends: Sequence[str]) -> str:
-    """An SRDF.
+    """Write an SRDF.
 
     Args:
         robot: its name, as in its URDF.

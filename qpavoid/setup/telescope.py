@@ -10,7 +10,7 @@ import pinocchio as pin
 from qpavoid.model.pairs import pair_array
 from qpavoid.model.robot import Robot
 from qpavoid.problem import Array
-from qpavoid.setup.sampling import BoolArray, Sampled
+from qpavoid.setup.sampling import BoolArray, PairSamples
 
 _LEAST = 0.1
 """Share of the samples in which such a pair touches, at the least: what touches more seldom meets an end stop [-]."""
@@ -20,7 +20,7 @@ _STRAIGHT = 1e-6
 """Departure of a path from a straight line, as a share of its length, that is rounding [-]."""
 
 
-def drawn_in(robot: Robot, sampled: Sampled) -> BoolArray:
+def nested_pairs(robot: Robot, pair_samples: PairSamples) -> BoolArray:
     """Find the pairs (m,) that overlap when a telescope is drawn in.
 
     Two conditions. The origin of one body's joint moves along a straight line as seen from the other's, so that nothing
@@ -30,26 +30,26 @@ def drawn_in(robot: Robot, sampled: Sampled) -> BoolArray:
 
     Args:
         robot: with its pairs.
-        sampled: of these pairs.
+        pair_samples: of these pairs.
     """
     bodies = robot.bodies.geometryObjects
-    found = np.zeros(len(sampled.contact), dtype=bool)
-    candidates = np.flatnonzero((sampled.touching.mean(axis=0) >= _LEAST) & ~sampled.always).tolist()
+    is_nested = np.zeros(len(pair_samples.contact), dtype=bool)
+    candidates = np.flatnonzero((pair_samples.touching.mean(axis=0) >= _LEAST) & ~pair_samples.always).tolist()
     if not candidates:
-        return found
-    poses = _joint_poses(robot.model, sampled.poses)
+        return is_nested
+    poses = _joint_poses(robot.model, pair_samples.poses)
     pairs = pair_array(robot.bodies)
     for index in candidates:
         a, b = (bodies[int(i)].parentJoint for i in pairs[index])
         for one, other in ((a, b), (b, a)):
             extension = _along_line(poses[:, one], poses[:, other])
-            if extension is not None and _decides(extension, sampled.touching[:, index]):
-                found[index] = True
-    return found
+            if extension is not None and _decides(extension, pair_samples.touching[:, index]):
+                is_nested[index] = True
+    return is_nested
 
 
 def _joint_poses(model: Any, samples: Array) -> Array:
-    """Homogeneous world poses (k, joints, 4, 4) of all joints in some configurations (k, nq)."""
+    """Compute world poses (k, joints, 4, 4) of all joints in configurations (k, nq)."""
     data, poses = model.createData(), []
     for q in samples:
         pin.forwardKinematics(model, data, q)
@@ -58,10 +58,13 @@ def _joint_poses(model: Any, samples: Array) -> Array:
 
 
 def _along_line(frames: Array, origins: Array) -> Array | None:
-    """Place (k,) of some origins along the straight line that they keep to as seen from some frames [m], if they do."""
+    """Return the place (k,) of origins along a straight line, as seen from frames [m].
+
+    None if they do not keep to one.
+    """
     offset = origins[:, :3, 3] - frames[:, :3, 3]
-    seen = np.einsum("kij,ki->kj", frames[:, :3, :3], offset)
-    centred = seen - seen.mean(axis=0)
+    in_frame = np.einsum("kij,ki->kj", frames[:, :3, :3], offset)
+    centred = in_frame - in_frame.mean(axis=0)
     _, sizes, axes = np.linalg.svd(centred, full_matrices=False)
     if sizes[0] < 1e-6 or sizes[1] > _STRAIGHT * sizes[0]:
         return None
@@ -69,7 +72,7 @@ def _along_line(frames: Array, origins: Array) -> Array | None:
 
 
 def _decides(extension: Array, touching: BoolArray) -> bool:
-    """Whether a threshold of the extension (k,) separates the samples that touch (k,) from the others."""
+    """Return True if a threshold of the extension (k,) separates touching samples (k,)."""
     in_order = touching[np.argsort(extension)]
     below = np.concatenate(([0], np.cumsum(in_order)))
     count, total = np.arange(len(in_order) + 1), int(below[-1])

@@ -13,31 +13,31 @@ import yaml
 
 from qpavoid.config import Body
 from qpavoid.config.shipped import EXAMPLES, example_robot
-from qpavoid.model.notes import Note, NoteKind, shortened
-from qpavoid.setup.add import Described, Wishes
+from qpavoid.model.notes import Note, NoteKind, abbreviate
+from qpavoid.setup.add import DescribeOptions, Description
 from qpavoid.setup.srdf import MADE_BY, srdf_text
 from qpavoid.setup.written import BLANK, seal
 
 
-def description_files(described: Described, folder: Path) -> dict[Path, bytes]:
-    """The files of a description, sealed.
+def description_files(description: Description, folder: Path) -> dict[Path, bytes]:
+    """Write the files of a description, sealed.
 
     Args:
-        described: what they say.
+        description: what they say.
         folder: where they are to stand; paths in them are relative to it.
     """
-    srdf = folder / f"{described.config.name}.srdf"
-    comment = f"{described.config.name}: {MADE_BY}; {BLANK}"
-    text = srdf_text(described.robot.model.name, comment, described.disabled, described.config.end_effectors)
+    srdf = folder / f"{description.config.name}.srdf"
+    comment = f"{description.config.name}: {MADE_BY}; {BLANK}"
+    text = srdf_text(description.robot.model.name, comment, description.disabled, description.config.end_effectors)
     return {
-        folder / "robot.yaml": seal(_robot_yaml(described, folder, srdf.name).encode()),
+        folder / "robot.yaml": seal(_robot_yaml(description, folder, srdf.name).encode()),
         srdf: seal(text.encode()),
     }
 
 
-def _robot_yaml(described: Described, folder: Path, srdf: str) -> str:
-    config = described.config
-    lines = [f"# {line}" for line in [*_header(described), f"Again: {_command(described, folder)}"]]
+def _robot_yaml(description: Description, folder: Path, srdf: str) -> str:
+    config = description.config
+    lines = [f"# {line}" for line in [*_header(description), f"Again: {_command(description, folder)}"]]
     lines += [f"name: {_flow(config.name)}", f"urdf: {_flow(_reference(Path(config.urdf), folder))}"]
     lines.append(f"srdf: {_flow(srdf)}")
     if config.package_dirs:
@@ -49,7 +49,7 @@ def _robot_yaml(described: Described, folder: Path, srdf: str) -> str:
     lines.append(f"end_effectors: {_flow(list(config.end_effectors))}")
     assert not isinstance(config.bodies, str)
     lines += ["bodies:" if config.bodies else "bodies: []"]
-    lines += _body_lines(config.bodies, described)
+    lines += _body_lines(config.bodies, description)
     if config.disabled_pairs:
         lines.append("disabled_pairs:   # of links that have other pairs which are checked; the rest is in the SRDF")
         lines += [f"  - {_flow(list(pair))}" for pair in config.disabled_pairs]
@@ -65,31 +65,31 @@ def _robot_yaml(described: Described, folder: Path, srdf: str) -> str:
     return "\n".join([*lines, ""])
 
 
-def _header(described: Described) -> list[str]:
-    lines = [f"{described.config.name}: {MADE_BY}, which leaves it alone once you edit it; {BLANK}"]
+def _header(description: Description) -> list[str]:
+    lines = [f"{description.config.name}: {MADE_BY}, which leaves it alone once you edit it; {BLANK}"]
     lines += [
-        f"Bodies: {volume_line(described)}.",
-        f"Pairs: {pairs_line(described)}.",
-        f"Home: {home_line(described)}.",
+        f"Bodies: {volume_line(description)}.",
+        f"Pairs: {pairs_line(description)}.",
+        f"Home: {home_line(description)}.",
     ]
-    return [*lines, *note_lines(described.notes)]
+    return [*lines, *note_lines(description.notes)]
 
 
-def pairs_line(described: Described) -> str:
-    """How many pairs are checked, and why the others are not."""
-    counts, wishes = described.counts, described.wishes
-    honoured = "no SRDF came with it" if described.honoured is None else f"in {described.honoured.name}"
+def pairs_line(description: Description) -> str:
+    """Summarise how many pairs are checked, and why the others are not."""
+    counts, options = description.counts, description.options
+    srdf_of_file = "no SRDF came with it" if description.honoured is None else f"in {description.honoured.name}"
     return (
-        f"{counts['active']} of {counts['all']} are checked, {len(described.config.pair_margins)} of them with a "
-        f"smaller safety distance; {counts['adjacent']} are adjacent, {counts['srdf']} disabled ({honoured}), "
+        f"{counts['active']} of {counts['all']} are checked, {len(description.config.pair_margins)} of them with a "
+        f"smaller safety distance; {counts['adjacent']} are adjacent, {counts['srdf']} disabled ({srdf_of_file}), "
         f"{counts['always']} touch always, {counts['drawn in']} when drawn in, {counts['never']} come never within "
-        f"{1000 * described.near:.0f} mm ({wishes.samples} samples, seed {wishes.seed}, descent from the nearest)"
+        f"{1000 * description.near:.0f} mm ({options.samples} samples, seed {options.seed}, descent from the nearest)"
     )
 
 
-def home_line(described: Described) -> str:
-    """How clear the home pose is, and how well the limbs can move there."""
-    home = described.home
+def home_line(description: Description) -> str:
+    """Summarise the clearance of the home pose, and the conditioning of the limbs there."""
+    home = description.home
     words = ["no pair is checked"]
     if home.nearest is not None:
         words = [f"least distance {1000 * home.clearance:.1f} mm ({' - '.join(home.nearest)})"]
@@ -97,49 +97,49 @@ def home_line(described: Described) -> str:
 
 
 def note_lines(notes: Sequence[Note]) -> list[str]:
-    """The table of all that was left out, mended, replaced or assumed: a line each, and another for the remedy."""
+    """Write the table of notes: a line each, and another for the remedy."""
     order = {"error": 0, "warning": 1, "note": 2}
     lines = []
     for note in sorted(notes, key=lambda note: order[note.severity]):
         share = "" if note.share is None else f"{100.0 * note.share:.0f} %"
-        names = " - ".join(note.subject) if note.kind is NoteKind.PAIR else shortened(note.subject)
+        names = " - ".join(note.subject) if note.kind is NoteKind.PAIR else abbreviate(note.subject)
         lines.append(f"{note.severity:<8} {note.kind.value:<6} {share:>5}  {names}{': ' if names else ''}{note.what}")
         if note.remedy:
             lines.append(f"{'':24}→ {note.remedy}")
     return lines
 
 
-def _command(described: Described, folder: Path) -> str:
-    """The command that writes the same again."""
-    wishes = described.wishes
-    words = ["qpavoid robot add", _reference(described.urdf, Path()), "--name", described.config.name]
-    words += ["--out", folder.as_posix()] if folder != Path(described.config.name) else []
-    words += ["--bodies", wishes.bodies] if wishes.bodies != Wishes.bodies else []
-    words += [word for link, kind in wishes.bodies_of.items() for word in ("--bodies", f"{link}={kind}")]
-    words += ["--root", wishes.root] if wishes.root != Wishes.root else []
-    words += [word for joint in wishes.lock for word in ("--lock", joint)]
-    words += [word for joint, value in wishes.home.items() for word in ("--home", f"{joint}={value:g}")]
-    for entry in map(str, wishes.package_dirs):
+def _command(description: Description, folder: Path) -> str:
+    """Write the command that makes the same files."""
+    options = description.options
+    words = ["qpavoid robot add", _reference(description.urdf, Path()), "--name", description.config.name]
+    words += ["--out", folder.as_posix()] if folder != Path(description.config.name) else []
+    words += ["--bodies", options.bodies] if options.bodies != DescribeOptions.bodies else []
+    words += [word for link, kind in options.bodies_of.items() for word in ("--bodies", f"{link}={kind}")]
+    words += ["--root", options.root] if options.root != DescribeOptions.root else []
+    words += [word for joint in options.lock for word in ("--lock", joint)]
+    words += [word for joint, value in options.home.items() for word in ("--home", f"{joint}={value:g}")]
+    for entry in map(str, options.package_dirs):
         words += ["--package" if _PACKAGE.fullmatch(entry) else "--package-dir", entry]
-    words += ["--allow-missing-meshes"] if wishes.allow_missing_meshes else []
-    words += ["--srdf", wishes.srdf.as_posix()] if wishes.srdf is not None else []
-    words += ["--samples", str(wishes.samples)] if wishes.samples != Wishes.samples else []
-    words += ["--seed", str(wishes.seed)] if wishes.seed != Wishes.seed else []
+    words += ["--allow-missing-meshes"] if options.allow_missing_meshes else []
+    words += ["--srdf", options.srdf.as_posix()] if options.srdf is not None else []
+    words += ["--samples", str(options.samples)] if options.samples != DescribeOptions.samples else []
+    words += ["--seed", str(options.seed)] if options.seed != DescribeOptions.seed else []
     return " ".join([words[0], *(quote(word) for word in words[1:])])
 
 
-def volume_line(described: Described) -> str:
-    """How many bodies there are, and what room they take beside what the geometry encloses and its hulls."""
+def volume_line(description: Description) -> str:
+    """Summarise the bodies: number, and volume beside that of the geometry and its hulls."""
     volume, inside, hulls = (
-        sum(getattr(link, name) for link in described.links.values()) for name in ("volume", "inside", "hulls")
+        sum(getattr(link, name) for link in description.links.values()) for name in ("volume", "inside", "hulls")
     )
     over = ""
     if inside > 0.0:
         over = f", {volume / inside:.2f} times the {1e3 * inside:.2f} l of the geometry (hulls: {hulls / inside:.2f})"
-    return f"{len(described.config.bodies)}, {1e3 * volume:.2f} l{over}"
+    return f"{len(description.config.bodies)}, {1e3 * volume:.2f} l{over}"
 
 
-def _body_lines(bodies: Sequence[Body], described: Described) -> list[str]:
+def _body_lines(bodies: Sequence[Body], description: Description) -> list[str]:
     lines, last = [], ""
     for body in bodies:
         fields: dict[str, Any] = {"name": body.name, "frame": body.frame, "shape": body.shape.model_dump()}
@@ -148,7 +148,7 @@ def _body_lines(bodies: Sequence[Body], described: Described) -> list[str]:
             fields["position"] = list(body.position)
         if any(body.rpy):
             fields["rpy"] = list(body.rpy)
-        link = described.links[body.frame]
+        link = description.links[body.frame]
         comment = f"   # {link.volume / link.inside:.2f} of it" if link.inside > 0.0 and body.frame != last else ""
         lines.append(f"  - {_flow(fields)}{comment}")
         last = body.frame
@@ -161,7 +161,7 @@ def _flow(value: Any) -> str:
 
 
 def _reference(urdf: Path, folder: Path) -> str:
-    """The URDF as a robot.yaml names it."""
+    """Write the path of the URDF as a robot.yaml names it."""
     robots = example_robot("").resolve()
     if urdf.is_relative_to(robots):
         return f"{EXAMPLES}{urdf.relative_to(robots).as_posix()}"
@@ -173,7 +173,7 @@ _PACKAGE = re.compile(r"([A-Za-z][\w.-]*)=(.+)", re.DOTALL)
 
 
 def _entry(entry: str, folder: Path) -> str:
-    """An entry of `package_dirs` with its folder relative to that of the robot.yaml."""
+    """Write an entry of `package_dirs`, its folder relative to that of the robot.yaml."""
     match = _PACKAGE.fullmatch(entry)
     return f"{match[1]}={_relative(Path(match[2]), folder)}" if match else _relative(Path(entry), folder)
 

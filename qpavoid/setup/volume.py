@@ -18,7 +18,7 @@ _SAME = 1e-6
 
 
 def solid_volume(surface: Array) -> float:
-    """Volume of the inside of a mesh [m³].
+    """Compute the volume of the inside of a mesh [m³].
 
     Of a closed surface, that of the divergence theorem. Of any other the larger of two estimates, good to some 5 %: the
     cells of a grid that the surface passes through (half of their volume) or that cannot be reached from outside,
@@ -40,19 +40,19 @@ def solid_volume(surface: Array) -> float:
 
 
 def _is_closed(surface: Array, same: float) -> bool:
-    """Whether every edge of a triangle is passed by another triangle in the other direction."""
+    """Return True if each edge is passed in both directions, by two triangles."""
     cells = np.round((surface.reshape(-1, 3) - surface.min(axis=(0, 1))) / same).astype(np.int64)
     names = cells @ [1 << 42, 1 << 21, 1]
     corners = np.unique(names, return_inverse=True)[1].reshape(-1, 3)
     edges = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
     edges = edges[edges[:, 0] != edges[:, 1]]
     count = int(corners.max()) + 1
-    there, back = np.sort(edges @ [count, 1]), np.sort(edges @ [1, count])
-    return bool(np.array_equal(there, back))
+    forward_edges, backward_edges = np.sort(edges @ [count, 1]), np.sort(edges @ [1, count])
+    return bool(np.array_equal(forward_edges, backward_edges))
 
 
 def _filled(surface: Array, size: float) -> float:
-    """Volume by cells that cannot be reached from outside [m³]."""
+    """Compute the volume of the cells that cannot be reached from outside [m³]."""
     cell = size / _CELLS
     points = _on_surface(surface)
     index = np.floor((points - points.min(axis=0)) / cell).astype(np.intp) + 1
@@ -62,7 +62,7 @@ def _filled(surface: Array, size: float) -> float:
 
 
 def _on_surface(surface: Array) -> Array:
-    """Points (n, 3) spread evenly over triangles, and their corners."""
+    """Return points (n, 3) spread evenly over triangles, and their corners."""
     random, area = np.random.default_rng(0), _areas(surface)
     chosen = surface[random.choice(len(surface), _POINTS, p=area / area.sum())] if area.sum() > 0.0 else surface
     weights = random.dirichlet(np.ones(3), len(chosen))
@@ -75,7 +75,9 @@ def _areas(surface: Array) -> Array:
 
 
 def _wound(surface: Array) -> float:
-    """Volume by the winding number of random points in the box around a surface [m³].
+    """Estimate the volume that a surface encloses by winding numbers [m³].
+
+    Of random points in the box around it.
 
     Of a surface of many triangles, some that are drawn by area stand for all: each with its own solid angle, scaled.
     """

@@ -1,4 +1,4 @@
-"""Files that are written again only as long as nobody else has touched them.
+"""Files that are written again only if they were not edited.
 
 Each carries the digest of its own content, so that an edit shows.
 """
@@ -19,17 +19,17 @@ _SEAL = re.compile(rb"sha256 [0-9a-f]{%d}" % _DIGITS)
 
 
 def seal(content: bytes) -> bytes:
-    """Puts the digest of a content in the place of its `BLANK`."""
+    """Put the digest of a content in the place of its `BLANK`."""
     return content.replace(BLANK.encode(), b"sha256 " + sha256(content).hexdigest()[:_DIGITS].encode(), 1)
 
 
-def untouched(content: bytes) -> bool:
-    """Whether a content is as `seal` left it."""
+def is_sealed(content: bytes) -> bool:
+    """Return True if a content is as `seal` left it."""
     return seal(_SEAL.sub(BLANK.encode(), content, count=1)) == content and _SEAL.search(content) is not None
 
 
 def write_files(contents: Mapping[Path, bytes], force: bool = False) -> dict[Path, str]:
-    """Writes all files, or none.
+    """Write all files, or none.
 
     Args:
         contents: what each is to hold, sealed.
@@ -39,7 +39,7 @@ def write_files(contents: Mapping[Path, bytes], force: bool = False) -> dict[Pat
         For each file `written`, `unchanged` or `updated`.
 
     Raises:
-        ConfigError: a file was edited since it was written, or is somebody else's; or it cannot be written.
+        ConfigError: a file was edited since it was written, or was not written by it; or it cannot be written.
     """
     outcome = {}
     for path, content in contents.items():
@@ -50,7 +50,7 @@ def write_files(contents: Mapping[Path, bytes], force: bool = False) -> dict[Pat
             continue
         except OSError as error:
             raise ConfigError(f"{path}: {error.strerror}; give another folder with --out") from None
-        if not (force or before == content or untouched(before)):
+        if not (force or before == content or is_sealed(before)):
             raise ConfigError(
                 f"{path}: edited since it was written, or written by hand: left as it is; --force overwrites it, "
                 "--out DIR writes elsewhere"

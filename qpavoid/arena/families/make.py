@@ -72,7 +72,7 @@ def _scenario(family: Family, template: dict[str, Any], draw: Draw, seed: int) -
         fields.update(generated)
         if "q0" in generated and isinstance(template_fields.get("q0"), dict):
             fields["q0"] = {**template_fields["q0"], **generated["q0"]}
-    return validate(_rounded(fields), ScenarioConfig, family.path).read_from(family.path)
+    return validate(_rounded(fields), ScenarioConfig, family.path).with_source(family.path)
 
 
 def _generate(family: Family, template_fields: dict[str, Any], draw: Draw) -> dict[str, Any]:

@@ -1,0 +1,111 @@
+"""The collision bodies of a robot: fitted to the shapes of its file, or listed one by one in its robot.yaml."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from qpavoid.config import Body, Hull, RobotConfig
+from qpavoid.errors import ConfigError, UnknownName, nearest
+from qpavoid.geometry.bodies import check_meshes, convert_bodies, make_shape, triangle_meshes
+from qpavoid.model.joints import frame_index
+from qpavoid.model.notes import Note, NoteKind
+from qpavoid.model.packages import absolute_entries
+from qpavoid.model.plausibility import note_implausible_sizes
+from qpavoid.model.trajectory import rpy_to_matrix
+from qpavoid.model.urdf import read_pieces
+
+
+def robot_bodies(config: RobotConfig, urdf: Path, model: Any, path: Path, notes: list[Note]) -> Any:
+    """Make the geometry model of the collision bodies that a robot.yaml asks for.
+
+    Args:
+        config: fields of the robot.yaml.
+        urdf: its URDF or MJCF.
+        model: Pinocchio model of that.
+        path: the robot.yaml, to name in errors.
+        notes: what was left out or replaced is added to them.
+
+    Raises:
+        ConfigError, UnknownName: a shape that cannot be read, a frame or a piece of geometry that does not exist.
+    """
+    package_dirs = absolute_entries(config.package_dirs, path.parent)
+
+    def read(enclosed: bool, notes_of_pieces: list[Note]) -> Any:
+        return read_pieces(
+            urdf, model, package_dirs, path, notes_of_pieces,
+            visuals=config.visuals, allow_missing=config.allow_missing_meshes, enclosed=enclosed,
+        )  # fmt: skip
+
+    if not isinstance(config.bodies, str):
+        hulls = _hulls(config.bodies, lambda: read(True, []), path)  # what is not listed is left out on purpose
+        return _listed_bodies(config.bodies, model, hulls, path)
+    pieces = read(False, notes)
+    check_meshes(pieces, str(path))
+    note_implausible_sizes(model, pieces, notes)
+    bodies = convert_bodies(pieces, config.bodies)
+    if meshes := triangle_meshes(bodies):
+        clause = (
+            f"{len(meshes)} triangle meshes cost 100 to 500 µs a pair at every tick, some pairs several ms, convex "
+            "hulls about 1 µs, capsules 0.1 µs"
+        )
+        remedy = "set `bodies` to convex or capsule"
+        notes.append(Note(NoteKind.MESH, tuple(meshes), clause, remedy, "warning"))
+    return bodies
+
+
+def _hulls(configs: Sequence[Body], read: Callable[[], Any], path: Path) -> dict[str, Any]:
+    """Make the hulls of the pieces of geometry that bodies name."""
+    indices = {body.shape.geometry: index for index, body in enumerate(configs) if isinstance(body.shape, Hull)}
+    if not indices:
+        return {}
+    pieces = {piece.name: piece for piece in read().geometryObjects}
+    selection = pin.GeometryModel()
+    for name, index in indices.items():
+        if name not in pieces:
+            raise UnknownName(
+                f"{path}: bodies.{index}.shape.geometry: no collision geometry {name!r}{nearest(name, pieces)}"
+            )
+        selection.addGeometryObject(pieces[name])
+    check_meshes(selection, str(path))
+    return {hull.name: hull for hull in convert_bodies(selection, "convex").geometryObjects}
+
+
+def _listed_bodies(configs: Sequence[Body], model: Any, hulls: Mapping[str, Any], path: Path) -> Any:
+    bodies = pin.GeometryModel()
+    for index, body in enumerate(configs):
+        if not model.existFrame(body.frame):
+            frames = [f.name for f in model.frames if f.type == pin.BODY]
+            raise UnknownName(f"{path}: bodies.{index}.frame: no frame {body.frame!r}{nearest(body.frame, frames)}")
+        if bodies.existGeometryName(body.name):
+            raise ConfigError(f"{path}: bodies.{index}.name: {body.name!r} is given twice: names must differ")
+        frame_id = frame_index(model, body.frame)
+        frame = model.frames[frame_id]
+        placement = frame.placement * pin.SE3(rpy_to_matrix(body.rpy), np.array(body.position))
+        if isinstance(body.shape, Hull):
+            hull = hulls[body.shape.geometry]
+            geometry, placement = hull.geometry, placement * _in_link(hull, model)
+        else:
+            geometry = make_shape(body.shape)
+        bodies.addGeometryObject(pin.GeometryObject(body.name, frame.parentJoint, frame_id, placement, geometry))
+    return bodies
+
+
+def _in_link(body: Any, model: Any) -> Any:
+    """Return the placement of a body in the frame of its link."""
+    return model.frames[body.parentFrame].placement.actInv(body.placement)
+
+
+def pair_margins(config: RobotConfig, bodies: Any, path: Path) -> dict[frozenset[str], float]:
+    """Return the safety distances of pairs of bodies that have one of their own [m]."""
+    names = [body.name for body in bodies.geometryObjects]
+    for index, own in enumerate(config.pair_margins):
+        for name in own.bodies:
+            if name not in names:
+                where = f"{path}: pair_margins.{index}.bodies"
+                raise UnknownName(f"{where}: no body {name!r}{nearest(name, names)}")
+    return {frozenset(own.bodies): own.d1 for own in config.pair_margins}
