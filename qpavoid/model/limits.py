@@ -89,8 +89,8 @@ def limit_layout(joints: JointBounds, position_gain: float, dt: float) -> dict[s
     share `position_gain` of the margin to a position limit in one control period; a joint with one keeps to the speeds
     from which it can still brake (`kernels.speed_to_stop`), so that position, velocity and acceleration
     limits never contradict each other once they are met; where its jerk has a limit, too, it keeps to the velocities
-    from which a stop within all of these ends in time (`kernels.braking_bounds`). A joint outside its limits moves back, at
-    no more than its largest speed. Bounds never cross: from a state that no braking can save, the jerk limit is
+    from which a stop within all of these ends in time (`kernels.braking_bounds`). A joint outside its limits moves
+    back, at no more than its largest speed. Bounds never cross: from a state that no braking can save, the jerk limit is
     relaxed, then that of the acceleration.
 
     Args:
