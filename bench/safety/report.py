@@ -68,8 +68,9 @@ def _sections(found: list[Trial], failures: dict[int, str], solvers: Sequence[st
         "farther apart than d2, and evades from there within its limits, by ten policies, with no task. If one of "
         "them stays clear, the contact was avoidable. It counts as unavoidable only if all fail *and* a linear "
         "program over the joint velocities proves why: the pair does not depend on any joint (`fixed`), or, in the "
-        f"last period of the longest evasion, no velocity held for {PROOF_TIME:g} s keeps it apart (`outrun`), or all near "
-        "pairs at once (`squeezed`). What is not proved counts as avoidable. `bench/safety/verdict.py` has the details.",
+        f"last period of the longest evasion, no velocity held for {PROOF_TIME:g} s keeps it apart (`outrun`), or all "
+        "near pairs at once (`squeezed`). What is not proved counts as avoidable. Details are in "
+        "`bench/safety/verdict.py`.",
         "",
         *_by_solver(found, solvers),
         "",
