@@ -1,4 +1,4 @@
-"""What holds between the ticks: distances on the way from one to the next, thin plates, long periods, full speed."""
+"""Distances between control steps: thin plates, long periods, full speed."""
 
 import numpy as np
 import pinocchio as pin
@@ -17,8 +17,8 @@ BOX = {"type": "box", "size": [0.2, 0.2, 0.2]}
 SAFE = 0.02
 
 
-def least_on_the_way(log, controller, steps=10):
-    """Least distance of a run, also between its ticks."""
+def min_distance(log, controller, steps=10):
+    """Least distance of a run, also between its control steps."""
     ruler, dt = Ruler(controller.scene), log.t[1] - log.t[0]
     return min(ruler.least_between(q, v, dt, t, steps) for q, v, t in zip(log.q, log.v, log.t, strict=True))
 
@@ -26,7 +26,7 @@ def least_on_the_way(log, controller, steps=10):
 @pytest.mark.parametrize("row", ["beta", "task-switching", "damper"])
 @pytest.mark.parametrize("shape", [PLATE, BALL, BOX], ids=["plate", "ball", "box"])
 @pytest.mark.parametrize(("dt", "duration"), [(0.001, 0.8), (0.01, 2.0), (0.02, 2.0), (0.05, 3.0)])
-def test_no_period_and_no_speed_pass_the_safe_distance(row, shape, dt, duration):
+def test_safety_distance_is_kept_at_any_period_and_speed(row, shape, dt, duration):
     """A target that leaves at 2 m/s leads through the obstacle: the Panda comes at its joints' full speed."""
     run = scenario(
         "panda",
@@ -38,7 +38,7 @@ def test_no_period_and_no_speed_pass_the_safe_distance(row, shape, dt, duration)
     )
     log = simulate(run)
     controller, _ = Controller.from_scenario(run)
-    assert least_on_the_way(log, controller, 10 if dt > 0.001 else 2) > SAFE - 1e-3
+    assert min_distance(log, controller, 10 if dt > 0.001 else 2) > SAFE - 1e-3
     assert log.metrics()["peak_velocity"] > 1.0
     counts = log.metrics()["status_counts"]
     # rows with α ask for the stop at once, and at the margin may lack a few mm/s
@@ -51,8 +51,8 @@ def test_no_period_and_no_speed_pass_the_safe_distance(row, shape, dt, duration)
 
 @pytest.mark.parametrize("dt", [0.001, 0.005, 0.01, 0.02, 0.05])
 @pytest.mark.parametrize("speed", [0.5, 2.0, 10.0])
-def test_nothing_tunnels_through_a_plate(tmp_path, dt, speed):
-    """2 mm of plate, up to 0.5 m in one tick, without an acceleration limit and first seen at 0.1 m."""
+def test_plate_is_never_tunnelled_through(tmp_path, dt, speed):
+    """2 mm of plate, up to 0.5 m per control step, without an acceleration limit and in range from 0.1 m on."""
     robot = cartesian(tmp_path, speed=speed, acceleration=None)
     plate = Obstacle.at("plate", Box(size=(0.002, 2.0, 2.0)), [1.0, 0.0, 0.0])
     controller = make_controller(robot, [plate], "z", dt=dt, task={"gain": 1.0 / dt})
@@ -62,8 +62,8 @@ def test_nothing_tunnels_through_a_plate(tmp_path, dt, speed):
     assert after > 0.8
 
 
-def turned(controller, q, v, horizon, samples):
-    """Least of distance - safe distance of all pairs on the way of v, obstacles on theirs."""
+def min_margin(controller, q, v, horizon, samples):
+    """Least of distance - safety distance of all pairs along v, with moving obstacles."""
     ruler = Ruler(controller.scene)
     found = []
     for s in np.linspace(0.0, horizon, 12):
@@ -72,7 +72,7 @@ def turned(controller, q, v, horizon, samples):
     return min(found) - SAFE
 
 
-def test_the_closest_call_is_a_lower_bound(panda):
+def test_clearance_lower_bound_holds_with_moving_obstacles(panda):
     rng, bounds = np.random.default_rng(0), panda.bounds()
     balls = [Obstacle.at(f"ball{i}", Sphere(radius=0.08), [9.0, 0.0, 0.0]) for i in range(4)]
     controller = make_controller(panda, balls)
@@ -83,14 +83,14 @@ def test_the_closest_call_is_a_lower_bound(panda):
         places = {b.name: Sample.at(rng.uniform(-0.8, 0.8, 3), linear=rng.uniform(-0.5, 0.5, 3)) for b in balls}
         near = len(controller.tick(q, 0.0, None, places).proximity.pair)
         bound = controller._assembly.clearance_lower_bound(v, near, 0.1, horizon)
-        least = turned(controller, q, v, horizon, dict(enumerate(places.values())))
+        least = min_margin(controller, q, v, horizon, dict(enumerate(places.values())))
         assert least >= bound - 1e-9
         close += bound > 0.0
     assert close > 3
 
 
 def braking(q, v, step, dt):
-    """Poses along the tick and the stop after it, all joints slowed by one factor; five in each tick."""
+    """Poses along a control period and the stop after it, all joints slowed by one factor; five per period."""
     poses = []
     while v.any():
         poses += [q + s * dt * v for s in (0.2, 0.4, 0.6, 0.8, 1.0)]
@@ -98,10 +98,10 @@ def braking(q, v, step, dt):
     return poses
 
 
-def test_what_the_guard_lets_through_is_clear_by_brute_force(panda):
-    """Reckless commands among plates: along every tick and the stop after it, no pair comes 0.6 mm too near."""
+def test_braking_check_is_safe_by_brute_force(panda):
+    """Random commands among plates: along every step and the stop after it, no pair comes 0.6 mm too near."""
     rng, bounds = np.random.default_rng(0), panda.bounds()
-    step, looked, drawn_back = 0.01 * bounds.acceleration, 0, 0
+    step, evaluated, scaled = 0.01 * bounds.acceleration, 0, 0
     for _ in range(6):
         places = rng.uniform([0.3, -0.4, 0.2], [0.7, 0.4, 0.9], (3, 3))
         boxes = [Obstacle.at(f"box{i}", Box(size=(0.25, 0.25, 0.01)), place) for i, place in enumerate(places)]
@@ -113,33 +113,33 @@ def test_what_the_guard_lets_through_is_clear_by_brute_force(panda):
             if k % 30 == 0:
                 command = rng.uniform(-1.0, 1.0, 7) * bounds.velocity
             s = controller.filter(q, command)
-            drawn_back += s.command_scale < 1.0
-            way = braking(q, s.v, step, 0.01) if k % 4 == 0 else []
-            if way and (bounds.lower < way[-1]).all() and (way[-1] < bounds.upper).all():
-                looked += 1
-                assert min(ruler.distances(pose).min() for pose in way) > SAFE - 6e-4
+            scaled += s.command_scale < 1.0
+            path = braking(q, s.v, step, 0.01) if k % 4 == 0 else []
+            if path and (bounds.lower < path[-1]).all() and (path[-1] < bounds.upper).all():
+                evaluated += 1
+                assert min(ruler.distances(pose).min() for pose in path) > SAFE - 6e-4
             q = q + 0.01 * s.v
-    assert looked > 100 and drawn_back > 20
+    assert evaluated > 100 and scaled > 20
 
 
-def test_a_way_that_bends_is_looked_at_however_far_everything_is(panda, monkeypatch):
-    """A joint that comes fast to its limit brakes harder than others: what is known of straight ways will not do."""
-    controller, bounds, looks = make_controller(panda), panda.bounds(), []
-    guard = controller._commander.guard
-    worst = guard._worst
-    monkeypatch.setattr(guard, "_worst", lambda *given: looks.append(given[2]) or worst(*given))
+def test_braking_check_evaluates_curved_paths_at_any_distance(panda, monkeypatch):
+    """A joint fast near its limit brakes harder than others: the bound for straight paths does not apply."""
+    controller, bounds, calls = make_controller(panda), panda.bounds(), []
+    check = controller._commander.braking
+    min_margin = check._min_margin
+    monkeypatch.setattr(check, "_min_margin", lambda *args: calls.append(args[2]) or min_margin(*args))
     q, v = panda.home.copy(), np.zeros(7)
     v[0] = 0.5 * bounds.velocity[0]
-    for short, looked in ((0.5, False), (0.02, True)):
-        looks.clear()
-        q[0] = bounds.upper[0] - short
+    for distance, evaluates in ((0.5, False), (0.02, True)):
+        calls.clear()
+        q[0] = bounds.upper[0] - distance
         controller.reset(v)
         commanded = controller.filter(q, v).v
-        assert commanded[0] > 0.0 and bool(looks) == looked
+        assert commanded[0] > 0.0 and bool(calls) == evaluates
 
 
-def test_a_stop_ordered_at_any_tick_is_clear_also_at_the_limits(panda):
-    """The same with stops as they are driven, in which joints that come to their limits brake harder than others."""
+def test_stop_at_any_step_is_clear_also_at_the_limits(panda):
+    """The same with stops as they are commanded, in which joints near their limits brake harder than others."""
     rng, bounds, stops, at_limits = np.random.default_rng(1), panda.bounds(), 0, 0
     for _ in range(6):
         places = rng.uniform([0.3, -0.4, 0.2], [0.7, 0.4, 0.9], (3, 3))
@@ -160,17 +160,17 @@ def test_a_stop_ordered_at_any_tick_is_clear_also_at_the_limits(panda):
             here, stops = q, stops + bool(v.any())
             while v.any():
                 v = stopper.step(here, np.nan).v
-                for share in (0.5, 1.0):
-                    assert ruler.distances(here + 0.01 * share * v).min() > SAFE - 6e-4
+                for fraction in (0.5, 1.0):
+                    assert ruler.distances(here + 0.01 * fraction * v).min() > SAFE - 6e-4
                 here = here + 0.01 * v
             at_limits += bool((np.minimum(here - bounds.lower, bounds.upper - here) < 0.02).any())
     assert stops > 100 and at_limits > 10
 
 
 @pytest.mark.parametrize(("shape", "speed", "alone"), [(PLATE, 2.0, 0.0), (BALL, 0.5, 0.002), (BOX, 2.0, 0.015)])
-def test_where_the_linearisation_is_too_kind_the_step_is_shortened_and_logged(shape, speed, alone):
-    """50 ms ticks and a row that may use all that is left in one: alone, it leads into the plate."""
-    least, shares = {}, {}
+def test_command_scale_is_below_one_where_the_linearisation_fails(shape, speed, alone):
+    """Steps of 50 ms and a row that may use its whole margin in one: alone, it leads into the plate."""
+    least, scales = {}, {}
     for look_ahead in (False, True):
         run = scenario(
             "panda",
@@ -185,15 +185,15 @@ def test_where_the_linearisation_is_too_kind_the_step_is_shortened_and_logged(sh
             },
         )
         log = simulate(run)
-        least[look_ahead] = least_on_the_way(log, Controller.from_scenario(run)[0])
-        shares[look_ahead] = log.command_scale
+        least[look_ahead] = min_distance(log, Controller.from_scenario(run)[0])
+        scales[look_ahead] = log.command_scale
         assert log.metrics()["shortened_ticks"] == np.sum(log.command_scale < 1.0)
     assert least[False] < alone and least[True] > SAFE - 5e-4
-    assert (shares[False] == 1.0).all() and shares[True].min() < 1.0
+    assert (scales[False] == 1.0).all() and scales[True].min() < 1.0
 
 
-def test_nothing_is_first_seen_inside_its_margin(tmp_path):
-    """A row sees 30 mm ahead; at 2 m/s and 4 m/s² braking takes 0.5 m."""
+def test_braking_begins_before_rows_are_in_range(tmp_path):
+    """Rows begin 30 mm ahead; at 2 m/s and 4 m/s² braking takes 0.5 m."""
     robot = cartesian(tmp_path, speed=2.0, acceleration=4.0)
     wall = Obstacle.at("wall", Box(size=(0.1, 2.0, 2.0)), [2.05, 0.0, 0.0])
     controller = make_controller(
@@ -203,37 +203,37 @@ def test_nothing_is_first_seen_inside_its_margin(tmp_path):
         avoidance=Avoidance(d1=SAFE, d2=0.03, row=Damper(gain=20.0)),
         task={"gain": 50.0},
     )
-    braking, before = [], np.zeros(3)
+    distances, v_prev = [], np.zeros(3)
     for tick in drive(controller, np.array([-1.0, 0.0, 0.0]), 400, target=[4.0, 0.0, 0.0]):
         v = tick.solution.v
-        assert tick.solution.status is Status.SOLVED and (np.abs(v - before) <= 0.04 + 1e-9).all()
-        if v[0] < before[0] - 1e-6:
-            braking.append(1.95 - tick.state.q[0])
-        before = v
+        assert tick.solution.status is Status.SOLVED and (np.abs(v - v_prev) <= 0.04 + 1e-9).all()
+        if v[0] < v_prev[0] - 1e-6:
+            distances.append(1.95 - tick.state.q[0])
+        v_prev = v
         assert 1.95 - tick.state.q[0] > SAFE - 1e-3
-    assert braking[0] > 0.45 and 1.95 - tick.state.q[0] < SAFE + 2e-3
+    assert distances[0] > 0.45 and 1.95 - tick.state.q[0] < SAFE + 2e-3
 
 
 @pytest.mark.parametrize(
     ("linear", "angular"),
     [([-4.0, 0.0, 0.0], [0.0, 0.0, 0.0]), ([-2.8, 0.0, 0.0], [0.0, 0.0, 0.0]), ([0.0, 0.0, 0.0], [0.0, 0.0, 4.0])],
 )
-def test_the_look_ahead_moves_obstacles_on(tmp_path, linear, angular):
-    """No row sees it at 150 mm; at the end of the tick it is 200 or 140 mm nearer, or has turned on the robot."""
+def test_look_ahead_predicts_obstacles(tmp_path, linear, angular):
+    """No row at 150 mm; at the end of the control period it is 200 or 140 mm nearer, or turned towards the robot."""
     robot = cartesian(tmp_path, acceleration=None)
     bar = Obstacle.at("bar", Box(size=(0.02, 2.0, 0.02)), [9.0, 0.0, 0.0])
-    avoidance = Avoidance(d1=0.02, d2=0.10, backup=None)  # a way out would be sought as well
+    avoidance = Avoidance(d1=0.02, d2=0.10, backup=None)  # without backup trajectories
     controller = make_controller(robot, [bar], "z", dt=0.05, avoidance=avoidance)
     center = [0.21, 0.0, 0.0] if any(linear) else [0.21, -0.9, 0.0]  # the tool is a ball of 50 mm
-    seen = {"bar": Sample.at(center, linear=linear, angular=angular)}
-    tick = controller.tick(np.zeros(3), 0.0, {"z": Sample.at([0.0, 0.0, 0.0])}, seen)
+    update = {"bar": Sample.at(center, linear=linear, angular=angular)}
+    tick = controller.tick(np.zeros(3), 0.0, {"z": Sample.at([0.0, 0.0, 0.0])}, update)
     assert not len(tick.proximity.pair) and tick.problem.violation <= 0.0
-    turned_on = moved(seen["bar"], 0.05)
-    short = SAFE - Ruler(controller.scene).distances(np.zeros(3), {0: turned_on}).min()
-    assert short > 5e-3 and tick.solution.status is Status.RELAXED
+    predicted = moved(update["bar"], 0.05)
+    violation = SAFE - Ruler(controller.scene).distances(np.zeros(3), {0: predicted}).min()
+    assert violation > 5e-3 and tick.solution.status is Status.RELAXED
     (reason,) = tick.solution.reasons
     assert (reason.kind, reason.subject, reason.unit) == (ReasonKind.PREDICTED_TOO_NEAR, ("tool", "bar"), "m")
-    assert reason.amount == pytest.approx(short - TOLERANCE, abs=1e-6)
-    assert reason.severity is (Severity.ALARM if short > SAFE else Severity.WARNING)
-    away = seen["bar"]._replace(linear=-seen["bar"].linear, angular=-seen["bar"].angular)
+    assert reason.amount == pytest.approx(violation - TOLERANCE, abs=1e-6)
+    assert reason.severity is (Severity.ALARM if violation > SAFE else Severity.WARNING)
+    away = update["bar"]._replace(linear=-update["bar"].linear, angular=-update["bar"].angular)
     assert controller.step(np.zeros(3), 0.0, None, {"bar": away}).status is Status.SOLVED

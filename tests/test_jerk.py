@@ -1,6 +1,6 @@
 """Limits of position, velocity, acceleration and jerk as one viable set, and stops within them.
 
-The stop of one coordinate is followed tick by tick here, by its definition; the kernels have it in closed form.
+The stop of one coordinate is computed step by step here, by its definition; the kernels have it in closed form.
 """
 
 from dataclasses import replace
@@ -22,17 +22,17 @@ SAFE = 0.02
 # --- the stop of one coordinate ----------------------------------------------------------------------------------
 
 
-def harder(v):
+def largest_change(v):
     """σ(v): largest b for which b + (b - 1) + … is at most v."""
     n = max(np.ceil(0.5 * np.sqrt(1.0 + 8.0 * v) - 0.5), 1.0)
     return v / n + 0.5 * (n - 1.0)
 
 
-def followed(v, w, most):
+def stop_speeds(v, w, most):
     """Speeds of a stop, from v on, in the units of `kernels.braking_bounds`."""
     speeds = [v]
     while abs(v) > 1e-9 or abs(w) > 1.0:
-        target = -np.sign(v) * min(harder(abs(v)), most)
+        target = -np.sign(v) * min(largest_change(abs(v)), most)
         w = min(max(target, w - 1.0), w + 1.0)
         v += w
         speeds.append(v)
@@ -55,31 +55,31 @@ def moving(draw):
 many = settings(max_examples=400, deadline=None)
 
 
-def test_the_way_to_stop_by_hand():
+def test_way_to_stop_agrees_with_examples_by_hand():
     """From 3 with no change yet: 3, 2, then by 1.5 to 0.5, from which 0.5 leads to 0. From 1 with 2: 1, 2, 2, 1, 0."""
-    assert followed(3.0, 0.0, 10.0) == pytest.approx([3.0, 2.0, 0.5, 0.0])
+    assert stop_speeds(3.0, 0.0, 10.0) == pytest.approx([3.0, 2.0, 0.5, 0.0])
     assert stopping_distance(3.0, 0.0, 10.0)[0] == pytest.approx(5.5)
-    assert followed(1.0, 2.0, 10.0) == pytest.approx([1.0, 2.0, 2.0, 1.0, 0.0])
+    assert stop_speeds(1.0, 2.0, 10.0) == pytest.approx([1.0, 2.0, 2.0, 1.0, 0.0])
     assert stopping_distance(1.0, 2.0, 10.0)[0] == pytest.approx(6.0)
-    assert stopping_distance(10.0, 0.0, 0.5)[0] == pytest.approx(sum(np.arange(10.0, 0.0, -0.5)))  # no jerk to speak of
+    assert stopping_distance(10.0, 0.0, 0.5)[0] == pytest.approx(sum(np.arange(10.0, 0.0, -0.5)))  # negligible jerk limit
     assert stopping_distance(-5.0, 1.0, 4.0) == (0.0, 0.0)
 
 
 @many
 @given(moving())
-def test_the_way_to_stop_is_that_of_the_stop_followed_tick_by_tick(state):
+def test_way_to_stop_agrees_with_the_stop_step_by_step(state):
     v, w, most = state
-    expected = np.max(np.cumsum(followed(v, w, most)), initial=0.0)
+    expected = np.max(np.cumsum(stop_speeds(v, w, most)), initial=0.0)
     found = stopping_distance(v, w, most)[0]
-    if v > 0.0 and -w - 1.0 > min(harder(v), most):  # braking too hard to come to rest without passing it
+    if v > 0.0 and -w - 1.0 > min(largest_change(v), most):  # braking too hard to come to rest without passing it
         assert found >= expected - 1e-9
-        expected = np.sum(followed(v, -min(harder(v), most) - 1.0, most))
+        expected = np.sum(stop_speeds(v, -min(largest_change(v), most) - 1.0, most))
     assert found == pytest.approx(expected, rel=1e-9, abs=1e-9)
 
 
 @many
 @given(moving(), st.floats(0.0, 2.0))
-def test_ways_grow_with_the_change_and_are_convex_in_it(state, more):
+def test_way_to_stop_is_monotone_and_convex_in_the_change(state, more):
     v, w, most = state
     (low, slope), (middle, _), (high, _) = (
         stopping_distance(v + s * more, w + s * more, most) for s in (0.0, 0.5, 1.0)
@@ -93,9 +93,9 @@ def test_ways_grow_with_the_change_and_are_convex_in_it(state, more):
 
 @many
 @given(moving(), st.floats(0.0, 3.0))
-def test_of_two_stops_the_faster_stays_the_faster(state, more):
+def test_stops_preserve_the_order_of_speeds(state, more):
     v, w, most = state
-    slower, faster = followed(v, w, most), followed(v + more, min(w + more, most), most)
+    slower, faster = stop_speeds(v, w, most), stop_speeds(v + more, min(w + more, most), most)
     size = max(len(slower), len(faster))
     slower, faster = (np.pad(a, (0, size - len(a))) for a in (slower, faster))
     assert (slower <= faster + 1e-9).all()
@@ -105,7 +105,7 @@ def test_of_two_stops_the_faster_stays_the_faster(state, more):
 
 
 def jerky_joints(rng, count, some=True):
-    """Joints of all kinds, as `random_joints` has them, most of them with a jerk limit: mild, or hardly felt."""
+    """Joints of all kinds, as `random_joints` has them, most of them with a jerk limit, tight or wide."""
     joints, q = random_joints(rng, count)
     jerk = joints.acceleration * 10.0 ** rng.uniform(0.0, 3.0, count)
     return replace(joints, jerk=np.where(rng.random(count) < 0.9, jerk, np.inf) if some else jerk), q
@@ -119,58 +119,58 @@ def bounds_after(axes, q, v, w):
 def stops_within(joints, i, q, v, w, dt, slack):
     """Whether coordinate i, at q, moves at v after a change of w and then stops within its limits."""
     unit = joints.jerk[i] * dt**2
-    speeds = unit * followed(v / unit, w / unit, joints.acceleration[i] * dt / unit)
-    way = q + dt * np.cumsum(speeds)
-    inside = (way >= joints.lower[i] - slack).all() and (way <= joints.upper[i] + slack).all()
+    speeds = unit * stop_speeds(v / unit, w / unit, joints.acceleration[i] * dt / unit)
+    path = q + dt * np.cumsum(speeds)
+    inside = (path >= joints.lower[i] - slack).all() and (path <= joints.upper[i] + slack).all()
     return inside and (np.abs(speeds) <= joints.velocity[i] + slack).all()
 
 
 @pytest.mark.parametrize("dt", [0.001, 0.01, 0.05])
-def test_no_limit_is_left_in_a_hundred_thousand_ticks(dt):
-    """400 joints, 300 ticks each, driven into their limits, to and fro, or at random."""
+def test_bounds_keep_all_limits_in_a_hundred_thousand_steps(dt):
+    """400 joints, 300 steps each, driven into their limits, to and fro, or at random."""
     rng = np.random.default_rng(1)
     joints, q = jerky_joints(rng, 400)
     axes, v, w = Axes(joints, 0.5, dt), np.zeros(400), np.zeros(400)
     unit, reached = np.where(np.isinf(joints.jerk), np.inf, joints.jerk * dt**2), np.zeros(400, dtype=bool)
-    for tick in range(300):
+    for step in range(300):
         lower, upper = bounds_after(axes, q, v, w)
         assert (lower <= upper).all()
-        if tick % 60 == 0:
-            goal = rng.choice([0.0, 0.5, 1.0], 400)  # pushed one way for a while; 0.5: anywhere
-        following = lower + np.where(goal == 0.5, rng.random(400), goal) * (upper - lower)
-        change = following - v
+        if step % 60 == 0:
+            goal = rng.choice([0.0, 0.5, 1.0], 400)  # pushed to one side for a while; 0.5: anywhere
+        v_next = lower + np.where(goal == 0.5, rng.random(400), goal) * (upper - lower)
+        change = v_next - v
         assert (np.abs(change - w) <= unit * (1.0 + 1e-7) + 1e-12).all()
         assert (np.abs(change) <= joints.acceleration * dt + 1e-9).all()
-        assert (np.abs(following) <= joints.velocity + 1e-9).all()
-        q, v, w = q + dt * following, following, change
+        assert (np.abs(v_next) <= joints.velocity + 1e-9).all()
+        q, v, w = q + dt * v_next, v_next, change
         assert (q >= joints.lower - 1e-9).all() and (q <= joints.upper + 1e-9).all()
         reached |= np.minimum(q - joints.lower, joints.upper - q) < 1e-6
-    assert reached.mean() > 0.05  # pushed right to a limit, and no farther
+    assert reached.mean() > 0.05  # pushed up to a limit, and no farther
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_stop_ends_in_time_from_the_bounds_and_not_from_beyond_them(seed):
-    """Where neither the jerk nor the acceleration is what holds the bound; from all kinds of viable states."""
-    rng, dt, held = np.random.default_rng(seed), 0.01, 0
+def test_bounds_are_the_largest_speeds_with_a_stop_in_time(seed):
+    """Where neither the jerk nor the acceleration limits the bound; from all kinds of viable states."""
+    rng, dt, checked = np.random.default_rng(seed), 0.01, 0
     joints, q = jerky_joints(rng, 40, some=False)
     axes, v, w = Axes(joints, 0.5, dt), np.zeros(40), np.zeros(40)
     for _ in range(60):
         lower, upper = bounds_after(axes, q, v, w)
-        following = np.where(rng.random(40) < 0.6, upper, lower + rng.random(40) * (upper - lower))
-        w, v, q = following - v, following, q + dt * following
+        v_next = np.where(rng.random(40) < 0.6, upper, lower + rng.random(40) * (upper - lower))
+        w, v, q = v_next - v, v_next, q + dt * v_next
     unit, step = joints.jerk * dt**2, joints.acceleration * dt
     for bound, away in zip(bounds_after(axes, q, v, w), (-1.0, 1.0), strict=True):
         farthest = np.minimum(away * w + unit, step) - 1e-3 * unit
         for i in range(40):
             assert stops_within(joints, i, q[i], bound[i], bound[i] - v[i], dt, 1e-9)
             if away * (bound[i] - v[i]) < farthest[i]:
-                held, beyond = held + 1, bound[i] + away * 1e-3 * unit[i]
+                checked, beyond = checked + 1, bound[i] + away * 1e-3 * unit[i]
                 assert not stops_within(joints, i, q[i], beyond, beyond - v[i], dt, 0.0)
-    assert held > 10
+    assert checked > 10
 
 
-def test_a_jerk_that_is_hardly_limited_changes_nothing():
-    """Nor does it to a coordinate that has none beside one that has."""
+def test_wide_jerk_limits_change_no_bounds():
+    """Nor do they for a coordinate without one beside one with one."""
     rng, dt = np.random.default_rng(0), 0.01
     joints, q = random_joints(rng, 500)
     free = np.full(500, np.inf)
@@ -181,11 +181,11 @@ def test_a_jerk_that_is_hardly_limited_changes_nothing():
         lower, upper = bounds_after(one, q, v, 0.0 * w)
         found = bounds_after(other, q, v, w)
         np.testing.assert_allclose(found, (lower, upper), rtol=1e-6, atol=1e-6)
-        following = found[0] + rng.random(500) * (found[1] - found[0])
-        w, v, q = following - v, following, q + dt * following
+        v_next = found[0] + rng.random(500) * (found[1] - found[0])
+        w, v, q = v_next - v, v_next, q + dt * v_next
 
 
-def test_from_a_state_that_no_stop_saves_jerk_gives_way_then_acceleration():
+def test_bounds_relax_jerk_then_acceleration_from_states_without_a_stop():
     """Position and speed are kept, and the bounds do not cross; with acceleration, as far as that can be kept."""
     joints, q = jerky_joints(np.random.default_rng(3), 500)
     rng, dt = np.random.default_rng(4), 0.01
@@ -202,7 +202,7 @@ def test_from_a_state_that_no_stop_saves_jerk_gives_way_then_acceleration():
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
-def test_outside_its_position_limits_a_joint_is_sent_back_within_its_jerk(side):
+def test_bounds_return_a_joint_into_its_limits_within_its_jerk(side):
     """From rest, with no more than its acceleration and jerk; once inside, it stays there."""
     joints, _ = jerky_joints(np.random.default_rng(5), 300)
     joints = replace(joints, acceleration=10.0 ** np.random.default_rng(6).uniform(0, 2, 300))
@@ -210,16 +210,16 @@ def test_outside_its_position_limits_a_joint_is_sent_back_within_its_jerk(side):
     edge = joints.upper if side > 0 else joints.lower
     q = edge + side * rng.uniform(0.01, 5.0, 300) * np.minimum(joints.velocity, 0.1)
     v, w = np.zeros(300), np.zeros(300)
-    axes, select_voxels, back = Axes(joints, 0.5, dt), rng.random(300), np.zeros(300, dtype=bool)
+    axes, choice, back = Axes(joints, 0.5, dt), rng.random(300), np.zeros(300, dtype=bool)
     unit = np.where(np.isinf(joints.jerk), np.inf, joints.jerk * dt**2)
     for _ in range(3000):
         lower, upper = bounds_after(axes, q, v, w)
         assert (lower <= upper).all()
-        following = lower + select_voxels * (upper - lower)
-        change = following - v
+        v_next = lower + choice * (upper - lower)
+        change = v_next - v
         assert (np.abs(change) <= joints.acceleration * dt + 1e-9).all()
         assert (np.abs(change - w) <= unit * (1.0 + 1e-7) + 1e-9).all()
-        q, v, w = q + dt * following, following, change
+        q, v, w = q + dt * v_next, v_next, change
         inside = (q >= joints.lower - 1e-9) & (q <= joints.upper + 1e-9)
         assert inside[back].all()
         back |= inside
@@ -232,7 +232,7 @@ def test_outside_its_position_limits_a_joint_is_sent_back_within_its_jerk(side):
 
 
 def limited(seed, n=7):
-    """A layout with limits of everything, far away positions, and room to move."""
+    """A layout with all limits, far away from those of position."""
     rng = np.random.default_rng(seed)
     acceleration = rng.uniform(1.0, 20.0, n)
     joints = JointBounds(np.full(n, 5.0), np.arange(n), np.arange(n), np.full(n, -9.0), np.full(n, 9.0),
@@ -241,8 +241,8 @@ def limited(seed, n=7):
 
 
 def stops(x, q, v, w):
-    """Velocities of a stop as `velocity_bounds` and `stop_velocity` lead it, tick by tick."""
-    packed, way = kernels.pack(x), [v]
+    """Velocities of a stop by `velocity_bounds` and `stop_velocity`, step by step."""
+    packed, path = kernels.pack(x), [v]
     while (np.abs(v) > 1e-9 * x.v_step).any() or (np.abs(w) > x.dv_step).any():
         q = q + x.dt * v
         x.v_prev[:], x.dv_prev[:] = v, w
@@ -250,72 +250,72 @@ def stops(x, q, v, w):
         kernels.stop_velocity(packed)
         assert (x.v_stop >= x.lower).all() and (x.v_stop <= x.upper).all()
         v, w = x.v_stop.copy(), x.v_stop - v
-        way.append(v)
-        assert len(way) < 3000
-    return np.array(way)
+        path.append(v)
+        assert len(path) < 3000
+    return np.array(path)
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_a_stop_ends_at_rest_within_all_limits(seed):
+def test_stop_ends_at_rest_within_all_limits(seed):
     """At most twice as late as the slowest coordinate could alone."""
     x, rng = limited(seed)
     v, w = rng.uniform(-1.0, 1.0, 7) * 2.0, rng.uniform(-1.0, 1.0, 7) * x.v_step
-    way = stops(x, np.zeros(7), v, w)
-    assert np.abs(way[-1]).max() < 1e-9
-    changes = np.diff(way, axis=0)
+    path = stops(x, np.zeros(7), v, w)
+    assert np.abs(path[-1]).max() < 1e-9
+    changes = np.diff(path, axis=0)
     assert (np.abs(changes) <= x.v_step * (1.0 + 1e-9)).all()
     assert (np.abs(np.diff(changes, axis=0, prepend=w[None])) <= x.dv_step * (1.0 + 1e-9)).all()
-    alone = [len(followed(v[i] / x.dv_step[i], w[i] / x.dv_step[i], x.v_step[i] / x.dv_step[i])) for i in range(7)]
-    assert len(way) <= 2 * max(alone) + 1
+    alone = [len(stop_speeds(v[i] / x.dv_step[i], w[i] / x.dv_step[i], x.v_step[i] / x.dv_step[i])) for i in range(7)]
+    assert len(path) <= 2 * max(alone) + 1
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_stop_from_constant_speed_slows_all_coordinates_alike_and_as_fast_as_one_can(seed):
+def test_stop_from_constant_speed_is_uniform_and_of_least_time(seed):
     x, rng = limited(seed)
     v = rng.uniform(-2.0, 2.0, 7)
-    way = stops(x, np.zeros(7), v, np.zeros(7))
-    shares = way / v
-    np.testing.assert_allclose(shares, np.repeat(shares[:, :1], 7, axis=1), atol=1e-12)
-    jerk = np.abs(np.diff(way, n=2, axis=0, prepend=np.array([v]))) / x.dv_step
-    assert jerk[0].max() == pytest.approx(1.0) and (np.diff(shares[:, 0]) < 1e-12).all()
+    path = stops(x, np.zeros(7), v, np.zeros(7))
+    ratios = path / v
+    np.testing.assert_allclose(ratios, np.repeat(ratios[:, :1], 7, axis=1), atol=1e-12)
+    jerk = np.abs(np.diff(path, n=2, axis=0, prepend=np.array([v]))) / x.dv_step
+    assert jerk[0].max() == pytest.approx(1.0) and (np.diff(ratios[:, 0]) < 1e-12).all()
 
 
 @pytest.mark.parametrize("place", [0.0, 8.9])
 @pytest.mark.parametrize("seed", range(4))
-def test_the_way_of_a_stop_is_the_stop_of_the_ticks(seed, place):
+def test_stop_way_agrees_with_the_stop_step_by_step(seed, place):
     """In free space, and where position limits bend it."""
     x, rng = limited(seed)
     q, v, w = np.full(7, place), rng.uniform(0.5, 1.5, 7), rng.uniform(-1.0, 1.0, 7) * x.v_step
-    if place:  # a state that is viable: on the way there
+    if place:  # a viable state: moving there
         q, v, w = 0.0 * q + 5.0, 0.0 * v, 0.0 * w
         axes = kernels.pack(x)
         for _ in range(1000):
             x.v_prev[:], x.dv_prev[:] = v, w
             kernels.velocity_bounds(axes, q)
-            following = x.upper.copy() if (q < 8.0).any() else 0.5 * (x.upper + np.minimum(v, x.upper))
-            w, v = following - v, following
+            v_next = x.upper.copy() if (q < 8.0).any() else 0.5 * (x.upper + np.minimum(v, x.upper))
+            w, v = v_next - v, v_next
             q = q + x.dt * v
             if q.max() > 8.6:
                 break
         q = q - x.dt * v
     expected = stops(x, q, v, w)
-    way = np.full((1000, 7), np.nan)
-    way[0] = v
-    count = kernels.roll_out_stop(kernels.pack(x), q.copy(), w, way)
+    path = np.full((1000, 7), np.nan)
+    path[0] = v
+    count = kernels.roll_out_stop(kernels.pack(x), q.copy(), w, path)
     assert abs(count - len(expected)) <= 1
     size = min(count, len(expected))
-    np.testing.assert_allclose(way[:size], expected[:size], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(path[:size], expected[:size], rtol=1e-9, atol=1e-9)
     assert (np.ptp(expected[: size // 2] / v, axis=1) > 1e-6).any()  # not all coordinates alike
 
 
 # --- rows --------------------------------------------------------------------------------------------------------
 
 
-def test_half_of_jerks_and_accelerations_bring_a_pair_to_rest_where_it_has_to_be():
+def test_rows_stop_a_pair_at_its_distance_with_half_of_the_limits():
     """A pair that closes as fast as its row allows, and as its joints can follow, never comes nearer than it may."""
     step, unit, J, dt = np.array([0.1, 0.2]), np.array([0.01, 0.02]), np.array([[0.5, -1.0]]), 0.01
     d, v, w = np.array([0.9]), np.zeros(2), np.zeros(2)
-    way, changes = [], []
+    distances, changes = [], []
     for _ in range(400):
         closest = np.zeros((1, 10))
         closest[:, 0] = d
@@ -325,15 +325,17 @@ def test_half_of_jerks_and_accelerations_bring_a_pair_to_rest_where_it_has_to_be
         )  # fmt: skip
         kernels.row_bounds(kernels.pack(x), 1, False)
         # the velocity along J that closes fastest, within the row and within what half of the limits allow
-        share = np.array([-1.0, 1.0]) / (J[0] @ [-1.0, 1.0]) * np.array([1.0, 1.0])
+        per_speed = np.array([-1.0, 1.0]) / (J[0] @ [-1.0, 1.0]) * np.array([1.0, 1.0])
         least = max(x.rhs[0], J[0] @ (v + np.maximum(w + unit * [-1.0, 1.0], 0.0) * [1.0, 1.0]) - 9.0)
-        following = share * max(least, J[0] @ v + max(J[0] @ w - 0.5 * np.abs(J[0]) @ unit, -0.5 * np.abs(J[0]) @ step))
-        w, v = following - v, following
+        v_next = per_speed * max(
+            least, J[0] @ v + max(J[0] @ w - 0.5 * np.abs(J[0]) @ unit, -0.5 * np.abs(J[0]) @ step)
+        )
+        w, v = v_next - v, v_next
         changes.append(J[0] @ w)
         d = d + dt * (J @ v)
-        way.append(d[0])
+        distances.append(d[0])
     changes = np.array(changes)
     half = 0.5 * np.abs(J[0])
-    assert min(way) >= 0.1 - 1e-9 and way[-1] == pytest.approx(0.1, abs=1e-3)
+    assert min(distances) >= 0.1 - 1e-9 and distances[-1] == pytest.approx(0.1, abs=1e-3)
     assert (np.abs(np.diff(changes[:-60])) <= 1.25 * half @ unit).all()
     assert np.abs(changes).max() <= 1.01 * half @ step

@@ -1,7 +1,6 @@
-"""Jerk limits among moving obstacles and points, with contacts, loads, bases that move, and strict priorities.
+"""Jerk limits with moving obstacles, points, contacts, attached objects, moving bases, and strict priorities.
 
-Whatever happens, a tick that is SOLVED keeps to acceleration and jerk limits, and one that does not says which joint
-passes them.
+Always: a step that is SOLVED keeps acceleration and jerk limits, and one that does not names the joints beyond them.
 """
 
 import numpy as np
@@ -17,7 +16,7 @@ from qpavoid.config import Sphere
 
 
 class Limited:
-    """Checks ticks, one after the other, against the limits by their definition."""
+    """Checks control steps, one after the other, against the limits by their definition."""
 
     def __init__(self, controller):
         bounds, dt = controller._bounds, controller.dt
@@ -25,30 +24,30 @@ class Limited:
             (bounds.acceleration * dt, bounds.jerk * dt**2),
             controller.scene.robot.coordinate_names,
         )
-        self._before, self.relaxed, self.passed, self.most = np.zeros((2, len(bounds.jerk))), [], 0, 0.0
+        self._last, self.relaxed, self.passed, self.most = np.zeros((2, len(bounds.jerk))), [], 0, 0.0
 
     def check(self, solution):
-        """What the last ticks and this one make of acceleration and jerk; returns the solution."""
-        change = solution.v - self._before[0]
+        """Check the acceleration and jerk of a step; returns the solution."""
+        change = solution.v - self._last[0]
         kinds = ReasonKind.ACCELERATION_RELAXED, ReasonKind.JERK_RELAXED
-        said = [reason.subject[0] for reason in solution.reasons if reason.kind in kinds]
-        for size, step in zip((change, change - self._before[1]), self._steps, strict=True):
+        named = [reason.subject[0] for reason in solution.reasons if reason.kind in kinds]
+        for size, step in zip((change, change - self._last[1]), self._steps, strict=True):
             passing = np.flatnonzero(np.abs(size) > step + 3e-6)
             assert not len(passing) or solution.status is not Status.SOLVED
-            assert {self._names[j] for j in passing} <= set(said), solution
+            assert {self._names[j] for j in passing} <= set(named), solution
             self.passed += len(passing)
-        self.most = max(self.most, float(np.max(np.abs(change - self._before[1]) / self._steps[1])))
-        self._before = np.array([solution.v, change])
+        self.most = max(self.most, float(np.max(np.abs(change - self._last[1]) / self._steps[1])))
+        self._last = np.array([solution.v, change])
         if solution.status is not Status.SOLVED:
             self.relaxed.append(solution)
         return solution
 
 
-def followed(scenario, ticks):
-    """A scenario's first ticks, checked: the check, least distance, joint velocities (N, nv), configuration after."""
+def run_checked(scenario, steps):
+    """A scenario's first steps, checked: the check, least distance, joint velocities (N, nv), configuration after."""
     controller, q = Controller.from_scenario(scenario)
     limited, vs, least = Limited(controller), [], np.inf
-    for k in range(ticks):
+    for k in range(steps):
         tick = controller.tick(q, k * controller.dt)
         least = min(least, tick.proximity.distance.min(initial=np.inf))
         vs.append(limited.check(tick.solution).v)
@@ -58,17 +57,17 @@ def followed(scenario, ticks):
 
 def limited_situation(course, acceleration, jerk):
     fields = {**situation(course).model_dump(mode="json"), "limits": {"acceleration": acceleration, "jerk": jerk}}
-    return followed(changed("situation1", **fields), 1300)
+    return run_checked(changed("situation1", **fields), 1300)
 
 
 # --- moving obstacles --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("course", "jerk"), [(course, 50.0 * 4.0 ** (k % 2)) for k, course in enumerate(COURSES)])
-def test_a_sphere_that_comes_on_is_kept_clear_of_to_2_mm(course, jerk):
-    """As without jerk limits: a margin may have to give way for some ticks, accelerations and jerks do not."""
+def test_distance_to_an_approaching_sphere_is_kept_to_2_mm(course, jerk):
+    """As without jerk limits: a margin may be relaxed for some steps, accelerations and jerks are not."""
     fields = situation(course).model_dump(mode="json")
-    limited, least, vs, _ = followed(
+    limited, least, vs, _ = run_checked(
         changed("situation1", **{**fields, "limits": {"acceleration": 5.0, "jerk": jerk}}), 1300
     )
     assert SAFE - 2e-3 < least < 0.03
@@ -79,10 +78,10 @@ def test_a_sphere_that_comes_on_is_kept_clear_of_to_2_mm(course, jerk):
 
 
 @pytest.mark.parametrize("course", ["front 0.2", "head-on 0.4", "chase 0.3"])
-def test_with_harsh_limits_it_is_kept_too_and_what_rows_lack_is_said(course):
+def test_distance_is_kept_under_tight_limits_with_relaxed_rows_reported(course):
     """At 2 rad/s² and 10 rad/s³, where it takes 0.4 s until a joint brakes fully."""
     fields = situation(course).model_dump(mode="json")
-    limited, least, _, _ = followed(
+    limited, least, _, _ = run_checked(
         changed("situation1", **{**fields, "limits": {"acceleration": 2.0, "jerk": 10.0}}), 1300
     )
     assert least > SAFE - 2e-3
@@ -92,8 +91,8 @@ def test_with_harsh_limits_it_is_kept_too_and_what_rows_lack_is_said(course):
 
 @pytest.mark.parametrize("solver", ["qp", "qp:daqp", "hqp"])
 @pytest.mark.parametrize("seed", range(2))
-def test_balls_thrown_at_a_panda(panda, solver, seed):
-    """Contact is often avoided only beyond the limits; the ticks after that have to come back within them."""
+def test_limits_and_reports_with_balls_thrown_at_a_panda(panda, solver, seed):
+    """Contact is often avoided only beyond the limits; the steps after that have to return into them."""
     rng, count = np.random.default_rng(100 + seed), 3
     balls = [Obstacle.at(f"ball{i}", Sphere(radius=0.08), [5.0, 0.0, i]) for i in range(count)]
     controller = make_controller(
@@ -104,8 +103,8 @@ def test_balls_thrown_at_a_panda(panda, solver, seed):
         if k % 100 == 0:
             goal = rng.uniform([0.25, -0.4, 0.2], [0.65, 0.4, 0.7])
         for i in np.flatnonzero(np.linalg.norm(place - [0.3, 0.0, 0.4], axis=1) > 1.6):
-            way = rng.normal(size=3)
-            velocity[i] = rng.uniform(0.3, 0.9) * way / np.linalg.norm(way)
+            direction = rng.normal(size=3)
+            velocity[i] = rng.uniform(0.3, 0.9) * direction / np.linalg.norm(direction)
             place[i] = rng.uniform([0.1, -0.4, 0.2], [0.6, 0.4, 0.8]) - velocity[i] * (
                 0.5 + 0.6 / np.linalg.norm(velocity[i])
             )
@@ -118,8 +117,8 @@ def test_balls_thrown_at_a_panda(panda, solver, seed):
     assert limited.relaxed and (limited.passed > 0 or seed or solver == "hqp")
 
 
-def test_the_ticks_after_one_beyond_the_limits_say_so_as_long_as_they_are(tmp_path):
-    """A ball leaves the tool no time: it jumps away at its full speed, and what jumps has to come back."""
+def test_steps_after_one_beyond_the_limits_report_their_excess(tmp_path):
+    """A ball leaves the tool no time: it jumps away at its full speed, and returns into its limits later."""
     robot = cartesian(tmp_path, speed=1.0, acceleration=4.0)
     ball = Obstacle.at("ball", Sphere(radius=0.1), [9.0, 0.0, 0.0])
     controller = make_controller(robot, [ball], "z", limits=Limits(jerk=40.0))
@@ -139,7 +138,7 @@ def test_the_ticks_after_one_beyond_the_limits_say_so_as_long_as_they_are(tmp_pa
 
 @pytest.mark.parametrize("dt", [0.005, 0.02])
 @pytest.mark.parametrize("speed", [0.5, 2.0])
-def test_a_wall_of_points_is_not_passed(tmp_path, dt, speed):
+def test_wall_of_points_is_not_crossed(tmp_path, dt, speed):
     robot = cartesian(tmp_path, speed=speed, acceleration=8.0)
     controller = make_controller(
         robot, [Obstacle.at("camera", CLOUD, [0, 0, 0])], "z", dt=dt, task={"gain": 20.0}, limits=Limits(jerk=80.0)
@@ -155,14 +154,14 @@ def test_a_wall_of_points_is_not_passed(tmp_path, dt, speed):
     assert not limited.relaxed and limited.most == pytest.approx(1.0, abs=1e-3)
 
 
-# --- robots that stand, drive, fly and carry -----------------------------------------------------------------------
+# --- contacts, moving bases, attached objects -----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("solver", ["qp", "hqp"])
-def test_a_humanoid_over_its_contacts(solver):
-    """Its feet do not slide, and its joints keep to their limits although contacts turn from tick to tick."""
+def test_limits_hold_for_a_humanoid_over_its_contacts(solver):
+    """Its feet do not slide, and its joints keep their limits although contact Jacobians change in every step."""
     scenario = changed("humanoid_reach", solver=solver, limits={"acceleration": 2.0, "jerk": 20.0})
-    limited, least, vs, q = followed(scenario, 220)
+    limited, least, vs, q = run_checked(scenario, 220)
     assert least > 0.015 - 1e-3 and np.abs(vs).max() > 0.05
     controller, q0 = Controller.from_scenario(scenario)
     model, data = controller.scene.robot.model, controller.scene.robot.model.createData()
@@ -176,14 +175,14 @@ def test_a_humanoid_over_its_contacts(solver):
 
 
 @pytest.mark.parametrize("limits", [{"acceleration": 5.0, "jerk": 100.0}, {"acceleration": 2.0, "jerk": 20.0}])
-def test_a_base_that_drives(limits):
-    limited, least, vs, _ = followed(changed("tiago_column", limits=limits), 1200)
+def test_limits_hold_for_a_mobile_base(limits):
+    limited, least, vs, _ = run_checked(changed("tiago_column", limits=limits), 1200)
     assert least > 0.012 - 1e-3 and np.abs(vs[:, :2]).max() > 0.05
     assert not limited.relaxed and limited.most == pytest.approx(1.0, abs=1e-3)
 
 
-def test_a_base_that_flies_past_a_ball():
-    """A trunk with six coordinates of its own, whose velocities are in its own axes; the ball is in its way."""
+def test_limits_hold_for_a_floating_base_past_a_ball():
+    """A trunk with six coordinates of its own, whose velocities are in its own axes; the ball is on its path."""
     robot = load("floating")
     ball = Obstacle.at("ball", Sphere(radius=0.1), [0.5, 0.02, 0.0])
     controller = make_controller(
@@ -201,14 +200,14 @@ def test_a_base_that_flies_past_a_ball():
 
 
 @pytest.mark.parametrize("solver", ["qp", "hqp"])
-def test_a_load_past_a_pole_and_a_shelf(solver):
+def test_limits_hold_with_an_attached_box_past_a_pole(solver):
     limits = {"acceleration": 5.0, "jerk": 100.0}
-    limited, least, vs, _ = followed(changed("carried_box", solver=solver, limits=limits), 500)
+    limited, least, vs, _ = run_checked(changed("carried_box", solver=solver, limits=limits), 500)
     assert least > 0.02 - 1e-3 and np.abs(vs).max() > 0.1
     assert not limited.relaxed and limited.most == pytest.approx(1.0, abs=1e-3)
 
 
-def test_a_joint_that_moves_another_one():
+def test_limits_hold_for_a_mimic_joint():
     """Fingers that follow each other, one coordinate for both, closing on a ball."""
     robot = load("mimic")
     tool = robot.frame_id("l_gripper_r_finger_tip", "test")

@@ -1,4 +1,4 @@
-"""Jerk limits in the loop of a controller: static obstacles, stops, what gives way, and what users say."""
+"""Jerk limits in the loop of a controller: static obstacles, stops, relaxation, and settings."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ SAFE = 0.02
 
 
 def within_limits(controller, vs, slack=1e-9):
-    """That commands, from a standstill on, keep to velocity, acceleration and jerk limits."""
+    """Assert that commands, from rest on, keep velocity, acceleration and jerk limits."""
     b, dt = controller._bounds, controller.dt
     changes = np.diff(vs, axis=0, prepend=np.zeros((1, len(vs[0]))))
     jumps = np.diff(changes, axis=0, prepend=np.zeros((1, len(vs[0]))))
@@ -29,7 +29,7 @@ def within_limits(controller, vs, slack=1e-9):
 @pytest.mark.parametrize("row", ["beta", "task-switching", "damper"])
 @pytest.mark.parametrize("size", [[0.004, 0.6, 0.6], [0.2, 0.2, 0.2]], ids=["plate", "box"])
 @pytest.mark.parametrize(("dt", "duration"), [(0.002, 0.8), (0.01, 1.5), (0.05, 3.0)])
-def test_no_period_and_no_speed_pass_the_safe_distance(row, size, dt, duration):
+def test_safety_distance_is_kept_at_any_period_and_speed(row, size, dt, duration):
     """As without jerk limits, with ones of about 10 times the accelerations a second: a target leads through a body."""
     run = scenario(
         "panda",
@@ -52,8 +52,8 @@ def test_no_period_and_no_speed_pass_the_safe_distance(row, size, dt, duration):
 
 @pytest.mark.parametrize("solver", ["qp", "hqp"])
 @pytest.mark.parametrize(("jerk", "gain"), [(20.0, 2.0), (20.0, 5.0), (10.0, 1.0), (10.0, 2.0)])
-def test_a_target_is_reached_and_the_robot_then_rests(panda, solver, jerk, gain):
-    """At 2 rad/s²: the velocity closest to the wanted one in every tick swings to and fro at up to 0.7 rad/s."""
+def test_target_is_reached_and_the_robot_rests_there(panda, solver, jerk, gain):
+    """At 2 rad/s²: the velocity closest to v_tracking in every step would oscillate at up to 0.7 rad/s."""
     slow = replace(panda, acceleration=dict.fromkeys(panda.coordinate_names, 2.0))
     goal = np.array([0.407, 0.3, 0.387])
     controller = make_controller(slow, (), "panda_hand_tcp", solver, limits=Limits(jerk=jerk), task={"gain": gain})
@@ -63,14 +63,14 @@ def test_a_target_is_reached_and_the_robot_then_rests(panda, solver, jerk, gain)
     assert within_limits(controller, np.array([tick.solution.v for tick in ticks])) == pytest.approx(1.0, abs=1e-6)
 
 
-def test_within_jerk_limits_a_carried_box_gets_past_a_pole():
+def test_attached_box_passes_a_pole_within_jerk_limits():
     """At 2 rad/s² and 20 rad/s³, where it would swing through the workspace at 2.6 rad/s."""
     metrics = simulate(changed("carried_box", limits={"acceleration": 2.0, "jerk": 20.0})).metrics()
     assert metrics["arrived"] and metrics["peak_velocity"] < 1.0 and metrics["min_distance"] > 0.02 - 1e-3
 
 
-def test_nothing_is_first_seen_inside_its_margin(tmp_path):
-    """A row sees 30 mm ahead; at 2 m/s, 4 m/s² and 20 m/s³, braking takes 0.7 m."""
+def test_braking_begins_before_rows_are_in_range(tmp_path):
+    """Rows begin 30 mm ahead; at 2 m/s, 4 m/s² and 20 m/s³, braking takes 0.7 m."""
     robot = cartesian(tmp_path, speed=2.0, acceleration=4.0)
     wall = Obstacle.at("wall", Box(size=(0.1, 2.0, 2.0)), [2.05, 0.0, 0.0])
     controller = make_controller(
@@ -116,7 +116,7 @@ def test_random_targets_among_obstacles_stay_feasible(panda, seed):
     assert least > SAFE - 1e-3
 
 
-def test_what_is_left_on_the_way_of_a_stop_is_a_lower_bound(panda):
+def test_clearance_lower_bound_holds_along_stops(panda):
     """Distances along stops from random velocities and accelerations, by brute force."""
     rng, bounds = np.random.default_rng(0), panda.bounds()
     balls = [Obstacle.at(f"ball{i}", Sphere(radius=0.08), p) for i, p in enumerate(rng.uniform(-0.7, 0.7, (3, 3)))]
@@ -130,10 +130,10 @@ def test_what_is_left_on_the_way_of_a_stop_is_a_lower_bound(panda):
         controller.reset(before)
         v = before + 0.01 * change
         stop = assembly.stop(q, v)
-        way = stop.way.copy()
+        velocities = stop.way.copy()
         bound = assembly.clearance_lower_bound(v, near, 0.1, float(stop.forwards.sum()), stop)
         least = np.inf
-        for velocity in way:
+        for velocity in velocities:
             least = min(least, ruler.distances(q).min())
             q = q + 0.01 * velocity
         assert min(least, ruler.distances(q).min()) - SAFE >= bound - 1e-9
@@ -141,12 +141,12 @@ def test_what_is_left_on_the_way_of_a_stop_is_a_lower_bound(panda):
     assert close > 3
 
 
-def test_a_stop_is_within_the_jerk_and_the_next_good_tick_goes_on(panda):
+def test_stop_keeps_the_jerk_and_valid_input_resumes(panda):
     controller = make_controller(panda, frame="panda_hand_tcp", task={"gain": 4.0}, limits=Limits(jerk=200.0))
     q, vs, target = panda.home.copy(), [], {"panda_hand_tcp": Sample.at([0.4, 0.3, 0.6])}
     for k in range(90):
-        given = np.full(7, np.nan) if 15 <= k < 60 else q
-        s = controller.step(given, 0.01 * k, target)
+        measured = np.full(7, np.nan) if 15 <= k < 60 else q
+        s = controller.step(measured, 0.01 * k, target)
         assert s.status is (Status.STOPPED if 15 <= k < 60 else Status.SOLVED)
         vs.append(s.v)
         q = q + 0.01 * s.v
@@ -154,7 +154,7 @@ def test_a_stop_is_within_the_jerk_and_the_next_good_tick_goes_on(panda):
     assert np.abs(vs[14]).max() > 0.2 and np.abs(vs[59]).max() < 1e-9 and np.abs(vs[75]).max() > 0.1
 
 
-def test_a_measured_velocity_counts_and_a_reset_forgets_the_acceleration(panda):
+def test_measured_velocity_counts_and_reset_drops_the_acceleration(panda):
     controller = make_controller(panda, frame="panda_hand_tcp", task={"gain": 50.0}, limits=Limits(jerk=200.0))
     q, target, v, change = panda.home, {"panda_hand_tcp": Sample.at([0.2, 0.6, 0.6])}, np.zeros(7), np.zeros(7)
     unit = 200.0 * 0.01**2
@@ -170,24 +170,24 @@ def test_a_measured_velocity_counts_and_a_reset_forgets_the_acceleration(panda):
     assert (np.abs(controller.step(q, 0.0, target).v - v) <= unit + 1e-12).all()
 
 
-# --- what gives way, and what users say --------------------------------------------------------------------------
+# --- relaxation, and settings --------------------------------------------------------------------------
 
 
 PASSED = ReasonKind.ACCELERATION_RELAXED, ReasonKind.JERK_RELAXED
 
 
-@pytest.mark.parametrize("gives_way", [True, False])
-def test_jerk_gives_way_with_the_acceleration_or_never(tmp_path, gives_way):
+@pytest.mark.parametrize("relaxes", [True, False])
+def test_jerk_is_relaxed_with_the_acceleration_or_never(tmp_path, relaxes):
     """A ball that comes straight at the tool at 2 m/s from 60 mm off: contact cannot be avoided within the limits."""
     robot = cartesian(tmp_path, speed=5.0, acceleration=4.0)
-    limits = Limits(jerk=40.0, relax_acceleration=gives_way)
+    limits = Limits(jerk=40.0, relax_acceleration=relaxes)
     ball = Obstacle.at("ball", Sphere(radius=0.1), [9.0, 0.0, 0.0])
     controller = make_controller(robot, [ball], "z", limits=limits)
     seen = {"ball": Sample.at([0.21, 0.0, 0.0], linear=[-6.0, 0.0, 0.0])}
     tick = controller.tick(np.zeros(3), 0.0, {"z": Sample.at([0.0, 0.0, 0.0])}, seen)
     assert tick.problem.jerk_limited and tick.solution.status is Status.RELAXED
     step = np.abs(tick.solution.v).max()
-    if gives_way:
+    if relaxes:
         assert step > 4.0 * 0.01
         (reason,) = [reason for reason in tick.solution.reasons if reason.kind is ReasonKind.JERK_RELAXED]
         assert reason.subject == ("joint_x",) and reason.unit == "m/s"
@@ -197,7 +197,7 @@ def test_jerk_gives_way_with_the_acceleration_or_never(tmp_path, gives_way):
         assert not any(reason.kind in PASSED for reason in tick.solution.reasons)
 
 
-def test_the_reason_names_the_limits_that_there_are(panda):
+def test_relaxation_reason_names_the_limits_present(panda):
     """Without jerk limits, none is named."""
     for limits, kind in zip((Limits(), Limits(jerk=50.0)), PASSED, strict=True):
         problem = make_controller(panda, frame="panda_hand_tcp", limits=limits).tick(panda.home).problem
@@ -205,8 +205,7 @@ def test_the_reason_names_the_limits_that_there_are(panda):
         assert relaxation_reasons(relaxed, problem) == (Reason.of(kind, "panda_joint2", amount=0.5, unit="rad/s"),)
 
 
-def test_jerk_limits_of_a_robot_and_of_a_scenario(tmp_path):
-    """The scenario's is for joints to which the robot gives none."""
+def test_scenario_jerk_limit_applies_to_joints_without_one(tmp_path):
     cartesian(tmp_path)
     body = {"name": "tool", "frame": "z", "shape": {"type": "sphere", "radius": 0.05}}
     limits = {"acceleration": {"joint_x": 2.0, "joint_y": 3.0}, "jerk": {"joint_x": 30.0}}
@@ -228,13 +227,13 @@ def test_jerk_limits_of_a_robot_and_of_a_scenario(tmp_path):
         ({"acceleration": {"joint_q": 3.0}, "jerk": {"joint_q": 9.0}}, "joint_q"),
     ],
 )
-def test_errors_name_the_field(tmp_path, limits, said):
+def test_invalid_jerk_limits_name_the_field(tmp_path, limits, said):
     cartesian(tmp_path)
     with pytest.raises(ConfigError, match=said):
         Robot.from_urdf(tmp_path / "cartesian.urdf", bodies="convex", limits=limits)
 
 
-def test_a_scenario_says_where_its_jerk_limit_lacks_an_acceleration():
+def test_jerk_limit_without_acceleration_names_the_scenario():
     run = changed("situation1", limits={"jerk": 50.0})
     with pytest.raises(ConfigError, match=r"situation1.*limits\.jerk: 7 of 7"):
         Controller.from_scenario(run)

@@ -1,4 +1,4 @@
-"""No step in the commanded velocity beyond the acceleration limits, whatever pairs and witness points do."""
+"""Commanded velocities keep acceleration limits while pairs and witness points change."""
 
 from functools import cache
 from itertools import pairwise
@@ -26,48 +26,48 @@ def run(name, solver, acceleration=None):
 
 @cache
 def damped(name):
-    """The QP with damper rows that hold 20 mm."""
+    """The QP with damper rows for 20 mm."""
     avoidance = load_scenario(name).avoidance.model_dump() | {"row": {"type": "damper", "d_safe": 0.12}}
     return simulate(changed(name, avoidance=avoidance), "qp")
 
 
 @pytest.mark.parametrize("acceleration", [2.0, 10.0])
 @pytest.mark.parametrize("name", ["situation1", "situation2"])
-def test_accelerations_of_the_papers_situations(name, acceleration):
-    """The paper's robot has no limits of its own; with one, it holds at every tick, and the distance with it."""
+def test_qp_keeps_accelerations_in_the_papers_situations(name, acceleration):
+    """The paper's robot has no limits of its own; with one, every step keeps it, and the distance too."""
     log = run(name, "qp", acceleration)
     assert accelerations(log.v, 0.01).max() <= acceleration + 1e-6
     assert log.metrics()["status_counts"]["RELAXED"] == log.metrics()["status_counts"]["STOPPED"] == 0
     assert log.metrics()["min_distance"] > 0.02 - 5e-4
 
 
-def test_accelerations_of_the_panda_on_its_line(panda):
+def test_qp_keeps_accelerations_of_the_panda_on_its_line(panda):
     """A box beside the line, and a ball that rolls onto it: the limits of the data sheet."""
     log = run("panda_line", "qp")
     assert (accelerations(log.v, 0.01) <= panda.bounds().acceleration + 1e-6).all()
     assert log.metrics()["status_counts"]["RELAXED"] == 0
-    assert len(set(log.closest_pair.tolist())) > 3  # the nearest pair changes on the way
+    assert len(set(log.closest_pair.tolist())) > 3  # the nearest pair changes during the run
     assert log.metrics()["min_distance"] > 0.02 - 5e-4
 
 
-@pytest.mark.parametrize(("name", "share"), [("situation1", 1.0), ("situation2", 1.5)])
-def test_jitter_beside_eq10(name, share):
+@pytest.mark.parametrize(("name", "ratio"), [("situation1", 1.0), ("situation2", 1.5)])
+def test_qp_jitter_is_of_the_order_of_eq10(name, ratio):
     """Σ|Δq̇| of damper rows against eq. 10: 9.7 to 11.1 in the first situation, 9.4 to 6.4 in the second. Rows with the
-    gains of eq. 10, which hold four times the distance and more, make it 13.5 and 11.7.
+    gains of eq. 10, which keep four times the distance and more, make it 13.5 and 11.7.
     """
-    theirs = run(name, "eq10").metrics()["jitter"]
-    assert damped(name).metrics()["jitter"] <= share * theirs
-    assert run(name, "qp").metrics()["jitter"] <= (share + 0.4) * theirs
+    of_eq10 = run(name, "eq10").metrics()["jitter"]
+    assert damped(name).metrics()["jitter"] <= ratio * of_eq10
+    assert run(name, "qp").metrics()["jitter"] <= (ratio + 0.4) * of_eq10
 
 
 def witnesses(ticks):
-    """How far the witness point on the tool jumps at most from one tick to the next [m]."""
+    """Largest jump of the witness point on the tool from one step to the next [m]."""
     points = [tick.proximity.point_a[0] for tick in ticks if len(tick.proximity.pair)]
     return max(np.linalg.norm(b - a) for a, b in pairwise(points))
 
 
 def rocking(shape):
-    """An obstacle that rocks by 0.02 rad under the tool, so that what is nearest flips from end to end."""
+    """An obstacle that rocks by 0.02 rad under the tool, so that the witness point jumps from end to end."""
 
     def at(t):
         turn = np.array([0.0, 1.0, 0.0])
@@ -88,7 +88,7 @@ TOOLS = {
 
 @pytest.mark.parametrize("row", ROWS)
 @pytest.mark.parametrize("case", TOOLS)
-def test_witness_points_that_jump_do_not_jerk(tmp_path, case, row):
+def test_accelerations_are_kept_when_witness_points_jump(tmp_path, case, row):
     """A tool pressed down on a slab that rocks: the nearest point jumps from one end of it to the other."""
     shape, jump = TOOLS[case]
     cartesian(tmp_path)
@@ -104,7 +104,7 @@ def test_witness_points_that_jump_do_not_jerk(tmp_path, case, row):
 
 
 @pytest.mark.parametrize("row", ROWS)
-def test_the_nearest_of_two_changes_without_a_jerk(tmp_path, row):
+def test_accelerations_are_kept_when_the_nearest_pair_changes(tmp_path, row):
     """A tool pressed down while it slides over a ball and a capsule: pairs enter, become the nearest, and leave."""
     robot = cartesian(tmp_path, acceleration=4.0)
     over = [
@@ -123,8 +123,8 @@ def test_the_nearest_of_two_changes_without_a_jerk(tmp_path, row):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_obstacles_that_flicker_in_and_out_of_range(panda, seed):
-    """Seen and lost at random, at the edge of the influence distance: accelerations hold all the same."""
+def test_accelerations_are_kept_with_flickering_obstacles(panda, seed):
+    """Detected and lost at random, at the edge of the influence distance."""
     rng, bounds = np.random.default_rng(seed), panda.bounds()
     controller = make_controller(
         panda, [Obstacle.at(f"ball{i}", Sphere(radius=0.05), [9.0, 0, i]) for i in range(3)], "panda_hand_tcp"

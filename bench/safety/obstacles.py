@@ -1,4 +1,4 @@
-"""Random obstacles: what they look like, and how they get in the way."""
+"""Random obstacles: shapes, and motions across the path of the robot."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ if TYPE_CHECKING:
 def draw_obstacle(
     random: np.random.Generator, name: str, moving: bool, way: ToolPath, bodies: Array, ranges: Ranges
 ) -> dict[str, Any]:
-    """An obstacle as a scenario file has it; whether there is room for it at the start is not looked at.
+    """Return an obstacle as in a scenario file; whether its place is free at the start is not checked.
 
     Args:
-        random: where it is drawn from.
+        random: generator.
         name: its name.
         moving: whether it moves.
-        way: of a tool.
-        bodies: (b, 3) where parts of the robot are likely to be at some time [m].
+        way: path of a tool.
+        bodies: (b, 3) likely positions of parts of the robot [m].
         ranges: sizes and speeds.
     """
     if moving:
         motion = MOTIONS[random.integers(len(MOTIONS))](random, way, bodies, ranges)
-        if motion["type"] == "line" and random.random() < ranges.tumbling_share:
+        if motion["type"] == "line" and random.random() < ranges.tumbling_fraction:
             motion = _tumbling(random, motion, ranges)
     else:
         motion = {"type": "fixed", "position": _beside(random, way, bodies).tolist(), "rpy": _rpy(random)}
@@ -52,39 +52,39 @@ def _shape(random: np.random.Generator, ranges: Ranges) -> dict[str, Any]:
 
 
 def _beside(random: np.random.Generator, way: ToolPath, bodies: Array) -> Array:
-    """Somewhere near the tool's way, two times in three, else near the robot, (3,) [m]."""
+    """Return a point (3,) near the tool's path, two times in three, else near the robot [m]."""
     near_way = random.random() < 2.0 / 3.0
     point = way.point(random.uniform(-0.1, 1.1)) if near_way else bodies[random.integers(len(bodies))]
     return np.asarray(point + random.uniform(0.0, 0.35) * _direction(random))
 
 
 def _crossing(random: np.random.Generator, way: ToolPath, bodies: Array, ranges: Ranges) -> dict[str, Any]:
-    """A line through the tool's way, at the time when the tool is there."""
-    speed, share, direction = random.uniform(*ranges.obstacle_speed), random.uniform(0.2, 1.0), _direction(random)
-    return tool_path.crossing(way, share, direction, random.uniform(0.0, 0.05) * _direction(random), speed)
+    """Return a line through the tool's path, at the time when the tool is there."""
+    speed, fraction, direction = random.uniform(*ranges.obstacle_speed), random.uniform(0.2, 1.0), _direction(random)
+    return tool_path.crossing(way, fraction, direction, random.uniform(0.0, 0.05) * _direction(random), speed)
 
 
 def _at_the_arm(random: np.random.Generator, way: ToolPath, bodies: Array, ranges: Ranges) -> dict[str, Any]:
-    """A line through a part of the robot."""
+    """Return a line through a part of the robot."""
     speed, direction = random.uniform(*ranges.obstacle_speed), _direction(random)
     point = bodies[random.integers(len(bodies))] + random.uniform(0.0, 0.1) * _direction(random)
     return line(point - random.uniform(0.3, 1.0) * direction, point + tool_path.OVERSHOOT * direction, speed)
 
 
 def _head_on(random: np.random.Generator, way: ToolPath, bodies: Array, ranges: Ranges) -> dict[str, Any]:
-    """Along the tool's way, towards it."""
-    aside = random.uniform(0.0, 0.03) * _direction(random)
-    return tool_path.head_on(way, random.uniform(0.2, 0.6), aside, random.uniform(*ranges.obstacle_speed))
+    """Return a line along the tool's path, towards it."""
+    offset = random.uniform(0.0, 0.03) * _direction(random)
+    return tool_path.head_on(way, random.uniform(0.2, 0.6), offset, random.uniform(*ranges.obstacle_speed))
 
 
 def _chasing(random: np.random.Generator, way: ToolPath, bodies: Array, ranges: Ranges) -> dict[str, Any]:
-    """Along the tool's way from behind, and on past the goal."""
-    aside = random.uniform(0.0, 0.03) * _direction(random)
-    return tool_path.chasing(way, random.uniform(0.2, 0.6), aside, random.uniform(*ranges.obstacle_speed))
+    """Return a line along the tool's path from behind, and on past the goal."""
+    offset = random.uniform(0.0, 0.03) * _direction(random)
+    return tool_path.chasing(way, random.uniform(0.2, 0.6), offset, random.uniform(*ranges.obstacle_speed))
 
 
 def _circling(random: np.random.Generator, way: ToolPath, bodies: Array, ranges: Ranges) -> dict[str, Any]:
-    """Round and round, near the tool's way or the robot."""
+    """Return a circle near the tool's path or the robot."""
     radius = random.uniform(0.05, 0.3)
     return {
         "type": "circle",
@@ -98,11 +98,11 @@ def _circling(random: np.random.Generator, way: ToolPath, bodies: Array, ranges:
 
 
 MOTIONS = (_crossing, _at_the_arm, _head_on, _chasing, _circling)
-"""All equally likely."""
+"""Motions, all equally likely."""
 
 
 def _tumbling(random: np.random.Generator, line: dict[str, Any], ranges: Ranges) -> dict[str, Any]:
-    """The same line, turning from one orientation to another."""
+    """Return the same line, turning from one orientation to another."""
     time = float(np.linalg.norm(np.subtract(line["end"], line["start"]))) / line["speed"]
     yaw = random.uniform(-1.0, 1.0) * min(ranges.turn_rate * time, np.pi)
     first = _rpy(random)

@@ -55,27 +55,22 @@ def _sections(found: list[Trial], failures: dict[int, str], solvers: Sequence[st
         f"{len(found)} runs in {cost.seconds / 60:.1f} minutes. The commanded joint velocities of every run are run "
         "in MuJoCo, with its own integration, kinematics and distances, at every control step and in between, so that "
         f"nothing moves more than {1e3 * STEP:g} mm from one evaluation to the next. {_machine()}; load before and "
-        "at the "
-        f"end: {cost.load[0]:.1f} and {cost.load[1]:.1f}.",
+        f"at the end: {cost.load[0]:.1f} and {cost.load[1]:.1f}.",
         "",
         "**What this does not show.** Velocities are followed exactly, and obstacles move as announced, with the "
         "velocity that the controller is given: no delay, no noise, no dynamics. Joint placements, collision shapes "
-        "and "
-        "the obstacles' motions come from the same description on both sides, so neither detects an error in those. "
-        f"A contact of two moving bodies between two evaluations is at most {1e3 * STEP:g} mm deep, and may "
+        "and the obstacles' motions come from the same description on both sides, so neither detects an error in "
+        f"those. A contact of two moving bodies between two evaluations is at most {1e3 * STEP:g} mm deep, and may "
         f"be missed (a control step has at most {MAX_INSTANTS} evaluations). `eq10` and `tracking` are scaled to the "
-        "joints' limits "
-        "afterwards. Runs are short: one that has not arrived when it ends is not lost.",
+        "joints' limits afterwards. Runs are short: one that has not arrived when it ends is not lost.",
         "",
         "**Avoidable or not.** The robot is taken back to the last control step at which the pair in contact was "
-        "farther "
-        "apart than d2, and evades from there within its limits, by ten policies, with no task. If one of them stays "
-        "clear, "
-        "the contact was avoidable. It counts as unavoidable only if all fail *and* a linear program over the joint "
-        "velocities proves why: the pair does not depend on any joint (`fixed`), or, in the last period of the longest "
-        f"evasion, no velocity held for {PROOF_TIME:g} s keeps it apart (`outrun`), or all near pairs at once "
-        "(`squeezed`). "
-        "What is not proved counts as avoidable. `bench/safety/verdict.py` has the details.",
+        "farther apart than d2, and evades from there within its limits, by ten policies, with no task. If one of "
+        "them stays clear, the contact was avoidable. It counts as unavoidable only if all fail *and* a linear "
+        "program over the joint velocities proves why: the pair does not depend on any joint (`fixed`), or, in the "
+        f"last period of the longest evasion, no velocity held for {PROOF_TIME:g} s keeps it apart (`outrun`), or all "
+        "near pairs at once (`squeezed`). What is not proved counts as avoidable. Details are in "
+        "`bench/safety/verdict.py`.",
         "",
         *_by_solver(found, solvers),
         "",
@@ -166,10 +161,9 @@ def _disagreement(found: list[Trial]) -> list[str]:
         f"**Where MuJoCo and qpavoid differ.** Distances, apart: by at most {worst.disagreement:.1e} m (seed "
         f"{worst.seed}, {worst.solver}); configurations, integrated to the end of a run: "
         f"{max(trial.drift for trial in found):.1e} rad. Runs with a contact that only the checker found, between "
-        "control steps: "
-        f"{len(unlogged)}. Largest excess over a joint's velocity limit {excess[0].speed_excess:.1e} rad/s (seed "
-        f"{excess[0].seed}, {excess[0].solver}), over its position limit {excess[1].position_excess:.1e} rad (seed "
-        f"{excess[1].seed}, {excess[1].solver}); negative figures are margins. Runs over their "
+        f"control steps: {len(unlogged)}. Largest excess over a joint's velocity limit {excess[0].speed_excess:.1e} "
+        f"rad/s (seed {excess[0].seed}, {excess[0].solver}), over its position limit {excess[1].position_excess:.1e} "
+        f"rad (seed {excess[1].seed}, {excess[1].solver}); negative figures are margins. Runs over their "
         f"acceleration limit: {len(exceeding)} ({_counts(exceeding)}).",
     ]
 
