@@ -1,4 +1,4 @@
-"""The independent checker and the safety campaign: MuJoCo's distances, contacts between ticks, verdicts, and a small campaign."""
+"""The independent checker and the safety campaign: distances, contacts between steps, verdicts, a small campaign."""
 
 from dataclasses import replace
 from functools import cache
