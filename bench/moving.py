@@ -1,4 +1,4 @@
-"""`python -m bench.moving`: what obstacles that move, and obstacles that a program tells of, add to a tick."""
+"""`python -m bench.moving`: time that moving and external obstacles add to a control step."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ OBSTACLES = 50
 MOVING = (0, 1, 10, 50)
 DT = 0.01
 BATCH = 25
-"""Ticks that are timed as one."""
+"""Control steps that are timed as one."""
 
 
 def main() -> None:
     """Parses the options, measures in a process of its own, writes bench/results/moving.md and prints it."""
     parser = argparse.ArgumentParser(prog="python -m bench.moving", description=__doc__)
-    parser.add_argument("--rounds", type=int, default=200, help=f"batches of {BATCH} ticks of each kind (200)")
+    parser.add_argument("--rounds", type=int, default=200, help=f"batches of {BATCH} control steps of each kind (200)")
     parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.child:
-        print(json.dumps({**measure(options.rounds), "without": foresight(backup=None), "with": foresight()}))
+        print(json.dumps({**measure(options.rounds), "without": closed_loop(backup=None), "with": closed_loop()}))
         return
     load = os.getloadavg()[0]
     found = _child(options.rounds)
@@ -41,13 +41,13 @@ def main() -> None:
         f"{platform.system()}, {os.cpu_count()} CPUs, Python {platform.python_version()}, numpy {np.__version__}, "
         f"load {load:.1f} at the start. One thread.",
         "",
-        f"A Panda holds its tool still among {OBSTACLES} spheres, 2 m away, so that nothing is near: a tick is "
+        f"A Panda holds its tool still among {OBSTACLES} spheres, 2 m away, so that nothing is near: a step is "
         "kinematics, bounding spheres, task rows and bounds. Some move on lines and circles, or are given to `step` as "
-        f"a `Sample` or a `Pose`. Kinds take turns, {BATCH} ticks each; median over {options.rounds} turns [µs]; in "
+        f"a `Sample` or a `Pose`. Kinds take turns, {BATCH} steps each; median over {options.rounds} turns [µs]; in "
         "brackets what "
         "one such obstacle adds.",
         "",
-        "| obstacles | tick |",
+        "| obstacles | step |",
         "|---|---:|",
     ]
     for kind, count in ((kind, count) for kind in ("moving", "given as Sample", "given as Pose") for count in MOVING):
@@ -56,17 +56,17 @@ def main() -> None:
             lines.append(f"| {count} of {OBSTACLES} {kind} | {_cell(found[name], found['moving, 0'], count)} |")
     lines += [
         "",
-        "## Foresight",
+        "## Backup trajectories",
         "",
         "The scenario of `bench.endurance`, in closed loop: a Panda follows a circle among 50 obstacles, 10 of them on "
-        "circles. Flights are flown where what moves may come near; without: `avoidance: {backup: null}` [µs].",
+        "circles. Rollouts are computed where these may come near; without: `avoidance: {backup: null}` [µs].",
         "",
-        "| | p50 | p99 | worst | flights a tick | time of a flight |",
+        "| | p50 | p99 | worst | rollouts per step | time of a rollout |",
         "|---|---:|---:|---:|---:|---:|",
     ]
     for name in ("without", "with"):
-        p50, p99, worst, flights, each = found[name]
-        lines.append(f"| {name} | {p50:.0f} | {p99:.0f} | {worst:.0f} | {flights:.2f} | {each:.0f} |")
+        p50, p99, worst, count, each = found[name]
+        lines.append(f"| {name} | {p50:.0f} | {p99:.0f} | {worst:.0f} | {count:.2f} | {each:.0f} |")
     text = "\n".join(lines) + "\n"
     RESULTS.write_text(text)
     print(text)
@@ -85,7 +85,7 @@ def _child(rounds: int) -> dict[str, Any]:
 
 
 def measure(rounds: int) -> dict[str, float]:
-    """Median time of a tick of each kind [µs]."""
+    """Return the median time of a control step of each kind [µs]."""
     kinds = dict(_kinds())
     samples: dict[str, list[int]] = {name: [] for name in kinds}
     for turn in range(rounds):
@@ -97,33 +97,33 @@ def measure(rounds: int) -> dict[str, float]:
     return {name: 1e-3 * float(np.median(ns)) / BATCH for name, ns in samples.items()}
 
 
-def foresight(**avoidance: Any) -> tuple[float, ...]:
-    """p50, p99 and worst of a lap's ticks in closed loop [µs]; flights a tick, and the time of one [µs]."""
+def closed_loop(**avoidance: Any) -> tuple[float, ...]:
+    """Return p50, p99 and worst of a lap's control steps [µs]; rollouts per step, and the time of one [µs]."""
     import pinocchio as pin
 
     from bench.endurance import LAP, scenario
     from qpavoid import Controller
 
     controller, q = Controller.from_scenario(scenario(**avoidance))
-    ticks, flights = [], []
+    steps, rollouts = [], []
     backup = controller._commander.backup
     if backup is not None:
-        fly = backup.flights.better
+        rollout = backup.rollouts.rollout
 
         def timed(*args: Any) -> Any:
             begin = perf_counter_ns()
-            flight = fly(*args)
-            flights.append(1e-3 * (perf_counter_ns() - begin))
-            return flight
+            trajectory = rollout(*args)
+            rollouts.append(1e-3 * (perf_counter_ns() - begin))
+            return trajectory
 
-        backup.flights.better = timed  # type: ignore[method-assign]
+        backup.rollouts.rollout = timed  # type: ignore[method-assign]
     for k in range(LAP):
         begin = perf_counter_ns()
         v = controller.step(q, k * DT).v
-        ticks.append(1e-3 * (perf_counter_ns() - begin))
+        steps.append(1e-3 * (perf_counter_ns() - begin))
         q = pin.integrate(controller.scene.robot.model, q, DT * v)
-    each = float(np.median(flights)) if flights else 0.0
-    return *(float(p) for p in np.percentile(ticks, [50, 99, 100])), len(flights) / LAP, each
+    each = float(np.median(rollouts)) if rollouts else 0.0
+    return *(float(p) for p in np.percentile(steps, [50, 99, 100])), len(rollouts) / LAP, each
 
 
 def _kinds() -> Any:
@@ -131,22 +131,22 @@ def _kinds() -> Any:
 
     for count in MOVING:
         yield f"moving, {count}", _stepper(count)
-    for what in (Sample, Pose):
+    for kind in (Sample, Pose):
         for count in MOVING[1:]:
-            given = {f"o{i}": what.at([2.0 + 0.1 * i, 0.0, 1.0]) for i in range(count)}
-            yield f"given as {what.__name__}, {count}", _stepper(0, given)
+            updates = {f"o{i}": kind.at([2.0 + 0.1 * i, 0.0, 1.0]) for i in range(count)}
+            yield f"given as {kind.__name__}, {count}", _stepper(0, updates)
 
 
-def _stepper(moving: int, given: dict[str, Any] | None = None) -> Callable[[float], Any]:
-    """A tick at a time [s], of a scene in which the first so many obstacles move."""
+def _stepper(moving: int, updates: dict[str, Any] | None = None) -> Callable[[float], Any]:
+    """Return a function of time [s]: a control step of a scene in which the first so many obstacles move."""
     from qpavoid import Controller, Obstacle, Robot, build_scene, build_tasks
     from qpavoid.config import Circle, Fixed, Line, Sphere, Task
     from qpavoid.model.trajectory import build_motion
 
     random, obstacles = np.random.default_rng(3), []
     for i in range(OBSTACLES):
-        way = random.normal(size=3)
-        place = 2.0 * random.uniform(0.9, 1.1) * way / np.linalg.norm(way)
+        direction = random.normal(size=3)
+        place = 2.0 * random.uniform(0.9, 1.1) * direction / np.linalg.norm(direction)
         motion: Any = Fixed(position=tuple(place))
         if i < moving:
             line = Line(start=tuple(place), displacement=(0.2, 0.1, 0.1), speed=0.02)
@@ -155,7 +155,7 @@ def _stepper(moving: int, given: dict[str, Any] | None = None) -> Callable[[floa
     robot = Robot.load("panda")
     tasks = build_tasks([Task(frame="panda_hand_tcp", type="pose", motion=Fixed())], robot, robot.home)
     controller = Controller(build_scene(robot, obstacles), tasks, dt=DT)
-    return lambda t: controller.step(robot.home, t, None, given)
+    return lambda t: controller.step(robot.home, t, None, updates)
 
 
 if __name__ == "__main__":

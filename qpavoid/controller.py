@@ -365,7 +365,7 @@ class Controller:
         self._grasps.attach(index, frame_id, self._given_or_last(q))
         self._commander.invalidate()
         self._obstacles.carry(index, True)
-        self._commander.guard.forget(index)
+        self._commander.braking.forget(index)
 
     def release(self, obstacle: str, q: Array | None = None) -> Sample:
         """Puts an obstacle down that the robot carries: it rests where it is, until `step` is told something else.
@@ -457,7 +457,7 @@ class Controller:
                 for query in (self._query, *self._commander.queries):
                     query.fill(index, voxels)
             self._query.placing.place(*observed.seen)
-            self._commander.guard.see(observed.seen.which)
+            self._commander.braking.mark_updated(observed.seen.which)
             faults, assumptions = faults + observed.stop, assumptions + observed.assumptions
         self._kinematics.compute(q)
         self._query.compute(self._kinematics.data, self._reach)

@@ -219,7 +219,7 @@ class Solution(NamedTuple):
     """What was relaxed, or why the robot stops; empty when nothing was."""
     slack: Array | None = None
     """(k,) what each avoidance row gave way [m/s]; None when none did."""
-    share: float = 1.0
+    command_scale: float = 1.0
     """How much of the law's velocity is left after looking ahead; the rest is the velocity of a stop."""
     stalled: tuple[Reason, ...] = ()
     """What keeps the tasks from making progress, once they have made none for a while."""

@@ -18,8 +18,8 @@ pytest.importorskip("bench", reason="bench/ is in the repository only")
 
 from bench.safety import report
 from bench.safety.campaign import FOLDER, KINDS, RANGES, draw
-from bench.safety.flight import Start, fly, joint_means, manners
-from bench.safety.referee import disagreement, feedforward, referee
+from bench.safety.referee import disagreement, drift, referee
+from bench.safety.rollout import Start, evade, joint_limits, policies
 from bench.safety.trial import trials
 from bench.safety.verdict import judge
 from qpavoid.arena.checker import STEP, DistanceMonitor
@@ -125,7 +125,7 @@ def test_checker_finds_no_false_contact():
     assert findings.contacts == ()
     assert findings.distance == pytest.approx(0.02, abs=1e-3)
     assert findings.distance == pytest.approx(log.min_distance.min(), abs=1e-4)
-    assert disagreement(mujoco_model, log, findings) < 1e-6 and feedforward(log, findings) < 1e-9
+    assert disagreement(mujoco_model, log, findings) < 1e-6 and drift(log, findings) < 1e-9
 
 
 def test_checker_integrates_velocities_itself():
@@ -134,7 +134,7 @@ def test_checker_integrates_velocities_itself():
     moved = replace(log, q=log.q + 0.1)
     findings, moved_findings = referee(mujoco_model, log), referee(mujoco_model, moved)
     assert moved_findings.contacts == findings.contacts
-    assert feedforward(moved, moved_findings) == pytest.approx(0.1)
+    assert drift(moved, moved_findings) == pytest.approx(0.1)
 
 
 def test_checker_joint_limits():
@@ -269,11 +269,11 @@ def test_backup_rollouts_respect_limits(monkeypatch, acceleration):
     limits = Limits(acceleration=acceleration)
     scenario = draw(9).model_copy(update={"limits": limits, "dt": 0.02})
     mujoco_model = load_model(scenario)
-    means = joint_means(mujoco_model, scenario)
+    means = joint_limits(mujoco_model, scenario)
     start = Start(mujoco_model.q0, np.zeros_like(mujoco_model.q0), 0.0, 1.2)
-    for manner in list(manners(len(mujoco_model.q0)))[::3]:
+    for policy in list(policies(len(mujoco_model.q0)))[::3]:
         steps.clear()
-        fly(mujoco_model, means, start, scenario.dt, manner, mujoco_model.movable)
+        evade(mujoco_model, means, start, scenario.dt, policy, mujoco_model.movable)
         q, v = (np.array(array) for array in zip(*steps, strict=True))
         assert np.all(np.abs(v) <= means.speed + 1e-9)
         assert np.all((q >= means.lower - 1e-6) & (q <= means.upper + 1e-6))
@@ -314,7 +314,7 @@ def test_qp_has_no_avoidable_collision():
     found = small_campaign("qp", 15)
     assert {(trial.seed, trial.judged) for trial in found if trial.avoidable} == set()
     assert all(trial.speed_excess < 1e-9 and trial.position_excess < 1e-9 for trial in found)
-    assert all(trial.disagreement < 1e-6 and trial.feedforward < 1e-6 and not trial.failure for trial in found)
+    assert all(trial.disagreement < 1e-6 and trial.drift < 1e-6 and not trial.failure for trial in found)
 
 
 @pytest.mark.parametrize("seed", [13, 79, 99, 122, 912, 957])

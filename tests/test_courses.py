@@ -376,9 +376,9 @@ def test_python_work_does_not_grow_with_the_number_of_moving_obstacles(panda):
             controller.step(panda.home, t)
         assert not len(controller.tick(panda.home, 0.12).proximity.pair)
         ticks.append(instructions(lambda controller=controller: controller.step(panda.home, 0.13)))
-        guard, query = controller._commander.guard, controller._query
-        guard._place_obstacles(query)  # scipy looks for what it needs at the first call
-        ahead.append(instructions(lambda guard=guard, query=query: guard._place_obstacles(query)))
+        braking, query = controller._commander.braking, controller._query
+        braking._place_obstacles(query)  # scipy looks for what it needs at the first call
+        ahead.append(instructions(lambda braking=braking, query=query: braking._place_obstacles(query)))
         speeds = controller._query.placing.speeds[panda.model.njoints :]
         assert np.count_nonzero(speeds) == count  # they do move
     assert 0 < ticks[0] == ticks[1] < 4000

@@ -113,7 +113,7 @@ def test_what_the_guard_lets_through_is_clear_by_brute_force(panda):
             if k % 30 == 0:
                 command = rng.uniform(-1.0, 1.0, 7) * bounds.velocity
             s = controller.filter(q, command)
-            drawn_back += s.share < 1.0
+            drawn_back += s.command_scale < 1.0
             way = braking(q, s.v, step, 0.01) if k % 4 == 0 else []
             if way and (bounds.lower < way[-1]).all() and (way[-1] < bounds.upper).all():
                 looked += 1

@@ -30,7 +30,7 @@ def test_a_safe_command_comes_back_bit_for_bit(panda, seed):
             command = v.copy()
         s = controller.filter(q, command)
         assert s.v.tobytes() == command.tobytes() and s.v is not command
-        assert s.status is Status.SOLVED and s.share == 1.0 and s.reasons == ()
+        assert s.status is Status.SOLVED and s.command_scale == 1.0 and s.reasons == ()
         q, v = q + 0.01 * s.v, s.v
 
 

@@ -1,1 +1,1 @@
-"""Safety: another simulator plays what the solvers command, in thousands of random scenes, and looks for contacts."""
+"""Safety campaign: another simulator runs what the solvers command, in random scenes, and detects contacts."""

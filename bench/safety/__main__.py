@@ -19,7 +19,7 @@ RESULTS = Path(__file__).parents[1] / "results"
 
 
 def main() -> None:
-    """Parses the options and runs what they ask for."""
+    """Parse the options, and run the campaign or one seed."""
     parser = argparse.ArgumentParser(prog="python -m bench.safety", description=__doc__)
     parser.add_argument("--runs", type=int, default=2000, help="scenarios, each with every solver (2000)")
     parser.add_argument("--first", type=int, default=0, help="seed of the first (0)")
@@ -28,11 +28,11 @@ def main() -> None:
         "--solvers",
         "--solver",
         default="qp,qp-alone,eq10,tracking",
-        help="comma-separated (qp,qp-alone,eq10,tracking); qp-alone is qp without foresight",
+        help="comma-separated (qp,qp-alone,eq10,tracking); qp-alone is qp without backup trajectories",
     )
     parser.add_argument("--jobs", type=int, help="processes (one a core)")
     parser.add_argument("--name", default="safety", help="of the files written to bench/results (safety)")
-    parser.add_argument("--seed", type=int, help="run this one only, and print everything about it")
+    parser.add_argument("--seed", type=int, help="run this one only, and print all details")
     options = parser.parse_args()
     solvers = options.solvers.split(",")
     if options.seed is not None:
@@ -43,25 +43,25 @@ def main() -> None:
     seeds = range(options.first, options.first + options.runs)
     chosen = list(seeds) if options.seeds is None else [int(seed) for seed in options.seeds.split(",")]
     found, failures = campaign(chosen, solvers, options.jobs)
-    took = report.Took(perf_counter() - begin, (load_before, os.getloadavg()[0]))
-    print(report.write(found, failures, solvers, took, RESULTS, options.name))
+    cost = report.Cost(perf_counter() - begin, (load_before, os.getloadavg()[0]))
+    print(report.write(found, failures, solvers, cost, RESULTS, options.name))
 
 
 def campaign(seeds: Sequence[int], solvers: list[str], jobs: int | None = None) -> tuple[list[Trial], dict[int, str]]:
-    """Trials of all seeds in their order, and what went wrong by seed."""
+    """Return the trials of all seeds in their order, and error messages by seed."""
 
-    def tell(done: int, total: int) -> None:
+    def report_progress(done: int, total: int) -> None:
         if done % 50 == 0 or done == total:
             print(f"{done}/{total}", flush=True)
 
     with Workers(jobs) as workers:
-        answers = workers.map(trials, [(seed, solvers) for seed in seeds], tell)
+        answers = workers.map(trials, [(seed, solvers) for seed in seeds], report_progress)
     failed = {s: f"{type(a).__name__}: {a}" for s, a in zip(seeds, answers, strict=True) if isinstance(a, Exception)}
     return [trial for answer in answers if not isinstance(answer, Exception) for trial in answer], failed
 
 
 def describe(seed: int, solver: str) -> None:
-    """Runs one seed and prints its scene, what the referee saw, and all verdicts."""
+    """Run one seed, and print its scene, the findings of the checker, and all verdicts."""
     scenario = draw(seed)
     twin = load_model(scenario)
     scenario = as_named(scenario, solver)
@@ -79,9 +79,9 @@ def describe(seed: int, solver: str) -> None:
         print(f"{name:16} {value}")
     names = twin.scene.pair_names
     for contact in findings.contacts:
-        tick = int(log.t.searchsorted(contact.time)) - 1
-        status = STATUSES[log.status[max(tick, 0)]].value
-        where = f"{' - '.join(names[contact.pair])} at {contact.time:.4f} s (tick {tick}, {status})"
+        step = int(log.t.searchsorted(contact.time)) - 1
+        status = STATUSES[log.status[max(step, 0)]].value
+        where = f"{' - '.join(names[contact.pair])} at {contact.time:.4f} s (step {step}, {status})"
         print(f"contact {where}, {1e3 * contact.depth:.2f} mm deep")
     for verdict in verdicts:
         print(f"verdict {' - '.join(names[verdict.contact.pair])}: {verdict.why}: {verdict.detail}")

@@ -1,4 +1,4 @@
-"""What the referee says of a log, and how far the two agree."""
+"""Findings of the independent checker on a log, and how far the two agree."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from qpavoid.arena.mujoco_model import MujocoModel
 
 
 def referee(twin: MujocoModel, log: Log) -> Findings:
-    """Plays a log's velocities from the twin's start.
+    """Run a log's velocities in MuJoCo from the twin's start.
 
     Raises:
         ValueError: the log is of another scene.
@@ -21,14 +21,14 @@ def referee(twin: MujocoModel, log: Log) -> Findings:
 
 
 def drift(log: Log, findings: Findings) -> float:
-    """Largest difference between the log's configurations and MuJoCo's [rad or m]."""
+    """Return the largest difference between the log's configurations and MuJoCo's [rad or m]."""
     return float(np.max(np.abs(findings.q - log.q), initial=0.0))
 
 
 def disagreement(twin: MujocoModel, log: Log, findings: Findings) -> float:
-    """Largest difference between the log's smallest distance and MuJoCo's of that pair, at ticks without contact [m].
+    """Return the largest difference between the log's least distance and MuJoCo's of that pair [m].
 
-    In deep penetration the two mean different things.
+    Only of control steps without contact: in deep penetration the two mean different things.
     """
     worst, ours = 0.0, log.min_distance
     for k in np.flatnonzero((ours > 0.0) & (ours < np.inf)).tolist():

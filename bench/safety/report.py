@@ -15,7 +15,7 @@ import numpy as np
 
 from bench.safety.campaign import KINDS, RANGES
 from bench.safety.trial import Trial
-from bench.safety.verdict import AHEAD, RESOLUTION
+from bench.safety.verdict import PROOF_TIME, RESOLUTION
 from qpavoid.arena.checker import MAX_INSTANTS, STEP
 from qpavoid.run.machine import cpu, versions
 
@@ -24,20 +24,20 @@ LISTED = 10
 """Avoidable collisions that are listed for each solver; those of `qp` and `qp-alone` all are. The CSV has them all."""
 
 
-class Took(NamedTuple):
-    """What the campaign cost."""
+class Cost(NamedTuple):
+    """Time of the campaign, and load of the machine."""
 
     seconds: float
     load: tuple[float, float]
-    """Of the machine before and at the end."""
+    """Load average before and at the end [-]."""
 
 
 def write(
-    found: list[Trial], failures: dict[int, str], solvers: Sequence[str], took: Took, folder: Path, name: str
+    found: list[Trial], failures: dict[int, str], solvers: Sequence[str], cost: Cost, folder: Path, name: str
 ) -> str:
-    """Writes NAME.md and NAME.csv, and returns the Markdown."""
+    """Write NAME.md and NAME.csv, and return the Markdown."""
     folder.mkdir(parents=True, exist_ok=True)
-    markdown = "\n".join(_sections(found, failures, solvers, took)) + "\n"
+    markdown = "\n".join(_sections(found, failures, solvers, cost)) + "\n"
     (folder / f"{name}.md").write_text(markdown)
     with (folder / f"{name}.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, [field.name for field in fields(Trial)])
@@ -46,29 +46,35 @@ def write(
     return markdown
 
 
-def _sections(found: list[Trial], failures: dict[int, str], solvers: Sequence[str], took: Took) -> list[str]:
+def _sections(found: list[Trial], failures: dict[int, str], solvers: Sequence[str], cost: Cost) -> list[str]:
     seeds = sorted({trial.seed for trial in found} | set(failures))
     lines = [
         "# Safety",
         "",
         f"{len(seeds)} random scenarios (seeds {_named(seeds)}), each with {', '.join(solvers)}: "
-        f"{len(found)} runs in {took.seconds / 60:.1f} minutes. The commanded joint velocities of every run are played "
-        "in MuJoCo, with its own integration, kinematics and distances, at every tick and between ticks, so that "
-        f"nothing moves more than {1e3 * STEP:g} mm from one look to the next. {_machine()}; load before and at the "
-        f"end: {took.load[0]:.1f} and {took.load[1]:.1f}.",
+        f"{len(found)} runs in {cost.seconds / 60:.1f} minutes. The commanded joint velocities of every run are run "
+        "in MuJoCo, with its own integration, kinematics and distances, at every control step and in between, so that "
+        f"nothing moves more than {1e3 * STEP:g} mm from one evaluation to the next. {_machine()}; load before and "
+        "at the "
+        f"end: {cost.load[0]:.1f} and {cost.load[1]:.1f}.",
         "",
         "**What this does not show.** Velocities are followed exactly, and obstacles move as announced, with the "
-        "velocity that the controller is told: no delay, no noise, no dynamics. Joint placements, collision shapes and "
-        "the obstacles' motions come from the same description on both sides, so an error in those is seen by neither. "
-        f"What two bodies that both move touch and leave between two looks is at most {1e3 * STEP:g} mm deep, and may "
-        f"be missed (a tick has at most {MAX_INSTANTS} looks). `eq10` and `tracking` are scaled to the joints' limits "
+        "velocity that the controller is given: no delay, no noise, no dynamics. Joint placements, collision shapes "
+        "and "
+        "the obstacles' motions come from the same description on both sides, so neither detects an error in those. "
+        f"A contact of two moving bodies between two evaluations is at most {1e3 * STEP:g} mm deep, and may "
+        f"be missed (a control step has at most {MAX_INSTANTS} evaluations). `eq10` and `tracking` are scaled to the "
+        "joints' limits "
         "afterwards. Runs are short: one that has not arrived when it ends is not lost.",
         "",
-        "**Avoidable or not.** The robot is taken back to the last tick at which the pair that touched was farther "
-        "apart than d2, and flees from there within its limits, in ten ways, with no task. If one of them stays clear, "
+        "**Avoidable or not.** The robot is taken back to the last control step at which the pair in contact was "
+        "farther "
+        "apart than d2, and evades from there within its limits, by ten policies, with no task. If one of them stays "
+        "clear, "
         "the contact was avoidable. It counts as unavoidable only if all fail *and* a linear program over the joint "
-        "velocities proves why: the pair does not depend on any joint (`fixed`), or, at the last step of the longest "
-        f"flight, no velocity held for {AHEAD:g} s keeps it apart (`outrun`), or all near pairs at once (`squeezed`). "
+        "velocities proves why: the pair does not depend on any joint (`fixed`), or, in the last period of the longest "
+        f"evasion, no velocity held for {PROOF_TIME:g} s keeps it apart (`outrun`), or all near pairs at once "
+        "(`squeezed`). "
         "What is not proved counts as avoidable. `bench/safety/verdict.py` has the details.",
         "",
         *_by_solver(found, solvers),
@@ -102,7 +108,7 @@ _COLUMNS = (
 def _by_solver(found: list[Trial], solvers: Sequence[str]) -> list[str]:
     lines = [
         "A run counts as avoidable if any of its contacts is. Near misses: no contact, but nearer than d1/2. Worst "
-        "distance: of runs without an unavoidable contact, among pairs that the robot can part.",
+        "distance: of runs without an unavoidable contact, among pairs whose distance depends on a joint.",
         "",
         f"| solver | {' | '.join(_COLUMNS)} |",
         "|---|" + "---:|" * len(_COLUMNS),
@@ -153,17 +159,18 @@ def _summary(found: list[Trial]) -> list[str]:
 
 def _disagreement(found: list[Trial]) -> list[str]:
     worst = max(found, key=lambda trial: trial.disagreement)
-    unseen = [trial for trial in found if trial.collided and not trial.seen]
+    unlogged = [trial for trial in found if trial.collided and not trial.logged]
     excess = [max(found, key=lambda t, name=name: getattr(t, name)) for name in ("speed_excess", "position_excess")]
-    hasty = [trial for trial in found if trial.acceleration_excess > 1e-6]
+    exceeding = [trial for trial in found if trial.acceleration_excess > 1e-6]
     return [
         f"**Where MuJoCo and qpavoid differ.** Distances, apart: by at most {worst.disagreement:.1e} m (seed "
         f"{worst.seed}, {worst.solver}); configurations, integrated to the end of a run: "
-        f"{max(trial.drift for trial in found):.1e} rad. Runs with a contact that only the referee saw, between ticks: "
-        f"{len(unseen)}. Largest excess over a joint's velocity limit {excess[0].speed_excess:.1e} rad/s (seed "
+        f"{max(trial.drift for trial in found):.1e} rad. Runs with a contact that only the checker found, between "
+        "control steps: "
+        f"{len(unlogged)}. Largest excess over a joint's velocity limit {excess[0].speed_excess:.1e} rad/s (seed "
         f"{excess[0].seed}, {excess[0].solver}), over its position limit {excess[1].position_excess:.1e} rad (seed "
         f"{excess[1].seed}, {excess[1].solver}); negative figures are margins. Runs over their "
-        f"acceleration limit: {len(hasty)} ({_counts(hasty)}).",
+        f"acceleration limit: {len(exceeding)} ({_counts(exceeding)}).",
     ]
 
 
@@ -181,39 +188,39 @@ def _avoidable(found: list[Trial], solver: str) -> list[str]:
             f"`python -m bench.safety --seed SEED --solver {solver}` runs one again."
             + (f" The first {len(shown)} of {len(bad)}:" if len(shown) < len(bad) else ""),
             "",
-            "| seed | robot | dt [ms] | obstacles, moving | distance [mm] | last way out | contact, how it is known |",
+            "| seed | robot | dt [ms] | obstacles, moving | distance [mm] | last avoidable | contact, proof |",
             "|---:|---|---:|---:|---:|---|---|",
         ]
         lines += [
             f"| {t.seed} | {t.robot} | {1e3 * t.dt:g} | {t.obstacles}, {t.moving} | {1e3 * t.distance:.2f} | "
-            f"{_way_out(t)} | {t.verdict}: {t.judged} |"
+            f"{_last_avoidable(t)} | {t.verdict}: {t.judged} |"
             for t in shown
         ]
         lines += _explained(bad)
     return lines
 
 
-def _way_out(trial: Trial) -> str:
-    if np.isnan(trial.way_out):
+def _last_avoidable(trial: Trial) -> str:
+    if np.isnan(trial.lead_time):
         return ""
-    return f"{trial.way_out:.2f} s before, {1e3 * trial.apart:.0f} mm apart, {trial.then}"
+    return f"{trial.lead_time:.2f} s before, {1e3 * trial.lead_distance:.0f} mm apart, {trial.lead_status}"
 
 
 def _explained(bad: list[Trial]) -> list[str]:
-    """What the last ways out have in common."""
-    known = [trial for trial in bad if not np.isnan(trial.way_out)]
+    """Return a paragraph on the last moments at which contacts were avoidable."""
+    known = [trial for trial in bad if not np.isnan(trial.lead_time)]
     if not known:
         return []
-    early = [trial for trial in known if trial.apart > trial.d1]
-    met = sum(trial.then == "SOLVED" for trial in early)
+    early = [trial for trial in known if trial.lead_distance > trial.d1]
+    met = sum(trial.lead_status == "SOLVED" for trial in early)
     return [
         "",
-        "**Why.** The last way out is the last moment from which one of the ten flights still gets away (to within "
+        "**Why.** Last avoidable is the last moment from which one of the ten evasions still stays clear (to within "
         f"{1e3 * RESOLUTION:g} ms). In {len(early)} of {len(known)} runs the pair was then still farther apart than "
-        f"d1, in {met} of these every row was met: a law that looks at the distances and velocities of one tick has "
-        "nothing to go by yet; what closes the way is where obstacles will be later. Time from there to the contact: "
-        f"{np.median([t.way_out for t in early] or [np.nan]):.2f} s in the median of these, "
-        f"{max((t.way_out for t in known), default=np.nan):.2f} s at most.",
+        f"d1, in {met} of these every row was met: the distances and velocities of one control step do not show it "
+        "yet; it follows from later obstacle positions. Time from there to the contact: "
+        f"{np.median([t.lead_time for t in early] or [np.nan]):.2f} s in the median of these, "
+        f"{max((t.lead_time for t in known), default=np.nan):.2f} s at most.",
     ]
 
 
@@ -222,7 +229,7 @@ def _ranges() -> list[str]:
         "## What scenarios are drawn from",
         "",
         f"Robots, equally likely: {', '.join(kind.robot for kind in KINDS)}. What each field means is in "
-        "`bench/safety/campaign.py`; how obstacles get in the way (beside the tool's way, across it, head on, from "
+        "`bench/safety/campaign.py`; how obstacles are placed (beside the tool's path, across it, head on, from "
         "behind, at the arm, in circles) in `bench/safety/obstacles.py`.",
         "",
         "| field | values |",

@@ -1,4 +1,4 @@
-"""One run: a seed's scenario, one solver, the referee and the verdict; the row of a table."""
+"""One run: a seed's scenario, one solver, the independent checker and the verdict; the row of a table."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from bench.safety.campaign import draw
 from bench.safety.referee import disagreement, drift, referee
-from bench.safety.verdict import Verdict, judge, last_way_out
+from bench.safety.verdict import Verdict, judge, last_avoidable
 from qpavoid import Log, ScenarioConfig, Status
 from qpavoid.arena.checker import Findings
 from qpavoid.arena.mujoco_model import MujocoModel, load_model
@@ -18,12 +18,12 @@ from qpavoid.run.log import STATUSES
 from qpavoid.run.simulate import simulate
 
 ALONE = "-alone"
-"""What the name of a solver ends with that keeps no way out at hand."""
+"""Suffix of the name of a solver without backup trajectories."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """What is kept of a run. Distances are MuJoCo's."""
+    """Record of a run; distances are MuJoCo's."""
 
     seed: int
     robot: str
@@ -33,36 +33,36 @@ class Trial:
     ticks: int
     obstacles: int
     moving: int
-    """How many of them move."""
+    """Number of those that move."""
     d1: float
     """[m]."""
     distance: float
-    """Smallest of the pairs that the robot can part [m]."""
+    """Least of the pairs whose distance depends on a joint [m]."""
     pair: str
-    """Which pair that was."""
+    """Of that distance."""
     time: float
-    """When [s]."""
+    """Of that distance [s]."""
     contacts: int
-    """Pairs that touched."""
+    """Pairs in contact at any time."""
     verdict: str
     """`clear`, or that of the first contact that is avoidable, or else of the first contact."""
     judged: str
-    """Pair and time of that contact, and how the verdict is known."""
-    way_out: float
-    """How long before that contact the last flight got away; NaN where that was not looked for [s]."""
-    apart: float
-    """How far apart the pair was then [m]."""
-    then: str
-    """How the tick ended that let it pass."""
+    """Pair and time of that contact, and the proof of the verdict."""
+    lead_time: float
+    """Time from the last moment at which it was avoidable to that contact; NaN where not determined [s]."""
+    lead_distance: float
+    """Distance of the pair at that moment [m]."""
+    lead_status: str
+    """Status of the control step at that moment."""
     relaxed: float
-    """Time of ticks that ended RELAXED [s]."""
+    """Time of RELAXED control steps [s]."""
     stopped: float
-    """The same of STOPPED [s]."""
+    """Time of STOPPED control steps [s]."""
     arrived: bool
     error: float
     """Distance from the goal at the end [m]."""
-    seen: bool
-    """Whether the log itself has a contact: it knows the ticks only."""
+    logged: bool
+    """Whether the log itself has a contact: it knows the control steps only."""
     disagreement: float
     """Largest difference between the log's distances and MuJoCo's [m]."""
     drift: float
@@ -74,37 +74,37 @@ class Trial:
     acceleration_excess: float
     """Beyond the acceleration limits, at most; -inf without [rad/s² or m/s²]."""
     looks: int
-    """Instants that the referee looked at."""
+    """Instants that the checker evaluated."""
     seconds: float
-    """What the run took, simulation, referee and verdict [s]."""
+    """Time of simulation, checker and verdict [s]."""
     failure: str
-    """Why the run ended before its time; empty if it did not."""
+    """Why the run ended early; empty if it did not."""
 
     @property
     def collided(self) -> bool:
-        """Something touched."""
+        """Whether anything was in contact."""
         return self.contacts > 0
 
     @property
     def avoidable(self) -> bool:
-        """A contact could have been avoided, or nothing proves that it could not."""
+        """Whether a contact was avoidable, or is not proved to be unavoidable."""
         return self.verdict in ("avoidable", "unproven")
 
     @property
     def near(self) -> bool:
-        """No contact, but nearer than d1/2."""
+        """Whether it came nearer than d1/2 without contact."""
         return not self.collided and self.distance < 0.5 * self.d1
 
 
 def trials(seed: int, solvers: Sequence[str]) -> list[Trial]:
-    """The scenario of a seed with several solvers."""
+    """Run the scenario of a seed with several solvers."""
     scenario = draw(seed)
     twin = load_model(scenario)
     return [examine(seed, as_named(scenario, solver), twin, solver)[0] for solver in solvers]
 
 
 def as_named(scenario: ScenarioConfig, solver: str) -> ScenarioConfig:
-    """The same scenario, without `avoidance.backup` where the solver is given as `qp-alone`."""
+    """Return the scenario, without `avoidance.backup` for `qp-alone`."""
     if not solver.endswith(ALONE):
         return scenario
     avoidance = scenario.avoidance.model_copy(update={"backup": None})
@@ -114,17 +114,17 @@ def as_named(scenario: ScenarioConfig, solver: str) -> ScenarioConfig:
 def examine(
     seed: int, scenario: ScenarioConfig, twin: MujocoModel, solver: str
 ) -> tuple[Trial, Log, Findings, tuple[Verdict, ...]]:
-    """One run, with everything that its row was made of."""
+    """Run one solver; return its row, and what it was made of."""
     begin = perf_counter()
     log = simulate(scenario, solver.removesuffix(ALONE))
     findings = referee(twin, log)
     verdicts = judge(twin, scenario, log, findings)
     names, metrics = [" - ".join(pair) for pair in twin.scene.pair_names], log.metrics()
     decisive = next((verdict for verdict in verdicts if verdict.avoidable), verdicts[0] if verdicts else None)
-    way_out, apart, then = np.nan, np.nan, ""
-    if decisive and decisive.why == "avoidable" and solver.startswith("qp"):  # the others' would take hours
-        way_out, apart, status = last_way_out(twin, scenario, log, findings, decisive)
-        then = STATUSES[status].value
+    lead_time, lead_distance, lead_status = np.nan, np.nan, ""
+    if decisive and decisive.why == "avoidable" and solver.startswith("qp"):  # for the others it would take hours
+        lead_time, lead_distance, status = last_avoidable(twin, scenario, log, findings, decisive)
+        lead_status = STATUSES[status].value
     trial = Trial(
         seed=seed,
         robot=twin.scene.robot.name,
@@ -142,14 +142,14 @@ def examine(
         judged=f"{names[decisive.contact.pair]} at {decisive.contact.time:.3f} s: {decisive.detail}"
         if decisive
         else "",
-        way_out=way_out,
-        apart=apart,
-        then=then,
+        lead_time=lead_time,
+        lead_distance=lead_distance,
+        lead_status=lead_status,
         relaxed=_time(log, Status.RELAXED, scenario.dt),
         stopped=_time(log, Status.STOPPED, scenario.dt),
         arrived=metrics["arrived"],
         error=metrics["final_error"],
-        seen=metrics["collided"],
+        logged=metrics["collided"],
         disagreement=disagreement(twin, log, findings),
         drift=drift(log, findings),
         speed_excess=findings.speed_excess,

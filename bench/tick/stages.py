@@ -15,7 +15,7 @@ STAGES = {
     "proximity": ("qpavoid.control.distances:DistanceQuery.compute",),
     "rows": ("qpavoid.control.assembler:Assembly.compute",),
     "solve": ("qpavoid.solvers.qp:Qp.solve",),
-    "look ahead": ("qpavoid.safety.braking:Guard.check",),
+    "look ahead": ("qpavoid.safety.braking:BrakingCheck.check",),
 }
 """Stage: the functions that make it up; one that is called by another counts as part of that. What is left of a step
 is `the rest`."""

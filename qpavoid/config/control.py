@@ -55,25 +55,26 @@ AvoidanceRow = Annotated[Beta | TaskSwitching | Damper | Cbf, Field(discriminato
 
 
 class Backup(Block):
-    """Foresight where obstacles move: tasks go on only where the robot could still flee (`qpavoid.safety.backup`).
+    """Backup trajectories among moving obstacles: tasks are followed only while the robot could still keep clear.
 
-    It takes obstacles to go on as their trajectories say, or what was told of their twists lately, and time where they
-    come near. Laws that keep no limits are commanded as they are, and flights do not hold contacts.
+    Obstacles are predicted along their trajectories, or at the mean twist of their last updates; see
+    `qpavoid.safety.backup`. Backup trajectories take time where obstacles come near, do not hold contacts, and do not
+    apply to solvers that keep no limits.
     """
 
     horizon: Annotated[float, Field(ge=0.1, le=10.0)] = 1.5
-    """How long a flight has to stay clear [s]."""
+    """Time for which a backup trajectory has to stay clear [s]."""
     period: Annotated[float, Field(ge=0.005, le=0.5)] = 0.04
-    """Time from one decision of a flight to the next [s]; distances are looked at as often, or twice as often."""
-    reach: Positive = 0.3
-    """Distance up to which flights look at pairs [m]."""
-    comfort: Positive = 0.1
-    """Distance beyond which flights want no more [m]."""
-    safe: Annotated[float, Field(ge=0, le=1)] = 0.5
-    """Share of the safe distance that a flight has to keep [-]."""
-    attempts: Annotated[int, Field(ge=1, le=100)] = 3
-    """Flights drawn at random that a tick may try where those like the last good one do not stay clear [-]. The more,
-    the sooner a way out is found, and the more time such a tick takes."""
+    """Time between two decisions of a backup trajectory [s]; distances are evaluated as often, or twice as often."""
+    influence_distance: Positive = 0.3
+    """Distance below which a pair counts in a backup trajectory [m]."""
+    preferred_distance: Positive = 0.1
+    """Distance from which on a backup trajectory does not part a pair any farther [m]."""
+    distance_scale: Annotated[float, Field(ge=0, le=1)] = 0.5
+    """Fraction of the safety distance that a backup trajectory has to keep [-]."""
+    candidates: Annotated[int, Field(ge=1, le=100)] = 3
+    """Random backup trajectories that a control step may try where those like the last sufficient one do not stay clear
+    [-]. More of them find one sooner, and take more time in such a step."""
 
 
 class Avoidance(Block):
@@ -95,7 +96,7 @@ class Avoidance(Block):
     leads nearer than the safe distance."""
 
     backup: Backup | None = Backup()
-    """How a way out is kept at hand where obstacles move; `null`: none is."""
+    """Backup trajectories among moving obstacles; `null`: none."""
 
     @property
     def hold(self) -> float:

@@ -1,4 +1,4 @@
-"""Work of a backup trajectory between two decisions: near pairs, ramps of velocities, distances of paths."""
+"""Kernels of backup trajectories: rows of near pairs, velocity ramps, clearance of paths."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ ROUND_OFF = 1e-12
 
 @compiled
 def backup_rows(
-    x: Any, q: Array, pairs: IntArray, reach: float, moving: bool, enabled: Mask, touch: float
+    x: Any, q: Array, pairs: IntArray, influence_distance: float, moving: bool, enabled: Mask, touch: float
 ) -> tuple[int, int, float, float]:
-    """Write velocity bounds, and the rows of the enabled pairs that are near and do not touch.
+    """Write velocity bounds, and the rows of the enabled pairs that are near and not in contact.
 
     Args:
         x: see `velocity_bounds` and `distance_rows`.
         q: configuration (nq,).
         pairs: which pairs to consider (c,), increasing.
-        reach: distance below which a pair is near [m].
+        influence_distance: distance below which a pair is near [m].
         moving: whether any obstacle moves.
-        enabled: (m,) enabled pairs; those that touch are taken out.
-        touch: distance below which a pair touches [m].
+        enabled: (m,) enabled pairs; those in contact are disabled.
+        touch: distance below which a pair is in contact [m].
 
     Returns:
-        Number of rows, number of enabled pairs that touch, and the least distance with these and without [m];
-        `reach`, where nothing is nearer.
+        Number of rows, number of enabled pairs in contact, and the least distance with these and without [m], at most
+        `influence_distance`.
     """
     velocity_bounds(x, q)
-    k = distance_rows(x, pairs, reach, moving)
-    n, touching, nearest, rest = 0, 0, reach, reach
+    k = distance_rows(x, pairs, influence_distance, moving)
+    n, touching, nearest, nearest_apart = 0, 0, influence_distance, influence_distance
     for i in range(k):
         if not enabled[x.near[i]]:
             continue
@@ -46,7 +46,7 @@ def backup_rows(
             enabled[x.near[i]] = False
             touching += 1
             continue
-        rest = min(rest, distance + slack)
+        nearest_apart = min(nearest_apart, distance + slack)
         if n < i:
             x.near[n], x.feedforward[n] = x.near[i], x.feedforward[i]
             for c in range(10):
@@ -54,63 +54,63 @@ def backup_rows(
             for c in range(x.J.shape[1]):
                 x.J[n, c] = x.J[i, c]
         n += 1
-    return n, touching, nearest, rest
+    return n, touching, nearest, nearest_apart
 
 
 @compiled
-def closes_below(closest: Array, J: Array, feedforward: Array, v: Array, span: float, safe: float) -> bool:
-    """Return True if a pair is nearer than `safe` after `span`, to first order.
+def closes_below(closest: Array, J: Array, feedforward: Array, v: Array, span: float, distance: float) -> bool:
+    """Return whether a pair is nearer than `distance` after `span`, to first order.
 
     Args:
         closest: distances first (k, 10) [m].
         J: velocity Jacobian of these (k, n).
         feedforward: their rates due to the obstacles (k,) [m/s].
         v: velocity (n,).
-        span: [s].
-        safe: [m].
+        span: time [s].
+        distance: threshold [m].
     """
     for i in range(len(feedforward)):
         rate = feedforward[i]
         for c in range(len(v)):
             rate += J[i, c] * v[c]
-        if closest[i, 0] + span * rate < safe:
+        if closest[i, 0] + span * rate < distance:
             return True
     return False
 
 
 @compiled
-def rate_limit(v: Array, wanted: Array, v_step: Array, meets: bool) -> Array:
-    """Compute velocities of successive ticks, each as close to the wanted one as the largest changes allow.
+def rate_limit(v: Array, targets: Array, v_step: Array, stop_when_met: bool) -> Array:
+    """Compute velocities of successive control steps, each as close to its target as the largest change allows.
 
     Args:
-        v: velocity (n,) before.
-        wanted: velocities (k, n).
-        v_step: largest change of v in a tick (n,), infinite where there is none.
-        meets: whether to end where the wanted velocity is met.
+        v: velocity (n,) before the first.
+        targets: velocities (k, n).
+        v_step: largest change of v in a control step (n,), infinite without a limit.
+        stop_when_met: whether to end at the first target that is met.
 
     Returns:
-        As many as there are until then (<= k, n).
+        Velocities until then (<= k, n).
     """
-    steps, before = np.empty(wanted.shape), v
-    for k in range(len(wanted)):
-        off = 0.0
+    ramp, v_prev = np.empty(targets.shape), v
+    for k in range(len(targets)):
+        error = 0.0
         for c in range(len(v)):
-            steps[k, c] = before[c] + min(max(wanted[k, c] - before[c], -v_step[c]), v_step[c])
-            off = max(off, abs(steps[k, c] - wanted[k, c]))
-        if meets and off < ROUND_OFF:
-            return steps[: k + 1]
-        before = steps[k]
-    return steps
+            ramp[k, c] = v_prev[c] + min(max(targets[k, c] - v_prev[c], -v_step[c]), v_step[c])
+            error = max(error, abs(ramp[k, c] - targets[k, c]))
+        if stop_when_met and error < ROUND_OFF:
+            return ramp[: k + 1]
+        v_prev = ramp[k]
+    return ramp
 
 
 @compiled
-def min_sphere_distance(paths: Array, centers: Array, sizes: Array) -> float:
-    """Compute the least distance between spheres that move along paths and others at rest [m]; infinite without any.
+def min_sphere_distance(paths: Array, centers: Array, radii: Array) -> float:
+    """Compute the least distance between spheres along paths and spheres at rest [m]; infinite without any.
 
     Args:
-        paths: centres at some times (t, o, 3) [m].
+        paths: sampled centers of the moving ones (t, o, 3) [m].
         centers: of those at rest (b, 3) [m].
-        sizes: sum of the radii of each combination (o, b) [m].
+        radii: sum of the two radii of each combination (o, b) [m].
     """
     least = np.inf
     for o in range(paths.shape[1]):
@@ -119,5 +119,5 @@ def min_sphere_distance(paths: Array, centers: Array, sizes: Array) -> float:
             for t in range(len(paths)):
                 x, y, z = paths[t, o, 0] - centers[b, 0], paths[t, o, 1] - centers[b, 1], paths[t, o, 2] - centers[b, 2]
                 nearest = np.minimum(nearest, x * x + y * y + z * z)  # keeps NaN, unlike min
-            least = np.minimum(least, np.sqrt(nearest) - sizes[o, b])
+            least = np.minimum(least, np.sqrt(nearest) - radii[o, b])
     return least

@@ -143,7 +143,7 @@ class Recorder:
         values = {
             "t": state.t,
             "slack": 0.0 if solution.slack is None else float(np.max(solution.slack, initial=0.0)),
-            "command_scale": solution.share,
+            "command_scale": solution.command_scale,
             "stalled": bool(solution.stalled),
             "severity": solution.severity or 0,
             "saturation": solution.saturation,

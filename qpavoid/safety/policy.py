@@ -1,4 +1,4 @@
-"""What a flight is: where it begins, how it flees, where it leads, and what that is worth."""
+"""Data of backup trajectories: where one begins, its policy, the velocities, and how good it is."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from qpavoid.control.estimates import ObstacleEstimates
 from qpavoid.problem import Array, Mask
 
 TOUCH = 1e-3
-"""Distance below which a pair counts as touching [m]."""
+"""Distance below which a pair counts as in contact [m]: above the error of any distance algorithm in use."""
 
 
 class BackupPolicy(NamedTuple):
-    """A way to flee."""
+    """Rule by which a backup trajectory keeps away from everything."""
 
     horizon: float
-    """h [s]; 0 stands still."""
-    leaning: Array
+    """h [s]; 0 brakes to a standstill."""
+    bias_velocity: Array
     """v̂ (nv,) [rad/s, m/s]."""
 
 
 class Near(NamedTuple):
-    """What a flight looks at: the watched pairs within reach; in memory that the next look overwrites."""
+    """Enabled pairs within the influence distance; in memory that the next evaluation overwrites."""
 
     closest: Array
     """(k, 10) distances first [m]."""
@@ -34,61 +34,73 @@ class Near(NamedTuple):
 
 
 class Start(NamedTuple):
-    """Where a flight begins."""
+    """State in which a backup trajectory begins."""
 
     q: Array
     """(nq,)."""
     v: Array
-    """(nv,) velocity that has led there."""
-    w: Array
-    """(nv,) by how much that changed in the tick before."""
+    """(nv,) velocity of the control step before."""
+    dv: Array
+    """(nv,) change of velocity in that step."""
     t: float
     """[s]."""
-    watched: Mask
-    """(m,) pairs that are not to touch."""
+    enabled: Mask
+    """(m,) pairs that may not come into contact."""
 
 
-class Value(NamedTuple):
-    """How good a flight is, the larger the better."""
+class BackupScore(NamedTuple):
+    """Quality of a backup trajectory, the larger the better, compared field by field."""
 
-    clear: float
-    """The horizon of the foresight, less what is left of it, for each pair that touches, when that first does [s].
+    time_to_contact: float
+    """The horizon, less what is left of it at the first contact of each pair that comes into contact [s].
 
-    Of a pair that touches in every flight, nothing more is lost by keeping the others apart.
+    Contacts add up: one that no trajectory avoids is no reason to accept a second one.
     """
-    distance: float
-    """Smallest distance of pairs that do not touch, up to what counts as safe [m]."""
+    clearance: float
+    """Least distance of the pairs without contact, capped at the one that suffices [m]."""
 
 
-class Flight(NamedTuple):
-    """Velocities, and where they lead."""
+class BackupTrajectory(NamedTuple):
+    """Velocities of successive control steps, and what is known of where they lead."""
 
     start: Start
     v: Array
-    """(k, nv) of each tick."""
-    manner: BackupPolicy
-    value: Value
-    until: float
-    """When something touches; the end, if nothing does before [s]."""
-    least: float
-    """Smallest distance of pairs that do not touch, up to that at which flights look at pairs [m]."""
-    told: ObstacleEstimates | None
-    """What was told of obstacles when it was flown."""
+    """(k, nv) of each control step."""
+    policy: BackupPolicy
+    score: BackupScore
+    contact_time: float
+    """Time of the first contact; without one, the end [s]."""
+    clearance: float
+    """Least distance of the pairs without contact, at most the influence distance [m]."""
+    estimates: ObstacleEstimates | None
+    """Of the external obstacles, as the trajectory was computed."""
 
 
-class Tally:
-    """What touches in the course of a flight."""
+class ContactAccumulator:
+    """Contacts along a backup trajectory, summed up as it is computed."""
 
     def __init__(self, start: Start, horizon: float) -> None:
-        self.watched, self.until, self.least = start.watched.copy(), np.inf, np.inf
-        self.lost, self._before, self._deadline = 0.0, np.inf, start.t + horizon
+        """Begin without any contact.
 
-    def count(self, found: tuple[int, float, float], t: float, span: float) -> None:
-        """Takes what a look has found, see `backup_rows`, into account; at t, `span` after the last one [s]."""
-        touching, nearest, rest = found
-        if touching:
-            closing = self._before - nearest
-            when = t - span * (TOUCH - nearest) / closing if 0.0 < closing < np.inf else t
-            self.until = min(self.until, when)
-            self.lost += touching * max(self._deadline - when, 0.0)
-        self.least, self._before = min(self.least, rest), rest
+        Args:
+            start: of the trajectory.
+            horizon: time after the start from which on a contact costs nothing [s].
+        """
+        self.enabled, self.contact_time, self.clearance = start.enabled.copy(), np.inf, np.inf
+        self.lost_time, self._clearance_before, self._deadline = 0.0, np.inf, start.t + horizon
+
+    def add(self, distances: tuple[int, float, float], t: float, span: float) -> None:
+        """Add the distances of one pose; contacts are dated by interpolation between two poses.
+
+        Args:
+            distances: pairs in contact, least distance with and without these [m]; see `kernels.backup_rows`.
+            t: time of the pose [s].
+            span: time since the pose before [s].
+        """
+        contacts, nearest, nearest_apart = distances
+        if contacts:
+            closing = self._clearance_before - nearest
+            time = t - span * (TOUCH - nearest) / closing if 0.0 < closing < np.inf else t
+            self.contact_time = min(self.contact_time, time)
+            self.lost_time += contacts * max(self._deadline - time, 0.0)
+        self.clearance, self._clearance_before = min(self.clearance, nearest_apart), nearest_apart

@@ -1,10 +1,12 @@
-"""Flights: the robot drops its tasks and keeps away from everything, while obstacles go on as they are known to.
+"""Rollouts of backup trajectories: the robot drops its tasks and keeps away from everything.
 
-In every period a flight maximises the smallest distance at a horizon h, to first order:
+Obstacles follow their trajectories, or are predicted at constant velocity. In every period a backup trajectory
+maximises the smallest distance at a horizon h, to first order:
 
-    max s - ½ s²/c - ε/2c ‖v - v̂‖²  s.t.  d + h (J v + ḋ_obs) >= s,  s <= c,  lower <= v <= upper,    c: the comfort.
+    max s - ½ s²/c - ε/2c ‖v - v̂‖²  s.t.  d + h (J v + ḋ_obs) >= s,  s <= c,  lower <= v <= upper
 
-This is greedy, and runs into dead ends; which v̂ leads out of one cannot be told beforehand.
+with c the preferred distance. This is greedy, and runs into dead ends; which bias v̂ leads out of one is not known
+beforehand (see `qpavoid.safety.backup`).
 """
 
 from __future__ import annotations
@@ -25,22 +27,30 @@ from qpavoid.model.limits import JointBounds
 from qpavoid.model.scene import Scene
 from qpavoid.problem import Array, Mask
 from qpavoid.safety.jerk import Ramps
-from qpavoid.safety.policy import TOUCH, BackupPolicy, Flight, Near, Start, Tally, Value
+from qpavoid.safety.policy import (
+    TOUCH,
+    BackupPolicy,
+    BackupScore,
+    BackupTrajectory,
+    ContactAccumulator,
+    Near,
+    Start,
+)
 
-_GENTLE = 1e-4
-"""ε: what the square of a joint speed counts beside that of a distance [m²/(rad/s)²]."""
-_DEEPEST = 10.0
-"""Penetration that no flight foresees [m]."""
+_EFFORT_WEIGHT = 1e-4
+"""ε: weight of the square of a joint speed beside that of a distance [m²/(rad/s)²]; only breaks ties."""
+_MAX_DEPTH = 10.0
+"""Lower bound of s in the QP [m]: deeper than any penetration."""
 _ROUND_OFF = 1e-6
 """Difference of two times that counts as none [s]."""
-_MANY = 300
-"""Times of which it is remembered what was foreseen, before those that are over are forgotten."""
+_MAX_PREDICTIONS = 300
+"""Times whose predicted obstacle states are cached before the past ones are dropped."""
 _BEYOND = 0.1
-"""How much longer than the horizon flights are, so that they need not be flown anew in every tick [s]."""
+"""Time by which a rollout exceeds the horizon [s], so that it stays valid for some control steps."""
 
 
-class Flights:
-    """Flies, on kinematics and distances of its own."""
+class BackupRollouts:
+    """Computes backup trajectories, on kinematics and distances of its own."""
 
     def __init__(
         self,
@@ -52,197 +62,213 @@ class Flights:
         dt: float,
         settings: Backup,
     ) -> None:
-        """Lays the memory out.
+        """Allocate all memory, and compile all kernels.
 
         Args:
             scene: robot and obstacles.
             bounds: limits of the joints.
-            obstacles: what is known of the obstacles.
+            obstacles: states of the obstacles.
             avoidance: distances and rows of the controller.
             limits: use of the joint limits.
             dt: control period [s].
-            settings: how far and how hard to look.
+            settings: horizon, period and distances.
         """
         model = scene.robot.model
         self._model, self._obstacles, self.settings, self._dt = model, obstacles, settings, dt
-        self._ticks = max(1, int(np.ceil(settings.period / dt - 1e-9)))
-        self.period = self._ticks * dt
+        self._period_steps = max(1, int(np.ceil(settings.period / dt - 1e-9)))
+        self.period = self._period_steps * dt
         """Time between two decisions [s]."""
         self.kinematics, self.query = ForwardKinematics(model), DistanceQuery(scene)
-        # what is wanted may be farther away than jerks get in a period
+        # a velocity may be asked for that is farther away than jerk limits allow in a period
         free = replace(bounds, jerk=np.full(model.nv, np.inf))
         self._layout = lay_out(scene, (), (), free, self.kinematics, self.query, avoidance, limits, 0.01, self.period)
         self._packed, self._masks = kernels.pack(self._layout), support_masks(model)
         self._views: dict[int, Near] = {}
-        self._none = np.zeros((0, model.nv))
-        self._flat = all(joint.nv <= 1 for joint in list(model.joints)[1:])
-        """Whether the velocities of some ticks lead as far as their sum: joints of one coordinate at most."""
-        self.parted = self._which_part()
-        """(m,) pairs that the robot can part."""
+        self._no_velocities = np.zeros((0, model.nv))
+        self._is_vector_space = all(joint.nv <= 1 for joint in list(model.joints)[1:])
+        """Whether configurations add up: joints of one coordinate at most."""
+        self.separable_pairs = self._find_separable_pairs()
+        """(m,) pairs whose distance depends on a joint."""
         self.ramps = Ramps(bounds, dt)
-        """How it gets from one velocity to another."""
+        """Velocity ramps within the limits."""
         self.lever_arm = max(1.0, max_lever_arm(model, self.query.max_extension()))
-        """Farther than this no point of the robot moves when a joint moves by 1 [m/rad, 1]."""
-        self.enough = Value(settings.horizon, settings.safe * (avoidance.hold - avoidance.offset))
-        """What a flight is worth that need not be any better."""
-        self.still = BackupPolicy(0.0, np.zeros(model.nv))
-        """Standing still."""
-        self._foreseen: dict[float, Seen] = {}
+        """Bound on the distance that a point of the robot moves when a joint moves by 1 [m/rad, 1]."""
+        self.sufficient_score = BackupScore(
+            settings.horizon, settings.distance_scale * (avoidance.hold - avoidance.offset)
+        )
+        """Score from which on a backup trajectory need not be improved."""
+        self.stop_policy = BackupPolicy(0.0, np.zeros(model.nv))
+        """Braking to a standstill."""
+        self._predictions: dict[float, Seen] = {}
         self._compile(scene.robot.home)
 
     def _compile(self, q: Array) -> None:
-        """So that no tick waits for the compiler."""
-        still = self.still.leaning
-        near = self._look(q, 0.0, still, Tally(Start(q, still, still, 0.0, self.parted), 1.0), 0.0)
-        kernels.closes_below(*near, still, 1.0, 0.0)
+        """Call every kernel once, so that no control step waits for the compiler."""
+        zero = self.stop_policy.bias_velocity
+        start = Start(q, zero, zero, 0.0, self.separable_pairs)
+        near = self._evaluate(q, 0.0, zero, ContactAccumulator(start, 1.0), 0.0)
+        kernels.closes_below(*near, zero, 1.0, 0.0)
         kernels.min_sphere_distance(np.zeros((1, 1, 3)), np.zeros((1, 3)), np.zeros((1, 1)))
-        self.ramps.towards(still, still, self._flee(near, BackupPolicy(0.1, still))[None])
+        self.ramps.follow(zero, zero, self._policy_velocity(near, BackupPolicy(0.1, zero))[None])
         self.drop_predictions()
 
-    def go_on_to(self, t: float) -> None:
-        """Forgets what was foreseen and is over at t [s]; all of it, where obstacles are told of."""
+    def prune(self, t: float) -> None:
+        """Drop predicted obstacle states before t [s]; all of them, if any obstacle is external."""
         if self._obstacles.told is not None:
-            self._foreseen.clear()
-        elif len(self._foreseen) > _MANY:
-            self._foreseen = {at: seen for at, seen in self._foreseen.items() if at > t}
+            self._predictions.clear()
+        elif len(self._predictions) > _MAX_PREDICTIONS:
+            self._predictions = {time: states for time, states in self._predictions.items() if time > t}
 
     def invalidate(self) -> None:
-        """What the robot carries, or what may touch, has changed."""
+        """Take in that attached objects, or the disabled pairs, have changed."""
         hand_over(self._layout, self._masks, self.query)
-        self.parted = self._which_part()
+        self.separable_pairs = self._find_separable_pairs()
         self.drop_predictions()
 
     def drop_predictions(self) -> None:
-        """There is news of the obstacles: where they will be has to be foreseen anew."""
-        self._foreseen.clear()
+        """Drop all predicted obstacle states, after an update of the obstacles."""
+        self._predictions.clear()
 
-    def _which_part(self) -> Mask:
+    def _find_separable_pairs(self) -> Mask:
         return np.asarray(np.any(self._layout.support != 0.0, axis=1))
 
-    def predicted(self, t: float) -> Seen:
-        """The obstacles that move, as far as is known, at t [s]."""
-        t = round(t, 9)  # the same time may be come to in several ways
-        if t not in self._foreseen:
-            self._foreseen[t] = self._obstacles.predicted(t)
-        return self._foreseen[t]
+    def obstacles_at(self, t: float) -> Seen:
+        """Return the predicted states of the obstacles that move, at t [s]."""
+        t = round(t, 9)  # sums of periods differ in their last digits
+        if t not in self._predictions:
+            self._predictions[t] = self._obstacles.predicted(t)
+        return self._predictions[t]
 
-    def a_tick_on(self, flight: Flight) -> Flight:
-        """What is left of a flight after a tick."""
-        (q, before, _, t, watched), v = flight.start, flight.v[0]
-        begun = Start(pin.integrate(self._model, q, self._dt * v), v, v - before, t + self._dt, watched)
-        return flight._replace(start=begun, v=flight.v[1:])
+    def advance(self, trajectory: BackupTrajectory) -> BackupTrajectory:
+        """Return a trajectory without its first control step."""
+        (q, v_prev, _, t, enabled), v = trajectory.start, trajectory.v[0]
+        start = Start(pin.integrate(self._model, q, self._dt * v), v, v - v_prev, t + self._dt, enabled)
+        return trajectory._replace(start=start, v=trajectory.v[1:])
 
-    def holds_from(self, flight: Flight, start: Start, fastest: float = 0.0) -> bool:
-        """Whether a flight that is good enough is so from a start close to its own, without another look.
+    def is_valid_from(self, trajectory: BackupTrajectory, start: Start, max_obstacle_speed: float = 0.0) -> bool:
+        """Return whether a sufficient trajectory is certainly so from a start close to its own, without a rollout.
 
-        The same velocities lead past the same places, but for how far the start is off, and what is lost until they are
-        reached. No point of the robot is farther off than the longest lever times the sum of that over the joints; and
-        no point of an obstacle than what is told of it now differs from what was, and than it moves in the time by
-        which the start is early or late.
+        The same velocities lead through the same poses, up to the offset of the start and what is lost until they are
+        reached. No point of the robot is off by more than the longest lever arm times the sum of that over the joints;
+        and no point of an obstacle by more than the error of its prediction, plus its motion in the time by which the
+        start is early or late.
 
         Args:
-            flight: whether it holds.
-            start: from where.
-            fastest: largest speed of any point of an obstacle [m/s].
+            trajectory: the one in question.
+            start: where it would begin.
+            max_obstacle_speed: largest speed of any point of an obstacle [m/s].
         """
-        if flight.until < start.t + self.settings.horizon - 1e-9:
+        if trajectory.contact_time < start.t + self.settings.horizon - 1e-9:
             return False
-        late = abs(start.t - flight.start.t)
-        if late > self._dt or not np.array_equal(flight.start.watched, start.watched):
+        delay = abs(start.t - trajectory.start.t)
+        if delay > self._dt or not np.array_equal(trajectory.start.enabled, start.enabled):
             return False
-        off = pin.difference(self._model, flight.start.q, start.q)
-        most = float(np.abs(off).sum())
-        if self.ramps.accelerated:
-            steps = self.ramps.towards(start.v, start.w, flight.v, meets=True)
-            off = off + self._dt * np.cumsum(steps - flight.v[: len(steps)], axis=0)
-            most = max(most, float(np.abs(off).sum(axis=1).max(initial=0.0)))
+        offset = pin.difference(self._model, trajectory.start.q, start.q)
+        max_offset = float(np.abs(offset).sum())
+        if self.ramps.has_acceleration_limits:
+            ramp = self.ramps.follow(start.v, start.dv, trajectory.v, stop_when_met=True)
+            offset = offset + self._dt * np.cumsum(ramp - trajectory.v[: len(ramp)], axis=0)
+            max_offset = max(max_offset, float(np.abs(offset).sum(axis=1).max(initial=0.0)))
         span = self.settings.horizon + _BEYOND
-        off_too = (late * fastest if late > _ROUND_OFF else 0.0) + prediction_error_bound(
-            self._obstacles.told, flight.told, span, self.query.placing.reach
+        obstacle_offset = (delay * max_obstacle_speed if delay > _ROUND_OFF else 0.0) + prediction_error_bound(
+            self._obstacles.told, trajectory.estimates, span, self.query.placing.reach
         )
-        return bool(flight.least - self.lever_arm * most - off_too >= self.enough.distance)
+        clearance = trajectory.clearance - self.lever_arm * max_offset - obstacle_offset
+        return bool(clearance >= self.sufficient_score.clearance)
 
-    def fly(self, start: Start, manner: BackupPolicy, given: Array | None = None) -> Flight:
-        """`better` than nothing."""
-        flight = self.better(None, start, manner, given)
-        assert flight is not None
-        return flight
+    def simulate(self, start: Start, policy: BackupPolicy, prefix: Array | None = None) -> BackupTrajectory:
+        """Compute a trajectory to its end, however good; see `rollout`."""
+        trajectory = self.rollout(start, policy, prefix, None)
+        assert trajectory is not None
+        return trajectory
 
-    def better(
-        self, than: Flight | None, start: Start, manner: BackupPolicy, given: Array | None = None
-    ) -> Flight | None:
-        """Flees with decisions a period apart until the horizon; what has touched is left out of account from then on.
+    def rollout(
+        self, start: Start, policy: BackupPolicy, prefix: Array | None, must_beat: BackupTrajectory | None
+    ) -> BackupTrajectory | None:
+        """Compute a backup trajectory, with a decision in every period until the horizon.
 
-        Distances are looked at as often, and midway where something may come too near and part again before that. All
-        flights decide and look at the same times, multiples of the period, so that their values can be compared; and
-        where what is given ends.
+        Distances are evaluated as often, and midway where a pair may come too near and part again before that. A pair
+        that has been in contact does not count any more. All trajectories decide and evaluate at the same times,
+        multiples of the period, so that their scores can be compared; and at the end of the prefix.
 
         Args:
-            than: flight that has to be outdone; one that turns out not to is not flown to its end.
             start: where it begins.
-            manner: how it flees.
-            given: velocities (k, nv) of the first ticks; it flees from then on.
+            policy: how it keeps away.
+            prefix: velocities (k, nv) of the first control steps, before the policy decides.
+            must_beat: a trajectory; the rollout ends as soon as its score is no better.
 
         Returns:
-            The flight; None where it is no better than the other one.
+            The trajectory; None if it is no better than the other one.
         """
-        q, v, w, t, _ = start
-        horizon, safe = self.enough
-        end, plan, tally = t + horizon + _BEYOND, list[Array](), Tally(start, horizon)
-        near = self._look(q, t, v, tally, 0.0)
-        left = self._none if given is None else given
+        q, v, dv, t, _ = start
+        horizon, sufficient = self.sufficient_score
+        end, velocities, contacts = t + horizon + _BEYOND, list[Array](), ContactAccumulator(start, horizon)
+        near = self._evaluate(q, t, v, contacts, 0.0)
+        remaining = self._no_velocities if prefix is None else prefix
         for _ in range(int((horizon + _BEYOND) / self._dt) + 2):
             if t >= end - 1e-9:
                 break
-            count = self._ticks - round(t / self._dt) % self._ticks
-            wanted, left = left[:count], left[count:]
-            held = not len(wanted)
-            if held:
-                wanted = self._flee(near, manner)[None].repeat(count, axis=0)
-            count = len(wanted)
-            steps = self.ramps.towards(v, w, wanted, held)
-            ahead, span = self._moved(q, steps), count * self._dt
-            if kernels.closes_below(*near, steps[count // 2], span, safe):
+            count = self._period_steps - round(t / self._dt) % self._period_steps
+            targets, remaining = remaining[:count], remaining[count:]
+            decides = not len(targets)
+            if decides:
+                targets = self._policy_velocity(near, policy)[None].repeat(count, axis=0)
+            count = len(targets)
+            ramp = self.ramps.follow(v, dv, targets, decides)
+            q_next, span = self._integrate(q, ramp), count * self._dt
+            if kernels.closes_below(*near, ramp[count // 2], span, sufficient):
                 span *= 0.5
                 t += span
-                self._look(pin.interpolate(self._model, q, ahead, 0.5), t, v, tally, span)
+                self._evaluate(pin.interpolate(self._model, q, q_next, 0.5), t, v, contacts, span)
             t += span
-            near = self._look(ahead, t, steps[-1], tally, span)
-            value = Value(horizon - tally.lost, min(tally.least, safe))
-            if than is not None and value <= than.value:
+            near = self._evaluate(q_next, t, ramp[-1], contacts, span)
+            score = BackupScore(horizon - contacts.lost_time, min(contacts.clearance, sufficient))
+            if must_beat is not None and score <= must_beat.score:
                 return None
-            plan.append(steps)
-            w = steps[-1] - (steps[-2] if count > 1 else v)
-            q, v = ahead, steps[-1]
-        return Flight(
-            start, np.concatenate(plan), manner, value, min(tally.until, t), tally.least, self._obstacles.told
+            velocities.append(ramp)
+            dv = ramp[-1] - (ramp[-2] if count > 1 else v)
+            q, v = q_next, ramp[-1]
+        return BackupTrajectory(
+            start,
+            np.concatenate(velocities),
+            policy,
+            score,
+            min(contacts.contact_time, t),
+            contacts.clearance,
+            self._obstacles.told,
         )
 
     def decision_before(self, start: Start, k: int) -> int:
-        """The last tick at which a flight that begins there decides before its k-th one; 0 where it has not yet."""
-        return max(k - (round(start.t / self._dt) + k) % self._ticks, 0)
+        """Return the last decision, as a control step, of a trajectory from `start` before step k; 0 without any."""
+        return max(k - (round(start.t / self._dt) + k) % self._period_steps, 0)
 
-    def _moved(self, q: Array, steps: Array) -> Array:
-        """Where the velocities (k, nv) of some ticks lead from q (nq,)."""
-        if self._flat:
-            return np.asarray(pin.integrate(self._model, q, self._dt * np.add.reduce(steps)))
-        for step in steps:
-            q = pin.integrate(self._model, q, self._dt * step)
+    def _integrate(self, q: Array, velocities: Array) -> Array:
+        """Integrate the velocities (k, nv) of successive control steps from q (nq,)."""
+        if self._is_vector_space:
+            return np.asarray(pin.integrate(self._model, q, self._dt * np.add.reduce(velocities)))
+        for v in velocities:
+            q = pin.integrate(self._model, q, self._dt * v)
         return q
 
-    def _look(self, q: Array, t: float, v: Array, tally: Tally, span: float) -> Near:
-        """What is near at q (nq,), reached with v (nv,), with the obstacles where they will be at t, `span` after the
-        last look [s].
+    def _evaluate(self, q: Array, t: float, v: Array, contacts: ContactAccumulator, span: float) -> Near:
+        """Evaluate the rows of near pairs, and the contacts.
+
+        Args:
+            q: configuration (nq,).
+            t: time at which the obstacles are predicted [s].
+            v: velocity (nv,) of the control step before.
+            contacts: which pairs count, and where their contacts are added.
+            span: time since the last evaluation [s].
         """
-        query, reach = self.query, self.settings.reach
-        query.placing.place(*self.predicted(t))
+        query, influence_distance = self.query, self.settings.influence_distance
+        query.placing.place(*self.obstacles_at(t))
         self.kinematics.compute(q)
-        query.compute(self.kinematics.data, reach)
+        query.compute(self.kinematics.data, influence_distance)
         self._layout.v_prev[:] = v
-        k, touching, nearest, rest = kernels.backup_rows(
-            self._packed, q, query.pairs, reach, query.placing.moving, tally.watched, TOUCH
+        k, touching, nearest, nearest_apart = kernels.backup_rows(
+            self._packed, q, query.pairs, influence_distance, query.placing.moving, contacts.enabled, TOUCH
         )
-        tally.count((touching, nearest, rest), t, span)
+        contacts.add((touching, nearest, nearest_apart), t, span)
         return self._views.get(k) or self._view(k)
 
     def _view(self, k: int) -> Near:
@@ -250,16 +276,18 @@ class Flights:
         self._views[k] = Near(x.closest[:k], x.J[:k], x.feedforward[:k])
         return self._views[k]
 
-    def _flee(self, near: Near, manner: BackupPolicy) -> Array:
-        """Velocity (nv,) of a flight for its next period."""
+    def _policy_velocity(self, near: Near, policy: BackupPolicy) -> Array:
+        """Compute the velocity (nv,) of a policy for the next period."""
         lower, upper, v = self._layout.lower, self._layout.upper, None
-        if manner.horizon:
-            v = _farthest(near, manner, self.settings.comfort, lower, upper)
+        if policy.horizon:
+            v = _farthest(near, policy, self.settings.preferred_distance, lower, upper)
         return np.minimum(np.maximum(0.0 if v is None else v, lower), upper)
 
 
-def _farthest(near: Near, manner: BackupPolicy, comfort: float, lower: Array, upper: Array) -> Array | None:
-    """v (nv,) with the largest s, see above, within its bounds (nv,); None where none is found."""
-    (closest, J, feedforward), (h, leaning) = near, manner
-    v, met = kernels.farthest(h, closest, J, feedforward, comfort, _DEEPEST, _GENTLE, leaning, lower, upper)
-    return v if met else None
+def _farthest(near: Near, policy: BackupPolicy, preferred_distance: float, lower: Array, upper: Array) -> Array | None:
+    """Return v (nv,) with the largest s, see above, within its bounds (nv,); None if the solver fails."""
+    (closest, J, feedforward), (h, bias) = near, policy
+    v, converged = kernels.farthest(
+        h, closest, J, feedforward, preferred_distance, _MAX_DEPTH, _EFFORT_WEIGHT, bias, lower, upper
+    )
+    return v if converged else None

@@ -15,7 +15,7 @@ from qpavoid.arena.families.tool_path import ToolPath
 from qpavoid.errors import ConfigError
 from qpavoid.model.robot import Robot
 from qpavoid.problem import Array
-from qpavoid.safety.reach import arm
+from qpavoid.safety.reachability import arm
 
 REST_TIME = 3.0
 """Time from the end of the planned motion to that of the run [s]."""

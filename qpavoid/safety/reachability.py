@@ -1,4 +1,4 @@
-"""What is certain of a goal without looking for a way to it: it is too far from the arm, or inside something."""
+"""Targets that certainly cannot be reached, known without a search: beyond the arm, or inside an obstacle."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ _POINT = coal.Sphere(1e-6)
 
 
 def arm(robot: Robot, frame_id: int, first: int = 1) -> tuple[Array, float]:
-    """Where the chain of joints that moves a frame begins at home (3,), and how long its links are in a row [m].
+    """Return the root (3,) of the chain of joints that moves a frame, at home, and the sum of its link lengths [m].
 
     Args:
         robot: its joints may turn or slide; with others, such as a floating base, or mimics, the length is infinite.
         frame_id: of the frame.
-        first: which joint of the chain it begins with, counted from 1.
+        first: first joint of the chain, counted from 1.
     """
     model, data = robot.model, robot.model.createData()
     frame = model.frames[frame_id]
@@ -46,54 +46,56 @@ def arm(robot: Robot, frame_id: int, first: int = 1) -> tuple[Array, float]:
 
 
 def clearance(point: Array, solids: Iterable[tuple[Any, Any]]) -> float:
-    """Distance of a point (3,) from the nearest of some shapes at their poses [m], negative inside; inf from none.
+    """Return the distance of a point (3,) from the nearest of some shapes [m]: negative inside, inf without any.
 
     Args:
-        point: in the axes of the poses.
+        point: in the frame of the poses.
         solids: coal shapes, and their poses as pinocchio has them.
     """
-    here, request = coal.Transform3s(np.eye(3), point), coal.DistanceRequest()
+    at_point, request = coal.Transform3s(np.eye(3), point), coal.DistanceRequest()
     distances = [
         coal.distance(
-            _POINT, here, shape, coal.Transform3s(pose.rotation, pose.translation), request, coal.DistanceResult()
+            _POINT, at_point, shape, coal.Transform3s(pose.rotation, pose.translation), request, coal.DistanceResult()
         )
         for shape, pose in solids
     ]
     return float(min(distances, default=np.inf))
 
 
-def too_near(scene: Scene, query: DistanceQuery, frame_id: int, goal: Array, keep: float) -> tuple[float, int]:
-    """By how much a frame's goal is nearer to an obstacle than the bodies that move with the frame may come.
+def target_violation(
+    scene: Scene, query: DistanceQuery, frame_id: int, goal: Array, safety_distance: float
+) -> tuple[float, int]:
+    """Return by how much a target is too near to an obstacle for the bodies that move with the frame [m].
 
-    With its origin at the goal, some point of a body is no farther from the goal than the body is from that origin,
-    however the frame is turned, and so no farther from the obstacle than both distances together.
+    With the frame's origin at the target, some point of a body is no farther from the target than the body is from that
+    origin, however the frame is turned, and so no farther from the obstacle than both distances together.
 
     Args:
         scene: of the robot.
-        query: where the obstacles are now, and which pairs are watched.
+        query: present obstacle poses, and active pairs.
         frame_id: of the frame.
-        goal: (3,) world [m].
-        keep: distance between surfaces that is kept [m].
+        goal: target (3,), world [m].
+        safety_distance: between surfaces [m].
 
     Returns:
-        How much [m], not positive where nothing is certain, and geometry of the obstacle, -1 if there is none. Point
-        clouds are left out.
+        The violation [m], not positive where nothing is certain, and the geometry of the obstacle, -1 if there is none.
+        Point clouds are not considered.
     """
     frame, bodies = scene.robot.model.frames[frame_id], query.bodies
     joints = np.array([body.parentJoint for body in bodies], dtype=np.intp)
     first, second = scene.pairs.T
     free = (scene.obstacle_of[second] >= 0) & (joints[second] == 0)
     free &= ~np.isin(scene.obstacle_of[second], list(scene.clouds))
-    watched = query.enabled if query.disabled_pairs is None else query.enabled & ~query.disabled_pairs
-    worst, which = 0.0, -1
+    active = query.enabled if query.disabled_pairs is None else query.enabled & ~query.disabled_pairs
+    worst, obstacle = 0.0, -1
     from_origin: dict[int, float] = {}
-    for a, b in scene.pairs[free & watched & (joints[first] == frame.parentJoint)].tolist():
+    for a, b in scene.pairs[free & active & (joints[first] == frame.parentJoint)].tolist():
         if a not in from_origin:
             solid = bodies[a].geometry, bodies[a].placement
             from_origin[a] = max(clearance(frame.placement.translation, [solid]), 0.0)
         pose = query.poses[b]
         place = pin.SE3(pose[:9].reshape(3, 3).T, pose[9:])
-        short = keep - from_origin[a] - clearance(goal, [(bodies[b].geometry, place)])
-        if short > worst:
-            worst, which = short, b
-    return worst, which
+        violation = safety_distance - from_origin[a] - clearance(goal, [(bodies[b].geometry, place)])
+        if violation > worst:
+            worst, obstacle = violation, b
+    return worst, obstacle

@@ -1,4 +1,4 @@
-"""What gives way, and by how much: margins, then accelerations, then contact, and among pairs the deepest last.
+"""What is relaxed, and by how much: margins, then accelerations, then contact, and among pairs the deepest last.
 
 Checked against sequences of linear programs by scipy's HiGHS and a quadratic program by quadprog.
 """
@@ -15,7 +15,7 @@ from qpavoid import Avoidance, Obstacle, ReasonKind, Severity, Status, make_solv
 from qpavoid.config import Box, Damper
 from qpavoid.problem import AvoidanceRows, Tracking, make_problem
 
-NV, PAIRS, HOLD, GAIN = 5, 4, 0.05, 5.0
+NV, PAIRS, SAFE, GAIN = 5, 4, 0.05, 5.0
 
 
 def random_problem(seed):
@@ -23,9 +23,9 @@ def random_problem(seed):
     rng = np.random.default_rng(seed)
     d = rng.permutation(np.linspace(-0.03, 0.12, 12))[:PAIRS] + rng.uniform(-1e-3, 1e-3, PAIRS)
     feedforward = rng.choice([0.0, 1.0], PAIRS) * rng.uniform(-0.4, 0.1, PAIRS)
-    b = np.minimum(GAIN * (HOLD - d), 0.2) - feedforward
+    b = np.minimum(GAIN * (SAFE - d), 0.2) - feedforward
     touch = np.minimum(np.minimum(-GAIN * d, 0.2) - feedforward, b)
-    rows = AvoidanceRows(np.arange(PAIRS), d, 0.5 * rng.normal(size=(PAIRS, NV)), b, HOLD, 0.2, touch)
+    rows = AvoidanceRows(np.arange(PAIRS), d, 0.5 * rng.normal(size=(PAIRS, NV)), b, SAFE, 0.2, touch)
     hard = rng.uniform(-1.0, 0.0, NV), rng.uniform(0.0, 1.0, NV)
     last, step = rng.uniform(*hard), rng.uniform(0.03, 0.4, NV)
     soft = np.maximum(hard[0], last - step), np.minimum(hard[1], last + step)
@@ -39,7 +39,7 @@ def feasible(J, b, lower, upper):
 
 
 def least_slack(rows, b, floor, lower, upper):
-    """From the deepest row on: the least by which each has to give, given what those before it gave."""
+    """From the deepest row on: the least slack of each, with those before it at theirs."""
     slack, bound = np.zeros(PAIRS), floor.copy()
     for i in np.argsort(rows.d):
         lifted = np.where(np.arange(PAIRS) == i, 1.0, 0.0)[:, None]
@@ -58,7 +58,7 @@ def least_slack(rows, b, floor, lower, upper):
 
 @settings(derandomize=True, deadline=None, max_examples=250)
 @given(st.integers(0, 2**32 - 1))
-def test_margins_then_accelerations_then_contact_and_the_deepest_last(seed):
+def test_relaxation_takes_margins_then_accelerations_then_contact(seed):
     x = random_problem(seed)
     rows, s = x.avoidance, make_solver("qp").solve(x)
     assert (s.v >= x.hard_lower - 2e-6).all() and (s.v <= x.hard_upper + 2e-6).all()
@@ -69,21 +69,21 @@ def test_margins_then_accelerations_then_contact_and_the_deepest_last(seed):
         assert within and (rows.J @ s.v >= rows.b - 2e-6).all() and s.reasons == ()
         return
     assert s.status is Status.RELAXED and s.reasons
-    nothing = np.full(PAIRS, -np.inf)
+    no_floor = np.full(PAIRS, -np.inf)
     if feasible(rows.J, rows.touch, x.lower, x.upper):
         assert within  # margins come before accelerations
         expected = least_slack(rows, rows.b, rows.touch, x.lower, x.upper)
         np.testing.assert_allclose(s.slack, expected, atol=1e-3)
         return
-    contact = least_slack(rows, rows.touch, nothing, x.hard_lower, x.hard_upper)
+    contact = least_slack(rows, rows.touch, no_floor, x.hard_lower, x.hard_upper)
     assert (rows.J @ s.v >= rows.touch - contact - 1e-4).all()
     assert not within
-    passed = np.maximum(np.maximum(s.v - x.upper, x.lower - s.v), 0.0)
-    assert np.sum((passed / (x.upper - x.lower)) ** 2) < 1.05 * least_excess(x, rows.touch - contact) + 1e-4
+    excess = np.maximum(np.maximum(s.v - x.upper, x.lower - s.v), 0.0)
+    assert np.sum((excess / (x.upper - x.lower)) ** 2) < 1.05 * least_excess(x, rows.touch - contact) + 1e-4
 
 
 def least_excess(x, least):
-    """Sum of squares of what the acceleration limits have to be passed by, in units of their widths."""
+    """Least sum of squares of the excess over acceleration limits, in units of their widths."""
     eye, zero = np.eye(NV), np.zeros((PAIRS, NV))
     P = np.diag(np.r_[np.full(NV, 1e-8), 2.0 / (x.upper - x.lower) ** 2])
     G = -np.block([[x.avoidance.J, zero], [eye, eye], [-eye, eye]])
@@ -93,8 +93,8 @@ def least_excess(x, least):
     return np.sum((found[NV:] / (x.upper - x.lower)) ** 2)
 
 
-def test_every_outcome_of_the_order_occurs():
-    """So that the test above is not about one branch only."""
+def test_random_problems_need_every_level_of_relaxation():
+    """So that the test above covers every branch."""
     kinds = {"met": 0, "margins": 0, "accelerations": 0, "contact": 0}
     for seed in range(150):
         x = random_problem(seed)
@@ -106,7 +106,7 @@ def test_every_outcome_of_the_order_occurs():
 
 
 @pytest.mark.parametrize("off", [0.004, -0.004])
-def test_between_two_walls_the_nearer_one_decides_and_both_are_named(tmp_path, off):
+def test_relaxation_between_two_walls_favours_the_nearer(tmp_path, off):
     """Walls 50 mm from a tool that wants 60 mm on both sides; 4 mm off the middle."""
     robot = cartesian(tmp_path, acceleration=None)
     walls = [Obstacle.at(n, Box(size=(0.1, 1, 1)), [x, 0, 0]) for n, x in (("left", -0.15), ("right", 0.15))]

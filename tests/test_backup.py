@@ -1,4 +1,4 @@
-"""Foresight: a way out is kept at hand where obstacles move, and taken where the task would give it away."""
+"""Backup trajectories: one is kept while obstacles move, and followed where the task would leave none."""
 
 import numpy as np
 import pinocchio as pin
@@ -13,7 +13,7 @@ from qpavoid.control.estimates import prediction_error_bound
 from qpavoid.control.obstacles import Obstacles
 from qpavoid.control.trajectories import extrapolate
 from qpavoid.model.trajectory import build_motion
-from qpavoid.safety.policy import BackupPolicy, Near, Start, Tally
+from qpavoid.safety.policy import BackupPolicy, ContactAccumulator, Near, Start
 from qpavoid.safety.rollout import _farthest
 from qpavoid.solvers.backends import solve_daqp
 
@@ -22,7 +22,7 @@ GAP = 0.5
 """Radius of the two balls that close in [m]."""
 
 
-def jaws(stop=GAP, speed=0.3):
+def closing_balls(stop=GAP, speed=0.3):
     """Two large balls that come from both sides until they touch, where the robot stands."""
     balls = []
     for name, side in (("left", 1.0), ("right", -1.0)):
@@ -31,39 +31,52 @@ def jaws(stop=GAP, speed=0.3):
     return balls
 
 
-def pincer(folder, backup, acceleration=None, given=False, jerk=None):
-    """A ball on slides, told to stay where the jaws close in 2.7 s; distances at every tick, and the solutions."""
+def backup_of(controller):
+    """The backup planner of a controller."""
+    return controller._commander.backup
+
+
+def count_rollouts(controller, record):
+    """Calls `record` with the start time of every rollout of a controller."""
+    rollouts = backup_of(controller).rollouts
+    rollout = rollouts.rollout
+    rollouts.rollout = lambda start, *args: record(start.t) or rollout(start, *args)
+
+
+def run_between_closing_balls(folder, backup, acceleration=None, external=False, jerk=None):
+    """A ball on slides whose target is where the balls meet in 2.7 s; distances at every step, and the solutions."""
     robot = cartesian(folder, "xy", speed=0.25, acceleration=acceleration)
     avoidance = Avoidance(d1=0.02, d2=0.10, backup=backup)
-    controller = make_controller(robot, jaws(), "y", avoidance=avoidance, limits=Limits(jerk=jerk))
+    controller = make_controller(robot, closing_balls(), "y", avoidance=avoidance, limits=Limits(jerk=jerk))
     q, gaps, solutions = robot.home.copy(), [], []
     for k in range(280):
         t = k * DT
         centers = [obstacle.motion.sample(t).position[:2] for obstacle in controller.scene.obstacles]
         gaps.append(min(np.linalg.norm(q - center) for center in centers) - GAP - 0.05)
-        seen = {o.name: o.motion.sample(t) for o in controller.scene.obstacles} if given else None
-        solutions.append(controller.step(q, t, {"y": Sample.at([0.0, 0.0, 0.0])}, seen))
+        updates = {o.name: o.motion.sample(t) for o in controller.scene.obstacles} if external else None
+        solutions.append(controller.step(q, t, {"y": Sample.at([0.0, 0.0, 0.0])}, updates))
         q = pin.integrate(robot.model, q, DT * solutions[-1].v)
     return np.array(gaps), solutions
 
 
-def test_jaws_close_on_a_law_that_looks_one_tick_ahead(tmp_path):
-    gaps, _ = pincer(tmp_path, None)
+def test_without_backup_qp_is_trapped_by_closing_obstacles(tmp_path):
+    gaps, _ = run_between_closing_balls(tmp_path, None)
     assert gaps.min() < -0.01
 
 
 @pytest.mark.parametrize(
-    ("acceleration", "given", "jerk"), [(None, True, None), (2.0, False, None), (2.0, False, 50.0), (2.0, False, 4.0)]
+    ("acceleration", "external", "jerk"),
+    [(None, True, None), (2.0, False, None), (2.0, False, 50.0), (2.0, False, 4.0)],
 )
-def test_who_looks_farther_leaves_in_time_and_says_why(tmp_path, acceleration, given, jerk):
-    gaps, solutions = pincer(tmp_path, Backup(), acceleration, given, jerk)
-    assert gaps.min() > 0.5 * Backup().safe * 0.02  # looked at every 40 ms
-    fled = [s for s in solutions if any(reason.kind is ReasonKind.BACKUP for reason in s.reasons)]
-    assert len(fled) > 10 and all(s.status is Status.RELAXED for s in fled)
+def test_backup_leaves_closing_obstacles_in_time_and_reports_it(tmp_path, acceleration, external, jerk):
+    gaps, solutions = run_between_closing_balls(tmp_path, Backup(), acceleration, external, jerk)
+    assert gaps.min() > 0.5 * Backup().distance_scale * 0.02  # evaluated every 40 ms
+    backups = [s for s in solutions if any(reason.kind is ReasonKind.BACKUP for reason in s.reasons)]
+    assert len(backups) > 10 and all(s.status is Status.RELAXED for s in backups)
     # beside balls that touch, a ball of 5 cm is clear at √(0.55² - 0.5²) m from there, which takes 0.92 s
     latest = (1.3 - GAP) / 0.3 - np.sqrt(0.55**2 - GAP**2) / 0.25
-    first = next(k for k, solution in enumerate(solutions) if solution is fled[0])
-    assert latest - (1.0 if jerk else 0.5) < DT * first < latest + 0.05  # jerks take their time
+    first = next(k for k, solution in enumerate(solutions) if solution is backups[0])
+    assert latest - (1.0 if jerk else 0.5) < DT * first < latest + 0.05  # jerk limits delay braking
     v = np.array([s.v for s in solutions])
     assert np.abs(v).max() <= 0.25 + 1e-9
     if acceleration:
@@ -71,52 +84,53 @@ def test_who_looks_farther_leaves_in_time_and_says_why(tmp_path, acceleration, g
         assert np.abs(change).max() <= acceleration + 1e-6
 
 
-def test_in_short_periods_decisions_hold_for_10_ms(tmp_path):
-    """A ball on slides that is to stay where the jaws close leaves in time, with a decision in ten ticks at most."""
+def test_backup_decisions_hold_for_10_ms_in_short_control_periods(tmp_path):
+    """A ball on slides whose target is where two balls meet leaves in time, with a decision in ten steps at most."""
     dt, robot = 0.001, cartesian(tmp_path, "xy", speed=0.25, acceleration=2.0)
-    controller = make_controller(robot, jaws(), "y", dt=dt, avoidance=Avoidance(d1=0.02, d2=0.10))
-    flights, flown = controller._commander.backup.flights, []
-    better = flights.better
-    flights.better = lambda *a: flown.append(k) or better(*a)
+    controller = make_controller(robot, closing_balls(), "y", dt=dt, avoidance=Avoidance(d1=0.02, d2=0.10))
+    decisions = []
+    count_rollouts(controller, lambda _: decisions.append(k))
     q, least, far = robot.home.copy(), np.inf, 0.0
     for k in range(2800):
         centers = [obstacle.motion.sample(k * dt).position[:2] for obstacle in controller.scene.obstacles]
         least = min(least, *(np.linalg.norm(q - center) - GAP - 0.05 for center in centers))
         q = pin.integrate(robot.model, q, dt * controller.step(q, k * dt, {"y": Sample.at([0.0, 0.0, 0.0])}).v)
         far = max(far, abs(q[0]) if k < 500 else 0.0)
-    assert least > 0.5 * Backup().safe * 0.02
+    assert least > 0.5 * Backup().distance_scale * 0.02
     assert far < 1e-3  # it stays at its task while that is safe
-    ticks = np.unique(flown)
-    assert len(ticks) > 5 and np.diff(ticks).min() >= 10
+    steps = np.unique(decisions)
+    assert len(steps) > 5 and np.diff(steps).min() >= 10
 
 
-def test_what_is_given_is_flown_before_it_flees(among_balls):
+def test_rollout_begins_with_its_prefix(among_balls):
     _, planner, q = among_balls
     planner.reset()
     v = np.full(len(q), 0.02)
-    for ticks in (1, 3, 4, 9):
-        flight = planner.flights.fly(start_of(planner, q, 0.02), planner.flights.still, np.tile(v, (ticks, 1)))
-        assert len(flight.v) >= 150
-        steps = planner.flights.ramps.towards(np.zeros(len(q)), np.zeros(len(q)), np.tile(v, (ticks, 1)))
-        np.testing.assert_allclose(flight.v[:ticks], steps, rtol=0, atol=1e-12)
-        assert np.abs(flight.v[ticks]).max() < 0.02 - 1e-4  # 0.03 rad/s a tick at the least
+    for steps in (1, 3, 4, 9):
+        trajectory = planner.rollouts.simulate(
+            start_of(planner, q, 0.02), planner.rollouts.stop_policy, np.tile(v, (steps, 1))
+        )
+        assert len(trajectory.v) >= 150
+        ramp = planner.rollouts.ramps.follow(np.zeros(len(q)), np.zeros(len(q)), np.tile(v, (steps, 1)))
+        np.testing.assert_allclose(trajectory.v[:steps], ramp, rtol=0, atol=1e-12)
+        assert np.abs(trajectory.v[steps]).max() < 0.02 - 1e-4  # it changes by 0.03 rad/s per step at least
 
 
-def test_where_nothing_moves_it_changes_no_bit():
+def test_backup_is_bitwise_neutral_among_static_obstacles():
     base = load_scenario("ur5_pole", ["duration=3"])
     assert all(o.motion.type == "fixed" for o in base.obstacles)
-    blind = base.model_copy(update={"avoidance": base.avoidance.model_copy(update={"backup": None})})
-    (one, q), (two, _) = Controller.from_scenario(base), Controller.from_scenario(blind.read_from(base.source))
+    without = base.model_copy(update={"avoidance": base.avoidance.model_copy(update={"backup": None})})
+    (one, q), (two, _) = Controller.from_scenario(base), Controller.from_scenario(without.read_from(base.source))
     for k in range(300):
         v = one.step(q, k * base.dt).v
         assert np.array_equal(v, two.step(q, k * base.dt).v)
         q = pin.integrate(one.scene.robot.model, q, v * base.dt)
 
 
-def test_commands_of_others_are_kept_out_of_traps_too(tmp_path):
+def test_backup_applies_to_filtered_velocities(tmp_path):
     robot = cartesian(tmp_path, "xy", speed=0.25, acceleration=None)
     for backup, trapped in ((None, True), (Backup(), False)):
-        controller = make_controller(robot, jaws(), avoidance=Avoidance(d1=0.02, d2=0.10, backup=backup))
+        controller = make_controller(robot, closing_balls(), avoidance=Avoidance(d1=0.02, d2=0.10, backup=backup))
         q, least = robot.home.copy(), np.inf
         for k in range(300):
             solution = controller.filter(q, np.zeros(2), k * DT)
@@ -126,18 +140,18 @@ def test_commands_of_others_are_kept_out_of_traps_too(tmp_path):
         assert (least < 0.0) == trapped
 
 
-STILL = BackupPolicy(1.0, np.zeros(4))
-"""A second ahead, leaning nowhere."""
+UNBIASED = BackupPolicy(1.0, np.zeros(4))
+"""Horizon of 1 s, no bias velocity."""
 
 
-def test_the_farthest_velocity_is_that_of_a_linear_program():
+def test_farthest_maximises_the_smallest_distance():
     from scipy.optimize import linprog
 
     rng = np.random.default_rng(0)
     for _ in range(50):
         A, d = 0.2 * rng.normal(size=(6, 4)), rng.uniform(0.0, 0.1, 6)
         lower, upper = -np.ones(4), np.ones(4)
-        v = _farthest(Near(np.column_stack((d, np.zeros((6, 9)))), A, np.zeros(6)), STILL, 10.0, lower, upper)
+        v = _farthest(Near(np.column_stack((d, np.zeros((6, 9)))), A, np.zeros(6)), UNBIASED, 10.0, lower, upper)
         best = linprog(
             [0, 0, 0, 0, -1], A_ub=np.column_stack((-A, np.ones(6))), b_ub=d, bounds=[(-1, 1)] * 4 + [(None, None)]
         )
@@ -145,23 +159,23 @@ def test_the_farthest_velocity_is_that_of_a_linear_program():
         assert v is not None and (A @ v + d).min() == pytest.approx(best.x[-1], abs=1e-4)
 
 
-def test_farthest_is_the_minimum_that_daqp_finds():
+def test_farthest_agrees_with_daqp():
     """max s - ½ s²/c - ε/2c ‖v - v̂‖²  s.t.  d + h (J v + ḋ) >= s,  lower <= v <= upper, as one QP in (v, s)."""
     rng = np.random.default_rng(1)
     for _ in range(20):
         closest, J, feedforward = rng.uniform(0.0, 0.1, (5, 10)), rng.normal(size=(5, 3)), 0.1 * rng.normal(size=5)
-        h, comfort, low_effort, leaning = 0.2, 0.1, 1e-4, rng.normal(size=3)
-        v, met = kernels.farthest(
-            h, closest, J, feedforward, comfort, 10.0, low_effort, leaning, -np.ones(3), np.ones(3)
+        h, preferred, effort, bias = 0.2, 0.1, 1e-4, rng.normal(size=3)
+        v, converged = kernels.farthest(
+            h, closest, J, feedforward, preferred, 10.0, effort, bias, -np.ones(3), np.ones(3)
         )
-        P = np.diag([low_effort, low_effort, low_effort, 1.0])
+        P = np.diag([effort, effort, effort, 1.0])
         G, least = np.column_stack((h * J, -np.ones(5))), -(closest[:, 0] + h * feedforward)
-        bounds = np.array([-1.0, -1.0, -1.0, -10.0]), np.array([1.0, 1.0, 1.0, comfort])
-        expected = solve_daqp(P, -P @ np.append(leaning, comfort), G, least, *bounds)
-        assert met and v == pytest.approx(expected[:3], abs=1e-6)
+        bounds = np.array([-1.0, -1.0, -1.0, -10.0]), np.array([1.0, 1.0, 1.0, preferred])
+        expected = solve_daqp(P, -P @ np.append(bias, preferred), G, least, *bounds)
+        assert converged and v == pytest.approx(expected[:3], abs=1e-6)
 
 
-def test_that_flights_do_not_hold_contacts_is_said_where_something_moves():
+def test_missing_backup_with_contacts_is_an_assumption_where_obstacles_move():
     for moves in (False, True):
         ball = {"type": "line", "start": [1, 1, 1], "end": [1, -1, 1], "speed": 0.1}
         ball = ball if moves else {"type": "fixed", "position": [1, 1, 1]}
@@ -171,24 +185,23 @@ def test_that_flights_do_not_hold_contacts_is_said_where_something_moves():
         )
         assert scenario.contacts and scenario.avoidance.backup is not None
         controller, q = Controller.from_scenario(scenario)
-        assert controller._commander.backup is None
+        assert backup_of(controller) is None
         kinds = [reason.kind for reason in controller.step(q).assumptions]
         assert (ReasonKind.NO_BACKUP in kinds) == moves
 
 
-def test_only_laws_that_keep_limits_are_held_back(tmp_path):
-    """What a law of the paper says is commanded as it is, so that it can be compared."""
+def test_backup_applies_to_bounded_solvers_only(tmp_path):
+    """The velocity of a law of the paper is commanded as it is, so that it can be compared."""
     robot = cartesian(tmp_path, "xy", speed=0.25, acceleration=None)
-    for law, held_back in (("eq10", False), ("qp", True)):
-        controller = make_controller(robot, jaws(), "y", solver=law, avoidance=Avoidance(d1=0.02, d2=0.10))
-        flown = []
-        better = controller._commander.backup.flights.better
-        controller._commander.backup.flights.better = lambda *a, b=better, f=flown: f.append(a) or b(*a)
+    for solver, applies in (("eq10", False), ("qp", True)):
+        controller = make_controller(robot, closing_balls(), "y", solver=solver, avoidance=Avoidance(d1=0.02, d2=0.10))
+        times = []
+        count_rollouts(controller, times.append)
         controller.step(robot.home, 2.5, {"y": Sample.at([0.0, 0.0, 0.0])})
-        assert bool(flown) == held_back
+        assert bool(times) == applies
 
 
-def test_limits_of_the_settings_are_told():
+def test_backup_settings_outside_their_limits_are_refused():
     fields = {"robot": "panda", "tasks": [{"frame": "panda_hand_tcp"}], "duration": 1.0}
     with pytest.raises(ValueError, match="horizon"):
         ScenarioConfig.model_validate({**fields, "avoidance": {"backup": {"horizon": 0.0}}})
@@ -203,8 +216,8 @@ def slab(name, size, at, to=None, speed=0.3):
     return Obstacle(name, Box(size=size), build_motion(Line(start=at, end=to, speed=speed), None, SHIPPED.parent), True)
 
 
-def press():
-    """A chamber 0.6 m wide, with a piston that comes down in it, and a way out: a neck 20 cm high low in one wall."""
+def chamber_with_piston():
+    """A chamber 0.6 m wide, with a piston that comes down in it, and an exit: a neck 20 cm high low in one wall."""
     return [
         slab("floor", (0.7, 0.1, 0.2), (0.0, -0.35, 0.0)),
         slab("left", (0.1, 2.0, 0.2), (-0.35, 0.65, 0.0)),
@@ -214,22 +227,24 @@ def press():
     ]
 
 
-def test_a_way_out_that_leads_nearer_first_is_found(tmp_path):
-    """Whoever only keeps away from everything stays in the chamber: in the neck walls are at 5 cm, not at 10."""
+def test_backup_search_finds_an_exit_that_leads_nearer_first(tmp_path):
+    """Keeping away from everything leads nowhere: in the neck walls are at 5 cm, in the chamber at 10."""
     robot = cartesian(tmp_path, "xy", speed=0.4, acceleration=None)
     for backup, crushed in ((None, True), (Backup(), False)):
-        controller = make_controller(robot, press(), "y", avoidance=Avoidance(d1=0.02, d2=0.10, backup=backup))
+        controller = make_controller(
+            robot, chamber_with_piston(), "y", avoidance=Avoidance(d1=0.02, d2=0.10, backup=backup)
+        )
         ruler, q, least = Ruler(controller.scene), robot.home.copy(), np.inf
         for k in range(240):
             v = controller.step(q, k * DT, {"y": Sample.at([0.0, 0.0, 0.0])}).v
             least = min(least, ruler.least_between(q, v, DT, k * DT, steps=2))
             q = pin.integrate(robot.model, q, DT * v)
         assert (least < 0.0) == crushed, least
-        assert crushed or (q[0] > 0.3 and least > 0.9 * Backup().safe * 0.02)
+        assert crushed or (q[0] > 0.3 and least > 0.9 * Backup().distance_scale * 0.02)
 
 
-def test_past_a_contact_that_cannot_be_helped_others_are_kept_off(tmp_path):
-    """A slide along y cannot leave the way of a wall that comes along x, but that of a ball which comes after it."""
+def test_backup_avoids_further_contacts_after_an_unavoidable_one(tmp_path):
+    """A slide along y cannot avoid a wall that comes along x, but it can avoid the ball behind it."""
     robot = cartesian(tmp_path, "y", speed=0.25)
     wall = Obstacle(
         "wall", Box(size=(0.02, 4.0, 0.4)),
@@ -247,12 +262,12 @@ def test_past_a_contact_that_cannot_be_helped_others_are_kept_off(tmp_path):
         walls.append(abs(x[0]) - 0.01 - 0.05)
         balls.append(np.hypot(x[1], q[0] - 0.02) - 0.15 - 0.05)
         q = pin.integrate(robot.model, q, DT * controller.step(q, t, {"y": Sample.at([0.0, 0.0, 0.0])}).v)
-    assert min(walls) < 0.0 < 0.5 * Backup().safe * 0.02 < min(balls)
+    assert min(walls) < 0.0 < 0.5 * Backup().distance_scale * 0.02 < min(balls)
 
 
-def test_where_there_is_no_way_out_every_tick_has_an_outcome_all_the_same(tmp_path):
+def test_every_step_has_an_outcome_without_any_clear_backup(tmp_path):
     robot = cartesian(tmp_path, "xy", speed=0.4, acceleration=None)
-    closed, dt = [*press(), slab("plug", (0.05, 0.2, 0.2), (0.325, -0.15, 0.0))], 0.05
+    closed, dt = [*chamber_with_piston(), slab("plug", (0.05, 0.2, 0.2), (0.325, -0.15, 0.0))], 0.05
     controller = make_controller(robot, closed, "y", dt=dt, avoidance=Avoidance(d1=0.02, d2=0.10, backup=Backup()))
     ruler, q, least = Ruler(controller.scene), robot.home.copy(), np.inf
     for k in range(60):
@@ -266,7 +281,7 @@ def test_where_there_is_no_way_out_every_tick_has_an_outcome_all_the_same(tmp_pa
 def planner_of(scenario):
     """A planner, its controller, and the start of a run."""
     controller, q = Controller.from_scenario(scenario)
-    planner = controller._commander.backup
+    planner = backup_of(controller)
     assert planner is not None
     return controller, planner, q
 
@@ -276,7 +291,7 @@ LIMITS = {"speeds": {}, "accelerations": {"acceleration": 3.0}, "jerks": {"accel
 
 @pytest.fixture(scope="module", params=LIMITS.values(), ids=LIMITS)
 def among_balls(request):
-    """A Panda among balls that cross its way."""
+    """A Panda among balls that cross its path."""
     balls = [
         {
             "name": f"ball{i}",
@@ -296,128 +311,131 @@ def among_balls(request):
 
 
 def start_of(planner, q, t, v=None):
-    return Start(q, np.zeros(len(q)) if v is None else v, np.zeros(len(q)), t, planner.flights.parted)
+    return Start(q, np.zeros(len(q)) if v is None else v, np.zeros(len(q)), t, planner.rollouts.separable_pairs)
 
 
-def largest_change(flight, times):
-    """Of the velocities of a flight from tick to tick, or of that change itself."""
-    before = [flight.start.v - flight.start.w, flight.start.v]
-    return np.abs(np.diff(np.vstack((before, flight.v)), times, axis=0)).max(initial=0.0)
+def largest_change(trajectory, times):
+    """Of the velocities of a trajectory from step to step, or of that change itself."""
+    before = [trajectory.start.v - trajectory.start.dv, trajectory.start.v]
+    return np.abs(np.diff(np.vstack((before, trajectory.v)), times, axis=0)).max(initial=0.0)
 
 
-def test_a_flight_that_is_flown_again_is_the_same_and_so_is_what_is_left_of_it(among_balls):
+def test_rollout_of_a_trajectory_and_of_its_remainder_reproduces_it(among_balls):
     _, planner, q = among_balls
     planner.reset()
     touched = 0
-    for t in (0.02, 0.13, 0.51, 1.17):  # a tick later, flights end at the same time
-        for manner in [planner.flights.still, *(planner._drawn() for _ in range(5))]:
-            planner.flights.drop_predictions()
-            flight = planner.flights.fly(start_of(planner, q, t), manner)
-            again = planner.flights.fly(flight.start, planner.flights.still, flight.v)
-            assert again.value == pytest.approx(flight.value, abs=1e-12)
-            np.testing.assert_allclose(again.v, flight.v, rtol=0, atol=1e-12)
-            assert largest_change(flight, 2) <= planner.flights.ramps.steps.dv_step.max() * (1.0 + 1e-9)
-            assert largest_change(flight, 1) <= planner.flights.ramps.steps.v_step.max() * (1.0 + 1e-9)
-            touched += flight.value.clear < 1.5
-            left = planner.flights.a_tick_on(flight)
-            later = planner.flights.fly(left.start, manner, left.v)
-            assert later.until == pytest.approx(flight.until, abs=1e-9)
-            assert later.least >= flight.least - 1e-9
+    for t in (0.02, 0.13, 0.51, 1.17):  # a step later, trajectories end at the same time
+        for policy in [planner.rollouts.stop_policy, *(planner._sample_policy() for _ in range(5))]:
+            planner.rollouts.drop_predictions()
+            trajectory = planner.rollouts.simulate(start_of(planner, q, t), policy)
+            again = planner.rollouts.simulate(trajectory.start, planner.rollouts.stop_policy, trajectory.v)
+            assert again.score == pytest.approx(trajectory.score, abs=1e-12)
+            np.testing.assert_allclose(again.v, trajectory.v, rtol=0, atol=1e-12)
+            assert largest_change(trajectory, 2) <= planner.rollouts.ramps.limits.dv_step.max() * (1.0 + 1e-9)
+            assert largest_change(trajectory, 1) <= planner.rollouts.ramps.limits.v_step.max() * (1.0 + 1e-9)
+            touched += trajectory.score.time_to_contact < 1.5
+            remainder = planner.rollouts.advance(trajectory)
+            later = planner.rollouts.simulate(remainder.start, policy, remainder.v)
+            assert later.contact_time == pytest.approx(trajectory.contact_time, abs=1e-9)
+            assert later.clearance >= trajectory.clearance - 1e-9
     assert 0 < touched < 24
 
 
-def test_only_a_flight_that_outdoes_another_is_flown_to_its_end(among_balls):
+def test_rollout_ends_early_exactly_when_it_does_not_beat_another(among_balls):
     _, planner, q = among_balls
     planner.reset()
     best, counts = None, {True: 0, False: 0}
     for t in (0.13, 0.51, 1.17):
         start, best = start_of(planner, q, t), None
         for _ in range(8):
-            manner = planner._drawn()
-            alone = planner.flights.fly(start, manner)
-            outdoes = best is None or alone.value > best.value
-            found = planner.flights.better(best, start, manner)
-            assert (found is not None) == outdoes
+            policy = planner._sample_policy()
+            alone = planner.rollouts.simulate(start, policy)
+            beats = best is None or alone.score > best.score
+            found = planner.rollouts.rollout(start, policy, None, best)
+            assert (found is not None) == beats
             if found is not None:
-                assert found.value == alone.value
-            counts[outdoes] += 1
+                assert found.score == alone.score
+            counts[beats] += 1
             best = found or best
     assert min(counts.values()) > 2
 
 
-def test_flights_that_hold_from_a_start_close_by_do_so(among_balls):
-    """With the bound taken at its word by flying anew what it says need not be."""
+def test_validity_from_a_nearby_start_is_conservative(among_balls):
+    """Against a rollout from that start."""
     _, planner, q = among_balls
     planner.reset()
-    rng, held = np.random.default_rng(2), 0
+    rng, valid = np.random.default_rng(2), 0
     for _ in range(60):
         t = rng.uniform(0.0, 2.0)
-        planner.flights.drop_predictions()
-        flight = planner.flights.fly(start_of(planner, q, t), planner._drawn())
+        planner.rollouts.drop_predictions()
+        trajectory = planner.rollouts.simulate(start_of(planner, q, t), planner._sample_policy())
         off = rng.uniform(-1.0, 1.0, len(q)) * 10.0 ** rng.uniform(-4.0, -1.5)
         start = start_of(planner, pin.integrate(planner._model, q, off), t, rng.uniform(-0.05, 0.05, len(q)))
-        if planner.flights.holds_from(flight, start):
-            held += 1
-            again = planner.flights.fly(start, planner.flights.still, flight.v)
-            assert again.value >= planner.flights.enough
-            assert again.least >= flight.least - planner.flights.lever_arm * 0.1 * len(q)
-    assert 2 < held < 55
+        if planner.rollouts.is_valid_from(trajectory, start):
+            valid += 1
+            again = planner.rollouts.simulate(start, planner.rollouts.stop_policy, trajectory.v)
+            assert again.score >= planner.rollouts.sufficient_score
+            assert again.clearance >= trajectory.clearance - planner.rollouts.lever_arm * 0.1 * len(q)
+    assert 2 < valid < 55
 
 
-def test_a_plate_that_is_passed_between_two_looks_is_seen(tmp_path):
-    """A ball of 10 cm at 3 m/s passes a plate of 2 mm within 34 ms; flights decide every 40 ms."""
+def test_rollout_detects_a_plate_passed_between_two_decisions(tmp_path):
+    """A ball of 10 cm at 3 m/s passes a plate of 2 mm within 34 ms; rollouts decide every 40 ms."""
     robot = cartesian(tmp_path, "xy", speed=3.0, acceleration=None)
     plate = slab("plate", (0.002, 2.0, 0.2), (0.001, 0.0, 0.0))
     for shift in np.linspace(0.0, 0.12, 7):
         controller = make_controller(
-            robot, [plate, *jaws()], "y", avoidance=Avoidance(d1=0.02, d2=0.1, backup=Backup())
+            robot, [plate, *closing_balls()], "y", avoidance=Avoidance(d1=0.02, d2=0.1, backup=Backup())
         )
-        planner = controller._commander.backup
+        planner = backup_of(controller)
         q = np.array([-0.5 - shift, 0.0])
-        still, start = planner.flights.still, start_of(planner, q, 0.0)
-        flight = planner.flights.fly(start, still, np.tile([3.0, 0.0], (40, 1)))
-        touches = (0.45 + shift) / 3.0
-        assert flight.until == pytest.approx(touches, abs=0.04), shift
+        start = start_of(planner, q, 0.0)
+        trajectory = planner.rollouts.simulate(start, planner.rollouts.stop_policy, np.tile([3.0, 0.0], (40, 1)))
+        contact = (0.45 + shift) / 3.0
+        assert trajectory.contact_time == pytest.approx(contact, abs=0.04), shift
 
 
-def test_what_was_found_clear_is_looked_at_anew_when_obstacles_turn(tmp_path):
+def test_backup_is_verified_anew_when_obstacles_turn(tmp_path):
     robot = cartesian(tmp_path, "xy", speed=0.25, acceleration=None)
     chaser = Obstacle.at("chaser", Sphere(radius=0.1), [-0.4, 0.0, 0.0])
-    avoidance = Avoidance(d1=0.02, d2=0.1, backup=Backup(attempts=20))
+    avoidance = Avoidance(d1=0.02, d2=0.1, backup=Backup(candidates=20))
     controller = make_controller(robot, [chaser], "y", avoidance=avoidance)
-    planner = controller._commander.backup
+    planner = backup_of(controller)
 
-    def told(speed):
+    def update(speed):
         return {"chaser": Sample.at([-0.4, 0.0, 0.0], linear=[speed, 0.0, 0.0])}
 
-    start = Start(robot.home, np.zeros(2), np.zeros(2), 0.0, planner.flights.parted)
+    start = Start(robot.home, np.zeros(2), np.zeros(2), 0.0, planner.rollouts.separable_pairs)
     for speed, clear in ((0.0, 1.5), (0.5, 0.25 / 0.5)):
-        for k in range(200):  # what is foreseen is of the mean of what was told lately
-            controller._obstacles.observe(0.01 * (k - 199), told(speed))
-        planner.flights.drop_predictions()
-        found, _ = planner._way_out(start)
+        for k in range(200):  # the prediction is of the mean twist
+            controller._obstacles.observe(0.01 * (k - 199), update(speed))
+        planner.rollouts.drop_predictions()
+        found, _ = planner._current_backup(start)
         if speed == 0.0:
-            planner._kept = found
+            planner._backup = found
             assert np.abs(found.v).max() < 1e-9
-        as_kept = planner.flights.fly(start, planner.flights.still, planner._kept.v)
-        assert as_kept.value.clear == pytest.approx(clear, abs=0.005)
-        assert found.value >= planner.flights.enough  # aside, at less than 0.25 m/s: 0.21 m in 0.4 m / (0.5 m/s)
-        assert planner.flights.fly(start, planner.flights.still, found.v).value == pytest.approx(found.value, abs=1e-9)
+        kept = planner.rollouts.simulate(start, planner.rollouts.stop_policy, planner._backup.v)
+        assert kept.score.time_to_contact == pytest.approx(clear, abs=0.005)
+        assert (
+            found.score >= planner.rollouts.sufficient_score
+        )  # aside, at less than 0.25 m/s: 0.21 m in 0.4 m / (0.5 m/s)
+        again = planner.rollouts.simulate(start, planner.rollouts.stop_policy, found.v)
+        assert again.score == pytest.approx(found.score, abs=1e-9)
 
 
-def test_what_was_foreseen_is_forgotten_when_it_is_over(among_balls):
+def test_predicted_states_of_the_past_are_dropped(among_balls):
     controller, planner, q = among_balls
     controller.reset()
     most = 0
     for k in range(400):
         q = pin.integrate(planner._model, q, DT * controller.step(q, k * DT).v)
-        most = max(most, len(planner.flights._foreseen))
-    assert 100 < most < 1000  # a tick in trouble foresees some hundreds
-    for t, seen in planner.flights._foreseen.items():
-        np.testing.assert_array_equal(seen.states, controller._obstacles.predicted(t).states)
+        most = max(most, len(planner.rollouts._predictions))
+    assert 100 < most < 1000  # a step with many rollouts predicts some hundreds
+    for t, predicted in planner.rollouts._predictions.items():
+        np.testing.assert_array_equal(predicted.states, controller._obstacles.predicted(t).states)
 
 
-def test_no_flight_is_flown_where_nothing_comes_near(tmp_path, monkeypatch):
+def test_no_rollout_while_moving_obstacles_stay_far(tmp_path):
     robot = cartesian(tmp_path, "xy", speed=0.25, acceleration=None)
     far = [
         Obstacle(
@@ -425,18 +443,17 @@ def test_no_flight_is_flown_where_nothing_comes_near(tmp_path, monkeypatch):
         )
     ]
     controller = make_controller(robot, far, "y", avoidance=Avoidance(d1=0.02, d2=0.1, backup=Backup()))
-    flown = []
-    better = controller._commander.backup.flights.better
-    monkeypatch.setattr(controller._commander.backup.flights, "better", lambda *a: flown.append(a[1].t) or better(*a))
+    times = []
+    count_rollouts(controller, times.append)
     q = robot.home.copy()
     for k in range(0, 900, 10):
         controller.step(q, k * DT, {"y": Sample.at([0.0, 0.0, 0.0])})
-        if flown:
+        if times:
             break
-    near = 3.0 - 0.15 - 0.3 * (k * DT + 1.51)  # where it will be a tick and 1.5 s later
+    near = 3.0 - 0.15 - 0.3 * (k * DT + 1.51)  # its distance a step and 1.5 s later
     assert (
         near - 0.015 - 0.03 < 0.1 < near - 0.015 + 0.03
-    )  # looked at every 0.1 s, up to the first such time after that
+    )  # evaluated every 0.1 s, up to the first such time after that
 
 
 @settings(max_examples=60, deadline=None)
@@ -445,7 +462,7 @@ def test_no_flight_is_flown_where_nothing_comes_near(tmp_path, monkeypatch):
     st.floats(0.0, 1.0),
     st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0)),
 )
-def test_where_nobody_is_said_to_come_nobody_does(tmp_path_factory, lines, t, v):
+def test_far_obstacle_check_is_conservative(tmp_path_factory, lines, t, v):
     robot = ROBOTS.setdefault("xy", cartesian(tmp_path_factory.mktemp("robot"), "xy", speed=1.0, acceleration=2.0))
     obstacles = [
         Obstacle(f"o{i}", Sphere(radius=0.1), build_motion(Line(start=line[:3], end=line[3:6], speed=line[6])), True)
@@ -455,15 +472,15 @@ def test_where_nobody_is_said_to_come_nobody_does(tmp_path_factory, lines, t, v)
     if not obstacles:
         return
     controller = make_controller(robot, obstacles, avoidance=Avoidance(d1=0.02, d2=0.1, backup=Backup()))
-    planner, v = controller._commander.backup, np.array(v)
-    for k, away in enumerate((0.0, 0.01, 0.1, 0.3)):  # what was found from one place counts for others near by
+    planner, v = backup_of(controller), np.array(v)
+    for k, away in enumerate((0.0, 0.01, 0.1, 0.3)):  # a cached clearance counts for configurations near by
         home, at = robot.home + away, t + 0.02 * k
-        moving = [o for o in obstacles if o.motion.sample(at).linear.any()]  # who rests does not come
-        if not planner._nobody_comes(Start(home, v, np.zeros(2), at, planner.flights.parted)):
+        moving = [o for o in obstacles if o.motion.sample(at).linear.any()]  # those at rest do not count
+        if not planner._moving_obstacles_stay_far(Start(home, v, np.zeros(2), at, planner.rollouts.separable_pairs)):
             continue
         for later in np.linspace(0.0, 1.5, 76):
-            rate_limit = np.minimum(later, np.abs(v) / 2.0)
-            q = home + np.sign(v) * (np.abs(v) * rate_limit - rate_limit**2)
+            braking = np.minimum(later, np.abs(v) / 2.0)
+            q = home + np.sign(v) * (np.abs(v) * braking - braking**2)
             place = np.array([*q, 0.0])
             centers = [o.motion.sample(at + later).position for o in moving]
             assert min((np.linalg.norm(place - center) for center in centers), default=1.0) - 0.15 > 0.1
@@ -473,92 +490,98 @@ ROBOTS = {}
 """Robots that are built once."""
 
 
-def test_a_flight_holds_only_while_it_is_of_what_is(tmp_path, among_balls):
+def test_backup_validity_ends_with_time_pairs_and_attachments(tmp_path, among_balls):
     _, planner, q = among_balls
     planner.reset()
-    planner.flights.drop_predictions()
-    flight = next(
+    planner.rollouts.drop_predictions()
+    trajectory = next(
         f
-        for f in iter(lambda: planner.flights.fly(start_of(planner, q, 0.0), planner._drawn()), None)
-        if f.value >= planner.flights.enough
+        for f in iter(lambda: planner.rollouts.simulate(start_of(planner, q, 0.0), planner._sample_policy()), None)
+        if f.score >= planner.rollouts.sufficient_score
     )
-    assert planner.flights.holds_from(flight, flight.start)
-    assert not planner.flights.holds_from(flight, flight.start._replace(t=0.02))  # obstacles are elsewhere by then
-    late = flight.start._replace(t=0.008)
-    room = flight.least - planner.flights.enough.distance
-    assert planner.flights.holds_from(flight, late, 0.99 * room / 0.008)
-    assert not planner.flights.holds_from(flight, late, 1.01 * room / 0.008)
-    assert not planner.flights.holds_from(flight, flight.start._replace(watched=~planner.flights.parted))
+    assert planner.rollouts.is_valid_from(trajectory, trajectory.start)
+    assert not planner.rollouts.is_valid_from(
+        trajectory, trajectory.start._replace(t=0.02)
+    )  # obstacles are elsewhere by then
+    late = trajectory.start._replace(t=0.008)
+    margin = trajectory.clearance - planner.rollouts.sufficient_score.clearance
+    assert planner.rollouts.is_valid_from(trajectory, late, 0.99 * margin / 0.008)
+    assert not planner.rollouts.is_valid_from(trajectory, late, 1.01 * margin / 0.008)
+    assert not planner.rollouts.is_valid_from(
+        trajectory, trajectory.start._replace(enabled=~planner.rollouts.separable_pairs)
+    )
     load = Obstacle.at("load", Sphere(radius=0.02), [0.3, 0.0, 0.0], graspable=True)
     ball = Obstacle(
         "ball", Sphere(radius=0.1), build_motion(Line(start=(0.0, 0.6, 0.0), end=(0.0, -2.0, 0.0), speed=0.01)), True
     )
     robot = cartesian(tmp_path, "xy", speed=0.25, acceleration=None)
-    controller = make_controller(robot, [load, ball], avoidance=Avoidance(d1=0.02, d2=0.1, backup=Backup(comfort=0.5)))
-    planner = controller._commander.backup
+    controller = make_controller(
+        robot, [load, ball], avoidance=Avoidance(d1=0.02, d2=0.1, backup=Backup(preferred_distance=0.5))
+    )
+    planner = backup_of(controller)
     for change in (
         lambda: controller.attach("load", "y", robot.home),
         lambda: controller.allow_contact("load", ["ball"]),
         lambda: controller.release("load", robot.home),
     ):
         controller.filter(robot.home, np.zeros(2), 0.0)
-        assert planner._kept is not None and planner.flights.holds_from(planner._kept, planner._kept.start)
+        assert planner._backup is not None and planner.rollouts.is_valid_from(planner._backup, planner._backup.start)
         change()
-        assert not planner.flights.holds_from(planner._kept, planner._kept.start)
+        assert not planner.rollouts.is_valid_from(planner._backup, planner._backup.start)
 
 
-def test_flights_know_what_the_robot_carries(tmp_path):
-    """Rates of a load's distances as it is carried, by finite differences; before, it is nothing that joints move."""
+def test_rollout_moves_attached_objects(tmp_path):
+    """Rates of the distances of an attached object, by finite differences; before, no joint moves it."""
     load = Obstacle.at("load", Sphere(radius=0.02), [0.3, 0.0, 0.0], graspable=True)
     ball = Obstacle(
         "ball", Sphere(radius=0.1), build_motion(Line(start=(0.3, 0.3, 0), end=(1, 1, 0), speed=0.01)), True
     )
     robot = cartesian(tmp_path, "xy", speed=0.25, acceleration=None)
     controller = make_controller(robot, [load, ball], avoidance=Avoidance(d1=0.02, d2=0.1))
-    flights, q = controller._commander.backup.flights, robot.home
+    rollouts, q = backup_of(controller).rollouts, robot.home
     pair = next(i for i, names in enumerate(controller.scene.pair_names) if set(names) == {"load", "ball"})
-    assert not flights.parted[pair]
+    assert not rollouts.separable_pairs[pair]
     controller.attach("load", "y", q)
-    assert flights.parted[pair]
+    assert rollouts.separable_pairs[pair]
 
-    def look(q):
-        near = flights._look(q, 0.0, np.zeros(2), Tally(Start(q, *np.zeros((2, 2)), 0.0, flights.parted), 1.5), 0.0)
-        (row,) = np.flatnonzero(flights._layout.near[: len(near.feedforward)] == pair)
+    def evaluate(q):
+        start = Start(q, *np.zeros((2, 2)), 0.0, rollouts.separable_pairs)
+        near = rollouts._evaluate(q, 0.0, np.zeros(2), ContactAccumulator(start, 1.5), 0.0)
+        (row,) = np.flatnonzero(rollouts._layout.near[: len(near.feedforward)] == pair)
         return near.closest[row, 0], near.J[row].copy()
 
-    d, J = look(q)
+    d, J = evaluate(q)
     assert d == pytest.approx(0.3 - 0.12)
-    numeric = [(look(q + h)[0] - look(q - h)[0]) / 2e-6 for h in 1e-6 * np.eye(2)]
+    numeric = [(evaluate(q + h)[0] - evaluate(q - h)[0]) / 2e-6 for h in 1e-6 * np.eye(2)]
     np.testing.assert_allclose(J, numeric, atol=1e-6)
     assert J[1] == pytest.approx(-1.0)
     controller.release("load", q)
-    assert not flights.parted[pair]
+    assert not rollouts.separable_pairs[pair]
 
 
-def test_told_obstacles_are_foreseen_once_as_long_as_they_do_what_was_told(tmp_path):
-    """And how far they stray bounds what flights are off: none is flown for what cannot make it touch."""
+def test_external_obstacles_as_predicted_need_no_new_rollouts(tmp_path):
+    """The prediction error bounds the error of a trajectory: none is computed for what cannot bring it into contact."""
     robot = cartesian(tmp_path, "xy", speed=0.25, acceleration=None)
-    flown = {}
+    counts = {}
     for noise in (0.0, 1e-4, 0.05):
         rng = np.random.default_rng(0)
         ball = Obstacle.at("ball", Sphere(radius=0.1), [0.5, 0.0, 0.0])
         controller = make_controller(robot, [ball], "y", avoidance=Avoidance(d1=0.02, d2=0.10))
-        flights, starts = controller._commander.backup.flights, []
-        better = flights.better
-        flights.better = lambda *a, s=starts, b=better: s.append(a[1].t) or b(*a)
+        times = []
+        count_rollouts(controller, times.append)
         q = robot.home.copy()
         for k in range(60):
             at = [0.3 - 0.05 * DT * k, 0.0, 0.0] + noise * rng.normal(size=3)
-            seen = {"ball": Sample.at(at, linear=[-0.05, 0.0, 0.0])}
+            update = {"ball": Sample.at(at, linear=[-0.05, 0.0, 0.0])}
             q = pin.integrate(
-                robot.model, q, DT * controller.step(q, k * DT, {"y": Sample.at([0.0, 0.0, 0.0])}, seen).v
+                robot.model, q, DT * controller.step(q, k * DT, {"y": Sample.at([0.0, 0.0, 0.0])}, update).v
             )
-        flown[noise] = len(starts)
-    assert 0 < flown[0.0] <= flown[1e-4] < 10 < flown[0.05]
+        counts[noise] = len(times)
+    assert 0 < counts[0.0] <= counts[1e-4] < 10 < counts[0.05]
 
 
-def test_paths_are_what_is_foreseen_of_those_on_trajectories_and_those_told_of():
-    times, given = np.array([0.3, 0.4, 1.9]), {"b": Sample.at([0, 1, 0], linear=[0.1, 0, 0.2], angular=[0, 0, 3.0])}
+def test_paths_agree_with_predicted_states():
+    times, update = np.array([0.3, 0.4, 1.9]), {"b": Sample.at([0, 1, 0], linear=[0.1, 0, 0.2], angular=[0, 0, 3.0])}
     line = build_motion(Line(start=(0.0, 0.6, 0.0), end=(0.0, -2.0, 0.0), speed=0.5))
     still = Obstacle.at("still", Sphere(radius=0.1), [9.0, 0.0, 0.0])
     obstacles = Obstacles(
@@ -567,21 +590,21 @@ def test_paths_are_what_is_foreseen_of_those_on_trajectories_and_those_told_of()
         0.1,
     )
     for k in range(4):
-        obstacles.observe(0.1 * k, given if k % 2 else None)
+        obstacles.observe(0.1 * k, update if k % 2 else None)
         places, rates = obstacles.paths(times)
         assert obstacles.any_may_move and len(rates) == (2 if k else 1)
         for t, row in zip(times, places, strict=True):
             np.testing.assert_allclose(row, obstacles.predicted(t).states[obstacles.moving, 9:12], rtol=0, atol=1e-12)
         expected = [[0.5, 0.0], [np.sqrt(0.05), 3.0]][: len(rates)]
         np.testing.assert_allclose(rates, expected, rtol=0, atol=1e-12)
-    rest = Obstacles([still], Sensing(), 0.1)
+    resting = Obstacles([still], Sensing(), 0.1)
     for twist, any_may_move in (([0, 0, 0], False), ([0, 0, 0.1], True)):
-        rest.observe(0.0, {"still": Sample.at([9.0, 0.0, 0.0], linear=twist)})
-        assert rest.any_may_move == any_may_move
+        resting.observe(0.0, {"still": Sample.at([9.0, 0.0, 0.0], linear=twist)})
+        assert resting.any_may_move == any_may_move
 
 
-def test_what_is_foreseen_is_of_the_mean_of_what_was_told_lately():
-    """Of a ball that is seen to within 5 mm, a bare pose at a time, twists are off by 0.7 m/s; what will be is not."""
+def test_prediction_uses_the_mean_twist():
+    """Poses with a noise of 5 mm give twists with errors of 0.7 m/s, but predictions without."""
     dt, rng = 0.01, np.random.default_rng(0)
     obstacles, off = Obstacles([Obstacle.at("ball", Sphere(radius=0.1), [0, 0, 0])], Sensing(), dt), []
     for k in range(200):
@@ -598,25 +621,24 @@ def test_what_is_foreseen_is_of_the_mean_of_what_was_told_lately():
     assert np.std(off) < 0.05 and np.abs(np.mean(off, axis=0)).max() < 0.02
 
 
-def test_a_clock_that_is_not_exact_costs_no_flights(tmp_path):
-    flown = {}
+def test_clock_jitter_costs_no_rollouts(tmp_path):
+    counts = {}
     for jitter in (0.0, 1e-3):
         rng, robot = np.random.default_rng(0), cartesian(tmp_path, "xy", speed=0.25, acceleration=None)
-        controller = make_controller(robot, jaws(speed=0.12), "y", avoidance=Avoidance(d1=0.02, d2=0.10))
-        flights, starts = controller._commander.backup.flights, []
-        better = flights.better
-        flights.better = lambda *a, s=starts, b=better: s.append(a[1].t) or b(*a)
+        controller = make_controller(robot, closing_balls(speed=0.12), "y", avoidance=Avoidance(d1=0.02, d2=0.10))
+        times = []
+        count_rollouts(controller, times.append)
         q = robot.home.copy()
         for k in range(300, 480):
             t = k * DT + jitter * rng.uniform(-1.0, 1.0)
             q = pin.integrate(robot.model, q, DT * controller.step(q, t, {"y": Sample.at([0.0, 0.0, 0.0])}).v)
-        flown[jitter] = len(starts)
-    assert flown[0.0] > 5 and flown[1e-3] < 2 * flown[0.0] < 100
+        counts[jitter] = len(times)
+    assert counts[0.0] > 5 and counts[1e-3] < 2 * counts[0.0] < 100
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 10**6), st.floats(0.0, 0.3))
-def test_how_far_obstacles_stray_is_no_less_than_any_point_of_them(seed, size):
+def test_prediction_error_bound_covers_every_point(seed, size):
     rng, dt = np.random.default_rng(seed), 0.05
     names = ["a", "b"]
     obstacles = Obstacles([Obstacle.at(name, Sphere(radius=0.1), [0, 0, 0]) for name in names], Sensing(), dt)
