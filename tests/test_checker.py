@@ -1,4 +1,4 @@
-"""Independent checker and safety campaign: MuJoCo's distances, contacts between steps, verdicts, a small campaign."""
+"""Independent checker and safety campaign: distances, contacts between steps, verdicts, a small campaign."""
 
 from dataclasses import replace
 from functools import cache

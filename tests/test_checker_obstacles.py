@@ -22,14 +22,14 @@ from qpavoid.arena.mujoco_model import build
 TCP, HOLD = "panda_hand_tcp", 0.02
 
 
-def smallest_distances(controller, mujoco_model, ticks, target, updates=None):
+def smallest_distances(controller, checked, ticks, target, updates=None):
     """Return the smallest distance of every pair in a closed loop, checked five times in each step."""
-    least = np.full(len(mujoco_model.scene.pairs), np.inf)
+    least = np.full(len(checked.scene.pairs), np.inf)
     for tick in drive(controller, controller.scene.robot.home.copy(), ticks, target=target, obstacles=updates):
         assert tick.solution.status is Status.SOLVED, tick.solution.reasons
         for share in (0.2, 0.4, 0.6, 0.8, 1.0):
-            mujoco_model.place(mujoco_model.integrate(tick.state.q, tick.solution.v, share * controller.dt), 0.0)
-            least = np.minimum(least, [mujoco_model.distance(pair) for pair in range(len(least))])
+            checked.place(checked.integrate(tick.state.q, tick.solution.v, share * controller.dt), 0.0)
+            least = np.minimum(least, [checked.distance(pair) for pair in range(len(least))])
     return least
 
 
@@ -43,18 +43,16 @@ def test_distances_to_the_new_shapes(panda, tmp_path):
     mesh = Mesh(path=str(write_stl(tmp_path / "shelf.stl", boards(*SHELF))))
     shapes = [Ellipsoid(radii=(0.1, 0.2, 0.1)), HalfSpace(), mesh]
     scene = build_scene(panda, [Obstacle.at(f"o{i}", s, [0.5, 0.1, 0.2 * i - 0.2]) for i, s in enumerate(shapes)])
-    mujoco_model, rng, count = build(scene, panda.home), np.random.default_rng(0), 0
+    checked, rng, count = build(scene, panda.home), np.random.default_rng(0), 0
     for _ in range(8):
         q = random_q(panda, rng)
-        mujoco_model.place(q, 0.0)
+        checked.place(q, 0.0)
         model, data = panda.model, scene.geometry.createData()
         pin.updateGeometryPlacements(model, model.createData(), scene.geometry, data, q)
         pin.computeDistances(scene.geometry, data)
         for pair, result in enumerate(data.distanceResults):
             if result.min_distance > 0.0:
-                assert mujoco_model.distance(pair) == pytest.approx(result.min_distance, abs=2e-4), scene.pair_names[
-                    pair
-                ]
+                assert checked.distance(pair) == pytest.approx(result.min_distance, abs=2e-4), scene.pair_names[pair]
                 count += 1
     assert count > 150
 
@@ -68,12 +66,12 @@ def test_cloud_distance_equals_all_voxels(panda):
         panda, [Obstacle.at("camera", shape, [0, 0, 0])], TCP, avoidance=Avoidance(d1=HOLD, d2=0.1)
     )
     centers, ball = Voxels.of(points, shape.resolution).centers, Sphere(radius=voxel_radius(shape.resolution))
-    mujoco_model = build(build_scene(panda, [Obstacle.at(f"v{i}", ball, c) for i, c in enumerate(centers)]), panda.home)
-    of_voxels = mujoco_model.scene.pairs[:, 1] >= mujoco_model.bodies
+    checked = build(build_scene(panda, [Obstacle.at(f"v{i}", ball, c) for i, c in enumerate(centers)]), panda.home)
+    of_voxels = checked.scene.pairs[:, 1] >= checked.bodies
     assert len(centers) > 60
     least = smallest_distances(
         controller,
-        mujoco_model,
+        checked,
         90,
         lambda t: tool + np.array([0.0, 0.5 * t, 0.0]),
         lambda t: {"camera": Points(points)},
@@ -92,16 +90,16 @@ def test_attached_object_equals_body_of_robot(panda):
     controller = make_controller(panda, [load, Obstacle.at("pole", pole, at)], TCP, avoidance=avoidance)
     controller.attach("box", TCP, panda.home)
     welded = _with_body(panda, "box", box, pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.14])))
-    mujoco_model = build(build_scene(welded, [Obstacle.at("pole", pole, at)]), panda.home)
-    pair = mujoco_model.scene.pair_names.index(("box", "pole"))
+    checked = build(build_scene(welded, [Obstacle.at("pole", pole, at)]), panda.home)
+    pair = checked.scene.pair_names.index(("box", "pole"))
     start = tool.translation
 
     def way(t):
         return start + np.array([0.0, min(0.3 * t, 0.4), 0.0])
 
-    assert HOLD - 1e-3 < smallest_distances(controller, mujoco_model, 150, way)[pair] < HOLD + 0.03
+    assert HOLD - 1e-3 < smallest_distances(controller, checked, 150, way)[pair] < HOLD + 0.03
     alone = make_controller(panda, [Obstacle.at("pole", pole, at)], TCP, avoidance=avoidance)
-    assert smallest_distances(alone, mujoco_model, 150, way)[pair] < 0.0
+    assert smallest_distances(alone, checked, 150, way)[pair] < 0.0
 
 
 def _with_body(robot: Robot, name, shape, inside):
@@ -125,9 +123,9 @@ def test_decomposed_mesh_equals_its_boards(panda, tmp_path):
     pieces = [
         Obstacle.at(f"b{i}", Box(size=size), place + turn @ np.array(c), turn) for i, (c, size) in enumerate(SHELF)
     ]
-    mujoco_model = build(build_scene(panda, pieces), panda.home)
-    of_boards = mujoco_model.scene.pairs[:, 1] >= mujoco_model.bodies
+    checked = build(build_scene(panda, pieces), panda.home)
+    of_boards = checked.scene.pairs[:, 1] >= checked.bodies
     least = smallest_distances(
-        controller, mujoco_model, 120, lambda t: tool + np.array([min(0.3 * t, 0.2), 0.0, 0.2 * np.sin(3.0 * t)])
+        controller, checked, 120, lambda t: tool + np.array([min(0.3 * t, 0.2), 0.0, 0.2 * np.sin(3.0 * t)])
     )
     assert HOLD - 1e-3 < least[of_boards].min() < 0.05

@@ -43,9 +43,8 @@ def test_its_figures_are_those_of_the_tables():
 def test_its_numbers_are_those_of_the_statistics():
     assert f"with {100 * CONFIDENCE:.0f} %" in PAGE and f"from {_MANY} runs on" in PAGE
     assert f"p is not below {1 - CONFIDENCE:.2f}" in PAGE
-    assert not duel(
-        np.ones(5, dtype=bool), np.zeros(5, dtype=bool)
-    ).decided  # five cases separate no two entrants, six do
+    # five cases separate no two entrants, six do
+    assert not duel(np.ones(5, dtype=bool), np.zeros(5, dtype=bool)).decided
     assert duel(np.ones(6, dtype=bool), np.zeros(6, dtype=bool)).decided
     draw = np.random.default_rng(0)
     held = [low <= 1.0 <= high for _, low, high in (mean(draw.exponential(size=6)) for _ in range(1000))]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from qpavoid.arena.families import tool_path
-from qpavoid.arena.families.tool_path import ToolPath, line
+from qpavoid.arena.families.tool_path import ToolPath, line_motion
 from qpavoid.problem import Array
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ def _at_the_arm(random: np.random.Generator, way: ToolPath, bodies: Array, range
     """Return a line through a part of the robot."""
     speed, direction = random.uniform(*ranges.obstacle_speed), _direction(random)
     point = bodies[random.integers(len(bodies))] + random.uniform(0.0, 0.1) * _direction(random)
-    return line(point - random.uniform(0.3, 1.0) * direction, point + tool_path.OVERSHOOT * direction, speed)
+    return line_motion(point - random.uniform(0.3, 1.0) * direction, point + tool_path.OVERSHOOT * direction, speed)
 
 
 def _head_on(random: np.random.Generator, way: ToolPath, bodies: Array, ranges: Ranges) -> dict[str, Any]:

@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
-from qpavoid.arena.referee import Watch
-from qpavoid.arena.twin import Twin
 from scipy.optimize import linprog
 
 from qpavoid import ScenarioConfig
+from qpavoid.arena.checker import DistanceMonitor
+from qpavoid.arena.mujoco_model import MujocoModel
 from qpavoid.problem import Array
 
 PERIOD = 0.02
@@ -111,7 +111,7 @@ class Evasion:
     """Least distance along it [m]."""
 
 
-def joint_limits(twin: Twin, scenario: ScenarioConfig) -> JointLimits:
+def joint_limits(twin: MujocoModel, scenario: ScenarioConfig) -> JointLimits:
     """Return the joint limits of a scenario."""
     bounds = twin.scene.robot.bounds().within(scenario.limits)
     lower, upper = np.full_like(bounds.velocity, -np.inf), np.full_like(bounds.velocity, np.inf)
@@ -129,16 +129,18 @@ def policies(count: int) -> Iterator[EvasionPolicy]:
         yield EvasionPolicy(f"evasion, bias {i},", HORIZONS[0], BIAS_COST * direction / np.linalg.norm(direction))
 
 
-def evade(twin: Twin, limits: JointLimits, start: Start, dt: float, policy: EvasionPolicy, pairs: Any) -> Evasion:
+def evade(
+    twin: MujocoModel, limits: JointLimits, start: Start, dt: float, policy: EvasionPolicy, pairs: Any
+) -> Evasion:
     """Follow a policy with control steps of dt [s], to the end or to the first contact of one of the pairs (m,)."""
     q, v, t, _ = start
     twin.place(q, t)
-    watch = Watch(twin)
-    watch.look(t)
+    watch = DistanceMonitor(twin)
+    watch.measure(t)
     pairs = pairs.copy()
     pairs[[contact.pair for contact in watch.contacts]] = False
-    watch = Watch(twin, pairs)
-    watch.look(t)
+    watch = DistanceMonitor(twin, pairs)
+    watch.measure(t)
     steps = int(np.ceil(PERIOD / dt - 1e-9))
     while t < start.until - 1e-9:
         box, begin, before, last = limits.box(q, v, steps * dt), t, q, v
@@ -156,7 +158,7 @@ def evade(twin: Twin, limits: JointLimits, start: Start, dt: float, policy: Evas
     return Evasion(None, t, q, v, watch.distance)
 
 
-def near_rows(twin: Twin, q: Array, t: float, pairs: Any, max_distance: float) -> Rows:
+def near_rows(twin: MujocoModel, q: Array, t: float, pairs: Any, max_distance: float) -> Rows:
     """Return the rows of those of the pairs (m,) that are nearer than `max_distance` [m], all by MuJoCo."""
     twin.place(q, t)
     scene, model, data = twin.scene, twin.model, twin.data

@@ -90,8 +90,8 @@ def limit_layout(joints: JointBounds, position_gain: float, dt: float) -> dict[s
     from which it can still brake (`kernels.speed_to_stop`), so that position, velocity and acceleration
     limits never contradict each other once they are met; where its jerk has a limit, too, it keeps to the velocities
     from which a stop within all of these ends in time (`kernels.braking_bounds`). A joint outside its limits moves
-    back, at no more than its largest speed. Bounds never cross: from a state that no braking can save, the jerk limit is
-    relaxed, then that of the acceleration.
+    back, at no more than its largest speed. Bounds never cross: from a state that no braking can save, the jerk
+    limit is relaxed, then that of the acceleration.
 
     Args:
         joints: the robot's limits.

@@ -61,7 +61,7 @@ def motion_figure(log: Log) -> Figure:
         y = 0.45 + (rows - row - 0.55) * cell_height
         box = ((x - square / 2) / width, (y - square / 2) / height, square / width, square / height)
         ax: Any = figure.add_axes(box, projection="3d", proj_type="ortho", computed_zorder=False)
-        ax.patch.set_extent(False)
+        ax.patch.set_visible(False)
         ax.view_init(elevation, azimuth)
         _draw(ax, log, int(tick), towards, lower, upper)
         ax.set(xlim=(lower[0], upper[0]), ylim=(lower[1], upper[1]), zlim=(lower[2], upper[2]))
