@@ -97,7 +97,7 @@ def _time(robot: Robot, pairs: list[tuple[int, int]], steps: int, rounds: int) -
         geometry.addCollisionPair(pin.CollisionPair(a, b))
     data, of_model = geometry.createData(), robot.model.createData()
     for request in data.distanceRequests:
-        request.gjk_tolerance = 1e-10  # as in the tick
+        request.gjk_tolerance = 1e-10  # as in a control step
     phase = np.random.default_rng(0).uniform(0.0, 2.0 * np.pi, robot.model.nv)
     taken = np.empty((rounds, steps))
     for i in np.ndindex(taken.shape):

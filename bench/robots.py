@@ -32,7 +32,7 @@ HEAD = """# Every robot of example-robot-data
 with default options and a fixed base, and then checks the robot.yaml that was written. example-robot-data {data},
 pinocchio {pin}, coal {coal}; a machine with 2 cores that was busy with other things: take the times as upper bounds.
 
-- *pairs*: as the bare URDF loads (adjacent pairs and those that always touch are off already) → as written;
+- *pairs*: as the bare URDF loads (without adjacent pairs and those that always touch) → as written;
 - *bodies*: pieces of collision geometry → bodies in the written robot.yaml, and their volume in units of what the
   geometry encloses;
 - *step*: median control step that tracks all end effectors near the home pose, without obstacles, bare → written;

@@ -275,11 +275,14 @@ def test_home_is_the_wish_or_near_it(tmp_path):
     d1, good = np.array([D1]), np.array([0.0, 1.0])
     home = find_home(robot, [robot.home, good], [], d1)
     assert (
-        home.wish == 1 and np.array_equal(home.q, good) and home.clearance >= HOME_CLEARANCE * D1 and home.short == 0.0
+        home.preference == 1
+        and np.array_equal(home.q, good)
+        and home.clearance >= HOME_CLEARANCE * D1
+        and home.deficit == 0.0
     )
     for own in (D1, 0.003):
         home = find_home(robot, [robot.home], [], np.array([own]))
-        assert home.wish is None and touching(robot, home.q, np.inf)[0][2] == home.clearance
+        assert home.preference is None and touching(robot, home.q, np.inf)[0][2] == home.clearance
         assert HOME_CLEARANCE * own <= home.clearance < HOME_CLEARANCE * own + 0.02 and home.nearest == ("base", "tip")
         assert np.linalg.norm(home.q - robot.home) < 1.0
         bounds = robot.bounds()
@@ -302,7 +305,11 @@ def test_home_is_bent(tmp_path):
     columns = np.array([along[0] + along[1], along[1], [0.0, 0.0]]).T
     assert limb.value == pytest.approx(np.linalg.svd(columns, compute_uv=False)[1], abs=1e-9)
     straight = find_home(tool, [np.zeros(3)], ["link3"], np.zeros(0))
-    assert straight.wish is None and not straight.singular and straight.conditioning["link3"].ratio >= MIN_CONDITIONING
+    assert (
+        straight.preference is None
+        and not straight.singular
+        and straight.conditioning["link3"].ratio >= MIN_CONDITIONING
+    )
     assert np.count_nonzero(straight.q) == 1  # one bend is enough
     pinned = find_home(tool, [np.zeros(3)], ["link3"], np.zeros(0), pinned=["joint2"])
     assert pinned.singular == ["link3"] and pinned.q[1] == 0.0

@@ -316,7 +316,7 @@ def test_aliases_and_marks_that_do_no_harm_are_read(tmp_path):
         ("tags=&a [*a]", "is not a YAML value"),
         ('tasks.0.frame="\\ud800"', "is not a YAML value"),
         ("tasks." + "9" * 5000 + ".gain=1", "is not an index below 1"),
-        ("duration=1e8", r"duration / dt is 1e\+10 ticks; at most 1000000"),
+        ("duration=1e8", r"duration / dt is 1e\+10 control steps; at most 1000000"),
         ("obstacles.0.motion.position=[1e308, 0, 0]", "less than or equal to 1000000000"),
         ("obstacles.0.shape.size=[1e308, 1, 1]", "less than or equal to 1000000000"),
     ],

@@ -14,7 +14,7 @@ from qpavoid.config import Task
 from qpavoid.model.notes import NoteKind
 from qpavoid.setup.add import DescribeOptions, describe
 from qpavoid.setup.check import check_robot
-from qpavoid.setup.home import BENT, ROOM
+from qpavoid.setup.home import MIN_CONDITIONING, HOME_CLEARANCE
 from qpavoid.setup.sampling import D1, touching
 from qpavoid.setup.texts import description_files
 from qpavoid.setup.written import write_files
@@ -142,7 +142,7 @@ def made(tmp_path, name, text=None, **wishes):
 
 def nothing_unseen(path, described, samples, folders=()):
     """Every collision of two links is one of a pair that is kept, or of links that are named with how often."""
-    named = {frozenset(entry.links): entry for entry in described.left_out}
+    named = {frozenset(entry.links): entry for entry in described.unchecked}
     missed = unseen(path, described.robot, described.config.lock, samples, folders)
     for links, count in missed.items():
         assert links in named and named[links].reason != "never", (sorted(links), count)
@@ -213,14 +213,18 @@ def test_carriages_on_a_rail_are_no_telescope(tmp_path):
     """They touch in the middle of their ranges: P(|x1 - x2| < 0.2) = 1 - (1 - 0.2/0.8)² of two even ranges of 0.8."""
     _, described = made(tmp_path, "rail")
     assert described.counts["drawn in"] == described.counts["always"] == 0
-    assert described.counts["active"] == 1 and described.home.clearance >= ROOM * D1
-    assert described.home.wish is None and notes_of(described, NoteKind.HOME)
+    assert described.counts["active"] == 1 and described.home.clearance >= HOME_CLEARANCE * D1
+    assert described.home.preference is None and notes_of(described, NoteKind.HOME)
 
 
 def test_home_of_a_straight_arm_starts_a_line_straight_down(tmp_path):
     _, described = made(tmp_path, "straight")
     robot, home = described.robot, described.home
-    assert home.clearance >= ROOM * D1 and not home.singular and home.conditioning["tool"].ratio >= BENT
+    assert (
+        home.clearance >= HOME_CLEARANCE * D1
+        and not home.singular
+        and home.conditioning["tool"].ratio >= MIN_CONDITIONING
+    )
     controller = Controller(build_scene(robot), build_tasks([Task(frame="tool")], robot, robot.home), dt=0.005)
     data, frame = robot.model.createData(), robot.frame_id("tool", "test")
     pin.framesForwardKinematics(robot.model, data, robot.home)

@@ -15,7 +15,7 @@ from qpavoid import Robot, load_scenario
 from qpavoid.config import RobotConfig
 from qpavoid.config.loading import read_config
 from qpavoid.config.shipped import data_folder, find_robot
-from qpavoid.model.notes import NoteKind
+from qpavoid.model.notes import RobotWarning
 from qpavoid.model.packages import find_mesh
 from qpavoid.run.simulate import simulate
 from qpavoid.setup.add import DescribeOptions, describe
@@ -263,8 +263,8 @@ def test_edited_file_is_overwritten_only_by_force(cli, tmp_path):
 def test_added_base_has_the_speed_limit_that_was_assumed(cli, tmp_path, root, size):
     """A URDF gives no speed of a base: `add` writes the assumed one, which then is no assumption any more."""
     write_chain(tmp_path)
-    bare = Robot.from_urdf(tmp_path / "chain.urdf", root_joint=root)
-    assert any("root_joint" in note.subject for note in bare.notes if note.kind is NoteKind.LIMIT)
+    with pytest.warns(RobotWarning, match="root_joint: no velocity limit"):
+        bare = Robot.from_urdf(tmp_path / "chain.urdf", root_joint=root)
     assert cli("robot", "add", "chain.urdf", "--root", root, "--no-picture").status == 0
     path = tmp_path / "chain" / "robot.yaml"
     assert yaml.safe_load(path.read_text())["limits"] == {"velocity": {"root_joint": [1.0] * size}}

@@ -30,7 +30,7 @@ class Body(Block):
     name: str
     """Name by which pairs, logs and messages know it."""
     frame: str
-    """Link or frame of the URDF that carries it."""
+    """Link or frame of the URDF that it is fixed to."""
     shape: BodyShape
     position: Vec3 = (0.0, 0.0, 0.0)
     """Position of the shape's origin in `frame` [m]."""

@@ -14,7 +14,7 @@ from qpavoid.config.shapes import HalfSpace, Mesh, ObstacleShape, PointCloud
 from qpavoid.config.solver import QpSolver, SolverConfig
 from qpavoid.config.tasks import AnyTask, Contact
 
-_MOST_TICKS = 1_000_000
+_MAX_STEPS = 1_000_000
 """The log of so many takes a gigabyte or two of memory; at 10 ms they are 2.8 hours."""
 
 
@@ -27,9 +27,9 @@ class ObstacleConfig(Block):
     motion: Motion
     """Where its origin is; what a task could take from its frame must be given here."""
     graspable: bool = False
-    """Whether a frame of the robot may carry it for a while; costs pairs with the other obstacles."""
+    """Whether it may be attached to a frame of the robot for a while; costs pairs with the other obstacles."""
     attached_to: str | None = None
-    """Frame of the robot that carries it from the start, where `motion` puts it at first."""
+    """Frame of the robot that it is attached to from the start, where `motion` puts it at first."""
     source: Literal["scene", "external"] = "scene"
     """Where its pose comes from: `scene`, from `motion`, unless a program gives it in `step`; `external`, from such a
     program from the start, without which the robot stops after `sensing.stop_after`; `motion` is then a `fixed` one,
@@ -61,7 +61,7 @@ class ScenarioConfig(Block):
     q0: list[Number] | dict[str, Number] = {}
     """Initial configuration [rad or m]: all of q, or by joint name over the home pose."""
     lock: list[str] = []
-    """Joints held at q0 for the whole run; `*` and `?` match as in file names."""
+    """Joints locked at q0 for the whole run; `*` and `?` match as in file names."""
     tasks: Annotated[list[AnyTask], Field(min_length=1)]
     contacts: list[Contact] = []
     """Frames that stay where they are at q0, such as feet; for `qp` and `hqp`."""
@@ -97,9 +97,9 @@ class ScenarioConfig(Block):
 
     @model_validator(mode="after")
     def _ends(self) -> ScenarioConfig:
-        if self.duration / self.dt > _MOST_TICKS:
+        if self.duration / self.dt > _MAX_STEPS:
             raise ValueError(
-                f"duration / dt is {self.duration / self.dt:.3g} ticks; at most {_MOST_TICKS} are run and logged"
+                f"duration / dt is {self.duration / self.dt:.3g} control steps; at most {_MAX_STEPS} are run and logged"
             )
         return self
 

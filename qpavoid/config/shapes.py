@@ -10,7 +10,7 @@ from qpavoid.config.base import Block, Positive
 
 
 class Sphere(Block):
-    """Ball about the origin."""
+    """Sphere about the origin."""
 
     type: Literal["sphere"] = "sphere"
     radius: Positive
@@ -18,7 +18,7 @@ class Sphere(Block):
 
 
 class Capsule(Block):
-    """Segment along z, centred on the origin, swept by a ball."""
+    """Segment along z, centred on the origin, swept by a sphere."""
 
     type: Literal["capsule"] = "capsule"
     radius: Positive
@@ -87,14 +87,14 @@ class Mesh(Block):
 
 
 class PointCloud(Block):
-    """Points as from a depth camera, merged into voxels; each voxel counts as the ball around it."""
+    """Points as from a depth camera, merged into voxels; each voxel counts as the sphere around it."""
 
     type: Literal["point_cloud"] = "point_cloud"
     path: str | None = None
     """Points to start with [m], relative to the scenario file: `.npy` (n, 3), or `.csv` with the header `x,y,z`; left
     out: none until a program gives some."""
     resolution: Annotated[float, Field(ge=1e-3, le=1.0)] = 0.02
-    """Edge of a voxel [m]; balls have a radius of √3/2 of it."""
+    """Edge of a voxel [m]; its sphere has a radius of √3/2 of it."""
     nearest: Annotated[int, Field(ge=1, le=32)] = 8
     """How many voxels each body of the robot keeps clear of at a time [-]: the nearest at different places of the body,
     then the nearest in different directions."""

@@ -10,7 +10,7 @@ from qpavoid.config.base import Block, NonNegative, Positive
 
 
 class ClosedForm(Block):
-    """A law without a back end."""
+    """A solver without a back end."""
 
     name: str
 
@@ -43,7 +43,7 @@ class GradientProjectionSolver(ClosedForm):
 
     name: Literal["gradient-projection"] = "gradient-projection"
     gain: NonNegative = 10.0
-    """k: self-motion for each m/rad of gradient; joint limits may leave room for less [rad²/(m s)]."""
+    """k: self-motion for each m/rad of gradient; joint limits may allow less [rad²/(m s)]."""
 
 
 class PotentialFieldSolver(ClosedForm):
@@ -64,7 +64,7 @@ class QpSolver(Block):
     """`native` (compiled by numba), `daqp`, `proxqp`, `osqp`, `quadprog`, or whatever else qpsolvers finds
     installed; `auto` is `native`."""
     regularization: Positive = 1e-3
-    """λ: cost of leaving the tracking law's velocity [(rad/s)⁻²]."""
+    """λ: cost of leaving the tracking velocity [(rad/s)⁻²]."""
 
     @property
     def label(self) -> str:

@@ -1,7 +1,7 @@
 """Tasks of a robot, and frames that stay in contact with the ground.
 
-Every task is rows A v = b with a `weight`, for laws that weigh tasks against each other (`qp`), and a `priority`, for
-those that keep strict order (`hqp`).
+Every task is rows A v = b with a `weight`, for solvers that weigh tasks against each other (`qp`), and a `priority`,
+for those that keep strict order (`hqp`).
 """
 
 from __future__ import annotations

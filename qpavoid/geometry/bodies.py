@@ -189,8 +189,8 @@ def _unpack_fit(path: Path) -> CapsuleFit:
     return CapsuleFit(numbers[:3], numbers[3:12].reshape(3, 3), float(numbers[12]), float(numbers[13]))
 
 
-_AROUND_BALL = 1.04 * np.concatenate((half_sphere(100), -half_sphere(100)))
-"""Points whose hull encloses the unit ball (200, 3)."""
+_AROUND_SPHERE = 1.04 * np.concatenate((half_sphere(100), -half_sphere(100)))
+"""Points whose hull encloses the unit sphere (200, 3)."""
 _ENDLESS = 1e6
 """Half the size of a box around what has no end [m]."""
 _THINNEST = 1e-4
@@ -209,7 +209,7 @@ def hull_points(geometry: Any) -> Array:
     if isinstance(geometry, coal.Cone):
         return np.concatenate((rim(geometry.radius, -geometry.halfLength), [[0.0, 0.0, geometry.halfLength]]))
     if isinstance(geometry, coal.Ellipsoid):
-        return np.asarray(_AROUND_BALL * np.asarray(geometry.radii))
+        return np.asarray(_AROUND_SPHERE * np.asarray(geometry.radii))
     geometry.computeLocalAABB()
     half, center = 0.5 * (geometry.aabb_local.max_ - geometry.aabb_local.min_), geometry.aabb_center
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)

@@ -80,8 +80,8 @@ def _fit_along(height: Array, off_axis: Array, radius: Array) -> Array:
 
     Rows are [radius, length, height of the middle].
 
-    Each point lets the caps' centres come no nearer to the far side than its reach; where they would cross, a ball
-    about their middle encloses everything.
+    Each point lets the caps' centres come no nearer to the far side than half its chord; where they would cross, a
+    sphere about their middle encloses everything.
 
     Args:
         height: of the points along each axis (k, n).

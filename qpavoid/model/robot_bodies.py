@@ -50,7 +50,7 @@ def robot_bodies(config: RobotConfig, urdf: Path, model: Any, path: Path, notes:
     bodies = convert_bodies(pieces, config.bodies)
     if meshes := triangle_meshes(bodies):
         clause = (
-            f"{len(meshes)} triangle meshes cost 100 to 500 µs a pair at every tick, some pairs several ms, convex "
+            f"{len(meshes)} triangle meshes cost 100 to 500 µs a pair at every step, some pairs several ms, convex "
             "hulls about 1 µs, capsules 0.1 µs"
         )
         remedy = "set `bodies` to convex or capsule"

@@ -31,7 +31,7 @@ def make_solids(shape: ObstacleShape, folder: Path, where: str) -> list[Any]:
     """Make the coal geometries of an obstacle, all in the obstacle's own frame.
 
     Args:
-        shape: of a point cloud, the ball that stands for one of its voxels.
+        shape: of a point cloud, the sphere that stands for one of its voxels.
         folder: where relative paths start.
         where: the obstacle's `shape`, to name in errors.
 
@@ -48,7 +48,7 @@ def make_solids(shape: ObstacleShape, folder: Path, where: str) -> list[Any]:
     vertices, triangles = corners(mesh)
     if shape.method == "surface":
         warnings.warn(
-            f"{where}.method: surface: {len(triangles)} triangles cost 100 to 500 µs a pair at every tick, "
+            f"{where}.method: surface: {len(triangles)} triangles cost 100 to 500 µs a pair at every step, "
             "some pairs several ms; set `method` to decomposed or convex",
             MeshWarning,
             stacklevel=5,

@@ -62,7 +62,7 @@ def read_shapes(
 ) -> Any:
     """Read the shapes of a URDF into a geometry model.
 
-    A shape is called by its link and its index in it, as in `hand_0`; where one element has several, the others carry
+    A shape is called by its link and its index in it, as in `hand_0`; where one element has several, further ones have
     a second index.
 
     Args:
@@ -168,7 +168,7 @@ def _make(element: ET.Element, where: str, name: str, tag: str, meshes: Meshes, 
         clause = f"left out: its <{element.tag}> has no size"
         notes.append(Note(NoteKind.SHAPE, (name,), clause, "give it one, or take it out", "warning"))
         return None
-    if not all(sizes) and not (kind == "capsule" and sizes[0]):  # a capsule without length is a ball
+    if not all(sizes) and not (kind == "capsule" and sizes[0]):  # a capsule without length is a sphere
         clause = f"a size of 0 of its <{element.tag}> is taken as {THINNEST:g} m"
         notes.append(Note(NoteKind.SHAPE, (name,), clause, "give it one", "warning"))
         sizes = [max(size, THINNEST) for size in sizes]
@@ -193,7 +193,7 @@ _PRIMITIVES: dict[str, tuple[Callable[[ET.Element, str], list[float]], Callable[
     "capsule": (_radius_and_length, coal.Capsule),
     "ellipsoid": (_radii, coal.Ellipsoid),
 }
-"""Element: its sizes [m], and what makes the geometry of them. The length of a capsule is that between its balls."""
+"""Element: its sizes [m], and the constructor of the geometry. A capsule's length is that between its caps' centres."""
 
 
 def _make_mesh(element: ET.Element, where: str, name: str, meshes: Meshes, notes: list[Note]) -> Made | None:

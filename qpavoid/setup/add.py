@@ -66,7 +66,7 @@ class DescribeOptions:
     root: Root = "fixed"
     """How the root link is attached to the world."""
     lock: Sequence[str] = ()
-    """Joints (with `*` and `?`) held at the home pose for good."""
+    """Joints (with `*` and `?`) locked at the home pose."""
     home: Mapping[str, float] = field(default_factory=dict)
     """Joint: position of a home pose to prefer [rad or m]."""
     package_dirs: Sequence[str | Path] = ()
@@ -105,7 +105,7 @@ class Description:
     """Pairs: all, adjacent, srdf, always, drawn in, never, active."""
     near: float
     """Distance that counts as never coming near [m]."""
-    measure_unchecked: Sequence[UncheckedLinks]
+    unchecked: Sequence[UncheckedLinks]
     """Links that are not checked against each other."""
     home: Home
     """The home pose."""
@@ -200,7 +200,7 @@ def _describe(urdf: Path, options: DescribeOptions, progress: Callable[[str], No
         links=links,
         counts={"all": pair_count, **counts, "active": pair_count - sum(counts.values())},
         near=sampled.near,
-        measure_unchecked=links_unchecked,
+        unchecked=links_unchecked,
         home=home,
         notes=tuple(dict.fromkeys(merge_notes([*robot.notes, *notes]))),
     )

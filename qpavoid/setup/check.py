@@ -40,7 +40,7 @@ from qpavoid.setup.shapes import Piece, pieces_of
 _MAX_STEPS, _MAX_SECONDS = 300, 5.0
 """Timed for the median, as far as they take no longer than so many seconds."""
 _SLOW_STEP = 1000.0
-"""Median tick from which it is worth a word [µs]."""
+"""Median control step from which a warning is given: the whole period of a 1 kHz loop [µs]."""
 _MAX_SPEED = {"revolute": 50.0, "continuous": 50.0, "prismatic": 10.0}
 """Speed limits [rad/s, m/s] above which one is hardly meant."""
 _MAX_RANGE = {"revolute": 8.0 * math.pi, "prismatic": 20.0}

@@ -218,7 +218,7 @@ def _document(description: Description, outcome: dict[Path, str], seconds: float
         "geometry_volume": sum(link.inside for link in links),
         "pairs": dict(description.counts),
         "pair_margins": [own.model_dump() for own in description.config.pair_margins],
-        "left_out": [asdict(entry) for entry in description.measure_unchecked],
+        "left_out": [asdict(entry) for entry in description.unchecked],
         "samples": description.options.samples,
         "seed": description.options.seed,
         "srdf": None if description.honoured is None else str(description.honoured),

@@ -1,4 +1,4 @@
-"""Poses of a robot's joints: those that an SRDF names, and those at which joints are held."""
+"""Poses of a robot's joints: those that an SRDF names, and those at which joints are locked."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def joint_locks(
     Those that the user names, wheels, and joints that could not follow another one.
 
     A joint that mimics another one follows it without a coordinate of its own, and the other one stays free. Where
-    Pinocchio cannot read the two so, they would move on their own, which they cannot, and both are held.
+    Pinocchio cannot read the two so, they would move on their own, which they cannot, and both are locked.
     """
     names = list(model.names)[1:]
     lock_names = []
@@ -99,7 +99,7 @@ def joint_locks(
     values = {}
     for name in [*lock_names, *coupled]:
         if model.joints[model.getJointId(name)].shortname() == MIMIC:
-            continue  # it is held with the one that it follows
+            continue  # it is locked with the one that it follows
         if name not in start:
             raise ConfigError(f"--lock: joint {name!r} is not described by one number and cannot be held; leave it out")
         leader, multiplier, offset = followers.get(name, (name, 1.0, 0.0))

@@ -32,7 +32,7 @@ _FIRST = 500
 _SETTLE = 250
 """Samples after which it is decided again which ones these are."""
 _DOUBT = 0.1
-"""Share of samples by which a pair's contact may differ from `ALWAYS_TOUCHING` and still come to reach it [-]."""
+"""Share of samples by which a pair's contact may differ from `ALWAYS_TOUCHING` and still come to attain it [-]."""
 _STEPS = 60
 """Of a descent."""
 _UNBOUNDED = np.pi
@@ -187,8 +187,9 @@ class PairSamples:
 def sample_pairs(robot: Robot, samples: int = SAMPLES, seed: int = SEED) -> PairSamples:
     """Find which of a robot's pairs always touch and which never come near.
 
-    Random configurations first; each pair that stayed apart in all of them is then led downhill from where it came
-    closest, so that "never" does not rest on luck alone. It is still no proof: samples are finite, descents local.
+    Random configurations first; each pair that stayed apart in all of them then descends along its gradient from where
+    it came closest, so that "never" does not depend on the samples alone. It is still no proof: samples are finite,
+    descents local.
 
     Args:
         robot: with its pairs.
@@ -226,10 +227,10 @@ def sample_pairs(robot: Robot, samples: int = SAMPLES, seed: int = SEED) -> Pair
 
 def pairs_always_near(robot: Robot, samples: int, seed: int = SEED) -> IntArray:
     """Find the pairs of bodies (k, 2) within `ALWAYS_NEAR` of each other in every sample."""
-    distances, fat = PairDistances(robot), ALWAYS_NEAR * robot_size(robot)
+    distances, limit = PairDistances(robot), ALWAYS_NEAR * robot_size(robot)
     near = np.ones(len(distances.pairs), dtype=bool)
     for q in Space(robot).draw(np.random.default_rng(seed), samples if near.any() else 0):
-        near &= distances.all(q) < fat
+        near &= distances.all(q) < limit
         distances.deactivate(np.flatnonzero(~near))
     return distances.pairs[near]
 

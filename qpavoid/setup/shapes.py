@@ -83,8 +83,8 @@ def kinds_of_links(pieces: Sequence[Piece], kind: Bodies, by_pattern: Mapping[st
 def bodies_of_link(pieces: Sequence[Piece], link: str, kind: Bodies) -> LinkBodies:
     """Fit bodies that enclose all pieces of a link.
 
-    One capsule around all pieces takes the place of several shapes where it takes no more room than they do, or, in
-    `auto`, where it is not gross.
+    One capsule around all pieces takes the place of several shapes where it has no more volume than they have, or, in
+    `auto`, where it is not too large.
     """
     pieces = [piece for piece in pieces if piece.link == link]
     fits = [fit_piece(piece.geometry, kind, piece.inside) for piece in pieces]
