@@ -350,7 +350,8 @@ def test_margins_are_those_of_the_near_pairs():
     x = rows_at(np.full(2, 0.2), beta=False)
     y = make_layout(7, pairs=4, obstacles=2, **{
         **{name: np.concatenate((getattr(x, name),) * 2) for name in ("closest", "feedforward", "J")},
-        "near_pairs": np.array([1, 3, -1, -1]), "twist_row": np.array([0, 1, 0, 2]), "margin": np.array([9.0, 0.05, 0.0]),
+        "near_pairs": np.array([1, 3, -1, -1]), "twist_row": np.array([0, 1, 0, 2]),
+        "margin": np.array([9.0, 0.05, 0.0]),
         "lower": x.lower, "upper": x.upper, "v_stop": x.v_stop, "beta": False,
     })  # fmt: skip
     run("row_bounds", y, 2, True)

@@ -19,7 +19,7 @@ _LOW_EFFORT = 1.0
 
 
 class Qp:
-    """min ‖A (v - v0)‖² + λ ‖v - v0‖²  s.t. J v >= b,  lower <= v <= upper.
+    """min ‖A (v - v0)‖² + λ ‖v - v0‖²  s.t.  J v >= b,  lower <= v <= upper.
 
     v0 = J⁺ẋ is the tracking law's velocity, so the answer is the safe velocity closest to it, and v0 itself whenever
     that is safe. As A v0 = b wherever the task can be met, the first term is the tracking cost ‖A v - b‖²;
