@@ -42,7 +42,7 @@ class ReasonKind(str, Enum):
     AT_UPPER_LIMIT = "AT_UPPER_LIMIT"
     """The same of its upper position limit."""
     AT_VELOCITY_LIMIT = "AT_VELOCITY_LIMIT"
-    """A joint moves at its velocity limit where a row wants more: the joint, its velocity [rad/s or m/s]."""
+    """A joint moves at its velocity limit where a row demands more: the joint, its velocity [rad/s or m/s]."""
     STALLED = "STALLED"
     """The tasks make no progress: the pair that blocks them, the violation of its row by their velocity [m/s]; no pair
     where several rows block them together."""

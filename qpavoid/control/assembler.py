@@ -51,7 +51,7 @@ class _StopAhead:
         self._way = np.zeros((_MOST_TICKS, len(layout.v_prev)))
 
     def way(self, q: Array, v: Array, w: Array) -> Array:
-        """See `kernels.stop_way`; a view of memory that the next call overwrites."""
+        """See `kernels.roll_out_stop`; a view of memory that the next call overwrites."""
         self._way[0] = v
         return self._way[: kernels.roll_out_stop(self._packed, q, w, self._way)]
 

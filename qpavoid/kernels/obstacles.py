@@ -181,7 +181,7 @@ def check_states(
     Returns:
         (k,) FINE, NORMALISED, or the code of the first fault; (k,) largest entry of |RᵀR - I|.
     """
-    codes, off, gram, new = np.zeros(len(numbers), np.intp), np.zeros(len(numbers)), np.empty((3, 3)), np.empty(9)
+    codes, deviation, gram, new = np.zeros(len(numbers), np.intp), np.zeros(len(numbers)), np.empty((3, 3)), np.empty(9)
     for k in range(len(numbers)):
         x, count = states[numbers[k]], 18 if kind[k] == SAMPLE else 12
         total, far, fast = 0.0, 0.0, 0.0
@@ -200,13 +200,13 @@ def check_states(
         _gram(x, gram)
         for r in range(3):
             for c in range(3):
-                off[k] = max(off[k], abs(gram[r, c] - (1.0 if r == c else 0.0)))
+                deviation[k] = max(deviation[k], abs(gram[r, c] - (1.0 if r == c else 0.0)))
         normal = x[1] * x[5] - x[2] * x[4], x[2] * x[3] - x[0] * x[5], x[0] * x[4] - x[1] * x[3]
         if normal[0] * x[6] + normal[1] * x[7] + normal[2] * x[8] < 0.0:
             codes[k] = LEFT_HANDED
-        elif not off[k] <= NEARLY:
+        elif not deviation[k] <= NEARLY:
             codes[k] = NO_ROTATION
-        elif off[k] > EXACT:
+        elif deviation[k] > EXACT:
             codes[k] = NORMALISED
             for _ in range(4):
                 _gram(x, gram)
@@ -216,7 +216,7 @@ def check_states(
                         for i in range(3):
                             new[3 * c + r] -= 0.5 * x[3 * i + r] * gram[i, c]
                 x[:9] = new
-    return codes, off
+    return codes, deviation
 
 
 @compiled

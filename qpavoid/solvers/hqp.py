@@ -29,7 +29,7 @@ _MIN_SINGULAR_VALUE = 1e-12
 class Hqp(Qp):
     """Hierarchical QP: for each priority p in turn, among the optima of all before it,
 
-        min ‖A_p v - b_p‖² + λ ‖v - v̂‖²  s.t. J v >= b,  lower <= v <= upper.
+        min ‖A_p v - b_p‖² + λ ‖v - v̂‖²  s.t.  J v >= b,  lower <= v <= upper.
 
     v̂ is the same cascade without the inequalities, v̂ += Z (A_p Z)⁺ (b_p - A_p v̂) with a basis Z of the null space of
     the levels before (Siciliano and Slotine 1991), each inverse damped as J⁺ is: the answer wherever it is safe. In the

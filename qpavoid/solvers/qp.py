@@ -19,11 +19,11 @@ _LOW_EFFORT = 1.0
 
 
 class Qp:
-    """min ‖A (v - v0)‖² + λ ‖v - v0‖²  s.t. J v >= b,  lower <= v <= upper.
+    """min ‖A (v - v_t)‖² + λ ‖v - v_t‖²  s.t.  J v >= b,  lower <= v <= upper.
 
-    v0 = J⁺ẋ is the tracking law's velocity, so the answer is the safe velocity closest to it, and v0 itself whenever
-    that is safe. As A v0 = b wherever the task can be met, the first term is the tracking cost ‖A v - b‖²;
-    measuring λ from v0 rather than from 0 leaves tracking free of bias.
+    v_t = J⁺ẋ is `v_tracking`, so the answer is the safe velocity closest to it, and v_t itself whenever that is safe.
+    As A v_t = b wherever the task can be met, the first term is the tracking cost ‖A v - b‖²; that λ counts from v_t,
+    not from 0, leaves tracking without bias.
 
     Where no velocity meets all constraints, margins are relaxed, then acceleration limits, then contact of pairs, as
     little as possible and the deepest pair least (`solvers.relaxation`): in compiled code with `native`, by daqp with

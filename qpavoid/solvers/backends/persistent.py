@@ -121,7 +121,7 @@ class ProxqpWorkspace:
 class OsqpWorkspace:
     """Operator splitting (Stellato et al. 2020) with polishing, which makes it exact.
 
-    Bounds are the first rows of [I; G].     An additional variable is at its bound by its cost: where no row at all is
+    Bounds are the first rows of [I; G]. An additional variable is at its bound by its cost: where no row at all is
     active, polishing prints a line to the output of the process, at any settings (osqp 1.1, osqp/osqp#785).
     """
 
