@@ -15,7 +15,7 @@ from qpavoid.arena.entrants import ENTRANTS
 from qpavoid.config import Avoidance, GradientProjectionSolver, PotentialFieldSolver, Sphere
 from qpavoid.config.shipped import scenario_names
 from qpavoid.problem import AvoidanceRows, Tracking, make_problem
-from qpavoid.run import simulate
+from qpavoid.run.simulate import simulate
 from qpavoid.solvers.analytic import tracking_velocity
 from qpavoid.solvers.potential import repulsion
 from qpavoid.solvers.projection import clearance_slope, room
