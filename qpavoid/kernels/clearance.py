@@ -66,14 +66,14 @@ def clearance_lower_bound(x: Any, v: Array, k: int, influence_distance: float, h
 def _clearance_along_normal(x: Any, v: Array, i: int, horizon: float, curvature: float) -> float:
     """Bound the clearance of near pair i from below until `horizon`, along its normal.
 
-        The clearance is the distance minus the safety distance. Two convex bodies are at least as far apart as along any
+    The clearance is the distance minus the safety distance. Two convex bodies are at least as far apart as along any
     direction: as far along it as the nearest points of the two. In the direction of the normal n, these move with the
     witness points, and with the rotation of the bodies: a point r of a body that turns at ω approaches by (r - p)·(n ×
     ω) faster than the witness point p. Of the box around the body, the corner where that is largest counts, which |n ×
     ω| along its edges gives. The path of a point of an obstacle that turns deviates from a line by no more than ½ ω h²
     times the speed of its fastest point. A stop within jerk limits may lead backwards, so both signs of the closing
     speed count; an obstacle need not move as long as the robot does, so that it recedes does not count.
-    
+
     Args:
         x: reads the results of the step, and omega of the joints.
         v: velocity (n,) [rad/s or m/s].
