@@ -11,8 +11,8 @@ from time import perf_counter
 import numpy as np
 
 from qpavoid import Controller, ScenarioConfig, Workers, load_scenario, simulate_many, steps
-from qpavoid.run import simulate
 from qpavoid.run.machine import cpu
+from qpavoid.run.simulate import simulate
 
 RESULTS = Path(__file__).parent / "results" / "batch.md"
 SCENARIOS = ("situation1", "panda_line")

@@ -1,6 +1,6 @@
 """Run a shipped scenario with two solvers and print what came out."""
 
-from qpavoid.run import simulate
+from qpavoid.run.simulate import simulate
 
 for solver in ("eq10", "qp"):
     log = simulate("situation1", solver=solver)

@@ -15,7 +15,7 @@ from qpavoid.arena.trial import run_trial
 from qpavoid.arena.twin import build
 from qpavoid.arena.world import build_world
 from qpavoid.errors import ConfigError, UnknownName
-from qpavoid.run import simulate
+from qpavoid.run.simulate import simulate
 
 DT = 0.01
 

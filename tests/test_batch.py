@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from qpavoid import ConfigError, Controller, NumericalError, SolverNotInstalled, UnknownName, load_scenario
-from qpavoid.run import simulate
 from qpavoid.run.batch import BatchError, WorkerDied, Workers, simulate_many, steps
 from qpavoid.run.log import STATUSES
+from qpavoid.run.simulate import simulate
 
 DIE = "__import__('os')._exit(3)"
 

@@ -6,7 +6,7 @@ from closed_loop import cartesian, drive, make_controller
 
 from qpavoid import Avoidance, Obstacle, ReasonKind, Sample, Severity
 from qpavoid.config import Box, Capsule, Detour, Progress, Sphere
-from qpavoid.run import simulate
+from qpavoid.run.simulate import simulate
 
 D1, GOAL = 0.03, np.array([0.6, 0.0, 0.0])
 SHAPES = {

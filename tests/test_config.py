@@ -14,7 +14,7 @@ from qpavoid.config import Block, RobotConfig, ScenarioConfig
 from qpavoid.config.loading import read_config
 from qpavoid.config.shipped import data_folder, robot_names, scenario_names
 from qpavoid.errors import nearest
-from qpavoid.run import simulate
+from qpavoid.run.simulate import simulate
 from qpavoid.solvers import SOLVERS, parse_solver
 
 BLOCKS = [b for b in vars(config).values() if isinstance(b, type) and issubclass(b, Block) and b is not Block]

@@ -18,7 +18,7 @@ from qpavoid import (
 )
 from qpavoid.control.contacts import build_contacts, solve_contacts, tracking_within
 from qpavoid.problem import AvoidanceRows, Contacts, Problem, Solution, Status, Tracking, make_problem
-from qpavoid.run import simulate
+from qpavoid.run.simulate import simulate
 from qpavoid.solvers import backend_names, make_solver
 from qpavoid.solvers.backends import solve_daqp
 

@@ -8,7 +8,7 @@ from conftest import moved
 
 from qpavoid import Avoidance, Controller, Obstacle, ReasonKind, Sample, Severity, Status
 from qpavoid.config import Box, Damper, Sphere
-from qpavoid.run import simulate
+from qpavoid.run.simulate import simulate
 from qpavoid.safety.braking import TOLERANCE
 
 PLATE = {"type": "box", "size": [0.004, 0.6, 0.6]}

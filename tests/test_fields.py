@@ -15,7 +15,7 @@ from qpavoid.arena.entrants import ENTRANTS
 from qpavoid.config import Avoidance, GradientProjectionSolver, PotentialFieldSolver, Sphere
 from qpavoid.config.shipped import scenario_names
 from qpavoid.problem import AvoidanceRows, Tracking, make_problem
-from qpavoid.run import simulate
+from qpavoid.run.simulate import simulate
 from qpavoid.solvers.analytic import tracking_velocity
 from qpavoid.solvers.potential import repulsion
 from qpavoid.solvers.projection import clearance_slope, step_fraction
@@ -243,7 +243,7 @@ def test_a_target_that_is_nan_ends_in_a_stop_that_says_so(name):
     solution = controller.step(q, targets={"panda_hand_tcp": lost})
     (reason,) = solution.reasons
     assert solution.status is Status.STOPPED
-    assert (reason.kind, reason.subject) == (ReasonKind.IMPLAUSIBLE, ("target panda_hand_tcp",))
+    assert (reason.kind, reason.subject) == (ReasonKind.IMPLAUSIBLE, ("target", "panda_hand_tcp",))
     assert not solution.v.any()
 
 

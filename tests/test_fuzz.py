@@ -26,7 +26,7 @@ from qpavoid.config import Csv, RobotConfig
 from qpavoid.config.loading import read_config
 from qpavoid.config.shipped import data_folder
 from qpavoid.model.trajectory import build_motion
-from qpavoid.run import simulate
+from qpavoid.run.simulate import simulate
 
 if not hasattr(signal, "SIGALRM"):
     pytest.skip("a hang can only be stopped with SIGALRM", allow_module_level=True)

@@ -9,7 +9,7 @@ from conftest import SPHERE, obstacle
 from qpavoid import Controller, ReasonKind, Sample, Severity, build_scene, build_tasks, config, load_scenario
 from qpavoid.config import HqpSolver
 from qpavoid.problem import AvoidanceRows, Status, Tracking, make_problem
-from qpavoid.run import simulate
+from qpavoid.run.simulate import simulate
 from qpavoid.solvers import backend_names, make_solver, parse_solver
 from qpavoid.solvers.backends import solve_daqp
 from qpavoid.solvers.hqp import Hqp

@@ -8,7 +8,7 @@ from closed_loop import Ruler, cartesian, changed, drive, make_controller, scena
 
 from qpavoid import Avoidance, ConfigError, Controller, Limits, Obstacle, Reason, ReasonKind, Robot, Sample, Status
 from qpavoid.config import Box, Damper, Sphere
-from qpavoid.run import simulate
+from qpavoid.run.simulate import simulate
 from qpavoid.solvers.reasons import relaxation_reasons
 from qpavoid.solvers.relaxation import Relaxed
 

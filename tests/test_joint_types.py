@@ -9,7 +9,7 @@ from conftest import EXAMPLES, SPHERE, Bench, differences, look, obstacle, rando
 from qpavoid import ConfigError, Controller, Log, Robot, Sample, build_scene, build_tasks, config, load_scenario
 from qpavoid.model.kinematics import chains, max_lever_arm
 from qpavoid.model.notes import RobotWarning
-from qpavoid.run import simulate
+from qpavoid.run.simulate import simulate
 
 
 def body(name, frame):

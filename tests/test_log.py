@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from qpavoid import ConfigError, Controller, Log, ScenarioConfig, Severity, load_scenario
-from qpavoid.run import simulate
 from qpavoid.run.log import STATUSES
+from qpavoid.run.simulate import simulate
 from qpavoid.solvers.analytic import TrackingOnly
 
 ARRAYS = [f.name for f in fields(Log) if f.name != "meta"]

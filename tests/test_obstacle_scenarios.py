@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from qpavoid import ConfigError, Controller, Log, load_scenario
-from qpavoid.run import simulate
+from qpavoid.run.simulate import simulate
 from qpavoid.viz.motion import local_faces, motion_figure, shape_faces
 
 

@@ -10,8 +10,8 @@ from matplotlib.colors import to_hex
 from numpy.testing import assert_allclose
 
 from qpavoid import Log, Status, load_scenario
-from qpavoid.run import simulate
 from qpavoid.run.log import STATUSES
+from qpavoid.run.simulate import simulate
 
 pytest.importorskip("matplotlib")
 

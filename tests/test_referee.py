@@ -11,7 +11,7 @@ import pytest
 from conftest import BOX, CAPSULE, CYLINDER, SPHERE, obstacle, random_q, random_scene, write_chain
 
 from qpavoid import Limits, Robot, ScenarioConfig, build_scene, load_scenario
-from qpavoid.run import simulate
+from qpavoid.run.simulate import simulate
 
 pytest.importorskip("mujoco")
 pytest.importorskip("bench", reason="bench/ is in the repository only")

@@ -16,7 +16,7 @@ from qpavoid.config import RobotConfig
 from qpavoid.config.loading import read_config
 from qpavoid.config.shipped import data_folder, find_robot
 from qpavoid.model.packages import find_mesh
-from qpavoid.run import simulate
+from qpavoid.run.simulate import simulate
 from qpavoid.setup.add import Wishes, describe
 from qpavoid.setup.check import check_robot
 from qpavoid.setup.sampling import touching

@@ -27,7 +27,7 @@ from qpavoid.config import Cone, Ellipsoid, HalfSpace, Mesh
 from qpavoid.control import distances as proximity_module
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.geometry.bodies import MeshWarning, enclosing_capsule, make_shape
-from qpavoid.run import simulate
+from qpavoid.run.simulate import simulate
 
 CONE = Cone(radius=0.09, length=0.25)
 ELLIPSOID = Ellipsoid(radii=(0.1, 0.16, 0.07))

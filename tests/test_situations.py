@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from qpavoid import Log, load_scenario
-from qpavoid.run import simulate
+from qpavoid.run.simulate import simulate
 
 OFFSET = 0.10
 """Radii of the two bodies [m]: axis distance minus surface distance in both situations."""

@@ -10,7 +10,7 @@ from closed_loop import accelerations, cartesian, changed, drive, make_controlle
 
 from qpavoid import Avoidance, Obstacle, Robot, Sample, load_scenario
 from qpavoid.config import Box, Capsule, Damper, Sphere
-from qpavoid.run import simulate
+from qpavoid.run.simulate import simulate
 
 ROWS = {
     "beta": Avoidance(d1=0.02, d2=0.1),

@@ -7,7 +7,7 @@ from conftest import write_chain
 from numpy.testing import assert_allclose
 
 from qpavoid import Log, Robot, load_scenario
-from qpavoid.run import simulate
+from qpavoid.run.simulate import simulate
 
 OBLIQUE = np.array([0.6, 0.0, 0.8])
 JOINTS = [

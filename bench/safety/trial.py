@@ -14,8 +14,8 @@ from bench.safety.verdict import Verdict, judge, last_way_out
 from qpavoid import Log, ScenarioConfig, Status
 from qpavoid.arena.referee import Findings
 from qpavoid.arena.twin import Twin, load
-from qpavoid.run import simulate
 from qpavoid.run.log import STATUSES
+from qpavoid.run.simulate import simulate
 
 ALONE = "-alone"
 """What the name of a solver ends with that keeps no way out at hand."""
