@@ -22,10 +22,10 @@ last = np.zeros((1, 18))
 last[0, :9] = np.eye(3).ravel()
 new = last.copy()
 new[0, :9] = np.array([[np.cos(0.1), -np.sin(0.1), 0.0], [np.sin(0.1), np.cos(0.1), 0.0], [0.0, 0.0, 1.0]]).T.ravel()
-which, posed = np.zeros(1, dtype=np.intp), np.ones(1, dtype=bool)
-kernels.take_in(which, posed, new, np.zeros(1, dtype=np.intp), last, np.zeros((1, 18)), 0.5)
+numbers, kind, times = np.zeros(1, dtype=np.intp), np.ones(1, dtype=np.intp), np.array([0.5])
+kernels.update_measured_states(numbers, kind, times, new, np.zeros(1), last, np.zeros((1, 18)), 1e-9, 1e3)
 print(new[0, 17])
-print(sum(kernels.take_in.stats.cache_hits.values()))
+print(sum(kernels.update_measured_states.stats.cache_hits.values()))
 kernels.first_use.end()
 """
 """Prints the speed of a turn, which `rotation_vector` of another file finds, and whether the code was on disk."""
@@ -33,8 +33,8 @@ ALONE = """
 import numpy as np
 from qpavoid import kernels
 
-print(kernels.in_one_alone({a}, np.arange(3, 8)).sum())
-print(sum(kernels.in_one_alone.stats.cache_hits.values()))
+print(kernels.sorted_setxor({a}, np.arange(3, 8)).sum())
+print(sum(kernels.sorted_setxor.stats.cache_hits.values()))
 kernels.first_use.end()
 """
 SHORT = ALONE.format(a="np.arange(5)")
@@ -119,7 +119,7 @@ def test_an_unwritable_cache_is_named_and_optional(installed, tmp_path):
 
 def test_damaged_code_is_not_run(installed, tmp_path):
     run(installed, tmp_path)
-    (path,) = tmp_path.glob("kernels-*/culling.in_one_alone-*.code")
+    (path,) = tmp_path.glob("kernels-*/broadphase.sorted_setxor-*.code")
     content = path.read_bytes()
     for damaged in (b"", content[: len(content) // 2], content[:5000] + b"\0" * 8 + content[5008:]):
         path.write_bytes(damaged)
@@ -131,7 +131,7 @@ def test_concurrent_processes_do_not_mix_their_code(installed, tmp_path):
     """Each compiles the same function for other types first; afterwards the code of all of them is there."""
     script = """
 import numpy as np
-from qpavoid.kernels import in_one_alone as alone
+from qpavoid.kernels import sorted_setxor as alone
 a, b = np.arange(5), np.arange(3, 8)
 calls = [(a, b), (a[::2], b), (a, b[::2]), (a[::2], b[::2])]
 for i in range(4):

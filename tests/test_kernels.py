@@ -564,7 +564,7 @@ def test_is_tracking_clear_by_the_clearance_bound_until_its_stop(fields):
         q = np.random.default_rng(seed).uniform(-1.0, 1.0, 8)
         expected = run("clearance_lower_bound", x, x.v_tracking, 30, 0.5, x.dt * ticks) > -2e-4
         expected &= not (x.acceleration_limited and run("leaves_position_limits", x, q, x.v_tracking, x.dt * ticks))
-        assert run("tracking_clear", x, q, 30, 0.5) == expected
+        assert run("is_tracking_clear", x, q, 30, 0.5) == expected
         clear += expected
     assert 0 < clear < 40
 
