@@ -14,7 +14,7 @@ from qpavoid.config import Task
 from qpavoid.model.notes import NoteKind
 from qpavoid.setup.add import DescribeOptions, describe
 from qpavoid.setup.check import check_robot
-from qpavoid.setup.home import MIN_CONDITIONING, HOME_CLEARANCE
+from qpavoid.setup.home import HOME_CLEARANCE, MIN_CONDITIONING
 from qpavoid.setup.sampling import D1, touching
 from qpavoid.setup.texts import description_files
 from qpavoid.setup.written import write_files
