@@ -459,8 +459,8 @@ def test_mimic_drivers_stay_free(panda_described):
 
 def test_home_and_locks_may_be_wished():
     urdf = EXAMPLES / "ur_description/urdf/ur5_robot.urdf"
-    wishes = DescribeOptions(home={"elbow_joint": 1.57, "wrist_3_joint": 0.5}, lock=["wrist_3*"], samples=10)
-    config = describe(urdf, wishes).config
+    options = DescribeOptions(home={"elbow_joint": 1.57, "wrist_3_joint": 0.5}, lock=["wrist_3*"], samples=10)
+    config = describe(urdf, options).config
     assert config.home["elbow_joint"] == 1.57 and config.lock == {"wrist_3_joint": 0.5}
     with pytest.raises(UnknownName, match=r"--home: no joint 'elbow'; did you mean 'elbow_joint'"):
         describe(urdf, DescribeOptions(home={"elbow": 1.0}))

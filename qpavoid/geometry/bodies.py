@@ -192,9 +192,9 @@ def _unpack_fit(path: Path) -> CapsuleFit:
 _AROUND_SPHERE = 1.04 * np.concatenate((half_sphere(100), -half_sphere(100)))
 """Points whose hull encloses the unit sphere (200, 3)."""
 _ENDLESS = 1e6
-"""Half the size of a box around what has no end [m]."""
+"""Half the size of the box that stands for a half-space: larger than any scene [m]."""
 _THINNEST = 1e-4
-"""Side of the box that stands for a flat mesh, across its plane [m]."""
+"""Side of the box that stands for a flat mesh, across its plane: thin beside any safety distance [m]."""
 
 
 def hull_points(geometry: Any) -> Array:

@@ -9,7 +9,7 @@ import numpy as np
 from qpavoid.problem import Array
 
 _MANY, _PROMISING = 200, 12
-"""Points from which axes are sorted out first, and axes that are left then."""
+"""Number of points from which axes are preselected on extreme points, and number of axes selected."""
 _WIDER = (1.0, 1.02, 1.05, 1.1, 1.2, 1.4)
 """Radii that are tried, in units of the smallest one that encloses the projected points."""
 

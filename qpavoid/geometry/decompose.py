@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull, QhullError
 from qpavoid.problem import Array, IntArray
 
 _CUTS = 8
-"""Slabs along each axis, at most."""
+"""Slabs along each axis, at most: their third power bounds the cells that are merged."""
 _CLOSE = 1e-3
 """Share of a part's extent below which coordinates count as the same."""
 _THIN = 1e-9

@@ -23,7 +23,7 @@ _BLOCK = 4
 _MAX_DISTANCE = 1e2
 """Largest distance of a point from the cloud's origin [m]; no depth camera measures farther, and others are dropped."""
 _LARGEST, _MOST_POINTS = 200_000_000, 5_000_000
-"""Of a file [bytes], and points of it."""
+"""Size of a file [bytes] and number of its points, at most: what a scenario reads within seconds."""
 
 
 class Points(NamedTuple):

@@ -17,7 +17,7 @@ from qpavoid.problem import Array
 
 CSV_HEADERS = ("t,x,y,z", "t,x,y,z,qx,qy,qz,qw")
 _LARGEST_CSV, _MOST_ROWS = 20_000_000, 100_000
-"""Of a CSV file [bytes], and rows; each becomes a piece of some kilobytes."""
+"""Size of a CSV file [bytes] and number of its rows, at most; each row becomes a piece of some kilobytes."""
 
 
 def read_poses(path: Path, initial: Array) -> tuple[list[float], list[Array], list[Array]]:

@@ -17,7 +17,7 @@ _DIGITS = 4, 5
 _FINGERS = re.compile(
     r"hand|finger|thumb|grip|jaw|knuckle|(?:^|[^a-z])(?:index|middle|ring|little|pinky)(?:[^a-z]|$)", re.IGNORECASE
 )
-"""What fingers' joints are called, of which some hands have only one, and others chains longer than those of a leg."""
+"""Names of fingers' joints: some hands have only one joint, and others chains longer than those of a leg."""
 _TOOL_WORDS = ("tcp", "tool", "end_effector", "ee", "grasp", "gripper", "palm", "hand", "sole", "foot", "tip")
 """Parts of a frame's name that make it the tool among those that move together, the best first."""
 _LINKS = (pin.BODY, pin.OP_FRAME)

@@ -20,7 +20,7 @@ TRANSLATIONS = {
     "JointModelTranslation": 3,
     "JointModelFreeFlyer": 3,
 }
-"""How many velocity coordinates of a joint are lengths; they come before its angles."""
+"""Joint type: number of its velocity coordinates that are lengths; they precede its angles."""
 MIMIC = "JointModelMimic"
 """A joint that another joint's coordinate moves, at a constant ratio; it has none of its own."""
 

@@ -232,7 +232,7 @@ class Robot:
 
 
 _MAX_BODIES = 300
-"""Time and memory grow with the square: 45 000 pairs of 300 bodies take ten seconds. Humanoids have 112."""
+"""Bodies of a robot, at most: the 45 000 pairs of 300 bodies take ten seconds to load. Humanoids have 112."""
 
 
 def _fields_of_urdf(path: Path) -> dict[str, Any]:

@@ -22,9 +22,9 @@ from qpavoid.problem import Array, IntArray
 _LARGEST = 100_000_000
 """Size of a file [bytes]: the reader takes it into memory as a whole before it looks at it."""
 _MOST_TRIANGLES = 200_000
-"""Of a mesh that is decomposed: its time grows with them; these take some seconds."""
+"""Triangles of a mesh that is decomposed, at most: these take some seconds."""
 _THINNEST = 1e-4
-"""Thickness that is given to what is flat [m]: a hull needs an inside."""
+"""Thickness of the hull of flat points [m]: a hull needs an inside."""
 
 
 def make_solids(shape: ObstacleShape, folder: Path, where: str) -> list[Any]:

@@ -26,7 +26,7 @@ from qpavoid.model.csv_poses import read_poses
 from qpavoid.problem import Array, require_finite
 
 END_TOLERANCE = 1e-9
-"""How early a piece ends [s]: k·dt may fall a rounding error short of the time it stands for."""
+"""Time before its end at which a piece ends [s]: k·dt may be a rounding error less than the time it stands for."""
 
 
 class Sample(NamedTuple):

@@ -15,7 +15,7 @@ _LARGEST = 10_000_000
 _DEEPEST = 50
 """Levels of nesting; humanoids take 7."""
 _MOST_ATTRIBUTES = 100
-"""Of one element; humanoids take 12."""
+"""Attributes of one element, at most; humanoids take 12."""
 
 
 def read_robot_xml(path: Path, kind: str) -> ET.Element:

@@ -38,15 +38,15 @@ from qpavoid.setup.sampling import D1, Space, touching
 from qpavoid.setup.shapes import Piece, pieces_of
 
 _MAX_STEPS, _MAX_SECONDS = 300, 5.0
-"""Timed for the median, as far as they take no longer than so many seconds."""
+"""Control steps that are timed for the median, and the time after which timing ends [s]."""
 _SLOW_STEP = 1000.0
 """Median control step from which a warning is given: the whole period of a 1 kHz loop [µs]."""
 _MAX_SPEED = {"revolute": 50.0, "continuous": 50.0, "prismatic": 10.0}
-"""Speed limits [rad/s, m/s] above which one is hardly meant."""
+"""Speed limits above which one is probably an error [rad/s, m/s]."""
 _MAX_RANGE = {"revolute": 8.0 * math.pi, "prismatic": 20.0}
-"""Ranges [rad, m] above which one is hardly meant."""
+"""Ranges above which one is probably an error [rad, m]."""
 _MIN_RANGE = 1e-3
-"""Range [rad, m] below which a joint is better locked."""
+"""Range below which a joint is better locked [rad, m]."""
 
 
 def check_robot(
@@ -272,7 +272,7 @@ def _check_built_robot(report: Report, robot: Robot, pieces: Sequence[Piece], pr
         report.notes.append(Note(NoteKind.JOINT, (), clause, "`root_joint: free_flyer`, or --root"))
     progress("timing a control step")
     try:
-        report.tick_us = tick_time(robot, report.end_effectors)
+        report.tick_us = step_time(robot, report.end_effectors)
     except QpavoidError as error:
         clause = f"a controller cannot be made: {error}"
         report.notes.append(Note(NoteKind.FILE, (), clause, "mend what it names", "error"))
@@ -307,7 +307,7 @@ def _check_home(report: Report, robot: Robot) -> None:
         report.notes.append(Note(NoteKind.HOME, tuple(singular), clause, remedy))
 
 
-def tick_time(robot: Robot, frames: Sequence[str]) -> float:
+def step_time(robot: Robot, frames: Sequence[str]) -> float:
     """Time a control step near the home pose; the median [µs].
 
     Its tasks keep all end effectors where they are at home.

@@ -264,4 +264,4 @@ class Progress:
 
 
 _PATIENCE = 2.0
-"""Time between two lines [s]."""
+"""Least time between two lines of progress [s]."""

@@ -19,11 +19,11 @@ HOME_CLEARANCE = 4.0 / 3.0
 MIN_CONDITIONING = 0.5
 """Conditioning of a limb at home, in units of what it typically has, below which it counts as singular [-]."""
 _DRAWS = 200
-"""Configurations that tell what is typical, and tries at mending one fault."""
+"""Random configurations for the typical conditioning, and trials to repair one fault."""
 _MAX_TRIES = 3000
-"""Tries in all."""
+"""Trials of all repairs together: some seconds."""
 _DIGITS = 2
-"""After the point, of positions that were drawn [rad or m]."""
+"""Decimals of positions that were drawn [rad or m]."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ class _PoseCriteria:
 
 
 _CONTACT_FAULT = 10.0
-"""Fault of a collision beside that of a pair that is merely near, or of a bend [-]."""
+"""Additional fault of a pair in collision: larger than all faults of pairs that are merely near [-]."""
 
 
 def find_home(

@@ -22,7 +22,7 @@ from qpavoid.problem import Array
 from qpavoid.setup.srdf import Semantics
 
 _DIGITS = 5
-"""After the point, of positions in files [rad or m]."""
+"""Decimals of positions in files [rad or m]."""
 
 
 def home_candidates(robot: Robot, semantics: Semantics) -> list[Array]:

@@ -20,7 +20,7 @@ from qpavoid.setup.shapes import Piece
 
 Reason = Literal["adjacent", "srdf", "always", "drawn in", "never"]
 _POSES = 200
-"""Configurations in which the geometry of links that are not checked is looked at."""
+"""Random configurations in which contacts of the geometry of unchecked links are counted."""
 
 
 @dataclass(frozen=True)

@@ -28,13 +28,13 @@ ALWAYS_NEAR = 0.03
 D1 = Avoidance().d1
 """Safety distance of the pairs that have none of their own [m]."""
 _FIRST = 500
-"""Samples in which all pairs are computed; afterwards only those that may be at one end of the scale."""
+"""Samples in which all pairs are computed; later ones only compute pairs that may always or never touch."""
 _SETTLE = 250
-"""Samples after which it is decided again which ones these are."""
+"""Samples between two selections of these pairs."""
 _DOUBT = 0.1
 """Share of samples by which a pair's contact may differ from `ALWAYS_TOUCHING` and still come to attain it [-]."""
 _STEPS = 60
-"""Of a descent."""
+"""Steps of a descent, at most."""
 _UNBOUNDED = np.pi
 """Half the range of coordinates without limits: continuous joints, and a root, whose pose does not matter here."""
 

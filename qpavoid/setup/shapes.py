@@ -131,7 +131,7 @@ def capsule_fields(fit: CapsuleFit, placement: Any) -> dict[str, Any]:
 
 
 _DIGITS = 5
-"""After the point, of lengths [m] and angles [rad] in files."""
+"""Decimals of lengths [m] and angles [rad] in files: 0.01 mm."""
 
 
 def _exact_fields(piece: Piece) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from qpavoid.setup.sampling import BoolArray, PairSamples
 _LEAST = 0.1
 """Share of the samples in which such a pair touches, at the least: what touches more seldom meets an end stop [-]."""
 _ERRORS = 0.01
-"""Share of the samples in which the extension may fail to tell whether the pair touches [-]."""
+"""Share of the samples in which the extension may fail to predict whether the pair touches [-]."""
 _STRAIGHT = 1e-6
 """Departure of a path from a straight line, as a share of its length, that is rounding [-]."""
 

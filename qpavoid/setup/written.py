@@ -14,7 +14,7 @@ from qpavoid.errors import ConfigError
 
 _DIGITS = 16
 BLANK = "sha256 " + _DIGITS * "0"
-"""What a file must hold once, where its digest goes."""
+"""Placeholder of the digest, which a file holds once."""
 _SEAL = re.compile(rb"sha256 [0-9a-f]{%d}" % _DIGITS)
 
 
