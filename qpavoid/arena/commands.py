@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from qpavoid.arena.suite import Suite
     from qpavoid.arena.sweep import Tally
 
-app = typer.Typer(no_args_is_help=True, help="Compare laws on families of scenarios: the arena.")
+app = typer.Typer(no_args_is_help=True, help="Compare solvers on families of scenarios: the arena.")
 
 _PACKAGES = ("distributed", "pyarrow", "mujoco", "jinja2", "matplotlib")
 
@@ -83,7 +83,7 @@ def smoke(
     jobs: Jobs = None,
     json: Json = False,
 ) -> None:
-    """Run a few cases of everything, and say what is broken: exit status 1 if anything is."""
+    """Run a few cases of everything, and list faults: exit status 1 if there are any."""
     from qpavoid.arena.plan import cases_of, runs_of
     from qpavoid.arena.suite import load_suite
     from qpavoid.arena.summary import find_faults
