@@ -243,7 +243,13 @@ def test_a_target_that_is_nan_ends_in_a_stop_that_says_so(name):
     solution = controller.step(q, targets={"panda_hand_tcp": lost})
     (reason,) = solution.reasons
     assert solution.status is Status.STOPPED
-    assert (reason.kind, reason.subject) == (ReasonKind.IMPLAUSIBLE, ("target", "panda_hand_tcp"))
+    assert (reason.kind, reason.subject) == (
+        ReasonKind.IMPLAUSIBLE,
+        (
+            "target",
+            "panda_hand_tcp",
+        ),
+    )
     assert not solution.v.any()
 
 
