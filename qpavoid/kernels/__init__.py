@@ -11,6 +11,14 @@ from qpavoid.kernels.clearance import (
     leaves_position_limits,
     tracking_clear,
 )
+from qpavoid.kernels.estimates import (
+    are_fine,
+    count_faults,
+    extrapolate_estimates,
+    extrapolate_states,
+    update_estimates,
+    write_states,
+)
 from qpavoid.kernels.layout import RowLayout
 from qpavoid.kernels.obstacles import (
     Pieces,
@@ -36,15 +44,19 @@ __all__ = [
     "Pieces",
     "Placed",
     "RowLayout",
+    "are_fine",
     "assemble",
     "backup_rows",
     "candidates",
     "check_states",
     "clearance_lower_bound",
     "closes_below",
+    "count_faults",
     "damped_solution",
     "distance_rows",
     "easing_stop",
+    "extrapolate_estimates",
+    "extrapolate_states",
     "farthest",
     "first_use",
     "frame_rows",
@@ -68,8 +80,10 @@ __all__ = [
     "stop_way",
     "tracking_clear",
     "tracking_violation",
+    "update_estimates",
     "update_measured_states",
     "velocity_bounds",
     "violation",
     "within_reach",
+    "write_states",
 ]

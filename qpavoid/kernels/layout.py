@@ -32,7 +32,7 @@ class RowLayout(NamedTuple):
     frame_ids: IntArray
     """(f,) the tracked ones."""
     targets: Array
-    """(f, 18) position, rotation by rows, linear and angular velocity of each target [m, -, m/s, rad/s]."""
+    """(f, 18) state of each target, see `kernels.obstacles`."""
     turns: IntArray
     """(t,) which frames have an orientation to follow."""
     gain: Array

@@ -40,7 +40,7 @@ def frame_rows(x: Any) -> None:
         row_wrenches[r + 1, 3], row_wrenches[r + 1, 5] = -pz, px
         row_wrenches[r + 2, 3], row_wrenches[r + 2, 4] = py, -px
         for i in range(3):
-            b[r + i] = targets[f, 12 + i] + x.gain[f] * (targets[f, i] - poses[f, 9 + i])
+            b[r + i] = targets[f, 12 + i] + x.gain[f] * (targets[f, 9 + i] - poses[f, 9 + i])
     missing = np.empty((3, 3))
     for n in range(len(x.turns)):
         f = x.turns[n]
@@ -48,7 +48,7 @@ def frame_rows(x: Any) -> None:
             for j in range(3):
                 missing[i, j] = 0.0
                 for c in range(3):
-                    missing[i, j] += targets[f, 3 + 3 * i + c] * poses[f, 3 * c + j]
+                    missing[i, j] += targets[f, 3 * c + i] * poses[f, 3 * c + j]
         errors = _rotation_vector(missing)
         for i in range(3):
             b[3 * (moving + n) + i] = targets[f, 15 + i] + x.gain[f] * errors[i]

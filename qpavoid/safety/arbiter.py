@@ -11,7 +11,7 @@ import numpy as np
 from qpavoid.config import Avoidance, Limits, Progress
 from qpavoid.control.assembler import Assembly
 from qpavoid.control.distances import DistanceQuery
-from qpavoid.control.obstacles import Obstacles
+from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.control.tasks.frames import FrameTask
 from qpavoid.errors import NumericalError
 from qpavoid.kernels import TOLERANCE
@@ -41,7 +41,7 @@ class Arbiter:
         solver: Solver,
         assembly: Assembly,
         query: DistanceQuery,
-        obstacles: Obstacles,
+        obstacles: ObstacleTracker,
         bounds: JointBounds,
         frames: list[FrameTask],
         avoidance: Avoidance,

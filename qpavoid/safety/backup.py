@@ -23,7 +23,7 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid import kernels
-from qpavoid.control.obstacles import Obstacles
+from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.model.limits import JointBounds
 from qpavoid.model.scene import Scene
 from qpavoid.problem import Array, IntArray, Proximity
@@ -76,7 +76,9 @@ class _Apart(NamedTuple):
 class BackupPlanner:
     """Tries flights, and decides which is commanded."""
 
-    def __init__(self, flights: Flights, scene: Scene, bounds: JointBounds, obstacles: Obstacles, dt: float) -> None:
+    def __init__(
+        self, flights: Flights, scene: Scene, bounds: JointBounds, obstacles: ObstacleTracker, dt: float
+    ) -> None:
         """Begins with no flight kept.
 
         Args:
@@ -184,7 +186,7 @@ class BackupPlanner:
 
     def _paths(self, first: int) -> _Paths:
         """The ways of all that moves from a multiple of `_SPAN` until the horizon."""
-        if first != self._ways.first or self._obstacles.told is not None:
+        if first != self._ways.first or self._obstacles.estimates is not None:
             count = int(np.ceil(self._settings.horizon / _SPAN)) + 2
             places, rates = self._obstacles.paths(_SPAN * np.arange(first, first + count, dtype=np.float64))
             moves = np.flatnonzero(rates.any(axis=1) | (places != places[0]).any(axis=(0, 2)))

@@ -18,7 +18,7 @@ from qpavoid import kernels
 from qpavoid.config import Avoidance, Backup, Limits
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.estimates import prediction_error_bound
-from qpavoid.control.obstacles import Obstacles, Seen
+from qpavoid.control.obstacles import ObstacleStates, ObstacleTracker
 from qpavoid.control.row_layout import hand_over, lay_out
 from qpavoid.model.kinematics import ForwardKinematics, max_lever_arm, support_masks
 from qpavoid.model.limits import JointBounds
@@ -46,7 +46,7 @@ class Flights:
         self,
         scene: Scene,
         bounds: JointBounds,
-        obstacles: Obstacles,
+        obstacles: ObstacleTracker,
         avoidance: Avoidance,
         limits: Limits,
         dt: float,
@@ -87,7 +87,7 @@ class Flights:
         """What a flight is worth that need not be any better."""
         self.still = BackupPolicy(0.0, np.zeros(model.nv))
         """Standing still."""
-        self._foreseen: dict[float, Seen] = {}
+        self._foreseen: dict[float, ObstacleStates] = {}
         self._compile(scene.robot.home)
 
     def _compile(self, q: Array) -> None:
@@ -101,7 +101,7 @@ class Flights:
 
     def go_on_to(self, t: float) -> None:
         """Forgets what was foreseen and is over at t [s]; all of it, where obstacles are told of."""
-        if self._obstacles.told is not None:
+        if self._obstacles.estimates is not None:
             self._foreseen.clear()
         elif len(self._foreseen) > _MANY:
             self._foreseen = {at: seen for at, seen in self._foreseen.items() if at > t}
@@ -119,7 +119,7 @@ class Flights:
     def _which_part(self) -> Mask:
         return np.asarray(np.any(self._layout.support != 0.0, axis=1))
 
-    def predicted(self, t: float) -> Seen:
+    def predicted(self, t: float) -> ObstacleStates:
         """The obstacles that move, as far as is known, at t [s]."""
         t = round(t, 9)  # the same time may be come to in several ways
         if t not in self._foreseen:
@@ -158,7 +158,7 @@ class Flights:
             most = max(most, float(np.abs(off).sum(axis=1).max(initial=0.0)))
         span = self.settings.horizon + _BEYOND
         off_too = (late * fastest if late > _ROUND_OFF else 0.0) + prediction_error_bound(
-            self._obstacles.told, flight.told, span, self.query.placing.reach
+            self._obstacles.estimates, flight.told, span, self.query.placing.reach
         )
         return bool(flight.least - self.lever_arm * most - off_too >= self.enough.distance)
 
@@ -215,7 +215,7 @@ class Flights:
             w = steps[-1] - (steps[-2] if count > 1 else v)
             q, v = ahead, steps[-1]
         return Flight(
-            start, np.concatenate(plan), manner, value, min(tally.until, t), tally.least, self._obstacles.told
+            start, np.concatenate(plan), manner, value, min(tally.until, t), tally.least, self._obstacles.estimates
         )
 
     def decision_before(self, start: Start, k: int) -> int:
