@@ -190,6 +190,7 @@ class Controller:
         self._assembly.clearance_lower_bound(v, 0, self._reach, self.dt)
         self._assembly.leaves_position_limits(q, v, self.dt)
         self._obstacles.warm_up()
+        kernels.projection_cost(np.zeros((0, len(v))), 1.0, v)
         self._commander.solver = law
         self.reset()
 

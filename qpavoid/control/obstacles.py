@@ -99,15 +99,13 @@ class ObstacleTracker:
 
     def warm_up(self) -> None:
         """Run the kernels once on nothing, so that no step waits for the compiler."""
-        nothing = {"which": NO_UPDATE.which, "kind": NO_UPDATE.kind, "stamps": NO_UPDATE.stamps}
-        states = self._measured.updates
-        kernels.check_states(states, nothing["which"], nothing["kind"], FARTHEST, FASTEST)
-        kernels.write_states(states, nothing["which"], np.zeros((0, 3)), np.zeros((0, 3, 3)), *np.zeros((2, 0, 3)))
-        kernels.count_faults(
-            states, nothing["which"], nothing["kind"], FARTHEST, FASTEST, nothing["kind"], nothing["stamps"]
-        )
-        self._measured.update(**nothing, states=self._current.states)
-        self._measured.extrapolate(nothing["which"], 0.0, 0.0, 0.0, self._current.states, self._current.margin)
+        none, no_stamps, no_vectors = NO_UPDATE.which, NO_UPDATE.stamps, np.zeros((0, 3))
+        states, now = self._measured.updates, self._current
+        kernels.check_states(states, none, none, FARTHEST, FASTEST)
+        kernels.write_states(states, none, no_vectors, np.zeros((0, 3, 3)), no_vectors, no_vectors)
+        kernels.count_faults(states, none, none, FARTHEST, FASTEST, none, no_stamps)
+        self._measured.update(none, none, no_stamps, now.states)
+        self._measured.extrapolate(none, 0.0, 0.0, 0.0, now.states, now.margin)
         extrapolate(states[:0], 0.0)
 
     @property

@@ -9,6 +9,7 @@ import numpy as np
 
 from qpavoid import kernels
 from qpavoid.control.inputs import FARTHEST, FASTEST, FAULTS
+from qpavoid.control.poses import is_sample_of_arrays
 from qpavoid.control.tasks.frames import AnyTask
 from qpavoid.control.trajectories import STATE, as_samples, put
 from qpavoid.errors import ConfigError, NumericalError, UnknownName, nearest
@@ -36,12 +37,16 @@ class TargetReader:
             raise ConfigError(f"tasks: two have the same name among {', '.join(self._tasks)}; give one a `name`")
         self._names, self._list = list(self._tasks), list(tasks)
         self._frames, self._others = frames, np.zeros((len(tasks) - len(frames), STATE))
+        self._motions: list[Any] = [task.motion for task in tasks]
         self._views = [*as_samples(self._frames), *as_samples(self._others)]
+        self._frame_views = self._views[: len(frames)]
+        self._named_views = [*zip(self._names, self._frame_views, strict=False)]
         every = np.arange(max(len(frames), len(self._others)))
         self._every, self._kind = every, np.full(len(every), SAMPLE)
         self._codes, self._off = np.zeros(len(every), dtype=np.intp), np.zeros(len(every))
         self.read(0.0, None)
         self._check(self._frames, self._every[: len(frames)])
+        kernels.are_fine(self._frames, FARTHEST, FASTEST)
 
     def read(
         self, t: float, targets: Mapping[str, Any] | None
@@ -60,10 +65,12 @@ class TargetReader:
             raise NumericalError(f"targets: give a mapping of names to targets, not {targets!r:.60}")
         count = len(self._frames)
         if not targets:
-            samples = [task.motion.sample(t) for task in self._list]
-            for row in range(count):
-                put(self._views[row], samples[row])
+            samples = [motion.sample(t) for motion in self._motions]
+            for view, sample in zip(self._frame_views, samples):  # noqa: B905 (strict costs as much as the copying)
+                view[0][:], view[1][:], view[2][:], view[3][:] = sample[:4]
             return samples, (), ()
+        if len(targets) == count == len(self._list) and self._write(targets):
+            return [targets[name] for name in self._names], (), ()
         samples, given, other, faults = [], list[int](), list[int](), list[Reason]()
         known = 0
         for row, (name, task) in enumerate(self._tasks.items()):
@@ -97,6 +104,15 @@ class TargetReader:
                 if self._check(states, which):
                     self._mend(t, samples, [first + row for row in rows], faults, normalised)
         return samples, tuple(faults), tuple(normalised)
+
+    def _write(self, targets: Mapping[str, Any]) -> bool:
+        """Write samples that are fine as they are, of all tasks, which are frames; False where there is any other."""
+        for name, view in self._named_views:
+            sample = targets.get(name)
+            if type(sample) is not Sample or not is_sample_of_arrays(sample):
+                return False
+            view[0][:], view[1][:], view[2][:], view[3][:] = sample[:4]
+        return bool(kernels.are_fine(self._frames, FARTHEST, FASTEST))
 
     def _check(self, states: Array, rows: Any) -> int:
         k = len(rows)

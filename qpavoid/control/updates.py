@@ -137,7 +137,7 @@ class UpdateReader:
             else:
                 cloud, sample = None, _checked(name, value)
             bare = isinstance(sample, Pose)
-            sample = Sample(*sample[:2], *_ZERO_TWIST, *sample[2:]) if bare else sample
+            sample = Sample(sample[0], sample[1], *_ZERO_TWIST, sample[2], sample[3]) if bare else sample
             if isinstance(value, Points) and cloud is None:
                 _flags([name], [sample])
                 wrong = self._wrong_stamp(index, _stamp(name, sample, t), t, shift)
@@ -185,7 +185,7 @@ class UpdateReader:
                         unusable.append(int(which[k]))
                 which, kind, stamps = which[~late], kind[~late], stamps[~late]
                 columns = [column[~late] if len(column) else column for column in columns]
-                kept = self._select([names[k] for k in np.flatnonzero(~late)], kept.type, which.tolist())
+                kept = self._select([names[k] for k in np.flatnonzero(~late).tolist()], kept.type, which.tolist())
         states = self._measured.updates
         kernels.write_states(states, which, *columns)
         if kernels.count_faults(states, which, kind, FARTHEST, FASTEST, kept.codes, kept.off):
@@ -277,10 +277,10 @@ def _columns(names: Sequence[str], samples: Sequence[Any]) -> tuple[list[Array],
     """
     *parts, times, rests = zip(*samples, strict=True)
     try:
-        columns = [np.array(part) for part in parts]
-        fits = all([column.dtype == np.float64 for column in columns])
-        k = len(samples)
-        fits = fits and columns[1].shape == (k, 3, 3) and all([c.shape == (k, 3) for c in columns[:1] + columns[2:]])
+        columns, k = [np.array(part) for part in parts], len(samples)
+        shapes = [column.shape for column in columns]
+        fits = shapes == [(k, 3), (k, 3, 3), (k, 3), (k, 3)][: len(columns)]
+        fits = fits and {column.dtype for column in columns} == {np.dtype(np.float64)}
     except (ValueError, TypeError, OverflowError):
         fits = False
     if not fits:

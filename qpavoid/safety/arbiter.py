@@ -203,7 +203,7 @@ def _well_formed(problem: Problem, solution: Solution) -> bool:
         isinstance(solution, Solution)
         and isinstance(solution.status, Status)
         and isinstance(solution.reasons, tuple)
-        and all(isinstance(reason, Reason) for reason in solution.reasons)
+        and (not solution.reasons or all(isinstance(reason, Reason) for reason in solution.reasons))
         and (slack is None or (getattr(slack, "shape", None) == (k,) and bool(np.isfinite(slack).all())))
     )
 
