@@ -13,25 +13,17 @@ import pinocchio as pin
 
 from qpavoid import kernels
 from qpavoid.config import Avoidance, Limits, Progress, ScenarioConfig, Sensing
+from qpavoid.control.arguments import ArgumentReader, Arguments
 from qpavoid.control.assembler import Assembly
 from qpavoid.control.attach import Attachments
 from qpavoid.control.contacts import ContactRows, build_contacts
 from qpavoid.control.distances import DistanceQuery
-from qpavoid.control.inputs import (
-    FARTHEST,
-    FASTEST,
-    FAULTS,
-    LARGEST_COMMAND,
-    Clock,
-    Configurations,
-    Times,
-    check_velocity,
-)
-from qpavoid.control.obstacles import Obstacles, Pose, Update
+from qpavoid.control.inputs import FASTEST, Clock, Configurations, check_velocity
+from qpavoid.control.obstacles import ObstacleTracker
+from qpavoid.control.poses import Pose
+from qpavoid.control.targets import TargetReader
 from qpavoid.control.tasks.frames import AnyTask, build_tasks, in_order
-from qpavoid.control.trajectories import STATE, as_samples, put
 from qpavoid.errors import ConfigError, NumericalError, UnknownName, located, nearest
-from qpavoid.kernels.obstacles import NORMALISED, SAMPLE
 from qpavoid.model.cloud import Points
 from qpavoid.model.kinematics import ForwardKinematics, Kinematics
 from qpavoid.model.limits import OUTSIDE
@@ -62,32 +54,16 @@ class Tick(NamedTuple):
     solution: Solution
 
 
-class _Inputs(NamedTuple):
-    """Arguments of a step, checked; nothing has been changed by them yet."""
+class _Built(NamedTuple):
+    """Problem of a step, and what it was built from."""
 
-    times: Times
-    q: Array | None
-    """(nq,); None where it cannot be true."""
-    v: Array | None
-    """(nv,) as measured; None where it is not given, or cannot be true."""
-    desired: Array | None
-    """(nv,) velocity to follow in place of the tasks; zero where it cannot be true."""
-    samples: tuple[Any, ...]
-    """Targets of all tasks."""
-    update: Update | None
-    faults: tuple[Reason, ...]
-    """Why the robot has to stop."""
-    notes: tuple[Reason, ...]
-
-
-class _Output(NamedTuple):
-    """What a step worked out."""
-
-    state: State
-    samples: tuple[Any, ...]
+    q: Array
+    t: float
+    targets: Sequence[Any]
     proximity: Proximity
     problem: Problem
-    solution: Solution
+    faults: tuple[Reason, ...]
+    assumptions: tuple[Reason, ...]
 
 
 _NO_BACKUP_WITH_CONTACTS = Reason.of(
@@ -148,11 +124,8 @@ class Controller:
         self._query = DistanceQuery(scene)
         self._q_shape, self._v_shape = (model.nq,), (model.nv,)
         self._clock = Clock(dt)
-        self._task_names = {task.settings.label: task for task in self.tasks}
         self._others = others
-        if len(self._task_names) < len(self.tasks):
-            raise ConfigError(f"tasks: two have the same name among {', '.join(self._task_names)}; give one a `name`")
-        self._obstacles = Obstacles(scene.obstacles, sensing or Sensing(), dt)
+        self._obstacles = ObstacleTracker(scene.obstacles, sensing or Sensing(), dt)
         self._reach = self.avoidance.d2 - self.avoidance.offset
         self._bounds = scene.robot.bounds().within(self.limits)
         names = scene.robot.coordinate_units
@@ -160,12 +133,14 @@ class Controller:
             model, self._bounds.q_index, self._bounds.lower, self._bounds.upper,
             [names[j] for j in self._bounds.v_index.tolist()],
         )  # fmt: skip
-        self._goals = np.zeros((len(self.tasks), STATE))
-        self._goal_views = as_samples(self._goals)
         self._q_last = scene.robot.home.copy()
         self._assembly = Assembly(
             scene, self.tasks, self._bounds, self._kinematics, self._query, self.avoidance,
             self.limits, tracking_damping, dt, contacts, law.bounded and self.avoidance.look_ahead,
+        )  # fmt: skip
+        self._arguments = ArgumentReader(
+            (self._q_shape, self._v_shape), self._clock, self._configurations,
+            TargetReader(self.tasks, self._assembly.targets), self._obstacles,
         )  # fmt: skip
         self._no_backup: tuple[Reason, ...] = ()
         if contacts is not None and self.avoidance.backup is not None:
@@ -215,6 +190,7 @@ class Controller:
         self._assembly.clearance_lower_bound(v, 0, self._reach, self.dt)
         self._assembly.leaves_position_limits(q, v, self.dt)
         self._obstacles.warm_up()
+        kernels.projection_cost(np.zeros((0, len(v))), 1.0, v)
         self._commander.solver = law
         self.reset()
 
@@ -300,7 +276,8 @@ class Controller:
             NumericalError: an argument of the wrong shape, or not made of numbers.
             UnknownName: of a target or obstacle.
         """
-        return self._compute(q, t, targets, obstacles, v)[-1]
+        begin = perf_counter()
+        return self._solve(self._build(self._arguments.read(q, t, targets, obstacles, v)), begin)
 
     def tick(
         self,
@@ -311,10 +288,14 @@ class Controller:
         v: Array | None = None,
     ) -> Tick:
         """Like `step`, with everything that led to the velocity."""
-        state, samples, proximity, problem, solution = self._compute(q, t, targets, obstacles, v)
+        begin = perf_counter()
+        built = self._build(self._arguments.read(q, t, targets, obstacles, v))
+        state = State(built.q.copy(), self._assembly.v_prev.copy(), built.t)
+        solution = self._solve(built, begin)
         kinematics = _copied(self._assembly.kinematics)
         errors = np.array([task.error for task in self._others])
-        return Tick(state, samples, errors, kinematics, _copied(proximity), _copied(problem), solution)
+        proximity, problem = _copied(built.proximity), _copied(built.problem)
+        return Tick(state, tuple(built.targets), errors, kinematics, proximity, problem, solution)
 
     def filter(
         self,
@@ -338,8 +319,10 @@ class Controller:
         Raises:
             NumericalError, UnknownName: as `step`.
         """
-        desired = as_vector("v_desired", v_desired, self._v_shape)
-        return self._compute(q, t, None, obstacles, v, desired)[-1]
+        begin = perf_counter()
+        v_desired = as_vector("v_desired", v_desired, self._v_shape)
+        built = self._build(self._arguments.read(q, t, None, obstacles, v, v_desired))
+        return self._solve(built, begin, from_tasks=False)
 
     def attach(self, obstacle: str, frame: str, q: Array | None = None) -> None:
         """From now on, a frame of the robot carries an obstacle, which stays where it is relative to the frame.
@@ -364,7 +347,7 @@ class Controller:
         index, frame_id = self._obstacles.index(obstacle), self.scene.robot.frame_id(frame, "attach")
         self._grasps.attach(index, frame_id, self._given_or_last(q))
         self._commander.invalidate()
-        self._obstacles.carry(index, True)
+        self._obstacles.attach(index, True)
         self._commander.braking.forget(index)
 
     def release(self, obstacle: str, q: Array | None = None) -> Sample:
@@ -387,7 +370,7 @@ class Controller:
         index = self._obstacles.index(obstacle)
         sample = self._grasps.release(index, self._given_or_last(q))
         self._commander.invalidate()
-        self._obstacles.carry(index, False)
+        self._obstacles.attach(index, False)
         return sample
 
     def allow_contact(self, obstacle: str, others: Sequence[str], allowed: bool = True) -> None:
@@ -438,139 +421,50 @@ class Controller:
         self._obstacles.reset()
         self._commander.reset()
 
-    def _compute(
-        self,
-        q: Array,
-        t: float | None,
-        targets: Mapping[str, Any] | None,
-        obstacles: Mapping[str, Sample | Pose | Points] | None,
-        v: Array | None,
-        desired: Array | None = None,
-    ) -> _Output:
-        begin = perf_counter()
-        inputs = self._read(q, t, targets, obstacles, v, desired)
-        q, desired, samples = self._take_over(inputs), inputs.desired, inputs.samples
-        observed = self._obstacles.advance(inputs.update)
-        faults, assumptions = inputs.faults, inputs.notes
+    def _build(self, arguments: Arguments) -> _Built:
+        """Take over the arguments of a step, and build its problem."""
+        times, q, v, v_desired, targets, update, faults, assumptions = arguments
+        if times.resumed:
+            self._assembly.restart(np.zeros(self._v_shape))
+            self._commander.reset()
+        if v is not None:
+            self._assembly.measured(v)
+        if q is None:  # where the robot is if it moved as commanded
+            q = np.asarray(pin.integrate(self.scene.robot.model, self._q_last, self.dt * self._assembly.v_prev))
+        self._q_last[:] = q
+        self._clock.set(times.t)
+        observed = self._obstacles.advance(update)
         if observed is not None:
             for index, voxels in observed.voxels.items():
                 for query in (self._query, *self._commander.queries):
                     query.fill(index, voxels)
-            self._query.placing.place(*observed.seen)
-            self._commander.braking.mark_updated(observed.seen.which)
+            self._query.placing.place(*observed.now)
+            self._commander.braking.mark_updated(observed.now.which)
             faults, assumptions = faults + observed.stop, assumptions + observed.assumptions
         self._kinematics.compute(q)
         self._query.compute(self._kinematics.data, self._reach)
         if self._query.disabled_pairs is not None:
             self._grasps.update()
-        proximity, problem = self._assembly.compute(q, samples, self._query, self._reach)
-        if desired is not None:
-            problem = self._assembly.follow(desired, problem)
-        state = State(q.copy(), self._assembly.v_prev.copy(), inputs.times.t)
-        built = perf_counter()
+        proximity, problem = self._assembly.compute(q, targets, self._query, self._reach)
+        if v_desired is not None:
+            problem = self._assembly.follow(v_desired, problem)
+        return _Built(q, times.t, targets, proximity, problem, faults, assumptions)
+
+    def _solve(self, built: _Built, begin: float, from_tasks: bool = True) -> Solution:
+        """Decide what is commanded; the step began at `begin` [s]."""
+        q, t, _, proximity, problem, faults, assumptions = built
+        middle = perf_counter()
         if faults:
             solution = self._commander.stop(problem, faults)
         else:
-            solution = self._commander.decide(q, inputs.times.t, problem, proximity, tasks=desired is None)
+            solution = self._commander.decide(q, t, problem, proximity, tasks=from_tasks)
         self._assembly.remember(solution.v)
         if self._no_backup and len(self._obstacles.moving):
             assumptions += self._no_backup
         if problem.position_margin < -OUTSIDE:
             assumptions += self._bounds.outside(q, problem.joint_names, problem.joint_units)
         solution = solution._replace(assumptions=assumptions) if assumptions else solution
-        solution = solution.with_times(built - begin, perf_counter() - built)
-        return _Output(state, samples, proximity, problem, solution)
-
-    def _read(
-        self,
-        q: Any,
-        t: Any,
-        targets: Mapping[str, Any] | None,
-        obstacles: Mapping[str, Sample | Pose | Points] | None,
-        v: Any,
-        desired: Array | None,
-    ) -> _Inputs:
-        """Check the arguments of a step: whatever raises does so here, before anything is changed."""
-        measured = as_vector("q", q, self._q_shape)
-        known = None if v is None else as_vector("v", v, self._v_shape)
-        times = self._clock.read(t)
-        configuration, faults, notes = self._configurations.read("q", measured)
-        if wrong := () if known is None else check_velocity("v", known, FASTEST):
-            known = None
-        slow = () if desired is None else check_velocity("v_desired", desired, LARGEST_COMMAND)
-        samples, missed, normalised = self._targets(times.t, targets)
-        update = self._obstacles.read(times.t, obstacles, times.shift)
-        return _Inputs(
-            times=times,
-            q=None if faults else configuration,
-            v=known,
-            desired=np.zeros(self._v_shape) if slow else desired,
-            samples=samples,
-            update=update,
-            faults=(*wrong, *faults, *times.faults, *slow, *missed),
-            notes=(*times.notes, *notes, *normalised),
-        )
-
-    def _take_over(self, inputs: _Inputs) -> Array:
-        """Begin a step with checked arguments; where the robot is (nq,)."""
-        if inputs.times.resumed:
-            self._assembly.restart(np.zeros(self._v_shape))
-            self._commander.reset()
-        if inputs.v is not None:
-            self._assembly.measured(inputs.v)
-        q = self._expected() if inputs.q is None else inputs.q
-        self._q_last[:] = q
-        self._clock.set(inputs.times.t)
-        return q
-
-    def _expected(self) -> Array:
-        """Where the robot is if it did what it was told last (nq,)."""
-        return np.asarray(pin.integrate(self.scene.robot.model, self._q_last, self.dt * self._assembly.v_prev))
-
-    def _targets(
-        self, t: float, given: Mapping[str, Any] | None
-    ) -> tuple[tuple[Any, ...], tuple[Reason, ...], tuple[Reason, ...]]:
-        """Targets of all tasks, what is wrong with those that are given, and what was normalised in them."""
-        if given is not None and not isinstance(given, Mapping):
-            raise NumericalError(f"targets: give a mapping of names to targets, not {given!r:.60}")
-        if not given:
-            return tuple([task.motion.sample(t) for task in self.tasks]), (), ()
-        samples, known, placed, faults = [], 0, list[int](), list[Reason]()
-        for row, (name, task) in enumerate(self._task_names.items()):
-            sample = None
-            if name in given:
-                known += 1
-                try:
-                    sample = task.as_target(given[name])
-                except NumericalError as error:
-                    raise NumericalError(f"target {name!r}: {error}") from None
-                if isinstance(sample, Sample):
-                    put(self._goal_views[row], sample)
-                    placed.append(row)
-                elif fault := task.fault(sample):
-                    faults.append(_implausible(name, fault))
-                    sample = None
-            samples.append(task.motion.sample(t) if sample is None else sample)
-        if known < len(given):
-            name = next(name for name in given if name not in self._task_names)
-            raise UnknownName(f"no target {name!r:.60}{nearest(str(name), self._task_names)}")
-        if not placed:
-            return tuple(samples), tuple(faults), ()
-        rows, normalised = np.array(placed), list[Reason]()
-        codes, off = kernels.check_states(self._goals, rows, np.full(len(rows), SAMPLE), FARTHEST, FASTEST)
-        for k in np.flatnonzero(codes).tolist() if codes.any() else ():
-            name, task = list(self._task_names.items())[placed[k]]
-            if codes[k] == NORMALISED:
-                samples[placed[k]] = samples[placed[k]]._replace(rotation=self._goal_views[placed[k]].rotation.copy())
-                normalised.append(Reason.of(ReasonKind.NORMALISED, "target", name, amount=float(off[k]), unit="-"))
-            else:
-                samples[placed[k]] = task.motion.sample(t)
-                faults.append(_implausible(name, FAULTS[int(codes[k])]))
-        return tuple(samples), tuple(faults), tuple(normalised)
-
-
-def _implausible(target: str, detail: str) -> Reason:
-    return Reason.of(ReasonKind.IMPLAUSIBLE, "target", target, detail=detail)
+        return solution.with_times(middle - begin, perf_counter() - middle)
 
 
 def _name(solver: Solver | str) -> str:

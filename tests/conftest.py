@@ -15,6 +15,7 @@ from qpavoid.config.shipped import example_robot_data
 from qpavoid.control.assembler import Assembly
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.tasks.frames import in_order
+from qpavoid.control.trajectories import as_samples, put
 from qpavoid.kernels.cache import FOLDER
 from qpavoid.kernels.layout import RowLayout
 from qpavoid.model.kinematics import ForwardKinematics
@@ -142,6 +143,8 @@ class Bench:
         self.kinematics.compute(q)
         self.query.compute(self.kinematics.data, reach)
         targets = targets or [task.motion.sample(0.0) for part in in_order(self.tasks) for task in part]
+        for view, target in zip(as_samples(self.assembly.targets), targets, strict=False):
+            put(view, target)
         return self.assembly.compute(np.asarray(q), targets, self.query, reach)
 
 

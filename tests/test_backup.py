@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from qpavoid import Controller, Obstacle, Pose, ReasonKind, Sample, ScenarioConfig, Status, kernels, load_scenario
 from qpavoid.config import Avoidance, Backup, Box, Limits, Line, Sensing, Sphere
 from qpavoid.control.estimates import prediction_error_bound
-from qpavoid.control.obstacles import Obstacles
+from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.control.trajectories import extrapolate
 from qpavoid.model.trajectory import build_motion
 from qpavoid.safety.policy import BackupPolicy, ContactAccumulator, Near, Start
@@ -584,7 +584,7 @@ def test_paths_agree_with_predicted_states():
     times, update = np.array([0.3, 0.4, 1.9]), {"b": Sample.at([0, 1, 0], linear=[0.1, 0, 0.2], angular=[0, 0, 3.0])}
     line = build_motion(Line(start=(0.0, 0.6, 0.0), end=(0.0, -2.0, 0.0), speed=0.5))
     still = Obstacle.at("still", Sphere(radius=0.1), [9.0, 0.0, 0.0])
-    obstacles = Obstacles(
+    obstacles = ObstacleTracker(
         [still, Obstacle("a", Sphere(radius=0.1), line, True), Obstacle.at("b", Sphere(radius=0.1), [0, 0, 0])],
         Sensing(),
         0.1,
@@ -597,7 +597,7 @@ def test_paths_agree_with_predicted_states():
             np.testing.assert_allclose(row, obstacles.predicted(t).states[obstacles.moving, 9:12], rtol=0, atol=1e-12)
         expected = [[0.5, 0.0], [np.sqrt(0.05), 3.0]][: len(rates)]
         np.testing.assert_allclose(rates, expected, rtol=0, atol=1e-12)
-    resting = Obstacles([still], Sensing(), 0.1)
+    resting = ObstacleTracker([still], Sensing(), 0.1)
     for twist, any_may_move in (([0, 0, 0], False), ([0, 0, 0.1], True)):
         resting.observe(0.0, {"still": Sample.at([9.0, 0.0, 0.0], linear=twist)})
         assert resting.any_may_move == any_may_move
@@ -606,7 +606,7 @@ def test_paths_agree_with_predicted_states():
 def test_prediction_uses_the_mean_twist():
     """Poses with a noise of 5 mm give twists with errors of 0.7 m/s, but predictions without."""
     dt, rng = 0.01, np.random.default_rng(0)
-    obstacles, off = Obstacles([Obstacle.at("ball", Sphere(radius=0.1), [0, 0, 0])], Sensing(), dt), []
+    obstacles, off = ObstacleTracker([Obstacle.at("ball", Sphere(radius=0.1), [0, 0, 0])], Sensing(), dt), []
     for k in range(200):
         t = k * dt
         at = np.array([0.2 * t, 0.0, 0.0])
@@ -641,7 +641,7 @@ def test_clock_jitter_costs_no_rollouts(tmp_path):
 def test_prediction_error_bound_covers_every_point(seed, size):
     rng, dt = np.random.default_rng(seed), 0.05
     names = ["a", "b"]
-    obstacles = Obstacles([Obstacle.at(name, Sphere(radius=0.1), [0, 0, 0]) for name in names], Sensing(), dt)
+    obstacles = ObstacleTracker([Obstacle.at(name, Sphere(radius=0.1), [0, 0, 0]) for name in names], Sensing(), dt)
 
     def sample(turn, *parts):
         return Sample(parts[0], pin.exp3(turn), *parts[1:])

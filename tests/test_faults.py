@@ -7,7 +7,7 @@ from closed_loop import Ruler, cartesian, drive, make_controller
 
 from qpavoid import Avoidance, NumericalError, Obstacle, ReasonKind, Sample, Severity, Status
 from qpavoid.config import Box, Damper, Sensing, Sphere
-from qpavoid.control.obstacles import Pose
+from qpavoid.control.poses import Pose
 
 NAN, INF = float("nan"), float("inf")
 TOOL = "panda_hand_tcp"

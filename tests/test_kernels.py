@@ -72,7 +72,7 @@ def random_layout(seed, frames=2, turns=(1,), pairs=9, nv=7, obstacles=3, joints
     results[:, 1:4] /= np.linalg.norm(results[:, 1:4], axis=1, keepdims=True)
     poses = poses_of(rotations(rng, frames + 2), rng.normal(size=(frames + 2, 3)), 14 if views else 12)
     targets = np.hstack(
-        (rng.normal(size=(frames, 3)), rotations(rng, frames).reshape(-1, 9), rng.normal(size=(frames, 6)))
+        (rotations(rng, frames).reshape(-1, 9), rng.normal(size=(frames, 3)), rng.normal(size=(frames, 6)))
     )
     limited = np.arange(nv) if plain else np.delete(np.arange(nv), [0, nv // 2][: nv - 1])
     q_lower = rng.uniform(-2.0, 0.0, len(limited))
@@ -600,11 +600,11 @@ def test_frame_rows_by_their_definition(count, turns):
     expected_A, expected_b = [], []
     for f, pose in enumerate(x.frame_poses[x.frame_ids]):
         expected_A += list(x.J_world[:3] + np.array([np.cross(twist[3:], pose[9:]) for twist in x.J_world.T]).T)
-        expected_b += [x.targets[f, 12:15] + x.gain[f] * (x.targets[f, :3] - pose[9:])]
+        expected_b += [x.targets[f, 12:15] + x.gain[f] * (x.targets[f, 9:12] - pose[9:])]
     for f in turns:
         R = x.frame_poses[x.frame_ids[f], :9].reshape(3, 3).T
         expected_A += list(x.J_world[3:])
-        expected_b += [x.targets[f, 15:] + x.gain[f] * pin.log3(x.targets[f, 3:12].reshape(3, 3) @ R.T)]
+        expected_b += [x.targets[f, 15:] + x.gain[f] * pin.log3(x.targets[f, :9].reshape(3, 3).T @ R.T)]
     expected_b = [b * min(1.0, cap / np.linalg.norm(b)) for b, cap in zip(expected_b, x.cap, strict=True)]
     packed = kernels.pack(x)
     for _ in range(2):  # what the first call leaves in `row_wrenches` does not show in the second
@@ -618,7 +618,7 @@ def test_frame_rows_at_the_edges_of_caps():
     """A command at rest stays at rest, one just at its cap is left alone, and NaN is not capped away."""
     for speed, expected in ((0.0, 0.0), (0.5, 0.5), (2.0, 0.5), (np.nan, np.nan)):
         targets = np.zeros((1, 18))
-        targets[0, 3:12] = np.eye(3).ravel()
+        targets[0, :9] = np.eye(3).ravel()
         targets[0, 12] = speed
         x = make_layout(7, frames=1, targets=targets, frame_poses=np.zeros((1, 12)), cap=np.array([0.5]))
         run("frame_rows", x)

@@ -87,7 +87,8 @@ class Assembly:
         self._stop, self._dt = _StopAhead(x) if x.jerk_limited else None, dt
         robot = scene.robot
         self._names = scene.pair_names, tuple(robot.coordinate_names), tuple(robot.coordinate_units)
-        self._targets = [(row[:3], row[3:12].reshape(3, 3), row[12:15], row[15:]) for row in self._layout.targets]
+        self.targets = self._layout.targets
+        """(f, 18) states that the frame tasks are to reach, see `trajectories`; to be written before `compute`."""
         self._views: dict[int, tuple[Proximity, AvoidanceRows]] = {}
         levels = task_levels(frames, self._others)
         self._tracking = Tracking(self._layout.A, self._layout.b, damping)
@@ -112,10 +113,8 @@ class Assembly:
             reach: surface distance below which a pair is near [m].
         """
         x = self._layout
-        for views, target in zip(self._targets, targets):  # noqa: B905 (strict costs as much as the copying)
-            views[0][:], views[1][:], views[2][:], views[3][:] = target[:4]
         if self._others:
-            for task, target in zip(self._others, targets[len(self._targets) :], strict=True):
+            for task, target in zip(self._others, targets[len(self.targets) :], strict=True):
                 task.update(q, self._forward, target)
         held = None
         if self._contacts is not None:
@@ -302,7 +301,7 @@ class Assembly:
 
     def goal(self, frame: int) -> tuple[Array, float]:
         """Where a task wants its frame (3,), world, and how far that is from where the frame is [m]."""
-        target = self._targets[frame][0]
+        target = self.targets[frame, 9:12]
         return target.copy(), float(np.linalg.norm(target - self.kinematics.position[frame]))
 
     def wanted_velocity(self, frame: int) -> Array:

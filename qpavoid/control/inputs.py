@@ -6,7 +6,7 @@ are wide of anything that a robot does, and narrow enough that no arithmetic of 
 
 from __future__ import annotations
 
-from math import hypot, inf, isfinite, ulp
+from math import floor, hypot, inf, isfinite, log2, ulp
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -61,6 +61,7 @@ class Clock:
     def __init__(self, dt: float) -> None:
         self._dt, self._now = dt, -inf
         self._gap = max(_GAP[0] * dt, _GAP[1])
+        self._fine = 2.0 ** (52 + floor(log2(_RESOLUTION * dt)))  # below it, the resolution of a time is fine enough
 
     def reset(self) -> None:
         """Let the next step be the first one."""
@@ -82,6 +83,8 @@ class Clock:
         expected = self._now + self._dt if self._now > -inf else 0.0
         if t is None:
             return Times(expected)
+        if type(t) is float and abs(t) < self._fine and (abs(t - expected) <= _OFF * self._dt or self._now == -inf):
+            return Times(t)
         t = as_time("t", t)
         if not ulp(t) <= _RESOLUTION * self._dt:  # neither for NaN and infinity
             rough = f"{t:g}: its resolution is coarser than {_RESOLUTION:g} control periods; is it in seconds?"

@@ -14,7 +14,6 @@ from math import inf
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from qpavoid import kernels
 from qpavoid.kernels import Pieces
@@ -36,19 +35,13 @@ def put(view: Sample, sample: Sample) -> None:
 
 
 def extrapolate(states: Array, t: float | Array) -> None:
-    """Brings bodies to where they are t seconds later if they keep their twists about their origins, in place [s].
+    """Bring bodies to where they are some time later at constant twists about their origins, in place.
 
     Args:
         states: (k, 18).
-        t: one for all, or (k,) [s].
+        t: that time, one for all or (k,) [s].
     """
-    t = np.broadcast_to(np.reshape(t, (-1, 1)), (len(states), 1))
-    states[:, 9:12] += t * states[:, 12:15]
-    turning = np.flatnonzero(states[:, 15:].any(axis=1))
-    if len(turning):
-        turns = Rotation.from_rotvec(t[turning] * states[turning, 15:]).as_matrix()
-        axes = states[turning, :9].reshape(-1, 3, 3)  # the columns of each rotation, as rows
-        states[turning, :9] = np.matmul(axes, turns.swapaxes(1, 2)).reshape(-1, 9)
+    kernels.extrapolate_states(states, np.full(len(states), t, dtype=np.float64))
 
 
 class TrajectoryBatch:

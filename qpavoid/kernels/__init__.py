@@ -13,6 +13,14 @@ from qpavoid.kernels.clearance import (
     joint_speeds,
     leaves_position_limits,
 )
+from qpavoid.kernels.estimates import (
+    are_fine,
+    count_faults,
+    extrapolate_estimates,
+    extrapolate_states,
+    update_estimates,
+    write_states,
+)
 from qpavoid.kernels.layout import RowLayout
 from qpavoid.kernels.obstacles import (
     ObstacleArrays,
@@ -36,14 +44,18 @@ __all__ = [
     "ObstacleArrays",
     "Pieces",
     "RowLayout",
+    "are_fine",
     "assemble",
     "backup_rows",
     "candidates",
     "check_states",
     "clearance_lower_bound",
     "closes_below",
+    "count_faults",
     "damped_solution",
     "distance_rows",
+    "extrapolate_estimates",
+    "extrapolate_states",
     "first_use",
     "frame_rows",
     "is_tracking_clear",
@@ -68,8 +80,10 @@ __all__ = [
     "speed_to_stop",
     "stop_velocity",
     "tracking_violation",
+    "update_estimates",
     "update_measured_states",
     "velocity_bounds",
     "violation",
     "voxels_within",
+    "write_states",
 ]

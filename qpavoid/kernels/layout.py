@@ -32,7 +32,7 @@ class RowLayout(NamedTuple):
     frame_ids: IntArray
     """(f,) the tracked ones among these."""
     targets: Array
-    """(f, 18) position, rotation by rows, linear and angular velocity of each target [m, -, m/s, rad/s]."""
+    """(f, 18) state of each target, see `kernels.obstacles`."""
     oriented: IntArray
     """(t,) numbers of the tracked frames that have an orientation to follow."""
     gain: Array

@@ -46,7 +46,7 @@ def frame_rows(x: Any) -> None:
         row_wrenches[r + 1, 3], row_wrenches[r + 1, 5] = -pz, px
         row_wrenches[r + 2, 3], row_wrenches[r + 2, 4] = py, -px
         for i in range(3):
-            b[r + i] = targets[f, 12 + i] + x.gain[f] * (targets[f, i] - poses[f, 9 + i])
+            b[r + i] = targets[f, 12 + i] + x.gain[f] * (targets[f, 9 + i] - poses[f, 9 + i])
     R_error = np.empty((3, 3))
     for n in range(len(x.oriented)):
         f = x.oriented[n]
@@ -54,7 +54,7 @@ def frame_rows(x: Any) -> None:
             for j in range(3):
                 R_error[i, j] = 0.0
                 for c in range(3):
-                    R_error[i, j] += targets[f, 3 + 3 * i + c] * poses[f, 3 * c + j]
+                    R_error[i, j] += targets[f, 3 * c + i] * poses[f, 3 * c + j]
         errors = _rotation_vector(R_error)
         for i in range(3):
             b[3 * (positioned + n) + i] = targets[f, 15 + i] + x.gain[f] * errors[i]

@@ -12,7 +12,7 @@ import numpy as np
 from qpavoid.config import Avoidance, Limits, Progress
 from qpavoid.control.assembler import Assembly
 from qpavoid.control.distances import DistanceQuery
-from qpavoid.control.obstacles import Obstacles
+from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.control.tasks.frames import FrameTask
 from qpavoid.errors import NumericalError
 from qpavoid.kernels import TOLERANCE
@@ -42,7 +42,7 @@ class Arbiter:
         solver: Solver,
         assembly: Assembly,
         query: DistanceQuery,
-        obstacles: Obstacles,
+        obstacles: ObstacleTracker,
         bounds: JointBounds,
         frames: list[FrameTask],
         avoidance: Avoidance,
@@ -216,7 +216,7 @@ def _well_formed(problem: Problem, solution: Solution) -> bool:
         isinstance(solution, Solution)
         and isinstance(solution.status, Status)
         and isinstance(solution.reasons, tuple)
-        and all(isinstance(reason, Reason) for reason in solution.reasons)
+        and (not solution.reasons or all(isinstance(reason, Reason) for reason in solution.reasons))
         and (slack is None or (getattr(slack, "shape", None) == (k,) and bool(np.isfinite(slack).all())))
     )
 

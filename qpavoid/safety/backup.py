@@ -23,7 +23,7 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid import kernels
-from qpavoid.control.obstacles import Obstacles
+from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.model.limits import JointBounds
 from qpavoid.model.scene import Scene
 from qpavoid.problem import Array, IntArray, Proximity
@@ -77,7 +77,7 @@ class BackupPlanner:
     """Decides between the velocity of the solver and the first one of a backup trajectory."""
 
     def __init__(
-        self, rollouts: BackupRollouts, scene: Scene, bounds: JointBounds, obstacles: Obstacles, dt: float
+        self, rollouts: BackupRollouts, scene: Scene, bounds: JointBounds, obstacles: ObstacleTracker, dt: float
     ) -> None:
         """Begin without a backup trajectory.
 
@@ -194,7 +194,7 @@ class BackupPlanner:
 
     def _sample_paths(self, first: int) -> _SampledPaths:
         """Sample the positions of moving obstacles from a multiple of `_SPHERE_PERIOD` until the horizon."""
-        if first != self._paths.first or self._obstacles.told is not None:
+        if first != self._paths.first or self._obstacles.estimates is not None:
             count = int(np.ceil(self._settings.horizon / _SPHERE_PERIOD)) + 2
             times = _SPHERE_PERIOD * np.arange(first, first + count, dtype=np.float64)
             positions, rates = self._obstacles.paths(times)

@@ -20,7 +20,7 @@ from qpavoid import kernels
 from qpavoid.config import Avoidance, Backup, Limits
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.estimates import prediction_error_bound
-from qpavoid.control.obstacles import Obstacles, Seen
+from qpavoid.control.obstacles import ObstacleStates, ObstacleTracker
 from qpavoid.control.row_layout import hand_over, lay_out
 from qpavoid.model.kinematics import ForwardKinematics, max_lever_arm, support_masks
 from qpavoid.model.limits import JointBounds
@@ -56,7 +56,7 @@ class BackupRollouts:
         self,
         scene: Scene,
         bounds: JointBounds,
-        obstacles: Obstacles,
+        obstacles: ObstacleTracker,
         avoidance: Avoidance,
         limits: Limits,
         dt: float,
@@ -99,7 +99,7 @@ class BackupRollouts:
         """Score from which on a backup trajectory need not be improved."""
         self.stop_policy = BackupPolicy(0.0, np.zeros(model.nv))
         """Braking to a standstill."""
-        self._predictions: dict[float, Seen] = {}
+        self._predictions: dict[float, ObstacleStates] = {}
         self._compile(scene.robot.home)
 
     def _compile(self, q: Array) -> None:
@@ -114,7 +114,7 @@ class BackupRollouts:
 
     def prune(self, t: float) -> None:
         """Drop predicted obstacle states before t [s]; all of them, if any obstacle is external."""
-        if self._obstacles.told is not None:
+        if self._obstacles.estimates is not None:
             self._predictions.clear()
         elif len(self._predictions) > _MAX_PREDICTIONS:
             self._predictions = {time: states for time, states in self._predictions.items() if time > t}
@@ -132,7 +132,7 @@ class BackupRollouts:
     def _find_separable_pairs(self) -> Mask:
         return np.asarray(np.any(self._layout.support != 0.0, axis=1))
 
-    def obstacles_at(self, t: float) -> Seen:
+    def obstacles_at(self, t: float) -> ObstacleStates:
         """Return the predicted states of the obstacles that move, at t [s]."""
         t = round(t, 9)  # sums of periods differ in their last digits
         if t not in self._predictions:
@@ -171,7 +171,7 @@ class BackupRollouts:
             max_offset = max(max_offset, float(np.abs(offset).sum(axis=1).max(initial=0.0)))
         span = self.settings.horizon + _BEYOND
         obstacle_offset = (delay * max_obstacle_speed if delay > _ROUND_OFF else 0.0) + prediction_error_bound(
-            self._obstacles.told, trajectory.estimates, span, self.query.placing.reach
+            self._obstacles.estimates, trajectory.estimates, span, self.query.placing.reach
         )
         clearance = trajectory.clearance - self.lever_arm * max_offset - obstacle_offset
         return bool(clearance >= self.sufficient_score.clearance)
@@ -235,7 +235,7 @@ class BackupRollouts:
             score,
             min(contacts.contact_time, t),
             contacts.clearance,
-            self._obstacles.told,
+            self._obstacles.estimates,
         )
 
     def decision_before(self, start: Start, k: int) -> int:

@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid import config
-from qpavoid.control.obstacles import as_goal
+from qpavoid.control.poses import as_goal
 from qpavoid.control.tasks.rows import Axis, Com, Constant, Damping, Manipulability, Posture, Relative, RowTask
 from qpavoid.errors import ConfigError, located
 from qpavoid.model.kinematics import support_masks

@@ -13,7 +13,7 @@ import pinocchio as pin
 
 from qpavoid import config
 from qpavoid.control.inputs import FARTHEST, Configurations
-from qpavoid.control.obstacles import as_goal
+from qpavoid.control.poses import as_goal
 from qpavoid.errors import NumericalError
 from qpavoid.kernels.rotation import rotation_vector
 from qpavoid.model.kinematics import ForwardKinematics, columns, support_masks

@@ -1,0 +1,77 @@
+"""Arguments of a control step, all checked before anything is changed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from qpavoid.control.inputs import FASTEST, LARGEST_COMMAND, Clock, Configurations, Times, check_velocity
+from qpavoid.control.obstacles import ObstacleTracker, StepUpdate
+from qpavoid.control.targets import TargetReader
+from qpavoid.problem import Array, as_vector
+from qpavoid.reason import Reason
+
+
+class Arguments(NamedTuple):
+    """Arguments of a step, checked; nothing has been changed by them yet."""
+
+    times: Times
+    q: Array | None
+    """(nq,); None where it cannot be true."""
+    v: Array | None
+    """(nv,) as measured; None where it is not given, or cannot be true."""
+    v_desired: Array | None
+    """(nv,) velocity to follow in place of the tasks; zero where it cannot be true."""
+    targets: Sequence[Any]
+    """Of all tasks."""
+    update: StepUpdate | None
+    faults: tuple[Reason, ...]
+    """Why the robot has to stop."""
+    notes: tuple[Reason, ...]
+
+
+class ArgumentReader:
+    """Checks the arguments of the steps of one controller."""
+
+    def __init__(
+        self,
+        shapes: tuple[tuple[int, ...], tuple[int, ...]],
+        clock: Clock,
+        configurations: Configurations,
+        targets: TargetReader,
+        obstacles: ObstacleTracker,
+    ) -> None:
+        """Take over who checks what; `shapes` are those of q and v."""
+        self._q_shape, self._v_shape = shapes
+        self._clock, self._configurations, self._targets, self._obstacles = clock, configurations, targets, obstacles
+
+    def read(
+        self, q: Any, t: Any, targets: Mapping[str, Any] | None, obstacles: Mapping[str, Any] | None, v: Any,
+        v_desired: Any = None,
+    ) -> Arguments:  # fmt: skip
+        """Check the arguments of a step, see `Controller.step`: whatever raises does so here."""
+        q = as_vector("q", q, self._q_shape)
+        times = self._clock.read(t)
+        q, faults, notes = self._configurations.read("q", q)
+        q = None if faults else q
+        if v is not None:
+            v = as_vector("v", v, self._v_shape)
+            if wrong := check_velocity("v", v, FASTEST):
+                v, faults = None, wrong + faults
+        faults += times.faults
+        if v_desired is not None and (wrong := check_velocity("v_desired", v_desired, LARGEST_COMMAND)):
+            v_desired, faults = np.zeros(self._v_shape), faults + wrong
+        samples, missing, normalised = self._targets.read(times.t, targets)
+        update = self._obstacles.read(times.t, obstacles, times.shift)
+        return Arguments(
+            times,
+            q,
+            v,
+            v_desired,
+            samples,
+            update,
+            faults + missing,
+            times.notes + notes + normalised,
+        )

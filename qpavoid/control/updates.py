@@ -1,0 +1,314 @@
+"""Updates of obstacles that a step is given, checked before anything is changed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from qpavoid import kernels
+from qpavoid.config import PointCloud
+from qpavoid.control.estimates import MeasuredStates
+from qpavoid.control.inputs import FARTHEST, FASTEST, FAULTS, as_time
+from qpavoid.control.poses import Pose, as_sample
+from qpavoid.control.trajectories import as_samples, extrapolate, put
+from qpavoid.errors import NumericalError, UnknownName, nearest
+from qpavoid.kernels.obstacles import FINE, NORMALISED, POSE, REST, SAMPLE
+from qpavoid.model.cloud import Points, Voxels
+from qpavoid.model.scene import Obstacle
+from qpavoid.model.trajectory import Sample
+from qpavoid.problem import Array, IntArray
+from qpavoid.reason import Reason, ReasonKind, Severity
+
+_FLAGS = {bool, np.bool_}
+_NO_TWISTS = np.zeros((0, 3))
+
+
+class Update(NamedTuple):
+    """Usable updates of a step, of k obstacles; none of them is taken over yet."""
+
+    which: IntArray
+    """(k,) numbers of the obstacles."""
+    kind: IntArray
+    """(k,) SAMPLE, POSE or REST."""
+    stamps: Array
+    """(k,) their time stamps [s]."""
+    voxels: dict[int, Voxels]
+    """Of point clouds that are updated, by number: what is in them now."""
+    unusable: tuple[int, ...]
+    """Numbers of those of which there is an update that cannot be used."""
+    notes: tuple[Reason, ...]
+    estimated: tuple[Reason, ...]
+    """Of bare poses: that their twists are estimated."""
+
+
+NO_UPDATE = Update(np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp), np.zeros(0), {}, (), (), ())
+
+
+class _Selection(NamedTuple):
+    """Arrays for updates of the same k obstacles, all samples or all bare poses."""
+
+    names: list[str]
+    type: type
+    which: IntArray
+    kind: IntArray
+    estimated: tuple[Reason, ...]
+    codes: IntArray
+    off: Array
+
+
+class _Batch(NamedTuple):
+    """Samples, or bare poses, of k obstacles, as a step is given them."""
+
+    names: Sequence[str]
+    samples: Sequence[Any]
+    which: IntArray
+    kind: IntArray
+
+
+class UpdateReader:
+    """Reads what a program gives of obstacles; keeps arrays for the obstacles that were given last."""
+
+    def __init__(self, obstacles: Sequence[Obstacle], measured: MeasuredStates, dt: float) -> None:
+        """Read updates into `measured.updates`; dt is the control period [s]."""
+        self._obstacles, self._measured, self._dt = obstacles, measured, dt
+        self._index = {obstacle.name: i for i, obstacle in enumerate(obstacles)}
+        self.attached: set[int] = set()
+        """Numbers of the obstacles that the robot carries, whose updates are ignored."""
+        self._estimated = [Reason.of(ReasonKind.ESTIMATED, obstacle.name) for obstacle in obstacles]
+        self._selection: _Selection | None = None
+
+    def index(self, name: str) -> int:
+        """Return the number of an obstacle.
+
+        Raises:
+            UnknownName: there is none of that name.
+        """
+        if not isinstance(name, str) or name not in self._index:
+            raise UnknownName(f"no obstacle {name!r:.60}{nearest(str(name), self._index)}")
+        return self._index[name]
+
+    def attach(self, index: int, attached: bool) -> None:
+        """Ignore updates of obstacle number `index`, or read them again."""
+        (self.attached.add if attached else self.attached.discard)(index)
+        self._selection = None
+
+    def read(self, t: float, updates: Mapping[str, Sample | Pose | Points], shift: float) -> Update:
+        """Check the updates of a step.
+
+        Args:
+            t: time of the step [s].
+            updates: what the program gives, by name; at least one.
+            shift: by how much the clock was set back [s].
+
+        Raises:
+            UnknownName: there is no such obstacle.
+            NumericalError: an entry of the wrong shape, or not made of numbers.
+        """
+        names, samples = list(updates), list(updates.values())
+        kept = self._selection
+        types = set(map(type, samples))
+        if kept is None or kept.names != names or types != {kept.type}:
+            numbers = [self.index(name) for name in names]
+            plain = len(types) == 1 and types <= {Sample, Pose} and self.attached.isdisjoint(numbers)
+            self._selection = kept = self._select(names, next(iter(types)), numbers) if plain else None
+        if kept is not None:
+            return self._check(t, shift, _Batch(names, samples, kept.which, kept.kind), kept)
+        return self._read_each(t, shift, updates)
+
+    def _select(self, names: list[str], kind: type, numbers: list[int]) -> _Selection:
+        count, which = len(names), np.array(numbers, dtype=np.intp)
+        estimated = tuple([self._estimated[i] for i in numbers]) if kind is Pose else ()
+        kinds = np.full(count, POSE if kind is Pose else SAMPLE)
+        return _Selection(names, kind, which, kinds, estimated, np.zeros(count, dtype=np.intp), np.zeros(count))
+
+    def _read_each(self, t: float, shift: float, updates: Mapping[str, Any]) -> Update:
+        """Check updates of several kinds one by one: point clouds, bare poses among samples, attached obstacles."""
+        names, samples, kinds = list[str](), list[Sample](), list[int]()
+        voxels, unusable, notes = dict[int, Voxels](), list[int](), list[Reason]()
+        for name, value in updates.items():
+            index = self.index(name)
+            if index in self.attached:
+                notes.append(Reason.of(ReasonKind.IGNORED, name, detail="attached to the robot"))
+                continue
+            if isinstance(value, Points):
+                cloud, sample = self._cloud(index, value, notes), self._pose_of(index, value, t, shift)
+            else:
+                cloud, sample = None, _checked(name, value)
+            bare = isinstance(sample, Pose)
+            sample = Sample(sample[0], sample[1], *_ZERO_TWIST, sample[2], sample[3]) if bare else sample
+            if isinstance(value, Points) and cloud is None:
+                _flags([name], [sample])
+                wrong = self._wrong_stamp(index, _stamp(name, sample, t), t, shift)
+                notes += [wrong] if wrong else []
+                if wrong is None or wrong.kind is not ReasonKind.IGNORED:
+                    unusable.append(index)
+                continue
+            if cloud is not None:
+                voxels[index] = cloud
+            names.append(name)
+            samples.append(sample)
+            kinds.append(POSE if bare else SAMPLE)
+        which = np.array([self._index[name] for name in names], dtype=np.intp)
+        batch = _Batch(names, samples, which, np.array(kinds, dtype=np.intp))
+        update = self._check(t, shift, batch, self._select(names, Sample, which.tolist()))
+        fit = set(update.which.tolist())
+        return update._replace(
+            voxels={index: cloud for index, cloud in voxels.items() if index in fit},
+            unusable=(*unusable, *update.unusable),
+            notes=(*notes, *update.notes),
+            estimated=tuple([self._estimated[i] for i in update.which[update.kind == POSE].tolist()]),
+        )
+
+    def _check(self, t: float, shift: float, batch: _Batch, kept: _Selection) -> Update:
+        """Check samples or bare poses, all at once; `kept` has arrays for them."""
+        names, samples, which, kind = batch
+        if not samples:
+            return NO_UPDATE
+        columns, times, rests = _columns(names, samples)
+        unusable, notes = list[int](), list[Reason]()
+        flags = set(map(type, rests))
+        if flags != {bool} or True in rests:
+            kind = np.where(_flags(names, samples), REST, kind)
+        if times.count(None) == len(times):
+            stamps = np.full(len(times), t)
+        else:
+            stamps = np.array([_stamp(name, sample, t) for name, sample in zip(names, samples, strict=True)])
+            late = ~((stamps <= t + self._dt) & ~(stamps <= self._measured.stamps[which] + shift)) & (stamps != t)
+            if late.any():
+                for k in np.flatnonzero(late).tolist():
+                    wrong = self._wrong_stamp(int(which[k]), float(stamps[k]), t, shift)
+                    assert wrong is not None
+                    notes.append(wrong)
+                    if wrong.kind is not ReasonKind.IGNORED:
+                        unusable.append(int(which[k]))
+                which, kind, stamps = which[~late], kind[~late], stamps[~late]
+                columns = [column[~late] if len(column) else column for column in columns]
+                kept = self._select([names[k] for k in np.flatnonzero(~late).tolist()], kept.type, which.tolist())
+        states = self._measured.updates
+        kernels.write_states(states, which, *columns)
+        if kernels.count_faults(states, which, kind, FARTHEST, FASTEST, kept.codes, kept.off):
+            bad = kept.codes > NORMALISED
+            for k in np.flatnonzero(kept.codes != FINE).tolist():
+                name, code = self._obstacles[which[k]].name, int(kept.codes[k])
+                if bad[k]:
+                    notes.append(unlikely(name, FAULTS[code]))
+                    unusable.append(int(which[k]))
+                else:
+                    off = float(kept.off[k])
+                    notes.append(Reason.of(ReasonKind.NORMALISED, name, amount=off, unit="-"))
+            which, kind, stamps = which[~bad], kind[~bad], stamps[~bad]
+        estimated = kept.estimated
+        if estimated and (kind is not kept.kind or len(which) < len(estimated)):
+            estimated = tuple([self._estimated[i] for i in which[kind == POSE].tolist()])
+        return Update(which, kind, stamps, {}, tuple(unusable), tuple(notes), estimated)
+
+    def _wrong_stamp(self, index: int, stamp: float, t: float, shift: float) -> Reason | None:
+        """Return why an update with that time stamp [s] is not used; None where it is."""
+        name = self._obstacles[index].name
+        if stamp == t:
+            return None
+        if not stamp <= t + self._dt:  # neither is NaN
+            return unlikely(name, f"stamped {stamp:g} s, later than the control step")
+        if stamp <= self._measured.stamps[index] + shift:
+            return Reason.of(ReasonKind.IGNORED, name, detail=f"stamped {stamp:g} s, not later than the one before")
+        return None
+
+    def _pose_of(self, index: int, cloud: Points, t: float, shift: float) -> Any:
+        """Return the sample of a cloud's frame: as given with it, or where it is by what is known."""
+        if cloud.pose is None:
+            state = self._measured.states[index : index + 1].copy()
+            if index in self._measured.known:
+                extrapolate(state, t - shift - self._measured.stamps[index])
+            else:
+                put(as_samples(state)[0], self._obstacles[index].motion.sample(t))
+            sample = as_samples(state)[0]
+        else:
+            sample = _checked(self._obstacles[index].name, cloud.pose)
+        return sample._replace(t=sample.t if cloud.t is None else cloud.t, at_rest=cloud.at_rest or sample.at_rest)
+
+    def _cloud(self, index: int, cloud: Points, notes: list[Reason]) -> Voxels | None:
+        """Return the voxels of a point cloud; None where none of its points can be used."""
+        name, shape = self._obstacles[index].name, self._obstacles[index].shape
+        if not isinstance(shape, PointCloud):
+            raise NumericalError(f"obstacle {name!r}: points of a {shape.type}; give a Sample or a Pose")
+        if isinstance(cloud.points, Voxels):
+            voxels = cloud.points
+            if voxels.resolution != shape.resolution:
+                raise NumericalError(
+                    f"obstacle {name!r}: voxels of {voxels.resolution} m, but its resolution is {shape.resolution}"
+                )
+        else:
+            try:
+                voxels = Voxels.of(cloud.points, shape.resolution)
+            except NumericalError as error:
+                raise NumericalError(f"obstacle {name!r}: {error}") from None
+        if voxels.dropped:
+            everything = voxels.dropped == voxels.given
+            notes.append(
+                Reason.of(
+                    ReasonKind.POINTS_DROPPED,
+                    name,
+                    amount=voxels.dropped,
+                    unit="-",
+                    severity=Severity.WARNING if everything else None,
+                    detail=f"of {voxels.given}: NaN, infinite or more than 100 m away",
+                )
+            )
+            if everything:
+                return None
+        return voxels
+
+
+def unlikely(name: str, detail: str) -> Reason:
+    """Return the reason why an update of an obstacle is not used."""
+    return Reason.of(ReasonKind.IMPLAUSIBLE, name, severity=Severity.WARNING, detail=detail)
+
+
+_ZERO_TWIST = np.zeros(3), np.zeros(3)
+
+
+def _columns(names: Sequence[str], samples: Sequence[Any]) -> tuple[list[Array], tuple[Any, ...], tuple[Any, ...]]:
+    """Return positions (k, 3), rotations (k, 3, 3) and twists (k, 3), time stamps, and what is at rest.
+
+    Raises:
+        NumericalError: an entry of the wrong shape, or not made of numbers; names the obstacle.
+    """
+    *parts, times, rests = zip(*samples, strict=True)
+    try:
+        columns, k = [np.array(part) for part in parts], len(samples)
+        shapes = [column.shape for column in columns]
+        fits = shapes == [(k, 3), (k, 3, 3), (k, 3), (k, 3)][: len(columns)]
+        fits = fits and {column.dtype for column in columns} == {np.dtype(np.float64)}
+    except (ValueError, TypeError, OverflowError):
+        fits = False
+    if not fits:
+        checked = [_checked(name, sample) for name, sample in zip(names, samples, strict=True)]
+        columns = [np.array(part) for part in list(zip(*checked, strict=True))[:-2]]
+    return (columns if len(columns) == 4 else [*columns, _NO_TWISTS, _NO_TWISTS]), times, rests
+
+
+def _flags(names: Sequence[str], samples: Sequence[Any]) -> list[bool]:
+    """Return which of some samples or bare poses are at rest.
+
+    Raises:
+        NumericalError: that is neither true nor false, or one at rest has a velocity; names the obstacle.
+    """
+    for name, sample in zip(names, samples, strict=True):
+        if type(sample.at_rest) not in _FLAGS:
+            raise NumericalError(f"obstacle {name!r}: at_rest: {sample.at_rest!r:.60}; give true or false")
+        if sample.at_rest and isinstance(sample, Sample) and (np.any(sample.linear) or np.any(sample.angular)):
+            raise NumericalError(f"obstacle {name!r}: at_rest, but it has a velocity; leave one of them out")
+    return [bool(sample.at_rest) for sample in samples]
+
+
+def _stamp(name: str, sample: Any, t: float) -> float:
+    return t if sample.t is None else as_time(f"obstacle {name!r}: t", sample.t)
+
+
+def _checked(obstacle: str, value: Any) -> Any:
+    try:
+        return as_sample(value)
+    except NumericalError as error:
+        raise NumericalError(f"obstacle {obstacle!r}: {error}") from None
