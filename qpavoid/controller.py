@@ -23,6 +23,7 @@ from qpavoid.inputs import (
     FASTEST,
     FAULTS,
     LARGEST_COMMAND,
+    LARGEST_VELOCITY,
     Clock,
     Configurations,
     Times,
@@ -277,8 +278,9 @@ class Controller:
         Every call with arguments of the right kind ends in a solution, and one that raises changes nothing. What cannot
         be true ends in a stop that says so, with a reason of kind IMPLAUSIBLE: NaN, infinity, a joint more than 2π
         beyond its limits, a quaternion that is more than 1e-3 off length 1, a matrix that is no rotation, positions
-        beyond 1e6 m, speeds beyond 1e3 m/s or rad/s, a time whose resolution is coarser than dt/1000. Of an obstacle,
-        it counts as no update. Where q is unknown, the stop takes the robot to be where the last velocity has led it.
+        beyond 1e6 m, twists beyond 1e3 m/s or rad/s, joint velocities beyond a norm of 1e4, a time whose resolution is
+        coarser than dt/1000. Of an obstacle, it counts as no update. Where q is unknown, the stop takes the robot to be
+        where the last velocity has led it.
         Rotations and quaternions that are less than 1e-3 off are normalised, with a reason of kind NORMALISED.
 
         Args:
@@ -431,7 +433,7 @@ class Controller:
             NumericalError: v has the wrong shape, or cannot be true.
         """
         v = np.zeros(self._v_shape) if v is None else require_finite("v", v, self._v_shape)
-        if faults := check_velocity("v", v, FASTEST):
+        if faults := check_velocity("v", v, LARGEST_VELOCITY):
             raise NumericalError(str(faults[0]))
         self._assembly.restart(v)
         self._clock.reset()
@@ -495,7 +497,7 @@ class Controller:
         known = None if v is None else as_vector("v", v, self._v_shape)
         times = self._clock.read(t)
         configuration, faults, notes = self._configurations.read("q", measured)
-        if wrong := () if known is None else check_velocity("v", known, FASTEST):
+        if wrong := () if known is None else check_velocity("v", known, LARGEST_VELOCITY):
             known = None
         slow = () if desired is None else check_velocity("v_desired", desired, LARGEST_COMMAND)
         samples, missed, normalised = self._targets(times.t, targets)
