@@ -28,6 +28,7 @@ from qpavoid.inputs import (
     Configurations,
     Times,
     check_velocity,
+    is_exact,
 )
 from qpavoid.kernels.motions import NORMALISED, SAMPLE
 from qpavoid.kinematics import ForwardKinematics, Kinematics
@@ -547,6 +548,9 @@ class Controller:
                 except NumericalError as error:
                     raise NumericalError(f"target {name!r}: {error}") from None
                 if isinstance(sample, Sample):
+                    if is_exact(sample):
+                        samples.append(sample)
+                        continue
                     put(self._goal_views[row], sample)
                     placed.append(row)
                 elif fault := task.fault(sample):

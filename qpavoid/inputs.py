@@ -13,6 +13,7 @@ import numpy as np
 
 from qpavoid.errors import NumericalError
 from qpavoid.kernels.motions import EXACT, FAR, FAST, LEFT_HANDED, NEARLY, NO_ROTATION, NOT_FINITE
+from qpavoid.motion import Sample
 from qpavoid.problem import Array, as_vector, not_finite
 from qpavoid.reason import Reason, ReasonKind, Severity
 
@@ -206,3 +207,21 @@ def check_velocity(name: str, v: Array, largest: float) -> tuple[Reason, ...]:
     if hypot(*v.tolist()) <= largest:
         return ()
     return (Reason.of(ReasonKind.IMPLAUSIBLE, name, detail=not_finite(v)),)
+
+
+def is_exact(sample: Sample) -> bool:
+    """Return whether a sample needs no look by `kernels.check_states`: for one or two, a call of that costs more."""
+    twist = hypot(*sample.linear.tolist(), *sample.angular.tolist())
+    if not (hypot(*sample.position.tolist()) <= FARTHEST and twist <= FASTEST):
+        return False
+    x, y, z = sample.rotation.tolist()
+    if [x, y, z] == _IDENTITY:
+        return True
+    (a, b, c), (d, e, f), (g, h, i) = x, y, z
+    off = max(abs(a * a + d * d + g * g - 1.0), abs(b * b + e * e + h * h - 1.0), abs(c * c + f * f + i * i - 1.0))
+    across = max(abs(a * b + d * e + g * h), abs(a * c + d * f + g * i), abs(b * c + e * f + h * i))
+    right_handed = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0.0
+    return bool(off <= EXACT and across <= EXACT and right_handed)
+
+
+_IDENTITY = np.eye(3).tolist()
