@@ -18,7 +18,7 @@ from qpavoid.control.assembler import Assembly
 from qpavoid.control.attach import Attachments
 from qpavoid.control.contacts import ContactRows, build_contacts
 from qpavoid.control.distances import DistanceQuery
-from qpavoid.control.inputs import FASTEST, Clock, Configurations, check_velocity
+from qpavoid.control.inputs import LARGEST_VELOCITY, Clock, Configurations, check_velocity
 from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.control.poses import Pose
 from qpavoid.control.targets import TargetReader
@@ -253,8 +253,9 @@ class Controller:
         Every call with arguments of the right kind ends in a solution, and one that raises changes nothing. What cannot
         be true ends in a stop that says so, with a reason of kind IMPLAUSIBLE: NaN, infinity, a joint more than 2π
         beyond its limits, a quaternion that is more than 1e-3 off length 1, a matrix that is no rotation, positions
-        beyond 1e6 m, speeds beyond 1e3 m/s or rad/s, a time whose resolution is coarser than dt/1000. Of an obstacle,
-        it counts as no update. Where q is unknown, the stop takes the robot to be where the last velocity has led it.
+        beyond 1e6 m, twists beyond 1e3 m/s or rad/s, joint velocities beyond a norm of 1e4, a time whose resolution is
+        coarser than dt/1000. Of an obstacle, it counts as no update. Where q is unknown, the stop takes the robot to be
+        where the last velocity has led it.
         Rotations and quaternions that are less than 1e-3 off are normalised, with a reason of kind NORMALISED.
 
         Args:
@@ -414,7 +415,7 @@ class Controller:
             NumericalError: v has the wrong shape, or cannot be true.
         """
         v = np.zeros(self._v_shape) if v is None else require_finite("v", v, self._v_shape)
-        if faults := check_velocity("v", v, FASTEST):
+        if faults := check_velocity("v", v, LARGEST_VELOCITY):
             raise NumericalError(str(faults[0]))
         self._assembly.restart(v)
         self._clock.reset()

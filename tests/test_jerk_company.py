@@ -146,7 +146,7 @@ def test_wall_of_points_is_not_crossed(tmp_path, dt, speed):
     points, limited, least = wall(), Limited(controller), []
     surface = Voxels.of(points, CLOUD.resolution).centers
     for tick in drive(controller, np.array([-0.5, 0.03, 0.0]), round(3.0 / dt), target=[2.0, 0.1, 0.05],
-                      obstacles=lambda t: {"camera": Points(points)}):  # fmt: skip
+                      obstacles=lambda t: None if t else {"camera": Points(points, at_rest=True)}):  # fmt: skip
         limited.check(tick.solution)
         after = tick.state.q + dt * tick.solution.v
         least.append(np.linalg.norm(surface - after, axis=1).min() - 0.05 - BALL)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from qpavoid.control.inputs import FASTEST, LARGEST_COMMAND, Clock, Configurations, Times, check_velocity
+from qpavoid.control.inputs import LARGEST_COMMAND, LARGEST_VELOCITY, Clock, Configurations, Times, check_velocity
 from qpavoid.control.obstacles import ObstacleTracker, StepUpdate
 from qpavoid.control.targets import TargetReader
 from qpavoid.problem import Array, as_vector
@@ -58,7 +58,7 @@ class ArgumentReader:
         q = None if faults else q
         if v is not None:
             v = as_vector("v", v, self._v_shape)
-            if wrong := check_velocity("v", v, FASTEST):
+            if wrong := check_velocity("v", v, LARGEST_VELOCITY):
                 v, faults = None, wrong + faults
         faults += times.faults
         if v_desired is not None and (wrong := check_velocity("v_desired", v_desired, LARGEST_COMMAND)):

@@ -19,7 +19,9 @@ from qpavoid.reason import Reason, ReasonKind, Severity
 FARTHEST = 1e6
 """Coordinate of a position that is farther than any in a scene [m]; round-off is 0.1 nm there."""
 FASTEST = 1e3
-"""Component of a twist, or norm of a measured joint velocity, that nothing in a scene has [m/s, rad/s]."""
+"""Component of a twist that nothing in a scene has [m/s, rad/s]."""
+LARGEST_VELOCITY = 1e4
+"""Norm of a measured joint velocity that no robot has, whatever its number of joints [rad/s, m/s]."""
 LARGEST_COMMAND = 1e6
 """Norm of a velocity to `filter` that cannot be meant [rad/s, m/s]; far beyond all limits, which it is brought to."""
 _BEYOND = 2.0 * np.pi
