@@ -44,7 +44,7 @@ def test_a_step_from_any_state_ends_in_a_velocity(name, solver, request):
     )
     obstacles = [Obstacle.at(f"o{i}", shape, [0.0, 0.0, 9.0]) for i, shape in enumerate(shapes)]
     controller = make_controller(robot, obstacles, frame, solver)
-    fastest = np.where(np.isfinite(bounds.velocity), bounds.velocity, 5.0)
+    fastest = np.where(bounds.velocity < 100.0, bounds.velocity, 5.0)
     seen = dict.fromkeys(Status, 0)
     for k in range(400):
         if k % 4 == 0:
