@@ -16,19 +16,20 @@ from qpavoid.config import Avoidance, Limits, Progress, ScenarioConfig, Sensing
 from qpavoid.control.arguments import ArgumentReader, Arguments
 from qpavoid.control.assembler import Assembly
 from qpavoid.control.attach import Attachments
-from qpavoid.control.contacts import ContactRows, build_contacts
+from qpavoid.control.contacts import ContactRows
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.inputs import FASTEST, Clock, Configurations, check_velocity
 from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.control.poses import Pose
+from qpavoid.control.scenario import build_parts
 from qpavoid.control.targets import TargetReader
-from qpavoid.control.tasks.frames import AnyTask, build_tasks, in_order
+from qpavoid.control.tasks.frames import AnyTask, in_order
+from qpavoid.control.tick import Tick, copied
 from qpavoid.errors import ConfigError, NumericalError, UnknownName, located, nearest
 from qpavoid.model.cloud import Points
-from qpavoid.model.kinematics import ForwardKinematics, Kinematics
+from qpavoid.model.kinematics import ForwardKinematics
 from qpavoid.model.limits import OUTSIDE
-from qpavoid.model.robot import Robot
-from qpavoid.model.scene import Scene, build_obstacles, build_scene
+from qpavoid.model.scene import Scene
 from qpavoid.model.trajectory import Sample
 from qpavoid.problem import Array, Problem, Proximity, Solution, State, as_vector, require_finite
 from qpavoid.reason import Reason, ReasonKind
@@ -38,20 +39,6 @@ from qpavoid.solvers import SOLVERS, Solver, make_solver
 _log = logging.getLogger(__name__)
 _LONGEST = 1.0
 """Control period that is not meant [s]."""
-
-
-class Tick(NamedTuple):
-    """Everything that one tick computed."""
-
-    state: State
-    targets: tuple[Any, ...]
-    """One for each of the controller's tasks."""
-    errors: Array
-    """How far each of the tasks that are not frames was from its target, in its unit."""
-    kinematics: Kinematics
-    proximity: Proximity
-    problem: Problem
-    solution: Solution
 
 
 class _Built(NamedTuple):
@@ -209,36 +196,17 @@ class Controller:
         Raises:
             ConfigError, UnknownName, SolverNotInstalled: naming file, field and remedy.
         """
-        source = scenario.source
-        with located(f"{source}: robot"):
-            robot = Robot.load(scenario.robot, source.parent)
-        with located(f"{source}: solver"):
-            solver = make_solver(scenario.solver)
-        q0 = robot.configuration(scenario.q0, f"{source}: q0")
-        robot, q0 = robot.lock(scenario.lock, q0, f"{source}: lock")
-        obstacles = build_obstacles(scenario.obstacles, source)
-        with located(str(source)):
-            scene = build_scene(robot, obstacles)
-        tasks = build_tasks(scenario.tasks, robot, q0, source)
-        contacts = build_contacts(scenario.contacts, robot, q0, source)
+        source, parts = scenario.source, build_parts(scenario)
         with located(str(source)):
             controller = cls(
-                scene,
-                tasks,
-                solver,
-                scenario.dt,
-                scenario.avoidance,
-                scenario.limits,
-                scenario.tracking_damping,
-                scenario.sensing,
-                scenario.progress,
-                contacts,
-            )
+                parts.scene, parts.tasks, parts.solver, scenario.dt, scenario.avoidance, scenario.limits,
+                scenario.tracking_damping, scenario.sensing, scenario.progress, parts.contacts,
+            )  # fmt: skip
         for c in scenario.obstacles:
             if c.attached_to is not None:
                 with located(f"{source}: obstacles: {c.name!r}: attached_to"):
-                    controller.attach(c.name, c.attached_to, q0)
-        return controller, q0
+                    controller.attach(c.name, c.attached_to, parts.q0)
+        return controller, parts.q0
 
     def step(
         self,
@@ -292,9 +260,9 @@ class Controller:
         built = self._build(self._arguments.read(q, t, targets, obstacles, v))
         state = State(built.q.copy(), self._assembly.v_prev.copy(), built.t)
         solution = self._solve(built, begin)
-        kinematics = _copied(self._assembly.kinematics)
+        kinematics = copied(self._assembly.kinematics)
         errors = np.array([task.error for task in self._others])
-        proximity, problem = _copied(built.proximity), _copied(built.problem)
+        proximity, problem = copied(built.proximity), copied(built.problem)
         return Tick(state, tuple(built.targets), errors, kinematics, proximity, problem, solution)
 
     def filter(
@@ -471,12 +439,3 @@ def _name(solver: Solver | str) -> str:
     if isinstance(solver, str):
         return f"solver {solver!r}"
     return f"solver {solver.config.name!r}" if hasattr(solver, "config") else f"the solver {type(solver).__name__}"
-
-
-def _copied(value: Any) -> Any:
-    """The same with arrays of its own: what a tick computed stays as it was when the next one comes."""
-    if isinstance(value, np.ndarray):
-        return value.copy()
-    if hasattr(value, "_fields"):
-        return type(value)(*map(_copied, value))
-    return value

@@ -589,7 +589,7 @@ def test_what_is_foreseen_is_of_the_mean_of_what_was_told_lately():
         at = np.array([0.2 * t, 0.0, 0.0])
         obstacles.observe(t, {"ball": Pose.at(at + 0.005 * rng.normal(size=3))})
         if k == 1:
-            first = obstacles.told.states[0, 12:15]
+            first = obstacles.estimates.states[0, 12:15]
             np.testing.assert_array_equal(first, obstacles._seen.states[0, 12:15])  # of one twist, that is the mean
         if k > 50:
             off.append(obstacles.predicted(t + 1.0).states[0, 9:12] - at - [0.2, 0.0, 0.0])
@@ -626,7 +626,7 @@ def test_how_far_obstacles_stray_is_no_less_than_any_point_of_them(seed, size):
 
     first = {name: [rng.normal(size=3) for _ in range(4)] for name in names}
     obstacles.observe(0.0, {name: sample(*parts) for name, parts in first.items()})
-    before, radii = obstacles.told, np.array([0.2, 0.3])
+    before, radii = obstacles.estimates, np.array([0.2, 0.3])
     then = {name: obstacles.predicted(dt).states[i] for i, name in enumerate(names)}
     now = {}
     for name, state in then.items():
@@ -635,16 +635,16 @@ def test_how_far_obstacles_stray_is_no_less_than_any_point_of_them(seed, size):
             *(state[9:12] + size * rng.normal(size=3), R), *(state[12:].reshape(2, 3) + size * rng.normal(size=(2, 3)))
         )
     obstacles.observe(dt, now)
-    bound = prediction_error_bound(obstacles.told, before, 1.0, radii)
+    bound = prediction_error_bound(obstacles.estimates, before, 1.0, radii)
     for i, name in enumerate(names):
         for t in np.linspace(0.0, 1.0, 11):
             points = rng.normal(size=(50, 3))
             points *= radii[i] / np.linalg.norm(points, axis=1, keepdims=True)
-            states = np.array([then[name], obstacles.told.states[i]])
+            states = np.array([then[name], obstacles.estimates.states[i]])
             extrapolate(states, t)
             places = [points @ state[:9].reshape(3, 3) + state[9:12] for state in states]
             assert np.linalg.norm(places[0] - places[1], axis=1).max() <= bound + 1e-9
-    assert prediction_error_bound(obstacles.told, before, 1.0, np.array([np.inf, 0.3])) == np.inf or size < 1e-9
+    assert prediction_error_bound(obstacles.estimates, before, 1.0, np.array([np.inf, 0.3])) == np.inf or size < 1e-9
     assert bound > 0.0 or size < 1e-9
     obstacles.reset()
-    assert prediction_error_bound(obstacles.told, before, 1.0, radii) == np.inf
+    assert prediction_error_bound(obstacles.estimates, before, 1.0, radii) == np.inf
