@@ -337,7 +337,7 @@ def test_targets_of_the_wrong_kind(panda):
     stopped = controller.step(panda.home, targets={"posture": np.full(7, np.nan)})
     assert stopped.status.value == "STOPPED"
     assert [(reason.kind, reason.subject) for reason in stopped.reasons] == [
-        (ReasonKind.IMPLAUSIBLE, ("target posture",))
+        (ReasonKind.IMPLAUSIBLE, ("target", "posture"))
     ]
     assert controller.step(panda.home).status.value == "SOLVED"
 
