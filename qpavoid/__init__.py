@@ -5,7 +5,8 @@ from qpavoid.config.loading import load_scenario
 from qpavoid.control.contacts import build_contacts
 from qpavoid.control.poses import Pose
 from qpavoid.control.tasks.frames import build_tasks
-from qpavoid.controller import Controller, Tick
+from qpavoid.control.tick import Tick
+from qpavoid.controller import Controller
 from qpavoid.errors import ConfigError, NumericalError, QpavoidError, SolverNotInstalled, UnknownName
 from qpavoid.model.cloud import Points, Voxels
 from qpavoid.model.notes import Note, NoteKind, RobotWarning

@@ -1,4 +1,4 @@
-"""The tick: state in, joint velocity out. Embed this in your own loop."""
+"""The controller: state in, joint velocity out. Embed this in your own loop."""
 
 from __future__ import annotations
 
@@ -6,73 +6,40 @@ import logging
 from collections.abc import Mapping, Sequence
 from copy import copy
 from time import perf_counter
-from typing import Any, NamedTuple, NoReturn
+from typing import Any
 
 import numpy as np
-import pinocchio as pin
 
 from qpavoid import kernels
 from qpavoid.config import Avoidance, Limits, Progress, ScenarioConfig, Sensing
-from qpavoid.control.arguments import ArgumentReader, Arguments
+from qpavoid.control.arguments import ArgumentReader
 from qpavoid.control.assembler import Assembly
 from qpavoid.control.attach import Attachments
-from qpavoid.control.contacts import ContactRows, build_contacts
+from qpavoid.control.contacts import ContactRows
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.inputs import LARGEST_VELOCITY, Clock, Configurations, check_velocity
 from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.control.poses import Pose
+from qpavoid.control.scenario import build_parts
 from qpavoid.control.targets import TargetReader
-from qpavoid.control.tasks.frames import AnyTask, build_tasks, in_order
+from qpavoid.control.tasks.frames import AnyTask, in_order
+from qpavoid.control.tick import Tick, copied
 from qpavoid.errors import ConfigError, NumericalError, UnknownName, located, nearest
 from qpavoid.model.cloud import Points
-from qpavoid.model.kinematics import ForwardKinematics, Kinematics
-from qpavoid.model.limits import OUTSIDE
-from qpavoid.model.robot import Robot
-from qpavoid.model.scene import Scene, build_obstacles, build_scene
+from qpavoid.model.kinematics import ForwardKinematics
+from qpavoid.model.scene import Scene
 from qpavoid.model.trajectory import Sample
-from qpavoid.problem import Array, Problem, Proximity, Solution, State, as_vector, require_finite
-from qpavoid.reason import Reason, ReasonKind
+from qpavoid.problem import Array, Solution, State, as_vector, require_finite
 from qpavoid.safety.arbiter import Arbiter
+from qpavoid.safety.pipeline import NO_BACKUP_WITH_CONTACTS, Pipeline, check_solver
 from qpavoid.solvers import SOLVERS, Solver, make_solver
 
 _log = logging.getLogger(__name__)
-_LONGEST = 1.0
-"""Control period that is not meant [s]."""
+_MAX_DT = 1.0
+"""Largest control period that is accepted [s]: a longer one is in milliseconds."""
 
 
-class Tick(NamedTuple):
-    """Everything that one tick computed."""
-
-    state: State
-    targets: tuple[Any, ...]
-    """One for each of the controller's tasks."""
-    errors: Array
-    """How far each of the tasks that are not frames was from its target, in its unit."""
-    kinematics: Kinematics
-    proximity: Proximity
-    problem: Problem
-    solution: Solution
-
-
-class _Built(NamedTuple):
-    """Problem of a step, and what it was built from."""
-
-    q: Array
-    t: float
-    targets: Sequence[Any]
-    proximity: Proximity
-    problem: Problem
-    faults: tuple[Reason, ...]
-    assumptions: tuple[Reason, ...]
-
-
-_NO_BACKUP_WITH_CONTACTS = Reason.of(
-    ReasonKind.NO_BACKUP, "contacts", detail="backup trajectories do not hold contacts: avoidance.backup"
-)
-"""Assumption where obstacles move and the robot stands on something."""
-
-
-class Controller:
+class Controller(Pipeline):
     """Follows its tasks and keeps clear of everything in its scene."""
 
     def __init__(
@@ -88,7 +55,7 @@ class Controller:
         progress: Progress | None = None,
         contacts: ContactRows | None = None,
     ) -> None:
-        """Lays out the memory of the tick.
+        """Lay out the memory of a control step.
 
         Args:
             scene: robot and obstacles.
@@ -98,8 +65,8 @@ class Controller:
             avoidance: distances and rows; the defaults of a scenario if left out.
             limits: use of the joint limits; the defaults of a scenario if left out.
             tracking_damping: λ of the damped J⁺ [-].
-            sensing: what is made of obstacles without news; the defaults of a scenario if left out.
-            progress: when a task counts as stalled, and whether a way round is tried; likewise.
+            sensing: assumptions about obstacles without updates; the defaults of a scenario if left out.
+            progress: when a task counts as stalled, and detours; the defaults of a scenario if left out.
             contacts: frames that rest, see `build_contacts`; none if left out.
 
         Raises:
@@ -107,56 +74,52 @@ class Controller:
             ConfigError: dt is no period; there are contacts, and the solver is one that does not hold them.
         """
         begin = perf_counter()
-        if not 0.0 < dt <= _LONGEST:
-            raise ConfigError(f"dt: {dt} s, expected more than 0 and at most {_LONGEST}; it is in seconds")
+        if not 0.0 < dt <= _MAX_DT:
+            raise ConfigError(f"dt: {dt} s, expected more than 0 and at most {_MAX_DT}; it is in seconds")
         frames, others = in_order(tasks)
         others = [copy(task) for task in others]  # each writes into the memory of its own controller
-        self.scene, self.dt = scene, dt
+        self.scene, self.dt, model = scene, dt, scene.robot.model
         self.tasks: tuple[AnyTask, ...] = (*frames, *others)
         """Frames with a position to follow, then with an orientation alone, then all other tasks."""
-        law: Solver = make_solver(solver) if isinstance(solver, str) else solver
-        self._contacts = contacts is not None
-        self._check_law(law, solver)
+        law, self._contacts = make_solver(solver) if isinstance(solver, str) else solver, contacts is not None
+        check_solver(law, solver, self._contacts)
         self.avoidance, self.limits = avoidance or Avoidance(), limits or Limits()
-        model = scene.robot.model
         more = [i for task in others for i in task.frame_ids] + list(contacts.frame_ids if contacts else ())
         self._kinematics = ForwardKinematics(model, [*(task.frame_id for task in frames), *more])
         self._query = DistanceQuery(scene)
-        self._q_shape, self._v_shape = (model.nq,), (model.nv,)
-        self._clock = Clock(dt)
-        self._others = others
+        self._v_shape, self._clock, self._others = (model.nv,), Clock(dt), others
         self._obstacles = ObstacleTracker(scene.obstacles, sensing or Sensing(), dt)
-        self._reach = self.avoidance.d2 - self.avoidance.offset
+        self._influence_distance = self.avoidance.d2 - self.avoidance.offset
         self._bounds = scene.robot.bounds().within(self.limits)
         names = scene.robot.coordinate_units
         self._configurations = Configurations(
             model, self._bounds.q_index, self._bounds.lower, self._bounds.upper,
             [names[j] for j in self._bounds.v_index.tolist()],
         )  # fmt: skip
-        self._q_last = scene.robot.home.copy()
+        self._q_last, self._no_backup = scene.robot.home.copy(), ()
         self._assembly = Assembly(
             scene, self.tasks, self._bounds, self._kinematics, self._query, self.avoidance,
             self.limits, tracking_damping, dt, contacts, law.bounded and self.avoidance.look_ahead,
         )  # fmt: skip
         self._arguments = ArgumentReader(
-            (self._q_shape, self._v_shape), self._clock, self._configurations,
+            ((model.nq,), self._v_shape), self._clock, self._configurations,
             TargetReader(self.tasks, self._assembly.targets), self._obstacles,
         )  # fmt: skip
-        self._no_backup: tuple[Reason, ...] = ()
         if contacts is not None and self.avoidance.backup is not None:
             self.avoidance = self.avoidance.model_copy(update={"backup": None})
-            self._no_backup = (_NO_BACKUP_WITH_CONTACTS,)
+            self._no_backup = (NO_BACKUP_WITH_CONTACTS,)
         self._commander = Arbiter(
             scene, law, self._assembly, self._query, self._obstacles, self._bounds,
             [task for task in frames if task.moves], self.avoidance, self.limits, progress or Progress(), dt,
         )  # fmt: skip
-        hold = self.avoidance.safety_distance - self.avoidance.offset
-        self._grasps = Attachments(scene, (self._query, *self._commander.queries), self._assembly, hold)
+        queries = self._query, *self._commander.queries
+        self._grasps = Attachments(
+            scene, queries, self._assembly, self.avoidance.safety_distance - self.avoidance.offset
+        )
         self._warm_up()
         kernels.first_use.end()
         self.warm_up_time = perf_counter() - begin
-        """Time that it took to lay out the memory and run the first ticks, compilation included [s]; no later tick
-        waits for the compiler."""
+        """Time to lay out memory and run the first steps, compilation included [s]; no later step compiles."""
         _log.info("warmed up in %.3f s", self.warm_up_time)
 
     @property
@@ -170,15 +133,9 @@ class Controller:
 
     @solver.setter
     def solver(self, law: Solver) -> None:
-        self._check_law(law, law)
+        check_solver(law, law, self._contacts)
         self._commander.solver = law
         self._assembly.look_ahead(law.bounded and self.avoidance.look_ahead)
-
-    def _check_law(self, law: Solver, name: Solver | str) -> None:
-        if not callable(getattr(law, "solve", None)) or not hasattr(law, "bounded"):
-            raise ConfigError(f"solver: {type(law).__name__} is no law; it needs `solve(problem)` and `bounded`")
-        if self._contacts and not getattr(law, "holds_contacts", False):
-            raise ConfigError(f"contacts: {_name(name)} cannot hold them; use qp or hqp")
 
     def _warm_up(self) -> None:
         """Run the first steps, with a law that ships: one of the user's own may remember what it is asked."""
@@ -187,20 +144,12 @@ class Controller:
             self._commander.solver = make_solver("qp")
         self.tick(q)
         self.filter(q, v)
-        self._assembly.clearance_lower_bound(v, 0, self._reach, self.dt)
+        self._assembly.clearance_lower_bound(v, 0, self._influence_distance, self.dt)
         self._assembly.leaves_position_limits(q, v, self.dt)
         self._obstacles.warm_up()
         kernels.projection_cost(np.zeros((0, len(v))), 1.0, v)
         self._commander.solver = law
         self.reset()
-
-    def __reduce_ex__(self, protocol: Any) -> NoReturn:
-        """Refuse to be copied or pickled: a copy would share memory that coal and compiled code look into.
-
-        Raises:
-            TypeError: always.
-        """
-        raise TypeError("a Controller is neither copied nor pickled; build another one of its scene and tasks")
 
     @classmethod
     def from_scenario(cls, scenario: ScenarioConfig) -> tuple[Controller, Array]:
@@ -209,36 +158,17 @@ class Controller:
         Raises:
             ConfigError, UnknownName, SolverNotInstalled: naming file, field and remedy.
         """
-        source = scenario.source
-        with located(f"{source}: robot"):
-            robot = Robot.load(scenario.robot, source.parent)
-        with located(f"{source}: solver"):
-            solver = make_solver(scenario.solver)
-        q0 = robot.configuration(scenario.q0, f"{source}: q0")
-        robot, q0 = robot.lock(scenario.lock, q0, f"{source}: lock")
-        obstacles = build_obstacles(scenario.obstacles, source)
-        with located(str(source)):
-            scene = build_scene(robot, obstacles)
-        tasks = build_tasks(scenario.tasks, robot, q0, source)
-        contacts = build_contacts(scenario.contacts, robot, q0, source)
+        source, parts = scenario.source, build_parts(scenario)
         with located(str(source)):
             controller = cls(
-                scene,
-                tasks,
-                solver,
-                scenario.dt,
-                scenario.avoidance,
-                scenario.limits,
-                scenario.tracking_damping,
-                scenario.sensing,
-                scenario.progress,
-                contacts,
-            )
+                parts.scene, parts.tasks, parts.solver, scenario.dt, scenario.avoidance, scenario.limits,
+                scenario.tracking_damping, scenario.sensing, scenario.progress, parts.contacts,
+            )  # fmt: skip
         for c in scenario.obstacles:
             if c.attached_to is not None:
                 with located(f"{source}: obstacles: {c.name!r}: attached_to"):
-                    controller.attach(c.name, c.attached_to, q0)
-        return controller, q0
+                    controller.attach(c.name, c.attached_to, parts.q0)
+        return controller, parts.q0
 
     def step(
         self,
@@ -291,12 +221,11 @@ class Controller:
         """Like `step`, with everything that led to the velocity."""
         begin = perf_counter()
         built = self._build(self._arguments.read(q, t, targets, obstacles, v))
-        state = State(built.q.copy(), self._assembly.v_prev.copy(), built.t)
+        state = State(built[0].copy(), self._assembly.v_prev.copy(), built[1])
         solution = self._solve(built, begin)
-        kinematics = _copied(self._assembly.kinematics)
+        kinematics = copied(self._assembly.kinematics)
         errors = np.array([task.error for task in self._others])
-        proximity, problem = _copied(built.proximity), _copied(built.problem)
-        return Tick(state, tuple(built.targets), errors, kinematics, proximity, problem, solution)
+        return Tick(state, tuple(built[2]), errors, kinematics, copied(built[3]), copied(built[4]), solution)
 
     def filter(
         self,
@@ -326,7 +255,7 @@ class Controller:
         return self._solve(built, begin, from_tasks=False)
 
     def attach(self, obstacle: str, frame: str, q: Array | None = None) -> None:
-        """From now on, a frame of the robot carries an obstacle, which stays where it is relative to the frame.
+        """Attach an obstacle to a frame of the robot; it stays where it is relative to the frame.
 
         Until it is released it is a body of the robot: it keeps clear of the other obstacles and of the robot, except
         of what it touches now, until the two have once been apart, and of the link that carries it and all beyond it.
@@ -352,9 +281,9 @@ class Controller:
         self._commander.braking.forget(index)
 
     def release(self, obstacle: str, q: Array | None = None) -> Sample:
-        """Puts an obstacle down that the robot carries: it rests where it is, until `step` is told something else.
+        """Release an attached obstacle: it rests where it is, until it is given to `step` again.
 
-        What touches it now need not part from it at once: it is kept clear of when it has once been apart.
+        Pairs of it that touch now get rows once they have been farther apart than the safety distance.
 
         Args:
             obstacle: its name.
@@ -375,7 +304,7 @@ class Controller:
         return sample
 
     def allow_contact(self, obstacle: str, others: Sequence[str], allowed: bool = True) -> None:
-        """Lets an obstacle and some bodies or other obstacles touch, as a gripper has to that is about to grasp it.
+        """Let an obstacle and some bodies or other obstacles touch, as before a grasp.
 
         Args:
             obstacle: its name.
@@ -398,18 +327,18 @@ class Controller:
         self._commander.invalidate()
 
     def obstacle_pose(self, obstacle: str, q: Array | None = None) -> Sample:
-        """World pose of an obstacle as the last tick had it, carried or not; see `release` for the arguments."""
+        """Return the world pose of an obstacle in the last step, attached or not; see `release`."""
         return self._grasps.pose(self._obstacles.index(obstacle), self._given_or_last(q))
 
     def sync_attachments(self, query: DistanceQuery) -> None:
-        """Brings other distances of the scene to what the robot carries now, and what may touch."""
-        self._grasps.tell(query)
+        """Bring other distances of the scene up to date with attached objects and allowed contacts."""
+        self._grasps.sync(query)
 
     def _given_or_last(self, q: Array | None) -> Array:
         return self._q_last if q is None else self._configurations.require("q", q)
 
     def reset(self, v: Array | None = None) -> None:
-        """Forgets the steps before: the robot moves at v (nv,), or stands still; it keeps what it carries.
+        """Forget the steps before; the robot moves at v (nv,), or stands still. Attached objects stay attached.
 
         Raises:
             NumericalError: v has the wrong shape, or cannot be true.
@@ -421,63 +350,3 @@ class Controller:
         self._clock.reset()
         self._obstacles.reset()
         self._commander.reset()
-
-    def _build(self, arguments: Arguments) -> _Built:
-        """Take over the arguments of a step, and build its problem."""
-        times, q, v, v_desired, targets, update, faults, assumptions = arguments
-        if times.resumed:
-            self._assembly.restart(np.zeros(self._v_shape))
-            self._commander.reset()
-        if v is not None:
-            self._assembly.measured(v)
-        if q is None:  # where the robot is if it moved as commanded
-            q = np.asarray(pin.integrate(self.scene.robot.model, self._q_last, self.dt * self._assembly.v_prev))
-        self._q_last[:] = q
-        self._clock.set(times.t)
-        observed = self._obstacles.advance(update)
-        if observed is not None:
-            for index, voxels in observed.voxels.items():
-                for query in (self._query, *self._commander.queries):
-                    query.fill(index, voxels)
-            self._query.placing.place(*observed.now)
-            self._commander.braking.mark_updated(observed.now.which)
-            faults, assumptions = faults + observed.stop, assumptions + observed.assumptions
-        self._kinematics.compute(q)
-        self._query.compute(self._kinematics.data, self._reach)
-        if self._query.disabled_pairs is not None:
-            self._grasps.update()
-        proximity, problem = self._assembly.compute(q, targets, self._query, self._reach)
-        if v_desired is not None:
-            problem = self._assembly.follow(v_desired, problem)
-        return _Built(q, times.t, targets, proximity, problem, faults, assumptions)
-
-    def _solve(self, built: _Built, begin: float, from_tasks: bool = True) -> Solution:
-        """Decide what is commanded; the step began at `begin` [s]."""
-        q, t, _, proximity, problem, faults, assumptions = built
-        middle = perf_counter()
-        if faults:
-            solution = self._commander.stop(problem, faults)
-        else:
-            solution = self._commander.decide(q, t, problem, proximity, tasks=from_tasks)
-        self._assembly.remember(solution.v)
-        if self._no_backup and len(self._obstacles.moving):
-            assumptions += self._no_backup
-        if problem.position_margin < -OUTSIDE:
-            assumptions += self._bounds.outside(q, problem.joint_names, problem.joint_units)
-        solution = solution._replace(assumptions=assumptions) if assumptions else solution
-        return solution.with_times(middle - begin, perf_counter() - middle)
-
-
-def _name(solver: Solver | str) -> str:
-    if isinstance(solver, str):
-        return f"solver {solver!r}"
-    return f"solver {solver.config.name!r}" if hasattr(solver, "config") else f"the solver {type(solver).__name__}"
-
-
-def _copied(value: Any) -> Any:
-    """The same with arrays of its own: what a tick computed stays as it was when the next one comes."""
-    if isinstance(value, np.ndarray):
-        return value.copy()
-    if hasattr(value, "_fields"):
-        return type(value)(*map(_copied, value))
-    return value

@@ -392,7 +392,7 @@ def test_a_loop_is_the_same_as_with_every_motion_sampled_alone(panda, monkeypatc
         if alone:
             monkeypatch.setattr(courses, "_cut", lambda motion: None)
         controller = make_controller(panda, circling(np.random.default_rng(6), 9, 0.6), "panda_hand_tcp")
-        assert len(controller._obstacles._courses.others) == (9 if alone else 0)
+        assert len(controller._obstacles._trajectories.others) == (9 if alone else 0)
         runs.append(list(drive(controller, panda.home, 200, target=[0.6, 0.2, 0.5])))
     together, alone = runs
     near = [len(tick.proximity.pair) for tick in alone]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -11,9 +10,9 @@ from qpavoid import kernels
 from qpavoid.config import Avoidance, Limits
 from qpavoid.control.contacts import ContactRows, tracking_within
 from qpavoid.control.distances import DistanceQuery
+from qpavoid.control.jerk_stops import Stop, StopFollower
 from qpavoid.control.row_layout import hand_over, lay_out
 from qpavoid.control.tasks.frames import AnyTask, in_order, task_levels
-from qpavoid.kernels.layout import RowLayout
 from qpavoid.model.kinematics import ForwardKinematics, Kinematics, support_masks
 from qpavoid.model.limits import JointBounds
 from qpavoid.model.scene import Scene
@@ -21,39 +20,8 @@ from qpavoid.model.trajectory import Sample
 from qpavoid.problem import Array, AvoidanceRows, Problem, Proximity, Tracking
 from qpavoid.solvers.analytic import pseudo_inverse
 
-_MOST_TICKS = 1000
-"""Ticks of a stop that are followed."""
-
-
 _ROUND_OFF = 1e-9
 """Share of a coordinate's largest change of speed in a tick that counts as round-off [-]."""
-
-
-class Stop(NamedTuple):
-    """A tick at a velocity v and the stop within jerk limits after it, of m ticks in all."""
-
-    way: Array
-    """(m, nv) velocities; memory that the next stop overwrites."""
-    forwards: Array
-    """(m,) for how long v would lead as far [s]."""
-    aside: Array
-    """(m,) how far any point moves beside that, at most [m]."""
-    ways: Array
-    """(nv,) how far each coordinate moves in all [rad or m]."""
-
-
-class _StopAhead:
-    """Follows stops within jerk limits, in memory of its own."""
-
-    def __init__(self, layout: RowLayout) -> None:
-        names = "v_prev", "dv_prev", "lower", "upper", "hard_lower", "hard_upper", "v_stop"
-        self._packed = kernels.pack(layout._replace(**{name: getattr(layout, name).copy() for name in names}))
-        self._way = np.zeros((_MOST_TICKS, len(layout.v_prev)))
-
-    def way(self, q: Array, v: Array, w: Array) -> Array:
-        """See `kernels.roll_out_stop`; a view of memory that the next call overwrites."""
-        self._way[0] = v
-        return self._way[: kernels.roll_out_stop(self._packed, q, w, self._way)]
 
 
 class Assembly:
@@ -84,7 +52,7 @@ class Assembly:
         x = self._layout
         self._hard = (x.hard_lower, x.hard_upper) if limits.relax_acceleration else (x.lower, x.upper)
         self._packed = kernels.pack(self._layout)
-        self._stop, self._dt = _StopAhead(x) if x.jerk_limited else None, dt
+        self._stop, self._dt = StopFollower(x) if x.jerk_limited else None, dt
         robot = scene.robot
         self._names = scene.pair_names, tuple(robot.coordinate_names), tuple(robot.coordinate_units)
         self.targets = self._layout.targets

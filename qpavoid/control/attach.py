@@ -102,8 +102,8 @@ class Attachments:
             self._touching = self._touching[~apart]
             self._look_away()
 
-    def tell(self, query: DistanceQuery) -> None:
-        """Brings other distances of the same scene to who carries what now."""
+    def sync(self, query: DistanceQuery) -> None:
+        """Bring other distances of the same scene up to date with the attached objects."""
         if query.carried != self.carried:
             for index in {*query.carried, *self.carried}:
                 body = self._queries[0].bodies[self._geometry(index)]

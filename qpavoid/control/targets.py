@@ -14,7 +14,7 @@ from qpavoid.control.tasks.frames import AnyTask
 from qpavoid.control.trajectories import STATE, as_samples, put
 from qpavoid.errors import ConfigError, NumericalError, UnknownName, nearest
 from qpavoid.kernels.obstacles import FINE, NORMALISED, SAMPLE
-from qpavoid.model.trajectory import Sample
+from qpavoid.model.trajectory import Sample, Still
 from qpavoid.problem import Array
 from qpavoid.reason import Reason, ReasonKind
 
@@ -40,6 +40,11 @@ class TargetReader:
         self._motions: list[Any] = [task.motion for task in tasks]
         self._views = [*as_samples(self._frames), *as_samples(self._others)]
         self._frame_views = self._views[: len(frames)]
+        self._still = all(
+            type(motion) is Still and not any(part.flags.writeable for part in motion.pose[:4])
+            for motion in self._motions[: len(frames)]
+        )
+        self._written = False  # whether the frames are the poses of motions that never change
         self._named_views = [*zip(self._names, self._frame_views, strict=False)]
         every = np.arange(max(len(frames), len(self._others)))
         self._every, self._kind = every, np.full(len(every), SAMPLE)
@@ -66,9 +71,12 @@ class TargetReader:
         count = len(self._frames)
         if not targets:
             samples = [motion.sample(t) for motion in self._motions]
-            for view, sample in zip(self._frame_views, samples):  # noqa: B905 (strict costs as much as the copying)
-                view[0][:], view[1][:], view[2][:], view[3][:] = sample[:4]
+            if not (self._still and self._written):
+                for view, sample in zip(self._frame_views, samples):  # noqa: B905 (strict costs as much as the copying)
+                    view[0][:], view[1][:], view[2][:], view[3][:] = sample[:4]
+                self._written = True
             return samples, (), ()
+        self._written = False
         if len(targets) == count == len(self._list) and self._write(targets):
             return [targets[name] for name in self._names], (), ()
         samples, given, other, faults = [], list[int](), list[int](), list[Reason]()

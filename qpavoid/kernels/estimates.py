@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from qpavoid.kernels.obstacles import POSE, REST, SAMPLE, check_states, update_measured_states
+from qpavoid.kernels.obstacles import FINE, POSE, REST, SAMPLE, check_states, update_measured_states
 from qpavoid.kernels.packing import compiled
 from qpavoid.problem import Array, IntArray
 
@@ -30,7 +30,7 @@ def count_faults(
     codes[:], off[:] = check_states(states, which, kind, max_position, max_speed)
     count = 0
     for code in codes:
-        count += code != 0
+        count += code != FINE
     return count
 
 
@@ -45,7 +45,10 @@ def are_fine(states: Array, max_position: float, max_speed: float) -> bool:
     """
     k = len(states)
     codes, _ = check_states(states.copy(), np.arange(k), np.full(k, SAMPLE), max_position, max_speed)
-    return not codes.any()
+    faults = 0
+    for code in codes:
+        faults += code != FINE
+    return faults == 0
 
 
 @compiled

@@ -13,7 +13,8 @@ from qpavoid.config import Mesh, PointCloud, ScenarioConfig
 from qpavoid.config.loading import load_scenario
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.tasks.frames import in_order
-from qpavoid.controller import Controller, Tick
+from qpavoid.control.tick import Tick
+from qpavoid.controller import Controller
 from qpavoid.errors import ConfigError, NumericalError
 from qpavoid.geometry.bodies import enclosing_capsule
 from qpavoid.model.scene import PARKING_DISTANCE, Scene

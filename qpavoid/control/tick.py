@@ -1,0 +1,33 @@
+"""Everything that one control step computed, for logs and figures."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from qpavoid.model.kinematics import Kinematics
+from qpavoid.problem import Array, Problem, Proximity, Solution, State
+
+
+class Tick(NamedTuple):
+    """Everything that one tick computed."""
+
+    state: State
+    targets: tuple[Any, ...]
+    """One for each of the controller's tasks."""
+    errors: Array
+    """How far each of the tasks that are not frames was from its target, in its unit."""
+    kinematics: Kinematics
+    proximity: Proximity
+    problem: Problem
+    solution: Solution
+
+
+def copied(value: Any) -> Any:
+    """The same with arrays of its own: what a tick computed stays as it was when the next one comes."""
+    if isinstance(value, np.ndarray):
+        return value.copy()
+    if hasattr(value, "_fields"):
+        return type(value)(*map(copied, value))
+    return value
