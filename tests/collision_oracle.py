@@ -61,7 +61,7 @@ def configuration(model, positions):
 
 
 def draw(model, random):
-    """Positions of all joints, even over their ranges; all the way round where they have none."""
+    """Positions of all joints, even over their ranges; a full turn where they have none."""
     found = {}
     for name, joint in zip(list(model.names)[1:], list(model.joints)[1:], strict=True):
         if joint.nv == 1 and joint.shortname() != "JointModelMimic":

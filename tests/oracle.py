@@ -1,7 +1,7 @@
 """Signed distances of convex bodies from their support functions alone, by brute force over directions.
 
 The signed distance of A and B is the largest gap -(h_A(n) + h_B(-n)) over all unit vectors n from A to B: apart, that
-is the separating direction; in penetration, the shortest way out.
+is the separating direction; in penetration, the shortest separation.
 """
 
 import coal

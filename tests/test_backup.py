@@ -613,7 +613,7 @@ def test_prediction_uses_the_mean_twist():
         obstacles.observe(t, {"ball": Pose.at(at + 0.005 * rng.normal(size=3))})
         if k == 1:
             first = obstacles.estimates.states[0, 12:15]
-            np.testing.assert_array_equal(first, obstacles._seen.states[0, 12:15])  # of one twist, that is the mean
+            np.testing.assert_array_equal(first, obstacles._current.states[0, 12:15])  # of one twist, that is the mean
         if k > 50:
             off.append(obstacles.predicted(t + 1.0).states[0, 9:12] - at - [0.2, 0.0, 0.0])
             places, _ = obstacles.paths(np.array([t + 1.0]))

@@ -1,4 +1,4 @@
-"""Frames at rest: held exactly by every back end, whatever gives way; and a humanoid that reaches without sliding."""
+"""Frames at rest: held exactly by every back end, whatever is relaxed; and a humanoid that reaches without sliding."""
 
 import numpy as np
 import pinocchio as pin

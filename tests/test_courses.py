@@ -171,7 +171,7 @@ def test_states_move_on_at_their_twists(data):
 
 
 def memory(rng, obstacles, loads, centred):
-    """Of a scene that nobody has built: obstacle i has i % 3 bodies; five bodies before them are the robot's."""
+    """Of a scene that was never built: obstacle i has i % 3 bodies; five bodies before them are the robot's."""
     owner = np.concatenate([np.full(5, -1), np.repeat(np.arange(obstacles), np.arange(obstacles) % 3)])
     local = rng.normal(size=(len(owner), 3)) * (not centred)
     return owner, kernels.ObstacleArrays(

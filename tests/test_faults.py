@@ -107,8 +107,8 @@ def test_a_blind_stop_ends_at_rest_inside_the_joint_limits(panda):
     upper, command = panda.model.upperPositionLimit, np.r_[2.0, np.zeros(5), -1.0]
     blind = None
     for k in range(400):
-        told = np.full(7, NAN) if blind is not None else q
-        solution = controller.filter(told, command)
+        q_given = np.full(7, NAN) if blind is not None else q
+        solution = controller.filter(q_given, command)
         if blind is None and solution.v[0] < 1.5 and q[0] > 2.0:
             blind = k
         q = q + 0.01 * solution.v

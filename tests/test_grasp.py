@@ -318,8 +318,8 @@ def test_wrong_calls_are_named_with_a_remedy(panda):
         controller.attach("box", "universe")
     with pytest.raises(ConfigError, match="not carried"):
         controller.release("box")
-    with pytest.raises(UnknownName, match="no body or obstacle 'nobody'"):
-        controller.allow_contact("box", [TCP_BODY, "nobody"])
+    with pytest.raises(UnknownName, match="no body or obstacle 'no_one'"):
+        controller.allow_contact("box", [TCP_BODY, "no_one"])
     with pytest.raises(UnknownName, match="no body or obstacle 3"):
         controller.allow_contact("box", [3])
     with pytest.raises(UnknownName, match="list of names"):

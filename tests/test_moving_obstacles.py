@@ -102,7 +102,7 @@ def test_trajectory_twist_and_pose_stream_agree(course):
 def test_an_estimated_twist_is_the_difference_quotient_also_after_a_gap(panda):
     controller = make_controller(panda, [Obstacle.at("ball", Sphere(radius=0.05), [0.5, 0, 0.8])], "panda_hand_tcp")
     speed = np.array([0.1, -0.2, 0.05])
-    for k in (0, 1, 2, 5, 6):  # nothing is heard of it in ticks 3 and 4
+    for k in (0, 1, 2, 5, 6):  # it is not updated in ticks 3 and 4
         seen = {"ball": Pose.at([0.45, 0.0, 0.7] + 0.01 * k * speed)}
         tick = controller.tick(panda.home, 0.01 * k, None, seen)
         for later in (0.03, 0.04) if k == 2 else ():

@@ -1,4 +1,4 @@
-"""Bodies that overlap already: signed normals, a bounded way out, the margin restored and then held."""
+"""Bodies that overlap already: signed normals, a bounded recovery, the margin restored and then held."""
 
 import numpy as np
 import pinocchio as pin
@@ -65,7 +65,7 @@ def test_it_moves_out_at_a_bounded_speed_and_stays_out(tmp_path, name, recovery)
     assert distances[0] < -0.02
     assert np.linalg.norm(vs, axis=1).max() < recovery + 0.05
     assert np.abs(vs).max() <= 1.0 and accelerations(vs, 0.01).max() <= 4.0 + 1e-6
-    assert (np.diff(distances) > -1e-3).all()  # on the way out and for ever after
+    assert (np.diff(distances) > -1e-3).all()  # during recovery and after it
     assert distances[-1] > D1 - 1e-3
     restored = np.argmax(distances > D1 - 1e-3)
     assert restored < (D1 - start) / recovery / 0.01 + 200

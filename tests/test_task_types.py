@@ -221,7 +221,7 @@ def controller_of(robot, *tasks, **settings):
 
 
 def test_a_camera_keeps_looking_at_a_point_that_moves(panda):
-    """The feed-forward leaves no lag; from behind it turns all the way round."""
+    """The feed-forward leaves no lag; from behind it turns through a full turn."""
     circle = config.Circle(center=(0.6, 0.0, 0.2), radius=0.2, period=6.0)
     tasks = build_tasks([config.LookAtTask(frame="panda_hand", motion=circle, gain=4.0)], panda, panda.home)
     controller = Controller(build_scene(panda), tasks, dt=0.01)
@@ -304,7 +304,7 @@ def test_two_hands_on_one_object():
 
 
 @pytest.mark.parametrize(
-    ("block", "told"),
+    ("block", "message"),
     [
         (config.Task(frame="hand"), "tasks.0.frame: panda has no frame 'hand'"),
         (config.RelativeTask(frame="panda_hand", relative_to="x"), "tasks.0.relative_to: panda has no frame 'x'"),
@@ -315,8 +315,8 @@ def test_two_hands_on_one_object():
         (config.LookAtTask(frame="panda_hand", motion=config.Fixed()), "tasks.0: motion.position is missing"),
     ],
 )
-def test_what_cannot_be_used_is_named(panda, block, told):
-    with pytest.raises(ConfigError, match=told.replace(".", r"\.")):
+def test_what_cannot_be_used_is_named(panda, block, message):
+    with pytest.raises(ConfigError, match=message.replace(".", r"\.")):
         build_tasks([block], panda, panda.home)
 
 
@@ -324,13 +324,13 @@ def test_targets_of_the_wrong_kind(panda):
     controller = controller_of(
         panda, config.Task(frame="panda_hand_tcp"), config.PostureTask(weight=1e-3), config.DampingTask(weight=1e-3)
     )
-    for name, target, told in [
+    for name, target, message in [
         ("posture", np.zeros(3), r"target 'posture': q: shape \(3,\), expected \(7,\)"),
         ("posture", Sample.at([0, 0, 0]), "target 'posture'"),
         ("damping", np.zeros(7), "target 'damping': a task of type damping takes none"),
         ("panda_hand_tcp", np.zeros(3), r"target 'panda_hand_tcp': neither .*; give Sample.at\(position"),
     ]:
-        with pytest.raises(NumericalError, match=told):
+        with pytest.raises(NumericalError, match=message):
             controller.step(panda.home, targets={name: target})
     with pytest.raises(UnknownName, match="no target 'postur'; did you mean 'posture'"):
         controller.step(panda.home, targets={"postur": panda.home})

@@ -31,15 +31,15 @@ def lay_out(
     dt: float,
     looks_ahead: bool = False,
 ) -> RowLayout:
-    """The layout of a controller, or of flights; see `RowLayout`.
+    """Lay out the memory of a controller or a rollout; see `RowLayout`.
 
     Args:
         scene: robot and obstacles.
         frames: frames that follow motions, those with a position first.
         others: all other tasks.
         bounds: limits of the joints.
-        kinematics: whose memory is looked into.
-        query: likewise.
+        kinematics: whose arrays the layout views.
+        query: distances, whose arrays it views.
         avoidance: distances and rows.
         limits: use of the joint limits.
         damping: λ of the tracking law [-].

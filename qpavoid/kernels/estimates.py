@@ -63,7 +63,7 @@ def write_states(
         positions: (k, 3) [m].
         rotations: (k, 3, 3) body axes to world axes.
         linear: (k, 3) or (0, 3) for zero [m/s].
-        angular: likewise [rad/s].
+        angular: (k, 3) or (0, 3) for zero [rad/s].
     """
     for k in range(len(which)):
         x = states[which[k]]

@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from qpavoid.kernels.cholesky import dot, extend_factor, factorise, solve_factored
 from qpavoid.kernels.packing import compiled
 from qpavoid.problem import Array, IntArray
 
@@ -163,7 +164,7 @@ def minimize(P: Array, x: Array, G: Array, h: Array, lower: Array, upper: Array,
     """
     n, m = len(x), len(h)
     L = np.zeros((n, n))
-    _factorise(P, L, n)
+    factorise(P, L, n)
     capacity = n + np.count_nonzero(soft)  # constraints that can be active at a time
     N, W = np.zeros((capacity + 1, n)), np.zeros((capacity + 1, n))
     S, R = np.zeros((capacity + 1, capacity + 1)), np.zeros((capacity + 1, capacity + 1))
@@ -181,19 +182,19 @@ def minimize(P: Array, x: Array, G: Array, h: Array, lower: Array, upper: Array,
         if np.isnan(violation):
             return False
         _write_normal(p, N[count], G)
-        _solve(L, N[count], W[count], n)
+        solve_factored(L, N[count], W[count], n)
         u[count] = 0.0
         softness = soft[p - 2 * n] if p >= 2 * n else 0.0
-        square = _dot(N[count], W[count]) + softness
+        square = dot(N[count], W[count]) + softness
         while True:
             for j in range(count):
-                S[count, j] = _dot(N[j], W[count])
-            _solve(R, S[count], r, count)
+                S[count, j] = dot(N[j], W[count])
+            solve_factored(R, S[count], r, count)
             z[:] = W[count]
             for j in range(count):
                 for i in range(n):
                     z[i] -= r[j] * W[j, i]
-            curvature = _dot(N[count], z) + softness
+            curvature = dot(N[count], z) + softness
             # the longest step that keeps all multipliers positive, and the one that reaches the constraint
             dual_step, leaving = np.inf, -1
             for j in range(count):
@@ -213,7 +214,7 @@ def minimize(P: Array, x: Array, G: Array, h: Array, lower: Array, upper: Array,
             _update_soft_row(p, u[count], bound, h, soft, n)
             if reachable and step == violation / curvature:
                 S[count, count] = square
-                _extend(S, R, count)
+                extend_factor(S, R, count)
                 active[count], met[p] = p, True
                 count += 1
                 break
@@ -239,53 +240,6 @@ def _update_soft_row(p: int, multiplier: float, bound: Array, h: Array, soft: Ar
     """
     if p >= 2 * n:
         bound[p - 2 * n] = h[p - 2 * n] - soft[p - 2 * n] * multiplier
-
-
-@compiled
-def _dot(a: Array, b: Array) -> float:
-    """Compute aᵀb of two vectors (n,)."""
-    total = 0.0
-    for i in range(len(a)):
-        total += a[i] * b[i]
-    return total
-
-
-@compiled
-def _factorise(M: Array, L: Array, n: int) -> None:
-    """Write to L the lower Cholesky factor of the first n rows and columns of M; see `_extend`."""
-    for i in range(n):
-        _extend(M, L, i)
-
-
-@compiled
-def _extend(M: Array, L: Array, i: int) -> None:
-    """Write row i of the Cholesky factor L of M, given the rows before.
-
-    It is NaN where M is not positive definite. The diagonal has the inverses: 1 / L_ii, as divisions are slow.
-    """
-    for j in range(i):
-        total = M[i, j]
-        for c in range(j):
-            total -= L[i, c] * L[j, c]
-        L[i, j] = total * L[j, j]
-    total = M[i, i]
-    for c in range(i):
-        total -= L[i, c] * L[i, c]
-    L[i, i] = 1.0 / np.sqrt(total)
-
-
-@compiled
-def _solve(L: Array, b: Array, y: Array, n: int) -> None:
-    """Solve L Lᵀ y = b of the first n rows and columns; the diagonal of L is inverted."""
-    for i in range(n):
-        total = b[i]
-        for c in range(i):
-            total -= L[i, c] * y[c]
-        y[i] = total * L[i, i]
-    for i in range(n - 1, -1, -1):
-        y[i] *= L[i, i]
-        for c in range(i):
-            y[c] -= L[i, c] * y[i]
 
 
 @compiled
@@ -315,7 +269,7 @@ def _drop(N: Array, W: Array, S: Array, R: Array, active: IntArray, u: Array, le
         N: normals (·, n).
         W: P⁻¹ times these (·, n).
         S: lower triangle of NᵀW.
-        R: its Cholesky factor, see `_extend`.
+        R: its Cholesky factor, see `extend_factor`.
         active: numbers of the active constraints.
         u: their multipliers, then that of the entering one.
         leaving: place of the constraint in `active`.
@@ -327,7 +281,7 @@ def _drop(N: Array, W: Array, S: Array, R: Array, active: IntArray, u: Array, le
         active[j] = active[j + 1]
         for c in range(j + 1):
             S[j, c] = S[j + 1, c if c < leaving else c + 1]
-        _extend(S, R, j)
+        extend_factor(S, R, j)
 
 
 @compiled
