@@ -1,4 +1,4 @@
-"""Frames that rest on the ground: rows J v = 0 that never give way.
+"""Frames that rest on the ground: rows J v = 0 that are never relaxed.
 
 They are solved before anything else: with an orthonormal basis Z of the velocities that move no contact, v = rest + Z w
 for any w, and all tasks, rows and bounds become ones of w. So they come before tracking, avoidance and acceleration

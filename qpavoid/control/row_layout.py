@@ -31,7 +31,7 @@ def lay_out(
     dt: float,
     looks_ahead: bool = False,
 ) -> RowLayout:
-    """The layout of a controller, or of flights; see `RowLayout`.
+    """Lay out memory of a controller, or of backup trajectories; see `RowLayout`.
 
     Args:
         scene: robot and obstacles.
@@ -39,7 +39,7 @@ def lay_out(
         others: all other tasks.
         bounds: limits of the joints.
         kinematics: whose memory is looked into.
-        query: likewise.
+        query: distances of the scene.
         avoidance: distances and rows.
         limits: use of the joint limits.
         damping: λ of the tracking law [-].
@@ -60,7 +60,7 @@ def lay_out(
         twists=query.placing.twists,
         twist_row=query.twist_row,
         margin=query.placing.margin,
-        slack=scene.slack(avoidance.hold - avoidance.offset),
+        distance_allowance=scene.distance_allowance(avoidance.hold - avoidance.offset),
         joint_poses=kinematics.joint_poses,
         parents=np.array(list(model.parents), dtype=np.intp),
         column_joints=column_joints(model),

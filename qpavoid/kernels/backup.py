@@ -40,7 +40,7 @@ def backup_rows(
     for i in range(k):
         if not enabled[x.near[i]]:
             continue
-        distance, slack = x.closest[i, 0], x.slack[x.near[i]]
+        distance, slack = x.closest[i, 0], x.distance_allowance[x.near[i]]
         nearest = np.minimum(nearest, distance + slack)  # keeps NaN, unlike min
         if not distance >= touch:
             enabled[x.near[i]] = False

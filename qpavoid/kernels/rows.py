@@ -87,7 +87,7 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
         moving: whether any obstacle moves or has a margin.
     """
     for i in range(k):
-        slack = x.slack[x.near[i]]
+        slack = x.distance_allowance[x.near[i]]
         d = x.closest[i, 0] + x.offset - x.margin[x.twist_row[x.near[i]]] + slack
         value = x.row_gain * (x.hold - d)
         parting = value > 0.0

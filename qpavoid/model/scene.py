@@ -108,7 +108,7 @@ class Scene:
         """Names of the obstacles."""
         return [obstacle.name for obstacle in self.obstacles]
 
-    def slack(self, hold: float) -> Array:
+    def distance_allowance(self, hold: float) -> Array:
         """By how much the safety distance of each pair is less than that of the scenario (m,) [m].
 
         Args:

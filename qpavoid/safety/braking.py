@@ -104,7 +104,7 @@ class BrakingCheck:
         self._bounds, self._rate = bounds, position_gain / dt
         self._acceleration, self._accelerated = bounds.acceleration, bool(np.isfinite(bounds.acceleration).any())
         self._jerked = bool(np.isfinite(bounds.jerk).any())
-        self._given, self._slack = np.zeros(len(scene.pairs)), scene.slack(hold)
+        self._given, self._distance_allowance = np.zeros(len(scene.pairs)), scene.distance_allowance(hold)
         self._least = np.inf  # distance of any pair in the looks along the velocity under test [m]
         self._news, self._heard = np.zeros(len(scene.obstacles), dtype=bool), False
 
@@ -315,7 +315,10 @@ class BrakingCheck:
         pairs = ahead.pairs
         if not len(pairs):
             return _FARTHEST, -1
-        there, here = ahead.found(pairs) + self._slack[pairs], now.found(pairs) + self._slack[pairs]
+        there, here = (
+            ahead.found(pairs) + self._distance_allowance[pairs],
+            now.found(pairs) + self._distance_allowance[pairs],
+        )
         margins = ahead.placing.margin
         if margins.any():
             margin = margins[ahead.twist_row[pairs]]
