@@ -164,7 +164,7 @@ def make_layout(nv, frames=0, turns=(), pairs=0, obstacles=0, joints=1, **fields
         "task_support": np.ones((rows, nv)), "row_wrenches": row_wrenches, "results": np.zeros((pairs, 10)),
         "support": np.ones((pairs, nv)), "twists": np.zeros((obstacles + 1, 6)),
         "twist_row": np.full(pairs, obstacles), "margin": np.zeros(obstacles + 1),
-        "slack": np.zeros(pairs),
+        "distance_allowance": np.zeros(pairs),
         "joint_poses": np.zeros((joints, 12)), "joint_radius": np.zeros(joints),
         "parents": np.maximum(np.arange(joints) - 1, 0), "column_joints": np.full(nv, joints - 1),
         "chain_rotation": np.ones((1, nv)), "chain_translation": np.zeros((1, nv)), "lever_arm": 1.0,

@@ -335,7 +335,7 @@ def test_slack_moves_the_safety_distance_of_a_pair():
     """A pair with slack s has the row of one that is s farther away, but touches where it touches."""
     d, slack = np.array([0.02, 0.06, 0.2]), np.array([0.09, 0.0, 0.05])
     fields = {"offset": 0.01, "beta": False, "row_gain": 5.0, "safety_distance": 0.1}
-    x, y = rows_at(d, slack=slack, **fields), rows_at(d + slack, **fields)
+    x, y = rows_at(d, distance_allowance=slack, **fields), rows_at(d + slack, **fields)
     z = rows_at(d, **fields)
     for layout in (x, y, z):
         run("row_bounds", layout, 3, False)

@@ -150,7 +150,7 @@ class DistanceQuery:
             self.placing.reaches(index, slots.reach)
 
     def carry(self, index: int, joint: int, sample: Sample) -> None:
-        """Attach an obstacle to a joint from now on, or to none.
+        """Attach an obstacle to a joint, or release it.
 
         Args:
             index: number of the obstacle.

@@ -104,13 +104,13 @@ class MeasuredStates:
 def prediction_error_bound(
     now: ObstacleEstimates | None, before: ObstacleEstimates | None, span: float, reach: Array
 ) -> float:
-    """Bound the error of predicted obstacle positions, now and for some time [m].
+    """Bound how far any point of an obstacle is from its prediction, now and for some time [m].
 
     Positions and rotations that are off by δp and δR, and twists by δv and δω, leave a point that is r from the
     origin no farther off than |δp| + t |δv| + r (‖δR‖ + t |δω|) after t.
 
     Args:
-        now: estimates of the step.
+        now: current estimates.
         before: estimates that the prediction was made of.
         span: for how long it counts [s].
         reach: distance from each obstacle's origin to its farthest point (o,) [m].

@@ -220,7 +220,7 @@ class ObstacleTracker:
             NumericalError: an entry of the wrong shape, or not made of numbers; a trajectory of another class gives
                 what cannot be true.
         """
-        if updates is not None and not isinstance(updates, Mapping):
+        if updates is not None and type(updates) is not dict and not isinstance(updates, Mapping):
             raise NumericalError(f"obstacles: give a mapping of names to samples, not {updates!r:.60}")
         if updates:
             given = self._reader.read(t, updates, shift)

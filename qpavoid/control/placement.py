@@ -38,7 +38,7 @@ class ObstaclePlacement:
         """(o + 1 + c, 6) of the obstacles at the world's origin; row o stays zero: for the robot and its loads.
         The last c are those of the obstacles that can be carried, negative: for pairs of which they come first."""
         self.margin = np.zeros(len(self.twists))
-        """(o + 1 + c,) to be taken off the distances to each obstacle [m]."""
+        """(o + 1 + c,) to be taken off the distances to each obstacle, in the same order [m]."""
         self.speeds = np.zeros(joints + count)
         """(njoints + o,) largest speed of any point that a joint carries, or of an obstacle [m/s]; here, the latter."""
         self.moving = False
@@ -89,7 +89,7 @@ class ObstaclePlacement:
         Args:
             which: their numbers (k,), of none that is carried; quickest if it is the same array as the time before.
             states: of all obstacles; read where `which` says (o, 18).
-            margin: to be taken off the distances to each obstacle, (o,) [m].
+            margin: to be taken off the distances to each obstacle (o,) [m].
 
         Raises:
             NumericalError: NaN or infinity; names the obstacle. All stay where they were.

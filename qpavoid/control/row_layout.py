@@ -31,15 +31,15 @@ def lay_out(
     dt: float,
     looks_ahead: bool = False,
 ) -> RowLayout:
-    """Lay out the memory of a controller or a rollout; see `RowLayout`.
+    """Lay out memory of a controller, or of backup trajectories; see `RowLayout`.
 
     Args:
         scene: robot and obstacles.
         frames: frames that follow motions, those with a position first.
         others: all other tasks.
         bounds: limits of the joints.
-        kinematics: whose arrays the layout views.
-        query: distances, whose arrays it views.
+        kinematics: whose memory is looked into.
+        query: distances of the scene.
         avoidance: distances and rows.
         limits: use of the joint limits.
         damping: λ of the tracking law [-].
@@ -60,7 +60,7 @@ def lay_out(
         twists=query.placing.twists,
         twist_row=query.twist_row,
         margin=query.placing.margin,
-        slack=scene.slack(avoidance.safety_distance - avoidance.offset),
+        distance_allowance=scene.distance_allowance(avoidance.safety_distance - avoidance.offset),
         joint_poses=kinematics.joint_poses,
         parents=np.array(list(model.parents), dtype=np.intp),
         column_joints=column_joints(model),

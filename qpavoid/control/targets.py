@@ -66,7 +66,7 @@ class TargetReader:
             UnknownName: there is no such task.
             NumericalError: a target of the wrong shape, or not made of numbers.
         """
-        if targets is not None and not isinstance(targets, Mapping):
+        if targets is not None and type(targets) is not dict and not isinstance(targets, Mapping):
             raise NumericalError(f"targets: give a mapping of names to targets, not {targets!r:.60}")
         count = len(self._frames)
         if not targets:

@@ -40,7 +40,7 @@ def backup_rows(
     for i in range(k):
         if not enabled[x.near_pairs[i]]:
             continue
-        distance, slack = x.closest[i, 0], x.slack[x.near_pairs[i]]
+        distance, slack = x.closest[i, 0], x.distance_allowance[x.near_pairs[i]]
         nearest = np.minimum(nearest, distance + slack)  # keeps NaN, unlike min
         if not distance >= touch:
             enabled[x.near_pairs[i]] = False

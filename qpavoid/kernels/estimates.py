@@ -36,15 +36,15 @@ def count_faults(
 
 @compiled
 def are_fine(states: Array, max_position: float, max_speed: float) -> bool:
-    """Return True if `check_states` finds all of some samples FINE; these stay as they are.
+    """Return True if `check_states` finds all of some samples FINE.
 
     Args:
-        states: (k, 18).
+        states: (k, 18), normalised in place.
         max_position: largest coordinate of a position [m].
         max_speed: largest component of a twist [m/s, rad/s].
     """
     k = len(states)
-    codes, _ = check_states(states.copy(), np.arange(k), np.full(k, SAMPLE), max_position, max_speed)
+    codes, _ = check_states(states, np.arange(k), np.full(k, SAMPLE), max_position, max_speed)
     faults = 0
     for code in codes:
         faults += code != FINE

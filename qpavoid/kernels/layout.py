@@ -62,7 +62,7 @@ class RowLayout(NamedTuple):
     """(m,) row of `twists` that moves each pair's second body."""
     margin: Array
     """(o + 1,) taken off the distances to each obstacle, for its uncertainty [m]; the last one stays zero."""
-    slack: Array
+    distance_allowance: Array
     """(m,) added to the distance of a pair whose own safety distance is below `safety_distance`: the difference [m]."""
     joint_poses: Array
     """(J, 12) world poses of all joints: rotation by columns, then origin [m]; row 0 is the world."""

@@ -100,7 +100,7 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
         moving: whether any obstacle moves or has a margin.
     """
     for i in range(k):
-        slack = x.slack[x.near_pairs[i]]
+        slack = x.distance_allowance[x.near_pairs[i]]
         d = x.closest[i, 0] + x.offset - x.margin[x.twist_row[x.near_pairs[i]]] + slack
         rate = x.row_gain * (x.safety_distance - d)
         separating = rate > 0.0

@@ -110,7 +110,7 @@ class Scene:
         """Names of the obstacles."""
         return [obstacle.name for obstacle in self.obstacles]
 
-    def slack(self, safety_distance: float) -> Array:
+    def distance_allowance(self, safety_distance: float) -> Array:
         """Return how much smaller each pair's safety distance is than the scenario's (m,) [m].
 
         Args:

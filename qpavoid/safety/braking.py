@@ -106,7 +106,10 @@ class BrakingCheck:
         self._bounds, self._rate = bounds, position_gain / dt
         self._acceleration, self._accelerated = bounds.acceleration, bool(np.isfinite(bounds.acceleration).any())
         self._jerked = bool(np.isfinite(bounds.jerk).any())
-        self._allowance, self._slack = np.zeros(len(scene.pairs)), scene.slack(safety_distance)
+        self._allowance, self._distance_allowance = (
+            np.zeros(len(scene.pairs)),
+            scene.distance_allowance(safety_distance),
+        )
         self._min_distance = np.inf  # of any pair along the velocity under test [m]
         self._updated, self._has_updates = np.zeros(len(scene.obstacles), dtype=bool), False
 
@@ -323,7 +326,8 @@ class BrakingCheck:
         pairs = query.pairs
         if not len(pairs):
             return _MAX_MARGIN, -1
-        later, present = query.found(pairs) + self._slack[pairs], now.found(pairs) + self._slack[pairs]
+        allowance = self._distance_allowance[pairs]
+        later, present = query.found(pairs) + allowance, now.found(pairs) + allowance
         margins = query.placing.margin
         if margins.any():
             margin = margins[query.twist_row[pairs]]
