@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping, Sequence
 from copy import copy
 from time import perf_counter
@@ -34,7 +33,6 @@ from qpavoid.safety.arbiter import Arbiter
 from qpavoid.safety.pipeline import NO_BACKUP_WITH_CONTACTS, Pipeline, check_solver
 from qpavoid.solvers import SOLVERS, Solver, make_solver
 
-_log = logging.getLogger(__name__)
 _MAX_DT = 1.0
 """Largest control period that is accepted [s]: a longer one is in milliseconds."""
 
@@ -120,7 +118,6 @@ class Controller(Pipeline):
         kernels.first_use.end()
         self.warm_up_time = perf_counter() - begin
         """Time to lay out memory and run the first steps, compilation included [s]; no later step compiles."""
-        _log.info("warmed up in %.3f s", self.warm_up_time)
 
     @property
     def solver(self) -> Solver:
