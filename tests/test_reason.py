@@ -216,3 +216,10 @@ def test_every_stop_alarms(tmp_path, what):
     assert Severity.ALARM in [reason.severity for reason in solution.reasons]
     kind = {"law": ReasonKind.SOLVER_FAILED, "stale": ReasonKind.STALE}.get(what, ReasonKind.IMPLAUSIBLE)
     assert kind in [reason.kind for reason in solution.reasons]
+
+
+def test_solution_with_times_changes_the_two_times_alone():
+    """Whatever fields a solution has: they are passed by position."""
+    solution = Solution(*[object() for _ in Solution._fields])
+    timed = solution.with_times(1.0, 2.0)
+    assert timed == solution._replace(build_time=1.0, solve_time=2.0)
