@@ -123,7 +123,7 @@ def test_checker_finds_no_false_contact():
     mujoco_model, log = situation("qp")
     findings = referee(mujoco_model, log)
     assert findings.contacts == ()
-    assert findings.distance == pytest.approx(0.02, abs=1e-3)
+    assert findings.distance > 0.08  # d1
     assert findings.distance == pytest.approx(log.min_distance.min(), abs=1e-4)
     assert disagreement(mujoco_model, log, findings) < 1e-6 and drift(log, findings) < 1e-9
 
@@ -350,7 +350,7 @@ def test_tracking_alone_collides_and_could_have_avoided_it():
 
 def test_the_report_has_every_run(tmp_path):
     found = small_campaign("qp", 15) + small_campaign("tracking", 8)
-    text = report.write(found, {99: "ValueError: no"}, ("qp", "tracking"), report.Took(60.0, (0.1, 0.2)), tmp_path, "s")
+    text = report.write(found, {99: "ValueError: no"}, ("qp", "tracking"), report.Cost(60.0, (0.1, 0.2)), tmp_path, "s")
     assert (tmp_path / "s.md").read_text() == text
     assert len((tmp_path / "s.csv").read_text().splitlines()) == 1 + len(found)
     assert "seed 99: ValueError: no" in text

@@ -34,7 +34,10 @@ def tables():
         yield [dict(zip(lines[0], line, strict=True)) for line in lines[2:]]
 
 
-FIGURES = [rows for rows in tables() if "Σ|Δq̇| [rad/s]" in rows[0]]
+FIGURES = [
+    rows for rows in tables() if "Σ|Δq̇| [rad/s]" in rows[0] and not any(" / " in cell for cell in rows[0].values())
+]
+"""Tables of single runs; the one of ratios has two figures in a cell."""
 COMMANDS = re.findall(r"^    qpavoid (compare .*)$", PAGE, re.M)
 
 

@@ -80,7 +80,7 @@ def refusal(name: str, folder: Path) -> str:
         assert np.isfinite(pin.computeJointJacobians(found.model, data, found.home)).all()
         assert np.all(found.bounds().lower < found.bounds().upper)
     if name == "path.csv":
-        assert all(np.isfinite(part).all() for t in (-1.0, 0.05, 0.5, 9.0) for part in found.sample(t))
+        assert all(np.isfinite(part).all() for t in (-1.0, 0.05, 0.5, 9.0) for part in found.sample(t)[:4])
     return ""
 
 
@@ -428,7 +428,7 @@ def test_log_with_an_array_of_any_header(header, arrays, tmp_path):
 
 
 def test_log_that_unpacks_to_more_than_memory_holds(tmp_path, monkeypatch):
-    monkeypatch.setattr("qpavoid.run.log._LARGEST", 20_000_000)
+    monkeypatch.setattr("qpavoid.run.log._MAX_SIZE", 20_000_000)
     with zipfile.ZipFile(tmp_path / "run.npz", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("t.npy", bytes(30_000_000))
     assert (tmp_path / "run.npz").stat().st_size < 100_000

@@ -105,7 +105,7 @@ def test_the_first_compilation_is_announced_and_timed_and_no_other(installed, tm
 
 def test_a_controller_ends_the_first_use():
     """All that its construction compiles is on disk, in the user's cache or where NUMBA_CACHE_DIR says."""
-    assert (FOLDER / "complete").exists() and any(FOLDER.glob("tick.assemble-*.code"))
+    assert (FOLDER / "complete").exists() and any(FOLDER.glob("step.assemble-*.code"))
 
 
 def test_an_unwritable_cache_is_named_and_optional(installed, tmp_path):

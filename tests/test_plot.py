@@ -361,7 +361,7 @@ def test_compared_curves_are_those_of_the_logs(sphere):
     distance, _, error, speed = compare_time_figure(sphere).axes
     for log in sphere:
         name = log.meta["solver"]
-        assert_allclose(lines(distance)[name].get_ydata(), log.min_distance + 0.10)
+        assert_allclose(lines(distance)[name].get_ydata(), log.min_distance)
         assert_allclose(lines(error)[name].get_ydata(), np.linalg.norm(log.target - log.tool, axis=2)[:, 0], atol=1e-8)
         assert_allclose(lines(speed)[name].get_ydata(), np.abs(log.v).max(axis=1))
 

@@ -171,7 +171,7 @@ class UpdateReader:
         flags = set(map(type, rests))
         if flags != {bool} or True in rests:
             kind = np.where(_flags(names, samples), REST, kind)
-        if times.count(None) == len(times):
+        if all(time is None for time in times):
             stamps = np.full(len(times), t)
         else:
             stamps = np.array([_stamp(name, sample, t) for name, sample in zip(names, samples, strict=True)])
