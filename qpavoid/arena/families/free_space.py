@@ -26,12 +26,6 @@ def placed_bodies(robot: Robot, q: Array) -> list[tuple[int, Any, Any]]:
     ]
 
 
-def as_placed_shape(geometry: Any) -> PlacedShape:
-    """Return a geometry's shape and its placement in the frame that it is fixed to."""
-    place = geometry.placement
-    return geometry.geometry, coal.Transform3s(place.rotation, place.translation)
-
-
 def min_distance(shape: Any, placement: Any, other_shapes: Sequence[PlacedShape]) -> float:
     """Return the smallest distance of a shape from others [m]; negative inside, inf from none."""
     request = coal.DistanceRequest()
