@@ -277,5 +277,5 @@ def test_unknown_and_missing_solvers_are_named():
         make_solver("eq1O")
     with pytest.raises(UnknownName, match="usable are daqp"):
         make_solver("qp:nope")
-    with pytest.raises(SolverNotInstalled, match="pip install gurobipy"):
+    with pytest.raises(SolverNotInstalled, match="pip install 'qpsolvers\\[gurobi\\]'"):
         make_backend("gurobi")
