@@ -24,19 +24,19 @@ pytest.importorskip("mujoco")
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from qpavoid.arena import commands, store, sweep
-from qpavoid.arena.entrant_file import entrant_from_file
-from qpavoid.arena.entrants import ENTRANTS
-from qpavoid.arena.families import load_family, make_case
-from qpavoid.arena.plan import cases_of, is_complete, missing_cases, missing_runs, runs_of
-from qpavoid.arena.scores import COLUMNS, KEY
-from qpavoid.arena.store import Store, read_cases, read_runs
-from qpavoid.arena.suite import EntrantConfig, load_suite, origin
-from qpavoid.arena.summary import find_faults, summary
-from qpavoid.arena.trial import run_trial
-from qpavoid.arena.world import build_world
 from qpavoid.config.shipped import family_names, suite_names
 from qpavoid.errors import ConfigError, UnknownName
+from qpavoid_bench.arena import commands, store, sweep
+from qpavoid_bench.arena.entrant_file import entrant_from_file
+from qpavoid_bench.arena.entrants import ENTRANTS
+from qpavoid_bench.arena.families import load_family, make_case
+from qpavoid_bench.arena.plan import cases_of, is_complete, missing_cases, missing_runs, runs_of
+from qpavoid_bench.arena.scores import COLUMNS, KEY
+from qpavoid_bench.arena.store import Store, read_cases, read_runs
+from qpavoid_bench.arena.suite import EntrantConfig, load_suite, origin
+from qpavoid_bench.arena.summary import find_faults, summary
+from qpavoid_bench.arena.trial import run_trial
+from qpavoid_bench.arena.world import build_world
 
 POST = {
     "title": "A post",
