@@ -125,6 +125,7 @@ def now_and_then(problem):
 
 NUMBER = 7
 '''
+PATH = f"{Path.cwd()}{os.pathsep}{Path.cwd() / 'bench'}"
 
 
 @pytest.fixture
@@ -509,7 +510,7 @@ def test_sweep_continues_after_case_failure(folder, client):
 @pytest.fixture
 def cluster(tmp_path):
     """A scheduler and two workers of this test's own, as users start them: its address and the workers."""
-    python, env = [sys.executable, "-m"], {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path.cwd())}
+    python, env = [sys.executable, "-m"], {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": PATH}
     processes, quiet = [], {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": env, "cwd": tmp_path}
     file = tmp_path / "scheduler.json"
 
@@ -568,7 +569,7 @@ def test_sweep_survives_lost_worker(folder, cluster):
 def bench(folder, *words):
     """`qpavoid bench run` of the suite in a folder, in a process group of its own."""
     command = [sys.executable, "-m", "qpavoid", "bench", "run", "mine.yaml", "--out", "out", "--jobs", "2", *words]
-    env = {**os.environ, "PYTHONPATH": str(Path.cwd())}
+    env = {**os.environ, "PYTHONPATH": PATH}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen(command, cwd=folder, env=env, start_new_session=True, **pipes)
 
