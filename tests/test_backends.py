@@ -61,7 +61,7 @@ def assert_minimum(name: str, answer: np.ndarray | None, qp: QP, reference: np.n
 
 @pytest.mark.parametrize("name", BACKENDS)
 def test_back_ends_find_the_minimum_after_any_size(name):
-    """proxqp gives up on one in 800, which `Qp` then gives to daqp."""
+    """proxqp finds no solution of one in 800, which `Qp` then gives to daqp."""
     random, solve, unsolved = np.random.default_rng(1), make_backend(name), 0
     for _ in range(150):
         qp = make_qp(random, int(random.choice([7, 14, 35])), int(random.integers(0, 31)))
