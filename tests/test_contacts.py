@@ -10,6 +10,7 @@ from qpavoid import (
     Controller,
     ReasonKind,
     Severity,
+    Solver,
     UnknownName,
     build_scene,
     build_tasks,
@@ -192,7 +193,7 @@ def test_laws_that_cannot_hold_contacts_are_refused(solo, solver):
 
 
 def test_a_law_of_the_users_own_may_say_that_it_holds_them(solo):
-    class Own:
+    class Own(Solver):
         bounded = True
         holds_contacts = True
 
