@@ -11,11 +11,11 @@ from numpy.typing import ArrayLike
 
 from qpavoid.arena.families.inverse_kinematics import FrameGoal, JointRanges, solve_inverse_kinematics
 from qpavoid.arena.families.parameters import Redraw
+from qpavoid.arena.families.reach import arm
 from qpavoid.arena.families.tool_path import ToolPath
 from qpavoid.errors import ConfigError
 from qpavoid.model.robot import Robot
 from qpavoid.problem import Array
-from qpavoid.safety.reachability import arm
 
 REST_TIME = 3.0
 """Time from the end of the planned motion to that of the run [s]."""

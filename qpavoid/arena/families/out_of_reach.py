@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from qpavoid.arena.families.reach import arm, clearance
 from qpavoid.arena.world import World
 from qpavoid.control.tasks.frames import FrameTask
 from qpavoid.model.robot import Robot
-from qpavoid.safety.reachability import arm, clearance
 
 
 def out_of_reach(world: World, task: FrameTask, t: float, tolerance: float) -> str:

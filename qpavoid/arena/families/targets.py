@@ -8,10 +8,10 @@ import numpy as np
 
 from qpavoid.arena.families.arms import position_task, scenario_fields, straight_path
 from qpavoid.arena.families.parameters import Draw
+from qpavoid.arena.families.reach import arm
 from qpavoid.arena.families.statics import fixed_obstacle, sideways_path
 from qpavoid.arena.families.tool_path import path_motion
 from qpavoid.model.robot import Robot
-from qpavoid.safety.reachability import arm
 
 _REST_TIME = 8.0
 """Time to come to rest after the planned motion [s]."""
