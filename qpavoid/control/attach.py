@@ -89,7 +89,7 @@ class Attachments:
         own, query = self._table.pairs_of(index), self._query
         was_touching = np.isin(np.arange(len(own)), self._touching)
         self._kinematics.compute(q)
-        query.compute(self._kinematics.joint_poses, self._safety_distance)
+        query.compute(self._kinematics.joint_poses, query.influence_distance)
         pairs = np.arange(len(own))
         touching = own & (query.distances_of(pairs) <= self._safety_distance)
         self._touching = np.flatnonzero((touching | (was_touching & ~own)) & ~self._rigid)
@@ -108,13 +108,17 @@ class Attachments:
         self._allowed[chosen] = allowed
         self._update()
 
+    @property
+    def is_watching(self) -> bool:
+        """Whether there are pairs that touch, and are ignored until they are apart."""
+        return len(self._touching) > 0
+
     def update(self) -> None:
         """Let pairs that touched get rows again, once they are apart in the distances of this step."""
-        if len(self._touching):
-            apart = self._query.distances_of(self._touching) > self._safety_distance
-            if apart.any():
-                self._touching = self._touching[~apart]
-                self._update()
+        apart = self._query.distances_of(self._touching) > self._safety_distance
+        if apart.any():
+            self._touching = self._touching[~apart]
+            self._update()
 
     def _change(self, index: int, joint: int, placement: Array) -> None:
         self._table.attach(index, joint, placement)

@@ -53,7 +53,11 @@ class DistanceQuery:
         )
         """(o,) distance from each obstacle's origin to its farthest point; infinite of a half-space [m]."""
         self._planes = np.flatnonzero(np.isinf(self.obstacle_radii)).tolist()
-        bodies, pairs, rows = len(table.spheres), len(scene.pairs), obstacles + 1 + scene.movable - len(scene.body_names)
+        bodies, pairs, rows = (
+            len(table.spheres),
+            len(scene.pairs),
+            obstacles + 1 + scene.movable - len(scene.body_names),
+        )
         self.arrays = kernels.DistanceArrays(
             joints=table.joints,
             placements=table.placements,
@@ -86,7 +90,9 @@ class DistanceQuery:
         """(c,) pairs that were computed and are to get rows, increasing."""
         self.is_moving = False
         """Whether any obstacle has a velocity or a margin."""
-        self._near, self._influence_distance = self.arrays.near[:0], np.nan
+        self._near = self.arrays.near[:0]
+        self.influence_distance = np.nan
+        """Surface distance below which a pair is near [m]; set it by `set_influence_distance`."""
         for view, obstacle in zip(as_samples(self.arrays.states), scene.obstacles, strict=True):
             put(view, obstacle.motion.sample(0.0))
         self._clouds = {i: self._make_proxies(i) for i in scene.clouds}
@@ -127,11 +133,11 @@ class DistanceQuery:
 
     def set_influence_distance(self, influence_distance: float) -> None:
         """Choose the surface distance below which a pair is near [m]."""
-        if influence_distance != self._influence_distance:
+        if influence_distance != self.influence_distance:
             radius, pair_of = self.table.spheres[:, 3], self.table.pair_of
             touching = radius[: len(pair_of), None] + radius + influence_distance
             self.arrays.max_square[:] = np.where(pair_of >= 0, touching**2 * (1.0 + 1e-9), -1.0)
-            self._influence_distance = influence_distance
+            self.influence_distance = influence_distance
 
     def compute(self, joint_poses: Array, influence_distance: float) -> None:
         """Compute the distance of every pair that is nearer than `influence_distance`; `pairs` says which.
@@ -190,8 +196,13 @@ class DistanceQuery:
         coal.distance(*a, *b, self._request, result)
         self.arrays.results[pair] = read_results([result])[0]
 
-    def body_spheres(self) -> tuple[Array, Array]:
-        """Return world centres (b, 3) and radii (b,) of the spheres around the bodies that joints may move [m]."""
+    def body_spheres(self, joint_poses: Array) -> tuple[Array, Array]:
+        """Return world centres (b, 3) and radii (b,) of the spheres around the bodies that joints may move [m].
+
+        Args:
+            joint_poses: world poses of all joints (njoints, 12).
+        """
+        kernels.place_bodies(self.packed, joint_poses)
         count = len(self.table.joints)
         poses, spheres = self.arrays.poses[:count], self.table.spheres[:count]
         turned = (spheres[:, None, :3] @ poses[:, :9].reshape(-1, 3, 3))[:, 0]
@@ -231,7 +242,7 @@ class DistanceQuery:
         """Move the proxies of a cloud to the voxels that are nearest to each body."""
         x, unattached = self.arrays, np.flatnonzero(self.table.joints < 0)
         poses, sample = x.poses[: len(self.table.joints)], self._views[index]
-        positions = cloud.places(poses, unattached, sample, self._influence_distance).reshape(-1, 3)
+        positions = cloud.places(poses, unattached, sample, self.influence_distance).reshape(-1, 3)
         proxies = cloud.geometries.ravel()
         x.poses[proxies, 9:] = x.centers[proxies, :3] = positions
         x.centers[proxies, 4] = -np.einsum("ij,ij->i", positions, positions)

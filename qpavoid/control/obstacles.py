@@ -49,6 +49,14 @@ class ObstacleStates(NamedTuple):
     voxels: dict[int, Voxels]
     """Of point clouds that were updated, by number: what is in them."""
 
+    @classmethod
+    def of(cls, samples: Sequence[Sample], margin: float = 0.0) -> ObstacleStates:
+        """Return the states of all obstacles at some samples, with a margin of each [m]."""
+        states = np.zeros((len(samples), STATE))
+        for view, sample in zip(as_samples(states), samples, strict=True):
+            put(view, sample)
+        return cls(np.arange(len(samples)), states, np.full(len(samples), margin), {})
+
 
 class Observation(NamedTuple):
     """What a control step has to say of the obstacles."""
@@ -161,6 +169,11 @@ class ObstacleTracker:
         self._sample_trajectories(t, states)
         return states[:, 9:12], _rates(states)
 
+    @property
+    def current(self) -> ObstacleStates:
+        """States in the last step; the next one overwrites them."""
+        return self._current
+
     def at(self, t: float) -> ObstacleStates:
         """Return the states at t [s]: on trajectories, or at constant mean twists; of the last step, as observed.
 
@@ -175,6 +188,10 @@ class ObstacleTracker:
             extrapolate(later, t - estimates.t)
             states[list(estimates.which)] = later
         return self._current._replace(states=states)
+
+    def after(self, duration: float) -> ObstacleStates:
+        """Return the states some time after the last step [s]; see `at`."""
+        return self.at(self._now + duration)
 
     def _sample_trajectories(self, t: float, states: Array) -> None:
         """Bring the states (o, 18) of those that follow a trajectory to time t [s]."""

@@ -103,13 +103,13 @@ class PairTable:
 
     def pairs_of(self, index: int) -> Mask:
         """Return the pairs (m,) of an obstacle that is one body."""
-        return np.any(self._scene.pairs == self.first[index], axis=1)
+        return np.asarray(np.any(self._scene.pairs == self.first[index], axis=1))
 
     def max_extension(self) -> Array:
         """Return `joint_radius` (njoints,) as large as it may ever become [m]."""
         radii = self.spheres[len(self._scene.body_names) : len(self.joints), 3]
         if not len(radii):
-            return self.joint_radius.copy()
+            return np.array(self.joint_radius)
         return np.full_like(self.joint_radius, self.joint_radius.max() + 2.0 * radii.max() + _MAX_GRASP)
 
     def _update(self) -> None:

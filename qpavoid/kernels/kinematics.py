@@ -33,7 +33,7 @@ class KinematicsArrays(NamedTuple):
     placements: Array
     """(J, 12) pose P of each joint in its parent, at zero."""
     turns: Array
-    """(J, 2, 9) P K and P K² by columns, with K = [a]× of the axis a: P + sin θ P K + (1 - cos θ) P K² is turned by θ."""
+    """(J, 2, 9) P K and P K² by columns, K = [a]× of the axis a: P + sin θ P K + (1 - cos θ) P K² is turned by θ."""
     slides: Array
     """(J, 3) axis of each joint in its parent."""
     column_joints: IntArray
@@ -92,7 +92,7 @@ def compose(a: Array, b: Array, product: Array) -> None:
 
 @compiled
 def _column(pose: Array, motion: Array, column: Array) -> None:
-    """Write the twist at the world's origin [R v + p × R w; R w] of a motion [v; w] (6,) in the axes of a pose (12,)."""
+    """Write the twist [R v + p × R w; R w] (6,) at the world's origin of a motion [v; w] in the axes of a pose (12,)."""
     for r in range(3):
         column[r] = pose[r] * motion[0] + pose[3 + r] * motion[1] + pose[6 + r] * motion[2]
         column[3 + r] = pose[r] * motion[3] + pose[3 + r] * motion[4] + pose[6 + r] * motion[5]
@@ -155,5 +155,7 @@ def _rotate(placement: Array, quaternion: Array, pose: Array) -> None:
     for c in range(3):
         for r in range(3):
             pose[3 * c + r] = (
-                placement[r] * turned[3 * c] + placement[3 + r] * turned[3 * c + 1] + placement[6 + r] * turned[3 * c + 2]
+                placement[r] * turned[3 * c]
+                + placement[3 + r] * turned[3 * c + 1]
+                + placement[6 + r] * turned[3 * c + 2]
             )
