@@ -8,7 +8,15 @@ from conftest import SPHERE, Bench, make_layout, obstacle
 
 from qpavoid import Avoidance, Sample, build_scene, kernels
 from qpavoid.control.avoidance import row_form
-from qpavoid.solvers.gains import alpha, beta
+
+
+def alpha(d, d2):
+    return np.array([kernels.alpha(x, d2) for x in d])
+
+
+def beta(d, d1, d2):
+    return np.array([kernels.beta(x, d1, d2) for x in d])
+
 
 D1, D2, XI = 0.12, 0.24, 5.0
 TINY = 1e-9

@@ -42,7 +42,7 @@ class RowAssembler:
         self._forward = ForwardKinematics(scene.robot.model, [*(task.frame_id for task in frames), *more])
         self.query = DistanceQuery(scene)
         """Distances of the control step."""
-        self.influence_distance = avoidance.d2 - avoidance.offset
+        self.influence_distance = float(avoidance.d2 - avoidance.offset)
         """Surface distance below which a pair gets a row [m]."""
         self.query.set_influence_distance(self.influence_distance)
         x = self._layout = lay_out(
@@ -63,6 +63,8 @@ class RowAssembler:
         self._is_compiled = (
             self._forward.is_compiled and self.query.is_compiled and not self._others and contacts is None
         )
+        self._q = scene.robot.home.copy()
+        self._step = self._compile()
         self.kinematics = Kinematics(x.J_world, x.poses)
         """World Jacobian and poses of the tracked frames in this step."""
 
@@ -80,6 +82,12 @@ class RowAssembler:
         if looks_ahead != self._layout.looks_ahead:
             self._layout = self._layout._replace(looks_ahead=looks_ahead)
             self._packed = kernels.pack(self._layout)
+            self._step = self._compile()
+
+    def _compile(self) -> Callable[..., tuple[int, int, int, int, float, bool, float]]:
+        """Return the code of `kernels.control_step` for this memory."""
+        arguments = self._packed, self._q, self.influence_distance, False
+        return kernels.direct(kernels.control_step, *arguments) if self._is_compiled else kernels.control_step
 
     def compute(self, q: Array, targets: Sequence[Any]) -> tuple[Proximity, Problem]:
         """Compute distances, rows and bounds at a configuration, with the obstacles as placed.
@@ -90,8 +98,9 @@ class RowAssembler:
         """
         x, query, contacts = self._layout, self.query, None
         if self._is_compiled:
-            near, rows, meeting, k, violation, clear, margin = kernels.control_step(
-                self._packed, q, self.influence_distance, query.is_moving
+            self._q[:] = q  # the code takes q as it is: in one piece, and writeable
+            near, rows, meeting, k, violation, clear, margin = self._step(
+                self._packed, self._q, self.influence_distance, query.is_moving
             )
             query.finish(near, rows, meeting)
             if meeting:

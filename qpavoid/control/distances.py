@@ -86,11 +86,9 @@ class DistanceQuery:
         )
         """Memory of the distances, see `DistanceArrays`; the results are those of `pairs`."""
         self.packed = kernels.pack(self.arrays)
-        self.pairs: IntArray = self.arrays.rows[:0]
-        """(c,) pairs that were computed and are to get rows, increasing."""
         self.is_moving = False
         """Whether any obstacle has a velocity or a margin."""
-        self._near = self.arrays.near[:0]
+        self._near_count, self._row_count = 0, 0
         self.influence_distance = np.nan
         """Surface distance below which a pair is near [m]; set it by `set_influence_distance`."""
         for view, obstacle in zip(as_samples(self.arrays.states), scene.obstacles, strict=True):
@@ -160,12 +158,22 @@ class DistanceQuery:
             rows: number of those that get rows.
             meeting: number of those whose cores meet.
         """
-        x = self.arrays
-        self._near, self.pairs = x.near[:near], x.rows[:rows]
+        self._near_count, self._row_count = near, rows
         if len(self._by_coal):
             self._compute_by_coal()
-        for pair in x.meeting[:meeting].tolist():
-            self._compute_one(pair)
+        if meeting:
+            for pair in self.arrays.meeting[:meeting].tolist():
+                self._compute_one(pair)
+
+    @property
+    def pairs(self) -> IntArray:
+        """(c,) pairs that were computed and are to get rows, increasing."""
+        return self.arrays.rows[: self._row_count]
+
+    @property
+    def _near(self) -> IntArray:
+        """(c,) pairs that were computed, increasing."""
+        return self.arrays.near[: self._near_count]
 
     def _compute_by_coal(self) -> None:
         """Compute the near pairs that have no closed form in one call of coal."""

@@ -27,9 +27,9 @@ from qpavoid.kernels.near_pairs import DistanceArrays, near_pairs, place_bodies,
 from qpavoid.kernels.obstacles import Pieces, check_states, sample_pieces, update_measured_states
 from qpavoid.kernels.qp import max_clearance_velocity, minimize, project, project_soft
 from qpavoid.kernels.rotation import rotation_vector
-from qpavoid.kernels.rows import distance_rows, row_bounds
+from qpavoid.kernels.rows import alpha, beta, distance_rows, row_bounds
 from qpavoid.kernels.step import assemble, control_step, tracking_violation, violation
-from qpavoid.kernels.structures import pack
+from qpavoid.kernels.structures import direct, pack
 from qpavoid.kernels.tasks import damped_solution, frame_rows, projection_cost
 from qpavoid.kernels.voxels import select_voxels, voxels_within
 
@@ -40,9 +40,11 @@ __all__ = [
     "KinematicsArrays",
     "Pieces",
     "RowLayout",
+    "alpha",
     "are_fine",
     "assemble",
     "backup_rows",
+    "beta",
     "candidates",
     "check_states",
     "clearance_lower_bound",
@@ -50,6 +52,7 @@ __all__ = [
     "control_step",
     "count_faults",
     "damped_solution",
+    "direct",
     "distance_rows",
     "extrapolate_estimates",
     "extrapolate_states",

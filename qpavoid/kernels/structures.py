@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, cast
 
-from numba import config, types
+from numba import config, typeof, types
 from numba.experimental import structref
 
 from qpavoid.kernels.kinematics import KinematicsArrays
@@ -84,3 +85,20 @@ def pack(layout: KinematicsArrays | DistanceArrays | RowLayout) -> Any:
     With `NUMBA_DISABLE_JIT=1` that is the named tuple itself.
     """
     return layout if config.DISABLE_JIT else _PACK[type(layout)](tuple(layout))
+
+
+def direct(kernel: Any, *arguments: Any) -> Callable[..., Any]:
+    """Return the machine code of a kernel for the types of some arguments, which the kernel is called with once.
+
+    numba finds out the types of all arguments in every call, which costs 0.6 µs where one is a structure. The code does
+    not check them: call it with the same structure, and with arrays of the same type and layout.
+
+    Args:
+        kernel: compiled.
+        arguments: of a call.
+    """
+    kernel(*arguments)
+    if config.DISABLE_JIT:
+        return cast(Callable[..., Any], kernel)
+    code = kernel.overloads.get(tuple(typeof(argument) for argument in arguments))
+    return cast(Callable[..., Any], getattr(code, "entry_point", kernel))
