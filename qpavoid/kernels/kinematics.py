@@ -92,7 +92,7 @@ def compose(a: Array, b: Array, product: Array) -> None:
 
 @compiled
 def _column(pose: Array, motion: Array, column: Array) -> None:
-    """Write the twist [R v + p × R w; R w] (6,) at the world's origin of a motion [v; w] in the axes of a pose (12,)."""
+    """Write the twist (6,) at the world's origin [R v + p × R w; R w] of a motion [v; w] in the axes of a pose."""
     for r in range(3):
         column[r] = pose[r] * motion[0] + pose[3 + r] * motion[1] + pose[6 + r] * motion[2]
         column[3 + r] = pose[r] * motion[3] + pose[3 + r] * motion[4] + pose[6 + r] * motion[5]
