@@ -14,7 +14,7 @@ from qpavoid.cli import main
 from qpavoid.config.shipped import example_robot_data
 from qpavoid.control.assembler import Assembly
 from qpavoid.control.distances import DistanceQuery
-from qpavoid.control.tasks.frames import in_order
+from qpavoid.control.tasks import in_order
 from qpavoid.control.trajectories import as_samples, put
 from qpavoid.kernels.cache import FOLDER
 from qpavoid.kernels.layout import RowLayout
@@ -130,7 +130,7 @@ class Bench:
         self.robot, self.tasks = scene.robot, tuple(tasks)
         self.kinematics = ForwardKinematics(
             scene.robot.model,
-            [i for task in tasks for i in (task.frame_ids if hasattr(task, "frame_ids") else (task.frame_id,))],
+            [i for task in tasks for i in task.frame_ids],
         )
         self.query = query or DistanceQuery(scene)
         self.assembly = Assembly(

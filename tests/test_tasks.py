@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from conftest import Bench, differences, random_q
+from conftest import SPHERE, Bench, differences, obstacle, random_q
 
-from qpavoid import NumericalError, Sample, UnknownName, build_scene, config
-from qpavoid.control.tasks.frames import build_tasks
+from qpavoid import Controller, NumericalError, Sample, UnknownName, build_scene, config
+from qpavoid.control.tasks import build_tasks
 from qpavoid.problem import Tracking
 
 FIXED = config.Fixed(type="fixed")
@@ -160,3 +160,41 @@ def test_unknown_frame(panda):
 def test_a_configuration_that_is_none_is_refused(panda, q0):
     with pytest.raises(NumericalError, match=r"q0: (shape \(3,\), expected \(7,\)|NaN)"):
         build_tasks([config.Task(frame="panda_hand_tcp")], panda, q0)
+
+
+EVERY_KIND = [
+    config.Task(frame="panda_hand_tcp"),
+    config.Task(frame="panda_link6", type="orientation", orientation_weight=0.1, name="turn"),
+    config.RelativeTask(frame="panda_hand", relative_to="panda_link3", weight=0.2),
+    config.ComTask(weight=0.3),
+    config.PostureTask(weight=0.1),
+    config.DampingTask(weight=0.01),
+    config.LookAtTask(frame="panda_hand", motion=config.Fixed(position=(0.6, 0.2, 0.1)), weight=0.2),
+    config.AlignTask(frame="panda_link7", direction=(0, 0, -1), weight=0.2),
+    config.ManipulabilityTask(frame="panda_hand_tcp", weight=0.01),
+]
+
+
+def test_controllers_share_tasks_and_a_scene_without_disturbing_each_other(panda):
+    """Interleaved steps of two that share them are those of two with tasks and scenes of their own, bit for bit."""
+
+    def scene():
+        return build_scene(panda, [obstacle("ball", SPHERE, (0.5, 0.1, 0.4))])
+
+    def controllers(tasks, scenes):
+        return [Controller(scene, list(part), dt=0.01) for part, scene in zip(tasks, scenes, strict=True)]
+
+    built = [build_tasks(EVERY_KIND, panda, panda.home) for _ in range(3)]
+    sharing, alone = controllers([built[0]] * 2, [scene()] * 2), controllers(built[1:], [scene(), scene()])
+    states, rng = [panda.home, random_q(panda, np.random.default_rng(6), 0.2)], np.random.default_rng(7)
+    for _ in range(20):
+        for i, (one, other) in enumerate(zip(sharing, alone, strict=True)):
+            axis = rng.normal(size=3)
+            targets = {"posture": panda.home + rng.uniform(-0.2, 0.2, 7), "align": axis / np.linalg.norm(axis)}
+            targets["com"] = Sample.at(rng.uniform(0.0, 0.3, 3), linear=rng.normal(size=3))
+            found, expected = (controller.tick(states[i], targets=targets) for controller in (one, other))
+            np.testing.assert_array_equal(found.problem.tracking.A, expected.problem.tracking.A)
+            np.testing.assert_array_equal(found.problem.tracking.b, expected.problem.tracking.b)
+            np.testing.assert_array_equal(found.errors, expected.errors)
+            np.testing.assert_array_equal(found.solution.v, expected.solution.v)
+            states[i] = pin.integrate(panda.model, states[i], 0.01 * found.solution.v)

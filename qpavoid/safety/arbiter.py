@@ -13,7 +13,7 @@ from qpavoid.config import Avoidance, Limits, Progress
 from qpavoid.control.assembler import Assembly
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.obstacles import ObstacleTracker
-from qpavoid.control.tasks.frames import FrameTask
+from qpavoid.control.tasks import FrameTask
 from qpavoid.errors import NumericalError
 from qpavoid.kernels import TOLERANCE
 from qpavoid.model.limits import JointBounds, saturate

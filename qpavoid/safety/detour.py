@@ -17,7 +17,7 @@ import numpy as np
 from qpavoid.config import Detour
 from qpavoid.control.assembler import Assembly
 from qpavoid.control.distances import DistanceQuery
-from qpavoid.control.tasks.frames import FrameTask
+from qpavoid.control.tasks import FrameTask
 from qpavoid.model.scene import Scene
 from qpavoid.problem import Array, Problem, Proximity
 from qpavoid.reason import Reason, ReasonKind

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from qpavoid.arena.world import World
-from qpavoid.control.tasks.frames import FrameTask
+from qpavoid.control.tasks import FrameTask
 from qpavoid.model.robot import Robot
 from qpavoid.safety.reachability import arm, clearance
 

@@ -12,7 +12,7 @@ from qpavoid.arena.families.planner import Plan, plan
 from qpavoid.arena.scores import surface_safety_distance
 from qpavoid.arena.world import World
 from qpavoid.config import ScenarioConfig
-from qpavoid.control.tasks.frames import FrameTask
+from qpavoid.control.tasks import FrameTask
 from qpavoid.errors import ConfigError
 from qpavoid.problem import Array
 

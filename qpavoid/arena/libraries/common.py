@@ -10,7 +10,7 @@ import pinocchio as pin
 from qpavoid.arena.case import Case
 from qpavoid.arena.world import World
 from qpavoid.config import Avoidance
-from qpavoid.control.tasks.frames import FrameTask
+from qpavoid.control.tasks import FrameTask
 from qpavoid.errors import ConfigError
 from qpavoid.model.scene import Scene
 from qpavoid.model.trajectory import Sample

@@ -30,7 +30,7 @@ from qpavoid.arena.libraries.settings import PLACO, PLACO_PYTHON
 from qpavoid.arena.mujoco_model import hinge_or_slide
 from qpavoid.arena.world import World
 from qpavoid.config import Limits
-from qpavoid.control.tasks.frames import FrameTask
+from qpavoid.control.tasks import FrameTask
 from qpavoid.errors import ConfigError
 from qpavoid.model.scene import Scene
 from qpavoid.model.trajectory import Sample
