@@ -51,11 +51,12 @@ class Axis(RowTask):
         d, a = way / distance, R @ self._axis
         across = _across(a, d)
         angle = atan2(length(np.cross(a, d)), np.dot(a, d))
-        A[:] = np.cross(across, d) @ J[3:]  # -τ·(ω × d) = ω·(τ × d)
-        b[:] = self._gain * angle, 0.0
+        rates = np.cross(across, d) @ J[3:]  # -τ·(ω × d) = ω·(τ × d)
+        wanted = np.array([self._gain * angle, 0.0])
         if self._looks:
-            A -= across @ J[:3] / distance
-            b -= across @ target.linear / distance
+            rates -= across @ J[:3] / distance
+            wanted -= across @ target.linear / distance
+        self._scale_into(A, b, rates, wanted)
         return angle
 
     def as_target(self, value: Any) -> Any:

@@ -53,7 +53,10 @@ class RowTask:
         """
         self.settings, self.motion, self.rows, self.frame_ids = settings, motion, rows, frame_ids
         self.scale = np.full(rows, np.sqrt(settings.weight))
-        """(rows,) roots of the weights; what it writes is multiplied by them."""
+        """(rows,) roots of the weights, by which its rows are multiplied."""
+
+    def write_constant_rows(self, A: Array) -> None:
+        """Write what never changes of A (rows, nv), which is zero: once, when a controller is made."""
 
     def write_rows(self, q: Array, kinematics: ForwardKinematics, target: Any, A: Array, b: Array) -> float:
         """Write the rows A v = b, and return how far the task is from its target, in its unit.
@@ -62,10 +65,14 @@ class RowTask:
             q: configuration (nq,).
             kinematics: those at q.
             target: what to reach now.
-            A: (rows, nv) to be written, but for what is zero at all times.
-            b: (rows,) to be written.
+            A: (rows, nv), as the step before has left them.
+            b: (rows,), as well.
         """
         raise NotImplementedError
+
+    def _scale_into(self, A: Array, b: Array, J: Array, wanted: Array) -> None:
+        np.multiply(J, self.scale[:, None], out=A)
+        np.multiply(wanted, self.scale, out=b)
 
     def as_target(self, value: Any) -> Any:
         """Check a target that was given at run time: here, a `Sample` or a `Pose` that rests.

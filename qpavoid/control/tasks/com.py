@@ -28,7 +28,7 @@ class Com(RowTask):
     def write_rows(self, q: Array, kinematics: ForwardKinematics, target: Any, A: Array, b: Array) -> float:
         """See `RowTask.write_rows`."""
         n = self.rows
-        A[:] = pin.jacobianCenterOfMass(self._model, kinematics.data, False)[:n]
+        J = pin.jacobianCenterOfMass(self._model, kinematics.data, False)
         error = (target.position - kinematics.data.com[0])[:n]
-        b[:] = target.linear[:n] + self._gain * error
+        self._scale_into(A, b, J[:n], target.linear[:n] + self._gain * error)
         return length(error)

@@ -66,20 +66,16 @@ class TaskRows:
     """Rows of the tasks that write their own, in the memory of one controller."""
 
     def __init__(self, tasks: Sequence[RowTask], A: Array, b: Array) -> None:
-        """Give each its rows: the last ones of A (r, nv) and b (r,)."""
+        """Give each its rows: the last ones of A (r, nv) and b (r,), which are zero."""
         self.errors = np.zeros(len(tasks))
         """How far each of the tasks was from its target in the last step, in its unit."""
-        scale = np.concatenate([np.zeros(0), *(task.scale for task in tasks)])
-        begin = len(b) - len(scale)
-        self._scale, self._A, self._b = scale[:, None], A[begin:], b[begin:]
-        self._parts = []
+        self._parts, begin = list[Any](), len(b) - sum(task.rows for task in tasks)
         for task in tasks:
             rows = slice(begin, begin := begin + task.rows)
             self._parts.append((task, A[rows], b[rows]))
+            task.write_constant_rows(A[rows])
 
     def write(self, q: Array, kinematics: ForwardKinematics, targets: Sequence[Any]) -> None:
-        """Write all rows at q (nq,), for which the kinematics are up to date, and scale them."""
+        """Write all rows at q (nq,), for which the kinematics are up to date."""
         for i, ((task, A, b), target) in enumerate(zip(self._parts, targets, strict=True)):
             self.errors[i] = task.write_rows(q, kinematics, target, A, b)
-        self._A *= self._scale
-        self._b *= self._scale[:, 0]

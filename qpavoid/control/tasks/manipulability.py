@@ -46,6 +46,6 @@ class Manipulability(RowTask):
         along = np.cross(Y[:3], W, axis=0)
         about = np.cross(Y[:3], V, axis=0) + np.cross(Y[3:], W, axis=0)
         gradient = (V * (along @ self._beyond.T)).sum(axis=0) + (W * (about @ self._beyond.T)).sum(axis=0)
-        A[0] = gradient @ self._fold
-        b[0] = self._gain * np.dot(A[0], A[0])
+        gradient = gradient @ self._fold
+        self._scale_into(A, b, gradient, self._gain * np.dot(gradient, gradient))
         return w

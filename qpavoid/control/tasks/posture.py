@@ -33,11 +33,13 @@ class Damping(RowTask):
             raise ConfigError(f"{start.where}.joints: none of them has a coordinate; name some that move")
         super().__init__(settings, Constant(), len(index))
         self._coordinates = np.sort(index)
-        self._A = np.eye(self._model.nv)[self._coordinates]
+
+    def write_constant_rows(self, A: Array) -> None:
+        """See `RowTask.write_constant_rows`."""
+        A[np.arange(self.rows), self._coordinates] = self.scale
 
     def write_rows(self, q: Array, kinematics: ForwardKinematics, target: Any, A: Array, b: Array) -> float:
-        """See `RowTask.write_rows`."""
-        A[:], b[:] = self._A, 0.0
+        """Write nothing: b is zero."""
         return 0.0
 
 
@@ -50,12 +52,13 @@ class Posture(Damping):
         for name in settings.q:
             joint = self._model.joints[self._model.getJointId(name)]
             q[joint.idx_q : joint.idx_q + joint.nq] = given[joint.idx_q : joint.idx_q + joint.nq]
-        self.motion, self._gain, self._configurations = Constant(q), settings.gain, Configurations(self._model)
+        self.motion, self._rate = Constant(q), settings.gain * self.scale
+        self._configurations = Configurations(self._model)
 
     def write_rows(self, q: Array, kinematics: ForwardKinematics, target: Any, A: Array, b: Array) -> float:
         """See `RowTask.write_rows`."""
         error = pin.difference(self._model, q, target)[self._coordinates]
-        A[:], b[:] = self._A, self._gain * error
+        np.multiply(error, self._rate, out=b)
         return length(error)
 
     def as_target(self, value: Any) -> Any:
