@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from copy import copy
 from time import perf_counter
 from typing import Any, NoReturn
 
@@ -17,7 +16,7 @@ from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.inputs import LARGEST_VELOCITY, check_velocity
 from qpavoid.control.poses import Pose
 from qpavoid.control.scenario import build_parts
-from qpavoid.control.tasks.frames import AnyTask, in_order
+from qpavoid.control.tasks import RowTask, in_order
 from qpavoid.control.tick import Tick, copied
 from qpavoid.errors import ConfigError, NumericalError, UnknownName, located, nearest
 from qpavoid.model.cloud import Points
@@ -42,7 +41,7 @@ class Controller:
     def __init__(
         self,
         scene: Scene,
-        tasks: Sequence[AnyTask],
+        tasks: Sequence[RowTask],
         solver: Solver | str = "qp",
         dt: float = 0.01,
         avoidance: Avoidance | None = None,
@@ -75,7 +74,7 @@ class Controller:
             raise ConfigError(f"dt: {dt} s, expected more than 0 and at most {_MAX_DT}; it is in seconds")
         frames, others = in_order(tasks)
         self.scene, self.dt = scene, dt
-        self.tasks: tuple[AnyTask, ...] = (*frames, *[copy(task) for task in others])
+        self.tasks: tuple[RowTask, ...] = (*frames, *others)
         """Frames with a position to follow, then with an orientation alone, then all other tasks."""
         law, self._has_contacts = make_solver(solver) if isinstance(solver, str) else solver, contacts is not None
         check_solver(law, solver, self._has_contacts)
@@ -206,7 +205,7 @@ class Controller:
         state = State(step.q.copy(), rows.previous.v.copy(), step.t)
         solution = self._decide(step, begin)
         return Tick(
-            state, tuple(step.targets), rows.errors, copied(rows.kinematics), copied(step.proximity),
+            state, tuple(step.targets), rows.task_errors.copy(), copied(rows.kinematics), copied(step.proximity),
             copied(step.problem), solution,
         )  # fmt: skip
 

@@ -14,7 +14,8 @@ from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.jerk_stops import JerkStop, JerkStops
 from qpavoid.control.previous_velocity import PreviousVelocity
 from qpavoid.control.row_layout import lay_out
-from qpavoid.control.tasks.frames import AnyTask, in_order, task_levels
+from qpavoid.control.tasks import RowTask, in_order
+from qpavoid.control.tasks.layout import TaskRows, task_levels
 from qpavoid.model.kinematics import ForwardKinematics, Kinematics
 from qpavoid.model.limits import JointBounds
 from qpavoid.model.scene import Scene
@@ -28,7 +29,7 @@ class RowAssembler:
     def __init__(
         self,
         scene: Scene,
-        tasks: Sequence[AnyTask],
+        tasks: Sequence[RowTask],
         bounds: JointBounds,
         avoidance: Avoidance,
         limits: Limits,
@@ -37,16 +38,17 @@ class RowAssembler:
         contacts: ContactRows | None = None,
     ) -> None:
         """Lay the memory out; see `Controller` for the arguments."""
-        frames, self._others = in_order(tasks)
-        more = [i for task in self._others for i in task.frame_ids] + list(contacts.frame_ids if contacts else ())
-        self._forward = ForwardKinematics(scene.robot.model, [*(task.frame_id for task in frames), *more])
+        frames, others = in_order(tasks)
+        frame_ids = [i for task in (*frames, *others) for i in task.frame_ids]
+        frame_ids += contacts.frame_ids if contacts else ()
+        self._forward = ForwardKinematics(scene.robot.model, frame_ids)
         self.query = DistanceQuery(scene)
         """Distances of the control step."""
         self.influence_distance = float(avoidance.d2 - avoidance.offset)
         """Surface distance below which a pair gets a row [m]."""
         self.query.set_influence_distance(self.influence_distance)
         x = self._layout = lay_out(
-            scene, frames, self._others, bounds, self._forward, self.query, avoidance, limits, damping, dt
+            scene, frames, others, bounds, self._forward, self.query, avoidance, limits, damping, dt
         )
         self._hard = (x.hard_lower, x.hard_upper) if limits.relax_acceleration else (x.lower, x.upper)
         self._packed, self._contacts = kernels.pack(x), contacts
@@ -57,21 +59,17 @@ class RowAssembler:
         self._stops = JerkStops(x, self._packed) if x.jerk_limited else None
         self.targets = x.targets
         """(f, 18) states that the frame tasks are to reach, see `trajectories`; to be written before `compute`."""
-        self._tracking, self._levels = Tracking(x.A, x.b, damping), task_levels(frames, self._others)
+        self._tracking, self._levels = Tracking(x.A, x.b, damping), task_levels(frames, others)
         self._views: dict[int, tuple[Proximity, AvoidanceRows]] = {}
+        self._task_rows = TaskRows(others, x.A, x.b)
+        self.task_errors = self._task_rows.errors
+        """How far each of the tasks that are not frames was from its target in the last step, in its unit."""
         self._eye = np.eye(len(x.v_tracking))
-        self._is_compiled = (
-            self._forward.is_compiled and self.query.is_compiled and not self._others and contacts is None
-        )
+        self._is_compiled = self._forward.is_compiled and self.query.is_compiled and not others and contacts is None
         self._q = scene.robot.home.copy()
         self._step = self._compile()
         self.kinematics = Kinematics(x.J_world, x.poses)
         """World Jacobian and poses of the tracked frames in this step."""
-
-    @property
-    def errors(self) -> Array:
-        """Errors of the tasks that are not frames in this step, each in its unit."""
-        return np.array([task.error for task in self._others])
 
     def look_ahead(self, looks_ahead: bool) -> None:
         """Choose whether kernels look for velocities that lead nowhere near anything, see `RowLayout.looks_ahead`.
@@ -108,8 +106,8 @@ class RowAssembler:
         else:
             self._forward.compute(q)
             query.compute(self._forward.joint_poses, self.influence_distance)
-            for task, target in zip(self._others, targets[len(self.targets) :], strict=True):
-                task.update(q, self._forward, target)
+            if self.task_errors.size:
+                self._task_rows.write(q, self._forward, targets[len(self.targets) :])
             if self._contacts is not None:
                 contacts = self._contacts.update(self._forward)
                 x.v_prev[:] = contacts.project(x.v_prev)

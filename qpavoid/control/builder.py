@@ -16,7 +16,7 @@ from qpavoid.control.contacts import ContactRows
 from qpavoid.control.inputs import Clock, Configurations
 from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.control.targets import TargetReader
-from qpavoid.control.tasks.frames import AnyTask
+from qpavoid.control.tasks import RowTask
 from qpavoid.model.limits import OUTSIDE, JointBounds
 from qpavoid.model.scene import Scene
 from qpavoid.model.trajectory import Sample
@@ -48,7 +48,7 @@ class ProblemBuilder:
     def __init__(
         self,
         scene: Scene,
-        tasks: Sequence[AnyTask],
+        tasks: Sequence[RowTask],
         bounds: JointBounds,
         avoidance: Avoidance,
         limits: Limits,
