@@ -13,8 +13,9 @@ from hypothesis import settings
 from qpavoid import Controller, Obstacle, Robot, Sample, build_scene, build_tasks, config, load_scenario
 from qpavoid.cli import main
 from qpavoid.config.shipped import example_robot_data
-from qpavoid.control.assembler import Assembly
+from qpavoid.control.assembler import RowAssembler
 from qpavoid.control.distances import DistanceQuery
+from qpavoid.control.obstacles import ObstacleStates
 from qpavoid.control.row_layout import lay_out
 from qpavoid.control.tasks import in_order
 from qpavoid.control.trajectories import as_samples, put
@@ -128,31 +129,37 @@ def random_scene(robot, rng, shapes):
 class Bench:
     """Tasks, rows and limits of a scene, without a solver."""
 
-    def __init__(self, scene, tasks=(), avoidance=None, position_gain=0.5, damping=0.0, dt=0.01, query=None):
-        self.robot, self.tasks = scene.robot, tuple(tasks)
-        self.kinematics = ForwardKinematics(
-            scene.robot.model,
-            [i for task in tasks for i in task.frame_ids],
-        )
-        self.query = query or DistanceQuery(scene)
-        self.assembly = Assembly(
-            scene, tasks, scene.robot.bounds(), self.kinematics, self.query, avoidance or config.Avoidance(),
+    def __init__(self, scene, tasks=(), avoidance=None, position_gain=0.5, damping=0.0, dt=0.01):
+        self.scene, self.robot, self.tasks = scene, scene.robot, tuple(tasks)
+        self.rows = RowAssembler(
+            scene, tasks, scene.robot.bounds(), avoidance or config.Avoidance(),
             config.Limits(position_gain=position_gain), damping, dt,
         )  # fmt: skip
+        self.query = self.rows.query
+
+    def place(self, samples):
+        """Obstacles at other samples, by number; all others where they are at time 0."""
+        place(self.query, self.scene, samples)
 
     def compute(self, q, targets=None, reach=np.inf):
         """Proximity and problem at q, as they are until the next call."""
-        self.kinematics.compute(q)
-        self.query.compute(self.kinematics.data, reach)
+        self.rows.influence_distance = float(reach)
+        self.query.set_influence_distance(float(reach))
         targets = targets or [task.motion.sample(0.0) for part in in_order(self.tasks) for task in part]
-        for view, target in zip(as_samples(self.assembly.targets), targets, strict=False):
+        for view, target in zip(as_samples(self.rows.targets), targets, strict=False):
             put(view, target)
-        return self.assembly.compute(np.asarray(q), targets, self.query, reach)
+        return self.rows.compute(np.asarray(q), targets)
 
     def rows(self, q, targets=None):
         """A and b of the tasks at q, copied."""
         tracking = self.compute(q, targets, reach=-1.0)[1].tracking
         return tracking.A.copy(), tracking.b.copy()
+
+
+def place(query, scene, samples, margin=0.0):
+    """Obstacles of a query at other samples, by number; all others where they are at time 0."""
+    all_samples = [samples.get(i, obstacle.motion.sample(0.0)) for i, obstacle in enumerate(scene.obstacles)]
+    query.place(ObstacleStates.of(all_samples, margin))
 
 
 def task_bench(robot, *blocks, **settings):
@@ -214,11 +221,11 @@ def _layout_of_a_robot():
     return lay_out_step(build_scene(Robot.load("paper-dual-arm")), avoidance=avoidance)[0]
 
 
-def look(scene, q, samples=None, reach=np.inf, query=None):
+def look(scene, q, samples=None, reach=np.inf, bench=None):
     """Proximity of a scene at q, with obstacles (by index) moved to `samples`."""
-    bench = Bench(scene, query=query)
-    for index, sample in (samples or {}).items():
-        bench.query.place_obstacle(index, sample)
+    bench = bench or Bench(scene)
+    if samples:
+        bench.place(samples)
     return bench.compute(q, reach=reach)[0]
 
 

@@ -26,7 +26,6 @@ from conftest import (
 from qpavoid import Avoidance, Controller, Obstacle, Sample, build_scene, config, load_scenario
 from qpavoid.control import distances
 from qpavoid.control import placement as placing
-from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.tasks import build_tasks
 from qpavoid.geometry.segments import capsule_distances
 from qpavoid.model import views as memory
@@ -205,10 +204,10 @@ def test_clearance_lower_bound_holds_on_straight_paths(name, request):
             start, speed = body.motion.sample(0.0), rng.choice([0.0, 0.3, 1.0])
             twist = {"linear": speed * rng.uniform(-1, 1, 3), "angular": speed * rng.uniform(-1, 1, 3)}
             samples[i] = start._replace(**twist)
-            bench.query.place_obstacle(i, samples[i])
+        bench.place(samples)
         near = len(bench.compute(q, reach=0.3)[0].pair)
         for horizon in (0.01, 0.1, 0.3):
-            least = bench.assembly.clearance_lower_bound(v, near, 0.3, horizon)
+            least = bench.rows.clearance_lower_bound(v, near, horizon)
             assert np.isfinite(least)
             for t in (0.5 * horizon, horizon):
                 later = {i: moved(sample, t) for i, sample in samples.items()}
@@ -330,9 +329,9 @@ def test_tick_is_not_overwritten_by_the_next(panda):
 
 def test_distances_follow_an_obstacle_while_the_robot_rests(panda):
     scene = build_scene(panda, [obstacle("ball", SPHERE, (0.6, 0.0, 0.5))])
-    query = DistanceQuery(scene)
-    first = look(scene, panda.home, query=query)
-    later = look(scene, panda.home, {0: Sample.at((2.6, 0.0, 0.5))}, query=query)
+    query = Bench(scene)
+    first = look(scene, panda.home, bench=query)
+    later = look(scene, panda.home, {0: Sample.at((2.6, 0.0, 0.5))}, bench=query)
     assert later.distance[-1] > first.distance[-1] + 1.0
 
 
@@ -355,14 +354,14 @@ def test_distances_of_near_pairs_are_those_among_all(name, request):
     rng = np.random.default_rng(15)
     scene = random_scene(robot, rng, [SPHERE, CAPSULE, BOX, CYLINDER] * 2)
     assert len(scene.pairs) > 48
-    culled, whole = DistanceQuery(scene), DistanceQuery(scene)
+    culled, whole = Bench(scene), Bench(scene)
     samples = {i: o.motion.sample(0.0) for i, o in enumerate(scene.obstacles)}
     counts = set()
     for _ in range(40):
         q = random_q(robot, rng, spread=1.5)
         samples = {i: next_sample(rng, sample) for i, sample in samples.items()}
         influence = rng.choice([-0.02, 0.0, 0.05, 0.1, 0.3, 2.0, np.inf])
-        found, everything = look(scene, q, samples, influence, culled), look(scene, q, samples, query=whole)
+        found, everything = look(scene, q, samples, influence, culled), look(scene, q, samples, bench=whole)
         np.testing.assert_array_equal(found.pair, np.flatnonzero(everything.distance < influence))
         # coal starts from where it ended the last time, which shows within its stopping criteria
         distance = everything.distance[found.pair]
@@ -396,12 +395,12 @@ def test_bounding_spheres_are_tight(panda, shape, corner, size):
         tip = body.halfLength + body.radius
         turn = pin.Quaternion.FromTwoVectors(np.array(corner) / np.linalg.norm(corner), -axis).matrix()
         samples[i] = Sample.at(placement.translation + (tip + gap + size) * axis, turn)
-    query = DistanceQuery(scene)
+    query = Bench(scene)
     facing = [scene.pair_names.index((scene.body_names[i], f"o{i}")) for i in range(count)]
-    everything = look(scene, q, samples, query=query)
+    everything = look(scene, q, samples, bench=query)
     np.testing.assert_allclose(everything.distance[facing], gap, rtol=0, atol=1e-8)
     for reach, expected in ((gap + 1e-7, facing), (gap - 1e-7, [])):
-        found = look(scene, q, reach=reach, query=query)
+        found = look(scene, q, reach=reach, bench=query)
         assert sorted(set(facing) & set(found.pair)) == sorted(expected)
         np.testing.assert_array_equal(found.pair, np.flatnonzero(everything.distance < reach))
 

@@ -10,7 +10,8 @@ import pinocchio as pin
 import pytest
 from conftest import BOX, CAPSULE, CYLINDER, SPHERE, lay_out_step, make_layout, random_q, random_scene
 
-from qpavoid import Sample, kernels
+from qpavoid import kernels
+from qpavoid.control.obstacles import ObstacleStates
 from qpavoid.kernels.packing import compiled
 
 SEEDS = range(8)
@@ -29,13 +30,15 @@ class Step:
         self.rng, self.robot = np.random.default_rng(seed), robot
         scene = random_scene(robot, self.rng, [SPHERE, CAPSULE, BOX, CYLINDER] * 2)
         x, kinematics, query = lay_out_step(scene)
-        for i, obstacle in enumerate(scene.obstacles):
-            start = obstacle.motion.sample(0.0)
-            twist = self.rng.uniform(-0.5, 0.5, (2, 3))
-            query.place_obstacle(i, Sample.at(start.position, start.rotation, linear=twist[0], angular=twist[1]))
+        starts = [obstacle.motion.sample(0.0) for obstacle in scene.obstacles]
+        twists = self.rng.uniform(-0.5, 0.5, (len(starts), 2, 3))
+        samples = [
+            s._replace(linear=linear, angular=angular) for s, (linear, angular) in zip(starts, twists, strict=True)
+        ]
+        query.place(ObstacleStates.of(samples))
         self.q, self.pairs = random_q(robot, self.rng), np.arange(len(scene.pairs))
         kinematics.compute(self.q)
-        query.compute(kinematics.data, np.inf)
+        query.compute(kinematics.joint_poses, np.inf)
         self.x = x._replace(**fields)
         x.margin[:-1] = self.rng.choice([0.0, 0.02, 0.1], len(scene.obstacles))
         self.keep = scene, kinematics, query  # owners of the memory
@@ -75,7 +78,7 @@ def spheres(seed, bodies=5, geometries=12, size=1.0):
     expected = sorted(pair_of[i, j] for i, j in combinations if np.linalg.norm(world[i] - world[j]) <= touching[i, j])
     within, found = np.where(pair_of >= 0, touching**2, -1.0), np.full(len(combinations), -7)
     poses = np.hstack((R.swapaxes(1, 2).reshape(-1, 9), p))
-    return [poses, local, centers, within, pair_of, found], expected
+    return [poses, local, centers, within, pair_of, np.ones(len(combinations), dtype=bool), found], expected
 
 
 def found_by(args):
@@ -100,7 +103,15 @@ def test_candidates_include_spheres_that_just_touch():
     for sign, expected in ((1, [0, 1, 2]), (-1, [])):
         centers = np.hstack((world, np.ones((4, 1)), -np.sum(world**2, axis=1, keepdims=True)))
         within = np.array([[-1.0, *[0.25 * (1 + sign * 1e-9)] * 3]])
-        args = [poses, np.zeros((4, 3)), centers, within, np.array([[-1, 0, 1, 2]]), np.full(3, -7)]
+        args = [
+            poses,
+            np.zeros((4, 3)),
+            centers,
+            within,
+            np.array([[-1, 0, 1, 2]]),
+            np.ones(3, dtype=bool),
+            np.full(3, -7),
+        ]
         assert found_by(args) == expected
 
 
