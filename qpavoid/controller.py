@@ -3,47 +3,45 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from copy import copy
 from time import perf_counter
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
 from qpavoid import kernels
 from qpavoid.config import Avoidance, Limits, Progress, ScenarioConfig, Sensing
-from qpavoid.control.arguments import ArgumentReader
-from qpavoid.control.assembler import Assembly
-from qpavoid.control.attach import Attachments
+from qpavoid.control.builder import ProblemBuilder, StepProblem
 from qpavoid.control.contacts import ContactRows
 from qpavoid.control.distances import DistanceQuery
-from qpavoid.control.inputs import LARGEST_VELOCITY, Clock, Configurations, check_velocity
-from qpavoid.control.obstacles import ObstacleTracker
+from qpavoid.control.inputs import LARGEST_VELOCITY, check_velocity
 from qpavoid.control.poses import Pose
 from qpavoid.control.scenario import build_parts
-from qpavoid.control.targets import TargetReader
-from qpavoid.control.tasks.frames import AnyTask, in_order
+from qpavoid.control.tasks import RowTask, in_order
 from qpavoid.control.tick import Tick, copied
 from qpavoid.errors import ConfigError, NumericalError, UnknownName, located, nearest
 from qpavoid.model.cloud import Points
-from qpavoid.model.kinematics import ForwardKinematics
 from qpavoid.model.scene import Scene
 from qpavoid.model.trajectory import Sample
 from qpavoid.problem import Array, Solution, State, as_vector, require_finite
-from qpavoid.safety.arbiter import Arbiter
-from qpavoid.safety.pipeline import NO_BACKUP_WITH_CONTACTS, Pipeline, check_solver
+from qpavoid.reason import Reason, ReasonKind
+from qpavoid.safety.arbiter import Arbiter, check_solver
 from qpavoid.solvers import SOLVERS, Solver, make_solver
 
 _MAX_DT = 1.0
 """Largest control period that is accepted [s]: a longer one is in milliseconds."""
+_NO_BACKUP_WITH_CONTACTS = Reason.of(
+    ReasonKind.NO_BACKUP, "contacts", detail="backup trajectories do not hold contacts: avoidance.backup"
+)
+"""Assumption where obstacles move and the robot stands on something."""
 
 
-class Controller(Pipeline):
+class Controller:
     """Follows its tasks and keeps clear of everything in its scene."""
 
     def __init__(
         self,
         scene: Scene,
-        tasks: Sequence[AnyTask],
+        tasks: Sequence[RowTask],
         solver: Solver | str = "qp",
         dt: float = 0.01,
         avoidance: Avoidance | None = None,
@@ -75,45 +73,25 @@ class Controller(Pipeline):
         if not 0.0 < dt <= _MAX_DT:
             raise ConfigError(f"dt: {dt} s, expected more than 0 and at most {_MAX_DT}; it is in seconds")
         frames, others = in_order(tasks)
-        others = [copy(task) for task in others]  # each writes into the memory of its own controller
-        self.scene, self.dt, model = scene, dt, scene.robot.model
-        self.tasks: tuple[AnyTask, ...] = (*frames, *others)
+        self.scene, self.dt = scene, dt
+        self.tasks: tuple[RowTask, ...] = (*frames, *others)
         """Frames with a position to follow, then with an orientation alone, then all other tasks."""
-        law, self._contacts = make_solver(solver) if isinstance(solver, str) else solver, contacts is not None
-        check_solver(law, solver, self._contacts)
+        law, self._has_contacts = make_solver(solver) if isinstance(solver, str) else solver, contacts is not None
+        check_solver(law, solver, self._has_contacts)
         self.avoidance, self.limits = avoidance or Avoidance(), limits or Limits()
-        more = [i for task in others for i in task.frame_ids] + list(contacts.frame_ids if contacts else ())
-        self._kinematics = ForwardKinematics(model, [*(task.frame_id for task in frames), *more])
-        self._query = DistanceQuery(scene)
-        self._v_shape, self._clock, self._others = (model.nv,), Clock(dt), others
-        self._obstacles = ObstacleTracker(scene.obstacles, sensing or Sensing(), dt)
-        self._influence_distance = self.avoidance.d2 - self.avoidance.offset
-        self._bounds = scene.robot.bounds().within(self.limits)
-        names = scene.robot.coordinate_units
-        self._configurations = Configurations(
-            model, self._bounds.q_index, self._bounds.lower, self._bounds.upper,
-            [names[j] for j in self._bounds.v_index.tolist()],
-        )  # fmt: skip
-        self._q_last, self._no_backup = scene.robot.home.copy(), ()
-        self._assembly = Assembly(
-            scene, self.tasks, self._bounds, self._kinematics, self._query, self.avoidance,
-            self.limits, tracking_damping, dt, contacts, law.bounded and self.avoidance.look_ahead,
-        )  # fmt: skip
-        self._arguments = ArgumentReader(
-            ((model.nq,), self._v_shape), self._clock, self._configurations,
-            TargetReader(self.tasks, self._assembly.targets), self._obstacles,
-        )  # fmt: skip
+        self._v_shape, self._no_backup = (scene.robot.model.nv,), tuple[Reason, ...]()
         if contacts is not None and self.avoidance.backup is not None:
             self.avoidance = self.avoidance.model_copy(update={"backup": None})
-            self._no_backup = (NO_BACKUP_WITH_CONTACTS,)
-        self._commander = Arbiter(
-            scene, law, self._assembly, self._query, self._obstacles, self._bounds,
-            self.avoidance, self.limits, progress or Progress(), dt,
-        )  # fmt: skip
-        queries = self._query, *self._commander.queries
-        self._grasps = Attachments(
-            scene, queries, self._assembly, self.avoidance.safety_distance - self.avoidance.offset
+            self._no_backup = (_NO_BACKUP_WITH_CONTACTS,)
+        bounds = scene.robot.bounds().within(self.limits)
+        self._builder = ProblemBuilder(
+            scene, self.tasks, bounds, self.avoidance, self.limits, sensing or Sensing(), tracking_damping, dt, contacts
         )
+        self._arbiter = Arbiter(
+            scene, law, self._builder.rows, self._builder.tracker, bounds, self.avoidance, self.limits,
+            progress or Progress(), dt,
+        )  # fmt: skip
+        self._builder.rows.look_ahead(law.bounded and self.avoidance.look_ahead)
         self._warm_up()
         kernels.first_use.end()
         self.warm_up_time = perf_counter() - begin
@@ -126,26 +104,32 @@ class Controller(Pipeline):
         Raises:
             ConfigError: on assignment, of a law that has no `solve` or `bounded`, or does not hold contacts.
         """
-        return self._commander.solver
+        return self._arbiter.solver
 
     @solver.setter
     def solver(self, law: Solver) -> None:
-        check_solver(law, law, self._contacts)
-        self._commander.solver = law
-        self._assembly.look_ahead(law.bounded and self.avoidance.look_ahead)
+        check_solver(law, law, self._has_contacts)
+        self._arbiter.solver = law
+        self._builder.rows.look_ahead(law.bounded and self.avoidance.look_ahead)
+
+    @property
+    def attached(self) -> Mapping[str, int]:
+        """Joint that each attached object is attached to, by name of the object."""
+        table = self._builder.rows.query.table
+        return {self.scene.obstacles[index].name: joint for index, joint in table.attached.items()}
 
     def _warm_up(self) -> None:
         """Run the first steps, with a law that ships: one of the user's own may remember what it is asked."""
-        q, v, law = self.scene.robot.home, np.zeros(self._v_shape), self._commander.solver
+        q, v, law = self.scene.robot.home, np.zeros(self._v_shape), self._arbiter.solver
         if type(law) not in SOLVERS.values():
-            self._commander.solver = make_solver("qp")
+            self._arbiter.solver = make_solver("qp")
         self.tick(q)
         self.filter(q, v)
-        self._assembly.clearance_lower_bound(v, 0, self._influence_distance, self.dt)
-        self._assembly.leaves_position_limits(q, v, self.dt)
-        self._obstacles.warm_up()
+        self._builder.rows.clearance_lower_bound(v, 0, self.dt)
+        self._builder.rows.leaves_position_limits(q, v, self.dt)
+        self._builder.tracker.warm_up()
         kernels.projection_cost(np.zeros((0, len(v))), 1.0, v)
-        self._commander.solver = law
+        self._arbiter.solver = law
         self.reset()
 
     @classmethod
@@ -205,7 +189,7 @@ class Controller(Pipeline):
             UnknownName: of a target or obstacle.
         """
         begin = perf_counter()
-        return self._solve(self._build(self._arguments.read(q, t, targets, obstacles, v)), begin)
+        return self._decide(self._builder.build(self._builder.read(q, t, targets, obstacles, v)), begin)
 
     def tick(
         self,
@@ -217,12 +201,13 @@ class Controller(Pipeline):
     ) -> Tick:
         """Like `step`, with everything that led to the velocity."""
         begin = perf_counter()
-        built = self._build(self._arguments.read(q, t, targets, obstacles, v))
-        state = State(built[0].copy(), self._assembly.v_prev.copy(), built[1])
-        solution = self._solve(built, begin)
-        kinematics = copied(self._assembly.kinematics)
-        errors = np.array([task.error for task in self._others])
-        return Tick(state, tuple(built[2]), errors, kinematics, copied(built[3]), copied(built[4]), solution)
+        rows, step = self._builder.rows, self._builder.build(self._builder.read(q, t, targets, obstacles, v))
+        state = State(step.q.copy(), rows.previous.v.copy(), step.t)
+        solution = self._decide(step, begin)
+        return Tick(
+            state, tuple(step.targets), rows.task_errors.copy(), copied(rows.kinematics), copied(step.proximity),
+            copied(step.problem), solution,
+        )  # fmt: skip
 
     def filter(
         self,
@@ -248,8 +233,24 @@ class Controller(Pipeline):
         """
         begin = perf_counter()
         v_desired = as_vector("v_desired", v_desired, self._v_shape)
-        built = self._build(self._arguments.read(q, t, None, obstacles, v, v_desired))
-        return self._solve(built, begin, from_tasks=False)
+        step = self._builder.build(self._builder.read(q, t, None, obstacles, v, v_desired))
+        return self._decide(step, begin, from_tasks=False)
+
+    def _decide(self, step: StepProblem, begin: float, from_tasks: bool = True) -> Solution:
+        """Decide what is commanded; the step began at `begin` [s]."""
+        middle, arbiter, builder = perf_counter(), self._arbiter, self._builder
+        if step.resumed:
+            arbiter.reset()
+        if step.faults:
+            solution = arbiter.stop(step.problem, step.faults)
+        else:
+            solution = arbiter.decide(step.q, step.t, step.problem, step.proximity, tasks=from_tasks)
+        builder.rows.previous.remember(solution.v)
+        assumptions = step.assumptions
+        if self._no_backup and len(builder.tracker.moving):
+            assumptions += self._no_backup
+        solution = solution._replace(assumptions=assumptions) if assumptions else solution
+        return solution.with_times(middle - begin, perf_counter() - middle)
 
     def attach(self, obstacle: str, frame: str, q: Array | None = None) -> None:
         """Attach an obstacle to a frame of the robot; it stays where it is relative to the frame.
@@ -271,11 +272,9 @@ class Controller(Pipeline):
         """
         if not isinstance(frame, str):
             raise UnknownName(f"attach: no frame {frame!r:.60}; give its name")
-        index, frame_id = self._obstacles.index(obstacle), self.scene.robot.frame_id(frame, "attach")
-        self._grasps.attach(index, frame_id, self._given_or_last(q))
-        self._commander.invalidate()
-        self._obstacles.attach(index, True)
-        self._commander.braking.forget(index)
+        index, frame_id = self._builder.tracker.index(obstacle), self.scene.robot.frame_id(frame, "attach")
+        self._builder.attach(index, frame_id, q)
+        self._arbiter.invalidate()
 
     def release(self, obstacle: str, q: Array | None = None) -> Sample:
         """Release an attached obstacle: it rests where it is, until it is given to `step` again.
@@ -294,10 +293,8 @@ class Controller(Pipeline):
             ConfigError: it is not carried.
             NumericalError: q cannot be true.
         """
-        index = self._obstacles.index(obstacle)
-        sample = self._grasps.release(index, self._given_or_last(q))
-        self._commander.invalidate()
-        self._obstacles.attach(index, False)
+        sample = self._builder.release(self._builder.tracker.index(obstacle), q)
+        self._arbiter.invalidate()
         return sample
 
     def allow_contact(self, obstacle: str, others: Sequence[str], allowed: bool = True) -> None:
@@ -312,7 +309,7 @@ class Controller(Pipeline):
             UnknownName: no such obstacle or body.
             ConfigError: none of the others has a pair with it.
         """
-        index, known = self._obstacles.index(obstacle), {*self.scene.body_names, *self.scene.obstacle_names}
+        index, known = self._builder.tracker.index(obstacle), {*self.scene.body_names, *self.scene.obstacle_names}
         try:
             names = [others] if isinstance(others, str) else list(others)
         except TypeError:
@@ -320,19 +317,16 @@ class Controller(Pipeline):
         for name in names:
             if not isinstance(name, str) or name not in known:
                 raise UnknownName(f"allow_contact: no body or obstacle {name!r:.60}{nearest(str(name), known)}")
-        self._grasps.allow(index, set(names), allowed)
-        self._commander.invalidate()
+        self._builder.attachments.allow(index, set(names), allowed)
+        self._arbiter.invalidate()
 
     def obstacle_pose(self, obstacle: str, q: Array | None = None) -> Sample:
         """Return the world pose of an obstacle in the last step, attached or not; see `release`."""
-        return self._grasps.pose(self._obstacles.index(obstacle), self._given_or_last(q))
+        return self._builder.pose(self._builder.tracker.index(obstacle), q)
 
-    def sync_attachments(self, query: DistanceQuery) -> None:
-        """Bring other distances of the scene up to date with attached objects and allowed contacts."""
-        self._grasps.sync(query)
-
-    def _given_or_last(self, q: Array | None) -> Array:
-        return self._q_last if q is None else self._configurations.require("q", q)
+    def distances(self) -> DistanceQuery:
+        """Return distances of the scene in memory of their own, which know what is attached to the robot."""
+        return DistanceQuery(self.scene, self._builder.rows.query.table)
 
     def reset(self, v: Array | None = None) -> None:
         """Forget the steps before; the robot moves at v (nv,), or stands still. Attached objects stay attached.
@@ -343,7 +337,13 @@ class Controller(Pipeline):
         v = np.zeros(self._v_shape) if v is None else require_finite("v", v, self._v_shape)
         if faults := check_velocity("v", v, LARGEST_VELOCITY):
             raise NumericalError(str(faults[0]))
-        self._assembly.restart(v)
-        self._clock.reset()
-        self._obstacles.reset()
-        self._commander.reset()
+        self._builder.reset(v)
+        self._arbiter.reset()
+
+    def __reduce_ex__(self, protocol: Any) -> NoReturn:
+        """Refuse to be copied or pickled: a copy would share memory that coal and compiled code look into.
+
+        Raises:
+            TypeError: always.
+        """
+        raise TypeError("a Controller is neither copied nor pickled; build another one of its scene and tasks")

@@ -2,10 +2,12 @@
 
 import numpy as np
 import pinocchio as pin
+from conftest import place
 
 from qpavoid import Avoidance, Controller, Limits, Robot, Sample, build_scene, build_tasks, load_scenario
 from qpavoid.config import Progress, ScenarioConfig, Sensing, Task
 from qpavoid.control.distances import DistanceQuery
+from qpavoid.model.kinematics import ForwardKinematics
 
 SHIPPED = load_scenario("situation1").source
 """A place from which scenarios made here are taken to be read, so that robots are found by name."""
@@ -82,15 +84,15 @@ class Ruler:
 
     def __init__(self, scene):
         self.scene, self.model = scene, scene.robot.model
-        self._data, self._query = self.model.createData(), DistanceQuery(scene)
+        self._kinematics, self._query = ForwardKinematics(self.model), DistanceQuery(scene)
 
     def distances(self, q, samples=None):
         """(m,) at q, infinite beyond 10 m, with obstacles by number at `samples`."""
-        for index, sample in (samples or {}).items():
-            self._query.place_obstacle(index, sample)
-        pin.forwardKinematics(self.model, self._data, q)
-        self._query.compute(self._data, 10.0)
-        return self._query.found(np.arange(len(self.scene.pairs))).copy()
+        if samples:
+            place(self._query, self.scene, samples)
+        self._kinematics.compute(q)
+        self._query.compute(self._kinematics.joint_poses, 10.0)
+        return self._query.distances_of(np.arange(len(self.scene.pairs))).copy()
 
     def least_between(self, q, v, dt, t, steps=10):
         """Least distance on the way from q at v for dt, obstacles on their motions from t on."""

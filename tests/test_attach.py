@@ -253,7 +253,7 @@ def test_nothing_comes_nearer_than_the_closest_call_says_with_a_load(panda):
         q, v = random_q(panda, rng), rng.uniform(-1, 1, 7)
         near = len(controller.tick(q).proximity.pair)
         for horizon in (0.02, 0.2):
-            least = controller._assembly.clearance_lower_bound(v, near, 0.3, horizon)
+            least = controller._builder.rows.clearance_lower_bound(v, near, 0.3, horizon)
             after = pin.integrate(panda.model, q, horizon * v)
             for ball in balls:
                 there = pin.SE3(np.eye(3), ball.motion.sample(0.0).position)

@@ -134,8 +134,7 @@ def test_offset_is_added_and_near_pairs_keep_their_order(panda):
     scene = build_scene(panda, [obstacle(f"o{i}", SPHERE, place) for i, place in enumerate(places)])
     settings = Avoidance(d1=D1, d2=D2, offset=0.1, row={"type": "beta", "gain": XI})
     bench = Bench(scene, avoidance=settings)
-    for i, place in enumerate(places):
-        bench.query.place_obstacle(i, Sample.at(place, linear=[0.1, 0.2, -0.3]))
+    bench.place({i: Sample.at(place, linear=[0.1, 0.2, -0.3]) for i, place in enumerate(places)})
     everything, _ = bench.compute(panda.home)
     distance, rate = everything.distance.copy(), everything.feedforward.copy()
     near = np.flatnonzero(distance < D2 - 0.1)

@@ -33,7 +33,7 @@ def closing_balls(stop=GAP, speed=0.3):
 
 def backup_of(controller):
     """The backup planner of a controller."""
-    return controller._commander.backup
+    return controller._arbiter.backup
 
 
 def count_rollouts(controller, record):
@@ -408,7 +408,7 @@ def test_backup_is_verified_anew_when_obstacles_turn(tmp_path):
     start = Start(robot.home, np.zeros(2), np.zeros(2), 0.0, planner.rollouts.separable_pairs)
     for speed, clear in ((0.0, 1.5), (0.5, 0.25 / 0.5)):
         for k in range(200):  # the prediction is of the mean twist
-            controller._obstacles.observe(0.01 * (k - 199), update(speed))
+            controller._builder.tracker.advance(controller._builder.tracker.read(0.01 * (k - 199), update(speed)))
         planner.rollouts.drop_predictions()
         found, _ = planner._current_backup(start)
         if speed == 0.0:
@@ -432,7 +432,7 @@ def test_predicted_states_of_the_past_are_dropped(among_balls):
         most = max(most, len(planner.rollouts._predictions))
     assert 100 < most < 1000  # a step with many rollouts predicts some hundreds
     for t, predicted in planner.rollouts._predictions.items():
-        np.testing.assert_array_equal(predicted.states, controller._obstacles.predicted(t).states)
+        np.testing.assert_array_equal(predicted.states, controller._builder.tracker.at(t).states)
 
 
 def test_no_rollout_while_moving_obstacles_stay_far(tmp_path):
@@ -590,16 +590,16 @@ def test_paths_agree_with_predicted_states():
         0.1,
     )
     for k in range(4):
-        obstacles.observe(0.1 * k, update if k % 2 else None)
+        obstacles.advance(obstacles.read(0.1 * k, update if k % 2 else None))
         places, rates = obstacles.paths(times)
         assert obstacles.any_may_move and len(rates) == (2 if k else 1)
         for t, row in zip(times, places, strict=True):
-            np.testing.assert_allclose(row, obstacles.predicted(t).states[obstacles.moving, 9:12], rtol=0, atol=1e-12)
+            np.testing.assert_allclose(row, obstacles.at(t).states[obstacles.moving, 9:12], rtol=0, atol=1e-12)
         expected = [[0.5, 0.0], [np.sqrt(0.05), 3.0]][: len(rates)]
         np.testing.assert_allclose(rates, expected, rtol=0, atol=1e-12)
     resting = ObstacleTracker([still], Sensing(), 0.1)
     for twist, any_may_move in (([0, 0, 0], False), ([0, 0, 0.1], True)):
-        resting.observe(0.0, {"still": Sample.at([9.0, 0.0, 0.0], linear=twist)})
+        resting.advance(resting.read(0.0, {"still": Sample.at([9.0, 0.0, 0.0], linear=twist)}))
         assert resting.any_may_move == any_may_move
 
 
@@ -610,14 +610,14 @@ def test_prediction_uses_the_mean_twist():
     for k in range(200):
         t = k * dt
         at = np.array([0.2 * t, 0.0, 0.0])
-        obstacles.observe(t, {"ball": Pose.at(at + 0.005 * rng.normal(size=3))})
+        obstacles.advance(obstacles.read(t, {"ball": Pose.at(at + 0.005 * rng.normal(size=3))}))
         if k == 1:
             first = obstacles.estimates.states[0, 12:15]
             np.testing.assert_array_equal(first, obstacles._current.states[0, 12:15])  # of one twist, that is the mean
         if k > 50:
-            off.append(obstacles.predicted(t + 1.0).states[0, 9:12] - at - [0.2, 0.0, 0.0])
+            off.append(obstacles.at(t + 1.0).states[0, 9:12] - at - [0.2, 0.0, 0.0])
             places, _ = obstacles.paths(np.array([t + 1.0]))
-            np.testing.assert_allclose(places[0, 0], obstacles.predicted(t + 1.0).states[0, 9:12], rtol=0, atol=1e-12)
+            np.testing.assert_allclose(places[0, 0], obstacles.at(t + 1.0).states[0, 9:12], rtol=0, atol=1e-12)
     assert np.std(off) < 0.05 and np.abs(np.mean(off, axis=0)).max() < 0.02
 
 
@@ -647,16 +647,16 @@ def test_prediction_error_bound_covers_every_point(seed, size):
         return Sample(parts[0], pin.exp3(turn), *parts[1:])
 
     first = {name: [rng.normal(size=3) for _ in range(4)] for name in names}
-    obstacles.observe(0.0, {name: sample(*parts) for name, parts in first.items()})
+    obstacles.advance(obstacles.read(0.0, {name: sample(*parts) for name, parts in first.items()}))
     before, radii = obstacles.estimates, np.array([0.2, 0.3])
-    then = {name: obstacles.predicted(dt).states[i] for i, name in enumerate(names)}
+    then = {name: obstacles.at(dt).states[i] for i, name in enumerate(names)}
     now = {}
     for name, state in then.items():
         R = state[:9].reshape(3, 3).T @ pin.exp3(size * rng.normal(size=3))
         now[name] = Sample(
             *(state[9:12] + size * rng.normal(size=3), R), *(state[12:].reshape(2, 3) + size * rng.normal(size=(2, 3)))
         )
-    obstacles.observe(dt, now)
+    obstacles.advance(obstacles.read(dt, now))
     bound = prediction_error_bound(obstacles.estimates, before, 1.0, radii)
     for i, name in enumerate(names):
         for t in np.linspace(0.0, 1.0, 11):

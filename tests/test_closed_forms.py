@@ -12,6 +12,7 @@ from oracle import support
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.geometry.cores import cores, has_closed_form
 from qpavoid.kernels.distances import MIN_CORE_DISTANCE, closed_forms
+from qpavoid.model.kinematics import ForwardKinematics
 
 AT_ORIGIN = pin.SE3.Identity()
 
@@ -124,20 +125,21 @@ def test_a_query_has_the_same_results_as_coal_alone(panda, monkeypatch, copies):
     rng = np.random.default_rng(3)
     scene = random_scene(panda, rng, [SPHERE, CAPSULE, BOX, CYLINDER] * 2)
     model = scene.robot.model
-    query, data, deep = DistanceQuery(scene), model.createData(), 0
-    assert query._copy == copies and 0 < query._known.sum() < len(scene.pairs)
+    query, kinematics, deep = DistanceQuery(scene), ForwardKinematics(model), 0
+    closed = query.table.has_closed_form
+    assert 0 < closed.sum() < len(scene.pairs)
     alone, geometry_data = scene.geometry, scene.geometry.createData()
     for request in geometry_data.distanceRequests:
         request.gjk_tolerance = 1e-10
     for _ in range(40):
         q = random_q(panda, rng, spread=1.5)
-        pin.forwardKinematics(model, data, q)
-        query.compute(data, 0.2)
-        pin.updateGeometryPlacements(model, data, alone, geometry_data)
+        kinematics.compute(q)
+        query.compute(kinematics.joint_poses, 0.2)
+        pin.updateGeometryPlacements(model, kinematics.data, alone, geometry_data)
         pin.computeDistances(alone, geometry_data)
         exact = np.array([result.min_distance for result in geometry_data.distanceResults])
-        np.testing.assert_allclose(query.results[query.pairs, 0], exact[query.pairs], rtol=0, atol=1e-7)
+        np.testing.assert_allclose(query.arrays.results[query.pairs, 0], exact[query.pairs], rtol=0, atol=1e-7)
         near = np.flatnonzero(exact < 0.2)
         assert np.isin(near, query.pairs).all()
-        deep += int((exact[query._known] < -0.1).sum())
+        deep += int((exact[closed] < -0.1).sum())
     assert deep > 20

@@ -123,7 +123,7 @@ def test_nan_distances_stop_the_robot_instead_of_being_dropped(make, panda, monk
     """Whatever makes a distance NaN: the pair is not hidden."""
     controller = make()
     assert controller.step(panda.home).status is Status.SOLVED
-    query = controller._query
+    query = controller._builder.rows.query
     compute = query.compute
 
     def poisoned(data, reach):

@@ -82,7 +82,7 @@ def test_clearance_lower_bound_holds_with_moving_obstacles(panda):
         horizon = rng.uniform(0.005, 0.3)
         places = {b.name: Sample.at(rng.uniform(-0.8, 0.8, 3), linear=rng.uniform(-0.5, 0.5, 3)) for b in balls}
         near = len(controller.tick(q, 0.0, None, places).proximity.pair)
-        bound = controller._assembly.clearance_lower_bound(v, near, 0.1, horizon)
+        bound = controller._builder.rows.clearance_lower_bound(v, near, 0.1, horizon)
         least = min_margin(controller, q, v, horizon, dict(enumerate(places.values())))
         assert least >= bound - 1e-9
         close += bound > 0.0
@@ -125,7 +125,7 @@ def test_braking_check_is_safe_by_brute_force(panda):
 def test_braking_check_evaluates_curved_paths_at_any_distance(panda, monkeypatch):
     """A joint fast near its limit brakes harder than others: the bound for straight paths does not apply."""
     controller, bounds, calls = make_controller(panda), panda.bounds(), []
-    check = controller._commander.braking
+    check = controller._arbiter.braking
     min_margin = check._min_margin
     monkeypatch.setattr(check, "_min_margin", lambda *args: calls.append(args[2]) or min_margin(*args))
     q, v = panda.home.copy(), np.zeros(7)

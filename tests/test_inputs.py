@@ -550,11 +550,11 @@ def test_braking_check_looks_at_a_bounded_number_of_poses_whatever_moves(tmp_pat
     controller.reset(np.array([0.9, 0.0, 0.0]))
     looks, look = [], BrakingCheck._margin_at
     monkeypatch.setattr(BrakingCheck, "_margin_at", lambda self, *args: looks.append(1) or look(self, *args))
-    query, braking = controller._query, controller._commander.braking
+    query, braking = controller._builder.rows.query, controller._arbiter.braking
     tick = controller.tick(np.zeros(3), v=np.array([0.9, 0.0, 0.0]))
     looks.clear()
     way = braking._min_margin if jerk is None else braking._min_margin_with_jerk
-    way(controller._assembly, np.zeros(3), tick.solution.v, query, 0.2, speed)
+    way(controller._builder.rows, np.zeros(3), tick.solution.v, query, 0.2, speed)
     assert 0 < len(looks) <= 48 + 200 + 6 * 48
 
 

@@ -120,7 +120,7 @@ def test_clearance_lower_bound_holds_along_stops(panda):
     rng, bounds = np.random.default_rng(0), panda.bounds()
     balls = [Obstacle.at(f"ball{i}", Sphere(radius=0.08), p) for i, p in enumerate(rng.uniform(-0.7, 0.7, (3, 3)))]
     controller = make_controller(panda, balls, limits=Limits(jerk=400.0))
-    assembly, ruler, close = controller._assembly, Ruler(controller.scene), 0
+    assembly, ruler, close = controller._builder.rows, Ruler(controller.scene), 0
     for _ in range(150):
         q = rng.uniform(bounds.lower + 0.3, bounds.upper - 0.3)
         before, change = rng.uniform(-0.3, 0.3, 7) * bounds.velocity, rng.uniform(-1.0, 1.0, 7) * bounds.acceleration

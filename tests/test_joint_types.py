@@ -86,12 +86,12 @@ def test_speeds_of_all_joints(named):
     for _ in range(20):
         q, v = random_q(robot, rng), rng.normal(size=model.nv)
         bench.compute(q)
-        bench.assembly.clearance_lower_bound(v, 0, 1.0, 0.01)
+        bench.rows.clearance_lower_bound(v, 0, 0.01)
         pin.forwardKinematics(model, data, q, v)
         velocities = np.array([motion.vector for motion in data.v])
         expected = np.linalg.norm(velocities[:, :3], axis=1)
         expected += np.linalg.norm(velocities[:, 3:], axis=1) * bench.query.joint_radius()
-        np.testing.assert_allclose(bench.query.placing.speeds[: model.njoints], expected, atol=1e-12)
+        np.testing.assert_allclose(bench.query.arrays.speeds[: model.njoints], expected, atol=1e-12)
 
 
 def test_a_run_from_file_to_log(named, tmp_path):

@@ -23,7 +23,6 @@ from qpavoid import (
     kernels,
 )
 from qpavoid.config import PointCloud
-from qpavoid.control.distances import DistanceQuery
 from qpavoid.kernels.voxels import SAME_DIRECTION
 from qpavoid.model.cloud import read_points, voxel_radius
 
@@ -133,10 +132,10 @@ def test_the_nearest_voxels_of_each_body_have_slots(name, turned, request, tmp_p
     if turned:
         pose = {0: Sample.at([0.1, -0.2, 0.3], pin.rpy.rpyToMatrix(0.3, 0.2, 0.9))}
         centers = centers @ pose[0].rotation.T + pose[0].position
-    query = DistanceQuery(scene)
+    query = Bench(scene)
     for _ in range(3):
         q = random_q(robot, rng)
-        found = look(scene, q, pose, reach=0.25, query=query)
+        found = look(scene, q, pose, reach=0.25, bench=query)
         expected = np.sort(body_distances(scene, q, centers), axis=1)
         for body in range(len(scene.body_names)):
             pairs = np.flatnonzero((scene.pairs[:, 0] == body) & (scene.obstacle_of[scene.pairs[:, 1]] == 0))
@@ -380,7 +379,7 @@ def test_the_closest_call_counts_voxels_that_have_no_slot(panda, tmp_path):
         q, v = random_q(panda, rng), rng.uniform(-1.0, 1.0, 7)
         near = len(bench.compute(q, reach=0.3)[0].pair)
         for horizon in (0.01, 0.1):
-            least = bench.assembly.clearance_lower_bound(v, near, 0.3, horizon)
+            least = bench.rows.clearance_lower_bound(v, near, horizon)
             assert ruler.distances(pin.integrate(panda.model, q, horizon * v)).min() - hold >= least - 1e-9
 
 

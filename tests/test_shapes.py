@@ -25,7 +25,6 @@ from qpavoid import (
 )
 from qpavoid.config import Cone, Ellipsoid, HalfSpace, Mesh
 from qpavoid.control import distances as proximity_module
-from qpavoid.control.distances import DistanceQuery
 from qpavoid.geometry.bodies import MeshWarning, enclosing_capsule, make_shape
 from qpavoid.run.simulate import simulate
 
@@ -200,14 +199,14 @@ def test_half_spaces_are_never_culled(panda, monkeypatch):
     rng = np.random.default_rng(8)
     scene = build_scene(panda, [obstacle("floor", FLOOR, (0, 0, -0.1)), obstacle("ball", SPHERE, (0.6, 0, 0.3))])
     monkeypatch.setattr(proximity_module, "_CULL_FROM", 10_000)
-    plain = DistanceQuery(scene)
+    plain = Bench(scene)
     monkeypatch.setattr(proximity_module, "_CULL_FROM", 0)
-    culled = DistanceQuery(scene)
+    culled = Bench(scene)
     assert plain._cull is None and culled._cull is not None
     for reach in (0.1, 0.5, np.inf):
         for _ in range(5):
             q = random_q(panda, rng)
-            found, expected = look(scene, q, reach=reach, query=culled), look(scene, q, reach=reach, query=plain)
+            found, expected = look(scene, q, reach=reach, bench=culled), look(scene, q, reach=reach, bench=plain)
             np.testing.assert_array_equal(found.pair, expected.pair)
             np.testing.assert_allclose(found.distance, expected.distance, atol=1e-12)
     assert "floor" in {scene.pair_names[pair][1] for pair in found.pair}
@@ -225,13 +224,13 @@ def test_what_passes_close_by_is_known_not_to_come_nearer(panda, shape):
             rng.uniform([-0.5, -0.5, 0.0], [0.5, 0.5, 0.9]), pin.exp3(rng.uniform(-2, 2, 3)),
             *(rng.choice([0.0, 0.3]) * rng.uniform(-1, 1, 3) for _ in range(2)),
         )  # fmt: skip
-        bench.query.place_obstacle(0, sample)
+        bench.place({0: sample})
         proximity = bench.compute(q, reach=0.1)[0]
         gap = proximity.distance.min(initial=np.inf) - Avoidance().safety_distance
         if not 0.0 < gap < 0.01:
             continue
         close += 1
-        least = bench.assembly.clearance_lower_bound(v, len(proximity.pair), 0.1, 0.02)
+        least = bench.rows.clearance_lower_bound(v, len(proximity.pair), 0.02)
         warned += least > 0.0
         for t in (0.005, 0.01, 0.02):
             found = look(scene, pin.integrate(panda.model, q, t * v), {0: moved(sample, t)}, 0.1)
@@ -251,11 +250,11 @@ def test_the_closest_call_holds_for_half_spaces_that_move_and_turn(panda, turnin
             [0, 0, -0.3], pin.rpy.rpyToMatrix(*rng.uniform(-0.4, 0.4, 3)), rng.uniform(-0.3, 0.3, 3),
             turning * rng.uniform(-1, 1, 3),
         )  # fmt: skip
-        bench.query.place_obstacle(0, sample)
-        assert np.isfinite(bench.query.placing.speeds).all()
+        bench.place({0: sample})
+        assert np.isfinite(bench.query.arrays.speeds).all()
         near = len(bench.compute(q, reach=0.3)[0].pair)
         for horizon in (0.01, 0.1, 0.3):
-            least = bench.assembly.clearance_lower_bound(v, near, 0.3, horizon)
+            least = bench.rows.clearance_lower_bound(v, near, horizon)
             later = sample._replace(
                 position=sample.position + horizon * sample.linear,
                 rotation=pin.exp3(horizon * sample.angular) @ sample.rotation,

@@ -14,6 +14,7 @@ from pydantic import TypeAdapter
 from qpavoid import Obstacle, ReasonKind, Sample, Status, build_scene, config, kernels
 from qpavoid.control import trajectories as courses
 from qpavoid.control.distances import DistanceQuery
+from qpavoid.control.obstacles import ObstacleStates
 from qpavoid.errors import NumericalError
 from qpavoid.kernels.obstacles import (
     FAR,
@@ -132,7 +133,7 @@ def test_a_controller_follows_motions_of_other_classes(panda):
         controller.step(panda.home, t)
         found = controller.obstacle_pose("it")
         np.testing.assert_array_equal(found.position, Pendulum().sample(t).position)
-        np.testing.assert_array_equal(controller._query.placing.samples[0].linear, Pendulum().sample(t).linear)
+        np.testing.assert_array_equal(controller._builder.tracker.current.states[0, 12:15], Pendulum().sample(t).linear)
 
 
 def test_a_motion_that_gives_nonsense_is_named_and_moves_nothing(panda):
@@ -170,19 +171,6 @@ def test_states_move_on_at_their_twists(data):
 # --- what distances know of them ---------------------------------------------------------------------------------
 
 
-def memory(rng, obstacles, loads, centred):
-    """Of a scene that was never built: obstacle i has i % 3 bodies; five bodies before them are the robot's."""
-    owner = np.concatenate([np.full(5, -1), np.repeat(np.arange(obstacles), np.arange(obstacles) % 3)])
-    local = rng.normal(size=(len(owner), 3)) * (not centred)
-    return owner, kernels.ObstacleArrays(
-        states=np.zeros((obstacles, courses.STATE)), twists=np.zeros((obstacles + 1 + loads, 6)),
-        margin=np.zeros(obstacles + 1 + loads), speeds=np.zeros(obstacles),
-        bounding_radius=rng.uniform(0.1, 1.0, obstacles),
-        placements=rng.normal(size=(len(owner), 12)), local=local,
-        centers=np.ones((len(owner), 5)),
-    )  # fmt: skip
-
-
 def random_states(rng, count, turning):
     states = np.zeros((count, courses.STATE))
     for view in courses.as_samples(states):
@@ -192,52 +180,52 @@ def random_states(rng, count, turning):
     return states
 
 
+def placed_scene(panda, count):
+    """Spheres, capsules and boxes of which the first two may be attached, and distances of theirs."""
+    shapes = [SPHERE, CAPSULE, BOX]
+    obstacles = [obstacle(f"o{i}", shapes[i % 3], (1.0 + i, 0.0, 0.5), graspable=i < 2) for i in range(count)]
+    scene = build_scene(panda, obstacles)
+    return scene, DistanceQuery(scene)
+
+
 @pytest.mark.parametrize("turning", [False, True])
-@pytest.mark.parametrize("centred", [False, True])
-@pytest.mark.parametrize("loads", [0, 2])
-def test_what_distances_know_by_definition(loads, centred, turning):
+def test_place_writes_twists_speeds_and_poses_by_definition(panda, turning):
     rng = np.random.default_rng(1)
-    owner, x = memory(rng, 8, loads, centred)
-    before = x.placements.copy()
+    scene, query = placed_scene(panda, 8)
+    x, first, joints = query.arrays, len(scene.body_names), panda.model.njoints
+    before = x.poses.copy()
     for which in ([0, 2, 3, 7], [5], [4, 1], []):
-        which = np.array(which, dtype=np.intp)
-        geometries = np.array([g for i in which for g in np.flatnonzero(owner == i)], dtype=np.intp)
-        owners = np.array([list(which).index(i) for i in owner[geometries]], dtype=np.intp)
         states, margin = random_states(rng, 8, turning), rng.choice([0.0, 0.1], 8)
-        bad, moving = kernels.place_obstacles(x, which, geometries, owners, states, margin)
-        assert bad == -1 and moving == bool(x.twists.any() or x.margin.any())
+        query.place(ObstacleStates(np.array(which, dtype=np.intp), states, margin, {}))
+        assert query.is_moving == bool(states[which, 12:].any() or margin[which].any())
         for i in which:
             sample = courses.as_samples(states)[i]
             at_origin = pin.SE3(np.eye(3), sample.position).act(pin.Motion(sample.linear, sample.angular))
             np.testing.assert_allclose(x.twists[i], at_origin.vector, atol=1e-14)
-            speed = np.linalg.norm(sample.linear) + x.bounding_radius[i] * np.linalg.norm(sample.angular)
-            assert x.speeds[i] == pytest.approx(speed, abs=1e-14)
+            speed = np.linalg.norm(sample.linear) + query.obstacle_radii[i] * np.linalg.norm(sample.angular)
+            assert x.speeds[joints + i] == pytest.approx(speed, abs=1e-14)
             assert x.margin[i] == margin[i] and (x.states[i] == states[i]).all()
-        for g in geometries:
-            sample = courses.as_samples(states)[owner[g]]
-            np.testing.assert_array_equal(x.placements[g, :9].reshape(3, 3).T, sample.rotation)
-            np.testing.assert_array_equal(x.placements[g, 9:], sample.position)
-            center = sample.rotation @ x.local[g] + sample.position
-            np.testing.assert_allclose(x.centers[g], [*center, 1.0, -center @ center], atol=1e-13)
-        np.testing.assert_array_equal(x.twists[9:], -x.twists[:loads])
-        np.testing.assert_array_equal(x.margin[9:], x.margin[:loads])
+            np.testing.assert_array_equal(x.poses[first + i, :9].reshape(3, 3).T, sample.rotation)
+            np.testing.assert_array_equal(x.poses[first + i, 9:], sample.position)
+            center = sample.position + sample.rotation @ query.table.spheres[first + i, :3]
+            np.testing.assert_allclose(x.centers[first + i], [*center, 1.0, -center @ center], atol=1e-13)
+        np.testing.assert_array_equal(x.twists[9:], -x.twists[:2])
+        np.testing.assert_array_equal(x.margin[9:], x.margin[:2])
         assert not x.twists[8].any() and x.margin[8] == 0.0
-    untouched = ~np.isin(owner, [0, 2, 3, 7, 5, 4, 1])
-    np.testing.assert_array_equal(x.placements[untouched], before[untouched])
+    np.testing.assert_array_equal(x.poses[first + 6], before[first + 6])
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_numbers_that_cannot_be_true_change_nothing(value):
+def test_place_refuses_implausible_numbers_and_changes_nothing(panda, value):
     rng = np.random.default_rng(2)
-    owner, x = memory(rng, 6, 1, False)
-    before = [np.copy(part) for part in x]
-    which, geometries = np.arange(6), np.flatnonzero(owner >= 0)
+    _, query = placed_scene(panda, 6)
+    before = [np.copy(part) for part in query.arrays]
     for column in range(courses.STATE):
         states = random_states(rng, 6, True)
         states[3, column] = value
-        bad, _ = kernels.place_obstacles(x, which, geometries, owner[geometries], states, np.zeros(6))
-        assert bad == 3
-        for part, was in zip(x, before, strict=True):
+        with pytest.raises(NumericalError, match="o3"):
+            query.place(ObstacleStates(np.arange(6), states, np.zeros(6), {}))
+        for part, was in zip(query.arrays, before, strict=True):
             np.testing.assert_array_equal(part, was)
 
 
@@ -332,21 +320,6 @@ def test_take_in_gives_bare_poses_the_twist_that_has_led_to_them(seed):
         np.testing.assert_array_equal(now[others], was[others])
 
 
-def test_some_move_in_coals_model_and_the_others_stay(panda):
-    """Through the query: each body where its obstacle is, and no other."""
-    shapes = [SPHERE, CAPSULE, BOX, SPHERE]
-    scene = build_scene(panda, [obstacle(f"o{i}", shape, (1.0 + i, 0.0, 0.5)) for i, shape in enumerate(shapes)])
-    query, rng = DistanceQuery(scene), np.random.default_rng(3)
-    states = random_states(rng, 4, True)
-    query.placing.place(np.array([2, 0]), states, np.zeros(4))
-    views = courses.as_samples(states)
-    first = len(scene.body_names)
-    for i, body in enumerate(list(query.bodies)[first:]):
-        expected = views[i] if i in (0, 2) else scene.obstacles[i].motion.sample(0.0)
-        np.testing.assert_array_equal(body.placement.rotation, expected.rotation)
-        np.testing.assert_array_equal(body.placement.translation, expected.position)
-
-
 # --- in the tick -------------------------------------------------------------------------------------------------
 
 
@@ -369,21 +342,14 @@ def circling(rng, count, away, radius=0.3):
 
 
 def test_python_work_does_not_grow_with_the_number_of_moving_obstacles(panda):
-    """Neither that of a tick, nor that of looking ahead."""
-    ticks, ahead = [], []
+    steps = []
     for count in (30, 90):
         controller = make_controller(panda, circling(np.random.default_rng(5), count, 20.0), "panda_hand_tcp")
         for t in (0.10, 0.11):
             controller.step(panda.home, t)
         assert not len(controller.tick(panda.home, 0.12).proximity.pair)
-        ticks.append(instructions(lambda controller=controller: controller.step(panda.home, 0.13)))
-        braking, query = controller._commander.braking, controller._query
-        braking._place_obstacles(query)  # scipy looks for what it needs at the first call
-        ahead.append(instructions(lambda braking=braking, query=query: braking._place_obstacles(query)))
-        speeds = controller._query.placing.speeds[panda.model.njoints :]
-        assert np.count_nonzero(speeds) == count  # they do move
-    assert 0 < ticks[0] == ticks[1] < 4000
-    assert 0 < ahead[0] == ahead[1] < 2000
+        steps.append(instructions(lambda controller=controller: controller.step(panda.home, 0.13)))
+    assert 0 < steps[0] == steps[1] < 4000
 
 
 def test_a_loop_is_the_same_as_with_every_motion_sampled_alone(panda, monkeypatch):
@@ -392,7 +358,6 @@ def test_a_loop_is_the_same_as_with_every_motion_sampled_alone(panda, monkeypatc
         if alone:
             monkeypatch.setattr(courses, "_cut", lambda motion: None)
         controller = make_controller(panda, circling(np.random.default_rng(6), 9, 0.6), "panda_hand_tcp")
-        assert len(controller._obstacles._trajectories.others) == (9 if alone else 0)
         runs.append(list(drive(controller, panda.home, 200, target=[0.6, 0.2, 0.5])))
     together, alone = runs
     near = [len(tick.proximity.pair) for tick in alone]

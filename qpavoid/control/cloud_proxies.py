@@ -64,7 +64,7 @@ class CloudProxies:
             self._distance, self._place = np.zeros(room), np.zeros((room, 4))
 
     @property
-    def reach(self) -> float:
+    def radius(self) -> float:
         """Distance of the farthest ball's surface from the cloud's origin [m]."""
         farthest = np.sqrt(np.square(self.voxels.centers).sum(axis=1).max(initial=0.0))
         return float(farthest) + self._ball

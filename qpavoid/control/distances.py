@@ -1,297 +1,275 @@
-"""Closest points of the pairs within reach; without a Python loop.
+"""Closest points of the pairs within the influence distance; without a Python loop.
 
-Bounding spheres tell which pairs can be within reach at all. Spheres, capsules and boxes have closed forms; one call of
-coal does the rest, with all other pairs switched off, and its results are viewed as one array.
+Bounding spheres tell which pairs can be near at all. Spheres, capsules and boxes have closed forms; one call of coal
+does the rest, with all other pairs switched off, and its results are viewed as one array.
 """
 
 from __future__ import annotations
-
-from typing import Any
 
 import coal
 import numpy as np
 import pinocchio as pin
 
+from qpavoid import kernels
 from qpavoid.config import PointCloud
-from qpavoid.control.broadphase import Cull
 from qpavoid.control.cloud_proxies import CloudProxies
-from qpavoid.control.placement import ObstaclePlacement
-from qpavoid.geometry.bodies import bounding_box, bounding_sphere
-from qpavoid.geometry.cores import cores, has_closed_form
-from qpavoid.kernels.distances import closed_forms
-from qpavoid.model.cloud import Voxels
+from qpavoid.control.obstacles import ObstacleStates
+from qpavoid.control.pair_table import PairTable
+from qpavoid.control.trajectories import STATE, as_samples, put
+from qpavoid.errors import NumericalError
 from qpavoid.model.scene import Scene
-from qpavoid.model.trajectory import Sample
 from qpavoid.model.views import read_poses, read_results, view_poses, view_results
-from qpavoid.problem import Array, IntArray, Mask
+from qpavoid.problem import Array, IntArray
 
-_CULL_FROM = 48
-"""Number of pairs from which looking at bounding spheres first pays."""
 _TOLERANCE = 1e-10
 """At which coal stops; its default, 1e-6, leaves errors of 7e-3 in normals of boxes and hulls."""
-_LONGEST_GRASP = 0.5
-"""Largest gap between the robot and what it carries [m]."""
+_MAX_STOP = 1.0
+"""How far the robot may go before it stands, where a half-space that turns is concerned [m]."""
 
 
 class DistanceQuery:
     """Distances of a scene's pairs; owns the buffers that every call overwrites."""
 
-    def __init__(self, scene: Scene) -> None:
-        self._scene = scene
-        self._geometry = pin.GeometryModel(scene.geometry)
-        self._data = self._geometry.createData()
-        for request in self._data.distanceRequests:
-            request.gjk_tolerance = _TOLERANCE
-        bodies = self._geometry.geometryObjects
-        self._first_obstacle, self._movable = len(scene.body_names), scene.movable
-        self._pieces = [np.flatnonzero(scene.obstacle_of == i).tolist() for i in range(len(scene.obstacles))]
-        model = scene.robot.model
-        pin.updateGeometryPlacements(model, model.createData(), self._geometry, self._data, pin.neutral(model))
-        pin.computeDistances(self._geometry, self._data)  # so that there is something to compare the view with
-        view = view_results(self._data.distanceResults)
-        self.results: Array = read_results(self._data.distanceResults) if view is None else view
-        """(m, 10) [distance, normal, point a, point b] of all pairs; only those of `pairs` are of this tick."""
-        poses = view_poses(self._data.oMg, writeable=True)
-        self.poses: Array = read_poses(self._data.oMg) if poses is None else poses
-        """(g, 12) world poses of all bodies, the robot's first."""
-        self._copy, self._copy_poses = view is None, poses is None
-        shapes = [bounding_sphere(body.geometry) for body in bodies]
-        self.spheres = np.array([(*center, radius) for center, radius in shapes]).reshape(-1, 4)
-        """(g, 4) bounding sphere of each body in its own frame: centre and radius [m]; infinite of a half-space."""
-        self._joints = model.njoints
-        self.placing = ObstaclePlacement(scene, bodies, self.poses, self.spheres)
-        """Where the obstacles are."""
-        self.group: IntArray = np.arange(len(scene.pairs))
-        """(m,) first of the pairs of the same body and point cloud; of other pairs, their own number."""
-        self._grouped = np.zeros(len(scene.pairs), dtype=bool)
-        self._slots = {i: self._make_slots(i, voxels) for i, voxels in scene.clouds.items()}
-        for i, slots in self._slots.items():
-            self.placing.reaches(i, slots.reach)
-        self.carried: dict[int, int] = {}
-        """Joint that carries each obstacle which is carried, by number of the obstacle."""
-        self.disabled_pairs: Any = None
-        """(m,) pairs that are computed but of which no row is made; None where there are none."""
-        self.enabled = np.ones(len(scene.pairs), dtype=bool)
-        """(m,) which pairs are computed at all."""
-        self.twist_row: IntArray = np.zeros(len(scene.pairs), dtype=np.intp)
-        """(m,) row of `twists` that moves each pair."""
-        self._cores = cores([body.geometry for body in bodies])
-        self._known = has_closed_form(self._cores, scene.pairs)
-        self._others = bool(len(self._known)) and not self._known.all()
-        self._met, self._request = np.zeros(len(scene.pairs), dtype=np.intp), coal.DistanceRequest()
-        self._request.gjk_tolerance = _TOLERANCE
-        culls = len(scene.pairs) >= _CULL_FROM or bool(self._slots)
-        arrays = self.poses, self.spheres, self.placing.centers, ~self._known
-        self._cull = Cull(scene, self._data, *arrays) if culls else None
-        self.pairs: IntArray = np.arange(len(scene.pairs))
-        """(c,) pairs that were computed and are to get rows, increasing."""
-        self._surface = _surface_pairs(scene)
-        self.switch()
-        self._in_closed_form(self.pairs[:0])  # no tick waits for the compiler
-
-    @property
-    def bodies(self) -> Any:
-        """Geometries as they are placed and carried now, in the order of the geometry model."""
-        return self._geometry.geometryObjects
-
-    def boxes(self) -> Array:
-        """(g, 6) box around each body in its own frame: centre and half its sizes [m]."""
-        return np.array([np.concatenate(bounding_box(body.geometry)) for body in self.bodies]).reshape(-1, 6)
-
-    def convex(self) -> Mask:
-        """(m,) whether both bodies of a pair are convex; pairs with a point cloud stand for more than they hold."""
-        mesh = np.array([isinstance(body.geometry, coal.BVHModelBase) for body in self.bodies], dtype=bool)
-        return ~mesh[self._scene.pairs].any(axis=1) & ~self._grouped
-
-    def max_extension(self) -> Array:
-        """(njoints,) the same as `joint_radius`, with whatever may ever be carried [m]."""
-        radii, reach = self.spheres[self._first_obstacle : self._movable, 3], self.joint_radius()
-        return np.full_like(reach, reach.max() + 2.0 * radii.max() + _LONGEST_GRASP) if len(radii) else reach
-
-    def moved_by(self) -> IntArray:
-        """(m, 2) what moves the two bodies of each pair: number of a joint, or njoints plus that of an obstacle."""
-        joints = np.array([body.parentJoint for body in self._geometry.geometryObjects], dtype=np.intp)
-        of = self._scene.obstacle_of
-        free = (of >= 0) & ~np.isin(of, list(self.carried))
-        joints[free] = self._joints + of[free]
-        return joints[self._scene.pairs]
-
-    def joint_radius(self) -> Array:
-        """(njoints,) distance from each joint's origin to the farthest point of a body that it carries [m]."""
-        reach = np.zeros(self._joints)
-        bodies = self._geometry.geometryObjects
-        for i in [*range(self._first_obstacle), *(self._pieces[index][0] for index in self.carried)]:
-            body, (*center, radius) = bodies[i], self.spheres[i]
-            placed = body.placement.rotation @ np.array(center) + body.placement.translation
-            reach[body.parentJoint] = max(reach[body.parentJoint], float(np.linalg.norm(placed)) + radius)
-        return reach
-
-    def place_obstacle(self, index: int, sample: Sample, margin: float = 0.0, voxels: Voxels | None = None) -> None:
-        """Puts obstacle number `index` to a pose, with a velocity, and takes a margin [m] off its distances.
+    def __init__(self, scene: Scene, table: PairTable | None = None) -> None:
+        """Lay the memory out; all obstacles are where they are at time 0.
 
         Args:
-            index: which one; not one that is carried.
-            sample: where it is and how it moves.
-            margin: taken off its distances [m].
-            voxels: of a point cloud, what is in it now; as before if left out.
+            scene: robot and obstacles.
+            table: its bodies and pairs, with what is attached to the robot; one of its own if left out.
+        """
+        self.table = table = PairTable(scene) if table is None else table
+        self._scene, self._data = scene, scene.geometry.createData()
+        self._request = coal.DistanceRequest()
+        for request in (*self._data.distanceRequests, self._request):
+            request.gjk_tolerance = _TOLERANCE
+        model, obstacles = scene.robot.model, len(scene.obstacles)
+        pin.updateGeometryPlacements(model, model.createData(), scene.geometry, self._data, pin.neutral(model))
+        pin.computeDistances(scene.geometry, self._data)  # so that there is something to compare the view with
+        results, poses = view_results(self._data.distanceResults), view_poses(self._data.oMg, writeable=True)
+        self._has_views = results is not None and poses is not None
+        radii = np.linalg.norm(table.spheres[:, :3], axis=1) + table.spheres[:, 3]
+        self.obstacle_radii: Array = np.array(
+            [radii[i:j].max(initial=0.0) for i, j in zip(table.first[:-1], table.first[1:], strict=True)]
+        )
+        """(o,) distance from each obstacle's origin to its farthest point; infinite of a half-space [m]."""
+        self._planes = np.flatnonzero(np.isinf(self.obstacle_radii)).tolist()
+        bodies, pairs, rows = (
+            len(table.spheres),
+            len(scene.pairs),
+            obstacles + 1 + scene.movable - len(scene.body_names),
+        )
+        self.arrays = kernels.DistanceArrays(
+            joints=table.joints,
+            placements=table.placements,
+            twist_row=table.twist_row,
+            enabled=table.enabled,
+            ignored=table.ignored,
+            pairs=np.ascontiguousarray(scene.pairs, dtype=np.intp),
+            pair_of=table.pair_of,
+            local=table.spheres[:, :3].copy(),
+            cores=table.cores,
+            has_closed_form=table.has_closed_form,
+            first=table.first,
+            is_cloud=np.array([i in scene.clouds for i in range(obstacles)], dtype=bool),
+            bounding_radius=np.nan_to_num(self.obstacle_radii, posinf=0.0),
+            max_square=np.empty(table.pair_of.shape),
+            states=np.zeros((obstacles, STATE)),
+            twists=np.zeros((rows, 6)),
+            margin=np.zeros(rows),
+            speeds=np.zeros(model.njoints + obstacles),
+            poses=read_poses(self._data.oMg) if poses is None else poses,
+            centers=np.ones((bodies, 5)),
+            near=np.zeros(pairs, dtype=np.intp),
+            rows=np.zeros(pairs, dtype=np.intp),
+            meeting=np.zeros(pairs, dtype=np.intp),
+            results=read_results(self._data.distanceResults) if results is None else results,
+        )
+        """Memory of the distances, see `DistanceArrays`; the results are those of `pairs`."""
+        self.packed = kernels.pack(self.arrays)
+        self.is_moving = False
+        """Whether any obstacle has a velocity or a margin."""
+        self._near_count, self._row_count = 0, 0
+        self.influence_distance = np.nan
+        """Surface distance below which a pair is near [m]; set it by `set_influence_distance`."""
+        for view, obstacle in zip(as_samples(self.arrays.states), scene.obstacles, strict=True):
+            put(view, obstacle.motion.sample(0.0))
+        self._clouds = {i: self._make_proxies(i) for i in scene.clouds}
+        for i in self._clouds:
+            self._set_radius(i)
+        for center, pose, sphere in zip(self.arrays.centers, self.arrays.poses, table.spheres, strict=True):
+            center[:3] = sphere[:3] @ pose[:9].reshape(3, 3) + pose[9:]
+            center[4] = -(center[:3] @ center[:3])
+        self._by_coal = np.flatnonzero(~table.has_closed_form)
+        for pair in range(pairs):
+            self._data.deactivateCollisionPair(pair)
+        self._active = np.zeros(pairs, dtype=bool)
+        self._surfaces = table.is_mesh[scene.pairs].any(axis=1) & ~table.is_plane[scene.pairs].any(axis=1)
+        self.is_compiled = not (len(self._by_coal) or self._clouds) and self._has_views
+        """Whether kernels compute everything, but for pairs whose cores meet."""
+        self._views = as_samples(self.arrays.states)
+
+    def place(self, obstacles: ObstacleStates) -> None:
+        """Move obstacles to other states.
+
+        Args:
+            obstacles: those that may have another state than at time 0, with margins, and points of clouds.
 
         Raises:
-            NumericalError: NaN or infinity; names the obstacle, which stays where it was.
+            NumericalError: NaN or infinity; names the obstacle. All stay where they were.
         """
-        if voxels is not None:
-            self.fill(index, voxels)
-        self.placing.place_one(index, sample, margin)
+        x = self.arrays
+        for index, voxels in obstacles.voxels.items():
+            if voxels is not self._clouds[index].voxels:
+                self._clouds[index].fill_with(voxels)
+                self._set_radius(index)
+        for index in self._planes:
+            state = obstacles.states[index]
+            x.bounding_radius[index] = self._extent_on_plane(state) if state[15:].any() else 0.0
+        bad, self.is_moving = kernels.place_obstacles(self.packed, obstacles.which, obstacles.states, obstacles.margin)
+        if bad >= 0:
+            raise NumericalError(f"obstacle {self._scene.obstacles[bad].name!r}: NaN or infinity in its pose or twist")
 
-    def fill(self, index: int, voxels: Voxels) -> None:
-        """Takes other voxels as what is in obstacle number `index`, a point cloud."""
-        slots = self._slots[index]
-        if voxels is not slots.voxels:
-            slots.fill_with(voxels)
-            self.placing.reaches(index, slots.reach)
+    def set_influence_distance(self, influence_distance: float) -> None:
+        """Choose the surface distance below which a pair is near [m]."""
+        if influence_distance != self.influence_distance:
+            radius, pair_of = self.table.spheres[:, 3], self.table.pair_of
+            touching = radius[: len(pair_of), None] + radius + influence_distance
+            self.arrays.max_square[:] = np.where(pair_of >= 0, touching**2 * (1.0 + 1e-9), -1.0)
+            self.influence_distance = influence_distance
 
-    def carry(self, index: int, joint: int, sample: Sample) -> None:
-        """Attach an obstacle to a joint, or release it.
+    def compute(self, joint_poses: Array, influence_distance: float) -> None:
+        """Compute the distance of every pair that is nearer than `influence_distance`; `pairs` says which.
 
         Args:
-            index: number of the obstacle.
-            joint: number of the joint; 0 for none.
-            sample: its pose in the joint's frame, or in the world.
+            joint_poses: world poses of all joints (njoints, 12).
+            influence_distance: surface distance [m].
         """
-        (geometry,) = self._pieces[index]
-        self._geometry.geometryObjects[geometry].parentJoint = joint
-        self.place_obstacle(index, sample)
-        self.carried.pop(index, None)
-        if joint:
-            self.carried[index] = joint
-        self.switch()
+        self.set_influence_distance(influence_distance)
+        kernels.place_bodies(self.packed, joint_poses)
+        for index, cloud in self._clouds.items():
+            self._place_proxies(index, cloud)
+        self.finish(*kernels.near_pairs(self.packed))
 
-    def switch(self) -> None:
-        """Brings what depends on who carries what up to date, in place."""
-        scene, obstacles = self._scene, len(self._scene.obstacles)
-        free = ~np.isin(scene.obstacle_of, list(self.carried)) & (scene.obstacle_of >= 0)
-        first, second = scene.pairs.T
-        of = scene.obstacle_of
-        negative = np.where(free[first], obstacles + 1 + of[first], obstacles)
-        self.twist_row[:] = np.where(free[second], of[second], negative)
-        self.enabled[:] = ~(free[first] & free[second])
-        self._off = np.flatnonzero(free[: self._movable])
-        self._on = np.flatnonzero(self.enabled)
-        if self._cull is not None:
-            self._cull.enable(self.enabled)
-        else:
-            for pair, on in enumerate((self.enabled & ~self._known).tolist()):
-                (self._data.activateCollisionPair if on else self._data.deactivateCollisionPair)(pair)
-
-    def compute(self, data: Any, reach: float) -> None:
-        """Brings `results` up to date for every pair nearer than `reach`, and says in `pairs` which ones it computed.
+    def finish(self, near: int, rows: int, meeting: int) -> None:
+        """Compute what kernels cannot, by coal.
 
         Args:
-            data: pinocchio data that holds the joint placements of this tick.
-            reach: surface distance [m].
+            near: number of near pairs.
+            rows: number of those that get rows.
+            meeting: number of those whose cores meet.
         """
-        pin.updateGeometryPlacements(self._scene.robot.model, data, self._geometry, self._data)
-        if self._copy_poses:
-            self.poses[:] = read_poses(self._data.oMg)
-        if self._slots:
-            for index, slots in self._slots.items():
-                self._fill(index, slots, reach)
-        pairs = self._on if self._cull is None else self._cull.switch(reach)
-        if self._others:
-            pin.computeDistances(self._geometry, self._data)
-        self._in_closed_form(pairs)
-        if self._surface is not None:
-            self._mend_surfaces(pairs)
-        self._computed = pairs
-        self.pairs = pairs if self.disabled_pairs is None else pairs[~self.disabled_pairs[pairs]]
+        self._near_count, self._row_count = near, rows
+        if len(self._by_coal):
+            self._compute_by_coal()
+        if meeting:
+            for pair in self.arrays.meeting[:meeting].tolist():
+                self._compute_one(pair)
 
-    def body_spheres(self, data: Any) -> tuple[Array, Array]:
-        """World centres (b, 3) and radii (b,) of spheres around the robot's bodies and all that it may carry [m].
+    @property
+    def pairs(self) -> IntArray:
+        """(c,) pairs that were computed and are to get rows, increasing."""
+        return self.arrays.rows[: self._row_count]
+
+    @property
+    def _near(self) -> IntArray:
+        """(c,) pairs that were computed, increasing."""
+        return self.arrays.near[: self._near_count]
+
+    def _compute_by_coal(self) -> None:
+        """Compute the near pairs that have no closed form in one call of coal."""
+        x, active = self.arrays, np.zeros(len(self._active), dtype=bool)
+        active[self._near] = True
+        active &= ~x.has_closed_form
+        changed = np.flatnonzero(active != self._active)
+        for pair, on in zip(changed.tolist(), active[changed].tolist(), strict=True):
+            (self._data.activateCollisionPair if on else self._data.deactivateCollisionPair)(pair)
+        self._active = active
+        if not self._has_views:
+            for pose, target in zip(x.poses, self._data.oMg, strict=True):
+                target.rotation, target.translation = pose[:9].reshape(3, 3).T, pose[9:]
+        pin.computeDistances(self._scene.geometry, self._data)
+        if not self._has_views:
+            x.results[active] = read_results(self._data.distanceResults)[active]
+        meshes = np.flatnonzero(active & self._surfaces)
+        if len(meshes):
+            x.results[meshes] = _with_normals(x.results[meshes])
+
+    def _compute_one(self, pair: int) -> None:
+        bodies, poses = self._scene.geometry.geometryObjects, self.arrays.poses
+        a, b = (
+            (bodies[i].geometry, coal.Transform3s(poses[i, :9].reshape(3, 3).T.copy(), poses[i, 9:].copy()))
+            for i in self.arrays.pairs[pair].tolist()
+        )
+        result = coal.DistanceResult()
+        coal.distance(*a, *b, self._request, result)
+        self.arrays.results[pair] = read_results([result])[0]
+
+    def body_spheres(self, joint_poses: Array) -> tuple[Array, Array]:
+        """Return world centres (b, 3) and radii (b,) of the spheres around the bodies that joints may move [m].
 
         Args:
-            data: pinocchio data that holds the joint placements.
+            joint_poses: world poses of all joints (njoints, 12).
         """
-        pin.updateGeometryPlacements(self._scene.robot.model, data, self._geometry, self._data)
-        poses = read_poses(self._data.oMg) if self._copy_poses else self.poses
-        poses, spheres = poses[: self._movable], self.spheres[: self._movable]
+        kernels.place_bodies(self.packed, joint_poses)
+        count = len(self.table.joints)
+        poses, spheres = self.arrays.poses[:count], self.table.spheres[:count]
         turned = (spheres[:, None, :3] @ poses[:, :9].reshape(-1, 3, 3))[:, 0]
         return turned + poses[:, 9:], spheres[:, 3]
 
-    def found(self, pairs: IntArray) -> Array:
-        """Distances (k,) of some pairs at the last call; infinite for those that were out of reach [m].
+    def distances_of(self, pairs: IntArray) -> Array:
+        """Return distances (k,) of some pairs at the last call; infinite for those that were not near [m].
 
-        Of a point cloud, that of its nearest voxel to each body: which voxel it is changes, and is not what counts.
+        Of a point cloud, that of its nearest voxel to each body: the identity of that voxel may change between calls.
         """
-        distance = self.results[pairs, 0]
-        if self._cull is not None and pairs is not self.pairs:
-            distance = np.where(self._cull.active[pairs], distance, np.inf)
-        if self._slots:
-            least = np.full(len(self._scene.pairs), np.inf)
-            near = self._computed
-            np.minimum.at(least, self.group[near], self.results[near, 0])
-            distance = np.where(self._grouped[pairs], least[self.group[pairs]], distance)
-        return np.asarray(distance)
+        distance, results = np.full(len(self.table.group), np.inf), self.arrays.results
+        if not self._clouds:
+            distance[self._near] = results[self._near, 0]
+            return distance[pairs]
+        np.minimum.at(distance, self.table.group[self._near], results[self._near, 0])
+        return np.asarray(distance[self.table.group[pairs]])
 
-    def widest(self, given: Array) -> Array:
-        """What is granted (m,) to each pair; of the balls of a cloud, each body's most."""
-        if not self._slots:
-            return given
-        most = np.zeros_like(given)
-        np.maximum.at(most, self.group, given)
-        return most[self.group]
+    def max_over_group(self, values: Array) -> Array:
+        """Return the largest of some values (m,) among the pairs of the same body and point cloud (m,)."""
+        if not self._clouds:
+            return values
+        largest = np.zeros_like(values)
+        np.maximum.at(largest, self.table.group, values)
+        return largest[self.table.group]
 
-    def _in_closed_form(self, pairs: IntArray) -> None:
-        """Distances of the pairs that have one; those whose cores meet are computed by coal after all."""
-        bodies = self._scene.pairs
-        if self._copy and self._others:
-            self.results[~self._known] = read_results(self._data.distanceResults)[~self._known]
-        count = closed_forms(self.poses, self._cores, bodies, self._known, pairs, self.results, self._met)
-        for pair in self._met[:count].tolist():
-            a, b = (
-                (self._geometry.geometryObjects[i].geometry, coal.Transform3s(pose.rotation, pose.translation))
-                for i, pose in ((i, self._data.oMg[i]) for i in bodies[pair].tolist())
-            )
-            result = coal.DistanceResult()
-            coal.distance(*a, *b, self._request, result)
-            self.results[pair] = read_results([result])[0]
-
-    def _make_slots(self, index: int, voxels: Voxels) -> CloudProxies:
-        shape, first = self._scene.obstacles[index].shape, self._movable
+    def _make_proxies(self, index: int) -> CloudProxies:
+        shape, bodies = self._scene.obstacles[index].shape, self._scene.geometry.geometryObjects
         assert isinstance(shape, PointCloud)
-        a, b = self._scene.pairs.T
-        mine = np.flatnonzero(self._scene.obstacle_of[b] == index)
-        self._grouped[mine] = True
-        self.group[mine] = mine[np.searchsorted(a[mine], a[mine])]
-        bodies = [self._geometry.geometryObjects[i].geometry for i in range(first)]
-        return CloudProxies(bodies, np.array(self._pieces[index]), shape.resolution, shape.nearest, voxels)
+        proxies = np.arange(self.table.first[index], self.table.first[index + 1])
+        geometries = [bodies[i].geometry for i in range(len(self.table.joints))]
+        return CloudProxies(geometries, proxies, shape.resolution, shape.nearest, self._scene.clouds[index])
 
-    def _fill(self, index: int, slots: CloudProxies, reach: float) -> None:
-        """Puts the balls of a cloud to the voxels that are nearest to each body."""
-        places = slots.places(self.poses[: self._movable], self._off, self.placing.samples[index], reach).reshape(-1, 3)
-        geometries = slots.geometries.ravel()
-        self.poses[geometries, 9:] = places
-        if self._copy_poses:
-            for geometry, place in zip(geometries.tolist(), places, strict=True):
-                self._data.oMg[geometry] = pin.SE3(np.eye(3), place)
-        assert self._cull is not None
-        self._cull.place_points(geometries, places)
+    def _set_radius(self, index: int) -> None:
+        self.obstacle_radii[index] = self.arrays.bounding_radius[index] = self._clouds[index].radius
 
-    def _mend_surfaces(self, pairs: IntArray) -> None:
-        """Of two triangle meshes coal gives no normal; of one that is cut through, no distance to be trusted."""
-        assert self._surface is not None
-        pairs = pairs[np.isin(pairs, self._surface, assume_unique=True)]
-        results = self.results[pairs]
-        apart = results[:, 0] > 0.0
-        results[~apart, 0] = np.nan
-        way = results[:, 7:10] - results[:, 4:7]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            results[:, 1:4] = way / np.linalg.norm(way, axis=1, keepdims=True)
-        self.results[pairs] = results
+    def _place_proxies(self, index: int, cloud: CloudProxies) -> None:
+        """Move the proxies of a cloud to the voxels that are nearest to each body."""
+        x, unattached = self.arrays, np.flatnonzero(self.table.joints < 0)
+        poses, sample = x.poses[: len(self.table.joints)], self._views[index]
+        positions = cloud.places(poses, unattached, sample, self.influence_distance).reshape(-1, 3)
+        proxies = cloud.geometries.ravel()
+        x.poses[proxies, 9:] = x.centers[proxies, :3] = positions
+        x.centers[proxies, 4] = -np.einsum("ij,ij->i", positions, positions)
+
+    def _extent_on_plane(self, state: Array) -> float:
+        """Return the distance from a half-space's origin to what the robot may come to before it stands [m]."""
+        count = len(self.table.joints)
+        away = np.linalg.norm(self.arrays.poses[:count, 9:] - state[9:12], axis=1)
+        return float(np.max(away + self.table.spheres[:count, 3])) + _MAX_STOP
 
 
-def _surface_pairs(scene: Scene) -> IntArray | None:
-    """Pairs with a triangle mesh in them, other than with a half-space; None where there are none."""
-    kinds = [body.geometry for body in scene.geometry.geometryObjects]
-    mesh = np.array([isinstance(kind, coal.BVHModelBase) for kind in kinds], dtype=bool)
-    flat = np.array([isinstance(kind, coal.Halfspace) for kind in kinds], dtype=bool)
-    pairs = np.flatnonzero(mesh[scene.pairs].any(axis=1) & ~flat[scene.pairs].any(axis=1))
-    return pairs if len(pairs) else None
+def _with_normals(results: Array) -> Array:
+    """Return results (k, 10) of triangle meshes with their normals, which coal does not give.
+
+    The distance of one that is cut through is NaN, as it cannot be trusted.
+    """
+    results = results.copy()
+    results[~(results[:, 0] > 0.0), 0] = np.nan
+    between = results[:, 7:10] - results[:, 4:7]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        results[:, 1:4] = between / np.linalg.norm(between, axis=1, keepdims=True)
+    return results

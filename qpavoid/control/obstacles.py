@@ -41,23 +41,33 @@ class ObstacleStates(NamedTuple):
     """States of the obstacles at one time."""
 
     which: IntArray
-    """(k,) numbers of those that may have moved since the scene was built."""
+    """(k,) numbers of those that may have another state than at time 0."""
     states: Array
-    """(o, 18) of all obstacles, see `trajectories`; rows other than `which` may be anything."""
+    """(o, 18) of all obstacles, see `trajectories`; of an attached one, where it was when it was attached."""
     margin: Array
-    """(o,) to be taken off the distances to each, read where `which` says [m]."""
+    """(o,) to be taken off the distances to each [m]."""
+    voxels: dict[int, Voxels]
+    """Of point clouds that were updated, by number: what is in them."""
+
+    @classmethod
+    def of(cls, samples: Sequence[Sample], margin: float = 0.0) -> ObstacleStates:
+        """Return the states of all obstacles at some samples, with a margin of each [m]."""
+        states = np.zeros((len(samples), STATE))
+        for view, sample in zip(as_samples(states), samples, strict=True):
+            put(view, sample)
+        return cls(np.arange(len(samples)), states, np.full(len(samples), margin), {})
 
 
 class Observation(NamedTuple):
-    """Everything that a control step has to know of the obstacles."""
+    """What a control step has to say of the obstacles."""
 
-    now: ObstacleStates
-    voxels: dict[int, Voxels]
-    """Of point clouds that are updated, by number: what is in them now."""
     assumptions: tuple[Reason, ...] = ()
     """What was not measured but taken for granted."""
     stop: tuple[Reason, ...] = ()
     """Why the robot has to stop; empty if it has not."""
+
+
+_NOTHING = Observation()
 
 
 class StepUpdate(NamedTuple):
@@ -85,8 +95,13 @@ class ObstacleTracker:
         self._moving = [i for i, obstacle in enumerate(obstacles) if obstacle.moves]
         self._trajectories = TrajectoryBatch({i: obstacles[i].motion for i in self._moving})
         self._now, count = 0.0, len(obstacles)
-        self._current = ObstacleStates(np.array(self._moving, np.intp), np.zeros((count, STATE)), np.zeros(count))
+        self._current = ObstacleStates(np.array(self._moving, np.intp), np.zeros((count, STATE)), np.zeros(count), {})
         self._views = as_samples(self._current.states)
+        for view, obstacle in zip(self._views, obstacles, strict=True):
+            put(view, obstacle.motion.sample(0.0))
+        self._placed: set[int] = set()  # numbers of those that are, or were, attached to the robot
+        self.moving: IntArray = self._current.which
+        """(k,) numbers of those on a trajectory or external; no attached object is among them."""
         self._measured = MeasuredStates(count, dt)
         self._reader = UpdateReader(obstacles, self._measured, dt)
         self._estimates: ObstacleEstimates | None = None
@@ -107,11 +122,6 @@ class ObstacleTracker:
         self._measured.update(none, none, no_stamps, now.states)
         self._measured.extrapolate(none, 0.0, 0.0, 0.0, now.states, now.margin)
         extrapolate(states[:0], 0.0)
-
-    @property
-    def moving(self) -> IntArray:
-        """(k,) numbers of those on a trajectory or external; no attached object is among them."""
-        return self._current.which
 
     @property
     def estimates(self) -> ObstacleEstimates | None:
@@ -159,8 +169,18 @@ class ObstacleTracker:
         self._sample_trajectories(t, states)
         return states[:, 9:12], _rates(states)
 
-    def predicted(self, t: float) -> ObstacleStates:
-        """Predict the states at t [s]: on trajectories, or at constant mean twists."""
+    @property
+    def current(self) -> ObstacleStates:
+        """States in the last step; the next one overwrites them."""
+        return self._current
+
+    def at(self, t: float) -> ObstacleStates:
+        """Return the states at t [s]: on trajectories, or at constant mean twists; of the last step, as observed.
+
+        Those of the last step are overwritten by the next one.
+        """
+        if t == self._now or not len(self.moving):
+            return self._current
         states, estimates = self._current.states.copy(), self.estimates
         self._sample_trajectories(t, states)
         if estimates is not None:
@@ -169,19 +189,36 @@ class ObstacleTracker:
             states[list(estimates.which)] = later
         return self._current._replace(states=states)
 
+    def after(self, duration: float) -> ObstacleStates:
+        """Return the states some time after the last step [s]; see `at`."""
+        return self.at(self._now + duration)
+
     def _sample_trajectories(self, t: float, states: Array) -> None:
         """Bring the states (o, 18) of those that follow a trajectory to time t [s]."""
         self._trajectories.sample(t, states)
         for index, motion in self._trajectories.others.items():
             put(as_samples(states)[index], motion.sample(t))
 
-    def attach(self, index: int, attached: bool) -> None:
-        """Take an obstacle as attached to the robot, or as at rest where it was released, until it is given again."""
+    def attach(self, index: int) -> None:
+        """Take an obstacle as attached to the robot: updates of it are ignored."""
         self._moving = [i for i in self._moving if i != index]
         self._measured.forget(index)
         self._awaited.discard(index)
-        self._reader.attach(index, attached)
+        self._placed.add(index)
+        self._reader.attach(index, True)
+        self._current.states[index, 12:], self._current.margin[index] = 0.0, 0.0
         self._renew()
+
+    def release(self, index: int, sample: Sample) -> None:
+        """Take an attached obstacle as at rest at a sample, until it is given again."""
+        self._reader.attach(index, False)
+        put(self._views[index], sample)
+        self._renew()
+
+    def pose(self, index: int) -> Sample:
+        """Return the world pose of an obstacle in the last step; of an attached one, where it was attached."""
+        position, rotation, *_ = self._views[index]
+        return Sample.at(position.copy(), rotation.copy())
 
     def reset(self) -> None:
         """Forget what was given."""
@@ -195,12 +232,9 @@ class ObstacleTracker:
         """Lay out the numbers of the obstacles that move."""
         self._estimates, self._known = None, None
         self._external = np.array(list(self._measured.known), dtype=np.intp)
-        moving = np.array(sorted({*self._moving, *self._measured.known}), dtype=np.intp)
-        self._current = self._current._replace(which=moving)
-
-    def observe(self, t: float, updates: Mapping[str, Sample | Pose | Points] | None) -> Observation | None:
-        """`read` and `advance` in one."""
-        return self.advance(self.read(t, updates))
+        moving = {*self._moving, *self._measured.known}
+        self.moving = np.array(sorted(moving), dtype=np.intp)
+        self._current = self._current._replace(which=np.array(sorted(moving | self._placed), dtype=np.intp))
 
     def read(
         self, t: float, updates: Mapping[str, Sample | Pose | Points] | None, shift: float = 0.0
@@ -250,10 +284,10 @@ class ObstacleTracker:
                 sampled.append((index, as_samples(state)[0]))
         return sampled
 
-    def advance(self, update: StepUpdate | None) -> Observation | None:
-        """Take over what a step is given; return what it has to know of all obstacles, None where there is nothing."""
+    def advance(self, update: StepUpdate | None) -> Observation:
+        """Take over what a step is given; return what there is to say of all obstacles."""
         if update is None:
-            return None
+            return _NOTHING
         t, shift, given, sampled = update
         self._now, self._estimates, current = t, None, self._current
         if shift:
@@ -267,6 +301,7 @@ class ObstacleTracker:
         notes, stop = given.notes, tuple[Reason, ...]()
         if len(given.which):
             notes += self._take_over(given)
+            self._current.voxels.update(given.voxels)
         if len(self._external):
             current.margin.fill(0.0)
             stale = self._measured.extrapolate(
@@ -275,7 +310,7 @@ class ObstacleTracker:
             if stale or self._awaited:
                 assumptions, stop = self._overdue(t)
                 notes += assumptions
-        return Observation(self._current, given.voxels, notes, stop)
+        return Observation(notes, stop)
 
     def _take_over(self, update: Update) -> tuple[Reason, ...]:
         """Take over the usable updates; return what there is to say of them."""

@@ -21,27 +21,23 @@ from qpavoid.kernels.estimates import (
     update_estimates,
     write_states,
 )
+from qpavoid.kernels.kinematics import KinematicsArrays, update_kinematics
 from qpavoid.kernels.layout import RowLayout
-from qpavoid.kernels.obstacles import (
-    ObstacleArrays,
-    Pieces,
-    check_states,
-    place_obstacles,
-    sample_pieces,
-    update_measured_states,
-)
-from qpavoid.kernels.packing import pack
+from qpavoid.kernels.near_pairs import DistanceArrays, near_pairs, place_bodies, place_obstacles
+from qpavoid.kernels.obstacles import Pieces, check_states, sample_pieces, update_measured_states
 from qpavoid.kernels.qp import max_clearance_velocity, minimize, project, project_soft
 from qpavoid.kernels.rotation import rotation_vector
 from qpavoid.kernels.rows import alpha, beta, distance_rows, row_bounds
-from qpavoid.kernels.step import assemble, tracking_violation, violation
+from qpavoid.kernels.step import assemble, control_step, tracking_violation, violation
+from qpavoid.kernels.structures import direct, pack
 from qpavoid.kernels.tasks import damped_solution, frame_rows, projection_cost
 from qpavoid.kernels.voxels import select_voxels, voxels_within
 
 __all__ = [
     "ROUND_OFF",
     "TOLERANCE",
-    "ObstacleArrays",
+    "DistanceArrays",
+    "KinematicsArrays",
     "Pieces",
     "RowLayout",
     "alpha",
@@ -53,8 +49,10 @@ __all__ = [
     "check_states",
     "clearance_lower_bound",
     "closes_below",
+    "control_step",
     "count_faults",
     "damped_solution",
+    "direct",
     "distance_rows",
     "extrapolate_estimates",
     "extrapolate_states",
@@ -67,7 +65,9 @@ __all__ = [
     "max_clearance_velocity",
     "min_sphere_distance",
     "minimize",
+    "near_pairs",
     "pack",
+    "place_bodies",
     "place_obstacles",
     "project",
     "project_soft",
@@ -83,6 +83,7 @@ __all__ = [
     "stop_velocity",
     "tracking_violation",
     "update_estimates",
+    "update_kinematics",
     "update_measured_states",
     "velocity_bounds",
     "violation",

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from qpavoid.kernels.packing import compiled
-from qpavoid.problem import Array, IntArray
+from qpavoid.problem import Array, IntArray, Mask
 
 
 @compiled
 def candidates(
-    poses: Array, local: Array, centers: Array, max_square: Array, pair_of: IntArray, pairs: IntArray
+    poses: Array, local: Array, centers: Array, max_square: Array, pair_of: IntArray, enabled: Mask, pairs: IntArray
 ) -> int:
     """Find the pairs whose bounding spheres are near each other.
 
@@ -22,6 +22,7 @@ def candidates(
         max_square: squared distance of centres up to which each combination is near (b, g) [m²]; negative where there
             is no pair.
         pair_of: index of the pair of each combination (b, g), increasing along the rows, one after the other.
+        enabled: pairs that are considered (m,).
         pairs: out (m,), the first entries: indices of the near pairs, increasing.
 
     Returns:
@@ -41,7 +42,7 @@ def candidates(
             dx, dy, dz = x[j] - x[i], y[j] - y[i], z[j] - z[i]
             near[j] = dx * dx + dy * dy + dz * dz <= max_square[i, j]
         for j in range(geometries):
-            if near[j]:
+            if near[j] and enabled[pair_of[i, j]]:
                 pairs[count] = pair_of[i, j]
                 count += 1
     return count

@@ -5,7 +5,7 @@ Arrays that look into the memory of Pinocchio and coal are views; outputs are ov
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from qpavoid.problem import Array, IntArray, Mask
 
@@ -18,6 +18,10 @@ class RowLayout(NamedTuple):
     columns: those of joints that mimic another joint are moved by the coordinate of that joint.
     """
 
+    kinematics: Any
+    """`KinematicsArrays` in compiled code: everything about the robot's configuration comes from them."""
+    distances: Any
+    """`DistanceArrays` in compiled code: everything about the pairs comes from them."""
     J_world: Array
     """(6, e) world Jacobian of all joints, linear rows first, at the world's origin."""
     columns: IntArray

@@ -43,28 +43,6 @@ class Pieces(NamedTuple):
     """(n, 7, 18) the constant terms."""
 
 
-class ObstacleArrays(NamedTuple):
-    """States of o obstacles, of which the first c can be attached, as the distances of g bodies need them."""
-
-    states: Array
-    """(o, 18) state of each obstacle."""
-    twists: Array
-    """(o + 1 + c, 6) twists at the world's origin, linear before angular [m/s, rad/s]; row o stays zero, the last c are
-    the negative twists of the first c."""
-    margin: Array
-    """(o + 1 + c,) taken off the distances to each, in the order of `twists` but never negative [m]."""
-    speeds: Array
-    """(o,) largest speed of any of its points [m/s]."""
-    bounding_radius: Array
-    """(o,) distance from its origin to its farthest point, 0 of a half-space that does not turn [m]."""
-    placements: Array
-    """(g, 12) poses of all bodies: rotation by columns, then position."""
-    local: Array
-    """(g, 3) centres of their bounding spheres in their own frames [m]."""
-    centers: Array
-    """(g, 5) the same in the world, as rows [c, 1, -|c|²]; those of the robot's bodies are not updated."""
-
-
 @compiled
 def sample_pieces(x: Pieces, t: float, tolerance: float, states: Array) -> None:
     """Write the states of the bodies of `x` at time t.
@@ -98,68 +76,6 @@ def sample_pieces(x: Pieces, t: float, tolerance: float, states: Array) -> None:
             if weights[i] != 0.0:
                 for c in range(18):
                     state[c] += weights[i] * x.terms[low, i, c]
-
-
-@compiled
-def place_obstacles(
-    x: ObstacleArrays, numbers: IntArray, geometries: IntArray, owners: IntArray, states: Array, margin: Array
-) -> tuple[int, bool]:
-    """Write the states of some obstacles, with twists, speeds, poses and sphere centres.
-
-    The twist at the world's origin is [v - ω × p, ω]; the largest speed of any point is |v| + |ω| R with the bounding
-    radius R.
-
-    Args:
-        x: overwritten; not changed where a number is NaN or infinite.
-        numbers: of the obstacles (k,).
-        geometries: numbers of their bodies (b,).
-        owners: index in `numbers` of the obstacle that each of these belongs to (b,).
-        states: of all obstacles (o, 18); rows `numbers` are read.
-        margin: taken off the distances to each obstacle (o,) [m]; entries `numbers` are read.
-
-    Returns:
-        Number of the first obstacle with NaN or infinity, -1 where there is none; whether any of all obstacles has a
-        velocity or a margin.
-    """
-    obstacles = len(x.states)
-    negative = len(x.twists) - obstacles - 1
-    for i in numbers:
-        total = 0.0
-        for c in range(18):
-            total += states[i, c]
-        if not abs(total) < np.inf:  # isfinite does not survive the reordering of sums
-            return i, True
-    for i in numbers:
-        x.states[i] = states[i]
-        state, twist = x.states[i], x.twists[i]
-        px, py, pz = state[9], state[10], state[11]
-        vx, vy, vz, wx, wy, wz = state[12], state[13], state[14], state[15], state[16], state[17]
-        twist[0], twist[1], twist[2] = vx - wy * pz + wz * py, vy - wz * px + wx * pz, vz - wx * py + wy * px
-        twist[3], twist[4], twist[5] = wx, wy, wz
-        x.margin[i] = margin[i]
-        if i < negative:
-            x.margin[obstacles + 1 + i] = margin[i]
-            for c in range(6):
-                x.twists[obstacles + 1 + i, c] = -twist[c]
-        angular_speed = np.sqrt(wx * wx + wy * wy + wz * wz)
-        x.speeds[i] = np.sqrt(vx * vx + vy * vy + vz * vz) + angular_speed * x.bounding_radius[i]
-    for n in range(len(geometries)):
-        g, state = geometries[n], x.states[numbers[owners[n]]]
-        for c in range(12):
-            x.placements[g, c] = state[c]
-        length = 0.0
-        for r in range(3):
-            rotated = state[r] * x.local[g, 0] + state[3 + r] * x.local[g, 1] + state[6 + r] * x.local[g, 2]
-            x.centers[g, r] = rotated + state[9 + r]
-            length += x.centers[g, r] ** 2
-        x.centers[g, 4] = -length
-    for i in range(obstacles):
-        if x.margin[i] != 0.0:
-            return -1, True
-        for c in range(6):
-            if x.twists[i, c] != 0.0:
-                return -1, True
-    return -1, False
 
 
 @compiled

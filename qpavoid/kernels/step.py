@@ -9,10 +9,34 @@ import numpy as np
 from qpavoid.kernels.bounds import velocity_bounds
 from qpavoid.kernels.braking_trajectory import stop_velocity
 from qpavoid.kernels.clearance import is_tracking_clear
+from qpavoid.kernels.kinematics import update_kinematics
+from qpavoid.kernels.near_pairs import near_pairs, place_bodies
 from qpavoid.kernels.packing import compiled
 from qpavoid.kernels.rows import distance_rows, row_bounds
 from qpavoid.kernels.tasks import damped_solution, frame_rows
 from qpavoid.problem import Array, IntArray
+
+
+@compiled
+def control_step(
+    x: Any, q: Array, influence_distance: float, moving: bool
+) -> tuple[int, int, int, int, float, bool, float]:
+    """Compute kinematics, distances and all rows and bounds of a control step.
+
+    Args:
+        x: memory of the step; see `RowLayout`.
+        q: configuration (nq,).
+        influence_distance: surface distance below which a pair is near [m].
+        moving: whether any obstacle moves.
+
+    Returns:
+        What `near_pairs` returns, then what `assemble` does.
+    """
+    update_kinematics(x.kinematics, q)
+    place_bodies(x.distances, x.joint_poses)
+    near, rows, meeting = near_pairs(x.distances)
+    k, worst, clear, margin = assemble(x, q, x.distances.rows[:rows], influence_distance, moving)
+    return near, rows, meeting, k, worst, clear, margin
 
 
 @compiled

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
+from qpavoid import kernels
+from qpavoid.kernels.kinematics import FREE, PLANAR, PRISMATIC, REVOLUTE, SPHERICAL, TRANSLATION, UNBOUNDED
 from qpavoid.model.views import read_poses, view_poses
 from qpavoid.problem import Array, IntArray
 
@@ -23,6 +26,17 @@ TRANSLATIONS = {
 """Joint type: number of its velocity coordinates that are lengths; they precede its angles."""
 MIMIC = "JointModelMimic"
 """A joint that another joint's coordinate moves, at a constant ratio; it has none of its own."""
+
+_KINDS = {
+    REVOLUTE: "JointModel(R[XYZ]|RevoluteUnaligned)",
+    UNBOUNDED: "JointModelR(UB[XYZ]|evoluteUnboundedUnaligned)",
+    PRISMATIC: "JointModelP([XYZ]|rismaticUnaligned)",
+    TRANSLATION: "JointModelTranslation",
+    PLANAR: "JointModelPlanar",
+    SPHERICAL: "JointModelSpherical",
+    FREE: "JointModelFreeFlyer",
+}
+"""Joint types of Pinocchio that the kernels know."""
 
 
 class Kinematics(NamedTuple):
@@ -47,7 +61,11 @@ class Kinematics(NamedTuple):
 
 
 class ForwardKinematics:
-    """Joint placements, world Jacobian and the poses of some frames, in data that every call overwrites."""
+    """Joint placements, world Jacobian and the poses of some frames, in data that every call overwrites.
+
+    A kernel writes them where Pinocchio's own algorithms look for them; of joints that it does not know (helical,
+    universal, composite), Pinocchio computes them.
+    """
 
     def __init__(self, model: Any, frame_ids: Sequence[int] = ()) -> None:
         """Allocate the memory of all results.
@@ -58,29 +76,89 @@ class ForwardKinematics:
         """
         self.data = model.createData()
         self._model, self._ids = model, list(frame_ids)
+        self._poses = self.data.oMi, self.data.oMf, self.data.liMi
         pin.framesForwardKinematics(model, self.data, pin.neutral(model))
-        view, joints = view_poses(self.data.oMf), view_poses(self.data.oMi)
-        self._copy, self._copy_joints = view is None, joints is None
+        pin.computeJointJacobians(model, self.data, pin.neutral(model))
+        views = [view_poses(poses, writeable=True) for poses in self._poses]
+        arrays = [read_poses(poses) if view is None else view for view, poses in zip(views, self._poses, strict=True)]
         self.J: Array = self.data.J.reshape(6, model.nvExtended, order="F")  # of one joint, it comes as a vector
         """(6, e) see `Kinematics.J`."""
-        self.frame_poses: Array = read_poses(self.data.oMf) if view is None else view
-        """(frames, 12) world poses of all frames; only those of `frame_ids` are kept up to date."""
-        self.joint_poses: Array = read_poses(self.data.oMi) if joints is None else joints
-        """(njoints, 12) world poses of all joints."""
+        self.joint_poses, self.frame_poses, self._local_poses = arrays
+        """(njoints, 12), (frames, 12) world poses of all joints and frames; only the frames `frame_ids` are kept up to
+        date."""
+        kinds = [_joint_kind(model, self.data, i) for i in range(model.njoints)]
+        self.arrays = self._lay_out(kinds)
+        """The same memory, as kernels see it."""
+        self.packed = kernels.pack(self.arrays)
+        self.is_compiled = min(kinds) >= 0 and all(view is not None for view in views)
+        """Whether the kernel computes everything."""
 
     def compute(self, q: Array) -> None:
         """Compute everything at a configuration q (nq,).
 
         `data` then holds the joint placements.
         """
+        if self.is_compiled:
+            kernels.update_kinematics(self.packed, q)
+            return
         model, data = self._model, self.data
         pin.computeJointJacobians(model, data, q)
         for frame_id in self._ids:
             pin.updateFramePlacement(model, data, frame_id)
-        if self._copy:
-            self.frame_poses[:] = read_poses(data.oMf)
-        if self._copy_joints:
-            self.joint_poses[:] = read_poses(data.oMi)
+        self.joint_poses[:], self.frame_poses[:] = read_poses(data.oMi), read_poses(data.oMf)
+
+    def _lay_out(self, kinds: Sequence[int]) -> kernels.KinematicsArrays:
+        model, joints = self._model, list(self._model.joints)
+        owners, frames = column_joints(model), [model.frames[i] for i in self._ids]
+        scaling = [_mimicry(joint)[0] for joint in joints]
+        motions = np.array(
+            [self.data.oMi[j].actInv(pin.Motion(self.J[:, c])).vector for c, j in enumerate(owners.tolist())]
+        ).reshape(-1, 6)
+        placements, turns = read_poses(model.jointPlacements), np.zeros((model.njoints, 2, 9))
+        slides = np.zeros((model.njoints, 3))
+        for i in range(1, model.njoints):
+            first, last = motions[owners == i][0] / scaling[i], motions[owners == i][-1] / scaling[i]
+            cross, rotation = pin.skew(last[3:]), model.jointPlacements[i].rotation
+            turns[i] = [(rotation @ k).ravel(order="F") for k in (cross, cross @ cross)]
+            slides[i] = rotation @ first[:3]
+        return kernels.KinematicsArrays(
+            kind=np.array(kinds, dtype=np.intp),
+            parents=np.array(list(model.parents), dtype=np.intp),
+            q_index=np.array([joint.idx_q for joint in joints], dtype=np.intp),
+            multiplier=np.array(scaling),
+            origin=np.array([_mimicry(joint)[1] for joint in joints]),
+            placements=placements,
+            turns=turns,
+            slides=slides,
+            column_joints=owners,
+            motions=motions,
+            frame_ids=np.array(self._ids, dtype=np.intp),
+            frame_joints=np.array([frame.parentJoint for frame in frames], dtype=np.intp),
+            frame_placements=read_poses([frame.placement for frame in frames]),
+            local_poses=self._local_poses,
+            joint_poses=self.joint_poses,
+            frame_poses=self.frame_poses,
+            J=self.J,
+        )
+
+
+def _joint_kind(model: Any, data: Any, i: int) -> int:
+    """Return the kind of joint i as the kernels call it, -1 of one that they do not know; of the world, any."""
+    if i == 0:
+        return REVOLUTE
+    joint = model.joints[i]
+    name = joint.shortname()
+    if name == MIMIC:  # of one angle or length
+        return REVOLUTE if data.J.reshape(6, -1, order="F")[3:, joint.idx_vExtended].any() else PRISMATIC
+    return next((kind for kind, pattern in _KINDS.items() if re.fullmatch(pattern, name)), -1)
+
+
+def _mimicry(joint: Any) -> tuple[float, float]:
+    """Return by what the coordinate of a joint is multiplied, and what is added to it: 1 and 0 but for a mimic."""
+    if joint.shortname() != MIMIC:
+        return 1.0, 0.0
+    mimic = joint.extract()
+    return float(mimic.scaling), float(mimic.offset)
 
 
 def columns(model: Any) -> IntArray:

@@ -12,12 +12,13 @@ import pinocchio as pin
 from qpavoid import kernels
 from qpavoid.config import Mesh, PointCloud, ScenarioConfig
 from qpavoid.config.loading import load_scenario
-from qpavoid.control.distances import DistanceQuery
-from qpavoid.control.tasks.frames import in_order
+from qpavoid.control.obstacles import ObstacleStates
+from qpavoid.control.tasks import in_order
 from qpavoid.control.tick import Tick
 from qpavoid.controller import Controller
 from qpavoid.errors import ConfigError, NumericalError
 from qpavoid.geometry.bodies import enclosing_capsule
+from qpavoid.model.kinematics import ForwardKinematics
 from qpavoid.model.scene import PARKING_DISTANCE, Scene
 from qpavoid.model.solids import surface_triangles
 from qpavoid.problem import Array, Solution, Status
@@ -108,7 +109,7 @@ class Recorder:
         self._scene, self._scenario = scene, scenario
         self._frames, self._other_tasks = in_order(controller.tasks)
         self._controller = controller
-        self._data, self._query = model.createData(), DistanceQuery(scene)  # distances of all pairs, near or not
+        self._kinematics, self._query = ForwardKinematics(model), controller.distances()  # of all pairs, near or not
         self._ends, self._radii = _drawing_axes(scene.robot.bodies)
         tasks, bodies, obstacles = len(self._frames), len(scene.body_names), len(scene.obstacles)
         shapes: dict[str, tuple[int, ...]] = {
@@ -174,11 +175,11 @@ class Recorder:
     def _write_bodies(self, tick: Tick, rows: dict[str, Array]) -> None:
         """Store the distances of all pairs, and the poses of bodies and obstacles."""
         scene = self._scene
-        pin.forwardKinematics(scene.robot.model, self._data, tick.state.q)
-        self._controller.sync_attachments(self._query)
+        self._kinematics.compute(tick.state.q)
+        samples, attached = [], self._controller.attached
         counted_body = np.arange(len(scene.geometry.geometryObjects))
         for i, obstacle in enumerate(scene.obstacles):
-            is_attached = i in self._query.carried
+            is_attached = obstacle.name in attached
             sample = (
                 self._controller.obstacle_pose(obstacle.name, tick.state.q)
                 if is_attached
@@ -186,12 +187,12 @@ class Recorder:
             )
             rows["obstacle_position"][i], rows["obstacle_rotation"][i] = sample.position, sample.rotation
             if is_attached:
-                counted_body[np.flatnonzero(scene.obstacle_of == i)] = _attachment_body(scene, self._query.carried[i])
-            elif obstacle.moves:
-                self._query.place_obstacle(i, sample)
-        self._query.compute(self._data, np.inf)
+                counted_body[np.flatnonzero(scene.obstacle_of == i)] = _attachment_body(scene, attached[obstacle.name])
+            samples.append(sample)
+        self._query.place(ObstacleStates.of(samples))
+        self._query.compute(self._kinematics.joint_poses, np.inf)
         distance, pairs = np.full(len(scene.pairs), np.inf), self._query.pairs
-        distance[pairs] = self._query.results[pairs, 0]
+        distance[pairs] = self._query.arrays.results[pairs, 0]
         distance[distance > 0.5 * PARKING_DISTANCE] = np.inf
         if np.isfinite(distance).any():
             self._arrays["closest_pair"][self._count] = np.argmin(distance)
@@ -200,7 +201,7 @@ class Recorder:
         np.minimum.at(nearest, counted_body[scene.pairs[:, 1]], distance)
         rows["body_distance"][:] = nearest[: rows["body_distance"].shape[0]]
         for i, body in enumerate(scene.robot.bodies.geometryObjects):
-            joint = self._data.oMi[body.parentJoint]
+            joint = self._kinematics.data.oMi[body.parentJoint]
             rows["body_ends"][i] = self._ends[i] @ joint.rotation.T + joint.translation
 
     def log(self, stopped_by: str | None = None) -> Log:

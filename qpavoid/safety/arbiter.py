@@ -10,10 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from qpavoid.config import Avoidance, Limits, Progress
-from qpavoid.control.assembler import Assembly
-from qpavoid.control.distances import DistanceQuery
+from qpavoid.control.assembler import RowAssembler
 from qpavoid.control.obstacles import ObstacleTracker
-from qpavoid.errors import NumericalError
+from qpavoid.errors import ConfigError, NumericalError
 from qpavoid.kernels import TOLERANCE
 from qpavoid.model.limits import JointBounds, saturate
 from qpavoid.model.scene import Scene
@@ -38,8 +37,7 @@ class Arbiter:
         self,
         scene: Scene,
         solver: Solver,
-        assembly: Assembly,
-        query: DistanceQuery,
+        rows: RowAssembler,
         obstacles: ObstacleTracker,
         bounds: JointBounds,
         avoidance: Avoidance,
@@ -52,8 +50,7 @@ class Arbiter:
         Args:
             scene: robot and obstacles.
             solver: the control law.
-            assembly: of the problems.
-            query: distances of the control step.
+            rows: of the problems.
             obstacles: states of the obstacles.
             bounds: limits of the joints.
             avoidance: distances and rows.
@@ -61,22 +58,17 @@ class Arbiter:
             progress: when a task counts as stalled.
             dt: control period [s].
         """
-        self._scene, self.solver, self._assembly, self._query = scene, solver, assembly, query
+        self._scene, self.solver, self._rows, self._obstacles = scene, solver, rows, obstacles
         self._bounds, self._avoidance, self._limits = bounds, avoidance, limits
         self._v_shape = (scene.robot.model.nv,)
-        self._influence_distance = avoidance.d2 - avoidance.offset
         safety_distance = avoidance.safety_distance - avoidance.offset
-        self.braking = BrakingCheck(scene, bounds, limits.position_gain, safety_distance, dt)
+        self._braking = BrakingCheck(scene, rows, bounds, limits.position_gain, safety_distance, dt)
         self.progress = ProgressMonitor(progress, dt, scene.pair_names)
         self.backup: BackupPlanner | None = None
         if avoidance.backup is not None and scene.obstacles:
-            rollouts = BackupRollouts(scene, bounds, obstacles, avoidance, limits, dt, avoidance.backup)
+            table, settings = rows.query.table, avoidance.backup
+            rollouts = BackupRollouts(scene, table, bounds, obstacles, avoidance, limits, dt, settings)
             self.backup = BackupPlanner(rollouts, scene, bounds, obstacles, dt)
-
-    @property
-    def queries(self) -> tuple[DistanceQuery, ...]:
-        """Distances of predicted states, which need to be given attached objects and points."""
-        return (self.braking.query, *([self.backup.rollouts.query] if self.backup else []))
 
     def invalidate(self) -> None:
         """Take in that attached objects, or the disabled pairs, have changed."""
@@ -115,9 +107,9 @@ class Arbiter:
         try:
             if from_tasks:
                 if problem.levels and isinstance(self.solver, Hqp):  # v_tracking is not a cascade's
-                    problem = self._assembly.prioritised(problem, self.solver.tracked)
+                    problem = self._rows.prioritised(problem, self.solver.tracked)
                 elif problem.jerk_limited:
-                    problem = self._assembly.eased(problem)
+                    problem = self._rows.within_jerks(problem)
             solution = self.solver.solve(problem)
             v = solution.v
             usable = (
@@ -154,9 +146,7 @@ class Arbiter:
         def low_effort() -> Array | None:
             return self.solver.low_effort(problem, solution.slack) if isinstance(self.solver, Qp) else None
 
-        result = self.braking.check(
-            q, solution, problem, low_effort, self._assembly, self._query, self._influence_distance
-        )
+        result = self._braking.check(q, solution, problem, low_effort, self._obstacles)
         if result is None:
             return solution
         v, scale, violation, pair, distance = result
@@ -174,7 +164,7 @@ class Arbiter:
     ) -> Solution:
         """Replace the velocity by that of the backup trajectory, where none would be left after it."""
         try:
-            v = backup.check(q, solution.v, t, self._assembly.v_prev, self._assembly.dv_prev, proximity)
+            v = backup.check(q, solution.v, t, self._rows.previous.v, self._rows.previous.dv, proximity)
         except NumericalError as error:  # of a predicted state; raised by `step` once it is the present one
             why = f"prediction of an {error}"
             return solution.with_reasons(Reason.of(ReasonKind.NO_BACKUP, severity=Severity.WARNING, detail=why))
@@ -187,13 +177,13 @@ class Arbiter:
 
         They do after a relaxed control step, before a position or velocity limit, and to hold contacts.
         """
-        if not (self._assembly.limits_may_give_way and self.solver.bounded):
+        if not (self._rows.previous.needs_report and self.solver.bounded):
             return solution
         kinds = (ReasonKind.ACCELERATION_RELAXED, ReasonKind.JERK_RELAXED)
         named = {reason.subject for reason in solution.reasons if reason.kind in kinds}
         excesses = [
             Reason.of(kind, problem.joint_names[j], amount=float(excess[j]), unit=f"{problem.joint_units[j]}/s")
-            for kind, excess in zip(kinds, self._assembly.beyond_limits(solution.v), strict=True)
+            for kind, excess in zip(kinds, self._rows.previous.excess(solution.v), strict=True)
             for j in np.flatnonzero(excess > _LIMIT_TOLERANCE).tolist()
             if (problem.joint_names[j],) not in named
         ]
@@ -216,3 +206,21 @@ def _well_formed(problem: Problem, solution: Solution) -> bool:
 
 def _stop(problem: Problem, reasons: tuple[Reason, ...]) -> Solution:
     return Solution(problem.v_stop.copy(), Status.STOPPED, reasons)
+
+
+def check_solver(law: Solver, name: Solver | str, contacts: bool) -> None:
+    """Check that a solver can be used; `name` is what the user gave, `contacts` whether there are any.
+
+    Raises:
+        ConfigError: it has no `solve` or `bounded`, or does not hold contacts.
+    """
+    if not callable(getattr(law, "solve", None)) or not hasattr(law, "bounded"):
+        raise ConfigError(f"solver: {type(law).__name__} is no law; it needs `solve(problem)` and `bounded`")
+    if contacts and not getattr(law, "holds_contacts", False):
+        raise ConfigError(f"contacts: {_name(name)} cannot hold them; use qp or hqp")
+
+
+def _name(solver: Solver | str) -> str:
+    if isinstance(solver, str):
+        return f"solver {solver!r}"
+    return f"solver {solver.config.name!r}" if hasattr(solver, "config") else f"the solver {type(solver).__name__}"

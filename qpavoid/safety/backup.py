@@ -102,7 +102,6 @@ class BackupPlanner:
         self._random, self._straight_policies = np.random.default_rng(0), list[float]()
         self._cached_clearance: _CachedClearance | None = None
         self._paths = _NO_PATHS
-        self.rollouts.drop_predictions()
 
     def invalidate(self) -> None:
         """Take in that attached objects or disabled pairs have changed, and require a new verification."""
@@ -125,7 +124,6 @@ class BackupPlanner:
         if not self._obstacles.any_may_move:
             self._backup = None
             return None
-        self.rollouts.prune(t - _SPHERE_PERIOD)
         enabled = self.rollouts.separable_pairs
         next_state = Start(pin.integrate(self._model, q, self._dt * v), v, v - v_prev, t + self._dt, enabled)
         if self._moving_obstacles_stay_far(next_state):
@@ -185,8 +183,8 @@ class BackupPlanner:
             if self.rollouts.lever_arm * (moved + stop) < cached.clearance:
                 return True
         self.rollouts.kinematics.compute(start.q)
-        centers, radii = self.rollouts.query.body_spheres(self.rollouts.kinematics.data)
-        obstacle_radii = self.rollouts.query.placing.reach[paths.moving] + paths.max_deviation
+        centers, radii = self.rollouts.query.body_spheres(self.rollouts.kinematics.joint_poses)
+        obstacle_radii = self.rollouts.query.obstacle_radii[paths.moving] + paths.max_deviation
         obstacle_radii = obstacle_radii + self._settings.preferred_distance
         clearance = kernels.min_sphere_distance(paths.positions, centers, obstacle_radii[:, None] + radii)
         self._cached_clearance = _CachedClearance(paths, start.q, clearance)
@@ -202,7 +200,7 @@ class BackupPlanner:
             moving = self._obstacles.moving[moves]
             speed, spin = rates[moves].T
             # half-spaces have no end: of one that does not turn, 0 · ∞ counts as 0
-            radii, rim_speed = self.rollouts.query.placing.reach[moving], np.zeros_like(spin)
+            radii, rim_speed = self.rollouts.query.obstacle_radii[moving], np.zeros_like(spin)
             np.multiply(spin, radii, out=rim_speed, where=spin > 0.0)
             max_speed = float(np.max(speed + rim_speed, initial=0.0))
             max_deviation = 0.5 * _SPHERE_PERIOD * speed

@@ -15,20 +15,20 @@ proof).
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from math import floor
 from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
-from qpavoid.control.assembler import Assembly
+from qpavoid.control.assembler import RowAssembler
 from qpavoid.control.distances import DistanceQuery
-from qpavoid.control.trajectories import extrapolate
+from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.kernels import TOLERANCE, speed_to_stop
+from qpavoid.model.kinematics import ForwardKinematics
 from qpavoid.model.limits import JointBounds
 from qpavoid.model.scene import Scene
-from qpavoid.problem import Array, IntArray, Problem, Solution
+from qpavoid.problem import Array, Problem, Solution
 
 _MAX_APPROACH_IN_VIOLATION = 1e-5
 """Approach per control step that a pair below its safety distance may make [m]: round-off of the row that parts it."""
@@ -87,6 +87,7 @@ class BrakingCheck:
     def __init__(
         self,
         scene: Scene,
+        rows: RowAssembler,
         bounds: JointBounds,
         position_gain: float,
         safety_distance: float,
@@ -96,35 +97,22 @@ class BrakingCheck:
 
         Args:
             scene: robot and obstacles.
+            rows: kinematics, distances and rows of the control step.
             bounds: limits of the joints.
             position_gain: fraction of the range left to a position limit that one control step may use [-].
             safety_distance: between surfaces [m].
             dt: control period [s].
         """
         self._model, self._safety_distance, self._dt = scene.robot.model, safety_distance, dt
-        self._data, self._query = scene.robot.model.createData(), DistanceQuery(scene)
+        self._rows, self._now = rows, rows.query
+        self._kinematics, self._query = ForwardKinematics(self._model), DistanceQuery(scene, rows.query.table)
         self._bounds, self._rate = bounds, position_gain / dt
         self._acceleration, self._accelerated = bounds.acceleration, bool(np.isfinite(bounds.acceleration).any())
-        self._jerked = bool(np.isfinite(bounds.jerk).any())
         self._allowance, self._distance_allowance = (
             np.zeros(len(scene.pairs)),
             scene.distance_allowance(safety_distance),
         )
         self._min_distance = np.inf  # of any pair along the velocity under test [m]
-        self._updated, self._has_updates = np.zeros(len(scene.obstacles), dtype=bool), False
-
-    def mark_updated(self, indices: IntArray) -> None:
-        """Mark obstacles (k,) whose state has changed: their predicted poses are out of date."""
-        self._updated[indices] = self._has_updates = True
-
-    @property
-    def query(self) -> DistanceQuery:
-        """Distances along the path, which need to be given attached objects and points."""
-        return self._query
-
-    def forget(self, index: int) -> None:
-        """Take obstacle number `index` as resting at its pose, or as attached."""
-        self._updated[index] = False
 
     def check(
         self,
@@ -132,9 +120,7 @@ class BrakingCheck:
         solution: Solution,
         problem: Problem,
         low_effort: Callable[[], Array | None],
-        assembly: Assembly,
-        query: DistanceQuery,
-        max_distance: float,
+        obstacles: ObstacleTracker,
     ) -> BrakingResult | None:
         """Return None if the path of a solution's velocity is clear, else the largest scale of it that is, or the best.
 
@@ -145,29 +131,28 @@ class BrakingCheck:
             solution: the solver's.
             problem: the one that was solved.
             low_effort: returns another solution of less joint motion, if there is one.
-            assembly: of this control step.
-            query: distances of this control step.
-            max_distance: surface distance up to which these were evaluated [m].
+            obstacles: states of the obstacles.
         """
         v, v_stop, rows = solution.v, problem.v_stop, problem.avoidance
         if problem.tracking_is_clear and v.tobytes() == problem.v_tracking.tobytes():
             return None
-        near = rows.pair
-        stop = assembly.stop(q, v) if self._jerked else None
-        horizon = self._dt + 0.5 * self._stopping_time(v) if stop is None else float(stop.forwards.sum())
-        is_uniform = horizon <= self._dt or stop is not None or not assembly.leaves_position_limits(q, v, horizon)
-        if is_uniform and assembly.clearance_lower_bound(v, len(near), max_distance, horizon, stop) > -TOLERANCE:
+        near, now = rows.pair, self._now
+        stop = self._rows.stop(q, v)
+        horizon = self._dt + 0.5 * self._stopping_time(v) if stop is None else float(stop.equivalent_time.sum())
+        is_uniform = horizon <= self._dt or stop is not None or not self._rows.leaves_position_limits(q, v, horizon)
+        if is_uniform and self._rows.clearance_lower_bound(v, len(near), horizon, stop) > -TOLERANCE:
             return None
         self._allowance.fill(0.0)
         self._min_distance = np.inf
         if solution.slack is not None:
             self._allowance[near] = 1.1 * horizon * solution.slack
-            self._allowance[:] = self._query.widest(self._allowance)
-        self._place_obstacles(query)
-        speed = float(query.placing.speeds.max())
-        margin = (float(query.found(query.pairs).min()) if len(near) else max_distance) - self._safety_distance
-        evaluate = partial(self._min_margin_with_jerk if self._jerked else self._min_margin, assembly)
-        least, pair = evaluate(q, v, query, margin, speed)
+            self._allowance[:] = self._query.max_over_group(self._allowance)
+        self._query.place(obstacles.after(self._dt))
+        speed = float(now.arrays.speeds.max())
+        nearest = float(now.distances_of(now.pairs).min()) if len(near) else self._rows.influence_distance
+        margin = nearest - self._safety_distance
+        evaluate = self._min_margin_with_jerk if stop is not None else self._min_margin
+        least, pair = evaluate(q, v, margin, speed)
         if least >= 0.0:
             return None
         best, cost = BrakingResult(v, 1.0, -least, pair, self._min_distance), -least
@@ -175,9 +160,9 @@ class BrakingCheck:
         full = v if straight is None else straight
         for scale in _SCALES if straight is None else (1.0, *_SCALES):
             blend, self._min_distance = v_stop + scale * (full - v_stop), np.inf
-            least, pair = evaluate(q, blend, query, margin, speed)
+            least, pair = evaluate(q, blend, margin, speed)
             # a stop was clear one control step ago
-            if least >= (-_REFINEMENT_ERROR if self._jerked and scale == 0.0 else 0.0):
+            if least >= (-_REFINEMENT_ERROR if stop is not None and scale == 0.0 else 0.0):
                 return BrakingResult(blend, scale, 0.0, -1, self._min_distance)
             slack = 0.0 if solution.slack is None else solution.slack
             violation = np.max(rows.b - rows.J @ blend - slack, initial=0.0)
@@ -186,35 +171,20 @@ class BrakingCheck:
                 cost = _VIOLATION_TIME * violation - least
         return best
 
-    def _place_obstacles(self, now: DistanceQuery) -> None:
-        """Place the obstacles at their poses at the end of the control period."""
-        if self._has_updates:
-            indices = np.flatnonzero(self._updated)
-            states = now.placing.states.copy()
-            extrapolate(states, self._dt)
-            self._query.placing.place(indices, states, now.placing.margin)
-            self._updated[indices] = states[indices, 12:].any(axis=1)  # those that move have other poses one step later
-            self._has_updates = bool(self._updated.any())
-        self._query.placing.margin[:] = now.placing.margin
-
-    def _min_margin(
-        self, assembly: Assembly, q: Array, v: Array, now: DistanceQuery, margin: float, speed: float
-    ) -> tuple[float, int]:
+    def _min_margin(self, q: Array, v: Array, margin: float, speed: float) -> tuple[float, int]:
         """Return the least margin, distance - required distance, along the path of v and its stop [m], and its pair.
 
         Steps are such that no two bodies can meet in between, and no shorter than `_MIN_STEP`: the approach of a pair
         within one of those is of second order in it, as it was not too near at either end.
 
         Args:
-            assembly: of this control step.
             q: start (nq,).
             v: velocity (nv,).
-            now: distances at the start.
             margin: least margin at the start [m].
             speed: bound on the speed of any point of the robot [m/s].
         """
         least, pair, count = np.inf, -1, 0
-        segments = self._segments(assembly, q, v)
+        segments = self._segments(q, v)
         remaining = sum(duration for *_, duration in segments)
         for start, velocity, duration in segments:
             t = 0.0
@@ -226,20 +196,19 @@ class BrakingCheck:
                 step = end - t if is_last else step
                 t, remaining = end if is_last else t + step, remaining - step
                 count = min(count + 1, _MAX_POSES - 1)
-                here, nearest = self._margin_at(pin.integrate(self._model, start, t * velocity), now)
+                here, nearest = self._margin_at(pin.integrate(self._model, start, t * velocity))
                 if not here >= least:
                     least, pair = here, nearest
                 margin = min(max(here, 0.0), _MAX_MARGIN)
         return least, pair
 
-    def _min_margin_with_jerk(
-        self, assembly: Assembly, q: Array, v: Array, now: DistanceQuery, margin: float, speed: float
-    ) -> tuple[float, int]:
+    def _min_margin_with_jerk(self, q: Array, v: Array, margin: float, speed: float) -> tuple[float, int]:
         """Return what `_min_margin` does, under jerk limits: the path is curved, and may be nearest between poses."""
-        stop, speed = assembly.stop(q, v), max(speed, _MIN_SPEED)
+        stop, speed = self._rows.stop(q, v), max(speed, _MIN_SPEED)
+        assert stop is not None
         # at such times no point moves faster than `speed`
-        times = np.concatenate(([0.0], np.cumsum(np.maximum(stop.forwards + stop.aside / speed, 1e-9))))
-        travel = np.concatenate((np.zeros((1, len(v))), np.cumsum(self._dt * stop.way, axis=0)))
+        times = np.concatenate(([0.0], np.cumsum(np.maximum(stop.equivalent_time + stop.lateral_bound / speed, 1e-9))))
+        travel = np.concatenate((np.zeros((1, len(v))), np.cumsum(self._dt * stop.velocities, axis=0)))
 
         def move(pose: Array, start: float, end: float) -> Array:
             places = []
@@ -250,7 +219,7 @@ class BrakingCheck:
 
         def evaluate(before: _PathPoint, t: float) -> _PathPoint:
             pose = move(before.q, before.t, t)
-            return _PathPoint(t, pose, *self._margin_at(pose, now))
+            return _PathPoint(t, pose, *self._margin_at(pose))
 
         path = [_PathPoint(0.0, q, margin, -1)]
         while (t := path[-1].t) < times[-1]:
@@ -276,10 +245,10 @@ class BrakingCheck:
         least = points[int(np.argmin([point.margin for point in points]))]  # the first NaN, where there is one
         return least.margin, least.pair
 
-    def _segments(self, assembly: Assembly, q: Array, v: Array) -> list[tuple[Array, Array, float]]:
+    def _segments(self, q: Array, v: Array) -> list[tuple[Array, Array, float]]:
         """Return straight segments of the path of v and its stop: start (nq,), velocity (nv,) and duration [s] each."""
         end = self._equivalent_time(self._stopping_time(v))
-        if end > self._dt and assembly.leaves_position_limits(q, v, end):
+        if end > self._dt and self._rows.leaves_position_limits(q, v, end):
             return self._segments_at_limits(q, v)
         return [(q, v, end)]
 
@@ -318,19 +287,19 @@ class BrakingCheck:
         """Return the time that the stop from v takes [s]."""
         return float((np.abs(v) / self._acceleration).max()) if self._accelerated else 0.0
 
-    def _margin_at(self, q: Array, now: DistanceQuery) -> tuple[float, int]:
+    def _margin_at(self, q: Array) -> tuple[float, int]:
         """Return the least margin at q (nq,) [m], and its pair; -1 if all pairs are farther than `_MAX_MARGIN`."""
-        pin.forwardKinematics(self._model, self._data, q)
-        query = self._query
-        query.compute(self._data, self._safety_distance + _MAX_MARGIN)
+        self._kinematics.compute(q)
+        query, now = self._query, self._now
+        query.compute(self._kinematics.joint_poses, self._safety_distance + _MAX_MARGIN)
         pairs = query.pairs
         if not len(pairs):
             return _MAX_MARGIN, -1
         allowance = self._distance_allowance[pairs]
-        later, present = query.found(pairs) + allowance, now.found(pairs) + allowance
-        margins = query.placing.margin
+        later, present = query.distances_of(pairs) + allowance, now.distances_of(pairs) + allowance
+        margins = query.arrays.margin
         if margins.any():
-            margin = margins[query.twist_row[pairs]]
+            margin = margins[query.table.twist_row[pairs]]
             later, present = later - margin, present - margin
         self._min_distance = min(self._min_distance, float(later.min()))
         required = np.minimum(self._safety_distance - TOLERANCE, present - _MAX_APPROACH_IN_VIOLATION)

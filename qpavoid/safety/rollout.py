@@ -20,9 +20,10 @@ from qpavoid import kernels
 from qpavoid.config import Avoidance, Backup, Limits
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.estimates import prediction_error_bound
-from qpavoid.control.obstacles import ObstacleStates, ObstacleTracker
-from qpavoid.control.row_layout import hand_over, lay_out
-from qpavoid.model.kinematics import ForwardKinematics, max_lever_arm, support_masks
+from qpavoid.control.obstacles import ObstacleTracker
+from qpavoid.control.pair_table import PairTable
+from qpavoid.control.row_layout import lay_out
+from qpavoid.model.kinematics import ForwardKinematics, max_lever_arm
 from qpavoid.model.limits import JointBounds
 from qpavoid.model.scene import Scene
 from qpavoid.problem import Array, Mask
@@ -43,8 +44,6 @@ _MAX_DEPTH = 10.0
 """Lower bound of s in the QP [m]: deeper than any penetration."""
 _ROUND_OFF = 1e-6
 """Difference of two times that counts as none [s]."""
-_MAX_PREDICTIONS = 300
-"""Times whose predicted obstacle states are cached before the past ones are dropped."""
 _BEYOND = 0.1
 """Time by which a rollout exceeds the horizon [s], so that it stays valid for some control steps."""
 
@@ -55,6 +54,7 @@ class BackupRollouts:
     def __init__(
         self,
         scene: Scene,
+        table: PairTable,
         bounds: JointBounds,
         obstacles: ObstacleTracker,
         avoidance: Avoidance,
@@ -66,6 +66,7 @@ class BackupRollouts:
 
         Args:
             scene: robot and obstacles.
+            table: its bodies and pairs, with what is attached to the robot.
             bounds: limits of the joints.
             obstacles: states of the obstacles.
             avoidance: distances and rows of the controller.
@@ -78,11 +79,11 @@ class BackupRollouts:
         self._period_steps = max(1, int(np.ceil(settings.period / dt - 1e-9)))
         self.period = self._period_steps * dt
         """Time between two decisions [s]."""
-        self.kinematics, self.query = ForwardKinematics(model), DistanceQuery(scene)
+        self.kinematics, self.query = ForwardKinematics(model), DistanceQuery(scene, table)
         # a velocity may be asked for that is farther away than jerk limits allow in a period
         free = replace(bounds, jerk=np.full(model.nv, np.inf))
         self._layout = lay_out(scene, (), (), free, self.kinematics, self.query, avoidance, limits, 0.01, self.period)
-        self._packed, self._masks = kernels.pack(self._layout), support_masks(model)
+        self._packed = kernels.pack(self._layout)
         self._views: dict[int, Near] = {}
         self._no_velocities = np.zeros((0, model.nv))
         self._is_vector_space = all(joint.nv <= 1 for joint in list(model.joints)[1:])
@@ -91,7 +92,7 @@ class BackupRollouts:
         """(m,) pairs whose distance depends on a joint."""
         self.ramps = Ramps(bounds, dt)
         """Velocity ramps within the limits."""
-        self.lever_arm = max(1.0, max_lever_arm(model, self.query.max_extension()))
+        self.lever_arm = max(1.0, max_lever_arm(model, table.max_extension()))
         """Bound on the distance that a point of the robot moves when a joint moves by 1 [m/rad, 1]."""
         self.sufficient_score = BackupScore(
             settings.horizon, settings.distance_scale * (avoidance.safety_distance - avoidance.offset)
@@ -99,7 +100,6 @@ class BackupRollouts:
         """Score from which on a backup trajectory need not be improved."""
         self.stop_policy = BackupPolicy(0.0, np.zeros(model.nv))
         """Braking to a standstill."""
-        self._predictions: dict[float, ObstacleStates] = {}
         self._compile(scene.robot.home)
 
     def _compile(self, q: Array) -> None:
@@ -110,34 +110,13 @@ class BackupRollouts:
         kernels.closes_below(*near, zero, 1.0, 0.0)
         kernels.min_sphere_distance(np.zeros((1, 1, 3)), np.zeros((1, 3)), np.zeros((1, 1)))
         self.ramps.follow(zero, zero, self._policy_velocity(near, BackupPolicy(0.1, zero))[None])
-        self.drop_predictions()
-
-    def prune(self, t: float) -> None:
-        """Drop predicted obstacle states before t [s]; all of them, if any obstacle is external."""
-        if self._obstacles.estimates is not None:
-            self._predictions.clear()
-        elif len(self._predictions) > _MAX_PREDICTIONS:
-            self._predictions = {time: states for time, states in self._predictions.items() if time > t}
 
     def invalidate(self) -> None:
         """Take in that attached objects, or the disabled pairs, have changed."""
-        hand_over(self._layout, self._masks, self.query)
         self.separable_pairs = self._find_separable_pairs()
-        self.drop_predictions()
-
-    def drop_predictions(self) -> None:
-        """Drop all predicted obstacle states, after an update of the obstacles."""
-        self._predictions.clear()
 
     def _find_separable_pairs(self) -> Mask:
         return np.asarray(np.any(self._layout.support != 0.0, axis=1))
-
-    def obstacles_at(self, t: float) -> ObstacleStates:
-        """Return the predicted states of the obstacles that move, at t [s]."""
-        t = round(t, 9)  # sums of periods differ in their last digits
-        if t not in self._predictions:
-            self._predictions[t] = self._obstacles.predicted(t)
-        return self._predictions[t]
 
     def advance(self, trajectory: BackupTrajectory) -> BackupTrajectory:
         """Return a trajectory without its first control step."""
@@ -171,7 +150,7 @@ class BackupRollouts:
             max_offset = max(max_offset, float(np.abs(offset).sum(axis=1).max(initial=0.0)))
         span = self.settings.horizon + _BEYOND
         obstacle_offset = (delay * max_obstacle_speed if delay > _ROUND_OFF else 0.0) + prediction_error_bound(
-            self._obstacles.estimates, trajectory.estimates, span, self.query.placing.reach
+            self._obstacles.estimates, trajectory.estimates, span, self.query.obstacle_radii
         )
         clearance = trajectory.clearance - self.lever_arm * max_offset - obstacle_offset
         return bool(clearance >= self.sufficient_score.clearance)
@@ -261,12 +240,12 @@ class BackupRollouts:
             span: time since the last evaluation [s].
         """
         query, influence_distance = self.query, self.settings.influence_distance
-        query.placing.place(*self.obstacles_at(t))
+        query.place(self._obstacles.at(t))
         self.kinematics.compute(q)
-        query.compute(self.kinematics.data, influence_distance)
+        query.compute(self.kinematics.joint_poses, influence_distance)
         self._layout.v_prev[:] = v
         k, touching, nearest, nearest_apart = kernels.backup_rows(
-            self._packed, q, query.pairs, influence_distance, query.placing.moving, contacts.enabled, TOUCH
+            self._packed, q, query.pairs, influence_distance, query.is_moving, contacts.enabled, TOUCH
         )
         contacts.add((touching, nearest, nearest_apart), t, span)
         return self._views.get(k) or self._view(k)

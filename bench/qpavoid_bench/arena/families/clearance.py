@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import pinocchio as pin
 
 from qpavoid.control.distances import DistanceQuery
+from qpavoid.control.obstacles import ObstacleStates
+from qpavoid.model.kinematics import ForwardKinematics
 from qpavoid.problem import Array
 from qpavoid_bench.arena.families.inverse_kinematics import JointRanges
 from qpavoid_bench.arena.world import World
@@ -35,8 +36,11 @@ class Clearance:
         """Smallest distance that every sample has to have [m]."""
         self._search_distance = self.least + _SEARCH_MARGIN
         scene = world.scene
-        self._model, self._data, self._query = scene.robot.model, scene.robot.model.createData(), DistanceQuery(scene)
-        self._moving = [(i, o.motion) for i, o in enumerate(scene.obstacles) if o.moves]
+        self._model, self._query = scene.robot.model, DistanceQuery(scene)
+        self._kinematics = ForwardKinematics(self._model)
+        self._motions = [obstacle.motion for obstacle in scene.obstacles]
+        self.depends_on_time = any(obstacle.moves for obstacle in scene.obstacles)
+        """Whether an obstacle moves."""
         self._fixed = ~np.any(scene.support != 0.0, axis=1)
         self._duration = duration
         self.speed = self._max_obstacle_speed()
@@ -45,16 +49,13 @@ class Clearance:
         """(nv,) bound on the travel of any point of the robot per unit of each coordinate [m/rad or 1]. A joint
         moves one body of a pair, or both as one: no distance changes by more than lever_arm @ |Δq|."""
 
-    @property
-    def depends_on_time(self) -> bool:
-        """Return True if an obstacle moves."""
-        return bool(self._moving)
-
     def at(self, q: Array, t: float) -> float:
         """Return the smallest distance of any pair [m], up to 0.1 m above the required one."""
         self._compute(q, t)
         pairs = self._query.pairs
-        return float(min(self._query.results[pairs, 0].min(initial=self._search_distance), self._search_distance))
+        return float(
+            min(self._query.arrays.results[pairs, 0].min(initial=self._search_distance), self._search_distance)
+        )
 
     def is_clear(self, q: Array, t: float) -> bool:
         """Return True if all pairs have the distance that a sample needs."""
@@ -67,7 +68,7 @@ class Clearance:
             return True
         for t in np.arange(0.0, self._duration + _STATIC_PERIOD, _STATIC_PERIOD) if self.depends_on_time else (0.0,):
             self._compute(q, float(t))
-            if self._query.found(fixed).min() < self.least:
+            if self._query.distances_of(fixed).min() < self.least:
                 return False
         return True
 
@@ -90,22 +91,24 @@ class Clearance:
         return True
 
     def _compute(self, q: Array, t: float) -> None:
-        for index, motion in self._moving:
-            self._query.place_obstacle(index, motion.sample(t))
-        pin.forwardKinematics(self._model, self._data, q)
-        self._query.compute(self._data, self._search_distance)
+        self._place(t)
+        self._kinematics.compute(q)
+        self._query.compute(self._kinematics.joint_poses, self._search_distance)
+
+    def _place(self, t: float) -> None:
+        if self.depends_on_time:
+            self._query.place(ObstacleStates.of([motion.sample(t) for motion in self._motions]))
 
     def _max_obstacle_speed(self) -> float:
         fastest = 0.0
-        for t in np.arange(0.0, self._duration, _SPEED_PERIOD) if self._moving else ():
-            for index, motion in self._moving:
-                self._query.place_obstacle(index, motion.sample(float(t)))
-            fastest = max(fastest, float(self._query.placing.speeds.max()))
+        for t in np.arange(0.0, self._duration, _SPEED_PERIOD) if self.depends_on_time else ():
+            self._place(float(t))
+            fastest = max(fastest, float(self._query.arrays.speeds.max()))
         return fastest
 
     def _lever_arms(self, ranges: JointRanges) -> Array:
         """Bound the distance of points from each joint (nv,) by the lengths of the links after it."""
-        model, max_extension, lever_arm = self._model, self._query.joint_radius(), np.ones(self._model.nv)
+        model, max_extension, lever_arm = self._model, self._query.table.joint_radius.copy(), np.ones(self._model.nv)
         farthest = np.maximum(np.abs(ranges.lower), np.abs(ranges.upper))
         for i in range(model.njoints - 1, 0, -1):
             joint, parent = model.joints[i], model.parents[i]

@@ -1,0 +1,136 @@
+"""From the arguments of a control step to its problem: the owner of obstacle states, attached objects and rows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from qpavoid.config import Avoidance, Limits, Sensing
+from qpavoid.control.arguments import ArgumentReader, Arguments
+from qpavoid.control.assembler import RowAssembler
+from qpavoid.control.attach import Attachments
+from qpavoid.control.contacts import ContactRows
+from qpavoid.control.inputs import Clock, Configurations
+from qpavoid.control.obstacles import ObstacleTracker
+from qpavoid.control.targets import TargetReader
+from qpavoid.control.tasks import RowTask
+from qpavoid.model.limits import OUTSIDE, JointBounds
+from qpavoid.model.scene import Scene
+from qpavoid.model.trajectory import Sample
+from qpavoid.problem import Array, Problem, Proximity
+from qpavoid.reason import Reason
+
+
+class StepProblem(NamedTuple):
+    """Problem of a control step, with what it was made of."""
+
+    q: Array
+    """(nq,)."""
+    t: float
+    """[s]."""
+    resumed: bool
+    """Whether the step begins anew: after a gap, or because the clock was set back."""
+    targets: Sequence[Any]
+    """Of all tasks."""
+    proximity: Proximity
+    problem: Problem
+    faults: tuple[Reason, ...]
+    """Why the robot has to stop."""
+    assumptions: tuple[Reason, ...]
+
+
+class ProblemBuilder:
+    """Builds the problem of each control step of one controller."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        tasks: Sequence[RowTask],
+        bounds: JointBounds,
+        avoidance: Avoidance,
+        limits: Limits,
+        sensing: Sensing,
+        damping: float,
+        dt: float,
+        contacts: ContactRows | None,
+    ) -> None:
+        """Lay the memory out; see `Controller` for the arguments."""
+        model, names = scene.robot.model, scene.robot.coordinate_units
+        self._model, self._bounds, self._dt, self._q_last = model, bounds, dt, scene.robot.home.copy()
+        self.rows = RowAssembler(scene, tasks, bounds, avoidance, limits, damping, dt, contacts)
+        self.tracker = ObstacleTracker(scene.obstacles, sensing, dt)
+        self.attachments = Attachments(scene, self.rows.query, avoidance.safety_distance - avoidance.offset)
+        self._clock = Clock(dt)
+        units = [names[j] for j in bounds.v_index.tolist()]
+        self._configurations = Configurations(model, bounds.q_index, bounds.lower, bounds.upper, units)
+        targets = TargetReader(tasks, self.rows.targets)
+        shapes = (model.nq,), (model.nv,)
+        self._reader = ArgumentReader(shapes, self._clock, self._configurations, targets, self.tracker)
+
+    def read(self, q: Any, t: Any, targets: Any, obstacles: Any, v: Any, v_desired: Any = None) -> Arguments:
+        """Check the arguments of a step, see `Controller.step`: whatever raises does so here, and changes nothing."""
+        return self._reader.read(q, t, targets, obstacles, v, v_desired)
+
+    def build(self, arguments: Arguments) -> StepProblem:
+        """Take over the arguments of a step, and build its problem."""
+        times, q, v, v_desired, targets, update, faults, assumptions = arguments
+        rows, query = self.rows, self.rows.query
+        if times.resumed:
+            rows.previous.restart(np.zeros(self._model.nv))
+        if v is not None:
+            rows.previous.measure(v)
+        if q is None:  # where the robot is if it moved as commanded
+            q = np.asarray(pin.integrate(self._model, self._q_last, self._dt * rows.previous.v))
+        self._q_last[:] = q
+        self._clock.set(times.t)
+        if update is not None:
+            observed = self.tracker.advance(update)
+            query.place(self.tracker.at(times.t))
+            faults, assumptions = faults + observed.stop, assumptions + observed.assumptions
+        proximity, problem = rows.compute(q, targets)
+        if self.attachments.is_watching:
+            self.attachments.update()
+        if v_desired is not None:
+            problem = rows.follow(v_desired, problem)
+        if problem.position_margin < -OUTSIDE:
+            assumptions += self._bounds.outside(q, problem.joint_names, problem.joint_units)
+        return StepProblem(q, times.t, times.resumed, targets, proximity, problem, faults, assumptions)
+
+    def attach(self, index: int, frame_id: int, q: Array | None) -> None:
+        """Attach an obstacle to a frame; see `Controller.attach`."""
+        q = self._given_or_last(q)
+        self.attachments.attach(index, frame_id, q, self._pose(index, q))
+        self.tracker.attach(index)
+        self._place_attachment(index, q)
+
+    def release(self, index: int, q: Array | None) -> Sample:
+        """Release an attached object, and return its world pose; see `Controller.release`."""
+        q = self._given_or_last(q)
+        sample = self.attachments.release(index, q)
+        self.tracker.release(index, sample)
+        self._place_attachment(index, q)
+        return sample
+
+    def _place_attachment(self, index: int, q: Array) -> None:
+        self.rows.query.place(self.tracker.current)
+        self.attachments.ignore_touching(index, q)
+
+    def pose(self, index: int, q: Array | None) -> Sample:
+        """Return the world pose of an obstacle in the last step, attached or not."""
+        return self._pose(index, self._given_or_last(q))
+
+    def _pose(self, index: int, q: Array) -> Sample:
+        is_attached = index in self.rows.query.table.attached
+        return self.attachments.pose(index, q) if is_attached else self.tracker.pose(index)
+
+    def _given_or_last(self, q: Array | None) -> Array:
+        return self._q_last if q is None else self._configurations.require("q", q)
+
+    def reset(self, v: Array) -> None:
+        """Forget the steps before; the robot moves at v (nv,). Attached objects stay attached."""
+        self.rows.previous.restart(v)
+        self._clock.reset()
+        self.tracker.reset()

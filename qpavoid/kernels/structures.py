@@ -1,0 +1,104 @@
+"""Memory of the kernels as structures of compiled code: each named tuple of arrays becomes one argument."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, cast
+
+from numba import config, typeof, types
+from numba.experimental import structref
+
+from qpavoid.kernels.kinematics import KinematicsArrays
+from qpavoid.kernels.layout import RowLayout
+from qpavoid.kernels.near_pairs import DistanceArrays
+from qpavoid.kernels.packing import compiled
+
+
+class _Structure(types.StructRef):  # type: ignore[misc]
+    """Type of a structure, made of those of its fields."""
+
+    def preprocess_fields(self, fields: Any) -> Any:
+        """Return the types of the fields, without the literal values that numba infers."""
+        return tuple((name, types.unliteral(field)) for name, field in fields)
+
+
+class PackedKinematics(structref.StructRefProxy):  # type: ignore[misc]
+    """`KinematicsArrays` in compiled code."""
+
+
+class PackedDistances(structref.StructRefProxy):  # type: ignore[misc]
+    """`DistanceArrays` in compiled code."""
+
+
+class PackedRows(structref.StructRefProxy):  # type: ignore[misc]
+    """A `RowLayout` in compiled code."""
+
+
+@structref.register
+class PackedKinematicsType(_Structure):
+    """Type of `PackedKinematics`."""
+
+
+@structref.register
+class PackedDistancesType(_Structure):
+    """Type of `PackedDistances`."""
+
+
+@structref.register
+class PackedRowsType(_Structure):
+    """Type of `PackedRows`."""
+
+
+for proxy, kind, fields in (
+    (PackedKinematics, PackedKinematicsType, KinematicsArrays._fields),
+    (PackedDistances, PackedDistancesType, DistanceArrays._fields),
+    (PackedRows, PackedRowsType, RowLayout._fields),
+):
+    structref.define_boxing(kind, proxy)
+    structref.define_constructor(proxy, kind, list(fields))
+
+
+@compiled
+def _pack_kinematics(fields: Any) -> Any:
+    """Return a structure of the fields of `KinematicsArrays`."""
+    return PackedKinematics(*fields)
+
+
+@compiled
+def _pack_distances(fields: Any) -> Any:
+    """Return a structure of the fields of `DistanceArrays`."""
+    return PackedDistances(*fields)
+
+
+@compiled
+def _pack_rows(fields: Any) -> Any:
+    """Return a structure of the fields of a `RowLayout`."""
+    return PackedRows(*fields)
+
+
+_PACK = {KinematicsArrays: _pack_kinematics, DistanceArrays: _pack_distances, RowLayout: _pack_rows}
+
+
+def pack(layout: KinematicsArrays | DistanceArrays | RowLayout) -> Any:
+    """Return memory in the form that the kernels take; both look into the same arrays.
+
+    With `NUMBA_DISABLE_JIT=1` that is the named tuple itself.
+    """
+    return layout if config.DISABLE_JIT else _PACK[type(layout)](tuple(layout))
+
+
+def direct(kernel: Any, *arguments: Any) -> Callable[..., Any]:
+    """Return the machine code of a kernel for the types of some arguments, which the kernel is called with once.
+
+    numba finds out the types of all arguments in every call, which costs 0.6 µs where one is a structure. The code does
+    not check them: call it with the same structure, and with arrays of the same type and layout.
+
+    Args:
+        kernel: compiled.
+        arguments: of a call.
+    """
+    kernel(*arguments)
+    if config.DISABLE_JIT:
+        return cast(Callable[..., Any], kernel)
+    code = kernel.overloads.get(tuple(typeof(argument) for argument in arguments))
+    return cast(Callable[..., Any], getattr(code, "entry_point", kernel))
