@@ -116,7 +116,7 @@ class _Lap:
     def __init__(self) -> None:
         from qpavoid import Controller
 
-        self.controller, q = Controller.from_scenario(scenario(backup=None))  # bench.moving times backup rollouts
+        self.controller, q = Controller.from_scenario(scenario(backup=False))  # bench.moving times backup rollouts
         self.t = [k * DT for k in range(LAP)]
         self.q, pairs, self.status = [], [], []
         for k in range(2 * LAP):  # the first lap gets into the swing of it

@@ -31,7 +31,7 @@ def main() -> None:
     parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.child:
-        print(json.dumps({**measure(options.rounds), "without": closed_loop(backup=None), "with": closed_loop()}))
+        print(json.dumps({**measure(options.rounds), "without": closed_loop(backup=False), "with": closed_loop()}))
         return
     load = os.getloadavg()[0]
     found = _child(options.rounds)
@@ -59,7 +59,7 @@ def main() -> None:
         "## Backup trajectories",
         "",
         "The scenario of `bench.endurance`, in closed loop: a Panda follows a circle among 50 obstacles, 10 of them on "
-        "circles. Rollouts are computed where these may come near; without: `avoidance: {backup: null}` [µs].",
+        "circles. Rollouts are computed where these may come near; without: `avoidance: {backup: false}` [µs].",
         "",
         "| | p50 | p99 | worst | rollouts per step | time of a rollout |",
         "|---|---:|---:|---:|---:|---:|",

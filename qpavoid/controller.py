@@ -24,8 +24,9 @@ from qpavoid.model.scene import Scene
 from qpavoid.model.trajectory import Sample
 from qpavoid.problem import Array, Solution, State, as_vector, require_finite
 from qpavoid.reason import Reason, ReasonKind
-from qpavoid.safety.arbiter import Arbiter, check_solver
-from qpavoid.solvers import SOLVERS, Solver, make_solver
+from qpavoid.safety.arbiter import Arbiter
+from qpavoid.safety.settings import SafetySettings
+from qpavoid.solvers import Solver, check_solver, make_solver
 
 _MAX_DT = 1.0
 """Largest control period that is accepted [s]: a longer one is in milliseconds."""
@@ -77,20 +78,18 @@ class Controller:
         self.tasks: tuple[RowTask, ...] = (*frames, *others)
         """Frames with a position to follow, then with an orientation alone, then all other tasks."""
         law, self._has_contacts = make_solver(solver) if isinstance(solver, str) else solver, contacts is not None
-        check_solver(law, solver, self._has_contacts)
+        check_solver(law, self._has_contacts)
         self.avoidance, self.limits = avoidance or Avoidance(), limits or Limits()
         self._v_shape, self._no_backup = (scene.robot.model.nv,), tuple[Reason, ...]()
-        if contacts is not None and self.avoidance.backup is not None:
-            self.avoidance = self.avoidance.model_copy(update={"backup": None})
+        if contacts is not None and self.avoidance.backup:
+            self.avoidance = self.avoidance.model_copy(update={"backup": False})
             self._no_backup = (_NO_BACKUP_WITH_CONTACTS,)
         bounds = scene.robot.bounds().within(self.limits)
         self._builder = ProblemBuilder(
             scene, self.tasks, bounds, self.avoidance, self.limits, sensing or Sensing(), tracking_damping, dt, contacts
         )
-        self._arbiter = Arbiter(
-            scene, law, self._builder.rows, self._builder.tracker, bounds, self.avoidance, self.limits,
-            progress or Progress(), dt,
-        )  # fmt: skip
+        settings = SafetySettings(scene, bounds, self.avoidance, self.limits, progress or Progress(), dt)
+        self._arbiter = Arbiter(settings, law, self._builder.rows, self._builder.tracker)
         self._builder.rows.look_ahead(law.bounded and self.avoidance.look_ahead)
         self._warm_up()
         kernels.first_use.end()
@@ -102,13 +101,13 @@ class Controller:
         """The law, which may be exchanged between steps.
 
         Raises:
-            ConfigError: on assignment, of a law that has no `solve` or `bounded`, or does not hold contacts.
+            ConfigError: on assignment, of a law that lacks something of `Solver`, or does not hold contacts.
         """
         return self._arbiter.solver
 
     @solver.setter
     def solver(self, law: Solver) -> None:
-        check_solver(law, law, self._has_contacts)
+        check_solver(law, self._has_contacts)
         self._arbiter.solver = law
         self._builder.rows.look_ahead(law.bounded and self.avoidance.look_ahead)
 
@@ -121,8 +120,7 @@ class Controller:
     def _warm_up(self) -> None:
         """Run the first steps, with a law that ships: one of the user's own may remember what it is asked."""
         q, v, law = self.scene.robot.home, np.zeros(self._v_shape), self._arbiter.solver
-        if type(law) not in SOLVERS.values():
-            self._arbiter.solver = make_solver("qp")
+        self._arbiter.solver = make_solver("qp")
         self.tick(q)
         self.filter(q, v)
         self._builder.rows.clearance_lower_bound(v, 0, self.dt)
@@ -244,7 +242,7 @@ class Controller:
         if step.faults:
             solution = arbiter.stop(step.problem, step.faults)
         else:
-            solution = arbiter.decide(step.q, step.t, step.problem, step.proximity, tasks=from_tasks)
+            solution = arbiter.decide(step.q, step.t, step.problem, step.proximity, from_tasks)
         builder.rows.previous.remember(solution.v)
         assumptions = step.assumptions
         if self._no_backup and len(builder.tracker.moving):

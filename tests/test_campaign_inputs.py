@@ -19,7 +19,7 @@ from qpavoid import (
     build_scene,
     build_tasks,
 )
-from qpavoid.config import Backup, Box, HalfSpace, PointCloud, PostureTask, Sphere, Task
+from qpavoid.config import Box, HalfSpace, PointCloud, PostureTask, Sphere, Task
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.controller import Controller
 
@@ -158,7 +158,7 @@ def make(panda, jerk):
     )  # fmt: skip
     tasks = build_tasks([Task(frame=TOOL), PostureTask(weight=0.01)], panda, panda.home)
     limits = Limits(jerk=jerk) if jerk else Limits()
-    return Controller(scene, tasks, "qp", 0.01, Avoidance(d1=0.02, d2=0.15, backup=Backup(horizon=0.5)), limits)
+    return Controller(scene, tasks, "qp", 0.01, Avoidance(d1=0.02, d2=0.15), limits)
 
 
 def answer(controller, kind, arguments):

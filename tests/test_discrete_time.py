@@ -222,7 +222,7 @@ def test_look_ahead_predicts_obstacles(tmp_path, linear, angular):
     """No row at 150 mm; at the end of the control period it is 200 or 140 mm nearer, or turned towards the robot."""
     robot = cartesian(tmp_path, acceleration=None)
     bar = Obstacle.at("bar", Box(size=(0.02, 2.0, 0.02)), [9.0, 0.0, 0.0])
-    avoidance = Avoidance(d1=0.02, d2=0.10, backup=None)  # without backup trajectories
+    avoidance = Avoidance(d1=0.02, d2=0.10, backup=False)  # without backup trajectories
     controller = make_controller(robot, [bar], "z", dt=0.05, avoidance=avoidance)
     center = [0.21, 0.0, 0.0] if any(linear) else [0.21, -0.9, 0.0]  # the tool is a ball of 50 mm
     update = {"bar": Sample.at(center, linear=linear, angular=angular)}

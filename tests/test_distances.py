@@ -448,7 +448,7 @@ def test_python_work_of_a_step_does_not_grow_with_the_number_of_pairs(panda, cas
 @pytest.mark.slow
 def test_memory_of_steps_does_not_grow():
     """Pairs come within the influence distance and leave it, and the QP is solved."""
-    controller, q = Controller.from_scenario(load_scenario("panda_line", ["avoidance.backup=null"]))
+    controller, q = Controller.from_scenario(load_scenario("panda_line", ["avoidance.backup=false"]))
     used = []
     tracemalloc.start()
     try:

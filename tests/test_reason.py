@@ -129,7 +129,7 @@ def test_relaxed_row_far_from_safety_distance_informs(tmp_path):
     """At 90 mm of 100, from a ball at 1.4 m/s, which the tool's 1 m/s cannot quite leave: nothing touches for long."""
     robot = cartesian(tmp_path, axes="x", acceleration=None)
     controller = make_controller(
-        robot, [Obstacle.at("ball", BALL, [9.0, 0, 0])], "x", avoidance=Avoidance(d1=0.02, d2=0.1, backup=None)
+        robot, [Obstacle.at("ball", BALL, [9.0, 0, 0])], "x", avoidance=Avoidance(d1=0.02, d2=0.1, backup=False)
     )
     seen = {"ball": Sample.at([0.24, 0.0, 0.0], linear=[-1.4, 0.0, 0.0])}
     solution = controller.step(np.zeros(1), obstacles=seen)

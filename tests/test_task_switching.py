@@ -158,7 +158,7 @@ def test_an_obstacle_towards_a_fixed_body_is_no_contradiction(tmp_path):
     """A tool on one rail, along x; a ball comes along z from 0.3 m: only below the safety distance is it said."""
     robot = cartesian(tmp_path, axes="x")
     ball = Obstacle.at("ball", Sphere(radius=0.05), [0.0, 0.0, 1.0])
-    controller = make_controller(robot, [ball], "x", avoidance=Avoidance(**SETTINGS, backup=None))
+    controller = make_controller(robot, [ball], "x", avoidance=Avoidance(**SETTINGS, backup=False))
 
     def here(t):
         return {"ball": Sample.at([0.0, 0.0, 0.405 - 0.2 * t], linear=[0.0, 0.0, -0.2])}

@@ -107,7 +107,7 @@ def as_named(scenario: ScenarioConfig, solver: str) -> ScenarioConfig:
     """Return the scenario, without `avoidance.backup` for `qp-alone`."""
     if not solver.endswith(ALONE):
         return scenario
-    avoidance = scenario.avoidance.model_copy(update={"backup": None})
+    avoidance = scenario.avoidance.model_copy(update={"backup": False})
     return scenario.model_copy(update={"avoidance": avoidance}).with_source(scenario.source)
 
 

@@ -7,7 +7,6 @@ and read by `qpavoid.config.loading`; `qpavoid.model` turns these models into li
 from qpavoid.config.base import Block
 from qpavoid.config.control import (
     Avoidance,
-    Backup,
     Beta,
     Damper,
     Limits,
@@ -59,7 +58,6 @@ __all__ = [
     "AlignTask",
     "AnyTask",
     "Avoidance",
-    "Backup",
     "Beta",
     "Block",
     "Body",

@@ -46,29 +46,6 @@ class Damper(Block):
 AvoidanceRow = Annotated[Beta | TaskSwitching | Damper, Field(discriminator="type")]
 
 
-class Backup(Block):
-    """Backup trajectories among moving obstacles: tasks are followed only while the robot could still keep clear.
-
-    Obstacles are predicted along their trajectories, or at the mean twist of their last updates; see
-    `qpavoid.safety.backup`. Backup trajectories take time where obstacles come near, do not hold contacts, and do not
-    apply to solvers that keep no limits.
-    """
-
-    horizon: Annotated[float, Field(ge=0.1, le=10.0)] = 1.5
-    """Time for which a backup trajectory has to stay clear [s]."""
-    period: Annotated[float, Field(ge=0.005, le=0.5)] = 0.04
-    """Time between two decisions of a backup trajectory [s]; distances are evaluated as often, or twice as often."""
-    influence_distance: Positive = 0.3
-    """Distance below which a pair counts in a backup trajectory [m]."""
-    preferred_distance: Positive = 0.1
-    """Distance from which on a backup trajectory does not part a pair any farther [m]."""
-    distance_scale: Annotated[float, Field(ge=0, le=1)] = 0.5
-    """Fraction of the safety distance that a backup trajectory has to keep [-]."""
-    candidates: Annotated[int, Field(ge=1, le=100)] = 3
-    """Random backup trajectories that a control step may try where those like the last sufficient one do not stay clear
-    [-]. More of them find one sooner, and take more time in such a step."""
-
-
 class Avoidance(Block):
     """Avoidance of collisions: distances, rows, and what checks the command."""
 
@@ -87,8 +64,9 @@ class Avoidance(Block):
     """Whether a velocity of the QP is checked over its control period and the braking trajectory after it, and reduced
     where that leads nearer than the safety distance."""
 
-    backup: Backup | None = Backup()
-    """The backup trajectory where obstacles move; `null`: none is kept."""
+    backup: bool = True
+    """Whether tasks are followed only while a backup trajectory stays clear of moving obstacles, see
+    `qpavoid.safety.backup`. Takes time where these come near; not with contacts, nor for laws that keep no limits."""
 
     @property
     def safety_distance(self) -> float:

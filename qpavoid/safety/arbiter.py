@@ -9,22 +9,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from qpavoid.config import Avoidance, Limits, Progress
 from qpavoid.control.assembler import RowAssembler
 from qpavoid.control.obstacles import ObstacleTracker
-from qpavoid.errors import ConfigError, NumericalError
+from qpavoid.errors import NumericalError
 from qpavoid.kernels import TOLERANCE
-from qpavoid.model.limits import JointBounds, saturate
-from qpavoid.model.scene import Scene
+from qpavoid.model.limits import saturate
 from qpavoid.problem import Array, Problem, Proximity, Solution, Status, is_finite_and_bounded
 from qpavoid.reason import Reason, ReasonKind, Severity
 from qpavoid.safety.backup import BackupPlanner
 from qpavoid.safety.braking import BrakingCheck
 from qpavoid.safety.progress import ProgressMonitor
-from qpavoid.safety.rollout import BackupRollouts
+from qpavoid.safety.settings import SafetySettings
 from qpavoid.solvers import Solver
-from qpavoid.solvers.hqp import Hqp
-from qpavoid.solvers.qp import Qp
 
 _LIMIT_TOLERANCE = 2e-6
 """Excess over acceleration or jerk limits that is not reported [rad/s, m/s]: the tolerance of the QP."""
@@ -34,41 +30,22 @@ class Arbiter:
     """Solves the problem of a control step, and decides what is commanded."""
 
     def __init__(
-        self,
-        scene: Scene,
-        solver: Solver,
-        rows: RowAssembler,
-        obstacles: ObstacleTracker,
-        bounds: JointBounds,
-        avoidance: Avoidance,
-        limits: Limits,
-        progress: Progress,
-        dt: float,
+        self, settings: SafetySettings, solver: Solver, rows: RowAssembler, obstacles: ObstacleTracker
     ) -> None:
         """Build the checks, each with memory of its own.
 
         Args:
-            scene: robot and obstacles.
+            settings: of the controller.
             solver: the control law.
             rows: of the problems.
             obstacles: states of the obstacles.
-            bounds: limits of the joints.
-            avoidance: distances and rows.
-            limits: use of the joint limits.
-            progress: when a task counts as stalled.
-            dt: control period [s].
         """
-        self._scene, self.solver, self._rows, self._obstacles = scene, solver, rows, obstacles
-        self._bounds, self._avoidance, self._limits = bounds, avoidance, limits
-        self._v_shape = (scene.robot.model.nv,)
-        safety_distance = avoidance.safety_distance - avoidance.offset
-        self._braking = BrakingCheck(scene, rows, bounds, limits.position_gain, safety_distance, dt)
-        self.progress = ProgressMonitor(progress, dt, scene.pair_names)
-        self.backup: BackupPlanner | None = None
-        if avoidance.backup is not None and scene.obstacles:
-            table, settings = rows.query.table, avoidance.backup
-            rollouts = BackupRollouts(scene, table, bounds, obstacles, avoidance, limits, dt, settings)
-            self.backup = BackupPlanner(rollouts, scene, bounds, obstacles, dt)
+        self._settings, self.solver, self._rows = settings, solver, rows
+        self._v_shape = (settings.scene.robot.model.nv,)
+        self._braking = BrakingCheck(settings, rows, obstacles)
+        self.progress = ProgressMonitor(settings)
+        has_backup = settings.avoidance.backup and len(settings.scene.obstacles) > 0
+        self.backup = BackupPlanner(settings, rows.query.table, obstacles) if has_backup else None
 
     def invalidate(self) -> None:
         """Take in that attached objects, or the disabled pairs, have changed."""
@@ -81,7 +58,7 @@ class Arbiter:
         if self.backup is not None:
             self.backup.reset()
 
-    def decide(self, q: Array, t: float, problem: Problem, proximity: Proximity, tasks: bool) -> Solution:
+    def decide(self, q: Array, t: float, problem: Problem, proximity: Proximity, from_tasks: bool) -> Solution:
         """Return the solution that is commanded.
 
         Args:
@@ -89,10 +66,10 @@ class Arbiter:
             t: time [s].
             problem: of this control step.
             proximity: distances of this control step.
-            tasks: whether the problem is of the tasks, whose progress is monitored; else it is of a given velocity.
+            from_tasks: whether the problem is of the tasks, whose progress is monitored; else of a given velocity.
         """
-        solution = self._solve(q, problem, tasks)
-        if tasks and (stalled := self.progress.update(problem, solution)):
+        solution = self._solve(q, problem, from_tasks)
+        if from_tasks and (stalled := self.progress.update(problem, solution)):
             solution = solution._replace(stalled=stalled)
         if self.backup is not None and self.solver.bounded:
             solution = self._ensure_backup(self.backup, q, t, proximity, problem, solution)
@@ -106,7 +83,7 @@ class Arbiter:
         """Return the solution within the limits, after the stop look-ahead."""
         try:
             if from_tasks:
-                if problem.levels and isinstance(self.solver, Hqp):  # v_tracking is not a cascade's
+                if problem.levels and self.solver.prioritised:  # v_tracking is not a cascade's
                     problem = self._rows.prioritised(problem, self.solver.tracked)
                 elif problem.jerk_limited:
                     problem = self._rows.within_jerks(problem)
@@ -127,32 +104,26 @@ class Arbiter:
             given = solution.reasons if _well_formed(problem, solution) else ()
             return _stop(problem, (*given, failed))
         if not self.solver.bounded:
-            if self._limits.saturate:
-                v, change = saturate(v, problem.lower, problem.upper, self._bounds.velocity)
-                return solution._replace(v=v, saturation=change)
-            return solution
-        if not isinstance(self.solver, Qp):
-            met = solution.status is Status.SOLVED
-            limits = (problem.lower, problem.upper) if met else (problem.hard_lower, problem.hard_upper)
-            v = np.clip(v, *limits)
-            solution = solution._replace(v=v, saturation=float(np.max(np.abs(v - solution.v), initial=0.0)))
-        if self._avoidance.look_ahead:
-            return self._check_braking(q, problem, solution)
-        return solution
+            if not self._settings.limits.saturate:
+                return solution
+            v, change = saturate(v, problem.lower, problem.upper, self._settings.bounds.velocity)
+            return solution._replace(v=v, saturation=change)
+        if problem.violation <= 0.0 and v.tobytes() == problem.v_tracking.tobytes():
+            if problem.tracking_is_clear:
+                return solution
+        else:
+            solution = _clipped(problem, solution)
+        return self._check_braking(q, problem, solution) if self._settings.avoidance.look_ahead else solution
 
     def _check_braking(self, q: Array, problem: Problem, solution: Solution) -> Solution:
         """Scale the velocity towards the stop, where its path leads too near."""
-
-        def low_effort() -> Array | None:
-            return self.solver.low_effort(problem, solution.slack) if isinstance(self.solver, Qp) else None
-
-        result = self._braking.check(q, solution, problem, low_effort, self._obstacles)
+        result = self._braking.check(q, solution, problem, self.solver.low_effort)
         if result is None:
             return solution
         v, scale, violation, pair, distance = result
         if violation <= TOLERANCE:
             return solution._replace(v=v, command_scale=scale)
-        names = self._scene.pair_names[pair]
+        names = self._settings.scene.pair_names[pair]
         if violation != violation:  # NaN
             return _stop(problem, (*solution.reasons, Reason.of(ReasonKind.UNKNOWN_DISTANCE, *names)))
         severity = Severity.ALARM if distance < 0.0 else Severity.WARNING
@@ -190,6 +161,16 @@ class Arbiter:
         return solution.with_reasons(*excesses) if excesses else solution
 
 
+def _clipped(problem: Problem, solution: Solution) -> Solution:
+    """Clip the velocity of a `bounded` solver to the bounds that it has to keep, in case it does not."""
+    is_solved, v = solution.status is Status.SOLVED, solution.v
+    lower, upper = (problem.lower, problem.upper) if is_solved else (problem.hard_lower, problem.hard_upper)
+    within = np.minimum(np.maximum(v, lower), upper)
+    if within.tobytes() == v.tobytes():
+        return solution
+    return solution._replace(v=within, saturation=float(np.abs(within - v).max()))
+
+
 def _well_formed(problem: Problem, solution: Solution) -> bool:
     """Return whether all fields but the velocity of a solver's answer are of the right kind."""
     slack, k = solution.slack, len(problem.avoidance.d)
@@ -206,21 +187,3 @@ def _well_formed(problem: Problem, solution: Solution) -> bool:
 
 def _stop(problem: Problem, reasons: tuple[Reason, ...]) -> Solution:
     return Solution(problem.v_stop.copy(), Status.STOPPED, reasons)
-
-
-def check_solver(law: Solver, name: Solver | str, contacts: bool) -> None:
-    """Check that a solver can be used; `name` is what the user gave, `contacts` whether there are any.
-
-    Raises:
-        ConfigError: it has no `solve` or `bounded`, or does not hold contacts.
-    """
-    if not callable(getattr(law, "solve", None)) or not hasattr(law, "bounded"):
-        raise ConfigError(f"solver: {type(law).__name__} is no law; it needs `solve(problem)` and `bounded`")
-    if contacts and not getattr(law, "holds_contacts", False):
-        raise ConfigError(f"contacts: {_name(name)} cannot hold them; use qp or hqp")
-
-
-def _name(solver: Solver | str) -> str:
-    if isinstance(solver, str):
-        return f"solver {solver!r}"
-    return f"solver {solver.config.name!r}" if hasattr(solver, "config") else f"the solver {type(solver).__name__}"

@@ -26,9 +26,8 @@ from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.kernels import TOLERANCE, speed_to_stop
 from qpavoid.model.kinematics import ForwardKinematics
-from qpavoid.model.limits import JointBounds
-from qpavoid.model.scene import Scene
 from qpavoid.problem import Array, Problem, Solution
+from qpavoid.safety.settings import SafetySettings
 
 _MAX_APPROACH_IN_VIOLATION = 1e-5
 """Approach per control step that a pair below its safety distance may make [m]: round-off of the row that parts it."""
@@ -54,6 +53,9 @@ that approaches come nearer."""
 _SCALES = (0.75, 0.5, 0.25, 0.0)
 """Scales of the velocity that are tried where it leads too near [-]; the rest is the stop."""
 
+LowEffort = Callable[[Problem, "Array | None"], "Array | None"]
+"""(problem, slack) -> velocity; see `Solver.low_effort`."""
+
 
 class BrakingResult(NamedTuple):
     """A velocity that was checked."""
@@ -70,6 +72,23 @@ class BrakingResult(NamedTuple):
     """Least distance of any pair along it, less the margins of stale obstacles [m]; negative: contact is predicted."""
 
 
+class _Path(NamedTuple):
+    """A path in q, straight between m + 1 points: a velocity for one control period, then its stop."""
+
+    times: Array
+    """(m + 1,) of the points, from 0 on [s]; no point of the robot moves faster than at the start."""
+    travel: Array
+    """(m + 1, nv) displacement from the start."""
+    period_end: float
+    """End of the control period [s]."""
+
+    def displacement(self, t: float) -> Array:
+        """Return the displacement (nv,) from the start at time t."""
+        times, travel = self.times, self.travel
+        k = min(int(np.searchsorted(times, t, side="right")), len(times) - 1)
+        return np.asarray(travel[k] - (times[k] - t) / (times[k] - times[k - 1]) * (travel[k] - travel[k - 1]))
+
+
 class _PathPoint(NamedTuple):
     """A pose along a path that was evaluated."""
 
@@ -79,48 +98,37 @@ class _PathPoint(NamedTuple):
     margin: float
     """Least of distance - required distance [m]."""
     pair: int
+    distance: float
+    """Least distance, less the margins of stale obstacles [m]."""
 
 
 class BrakingCheck:
     """Checks velocities ahead in time, on kinematics and distances of its own."""
 
-    def __init__(
-        self,
-        scene: Scene,
-        rows: RowAssembler,
-        bounds: JointBounds,
-        position_gain: float,
-        safety_distance: float,
-        dt: float,
-    ) -> None:
+    def __init__(self, settings: SafetySettings, rows: RowAssembler, obstacles: ObstacleTracker) -> None:
         """Allocate all memory.
 
         Args:
-            scene: robot and obstacles.
+            settings: of the controller.
             rows: kinematics, distances and rows of the control step.
-            bounds: limits of the joints.
-            position_gain: fraction of the range left to a position limit that one control step may use [-].
-            safety_distance: between surfaces [m].
-            dt: control period [s].
+            obstacles: states of the obstacles.
         """
-        self._model, self._safety_distance, self._dt = scene.robot.model, safety_distance, dt
-        self._rows, self._now = rows, rows.query
+        scene = settings.scene
+        self._model, self._bounds, self._dt = scene.robot.model, settings.bounds, settings.dt
+        self._safety_distance, self._rate = settings.safety_distance, settings.limits.position_gain / settings.dt
+        self._rows, self._now, self._obstacles = rows, rows.query, obstacles
         self._kinematics, self._query = ForwardKinematics(self._model), DistanceQuery(scene, rows.query.table)
-        self._bounds, self._rate = bounds, position_gain / dt
-        self._acceleration, self._accelerated = bounds.acceleration, bool(np.isfinite(bounds.acceleration).any())
-        self._allowance, self._distance_allowance = (
-            np.zeros(len(scene.pairs)),
-            scene.distance_allowance(safety_distance),
-        )
-        self._min_distance = np.inf  # of any pair along the velocity under test [m]
+        self._has_accelerations = bool(np.isfinite(settings.bounds.acceleration).any())
+        self._has_jerks = bool(np.isfinite(settings.bounds.jerk).any())
+        self._allowance = np.zeros(len(scene.pairs))
+        self._distance_allowance = scene.distance_allowance(self._safety_distance)
 
     def check(
         self,
         q: Array,
         solution: Solution,
         problem: Problem,
-        low_effort: Callable[[], Array | None],
-        obstacles: ObstacleTracker,
+        low_effort: Callable[[Problem, Array | None], Array | None],
     ) -> BrakingResult | None:
         """Return None if the path of a solution's velocity is clear, else the largest scale of it that is, or the best.
 
@@ -131,129 +139,94 @@ class BrakingCheck:
             solution: the solver's.
             problem: the one that was solved.
             low_effort: returns another solution of less joint motion, if there is one.
-            obstacles: states of the obstacles.
         """
-        v, v_stop, rows = solution.v, problem.v_stop, problem.avoidance
-        if problem.tracking_is_clear and v.tobytes() == problem.v_tracking.tobytes():
-            return None
-        near, now = rows.pair, self._now
+        v, v_stop, rows, slack = solution.v, problem.v_stop, problem.avoidance, solution.slack
         stop = self._rows.stop(q, v)
         horizon = self._dt + 0.5 * self._stopping_time(v) if stop is None else float(stop.equivalent_time.sum())
         is_uniform = horizon <= self._dt or stop is not None or not self._rows.leaves_position_limits(q, v, horizon)
-        if is_uniform and self._rows.clearance_lower_bound(v, len(near), horizon, stop) > -TOLERANCE:
+        if is_uniform and self._rows.clearance_lower_bound(v, len(rows.pair), horizon, stop) > -TOLERANCE:
             return None
         self._allowance.fill(0.0)
-        self._min_distance = np.inf
-        if solution.slack is not None:
-            self._allowance[near] = 1.1 * horizon * solution.slack
+        if slack is not None:
+            self._allowance[rows.pair] = 1.1 * horizon * slack
             self._allowance[:] = self._query.max_over_group(self._allowance)
-        self._query.place(obstacles.after(self._dt))
-        speed = float(now.arrays.speeds.max())
-        nearest = float(now.distances_of(now.pairs).min()) if len(near) else self._rows.influence_distance
-        margin = nearest - self._safety_distance
-        evaluate = self._min_margin_with_jerk if stop is not None else self._min_margin
-        least, pair = evaluate(q, v, margin, speed)
-        if least >= 0.0:
+        self._query.place(self._obstacles.after(self._dt))
+        least = self._least(q, v)
+        if least.margin >= 0.0:
             return None
-        best, cost = BrakingResult(v, 1.0, -least, pair, self._min_distance), -least
-        straight = low_effort()
-        full = v if straight is None else straight
-        for scale in _SCALES if straight is None else (1.0, *_SCALES):
-            blend, self._min_distance = v_stop + scale * (full - v_stop), np.inf
-            least, pair = evaluate(q, blend, margin, speed)
+        best, cost = BrakingResult(v, 1.0, -least.margin, least.pair, least.distance), -least.margin
+        straight = low_effort(problem, slack)
+        full, scales = (v, _SCALES) if straight is None else (straight, (1.0, *_SCALES))
+        for scale in scales:
+            blend = v_stop + scale * (full - v_stop)
+            least = self._least(q, blend)
             # a stop was clear one control step ago
-            if least >= (-_REFINEMENT_ERROR if stop is not None and scale == 0.0 else 0.0):
-                return BrakingResult(blend, scale, 0.0, -1, self._min_distance)
-            slack = 0.0 if solution.slack is None else solution.slack
-            violation = np.max(rows.b - rows.J @ blend - slack, initial=0.0)
-            if _VIOLATION_TIME * violation - least < cost:
-                best = BrakingResult(blend, scale, -least, pair, self._min_distance)
-                cost = _VIOLATION_TIME * violation - least
+            if least.margin >= (-_REFINEMENT_ERROR if self._has_jerks and scale == 0.0 else 0.0):
+                return BrakingResult(blend, scale, 0.0, -1, least.distance)
+            excess = rows.b - rows.J @ blend - (0.0 if slack is None else slack)
+            tried = _VIOLATION_TIME * float(np.max(excess, initial=0.0)) - least.margin
+            if tried < cost:
+                best, cost = BrakingResult(blend, scale, -least.margin, least.pair, least.distance), tried
         return best
 
-    def _min_margin(self, q: Array, v: Array, margin: float, speed: float) -> tuple[float, int]:
-        """Return the least margin, distance - required distance, along the path of v and its stop [m], and its pair.
+    def _least(self, q: Array, v: Array) -> _PathPoint:
+        """Return the point of least margin along the path of v (nv,) and its stop, with the least distance of all.
 
         Steps are such that no two bodies can meet in between, and no shorter than `_MIN_STEP`: the approach of a pair
-        within one of those is of second order in it, as it was not too near at either end.
-
-        Args:
-            q: start (nq,).
-            v: velocity (nv,).
-            margin: least margin at the start [m].
-            speed: bound on the speed of any point of the robot [m/s].
+        within one of those is of second order in it, as it was not too near at either end. A curved path may turn back
+        in between, and before its end: there the least margin is refined.
         """
-        least, pair, count = np.inf, -1, 0
-        segments = self._segments(q, v)
-        remaining = sum(duration for *_, duration in segments)
-        for start, velocity, duration in segments:
-            t = 0.0
-            while t < duration:
-                step = max(0.5 * margin, _MIN_STEP, speed * remaining / (_MAX_POSES - count)) / max(speed, 1e-9)
-                # the end of the control period is always evaluated, and the last of all poses is the end
-                end = self._dt if t < self._dt and not count else duration
-                is_last = count >= _MAX_POSES - 1 or step >= end - t
-                step = end - t if is_last else step
-                t, remaining = end if is_last else t + step, remaining - step
-                count = min(count + 1, _MAX_POSES - 1)
-                here, nearest = self._margin_at(pin.integrate(self._model, start, t * velocity))
-                if not here >= least:
-                    least, pair = here, nearest
-                margin = min(max(here, 0.0), _MAX_MARGIN)
-        return least, pair
-
-    def _min_margin_with_jerk(self, q: Array, v: Array, margin: float, speed: float) -> tuple[float, int]:
-        """Return what `_min_margin` does, under jerk limits: the path is curved, and may be nearest between poses."""
-        stop, speed = self._rows.stop(q, v), max(speed, _MIN_SPEED)
-        assert stop is not None
-        # at such times no point moves faster than `speed`
-        times = np.concatenate(([0.0], np.cumsum(np.maximum(stop.equivalent_time + stop.lateral_bound / speed, 1e-9))))
-        travel = np.concatenate((np.zeros((1, len(v))), np.cumsum(self._dt * stop.velocities, axis=0)))
-
-        def move(pose: Array, start: float, end: float) -> Array:
-            places = []
-            for t in (start, end):
-                k = min(int(np.searchsorted(times, t, side="right")), len(times) - 1)
-                places.append(travel[k] - (times[k] - t) / (times[k] - times[k - 1]) * (travel[k] - travel[k - 1]))
-            return np.asarray(pin.integrate(self._model, pose, places[1] - places[0]))
-
-        def evaluate(before: _PathPoint, t: float) -> _PathPoint:
-            pose = move(before.q, before.t, t)
-            return _PathPoint(t, pose, *self._margin_at(pose))
-
-        path = [_PathPoint(0.0, q, margin, -1)]
-        while (t := path[-1].t) < times[-1]:
-            count = _MAX_POSES - len(path)
-            step = max(0.5 * min(max(path[-1].margin, 0.0), _MAX_MARGIN), _MIN_STEP) / speed
-            step = max(step, (times[-1] - t) / max(count, 1))
+        path, now, speed = self._path(q, v), self._now, max(float(self._now.arrays.speeds.max()), _MIN_SPEED)
+        nearest = float(np.min(now.distances_of(now.pairs), initial=self._rows.influence_distance))
+        points = [_PathPoint(0.0, q, nearest - self._safety_distance, -1, np.inf)]
+        end = float(path.times[-1])
+        while (t := points[-1].t) < end and points[-1].margin == points[-1].margin:
+            count = _MAX_POSES - len(points)
+            step = max(0.5 * min(max(points[-1].margin, 0.0), _MAX_MARGIN), _MIN_STEP) / speed
+            step = max(step, (end - t) / max(count, 1))
             # the end of the control period is always evaluated, and the last of all poses is the end
-            end = times[1] if len(path) == 1 else times[-1]
-            path.append(evaluate(path[-1], float(end if count <= 1 else min(t + step, end))))
-        # the path may turn back just before its end
-        points = [*path[1:], evaluate(path[-2], 0.5 * (path[-2].t + path[-1].t))]
-        for before, here, after in zip(path[:-2], path[1:-1], path[2:], strict=True):
-            if not (before.margin >= here.margin <= after.margin and here.margin < _REFINE_BELOW):
-                continue
-            for _ in range(_REFINEMENTS):
-                is_first_longer = here.t - before.t > after.t - here.t
-                between = evaluate(here, 0.5 * (here.t + (before.t if is_first_longer else after.t)))
-                points.append(between)
-                if between.margin < here.margin:
-                    before, here, after = (before, between, here) if is_first_longer else (here, between, after)
-                else:
-                    before, after = (between, after) if is_first_longer else (before, between)
-        least = points[int(np.argmin([point.margin for point in points]))]  # the first NaN, where there is one
-        return least.margin, least.pair
+            last = path.period_end if len(points) == 1 else end
+            points.append(self._evaluate(path, points[-1], last if count <= 1 else min(t + step, last)))
+        found = points[1:]
+        if self._has_jerks:
+            found = [*found, self._evaluate(path, points[-2], 0.5 * (points[-2].t + points[-1].t))]
+            for before, here, after in zip(points[:-2], points[1:-1], points[2:], strict=True):
+                if before.margin >= here.margin <= after.margin and here.margin < _REFINE_BELOW:
+                    found += self._refine(path, before, here, after)
+        least = found[int(np.argmin([point.margin for point in found]))]  # the first NaN, where there is one
+        return least._replace(distance=min(point.distance for point in found))
 
-    def _segments(self, q: Array, v: Array) -> list[tuple[Array, Array, float]]:
-        """Return straight segments of the path of v and its stop: start (nq,), velocity (nv,) and duration [s] each."""
-        end = self._equivalent_time(self._stopping_time(v))
-        if end > self._dt and self._rows.leaves_position_limits(q, v, end):
-            return self._segments_at_limits(q, v)
-        return [(q, v, end)]
+    def _refine(self, path: _Path, before: _PathPoint, here: _PathPoint, after: _PathPoint) -> list[_PathPoint]:
+        """Return points around the least margin between two points."""
+        found = []
+        for _ in range(_REFINEMENTS):
+            is_first_longer = here.t - before.t > after.t - here.t
+            between = self._evaluate(path, here, 0.5 * (here.t + (before.t if is_first_longer else after.t)))
+            found.append(between)
+            if between.margin < here.margin:
+                before, here, after = (before, between, here) if is_first_longer else (here, between, after)
+            else:
+                before, after = (between, after) if is_first_longer else (before, between)
+        return found
 
-    def _segments_at_limits(self, q: Array, v: Array) -> list[tuple[Array, Array, float]]:
-        """Return the control steps of v and of its stop, where joints near position limits have to brake harder.
+    def _path(self, q: Array, v: Array) -> _Path:
+        """Return the path of v (nv,) and its stop: curved under jerk limits, else straight up to position limits."""
+        stop = self._rows.stop(q, v)
+        if stop is not None:
+            speed = max(float(self._now.arrays.speeds.max()), _MIN_SPEED)
+            durations = np.maximum(stop.equivalent_time + stop.lateral_bound / speed, 1e-9)
+            return _joined(durations, self._dt * stop.velocities, float(durations[0]))
+        n = self._stopping_time(v) / self._dt
+        m = floor(n)
+        # v leads as far in this time as v and its stop: dt Σ (1 - i/n), i = 0, …, m
+        duration = self._dt * (1.0 + m - (0.5 * m * (m + 1) / n if m else 0.0))
+        if duration > self._dt and self._rows.leaves_position_limits(q, v, duration):
+            steps = self._dt * self._steps_at_limits(q, v)
+            return _joined(np.full(len(steps), self._dt), steps, self._dt)
+        return _joined(np.array([duration]), duration * v[None], self._dt)
+
+    def _steps_at_limits(self, q: Array, v: Array) -> Array:
+        """Return the velocities (m, nv) of v and of its stop, where joints near position limits have to brake harder.
 
         A joint that uniform slowing leaves inside its limits is never clipped along the path, because its range then
         suffices for braking all the more; so the path is straight unless its end lies outside.
@@ -262,47 +235,43 @@ class BrakingCheck:
         step, i, j = x.acceleration * dt, x.q_index, x.v_index
         limited = np.isfinite(step[j])
         finite_step = np.where(limited, step[j], 1.0)
-        segments: list[tuple[Array, Array, float]] = []
-        while len(segments) < _MAX_STOP_STEPS:
-            segments.append((q, v, dt))
+        velocities = [v]
+        while len(velocities) < _MAX_STOP_STEPS and (slowing := float((np.abs(v) / step).max())) > 1.0:
             q = pin.integrate(self._model, q, dt * v)
-            slowing = float((np.abs(v) / step).max())
-            if slowing <= 1.0:
-                break
             margin = np.maximum(np.array([q[i] - x.lower, x.upper - q[i]]), 0.0)
             down, up = np.where(limited, speed_to_stop(margin, finite_step, dt), self._rate * margin)
-            v_next = (1.0 - 1.0 / slowing) * v
             hardest = v[j] - step[j], v[j] + step[j]
-            v_next[j] = np.clip(v_next[j], np.maximum(-down, hardest[0]), np.minimum(up, hardest[1]))
-            v = v_next
-        return segments
-
-    def _equivalent_time(self, stopping_time: float) -> float:
-        """Return the time for which v leads as far as v and its stop: dt Σ (1 - i dt / stopping_time), i = 0, … [s]."""
-        n = stopping_time / self._dt
-        m = floor(n)
-        return self._dt * (1.0 + m - (0.5 * m * (m + 1) / n if m else 0.0))
+            v = (1.0 - 1.0 / slowing) * v
+            v[j] = np.clip(v[j], np.maximum(-down, hardest[0]), np.minimum(up, hardest[1]))
+            velocities.append(v)
+        return np.array(velocities)
 
     def _stopping_time(self, v: Array) -> float:
         """Return the time that the stop from v takes [s]."""
-        return float((np.abs(v) / self._acceleration).max()) if self._accelerated else 0.0
+        return float((np.abs(v) / self._bounds.acceleration).max()) if self._has_accelerations else 0.0
 
-    def _margin_at(self, q: Array) -> tuple[float, int]:
-        """Return the least margin at q (nq,) [m], and its pair; -1 if all pairs are farther than `_MAX_MARGIN`."""
+    def _evaluate(self, path: _Path, before: _PathPoint, t: float) -> _PathPoint:
+        """Evaluate the pose at time t, integrated from that of another point; pair -1 if none is near."""
+        q = pin.integrate(self._model, before.q, path.displacement(t) - path.displacement(before.t))
         self._kinematics.compute(q)
         query, now = self._query, self._now
         query.compute(self._kinematics.joint_poses, self._safety_distance + _MAX_MARGIN)
         pairs = query.pairs
         if not len(pairs):
-            return _MAX_MARGIN, -1
+            return _PathPoint(t, q, _MAX_MARGIN, -1, np.inf)
         allowance = self._distance_allowance[pairs]
         later, present = query.distances_of(pairs) + allowance, now.distances_of(pairs) + allowance
         margins = query.arrays.margin
         if margins.any():
-            margin = margins[query.table.twist_row[pairs]]
-            later, present = later - margin, present - margin
-        self._min_distance = min(self._min_distance, float(later.min()))
+            stale = margins[query.table.twist_row[pairs]]
+            later, present = later - stale, present - stale
         required = np.minimum(self._safety_distance - TOLERANCE, present - _MAX_APPROACH_IN_VIOLATION)
-        margin_of_pairs = later - required + self._allowance[pairs]
-        least = int(margin_of_pairs.argmin())  # the first NaN, where there is one
-        return float(margin_of_pairs[least]), int(pairs[least])
+        margin = later - required + self._allowance[pairs]
+        least = int(margin.argmin())  # the first NaN, where there is one
+        return _PathPoint(t, q, float(margin[least]), int(pairs[least]), float(later.min()))
+
+
+def _joined(durations: Array, steps: Array, period_end: float) -> _Path:
+    """Return the path of straight steps (m, nv) of some durations (m,) [s]."""
+    times = np.concatenate(([0.0], np.cumsum(durations)))
+    return _Path(times, np.concatenate((np.zeros((1, steps.shape[1])), np.cumsum(steps, axis=0))), period_end)

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from qpavoid.config import Progress
 from qpavoid.problem import Array, Problem, Solution
 from qpavoid.reason import Reason, ReasonKind
+from qpavoid.safety.settings import SafetySettings
 
 _MIN_PROGRESS = 0.1
 """Fraction of the task velocity below which there is no progress [-]."""
@@ -29,9 +29,9 @@ _MAX_STALL = 1.1
 class ProgressMonitor:
     """Follows the progress of a controller's tasks from control step to control step."""
 
-    def __init__(self, config: Progress, dt: float, pair_names: tuple[tuple[str, str], ...]) -> None:
-        self._config, self._dt, self._names = config, dt, pair_names
-        self._max_stalled_steps = _MAX_STALL * config.stalled_after / dt + _CHECK_STEPS
+    def __init__(self, settings: SafetySettings) -> None:
+        self._names = settings.scene.pair_names
+        self._limit = settings.progress.stalled_after / settings.dt  # control steps
         self.reset()
 
     def reset(self) -> None:
@@ -58,7 +58,7 @@ class ProgressMonitor:
         is_at_rest = float(achieved @ achieved) < _MAX_SPEED_AT_REST**2
         is_stuck = is_at_rest and size > _MIN_TASK_SPEED**2 and float(achieved @ wanted) < _MIN_PROGRESS * size
         stalled_steps = self._stalled_steps + (steps if is_stuck else -steps)
-        self._stalled_steps = min(max(stalled_steps, 0), self._max_stalled_steps)
+        self._stalled_steps = min(max(stalled_steps, 0), _MAX_STALL * self._limit + _CHECK_STEPS)
         if not self.stalled:
             return ()
         pairs = [
@@ -71,7 +71,7 @@ class ProgressMonitor:
     @property
     def stalled(self) -> bool:
         """Whether there was no progress for long enough."""
-        return self._stalled_steps * self._dt >= self._config.stalled_after
+        return self._stalled_steps >= self._limit
 
 
 def _find_blocking_pairs(problem: Problem, v: Array) -> list[tuple[int, float]]:

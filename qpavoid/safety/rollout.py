@@ -12,32 +12,34 @@ beforehand (see `qpavoid.safety.backup`).
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
 from qpavoid import kernels
-from qpavoid.config import Avoidance, Backup, Limits
 from qpavoid.control.distances import DistanceQuery
-from qpavoid.control.estimates import prediction_error_bound
+from qpavoid.control.estimates import ObstacleEstimates, prediction_error_bound
 from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.control.pair_table import PairTable
 from qpavoid.control.row_layout import lay_out
 from qpavoid.model.kinematics import ForwardKinematics, max_lever_arm
-from qpavoid.model.limits import JointBounds
-from qpavoid.model.scene import Scene
 from qpavoid.problem import Array, Mask
 from qpavoid.safety.jerk import Ramps
-from qpavoid.safety.policy import (
-    TOUCH,
-    BackupPolicy,
-    BackupScore,
-    BackupTrajectory,
-    ContactAccumulator,
-    Near,
-    Start,
-)
+from qpavoid.safety.settings import SafetySettings
 
+HORIZON = 1.5
+"""Time for which a backup trajectory has to stay clear [s]: longer than an arm needs to stop or to step aside."""
+_PERIOD = 0.04
+"""Time between two decisions of a backup trajectory, about [s]: at 1 m/s, less than half of the preferred distance."""
+_INFLUENCE_DISTANCE = 0.3
+"""Distance below which a pair counts [m]: what closes in at 1 m/s within the longest policy horizon is seen before."""
+PREFERRED_DISTANCE = 0.1
+"""c: distance from which on a pair is not parted any farther [m]: the default influence distance of the rows."""
+_DISTANCE_SCALE = 0.5
+"""Fraction of the safety distance that has to be kept [-]: predictions may be wrong by the other half."""
+TOUCH = 1e-3
+"""Distance below which a pair counts as in contact [m]: above the error of any distance algorithm in use."""
 _EFFORT_WEIGHT = 1e-4
 """ε: weight of the square of a joint speed beside that of a distance [m²/(rad/s)²]; only breaks ties."""
 _MAX_DEPTH = 10.0
@@ -47,75 +49,125 @@ _ROUND_OFF = 1e-6
 _BEYOND = 0.1
 """Time by which a rollout exceeds the horizon [s], so that it stays valid for some control steps."""
 
+Near = tuple[Array, Array, Array]
+"""Witness points (k, 10), distances first, Jacobians (k, nv) and feed-forward (k,) of the enabled pairs within the
+influence distance; in memory that the next evaluation overwrites."""
+
+
+class BackupPolicy(NamedTuple):
+    """Rule by which a backup trajectory keeps away from everything."""
+
+    horizon: float
+    """h [s]; 0 brakes to a standstill."""
+    bias_velocity: Array
+    """v̂ (nv,) [rad/s, m/s]."""
+
+
+class Start(NamedTuple):
+    """State in which a backup trajectory begins."""
+
+    q: Array
+    """(nq,)."""
+    v: Array
+    """(nv,) velocity of the control step before."""
+    dv: Array
+    """(nv,) change of velocity in that step."""
+    t: float
+    """[s]."""
+    enabled: Mask
+    """(m,) pairs that may not come into contact."""
+
+
+class BackupScore(NamedTuple):
+    """Quality of a backup trajectory, the larger the better, compared field by field."""
+
+    time_to_contact: float
+    """The horizon, less what is left of it at the first contact of each pair that comes into contact [s].
+
+    Contacts add up: one that no trajectory avoids is no reason to accept a second one.
+    """
+    clearance: float
+    """Least distance of the pairs without contact, capped at the one that suffices [m]."""
+
+
+class BackupTrajectory(NamedTuple):
+    """Velocities of successive control steps, and what is known of where they lead."""
+
+    start: Start
+    v: Array
+    """(k, nv) of each control step."""
+    policy: BackupPolicy
+    score: BackupScore
+    contact_time: float
+    """Time of the first contact; without one, the end [s]."""
+    clearance: float
+    """Least distance of the pairs without contact, at most the influence distance [m]."""
+    estimates: ObstacleEstimates | None
+    """Of the external obstacles, as the trajectory was computed."""
+
+
+class _Contacts:
+    """Contacts along a backup trajectory, summed up as it is computed."""
+
+    def __init__(self, start: Start) -> None:
+        self.enabled, self.time, self.clearance = start.enabled.copy(), np.inf, np.inf
+        self.lost_time, self._clearance_before, self._deadline = 0.0, np.inf, start.t + HORIZON
+
+    def add(self, count: int, nearest: float, nearest_apart: float, t: float, span: float) -> None:
+        """Add a pose at t [s], `span` after the one before; contacts are dated by interpolation between the two.
+
+        There, `count` pairs come into contact; the least distance with these, and without, is given [m].
+        """
+        if count:
+            closing = self._clearance_before - nearest
+            time = t - span * (TOUCH - nearest) / closing if 0.0 < closing < np.inf else t
+            self.time = min(self.time, time)
+            self.lost_time += count * max(self._deadline - time, 0.0)
+        self.clearance, self._clearance_before = min(self.clearance, nearest_apart), nearest_apart
+
 
 class BackupRollouts:
     """Computes backup trajectories, on kinematics and distances of its own."""
 
-    def __init__(
-        self,
-        scene: Scene,
-        table: PairTable,
-        bounds: JointBounds,
-        obstacles: ObstacleTracker,
-        avoidance: Avoidance,
-        limits: Limits,
-        dt: float,
-        settings: Backup,
-    ) -> None:
+    def __init__(self, settings: SafetySettings, table: PairTable, obstacles: ObstacleTracker) -> None:
         """Allocate all memory, and compile all kernels.
 
         Args:
-            scene: robot and obstacles.
-            table: its bodies and pairs, with what is attached to the robot.
-            bounds: limits of the joints.
+            settings: of the controller.
+            table: bodies and pairs of its scene, with what is attached to the robot.
             obstacles: states of the obstacles.
-            avoidance: distances and rows of the controller.
-            limits: use of the joint limits.
-            dt: control period [s].
-            settings: horizon, period and distances.
         """
-        model = scene.robot.model
-        self._model, self._obstacles, self.settings, self._dt = model, obstacles, settings, dt
-        self._period_steps = max(1, int(np.ceil(settings.period / dt - 1e-9)))
-        self.period = self._period_steps * dt
+        scene, self._dt = settings.scene, settings.dt
+        model = self._model = scene.robot.model
+        self._obstacles, self._period_steps = obstacles, max(1, int(np.ceil(_PERIOD / self._dt - 1e-9)))
+        self.period = self._period_steps * self._dt
         """Time between two decisions [s]."""
         self.kinematics, self.query = ForwardKinematics(model), DistanceQuery(scene, table)
         # a velocity may be asked for that is farther away than jerk limits allow in a period
-        free = replace(bounds, jerk=np.full(model.nv, np.inf))
-        self._layout = lay_out(scene, (), (), free, self.kinematics, self.query, avoidance, limits, 0.01, self.period)
-        self._packed = kernels.pack(self._layout)
-        self._views: dict[int, Near] = {}
-        self._no_velocities = np.zeros((0, model.nv))
+        free = replace(settings.bounds, jerk=np.full(model.nv, np.inf))
+        self._layout = lay_out(
+            scene, (), (), free, self.kinematics, self.query, settings.avoidance, settings.limits, 0.01, self.period
+        )
+        self._packed, self._views = kernels.pack(self._layout), dict[int, Near]()
         self._is_vector_space = all(joint.nv <= 1 for joint in list(model.joints)[1:])
         """Whether configurations add up: joints of one coordinate at most."""
-        self.separable_pairs = self._find_separable_pairs()
-        """(m,) pairs whose distance depends on a joint."""
-        self.ramps = Ramps(bounds, dt)
+        self.ramps = Ramps(settings.bounds, self._dt)
         """Velocity ramps within the limits."""
         self.lever_arm = max(1.0, max_lever_arm(model, table.max_extension()))
         """Bound on the distance that a point of the robot moves when a joint moves by 1 [m/rad, 1]."""
-        self.sufficient_score = BackupScore(
-            settings.horizon, settings.distance_scale * (avoidance.safety_distance - avoidance.offset)
-        )
+        self.sufficient_score = BackupScore(HORIZON, _DISTANCE_SCALE * settings.safety_distance)
         """Score from which on a backup trajectory need not be improved."""
-        self.stop_policy = BackupPolicy(0.0, np.zeros(model.nv))
+        zero = np.zeros(model.nv)
+        self.stop_policy = BackupPolicy(0.0, zero)
         """Braking to a standstill."""
-        self._compile(scene.robot.home)
-
-    def _compile(self, q: Array) -> None:
-        """Call every kernel once, so that no control step waits for the compiler."""
-        zero = self.stop_policy.bias_velocity
-        start = Start(q, zero, zero, 0.0, self.separable_pairs)
-        near = self._evaluate(q, 0.0, zero, ContactAccumulator(start, 1.0), 0.0)
+        # every kernel once, so that no control step waits for the compiler
+        near = self._evaluate(scene.robot.home, 0.0, zero, _Contacts(Start(zero, zero, zero, 0.0, self.enabled)), 0.0)
         kernels.closes_below(*near, zero, 1.0, 0.0)
-        kernels.min_sphere_distance(np.zeros((1, 1, 3)), np.zeros((1, 3)), np.zeros((1, 1)))
         self.ramps.follow(zero, zero, self._policy_velocity(near, BackupPolicy(0.1, zero))[None])
 
-    def invalidate(self) -> None:
-        """Take in that attached objects, or the disabled pairs, have changed."""
-        self.separable_pairs = self._find_separable_pairs()
-
-    def _find_separable_pairs(self) -> Mask:
+    @property
+    def enabled(self) -> Mask:
+        """(m,) pairs whose distance depends on a joint."""
         return np.asarray(np.any(self._layout.support != 0.0, axis=1))
 
     def advance(self, trajectory: BackupTrajectory) -> BackupTrajectory:
@@ -129,15 +181,10 @@ class BackupRollouts:
 
         The same velocities lead through the same poses, up to the offset of the start and what is lost until they are
         reached. No point of the robot is off by more than the longest lever arm times the sum of that over the joints;
-        and no point of an obstacle by more than the error of its prediction, plus its motion in the time by which the
-        start is early or late.
-
-        Args:
-            trajectory: the one in question.
-            start: where it would begin.
-            max_obstacle_speed: largest speed of any point of an obstacle [m/s].
+        and no point of an obstacle by more than the error of its prediction, plus its motion, at most at
+        `max_obstacle_speed` [m/s], in the time by which the start is early or late.
         """
-        if trajectory.contact_time < start.t + self.settings.horizon - 1e-9:
+        if trajectory.contact_time < start.t + HORIZON - 1e-9:
             return False
         delay = abs(start.t - trajectory.start.t)
         if delay > self._dt or not np.array_equal(trajectory.start.enabled, start.enabled):
@@ -148,18 +195,11 @@ class BackupRollouts:
             ramp = self.ramps.follow(start.v, start.dv, trajectory.v, stop_when_met=True)
             offset = offset + self._dt * np.cumsum(ramp - trajectory.v[: len(ramp)], axis=0)
             max_offset = max(max_offset, float(np.abs(offset).sum(axis=1).max(initial=0.0)))
-        span = self.settings.horizon + _BEYOND
         obstacle_offset = (delay * max_obstacle_speed if delay > _ROUND_OFF else 0.0) + prediction_error_bound(
-            self._obstacles.estimates, trajectory.estimates, span, self.query.obstacle_radii
+            self._obstacles.estimates, trajectory.estimates, HORIZON + _BEYOND, self.query.obstacle_radii
         )
         clearance = trajectory.clearance - self.lever_arm * max_offset - obstacle_offset
         return bool(clearance >= self.sufficient_score.clearance)
-
-    def simulate(self, start: Start, policy: BackupPolicy, prefix: Array | None = None) -> BackupTrajectory:
-        """Compute a trajectory to its end, however good; see `rollout`."""
-        trajectory = self.rollout(start, policy, prefix, None)
-        assert trajectory is not None
-        return trajectory
 
     def rollout(
         self, start: Start, policy: BackupPolicy, prefix: Array | None, must_beat: BackupTrajectory | None
@@ -180,11 +220,11 @@ class BackupRollouts:
             The trajectory; None if it is no better than the other one.
         """
         q, v, dv, t, _ = start
-        horizon, sufficient = self.sufficient_score
-        end, velocities, contacts = t + horizon + _BEYOND, list[Array](), ContactAccumulator(start, horizon)
+        end, velocities, contacts = t + HORIZON + _BEYOND, list[Array](), _Contacts(start)
+        sufficient = self.sufficient_score.clearance
         near = self._evaluate(q, t, v, contacts, 0.0)
-        remaining = self._no_velocities if prefix is None else prefix
-        for _ in range(int((horizon + _BEYOND) / self._dt) + 2):
+        remaining = np.zeros((0, len(v))) if prefix is None else prefix
+        for _ in range(int((HORIZON + _BEYOND) / self._dt) + 2):
             if t >= end - 1e-9:
                 break
             count = self._period_steps - round(t / self._dt) % self._period_steps
@@ -201,21 +241,15 @@ class BackupRollouts:
                 self._evaluate(pin.interpolate(self._model, q, q_next, 0.5), t, v, contacts, span)
             t += span
             near = self._evaluate(q_next, t, ramp[-1], contacts, span)
-            score = BackupScore(horizon - contacts.lost_time, min(contacts.clearance, sufficient))
+            score = BackupScore(HORIZON - contacts.lost_time, min(contacts.clearance, sufficient))
             if must_beat is not None and score <= must_beat.score:
                 return None
             velocities.append(ramp)
             dv = ramp[-1] - (ramp[-2] if count > 1 else v)
             q, v = q_next, ramp[-1]
-        return BackupTrajectory(
-            start,
-            np.concatenate(velocities),
-            policy,
-            score,
-            min(contacts.contact_time, t),
-            contacts.clearance,
-            self._obstacles.estimates,
-        )
+        contact_time, estimates = min(contacts.time, t), self._obstacles.estimates
+        v_all = np.concatenate(velocities)
+        return BackupTrajectory(start, v_all, policy, score, contact_time, contacts.clearance, estimates)
 
     def decision_before(self, start: Start, k: int) -> int:
         """Return the last decision, as a control step, of a trajectory from `start` before step k; 0 without any."""
@@ -229,44 +263,32 @@ class BackupRollouts:
             q = pin.integrate(self._model, q, self._dt * v)
         return q
 
-    def _evaluate(self, q: Array, t: float, v: Array, contacts: ContactAccumulator, span: float) -> Near:
-        """Evaluate the rows of near pairs, and the contacts.
+    def _evaluate(self, q: Array, t: float, v: Array, contacts: _Contacts, span: float) -> Near:
+        """Evaluate the rows of near pairs, and the contacts, at q (nq,) and t [s], `span` after the pose before.
 
-        Args:
-            q: configuration (nq,).
-            t: time at which the obstacles are predicted [s].
-            v: velocity (nv,) of the control step before.
-            contacts: which pairs count, and where their contacts are added.
-            span: time since the last evaluation [s].
+        v (nv,) is the velocity of the control step before.
         """
-        query, influence_distance = self.query, self.settings.influence_distance
+        query = self.query
         query.place(self._obstacles.at(t))
         self.kinematics.compute(q)
-        query.compute(self.kinematics.joint_poses, influence_distance)
+        query.compute(self.kinematics.joint_poses, _INFLUENCE_DISTANCE)
         self._layout.v_prev[:] = v
         k, touching, nearest, nearest_apart = kernels.backup_rows(
-            self._packed, q, query.pairs, influence_distance, query.is_moving, contacts.enabled, TOUCH
+            self._packed, q, query.pairs, _INFLUENCE_DISTANCE, query.is_moving, contacts.enabled, TOUCH
         )
-        contacts.add((touching, nearest, nearest_apart), t, span)
-        return self._views.get(k) or self._view(k)
-
-    def _view(self, k: int) -> Near:
-        x = self._layout
-        self._views[k] = Near(x.closest[:k], x.J[:k], x.feedforward[:k])
+        contacts.add(touching, nearest, nearest_apart, t, span)
+        if k not in self._views:
+            x = self._layout
+            self._views[k] = x.closest[:k], x.J[:k], x.feedforward[:k]
         return self._views[k]
 
     def _policy_velocity(self, near: Near, policy: BackupPolicy) -> Array:
-        """Compute the velocity (nv,) of a policy for the next period."""
-        lower, upper, v = self._layout.lower, self._layout.upper, None
-        if policy.horizon:
-            v = _farthest(near, policy, self.settings.preferred_distance, lower, upper)
-        return np.minimum(np.maximum(0.0 if v is None else v, lower), upper)
-
-
-def _farthest(near: Near, policy: BackupPolicy, preferred_distance: float, lower: Array, upper: Array) -> Array | None:
-    """Return v (nv,) with the largest s, see above, within its bounds (nv,); None if the solver fails."""
-    (closest, J, feedforward), (h, bias) = near, policy
-    v, converged = kernels.max_clearance_velocity(
-        h, closest, J, feedforward, preferred_distance, _MAX_DEPTH, _EFFORT_WEIGHT, bias, lower, upper
-    )
-    return v if converged else None
+        """Compute the velocity (nv,) of a policy for the next period; that of a stop where its QP fails."""
+        x, (h, bias) = self._layout, policy
+        v = np.zeros_like(bias)
+        if h:
+            farthest, converged = kernels.max_clearance_velocity(
+                h, *near, PREFERRED_DISTANCE, _MAX_DEPTH, _EFFORT_WEIGHT, bias, x.lower, x.upper
+            )
+            v = farthest if converged else v
+        return np.minimum(np.maximum(v, x.lower), x.upper)

@@ -117,7 +117,7 @@ def library_entrant(
 
 def _without_backup(row: str) -> dict[str, Any]:
     """Return avoidance fields with rows of one kind and no backup trajectory."""
-    return {"row": {"type": row}, "backup": None}
+    return {"row": {"type": row}, "backup": False}
 
 
 ENTRANTS = {

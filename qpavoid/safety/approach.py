@@ -1,0 +1,94 @@
+"""Proof by bounding spheres that no moving obstacle comes near: then nothing has to be looked ahead for."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from qpavoid import kernels
+from qpavoid.control.obstacles import ObstacleTracker
+from qpavoid.problem import Array, IntArray
+from qpavoid.safety.rollout import HORIZON, PREFERRED_DISTANCE, BackupRollouts, Start
+from qpavoid.safety.settings import SafetySettings
+
+_PERIOD = 0.1
+"""Time between two positions of the bounding spheres of moving obstacles [s]."""
+
+
+class _Paths(NamedTuple):
+    """Positions of the moving obstacles, every `_PERIOD` until the horizon."""
+
+    first: int
+    """Multiple of that period at which they begin."""
+    moving: IntArray
+    """(k,) numbers of the obstacles that move until then."""
+    positions: Array
+    """(t, k, 3) [m]."""
+    max_deviation: Array
+    """(k,) largest distance from the nearest of these positions in between [m]."""
+    max_speed: float
+    """Largest speed of any of their points [m/s]."""
+
+
+class ApproachCheck:
+    """Keeps one sample of obstacle paths, and the clearance from them of a robot that rests."""
+
+    def __init__(self, settings: SafetySettings, rollouts: BackupRollouts, obstacles: ObstacleTracker) -> None:
+        """Use the kinematics and distances of the rollouts."""
+        self._model, self._braking = settings.scene.robot.model, 0.5 / settings.bounds.acceleration
+        self._rollouts, self._obstacles = rollouts, obstacles
+        kernels.min_sphere_distance(np.zeros((1, 1, 3)), np.zeros((1, 3)), np.zeros((1, 1)))
+        self.reset()
+
+    def reset(self) -> None:
+        """Drop the sample."""
+        self._paths: _Paths | None = None
+        self._clearance: tuple[Array, float] | None = None
+
+    @property
+    def max_speed(self) -> float:
+        """Largest speed of any point of an obstacle in the last sample [m/s]."""
+        return 0.0 if self._paths is None else self._paths.max_speed
+
+    def stays_far(self, start: Start) -> bool:
+        """Return whether moving obstacles certainly stay away from a robot that brakes from `start`.
+
+        Between their sampled positions, obstacles are taken to be no faster than at these. A clearance counts until the
+        next sample, less the motion of the robot since.
+        """
+        paths = self._sample(int(np.floor(start.t / _PERIOD)))
+        if not len(paths.moving):
+            return True
+        lever_arm, query = self._rollouts.lever_arm, self._rollouts.query
+        stop = float(np.square(start.v) @ self._braking)
+        if self._clearance is not None:
+            q, clearance = self._clearance
+            moved = float(np.abs(pin.difference(self._model, q, start.q)).sum())
+            if lever_arm * (moved + stop) < clearance:
+                return True
+        self._rollouts.kinematics.compute(start.q)
+        centers, radii = query.body_spheres(self._rollouts.kinematics.joint_poses)
+        obstacle_radii = query.obstacle_radii[paths.moving] + paths.max_deviation + PREFERRED_DISTANCE
+        clearance = kernels.min_sphere_distance(paths.positions, centers, obstacle_radii[:, None] + radii)
+        self._clearance = start.q, clearance
+        return (lever_arm * stop if stop else 0.0) < clearance
+
+    def _sample(self, first: int) -> _Paths:
+        """Sample the positions of moving obstacles from a multiple of `_PERIOD` until the horizon."""
+        if self._paths is not None and first == self._paths.first and self._obstacles.estimates is None:
+            return self._paths
+        count = int(np.ceil(HORIZON / _PERIOD)) + 2
+        times = _PERIOD * np.arange(first, first + count, dtype=np.float64)
+        positions, rates = self._obstacles.paths(times)
+        moves = np.flatnonzero(rates.any(axis=1) | (positions != positions[0]).any(axis=(0, 2)))
+        moving = self._obstacles.moving[moves]
+        speed, spin = rates[moves].T
+        # half-spaces have no end: of one that does not turn, 0 · ∞ counts as 0
+        radii, rim_speed = self._rollouts.query.obstacle_radii[moving], np.zeros_like(spin)
+        np.multiply(spin, radii, out=rim_speed, where=spin > 0.0)
+        max_speed = float(np.max(speed + rim_speed, initial=0.0))
+        self._paths = _Paths(first, moving, positions[:, moves].copy(), 0.5 * _PERIOD * speed, max_speed)
+        self._clearance = None
+        return self._paths
