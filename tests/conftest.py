@@ -9,12 +9,12 @@ import pinocchio as pin
 import pytest
 from hypothesis import settings
 
-from qpavoid import Controller, Obstacle, Robot, Sample, build_scene, config, load_scenario
+from qpavoid import Controller, Obstacle, Robot, Sample, build_scene, build_tasks, config, load_scenario
 from qpavoid.cli import main
 from qpavoid.config.shipped import example_robot_data
 from qpavoid.control.assembler import Assembly
 from qpavoid.control.distances import DistanceQuery
-from qpavoid.control.tasks.frames import in_order
+from qpavoid.control.tasks import in_order
 from qpavoid.control.trajectories import as_samples, put
 from qpavoid.kernels.cache import FOLDER
 from qpavoid.kernels.layout import RowLayout
@@ -130,7 +130,7 @@ class Bench:
         self.robot, self.tasks = scene.robot, tuple(tasks)
         self.kinematics = ForwardKinematics(
             scene.robot.model,
-            [i for task in tasks for i in (task.frame_ids if hasattr(task, "frame_ids") else (task.frame_id,))],
+            [i for task in tasks for i in task.frame_ids],
         )
         self.query = query or DistanceQuery(scene)
         self.assembly = Assembly(
@@ -146,6 +146,28 @@ class Bench:
         for view, target in zip(as_samples(self.assembly.targets), targets, strict=False):
             put(view, target)
         return self.assembly.compute(np.asarray(q), targets, self.query, reach)
+
+    def rows(self, q, targets=None):
+        """A and b of the tasks at q, copied."""
+        tracking = self.compute(q, targets, reach=-1.0)[1].tracking
+        return tracking.A.copy(), tracking.b.copy()
+
+
+def task_bench(robot, *blocks, **settings):
+    """Tasks of a robot without anything else around them."""
+    return Bench(build_scene(robot), build_tasks(blocks, robot, robot.home), **settings)
+
+
+_DATA = {}
+
+
+def frames(robot, names, q):
+    """Placements (SE3) of some frames, on data of their own: making these takes longer than using them."""
+    if robot.name not in _DATA or _DATA[robot.name][0] is not robot.model:
+        _DATA[robot.name] = robot.model, robot.model.createData()
+    model, data = _DATA[robot.name]
+    pin.framesForwardKinematics(model, data, q)
+    return [data.oMf[robot.model.getFrameId(name)].copy() for name in names]
 
 
 def make_layout(nv, frames=0, turns=(), pairs=0, obstacles=0, joints=1, **fields):

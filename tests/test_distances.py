@@ -27,7 +27,7 @@ from qpavoid import Avoidance, Controller, Obstacle, Sample, build_scene, config
 from qpavoid.control import distances as proximity
 from qpavoid.control import placement as placing
 from qpavoid.control.distances import DistanceQuery
-from qpavoid.control.tasks.frames import build_tasks
+from qpavoid.control.tasks import build_tasks
 from qpavoid.geometry.segments import capsule_distances
 from qpavoid.model import views as memory
 from qpavoid.model.kinematics import support_masks

@@ -72,7 +72,7 @@ def solver_entrant(
         description: what it is, in a line.
         solver: as in `eq10` or `qp:proxqp`, or with its settings.
         packages: what its back end needs.
-        changes: blocks of the scenario that it has its own way, as in `avoidance={"row": {"type": "cbf"}}`; what is
+        changes: blocks of the scenario that it has its own way, as in `avoidance={"row": {"type": "damper"}}`; what is
             not named of a block stays as it is.
     """
     config = parse_solver(solver) if isinstance(solver, str) else solver
@@ -95,10 +95,10 @@ def _start_library(module: str, case: Case, world: World) -> Pilot:
     return pilot
 
 
-def _qp_without_backup(name: str, description: str, row: str, **changes: Any) -> Entrant:
+def _qp_without_backup(name: str, description: str, row: str) -> Entrant:
     """Return the QP with rows of one kind and no backup trajectory."""
-    description = f"QP with {description}, no backup trajectory"
-    return solver_entrant(name, description, "qp", avoidance={"row": {"type": row}, "backup": None}, **changes)
+    changes = {"row": {"type": row}, "backup": None}
+    return solver_entrant(name, f"QP with {description}, no backup trajectory", "qp", avoidance=changes)
 
 
 ENTRANTS = {
@@ -115,10 +115,6 @@ ENTRANTS = {
         _qp_without_backup("qp-task-switching", "the gains of eq. 10 in its rows", "task-switching"),
         _qp_without_backup("qp-no-backup", "beta rows", "beta"),
         _qp_without_backup("qp-damper", "velocity damper rows", "damper"),
-        _qp_without_backup("qp-cbf", "control barrier rows", "cbf"),
-        _qp_without_backup(
-            "qp-detour", "beta rows that tries detours round what stalls it", "beta", progress={"detour": {}}
-        ),
         solver_entrant("qp:native", "QP, compiled active-set method", "qp:native"),
         solver_entrant("qp:daqp", "QP, back end daqp", "qp:daqp"),
         solver_entrant("qp:proxqp", "QP, back end ProxQP", "qp:proxqp"),
