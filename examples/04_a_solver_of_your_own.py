@@ -1,13 +1,13 @@
-"""A law of your own: anything with `solve` runs on every scenario, against the laws that ship."""
+"""A law of your own: a `Solver` with `solve` runs on every scenario, against the laws that ship."""
 
 import numpy as np
 import pinocchio as pin
 
-from qpavoid import Controller, Problem, Solution, load_scenario
+from qpavoid import Controller, Problem, Solution, Solver, load_scenario
 from qpavoid.solvers.analytic import tracking_velocity
 
 
-class SlowDown:
+class SlowDown(Solver):
     """Tracks, and slows down in proportion to the distance that is left; never leaves its path."""
 
     bounded = False

@@ -56,7 +56,7 @@ class Controller:
         Args:
             scene: robot and obstacles.
             tasks: what to follow; see `build_tasks`. None are needed for `filter`.
-            solver: anything with `solve`, or a name such as `eq10` or `qp:proxqp`.
+            solver: a `Solver`, or a name such as `eq10` or `qp:proxqp`.
             dt: control period [s]: each velocity is meant to be held that long.
             avoidance: distances and rows; the defaults of a scenario if left out.
             limits: use of the joint limits; the defaults of a scenario if left out.

@@ -11,6 +11,7 @@ from qpavoid import (
     ReasonKind,
     Robot,
     Severity,
+    Solver,
     UnknownName,
     build_scene,
     build_tasks,
@@ -187,7 +188,7 @@ def test_laws_that_cannot_hold_contacts_are_refused(solo):
 
 
 def test_a_law_of_the_users_own_may_say_that_it_holds_them(solo):
-    class Own:
+    class Own(Solver):
         bounded = True
         holds_contacts = True
 

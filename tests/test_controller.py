@@ -13,6 +13,7 @@ from qpavoid import (
     ReasonKind,
     Sample,
     Solution,
+    Solver,
     Status,
     UnknownName,
     build_scene,
@@ -136,7 +137,7 @@ def test_nan_distances_stop_the_robot_instead_of_being_dropped(make, panda, monk
 
 
 def test_a_law_that_takes_over_is_the_one_that_counts(controller, panda):
-    class Creep:
+    class Creep(Solver):
         bounded = False
 
         def solve(self, problem):

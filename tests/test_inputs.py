@@ -23,6 +23,7 @@ from qpavoid import (
     Sensing,
     Severity,
     Solution,
+    Solver,
     Status,
     build_scene,
     build_tasks,
@@ -455,7 +456,7 @@ def test_the_look_ahead_is_that_of_the_law_that_takes_over(panda):
         np.testing.assert_array_equal(a, b)
 
 
-class Remembers:
+class Remembers(Solver):
     """A law that counts what it is asked."""
 
     bounded, asked = True, 0
@@ -486,7 +487,7 @@ def test_a_law_of_the_users_own_is_not_asked_before_the_first_step(panda):
     ],
 )
 def test_an_answer_of_the_wrong_kind_is_a_stop(panda, answer):
-    class Odd:
+    class Odd(Solver):
         bounded = True
 
         def solve(self, problem):

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from closed_loop import Ruler, cartesian, changed, drive, make_controller, scenario
 
-from qpavoid import Avoidance, ConfigError, Controller, Limits, Obstacle, Reason, ReasonKind, Robot, Sample, Status
+from qpavoid import Avoidance, ConfigError, Controller, Limits, Obstacle, ReasonKind, Robot, Sample, Status
 from qpavoid.config import Box, Damper, Sphere
 from qpavoid.run.simulate import simulate
-from qpavoid.solvers.reasons import relaxation_reasons
-from qpavoid.solvers.relaxation import Relaxed
+from qpavoid.solvers.relaxation import relaxed_solution
 
 SAFE = 0.02
 
@@ -201,8 +200,11 @@ def test_relaxation_reason_names_the_limits_present(panda):
     """Without jerk limits, none is named."""
     for limits, kind in zip((Limits(), Limits(jerk=50.0)), PASSED, strict=True):
         problem = make_controller(panda, frame="panda_hand_tcp", limits=limits).tick(panda.home).problem
-        relaxed = Relaxed(np.zeros(7), np.zeros(len(problem.avoidance.d)), np.array([0.0, 0.5, *np.zeros(5)]))
-        assert relaxation_reasons(relaxed, problem) == (Reason.of(kind, "panda_joint2", amount=0.5, unit="rad/s"),)
+        v = np.zeros(7)
+        v[1] = problem.upper[1] + 0.5
+        (reason,) = relaxed_solution(v, problem).reasons
+        assert (reason.kind, reason.subject, reason.unit) == (kind, ("panda_joint2",), "rad/s")
+        assert reason.amount == pytest.approx(0.5)
 
 
 def test_scenario_jerk_limit_applies_to_joints_without_one(tmp_path):

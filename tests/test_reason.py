@@ -18,6 +18,7 @@ from qpavoid import (
     Sensing,
     Severity,
     Solution,
+    Solver,
     Status,
     make_solver,
 )
@@ -184,7 +185,7 @@ def test_a_slack_within_the_tolerance_of_the_qp_is_no_relaxation(solver):
         assert sum(reason.amount for reason in rows) == pytest.approx(gap, abs=5e-6)
 
 
-class Broken:
+class Broken(Solver):
     """A law that stops, or fails."""
 
     bounded = True

@@ -267,14 +267,14 @@ def test_a_failing_or_wrong_back_end_is_replaced_then_stops(answer, monkeypatch)
     problem = with_rows(problem, b=rows.J @ tracking_velocity(problem) + 1.0)._replace(v_stop=np.full(NV, 0.05))
     for relaxed in (problem, squeezed((0.145, 0.175))._replace(v_stop=problem.v_stop)):
         expected = make_solver("qp:daqp").solve(relaxed)
-        solver = make_solver("qp:daqp")
-        solver._backend = answer
-        solution = solver.solve(relaxed)
-        assert (solution.status, solution.reasons) == (expected.status, expected.reasons)
-        np.testing.assert_allclose(solution.v, expected.v, atol=1e-9)
         with monkeypatch.context() as patch:
+            patch.setattr(qp, "make_backend", lambda name: answer)
+            solution = make_solver("qp:quadprog").solve(relaxed)
+            assert (solution.status, solution.reasons) == (expected.status, expected.reasons)
+            np.testing.assert_allclose(solution.v, expected.v, atol=1e-9)
             patch.setattr(qp, "solve_daqp", answer)
-            solution = solver.solve(relaxed)
+            patch.setattr(kernels, "project_soft", lambda *_: (np.zeros(NV), False))
+            solution = make_solver("qp:quadprog").solve(relaxed)
         assert solution.status is Status.STOPPED
         assert [reason.kind for reason in solution.reasons] == [ReasonKind.SOLVER_FAILED]
         np.testing.assert_array_equal(solution.v, 0.05)

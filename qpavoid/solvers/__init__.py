@@ -1,39 +1,23 @@
 """Solvers, the exchangeable part of a control step: Problem in, Solution out.
 
-A solver is anything with `solve`; those that ship are listed in SOLVERS and chosen by name.
+A solver derives from `Solver`; those that ship are listed in SOLVERS and chosen by name.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
 from qpavoid.config import SolverConfig, expand_solver
 from qpavoid.errors import ConfigError, UnknownName, nearest
-from qpavoid.problem import Problem, Solution
 from qpavoid.solvers.analytic import Eq10, TrackingOnly
 from qpavoid.solvers.backends import backend_names
 from qpavoid.solvers.baselines import GradientProjection, PotentialField
 from qpavoid.solvers.hqp import Hqp
 from qpavoid.solvers.qp import Qp
-
-
-class Solver(Protocol):
-    """A control law: one velocity for each problem."""
-
-    bounded: bool
-    """Whether its velocity is within the problem's bounds by construction."""
-
-    def solve(self, problem: Problem) -> Solution:
-        """Return the velocity of one control step; never raise on a well-formed problem.
-
-        Args:
-            problem: rows, bounds and tracking velocity of the step.
-        """
-        ...
-
+from qpavoid.solvers.solver import Solver, check_solver
 
 SOLVERS: dict[str, Callable[[Any], Solver]] = {
     "tracking": TrackingOnly,
@@ -80,4 +64,4 @@ def make_solver(config: SolverConfig | str) -> Solver:
     return SOLVERS[config.name](config)
 
 
-__all__ = ["SOLVERS", "Solver", "backend_names", "make_solver", "parse_solver"]
+__all__ = ["SOLVERS", "Solver", "backend_names", "check_solver", "make_solver", "parse_solver"]

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from qpavoid import kernels
-from qpavoid.config import Eq10Solver, TrackingSolver
+from qpavoid.config import Eq10Solver
 from qpavoid.problem import Array, Problem, Solution, Tracking
+from qpavoid.solvers.solver import NamedSolver
 
 _MIN_SQUARE = 1e-12
 """Squared length below which a projected row counts as zero [m²/rad²]: an absolute cut-off, since a relative one
@@ -59,23 +60,18 @@ def null_space_part(row: Array, tracking: Tracking) -> Array:
     return np.asarray(row - (row @ pseudo_inverse(J, tracking.damping)) @ J)
 
 
-class TrackingOnly:
+class TrackingOnly(NamedSolver):
     """q̇ = J⁺ẋ, damped least squares: the baseline, without avoidance.
 
     Nakamura and Hanafusa 1986; Wampler 1986.
     """
-
-    bounded = False
-
-    def __init__(self, config: TrackingSolver) -> None:
-        self.config = config
 
     def solve(self, problem: Problem) -> Solution:
         """Return J⁺ẋ; see `Solver.solve`."""
         return Solution(tracking_velocity(problem))
 
 
-class Eq10:
+class Eq10(NamedSolver):
     """Eq. 10 of the task-switching paper, for the closest pair:
 
         q̇ = (I - α J_d⁺J_d) J⁺ẋ + β (J_d N)⁺ (ẋ0 - w),  N = I - J⁺J.
@@ -85,10 +81,8 @@ class Eq10:
     printed would brake an arm that already recedes. The projector is bounded and not damped, (J_d N)⁺ is.
     """
 
-    bounded = False
-
     def __init__(self, config: Eq10Solver) -> None:
-        self.config = config
+        super().__init__(config)
         kernels.alpha(1.0, 1.0), kernels.beta(1.0, 1.0, 2.0)  # no control step waits for the compiler
 
     def solve(self, problem: Problem) -> Solution:

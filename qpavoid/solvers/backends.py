@@ -17,6 +17,7 @@ import numpy as np
 import qpsolvers
 from scipy.sparse import csc_matrix
 
+from qpavoid import kernels
 from qpavoid.errors import SolverNotInstalled, UnknownName
 from qpavoid.problem import Array
 
@@ -27,6 +28,8 @@ P (n, n) is symmetric and positive definite, G (m, n) C-contiguous; m may be 0 a
 be infinite. A back end belongs to one thread: it has memory between calls, but no call depends on another one.
 """
 
+TOLERANCE = 1e-6
+"""Largest violation of a row [m/s] or bound [rad/s] with which an answer counts as a solution: what back ends reach."""
 _INFINITY = 1e30
 """Bound from which daqp takes a side as unbounded [-]: its own constant DAQP_INF."""
 _TIGHT: dict[str, dict[str, Any]] = {
@@ -151,4 +154,45 @@ def _with_an_active_bound(
     return hessian, np.append(q, -1.0), rows, np.append(lower, -np.inf), np.append(upper, 0.0)
 
 
-__all__ = ["Backend", "Daqp", "backend_names", "make_backend", "solve_daqp", "through_qpsolvers"]
+def verified(backend: Backend, P: Array, q: Array, G: Array, h: Array, lower: Array, upper: Array) -> Array | None:
+    """Compute the solution of a QP, see `Backend`, clipped to its bounds.
+
+    Returns:
+        (n,); None where the back end fails, whatever it raises, or a violation is above `TOLERANCE`.
+    """
+    try:
+        v = backend(P, q, G, h, lower, upper)
+    except Exception:  # the robot must get a velocity
+        return None
+    if v is None or np.shape(v) != q.shape or not kernels.violation(v, G, h, lower, upper) <= TOLERANCE:
+        return None  # NaN fails the comparison too
+    return np.asarray(np.minimum(np.maximum(v, lower), upper))
+
+
+def within(backend: Backend, Z: Array, start: Array) -> Backend:
+    """Return a back end whose answers are x = start + Z w: equality constraints are met exactly.
+
+    Bounds become rows, as w has other coordinates than x.
+
+    Args:
+        backend: solves for w.
+        Z: (n, k) orthonormal columns.
+        start: (n,).
+    """
+
+    def solve(P: Array, q: Array, G: Array, h: Array, lower: Array, upper: Array) -> Array | None:
+        rows, right = reduced_rows(Z, start, G, h, lower, upper)
+        free = np.full(Z.shape[1], np.inf)
+        w = backend(Z.T @ P @ Z, Z.T @ (q + P @ start), rows, right, -free, free)
+        return None if w is None else start + Z @ w
+
+    return solve
+
+
+def reduced_rows(Z: Array, start: Array, G: Array, h: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
+    """Return rows and right-hand sides in w of G x >= h, then of the finite bounds, for x = start + Z w."""
+    below, above = lower - start, start - upper
+    bounded_below, bounded_above = np.isfinite(below), np.isfinite(above)
+    rows = np.concatenate((G @ Z, Z[bounded_below], -Z[bounded_above]))
+    right = np.concatenate((h - G @ start, below[bounded_below], above[bounded_above]))
+    return np.ascontiguousarray(rows), right

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from qpavoid.config import GradientProjectionSolver, PotentialFieldSolver
 from qpavoid.problem import Array, Problem, Solution
 from qpavoid.solvers.analytic import null_space_part, tracking_velocity
+from qpavoid.solvers.solver import NamedSolver
 
 
-class GradientProjection:
+class GradientProjection(NamedSolver):
     """q̇ = J⁺ẋ + (I - J⁺J) a,  a = k ∇h (Liégeois 1977, "Automatic supervisory control of the configuration and behavior
     of multibody mechanisms", IEEE Trans. SMC 7(12); eq. 9 of the task-switching paper).
 
@@ -25,11 +25,6 @@ class GradientProjection:
     Babcock 1989, "Self motion determination based on actuator velocity bounds for redundant manipulators"): clipped
     joint by joint, the motion would leave the null space and move the tool.
     """
-
-    bounded = False
-
-    def __init__(self, config: GradientProjectionSolver) -> None:
-        self.config = config
 
     def solve(self, problem: Problem) -> Solution:
         """Return J⁺ẋ plus the self-motion that adds clearance; see `Solver.solve`."""
@@ -68,7 +63,7 @@ def step_fraction(v: Array, a: Array, lower: Array, upper: Array) -> float:
     return float(np.maximum(fraction, 0.0))
 
 
-class PotentialField:
+class PotentialField(NamedSolver):
     """q̇ = J⁺ẋ + Σ f(d_i) J_iᵀ over the pairs in range: the field of Khatib (1986), "Real-time obstacle avoidance for
     manipulators and mobile robots", IJRR 5(1), at velocity level.
 
@@ -86,11 +81,6 @@ class PotentialField:
 
     It ignores the task: where attraction and repulsion balance, the robot stalls.
     """
-
-    bounded = False
-
-    def __init__(self, config: PotentialFieldSolver) -> None:
-        self.config = config
 
     def solve(self, problem: Problem) -> Solution:
         """Return attraction plus repulsion; the attraction itself without a pair in range; see `Solver.solve`."""

@@ -13,10 +13,9 @@ import numpy as np
 from qpavoid import kernels
 from qpavoid.problem import Array, IntArray, Problem, Solution
 from qpavoid.reason import Reason, ReasonKind
-from qpavoid.solvers.backends import Backend
-from qpavoid.solvers.qp import Qp, relaxed_solution
-from qpavoid.solvers.reduced import solve_within
-from qpavoid.solvers.relaxation import closest
+from qpavoid.solvers.backends import verified, within
+from qpavoid.solvers.qp import Qp
+from qpavoid.solvers.relaxation import relaxed_solution
 
 Levels = list[tuple[Array, Array]]
 """Rows A (r, nv) and right-hand sides b (r,) of each priority, the first one first."""
@@ -40,6 +39,8 @@ class Hqp(Qp):
     and is named in the reasons.
     """
 
+    prioritised = True
+
     def solve(self, problem: Problem) -> Solution:
         """Return the lexicographic optimum; relaxed without one; a stop where that fails too."""
         if problem.violation <= 0.0 and not problem.levels:
@@ -54,47 +55,37 @@ class Hqp(Qp):
         v, unsolved = self._levels(problem, damped, unconstrained, rows.b, lower, upper)
         if v is not None:
             return Solution(v).with_reasons(*unsolved) if unsolved else Solution(v)
-        P, q = kernels.projection_cost(problem.tracking.A, 1e-3, unconstrained)
-        relaxed = self._relax(P, q, problem)
+        relaxed = self._relax(problem)
         if isinstance(relaxed, Solution):
             return relaxed
-        lower, upper = np.minimum(lower, relaxed.v), np.maximum(upper, relaxed.v)
-        v, unsolved = self._levels(problem, damped, unconstrained, rows.b - relaxed.slack, lower, upper)
-        relaxed = relaxed if v is None else relaxed._replace(v=v)
-        return relaxed_solution(relaxed, problem, *unsolved)
+        slack = np.maximum(rows.b - rows.J @ relaxed, 0.0)
+        lower, upper = np.minimum(lower, relaxed), np.maximum(upper, relaxed)
+        v, unsolved = self._levels(problem, damped, unconstrained, rows.b - slack, lower, upper)
+        return relaxed_solution(relaxed if v is None else v, problem, *unsolved)
 
     def tracked(self, problem: Problem) -> Array:
-        """Return the velocity (nv,) of the cascade without inequalities, v̂ [rad/s or m/s].
-
-        Args:
-            problem: with its tasks and priorities.
-        """
+        """Return the velocity (nv,) of the cascade without inequalities, v̂ [rad/s or m/s]."""
         return _cascade(problem, problem.levels or (np.arange(len(problem.tracking.b)),))[0]
 
     def _levels(
         self, problem: Problem, levels: Levels, unconstrained: Array, b: Array, lower: Array, upper: Array
     ) -> tuple[Array | None, tuple[Reason, ...]]:
-        """Solve the levels within J v >= b and the bounds.
-
-        Args:
-            problem: with J and the contacts.
-            levels: rows and right-hand sides of each priority.
-            unconstrained: v̂ (nv,).
-            b: right-hand sides of the avoidance rows (k,) [m/s].
-            lower: lower bounds (nv,).
-            upper: upper bounds (nv,).
+        """Solve the levels within J v >= b and the bounds, as near to the unconstrained v̂ (nv,) as each leaves it.
 
         Returns:
             Velocity (nv,), None where the first level has no solution; reasons for the levels without one.
         """
-        J, (Z, v) = problem.avoidance.J, _start(problem)
+        J, (Z, v), regularization = problem.avoidance.J, _start(problem), self.config.regularization
         met, unsolved = False, list[Reason]()
         for level, (A, rate) in enumerate((*levels, (np.eye(len(v)), unconstrained))):
             P = A.T @ A
-            P.ravel()[:: len(P) + 1] += self.config.regularization
-            q = -(A.T @ rate + self.config.regularization * unconstrained)
-            # once the inequalities are met, v itself is a solution, in spite of round-off
-            better = self._solve(Z, v, P, q, J, b, lower, upper, met)
+            P.ravel()[:: len(P) + 1] += regularization
+            q = -(A.T @ rate + regularization * unconstrained)
+            limits = b, lower, upper
+            if met:  # v itself is a solution, in spite of round-off
+                limits = np.minimum(b, J @ v), np.minimum(lower, v), np.maximum(upper, v)
+            answers = (verified(within(backend, Z, v), P, q, J, *limits) for backend in self._backends)
+            better = next((answer for answer in answers if answer is not None), None)
             if better is not None:
                 v, met = better, True
             elif not met:
@@ -105,29 +96,6 @@ class Hqp(Qp):
             if not Z.shape[1]:
                 break
         return np.clip(v, lower, upper), tuple(unsolved)
-
-    def _solve(
-        self, Z: Array, v: Array, P: Array, q: Array, J: Array, b: Array, lower: Array, upper: Array, met: bool
-    ) -> Array | None:
-        """Solve one level among v + Z w; v is feasible if the inequalities are `met`."""
-        if met:
-            b, lower, upper = np.minimum(b, J @ v), np.minimum(lower, v), np.maximum(upper, v)
-        for backend in self._backends:
-            better = _solve_level(backend, Z, v, P, q, J, b, lower, upper)
-            if better is not None:
-                return better
-        return None
-
-
-def _solve_level(
-    backend: Backend, Z: Array, v: Array, P: Array, q: Array, J: Array, b: Array, lower: Array, upper: Array
-) -> Array | None:
-    """Solve one level among v + Z w; None where the back end fails or its answer does not verify."""
-
-    def reduced(P: Array, q: Array, G: Array, h: Array, lower: Array, upper: Array) -> Array | None:
-        return solve_within(backend, Z, v, P, q, G, h, lower, upper)
-
-    return closest(reduced, P, q, J, b, lower, upper)
 
 
 def _start(problem: Problem) -> tuple[Array, Array]:
@@ -141,10 +109,6 @@ def _cascade(problem: Problem, levels: tuple[IntArray, ...]) -> tuple[Array, Lev
 
     With the singular values s of A_p Z, these have the right-hand sides that damping leaves of the tasks: their part
     along each left singular vector is scaled with s² / (s² + λ²). So nothing jumps where an inequality begins to bind.
-
-    Args:
-        problem: with its tracking rows and contacts.
-        levels: indices of the rows of each priority.
 
     Returns:
         v̂ (nv,), NaN where a row has NaN; rows and right-hand sides of each level.

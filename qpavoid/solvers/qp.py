@@ -9,16 +9,15 @@ from qpavoid.config import HqpSolver, QpSolver
 from qpavoid.problem import Array, Problem, Solution, Status
 from qpavoid.reason import Reason, ReasonKind
 from qpavoid.solvers.analytic import tracking_velocity
-from qpavoid.solvers.backends import Backend, Daqp, make_backend, solve_daqp
-from qpavoid.solvers.reasons import relaxation_reasons
-from qpavoid.solvers.reduced import in_contact_null_space
-from qpavoid.solvers.relaxation import Closest, Relaxed, by_back_end, closest, relax
+from qpavoid.solvers.backends import make_backend, solve_daqp, verified, within
+from qpavoid.solvers.relaxation import project, relax, relaxed_solution
+from qpavoid.solvers.solver import NamedSolver
 
 _LOW_EFFORT = 1.0
 """λ of a solution of low effort [(m/rad)²]: joint speeds count as much as the tool's speed."""
 
 
-class Qp:
+class Qp(NamedSolver):
     """min ‖A (v - v_t)‖² + λ ‖v - v_t‖²  s.t.  J v >= b,  lower <= v <= upper.
 
     v_t = J⁺ẋ is `v_tracking`, so the answer is the safe velocity closest to it, and v_t itself whenever that is safe.
@@ -26,54 +25,46 @@ class Qp:
     not from 0, leaves tracking without bias.
 
     Where no velocity meets all constraints, margins are relaxed, then acceleration limits, then contact of pairs, as
-    little as possible and the deepest pair least (`solvers.relaxation`): in compiled code with `native`, by daqp with
-    every other back end. An answer counts only if it verifies: of a back end that fails or returns no solution, daqp
-    solves the QP of that control step, and where that fails too, the solution is a stop.
+    little as possible and the deepest pair least (`solvers.relaxation`). An answer of a back end counts only if it
+    verifies: else daqp solves the QP of that control step, and where nothing helps, the solution is a stop.
 
-    Contacts of the robot are met exactly: with v = v_particular + Z w, all of the above is solved for w
-    (`solvers.reduced`), by daqp where the back end is `native`.
+    Contacts of the robot are met exactly: with v = v_particular + Z w, all of the above is solved for w, by daqp where
+    the back end is `native`.
     """
 
     bounded = True
     holds_contacts = True
 
     def __init__(self, config: QpSolver | HqpSolver) -> None:
-        self.config = config
+        super().__init__(config)
         self._native = config.backend in ("auto", "native")
-        self._backend = make_backend("daqp" if self._native else config.backend)
+        backend = make_backend("daqp" if self._native else config.backend)
+        self._backends = (backend,) if self._native or config.backend == "daqp" else (backend, solve_daqp)
         if self._native:
             _warm_up()
-
-    @property
-    def _backends(self) -> tuple[Backend, ...]:
-        """Return the chosen back end, then daqp where that is another one."""
-        return (self._backend,) if isinstance(self._backend, Daqp) else (self._backend, solve_daqp)
 
     def solve(self, problem: Problem) -> Solution:
         """Return the closest safe velocity; relaxed where there is none; a stop where that fails too."""
         if problem.violation <= 0.0:
             return Solution(problem.v_tracking.copy())
-        A, rows, lower, upper, v_tracking = (
-            problem.tracking.A,
-            problem.avoidance,
-            problem.lower,
-            problem.upper,
-            problem.v_tracking,
-        )
+        A, rows, lower, upper = problem.tracking.A, problem.avoidance, problem.lower, problem.upper
+        regularization, v_tracking, contacts = self.config.regularization, problem.v_tracking, problem.contacts
         if v_tracking[0] != v_tracking[0]:
             v_tracking = tracking_velocity(problem)
-            if problem.contacts is None and kernels.violation(v_tracking, rows.J, rows.b, lower, upper) <= 0.0:
+            if contacts is None and kernels.violation(v_tracking, rows.J, rows.b, lower, upper) <= 0.0:
                 return Solution(v_tracking)
-        if self._native and problem.contacts is None:
-            answer, solved = kernels.project(A, self.config.regularization, v_tracking, rows.J, rows.b, lower, upper)
+        if self._native and contacts is None:
+            v, solved = kernels.project(A, regularization, v_tracking, rows.J, rows.b, lower, upper)
             if solved:
-                return Solution(answer)
-        P, q = kernels.projection_cost(A, self.config.regularization, v_tracking)
-        for backend in self._backends:
-            v = closest(in_contact_null_space(problem.contacts, backend), P, q, rows.J, rows.b, lower, upper)
-            if v is not None:
                 return Solution(v)
-        relaxed = self._relax(P, q, problem)
+        P, q = kernels.projection_cost(A, regularization, v_tracking)
+        for backend in self._backends:
+            if contacts is not None:
+                backend = within(backend, contacts.Z, contacts.v_particular)
+            answer = verified(backend, P, q, rows.J, rows.b, lower, upper)
+            if answer is not None:
+                return Solution(answer)
+        relaxed = self._relax(problem)
         return relaxed if isinstance(relaxed, Solution) else relaxed_solution(relaxed, problem)
 
     def low_effort(self, problem: Problem, slack: Array | None) -> Array | None:
@@ -81,22 +72,11 @@ class Qp:
 
         The usual one may move joints through the null space of the task at full speed for a few mm/s of a row; rows do
         not contain how distances then curve within a control step.
-
-        Args:
-            problem: rows and bounds.
-            slack: violation of the rows (k,) [m/s]; None where there is none.
-
-        Returns:
-            (nv,), or None without a solution.
         """
-        rows = problem.avoidance
-        b = rows.b if slack is None else rows.b - slack
-        P, q = kernels.projection_cost(problem.tracking.A, _LOW_EFFORT, tracking_velocity(problem))
-        return closest(
-            in_contact_null_space(problem.contacts, solve_daqp), P, q, rows.J, b, problem.lower, problem.upper
-        )
+        b = problem.avoidance.b if slack is None else problem.avoidance.b - slack
+        return project(problem, problem.tracking.A, _LOW_EFFORT, problem.avoidance.J, b, problem.lower, problem.upper)
 
-    def _relax(self, P: Array, q: Array, problem: Problem) -> Relaxed | Solution:
+    def _relax(self, problem: Problem) -> Array | Solution:
         """Relax as little as possible; return a stop where no relaxed problem is solved, or a distance is NaN."""
         rows = problem.avoidance
         unknown = np.flatnonzero(~np.isfinite(rows.b + rows.J.sum(axis=1)))
@@ -104,46 +84,15 @@ class Qp:
             pairs = [problem.pair_names[rows.pair[i]] for i in unknown.tolist()]
             reasons = tuple([Reason.of(ReasonKind.UNKNOWN_DISTANCE, *pair) for pair in pairs])
             return Solution(problem.v_stop.copy(), Status.STOPPED, reasons)
-        relaxed = None
-        if self._native and problem.contacts is None:
-            relaxed = relax(problem, self._compiled(problem))
-        backend = in_contact_null_space(problem.contacts, solve_daqp)
-        if relaxed is None:
-            relaxed = relax(problem, by_back_end(backend, P, q, tracking_velocity(problem)))
-        if relaxed is not None:
-            return relaxed
+        v = relax(problem, self.config.regularization)
+        if v is not None:
+            return v
         reason = Reason.of(ReasonKind.SOLVER_FAILED, detail="the QP back end returned no usable velocity")
+        no_rows = rows.J[:0], rows.b[:0]
         hard = problem.hard_lower, problem.hard_upper
-        if problem.contacts is not None and closest(backend, P, q, rows.J[:0], rows.b[:0], *hard) is None:
+        if problem.contacts is not None and project(problem, problem.tracking.A, 1.0, *no_rows, *hard) is None:
             reason = Reason.of(ReasonKind.CONTACTS_INFEASIBLE, "contacts")
         return Solution(problem.v_stop.copy(), Status.STOPPED, (reason,))
-
-    def _compiled(self, problem: Problem) -> Closest:
-        """Return a function that solves the QPs of a problem's tracking cost in compiled code."""
-        A, v_tracking, plain = problem.tracking.A, tracking_velocity(problem), np.zeros((0, len(problem.lower)))
-
-        def solve(J: Array, b: Array, soft: Array, lower: Array, upper: Array) -> Array | None:
-            cost = (plain, 1.0) if soft.any() else (A, self.config.regularization)
-            v, solved = kernels.project_soft(*cost, v_tracking, J, b, lower, upper, soft)
-            return v if solved else None
-
-        return solve
-
-
-def relaxed_solution(relaxed: Relaxed, problem: Problem, *reasons: Reason) -> Solution:
-    """Return the solution with its reasons.
-
-    It is SOLVED where nothing is relaxed by more than the tolerance of a QP.
-
-    Args:
-        relaxed: the velocity, with its slacks.
-        problem: the one that it solves.
-        reasons: added to those of the relaxation.
-    """
-    reasons = (*relaxation_reasons(relaxed, problem), *reasons)
-    if not reasons:
-        return Solution(np.clip(relaxed.v, problem.lower, problem.upper))
-    return Solution(relaxed.v, Status.RELAXED, reasons, relaxed.slack if relaxed.slack.any() else None)
 
 
 def _warm_up() -> None:

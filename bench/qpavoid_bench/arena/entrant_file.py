@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from qpavoid import Controller
+from qpavoid import Controller, Solver
 from qpavoid.config.text import read_text
 from qpavoid.errors import ConfigError, UnknownName, nearest
 from qpavoid.model.trajectory import Sample
@@ -83,7 +83,7 @@ def _classify(candidate: Any) -> str | None:
     return {1: "law", 2: "pilot"}.get(len(required))
 
 
-class _SolverPilot:
+class _SolverPilot(Solver):
     """A user's solver in a controller.
 
     An exception of the solver is a failure of the entrant, not the braking stop that the controller makes of it.
