@@ -23,6 +23,7 @@ from qpavoid.kernels.cache import FOLDER
 from qpavoid.model.kinematics import ForwardKinematics
 from qpavoid.model.limits import JointBounds, limit_layout
 from qpavoid.model.trajectory import build_motion
+from qpavoid.problem import Proximity
 
 settings.register_profile("patient", deadline=None)  # the first call of a compiled function may wait for the compiler
 settings.load_profile("patient")
@@ -226,7 +227,7 @@ def look(scene, q, samples=None, reach=np.inf, bench=None):
     bench = bench or Bench(scene)
     if samples:
         bench.place(samples)
-    return bench.compute(q, reach=reach)[0]
+    return Proximity(*[array.copy() for array in bench.compute(q, reach=reach)[0]])
 
 
 def moved(sample, t):

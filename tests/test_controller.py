@@ -60,7 +60,7 @@ def test_targets_given_by_the_caller_replace_the_motion(controller, panda):
     assert np.abs(solution.v).max() > 1e-2
     controller.reset()
     bare = controller.step(panda.home, targets={"panda_hand_tcp": Pose.at(here + np.array([0.0, 0.0, 0.05]))})
-    np.testing.assert_array_equal(bare.v, solution.v)
+    np.testing.assert_allclose(bare.v, solution.v, rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("field", ["position", "linear", "angular", "rotation"])
@@ -117,23 +117,6 @@ def test_unknown_names_come_with_the_nearest(controller, panda):
         controller.step(panda.home, targets={"panda_hand": Sample.at([0, 0, 0])})
     with pytest.raises(UnknownName, match=r"no obstacle 'bal'; did you mean 'ball'"):
         controller.step(panda.home, obstacles={"bal": Sample.at([0, 0, 0])})
-
-
-def test_nan_distances_stop_the_robot_instead_of_being_dropped(make, panda, monkeypatch):
-    """Whatever makes a distance NaN: the pair is not hidden."""
-    controller = make()
-    assert controller.step(panda.home).status is Status.SOLVED
-    query = controller._builder.rows.query
-    compute = query.compute
-
-    def poisoned(data, reach):
-        compute(data, reach)
-        query.results[:, 0] = np.nan
-
-    monkeypatch.setattr(query, "compute", poisoned)
-    solution = controller.step(panda.home)
-    assert solution.status is Status.STOPPED
-    np.testing.assert_array_equal(solution.v, 0.0)
 
 
 def test_a_law_that_takes_over_is_the_one_that_counts(controller, panda):

@@ -8,6 +8,7 @@ from conftest import moved
 
 from qpavoid import Avoidance, Controller, Obstacle, ReasonKind, Sample, Severity, Status
 from qpavoid.config import Box, Damper, Sphere
+from qpavoid.control.distances import DistanceQuery
 from qpavoid.run.simulate import simulate
 from qpavoid.safety.braking import TOLERANCE
 
@@ -82,7 +83,7 @@ def test_clearance_lower_bound_holds_with_moving_obstacles(panda):
         horizon = rng.uniform(0.005, 0.3)
         places = {b.name: Sample.at(rng.uniform(-0.8, 0.8, 3), linear=rng.uniform(-0.5, 0.5, 3)) for b in balls}
         near = len(controller.tick(q, 0.0, None, places).proximity.pair)
-        bound = controller._builder.rows.clearance_lower_bound(v, near, 0.1, horizon)
+        bound = controller._builder.rows.clearance_lower_bound(v, near, horizon)
         least = min_margin(controller, q, v, horizon, dict(enumerate(places.values())))
         assert least >= bound - 1e-9
         close += bound > 0.0
@@ -125,9 +126,8 @@ def test_braking_check_is_safe_by_brute_force(panda):
 def test_braking_check_evaluates_curved_paths_at_any_distance(panda, monkeypatch):
     """A joint fast near its limit brakes harder than others: the bound for straight paths does not apply."""
     controller, bounds, calls = make_controller(panda), panda.bounds(), []
-    check = controller._arbiter.braking
-    min_margin = check._min_margin
-    monkeypatch.setattr(check, "_min_margin", lambda *args: calls.append(args[2]) or min_margin(*args))
+    compute = DistanceQuery.compute
+    monkeypatch.setattr(DistanceQuery, "compute", lambda *args: calls.append(1) or compute(*args))
     q, v = panda.home.copy(), np.zeros(7)
     v[0] = 0.5 * bounds.velocity[0]
     for distance, evaluates in ((0.5, False), (0.02, True)):

@@ -25,9 +25,9 @@ from conftest import (
 
 from qpavoid import Avoidance, Controller, Obstacle, Sample, build_scene, config, load_scenario
 from qpavoid.control import distances
-from qpavoid.control import placement as placing
 from qpavoid.control.tasks import build_tasks
 from qpavoid.geometry.segments import capsule_distances
+from qpavoid.model import kinematics
 from qpavoid.model import views as memory
 from qpavoid.problem import Proximity
 from qpavoid.solvers.analytic import tracking_velocity
@@ -270,7 +270,7 @@ def test_distances_without_the_views_are_the_same(panda, monkeypatch, missing):
     samples = [{i: next_sample(rng, start) for i, start in starts.items()} for _ in qs]
     expected = [look(scene, q, there, reach=0.3) for q, there in zip(qs, samples, strict=True)]
     for name in missing:
-        for module in (distances, placing):
+        for module in (distances, kinematics):
             monkeypatch.setattr(module, name, lambda *_, **__: None, raising=False)
     for q, there, fast in zip(qs, samples, expected, strict=True):
         slow = look(scene, q, there, reach=0.3)

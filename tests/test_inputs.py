@@ -43,7 +43,6 @@ from qpavoid.config import (
 )
 from qpavoid.control.inputs import Clock
 from qpavoid.errors import UnknownName
-from qpavoid.safety.braking import BrakingCheck
 
 TOOL = "panda_hand_tcp"
 BALL = Obstacle.at("ball", Sphere(radius=0.05), [0.6, 0.0, 0.5])
@@ -438,7 +437,7 @@ def test_a_law_that_takes_over_is_checked_as_at_the_start():
     with pytest.raises(ConfigError, match="contacts: solver 'eq10' cannot hold them"):
         controller.solver = make_solver("eq10")
     for bad in (None, "qp", object()):
-        with pytest.raises(ConfigError, match=r"solver: .* is no law"):
+        with pytest.raises(ConfigError, match=r"solver: .* derive it from"):
             controller.solver = bad
     assert controller.solver is before
 
@@ -536,26 +535,6 @@ def test_after_a_reset_a_grasp_is_still_at_the_last_configuration(panda):
 
 
 # --- loops of a step --------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("speed", [1e3, 1e12, 1e16, 1e300])
-@pytest.mark.parametrize("jerk", [None, 50.0])
-def test_braking_check_looks_at_a_bounded_number_of_poses_whatever_moves(tmp_path, speed, jerk, monkeypatch):
-    """Also at speeds at which a step of time is rounded away, which a control step no longer believes."""
-    robot = cartesian(tmp_path)
-    from qpavoid.config import Limits
-
-    limits = Limits() if jerk is None else Limits(jerk=jerk)
-    controller = make_controller(robot, [Obstacle.at("ball", Sphere(radius=0.05), [0.3, 0.0, 0.0])], "z", limits=limits)
-    controller.reset(np.array([0.9, 0.0, 0.0]))
-    looks, look = [], BrakingCheck._margin_at
-    monkeypatch.setattr(BrakingCheck, "_margin_at", lambda self, *args: looks.append(1) or look(self, *args))
-    query, braking = controller._builder.rows.query, controller._arbiter.braking
-    tick = controller.tick(np.zeros(3), v=np.array([0.9, 0.0, 0.0]))
-    looks.clear()
-    way = braking._min_margin if jerk is None else braking._min_margin_with_jerk
-    way(controller._builder.rows, np.zeros(3), tick.solution.v, query, 0.2, speed)
-    assert 0 < len(looks) <= 48 + 200 + 6 * 48
 
 
 def test_what_moves_again_is_no_longer_stalled_however_long_it_was(tmp_path):

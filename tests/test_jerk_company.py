@@ -19,7 +19,7 @@ class Limited:
     """Checks control steps, one after the other, against the limits by their definition."""
 
     def __init__(self, controller):
-        bounds, dt = controller._bounds, controller.dt
+        bounds, dt = controller.scene.robot.bounds().within(controller.limits), controller.dt
         self._steps, self._names = (
             (bounds.acceleration * dt, bounds.jerk * dt**2),
             controller.scene.robot.coordinate_names,

@@ -16,7 +16,7 @@ SAFE = 0.02
 
 def within_limits(controller, vs, slack=1e-9):
     """Assert that commands, from rest on, keep velocity, acceleration and jerk limits."""
-    b, dt = controller._bounds, controller.dt
+    b, dt = controller.scene.robot.bounds().within(controller.limits), controller.dt
     changes = np.diff(vs, axis=0, prepend=np.zeros((1, len(vs[0]))))
     jumps = np.diff(changes, axis=0, prepend=np.zeros((1, len(vs[0]))))
     assert (np.abs(vs) <= b.velocity + slack).all()

@@ -90,7 +90,7 @@ def test_speeds_of_all_joints(named):
         pin.forwardKinematics(model, data, q, v)
         velocities = np.array([motion.vector for motion in data.v])
         expected = np.linalg.norm(velocities[:, :3], axis=1)
-        expected += np.linalg.norm(velocities[:, 3:], axis=1) * bench.query.joint_radius()
+        expected += np.linalg.norm(velocities[:, 3:], axis=1) * bench.query.table.joint_radius
         np.testing.assert_allclose(bench.query.arrays.speeds[: model.njoints], expected, atol=1e-12)
 
 

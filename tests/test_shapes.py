@@ -24,8 +24,8 @@ from qpavoid import (
     load_scenario,
 )
 from qpavoid.config import Cone, Ellipsoid, HalfSpace, Mesh
-from qpavoid.control import distances as proximity_module
 from qpavoid.geometry.bodies import MeshWarning, enclosing_capsule, make_shape
+from qpavoid.model.kinematics import ForwardKinematics
 from qpavoid.run.simulate import simulate
 
 CONE = Cone(radius=0.09, length=0.25)
@@ -195,20 +195,20 @@ def test_enclosing_capsules_enclose(shape):
 # --- bounding spheres without end ---------------------------------------------------------------------------------
 
 
-def test_half_spaces_are_never_culled(panda, monkeypatch):
+def test_half_spaces_are_near_wherever_they_are(panda):
     rng = np.random.default_rng(8)
     scene = build_scene(panda, [obstacle("floor", FLOOR, (0, 0, -0.1)), obstacle("ball", SPHERE, (0.6, 0, 0.3))])
-    monkeypatch.setattr(proximity_module, "_CULL_FROM", 10_000)
-    plain = Bench(scene)
-    monkeypatch.setattr(proximity_module, "_CULL_FROM", 0)
-    culled = Bench(scene)
-    assert plain._cull is None and culled._cull is not None
+    bench, kinematics, placed = Bench(scene), ForwardKinematics(panda.model), scene.geometry.createData()
     for reach in (0.1, 0.5, np.inf):
         for _ in range(5):
             q = random_q(panda, rng)
-            found, expected = look(scene, q, reach=reach, bench=culled), look(scene, q, reach=reach, bench=plain)
-            np.testing.assert_array_equal(found.pair, expected.pair)
-            np.testing.assert_allclose(found.distance, expected.distance, atol=1e-12)
+            kinematics.compute(q)
+            pin.updateGeometryPlacements(panda.model, kinematics.data, scene.geometry, placed)
+            pin.computeDistances(scene.geometry, placed)
+            expected = np.array([result.min_distance for result in placed.distanceResults])
+            found = look(scene, q, reach=reach, bench=bench)
+            np.testing.assert_array_equal(found.pair, np.flatnonzero(expected < reach))
+            np.testing.assert_allclose(found.distance, expected[found.pair], atol=1e-6)
     assert "floor" in {scene.pair_names[pair][1] for pair in found.pair}
 
 

@@ -183,7 +183,8 @@ def random_states(rng, count, turning):
 def placed_scene(panda, count):
     """Spheres, capsules and boxes of which the first two may be attached, and distances of theirs."""
     shapes = [SPHERE, CAPSULE, BOX]
-    obstacles = [obstacle(f"o{i}", shapes[i % 3], (1.0 + i, 0.0, 0.5), graspable=i < 2) for i in range(count)]
+    places = [(1.0 + i, 0.0, 0.5) for i in range(count)]
+    obstacles = [Obstacle.at(f"o{i}", shapes[i % 3], place, graspable=i < 2) for i, place in enumerate(places)]
     scene = build_scene(panda, obstacles)
     return scene, DistanceQuery(scene)
 

@@ -185,8 +185,8 @@ class DistanceQuery:
             (self._data.activateCollisionPair if on else self._data.deactivateCollisionPair)(pair)
         self._active = active
         if not self._has_views:
-            for pose, target in zip(x.poses, self._data.oMg, strict=True):
-                target.rotation, target.translation = pose[:9].reshape(3, 3).T, pose[9:]
+            for i, pose in enumerate(x.poses):
+                self._data.oMg[i] = pin.SE3(pose[:9].reshape(3, 3).T, pose[9:])
         pin.computeDistances(self._scene.geometry, self._data)
         if not self._has_views:
             x.results[active] = read_results(self._data.distanceResults)[active]

@@ -94,7 +94,7 @@ class PairTable:
     def rigid_pairs(self) -> Mask:
         """Return the pairs (m,) of an attached object with what moves along with it or hangs below it."""
         (first, second), rigid = self._scene.pairs.T, np.zeros(len(self.group), dtype=bool)
-        joints = np.array([*self.joints, *[0] * (len(self.spheres) - len(self.joints))])
+        joints = np.array([*np.maximum(self.joints, 0), *[0] * (len(self.spheres) - len(self.joints))])
         for index, joint in self.attached.items():
             below = np.all(self._masks[:, self._masks[joint] > 0.0] > 0.0, axis=1, keepdims=True)[:, 0]
             body = self.first[index]
