@@ -10,13 +10,13 @@ import pinocchio as pin
 import pytest
 from hypothesis import settings
 
-from qpavoid import Controller, Obstacle, Robot, Sample, build_scene, config, load_scenario
+from qpavoid import Controller, Obstacle, Robot, Sample, build_scene, build_tasks, config, load_scenario
 from qpavoid.cli import main
 from qpavoid.config.shipped import example_robot_data
 from qpavoid.control.assembler import Assembly
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.row_layout import lay_out
-from qpavoid.control.tasks.frames import in_order
+from qpavoid.control.tasks import in_order
 from qpavoid.control.trajectories import as_samples, put
 from qpavoid.kernels.cache import FOLDER
 from qpavoid.model.kinematics import ForwardKinematics
@@ -132,7 +132,7 @@ class Bench:
         self.robot, self.tasks = scene.robot, tuple(tasks)
         self.kinematics = ForwardKinematics(
             scene.robot.model,
-            [i for task in tasks for i in (task.frame_ids if hasattr(task, "frame_ids") else (task.frame_id,))],
+            [i for task in tasks for i in task.frame_ids],
         )
         self.query = query or DistanceQuery(scene)
         self.assembly = Assembly(
@@ -149,11 +149,33 @@ class Bench:
             put(view, target)
         return self.assembly.compute(np.asarray(q), targets, self.query, reach)
 
+    def rows(self, q, targets=None):
+        """A and b of the tasks at q, copied."""
+        tracking = self.compute(q, targets, reach=-1.0)[1].tracking
+        return tracking.A.copy(), tracking.b.copy()
+
+
+def task_bench(robot, *blocks, **settings):
+    """Tasks of a robot without anything else around them."""
+    return Bench(build_scene(robot), build_tasks(blocks, robot, robot.home), **settings)
+
+
+_DATA = {}
+
+
+def frames(robot, names, q):
+    """Placements (SE3) of some frames, on data of their own: making these takes longer than using them."""
+    if robot.name not in _DATA or _DATA[robot.name][0] is not robot.model:
+        _DATA[robot.name] = robot.model, robot.model.createData()
+    model, data = _DATA[robot.name]
+    pin.framesForwardKinematics(model, data, q)
+    return [data.oMf[robot.model.getFrameId(name)].copy() for name in names]
+
 
 def lay_out_step(scene, tasks=(), damping=0.0, dt=0.01, avoidance=None, limits=None, query=None):
     """Memory of a control step, as a controller lays it out, and the kinematics and distances that it looks into."""
     frames, others = in_order(tasks)
-    kinematics = ForwardKinematics(scene.robot.model, [task.frame_id for task in frames])
+    kinematics = ForwardKinematics(scene.robot.model, [i for task in tasks for i in task.frame_ids])
     query, limits = query or DistanceQuery(scene), limits or config.Limits()
     bounds = scene.robot.bounds().within(limits)
     settings = avoidance or config.Avoidance()

@@ -246,7 +246,9 @@ def test_braking_look_ahead_includes_attached_objects(tmp_path):
 def test_clear_tracking_velocity_with_a_load_stays_clear(panda):
     """Where the look-ahead calls the tracking law clear, the box keeps its distance until the end of a stop."""
     rng, clear = np.random.default_rng(3), 0
-    balls = [Obstacle.at(f"b{i}", Sphere(radius=0.05), rng.uniform([0.35, -0.5, 0.0], [0.8, 0.5, 0.9])) for i in range(5)]
+    balls = [
+        Obstacle.at(f"b{i}", Sphere(radius=0.05), rng.uniform([0.35, -0.5, 0.0], [0.8, 0.5, 0.9])) for i in range(5)
+    ]
     controller = panda_with(panda, balls, offset=(0.0, 0.0, 0.14), avoidance=Avoidance(d1=HOLD, d2=0.3))
     controller.attach("box", TCP, panda.home)
     held = pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.14]))

@@ -23,11 +23,10 @@ from conftest import (
     random_scene,
 )
 
-from qpavoid import Avoidance, Controller, Obstacle, Sample, build_scene, config, load_scenario
+from qpavoid import Avoidance, Controller, Obstacle, Sample, build_scene, build_tasks, config, load_scenario
 from qpavoid.control import distances
 from qpavoid.control import placement as placing
 from qpavoid.control.distances import DistanceQuery
-from qpavoid.control.tasks.frames import build_tasks
 from qpavoid.geometry.segments import capsule_distances
 from qpavoid.model import views as memory
 from qpavoid.problem import Proximity
