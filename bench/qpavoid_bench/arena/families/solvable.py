@@ -10,9 +10,9 @@ from qpavoid.errors import ConfigError
 from qpavoid.problem import Array
 from qpavoid_bench.arena.families.clearance import Clearance
 from qpavoid_bench.arena.families.inverse_kinematics import FrameGoal, JointRanges, solve_inverse_kinematics
-from qpavoid_bench.arena.families.out_of_reach import out_of_reach
 from qpavoid_bench.arena.families.parameters import Redraw
 from qpavoid_bench.arena.families.planner import Plan, plan
+from qpavoid_bench.arena.families.reach import out_of_reach
 from qpavoid_bench.arena.scores import surface_safety_distance
 from qpavoid_bench.arena.world import World
 
