@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from conftest import EXAMPLES, differences, frames, random_q, task_bench
+from conftest import EXAMPLES, differences, frames, random_q, task_bench, write_chain
 
 from qpavoid import ConfigError, NumericalError, Robot, build_tasks, config
 
@@ -164,6 +164,12 @@ def test_manipulability(case, part):
 def test_what_cannot_be_used_is_named(panda, block, message):
     with pytest.raises(ConfigError, match=f"bench.yaml: {message}".replace(".", r"\.")):
         build_tasks([block], panda, panda.home, Path("bench.yaml"))
+
+
+def test_a_robot_without_mass_has_no_centre_of_mass(tmp_path):
+    robot = Robot.from_urdf(write_chain(tmp_path), bodies=[])
+    with pytest.raises(ConfigError, match=r"tasks: tasks\.0: chain has no mass, so no centre of mass"):
+        build_tasks([config.ComTask()], robot, robot.home)
 
 
 @pytest.mark.parametrize("q0", [np.zeros(3), np.full(7, np.nan)])

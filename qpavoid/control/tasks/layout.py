@@ -57,8 +57,8 @@ def task_layout(frames: Sequence[FrameTask], others: Sequence[RowTask], model: A
 def task_levels(frames: Sequence[FrameTask], others: Sequence[RowTask]) -> tuple[IntArray, ...]:
     """Which rows belong to each priority, the first one first."""
     ordered = *(task for task in frames if task.moves), *(task for task in frames if task.turns), *others
-    rows = [task.rows if task in others else 3 for task in ordered]
-    priorities = np.repeat([task.settings.priority for task in ordered], rows)
+    owners = [task.settings.priority for task in ordered for _ in range(task.rows if task in others else 3)]
+    priorities = np.array(owners, dtype=np.intp)
     return tuple(np.flatnonzero(priorities == level) for level in np.unique(priorities))
 
 
