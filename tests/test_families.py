@@ -453,7 +453,7 @@ def test_family_file_errors_name_file_and_field(family, text, change, error, sai
 )  # fmt: skip
 def test_family_without_case_names_cause(family, monkeypatch, text, change, code, error, said):
     """A family that makes no case says why."""
-    monkeypatch.setattr("qpavoid_bench.arena.families.solvable._TRIES", 5)
+    monkeypatch.setattr("qpavoid_bench.arena.families.solvable.MAX_TRIES", 5)
     monkeypatch.setattr("qpavoid_bench.arena.families.make.MAX_DRAWS", 10)
     loaded = family(text, *([change] if change else []), code=code)
     with pytest.raises(error, match=said) as raised:
