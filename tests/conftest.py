@@ -183,7 +183,7 @@ def frames(robot, names, q):
 def lay_out_step(scene, tasks=(), damping=0.0, dt=0.01, avoidance=None, limits=None, query=None):
     """Memory of a control step, as a controller lays it out, and the kinematics and distances that it looks into."""
     frames, others = in_order(tasks)
-    kinematics = ForwardKinematics(scene.robot.model, [task.frame_id for task in frames])
+    kinematics = ForwardKinematics(scene.robot.model, [i for task in tasks for i in task.frame_ids])
     query, limits = query or DistanceQuery(scene), limits or config.Limits()
     bounds = scene.robot.bounds().within(limits)
     settings = avoidance or config.Avoidance()
