@@ -19,7 +19,7 @@ from qpavoid import Robot, config
 from qpavoid.geometry.bodies import convert_bodies, enclosing_capsule, make_shape
 from qpavoid.geometry.capsules import fit_capsule
 from qpavoid.geometry.segments import point_segment
-from qpavoid.model.urdf import read_collision, read_model
+from qpavoid.model.urdf import read_model, read_pieces
 
 PANDA = EXAMPLES / "panda_description/urdf/panda.urdf"
 STL_FACET = "facet normal 0 0 1\nouter loop\nvertex {}\nvertex {}\nvertex {}\nendloop\nendfacet\n"
@@ -28,7 +28,7 @@ STL_FACET = "facet normal 0 0 1\nouter loop\nvertex {}\nvertex {}\nvertex {}\nen
 @pytest.fixture(scope="module")
 def meshes():
     """Vertices of the Panda's collision meshes, by name."""
-    bodies = read_collision(PANDA, read_model(PANDA, "fixed"), [], PANDA).geometryObjects
+    bodies = read_pieces(PANDA, read_model(PANDA, "fixed"), [], PANDA, visuals=False, enclosed=True).geometryObjects
     return {b.name: np.array(b.geometry.vertices()) for b in bodies if isinstance(b.geometry, coal.BVHModelBase)}
 
 
@@ -153,7 +153,7 @@ def test_configured_primitives_have_the_size_they_say():
 
 
 def read_panda():
-    return read_collision(PANDA, read_model(PANDA, "fixed"), [], PANDA)
+    return read_pieces(PANDA, read_model(PANDA, "fixed"), [], PANDA, visuals=False, enclosed=True)
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from urdfs import BASE, HEAD, LIMITS, ROD, SEEN_ROD, arm, write
 from qpavoid import Avoidance, ConfigError, Controller, Obstacle, Robot, Sample, build_scene, build_tasks
 from qpavoid.config import Task
 from qpavoid.model.notes import NoteKind, RobotWarning
-from qpavoid.model.urdf import read_collision, read_model
+from qpavoid.model.urdf import read_model, read_pieces
 from qpavoid.model.xml_file import read_robot_xml
 
 
@@ -622,7 +622,7 @@ def test_every_shape_of_a_file_is_in_the_model(path):
         pytest.skip("a list of other files")
     notes = []
     model = read_model(path, "fixed", notes)
-    geometry = read_collision(path, model, [], path, notes=notes)
+    geometry = read_pieces(path, model, [], path, notes, visuals=False, enclosed=True)
     found = Counter(model.frames[piece.parentFrame].name for piece in geometry.geometryObjects)
     expected = {
         link.get("name"): len(link.findall("collision/geometry/*"))
@@ -652,7 +652,7 @@ def test_model_and_shapes_are_those_of_pinocchio(path):
             os.dup2(saved, 2)
             os.close(saved)
     assert model == expected
-    ours = read_collision(path, model, [], path)
+    ours = read_pieces(path, model, [], path, visuals=False, enclosed=True)
     assert [piece.name for piece in ours.geometryObjects] == [piece.name for piece in theirs.geometryObjects]
     for mine, other in zip(ours.geometryObjects, theirs.geometryObjects, strict=True):
         assert (mine.parentJoint, mine.parentFrame) == (other.parentJoint, other.parentFrame)
