@@ -28,7 +28,6 @@ from qpavoid.control import distances as proximity
 from qpavoid.control import placement as placing
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.tasks.frames import build_tasks
-from qpavoid.geometry.segments import capsule_distances
 from qpavoid.model import views as memory
 from qpavoid.model.kinematics import support_masks
 from qpavoid.problem import Proximity
@@ -47,14 +46,16 @@ def world_placements(scene, q):
     return [data.oMi[body.parentJoint] * body.placement for body in scene.geometry.geometryObjects]
 
 
-def axes(scene, q):
-    """Ends (n, 2, 3) and radii (n,) of the capsules and spheres of a scene."""
-    ends, radii = [], []
-    for body, placement in zip(scene.geometry.geometryObjects, world_placements(scene, q), strict=True):
-        half = body.geometry.halfLength if isinstance(body.geometry, coal.Capsule) else 0.0
-        ends.append([placement.act(np.array([0.0, 0.0, z])) for z in (-half, half)])
-        radii.append(body.geometry.radius)
-    return np.array(ends), np.array(radii)
+def by_coal(scene, q):
+    """[distance, normal, point a, point b] of every pair by coal's own formulas (m, 10)."""
+    places, rows = world_placements(scene, q), []
+    bodies = [body.geometry for body in scene.geometry.geometryObjects]
+    for a, b in scene.pairs:
+        at = [coal.Transform3s(places[i].rotation, places[i].translation) for i in (a, b)]
+        result = coal.DistanceResult()
+        coal.distance(bodies[a], at[0], bodies[b], at[1], coal.DistanceRequest(), result)
+        rows.append((result.min_distance, *result.normal, *result.getNearestPoint1(), *result.getNearestPoint2()))
+    return np.array(rows)
 
 
 @pytest.fixture
@@ -72,22 +73,21 @@ def with_obstacle(scene):
 
 
 @pytest.mark.parametrize("name", ["paper", "panda"])
-def test_capsules_and_spheres_agree_with_the_closed_form(name, request):
+def test_capsules_and_spheres_agree_with_coal(name, request):
     robot = request.getfixturevalue(name)
     rng = np.random.default_rng(1)
     scene = random_scene(robot, rng, [SPHERE, CAPSULE] * 4)
     for _ in range(TICKS):
         q = random_q(robot, rng, spread=2.0)
-        ends, radii = axes(scene, q)
-        a, b = scene.pairs.T
-        expected = capsule_distances(ends[a], radii[a], ends[b], radii[b])
-        found = look(scene, q)
-        np.testing.assert_allclose(found.distance, expected.distance, atol=1e-9)
-        distinct = expected.distance + radii[a] + radii[b] > 1e-3  # elsewhere the normal has no definite direction
+        radii = np.array([body.geometry.radius for body in scene.geometry.geometryObjects])
+        expected, found = by_coal(scene, q), look(scene, q)
+        np.testing.assert_allclose(found.distance, expected[:, 0], atol=1e-9)
+        distinct = (
+            expected[:, 0] + radii[scene.pairs].sum(axis=1) > 1e-3
+        )  # elsewhere the normal has no definite direction
         assert distinct.mean() > 0.9
-        np.testing.assert_allclose(found.normal[distinct], expected.normal[distinct], atol=1e-7)
-        np.testing.assert_allclose(found.point_a[distinct], expected.point_a[distinct], atol=1e-7)
-        np.testing.assert_allclose(found.point_b[distinct], expected.point_b[distinct], atol=1e-7)
+        parts = np.column_stack((found.normal, found.point_a, found.point_b))
+        np.testing.assert_allclose(parts[distinct], expected[distinct, 1:], atol=1e-7)
 
 
 def distance_to_box(points, box, size):
@@ -150,10 +150,9 @@ def test_distance_jacobian_of_capsules_and_spheres(name, request):
     assert any(masks[joints[a]].any() and masks[joints[b]].any() for a, b in scene.pairs)
     for _ in range(TICKS):
         q = random_q(robot, rng)
-        _, radii = axes(scene, q)
-        a, b = scene.pairs.T
+        radii = np.array([body.geometry.radius for body in scene.geometry.geometryObjects])
         found = look(scene, q)
-        smooth = found.distance + radii[a] + radii[b] > 1e-3  # crossing axes are a kink of the distance
+        smooth = found.distance + radii[scene.pairs].sum(axis=1) > 1e-3  # crossing axes are a kink of the distance
         expected = differences(lambda q: look(scene, q).distance, robot, q)
         np.testing.assert_allclose(found.J[smooth], expected[smooth], atol=1e-6)
 
