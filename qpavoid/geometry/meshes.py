@@ -73,10 +73,43 @@ def surface_triangles(geometry: Any) -> Array:
         return np.asarray(vertices[triangles])
     points = np.array(geometry.points())
     faces = points[ConvexHull(points).simplices]
-    normals = np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])
-    inwards = np.einsum("ij,ij->i", normals, faces[:, 0] - points.mean(axis=0)) < 0.0
+    inwards = np.einsum("ij,ij->i", normals(faces), faces[:, 0] - points.mean(axis=0)) < 0.0
     faces[inwards] = faces[inwards][:, ::-1]
     return np.asarray(faces)
+
+
+def normals(triangles: Array) -> Array:
+    """Return the normals (t, 3) of triangles (t, 3, 3), twice as long as their areas [m²]."""
+    return np.asarray(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]))
+
+
+def cut(triangles: Array, heights: Array) -> tuple[Array, Array]:
+    """Cut triangles (t, 3, 3) at a plane; return those below and those above it, (k, 3, 3) each.
+
+    Args:
+        triangles: their corners [m].
+        heights: of the corners above the plane (t, 3) [m]; triangles that lie in it are in both results.
+    """
+    below, above = (heights <= 0.0).all(axis=1), (heights >= 0.0).all(axis=1)
+    crossed = ~(below | above)
+    corners, h = triangles[crossed], heights[crossed]
+    # the corner that is alone on its side comes first
+    lone = np.where((h < 0.0).sum(axis=1) == 1, (h < 0.0).argmax(axis=1), (h > 0.0).argmax(axis=1))
+    order = (lone[:, None] + np.arange(3)) % 3
+    (a, b, c), h = (
+        np.moveaxis(np.take_along_axis(corners, order[..., None], axis=1), 1, 0),
+        np.take_along_axis(h, order, 1),
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = np.clip(h[:, :1] / (h[:, :1] - h[:, 1:]), 0.0, 1.0)
+    ab, ac = a + share[:, :1] * (b - a), a + share[:, 1:] * (c - a)
+    tip, low = np.stack((a, ab, ac), axis=1), h[:, 0] < 0.0
+    base = np.stack((ab, b, c, ab, c, ac), axis=1)
+    sides = [
+        np.concatenate((triangles[whole], tip[tips], base[~tips].reshape(-1, 3, 3)))
+        for whole, tips in ((below, low), (above, ~low))
+    ]
+    return sides[0], sides[1]
 
 
 def convex_hull(points: Array) -> Any:
