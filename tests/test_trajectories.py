@@ -31,9 +31,6 @@ from qpavoid.model.trajectory import Motion, Trajectory, build_motion, still
 
 coordinate = st.floats(-2.0, 2.0)
 point = st.tuples(coordinate, coordinate, coordinate)
-angles = st.tuples(*[st.floats(-math.pi, math.pi)] * 3)
-profile = st.sampled_from(["constant", "smooth"])
-direction = point.filter(lambda v: np.linalg.norm(v) > 0.1)
 
 
 def build(**block):
