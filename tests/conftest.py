@@ -1,7 +1,6 @@
 """Robots, random scenes and finite differences shared by the tests."""
 
 import functools
-import os
 import sys
 import warnings
 
@@ -36,17 +35,7 @@ CYLINDER = config.Cylinder(type="cylinder", radius=0.07, length=0.25)
 
 
 @pytest.fixture(scope="session", autouse=True)
-def cache_of_the_tests(tmp_path_factory):
-    """One directory for all tests and the processes they start, so that none touches the user's."""
-    base = tmp_path_factory.getbasetemp()
-    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("QPAVOID_CACHE", str(shared / "qpavoid-cache"))
-        yield
-
-
-@pytest.fixture(scope="session", autouse=True)
-def compiled_kernels(cache_of_the_tests):
+def compiled_kernels():
     """All kernels of a controller are on disk before any test: none finds on stderr that they are compiled."""
     if not (FOLDER / "complete").exists():
         Controller.from_scenario(load_scenario("situation1"))
