@@ -1,12 +1,10 @@
-"""`python -m bench.meshes`: what a pair of meshes costs against hulls and capsules, and what the cache saves."""
+"""`python -m bench.meshes`: what a pair of meshes costs against hulls and capsules, and what loading takes."""
 
 from __future__ import annotations
 
 import argparse
 import os
 import platform
-import shutil
-import tempfile
 import warnings
 from pathlib import Path
 from time import perf_counter
@@ -61,10 +59,10 @@ def main() -> None:
         "",
         "## Loading a robot",
         "",
-        f"Fastest of {options.loads} in one process, in turns with the cache off, empty, and filled.",
+        f"Fastest of {options.loads} in one process.",
         "",
-        "| robot | bodies | off [ms] | empty [ms] | filled [ms] | files | size [kB] |",
-        "|---|---|---:|---:|---:|---:|---:|",
+        "| robot | bodies | [ms] |",
+        "|---|---|---:|",
     ]
     for name, kind in [("panda", "capsule"), ("panda", "convex"), ("g1", "convex"), ("talos", "convex")]:
         lines.append(_loading(name, kind, options.loads))
@@ -117,29 +115,12 @@ def _faces(robot: Robot) -> str:
 
 
 def _loading(name: str, kind: str, loads: int) -> str:
-    def load() -> float:
+    seconds = []
+    for _ in range(loads):
         begin = perf_counter()
         Robot.from_urdf(SHARE / LOADED[name], bodies=kind)
-        return perf_counter() - begin
-
-    before = os.environ.get("QPAVOID_CACHE")
-    off, empty, filled = [], [], []
-    with tempfile.TemporaryDirectory() as folder:
-        cache = Path(folder) / "cache"
-        for _ in range(loads):
-            os.environ["QPAVOID_CACHE"] = "0"
-            off.append(load())
-            os.environ["QPAVOID_CACHE"] = str(cache)
-            shutil.rmtree(cache, ignore_errors=True)
-            empty.append(load())
-            filled.append(load())
-        sizes = [path.stat().st_size for path in cache.iterdir()]
-    if before is None:
-        del os.environ["QPAVOID_CACHE"]
-    else:
-        os.environ["QPAVOID_CACHE"] = before
-    cells = " | ".join(f"{1e3 * seconds:.0f}" for seconds in map(min, (off, empty, filled)))
-    return f"| {name} | {kind} | {cells} | {len(sizes)} | {sum(sizes) / 1e3:.0f} |"
+        seconds.append(perf_counter() - begin)
+    return f"| {name} | {kind} | {1e3 * min(seconds):.0f} |"
 
 
 if __name__ == "__main__":

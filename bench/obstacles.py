@@ -18,8 +18,7 @@ import pinocchio as pin
 from bench.tick.robots import SHARE
 from qpavoid import Avoidance, Controller, Obstacle, Points, Robot, Sample, Voxels, build_scene, build_tasks
 from qpavoid.config import Box, Capsule, Cone, Cylinder, Ellipsoid, HalfSpace, Mesh, PointCloud, Sphere, Task
-from qpavoid.geometry.bodies import MeshWarning
-from qpavoid.model.solids import hull_of
+from qpavoid.geometry.meshes import MeshWarning, convex_hull
 
 RESULTS = Path(__file__).parent / "results" / "obstacles.md"
 CLOUDS = (1_000, 3_000, 10_000, 30_000, 100_000)
@@ -65,7 +64,7 @@ def pair_table(rounds: int) -> list[str]:
     """Rows: shapes of obstacles; columns: shapes of bodies."""
     rng = np.random.default_rng(0)
     bodies = {"sphere": coal.Sphere(0.06), "capsule": coal.Capsule(0.05, 0.25), "box": coal.Box(0.1, 0.1, 0.2),
-              "hull": hull_of(0.08 * rng.normal(size=(60, 3)))}  # fmt: skip
+              "hull": convex_hull(0.08 * rng.normal(size=(60, 3)))}  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
         path = torus(Path(folder) / "ring.stl")
         obstacles = {

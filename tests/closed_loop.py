@@ -84,15 +84,15 @@ class Ruler:
 
     def __init__(self, scene):
         self.scene, self.model = scene, scene.robot.model
-        self._kinematics, self._query = ForwardKinematics(self.model), DistanceQuery(scene)
+        self.kinematics, self.query = ForwardKinematics(self.model), DistanceQuery(scene)
 
     def distances(self, q, samples=None):
         """(m,) at q, infinite beyond 10 m, with obstacles by number at `samples`."""
         if samples:
-            place(self._query, self.scene, samples)
-        self._kinematics.compute(q)
-        self._query.compute(self._kinematics.joint_poses, 10.0)
-        return self._query.distances_of(np.arange(len(self.scene.pairs))).copy()
+            place(self.query, self.scene, samples)
+        self.kinematics.compute(q)
+        self.query.compute(self.kinematics.joint_poses, 10.0)
+        return self.query.distances_of(np.arange(len(self.scene.pairs))).copy()
 
     def least_between(self, q, v, dt, t, steps=10):
         """Least distance on the way from q at v for dt, obstacles on their motions from t on."""

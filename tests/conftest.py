@@ -1,7 +1,6 @@
 """Robots, random scenes and finite differences shared by the tests."""
 
 import functools
-import os
 import sys
 import warnings
 
@@ -36,17 +35,7 @@ CYLINDER = config.Cylinder(type="cylinder", radius=0.07, length=0.25)
 
 
 @pytest.fixture(scope="session", autouse=True)
-def cache_of_the_tests(tmp_path_factory):
-    """One directory for all tests and the processes they start, so that none touches the user's."""
-    base = tmp_path_factory.getbasetemp()
-    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("QPAVOID_CACHE", str(shared / "qpavoid-cache"))
-        yield
-
-
-@pytest.fixture(scope="session", autouse=True)
-def compiled_kernels(cache_of_the_tests):
+def compiled_kernels():
     """All kernels of a controller are on disk before any test: none finds on stderr that they are compiled."""
     if not (FOLDER / "complete").exists():
         Controller.from_scenario(load_scenario("situation1"))
@@ -183,7 +172,7 @@ def frames(robot, names, q):
 def lay_out_step(scene, tasks=(), damping=0.0, dt=0.01, avoidance=None, limits=None, query=None):
     """Memory of a control step, as a controller lays it out, and the kinematics and distances that it looks into."""
     frames, others = in_order(tasks)
-    kinematics = ForwardKinematics(scene.robot.model, [task.frame_id for task in frames])
+    kinematics = ForwardKinematics(scene.robot.model, [i for task in tasks for i in task.frame_ids])
     query, limits = query or DistanceQuery(scene), limits or config.Limits()
     bounds = scene.robot.bounds().within(limits)
     settings = avoidance or config.Avoidance()

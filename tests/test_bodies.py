@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 from qpavoid import Robot, config
 from qpavoid.geometry.bodies import convert_bodies, enclosing_capsule, make_shape
 from qpavoid.geometry.capsules import fit_capsule
-from qpavoid.geometry.segments import point_segment
-from qpavoid.model.urdf import read_collision, read_model
+from qpavoid.geometry.segments import point_segment_distance
+from qpavoid.model.urdf import read_model, read_pieces
 
 PANDA = EXAMPLES / "panda_description/urdf/panda.urdf"
 STL_FACET = "facet normal 0 0 1\nouter loop\nvertex {}\nvertex {}\nvertex {}\nendloop\nendfacet\n"
@@ -28,20 +28,20 @@ STL_FACET = "facet normal 0 0 1\nouter loop\nvertex {}\nvertex {}\nvertex {}\nen
 @pytest.fixture(scope="module")
 def meshes():
     """Vertices of the Panda's collision meshes, by name."""
-    bodies = read_collision(PANDA, read_model(PANDA, "fixed"), [], PANDA).geometryObjects
+    bodies = read_pieces(PANDA, read_model(PANDA, "fixed"), [], PANDA, visuals=False, enclosed=True).geometryObjects
     return {b.name: np.array(b.geometry.vertices()) for b in bodies if isinstance(b.geometry, coal.BVHModelBase)}
 
 
 def overlap(fit, points):
     """How far the outermost point sticks out of the capsule [m]; negative when all are inside."""
     half = 0.5 * fit.length * fit.rotation[:, 2]
-    return float(np.max(point_segment(points, fit.center - half, fit.center + half).distance) - fit.radius)
+    return float(np.max(point_segment_distance(points, fit.center - half, fit.center + half)) - fit.radius)
 
 
 def capsule_volume(ends, points):
     """Volume of the smallest capsule around `points` with the given ends of its axis, flattened (6,)."""
     a, b = ends.reshape(2, 3)
-    r = np.max(point_segment(points, a, b).distance)
+    r = np.max(point_segment_distance(points, a, b))
     return np.pi * r**2 * (np.linalg.norm(b - a) + 4.0 / 3.0 * r)
 
 
@@ -153,7 +153,7 @@ def test_configured_primitives_have_the_size_they_say():
 
 
 def read_panda():
-    return read_collision(PANDA, read_model(PANDA, "fixed"), [], PANDA)
+    return read_pieces(PANDA, read_model(PANDA, "fixed"), [], PANDA, visuals=False, enclosed=True)
 
 
 @pytest.mark.parametrize(
@@ -189,7 +189,7 @@ def test_capsules_sit_around_the_meshes_in_the_link_frame(meshes):
         a, b = (body.placement.act(np.array([0.0, 0.0, z])) for z in (-half, half))
         placement = before[body.name].placement
         points = meshes[body.name] @ placement.rotation.T + placement.translation
-        assert np.max(point_segment(points, a, b).distance) < body.geometry.radius + 1e-9
+        assert np.max(point_segment_distance(points, a, b)) < body.geometry.radius + 1e-9
 
 
 @pytest.mark.filterwarnings("ignore::qpavoid.model.notes.RobotWarning")

@@ -118,7 +118,7 @@ def test_closed_forms_exist_of_spheres_capsules_and_boxes():
 
 
 @pytest.mark.parametrize("copies", [False, True], ids=["views", "copies"])
-def test_a_query_has_the_same_results_as_coal_alone(panda, monkeypatch, copies):
+def test_distance_query_agrees_with_coal(panda, monkeypatch, copies):
     """Deep in penetration, too, with shapes of all kinds; and where the memory of coal cannot be looked into."""
     if copies:
         monkeypatch.setattr("qpavoid.control.distances.view_results", lambda *_: None)

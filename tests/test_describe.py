@@ -17,7 +17,7 @@ from scipy.spatial import ConvexHull
 from qpavoid import ConfigError, Robot, UnknownName
 from qpavoid.config import Box, Capsule, Hull, RobotConfig, Sphere
 from qpavoid.geometry.capsules import CapsuleFit, fit_capsule
-from qpavoid.geometry.segments import point_segment
+from qpavoid.geometry.segments import point_segment_distance
 from qpavoid.model.end_effectors import end_effectors
 from qpavoid.model.trajectory import rpy_to_matrix
 from qpavoid.model.urdf import read_model
@@ -63,7 +63,7 @@ def outside(points, capsules):
     depth = []
     for fit in capsules:
         half = 0.5 * fit.length * fit.rotation[:, 2]
-        depth.append(point_segment(points, fit.center - half, fit.center + half).distance - fit.radius)
+        depth.append(point_segment_distance(points, fit.center - half, fit.center + half) - fit.radius)
     return float(np.min(depth, axis=0).max())
 
 

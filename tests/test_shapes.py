@@ -24,7 +24,8 @@ from qpavoid import (
     load_scenario,
 )
 from qpavoid.config import Cone, Ellipsoid, HalfSpace, Mesh
-from qpavoid.geometry.bodies import MeshWarning, enclosing_capsule, make_shape
+from qpavoid.geometry.bodies import enclosing_capsule, make_shape
+from qpavoid.geometry.meshes import MeshWarning
 from qpavoid.model.kinematics import ForwardKinematics
 from qpavoid.run.simulate import simulate
 
@@ -300,7 +301,7 @@ def test_a_decomposed_mesh_is_its_boards(tmp_path, shelf):
 
 
 @pytest.mark.parametrize("method", ["convex", "decomposed", "surface"])
-@pytest.mark.filterwarnings("ignore::qpavoid.geometry.bodies.MeshWarning")
+@pytest.mark.filterwarnings("ignore::qpavoid.geometry.meshes.MeshWarning")
 def test_meshes_move_and_turn_like_any_other_obstacle(tmp_path, method):
     path = write_stl(tmp_path / "box.stl", boards(((0, 0, 0), (200.0, 300.0, 100.0))))
     mesh = Mesh(path=str(path), scale=1e-3, method=method)

@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 from closed_loop import drive, make_controller
 from conftest import BOX, CAPSULE, SPHERE, instructions, moved, obstacle
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
@@ -28,71 +28,14 @@ from qpavoid.kernels.obstacles import (
     REST,
     SAMPLE,
 )
-from qpavoid.model.trajectory import END_TOLERANCE, Motion, Orbit, Still, build_motion
+from qpavoid.model.trajectory import Motion, Trajectory, build_motion, still
 
 coordinate = st.floats(-2.0, 2.0)
 point = st.tuples(coordinate, coordinate, coordinate)
-angles = st.tuples(*[st.floats(-math.pi, math.pi)] * 3)
-profile = st.sampled_from(["constant", "smooth"])
-direction = point.filter(lambda v: np.linalg.norm(v) > 0.1)
-EARLY = (-1.0, -1e-6, -2.0 * END_TOLERANCE, -0.5 * END_TOLERANCE, 0.0, 0.5 * END_TOLERANCE, 1e-6)
-"""Where to look around a corner [s]."""
 
 
 def build(**block):
     return build_motion(TypeAdapter(config.Motion).validate_python(block))
-
-
-fixed = st.builds(build, type=st.just("fixed"), position=point, rpy=angles)
-line = st.builds(
-    build, type=st.just("line"), start=point, displacement=direction, speed=st.floats(0.05, 3.0), rpy=angles,
-    start_time=st.floats(0.0, 3.0), profile=profile,
-)  # fmt: skip
-circle = st.builds(
-    build, type=st.just("circle"), center=point, radius=st.floats(0.01, 1.0), normal=st.just((0.2, -0.4, 1.0)),
-    start_direction=st.sampled_from([(1.0, 0.0, 0.0), (0.0, -1.0, 0.3)]), period=st.floats(0.3, 8.0), rpy=angles,
-    turns=st.none() | st.floats(0.05, 3.0),
-)  # fmt: skip
-
-
-@st.composite
-def way(draw):
-    """Some waypoints, of which some only turn, some do not, and some do neither."""
-    count = draw(st.integers(2, 5))
-    steps = draw(st.lists(st.floats(0.05, 2.0), min_size=count, max_size=count))
-    positions = draw(st.lists(st.sampled_from([(0.1, 0.2, 0.3)]) | point, min_size=count, max_size=count))
-    rpys = draw(st.lists(st.sampled_from([(0.0, 0.0, 0.0), (0.4, 0.0, 3.1)]) | angles, min_size=count, max_size=count))
-    times = (np.cumsum(steps) - 1.0).tolist()
-    return build(type="waypoints", times=times, positions=positions, rpys=rpys, profile=draw(profile))
-
-
-def corners(motion):
-    if isinstance(motion, Still):
-        return [0.0]
-    return [0.0, min(motion.end, 1e6)] if isinstance(motion, Orbit) else list(motion.times)
-
-
-def assert_samples(views, motions, t):
-    for view, motion in zip(views, motions, strict=True):
-        for found, expected in zip(view[:4], motion.sample(t)[:4], strict=True):
-            np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
-
-
-# --- where they are ----------------------------------------------------------------------------------------------
-
-
-@settings(max_examples=50)
-@given(motions=st.lists(fixed | line | circle | way(), min_size=1, max_size=4), data=st.data())
-def test_all_at_once_are_where_each_alone_is(motions, data):
-    """At any time, around corners, and when time goes back."""
-    edges = [corner + early for motion in motions for corner in corners(motion) for early in EARLY]
-    times = [*data.draw(st.permutations(edges)), *data.draw(st.lists(st.floats(-5.0, 20.0), max_size=10)), 1.7e9]
-    together = courses.TrajectoryBatch(dict(enumerate(motions)))
-    assert not together.others
-    states = np.full((len(motions), courses.STATE), np.nan)
-    for t in times:
-        together.sample(t, states)
-        assert_samples(courses.as_samples(states), motions, t)
 
 
 def test_only_rows_of_its_own_are_written():
@@ -114,16 +57,17 @@ class Pendulum:
         return Sample.at([2.0, 0.1 * math.sin(t), 1.0], linear=[0.0, 0.1 * math.cos(t), 0.0])
 
 
-class Drifting(Still):
+class Drifting(Trajectory):
     """One that is derived from one of ours."""
 
     def sample(self, t):
-        return self.pose._replace(position=self.pose.position + t)
+        return self.initial._replace(position=self.initial.position + t)
 
 
 def test_motions_of_other_classes_are_left_to_their_sample():
     motions: dict[int, Motion] = {0: Pendulum(), 1: build(type="circle", center=(0, 0, 1), radius=0.2, period=3)}
-    motions[2] = Drifting(Sample.at([0.0, 0.0, 0.0]))
+    rest = still(Sample.at([0.0, 0.0, 0.0]))
+    motions[2] = Drifting(rest.pieces, rest.initial)
     assert set(courses.TrajectoryBatch(motions).others) == {0, 2}
 
 
@@ -353,18 +297,22 @@ def test_python_work_does_not_grow_with_the_number_of_moving_obstacles(panda):
     assert 0 < steps[0] == steps[1] < 4000
 
 
-def test_a_loop_is_the_same_as_with_every_motion_sampled_alone(panda, monkeypatch):
+def test_a_loop_is_the_same_with_trajectories_of_another_class(panda):
+    """One that does no more than to pass on the samples of ours."""
+
+    class Relay:
+        def __init__(self, motion):
+            self.sample = motion.sample
+
+    obstacles = circling(np.random.default_rng(6), 9, 0.6)
+    relayed = [Obstacle(item.name, item.shape, Relay(item.motion)) for item in obstacles]
     runs = []
-    for alone in (False, True):
-        if alone:
-            monkeypatch.setattr(courses, "_cut", lambda motion: None)
-        controller = make_controller(panda, circling(np.random.default_rng(6), 9, 0.6), "panda_hand_tcp")
+    for scene in (obstacles, relayed):
+        controller = make_controller(panda, scene, "panda_hand_tcp")
         runs.append(list(drive(controller, panda.home, 200, target=[0.6, 0.2, 0.5])))
-    together, alone = runs
-    near = [len(tick.proximity.pair) for tick in alone]
-    statuses = {tick.solution.status for tick in alone}
-    assert max(near) > 3 and statuses == {Status.SOLVED, Status.RELAXED}
-    for a, b in zip(together, alone, strict=True):
+    assert max(len(tick.proximity.pair) for tick in runs[0]) > 3
+    assert {tick.solution.status for tick in runs[0]} == {Status.SOLVED, Status.RELAXED}
+    for a, b in zip(*runs, strict=True):
         np.testing.assert_allclose(a.solution.v, b.solution.v, atol=1e-9)
         np.testing.assert_array_equal(a.proximity.pair, b.proximity.pair)
         np.testing.assert_allclose(a.proximity.feedforward, b.proximity.feedforward, atol=1e-9)

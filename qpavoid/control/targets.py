@@ -14,7 +14,7 @@ from qpavoid.control.tasks import RowTask
 from qpavoid.control.trajectories import STATE, as_samples, put
 from qpavoid.errors import ConfigError, NumericalError, UnknownName, nearest
 from qpavoid.kernels.obstacles import FINE, NORMALISED, SAMPLE
-from qpavoid.model.trajectory import Sample, Still
+from qpavoid.model.trajectory import Sample, Trajectory
 from qpavoid.problem import Array
 from qpavoid.reason import Reason, ReasonKind
 
@@ -40,10 +40,7 @@ class TargetReader:
         self._motions: list[Any] = [task.motion for task in tasks]
         self._views = [*as_samples(self._frames), *as_samples(self._others)]
         self._frame_views = self._views[: len(frames)]
-        self._still = all(
-            type(motion) is Still and not any(part.flags.writeable for part in motion.pose[:4])
-            for motion in self._motions[: len(frames)]
-        )
+        self._still = all(type(motion) is Trajectory and motion.is_still for motion in self._motions[: len(frames)])
         self._written = False  # whether the frames are the poses of motions that never change
         self._named_views = [*zip(self._names, self._frame_views, strict=False)]
         every = np.arange(max(len(frames), len(self._others)))

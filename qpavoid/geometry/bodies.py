@@ -1,8 +1,7 @@
-"""Collision shapes: from the config's primitives, and from the meshes of a URDF."""
+"""Collision shapes of coal: made of the config's primitives and of meshes, and what encloses them."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import coal
@@ -10,31 +9,26 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid.config import Box, Capsule, Cone, Cylinder, Ellipsoid, Shape, Sphere
-from qpavoid.config.base import LARGEST
-from qpavoid.errors import ConfigError
-from qpavoid.geometry.cache import load_or_make
 from qpavoid.geometry.capsules import CapsuleFit, fit_capsule, half_sphere
+from qpavoid.geometry.meshes import convex_hull
 from qpavoid.problem import Array
-
-
-class MeshWarning(UserWarning):
-    """Distances will be slow: a robot is made of triangle meshes."""
 
 
 def make_shape(shape: Shape) -> Any:
     """Make the coal geometry of a configured primitive."""
-    if isinstance(shape, Sphere):
-        return coal.Sphere(shape.radius)
-    if isinstance(shape, Capsule):
-        return coal.Capsule(shape.radius, shape.length)
-    if isinstance(shape, Box):
-        return coal.Box(*shape.size)
-    if isinstance(shape, Cone):
-        return coal.Cone(shape.radius, shape.length)
-    if isinstance(shape, Ellipsoid):
-        return coal.Ellipsoid(*shape.radii)
-    assert isinstance(shape, Cylinder)
-    return coal.Cylinder(shape.radius, shape.length)
+    match shape:
+        case Sphere():
+            return coal.Sphere(shape.radius)
+        case Capsule():
+            return coal.Capsule(shape.radius, shape.length)
+        case Box():
+            return coal.Box(*shape.size)
+        case Cone():
+            return coal.Cone(shape.radius, shape.length)
+        case Ellipsoid():
+            return coal.Ellipsoid(*shape.radii)
+        case Cylinder():
+            return coal.Cylinder(shape.radius, shape.length)
 
 
 def convert_bodies(bodies: Any, kind: str) -> Any:
@@ -49,8 +43,7 @@ def convert_bodies(bodies: Any, kind: str) -> Any:
     for body in bodies.geometryObjects:
         geometry, placement = body.geometry, body.placement
         if kind == "convex" and isinstance(geometry, coal.BVHModelBase):
-            geometry, inside = _convex_hull(geometry)
-            placement = placement * inside
+            geometry = convex_hull(np.array(geometry.vertices()))
         elif kind == "capsule":
             fit = enclosing_capsule(geometry)
             geometry = coal.Capsule(fit.radius, fit.length) if fit.length > 0 else coal.Sphere(fit.radius)
@@ -59,28 +52,6 @@ def convert_bodies(bodies: Any, kind: str) -> Any:
             pin.GeometryObject(body.name, body.parentJoint, body.parentFrame, placement, geometry)
         )
     return converted
-
-
-def check_meshes(bodies: Any, origin: str) -> None:
-    """Check that meshes have corners and that all are numbers.
-
-    Hulls and distances need them.
-
-    Args:
-        bodies: pinocchio geometry model as read from a URDF.
-        origin: file to name in errors.
-
-    Raises:
-        ConfigError: naming the mesh.
-    """
-    for body in bodies.geometryObjects:
-        if isinstance(body.geometry, coal.BVHModelBase):
-            points = np.array(body.geometry.vertices())
-            where = f"{origin}: {body.name}: mesh {body.meshPath}"
-            if points.ndim != 2 or len(points) < 3:
-                raise ConfigError(f"{where}: has no triangle; export it again")
-            if not np.all(np.abs(points) <= LARGEST):  # False for NaN too
-                raise ConfigError(f"{where}: a corner is NaN, infinite or beyond {LARGEST:g} m; export it again")
 
 
 def triangle_meshes(bodies: Any) -> list[str]:
@@ -97,8 +68,7 @@ def enclosing_capsule(geometry: Any) -> CapsuleFit:
         return CapsuleFit(np.zeros(3), np.eye(3), geometry.radius, 0.0)
     if isinstance(geometry, coal.Capsule):
         return CapsuleFit(np.zeros(3), np.eye(3), geometry.radius, 2.0 * geometry.halfLength)
-    points = hull_points(geometry)
-    return load_or_make("capsule", points, lambda: fit_capsule(points), _pack_fit, _unpack_fit)
+    return fit_capsule(hull_points(geometry))
 
 
 def bounding_sphere(geometry: Any) -> tuple[Array, float]:
@@ -106,14 +76,18 @@ def bounding_sphere(geometry: Any) -> tuple[Array, float]:
 
     The radius is infinite for a half-space.
     """
-    if isinstance(geometry, coal.Halfspace):
-        return np.zeros(3), np.inf
-    if isinstance(geometry, coal.Ellipsoid):
-        return np.zeros(3), float(np.max(geometry.radii))
-    if isinstance(geometry, coal.Sphere | coal.Capsule | coal.Cylinder):
-        half = getattr(geometry, "halfLength", 0.0)
-        wide = isinstance(geometry, coal.Cylinder)
-        return np.zeros(3), float(np.hypot(geometry.radius, half) if wide else geometry.radius + half)
+    center = np.zeros(3)
+    match geometry:
+        case coal.Halfspace():
+            return center, np.inf
+        case coal.Ellipsoid():
+            return center, float(np.max(geometry.radii))
+        case coal.Sphere():
+            return center, float(geometry.radius)
+        case coal.Capsule():
+            return center, float(geometry.radius + geometry.halfLength)
+        case coal.Cylinder():
+            return center, float(np.hypot(geometry.radius, geometry.halfLength))
     geometry.computeLocalAABB()
     return np.array(geometry.aabb_center), float(geometry.aabb_radius)
 
@@ -130,90 +104,27 @@ def bounding_box(geometry: Any) -> tuple[Array, Array]:
     return 0.5 * (low + high), 0.5 * (high - low)
 
 
-def _convex_hull(mesh: Any) -> tuple[Any, Any]:
-    """Return the hull of a mesh, and its placement in the mesh's frame.
-
-    A thin box stands for a flat mesh.
-
-    A flat point set has no hull with an inside, and qhull ends the process over it.
-    """
-    points = np.array(mesh.vertices())
-    center = points.mean(axis=0)
-    axes = np.linalg.svd(points - center, full_matrices=False)[2]
-    axes[2] *= np.sign(np.linalg.det(axes))
-    local = (points - center) @ axes.T
-    low, high = local.min(axis=0), local.max(axis=0)
-    size = high - low
-    if size.min() > 1e-6 * size.max():
-        return load_or_make("hull", points, lambda: run_qhull(mesh), _pack_hull, _unpack_hull), pin.SE3.Identity()
-    middle = center + axes.T @ (0.5 * (low + high))
-    return coal.Box(*np.maximum(size, _THINNEST)), pin.SE3(np.ascontiguousarray(axes.T), middle)
-
-
-def run_qhull(mesh: Any) -> Any:
-    """Make coal's convex hull of the vertices of a mesh that are not all in one plane.
-
-    qhull ends the process over those.
-    """
-    try:
-        mesh.buildConvexHull(True, "Qt")
-    except RuntimeError:
-        # a corner with more than 255 neighbours, as where a round flat face is cut into a fan of triangles: qhull's
-        # other way with flat faces moves corners by rounding errors and makes no fans
-        mesh.buildConvexHull(True, "QJ")
-    return mesh.convex
-
-
-def _pack_hull(hull: Any) -> bytes:
-    """Serialise a hull in coal's own format.
-
-    Making a hull of points and triangles takes as long as finding it.
-    """
-    buffer = pin.serialization.StreamBuffer()
-    hull.saveToBuffer(buffer)
-    return bytes(buffer.tobytes())
-
-
-def _unpack_hull(path: Path) -> Any:
-    hull = coal.Convex()
-    hull.loadFromBinary(str(path))
-    return hull
-
-
-def _pack_fit(fit: CapsuleFit) -> bytes:
-    return np.concatenate((fit.center, fit.rotation.ravel(), (fit.radius, fit.length))).tobytes()
-
-
-def _unpack_fit(path: Path) -> CapsuleFit:
-    numbers = np.fromfile(path, count=14)
-    return CapsuleFit(numbers[:3], numbers[3:12].reshape(3, 3), float(numbers[12]), float(numbers[13]))
-
-
-_AROUND_SPHERE = 1.04 * np.concatenate((half_sphere(100), -half_sphere(100)))
-"""Points whose hull encloses the unit sphere (200, 3)."""
 _ENDLESS = 1e6
 """Half the size of the box that stands for a half-space: larger than any scene [m]."""
-_THINNEST = 1e-4
-"""Side of the box that stands for a flat mesh, across its plane: thin beside any safety distance [m]."""
+_AROUND_SPHERE = 1.04 * np.concatenate((half_sphere(100), -half_sphere(100)))
+"""Points whose hull encloses the unit sphere (200, 3)."""
 
 
 def hull_points(geometry: Any) -> Array:
     """Return points whose hull encloses the shape (n, 3) [m]."""
-    if isinstance(geometry, coal.BVHModelBase):
-        hull, _ = _convex_hull(geometry)  # fine meshes have a hundred times the points of their hulls
-        return np.array(hull.points() if isinstance(hull, coal.ConvexBase) else geometry.vertices())
-    if isinstance(geometry, coal.ConvexBase):
-        return np.array(geometry.points())
-    if isinstance(geometry, coal.Cylinder):
-        return np.concatenate([rim(geometry.radius, z) for z in (-geometry.halfLength, geometry.halfLength)])
-    if isinstance(geometry, coal.Cone):
-        return np.concatenate((rim(geometry.radius, -geometry.halfLength), [[0.0, 0.0, geometry.halfLength]]))
-    if isinstance(geometry, coal.Ellipsoid):
-        return np.asarray(_AROUND_SPHERE * np.asarray(geometry.radii))
-    geometry.computeLocalAABB()
-    half, center = 0.5 * (geometry.aabb_local.max_ - geometry.aabb_local.min_), geometry.aabb_center
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
-    return np.asarray(center + corners * half)
+    match geometry:
+        case coal.BVHModelBase():  # fine meshes have a hundred times the points of their hulls
+            return np.array(convex_hull(np.array(geometry.vertices())).points())
+        case coal.ConvexBase():
+            return np.array(geometry.points())
+        case coal.Cylinder():
+            return np.concatenate([rim(geometry.radius, z) for z in (-geometry.halfLength, geometry.halfLength)])
+        case coal.Cone():
+            return np.concatenate((rim(geometry.radius, -geometry.halfLength), [[0.0, 0.0, geometry.halfLength]]))
+        case coal.Ellipsoid():
+            return np.asarray(_AROUND_SPHERE * np.asarray(geometry.radii))
+    center, half = bounding_box(geometry)
+    return np.asarray(center + half * [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 
 
 def rim(radius: float, z: float) -> Array:

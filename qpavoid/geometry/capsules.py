@@ -62,10 +62,7 @@ def fit_capsule(points: Array, directions: int = 250) -> CapsuleFit:
 
 
 def _tried_along(points: Array, rotations: Array) -> tuple[Array, Array, Array]:
-    """Fit capsules along k axes, of several radii each.
-
-    Returns volumes (w, k), fits (w, k, 3) and the axes' centres (k, 2).
-    """
+    """Fit capsules along k axes, of w radii each: volumes (w, k), fits (w, k, 3) and the axes' centres (k, 2)."""
     local = points @ rotations
     center, narrowest = _enclosing_circles(local[..., :2])
     off_axis = np.sum((local[..., :2] - center[:, None]) ** 2, axis=2)
@@ -76,17 +73,10 @@ def _tried_along(points: Array, rotations: Array) -> tuple[Array, Array, Array]:
 
 
 def _fit_along(height: Array, off_axis: Array, radius: Array) -> Array:
-    """Fit the shortest capsules of given radii around points along given axes.
+    """Fit the shortest capsules of given radii (k,) along given axes: rows [radius, length, height of the middle].
 
-    Rows are [radius, length, height of the middle].
-
-    Each point lets the caps' centres come no nearer to the far side than half its chord; where they would cross, a
-    sphere about their middle encloses everything.
-
-    Args:
-        height: of the points along each axis (k, n).
-        off_axis: their squared distances from it (k, n).
-        radius: of the capsules (k,).
+    Each point, at a height (k, n) along an axis and a squared distance (k, n) from it, lets the caps' centres come no
+    nearer to the far side than half its chord; where they would cross, a sphere about their middle encloses everything.
     """
     half_chord = np.sqrt(np.maximum(radius[:, None] ** 2 - off_axis, 0.0))
     low, high = np.min(height + half_chord, axis=1), np.max(height - half_chord, axis=1)
@@ -117,15 +107,14 @@ def _rotations_to(axes: Array) -> Array:
 
 
 def _enclosing_circles(points: Array) -> tuple[Array, Array]:
-    """Find a nearly smallest circle around each set of 2-D points (k, n, 2).
-
-    Returns centres (k, 2) and radii (k,).
+    """Find a nearly smallest circle around each set of 2-D points (k, n, 2): centres (k, 2) and radii (k,).
 
     Badoiu and Clarkson's iteration for the centre; the radius is then exact for that centre.
     """
     center = 0.5 * (points.min(axis=1) + points.max(axis=1))
-    every = np.arange(len(points))
+    square, every = np.sum(points**2, axis=2), np.arange(len(points))
     for step in range(1, 60):
-        index_of_farthest = np.argmax(np.sum((points - center[:, None]) ** 2, axis=2), axis=1)
-        center = center + (points[every, index_of_farthest] - center) / (step + 1)
+        # |p - c|² without |c|², which is the same for all points
+        farthest = np.argmax(square - 2.0 * (points @ center[:, :, None])[..., 0], axis=1)
+        center = center + (points[every, farthest] - center) / (step + 1)
     return center, np.sqrt(np.max(np.sum((points - center[:, None]) ** 2, axis=2), axis=1))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from qpavoid.problem import Array
 
 CSV_HEADERS = ("t,x,y,z", "t,x,y,z,qx,qy,qz,qw")
 _LARGEST_CSV, _MOST_ROWS = 20_000_000, 100_000
-"""Size of a CSV file [bytes] and number of its rows, at most; each row becomes a piece of some kilobytes."""
+"""Size of a CSV file [bytes] and number of its rows, at most; each row becomes a piece of a kilobyte."""
 
 
 def read_poses(path: Path, initial: Array) -> tuple[list[float], list[Array], list[Array]]:
@@ -29,15 +30,13 @@ def read_poses(path: Path, initial: Array) -> tuple[list[float], list[Array], li
         ConfigError: naming file, line and column.
     """
     reader = csv.reader(io.StringIO(read_text(path, _LARGEST_CSV, f"{path}: motion.path")))
-    rows: list[tuple[int, list[str]]] = []
+    cells_of_lines = ((reader.line_num, [cell.strip() for cell in row]) for row in reader if row)
     try:
-        for row in reader:
-            if row:
-                rows.append((reader.line_num, [cell.strip() for cell in row]))
-            if len(rows) > _MOST_ROWS + 1:
-                raise ConfigError(f"{path}: more than {_MOST_ROWS} rows; give fewer poses, it is linear in between")
+        rows = list(islice(cells_of_lines, _MOST_ROWS + 2))
     except csv.Error as error:
         raise ConfigError(f"{path}, line {reader.line_num}: {error}; correct the cell") from None
+    if len(rows) > _MOST_ROWS + 1:
+        raise ConfigError(f"{path}: more than {_MOST_ROWS} rows; give fewer poses, it is linear in between")
     header = ",".join(rows[0][1]) if rows else ""
     if header not in CSV_HEADERS:
         expected = "` or `".join(CSV_HEADERS)
@@ -45,20 +44,21 @@ def read_poses(path: Path, initial: Array) -> tuple[list[float], list[Array], li
     if len(rows) < 3:
         raise ConfigError(f"{path}: {len(rows) - 1} row(s) of poses; give at least two, or use `type: fixed`")
     columns = header.split(",")
-    times: list[float] = []
-    positions: list[Array] = []
-    rotations: list[Array] = []
+    times, positions, rotations = list[float](), list[Array](), list[Array]()
     for line, cells in rows[1:]:
         where = f"{path}, line {line}"
         if len(cells) != len(columns):
             raise ConfigError(f"{where}: {len(cells)} cells; give {len(columns)}, as the header `{header}`")
         values = [_number(cell, f"{where}, {column}") for cell, column in zip(cells, columns, strict=True)]
-        t, position, quaternion = values[0], values[1:4], values[4:]
+        t, position, quaternion = values[0], np.array(values[1:4]), np.array(values[4:])
         if times and t <= times[-1]:
             raise ConfigError(f"{where}, t: {t} comes after {times[-1]}; times must increase")
+        norm = np.linalg.norm(quaternion)  # need not be 1: files hold rounded numbers
+        if len(quaternion) and norm < 1e-6:
+            raise ConfigError(f"{where}, qx,qy,qz,qw: the quaternion is zero; no turn is 0,0,0,1")
         times.append(t)
-        positions.append(np.array(position))
-        rotations.append(_unit_quaternion_matrix(quaternion, where) if quaternion else initial)
+        positions.append(position)
+        rotations.append(pin.Quaternion(quaternion / norm).toRotationMatrix() if len(quaternion) else initial)
     return times, positions, rotations
 
 
@@ -70,15 +70,3 @@ def _number(cell: str, where: str) -> float:
     if not abs(value) <= LARGEST * 10.0:  # seconds of the calendar are 1.7e9
         raise ConfigError(f"{where}: `{cell}` is not a finite number of sane size; correct the cell")
     return value
-
-
-def _unit_quaternion_matrix(quaternion: list[float], where: str) -> Array:
-    """Return the rotation (3, 3) of (qx, qy, qz, qw).
-
-    It need not have unit length: files hold rounded numbers.
-    """
-    norm = math.hypot(*quaternion)
-    if norm < 1e-6:
-        raise ConfigError(f"{where}, qx,qy,qz,qw: the quaternion is zero; no turn is 0,0,0,1")
-    matrix: Array = pin.Quaternion(np.array(quaternion) / norm).toRotationMatrix()
-    return matrix

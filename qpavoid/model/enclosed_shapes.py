@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from typing import Any
 
 import coal
@@ -26,22 +27,21 @@ def remove_enclosed(pieces: Any, notes: list[Note]) -> Any:
         pieces: Pinocchio geometry model.
         notes: what was left out is added to them.
     """
-    objects = list(pieces.geometryObjects)
-    links: dict[int, list[int]] = {}
-    for i, piece in enumerate(objects):
-        links.setdefault(piece.parentFrame, []).append(i)
-    result = pin.GeometryModel()
-    enclosed_by: dict[int, int] = {}
+    links: dict[int, list[Any]] = defaultdict(list)
+    for piece in pieces.geometryObjects:
+        links[piece.parentFrame].append(piece)
+    enclosing: dict[str, str] = {}
     for members in links.values():
-        for i in members:
-            candidates = (j for j in members if j != i and enclosed_by.get(j) != i and j not in enclosed_by)
-            enclosing = next((j for j in candidates if _encloses(objects[j], objects[i])), None)
-            if enclosing is not None:
-                enclosed_by[i] = enclosing
-        _name_mixture([objects[i] for i in members if i not in enclosed_by], notes)
-    for i, piece in enumerate(objects):
-        if i in enclosed_by:
-            clause = f"left out: it lies inside {objects[enclosed_by[i]].name}, a shape of the same link"
+        for inner in members:
+            outers = (piece for piece in members if piece.name != inner.name and piece.name not in enclosing)
+            outer = next((piece for piece in outers if _encloses(piece, inner)), None)
+            if outer is not None:
+                enclosing[inner.name] = outer.name
+        _name_mixture([piece for piece in members if piece.name not in enclosing], notes)
+    result = pin.GeometryModel()
+    for piece in pieces.geometryObjects:
+        if piece.name in enclosing:
+            clause = f"left out: it lies inside {enclosing[piece.name]}, a shape of the same link"
             notes.append(Note(NoteKind.SHAPE, (piece.name,), clause))
         else:
             result.addGeometryObject(piece)
@@ -49,10 +49,7 @@ def remove_enclosed(pieces: Any, notes: list[Note]) -> Any:
 
 
 def _name_mixture(pieces: list[Any], notes: list[Note]) -> None:
-    """Note the shapes of a link that has meshes beside simple shapes.
-
-    Often one set is meant to replace the other.
-    """
+    """Note the shapes of a link that has meshes beside simple shapes: often one set is meant to replace the other."""
     meshes = [piece for piece in pieces if isinstance(piece.geometry, coal.BVHModelBase)]
     if meshes and len(meshes) < len(pieces):
         names = tuple(piece.name for piece in pieces)
@@ -69,9 +66,7 @@ def _encloses(outer: Any, inner: Any) -> bool:
         return False
     mesh = isinstance(inner.geometry, coal.BVHModelBase)
     points = np.array(inner.geometry.vertices()) if mesh else hull_points(inner.geometry)
-    if not len(points) or not np.isfinite(points).all():
-        return False
-    return bool(_depth(outer.geometry, points @ placement.rotation.T + placement.translation).min() >= -_ROUND_OFF)
+    return bool(_excess(outer.geometry, points @ placement.rotation.T + placement.translation).max() <= _ROUND_OFF)
 
 
 def _same(a: Any, b: Any) -> bool:
@@ -80,20 +75,16 @@ def _same(a: Any, b: Any) -> bool:
     return type(a.geometry) is type(b.geometry) and bool(a.geometry == b.geometry)
 
 
-def _depth(shape: Any, points: Array) -> Array:
-    """Return a lower bound on the depth of points (n, 3) inside a shape (n,) [m].
-
-    Negative outside.
-    """
-    if isinstance(shape, coal.Box):
-        return np.asarray((shape.halfSide - np.abs(points)).min(axis=1))
-    if isinstance(shape, coal.Sphere):
-        return np.asarray(shape.radius - np.linalg.norm(points, axis=1))
-    if isinstance(shape, coal.Ellipsoid):
-        scaled = np.linalg.norm(points / shape.radii, axis=1)
-        return np.asarray((1.0 - scaled) * np.min(shape.radii))
-    height_excess = np.abs(points[:, 2]) - shape.halfLength
-    radius = np.linalg.norm(points[:, :2], axis=1)
-    if isinstance(shape, coal.Cylinder):
-        return np.asarray(np.minimum(shape.radius - radius, -height_excess))
-    return np.asarray(shape.radius - np.hypot(radius, np.maximum(height_excess, 0.0)))
+def _excess(shape: Any, points: Array) -> Array:
+    """Return an upper bound on how far points (n, 3) stand out of a shape (n,) [m]; negative inside."""
+    radial, axial = np.linalg.norm(points[:, :2], axis=1), np.abs(points[:, 2])
+    match shape:
+        case coal.Box():
+            return np.asarray((np.abs(points) - shape.halfSide).max(axis=1))
+        case coal.Sphere():
+            return np.asarray(np.linalg.norm(points, axis=1) - shape.radius)
+        case coal.Ellipsoid():
+            return np.asarray((np.linalg.norm(points / shape.radii, axis=1) - 1.0) * np.min(shape.radii))
+        case coal.Cylinder():
+            return np.asarray(np.maximum(radial - shape.radius, axial - shape.halfLength))
+    return np.asarray(np.hypot(radial, np.maximum(axial - shape.halfLength, 0.0)) - shape.radius)

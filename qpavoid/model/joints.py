@@ -15,7 +15,7 @@ from qpavoid.model.kinematics import MIMIC, TRANSLATIONS
 from qpavoid.model.limits import JointBounds
 from qpavoid.model.notes import Note, NoteKind
 from qpavoid.model.pairs import pair_array
-from qpavoid.problem import Array, IntArray
+from qpavoid.problem import Array, IntArray, Mask
 
 _NO_LIMIT = 1e9
 """Speed [rad/s or m/s] or position [rad or m] from which a limit means that there is none, as files write it."""
@@ -32,32 +32,31 @@ def frame_index(model: Any, name: str) -> int:
 
 
 def joint_bounds(model: Any) -> JointBounds:
-    """Read the joint limits of a model, in tangent space.
-
-    A URDF has no fields for accelerations and jerks.
+    """Read the joint limits of a model, in tangent space; a URDF has none of accelerations and jerks.
 
     Only joints with one coordinate in q and v have position limits. A velocity limit of 0, and a range from 0 to 0,
     mean that the URDF gives none; see `joints_fixed_by_limits` of ranges that are meant, `assume_speeds` of velocities.
     """
     lower, upper = np.array(model.lowerPositionLimit), np.array(model.upperPositionLimit)
     lower[lower <= -_NO_LIMIT], upper[upper >= _NO_LIMIT] = -np.inf, np.inf
-    q_index, v_index = [], []
-    for joint in list(model.joints)[1:]:
-        low, high = lower[joint.idx_q], upper[joint.idx_q]
-        if joint.nq == joint.nv == 1 and np.isfinite([low, high]).any() and low < high:
-            q_index.append(joint.idx_q)
-            v_index.append(joint.idx_v)
-    q_indices = np.array(q_index, dtype=np.intp)
+    single = np.array([(j.idx_q, j.idx_v) for j in model.joints[1:] if j.nq == j.nv == 1], dtype=np.intp).reshape(-1, 2)
+    low, high = lower[single[:, 0]], upper[single[:, 0]]
+    limited = (np.isfinite(low) | np.isfinite(high)) & (low < high)
     velocity = np.array(model.velocityLimit)
     return JointBounds(
-        velocity=np.where((velocity > 0.0) & (velocity < _NO_LIMIT), velocity, np.inf),
-        q_index=q_indices,
-        v_index=np.array(v_index, dtype=np.intp),
-        lower=lower[q_indices],
-        upper=upper[q_indices],
+        velocity=np.where(_is_speed(velocity), velocity, np.inf),
+        q_index=single[limited, 0],
+        v_index=single[limited, 1],
+        lower=low[limited],
+        upper=high[limited],
         acceleration=np.full(model.nv, np.inf),
         jerk=np.full(model.nv, np.inf),
     )
+
+
+def _is_speed(velocity: Array) -> Mask:
+    """Return which velocity limits are ones."""
+    return np.asarray((velocity > 0.0) & (velocity < _NO_LIMIT))
 
 
 def set_limits(model: Any, limits: JointLimits, path: Path) -> None:
@@ -89,10 +88,7 @@ def set_limits(model: Any, limits: JointLimits, path: Path) -> None:
 
 
 def _set_speeds(model: Any, velocity: Array) -> None:
-    """Set the largest speeds (nv,) of both directions.
-
-    A URDF has one number, and Pinocchio reads it as both.
-    """
+    """Set the largest speeds (nv,), which are those of both directions in a URDF."""
     model.velocityLimit, model.lowerVelocityLimit = velocity, -velocity
 
 
@@ -110,9 +106,9 @@ def assume_speeds(model: Any, notes: list[Note]) -> None:
         notes: the joints are named in them.
     """
     velocity = np.array(model.velocityLimit)
-    has_limit = (velocity > 0.0) & (velocity < _NO_LIMIT)
+    has_limit = _is_speed(velocity)
     names: dict[str, list[str]] = {}
-    for name, joint in zip(list(model.names)[1:], list(model.joints)[1:], strict=True):
+    for name, joint in zip(model.names[1:], model.joints[1:], strict=True):
         part = slice(joint.idx_v, joint.idx_v + joint.nv)
         if joint.shortname() != MIMIC and not has_limit[part].all():
             metres = TRANSLATIONS.get(joint.shortname(), 0)
@@ -132,7 +128,7 @@ def find_joint(model: Any, name: str, where: str) -> Any:
         UnknownName: there is none; with the nearest one.
     """
     if not model.existJointName(name):
-        names = list(model.names)[1:]
+        names = model.names[1:]
         raise UnknownName(f"{where}: no joint {name!r}{nearest(name, names)}")
     return model.joints[model.getJointId(name)]
 
@@ -143,7 +139,7 @@ def middle_configuration(model: Any) -> Array:
     A bounded joint whose range leaves 0 out stands at the middle of its range.
     """
     q = pin.neutral(model)
-    for joint in list(model.joints)[1:]:
+    for joint in model.joints[1:]:
         lower, upper = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
         if joint.nq == 1 and not lower <= q[joint.idx_q] <= upper:
             q[joint.idx_q] = 0.5 * (lower + upper)
@@ -193,18 +189,15 @@ def _follows(model: Any, name: str) -> str:
 def remove_joints(
     model: Any, bodies: Any, joint_names: Sequence[str], q: Array, where: str
 ) -> tuple[Any, Any, IntArray]:
-    """Fix some joints where q has them.
-
-    Returns the smaller model and its bodies, and the indices in q of the remaining coordinates.
-    """
+    """Fix some joints where q has them: the smaller model, its bodies, and the indices in q that remain."""
     ids = [find_joint(model, name, where).id for name in joint_names]
     for joint, leader in zip(list(model.mimicking_joints), list(model.mimicked_joints), strict=True):
         if leader in ids and joint not in ids:
             ids.append(joint)
         elif joint in ids and leader not in ids:
             raise ConfigError(f"{where}: {_follows(model, model.names[joint])}; lock that one")
-    free_joints = [joint for joint in list(model.joints)[1:] if joint.id not in ids]
-    index = np.array([i for joint in free_joints for i in range(joint.idx_q, joint.idx_q + joint.nq)], dtype=np.intp)
+    kept = [range(joint.idx_q, joint.idx_q + joint.nq) for joint in model.joints[1:] if joint.id not in ids]
+    index = np.array([i for coordinates in kept for i in coordinates], dtype=np.intp)
     model, bodies = pin.buildReducedModel(model, bodies, ids, q)
     joints = [body.parentJoint for body in bodies.geometryObjects]
     for a, b in pair_array(bodies).tolist():

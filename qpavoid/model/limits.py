@@ -44,7 +44,10 @@ class JointBounds:
         Raises:
             ConfigError: a coordinate has a jerk limit, and none of its acceleration.
         """
-        acceleration, jerk = _or(self.acceleration, config.acceleration), _or(self.jerk, config.jerk)
+        acceleration, jerk = (
+            limits if default is None else np.where(np.isfinite(limits), limits, default)
+            for limits, default in ((self.acceleration, config.acceleration), (self.jerk, config.jerk))
+        )
         missing = np.isfinite(jerk) & np.isinf(acceleration)
         if missing.any():
             raise ConfigError(
@@ -59,9 +62,7 @@ class JointBounds:
         )
 
     def outside(self, q: Array, names: Sequence[str], units: Sequence[str]) -> tuple[Reason, ...]:
-        """List the coordinates outside their position limits.
-
-        The amount is negative below the lower limit.
+        """List the coordinates outside their position limits; the amount is negative below the lower one.
 
         Args:
             q: configuration (nq,).
@@ -75,11 +76,6 @@ class JointBounds:
             hint = "is it in degrees?" if abs(amount) > _TURN else ""
             reasons.append(Reason.of(ReasonKind.LIMIT_RECOVERY, names[j], amount=amount, unit=units[j], detail=hint))
         return tuple(reasons)
-
-
-def _or(limits: Array, default: float | None) -> Array:
-    """Return the limits (nv,) of a robot, with a default where it has none."""
-    return np.where(np.isfinite(limits), limits, np.inf if default is None else default)
 
 
 def limit_layout(joints: JointBounds, position_gain: float, dt: float) -> dict[str, Any]:
@@ -99,9 +95,7 @@ def limit_layout(joints: JointBounds, position_gain: float, dt: float) -> dict[s
         dt: control period [s].
     """
     nv = len(joints.velocity)
-    acceleration_limited, jerk_limited = (
-        bool(np.isfinite(limits).any()) for limits in (joints.acceleration, joints.jerk)
-    )
+    acceleration_limited = bool(np.isfinite(joints.acceleration).any())
     lower, upper = np.zeros(nv), np.zeros(nv)
     return {
         "q_index": joints.q_index,
@@ -121,15 +115,12 @@ def limit_layout(joints: JointBounds, position_gain: float, dt: float) -> dict[s
         "position_rate": position_gain / dt,
         "dt": dt,
         "acceleration_limited": acceleration_limited,
-        "jerk_limited": jerk_limited,
+        "jerk_limited": bool(np.isfinite(joints.jerk).any()),
     }
 
 
 def saturate(v: Array, lower: Array, upper: Array, v_max: Array) -> tuple[Array, float]:
-    """Scale, then clip a raw velocity to the limits.
-
-    First one factor for all joints, so that the direction is kept while only speeds are exceeded; then each joint
-    is clipped to what its position limit leaves.
+    """Scale a raw velocity to the speed limits, which keeps its direction, then clip each joint to its bounds.
 
     Args:
         v: raw velocity (nv,).

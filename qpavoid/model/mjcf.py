@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import warnings
 import xml.etree.ElementTree as ET
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,27 +11,52 @@ import coal
 import pinocchio as pin
 
 from qpavoid.errors import ConfigError
+from qpavoid.geometry.meshes import check_mesh
+from qpavoid.model.urdf_tree import check_counts, numbers_of
 
 _UNREAD = ("frame", "replicate", "composite", "flexcomp", "attach")
 """Elements of a worldbody that Pinocchio passes over, with the bodies, joints and geoms in them."""
-_ANEW = "save it as one plain file, for example with mj_saveLastXML"
+_PLAIN = "save it as one plain file, for example with mj_saveLastXML"
+_NUMBERS = {
+    "pos", "quat", "axis", "axisangle", "xyaxes", "zaxis", "euler", "range", "size", "fromto", "ref", "scale", "mass",
+    "diaginertia", "fullinertia", "vertex",
+}  # fmt: skip
+"""Attributes that are numbers, in every element that has them."""
 
 
-def model_of_mjcf(mjcf: Path, root: Any) -> Any:
+def check_mjcf(root: ET.Element) -> None:
+    """Check an MJCF for what Pinocchio passes over without a word.
+
+    Raises:
+        ValueError: naming the element, and a remedy.
+    """
+    if root.find(".//include") is not None:
+        raise ValueError(f"it has an <include>; {_PLAIN}")
+    for tag in _UNREAD:
+        if root.find(f"worldbody//{tag}") is not None:
+            raise ValueError(f"what is in a <{tag}> would be lost; {_PLAIN}")
+    bodies, joints, geoms = (len(root.findall(f"worldbody//{tag}")) for tag in ("body", "joint", "geom"))
+    check_counts(bodies, joints, geoms)
+    if not bodies:
+        raise ValueError("its worldbody has no body")
+    for element in root.iter():
+        for key in sorted(_NUMBERS.intersection(element.keys())):
+            numbers_of(element.get(key, ""), f"{element.tag} {key}={element.get(key)!r:.60}")
+
+
+def read_mjcf(mjcf: Path, root_joint: Any) -> Any:
     """Read the Pinocchio model of an MJCF.
 
     Args:
         mjcf: the file.
-        root: joint between the world and the root body, or None.
+        root_joint: joint between the world and the root body, or None.
     """
-    with warnings.catch_warnings():  # of a change of name that older versions do not have
-        warnings.simplefilter("ignore", DeprecationWarning)
-        if root is None:
-            return pin.buildModelFromMJCF(str(mjcf))
-        return pin.buildModelFromMJCF(str(mjcf), root, "root_joint")[0]
+    if root_joint is None:
+        return pin.buildModelFromMJCF(str(mjcf))
+    return pin.buildModelFromMJCF(str(mjcf), root_joint, "root_joint")[0]
 
 
-def shapes_of_mjcf(mjcf: Path, root: ET.Element, model: Any, visual: bool) -> Any:
+def read_geoms(mjcf: Path, root: ET.Element, model: Any, visual: bool) -> Any:
     """Read the geoms that collide, or the visual ones, into a geometry model.
 
     A geom collides if its contype or conaffinity is not 0.
@@ -50,41 +73,24 @@ def shapes_of_mjcf(mjcf: Path, root: ET.Element, model: Any, visual: bool) -> An
         ConfigError: a geom that Pinocchio does not read, or a plane that would move, naming the body.
     """
     geometries = {kind: pin.buildGeomFromMJCF(model, str(mjcf), kind) for kind in (pin.COLLISION, pin.VISUAL)}
-    _check_every_geom(mjcf, root, model, geometries.values())
-    geometry = geometries[pin.VISUAL if visual else pin.COLLISION]
-    for name in [piece.name for piece in geometry.geometryObjects if piece.parentFrame == 0]:
-        geometry.removeGeometryObject(name)
-    return geometry
-
-
-def check_elements(mjcf: Path, root: ET.Element) -> None:
-    """Check that an MJCF has no element that Pinocchio passes over.
-
-    Raises:
-        ConfigError: naming it.
-    """
-    for tag in _UNREAD:
-        if root.find(f"worldbody//{tag}") is not None:
-            raise ConfigError(f"{mjcf}: not a usable MJCF: what is in a <{tag}> would be lost; {_ANEW}")
-
-
-def _check_every_geom(mjcf: Path, root: ET.Element, model: Any, geometries: Any) -> None:
-    pieces = {
-        piece.name: piece for geometry in geometries for piece in geometry.geometryObjects if piece.parentFrame != 0
-    }
+    for geometry in geometries.values():
+        for name in [piece.name for piece in geometry.geometryObjects if piece.parentFrame == 0]:
+            geometry.removeGeometryObject(name)
+    pieces = {piece.name: piece for geometry in geometries.values() for piece in geometry.geometryObjects}
     counts = Counter(model.frames[piece.parentFrame].name for piece in pieces.values())
-    for body, count in _geoms(root):
-        if counts[body] < count:
+    for body in root.iterfind("worldbody//body"):
+        name, count = body.get("name", ""), len(body.findall("geom"))
+        if counts[name] < count:
             raise ConfigError(
-                f"{mjcf}: not a usable MJCF: body {body!r}: {counts[body]} of its {count} geoms can be read; give "
-                f"every body and geom a name of its own, or {_ANEW}"
+                f"{mjcf}: not a usable MJCF: body {name!r}: {counts[name]} of its {count} geoms can be read; give "
+                f"every body and geom a name of its own, or {_PLAIN}"
             )
     for piece in pieces.values():
-        if isinstance(piece.geometry, coal.Halfspace | coal.Plane):
-            raise ConfigError(f"{mjcf}: not a usable MJCF: geom {piece.name!r}: a plane that moves; make it a box")
-
-
-def _geoms(root: ET.Element) -> Iterator[tuple[str, int]]:
-    """Yield the name of every body and the number of its geoms."""
-    for body in root.iterfind("worldbody//body"):
-        yield body.get("name", ""), len(body.findall("geom"))
+        try:
+            if isinstance(piece.geometry, coal.Halfspace | coal.Plane):
+                raise ValueError("a plane that moves; make it a box")
+            if isinstance(piece.geometry, coal.BVHModelBase):
+                check_mesh(piece.geometry)
+        except ValueError as fault:
+            raise ConfigError(f"{mjcf}: not a usable MJCF: geom {piece.name!r}: {fault}") from None
+    return geometries[pin.VISUAL if visual else pin.COLLISION]

@@ -25,20 +25,19 @@ def note_implausible_sizes(model: Any, pieces: Any, notes: list[Note]) -> None:
         pieces: its geometry model.
         notes: they are added to these.
     """
+
+    def warn(kind: NoteKind, name: str, clause: str, remedy: str) -> None:
+        notes.append(Note(kind, (name,), clause, remedy, "warning"))
+
     for piece in pieces.geometryObjects:
-        if isinstance(piece.geometry, coal.Halfspace | coal.Plane):
-            continue
         size = float(np.max(2.0 * bounding_box(piece.geometry)[1]))
         mesh = isinstance(piece.geometry, coal.BVHModelBase)
-        kind, remedy = (NoteKind.MESH, _MILLIMETRES) if mesh else (NoteKind.SHAPE, "sizes are in metres")
         if size > _LARGEST:
-            notes.append(Note(kind, (piece.name,), f"is {size:.4g} m across", remedy, "warning"))
+            kind, remedy = (NoteKind.MESH, _MILLIMETRES) if mesh else (NoteKind.SHAPE, "sizes are in metres")
+            warn(kind, piece.name, f"is {size:.4g} m across", remedy)
         elif mesh and size < _SMALLEST:
-            clause = f"is {1000 * size:.3g} mm across"
-            notes.append(Note(kind, (piece.name,), clause, "if it is in metres take its scale out", "warning"))
-    placements = list(model.jointPlacements)
-    for joint, placement in zip(list(model.names)[1:], placements[1:], strict=True):
+            warn(NoteKind.MESH, piece.name, f"is {1000 * size:.3g} mm across", "if it is in metres take its scale out")
+    for joint, placement in zip(model.names[1:], model.jointPlacements[1:], strict=True):
         offset = float(np.linalg.norm(placement.translation))
         if offset > _LARGEST:
-            clause = f"stands {offset:.4g} m from the joint before it"
-            notes.append(Note(NoteKind.JOINT, (joint,), clause, "origins are in metres", "warning"))
+            warn(NoteKind.JOINT, joint, f"stands {offset:.4g} m from the joint before it", "origins are in metres")

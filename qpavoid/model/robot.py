@@ -87,8 +87,29 @@ class Robot:
             ConfigError, UnknownName: naming file, field and remedy.
         """
         path = find_robot(str(name_or_path), folder)
-        file_fields = read_mapping(path) if path.suffix in (".yaml", ".yml") else _fields_of_urdf(path)
-        config = validate({**file_fields, **fields}, RobotConfig, path)
+        if path.suffix not in (".yaml", ".yml"):
+            return cls.from_urdf(path, packages=packages, **fields)
+        return cls._from_fields({**read_mapping(path), **fields}, path, packages)
+
+    @classmethod
+    def from_urdf(cls, path: str | Path, *, packages: Mapping[str, str | Path] | None = None, **fields: Any) -> Robot:
+        """Build a robot from a bare URDF or MJCF.
+
+        Args:
+            path: the file.
+            packages: see `load`.
+            fields: any other field of a robot.yaml, such as `bodies="capsule"` or `root_joint="free_flyer"`.
+
+        Raises:
+            ConfigError, UnknownName: naming file, field and remedy.
+        """
+        path = Path(path)
+        bare = {"name": Path(path.name.removesuffix(".xacro")).stem, "urdf": path.name}
+        return cls._from_fields({**bare, **fields}, path, packages)
+
+    @classmethod
+    def _from_fields(cls, fields: dict[str, Any], path: Path, packages: Mapping[str, str | Path] | None) -> Robot:
+        config = validate(fields, RobotConfig, path)
         if packages:
             entries = [*(f"{name}={place}" for name, place in packages.items()), *config.package_dirs]
             config = config.model_copy(update={"package_dirs": entries})
@@ -105,21 +126,46 @@ class Robot:
         Raises:
             ConfigError, UnknownName: naming file, field and remedy.
         """
-        return _build(config, path)
-
-    @classmethod
-    def from_urdf(cls, path: str | Path, **fields: Any) -> Robot:
-        """Build a robot from a bare URDF or MJCF.
-
-        Args:
-            path: the file.
-            fields: any other field of a robot.yaml, such as `bodies="capsule"` or `root_joint="free_flyer"`.
-
-        Raises:
-            ConfigError, UnknownName: naming file, field and remedy.
-        """
-        path = Path(path)
-        return cls.from_config(validate({**_fields_of_urdf(path), **fields}, RobotConfig, path), path)
+        notes: list[Note] = []
+        urdf = find_resource(config.urdf, path.parent, f"{path}: urdf")
+        model = read_model(urdf, config.root_joint, notes)
+        ends = _end_effectors(model, config.end_effectors, path, notes)
+        bodies = robot_bodies(config, urdf, model, path, notes)
+        set_limits(model, config.limits, path)
+        home = set_joints(model, middle_configuration(model), config.home, f"{path}: home")
+        fixed = {**_fixed(urdf, config, notes), **config.lock}
+        home = set_joints(model, home, fixed, f"{path}: lock")
+        if fixed:
+            model, bodies, index = remove_joints(model, bodies, list(fixed), home, f"{path}: lock")
+            home = home[index]
+        if model.nv == 0:
+            raise ConfigError(
+                f"{path}: no joint of {urdf.name} moves; give at least one that is neither fixed nor locked"
+            )
+        assume_speeds(model, notes)
+        if bodies.ngeoms > _MAX_BODIES:
+            raise ConfigError(
+                f"{path}: {bodies.ngeoms} bodies; at most {_MAX_BODIES} are read: list fewer under `bodies`"
+            )
+        add_self_pairs(model, bodies, config.disabled_pairs, str(path))
+        if config.srdf is not None:
+            apply_srdf(model, bodies, find_resource(config.srdf, path.parent, f"{path}: srdf"))
+        always_touching = drop_always_touching(model, bodies, joint_bounds(model))
+        notes = merge_notes([*notes, *(pair.note() for pair in always_touching)])
+        issue_warning(notes, str(path))
+        return cls(
+            name=config.name,
+            model=model,
+            bodies=bodies,
+            home=home,
+            end_effectors=ends,
+            source=str(path),
+            always_touching=tuple(always_touching),
+            margins=pair_margins(config, bodies, path),
+            acceleration=config.limits.acceleration,
+            jerk=config.limits.jerk,
+            notes=tuple(notes),
+        )
 
     @property
     def joint_names(self) -> list[str]:
@@ -235,52 +281,6 @@ _MAX_BODIES = 300
 """Bodies of a robot, at most: the 45 000 pairs of 300 bodies take ten seconds to load. Humanoids have 112."""
 
 
-def _fields_of_urdf(path: Path) -> dict[str, Any]:
-    """Return the fields of the robot.yaml that a bare URDF or MJCF stands for."""
-    return {"name": Path(path.name.removesuffix(".xacro")).stem, "urdf": path.name}
-
-
-def _build(config: RobotConfig, path: Path) -> Robot:
-    notes: list[Note] = []
-    urdf = find_resource(config.urdf, path.parent, f"{path}: urdf")
-    model = read_model(urdf, config.root_joint, notes)
-    ends = _end_effectors(model, config.end_effectors, path, notes)
-    bodies = robot_bodies(config, urdf, model, path, notes)
-    set_limits(model, config.limits, path)
-    home = set_joints(model, middle_configuration(model), config.home, f"{path}: home")
-    fixed = {**_fixed(urdf, config, notes), **config.lock}
-    home = set_joints(model, home, fixed, f"{path}: lock")
-    if fixed:
-        model, bodies, index = remove_joints(model, bodies, list(fixed), home, f"{path}: lock")
-        home = home[index]
-    if model.nv == 0:
-        raise ConfigError(f"{path}: no joint of {urdf.name} moves; give at least one that is neither fixed nor locked")
-    assume_speeds(model, notes)
-    if len(bodies.geometryObjects) > _MAX_BODIES:
-        raise ConfigError(
-            f"{path}: {len(bodies.geometryObjects)} bodies; at most {_MAX_BODIES} are read: list fewer under `bodies`"
-        )
-    add_self_pairs(model, bodies, config.disabled_pairs, str(path))
-    if config.srdf is not None:
-        apply_srdf(model, bodies, find_resource(config.srdf, path.parent, f"{path}: srdf"))
-    always_touching = drop_always_touching(model, bodies, joint_bounds(model))
-    notes = merge_notes([*notes, *(pair.note() for pair in always_touching)])
-    issue_warning(notes, str(path))
-    return Robot(
-        config.name,
-        model,
-        bodies,
-        home,
-        ends,
-        str(path),
-        tuple(always_touching),
-        pair_margins(config, bodies, path),
-        config.limits.acceleration,
-        config.limits.jerk,
-        tuple(notes),
-    )
-
-
 def _end_effectors(model: Any, frames_of_config: Sequence[str], path: Path, notes: list[Note]) -> tuple[str, ...]:
     """Return the listed end effectors, or those at the ends of the limbs."""
     for name in frames_of_config:
@@ -295,20 +295,13 @@ def _end_effectors(model: Any, frames_of_config: Sequence[str], path: Path, note
 
 
 def _fixed(urdf: Path, config: RobotConfig, notes: list[Note]) -> dict[str, float]:
-    """Find the joints whose limits in the file leave no range, unless the robot.yaml gives one.
-
-    See `joints_fixed_by_limits`.
-    """
+    """Find the joints whose limits in the file leave no range (`joints_fixed_by_limits`) and that the config leaves."""
     if is_mjcf(urdf):
         return {}
-    fixed = {
-        name: value
-        for name, value in joints_fixed_by_limits(read_robot_xml(urdf, "URDF"), notes).items()
-        if name not in config.limits.position and name not in config.lock
-    }
+    fixed = joints_fixed_by_limits(read_robot_xml(urdf, "URDF"), notes)
+    fixed = {name: fixed[name] for name in fixed if name not in config.limits.position and name not in config.lock}
+    remedy = "give its range under `limits.position` if it moves"
     for name, value in fixed.items():
         clause = f"locked at {value:g}, which is its lower and its upper limit"
-        notes.append(
-            Note(NoteKind.JOINT, (name,), clause, "give its range under `limits.position` if it moves", "warning")
-        )
+        notes.append(Note(NoteKind.JOINT, (name,), clause, remedy, "warning"))
     return fixed

@@ -11,7 +11,7 @@ import pinocchio as pin
 
 from qpavoid.config import Body, Hull, RobotConfig
 from qpavoid.errors import ConfigError, UnknownName, nearest
-from qpavoid.geometry.bodies import check_meshes, convert_bodies, make_shape, triangle_meshes
+from qpavoid.geometry.bodies import convert_bodies, make_shape, triangle_meshes
 from qpavoid.model.joints import frame_index
 from qpavoid.model.notes import Note, NoteKind
 from qpavoid.model.packages import absolute_entries
@@ -45,7 +45,6 @@ def robot_bodies(config: RobotConfig, urdf: Path, model: Any, path: Path, notes:
         hulls = _hulls(config.bodies, lambda: read(True, []), path)  # what is not listed is left out on purpose
         return _listed_bodies(config.bodies, model, hulls, path)
     pieces = read(False, notes)
-    check_meshes(pieces, str(path))
     note_implausible_sizes(model, pieces, notes)
     bodies = convert_bodies(pieces, config.bodies)
     if meshes := triangle_meshes(bodies):
@@ -71,7 +70,6 @@ def _hulls(configs: Sequence[Body], read: Callable[[], Any], path: Path) -> dict
                 f"{path}: bodies.{index}.shape.geometry: no collision geometry {name!r}{nearest(name, pieces)}"
             )
         selection.addGeometryObject(pieces[name])
-    check_meshes(selection, str(path))
     return {hull.name: hull for hull in convert_bodies(selection, "convex").geometryObjects}
 
 

@@ -20,7 +20,7 @@ from qpavoid.model.kinematics import support_masks
 from qpavoid.model.pairs import pair_array
 from qpavoid.model.robot import Robot
 from qpavoid.model.solids import make_solids
-from qpavoid.model.trajectory import Motion, Sample, Still, build_motion
+from qpavoid.model.trajectory import Motion, Sample, build_motion, still
 from qpavoid.problem import Array, IntArray
 
 PARKING_DISTANCE = 1e4
@@ -77,7 +77,7 @@ class Obstacle:
         if off > NEARLY or np.linalg.det(sample.rotation) < 0.0:
             clause = "left-handed" if np.linalg.det(sample.rotation) < 0.0 else f"|RᵀR - I| is {off:.2g}"
             raise ConfigError(f"obstacle {name!r}: rotation: {clause}; give a rotation (3, 3)")
-        return cls(name, shape, Still(sample), moves=False, graspable=graspable, external=external)
+        return cls(name, shape, still(sample), moves=False, graspable=graspable, external=external)
 
 
 @dataclass(frozen=True)

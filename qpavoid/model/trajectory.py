@@ -1,13 +1,11 @@
-"""Off-line trajectories of targets and obstacles: pose and velocity of a body origin as functions of time.
+"""Trajectories of targets and obstacles that are known beforehand: pose and velocity as functions of time.
 
-Three kinds cover all: `Still` (fixed pose), `Polyline` (line, waypoints, CSV) and `Orbit` (circle). All that can
-be worked out beforehand is, because `sample` runs in the control loop.
+The formulas are those of `kernels.sample_pieces`, which a program's loop calls for all moving obstacles at once.
 """
 
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -18,13 +16,17 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
+from qpavoid import kernels
 from qpavoid.config import Circle, Csv, Fixed, Line, Waypoints
 from qpavoid.config import Motion as MotionConfig
 from qpavoid.config.base import LARGEST
 from qpavoid.errors import ConfigError, NumericalError, located
+from qpavoid.kernels import Pieces
 from qpavoid.model.csv_poses import read_poses
 from qpavoid.problem import Array, require_finite
 
+STATE = 18
+"""Numbers in the state of a body."""
 END_TOLERANCE = 1e-9
 """Time before its end at which a piece ends [s]: k·dt may be a rounding error less than the time it stands for."""
 
@@ -77,81 +79,34 @@ class Motion(Protocol):
         """Pose and velocity at t [s], at a corner of the next piece; NumericalError if t is NaN or inf."""
 
 
-@dataclass(frozen=True, slots=True)
-class Still:
-    """A pose that never changes."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """A motion in pieces: rest, straight lines with the shortest rotation in each, circles."""
 
-    pose: Sample
+    pieces: Pieces
+    """Those of one body."""
+    initial: Sample
+    """Pose at which it rests before anything begins."""
 
-    def sample(self, t: float) -> Sample:
-        """See `Motion.sample`."""
-        return self.pose
-
-
-@dataclass(frozen=True, slots=True)
-class Piece:
-    """Stretch from one waypoint to the next: x = x0 + s Δx, R = exp(s φ [a]) R0, s from 0 to 1."""
-
-    time: float  # of its start [s]
-    duration: float  # [s]
-    start: Sample  # x0 and R0, at rest
-    displacement: Array  # Δx (3,) [m]
-    angle: float  # φ in [0, π] [rad]; exactly 0 where the orientation stays
-    axis: Array  # unit a (3,)
-    turned: tuple[Array, Array]  # [a] R0, [a]² R0: Rodrigues' formula needs only their weighted sum
-
-
-@dataclass(frozen=True, slots=True)
-class Polyline:
-    """Straight pieces with the shortest turn in each; rest before the first waypoint and after the last."""
-
-    times: tuple[float, ...]  # of the waypoints [s], increasing
-    first: Sample
-    last: Sample
-    pieces: tuple[Piece, ...]  # one fewer than waypoints: a single waypoint is a pose that does not change
-    smooth: bool  # s = 10 τ³ - 15 τ⁴ + 6 τ⁵, rest to rest, instead of s = τ, the share of the piece's time
+    @property
+    def is_still(self) -> bool:
+        """True if the pose never changes."""
+        return len(self.pieces.starts) == 1
 
     def sample(self, t: float) -> Sample:
         """See `Motion.sample`."""
-        index = bisect_right(self.times, _finite(t) + END_TOLERANCE) - 1
-        if index < 0:
-            return self.first
-        if index >= len(self.pieces):
-            return self.last
-        piece = self.pieces[index]
-        s = max(0.0, (t - piece.time) / piece.duration)
-        rate = 1.0 / piece.duration
-        if self.smooth:
-            rate *= 30.0 * (s * (1.0 - s)) ** 2
-            s *= s * s * (10.0 + s * (6.0 * s - 15.0))
-        start = piece.start
-        position, linear = start.position + s * piece.displacement, rate * piece.displacement
-        if piece.angle == 0.0:
-            return Sample(position, start.rotation, linear, start.angular)
-        angle, (first_product, second_product) = s * piece.angle, piece.turned
-        rotation = start.rotation + math.sin(angle) * first_product + (1.0 - math.cos(angle)) * second_product
-        return Sample(position, rotation, linear, rate * piece.angle * piece.axis)
+        if self.is_still:
+            return self.initial
+        if not math.isfinite(t):
+            raise NumericalError(f"the time at which a motion is sampled is {t}")
+        states = np.empty((1, STATE))
+        kernels.sample_pieces(self.pieces, t, END_TOLERANCE, states)
+        return view_state(states[0])
 
 
-@dataclass(frozen=True, slots=True)
-class Orbit:
-    """Circle at constant speed from t = 0: x = c + u cos ωt + w sin ωt; rest before 0 and after `end`."""
-
-    center: Sample  # c, and the constant orientation; at rest
-    u: Array  # (3,) from the centre to the start [m]
-    w: Array  # (3,) from the centre to the place a quarter turn on [m]
-    omega: float  # ω [rad/s]
-    end: float  # [s]; infinite if it goes on for ever
-
-    def sample(self, t: float) -> Sample:
-        """See `Motion.sample`."""
-        early = _finite(t) + END_TOLERANCE
-        angle = self.omega * (max(t, 0.0) if early < self.end else self.end)
-        cos, sin = math.cos(angle), math.sin(angle)
-        center = self.center
-        moves = 0.0 <= early < self.end
-        linear = self.omega * (cos * self.w - sin * self.u) if moves else center.linear
-        return Sample(center.position + cos * self.u + sin * self.w, center.rotation, linear, center.angular)
+def view_state(state: Array) -> Sample:
+    """View the state of a body (18,) as a sample: rotation by columns, position, linear and angular velocity."""
+    return Sample(state[9:12], state[:9].reshape(3, 3).T, state[12:15], state[15:])
 
 
 def build_motion(config: MotionConfig, start: Sample | None = None, folder: Path = Path()) -> Motion:
@@ -170,7 +125,7 @@ def build_motion(config: MotionConfig, start: Sample | None = None, folder: Path
     match config:
         case Fixed():
             position = _position(config.position, start, "position")
-            return Still(Sample.at(position, _rotation(config.rpy, initial)))
+            return still(Sample.at(position, _rotation(config.rpy, initial)))
         case Line():
             return _line(config, start, _rotation(config.rpy, initial))
         case Waypoints():
@@ -178,7 +133,7 @@ def build_motion(config: MotionConfig, start: Sample | None = None, folder: Path
             rotations = same if config.rpys is None else [rpy_to_matrix(rpy) for rpy in config.rpys]
             return _polyline(config.times, config.positions, rotations, config.profile == "smooth")
         case Circle():
-            return _orbit(config, start, _rotation(config.rpy, initial))
+            return _circle(config, start, _rotation(config.rpy, initial))
         case Csv():
             poses = read_poses(folder / config.path, initial)
             with located(str(folder / config.path)):
@@ -194,28 +149,51 @@ def rpy_to_matrix(rpy: ArrayLike) -> Array:
     return matrix
 
 
-# --- one builder a kind -------------------------------------------------------------------------------------
+def still(pose: Sample) -> Trajectory:
+    """Make the motion of a body that stays at a pose."""
+    return _resting([pose], [])
+
+
+def _resting(poses: Sequence[Sample], starts: Sequence[float]) -> Trajectory:
+    """Make a motion of one more pieces than `starts`, in each of which it rests at a pose."""
+    count = len(poses)
+    clock, terms = np.zeros((count, 4)), np.zeros((count, 7, STATE))
+    clock[:, 1] = math.inf
+    for pose, term in zip(poses, terms[:, 0], strict=True):
+        view = view_state(term)
+        view.position[:], view.rotation[:] = pose.position, pose.rotation
+    bodies, first = np.zeros(1, dtype=np.intp), np.array([0, count], dtype=np.intp)
+    return Trajectory(Pieces(bodies, first, np.array([-math.inf, *starts]), clock, terms), poses[0])
 
 
 def _polyline(
     times: Sequence[float], positions: Sequence[ArrayLike], rotations: Sequence[Array], smooth: bool = False
-) -> Polyline:
+) -> Trajectory:
+    """Make straight lines with R = exp(s φ [a]) R0 = R0 + [a]² R0 + sin(sφ) [a] R0 - cos(sφ) [a]² R0 (Rodrigues).
+
+    It rests before the first waypoint and after the last.
+    """
     samples = [Sample.at(p, r) for p, r in zip(positions, rotations, strict=True)]
-    pieces = []
-    for (t0, a), (t1, b) in pairwise(zip(times, samples, strict=True)):
-        if not np.linalg.norm(b.position - a.position) <= LARGEST * (t1 - t0):
+    result = _resting([samples[0], *samples], times)
+    clock, terms = result.pieces.clock[1:-1], result.pieces.terms[1:-1]
+    for k, ((t0, a), (t1, b)) in enumerate(pairwise(zip(times, samples, strict=True))):
+        displacement = b.position - a.position
+        if not np.linalg.norm(displacement) <= LARGEST * (t1 - t0):
             raise ConfigError(f"motion: from t = {t0:g} to {t1:g} it moves faster than {LARGEST:g} m/s; give it time")
         turn = pin.AngleAxis(b.rotation @ a.rotation.T)
-        # Two roundings of the same orientation are no turn.
-        angle = turn.angle if turn.angle > 1e-12 else 0.0
-        axis = np.array(turn.axis)
-        first_product = pin.skew(axis) @ a.rotation
-        turned = (first_product, pin.skew(axis) @ first_product)
-        pieces.append(Piece(t0, t1 - t0, a, b.position - a.position, angle, axis, turned))
-    return Polyline(tuple(times), samples[0], samples[-1], tuple(pieces), smooth)
+        angle = turn.angle if turn.angle > 1e-12 else 0.0  # two roundings of the same orientation are no turn
+        clock[k] = t0, t1 - t0, angle, smooth
+        terms[k, 1, 9:12] = terms[k, 4, 12:15] = displacement
+        if angle > 0.0:
+            once = pin.skew(turn.axis) @ a.rotation
+            twice = pin.skew(turn.axis) @ once
+            terms[k, 0, :9] += twice.T.ravel()
+            terms[k, 2, :9], terms[k, 3, :9] = once.T.ravel(), -twice.T.ravel()
+            terms[k, 4, 15:] = angle * turn.axis
+    return result
 
 
-def _line(config: Line, start: Sample | None, rotation: Array) -> Polyline:
+def _line(config: Line, start: Sample | None, rotation: Array) -> Trajectory:
     begin = _position(config.start, start, "start")
     field = "displacement" if config.end is None else "end"
     end = begin + np.array(config.displacement) if config.end is None else np.array(config.end)
@@ -226,22 +204,30 @@ def _line(config: Line, start: Sample | None, rotation: Array) -> Polyline:
     return _polyline(times, [begin, end], [rotation, rotation], config.profile == "smooth")
 
 
-def _orbit(config: Circle, start: Sample | None, rotation: Array) -> Orbit:
+def _circle(config: Circle, start: Sample | None, rotation: Array) -> Trajectory:
+    """Make a circle at constant speed from t = 0: x = c + u cos ωt + w sin ωt; rest before 0 and after its turns."""
     normal = _direction(config.normal, "normal")
     direction = _direction(config.start_direction, "start_direction")
     in_plane = direction - (direction @ normal) * normal
     if np.linalg.norm(in_plane) < 1e-6:
         raise ConfigError("motion.start_direction is parallel to motion.normal; give one across it")
     u = config.radius * in_plane / np.linalg.norm(in_plane)
+    w = np.cross(normal, u)
     center = _position(None, start, "center") - u if config.center is None else np.array(config.center)
     omega = 2.0 * math.pi / config.period
     if omega * max(1.0, config.radius) > LARGEST:
         raise ConfigError(f"motion.period = {config.period:g}: faster than {LARGEST:g} m/s or rad/s; give it time")
-    end = math.inf if config.turns is None else config.turns * config.period
-    return Orbit(Sample.at(center, rotation), u, np.asarray(np.cross(normal, u), dtype=np.float64), omega, end)
-
-
-# --- small checks and conversions ---------------------------------------------------------------------------
+    poses, starts = [Sample.at(center + u, rotation), Sample.at(center, rotation)], [0.0]
+    if config.turns is not None:
+        angle = 2.0 * math.pi * config.turns
+        poses.append(Sample.at(center + math.cos(angle) * u + math.sin(angle) * w, rotation))
+        starts.append(config.turns * config.period)
+    result = _resting(poses, starts)
+    result.pieces.clock[1] = 0.0, 1.0, omega, 0.0
+    terms = result.pieces.terms[1]
+    terms[2, 9:12] = terms[6, 12:15] = w
+    terms[3, 9:12], terms[5, 12:15] = u, -u
+    return result
 
 
 def _position(value: tuple[float, float, float] | None, start: Sample | None, field: str) -> Array:
@@ -268,9 +254,3 @@ def _checked(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
     array = np.array(require_finite(name, value, shape))
     array.setflags(write=False)  # samples of one motion share it
     return array
-
-
-def _finite(t: float) -> float:
-    if not math.isfinite(t):
-        raise NumericalError(f"the time at which a motion is sampled is {t}")
-    return t

@@ -6,8 +6,9 @@ import os
 import sys
 import tempfile
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +17,10 @@ import pinocchio as pin
 from qpavoid.config.shipped import EXAMPLES, example_robot
 from qpavoid.errors import ConfigError
 from qpavoid.model.enclosed_shapes import remove_enclosed
-from qpavoid.model.mjcf import check_elements, model_of_mjcf, shapes_of_mjcf
+from qpavoid.model.mjcf import check_mjcf, read_geoms, read_mjcf
 from qpavoid.model.notes import Note, NoteKind
 from qpavoid.model.packages import mesh_folders
-from qpavoid.model.urdf_check import check_mjcf, check_urdf
-from qpavoid.model.urdf_shapes import MISSING, Meshes, links_with_shapes, read_shapes
+from qpavoid.model.urdf_shapes import MISSING, ShapeReader
 from qpavoid.model.urdf_tree import tree_xml
 from qpavoid.model.xml_file import read_robot_xml, undeclared_prefixes
 
@@ -49,29 +49,13 @@ def find_resource(value: str, folder: Path, where: str) -> Path:
     return result
 
 
-@contextmanager
-def _quiet_stderr() -> Iterator[list[str]]:
-    """Catch what C++ parsers print on the process's error stream.
-
-    One line of an error can then say it instead.
-    """
-    lines: list[str] = []
-    sys.stderr.flush()
-    stderr_copy = os.dup(2)
-    with tempfile.TemporaryFile() as file:
-        os.dup2(file.fileno(), 2)
-        try:
-            yield lines
-        finally:
-            os.dup2(stderr_copy, 2)
-            os.close(stderr_copy)
-            file.seek(0)
-            lines += file.read().decode(errors="replace").splitlines()
-
-
 def is_mjcf(path: Path) -> bool:
     """Return True if a robot's file is an MJCF, by its name."""
     return path.suffix == ".xml"
+
+
+def _root(path: Path) -> ET.Element:
+    return read_robot_xml(path, "MJCF" if is_mjcf(path) else "URDF")
 
 
 def read_model(urdf: Path, root_joint: str, notes: list[Note] | None = None) -> Any:
@@ -89,28 +73,18 @@ def read_model(urdf: Path, root_joint: str, notes: list[Note] | None = None) -> 
         ConfigError: not a usable file, with the parser's own reason, or one that it passes over.
     """
     notes = [] if notes is None else notes
-    kind = "MJCF" if is_mjcf(urdf) else "URDF"
-    root = _ROOT_JOINTS[root_joint]()
-    xml = read_robot_xml(urdf, kind)
-    if kind == "MJCF":
-        check_mjcf(urdf)
-        check_elements(urdf, xml)
-    else:
-        check_urdf(urdf)
-        _name_prefixes(xml, notes)
-    model, reason = None, ""
-    with _quiet_stderr() as messages:
-        try:
-            model = model_of_mjcf(urdf, root) if kind == "MJCF" else _model_of_urdf(tree_xml(xml, notes), root, notes)
-        except (ValueError, RuntimeError, IndexError) as error:
-            reason = _reason(error)
-    first = next((line.split(":", 1)[1].strip() for line in messages if line.startswith("Error:")), "")
-    if model is None or first:
-        raise ConfigError(f"{urdf}: not a usable {kind}: {first or reason}")
-    for link in xml.findall("link"):
-        if not model.existFrame(link.get("name", ""), pin.BODY):
-            raise ConfigError(f"{urdf}: not a usable {kind}: link {link.get('name')!r} was lost by the parser")
-    return model
+    xml, root = _root(urdf), _ROOT_JOINTS[root_joint]()
+    where = f"{urdf}: not a usable {'MJCF' if is_mjcf(urdf) else 'URDF'}"
+    try:
+        if is_mjcf(urdf):
+            check_mjcf(xml)
+            build = partial(read_mjcf, urdf, root)
+        else:
+            _name_prefixes(xml, notes)
+            build = partial(_model_of_urdf, tree_xml(xml, notes), root, notes)
+    except ValueError as fault:
+        raise ConfigError(f"{where}: {fault}") from None
+    return _parsed(build, where)
 
 
 def _name_prefixes(root: ET.Element, notes: list[Note]) -> None:
@@ -120,28 +94,58 @@ def _name_prefixes(root: ET.Element, notes: list[Note]) -> None:
         notes.append(Note(NoteKind.FILE, tuple(prefixes), clause, remedy, "warning"))
 
 
-def _model_of_urdf(xml: str, root: Any, notes: list[Note]) -> Any:
-    arguments = (xml,) if root is None else (xml, root)
+def _model_of_urdf(tree: str, root: Any, notes: list[Note]) -> Any:
+    arguments = (tree,) if root is None else (tree, root)
     try:
         return pin.buildModelFromXML(*arguments, mimic=True)
     except (ValueError, RuntimeError) as error:
         reason = _reason(error)
     model = pin.buildModelFromXML(*arguments, mimic=False)
-    joints = tuple(joint.get("name", "") for joint in ET.fromstring(xml).iterfind("joint") if _mimics(joint))
+    joints = tuple(
+        joint.get("name", "") for joint in ET.fromstring(tree).iterfind("joint[mimic]") if joint.get("type") != "fixed"
+    )
     clause = f"should follow others (mimic), and move on their own: {reason[-120:]}"
     notes.append(Note(NoteKind.JOINT, joints, clause, "hold them under `lock`", "warning"))
     return model
 
 
-def _mimics(joint: ET.Element) -> bool:
-    return joint.find("mimic") is not None and joint.get("type") != "fixed"
+def _parsed(parse: Callable[[], Any], where: str, remedy: str = "") -> Any:
+    """Return what a C++ parser makes of a file; what it prints on the process's error stream is caught.
+
+    Raises:
+        ConfigError: it raises an error, or prints one; in one line.
+    """
+    result, reason = None, ""
+    with _quiet_stderr() as messages:
+        try:
+            result = parse()
+        except (ValueError, RuntimeError, IndexError) as error:
+            reason = _reason(error)
+    reason = next((line.split(":", 1)[1].strip() for line in messages if line.startswith("Error:")), reason)
+    if reason:
+        raise ConfigError(f"{where}: {reason}{remedy}")
+    return result
+
+
+@contextmanager
+def _quiet_stderr() -> Iterator[list[str]]:
+    """Catch the lines that are printed on the process's error stream."""
+    lines: list[str] = []
+    sys.stderr.flush()
+    stderr_copy = os.dup(2)
+    with tempfile.TemporaryFile() as file:
+        os.dup2(file.fileno(), 2)
+        try:
+            yield lines
+        finally:
+            os.dup2(stderr_copy, 2)
+            os.close(stderr_copy)
+            file.seek(0)
+            lines += file.read().decode(errors="replace").splitlines()
 
 
 def _reason(error: Exception) -> str:
-    """Return the last part of a message of Pinocchio's.
-
-    What precedes it is a place in its own source.
-    """
+    """Return the last part of a message of Pinocchio's, which begins with a place in its own source."""
     if isinstance(error, IndexError):  # of a look-up in C++, without a name
         return "it refers to a class, mesh or other name that it does not define"
     return " ".join(str(error).split()).rpartition("message: ")[2].rstrip(".")
@@ -158,9 +162,10 @@ def read_pieces(
     allow_missing: bool = False,
     enclosed: bool = False,
 ) -> Any:
-    """Read the collision geometry of a URDF or MJCF; visual geometry of links without any.
+    """Read the collision geometry of a URDF or MJCF, meshes as they are; visual geometry of links without any.
 
-    A shape that lies inside another one of its link is left out: nothing can touch it.
+    A shape that lies inside another one of its link is left out: nothing can touch it. So is what an MJCF fixes to its
+    world (a floor), which is no part of the robot.
 
     Args:
         urdf: the file.
@@ -175,73 +180,28 @@ def read_pieces(
     Raises:
         ConfigError: a shape that cannot be read or found.
     """
-    notes = [] if notes is None else notes
-    pieces = read_collision(urdf, model, package_dirs, path, notes=notes, allow_missing=allow_missing)
+    notes, root = [] if notes is None else notes, _root(urdf)
+    folders = [] if is_mjcf(urdf) else mesh_folders(urdf, package_dirs)
+
+    def read(tag: str, skipped: set[int], allow_faults: bool = False) -> Any:
+        if is_mjcf(urdf):
+            return read_geoms(urdf, root, model, tag == "visual")
+        return ShapeReader(model, folders, str(path), notes, allow_missing, allow_faults).read(root, tag, skipped)
+
+    where, remedy = f"{path}: {urdf.name}", f"; {MISSING}"
+    pieces = _parsed(lambda: read("collision", set()), where, remedy)
     if visuals:
-        _add_visuals(pieces, urdf, model, package_dirs, path, notes, allow_missing)
+        with_collision = {piece.parentFrame for piece in pieces.geometryObjects}
+        shapes = _parsed(lambda: read("visual", with_collision, bool(with_collision)), where, remedy).geometryObjects
+        added = [piece for piece in shapes if piece.parentFrame not in with_collision]
+        for piece in added:
+            pieces.addGeometryObject(piece)
+        if added:
+            names = tuple(dict.fromkeys(model.frames[piece.parentFrame].name for piece in added))
+            clause = "no collision shape: what is meant to be seen of it serves instead"
+            remedy = "list bodies of your own, or set `visuals: false` where nothing can be hit"
+            notes.append(Note(NoteKind.LINK, names, clause, remedy, "warning"))
     return pieces if enclosed else remove_enclosed(pieces, notes)
-
-
-def _add_visuals(
-    pieces: Any, urdf: Path, model: Any, package_dirs: Sequence[str], path: Path, notes: list[Note], allow_missing: bool
-) -> None:
-    """Add the visual geometry of the links that have no collision geometry."""
-    links_with_collision = {piece.parentFrame for piece in pieces.geometryObjects}
-    if is_mjcf(urdf):
-        visual_model = read_collision(urdf, model, package_dirs, path, visual=True)
-        result = [piece for piece in visual_model.geometryObjects if piece.parentFrame not in links_with_collision]
-    else:
-        root = read_robot_xml(urdf, "URDF")
-        visual_links = links_with_shapes(root, "visual")
-        links = [link for link in visual_links if model.getFrameId(link, pin.BODY) not in links_with_collision]
-        meshes = Meshes(mesh_folders(urdf, package_dirs), str(path), allow_missing, bool(links_with_collision))
-        with _quiet_stderr():
-            result = list(read_shapes(root, model, meshes, "visual", links, notes).geometryObjects)
-    for piece in result:
-        pieces.addGeometryObject(piece)
-    if result:
-        names = tuple(dict.fromkeys(model.frames[piece.parentFrame].name for piece in result))
-        clause = "no collision shape: what is meant to be seen of it serves instead"
-        remedy = "list bodies of your own, or set `visuals: false` where nothing can be hit"
-        notes.append(Note(NoteKind.LINK, names, clause, remedy, "warning"))
-
-
-def read_collision(
-    urdf: Path,
-    model: Any,
-    package_dirs: Sequence[str],
-    path: Path,
-    visual: bool = False,
-    notes: list[Note] | None = None,
-    allow_missing: bool = False,
-) -> Any:
-    """Read the collision geometry of a URDF or MJCF, meshes as they are.
-
-    What an MJCF fixes to its world (a floor) is no part of the robot and left out.
-
-    Args:
-        urdf: the file.
-        model: its model.
-        package_dirs: folders to look for meshes in first, and `NAME=FOLDER`; see `mesh_folders`.
-        path: file to name in errors.
-        visual: whether visual geometry is read instead.
-        notes: what was left out or mended is added to them.
-        allow_missing: whether shapes whose meshes are missing are left out.
-
-    Raises:
-        ConfigError: a shape that cannot be read or found.
-    """
-    notes = [] if notes is None else notes
-    root = read_robot_xml(urdf, "MJCF" if is_mjcf(urdf) else "URDF")
-    with _quiet_stderr():
-        if not is_mjcf(urdf):
-            meshes = Meshes(mesh_folders(urdf, package_dirs), str(path), allow_missing)
-            return read_shapes(root, model, meshes, "visual" if visual else "collision", None, notes)
-        try:
-            return shapes_of_mjcf(urdf, root, model, visual)
-        except (ValueError, RuntimeError, IndexError) as error:
-            reason = _reason(error)
-    raise ConfigError(f"{path}: {urdf.name}: {reason}; {MISSING}")
 
 
 def mesh_names(urdf: Path, tag: str = "") -> list[str]:
@@ -251,10 +211,8 @@ def mesh_names(urdf: Path, tag: str = "") -> list[str]:
         urdf: the file.
         tag: `collision` or `visual` for those of a URDF alone.
     """
-    mjcf = is_mjcf(urdf)
-    root = read_robot_xml(urdf, "MJCF" if mjcf else "URDF")
-    meshes = root.iterfind(f".//{tag}//mesh" if tag and not mjcf else ".//mesh")
-    names = (mesh.get("file" if mjcf else "filename", "") for mesh in meshes)
+    meshes = _root(urdf).iterfind(f".//{tag}//mesh" if tag and not is_mjcf(urdf) else ".//mesh")
+    names = (mesh.get("file" if is_mjcf(urdf) else "filename", "") for mesh in meshes)
     return list(dict.fromkeys(name for name in names if name))
 
 
@@ -270,10 +228,4 @@ def apply_srdf(model: Any, bodies: Any, srdf: Path) -> None:
         ConfigError: not a usable SRDF.
     """
     read_robot_xml(srdf, "SRDF")
-    with _quiet_stderr():
-        try:
-            pin.removeCollisionPairs(model, bodies, str(srdf), False)
-            return
-        except (ValueError, RuntimeError) as error:
-            reason = _reason(error)
-    raise ConfigError(f"{srdf}: not a usable SRDF: {reason}")
+    _parsed(lambda: pin.removeCollisionPairs(model, bodies, str(srdf), False), f"{srdf}: not a usable SRDF")

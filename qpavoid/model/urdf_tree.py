@@ -1,4 +1,4 @@
-"""Links and joints of a URDF as Pinocchio is given them: faults mended and named, and no shapes."""
+"""Links and joints of a URDF: checked, and written as Pinocchio is given them, with faults mended and named."""
 
 from __future__ import annotations
 
@@ -10,12 +10,17 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from qpavoid.config.base import LARGEST
+from qpavoid.errors import nearest
 from qpavoid.model.notes import Note, NoteKind
 from qpavoid.model.trajectory import rpy_to_matrix
-from qpavoid.model.urdf_check import floats
 
+_MOST_LINKS, _MOST_MOVING, _MOST_SHAPES = 1000, 200, 300
+"""Humanoids have 130, 101 and 112. Parsers recurse along a chain; memory grows with the cube of the joints that move,
+and the pairs with the square of the shapes."""
 _LIMITED = ("revolute", "prismatic")
 """Types of joints that have a range."""
+_WITH_AXIS = (*_LIMITED, "continuous", "planar")
 _INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
@@ -23,21 +28,41 @@ def tree_xml(root: ET.Element, notes: list[Note]) -> str:
     """Write a URDF without shapes, materials and elements of other tools.
 
     The parser behind Pinocchio leaves a link at its first fault, whatever comes after it in the link: of an inertial, a
-    visual, a collision. Shapes are therefore read apart from it (`read_shapes`).
+    visual, a collision. Shapes are therefore read apart from it (`ShapeReader`).
 
     Args:
-        root: of the file, which `check_urdf` has passed.
+        root: of the file.
         notes: what was mended is added to them.
 
     Raises:
-        ValueError: an origin or an axis of another number of numbers than it needs, naming the joint.
+        ValueError: no tree of links, or an origin, axis or limit that is none, naming link or joint, element and
+            remedy.
     """
+    links, joints = _named(root, "link"), _named(root, "joint")
+    moving = [joint for joint in joints.values() if joint.get("type") != "fixed"]
+    check_counts(len(links), len(moving), len(root.findall("link/collision")))
+    _check_tree(links, joints)
     robot = ET.Element("robot", name=root.get("name") or "robot")
-    for link in root.findall("link"):
+    for link in links.values():
         _add_link(robot, link, notes)
-    for joint in root.findall("joint"):
+    for joint in joints.values():
         _add_joint(robot, joint, notes)
     return ET.tostring(robot, encoding="unicode")
+
+
+def check_counts(links: int, moving: int, shapes: int) -> None:
+    """Check that a file has no more links, joints that move and collision shapes than can be worked with.
+
+    Raises:
+        ValueError: it has, with the numbers.
+    """
+    for count, most, noun in (
+        (links, _MOST_LINKS, "links"),
+        (moving, _MOST_MOVING, "joints that move"),
+        (shapes, _MOST_SHAPES, "collision shapes"),
+    ):
+        if count > most:
+            raise ValueError(f"{count} {noun}; at most {most} are read")
 
 
 def origin(element: ET.Element, where: str) -> Any:
@@ -49,19 +74,25 @@ def origin(element: ET.Element, where: str) -> Any:
     child = element.find("origin")
     if child is None:
         return pin.SE3.Identity()
-    position = vector(child, "xyz", 3, where, (0.0, 0.0, 0.0))
+    position = np.array(vector(child, "xyz", 3, where, (0.0, 0.0, 0.0)))
     if child.get("quat_xyzw") is None:
-        roll, pitch, yaw = vector(child, "rpy", 3, where, (0.0, 0.0, 0.0))
-        return pin.SE3(rpy_to_matrix((roll, pitch, yaw)), np.array(position))
+        return pin.SE3(rpy_to_matrix(vector(child, "rpy", 3, where, (0.0, 0.0, 0.0))), position)
     if child.get("rpy") is not None:
         raise ValueError(f"{where}: origin has both rpy and quat_xyzw; give one")
-    quaternion = np.array(vector(child, "quat_xyzw", 4, where, ()))
+    quaternion = np.array(vector(child, "quat_xyzw", 4, where))
     if np.linalg.norm(quaternion) < 1e-6:
         raise ValueError(f"{where}: origin quat_xyzw={child.get('quat_xyzw')!r} has no length")
-    return pin.SE3(pin.Quaternion(quaternion / np.linalg.norm(quaternion)), np.array(position))
+    return pin.SE3(pin.Quaternion(quaternion / np.linalg.norm(quaternion)), position)
 
 
-def vector(element: ET.Element, attribute: str, size: int, where: str, default: Sequence[float]) -> list[float]:
+def vector(
+    element: ET.Element,
+    attribute: str,
+    size: int,
+    where: str,
+    default: Sequence[float] | None = None,
+    largest: float = LARGEST,
+) -> list[float]:
     """Read the numbers of an attribute.
 
     Args:
@@ -69,20 +100,40 @@ def vector(element: ET.Element, attribute: str, size: int, where: str, default: 
         attribute: its name.
         size: how many numbers there must be.
         where: what to name in errors.
-        default: numbers where the attribute is left out; nothing where it must not be.
+        default: numbers where the attribute is left out; None where it must not be.
+        largest: amount that none may exceed.
 
     Raises:
-        ValueError: missing, not numbers, or another number of them.
+        ValueError: missing, not finite numbers, too large, or another number of them.
     """
     text = element.get(attribute)
-    place = f"{where}: {element.tag} {attribute}"
     if text is None:
-        if default:
+        if default is not None:
             return list(default)
-        raise ValueError(f"{place} is missing; give it {size} number{'s' * (size > 1)}")
-    numbers = list(floats(text, f"{place}={text!r}"))
+        raise ValueError(f"{where}: {element.tag} {attribute} is missing; give it {size} number{'s' * (size > 1)}")
+    place = f"{where}: {element.tag} {attribute}={text!r}"
+    numbers = numbers_of(text, place, largest)
     if len(numbers) != size:
-        raise ValueError(f"{place}={text!r}: {len(numbers)} numbers; give {size}")
+        raise ValueError(f"{place}: {len(numbers)} numbers; give {size}")
+    return numbers
+
+
+def numbers_of(text: str, where: str, largest: float = LARGEST) -> list[float]:
+    """Read the numbers of a text.
+
+    Raises:
+        ValueError: one that is no finite number, or too large.
+    """
+    numbers = []
+    for word in text.split():
+        try:
+            numbers.append(float(word))
+        except ValueError:
+            raise ValueError(f"{where}: {word!r} is not a number") from None
+        if not math.isfinite(numbers[-1]):
+            raise ValueError(f"{where}: must be finite")
+        if abs(numbers[-1]) > largest:
+            raise ValueError(f"{where}: must be at most {largest:g}")
     return numbers
 
 
@@ -96,11 +147,12 @@ def joints_fixed_by_limits(root: ET.Element, notes: list[Note]) -> dict[str, flo
         root: of the file.
         notes: ranges that say nothing are named in them.
     """
-    ranges = {}
-    for joint in root.findall("joint"):
-        limit = joint.find("limit")
-        if joint.get("type") in _LIMITED and limit is not None and joint.find("mimic") is None:
-            ranges[joint.get("name", "")] = _range(limit)
+    ranges = {
+        joint.get("name", ""): _range(_limit_values(limit, ""))
+        for joint in root.findall("joint")
+        for limit in joint.findall("limit")[:1]
+        if joint.get("type") in _LIMITED and joint.find("mimic") is None
+    }
     if all(limits in (None, (0.0, 0.0)) for limits in ranges.values()):
         if empty := tuple(name for name, limits in ranges.items() if limits is not None):
             clause = "every range of the file is [0, 0], which says nothing: they move without position limits"
@@ -109,46 +161,75 @@ def joints_fixed_by_limits(root: ET.Element, notes: list[Note]) -> dict[str, flo
     return {name: limits[0] for name, limits in ranges.items() if limits is not None and limits[0] == limits[1]}
 
 
-def _range(limit: ET.Element) -> tuple[float, float] | None:
-    """Read the lower and upper limit, 0 where one is left out; None where both are."""
-    if limit.get("lower") is None and limit.get("upper") is None:
-        return None
-    lower, upper = (next(floats(limit.get(side, ""), f"limit {side}"), 0.0) for side in ("lower", "upper"))
-    return lower, upper
+def _named(root: ET.Element, tag: str) -> dict[str, ET.Element]:
+    result: dict[str, ET.Element] = {}
+    for element in root.findall(tag):
+        name = element.get("name")
+        if not name:
+            raise ValueError(f"a {tag} has no name; give it one")
+        if name in result:
+            raise ValueError(f"{tag} {name!r} is given twice; names must differ")
+        result[name] = element
+    return result
+
+
+def _check_tree(links: dict[str, ET.Element], joints: dict[str, ET.Element]) -> None:
+    """Check that every link but one has one joint above it, and that all form one tree."""
+    above: dict[str, str] = {}
+    for name, joint in joints.items():
+        ends = []
+        for tag in ("parent", "child"):
+            link = next((element.get("link") for element in joint.findall(tag)), None)
+            if link is None:
+                raise ValueError(f"joint {name!r}: <{tag} link=…> is missing")
+            if link not in links:
+                raise ValueError(f"joint {name!r}: {tag}: no link {link!r}{nearest(link, links)}")
+            ends.append(link)
+        parent, child = ends
+        if child in above:
+            raise ValueError(f"joint {name!r}: link {child!r} already hangs from {above[child]!r}; give it one parent")
+        above[child] = parent
+    roots = [name for name in links if name not in above]
+    if not links:
+        raise ValueError("it has no link")
+    if len(roots) > 1:
+        raise ValueError(f"links {roots[0]!r} and {roots[1]!r} hang from no joint; join them, a robot is one tree")
+    for start in links:
+        name, steps = start, 0
+        while name in above:
+            name, steps = above[name], steps + 1
+            if steps > len(links):
+                raise ValueError(f"link {start!r} hangs from a cycle of joints; a robot is a tree")
 
 
 def _add_link(robot: ET.Element, link: ET.Element, notes: list[Note]) -> None:
-    name = link.get("name", "")
+    """Add a link with its inertial; what cannot be read of that is left out and named."""
+    name, inertial = link.get("name", ""), link.find("inertial")
     element = ET.SubElement(robot, "link", name=name)
-    inertial = link.find("inertial")
     if inertial is None:
         return
+    clause, moments = "its inertial is left out", [0.0] * len(_INERTIA)
     try:
-        placement = origin(inertial, f"link {name!r}: inertial")
-        mass = vector(_child(inertial, "mass"), "value", 1, "inertial", ())[0]
+        placement = origin(inertial, "inertial")
+        mass = vector(_child(inertial, "mass"), "value", 1, "inertial")[0]
+        clause = "its mass counts as a point's"
+        inertia = _child(inertial, "inertia")
+        moments = [vector(inertia, moment, 1, "inertial")[0] for moment in _INERTIA]
     except ValueError as fault:
-        clause = f"its inertial is left out: {str(fault).removeprefix(f'link {name!r}: ')}"
+        clause += f": {str(fault).removeprefix('inertial: ')}"
         notes.append(Note(NoteKind.LINK, (name,), clause, "none is needed unless torques are asked for"))
-        return
-    inertia = inertial.find("inertia")
-    try:
-        if inertia is None:
-            raise ValueError("inertia is missing")
-        moments = [vector(inertia, moment, 1, "inertial", ())[0] for moment in _INERTIA]
-    except ValueError as fault:
-        clause = f"its mass counts as a point's: {str(fault).removeprefix('inertial: ')}"
-        notes.append(Note(NoteKind.LINK, (name,), clause, "none is needed unless torques are asked for"))
-        moments = [0.0] * len(_INERTIA)
-    inertial_copy = ET.SubElement(element, "inertial")
-    _add_origin(inertial_copy, inertial, placement)
-    ET.SubElement(inertial_copy, "mass", value=repr(mass))
-    ET.SubElement(inertial_copy, "inertia", dict(zip(_INERTIA, map(repr, moments), strict=True)))
+        if clause.startswith("its inertial"):
+            return
+    part = ET.SubElement(element, "inertial")
+    _add_origin(part, inertial, placement)
+    ET.SubElement(part, "mass", value=repr(mass))
+    ET.SubElement(part, "inertia", dict(zip(_INERTIA, map(repr, moments), strict=True)))
 
 
 def _child(element: ET.Element, tag: str) -> ET.Element:
     child = element.find(tag)
     if child is None:
-        raise ValueError(f"{element.tag}: {tag} is missing")
+        raise ValueError(f"{tag} is missing")
     return child
 
 
@@ -159,12 +240,16 @@ def _add_joint(robot: ET.Element, joint: ET.Element, notes: list[Note]) -> None:
     for tag in ("parent", "child"):
         ET.SubElement(element, tag, link=_child(joint, tag).get("link", ""))
     _add_origin(element, joint, origin(joint, where))
-    for axis in joint.findall("axis")[:1]:
-        ET.SubElement(element, "axis", xyz=" ".join(map(repr, vector(axis, "xyz", 3, where, (1.0, 0.0, 0.0)))))
-    for tag, attributes in (("mimic", ("joint", "multiplier", "offset")), ("dynamics", ("damping", "friction"))):
+    for axis in joint.findall("axis")[:1] if kind in _WITH_AXIS else ():
+        direction = vector(axis, "xyz", 3, where)
+        if math.hypot(*direction) < 1e-6:
+            raise ValueError(f"{where}: axis xyz={axis.get('xyz')!r} has no length; give a direction such as 0 0 1")
+        ET.SubElement(element, "axis", xyz=" ".join(map(repr, direction)))
+    for tag, attributes in (("mimic", ("multiplier", "offset")), ("dynamics", ("damping", "friction"))):
         for child in joint.findall(tag)[:1]:
-            values = {attribute: child.get(attribute) for attribute in attributes}
-            ET.SubElement(element, tag, {key: text for key, text in values.items() if text is not None})
+            names = {"joint": child.get("joint", "")} if child.get("joint") is not None else {}
+            values = {key: repr(vector(child, key, 1, where)[0]) for key in attributes if child.get(key) is not None}
+            ET.SubElement(element, tag, names | values)
     _add_limit(element, joint, notes)
 
 
@@ -180,30 +265,36 @@ def _add_origin(element: ET.Element, source: ET.Element, placement: Any) -> None
 
 
 def _add_limit(element: ET.Element, joint: ET.Element, notes: list[Note]) -> None:
-    """Add the limit of a joint, its range in order.
-
-    Speeds and efforts that are left out become 0.
-    """
-    name, limit = joint.get("name", ""), joint.find("limit")
-    limited = joint.get("type") in _LIMITED
-    if limit is None:
-        limit = ET.Element("limit")
-        if not limited:
-            return
-    where = f"joint {name!r}"
-    values = {
-        attribute: vector(limit, attribute, 1, where, (0.0,))[0]
-        for attribute in ("lower", "upper", "velocity", "effort")
-        if limit.get(attribute) is not None
-    }
-    fields = {"velocity": 0.0, "effort": 0.0, **values}
-    remedy = "give its range under `limits.position`"
-    limits = _range(limit)
+    """Add the limit of a joint, its range in order; speeds and efforts that are left out become 0."""
+    name, limit, limited = joint.get("name", ""), joint.find("limit"), joint.get("type") in _LIMITED
+    if limit is None and not limited:
+        return
+    values = {} if limit is None else _limit_values(limit, f"joint {name!r}")
+    if values.get("velocity", 0.0) < 0.0:
+        raise ValueError(f"joint {name!r}: limit velocity={values['velocity']:g}: must not be negative")
+    limits, clause = _range(values), ""
     if limited and limits is None:
         clause = "has no <limit> lower and upper: it moves without position limits"
-        notes.append(Note(NoteKind.LIMIT, (name,), clause, remedy, "warning"))
     elif limited and limits is not None and limits[0] > limits[1]:
         clause = f"its lower limit {limits[0]:g} is above its upper one {limits[1]:g}: the two are swapped"
-        notes.append(Note(NoteKind.LIMIT, (name,), clause, remedy, "warning"))
-        fields["lower"], fields["upper"] = limits[1], limits[0]
-    ET.SubElement(element, "limit", {key: repr(value) for key, value in fields.items() if math.isfinite(value)})
+        values["upper"], values["lower"] = limits
+    if clause:
+        notes.append(Note(NoteKind.LIMIT, (name,), clause, "give its range under `limits.position`", "warning"))
+    fields = {"velocity": 0.0, "effort": 0.0, **values}
+    ET.SubElement(element, "limit", {key: repr(value) for key, value in fields.items()})
+
+
+def _limit_values(limit: ET.Element, where: str) -> dict[str, float]:
+    """Read the numbers that a <limit> has; of any size, where a huge one means that there is none."""
+    return {
+        key: vector(limit, key, 1, where, largest=math.inf)[0]
+        for key in ("lower", "upper", "velocity", "effort")
+        if limit.get(key) is not None
+    }
+
+
+def _range(values: dict[str, float]) -> tuple[float, float] | None:
+    """Return the lower and upper limit, 0 where one is left out; None where both are."""
+    if values.keys().isdisjoint(("lower", "upper")):
+        return None
+    return values.get("lower", 0.0), values.get("upper", 0.0)

@@ -18,37 +18,37 @@ RESULT = 10
 """Doubles of a distance result: distance, normal, nearest point 1, nearest point 2."""
 
 
-def _view(addresses: list[int], fields: int, writeable: bool = False) -> Array | None:
-    """View memory as rows of `fields` doubles at equally spaced addresses (n, fields).
+def _view(firsts: list[Array], offset: int, writeable: bool, expected: Array) -> Array | None:
+    """View memory as rows of doubles (n, fields), None where it is not as expected.
 
     The view is valid as long as the C++ vector that it looks into lives and is not resized.
+
+    Args:
+        firsts: arrays that begin `offset` bytes after each row.
+        offset: see there.
+        writeable: whether the view may be written to.
+        expected: the rows, read through the accessors; memory that nothing was written to yet may hold NaN.
     """
-    strides = np.diff(addresses)
+    addresses = [int(array.__array_interface__["data"][0]) - offset for array in firsts]
+    strides, fields = np.diff(addresses), expected.shape[1]
     if len(strides) == 0 or not (strides == strides[0]).all() or strides[0] < 8 * fields or strides[0] % 8:
         return None
     stride = int(strides[0])
     doubles = (len(addresses) - 1) * stride // 8 + fields  # the last row must not be read past its own end
     memory = np.ctypeslib.as_array((ctypes.c_double * doubles).from_address(addresses[0]))
-    return np.lib.stride_tricks.as_strided(memory, (len(addresses), fields), (stride, 8), writeable=writeable)
-
-
-def _address(array: Array) -> int:
-    return int(array.__array_interface__["data"][0])
+    view = np.lib.stride_tricks.as_strided(memory, (len(addresses), fields), (stride, 8), writeable=writeable)
+    return view if np.array_equal(view, expected, equal_nan=True) else None
 
 
 def read_poses(poses: Any) -> Array:
-    """Read world poses through the accessors (n, 12).
-
-    Rotation by columns, then translation.
-    """
+    """Read world poses through the accessors (n, 12): rotation by columns, then translation."""
     rows = [np.concatenate((pose.rotation.ravel(order="F"), pose.translation)) for pose in poses]
     return np.array(rows).reshape(-1, 12)
 
 
 def view_poses(poses: Any, writeable: bool = False) -> Array | None:
     """View what `read_poses` reads; None where the view disagrees with the accessors."""
-    view = _view([_address(pose.rotation) for pose in poses], 12, writeable)
-    return view if view is not None and np.array_equal(view, read_poses(poses)) else None
+    return _view([pose.rotation for pose in poses], 0, writeable, read_poses(poses))
 
 
 def read_results(results: Any) -> Array:
@@ -59,7 +59,4 @@ def read_results(results: Any) -> Array:
 
 def view_results(results: Any) -> Array | None:
     """View what `read_results` reads; None where the view disagrees with the accessors."""
-    # the distance stands before the normal
-    view = _view([_address(result.normal) - 8 for result in results], RESULT, writeable=True)
-    agrees = view is not None and np.array_equal(view, read_results(results), equal_nan=True)
-    return view if agrees else None
+    return _view([result.normal for result in results], 8, True, read_results(results))  # the distance comes before

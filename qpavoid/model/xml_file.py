@@ -1,10 +1,16 @@
-"""URDF, SRDF and MJCF text, checked before a C++ parser sees it: those recurse, and some are quadratic."""
+"""URDF, SRDF and MJCF text as XML, checked before a C++ parser sees it: those recurse."""
 
 from __future__ import annotations
 
+import io
 import xml.etree.ElementTree as ET
 from pathlib import Path
-from xml.parsers import expat
+from xml.sax import SAXParseException
+from xml.sax.handler import ContentHandler
+from xml.sax.xmlreader import AttributesImpl, InputSource
+
+import defusedxml.sax
+from defusedxml import DefusedXmlException
 
 from qpavoid.config.text import read_text
 from qpavoid.errors import ConfigError
@@ -14,8 +20,6 @@ _LARGEST = 10_000_000
 """Size of a file [bytes]; humanoids take 200 000."""
 _DEEPEST = 50
 """Levels of nesting; humanoids take 7."""
-_MOST_ATTRIBUTES = 100
-"""Attributes of one element, at most; humanoids take 12."""
 
 
 def read_robot_xml(path: Path, kind: str) -> ET.Element:
@@ -32,13 +36,16 @@ def read_robot_xml(path: Path, kind: str) -> ET.Element:
     """
     text = read_text(path, _LARGEST)
     where = f"{path}: not a usable {kind}"
-    _refuse_doctype(text, where)
-    if is_xacro(path, text):
-        text = expand_xacro(path)
-        _refuse_doctype(text, where)
     try:
         root = _parse(text)
-    except (expat.ExpatError, ValueError) as error:
+        if is_xacro(path, text):
+            root = _parse(expand_xacro(path))
+    except DefusedXmlException:
+        raise ConfigError(f"{where}: it has a <!DOCTYPE>; take it out, entities are not read") from None
+    except SAXParseException as error:
+        place = f"line {error.getLineNumber()}, column {error.getColumnNumber()}"
+        raise ConfigError(f"{where}: {error.getMessage()}: {place}") from None
+    except ValueError as error:
         raise ConfigError(f"{where}: {error}") from None
     expected_tag = "mujoco" if kind == "MJCF" else "robot"
     if root.tag != expected_tag:
@@ -57,38 +64,34 @@ def undeclared_prefixes(root: ET.Element) -> list[str]:
     return [prefix for prefix in prefixes if prefix not in declared]
 
 
-def _refuse_doctype(text: str, where: str) -> None:
-    if "<!DOCTYPE" in text:  # before any parser: only a DOCTYPE can declare entities that grow or that read files
-        raise ConfigError(f"{where}: it has a <!DOCTYPE>; take it out, entities are not read")
-
-
 def _parse(text: str) -> ET.Element:
     """Parse a text; prefixes are part of the names, as the C++ parsers have it."""
-    # those take every file for UTF-8, whatever it says
-    parser, builder = expat.ParserCreate("utf-8"), _Builder()
-    parser.StartElementHandler = builder.start
-    parser.EndElementHandler = builder.end
-    parser.CharacterDataHandler = builder.data
-    parser.buffer_text = True
-    parser.Parse(text.encode(), True)
-    return builder.close()
+    parser, builder, source = defusedxml.sax.make_parser(), _Builder(), InputSource()
+    parser.forbid_dtd = True
+    parser.setContentHandler(builder)
+    source.setByteStream(io.BytesIO(text.encode()))
+    source.setEncoding("utf-8")  # the C++ parsers take every file for that, whatever it says
+    parser.parse(source)
+    return builder.tree.close()
 
 
-class _Builder(ET.TreeBuilder):
-    """Stops where a tree gets too deep or too wide."""
+class _Builder(ContentHandler):
+    """Builds a tree, and stops where it gets too deep."""
 
     def __init__(self) -> None:
         super().__init__()
+        self.tree = ET.TreeBuilder()
         self._depth = 0
 
-    def start(self, tag: str, attrs: dict[str, str]) -> ET.Element:
+    def startElement(self, name: str, attrs: AttributesImpl) -> None:
         self._depth += 1
         if self._depth > _DEEPEST:
-            raise ValueError(f"<{tag}> is nested more than {_DEEPEST} deep")
-        if len(attrs) > _MOST_ATTRIBUTES:
-            raise ValueError(f"<{tag}> has more than {_MOST_ATTRIBUTES} attributes")
-        return super().start(tag, attrs)
+            raise ValueError(f"<{name}> is nested more than {_DEEPEST} deep")
+        self.tree.start(name, dict(attrs.items()))
 
-    def end(self, tag: str) -> ET.Element:
+    def endElement(self, name: str) -> None:
         self._depth -= 1
-        return super().end(tag)
+        self.tree.end(name)
+
+    def characters(self, content: str) -> None:
+        self.tree.data(content)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from qpavoid.geometry.segments import point_segment
+from qpavoid.geometry.segments import point_segment_distance
 from qpavoid.problem import Array, Status
 from qpavoid.reason import Severity
 
@@ -92,5 +92,5 @@ def path_deviation(log: Log, corners: int = 500) -> Array:
     for task in range(tasks):
         path, tool = log.target[every, task], log.tool[:, task]
         for start, end in zip(path, np.concatenate((path[1:], path[-1:])), strict=True):
-            deviation[:, task] = np.minimum(deviation[:, task], point_segment(tool, start, end).distance)
+            deviation[:, task] = np.minimum(deviation[:, task], point_segment_distance(tool, start, end))
     return deviation

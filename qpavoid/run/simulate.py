@@ -18,9 +18,9 @@ from qpavoid.control.tick import Tick
 from qpavoid.controller import Controller
 from qpavoid.errors import ConfigError, NumericalError
 from qpavoid.geometry.bodies import enclosing_capsule
+from qpavoid.geometry.meshes import surface_triangles
 from qpavoid.model.kinematics import ForwardKinematics
 from qpavoid.model.scene import PARKING_DISTANCE, Scene
-from qpavoid.model.solids import surface_triangles
 from qpavoid.problem import Array, Solution, Status
 from qpavoid.run.log import STATUSES, Log, versions
 from qpavoid.solvers import parse_solver

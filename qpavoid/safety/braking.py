@@ -15,7 +15,7 @@ proof).
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import floor
+from math import floor, isnan
 from typing import NamedTuple
 
 import numpy as np
@@ -180,7 +180,7 @@ class BrakingCheck:
         nearest = float(np.min(now.distances_of(now.pairs), initial=self._rows.influence_distance))
         points = [_PathPoint(0.0, q, nearest - self._safety_distance, -1, np.inf)]
         end = float(path.times[-1])
-        while (t := points[-1].t) < end and points[-1].margin == points[-1].margin:
+        while (t := points[-1].t) < end and (len(points) == 1 or not isnan(points[-1].margin)):
             count = _MAX_POSES - len(points)
             step = max(0.5 * min(max(points[-1].margin, 0.0), _MAX_MARGIN), _MIN_STEP) / speed
             step = max(step, (end - t) / max(count, 1))

@@ -12,7 +12,6 @@ import numpy as np
 
 from qpavoid.config import JointLimits, RobotConfig
 from qpavoid.errors import ConfigError, UnknownName, nearest
-from qpavoid.geometry.bodies import check_meshes
 from qpavoid.model.end_effectors import end_effectors
 from qpavoid.model.kinematics import MIMIC
 from qpavoid.model.notes import Note, NoteKind, RobotWarning, merge_notes
@@ -277,7 +276,6 @@ def _pieces(
     if not geometry.ngeoms:
         clause = "has no geometry at all: nothing is checked"
         notes.append(Note(NoteKind.SHAPE, (urdf.name,), clause, "list `bodies`", "warning"))
-    check_meshes(geometry, str(urdf))
     note_implausible_sizes(model, geometry, notes)
     return pieces_of(geometry.geometryObjects, model)
 

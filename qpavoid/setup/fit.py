@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from qpavoid.geometry.bodies import enclosing_capsule, hull_points
 from qpavoid.geometry.capsules import CapsuleFit, extreme_points, fit_capsule
-from qpavoid.geometry.segments import point_segment
+from qpavoid.geometry.segments import point_segment_distance
 from qpavoid.problem import Array
 from qpavoid.setup.volume import solid_volume
 
@@ -120,7 +120,7 @@ def _fit(surface: Array) -> CapsuleFit:
         return fit_capsule(points)
     fit = fit_capsule(extreme_points(points))
     half = 0.5 * fit.length * fit.rotation[:, 2]
-    sticks_out = float(point_segment(points, fit.center - half, fit.center + half).distance.max()) - fit.radius
+    sticks_out = float(point_segment_distance(points, fit.center - half, fit.center + half).max()) - fit.radius
     wider = replace(fit, radius=fit.radius + max(sticks_out, 0.0))
     return wider if wider.volume <= _WIDER * fit.volume else fit_capsule(points)
 

@@ -12,7 +12,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-from qpavoid.geometry.segments import point_segment, segment_segment
+from qpavoid.geometry.segments import point_segment_distance, segment_segment_distance
 from qpavoid.problem import Array, IntArray
 from qpavoid.run.log import Log
 
@@ -215,7 +215,7 @@ def view_angles(log: Log) -> tuple[float, float]:
     bodies, thickness = log.body_ends[0], np.array(log.meta["body_radii"])
     middles, patches, radii, is_foreign = _occluders(log)
     points = np.concatenate([path, bodies.mean(axis=1), bodies[:, 1], middles])[:, None]
-    own = point_segment(points, bodies[:, 0], bodies[:, 1]).distance < 1.3 * thickness
+    own = point_segment_distance(points, bodies[:, 0], bodies[:, 1]) < 1.3 * thickness
     to_patches = patches - points
     squared = np.sum(to_patches**2, axis=2)
     is_screen = squared > (1.3 * radii) ** 2
@@ -224,7 +224,7 @@ def view_angles(log: Log) -> tuple[float, float]:
     for elevation in (20.0, 35.0):
         for azimuth in (-25.0, 25.0, -45.0, 45.0, -65.0, 65.0, -115.0, 115.0, -135.0, 135.0, -155.0, 155.0):
             towards = towards_viewer(elevation, azimuth)
-            ray = segment_segment(points, points + 10.0 * towards, bodies[:, 0], bodies[:, 1]).distance
+            ray = segment_segment_distance(points, points + 10.0 * towards, bodies[:, 0], bodies[:, 1])
             along = to_patches @ towards
             is_hidden = is_screen & (along > 0.0) & (squared - along**2 < radii**2)
             hidden = np.any((ray < thickness) & ~own, axis=1) | np.any(is_hidden, axis=1)

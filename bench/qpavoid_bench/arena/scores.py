@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from qpavoid.config import ScenarioConfig
-from qpavoid.geometry.segments import point_segment
+from qpavoid.geometry.segments import point_segment_distance
 from qpavoid.problem import Array, Status
 from qpavoid.run.log import STATUSES
 from qpavoid_bench.arena.case import Case
@@ -192,7 +192,7 @@ def _max_deviation(rollout: Rollout) -> float:
     for tool, target in zip(rollout.tool.swapaxes(0, 1), rollout.target[corners].swapaxes(0, 1), strict=True):
         nearest = np.full(len(tool), np.inf)
         for start, end in zip(target, np.concatenate((target[1:], target[-1:])), strict=True):
-            nearest = np.minimum(nearest, point_segment(tool, start, end).distance)
+            nearest = np.minimum(nearest, point_segment_distance(tool, start, end))
         worst = max(worst, float(nearest.max()))
     return worst
 
