@@ -17,7 +17,6 @@ from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.obstacles import ObstacleStates
 from qpavoid.control.row_layout import lay_out
 from qpavoid.control.tasks import in_order
-from qpavoid.control.trajectories import as_samples, put
 from qpavoid.kernels.cache import FOLDER
 from qpavoid.model.kinematics import ForwardKinematics
 from qpavoid.model.limits import JointBounds, limit_layout
@@ -136,8 +135,8 @@ class Bench:
         self.rows.influence_distance = float(reach)
         self.query.set_influence_distance(float(reach))
         targets = targets or [task.motion.sample(0.0) for part in in_order(self.tasks) for task in part]
-        for view, target in zip(as_samples(self.rows.targets), targets, strict=False):
-            put(view, target)
+        for row, target in zip(self.rows.targets, targets, strict=False):
+            row[:] = target.row
         return self.rows.compute(np.asarray(q), targets)
 
     def rows(self, q, targets=None):

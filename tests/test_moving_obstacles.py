@@ -8,7 +8,7 @@ from closed_loop import SHIPPED, Ruler, changed, drive, make_controller
 
 from qpavoid import Controller, Obstacle, ScenarioConfig, Status, load_scenario
 from qpavoid.config import Sphere
-from qpavoid.control.poses import Pose
+from qpavoid.model.sample import Pose
 from qpavoid.run.simulate import simulate
 
 TOOL = np.array([0.39644872, 0.65090125, 0.74741443])
