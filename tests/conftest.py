@@ -120,11 +120,11 @@ class Bench:
 
     def __init__(self, scene, tasks=(), avoidance=None, position_gain=0.5, damping=0.0, dt=0.01):
         self.scene, self.robot, self.tasks = scene, scene.robot, tuple(tasks)
-        self.rows = RowAssembler(
+        self.assembler = RowAssembler(
             scene, tasks, scene.robot.bounds(), avoidance or config.Avoidance(),
             config.Limits(position_gain=position_gain), damping, dt,
         )  # fmt: skip
-        self.query = self.rows.query
+        self.query = self.assembler.query
 
     def place(self, samples):
         """Obstacles at other samples, by number; all others where they are at time 0."""
@@ -132,12 +132,12 @@ class Bench:
 
     def compute(self, q, targets=None, reach=np.inf):
         """Proximity and problem at q, as they are until the next call."""
-        self.rows.influence_distance = float(reach)
+        self.assembler.influence_distance = float(reach)
         self.query.set_influence_distance(float(reach))
         targets = targets or [task.motion.sample(0.0) for part in in_order(self.tasks) for task in part]
-        for row, target in zip(self.rows.targets, targets, strict=False):
+        for row, target in zip(self.assembler.targets, targets, strict=False):
             row[:] = target.row
-        return self.rows.compute(np.asarray(q), targets)
+        return self.assembler.compute(np.asarray(q), targets)
 
     def rows(self, q, targets=None):
         """A and b of the tasks at q, copied."""

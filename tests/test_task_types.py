@@ -146,7 +146,7 @@ def test_manipulability(case, part):
         gradient = differences(measure, robot, q)[0]
         np.testing.assert_allclose(A[0], gradient, atol=1e-5 * max(1.0, np.abs(gradient).max()))
         np.testing.assert_allclose(b, 2.0 * A[0] @ A[0], rtol=1e-12)
-        assert bench.rows.task_errors[0] == pytest.approx(measure(q)[0], rel=1e-9)
+        assert bench.assembler.task_errors[0] == pytest.approx(measure(q)[0], rel=1e-9)
 
 
 @pytest.mark.parametrize(
