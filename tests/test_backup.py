@@ -6,6 +6,7 @@ import pytest
 from closed_loop import SHIPPED, Ruler, cartesian, changed, make_controller
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from qpavoid.safety.policy import BackupPolicy, ContactAccumulator, Near, Start
 
 from qpavoid import Controller, Obstacle, Pose, ReasonKind, Sample, ScenarioConfig, Status, kernels, load_scenario
 from qpavoid.config import Avoidance, Backup, Box, Limits, Line, Sensing, Sphere
@@ -13,7 +14,6 @@ from qpavoid.control.estimates import prediction_error_bound
 from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.control.trajectories import extrapolate
 from qpavoid.model.trajectory import build_motion
-from qpavoid.safety.policy import BackupPolicy, ContactAccumulator, Near, Start
 from qpavoid.safety.rollout import _farthest
 from qpavoid.solvers.backends import solve_daqp
 
