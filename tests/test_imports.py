@@ -25,7 +25,7 @@ def import_alone(*modules: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
 
 
-READERS = ["config", "problem", "solvers", "config.loading", "run.report", "run.log", "run.metrics", "viz.figures"]
+READERS = ["config", "problem", "solvers", "config.loading", "run.report", "run.log", "viz.figures"]
 
 
 def test_modules_need_no_robot_library():

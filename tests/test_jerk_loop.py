@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from closed_loop import Ruler, cartesian, changed, drive, make_controller, scenario
+from conftest import Bench
 
-from qpavoid import Avoidance, ConfigError, Controller, Limits, Obstacle, ReasonKind, Robot, Sample, Status
+from qpavoid import Avoidance, ConfigError, Controller, Limits, Obstacle, ReasonKind, Robot, Sample, Status, build_scene
 from qpavoid.config import Box, Damper, Sphere
 from qpavoid.run.simulate import simulate
 from qpavoid.solvers.relaxation import relaxed_solution
@@ -119,18 +120,17 @@ def test_clearance_lower_bound_holds_along_stops(panda):
     """Distances along stops from random velocities and accelerations, by brute force."""
     rng, bounds = np.random.default_rng(0), panda.bounds()
     balls = [Obstacle.at(f"ball{i}", Sphere(radius=0.08), p) for i, p in enumerate(rng.uniform(-0.7, 0.7, (3, 3)))]
-    controller = make_controller(panda, balls, limits=Limits(jerk=400.0))
-    assembly, ruler, close = controller._builder.rows, Ruler(controller.scene), 0
+    scene = build_scene(replace(panda, jerk=dict.fromkeys(panda.acceleration, 400.0)), balls)
+    bench, ruler, close = Bench(scene, avoidance=Avoidance(d1=SAFE, d2=0.1)), Ruler(scene), 0
     for _ in range(150):
         q = rng.uniform(bounds.lower + 0.3, bounds.upper - 0.3)
         before, change = rng.uniform(-0.3, 0.3, 7) * bounds.velocity, rng.uniform(-1.0, 1.0, 7) * bounds.acceleration
-        controller.reset(before)
-        near = len(controller.tick(q).proximity.pair)
-        controller.reset(before)
+        bench.rows.previous.restart(before)
+        near = len(bench.compute(q, reach=0.1)[0].pair)
         v = before + 0.01 * change
-        stop = assembly.stop(q, v)
-        velocities = stop.way.copy()
-        bound = assembly.clearance_lower_bound(v, near, 0.1, float(stop.forwards.sum()), stop)
+        stop = bench.rows.stop(q, v)
+        velocities = stop.velocities.copy()
+        bound = bench.rows.clearance_lower_bound(v, near, float(stop.equivalent_time.sum()), stop)
         least = np.inf
         for velocity in velocities:
             least = min(least, ruler.distances(q).min())

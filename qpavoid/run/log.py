@@ -1,10 +1,9 @@
-"""Record of a run, saved as .npz with the configuration and versions that made it."""
+"""Record of a run, saved as .npz with the configuration and versions that made it, and its key figures."""
 
 from __future__ import annotations
 
 import json
 import os.path
-import platform
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -14,10 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from qpavoid.errors import ConfigError
+from qpavoid.geometry.segments import point_segment_distance
 from qpavoid.problem import Array, IntArray, Status
 from qpavoid.reason import Severity
-from qpavoid.run import machine
-from qpavoid.run.metrics import run_metrics
 
 STATUSES = tuple(Status)
 """Status of each code in `Log.status`."""
@@ -34,8 +32,10 @@ _SHAPES = {
     "body_ends": "N b 2 3", "obstacle_position": "N o 3", "obstacle_rotation": "N o 3 3",
 }  # fmt: skip
 """Shape of each array; a letter is the same number wherever it stands."""
-_KINDS = {"closest_pair": "i", "status": "i", "stalled": "b", "severity": "i"}
-"""Kind of an array's numbers, where they are not floating point."""
+_TYPES = {"closest_pair": np.intp, "status": np.int8, "stalled": np.bool_, "severity": np.int8}
+"""Type of an array's numbers, where they are not floating point."""
+_MAX_EVENTS = 20
+"""Number of changes of reasons that are among the figures of a run: what a reader of JSON can take in."""
 _META = {"scenario": str, "solver": str, "completed": bool, "pairs": list, "config": dict}
 
 
@@ -97,6 +97,13 @@ class Log:
     meta: dict[str, Any] = field(default_factory=dict)
     """Names, shapes, limits, the scenario's configuration, versions, and how the run ended."""
 
+    @classmethod
+    def allocate(cls, sizes: dict[str, int]) -> dict[str, Any]:
+        """Lay out the arrays of a run; `sizes` has the numbers N, nq, nv, k, s, b, o of the shapes above."""
+        sides = {"2": 2, "3": 3, **sizes}
+        shapes = {name: [sides[letter] for letter in letters.split()] for name, letters in _SHAPES.items()}
+        return {name: np.zeros(shape, dtype=_TYPES.get(name, np.float64)) for name, shape in shapes.items()}
+
     @property
     def min_distance(self) -> Array:
         """Return the smallest distance of any body at each step, (N,) [m]."""
@@ -108,8 +115,80 @@ class Log:
         return Log(**{name: array[:count] for name, array in self._arrays().items()}, meta=self.meta)
 
     def metrics(self) -> dict[str, Any]:
-        """Compute the key figures of the run; see `qpavoid.run.metrics.run_metrics`."""
-        return run_metrics(self)
+        """Compute the figures by which runs are compared.
+
+        Returns:
+            scenario, solver; completed: ran for its whole duration; arrived: so it did, and every task that
+            is measured in metres ended within the goal tolerance; task_errors: of tasks that are not
+            frames, [error, unit] at the end; collided; min_distance: surface to surface [m], None where
+            nothing is paired; min_pair: names of that pair; time_in_collision [s]; time_below: threshold ->
+            [s]; final_error [m]; max_deviation: largest distance of a tool from its planned path [m];
+            tracking_rmse: of the distance to the moving target [m]; peak_velocity: fastest joint [rad/s or
+            m/s]; jitter: Σ|Δq̇| over joints and ticks [rad/s]; status_counts; relaxed_ticks;
+            shortened_ticks: steps scaled down by the stop look-ahead; time_blocked: stalled [s];
+            severity_counts: steps by the worst severity of their reasons; events: the first changes of
+            reasons, as [t, status, reasons as data]; tick_us: p50, p99 and max of the computation time of a
+            step [µs].
+        """
+        config, dt = self.meta["config"], self.meta["config"]["dt"]
+        distance = self.min_distance
+        closest = int(np.argmin(distance)) if np.isfinite(distance).any() else None
+        error = np.linalg.norm(self.target - self.tool, axis=2)
+        statuses = [status.value for status in STATUSES]
+        counts = {name: int(np.sum(self.status == code)) for code, name in enumerate(statuses)}
+        tick_us = 1e6 * (self.build_time + self.solve_time)
+        other_tasks = {
+            name: [float(self.task_error[-1, i]), unit]
+            for i, (name, unit) in enumerate(self.meta.get("tasks", []))
+            if len(self.task_error)
+        }
+        metres = [value for value, unit in other_tasks.values() if unit == "m"]
+        final_error = (
+            float(np.max([*error[-1], *metres])) if len(error) and (error.shape[1] or metres) else float("nan")
+        )
+        return {
+            "scenario": self.meta["scenario"],
+            "solver": self.meta["solver"],
+            "completed": self.meta["completed"],
+            "arrived": self.meta["completed"] and bool(final_error <= config["goal_tolerance"]),
+            "collided": bool(np.any(distance < 0.0)),
+            "min_distance": None if closest is None else float(distance[closest]),
+            "min_pair": None if closest is None else self.meta["pairs"][self.closest_pair[closest]],
+            "time_in_collision": dt * float(np.sum(distance < 0.0)),
+            "time_below": {str(limit): dt * float(np.sum(distance < limit)) for limit in config["thresholds"]},
+            "final_error": final_error,
+            "task_errors": other_tasks,
+            "max_deviation": float(np.max(self.path_deviation(), initial=0.0)),
+            "tracking_rmse": float(np.sqrt(np.mean(error**2))) if error.size else float("nan"),
+            "peak_velocity": float(np.max(np.abs(self.v), initial=0.0)),
+            "jitter": float(np.sum(np.abs(np.diff(self.v, axis=0)))),
+            "status_counts": counts,
+            "relaxed_ticks": counts[Status.RELAXED.value],
+            "shortened_ticks": int(np.sum(self.command_scale < 1.0)),
+            "time_blocked": dt * float(np.sum(self.stalled)),
+            "severity_counts": {level.name: int(np.sum(self.severity == level)) for level in Severity},
+            "events": self.meta["events"][:_MAX_EVENTS],
+            "tick_us": {
+                "p50": float(np.median(tick_us)) if len(tick_us) else float("nan"),
+                "p99": float(np.quantile(tick_us, 0.99)) if len(tick_us) else float("nan"),
+                "max": float(np.max(tick_us, initial=0.0)),
+            },
+        }
+
+    def path_deviation(self, corners: int = 500) -> Array:
+        """Compute the distance of each tool from the path that its target draws, at whatever time, (N, k) [m].
+
+        Args:
+            corners: the path is taken as a polyline with at most so many corners.
+        """
+        count, tasks = self.tool.shape[:2]
+        deviation = np.full((count, tasks), np.inf)
+        every = np.unique(np.linspace(0, max(count - 1, 0), min(count, corners)).astype(int))
+        for task in range(tasks):
+            path, tool = self.target[every, task], self.tool[:, task]
+            for start, end in zip(path, np.concatenate((path[1:], path[-1:])), strict=True):
+                deviation[:, task] = np.minimum(deviation[:, task], point_segment_distance(tool, start, end))
+        return deviation
 
     def save(self, path: str | Path) -> Path:
         """Write the log; the parent folder is made where it is missing.
@@ -157,7 +236,7 @@ class Log:
         sides: dict[str, int] = {"2": 2, "3": 3}
         for name, dimensions in _SHAPES.items():
             array = getattr(self, name)
-            if array.dtype.kind != _KINDS.get(name, "f"):
+            if array.dtype.kind != np.dtype(_TYPES.get(name, np.float64)).kind:
                 raise ValueError(f"{name} holds {array.dtype}")
             letters = dimensions.split()
             if len(letters) != array.ndim or any(
@@ -181,11 +260,3 @@ class Log:
 
     def _arrays(self) -> dict[str, Any]:
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "meta"}
-
-
-_PACKAGES = ("qpavoid", "pin", "coal", "numpy", "qpsolvers", "daqp", "proxsuite", "osqp", "quadprog")
-
-
-def versions() -> dict[str, str]:
-    """Return the versions of everything that shapes a result."""
-    return {"python": platform.python_version(), "machine": platform.machine(), **machine.versions(_PACKAGES)}

@@ -42,14 +42,7 @@ def metrics_table(runs: Sequence[dict[str, Any]], width: int = 80) -> Table:
         count_shown += 1
     hidden = len(_COLUMNS) - count_shown
     more = f"; {hidden} more column{'s' * (hidden > 1)} in a wider terminal" if hidden else ""
-    table = Table(
-        title=f"[bold]{escape(runs[0]['scenario'])}[/] (distances between surfaces{more})",
-        title_justify="left",
-        title_style="",
-        box=box.SIMPLE_HEAD,
-        pad_edge=False,
-        padding=0,  # columns are a blank apart, which leaves the outcome its room
-    )
+    table = _table(f"[bold]{escape(runs[0]['scenario'])}[/] (distances between surfaces{more})")
     table.add_column("solver", no_wrap=True)
     for heading, _ in _COLUMNS[:count_shown]:
         table.add_column(escape(heading), justify="right", no_wrap=True)
@@ -78,10 +71,7 @@ def ratios_table(runs: Sequence[dict[str, Any]], numerator: str, denominator: st
         numerator: solver whose figures stand above the line.
         denominator: the other one.
     """
-    table = Table(
-        title=f"[bold]{escape(numerator)} / {escape(denominator)}[/]", title_justify="left", title_style="",
-        box=box.SIMPLE_HEAD, pad_edge=False, padding=0,
-    )  # fmt: skip
+    table = _table(f"[bold]{escape(numerator)} / {escape(denominator)}[/]")
     table.add_column("scenario", no_wrap=True)
     table.add_column("", no_wrap=True)
     for heading, *_ in _RATIOS:
@@ -108,6 +98,11 @@ def ratios_table(runs: Sequence[dict[str, Any]], numerator: str, denominator: st
 def _ratio(a: float | None, b: float | None) -> str:
     """Format a / b; empty where one of them is nearly zero, or a depth of penetration."""
     return f"{a / b:.2f}" if a is not None and b is not None and min(a, b) > _MIN_RATIO_VALUE else ""
+
+
+def _table(title: str) -> Table:
+    """Make a table whose columns are a blank apart."""
+    return Table(title=title, title_justify="left", title_style="", box=box.SIMPLE_HEAD, pad_edge=False, padding=0)
 
 
 def outcome(run: dict[str, Any]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import platform
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -22,7 +23,8 @@ from qpavoid.geometry.meshes import surface_triangles
 from qpavoid.model.kinematics import ForwardKinematics
 from qpavoid.model.scene import PARKING_DISTANCE, Scene
 from qpavoid.problem import Array, Solution, Status
-from qpavoid.run.log import STATUSES, Log, versions
+from qpavoid.run.log import STATUSES, Log
+from qpavoid.run.machine import versions
 from qpavoid.solvers import parse_solver
 
 _MAX_EVENTS = 1000
@@ -111,55 +113,31 @@ class Recorder:
         self._controller = controller
         self._kinematics, self._query = ForwardKinematics(model), controller.distances()  # of all pairs, near or not
         self._ends, self._radii = _drawing_axes(scene.robot.bodies)
-        tasks, bodies, obstacles = len(self._frames), len(scene.body_names), len(scene.obstacles)
-        shapes: dict[str, tuple[int, ...]] = {
-            "t": (), "q": (model.nq,), "v": (model.nv,),
-            "target": (tasks, 3), "tool": (tasks, 3), "tool_rotation": (tasks, 3, 3), "turn_error": (tasks,),
-            "task_error": (len(self._other_tasks),),
-            "body_distance": (bodies,), "alpha": (), "beta": (), "slack": (), "command_scale": (), "saturation": (),
-            "build_time": (), "solve_time": (),
-            "body_ends": (bodies, 2, 3), "obstacle_position": (obstacles, 3), "obstacle_rotation": (obstacles, 3, 3),
-        }  # fmt: skip
-        self._arrays: dict[str, Any] = {name: np.zeros((ticks, *shape)) for name, shape in shapes.items()}
-        self._arrays["closest_pair"] = np.full(ticks, -1, dtype=np.intp)
-        self._arrays["status"] = np.zeros(ticks, dtype=np.int8)
-        self._arrays["stalled"] = np.zeros(ticks, dtype=np.bool_)
-        self._arrays["severity"] = np.zeros(ticks, dtype=np.int8)
+        sizes = {"N": ticks, "nq": model.nq, "nv": model.nv, "k": len(self._frames), "s": len(self._other_tasks)}
+        self._arrays = Log.allocate({**sizes, "b": len(scene.body_names), "o": len(scene.obstacles)})
+        self._arrays["closest_pair"].fill(-1)
         self._events: list[list[Any]] = []
         self._keys: tuple[object, ...] = ()
         self._count = 0
 
     def add(self, tick: Tick) -> None:
         """Store one step."""
-        rows = {name: array[self._count] for name, array in self._arrays.items() if array.ndim > 1}
-        scalars = {name: array for name, array in self._arrays.items() if array.ndim == 1}
-        state, solution, rows_avoid = tick.state, tick.solution, tick.problem.avoidance
-        rows["q"][:], rows["v"][:] = state.q, solution.v
-        rows["tool"][:], rows["tool_rotation"][:] = tick.kinematics.position, tick.kinematics.rotation
-        rows["task_error"][:] = tick.errors
-        for i, (task, target) in enumerate(zip(self._frames, tick.targets, strict=False)):
-            rows["target"][i] = target.position if task.moves else rows["tool"][i]
+        i, x, state, solution, near = self._count, self._arrays, tick.state, tick.solution, tick.problem.avoidance
+        x["t"][i], x["q"][i], x["v"][i], x["task_error"][i] = state.t, state.q, solution.v, tick.errors
+        x["tool"][i], x["tool_rotation"][i] = tick.kinematics.position, tick.kinematics.rotation
+        for k, (task, target) in enumerate(zip(self._frames, tick.targets, strict=False)):
+            x["target"][i, k] = target.position if task.moves else x["tool"][i, k]
             if task.turns:
-                error = pin.log3(target.rotation @ tick.kinematics.rotation[i].T)
-                rows["turn_error"][i] = np.linalg.norm(error)
-        self._write_bodies(tick, rows)
-        values = {
-            "t": state.t,
-            "slack": 0.0 if solution.slack is None else float(np.max(solution.slack, initial=0.0)),
-            "command_scale": solution.command_scale,
-            "stalled": bool(solution.stalled),
-            "severity": solution.severity or 0,
-            "saturation": solution.saturation,
-            "build_time": solution.build_time,
-            "solve_time": solution.solve_time,
-            "status": STATUSES.index(solution.status),
-        }
-        if len(rows_avoid.d):
-            d = float(rows_avoid.d.min())
-            values["alpha"] = kernels.alpha(d, rows_avoid.d2)
-            values["beta"] = kernels.beta(d, rows_avoid.d1, rows_avoid.d2)
-        for name, value in values.items():
-            scalars[name][self._count] = value
+                x["turn_error"][i, k] = np.linalg.norm(pin.log3(target.rotation @ tick.kinematics.rotation[k].T))
+        for name in ("command_scale", "saturation", "build_time", "solve_time"):
+            x[name][i] = getattr(solution, name)
+        x["stalled"][i], x["severity"][i] = bool(solution.stalled), solution.severity or 0
+        x["status"][i] = STATUSES.index(solution.status)
+        x["slack"][i] = 0.0 if solution.slack is None else np.max(solution.slack, initial=0.0)
+        if len(near.d):
+            d = float(near.d.min())
+            x["alpha"][i], x["beta"][i] = kernels.alpha(d, near.d2), kernels.beta(d, near.d1, near.d2)
+        self._write_bodies(tick)
         self._count += 1
         self._record_events(state.t, solution)
 
@@ -172,9 +150,9 @@ class Recorder:
             self._events.append([t, solution.status.value, [reason.as_dict() for reason in reasons]])
         self._keys = keys
 
-    def _write_bodies(self, tick: Tick, rows: dict[str, Array]) -> None:
+    def _write_bodies(self, tick: Tick) -> None:
         """Store the distances of all pairs, and the poses of bodies and obstacles."""
-        scene = self._scene
+        scene, n, x = self._scene, self._count, self._arrays
         self._kinematics.compute(tick.state.q)
         samples, attached = [], self._controller.attached
         counted_body = np.arange(len(scene.geometry.geometryObjects))
@@ -185,7 +163,7 @@ class Recorder:
                 if is_attached
                 else obstacle.motion.sample(tick.state.t)
             )
-            rows["obstacle_position"][i], rows["obstacle_rotation"][i] = sample.position, sample.rotation
+            x["obstacle_position"][n, i], x["obstacle_rotation"][n, i] = sample.position, sample.rotation
             if is_attached:
                 counted_body[np.flatnonzero(scene.obstacle_of == i)] = _attachment_body(scene, attached[obstacle.name])
             samples.append(sample)
@@ -195,14 +173,14 @@ class Recorder:
         distance[pairs] = self._query.arrays.results[pairs, 0]
         distance[distance > 0.5 * PARKING_DISTANCE] = np.inf
         if np.isfinite(distance).any():
-            self._arrays["closest_pair"][self._count] = np.argmin(distance)
+            x["closest_pair"][n] = np.argmin(distance)
         nearest = np.full(len(scene.geometry.geometryObjects), np.inf)
         np.minimum.at(nearest, counted_body[scene.pairs[:, 0]], distance)
         np.minimum.at(nearest, counted_body[scene.pairs[:, 1]], distance)
-        rows["body_distance"][:] = nearest[: rows["body_distance"].shape[0]]
+        x["body_distance"][n] = nearest[: len(scene.body_names)]
         for i, body in enumerate(scene.robot.bodies.geometryObjects):
             joint = self._kinematics.data.oMi[body.parentJoint]
-            rows["body_ends"][i] = self._ends[i] @ joint.rotation.T + joint.translation
+            x["body_ends"][n, i] = self._ends[i] @ joint.rotation.T + joint.translation
 
     def log(self, stopped_by: str | None = None) -> Log:
         """Return the steps stored so far as a log.
@@ -236,7 +214,7 @@ class Recorder:
             "body_radii": self._radii,
             "obstacles": [_describe_obstacle(scene, i) for i in range(len(scene.obstacles))],
             "pairs": [list(pair) for pair in scene.pair_names],
-            "versions": versions(),
+            "versions": {"python": platform.python_version(), "machine": platform.machine(), **versions()},
         }
         arrays = {name: array[: self._count].copy() for name, array in self._arrays.items()}
         return Log(**arrays, meta=meta)

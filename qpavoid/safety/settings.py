@@ -1,4 +1,4 @@
-"""What all checks of a command are told once: robot, scene, limits and the scenario's blocks."""
+"""What all checks of a command share: robot, scene, limits and the blocks of the scenario."""
 
 from __future__ import annotations
 

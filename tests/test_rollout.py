@@ -1,0 +1,201 @@
+"""Rollouts of backup trajectories, by themselves: scores, validity, and the proof that nothing comes near."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from closed_loop import cartesian, changed
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import linprog
+
+from qpavoid import Avoidance, Limits, Obstacle, build_scene, kernels
+from qpavoid.config import Box, Line, Progress, Sensing, Sphere
+from qpavoid.control.obstacles import ObstacleTracker
+from qpavoid.control.pair_table import PairTable
+from qpavoid.control.scenario import build_parts
+from qpavoid.model.trajectory import build_motion
+from qpavoid.safety.approach import ApproachCheck
+from qpavoid.safety.rollout import BackupPolicy, BackupRollouts, Start
+from qpavoid.safety.settings import SafetySettings
+from qpavoid.solvers.backends import solve_daqp
+
+
+def rollouts_of(scene, limits=None, dt=0.01):
+    """Rollouts of a scene, its settings and its obstacles."""
+    limits = limits or Limits()
+    bounds = scene.robot.bounds().within(limits)
+    shared = SafetySettings(scene, bounds, Avoidance(d1=0.03, d2=0.1), limits, Progress(), dt)
+    tracker = ObstacleTracker(scene.obstacles, Sensing(), dt)
+    return BackupRollouts(shared, PairTable(scene), tracker), shared, tracker
+
+
+LIMITS = {"speeds": {}, "accelerations": {"acceleration": 3.0}, "jerks": {"acceleration": 3.0, "jerk": 60.0}}
+
+
+@pytest.fixture(scope="module", params=LIMITS.values(), ids=LIMITS)
+def among_balls(request):
+    """Rollouts of a Panda among balls that cross its path, its settings, and where it begins."""
+    ends = [
+        ((0.9, 0.1, 0.5), (-0.9, 0.1, 0.5)),
+        ((0.4, -0.8, 0.7), (0.4, 0.8, 0.4)),
+        ((0.2, 0.7, 0.3), (0.2, -0.7, 0.3)),
+    ]
+    shape = {"type": "sphere", "radius": 0.08}
+    balls = [
+        {"name": f"ball{i}", "shape": shape, "motion": {"type": "line", "start": start, "end": end, "speed": 0.3}}
+        for i, (start, end) in enumerate(ends)
+    ]
+    parts = build_parts(changed("panda_line", obstacles=balls))
+    rollouts, shared, _ = rollouts_of(parts.scene, Limits(**request.param))
+    return rollouts, shared, parts.q0
+
+
+def random_policies(rollouts, count, seed=0):
+    """The stop, and random policies."""
+    rng, nv = np.random.default_rng(seed), len(rollouts.stop_policy.bias_velocity)
+    yield rollouts.stop_policy
+    for _ in range(count):
+        yield BackupPolicy(rng.choice([0.05, 0.2, 0.5]), rng.normal(size=nv) * rng.choice([0.0, 5.0]))
+
+
+def start_of(rollouts, q, t, v=None):
+    rest = np.zeros(len(q))
+    return Start(q, rest if v is None else v, rest, t, rollouts.enabled)
+
+
+def largest_change(trajectory, times):
+    """Of the velocities of a trajectory from step to step, or of that change itself."""
+    before = [trajectory.start.v - trajectory.start.dv, trajectory.start.v]
+    return np.abs(np.diff(np.vstack((before, trajectory.v)), times, axis=0)).max(axis=0, initial=0.0)
+
+
+def test_rollout_of_a_trajectory_and_of_its_remainder_reproduces_it(among_balls):
+    rollouts, shared, q = among_balls
+    touched, bounds = 0, shared.bounds
+    for t in (0.02, 0.13, 0.51):  # a step later, trajectories end at the same time
+        for policy in random_policies(rollouts, 4):
+            trajectory = rollouts.rollout(start_of(rollouts, q, t), policy, None, None)
+            again = rollouts.rollout(trajectory.start, rollouts.stop_policy, trajectory.v, None)
+            assert again.score == pytest.approx(trajectory.score, abs=1e-12)
+            np.testing.assert_allclose(again.v, trajectory.v, rtol=0, atol=1e-12)
+            assert (largest_change(trajectory, 1) <= 0.01 * bounds.acceleration * (1.0 + 1e-9)).all()
+            assert (largest_change(trajectory, 2) <= 1e-4 * bounds.jerk * (1.0 + 1e-9)).all()
+            touched += trajectory.score.time_to_contact < 1.5
+            remainder = rollouts.advance(trajectory)
+            later = rollouts.rollout(remainder.start, policy, remainder.v, None)
+            assert later.contact_time == pytest.approx(trajectory.contact_time, abs=1e-9)
+            assert later.clearance >= trajectory.clearance - 1e-9
+    assert 0 < touched < 15
+
+
+def test_rollout_ends_early_exactly_when_it_does_not_beat_another(among_balls):
+    rollouts, _, q = among_balls
+    counts = {True: 0, False: 0}
+    for t in (0.13, 0.51):
+        start, best = start_of(rollouts, q, t), None
+        for policy in random_policies(rollouts, 6, seed=1):
+            alone = rollouts.rollout(start, policy, None, None)
+            beats = best is None or alone.score > best.score
+            found = rollouts.rollout(start, policy, None, best)
+            assert (found is not None) == beats and (found is None or found.score == alone.score)
+            counts[beats] += 1
+            best = found or best
+    assert min(counts.values()) > 1
+
+
+def test_validity_from_a_nearby_start_is_conservative(among_balls):
+    """Against a rollout from that start; and it ends with time, and with other pairs."""
+    rollouts, shared, q = among_balls
+    rng, valid, policies = np.random.default_rng(2), 0, [*random_policies(rollouts, 29, seed=3)]
+    for policy in policies:
+        t = rng.uniform(0.0, 2.0)
+        trajectory = rollouts.rollout(start_of(rollouts, q, t), policy, None, None)
+        off = rng.uniform(-1.0, 1.0, len(q)) * 10.0 ** rng.uniform(-4.0, -1.5)
+        moved = pin.integrate(shared.scene.robot.model, q, off)
+        start = start_of(rollouts, moved, t, rng.uniform(-0.05, 0.05, len(q)))
+        if rollouts.is_valid_from(trajectory, start):
+            valid += 1
+            again = rollouts.rollout(start, rollouts.stop_policy, trajectory.v, None)
+            assert again.score >= rollouts.sufficient_score
+            assert not rollouts.is_valid_from(trajectory, start._replace(t=t + 0.02))
+            assert not rollouts.is_valid_from(trajectory, start._replace(enabled=~rollouts.enabled))
+            margin = trajectory.clearance - rollouts.sufficient_score.clearance
+            late = trajectory.start._replace(t=t + 0.008)
+            assert rollouts.is_valid_from(trajectory, late, 0.99 * margin / 0.008)
+            assert not rollouts.is_valid_from(trajectory, late, 1.01 * margin / 0.008)
+    assert 1 < valid < 28
+
+
+def test_a_plate_passed_between_two_decisions_is_a_contact(tmp_path):
+    """A ball of 10 cm at 3 m/s passes a plate of 2 mm within 34 ms; rollouts decide every 40 ms."""
+    robot = cartesian(tmp_path, "xy", speed=3.0, acceleration=None)
+    plate = Obstacle.at("plate", Box(size=(0.002, 2.0, 0.2)), (0.001, 0.0, 0.0))
+    rollouts, _, _ = rollouts_of(build_scene(robot, [plate]))
+    for shift in np.linspace(0.0, 0.12, 7):
+        start = start_of(rollouts, np.array([-0.5 - shift, 0.0]), 0.0)
+        trajectory = rollouts.rollout(start, rollouts.stop_policy, np.tile([3.0, 0.0], (40, 1)), None)
+        assert trajectory.contact_time == pytest.approx((0.45 + shift) / 3.0, abs=0.04), shift
+
+
+def farthest(h, closest, J, feedforward, c, bias, bound=1.0):
+    nv = len(bias)
+    args = h, closest, J, feedforward, c, 10.0, 1e-4, bias, np.full(nv, -bound), np.full(nv, bound)
+    v, converged = kernels.max_clearance_velocity(*args)
+    assert converged
+    return v
+
+
+def test_policies_maximise_the_smallest_distance():
+    """To first order: against a linear program without a preferred distance, and as one QP in (v, s) by daqp."""
+    rng = np.random.default_rng(0)
+    for _ in range(25):
+        A, d = 0.2 * rng.normal(size=(6, 4)), rng.uniform(0.0, 0.1, 6)
+        v = farthest(1.0, np.column_stack((d, np.zeros((6, 9)))), A, np.zeros(6), 10.0, np.zeros(4))
+        least = np.column_stack((-A, np.ones(6)))
+        best = linprog([0, 0, 0, 0, -1], A_ub=least, b_ub=d, bounds=[(-1, 1)] * 4 + [(None, None)])
+        # the regularisation costs at most ε/2 ‖v‖² <= 2e-4 of ½ (10 - s)², whose slope is about 10
+        assert (A @ v + d).min() == pytest.approx(best.x[-1], abs=1e-4)
+        closest, J, rates, bias = (
+            rng.uniform(0.0, 0.1, (5, 10)),
+            rng.normal(size=(5, 3)),
+            0.1 * rng.normal(size=5),
+            rng.normal(size=3),
+        )
+        v = farthest(0.2, closest, J, rates, 0.1, bias)
+        P, G = np.diag([1e-4, 1e-4, 1e-4, 1.0]), np.column_stack((0.2 * J, -np.ones(5)))
+        limits = np.array([-1.0, -1.0, -1.0, -10.0]), np.array([1.0, 1.0, 1.0, 0.1])
+        expected = solve_daqp(P, -P @ np.append(bias, 0.1), G, -(closest[:, 0] + 0.2 * rates), *limits)
+        assert v == pytest.approx(expected[:3], abs=1e-6)
+
+
+ROBOTS = {}
+"""Robots that are built once."""
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    st.lists(st.tuples(*[st.floats(-1.5, 1.5)] * 6, st.floats(0.05, 0.5)), min_size=1, max_size=4),
+    st.floats(0.0, 1.0),
+    st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0)),
+)
+def test_approach_check_is_conservative(tmp_path_factory, lines, t, v):
+    robot = ROBOTS.setdefault("xy", cartesian(tmp_path_factory.mktemp("robot"), "xy", speed=1.0, acceleration=2.0))
+    obstacles = [
+        Obstacle(f"o{i}", Sphere(radius=0.1), build_motion(Line(start=line[:3], end=line[3:6], speed=line[6])), True)
+        for i, line in enumerate(lines)
+        if np.linalg.norm(np.subtract(line[:3], line[3:6])) > 1e-3
+    ]
+    if not obstacles:
+        return
+    rollouts, shared, tracker = rollouts_of(build_scene(robot, obstacles))
+    check, v = ApproachCheck(shared, rollouts, tracker), np.array(v)
+    for k, away in enumerate((0.0, 0.01, 0.1, 0.3)):  # a cached clearance counts for configurations near by
+        home, at = robot.home + away, t + 0.02 * k
+        moving = [o for o in obstacles if o.motion.sample(at).linear.any()]  # those at rest do not count
+        if not check.stays_far(Start(home, v, np.zeros(2), at, rollouts.enabled)):
+            continue
+        for later in np.linspace(0.0, 1.5, 76):
+            braking = np.minimum(later, np.abs(v) / 2.0)
+            place = np.array([*(home + np.sign(v) * (np.abs(v) * braking - braking**2)), 0.0])
+            centers = [o.motion.sample(at + later).position for o in moving]
+            assert min((np.linalg.norm(place - center) for center in centers), default=1.0) - 0.15 > 0.1
