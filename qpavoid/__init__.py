@@ -3,7 +3,6 @@
 from qpavoid.config import Avoidance, Limits, Progress, ScenarioConfig, Sensing
 from qpavoid.config.loading import load_scenario
 from qpavoid.control.contacts import build_contacts
-from qpavoid.control.poses import Pose
 from qpavoid.control.tasks import build_tasks
 from qpavoid.control.tick import Tick
 from qpavoid.controller import Controller
@@ -11,8 +10,8 @@ from qpavoid.errors import ConfigError, NumericalError, QpavoidError, SolverNotI
 from qpavoid.model.cloud import Points, Voxels
 from qpavoid.model.notes import Note, NoteKind, RobotWarning
 from qpavoid.model.robot import Robot
+from qpavoid.model.sample import Pose, Sample
 from qpavoid.model.scene import Obstacle, Scene, build_scene
-from qpavoid.model.trajectory import Sample
 from qpavoid.problem import Problem, Solution, Status
 from qpavoid.reason import Reason, ReasonKind, Severity
 from qpavoid.run.batch import BatchError, Steps, simulate_many, steps

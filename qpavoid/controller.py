@@ -14,14 +14,13 @@ from qpavoid.control.builder import ProblemBuilder, StepProblem
 from qpavoid.control.contacts import ContactRows
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.inputs import LARGEST_VELOCITY, check_velocity
-from qpavoid.control.poses import Pose
 from qpavoid.control.scenario import build_parts
 from qpavoid.control.tasks import RowTask, in_order
 from qpavoid.control.tick import Tick, copied
 from qpavoid.errors import ConfigError, NumericalError, UnknownName, located, nearest
 from qpavoid.model.cloud import Points
+from qpavoid.model.sample import Pose, Sample
 from qpavoid.model.scene import Scene
-from qpavoid.model.trajectory import Sample
 from qpavoid.problem import Array, Solution, State, as_vector, require_finite
 from qpavoid.reason import Reason, ReasonKind
 from qpavoid.safety.arbiter import Arbiter

@@ -17,7 +17,6 @@ from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.obstacles import ObstacleStates
 from qpavoid.control.row_layout import lay_out
 from qpavoid.control.tasks import in_order
-from qpavoid.control.trajectories import as_samples, put
 from qpavoid.kernels.cache import FOLDER
 from qpavoid.model.kinematics import ForwardKinematics
 from qpavoid.model.limits import JointBounds, limit_layout
@@ -121,11 +120,11 @@ class Bench:
 
     def __init__(self, scene, tasks=(), avoidance=None, position_gain=0.5, damping=0.0, dt=0.01):
         self.scene, self.robot, self.tasks = scene, scene.robot, tuple(tasks)
-        self.rows = RowAssembler(
+        self.assembler = RowAssembler(
             scene, tasks, scene.robot.bounds(), avoidance or config.Avoidance(),
             config.Limits(position_gain=position_gain), damping, dt,
         )  # fmt: skip
-        self.query = self.rows.query
+        self.query = self.assembler.query
 
     def place(self, samples):
         """Obstacles at other samples, by number; all others where they are at time 0."""
@@ -133,12 +132,12 @@ class Bench:
 
     def compute(self, q, targets=None, reach=np.inf):
         """Proximity and problem at q, as they are until the next call."""
-        self.rows.influence_distance = float(reach)
+        self.assembler.influence_distance = float(reach)
         self.query.set_influence_distance(float(reach))
         targets = targets or [task.motion.sample(0.0) for part in in_order(self.tasks) for task in part]
-        for view, target in zip(as_samples(self.rows.targets), targets, strict=False):
-            put(view, target)
-        return self.rows.compute(np.asarray(q), targets)
+        for row, target in zip(self.assembler.targets, targets, strict=False):
+            row[:] = target.row
+        return self.assembler.compute(np.asarray(q), targets)
 
     def rows(self, q, targets=None):
         """A and b of the tasks at q, copied."""
@@ -169,14 +168,11 @@ def frames(robot, names, q):
     return [data.oMf[robot.model.getFrameId(name)].copy() for name in names]
 
 
-def lay_out_step(scene, tasks=(), damping=0.0, dt=0.01, avoidance=None, limits=None, query=None):
+def lay_out_step(scene, avoidance=None):
     """Memory of a control step, as a controller lays it out, and the kinematics and distances that it looks into."""
-    frames, others = in_order(tasks)
-    kinematics = ForwardKinematics(scene.robot.model, [i for task in tasks for i in task.frame_ids])
-    query, limits = query or DistanceQuery(scene), limits or config.Limits()
-    bounds = scene.robot.bounds().within(limits)
-    settings = avoidance or config.Avoidance()
-    return lay_out(scene, frames, others, bounds, kinematics, query, settings, limits, damping, dt), kinematics, query
+    kinematics, query, limits = ForwardKinematics(scene.robot.model, []), DistanceQuery(scene), config.Limits()
+    bounds, avoidance = scene.robot.bounds().within(limits), avoidance or config.Avoidance()
+    return lay_out(scene, [], [], bounds, kinematics, query, avoidance, limits, 0.0, 0.01), kinematics, query
 
 
 def make_layout(nv, pairs=0, obstacles=0, **fields):
@@ -208,7 +204,7 @@ def make_layout(nv, pairs=0, obstacles=0, **fields):
 @functools.cache
 def _layout_of_a_robot():
     avoidance = config.Avoidance(d1=0.1, d2=0.3, row={"type": "beta", "gain": 5.0}, recovery_speed=0.2)
-    return lay_out_step(build_scene(Robot.load("paper-dual-arm")), avoidance=avoidance)[0]
+    return lay_out_step(build_scene(Robot.load("paper-dual-arm")), avoidance)[0]
 
 
 def look(scene, q, samples=None, reach=np.inf, bench=None):

@@ -85,10 +85,13 @@ class Caller:
         twist = self.rng.normal(size=(2, 3)) * self.pick([0.0, 0.2, 2.0])
         at_rest = self.pick([False, False, False, True, *(["yes", None, 0.0] if self.chance(share) else [])])
         place = self.spoilt(place, share)
-        if self.chance(0.4):
-            return Pose(place, R, self.stamp(share), at_rest)
         linear, angular = (self.spoilt(part, share) for part in twist)
-        return Sample(place, R, linear, angular, self.stamp(share), at_rest)
+        try:
+            if self.chance(0.4):
+                return Pose(place, R, self.stamp(share), at_rest)
+            return Sample(place, R, linear, angular, self.stamp(share), at_rest)
+        except NumericalError:  # parts of the wrong shape or kind
+            return self.pick(MISTYPED)
 
     def points(self, share):
         points = self.rng.uniform(-0.2, 1.0, (int(self.rng.integers(0, 20)), 3))

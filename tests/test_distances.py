@@ -122,7 +122,7 @@ def test_clearance_lower_bound_holds_on_straight_paths(name, request):
         bench.place(samples)
         near = len(bench.compute(q, reach=0.3)[0].pair)
         for horizon in (0.01, 0.1, 0.3):
-            least = bench.rows.clearance_lower_bound(v, near, horizon)
+            least = bench.assembler.clearance_lower_bound(v, near, horizon)
             assert np.isfinite(least)
             for t in (0.5 * horizon, horizon):
                 later = {i: moved(sample, t) for i, sample in samples.items()}

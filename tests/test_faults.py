@@ -5,9 +5,9 @@ import pinocchio as pin
 import pytest
 from closed_loop import Ruler, cartesian, drive, make_controller
 
-from qpavoid import Avoidance, NumericalError, Obstacle, ReasonKind, Sample, Severity, Status
+from qpavoid import Avoidance, NumericalError, Obstacle, ReasonKind, Sample, Severity, Status, UnknownName
 from qpavoid.config import Box, Damper, Sensing, Sphere
-from qpavoid.control.poses import Pose
+from qpavoid.model.sample import Pose
 
 NAN, INF = float("nan"), float("inf")
 TOOL = "panda_hand_tcp"
@@ -124,23 +124,36 @@ def test_stop_without_q_ends_inside_the_joint_limits(panda):
         ({"t": np.zeros(2)}, "t: not a number"),
         ({"q": [10**400] * 7}, "q: not an array"),
         ({"targets": [TOOL]}, "targets: give a mapping"),
+        ({"v": np.ones(7), "obstacles": {"ball": Pose.at([0.4, 0, 0.5]), "typo": Pose.at([1, 0, 0])}}, "no obstacle"),
+        ({"t": 99.0, "v": np.ones(7), "targets": {"typo": Pose.at([1, 0, 0])}}, "no target"),
         ({"obstacles": "ball"}, "obstacles: give a mapping"),
         ({"obstacles": {"ball": Sample.at([1, 0, 0], t="now")}}, "obstacle 'ball': t: not a number"),
         ({"obstacles": {"ball": Sample.at([1, 0, 0], linear=[1, 0, 0], at_rest=True)}}, "obstacle 'ball': at_rest"),
-        ({"targets": {TOOL: Sample(np.zeros(2), np.eye(3), np.zeros(3), np.zeros(3))}}, f"target '{TOOL}': position"),
         ({"targets": {TOOL: np.eye(4)}}, f"target '{TOOL}': neither"),
-        ({"obstacles": {"ball": Sample(np.zeros(3), np.eye(4), np.zeros(3), np.zeros(3))}}, "obstacle 'ball': rot"),
-        ({"obstacles": {"ball": Pose(np.zeros(3), np.zeros(9))}}, "obstacle 'ball': rotation"),
         ({"obstacles": {"ball": "there"}}, "obstacle 'ball': neither"),
     ],
 )
 def test_malformed_step_names_its_argument_and_changes_nothing(panda, call, name):
     touched, clean = panda_controller(panda), panda_controller(panda)
     for k in range(5):
-        with pytest.raises(NumericalError, match=f"^{name}"):
+        with pytest.raises((NumericalError, UnknownName), match=f"^{name}"):
             touched.step(**{"q": panda.home, **call})
         got, expected = (c.step(panda.home, 0.01 * k, up(panda)) for c in (touched, clean))
         np.testing.assert_array_equal(got.v, expected.v)
+
+
+@pytest.mark.parametrize(
+    ("parts", "name"),
+    [
+        ((np.zeros(2), np.eye(3), np.zeros(3), np.zeros(3)), "position: shape"),
+        ((np.zeros(3), np.eye(4), np.zeros(3), np.zeros(3)), "rotation: shape"),
+        ((np.zeros(3), np.eye(3), "fast", np.zeros(3)), "linear: not"),
+        ((np.zeros(3), np.zeros(9)), "rotation: shape"),
+    ],
+)
+def test_malformed_sample_or_pose_names_its_part(parts, name):
+    with pytest.raises(NumericalError, match=f"^{name}"):
+        (Sample if len(parts) == 4 else Pose)(*parts)
 
 
 # --- states that jump or lie outside ---------------------------------------------------------------------------

@@ -86,7 +86,7 @@ def test_speeds_of_all_joints(named):
     for _ in range(20):
         q, v = random_q(robot, rng), rng.normal(size=model.nv)
         bench.compute(q)
-        bench.rows.clearance_lower_bound(v, 0, 0.01)
+        bench.assembler.clearance_lower_bound(v, 0, 0.01)
         pin.forwardKinematics(model, data, q, v)
         velocities = np.array([motion.vector for motion in data.v])
         expected = np.linalg.norm(velocities[:, :3], axis=1)

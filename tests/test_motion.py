@@ -17,7 +17,8 @@ from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 
 from qpavoid import config
 from qpavoid.errors import ConfigError, NumericalError
-from qpavoid.model.trajectory import Motion, Sample, build_motion, rpy_to_matrix
+from qpavoid.model.sample import Sample
+from qpavoid.model.trajectory import Motion, build_motion, rpy_to_matrix
 
 Array = NDArray[np.float64]
 Profile = Literal["constant", "smooth"]

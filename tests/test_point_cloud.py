@@ -327,7 +327,7 @@ def test_clearance_lower_bound_includes_voxels_without_pairs(panda, tmp_path):
         q, v = random_q(panda, rng), rng.uniform(-1.0, 1.0, 7)
         near = len(bench.compute(q, reach=0.3)[0].pair)
         for horizon in (0.01, 0.1):
-            least = bench.rows.clearance_lower_bound(v, near, horizon)
+            least = bench.assembler.clearance_lower_bound(v, near, horizon)
             assert ruler.distances(pin.integrate(panda.model, q, horizon * v)).min() - hold >= least - 1e-9
 
 

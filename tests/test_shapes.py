@@ -231,7 +231,7 @@ def test_what_passes_close_by_is_known_not_to_come_nearer(panda, shape):
         if not 0.0 < gap < 0.01:
             continue
         close += 1
-        least = bench.rows.clearance_lower_bound(v, len(proximity.pair), 0.02)
+        least = bench.assembler.clearance_lower_bound(v, len(proximity.pair), 0.02)
         warned += least > 0.0
         for t in (0.005, 0.01, 0.02):
             found = look(scene, pin.integrate(panda.model, q, t * v), {0: moved(sample, t)}, 0.1)
@@ -255,7 +255,7 @@ def test_the_closest_call_holds_for_half_spaces_that_move_and_turn(panda, turnin
         assert np.isfinite(bench.query.arrays.speeds).all()
         near = len(bench.compute(q, reach=0.3)[0].pair)
         for horizon in (0.01, 0.1, 0.3):
-            least = bench.rows.clearance_lower_bound(v, near, horizon)
+            least = bench.assembler.clearance_lower_bound(v, near, horizon)
             later = sample._replace(
                 position=sample.position + horizon * sample.linear,
                 rotation=pin.exp3(horizon * sample.angular) @ sample.rotation,

@@ -194,18 +194,18 @@ def test_task_switching_rows_follow_the_tracked_velocity(panda, change):
         scene, build_tasks([hand, wrist], robot, robot.home), Avoidance(**SETTINGS, recovery_speed=1e3), damping=0.05
     )
     rng = np.random.default_rng(1)
-    bench.rows.previous.restart(0.1 * rng.normal(size=7))
+    bench.assembler.previous.restart(0.1 * rng.normal(size=7))
     targets = [Sample.at([0.45, 0.4, 0.4]), Sample.at([0.3, -0.2, 0.5])]
     near, problem = bench.compute(robot.home, targets, reach=0.3)
     before, v = problem.avoidance.b.copy(), problem.v_tracking.copy()
     assert_rows(scene, near, problem, v)
     if change == "eased":
-        changed = bench.rows.within_jerks(problem)
+        changed = bench.assembler.within_jerks(problem)
     elif change == "followed":
-        changed = bench.rows.follow(0.1 * rng.normal(size=7), problem)
+        changed = bench.assembler.follow(0.1 * rng.normal(size=7), problem)
     else:
         law = make_solver("hqp")
-        changed = bench.rows.prioritised(problem, law.tracked)
+        changed = bench.assembler.prioritised(problem, law.tracked)
     tracked = law.tracked(problem) if change == "of a cascade" else changed.v_tracking
     assert np.abs(tracked - v).max() > 0.01 and np.abs(changed.avoidance.b - before).max() > 0.01
     assert_rows(scene, near, changed, tracked)

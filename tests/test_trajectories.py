@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
 from qpavoid import Obstacle, ReasonKind, Sample, Status, build_scene, config, kernels
-from qpavoid.control import trajectories as courses
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.obstacles import ObstacleStates
+from qpavoid.control.trajectories import TrajectoryBatch, extrapolate
 from qpavoid.errors import NumericalError
 from qpavoid.kernels.obstacles import (
     FAR,
@@ -28,6 +28,7 @@ from qpavoid.kernels.obstacles import (
     REST,
     SAMPLE,
 )
+from qpavoid.model.sample import STATE
 from qpavoid.model.trajectory import Motion, Trajectory, build_motion, still
 
 coordinate = st.floats(-2.0, 2.0)
@@ -43,8 +44,8 @@ def test_only_rows_of_its_own_are_written():
         4: build(type="line", start=(0, 0, 1), end=(1, 0, 1), speed=0.5),
         1: build(type="fixed", position=(1, 2, 3)),
     }
-    states = np.full((6, courses.STATE), np.nan)
-    courses.TrajectoryBatch(motions).sample(1.0, states)
+    states = np.full((6, STATE), np.nan)
+    TrajectoryBatch(motions).sample(1.0, states)
     assert np.flatnonzero(np.isfinite(states).all(axis=1)).tolist() == [1, 4]
     assert np.flatnonzero(np.isnan(states).all(axis=1)).tolist() == [0, 2, 3, 5]
     np.testing.assert_allclose(states[4, 9:15], [0.5, 0, 1, 0.5, 0, 0], atol=1e-15)
@@ -68,7 +69,7 @@ def test_motions_of_other_classes_are_left_to_their_sample():
     motions: dict[int, Motion] = {0: Pendulum(), 1: build(type="circle", center=(0, 0, 1), radius=0.2, period=3)}
     rest = still(Sample.at([0.0, 0.0, 0.0]))
     motions[2] = Drifting(rest.pieces, rest.initial)
-    assert set(courses.TrajectoryBatch(motions).others) == {0, 2}
+    assert set(TrajectoryBatch(motions).others) == {0, 2}
 
 
 def test_a_controller_follows_motions_of_other_classes(panda):
@@ -98,16 +99,16 @@ def test_a_motion_that_gives_nonsense_is_named_and_moves_nothing(panda):
 
 @given(data=st.data())
 def test_states_move_on_at_their_twists(data):
-    states = np.zeros((4, courses.STATE))
-    views, expected = courses.as_samples(states), []
+    states = np.zeros((4, STATE))
+    expected = []
     t = data.draw(st.floats(-1.0, 1.0))
-    for view in views:
+    for state in states:
         twist = data.draw(st.sampled_from([(0.0, 0.0, 0.0)]) | point)
         sample = Sample.at(data.draw(point), pin.exp3(np.array(data.draw(point))), data.draw(point), twist)
-        courses.put(view, sample)
+        state[:] = sample.row
         expected.append(moved(sample, t))
-    courses.extrapolate(states, t)
-    for view, sample in zip(views, expected, strict=True):
+    extrapolate(states, t)
+    for view, sample in zip(map(Sample.of_row, states), expected, strict=True):
         np.testing.assert_allclose(view.position, sample.position, atol=1e-14)
         np.testing.assert_allclose(view.rotation, sample.rotation, atol=1e-14)
 
@@ -116,11 +117,11 @@ def test_states_move_on_at_their_twists(data):
 
 
 def random_states(rng, count, turning):
-    states = np.zeros((count, courses.STATE))
-    for view in courses.as_samples(states):
+    states = np.zeros((count, STATE))
+    for state in states:
         twist = rng.normal(size=(2, 3)) * (rng.random() < 0.7)
         rotation = pin.exp3(rng.normal(size=3))
-        courses.put(view, Sample(rng.normal(size=3), rotation, twist[0], turning * twist[1]))
+        state[:] = Sample(rng.normal(size=3), rotation, twist[0], turning * twist[1]).row
     return states
 
 
@@ -144,7 +145,7 @@ def test_place_writes_twists_speeds_and_poses_by_definition(panda, turning):
         query.place(ObstacleStates(np.array(which, dtype=np.intp), states, margin, {}))
         assert query.is_moving == bool(states[which, 12:].any() or margin[which].any())
         for i in which:
-            sample = courses.as_samples(states)[i]
+            sample = Sample.of_row(states[i])
             at_origin = pin.SE3(np.eye(3), sample.position).act(pin.Motion(sample.linear, sample.angular))
             np.testing.assert_allclose(x.twists[i], at_origin.vector, atol=1e-14)
             speed = np.linalg.norm(sample.linear) + query.obstacle_radii[i] * np.linalg.norm(sample.angular)
@@ -165,7 +166,7 @@ def test_place_refuses_implausible_numbers_and_changes_nothing(panda, value):
     rng = np.random.default_rng(2)
     _, query = placed_scene(panda, 6)
     before = [np.copy(part) for part in query.arrays]
-    for column in range(courses.STATE):
+    for column in range(STATE):
         states = random_states(rng, 6, True)
         states[3, column] = value
         with pytest.raises(NumericalError, match="o3"):

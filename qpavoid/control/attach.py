@@ -14,8 +14,8 @@ import pinocchio as pin
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.errors import ConfigError
 from qpavoid.model.kinematics import ForwardKinematics
+from qpavoid.model.sample import Sample
 from qpavoid.model.scene import Scene
-from qpavoid.model.trajectory import Sample
 from qpavoid.model.views import read_poses
 from qpavoid.problem import Array, IntArray, Mask
 

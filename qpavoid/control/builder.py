@@ -18,8 +18,8 @@ from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.control.targets import TargetReader
 from qpavoid.control.tasks import RowTask
 from qpavoid.model.limits import OUTSIDE, JointBounds
+from qpavoid.model.sample import Sample
 from qpavoid.model.scene import Scene
-from qpavoid.model.trajectory import Sample
 from qpavoid.problem import Array, Problem, Proximity
 from qpavoid.reason import Reason
 

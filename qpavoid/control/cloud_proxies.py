@@ -15,8 +15,8 @@ from scipy.spatial import ConvexHull
 from qpavoid import kernels
 from qpavoid.geometry.bodies import enclosing_capsule, hull_points
 from qpavoid.model.cloud import Voxels, voxel_radius
+from qpavoid.model.sample import Sample
 from qpavoid.model.scene import PARKING_DISTANCE
-from qpavoid.model.trajectory import Sample
 from qpavoid.problem import Array, IntArray
 
 _PLACES = 3

@@ -15,8 +15,8 @@ from qpavoid.config import PointCloud
 from qpavoid.control.cloud_proxies import CloudProxies
 from qpavoid.control.obstacles import ObstacleStates
 from qpavoid.control.pair_table import PairTable
-from qpavoid.control.trajectories import STATE, as_samples, put
 from qpavoid.errors import NumericalError
+from qpavoid.model.sample import STATE, Sample
 from qpavoid.model.scene import Scene
 from qpavoid.model.views import read_poses, read_results, view_poses, view_results
 from qpavoid.problem import Array, IntArray
@@ -91,8 +91,8 @@ class DistanceQuery:
         self._near_count, self._row_count = 0, 0
         self.influence_distance = np.nan
         """Surface distance below which a pair is near [m]; set it by `set_influence_distance`."""
-        for view, obstacle in zip(as_samples(self.arrays.states), scene.obstacles, strict=True):
-            put(view, obstacle.motion.sample(0.0))
+        for state, obstacle in zip(self.arrays.states, scene.obstacles, strict=True):
+            state[:] = obstacle.motion.sample(0.0).row
         self._clouds = {i: self._make_proxies(i) for i in scene.clouds}
         for i in self._clouds:
             self._set_radius(i)
@@ -106,7 +106,6 @@ class DistanceQuery:
         self._surfaces = table.is_mesh[scene.pairs].any(axis=1) & ~table.is_plane[scene.pairs].any(axis=1)
         self.is_compiled = not (len(self._by_coal) or self._clouds) and self._has_views
         """Whether kernels compute everything, but for pairs whose cores meet."""
-        self._views = as_samples(self.arrays.states)
 
     def place(self, obstacles: ObstacleStates) -> None:
         """Move obstacles to other states.
@@ -249,7 +248,7 @@ class DistanceQuery:
     def _place_proxies(self, index: int, cloud: CloudProxies) -> None:
         """Move the proxies of a cloud to the voxels that are nearest to each body."""
         x, unattached = self.arrays, np.flatnonzero(self.table.joints < 0)
-        poses, sample = x.poses[: len(self.table.joints)], self._views[index]
+        poses, sample = x.poses[: len(self.table.joints)], Sample.of_row(x.states[index])
         positions = cloud.places(poses, unattached, sample, self.influence_distance).reshape(-1, 3)
         proxies = cloud.geometries.ravel()
         x.poses[proxies, 9:] = x.centers[proxies, :3] = positions

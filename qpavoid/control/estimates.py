@@ -9,8 +9,8 @@ import numpy as np
 
 from qpavoid import kernels
 from qpavoid.control.inputs import FASTEST
-from qpavoid.control.trajectories import STATE, as_samples, extrapolate, put
-from qpavoid.model.trajectory import Sample
+from qpavoid.control.trajectories import extrapolate
+from qpavoid.model.sample import STATE, Sample
 from qpavoid.problem import Array, IntArray
 
 _STEADY = 0.2
@@ -54,7 +54,6 @@ class MeasuredStates:
         """(o, 18) what the step is given, before it is taken over."""
         self.known: dict[int, None] = {}
         """Numbers of the obstacles that are given, in the order in which they first were."""
-        self._views = as_samples(self.states)
 
     def forget(self, index: int) -> None:
         """Drop what is known of obstacle number `index`."""
@@ -64,7 +63,7 @@ class MeasuredStates:
 
     def begin(self, index: int, t: float, sample: Sample) -> None:
         """Take a sample as what is known of obstacle number `index` at t [s]."""
-        put(self._views[index], sample)
+        self.states[index] = sample.row
         self.known[index], self.stamps[index] = None, t
 
     def update(self, which: IntArray, kind: IntArray, stamps: Array, states: Array) -> int:

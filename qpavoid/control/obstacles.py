@@ -18,14 +18,13 @@ from qpavoid import kernels
 from qpavoid.config import Sensing
 from qpavoid.control.estimates import MeasuredStates, ObstacleEstimates
 from qpavoid.control.inputs import FARTHEST, FASTEST, FAULTS
-from qpavoid.control.poses import Pose
-from qpavoid.control.trajectories import STATE, TrajectoryBatch, as_samples, extrapolate, put
+from qpavoid.control.trajectories import TrajectoryBatch, extrapolate
 from qpavoid.control.updates import NO_UPDATE, Update, UpdateReader, unlikely
 from qpavoid.errors import NumericalError
 from qpavoid.kernels.obstacles import FAST, NORMALISED, NOT_FINITE, SAMPLE
 from qpavoid.model.cloud import Points, Voxels
+from qpavoid.model.sample import STATE, Pose, Sample
 from qpavoid.model.scene import Obstacle
-from qpavoid.model.trajectory import Sample
 from qpavoid.problem import Array, IntArray
 from qpavoid.reason import Reason, ReasonKind, Severity
 
@@ -52,9 +51,7 @@ class ObstacleStates(NamedTuple):
     @classmethod
     def of(cls, samples: Sequence[Sample], margin: float = 0.0) -> ObstacleStates:
         """Return the states of all obstacles at some samples, with a margin of each [m]."""
-        states = np.zeros((len(samples), STATE))
-        for view, sample in zip(as_samples(states), samples, strict=True):
-            put(view, sample)
+        states = np.array([sample.row for sample in samples]).reshape(-1, STATE)
         return cls(np.arange(len(samples)), states, np.full(len(samples), margin), {})
 
 
@@ -96,9 +93,8 @@ class ObstacleTracker:
         self._trajectories = TrajectoryBatch({i: obstacles[i].motion for i in self._moving})
         self._now, count = 0.0, len(obstacles)
         self._current = ObstacleStates(np.array(self._moving, np.intp), np.zeros((count, STATE)), np.zeros(count), {})
-        self._views = as_samples(self._current.states)
-        for view, obstacle in zip(self._views, obstacles, strict=True):
-            put(view, obstacle.motion.sample(0.0))
+        for state, obstacle in zip(self._current.states, obstacles, strict=True):
+            state[:] = obstacle.motion.sample(0.0).row
         self._placed: set[int] = set()  # numbers of those that are, or were, attached to the robot
         self.moving: IntArray = self._current.which
         """(k,) numbers of those on a trajectory or external; no attached object is among them."""
@@ -114,10 +110,10 @@ class ObstacleTracker:
 
     def warm_up(self) -> None:
         """Run the kernels once on nothing, so that no step waits for the compiler."""
-        none, no_stamps, no_vectors = NO_UPDATE.which, NO_UPDATE.stamps, np.zeros((0, 3))
+        none, no_stamps = NO_UPDATE.which, NO_UPDATE.stamps
         states, now = self._measured.updates, self._current
         kernels.check_states(states, none, none, FARTHEST, FASTEST)
-        kernels.write_states(states, none, no_vectors, np.zeros((0, 3, 3)), no_vectors, no_vectors)
+        kernels.write_rows(states, none, states[:0])
         kernels.count_faults(states, none, none, FARTHEST, FASTEST, none, no_stamps)
         self._measured.update(none, none, no_stamps, now.states)
         self._measured.extrapolate(none, 0.0, 0.0, 0.0, now.states, now.margin)
@@ -197,7 +193,7 @@ class ObstacleTracker:
         """Bring the states (o, 18) of those that follow a trajectory to time t [s]."""
         self._trajectories.sample(t, states)
         for index, motion in self._trajectories.others.items():
-            put(as_samples(states)[index], motion.sample(t))
+            states[index] = motion.sample(t).row
 
     def attach(self, index: int) -> None:
         """Take an obstacle as attached to the robot: updates of it are ignored."""
@@ -212,13 +208,13 @@ class ObstacleTracker:
     def release(self, index: int, sample: Sample) -> None:
         """Take an attached obstacle as at rest at a sample, until it is given again."""
         self._reader.attach(index, False)
-        put(self._views[index], sample)
+        self._current.states[index] = sample.row
         self._renew()
 
     def pose(self, index: int) -> Sample:
         """Return the world pose of an obstacle in the last step; of an attached one, where it was attached."""
-        position, rotation, *_ = self._views[index]
-        return Sample.at(position.copy(), rotation.copy())
+        sample = Sample.of_row(self._current.states[index])
+        return Sample.at(sample.position, sample.rotation)
 
     def reset(self) -> None:
         """Forget what was given."""
@@ -275,13 +271,12 @@ class ObstacleTracker:
         for index, motion in self._trajectories.others.items():
             if index in self._moving and index not in self._measured.known and index not in given:
                 sample = motion.sample(t)
-                state = np.zeros((1, STATE))
-                put(as_samples(state)[0], sample)
+                state = sample.row[None].copy()
                 code = int(kernels.check_states(state, _FIRST, _SAMPLED, FARTHEST, FASTEST)[0][0])
                 if code > NORMALISED:
                     fault = f"{FAULTS[code]} in its pose or twist" if code == NOT_FINITE else FAULTS[code]
                     raise NumericalError(f"obstacle {self._obstacles[index].name!r}: {fault}")
-                sampled.append((index, as_samples(state)[0]))
+                sampled.append((index, Sample.of_row(state[0])))
         return sampled
 
     def advance(self, update: StepUpdate | None) -> Observation:
@@ -295,7 +290,7 @@ class ObstacleTracker:
             self._sampled.clear()
         self._trajectories.sample(t, current.states)
         for index, sample in sampled:
-            put(self._views[index], sample)
+            current.states[index] = sample.row
         if given.unusable or self._awaited:
             self._begin([i for i in (*given.unusable, *self._awaited) if i not in self._measured.known], t)
         notes, stop = given.notes, tuple[Reason, ...]()

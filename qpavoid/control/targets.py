@@ -3,20 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from qpavoid import kernels
 from qpavoid.control.inputs import FARTHEST, FASTEST, FAULTS
-from qpavoid.control.poses import is_sample_of_arrays
 from qpavoid.control.tasks import RowTask
-from qpavoid.control.trajectories import STATE, as_samples, put
 from qpavoid.errors import ConfigError, NumericalError, UnknownName, nearest
 from qpavoid.kernels.obstacles import FINE, NORMALISED, SAMPLE
-from qpavoid.model.trajectory import Sample, Trajectory
+from qpavoid.model.sample import Sample
+from qpavoid.model.trajectory import Trajectory
 from qpavoid.problem import Array
 from qpavoid.reason import Reason, ReasonKind
+
+_ONE, _AS_SAMPLE = np.zeros(1, dtype=np.intp), np.full(1, SAMPLE)
+
+
+class Targets(NamedTuple):
+    """Targets of a step, checked."""
+
+    samples: Sequence[Any]
+    """What each task should reach, in the order of the tasks."""
+    faults: tuple[Reason, ...] = ()
+    """What is wrong with those that are given."""
+    normalised: tuple[Reason, ...] = ()
+    """What was normalised in them."""
 
 
 class TargetReader:
@@ -35,25 +47,15 @@ class TargetReader:
         self._tasks = {task.settings.label: task for task in tasks}
         if len(self._tasks) < len(tasks):
             raise ConfigError(f"tasks: two have the same name among {', '.join(self._tasks)}; give one a `name`")
-        self._names, self._list = list(self._tasks), list(tasks)
-        self._frames, self._others = frames, np.zeros((len(tasks) - len(frames), STATE))
+        self._names, self._frames = list(self._tasks), frames
         self._motions: list[Any] = [task.motion for task in tasks]
-        self._views = [*as_samples(self._frames), *as_samples(self._others)]
-        self._frame_views = self._views[: len(frames)]
-        self._still = all(type(motion) is Trajectory and motion.is_still for motion in self._motions[: len(frames)])
-        self._written = False  # whether the frames are the poses of motions that never change
-        self._named_views = [*zip(self._names, self._frame_views, strict=False)]
-        every = np.arange(max(len(frames), len(self._others)))
-        self._every, self._kind = every, np.full(len(every), SAMPLE)
-        self._codes, self._off = np.zeros(len(every), dtype=np.intp), np.zeros(len(every))
+        self._is_still = all(type(motion) is Trajectory and motion.is_still for motion in self._motions[: len(frames)])
+        self._is_written = False  # whether the frames are the poses of motions that never change
         self.read(0.0, None)
-        self._check(self._frames, self._every[: len(frames)])
-        kernels.are_fine(self._frames, FARTHEST, FASTEST)
+        kernels.are_fine(frames, FARTHEST, FASTEST)
 
-    def read(
-        self, t: float, targets: Mapping[str, Any] | None
-    ) -> tuple[Sequence[Any], tuple[Reason, ...], tuple[Reason, ...]]:
-        """Return the targets of all tasks, what is wrong with those that are given, and what was normalised in them.
+    def read(self, t: float, targets: Mapping[str, Any] | None) -> Targets:
+        """Return the targets of all tasks.
 
         Args:
             t: time of the step [s].
@@ -65,82 +67,59 @@ class TargetReader:
         """
         if targets is not None and type(targets) is not dict and not isinstance(targets, Mapping):
             raise NumericalError(f"targets: give a mapping of names to targets, not {targets!r:.60}")
-        count = len(self._frames)
         if not targets:
             samples = [motion.sample(t) for motion in self._motions]
-            if not (self._still and self._written):
-                for view, sample in zip(self._frame_views, samples):  # noqa: B905 (strict costs as much as the copying)
-                    view[0][:], view[1][:], view[2][:], view[3][:] = sample[:4]
-                self._written = True
-            return samples, (), ()
-        self._written = False
-        if len(targets) == count == len(self._list) and self._write(targets):
-            return [targets[name] for name in self._names], (), ()
-        samples, given, other, faults = [], list[int](), list[int](), list[Reason]()
-        known = 0
-        for row, (name, task) in enumerate(self._tasks.items()):
+            if not (self._is_still and self._is_written):
+                self._write(samples)
+                self._is_written = True
+            return Targets(samples)
+        self._is_written = False
+        samples = [targets.get(name) for name in self._names]
+        if len(targets) == len(samples) == len(self._frames) and set(map(type, samples)) == {Sample}:
+            self._write(samples)
+            if kernels.are_fine(self._frames, FARTHEST, FASTEST):
+                return Targets(samples)
+        return self._read_each(t, targets)
+
+    def _write(self, samples: Sequence[Any]) -> None:
+        """Write the states of the frame tasks."""
+        for row in range(len(self._frames)):
+            self._frames[row] = samples[row].row
+
+    def _read_each(self, t: float, targets: Mapping[str, Any]) -> Targets:
+        """Check targets one by one: of several kinds, not of all tasks, or with numbers that cannot be true."""
+        samples, faults, normalised = list[Any](), list[Reason](), list[Reason]()
+        for name, task in self._tasks.items():
             sample = None
             if name in targets:
-                known += 1
                 try:
                     sample = task.as_target(targets[name])
                 except NumericalError as error:
                     raise NumericalError(f"target {name!r}: {error}") from None
-                if row < count:
-                    given.append(row)
-                elif isinstance(sample, Sample):
-                    other.append(row - count)
-                    put(self._views[row], sample)
-                elif fault := task.fault(sample):
-                    faults.append(_implausible(name, fault))
-                    sample = None
-            if sample is None:
-                sample = task.motion.sample(t)
-            if row < count:
-                put(self._views[row], sample)
-            samples.append(sample)
-        if known < len(targets):
-            name = next(name for name in targets if name not in self._tasks)
-            raise UnknownName(f"no target {name!r:.60}{nearest(str(name), self._tasks)}")
-        normalised: list[Reason] = []
-        for states, rows, first in ((self._frames, given, 0), (self._others, other, count)):
-            if rows:
-                which = self._every[: len(rows)] if len(rows) == len(states) else np.array(rows)
-                if self._check(states, which):
-                    self._mend(t, samples, [first + row for row in rows], faults, normalised)
-        return samples, tuple(faults), tuple(normalised)
+                sample, reason = _checked(name, task, sample)
+                if reason is not None:
+                    (normalised if reason.kind is ReasonKind.NORMALISED else faults).append(reason)
+            samples.append(task.motion.sample(t) if sample is None else sample)
+        if unknown := [name for name in targets if name not in self._tasks]:
+            raise UnknownName(f"no target {unknown[0]!r:.60}{nearest(str(unknown[0]), self._tasks)}")
+        self._write(samples)
+        return Targets(samples, tuple(faults), tuple(normalised))
 
-    def _write(self, targets: Mapping[str, Any]) -> bool:
-        """Write samples that are fine as they are, of all tasks, which are frames; False where there is any other."""
-        for name, view in self._named_views:
-            sample = targets.get(name)
-            if type(sample) is not Sample or not is_sample_of_arrays(sample):
-                return False
-            view[0][:], view[1][:], view[2][:], view[3][:] = sample[:4]
-        return bool(kernels.are_fine(self._frames, FARTHEST, FASTEST))
 
-    def _check(self, states: Array, rows: Any) -> int:
-        k = len(rows)
-        return int(
-            kernels.count_faults(states, rows, self._kind[:k], FARTHEST, FASTEST, self._codes[:k], self._off[:k])
-        )
-
-    def _mend(
-        self, t: float, samples: list[Any], rows: list[int], faults: list[Reason], normalised: list[Reason]
-    ) -> None:
-        """Replace what cannot be true by the task's motion, and rotations that are nearly ones by these."""
-        for k in np.flatnonzero(self._codes[: len(rows)] != FINE).tolist():
-            row, code = rows[k], int(self._codes[k])
-            name, view = self._names[row], self._views[row]
-            if code == NORMALISED:
-                samples[row] = samples[row]._replace(rotation=view.rotation.copy())
-                normalised.append(
-                    Reason.of(ReasonKind.NORMALISED, "target", name, amount=float(self._off[k]), unit="-")
-                )
-            else:
-                samples[row] = self._list[row].motion.sample(t)
-                put(view, samples[row])
-                faults.append(_implausible(name, FAULTS[code]))
+def _checked(name: str, task: RowTask, target: Any) -> tuple[Any, Reason | None]:
+    """Return a target, None where it cannot be true, and what is wrong with it or was normalised in it."""
+    if not isinstance(target, Sample):
+        fault = task.fault(target)
+        return (None, _implausible(name, fault)) if fault else (target, None)
+    state = target.row[None].copy()
+    codes, off = kernels.check_states(state, _ONE, _AS_SAMPLE, FARTHEST, FASTEST)
+    code = int(codes[0])
+    if code == FINE:
+        return target, None
+    if code == NORMALISED:
+        sample = Sample.of_row(state[0], target.t, target.at_rest)
+        return sample, Reason.of(ReasonKind.NORMALISED, "target", name, amount=float(off[0]), unit="-")
+    return None, _implausible(name, FAULTS[code])
 
 
 def _implausible(target: str, detail: str) -> Reason:

@@ -11,20 +11,8 @@ import numpy as np
 
 from qpavoid import kernels
 from qpavoid.kernels import Pieces
-from qpavoid.model.trajectory import END_TOLERANCE, STATE, Motion, Sample, Trajectory, view_state
+from qpavoid.model.trajectory import END_TOLERANCE, Motion, Trajectory
 from qpavoid.problem import Array
-
-__all__ = ["STATE", "TrajectoryBatch", "as_samples", "extrapolate", "put"]
-
-
-def as_samples(states: Array) -> list[Sample]:
-    """View each row of the states (k, 18) as a sample."""
-    return [view_state(row) for row in states]
-
-
-def put(view: Sample, sample: Sample) -> None:
-    """Writes a sample into one of the views of `as_samples`."""
-    view[0][:], view[1][:], view[2][:], view[3][:] = sample[:4]
 
 
 def extrapolate(states: Array, t: float | Array) -> None:

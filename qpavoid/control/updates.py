@@ -11,18 +11,16 @@ from qpavoid import kernels
 from qpavoid.config import PointCloud
 from qpavoid.control.estimates import MeasuredStates
 from qpavoid.control.inputs import FARTHEST, FASTEST, FAULTS, as_time
-from qpavoid.control.poses import Pose, as_sample
-from qpavoid.control.trajectories import as_samples, extrapolate, put
+from qpavoid.control.trajectories import extrapolate
 from qpavoid.errors import NumericalError, UnknownName, nearest
 from qpavoid.kernels.obstacles import FINE, NORMALISED, POSE, REST, SAMPLE
 from qpavoid.model.cloud import Points, Voxels
+from qpavoid.model.sample import Pose, Sample, as_sample
 from qpavoid.model.scene import Obstacle
-from qpavoid.model.trajectory import Sample
 from qpavoid.problem import Array, IntArray
 from qpavoid.reason import Reason, ReasonKind, Severity
 
 _FLAGS = {bool, np.bool_}
-_NO_TWISTS = np.zeros((0, 3))
 
 
 class Update(NamedTuple):
@@ -137,7 +135,7 @@ class UpdateReader:
             else:
                 cloud, sample = None, _checked(name, value)
             bare = isinstance(sample, Pose)
-            sample = Sample(sample[0], sample[1], *_ZERO_TWIST, sample[2], sample[3]) if bare else sample
+            sample = sample.as_sample() if bare else sample
             if isinstance(value, Points) and cloud is None:
                 _flags([name], [sample])
                 wrong = self._wrong_stamp(index, _stamp(name, sample, t), t, shift)
@@ -166,7 +164,8 @@ class UpdateReader:
         names, samples, which, kind = batch
         if not samples:
             return NO_UPDATE
-        columns, times, rests = _columns(names, samples)
+        rows, times = np.array([sample.row for sample in samples]), [sample.t for sample in samples]
+        rests = [sample.at_rest for sample in samples]
         unusable, notes = list[int](), list[Reason]()
         flags = set(map(type, rests))
         if flags != {bool} or True in rests:
@@ -184,10 +183,10 @@ class UpdateReader:
                     if wrong.kind is not ReasonKind.IGNORED:
                         unusable.append(int(which[k]))
                 which, kind, stamps = which[~late], kind[~late], stamps[~late]
-                columns = [column[~late] if len(column) else column for column in columns]
+                rows = rows[~late]
                 kept = self._select([names[k] for k in np.flatnonzero(~late).tolist()], kept.type, which.tolist())
         states = self._measured.updates
-        kernels.write_states(states, which, *columns)
+        kernels.write_rows(states, which, rows)
         if kernels.count_faults(states, which, kind, FARTHEST, FASTEST, kept.codes, kept.off):
             bad = kept.codes > NORMALISED
             for k in np.flatnonzero(kept.codes != FINE).tolist():
@@ -222,8 +221,8 @@ class UpdateReader:
             if index in self._measured.known:
                 extrapolate(state, t - shift - self._measured.stamps[index])
             else:
-                put(as_samples(state)[0], self._obstacles[index].motion.sample(t))
-            sample = as_samples(state)[0]
+                state[0] = self._obstacles[index].motion.sample(t).row
+            sample = Sample.of_row(state[0])
         else:
             sample = _checked(self._obstacles[index].name, cloud.pose)
         return sample._replace(t=sample.t if cloud.t is None else cloud.t, at_rest=cloud.at_rest or sample.at_rest)
@@ -264,29 +263,6 @@ class UpdateReader:
 def unlikely(name: str, detail: str) -> Reason:
     """Return the reason why an update of an obstacle is not used."""
     return Reason.of(ReasonKind.IMPLAUSIBLE, name, severity=Severity.WARNING, detail=detail)
-
-
-_ZERO_TWIST = np.zeros(3), np.zeros(3)
-
-
-def _columns(names: Sequence[str], samples: Sequence[Any]) -> tuple[list[Array], tuple[Any, ...], tuple[Any, ...]]:
-    """Return positions (k, 3), rotations (k, 3, 3) and twists (k, 3), time stamps, and what is at rest.
-
-    Raises:
-        NumericalError: an entry of the wrong shape, or not made of numbers; names the obstacle.
-    """
-    *parts, times, rests = zip(*samples, strict=True)
-    try:
-        columns, k = [np.array(part) for part in parts], len(samples)
-        shapes = [column.shape for column in columns]
-        fits = shapes == [(k, 3), (k, 3, 3), (k, 3), (k, 3)][: len(columns)]
-        fits = fits and {column.dtype for column in columns} == {np.dtype(np.float64)}
-    except (ValueError, TypeError, OverflowError):
-        fits = False
-    if not fits:
-        checked = [_checked(name, sample) for name, sample in zip(names, samples, strict=True)]
-        columns = [np.array(part) for part in list(zip(*checked, strict=True))[:-2]]
-    return (columns if len(columns) == 4 else [*columns, _NO_TWISTS, _NO_TWISTS]), times, rests
 
 
 def _flags(names: Sequence[str], samples: Sequence[Any]) -> list[bool]:

@@ -19,7 +19,7 @@ from qpavoid.kernels.estimates import (
     extrapolate_estimates,
     extrapolate_states,
     update_estimates,
-    write_states,
+    write_rows,
 )
 from qpavoid.kernels.kinematics import KinematicsArrays, update_kinematics
 from qpavoid.kernels.layout import RowLayout
@@ -88,5 +88,5 @@ __all__ = [
     "velocity_bounds",
     "violation",
     "voxels_within",
-    "write_states",
+    "write_rows",
 ]

@@ -52,27 +52,19 @@ def are_fine(states: Array, max_position: float, max_speed: float) -> bool:
 
 
 @compiled
-def write_states(
-    states: Array, which: IntArray, positions: Array, rotations: Array, linear: Array, angular: Array
-) -> None:
-    """Write samples into rows of states.
+def write_rows(states: Array, which: IntArray, rows: Array) -> None:
+    """Write samples, or bare poses, into rows of states; the velocities of poses are zero.
 
     Args:
         states: out: rows `which` (o, 18).
         which: numbers of the rows (k,).
-        positions: (k, 3) [m].
-        rotations: (k, 3, 3) body axes to world axes.
-        linear: (k, 3) or (0, 3) for zero [m/s].
-        angular: (k, 3) or (0, 3) for zero [rad/s].
+        rows: (k, 18) or (k, 12).
     """
     for k in range(len(which)):
         x = states[which[k]]
-        for r in range(3):
-            x[9 + r] = positions[k, r]
-            x[12 + r] = linear[k, r] if len(linear) else 0.0
-            x[15 + r] = angular[k, r] if len(angular) else 0.0
-            for c in range(3):
-                x[3 * c + r] = rotations[k, r, c]
+        x[12:] = 0.0
+        for c in range(rows.shape[1]):
+            x[c] = rows[k, c]
 
 
 @compiled

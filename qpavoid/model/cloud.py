@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from qpavoid.config.text import read_text
 from qpavoid.errors import ConfigError, NumericalError
-from qpavoid.model.trajectory import Sample
+from qpavoid.model.sample import Sample
 from qpavoid.problem import Array, IntArray, as_numbers
 
 _BLOCK = 4

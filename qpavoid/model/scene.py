@@ -19,8 +19,9 @@ from qpavoid.model.cloud import Voxels, read_points
 from qpavoid.model.kinematics import support_masks
 from qpavoid.model.pairs import pair_array
 from qpavoid.model.robot import Robot
+from qpavoid.model.sample import Sample
 from qpavoid.model.solids import make_solids
-from qpavoid.model.trajectory import Motion, Sample, build_motion, still
+from qpavoid.model.trajectory import Motion, build_motion, still
 from qpavoid.problem import Array, IntArray
 
 PARKING_DISTANCE = 1e4

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 import pinocchio as pin
@@ -23,53 +23,11 @@ from qpavoid.config.base import LARGEST
 from qpavoid.errors import ConfigError, NumericalError, located
 from qpavoid.kernels import Pieces
 from qpavoid.model.csv_poses import read_poses
-from qpavoid.problem import Array, require_finite
+from qpavoid.model.sample import POSE, STATE, Sample
+from qpavoid.problem import Array
 
-STATE = 18
-"""Numbers in the state of a body."""
 END_TOLERANCE = 1e-9
 """Time before its end at which a piece ends [s]: k·dt may be a rounding error less than the time it stands for."""
-
-
-class Sample(NamedTuple):
-    """Pose of a body origin and its velocity, all in world axes."""
-
-    position: Array
-    """(3,) world position [m]."""
-    rotation: Array
-    """(3, 3) body axes to world axes."""
-    linear: Array
-    """(3,) velocity of the origin [m/s]."""
-    angular: Array
-    """(3,) angular velocity [rad/s]."""
-    t: float | None = None
-    """Time stamp: when an obstacle was there [s]; the time of the control step if left out."""
-    at_rest: bool = False
-    """Whether an obstacle stays there until another sample is given: it is never stale."""
-
-    @classmethod
-    def at(
-        cls,
-        position: ArrayLike,
-        rotation: ArrayLike | None = None,
-        linear: ArrayLike | None = None,
-        angular: ArrayLike | None = None,
-        t: float | None = None,
-        at_rest: bool = False,
-    ) -> Sample:
-        """Make a sample of read-only copies; what is left out is the identity, or zero.
-
-        Raises:
-            NumericalError: an entry has the wrong shape, or holds what is not a finite number.
-        """
-        return cls(
-            _checked("position", position, (3,)),
-            _checked("rotation", np.eye(3) if rotation is None else rotation, (3, 3)),
-            _checked("linear", np.zeros(3) if linear is None else linear, (3,)),
-            _checked("angular", np.zeros(3) if angular is None else angular, (3,)),
-            t,
-            at_rest,
-        )
 
 
 class Motion(Protocol):
@@ -101,12 +59,7 @@ class Trajectory:
             raise NumericalError(f"the time at which a motion is sampled is {t}")
         states = np.empty((1, STATE))
         kernels.sample_pieces(self.pieces, t, END_TOLERANCE, states)
-        return view_state(states[0])
-
-
-def view_state(state: Array) -> Sample:
-    """View the state of a body (18,) as a sample: rotation by columns, position, linear and angular velocity."""
-    return Sample(state[9:12], state[:9].reshape(3, 3).T, state[12:15], state[15:])
+        return Sample.of_row(states[0])
 
 
 def build_motion(config: MotionConfig, start: Sample | None = None, folder: Path = Path()) -> Motion:
@@ -160,8 +113,7 @@ def _resting(poses: Sequence[Sample], starts: Sequence[float]) -> Trajectory:
     clock, terms = np.zeros((count, 4)), np.zeros((count, 7, STATE))
     clock[:, 1] = math.inf
     for pose, term in zip(poses, terms[:, 0], strict=True):
-        view = view_state(term)
-        view.position[:], view.rotation[:] = pose.position, pose.rotation
+        term[:POSE] = pose.row[:POSE]
     bodies, first = np.zeros(1, dtype=np.intp), np.array([0, count], dtype=np.intp)
     return Trajectory(Pieces(bodies, first, np.array([-math.inf, *starts]), clock, terms), poses[0])
 
@@ -248,9 +200,3 @@ def _direction(vector: tuple[float, float, float], field: str) -> Array:
     if norm < 1e-9:
         raise ConfigError(f"motion.{field} has no length; give a direction such as [0, 0, 1]")
     return np.array(vector) / norm
-
-
-def _checked(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    array = np.array(require_finite(name, value, shape))
-    array.setflags(write=False)  # samples of one motion share it
-    return array

@@ -12,8 +12,8 @@ import numpy as np
 
 from qpavoid.config import ScenarioConfig
 from qpavoid.config.base import Block, NonNegative
+from qpavoid.model.sample import Sample
 from qpavoid.model.scene import Obstacle
-from qpavoid.model.trajectory import Sample
 
 
 class Sensor(Block):

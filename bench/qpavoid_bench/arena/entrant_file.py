@@ -14,7 +14,7 @@ import numpy as np
 from qpavoid import Controller, Solver
 from qpavoid.config.text import read_text
 from qpavoid.errors import ConfigError
-from qpavoid.model.trajectory import Sample
+from qpavoid.model.sample import Sample
 from qpavoid.problem import Array, Problem, Solution, require_finite
 from qpavoid_bench.arena.case import Case
 from qpavoid_bench.arena.entrants import Entrant

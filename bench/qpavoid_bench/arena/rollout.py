@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 import pinocchio as pin
 
-from qpavoid.model.trajectory import Sample
+from qpavoid.model.sample import Sample
 from qpavoid.problem import Array, IntArray, Solution, Status
 from qpavoid.run.log import STATUSES
 from qpavoid_bench.arena.case import Case, SensorModel

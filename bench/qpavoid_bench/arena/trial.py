@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial
 from time import perf_counter
 
-from qpavoid.model.trajectory import Sample
+from qpavoid.model.sample import Sample
 from qpavoid.problem import Array, Solution
 from qpavoid_bench.arena.case import Case
 from qpavoid_bench.arena.checker import check_run

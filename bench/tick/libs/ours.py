@@ -12,7 +12,7 @@ from bench.tick.workloads import Array, Workload
 from qpavoid import Controller
 from qpavoid.config import Avoidance, Task
 from qpavoid.control.tasks import build_tasks
-from qpavoid.model.trajectory import Sample
+from qpavoid.model.sample import Sample
 
 
 class Ours:

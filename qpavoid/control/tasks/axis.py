@@ -9,11 +9,11 @@ import numpy as np
 
 from qpavoid import config
 from qpavoid.control.inputs import FARTHEST
-from qpavoid.control.poses import as_goal
 from qpavoid.control.tasks.base import Constant, RowTask, Target, frame_jacobian, frame_pose, length
 from qpavoid.control.tasks.start import Start
 from qpavoid.errors import ConfigError
 from qpavoid.model.kinematics import ForwardKinematics
+from qpavoid.model.sample import as_goal
 from qpavoid.problem import Array, as_vector
 
 _ALIGNED = 1e-9

@@ -9,9 +9,9 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid import config
-from qpavoid.control.poses import as_goal
 from qpavoid.errors import NumericalError
 from qpavoid.model.kinematics import ForwardKinematics
+from qpavoid.model.sample import as_goal
 from qpavoid.problem import Array
 
 PARTS = {"position": slice(0, 3), "orientation": slice(3, 6), "pose": slice(0, 6)}

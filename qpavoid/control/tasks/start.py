@@ -9,7 +9,8 @@ from typing import Any
 from qpavoid import config
 from qpavoid.errors import located
 from qpavoid.model.robot import Robot
-from qpavoid.model.trajectory import Motion, Sample, build_motion
+from qpavoid.model.sample import Sample
+from qpavoid.model.trajectory import Motion, build_motion
 from qpavoid.problem import Array
 
 

@@ -10,8 +10,8 @@ import pinocchio as pin
 from qpavoid.config import Avoidance
 from qpavoid.control.tasks import FrameTask
 from qpavoid.errors import ConfigError
+from qpavoid.model.sample import Sample
 from qpavoid.model.scene import Scene
-from qpavoid.model.trajectory import Sample
 from qpavoid.problem import Array, IntArray
 from qpavoid_bench.arena.case import Case
 from qpavoid_bench.arena.world import World

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from qpavoid.errors import ConfigError
-from qpavoid.model.trajectory import Sample
+from qpavoid.model.sample import Sample
 from qpavoid.problem import Array, Solution
 from qpavoid_bench.arena.case import Case
 from qpavoid_bench.arena.libraries.common import (

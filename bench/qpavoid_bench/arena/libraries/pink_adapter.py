@@ -12,7 +12,7 @@ from pink.barriers import SelfCollisionBarrier
 from pink.limits import AccelerationLimit, ConfigurationLimit, VelocityLimit
 from pink.tasks import FrameTask
 
-from qpavoid.model.trajectory import Sample
+from qpavoid.model.sample import Sample
 from qpavoid.problem import Array, Solution
 from qpavoid_bench.arena.case import Case
 from qpavoid_bench.arena.libraries.common import (

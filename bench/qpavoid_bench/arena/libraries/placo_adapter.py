@@ -21,8 +21,8 @@ import pinocchio as pin
 from qpavoid.config import Limits
 from qpavoid.control.tasks import FrameTask
 from qpavoid.errors import ConfigError
+from qpavoid.model.sample import Sample
 from qpavoid.model.scene import Scene
-from qpavoid.model.trajectory import Sample
 from qpavoid.problem import Array, Solution
 from qpavoid_bench.arena.case import Case
 from qpavoid_bench.arena.libraries.common import (
