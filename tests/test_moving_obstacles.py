@@ -47,7 +47,7 @@ def test_qp_keeps_its_safety_distance_from_a_moving_sphere(course):
     assert metrics["status_counts"]["STOPPED"] == 0
 
 
-@pytest.mark.parametrize("backup", [{}, pytest.param(None, marks=pytest.mark.slow)], ids=["backup", "law alone"])
+@pytest.mark.parametrize("backup", [True, pytest.param(False, marks=pytest.mark.slow)], ids=["backup", "law alone"])
 @pytest.mark.parametrize(
     "course", [c if c in ("head-on 0.4", "chase 0.3") else pytest.param(c, marks=pytest.mark.slow) for c in COURSES]
 )

@@ -187,7 +187,8 @@ def test_task_switching_rows_of_a_filter_follow_its_command(panda):
 @pytest.mark.parametrize("change", ["eased", "followed", "of a cascade"])
 def test_task_switching_rows_follow_the_tracked_velocity(panda, change):
     """Whatever takes the place of v0, u is of that; the problem that it was made from stays as it was."""
-    robot = panda if change == "eased" else replace(panda, acceleration={})
+    jerk = dict.fromkeys(panda.acceleration, 1e6)
+    robot = replace(panda, jerk=jerk) if change == "eased" else replace(panda, acceleration={})
     scene = build_scene(robot, [obstacle("ball", SPHERE, [0.5, 0.3, 0.45])])
     hand, wrist = Task(frame="panda_hand_tcp"), Task(frame="panda_link7", priority=2)
     bench = Bench(
