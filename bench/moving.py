@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from time import perf_counter_ns
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
@@ -103,25 +104,24 @@ def closed_loop(**avoidance: Any) -> tuple[float, ...]:
 
     from bench.endurance import LAP, scenario
     from qpavoid import Controller
+    from qpavoid.safety.rollout import BackupRollouts
 
     controller, q = Controller.from_scenario(scenario(**avoidance))
     steps, rollouts = [], []
-    backup = controller._commander.backup
-    if backup is not None:
-        rollout = backup.rollouts.rollout
+    rollout = BackupRollouts.rollout
 
-        def timed(*args: Any) -> Any:
-            begin = perf_counter_ns()
-            trajectory = rollout(*args)
-            rollouts.append(1e-3 * (perf_counter_ns() - begin))
-            return trajectory
-
-        backup.rollouts.rollout = timed  # type: ignore[method-assign]
-    for k in range(LAP):
+    def timed(*args: Any) -> Any:
         begin = perf_counter_ns()
-        v = controller.step(q, k * DT).v
-        steps.append(1e-3 * (perf_counter_ns() - begin))
-        q = pin.integrate(controller.scene.robot.model, q, DT * v)
+        trajectory = rollout(*args)
+        rollouts.append(1e-3 * (perf_counter_ns() - begin))
+        return trajectory
+
+    with patch.object(BackupRollouts, "rollout", timed):
+        for k in range(LAP):
+            begin = perf_counter_ns()
+            v = controller.step(q, k * DT).v
+            steps.append(1e-3 * (perf_counter_ns() - begin))
+            q = pin.integrate(controller.scene.robot.model, q, DT * v)
     each = float(np.median(rollouts)) if rollouts else 0.0
     return *(float(p) for p in np.percentile(steps, [50, 99, 100])), len(rollouts) / LAP, each
 
