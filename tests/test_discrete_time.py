@@ -74,7 +74,7 @@ def test_clearance_lower_bound_holds_with_moving_obstacles(panda):
         places = [Sample.at(rng.uniform(-0.8, 0.8, 3), linear=rng.uniform(-0.5, 0.5, 3)) for _ in range(4)]
         bench.place(dict(enumerate(places)))
         near = len(bench.compute(q, reach=0.1)[0].pair)
-        bound = bench.rows.clearance_lower_bound(v, near, horizon)
+        bound = bench.assembler.clearance_lower_bound(v, near, horizon)
         for s in np.linspace(0.0, horizon, 12):
             there = {i: x._replace(position=x.position + s * x.linear) for i, x in enumerate(places)}
             found.append(ruler.distances(q + s * v, there).min())

@@ -103,12 +103,12 @@ def test_clearance_lower_bound_holds_along_stops(panda):
     for _ in range(150):
         q = rng.uniform(bounds.lower + 0.3, bounds.upper - 0.3)
         before, change = rng.uniform(-0.3, 0.3, 7) * bounds.velocity, rng.uniform(-1.0, 1.0, 7) * bounds.acceleration
-        bench.rows.previous.restart(before)
+        bench.assembler.previous.restart(before)
         near = len(bench.compute(q, reach=0.1)[0].pair)
         v = before + 0.01 * change
-        stop = bench.rows.stop(q, v)
+        stop = bench.assembler.stop(q, v)
         velocities = stop.velocities.copy()
-        bound = bench.rows.clearance_lower_bound(v, near, float(stop.equivalent_time.sum()), stop)
+        bound = bench.assembler.clearance_lower_bound(v, near, float(stop.equivalent_time.sum()), stop)
         least = np.inf
         for velocity in velocities:
             least = min(least, ruler.distances(q).min())
