@@ -98,11 +98,14 @@ class ObstacleTracker:
         self._placed: set[int] = set()  # numbers of those that are, or were, attached to the robot
         self.moving: IntArray = self._current.which
         """(k,) numbers of those on a trajectory or external; no attached object is among them."""
+        self.on_trajectories: IntArray = self._current.which
+        """(k,) numbers of those on a trajectory that are not external."""
         self._measured = MeasuredStates(count, dt)
         self._reader = UpdateReader(obstacles, self._measured, dt)
         self._estimates: ObstacleEstimates | None = None
         self._sampled: dict[float, tuple[Array, Array]] = {}  # of those on trajectories, by time: see `paths`
-        self._external = np.zeros(0, dtype=np.intp)  # numbers of those that are given
+        self.external: IntArray = np.zeros(0, dtype=np.intp)
+        """(k,) numbers of those that a program gives."""
         self._awaited = {i for i, obstacle in enumerate(obstacles) if obstacle.external}  # external, never given
         self._known: IntArray | None = None  # the last `which` of an update, all of which are known
         self.index = self._reader.index
@@ -113,8 +116,7 @@ class ObstacleTracker:
         none, no_stamps = NO_UPDATE.which, NO_UPDATE.stamps
         states, now = self._measured.updates, self._current
         kernels.check_states(states, none, none, FARTHEST, FASTEST)
-        kernels.write_rows(states, none, states[:0])
-        kernels.count_faults(states, none, none, FARTHEST, FASTEST, none, no_stamps)
+        kernels.write_rows(states, none, states[:0], none, FARTHEST, FASTEST, none, no_stamps)
         self._measured.update(none, none, no_stamps, now.states)
         self._measured.extrapolate(none, 0.0, 0.0, 0.0, now.states, now.margin)
         extrapolate(states[:0], 0.0)
@@ -132,13 +134,15 @@ class ObstacleTracker:
     @property
     def any_may_move(self) -> bool:
         """Whether any is on a trajectory or has a mean twist, so that it may be elsewhere later."""
-        estimates = self.estimates
-        if estimates is None or len(estimates.which) < len(self.moving):
-            return len(self.moving) > 0
-        return bool(estimates.states[:, 12:].any())
+        return len(self.on_trajectories) > 0 or bool(self._measured.twists.any())
+
+    @property
+    def mean_twists(self) -> Array:
+        """(o, 6) mean twists of external obstacles, with which they are predicted; zero of all others."""
+        return self._measured.twists
 
     def paths(self, times: Array) -> tuple[Array, Array]:
-        """Predict the obstacles that move.
+        """Predict the obstacles `on_trajectories`.
 
         Args:
             times: (t,) [s].
@@ -146,18 +150,9 @@ class ObstacleTracker:
         Returns:
             Positions (t, k, 3) [m]; their largest speeds and rates of turning at these times (k, 2) [m/s, rad/s].
         """
-        positions, rates = np.empty((len(times), len(self.moving), 3)), np.empty((len(self.moving), 2))
-        estimates = self.estimates
-        if estimates is None or len(estimates.which) < len(self.moving):
-            self._sampled = {t: self._sampled.get(t) or self._sample(t) for t in times.tolist()}
-            sampled = [np.array(parts) for parts in zip(*self._sampled.values(), strict=True)]
-            positions[:], rates[:] = sampled[0][:, self.moving], sampled[1][:, self.moving].max(axis=0)
-        if estimates is not None:
-            columns = np.searchsorted(self.moving, estimates.which)
-            displacements = (times - estimates.t)[:, None, None] * estimates.states[:, 12:15]
-            positions[:, columns] = estimates.states[:, 9:12] + displacements
-            rates[columns] = _rates(estimates.states)
-        return positions, rates
+        self._sampled = {t: self._sampled.get(t) or self._sample(t) for t in times.tolist()}
+        positions, rates = [np.array(parts) for parts in zip(*self._sampled.values(), strict=True)]
+        return positions[:, self.on_trajectories], rates[:, self.on_trajectories].max(axis=0)
 
     def _sample(self, t: float) -> tuple[Array, Array]:
         """Sample positions (o, 3) and rates (o, 2) of those that follow a trajectory."""
@@ -227,7 +222,8 @@ class ObstacleTracker:
     def _renew(self) -> None:
         """Lay out the numbers of the obstacles that move."""
         self._estimates, self._known = None, None
-        self._external = np.array(list(self._measured.known), dtype=np.intp)
+        self.external = np.array(list(self._measured.known), dtype=np.intp)
+        self.on_trajectories = np.array([i for i in self._moving if i not in self._measured.known], dtype=np.intp)
         moving = {*self._moving, *self._measured.known}
         self.moving = np.array(sorted(moving), dtype=np.intp)
         self._current = self._current._replace(which=np.array(sorted(moving | self._placed), dtype=np.intp))
@@ -297,10 +293,10 @@ class ObstacleTracker:
         if len(given.which):
             notes += self._take_over(given)
             self._current.voxels.update(given.voxels)
-        if len(self._external):
+        if len(self.external):
             current.margin.fill(0.0)
             stale = self._measured.extrapolate(
-                self._external, t, self._stale_after, self._growth, current.states, current.margin
+                self.external, t, self._stale_after, self._growth, current.states, current.margin
             )
             if stale or self._awaited:
                 assumptions, stop = self._overdue(t)
@@ -340,9 +336,9 @@ class ObstacleTracker:
         for index in self._awaited:
             since = float(t - self._measured.stamps[index])
             assumptions.append(Reason.of(ReasonKind.NEVER_UPDATED, self._obstacles[index].name, amount=since, unit="s"))
-        age = t - self._measured.stamps[self._external]
-        stale = (age > self._stale_after) & ~self._measured.at_rest[self._external]
-        for index, old in zip(self._external[stale].tolist(), age[stale].tolist(), strict=True):
+        age = t - self._measured.stamps[self.external]
+        stale = (age > self._stale_after) & ~self._measured.at_rest[self.external]
+        for index, old in zip(self.external[stale].tolist(), age[stale].tolist(), strict=True):
             name, margin = self._obstacles[index].name, self._current.margin[index]
             kind = ReasonKind.NEVER_UPDATED if index in self._awaited else ReasonKind.STALE
             if kind is ReasonKind.STALE:

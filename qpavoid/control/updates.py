@@ -186,8 +186,7 @@ class UpdateReader:
                 rows = rows[~late]
                 kept = self._select([names[k] for k in np.flatnonzero(~late).tolist()], kept.type, which.tolist())
         states = self._measured.updates
-        kernels.write_rows(states, which, rows)
-        if kernels.count_faults(states, which, kind, FARTHEST, FASTEST, kept.codes, kept.off):
+        if kernels.write_rows(states, which, rows, kind, FARTHEST, FASTEST, kept.codes, kept.off):
             bad = kept.codes > NORMALISED
             for k in np.flatnonzero(kept.codes != FINE).tolist():
                 name, code = self._obstacles[which[k]].name, int(kept.codes[k])

@@ -1,6 +1,6 @@
 """Array work of a control step: loops that numba compiles at their first use, and stores on disk (`kernels.cache`)."""
 
-from qpavoid.kernels.backup import ROUND_OFF, backup_rows, closes_below, min_sphere_distance, rate_limit
+from qpavoid.kernels.backup import ROUND_OFF, backup_rows, closes_below, line_clearance, min_sphere_distance, rate_limit
 from qpavoid.kernels.bounds import velocity_bounds
 from qpavoid.kernels.braking_bounds import speed_to_stop
 from qpavoid.kernels.braking_trajectory import jerk_limited_stop, roll_out_stop, stop_velocity
@@ -15,7 +15,6 @@ from qpavoid.kernels.clearance import (
 )
 from qpavoid.kernels.estimates import (
     are_fine,
-    count_faults,
     extrapolate_estimates,
     extrapolate_states,
     update_estimates,
@@ -50,7 +49,6 @@ __all__ = [
     "clearance_lower_bound",
     "closes_below",
     "control_step",
-    "count_faults",
     "damped_solution",
     "direct",
     "distance_rows",
@@ -62,6 +60,7 @@ __all__ = [
     "jerk_limited_stop",
     "joint_speeds",
     "leaves_position_limits",
+    "line_clearance",
     "max_clearance_velocity",
     "min_sphere_distance",
     "minimize",

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from qpavoid.kernels.bounds import velocity_bounds
+from qpavoid.kernels.near_pairs import place_bodies
 from qpavoid.kernels.packing import compiled
 from qpavoid.kernels.rows import distance_rows
 from qpavoid.problem import Array, IntArray, Mask
@@ -101,6 +102,49 @@ def rate_limit(v: Array, targets: Array, v_step: Array, stop_when_met: bool) -> 
             return ramp[: k + 1]
         v_prev = ramp[k]
     return ramp
+
+
+@compiled
+def line_clearance(
+    x: Any, joint_poses: Array, spheres: Array, numbers: IntArray, states: Array, twists: Array, radii: Array,
+    horizon: float,
+) -> tuple[float, float]:  # fmt: skip
+    """Compute the least distance between bounding spheres of the robot at rest and of obstacles on straight lines.
+
+    Args:
+        x: `DistanceArrays`, in which the bodies that joints move are placed.
+        joint_poses: (J, 12).
+        spheres: bounding sphere of each body in its frame, centre and radius (g, 4) [m].
+        numbers: of the obstacles (k,); those that do not move do not count.
+        states: of all obstacles (o, 18).
+        twists: velocities that they keep (o, 6) [m/s, rad/s].
+        radii: of their bounding spheres (o,) [m].
+        horizon: time for which they go on [s].
+
+    Returns:
+        The distance, infinite without any [m]; largest speed of any point of an obstacle [m/s].
+    """
+    place_bodies(x, joint_poses)
+    least, fastest, center = np.inf, 0.0, np.empty(3)
+    for i in numbers:
+        p, v, w, r = states[i, 9:12], twists[i, :3], twists[i, 3:], radii[i]
+        square, turning = v[0] ** 2 + v[1] ** 2 + v[2] ** 2, np.sqrt(w[0] ** 2 + w[1] ** 2 + w[2] ** 2)
+        if not (square > 0.0 or turning > 0.0):
+            continue
+        fastest = max(fastest, np.sqrt(square) + (turning * r if turning > 0.0 else 0.0))
+        for b in range(len(x.joints)):
+            if x.joints[b] < 0:
+                continue
+            pose, sphere, toward = x.poses[b], spheres[b], 0.0
+            for c in range(3):
+                center[c] = pose[c] * sphere[0] + pose[3 + c] * sphere[1] + pose[6 + c] * sphere[2] + pose[9 + c]
+                toward += (center[c] - p[c]) * v[c]
+            t = min(max(toward / square, 0.0), horizon) if square > 0.0 else 0.0
+            distance = 0.0
+            for c in range(3):
+                distance += (p[c] + t * v[c] - center[c]) ** 2
+            least = np.minimum(least, np.sqrt(distance) - r - sphere[3])
+    return least, fastest
 
 
 @compiled

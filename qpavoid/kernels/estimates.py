@@ -13,28 +13,6 @@ from qpavoid.problem import Array, IntArray
 
 
 @compiled
-def count_faults(
-    states: Array, which: IntArray, kind: IntArray, max_position: float, max_speed: float, codes: IntArray, off: Array
-) -> int:
-    """Count the states that `check_states` does not find FINE.
-
-    Args:
-        states: (o, 18), normalised in place.
-        which: numbers of those to check (k,).
-        kind: how each is given (k,): SAMPLE, POSE or REST.
-        max_position: largest coordinate of a position [m].
-        max_speed: largest component of a twist [m/s, rad/s].
-        codes: out: (k,) what `check_states` finds.
-        off: out: (k,) largest entry of |RᵀR - I|.
-    """
-    codes[:], off[:] = check_states(states, which, kind, max_position, max_speed)
-    count = 0
-    for code in codes:
-        count += code != FINE
-    return count
-
-
-@compiled
 def are_fine(states: Array, max_position: float, max_speed: float) -> bool:
     """Return True if `check_states` finds all of some samples FINE.
 
@@ -52,19 +30,35 @@ def are_fine(states: Array, max_position: float, max_speed: float) -> bool:
 
 
 @compiled
-def write_rows(states: Array, which: IntArray, rows: Array) -> None:
-    """Write samples, or bare poses, into rows of states; the velocities of poses are zero.
+def write_rows(
+    states: Array, which: IntArray, rows: Array, kind: IntArray, max_position: float, max_speed: float,
+    codes: IntArray, off: Array,
+) -> int:  # fmt: skip
+    """Write samples, or bare poses, into rows of states, and check them; the velocities of poses are zero.
 
     Args:
-        states: out: rows `which` (o, 18).
+        states: out: rows `which` (o, 18), normalised.
         which: numbers of the rows (k,).
         rows: (k, 18) or (k, 12).
+        kind: how each is given (k,): SAMPLE, POSE or REST.
+        max_position: largest coordinate of a position [m].
+        max_speed: largest component of a twist [m/s, rad/s].
+        codes: out: (k,) what `check_states` finds.
+        off: out: (k,) largest entry of |RᵀR - I|.
+
+    Returns:
+        How many are not FINE.
     """
     for k in range(len(which)):
         x = states[which[k]]
         x[12:] = 0.0
         for c in range(rows.shape[1]):
             x[c] = rows[k, c]
+    codes[:], off[:] = check_states(states, which, kind, max_position, max_speed)
+    count = 0
+    for code in codes:
+        count += code != FINE
+    return count
 
 
 @compiled

@@ -39,6 +39,8 @@ class ApproachCheck:
         """Use the kinematics and distances of the rollouts."""
         self._model, self._braking = settings.scene.robot.model, 0.5 / settings.bounds.acceleration
         self._rollouts, self._obstacles = rollouts, obstacles
+        zero = np.zeros(settings.scene.robot.model.nv)
+        self._clearance_of_external(Start(settings.scene.robot.home, zero, zero, 0.0, rollouts.enabled))
         kernels.min_sphere_distance(np.zeros((1, 1, 3)), np.zeros((1, 3)), np.zeros((1, 1)))
         self.reset()
 
@@ -46,14 +48,34 @@ class ApproachCheck:
         """Drop the sample."""
         self._paths: _Paths | None = None
         self._clearance: tuple[Array, float] | None = None
+        self._numbers, self._max_external_speed = self._obstacles.on_trajectories, 0.0
 
     @property
     def max_speed(self) -> float:
-        """Largest speed of any point of an obstacle in the last sample [m/s]."""
-        return 0.0 if self._paths is None else self._paths.max_speed
+        """Largest speed of any point of an obstacle [m/s]."""
+        return max(self._max_external_speed, 0.0 if self._paths is None else self._paths.max_speed)
 
     def stays_far(self, start: Start) -> bool:
-        """Return whether moving obstacles certainly stay away from a robot that brakes from `start`.
+        """Return whether moving obstacles certainly stay away from a robot that brakes from `start`."""
+        stop = float(np.square(start.v) @ self._braking)
+        far, self._max_external_speed = True, 0.0
+        if len(self._obstacles.external):
+            clearance, self._max_external_speed = self._clearance_of_external(start)
+            far = (self._rollouts.lever_arm * stop if stop else 0.0) < clearance
+        return far and (not len(self._obstacles.on_trajectories) or self._trajectories_stay_far(start, stop))
+
+    def _clearance_of_external(self, start: Start) -> tuple[float, float]:
+        """Return the clearance of obstacles that go on at their mean twists [m], and their largest speed [m/s]."""
+        kinematics, query, obstacles = self._rollouts.kinematics, self._rollouts.query, self._obstacles
+        kinematics.compute(start.q)
+        clearance, speed = kernels.line_clearance(
+            query.packed, kinematics.joint_poses, query.table.spheres, obstacles.external, obstacles.current.states,
+            obstacles.mean_twists, query.obstacle_radii, HORIZON,
+        )  # fmt: skip
+        return clearance - PREFERRED_DISTANCE, speed
+
+    def _trajectories_stay_far(self, start: Start, stop: float) -> bool:
+        """Return whether obstacles on trajectories stay away.
 
         Between their sampled positions, obstacles are taken to be no faster than at these. A clearance counts until the
         next sample, less the motion of the robot since.
@@ -62,7 +84,6 @@ class ApproachCheck:
         if not len(paths.moving):
             return True
         lever_arm, query = self._rollouts.lever_arm, self._rollouts.query
-        stop = float(np.square(start.v) @ self._braking)
         if self._clearance is not None:
             q, clearance = self._clearance
             moved = float(np.abs(pin.difference(self._model, q, start.q)).sum())
@@ -77,13 +98,15 @@ class ApproachCheck:
 
     def _sample(self, first: int) -> _Paths:
         """Sample the positions of moving obstacles from a multiple of `_PERIOD` until the horizon."""
-        if self._paths is not None and first == self._paths.first and self._obstacles.estimates is None:
+        numbers = self._obstacles.on_trajectories
+        if self._paths is not None and first == self._paths.first and numbers is self._numbers:
             return self._paths
+        self._numbers = numbers
         count = int(np.ceil(HORIZON / _PERIOD)) + 2
         times = _PERIOD * np.arange(first, first + count, dtype=np.float64)
         positions, rates = self._obstacles.paths(times)
         moves = np.flatnonzero(rates.any(axis=1) | (positions != positions[0]).any(axis=(0, 2)))
-        moving = self._obstacles.moving[moves]
+        moving = numbers[moves]
         speed, spin = rates[moves].T
         # half-spaces have no end: of one that does not turn, 0 · ∞ counts as 0
         radii, rim_speed = self._rollouts.query.obstacle_radii[moving], np.zeros_like(spin)
