@@ -335,11 +335,11 @@ def test_entrant_from_file_digest_depends_on_text_only(folder):
 def test_entrant_from_file_failure_names_cause(folder, name, said):
     """A controller brakes where its law fails; the arena must not take that for what the law wants."""
     row = run_trial(make_case(load_family(folder / "post.yaml"), 0), entrant_from_file(folder / "laws.py", name))
-    assert re.search(said, row.failure) and not row.success
+    assert re.search(said, row.failure)
     if name == "now_and_then":
         assert 0.0 < row.failed < 1.0 and row.path_length > 0.0
     else:
-        assert row.failed == row.stopped == 1.0
+        assert row.failed == row.stopped == 1.0 and not row.success
 
 
 # --- sweeps ------------------------------------------------------------------------------------------------------
