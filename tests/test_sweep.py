@@ -355,7 +355,7 @@ def test_sweep_in_processes(folder):
     """Entrants of every kind run from text that was sent; what ends its process has failed, and is not lost."""
     own = [f"laws.py:{name}" for name in ("Halved", "solution", "velocity", "pilot", "Picky", "Deadly")]
     suite = load_suite(write_suite(folder, ["tracking", "qp", *own], seeds=1))
-    with Workers(2) as workers:
+    with Workers(1) as workers:
         assert swept(suite, folder / "out", workers)[1:] == (8, 8, 0, 0)
     assert not plan_of(suite, folder / "out").runs
     runs = {row["entrant"]: row for row in rows_in(folder)}
