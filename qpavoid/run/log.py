@@ -158,7 +158,7 @@ class Log:
             "time_below": {str(limit): dt * float(np.sum(distance < limit)) for limit in config["thresholds"]},
             "final_error": final_error,
             "task_errors": other_tasks,
-            "max_deviation": float(np.max(self.path_deviation(), initial=0.0)),
+            "max_deviation": float(np.max(path_deviation(self.tool, self.target), initial=0.0)),
             "tracking_rmse": float(np.sqrt(np.mean(error**2))) if error.size else float("nan"),
             "peak_velocity": float(np.max(np.abs(self.v), initial=0.0)),
             "jitter": float(np.sum(np.abs(np.diff(self.v, axis=0)))),
@@ -174,21 +174,6 @@ class Log:
                 "max": float(np.max(tick_us, initial=0.0)),
             },
         }
-
-    def path_deviation(self, corners: int = 500) -> Array:
-        """Compute the distance of each tool from the path that its target draws, at whatever time, (N, k) [m].
-
-        Args:
-            corners: the path is taken as a polyline with at most so many corners.
-        """
-        count, tasks = self.tool.shape[:2]
-        deviation = np.full((count, tasks), np.inf)
-        every = np.unique(np.linspace(0, max(count - 1, 0), min(count, corners)).astype(int))
-        for task in range(tasks):
-            path, tool = self.target[every, task], self.tool[:, task]
-            for start, end in zip(path, np.concatenate((path[1:], path[-1:])), strict=True):
-                deviation[:, task] = np.minimum(deviation[:, task], point_segment_distance(tool, start, end))
-        return deviation
 
     def save(self, path: str | Path) -> Path:
         """Write the log; the parent folder is made where it is missing.
@@ -260,3 +245,25 @@ class Log:
 
     def _arrays(self) -> dict[str, Any]:
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "meta"}
+
+
+def path_deviation(tool: Array, target: Array, corners: int = 500) -> Array:
+    """Compute the distance of each tool from the path that its target draws, at whatever time.
+
+    Args:
+        tool: (N, k, 3) positions of the tools [m].
+        target: (N, k, 3) positions of their targets [m].
+        corners: the path is taken as a polyline with at most so many corners.
+
+    Returns:
+        (N, k) [m].
+    """
+    count, tasks = tool.shape[:2]
+    deviation = np.full((count, tasks), np.inf)
+    every = np.unique(np.linspace(0, max(count - 1, 0), min(count, corners)).astype(int))
+    for task in range(tasks):
+        path = target[every, task]
+        for start, end in zip(path, np.concatenate((path[1:], path[-1:])), strict=True):
+            distance = point_segment_distance(tool[:, task], start, end)
+            deviation[:, task] = np.minimum(deviation[:, task], distance)
+    return deviation

@@ -11,7 +11,7 @@ from matplotlib.patches import Patch, Polygon
 from scipy.spatial import ConvexHull
 
 from qpavoid.problem import Array
-from qpavoid.run.log import Log
+from qpavoid.run.log import Log, path_deviation
 from qpavoid.viz.motion import AT_REST_COLOUR, OBSTACLE_COLOUR, capsule_faces, is_endless, moving_bodies, obstacle_faces
 from qpavoid.viz.style import COLOURS, D2, DASHES, add_grid, add_legend, draw_levels, is_qp, label_distances, units
 
@@ -65,7 +65,7 @@ def compare_time_figure(logs: Sequence[Log]) -> Figure:
         line = {**style, "linewidth": 1.7}
         to_target = np.linalg.norm(log.target - log.tool, axis=2)
         distance.plot(log.t, log.min_distance, **line)
-        deviation.plot(log.t, np.max(log.path_deviation(), axis=1, initial=0.0), **line)
+        deviation.plot(log.t, np.max(path_deviation(log.tool, log.target), axis=1, initial=0.0), **line)
         error.plot(log.t, np.max(to_target, axis=1, initial=1e-3 * ERROR_FLOOR), **line)
         speed.plot(log.t, np.max(np.abs(log.v), axis=1, initial=0.0), **line)
     solvers = distance.get_legend_handles_labels()[0]
