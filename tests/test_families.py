@@ -321,23 +321,6 @@ def test_clearance_lever_arms_bound_travel(name, gantry):
     assert longest > 0.5  # they are no bounds for their own sake
 
 
-def test_inverse_kinematics_attains_poses_within_limits(panda):
-    random, ranges, data = np.random.default_rng(1), JointRanges.of(panda), panda.model.createData()
-    frame, found = panda.frame_id("panda_hand_tcp", "test"), 0
-    for _ in range(20):
-        pin.framesForwardKinematics(panda.model, data, random.uniform(0.7 * ranges.lower, 0.7 * ranges.upper))
-        goal = FrameGoal(frame, data.oMf[frame].translation.copy(), data.oMf[frame].rotation.copy())
-        q = solve_inverse_kinematics(panda, [goal], panda.home, ranges, 1e-4)
-        if q is None:
-            continue
-        found += 1
-        assert ((ranges.lower <= q) & (q <= ranges.upper)).all()
-        pin.framesForwardKinematics(panda.model, data, q)
-        assert np.linalg.norm(data.oMf[frame].translation - goal.position) < 2e-4
-        assert np.linalg.norm(pin.log3(goal.rotation @ data.oMf[frame].rotation.T)) < 2e-4
-    assert found >= 10
-
-
 # --- a reader's own family ---------------------------------------------------------------------------------
 
 TEMPLATE = """
@@ -403,14 +386,6 @@ def family(tmp_path):
         return load_family(tmp_path / "own.yaml")
 
     return family
-
-
-def test_family_generator_from_file(family):
-    """A function beside the file is a generator."""
-    made = [make_case(family(GENERATED), seed) for seed in range(4)]
-    assert {len(m.scenario.obstacles) for m in made} <= {1, 2, 3}
-    assert len({str(m.scenario.obstacles) for m in made}) == 4
-    assert all(m.scenario.avoidance.d1 == 0.03 for m in made)
 
 
 @pytest.mark.parametrize(

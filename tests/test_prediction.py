@@ -18,27 +18,20 @@ def observe(tracker, t, updates):
     tracker.advance(tracker.read(t, updates))
 
 
-def test_paths_agree_with_predicted_states():
+def test_paths_are_those_of_obstacles_on_trajectories():
     times, update = np.array([0.3, 0.4, 1.9]), {"b": Sample.at([0, 1, 0], linear=[0.1, 0, 0.2], angular=[0, 0, 3.0])}
     line = build_motion(Line(start=(0.0, 0.6, 0.0), end=(0.0, -2.0, 0.0), speed=0.5))
-    still = Obstacle.at("still", Sphere(radius=0.1), [9.0, 0.0, 0.0])
-    obstacles = ObstacleTracker(
-        [still, Obstacle("a", Sphere(radius=0.1), line, True), Obstacle.at("b", Sphere(radius=0.1), [0, 0, 0])],
-        Sensing(),
-        0.1,
-    )
+    obstacles = [Obstacle.at(name, Sphere(radius=0.1), [9.0, 0.0, 0.0]) for name in ("still", "b")]
+    obstacles.insert(1, Obstacle("a", Sphere(radius=0.1), line, True))
+    tracker = ObstacleTracker(obstacles, Sensing(), 0.1)
     for k in range(4):
-        observe(obstacles, 0.1 * k, update if k % 2 else None)
-        places, rates = obstacles.paths(times)
-        assert obstacles.any_may_move and len(rates) == (2 if k else 1)
+        observe(tracker, 0.1 * k, update if k % 2 else None)
+        places, rates = tracker.paths(times)
+        assert tracker.on_trajectories.tolist() == [1] and tracker.external.tolist() == [2] * (k > 0)
         for t, row in zip(times, places, strict=True):
-            np.testing.assert_allclose(row, obstacles.at(t).states[obstacles.moving, 9:12], rtol=0, atol=1e-12)
-        expected = [[0.5, 0.0], [np.sqrt(0.05), 3.0]][: len(rates)]
-        np.testing.assert_allclose(rates, expected, rtol=0, atol=1e-12)
-    resting = ObstacleTracker([still], Sensing(), 0.1)
-    for twist, any_may_move in (([0, 0, 0], False), ([0, 0, 0.1], True)):
-        observe(resting, 0.0, {"still": Sample.at([9.0, 0.0, 0.0], linear=twist)})
-        assert resting.any_may_move == any_may_move
+            np.testing.assert_allclose(row, tracker.at(t).states[[1], 9:12], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(rates, [[0.5, 0.0]], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(tracker.mean_twists, [[0] * 6, [0] * 6, [0.1, 0, 0.2, 0, 0, 3.0]], atol=1e-12)
 
 
 def test_prediction_uses_the_mean_twist():
@@ -54,8 +47,6 @@ def test_prediction_uses_the_mean_twist():
             np.testing.assert_array_equal(first, obstacles.current.states[0, 12:15])  # of one twist, that is the mean
         if k > 50:
             off.append(obstacles.at(t + 1.0).states[0, 9:12] - at - [0.2, 0.0, 0.0])
-            places, _ = obstacles.paths(np.array([t + 1.0]))
-            np.testing.assert_allclose(places[0, 0], obstacles.at(t + 1.0).states[0, 9:12], rtol=0, atol=1e-12)
     assert np.std(off) < 0.05 and np.abs(np.mean(off, axis=0)).max() < 0.02
 
 

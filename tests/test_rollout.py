@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from qpavoid import Avoidance, Limits, Obstacle, build_scene, kernels
+from qpavoid import Avoidance, Limits, Obstacle, Sample, build_scene, kernels
 from qpavoid.config import Box, Line, Progress, Sensing, Sphere
 from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.control.pair_table import PairTable
@@ -192,10 +192,32 @@ def test_approach_check_is_conservative(tmp_path_factory, lines, t, v):
     for k, away in enumerate((0.0, 0.01, 0.1, 0.3)):  # a cached clearance counts for configurations near by
         home, at = robot.home + away, t + 0.02 * k
         moving = [o for o in obstacles if o.motion.sample(at).linear.any()]  # those at rest do not count
-        if not check.stays_far(Start(home, v, np.zeros(2), at, rollouts.enabled)):
+        if not check.stays_far(home, v, at):
             continue
         for later in np.linspace(0.0, 1.5, 76):
             braking = np.minimum(later, np.abs(v) / 2.0)
             place = np.array([*(home + np.sign(v) * (np.abs(v) * braking - braking**2)), 0.0])
             centers = [o.motion.sample(at + later).position for o in moving]
             assert min((np.linalg.norm(place - center) for center in centers), default=1.0) - 0.15 > 0.1
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.lists(st.tuples(*[st.floats(-1.5, 1.5)] * 3, *[st.floats(-1.0, 1.0)] * 2), min_size=1, max_size=4),
+    st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0)),
+)
+def test_approach_check_of_external_obstacles_is_conservative(tmp_path_factory, balls, v):
+    robot = ROBOTS.setdefault("xy", cartesian(tmp_path_factory.mktemp("robot"), "xy", speed=1.0, acceleration=2.0))
+    obstacles = [Obstacle.at(f"o{i}", Sphere(radius=0.1), [9.0, 0.0, 0.0]) for i in range(len(balls))]
+    rollouts, shared, tracker = rollouts_of(build_scene(robot, obstacles))
+    samples = [Sample.at(ball[:3], linear=[*ball[3:], 0.0]) for ball in balls]
+    tracker.advance(tracker.read(0.0, {f"o{i}": sample for i, sample in enumerate(samples)}))
+    check, v = ApproachCheck(shared, rollouts, tracker), np.array(v)
+    if not check.stays_far(robot.home, v, 0.0):
+        return
+    assert check.max_speed == pytest.approx(max(np.linalg.norm(sample.linear) for sample in samples), abs=1e-12)
+    for later in np.linspace(0.0, 1.5, 76):
+        braking = np.clip(later - 0.01, 0.0, np.abs(v) / 2.0)
+        place = robot.home + min(later, 0.01) * v + np.sign(v) * (np.abs(v) * braking - braking**2)
+        centers = [sample.position + later * sample.linear for sample in samples if sample.linear.any()]
+        assert min((np.linalg.norm([*place, 0.0] - center) for center in centers), default=1.0) - 0.15 > 0.1

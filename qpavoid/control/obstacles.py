@@ -132,11 +132,6 @@ class ObstacleTracker:
         return self._estimates
 
     @property
-    def any_may_move(self) -> bool:
-        """Whether any is on a trajectory or has a mean twist, so that it may be elsewhere later."""
-        return len(self.on_trajectories) > 0 or bool(self._measured.twists.any())
-
-    @property
     def mean_twists(self) -> Array:
         """(o, 6) mean twists of external obstacles, with which they are predicted; zero of all others."""
         return self._measured.twists

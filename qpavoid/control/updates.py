@@ -224,7 +224,7 @@ class UpdateReader:
             sample = Sample.of_row(state[0])
         else:
             sample = _checked(self._obstacles[index].name, cloud.pose)
-        return sample._replace(t=sample.t if cloud.t is None else cloud.t, at_rest=cloud.at_rest or sample.at_rest)
+        return sample.stamped(sample.t if cloud.t is None else cloud.t, cloud.at_rest or sample.at_rest)
 
     def _cloud(self, index: int, cloud: Points, notes: list[Reason]) -> Voxels | None:
         """Return the voxels of a point cloud; None where none of its points can be used."""

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from qpavoid.kernels.bounds import velocity_bounds
+from qpavoid.kernels.kinematics import update_kinematics
 from qpavoid.kernels.near_pairs import place_bodies
 from qpavoid.kernels.packing import compiled
 from qpavoid.kernels.rows import distance_rows
@@ -106,14 +107,17 @@ def rate_limit(v: Array, targets: Array, v_step: Array, stop_when_met: bool) -> 
 
 @compiled
 def line_clearance(
-    x: Any, joint_poses: Array, spheres: Array, numbers: IntArray, states: Array, twists: Array, radii: Array,
-    horizon: float,
-) -> tuple[float, float]:  # fmt: skip
+    x: Any, q: Array, v: Array, dt: float, braking: Array, spheres: Array, numbers: IntArray, states: Array,
+    twists: Array, radii: Array, horizon: float,
+) -> tuple[float, float, float]:  # fmt: skip
     """Compute the least distance between bounding spheres of the robot at rest and of obstacles on straight lines.
 
     Args:
-        x: `DistanceArrays`, in which the bodies that joints move are placed.
-        joint_poses: (J, 12).
+        x: memory of a control step, in which joints and the bodies that they move are placed.
+        q: configuration (nq,).
+        v: velocity of the robot (n,) [rad/s or m/s].
+        dt: control period [s].
+        braking: way on which each coordinate brakes, over the square of its speed (n,) [s²/rad or s²/m].
         spheres: bounding sphere of each body in its frame, centre and radius (g, 4) [m].
         numbers: of the obstacles (k,); those that do not move do not count.
         states: of all obstacles (o, 18).
@@ -122,29 +126,34 @@ def line_clearance(
         horizon: time for which they go on [s].
 
     Returns:
-        The distance, infinite without any [m]; largest speed of any point of an obstacle [m/s].
+        The distance, infinite without any [m]; sum of the ways of all coordinates in the control period and in braking
+        after it [rad, m]; largest speed of any point of an obstacle [m/s].
     """
-    place_bodies(x, joint_poses)
-    least, fastest, center = np.inf, 0.0, np.empty(3)
+    update_kinematics(x.kinematics, q)
+    place_bodies(x.distances, x.joint_poses)
+    joints, poses = x.distances.joints, x.distances.poses
+    travel, least, fastest, center = 0.0, np.inf, 0.0, np.empty(3)
+    for i in range(len(v)):
+        travel += dt * abs(v[i]) + braking[i] * v[i] * v[i]
     for i in numbers:
-        p, v, w, r = states[i, 9:12], twists[i, :3], twists[i, 3:], radii[i]
-        square, turning = v[0] ** 2 + v[1] ** 2 + v[2] ** 2, np.sqrt(w[0] ** 2 + w[1] ** 2 + w[2] ** 2)
+        p, u, w, r = states[i, 9:12], twists[i, :3], twists[i, 3:], radii[i]
+        square, turning = u[0] ** 2 + u[1] ** 2 + u[2] ** 2, np.sqrt(w[0] ** 2 + w[1] ** 2 + w[2] ** 2)
         if not (square > 0.0 or turning > 0.0):
             continue
         fastest = max(fastest, np.sqrt(square) + (turning * r if turning > 0.0 else 0.0))
-        for b in range(len(x.joints)):
-            if x.joints[b] < 0:
+        for b in range(len(joints)):
+            if joints[b] < 0:
                 continue
-            pose, sphere, toward = x.poses[b], spheres[b], 0.0
+            pose, sphere, toward = poses[b], spheres[b], 0.0
             for c in range(3):
                 center[c] = pose[c] * sphere[0] + pose[3 + c] * sphere[1] + pose[6 + c] * sphere[2] + pose[9 + c]
-                toward += (center[c] - p[c]) * v[c]
+                toward += (center[c] - p[c]) * u[c]
             t = min(max(toward / square, 0.0), horizon) if square > 0.0 else 0.0
             distance = 0.0
             for c in range(3):
-                distance += (p[c] + t * v[c] - center[c]) ** 2
+                distance += (p[c] + t * u[c] - center[c]) ** 2
             least = np.minimum(least, np.sqrt(distance) - r - sphere[3])
-    return least, fastest
+    return least, travel, fastest
 
 
 @compiled

@@ -38,6 +38,12 @@ class _Placed:
         """(3, 3) body axes to world axes."""
         return np.asarray(self.row[:9].reshape(3, 3).T)
 
+    def stamped(self, t: float | None, at_rest: bool) -> Any:
+        """Return the same with another time stamp [s]."""
+        placed = type(self).__new__(type(self))
+        placed.row, placed.t, placed.at_rest = self.row, t, at_rest
+        return placed
+
     def _write_pose(self, position: Any, rotation: Any, t: float | None, at_rest: bool) -> None:
         self.row[:9] = as_vector("rotation", rotation, (3, 3)).T.ravel()
         self.row[9:12] = as_vector("position", position, (3,))

@@ -10,7 +10,7 @@ import pinocchio as pin
 from qpavoid import kernels
 from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.problem import Array, IntArray
-from qpavoid.safety.rollout import HORIZON, PREFERRED_DISTANCE, BackupRollouts, Start
+from qpavoid.safety.rollout import HORIZON, PREFERRED_DISTANCE, BackupRollouts
 from qpavoid.safety.settings import SafetySettings
 
 _PERIOD = 0.1
@@ -37,10 +37,14 @@ class ApproachCheck:
 
     def __init__(self, settings: SafetySettings, rollouts: BackupRollouts, obstacles: ObstacleTracker) -> None:
         """Use the kinematics and distances of the rollouts."""
-        self._model, self._braking = settings.scene.robot.model, 0.5 / settings.bounds.acceleration
+        self._model, self._period = settings.scene.robot.model, settings.dt
+        self._braking = 0.5 / settings.bounds.acceleration
         self._rollouts, self._obstacles = rollouts, obstacles
         zero = np.zeros(settings.scene.robot.model.nv)
-        self._clearance_of_external(Start(settings.scene.robot.home, zero, zero, 0.0, rollouts.enabled))
+        kernels.line_clearance(
+            rollouts.packed, settings.scene.robot.home, zero, self._period, self._braking, rollouts.query.table.spheres,
+            obstacles.external, obstacles.current.states, obstacles.mean_twists, rollouts.query.obstacle_radii, HORIZON,
+        )  # fmt: skip
         kernels.min_sphere_distance(np.zeros((1, 1, 3)), np.zeros((1, 3)), np.zeros((1, 1)))
         self.reset()
 
@@ -55,46 +59,51 @@ class ApproachCheck:
         """Largest speed of any point of an obstacle [m/s]."""
         return max(self._max_external_speed, 0.0 if self._paths is None else self._paths.max_speed)
 
-    def stays_far(self, start: Start) -> bool:
-        """Return whether moving obstacles certainly stay away from a robot that brakes from `start`."""
-        stop = float(np.square(start.v) @ self._braking)
-        far, self._max_external_speed = True, 0.0
-        if len(self._obstacles.external):
-            clearance, self._max_external_speed = self._clearance_of_external(start)
-            far = (self._rollouts.lever_arm * stop if stop else 0.0) < clearance
-        return far and (not len(self._obstacles.on_trajectories) or self._trajectories_stay_far(start, stop))
+    def stays_far(self, q: Array, v: Array, t: float) -> bool:
+        """Return whether moving obstacles certainly stay away from a robot that moves at v once more, and brakes.
 
-    def _clearance_of_external(self, start: Start) -> tuple[float, float]:
-        """Return the clearance of obstacles that go on at their mean twists [m], and their largest speed [m/s]."""
-        kinematics, query, obstacles = self._rollouts.kinematics, self._rollouts.query, self._obstacles
-        kinematics.compute(start.q)
-        clearance, speed = kernels.line_clearance(
-            query.packed, kinematics.joint_poses, query.table.spheres, obstacles.external, obstacles.current.states,
-            obstacles.mean_twists, query.obstacle_radii, HORIZON,
+        Args:
+            q: configuration (nq,).
+            v: velocity (nv,) of this control step.
+            t: time [s].
+        """
+        return self._external_stay_far(q, v) and self._trajectories_stay_far(q, v, t)
+
+    def _external_stay_far(self, q: Array, v: Array) -> bool:
+        """Return whether external obstacles stay away that go on at their mean twists."""
+        rollouts, obstacles, self._max_external_speed = self._rollouts, self._obstacles, 0.0
+        if not len(obstacles.external):
+            return True
+        clearance, travel, self._max_external_speed = kernels.line_clearance(
+            rollouts.packed, q, v, self._period, self._braking, rollouts.query.table.spheres, obstacles.external,
+            obstacles.current.states, obstacles.mean_twists, rollouts.query.obstacle_radii, HORIZON,
         )  # fmt: skip
-        return clearance - PREFERRED_DISTANCE, speed
+        return bool(rollouts.lever_arm * travel < clearance - PREFERRED_DISTANCE)
 
-    def _trajectories_stay_far(self, start: Start, stop: float) -> bool:
+    def _trajectories_stay_far(self, q: Array, v: Array, t: float) -> bool:
         """Return whether obstacles on trajectories stay away.
 
         Between their sampled positions, obstacles are taken to be no faster than at these. A clearance counts until the
         next sample, less the motion of the robot since.
         """
-        paths = self._sample(int(np.floor(start.t / _PERIOD)))
+        if not len(self._obstacles.on_trajectories):
+            return True
+        paths = self._sample(int(np.floor(t / _PERIOD)))
         if not len(paths.moving):
             return True
         lever_arm, query = self._rollouts.lever_arm, self._rollouts.query
+        travel = float((self._period * np.abs(v) + self._braking * np.square(v)).sum())
         if self._clearance is not None:
-            q, clearance = self._clearance
-            moved = float(np.abs(pin.difference(self._model, q, start.q)).sum())
-            if lever_arm * (moved + stop) < clearance:
+            then, clearance = self._clearance
+            moved = float(np.abs(pin.difference(self._model, then, q)).sum())
+            if lever_arm * (moved + travel) < clearance:
                 return True
-        self._rollouts.kinematics.compute(start.q)
+        self._rollouts.kinematics.compute(q)
         centers, radii = query.body_spheres(self._rollouts.kinematics.joint_poses)
         obstacle_radii = query.obstacle_radii[paths.moving] + paths.max_deviation + PREFERRED_DISTANCE
         clearance = kernels.min_sphere_distance(paths.positions, centers, obstacle_radii[:, None] + radii)
-        self._clearance = start.q, clearance
-        return (lever_arm * stop if stop else 0.0) < clearance
+        self._clearance = q.copy(), clearance
+        return lever_arm * travel < clearance
 
     def _sample(self, first: int) -> _Paths:
         """Sample the positions of moving obstacles from a multiple of `_PERIOD` until the horizon."""

@@ -79,14 +79,14 @@ class BackupPlanner:
             dv_prev: change of velocity (nv,) in that step.
             proximity: distances of this control step; pairs in contact do not count.
         """
-        if not self._obstacles.any_may_move:
+        if not len(self._obstacles.moving):
+            self._backup = None
+            return None
+        if self._approach.stays_far(q, v, t):
             self._backup = None
             return None
         enabled = self._enabled
         next_state = Start(pin.integrate(self._model, q, self._dt * v), v, v - v_prev, t + self._dt, enabled)
-        if self._approach.stays_far(next_state):
-            self._backup = None
-            return None
         touching = proximity.pair[proximity.distance < TOUCH]
         if len(touching):
             enabled = enabled.copy()

@@ -148,7 +148,7 @@ class BackupRollouts:
         self._layout = lay_out(
             scene, (), (), free, self.kinematics, self.query, settings.avoidance, settings.limits, 0.01, self.period
         )
-        self._packed, self._views = kernels.pack(self._layout), dict[int, Near]()
+        self.packed, self._views = kernels.pack(self._layout), dict[int, Near]()
         self._is_vector_space = all(joint.nv <= 1 for joint in list(model.joints)[1:])
         """Whether configurations add up: joints of one coordinate at most."""
         self.ramps = Ramps(settings.bounds, self._dt)
@@ -274,7 +274,7 @@ class BackupRollouts:
         query.compute(self.kinematics.joint_poses, _INFLUENCE_DISTANCE)
         self._layout.v_prev[:] = v
         k, touching, nearest, nearest_apart = kernels.backup_rows(
-            self._packed, q, query.pairs, _INFLUENCE_DISTANCE, query.is_moving, contacts.enabled, TOUCH
+            self.packed, q, query.pairs, _INFLUENCE_DISTANCE, query.is_moving, contacts.enabled, TOUCH
         )
         contacts.add(touching, nearest, nearest_apart, t, span)
         if k not in self._views:

@@ -11,8 +11,7 @@ from matplotlib.patches import Patch, Polygon
 from scipy.spatial import ConvexHull
 
 from qpavoid.problem import Array
-from qpavoid.run.log import Log
-from qpavoid.run.metrics import path_deviation
+from qpavoid.run.log import Log, path_deviation
 from qpavoid.viz.motion import AT_REST_COLOUR, OBSTACLE_COLOUR, capsule_faces, is_endless, moving_bodies, obstacle_faces
 from qpavoid.viz.style import COLOURS, D2, DASHES, add_grid, add_legend, draw_levels, is_qp, label_distances, units
 
