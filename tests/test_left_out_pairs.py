@@ -16,8 +16,7 @@ from qpavoid.setup.add import DescribeOptions, describe
 from qpavoid.setup.check import check_robot
 from qpavoid.setup.home import HOME_CLEARANCE, MIN_CONDITIONING
 from qpavoid.setup.sampling import D1, touching
-from qpavoid.setup.texts import description_files
-from qpavoid.setup.written import write_files
+from qpavoid.setup.texts import description_files, write_files
 
 LIMIT = 'velocity="1" effort="1"'
 
@@ -257,12 +256,12 @@ def test_wheels_of_a_mobile_base_are_locked_and_named(tmp_path, root, wheels):
 
 def test_one_table_holds_all_that_was_left_out(cli, tmp_path):
     (tmp_path / "telescope.urdf").write_text(TELESCOPE)
-    added = cli("robot", "add", "telescope.urdf", "--no-picture")
+    added = cli("robot", "add", "telescope.urdf")
     row = next(line for line in added.stdout.splitlines() if "s0 - s2" in line)
     severity, kind, share, sign = row.split()[:4]
     assert (severity, kind, sign) == ("note", "pair", "%") and 50 < int(share) < 75
     assert any(line.split()[:2] == ["warning", "joint"] and "held" in line for line in added.stdout.splitlines())
-    document = json.loads(cli("robot", "add", "telescope.urdf", "--no-picture", "--json").stdout)
+    document = json.loads(cli("robot", "add", "telescope.urdf", "--json").stdout)
     (note,) = [note for note in document["notes"] if note["subject"] == ["s0", "s2"]]
     assert note["kind"] == "pair" and note["share"] == pytest.approx(int(share) / 100, abs=0.006)
     entry = next(entry for entry in document["left_out"] if entry["links"] == ["s0", "s2"])
@@ -285,7 +284,7 @@ def test_packages_by_name(cli, tmp_path):
     assert cli("robot", "check", "wrist.urdf", "--package", f"my_robot={tmp_path}/elsewhere").status == 0
     allowed = cli("robot", "check", "wrist.urdf", "--allow-missing-meshes")
     assert allowed.status == 0 and re.search("^warning +mesh +hand_0: left out", allowed.stdout, re.MULTILINE)
-    added = cli("robot", "add", "wrist.urdf", "--package", "my_robot=elsewhere", "--no-picture", "--samples", "50")
+    added = cli("robot", "add", "wrist.urdf", "--package", "my_robot=elsewhere", "--samples", "50")
     assert added.status == 0, added.stderr
     assert {body.name for body in Robot.load("wrist/robot.yaml").bodies.geometryObjects} >= {"hand", "forearm"}
     bad = cli("robot", "check", "wrist.urdf", "--package", "my_robot=nowhere")

@@ -12,15 +12,25 @@ import pinocchio as pin
 from qpavoid.config import PairMargin
 from qpavoid.model.joints import frame_index
 from qpavoid.model.notes import Note, NoteKind
-from qpavoid.model.pairs import ALWAYS_TOUCHING, find_contacts
+from qpavoid.model.pairs import ALWAYS_TOUCHING, find_contacts, pair_array
 from qpavoid.model.robot import Robot
 from qpavoid.problem import Array
 from qpavoid.setup.sampling import D1, SEED, BoolArray, PairSamples, Space
 from qpavoid.setup.shapes import Piece
 
 Reason = Literal["adjacent", "srdf", "always", "drawn in", "never"]
+SRDF_REASONS = {"adjacent": "Adjacent", "always": "Default", "never": "Never", "drawn in": "Default", "srdf": "User"}
+"""Reasons as an SRDF gives them."""
+_ORDER = ("drawn in", "always", "srdf", "adjacent", "never")
+"""Reasons that two links have for several pairs of their bodies: the first one of these is given."""
 _POSES = 200
 """Random configurations in which contacts of the geometry of unchecked links are counted."""
+_LEAST = 0.1
+"""Share of the samples in which a telescope is drawn in, at the least: what touches more seldom meets an end stop."""
+_ERRORS = 0.01
+"""Share of the samples in which the extension may fail to predict whether a telescope's pair touches [-]."""
+_STRAIGHT = 1e-6
+"""Departure of a path from a straight line, as a share of its length, that is rounding [-]."""
 
 
 @dataclass(frozen=True)
@@ -34,32 +44,35 @@ class UncheckedLinks:
     geometry: float
     """The same of the file's own geometry, meshes as they are [-]."""
 
-    def note(self) -> Note | None:
-        """Return a note of what may matter.
-
-        None of pairs that never touch, or always do as neighbours do.
-        """
-        share, kind = self.geometry, NoteKind.PAIR
+    def notes(self) -> list[Note]:
+        """Return a note of what may matter; none of pairs that never touch, or always do as neighbours do."""
+        share, severity = self.geometry, "note"
         if self.reason == "always" and share < ALWAYS_TOUCHING:
-            bodies = 100.0 * (self.bodies or 0.0)
+            bodies, severity = 100.0 * (self.bodies or 0.0), "warning"
             clause = f"not checked: their bodies touch in {bodies:.0f} % of configurations, their geometry more seldom"
             remedy = f"leaner bodies: --bodies {self.links[0]}=convex, or of your own"
-            return Note(kind, self.links, clause, remedy, "warning", share)
-        if self.reason == "always":
-            return Note(kind, self.links, "not checked: they overlap by design", share=share)
-        if self.reason == "drawn in":
-            return Note(kind, self.links, "not checked: they slide into each other by design", share=share)
-        if not 0.0 < share < ALWAYS_TOUCHING:
-            return None
-        why, remedy = "one joint apart", "limit that joint so that they cannot"
-        if self.reason == "srdf":
-            why, remedy = "disabled by hand", "take them out of the SRDF or `disabled_pairs`"
-        return Note(kind, self.links, f"not checked ({why}), but can touch", remedy, share=share)
+        elif self.reason in ("always", "drawn in"):
+            design = "overlap" if self.reason == "always" else "slide into each other"
+            clause, remedy = f"not checked: they {design} by design", ""
+        elif not 0.0 < share < ALWAYS_TOUCHING:
+            return []
+        elif self.reason == "srdf":
+            clause = "not checked (disabled by hand), but can touch"
+            remedy = "take them out of the SRDF or `disabled_pairs`"
+        else:
+            clause, remedy = "not checked (one joint apart), but can touch", "limit that joint so that they cannot"
+        return [Note(NoteKind.PAIR, self.links, clause, remedy, severity, share)]  # type: ignore[arg-type]
 
 
-def _pairs(robot: Robot) -> list[frozenset[str]]:
+def named_pairs(robot: Robot) -> list[frozenset[str]]:
+    """Return the names of the bodies of each pair."""
     names = [body.name for body in robot.bodies.geometryObjects]
     return [frozenset((names[pair.first], names[pair.second])) for pair in robot.bodies.collisionPairs]
+
+
+def links_of_bodies(robot: Robot) -> dict[str, str]:
+    """Return the link of each body, by name."""
+    return {body.name: robot.model.frames[body.parentFrame].name for body in robot.bodies.geometryObjects}
 
 
 def pair_reasons(
@@ -75,8 +88,8 @@ def pair_reasons(
     """
     names = [body.name for body in bare.bodies.geometryObjects]
     touching = {frozenset(pair[:2]) for pair in robot.always_touching}
-    checked = {*_pairs(bare), *(frozenset(pair[:2]) for pair in bare.always_touching)}
-    mask = {pair: i for i, pair in enumerate(_pairs(robot))}
+    checked = {*named_pairs(bare), *(frozenset(pair[:2]) for pair in bare.always_touching)}
+    mask = {pair: i for i, pair in enumerate(named_pairs(robot))}
     reasons: dict[frozenset[str], Reason] = {}
     for pair in [frozenset((a, b)) for i, a in enumerate(names) for b in names[:i]]:
         index = mask.get(pair)
@@ -93,23 +106,19 @@ def pair_reasons(
     return reasons
 
 
-_WHY = {"adjacent": "Adjacent", "always": "Default", "never": "Never", "drawn in": "Default"}
-
-
 def by_link(
     robot: Robot, reasons: Mapping[frozenset[str], Reason]
 ) -> tuple[dict[frozenset[str], Reason], list[tuple[str, str]]]:
     """Sort unchecked pairs: by links where that describes them, else by bodies."""
-    link = _links(robot)
+    link = links_of_bodies(robot)
     pairs: dict[frozenset[str], list[Reason | None]] = {}
     names = list(link)
     for i, a in enumerate(names):
         for b in names[:i]:
             if link[a] != link[b]:
                 pairs.setdefault(frozenset((link[a], link[b])), []).append(reasons.get(frozenset((a, b))))
-    order: tuple[Reason, ...] = ("drawn in", "always", "srdf", "adjacent", "never")
     disabled = {
-        links: min((why for why in whys if why), key=order.index) for links, whys in pairs.items() if None not in whys
+        links: min((why for why in whys if why), key=_ORDER.index) for links, whys in pairs.items() if None not in whys
     }
     single = [
         (min(pair), max(pair))
@@ -117,15 +126,6 @@ def by_link(
         if why in ("never", "always", "drawn in") and frozenset(link[body] for body in pair) not in disabled
     ]
     return disabled, sorted(single)
-
-
-def srdf_reason(reason: Reason) -> str:
-    """Return the reason as an SRDF gives it."""
-    return _WHY.get(reason, "User")
-
-
-def _links(robot: Robot) -> dict[str, str]:
-    return {body.name: robot.model.frames[body.parentFrame].name for body in robot.bodies.geometryObjects}
 
 
 def measure_unchecked(
@@ -144,7 +144,7 @@ def measure_unchecked(
     """
     # bodies enclose the geometry: where they never come near, it does not touch
     of_geometry = geometry_contacts(robot, pieces, [links for links, reason in disabled.items() if reason != "never"])
-    link = _links(robot)
+    link = links_of_bodies(robot)
     of_bodies: dict[frozenset[str], float] = {}
     for pair, share in shares.items():
         links = frozenset(link[body] for body in pair)
@@ -156,24 +156,22 @@ def measure_unchecked(
 
 
 def find_unchecked(robot: Robot, pieces: Sequence[Piece]) -> list[UncheckedLinks]:
-    """Find the links of a robot of which no pair of bodies is checked.
-
-    Also how often their geometry touches.
+    """Find the links of a robot of which no pair of bodies is checked, and how often their geometry touches.
 
     Args:
         robot: with its pairs.
         pieces: geometry as the file has it.
     """
-    link, joint = _links(robot), {body.name: body.parentJoint for body in robot.bodies.geometryObjects}
-    checked = {frozenset(link[body] for body in pair) for pair in _pairs(robot)}
-    always = {frozenset((link[pair.a], link[pair.b])) for pair in robot.always_touching}
+    link, joint = links_of_bodies(robot), {body.name: body.parentJoint for body in robot.bodies.geometryObjects}
+    checked = {frozenset(link[body] for body in pair) for pair in named_pairs(robot)}
+    checked |= {frozenset((link[pair.a], link[pair.b])) for pair in robot.always_touching}
     parents, disabled, names = robot.model.parents, dict[frozenset[str], Reason](), list(link)
     for i, a in enumerate(names):
         for b in names[:i]:
             pair = frozenset((link[a], link[b]))
-            if joint[a] != joint[b] and pair not in checked and pair not in always:
-                adjacent = parents[joint[a]] == joint[b] or parents[joint[b]] == joint[a]
-                disabled[pair] = "adjacent" if adjacent else "srdf"
+            if joint[a] != joint[b] and pair not in checked:
+                is_adjacent = parents[joint[a]] == joint[b] or parents[joint[b]] == joint[a]
+                disabled[pair] = "adjacent" if is_adjacent else "srdf"
     return measure_unchecked(robot, pieces, disabled, {})
 
 
@@ -193,18 +191,15 @@ def geometry_contacts(
     for number, piece in enumerate(pieces):
         frame_id = frame_index(robot.model, piece.link)
         frame = robot.model.frames[frame_id]
-        body = pin.GeometryObject(
-            f"{number}", frame.parentJoint, frame_id, frame.placement * piece.placement, piece.geometry
-        )
+        placement = frame.placement * piece.placement
+        body = pin.GeometryObject(f"{number}", frame.parentJoint, frame_id, placement, piece.geometry)
         owners.setdefault(piece.link, []).append(geometry.addGeometryObject(body))
     joints, pair_links = [body.parentJoint for body in geometry.geometryObjects], []
     for pair in links:
         a, b = sorted(pair)
-        for i in owners.get(a, []):
-            for j in owners.get(b, []):
-                if joints[i] != joints[j]:
-                    geometry.addCollisionPair(pin.CollisionPair(min(i, j), max(i, j)))
-                    pair_links.append(pair)
+        for i, j in [(i, j) for i in owners.get(a, []) for j in owners.get(b, []) if joints[i] != joints[j]]:
+            geometry.addCollisionPair(pin.CollisionPair(min(i, j), max(i, j)))
+            pair_links.append(pair)
     touching = find_contacts(robot.model, geometry, list(Space(robot).draw(np.random.default_rng(SEED), _POSES)))
     touches: dict[frozenset[str], BoolArray] = {}
     for pair, column in zip(pair_links, touching.T, strict=True):
@@ -213,26 +208,64 @@ def geometry_contacts(
 
 
 def shares_of_contact(robot: Robot, pair_samples: PairSamples) -> dict[frozenset[str], float]:
-    """Return the share of configurations in which each pair touches [-].
-
-    Only of pairs that were sampled.
-    """
-    shares = dict(zip(_pairs(robot), pair_samples.contact.tolist(), strict=True))
+    """Return the share of configurations in which each pair touches [-]; only of pairs that were sampled."""
+    shares = dict(zip(named_pairs(robot), pair_samples.contact.tolist(), strict=True))
     return {**shares, **{frozenset((pair.a, pair.b)): pair.share for pair in robot.always_touching}}
 
 
 def own_margins(robot: Robot, d1: Array) -> list[PairMargin]:
     """Return the pairs with a safety distance of their own, from that of each pair (m,)."""
-    bodies = [sorted(pair) for pair in _pairs(robot)]
+    bodies = [sorted(pair) for pair in named_pairs(robot)]
     return [PairMargin(bodies=(a, b), d1=float(own)) for (a, b), own in zip(bodies, d1, strict=True) if own < D1]
 
 
 def with_pairs(robot: Robot, mask: BoolArray) -> Robot:
     """Return the robot with some of its pairs only."""
     bodies = pin.GeometryModel(robot.bodies)
-    pairs = list(robot.bodies.collisionPairs)
-    bodies.removeAllCollisionPairs()
-    for pair, is_kept in zip(pairs, mask, strict=True):
-        if is_kept:
-            bodies.addCollisionPair(pair)
+    for pair, is_kept in zip(list(robot.bodies.collisionPairs), mask, strict=True):
+        if not is_kept:
+            bodies.removeCollisionPair(pair)
     return replace(robot, bodies=bodies)
+
+
+def nested_pairs(robot: Robot, pair_samples: PairSamples) -> BoolArray:
+    """Find the pairs (m,) that overlap when a telescope is drawn in, as a finger in its guide.
+
+    Two conditions. The origin of one body's joint moves along a straight line as seen from the other's, so that nothing
+    but prismatic joints with a common axis moves it; and its place along that line alone decides whether they touch:
+    always on one side of a threshold, never on the other. A pair that meets an obstacle of the robot's own, such as two
+    carriages on one rail, touches in the middle of its range or only near an end, and stays.
+
+    Args:
+        robot: with its pairs.
+        pair_samples: of these pairs.
+    """
+    is_nested = np.zeros(len(pair_samples.contact), dtype=bool)
+    candidates = np.flatnonzero((pair_samples.touching.mean(axis=0) >= _LEAST) & ~pair_samples.always).tolist()
+    data, poses = robot.model.createData(), list[list[Array]]()
+    for q in pair_samples.poses if candidates else ():
+        pin.forwardKinematics(robot.model, data, q)
+        poses.append([pose.homogeneous for pose in data.oMi])
+    joints, pairs, joint_poses = [b.parentJoint for b in robot.bodies.geometryObjects], pair_array(robot.bodies), poses
+    for index in candidates:
+        a, b = (np.array([pose[joints[int(i)]] for pose in joint_poses]) for i in pairs[index])
+        touching = pair_samples.touching[:, index]
+        is_nested[index] = any(_decides(_along_line(*frames), touching) for frames in ((a, b), (b, a)))
+    return is_nested
+
+
+def _along_line(frames: Array, origins: Array) -> Array | None:
+    """Return places (k,) of origins along a line, as seen from frames [m]; None if they do not keep to one."""
+    in_frame = np.einsum("kij,ki->kj", frames[:, :3, :3], origins[:, :3, 3] - frames[:, :3, 3])
+    centred = in_frame - in_frame.mean(axis=0)
+    _, sizes, axes = np.linalg.svd(centred, full_matrices=False)
+    return None if sizes[0] < 1e-6 or sizes[1] > _STRAIGHT * sizes[0] else np.asarray(centred @ axes[0])
+
+
+def _decides(extension: Array | None, touching: BoolArray) -> bool:
+    """Return True if a threshold of the extension (k,) separates touching samples (k,)."""
+    if extension is None:
+        return False
+    steps = np.where(touching[np.argsort(extension)], -1, 1)
+    errors = touching.sum() + np.cumsum(np.concatenate(([0], steps)))  # if those above each threshold do not touch
+    return bool(min(errors.min(), len(steps) - errors.max()) <= _ERRORS * len(steps))
