@@ -120,11 +120,16 @@ def _best_cut(surface: Array) -> tuple[Array, float] | None:
 
 
 def _coarse(surface: Array) -> Array:
-    """Coarsen a surface of many triangles: corners on a grid, each triangle once."""
+    """Coarsen a surface of many triangles: corners on a grid, without triangles that vanish or coincide."""
     if len(surface) <= _FINE:
         return surface
-    cell = float(np.ptp(surface.reshape(-1, 3), axis=0).max()) / _GRID
-    return np.asarray(cell * np.unique(np.round(surface / cell), axis=0))
+    low, cell = surface.min(axis=(0, 1)), float(np.ptp(surface.reshape(-1, 3), axis=0).max()) / _GRID
+    index = np.round(surface / cell).astype(np.int64)
+    index -= index.min(axis=(0, 1))
+    corners = np.sort(index @ [1, 1024, 1024 * 1024], axis=1)
+    is_solid = (np.diff(corners, axis=1) > 0).all(axis=1)
+    first = np.unique(corners[is_solid], axis=0, return_index=True)[1]
+    return np.asarray(low + cell * index[is_solid][np.sort(first)]) if len(first) else surface[:_FINE]
 
 
 def cut(surface: Array, normal: Array, height: float, side: float) -> Array:
