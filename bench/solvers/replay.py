@@ -18,15 +18,10 @@ from bench.solvers.record import QP, Run
 from bench.solvers.verify import Judgement, Truth, judge, truth, violation
 from qpavoid.kernels import minimize
 from qpavoid.problem import Array
-from qpavoid.solvers.backends import Backend, backend_names, make_backend
-from qpavoid.solvers.backends.wrapped import through_qpsolvers
+from qpavoid.solvers.backends import Backend, backend_names, make_backend, through_qpsolvers
 
-BEFORE = {
-    "daqp": {"primal_tol": 1e-9, "dual_tol": 1e-12},
-    "proxqp": {"eps_abs": 1e-10, "eps_rel": 0.0},
-    "osqp": {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 20000, "polishing": True, "raise_error": False},
-}
-"""Settings with which the back ends that are called natively can be called through qpsolvers."""
+BEFORE = {"daqp": {"primal_tol": 1e-9, "dual_tol": 1e-12}}
+"""Settings with which the back end that is called natively can be called through qpsolvers."""
 
 
 class Cell(NamedTuple):

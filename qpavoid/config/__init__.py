@@ -9,9 +9,7 @@ from qpavoid.config.control import (
     Avoidance,
     Backup,
     Beta,
-    Cbf,
     Damper,
-    Detour,
     Limits,
     Progress,
     Sensing,
@@ -58,10 +56,10 @@ from qpavoid.config.tasks import (
 )
 
 __all__ = [
-    "AlignTask", "AnyTask", "Avoidance", "Backup", "Beta", "Block", "Body", "Box", "Capsule", "Cbf", "Circle",
-    "ComTask", "Cone", "Contact", "Csv", "Cylinder", "Damper", "DampingTask", "Detour", "Ellipsoid", "Eq10Solver",
-    "Fixed", "GradientProjectionSolver", "HalfSpace", "HqpSolver", "Hull", "JointLimits", "Limits", "Line",
-    "LookAtTask", "ManipulabilityTask", "Mesh", "Motion", "ObstacleConfig", "ObstacleShape", "PairMargin", "PointCloud",
+    "AlignTask", "AnyTask", "Avoidance", "Backup", "Beta", "Block", "Body", "Box", "Capsule", "Circle", "ComTask",
+    "Cone", "Contact", "Csv", "Cylinder", "Damper", "DampingTask", "Ellipsoid", "Eq10Solver", "Fixed",
+    "GradientProjectionSolver", "HalfSpace", "HqpSolver", "Hull", "JointLimits", "Limits", "Line", "LookAtTask",
+    "ManipulabilityTask", "Mesh", "Motion", "ObstacleConfig", "ObstacleShape", "PairMargin", "PointCloud",
     "PostureTask", "PotentialFieldSolver", "Progress", "QpSolver", "RelativeTask", "RobotConfig", "ScenarioConfig",
     "Sensing", "Shape", "SolverConfig", "Sphere", "Task", "TaskBlock", "TaskSwitching", "TrackingSolver", "Waypoints",
     "expand_solver",

@@ -12,7 +12,8 @@ from qpavoid.control.contacts import ContactRows, tracking_within
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.jerk_stops import Stop, StopFollower
 from qpavoid.control.row_layout import hand_over, lay_out
-from qpavoid.control.tasks.frames import AnyTask, in_order, task_levels
+from qpavoid.control.tasks import RowTask, in_order
+from qpavoid.control.tasks.layout import TaskRows, task_levels
 from qpavoid.model.kinematics import ForwardKinematics, Kinematics, support_masks
 from qpavoid.model.limits import JointBounds
 from qpavoid.model.scene import Scene
@@ -30,7 +31,7 @@ class Assembly:
     def __init__(
         self,
         scene: Scene,
-        tasks: Sequence[AnyTask],
+        tasks: Sequence[RowTask],
         bounds: JointBounds,
         kinematics: ForwardKinematics,
         query: DistanceQuery,
@@ -42,12 +43,12 @@ class Assembly:
         looks_ahead: bool = False,
     ) -> None:
         """Lays the memory out; see `Controller` for the arguments, and `RowLayout` for `looks_ahead`."""
-        frames, self._others = in_order(tasks)
+        frames, others = in_order(tasks)
         self._masks = support_masks(scene.robot.model)
         # with jerk limits, a stop goes another way; with contacts, v0 does
         looks_ahead = looks_ahead and contacts is None and not np.isfinite(bounds.jerk).any()
         self._layout = lay_out(
-            scene, frames, self._others, bounds, kinematics, query, avoidance, limits, damping, dt, looks_ahead
+            scene, frames, others, bounds, kinematics, query, avoidance, limits, damping, dt, looks_ahead
         )
         x = self._layout
         self._hard = (x.hard_lower, x.hard_upper) if limits.relax_acceleration else (x.lower, x.upper)
@@ -58,7 +59,9 @@ class Assembly:
         self.targets = self._layout.targets
         """(f, 18) states that the frame tasks are to reach, see `trajectories`; to be written before `compute`."""
         self._views: dict[int, tuple[Proximity, AvoidanceRows]] = {}
-        levels = task_levels(frames, self._others)
+        levels, self._task_rows = task_levels(frames, others), TaskRows(others, x.A, x.b)
+        self.task_errors = self._task_rows.errors
+        """How far each of the tasks that are not frames was from its target in the last step, in its unit."""
         self._tracking = Tracking(self._layout.A, self._layout.b, damping)
         self._levels = levels if len(levels) > 1 else ()
         self._forward, self._contacts = kinematics, contacts
@@ -81,9 +84,8 @@ class Assembly:
             reach: surface distance below which a pair is near [m].
         """
         x = self._layout
-        if self._others:
-            for task, target in zip(self._others, targets[len(self.targets) :], strict=True):
-                task.update(q, self._forward, target)
+        if self.task_errors.size:
+            self._task_rows.write(q, self._forward, targets[len(self.targets) :])
         held = None
         if self._contacts is not None:
             held = self._contacts.update(self._forward)
@@ -210,36 +212,11 @@ class Assembly:
         worst = float(kernels.violation(eased, rows.J, rows.b, x.lower, x.upper))
         return problem._replace(tracking=tracking, avoidance=rows, v_tracking=eased, violation=worst)
 
-    def redirected(self, problem: Problem, frame: int, velocity: Array) -> Problem:
-        """The problem of this tick with a velocity (3,) added to the linear one that a task asks for [m/s].
-
-        Args:
-            problem: as `compute` gave it.
-            frame: which task.
-            velocity: world [m/s].
-        """
-        x = self._layout
-        linear = slice(3 * frame, 3 * frame + 3)
-        b = x.b.copy()
-        x.b[linear] += x.scale[linear] * velocity
-        v_tracking = np.empty_like(x.v_tracking)
-        if problem.contacts is None:
-            kernels.damped_solution(self._packed, v_tracking)
-        else:
-            v_tracking[:] = tracking_within(problem.contacts, x.A, x.b, x.damping)
-        tracking = problem.tracking._replace(b=x.b.copy())
-        x.b[:] = b
-        rows = self._along(problem.avoidance, v_tracking)
-        worst = float(kernels.violation(v_tracking, rows.J, rows.b, x.lower, x.upper))
-        return problem._replace(
-            tracking=tracking, avoidance=rows, v_tracking=v_tracking, violation=worst, tracking_is_clear=False
-        )
-
     def prioritised(self, problem: Problem, tracked: Callable[[Problem], Array]) -> Problem:
         """The problem of this tick with rows for what a cascade tracks, which is not v0.
 
         Args:
-            problem: as `compute` gave it, or redirected.
+            problem: as `compute` gave it.
             tracked: gives that velocity (nv,).
         """
         if not self._layout.task_switching:
@@ -259,28 +236,6 @@ class Assembly:
         for array, values in zip(memory, kept, strict=True):
             array[:] = values
         return along
-
-    def at_length(self, problem: Problem) -> Problem:
-        """The problem of this tick with what the limits of accelerations and jerks allow at length, not at once."""
-        x = self._layout
-        return problem._replace(
-            lower=x.hard_lower, upper=x.hard_upper, hard_lower=x.hard_lower, hard_upper=x.hard_upper
-        )
-
-    def goal(self, frame: int) -> tuple[Array, float]:
-        """Where a task wants its frame (3,), world, and how far that is from where the frame is [m]."""
-        target = self.targets[frame, 9:12]
-        return target.copy(), float(np.linalg.norm(target - self.kinematics.position[frame]))
-
-    def wanted_velocity(self, frame: int) -> Array:
-        """Linear velocity (3,) that a task asks of its frame [m/s]."""
-        rows = slice(3 * frame, 3 * frame + 3)
-        return np.asarray(self._layout.b[rows] / self._layout.scale[rows])
-
-    def frame_velocity(self, frame: int, v: Array) -> Array:
-        """Linear velocity (3,) of a task's frame at v [m/s]."""
-        rows = slice(3 * frame, 3 * frame + 3)
-        return np.asarray(self._layout.A[rows] @ v / self._layout.scale[rows])
 
     def _count_from_before(self) -> None:
         """Narrows the bounds to what accelerations and jerks allow from the velocity before.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -18,20 +17,18 @@ import pinocchio as pin
 from qpavoid.config import RobotConfig, Task
 from qpavoid.config.loading import read_config
 from qpavoid.config.shipped import find_robot
-from qpavoid.control.tasks.frames import build_tasks
+from qpavoid.control.tasks import build_tasks
 from qpavoid.controller import Controller
 from qpavoid.errors import ConfigError, QpavoidError
 from qpavoid.geometry.bodies import convert_bodies, triangle_meshes
 from qpavoid.model.end_effectors import end_effectors
-from qpavoid.model.kinematics import MIMIC
 from qpavoid.model.notes import Note, NoteKind, RobotWarning, abbreviate
 from qpavoid.model.packages import absolute_entries, find_mesh, mesh_folders
 from qpavoid.model.robot import Robot
 from qpavoid.model.scene import build_scene
 from qpavoid.model.urdf import find_resource, is_mjcf, mesh_names, read_model, read_pieces
-from qpavoid.model.xml_file import read_robot_xml
 from qpavoid.setup.home import MIN_CONDITIONING, Conditioning, Limbs
-from qpavoid.setup.joints import ENDLESS, joint_kind, mimics
+from qpavoid.setup.joint_report import Joint, joint_notes, list_joints
 from qpavoid.setup.pairs import find_unchecked
 from qpavoid.setup.sampling import D1, Space, touching
 from qpavoid.setup.shapes import Piece, pieces_of
@@ -40,30 +37,6 @@ _MAX_STEPS, _MAX_SECONDS = 300, 5.0
 """Control steps that are timed for the median, and the time after which timing ends [s]."""
 _SLOW_STEP = 1000.0
 """Median control step from which a warning is given: the whole period of a 1 kHz loop [µs]."""
-_MAX_SPEED = {"revolute": 50.0, "continuous": 50.0, "prismatic": 10.0}
-"""Speed limits above which one is probably an error [rad/s, m/s]."""
-_MAX_RANGE = {"revolute": 8.0 * math.pi, "prismatic": 20.0}
-"""Ranges above which one is probably an error [rad, m]."""
-_MIN_RANGE = 1e-3
-"""Range below which a joint is better locked [rad, m]."""
-
-
-@dataclass(frozen=True)
-class Joint:
-    """A joint as the file has it, with the limits that hold."""
-
-    name: str
-    kind: str
-    """`fixed`, `revolute`, `continuous`, `prismatic`, `planar`, `floating` or `spherical`."""
-    mimics: str | None = None
-    lower: float | None = None
-    """[rad or m]; None: no limit."""
-    upper: float | None = None
-    velocity: float | None = None
-    """[rad/s or m/s]; None: no limit."""
-    locked: bool = False
-    led: bool = False
-    """It moves with the joint that it mimics, and has no coordinate of its own."""
 
 
 @dataclass
@@ -160,8 +133,8 @@ def _report(config: RobotConfig, path: Path, progress: Callable[[str], None]) ->
         except ConfigError as error:
             report.add("error", NoteKind.FILE, (), str(error), "mend what it names")
         report.load_seconds = perf_counter() - begin
-    report.joints = _joints(urdf, model if robot is None else robot.model, config, model)
-    _check_joints(report, config)
+    report.joints = list_joints(urdf, model if robot is None else robot.model, config, model)
+    report.notes += joint_notes(report.joints, config)
     if robot is not None:
         report.notes += robot.notes
         _check_built_robot(report, _with_hulls(robot), pieces, progress)
@@ -225,68 +198,6 @@ def _shape_name(geometry: Any) -> str:
     if isinstance(geometry, coal.BVHModelBase):
         return "mesh"
     return "convex mesh" if isinstance(geometry, coal.ConvexBase) else type(geometry).__name__.lower()
-
-
-# --- joints -------------------------------------------------------------------------------------------------
-
-
-def _joints(urdf: Path, model: Any, config: RobotConfig, whole: Any) -> list[Joint]:
-    """List all joints: those that move, with the limits in force, locked and fixed ones."""
-    leaders = {name: leader for name, (leader, _, _) in mimics(urdf).items()}
-    elements = [] if is_mjcf(urdf) else read_robot_xml(urdf, "URDF").findall("joint")
-    kinds = {joint.get("name", ""): joint.get("type", "") for joint in elements}
-    joints = []
-    for name, joint in zip(list(whole.names)[1:], list(whole.joints)[1:], strict=True):
-        is_follower, leader = joint.shortname() == MIMIC, leaders.get(name)
-        kind = kinds[name] if is_follower else joint_kind(joint)
-        is_locked = name in config.lock or (is_follower and leader in config.lock)
-        if is_locked or is_follower or not model.existJointName(name):  # the latter: its limits leave it no range
-            is_led = is_follower and not is_locked
-            joints.append(Joint(name, kind, leader, locked=not is_led, led=is_led))
-            continue
-        live = model.joints[model.getJointId(name)]
-        velocity = _limit(float(np.max(model.velocityLimit[live.idx_v : live.idx_v + live.nv])))
-        lower = upper = None
-        if live.nq == live.nv == 1:
-            lower, upper = _limit(model.lowerPositionLimit[live.idx_q]), _limit(model.upperPositionLimit[live.idx_q])
-        joints.append(Joint(name, kind, leader, lower, upper, velocity or None))
-    return joints + [Joint(name, "fixed") for name, kind in kinds.items() if kind == "fixed"]
-
-
-def _limit(value: float) -> float | None:
-    return float(value) if abs(value) < ENDLESS else None
-
-
-def _check_joints(report: Report, config: RobotConfig) -> None:
-    moving = [joint for joint in report.joints if joint.kind in _MAX_SPEED and not (joint.locked or joint.led)]
-    spans = {
-        joint.name: (joint, joint.upper - joint.lower)
-        for joint in moving
-        if joint.kind in _MAX_RANGE and joint.lower is not None and joint.upper is not None
-    }
-    position, velocity, acceleration = (
-        f"`limits: {{{kind}: {{JOINT: {value}}}}}` in a robot.yaml"
-        for kind, value in (("position", "[-2.0, 2.0]"), ("velocity", "1.5"), ("acceleration", "10.0"))
-    )
-    for severity, kind, clause, names, remedy in (
-        ("warning", NoteKind.LIMIT, "no position limits",
-         [j.name for j in moving if j.kind in _MAX_RANGE and (j.name not in spans or j.lower == j.upper == 0.0)],
-         position),
-        ("warning", NoteKind.LIMIT, "no velocity limit", [j.name for j in moving if j.velocity is None], velocity),
-        ("warning", NoteKind.LIMIT, "a velocity limit beyond what such joints do",
-         [j.name for j in moving if j.velocity is not None and j.velocity > _MAX_SPEED[j.kind]], velocity),
-        ("warning", NoteKind.LIMIT, "a range wider than such joints have",
-         [name for name, (joint, span) in spans.items() if span > _MAX_RANGE[joint.kind]], position),
-        ("warning", NoteKind.JOINT, "hardly any range",
-         [name for name, (_, span) in spans.items() if 0.0 < span < _MIN_RANGE],
-         "`lock: {JOINT: 0.0}` in a robot.yaml"),
-        ("warning", NoteKind.JOINT, "mimic joints that move on their own here", [j.name for j in moving if j.mimics],
-         "`qpavoid robot add` holds them and those that they follow; or list them under `lock`"),
-        ("note", NoteKind.LIMIT, "no acceleration limit (a URDF has no field for it)",
-         [j.name for j in moving if j.name not in config.limits.acceleration], acceleration),
-    ):  # fmt: skip
-        if names:
-            report.add(severity, kind, names, clause, remedy)
 
 
 # --- the robot as it loads ----------------------------------------------------------------------------------

@@ -20,8 +20,9 @@ from qpavoid.model.notes import Note
 from qpavoid.run.report import to_json
 from qpavoid.run.terminal import ERR, OUT
 from qpavoid.setup.add import DescribeOptions, Description, Root, describe
-from qpavoid.setup.check import Joint, Report, check_robot
+from qpavoid.setup.check import Report, check_robot
 from qpavoid.setup.fit import Bodies
+from qpavoid.setup.joint_report import Joint
 from qpavoid.setup.sampling import SAMPLES, SEED
 from qpavoid.setup.texts import description_files, note_lines, summary, write_files
 

@@ -11,7 +11,7 @@ from bench.tick.stages import measure
 from bench.tick.workloads import Array, Workload
 from qpavoid import Controller
 from qpavoid.config import Avoidance, Task
-from qpavoid.control.tasks.frames import build_tasks
+from qpavoid.control.tasks import build_tasks
 from qpavoid.model.trajectory import Sample
 
 

@@ -1,0 +1,216 @@
+"""MuJoCo model of a scene: the same joints, bodies and obstacles.
+
+Kinematics and distances are MuJoCo's own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import coal
+import mujoco
+import numpy as np
+import pinocchio as pin
+
+from qpavoid import Sample, ScenarioConfig, Scene, build_scene
+from qpavoid.model.scene import build_obstacles
+from qpavoid.problem import Array, IntArray
+from qpavoid_bench.arena.world import load_robot
+
+MAX_DISTANCE = 100.0
+"""Largest distance that MuJoCo looks for [m]: beyond any scene."""
+
+
+@dataclass(frozen=True)
+class MujocoModel:
+    """A scene and its MuJoCo model.
+
+    Configurations and velocities go in and out in the scene's order.
+    """
+
+    scene: Scene
+    q0: Array
+    """(nq,) configuration at the start."""
+    model: Any
+    data: Any
+    geoms: IntArray
+    """(g,) MuJoCo geom of each of the scene's geometries."""
+    q_index: IntArray
+    """(nv,) place in qpos of each coordinate."""
+    v_index: IntArray
+    """(nv,) place in qvel of each coordinate."""
+    bodies: int
+    """Number of geometries of the robot; those of obstacles come after them."""
+
+    @property
+    def movable(self) -> Any:
+        """Return for each pair (m,) whether the robot can change its distance at all."""
+        return np.any(self.scene.support != 0.0, axis=1)
+
+    def place(self, q: Array, t: float) -> None:
+        """Put the robot to q (nv,) and the obstacles to their poses at t [s]."""
+        self.data.qpos[self.q_index] = q
+        for i, obstacle in enumerate(self.scene.obstacles):
+            if obstacle.moves:
+                place_mocap(self.data, i, obstacle.motion.sample(t))
+        mujoco.mj_kinematics(self.model, self.data)
+
+    def integrate(self, q: Array, v: Array, dt: float) -> Array:
+        """Integrate v (nv,) from q (nv,) over dt [s] by MuJoCo; return q (nv,)."""
+        position, velocity = np.zeros(self.model.nq), np.zeros(self.model.nv)
+        position[self.q_index], velocity[self.v_index] = q, v
+        mujoco.mj_integratePos(self.model, position, velocity, dt)
+        return position[self.q_index]
+
+    def poses(self) -> tuple[Array, Array]:
+        """Return centres (g, 3) [m] and axes (g, 9) of the geometries in the current pose."""
+        return self.data.geom_xpos[self.geoms], self.data.geom_xmat[self.geoms]
+
+    def distance(self, pair: int, ends: Array | None = None) -> float:
+        """Return the signed distance of a pair [m]; its witness points go to `ends` (6,)."""
+        a, b = self.geoms[self.scene.pairs[pair]]
+        return float(
+            mujoco.mj_geomDistance(self.model, self.data, a, b, MAX_DISTANCE, np.empty(6) if ends is None else ends)
+        )
+
+
+def place_mocap(data: Any, index: int, sample: Sample) -> None:
+    """Put an obstacle, by its number, to a pose; call MuJoCo's kinematics afterwards."""
+    data.mocap_pos[index] = sample.position
+    mujoco.mju_mat2Quat(data.mocap_quat[index], np.ascontiguousarray(sample.rotation).ravel())
+
+
+def load_model(scenario: ScenarioConfig) -> MujocoModel:
+    """Build the MuJoCo model of a scenario."""
+    robot, q0 = load_robot(scenario.robot, scenario.q0, scenario.lock, scenario.source)
+    return build(build_scene(robot, build_obstacles(scenario.obstacles, scenario.source)), q0)
+
+
+def build(scene: Scene, q0: Array, frames: Sequence[int] = ()) -> MujocoModel:
+    """Build the MuJoCo model of a scene: one body a joint, one mocap body an obstacle.
+
+    Args:
+        scene: what is written.
+        q0: where the robot starts (nq,).
+        frames: of the robot's model, by their indices; these become sites `frame 0`, `frame 1` and so on.
+
+    Raises:
+        ValueError: a joint that is neither a hinge nor a slide, or a shape that MuJoCo does not know.
+    """
+    spec, robot = mujoco.MjSpec(), scene.robot.model
+    spec.compiler.degree = False
+    # the default, 1e-6, is of the size of the penetrations to be compared
+    spec.option.ccd_tolerance, spec.option.ccd_iterations = 1e-9, 200
+    bounds = scene.robot.bounds()
+    ranges_by_joint = np.clip(np.stack((bounds.lower, bounds.upper), axis=1), -mujoco.mjMAXVAL, mujoco.mjMAXVAL)
+    ranges = dict(zip(bounds.q_index.tolist(), ranges_by_joint, strict=True))
+    bodies = [spec.worldbody]
+    for i in range(1, robot.njoints):
+        placement = robot.jointPlacements[i]
+        body = bodies[robot.parents[i]].add_body(
+            name=robot.names[i], pos=placement.translation, quat=_quaternion(placement.rotation),
+            explicitinertial=True, mass=1.0, inertia=[1.0, 1.0, 1.0],
+        )  # fmt: skip
+        slides, axis = hinge_or_slide(robot, i)
+        kind = mujoco.mjtJoint.mjJNT_SLIDE if slides else mujoco.mjtJoint.mjJNT_HINGE
+        joint = body.add_joint(name=robot.names[i], type=kind, axis=axis)
+        if robot.joints[i].idx_q in ranges:  # neither kinematics nor integration heed them; who reads the model may
+            joint.limited, joint.range = True, ranges[robot.joints[i].idx_q]
+        bodies.append(body)
+    for i, frame in enumerate(robot.frames[index] for index in frames):
+        place = frame.placement
+        bodies[frame.parentJoint].add_site(name=f"frame {i}", pos=place.translation, quat=_quaternion(place.rotation))
+    first = len(scene.body_names)
+    obstacles = [spec.worldbody.add_body(name=f"obstacle {i}", mocap=True) for i in range(len(scene.obstacles))]
+    for i, geometry in enumerate(scene.geometry.geometryObjects):
+        if i < first:
+            _add_geom(spec, bodies[geometry.parentJoint], geometry, geometry.placement)
+        else:
+            _add_geom(spec, obstacles[scene.obstacle_of[i]], geometry, pin.SE3.Identity())
+    model = spec.compile()
+    joints = [model.joint(name) for name in list(robot.names)[1:]]
+    mujoco_model = MujocoModel(
+        scene=scene,
+        q0=np.array(q0),
+        model=model,
+        data=mujoco.MjData(model),
+        geoms=np.array([model.geom(geometry.name).id for geometry in scene.geometry.geometryObjects], dtype=np.intp),
+        q_index=np.array([joint.qposadr[0] for joint in joints], dtype=np.intp),
+        v_index=np.array([joint.dofadr[0] for joint in joints], dtype=np.intp),
+        bodies=first,
+    )
+    for i, obstacle in enumerate(scene.obstacles):
+        place_mocap(mujoco_model.data, i, obstacle.motion.sample(0.0))
+    mujoco_model.place(mujoco_model.q0, 0.0)
+    return mujoco_model
+
+
+def hinge_or_slide(model: Any, index: int) -> tuple[bool, Array]:
+    """Return True for a slide, False for a hinge, and the joint's axis (3,) in its own frame.
+
+    Raises:
+        ValueError: it is neither a hinge nor a slide.
+    """
+    joint = model.joints[index]
+    if joint.nq != 1 or joint.nv != 1:
+        raise ValueError(f"joint {model.names[index]!r}: {joint.shortname()} is neither a hinge nor a slide")
+    data = model.createData()
+    pin.computeJointJacobians(model, data, pin.neutral(model))
+    screw = np.asarray(data.joints[index].S).ravel()
+    return (True, screw[:3]) if np.any(screw[:3]) else (False, screw[3:])
+
+
+def _add_geom(spec: Any, body: Any, geometry: Any, placement: Any) -> None:
+    """Add a geometry to a body of the MuJoCo model."""
+    kinds, shape = mujoco.mjtGeom, geometry.geometry
+    place = {"name": geometry.name, "pos": placement.translation, "quat": _quaternion(placement.rotation)}
+    match shape:
+        case coal.Sphere():
+            body.add_geom(type=kinds.mjGEOM_SPHERE, size=_three(shape.radius), **place)
+        case coal.Capsule() if shape.halfLength == 0.0:
+            body.add_geom(type=kinds.mjGEOM_SPHERE, size=_three(shape.radius), **place)
+        case coal.Capsule():
+            body.add_geom(type=kinds.mjGEOM_CAPSULE, size=_three(shape.radius, shape.halfLength), **place)
+        case coal.Cylinder():
+            body.add_geom(type=kinds.mjGEOM_CYLINDER, size=_three(shape.radius, shape.halfLength), **place)
+        case coal.Box():
+            body.add_geom(type=kinds.mjGEOM_BOX, size=_three(*shape.halfSide), **place)
+        case coal.Ellipsoid():
+            body.add_geom(type=kinds.mjGEOM_ELLIPSOID, size=_three(*shape.radii), **place)
+        case coal.Halfspace():
+            body.add_geom(
+                type=kinds.mjGEOM_BOX,
+                size=_three(_HALF_SPACE_SIDE, _HALF_SPACE_SIDE, _HALF_SPACE_SIDE),
+                **_below_plane(place),
+            )
+        case coal.ConvexBase():
+            mesh = spec.add_mesh(name=geometry.name, uservert=np.array(shape.points()).ravel())
+            mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+            body.add_geom(type=kinds.mjGEOM_MESH, meshname=geometry.name, **place)
+        case _:
+            raise ValueError(f"body {geometry.name!r}: {type(shape).__name__} has no counterpart")
+
+
+_HALF_SPACE_SIDE = 20.0
+"""Half the side of the box that stands for a half-space [m]: MuJoCo computes no distance to planes."""
+
+
+def _below_plane(place: dict[str, Any]) -> dict[str, Any]:
+    """Return the placement of a box whose top face is the plane of that placement."""
+    up = np.empty(9)
+    mujoco.mju_quat2Mat(up, place["quat"])
+    return {**place, "pos": np.asarray(place["pos"]) - _HALF_SPACE_SIDE * up[2::3]}
+
+
+def _three(*sizes: float) -> Sequence[float]:
+    """Return up to three sizes, filled up with zeros."""
+    return [*sizes, 0.0, 0.0][:3]
+
+
+def _quaternion(rotation: Array) -> Array:
+    """Return the quaternion (4,), w first, of a rotation (3, 3)."""
+    quaternion = np.empty(4)
+    mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(rotation).ravel())
+    return quaternion
