@@ -248,16 +248,6 @@ def test_pairs_are_judged_by_samples_and_a_descent(tmp_path):
     assert safety_distances(sampled)[0] == pytest.approx(0.5 * gap, abs=1e-4) and gap < D1
 
 
-@pytest.mark.parametrize("limit", [0.4, 2.0])
-def test_contact_is_a_share_of_the_samples(tmp_path, limit):
-    """A ball at the tip of two links that fold touches one on the base while |x| < a: its share is counted."""
-    limits = {"position": {"joint1": (-1e-6, 1e-6), "joint2": (-limit, limit)}}
-    robot = chain(tmp_path, [ball("a", "link0", [0, 0, 0.85], 0.04), ball("b", "link2", [0, 0, 0.25], 0.0119)],
-                  limits=limits)  # fmt: skip
-    half = 2.0 * math.asin(0.0519 / 2.0 / 0.25)  # chord of the arc that b's centre may be off
-    assert sample_pairs(robot, 2000).contact[0] == pytest.approx(half / limit, abs=0.05)
-
-
 def test_home_is_the_wish_or_near_it(tmp_path):
     """Clear by 4/3 of the safety distance, or of the pair's own, and hardly farther from the wish than that takes."""
     robot = chain(tmp_path, [ball("base", "link0", [0, 0, 0.85]), ball("tip", "link2", [0, 0, 0.25])])
