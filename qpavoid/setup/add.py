@@ -139,15 +139,14 @@ def _describe(urdf: Path, options: DescribeOptions, progress: Callable[[str], No
         lock=joint_locks(urdf, model, options.lock, semantics, notes, wheels),
         end_effectors=end_effectors(model, semantics.end_effectors),
     )
-    config_with_srdf = bare.model_copy(update={"srdf": None if honoured is None else str(honoured.resolve())})
-    links, robot = _links(pieces, config_with_srdf, semantics, options, notes, progress)
+    with_srdf = bare.model_copy(update={"srdf": None if honoured is None else str(honoured.resolve())})
+    links, robot = _links(pieces, with_srdf, semantics, options, notes, progress)
     bodies = {"bodies": [body for link in links.values() for body in link.bodies]}
-    robot_without_srdf = robot if honoured is None else Robot.from_config(bare.model_copy(update=bodies), urdf)
 
     progress(f"sampling {len(robot.bodies.collisionPairs)} pairs")
     sampled = sample_pairs(robot, options.samples, options.seed)
     is_nested = pairs.nested_pairs(robot, sampled)
-    reasons = pairs.pair_reasons(robot_without_srdf, robot, sampled, is_nested)
+    reasons = pairs.pair_reasons(robot, sampled, is_nested)
     disabled, single = pairs.by_link(robot, reasons)
     is_active = ~sampled.never & ~sampled.always & ~is_nested
     active, d1 = pairs.with_pairs(robot, is_active), safety_distances(sampled)[is_active]

@@ -76,33 +76,34 @@ def links_of_bodies(robot: Robot) -> dict[str, str]:
 
 
 def pair_reasons(
-    bare: Robot, robot: Robot, pair_samples: PairSamples, is_nested: BoolArray
+    robot: Robot, sampled: PairSamples | None = None, is_nested: BoolArray | None = None
 ) -> dict[frozenset[str], Reason]:
     """Explain why each pair of bodies that is not checked is not.
 
     Args:
-        bare: the robot without an SRDF.
-        robot: the robot with it.
-        pair_samples: what became of its pairs.
+        robot: with its pairs.
+        sampled: what became of its m pairs in random configurations; None: all of them are checked.
         is_nested: which of them slide into each other (m,).
     """
-    names = [body.name for body in bare.bodies.geometryObjects]
+    bodies, parents = robot.bodies.geometryObjects, robot.model.parents
     touching = {frozenset(pair[:2]) for pair in robot.always_touching}
-    checked = {*named_pairs(bare), *(frozenset(pair[:2]) for pair in bare.always_touching)}
-    mask = {pair: i for i, pair in enumerate(named_pairs(robot))}
+    numbers = {pair: i for i, pair in enumerate(named_pairs(robot))}
     reasons: dict[frozenset[str], Reason] = {}
-    for pair in [frozenset((a, b)) for i, a in enumerate(names) for b in names[:i]]:
-        index = mask.get(pair)
-        if pair in touching or (index is not None and pair_samples.always[index]):
-            reasons[pair] = "always"
-        elif pair not in checked:
-            reasons[pair] = "adjacent"
-        elif index is None:
-            reasons[pair] = "srdf"
-        elif is_nested[index]:
-            reasons[pair] = "drawn in"
-        elif pair_samples.never[index]:
-            reasons[pair] = "never"
+    for i, body in enumerate(bodies):
+        for other in bodies[:i]:
+            pair, a, b = frozenset((body.name, other.name)), body.parentJoint, other.parentJoint
+            number = numbers.get(pair)
+            if pair in touching:
+                reasons[pair] = "always"
+            elif number is None:
+                is_adjacent = a == b or parents[a] == b or parents[b] == a
+                reasons[pair] = "adjacent" if is_adjacent else "srdf"
+            elif sampled is not None and sampled.always[number]:
+                reasons[pair] = "always"
+            elif is_nested is not None and is_nested[number]:
+                reasons[pair] = "drawn in"
+            elif sampled is not None and sampled.never[number]:
+                reasons[pair] = "never"
     return reasons
 
 
@@ -162,16 +163,8 @@ def find_unchecked(robot: Robot, pieces: Sequence[Piece]) -> list[UncheckedLinks
         robot: with its pairs.
         pieces: geometry as the file has it.
     """
-    link, joint = links_of_bodies(robot), {body.name: body.parentJoint for body in robot.bodies.geometryObjects}
-    checked = {frozenset(link[body] for body in pair) for pair in named_pairs(robot)}
-    checked |= {frozenset((link[pair.a], link[pair.b])) for pair in robot.always_touching}
-    parents, disabled, names = robot.model.parents, dict[frozenset[str], Reason](), list(link)
-    for i, a in enumerate(names):
-        for b in names[:i]:
-            pair = frozenset((link[a], link[b]))
-            if joint[a] != joint[b] and pair not in checked:
-                is_adjacent = parents[joint[a]] == joint[b] or parents[joint[b]] == joint[a]
-                disabled[pair] = "adjacent" if is_adjacent else "srdf"
+    disabled, _ = by_link(robot, pair_reasons(robot))
+    disabled = {links: why for links, why in disabled.items() if why != "always"}  # those are notes of the robot's own
     return measure_unchecked(robot, pieces, disabled, {})
 
 
