@@ -207,7 +207,7 @@ def test_contacts_that_cannot_be_used_are_named(solo, panda):
         build_contacts(pair, panda, random_q(panda, np.random.default_rng(0)))
 
 
-@pytest.mark.parametrize("solver", ["qp", "hqp"])
+@pytest.mark.parametrize("solver", ["qp", pytest.param("hqp", marks=pytest.mark.slow)])
 def test_humanoid_reaches_past_a_ball_without_sliding(solver):
     scenario, g1 = load_scenario("humanoid_reach", solver=solver), Robot.load("g1")
     log = simulate(scenario)
