@@ -141,7 +141,7 @@ def _draw(ax: Any, log: Log, step: int, lower: Array, upper: Array) -> None:
         if is_endless(log, i):
             faces, colour = faces[((faces >= lower) & (faces <= upper)).all(axis=(1, 2))], GROUND
         surfaces.append((faces, colour))
-    if surfaces:
+    if any(len(faces) for faces, _ in surfaces):
         # One collection for all: matplotlib sorts faces by depth within a collection only.
         faces = np.concatenate([faces for faces, _ in surfaces])
         colours = np.repeat([colour for _, colour in surfaces], [len(faces) for faces, _ in surfaces])
