@@ -64,7 +64,7 @@ def row(urdf: Path, folder: Path) -> tuple[str, bool]:
     """Return a robot's row of the table, and True if every command ended as it should."""
     name = urdf.relative_to(ROBOTS).as_posix()
     checked, why = run("check", str(urdf))
-    added, why_not = run("add", str(urdf), "--out", str(folder / name), "--no-picture")
+    added, why_not = run("add", str(urdf), "--out", str(folder / name))
     written, why_neither = run("check", str(folder / name / "robot.yaml")) if added else (None, "")
     said = list(dict.fromkeys(text.replace(f"{urdf}: ", "") for text in (why, why_not, why_neither) if text))
     if checked and checked["notes"]:
