@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from qpavoid_bench.tick.robots import ROBOTS, SHARE
 
-from bench.tick.robots import ROBOTS, SHARE
 from qpavoid import Robot
 from qpavoid.model.notes import RobotWarning
 

@@ -14,8 +14,8 @@ from typing import Any
 import coal
 import numpy as np
 import pinocchio as pin
+from qpavoid_bench.tick.robots import SHARE
 
-from bench.tick.robots import SHARE
 from qpavoid import Avoidance, Controller, Obstacle, Points, Robot, Sample, Voxels, build_scene, build_tasks
 from qpavoid.config import Box, Capsule, Cone, Cylinder, Ellipsoid, HalfSpace, Mesh, PointCloud, Sphere, Task
 from qpavoid.geometry.bodies import MeshWarning

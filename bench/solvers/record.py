@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
+from qpavoid_bench.tick.build import build, make_scene
 
-from bench.tick.build import build, make_scene
 from qpavoid import Avoidance, Controller, Sample, ScenarioConfig, build_tasks, load_scenario
 from qpavoid.config import QpSolver, Task
 from qpavoid.config.shipped import scenario_names

@@ -9,9 +9,8 @@ import pink
 import pinocchio as pin
 from pink.barriers import SelfCollisionBarrier
 from pink.tasks import FrameTask
-
-from bench.tick.build import make_scene
-from bench.tick.workloads import Array, Workload
+from qpavoid_bench.tick.build import make_scene
+from qpavoid_bench.tick.workloads import Array, Workload
 
 
 class AllPairs:
@@ -19,12 +18,6 @@ class AllPairs:
 
     count: int | None = None
     """How many of the closest pairs get a row; None: all."""
-    settings = (
-        "SelfCollisionBarrier(d_min, gain 1.0, safe_displacement_gain 1.0) of all pairs or of the 20 closest; it has "
-        "no influence distance; FrameTask(cost 1, gain 1.0, lm_damping 0); limits None: position and velocity; "
-        "damping 1e-12; solver daqp"
-    )
-    packages = ("pin-pink", "pin", "coal", "qpsolvers", "daqp", "numpy")
 
     def __init__(self, workload: Workload) -> None:
         self.workload = workload

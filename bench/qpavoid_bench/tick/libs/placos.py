@@ -8,20 +8,11 @@ import coal
 import numpy as np
 import pinocchio as pin
 import placo
-
-from bench.tick.workloads import Array, Body, Workload
+from qpavoid_bench.tick.workloads import Array, Body, Workload
 
 
 class Placo:
     """AvoidSelfCollisions constraint with all pairs."""
-
-    settings = (
-        "avoid_self_collisions constraint (hard, margin = d_min, trigger = influence distance); frame tasks soft, "
-        "weight 1, full error in one step (it has no gain); joint and velocity limits on; fixed robots through "
-        "mask_fbase(True): its model always has a floating base; obstacles are added to its collision model, since it "
-        "has no interface for them"
-    )
-    packages = ("placo", "pin", "coal", "numpy")
 
     def __init__(self, workload: Workload) -> None:
         self.workload = workload

@@ -7,8 +7,7 @@ from typing import Any
 import mink
 import mujoco
 import numpy as np
-
-from bench.tick.workloads import Array, Body, Workload
+from qpavoid_bench.tick.workloads import Array, Body, Workload
 
 
 class GivenPairs(mink.CollisionAvoidanceLimit):
@@ -24,13 +23,6 @@ class GivenPairs(mink.CollisionAvoidanceLimit):
 
 class Mink:
     """One CollisionAvoidanceLimit with all pairs."""
-
-    settings = (
-        "CollisionAvoidanceLimit(gain 0.85, minimum distance d_min, detection distance = influence distance, broad "
-        "phase on) with the pairs given, not filtered; FrameTask(cost 1, gain 1.0, lm_damping 0); ConfigurationLimit "
-        "(gain 0.95), VelocityLimit; damping 1e-12; solver daqp"
-    )
-    packages = ("mink", "mujoco", "qpsolvers", "daqp", "numpy")
 
     def __init__(self, workload: Workload) -> None:
         self.workload = workload

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import cache
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from qpavoid_bench.tick.robots import ROBOTS, RobotSpec, load
+from qpavoid_bench.tick.workloads import Array, Body, Frame, Joint, Workload, pose
 
-from bench.tick.robots import ROBOTS, RobotSpec, load
-from bench.tick.workloads import Array, Body, Frame, Joint, Workload, pose
 from qpavoid import Obstacle, Robot, Scene, build_scene
 from qpavoid.config import Box, Sphere
 
@@ -22,21 +23,34 @@ CLEARANCE = 0.035
 NEAR = 0.05
 """Obstacles that are put near a tool come at least this close to it."""
 INFLUENCES = (0.10, 0.30)
-SIZES = {"panda": (0, 5, 50, 500), "baxter": (0, 50), "g1": (8,)}
+SIZES = {"panda": (0, 5, 20, 50, 500), "baxter": (0, 50), "g1": (8,)}
 """Numbers of obstacles."""
+VARIANTS = ("held", "sample1", "sample50", "pose1", "pose50")
+_NAME = re.compile(r"(panda|baxter|g1)-(\d+)@(0\.\d+)(?:\+(held|(?:sample|pose)[1-9]\d*))?")
 
 
-def names() -> list[str]:
-    """All workloads: ROBOT-OBSTACLES@INFLUENCE."""
+def recorded_names() -> list[str]:
+    """Return the workloads for all libraries: ROBOT-OBSTACLES@INFLUENCE."""
     return [f"{robot}-{n}@{d:.2f}" for robot, sizes in SIZES.items() for n in sizes for d in INFLUENCES]
 
 
+def variant_names() -> list[str]:
+    """Return those for qpavoid alone: ROBOT-OBSTACLES@INFLUENCE+VARIANT."""
+    return [f"panda-50@{d:.2f}+{variant}" for d in INFLUENCES for variant in VARIANTS]
+
+
+def is_recorded(name: str) -> bool:
+    """Return whether a name is one that `build` understands, listed or not."""
+    return _NAME.fullmatch(name) is not None
+
+
 def build(name: str) -> Workload:
-    """The workload of that name; the same at every call."""
-    scenery, influence = name.split("@")
-    robot, obstacles = scenery.split("-")
+    """Return the workload of that name; the same at every call."""
+    match = _NAME.fullmatch(name)
+    assert match is not None, name
+    robot, obstacles, influence, variant = match.groups()
     workload = _build(robot, int(obstacles))
-    return replace(workload, name=name, influence=float(influence))
+    return replace(workload, name=name, influence=float(influence), variant=variant or "")
 
 
 def make_scene(workload: Workload) -> Scene:

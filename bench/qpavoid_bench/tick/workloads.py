@@ -82,6 +82,8 @@ class Workload:
     """(T, nq) recorded configurations, one a tick."""
     targets: Array
     """(T, f, 4, 4) where each frame should be one period later."""
+    variant: str = ""
+    """Of qpavoid alone: `held` (no targets are given), `sampleN` or `poseN` (so many obstacles are, at every step)."""
 
     @property
     def boxes(self) -> Any:

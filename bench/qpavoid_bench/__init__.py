@@ -1,0 +1,1 @@
+"""Benchmark of qpavoid: one control step beside other libraries, back ends, endurance."""

@@ -1,0 +1,58 @@
+"""Tables of the reports: Markdown for people, CSV for programs, and the machine that the figures are of."""
+
+from __future__ import annotations
+
+import csv
+import os
+import platform
+from collections.abc import Iterable, Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+RESULTS = Path("bench") / "results"
+"""Folder of results below the working directory, if a command is given no other."""
+
+
+def table(head: Sequence[str], rows: Iterable[Iterable[Any]], text_columns: int = 1) -> str:
+    """Return a Markdown table; columns after the first `text_columns` are set to the right."""
+    lines = [head, ["---"] * text_columns + ["---:"] * (len(head) - text_columns), *rows]
+    return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
+
+
+def number(value: float) -> str:
+    """Return a number with three digits at most; `-` for NaN."""
+    return "-" if np.isnan(value) else f"{value:.1f}" if abs(value) < 100.0 else f"{value:.0f}"
+
+
+def machine() -> str:
+    """Return processor, cores, system and interpreter in one line."""
+    from qpavoid.run.machine import cpu
+
+    return f"{cpu()}, {os.cpu_count()} CPUs, {platform.system()}, Python {platform.python_version()}"
+
+
+def versions(packages: Iterable[str]) -> str:
+    """Return the packages that are installed, with their versions, in one line."""
+    found = []
+    for package in packages:
+        try:
+            found.append(f"{package} {version(package)}")
+        except PackageNotFoundError:
+            continue
+    return ", ".join(found)
+
+
+def write(folder: Path, name: str, sections: Iterable[str], rows: Sequence[Mapping[str, Any]] = ()) -> str:
+    """Write NAME.md, and NAME.csv if there are rows; return the Markdown."""
+    folder.mkdir(parents=True, exist_ok=True)
+    markdown = "\n\n".join(section for section in sections if section) + "\n"
+    (folder / f"{name}.md").write_text(markdown, encoding="utf-8")
+    if rows:
+        with (folder / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, list(rows[0]))
+            writer.writeheader()
+            writer.writerows(rows)
+    return markdown
