@@ -58,6 +58,10 @@ class Recorded:
         t = self._steps * self.workload.dt
         return self.controller.step(self._q[tick], t, self._targets[tick], self._obstacles).v
 
+    def problem(self, tick: int) -> Any:
+        """Return the `Problem` of a control step."""
+        return self.controller.tick(self._q[tick], None, self._targets[tick], self._obstacles).problem
+
     def velocity(self, v: Any) -> Array:
         """As it is."""
         return v

@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 import qpsolvers
+from qpavoid_bench.solvers.record import QP
 from scipy.optimize import linprog, nnls
 
-from bench.solvers.record import QP
 from qpavoid.problem import Array
 from qpavoid.solvers.backends import solve_daqp
 
@@ -16,13 +16,8 @@ VIOLATION = 1e-6
 """Largest violation of a row or bound [m/s, rad/s]: what the `qp` solver accepts."""
 DISTANCE = 1e-6
 """Largest distance from the reference in any coordinate [rad/s]."""
-GAP = 1e-8
-"""Largest relative excess of the cost, where the minimum is too flat for the distance to mean anything."""
-FLAT = 1e-6
-"""Smallest eigenvalue of P below which a minimum is called flat."""
-
 EDGE = 1e-9
-"""Room between rows and bounds below which round-off decides whether there is any [m/s]."""
+"""Slack of rows and bounds below which round-off decides whether there is any [m/s]."""
 
 
 class Truth(NamedTuple):
@@ -32,11 +27,9 @@ class Truth(NamedTuple):
     """The minimum (n,); None where rows and bounds contradict each other."""
     stationarity: float
     """‖P x + q - Aᵀy‖∞ of the reference itself, y >= 0 of its active rows and bounds by non-negative least squares."""
-    flat: bool
-    """Whether the minimum is judged by its cost."""
-    edge: bool = False
+    at_edge: bool = False
     """Rows can be met with less than `EDGE` to spare, below what solvers can tell: no answer is right too."""
-    open: bool = False
+    is_open: bool = False
     """Neither minimum nor contradiction could be shown; answers to such a QP are not judged."""
 
 
@@ -47,76 +40,69 @@ class Judgement(NamedTuple):
     """It gave an x, whatever that is worth; or, for a contradiction, it gave none."""
     right: bool
     violation: float
+    """Largest violation of a row or bound [m/s, rad/s]; NaN where it means nothing."""
     distance: float
     """‖x - reference‖∞ [rad/s]; NaN where it means nothing."""
 
 
-def truth(qp: QP) -> Truth:
-    """The best of daqp's and quadprog's answers, solved again as equations on its active set, and what proves it."""
-    flat = bool(np.linalg.eigvalsh(qp.P)[0] < FLAT)
-    best = Truth(None, np.inf, flat)
-    for x in (solve_daqp(*qp), _quadprog(qp)):
+def find_truth(qp: QP) -> Truth:
+    """Return the better of daqp's and quadprog's answers, solved again on its active set, with its proof."""
+    best = Truth(None, np.inf)
+    for x in (solve_daqp(*qp[:6]), _quadprog(qp)):
         if x is None or violation(qp, x) > VIOLATION:
             continue
         for candidate in (x, _on_active_set(qp, x)):
             residual = stationarity(qp, candidate)
             if violation(qp, candidate) <= 1e-9 and residual < best.stationarity:
-                best = Truth(candidate, residual, flat)
-    if best.x is not None:
-        edge = least_violation(qp) > -EDGE
-        return best._replace(edge=edge, open=best.stationarity > 1e-8 * max(1.0, float(np.abs(qp.q).max())))
-    return best._replace(open=least_violation(qp) <= VIOLATION)
+                best = Truth(candidate, residual)
+    if best.x is None:
+        return best._replace(is_open=least_violation(qp) <= VIOLATION)
+    is_open = best.stationarity > 1e-8 * max(1.0, float(np.abs(qp.q).max()))
+    return best._replace(at_edge=least_violation(qp) > -EDGE, is_open=is_open)
 
 
-def judge(qp: QP, right: Truth, x: Array | None) -> Judgement:
-    """Compares an answer with the truth."""
-    if right.x is None:
+def judge(qp: QP, truth: Truth, x: Array | None) -> Judgement:
+    """Compare an answer with the truth."""
+    if truth.x is None:
         return Judgement(x is None, x is None or not violation(qp, x) <= VIOLATION, np.nan, np.nan)
     if x is None:
-        return Judgement(right.edge, right.edge, np.nan, np.nan)
-    excess, off = violation(qp, x), float(np.abs(x - right.x).max())
-    reference = cost(qp, right.x)
-    close = abs(cost(qp, x) - reference) <= GAP * (1.0 + abs(reference)) if right.flat else off <= DISTANCE
-    return Judgement(True, excess <= VIOLATION and close, excess, np.nan if right.flat else off)
-
-
-def cost(qp: QP, x: Array) -> float:
-    """½ xᵀP x + qᵀx."""
-    return float(0.5 * x @ qp.P @ x + qp.q @ x)
+        return Judgement(truth.at_edge, truth.at_edge, np.nan, np.nan)
+    excess, distance = violation(qp, x), float(np.abs(x - truth.x).max())
+    return Judgement(True, excess <= VIOLATION and distance <= DISTANCE, excess, distance)
 
 
 def violation(qp: QP, x: Array) -> float:
-    """Largest amount by which a row or bound is missed; NaN stays NaN."""
-    short = np.concatenate((qp.h - qp.G @ x, qp.lower - x, x - qp.upper))
-    return float(np.maximum(short.max(), 0.0))
+    """Return the largest amount by which a row or bound is missed; NaN stays NaN."""
+    missing = np.concatenate((qp.h - qp.G @ x, qp.lower - x, x - qp.upper))
+    return float(np.maximum(missing.max(), 0.0))
 
 
 def stationarity(qp: QP, x: Array) -> float:
-    """‖P x + q - Aᵀy‖∞ with the y >= 0 that makes it least; A are the rows and bounds that hold as equations at x."""
+    """Return the least ‖P x + q - Aᵀy‖∞ over y >= 0; A are the rows and bounds that hold as equations at x."""
     A, _ = _active(qp, x)
     gradient = qp.P @ x + qp.q
     return float(np.abs(gradient - A.T @ nnls(A.T, gradient)[0]).max() if len(A) else np.abs(gradient).max())
 
 
 def least_violation(qp: QP) -> float:
-    """Least t for which some x within the bounds meets every row up to t: above 0, the rows contradict; at least -1."""
+    """Return the least t >= -1 such that an x within the bounds meets every row up to t: above 0, a contradiction."""
     m, n = qp.G.shape
     bounds = [*zip(qp.lower, qp.upper, strict=True), (-1.0, None)]
     result = linprog(np.eye(n + 1)[-1], np.hstack((-qp.G, -np.ones((m, 1)))), -qp.h, bounds=bounds)
     return float(result.x[-1]) if result.success else np.inf
 
 
-def _active(qp: QP, x: Array, within: float = 1e-7) -> tuple[Array, Array]:
-    """Rows A (k, n) and sides b (k,) of what is active at x: A x >= b."""
+def _active(qp: QP, x: Array) -> tuple[Array, Array]:
+    """Return rows A (k, n) and sides b (k,) of what is active at x: A x >= b."""
     eye = np.eye(len(x))
     rows = np.vstack((qp.G, eye, -eye))
     sides = np.concatenate((qp.h, qp.lower, -qp.upper))
-    active = rows @ x - sides < within
+    active = rows @ x - sides < 1e-7
     return rows[active], sides[active]
 
 
 def _on_active_set(qp: QP, x: Array) -> Array:
-    """Minimum on the active set of x, by its linear equations: takes the last digits of round-off away."""
+    """Return the minimum on the active set of x, by its linear equations: takes the last digits of round-off away."""
     A, b = _active(qp, x)
     k = len(b)
     matrix = np.block([[qp.P, A.T], [A, np.zeros((k, k))]])

@@ -1,0 +1,120 @@
+"""Replays recorded QPs through back ends, in the order of the steps and in turns, and judges every answer."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+import sys
+from collections.abc import Callable, Iterator
+from time import perf_counter_ns
+from typing import NamedTuple
+
+import numpy as np
+import qpsolvers
+from qpavoid_bench.solvers.record import QP, REGULARIZATION, Run, Solve
+from qpavoid_bench.solvers.truth import Judgement, Truth, judge
+
+from qpavoid import kernels
+from qpavoid.problem import Array
+from qpavoid.solvers.backends import Backend, backend_names, make_backend
+from qpavoid.solvers.backends.wrapped import through_qpsolvers
+
+
+class Cell(NamedTuple):
+    """One back end on one run."""
+
+    us: Array
+    """(rounds, k) time of each call [µs]."""
+    judged: list[Judgement]
+    """(k,) its answers; those to open QPs are left out."""
+
+
+def contestants() -> dict[str, Callable[[float], Solve]]:
+    """Return how each back end is made for a control period dt [s].
+
+    They are those of `make_backend`, and for comparison the solvers at their own default tolerances, with the velocity
+    v and the displacement v dt as the unknown.
+    """
+    makers: dict[str, Callable[[float], Solve]] = {"native": lambda dt: _native}
+    for name in backend_names():
+        makers[name] = lambda dt, name=name: _backend(make_backend(name))
+    for name in sorted(qpsolvers.available_solvers):
+        makers[f"{name}, defaults"] = lambda dt, name=name: _backend(through_qpsolvers(name, {}))
+        makers[f"{name}, defaults, v dt"] = lambda dt, name=name: _backend(through_qpsolvers(name, {}), dt)
+    return makers
+
+
+def _native(qp: QP) -> Array | None:
+    """Solve in compiled code, as the `qp` solver does."""
+    x, solved = kernels.project(qp.A, REGULARIZATION, qp.v, qp.G, qp.h, qp.lower, qp.upper)
+    return x if solved else None
+
+
+def _backend(backend: Backend, unit: float = 1.0) -> Solve:
+    """Return a back end whose unknown is the velocity times `unit`."""
+
+    def solve(qp: QP) -> Array | None:
+        if unit == 1.0:
+            return backend(*qp[:6])
+        x = backend(qp.P, qp.q * unit, qp.G, qp.h * unit, qp.lower * unit, qp.upper * unit)
+        return None if x is None else x / unit
+
+    return solve
+
+
+def replay(
+    run: Run, truths: list[Truth], makers: dict[str, Callable[[float], Solve]], rounds: int, budget: float
+) -> dict[str, Cell]:
+    """Time and judge every back end on a run.
+
+    In each round every back end is made anew and sees the whole run; the order is turned round by one each time.
+
+    Args:
+        run: the QPs.
+        truths: their right answers.
+        makers: how to make each back end.
+        rounds: how often they take turns.
+        budget: a back end that has used that many seconds sits out the rounds that are left [s].
+    """
+    names = list(makers)
+    ns: dict[str, list[list[int]]] = {name: [] for name in names}
+    judged: dict[str, list[Judgement]] = {}
+    for turn in range(rounds):
+        shift = turn % len(names)
+        for name in names[shift:] + names[:shift]:
+            if 1e-9 * sum(map(sum, ns[name])) > budget:
+                continue
+            with _quiet():
+                answers, times = _pass(makers[name](run.dt), run.qps)
+            ns[name].append(times)
+            if turn == 0:
+                triples = zip(run.qps, truths, answers, strict=True)
+                judged[name] = [judge(qp, truth, x) for qp, truth, x in triples if not truth.is_open]
+    return {name: Cell(1e-3 * np.array(ns[name], dtype=float), judged[name]) for name in names}
+
+
+def _pass(solve: Solve, qps: list[QP]) -> tuple[list[Array | None], list[int]]:
+    answers, times = [], []
+    gc.collect()
+    solve(qps[0])
+    for qp in qps:
+        begin = perf_counter_ns()
+        x = solve(qp)
+        times.append(perf_counter_ns() - begin)
+        answers.append(x)
+    return answers, times
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep what C code prints off the terminal: osqp says on stdout when there was nothing to polish."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    with open(os.devnull, "w") as nowhere:
+        os.dup2(nowhere.fileno(), 1)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
