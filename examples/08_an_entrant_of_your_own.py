@@ -28,10 +28,10 @@ class RowByRow:
 
 def main() -> None:
     """Three cases by hand, as a sweep runs them: in a closed loop, judged by MuJoCo."""
-    from qpavoid.arena.entrant_file import entrant_from_file
-    from qpavoid.arena.entrants import find_entrant
-    from qpavoid.arena.families import load_family, make_case
-    from qpavoid.arena.trial import run_trial
+    from qpavoid_bench.arena.entrant_file import entrant_from_file
+    from qpavoid_bench.arena.entrants import find_entrant
+    from qpavoid_bench.arena.families import load_family, make_case
+    from qpavoid_bench.arena.trial import run_trial
 
     entrants = [find_entrant("tracking"), find_entrant("qp"), entrant_from_file(Path(__file__), "RowByRow")]
     for seed in range(3):

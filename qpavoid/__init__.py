@@ -15,8 +15,9 @@ from qpavoid.model.scene import Obstacle, Scene, build_scene
 from qpavoid.model.trajectory import Sample
 from qpavoid.problem import Problem, Solution, Status
 from qpavoid.reason import Reason, ReasonKind, Severity
-from qpavoid.run.batch import BatchError, Steps, WorkerDied, Workers, simulate_many, steps
+from qpavoid.run.batch import BatchError, Steps, simulate_many, steps
 from qpavoid.run.log import Log
+from qpavoid.run.pool import WorkerDied, Workers
 from qpavoid.run.simulate import simulate
 from qpavoid.solvers import SOLVERS, Solver, make_solver
 

@@ -19,7 +19,6 @@ import typer
 from rich.markup import escape
 from rich.progress import Progress, TaskID
 
-from qpavoid.arena import commands as bench_commands
 from qpavoid.config import RobotConfig, ScenarioConfig
 from qpavoid.config.fields import page, schema_of
 from qpavoid.config.loading import load_scenario
@@ -40,7 +39,6 @@ app = typer.Typer(
     help="Follow a planned motion and stay clear of obstacles, other arms and yourself.",
 )
 app.add_typer(robot_commands.app, name="robot")
-app.add_typer(bench_commands.app, name="bench")
 
 Sets = Annotated[
     list[str] | None, typer.Option("--set", metavar="PATH=VALUE", help="Override a field: avoidance.d2=0.30")
@@ -142,6 +140,21 @@ def compare(
         if len(names) > 1:
             OUT.print(ratios_table(metrics, names[-2], names[-1]))
     raise typer.Exit(0 if all(run["completed"] for run in metrics) and len(logs) == len(configs) else 1)
+
+
+@app.command("bench", context_settings={"ignore_unknown_options": True, "help_option_names": []})
+def bench_(words: Annotated[list[str] | None, typer.Argument(metavar="COMMAND ...")] = None) -> None:
+    """Compare solvers on families of scenarios: the arena. `qpavoid bench --help` lists its commands."""
+    try:
+        from qpavoid_bench.arena.commands import app as bench
+    except ModuleNotFoundError as missing:
+        if missing.name != "qpavoid_bench":
+            raise
+        raise ConfigError(
+            "qpavoid bench needs the package qpavoid_bench, which comes with qpavoid; put the "
+            "checkout's folder `bench` on PYTHONPATH, or install the checkout"
+        ) from None
+    raise typer.Exit(bench(words or ["--help"], prog_name="qpavoid bench", standalone_mode=False) or 0)
 
 
 class Schema(str, Enum):

@@ -21,17 +21,17 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
 from scipy.stats import binom, binomtest
 
-from qpavoid.arena import statistics
-from qpavoid.arena.coverage import missing_results
-from qpavoid.arena.figures import safety_against_tracking, success_against_time
-from qpavoid.arena.report import report_of, rerun_line, write_report
-from qpavoid.arena.results import results_of
-from qpavoid.arena.scores import COLUMNS
-from qpavoid.arena.statistics import CONFIDENCE, duel, mean, median, pareto, ranks, rate
-from qpavoid.arena.store import Store, read_failures
-from qpavoid.arena.tables import COLUMNS as SHOWN
-from qpavoid.arena.tables import MORE
 from qpavoid.errors import ConfigError
+from qpavoid_bench.arena import statistics
+from qpavoid_bench.arena.coverage import missing_results
+from qpavoid_bench.arena.figures import safety_against_tracking, success_against_time
+from qpavoid_bench.arena.report import report_of, rerun_line, write_report
+from qpavoid_bench.arena.results import results_of
+from qpavoid_bench.arena.scores import COLUMNS
+from qpavoid_bench.arena.statistics import CONFIDENCE, duel, mean, median, pareto, ranks, rate
+from qpavoid_bench.arena.store import Store, read_failures
+from qpavoid_bench.arena.tables import COLUMNS as SHOWN
+from qpavoid_bench.arena.tables import MORE
 
 flags = st.lists(st.booleans(), min_size=1, max_size=30)
 

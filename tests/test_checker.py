@@ -14,7 +14,7 @@ from qpavoid import Limits, Robot, ScenarioConfig, build_scene, load_scenario
 from qpavoid.run.simulate import simulate
 
 pytest.importorskip("mujoco")
-pytest.importorskip("bench", reason="bench/ is in the repository only")
+pytest.importorskip("bench.safety", reason="bench/safety is in the repository only")
 
 from bench.safety import report
 from bench.safety.campaign import FOLDER, KINDS, RANGES, draw
@@ -22,8 +22,8 @@ from bench.safety.referee import disagreement, drift, referee
 from bench.safety.rollout import Start, evade, joint_limits, policies
 from bench.safety.trial import trials
 from bench.safety.verdict import judge
-from qpavoid.arena.checker import STEP, DistanceMonitor
-from qpavoid.arena.mujoco_model import build, load_model
+from qpavoid_bench.arena.checker import STEP, DistanceMonitor
+from qpavoid_bench.arena.mujoco_model import build, load_model
 
 PLATE = BOX.model_copy(update={"size": (0.3, 0.2, 0.006)})
 

@@ -15,9 +15,9 @@ from qpavoid.geometry.bodies import make_shape
 from qpavoid.model.cloud import voxel_radius
 
 pytest.importorskip("mujoco")
-pytest.importorskip("bench", reason="bench/ is in the repository only")
+pytest.importorskip("bench.safety", reason="bench/safety is in the repository only")
 
-from qpavoid.arena.mujoco_model import build
+from qpavoid_bench.arena.mujoco_model import build
 
 TCP, HOLD = "panda_hand_tcp", 0.02
 

@@ -11,9 +11,9 @@ pytest.importorskip("pyarrow")
 pytest.importorskip("distributed")
 pytest.importorskip("mujoco")
 
-from qpavoid.arena import sweep
-from qpavoid.arena.store import read_runs
 from qpavoid.config.shipped import suite_names
+from qpavoid_bench.arena import sweep
+from qpavoid_bench.arena.store import read_runs
 
 DOCS = Path(__file__).parent.parent / "docs"
 PAGE = (DOCS / "arena.md").read_text(encoding="utf-8")

@@ -13,11 +13,11 @@ pytest.importorskip("mujoco")
 
 import pyarrow as pa
 
-from qpavoid.arena.report import report_of
-from qpavoid.arena.scores import COLUMNS
-from qpavoid.arena.statistics import _MANY, CONFIDENCE, duel, mean
-from qpavoid.arena.tables import COLUMNS as SHOWN
-from qpavoid.arena.tables import MORE
+from qpavoid_bench.arena.report import report_of
+from qpavoid_bench.arena.scores import COLUMNS
+from qpavoid_bench.arena.statistics import _MANY, CONFIDENCE, duel, mean
+from qpavoid_bench.arena.tables import COLUMNS as SHOWN
+from qpavoid_bench.arena.tables import MORE
 
 PAGE = (Path(__file__).parent.parent / "docs/arena_report.md").read_text(encoding="utf-8")
 

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from qpavoid.arena.families import family_names, load_family, make_case
-from qpavoid.arena.families.arms import arms
 from qpavoid.model.robot import Robot
+from qpavoid_bench.arena.families import family_names, load_family, make_case
+from qpavoid_bench.arena.families.arms import arms
 
 PAGE = (Path(__file__).parent.parent / "docs" / "arena_families.md").read_text(encoding="utf-8")
 FAMILIES = re.findall(r"```yaml\n(.*?)```", PAGE, re.S)

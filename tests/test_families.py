@@ -13,17 +13,17 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
 from qpavoid import ScenarioConfig
-from qpavoid.arena.case import Case
-from qpavoid.arena.families import Draw, Redraw, family_names, load_family, make_case
-from qpavoid.arena.families.clearance import MIN_ADVANCE, Clearance
-from qpavoid.arena.families.inverse_kinematics import FrameGoal, JointRanges, solve_inverse_kinematics
-from qpavoid.arena.families.parameters import Parameter
-from qpavoid.arena.families.planner import plan
-from qpavoid.arena.families.solvable import find_plan
-from qpavoid.arena.scores import surface_safety_distance
-from qpavoid.arena.world import build_world
 from qpavoid.config.shipped import scenario_names, setup_names
 from qpavoid.errors import ConfigError, UnknownName
+from qpavoid_bench.arena.case import Case
+from qpavoid_bench.arena.families import Draw, Redraw, family_names, load_family, make_case
+from qpavoid_bench.arena.families.clearance import MIN_ADVANCE, Clearance
+from qpavoid_bench.arena.families.inverse_kinematics import FrameGoal, JointRanges, solve_inverse_kinematics
+from qpavoid_bench.arena.families.parameters import Parameter
+from qpavoid_bench.arena.families.planner import plan
+from qpavoid_bench.arena.families.solvable import find_plan
+from qpavoid_bench.arena.scores import surface_safety_distance
+from qpavoid_bench.arena.world import build_world
 
 FAMILIES = family_names()
 TIMED = {"chasing", "crossing", "head_on", "noisy_sensor", "random_walk"}
@@ -69,7 +69,7 @@ def test_case_starts_clear_with_proof_of_solution(name):
 def test_cases_are_the_same_in_another_process():
     chosen = [("situation1", 5), ("sphere_field", 1), ("crossing", 2), ("unreachable", 0), ("noisy_sensor", 1)]
     code = (
-        "import sys, json\nfrom qpavoid.arena.families import load_family, make_case\n"
+        "import sys, json\nfrom qpavoid_bench.arena.families import load_family, make_case\n"
         "print(json.dumps([make_case(load_family(n), s).to_json() for n, s in json.loads(sys.argv[1])]))"
     )
     done = subprocess.run(
@@ -83,11 +83,13 @@ def test_cases_are_the_same_in_another_process():
 def test_plan_is_clear_in_mujoco(name, monkeypatch):
     """Mujoco finds the plan clear."""
     pytest.importorskip("mujoco")
-    from qpavoid.arena.checker import DistanceMonitor
-    from qpavoid.arena.mujoco_model import build
+    from qpavoid_bench.arena.checker import DistanceMonitor
+    from qpavoid_bench.arena.mujoco_model import build
 
     plans = []
-    monkeypatch.setattr("qpavoid.arena.families.solvable.plan", lambda *given: plans.append(plan(*given)) or plans[-1])
+    monkeypatch.setattr(
+        "qpavoid_bench.arena.families.solvable.plan", lambda *given: plans.append(plan(*given)) or plans[-1]
+    )
     scenario = make_case(load_family(name), 0).scenario
     world, keep, found = build_world(scenario), surface_safety_distance(scenario), plans[-1]
     mujoco_model = build(world.scene, world.q0)
@@ -267,7 +269,7 @@ def test_plan_goes_through_opening(gantry):
 
 def test_plan_is_none_without_solution(gantry, monkeypatch):
     """No plan where there is none."""
-    monkeypatch.setattr("qpavoid.arena.families.planner.MAX_NODES", 1000)
+    monkeypatch.setattr("qpavoid_bench.arena.families.planner.MAX_NODES", 1000)
     with pytest.raises(Redraw, match="no plan"):
         planned(scenario_of(gantry, [wall("all", -1.2, 1.2)]))
     with pytest.raises(Redraw, match="no plan"):  # 120 mm for a ball of 100 mm that keeps 20 mm on each side
@@ -435,7 +437,7 @@ def posts(draw, robot):
     }
 """
 UNLUCKY = """
-from qpavoid.arena.families import Redraw
+from qpavoid_bench.arena.families import Redraw
 def posts(draw, robot):
     raise Redraw('bad luck')
 """
@@ -518,8 +520,8 @@ def test_family_file_errors_name_file_and_field(family, text, change, error, sai
 )  # fmt: skip
 def test_family_without_case_names_cause(family, monkeypatch, text, change, code, error, said):
     """A family that makes no case says why."""
-    monkeypatch.setattr("qpavoid.arena.families.solvable._TRIES", 5)
-    monkeypatch.setattr("qpavoid.arena.families.make.MAX_DRAWS", 10)
+    monkeypatch.setattr("qpavoid_bench.arena.families.solvable._TRIES", 5)
+    monkeypatch.setattr("qpavoid_bench.arena.families.make.MAX_DRAWS", 10)
     loaded = family(text, *([change] if change else []), code=code)
     with pytest.raises(error, match=said) as raised:
         make_case(loaded, 0)

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 from qpavoid import Controller, ReasonKind, Sample, Status, build_scene, load_scenario, make_solver
-from qpavoid.arena.entrants import ENTRANTS
 from qpavoid.config import Avoidance, GradientProjectionSolver, PotentialFieldSolver, Sphere
 from qpavoid.config.shipped import scenario_names
 from qpavoid.problem import AvoidanceRows, Tracking, make_problem
@@ -19,6 +18,7 @@ from qpavoid.run.simulate import simulate
 from qpavoid.solvers.analytic import tracking_velocity
 from qpavoid.solvers.potential import repulsion
 from qpavoid.solvers.projection import clearance_slope, step_fraction
+from qpavoid_bench.arena.entrants import ENTRANTS
 
 NV, D1, D2 = 7, 0.02, 0.12
 LAWS = ("gradient-projection", "potential-field")

@@ -8,9 +8,23 @@ import pytest
 
 import qpavoid
 
+BENCH = Path(qpavoid.__file__).parents[1] / "bench" / "qpavoid_bench"
+if not BENCH.is_dir():  # in a wheel it stands beside the package
+    BENCH = Path(qpavoid.__file__).parents[1] / "qpavoid_bench"
+FOR_BENCHMARKS = {
+    "qpavoid.errors": "error classes, and how messages name a place and the nearest name",
+    "qpavoid.control.distances": "DistanceQuery: the planner that proves a case solvable checks distances",
+    "qpavoid.control.tasks.frames": "FrameTask: which goals the scores and other libraries follow",
+    "qpavoid.safety.reachability": "arm, clearance: goals out of reach are made by it",
+    "qpavoid.solvers": "parse_solver: entrants are named as in scenarios",
+    "qpavoid.geometry.segments": "point_segment: distance of a tool from its target's path",
+    "qpavoid.viz.style": "colours and grid: figures look alike",
+}
+"""What the benchmarks import beside public names and `qpavoid.{config,problem,model,run}`, and for what."""
+
 LEVELS = (
     ("errors", "reason"), ("config", "problem"), ("kernels", "geometry"), ("solvers", "model"), ("control",),
-    ("safety",), ("controller",), ("run",), ("viz",), ("setup", "arena"), ("cli",), ("__main__",),
+    ("safety",), ("controller",), ("run",), ("viz",), ("setup",), ("cli",), ("__main__",),
 )  # fmt: skip
 """Rooms (folders, and modules beside them) from the bottom up; those of one level do not know each other."""
 LEVEL = {room: level for level, rooms in enumerate(LEVELS) for room in rooms}
@@ -45,6 +59,25 @@ def test_imports_lead_down():
     assert [arrow for arrow in arrows() if LEVEL[arrow[0]] <= LEVEL[arrow[1]]] == []
 
 
+def test_benchmarks_import_few_other_modules():
+    """The benchmarks stand on public names; a module that they need beside them has a reason, and none is idle."""
+    others = set()
+    for path in BENCH.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.ImportFrom) or not node.module or node.module.split(".")[0] != "qpavoid":
+                continue
+            if node.module == "qpavoid":
+                assert {alias.name for alias in node.names} <= set(qpavoid.__all__), path
+            elif node.module.split(".")[1] not in ("config", "problem", "model", "run"):
+                others.add(node.module)
+    assert others == set(FOR_BENCHMARKS)
+
+
+def test_core_imports_the_benchmarks_from_the_command_line_alone():
+    importers = {path.name for path in ROOT.rglob("*.py") if any("qpavoid_bench" in name for name in imported(path))}
+    assert importers == {"cli.py"}
+
+
 def test_floors(capsys):
     below = defaultdict(set)
     for room, other, _ in arrows():
@@ -59,6 +92,6 @@ def test_floors(capsys):
     assert floors <= 12
 
 
-@pytest.mark.parametrize("path", sorted(ROOT.rglob("*.py")), ids=lambda path: path.relative_to(ROOT).as_posix())
+@pytest.mark.parametrize("path", [*sorted(ROOT.rglob("*.py")), *sorted(BENCH.rglob("*.py"))], ids=str)
 def test_modules_have_one_idea(path):
     assert len(path.read_text(encoding="utf-8").splitlines()) <= 350

@@ -10,14 +10,14 @@ import pinocchio as pin
 import pytest
 
 from qpavoid import Sample, load_scenario
-from qpavoid.arena.case import Case, Sensor
-from qpavoid.arena.entrants import ENTRANTS, find_entrant
-from qpavoid.arena.libraries.common import frame_tasks, movable_pairs, target_after_step
-from qpavoid.arena.libraries.settings import PLACO_PYTHON
-from qpavoid.arena.rollout import roll_out
-from qpavoid.arena.trial import run_trial
-from qpavoid.arena.world import build_world
 from qpavoid.errors import ConfigError
+from qpavoid_bench.arena.case import Case, Sensor
+from qpavoid_bench.arena.entrants import ENTRANTS, find_entrant
+from qpavoid_bench.arena.libraries.common import frame_tasks, movable_pairs, target_after_step
+from qpavoid_bench.arena.libraries.settings import PLACO_PYTHON
+from qpavoid_bench.arena.rollout import roll_out
+from qpavoid_bench.arena.trial import run_trial
+from qpavoid_bench.arena.world import build_world
 
 pytest.importorskip("mujoco")
 
@@ -130,7 +130,7 @@ def test_pink_equals_tracking_with_barrier_damping():
     pytest.importorskip("pink")
     from pink.barriers import SelfCollisionBarrier
 
-    from qpavoid.arena.libraries.settings import PINK
+    from qpavoid_bench.arena.libraries.settings import PINK
 
     case, world, pilot = start("pink", "ur5_pole", "obstacles=[]")
     (task,), targets = world.tasks, targets_at(world, 1.0)
@@ -256,7 +256,7 @@ def test_placo_killed_process_fails_without_hang(placo):
 
 def test_placo_silent_process_is_ended(placo, monkeypatch):
     """A process that does not answer is ended."""
-    monkeypatch.setattr("qpavoid.arena.libraries.placo_adapter.STEP_TIMEOUT", 0.3)
+    monkeypatch.setattr("qpavoid_bench.arena.libraries.placo_adapter.STEP_TIMEOUT", 0.3)
     _, world, pilot = start("placo", "ur5_pole")
     pilot.worker.process.send_signal(signal.SIGSTOP)
     with pytest.raises(RuntimeError, match=r"did not answer within 0\.3 s"):

@@ -24,19 +24,19 @@ pytest.importorskip("mujoco")
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from qpavoid.arena import commands, store, sweep
-from qpavoid.arena.entrant_file import entrant_from_file
-from qpavoid.arena.entrants import ENTRANTS
-from qpavoid.arena.families import load_family, make_case
-from qpavoid.arena.plan import cases_of, is_complete, missing_cases, missing_runs, runs_of
-from qpavoid.arena.scores import COLUMNS, KEY
-from qpavoid.arena.store import Store, read_cases, read_runs
-from qpavoid.arena.suite import EntrantConfig, load_suite, origin
-from qpavoid.arena.summary import find_faults, summary
-from qpavoid.arena.trial import run_trial
-from qpavoid.arena.world import build_world
 from qpavoid.config.shipped import family_names, suite_names
 from qpavoid.errors import ConfigError, UnknownName
+from qpavoid_bench.arena import commands, store, sweep
+from qpavoid_bench.arena.entrant_file import entrant_from_file
+from qpavoid_bench.arena.entrants import ENTRANTS
+from qpavoid_bench.arena.families import load_family, make_case
+from qpavoid_bench.arena.plan import cases_of, is_complete, missing_cases, missing_runs, runs_of
+from qpavoid_bench.arena.scores import COLUMNS, KEY
+from qpavoid_bench.arena.store import Store, read_cases, read_runs
+from qpavoid_bench.arena.suite import EntrantConfig, load_suite, origin
+from qpavoid_bench.arena.summary import find_faults, summary
+from qpavoid_bench.arena.trial import run_trial
+from qpavoid_bench.arena.world import build_world
 
 POST = {
     "title": "A post",
@@ -125,6 +125,7 @@ def now_and_then(problem):
 
 NUMBER = 7
 '''
+PATH = f"{Path.cwd()}{os.pathsep}{Path.cwd() / 'bench'}"
 
 
 @pytest.fixture
@@ -509,7 +510,7 @@ def test_sweep_continues_after_case_failure(folder, client):
 @pytest.fixture
 def cluster(tmp_path):
     """A scheduler and two workers of this test's own, as users start them: its address and the workers."""
-    python, env = [sys.executable, "-m"], {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path.cwd())}
+    python, env = [sys.executable, "-m"], {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": PATH}
     processes, quiet = [], {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": env, "cwd": tmp_path}
     file = tmp_path / "scheduler.json"
 
@@ -568,7 +569,7 @@ def test_sweep_survives_lost_worker(folder, cluster):
 def bench(folder, *words):
     """`qpavoid bench run` of the suite in a folder, in a process group of its own."""
     command = [sys.executable, "-m", "qpavoid", "bench", "run", "mine.yaml", "--out", "out", "--jobs", "2", *words]
-    env = {**os.environ, "PYTHONPATH": str(Path.cwd())}
+    env = {**os.environ, "PYTHONPATH": PATH}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen(command, cwd=folder, env=env, start_new_session=True, **pipes)
 

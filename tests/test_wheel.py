@@ -16,6 +16,14 @@ import pytest
 from qpavoid.config.shipped import family_names, robot_names, scenario_names, setup_names
 
 ROOT = Path(__file__).parent.parent
+BENCH = """
+import qpavoid.cli, sys
+sys.argv, sys.stderr = ["qpavoid", "bench", "list"], sys.stdout
+try:
+    qpavoid.cli.main()
+except SystemExit as end:
+    assert end.code == 2
+"""
 
 
 def call(*command: object, cwd: Path) -> str:
@@ -50,21 +58,24 @@ def in_wheel(path: Path) -> set[str]:
         return {name for name in archive.namelist() if not name.endswith("/")}
 
 
-def modules() -> set[str]:
-    return {str(path.relative_to(ROOT).as_posix()) for path in (ROOT / "qpavoid").rglob("*.py")}
+def modules(bench: Path) -> set[str]:
+    """Return the modules of both packages, with `bench` in the place of the checkout's folder."""
+    core = {path.relative_to(ROOT) for path in (ROOT / "qpavoid").rglob("*.py")}
+    benches = {bench / path.relative_to(ROOT / "bench") for path in (ROOT / "bench/qpavoid_bench").rglob("*.py")}
+    return {path.as_posix() for path in core | benches}
 
 
 def test_wheel_holds_the_package_its_robots_and_scenarios(built):
     names = in_wheel(built[0])
     package = {name for name in names if ".dist-info/" not in name}
-    assert {name for name in package if name.endswith(".py") and "_data/" not in name} == modules()
+    assert {name for name in package if name.endswith(".py") and "_data/" not in name} == modules(Path())
     assert "qpavoid/py.typed" in package
     assert {f"qpavoid/_data/robots/{name}/robot.yaml" for name in robot_names()} <= package
     assert {f"qpavoid/_data/tasks/{name}.yaml" for name in scenario_names()} <= package
     assert {f"qpavoid/_data/tasks/families/{name}.yaml" for name in family_names()} <= package
     assert {f"qpavoid/_data/tasks/families/setups/{name}.yaml" for name in setup_names()} <= package
     assert "qpavoid/_data/robots/paper-dual-arm/paper_dual_arm.urdf" in package
-    assert {name.split("/")[0] for name in package} == {"qpavoid"}
+    assert {name.split("/")[0] for name in package} == {"qpavoid", "qpavoid_bench"}
     assert not any("__pycache__" in name or name.endswith((".npz", ".png")) for name in names)
     assert any(name.endswith(".dist-info/licenses/LICENSE") for name in names)
 
@@ -73,10 +84,11 @@ def test_sdist_builds_the_same_wheel(built, python, tmp_path):
     wheel, sdist = built
     with tarfile.open(sdist) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
-    assert modules() | {"pyproject.toml", "README.md", "LICENSE", "robots/panda/robot.yaml"} <= names
+    assert modules(Path("bench")) | {"pyproject.toml", "README.md", "LICENSE", "robots/panda/robot.yaml"} <= names
     assert {f"tests/{path.name}" for path in (ROOT / "tests").glob("test_*.py")} <= names
     assert {f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")} <= names  # which tests read
-    assert not any(name.startswith(("bench", ".git/", ".ci", "out/")) for name in names)
+    assert not any(name.startswith((".git/", ".ci", "out/")) for name in names)
+    assert {name.split("/")[1] for name in names if name.startswith("bench/")} == {"qpavoid_bench"}
     options = ("--no-deps", "--no-build-isolation", "--quiet", "--wheel-dir")
     call(python, "-m", "pip", "wheel", *options, tmp_path, sdist, cwd=tmp_path)
     assert in_wheel(tmp_path / wheel.name) == in_wheel(wheel)
@@ -88,6 +100,7 @@ def test_installed_wheel_runs_away_from_the_checkout(built, python, tmp_path):
     assert ROOT not in Path(where.strip()).parents
     command = python.with_name("qpavoid.exe" if os.name == "nt" else "qpavoid")
     assert call(command, "list", "scenarios", cwd=tmp_path).split() == scenario_names()
+    assert "qpavoid[arena]" in call(python, "-c", BENCH, cwd=tmp_path)  # the package is there, its dependencies are not
     arguments = ("--solver", "qp", "--set", "duration=0.5", "--no-figures", "--json")
     for scenario in ("situation1", "panda_line"):  # a robot that ships, and one from example-robot-data
         document = json.loads(call(command, "run", scenario, *arguments, cwd=tmp_path))

@@ -1,1 +1,1 @@
-"""Benchmark of qpavoid: one control step beside other libraries, back ends, endurance."""
+"""Benchmarks of qpavoid: families of scenarios judged by a simulator, the time of a step, back ends, endurance."""

@@ -12,8 +12,8 @@ from bench.safety import report
 from bench.safety.campaign import draw
 from bench.safety.trial import Trial, as_named, examine, trials
 from qpavoid import Workers
-from qpavoid.arena.mujoco_model import load_model
 from qpavoid.run.log import STATUSES
+from qpavoid_bench.arena.mujoco_model import load_model
 
 RESULTS = Path(__file__).parents[1] / "results"
 

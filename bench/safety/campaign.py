@@ -13,12 +13,12 @@ import pinocchio as pin
 
 from bench.safety.obstacles import draw_obstacle
 from qpavoid import Robot, ScenarioConfig
-from qpavoid.arena.families.free_space import PlacedShape, min_distance, placed_bodies
-from qpavoid.arena.families.tool_path import ToolPath
 from qpavoid.config import Fixed, ObstacleConfig
 from qpavoid.geometry.bodies import make_shape
 from qpavoid.model.scene import build_obstacles
 from qpavoid.problem import Array
+from qpavoid_bench.arena.families.free_space import PlacedShape, min_distance, placed_bodies
+from qpavoid_bench.arena.families.tool_path import ToolPath
 
 FOLDER = Path(__file__).parent
 

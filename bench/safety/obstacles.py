@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from qpavoid.arena.families import tool_path
-from qpavoid.arena.families.tool_path import ToolPath, line_motion
 from qpavoid.problem import Array
+from qpavoid_bench.arena.families import tool_path
+from qpavoid_bench.arena.families.tool_path import ToolPath, line_motion
 
 if TYPE_CHECKING:
     from bench.safety.campaign import Ranges

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from qpavoid import Limits, Log
-from qpavoid.arena.checker import Findings, check_run
-from qpavoid.arena.mujoco_model import MujocoModel
+from qpavoid_bench.arena.checker import Findings, check_run
+from qpavoid_bench.arena.mujoco_model import MujocoModel
 
 
 def referee(twin: MujocoModel, log: Log) -> Findings:

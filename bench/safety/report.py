@@ -16,8 +16,8 @@ import numpy as np
 from bench.safety.campaign import KINDS, RANGES
 from bench.safety.trial import Trial
 from bench.safety.verdict import PROOF_TIME, RESOLUTION
-from qpavoid.arena.checker import MAX_INSTANTS, STEP
 from qpavoid.run.machine import cpu, versions
+from qpavoid_bench.arena.checker import MAX_INSTANTS, STEP
 
 PACKAGES = ("qpavoid", "mujoco", "pin", "coal", "daqp", "numpy", "scipy", "numba")
 LISTED = 10

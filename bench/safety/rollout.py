@@ -11,9 +11,9 @@ import numpy as np
 from scipy.optimize import linprog
 
 from qpavoid import ScenarioConfig
-from qpavoid.arena.checker import DistanceMonitor
-from qpavoid.arena.mujoco_model import MujocoModel
 from qpavoid.problem import Array
+from qpavoid_bench.arena.checker import DistanceMonitor
+from qpavoid_bench.arena.mujoco_model import MujocoModel
 
 PERIOD = 0.02
 """Time between two decisions of an evasion, in whole control steps [s]."""

@@ -12,10 +12,10 @@ from bench.safety.campaign import draw
 from bench.safety.referee import disagreement, drift, referee
 from bench.safety.verdict import Verdict, judge, last_avoidable
 from qpavoid import Log, ScenarioConfig, Status
-from qpavoid.arena.checker import Findings
-from qpavoid.arena.mujoco_model import MujocoModel, load_model
 from qpavoid.run.log import STATUSES
 from qpavoid.run.simulate import simulate
+from qpavoid_bench.arena.checker import Findings
+from qpavoid_bench.arena.mujoco_model import MujocoModel, load_model
 
 ALONE = "-alone"
 """Suffix of the name of a solver without backup trajectories."""

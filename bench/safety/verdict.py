@@ -35,8 +35,8 @@ from bench.safety.rollout import (
     policies,
 )
 from qpavoid import Log, ScenarioConfig
-from qpavoid.arena.checker import Contact, Findings
-from qpavoid.arena.mujoco_model import MujocoModel
+from qpavoid_bench.arena.checker import Contact, Findings
+from qpavoid_bench.arena.mujoco_model import MujocoModel
 
 AFTER = 0.5
 """Time after the contact in question for which evasions must stay clear [s]."""

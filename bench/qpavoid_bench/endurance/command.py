@@ -12,6 +12,7 @@ from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 import typer
+
 from qpavoid_bench.tables import RESULTS, machine, number, table, versions, write
 
 LOOPS = ("circling+alone", "circling")

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
-from qpavoid_bench.tables import RESULTS, machine, number, table, versions, write
 
 from qpavoid.errors import ConfigError
+from qpavoid_bench.tables import RESULTS, machine, number, table, versions, write
 
 if TYPE_CHECKING:
     from qpavoid_bench.solvers.record import Run

@@ -8,15 +8,15 @@ from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from qpavoid_bench.tick.build import build
-from qpavoid_bench.tick.libs.ours import Recorded
-from qpavoid_bench.tick.loops import circling
 
 from qpavoid import Controller, ScenarioConfig, load_scenario
 from qpavoid.config import QpSolver
 from qpavoid.config.shipped import scenario_names
 from qpavoid.problem import Array, Problem
 from qpavoid.solvers.analytic import tracking_velocity
+from qpavoid_bench.tick.build import build
+from qpavoid_bench.tick.libs.ours import Recorded
+from qpavoid_bench.tick.loops import circling
 
 REGULARIZATION = QpSolver().regularization
 

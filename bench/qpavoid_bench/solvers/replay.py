@@ -12,13 +12,13 @@ from typing import NamedTuple
 
 import numpy as np
 import qpsolvers
-from qpavoid_bench.solvers.record import QP, REGULARIZATION, Run, Solve
-from qpavoid_bench.solvers.truth import Judgement, Truth, judge
 
 from qpavoid import kernels
 from qpavoid.problem import Array
 from qpavoid.solvers.backends import Backend, backend_names, make_backend
 from qpavoid.solvers.backends.wrapped import through_qpsolvers
+from qpavoid_bench.solvers.record import QP, REGULARIZATION, Run, Solve
+from qpavoid_bench.solvers.truth import Judgement, Truth, judge
 
 
 class Cell(NamedTuple):

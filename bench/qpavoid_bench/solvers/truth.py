@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 import qpsolvers
-from qpavoid_bench.solvers.record import QP
 from scipy.optimize import linprog, nnls
 
 from qpavoid.problem import Array
 from qpavoid.solvers.backends import solve_daqp
+from qpavoid_bench.solvers.record import QP
 
 VIOLATION = 1e-6
 """Largest violation of a row or bound [m/s, rad/s]: what the `qp` solver accepts."""

@@ -1,6 +1,7 @@
 """`python -m qpavoid_bench.tick`, the same as `qpavoid bench tick`."""
 
 import typer
+
 from qpavoid_bench.tick.command import tick
 
 if __name__ == "__main__":

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from qpavoid_bench.tick.robots import ROBOTS, RobotSpec, load
-from qpavoid_bench.tick.workloads import Array, Body, Frame, Joint, Workload, pose
 
 from qpavoid import Obstacle, Robot, Scene, build_scene
 from qpavoid.config import Box, Sphere
+from qpavoid_bench.tick.robots import ROBOTS, RobotSpec, load
+from qpavoid_bench.tick.workloads import Array, Body, Frame, Joint, Workload, pose
 
 DT = 0.01
 TICKS = 1000

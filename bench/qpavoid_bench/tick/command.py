@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from qpavoid_bench.tables import RESULTS
 
 from qpavoid.errors import ConfigError
+from qpavoid_bench.tables import RESULTS
 
 QUICK = ("panda-0@0.10", "panda-5@0.10", "panda-50@0.10", "baxter-0@0.10", "g1-8@0.10")
 

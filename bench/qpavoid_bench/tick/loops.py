@@ -12,8 +12,6 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from qpavoid_bench.tick.robots import SHARE
-from qpavoid_bench.tick.workloads import Array
 
 from qpavoid import (
     Avoidance,
@@ -28,6 +26,8 @@ from qpavoid import (
     build_tasks,
 )
 from qpavoid.config import PointCloud, Task
+from qpavoid_bench.tick.robots import SHARE
+from qpavoid_bench.tick.workloads import Array
 
 TCP = "panda_hand_tcp"
 LAP = 1000

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
 from qpavoid_bench.tables import machine, number, table, write
 from qpavoid_bench.tick.runner import Cell, Results, Row
 

@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
+
+import qpavoid
 from qpavoid_bench.tick import build
 from qpavoid_bench.tick.libs import Library
 from qpavoid_bench.tick.workloads import Array, Workload
-
-import qpavoid
 
 PACKAGE = Path(__file__).resolve().parents[1]
 PLACO_ENVIRONMENT = Path("bench") / ".venv-placo"

@@ -15,6 +15,7 @@ from time import perf_counter_ns
 from typing import Any
 
 import numpy as np
+
 from qpavoid_bench.tables import versions
 
 

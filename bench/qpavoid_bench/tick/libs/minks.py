@@ -7,6 +7,7 @@ from typing import Any
 import mink
 import mujoco
 import numpy as np
+
 from qpavoid_bench.tick.workloads import Array, Body, Workload
 
 

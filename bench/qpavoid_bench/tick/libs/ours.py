@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+from qpavoid import Avoidance, Controller, Pose, Sample, build_tasks
+from qpavoid.config import Task
 from qpavoid_bench.tick.build import make_scene, reference
 from qpavoid_bench.tick.loops import Loop, make_loop
 from qpavoid_bench.tick.workloads import Array, Workload
-
-from qpavoid import Avoidance, Controller, Pose, Sample, build_tasks
-from qpavoid.config import Task
 
 
 def make(workload: Workload | str) -> Recorded | Loop:

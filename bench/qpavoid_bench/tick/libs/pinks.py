@@ -9,6 +9,7 @@ import pink
 import pinocchio as pin
 from pink.barriers import SelfCollisionBarrier
 from pink.tasks import FrameTask
+
 from qpavoid_bench.tick.build import make_scene
 from qpavoid_bench.tick.workloads import Array, Workload
 

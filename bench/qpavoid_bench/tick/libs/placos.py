@@ -8,6 +8,7 @@ import coal
 import numpy as np
 import pinocchio as pin
 import placo
+
 from qpavoid_bench.tick.workloads import Array, Body, Workload
 
 

@@ -1,1 +1,0 @@
-"""Benchmarks of qpavoid; never part of the wheel."""

@@ -1,0 +1,139 @@
+"""Entrants from users' Python files."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import sys
+from collections.abc import Callable, Mapping
+from functools import lru_cache, partial
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from qpavoid import Controller
+from qpavoid.config.text import read_text
+from qpavoid.errors import ConfigError, UnknownName, nearest
+from qpavoid.model.trajectory import Sample
+from qpavoid.problem import Array, Problem, Solution, require_finite
+from qpavoid_bench.arena.case import Case
+from qpavoid_bench.arena.entrants import Entrant
+from qpavoid_bench.arena.pilot import Pilot
+from qpavoid_bench.arena.world import World
+
+_MAX_FILE_SIZE = 10_000_000
+"""Largest Python file that is read [bytes]: more is no source file."""
+_ACCEPTED = (
+    "give a class with `solve(problem)`, made without arguments; a function of a problem; or, made from (case, world), "
+    "what has `step(q, t, targets, obstacles)`"
+)
+
+
+def entrant_from_file(path: Path, name: str) -> Entrant:
+    """Return the entrant of a Python file; the file is run.
+
+    It may be one of
+
+    - a class with `solve(problem)`, made without arguments: a `Solver`, which runs within a `Controller`;
+    - a function of one argument, the problem, that gives a `Solution` or a velocity (nv,): the same;
+    - a class with `step(q, t, targets, obstacles)`, made from (case, world): a `Pilot`;
+    - a function of two arguments, (case, world), that gives such a pilot.
+
+    Its digest covers the text of the file, which travels with it to wherever it runs; not what that imports.
+
+    Args:
+        path: the file.
+        name: of the class or function in it, and of the entrant.
+
+    Raises:
+        ConfigError, UnknownName: the file cannot be read or run, or there is no such entrant in it.
+    """
+    text = read_text(path, _MAX_FILE_SIZE)
+    candidate = _load_attribute(text, path.name, name)
+    if _classify(candidate) is None:
+        raise ConfigError(f"{path}:{name}: cannot take part; {_ACCEPTED}")
+    description = (inspect.getdoc(candidate) or f"from {path.name}").partition("\n")[0]
+    digest = hashlib.sha256(text.encode()).hexdigest()[:16]
+    return Entrant(
+        name, description, partial(_start_pilot, text, path.name, name), {"file": path.name, "digest": digest}
+    )
+
+
+def _start_pilot(text: str, file: str, name: str, case: Case, world: World) -> Pilot:
+    """Set the entrant of a file's text up for a case."""
+    candidate = _load_attribute(text, file, name)
+    kind = _classify(candidate)
+    if kind == "pilot":
+        pilot: Pilot = candidate(case, world)
+        return pilot
+    solver = candidate() if kind == "solver" else None
+    controller, _ = Controller.from_scenario(case.scenario)
+    return _SolverPilot(controller, solver.solve if solver else candidate, getattr(solver, "bounded", False))
+
+
+def _classify(candidate: Any) -> str | None:
+    """Return `solver`, `law` (a function of a problem), `pilot` or None for none of these."""
+    if inspect.isclass(candidate):
+        return "solver" if hasattr(candidate, "solve") else "pilot" if hasattr(candidate, "step") else None
+    if not inspect.isfunction(candidate):
+        return None
+    required = [p for p in inspect.signature(candidate).parameters.values() if p.default is p.empty]
+    return {1: "law", 2: "pilot"}.get(len(required))
+
+
+class _SolverPilot:
+    """A user's solver in a controller.
+
+    An exception of the solver is a failure of the entrant, not the braking stop that the controller makes of it.
+    """
+
+    def __init__(self, controller: Controller, solve: Callable[[Problem], Any], bounded: bool) -> None:
+        self.bounded = bounded
+        self._controller, self._solve = controller, solve
+        self._error: Exception | None = None
+        controller.solver = self
+
+    def solve(self, problem: Problem) -> Solution:
+        """Return the solver's solution, which may be a velocity alone."""
+        try:
+            answer = self._solve(problem)
+            solution = answer if isinstance(answer, Solution) else Solution(np.asarray(answer, dtype=np.float64))
+            require_finite("its velocity", solution.v, problem.lower.shape)
+        except Exception as error:  # whatever a user's law does
+            self._error = error
+            raise
+        return solution
+
+    def step(self, q: Array, t: float, targets: Mapping[str, Sample], obstacles: Mapping[str, Sample]) -> Solution:
+        """Compute the velocity to follow until the next step."""
+        self._error = None
+        solution = self._controller.step(q, t, targets, obstacles)
+        if self._error is not None:
+            raise self._error
+        return solution
+
+
+def _load_attribute(text: str, file: str, name: str) -> Any:
+    """Return a class or function of a file's text by its name."""
+    module = _load_module(text, file)
+    if not hasattr(module, name):
+        own_names = [
+            key for key, value in vars(module).items() if getattr(value, "__module__", None) == module.__name__
+        ]
+        raise UnknownName(f"{file}: there is no {name!r} in it{nearest(name, own_names)}")
+    return getattr(module, name)
+
+
+@lru_cache(maxsize=32)
+def _load_module(text: str, file: str) -> ModuleType:
+    """Run a file's text as a module: the same in every process, wherever the file lies."""
+    module = ModuleType(f"qpavoid_entrant_{hashlib.sha256(text.encode()).hexdigest()[:16]}")
+    sys.modules[module.__name__] = module  # dataclasses and pickle look for it there
+    try:
+        exec(compile(text, file, "exec"), module.__dict__)
+    except (Exception, SystemExit) as error:  # whatever a user's file does
+        del sys.modules[module.__name__]
+        raise ConfigError(f"{file}: cannot be run: {type(error).__name__}: {error}") from None
+    return module

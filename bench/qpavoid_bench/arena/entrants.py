@@ -1,0 +1,194 @@
+"""Entrants: solvers of this library with their settings, other libraries, and users' own."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, distribution
+from typing import Any
+
+from qpavoid import Controller
+from qpavoid.config import ScenarioConfig, SolverConfig
+from qpavoid.errors import ConfigError, UnknownName, nearest
+from qpavoid.solvers import make_solver, parse_solver
+from qpavoid_bench.arena.case import Case
+from qpavoid_bench.arena.libraries.settings import MINK, PINK, PLACO, PLACO_PYTHON
+from qpavoid_bench.arena.pilot import Pilot
+from qpavoid_bench.arena.world import World
+
+
+@dataclass(frozen=True)
+class Entrant:
+    """One column of the report."""
+
+    name: str
+    description: str
+    """Description in a line."""
+    start: Callable[[Case, World], Pilot]
+    """Function that sets the entrant up for a case."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Settings that distinguish it from others of its kind; changes of them make results of their own."""
+    packages: tuple[str, ...] = ()
+    """Packages that it needs, as `pip install` knows them; where one is not installed, it does not take part."""
+    interpreter_variable: str = ""
+    """Environment variable that may name another Python interpreter that has its packages."""
+
+    @property
+    def digest(self) -> str:
+        """Return a digest of its name and settings."""
+        text = json.dumps([self.name, dict(self.settings)], sort_keys=True, default=str)
+        return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Return those of its packages that are not installed."""
+        if self.interpreter_variable and os.environ.get(self.interpreter_variable):
+            return ()
+        return tuple(package for package in self.packages if not _installed(package))
+
+    @property
+    def remedy(self) -> str:
+        """Return the command that installs what is missing."""
+        instead = (
+            f", or set {self.interpreter_variable} to the Python interpreter that has it"
+            if self.interpreter_variable
+            else ""
+        )
+        return f"pip install {' '.join(self.missing)}{instead}"
+
+
+def solver_entrant(
+    name: str, description: str, solver: str | SolverConfig, packages: tuple[str, ...] = (), **changes: Any
+) -> Entrant:
+    """Return an entrant that runs a solver of this library within a `Controller`.
+
+    Args:
+        name: of the entrant.
+        description: what it is, in a line.
+        solver: as in `eq10` or `qp:proxqp`, or with its settings.
+        packages: what its back end needs.
+        changes: blocks of the scenario that it has its own way, as in `avoidance={"row": {"type": "cbf"}}`; what is
+            not named of a block stays as it is.
+    """
+    config = parse_solver(solver) if isinstance(solver, str) else solver
+
+    def start(case: Case, world: World) -> Pilot:
+        scenario = case.scenario.model_dump()
+        for block, fields in changes.items():
+            scenario[block] = {**scenario[block], **fields}
+        scenario["solver"] = config.model_dump()
+        x = ScenarioConfig.model_validate(scenario)
+        blocks = x.avoidance, x.limits, x.tracking_damping, x.sensing, x.progress
+        return Controller(world.scene, world.tasks, make_solver(x.solver), x.dt, *blocks)
+
+    settings = {"solver": solver if isinstance(solver, str) else solver.model_dump(), **changes}
+    return Entrant(name, description, start, settings, packages)
+
+
+def library_entrant(
+    name: str,
+    description: str,
+    module: str,
+    settings: Mapping[str, Any],
+    packages: tuple[str, ...],
+    interpreter_variable: str = "",
+) -> Entrant:
+    """Return an entrant that runs another library through its adapter.
+
+    Args:
+        name: of the entrant.
+        description: what it is, in a line.
+        module: of the adapter, in `qpavoid_bench.arena.libraries`; read when the entrant is first started.
+        settings: how it is set.
+        packages: what it runs on.
+        interpreter_variable: environment variable that may name another Python interpreter that has them.
+    """
+
+    def start(case: Case, world: World) -> Pilot:
+        pilot: Pilot = import_module(f"qpavoid_bench.arena.libraries.{module}").Pilot(case, world)
+        return pilot
+
+    return Entrant(name, description, start, settings, packages, interpreter_variable)
+
+
+def _without_backup(row: str) -> dict[str, Any]:
+    """Return avoidance fields with rows of one kind and no backup trajectory."""
+    return {"row": {"type": row}, "backup": None}
+
+
+ENTRANTS = {
+    entrant.name: entrant
+    for entrant in (
+        solver_entrant("tracking", "damped least squares on the task, no avoidance: the baseline", "tracking"),
+        solver_entrant("eq10", "task switching, eq. 10 with the consistent bracket", "eq10"),
+        solver_entrant("eq10-literal", "task switching, eq. 10 as printed", "eq10-literal"),
+        solver_entrant("gradient-projection", "tracking, clearance climbed in its null space", "gradient-projection"),
+        solver_entrant(
+            "potential-field", "tracking pulls, near pairs push: FIRAS at velocity level", "potential-field"
+        ),
+        solver_entrant("qp", "QP as each scenario has it, with a backup trajectory", "qp"),
+        solver_entrant(
+            "qp-task-switching",
+            "QP with the gains of eq. 10 in its rows, no backup trajectory",
+            "qp",
+            avoidance=_without_backup("task-switching"),
+        ),
+        solver_entrant(
+            "qp-no-backup", "QP with beta rows, no backup trajectory", "qp", avoidance=_without_backup("beta")
+        ),
+        solver_entrant(
+            "qp-damper", "QP with velocity damper rows, no backup trajectory", "qp", avoidance=_without_backup("damper")
+        ),
+        solver_entrant(
+            "qp-cbf", "QP with control barrier rows, no backup trajectory", "qp", avoidance=_without_backup("cbf")
+        ),
+        solver_entrant(
+            "qp-detour",
+            "QP with beta rows that tries detours round what stalls it, no backup trajectory",
+            "qp",
+            avoidance=_without_backup("beta"),
+            progress={"detour": {}},
+        ),
+        solver_entrant("qp:native", "QP, compiled active-set method", "qp:native", ("numba",)),
+        solver_entrant("qp:daqp", "QP, back end daqp", "qp:daqp"),
+        solver_entrant("qp:proxqp", "QP, back end ProxQP", "qp:proxqp"),
+        solver_entrant("qp:osqp", "QP, back end OSQP", "qp:osqp"),
+        solver_entrant("qp:quadprog", "QP, back end quadprog", "qp:quadprog", ("quadprog",)),
+        solver_entrant("hqp", "strict priorities, a cascade of QPs, with a backup trajectory", "hqp"),
+        library_entrant("pink", "Pink, with its barrier between collision bodies", "pink_adapter", PINK, ("pin-pink",)),
+        library_entrant("mink", "mink, with its limit on collisions", "mink_adapter", MINK, ("mink", "mujoco")),
+        library_entrant(
+            "placo", "placo, with its constraint on self-collisions", "placo_adapter", PLACO, ("placo",), PLACO_PYTHON
+        ),
+    )
+}
+"""Those that ship, in the order of the report. One with the name of a solver is that solver in each scenario as it
+is, safety options included; variants have names of their own."""
+
+
+def find_entrant(name: str) -> Entrant:
+    """Return a shipped entrant that is installed.
+
+    Raises:
+        UnknownName: there is none of that name.
+        ConfigError: it runs on something that is not installed.
+    """
+    if name not in ENTRANTS:
+        raise UnknownName(f"unknown entrant {name!r}{nearest(name, ENTRANTS)}")
+    entrant = ENTRANTS[name]
+    if entrant.missing:
+        raise ConfigError(f"entrant {name!r} needs {', '.join(entrant.missing)}: {entrant.remedy}")
+    return entrant
+
+
+def _installed(package: str) -> bool:
+    """Return True if a package is installed."""
+    try:
+        distribution(package)
+    except PackageNotFoundError:
+        return False
+    return True

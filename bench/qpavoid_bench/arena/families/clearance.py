@@ -1,0 +1,117 @@
+"""Clearance of a configuration, and of straight motions between configurations."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+
+from qpavoid.control.distances import DistanceQuery
+from qpavoid.problem import Array
+from qpavoid_bench.arena.families.inverse_kinematics import JointRanges
+from qpavoid_bench.arena.world import World
+
+MIN_ADVANCE = 0.005
+"""Smallest change of distance between two samples of a motion [m]: bounds their number near contact."""
+_SEARCH_MARGIN = 0.1
+"""Excess over the required distance up to which distances are computed [m]."""
+_STATIC_PERIOD = 0.05
+"""Time between two samples of pairs that no joint moves [s]."""
+_SPEED_PERIOD = 0.01
+"""Period of the samples from which the speed of obstacles is estimated [s]."""
+
+
+class Clearance:
+    """Distances of a world's pairs, for planning: q (nv,) of joints with one coordinate each."""
+
+    def __init__(self, world: World, duration: float, required_distance: float) -> None:
+        """Lay out distances and bounds on their rates.
+
+        Args:
+            world: nothing in it is carried.
+            duration: how long obstacles are followed [s].
+            required_distance: distance that everything is to keep all the time [m].
+        """
+        self.least = required_distance + 0.5 * MIN_ADVANCE
+        """Smallest distance that every sample has to have [m]."""
+        self._search_distance = self.least + _SEARCH_MARGIN
+        scene = world.scene
+        self._model, self._data, self._query = scene.robot.model, scene.robot.model.createData(), DistanceQuery(scene)
+        self._moving = [(i, o.motion) for i, o in enumerate(scene.obstacles) if o.moves]
+        self._fixed = ~np.any(scene.support != 0.0, axis=1)
+        self._duration = duration
+        self.speed = self._max_obstacle_speed()
+        """Largest speed of any point of an obstacle [m/s]."""
+        self.lever_arm = self._lever_arms(JointRanges.of(scene.robot))
+        """(nv,) bound on the travel of any point of the robot per unit of each coordinate [m/rad or 1]. A joint
+        moves one body of a pair, or both as one: no distance changes by more than lever_arm @ |Δq|."""
+
+    @property
+    def depends_on_time(self) -> bool:
+        """Return True if an obstacle moves."""
+        return bool(self._moving)
+
+    def at(self, q: Array, t: float) -> float:
+        """Return the smallest distance of any pair [m], up to 0.1 m above the required one."""
+        self._compute(q, t)
+        pairs = self._query.pairs
+        return float(min(self._query.results[pairs, 0].min(initial=self._search_distance), self._search_distance))
+
+    def is_clear(self, q: Array, t: float) -> bool:
+        """Return True if all pairs have the distance that a sample needs."""
+        return self.at(q, t) >= self.least
+
+    def immovable_pairs_are_clear(self, q: Array) -> bool:
+        """Return True if pairs that no joint can move stay clear, such as a base and an obstacle."""
+        fixed = np.flatnonzero(self._fixed)
+        if not len(fixed):
+            return True
+        for t in np.arange(0.0, self._duration + _STATIC_PERIOD, _STATIC_PERIOD) if self.depends_on_time else (0.0,):
+            self._compute(q, float(t))
+            if self._query.found(fixed).min() < self.least:
+                return False
+        return True
+
+    def is_clear_between(self, a: Array, ta: float, b: Array, tb: float) -> bool:
+        """Return True if all pairs are clear on the straight motion from a (nv,) at ta to b at tb.
+
+        Conservative advancement: no distance changes faster than the lever arms and the speed of obstacles allow, so
+        that the margin of the smallest one bounds the next advance. Samples are at least `MIN_ADVANCE` apart, and each
+        needs half as much beyond the required distance: between two samples no distance falls below the required one.
+        """
+        if not self.is_clear(b, tb):
+            return False
+        dq, fraction = b - a, 0.0
+        change = float(self.lever_arm @ np.abs(dq)) + self.speed * (tb - ta)
+        while fraction < 1.0:
+            margin = self.at(a + fraction * dq, ta + fraction * (tb - ta)) - self.least
+            if margin < 0.0:
+                return False
+            fraction += max(margin, MIN_ADVANCE) / max(change, 1e-12)
+        return True
+
+    def _compute(self, q: Array, t: float) -> None:
+        for index, motion in self._moving:
+            self._query.place_obstacle(index, motion.sample(t))
+        pin.forwardKinematics(self._model, self._data, q)
+        self._query.compute(self._data, self._search_distance)
+
+    def _max_obstacle_speed(self) -> float:
+        fastest = 0.0
+        for t in np.arange(0.0, self._duration, _SPEED_PERIOD) if self._moving else ():
+            for index, motion in self._moving:
+                self._query.place_obstacle(index, motion.sample(float(t)))
+            fastest = max(fastest, float(self._query.placing.speeds.max()))
+        return fastest
+
+    def _lever_arms(self, ranges: JointRanges) -> Array:
+        """Bound the distance of points from each joint (nv,) by the lengths of the links after it."""
+        model, max_extension, lever_arm = self._model, self._query.joint_radius(), np.ones(self._model.nv)
+        farthest = np.maximum(np.abs(ranges.lower), np.abs(ranges.upper))
+        for i in range(model.njoints - 1, 0, -1):
+            joint, parent = model.joints[i], model.parents[i]
+            slides = joint.shortname().startswith("JointModelP")
+            lever_arm[joint.idx_v] = 1.0 if slides else max_extension[i]
+            travel = farthest[joint.idx_v] if slides else 0.0
+            length = float(np.linalg.norm(model.jointPlacements[i].translation)) + travel
+            max_extension[parent] = max(max_extension[parent], length + max_extension[i])
+        return lever_arm

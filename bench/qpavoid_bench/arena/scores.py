@@ -1,0 +1,211 @@
+"""Figures of one run by which entrants are compared; a row of the results."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from qpavoid.config import ScenarioConfig
+from qpavoid.geometry.segments import point_segment
+from qpavoid.problem import Array, Status
+from qpavoid.run.log import STATUSES
+from qpavoid_bench.arena.case import Case
+from qpavoid_bench.arena.checker import Findings
+from qpavoid_bench.arena.rollout import Rollout
+from qpavoid_bench.arena.world import World
+
+REST_SPEED = 1e-3
+"""Speed of a tool below which it is at rest [m/s]."""
+REST_DURATION = 1.0
+"""Time for which tools are at rest at the end of a run that is stuck [s]."""
+_MAX_CORNERS = 500
+_ROUND_OFF = 1e-6
+
+
+@dataclass(frozen=True)
+class Score:
+    """Figures of one run.
+
+    Distances and limits are the checker's; a failure counts at its limit, and every run has all figures.
+    """
+
+    family: str
+    seed: int
+    robot: str
+    case: str
+    """`Case.key`: digest of the scenario."""
+    entrant: str
+    settings: str
+    """Digest of the entrant and its settings."""
+    version: str
+    """Version of qpavoid."""
+    reachable: bool
+    """Whether the goals can be reached."""
+    success: bool
+    """No contact, and all goals reached; where they cannot be, at rest at the end."""
+    collided: bool
+    """At least one pair touched."""
+    contacts: int
+    """Number of pairs that touched."""
+    min_distance: float
+    """Smallest distance of the pairs that the robot can move [m]."""
+    d1: float
+    """Safety distance between surfaces [m]."""
+    below_d1: float
+    """Fraction of the time with a distance below d1 [-]."""
+    arrived: bool
+    """Every tool ended within the goal tolerance."""
+    final_error: float
+    """Distance of the worst tool from its goal at the end [m]."""
+    tracking_error: float
+    """Root mean square of the distances between tools and their moving targets [m]."""
+    deviation: float
+    """Largest distance of a tool from the path of its target [m]."""
+    path_length: float
+    """Length of the tools' paths together, over that of their targets [-]."""
+    time_to_goal: float
+    """Time after which every tool stayed within the goal tolerance, over the duration; 1 where that was never [-]."""
+    stuck: bool
+    """Not arrived, no contact, and the tools rested for the last second."""
+    jerk: float
+    """Root mean square of the joints' jerk [rad/s³ or m/s³]."""
+    jitter: float
+    """Σ|Δq̇| over joints and ticks, per second [rad/s² or m/s²]."""
+    peak_velocity: float
+    """Largest velocity of a joint, over its limit [-]."""
+    violations: float
+    """Fraction of steps that exceed a velocity, position, acceleration or jerk limit [-]."""
+    relaxed: float
+    """Fraction of steps whose constraints were relaxed [-]."""
+    stopped: float
+    """Fraction of steps in which the robot was braked or at rest, the entrant's failures among them [-]."""
+    failed: float
+    """Fraction of steps in which the entrant raised, or gave no finite velocity [-]."""
+    failure: str
+    """Message of the first failure; empty without one."""
+    tick_p50: float
+    """Median computation time of a step [µs]."""
+    tick_p99: float
+    """99th percentile of the computation time of a step [µs]."""
+    ticks: int
+    dt: float
+    """Control period [s]."""
+    duration: float
+    """Duration of the run [s]."""
+    seconds: float
+    """Time that the run took to compute, checker included [s]."""
+
+    def row(self) -> dict[str, Any]:
+        """Return the figures as a row of a table."""
+        return asdict(self)
+
+
+COLUMNS = {field.name: str(field.type) for field in fields(Score)}
+"""Type of each column: `str`, `int`, `float` or `bool`."""
+KEY = ("case", "entrant", "settings", "version")
+"""Columns that identify a run."""
+
+
+def score(
+    case: Case, world: World, entrant: str, settings: str, rollout: Rollout, findings: Findings, seconds: float
+) -> Score:
+    """Compute the figures of a run.
+
+    Args:
+        case: what was run.
+        world: of the same case.
+        entrant: who ran it.
+        settings: digest of the entrant.
+        rollout: what it did.
+        findings: result of the checker.
+        seconds: what the run took [s].
+    """
+    scenario, ticks = case.scenario, len(rollout.t)
+    error = np.linalg.norm(rollout.target - rollout.tool, axis=2).max(axis=1, initial=0.0)
+    goal_error = np.linalg.norm(rollout.target[-1] - rollout.tool, axis=2).max(axis=1, initial=0.0)
+    outside_tolerance = np.flatnonzero(goal_error > scenario.goal_tolerance)
+    arrived = bool(goal_error[-1] <= scenario.goal_tolerance)
+    settled = rollout.tool[-1 - min(ticks - 1, round(REST_DURATION / scenario.dt)) :]
+    rests = bool(np.ptp(settled, axis=0).max(initial=0.0) <= REST_SPEED * REST_DURATION)
+    change = np.diff(rollout.v, axis=0)
+    limit = world.scene.robot.bounds().velocity
+    return Score(
+        family=case.family,
+        seed=case.seed,
+        robot=world.scene.robot.name,
+        case=case.key,
+        entrant=entrant,
+        settings=settings,
+        version=version("qpavoid"),
+        reachable=case.reachable,
+        success=not findings.contacts and (arrived if case.reachable else rests),
+        collided=bool(findings.contacts),
+        contacts=len(findings.contacts),
+        min_distance=findings.distance,
+        d1=surface_safety_distance(scenario),
+        below_d1=float(np.mean(findings.nearest < surface_safety_distance(scenario))),
+        arrived=arrived,
+        final_error=float(goal_error[-1]),
+        tracking_error=float(np.sqrt(np.mean(error**2))),
+        deviation=_max_deviation(rollout),
+        path_length=_path_length(rollout.tool) / max(_path_length(rollout.target), 1e-9),
+        time_to_goal=(int(outside_tolerance[-1]) + 1 if len(outside_tolerance) else 0) / ticks if arrived else 1.0,
+        stuck=case.reachable and not arrived and not findings.contacts and rests,
+        jerk=float(np.sqrt(np.mean(np.square(np.diff(change, axis=0))))) / scenario.dt**2,
+        jitter=float(np.abs(change).sum()) / scenario.duration,
+        peak_velocity=float(np.max(np.abs(rollout.v) / limit, initial=0.0)),
+        violations=float(np.mean(_violates_limits(world, scenario, rollout, findings))),
+        relaxed=_status_share(rollout, Status.RELAXED),
+        stopped=_status_share(rollout, Status.STOPPED),
+        failed=float(np.mean(rollout.failed)),
+        failure=rollout.failure,
+        tick_p50=1e6 * float(np.median(rollout.tick)),
+        tick_p99=1e6 * float(np.quantile(rollout.tick, 0.99)),
+        ticks=ticks,
+        dt=scenario.dt,
+        duration=scenario.duration,
+        seconds=seconds,
+    )
+
+
+def surface_safety_distance(scenario: ScenarioConfig) -> float:
+    """Return d1 between surfaces, below which avoidance has taken over entirely [m]."""
+    return scenario.avoidance.d1 - scenario.avoidance.offset
+
+
+def _status_share(rollout: Rollout, status: Status) -> float:
+    """Return the fraction of steps with a status."""
+    return float(np.mean(rollout.status == STATUSES.index(status)))
+
+
+def _path_length(path: Array) -> float:
+    """Return the length of all tools' paths (N, k, 3) together [m]."""
+    return float(np.linalg.norm(np.diff(path, axis=0), axis=2).sum())
+
+
+def _max_deviation(rollout: Rollout) -> float:
+    """Return the largest distance of a tool from the path that its target draws [m]."""
+    worst, corners = 0.0, np.unique(np.linspace(0, len(rollout.t) - 1, _MAX_CORNERS).astype(int))
+    for tool, target in zip(rollout.tool.swapaxes(0, 1), rollout.target[corners].swapaxes(0, 1), strict=True):
+        nearest = np.full(len(tool), np.inf)
+        for start, end in zip(target, np.concatenate((target[1:], target[-1:])), strict=True):
+            nearest = np.minimum(nearest, point_segment(tool, start, end).distance)
+        worst = max(worst, float(nearest.max()))
+    return worst
+
+
+def _violates_limits(world: World, scenario: ScenarioConfig, rollout: Rollout, findings: Findings) -> Array:
+    """Return for each step (N,) whether it exceeds a limit by more than round-off."""
+    bounds = world.scene.robot.bounds().within(scenario.limits)
+    q = findings.q[:, bounds.q_index]
+    acceleration = np.diff(rollout.v, axis=0, prepend=0.0) / scenario.dt
+    jerk = np.diff(acceleration, axis=0, prepend=0.0) / scenario.dt
+    return np.asarray(
+        (np.abs(rollout.v) > bounds.velocity + _ROUND_OFF).any(axis=1)
+        | ((q < bounds.lower - _ROUND_OFF) | (q > bounds.upper + _ROUND_OFF)).any(axis=1)
+        | (np.abs(acceleration) > bounds.acceleration + _ROUND_OFF / scenario.dt).any(axis=1)
+        | (np.abs(jerk) > bounds.jerk + _ROUND_OFF / scenario.dt**2).any(axis=1)
+    )

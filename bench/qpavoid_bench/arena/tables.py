@@ -1,0 +1,139 @@
+"""Tables of the arena's report: figures, families and intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from qpavoid.problem import Array
+from qpavoid_bench.arena.results import Results
+from qpavoid_bench.arena.statistics import Interval, mean, median, rate
+
+
+class Column(NamedTuple):
+    """One figure of a table."""
+
+    name: str
+    """Name of the figure in `scores.Score`."""
+    heading: str
+    """Heading with its unit."""
+    scale: float
+    """Factor from the score's unit to the table's."""
+    digits: int
+    kind: str
+    """`rate`, `mean` and `median` come with an interval; `low`, what 95 % of the runs are above, without."""
+    description: str
+
+
+COLUMNS = (
+    Column("success", "success [%]", 100.0, 0, "rate", "no contact, and every goal reached; at rest where none can be"),
+    Column("collided", "contact [%]", 100.0, 0, "rate", "runs in which something touched"),
+    Column(
+        "min_distance", "nearest, worst 5 % [mm]", 1e3, 1, "low", "smallest distance of the run that 95 % are above"
+    ),
+    Column("below_d1", "below d1 [%]", 100.0, 1, "mean", "time with something nearer than d1"),
+    Column("tracking_error", "tracking [mm]", 1e3, 0, "mean", "root mean square distance from the moving target"),
+    Column(
+        "time_to_goal", "time to goal [%]", 100.0, 0, "mean", "share of the duration until it stays there; 100 if never"
+    ),
+    Column("stuck", "stuck [%]", 100.0, 0, "mean", "not arrived, no contact, at rest"),
+    Column("jitter", "jitter [rad/s²]", 1.0, 2, "median", "Σ|Δq̇| over joints and ticks, per second"),
+    Column("tick_p50", "tick [µs]", 1.0, 0, "median", "median time of a tick, median over runs"),
+    Column("tick_p99", "p99 [µs]", 1.0, 0, "median", "99th percentile of a run, median over runs"),
+)
+MORE = (
+    Column("final_error", "final error [mm]", 1e3, 1, "mean", "of the worst tool from its goal"),
+    Column("deviation", "off the path [mm]", 1e3, 0, "mean", "largest distance of a tool from its target's path"),
+    Column("path_length", "length [-]", 1.0, 2, "mean", "of the tools' paths, over that of their targets"),
+    Column("jerk", "jerk [rad/s³]", 1.0, 0, "median", "root mean square over joints and ticks"),
+    Column("peak_velocity", "peak q̇ [-]", 1.0, 2, "median", "of the fastest joint, over its limit"),
+    Column("violations", "limits passed [%]", 100.0, 2, "mean", "ticks beyond a speed, position, acceleration or jerk"),
+    Column("relaxed", "relaxed [%]", 100.0, 1, "mean", "ticks that gave something up and said so"),
+    Column("stopped", "stopped [%]", 100.0, 1, "mean", "ticks in which the robot was braked or held"),
+    Column("failed", "failed [%]", 100.0, 2, "mean", "ticks in which the entrant raised or gave no finite velocity"),
+)  # fmt: skip
+
+
+class Cell(NamedTuple):
+    """Text of a cell, and the value that it is sorted by."""
+
+    text: str
+    sort: float | str
+    span: str = ""
+    """Interval of a figure."""
+    code: bool = False
+    """Whether the text is shown as code."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """Headings and rows."""
+
+    headings: tuple[str, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the report."""
+
+    title: str
+    text: tuple[str, ...] = ()
+    points: tuple[str, ...] = ()
+    tables: tuple[Table, ...] = ()
+    pictures: tuple[tuple[str, str, Any], ...] = ()
+    """Name, caption and figure of each picture."""
+
+
+def score_tables(results: Results, family: int | None = None) -> tuple[Table, ...]:
+    """Tabulate the main figures, and the further ones, of one family or of all.
+
+    Entrants are in the order of their ranks.
+    """
+    place = results.ranking(family)
+    return tuple(_score_table(results, columns, place, family) for columns in (COLUMNS, MORE))
+
+
+def _score_table(results: Results, columns: Sequence[Column], place: Mapping[str, int], family: int | None) -> Table:
+    rows = []
+    for name, rank in place.items():
+        entrant = results.entrants.index(name)
+        cells = [_cell(results.values(column.name, entrant, family), column) for column in columns]
+        rows.append((Cell(str(rank), rank), text_cell(name), *cells))
+    return Table(("rank", "entrant", *(column.heading for column in columns)), tuple(rows))
+
+
+_ESTIMATES = {"mean": mean, "median": median}
+
+
+def _cell(values: Array, column: Column) -> Cell:
+    values = values.astype(float)
+    if column.kind == "low":
+        value = float(np.quantile(values, 0.05, method="inverted_cdf"))  # one of them: some may be infinite
+        return Cell(_shown(column.scale * value, column.digits), value)
+    if column.kind == "rate":
+        return interval_cell(rate(int(values.sum()), len(values)), column.scale, column.digits)
+    return interval_cell(_ESTIMATES[column.kind](values), column.scale, column.digits)
+
+
+def interval_cell(interval: Interval, scale: float, digits: int) -> Cell:
+    """Return a cell with a figure and its interval."""
+    value, low, high = (_shown(scale * side, digits) for side in interval)
+    return Cell(value, interval.value, f"{low} – {high}")
+
+
+def _shown(value: float, digits: int) -> str:
+    return f"{round(value, digits) + 0.0:.{digits}f}"  # -0.0 + 0.0 is 0.0
+
+
+def text_cell(text: str) -> Cell:
+    """Return a cell that is sorted by its text."""
+    return Cell(text, text)
+
+
+def count_cell(count: int) -> Cell:
+    """Return a cell with a number of something."""
+    return Cell(str(count), count)
