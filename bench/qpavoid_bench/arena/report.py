@@ -46,7 +46,7 @@ COMPARISON_LIMITS = (
     "them one period ahead, as a task of this library would have it; of obstacles they know where these are, not how "
     "they move.",
     "Times are those of whole ticks, from state to velocity, on the machine above, with that many processes at once. "
-    "Ratios of less than 1.5 mean little; `bench/tick` is where libraries are timed side by side.",
+    "Ratios of less than 1.5 mean little; `qpavoid bench tick` is where libraries are timed side by side.",
     "Distances, contacts and limit violations are MuJoCo's, which runs the commanded velocities again with kinematics "
     "and distances of its own, at the ticks and between them.",
     "Not measured: drives, dynamics and forces; sensors, beyond the delay and noise of a family that says so; memory, "
@@ -226,7 +226,8 @@ def _worst_runs_section(results: Results, facts: dict[str, Any], folder: Path) -
 def _failure_text(row: dict[str, Any]) -> str:
     """Describe how a run failed."""
     if row["collided"]:
-        return f"{row['contacts']} contacts, {max(0.0, -1e3 * row['min_distance']):.1f} mm deep"
+        verdict = f"; {row['verdict']}" if row["verdict"] else ""
+        return f"{row['contacts']} contacts, {max(0.0, -1e3 * row['min_distance']):.1f} mm deep{verdict}"
     if row["reachable"]:
         return f"{1e3 * row['final_error']:.0f} mm short of its goal{', stuck' if row['stuck'] else ''}"
     return "not at rest at the end"

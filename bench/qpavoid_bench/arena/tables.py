@@ -31,6 +31,7 @@ class Column(NamedTuple):
 COLUMNS = (
     Column("success", "success [%]", 100.0, 0, "rate", "no contact, and every goal reached; at rest where none can be"),
     Column("collided", "contact [%]", 100.0, 0, "rate", "runs in which something touched"),
+    Column("avoidable", "avoidable contact [%]", 100.0, 0, "rate", "runs with one that the robot could have avoided"),
     Column(
         "min_distance", "nearest, worst 5 % [mm]", 1e3, 1, "low", "smallest distance of the run that 95 % are above"
     ),

@@ -15,6 +15,7 @@ from qpavoid_bench.arena.mujoco_model import build
 from qpavoid_bench.arena.pilot import Pilot
 from qpavoid_bench.arena.rollout import roll_out
 from qpavoid_bench.arena.scores import Score, score, surface_safety_distance
+from qpavoid_bench.arena.verdict import decisive, judge
 from qpavoid_bench.arena.world import World, build_world
 
 MAX_TIME_RATIO = 20.0
@@ -33,11 +34,15 @@ def run_trial(case: Case, entrant: Entrant) -> Score:
     begin = perf_counter()
     world = build_world(case.scenario)
     rollout = roll_out(case, _set_up(entrant, case, world), world, MAX_TIME_RATIO * case.scenario.duration)
-    scenario = case.scenario
-    findings = check_run(
-        build(world.scene, world.q0), rollout.t, rollout.v, scenario.limits, surface_safety_distance(scenario)
-    )
-    return score(case, world, entrant.name, entrant.digest, rollout, findings, perf_counter() - begin)
+    scenario, model = case.scenario, build(world.scene, world.q0)
+    findings = check_run(model, rollout.t, rollout.v, scenario.limits, surface_safety_distance(scenario))
+    verdict = None
+    if not case.solved_by:  # of the others it is known that all contacts are avoidable
+        verdict = decisive(judge(model, scenario, rollout.t, rollout.v, findings))
+    result = score(case, world, entrant.name, entrant.digest, rollout, findings, perf_counter() - begin)
+    if verdict is None:
+        return result
+    return replace(result, avoidable=verdict.avoidable, verdict=verdict.describe(model))
 
 
 def failing_entrant(entrant: Entrant, failure: str) -> Entrant:

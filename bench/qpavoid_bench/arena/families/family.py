@@ -16,7 +16,7 @@ from qpavoid.config.loading import read_config, read_mapping
 from qpavoid.config.shipped import find_family, find_robot, find_setup, setup_names
 from qpavoid.errors import ConfigError, UnknownName, nearest
 from qpavoid.model.robot import Robot
-from qpavoid_bench.arena.families import moving, statics, targets, two_arms
+from qpavoid_bench.arena.families import adversarial, moving, statics, targets, two_arms
 from qpavoid_bench.arena.families.parameters import Draw, Parameter
 
 Generator = Callable[[Draw, Robot], Mapping[str, Any]]
@@ -35,6 +35,7 @@ GENERATORS: dict[str, Generator] = {
     "head_on": moving.head_on,
     "chasing": moving.chasing,
     "random_walk": moving.random_walk,
+    "adversarial": adversarial.adversarial,
     "unreachable": targets.unreachable,
 }
 """Generators that ship."""
@@ -63,6 +64,8 @@ class FamilyConfig(Block):
     """Delay and noise of measured obstacle states: fields of `qpavoid_bench.arena.case.Sensor`, "$name" as above."""
     reachable: bool = True
     """Whether the goals can be reached; it is checked, whichever it is."""
+    proved: bool = True
+    """Whether a solution is proved to exist; where not, each contact is judged avoidable or not (`arena.verdict`)."""
 
     @model_validator(mode="after")
     def _check_robots(self) -> FamilyConfig:

@@ -49,7 +49,8 @@ def make_case(family: Family, seed: int) -> Case:
             scenario = _scenario(family, template, draw, seed)
             robot, q0 = _robot(family, scenario.robot, scenario.q0, scenario.lock)
             world = build_world_of(scenario, robot, q0)
-            how = solved_by(scenario, world, family.config.reachable, np.random.default_rng([seed, number]))
+            config, random = family.config, np.random.default_rng([seed, number])
+            how = solved_by(scenario, world, config.reachable if config.proved else None, random)
         except Redraw as reason:
             causes.append(str(reason))
             continue

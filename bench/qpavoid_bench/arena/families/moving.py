@@ -45,19 +45,24 @@ def _scenario_among(draw: Draw, robot: Robot, motion: MotionGenerator) -> dict[s
     """Put a tool's path among `count` obstacles, each of some `shape` and `radius`."""
     arm, path, q = sideways_path(draw, robot)
     obstacles = [
-        {"name": f"mover{i}", "shape": _shape(draw), "motion": motion(draw, arm, path)} for i in range(draw("count"))
+        {"name": f"mover{i}", "shape": draw_shape(draw), "motion": motion(draw, arm, path)}
+        for i in range(draw("count"))
     ]
     return scenario_fields(robot, q, [position_task(arm.tool, path_motion(path))], obstacles)
 
 
-def _shape(draw: Draw) -> dict[str, Any]:
-    """Draw a ball, or a capsule or cube of about its size."""
+def draw_shape(draw: Draw) -> dict[str, Any]:
+    """Draw a ball, or a capsule, cylinder, cube or plate of about its size."""
     radius = draw("radius")
     match draw("shape"):
         case "capsule":
             return {"type": "capsule", "radius": radius, "length": 2.0 * radius}
+        case "cylinder":
+            return {"type": "cylinder", "radius": radius, "length": 2.0 * radius}
         case "box":
             return {"type": "box", "size": [1.6 * radius] * 3}
+        case "plate":
+            return {"type": "box", "size": [4.0 * radius, 4.0 * radius, 0.1 * radius]}
         case _:
             return {"type": "sphere", "radius": radius}
 
@@ -82,6 +87,10 @@ def _random_walk(draw: Draw, arm: Arm, path: ToolPath) -> dict[str, Any]:
         length = float(np.linalg.norm(points[-1] - points[-2]))
         times.append(times[-1] + max(length / draw("obstacle_speed"), 0.1))
     return waypoint_motion(points, times, "constant")
+
+
+MOTIONS: dict[str, MotionGenerator] = {"crossing": _crossing, "head_on": _head_on, "chasing": _chasing}
+"""Motions across or along a tool's path, by name."""
 
 
 def _offset(draw: Draw, arm: Arm) -> Array:

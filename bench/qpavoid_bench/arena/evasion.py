@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 from scipy.optimize import linprog
 
-from qpavoid import ScenarioConfig
+from qpavoid import Limits
 from qpavoid.problem import Array
 from qpavoid_bench.arena.checker import DistanceMonitor
 from qpavoid_bench.arena.mujoco_model import MujocoModel
@@ -27,8 +26,7 @@ BIAS_COST = 0.01
 """Distance that they trade for each rad/s in that direction [m·s]."""
 
 
-@dataclass(frozen=True)
-class JointLimits:
+class JointLimits(NamedTuple):
     """Limits of the joints; (nv,) each, infinite where there is none."""
 
     speed: Array
@@ -39,6 +37,14 @@ class JointLimits:
     """[rad or m]."""
     acceleration: Array
     """[rad/s² or m/s²]."""
+
+    @classmethod
+    def of(cls, model: MujocoModel, limits: Limits) -> JointLimits:
+        """Return the limits of a model's robot."""
+        bounds = model.scene.robot.bounds().within(limits)
+        lower, upper = np.full_like(bounds.velocity, -np.inf), np.full_like(bounds.velocity, np.inf)
+        lower[bounds.v_index], upper[bounds.v_index] = bounds.lower, bounds.upper
+        return cls(bounds.velocity, lower, upper, bounds.acceleration)
 
     def box(self, q: Array, v: Array, dt: float) -> tuple[Array, Array]:
         """Return the smallest and largest velocities (nv,) for the next dt, at q (nv,) after velocity v (nv,)."""
@@ -58,8 +64,7 @@ class JointLimits:
         )
 
 
-@dataclass(frozen=True)
-class Rows:
+class Rows(NamedTuple):
     """Distances d of near pairs, with ḋ = J v + feedforward."""
 
     pair: Any
@@ -95,8 +100,7 @@ class EvasionPolicy(NamedTuple):
     """(nv,) distance that it trades for speed in that direction [m·s]."""
 
 
-@dataclass(frozen=True)
-class Evasion:
+class Evasion(NamedTuple):
     """Result of an evasion."""
 
     contact: int | None
@@ -111,14 +115,6 @@ class Evasion:
     """Least distance along it [m]."""
 
 
-def joint_limits(twin: MujocoModel, scenario: ScenarioConfig) -> JointLimits:
-    """Return the joint limits of a scenario."""
-    bounds = twin.scene.robot.bounds().within(scenario.limits)
-    lower, upper = np.full_like(bounds.velocity, -np.inf), np.full_like(bounds.velocity, np.inf)
-    lower[bounds.v_index], upper[bounds.v_index] = bounds.lower, bounds.upper
-    return JointLimits(bounds.velocity, lower, upper, bounds.acceleration)
-
-
 def policies(count: int) -> Iterator[EvasionPolicy]:
     """Yield all policies, for nv joints."""
     yield EvasionPolicy("standing still", 0.0, None)
@@ -130,61 +126,61 @@ def policies(count: int) -> Iterator[EvasionPolicy]:
 
 
 def evade(
-    twin: MujocoModel, limits: JointLimits, start: Start, dt: float, policy: EvasionPolicy, pairs: Any
+    model: MujocoModel, limits: JointLimits, start: Start, dt: float, policy: EvasionPolicy, pairs: Any
 ) -> Evasion:
     """Follow a policy with control steps of dt [s], to the end or to the first contact of one of the pairs (m,)."""
     q, v, t, _ = start
-    twin.place(q, t)
-    watch = DistanceMonitor(twin)
-    watch.measure(t)
+    model.place(q, t)
+    monitor = DistanceMonitor(model)
+    monitor.measure(t)
     pairs = pairs.copy()
-    pairs[[contact.pair for contact in watch.contacts]] = False
-    watch = DistanceMonitor(twin, pairs)
-    watch.measure(t)
+    pairs[[contact.pair for contact in monitor.contacts]] = False
+    monitor = DistanceMonitor(model, pairs)
+    monitor.measure(t)
     steps = int(np.ceil(PERIOD / dt - 1e-9))
     while t < start.until - 1e-9:
-        box, begin, before, last = limits.box(q, v, steps * dt), t, q, v
+        box, begin, q_begin, v_begin = limits.box(q, v, steps * dt), t, q, v
         stop = np.clip(np.zeros(len(q)), *box)
-        rows = near_rows(twin, q, t, pairs, INFLUENCE_DISTANCE) if policy.horizon else None
+        rows = near_rows(model, q, t, pairs, INFLUENCE_DISTANCE) if policy.horizon else None
         wanted = stop if rows is None else policy_velocity(rows, box, policy)
         # while the velocity stays, several control steps are as good as one
         count = steps if np.isfinite(limits.acceleration).any() else 1
         for _ in range(count):
             v = v + np.clip(wanted - v, *(sign * limits.acceleration * dt for sign in (-1.0, 1.0)))
-            q = watch.follow(q, v, t, steps * dt / count)
-            if watch.contacts:
-                return Evasion(watch.contacts[0].pair, begin, before, last, watch.distance)
+            q = monitor.follow(q, v, t, steps * dt / count)
+            if monitor.contacts:
+                return Evasion(monitor.contacts[0].pair, begin, q_begin, v_begin, monitor.distance)
             t += steps * dt / count
-    return Evasion(None, t, q, v, watch.distance)
+    return Evasion(None, t, q, v, monitor.distance)
 
 
-def near_rows(twin: MujocoModel, q: Array, t: float, pairs: Any, max_distance: float) -> Rows:
+def near_rows(model: MujocoModel, q: Array, t: float, pairs: Any, max_distance: float) -> Rows:
     """Return the rows of those of the pairs (m,) that are nearer than `max_distance` [m], all by MuJoCo."""
-    twin.place(q, t)
-    scene, model, data = twin.scene, twin.model, twin.data
-    mujoco.mj_comPos(model, data)
+    model.place(q, t)
+    scene, mujoco_model, data = model.scene, model.model, model.data
+    mujoco.mj_comPos(mujoco_model, data)
     first, second = scene.pairs.T
-    centers, radius = twin.poses()[0], model.geom_rbound[twin.geoms]
+    centers, radius = model.poses()[0], mujoco_model.geom_rbound[model.geoms]
     gap = np.linalg.norm(centers[first] - centers[second], axis=1) - radius[first] - radius[second]
     found, distance, points = [], [], np.empty((len(gap), 6))
     for pair in np.flatnonzero(pairs & (gap < max_distance)).tolist():
-        d = twin.distance(pair, points[len(found)])
+        d = model.distance(pair, points[len(found)])
         if 0.0 < d < max_distance:
             found.append(pair)
             distance.append(d)
     pair, d, ends = np.array(found, dtype=np.intp), np.array(distance), points[: len(found)].reshape(-1, 2, 3)
     normal = (ends[:, 1] - ends[:, 0]) / d[:, None]
-    jacobian = np.zeros((len(found), 2, 3, model.nv))
+    jacobian = np.zeros((len(found), 2, 3, mujoco_model.nv))
     velocity = np.zeros((len(found), 3))
     for i, sides in enumerate(scene.pairs[pair].tolist()):
         for side, geometry in enumerate(sides):
-            if geometry < twin.bodies:
-                body = model.geom_bodyid[twin.geoms[geometry]]
-                mujoco.mj_jac(model, data, jacobian[i, side], None, ends[i, side], body)
+            if geometry < model.bodies:
+                body = mujoco_model.geom_bodyid[model.geoms[geometry]]
+                mujoco.mj_jac(mujoco_model, data, jacobian[i, side], None, ends[i, side], body)
             elif scene.obstacles[scene.obstacle_of[geometry]].moves:
                 sample = scene.obstacles[scene.obstacle_of[geometry]].motion.sample(t)
                 velocity[i] = sample.linear + np.cross(sample.angular, ends[i, 1] - sample.position)
-    J = np.einsum("kx,kxv->kv", normal, jacobian[:, 1] - jacobian[:, 0])[:, twin.v_index]
+    J = np.einsum("kx,kxv->kv", normal, jacobian[:, 1] - jacobian[:, 0])[:, model.v_index]
     return Rows(pair, d, J, np.sum(normal * velocity, axis=1))
 
 
@@ -204,4 +200,4 @@ def largest(A: Array, b: Array, box: tuple[Array, Array], cap: float, bias: Arra
     cost = np.append(np.zeros(count) if bias is None else bias, -1.0)
     limits = [*zip(*box, strict=True), (None, None if np.isinf(cap) else cap)]
     result = linprog(cost, A_ub=np.column_stack((-A, np.ones(len(b)))), b_ub=b, bounds=limits, method="highs")
-    return result.x if result.status == 0 else None
+    return np.asarray(result.x) if result.status == 0 else None
