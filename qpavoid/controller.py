@@ -64,7 +64,7 @@ class Controller(Pipeline):
             limits: use of the joint limits; the defaults of a scenario if left out.
             tracking_damping: λ of the damped J⁺ [-].
             sensing: assumptions about obstacles without updates; the defaults of a scenario if left out.
-            progress: when a task counts as stalled, and detours; the defaults of a scenario if left out.
+            progress: when a task counts as stalled; the defaults of a scenario if left out.
             contacts: frames that rest, see `build_contacts`; none if left out.
 
         Raises:
@@ -108,7 +108,7 @@ class Controller(Pipeline):
             self._no_backup = (NO_BACKUP_WITH_CONTACTS,)
         self._commander = Arbiter(
             scene, law, self._assembly, self._query, self._obstacles, self._bounds,
-            [task for task in frames if task.moves], self.avoidance, self.limits, progress or Progress(), dt,
+            self.avoidance, self.limits, progress or Progress(), dt,
         )  # fmt: skip
         queries = self._query, *self._commander.queries
         self._grasps = Attachments(

@@ -46,12 +46,6 @@ class ReasonKind(str, Enum):
     STALLED = "STALLED"
     """The tasks make no progress: the pair that blocks them, the violation of its row by their velocity [m/s]; no pair
     where several rows block them together."""
-    OUT_OF_REACH = "OUT_OF_REACH"
-    """A target cannot be reached: the task, the missing distance [m]."""
-    TARGET_OBSTRUCTED = "TARGET_OBSTRUCTED"
-    """A target is too near to an obstacle: task and obstacle, what is missing to the safety distance [m]."""
-    DETOUR_ENDED = "DETOUR_ENDED"
-    """The detours of a task ended without progress: the task, the time spent on them [s]."""
     BACKUP = "BACKUP"
     """The backup trajectory replaces the tasks: from their velocity, none would stay clear of moving obstacles."""
     NO_BACKUP = "NO_BACKUP"
@@ -104,9 +98,6 @@ _TEXTS: dict[str, str] = {
     "AT_UPPER_LIMIT": "at its upper limit, velocity bound",
     "AT_VELOCITY_LIMIT": "at its velocity limit,",
     "STALLED": "no progress, row violated by",
-    "OUT_OF_REACH": "out of reach by",
-    "TARGET_OBSTRUCTED": "target too near by",
-    "DETOUR_ENDED": "detours ended without progress after",
     "BACKUP": "backup trajectory instead of the tasks",
     "NO_BACKUP": "no backup trajectory",
     "STALE": "not updated for",

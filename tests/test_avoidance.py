@@ -8,15 +8,23 @@ from conftest import SPHERE, Bench, make_layout, obstacle
 
 from qpavoid import Avoidance, Sample, build_scene, kernels
 from qpavoid.control.avoidance import row_form
-from qpavoid.solvers.gains import alpha, beta
+
+
+def alpha(d, d2):
+    return np.array([kernels.alpha(x, d2) for x in d])
+
+
+def beta(d, d1, d2):
+    return np.array([kernels.beta(x, d1, d2) for x in d])
+
 
 D1, D2, XI = 0.12, 0.24, 5.0
 TINY = 1e-9
 
 
-def bound(d, **row):
+def bound(d, cap=0.2, **row):
     """Right-hand sides of rows at distances d, for a robot without limits among obstacles at rest."""
-    settings = Avoidance(d1=D1, d2=D2, recovery_speed=0.2, row={"gain": XI, **row})
+    settings = Avoidance(d1=D1, d2=D2, recovery_speed=cap, row={"gain": XI, **row})
     closest = np.zeros((len(d), 10))
     closest[:, 0] = d
     free = np.full(2, np.inf)
@@ -83,19 +91,14 @@ def test_damper_row_by_hand():
     np.testing.assert_allclose(held, [-0.45, -0.15, 0.0, 0.1], atol=1e-12)
 
 
-def test_cbf_row_by_hand():
-    np.testing.assert_allclose(bound([0.24, 0.12, 0.0], type="cbf"), [-0.6, 0.0, 0.6], atol=1e-12)
-    np.testing.assert_allclose(bound([0.15, 0.0], type="cbf", d_safe=0.15), [0.0, 0.75], atol=1e-12)
-
-
-@pytest.mark.parametrize(("kind", "capped"), [("beta", True), ("damper", True), ("cbf", False)])
-def test_recovery_speed_is_capped(kind, capped):
+@pytest.mark.parametrize("kind", ["beta", "damper"])
+def test_recovery_speed_is_capped(kind):
     """5 · (0.12 - d) reaches the cap of 0.2 m/s at d = 0.08, deep in penetration it is still 0.2."""
-    found = bound([0.08, 0.05, -1.0], type=kind)
-    np.testing.assert_allclose(found, [0.2] * 3 if capped else [0.2, 0.35, 5.6], atol=1e-12)
+    np.testing.assert_allclose(bound([0.08, 0.05, -1.0], type=kind), [0.2] * 3, atol=1e-12)
+    np.testing.assert_allclose(bound([0.08, 0.05, -1.0], cap=None, type=kind), [0.2, 0.35, 5.6], atol=1e-12)
 
 
-@pytest.mark.parametrize("kind", ["beta", "damper", "cbf"])
+@pytest.mark.parametrize("kind", ["beta", "damper"])
 def test_bound_is_continuous_and_falls_with_the_distance(kind):
     d = np.linspace(-0.1, D2, 34001)  # steps of 1e-5 m
     found = bound(d, type=kind)
@@ -116,7 +119,7 @@ def test_beta_bound_is_continuous_where_its_branches_meet(edge):
 def test_a_row_that_is_met_exactly_never_passes_what_it_holds():
     """ḋ = bound from either side: the distance settles at d1 and is not crossed."""
     dt = 0.01
-    for kind in ("beta", "damper", "cbf"):
+    for kind in ("beta", "damper"):
         d = np.array([0.23, 0.05])
         for _ in range(2000):
             d = d + dt * bound(d, type=kind)
@@ -152,7 +155,7 @@ def test_offset_is_added_and_near_pairs_keep_their_order(panda):
     np.testing.assert_array_equal(proximity.feedforward, rate[near])
 
 
-@pytest.mark.parametrize("kind", ["beta", "task-switching", "damper", "cbf"])
+@pytest.mark.parametrize("kind", ["beta", "task-switching", "damper"])
 def test_no_pair_gives_no_row(kind, panda):
     bench = Bench(build_scene(panda), avoidance=Avoidance(row={"type": kind}))
     rows = bench.compute(panda.home, reach=-1.0)[1].avoidance

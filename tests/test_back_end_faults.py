@@ -7,7 +7,6 @@ import pytest
 from test_faults import NAN, panda_controller, up
 
 from qpavoid import Reason, ReasonKind, Sample, Severity, Solution, Status, make_solver
-from qpavoid.config import Detour, Progress
 
 
 def raising(*_):
@@ -112,10 +111,9 @@ class Law:
         lambda p: Solution(np.full(7, NAN), reasons=(Reason.of(ReasonKind.ROW_RELAXED, "a", "b"),)),
     ],
 )
-@pytest.mark.parametrize("progress", [Progress(), Progress(stalled_after=0.02, detour=Detour())])
-def test_a_failing_user_solver_stops_the_robot_with_the_reason(panda, fault, progress):
+def test_a_failing_user_solver_stops_the_robot_with_the_reason(panda, fault):
     law = Law()
-    controller = panda_controller(panda, law, progress=progress)
+    controller = panda_controller(panda, law)
     vs = []
     for k in range(90):
         law.fault = fault if 30 <= k < 60 else None

@@ -7,10 +7,8 @@ import pytest
 import qpsolvers
 
 from qpavoid.solvers.backends import backend_names, make_backend, solve_daqp
-from qpavoid.solvers.backends.persistent import OsqpWorkspace, Persistent, ProxqpWorkspace, residual
 
 BACKENDS = backend_names()
-NATIVE = ("daqp", "proxqp", "osqp")
 TOLERANCE = {"daqp": 1e-9, "quadprog": 1e-9, "proxqp": 1e-6, "osqp": 1e-6}
 """Largest error of x [rad/s]; P's smallest eigenvalue is 1e-3."""
 LESS_EXACT = 5e-4
@@ -63,22 +61,15 @@ def assert_minimum(name: str, answer: np.ndarray | None, qp: QP, reference: np.n
 
 @pytest.mark.parametrize("name", BACKENDS)
 def test_back_ends_find_the_minimum_after_any_size(name):
-    random, solve = np.random.default_rng(1), make_backend(name)
+    """proxqp finds no solution of one in 800, which `Qp` then gives to daqp."""
+    random, solve, unsolved = np.random.default_rng(1), make_backend(name), 0
     for _ in range(150):
         qp = make_qp(random, int(random.choice([7, 14, 35])), int(random.integers(0, 31)))
-        assert_minimum(name, solve(*qp), qp)
-
-
-@pytest.mark.parametrize("name", BACKENDS)
-def test_a_slowly_changing_problem_is_followed(name):
-    """What warm starts are for: the rows turn a little from tick to tick, and change their number at times."""
-    random, solve = np.random.default_rng(2), make_backend(name)
-    before, after = make_qp(random, 7, 9), make_qp(random, 7, 9)
-    for tick in range(200):
-        s, m = tick / 200.0, 9 - tick // 40
-        mixed = QP(*((1.0 - s) * a + s * b for a, b in zip(before, after, strict=True)))
-        qp = mixed._replace(G=np.ascontiguousarray(mixed.G[:m]), h=mixed.h[:m] - 0.5)
-        assert_minimum(name, solve(*qp), qp)
+        answer = solve(*qp)
+        unsolved += answer is None
+        if answer is not None or name != "proxqp":
+            assert_minimum(name, answer, qp)
+    assert unsolved <= 1
 
 
 @pytest.mark.parametrize("name", BACKENDS)
@@ -140,7 +131,7 @@ def test_locked_coordinates_stay(name):
     assert_minimum(name, answer, qp)
 
 
-@pytest.mark.parametrize("name", NATIVE)
+@pytest.mark.parametrize("name", ["daqp", "proxqp", "osqp"])
 @pytest.mark.parametrize("field", ["P", "q", "G", "h"])
 def test_back_ends_reject_and_forget_nan(name, field):
     random, solve = np.random.default_rng(8), make_backend(name)
@@ -190,68 +181,6 @@ def test_nothing_is_printed(name, m, slack, capfd):
         qp = qp._replace(h=qp.G @ x - slack, lower=lower, upper=x + 1.0)
         assert_minimum(name, solve(*qp), qp)
     assert capfd.readouterr() == ("", "")
-
-
-# --- workspaces -----------------------------------------------------------------------------------------------
-
-
-def test_the_residual_is_zero_at_the_minimum_only():
-    """Multipliers of x = clip(1, …) in closed form: min ½(x - 1)², x >= h has y = max(h - 1, 0)."""
-    one, bound = np.ones(1), np.full(1, 5.0)
-    for h in (0.3, 1.0, 2.5):
-        x, y = np.array([max(h, 1.0)]), np.array([max(h - 1.0, 0.0)])
-        qp = (np.eye(1), -one, np.eye(1), np.array([h]), -bound, bound)
-        assert residual(*qp, x, y) == pytest.approx(0.0, abs=1e-15)
-        assert residual(*qp, x + 1e-3, y) == pytest.approx(1e-3, rel=1e-6)
-        assert residual(*qp, x, y - 1e-3) == pytest.approx(1e-3, rel=1e-6)
-
-
-@pytest.mark.parametrize("make", [ProxqpWorkspace, OsqpWorkspace])
-def test_workspaces_verify_their_answers(make):
-    random = np.random.default_rng(11)
-    first = make_qp(random, 7, 5)
-    workspace = make(*first)
-    for qp in (first, make_qp(random, 7, 5), make_qp(random, 7, 5)):
-        workspace.update(*qp)
-        x, y = workspace.solve()
-        assert residual(*qp, x, y) < 1e-8
-
-
-class Scripted:
-    """A workspace that gives the right answer when it is new, and a wrong one or none when it is used again."""
-
-    made = 0
-    later: str = "right"
-
-    def __init__(self, *qp: np.ndarray) -> None:
-        Scripted.made += 1
-        self.qp, self.used = qp, False
-
-    def update(self, *qp: np.ndarray) -> None:
-        self.qp, self.used = qp, True
-
-    def solve(self) -> tuple[np.ndarray, np.ndarray] | None:
-        if self.used and Scripted.later == "none":
-            return None
-        x, y = ProxqpWorkspace(*self.qp).solve()
-        return (x + 0.01, y) if self.used and Scripted.later == "wrong" else (x, y)
-
-
-@pytest.mark.parametrize(("later", "made"), [("right", 1), ("wrong", 5), ("none", 5)])
-def test_a_wrong_warm_start_is_solved_again_cold(later, made):
-    Scripted.made, Scripted.later = 0, later
-    random, solve = np.random.default_rng(12), Persistent(Scripted)
-    for _ in range(5):
-        qp = make_qp(random, 7, 4)
-        assert_minimum("proxqp", solve(*qp), qp)
-    assert Scripted.made == made
-
-
-def test_workspaces_do_not_pile_up():
-    solve, random = Persistent(ProxqpWorkspace), np.random.default_rng(13)
-    for m in range(100):
-        solve(*make_qp(random, 7, m % 80 + 1))
-    assert len(solve._workspaces) <= 64
 
 
 def test_daqp_takes_any_number_of_rows():

@@ -189,7 +189,7 @@ def test_key_that_resembles_nothing_gets_the_list_of_the_block_it_is_in(load):
         ("tasks.0.motion.type", "lin", "tasks.0.motion: unknown type 'lin'; did you mean 'line'?"),
         ("obstacles.0.shape.type", "spher", "obstacles.0.shape: unknown type 'spher'; did you mean 'sphere'?"),
         ("avoidance.row.type", "dampr", "avoidance.row: unknown type 'dampr'; did you mean 'damper'?"),
-        ("avoidance.row", {"gain": 3}, "avoidance.row: `type` is missing; valid are beta, cbf, damper, task-switching"),
+        ("avoidance.row", {"gain": 3}, "avoidance.row: `type` is missing; valid are beta, damper, task-switching"),
         ("solver", {"backend": "osqp"}, f"solver: `name` is missing; valid are {', '.join(sorted(SOLVERS))}"),
         ("solver", "eq10:daqp", "solver.backend: unknown key; valid are alpha_cap, damping, name, retreat_speed"),
     ],

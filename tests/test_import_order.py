@@ -15,7 +15,6 @@ FOR_BENCHMARKS = {
     "qpavoid.errors": "error classes, and how messages name a place and the nearest name",
     "qpavoid.control.distances": "DistanceQuery: the planner that proves a case solvable checks distances",
     "qpavoid.control.tasks.frames": "FrameTask: which goals the scores and other libraries follow",
-    "qpavoid.safety.reachability": "arm, clearance: goals out of reach are made by it",
     "qpavoid.solvers": "parse_solver: entrants are named as in scenarios",
     "qpavoid.geometry.segments": "point_segment: distance of a tool from its target's path",
     "qpavoid.viz.style": "colours and grid: figures look alike",

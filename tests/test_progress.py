@@ -1,11 +1,11 @@
-"""A stalled task is reported, with what is in the way, and a bounded detour is tried where it is asked for."""
+"""A stalled task is reported, with what is in the way."""
 
 import numpy as np
 import pytest
 from closed_loop import cartesian, drive, make_controller
 
 from qpavoid import Avoidance, Obstacle, ReasonKind, Sample, Severity
-from qpavoid.config import Box, Capsule, Detour, Progress, Sphere
+from qpavoid.config import Box, Capsule, Sphere
 from qpavoid.run.simulate import simulate
 
 D1, GOAL = 0.03, np.array([0.6, 0.0, 0.0])
@@ -16,12 +16,12 @@ SHAPES = {
 }
 
 
-def head_on(tmp_path, solver="qp", shape="ball", acceleration=None, detour=None, **fields):
+def head_on(tmp_path, solver="qp", shape="ball", acceleration=None, **fields):
     """A tool whose J Jᵀ is the identity, so that any normal is an eigenvector, and an obstacle exactly in its way."""
     robot = cartesian(tmp_path, acceleration=acceleration, reach=fields.pop("reach", 5.0))
     return make_controller(
         robot, [Obstacle.at(shape, SHAPES[shape], [0.3, 0.0, 0.0])], "z", solver,
-        avoidance=Avoidance(d1=D1, d2=0.12), progress=Progress(detour=detour), task={"max_speed": 0.3}, **fields,
+        avoidance=Avoidance(d1=D1, d2=0.12), task={"max_speed": 0.3}, **fields,
     )  # fmt: skip
 
 
@@ -47,32 +47,6 @@ def test_stalled_names_the_obstacle_exactly_head_on(tmp_path, solver, shape):
         # v_tracking has the task's full speed; the row is zero at d1, where qp rests, and allows 50 mm/s farther out
         assert reason.amount == pytest.approx(0.3, abs=5e-3) or (solver == "eq10" and 0.25 < reason.amount < 0.3)
         assert reason.severity is Severity.WARNING
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("acceleration", [None, 4.0])
-def test_detour_passes_and_keeps_the_safety_distance(tmp_path, shape, acceleration):
-    controller = head_on(tmp_path, "qp", shape, acceleration, Detour())
-    q, reported, least = run_to(controller, 1200)
-    assert np.linalg.norm(q[-1] - GOAL) < 1e-3
-    arrived = np.argmax(np.linalg.norm(q - GOAL, axis=1) < 5e-3)
-    assert arrived < 1000  # ten seconds, where there is no end without it
-    assert least > D1 - 5e-4
-    assert reported[-1] == () and any(reported)
-    off = np.linalg.norm(q[:, 1:], axis=1).max()
-    assert 0.05 < off < 0.4  # around it, and no farther than it had to
-
-
-@pytest.mark.parametrize("course", [(1, 1, 0), (0, 0, 1), (1, 2, 3)])
-def test_detour_works_in_any_direction(tmp_path, course):
-    goal = 0.6 * np.array(course) / np.linalg.norm(course)
-    robot = cartesian(tmp_path)
-    controller = make_controller(
-        robot, [Obstacle.at("ball", Sphere(radius=0.1), 0.5 * goal)], "z",
-        avoidance=Avoidance(d1=D1, d2=0.12), progress=Progress(detour=Detour()), task={"max_speed": 0.3},
-    )  # fmt: skip
-    q, _, least = run_to(controller, 1200, goal)
-    assert np.linalg.norm(q[-1] - goal) < 1e-3 and least > D1 - 5e-4
 
 
 def test_stalled_names_panda_bodies_and_obstacle(panda):
@@ -109,11 +83,3 @@ def test_stalled_raises_no_false_alarm(scenario, longest):
     """Slowed down or pushed aside is not stalled; in Situation 1 the tool waits for its target to return."""
     metrics = simulate(scenario).metrics()
     assert metrics["time_blocked"] <= longest and metrics["arrived"]
-
-
-def test_detour_is_bitwise_neutral_without_a_stall(tmp_path):
-    loops = []
-    for detour in (None, Detour()):
-        controller = head_on(tmp_path, detour=detour)
-        loops.append(run_to(controller, 400, np.array([0.6, 0.3, 0.1]))[0])
-    np.testing.assert_array_equal(*loops)

@@ -6,14 +6,22 @@ import qpsolvers
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from qpavoid import Problem, ReasonKind, Severity, Status, UnknownName, make_solver
+from qpavoid import Problem, ReasonKind, Severity, Status, UnknownName, kernels, make_solver
 from qpavoid.config import Eq10Solver
 from qpavoid.errors import SolverNotInstalled
 from qpavoid.problem import AvoidanceRows, Tracking, make_problem
 from qpavoid.solvers import qp
 from qpavoid.solvers.analytic import tracking_velocity
 from qpavoid.solvers.backends import make_backend
-from qpavoid.solvers.gains import alpha, beta
+
+
+def alpha(d, d2):
+    return np.array([kernels.alpha(x, d2) for x in d])
+
+
+def beta(d, d1, d2):
+    return np.array([kernels.beta(x, d1, d2) for x in d])
+
 
 NV, D1, D2 = 7, 0.18, 0.36
 seeds = st.integers(0, 2**32 - 1)
@@ -277,5 +285,5 @@ def test_unknown_and_missing_solvers_are_named():
         make_solver("eq1O")
     with pytest.raises(UnknownName, match="usable are daqp"):
         make_solver("qp:nope")
-    with pytest.raises(SolverNotInstalled, match="pip install gurobipy"):
+    with pytest.raises(SolverNotInstalled, match="pip install 'qpsolvers\\[gurobi\\]'"):
         make_backend("gurobi")

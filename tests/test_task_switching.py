@@ -198,7 +198,7 @@ def test_filter_bounds_by_the_command_that_it_is_given(panda):
     assert braked > 50 and parted > 2
 
 
-@pytest.mark.parametrize("change", ["eased", "redirected", "followed", "of a cascade"])
+@pytest.mark.parametrize("change", ["eased", "followed", "of a cascade"])
 def test_rows_follow_the_velocity_that_is_tracked(panda, change):
     """Whatever takes the place of v0, u is of that; the problem that it was made from stays as it was."""
     robot = panda if change == "eased" else replace(panda, acceleration={})
@@ -215,8 +215,6 @@ def test_rows_follow_the_velocity_that_is_tracked(panda, change):
     assert_rows(scene, near, problem, v)
     if change == "eased":
         changed = bench.assembly.eased(problem)
-    elif change == "redirected":
-        changed = bench.assembly.redirected(problem, 0, np.array([0.3, -0.4, 0.1]))
     elif change == "followed":
         changed = bench.assembly.follow(0.1 * rng.normal(size=7), problem)
     else:

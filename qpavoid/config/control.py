@@ -32,7 +32,9 @@ class TaskSwitching(Block):
 
 
 class Damper(Block):
-    """Velocity damper: ḋ >= -ξ (d - d_safe); below d_safe it backs away, at most at `recovery_speed`."""
+    """Velocity damper: ḋ >= -ξ (d - d_safe); below d_safe it backs away, at most at `recovery_speed`. Without that cap,
+    it is a control barrier function d - d_safe with a linear class-K function.
+    """
 
     type: Literal["damper"] = "damper"
     gain: Positive = 5.0
@@ -41,17 +43,7 @@ class Damper(Block):
     """Safety distance [m], measured as d1 is; left out: d1."""
 
 
-class Cbf(Block):
-    """Control barrier function h = d - d_safe with linear class-K gain: ḋ >= -γ h, recovery speed not capped."""
-
-    type: Literal["cbf"] = "cbf"
-    gain: Positive = 5.0
-    """γ [1/s]."""
-    d_safe: Positive | None = None
-    """Safety distance [m], measured as d1 is; left out: d1."""
-
-
-AvoidanceRow = Annotated[Beta | TaskSwitching | Damper | Cbf, Field(discriminator="type")]
+AvoidanceRow = Annotated[Beta | TaskSwitching | Damper, Field(discriminator="type")]
 
 
 class Backup(Block):
@@ -89,8 +81,8 @@ class Avoidance(Block):
     between axes: its figures want the sum of the two radii here."""
     row: AvoidanceRow = Beta()
     """Form of the QP's avoidance rows."""
-    recovery_speed: Positive = 0.2
-    """Cap on the speed at which rows ask a pair that is too close to part [m/s]."""
+    recovery_speed: Positive | None = 0.2
+    """Cap on the speed at which rows ask a pair that is too close to part [m/s]; `null`: none."""
     look_ahead: bool = True
     """Whether a velocity of the QP is checked over its control period and the braking trajectory after it, and reduced
     where that leads nearer than the safety distance."""
@@ -101,7 +93,7 @@ class Avoidance(Block):
     @property
     def safety_distance(self) -> float:
         """Distance below which no row lets a pair come [m]."""
-        return self.d1 if isinstance(self.row, Beta | TaskSwitching) or self.row.d_safe is None else self.row.d_safe
+        return self.row.d_safe if isinstance(self.row, Damper) and self.row.d_safe is not None else self.d1
 
     @model_validator(mode="after")
     def _ordered(self) -> Avoidance:
@@ -109,9 +101,8 @@ class Avoidance(Block):
             raise ValueError(f"needs 0 < d1 < d2, got d1 = {self.d1}, d2 = {self.d2}")
         if self.d1 <= self.offset:
             raise ValueError(f"d1 = {self.d1} must exceed offset = {self.offset}, else it lies inside the bodies")
-        d_safe = getattr(self.row, "d_safe", None)
-        if d_safe is not None and not self.offset <= d_safe < self.d2:
-            raise ValueError(f"needs offset <= row.d_safe < d2, got {self.offset}, {d_safe}, {self.d2}")
+        if not self.offset <= self.safety_distance < self.d2:
+            raise ValueError(f"needs offset <= row.d_safe < d2, got {self.offset}, {self.safety_distance}, {self.d2}")
         return self
 
 
@@ -168,25 +159,8 @@ _LONG = 1e8
 """Longest `stale_after` whose fivefold is still a number that a file may give [s]."""
 
 
-class Detour(Block):
-    """Detour around what blocks a task, by circulation along its tangent, until its goal is reached or abandoned."""
-
-    speed: Positive = 0.1
-    """Speed along the tangent, added to the task's [m/s]."""
-    settle: NonNegative = 0.3
-    """Time for which the path has to be free before the detour ends [s]."""
-    longest: Positive = 15.0
-    """Time after which a detour has ended [s]; the other side is tried next."""
-    tries: Annotated[int, Field(ge=1)] = 4
-    """Detours that bring the tool no nearer to its goal than before, after which the goal is abandoned [-]."""
-    patience: Positive = 40.0
-    """Time with an obstructed path, on such detours and back, after which no detour is continued or begun [s]."""
-
-
 class Progress(Block):
-    """When a task counts as stalled, and what is done about it."""
+    """When a task counts as stalled."""
 
     stalled_after: Positive = 1.0
     """Time without progress after which a task counts as stalled [s]."""
-    detour: Detour | None = None
-    """Detour; left out: none is tried."""

@@ -210,36 +210,11 @@ class Assembly:
         worst = float(kernels.violation(eased, rows.J, rows.b, x.lower, x.upper))
         return problem._replace(tracking=tracking, avoidance=rows, v_tracking=eased, violation=worst)
 
-    def redirected(self, problem: Problem, frame: int, velocity: Array) -> Problem:
-        """The problem of this tick with a velocity (3,) added to the linear one that a task asks for [m/s].
-
-        Args:
-            problem: as `compute` gave it.
-            frame: which task.
-            velocity: world [m/s].
-        """
-        x = self._layout
-        linear = slice(3 * frame, 3 * frame + 3)
-        b = x.b.copy()
-        x.b[linear] += x.scale[linear] * velocity
-        v_tracking = np.empty_like(x.v_tracking)
-        if problem.contacts is None:
-            kernels.damped_solution(self._packed, v_tracking)
-        else:
-            v_tracking[:] = tracking_within(problem.contacts, x.A, x.b, x.damping)
-        tracking = problem.tracking._replace(b=x.b.copy())
-        x.b[:] = b
-        rows = self._along(problem.avoidance, v_tracking)
-        worst = float(kernels.violation(v_tracking, rows.J, rows.b, x.lower, x.upper))
-        return problem._replace(
-            tracking=tracking, avoidance=rows, v_tracking=v_tracking, violation=worst, tracking_is_clear=False
-        )
-
     def prioritised(self, problem: Problem, tracked: Callable[[Problem], Array]) -> Problem:
         """The problem of this tick with rows for what a cascade tracks, which is not v0.
 
         Args:
-            problem: as `compute` gave it, or redirected.
+            problem: as `compute` gave it.
             tracked: gives that velocity (nv,).
         """
         if not self._layout.task_switching:
@@ -259,28 +234,6 @@ class Assembly:
         for array, values in zip(memory, kept, strict=True):
             array[:] = values
         return along
-
-    def at_length(self, problem: Problem) -> Problem:
-        """The problem of this tick with what the limits of accelerations and jerks allow at length, not at once."""
-        x = self._layout
-        return problem._replace(
-            lower=x.hard_lower, upper=x.hard_upper, hard_lower=x.hard_lower, hard_upper=x.hard_upper
-        )
-
-    def goal(self, frame: int) -> tuple[Array, float]:
-        """Where a task wants its frame (3,), world, and how far that is from where the frame is [m]."""
-        target = self.targets[frame, 9:12]
-        return target.copy(), float(np.linalg.norm(target - self.kinematics.position[frame]))
-
-    def wanted_velocity(self, frame: int) -> Array:
-        """Linear velocity (3,) that a task asks of its frame [m/s]."""
-        rows = slice(3 * frame, 3 * frame + 3)
-        return np.asarray(self._layout.b[rows] / self._layout.scale[rows])
-
-    def frame_velocity(self, frame: int, v: Array) -> Array:
-        """Linear velocity (3,) of a task's frame at v [m/s]."""
-        rows = slice(3 * frame, 3 * frame + 3)
-        return np.asarray(self._layout.A[rows] @ v / self._layout.scale[rows])
 
     def _count_from_before(self) -> None:
         """Narrows the bounds to what accelerations and jerks allow from the velocity before.

@@ -1,13 +1,13 @@
 """Avoidance rows: how fast each near pair may close, as a function of its distance.
 
-With h = d - hold and gain ξ (hold is d_safe for damper and cbf, d1 for the others), ḋ = J v + drift stays above
+With h = d - d_s and gain ξ (d_s is d_safe for damper, d1 for the others), ḋ = J v + ḋ_obs stays above
 
 - beta: -(1 - β) ξ h, and for h < 0 min(-ξ h, recovery_speed);
 - task-switching: (1 - β)(1 - α) min(u, ẋ0) + β ẋ0, at least -ξ h for h < 0 and at most recovery_speed. That is the rate
-  of eq. 10 with the consistent bracket. u = J v0 + drift is the rate that tracking alone would give; α, capped, counts
+  of eq. 10 with the consistent bracket. u = J v0 + ḋ_obs is the rate that tracking alone would give; α, capped, counts
   for u < 0 only. No more of h than there is may be used in a tick: ḋ >= -h / dt;
-- damper: -ξ h, capped in the same way (Faverjon and Tournassoud 1987, in its linear form);
-- cbf: -γ h, not capped (Ames et al. 2019, with a linear class-K function).
+- damper: -ξ h, capped in the same way (Faverjon and Tournassoud 1987, in its linear form); without the cap, the control
+  barrier function of Ames et al. 2019 with a linear class-K function.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from qpavoid.config import Avoidance, Beta, Cbf, TaskSwitching
+from qpavoid.config import Avoidance, Beta, TaskSwitching
 
 
 def row_form(config: Avoidance) -> dict[str, Any]:
@@ -26,7 +26,7 @@ def row_form(config: Avoidance) -> dict[str, Any]:
         "offset": config.offset,
         "safety_distance": config.safety_distance,
         "row_gain": row.gain,
-        "recovery_speed": np.inf if isinstance(row, Cbf) else config.recovery_speed,
+        "recovery_speed": np.inf if config.recovery_speed is None else config.recovery_speed,
         "beta": isinstance(row, Beta),
         "task_switching": isinstance(row, TaskSwitching),
         "retreat_speed": row.retreat_speed if isinstance(row, TaskSwitching) else 0.0,

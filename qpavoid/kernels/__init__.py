@@ -33,7 +33,7 @@ from qpavoid.kernels.obstacles import (
 from qpavoid.kernels.packing import pack
 from qpavoid.kernels.qp import max_clearance_velocity, minimize, project, project_soft
 from qpavoid.kernels.rotation import rotation_vector
-from qpavoid.kernels.rows import distance_rows, row_bounds
+from qpavoid.kernels.rows import alpha, beta, distance_rows, row_bounds
 from qpavoid.kernels.step import assemble, tracking_violation, violation
 from qpavoid.kernels.tasks import damped_solution, frame_rows, projection_cost
 from qpavoid.kernels.voxels import select_voxels, voxels_within
@@ -44,9 +44,11 @@ __all__ = [
     "ObstacleArrays",
     "Pieces",
     "RowLayout",
+    "alpha",
     "are_fine",
     "assemble",
     "backup_rows",
+    "beta",
     "candidates",
     "check_states",
     "clearance_lower_bound",

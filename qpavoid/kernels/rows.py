@@ -105,7 +105,7 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
         rate = x.row_gain * (x.safety_distance - d)
         separating = rate > 0.0
         if x.beta and not separating:
-            rate *= 1.0 - _beta(x, d)
+            rate *= 1.0 - beta(d, x.d1, x.d2)
         elif x.task_switching:
             rate = max(_rate_of_eq10(x, i, d), rate if separating else (x.safety_distance - d) / x.dt)
         if x.acceleration_limited and rate < 0.0:
@@ -144,14 +144,30 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
 
 
 @compiled
-def _beta(x: Any, d: float) -> float:
-    """Compute β(d) of eq. 12 [-], see `gains.beta`.
+def alpha(d: float, d2: float) -> float:
+    """Compute the share of the approaching primary motion that is removed (eq. 11).
 
     Args:
-        x: reads d1 and d2.
         d: distance [m].
+        d2: influence distance [m].
+
+    Returns:
+        0 for d >= d2, ((d2 - d)/d)² below, infinite for d <= 0 [-]; callers cap it.
     """
-    return 0.5 + 0.5 * np.cos(np.pi * min(max((d - x.d1) / (x.d2 - x.d1), 0.0), 1.0))
+    ratio = max(d2 - d, 0.0) / max(d, MIN_DISTANCE)
+    return ratio * ratio
+
+
+@compiled
+def beta(d: float, d1: float, d2: float) -> float:
+    """Compute the weight of the avoidance task (eq. 12): a cosine blend from 1 at d1 to 0 at d2 [-].
+
+    Args:
+        d: distance [m].
+        d1: distance below which it is 1 [m].
+        d2: distance above which it is 0 [m].
+    """
+    return 0.5 + 0.5 * np.cos(np.pi * min(max((d - d1) / (d2 - d1), 0.0), 1.0))
 
 
 @compiled
@@ -171,12 +187,11 @@ def _rate_of_eq10(x: Any, i: int, d: float) -> float:
     u = x.feedforward[i]
     for c in range(len(x.v_tracking)):
         u += x.J[i, c] * x.v_tracking[c]
-    rate, beta = min(u, x.retreat_speed), _beta(x, d)
+    rate, weight = min(u, x.retreat_speed), beta(d, x.d1, x.d2)
     if u < 0.0:
-        ratio = max(x.d2 - d, 0.0) / max(d, MIN_DISTANCE)
         own = x.twist_row[x.near_pairs[i]] == len(x.margin) - 1
-        rate *= 1.0 - min(ratio * ratio, min(x.alpha_cap, OWN_ALPHA_CAP) if own else x.alpha_cap)
-    return (1.0 - beta) * rate + beta * x.retreat_speed
+        rate *= 1.0 - min(alpha(d, x.d2), min(x.alpha_cap, OWN_ALPHA_CAP) if own else x.alpha_cap)
+    return (1.0 - weight) * rate + weight * x.retreat_speed
 
 
 @compiled

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from qpavoid import kernels
 from qpavoid.config import Mesh, PointCloud, ScenarioConfig
 from qpavoid.config.loading import load_scenario
 from qpavoid.control.distances import DistanceQuery
@@ -21,7 +22,7 @@ from qpavoid.model.scene import PARKING_DISTANCE, Scene
 from qpavoid.model.solids import surface_triangles
 from qpavoid.problem import Array, Solution, Status
 from qpavoid.run.log import STATUSES, Log, versions
-from qpavoid.solvers import gains, parse_solver
+from qpavoid.solvers import parse_solver
 
 _MAX_EVENTS = 1000
 """Number of events that a log keeps: a run that changes its reasons at every step would fill memory."""
@@ -153,9 +154,9 @@ class Recorder:
             "status": STATUSES.index(solution.status),
         }
         if len(rows_avoid.d):
-            d = rows_avoid.d.min(keepdims=True)
-            values["alpha"] = gains.alpha(d, rows_avoid.d2)[0]
-            values["beta"] = gains.beta(d, rows_avoid.d1, rows_avoid.d2)[0]
+            d = float(rows_avoid.d.min())
+            values["alpha"] = kernels.alpha(d, rows_avoid.d2)
+            values["beta"] = kernels.beta(d, rows_avoid.d1, rows_avoid.d2)
         for name, value in values.items():
             scalars[name][self._count] = value
         self._count += 1

@@ -13,7 +13,6 @@ from qpavoid.config import Avoidance, Limits, Progress
 from qpavoid.control.assembler import Assembly
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.obstacles import ObstacleTracker
-from qpavoid.control.tasks.frames import FrameTask
 from qpavoid.errors import NumericalError
 from qpavoid.kernels import TOLERANCE
 from qpavoid.model.limits import JointBounds, saturate
@@ -22,7 +21,6 @@ from qpavoid.problem import Array, Problem, Proximity, Solution, Status, is_fini
 from qpavoid.reason import Reason, ReasonKind, Severity
 from qpavoid.safety.backup import BackupPlanner
 from qpavoid.safety.braking import BrakingCheck
-from qpavoid.safety.detour import Detours
 from qpavoid.safety.progress import ProgressMonitor
 from qpavoid.safety.rollout import BackupRollouts
 from qpavoid.solvers import Solver
@@ -44,7 +42,6 @@ class Arbiter:
         query: DistanceQuery,
         obstacles: ObstacleTracker,
         bounds: JointBounds,
-        frames: list[FrameTask],
         avoidance: Avoidance,
         limits: Limits,
         progress: Progress,
@@ -59,10 +56,9 @@ class Arbiter:
             query: distances of the control step.
             obstacles: states of the obstacles.
             bounds: limits of the joints.
-            frames: tasks that may be sent along a detour.
             avoidance: distances and rows.
             limits: use of the joint limits.
-            progress: when a task counts as stalled, and whether detours are tried.
+            progress: when a task counts as stalled.
             dt: control period [s].
         """
         self._scene, self.solver, self._assembly, self._query = scene, solver, assembly, query
@@ -71,8 +67,7 @@ class Arbiter:
         self._influence_distance = avoidance.d2 - avoidance.offset
         safety_distance = avoidance.safety_distance - avoidance.offset
         self.braking = BrakingCheck(scene, bounds, limits.position_gain, safety_distance, dt)
-        detours = Detours(progress.detour, dt, scene, frames, query, safety_distance) if progress.detour else None
-        self.progress = ProgressMonitor(progress, dt, scene.pair_names, detours)
+        self.progress = ProgressMonitor(progress, dt, scene.pair_names)
         self.backup: BackupPlanner | None = None
         if avoidance.backup is not None and scene.obstacles:
             rollouts = BackupRollouts(scene, bounds, obstacles, avoidance, limits, dt, avoidance.backup)
@@ -104,12 +99,9 @@ class Arbiter:
             proximity: distances of this control step.
             tasks: whether the problem is of the tasks, whose progress is monitored; else it is of a given velocity.
         """
-        if tasks:
-            solution = self._solve(q, problem, proximity)
-            stalled = self.progress.update(problem, solution)
-            solution = solution._replace(stalled=stalled) if stalled else solution
-        else:
-            solution = self._solve(q, problem)
+        solution = self._solve(q, problem, tasks)
+        if tasks and (stalled := self.progress.update(problem, solution)):
+            solution = solution._replace(stalled=stalled)
         if self.backup is not None and self.solver.bounded:
             solution = self._ensure_backup(self.backup, q, t, proximity, problem, solution)
         return self._report_limits(problem, solution)
@@ -118,11 +110,10 @@ class Arbiter:
         """Return the stop of this control step, with its reasons."""
         return self._report_limits(problem, _stop(problem, reasons))
 
-    def _solve(self, q: Array, problem: Problem, proximity: Proximity | None = None) -> Solution:
-        """Return the solution within the limits, after the stop look-ahead; with a proximity, detours may apply."""
+    def _solve(self, q: Array, problem: Problem, from_tasks: bool) -> Solution:
+        """Return the solution within the limits, after the stop look-ahead."""
         try:
-            if proximity is not None:
-                problem = self.progress.redirect(problem, proximity, self._assembly, self.solver)
+            if from_tasks:
                 if problem.levels and isinstance(self.solver, Hqp):  # v_tracking is not a cascade's
                     problem = self._assembly.prioritised(problem, self.solver.tracked)
                 elif problem.jerk_limited:

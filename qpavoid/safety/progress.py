@@ -1,8 +1,7 @@
-"""Detects tasks that make no progress because of avoidance, names what is in the way, and can start a detour.
+"""Detects tasks that make no progress because of avoidance, and names what is in the way.
 
 A robot that is pushed back exactly against its task velocity rests there: the projections of eq. 10 and of the QP both
-end in such points. A task counts as stalled by the fraction of its velocity that is left. Detours, where they are asked
-for, are those of `qpavoid.safety.detour`.
+end in such points. A task counts as stalled by the fraction of its velocity that is left.
 """
 
 from __future__ import annotations
@@ -10,11 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from qpavoid.config import Progress
-from qpavoid.control.assembler import Assembly
-from qpavoid.problem import Array, Problem, Proximity, Solution
+from qpavoid.problem import Array, Problem, Solution
 from qpavoid.reason import Reason, ReasonKind
-from qpavoid.safety.detour import Detours
-from qpavoid.solvers import Solver
 
 _MIN_PROGRESS = 0.1
 """Fraction of the task velocity below which there is no progress [-]."""
@@ -33,50 +29,29 @@ _MAX_STALL = 1.1
 class ProgressMonitor:
     """Follows the progress of a controller's tasks from control step to control step."""
 
-    def __init__(
-        self, config: Progress, dt: float, pair_names: tuple[tuple[str, str], ...], detours: Detours | None = None
-    ) -> None:
-        self._config, self._dt, self._names, self._detours = config, dt, pair_names, detours
+    def __init__(self, config: Progress, dt: float, pair_names: tuple[tuple[str, str], ...]) -> None:
+        self._config, self._dt, self._names = config, dt, pair_names
         self._max_stalled_steps = _MAX_STALL * config.stalled_after / dt + _CHECK_STEPS
         self.reset()
 
     def reset(self) -> None:
-        """Drop all counts, detours and searches."""
+        """Drop all counts."""
         self._step, self._stalled_steps = 0, 0.0
-        self._blocking_pairs: list[tuple[int, float]] = []
-        if self._detours is not None:
-            self._detours.reset()
-
-    def redirect(self, problem: Problem, proximity: Proximity, assembly: Assembly, solver: Solver) -> Problem:
-        """Return the problem to solve: the given one, or that of a detour around the pair in the way."""
-        detours = self._detours
-        if detours is None:
-            return problem
-        detours.update(problem, assembly)
-        if detours.active is None and self.stalled and self._blocking_pairs:
-            detours.begin(problem, proximity, assembly, solver, [pair for pair, _ in self._blocking_pairs])
-        if detours.active is None:
-            return problem
-        redirected = detours.follow(problem, proximity, assembly, self._config.stalled_after)
-        if redirected is None:
-            self._stalled_steps = 0.0
-            return problem
-        return redirected
 
     def update(self, problem: Problem, solution: Solution) -> tuple[Reason, ...]:
-        """Return the reasons why searches ended, and what stalls the tasks, after long enough without progress.
+        """Return what stalls the tasks, after long enough without progress.
 
         Args:
-            problem: of the tasks, without a detour.
+            problem: of the tasks.
             solution: what is commanded.
         """
-        A, ended = problem.tracking.A, self._detours.failures if self._detours is not None else ()
+        A = problem.tracking.A
         if not len(A) or (problem.violation <= 0.0 and solution.command_scale == 1.0):
             self._stalled_steps = 0.0
-            return ended
+            return ()
         self._step += 1
         if self._step % _CHECK_STEPS and not self.stalled:
-            return ended
+            return ()
         steps = 1 if self.stalled else _CHECK_STEPS
         wanted, achieved = A @ problem.v_tracking, A @ solution.v
         size = float(wanted @ wanted)
@@ -85,14 +60,13 @@ class ProgressMonitor:
         stalled_steps = self._stalled_steps + (steps if is_stuck else -steps)
         self._stalled_steps = min(max(stalled_steps, 0), self._max_stalled_steps)
         if not self.stalled:
-            return ended
-        self._blocking_pairs = _find_blocking_pairs(problem, solution.v)
+            return ()
         pairs = [
             Reason.of(ReasonKind.STALLED, *self._names[pair], amount=amount, unit="m/s")
-            for pair, amount in self._blocking_pairs
+            for pair, amount in _find_blocking_pairs(problem, solution.v)
         ]
         several = Reason.of(ReasonKind.STALLED, detail="several rows together")
-        return (*ended, *((*pairs, *_blocking_limits(problem, solution.v)) or (several,)))
+        return (*pairs, *_blocking_limits(problem, solution.v)) or (several,)
 
     @property
     def stalled(self) -> bool:

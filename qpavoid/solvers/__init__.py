@@ -15,9 +15,8 @@ from qpavoid.errors import ConfigError, UnknownName, nearest
 from qpavoid.problem import Problem, Solution
 from qpavoid.solvers.analytic import Eq10, TrackingOnly
 from qpavoid.solvers.backends import backend_names
+from qpavoid.solvers.baselines import GradientProjection, PotentialField
 from qpavoid.solvers.hqp import Hqp
-from qpavoid.solvers.potential import PotentialField
-from qpavoid.solvers.projection import GradientProjection
 from qpavoid.solvers.qp import Qp
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from qpavoid import kernels
 from qpavoid.config import Eq10Solver, TrackingSolver
 from qpavoid.problem import Array, Problem, Solution, Tracking
-from qpavoid.solvers import gains
 
 _MIN_SQUARE = 1e-12
 """Squared length below which a projected row counts as zero [m²/rad²]: an absolute cut-off, since a relative one
@@ -89,6 +89,7 @@ class Eq10:
 
     def __init__(self, config: Eq10Solver) -> None:
         self.config = config
+        kernels.alpha(1.0, 1.0), kernels.beta(1.0, 1.0, 2.0)  # no control step waits for the compiler
 
     def solve(self, problem: Problem) -> Solution:
         """Return the velocity of eq. 10, or J⁺ẋ without a pair in range; see `Solver.solve`."""
@@ -99,14 +100,14 @@ class Eq10:
         J_d = rows.J[closest]
         approach = float(J_d @ primary)
         literal = self.config.name == "eq10-literal"
-        d = rows.d[closest : closest + 1]
-        alpha = min(float(gains.alpha(d, rows.d2)[0]), self.config.alpha_cap)
+        d = float(rows.d[closest])
+        alpha = min(kernels.alpha(d, rows.d2), self.config.alpha_cap)
         if not literal and approach >= 0.0:
             alpha = 0.0
         switched = primary - alpha * approach * _row_inverse(J_d, damping=0.0)
         J_dN = null_space_part(J_d, problem.tracking)
         retreat_rate = self.config.retreat_speed - (approach if literal else float(J_d @ switched))
-        retreat = float(gains.beta(d, rows.d1, rows.d2)[0]) * retreat_rate * _row_inverse(J_dN, self.config.damping)
+        retreat = kernels.beta(d, rows.d1, rows.d2) * retreat_rate * _row_inverse(J_dN, self.config.damping)
         return Solution(switched + retreat)
 
 

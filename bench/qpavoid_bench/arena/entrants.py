@@ -71,7 +71,7 @@ def solver_entrant(
         description: what it is, in a line.
         solver: as in `eq10` or `qp:proxqp`, or with its settings.
         packages: what its back end needs.
-        changes: blocks of the scenario that it has its own way, as in `avoidance={"row": {"type": "cbf"}}`; what is
+        changes: blocks of the scenario that it has its own way, as in `avoidance={"row": {"type": "damper"}}`; what is
             not named of a block stays as it is.
     """
     config = parse_solver(solver) if isinstance(solver, str) else solver
@@ -142,16 +142,6 @@ ENTRANTS = {
         ),
         solver_entrant(
             "qp-damper", "QP with velocity damper rows, no backup trajectory", "qp", avoidance=_without_backup("damper")
-        ),
-        solver_entrant(
-            "qp-cbf", "QP with control barrier rows, no backup trajectory", "qp", avoidance=_without_backup("cbf")
-        ),
-        solver_entrant(
-            "qp-detour",
-            "QP with beta rows that tries detours round what stalls it, no backup trajectory",
-            "qp",
-            avoidance=_without_backup("beta"),
-            progress={"detour": {}},
         ),
         solver_entrant("qp:native", "QP, compiled active-set method", "qp:native", ("numba",)),
         solver_entrant("qp:daqp", "QP, back end daqp", "qp:daqp"),

@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike
 from qpavoid.errors import ConfigError
 from qpavoid.model.robot import Robot
 from qpavoid.problem import Array
-from qpavoid.safety.reachability import arm
 from qpavoid_bench.arena.families.inverse_kinematics import FrameGoal, JointRanges, solve_inverse_kinematics
 from qpavoid_bench.arena.families.parameters import Redraw
+from qpavoid_bench.arena.families.reach import arm
 from qpavoid_bench.arena.families.tool_path import ToolPath
 
 REST_TIME = 3.0

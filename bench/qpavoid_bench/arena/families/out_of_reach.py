@@ -6,7 +6,7 @@ import numpy as np
 
 from qpavoid.control.tasks.frames import FrameTask
 from qpavoid.model.robot import Robot
-from qpavoid.safety.reachability import arm, clearance
+from qpavoid_bench.arena.families.reach import arm, clearance
 from qpavoid_bench.arena.world import World
 
 

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from qpavoid.model.robot import Robot
-from qpavoid.safety.reachability import arm
 from qpavoid_bench.arena.families.arms import position_task, scenario_fields, straight_path
 from qpavoid_bench.arena.families.parameters import Draw
+from qpavoid_bench.arena.families.reach import arm
 from qpavoid_bench.arena.families.statics import fixed_obstacle, sideways_path
 from qpavoid_bench.arena.families.tool_path import path_motion
 
