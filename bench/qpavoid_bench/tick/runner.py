@@ -21,7 +21,6 @@ from qpavoid_bench.tick.libs import Library
 from qpavoid_bench.tick.workloads import Array, Workload
 
 PACKAGE = Path(__file__).resolve().parents[1]
-PLACO_ENVIRONMENT = Path("bench") / ".venv-placo"
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
 )
@@ -45,9 +44,9 @@ class Process:
     """A worker and the pipe to it."""
 
     def __init__(self, library: Library) -> None:
-        python = _placo_python() if library.own_python else sys.executable
-        own = [library.path or str(Path(qpavoid.__file__).parents[1])]
-        path = os.pathsep.join([*([] if library.own_python else own), str(PACKAGE.parent)])
+        python = os.environ.get(library.interpreter_variable, sys.executable)
+        own = [library.path or str(Path(qpavoid.__file__).parents[1])] * (python == sys.executable)
+        path = os.pathsep.join([*own, str(PACKAGE.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
         self._process = subprocess.Popen(
             [python, "-m", "qpavoid_bench.tick.worker", library.adapter],
             cwd=tempfile.gettempdir(),
@@ -264,14 +263,3 @@ class _Check:
             for frame, target in zip(workload.frames, workload.targets[tick], strict=True):
                 errors.append(np.linalg.norm(data.oMf[model.getFrameId(frame.name)].translation - target[:3, 3]))
         return float(np.median(errors))
-
-
-def _placo_python() -> str:
-    """Return the interpreter of placo's own environment, made on first use: placo needs an older pin."""
-    python = PLACO_ENVIRONMENT.resolve() / "bin" / "python"
-    if not (PLACO_ENVIRONMENT / "ready").exists():
-        print(f"making {PLACO_ENVIRONMENT} for placo", file=sys.stderr)
-        subprocess.run([sys.executable, "-m", "venv", "--clear", str(PLACO_ENVIRONMENT)], check=True)
-        subprocess.run([str(python), "-m", "pip", "install", "-qq", "placo"], check=True)
-        (PLACO_ENVIRONMENT / "ready").touch()
-    return str(python)

@@ -12,6 +12,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from qpavoid_bench.arena.libraries.settings import PLACO_PYTHON
+
 _OURS = (
     "Controller at its defaults; Task.gain = 1/dt, which is the dead beat that the others have by default; d1 = d_min, "
     "d2 = influence distance"
@@ -46,8 +48,8 @@ class Library:
     """Packages whose versions are reported."""
     closing_gain: float | None = None
     """ξ of its rows ḋ >= -(1 - β(d)) ξ (d - d_min), which its velocities are checked to respect [1/s]."""
-    own_python: bool = False
-    """Whether it needs an environment of its own."""
+    interpreter_variable: str = ""
+    """Environment variable that may name another Python interpreter that has its packages, as in the arena."""
     path: str | None = None
     """Folder whose `qpavoid` is run in place of this one."""
 
@@ -59,7 +61,7 @@ LIBRARIES = {
         Library("pink-all", "pinks:AllPairs", _PINK, ("pin-pink", "pin", "coal", "qpsolvers", "daqp", "numpy")),
         Library("pink-20", "pinks:Closest20", _PINK, ("pin-pink", "pin", "coal", "qpsolvers", "daqp", "numpy")),
         Library("mink", "minks:Mink", _MINK, ("mink", "mujoco", "qpsolvers", "daqp", "numpy")),
-        Library("placo", "placos:Placo", _PLACO, ("placo", "pin", "coal", "numpy"), own_python=True),
+        Library("placo", "placos:Placo", _PLACO, ("placo", "pin", "coal", "numpy"), interpreter_variable=PLACO_PYTHON),
     )
 }
 """In the order in which they take turns."""
