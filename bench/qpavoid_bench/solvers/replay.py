@@ -15,8 +15,7 @@ import qpsolvers
 
 from qpavoid import kernels
 from qpavoid.problem import Array
-from qpavoid.solvers.backends import Backend, backend_names, make_backend
-from qpavoid.solvers.backends import through_qpsolvers
+from qpavoid.solvers.backends import Backend, backend_names, make_backend, through_qpsolvers
 from qpavoid_bench.solvers.record import QP, REGULARIZATION, Run, Solve
 from qpavoid_bench.solvers.truth import Judgement, Truth, judge
 

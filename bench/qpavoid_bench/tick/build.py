@@ -13,7 +13,7 @@ import pinocchio as pin
 from qpavoid import Obstacle, Robot, Scene, build_scene
 from qpavoid.config import Box, Sphere
 from qpavoid_bench.tick.robots import ROBOTS, RobotSpec, load
-from qpavoid_bench.tick.workloads import Array, Body, Frame, Joint, Workload, pose
+from qpavoid_bench.tick.workloads import Array, Body, Joint, Workload
 
 DT = 0.01
 TICKS = 1000
@@ -65,7 +65,7 @@ def reference(scene: Scene, workload: Workload, ticks: Any) -> tuple[Array, Arra
     """Frames (k, f, 4, 4) and distances (k, m) at some ticks, by Pinocchio and coal."""
     model, geometry = scene.robot.model, scene.geometry
     data, bodies = model.createData(), geometry.createData()
-    ids = [model.getFrameId(frame.name) for frame in workload.frames]
+    ids = [model.getFrameId(name) for name, _, _ in workload.frames]
     frames, distances = [], []
     for tick in ticks:
         pin.updateGeometryPlacements(model, data, geometry, bodies, workload.q[tick])
@@ -86,11 +86,9 @@ def _build(name: str, count: int) -> Workload:
     obstacles = _scatter(robot, spec, q, count)
     scene = build_scene(robot, [_obstacle(body) for body in obstacles])
     model = robot.model
-    frames = tuple(
-        Frame(frame, model.frames[i].parentJoint, model.frames[i].placement.homogeneous)
-        for frame in spec.frames
-        for i in [model.getFrameId(frame)]
-    )
+    links = _links(model)
+    ids = [model.getFrameId(name) for name in spec.frames]
+    frames = [(model.frames[i].name, links[model.frames[i].parentJoint], model.frames[i].placement) for i in ids]
     workload = Workload(
         name="",
         robot=name,
@@ -98,12 +96,18 @@ def _build(name: str, count: int) -> Workload:
         d_min=D_MIN,
         dt=DT,
         nv=model.nv,
-        joints=_joints(robot),
-        bodies=tuple(_body(body) for body in robot.bodies.geometryObjects) + tuple(obstacles),
+        urdf=_urdf(model, links, frames),
+        floating=links[1] if spec.root_joint == "free_flyer" else "",
+        joints=tuple(
+            Joint(model.names[i], joint.idx_q, joint.idx_v, float(model.velocityLimit[joint.idx_v]))
+            for i, joint in enumerate(model.joints)
+            if i > 0 and joint.nv == 1
+        ),
+        bodies=(*(_body(body, links) for body in robot.bodies.geometryObjects), *obstacles),
         obstacles=count,
         pairs=np.array(scene.pairs),
         disabled_pairs=disabled,
-        frames=frames,
+        frames=tuple((frame, link, placement.homogeneous) for frame, link, placement in frames),
         q=q,
         targets=np.empty(0),
     )
@@ -126,8 +130,8 @@ def _swing(robot: Robot, spec: RobotSpec) -> Array:
     for joint in scalar:
         low, high = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
         amplitude[joint.idx_v] = min(amplitude[joint.idx_v], 0.3 * (high - low))
-        room = amplitude[joint.idx_v] + 0.02
-        home[joint.idx_q] = np.clip(home[joint.idx_q], low + room, high - room)
+        border = amplitude[joint.idx_v] + 0.02
+        home[joint.idx_q] = np.clip(home[joint.idx_q], low + border, high - border)
     angle = 2.0 * np.pi * np.arange(TICKS)[:, None] / TICKS * cycles + phase
     return np.array([pin.integrate(model, home, step) for step in amplitude * np.sin(angle)])
 
@@ -155,22 +159,23 @@ def _scatter(robot: Robot, spec: RobotSpec, q: Array, count: int) -> list[Body]:
     bodies: list[Body] = []
     while len(bodies) < count:
         near = len(bodies) < max(3, count // 10)
-        size = random.uniform(0.03, 0.08) if len(bodies) % 2 == 0 else random.uniform(0.05, 0.15, 3)
-        half = np.zeros(3) if np.ndim(size) == 0 else size / 2.0
-        inflate = float(size) if np.ndim(size) == 0 else 0.0
-        rotation = np.eye(3) if np.ndim(size) == 0 else _random_rotation(random)
+        pose, half, inflate = np.eye(4), np.zeros(3), 0.0
+        if len(bodies) % 2 == 0:
+            shape, size = "sphere", (inflate := random.uniform(0.03, 0.08),)
+        else:
+            shape, size = "box", tuple(random.uniform(0.05, 0.15, 3).tolist())
+            half, pose[:3, :3] = np.array(size) / 2.0, _random_rotation(random)
         if near:
             direction = random.normal(size=3)
-            reach = random.uniform(0.05, 0.4)
-            position = points[tools][random.integers(tools.sum())] + reach * direction / np.linalg.norm(direction)
+            distance = random.uniform(0.05, 0.4)
+            place = points[tools][random.integers(tools.sum())] + distance * direction / np.linalg.norm(direction)
         else:
-            position = center + spread * random.uniform(-1.0, 1.0, 3)
-        local = np.abs((points - position) @ rotation)
+            place = center + spread * random.uniform(-1.0, 1.0, 3)
+        pose[:3, 3] = place
+        local = np.abs((points - place) @ pose[:3, :3])
         gap = np.linalg.norm(np.maximum(local - half, 0.0), axis=1) - inflate - radius
-        if gap.min() < CLEARANCE or (near and gap[tools].min() > NEAR):
-            continue
-        shape, sides = ("sphere", (float(size),)) if np.ndim(size) == 0 else ("box", tuple(map(float, size)))
-        bodies.append(Body(f"obstacle{len(bodies)}", 0, shape, sides, pose(rotation, position)))
+        if gap.min() >= CLEARANCE and (not near or gap[tools].min() <= NEAR):
+            bodies.append(Body(f"obstacle{len(bodies)}", "world", shape, size, pose))
     return bodies
 
 
@@ -196,39 +201,48 @@ def _random_rotation(random: np.random.Generator) -> Array:
 
 
 def _obstacle(body: Body) -> Obstacle:
-    shape = Sphere(radius=body.size[0]) if body.shape == "sphere" else Box(size=body.size)
+    shape = Sphere(radius=body.size[0]) if body.shape == "sphere" else Box(size=body.size)  # type: ignore[arg-type]
     return Obstacle.at(body.name, shape, body.placement[:3, 3], body.placement[:3, :3])
 
 
-def _body(body: Any) -> Body:
-    half = getattr(body.geometry, "halfLength", None)
-    size = (body.geometry.radius,) if half is None else (body.geometry.radius, 2.0 * half)
-    return Body(body.name, body.parentJoint, "sphere" if half is None else "capsule", size, body.placement.homogeneous)
+def _body(body: Any, links: list[str]) -> Body:
+    half, radius = getattr(body.geometry, "halfLength", None), float(body.geometry.radius)
+    kind, size = ("sphere", (radius,)) if half is None else ("capsule", (radius, 2.0 * half))
+    return Body(body.name, links[body.parentJoint], kind, size, body.placement.homogeneous)
 
 
-def _joints(robot: Robot) -> tuple[Joint, ...]:
-    """The kinematic tree of a Pinocchio model."""
-    model = robot.model
+def _links(model: Any) -> list[str]:
+    """Return the name of the link that each joint moves."""
+    return ["world", *(f"link_{name}" for name in list(model.names)[1:])]
+
+
+def _urdf(model: Any, links: list[str], frames: list[tuple[str, str, Any]]) -> str:
+    """Return a URDF of a model's joints, and a fixed link for each frame; a floating base's link is the root."""
     data = model.createData()
     pin.computeJointJacobians(model, data, pin.neutral(model))
-    tree = [Joint("world", 0, "world", (0.0, 0.0, 0.0), np.eye(4), 0, 0, -np.inf, np.inf, np.inf)]
+    elements = []
     for i in range(1, model.njoints):
         joint = model.joints[i]
-        screw = np.asarray(data.joints[i].S).reshape(6, -1)[:, 0]
-        kind = "free" if joint.nv == 6 else "slide" if np.any(screw[:3]) else "hinge"
-        free = kind == "free"
-        tree.append(
-            Joint(
-                name=model.names[i],
-                parent=model.parents[i],
-                kind=kind,
-                axis=tuple(screw[:3] if kind == "slide" else screw[3:]),
-                placement=model.jointPlacements[i].homogeneous,
-                q_index=joint.idx_q,
-                v_index=joint.idx_v,
-                lower=-np.inf if free else float(model.lowerPositionLimit[joint.idx_q]),
-                upper=np.inf if free else float(model.upperPositionLimit[joint.idx_q]),
-                velocity=np.inf if free else float(model.velocityLimit[joint.idx_v]),
-            )
-        )
-    return tuple(tree)
+        if joint.nv == 6:
+            links = [links[i], *links[1:]]  # of what is fixed to the world there is nothing
+            continue
+        screw = np.asarray(data.joints[i].S).reshape(6)
+        kind, axis = ("prismatic", screw[:3]) if np.any(screw[:3]) else ("revolute", screw[3:])
+        low, high = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
+        limit = f'<limit lower="{low}" upper="{high}" velocity="{model.velocityLimit[joint.idx_v]}" effort="1e6"/>'
+        axes = f'<axis xyz="{_numbers(axis)}"/>{limit}'
+        elements.append(_joint(model.names[i], kind, links[model.parents[i]], links[i], model.jointPlacements[i], axes))
+    for name, link, placement in frames:
+        elements.append(_joint(f"to_{name}", "fixed", link, name, placement, ""))
+    names = dict.fromkeys([*links, *(name for name, _, _ in frames)])
+    return "\n".join(['<robot name="workload">', *(f'<link name="{name}"/>' for name in names), *elements, "</robot>"])
+
+
+def _joint(name: str, kind: str, parent: str, child: str, placement: Any, inner: str) -> str:
+    xyz, rpy = _numbers(placement.translation), _numbers(pin.rpy.matrixToRpy(placement.rotation))
+    links = f'<parent link="{parent}"/><child link="{child}"/>'
+    return f'<joint name="{name}" type="{kind}">{links}<origin xyz="{xyz}" rpy="{rpy}"/>{inner}</joint>'
+
+
+def _numbers(values: Any) -> str:
+    return " ".join(repr(float(value)) for value in values)

@@ -260,6 +260,6 @@ class _Check:
         data, errors = model.createData(), []
         for tick, v in zip(CHECK_TICKS, velocities, strict=True):
             pin.framesForwardKinematics(model, data, pin.integrate(model, workload.q[tick], v * workload.dt))
-            for frame, target in zip(workload.frames, workload.targets[tick], strict=True):
-                errors.append(np.linalg.norm(data.oMf[model.getFrameId(frame.name)].translation - target[:3, 3]))
+            for (name, _, _), target in zip(workload.frames, workload.targets[tick], strict=True):
+                errors.append(np.linalg.norm(data.oMf[model.getFrameId(name)].translation - target[:3, 3]))
         return float(np.median(errors))

@@ -1,7 +1,7 @@
 """A workload as plain data: what every library is given, whatever it is built on. Needs numpy only.
 
-Units are m, rad and s; poses are 4x4 matrices in world axes; configurations and velocities follow Pinocchio's
-conventions (a free joint has x y z qx qy qz qw, and its velocity is in its own axes).
+Units are m, rad and s; poses are 4x4 matrices; configurations and velocities follow Pinocchio's conventions (a floating
+base has x y z qx qy qz qw, and its velocity is in its own axes; its coordinates come first).
 """
 
 from __future__ import annotations
@@ -16,44 +16,27 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Joint:
-    """One joint; the list is sorted so that parents come first, and number 0 is the world."""
-
-    name: str
-    parent: int
-    kind: str
-    """world, free, hinge or slide."""
-    axis: tuple[float, float, float]
-    placement: Array
-    """(4, 4) in the parent joint."""
-    q_index: int
-    v_index: int
-    lower: float
-    upper: float
-    velocity: float
-    """Largest speed; infinite where there is none."""
-
-
-@dataclass(frozen=True)
 class Body:
     """A capsule (radius, length between the caps), sphere (radius) or box (full sides)."""
 
     name: str
-    joint: int
+    link: str
+    """Link of the URDF; `world` for an obstacle."""
     shape: str
     size: tuple[float, ...]
     placement: Array
-    """(4, 4) in the joint."""
+    """(4, 4) in the link."""
 
 
 @dataclass(frozen=True)
-class Frame:
-    """A frame with a pose task."""
+class Joint:
+    """A hinge or slide."""
 
     name: str
-    joint: int
-    placement: Array
-    """(4, 4) in the joint."""
+    q_index: int
+    v_index: int
+    speed: float
+    """Its limit; infinite where there is none."""
 
 
 @dataclass(frozen=True)
@@ -65,21 +48,26 @@ class Workload:
     influence: float
     """Distance below which a pair is constrained [m]."""
     d_min: float
-    """Distance that is held [m]."""
+    """Safety distance [m]."""
     dt: float
     """Control period [s]."""
     nv: int
+    urdf: str
+    """Joints and frames, without geometry; each joint moves a link `link_JOINT`."""
+    floating: str
+    """Root link, which a floating base moves; empty without one."""
     joints: tuple[Joint, ...]
     bodies: tuple[Body, ...]
     """The robot's, then the obstacles."""
     obstacles: int
-    pairs: Array
+    pairs: NDArray[np.intp]
     """(m, 2) indices of bodies."""
     disabled_pairs: tuple[tuple[str, str], ...]
     """Pairs of neighbouring bodies that are left out."""
-    frames: tuple[Frame, ...]
+    frames: tuple[tuple[str, str, Array], ...]
+    """Name, link and (4, 4) placement in it of each frame with a pose task."""
     q: Array
-    """(T, nq) recorded configurations, one a tick."""
+    """(T, nq) recorded configurations, one a step."""
     targets: Array
     """(T, f, 4, 4) where each frame should be one period later."""
     variant: str = ""
@@ -87,13 +75,5 @@ class Workload:
 
     @property
     def boxes(self) -> Any:
-        """(m,) whether a pair needs an iterative algorithm: it has a box in it."""
-        box = np.array([body.shape == "box" for body in self.bodies])
-        return box[self.pairs].any(axis=1)
-
-
-def pose(rotation: Array, translation: Array) -> Array:
-    """(4, 4) of a rotation and a translation."""
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, translation
-    return matrix
+        """Return for each pair (m,) whether it needs an iterative algorithm: it has a box in it."""
+        return np.array([body.shape == "box" for body in self.bodies])[self.pairs].any(axis=1)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from qpavoid import Avoidance, Controller, Pose, Sample, build_tasks
 from qpavoid.config import Task
 from qpavoid_bench.tick.build import make_scene, reference
@@ -22,8 +24,10 @@ class Recorded:
     def __init__(self, workload: Workload) -> None:
         self.workload, self.scene = workload, make_scene(workload)
         is_held = workload.variant == "held"
-        gain = {} if is_held else {"gain": 1.0 / workload.dt}
-        tasks = [Task(frame=frame.name, type="pose", **gain) for frame in workload.frames]
+        names = [name for name, _, _ in workload.frames]
+        tasks = [Task(frame=name, type="pose") for name in names]
+        if not is_held:
+            tasks = [Task(frame=name, type="pose", gain=1.0 / workload.dt) for name in names]
         self.controller = Controller(
             self.scene,
             build_tasks(tasks, self.scene.robot, workload.q[0]),
@@ -33,7 +37,6 @@ class Recorded:
         )
         self._q = list(workload.q)
         self._steps = 0
-        names = [frame.name for frame in workload.frames]
         self._targets: list[Any] = [None] * len(self._q)
         if not is_held:
             self._targets = [
@@ -61,14 +64,14 @@ class Recorded:
         """Return the `Problem` of a control step."""
         return self.controller.tick(self._q[tick], None, self._targets[tick], self._obstacles).problem
 
-    def velocity(self, v: Any) -> Array:
+    def velocity(self, v: Array) -> Array:
         """As it is."""
         return v
 
     def frames(self, tick: int) -> Array:
         """By Pinocchio on this scene's model."""
-        return reference(self.scene, self.workload, [tick])[0][0]
+        return np.asarray(reference(self.scene, self.workload, [tick])[0][0])
 
     def distances(self, tick: int) -> Array:
         """By coal on this scene's geometry."""
-        return reference(self.scene, self.workload, [tick])[1][0]
+        return np.asarray(reference(self.scene, self.workload, [tick])[1][0])

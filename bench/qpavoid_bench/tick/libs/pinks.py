@@ -31,7 +31,7 @@ class AllPairs:
         pairs = len(workload.pairs)
         count = pairs if self.count is None else min(self.count, pairs)
         self.barriers = [SelfCollisionBarrier(count, d_min=workload.d_min)] if count else []
-        self.tasks = [FrameTask(frame.name, position_cost=1.0, orientation_cost=1.0) for frame in workload.frames]
+        self.tasks = [FrameTask(name, position_cost=1.0, orientation_cost=1.0) for name, _, _ in workload.frames]
         self._targets = [[pin.SE3(target) for target in targets] for targets in workload.targets]
 
     def step(self, tick: int) -> Array:
@@ -39,7 +39,8 @@ class AllPairs:
         for task, target in zip(self.tasks, self._targets[tick], strict=True):
             task.set_target(target)
         self.configuration.update(self._q[tick])
-        return pink.solve_ik(self.configuration, self.tasks, self.workload.dt, solver="daqp", barriers=self.barriers)
+        v = pink.solve_ik(self.configuration, self.tasks, self.workload.dt, solver="daqp", barriers=self.barriers)
+        return np.asarray(v)
 
     def velocity(self, v: Any) -> Array:
         """As it is."""
@@ -48,8 +49,9 @@ class AllPairs:
     def frames(self, tick: int) -> Array:
         """Of Pink's configuration."""
         self.configuration.update(self._q[tick])
-        frames = self.workload.frames
-        return np.array([self.configuration.get_transform_frame_to_world(f.name).homogeneous for f in frames])
+        return np.array(
+            [self.configuration.get_transform_frame_to_world(task.frame).homogeneous for task in self.tasks]
+        )
 
     def distances(self, tick: int) -> Array:
         """Of Pink's configuration."""
