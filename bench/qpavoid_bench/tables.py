@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-RESULTS = Path("bench") / "results"
+_OF_CHECKOUT = Path("bench") / "results"
+RESULTS = _OF_CHECKOUT if _OF_CHECKOUT.is_dir() else Path("out") / "bench"
 """Folder of results below the working directory, if a command is given no other."""
 
 

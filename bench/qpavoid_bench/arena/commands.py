@@ -1,4 +1,4 @@
-"""Command line: `qpavoid bench run | smoke | report | show | list | tick | solvers | endurance`.
+"""Command line: `qpavoid bench run | smoke | report | show | list | tick | solvers | endurance | robots`.
 
 Dependencies of a command are imported when it runs.
 """
@@ -19,6 +19,7 @@ from qpavoid.run.report import to_json
 from qpavoid.run.terminal import ERR, OUT, names_of, progress, terminate_like_interrupt
 from qpavoid_bench.endurance.command import endurance
 from qpavoid_bench.solvers.command import solvers
+from qpavoid_bench.survey import robots
 from qpavoid_bench.tick.command import tick
 
 if TYPE_CHECKING:
@@ -34,9 +35,12 @@ app = typer.Typer(
     help="Compare solvers on families of scenarios: the arena.",
 )
 
-_MEASURES = {"tick": tick, "solvers": solvers, "endurance": endurance}
-for _name, _measure in _MEASURES.items():
-    app.command(_name)(_measure)
+app.command()(tick)
+app.command()(solvers)
+app.command()(endurance)
+app.command()(robots)
+_MEASURES = ("tick", "solvers", "endurance", "robots")
+"""Commands that need none of the packages below."""
 
 _PACKAGES = ("distributed", "pyarrow", "mujoco", "jinja2", "matplotlib")
 

@@ -162,13 +162,14 @@ def near_rows(model: MujocoModel, q: Array, t: float, pairs: Any, max_distance: 
     first, second = scene.pairs.T
     centers, radius = model.poses()[0], mujoco_model.geom_rbound[model.geoms]
     gap = np.linalg.norm(centers[first] - centers[second], axis=1) - radius[first] - radius[second]
-    found, distance, points = [], [], np.empty((len(gap), 6))
-    for pair in np.flatnonzero(pairs & (gap < max_distance)).tolist():
-        d = model.distance(pair, points[len(found)])
-        if 0.0 < d < max_distance:
-            found.append(pair)
-            distance.append(d)
-    pair, d, ends = np.array(found, dtype=np.intp), np.array(distance), points[: len(found)].reshape(-1, 2, 3)
+    found: list[tuple[int, float]] = []
+    points = np.empty((len(gap), 6))
+    for candidate in np.flatnonzero(pairs & (gap < max_distance)).tolist():
+        distance = model.distance(candidate, points[len(found)])
+        if 0.0 < distance < max_distance:
+            found.append((candidate, distance))
+    pair, d = np.array([p for p, _ in found], dtype=np.intp), np.array([distance for _, distance in found])
+    ends = points[: len(found)].reshape(-1, 2, 3)
     normal = (ends[:, 1] - ends[:, 0]) / d[:, None]
     jacobian = np.zeros((len(found), 2, 3, mujoco_model.nv))
     velocity = np.zeros((len(found), 3))

@@ -94,5 +94,5 @@ def _sections(steps: int, timed: int, runs: int, states: int) -> Iterator[str]:
             found = _measure("throughput", scenario, runs, states, processes)
             base = base or found
             cells = [f"{found[part]:,.0f} ({found[part] / base[part]:.2f})" for part in ("sweep", "states")]
-            rows.append([scenario, processes or "a loop in this process", *cells])
+            rows.append([scenario, str(processes) if processes else "a loop in this process", *cells])
     yield table(["scenario", "processes", "sweep", "states"], rows)

@@ -90,8 +90,8 @@ def _humanoid(every: int) -> Run:
 def _qp(problem: Problem) -> QP:
     A, rows, v = np.array(problem.tracking.A), problem.avoidance, np.array(tracking_velocity(problem))
     P = A.T @ A + REGULARIZATION * np.eye(A.shape[1])
-    sides = (np.array(side) for side in (rows.b, problem.lower, problem.upper))
-    return QP(P, -P @ v, np.array(rows.J, order="C"), *sides, A, v)
+    h, lower, upper = (np.array(side) for side in (rows.b, problem.lower, problem.upper))
+    return QP(P, -P @ v, np.array(rows.J, order="C"), h, lower, upper, A, v)
 
 
 Solve = Callable[[QP], "Array | None"]

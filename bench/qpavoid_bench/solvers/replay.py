@@ -7,6 +7,7 @@ import gc
 import os
 import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from time import perf_counter_ns
 from typing import NamedTuple
 
@@ -15,7 +16,7 @@ import qpsolvers
 
 from qpavoid import kernels
 from qpavoid.problem import Array
-from qpavoid.solvers.backends import Backend, backend_names, make_backend, through_qpsolvers
+from qpavoid.solvers.backends import backend_names, make_backend, through_qpsolvers
 from qpavoid_bench.solvers.record import QP, REGULARIZATION, Run, Solve
 from qpavoid_bench.solvers.truth import Judgement, Truth, judge
 
@@ -36,11 +37,10 @@ def contestants() -> dict[str, Callable[[float], Solve]]:
     v and the displacement v dt as the unknown.
     """
     makers: dict[str, Callable[[float], Solve]] = {"native": lambda dt: _native}
-    for name in backend_names():
-        makers[name] = lambda dt, name=name: _backend(make_backend(name))
+    makers.update({name: partial(_shipped, name) for name in backend_names()})
     for name in sorted(qpsolvers.available_solvers):
-        makers[f"{name}, defaults"] = lambda dt, name=name: _backend(through_qpsolvers(name, {}))
-        makers[f"{name}, defaults, v dt"] = lambda dt, name=name: _backend(through_qpsolvers(name, {}), dt)
+        makers[f"{name}, defaults"] = partial(_at_defaults, name, False)
+        makers[f"{name}, defaults, v dt"] = partial(_at_defaults, name, True)
     return makers
 
 
@@ -50,12 +50,16 @@ def _native(qp: QP) -> Array | None:
     return x if solved else None
 
 
-def _backend(backend: Backend, unit: float = 1.0) -> Solve:
-    """Return a back end whose unknown is the velocity times `unit`."""
+def _shipped(name: str, dt: float) -> Solve:
+    backend = make_backend(name)
+    return lambda qp: backend(*qp[:6])
+
+
+def _at_defaults(name: str, is_displacement: bool, dt: float) -> Solve:
+    """Return a solver at its own default tolerances, whose unknown is the velocity or the displacement."""
+    backend, unit = through_qpsolvers(name, {}), dt if is_displacement else 1.0
 
     def solve(qp: QP) -> Array | None:
-        if unit == 1.0:
-            return backend(*qp[:6])
         x = backend(qp.P, qp.q * unit, qp.G, qp.h * unit, qp.lower * unit, qp.upper * unit)
         return None if x is None else x / unit
 

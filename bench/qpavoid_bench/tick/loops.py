@@ -160,7 +160,7 @@ def _far(kind: str, count: str) -> Loop:
 
 def _scattered(shape: str) -> list[dict[str, Any]]:
     """Return 20 obstacles of one shape around the tool of a Panda in its home pose, 9 to 25 cm off its centre."""
-    random, obstacles = np.random.default_rng(2), []
+    random, obstacles = np.random.default_rng(2), list[dict[str, Any]]()
     while len(obstacles) < 20:
         direction = random.normal(size=3)
         offset = random.uniform(0.2, 0.3) * direction / np.linalg.norm(direction)

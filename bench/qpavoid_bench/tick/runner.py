@@ -178,7 +178,7 @@ def _measure(
     workload = build.build(name) if build.is_recorded(name) else None
     is_ours = workload is None or bool(workload.variant)
     libraries = [library for library in libraries if not is_ours or library.adapter.startswith("ours:")]
-    cells, pace = {library.name: Cell() for library in libraries}, {}
+    cells, pace = {library.name: Cell() for library in libraries}, dict[str, float]()
     check = _Check(workload) if workload else None
     for library in libraries:
         process = processes[library.name]
@@ -191,17 +191,17 @@ def _measure(
             cells[library.name].refused = str(error)
     for number in range(rounds):
         window = [(number * ticks + i) % build.TICKS for i in range(-WARM_UP, ticks)]
-        for library in list(pace):
-            count = int(np.clip(budget / pace[library], 3, ticks))
+        for timed in list(pace):
+            count = int(np.clip(budget / pace[timed], 3, ticks))
             chosen = window[:WARM_UP] + window[WARM_UP :: -(-ticks // count)]
             warm_up = min(WARM_UP, count // 3)
             try:
-                times = processes[library].ask("round", ticks=chosen[WARM_UP - warm_up :], warmup=warm_up)
+                times = processes[timed].ask("round", ticks=chosen[WARM_UP - warm_up :], warmup=warm_up)
             except LibraryError as error:
-                cells[library] = Cell(refused=f"in round {number}: {error}")
-                del pace[library]
+                cells[timed] = Cell(refused=f"in round {number}: {error}")
+                del pace[timed]
                 continue
-            cells[library].rounds.append(times)
+            cells[timed].rounds.append(times)
         print(".", end="", file=sys.stderr, flush=True)
     return Row(name, workload, check.in_range if check else np.nan, cells)
 

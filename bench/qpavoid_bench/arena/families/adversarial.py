@@ -106,7 +106,7 @@ def _is_clear(
 ) -> bool:
     """Return whether an obstacle is clear of bodies at the start, and of immovable ones until the end [s]."""
     config = ObstacleConfig.model_validate(obstacle)
-    motion, shape = build_motion(config.motion, None, Path()), make_shape(config.shape)
+    motion, shape = build_motion(config.motion, None, Path()), make_shape(config.shape)  # type: ignore[arg-type]
 
     def is_apart(t: float, others: list[PlacedShape]) -> bool:
         pose = motion.sample(t)

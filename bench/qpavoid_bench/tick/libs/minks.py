@@ -96,11 +96,16 @@ def build(workload: Workload) -> Any:
 
 
 def _shape(body: Body) -> dict[str, Any]:
-    kinds = {"sphere": mujoco.mjtGeom.mjGEOM_SPHERE, "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE}
+    """Return kind and size of a geom: half lengths, where a body has whole ones."""
     size = np.zeros(3)
-    size[: len(body.size)] = body.size
-    size *= {"sphere": 1.0, "capsule": np.array([1.0, 0.5, 1.0]), "box": 0.5}[body.shape]
-    return {"type": kinds.get(body.shape, mujoco.mjtGeom.mjGEOM_BOX), "size": size}
+    match body.shape:
+        case "sphere":
+            kind, size[0] = mujoco.mjtGeom.mjGEOM_SPHERE, body.size[0]
+        case "capsule":
+            kind, size[:2] = mujoco.mjtGeom.mjGEOM_CAPSULE, (body.size[0], 0.5 * body.size[1])
+        case _:
+            kind, size[:] = mujoco.mjtGeom.mjGEOM_BOX, 0.5 * np.array(body.size)
+    return {"type": kind, "size": size}
 
 
 def _placed(placement: Array) -> dict[str, Array]:
