@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import qpsolvers
 
-from qpavoid import kernels
+from qpavoid.kernels import project
 from qpavoid.problem import Array
 from qpavoid.solvers.backends import backend_names, make_backend, through_qpsolvers
 from qpavoid_bench.solvers.record import QP, REGULARIZATION, Run, Solve
@@ -46,7 +46,7 @@ def contestants() -> dict[str, Callable[[float], Solve]]:
 
 def _native(qp: QP) -> Array | None:
     """Solve in compiled code, as the `qp` solver does."""
-    x, solved = kernels.project(qp.A, REGULARIZATION, qp.v, qp.G, qp.h, qp.lower, qp.upper)
+    x, solved = project(qp.A, REGULARIZATION, qp.v, qp.G, qp.h, qp.lower, qp.upper)
     return x if solved else None
 
 

@@ -81,7 +81,7 @@ def _build(name: str, count: int) -> Workload:
     spec = ROBOTS[name]
     robot = load(spec)
     q = _swing(robot, spec)
-    disabled = _too_close(robot, q)
+    disabled = close_pairs(robot, q)
     robot = load(spec, disabled)
     obstacles = _scatter(robot, spec, q, count)
     scene = build_scene(robot, [_obstacle(body) for body in obstacles])
@@ -136,8 +136,8 @@ def _swing(robot: Robot, spec: RobotSpec) -> Array:
     return np.array([pin.integrate(model, home, step) for step in amplitude * np.sin(angle)])
 
 
-def _too_close(robot: Robot, q: Array) -> tuple[tuple[str, str], ...]:
-    """Pairs of the robot's own bodies that come nearer than the clearance: enclosing capsules of neighbours."""
+def close_pairs(robot: Robot, q: Array) -> tuple[tuple[str, str], ...]:
+    """Return pairs of the robot's own bodies that come nearer than the clearance in every fifth of q (T, nq)."""
     geometry = robot.bodies
     data, bodies = robot.model.createData(), geometry.createData()
     closest = np.full(len(geometry.collisionPairs), np.inf)

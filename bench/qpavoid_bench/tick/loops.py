@@ -26,10 +26,11 @@ from qpavoid import (
     build_tasks,
 )
 from qpavoid.config import PointCloud, Task
-from qpavoid_bench.tick.robots import SHARE
+from qpavoid_bench.tick.build import close_pairs
+from qpavoid_bench.tick.robots import ROBOTS, SHARE
 from qpavoid_bench.tick.workloads import Array
 
-TCP = "panda_hand_tcp"
+PANDA, TCP = ROBOTS["panda"], "panda_hand_tcp"
 LAP = 1000
 """Control steps after which everything in `circling` repeats."""
 DT = 0.01
@@ -188,8 +189,10 @@ def _swing(robot: Robot, obstacles: list[Obstacle], updates: Any = None, every: 
 
 def _bodies(kind: str) -> Loop:
     """Return a Panda with capsules around its meshes, their hulls, or the triangle meshes themselves."""
-    fingers = {"panda_finger_joint1": 0.0, "panda_finger_joint2": 0.0}
-    return _swing(Robot.from_urdf(SHARE / "panda_description/urdf/panda.urdf", bodies=kind, lock=fingers), [])
+    fields = {"bodies": kind, "lock": {"panda_finger_joint1": 0.0, "panda_finger_joint2": 0.0}, "home": PANDA.home}
+    robot = Robot.from_urdf(SHARE / PANDA.urdf, **fields)
+    touching = close_pairs(robot, robot.home[None])
+    return _swing(Robot.from_urdf(SHARE / PANDA.urdf, disabled_pairs=touching, **fields), [])
 
 
 def _cloud(count: int) -> Loop:
