@@ -4,7 +4,7 @@ from qpavoid.config import Avoidance, Limits, Progress, ScenarioConfig, Sensing
 from qpavoid.config.loading import load_scenario
 from qpavoid.control.contacts import build_contacts
 from qpavoid.control.poses import Pose
-from qpavoid.control.tasks.frames import build_tasks
+from qpavoid.control.tasks import build_tasks
 from qpavoid.control.tick import Tick
 from qpavoid.controller import Controller
 from qpavoid.errors import ConfigError, NumericalError, QpavoidError, SolverNotInstalled, UnknownName

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from copy import copy
 from time import perf_counter
 from typing import Any
 
@@ -21,7 +20,7 @@ from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.control.poses import Pose
 from qpavoid.control.scenario import build_parts
 from qpavoid.control.targets import TargetReader
-from qpavoid.control.tasks.frames import AnyTask, in_order
+from qpavoid.control.tasks import RowTask, in_order
 from qpavoid.control.tick import Tick, copied
 from qpavoid.errors import ConfigError, NumericalError, UnknownName, located, nearest
 from qpavoid.model.cloud import Points
@@ -43,7 +42,7 @@ class Controller(Pipeline):
     def __init__(
         self,
         scene: Scene,
-        tasks: Sequence[AnyTask],
+        tasks: Sequence[RowTask],
         solver: Solver | str = "qp",
         dt: float = 0.01,
         avoidance: Avoidance | None = None,
@@ -75,17 +74,16 @@ class Controller(Pipeline):
         if not 0.0 < dt <= _MAX_DT:
             raise ConfigError(f"dt: {dt} s, expected more than 0 and at most {_MAX_DT}; it is in seconds")
         frames, others = in_order(tasks)
-        others = [copy(task) for task in others]  # each writes into the memory of its own controller
         self.scene, self.dt, model = scene, dt, scene.robot.model
-        self.tasks: tuple[AnyTask, ...] = (*frames, *others)
+        self.tasks: tuple[RowTask, ...] = (*frames, *others)
         """Frames with a position to follow, then with an orientation alone, then all other tasks."""
         law, self._contacts = make_solver(solver) if isinstance(solver, str) else solver, contacts is not None
         check_solver(law, solver, self._contacts)
         self.avoidance, self.limits = avoidance or Avoidance(), limits or Limits()
-        more = [i for task in others for i in task.frame_ids] + list(contacts.frame_ids if contacts else ())
-        self._kinematics = ForwardKinematics(model, [*(task.frame_id for task in frames), *more])
+        frame_ids = [i for task in self.tasks for i in task.frame_ids] + list(contacts.frame_ids if contacts else ())
+        self._kinematics = ForwardKinematics(model, frame_ids)
         self._query = DistanceQuery(scene)
-        self._v_shape, self._clock, self._others = (model.nv,), Clock(dt), others
+        self._v_shape, self._clock = (model.nv,), Clock(dt)
         self._obstacles = ObstacleTracker(scene.obstacles, sensing or Sensing(), dt)
         self._influence_distance = self.avoidance.d2 - self.avoidance.offset
         self._bounds = scene.robot.bounds().within(self.limits)
@@ -220,8 +218,7 @@ class Controller(Pipeline):
         built = self._build(self._arguments.read(q, t, targets, obstacles, v))
         state = State(built[0].copy(), self._assembly.v_prev.copy(), built[1])
         solution = self._solve(built, begin)
-        kinematics = copied(self._assembly.kinematics)
-        errors = np.array([task.error for task in self._others])
+        errors, kinematics = self._assembly.task_errors.copy(), copied(self._assembly.kinematics)
         return Tick(state, tuple(built[2]), errors, kinematics, copied(built[3]), copied(built[4]), solution)
 
     def filter(

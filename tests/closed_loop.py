@@ -82,15 +82,15 @@ class Ruler:
 
     def __init__(self, scene):
         self.scene, self.model = scene, scene.robot.model
-        self._data, self._query = self.model.createData(), DistanceQuery(scene)
+        self.data, self.query = self.model.createData(), DistanceQuery(scene)
 
     def distances(self, q, samples=None):
         """(m,) at q, infinite beyond 10 m, with obstacles by number at `samples`."""
         for index, sample in (samples or {}).items():
-            self._query.place_obstacle(index, sample)
-        pin.forwardKinematics(self.model, self._data, q)
-        self._query.compute(self._data, 10.0)
-        return self._query.found(np.arange(len(self.scene.pairs))).copy()
+            self.query.place_obstacle(index, sample)
+        pin.forwardKinematics(self.model, self.data, q)
+        self.query.compute(self.data, 10.0)
+        return self.query.found(np.arange(len(self.scene.pairs))).copy()
 
     def least_between(self, q, v, dt, t, steps=10):
         """Least distance on the way from q at v for dt, obstacles on their motions from t on."""

@@ -1,5 +1,6 @@
 """Robots, random scenes and finite differences shared by the tests."""
 
+import functools
 import os
 import sys
 import warnings
@@ -9,16 +10,17 @@ import pinocchio as pin
 import pytest
 from hypothesis import settings
 
-from qpavoid import Controller, Obstacle, Robot, Sample, build_scene, config, load_scenario
+from qpavoid import Controller, Obstacle, Robot, Sample, build_scene, build_tasks, config, load_scenario
 from qpavoid.cli import main
 from qpavoid.config.shipped import example_robot_data
 from qpavoid.control.assembler import Assembly
 from qpavoid.control.distances import DistanceQuery
-from qpavoid.control.tasks.frames import in_order
+from qpavoid.control.row_layout import lay_out
+from qpavoid.control.tasks import in_order
 from qpavoid.control.trajectories import as_samples, put
 from qpavoid.kernels.cache import FOLDER
-from qpavoid.kernels.layout import RowLayout
 from qpavoid.model.kinematics import ForwardKinematics
+from qpavoid.model.limits import JointBounds, limit_layout
 from qpavoid.model.trajectory import build_motion
 
 settings.register_profile("patient", deadline=None)  # the first call of a compiled function may wait for the compiler
@@ -130,7 +132,7 @@ class Bench:
         self.robot, self.tasks = scene.robot, tuple(tasks)
         self.kinematics = ForwardKinematics(
             scene.robot.model,
-            [i for task in tasks for i in (task.frame_ids if hasattr(task, "frame_ids") else (task.frame_id,))],
+            [i for task in tasks for i in task.frame_ids],
         )
         self.query = query or DistanceQuery(scene)
         self.assembly = Assembly(
@@ -147,49 +149,69 @@ class Bench:
             put(view, target)
         return self.assembly.compute(np.asarray(q), targets, self.query, reach)
 
+    def rows(self, q, targets=None):
+        """A and b of the tasks at q, copied."""
+        tracking = self.compute(q, targets, reach=-1.0)[1].tracking
+        return tracking.A.copy(), tracking.b.copy()
 
-def make_layout(nv, frames=0, turns=(), pairs=0, obstacles=0, joints=1, **fields):
-    """Memory of a tick in which all inputs but `fields` are zero or without effect, and all outputs NaN."""
-    rows = 3 * (frames + len(turns))
-    row_wrenches = np.zeros((rows, 6))
-    row_wrenches[: 3 * frames, :3] = np.tile(np.eye(3), (frames, 1))
-    row_wrenches[3 * frames :, 3:] = np.tile(np.eye(3), (len(turns), 1))
-    none = np.zeros(0, dtype=np.intp)
-    inputs = {
-        "J_world": np.zeros((6, nv), order="F"), "columns": np.arange(nv), "has_mimics": False,
-        "unfolded_row": np.zeros(nv),
-        "frame_poses": np.zeros((frames, 12)),
-        "frame_ids": np.arange(frames), "targets": np.zeros((frames, 18)), "oriented": np.array(turns, dtype=np.intp),
-        "gain": np.ones(frames), "cap": np.full(frames + len(turns), np.inf), "scale": np.ones(rows),
-        "task_support": np.ones((rows, nv)), "row_wrenches": row_wrenches, "results": np.zeros((pairs, 10)),
-        "support": np.ones((pairs, nv)), "twists": np.zeros((obstacles + 1, 6)),
-        "twist_row": np.full(pairs, obstacles), "margin": np.zeros(obstacles + 1),
-        "distance_allowance": np.zeros(pairs),
-        "joint_poses": np.zeros((joints, 12)), "joint_radius": np.zeros(joints),
-        "parents": np.maximum(np.arange(joints) - 1, 0), "column_joints": np.full(nv, joints - 1),
-        "chain_rotation": np.ones((1, nv)), "chain_translation": np.zeros((1, nv)), "lever_arm": 1.0,
-        "bodies": np.zeros((pairs, 2), dtype=np.intp), "body_poses": np.zeros((1, 12)), "boxes": np.zeros((1, 6)),
-        "convex": np.zeros(pairs, dtype=bool),
-        "moved_by": np.zeros((pairs, 2), dtype=np.intp), "speeds": np.zeros(joints + obstacles),
-        "q_index": none, "v_index": none, "q_lower": np.zeros(0),
-        "q_upper": np.zeros(0), "v_max": np.full(nv, np.inf), "v_step": np.full(nv, np.inf), "v_prev": np.zeros(nv),
-        "dv_step": np.full(nv, np.inf), "dv_prev": np.zeros(nv), "jerk_limited": False, "looks_ahead": True,
-        "damping": 0.0, "offset": 0.0, "safety_distance": 0.1, "row_gain": 5.0,
-        "recovery_speed": 0.2, "beta": True, "d1": 0.1,
-        "task_switching": False, "retreat_speed": 0.0, "alpha_cap": 50.0, "d2": 0.3, "position_rate": 50.0, "dt": 0.01,
-        "acceleration_limited": False,
+
+def task_bench(robot, *blocks, **settings):
+    """Tasks of a robot without anything else around them."""
+    return Bench(build_scene(robot), build_tasks(blocks, robot, robot.home), **settings)
+
+
+_DATA = {}
+
+
+def frames(robot, names, q):
+    """Placements (SE3) of some frames, on data of their own: making these takes longer than using them."""
+    if robot.name not in _DATA or _DATA[robot.name][0] is not robot.model:
+        _DATA[robot.name] = robot.model, robot.model.createData()
+    model, data = _DATA[robot.name]
+    pin.framesForwardKinematics(model, data, q)
+    return [data.oMf[robot.model.getFrameId(name)].copy() for name in names]
+
+
+def lay_out_step(scene, tasks=(), damping=0.0, dt=0.01, avoidance=None, limits=None, query=None):
+    """Memory of a control step, as a controller lays it out, and the kinematics and distances that it looks into."""
+    frames, others = in_order(tasks)
+    kinematics = ForwardKinematics(scene.robot.model, [i for task in tasks for i in task.frame_ids])
+    query, limits = query or DistanceQuery(scene), limits or config.Limits()
+    bounds = scene.robot.bounds().within(limits)
+    settings = avoidance or config.Avoidance()
+    return lay_out(scene, frames, others, bounds, kinematics, query, settings, limits, damping, dt), kinematics, query
+
+
+def make_layout(nv, pairs=0, obstacles=0, **fields):
+    """Memory of a control step with other limits and pairs than its robot's: n coordinates without any limit.
+
+    Kernels of joint limits and of rows read what is replaced here, and nothing else.
+
+    Args:
+        nv: number of coordinates.
+        pairs: number of pairs, all of them near.
+        obstacles: number of obstacles.
+        fields: of `RowLayout`, in place of those.
+    """
+    infinite, none = np.full(nv, np.inf), np.zeros(0, dtype=np.intp)
+    joints = JointBounds(infinite, none, none, np.zeros(0), np.zeros(0), infinite, infinite)
+    rows = {name: np.full(pairs, np.nan) for name in ("d", "rhs", "rhs_contact")}
+    given = {
+        **limit_layout(joints, 0.5, 0.01), **rows, "near_pairs": np.arange(pairs), "closest": np.zeros((pairs, 10)),
+        "J": np.ones((pairs, nv)), "feedforward": np.zeros(pairs), "twist_row": np.full(pairs, obstacles),
+        "margin": np.zeros(obstacles + 1), "distance_allowance": np.zeros(pairs), "v_tracking": np.zeros(nv), **fields,
     }  # fmt: skip
-    shapes = {
-        "poses": (frames, 12), "A": (rows, nv), "b": rows, "closest": (pairs, 10), "J": (pairs, nv),
-        "feedforward": pairs,
-        "d": pairs, "rhs": pairs, "rhs_contact": pairs, "hard_lower": nv, "hard_upper": nv, "lower": nv, "upper": nv,
-        "v_stop": nv, "v_tracking": nv, "omega": (joints, 3),
-    }  # fmt: skip
-    outputs = {"near_pairs": np.full(pairs, -1), **{name: np.full(shape, np.nan) for name, shape in shapes.items()}}
-    given = {**inputs, **outputs, **fields}
     if not given["acceleration_limited"]:
         given["hard_lower"], given["hard_upper"] = given["lower"], given["upper"]
-    return RowLayout(**given)
+    elif given["hard_lower"] is given["lower"]:
+        given["hard_lower"], given["hard_upper"] = np.zeros(nv), np.zeros(nv)
+    return _layout_of_a_robot()._replace(**given)
+
+
+@functools.cache
+def _layout_of_a_robot():
+    avoidance = config.Avoidance(d1=0.1, d2=0.3, row={"type": "beta", "gain": 5.0}, recovery_speed=0.2)
+    return lay_out_step(build_scene(Robot.load("paper-dual-arm")), avoidance=avoidance)[0]
 
 
 def look(scene, q, samples=None, reach=np.inf, query=None):

@@ -11,20 +11,20 @@ PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")  # of a bare URDF, which the page prints as notes
-def test_code_runs(tmp_path, monkeypatch, capsys):
+def test_architecture_page_code_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     code = "\n".join(re.findall(r"```python\n(.*?)```", PAGE, re.S))
     exec(compile(code, "architecture.md", "exec"), {})
     assert "tool0" in capsys.readouterr().out
 
 
-def test_order_of_imports_is_the_packages():
+def test_architecture_page_has_the_order_of_imports():
     (line,) = re.findall(r"`(errors, reason < .*?)`", PAGE, re.S)
     rooms = [tuple(level.split(", ")) for level in " ".join(line.split()).split(" < ")]
     assert rooms == list(LEVELS[:-1])
 
 
-def test_files_it_names_exist():
+def test_architecture_page_names_files_that_exist():
     for name in re.findall(r"`((?:config|control|kernels|safety|solvers|model)/\w+(?:\.py|/)?)`", PAGE):
         path = ROOT / "qpavoid" / name
         assert path.exists() or path.with_suffix(".py").exists(), name

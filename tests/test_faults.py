@@ -55,25 +55,20 @@ def run(controller, q, ticks, calls=None):
     [
         ({"q": np.full(7, NAN)}, ("q",)),
         ({"q": with_(INF, 6)}, ("q",)),
-        ({"q": np.full(7, 1e200)}, ("q", "panda_joint1")),
         ({"q": with_(17.0, 3)}, ("q", "panda_joint4")),
         ({"v": with_(NAN, 2)}, ("v",)),
-        ({"v": with_(-INF, 0)}, ("v",)),
         ({"v": with_(2e4, 0)}, ("v",)),
         ({"t": NAN}, ("t",)),
-        ({"t": INF}, ("t",)),
         ({"t": 1.7e15}, ("t",)),
-        ({"t": 10**400}, ("t",)),
         ({"targets": {TOOL: sample(position=np.array([0.5, NAN, 0.5]))}}, ("target", TOOL)),
         ({"targets": {TOOL: sample(position=np.array([0.5, 2e6, 0.5]))}}, ("target", TOOL)),
         ({"targets": {TOOL: sample(linear=np.full(3, INF))}}, ("target", TOOL)),
         ({"targets": {TOOL: sample(angular=np.full(3, 2e3))}}, ("target", TOOL)),
-        ({"targets": {TOOL: sample(rotation=np.zeros((3, 3)))}}, ("target", TOOL)),
         ({"targets": {TOOL: sample(rotation=np.diag([1.0, -1.0, 1.0]))}}, ("target", TOOL)),
         ({"targets": {TOOL: Pose(np.array([0.5, 0.0, 0.5]), 0.5 * np.eye(3))}}, ("target", TOOL)),
     ],
 )
-def test_a_moving_robot_brakes_says_why_and_goes_on(panda, call, subject):
+def test_implausible_argument_brakes_the_robot_for_a_step(panda, call, subject):
     """The stop is the start of a braking motion: every joint slowed alike, by no more than its acceleration."""
     vs, said, _ = run(panda_controller(panda), panda.home, 30, {12: call})
     assert said[12].status is Status.STOPPED
@@ -90,7 +85,7 @@ def test_a_moving_robot_brakes_says_why_and_goes_on(panda, call, subject):
     assert (np.abs(np.diff(vs, axis=0)) <= step + 1e-9).all()
 
 
-def test_after_nan_at_rest_it_is_as_if_nothing_had_happened(panda):
+def test_nan_at_rest_changes_nothing_after_it(panda):
     clean, poisoned = panda_controller(panda), panda_controller(panda)
     for k in range(5):
         solution = poisoned.step(np.full(7, NAN), 0.01 * k, up(panda), v=np.full(7, NAN))
@@ -101,7 +96,7 @@ def test_after_nan_at_rest_it_is_as_if_nothing_had_happened(panda):
     np.testing.assert_array_equal(same, end)
 
 
-def test_a_blind_stop_ends_at_rest_inside_the_joint_limits(panda):
+def test_stop_without_q_ends_inside_the_joint_limits(panda):
     """q is NaN from the moment on at which a joint has just enough room left to brake."""
     controller, q = make_controller(panda, avoidance=Avoidance(d1=0.02, d2=0.1)), panda.home.copy()
     upper, command = panda.model.upperPositionLimit, np.r_[2.0, np.zeros(5), -1.0]
@@ -139,7 +134,7 @@ def test_a_blind_stop_ends_at_rest_inside_the_joint_limits(panda):
         ({"obstacles": {"ball": "there"}}, "obstacle 'ball': neither"),
     ],
 )
-def test_malformed_calls_name_their_argument_and_change_nothing(panda, call, name):
+def test_malformed_step_names_its_argument_and_changes_nothing(panda, call, name):
     touched, clean = panda_controller(panda), panda_controller(panda)
     for k in range(5):
         with pytest.raises(NumericalError, match=f"^{name}"):
@@ -151,7 +146,7 @@ def test_malformed_calls_name_their_argument_and_change_nothing(panda, call, nam
 # --- states that jump or lie outside ---------------------------------------------------------------------------
 
 
-def test_a_joint_outside_its_limits_is_brought_back(panda):
+def test_joint_outside_its_limits_is_brought_back(panda):
     controller = make_controller(panda, frame=TOOL)
     q = panda.home.copy()
     q[0], q[3] = panda.model.upperPositionLimit[0] + 0.1, panda.model.lowerPositionLimit[3] - 0.05
@@ -169,7 +164,7 @@ def test_a_joint_outside_its_limits_is_brought_back(panda):
     assert out[1] == pytest.approx(0.1) and out[-1] < 1e-6
 
 
-def test_a_configuration_in_degrees_is_a_stop(panda):
+def test_configuration_in_degrees_is_a_stop(panda):
     q, bounds = np.rad2deg(panda.home), panda.bounds()
     solution = make_controller(panda, frame=TOOL).step(q)
     assert solution.status is Status.STOPPED and not solution.v.any()
@@ -179,7 +174,7 @@ def test_a_configuration_in_degrees_is_a_stop(panda):
     assert len(expected) > 2 and {(r.kind, r.unit) for r in solution.reasons} == {(ReasonKind.IMPLAUSIBLE, "rad")}
 
 
-def test_a_turn_beyond_the_limits_is_the_border_of_what_is_believed(panda):
+def test_configuration_a_turn_beyond_its_limits_is_implausible(panda):
     for beyond, status in ((2 * np.pi - 1e-6, Status.SOLVED), (2 * np.pi + 1e-6, Status.STOPPED)):
         q = panda.home.copy()
         q[1] = panda.bounds().upper[1] + beyond
@@ -187,8 +182,8 @@ def test_a_turn_beyond_the_limits_is_the_border_of_what_is_believed(panda):
         assert (solution.status is Status.STOPPED) == (status is Status.STOPPED)
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_jumps_of_the_state_end_in_velocities_within_the_limits(panda, seed):
+@pytest.mark.parametrize("seed", range(2))
+def test_jumps_of_the_state_keep_to_the_limits(panda, seed):
     """One radian in every joint, again and again: whatever it lands in, also deep in obstacles."""
     rng = np.random.default_rng(seed)
     boxes = [Obstacle.at(f"box{i}", Box(size=(0.3, 0.3, 0.3)), rng.uniform(-0.6, 0.8, 3)) for i in range(4)]
@@ -206,23 +201,10 @@ def test_jumps_of_the_state_end_in_velocities_within_the_limits(panda, seed):
         q = q + 0.01 * last if k % 10 else np.clip(q, bounds.lower, bounds.upper) + rng.uniform(-1.0, 1.0, 7)
 
 
-def test_an_obstacle_that_jumps_a_metre_is_met_with_a_bounded_velocity(panda):
-    controller, bounds = panda_controller(panda), panda.bounds()
-    last, step = np.zeros(7), 0.01 * bounds.acceleration
-    for k in range(60):
-        place = [0.5, 0.0, 1.5] if k % 20 < 10 else [0.31, 0.0, 0.5]  # far above; inside the hand
-        tick = controller.tick(panda.home, 0.01 * k, None, {"ball": Sample.at(place)})
-        v = tick.solution.v
-        assert (np.abs(v) <= bounds.velocity + 1e-9).all()
-        if tick.solution.status is Status.SOLVED:
-            assert (np.abs(v - last) <= step + 1e-9).all()
-        last = v
-
-
 # --- obstacles without news ------------------------------------------------------------------------------------
 
 
-def test_an_obstacle_without_news_moves_on_grows_and_stops_the_robot(tmp_path):
+def test_stale_obstacle_moves_on_grows_and_stops_the_robot(tmp_path):
     robot = cartesian(tmp_path)
     sensing = Sensing(stale_after=0.2, margin_growth=0.1, stop_after=0.5)
     controller = make_controller(
@@ -257,29 +239,26 @@ def test_an_obstacle_without_news_moves_on_grows_and_stops_the_robot(tmp_path):
     assert sum(stopped) == 48 and not stopped[100]
 
 
-def test_nan_from_an_obstacle_counts_as_no_news(tmp_path):
-    robot = cartesian(tmp_path)
+def test_nan_from_an_obstacle_counts_as_no_update(tmp_path):
+    robot, coming = cartesian(tmp_path), Sample.at([0.3, 0.0, 0.0], linear=[-0.2, 0.0, 0.0])
     loops = []
     for bad in (None, {"ball": Sample(np.full(3, NAN), np.eye(3), np.zeros(3), np.zeros(3))}):
         controller = make_controller(robot, [Obstacle.at("ball", Sphere(radius=0.05), [0.3, 0.0, 0.0])], "z")
-        coming = Sample.at([0.3, 0.0, 0.0], linear=[-0.2, 0.0, 0.0])
-        ticks = drive(
-            controller, np.zeros(3), 100, target=[0.1, 0.0, 0.0], obstacles=lambda t, bad=bad, s=coming: s_at(t, s, bad)
-        )
+
+        def updates(t, bad=bad):
+            return {"ball": coming} if t < 0.005 else bad
+
+        ticks = drive(controller, np.zeros(3), 100, target=[0.1, 0.0, 0.0], obstacles=updates)
         loops.append(np.array([tick.solution.v for tick in ticks]))
     np.testing.assert_array_equal(*loops)
     assert loops[0].min() < -0.15  # pushed back by where it is expected
 
 
-def s_at(t, sample, bad):
-    return {"ball": sample} if t < 0.005 else bad
-
-
 # --- ticks that are held too long or too short -----------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_jitter_of_the_period_costs_no_more_than_the_way_of_a_tick(panda, seed):
+@pytest.mark.parametrize("seed", range(2))
+def test_jitter_of_the_period_costs_no_more_than_a_step(panda, seed):
     rng = np.random.default_rng(seed)
     wall = Obstacle.at("wall", Box(size=(0.02, 1.0, 1.0)), [0.50, 0.0, 0.5])
     tight = Avoidance(d1=0.02, d2=0.1, row=Damper(gain=20.0))

@@ -9,7 +9,7 @@ from qpavoid import Obstacle, ReasonKind, Sample, Status
 from qpavoid.config import Box, Capsule, Sphere
 
 
-def test_a_limiting_joint_is_named(tmp_path):
+def test_relaxed_step_names_the_limiting_joint(tmp_path):
     """A ball comes at 0.3 m/s, and the tool stands at the limit of the only joint that leads away from it."""
     robot = cartesian(tmp_path, axes="x", acceleration=None)
     controller = make_controller(robot, [Obstacle.at("ball", Sphere(radius=0.05), [0.0, 0, 0])], "x")
@@ -31,8 +31,8 @@ ROBOTS = ("panda", "paper", "solo")
 
 @pytest.mark.parametrize("name", ROBOTS)
 @pytest.mark.parametrize("solver", ["qp", "qp:daqp"])
-def test_a_step_from_any_state_ends_in_a_velocity(name, solver, request):
-    """Deep penetration, limits violated, any velocity before, obstacles at any speed: 400 ticks a robot."""
+def test_step_from_any_state_ends_in_a_velocity(name, solver, request):
+    """Deep penetration, limits violated, any velocity before, obstacles at any speed: 200 steps a robot."""
     robot = request.getfixturevalue(name)
     rng, bounds, nv = np.random.default_rng(3), robot.bounds(), robot.model.nv
     frame = {"panda": "panda_hand_tcp", "paper": "left_tool", "solo": "FL_FOOT"}[name]
@@ -46,7 +46,7 @@ def test_a_step_from_any_state_ends_in_a_velocity(name, solver, request):
     controller = make_controller(robot, obstacles, frame, solver)
     fastest = np.where(bounds.velocity < 100.0, bounds.velocity, 5.0)
     seen = dict.fromkeys(Status, 0)
-    for k in range(400):
+    for k in range(200):
         if k % 4 == 0:
             q = pin.integrate(robot.model, robot.home, rng.uniform(-2.5, 2.5, nv))
             controller.reset(rng.uniform(-1.2, 1.2, nv) * fastest)
@@ -68,11 +68,11 @@ def test_a_step_from_any_state_ends_in_a_velocity(name, solver, request):
         q = pin.integrate(robot.model, q, 0.01 * s.v)
     assert seen[Status.STOPPED] == 0
     # the quadruped's free base has no limits: it can always get out of the way
-    assert seen[Status.RELAXED] >= {"panda": 50, "paper": 5, "solo": 0}[name] and seen[Status.SOLVED] > 5
+    assert seen[Status.RELAXED] >= {"panda": 25, "paper": 2, "solo": 0}[name] and seen[Status.SOLVED] > 5
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_a_stop_from_any_speed_brakes_all_joints_alike_to_rest(panda, seed):
+@pytest.mark.parametrize("seed", range(3))
+def test_stop_from_any_speed_brakes_all_joints_alike(panda, seed):
     """Within the accelerations, and with no distance closing faster on the way, as all rates shrink by one factor."""
     rng, bounds = np.random.default_rng(seed), panda.bounds()
     controller = make_controller(panda, [Obstacle.at("ball", Sphere(radius=0.1), [0.5, 0.2, 0.5])])

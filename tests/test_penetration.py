@@ -33,7 +33,7 @@ def overlapping(tmp_path, name, **fields):
 
 
 @pytest.mark.parametrize("name", OVERLAPS)
-def test_the_normal_is_the_gradient_also_inside(tmp_path, name):
+def test_normal_in_penetration_is_the_gradient(tmp_path, name):
     """Along it the distance grows one to one: by differences, wherever the distance is smooth."""
     controller = overlapping(tmp_path, name)
     tick = controller.tick(np.array([1e-3, -2e-3, 1.5e-3]))
@@ -49,7 +49,7 @@ def test_the_normal_is_the_gradient_also_inside(tmp_path, name):
 
 @pytest.mark.parametrize("name", OVERLAPS)
 @pytest.mark.parametrize("recovery", [0.1, 0.3])
-def test_it_moves_out_at_a_bounded_speed_and_stays_out(tmp_path, name, recovery):
+def test_recovery_is_bounded_and_lasting(tmp_path, name, recovery):
     """Also where witness points coincide: within the speed asked for, the joints' speeds and accelerations."""
     avoidance = Avoidance(d1=D1, d2=0.1, recovery_speed=recovery)
     controller = overlapping(tmp_path, name, frame="z", avoidance=avoidance)
@@ -75,7 +75,7 @@ def test_it_moves_out_at_a_bounded_speed_and_stays_out(tmp_path, name, recovery)
 @pytest.mark.parametrize("target", [1.0, 0.3, 0.81])
 @pytest.mark.parametrize("backend", ["qp", "qp:daqp", "qp:proxqp"])
 @pytest.mark.parametrize("acceleration", [None, 4.0])
-def test_a_sphere_5_mm_deep_in_a_wall_comes_out_where_it_went_in(tmp_path, target, backend, acceleration):
+def test_recovery_of_a_sphere_in_a_wall_leads_back(tmp_path, target, backend, acceleration):
     """The case that drives others through: the wall's face at x = 0.85, the tool's radius 0.05, its centre at 0.805."""
     robot = cartesian(tmp_path, axes="x", acceleration=acceleration)
     wall = Obstacle.at("wall", Box(size=(0.3, 2.0, 2.0)), [1.0, 0.0, 0.0])
@@ -89,7 +89,7 @@ def test_a_sphere_5_mm_deep_in_a_wall_comes_out_where_it_went_in(tmp_path, targe
     assert tick.solution.status is Status.SOLVED
 
 
-def test_the_deepest_of_several_decides(tmp_path):
+def test_recovery_from_several_obstacles(tmp_path):
     """Between two balls that both overlap the tool, it leaves both, and sideways."""
     robot = cartesian(tmp_path)
     balls = [Obstacle.at(f"ball{i}", Sphere(radius=0.05), [x, 0.0, 0.001]) for i, x in enumerate((-0.06, 0.07))]
@@ -102,7 +102,7 @@ def test_the_deepest_of_several_decides(tmp_path):
     assert abs(tick.state.q[2]) > 0.05
 
 
-def test_a_robot_that_starts_in_an_obstacle_gets_out_by_all_its_joints(panda):
+def test_recovery_of_an_arm(panda):
     """The hand and fingers of the Panda 30 to 60 mm deep in a box; limits hold, and its own bodies stay apart."""
     box = Obstacle.at("box", Box(size=(0.2, 0.2, 0.2)), [0.35, 0.05, 0.5])
     controller = make_controller(panda, [box], "panda_hand_tcp")

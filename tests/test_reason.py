@@ -35,13 +35,13 @@ def read(entry: dict) -> Reason:
     return Reason(ReasonKind(entry["kind"]), tuple(entry["subject"]), entry["amount"], entry["unit"], severity)
 
 
-def test_severities_are_in_order():
+def test_severities_are_ordered():
     assert Severity.INFO < Severity.WARNING < Severity.ALARM
     assert max(Severity.ALARM, Severity.INFO) is Severity.ALARM and all(Severity)
 
 
 @pytest.mark.parametrize("kind", ReasonKind)
-def test_every_kind_has_a_severity_and_a_line_for_people(kind):
+def test_reason_kind_has_a_severity_and_a_line_for_people(kind):
     expected = "INFO" if kind.value in INFORMING else "ALARM" if kind.value in ALARMING else "WARNING"
     bare = Reason.of(kind)
     assert kind.severity is bare.severity is Severity[expected]
@@ -51,19 +51,19 @@ def test_every_kind_has_a_severity_and_a_line_for_people(kind):
     assert Reason.of(kind, severity=Severity.INFO).severity is Severity.INFO
 
 
-def test_no_two_kinds_read_the_same():
+def test_reason_kinds_read_differently():
     assert len({str(Reason.of(kind)) for kind in ReasonKind}) == len(ReasonKind)
 
 
 @pytest.mark.parametrize("kind", ReasonKind)
-def test_json_keeps_all_but_the_detail(kind):
+def test_reason_as_json_keeps_all_but_the_detail(kind):
     for amount, unit in ((None, ""), (0.25, "m/s"), (-3.0, "rad"), (7, "-")):
         reason = Reason.of(kind, "hand", "ball", amount=amount, unit=unit)
         assert read(json.loads(json.dumps(reason.as_dict()))) == reason
         assert reason.as_dict()["text"] == str(reason)
 
 
-def test_the_key_is_of_kind_and_subject_alone():
+def test_reason_key_is_of_kind_and_subject_alone():
     reason = Reason.of(ReasonKind.ROW_RELAXED, "hand", "ball", amount=0.1, unit="m/s")
     assert reason.key == reason._replace(amount=0.2, unit="m", severity=Severity.ALARM, detail="x").key
     others = reason._replace(kind=ReasonKind.STALLED), reason._replace(subject=("hand",))
@@ -71,7 +71,7 @@ def test_the_key_is_of_kind_and_subject_alone():
 
 
 @pytest.mark.parametrize("field", ["reasons", "stalled", "assumptions"])
-def test_the_severity_of_a_solution_is_the_worst_of_all_its_reasons(field):
+def test_severity_of_a_solution_is_the_worst_of_its_reasons(field):
     info, alarm = Reason.of(ReasonKind.ESTIMATED), Reason.of(ReasonKind.IMPLAUSIBLE)
     assert Solution(np.zeros(1)).severity is None
     assert Solution(np.zeros(1), assumptions=(info,)).severity is Severity.INFO
@@ -80,7 +80,7 @@ def test_the_severity_of_a_solution_is_the_worst_of_all_its_reasons(field):
     assert mixed._replace(**{field: (info, alarm, info)}).severity is Severity.ALARM
 
 
-def test_a_run_gives_the_same_reasons_to_json_and_to_its_log(cli):
+def test_reasons_of_a_run_are_the_same_in_json_and_log(cli):
     """In Situation 1 with damper rows the sphere keeps the tool from its target for a while."""
     rows = "avoidance.row={type: damper, d_safe: 0.12, gain: 5}"
     result = cli("run", "situation1", "--set", "duration=4", "--set", rows, "--json", "--no-figures")
@@ -97,7 +97,7 @@ def test_a_run_gives_the_same_reasons_to_json_and_to_its_log(cli):
     assert (log.severity[log.stalled] >= Severity.WARNING).all()
 
 
-def test_a_log_with_a_severity_that_there_is_not_is_refused(cli, tmp_path):
+def test_log_with_an_unknown_severity_is_refused(cli, tmp_path):
     document = json.loads(cli("run", "situation1", "--set", "duration=0.05", "--json", "--no-figures").stdout)
     with np.load(document["files"][0]) as file:
         arrays = dict(file)
@@ -110,7 +110,7 @@ def test_a_log_with_a_severity_that_there_is_not_is_refused(cli, tmp_path):
 # --- what each severity means ------------------------------------------------------------------------------------
 
 
-def test_a_margin_that_is_used_warns_and_contact_alarms(tmp_path):
+def test_relaxed_row_warns_and_contact_alarms(tmp_path):
     """A tool of 50 mm between walls that ask for 60 mm, and then with a ball that comes on too fast to be left."""
     robot = cartesian(tmp_path, acceleration=None)
     walls = [Obstacle.at(n, Box(size=(0.1, 1, 1)), [x, 0, 0]) for n, x in (("left", -0.15), ("right", 0.15))]
@@ -137,9 +137,9 @@ def test_relaxed_row_far_from_safety_distance_informs(tmp_path):
     assert {reason.severity for reason in solution.reasons} == {Severity.INFO}
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize(("given", "sigma"), [("pose", 0.5e-3), ("sample", 1e-3)])
-def test_noise_alone_at_twice_the_safety_distance_only_informs(tmp_path, given, sigma, seed):
+def test_noise_at_twice_the_safety_distance_informs(tmp_path, given, sigma, seed):
     """A ball at rest beside a tool that moves past it, seen at 100 Hz with an error of up to 1 mm and 50 mm/s."""
     rng = np.random.default_rng(seed)
     controller = make_controller(
@@ -173,7 +173,7 @@ def squeezed(gap: float) -> Problem:
 
 
 @pytest.mark.parametrize("solver", ["qp", "qp:daqp", "hqp"])
-def test_a_slack_within_the_tolerance_of_the_qp_is_no_relaxation(solver):
+def test_slack_within_the_tolerance_of_the_qp_is_no_relaxation(solver):
     for gap in (0.0, 1e-8, 1e-7, 5e-7, 1e-6, 1.5e-6, 1.9e-6):
         solution = make_solver(solver).solve(squeezed(gap))
         assert solution.status is Status.SOLVED and solution.reasons == (), gap
@@ -207,7 +207,7 @@ STOPS = {
 
 
 @pytest.mark.parametrize("what", STOPS)
-def test_every_stop_alarms(tmp_path, what):
+def test_stop_alarms(tmp_path, what):
     sensing = Sensing(stale_after=0.05, stop_after=0.1)
     controller = make_controller(cartesian(tmp_path), [Obstacle.at("ball", BALL, [9, 0, 0])], "z", sensing=sensing)
     assert controller.step(np.zeros(3)).severity is None

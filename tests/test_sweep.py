@@ -12,27 +12,25 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from in_process import InProcess
 
-pytest.importorskip("pyarrow")
 pytest.importorskip("distributed")
 pytest.importorskip("mujoco")
 
-import pyarrow as pa
-import pyarrow.parquet as pq
-
 from qpavoid.config.shipped import family_names, suite_names
 from qpavoid.errors import ConfigError, UnknownName
-from qpavoid_bench.arena import commands, store, sweep
+from qpavoid.run.pool import ClusterLost, ClusterWorkers, Workers
+from qpavoid_bench.arena import commands, sweep
 from qpavoid_bench.arena.entrant_file import entrant_from_file
 from qpavoid_bench.arena.entrants import ENTRANTS
 from qpavoid_bench.arena.families import load_family, make_case
-from qpavoid_bench.arena.plan import cases_of, is_complete, missing_cases, missing_runs, runs_of
 from qpavoid_bench.arena.scores import COLUMNS, KEY
-from qpavoid_bench.arena.store import Store, read_cases, read_runs
+from qpavoid_bench.arena.store import FILE, Store, read_cases, read_facts, read_failures, read_runs
 from qpavoid_bench.arena.suite import EntrantConfig, load_suite, origin
 from qpavoid_bench.arena.summary import find_faults, summary
 from qpavoid_bench.arena.trial import run_trial
@@ -125,7 +123,8 @@ def now_and_then(problem):
 
 NUMBER = 7
 '''
-PATH = f"{Path.cwd()}{os.pathsep}{Path.cwd() / 'bench'}"
+ENVIRONMENT = {**os.environ, "PYTHONPATH": f"{Path.cwd()}{os.pathsep}{Path.cwd() / 'bench'}"}
+"""In which processes find this checkout."""
 
 
 @pytest.fixture
@@ -143,26 +142,18 @@ def write_suite(folder, entrants=("tracking",), seeds=2, **more):
     return path
 
 
-@pytest.fixture(scope="module")
-def client():
-    """Two processes for all tests."""
-    with sweep.local_cluster(2) as client:
-        yield client
+def swept(suite, out, workers=None, tell=lambda tally: None):
+    with Store(out) as store:
+        return sweep.sweep(suite, store, workers or InProcess(), tell)
 
 
-def swept(suite, out, client, tell=lambda tally: None):
-    with Store(out) as there:
-        return sweep.sweep(suite, there, client, tell)
+def plan_of(suite, out):
+    with Store(out) as store:
+        return sweep.plan(suite, store)
 
 
-def abandon(writer):
-    """Leaves a folder as its writer does when it is killed: what the system closes is closed, nothing else happens."""
-    for file in (writer.runs, writer.cases, writer._failures, writer._lock):
-        file.close()
-
-
-def keys_of(table, key=KEY):
-    return list(zip(*(table[name].to_pylist() for name in key), strict=True))
+def rows_in(folder):
+    return read_runs(folder / "out").to_dict("records")
 
 
 def row_of(**fields):
@@ -174,77 +165,42 @@ def row_of(**fields):
 # --- the store ---------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
-@given(steps=st.lists(st.sampled_from(["row", "again", "fold", "killed", "torn", "renamed"]), max_size=25))
-def test_store_rows_survive_killed_writer(tmp_path_factory, steps):
-    """Against a dictionary: rows, Parquet files in between, ends of all kinds; each row is read once, in order."""
-    out, model = tmp_path_factory.mktemp("out"), {}
-    writer = Store(out)
-    for step in steps:
-        if step in ("row", "again"):
-            n = len(model) if step == "row" or not model else 0
-            model.setdefault(f"case{n}", float(n))
-            writer.runs.append(row_of(case=f"case{n}", jerk=float(n)))
-        elif step == "fold":
-            writer.runs.fold()
-        else:  # gone without a word: nothing is folded; the next writer begins with what lies there
-            journal = out / "runs.jsonl"
-            before = journal.read_bytes()
-            abandon(writer)
-            if step == "torn":
-                journal.write_bytes(before + b'{"case": "half')
-            if step == "renamed":  # killed between the renaming of a Parquet file and the end of its journal
-                with Store(out):
-                    pass
-                journal.write_bytes(before)
-            writer = Store(out)
-        table = read_runs(out)
-        assert dict(zip(table["case"].to_pylist(), table["jerk"].to_pylist(), strict=True)) == model
-        assert len(table) == len(model) and table["case"].to_pylist() == list(model)
-    writer.__exit__(None, None, None)
-    assert read_runs(out)["case"].to_pylist() == list(model)
-
-
 def test_store_row_round_trip(tmp_path):
-    """A row comes back as it was."""
+    """A row comes back as it was, once, however often it is added; NaN is read as NaN."""
     row = row_of(family="a – b", seed=2**40, success=True, min_distance=float("inf"), jerk=0.1 + 0.2, failure='"\n\\')
-    for fold in (False, True):
-        with Store(tmp_path / str(fold)) as writer:
-            writer.runs.append(row)
-            if not fold:
-                assert read_runs(tmp_path / str(fold)).to_pylist() == [row]
-        assert read_runs(tmp_path / str(fold)).to_pylist() == [row]
+    with Store(tmp_path) as store:
+        store.add("runs", row)
+        assert read_runs(tmp_path).to_dict("records") == [row]
+        store.add("runs", {**row, "jerk": 7.0})
+        store.add("runs", {**row, "case": "other", "jerk": float("nan")})
+    runs = read_runs(tmp_path)
+    assert runs.iloc[:1].to_dict("records") == [row] and np.isnan(runs["jerk"][1]) and len(runs) == 2
+    assert list((tmp_path).iterdir()) == [tmp_path / FILE]
 
 
-def test_store_folds_rows_into_few_files(tmp_path, monkeypatch):
-    """Many rows become few files."""
-    monkeypatch.setattr(store, "FOLD", 10)
-    with Store(tmp_path) as writer:
-        for n in range(35):
-            writer.runs.append(row_of(case=str(n)))
-        assert len(list((tmp_path / "runs").glob("*.parquet"))) == 3
-        assert (tmp_path / "runs.jsonl").read_bytes().count(b"\n") == 5
-    assert read_runs(tmp_path)["case"].to_pylist() == [str(n) for n in range(35)]
-    assert len(list((tmp_path / "runs").iterdir())) == 4
+def test_store_keeps_rows_of_a_killed_writer(tmp_path):
+    """Rows are there the moment that `add` returns; two writers may add at a time."""
+    writer = (
+        "import os, signal, sys; from pathlib import Path; from qpavoid_bench.arena.store import Store\n"
+        "store, row = Store(Path(sys.argv[1])), eval(sys.argv[2])\n"
+        "for n in range(20): store.add('runs', {**row, 'case': str(n)})\n"
+        "os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    with Store(tmp_path) as store:
+        command = [sys.executable, "-c", writer, str(tmp_path), repr(row_of())]
+        assert subprocess.run(command, env=ENVIRONMENT, check=False).returncode == -signal.SIGKILL
+        store.add("runs", row_of(case="ours"))
+    assert read_runs(tmp_path)["case"].to_list() == [*map(str, range(20)), "ours"]
 
 
-def test_store_has_one_writer(tmp_path):
-    """One writer a folder."""
-    with Store(tmp_path), pytest.raises(ConfigError, match=rf"process {os.getpid()} on .* writes here; .*--out"):
-        Store(tmp_path)
-    with Store(tmp_path):
-        pass
-
-
-def test_folders_that_cannot_be_read(tmp_path):
+def test_store_errors_name_file_and_remedy(tmp_path):
     with pytest.raises(ConfigError, match="no results here"):
         read_runs(tmp_path)
-    with Store(tmp_path) as writer:
-        writer.runs.append(row_of())
-    (part,) = (tmp_path / "runs").glob("*.parquet")
-    part.write_bytes(part.read_bytes()[:-10])
-    with pytest.raises(ConfigError, match=rf"{part.name}.*move the damaged file away"):
+    (tmp_path / FILE).write_text("not a database, though long enough to be one" * 100)
+    with pytest.raises(ConfigError, match=rf"{FILE}.*move the damaged file away"):
         read_runs(tmp_path)
+    with pytest.raises(ConfigError, match=rf"give a folder that can be written, with no damaged {FILE} in it"):
+        Store(tmp_path)
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match=r"file: .*give a folder that can be written"):
         Store(tmp_path / "file")
@@ -253,34 +209,32 @@ def test_folders_that_cannot_be_read(tmp_path):
 # --- what is missing ---------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
+@settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 @given(data=st.data())
-def test_plan_missing_runs_equal_set_difference(tmp_path_factory, data):
-    """Against loops over sets, with rows of other versions, settings and cases about."""
+def test_plan_is_what_is_wanted_less_what_is_done(tmp_path_factory, data):
+    """Rows of other versions, settings and cases do not count."""
     folder = tmp_path_factory.mktemp("suite")
     (folder / "post.yaml").write_text(yaml.safe_dump(POST))
     suite = load_suite(write_suite(folder, ["tracking", "qp", "eq10"], seeds=4))
     made = data.draw(st.sets(st.integers(0, 6)))
     of = origin(suite.families[0])
     done = data.draw(st.sets(st.tuples(st.integers(0, 5), st.sampled_from(["tracking", "qp", "hqp"]), st.booleans())))
-    with Store(folder / "out") as writer:
+    with Store(folder / "out") as store:
         for seed in made:
-            writer.cases.append({"family": "post", "seed": seed, "origin": of, "case": f"c{seed}", "json": "{}"})
-            writer.cases.append({"family": "post", "seed": seed, "origin": "old", "case": f"c{seed}-old", "json": "{}"})
+            for made_of in (of, "old"):
+                case = {"case": f"c{seed} {made_of}", "json": f"text {seed} {made_of}"}
+                store.add("cases", {"family": "post", "seed": seed, "origin": made_of, **case})
         for seed, name, ours in done:
             digest, made_by = ENTRANTS[name].digest, version("qpavoid") if ours else "0.0.1"
-            writer.runs.append(row_of(case=f"c{seed}", entrant=name, settings=digest, version=made_by))
-    out = folder / "out"
-    assert missing_cases(suite, out)["seed"].to_pylist() == [seed for seed in range(4) if seed not in made]
-    cases = cases_of(suite, out)
-    assert cases["case"].to_pylist() == [f"c{seed}" for seed in range(4) if seed in made]
-    wanted = [(seed, name) for seed in range(4) if seed in made for name in ("tracking", "qp", "eq10")]
-    left = [(f"c{seed}", name) for seed, name in wanted if (seed, name, True) not in done]
-    assert keys_of(missing_runs(suite, out, cases), ("case", "entrant")) == left
-    there = {(f"c{seed}", name) for seed, name in wanted if (seed, name, True) in done}
-    runs = runs_of(suite, out)
-    assert set(keys_of(runs, ("case", "entrant"))) == there and len(runs) == len(there)
-    assert is_complete(suite, out) == (not left and set(range(4)) <= made)
+            store.add("runs", row_of(case=f"c{seed} {of}", entrant=name, settings=digest, version=made_by))
+        plan = sweep.plan(suite, store)
+    there = [seed for seed in range(4) if seed in made]
+    assert plan.cases == [("post", seed, of) for seed in range(4) if seed not in made]
+    assert plan.texts == [f"text {seed} {of}" for seed in there]
+    wanted = [(seed, name) for seed in there for name in ("tracking", "qp", "eq10")]
+    assert {(case, name) for case, name, *_ in plan.keys} == {(f"c{seed} {of}", name) for seed, name in wanted}
+    left = [(f"text {seed} {of}", name) for seed, name in wanted if (seed, name, True) not in done]
+    assert [(text, entrant.name) for text, entrant in plan.runs] == left
 
 
 def test_digest_changes_with_settings_and_families(folder):
@@ -314,9 +268,10 @@ def test_suites_that_ship(name):
     assert suite.families and suite.entrants and len(suite.seeds) >= 2
 
 
-def test_the_full_suite_is_everything():
+def test_the_full_suite_is_everything_that_is_proved():
     suite = load_suite("full")
-    assert sorted(family.name for family in suite.families) == family_names()
+    proved = [name for name in family_names() if load_family(name).config.proved]
+    assert sorted(family.name for family in suite.families) == proved
     assert {entrant.name for entrant in suite.entrants + suite.absent} == set(ENTRANTS)
 
 
@@ -421,117 +376,65 @@ def test_entrant_from_file_continues_after_failure(folder):
 # --- sweeps ------------------------------------------------------------------------------------------------------
 
 
-def test_sweep_rows_equal_single_runs(folder, client):
-    """Also what shows that own entrants of every kind run: from text that was sent, in other processes."""
-    own = [f"laws.py:{name}" for name in ("Halved", "solution", "velocity", "Still", "pilot")]
-    path, out = write_suite(folder, ["tracking", "qp", *own], seeds=1), folder / "out"
+def test_sweep_goes_on_where_it_ended(folder):
+    path, out = write_suite(folder, ["tracking", "laws.py:Halved", "laws.py:Still"], seeds=1), folder / "out"
     suite, reports = load_suite(path), []
-    tally = swept(suite, out, client, reports.append)
-    assert tally.done == tally.total == 7 and tally.failed == 0
-    assert [t.done for t in reports if t.stage == "runs"] == list(range(8))
-    runs = {row["entrant"]: row for row in read_runs(out).to_pylist()}
-    case = make_case(load_family(folder / "post.yaml"), 0)
-    timed = {"tick_p50", "tick_p99", "seconds"}
-    for entrant in suite.entrants:
-        alone = run_trial(case, entrant).row()
-        row = runs[entrant.name]
-        assert row["failure"] == ""
-        for name in COLUMNS.keys() - timed:
-            assert row[name] == (
-                pytest.approx(alone[name], rel=1e-9, abs=1e-9) if COLUMNS[name] == "float" else alone[name]
-            )
-    figures = {
-        name: {k: v for k, v in row.items() if k not in timed | {"entrant", "settings"}} for name, row in runs.items()
-    }
-    assert figures["solution"] == figures["velocity"] == figures["tracking"] != figures["Halved"]
-    assert figures["Still"] == figures["pilot"] and runs["Still"]["path_length"] == 0.0
-
-    before = read_runs(out).to_pylist()
-    assert swept(suite, out, client).done == 0 and read_runs(out).to_pylist() == before
+    assert swept(suite, out, tell=reports.append) == ("runs", 3, 3, 0, 0)
+    assert [(t.stage, t.done) for t in reports] == [("cases", 0), ("cases", 1), *(("runs", n) for n in range(4))]
+    before = rows_in(folder)
+    assert swept(suite, out).done == 0 and rows_in(folder) == before
     (folder / "laws.py").write_text(LAWS + "# another one\n")
     more = load_suite(path, ["tracking", "eq10", f"{folder}/laws.py:Halved"], seeds=2)
-    assert swept(more, out, client).done == 5  # all three in the new case, and two that are new in the old one
-    after = read_runs(out)
-    assert after.to_pylist()[: len(before)] == before and len(set(keys_of(after))) == len(after) == 12
-    assert len(runs_of(suite, out)) == 7 and len(runs_of(more, out)) == 6  # of the text that Halved had, and has now
-    facts = json.loads((out / "suite.json").read_text())
-    assert {"tracking", "eq10", "Halved", "pilot"} <= {entry["name"] for entry in facts["entrants"].values()}
+    assert swept(more, out).done == 5  # all three in the new case, and two that are new in the old one
+    assert rows_in(folder)[:3] == before and len({tuple(row[name] for name in KEY) for row in rows_in(folder)}) == 8
+    facts = read_facts(out)
+    assert [entry["name"] for entry in facts["entrants"].values()] == ["tracking", "Halved", "Still", "eq10", "Halved"]
     assert facts["versions"]["qpavoid"] and facts["machine"]["cpu"]
 
 
-def test_sweep_keeps_runs_of_dead_processes(folder, client):
-    """What cannot be set up or takes its process down has failed and is not lost."""
-    suite = load_suite(write_suite(folder, ["laws.py:Picky", "laws.py:Deadly", "laws.py:Still"], seeds=2))
-    tally = swept(suite, folder / "out", client)
-    assert tally.done == tally.total == 6 and tally.failed == 0
-    rows = read_runs(folder / "out").to_pylist()
-    assert len({(row["seed"], row["entrant"]) for row in rows}) == len(rows) == 6
-    said = {"Picky": "cannot be set up: RuntimeError: not with me", "Deadly": "killed, out of memory or crashed"}
-    for row in rows:
+def test_sweep_in_processes(folder):
+    """Entrants of every kind run from text that was sent; what ends its process has failed, and is not lost."""
+    own = [f"laws.py:{name}" for name in ("Halved", "solution", "velocity", "pilot", "Picky", "Deadly")]
+    suite = load_suite(write_suite(folder, ["tracking", "qp", *own], seeds=1))
+    with Workers(2) as workers:
+        assert swept(suite, folder / "out", workers)[1:] == (8, 8, 0, 0)
+    assert not plan_of(suite, folder / "out").runs
+    runs = {row["entrant"]: row for row in rows_in(folder)}
+    timed = {"tick_p50", "tick_p99", "seconds"}
+    case = make_case(load_family(folder / "post.yaml"), 0)
+    for entrant in suite.entrants[:6]:
+        alone, row = run_trial(case, entrant).row(), runs[entrant.name]
+        for name in COLUMNS.keys() - timed:
+            expected = pytest.approx(alone[name], rel=1e-9, abs=1e-9) if COLUMNS[name] == "float" else alone[name]
+            assert row[name] == expected and row["failure"] == ""
+    assert runs["solution"]["path_length"] == runs["velocity"]["path_length"] == runs["tracking"]["path_length"] > 0.0
+    for name, said in {"Picky": "cannot be set up: RuntimeError: not with me", "Deadly": "crashed or too slow"}.items():
+        row = runs[name]
+        assert row["failed"] == row["stopped"] == row["time_to_goal"] == 1.0 and said in row["failure"]
         assert row["path_length"] == 0.0 and not row["success"] and not row["arrived"]
-        assert row["failed"] == (0.0 if row["entrant"] == "Still" else 1.0)
-        assert said.get(row["entrant"], "") in row["failure"]
-        assert row["stopped"] == row["failed"] and row["time_to_goal"] == 1.0
-    assert is_complete(suite, folder / "out")
 
 
-def test_sweep_replaces_lost_processes(folder, monkeypatch):
-    """As when a machine is so busy that they take too long to start again; otherwise the sweep waits for ever."""
-
-    def too_long(*_):
-        raise AssertionError("the sweep waits for a process that never comes")
-
-    monkeypatch.setitem(sweep._DASK_CONFIG, "distributed.deploy.lost-worker-timeout", "1 ms")
-    suite = load_suite(write_suite(folder, ["laws.py:Deadly", "laws.py:Still"], seeds=1))
-    before = signal.signal(signal.SIGALRM, too_long)
-    signal.alarm(120)
-    try:
-        with sweep.local_cluster(1) as client:
-            assert swept(suite, folder / "out", client)[1:] == (2, 2, 0, 0)
-    finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, before)
+def test_a_case_that_hangs_is_ended():
+    """A worker that exceeds the time limit ends, with its traceback, as one that crashes does."""
+    code = (
+        "import time; from qpavoid_bench.arena import sweep; sweep.TIME_LIMIT = 0.2\n"
+        "sweep.load_family = lambda path: time.sleep(600)\nsweep._make_case('x', 'y', 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and "Timeout" in done.stderr and "_make_case" in done.stderr
 
 
-def test_sweep_continues_after_case_failure(folder, client):
+def test_sweep_continues_after_case_failure(folder):
     (post,) = POST["scenario"]["obstacles"]
     around = {**post, "motion": {"type": "fixed", "position": [0.0, 0.0, 0.5]}}  # the arm itself: no draw will do
     crowded = {**POST, "scenario": {**POST["scenario"], "obstacles": [post, {**around, "name": "around"}]}}
     (folder / "crowded.yaml").write_text(yaml.safe_dump(crowded))
     suite = load_suite(write_suite(folder, ["tracking"], seeds=1, families=["crowded.yaml", "post.yaml"]))
-    tally = swept(suite, folder / "out", client)
-    assert tally.done == 1 and tally.failed == 1
-    (failure,) = map(json.loads, (folder / "out" / "failures.jsonl").read_text().splitlines())
+    assert swept(suite, folder / "out") == ("runs", 1, 1, 0, 1)
+    (failure,) = read_failures(folder / "out")
     assert failure["family"] == "crowded" and failure["entrant"] is None and "crowded.yaml" in failure["failure"]
-    assert not is_complete(suite, folder / "out")
-    assert read_runs(folder / "out")["family"].to_pylist() == ["post"]
-
-
-@pytest.fixture
-def cluster(tmp_path):
-    """A scheduler and two workers of this test's own, as users start them: its address and the workers."""
-    python, env = [sys.executable, "-m"], {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": PATH}
-    processes, quiet = [], {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": env, "cwd": tmp_path}
-    file = tmp_path / "scheduler.json"
-
-    def start(*words):
-        processes.append(subprocess.Popen([*python, *map(str, words)], **quiet))
-        return processes[-1]
-
-    try:
-        start("distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", 0, "--no-dashboard",
-              "--dashboard-address", "127.0.0.1:0", "--scheduler-file", file)  # fmt: skip
-        until(file.exists)
-        address = json.loads(file.read_text())["address"]
-        workers = [
-            start("distributed.cli.dask_worker", address, "--nthreads", 1, "--no-nanny", "--no-dashboard")
-            for _ in range(2)
-        ]
-        yield address, workers, processes[0]
-    finally:
-        for process in processes:
-            process.kill()
-            process.wait()
+    assert [family for family, *_ in plan_of(suite, folder / "out").cases] == ["crowded"]
+    assert [row["family"] for row in rows_in(folder)] == ["post"]
 
 
 def until(true, seconds=300.0):
@@ -541,67 +444,73 @@ def until(true, seconds=300.0):
         time.sleep(0.02)
 
 
-def test_sweep_survives_lost_worker(folder, cluster):
-    """A cluster loses a worker half way."""
-    address, workers, scheduler = cluster
-    suite, out = load_suite(write_suite(folder, ["tracking", "laws.py:Slow"], seeds=6)), folder / "out"
+@pytest.mark.slow
+def test_sweep_on_a_cluster_survives_a_lost_worker(folder, tmp_path):
+    """A cluster loses a worker half way, and in the end its scheduler."""
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": ENVIRONMENT, "cwd": tmp_path}
 
-    def tell(tally):
-        if tally.stage == "runs" and tally.done == 4:
-            workers[0].kill()
+    def start(module, *words):
+        processes.append(subprocess.Popen([sys.executable, "-m", module, *map(str, words)], **quiet))
+        return processes[-1]
 
-    with sweep.remote_cluster(address) as client:
-        client.wait_for_workers(2, timeout=300)
-        tally = swept(suite, out, client, tell)
-        assert len(client.nthreads()) == 1
-    assert tally.done == tally.total == 12 and tally.failed == 0
-    runs = read_runs(out)
-    assert len(runs) == len(set(keys_of(runs))) == 12 and not any(runs["failed"].to_pylist())
-    lines = sum(pq.read_metadata(part).num_rows for part in (out / "runs").glob("*.parquet"))
-    assert lines == 12  # nor was a row written twice and dropped on reading
-
-    # and when the scheduler goes, the sweep ends, and says so
-    longer = load_suite(folder / "mine.yaml", seeds=30)
-    with sweep.remote_cluster(address) as client, pytest.raises(sweep.ClusterLost), Store(out) as there:
-        sweep.sweep(longer, there, client, lambda tally: scheduler.kill() if tally.stage == "cases" else None)
-
-
-def bench(folder, *words):
-    """`qpavoid bench run` of the suite in a folder, in a process group of its own."""
-    command = [sys.executable, "-m", "qpavoid", "bench", "run", "mine.yaml", "--out", "out", "--jobs", "2", *words]
-    env = {**os.environ, "PYTHONPATH": PATH}
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    return subprocess.Popen(command, cwd=folder, env=env, start_new_session=True, **pipes)
-
-
-def rows_in(folder):
-    journal = folder / "out" / "runs.jsonl"
-    return journal.read_bytes().count(b"\n") if journal.exists() else 0
+    processes, file = [], tmp_path / "scheduler.json"
+    suite = load_suite(write_suite(folder, ["tracking", "laws.py:Slow"], seeds=6))
+    try:
+        local = ("--host", "127.0.0.1", "--port", 0, "--no-dashboard")
+        scheduler = start("distributed.cli.dask_scheduler", *local, "--scheduler-file", file)
+        until(file.exists)
+        address = json.loads(file.read_text())["address"]
+        options = ("--nthreads", 1, "--no-nanny", "--no-dashboard")
+        lost, _ = (start("distributed.cli.dask_worker", address, *options) for _ in range(2))
+        with ClusterWorkers(address) as workers:
+            until(lambda: len(workers) == 2)
+            kill = lambda tally: lost.kill() if tally[:2] == ("runs", 4) else None  # noqa: E731
+            assert swept(suite, folder / "out", workers, kill)[1:3] == (12, 12)
+            assert len(workers) == 1
+        rows = rows_in(folder)
+        assert len({(row["case"], row["entrant"]) for row in rows}) == len(rows) == 12
+        assert not any(row["failed"] for row in rows)
+        longer = load_suite(folder / "mine.yaml", seeds=30)
+        with ClusterWorkers(address) as workers, pytest.raises(ClusterLost):
+            swept(longer, folder / "out", workers, lambda tally: scheduler.kill() if tally.stage == "cases" else None)
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
 
 
-def test_killed_then_interrupted_then_finished(folder, client):
-    suite = load_suite(write_suite(folder, ["laws.py:Slow"], seeds=24))
-    first = bench(folder)
-    until(lambda: rows_in(folder) >= 3)
+@pytest.mark.slow
+def test_killed_then_interrupted_then_finished(folder):
+    def bench():
+        """`qpavoid bench run` of the suite, in a process group of its own."""
+        command = [sys.executable, "-m", "qpavoid", "bench", "run", "mine.yaml", "--out", "out", "--jobs", "2"]
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        return subprocess.Popen(command, cwd=folder, env=ENVIRONMENT, start_new_session=True, **pipes)
+
+    def seeds():
+        return read_runs(folder / "out")["seed"].to_list() if (folder / "out" / FILE).exists() else []
+
+    write_suite(folder, ["laws.py:Slow"], seeds=24)
+    first = bench()
+    until(lambda: len(seeds()) >= 3)
     first.kill()
     first.communicate()
-    kept = keys_of(read_runs(folder / "out"))
-    assert 3 <= len(kept) < 24 and len(set(kept)) == len(kept)
-    made = len(read_cases(folder / "out"))
+    kept, made = seeds(), len(read_cases(folder / "out"))
+    assert 3 <= len(kept) < 24 and made == 24
 
-    second, folded = bench(folder), folder / "out" / "runs"
-    until(lambda: list(folded.glob("*.parquet")) and rows_in(folder) >= 3)  # of its own: the first one's are folded
+    second = bench()
+    until(lambda: len(seeds()) >= len(kept) + 3)
     os.killpg(second.pid, signal.SIGINT)  # as a terminal does at Ctrl-C: to the workers as well
     printed, said = second.communicate(timeout=300)
     assert second.returncode == 1 and printed == ""
     assert "interrupted: " in said and "the same command goes on" in said and "Traceback" not in said
-    more = keys_of(read_runs(folder / "out"))
-    assert more[: len(kept)] == kept and len(kept) + 3 <= len(more) < 24 and len(set(more)) == len(more)
-    assert len(read_cases(folder / "out")) == made == 24
+    more = seeds()
+    assert more[: len(kept)] == kept and len(kept) + 3 <= len(more) < 24
 
-    tally = swept(suite, folder / "out", client)
-    assert tally.done == 24 - len(more) and tally.failed == 0
-    assert sorted(read_runs(folder / "out")["seed"].to_pylist()) == list(range(24))
+    third = bench()
+    printed, said = third.communicate(timeout=300)
+    assert third.returncode == 0 and f"24 runs, {24 - len(more)} of them new" in printed
+    assert sorted(seeds()) == list(range(24))
 
 
 # --- the commands ------------------------------------------------------------------------------------------------
@@ -610,13 +519,15 @@ def test_killed_then_interrupted_then_finished(folder, client):
 def test_bench_run_show_and_resume(cli, folder, monkeypatch):
     """Run then show then nothing left to do."""
     write_suite(folder, ["tracking", {"name": "wide", "solver": "qp", "avoidance": {"d2": 0.3}}], seeds=2)
-    first = cli("bench", "run", "mine.yaml", "--json", "--jobs", "1")
+    with monkeypatch.context() as patch:
+        patch.setattr("qpavoid.run.pool.Workers", InProcess)
+        first = cli("bench", "run", "mine.yaml", "--json", "--jobs", "1")
     assert first.status == 0
     document = json.loads(first.stdout)
     assert document["runs"] == document["new"] == 4 and document["failed"] == 0
     assert [entry["entrant"] for entry in document["entrants"]] == ["tracking", "wide"]
     with monkeypatch.context() as patch:
-        patch.setattr(sweep, "local_cluster", None)  # no process is started for it
+        patch.setattr("qpavoid.run.pool.Workers", None)  # no process is started for it
         rerun = cli("bench", "run", "mine.yaml")
     assert rerun.status == 0 and "4 runs, 0 of them new" in rerun.stdout and "tracking" in rerun.stdout
     out = Path("out/bench/mine")
@@ -625,7 +536,7 @@ def test_bench_run_show_and_resume(cli, folder, monkeypatch):
     )
     assert shown.status == 0
     run = json.loads(shown.stdout)["run"]
-    (row,) = [row for row in read_runs(out).to_pylist() if row["entrant"] == "wide" and row["seed"] == 1]
+    (row,) = [row for row in read_runs(out).to_dict("records") if row["entrant"] == "wide" and row["seed"] == 1]
     assert all(run[name] == row[name] for name in (*KEY, "success", "collided", "contacts"))
     assert cli("run", "case.yaml", "--no-figures").status in (0, 1)
     lines = cli("bench", "show", out, "--family", "post", "--seed", 1, "--entrant", "wide").stdout.splitlines()
@@ -654,7 +565,7 @@ def test_list_names_everything(cli):
     ],
 )
 def test_bad_input_is_a_line_and_exit_status_2(cli, monkeypatch, words, said):
-    monkeypatch.setattr(sweep, "_CONNECT_TIMEOUT", 0.5)
+    monkeypatch.setattr("qpavoid.run.pool._CONNECT_TIMEOUT", 0.5)
     result = cli("bench", *words)
     lines = [line for line in result.lines if "does not take part" not in line]
     assert result.status == 2 and len(lines) == 1
@@ -663,17 +574,17 @@ def test_bad_input_is_a_line_and_exit_status_2(cli, monkeypatch, words, said):
 
 def test_bench_without_extra_names_remedy(cli, monkeypatch):
     """Without the extra the bench says what to install."""
-    monkeypatch.setattr(commands, "find_spec", lambda name: None if name in ("pyarrow", "distributed") else True)
+    monkeypatch.setattr(commands, "find_spec", lambda name: None if name in ("pandas", "distributed") else True)
     result = cli("bench", "list")
     assert result.status == 2
-    assert result.lines == ["error: qpavoid bench needs distributed, pyarrow: pip install 'qpavoid[arena]'"]
+    assert result.lines == ["error: qpavoid bench needs distributed, pandas: pip install 'qpavoid[arena]'"]
 
 
 def test_cli_does_not_import_arena_dependencies():
     """The rest of the command line brings nothing of the arena in."""
     code = (
-        "import sys, qpavoid.cli; "
-        "sys.exit(bool({'dask', 'distributed', 'pyarrow', 'mujoco', 'matplotlib'} & sys.modules.keys()))"
+        "import sys, qpavoid.cli; names = {'distributed', 'pandas', 'mujoco', 'matplotlib', 'qpavoid_bench'}; "
+        "sys.exit(bool(names & sys.modules.keys()))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False, timeout=300).returncode == 0
 
@@ -695,8 +606,7 @@ def smoke_rows(folder, **changes):
         for case in cases
         for entrant in suite.entrants
     ]
-    table = pa.table({"case": [case.key for case in cases], "json": [case.to_json() for case in cases]})
-    return suite, [row for row in rows if row["family"]], table
+    return suite, [row for row in rows if row["family"]], cases
 
 
 @pytest.mark.parametrize(
@@ -715,26 +625,17 @@ def smoke_rows(folder, **changes):
 def test_find_faults_names_faults(folder, changes, said):
     """The smoke test tells what is broken."""
     suite, rows, cases = smoke_rows(folder, **changes)
-    faults = list(find_faults(suite, pa.Table.from_pylist(rows, schema=store.RUNS.schema), cases))
+    faults = list(find_faults(suite, pd.DataFrame(rows), cases))
     assert len(faults) == len(said) and all(fault.startswith(start) for fault, start in zip(faults, said, strict=True))
 
 
-def test_the_summary_is_that_of_numpy(tmp_path):
-    rng = np.random.default_rng(0)
-    figures = [{"failed": x, "min_distance": y, "tick_p50": z} for x, y, z in rng.normal(size=(200, 3))]
+def test_summary_by_hand():
+    values = [("b", 0, 0.0, 3.0), ("a", 1, 0.5, 2.0), ("b", 1, 0.1, 1.0), ("b", 1, 0.2, 5.0)]
     rows = [
-        row_of(
-            entrant=str(rng.choice(["b", "a"])), case=str(n), success=bool(rng.random() < 0.5), failure=f"{n}", **fields
-        )
-        for n, fields in enumerate(figures)
+        row_of(entrant=name, success=bool(won), failed=failed, tick_p50=x, min_distance=-x, failure=f"said at {x}")
+        for name, won, failed, x in values
     ]
-    table = summary(pa.Table.from_pylist(rows, schema=store.RUNS.schema))
-    assert [entry["entrant"] for entry in table] == list(dict.fromkeys(row["entrant"] for row in rows))
-    for entry in table:
-        own = [row for row in rows if row["entrant"] == entry["entrant"]]
-        failed = [row["failure"] for row in own if row["failed"] > 0]
-        assert entry["runs"] == len(own) and entry["failed"] == len(failed) and entry["failure"] == failed[0]
-        assert entry["success"] == pytest.approx(np.mean([row["success"] for row in own]))
-        assert entry["min_distance"] == min(row["min_distance"] for row in own)
-        assert entry["tick_p50"] == pytest.approx(np.median([row["tick_p50"] for row in own]), abs=0.1)
-    assert summary(store.RUNS.schema.empty_table()) == []
+    b, a = summary(pd.DataFrame(rows))
+    expected = {"entrant": "b", "runs": 3, "success": 2 / 3, "collided": 0.0, "min_distance": -5.0, "failed": 2}
+    assert b == {**expected, "tick_p50": 3.0, "failure": "said at 1.0"} and a["entrant"] == "a" and a["failed"] == 1
+    assert summary(pd.DataFrame(columns=list(COLUMNS))) == []

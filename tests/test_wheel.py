@@ -15,6 +15,7 @@ import pytest
 
 from qpavoid.config.shipped import family_names, robot_names, scenario_names, setup_names
 
+pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parent.parent
 BENCH = """
 import qpavoid.cli, sys

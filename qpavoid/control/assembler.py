@@ -12,7 +12,8 @@ from qpavoid.control.contacts import ContactRows, tracking_within
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.jerk_stops import Stop, StopFollower
 from qpavoid.control.row_layout import hand_over, lay_out
-from qpavoid.control.tasks.frames import AnyTask, in_order, task_levels
+from qpavoid.control.tasks import RowTask, in_order
+from qpavoid.control.tasks.layout import TaskRows, task_levels
 from qpavoid.model.kinematics import ForwardKinematics, Kinematics, support_masks
 from qpavoid.model.limits import JointBounds
 from qpavoid.model.scene import Scene
@@ -30,7 +31,7 @@ class Assembly:
     def __init__(
         self,
         scene: Scene,
-        tasks: Sequence[AnyTask],
+        tasks: Sequence[RowTask],
         bounds: JointBounds,
         kinematics: ForwardKinematics,
         query: DistanceQuery,
@@ -42,12 +43,12 @@ class Assembly:
         looks_ahead: bool = False,
     ) -> None:
         """Lays the memory out; see `Controller` for the arguments, and `RowLayout` for `looks_ahead`."""
-        frames, self._others = in_order(tasks)
+        frames, others = in_order(tasks)
         self._masks = support_masks(scene.robot.model)
         # with jerk limits, a stop goes another way; with contacts, v0 does
         looks_ahead = looks_ahead and contacts is None and not np.isfinite(bounds.jerk).any()
         self._layout = lay_out(
-            scene, frames, self._others, bounds, kinematics, query, avoidance, limits, damping, dt, looks_ahead
+            scene, frames, others, bounds, kinematics, query, avoidance, limits, damping, dt, looks_ahead
         )
         x = self._layout
         self._hard = (x.hard_lower, x.hard_upper) if limits.relax_acceleration else (x.lower, x.upper)
@@ -58,7 +59,9 @@ class Assembly:
         self.targets = self._layout.targets
         """(f, 18) states that the frame tasks are to reach, see `trajectories`; to be written before `compute`."""
         self._views: dict[int, tuple[Proximity, AvoidanceRows]] = {}
-        levels = task_levels(frames, self._others)
+        levels, self._task_rows = task_levels(frames, others), TaskRows(others, x.A, x.b)
+        self.task_errors = self._task_rows.errors
+        """How far each of the tasks that are not frames was from its target in the last step, in its unit."""
         self._tracking = Tracking(self._layout.A, self._layout.b, damping)
         self._levels = levels if len(levels) > 1 else ()
         self._forward, self._contacts = kinematics, contacts
@@ -81,9 +84,8 @@ class Assembly:
             reach: surface distance below which a pair is near [m].
         """
         x = self._layout
-        if self._others:
-            for task, target in zip(self._others, targets[len(self.targets) :], strict=True):
-                task.update(q, self._forward, target)
+        if self.task_errors.size:
+            self._task_rows.write(q, self._forward, targets[len(self.targets) :])
         held = None
         if self._contacts is not None:
             held = self._contacts.update(self._forward)

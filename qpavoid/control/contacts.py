@@ -12,11 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 from scipy.linalg.lapack import dgeqp3, dorgqr, dtrtrs
 
 from qpavoid import config
-from qpavoid.control.tasks.rows import frame_jacobian, frame_pose
+from qpavoid.control.tasks.base import frame_jacobian, frame_pose
 from qpavoid.errors import ConfigError
 from qpavoid.kernels.rotation import rotation_vector
 from qpavoid.model.kinematics import ForwardKinematics
@@ -32,24 +31,23 @@ _DEPENDENT = 1e-8
 class ContactRows:
     """The contacts of a robot, and where they rest."""
 
-    def __init__(self, settings: Sequence[config.Contact], frame_ids: Sequence[int], anchors: Any, model: Any) -> None:
-        """See `build_contacts`."""
-        self.frame_ids = tuple(frame_ids)
-        self._gains = np.array([contact.gain for contact in settings])
-        self._anchors, self._model = anchors, model
-        turns = [contact.type == "surface" for contact in settings]
-        self._rows = np.concatenate([np.repeat([True, turn], 3) for turn in turns])
+    def __init__(
+        self, settings: Sequence[config.Contact], frame_ids: Sequence[int], model: Any, kinematics: ForwardKinematics
+    ) -> None:
+        """Let the frames rest where the kinematics have them; see `build_contacts`."""
+        self.frame_ids, self._model = tuple(frame_ids), model
+        self._anchors = [tuple(part.copy() for part in frame_pose(kinematics, i)) for i in frame_ids]
+        self._gains = np.repeat([contact.gain for contact in settings], 6)
+        self._rows = np.repeat([(True, contact.type == "surface") for contact in settings], 3)
 
     def update(self, kinematics: ForwardKinematics) -> Contacts:
         """Their rows at the configuration for which the kinematics are up to date, solved."""
         J = np.concatenate([frame_jacobian(self._model, kinematics, i) for i in self.frame_ids])
-        b = np.concatenate(
-            [
-                gain * _slid(frame_pose(kinematics, frame_id), anchor)
-                for frame_id, anchor, gain in zip(self.frame_ids, self._anchors, self._gains, strict=True)
-            ]
-        )
-        b = b[self._rows]
+        missing = []
+        for frame_id, (position, rotation) in zip(self.frame_ids, self._anchors, strict=True):
+            x, R = frame_pose(kinematics, frame_id)
+            missing += [*(position - x), *rotation_vector((rotation @ R.T).tolist())]
+        b = (self._gains * missing)[self._rows]
         b *= min(1.0, _CORRECTION / max(float(np.abs(b).max()), 1e-12))
         return solve_contacts(J[self._rows], b)
 
@@ -57,7 +55,7 @@ class ContactRows:
 def build_contacts(
     configs: Sequence[config.Contact], robot: Robot, q0: Array, source: Path = Path("contacts")
 ) -> ContactRows | None:
-    """The contacts of a scenario, resting where their frames are at q0; None where there are none.
+    """Make the contacts of a scenario, resting where their frames are at q0; None where there are none.
 
     Args:
         configs: the scenario's `contacts`.
@@ -67,24 +65,21 @@ def build_contacts(
 
     Raises:
         UnknownName: of a frame.
+        ConfigError: the robot cannot move.
     """
     if not configs:
         return None
-    data, ids = robot.model.createData(), []
-    for index, contact in enumerate(configs):
-        ids.append(robot.frame_id(contact.frame, f"{source}: contacts.{index}.frame"))
-    pin.framesForwardKinematics(robot.model, data, q0)
-    anchors = [(data.oMf[i].translation.copy(), data.oMf[i].rotation.copy()) for i in ids]
-    rows = ContactRows(configs, ids, anchors, robot.model)
+    ids = [robot.frame_id(c.frame, f"{source}: contacts.{index}.frame") for index, c in enumerate(configs)]
     kinematics = ForwardKinematics(robot.model, ids)
     kinematics.compute(q0)
+    rows = ContactRows(configs, ids, robot.model, kinematics)
     if not rows.update(kinematics).Z.shape[1]:
         raise ConfigError(f"{source}: contacts leave {robot.name} no way to move; leave some out, or make them points")
     return rows
 
 
 def solve_contacts(J: Array, b: Array) -> Contacts:
-    """Solves J v = b by a QR factorisation of Jᵀ with pivoting; rows that follow from others are left out.
+    """Solve J v = b by a QR factorisation of Jᵀ with pivoting; rows that follow from others are left out.
 
     Args:
         J: (c, nv) contact Jacobian.
@@ -122,9 +117,3 @@ def tracking_within(contacts: Contacts, A: Array, b: Array, damping: float) -> A
         gram.ravel()[:: len(gram) + 1] += damping**2
         w = np.linalg.solve(gram, reduced.T @ asked)
     return np.asarray(contacts.v_particular + contacts.Z @ w)
-
-
-def _slid(pose: tuple[Array, Array], anchor: tuple[Array, Array]) -> Array:
-    """What is missing from a pose to the one where a contact rests (6,) [m, rad]."""
-    turned = rotation_vector((anchor[1] @ pose[1].T).tolist())
-    return np.concatenate((anchor[0] - pose[0], turned))

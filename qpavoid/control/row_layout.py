@@ -9,8 +9,8 @@ import numpy as np
 from qpavoid.config import Avoidance, Limits
 from qpavoid.control.avoidance import row_form
 from qpavoid.control.distances import DistanceQuery
-from qpavoid.control.tasks.frames import FrameTask, task_layout
-from qpavoid.control.tasks.rows import RowTask
+from qpavoid.control.tasks import FrameTask, RowTask
+from qpavoid.control.tasks.layout import task_layout
 from qpavoid.kernels.layout import RowLayout
 from qpavoid.model.kinematics import ForwardKinematics, chains, column_joints, columns, max_lever_arm
 from qpavoid.model.limits import JointBounds, limit_layout

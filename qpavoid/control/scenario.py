@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from qpavoid.config import ScenarioConfig
 from qpavoid.control.contacts import ContactRows, build_contacts
-from qpavoid.control.tasks.frames import AnyTask, build_tasks
+from qpavoid.control.tasks import RowTask, build_tasks
 from qpavoid.errors import located
 from qpavoid.model.robot import Robot
 from qpavoid.model.scene import Scene, build_obstacles, build_scene
@@ -18,7 +18,7 @@ class Parts(NamedTuple):
     """Parts of a controller, and the initial configuration."""
 
     scene: Scene
-    tasks: list[AnyTask]
+    tasks: list[RowTask]
     solver: Solver
     contacts: ContactRows | None
     q0: Array

@@ -10,7 +10,7 @@ import numpy as np
 from qpavoid import kernels
 from qpavoid.control.inputs import FARTHEST, FASTEST, FAULTS
 from qpavoid.control.poses import is_sample_of_arrays
-from qpavoid.control.tasks.frames import AnyTask
+from qpavoid.control.tasks import RowTask
 from qpavoid.control.trajectories import STATE, as_samples, put
 from qpavoid.errors import ConfigError, NumericalError, UnknownName, nearest
 from qpavoid.kernels.obstacles import FINE, NORMALISED, SAMPLE
@@ -22,7 +22,7 @@ from qpavoid.reason import Reason, ReasonKind
 class TargetReader:
     """Reads the targets of a step into the memory of the frame tasks."""
 
-    def __init__(self, tasks: Sequence[AnyTask], frames: Array) -> None:
+    def __init__(self, tasks: Sequence[RowTask], frames: Array) -> None:
         """Lay out memory for some tasks.
 
         Args:

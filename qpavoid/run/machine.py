@@ -11,7 +11,7 @@ from typing import Any
 
 PACKAGES = (
     "qpavoid", "numpy", "scipy", "pin", "coal", "numba", "mujoco", "daqp", "proxsuite", "osqp", "quadprog", "qpsolvers",
-    "pin-pink", "mink", "placo", "distributed", "pyarrow",
+    "pin-pink", "mink", "placo", "distributed", "pandas", "statsmodels",
 )  # fmt: skip
 """Packages whose versions a report lists, where they are installed."""
 

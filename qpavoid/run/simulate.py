@@ -13,7 +13,7 @@ from qpavoid import kernels
 from qpavoid.config import Mesh, PointCloud, ScenarioConfig
 from qpavoid.config.loading import load_scenario
 from qpavoid.control.distances import DistanceQuery
-from qpavoid.control.tasks.frames import in_order
+from qpavoid.control.tasks import in_order
 from qpavoid.control.tick import Tick
 from qpavoid.controller import Controller
 from qpavoid.errors import ConfigError, NumericalError

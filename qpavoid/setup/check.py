@@ -18,7 +18,7 @@ import pinocchio as pin
 from qpavoid.config import RobotConfig, Task
 from qpavoid.config.loading import read_config
 from qpavoid.config.shipped import find_robot
-from qpavoid.control.tasks.frames import build_tasks
+from qpavoid.control.tasks import build_tasks
 from qpavoid.controller import Controller
 from qpavoid.errors import ConfigError, QpavoidError
 from qpavoid.geometry.bodies import convert_bodies, triangle_meshes

@@ -23,8 +23,9 @@ from qpavoid_bench.survey import robots
 from qpavoid_bench.tick.command import tick
 
 if TYPE_CHECKING:
-    import pyarrow as pa
+    import pandas as pd
 
+    from qpavoid_bench.arena.case import Case
     from qpavoid_bench.arena.suite import Suite
     from qpavoid_bench.arena.sweep import Tally
 
@@ -42,7 +43,7 @@ app.command()(robots)
 _MEASURES = ("tick", "solvers", "endurance", "robots")
 """Commands that need none of the packages below."""
 
-_PACKAGES = ("distributed", "pyarrow", "mujoco", "jinja2", "matplotlib")
+_PACKAGES = ("distributed", "mujoco", "pandas", "statsmodels", "matplotlib")
 
 Name = Annotated[str, typer.Argument(metavar="SUITE", help="Shipped name or path of a YAML file.")]
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of results.")]
@@ -79,9 +80,7 @@ def run(
 
     The exit status is 1 when something could not be made or run, or was interrupted; collisions are results.
     """
-    from qpavoid_bench.arena.plan import runs_of
     from qpavoid_bench.arena.suite import load_suite
-    from qpavoid_bench.arena.summary import FIGURES
 
     if cluster is not None and jobs is not None:
         raise ConfigError("--jobs: the cluster has its own; leave one of --jobs and --cluster out")
@@ -91,7 +90,7 @@ def run(
     tally = _run_sweep(chosen, folder, cluster, jobs)
     for failure in _failures(folder):
         _print_error(failure)
-    _print(chosen, runs_of(chosen, folder, FIGURES), folder, tally, json)
+    _print(chosen, _runs_of(chosen, folder)[0], folder, tally, json)
     raise typer.Exit(1 if tally.failed else 0)
 
 
@@ -102,7 +101,6 @@ def smoke(
     json: Json = False,
 ) -> None:
     """Run a few cases of everything, and list faults: exit status 1 if there are any."""
-    from qpavoid_bench.arena.plan import cases_of, runs_of
     from qpavoid_bench.arena.suite import load_suite
     from qpavoid_bench.arena.summary import find_faults
 
@@ -110,8 +108,8 @@ def smoke(
     with ExitStack() as stack:
         folder = out or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="qpavoid-smoke-")))
         tally = _run_sweep(chosen, folder, None, jobs)
-        runs = runs_of(chosen, folder)
-        faults = [*_failures(folder), *find_faults(chosen, runs, cases_of(chosen, folder, ["case", "json"]))]
+        runs, cases = _runs_of(chosen, folder)
+        faults = [*_failures(folder), *find_faults(chosen, runs, cases)]
     _print(chosen, runs, out, tally, json, {"broken": faults})
     for fault in faults:
         _print_error(f"broken: {fault}")
@@ -120,7 +118,7 @@ def smoke(
 
 @app.command()
 def report(folder: Folder) -> None:
-    """Write the report of a folder: Markdown, and one page of HTML."""
+    """Write the report of a folder: Markdown with pictures."""
     from qpavoid_bench.arena.report import write_report
 
     for file in write_report(folder):
@@ -184,9 +182,9 @@ def _run_sweep(suite: Suite, folder: Path, cluster: str | None, jobs: int | None
     Raises:
         Exit: it was interrupted, or the cluster went away.
     """
-    from qpavoid_bench.arena.plan import is_complete
+    from qpavoid.run.pool import ClusterLost, ClusterWorkers, Workers
     from qpavoid_bench.arena.store import Store
-    from qpavoid_bench.arena.sweep import ClusterLost, Tally, local_cluster, remote_cluster, sweep
+    from qpavoid_bench.arena.sweep import Tally, plan, sweep
 
     for entrant in suite.absent:
         _print_error(f"{entrant.name} does not take part: it needs {', '.join(entrant.missing)}")
@@ -201,16 +199,31 @@ def _run_sweep(suite: Suite, folder: Path, cluster: str | None, jobs: int | None
             task, visible = bars[tally.stage], tally.total > 0
             bar.update(task, completed=tally.done, total=tally.total, description=lines, visible=visible)
 
-        if is_complete(suite, folder):
+        todo = plan(suite, store)
+        if not (todo.cases or todo.runs):
             return Tally("runs", 0, 0, 0, 0)
         try:
-            with remote_cluster(cluster) if cluster is not None else local_cluster(jobs) as client:
-                return sweep(suite, store, client, report_progress)
+            with Workers(jobs) if cluster is None else ClusterWorkers(cluster) as workers:
+                return sweep(suite, store, workers, report_progress)
         except (KeyboardInterrupt, ClusterLost) as reason:
             cause = "interrupted" if isinstance(reason, KeyboardInterrupt) else str(reason)
             done = "nothing" if last is None else f"{last.done} of {last.total} {last.stage}"
             _print_error(f"{cause}: {done} done, all that is done is kept in {folder}; the same command goes on")
             raise typer.Exit(1) from None
+
+
+def _runs_of(suite: Suite, folder: Path) -> tuple[pd.DataFrame, list[Case]]:
+    """Return runs of a suite that are done, and its cases that are made."""
+    from qpavoid_bench.arena.case import Case
+    from qpavoid_bench.arena.scores import KEY
+    from qpavoid_bench.arena.store import Store, read_runs
+    from qpavoid_bench.arena.sweep import plan
+
+    with Store(folder) as store:
+        wanted = plan(suite, store)
+    runs = read_runs(folder)
+    keys = zip(*(runs[name] for name in KEY), strict=True)
+    return runs[[key in wanted.keys for key in keys]], [Case.from_json(text) for text in wanted.texts]
 
 
 def _failures(folder: Path) -> list[str]:
@@ -226,7 +239,7 @@ def _failures(folder: Path) -> list[str]:
 
 def _print(
     suite: Suite,
-    runs: pa.Table,
+    runs: pd.DataFrame,
     folder: Path | None,
     tally: Tally,
     json: bool,
@@ -235,12 +248,13 @@ def _print(
     """Print the summary of a suite, as a table or as JSON."""
     from qpavoid_bench.arena.summary import summary, summary_table
 
+    rows = summary(runs)
     if json:
         fields = {"suite": suite.name, "folder": folder and str(folder), "new": tally.done, "runs": len(runs)}
-        print(to_json({**fields, "failed": tally.failed, **(extra_fields or {}), "entrants": summary(runs)}))
+        print(to_json({**fields, "failed": tally.failed, **(extra_fields or {}), "entrants": rows}))
         return
-    OUT.print(summary_table(runs, f"{suite.name}: {suite.title}"))
-    for row in summary(runs):
+    OUT.print(summary_table(rows, f"{suite.name}: {suite.title}"))
+    for row in rows:
         if row["failed"]:
             _print_error(f"{row['entrant']} failed in {row['failed']} of {row['runs']} runs: {row['failure']}")
     if folder is not None:

@@ -20,7 +20,7 @@ from qpavoid.model.trajectory import Sample
 from qpavoid.problem import Array, Problem, Solution, require_finite
 from qpavoid_bench.arena.case import Case
 from qpavoid_bench.arena.entrants import Entrant
-from qpavoid_bench.arena.pilot import Pilot
+from qpavoid_bench.arena.rollout import Pilot
 from qpavoid_bench.arena.world import World
 
 _MAX_FILE_SIZE = 10_000_000

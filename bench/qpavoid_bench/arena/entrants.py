@@ -7,6 +7,7 @@ import json
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, distribution
 from typing import Any
@@ -17,7 +18,7 @@ from qpavoid.errors import ConfigError, UnknownName, nearest
 from qpavoid.solvers import make_solver, parse_solver
 from qpavoid_bench.arena.case import Case
 from qpavoid_bench.arena.libraries.settings import MINK, PINK, PLACO, PLACO_PYTHON
-from qpavoid_bench.arena.pilot import Pilot
+from qpavoid_bench.arena.rollout import Pilot
 from qpavoid_bench.arena.world import World
 
 
@@ -75,49 +76,29 @@ def solver_entrant(
             not named of a block stays as it is.
     """
     config = parse_solver(solver) if isinstance(solver, str) else solver
-
-    def start(case: Case, world: World) -> Pilot:
-        scenario = case.scenario.model_dump()
-        for block, fields in changes.items():
-            scenario[block] = {**scenario[block], **fields}
-        scenario["solver"] = config.model_dump()
-        x = ScenarioConfig.model_validate(scenario)
-        blocks = x.avoidance, x.limits, x.tracking_damping, x.sensing, x.progress
-        return Controller(world.scene, world.tasks, make_solver(x.solver), x.dt, *blocks)
-
     settings = {"solver": solver if isinstance(solver, str) else solver.model_dump(), **changes}
-    return Entrant(name, description, start, settings, packages)
+    return Entrant(name, description, partial(_start_solver, config, changes), settings, packages)
 
 
-def library_entrant(
-    name: str,
-    description: str,
-    module: str,
-    settings: Mapping[str, Any],
-    packages: tuple[str, ...],
-    interpreter_variable: str = "",
-) -> Entrant:
-    """Return an entrant that runs another library through its adapter.
-
-    Args:
-        name: of the entrant.
-        description: what it is, in a line.
-        module: of the adapter, in `qpavoid_bench.arena.libraries`; read when the entrant is first started.
-        settings: how it is set.
-        packages: what it runs on.
-        interpreter_variable: environment variable that may name another Python interpreter that has them.
-    """
-
-    def start(case: Case, world: World) -> Pilot:
-        pilot: Pilot = import_module(f"qpavoid_bench.arena.libraries.{module}").Pilot(case, world)
-        return pilot
-
-    return Entrant(name, description, start, settings, packages, interpreter_variable)
+def _start_solver(solver: SolverConfig, changes: Mapping[str, Mapping[str, Any]], case: Case, world: World) -> Pilot:
+    scenario = case.scenario.model_dump()
+    for block, fields in changes.items():
+        scenario[block] = {**scenario[block], **fields}
+    x = ScenarioConfig.model_validate({**scenario, "solver": solver.model_dump()})
+    blocks = x.avoidance, x.limits, x.tracking_damping, x.sensing, x.progress
+    return Controller(world.scene, world.tasks, make_solver(x.solver), x.dt, *blocks)
 
 
-def _without_backup(row: str) -> dict[str, Any]:
-    """Return avoidance fields with rows of one kind and no backup trajectory."""
-    return {"row": {"type": row}, "backup": None}
+def _start_library(module: str, case: Case, world: World) -> Pilot:
+    """Set up another library through its adapter, a module of `libraries`, which is imported here."""
+    pilot: Pilot = import_module(f"qpavoid_bench.arena.libraries.{module}").Pilot(case, world)
+    return pilot
+
+
+def _qp_without_backup(name: str, description: str, row: str) -> Entrant:
+    """Return the QP with rows of one kind and no backup trajectory."""
+    changes = {"row": {"type": row}, "backup": None}
+    return solver_entrant(name, f"QP with {description}, no backup trajectory", "qp", avoidance=changes)
 
 
 ENTRANTS = {
@@ -131,28 +112,36 @@ ENTRANTS = {
             "potential-field", "tracking pulls, near pairs push: FIRAS at velocity level", "potential-field"
         ),
         solver_entrant("qp", "QP as each scenario has it, with a backup trajectory", "qp"),
-        solver_entrant(
-            "qp-task-switching",
-            "QP with the gains of eq. 10 in its rows, no backup trajectory",
-            "qp",
-            avoidance=_without_backup("task-switching"),
-        ),
-        solver_entrant(
-            "qp-no-backup", "QP with beta rows, no backup trajectory", "qp", avoidance=_without_backup("beta")
-        ),
-        solver_entrant(
-            "qp-damper", "QP with velocity damper rows, no backup trajectory", "qp", avoidance=_without_backup("damper")
-        ),
-        solver_entrant("qp:native", "QP, compiled active-set method", "qp:native", ("numba",)),
+        _qp_without_backup("qp-task-switching", "the gains of eq. 10 in its rows", "task-switching"),
+        _qp_without_backup("qp-no-backup", "beta rows", "beta"),
+        _qp_without_backup("qp-damper", "velocity damper rows", "damper"),
+        solver_entrant("qp:native", "QP, compiled active-set method", "qp:native"),
         solver_entrant("qp:daqp", "QP, back end daqp", "qp:daqp"),
         solver_entrant("qp:proxqp", "QP, back end ProxQP", "qp:proxqp"),
         solver_entrant("qp:osqp", "QP, back end OSQP", "qp:osqp"),
         solver_entrant("qp:quadprog", "QP, back end quadprog", "qp:quadprog", ("quadprog",)),
         solver_entrant("hqp", "strict priorities, a cascade of QPs, with a backup trajectory", "hqp"),
-        library_entrant("pink", "Pink, with its barrier between collision bodies", "pink_adapter", PINK, ("pin-pink",)),
-        library_entrant("mink", "mink, with its limit on collisions", "mink_adapter", MINK, ("mink", "mujoco")),
-        library_entrant(
-            "placo", "placo, with its constraint on self-collisions", "placo_adapter", PLACO, ("placo",), PLACO_PYTHON
+        Entrant(
+            "pink",
+            "Pink, with its barrier between collision bodies",
+            partial(_start_library, "pink_adapter"),
+            PINK,
+            ("pin-pink",),
+        ),
+        Entrant(
+            "mink",
+            "mink, with its limit on collisions",
+            partial(_start_library, "mink_adapter"),
+            MINK,
+            ("mink", "mujoco"),
+        ),
+        Entrant(
+            "placo",
+            "placo, with its constraint on self-collisions",
+            partial(_start_library, "placo_adapter"),
+            PLACO,
+            ("placo",),
+            PLACO_PYTHON,
         ),
     )
 }

@@ -21,20 +21,21 @@ _MARKERS = "osD^v<>"
 
 def safety_against_tracking(results: Results) -> Figure:
     """Draw the rate of runs without contact over the mean tracking error."""
-    x = [mean(1e3 * results.values("tracking_error", i)) for i in range(len(results.entrants))]
-    y = [_success_rate(~results.values("collided", i).astype(bool)) for i in range(len(results.entrants))]
+    x = [mean(1e3 * values) for values in results.table("tracking_error").T]
+    y = [_percent(rate(~values)) for values in results.table("collided").astype(bool).T]
     return _scatter(results, x, y, "mean tracking error [mm]", "runs without contact [%]")
 
 
 def success_against_time(results: Results) -> Figure:
     """Draw the rate of runs that succeed over the median time of a control step."""
-    x = [_quartiles(results.values("tick_p50", i)) for i in range(len(results.entrants))]
-    y = [_success_rate(results.values("success", i).astype(bool)) for i in range(len(results.entrants))]
+    low, middle, high = np.quantile(results.table("tick_p50"), [0.25, 0.5, 0.75], axis=0)
+    x = [Interval(*values) for values in zip(middle, low, high, strict=True)]
+    y = [_percent(rate(values)) for values in results.table("success").astype(bool).T]
     figure = _scatter(results, x, y, "median tick [µs], with quartiles over runs", "runs that succeed [%]")
     axis = figure.axes[0]
     axis.set_xscale("log")
-    low, high = axis.get_xlim()
-    axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high > 8.0 * low else range(1, 10)))
+    left, right = axis.get_xlim()
+    axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if right > 8.0 * left else range(1, 10)))
     axis.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axis.xaxis.set_minor_formatter("")
     return figure
@@ -42,36 +43,23 @@ def success_against_time(results: Results) -> Figure:
 
 def success_by_family(results: Results) -> Figure:
     """Draw the rate of runs that succeed by entrant, best first, and family."""
-    families = results.families
-    entrants = tuple(results.ranking())
-    order = [results.entrants.index(name) for name in entrants]
-    share = np.full((len(entrants), len(families)), np.nan)
-    for j in range(len(families)):
-        success = results.table("success", j)
-        if len(success):
-            share[:, j] = 100.0 * success.mean(axis=0)[order]
+    families, entrants = results.families, list(results.ranking())
+    runs = results.common.assign(success=100.0 * results.common["success"])
+    share = runs.pivot_table("success", "entrant", "family").reindex(index=entrants, columns=families).to_numpy()
     figure = Figure(figsize=(1.8 + 0.62 * len(families), 1.6 + 0.34 * len(entrants)), layout="constrained")
     ax = figure.subplots()
     image = ax.imshow(share, cmap="viridis", vmin=0.0, vmax=100.0, aspect="auto")
     ax.set_xticks(range(len(families)), families, rotation=45, ha="right", fontsize=8, parse_math=False)
     ax.set_yticks(range(len(entrants)), entrants, fontsize=8, parse_math=False)
-    for i, j in np.ndindex(share.shape):
-        if np.isfinite(share[i, j]):
-            colour = "black" if share[i, j] > 60.0 else "white"
-            ax.text(j, i, f"{share[i, j]:.0f}", ha="center", va="center", fontsize=7, color=colour)
+    for i, j in np.argwhere(np.isfinite(share)):
+        colour = "black" if share[i, j] > 60.0 else "white"
+        ax.text(j, i, f"{share[i, j]:.0f}", ha="center", va="center", fontsize=7, color=colour)
     figure.colorbar(image, ax=ax, label="runs that succeed [%]", fraction=0.04)
     return figure
 
 
-def _success_rate(flags: Any) -> Interval:
-    """Return a rate with its interval [%]."""
-    return Interval(*(100.0 * value for value in rate(int(flags.sum()), len(flags))))
-
-
-def _quartiles(values: Array) -> Interval:
-    """Return the median of values (n,) with their quartiles."""
-    low, middle, high = np.quantile(values, [0.25, 0.5, 0.75])
-    return Interval(float(middle), float(low), float(high))
+def _percent(interval: Interval) -> Interval:
+    return Interval(*(100.0 * value for value in interval))
 
 
 def _scatter(results: Results, x: list[Interval], y: list[Interval], x_label: str, y_label: str) -> Figure:
@@ -113,7 +101,7 @@ def _error_bar(interval: Interval) -> Array:
     return np.array([[max(value - low, 0.0)], [max(high - value, 0.0)]])
 
 
-def _label(ax: Any, names: tuple[str, ...], xs: Array, ys: Array) -> None:
+def _label(ax: Any, names: list[str], xs: Array, ys: Array) -> None:
     """Write names at the right-hand edge without overlap, with a thin line to each point."""
     bottom, top = ax.get_ylim()
     gap = _LABEL_HEIGHT / ax.figure.get_figheight()

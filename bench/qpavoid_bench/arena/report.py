@@ -4,35 +4,23 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections import Counter
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
+import pandas as pd
 
 from qpavoid.errors import ConfigError, QpavoidError
 from qpavoid_bench.arena import figures
-from qpavoid_bench.arena.coverage import missing_results
 from qpavoid_bench.arena.entrants import ENTRANTS
 from qpavoid_bench.arena.families import load_family
-from qpavoid_bench.arena.pages import write_markdown, write_page
 from qpavoid_bench.arena.results import Results, results_of
 from qpavoid_bench.arena.statistics import CONFIDENCE, duel, mean
-from qpavoid_bench.arena.store import read_failures, read_runs
+from qpavoid_bench.arena.store import read_facts, read_failures, read_runs
 from qpavoid_bench.arena.suite import describe_entrants
-from qpavoid_bench.arena.tables import (
-    COLUMNS,
-    MORE,
-    Cell,
-    Section,
-    Table,
-    count_cell,
-    interval_cell,
-    score_tables,
-    text_cell,
-)
+from qpavoid_bench.arena.tables import COLUMNS, MORE, code, escape, interval_text, markdown_table, score_tables
 
 COMPARISON_LIMITS = (
     "Velocities are followed exactly: no delay, no tracking error of a drive, no dynamics. What a real arm adds is the "
@@ -54,25 +42,39 @@ COMPARISON_LIMITS = (
 )
 
 
+_MAX_ROWS = 3
+"""Worst runs, and failures, that are listed of each entrant."""
+_MAX_SEEDS_SHOWN = 5
+_FIGURES = (
+    (figures.safety_against_tracking, "tracking", "Safety against tracking: full points are beaten by none in both."),
+    (
+        figures.success_against_time,
+        "speed",
+        "Success against the time of a tick: full points are beaten by none in both.",
+    ),
+    (figures.success_by_family, "families", "Success by family."),
+)
+"""Figures of a report: function, name of its file, caption."""
+
+
 def write_report(folder: Path) -> list[Path]:
-    """Write report.md with its figures, and report.html, into a folder of results.
+    """Write report.md and its figures into a folder of results.
 
     Raises:
         ConfigError: the folder holds no results, or none that all entrants have.
     """
-    facts = _read_facts(folder)
-    sections = tuple(report_of(read_runs(folder), facts, folder))
-    title = f"Arena: {facts.get('title') or folder.name}"
-    return [*write_markdown(folder, title, sections), write_page(folder, title, sections)]
+    facts = {**read_facts(folder), "failures": read_failures(folder)}
+    results = comparable_results(read_runs(folder), folder)
+    paths = [folder / "report.md", *(folder / f"report-{name}.png" for _, name, _ in _FIGURES)]
+    text = "\n".join([f"# Arena: {facts.get('title') or folder.name}", "", *report_lines(results, facts, folder)])
+    for path, (draw, _, _) in zip(paths[1:], _FIGURES, strict=True):
+        draw(results).savefig(path, dpi=110)
+    paths[0].write_text(text, encoding="utf-8")
+    return paths
 
 
-def report_of(runs: pa.Table, facts: dict[str, Any], folder: Path = Path("DIR")) -> Iterator[Section]:
-    """Yield the sections of a report.
-
-    Args:
-        runs: rows of `scores.Score`.
-        facts: what suite.json says.
-        folder: of the results, for the commands that run something again.
+def comparable_results(runs: pd.DataFrame, folder: Path) -> Results:
+    """Arrange runs for a report.
 
     Raises:
         ConfigError: no runs, or no case that all entrants have run.
@@ -80,107 +82,115 @@ def report_of(runs: pa.Table, facts: dict[str, Any], folder: Path = Path("DIR"))
     if not len(runs):
         raise ConfigError(f"{folder}: there are no runs to report; `qpavoid bench run` makes some")
     results = results_of(runs, tuple(ENTRANTS))
-    if not results.common.any():
-        counts = [len(results.rows_of(i)) for i in range(len(results.entrants))]
-        least = results.entrants[int(np.argmin(counts))]
+    if results.common.empty:
+        counts = results.runs["entrant"].value_counts()
         raise ConfigError(
-            f"{folder}: no case was run by all of {', '.join(results.entrants)}, {least} has run the fewest "
-            f"({min(counts)} of {len(results.cell)}); let the suite end first"
+            f"{folder}: no case was run by all of {', '.join(results.entrants)}, {counts.idxmin()} has run the fewest "
+            f"({counts.min()} of {results.cases}); let the suite end first"
         )
-    yield _provenance_section(results, runs, facts)
-    yield Section("Limits of the comparison", points=COMPARISON_LIMITS)
-    yield _entrants_section(results, facts)
-    yield _definitions_section()
-    yield _overall_section(results)
-    yield _comparison_section(results)
-    for index, name in enumerate(results.families):
-        yield _family_section(results, index, name)
-    yield _worst_runs_section(results, facts, folder)
-    yield _failures_section(results)
+    return results
 
 
-def _read_facts(folder: Path) -> dict[str, Any]:
-    """Read suite.json and the failures of the last sweep."""
-    try:
-        facts = json.loads((folder / "suite.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        facts = {}
-    return {**facts, "failures": read_failures(folder)}
+def report_lines(results: Results, facts: Mapping[str, Any], folder: Path = Path("DIR")) -> Iterator[str]:
+    """Yield the lines of a report, without its title.
+
+    Args:
+        results: what there is.
+        facts: of the last sweep, and its `failures`; whatever they lack is not asked for.
+        folder: of the results, for the commands that run something again.
+    """
+    sections = {
+        "What this was made on": [f"- {point}" for point in _provenance(results, facts)],
+        "Limits of the comparison": [f"- {point}" for point in COMPARISON_LIMITS],
+        "Who takes part": _entrants(results, facts),
+        "How it is scored": _definitions(),
+        "Overall": [*(f"![{caption}](report-{name}.png)\n" for _, name, caption in _FIGURES), *score_tables(results)],
+        "Beside the best": _beside_the_best(results),
+        **{f"Family: {name}": _family(results, name) for name in results.families},
+        "Worst runs": _worst_runs(results, facts, folder) or ["None."],
+        "Failures": _failures(results) or ["None."],
+    }
+    for title, lines in sections.items():
+        yield from (f"## {title}", "", *lines, "")
 
 
-def _provenance_section(results: Results, runs: pa.Table, facts: dict[str, Any]) -> Section:
-    """List versions, machine, numbers of runs, and gaps."""
-    points = [
-        f"{section.capitalize()}: " + ", ".join(f"{name} {value}" for name, value in facts[section].items()) + "."
-        for section in ("versions", "machine")
-        if facts.get(section)
-    ]
+def _provenance(results: Results, facts: Mapping[str, Any]) -> Iterator[str]:
+    """List versions, machine, numbers of runs, and everything that is not as the suite asks."""
+    for name in ("versions", "machine"):
+        if facts.get(name):
+            yield f"{name.capitalize()}: {', '.join(f'{key} {value}' for key, value in facts[name].items())}."
     if "workers" in facts:
-        points.append(f"Processes at once, in the last sweep: {facts['workers']}.")
-    points.append(
-        f"{len(runs)} runs: {len(results.entrants)} entrants, {len(results.families)} families, {len(results.cell)} "
-        f"cases. All figures are of the {int(results.common.sum())} cases that every entrant has run."
+        yield f"Processes at once, in the last sweep: {facts['workers']}."
+    yield (
+        f"{len(results.runs) + results.replaced} runs: {len(results.entrants)} entrants, {len(results.families)} "
+        f"families, {results.cases} cases. All figures are of the {results.common['case'].nunique()} cases that every "
+        "entrant has run."
     )
-    points += missing_results(results, facts)
-    return Section("What this was made on", points=tuple(points))
+    seeds = results.runs["seed"] - facts.get("first_seed", 0)
+    in_suite = results.runs[(seeds >= 0) & (seeds < facts.get("seeds", 0))]
+    for family in facts.get("families", ()):
+        missing = facts["seeds"] - in_suite.loc[in_suite["family"] == family, "seed"].nunique()
+        if missing:
+            yield f"No entrant has run {missing} of the {facts['seeds']} cases of {family} that the suite asks for."
+    for name, family, count in results.missing():
+        yield f"{name} has not run {count} cases of {family}, which count for no entrant."
+    for name, packages in facts.get("absent", {}).items():
+        if name not in results.entrants:
+            yield f"{name} does not take part: it needs {', '.join(packages)}."
+    for name in sorted({entry["name"] for entry in facts.get("entrants", {}).values()} - set(results.entrants)):
+        yield f"{name} was to take part, and has no run."
+    failed_seeds = defaultdict(list)
+    for failure in facts.get("failures", ()):
+        failed_seeds[failure["family"], failure["entrant"], failure["failure"]].append(str(failure["seed"]))
+    for (family, entrant, message), failed in failed_seeds.items():
+        outcome = "could not be made" if entrant is None else f"could not be run by {entrant}"
+        shown = ", ".join(failed[:_MAX_SEEDS_SHOWN]) + ", …" * (len(failed) > _MAX_SEEDS_SHOWN)
+        yield f"{family}, seed {shown}: {outcome}: {code(message.replace('`', chr(39)))}"
+    versions = results.runs.groupby("entrant")["version"].first()
+    if versions.nunique() > 1:
+        listed = ", ".join(f"{name} {versions[name]}" for name in results.entrants)
+        yield f"**Entrants ran with different versions of qpavoid**: {listed}."
+    if results.replaced:
+        yield (
+            f"{results.replaced} rows count for nothing: an entrant has run with other settings or another version "
+            "since, or the family has been changed."
+        )
+    if results.bounded:
+        yield f"{results.bounded} figures were infinite or no numbers: they stand at the worst of all runs."
 
 
-def _entrants_section(results: Results, facts: dict[str, Any]) -> Section:
-    """List entrants with their descriptions and settings."""
-    entrant_facts = {**describe_entrants(ENTRANTS.values()), **facts.get("entrants", {})}
-    rows = []
-    for name, digest in zip(results.entrants, results.settings, strict=True):
-        entry = entrant_facts.get(digest, {"says": "", "settings": {}})
-        settings = ", ".join(f"{key}: {_json_text(value)}" for key, value in entry["settings"].items())
-        rows.append((text_cell(name), text_cell(entry["says"]), text_cell(settings)))
-    return Section("Who takes part", tables=(Table(("entrant", "what it is", "its own settings"), tuple(rows)),))
+def _entrants(results: Results, facts: Mapping[str, Any]) -> list[str]:
+    """Tabulate entrants with their descriptions and settings."""
+    known = {**describe_entrants(ENTRANTS.values()), **facts.get("entrants", {})}
+    digests, rows = results.runs.groupby("entrant")["settings"].first(), []
+    for name in results.entrants:
+        entry = known.get(digests[name], {"says": "", "settings": {}})
+        settings = ", ".join(
+            f"{key}: {json.dumps(value, ensure_ascii=False)}" for key, value in entry["settings"].items()
+        )
+        rows.append((escape(name), escape(entry["says"]), escape(settings.replace('"', ""))))
+    return markdown_table(("entrant", "what it is", "its own settings"), rows)
 
 
-def _definitions_section() -> Section:
+def _definitions() -> list[str]:
     """Define the figures and the ranking."""
-    text = (
+    return [
         f"Ranges with figures hold the true value with {100 * CONFIDENCE:.0f} % over further seeds: of rates that of "
         "Wilson, of means the bootstrap's, of medians that of the sign test. A run that fails counts at its limit and "
         "is never left out: an entrant that raises is held for that tick, and its run goes on.",
+        "",
         "**Ranking.** By the share of runs that succeed; where that is the same, by the mean tracking error. "
         "Entrants that McNemar's exact test over the same cases cannot separate from the first of a rank, at "
         f"{100 * (1 - CONFIDENCE):.0f} %, share it. With few cases, the test separates little.",
-    )
-    rows = tuple((text_cell(column.heading), text_cell(column.description)) for column in (*COLUMNS, *MORE))
-    return Section("How it is scored", text, tables=(Table(("figure", "what it is"), rows),))
+        "",
+        *markdown_table(
+            ("figure", "what it is"),
+            [(escape(column.heading), escape(column.description)) for column in (*COLUMNS, *MORE)],
+        ),
+    ]
 
 
-def _overall_section(results: Results) -> Section:
-    """Tabulate and draw the results of all families."""
-    both = "full points are beaten by no other one in both"
-    pictures = (
-        ("tracking", f"Safety against tracking: {both}.", figures.safety_against_tracking(results)),
-        ("speed", f"Success against the time of a tick: {both}.", figures.success_against_time(results)),
-        ("families", "Success by family.", figures.success_by_family(results)),
-    )
-    return Section("Overall", tables=score_tables(results), pictures=pictures)
-
-
-def _family_section(results: Results, index: int, name: str) -> Section:
-    """Tabulate the results of one family."""
-    text, robots = _family_text(name), np.unique(results.values("robot", 0, index).astype(str)).tolist()
-    count = int(np.sum(results.common & (results.family == index)))
-    if not count:
-        return Section(f"Family: {name}", (*text, "No case that all have run."))
-    text = (*text, f"{count} cases, on {', '.join(robots)}.")
-    return Section(f"Family: {name}", text, tables=score_tables(results, index))
-
-
-def _family_text(name: str) -> tuple[str, ...]:
-    """Return title and purpose of a family, if its file can be read."""
-    try:
-        config = load_family(name).config
-    except QpavoidError:
-        return ()
-    return (f"{config.title}. {config.about}",)
-
-
-def _comparison_section(results: Results) -> Section:
+def _beside_the_best(results: Results) -> list[str]:
     """Compare every entrant with the first of the ranking."""
     success, tracking = results.table("success").astype(bool), results.table("tracking_error")
     first = next(iter(results.ranking()))
@@ -189,74 +199,77 @@ def _comparison_section(results: Results) -> Section:
     for i, name in enumerate(results.entrants):
         if i != best:
             d = duel(success[:, best], success[:, i])
-            difference = interval_cell(mean(tracking[:, i] - tracking[:, best]), 1e3, 1)
-            cells = count_cell(d.only_first), count_cell(d.only_second), Cell(f"{d.p:.2g}", d.p), difference
-            rows.append((text_cell(name), *cells))
-    headings = ("entrant", f"only {first} succeeds", "only this one does", "p of no difference", "more tracking [mm]")
+            difference = interval_text(mean(tracking[:, i] - tracking[:, best]), 1e3, 1)
+            rows.append((escape(name), d.only_first, d.only_second, f"{d.p:.2g}", difference))
+    headings = (
+        "entrant", f"only {escape(first)} succeeds", "only this one does", "p of no difference", "more tracking [mm]"
+    )  # fmt: skip
     text = (
-        f"Case by case against {first}, first of the ranking: in how many cases only one of the two does, and how "
-        "much larger the tracking error is.",
+        f"Case by case against {escape(first)}, first of the ranking: in how many cases only one of the two does, and "
+        "how much larger the tracking error is."
     )
-    return Section("Beside the best", text, tables=(Table(headings, tuple(rows)),) if rows else ())
+    return [text, "", *markdown_table(headings, rows)]
 
 
-_MAX_ROWS = 3
+def _family(results: Results, name: str) -> list[str]:
+    """Tabulate the results of one family, under its title and purpose if its file can be read."""
+    try:
+        config = load_family(name).config
+        text = [f"{config.title}. {config.about}", ""]
+    except QpavoidError:
+        text = []
+    runs = results.common[results.common["family"] == name]
+    if runs.empty:
+        return [*text, "No case that all have run."]
+    text += [f"{runs['case'].nunique()} cases, on {', '.join(sorted(runs['robot'].unique()))}.", ""]
+    return text + score_tables(results, name)
 
 
-def _worst_runs_section(results: Results, facts: dict[str, Any], folder: Path) -> Section:
-    """List the worst runs of each entrant."""
-    rows, entrant_facts = [], facts.get("entrants", {})
-    for entrant, name in enumerate(results.entrants):
-        file = entrant_facts.get(results.settings[entrant], {"settings": {}})["settings"].get("file", "")
-        index = results.rows_of(entrant)
-        index = index[~results.columns["success"][index].astype(bool)]
-        collided, distance, error = (results.columns[c][index] for c in ("collided", "min_distance", "final_error"))
-        worst = index[np.lexsort((-error, np.where(collided, distance, 0.0), ~collided.astype(bool)))[:_MAX_ROWS]]
-        for row in (results.row(i) for i in worst.tolist()):
-            place = text_cell(row["family"]), count_cell(row["seed"]), text_cell(row["robot"])
-            command = Cell(rerun_line(row, folder, file), name, code=True)
-            rows.append((text_cell(name), *place, text_cell(_failure_text(row)), command))
-    headings = ("entrant", "family", "seed", "robot", "what went wrong", "run it again")
-    text = (
-        f"The {_MAX_ROWS} worst runs of each entrant without success: deepest contacts first, then by final error.",
-    )
-    return Section("Worst runs", text if rows else ("None.",), tables=(Table(headings, tuple(rows)),) if rows else ())
+def _worst_runs(results: Results, facts: Mapping[str, Any], folder: Path) -> list[str]:
+    """Tabulate the worst runs of each entrant."""
+    rows = []
+    for name in results.entrants:
+        own = results.runs[(results.runs["entrant"] == name) & ~results.runs["success"]]
+        depth = np.where(own["collided"], own["min_distance"], 0.0)
+        worst = own.iloc[np.lexsort((-own["final_error"], depth, ~own["collided"]))[:_MAX_ROWS]]
+        for row in worst.to_dict("records"):
+            entry = facts.get("entrants", {}).get(row["settings"], {"settings": {}})
+            command = rerun_line(row, folder, entry["settings"].get("file", ""))
+            rows.append(
+                (*map(escape, (name, row["family"], str(row["seed"]), row["robot"], _fault(row))), code(command))
+            )
+    text = f"The {_MAX_ROWS} worst runs of each entrant without success: deepest contacts first, then by final error."
+    table = markdown_table(("entrant", "family", "seed", "robot", "what went wrong", "run it again"), rows)
+    return [text, "", *table] if rows else []
 
 
-def _failure_text(row: dict[str, Any]) -> str:
+def _fault(run: Mapping[Any, Any]) -> str:
     """Describe how a run failed."""
-    if row["collided"]:
-        verdict = f"; {row['verdict']}" if row["verdict"] else ""
-        return f"{row['contacts']} contacts, {max(0.0, -1e3 * row['min_distance']):.1f} mm deep{verdict}"
-    if row["reachable"]:
-        return f"{1e3 * row['final_error']:.0f} mm short of its goal{', stuck' if row['stuck'] else ''}"
+    if run["collided"]:
+        verdict = f"; {run['verdict']}" if run["verdict"] else ""
+        return f"{run['contacts']} contacts, {max(0.0, -1e3 * run['min_distance']):.1f} mm deep{verdict}"
+    if run["reachable"]:
+        return f"{1e3 * run['final_error']:.0f} mm short of its goal{', stuck' if run['stuck'] else ''}"
     return "not at rest at the end"
 
 
-def rerun_line(row: dict[str, Any], folder: Path, file: str = "") -> str:
+def rerun_line(run: Mapping[Any, Any], folder: Path, file: str = "") -> str:
     """Return the command that runs one row once more.
 
     Args:
-        row: the run.
+        run: the row.
         folder: of the results.
         file: that the entrant came from, where it does not ship.
     """
-    entrant = f"{file}:{row['entrant']}" if file else row["entrant"]
-    case = ("--family", row["family"], "--seed", row["seed"])
+    entrant = f"{file}:{run['entrant']}" if file else run["entrant"]
+    case = ("--family", run["family"], "--seed", run["seed"])
     return shlex.join(map(str, ("qpavoid", "bench", "show", folder, *case, "--entrant", entrant)))
 
 
-def _failures_section(results: Results) -> Section:
-    """List the first failures of entrants, with their counts."""
+def _failures(results: Results) -> list[str]:
+    """Tabulate the first failures of entrants, with their counts."""
     rows = []
-    for entrant, name in enumerate(results.entrants):
-        entrant_facts = results.columns["failure"][results.rows_of(entrant)]
-        often = Counter(sorted(entrant_facts[entrant_facts != ""])).most_common(_MAX_ROWS)
-        rows += [(text_cell(name), count_cell(count), text_cell(text)) for text, count in often]
-    headings = ("entrant", "runs", "the first thing that it said")
-    return Section("Failures", () if rows else ("None.",), tables=(Table(headings, tuple(rows)),) if rows else ())
-
-
-def _json_text(value: Any) -> str:
-    """Return a value as JSON without quotes."""
-    return json.dumps(value, ensure_ascii=False).replace('"', "")
+    for name in results.entrants:
+        texts = results.runs.loc[(results.runs["entrant"] == name) & (results.runs["failure"] != ""), "failure"]
+        rows += [(escape(name), n, escape(text)) for text, n in texts.value_counts().head(_MAX_ROWS).items()]
+    return markdown_table(("entrant", "runs", "the first thing that it said"), rows)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from time import perf_counter
+from typing import Protocol
 
 import numpy as np
 import pinocchio as pin
@@ -13,8 +14,29 @@ from qpavoid.model.trajectory import Sample
 from qpavoid.problem import Array, IntArray, Solution, Status
 from qpavoid.run.log import STATUSES
 from qpavoid_bench.arena.case import Case, SensorModel
-from qpavoid_bench.arena.pilot import Pilot
 from qpavoid_bench.arena.world import World
+
+
+class Pilot(Protocol):
+    """One entrant, set up for one case.
+
+    A `Controller` is one; other libraries come in through adapters. A pilot that works in another process gives the
+    time of its last step there in an attribute `seconds` [s].
+    """
+
+    def step(self, q: Array, t: float, targets: Mapping[str, Sample], obstacles: Mapping[str, Sample]) -> Solution:
+        """Compute the velocity for the next control period.
+
+        Args:
+            q: configuration (nq,) in the order of the scene's model.
+            t: time [s].
+            targets: what each task should reach now, by its name.
+            obstacles: where each obstacle is seen, and how it moves.
+
+        Raises:
+            Exception: it has no velocity for this step; the robot stays still, and the next step is asked for again.
+        """
+        ...
 
 
 @dataclass(frozen=True)

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
-import pyarrow.compute as pc
 import yaml
 
 from qpavoid.errors import ConfigError, UnknownName, nearest
 from qpavoid_bench.arena.case import Case
 from qpavoid_bench.arena.entrants import ENTRANTS
-from qpavoid_bench.arena.store import read_cases
+from qpavoid_bench.arena.store import read_cases, read_facts
 from qpavoid_bench.arena.suite import EntrantConfig, find_any
 from qpavoid_bench.arena.trial import run_trial
 
@@ -25,12 +23,12 @@ def find_case(folder: Path, family: str, seed: int) -> Case:
         ConfigError: it has no case of that seed, or no results.
     """
     cases = read_cases(folder)
-    in_family = cases.filter(pc.equal(cases["family"], family))
-    if not len(in_family):
-        raise UnknownName(f"{folder}: no family {family!r}{nearest(family, pc.unique(cases['family']).to_pylist())}")
-    texts = in_family.filter(pc.equal(in_family["seed"], seed))["json"].to_pylist()
+    in_family = cases[cases["family"] == family]
+    if in_family.empty:
+        raise UnknownName(f"{folder}: no family {family!r}{nearest(family, cases['family'].unique())}")
+    texts = in_family.loc[in_family["seed"] == seed, "json"].to_list()
     if not texts:
-        low, high = pc.min_max(in_family["seed"]).as_py().values()
+        low, high = in_family["seed"].min(), in_family["seed"].max()
         raise ConfigError(f"{folder}: {family} has no seed {seed}; there are {len(in_family)} from {low} to {high}")
     return Case.from_json(texts[-1])
 
@@ -63,8 +61,8 @@ def rerun(case: Case, entrant: str, folder: Path) -> dict[str, Any]:
 
 
 def _suite_entrant(name: str, folder: Path) -> EntrantConfig | None:
-    """Return a solver with settings of its own as suite.json has it; None if there is none."""
-    entrants = json.loads((folder / "suite.json").read_text(encoding="utf-8"))["entrants"].values()
+    """Return a solver with settings of its own as the last sweep had it; None if there is none."""
+    entrants = read_facts(folder)["entrants"].values()
     fields = [entry for entry in entrants if entry["name"] == name and "solver" in entry["settings"]]
     if name in ENTRANTS or not fields:
         return None

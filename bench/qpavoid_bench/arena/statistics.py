@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import bdtr, ndtr, ndtri, stdtrit
-from scipy.stats import binom
+from scipy import stats
+from statsmodels.stats.contingency_tables import mcnemar
+from statsmodels.stats.proportion import proportion_confint
 
 from qpavoid.problem import Array
 
 CONFIDENCE = 0.95
 """Confidence of all intervals and tests."""
-_Z = float(ndtri(0.5 + 0.5 * CONFIDENCE))
 _RESAMPLES = 2000
 _MANY = 3000
 """Sample size from which the mean is taken to be normal, without resampling."""
@@ -30,66 +29,37 @@ class Interval(NamedTuple):
     high: float
 
 
-def rate(successes: int, trials: int) -> Interval:
-    """Return the success rate with Wilson's interval (1927), within 0 and 1 and never empty.
-
-    Raises:
-        ValueError: no trials.
-    """
-    if trials < 1:
-        raise ValueError("no trials: there is no rate")
-    z2 = _Z**2
-    p = successes / trials
-    middle = (p + z2 / (2 * trials)) / (1.0 + z2 / trials)
-    half = np.sqrt(z2 * (p * (1.0 - p) + z2 / (4 * trials)) / trials) / (1.0 + z2 / trials)
-    return Interval(p, max(0.0, middle - half), min(1.0, middle + half))
+def rate(flags: Array | Flags) -> Interval:
+    """Return the share of flags (n,), n > 0, that are set, with Wilson's interval (1927)."""
+    low, high = proportion_confint(int(np.sum(flags)), len(flags), 1.0 - CONFIDENCE, method="wilson")
+    return Interval(float(np.mean(flags)), float(low), float(high))
 
 
 def mean(values: Array) -> Interval:
-    """Return the mean of values (n,) with a bootstrap interval, the same at every call.
+    """Return the mean of values (n,), n > 0, with a bootstrap interval, the same at every call.
 
-    Percentiles of the means of resamples, as far out as Student's t asks for, so that few values give a range that is
-    wide enough (the expanded percentile interval: Hesterberg, The American Statistician 69, 2015). Of the differences
-    between two entrants in the same cases, it is the paired bootstrap. One value has no range but itself.
-
-    Raises:
-        ValueError: no values.
+    Corrected for bias and skewness (BCa: Efron, J. Am. Stat. Assoc. 82, 1987). Of the differences between two entrants
+    in the same cases, it is the paired bootstrap. Values that are all the same have no range but themselves.
     """
-    count = len(values)
-    if count < 1:
-        raise ValueError("no values: there is no mean")
     middle = float(np.mean(values))
-    if count == 1:
+    if np.ptp(values) <= 1e-12 * max(1.0, np.max(np.abs(values))):  # round-off
         return Interval(middle, middle, middle)
-    if count >= _MANY:
-        half = _Z * float(np.std(values, ddof=1)) / float(np.sqrt(count))
-        return Interval(middle, middle - half, middle + half)
-    half_width = float(stdtrit(count - 1, 0.5 + 0.5 * CONFIDENCE) * np.sqrt(count / (count - 1)))
-    low, high = np.quantile(_resamples(count) @ values, [ndtr(-half_width), ndtr(half_width)])
-    return Interval(middle, min(float(low), middle), max(float(high), middle))  # round-off, where all are the same
-
-
-@lru_cache(maxsize=8)
-def _resamples(count: int) -> Array:
-    """Return weights (resamples, count) of values in means of bootstrap samples."""
-    return np.random.default_rng(0).multinomial(count, np.full(count, 1.0 / count), size=_RESAMPLES) / count
+    if len(values) >= _MANY:
+        return Interval(middle, *stats.norm.interval(CONFIDENCE, middle, stats.sem(values)))
+    range_ = stats.bootstrap(
+        (values,), np.mean, n_resamples=_RESAMPLES, confidence_level=CONFIDENCE, rng=0
+    ).confidence_interval
+    return Interval(middle, float(range_.low), float(range_.high))
 
 
 def median(values: Array) -> Interval:
-    """Return the median of values (n,) with its distribution-free interval (sign test).
+    """Return the median of values (n,), n > 0, with its distribution-free interval (sign test).
 
-    By signs: the number of values below the median is binomial (Conover, Practical Nonparametric Statistics, 3.2). Of
-    fewer than six values, it reaches from the least to the greatest, and holds less than it should.
-
-    Raises:
-        ValueError: no values.
+    Of few values, it reaches from the least to the greatest, and holds less than it should.
     """
-    count = len(values)
-    if count < 1:
-        raise ValueError("no values: there is no median")
-    outer = max(int(binom.ppf(0.5 - 0.5 * CONFIDENCE, count, 0.5)) - 1, 0)
-    ordered = np.sort(values)
-    return Interval(float(np.median(values)), float(ordered[outer]), float(ordered[count - 1 - outer]))
+    range_ = stats.quantile_test(values, q=np.median(values), p=0.5).confidence_interval(CONFIDENCE)
+    low, high = np.nan_to_num(range_.low, nan=np.min(values)), np.nan_to_num(range_.high, nan=np.max(values))
+    return Interval(float(np.median(values)), float(low), float(high))
 
 
 class Duel(NamedTuple):
@@ -110,7 +80,7 @@ class Duel(NamedTuple):
 def duel(first: Flags, second: Flags) -> Duel:
     """Compare successes (n,) of two entrants case by case."""
     won, lost = int(np.sum(first & ~second)), int(np.sum(second & ~first))
-    return Duel(won, lost, min(1.0, 2.0 * float(bdtr(min(won, lost), won + lost, 0.5))))
+    return Duel(won, lost, float(mcnemar([[0, won], [lost, 0]], exact=True).pvalue))
 
 
 def ranks(success: Flags, error: Array, names: Sequence[str]) -> dict[str, int]:

@@ -1,9 +1,9 @@
-"""Tables of the arena's report: figures, families and intervals."""
+"""Tables of the arena's report, as Markdown."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import re
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -58,83 +58,58 @@ MORE = (
 )  # fmt: skip
 
 
-class Cell(NamedTuple):
-    """Text of a cell, and the value that it is sorted by."""
-
-    text: str
-    sort: float | str
-    span: str = ""
-    """Interval of a figure."""
-    code: bool = False
-    """Whether the text is shown as code."""
+_ESTIMATES: dict[str, Callable[[Array], Interval]] = {"rate": rate, "mean": mean, "median": median}
 
 
-@dataclass(frozen=True)
-class Table:
-    """Headings and rows."""
-
-    headings: tuple[str, ...]
-    rows: tuple[tuple[Cell, ...], ...]
-
-
-@dataclass(frozen=True)
-class Section:
-    """A part of the report."""
-
-    title: str
-    text: tuple[str, ...] = ()
-    points: tuple[str, ...] = ()
-    tables: tuple[Table, ...] = ()
-    pictures: tuple[tuple[str, str, Any], ...] = ()
-    """Name, caption and figure of each picture."""
-
-
-def score_tables(results: Results, family: int | None = None) -> tuple[Table, ...]:
+def score_tables(results: Results, family: str | None = None) -> list[str]:
     """Tabulate the main figures, and the further ones, of one family or of all.
 
     Entrants are in the order of their ranks.
     """
     place = results.ranking(family)
-    return tuple(_score_table(results, columns, place, family) for columns in (COLUMNS, MORE))
+    lines = []
+    for columns in (COLUMNS, MORE):
+        tables = [results.table(column.name, family) for column in columns]
+        rows = []
+        for name, rank in place.items():
+            i = results.entrants.index(name)
+            rows.append((rank, escape(name), *(_cell(t[:, i], c) for t, c in zip(tables, columns, strict=True))))
+        lines += markdown_table(("rank", "entrant", *(column.heading for column in columns)), rows)
+    return lines
 
 
-def _score_table(results: Results, columns: Sequence[Column], place: Mapping[str, int], family: int | None) -> Table:
-    rows = []
-    for name, rank in place.items():
-        entrant = results.entrants.index(name)
-        cells = [_cell(results.values(column.name, entrant, family), column) for column in columns]
-        rows.append((Cell(str(rank), rank), text_cell(name), *cells))
-    return Table(("rank", "entrant", *(column.heading for column in columns)), tuple(rows))
-
-
-_ESTIMATES = {"mean": mean, "median": median}
-
-
-def _cell(values: Array, column: Column) -> Cell:
-    values = values.astype(float)
+def _cell(values: Array, column: Column) -> str:
     if column.kind == "low":
         value = float(np.quantile(values, 0.05, method="inverted_cdf"))  # one of them: some may be infinite
-        return Cell(_shown(column.scale * value, column.digits), value)
-    if column.kind == "rate":
-        return interval_cell(rate(int(values.sum()), len(values)), column.scale, column.digits)
-    return interval_cell(_ESTIMATES[column.kind](values), column.scale, column.digits)
+        return _shown(column.scale * value, column.digits)
+    return interval_text(_ESTIMATES[column.kind](values), column.scale, column.digits)
 
 
-def interval_cell(interval: Interval, scale: float, digits: int) -> Cell:
-    """Return a cell with a figure and its interval."""
+def interval_text(interval: Interval, scale: float, digits: int) -> str:
+    """Return a figure with its interval."""
     value, low, high = (_shown(scale * side, digits) for side in interval)
-    return Cell(value, interval.value, f"{low} – {high}")
+    return f"{value} ({low} – {high})"
 
 
 def _shown(value: float, digits: int) -> str:
     return f"{round(value, digits) + 0.0:.{digits}f}"  # -0.0 + 0.0 is 0.0
 
 
-def text_cell(text: str) -> Cell:
-    """Return a cell that is sorted by its text."""
-    return Cell(text, text)
+def markdown_table(headings: Sequence[str], rows: Iterable[Sequence[Any]]) -> list[str]:
+    """Return the lines of a Markdown table, whose cells are Markdown already; none without rows."""
+    body = [_row(row) for row in rows]
+    return [_row(headings), _row(["---"] * len(headings)), *body, ""] if body else []
 
 
-def count_cell(count: int) -> Cell:
-    """Return a cell with a number of something."""
-    return Cell(str(count), count)
+def _row(cells: Sequence[Any]) -> str:
+    return f"| {' | '.join(map(str, cells))} |"
+
+
+def escape(text: str) -> str:
+    """Escape a text so that a cell of a Markdown table shows it as it is."""
+    return re.sub(r"([\\`*_<>\[\]|~])", r"\\\1", " ".join(text.split()))
+
+
+def code(text: str) -> str:
+    """Return a cell of a Markdown table that shows a text as code."""
+    return f"`{' '.join(text.split()).replace('|', chr(92) + '|')}`"

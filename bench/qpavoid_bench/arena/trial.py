@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from time import perf_counter
 
 from qpavoid.model.trajectory import Sample
@@ -12,8 +13,7 @@ from qpavoid_bench.arena.case import Case
 from qpavoid_bench.arena.checker import check_run
 from qpavoid_bench.arena.entrants import Entrant
 from qpavoid_bench.arena.mujoco_model import build
-from qpavoid_bench.arena.pilot import Pilot
-from qpavoid_bench.arena.rollout import roll_out
+from qpavoid_bench.arena.rollout import Pilot, roll_out
 from qpavoid_bench.arena.scores import Score, score, surface_safety_distance
 from qpavoid_bench.arena.verdict import decisive, judge
 from qpavoid_bench.arena.world import World, build_world
@@ -31,11 +31,15 @@ def run_trial(case: Case, entrant: Entrant) -> Score:
         ConfigError, UnknownName: the case itself cannot be built.
         ValueError: it cannot be checked, as MuJoCo has no counterpart of a joint or shape.
     """
-    begin = perf_counter()
-    world = build_world(case.scenario)
-    rollout = roll_out(case, _set_up(entrant, case, world), world, MAX_TIME_RATIO * case.scenario.duration)
-    scenario, model = case.scenario, build(world.scene, world.q0)
-    findings = check_run(model, rollout.t, rollout.v, scenario.limits, surface_safety_distance(scenario))
+    begin, scenario = perf_counter(), case.scenario
+    world = build_world(scenario)
+    try:
+        pilot = entrant.start(case, world)
+    except Exception as error:  # whatever another library raises is a result here
+        pilot = _FailingPilot(f"cannot be set up: {type(error).__name__}: {error}")
+    rollout = roll_out(case, pilot, world, MAX_TIME_RATIO * scenario.duration)
+    model, d1 = build(world.scene, world.q0), surface_safety_distance(scenario)
+    findings = check_run(model, rollout.t, rollout.v, scenario.limits, d1)
     verdict = None
     if not case.solved_by:  # of the others it is known that all contacts are avoidable
         verdict = decisive(judge(model, scenario, rollout.t, rollout.v, findings))
@@ -46,17 +50,8 @@ def run_trial(case: Case, entrant: Entrant) -> Score:
 
 
 def failing_entrant(entrant: Entrant, failure: str) -> Entrant:
-    """Return the same entrant with runs in which it fails at every step.
-
-    Args:
-        entrant: it keeps its name and settings.
-        failure: message of the failure.
-    """
-
-    def start(case: Case, world: World) -> Pilot:
-        return _FailingPilot(failure)
-
-    return replace(entrant, start=start)
+    """Return an entrant of the same name and settings that fails at every step with a message."""
+    return replace(entrant, start=partial(_start_failing, failure))
 
 
 class NoVelocity(Exception):
@@ -73,9 +68,5 @@ class _FailingPilot:
         raise NoVelocity(self._failure)
 
 
-def _set_up(entrant: Entrant, case: Case, world: World) -> Pilot:
-    """Set an entrant up for a case; one that raises becomes a pilot that fails."""
-    try:
-        return entrant.start(case, world)
-    except Exception as error:  # whatever another library raises is a result here
-        return _FailingPilot(f"cannot be set up: {type(error).__name__}: {error}")
+def _start_failing(failure: str, case: Case, world: World) -> Pilot:
+    return _FailingPilot(failure)

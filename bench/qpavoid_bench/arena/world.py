@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from qpavoid.config import ScenarioConfig
-from qpavoid.control.tasks.frames import AnyTask, FrameTask, build_tasks
+from qpavoid.control.tasks import FrameTask, RowTask, build_tasks
 from qpavoid.errors import ConfigError, located
 from qpavoid.model.robot import Robot
 from qpavoid.model.scene import Scene, build_obstacles, build_scene
@@ -18,7 +18,7 @@ class World(NamedTuple):
     """A scenario, built."""
 
     scene: Scene
-    tasks: tuple[AnyTask, ...]
+    tasks: tuple[RowTask, ...]
     q0: Array
     """(nq,) configuration at the start."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from qpavoid.control.tasks.frames import FrameTask
+from qpavoid.control.tasks import FrameTask
 from qpavoid.model.robot import Robot
 from qpavoid_bench.arena.families.reach import arm, clearance
 from qpavoid_bench.arena.world import World

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from qpavoid.config import ScenarioConfig
-from qpavoid.control.tasks.frames import FrameTask
+from qpavoid.control.tasks import FrameTask
 from qpavoid.errors import ConfigError
 from qpavoid.problem import Array
 from qpavoid_bench.arena.families.clearance import Clearance

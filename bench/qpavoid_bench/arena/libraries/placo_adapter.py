@@ -19,7 +19,7 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid.config import Limits
-from qpavoid.control.tasks.frames import FrameTask
+from qpavoid.control.tasks import FrameTask
 from qpavoid.errors import ConfigError
 from qpavoid.model.scene import Scene
 from qpavoid.model.trajectory import Sample
