@@ -6,11 +6,12 @@ import csv
 import os
 import platform
 from collections.abc import Iterable, Mapping, Sequence
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from qpavoid.run.machine import cpu, versions
 
 _OF_CHECKOUT = Path("bench") / "results"
 RESULTS = _OF_CHECKOUT if _OF_CHECKOUT.is_dir() else Path("out") / "bench"
@@ -28,22 +29,11 @@ def number(value: float) -> str:
     return "-" if np.isnan(value) else f"{value:.1f}" if abs(value) < 100.0 else f"{value:.0f}"
 
 
-def machine() -> str:
-    """Return processor, cores, system and interpreter in one line."""
-    from qpavoid.run.machine import cpu
-
-    return f"{cpu()}, {os.cpu_count()} CPUs, {platform.system()}, Python {platform.python_version()}"
-
-
-def versions(packages: Iterable[str]) -> str:
-    """Return the packages that are installed, with their versions, in one line."""
-    found = []
-    for package in packages:
-        try:
-            found.append(f"{package} {version(package)}")
-        except PackageNotFoundError:
-            continue
-    return ", ".join(found)
+def describe_machine(*packages: str) -> str:
+    """Return processor, cores, system, interpreter and installed packages in one line."""
+    python = f"Python {platform.python_version()}"
+    found = (f"{name} {number}" for name, number in versions(packages).items())
+    return ", ".join((cpu(), f"{os.cpu_count()} CPUs", platform.system(), python, *found)) + "; one thread"
 
 
 def write(folder: Path, name: str, sections: Iterable[str], rows: Sequence[Mapping[str, Any]] = ()) -> str:

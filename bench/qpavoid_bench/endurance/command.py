@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 import typer
 
-from qpavoid_bench.tables import RESULTS, machine, number, table, versions, write
+from qpavoid_bench.tables import RESULTS, describe_machine, number, table, write
 
 LOOPS = ("circling+alone", "circling")
 SCENARIOS = ("situation1", "panda_line")
@@ -44,7 +44,7 @@ def _measure(*arguments: object, **environment: str) -> Any:
 def _sections(steps: int, timed: int, runs: int, states: int) -> Iterator[str]:
     yield "# Endurance"
     yield (
-        f"{machine()}, {versions(('qpavoid', 'numpy', 'pin'))}; one thread; load of the machine before: "
+        f"{describe_machine('qpavoid', 'numpy', 'pin')}; load of the machine before: "
         f"{os.getloadavg()[0]:.1f}. `circling` is a closed loop of `qpavoid bench tick`: a Panda's tool follows a "
         "circle among 50 obstacles, 10 of them on circles; all of it repeats after 1000 steps. `circling+alone` is "
         "without backup trajectories."

@@ -11,7 +11,7 @@ import numpy as np
 import typer
 
 from qpavoid.errors import ConfigError
-from qpavoid_bench.tables import RESULTS, machine, number, table, versions, write
+from qpavoid_bench.tables import RESULTS, describe_machine, number, table, write
 
 if TYPE_CHECKING:
     from qpavoid_bench.solvers.record import Run
@@ -66,8 +66,8 @@ def _sections(runs: list[Run], truths: list[list[Truth]], cells: list[dict[str, 
     yield "# QP back ends on recorded problems"
     yield (
         f"{sum(len(run.qps) for run in runs)} QPs from {len(runs)} closed loops, in the order of their control steps; "
-        f"{rounds} rounds in which the back ends take turns, each made anew at the start of a round. {machine()}; one "
-        f"thread; load at the end {os.getloadavg()[0]:.1f}. {versions(PACKAGES)}."
+        f"{rounds} rounds in which the back ends take turns, each made anew at the start of a round. "
+        f"{describe_machine(*PACKAGES)}; load at the end {os.getloadavg()[0]:.1f}."
     )
     yield (
         f"**An answer is right** when rows and bounds hold to {VIOLATION:g} and no coordinate is farther than "

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from qpavoid_bench.tables import machine, number, table, write
+from qpavoid_bench.tables import describe_machine, number, table, write
 from qpavoid_bench.tick.runner import Cell, Results, Row
 
 OURS = "qpavoid"
@@ -49,8 +49,8 @@ def _sections(results: Results) -> Iterator[str]:
     yield "# One control step"
     yield (
         "From a new configuration to a joint velocity: kinematics, Jacobians, distances, rows, tasks, limits, QP. All "
-        f"libraries get the same joints, capsules, obstacles, pairs, configurations and targets. {machine()}; one "
-        f"thread; up to {results.ticks} steps in each of {results.rounds} rounds in which the libraries take turns (a "
+        f"libraries get the same joints, capsules, obstacles, pairs, configurations and targets. {describe_machine()}; "
+        f"up to {results.ticks} steps in each of {results.rounds} rounds in which the libraries take turns (a "
         f"round of one library takes about {results.budget:g} s at most: slow ones make fewer steps); up to 20 steps "
         "before each round are not timed; garbage is collected before a round, and the collector stays on. Medians "
         "and 99th percentiles are those of the round in which they are least, the worst step is that of all rounds. "

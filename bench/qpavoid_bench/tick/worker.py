@@ -11,12 +11,11 @@ import importlib
 import os
 import pickle
 import sys
+from importlib.metadata import version
 from time import perf_counter_ns
 from typing import Any
 
 import numpy as np
-
-from qpavoid_bench.tables import versions
 
 
 class Worker:
@@ -29,12 +28,15 @@ class Worker:
 
     def hello(self, packages: tuple[str, ...]) -> str:
         """Return the versions of the packages."""
-        return versions(packages)
+        return ", ".join(f"{package} {version(package)}" for package in packages)
 
     def setup(self, workload: Any) -> None:
         """Build the library's own model of a workload."""
         self._library = None
+        gc.unfreeze()
         self._library = self._adapter(workload)
+        gc.collect()
+        gc.freeze()  # what a library is made of need not be looked at before each round
 
     def check(self, ticks: list[int]) -> dict[str, Any]:
         """Return frames, distances and velocities at some ticks."""
