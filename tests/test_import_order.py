@@ -18,7 +18,6 @@ FOR_BENCHMARKS = {
     "qpavoid.solvers.backends": "the back ends that are compared",
     "qpavoid.kernels": "project: the compiled QP, which is compared with them",
     "qpavoid.geometry.bodies": "make_shape: free places for random obstacles",
-    "qpavoid.geometry.segments": "point_segment: distance of a tool from its target's path",
     "qpavoid.viz.style": "colours and grid: figures look alike",
 }
 """What the benchmarks import beside public names and `qpavoid.{config,problem,model,run}`, and for what."""
