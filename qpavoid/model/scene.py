@@ -138,8 +138,7 @@ def build_scene(robot: Robot, obstacles: Sequence[Obstacle] = ()) -> Scene:
             read.
     """
     obstacles = sorted(obstacles, key=lambda obstacle: not obstacle.graspable)
-    geometry = pin.GeometryModel(robot.bodies)
-    bodies = len(robot.bodies.geometryObjects)
+    geometry, bodies = pin.GeometryModel(robot.bodies), robot.bodies.ngeoms
     movable = bodies + sum(obstacle.graspable for obstacle in obstacles)
     names, obstacle_of = [body.name for body in robot.bodies.geometryObjects], [-1] * bodies
     clouds: dict[int, Voxels] = {}
@@ -155,21 +154,16 @@ def build_scene(robot: Robot, obstacles: Sequence[Obstacle] = ()) -> Scene:
                 f"obstacles: {obstacle.name!r}: a {shape.type} cannot be carried; give a primitive, or a mesh with "
                 "`method: convex`"
             )
-        first = len(names)
         if isinstance(shape, config.PointCloud):
             clouds[number] = _points(shape, folder, where)
-            solids, placement = (
-                solids * (movable * shape.nearest),
-                pin.SE3(np.eye(3), np.array([PARKING_DISTANCE, 0.0, 0.0])),
-            )
-        for solid in solids:
-            piece = f"{obstacle.name}[{len(names) - first}]" if len(solids) > 1 else obstacle.name
+            solids = solids * (movable * shape.nearest)  # each body has spheres of its own
+            placement = pin.SE3(np.eye(3), np.array([PARKING_DISTANCE, 0.0, 0.0]))
+        for k, solid in enumerate(solids):
+            piece = f"{obstacle.name}[{k}]" if len(solids) > 1 else obstacle.name
             index = geometry.addGeometryObject(pin.GeometryObject(piece, 0, 0, placement, solid))
             names.append(obstacle.name)
             obstacle_of.append(number)
-            partners = range(min(index, movable))
-            if isinstance(shape, config.PointCloud):
-                partners = range((index - first) // shape.nearest, (index - first) // shape.nearest + 1)
+            partners = [k // shape.nearest] if isinstance(shape, config.PointCloud) else range(min(index, movable))
             for partner in partners:
                 fixed = partner < bodies and geometry.geometryObjects[partner].parentJoint == 0
                 if not (fixed and isinstance(shape, config.HalfSpace)):
