@@ -6,7 +6,6 @@ import os
 import site
 import sys
 import warnings
-import xml.etree.ElementTree as ET
 from collections import Counter
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,6 +23,7 @@ from qpavoid.config import Task
 from qpavoid.config.shipped import robot_names
 from qpavoid.model.notes import NoteKind, RobotWarning
 from qpavoid.model.urdf import read_model, read_pieces
+from qpavoid.model.xml_file import read_robot_xml
 
 
 def load(path, **fields):
@@ -592,7 +592,10 @@ def test_model_and_shapes_are_those_of_pinocchio(path):
     notes = []
     model = read_model(path, "fixed", notes)
     ours = read_pieces(path, model, [], path, notes, visuals=False, enclosed=True).geometryObjects
-    links = {link.get("name"): len(link.findall("collision/geometry/*")) for link in ET.parse(path).iter("link")}
+    links = {
+        link.get("name"): len(link.findall("collision/geometry/*"))
+        for link in read_robot_xml(path, "URDF").iter("link")
+    }
     assert Counter(model.frames[piece.parentFrame].name for piece in ours) == +Counter(links)
     assert not [note for note in notes if note.kind in (NoteKind.SHAPE, NoteKind.MESH)]
     if not path.is_relative_to(EXAMPLES):
