@@ -318,6 +318,10 @@ def test_ranges_that_are_all_zero_say_nothing(tmp_path):
     robot, message = load(write(tmp_path, text))
     assert robot.joint_names == ["j1", "j2"] and robot.bounds().q_index.size == 0
     assert any("limit j1, j2: every range of the file is [0, 0]" in line for line in message)
+    ball = {"type": "sphere", "radius": 0.2}
+    bodies = [{"name": "a", "frame": "base", "shape": ball}, {"name": "c", "frame": "b", "shape": ball}]
+    bodies[1]["position"] = [0.0, 0.0, -0.4]  # touches the other one where both joints are 0, and there alone
+    assert len(load(tmp_path / "m.urdf", bodies=bodies)[0].bodies.collisionPairs) == 1
 
 
 @pytest.mark.parametrize("limits", ['velocity="0" effort="1" lower="-1" upper="1"', 'lower="-1" upper="1"'])
@@ -592,11 +596,9 @@ def test_model_and_shapes_are_those_of_pinocchio(path):
     notes = []
     model = read_model(path, "fixed", notes)
     ours = read_pieces(path, model, [], path, notes, visuals=False, enclosed=True).geometryObjects
-    links = {
-        link.get("name"): len(link.findall("collision/geometry/*"))
-        for link in read_robot_xml(path, "URDF").iter("link")
-    }
-    assert Counter(model.frames[piece.parentFrame].name for piece in ours) == +Counter(links)
+    links = read_robot_xml(path, "URDF").iter("link")
+    counts = Counter({link.get("name"): len(link.findall("collision/geometry/*")) for link in links})
+    assert Counter(model.frames[piece.parentFrame].name for piece in ours) == +counts
     assert not [note for note in notes if note.kind in (NoteKind.SHAPE, NoteKind.MESH)]
     if not path.is_relative_to(EXAMPLES):
         return

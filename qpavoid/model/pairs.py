@@ -85,7 +85,7 @@ def drop_always_touching(model: Any, bodies: Any, joints: JointBounds, samples: 
     finite = np.isfinite(joints.lower) & np.isfinite(joints.upper)
     poses = []
     for _ in range(samples):
-        q = pin.integrate(model, neutral, random.uniform(-np.pi, np.pi, model.nv) * _turns(model))
+        q = pin.integrate(model, neutral, random.uniform(-np.pi, np.pi, model.nv))
         q[joints.q_index[finite]] = random.uniform(joints.lower[finite], joints.upper[finite])
         poses.append(q)
     share = find_contacts(model, bodies, poses, ALWAYS_TOUCHING).mean(axis=0)
@@ -94,15 +94,6 @@ def drop_always_touching(model: Any, bodies: Any, joints: JointBounds, samples: 
     for index in indices:
         bodies.removeCollisionPair(pin.CollisionPair(*pairs[index]))
     return [TouchingPair(names[pairs[i][0]], names[pairs[i][1]], float(share[i])) for i in indices]
-
-
-def _turns(model: Any) -> Array:
-    """Return 1 for coordinates that move, 0 for joints whose range is a point (nv,)."""
-    turns = np.ones(model.nv)
-    for joint in list(model.joints)[1:]:
-        if joint.nq == joint.nv == 1 and model.lowerPositionLimit[joint.idx_q] == model.upperPositionLimit[joint.idx_q]:
-            turns[joint.idx_v] = 0.0
-    return turns
 
 
 def find_contacts(model: Any, bodies: Any, poses: Sequence[Array], at_least: float = 0.0) -> Mask:
