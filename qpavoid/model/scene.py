@@ -202,9 +202,8 @@ def _without_cylinders_among_spheres(geometry: Any) -> None:
 
 
 def _points(shape: config.PointCloud, folder: Path, where: str) -> Voxels:
-    if shape.path is None:
-        return Voxels.of(np.zeros((0, 3)), shape.resolution)
-    voxels = Voxels.of(read_points(folder / shape.path, f"{where}.path"), shape.resolution)
+    points = np.zeros((0, 3)) if shape.path is None else read_points(folder / shape.path, f"{where}.path")
+    voxels = Voxels.of(points, shape.resolution)
     if voxels.dropped:
         raise ConfigError(
             f"{where}.path: {voxels.dropped} of {voxels.given} points are NaN, infinite or over 100 m away; leave them "
