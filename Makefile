@@ -12,7 +12,7 @@ figures: run
 	cp out/situation1_compare_path.png out/situation1_qp_motion.png out/five_spheres_compare_time.png docs/figures/
 
 test: .venv/dev
-	$(BIN)/pytest -n auto
+	$(BIN)/pytest -n auto --dist loadfile
 
 campaign: .venv/dev
 	$(BIN)/pytest -n auto -m slow

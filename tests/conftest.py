@@ -119,10 +119,7 @@ class Bench:
 
     def __init__(self, scene, tasks=(), avoidance=None, position_gain=0.5, damping=0.0, dt=0.01, query=None):
         self.robot, self.tasks = scene.robot, tuple(tasks)
-        self.kinematics = ForwardKinematics(
-            scene.robot.model,
-            [i for task in tasks for i in task.frame_ids],
-        )
+        self.kinematics = ForwardKinematics(scene.robot.model, [i for task in tasks for i in task.frame_ids])
         self.query = query or DistanceQuery(scene)
         self.assembly = Assembly(
             scene, tasks, scene.robot.bounds(), self.kinematics, self.query, avoidance or config.Avoidance(),
@@ -161,14 +158,11 @@ def frames(robot, names, q):
     return [data.oMf[robot.model.getFrameId(name)].copy() for name in names]
 
 
-def lay_out_step(scene, tasks=(), damping=0.0, dt=0.01, avoidance=None, limits=None, query=None):
+def lay_out_step(scene, avoidance=None):
     """Memory of a control step, as a controller lays it out, and the kinematics and distances that it looks into."""
-    frames, others = in_order(tasks)
-    kinematics = ForwardKinematics(scene.robot.model, [i for task in tasks for i in task.frame_ids])
-    query, limits = query or DistanceQuery(scene), limits or config.Limits()
-    bounds = scene.robot.bounds().within(limits)
-    settings = avoidance or config.Avoidance()
-    return lay_out(scene, frames, others, bounds, kinematics, query, settings, limits, damping, dt), kinematics, query
+    kinematics, query, limits = ForwardKinematics(scene.robot.model, []), DistanceQuery(scene), config.Limits()
+    bounds, avoidance = scene.robot.bounds().within(limits), avoidance or config.Avoidance()
+    return lay_out(scene, [], [], bounds, kinematics, query, avoidance, limits, 0.0, 0.01), kinematics, query
 
 
 def make_layout(nv, pairs=0, obstacles=0, **fields):
@@ -200,7 +194,7 @@ def make_layout(nv, pairs=0, obstacles=0, **fields):
 @functools.cache
 def _layout_of_a_robot():
     avoidance = config.Avoidance(d1=0.1, d2=0.3, row={"type": "beta", "gain": 5.0}, recovery_speed=0.2)
-    return lay_out_step(build_scene(Robot.load("paper-dual-arm")), avoidance=avoidance)[0]
+    return lay_out_step(build_scene(Robot.load("paper-dual-arm")), avoidance)[0]
 
 
 def look(scene, q, samples=None, reach=np.inf, query=None):

@@ -46,55 +46,48 @@ def panda_with(panda, others=(), offset=(0.0, 0.0, 0.08), shape=BOX, **fields):
 
 
 def distance_between(one, pose_one, two, pose_two):
-    """By coal, of two obstacles' shapes."""
+    """By coal, of two of its shapes."""
     request, result = coal.DistanceRequest(), coal.DistanceResult()
     request.gjk_tolerance = 1e-10
     places = [coal.Transform3s(pose.rotation, pose.translation) for pose in (pose_one, pose_two)]
-    return coal.distance(make_shape(one), places[0], make_shape(two), places[1], request, result)
+    return coal.distance(one, places[0], two, places[1], request, result)
 
 
 # --- rows ---------------------------------------------------------------------------------------------------------
 
 
 def test_attached_rows_agree_with_finite_differences(panda):
-    """Against obstacles at rest and moving, and against the robot's own links."""
-    rng = np.random.default_rng(0)
-    pole = pin.SE3(np.eye(3), np.array([0.45, 0.25, 0.3]))
-    controller = panda_with(panda, [Obstacle.at("pole", POLE, pole.translation)], avoidance=Avoidance(d1=HOLD, d2=3.0))
+    """Against an obstacle that moves, and against the robot's own links."""
+    rng, place = np.random.default_rng(0), np.array([0.45, 0.25, 0.3])
+    controller = panda_with(panda, [Obstacle.at("pole", POLE, place)], avoidance=Avoidance(d1=HOLD, d2=3.0))
     controller.attach("box", TCP, panda.home)
-    held = pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.08]))
-    twist = Sample.at(pole.translation, linear=[0.1, -0.2, 0.05])
-    names, count = controller.scene.pair_names, 0
+    held, twist = pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.08])), Sample.at(place, linear=[0.1, -0.2, 0.05])
+    names, apart = controller.scene.pair_names, 0
+    body = panda.bodies.geometryObjects[0]
+
+    def to_pole(q, t=0.0):
+        pole = pin.SE3(np.eye(3), place + t * twist.linear)
+        return np.array([distance_between(make_shape(BOX), grasp_at(panda, q) * held, make_shape(POLE), pole)])
+
+    def to_link(q):
+        data = panda.model.createData()
+        pin.forwardKinematics(panda.model, data, q)
+        link = data.oMi[body.parentJoint] * body.placement
+        return np.array([distance_between(body.geometry, link, make_shape(BOX), grasp_at(panda, q) * held)])
+
     for _ in range(6):
         q = random_q(panda, rng, 0.7)
-        tick = controller.tick(q, obstacles={"pole": twist})
-        row = int(np.flatnonzero([names[pair] == ("box", "pole") for pair in tick.proximity.pair])[0])
-
-        def at(q, t=0.0):
-            there = pin.SE3(np.eye(3), pole.translation + t * twist.linear)
-            return np.array([distance_between(BOX, grasp_at(panda, q) * held, POLE, there)])
-
-        assert tick.proximity.distance[row] == pytest.approx(at(q)[0], abs=1e-6)
-        if at(q)[0] > 5e-3:
-            np.testing.assert_allclose(tick.proximity.J[row], differences(at, panda, q, 1e-5)[0], atol=1e-4)
-            rate = (at(q, 1e-5)[0] - at(q, -1e-5)[0]) / 2e-5
-            assert tick.proximity.feedforward[row] == pytest.approx(rate, abs=1e-4)
-            count += 1
-        link = next(i for i, pair in enumerate(tick.proximity.pair) if names[pair][1] == "box")
-        body = panda.bodies.geometryObjects[panda.bodies.getGeometryId(names[tick.proximity.pair[link]][0])]
-
-        def own(q, body=body):
-            data = panda.model.createData()
-            pin.forwardKinematics(panda.model, data, q)
-            result, request = coal.DistanceResult(), coal.DistanceRequest()
-            request.gjk_tolerance = 1e-10
-            a, b = data.oMi[body.parentJoint] * body.placement, grasp_at(panda, q) * held
-            shapes = [coal.Transform3s(x.rotation, x.translation) for x in (a, b)]
-            return np.array([coal.distance(body.geometry, shapes[0], coal.Box(*BOX.size), shapes[1], request, result)])
-
-        assert tick.proximity.distance[link] == pytest.approx(own(q)[0], abs=1e-6)
-        np.testing.assert_allclose(tick.proximity.J[link], differences(own, panda, q, 1e-5)[0], atol=1e-4)
-    assert count > 3
+        near = controller.tick(q, obstacles={"pole": twist}).proximity
+        pairs = [names[pair] for pair in near.pair]
+        for pair, distance in ((("box", "pole"), to_pole), ((body.name, "box"), to_link)):
+            row = pairs.index(pair)
+            assert near.distance[row] == pytest.approx(distance(q)[0], abs=1e-6)
+            if near.distance[row] > 5e-3:
+                np.testing.assert_allclose(near.J[row], differences(distance, panda, q, 1e-5)[0], atol=1e-4)
+                apart += 1
+        row, rate = pairs.index(("box", "pole")), (to_pole(q, 1e-5)[0] - to_pole(q, -1e-5)[0]) / 2e-5
+        assert near.distance[row] < 5e-3 or near.feedforward[row] == pytest.approx(rate, abs=1e-4)
+    assert apart > 8
 
 
 def test_attached_pairs_are_those_beyond_the_hand(panda):
@@ -134,14 +127,14 @@ def carry_past(panda, attach):
     start = grasp_at(panda, panda.home).translation
     q, least, vs = panda.home.copy(), np.inf, []
     held = pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.14]))
-    pole_at = pin.SE3(np.eye(3), pole.motion.sample(0.0).position)
+    pole_at, shapes = pin.SE3(np.eye(3), pole.motion.sample(0.0).position), (make_shape(BOX), make_shape(pole.shape))
     for k in range(500):
         target = Sample.at(start + np.array([0.0, min(0.08 * k * 0.01, 0.4), 0.0]))
         given = None if attach else {"box": Sample.at([0.0, 0.0, 5.0])}
         tick = controller.tick(q, targets={TCP: target}, obstacles=given)
         q = pin.integrate(panda.model, q, 0.01 * tick.solution.v)
         vs.append(tick.solution.v)
-        least = min(least, distance_between(BOX, grasp_at(panda, q) * held, pole.shape, pole_at))
+        least = min(least, distance_between(shapes[0], grasp_at(panda, q) * held, shapes[1], pole_at))
     return controller, q, least, np.array(vs), tick
 
 
@@ -266,7 +259,7 @@ def test_clear_tracking_velocity_with_a_load_stays_clear(panda):
             box = grasp_at(panda, pin.integrate(panda.model, q, t * v)) * held
             for ball in balls:
                 there = pin.SE3(np.eye(3), ball.motion.sample(0.0).position)
-                assert distance_between(BOX, box, ball.shape, there) >= HOLD - 2e-4
+                assert distance_between(make_shape(BOX), box, make_shape(ball.shape), there) >= HOLD - 2e-4
     assert clear > 20
 
 
@@ -284,7 +277,7 @@ def test_attached_box_has_rows_with_points(panda, tmp_path):
     row = [names[pair] for pair in tick.proximity.pair].index(("box", "camera"))
     voxel = 0.02 * (np.floor(tip / 0.02) + 0.5)
     box = grasp_at(panda, panda.home, offset=(0.0, 0.0, 0.08))
-    expected = distance_between(BOX, box, Sphere(radius=0.01 * np.sqrt(3.0)), pin.SE3(np.eye(3), voxel))
+    expected = distance_between(make_shape(BOX), box, coal.Sphere(0.01 * np.sqrt(3.0)), pin.SE3(np.eye(3), voxel))
     assert tick.proximity.distance[row] == pytest.approx(expected, abs=1e-6)
 
 

@@ -9,7 +9,6 @@ from qpavoid import (
     Controller,
     Obstacle,
     Pose,
-    ReasonKind,
     Sample,
     Solution,
     Status,
@@ -60,36 +59,6 @@ def test_targets_replace_the_motion(controller, panda):
     controller.reset()
     bare = controller.step(panda.home, targets={"panda_hand_tcp": Pose.at(here + np.array([0.0, 0.0, 0.05]))})
     np.testing.assert_array_equal(bare.v, solution.v)
-
-
-@pytest.mark.parametrize("field", ["position", "linear", "angular", "rotation"])
-def test_nan_in_an_obstacle_counts_as_no_update(controller, panda, field):
-    """The ball is taken to be where it was last, or where its motion starts; and the next tick works."""
-    good, rest = Sample.at([0.55, 0.0, 0.5]), np.zeros(7)
-    before = controller.step(panda.home, obstacles={"ball": good}, v=rest).v
-    bad = {"ball": good._replace(**{field: np.full_like(getattr(good, field), np.nan)})}
-    blind = controller.step(panda.home, obstacles=bad, v=rest)
-    assert [(r.kind, r.subject) for r in blind.assumptions] == [(ReasonKind.IMPLAUSIBLE, ("ball",))]
-    np.testing.assert_allclose(blind.v, before, atol=1e-9)
-    again = controller.step(panda.home, obstacles={"ball": good}, v=rest)
-    assert not again.assumptions
-    np.testing.assert_allclose(again.v, before, atol=1e-9)
-    controller.reset()
-    first = controller.step(panda.home, obstacles=bad)
-    assert first.assumptions[0].kind is ReasonKind.IMPLAUSIBLE and np.isfinite(first.v).all()
-
-
-@pytest.mark.parametrize("q", [np.full(7, np.nan), np.r_[np.zeros(6), np.inf]])
-def test_implausible_state_is_a_stop_within_the_accelerations(controller, panda, q):
-    bound = panda.bounds().acceleration * controller.dt
-    moving = controller.step(panda.home, v=np.full(7, 0.5)).v
-    for _ in range(30):
-        stop = controller.step(q)
-        assert stop.status is Status.STOPPED and stop.reasons[0].key == ("IMPLAUSIBLE", ("q",))
-        assert (np.abs(stop.v - moving) <= bound + 1e-12).all()
-        moving = stop.v
-    np.testing.assert_array_equal(moving, 0.0)
-    assert controller.step(panda.home).status is Status.SOLVED
 
 
 def test_accelerations_count_from_the_last_or_the_measured_velocity(controller, panda):

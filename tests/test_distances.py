@@ -1,9 +1,8 @@
-"""Distances against closed forms, rates against finite differences, culling against none, and what a tick costs."""
+"""Rates of distances against finite differences, culling against none, and what a control step costs."""
 
 import gc
 import tracemalloc
 
-import coal
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -44,61 +43,9 @@ def world_placements(scene, q):
     return [data.oMi[body.parentJoint] * body.placement for body in scene.geometry.geometryObjects]
 
 
-def by_coal(scene, q):
-    """[distance, normal, point a, point b] of every pair by coal's own formulas (m, 10)."""
-    places, rows = world_placements(scene, q), []
-    bodies = [body.geometry for body in scene.geometry.geometryObjects]
-    for a, b in scene.pairs:
-        at = [coal.Transform3s(places[i].rotation, places[i].translation) for i in (a, b)]
-        result = coal.DistanceResult()
-        coal.distance(bodies[a], at[0], bodies[b], at[1], coal.DistanceRequest(), result)
-        rows.append((result.min_distance, *result.normal, *result.getNearestPoint1(), *result.getNearestPoint2()))
-    return np.array(rows)
-
-
 def with_obstacle(scene):
     """(m,) which pairs have an obstacle as their second body."""
     return scene.pairs[:, 1] >= len(scene.body_names)
-
-
-# --- distances, normals, witness points --------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", ["paper", "panda"])
-def test_distances_of_capsules_and_spheres_agree_with_coal(name, request):
-    robot = request.getfixturevalue(name)
-    rng = np.random.default_rng(1)
-    scene = random_scene(robot, rng, [SPHERE, CAPSULE] * 4)
-    for _ in range(CONFIGURATIONS):
-        q = random_q(robot, rng, spread=2.0)
-        radii = np.array([body.geometry.radius for body in scene.geometry.geometryObjects])
-        expected, found = by_coal(scene, q), look(scene, q)
-        np.testing.assert_allclose(found.distance, expected[:, 0], atol=1e-9)
-        distinct = (
-            expected[:, 0] + radii[scene.pairs].sum(axis=1) > 1e-3
-        )  # elsewhere the normal has no definite direction
-        assert distinct.mean() > 0.9
-        parts = np.column_stack((found.normal, found.point_a, found.point_b))
-        np.testing.assert_allclose(parts[distinct], expected[distinct, 1:], atol=1e-7)
-
-
-def test_distances_of_boxes_agree_with_a_search_along_the_capsule(panda):
-    rng = np.random.default_rng(2)
-    scene = random_scene(panda, rng, [BOX] * 3)
-    capsules = [i for i, b in enumerate(panda.bodies.geometryObjects) if isinstance(b.geometry, coal.Capsule)]
-    z = np.linspace(-1.0, 1.0, 20001)
-    for _ in range(CONFIGURATIONS):
-        q = random_q(panda, rng)
-        placements, found = world_placements(scene, q), look(scene, q).distance
-        for pair, (a, b) in enumerate(scene.pairs.tolist()):
-            if b < len(scene.body_names) or a not in capsules:
-                continue
-            capsule = scene.geometry.geometryObjects[a].geometry
-            axis = np.outer(z, capsule.halfLength * placements[a].rotation[:, 2]) + placements[a].translation
-            local = (axis - placements[b].translation) @ placements[b].rotation
-            nearest = np.linalg.norm(np.maximum(np.abs(local) - np.array(BOX.size) / 2, 0.0), axis=1).min()
-            if nearest > 0.0:
-                assert found[pair] == pytest.approx(nearest - capsule.radius, abs=1e-4)
 
 
 @pytest.mark.parametrize("shapes", [[SPHERE, CAPSULE], [BOX, CYLINDER]])
@@ -113,45 +60,30 @@ def test_normal_is_a_unit_vector_from_a_to_b_that_spans_the_witness_points(panda
 # --- rates -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["paper", "panda", "solo"])
-def test_distance_jacobian_of_capsules_and_spheres(name, request):
+@pytest.mark.parametrize(
+    ("name", "shapes", "tolerance"),
+    [
+        ("paper", [SPHERE, CAPSULE], 1e-6),
+        ("panda", [SPHERE, CAPSULE], 1e-6),
+        ("solo", [SPHERE, CAPSULE], 1e-6),
+        ("panda", [BOX], 1e-5),
+        ("panda", [CYLINDER], ROUND),
+        ("panda_convex", [SPHERE], 1e-4),
+    ],
+)
+def test_distance_jacobian_agrees_with_finite_differences(name, shapes, tolerance, request):
     """Includes pairs of the two arms, or of two legs, in which both bodies move; and a floating base."""
     robot = request.getfixturevalue(name)
     rng = np.random.default_rng(4)
-    scene = random_scene(robot, rng, [SPHERE, CAPSULE] * 2)
+    scene = random_scene(robot, rng, shapes * 3)
+    checked = with_obstacle(scene) | (tolerance == 1e-6)
     for _ in range(CONFIGURATIONS):
         q = random_q(robot, rng)
-        radii = np.array([body.geometry.radius for body in scene.geometry.geometryObjects])
         found = look(scene, q)
-        smooth = found.distance + radii[scene.pairs].sum(axis=1) > 1e-3  # crossing axes are a kink of the distance
-        expected = differences(lambda q: look(scene, q).distance, robot, q)
-        np.testing.assert_allclose(found.J[smooth], expected[smooth], atol=1e-6)
-
-
-@pytest.mark.parametrize(("shape", "tolerance"), [(BOX, 1e-5), (CYLINDER, ROUND)])
-def test_distance_jacobian_of_boxes_and_cylinders(panda, shape, tolerance):
-    rng = np.random.default_rng(5)
-    scene = random_scene(panda, rng, [shape] * 4)
-    others = with_obstacle(scene)
-    for _ in range(CONFIGURATIONS):
-        q = random_q(panda, rng)
-        found = look(scene, q)
-        expected = differences(lambda q: look(scene, q).distance, panda, q, step=1e-5)
-        apart = others & (found.distance > 1e-3)
-        assert apart.sum() > 0.8 * others.sum()
+        expected = differences(lambda q: look(scene, q).distance, robot, q, 1e-6 if tolerance == 1e-6 else 1e-5)
+        apart = checked & (found.distance > 1e-3)  # crossing axes are a kink of the distance
+        assert apart.sum() > 0.5 * checked.sum()
         np.testing.assert_allclose(found.J[apart], expected[apart], atol=tolerance)
-
-
-def test_distance_jacobian_of_convex_hulls(panda_convex):
-    rng = np.random.default_rng(6)
-    scene = random_scene(panda_convex, rng, [SPHERE] * 4)
-    others = with_obstacle(scene)
-    for _ in range(CONFIGURATIONS):
-        q = random_q(panda_convex, rng)
-        found = look(scene, q)
-        expected = differences(lambda q: look(scene, q).distance, panda_convex, q, step=1e-5)
-        apart = others & (found.distance > 1e-3)
-        np.testing.assert_allclose(found.J[apart], expected[apart], atol=1e-4)
 
 
 @pytest.mark.parametrize(("shapes", "tolerance"), [([SPHERE, CAPSULE], 1e-6), ([BOX], 1e-5), ([CYLINDER], ROUND)])
@@ -172,21 +104,6 @@ def test_feedforward_is_the_rate_when_only_obstacles_move(panda, shapes, toleran
     apart = found.distance > -0.02
     np.testing.assert_allclose(found.feedforward[apart], expected[apart], atol=tolerance)
     np.testing.assert_array_equal(found.feedforward[~obstacles], 0.0)
-
-
-def test_distance_jacobian_of_joints_beyond_the_body_is_exactly_zero(paper):
-    """`left_forearm` hangs on link 5: it moves with joints 1 to 5 of the left arm, and with nothing else."""
-    rng = np.random.default_rng(8)
-    scene = build_scene(paper, [obstacle("ball", SPHERE, (0.3, 0.1, 0.8))])
-    rows = np.array([look(scene, random_q(paper, rng, spread=3.0)).J for _ in range(10)])
-    moving = {"upper_arm": 3, "forearm": 5, "hand": 7}
-    for (a, b), row in zip(scene.pair_names, np.abs(rows).max(axis=0), strict=True):
-        columns = set()
-        for body in {a, b} - {"ball"}:
-            side, _, part = body.partition("_")
-            columns |= {i + 7 * (side == "right") for i in range(moving[part])}
-        assert set(np.flatnonzero(row)) <= columns
-        assert row.max() > 1e-2  # not in every configuration: the closest points may be the shoulders, which rest
 
 
 @pytest.mark.parametrize("name", ["paper", "panda", "solo"])
@@ -326,14 +243,6 @@ def test_tick_is_not_overwritten_by_the_next(panda):
         np.testing.assert_array_equal(array, before)
 
 
-def test_distances_follow_an_obstacle_while_the_robot_rests(panda):
-    scene = build_scene(panda, [obstacle("ball", SPHERE, (0.6, 0.0, 0.5))])
-    query = DistanceQuery(scene)
-    first = look(scene, panda.home, query=query)
-    later = look(scene, panda.home, {0: Sample.at((2.6, 0.0, 0.5))}, query=query)
-    assert later.distance[-1] > first.distance[-1] + 1.0
-
-
 # --- culling -----------------------------------------------------------------------------------------------------
 
 
@@ -418,7 +327,6 @@ def balls(rng, count, radius):
 CASES = {
     # (distance of the obstacles, avoidance, way that the tool has to go)
     "far": (50.0, Avoidance(), 0.0),
-    "near": (2.0, Avoidance(d1=1e-3, d2=5.0), 0.0),
     "near, solving": (2.0, Avoidance(d1=1e-3, d2=5.0, row={"type": "damper", "gain": 0.02}), 0.3),
 }
 

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
 from qpavoid import ScenarioConfig
-from qpavoid.config.shipped import scenario_names, setup_names
 from qpavoid.errors import ConfigError, UnknownName
 from qpavoid_bench.arena.case import Case
 from qpavoid_bench.arena.families import Draw, Redraw, family_names, load_family, make_case
@@ -38,11 +37,6 @@ def case(name, seed):
 
 
 # --- what ships --------------------------------------------------------------------------------------------
-
-
-def test_families_are_no_scenarios():
-    assert len(FAMILIES) >= 14
-    assert not {"narrow_gap", "sphere_field", *setup_names()} & set(scenario_names())
 
 
 @pytest.mark.parametrize("name", FAMILIES)
@@ -113,7 +107,7 @@ def test_plan_is_clear_in_mujoco(name, monkeypatch):
         assert np.linalg.norm(data.oMf[task.frame_id].translation - goal) < scenario.goal_tolerance
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_goals_out_of_reach_are_not_attained_by_search(seed):
     """Goals out of reach are attained by no search."""
     made = case("unreachable", seed)
@@ -131,62 +125,27 @@ def test_goals_out_of_reach_are_not_attained_by_search(seed):
         assert q is None or "inside" in made.solved_by
 
 
-def test_situations_keep_to_their_ranges():
-    family = load_family("situation1")
-    stated = family.config.parameters
-    for seed in range(6):
-        scenario = case("situation1", seed).scenario
-        motion, (task,) = scenario.obstacles[0].motion, scenario.tasks
-        for value, name in (*zip(motion.position, "xyz", strict=True), (task.motion.speed, "speed")):
-            assert stated[name].range[0] <= value <= stated[name].range[1]
-    assert case("situation1", 0).scenario.q0 != case("situation1", 1).scenario.q0
-
-
-@pytest.mark.parametrize("seed", [0, 1])
-def test_crossing_obstacles_meet_the_target(seed):
-    scenario = case("crossing", seed).scenario
-    world = build_world(scenario)
-    target = world.tools[0].motion
-    times = np.linspace(0.0, scenario.duration, 2000)
-    there = np.array([target.sample(t).position for t in times])
-    for obstacle in world.scene.obstacles:
-        # constant speed there, smooth here: both are at the meeting point, though not at quite the same time
-        missing_results = np.linalg.norm(
-            there[:, None, :] - [[obstacle.motion.sample(t).position for t in times[::10]]], axis=2
-        )
-        assert missing_results.min() < 0.05 * 1.3 + 0.01
-
-
-@pytest.mark.parametrize("seed", [0, 2])
-def test_two_tools_change_sides_and_meet_where_they_pass(seed):
+def test_tools_and_obstacles_meet_where_the_family_says():
+    world = build_world(case("crossing", 0).scenario)
+    times = np.linspace(0.0, 12.0, 2000)
+    tool = np.array([world.tools[0].motion.sample(t).position for t in times])
+    for obstacle in world.scene.obstacles:  # constant speed there, smooth here: not at quite the same time
+        there = np.array([obstacle.motion.sample(t).position for t in times[::10]])
+        assert np.linalg.norm(tool[:, None] - there, axis=2).min() < 0.05 * 1.3 + 0.01
     for name in ("crossing_arms", "passing"):
-        scenario = case(name, seed).scenario
-        left, right = (task.motion for task in build_world(scenario).tools)
-        times = np.linspace(0.0, scenario.duration, 1000)
+        left, right = (task.motion for task in build_world(case(name, 0).scenario).tools)
         apart = np.array([left.sample(t).position - right.sample(t).position for t in times])
-        assert apart[0, 1] > 0.0 > apart[-1, 1]
-        assert np.abs(apart[-1, 2]) > 0.01
-        if name == "passing":
-            at_rest = np.linalg.norm(np.diff(apart, axis=0), axis=1) < 1e-12
-            missing_results = np.linalg.norm(apart[1:][at_rest], axis=1)
-            assert ((missing_results >= 0.04 - 1e-9) & (missing_results <= 0.12 + 1e-9)).any()
+        assert apart[0, 1] > 0.0 > apart[-1, 1] and abs(apart[-1, 2]) > 0.01
+    at_rest = np.linalg.norm(np.diff(apart, axis=0), axis=1) < 1e-12  # of passing: they meet, and pause
+    gap = np.linalg.norm(apart[1:][at_rest], axis=1)
+    assert ((gap >= 0.04 - 1e-9) & (gap <= 0.12 + 1e-9)).any()
 
 
 # --- drawing -----------------------------------------------------------------------------------------------
 
-RANGES = st.tuples(st.floats(0.1, 10.0), st.floats(0.1, 10.0)).map(sorted).filter(lambda r: r[1] - r[0] > 1e-3)
-
 
 def parameter(**fields):
     return TypeAdapter(Parameter).validate_python({"about": "something", **fields})
-
-
-@given(limits=RANGES, kind=st.sampled_from(["uniform", "log_uniform"]), seed=st.integers(0, 1000))
-def test_draws_stay_within_their_range(limits, kind, seed):
-    draw = Draw({"a": parameter(type=kind, range=limits)}, seed, 0, frozenset())
-    values = [draw("a") for _ in range(20)]
-    assert limits[0] <= min(values) <= max(values) <= limits[1]
-    assert len(set(values)) > 1
 
 
 def test_whole_numbers_reach_both_ends_and_logarithms_are_even():
@@ -379,18 +338,6 @@ def test_inverse_kinematics_attains_poses_within_limits(panda):
     assert found >= 10
 
 
-def test_plan_of_many_goals_ends_at_free_one(gantry):
-    """A plan of many goals takes one that is free."""
-    scenario = scenario_of(gantry, [wall("low", -1.2, 0.4)])
-    world = build_world(scenario)
-    clearance = Clearance(world, 8.0, 0.02)
-    goals = np.array([[0.0, 0.9], [-0.5, -0.9]])  # the second is on this side
-    found = plan(
-        clearance, JointRanges.of(world.scene.robot), world.q0, goals, np.ones(2), 8.0, np.random.default_rng(0)
-    )
-    assert any(np.array_equal(found.q[-1], goal) for goal in goals)
-
-
 # --- a reader's own family ---------------------------------------------------------------------------------
 
 TEMPLATE = """
@@ -458,14 +405,6 @@ def family(tmp_path):
     return family
 
 
-def test_one_file_is_a_family(family):
-    made = [make_case(family(TEMPLATE), seed) for seed in range(4)]
-    assert {m.scenario.robot for m in made} == {"ur5"}
-    assert {m.scenario.obstacles[0].shape.radius for m in made} == {0.02, 0.03}
-    assert all(0.01 <= m.sensor.delay <= 0.05 and m.scenario.dt == 0.02 for m in made)
-    assert all("RRT-Connect: " in m.solved_by for m in made)
-
-
 def test_family_generator_from_file(family):
     """A function beside the file is a generator."""
     made = [make_case(family(GENERATED), seed) for seed in range(4)]
@@ -478,19 +417,15 @@ def test_family_generator_from_file(family):
     ("text", "change", "error", "said"),
     [
         (TEMPLATE, ("$y", "$yy"), UnknownName, r"scenario.obstacles.0.motion.position.1: unknown .*; did you mean 'y'"),
-        (TEMPLATE, ("$radius", "$raduis"), UnknownName, r"did you mean 'radius'"),
         (TEMPLATE, ("$delay", "0.01"), ConfigError, r"parameters.delay: stands nowhere as \$delay"),
         (TEMPLATE, ("[-0.25, -0.1]", "[-0.1, -0.25]"), ConfigError, r"parameters.y: range: needs low < high"),
-        (TEMPLATE, ("range: [-0.25, -0.1]", "rang: [-0.25, -0.1]"), ConfigError, r"did you mean 'range'"),
-        (TEMPLATE, ("type: uniform", "type: unifrom"), ConfigError, r"unknown type 'unifrom'; did you mean 'uniform'"),
         (TEMPLATE, ("robots: [ur5]", "robots: [ur6]"), UnknownName, r"robots.0: unknown robot 'ur6'.*'ur5'"),
         (TEMPLATE, ("robots: [ur5]", "robots: [{robot: ur5, lock: [$l]}]"), UnknownName, r"lock.0: unknown .*\$l"),
         (TEMPLATE, ("robots: [ur5]", "robots: [{q0: {}}]"), ConfigError, r"robots.0: needs a field `robot`"),
         (TEMPLATE, ("  dt: 0.02", "  robot: ur5"), ConfigError, r"`robot` belongs into `robots`"),
-        (GENERATED, ("posts.py:posts", "posts.py:post"), UnknownName, r"no function 'post'; did you mean 'posts'"),
-        (GENERATED, ("posts.py:posts", "pots.py:posts"), ConfigError, r"pots.py: no such file"),
+        (GENERATED, ("posts.py:posts", "posts.py:post"), UnknownName, r"no 'post' in it; did you mean 'posts'"),
+        (GENERATED, ("posts.py:posts", "pots.py:posts"), ConfigError, r"pots.py: cannot be read: No such file"),
         (GENERATED, ("posts.py:posts", "shelv"), UnknownName, r"unknown generator 'shelv'; did you mean 'shelf'"),
-        (GENERATED, ('"how many"', '""'), ConfigError, r"parameters.count.about"),
     ],
 )  # fmt: skip
 def test_family_file_errors_name_file_and_field(family, text, change, error, said):
@@ -505,7 +440,6 @@ def test_family_file_errors_name_file_and_field(family, text, change, error, sai
         (GENERATED, None, POSTS.replace('draw("y")', 'draw("yy")'), UnknownName, r"unknown parameter 'yy'"),
         (GENERATED, None, POSTS.replace('draw("y")', "-0.2"), ConfigError, r"never draws 'y'"),
         (GENERATED, None, POSTS.replace("robot.end", "robot.and"), ConfigError, r"AttributeError: .*and_effectors"),
-        (GENERATED, None, POSTS.replace('"duration"', '"duratoin"'), ConfigError, r"did you mean 'duration'"),
         (GENERATED, ("{dt: 0.02}", "{duration: 3}"), POSTS, ConfigError, r"scenario.duration: the generator gives it"),
         (GENERATED, None, UNLUCKY, ConfigError, r"10 draws and no case, most often: bad luck"),
         (TEMPLATE, ("[0, -0.5, 0]", "[0, -5, 0]"), POSTS, ConfigError, r"most often: the goal is not attained"),
@@ -515,12 +449,11 @@ def test_family_file_errors_name_file_and_field(family, text, change, error, sai
         (TEMPLATE, ("{frame: tool0, motion", "{frame: tool0, type: orientation, motion"), POSTS, ConfigError,
          r"none is that of a frame with a position"),
         (GENERATED, ("posts.py:posts", "passing"), POSTS, ConfigError, r"ur5 has 1 arms that move; two are needed"),
-        (TEMPLATE, ("{delay: $delay}", "{dealy: $delay}"), POSTS, ConfigError, r"did you mean 'delay'"),
     ],
 )  # fmt: skip
 def test_family_without_case_names_cause(family, monkeypatch, text, change, code, error, said):
     """A family that makes no case says why."""
-    monkeypatch.setattr("qpavoid_bench.arena.families.solvable._TRIES", 5)
+    monkeypatch.setattr("qpavoid_bench.arena.families.solvable.MAX_TRIES", 5)
     monkeypatch.setattr("qpavoid_bench.arena.families.make.MAX_DRAWS", 10)
     loaded = family(text, *([change] if change else []), code=code)
     with pytest.raises(error, match=said) as raised:
@@ -543,10 +476,3 @@ def test_a_case_is_the_same_wherever_its_file_lies(family, tmp_path):
     there.parent.mkdir()
     there.write_text(TEMPLATE)
     assert make_case(load_family(there), 0).key == here.key
-
-
-def test_seeds_begin_at_zero(family):
-    with pytest.raises(ConfigError, match="seed -1: give 0 or more"):
-        make_case(family(TEMPLATE), -1)
-    with pytest.raises(UnknownName, match="unknown family 'shelv'; did you mean 'shelf'"):
-        load_family("shelv")

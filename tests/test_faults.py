@@ -5,7 +5,7 @@ import pinocchio as pin
 import pytest
 from closed_loop import Ruler, cartesian, drive, make_controller
 
-from qpavoid import Avoidance, NumericalError, Obstacle, ReasonKind, Sample, Severity, Status
+from qpavoid import Avoidance, NumericalError, Obstacle, ReasonKind, Sample, Severity, Status, UnknownName
 from qpavoid.config import Box, Damper, Sensing, Sphere
 from qpavoid.control.poses import Pose
 
@@ -124,6 +124,8 @@ def test_stop_without_q_ends_inside_the_joint_limits(panda):
         ({"t": np.zeros(2)}, "t: not a number"),
         ({"q": [10**400] * 7}, "q: not an array"),
         ({"targets": [TOOL]}, "targets: give a mapping"),
+        ({"v": np.ones(7), "obstacles": {"ball": Pose.at([0.4, 0, 0.5]), "typo": Pose.at([1, 0, 0])}}, "no obstacle"),
+        ({"t": 99.0, "v": np.ones(7), "targets": {"typo": Pose.at([1, 0, 0])}}, "no target"),
         ({"obstacles": "ball"}, "obstacles: give a mapping"),
         ({"obstacles": {"ball": Sample.at([1, 0, 0], t="now")}}, "obstacle 'ball': t: not a number"),
         ({"obstacles": {"ball": Sample.at([1, 0, 0], linear=[1, 0, 0], at_rest=True)}}, "obstacle 'ball': at_rest"),
@@ -137,7 +139,7 @@ def test_stop_without_q_ends_inside_the_joint_limits(panda):
 def test_malformed_step_names_its_argument_and_changes_nothing(panda, call, name):
     touched, clean = panda_controller(panda), panda_controller(panda)
     for k in range(5):
-        with pytest.raises(NumericalError, match=f"^{name}"):
+        with pytest.raises((NumericalError, UnknownName), match=f"^{name}"):
             touched.step(**{"q": panda.home, **call})
         got, expected = (c.step(panda.home, 0.01 * k, up(panda)) for c in (touched, clean))
         np.testing.assert_array_equal(got.v, expected.v)

@@ -15,7 +15,7 @@ from qpavoid.kernels.packing import compiled
 from qpavoid.model.limits import JointBounds, limit_layout, saturate
 
 N = 4
-fast = settings(max_examples=200, deadline=None)
+fast = settings(max_examples=100, deadline=None)
 share = st.floats(0.01, 1.0)
 period = st.floats(1e-4, 0.1)
 velocities = arrays(np.float64, N, elements=st.floats(-50.0, 50.0))
@@ -28,12 +28,12 @@ class Axes:
 
     def __init__(self, joints, gain, dt):
         self.layout = make_layout(len(joints.velocity), **limit_layout(joints, gain, dt))
-        self._packed = pack(self.layout)
+        self.packed = pack(self.layout)
 
     def bounds(self, q, v_prev=0.0):
         """Copies of lower and upper."""
         self.layout.v_prev[:] = v_prev
-        velocity_bounds(self._packed, q)
+        velocity_bounds(self.packed, q)
         return self.layout.lower.copy(), self.layout.upper.copy()
 
 
@@ -55,7 +55,7 @@ def bounds(draw):
 
 @fast
 @given(bounds(), vector(-10.0, 10.0), period, share, share)
-def test_bounds_never_cross_and_keep_to_the_speed(joints, q, dt, gain, scale):
+def test_velocity_bounds_never_cross(joints, q, dt, gain, scale):
     lower, upper = bounds_at(joints.within(Limits(velocity_scale=scale)), q, gain, dt)
     assert not np.isnan([lower, upper]).any()
     assert (lower <= upper).all()
@@ -64,7 +64,7 @@ def test_bounds_never_cross_and_keep_to_the_speed(joints, q, dt, gain, scale):
 
 @fast
 @given(bounds(), vector(0.0, 1.0), vector(0.0, 1.0), period, share, share)
-def test_the_next_configuration_stays_inside(joints, place, choice, dt, gain, scale):
+def test_velocity_bounds_keep_the_next_configuration_inside(joints, place, choice, dt, gain, scale):
     q = joints.lower + place * (joints.upper - joints.lower)
     lower, upper = bounds_at(joints.within(Limits(velocity_scale=scale)), q, gain, dt)
     for v in (lower, upper, lower + choice * (upper - lower)):
@@ -77,7 +77,7 @@ def test_the_next_configuration_stays_inside(joints, place, choice, dt, gain, sc
 
 @fast
 @given(bounds(), vector(1e-3, 5.0), st.sampled_from([-1.0, 1.0]), period, share)
-def test_a_joint_outside_its_limits_returns_without_overshoot(joints, beyond, side, dt, gain):
+def test_velocity_bounds_outside_return_without_overshoot(joints, beyond, side, dt, gain):
     edge = joints.upper if side > 0 else joints.lower
     q = edge + side * beyond
     lower, upper = bounds_at(joints, q, gain, dt)
@@ -88,20 +88,9 @@ def test_a_joint_outside_its_limits_returns_without_overshoot(joints, beyond, si
     assert (following < beyond).all() and (following >= -1e-9).all()
 
 
-def test_bounds_by_hand():
-    joints = JointBounds(
-        np.array([2.0, 1.0, np.inf]), np.array([0, 3]), np.array([0, 2]), -np.ones(2), np.ones(2),
-        np.full(3, np.inf), np.full(3, np.inf),
-    )  # fmt: skip
-    q = np.array([0.99, 7.0, 7.0, 0.0])  # the middle joint is continuous: two numbers in q, one in v
-    lower, upper = Axes(joints.within(Limits(velocity_scale=0.5)), 0.5, 0.01).bounds(q)
-    np.testing.assert_allclose(upper, [0.5, 0.5, 50.0])
-    np.testing.assert_allclose(lower, [-1.0, -0.5, -50.0])
-
-
 @fast
 @given(bounds(), vector(0.0, 1.0), velocities, period, share)
-def test_saturated_velocity_is_within_the_bounds_and_its_change_is_reported(joints, place, v, dt, gain):
+def test_saturate_keeps_to_the_bounds(joints, place, v, dt, gain):
     q = joints.lower + place * (joints.upper - joints.lower)
     lower, upper = bounds_at(joints, q, gain, dt)
     within, change = saturate(v, lower, upper, joints.velocity)
@@ -111,19 +100,10 @@ def test_saturated_velocity_is_within_the_bounds_and_its_change_is_reported(join
 
 @fast
 @given(velocities, vector(0.01, 5.0))
-def test_saturate_keeps_the_direction_while_only_speeds_are_exceeded(v, v_max):
+def test_saturate_keeps_the_direction_within_position_limits(v, v_max):
     within, _ = saturate(v, -v_max, v_max, v_max)
     factor = min(1.0, 1.0 / max(np.max(np.abs(v) / v_max), 1e-300))
     np.testing.assert_allclose(within, factor * v, rtol=1e-12)
-
-
-@fast
-@given(vector(-1.0, 1.0), vector(0.01, 5.0))
-def test_saturate_keeps_a_velocity_within_the_bounds(place, v_max):
-    v = place * v_max
-    within, change = saturate(v, -v_max, v_max, v_max)
-    np.testing.assert_allclose(within, v, rtol=1e-15)
-    assert change <= 1e-15 * v_max.max()
 
 
 def test_saturate_by_hand():
@@ -134,18 +114,7 @@ def test_saturate_by_hand():
     assert change == pytest.approx(4.0)
 
 
-def test_without_any_limit_nothing_changes():
-    infinite = np.full(2, np.inf)
-    nothing = np.array([], dtype=np.intp)
-    joints = JointBounds(infinite, nothing, nothing, np.array([]), np.array([]), infinite, infinite)
-    lower, upper = bounds_at(joints.within(Limits(velocity_scale=0.5)), np.zeros(2), 0.5, 0.01)
-    v = np.array([1e6, -1e6])
-    within, change = saturate(v, lower, upper, infinite)
-    np.testing.assert_array_equal(within, v)
-    assert change == 0.0
-
-
-def test_bounds_of_robots(panda, solo):
+def test_joint_bounds_of_robots(panda, solo):
     """A floating base has the speed limits that it is given, and no position limits; joints keep the URDF's limits."""
     bounds = panda.bounds()
     np.testing.assert_array_equal(bounds.v_index, np.arange(7))
@@ -171,7 +140,7 @@ def travel(v, step, dt):
 
 
 @pytest.mark.parametrize("of", [speed_to_stop, compiled(speed_to_stop)])
-def test_a_coordinate_just_stops_in_time_from_the_speed_to_stop(of):
+def test_speed_to_stop_is_the_largest(of):
     """And does not from a speed that is a thousandth larger."""
     rng = np.random.default_rng(0)
     room, step, dt = (
@@ -218,7 +187,7 @@ def braked(draw):
 
 @fast
 @given(state=braked(), choice=vector(0.0, 1.0), gain=share)
-def test_a_state_that_can_be_braked_is_followed_by_one_that_can(state, choice, gain):
+def test_velocity_bounds_preserve_viability(state, choice, gain):
     """Whatever is chosen within the bounds keeps position, speed and acceleration limits, now and later."""
     joints, dt, q, v_prev = state
     lower, upper = Axes(joints, gain, dt).bounds(q, v_prev)
@@ -243,7 +212,7 @@ def random_joints(rng, count):
 
 
 @pytest.mark.parametrize("dt", [0.001, 0.01, 0.05])
-def test_no_limit_is_passed_in_a_hundred_thousand_steps(dt):
+def test_velocity_bounds_hold_in_a_hundred_thousand_steps(dt):
     """500 joints, 200 ticks each, driven into their limits, to and fro, or at random."""
     joints, q = random_joints(np.random.default_rng(1), 500)
     axes, rng, v_prev = Axes(joints, 0.5, dt), np.random.default_rng(2), np.zeros(500)
@@ -262,7 +231,7 @@ def test_no_limit_is_passed_in_a_hundred_thousand_steps(dt):
     assert reached.mean() > 0.05  # pushed right to a limit, and no farther
 
 
-def test_a_state_that_no_braking_saves_relaxes_the_acceleration():
+def test_velocity_bounds_relax_the_acceleration_alone():
     """Position and speed are kept, and the bounds do not cross."""
     joints, q = random_joints(np.random.default_rng(3), 500)
     rng, dt = np.random.default_rng(4), 0.01
@@ -281,7 +250,7 @@ def test_a_state_that_no_braking_saves_relaxes_the_acceleration():
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
-def test_a_joint_outside_its_position_limits_brakes_and_returns(side):
+def test_velocity_bounds_outside_brake_and_return(side):
     """With no more than its acceleration, from any speed within its limits; then it stays inside."""
     joints, _ = random_joints(np.random.default_rng(5), 500)
     joints = replace(joints, acceleration=10.0 ** np.random.default_rng(6).uniform(0, 2, 500))
@@ -293,7 +262,7 @@ def test_a_joint_outside_its_position_limits_brakes_and_returns(side):
     v = np.where(side * v < 0.0, -side * np.minimum(np.abs(v), speed_to_stop(width, step, dt)), v)
     axes, select_voxels = Axes(joints, 0.5, dt), rng.random(500)
     back = np.zeros(500, dtype=bool)
-    for _ in range(3000):
+    for _ in range(1500):
         lower, upper = axes.bounds(q, v)
         assert (lower <= upper).all()
         outside = side * (q - edge) > 1e-9
@@ -308,26 +277,10 @@ def test_a_joint_outside_its_position_limits_brakes_and_returns(side):
     assert back.all()
 
 
-def test_acceleration_limits_of_a_robot_and_of_a_scenario():
+def test_acceleration_limits_of_a_scenario_fill_in():
     """The scenario's is for joints to which the robot gives none; its share is of all of them."""
     given = np.array([2.0, np.inf, 4.0, np.inf])
     joints = JointBounds(np.ones(N), INDEX, INDEX, -np.ones(N), np.ones(N), given, FREE)
     np.testing.assert_array_equal(joints.within(Limits()).acceleration, given)
     found = joints.within(Limits(acceleration=6.0, acceleration_scale=0.5)).acceleration
     np.testing.assert_array_equal(found, [1.0, 3.0, 2.0, 3.0])
-
-
-def test_joints_with_and_without_acceleration_limits():
-    """3 mm from a limit: 0.2 where steps of 0.1 brake, half of the way in a tick where nothing does; one is free."""
-    joints = JointBounds(
-        np.full(3, 9.0),
-        np.array([0, 1]),
-        np.array([0, 1]),
-        np.full(2, -np.inf),
-        np.ones(2),
-        np.array([10.0, np.inf, 10.0]),
-        np.full(3, np.inf),
-    )
-    lower, upper = Axes(joints, 0.5, 0.01).bounds(np.array([0.997, 0.997, 0.0]), np.array([0.25, 3.0, 1.0]))
-    np.testing.assert_allclose(lower, [0.15, -9.0, 0.9], rtol=1e-9)
-    np.testing.assert_allclose(upper, [0.2, 0.15, 1.1], rtol=1e-9)

@@ -41,22 +41,24 @@ def followed(course):
 
 
 @pytest.mark.parametrize("course", COURSES)
-def test_qp_holds_its_safety_distance_in_situation_1(course):
+def test_qp_keeps_its_safety_distance_from_a_moving_sphere(course):
     metrics = followed(course).metrics()
     assert SAFE - 2e-3 < metrics["min_distance"] < 0.03
     assert metrics["status_counts"]["STOPPED"] == 0
 
 
-@pytest.mark.parametrize("backup", [{}, None], ids=["backup", "law alone"])
-@pytest.mark.parametrize("course", COURSES)
-def test_rows_of_eq10_hold_d1_as_eq10_does_not(course, backup):
+@pytest.mark.parametrize("backup", [{}, pytest.param(None, marks=pytest.mark.slow)], ids=["backup", "law alone"])
+@pytest.mark.parametrize(
+    "course", [c if c in ("head-on 0.4", "chase 0.3") else pytest.param(c, marks=pytest.mark.slow) for c in COURSES]
+)
+def test_task_switching_rows_keep_d1_as_eq10_does_not(course, backup):
     """The same gains: 80 mm between surfaces are asked for. What chases the tool catches it under eq. 10."""
     scenario = situation(course, {"type": "task-switching"}, backup=backup)
     metrics = simulate(scenario).metrics()
     assert metrics["min_distance"] > 0.080 - 2e-3
     assert metrics["status_counts"]["RELAXED"] == metrics["status_counts"]["STOPPED"] == 0
-    theirs = simulate(scenario, "eq10").metrics()
-    assert theirs["min_distance"] < 0.080 - 5e-3 and theirs["collided"] == course.startswith("chase")
+    of_eq10 = simulate(scenario, "eq10").metrics()
+    assert of_eq10["min_distance"] < 0.080 - 5e-3 and of_eq10["collided"] == course.startswith("chase")
 
 
 def given(course, what, ticks):
@@ -80,14 +82,14 @@ def blind(sample):
     return sample._replace(linear=np.zeros(3), angular=np.zeros(3))
 
 
-@pytest.mark.parametrize(("course", "below"), [("head-on 0.4", 5e-3), ("chase 0.3", 5e-3), ("front 0.4", 5e-3)])
-def test_without_the_obstacles_velocity_it_would_fall_well_below(course, below):
+@pytest.mark.parametrize(("course", "below"), [("head-on 0.4", 5e-3), ("chase 0.3", 5e-3)])
+def test_qp_without_the_velocity_of_the_obstacle_comes_closer(course, below):
     least, _, _ = given(course, blind, 900)
     assert least < SAFE - below
 
 
-@pytest.mark.parametrize("course", ["head-on 0.2", "front 0.4", "chase 0.15"])
-def test_trajectory_twist_and_pose_stream_agree(course):
+@pytest.mark.parametrize("course", ["front 0.4", "chase 0.15"])
+def test_motion_samples_and_poses_of_an_obstacle_agree(course):
     log = followed(course)
     ticks = 600
     least, vs, said = given(course, lambda sample: sample, ticks)
@@ -99,7 +101,7 @@ def test_trajectory_twist_and_pose_stream_agree(course):
     np.testing.assert_allclose(vs, log.v[:ticks], atol=0.05)
 
 
-def test_an_estimated_twist_is_the_difference_quotient_also_after_a_gap(panda):
+def test_estimated_twist_is_the_difference_quotient(panda):
     controller = make_controller(panda, [Obstacle.at("ball", Sphere(radius=0.05), [0.5, 0, 0.8])], "panda_hand_tcp")
     speed = np.array([0.1, -0.2, 0.05])
     for k in (0, 1, 2, 5, 6):  # it is not updated in ticks 3 and 4
@@ -113,7 +115,7 @@ def test_an_estimated_twist_is_the_difference_quotient_also_after_a_gap(panda):
     assert len(tick.proximity.feedforward) > 1
 
 
-def test_a_program_may_write_into_the_arrays_that_it_gave(panda):
+def test_arrays_of_a_pose_are_copied(panda):
     """What was given last is kept, not looked up: a pose that is moved in place has moved."""
     controller = make_controller(panda, [Obstacle.at("ball", Sphere(radius=0.05), [0.5, 0, 0.8])], "panda_hand_tcp")
     position, rotation, speed = np.array([0.45, 0.0, 0.7]), np.eye(3), np.array([0.1, -0.2, 0.05])
@@ -164,13 +166,11 @@ def crossing(left, right):
 @pytest.mark.parametrize(
     ("left", "right"),
     [
-        ((0.0, -0.8, 0.05), (0.0, 0.8, -0.05)),
         ((0.0, -0.8, 0.1), (0.0, 0.8, -0.1)),
-        ((0.0, -0.75, 0.1), (0.0, 0.75, 0.0)),
         ((0.1, -0.8, 0.0), (0.0, 0.8, 0.0)),
     ],
 )
-def test_two_arms_on_crossing_paths_both_arrive(left, right):
+def test_arms_on_crossing_paths_arrive(left, right):
     """Each tool goes 0.1 to 0.15 m past the middle; the hands pass each other at the safety distance."""
     least, error, blocked, _ = crossing(left, right)
     assert 0.02 - 2e-4 < least < 0.025
@@ -181,7 +181,7 @@ def test_two_arms_on_crossing_paths_both_arrive(left, right):
 @pytest.mark.parametrize(
     ("left", "right"), [((0.0, -0.651, 0.0), (0.0, 0.651, 0.0)), ((0.0, -0.651, 0.0), (0.0, 0.651, 0.05))]
 )
-def test_two_arms_with_goals_that_exclude_each_other_say_why(left, right):
+def test_arms_with_contradicting_goals_are_stalled(left, right):
     """Goals 0 and 50 mm apart; hands of 50 mm radius cannot both be there."""
     least, error, blocked, at_last = crossing(left, right)
     assert least > 0.02 - 2e-4

@@ -15,7 +15,6 @@ from qpavoid import (
     Reason,
     ReasonKind,
     Sample,
-    Sensing,
     Severity,
     Solution,
     Status,
@@ -35,11 +34,6 @@ def read(entry: dict) -> Reason:
     return Reason(ReasonKind(entry["kind"]), tuple(entry["subject"]), entry["amount"], entry["unit"], severity)
 
 
-def test_severities_are_ordered():
-    assert Severity.INFO < Severity.WARNING < Severity.ALARM
-    assert max(Severity.ALARM, Severity.INFO) is Severity.ALARM and all(Severity)
-
-
 @pytest.mark.parametrize("kind", ReasonKind)
 def test_reason_kind_has_a_severity_and_a_line_for_people(kind):
     expected = "INFO" if kind.value in INFORMING else "ALARM" if kind.value in ALARMING else "WARNING"
@@ -49,10 +43,7 @@ def test_reason_kind_has_a_severity_and_a_line_for_people(kind):
     line = str(Reason.of(kind, "hand", "ball", amount=0.0123, unit="m", detail="more"))
     assert line.startswith("hand - ball: ") and "12.3 mm" in line and line.endswith("(more)")
     assert Reason.of(kind, severity=Severity.INFO).severity is Severity.INFO
-
-
-def test_reason_kinds_read_differently():
-    assert len({str(Reason.of(kind)) for kind in ReasonKind}) == len(ReasonKind)
+    assert [str(Reason.of(other)) for other in ReasonKind].count(str(bare)) == 1
 
 
 @pytest.mark.parametrize("kind", ReasonKind)
@@ -182,40 +173,6 @@ def test_slack_within_the_tolerance_of_the_qp_is_no_relaxation(solver):
         assert solution.status is Status.RELAXED
         rows = [reason for reason in solution.reasons if reason.kind is ReasonKind.ROW_RELAXED]
         assert sum(reason.amount for reason in rows) == pytest.approx(gap, abs=5e-6)
-
-
-class Broken:
-    """A law that stops, or fails."""
-
-    bounded = True
-
-    def solve(self, problem):
-        raise RuntimeError("no licence")
-
-
-NAN = np.full(3, np.nan)
-STOPS = {
-    "q": lambda c: c.step(NAN),
-    "v": lambda c: c.step(np.zeros(3), v=NAN),
-    "t": lambda c: c.step(np.zeros(3), np.inf),
-    "v_desired": lambda c: c.filter(np.zeros(3), NAN),
-    "target": lambda c: c.step(np.zeros(3), targets={"z": Sample.at([0.0, 0.0, 0.0])._replace(position=NAN)}),
-    "law": lambda c: setattr(c, "solver", Broken()) or c.step(np.zeros(3)),
-    "stale": lambda c: [c.step(np.zeros(3), 0.01 * k, None, {"ball": Pose.at([1, 0, 0])} if k == 0 else None)
-                        for k in range(20)][-1],
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("what", STOPS)
-def test_stop_alarms(tmp_path, what):
-    sensing = Sensing(stale_after=0.05, stop_after=0.1)
-    controller = make_controller(cartesian(tmp_path), [Obstacle.at("ball", BALL, [9, 0, 0])], "z", sensing=sensing)
-    assert controller.step(np.zeros(3)).severity is None
-    solution = STOPS[what](controller)
-    assert solution.status is Status.STOPPED
-    assert Severity.ALARM in [reason.severity for reason in solution.reasons]
-    kind = {"law": ReasonKind.SOLVER_FAILED, "stale": ReasonKind.STALE}.get(what, ReasonKind.IMPLAUSIBLE)
-    assert kind in [reason.kind for reason in solution.reasons]
 
 
 def test_solution_with_times_changes_the_two_times_alone():

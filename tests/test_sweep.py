@@ -564,7 +564,7 @@ def test_list_names_everything(cli):
     ],
 )
 def test_bad_input_is_a_line_and_exit_status_2(cli, monkeypatch, words, said):
-    monkeypatch.setattr("qpavoid.run.pool._CONNECT_TIMEOUT", 0.5)
+    monkeypatch.setattr("qpavoid.run.pool.CONNECT_TIMEOUT", 0.5)
     result = cli("bench", *words)
     lines = [line for line in result.lines if "does not take part" not in line]
     assert result.status == 2 and len(lines) == 1

@@ -46,7 +46,7 @@ def rows(d, J, v_tracking, feedforward=0.0, own=False, **settings):
 # --- the row ------------------------------------------------------------------------------------------------------
 
 
-def test_row_by_hand():
+def test_task_switching_row_by_hand():
     """d2 = 3 d1: α is 1/4 at 0.24 and 1 at 0.18, β is 1/2 at 0.24; u = -0.4 m/s, then 0.2; below d1, ξ (d1 - d)."""
     one = np.ones((1, 1))
 
@@ -68,20 +68,20 @@ def test_row_by_hand():
     assert bound(0.13, -1.0, own=True) == pytest.approx(0.0)  # two bodies of the robot are not
 
 
-def test_eq10_row_uses_up_no_more_than_the_distance_in_a_step():
+def test_task_switching_row_uses_up_no_more_than_the_distance_in_a_step():
     """At 100 m/s, 0.2 m are gone in 2 ms; the row leaves the safety distance after 10 ms."""
     found = rows(np.array([0.32]), np.ones((1, 1)), [-100.0]).rhs[0]
     assert found == pytest.approx(-(0.32 - D1) / 0.01)
 
 
-def test_the_obstacles_velocity_counts_in_u_and_in_the_bound():
+def test_task_switching_row_includes_the_velocity_of_the_obstacle():
     """ḋ = J v + drift: a sphere that comes at 0.3 m/s on a robot at rest is an approach of 0.3 m/s."""
     x = rows(np.array([0.24]), np.ones((1, 1)), [0.0], feedforward=-0.3)
     assert x.rhs[0] == pytest.approx(formula(0.24, -0.3) + 0.3)
 
 
-@pytest.mark.parametrize("seed", range(20))
-def test_row_by_its_formula(seed):
+@pytest.mark.parametrize("seed", range(5))
+def test_task_switching_row_by_its_formula(seed):
     rng = np.random.default_rng(seed)
     d, J, v_tracking = rng.uniform(D1, D2, 50), rng.normal(size=(50, NV)), rng.normal(size=NV)
     feedforward, retreat, cap = rng.normal(), rng.uniform(0.0, 0.2), rng.uniform(1.0, 50.0)
@@ -95,51 +95,37 @@ def test_row_by_its_formula(seed):
 # --- beside eq. 10 ------------------------------------------------------------------------------------------------
 
 
-def both(seed, regularization):
-    """One pair at random: the problem, and what eq. 10 and the QP make of it with the same gains."""
-    rng = np.random.default_rng(seed)
-    A, b, J = rng.normal(size=(3, NV)), 0.3 * rng.normal(size=3), rng.normal(size=(1, NV))
-    d, retreat, cap = rng.uniform(D1, D2, 1), rng.choice([0.0, 0.1]), rng.choice([1.0, 50.0])
-    v_tracking = np.linalg.pinv(A) @ b
-    least = rows(d, J, v_tracking, retreat_speed=retreat, alpha_cap=cap).rhs.copy()
-    pair = AvoidanceRows(np.arange(1), d, J, least, D1, D2, least - 1.0)
-    problem = make_problem(Tracking(A, b, 0.0), pair, np.full(NV, -1e3), np.full(NV, 1e3), [("hand", "fist")])
-    eq10 = make_solver(Eq10Solver(damping=0.0, retreat_speed=retreat, alpha_cap=cap)).solve(problem)
-    qp = make_solver(QpSolver(regularization=regularization)).solve(problem)
-    assert qp.status is Status.SOLVED
-    return problem, eq10.v, qp.v
-
-
-def test_where_the_row_binds_both_laws_change_the_distance_alike():
-    bound = 0
-    for seed in range(2000):
-        problem, eq10, qp = both(seed, 1e-3)
-        J, b = problem.avoidance.J[0], problem.avoidance.b[0]
-        if J @ problem.v_tracking < b:
-            bound += 1
-            assert J @ qp == pytest.approx(J @ eq10, abs=1e-9)
-        else:
-            np.testing.assert_array_equal(qp, problem.v_tracking)
-            assert J @ eq10 >= b - 1e-9
-    assert 800 < bound < 1900
-
-
-def test_at_the_same_rate_the_qp_tracks_no_worse():
-    """Of all velocities with that rate, the QP takes the one with the least tracking error, as λ goes to 0."""
-    better = 0
+def test_task_switching_row_gives_the_rate_of_eq10():
+    """Of all velocities with the rate of eq. 10, the QP takes one that tracks no worse, as λ goes to 0."""
+    bound = better = 0
     for seed in range(500):
-        problem, eq10, qp = both(seed, 1e-9)
-        theirs, ours = (np.linalg.norm(problem.tracking.A @ v - problem.tracking.b) for v in (eq10, qp))
-        assert ours <= theirs + 1e-9
-        better += ours < theirs - 1e-3
-    assert better > 20  # where α took from the task what the null space could have given
+        rng = np.random.default_rng(seed)
+        A, b, J = rng.normal(size=(3, NV)), 0.3 * rng.normal(size=3), rng.normal(size=(1, NV))
+        d, retreat, cap = rng.uniform(D1, D2, 1), rng.choice([0.0, 0.1]), rng.choice([1.0, 50.0])
+        v_tracking = np.linalg.pinv(A) @ b
+        least = rows(d, J, v_tracking, retreat_speed=retreat, alpha_cap=cap).rhs.copy()
+        pair = AvoidanceRows(np.arange(1), d, J, least, D1, D2, least - 1.0)
+        problem = make_problem(Tracking(A, b, 0.0), pair, np.full(NV, -1e3), np.full(NV, 1e3), [("hand", "fist")])
+        eq10 = make_solver(Eq10Solver(damping=0.0, retreat_speed=retreat, alpha_cap=cap)).solve(problem).v
+        qp = make_solver(QpSolver(regularization=1e-9)).solve(problem)
+        assert qp.status is Status.SOLVED
+        if J[0] @ v_tracking < least[0]:
+            bound += 1
+            assert J[0] @ qp.v == pytest.approx(J[0] @ eq10, abs=1e-9)
+            of_eq10, of_qp = (np.linalg.norm(A @ v - b) for v in (eq10, qp.v))
+            assert of_qp <= of_eq10 + 1e-9
+            better += of_qp < of_eq10 - 1e-3
+        else:
+            np.testing.assert_allclose(qp.v, v_tracking, rtol=0, atol=1e-12)
+            assert J[0] @ eq10 >= least[0] - 1e-9
+    assert 200 < bound < 475 and better > 20
 
 
 # --- pairs that cannot part ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("name", "frame"), [("panda", "panda_hand_tcp"), ("ur5", "tool0")])
-def test_the_robots_own_pairs_never_make_it_infeasible(name, frame):
+def test_task_switching_rows_of_own_pairs_are_feasible(name, frame):
     """Neighbouring links at random configurations, within 0.3 m of each other: ten of them are asked at once."""
     robot = Robot.load(name)
     controller = make_controller(robot, (), frame, avoidance=Avoidance(**SETTINGS))
@@ -154,7 +140,7 @@ def test_the_robots_own_pairs_never_make_it_infeasible(name, frame):
     assert close > 50
 
 
-def test_an_obstacle_towards_a_fixed_body_is_no_contradiction(tmp_path):
+def test_task_switching_row_of_a_fixed_body_is_feasible(tmp_path):
     """A tool on one rail, along x; a ball comes along z from 0.3 m: only below the safety distance is it said."""
     robot = cartesian(tmp_path, axes="x")
     ball = Obstacle.at("ball", Sphere(radius=0.05), [0.0, 0.0, 1.0])
@@ -178,13 +164,13 @@ def rate(scene, pair, d, u, d2=0.3):
     return formula(d, u, 0.02, d2, cap=1.0 if own else 50.0)
 
 
-def test_filter_bounds_by_the_command_that_it_is_given(panda):
+def test_task_switching_rows_of_a_filter_follow_its_command(panda):
     """u is of the command, not of any task: some commands close in and are braked, those that part are not."""
     robot = replace(panda, acceleration={})
     ball = Obstacle.at("ball", Sphere(radius=0.05), [0.45, 0.05, 0.45])
     controller = make_controller(robot, [ball], "panda_hand_tcp", avoidance=Avoidance(**SETTINGS | {"d2": 0.06}))
     rng, braked, parted = np.random.default_rng(0), 0, 0
-    for _ in range(1000):
+    for _ in range(400):
         q, v = pin.integrate(robot.model, robot.home, rng.uniform(-0.5, 0.5, 7)), rng.uniform(-0.1, 0.1, 7)
         near = controller.tick(q, 0.0).proximity
         solution = controller.filter(q, v)
@@ -195,11 +181,11 @@ def test_filter_bounds_by_the_command_that_it_is_given(panda):
         safe = (near.J @ v >= least).all()
         assert np.array_equal(solution.v, v) == safe
         braked, parted = braked + (not safe), parted + safe
-    assert braked > 50 and parted > 2
+    assert braked > 20 and parted > 0
 
 
 @pytest.mark.parametrize("change", ["eased", "followed", "of a cascade"])
-def test_rows_follow_the_velocity_that_is_tracked(panda, change):
+def test_task_switching_rows_follow_the_tracked_velocity(panda, change):
     """Whatever takes the place of v0, u is of that; the problem that it was made from stays as it was."""
     robot = panda if change == "eased" else replace(panda, acceleration={})
     scene = build_scene(robot, [obstacle("ball", SPHERE, [0.5, 0.3, 0.45])])
@@ -237,7 +223,7 @@ def assert_rows(scene, near, problem, v):
     assert by_formula.all() or (np.isfinite(problem.v_stop).all() and scene.robot.acceleration)
 
 
-def test_tasks_that_repeat_each_other_without_damping_have_rows_too(panda):
+def test_task_switching_rows_of_repeated_tasks(panda):
     """λ = 0 and the same task twice: J⁺ẋ is that of the pseudo-inverse, and rows are bounded by it."""
     robot = replace(panda, acceleration={})
     scene = build_scene(robot, [obstacle("ball", SPHERE, [0.5, 0.3, 0.45])])

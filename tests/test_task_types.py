@@ -43,14 +43,14 @@ def case(request):
     return robot, TOOLS[request.param], [random_q(robot, rng) for _ in range(3)]
 
 
-def test_the_robots_are_what_they_are_chosen_for(baxter_fingers, tiago, solo):
+def test_robots_have_mimic_joints_and_moving_bases(baxter_fingers, tiago, solo):
     assert baxter_fingers.model.nvExtended == baxter_fingers.model.nv + 2
     assert tiago.model.nq > tiago.model.nv and tiago.model.joints[1].shortname() == "JointModelPlanar"
     assert {"JointModelRUBY", "JointModelRUBZ"} & {joint.shortname() for joint in tiago.model.joints}
     assert solo.model.joints[1].shortname() == "JointModelFreeFlyer"
 
 
-def test_frames(case):
+def test_frame_rows_agree_with_finite_differences(case):
     """Positions before orientations, scaled with the roots of the weights, in whatever order the tasks are given."""
     robot, (tool, other), configurations = case
     orientation = config.Task(frame=tool, type="orientation", orientation_weight=4.0, name="turn")
@@ -67,7 +67,7 @@ def test_frames(case):
 
 
 @pytest.mark.parametrize("part", PARTS)
-def test_relative_pose(case, part):
+def test_relative_rows_agree_with_finite_differences(case, part):
     robot, (a, b), configurations = case
     bench = task_bench(robot, config.RelativeTask(frame=b, relative_to=a, rows=part, gain=0.0))
     for q in configurations:
@@ -80,7 +80,7 @@ def test_relative_pose(case, part):
         np.testing.assert_allclose(bench.rows(q)[0], differences(moved, robot, q), atol=1e-6)
 
 
-def test_centre_of_mass(case):
+def test_com_rows_agree_with_finite_differences(case):
     robot, _, configurations = case
     bench = task_bench(robot, config.ComTask(), config.ComTask(axes="xy", weight=9.0))
     data = robot.model.createData()
@@ -89,7 +89,7 @@ def test_centre_of_mass(case):
         np.testing.assert_allclose(bench.rows(q)[0], np.concatenate((expected, 3.0 * expected[:2])), atol=3e-6)
 
 
-def test_posture_and_damping_are_rates_of_coordinates(case):
+def test_posture_and_damping_rows_are_rates_of_coordinates(case):
     robot, _, configurations = case
     bench = task_bench(robot, config.PostureTask(weight=4.0), config.DampingTask())
     one = [joint.idx_v for joint in list(robot.model.joints)[1:] if joint.nv == 1]
@@ -102,7 +102,7 @@ def test_posture_and_damping_are_rates_of_coordinates(case):
 
 
 @pytest.mark.parametrize("looks", [True, False])
-def test_axes(case, looks):
+def test_axis_rows_agree_with_finite_differences(case, looks):
     """The rows turn the wanted direction, as the frame sees it, towards the axis and across."""
     robot, (tool, _), configurations = case
     axis, direction = np.array([2.0, -1.0, 2.0]) / 3.0, np.array([0.6, 0.0, -0.8])
@@ -129,7 +129,7 @@ def test_axes(case, looks):
 
 
 @pytest.mark.parametrize("part", PARTS)
-def test_manipulability(case, part):
+def test_manipulability_row_is_the_gradient(case, part):
     """The analytic gradient of √det(J Jᵀ); its row asks for the rate of ascent along it."""
     robot, (tool, _), configurations = case
     bench = task_bench(robot, config.ManipulabilityTask(frame=tool, rows=part, gain=2.0))
@@ -161,18 +161,18 @@ def test_manipulability(case, part):
         (config.LookAtTask(frame="panda_hand", motion=config.Fixed()), "tasks.0: motion.position is missing"),
     ],
 )
-def test_what_cannot_be_used_is_named(panda, block, message):
+def test_tasks_that_cannot_be_used_are_named(panda, block, message):
     with pytest.raises(ConfigError, match=f"bench.yaml: {message}".replace(".", r"\.")):
         build_tasks([block], panda, panda.home, Path("bench.yaml"))
 
 
-def test_a_robot_without_mass_has_no_centre_of_mass(tmp_path):
+def test_com_task_needs_a_mass(tmp_path):
     robot = Robot.from_urdf(write_chain(tmp_path), bodies=[])
     with pytest.raises(ConfigError, match=r"tasks: tasks\.0: chain has no mass, so no centre of mass"):
         build_tasks([config.ComTask()], robot, robot.home)
 
 
 @pytest.mark.parametrize("q0", [np.zeros(3), np.full(7, np.nan)])
-def test_a_configuration_that_is_none_is_refused(panda, q0):
+def test_tasks_refuse_a_configuration_that_is_none(panda, q0):
     with pytest.raises(NumericalError, match=r"q0: (shape \(3,\), expected \(7,\)|NaN)"):
         build_tasks([config.Task(frame="panda_hand_tcp")], panda, q0)

@@ -54,7 +54,7 @@ def settle(controller, q, seconds=4.0, dt=0.01, **given):
 # What the rows of frames ask for
 
 
-def test_at_the_target_only_the_feed_forward_is_left(panda):
+def test_frame_rows_at_the_target_are_the_feedforward(panda):
     bench = task_bench(panda, config.Task(frame=TIP, type="pose", gain=7.0, weight=9.0, orientation_weight=4.0))
     q = random_q(panda, np.random.default_rng(3))
     linear, angular = np.array([0.1, -0.2, 0.3]), np.array([0.4, 0.5, -0.6])
@@ -76,7 +76,7 @@ def test_pose_error_decays_exponentially(panda):
         q = pin.integrate(panda.model, q, dt * np.linalg.pinv(A) @ b)
 
 
-def test_caps_shorten_the_command_and_keep_its_direction(panda):
+def test_caps_keep_the_direction_of_the_command(panda):
     q = panda.home
     start = sample(panda, TIP, q)
     shift, turn = np.array([3.0, 4.0, 0.0]), np.array([0.0, 0.6, 0.8])
@@ -93,7 +93,7 @@ def test_caps_shorten_the_command_and_keep_its_direction(panda):
     np.testing.assert_allclose(b(start, max_speed=0.5, max_turn_rate=0.5), 0.0, atol=1e-9)
 
 
-def test_a_motion_without_a_start_begins_where_the_frame_is(panda):
+def test_motion_without_a_start_begins_at_the_frame(panda):
     (task,) = build_tasks([config.Task(frame=TIP)], panda, panda.home)
     start, here = task.motion.sample(0.0), sample(panda, TIP, panda.home)
     np.testing.assert_allclose(start.position, here.position, atol=1e-12)
@@ -103,7 +103,7 @@ def test_a_motion_without_a_start_begins_where_the_frame_is(panda):
 # Where feedback leads
 
 
-def test_a_camera_keeps_looking_at_a_point_that_moves(panda):
+def test_look_at_task_follows_a_point_without_lag(panda):
     """The feed-forward leaves no lag; from behind it turns through a full turn."""
     circle = config.Circle(center=(0.6, 0.0, 0.2), radius=0.2, period=6.0)
     controller, q = controller_of(panda, config.LookAtTask(frame="panda_hand", motion=circle, gain=4.0)), panda.home
@@ -113,14 +113,14 @@ def test_a_camera_keeps_looking_at_a_point_that_moves(panda):
         assert k < 350 or tick.errors[0] < 2e-3
 
 
-def test_an_axis_turns_to_any_direction(panda):
+def test_align_task_reaches_any_direction(panda):
     controller = controller_of(panda, config.AlignTask(frame="panda_hand", direction=(0.0, 0.0, -1.0)))
     for direction in ([0.0, 0.6, -0.8], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]):
         q = settle(controller, panda.home, targets={"align": np.array(direction)})
         np.testing.assert_allclose(sample(panda, "panda_hand", q).rotation[:, 2], direction, atol=2e-3)
 
 
-def test_manipulability_rises_while_the_tool_stays(panda):
+def test_manipulability_task_keeps_the_tool(panda):
     tasks = config.Task(frame=TIP, gain=5.0), config.ManipulabilityTask(frame=TIP, gain=20.0, weight=1e-3)
     controller = controller_of(panda, *tasks, tracking_damping=1e-3)
     q0 = panda.configuration({"panda_joint2": -0.3, "panda_joint4": -2.9, "panda_joint6": 2.6}, "q0")
@@ -130,7 +130,7 @@ def test_manipulability_rises_while_the_tool_stays(panda):
     assert np.linalg.norm(sample(panda, TIP, q).position - target.position) < 2e-3
 
 
-def test_a_posture_in_the_null_space_of_a_tool(panda):
+def test_posture_task_acts_in_the_null_space_of_a_tool(panda):
     """A light posture draws the elbow to where it was; the tool stays where the tool's task has it."""
     tasks = config.Task(frame=TIP, type="pose"), config.PostureTask(weight=1e-3)
     controller = controller_of(panda, *tasks, tracking_damping=1e-3)
@@ -138,7 +138,7 @@ def test_a_posture_in_the_null_space_of_a_tool(panda):
     np.testing.assert_allclose(q, panda.home, atol=2e-3)
 
 
-def test_a_posture_given_at_run_time_turns_a_floating_base_the_short_way(solo):
+def test_posture_target_turns_a_floating_base_the_short_way(solo):
     controller = controller_of(solo, config.PostureTask(joints=["*", "root_joint"], gain=2.0))
     goal = pin.integrate(solo.model, solo.home, np.concatenate(([0.3, -0.2, 0.1, 0.9, -1.2, 2.0], 0.4 * np.ones(12))))
     q = settle(controller, solo.home, targets={"posture": goal}, seconds=5.0)
@@ -146,7 +146,7 @@ def test_a_posture_given_at_run_time_turns_a_floating_base_the_short_way(solo):
     assert np.linalg.norm(q[3:7]) == pytest.approx(1.0, abs=1e-12)
 
 
-def test_two_hands_on_one_object():
+def test_relative_task_keeps_two_hands_on_an_object():
     """Baxter carries a box 0.3 m to the left and up: one hand leads, the other one keeps its place on the box."""
     names = ("left_gripper", "right_gripper")
     home = {f"{side}_{joint}": value for side in ("left", "right")
@@ -174,7 +174,7 @@ def test_two_hands_on_one_object():
 # Tasks, targets and controllers
 
 
-def test_controllers_share_tasks_and_a_scene_without_disturbing_each_other(panda):
+def test_controllers_share_tasks_and_a_scene(panda):
     """Interleaved steps of two that share them are those of two with tasks and scenes of their own, bit for bit."""
 
     def controller(tasks, scene):
@@ -197,7 +197,7 @@ def test_controllers_share_tasks_and_a_scene_without_disturbing_each_other(panda
             states[i] = pin.integrate(panda.model, states[i], 0.01 * found.solution.v)
 
 
-def test_targets_of_the_wrong_kind(panda):
+def test_targets_of_the_wrong_kind_are_named(panda):
     light = {"weight": 1e-3}
     controller = controller_of(panda, config.Task(frame=TIP), config.PostureTask(**light), config.DampingTask(**light))
     for name, target, message in [
@@ -216,7 +216,7 @@ def test_targets_of_the_wrong_kind(panda):
     assert controller.step(panda.home).status.value == "SOLVED"
 
 
-def test_names_must_differ(panda):
+def test_task_names_must_differ(panda):
     twice = [config.Task(frame=TIP), config.Task(frame=TIP, type="orientation")]
     with pytest.raises(ConfigError, match="two have the same name among panda_hand_tcp"):
         controller_of(panda, *twice)

@@ -51,14 +51,18 @@ def viable_ticks(robot, frame, seed, ticks, shapes, max_speed, dt=0.01):
 CLUTTER = (Box(size=(0.3, 0.3, 0.3)), Sphere(radius=0.1), Capsule(radius=0.05, length=0.4), Box(size=(0.004, 0.5, 0.5)))
 
 
-@pytest.mark.parametrize("seed", range(10))
-def test_random_states_of_the_panda_stay_feasible(panda, seed):
-    """30,000 ticks among four obstacles at up to the joints' full speeds."""
-    viable_ticks(panda, "panda_hand_tcp", seed, 3000, CLUTTER, 1.0 if seed % 2 else 5.0)
+@pytest.mark.parametrize(
+    ("seed", "ticks"), [(0, 1000), (1, 1000), *(pytest.param(i, 3000, marks=pytest.mark.slow) for i in range(10))]
+)
+def test_random_states_of_the_panda_stay_feasible(panda, seed, ticks):
+    """Among four obstacles at up to the joints' full speeds; 30,000 steps in the campaign."""
+    viable_ticks(panda, "panda_hand_tcp", seed, ticks, CLUTTER, 1.0 if seed % 2 else 5.0)
 
 
-@pytest.mark.parametrize("seed", range(7))
-def test_random_states_of_a_cartesian_robot_stay_feasible(tmp_path, seed):
-    """70,000 ticks; its joint limits form a box that cuts through the obstacles."""
+@pytest.mark.parametrize(
+    ("seed", "ticks"), [(0, 3000), *(pytest.param(i, 10_000, marks=pytest.mark.slow) for i in range(7))]
+)
+def test_random_states_of_a_cartesian_robot_stay_feasible(tmp_path, seed, ticks):
+    """Its joint limits form a box that cuts through the obstacles; 70,000 steps in the campaign."""
     robot = cartesian(tmp_path, speed=2.0, acceleration=3.0, reach=0.7)
-    viable_ticks(robot, "z", seed, 10_000, CLUTTER, 2.0)
+    viable_ticks(robot, "z", seed, ticks, CLUTTER, 2.0)

@@ -84,7 +84,7 @@ class Voxels:
         voxel = np.floor(finite / resolution).astype(np.int64)
         places = np.concatenate((voxel // _BLOCK + _HALF, voxel % _BLOCK), axis=1)
         keys, first = np.unique(places @ _STRIDES, return_index=True)
-        centers: Array = (voxel[first] + 0.5) * resolution
+        centers = np.asarray((voxel[first] + 0.5) * resolution, dtype=np.float64)
         block = keys // _BLOCK**3
         starts = np.flatnonzero(np.diff(block, prepend=-1)).astype(np.intp)
         blocks = np.empty((len(starts), 4))

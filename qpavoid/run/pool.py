@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 from qpavoid.errors import ConfigError, QpavoidError
 
 _SINGLE_THREADED = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "NUMBA")}
-_CONNECT_TIMEOUT = 10.0
+CONNECT_TIMEOUT = 10.0
 """Time in which a scheduler has to answer, and a first worker to be there [s]."""
 
 Call = TypeVar("Call", bound=tuple[Any, ...])
@@ -185,7 +185,7 @@ class ClusterWorkers(Workers):
         self._log_level = logging.getLogger("distributed").level
         logging.getLogger("distributed").setLevel(logging.CRITICAL)  # it reports every dead worker, which we do as well
         try:
-            self._client = Client(address, timeout=_CONNECT_TIMEOUT)
+            self._client = Client(address, timeout=CONNECT_TIMEOUT)
         except (OSError, ValueError, TypeError) as error:  # TimeoutError among them
             start = "start one with `dask scheduler`, and give the address that it prints, as in tcp://host:8786"
             message = " ".join(str(error).split()) or type(error).__name__
@@ -230,7 +230,7 @@ def _unnumbered(_: int, function: Callable[..., Any], *call: Any) -> Any:
 def _check_versions(client: Any, address: str) -> None:
     """Check that there is a worker, and that all have this version of qpavoid."""
     try:
-        client.wait_for_workers(1, timeout=_CONNECT_TIMEOUT)
+        client.wait_for_workers(1, timeout=CONNECT_TIMEOUT)
     except TimeoutError:
         raise ConfigError(f"--cluster {address}: no worker there; start some with `dask worker {address}`") from None
     ours = version("qpavoid")

@@ -4,27 +4,24 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-import sys
 from collections.abc import Callable, Mapping
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 
 from qpavoid import Controller
 from qpavoid.config.text import read_text
-from qpavoid.errors import ConfigError, UnknownName, nearest
+from qpavoid.errors import ConfigError
 from qpavoid.model.trajectory import Sample
 from qpavoid.problem import Array, Problem, Solution, require_finite
 from qpavoid_bench.arena.case import Case
 from qpavoid_bench.arena.entrants import Entrant
+from qpavoid_bench.arena.python_file import MAX_FILE_SIZE, load_attribute
 from qpavoid_bench.arena.rollout import Pilot
 from qpavoid_bench.arena.world import World
 
-_MAX_FILE_SIZE = 10_000_000
-"""Largest Python file that is read [bytes]: more is no source file."""
 _ACCEPTED = (
     "give a class with `solve(problem)`, made without arguments; a function of a problem; or, made from (case, world), "
     "what has `step(q, t, targets, obstacles)`"
@@ -50,8 +47,8 @@ def entrant_from_file(path: Path, name: str) -> Entrant:
     Raises:
         ConfigError, UnknownName: the file cannot be read or run, or there is no such entrant in it.
     """
-    text = read_text(path, _MAX_FILE_SIZE)
-    candidate = _load_attribute(text, path.name, name)
+    text = read_text(path, MAX_FILE_SIZE)
+    candidate = load_attribute(text, path.name, name)
     if _classify(candidate) is None:
         raise ConfigError(f"{path}:{name}: cannot take part; {_ACCEPTED}")
     description = (inspect.getdoc(candidate) or f"from {path.name}").partition("\n")[0]
@@ -63,7 +60,7 @@ def entrant_from_file(path: Path, name: str) -> Entrant:
 
 def _start_pilot(text: str, file: str, name: str, case: Case, world: World) -> Pilot:
     """Set the entrant of a file's text up for a case."""
-    candidate = _load_attribute(text, file, name)
+    candidate = load_attribute(text, file, name)
     kind = _classify(candidate)
     if kind == "pilot":
         pilot: Pilot = candidate(case, world)
@@ -113,27 +110,3 @@ class _SolverPilot:
         if self._error is not None:
             raise self._error
         return solution
-
-
-def _load_attribute(text: str, file: str, name: str) -> Any:
-    """Return a class or function of a file's text by its name."""
-    module = _load_module(text, file)
-    if not hasattr(module, name):
-        own_names = [
-            key for key, value in vars(module).items() if getattr(value, "__module__", None) == module.__name__
-        ]
-        raise UnknownName(f"{file}: there is no {name!r} in it{nearest(name, own_names)}")
-    return getattr(module, name)
-
-
-@lru_cache(maxsize=32)
-def _load_module(text: str, file: str) -> ModuleType:
-    """Run a file's text as a module: the same in every process, wherever the file lies."""
-    module = ModuleType(f"qpavoid_entrant_{hashlib.sha256(text.encode()).hexdigest()[:16]}")
-    sys.modules[module.__name__] = module  # dataclasses and pickle look for it there
-    try:
-        exec(compile(text, file, "exec"), module.__dict__)
-    except (Exception, SystemExit) as error:  # whatever a user's file does
-        del sys.modules[module.__name__]
-        raise ConfigError(f"{file}: cannot be run: {type(error).__name__}: {error}") from None
-    return module

@@ -14,9 +14,10 @@ import mujoco
 import numpy as np
 import pinocchio as pin
 
-from qpavoid import Robot, Sample, ScenarioConfig, Scene, build_scene
+from qpavoid import Sample, ScenarioConfig, Scene, build_scene
 from qpavoid.model.scene import build_obstacles
 from qpavoid.problem import Array, IntArray
+from qpavoid_bench.arena.world import load_robot
 
 MAX_DISTANCE = 100.0
 """Largest distance that MuJoCo looks for [m]: beyond any scene."""
@@ -83,10 +84,8 @@ def place_mocap(data: Any, index: int, sample: Sample) -> None:
 
 def load_model(scenario: ScenarioConfig) -> MujocoModel:
     """Build the MuJoCo model of a scenario."""
-    source = scenario.source
-    robot = Robot.load(scenario.robot, source.parent)
-    robot, q0 = robot.lock(scenario.lock, robot.configuration(scenario.q0, str(source)), str(source))
-    return build(build_scene(robot, build_obstacles(scenario.obstacles, source)), q0)
+    robot, q0 = load_robot(scenario.robot, scenario.q0, scenario.lock, scenario.source)
+    return build(build_scene(robot, build_obstacles(scenario.obstacles, scenario.source)), q0)
 
 
 def build(scene: Scene, q0: Array, frames: Sequence[int] = ()) -> MujocoModel:

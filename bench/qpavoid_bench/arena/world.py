@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from qpavoid.config import ScenarioConfig
 from qpavoid.control.tasks import FrameTask, RowTask, build_tasks
@@ -28,17 +29,21 @@ class World(NamedTuple):
         return [task for task in self.tasks if isinstance(task, FrameTask) and task.moves]
 
 
-def build_world(scenario: ScenarioConfig) -> World:
-    """Build the world of a scenario.
+def load_robot(name: str, q0: Any, lock: Sequence[str], source: Path) -> tuple[Robot, Array]:
+    """Load a robot, once a process, without its locked joints, and its configuration (nq,) at the start.
+
+    Args:
+        name: of a robot, as a scenario has it.
+        q0: joint: value.
+        lock: names of joints.
+        source: file that asks for it; a relative path starts from its folder.
 
     Raises:
         ConfigError, UnknownName: naming file, field and remedy.
     """
-    source = scenario.source
     with located(f"{source}: robot"):
-        robot = _load_robot(scenario.robot, source.parent)
-    q0 = robot.configuration(scenario.q0, f"{source}: q0")
-    return build_world_of(scenario, *robot.lock(scenario.lock, q0, f"{source}: lock"))
+        robot = _load_robot(name, source.parent)
+    return robot.lock(lock, robot.configuration(q0, f"{source}: q0"), f"{source}: lock")
 
 
 @lru_cache(maxsize=16)
@@ -47,8 +52,8 @@ def _load_robot(name: str, folder: Path) -> Robot:
     return Robot.load(name, folder)
 
 
-def build_world_of(scenario: ScenarioConfig, robot: Robot, q0: Array) -> World:
-    """Build the world of a scenario with a robot that is loaded, its joints locked.
+def build_world(scenario: ScenarioConfig) -> World:
+    """Build the world of a scenario.
 
     Raises:
         ConfigError, UnknownName: naming file, field and remedy.
@@ -56,6 +61,7 @@ def build_world_of(scenario: ScenarioConfig, robot: Robot, q0: Array) -> World:
     source = scenario.source
     if scenario.contacts or any(obstacle.attached_to for obstacle in scenario.obstacles):
         raise ConfigError(f"{source}: the arena knows neither contacts nor obstacles that are carried; leave them out")
+    robot, q0 = load_robot(scenario.robot, scenario.q0, scenario.lock, source)
     obstacles = build_obstacles(scenario.obstacles, source)
     with located(str(source)):
         scene = build_scene(robot, obstacles)

@@ -14,7 +14,7 @@ from qpavoid.model.robot import Robot
 from qpavoid.problem import Array
 from qpavoid_bench.arena.families.inverse_kinematics import FrameGoal, JointRanges, solve_inverse_kinematics
 from qpavoid_bench.arena.families.parameters import Redraw
-from qpavoid_bench.arena.families.reach import arm
+from qpavoid_bench.arena.families.reach import chain
 from qpavoid_bench.arena.families.tool_path import ToolPath
 
 REST_TIME = 3.0
@@ -53,11 +53,11 @@ def arms(robot: Robot) -> list[Arm]:
     frames = {tool: robot.frame_id(tool, "end_effectors") for tool in robot.end_effectors}
     chains = {tool: list(model.supports[model.frames[frame].parentJoint]) for tool, frame in frames.items()}
     arms_found = []
-    for tool, chain in chains.items():
-        shared_joints = {joint for other, joints in chains.items() if other != tool for joint in joints}
-        own_places = [place for place, joint in enumerate(chain) if joint > 0 and joint not in shared_joints]
-        if own_places:
-            length = arm(robot, frames[tool], own_places[0])[1]
+    for tool, own in chains.items():
+        shared = {joint for other, joints in chains.items() if other != tool for joint in joints}
+        places = [place for place, joint in enumerate(own) if joint > 0 and joint not in shared]
+        if places:
+            length = chain(robot, frames[tool], places[0])[1]
             arms_found.append(Arm(tool, np.array(data.oMf[frames[tool]].translation), length))
     if not arms_found:
         raise ConfigError(f"{robot.name} has no tool that moves; give `end_effectors` in its robot.yaml")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from importlib.util import module_from_spec, spec_from_file_location
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,10 +14,12 @@ from pydantic import Field, model_validator
 from qpavoid.config.base import Block
 from qpavoid.config.loading import read_config, read_mapping
 from qpavoid.config.shipped import find_family, find_robot, find_setup, setup_names
-from qpavoid.errors import ConfigError, UnknownName, nearest
+from qpavoid.config.text import read_text
+from qpavoid.errors import ConfigError, UnknownName, located, nearest
 from qpavoid.model.robot import Robot
-from qpavoid_bench.arena.families import moving, statics, targets, two_arms
+from qpavoid_bench.arena.families import moving, statics, two_arms
 from qpavoid_bench.arena.families.parameters import Draw, Parameter
+from qpavoid_bench.arena.python_file import MAX_FILE_SIZE, load_attribute
 
 Generator = Callable[[Draw, Robot], Mapping[str, Any]]
 """Function from draws and the robot to fields of a scenario; the robot's locked joints are gone, its home is the
@@ -29,13 +31,11 @@ GENERATORS: dict[str, Generator] = {
     "box": statics.box,
     "opening": statics.opening,
     "narrow_gap": statics.narrow_gap,
+    "unreachable": statics.unreachable,
     "crossing_arms": two_arms.crossing_arms,
     "passing": two_arms.passing,
-    "crossing": moving.crossing,
-    "head_on": moving.head_on,
-    "chasing": moving.chasing,
-    "random_walk": moving.random_walk,
-    "unreachable": targets.unreachable,
+    **{name: partial(moving.movers, motion) for name, motion in moving.MOTIONS.items()},
+    "random_walk": partial(moving.movers, moving.wander),
 }
 """Generators that ship."""
 
@@ -162,20 +162,6 @@ def _generator(name: str, path: Path) -> Generator:
             own = "; or give your own as my_file.py:function"
             raise UnknownName(f"{path}: generator: unknown generator {name!r}{nearest(name, GENERATORS)}{own}")
         return GENERATORS[name]
-    source = path.parent / file
-    if not source.is_file():
-        raise ConfigError(f"{path}: generator: {source}: no such file")
-    spec = spec_from_file_location(source.stem, source)
-    if spec is None or spec.loader is None:
-        raise ConfigError(f"{path}: generator: {source}: not a Python file")
-    module = module_from_spec(spec)
-    try:
-        spec.loader.exec_module(module)
-    except Exception as error:  # whatever a reader's file does
-        raise ConfigError(f"{path}: generator: {source}: {type(error).__name__}: {error}") from error
-    function_found = getattr(module, function, None)
-    if not callable(function_found):
-        functions = [key for key, value in vars(module).items() if callable(value) and not key.startswith("_")]
-        raise UnknownName(f"{path}: generator: {source} has no function {function!r}{nearest(function, functions)}")
-    generator: Generator = function_found
+    with located(f"{path}: generator"):
+        generator: Generator = load_attribute(read_text(path.parent / file, MAX_FILE_SIZE), file, function)
     return generator

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from qpavoid.config import ScenarioConfig
 from qpavoid.config.loading import validate
-from qpavoid.errors import ConfigError, QpavoidError, located
-from qpavoid.model.robot import Robot
+from qpavoid.errors import ConfigError, QpavoidError
 from qpavoid_bench.arena.case import Case, Sensor
 from qpavoid_bench.arena.families.family import Family
 from qpavoid_bench.arena.families.parameters import Draw, Redraw
 from qpavoid_bench.arena.families.solvable import solved_by
-from qpavoid_bench.arena.world import build_world_of
+from qpavoid_bench.arena.world import build_world, load_robot
 
 MAX_DRAWS = 100
 """Largest number of draws of a seed before the family is refused."""
@@ -47,13 +44,13 @@ def make_case(family: Family, seed: int) -> Case:
         draw = Draw(family.config.parameters, seed, number, family.in_template)
         try:
             scenario = _scenario(family, template, draw, seed)
-            robot, q0 = _robot(family, scenario.robot, scenario.q0, scenario.lock)
-            world = build_world_of(scenario, robot, q0)
+            world = build_world(scenario)
             how = solved_by(scenario, world, family.config.reachable, np.random.default_rng([seed, number]))
         except Redraw as reason:
             causes.append(str(reason))
             continue
-        return Case(family.name, seed, scenario, _sensor(family, draw), family.config.reachable, how)
+        sensor = validate(_rounded(family.fill(family.config.sensor, draw)), Sensor, family.path)
+        return Case(family.name, seed, scenario, sensor, family.config.reachable, how)
     worst = max(set(causes), key=causes.count)
     raise ConfigError(
         f"{family.path}: seed {seed}: {MAX_DRAWS} draws and no case, most often: {worst}; widen or shift the ranges"
@@ -79,7 +76,8 @@ def _generate(family: Family, template_fields: dict[str, Any], draw: Draw) -> di
     """Run the generator of a family and check what it drew."""
     assert family.generator is not None
     where = f"{family.path}: generator {family.config.generator}"
-    robot, q0 = _robot(family, template_fields["robot"], template_fields.get("q0", {}), template_fields.get("lock", []))
+    fields = template_fields.get("q0", {}), template_fields.get("lock", [])
+    robot, q0 = load_robot(template_fields["robot"], *fields, family.path)
     try:
         generated = dict(family.generator(draw, replace(robot, home=q0)))
     except Redraw:
@@ -92,22 +90,6 @@ def _generate(family: Family, template_fields: dict[str, Any], draw: Draw) -> di
     if unused_names:
         raise ConfigError(f"{where}: never draws {unused_names[0]!r}; leave it out of `parameters`")
     return generated
-
-
-def _sensor(family: Family, draw: Draw) -> Sensor:
-    return validate(_rounded(family.fill(family.config.sensor, draw)), Sensor, family.path)
-
-
-def _robot(family: Family, name: str, q0: Any, lock: list[str]) -> tuple[Robot, Any]:
-    """Return a robot without its locked joints, and its configuration at the start."""
-    robot = _load_robot(name, family.path.parent)
-    return robot.lock(lock, robot.configuration(q0, f"{family.path}: q0"), f"{family.path}: lock")
-
-
-@lru_cache(maxsize=16)
-def _load_robot(name: str, folder: Path) -> Robot:
-    with located(f"{folder}: robots"):
-        return Robot.load(name, folder)
 
 
 def _rounded(value: Any) -> Any:

@@ -21,19 +21,28 @@ class ParameterBlock(Block):
     """Meaning of the parameter, with its unit."""
 
 
-class Uniform(ParameterBlock):
-    """Equally likely values."""
+class RangeBlock(ParameterBlock):
+    """Common fields of numbers of a range."""
 
-    type: Literal["uniform"]
     range: tuple[Number, Number]
     """Lowest and highest value."""
     whole: bool = False
     """Whole numbers only, both ends included."""
 
     @model_validator(mode="after")
-    def _check_range(self) -> Uniform:
-        _check(self.range, self.whole)
+    def _check_range(self) -> RangeBlock:
+        low, high = self.range
+        if not low < high:
+            raise ValueError(f"range: needs low < high, got {low:g}, {high:g}")
+        if self.whole and (low != round(low) or high != round(high)):
+            raise ValueError(f"range: {low:g}, {high:g} are not whole numbers; round them, or leave `whole` out")
         return self
+
+
+class Uniform(RangeBlock):
+    """Equally likely values."""
+
+    type: Literal["uniform"]
 
     def draw(self, random: np.random.Generator) -> float:
         """Draw a value of the range."""
@@ -41,19 +50,12 @@ class Uniform(ParameterBlock):
         return int(random.integers(int(low), int(high) + 1)) if self.whole else float(random.uniform(low, high))
 
 
-class LogUniform(ParameterBlock):
+class LogUniform(RangeBlock):
     """Values with equally likely logarithms: as many from 2 to 4 as from 20 to 40."""
 
     type: Literal["log_uniform"]
     range: tuple[Positive, Positive]
     """Lowest and highest value."""
-    whole: bool = False
-    """Whole numbers only, both ends included."""
-
-    @model_validator(mode="after")
-    def _check_range(self) -> LogUniform:
-        _check(self.range, self.whole)
-        return self
 
     def draw(self, random: np.random.Generator) -> float:
         """Draw a value of the range."""
@@ -86,14 +88,6 @@ class Direction(ParameterBlock):
 
 
 Parameter = Annotated[Uniform | LogUniform | Choice | Direction, Field(discriminator="type")]
-
-
-def _check(limits: tuple[float, float], whole: bool) -> None:
-    low, high = limits
-    if not low < high:
-        raise ValueError(f"range: needs low < high, got {low:g}, {high:g}")
-    if whole and (low != round(low) or high != round(high)):
-        raise ValueError(f"range: {low:g}, {high:g} are not whole numbers; round them, or leave `whole` out")
 
 
 class Redraw(Exception):

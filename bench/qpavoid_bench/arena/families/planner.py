@@ -44,58 +44,56 @@ class Plan(NamedTuple):
 
 
 class _Tree:
-    """Nodes q (nv,) at times t, each connected to its parent."""
+    """Nodes q (nv,) at times t, each connected to its parent; grows from its roots over clear edges."""
 
-    def __init__(self, roots: Array, t: float, forward: bool) -> None:
+    def __init__(self, clearance: Clearance, speed: Array, roots: Array, t: float, forward: bool) -> None:
+        self._clearance, self._speed, self._forward = clearance, speed, forward
         self.q = np.empty((MAX_NODES + len(roots), roots.shape[1]))
-        self.t, self.parent = np.full(len(self.q), t), np.full(len(self.q), -1)
-        self.q[: len(roots)], self.count, self.forward = roots, len(roots), forward
+        self.t, self._parent = np.full(len(self.q), t), np.full(len(self.q), -1)
+        self.q[: len(roots)], self.count = roots, len(roots)
 
-    def add(self, q: Array, t: float, parent: int) -> int:
-        self.q[self.count], self.t[self.count], self.parent[self.count] = q, t, parent
-        self.count += 1
-        return self.count - 1
+    def nearest(self, q: Array, t: float) -> int:
+        """Return the node that connects to q at t with the least motion; -1 if none."""
+        dq = np.abs(self.q[: self.count] - q)
+        cost = dq @ self._clearance.lever_arm
+        if self._clearance.depends_on_time:
+            time = t - self.t[: self.count] if self._forward else self.t[: self.count] - t
+            cost[(dq / self._speed).max(axis=1) > time] = np.inf
+        node = int(np.argmin(cost))
+        return node if np.isfinite(cost[node]) else -1
+
+    def extend(self, node: int, q: Array, t: float) -> tuple[int, bool]:
+        """Add a node one edge from another one towards q at t; return it, and whether it is q.
+
+        The node is -1 if the edge is not clear.
+        """
+        q_node, t_node = self.q[node], float(self.t[node])
+        dq, time = q - q_node, t - t_node
+        fraction = min(1.0, _MAX_EDGE / max(float(self._clearance.lever_arm @ np.abs(dq)), 1e-12))
+        if self._clearance.depends_on_time and time:
+            fraction = min(fraction, _MAX_EDGE_TIME / abs(time))
+        q_new, t_new = q_node + fraction * dq, t_node + fraction * time
+        edge = (q_node, t_node, q_new, t_new) if self._forward else (q_new, t_new, q_node, t_node)
+        if not self._clearance.is_clear_between(*edge):
+            return -1, False
+        new, self.count = self.count, self.count + 1
+        self.q[new], self.t[new], self._parent[new] = q_new, t_new, node
+        return new, fraction == 1.0
+
+    def connect(self, q: Array, t: float) -> int:
+        """Extend until q at t is reached; return the node, or -1 if an obstacle stops it."""
+        node, is_reached = self.nearest(q, t), False
+        while node >= 0 and not is_reached and self.count < len(self.q):
+            node, is_reached = self.extend(node, q, t)
+        return node if is_reached else -1
 
     def trace(self, node: int) -> list[int]:
         """Return the nodes from a node back to its root."""
         nodes = []
         while node >= 0:
             nodes.append(node)
-            node = int(self.parent[node])
+            node = int(self._parent[node])
         return nodes
-
-
-class _Search:
-    """Distance and extension of nodes, common to both trees."""
-
-    def __init__(self, clearance: Clearance, speed: Array) -> None:
-        self._clearance, self._speed, self._depends_on_time = clearance, speed, clearance.depends_on_time
-
-    def nearest(self, tree: _Tree, q: Array, t: float) -> int:
-        """Return the node of a tree that connects to q at t with the least motion; -1 if none."""
-        dq = np.abs(tree.q[: tree.count] - q)
-        cost = dq @ self._clearance.lever_arm
-        if self._depends_on_time:
-            time = t - tree.t[: tree.count] if tree.forward else tree.t[: tree.count] - t
-            cost[(dq / self._speed).max(axis=1) > time] = np.inf
-        node = int(np.argmin(cost))
-        return node if np.isfinite(cost[node]) else -1
-
-    def extend(self, tree: _Tree, node: int, q: Array, t: float) -> tuple[int, bool]:
-        """Add a node one edge from another one towards q at t; return it, and whether it is q.
-
-        The node is -1 if the edge is not clear.
-        """
-        dq, time = q - tree.q[node], t - float(tree.t[node])
-        cost = float(self._clearance.lever_arm @ np.abs(dq))
-        fraction = min(
-            1.0, _MAX_EDGE / max(cost, 1e-12), _MAX_EDGE_TIME / abs(time) if self._depends_on_time and time else 1.0
-        )
-        q_new, t_new = tree.q[node] + fraction * dq, float(tree.t[node]) + fraction * time
-        ends = (tree.q[node], float(tree.t[node]), q_new, t_new)
-        if not self._clearance.is_clear_between(*(ends if tree.forward else (*ends[2:], *ends[:2]))):
-            return -1, False
-        return tree.add(q_new, t_new, node), fraction == 1.0
 
 
 def plan(
@@ -118,38 +116,28 @@ def plan(
         duration: of the run [s].
         random: where samples come from.
     """
-    search, last = _Search(clearance, speed), duration if clearance.depends_on_time else 0.0
-    trees = (_Tree(start[None], 0.0, True), _Tree(goals, last, False))
+    last = duration if clearance.depends_on_time else 0.0
+    start_tree = _Tree(clearance, speed, start[None], 0.0, True)
+    goal_tree = _Tree(clearance, speed, goals, last, False)
     for round_index in range(_MAX_ROUNDS):
-        tree, other = trees[round_index % 2], trees[1 - round_index % 2]
+        tree, other = (goal_tree, start_tree) if round_index % 2 else (start_tree, goal_tree)
         if tree.count + other.count > MAX_NODES:
             return None
         q, t = (goals[0], last) if round_index == 0 else _sample(ranges, start, goals, round_index, last, random)
-        node = search.nearest(tree, q, t)
-        if node < 0:
-            continue
-        new, _ = search.extend(tree, node, q, t)
-        if new < 0:
-            continue
-        met = _connect(search, other, tree.q[new], float(tree.t[new]))
+        node = tree.nearest(q, t)
+        new = tree.extend(node, q, t)[0] if node >= 0 else -1
+        met = other.connect(tree.q[new], float(tree.t[new])) if new >= 0 else -1
         if met >= 0:
-            one, two = (new, met) if tree.forward else (met, new)
-            start_side, goal_side = trees[0].trace(one)[::-1], trees[1].trace(two)[1:]  # both end where the trees met
-            q_path = np.concatenate((trees[0].q[start_side], trees[1].q[goal_side]))
-            t_path = np.concatenate((trees[0].t[start_side], trees[1].t[goal_side]))
-            path = _shorten(clearance, q_path, t_path, random)
-            return _assign_times(
-                Plan(*path, trees[0].count + trees[1].count), speed, duration, clearance.depends_on_time
-            )
+            one, two = (met, new) if round_index % 2 else (new, met)
+            to_meeting, onward = start_tree.trace(one)[::-1], goal_tree.trace(two)[1:]  # both have where the trees met
+            q_path = np.concatenate((start_tree.q[to_meeting], goal_tree.q[onward]))
+            t_path = np.concatenate((start_tree.t[to_meeting], goal_tree.t[onward]))
+            q_path, t_path = _shorten(clearance, q_path, t_path, random)
+            if not clearance.depends_on_time:
+                times = (np.abs(np.diff(q_path, axis=0)) / speed).max(axis=1)
+                t_path = np.concatenate(([0.0], np.cumsum(times)))
+            return Plan(q_path, t_path, tree.count + other.count) if t_path[-1] <= duration else None
     return None
-
-
-def _connect(search: _Search, tree: _Tree, q: Array, t: float) -> int:
-    """Extend a tree until it reaches q at t; return the node, or -1 if an obstacle stops it."""
-    node, is_reached = search.nearest(tree, q, t), False
-    while node >= 0 and not is_reached and tree.count < len(tree.q):
-        node, is_reached = search.extend(tree, node, q, t)
-    return node if is_reached else -1
 
 
 def _sample(
@@ -178,11 +166,3 @@ def _shorten(clearance: Clearance, q: Array, t: Array, random: np.random.Generat
         if clearance.is_clear_between(q[i], float(t[i]), q[j], float(t[j])):
             q, t = np.delete(q, slice(i + 1, j), axis=0), np.delete(t, slice(i + 1, j))
     return q, t
-
-
-def _assign_times(path: Plan, speed: Array, duration: float, depends_on_time: bool) -> Plan | None:
-    """Give a plan times where nothing but the robot moves; None if it takes too long."""
-    if depends_on_time:
-        return path
-    t = np.concatenate(([0.0], np.cumsum((np.abs(np.diff(path.q, axis=0)) / speed).max(axis=1))))
-    return path._replace(t=t) if t[-1] <= duration else None

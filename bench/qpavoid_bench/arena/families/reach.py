@@ -1,4 +1,4 @@
-"""Bounds on what an arm can reach: the length of its links, and the distance of a point from solids."""
+"""Reach of an arm, and proof that a target lies farther away than the arm is long, or inside an obstacle."""
 
 from __future__ import annotations
 
@@ -9,14 +9,16 @@ import coal
 import numpy as np
 import pinocchio as pin
 
+from qpavoid.control.tasks import FrameTask
 from qpavoid.model.kinematics import MIMIC, TRANSLATIONS
 from qpavoid.model.robot import Robot
 from qpavoid.problem import Array
+from qpavoid_bench.arena.world import World
 
 _POINT = coal.Sphere(1e-6)
 
 
-def arm(robot: Robot, frame_id: int, first: int = 1) -> tuple[Array, float]:
+def chain(robot: Robot, frame_id: int, first: int = 1) -> tuple[Array, float]:
     """Return the root (3,) of the chain of joints that moves a frame, at home, and the sum of its link lengths [m].
 
     Args:
@@ -26,12 +28,12 @@ def arm(robot: Robot, frame_id: int, first: int = 1) -> tuple[Array, float]:
     """
     model, data = robot.model, robot.model.createData()
     frame = model.frames[frame_id]
-    chain = list(model.supports[frame.parentJoint])[first:]
-    if not chain:
+    joints = list(model.supports[frame.parentJoint])[first:]
+    if not joints:
         return np.array(frame.placement.translation), 0.0
     pin.forwardKinematics(model, data, robot.home)
     length = float(np.linalg.norm(frame.placement.translation))
-    for place, i in enumerate(chain):
+    for place, i in enumerate(joints):
         joint = model.joints[i]
         length += float(np.linalg.norm(model.jointPlacements[i].translation)) if place else 0.0
         translations = TRANSLATIONS.get(joint.shortname(), 0)
@@ -39,11 +41,44 @@ def arm(robot: Robot, frame_id: int, first: int = 1) -> tuple[Array, float]:
             length = np.inf
         elif translations:
             length += max(abs(model.lowerPositionLimit[joint.idx_q]), abs(model.upperPositionLimit[joint.idx_q]))
-    root = data.oMi[model.parents[chain[0]]].act(model.jointPlacements[chain[0]].translation)
+    root = data.oMi[model.parents[joints[0]]].act(model.jointPlacements[joints[0]].translation)
     return np.array(root), length
 
 
-def clearance(point: Array, solids: Iterable[tuple[Any, Any]]) -> float:
+def out_of_reach(world: World, task: FrameTask, t: float, tolerance: float) -> str:
+    """Prove that a target cannot be attained, in words; return "" where that is not certain.
+
+    Args:
+        world: where the task is.
+        task: of a frame.
+        t: when its target counts [s].
+        tolerance: how near would do [m].
+    """
+    robot, frame, target = world.scene.robot, task.settings.frame, task.motion.sample(t).position
+    root, length = chain(robot, task.frame_id)
+    beyond = float(np.linalg.norm(target - root)) - length - tolerance
+    if beyond > 0.0:
+        return f"{frame}: its goal is {1e3 * beyond:.0f} mm farther away than all links in a row are long"
+    enough = _shell(robot, task.frame_id) + tolerance
+    for geometry, number in zip(world.scene.geometry.geometryObjects, world.scene.obstacle_of, strict=True):
+        if number >= 0 and not world.scene.obstacles[number].moves:
+            depth = -_clearance(target, [(geometry.geometry, geometry.placement)])
+            if depth > enough:
+                return f"{frame}: its goal is {1e3 * depth:.0f} mm inside {world.scene.obstacle_names[number]!r}"
+    return ""
+
+
+def _shell(robot: Robot, frame_id: int) -> float:
+    """Return the distance of a frame's origin from the nearest body that moves with it [m].
+
+    It is inf if there is none.
+    """
+    frame = robot.model.frames[frame_id]
+    mates = [body for body in robot.bodies.geometryObjects if body.parentJoint == frame.parentJoint]
+    return max(_clearance(frame.placement.translation, [(body.geometry, body.placement) for body in mates]), 0.0)
+
+
+def _clearance(point: Array, solids: Iterable[tuple[Any, Any]]) -> float:
     """Return the distance of a point (3,) from the nearest of some shapes [m]: negative inside, inf without any.
 
     Args:

@@ -10,13 +10,13 @@ from qpavoid.errors import ConfigError
 from qpavoid.problem import Array
 from qpavoid_bench.arena.families.clearance import Clearance
 from qpavoid_bench.arena.families.inverse_kinematics import FrameGoal, JointRanges, solve_inverse_kinematics
-from qpavoid_bench.arena.families.out_of_reach import out_of_reach
 from qpavoid_bench.arena.families.parameters import Redraw
 from qpavoid_bench.arena.families.planner import Plan, plan
+from qpavoid_bench.arena.families.reach import out_of_reach
 from qpavoid_bench.arena.scores import surface_safety_distance
 from qpavoid_bench.arena.world import World
 
-_MAX_GOALS, _TRIES = 6, 40
+_MAX_GOALS, MAX_TRIES = 6, 40
 """Configurations that attain the goal: largest number, and number of searches."""
 _GOAL_PRECISION = 0.2
 """Fraction of the goal's tolerance within which they attain it [-]."""
@@ -103,8 +103,8 @@ def _goals(
             )
     motion: list[Array] = []
     configurations = False
-    for number in range(_TRIES):
-        spread = number / _TRIES
+    for number in range(MAX_TRIES):
+        spread = number / MAX_TRIES
         begin = world.q0 + spread * (random.uniform(ranges.lower, ranges.upper) - world.q0)
         q = solve_inverse_kinematics(robot, goals, begin, ranges, _GOAL_PRECISION * scenario.goal_tolerance)
         configurations |= q is not None

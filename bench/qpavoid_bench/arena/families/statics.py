@@ -1,4 +1,4 @@
-"""Generators of static scenes: spheres, shelf, box, opening in a wall, gap."""
+"""Generators of static scenes: spheres, shelf, box, opening in a wall, gap, goals out of reach."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from qpavoid.problem import Array
 from qpavoid_bench.arena.families.arms import Arm, arms, position_task, posture, scenario_fields, straight_path
 from qpavoid_bench.arena.families.free_space import min_distance, placed_bodies
 from qpavoid_bench.arena.families.parameters import Draw
+from qpavoid_bench.arena.families.reach import chain
 from qpavoid_bench.arena.families.tool_path import ToolPath, path_motion
 
 MIN_START_CLEARANCE = 0.03
@@ -20,6 +21,8 @@ _TRIES = 20
 """Places that are tried for each obstacle; without a free one, it is left out."""
 _BOARD = 0.02
 """Thickness of boards and walls [m]."""
+_UNREACHABLE_REST_TIME = 8.0
+"""Time to come to rest after the planned motion to a goal that cannot be reached [s]."""
 
 
 def sideways_path(draw: Draw, robot: Robot) -> tuple[Arm, ToolPath, Array]:
@@ -45,7 +48,7 @@ def sphere_field(draw: Draw, robot: Robot) -> dict[str, Any]:
             radius, offset = draw("radius"), arm.length * draw("aside") * np.array(draw("direction"))
             center = path.point(draw("along")) + offset
             if min_distance(coal.Sphere(radius), coal.Transform3s(np.eye(3), center), occupied) > MIN_START_CLEARANCE:
-                obstacles.append(fixed_obstacle(f"ball{i}", {"type": "sphere", "radius": radius}, center))
+                obstacles.append(_fixed_obstacle(f"ball{i}", {"type": "sphere", "radius": radius}, center))
                 break
     return scenario_fields(robot, q, [position_task(arm.tool, path_motion(path))], obstacles)
 
@@ -111,6 +114,26 @@ def narrow_gap(draw: Draw, robot: Robot) -> dict[str, Any]:
     return _scenario_through(draw, robot, arm, start, goal, obstacles)
 
 
+def unreachable(draw: Draw, robot: Robot) -> dict[str, Any]:
+    """Put the goal inside a ball, or beyond the length of the arm with a ball on the path.
+
+    It is `deep` of the ball's radius inside, or `beyond` all links in a row.
+    """
+    arm, path, q = sideways_path(draw, robot)
+    radius = arm.length * draw("radius")
+    goal, fraction, excess, depth = path.goal, draw("share"), draw("beyond"), draw("deep")
+    if draw("kind") == "inside":
+        ball = goal + (1.0 - depth) * radius * path.direction  # its nearest point is on this side: a place to rest
+    else:
+        root, length = chain(robot, robot.frame_id(arm.tool, "tool"))
+        direction = goal - root
+        goal = root + (length + excess) * direction / np.linalg.norm(direction)
+        ball = path.start + fraction * (goal - path.start)
+    path = straight_path(path.start, goal, draw("speed"))
+    obstacle = _fixed_obstacle("ball", {"type": "sphere", "radius": radius}, ball)
+    return scenario_fields(robot, q, [position_task(arm.tool, path_motion(path))], [obstacle], _UNREACHABLE_REST_TIME)
+
+
 _SIDES = (("left", 1.0), ("right", -1.0))
 
 
@@ -131,9 +154,9 @@ def _scenario_through(
 
 def _board(name: str, center: Array, length: float, width: float, height: float) -> dict[str, Any]:
     """Return an obstacle block of a box at rest."""
-    return fixed_obstacle(name, {"type": "box", "size": [length, width, height]}, center)
+    return _fixed_obstacle(name, {"type": "box", "size": [length, width, height]}, center)
 
 
-def fixed_obstacle(name: str, shape: dict[str, Any], position: Array) -> dict[str, Any]:
+def _fixed_obstacle(name: str, shape: dict[str, Any], position: Array) -> dict[str, Any]:
     """Return an obstacle block at rest at a position (3,) [m]."""
     return {"name": name, "shape": shape, "motion": {"type": "fixed", "position": position}}
