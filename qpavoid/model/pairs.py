@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from fnmatch import fnmatchcase
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,24 +29,20 @@ def add_self_pairs(model: Any, bodies: Any, disabled: Iterable[tuple[str, str]],
         UnknownName: a pattern that matches no body.
     """
     names = [body.name for body in bodies.geometryObjects]
-    disabled_pairs: set[frozenset[int]] = set()
-    for pattern_a, pattern_b in disabled:
-        matches = [_matching(pattern, names, origin) for pattern in (pattern_a, pattern_b)]
-        disabled_pairs |= {frozenset((i, j)) for i in matches[0] for j in matches[1]}
     joints = [body.parentJoint for body in bodies.geometryObjects]
-    for i in range(len(names)):
-        for j in range(i + 1, len(names)):
-            a, b = joints[i], joints[j]
-            adjacent = a == b or model.parents[a] == b or model.parents[b] == a
-            if not adjacent and frozenset((i, j)) not in disabled_pairs:
-                bodies.addCollisionPair(pin.CollisionPair(i, j))
 
+    def matching(pattern: str) -> list[int]:
+        matches = [i for i, name in enumerate(names) if fnmatchcase(name, pattern)]
+        if not matches:
+            raise UnknownName(f"{origin}: disabled_pairs: no body {pattern!r}{nearest(pattern, names)}")
+        return matches
 
-def _matching(pattern: str, names: list[str], origin: str) -> list[int]:
-    matches = [i for i, name in enumerate(names) if fnmatchcase(name, pattern)]
-    if not matches:
-        raise UnknownName(f"{origin}: disabled_pairs: no body {pattern!r}{nearest(pattern, names)}")
-    return matches
+    disabled_pairs = {frozenset((i, j)) for a, b in disabled for i in matching(a) for j in matching(b)}
+    for i, j in combinations(range(len(names)), 2):
+        a, b = joints[i], joints[j]
+        adjacent = a == b or model.parents[a] == b or model.parents[b] == a
+        if not adjacent and frozenset((i, j)) not in disabled_pairs:
+            bodies.addCollisionPair(pin.CollisionPair(i, j))
 
 
 ALWAYS_TOUCHING = 0.95
