@@ -14,7 +14,6 @@ FOR_BENCHMARKS = {
     "qpavoid.control.distances": "DistanceQuery: the planner that proves a case solvable checks distances",
     "qpavoid.control.tasks": "FrameTask: which goals the scores and other libraries follow",
     "qpavoid.solvers": "parse_solver: entrants are named as in scenarios",
-    "qpavoid.geometry.segments": "point_segment_distance: that of a tool from its target's path",
     "qpavoid.viz.style": "colours and grid: figures look alike",
 }
 """What the benchmarks import beside public names and `qpavoid.{config,problem,model,run}`, and for what."""

@@ -63,7 +63,13 @@ def limited_situation(course, acceleration, jerk):
 # --- moving obstacles --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("course", "jerk"), [(course, 50.0 * 4.0 ** (k % 2)) for k, course in enumerate(COURSES)])
+@pytest.mark.parametrize(
+    ("course", "jerk"),
+    [
+        pytest.param(course, 50.0 * 4.0 ** (k % 2), marks=[pytest.mark.slow] if k % 3 else [])
+        for k, course in enumerate(COURSES)
+    ],
+)
 def test_distance_to_an_approaching_sphere_is_kept_to_2_mm(course, jerk):
     """As without jerk limits: a margin may be relaxed for some steps, accelerations and jerks are not."""
     fields = situation(course).model_dump(mode="json")

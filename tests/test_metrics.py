@@ -107,21 +107,21 @@ def test_deviation_is_from_the_path_not_from_the_target_or_the_corners():
     angle = np.linspace(np.pi, 0, 5)
     tool = np.stack((0.5 + 0.3 * np.cos(angle), 0.3 * np.sin(angle), np.zeros(5)), axis=-1)[:, None]
     target = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [2, 0, 0], [2, 0, 0]], dtype=float)[:, None]
-    deviation = path_deviation(make_log(5, target=target, tool=tool))
+    deviation = path_deviation(tool, target)
     assert np.allclose(deviation[:, 0], 0.3 * np.sin(angle), atol=1e-12)
 
 
 def test_deviation_beyond_the_ends_of_the_path():
     target = np.array([[0, 0, 0], [1, 0, 0]], dtype=float)[:, None]
     tool = np.array([[-0.5, 0, 0], [1.3, 0.4, 0]])[:, None]
-    assert np.allclose(path_deviation(make_log(2, target=target, tool=tool))[:, 0], [0.5, 0.5])
+    assert np.allclose(path_deviation(tool, target)[:, 0], [0.5, 0.5])
 
 
 def test_deviation_of_a_long_run_is_off_by_the_sagitta_at_most():
     """3000 points of a circle drawn as a polyline of 99 pieces: the longest spans 31 of the steps."""
     angle = np.linspace(0, 2 * np.pi, 3000)
     circle = np.stack((np.cos(angle), np.sin(angle), 0 * angle), axis=-1)[:, None]
-    deviation = path_deviation(make_log(3000, target=circle, tool=circle), corners=100)
+    deviation = path_deviation(circle, circle, corners=100)
     assert np.max(deviation) == pytest.approx(1 - np.cos(31 * angle[1] / 2), rel=0.01)
 
 

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -23,7 +24,7 @@ pytest.importorskip("distributed")
 pytest.importorskip("mujoco")
 
 from qpavoid.config.shipped import family_names, suite_names
-from qpavoid.errors import ConfigError, UnknownName
+from qpavoid.errors import ConfigError
 from qpavoid.run.pool import ClusterLost, ClusterWorkers, Workers
 from qpavoid_bench.arena import commands, sweep
 from qpavoid_bench.arena.entrant_file import entrant_from_file
@@ -36,30 +37,21 @@ from qpavoid_bench.arena.summary import find_faults, summary
 from qpavoid_bench.arena.trial import run_trial
 from qpavoid_bench.arena.world import build_world
 
-POST = {
-    "title": "A post",
-    "about": "The tool of a UR5 goes past a post.",
-    "robots": ["ur5"],
-    "parameters": {"y": {"type": "uniform", "range": [-0.25, -0.15], "about": "of the post [m]"}},
-    "scenario": {
-        "tasks": [
-            {
-                "frame": "tool0",
-                "motion": {"type": "line", "displacement": [0, -0.2, 0], "speed": 0.2, "profile": "smooth"},
-            }
-        ],
-        "obstacles": [
-            {
-                "name": "post",
-                "shape": {"type": "capsule", "radius": 0.02, "length": 0.5},
-                "motion": {"type": "fixed", "position": [0.6, "$y", 0.25]},
-            }
-        ],
-        "avoidance": {"d1": 0.02, "d2": 0.12},
-        "dt": 0.02,
-        "duration": 3.0,
-    },
-}
+POST = yaml.safe_load("""
+title: A post
+about: The tool of a UR5 goes past a post.
+robots: [ur5]
+parameters: {y: {type: uniform, range: [-0.25, -0.15], about: "of the post [m]"}}
+scenario:
+  tasks: [{frame: tool0, motion: {type: line, displacement: [0, -0.2, 0], speed: 0.2, profile: smooth}}]
+  obstacles:
+  - name: post
+    shape: {type: capsule, radius: 0.02, length: 0.5}
+    motion: {type: fixed, position: [0.6, $y, 0.25]}
+  avoidance: {d1: 0.02, d2: 0.12}
+  dt: 0.02
+  duration: 3.0
+""")
 """A family that is solved at once."""
 LAWS = '''
 """Entrants of each kind."""
@@ -274,18 +266,6 @@ def test_the_full_suite_is_everything():
     assert {entrant.name for entrant in suite.entrants + suite.absent} == set(ENTRANTS)
 
 
-def test_entrant_config_changes_only_its_settings(folder):
-    """A law with settings of its own changes these and no others."""
-    path = write_suite(
-        folder, [{"name": "wide", "solver": {"name": "qp", "backend": "daqp"}, "avoidance": {"d2": 0.3}}]
-    )
-    (entrant,) = load_suite(path).entrants
-    case = make_case(load_family(folder / "post.yaml"), 0)
-    controller = entrant.start(case, build_world(case.scenario))
-    assert controller.avoidance == case.scenario.avoidance.model_copy(update={"d2": 0.3})
-    assert entrant.name == "wide" and entrant.settings["avoidance"] == {"d2": 0.3}
-
-
 def test_suite_selects_entrants(folder, monkeypatch):
     """Who takes part."""
     monkeypatch.setitem(ENTRANTS, "absent", replace(ENTRANTS["qp"], name="absent", packages=("no_such_package",)))
@@ -297,6 +277,9 @@ def test_suite_selects_entrants(folder, monkeypatch):
     chosen = load_suite(path, ["wide", "eq10"], [f"{folder}/laws.py:Still"], seeds=5)
     assert [entrant.name for entrant in chosen.entrants] == ["wide", "eq10", "Still"]
     assert chosen.entrants[0].digest == suite.entrants[1].digest and chosen.seeds == range(5)
+    case = make_case(load_family(folder / "post.yaml"), 0)
+    controller = chosen.entrants[0].start(case, build_world(case.scenario))
+    assert controller.avoidance == case.scenario.avoidance.model_copy(update={"d2": 0.3})  # and nothing else
     with pytest.raises(ConfigError, match="--solvers: entrant 'absent' needs no_such_package"):
         load_suite(path, ["absent"])
     with pytest.raises(ConfigError, match="none can take part: absent needs no_such_package"):
@@ -307,29 +290,19 @@ def test_suite_selects_entrants(folder, monkeypatch):
     ("fields", "options", "said"),
     [
         ({"entrants": ["trcking"]}, {}, r"mine.yaml: entrants.0: unknown entrant 'trcking'; did you mean 'tracking'"),
-        ({"families": ["shelv"]}, {}, r"mine.yaml: families.0: unknown family 'shelv'; did you mean 'shelf'"),
-        ({"famlies": ["shelf"]}, {}, r"famlies: unknown key; did you mean 'families'"),
         ({"entrants": ["qp", "qp"]}, {}, r"entrants.1: 'qp' is there twice"),
         ({"families": ["post.yaml", "post.yaml"]}, {}, r"'post' is there twice"),
         ({"entrants": [{"name": "a", "solver": "qp", "avoidance": {"d3": 1}}]}, {}, r"d3: unknown key"),
-        ({"entrants": [{"name": "a", "solver": "qq"}]}, {}, r"unknown name 'qq'"),
         ({"entrants": ["laws.py:Halvd"]}, {}, r"laws.py: there is no 'Halvd' in it; did you mean 'Halved'"),
         ({"entrants": ["laws.py:NUMBER"]}, {}, r"laws.py:NUMBER: cannot take part; give a class with `solve"),
-        ({"entrants": ["lows.py:Halved"]}, {}, r"lows.py: cannot be read: No such file"),
         ({}, {"solvers": ["trackin"]}, r"--solvers: unknown entrant 'trackin'; did you mean 'tracking'"),
         ({}, {"more": ["tracking"]}, r"--entrant: 'tracking' is there twice"),
         ({}, {"seeds": 0}, r"--seeds 0: give 1 to"),
-        ({"seeds": 0}, {}, r"seeds: .*greater than or equal to 1"),
     ],
 )
 def test_suite_errors_are_one_line(folder, fields, options, said):
     with pytest.raises(ConfigError, match=said):
         load_suite(write_suite(folder, **fields), **options)
-
-
-def test_no_such_suite():
-    with pytest.raises(UnknownName, match="unknown suite 'smok'; did you mean 'smoke'"):
-        load_suite("smok")
 
 
 def test_entrant_file_errors_name_file(tmp_path):
@@ -356,20 +329,17 @@ def test_entrant_from_file_digest_depends_on_text_only(folder):
         ("Mistyped", "AttributeError: 'Problem' object has no attribute 'v_tracking_'"),
         ("short", r"NumericalError: its velocity: shape \(3,\), expected \(6,\)"),
         ("nan", "NumericalError: its velocity: NaN or infinity"),
+        ("now_and_then", "ValueError: not now"),
     ],
 )
 def test_entrant_from_file_failure_names_cause(folder, name, said):
     """A controller brakes where its law fails; the arena must not take that for what the law wants."""
     row = run_trial(make_case(load_family(folder / "post.yaml"), 0), entrant_from_file(folder / "laws.py", name))
-    assert row.failed == row.stopped == 1.0 and not row.success and re.search(said, row.failure)
-
-
-def test_entrant_from_file_continues_after_failure(folder):
-    """A law that fails now and then goes on."""
-    row = run_trial(
-        make_case(load_family(folder / "post.yaml"), 0), entrant_from_file(folder / "laws.py", "now_and_then")
-    )
-    assert 0.0 < row.failed < 1.0 and row.failure == "ValueError: not now" and row.path_length > 0.0
+    assert re.search(said, row.failure)
+    if name == "now_and_then":
+        assert 0.0 < row.failed < 1.0 and row.path_length > 0.0
+    else:
+        assert row.failed == row.stopped == 1.0 and not row.success
 
 
 # --- sweeps ------------------------------------------------------------------------------------------------------
@@ -487,12 +457,16 @@ def test_killed_then_interrupted_then_finished(folder):
         return subprocess.Popen(command, cwd=folder, env=ENVIRONMENT, start_new_session=True, **pipes)
 
     def seeds():
-        return read_runs(folder / "out")["seed"].to_list() if (folder / "out" / FILE).exists() else []
+        with suppress(ConfigError):  # there are no results yet
+            return read_runs(folder / "out")["seed"].to_list()
+        return []
 
     write_suite(folder, ["laws.py:Slow"], seeds=24)
     first = bench()
-    until(lambda: len(seeds()) >= 3)
-    first.kill()
+    try:
+        until(lambda: len(seeds()) >= 3)
+    finally:
+        first.kill()
     first.communicate()
     kept, made = seeds(), len(read_cases(folder / "out"))
     assert 3 <= len(kept) < 24 and made == 24

@@ -58,7 +58,7 @@ def run_metrics(log: Log) -> dict[str, Any]:
         "time_below": {str(limit): dt * float(np.sum(distance < limit)) for limit in config["thresholds"]},
         "final_error": final_error,
         "task_errors": other_tasks,
-        "max_deviation": float(np.max(path_deviation(log), initial=0.0)),
+        "max_deviation": float(np.max(path_deviation(log.tool, log.target), initial=0.0)),
         "tracking_rmse": float(np.sqrt(np.mean(error**2))) if error.size else float("nan"),
         "peak_velocity": float(np.max(np.abs(log.v), initial=0.0)),
         "jitter": float(np.sum(np.abs(np.diff(log.v, axis=0)))),
@@ -76,21 +76,22 @@ def run_metrics(log: Log) -> dict[str, Any]:
     }
 
 
-def path_deviation(log: Log, corners: int = 500) -> Array:
+def path_deviation(tool: Array, target: Array, corners: int = 500) -> Array:
     """Compute the distance of each tool from the path that its target draws, at whatever time.
 
     Args:
-        log: the run.
+        tool: (N, k, 3) positions of the tools [m].
+        target: (N, k, 3) positions of their targets [m].
         corners: the path is taken as a polyline with at most so many corners.
 
     Returns:
         (N, k) [m].
     """
-    count, tasks = log.tool.shape[:2]
+    count, tasks = tool.shape[:2]
     deviation = np.full((count, tasks), np.inf)
     every = np.unique(np.linspace(0, max(count - 1, 0), min(count, corners)).astype(int))
     for task in range(tasks):
-        path, tool = log.target[every, task], log.tool[:, task]
+        path = target[every, task]
         for start, end in zip(path, np.concatenate((path[1:], path[-1:])), strict=True):
-            deviation[:, task] = np.minimum(deviation[:, task], point_segment_distance(tool, start, end))
+            deviation[:, task] = np.minimum(deviation[:, task], point_segment_distance(tool[:, task], start, end))
     return deviation

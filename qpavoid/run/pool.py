@@ -16,6 +16,7 @@ from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future
 from contextlib import contextmanager
 from importlib.metadata import version
 from itertools import islice
+from threading import Thread
 from typing import Any, TypeVar
 
 from qpavoid.errors import ConfigError, QpavoidError
@@ -162,8 +163,7 @@ class Workers:
                     return self._executor.submit(function, *call)
                 except BrokenExecutor:
                     self.stop()
-            ignore_interrupt = signal.signal, (signal.SIGINT, signal.SIG_IGN)  # a terminal sends Ctrl-C to all of them
-            self._executor = ProcessPoolExecutor(self._count, multiprocessing.get_context("spawn"), *ignore_interrupt)
+            self._executor = ProcessPoolExecutor(self._count, multiprocessing.get_context("spawn"), _begin_process)
             return self._executor.submit(function, *call)
 
 
@@ -216,6 +216,19 @@ class ClusterWorkers(Workers):
     def _submit(self, function: Callable[..., Any], call: tuple[Any, ...]) -> Future[Any]:
         future: Future[Any] = self._remote.submit(function, *call)
         return future
+
+
+def _begin_process() -> None:
+    """Leave Ctrl-C, which a terminal sends to all processes, to the one that started this one, and end with that."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+
+    def end() -> None:
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    Thread(target=end, daemon=True).start()
 
 
 def cores() -> int:

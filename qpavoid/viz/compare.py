@@ -66,7 +66,7 @@ def compare_time_figure(logs: Sequence[Log]) -> Figure:
         line = {**style, "linewidth": 1.7}
         to_target = np.linalg.norm(log.target - log.tool, axis=2)
         distance.plot(log.t, log.min_distance, **line)
-        deviation.plot(log.t, np.max(path_deviation(log), axis=1, initial=0.0), **line)
+        deviation.plot(log.t, np.max(path_deviation(log.tool, log.target), axis=1, initial=0.0), **line)
         error.plot(log.t, np.max(to_target, axis=1, initial=1e-3 * ERROR_FLOOR), **line)
         speed.plot(log.t, np.max(np.abs(log.v), axis=1, initial=0.0), **line)
     solvers = distance.get_legend_handles_labels()[0]

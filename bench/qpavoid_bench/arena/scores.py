@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from qpavoid.config import ScenarioConfig
-from qpavoid.geometry.segments import point_segment_distance
 from qpavoid.problem import Array, Status
 from qpavoid.run.log import STATUSES
+from qpavoid.run.metrics import path_deviation
 from qpavoid_bench.arena.case import Case
 from qpavoid_bench.arena.checker import Findings
 from qpavoid_bench.arena.rollout import Rollout
@@ -21,7 +21,6 @@ REST_SPEED = 1e-3
 """Speed of a tool below which it is at rest [m/s]."""
 REST_DURATION = 1.0
 """Time for which tools are at rest at the end of a run that is stuck [s]."""
-_MAX_CORNERS = 500
 _ROUND_OFF = 1e-6
 
 
@@ -150,7 +149,7 @@ def score(
         arrived=arrived,
         final_error=float(goal_error[-1]),
         tracking_error=float(np.sqrt(np.mean(error**2))),
-        deviation=_max_deviation(rollout),
+        deviation=float(path_deviation(rollout.tool, rollout.target).max(initial=0.0)),
         path_length=_path_length(rollout.tool) / max(_path_length(rollout.target), 1e-9),
         time_to_goal=(int(outside_tolerance[-1]) + 1 if len(outside_tolerance) else 0) / ticks if arrived else 1.0,
         stuck=case.reachable and not arrived and not findings.contacts and rests,
@@ -184,17 +183,6 @@ def _status_share(rollout: Rollout, status: Status) -> float:
 def _path_length(path: Array) -> float:
     """Return the length of all tools' paths (N, k, 3) together [m]."""
     return float(np.linalg.norm(np.diff(path, axis=0), axis=2).sum())
-
-
-def _max_deviation(rollout: Rollout) -> float:
-    """Return the largest distance of a tool from the path that its target draws [m]."""
-    worst, corners = 0.0, np.unique(np.linspace(0, len(rollout.t) - 1, _MAX_CORNERS).astype(int))
-    for tool, target in zip(rollout.tool.swapaxes(0, 1), rollout.target[corners].swapaxes(0, 1), strict=True):
-        nearest = np.full(len(tool), np.inf)
-        for start, end in zip(target, np.concatenate((target[1:], target[-1:])), strict=True):
-            nearest = np.minimum(nearest, point_segment_distance(tool, start, end))
-        worst = max(worst, float(nearest.max()))
-    return worst
 
 
 def _violates_limits(world: World, scenario: ScenarioConfig, rollout: Rollout, findings: Findings) -> Array:

@@ -130,10 +130,13 @@ def read_facts(folder: Path) -> dict[str, Any]:
 
 
 def _read(folder: Path, table: str, columns: Iterable[str]) -> pd.DataFrame:
+    nothing = ConfigError(f"{folder}: no results here; give a folder that `qpavoid bench run … --out` wrote")
     if not (folder / FILE).is_file():
-        raise ConfigError(f"{folder}: no results here; give a folder that `qpavoid bench run … --out` wrote")
+        raise nothing
     try:
         with closing(sqlite3.connect(folder / FILE, timeout=_WAIT)) as database:
+            if not database.execute("SELECT 1 FROM sqlite_master WHERE name = ?", [table]).fetchone():
+                raise nothing  # a sweep that begins has just made the file
             cursor = database.execute(f"SELECT {_quoted(columns)} FROM {table} ORDER BY rowid")
             return pd.DataFrame(cursor.fetchall(), columns=list(columns))
     except sqlite3.Error as error:

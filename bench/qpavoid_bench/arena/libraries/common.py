@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 import pinocchio as pin
 
-from qpavoid.config import Avoidance
 from qpavoid.control.tasks import FrameTask
 from qpavoid.errors import ConfigError
 from qpavoid.model.scene import Scene
@@ -15,6 +15,39 @@ from qpavoid.model.trajectory import Sample
 from qpavoid.problem import Array, IntArray
 from qpavoid_bench.arena.case import Case
 from qpavoid_bench.arena.world import World
+
+
+class Adapter:
+    """What every adapter is made from."""
+
+    def __init__(self, case: Case, world: World, library: str) -> None:
+        """Take what a library can be given of a case.
+
+        Raises:
+            ConfigError: the case has something that it cannot be given.
+        """
+        scenario, self.scene = case.scenario, world.scene
+        self.dt, self.tracking_damping, self.source = scenario.dt, scenario.tracking_damping, str(scenario.source)
+        self.frame_tasks = frame_tasks(case, world, library)
+        self.pairs = movable_pairs(world.scene)
+        self.d1, self.d2 = (d - scenario.avoidance.offset for d in (scenario.avoidance.d1, scenario.avoidance.d2))
+        self.bounds = world.scene.robot.bounds().within(scenario.limits)
+        numbers, count = world.scene.obstacle_of, len(world.scene.obstacles)
+        self._geometries = [np.flatnonzero(numbers == number).tolist() for number in range(count)]
+        self._numbers = {obstacle.name: number for number, obstacle in enumerate(world.scene.obstacles)}
+
+    def placements(self, obstacles: Mapping[str, Sample]) -> Iterator[tuple[int, pin.SE3]]:
+        """Yield the geometries of obstacles, by their numbers, and where they are."""
+        for name, sample in obstacles.items():
+            placement = pin.SE3(sample.rotation, sample.position)
+            yield from ((geometry, placement) for geometry in self._geometries[self._numbers[name]])
+
+    def targets_after_step(self, targets: Mapping[str, Sample], poses: Iterable[Array]) -> list[Array]:
+        """Return the pose (4, 4) that each task asks of its frame after a step, from its pose (4, 4) now."""
+        return [
+            target_after_step(task, targets[task.settings.label], pose, self.dt)
+            for task, pose in zip(self.frame_tasks, poses, strict=True)
+        ]
 
 
 def frame_tasks(case: Case, world: World, library: str) -> list[FrameTask]:
@@ -44,29 +77,14 @@ def movable_pairs(scene: Scene) -> IntArray:
     return np.asarray(scene.pairs[np.any(scene.support != 0.0, axis=1)], dtype=np.intp)
 
 
-def obstacle_geometries(scene: Scene) -> dict[str, list[int]]:
-    """Return the geometries of each obstacle, by its name."""
-    return {
-        obstacle.name: np.flatnonzero(scene.obstacle_of == number).tolist()
-        for number, obstacle in enumerate(scene.obstacles)
-    }
-
-
-def surface_distances(avoidance: Avoidance) -> tuple[float, float]:
-    """Return d1 and d2 between surfaces [m]."""
-    return avoidance.d1 - avoidance.offset, avoidance.d2 - avoidance.offset
-
-
 def task_costs(task: FrameTask) -> tuple[float, float]:
     """Return factors of a task's position and orientation errors.
 
     They are the roots of the weights, 0 for an error that does not count.
     """
     settings = task.settings
-    return (
-        math.sqrt(settings.weight) if task.moves else 0.0,
-        math.sqrt(settings.orientation_weight) if task.turns else 0.0,
-    )
+    weights = settings.weight if task.moves else 0.0, settings.orientation_weight if task.turns else 0.0
+    return math.sqrt(weights[0]), math.sqrt(weights[1])
 
 
 def target_after_step(task: FrameTask, target: Sample, pose: Array, dt: float) -> Array:

@@ -15,22 +15,13 @@ from pink.tasks import FrameTask
 from qpavoid.model.trajectory import Sample
 from qpavoid.problem import Array, Solution
 from qpavoid_bench.arena.case import Case
-from qpavoid_bench.arena.libraries.common import (
-    frame_tasks,
-    movable_pairs,
-    obstacle_geometries,
-    surface_distances,
-    target_after_step,
-    task_costs,
-)
+from qpavoid_bench.arena.libraries.common import Adapter, task_costs
 from qpavoid_bench.arena.libraries.settings import PINK
 from qpavoid_bench.arena.world import World
 
 
-class Pilot:
+class Pilot(Adapter):
     """Pink's solver for one case; obstacles are geometries that no joint moves.
-
-    Their placements are set at every step.
 
     The barrier knows no motion of obstacles, and keeps its rows for as long as q stays the same to `np.allclose`:
     a robot at rest does not see what comes. It is used as it is.
@@ -44,36 +35,24 @@ class Pilot:
         Raises:
             ConfigError: the case has something that it cannot be given.
         """
-        scenario, scene = case.scenario, world.scene
-        self._frame_tasks = frame_tasks(case, world, "Pink")
-        self._dt, self._geometries = scenario.dt, obstacle_geometries(scene)
-        self._damping = (PINK["cost"] * scenario.tracking_damping) ** 2
-        model, geometry = scene.robot.model.copy(), pin.GeometryModel(scene.geometry)
+        super().__init__(case, world, "Pink")
+        self._damping = (PINK["cost"] * self.tracking_damping) ** 2
+        model, geometry = world.scene.robot.model.copy(), pin.GeometryModel(world.scene.geometry)
         geometry.removeAllCollisionPairs()
-        pairs = movable_pairs(scene).tolist()
-        for a, b in pairs:
+        for a, b in self.pairs.tolist():
             geometry.addCollisionPair(pin.CollisionPair(a, b))
         self.configuration = pink.Configuration(model, model.createData(), world.q0, collision_model=geometry)
-        self._tasks = []
-        for task in self._frame_tasks:
-            position, orientation = task_costs(task)
-            frame = scene.robot.model.frames[task.frame_id].name
-            self._tasks.append(FrameTask(frame, PINK["cost"] * position, PINK["cost"] * orientation))
-        bounds = scene.robot.bounds().within(scenario.limits)
-        self._limits: list[Any] = [ConfigurationLimit(model), VelocityLimit(model, bounds.velocity)]
-        self._accelerations = None
-        if np.isfinite(bounds.acceleration).any():  # with no such joint, Pink's own limit cannot be made
-            self._accelerations = AccelerationLimit(model, bounds.acceleration)
-            self._limits.append(self._accelerations)
+        self._tasks = [
+            FrameTask(model.frames[task.frame_id].name, *(PINK["cost"] * cost for cost in task_costs(task)))
+            for task in self.frame_tasks
+        ]
+        self._limits: list[Any] = [ConfigurationLimit(model), VelocityLimit(model, self.bounds.velocity)]
+        if np.isfinite(self.bounds.acceleration).any():  # with no such joint, Pink's own limit cannot be made
+            self._limits.append(AccelerationLimit(model, self.bounds.acceleration))
         self._barriers = []
-        if pairs:
-            barrier = SelfCollisionBarrier(
-                min(PINK["n_collision_pairs"], len(pairs)),
-                gain=PINK["gain"],
-                safe_displacement_gain=PINK["safe_displacement_gain"],
-                d_min=surface_distances(scenario.avoidance)[0],
-            )
-            self._barriers = [barrier]
+        if len(self.pairs):
+            count, gains = min(PINK["n_collision_pairs"], len(self.pairs)), ("gain", "safe_displacement_gain")
+            self._barriers.append(SelfCollisionBarrier(count, d_min=self.d1, **{name: PINK[name] for name in gains}))
 
     def step(self, q: Array, t: float, targets: Mapping[str, Sample], obstacles: Mapping[str, Sample]) -> Solution:
         """Compute the velocity for the next control period.
@@ -81,29 +60,21 @@ class Pilot:
         Raises:
             NoSolutionFound, NotWithinConfigurationLimits: by Pink; the robot is held then.
         """
-        configuration, bodies = self.configuration, self.configuration.collision_model.geometryObjects
-        for name, sample in obstacles.items():
-            for piece in self._geometries[name]:
-                bodies[piece].placement = pin.SE3(sample.rotation, sample.position)
+        configuration = self.configuration
+        for geometry, placement in self.placements(obstacles):
+            configuration.collision_model.geometryObjects[geometry].placement = placement
         configuration.update(q)
-        for task, task_config in zip(self._tasks, self._frame_tasks, strict=True):
-            pose = configuration.get_transform_frame_to_world(task.frame).homogeneous
-            target = targets[task_config.settings.label]
-            task.set_target(pin.SE3(target_after_step(task_config, target, pose, self._dt)))
-        v = np.zeros(configuration.model.nv)
+        for task, pose in zip(self._tasks, self.targets_after_step(targets, self.frames()), strict=True):
+            task.set_target(pin.SE3(pose))
+        v, options = np.zeros(configuration.model.nv), {"solver": PINK["solver"], "damping": self._damping}
         try:
             v = pink.solve_ik(
-                configuration,
-                self._tasks,
-                self._dt,
-                solver=PINK["solver"],
-                damping=self._damping,
-                limits=self._limits,
-                barriers=self._barriers,
+                configuration, self._tasks, self.dt, limits=self._limits, barriers=self._barriers, **options
             )
         finally:
-            if self._accelerations is not None:
-                self._accelerations.set_last_integration(v, self._dt)
+            for limit in self._limits:
+                if isinstance(limit, AccelerationLimit):
+                    limit.set_last_integration(v, self.dt)
         return Solution(np.asarray(v))
 
     def frames(self) -> Array:

@@ -18,20 +18,11 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from qpavoid.config import Limits
-from qpavoid.control.tasks import FrameTask
 from qpavoid.errors import ConfigError
-from qpavoid.model.scene import Scene
 from qpavoid.model.trajectory import Sample
 from qpavoid.problem import Array, Solution
 from qpavoid_bench.arena.case import Case
-from qpavoid_bench.arena.libraries.common import (
-    frame_tasks,
-    movable_pairs,
-    obstacle_geometries,
-    surface_distances,
-    target_after_step,
-)
+from qpavoid_bench.arena.libraries.common import Adapter
 from qpavoid_bench.arena.libraries.settings import PLACO, PLACO_PYTHON
 from qpavoid_bench.arena.mujoco_model import hinge_or_slide
 from qpavoid_bench.arena.world import World
@@ -45,7 +36,7 @@ _NO_LIMIT = 1e6
 """Value in the URDF of a limit that a joint does not have [rad, m or their rates]."""
 
 
-class Pilot:
+class Pilot(Adapter):
     """placo's solver for one case; obstacles are bodies that no joint moves.
 
     Its constraint knows no motion of obstacles.
@@ -60,20 +51,20 @@ class Pilot:
         Raises:
             ConfigError: the case has something that it cannot be given, or the interpreter has no placo.
         """
-        scenario, scene = case.scenario, world.scene
-        self._frame_tasks = frame_tasks(case, world, "placo")
-        self._dt, self._geometries = scenario.dt, obstacle_geometries(scene)
-        margin, trigger = surface_distances(scenario.avoidance)
+        super().__init__(case, world, "placo")
         setup = {
-            "urdf": write_urdf(scene, self._frame_tasks, scenario.limits),
-            "joints": list(scene.robot.model.names)[1:],
-            "bodies": describe_bodies(scene, str(scenario.source)),
-            "pairs": movable_pairs(scene).tolist(),
-            "tasks": [_describe_task(task) for task in self._frame_tasks],
-            "dt": scenario.dt,
-            "regularization": scenario.tracking_damping**2,
-            "margin": margin,
-            "trigger": trigger,
+            "urdf": self._write_urdf(),
+            "joints": list(world.scene.robot.model.names)[1:],
+            "bodies": [self._describe_body(body) for body in world.scene.geometry.geometryObjects],
+            "pairs": self.pairs.tolist(),
+            "tasks": [
+                (task.moves, task.turns, task.settings.weight, task.settings.orientation_weight)
+                for task in self.frame_tasks
+            ],
+            "dt": self.dt,
+            "regularization": self.tracking_damping**2,
+            "margin": self.d1,
+            "trigger": self.d2,
             "priority": PLACO["priority"],
         }
         self.worker = Worker(os.environ.get(PLACO_PYTHON) or sys.executable)
@@ -85,7 +76,7 @@ class Pilot:
                 "environment with placo"
             ) from error
         except RuntimeError as error:
-            raise ConfigError(f"{scenario.source}: placo cannot be set up: {error}") from error
+            raise ConfigError(f"{self.source}: placo cannot be set up: {error}") from error
 
     def step(self, q: Array, t: float, targets: Mapping[str, Sample], obstacles: Mapping[str, Sample]) -> Solution:
         """Compute the velocity for the next control period.
@@ -93,40 +84,84 @@ class Pilot:
         Raises:
             RuntimeError: placo found none, or its process has ended; the robot is held then.
         """
-        begin, self.seconds = perf_counter(), 0.0
+        begin = perf_counter()
         try:
-            poses, place_time = self.worker.ask(
-                "place", {"q": q, "bodies": self._obstacle_poses(obstacles)}, STEP_TIMEOUT
-            )
-            pose = perf_counter()
-            there = [
-                target_after_step(task, targets[task.settings.label], pose, self._dt)
-                for task, pose in zip(self._frame_tasks, poses, strict=True)
-            ]
-            pose = perf_counter() - pose
+            poses, place_time = self._place(q, obstacles)
+            placed = perf_counter()
+            there = self.targets_after_step(targets, poses)
+            target_time = perf_counter() - placed
             v, solve_time = self.worker.ask("solve", there, STEP_TIMEOUT)
         except Exception:
             self.seconds = perf_counter() - begin
             raise
-        self.seconds = place_time + pose + solve_time
+        self.seconds = place_time + target_time + solve_time
         return Solution(np.asarray(v))
-
-    def _obstacle_poses(self, obstacles: Mapping[str, Sample]) -> dict[int, Array]:
-        """Return the pose (4, 4) of each geometry of the obstacles, by its number."""
-        return {
-            piece: pin.SE3(sample.rotation, sample.position).homogeneous
-            for name, sample in obstacles.items()
-            for piece in self._geometries[name]
-        }
 
     def frames(self, q: Array, obstacles: Mapping[str, Sample]) -> Array:
         """Return the poses (f, 4, 4) of the tasks' frames by placo."""
-        poses, _ = self.worker.ask("place", {"q": q, "bodies": self._obstacle_poses(obstacles)}, STEP_TIMEOUT)
-        return np.asarray(poses)
+        return np.asarray(self._place(q, obstacles)[0])
 
     def distances(self) -> Array:
         """Return the distances (k,) of the pairs by placo [m]."""
         return np.asarray(self.worker.ask("distances", None, STEP_TIMEOUT)[0])
+
+    def _place(self, q: Array, obstacles: Mapping[str, Sample]) -> tuple[Any, float]:
+        bodies = {geometry: placement.homogeneous for geometry, placement in self.placements(obstacles)}
+        return self.worker.ask("place", {"q": q, "bodies": bodies}, STEP_TIMEOUT)
+
+    def _describe_body(self, body: Any) -> tuple[int, str, Any, Array]:
+        """Return joint, shape, sizes and placement (4, 4) of a geometry.
+
+        Raises:
+            ConfigError: a shape that cannot be described.
+        """
+        kind: str = type(body.geometry).__name__
+        sizes: Any
+        match body.geometry:
+            case coal.Sphere() as shape:
+                sizes = (shape.radius,)
+            case coal.Capsule() | coal.Cylinder() | coal.Cone() as shape:
+                sizes = (shape.radius, 2.0 * shape.halfLength)
+            case coal.Box() as shape:
+                sizes = tuple((2.0 * shape.halfSide).tolist())
+            case coal.Ellipsoid() as shape:
+                sizes = tuple(shape.radii.tolist())
+            case coal.Halfspace() as shape:
+                sizes = (np.array(shape.n), shape.d)
+            case coal.ConvexBase() as shape:
+                kind, sizes = "Convex", np.array(shape.points())
+            case _:
+                raise ConfigError(f"{self.source}: {body.name!r}: the adapter of placo knows no {kind}")
+        return int(body.parentJoint), kind, sizes, np.array(body.placement.homogeneous)
+
+    def _write_urdf(self) -> str:
+        """Write joints of the robot and frames of its tasks as URDF, without geometry.
+
+        It has one link a joint, and one on a fixed joint a frame.
+        """
+        model, bounds = self.scene.robot.model, self.bounds
+        limits = np.clip(np.stack((bounds.lower, bounds.upper), axis=1), -_NO_LIMIT, _NO_LIMIT).tolist()
+        ranges = dict(zip(bounds.q_index.tolist(), limits, strict=True))
+        lines = ['<robot name="robot">', *(f'<link name="link {joint}"/>' for joint in range(model.njoints))]
+        for index in range(1, model.njoints):
+            joint = model.joints[index]
+            slides, axis = hinge_or_slide(model, index)
+            low, high = ranges.get(joint.idx_q, (-_NO_LIMIT, _NO_LIMIT))
+            lines.append(
+                f'<joint name="{model.names[index]}" type="{"prismatic" if slides else "revolute"}">'
+                f'<parent link="link {model.parents[index]}"/><child link="link {index}"/>'
+                f'{_origin(model.jointPlacements[index])}<axis xyz="{_numbers(axis)}"/>'
+                f'<limit lower="{low!r}" upper="{high!r}" effort="1" '
+                f'velocity="{min(float(bounds.velocity[joint.idx_v]), _NO_LIMIT)!r}"/></joint>'
+            )
+        for number, task in enumerate(self.frame_tasks):
+            frame = model.frames[task.frame_id]
+            lines.append(
+                f'<link name="frame {number}"/><joint name="to frame {number}" type="fixed">'
+                f'<parent link="link {frame.parentJoint}"/><child link="frame {number}"/>'
+                f"{_origin(frame.placement)}</joint>"
+            )
+        return "\n".join([*lines, "</robot>"])
 
 
 class WorkerEnded(RuntimeError):
@@ -184,74 +219,6 @@ def _close(process: subprocess.Popen[bytes], connection: Connection) -> None:
     connection.close()
     process.kill()
     process.wait()
-
-
-def _describe_task(task: FrameTask) -> tuple[bool, bool, float, float]:
-    return task.moves, task.turns, task.settings.weight, task.settings.orientation_weight
-
-
-def describe_bodies(scene: Scene, source: str) -> list[tuple[int, str, Any, Array]]:
-    """Return joint, shape, sizes and placement (4, 4) of each geometry.
-
-    Raises:
-        ConfigError: a shape that cannot be described.
-    """
-    bodies = []
-    for body in scene.geometry.geometryObjects:
-        kind, sizes = _shape(body, source)
-        bodies.append((int(body.parentJoint), kind, sizes, np.array(body.placement.homogeneous)))
-    return bodies
-
-
-def _shape(body: Any, source: str) -> tuple[str, Any]:
-    match body.geometry:
-        case coal.Sphere() as shape:
-            return "Sphere", (shape.radius,)
-        case coal.Capsule() | coal.Cylinder() | coal.Cone() as shape:
-            return type(shape).__name__, (shape.radius, 2.0 * shape.halfLength)
-        case coal.Box() as shape:
-            return "Box", tuple((2.0 * shape.halfSide).tolist())
-        case coal.Ellipsoid() as shape:
-            return "Ellipsoid", tuple(shape.radii.tolist())
-        case coal.Halfspace() as shape:
-            return "Halfspace", (np.array(shape.n), shape.d)
-        case coal.ConvexBase() as shape:
-            return "Convex", np.array(shape.points())
-        case shape:
-            raise ConfigError(f"{source}: {body.name!r}: the adapter of placo knows no {type(shape).__name__}")
-
-
-def write_urdf(scene: Scene, tasks: list[FrameTask], limits: Limits) -> str:
-    """Write joints of a robot and frames of its tasks as URDF, without geometry.
-
-    It has one link a joint, and one on a fixed joint a frame.
-    """
-    model, bounds = scene.robot.model, scene.robot.bounds().within(limits)
-    ranges = dict(zip(bounds.q_index.tolist(), np.stack((bounds.lower, bounds.upper), axis=1).tolist(), strict=True))
-    lines = ['<robot name="robot">', *(f'<link name="link {joint}"/>' for joint in range(model.njoints))]
-    for index in range(1, model.njoints):
-        joint = model.joints[index]
-        slides, axis = hinge_or_slide(model, index)
-        low, high = ranges.get(joint.idx_q, (-_NO_LIMIT, _NO_LIMIT))
-        lines.append(
-            f'<joint name="{model.names[index]}" type="{"prismatic" if slides else "revolute"}">'
-            f'<parent link="link {model.parents[index]}"/><child link="link {index}"/>'
-            f'{_origin(model.jointPlacements[index])}<axis xyz="{_numbers(axis)}"/>'
-            f'<limit lower="{_finite_limit(low)!r}" upper="{_finite_limit(high)!r}" '
-            f'velocity="{_finite_limit(bounds.velocity[joint.idx_v])!r}" effort="1"/></joint>'
-        )
-    for number, task in enumerate(tasks):
-        frame = model.frames[task.frame_id]
-        lines.append(
-            f'<link name="frame {number}"/><joint name="to frame {number}" type="fixed">'
-            f'<parent link="link {frame.parentJoint}"/><child link="frame {number}"/>'
-            f"{_origin(frame.placement)}</joint>"
-        )
-    return "\n".join([*lines, "</robot>"])
-
-
-def _finite_limit(limit: float) -> float:
-    return float(np.clip(limit, -_NO_LIMIT, _NO_LIMIT))
 
 
 def _origin(placement: Any) -> str:
