@@ -601,4 +601,5 @@ def test_every_robot_is_read_or_does_not_move(path):
     except ConfigError as error:
         assert "no joint of" in str(error)
     else:
-        assert np.isfinite(robot.bounds().velocity).all() and robot.bodies.ngeoms > 0
+        assert np.isfinite(robot.bounds().velocity).all()
+        assert robot.bodies.ngeoms > 0 or "<geometry" not in path.read_text()
