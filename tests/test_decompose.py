@@ -13,7 +13,7 @@ def indexed(triangles):
     return vertices, index.reshape(-1, 3)
 
 
-def torus(around=16, across=8, big=0.3, small=0.06):
+def torus(around=24, across=6, big=0.3, small=0.06):
     a, b = np.meshgrid(np.linspace(0, 2 * np.pi, around + 1), np.linspace(0, 2 * np.pi, across + 1), indexing="ij")
     r = big + small * np.cos(b)
     grid = np.stack((r * np.cos(a), r * np.sin(a), small * np.sin(b)), axis=-1)
