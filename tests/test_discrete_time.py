@@ -1,12 +1,11 @@
 """Distances between control steps: thin plates, long periods, full speed."""
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from closed_loop import Ruler, cartesian, drive, make_controller, scenario
-from conftest import moved
+from conftest import Bench, moved
 
-from qpavoid import Avoidance, Controller, Obstacle, ReasonKind, Sample, Severity, Status
+from qpavoid import Avoidance, Controller, Obstacle, ReasonKind, Sample, Severity, Status, build_scene
 from qpavoid.config import Box, Damper, Sphere
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.run.simulate import simulate
@@ -26,7 +25,9 @@ def min_distance(log, controller, steps=10):
 
 @pytest.mark.parametrize("row", ["beta", "task-switching", "damper"])
 @pytest.mark.parametrize("shape", [PLATE, BALL, BOX], ids=["plate", "ball", "box"])
-@pytest.mark.parametrize(("dt", "duration"), [(0.001, 0.8), (0.01, 2.0), (0.02, 2.0), (0.05, 3.0)])
+@pytest.mark.parametrize(
+    ("dt", "duration"), [(0.01, 2.0), (0.05, 3.0), pytest.param(0.001, 0.8, marks=pytest.mark.slow)]
+)
 def test_safety_distance_is_kept_at_any_period_and_speed(row, shape, dt, duration):
     """A target that leaves at 2 m/s leads through the obstacle: the Panda comes at its joints' full speed."""
     run = scenario(
@@ -50,8 +51,8 @@ def test_safety_distance_is_kept_at_any_period_and_speed(row, shape, dt, duratio
     assert (change <= dt * bounds.acceleration + 1e-9).all()
 
 
-@pytest.mark.parametrize("dt", [0.001, 0.005, 0.01, 0.02, 0.05])
-@pytest.mark.parametrize("speed", [0.5, 2.0, 10.0])
+@pytest.mark.parametrize("dt", [0.005, 0.01, 0.05])
+@pytest.mark.parametrize("speed", [0.5, 10.0])
 def test_plate_is_never_tunnelled_through(tmp_path, dt, speed):
     """2 mm of plate, up to 0.5 m per control step, without an acceleration limit and in range from 0.1 m on."""
     robot = cartesian(tmp_path, speed=speed, acceleration=None)
@@ -63,31 +64,23 @@ def test_plate_is_never_tunnelled_through(tmp_path, dt, speed):
     assert after > 0.8
 
 
-def min_margin(controller, q, v, horizon, samples):
-    """Least of distance - safety distance of all pairs along v, with moving obstacles."""
-    ruler = Ruler(controller.scene)
-    found = []
-    for s in np.linspace(0.0, horizon, 12):
-        there = {i: x._replace(position=x.position + s * x.linear) for i, x in samples.items()}
-        found.append(ruler.distances(pin.integrate(controller.scene.robot.model, q, s * v), there).min())
-    return min(found) - SAFE
-
-
 def test_clearance_lower_bound_holds_with_moving_obstacles(panda):
     rng, bounds = np.random.default_rng(0), panda.bounds()
-    balls = [Obstacle.at(f"ball{i}", Sphere(radius=0.08), [9.0, 0.0, 0.0]) for i in range(4)]
-    controller = make_controller(panda, balls)
-    close = 0
-    for _ in range(400):
+    scene = build_scene(panda, [Obstacle.at(f"ball{i}", Sphere(radius=0.08), [9.0, 0.0, 0.0]) for i in range(4)])
+    bench, ruler, close = Bench(scene, avoidance=Avoidance(d1=SAFE, d2=0.1)), Ruler(scene), 0
+    for _ in range(150):
         q, v = rng.uniform(bounds.lower, bounds.upper), rng.uniform(-1.0, 1.0, 7) * bounds.velocity
-        horizon = rng.uniform(0.005, 0.3)
-        places = {b.name: Sample.at(rng.uniform(-0.8, 0.8, 3), linear=rng.uniform(-0.5, 0.5, 3)) for b in balls}
-        near = len(controller.tick(q, 0.0, None, places).proximity.pair)
-        bound = controller._builder.rows.clearance_lower_bound(v, near, horizon)
-        least = min_margin(controller, q, v, horizon, dict(enumerate(places.values())))
-        assert least >= bound - 1e-9
+        horizon, found = rng.uniform(0.005, 0.3), []
+        places = [Sample.at(rng.uniform(-0.8, 0.8, 3), linear=rng.uniform(-0.5, 0.5, 3)) for _ in range(4)]
+        bench.place(dict(enumerate(places)))
+        near = len(bench.compute(q, reach=0.1)[0].pair)
+        bound = bench.assembler.clearance_lower_bound(v, near, horizon)
+        for s in np.linspace(0.0, horizon, 12):
+            there = {i: x._replace(position=x.position + s * x.linear) for i, x in enumerate(places)}
+            found.append(ruler.distances(q + s * v, there).min())
+        assert min(found) - SAFE >= bound - 1e-9
         close += bound > 0.0
-    assert close > 3
+    assert close > 1
 
 
 def braking(q, v, step, dt):

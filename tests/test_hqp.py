@@ -6,11 +6,10 @@ import pytest
 import qpsolvers
 from conftest import SPHERE, obstacle
 
-from qpavoid import Controller, ReasonKind, Sample, Severity, build_scene, build_tasks, config, load_scenario
+from qpavoid import Controller, ReasonKind, Severity, build_scene, build_tasks, config
 from qpavoid.config import HqpSolver
 from qpavoid.problem import AvoidanceRows, Status, Tracking, make_problem
-from qpavoid.run.simulate import simulate
-from qpavoid.solvers import backend_names, make_solver, parse_solver
+from qpavoid.solvers import backend_names, make_solver
 from qpavoid.solvers.backends import solve_daqp
 from qpavoid.solvers.hqp import Hqp
 
@@ -41,7 +40,7 @@ def costs(problem, v):
     return np.array([np.linalg.norm(A[rows] @ v - b[rows]) for rows in problem.levels])
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(4))
 def test_hqp_without_active_rows_is_the_null_space_cascade(seed):
     """v += (A_p N)⁺ (b_p - A_p v), N the projector on what levels before leave free (Siciliano and Slotine 1991)."""
     problem = random_problem(seed, bound=1e3)
@@ -92,21 +91,6 @@ def test_hqp_with_active_rows_and_bounds_is_the_lexicographic_optimum(backend):
         binding += found[0] > 1e-3
         later += found[2] > 1e-3
     assert binding >= 3 and later >= 6
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_a_weighted_qp_converges_to_the_hqp(seed):
-    problem = random_problem(seed, bound=0.8, k=3)
-    best = costs(problem, Hqp(HqpSolver(regularization=SMALL)).solve(problem).v)
-    far = []
-    for ratio in (1e1, 1e2, 1e3):
-        weight = np.concatenate([np.full(len(rows), ratio**-p) for p, rows in enumerate(problem.levels)])
-        A, b = problem.tracking.A * weight[:, None] ** 0.5, problem.tracking.b * weight**0.5
-        rows = problem.avoidance
-        P = A.T @ A + SMALL * np.eye(NV)
-        v = solve_daqp(P, -A.T @ b, rows.J, rows.b, problem.lower, problem.upper)
-        far.append(np.abs(costs(problem, v) - best)[:2].max())
-    assert far[2] < max(0.1 * far[0], 1e-4)
 
 
 def test_later_levels_keep_the_optimum_of_earlier_ones():
@@ -193,18 +177,6 @@ def panda_controller(panda, solver, tool=1, posture=2, **settings):
     return Controller(build_scene(panda, [ball]), build_tasks(tasks, panda, panda.home), solver, dt=0.01, **settings)
 
 
-def test_a_posture_of_equal_weight_takes_nothing_from_the_tool(panda):
-    """The posture wants the elbow elsewhere; with `qp` the tool pays for it, with `hqp` it does not."""
-    errors = {}
-    for solver in ("qp", "hqp"):
-        controller, q = panda_controller(panda, solver, tracking_damping=1e-3), panda.home
-        for _ in range(300):
-            q = pin.integrate(panda.model, q, 0.01 * controller.step(q).v)
-        tick = controller.tick(q)
-        errors[solver] = np.linalg.norm(tick.targets[0].position - tick.kinematics.position[0])
-    assert errors["hqp"] < 1e-4 < 0.02 < errors["qp"]
-
-
 @pytest.mark.parametrize("order", [(1, 2), (2, 1)])
 def test_the_order_of_priorities_is_that_of_the_file(panda, order):
     controller = panda_controller(panda, "hqp", *order, tracking_damping=0.0)
@@ -216,31 +188,3 @@ def test_the_order_of_priorities_is_that_of_the_file(panda, order):
     A, b, _ = problem.tracking
     first = problem.levels[0]
     np.testing.assert_allclose(A[first] @ v, b[first], atol=1e-6)
-
-
-def test_hqp_keeps_clear_and_arrives(panda):
-    controller, q = panda_controller(panda, "hqp"), panda.home
-    goal = Sample.at([0.55, 0.38, 0.45])
-    worst = np.inf
-    for _ in range(500):
-        tick = controller.tick(q, targets={"panda_hand_tcp": goal})
-        assert tick.solution.status is not Status.STOPPED
-        worst = min(worst, float(np.min(tick.proximity.distance, initial=np.inf)))
-        q = pin.integrate(panda.model, q, 0.01 * tick.solution.v)
-    assert worst > controller.avoidance.d1 - 1e-3
-    assert np.linalg.norm(tick.kinematics.position[0] - goal.position) < 0.01
-
-
-def test_a_safe_command_comes_back_bit_for_bit(panda):
-    controller = panda_controller(panda, "hqp")
-    wish = 0.01 * np.arange(7.0)
-    np.testing.assert_array_equal(controller.filter(panda.home, wish).v, wish)
-
-
-def test_hqp_is_selected_by_file_and_command_line():
-    assert isinstance(make_solver("hqp"), Hqp)
-    assert parse_solver("hqp:proxqp").label == "hqp:proxqp"
-    assert load_scenario("panda_line", solver="hqp").solver == HqpSolver()
-    assert load_scenario("panda_line", ["solver={name: hqp, regularization: 1.0e-4}"]).solver.regularization == 1e-4
-    log = simulate(load_scenario("panda_line", ["duration=1.0"], solver="hqp"))
-    assert log.meta["solver"] == "hqp" and not log.metrics()["collided"]

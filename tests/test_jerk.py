@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from test_limits import Axes, random_joints
 
 from qpavoid import kernels
-from qpavoid.kernels.braking_bounds import max_stopping_distance, stopping_distance
+from qpavoid.kernels.braking_bounds import stopping_distance
 from qpavoid.model.limits import JointBounds, limit_layout
 
 SAFE = 0.02
@@ -77,30 +77,6 @@ def test_way_to_stop_agrees_with_the_stop_step_by_step(state):
     assert found == pytest.approx(expected, rel=1e-9, abs=1e-9)
 
 
-@many
-@given(moving(), st.floats(0.0, 2.0))
-def test_way_to_stop_is_monotone_and_convex_in_the_change(state, more):
-    v, w, most = state
-    (low, slope), (middle, _), (high, _) = (
-        stopping_distance(v + s * more, w + s * more, most) for s in (0.0, 0.5, 1.0)
-    )
-    scale = max(high, 1.0)
-    assert low <= middle + 1e-12 * scale <= high + 2e-12 * scale
-    assert middle <= 0.5 * (low + high) + 1e-9 * scale
-    assert high >= low + more * slope - 1e-9 * scale  # the derivative of a convex function
-    assert high <= max_stopping_distance(v + more, w + more, most) * (1.0 + 1e-12) + 1e-12
-
-
-@many
-@given(moving(), st.floats(0.0, 3.0))
-def test_stops_preserve_the_order_of_speeds(state, more):
-    v, w, most = state
-    slower, faster = stop_speeds(v, w, most), stop_speeds(v + more, min(w + more, most), most)
-    size = max(len(slower), len(faster))
-    slower, faster = (np.pad(a, (0, size - len(a))) for a in (slower, faster))
-    assert (slower <= faster + 1e-9).all()
-
-
 # --- bounds ------------------------------------------------------------------------------------------------------
 
 
@@ -125,7 +101,7 @@ def stops_within(joints, i, q, v, w, dt, slack):
     return inside and (np.abs(speeds) <= joints.velocity[i] + slack).all()
 
 
-@pytest.mark.parametrize("dt", [0.001, 0.01, 0.05])
+@pytest.mark.parametrize("dt", [0.01, *(pytest.param(dt, marks=pytest.mark.slow) for dt in (0.001, 0.05))])
 def test_bounds_keep_all_limits_in_a_hundred_thousand_steps(dt):
     """400 joints, 300 steps each, driven into their limits, to and fro, or at random."""
     rng = np.random.default_rng(1)
@@ -148,7 +124,7 @@ def test_bounds_keep_all_limits_in_a_hundred_thousand_steps(dt):
     assert reached.mean() > 0.05  # pushed up to a limit, and no farther
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_bounds_are_the_largest_speeds_with_a_stop_in_time(seed):
     """Where neither the jerk nor the acceleration limits the bound; from all kinds of viable states."""
     rng, dt, checked = np.random.default_rng(seed), 0.01, 0
@@ -167,22 +143,6 @@ def test_bounds_are_the_largest_speeds_with_a_stop_in_time(seed):
                 checked, beyond = checked + 1, bound[i] + away * 1e-3 * unit[i]
                 assert not stops_within(joints, i, q[i], beyond, beyond - v[i], dt, 0.0)
     assert checked > 10
-
-
-def test_wide_jerk_limits_change_no_bounds():
-    """Nor do they for a coordinate without one beside one with one."""
-    rng, dt = np.random.default_rng(0), 0.01
-    joints, q = random_joints(rng, 500)
-    free = np.full(500, np.inf)
-    loose = replace(joints, jerk=np.where(rng.random(500) < 0.5, np.inf, 1e6 * joints.acceleration / dt))
-    one, other = Axes(replace(joints, jerk=free), 0.5, dt), Axes(loose, 0.5, dt)
-    v, w = np.zeros(500), np.zeros(500)
-    for _ in range(40):
-        lower, upper = bounds_after(one, q, v, 0.0 * w)
-        found = bounds_after(other, q, v, w)
-        np.testing.assert_allclose(found, (lower, upper), rtol=1e-6, atol=1e-6)
-        v_next = found[0] + rng.random(500) * (found[1] - found[0])
-        w, v, q = v_next - v, v_next, q + dt * v_next
 
 
 def test_bounds_relax_jerk_then_acceleration_from_states_without_a_stop():
@@ -255,7 +215,7 @@ def stops(x, q, v, w):
     return np.array(path)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_stop_ends_at_rest_within_all_limits(seed):
     """At most twice as late as the slowest coordinate could alone."""
     x, rng = limited(seed)
@@ -269,7 +229,7 @@ def test_stop_ends_at_rest_within_all_limits(seed):
     assert len(path) <= 2 * max(alone) + 1
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_stop_from_constant_speed_is_uniform_and_of_least_time(seed):
     x, rng = limited(seed)
     v = rng.uniform(-2.0, 2.0, 7)
@@ -281,7 +241,7 @@ def test_stop_from_constant_speed_is_uniform_and_of_least_time(seed):
 
 
 @pytest.mark.parametrize("place", [0.0, 8.9])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_stop_way_agrees_with_the_stop_step_by_step(seed, place):
     """In free space, and where position limits bend it."""
     x, rng = limited(seed)

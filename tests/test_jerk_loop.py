@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from closed_loop import Ruler, cartesian, changed, drive, make_controller, scenario
+from closed_loop import Ruler, cartesian, drive, make_controller, scenario
 from conftest import Bench
 
 from qpavoid import Avoidance, ConfigError, Controller, Limits, Obstacle, ReasonKind, Robot, Sample, Status, build_scene
-from qpavoid.config import Box, Damper, Sphere
+from qpavoid.config import Box, Sphere
 from qpavoid.run.simulate import simulate
 from qpavoid.solvers.relaxation import relaxed_solution
 
@@ -28,7 +28,9 @@ def within_limits(controller, vs, slack=1e-9):
 
 @pytest.mark.parametrize("row", ["beta", "task-switching", "damper"])
 @pytest.mark.parametrize("size", [[0.004, 0.6, 0.6], [0.2, 0.2, 0.2]], ids=["plate", "box"])
-@pytest.mark.parametrize(("dt", "duration"), [(0.002, 0.8), (0.01, 1.5), (0.05, 3.0)])
+@pytest.mark.parametrize(
+    ("dt", "duration"), [(0.01, 1.5), (0.05, 3.0), pytest.param(0.002, 0.8, marks=pytest.mark.slow)]
+)
 def test_safety_distance_is_kept_at_any_period_and_speed(row, size, dt, duration):
     """As without jerk limits, with ones of about 10 times the accelerations a second: a target leads through a body."""
     run = scenario(
@@ -51,7 +53,7 @@ def test_safety_distance_is_kept_at_any_period_and_speed(row, size, dt, duration
 
 
 @pytest.mark.parametrize("solver", ["qp", "hqp"])
-@pytest.mark.parametrize(("jerk", "gain"), [(20.0, 2.0), (20.0, 5.0), (10.0, 1.0), (10.0, 2.0)])
+@pytest.mark.parametrize(("jerk", "gain"), [(20.0, 5.0), (10.0, 1.0)])
 def test_target_is_reached_and_the_robot_rests_there(panda, solver, jerk, gain):
     """At 2 rad/s²: the velocity closest to v_tracking in every step would oscillate at up to 0.7 rad/s."""
     slow = replace(panda, acceleration=dict.fromkeys(panda.coordinate_names, 2.0))
@@ -63,31 +65,7 @@ def test_target_is_reached_and_the_robot_rests_there(panda, solver, jerk, gain):
     assert within_limits(controller, np.array([tick.solution.v for tick in ticks])) == pytest.approx(1.0, abs=1e-6)
 
 
-def test_attached_box_passes_a_pole_within_jerk_limits():
-    """At 2 rad/s² and 20 rad/s³, where it would swing through the workspace at 2.6 rad/s."""
-    metrics = simulate(changed("carried_box", limits={"acceleration": 2.0, "jerk": 20.0})).metrics()
-    assert metrics["arrived"] and metrics["peak_velocity"] < 1.0 and metrics["min_distance"] > 0.02 - 1e-3
-
-
-def test_braking_begins_before_rows_are_in_range(tmp_path):
-    """Rows begin 30 mm ahead; at 2 m/s, 4 m/s² and 20 m/s³, braking takes 0.7 m."""
-    robot = cartesian(tmp_path, speed=2.0, acceleration=4.0)
-    wall = Obstacle.at("wall", Box(size=(0.1, 2.0, 2.0)), [2.05, 0.0, 0.0])
-    controller = make_controller(
-        robot, [wall], "z", avoidance=Avoidance(d1=SAFE, d2=0.03, row=Damper(gain=20.0)), task={"gain": 50.0},
-        limits=Limits(jerk=20.0),
-    )  # fmt: skip
-    vs, near = [], []
-    for tick in drive(controller, np.array([-2.0, 0.0, 0.0]), 500, target=[4.0, 0.0, 0.0]):
-        assert tick.solution.status is Status.SOLVED
-        vs.append(tick.solution.v)
-        near.append(1.95 - tick.state.q[0])
-    within_limits(controller, np.array(vs))
-    assert max(v[0] for v in vs) == pytest.approx(2.0)
-    assert min(near) > SAFE - 1e-3 and near[-1] < SAFE + 2e-3
-
-
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_random_targets_among_obstacles_stay_feasible(panda, seed):
     """At up to full speed, half of the targets inside obstacles, with the robot's own accelerations."""
     rng, bounds = np.random.default_rng(seed), panda.bounds()
@@ -125,12 +103,12 @@ def test_clearance_lower_bound_holds_along_stops(panda):
     for _ in range(150):
         q = rng.uniform(bounds.lower + 0.3, bounds.upper - 0.3)
         before, change = rng.uniform(-0.3, 0.3, 7) * bounds.velocity, rng.uniform(-1.0, 1.0, 7) * bounds.acceleration
-        bench.rows.previous.restart(before)
+        bench.assembler.previous.restart(before)
         near = len(bench.compute(q, reach=0.1)[0].pair)
         v = before + 0.01 * change
-        stop = bench.rows.stop(q, v)
+        stop = bench.assembler.stop(q, v)
         velocities = stop.velocities.copy()
-        bound = bench.rows.clearance_lower_bound(v, near, float(stop.equivalent_time.sum()), stop)
+        bound = bench.assembler.clearance_lower_bound(v, near, float(stop.equivalent_time.sum()), stop)
         least = np.inf
         for velocity in velocities:
             least = min(least, ruler.distances(q).min())
@@ -233,9 +211,3 @@ def test_invalid_jerk_limits_name_the_field(tmp_path, limits, said):
     cartesian(tmp_path)
     with pytest.raises(ConfigError, match=said):
         Robot.from_urdf(tmp_path / "cartesian.urdf", bodies="convex", limits=limits)
-
-
-def test_jerk_limit_without_acceleration_names_the_scenario():
-    run = changed("situation1", limits={"jerk": 50.0})
-    with pytest.raises(ConfigError, match=r"situation1.*limits\.jerk: 7 of 7"):
-        Controller.from_scenario(run)

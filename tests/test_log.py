@@ -1,7 +1,7 @@
 """Records of runs: what is written, read back, cut short and run again."""
 
 import json
-from dataclasses import FrozenInstanceError, fields
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -9,7 +9,6 @@ import pytest
 from qpavoid import ConfigError, Controller, Log, ScenarioConfig, Severity, load_scenario
 from qpavoid.run.log import STATUSES
 from qpavoid.run.simulate import simulate
-from qpavoid.solvers.analytic import TrackingOnly
 
 ARRAYS = [f.name for f in fields(Log) if f.name != "meta"]
 SHORT = ("duration=0.2", "tasks.0.motion={type: circle, radius: 0.1, period: 2}")
@@ -63,11 +62,6 @@ def test_saved_and_loaded_log_is_the_same(log, tmp_path):
     assert loaded.metrics() == log.metrics()
 
 
-@pytest.mark.parametrize("name", ["run", "run.npz", "v1.2_qp", "v1.2_qp.npz"])
-def test_file_is_named_as_asked(log, tmp_path, name):
-    assert log.save(tmp_path / name).name == name.removesuffix(".npz") + ".npz"
-
-
 def test_log_versions_and_configuration(log):
     """Log knows what made it."""
     scenario = load_scenario("panda_line", SHORT)
@@ -102,11 +96,6 @@ def test_until_keeps_the_ticks_before(log):
     assert all(np.array_equal(getattr(part, name), getattr(log, name)[:10]) for name in ARRAYS)
     assert part.meta == log.meta
     assert_equal(log.until(99.0), log)
-
-
-def test_fields_cannot_be_exchanged(log):
-    with pytest.raises(FrozenInstanceError):
-        log.t = np.zeros(3)
 
 
 # Runs that end early
@@ -173,76 +162,7 @@ def test_log_of_malformed_state_names_cause(log, monkeypatch, tmp_path):
         np.testing.assert_array_equal(getattr(loaded, name), getattr(blind, name))
 
 
-def test_solver_that_returns_nan_stops_the_robot_and_is_seen(monkeypatch):
-    solve = TrackingOnly.solve
-
-    def fail(self, problem):
-        solution = solve(self, problem)
-        return solution._replace(v=np.full_like(solution.v, np.nan))
-
-    monkeypatch.setattr(TrackingOnly, "solve", fail)
-    log = simulate(load_scenario("situation1", SHORT, "tracking"))
-    assert said(log) == [("SOLVER_FAILED", [], "ALARM")]
-    assert (log.status == STATUSES.index("STOPPED")).all()
-    np.testing.assert_array_equal(log.v, 0.0)
-
-
 # Files that are no logs
-
-
-def write_text(path):
-    path.write_text("not a log")
-
-
-def write_nothing(path):
-    path.write_bytes(b"")
-
-
-def write_array(path):
-    with path.open("wb") as file:
-        np.save(file, np.zeros(3))
-
-
-def write_other_archive(path):
-    np.savez(path, a=np.zeros(3))
-
-
-def write_other_format(path):
-    np.savez(path, meta=np.array(json.dumps({"format": 0})))
-
-
-def write_list_as_meta(path):
-    np.savez(path, meta=np.array("[1, 2]"))
-
-
-def write_broken_meta(path):
-    np.savez(path, meta=np.array("{"))
-
-
-def write_too_little(path):
-    np.savez(path, meta=np.array(json.dumps({"format": 1})), t=np.zeros(3))
-
-
-@pytest.mark.parametrize(
-    "write",
-    [
-        write_text,
-        write_nothing,
-        write_array,
-        write_other_archive,
-        write_other_format,
-        write_list_as_meta,
-        write_broken_meta,
-        write_too_little,
-    ],
-)
-def test_file_that_is_no_log(tmp_path, write):
-    path = tmp_path / "run.npz"
-    write(path)
-    with pytest.raises(ConfigError) as error:
-        Log.load(path)
-    assert str(error.value).startswith(f"{path}: ")
-    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("kept", [0.3, 0.999])
@@ -254,18 +174,22 @@ def test_log_that_was_cut_off_while_copied(log, tmp_path, kept):
         Log.load(path)
 
 
-def test_log_with_damaged_content(log, tmp_path):
-    path = log.save(tmp_path / "run")
-    content = bytearray(path.read_bytes())
-    middle = len(content) // 2
-    content[middle : middle + 200] = bytes(200)
-    path.write_bytes(content)
-    with pytest.raises(ConfigError, match=r"run\.npz"):
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda path: path.write_text("not a log"),
+        lambda path: path.write_bytes(b""),
+        lambda path: np.savez(path, a=np.zeros(3)),
+        lambda path: np.savez(path, meta=np.array(json.dumps({"format": 0}))),
+        lambda path: np.savez(path, meta=np.array("[1, 2]")),
+        lambda path: np.savez(path, meta=np.array("{")),
+        lambda path: None,
+    ],
+    ids=["text", "nothing", "other archive", "other format", "list as meta", "broken meta", "missing"],
+)
+def test_file_that_is_no_log_is_refused_in_one_line(tmp_path, write):
+    path = tmp_path / "run.npz"
+    write(path)
+    with pytest.raises(ConfigError) as error:
         Log.load(path)
-
-
-def test_missing_log(tmp_path):
-    with pytest.raises(ConfigError, match=r"absent\.npz: no such file"):
-        Log.load(tmp_path / "absent.npz")
-    with pytest.raises(ConfigError):
-        Log.load(tmp_path)
+    assert str(error.value).startswith(f"{path}: ") and "\n" not in str(error.value)

@@ -8,11 +8,7 @@ import pytest
 TESTS = Path(__file__).parent
 NAMED_TUPLES = {"_asdict", "_fields", "_make", "_replace"}
 """Public members of named tuples, whose underscore keeps them apart from fields."""
-TO_DO = {
-    "test_back_end_faults.py", "test_backup.py", "test_cache.py", "test_discrete_time.py",
-    "test_hqp.py", "test_jerk_company.py", "test_jerk_loop.py",
-    "test_solvers.py", "test_trajectories.py",
-}  # fmt: skip
+TO_DO: set[str] = set()  # fmt: skip
 """Files that still read private members; a file is taken off once it reads none."""
 
 

@@ -127,15 +127,6 @@ def test_undamped_tracking_is_the_shortest_exact_velocity(seed):
     np.testing.assert_allclose(v, np.linalg.lstsq(tracking.A, tracking.b, rcond=None)[0], atol=1e-10)
 
 
-def test_rank_deficient_task_stays_bounded_without_damping():
-    problem = random_problem(3)
-    problem.tracking.A[2] = problem.tracking.A[1] * (1 + 1e-14)
-    problem = with_rows(problem)
-    assert np.isnan(problem.v_tracking).all()
-    v = tracking_velocity(problem)
-    assert np.linalg.norm(v) < 10.0
-
-
 # --- QP -------------------------------------------------------------------------------------------------------
 
 
@@ -226,31 +217,6 @@ def test_acceleration_limits_relax_before_contact_and_other_limits_never(backend
     assert solution.severity is (Severity.ALARM if contact else Severity.WARNING)
     assert np.all(np.abs(solution.v) <= 2.0)
     assert solution.slack[0] == pytest.approx(0.2 - feedforward - v, abs=1e-4)
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_rows_beyond_the_velocity_limits_relax(backend):
-    problem = random_problem(6, pairs=1, damping=0.01)
-    J = np.zeros((1, NV))
-    J[0, 2] = 0.5
-    solution = make_solver(f"qp:{backend}").solve(with_rows(problem, J=J, b=np.array([3.0])))
-    assert solution.status is Status.RELAXED
-    assert solution.v[2] == pytest.approx(2.0, abs=1e-4)
-    assert solution.slack[0] == pytest.approx(2.0, abs=1e-3)
-    assert np.all(np.abs(solution.v) <= 2.0)
-
-
-def test_no_slack_is_used_where_the_rows_can_be_met():
-    for seed in range(200):
-        problem = random_problem(seed, pairs=5, damping=0.01)
-        solution = make_solver("qp").solve(problem)
-        if solution.status is Status.SOLVED:
-            assert solution.slack is None
-        else:
-            rows = problem.avoidance
-            point = qpsolvers.solve_qp(np.eye(NV), np.zeros(NV), -rows.J, -rows.b,
-                                       lb=problem.lower, ub=problem.upper, solver="quadprog")  # fmt: skip
-            assert point is None
 
 
 def fail(*_):

@@ -1,7 +1,7 @@
 """Bodies and pairs of a scene as arrays, and what moves each body: one table for all distances of a controller.
 
 An obstacle that is attached to the robot is moved by a joint from then on. All distances look into the same arrays, so
-that nobody has to be told.
+that no change has to be passed on.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ class PairTable:
     def rigid_pairs(self) -> Mask:
         """Return the pairs (m,) of an attached object with what moves along with it or hangs below it."""
         (first, second), rigid = self._scene.pairs.T, np.zeros(len(self.group), dtype=bool)
-        joints = np.array([*np.maximum(self.joints, 0), *[0] * (len(self.spheres) - len(self.joints))])
+        joints = np.array([*np.maximum(self.joints, 0), *[0] * (len(self.spheres) - len(self.joints))], dtype=np.intp)
         for index, joint in self.attached.items():
             below = np.all(self._masks[:, self._masks[joint] > 0.0] > 0.0, axis=1, keepdims=True)[:, 0]
             body = self.first[index]
@@ -117,7 +117,7 @@ class PairTable:
         scene, of, obstacles = self._scene, self._scene.obstacle_of, len(self._scene.obstacles)
         first, second = scene.pairs.T
         free = (of >= 0) & ~np.isin(of, list(self.attached))
-        joints = np.array([*self.joints, *[0] * (len(of) - len(self.joints))])
+        joints = np.array([*self.joints, *[0] * (len(of) - len(self.joints))], dtype=np.intp)
         self.moved_by[:] = np.where(free, scene.robot.model.njoints + of, joints)[scene.pairs]
         self.twist_row[:] = np.where(
             free[second], of[second], np.where(free[first], obstacles + 1 + of[first], obstacles)

@@ -11,7 +11,8 @@ from matplotlib.patches import Patch, Polygon
 from scipy.spatial import ConvexHull
 
 from qpavoid.problem import Array
-from qpavoid.run.log import Log, path_deviation
+from qpavoid.run.log import Log
+from qpavoid.run.metrics import path_deviation
 from qpavoid.viz.style import (
     AT_REST,
     COLOURS,

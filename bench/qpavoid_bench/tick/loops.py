@@ -189,7 +189,11 @@ def _swing(robot: Robot, obstacles: list[Obstacle], updates: Any = None, every: 
 
 def _bodies(kind: str) -> Loop:
     """Return a Panda with capsules around its meshes, their hulls, or the triangle meshes themselves."""
-    fields: dict[str, Any] = {"bodies": kind, "lock": {"panda_finger_joint1": 0.0, "panda_finger_joint2": 0.0}, "home": PANDA.home}
+    fields: dict[str, Any] = {
+        "bodies": kind,
+        "lock": {"panda_finger_joint1": 0.0, "panda_finger_joint2": 0.0},
+        "home": PANDA.home,
+    }
     robot = Robot.from_urdf(SHARE / PANDA.urdf, **fields)
     touching = close_pairs(robot, robot.home[None])
     return _swing(Robot.from_urdf(SHARE / PANDA.urdf, disabled_pairs=touching, **fields), [])
