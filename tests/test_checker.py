@@ -1,8 +1,8 @@
-"""Independent checker and safety campaign: distances, contacts between steps, verdicts, a small campaign."""
+"""Independent checker and its verdicts: distances, contacts between steps, evasions, cases that once were contacts."""
 
+import json
 from dataclasses import replace
 from functools import cache
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -14,23 +14,21 @@ from qpavoid import Limits, Robot, ScenarioConfig, build_scene, load_scenario
 from qpavoid.run.simulate import simulate
 
 pytest.importorskip("mujoco")
-pytest.importorskip("bench.safety", reason="bench/safety is in the repository only")
 
-from bench.safety import report
-from bench.safety.campaign import FOLDER, KINDS, RANGES, draw
-from bench.safety.referee import disagreement, drift, referee
-from bench.safety.rollout import Start, evade, joint_limits, policies
-from bench.safety.trial import trials
-from bench.safety.verdict import judge
-from qpavoid_bench.arena.checker import STEP, DistanceMonitor
+from qpavoid_bench.arena.checker import STEP, DistanceMonitor, check_run
+from qpavoid_bench.arena.evasion import JointLimits, Start, evade, policies
+from qpavoid_bench.arena.families import load_family
+from qpavoid_bench.arena.families.make import make_case
 from qpavoid_bench.arena.mujoco_model import build, load_model
+from qpavoid_bench.arena.verdict import decisive, judge
 
+ROBOTS = ("panda", "paper-dual-arm", "ur5")
 PLATE = BOX.model_copy(update={"size": (0.3, 0.2, 0.006)})
 
 
 @cache
 def robot(name):
-    return Robot.load(name, FOLDER)
+    return Robot.load(name)
 
 
 @cache
@@ -44,6 +42,31 @@ def scene_of(robot_path, tasks, obstacles, **fields):
     return ScenarioConfig.model_validate(config).with_source(Path("handmade.yaml"))
 
 
+@cache
+def recorded_case(seed):
+    """A random scenario in which a solver once touched something."""
+    cases = json.loads(Path(__file__).with_name("adversarial_cases.json").read_text())
+    return ScenarioConfig.model_validate(cases[str(seed)]).with_source(Path(f"seed-{seed}.yaml"))
+
+
+def check(model, log):
+    return check_run(model, log.t, log.v, Limits.model_validate(log.meta["config"]["limits"]))
+
+
+def drift(log, findings):
+    """Largest difference between the log's configurations and MuJoCo's [rad or m]."""
+    return np.abs(findings.q - log.q).max()
+
+
+def disagreement(model, log, findings):
+    """Largest difference of the log's smallest distance, where there is no contact, from MuJoCo's of that pair [m]."""
+    worst = 0.0
+    for k in np.flatnonzero((log.min_distance > 0.0) & (log.min_distance < np.inf)).tolist():
+        model.place(findings.q[k], log.t[k])
+        worst = max(worst, abs(model.distance(log.closest_pair[k]) - log.min_distance[k]))
+    return worst
+
+
 # --- the MuJoCo model ----------------------------------------------------------------------------------------------
 
 
@@ -55,7 +78,7 @@ def coal_distances(scene, q):
     return np.array([result.min_distance for result in data.distanceResults])
 
 
-@pytest.mark.parametrize("name", [kind.robot for kind in KINDS])
+@pytest.mark.parametrize("name", ROBOTS)
 def test_distances_are_those_of_coal(name):
     rng, apart, inside = np.random.default_rng(1), 0, 0
     for _ in range(6):
@@ -70,7 +93,11 @@ def test_distances_are_those_of_coal(name):
         mujoco_model, bodies = build(scene, robot(name).home), scene.geometry.geometryObjects
         mujoco_model.place(q, 0.0)
         for pair, d in enumerate(coal_distances(scene, q)):
-            radii = [bodies[body].geometry.radius for body in scene.pairs[pair].tolist() if body < mujoco_model.bodies]
+            radii = [
+                getattr(bodies[body].geometry, "radius", 0.02)
+                for body in scene.pairs[pair].tolist()
+                if body < mujoco_model.bodies
+            ]
             if d > -0.9 * min(radii):  # MuJoCo's depth means something else once the axis of a capsule is inside a box
                 assert mujoco_model.distance(pair) == pytest.approx(d, abs=1e-4), scene.pair_names[pair]
                 apart, inside = apart + (d > 0.0), inside + (d < 0.0)
@@ -101,7 +128,7 @@ def test_a_floating_base_is_refused(solo):
 def test_checker_collision_depth_of_situation_1():
     """It finds the collision of situation 1 and its depth."""
     mujoco_model, log = situation("tracking")
-    findings = referee(mujoco_model, log)
+    findings = check(mujoco_model, log)
     names = [mujoco_model.scene.pair_names[contact.pair] for contact in findings.contacts]
     assert names == [("left_hand", "fist")]
     # the depth by hand: radii less the distance of the sphere's centre from the hand's axis
@@ -121,7 +148,7 @@ def test_checker_collision_depth_of_situation_1():
 def test_checker_finds_no_false_contact():
     """It sees none where there is none."""
     mujoco_model, log = situation("qp")
-    findings = referee(mujoco_model, log)
+    findings = check(mujoco_model, log)
     assert findings.contacts == ()
     assert findings.distance > 0.08  # d1
     assert findings.distance == pytest.approx(log.min_distance.min(), abs=1e-4)
@@ -132,7 +159,7 @@ def test_checker_integrates_velocities_itself():
     """It integrates the velocities and ignores the logged configurations."""
     mujoco_model, log = situation("tracking")
     moved = replace(log, q=log.q + 0.1)
-    findings, moved_findings = referee(mujoco_model, log), referee(mujoco_model, moved)
+    findings, moved_findings = check(mujoco_model, log), check(mujoco_model, moved)
     assert moved_findings.contacts == findings.contacts
     assert drift(moved, moved_findings) == pytest.approx(0.1)
 
@@ -141,14 +168,14 @@ def test_checker_joint_limits():
     """It checks the joint limits."""
     mujoco_model, log = situation("qp")
     bounds = mujoco_model.scene.robot.bounds()
-    assert referee(mujoco_model, log).speed_excess <= 0.0
+    assert check(mujoco_model, log).speed_excess <= 0.0
     fast = log.v.copy()
     fast[10:20, 2] = bounds.velocity[2] + 0.5
-    assert referee(mujoco_model, replace(log, v=fast)).speed_excess == pytest.approx(0.5)
+    assert check(mujoco_model, replace(log, v=fast)).speed_excess == pytest.approx(0.5)
     steady = np.zeros_like(log.v)
     steady[:, 0] = 1.0  # rad/s, for 12.99 s
     excess = mujoco_model.q0[0] + 13.0 - bounds.upper[0]
-    assert referee(mujoco_model, replace(log, v=steady)).position_excess == pytest.approx(excess, abs=0.02)
+    assert check(mujoco_model, replace(log, v=steady)).position_excess == pytest.approx(excess, abs=0.02)
 
 
 def test_checker_accelerations():
@@ -157,15 +184,8 @@ def test_checker_accelerations():
     mujoco_model, log = load_model(scenario), simulate(scenario, "tracking")
     v = np.zeros_like(log.v)
     v[5:, 1] = 0.05  # rad/s, within one tick of 0.01 s
-    assert referee(mujoco_model, replace(log, v=v)).acceleration_excess == pytest.approx(5.0 - 3.0)
-    assert referee(*situation("tracking")).acceleration_excess == -np.inf
-
-
-def test_checker_refuses_log_of_another_scene():
-    """It refuses the log of another scene."""
-    mujoco_model, _ = situation("qp")
-    with pytest.raises(ValueError, match="another scene"):
-        referee(mujoco_model, simulate(load_scenario("situation2", ["duration=0.1"])))
+    assert check(mujoco_model, replace(log, v=v)).acceleration_excess == pytest.approx(5.0 - 3.0)
+    assert check(*situation("tracking")).acceleration_excess == -np.inf
 
 
 def test_checker_finds_contact_between_steps(tmp_path):
@@ -181,18 +201,18 @@ def test_checker_finds_contact_between_steps(tmp_path):
         duration=0.4,
     )
     mujoco_model, log = load_model(scenario), simulate(scenario, "tracking")
-    findings = referee(mujoco_model, log)
+    findings = check(mujoco_model, log)
     assert log.min_distance.min() > 0.05
     assert [mujoco_model.scene.pair_names[contact.pair] for contact in findings.contacts] == [("link1_0", "plate")]
     assert findings.contacts[0].time == pytest.approx((0.45 - 0.033) / 3.0, abs=STEP)
 
 
-@pytest.mark.parametrize("seed", [2, 9])
+@pytest.mark.parametrize("seed", [9, 309])
 def test_checker_skipped_pairs_do_not_matter(seed):
     """What it does not measure again does not matter."""
-    scenario = draw(seed)
+    scenario = recorded_case(seed)
     mujoco_model, log = load_model(scenario), simulate(scenario, "tracking")
-    findings = referee(mujoco_model, log)
+    findings = check(mujoco_model, log)
     touched, smallest = set(), np.inf
     for q, t in zip(findings.q, log.t.tolist(), strict=True):
         mujoco_model.place(q, t)
@@ -213,7 +233,7 @@ def test_checker_travel_between_instants():
             centers.append(mujoco_model.poses()[0].copy())
             super().measure(t)
 
-    mujoco_model, centers = load_model(draw(9)), []
+    mujoco_model, centers = load_model(recorded_case(9)), []
     watch = Seen(mujoco_model)
     watch.measure(0.0)
     watch.follow(mujoco_model.q0, 0.5 * mujoco_model.scene.robot.bounds().velocity, 0.0, 0.05)
@@ -251,13 +271,13 @@ def test_verdicts(tmp_path, obstacles, why):
         duration=4.0,
     )
     mujoco_model, log = load_model(scenario), simulate(scenario, "tracking")
-    verdicts = judge(mujoco_model, scenario, log, referee(mujoco_model, log))
-    assert [verdict.why for verdict in verdicts] == why, verdicts
+    verdicts = judge(mujoco_model, scenario, log.t, log.v, check(mujoco_model, log))
+    assert [verdict.kind for verdict in verdicts] == why, verdicts
     assert verdicts[-1].avoidable == (why[-1] == "avoidable")
 
 
 @pytest.mark.parametrize("acceleration", [None, 10.0])
-def test_backup_rollouts_respect_limits(monkeypatch, acceleration):
+def test_evasions_respect_limits(monkeypatch, acceleration):
     steps, follow = [], DistanceMonitor.follow
 
     def recorded(watch, q, v, t, dt):
@@ -267,9 +287,9 @@ def test_backup_rollouts_respect_limits(monkeypatch, acceleration):
 
     monkeypatch.setattr(DistanceMonitor, "follow", recorded)
     limits = Limits(acceleration=acceleration)
-    scenario = draw(9).model_copy(update={"limits": limits, "dt": 0.02})
+    scenario = recorded_case(9).model_copy(update={"limits": limits, "dt": 0.02})
     mujoco_model = load_model(scenario)
-    means = joint_limits(mujoco_model, scenario)
+    means = JointLimits.of(mujoco_model, limits)
     start = Start(mujoco_model.q0, np.zeros_like(mujoco_model.q0), 0.0, 1.2)
     for policy in list(policies(len(mujoco_model.q0)))[::3]:
         steps.clear()
@@ -283,77 +303,60 @@ def test_backup_rollouts_respect_limits(monkeypatch, acceleration):
 
 def test_standing_still_proves_that_a_static_obstacle_is_avoidable():
     scenario, (mujoco_model, log) = load_scenario("situation1"), situation("tracking")
-    (verdict,) = judge(mujoco_model, scenario, log, referee(mujoco_model, log))
-    assert verdict.why == "avoidable" and "standing still" in verdict.detail
+    (verdict,) = judge(mujoco_model, scenario, log.t, log.v, check(mujoco_model, log))
+    assert verdict.kind == "avoidable" and "standing still" in verdict.detail
 
 
-# --- the campaign -------------------------------------------------------------------------------------------
+# --- cases ---------------------------------------------------------------------------------------------------
 
 
-def test_scenarios_can_be_drawn_again_and_begin_clear():
-    drawn = [draw(seed) for seed in range(30)]
-    assert drawn == [draw(seed) for seed in range(30)]
-    assert {scenario.robot for scenario in drawn} == {kind.robot for kind in KINDS}
-    assert len({scenario.dt for scenario in drawn}) > 3
-    assert max(len(scenario.obstacles) for scenario in drawn) > 10
-    for scenario in drawn:
-        mujoco_model = load_model(scenario)
+def test_adversarial_cases_begin_clear():
+    family = load_family("adversarial")
+    cases = [make_case(family, seed) for seed in range(16)]
+    assert {case.scenario.robot for case in cases} == set(ROBOTS)
+    assert len({case.scenario.dt for case in cases}) > 3
+    assert max(len(case.scenario.obstacles) for case in cases) > 10
+    for case in cases:
+        mujoco_model = load_model(case.scenario)
         smallest = min(mujoco_model.distance(pair) for pair in range(len(mujoco_model.scene.pairs)))
-        assert smallest > scenario.avoidance.d1 - 1e-6, scenario.title
-        assert RANGES.d1[0] <= scenario.avoidance.d1 <= RANGES.d1[1]
-        assert RANGES.duration[0] <= scenario.duration <= RANGES.duration[1]
+        assert smallest > case.scenario.avoidance.d1, case.scenario.title
+        assert not case.solved_by
 
 
-@cache
-def small_campaign(solver, count):
-    seeds = (seed for seed in range(100) if draw(seed).dt > 0.002)  # short periods take many ticks
-    return [trial for seed in islice(seeds, count) for trial in trials(seed, (solver,))]
+def run_and_judge(scenario, solver):
+    """Return log, findings and the decisive verdict of a run; None without contact."""
+    mujoco_model, log = load_model(scenario), simulate(scenario, solver)
+    findings = check(mujoco_model, log)
+    assert drift(log, findings) < 1e-6 and disagreement(mujoco_model, log, findings) < 1e-6
+    assert findings.speed_excess < 1e-9 and findings.position_excess < 1e-9
+    return findings, decisive(judge(mujoco_model, scenario, log.t, log.v, findings))
 
 
-def test_qp_has_no_avoidable_collision():
-    found = small_campaign("qp", 15)
-    assert {(trial.seed, trial.judged) for trial in found if trial.avoidable} == set()
-    assert all(trial.speed_excess < 1e-9 and trial.position_excess < 1e-9 for trial in found)
-    assert all(trial.disagreement < 1e-6 and trial.drift < 1e-6 and not trial.failure for trial in found)
-
-
-@pytest.mark.parametrize("seed", [13, 79, 99, 122, 912, 957])
+@pytest.mark.parametrize("seed", [79, 912, 957])
 def test_qp_regressions_of_collisions(seed):
-    """Margins bought with jumps of a wrist, ways that bend, a stop that let an obstacle come on."""
-    (trial,) = trials(seed, ("qp",))
-    assert not trial.avoidable, trial.judged
+    """Margins bought with jumps of a wrist, a stop that let an obstacle come on."""
+    _, verdict = run_and_judge(recorded_case(seed), "qp")
+    assert verdict is None or not verdict.avoidable, verdict
 
 
-@pytest.mark.parametrize(
-    ("seed", "blind"), [(265, True), (419, True), (309, False), (488, False), (559, False), (670, False)]
-)
-def test_backup_evades_closing_obstacles(seed, blind):
-    """Obstacles that close in from several sides, on a robot that follows its task until it is too late to evade.
-
-    Without it all are hit (bench/results/safety.md); the referee takes up to a minute to say that they need not be.
-    """
-    found = trials(seed, ("qp", "qp-alone") if blind else ("qp",))
-    assert not found[0].collided and found[0].speed_excess <= 1e-9, found[0].judged
-    assert all(trial.avoidable for trial in found[1:])
+@pytest.mark.parametrize("seed", [309, 559, 670])
+def test_backup_evades_closing_obstacles(seed):
+    """Obstacles close in from several sides; a robot that follows its task until then cannot evade any more."""
+    findings, _ = run_and_judge(recorded_case(seed), "qp")
+    assert not findings.contacts
 
 
-@pytest.mark.parametrize("seed", [768, 1084])
-def test_backup_avoids_contacts_beside_unavoidable_one(seed):
+def test_backup_avoids_contacts_beside_unavoidable_one():
     """A pair that touches in every rollout must not make the planner ignore the other pairs."""
-    (trial,) = trials(seed, ("qp",))
-    assert trial.collided and not trial.avoidable, trial.judged
+    findings, verdict = run_and_judge(recorded_case(1084), "qp")
+    assert findings.contacts and not verdict.avoidable, verdict
 
 
-def test_tracking_alone_collides_and_could_have_avoided_it():
-    assert sum(trial.avoidable for trial in small_campaign("tracking", 8)) > 4
-
-
-def test_the_report_has_every_run(tmp_path):
-    found = small_campaign("qp", 15) + small_campaign("tracking", 8)
-    text = report.write(found, {99: "ValueError: no"}, ("qp", "tracking"), report.Cost(60.0, (0.1, 0.2)), tmp_path, "s")
-    assert (tmp_path / "s.md").read_text() == text
-    assert len((tmp_path / "s.csv").read_text().splitlines()) == 1 + len(found)
-    assert "seed 99: ValueError: no" in text
-    bad = [trial for trial in found if trial.solver == "tracking" and trial.avoidable]
-    assert f"| **{len(bad)}** |" in text
-    assert all(f"| {trial.seed} | {trial.robot} |" in text for trial in bad[: report.LISTED])
+@pytest.mark.parametrize("seed", range(4))
+def test_qp_has_no_avoidable_collision_where_tracking_has(seed):
+    scenario = make_case(load_family("adversarial"), seed).scenario.model_copy(update={"dt": 0.02})
+    scenario = scenario.with_source(Path("seed.yaml"))
+    _, verdict = run_and_judge(scenario, "qp")
+    assert verdict is None or not verdict.avoidable, verdict
+    _, verdict = run_and_judge(scenario, "tracking")
+    assert verdict.avoidable

@@ -15,7 +15,6 @@ from qpavoid.geometry.bodies import make_shape
 from qpavoid.model.cloud import voxel_radius
 
 pytest.importorskip("mujoco")
-pytest.importorskip("bench.safety", reason="bench/safety is in the repository only")
 
 from qpavoid_bench.arena.mujoco_model import build
 

@@ -219,7 +219,7 @@ def test_jumps_of_the_state_keep_to_the_limits(panda, seed):
 
 def test_stale_obstacle_moves_on_grows_and_stops_the_robot(tmp_path):
     robot = cartesian(tmp_path)
-    sensing = Sensing(stale_after=0.2, margin_growth=0.1, stop_after=0.5)
+    sensing = Sensing(stale_after=0.2, stop_after=0.5)
     controller = make_controller(
         robot, [Obstacle.at("ball", Sphere(radius=0.05), [0.0, 3.0, 0.0])], "z", sensing=sensing
     )

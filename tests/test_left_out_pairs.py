@@ -1,7 +1,6 @@
 """No two links collide unseen: the robot's own geometry, by coal alone, against the pairs that `robot add` keeps."""
 
 import json
-import re
 
 import numpy as np
 import pinocchio as pin
@@ -16,8 +15,7 @@ from qpavoid.setup.add import DescribeOptions, describe
 from qpavoid.setup.check import check_robot
 from qpavoid.setup.home import HOME_CLEARANCE, MIN_CONDITIONING
 from qpavoid.setup.sampling import D1, touching
-from qpavoid.setup.texts import description_files
-from qpavoid.setup.written import write_files
+from qpavoid.setup.texts import description_files, write_files
 
 LIMIT = 'velocity="1" effort="1"'
 
@@ -257,73 +255,17 @@ def test_wheels_of_a_mobile_base_are_locked_and_named(tmp_path, root, wheels):
 
 def test_one_table_holds_all_that_was_left_out(cli, tmp_path):
     (tmp_path / "telescope.urdf").write_text(TELESCOPE)
-    added = cli("robot", "add", "telescope.urdf", "--no-picture")
+    added = cli("robot", "add", "telescope.urdf")
     row = next(line for line in added.stdout.splitlines() if "s0 - s2" in line)
     severity, kind, share, sign = row.split()[:4]
     assert (severity, kind, sign) == ("note", "pair", "%") and 50 < int(share) < 75
     assert any(line.split()[:2] == ["warning", "joint"] and "held" in line for line in added.stdout.splitlines())
-    document = json.loads(cli("robot", "add", "telescope.urdf", "--no-picture", "--json").stdout)
+    document = json.loads(cli("robot", "add", "telescope.urdf", "--json").stdout)
     (note,) = [note for note in document["notes"] if note["subject"] == ["s0", "s2"]]
     assert note["kind"] == "pair" and note["share"] == pytest.approx(int(share) / 100, abs=0.006)
     entry = next(entry for entry in document["left_out"] if entry["links"] == ["s0", "s2"])
     assert entry["reason"] == "drawn in" and entry["geometry"] == note["share"]
     assert {tuple(entry["links"]) for entry in document["left_out"]} >= {("base", "s0"), ("s0", "s1"), ("base", "s2")}
-
-
-def test_packages_by_name(cli, tmp_path):
-    (tmp_path / "elsewhere").mkdir()
-    corners = [(0, 0, 0), (0.1, 0, 0), (0, 0.1, 0), (0, 0, 0.1)]
-    faces = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
-    lines = ""
-    for face in faces:
-        points = "".join("vertex {} {} {}\n".format(*corners[i]) for i in face)
-        lines += f"facet normal 0 0 1\nouter loop\n{points}endloop\nendfacet\n"
-    (tmp_path / "elsewhere" / "a.stl").write_text(f"solid a\n{lines}endsolid a\n")
-    text = WRIST.replace(box(0.12, 0.12, 0.1), '<mesh filename="package://my_robot/a.stl"/>')
-    (tmp_path / "wrist.urdf").write_text(text)
-    assert cli("robot", "check", "wrist.urdf").status == 1
-    assert cli("robot", "check", "wrist.urdf", "--package", f"my_robot={tmp_path}/elsewhere").status == 0
-    allowed = cli("robot", "check", "wrist.urdf", "--allow-missing-meshes")
-    assert allowed.status == 0 and re.search("^warning +mesh +hand_0: left out", allowed.stdout, re.MULTILINE)
-    added = cli("robot", "add", "wrist.urdf", "--package", "my_robot=elsewhere", "--no-picture", "--samples", "50")
-    assert added.status == 0, added.stderr
-    assert {body.name for body in Robot.load("wrist/robot.yaml").bodies.geometryObjects} >= {"hand", "forearm"}
-    bad = cli("robot", "check", "wrist.urdf", "--package", "my_robot=nowhere")
-    assert bad.status == 2 and "no such folder 'nowhere'" in bad.stderr
-
-
-# --- robots of packages ------------------------------------------------------------------------------------------
-
-
-def package_urdfs():
-    """URDFs of packages that may be installed."""
-    from importlib.metadata import PackageNotFoundError, files
-
-    wanted = {
-        "airo-models": ("ur5e", "robotiq"),
-        "hello-robot-stretch-urdf": (".urdf",),
-        "icub-models": ("iCubGazeboV2_5/",),
-    }
-    for package, words in wanted.items():
-        try:
-            listed = [str(file.locate()) for file in files(package) or () if str(file).endswith(".urdf")]
-        except PackageNotFoundError:
-            continue
-        for word in words:
-            yield from [path for path in listed if word in path][:1]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("path", list(package_urdfs()))
-@pytest.mark.filterwarnings("ignore::qpavoid.model.notes.RobotWarning")
-def test_robots_of_packages(path):
-    from pathlib import Path
-
-    from qpavoid.model.packages import mesh_folders
-
-    assert check_robot(path).usable
-    described = describe(Path(path), DescribeOptions())
-    nothing_unseen(path, described, 100, [entry for entry in mesh_folders(Path(path), []) if "=" not in entry])
 
 
 @pytest.mark.slow

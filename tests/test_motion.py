@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,6 +24,7 @@ Profile = Literal["constant", "smooth"]
 
 HERE = Path()
 STEP = 1e-5  # of the central differences [s]
+CIRCLE = {"type": "circle", "center": (0, 0, 0), "radius": 1, "period": 1}
 POSES = "t,x,y,z,qx,qy,qz,qw"
 START = Sample.at([0.4, -0.1, 0.7], rpy_to_matrix([0.3, -0.5, 1.1]))
 
@@ -44,7 +44,7 @@ def write(folder: Path, *lines: str) -> str:
     return "path.csv"
 
 
-def assert_rests(motion: Motion, t: float, position: Any, rotation: Any) -> None:
+def assert_rests(motion: Motion, t: float, position: Any, rotation: Any):
     sample = motion.sample(t)
     np.testing.assert_allclose(sample.position, position, atol=1e-12)
     np.testing.assert_allclose(sample.rotation, rotation, atol=1e-12)
@@ -52,7 +52,7 @@ def assert_rests(motion: Motion, t: float, position: Any, rotation: Any) -> None
     assert not sample.angular.any()
 
 
-def assert_twist_is_rate_of_pose(motion: Motion, t: float) -> None:
+def assert_twist_is_rate_of_pose(motion: Motion, t: float):
     """Velocities against central differences; the rotation must be one, to 1e-12."""
     before, now, after = (motion.sample(t + dt) for dt in (-STEP, 0.0, STEP))
     np.testing.assert_allclose(now.rotation @ now.rotation.T, np.eye(3), atol=1e-12)
@@ -65,7 +65,7 @@ def assert_twist_is_rate_of_pose(motion: Motion, t: float) -> None:
 # --- closed forms -------------------------------------------------------------------------------------------
 
 
-def test_rpy_turns_about_fixed_axes() -> None:
+def test_rpy_turns_about_fixed_axes():
     rpy = [0.3, -0.7, 2.1]
     np.testing.assert_allclose(rpy_to_matrix(rpy), Rotation.from_euler("xyz", rpy).as_matrix(), atol=1e-15)
     np.testing.assert_allclose(rpy_to_matrix([0, 0, math.pi / 2]) @ [1, 0, 0], [0, 1, 0], atol=1e-15)
@@ -73,7 +73,7 @@ def test_rpy_turns_about_fixed_axes() -> None:
     np.testing.assert_allclose(rpy_to_matrix([0, math.pi / 2, 1.0]) @ [1, 0, 0], [0, 0, -1], atol=1e-15)
 
 
-def test_fixed_takes_from_the_start_what_is_left_out() -> None:
+def test_fixed_takes_from_the_start_what_is_left_out():
     for t in (0.0, 3.7):
         assert_rests(build(START, type="fixed"), t, START.position, START.rotation)
         assert_rests(build(START, type="fixed", position=(1, 2, 3)), t, (1, 2, 3), START.rotation)
@@ -81,7 +81,7 @@ def test_fixed_takes_from_the_start_what_is_left_out() -> None:
         assert_rests(build(type="fixed", position=(1, 2, 3)), t, (1, 2, 3), np.eye(3))
 
 
-def test_line_has_constant_velocity_on_its_half_open_interval() -> None:
+def test_line_has_constant_velocity_on_its_half_open_interval():
     line = build(START, type="line", displacement=(0, 3, 4), speed=0.5, start_time=1.0)  # 10 s
     end = START.position + np.array([0, 3, 4])
     velocity = np.array([0, 0.3, 0.4])
@@ -96,7 +96,7 @@ def test_line_has_constant_velocity_on_its_half_open_interval() -> None:
         assert_rests(line, t, end, START.rotation)
 
 
-def test_smooth_line_has_the_speed_of_the_quintic() -> None:
+def test_smooth_line_has_the_speed_of_the_quintic():
     line = build(type="line", start=(1, 0, 0), end=(3, 0, 0), speed=0.5, profile="smooth")  # 4 s
     middle, quarter = line.sample(2.0), line.sample(1.0)
     np.testing.assert_allclose(middle.position, [2, 0, 0], atol=1e-12)
@@ -109,7 +109,7 @@ def test_smooth_line_has_the_speed_of_the_quintic() -> None:
 
 
 @pytest.mark.parametrize("dt", [0.01, 0.001, 0.1, 1 / 3, 0.007])
-def test_accumulated_times_fall_on_the_right_side(dt: float) -> None:
+def test_accumulated_times_fall_on_the_right_side(dt):
     """At tick k of an n-tick line it moves for k < n and rests from n on, multiplied or summed up."""
     n = 800
     line = build(type="line", start=(0, 0, 0), end=(n * dt * 0.1, 0, 0), speed=0.1)
@@ -118,7 +118,7 @@ def test_accumulated_times_fall_on_the_right_side(dt: float) -> None:
         assert moving == [True] * n + [False] * 2
 
 
-def test_circle_runs_counter_clockwise_and_rests_after_its_turns() -> None:
+def test_circle_runs_counter_clockwise_and_rests_after_its_turns():
     circle = build(type="circle", center=(1, 2, 3), radius=0.5, normal=(0, 0, 2), period=4.0, turns=1.25)
     for t, x, v in (
         (0.0, (1.5, 2, 3), (0, math.pi / 4, 0)),
@@ -135,7 +135,7 @@ def test_circle_runs_counter_clockwise_and_rests_after_its_turns() -> None:
 
 
 @given(normal=direction, towards=direction, radius=st.floats(0.01, 2), t=st.floats(0, 100))
-def test_circle_without_centre_starts_at_the_frame(normal: Any, towards: Any, radius: float, t: float) -> None:
+def test_circle_without_centre_starts_at_the_frame(normal, towards, radius, t):
     if np.linalg.norm(np.cross(normal, towards)) < 1e-3:
         return
     circle = build(START, type="circle", radius=radius, normal=normal, start_direction=towards, period=3.0)
@@ -151,7 +151,7 @@ def test_circle_without_centre_starts_at_the_frame(normal: Any, towards: Any, ra
     np.testing.assert_allclose(now.linear, 2 * math.pi / 3.0 * np.cross(n, arm), atol=1e-9)
 
 
-def test_waypoints_pass_through_their_poses_and_turn_at_a_constant_rate() -> None:
+def test_waypoints_pass_through_their_poses_and_turn_at_a_constant_rate():
     rpys = [(0.0, 0.0, 3.0), (0.0, 0.0, -3.0), (0.0, 0.0, -2.5)]  # the short way from 3 to -3 is through π
     positions = [(0, 0, 0), (1, 0, 0), (1, 2, 0)]
     path = build(type="waypoints", times=[1, 2, 4], positions=positions, rpys=rpys)
@@ -166,14 +166,14 @@ def test_waypoints_pass_through_their_poses_and_turn_at_a_constant_rate() -> Non
     assert_rests(path, 4.0, positions[2], rpy_to_matrix(rpys[2]))
 
 
-def test_orientation_that_stays_is_exactly_constant() -> None:
+def test_orientation_that_stays_is_exactly_constant():
     rpy = (0.123, 1.1, -2.2)
     path = build(type="waypoints", times=[0, 1], positions=[(0, 0, 0), (1, 0, 0)], rpys=[rpy, rpy])
     assert not path.sample(0.5).angular.any()
     np.testing.assert_array_equal(path.sample(0.5).rotation, rpy_to_matrix(rpy))
 
 
-def test_two_roundings_of_one_orientation_are_no_turn(tmp_path: Path) -> None:
+def test_two_roundings_of_one_orientation_are_no_turn(tmp_path):
     for k in range(1, 20):
         q = np.array([0.1 * k, 0.2, -0.3, 0.7])
         rows = [f"{t},0,0,0," + ",".join(repr(float(x)) for x in scale * q) for t, scale in ((0, 1), (1, 0.7))]
@@ -182,7 +182,7 @@ def test_two_roundings_of_one_orientation_are_no_turn(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("angle", [1e-9, 1e-4, 1.0, math.pi - 1e-9, math.pi])
-def test_turns_of_any_size_reach_their_end(angle: float) -> None:
+def test_turns_of_any_size_reach_their_end(angle):
     axis = np.array([0.6, 0.0, 0.8])
     end = Rotation.from_rotvec(angle * axis) * Rotation.from_matrix(START.rotation)
     rpys = [Rotation.from_matrix(START.rotation).as_euler("xyz"), end.as_euler("xyz")]
@@ -192,7 +192,7 @@ def test_turns_of_any_size_reach_their_end(angle: float) -> None:
     np.testing.assert_allclose(rate if angle != math.pi else abs(rate), angle * axis, atol=1e-12)
 
 
-def test_csv_without_quaternions_keeps_the_orientation_of_the_start(tmp_path: Path) -> None:
+def test_csv_without_quaternions_keeps_the_orientation_of_the_start(tmp_path):
     name = write(tmp_path, "t, x, y, z", "0, 0, 0, 0", "", "2, 1, 0, -1", "3,1,1,1")
     motion = build(START, tmp_path, type="csv", path=name)
     np.testing.assert_allclose(motion.sample(0.5).position, [0.25, 0, -0.25], atol=1e-12)
@@ -206,9 +206,7 @@ def test_csv_without_quaternions_keeps_the_orientation_of_the_start(tmp_path: Pa
     q1=st.tuples(*[coordinate] * 4).filter(lambda q: np.linalg.norm(q) > 0.1),
     s=st.floats(0.01, 0.99),
 )
-def test_csv_quaternions_turn_the_short_way_whatever_their_sign(
-    tmp_path_factory: pytest.TempPathFactory, q0: Any, q1: Any, s: float
-) -> None:
+def test_csv_quaternions_turn_the_short_way_whatever_their_sign(tmp_path_factory, q0, q1, s):
     folder = tmp_path_factory.getbasetemp()
 
     def motion(sign: float, scale: float = 1.0) -> Motion:
@@ -242,20 +240,14 @@ def test_csv_quaternions_turn_the_short_way_whatever_their_sign(
     s=st.floats(0.01, 0.99),
     piece=st.integers(0, 1),
 )
-def test_twist_of_waypoints(positions: Any, rpys: Any, profile: Profile, s: float, piece: int) -> None:
+def test_twist_of_waypoints(positions, rpys, profile, s, piece):
     times = [0.5, 1.5, 4.0]
     motion = build(type="waypoints", times=times, positions=positions, rpys=rpys, profile=profile)
     assert_twist_is_rate_of_pose(motion, times[piece] + s * (times[piece + 1] - times[piece]))
 
 
-@given(displacement=direction, speed=st.floats(0.05, 1), profile=profile, s=st.floats(0.01, 0.99))
-def test_twist_of_a_line(displacement: Any, speed: float, profile: Profile, s: float) -> None:
-    motion = build(START, type="line", displacement=displacement, speed=speed, start_time=1, profile=profile)
-    assert_twist_is_rate_of_pose(motion, 1 + s * float(np.linalg.norm(displacement)) / speed)
-
-
 @given(normal=direction, radius=st.floats(0.01, 1), period=st.floats(1, 20), turns=st.floats(0.01, 0.99))
-def test_twist_of_a_circle(normal: Any, radius: float, period: float, turns: float) -> None:
+def test_twist_of_a_circle(normal, radius, period, turns):
     if np.linalg.norm(normal[1:]) < 1e-3:
         return
     motion = build(type="circle", center=(0, 0, 1), radius=radius, normal=normal, period=period, turns=1)
@@ -267,7 +259,7 @@ def test_twist_of_a_circle(normal: Any, radius: float, period: float, turns: flo
     rpys=st.lists(point, min_size=4, max_size=4),
     profile=profile,
 )
-def test_pose_is_continuous_at_the_corners(positions: Any, rpys: Any, profile: Profile) -> None:
+def test_pose_is_continuous_at_the_corners(positions, rpys, profile):
     times = [0.0, 0.7, 1.0, 2.5]
     motion = build(type="waypoints", times=times, positions=positions, rpys=rpys, profile=profile)
     for t, position, rpy in zip(times, positions, rpys, strict=True):
@@ -287,33 +279,19 @@ def test_pose_is_continuous_at_the_corners(positions: Any, rpys: Any, profile: P
     ("lines", "words"),
     [
         (["t,x,y", "0,0,0", "1,0,0"], ["header", "t,x,y,z,qx,qy,qz,qw"]),
-        ([], ["header", "t,x,y,z"]),
         (["0,0,0,0", "1,0,0,0"], ["header", "first line"]),
         (["t,x,y,z"], ["0 row", "two"]),
-        (["t,x,y,z", "0,0,0,0"], ["1 row", "two"]),
         (["t,x,y,z", "0,0,0,0", "", "1,0,abc,0"], ["line 4", "y", "abc"]),
-        (["t,x,y,z", "0,0,0,nan", "1,0,0,0"], ["line 2", "z", "nan"]),
-        (["t,x,y,z", "0,0,0,0", "inf,0,0,0"], ["line 3", "t", "inf"]),
-        (["t,x,y,z", "0,0,0,0", "1,0,0"], ["line 3", "3 cells", "4"]),
-        (["t,x,y,z", "0,0,0,0", "1,0,0,0", "1,0,0,0"], ["line 4", "increase"]),
         (["t,x,y,z", "0,0,0,0", "-1,0,0,0"], ["line 3", "increase"]),
         ([POSES, "0,0,0,0,0,0,0,1", "1,0,0,0,0,0,0,0"], ["line 3", "quaternion", "zero"]),
     ],
 )
-def test_bad_csv(tmp_path: Path, lines: list[str], words: list[str]) -> None:
+def test_bad_csv(tmp_path, lines, words):
     name = write(tmp_path, *lines)
     with pytest.raises(ConfigError) as error:
         build(None, tmp_path, type="csv", path=name)
     for word in (name, *words):
         assert word in str(error.value)
-
-
-def test_missing_and_unreadable_csv(tmp_path: Path) -> None:
-    (tmp_path / "binary.csv").write_bytes(b"\xff\xfe\x00")
-    for name in ("missing.csv", "binary.csv", "."):
-        with pytest.raises(ConfigError, match=r"motion\.path: cannot be read") as error:
-            build(None, tmp_path, type="csv", path=name)
-        assert str(tmp_path / name) in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -322,29 +300,13 @@ def test_missing_and_unreadable_csv(tmp_path: Path) -> None:
         ({"type": "fixed"}, "motion.position is missing"),
         ({"type": "line", "end": (0, 0, 1), "speed": 1}, "motion.start is missing"),
         ({"type": "circle", "radius": 1, "period": 1}, "motion.center is missing"),
-        (
-            {"type": "line", "start": (0, 0, 1), "end": (0, 0, 1), "speed": 1},
-            "motion.end: the line has no length",
-        ),
-        (
-            {"type": "line", "start": (0, 0, 1), "displacement": (0, 0, 0), "speed": 1},
-            "motion.displacement: the line",
-        ),
-        (
-            {"type": "circle", "center": (0, 0, 0), "radius": 1, "period": 1, "normal": (0, 0, 0)},
-            "motion.normal has no",
-        ),
-        (
-            {"type": "circle", "center": (0, 0, 0), "radius": 1, "period": 1, "start_direction": (0, 0, 0)},
-            "motion.start_direction has no length",
-        ),
-        (
-            {"type": "circle", "center": (0, 0, 0), "radius": 1, "period": 1, "normal": (-2, 0, 0)},
-            "motion.start_direction is parallel to motion.normal",
-        ),
+        ({"type": "line", "start": (0, 0, 1), "end": (0, 0, 1), "speed": 1}, "motion.end: the line has no length"),
+        ({**CIRCLE, "normal": (0, 0, 0)}, "motion.normal has no"),
+        ({**CIRCLE, "start_direction": (0, 0, 0)}, "motion.start_direction has no length"),
+        ({**CIRCLE, "normal": (-2, 0, 0)}, "motion.start_direction is parallel to motion.normal"),
     ],
 )
-def test_bad_block(block: dict[str, Any], words: str) -> None:
+def test_bad_block(block, words):
     with pytest.raises(ConfigError) as error:
         build(**block)
     assert words in str(error.value)
@@ -359,12 +321,12 @@ def test_bad_block(block: dict[str, Any], words: str) -> None:
         (lambda: Sample.at([0, 0, 0], angular=["a", "b", "c"]), "angular: not an array of numbers"),
     ],
 )
-def test_bad_sample(make: Callable[[], Sample], words: str) -> None:
+def test_bad_sample(make, words):
     with pytest.raises(NumericalError, match=words):
         make()
 
 
-def test_sample_copies_what_it_is_given_and_cannot_be_written_to() -> None:
+def test_sample_copies_what_it_is_given_and_cannot_be_written_to():
     position = np.zeros(3)
     sample = Sample.at(position)
     position[0] = 1.0
@@ -374,7 +336,7 @@ def test_sample_copies_what_it_is_given_and_cannot_be_written_to() -> None:
 
 
 @pytest.mark.parametrize("t", [math.nan, math.inf])
-def test_time_that_is_not_finite(t: float) -> None:
+def test_time_that_is_not_finite(t):
     for motion in (
         build(START, type="line", displacement=(1, 0, 0), speed=1),
         build(START, type="circle", radius=1, period=1),

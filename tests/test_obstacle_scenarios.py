@@ -5,7 +5,8 @@ import pytest
 
 from qpavoid import ConfigError, Controller, Log, load_scenario
 from qpavoid.run.simulate import simulate
-from qpavoid.viz.motion import local_faces, motion_figure, shape_faces
+from qpavoid.viz.motion import motion_figure
+from qpavoid.viz.surfaces import local_faces, shape_faces
 
 
 @pytest.fixture(scope="module")

@@ -291,9 +291,7 @@ def test_point_cloud_moves_with_its_frame(panda):
 
 
 def test_points_that_cannot_be_used_are_reasons(panda):
-    controller = make_controller(
-        panda, cloud_scene(panda).obstacles, sensing=Sensing(stale_after=0.05, stop_after=0.1, margin_growth=0.1)
-    )
+    controller = make_controller(panda, cloud_scene(panda).obstacles, sensing=Sensing(stale_after=0.05, stop_after=0.1))
     near = np.full((10, 3), [0.45, 0.0, 0.5])
     some, all_bad = np.vstack((near, np.full((2, 3), np.nan))), np.full((10, 3), np.nan)
     seen = controller.tick(panda.home, obstacles={"camera": Points(some)})

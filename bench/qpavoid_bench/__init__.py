@@ -1,1 +1,1 @@
-"""Benchmarks of qpavoid: controllers and libraries compared on families of scenarios, judged by a simulator."""
+"""Benchmarks of qpavoid: families of scenarios judged by a simulator, the time of a step, back ends, endurance."""

@@ -109,10 +109,8 @@ class Sensing(Block):
     """Treatment of external obstacles that are not updated: those that a program gives in `step`."""
 
     stale_after: Positive | None = 0.1
-    """Age of the last update after which an obstacle's distances shrink by a growing margin [s], but no less than three
-    control periods; `null`: never, it goes on at its last twist."""
-    margin_growth: NonNegative = 0.1
-    """How fast that margin grows: a bound on the error of the last twist [m/s]."""
+    """Age of the last update after which an obstacle's distances shrink by a margin that grows at 0.1 m/s [s], but no
+    less than three control periods; `null`: never, it goes on at its last twist."""
     stop_after: Positive | None = 0.5
     """Age of the last update after which the robot stops [s], but no less than three control periods; left out: five
     times `stale_after`; `null`: never."""

@@ -6,7 +6,6 @@ import typing
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
-from pydantic_core import ErrorDetails
 
 from qpavoid.errors import nearest
 
@@ -23,20 +22,17 @@ _REMEDIES = {
 
 def explain(error: ValidationError, model: type[BaseModel], data: dict[str, Any]) -> str:
     """Explain all faults of a file in one line: field, fault, nearest valid key."""
-    faults = [(tuple(_field(fault["loc"], fault["type"], data)), fault) for fault in error.errors()]
+    faults = [(_field(fault["loc"], fault["type"], data), fault) for fault in error.errors()]
     # Of a field that may be a list or a mapping, pydantic reports both; the one that was meant got deeper.
     above = {field[:depth] for field, _ in faults for depth in range(len(field))}
-    deepest = [(field, fault) for field, fault in faults if field not in above]
-    more = f"; and {len(deepest) - _MAX_FAULTS} more" if len(deepest) > _MAX_FAULTS else ""
-    clauses = [(".".join(field), _fault(fault, model)) for field, fault in deepest[:_MAX_FAULTS]]
-    return "; ".join(f"{field}: {clause}" if field else clause for field, clause in clauses) + more
+    clauses = [": ".join([*[".".join(field)][: len(field)], _clause(fault, model)])
+               for field, fault in faults if field not in above]  # fmt: skip
+    more = f"; and {len(clauses) - _MAX_FAULTS} more" if len(clauses) > _MAX_FAULTS else ""
+    return "; ".join(clauses[:_MAX_FAULTS]) + more
 
 
-def _field(loc: tuple[int | str, ...], kind: str, data: Any) -> list[str]:
-    """List the keys and indices of the file in a location.
-
-    pydantic's locations also name the members of unions.
-    """
+def _field(loc: tuple[int | str, ...], kind: str, data: Any) -> tuple[str, ...]:
+    """List the keys and indices of the file in a location; pydantic's also name the members of unions."""
     field = []
     for part in loc:
         try:
@@ -44,37 +40,35 @@ def _field(loc: tuple[int | str, ...], kind: str, data: Any) -> list[str]:
         except (LookupError, TypeError):
             continue
         field.append(str(part))
-    absent = kind == "missing" or (kind == "extra_forbidden" and field[-1] != loc[-1])  # the latter: `eq10:daqp`
-    return [*field, str(loc[-1])] if absent else field
+    is_absent = kind == "missing" or (kind == "extra_forbidden" and field[-1] != loc[-1])  # the latter: `eq10:daqp`
+    return (*field, str(loc[-1])) if is_absent else tuple(field)
 
 
-def _fault(fault: ErrorDetails, model: type[BaseModel]) -> str:
+def _clause(fault: Any, model: type[BaseModel]) -> str:
     """Say in words what is wrong."""
-    kind, loc, context = fault["type"], fault["loc"], fault.get("ctx", {})
-    if kind == "extra_forbidden":
-        keys = {key for block in _blocks_at(model, loc[:-1]) for key in block.model_fields}
-        return f"unknown key{nearest(str(loc[-1]), keys)}"
-    if kind == "missing":
-        return "is missing"
-    if kind in ("model_type", "model_attributes_type"):
-        return f"must be a mapping of fields, got {fault['input']!r:.60}"
-    if kind in ("union_tag_invalid", "union_tag_not_found"):
-        key = str(context["discriminator"]).strip("'")
-        tags = sorted(tag for block in _blocks_at(model, loc) for tag in _tags(block))
-        if kind == "union_tag_not_found":
-            return f"`{key}` is missing; valid are {', '.join(tags)}"
-        return f"unknown {key} {context['tag']!r}{nearest(str(context['tag']), tags)}"
-    if kind == "value_error":
-        return fault["msg"].removeprefix("Value error, ")
-    remedy = _REMEDIES.get(kind)
-    return f"{fault['msg']}, got {fault['input']!r:.60}" + (f": {remedy}" if remedy else "")
+    kind, loc, got = fault["type"], fault["loc"], f"{fault['input']!r:.60}"
+    match kind:
+        case "extra_forbidden":
+            keys = {key for block in _blocks_at(model, loc[:-1]) for key in block.model_fields}
+            return f"unknown key{nearest(str(loc[-1]), keys)}"
+        case "missing":
+            return "is missing"
+        case "model_type" | "model_attributes_type":
+            return f"must be a mapping of fields, got {got}"
+        case "union_tag_invalid" | "union_tag_not_found":
+            key = str(fault["ctx"]["discriminator"]).strip("'")
+            tags = sorted(tag for block in _blocks_at(model, loc) for tag in _tags(block))
+            if kind == "union_tag_not_found":
+                return f"`{key}` is missing; valid are {', '.join(tags)}"
+            tag = fault["ctx"]["tag"]
+            return f"unknown {key} {tag!r}{nearest(str(tag), tags)}"
+        case "value_error":
+            return str(fault["msg"].removeprefix("Value error, "))
+    return f"{fault['msg']}, got {got}" + (f": {_REMEDIES[kind]}" if kind in _REMEDIES else "")
 
 
 def _blocks_at(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[type[BaseModel]]:
-    """List the blocks that may stand at a location.
-
-    The chosen member of a union is named by its tag.
-    """
+    """List the blocks that may stand at a location, where the chosen member of a union is named by its tag."""
     blocks = [model]
     for part in loc:
         fields = [block.model_fields[str(part)] for block in blocks if part in block.model_fields]

@@ -1,8 +1,7 @@
-"""Every field that a scenario or a robot.yaml may have, as one page, made of the configuration's own types."""
+"""Every field that a scenario or a robot.yaml may have, as one page, made of the configuration's own JSON Schema."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 from pydantic import BaseModel
@@ -11,6 +10,14 @@ from qpavoid.config import RobotConfig, ScenarioConfig
 
 _LARGE = 1e8
 """Bound from which a limit of a field only excludes errors, and is not printed."""
+_HEAD = """# Fields of a scenario and of a robot.yaml
+
+Written by `qpavoid fields`. `qpavoid fields --schema scenario` (or `robot`) prints a JSON Schema: an editor that is
+given it completes fields and marks errors while you type. Unknown fields, NaN and infinity are errors.
+
+A scenario begins at [ScenarioConfig](#scenarioconfig), a robot.yaml at [RobotConfig](#robotconfig); the blocks they
+hold follow by name.
+"""
 
 
 def schema_of(root: type[BaseModel]) -> dict[str, Any]:
@@ -19,50 +26,30 @@ def schema_of(root: type[BaseModel]) -> dict[str, Any]:
     The tag that distinguishes blocks of a union is required.
     """
     schema = root.model_json_schema()
-    for name, tag in _tags(schema):
-        block = schema["$defs"][name]
-        if "const" in block["properties"][tag] and tag not in block.get("required", ()):
-            block["required"] = [tag, *block.get("required", ())]
+    for block in schema["$defs"].values():
+        for tag in ("type", "name"):
+            if "const" in block.get("properties", {}).get(tag, {}):
+                block["required"] = [tag, *block.get("required", ())]
     return schema
 
 
 def page() -> str:
-    """Write the page of all fields in Markdown.
-
-    One table for each block of a scenario and of a robot.yaml, outer ones first.
-    """
-    lines, visited_names = _HEAD.splitlines(), set[str]()
+    """Write the page of all fields in Markdown: one table for each block."""
+    roots, inner = dict[str, Any](), dict[str, Any]()
     for root in (ScenarioConfig, RobotConfig):
-        schema = schema_of(root)
-        blocks, queue = {root.__name__: schema, **schema.get("$defs", {})}, [root.__name__]
-        while queue:
-            name = queue.pop(0)
-            if name not in visited_names and "properties" in blocks[name]:
-                lines += _section(name, blocks)
-                queue += [ref for spec in blocks[name]["properties"].values() for ref in _refs(spec, blocks)]
-            visited_names.add(name)
+        roots[root.__name__] = schema_of(root)
+        inner |= roots[root.__name__]["$defs"]
+    lines = _HEAD.splitlines()
+    for name, block in [*roots.items(), *sorted(inner.items())]:
+        if "properties" not in block:
+            continue
+        lines += ["", f"## {name}", "", _flat(block.get("description", "")), ""]
+        if block["properties"]:
+            lines += ["| field | what it may be | left out | meaning |", "|---|---|---|---|"]
+        for field, spec in block["properties"].items():
+            default = "required" if field in block.get("required", ()) else _default_text(spec.get("default"))
+            lines.append(f"| `{field}` | {_kind(spec, inner)} | {default} | {_flat(spec.get('description', ''))} |")
     return "\n".join(lines)
-
-
-_HEAD = """# Fields of a scenario and of a robot.yaml
-
-Written by `qpavoid fields`. `qpavoid fields --schema scenario` (or `robot`) prints a JSON Schema: an editor that is
-given it completes fields and marks errors while you type. Unknown fields, NaN and infinity are errors.
-
-A scenario begins at [ScenarioConfig](#scenarioconfig), a robot.yaml at [RobotConfig](#robotconfig).
-"""
-
-
-def _section(name: str, blocks: dict[str, Any]) -> list[str]:
-    block = blocks[name]
-    lines = ["", f"## {name}", "", _flat(block.get("description", "")), ""]
-    if block["properties"]:
-        lines += ["| field | what it may be | left out | meaning |", "|---|---|---|---|"]
-    for field, spec in block["properties"].items():
-        default = "required" if field in block.get("required", ()) else _default_text(spec.get("default"))
-        kind, meaning = _kind(spec, blocks), _flat(spec.get("description", ""))
-        lines.append(f"| `{field}` | {kind} | {default} | {meaning} |")
-    return lines
 
 
 def _kind(spec: dict[str, Any], blocks: dict[str, Any]) -> str:
@@ -81,59 +68,24 @@ def _kind(spec: dict[str, Any], blocks: dict[str, Any]) -> str:
             return f"list of {_kind(spec.get('items', {}), blocks)}"
         case "object":
             return f"name: {_kind(spec.get('additionalProperties', {}), blocks)}"
-        case "number" | "integer":
-            return _number(spec)
-        case "null":
-            return "nothing"
+        case "number" | "integer" as kind:
+            signs = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
+            bounds = [f"{sign} {spec[key]:g}" for key, sign in signs.items() if abs(spec.get(key, _LARGE)) < _LARGE]
+            return f"{kind} {', '.join(bounds)}".strip()
         case kind:
-            return {"string": "text", "boolean": "`true` or `false`"}.get(str(kind), "anything")
-
-
-def _number(spec: dict[str, Any]) -> str:
-    bounds = [
-        f"{sign} {spec[key]:g}"
-        for key, sign in (("exclusiveMinimum", ">"), ("minimum", ">="), ("exclusiveMaximum", "<"), ("maximum", "<="))
-        if key in spec and abs(spec[key]) < _LARGE
-    ]
-    return " ".join(["integer" if spec["type"] == "integer" else "number", ", ".join(bounds)]).strip()
-
-
-def _refs(spec: Any, blocks: dict[str, Any]) -> Iterator[str]:
-    """Yield the names of the blocks that a field may hold."""
-    if isinstance(spec, dict):
-        for key, value in spec.items():
-            if key == "$ref":
-                name = value.rsplit("/", 1)[-1]
-                yield name
-                if "properties" not in blocks[name]:
-                    yield from _refs(blocks[name], blocks)
-            elif key not in ("default", "discriminator"):
-                yield from _refs(value, blocks)
-    elif isinstance(spec, list):
-        for each in spec:
-            yield from _refs(each, blocks)
-
-
-def _tags(spec: Any) -> Iterator[tuple[str, str]]:
-    """Yield each block of a union with the field that distinguishes it."""
-    if isinstance(spec, dict) and "discriminator" in spec:
-        for ref in spec["discriminator"]["mapping"].values():
-            yield ref.rsplit("/", 1)[-1], spec["discriminator"]["propertyName"]
-    for each in spec.values() if isinstance(spec, dict) else spec if isinstance(spec, list) else ():
-        yield from _tags(each)
+            names = {"string": "text", "boolean": "`true` or `false`", "null": "nothing"}
+            return names.get(str(kind), "anything")
 
 
 def _default_text(default: Any) -> str:
     """Write a default as a YAML file would give it."""
-    if isinstance(default, dict) and ("name" in default or "type" in default):
-        return f"`{default.get('name') or default['type']}`"
-    if isinstance(default, dict):
-        return "its defaults" if default else "none"
+    if isinstance(default, dict) and default:
+        return f"`{tag}`" if (tag := default.get("name") or default.get("type")) else "its defaults"
     if default is None or default == "":
         return "nothing"
     if isinstance(default, bool | float):
         return f"`{default:g}`" if isinstance(default, float) else f"`{str(default).lower()}`"
-    return f"`{default}`" if default != [] else "none"
+    return f"`{default}`" if default not in ([], {}) else "none"
 
 
 def _flat(text: str) -> str:

@@ -106,20 +106,18 @@ def _set(data: dict[str, Any], override: str, path: Path) -> None:
     except ValueError:
         raise ConfigError(f"--set {override!r}: {text!r} is not a YAML value") from None
     node: Any = data
-    keys = where.split(".")
-    for depth, key in enumerate(keys):
-        last = depth == len(keys) - 1
+    *inner, last = where.split(".")
+    for depth, key in enumerate([*inner, last]):
+        index: Any = key
         if isinstance(node, list):
             if not key.isdecimal() or len(key) > 9 or int(key) >= len(node):
                 raise ConfigError(f"{path}: --set {where}: {key!r} is not an index below {len(node)}")
-            index: Any = int(key)
-        elif isinstance(node, dict):
-            index = key
-            if not last and not isinstance(node.get(key), dict | list):
-                node[key] = _solver_mapping(node.get(key)) if key == "solver" else {}
-        else:
-            raise ConfigError(f"{path}: --set {where}: there is nothing below {'.'.join(keys[:depth])}")
-        if last:
+            index = int(key)
+        elif not isinstance(node, dict):
+            raise ConfigError(f"{path}: --set {where}: there is nothing below {'.'.join(inner[:depth])}")
+        elif depth < len(inner) and not isinstance(node.get(key), dict | list):
+            node[key] = _solver_mapping(node.get(key)) if key == "solver" else {}
+        if depth == len(inner):
             node[index] = value
         else:
             node = node[index]

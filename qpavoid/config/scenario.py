@@ -96,15 +96,10 @@ class ScenarioConfig(Block):
         return copy
 
     @model_validator(mode="after")
-    def _ends(self) -> ScenarioConfig:
+    def _checked(self) -> ScenarioConfig:
         if self.duration / self.dt > _MAX_STEPS:
-            raise ValueError(
-                f"duration / dt is {self.duration / self.dt:.3g} control steps; at most {_MAX_STEPS} are run and logged"
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _unique(self) -> ScenarioConfig:
+            steps = f"{self.duration / self.dt:.3g} control steps"
+            raise ValueError(f"duration / dt is {steps}; at most {_MAX_STEPS} are run and logged")
         for clause, names in (
             ("obstacle", [o.name for o in self.obstacles]),
             ("task", [t.label for t in self.tasks]),
@@ -113,11 +108,9 @@ class ScenarioConfig(Block):
             twice = sorted({n for n in names if names.count(n) > 1})
             if twice:
                 raise ValueError(f"{clause} {twice[0]!r} is given twice: names must differ")
+        needed = {Fixed: "position", Line: "start", Circle: "center"}
         for obstacle in self.obstacles:
-            if isinstance(obstacle.motion, Fixed) and obstacle.motion.position is None:
-                raise ValueError(f"obstacle {obstacle.name!r}: motion.position is missing")
-            if isinstance(obstacle.motion, Line) and obstacle.motion.start is None:
-                raise ValueError(f"obstacle {obstacle.name!r}: motion.start is missing")
-            if isinstance(obstacle.motion, Circle) and obstacle.motion.center is None:
-                raise ValueError(f"obstacle {obstacle.name!r}: motion.center is missing")
+            field = needed.get(type(obstacle.motion))
+            if field is not None and getattr(obstacle.motion, field) is None:
+                raise ValueError(f"obstacle {obstacle.name!r}: motion.{field} is missing")
         return self

@@ -22,37 +22,46 @@ def data_folder(kind: str) -> Path:
     return folder_in_wheel if folder_in_wheel.is_dir() else _PACKAGE.parent / kind
 
 
+_FILES = {
+    "robot": ("robots", "*/robot.yaml"),
+    "scenario": ("tasks", "*.yaml"),
+    "family": ("tasks", "families/*.yaml"),
+    "suite": ("tasks", "suites/*.yaml"),
+    "setup": ("tasks", "families/setups/*.yaml"),
+}
+"""Kind of thing that ships: its folder, and where in it its files are, named by what stands for the star."""
+
+
+def _shipped(kind: str) -> dict[str, Path]:
+    """Return the files of all things of a kind, by name."""
+    folder, pattern = _FILES[kind]
+    files = data_folder(folder).glob(pattern)
+    return dict(sorted((path.parent.name if "*/" in pattern else path.stem, path) for path in files))
+
+
 def robot_names() -> list[str]:
     """List the names of the robots that ship."""
-    return sorted(p.parent.name for p in data_folder("robots").glob("*/robot.yaml"))
+    return list(_shipped("robot"))
 
 
 def scenario_names() -> list[str]:
     """List the names of the scenarios that ship."""
-    return sorted(p.stem for p in data_folder("tasks").glob("*.yaml"))
+    return list(_shipped("scenario"))
 
 
 def family_names() -> list[str]:
     """List the names of the families of scenarios that ship."""
-    return sorted(p.stem for p in _families().glob("*.yaml"))
+    return list(_shipped("family"))
 
 
 def suite_names() -> list[str]:
     """List the names of the suites of the arena that ship."""
-    return sorted(p.stem for p in _suites().glob("*.yaml"))
+    return list(_shipped("suite"))
 
 
 def setup_names() -> list[str]:
     """List the robots that are set up for families: a posture, and locked joints."""
-    return sorted(p.stem for p in (_families() / "setups").glob("*.yaml"))
-
-
-def _families() -> Path:
-    return data_folder("tasks") / "families"
-
-
-def _suites() -> Path:
-    return data_folder("tasks") / "suites"
+    return list(_shipped("setup"))
 
 
 def example_robot_data() -> Path:
@@ -83,34 +92,22 @@ def find_scenario(name_or_path: str | Path) -> Path:
     Raises:
         ConfigError, UnknownName: there is none.
     """
-    return _find(str(name_or_path), "scenario", data_folder("tasks"), "{}.yaml", scenario_names())
+    return _find("scenario", str(name_or_path))
 
 
 def find_family(name_or_path: str | Path) -> Path:
-    """Find the path of the file of a family of scenarios, given by shipped name or by path.
-
-    Raises:
-        ConfigError, UnknownName: there is none.
-    """
-    return _find(str(name_or_path), "family", _families(), "{}.yaml", family_names())
+    """Find the path of the file of a family of scenarios; as `find_scenario`."""
+    return _find("family", str(name_or_path))
 
 
 def find_suite(name_or_path: str | Path) -> Path:
-    """Find the path of the file of a suite of the arena, given by shipped name or by path.
-
-    Raises:
-        ConfigError, UnknownName: there is none.
-    """
-    return _find(str(name_or_path), "suite", _suites(), "{}.yaml", suite_names())
+    """Find the path of the file of a suite of the arena; as `find_scenario`."""
+    return _find("suite", str(name_or_path))
 
 
 def find_setup(name: str) -> Path:
-    """Find the path of a shipped setup.
-
-    Raises:
-        UnknownName: there is none.
-    """
-    return _find(name, "setup", _families() / "setups", "{}.yaml", setup_names())
+    """Find the path of a shipped setup; as `find_scenario`."""
+    return _find("setup", name)
 
 
 def find_robot(name_or_path: str, folder: Path | None = None) -> Path:
@@ -124,23 +121,23 @@ def find_robot(name_or_path: str, folder: Path | None = None) -> Path:
         ConfigError, UnknownName: there is none.
     """
     if name_or_path.startswith(EXAMPLES):
-        return _find(str(example_robot(name_or_path)), "robot", Path(), "", [])
+        return _find("robot", str(example_robot(name_or_path)))
     if folder is not None and _looks_like_path(name_or_path) and os.path.isfile(folder / name_or_path):
         return folder / name_or_path
-    return _find(name_or_path, "robot", data_folder("robots"), "{}/robot.yaml", robot_names())
+    return _find("robot", name_or_path)
 
 
 def _looks_like_path(name: str) -> bool:
     return "/" in name or "\\" in name or name.endswith((".yaml", ".yml", ".urdf", ".xml", ".xacro"))
 
 
-def _find(name: str, kind: str, folder: Path, pattern: str, names: list[str]) -> Path:
-    if name in names:
-        return folder / pattern.format(name)
+def _find(kind: str, name: str) -> Path:
+    shipped = _shipped(kind)
+    if name in shipped:
+        return shipped[name]
     if _looks_like_path(name):
-        path = Path(name)
-        if os.path.isfile(path):  # False where the name is one that no file can have; Path.is_file may raise
-            return path
-        reason = "is a folder" if os.path.isdir(path) else "no such file"
-        raise ConfigError(f"{name}: {reason}; give a {kind} file{', or one of ' * bool(names)}{', '.join(names)}")
-    raise UnknownName(f"unknown {kind} {name!r}{nearest(name, names)}")
+        if os.path.isfile(name):  # False where the name is one that no file can have; Path.is_file may raise
+            return Path(name)
+        reason = "is a folder" if os.path.isdir(name) else "no such file"
+        raise ConfigError(f"{name}: {reason}; give a {kind} file, or one of {', '.join(shipped)}")
+    raise UnknownName(f"unknown {kind} {name!r}{nearest(name, shipped)}")

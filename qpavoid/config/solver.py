@@ -9,24 +9,25 @@ from pydantic import BeforeValidator, Field
 from qpavoid.config.base import Block, NonNegative, Positive
 
 
-class ClosedForm(Block):
-    """A solver without a back end."""
+class SolverBlock(Block):
+    """What all solvers share."""
 
     name: str
 
     @property
     def label(self) -> str:
         """Short form that names it."""
-        return self.name
+        backend = getattr(self, "backend", "auto")
+        return self.name if backend == "auto" else f"{self.name}:{backend}"
 
 
-class TrackingSolver(ClosedForm):
+class TrackingSolver(SolverBlock):
     """Damped least squares on the tracking task; does not avoid."""
 
     name: Literal["tracking"] = "tracking"
 
 
-class Eq10Solver(ClosedForm):
+class Eq10Solver(SolverBlock):
     """Eq. 10: `eq10` with the consistent bracket and α while approaching only, `eq10-literal` as printed."""
 
     name: Literal["eq10", "eq10-literal"] = "eq10"
@@ -38,7 +39,7 @@ class Eq10Solver(ClosedForm):
     """Largest α; eq. 11 grows without bound as d goes to 0 [-]."""
 
 
-class GradientProjectionSolver(ClosedForm):
+class GradientProjectionSolver(SolverBlock):
     """Tracking, with the gradient of the clearance in its null space (Liégeois 1977)."""
 
     name: Literal["gradient-projection"] = "gradient-projection"
@@ -46,7 +47,7 @@ class GradientProjectionSolver(ClosedForm):
     """k: self-motion for each m/rad of gradient; joint limits may allow less [rad²/(m s)]."""
 
 
-class PotentialFieldSolver(ClosedForm):
+class PotentialFieldSolver(SolverBlock):
     """Tracking as attraction, and FIRAS repulsion from every pair in range (Khatib 1986)."""
 
     name: Literal["potential-field"] = "potential-field"
@@ -56,7 +57,7 @@ class PotentialFieldSolver(ClosedForm):
     """Largest push of a pair, contact and penetration included [rad²/(m s)]."""
 
 
-class QpSolver(Block):
+class QpSolver(SolverBlock):
     """QP: tracking as cost, avoidance rows as inequalities, joint limits as bounds."""
 
     name: Literal["qp"] = "qp"
@@ -66,13 +67,8 @@ class QpSolver(Block):
     regularization: Positive = 1e-3
     """λ: cost of leaving the tracking velocity [(rad/s)⁻²]."""
 
-    @property
-    def label(self) -> str:
-        """Short form that names it."""
-        return self.name if self.backend == "auto" else f"{self.name}:{self.backend}"
 
-
-class HqpSolver(Block):
+class HqpSolver(SolverBlock):
     """Strict priorities: a cascade of QPs, one for each level of the tasks."""
 
     name: Literal["hqp"] = "hqp"
@@ -82,11 +78,6 @@ class HqpSolver(Block):
     regularization: Annotated[float, Field(ge=1e-7, le=1e3)] = 1e-3
     """λ: cost, at each level, of leaving the velocity that the tasks alone would have [(rad/s)⁻²]. As of `qp`, it keeps
     joints from full speed for the last mm/s of a level that obstacles hold up; it gives nothing to later levels."""
-
-    @property
-    def label(self) -> str:
-        """Short form that names it."""
-        return self.name if self.backend == "auto" else f"{self.name}:{self.backend}"
 
 
 def expand_solver(value: Any) -> Any:

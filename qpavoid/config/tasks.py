@@ -28,12 +28,8 @@ class TaskBlock(Block):
 
     @property
     def label(self) -> str:
-        """Its name, given or taken."""
-        return self.name or self.default_name()
-
-    def default_name(self) -> str:
-        """Return the name of a task that gives none."""
-        return str(getattr(self, "type"))  # noqa: B009
+        """Its name, given or taken: of a frame that follows a motion that of the frame, else the type."""
+        return self.name or str(getattr(self, "frame" if isinstance(self, Task) else "type"))
 
 
 class Task(TaskBlock):
@@ -53,10 +49,6 @@ class Task(TaskBlock):
     """Cap on the commanded linear speed [m/s]; left out: no cap."""
     max_turn_rate: Positive | None = None
     """Cap on the commanded angular speed [rad/s]; left out: no cap."""
-
-    def default_name(self) -> str:
-        """Return the name of a task that gives none."""
-        return self.frame
 
 
 class RelativeTask(TaskBlock):

@@ -85,9 +85,7 @@ class MeasuredStates:
             )
         )  # fmt: skip
 
-    def extrapolate(
-        self, which: IntArray, t: float, stale_after: float, growth: float, states: Array, margin: Array
-    ) -> int:
+    def extrapolate(self, which: IntArray, t: float, stale_after: float, states: Array, margin: Array) -> int:
         """Write where some obstacles are at t [s], and margins of stale ones; see `kernels.extrapolate_estimates`.
 
         Returns:
@@ -95,7 +93,7 @@ class MeasuredStates:
         """
         return int(
             kernels.extrapolate_estimates(
-                which, t, _LONGEST, self.stamps, self.states, states, stale_after, growth, self.at_rest, margin
+                which, t, _LONGEST, self.stamps, self.states, states, stale_after, self.at_rest, margin
             )
         )
 

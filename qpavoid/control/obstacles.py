@@ -88,7 +88,6 @@ class ObstacleTracker:
         least, (stale, stop) = _LEAST_PERIODS * dt + _ROUND_OFF, (config.stale_after, config.stop_after)
         self._stale_after = np.inf if stale is None else max(stale + _ROUND_OFF, least)
         self._stop_after = np.inf if stop is None else max(stop + _ROUND_OFF, least)
-        self._growth = config.margin_growth
         self._moving = [i for i, obstacle in enumerate(obstacles) if obstacle.moves]
         self._trajectories = TrajectoryBatch({i: obstacles[i].motion for i in self._moving})
         self._now, count = 0.0, len(obstacles)
@@ -118,7 +117,7 @@ class ObstacleTracker:
         kernels.check_states(states, none, none, FARTHEST, FASTEST)
         kernels.write_rows(states, none, states[:0], none, FARTHEST, FASTEST, none, no_stamps)
         self._measured.update(none, none, no_stamps, now.states)
-        self._measured.extrapolate(none, 0.0, 0.0, 0.0, now.states, now.margin)
+        self._measured.extrapolate(none, 0.0, 0.0, now.states, now.margin)
         extrapolate(states[:0], 0.0)
 
     @property
@@ -290,9 +289,7 @@ class ObstacleTracker:
             self._current.voxels.update(given.voxels)
         if len(self.external):
             current.margin.fill(0.0)
-            stale = self._measured.extrapolate(
-                self.external, t, self._stale_after, self._growth, current.states, current.margin
-            )
+            stale = self._measured.extrapolate(self.external, t, self._stale_after, current.states, current.margin)
             if stale or self._awaited:
                 assumptions, stop = self._overdue(t)
                 notes += assumptions

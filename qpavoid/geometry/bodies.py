@@ -42,8 +42,8 @@ def convert_bodies(bodies: Any, kind: str) -> Any:
     converted = pin.GeometryModel()
     for body in bodies.geometryObjects:
         geometry, placement = body.geometry, body.placement
-        if kind == "convex" and isinstance(geometry, coal.BVHModelBase):
-            geometry = convex_hull(np.array(geometry.vertices()))
+        if kind == "convex":
+            geometry = hull(geometry)
         elif kind == "capsule":
             fit = enclosing_capsule(geometry)
             geometry = coal.Capsule(fit.radius, fit.length) if fit.length > 0 else coal.Sphere(fit.radius)
@@ -52,6 +52,11 @@ def convert_bodies(bodies: Any, kind: str) -> Any:
             pin.GeometryObject(body.name, body.parentJoint, body.parentFrame, placement, geometry)
         )
     return converted
+
+
+def hull(geometry: Any) -> Any:
+    """Return the convex hull of a mesh; primitives as they are."""
+    return convex_hull(np.array(geometry.vertices())) if isinstance(geometry, coal.BVHModelBase) else geometry
 
 
 def triangle_meshes(bodies: Any) -> list[str]:
@@ -114,7 +119,7 @@ def hull_points(geometry: Any) -> Array:
     """Return points whose hull encloses the shape (n, 3) [m]."""
     match geometry:
         case coal.BVHModelBase():  # fine meshes have a hundred times the points of their hulls
-            return np.array(convex_hull(np.array(geometry.vertices())).points())
+            return np.array(hull(geometry).points())
         case coal.ConvexBase():
             return np.array(geometry.points())
         case coal.Cylinder():

@@ -109,10 +109,14 @@ def update_estimates(
     return rejected
 
 
+MARGIN_GROWTH = 0.1
+"""Rate at which the margin of a stale obstacle grows [m/s]: a bound on the error of its last twist."""
+
+
 @compiled
 def extrapolate_estimates(
     which: IntArray, t: float, longest: float, stamps: Array, last: Array, states: Array,
-    stale_after: float, growth: float, at_rest: Array, margin: Array,
+    stale_after: float, at_rest: Array, margin: Array,
 ) -> int:  # fmt: skip
     """Bring obstacles from where they were at their time stamps to t, at constant twists about their origins.
 
@@ -124,7 +128,6 @@ def extrapolate_estimates(
         last: states at these (o, 18).
         states: out: rows `which` (o, 18).
         stale_after: age from which one is stale [s].
-        growth: rate at which margins of stale ones grow [m/s].
         at_rest: those that are never stale (o,).
         margin: out: of the stale ones (o,) [m].
 
@@ -140,7 +143,7 @@ def extrapolate_estimates(
             continue
         if age > stale_after and not at_rest[i]:
             stale += 1
-            margin[i] = growth * (age - stale_after)
+            margin[i] = MARGIN_GROWTH * (age - stale_after)
         _extrapolate(x, min(age, longest))
     return stale
 

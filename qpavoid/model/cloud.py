@@ -20,6 +20,10 @@ from qpavoid.problem import Array, IntArray, as_numbers
 
 _BLOCK = 4
 """Voxels along the edge of a block."""
+_HALF = 2**15
+"""Blocks are numbered from -_HALF to _HALF - 1 along each axis."""
+_STRIDES = np.array([_BLOCK**3 * (2 * _HALF) ** 2, _BLOCK**3 * 2 * _HALF, _BLOCK**3, _BLOCK**2, _BLOCK, 1])
+"""Of a voxel's key for its block's numbers along the axes, and its own in the block."""
 _MAX_DISTANCE = 1e2
 """Largest distance of a point from the cloud's origin [m]; no depth camera measures farther, and others are dropped."""
 _LARGEST, _MOST_POINTS = 200_000_000, 5_000_000
@@ -78,9 +82,9 @@ class Voxels:
         is_finite = np.abs(array).max(axis=1, initial=0.0) <= _MAX_DISTANCE  # False for NaN too
         finite = array if is_finite.all() else array[is_finite]
         voxel = np.floor(finite / resolution).astype(np.int64)
-        keys = np.unique(_key(voxel // _BLOCK) * _BLOCK**3 + _within(voxel % _BLOCK))
-        corner = _BLOCK * _unkey(keys // _BLOCK**3) + _unwithin(keys % _BLOCK**3)
-        centers = (corner + 0.5) * resolution
+        places = np.concatenate((voxel // _BLOCK + _HALF, voxel % _BLOCK), axis=1)
+        keys, first = np.unique(places @ _STRIDES, return_index=True)
+        centers = np.asarray((voxel[first] + 0.5) * resolution, dtype=np.float64)
         block = keys // _BLOCK**3
         starts = np.flatnonzero(np.diff(block, prepend=-1)).astype(np.intp)
         blocks = np.empty((len(starts), 4))
@@ -133,35 +137,14 @@ def read_points(path: Path, where: str) -> Array:
         elif path.suffix == ".csv":
             header, _, rows = read_text(path, _LARGEST, where).partition("\n")
             if header.replace(" ", "").strip() != "x,y,z":
-                raise ConfigError(f"{where}: {path}: header is `{header.strip():.40}`; the first line must be `x,y,z`")
+                raise ValueError(f"header is `{header.strip():.40}`, and not `x,y,z`")
             points = np.loadtxt(rows.splitlines(), delimiter=",", ndmin=2, dtype=np.float64)
         else:
-            raise ConfigError(f"{where}: {path}: neither .npy nor .csv; convert it, as with numpy.save")
+            raise ValueError("neither .npy nor .csv")
+        if getattr(points, "ndim", 0) != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
+            raise ValueError(f"an array of shape {getattr(points, 'shape', ())}")
     except (ValueError, EOFError, OSError) as error:
         raise ConfigError(f"{where}: {path}: {error}; give an array (n, 3) of numbers") from None
-    if getattr(points, "ndim", 0) != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
-        raise ConfigError(f"{where}: {path}: an array of shape {getattr(points, 'shape', ())}; give (n, 3) numbers")
     if len(points) > _MOST_POINTS:
         raise ConfigError(f"{where}: {path}: {len(points)} points; at most {_MOST_POINTS} are read: thin them out")
     return np.asarray(points, dtype=np.float64)
-
-
-_HALF = 2**15
-"""Blocks are numbered from -_HALF to _HALF - 1 along each axis."""
-
-
-def _key(block: IntArray) -> Any:
-    shifted = block + _HALF
-    return (shifted[:, 0] * (2 * _HALF) + shifted[:, 1]) * (2 * _HALF) + shifted[:, 2]
-
-
-def _unkey(key: Any) -> Any:
-    return np.stack((key // (2 * _HALF) ** 2, key // (2 * _HALF) % (2 * _HALF), key % (2 * _HALF)), axis=1) - _HALF
-
-
-def _within(voxel: IntArray) -> Any:
-    return (voxel[:, 0] * _BLOCK + voxel[:, 1]) * _BLOCK + voxel[:, 2]
-
-
-def _unwithin(key: Any) -> Any:
-    return np.stack((key // _BLOCK**2, key // _BLOCK % _BLOCK, key % _BLOCK), axis=1)

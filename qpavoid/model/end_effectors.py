@@ -37,13 +37,12 @@ def end_effectors(model: Any, srdf_ends: Sequence[str] = ()) -> list[str]:
         srdf_ends: frames that an SRDF calls end effectors; those that do not exist are left out.
     """
     frames = {f.name: f.parentJoint for f in model.frames if f.type in _LINKS}
-    ends = [name for name in srdf_ends if name in frames]
-    ends = [_tool_named(model, frames[name]) or name for name in ends]
+    ends = [_tool(model, frames[name], name) or name for name in srdf_ends if name in frames]
     used_joints = {joint for name in ends for joint in list(model.supports[frames[name]])[1:]}
     root = 1 if model.njoints > 1 and model.names[1] == "root_joint" else 0
     for least in (_LIMB, 1):
         joints = _ends(model, root, 0, least)
-        tools = [_tool_frame(model, joint) for joint in joints if joint not in used_joints]
+        tools = [_tool(model, joint) for joint in joints if joint not in used_joints]
         ends += [name for name in tools if name is not None and not _NO_TOOLS.search(name)]
         if ends:
             break
@@ -73,17 +72,11 @@ def _depth(model: Any, joint: int) -> int:
     return 1 + max((_depth(model, child) for child in model.children[joint]), default=0)
 
 
-def _tool_frame(model: Any, joint: int) -> str | None:
-    """Find the frame of a joint that is best called a tool: by name, else its own link."""
-    names = [f.name for f in model.frames if f.parentJoint == joint and f.type in _LINKS]
-    return _tool_named(model, joint) or (str(names[0]) if names else None)
-
-
-def _tool_named(model: Any, joint: int) -> str | None:
-    """Find the frame of a joint whose name is that of a tool, if there is one."""
-    names = [f.name for f in model.frames if f.parentJoint == joint and f.type in _LINKS]
+def _tool(model: Any, joint: int, default: str | None = None) -> str | None:
+    """Find the frame of a joint whose name is that of a tool, else the default, else the joint's own link."""
+    names = [str(f.name) for f in model.frames if f.parentJoint == joint and f.type in _LINKS]
     for word in _TOOL_WORDS:
         pattern = re.compile(rf"(?:^|[^a-z]){word}(?:[^a-z]|$)", re.IGNORECASE)
         if named := [name for name in names if pattern.search(name)]:
-            return str(min(named, key=len))
-    return None
+            return min(named, key=len)
+    return default or (names[0] if names else None)

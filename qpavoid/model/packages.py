@@ -22,17 +22,12 @@ _HEAD = 100_000
 def absolute_entries(entries: Iterable[str], folder: Path) -> list[str]:
     """Make the folders of `package_dirs` absolute.
 
-    Relative ones are counted from the folder of the file that names them.
-
     Args:
         entries: folders that hold packages, or `NAME=FOLDER`.
-        folder: of the file.
+        folder: of the file that names them, from which relative ones are counted.
     """
-    result = []
-    for entry in entries:
-        name, place = _split(entry, folder)
-        result.append(f"{name}={folder / place}" if name else str(folder / place))
-    return result
+    parts = [_split(entry, folder) for entry in entries]
+    return [f"{name}={folder / place}" if name else str(folder / place) for name, place in parts]
 
 
 def mesh_folders(urdf: Path, entries: Iterable[str]) -> list[str]:
@@ -52,34 +47,28 @@ def mesh_folders(urdf: Path, entries: Iterable[str]) -> list[str]:
     above = [str(parent) for parent in urdf.resolve().parents]
     own = [folder for folder in above if os.path.isfile(os.path.join(folder, _MANIFEST))][:1]
     holders = [entry for entry in entries if not _split(entry)[0]] + [os.path.dirname(folder) for folder in own] + ros
-    names_of_manifests = [
+    folders = dict.fromkeys(folder for holder in holders for folder in _with_manifest(holder))
+    renamed = [
         f"{name}={folder}"
-        for folder in dict.fromkeys(folder for holder in holders for folder in _with_manifest(holder))
+        for folder in folders
         if (name := _manifest_name(folder)) and name != os.path.basename(folder)
     ]
-    return list(dict.fromkeys([*entries, *above, *names_of_manifests, str(example_robot_data()), *ros]))
+    return list(dict.fromkeys([*entries, *above, *renamed, str(example_robot_data()), *ros]))
 
 
 def find_mesh(name: str, entries: Iterable[str]) -> str | None:
     """Find the file of a mesh name; None if it is absent.
 
-    Names are such as `package://NAME/meshes/a.stl`, `file:///a.stl` or `meshes/a.stl`.
-
     Args:
-        name: as a URDF has it.
+        name: as a URDF has it, such as `package://NAME/meshes/a.stl`, `file:///a.stl` or `meshes/a.stl`.
         entries: see `mesh_folders`.
     """
-    for scheme in ("package://", "model://"):
-        if name.startswith(scheme):
-            name = name.removeprefix(scheme).lstrip("/")  # some write three slashes
-    name = name.removeprefix("file://")
+    name = re.sub(r"^(package|model):///*|^file://", "", name)  # some write three slashes
     package, _, inside = name.partition("/")
     for entry in entries:
         mapped, folder = _split(entry)
-        if mapped and mapped != package:
-            continue
         result = os.path.join(folder, inside if mapped else name)
-        if os.path.isfile(result):
+        if mapped in ("", package) and os.path.isfile(result):
             return result
     return None
 
@@ -93,9 +82,8 @@ def find_package(name: str, entries: Iterable[str]) -> str | None:
     """
     for entry in entries:
         mapped, folder = _split(entry)
-        if mapped == name:
-            return folder
-        if not mapped and os.path.isdir(result := os.path.join(folder, name)):
+        result = folder if mapped else os.path.join(folder, name)
+        if mapped in ("", name) and os.path.isdir(result):
             return result
     return None
 
@@ -120,10 +108,7 @@ def _with_manifest(holder: str) -> Iterator[str]:
 
 
 def _manifest_name(folder: str) -> str:
-    """Read the name that a package.xml gives, or nothing.
-
-    By its text: nothing else in the file matters here.
-    """
+    """Read the name that a package.xml gives, or nothing; by its text, as nothing else in the file matters here."""
     try:
         with open(os.path.join(folder, _MANIFEST), encoding="utf-8", errors="replace") as file:
             match = _NAME.search(re.sub(r"<!--.*?-->", "", file.read(_HEAD), flags=re.DOTALL))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from fnmatch import fnmatchcase
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,24 +29,20 @@ def add_self_pairs(model: Any, bodies: Any, disabled: Iterable[tuple[str, str]],
         UnknownName: a pattern that matches no body.
     """
     names = [body.name for body in bodies.geometryObjects]
-    disabled_pairs: set[frozenset[int]] = set()
-    for pattern_a, pattern_b in disabled:
-        matches = [_matching(pattern, names, origin) for pattern in (pattern_a, pattern_b)]
-        disabled_pairs |= {frozenset((i, j)) for i in matches[0] for j in matches[1]}
     joints = [body.parentJoint for body in bodies.geometryObjects]
-    for i in range(len(names)):
-        for j in range(i + 1, len(names)):
-            a, b = joints[i], joints[j]
-            adjacent = a == b or model.parents[a] == b or model.parents[b] == a
-            if not adjacent and frozenset((i, j)) not in disabled_pairs:
-                bodies.addCollisionPair(pin.CollisionPair(i, j))
 
+    def matching(pattern: str) -> list[int]:
+        matches = [i for i, name in enumerate(names) if fnmatchcase(name, pattern)]
+        if not matches:
+            raise UnknownName(f"{origin}: disabled_pairs: no body {pattern!r}{nearest(pattern, names)}")
+        return matches
 
-def _matching(pattern: str, names: list[str], origin: str) -> list[int]:
-    matches = [i for i, name in enumerate(names) if fnmatchcase(name, pattern)]
-    if not matches:
-        raise UnknownName(f"{origin}: disabled_pairs: no body {pattern!r}{nearest(pattern, names)}")
-    return matches
+    disabled_pairs = {frozenset((i, j)) for a, b in disabled for i in matching(a) for j in matching(b)}
+    for i, j in combinations(range(len(names)), 2):
+        a, b = joints[i], joints[j]
+        adjacent = a == b or model.parents[a] == b or model.parents[b] == a
+        if not adjacent and frozenset((i, j)) not in disabled_pairs:
+            bodies.addCollisionPair(pin.CollisionPair(i, j))
 
 
 ALWAYS_TOUCHING = 0.95
@@ -85,7 +82,7 @@ def drop_always_touching(model: Any, bodies: Any, joints: JointBounds, samples: 
     finite = np.isfinite(joints.lower) & np.isfinite(joints.upper)
     poses = []
     for _ in range(samples):
-        q = pin.integrate(model, neutral, random.uniform(-np.pi, np.pi, model.nv) * _turns(model))
+        q = pin.integrate(model, neutral, random.uniform(-np.pi, np.pi, model.nv))
         q[joints.q_index[finite]] = random.uniform(joints.lower[finite], joints.upper[finite])
         poses.append(q)
     share = find_contacts(model, bodies, poses, ALWAYS_TOUCHING).mean(axis=0)
@@ -94,15 +91,6 @@ def drop_always_touching(model: Any, bodies: Any, joints: JointBounds, samples: 
     for index in indices:
         bodies.removeCollisionPair(pin.CollisionPair(*pairs[index]))
     return [TouchingPair(names[pairs[i][0]], names[pairs[i][1]], float(share[i])) for i in indices]
-
-
-def _turns(model: Any) -> Array:
-    """Return 1 for coordinates that move, 0 for joints whose range is a point (nv,)."""
-    turns = np.ones(model.nv)
-    for joint in list(model.joints)[1:]:
-        if joint.nq == joint.nv == 1 and model.lowerPositionLimit[joint.idx_q] == model.upperPositionLimit[joint.idx_q]:
-            turns[joint.idx_v] = 0.0
-    return turns
 
 
 def find_contacts(model: Any, bodies: Any, poses: Sequence[Array], at_least: float = 0.0) -> Mask:

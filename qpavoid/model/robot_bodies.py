@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import pinocchio as pin
 
 from qpavoid.config import Body, Hull, RobotConfig
 from qpavoid.errors import ConfigError, UnknownName, nearest
-from qpavoid.geometry.bodies import convert_bodies, make_shape, triangle_meshes
+from qpavoid.geometry.bodies import convert_bodies, hull, make_shape, triangle_meshes
 from qpavoid.model.joints import frame_index
 from qpavoid.model.notes import Note, NoteKind
 from qpavoid.model.packages import absolute_entries
@@ -33,18 +33,19 @@ def robot_bodies(config: RobotConfig, urdf: Path, model: Any, path: Path, notes:
     Raises:
         ConfigError, UnknownName: a shape that cannot be read, a frame or a piece of geometry that does not exist.
     """
-    package_dirs = absolute_entries(config.package_dirs, path.parent)
+    package_dirs, listed = absolute_entries(config.package_dirs, path.parent), not isinstance(config.bodies, str)
 
-    def read(enclosed: bool, notes_of_pieces: list[Note]) -> Any:
+    def read() -> Any:
+        notes_of_pieces = [] if listed else notes  # what is not listed is left out on purpose
         return read_pieces(
             urdf, model, package_dirs, path, notes_of_pieces,
-            visuals=config.visuals, allow_missing=config.allow_missing_meshes, enclosed=enclosed,
+            visuals=config.visuals, allow_missing=config.allow_missing_meshes, enclosed=listed,
         )  # fmt: skip
 
     if not isinstance(config.bodies, str):
-        hulls = _hulls(config.bodies, lambda: read(True, []), path)  # what is not listed is left out on purpose
-        return _listed_bodies(config.bodies, model, hulls, path)
-    pieces = read(False, notes)
+        hulls = any(isinstance(body.shape, Hull) for body in config.bodies)
+        return _listed_bodies(config.bodies, model, read().geometryObjects if hulls else (), path)
+    pieces = read()
     note_implausible_sizes(model, pieces, notes)
     bodies = convert_bodies(pieces, config.bodies)
     if meshes := triangle_meshes(bodies):
@@ -57,45 +58,30 @@ def robot_bodies(config: RobotConfig, urdf: Path, model: Any, path: Path, notes:
     return bodies
 
 
-def _hulls(configs: Sequence[Body], read: Callable[[], Any], path: Path) -> dict[str, Any]:
-    """Make the hulls of the pieces of geometry that bodies name."""
-    indices = {body.shape.geometry: index for index, body in enumerate(configs) if isinstance(body.shape, Hull)}
-    if not indices:
-        return {}
-    pieces = {piece.name: piece for piece in read().geometryObjects}
-    selection = pin.GeometryModel()
-    for name, index in indices.items():
-        if name not in pieces:
-            raise UnknownName(
-                f"{path}: bodies.{index}.shape.geometry: no collision geometry {name!r}{nearest(name, pieces)}"
-            )
-        selection.addGeometryObject(pieces[name])
-    return {hull.name: hull for hull in convert_bodies(selection, "convex").geometryObjects}
-
-
-def _listed_bodies(configs: Sequence[Body], model: Any, hulls: Mapping[str, Any], path: Path) -> Any:
+def _listed_bodies(configs: Sequence[Body], model: Any, pieces: Sequence[Any], path: Path) -> Any:
+    """Make bodies of the shapes of a robot.yaml, or of pieces of the URDF that they name."""
+    named = {piece.name: piece for piece in pieces}
     bodies = pin.GeometryModel()
     for index, body in enumerate(configs):
+        where = f"{path}: bodies.{index}"
         if not model.existFrame(body.frame):
             frames = [f.name for f in model.frames if f.type == pin.BODY]
-            raise UnknownName(f"{path}: bodies.{index}.frame: no frame {body.frame!r}{nearest(body.frame, frames)}")
+            raise UnknownName(f"{where}.frame: no frame {body.frame!r}{nearest(body.frame, frames)}")
         if bodies.existGeometryName(body.name):
-            raise ConfigError(f"{path}: bodies.{index}.name: {body.name!r} is given twice: names must differ")
+            raise ConfigError(f"{where}.name: {body.name!r} is given twice: names must differ")
         frame_id = frame_index(model, body.frame)
         frame = model.frames[frame_id]
         placement = frame.placement * pin.SE3(rpy_to_matrix(body.rpy), np.array(body.position))
         if isinstance(body.shape, Hull):
-            hull = hulls[body.shape.geometry]
-            geometry, placement = hull.geometry, placement * _in_link(hull, model)
+            name = body.shape.geometry
+            if name not in named:
+                raise UnknownName(f"{where}.shape.geometry: no collision geometry {name!r}{nearest(name, named)}")
+            geometry = hull(named[name].geometry)
+            placement = placement * model.frames[named[name].parentFrame].placement.actInv(named[name].placement)
         else:
             geometry = make_shape(body.shape)
         bodies.addGeometryObject(pin.GeometryObject(body.name, frame.parentJoint, frame_id, placement, geometry))
     return bodies
-
-
-def _in_link(body: Any, model: Any) -> Any:
-    """Return the placement of a body in the frame of its link."""
-    return model.frames[body.parentFrame].placement.actInv(body.placement)
 
 
 def pair_margins(config: RobotConfig, bodies: Any, path: Path) -> dict[frozenset[str], float]:

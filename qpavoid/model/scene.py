@@ -139,8 +139,7 @@ def build_scene(robot: Robot, obstacles: Sequence[Obstacle] = ()) -> Scene:
             read.
     """
     obstacles = sorted(obstacles, key=lambda obstacle: not obstacle.graspable)
-    geometry = pin.GeometryModel(robot.bodies)
-    bodies = len(robot.bodies.geometryObjects)
+    geometry, bodies = pin.GeometryModel(robot.bodies), robot.bodies.ngeoms
     movable = bodies + sum(obstacle.graspable for obstacle in obstacles)
     names, obstacle_of = [body.name for body in robot.bodies.geometryObjects], [-1] * bodies
     clouds: dict[int, Voxels] = {}
@@ -156,21 +155,16 @@ def build_scene(robot: Robot, obstacles: Sequence[Obstacle] = ()) -> Scene:
                 f"obstacles: {obstacle.name!r}: a {shape.type} cannot be carried; give a primitive, or a mesh with "
                 "`method: convex`"
             )
-        first = len(names)
         if isinstance(shape, config.PointCloud):
             clouds[number] = _points(shape, folder, where)
-            solids, placement = (
-                solids * (movable * shape.nearest),
-                pin.SE3(np.eye(3), np.array([PARKING_DISTANCE, 0.0, 0.0])),
-            )
-        for solid in solids:
-            piece = f"{obstacle.name}[{len(names) - first}]" if len(solids) > 1 else obstacle.name
+            solids = solids * (movable * shape.nearest)  # each body has spheres of its own
+            placement = pin.SE3(np.eye(3), np.array([PARKING_DISTANCE, 0.0, 0.0]))
+        for k, solid in enumerate(solids):
+            piece = f"{obstacle.name}[{k}]" if len(solids) > 1 else obstacle.name
             index = geometry.addGeometryObject(pin.GeometryObject(piece, 0, 0, placement, solid))
             names.append(obstacle.name)
             obstacle_of.append(number)
-            partners = range(min(index, movable))
-            if isinstance(shape, config.PointCloud):
-                partners = range((index - first) // shape.nearest, (index - first) // shape.nearest + 1)
+            partners = [k // shape.nearest] if isinstance(shape, config.PointCloud) else range(min(index, movable))
             for partner in partners:
                 fixed = partner < bodies and geometry.geometryObjects[partner].parentJoint == 0
                 if not (fixed and isinstance(shape, config.HalfSpace)):
@@ -209,9 +203,8 @@ def _without_cylinders_among_spheres(geometry: Any) -> None:
 
 
 def _points(shape: config.PointCloud, folder: Path, where: str) -> Voxels:
-    if shape.path is None:
-        return Voxels.of(np.zeros((0, 3)), shape.resolution)
-    voxels = Voxels.of(read_points(folder / shape.path, f"{where}.path"), shape.resolution)
+    points = np.zeros((0, 3)) if shape.path is None else read_points(folder / shape.path, f"{where}.path")
+    voxels = Voxels.of(points, shape.resolution)
     if voxels.dropped:
         raise ConfigError(
             f"{where}.path: {voxels.dropped} of {voxels.given} points are NaN, infinite or over 100 m away; leave them "

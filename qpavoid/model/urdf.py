@@ -6,8 +6,7 @@ import os
 import sys
 import tempfile
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -116,32 +115,23 @@ def _parsed(parse: Callable[[], Any], where: str, remedy: str = "") -> Any:
         ConfigError: it raises an error, or prints one; in one line.
     """
     result, reason = None, ""
-    with _quiet_stderr() as messages:
-        try:
-            result = parse()
-        except (ValueError, RuntimeError, IndexError) as error:
-            reason = _reason(error)
-    reason = next((line.split(":", 1)[1].strip() for line in messages if line.startswith("Error:")), reason)
-    if reason:
-        raise ConfigError(f"{where}: {reason}{remedy}")
-    return result
-
-
-@contextmanager
-def _quiet_stderr() -> Iterator[list[str]]:
-    """Catch the lines that are printed on the process's error stream."""
-    lines: list[str] = []
     sys.stderr.flush()
     stderr_copy = os.dup(2)
     with tempfile.TemporaryFile() as file:
         os.dup2(file.fileno(), 2)
         try:
-            yield lines
+            result = parse()
+        except (ValueError, RuntimeError, IndexError) as error:
+            reason = _reason(error)
         finally:
             os.dup2(stderr_copy, 2)
             os.close(stderr_copy)
-            file.seek(0)
-            lines += file.read().decode(errors="replace").splitlines()
+        file.seek(0)
+        printed = file.read().decode(errors="replace").splitlines()
+    reason = next((line.split(":", 1)[1].strip() for line in printed if line.startswith("Error:")), reason)
+    if reason:
+        raise ConfigError(f"{where}: {reason}{remedy}")
+    return result
 
 
 def _reason(error: Exception) -> str:

@@ -15,7 +15,7 @@ from qpavoid.errors import nearest
 from qpavoid.model.notes import Note, NoteKind
 from qpavoid.model.trajectory import rpy_to_matrix
 
-_MOST_LINKS, _MOST_MOVING, _MOST_SHAPES = 1000, 200, 300
+_MOST = {"links": 1000, "joints that move": 200, "collision shapes": 300}
 """Humanoids have 130, 101 and 112. Parsers recurse along a chain; memory grows with the cube of the joints that move,
 and the pairs with the square of the shapes."""
 _LIMITED = ("revolute", "prismatic")
@@ -56,13 +56,10 @@ def check_counts(links: int, moving: int, shapes: int) -> None:
     Raises:
         ValueError: it has, with the numbers.
     """
-    for count, most, noun in (
-        (links, _MOST_LINKS, "links"),
-        (moving, _MOST_MOVING, "joints that move"),
-        (shapes, _MOST_SHAPES, "collision shapes"),
-    ):
-        if count > most:
-            raise ValueError(f"{count} {noun}; at most {most} are read")
+    counts = {"links": links, "joints that move": moving, "collision shapes": shapes}
+    for noun, count in counts.items():
+        if count > _MOST[noun]:
+            raise ValueError(f"{count} {noun}; at most {_MOST[noun]} are read")
 
 
 def origin(element: ET.Element, where: str) -> Any:

@@ -55,13 +55,9 @@ def read_robot_xml(path: Path, kind: str) -> ET.Element:
 
 def undeclared_prefixes(root: ET.Element) -> list[str]:
     """List the prefixes that no xmlns attribute declares, each once."""
-    prefixes: dict[str, None] = {}
-    declared = {"xml", "xmlns"}
-    for element in root.iter():
-        names = [name for name in (element.tag, *element.attrib) if ":" in name]
-        declared |= {name.removeprefix("xmlns:") for name in names if name.startswith("xmlns:")}
-        prefixes |= {name.partition(":")[0]: None for name in names}
-    return [prefix for prefix in prefixes if prefix not in declared]
+    names = [name for element in root.iter() for name in (element.tag, *element.attrib) if ":" in name]
+    declared = {"xml", "xmlns", *(name.removeprefix("xmlns:") for name in names if name.startswith("xmlns:"))}
+    return [prefix for prefix in dict.fromkeys(name.partition(":")[0] for name in names) if prefix not in declared]
 
 
 def _parse(text: str) -> ET.Element:

@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from qpavoid.errors import ConfigError
-from qpavoid.geometry.segments import point_segment_distance
 from qpavoid.problem import Array, IntArray, Status
 from qpavoid.reason import Severity
+from qpavoid.run.metrics import path_deviation
 
 STATUSES = tuple(Status)
 """Status of each code in `Log.status`."""
@@ -245,25 +245,3 @@ class Log:
 
     def _arrays(self) -> dict[str, Any]:
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "meta"}
-
-
-def path_deviation(tool: Array, target: Array, corners: int = 500) -> Array:
-    """Compute the distance of each tool from the path that its target draws, at whatever time.
-
-    Args:
-        tool: (N, k, 3) positions of the tools [m].
-        target: (N, k, 3) positions of their targets [m].
-        corners: the path is taken as a polyline with at most so many corners.
-
-    Returns:
-        (N, k) [m].
-    """
-    count, tasks = tool.shape[:2]
-    deviation = np.full((count, tasks), np.inf)
-    every = np.unique(np.linspace(0, max(count - 1, 0), min(count, corners)).astype(int))
-    for task in range(tasks):
-        path = target[every, task]
-        for start, end in zip(path, np.concatenate((path[1:], path[-1:])), strict=True):
-            distance = point_segment_distance(tool[:, task], start, end)
-            deviation[:, task] = np.minimum(deviation[:, task], distance)
-    return deviation

@@ -20,20 +20,10 @@ from qpavoid.model.plausibility import note_implausible_sizes
 from qpavoid.model.robot import Robot
 from qpavoid.model.urdf import read_model, read_pieces
 from qpavoid.problem import Array
+from qpavoid.setup import pairs
 from qpavoid.setup.fit import MAX_VOLUME_RATIO, Bodies
 from qpavoid.setup.home import HOME_CLEARANCE, Home, find_home
-from qpavoid.setup.poses import home_candidates, joint_locks, joint_values
-from qpavoid.setup.reasons import (
-    Reason,
-    UncheckedLinks,
-    by_link,
-    measure_unchecked,
-    own_margins,
-    pair_reasons,
-    shares_of_contact,
-    srdf_reason,
-    with_pairs,
-)
+from qpavoid.setup.joints import home_candidates, joint_locks, joint_values, wheel_joints
 from qpavoid.setup.sampling import (
     D1,
     SAMPLES,
@@ -46,10 +36,12 @@ from qpavoid.setup.sampling import (
 )
 from qpavoid.setup.shapes import LinkBodies, Piece, bodies_of_link, kinds_of_links, pieces_of
 from qpavoid.setup.srdf import Semantics, find_srdf, read_srdf
-from qpavoid.setup.telescope import nested_pairs
-from qpavoid.setup.wheels import wheel_joints
 
 Root = Literal["fixed", "planar", "free_flyer"]
+_HOME_NEAR = 0.04
+"""Distance at the preferred home pose, as a share of the robot's size, within which capsules are oversized [-]."""
+_POSES = 200
+"""Random poses in which oversized capsules show."""
 
 
 @dataclass(frozen=True)
@@ -88,8 +80,6 @@ class Description:
     """Fields of the robot.yaml; file names in it are absolute."""
     robot: Robot
     """As it is with that description."""
-    urdf: Path
-    """The file that it was made of."""
     options: DescribeOptions
     """What the user chose."""
     pieces: Sequence[Piece]
@@ -104,7 +94,7 @@ class Description:
     """Pairs: all, adjacent, srdf, always, drawn in, never, active."""
     near: float
     """Distance that counts as never coming near [m]."""
-    unchecked: Sequence[UncheckedLinks]
+    unchecked: Sequence[pairs.UncheckedLinks]
     """Links that are not checked against each other."""
     home: Home
     """The home pose."""
@@ -112,12 +102,8 @@ class Description:
     """What was left out, mended, replaced or assumed."""
 
 
-def _silent(_: str) -> None:
-    """Say nothing of the progress."""
-
-
 def describe(
-    urdf: Path, options: DescribeOptions | None = None, progress: Callable[[str], None] = _silent
+    urdf: Path, options: DescribeOptions | None = None, progress: Callable[[str], None] = lambda _: None
 ) -> Description:
     """Work out the robot.yaml of a URDF or MJCF.
 
@@ -129,12 +115,10 @@ def describe(
     Raises:
         ConfigError, UnknownName: naming file, field and remedy.
     """
-    options = options or DescribeOptions()
-    urdf = urdf.resolve()
     progress("reading the model")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RobotWarning)  # all notes of the robot are in the description
-        return _describe(urdf, options, progress)
+        return _describe(urdf.resolve(), options or DescribeOptions(), progress)
 
 
 def _describe(urdf: Path, options: DescribeOptions, progress: Callable[[str], None]) -> Description:
@@ -144,62 +128,57 @@ def _describe(urdf: Path, options: DescribeOptions, progress: Callable[[str], No
     notes: list[Note] = []
     packages = absolute_entries([str(entry) for entry in options.package_dirs], Path.cwd())
     pieces = _pieces(urdf, model, packages, options, notes)
+    wheels = [] if options.root == "fixed" else wheel_joints(model, pieces)
     bare = RobotConfig(
         name=options.name or urdf.stem,
         urdf=str(urdf),
         root_joint=options.root,
         package_dirs=packages,
         allow_missing_meshes=options.allow_missing_meshes,
-        lock=joint_locks(urdf, model, options.lock, semantics, notes, _wheels(model, pieces, options)),
+        lock=joint_locks(urdf, model, options.lock, semantics, notes, wheels),
         end_effectors=end_effectors(model, semantics.end_effectors),
     )
-    config_with_srdf = bare.model_copy(update={"srdf": None if honoured is None else str(honoured.resolve())})
-    links, robot = _links(pieces, config_with_srdf, semantics, options, notes, progress)
+    with_srdf = bare.model_copy(update={"srdf": None if honoured is None else str(honoured.resolve())})
+    links, robot = _links(pieces, with_srdf, semantics, options, notes, progress)
     bodies = {"bodies": [body for link in links.values() for body in link.bodies]}
-    robot_without_srdf = robot if honoured is None else Robot.from_config(bare.model_copy(update=bodies), urdf)
+
     progress(f"sampling {len(robot.bodies.collisionPairs)} pairs")
     sampled = sample_pairs(robot, options.samples, options.seed)
-    is_nested = nested_pairs(robot, sampled)
-    reasons = pair_reasons(robot_without_srdf, robot, sampled, is_nested)
-    disabled, single = by_link(robot, reasons)
-    active_mask = ~sampled.never & ~sampled.always & ~is_nested
-    active, d1 = with_pairs(robot, active_mask), safety_distances(sampled)[active_mask]
+    is_nested = pairs.nested_pairs(robot, sampled)
+    reasons = pairs.pair_reasons(robot, sampled, is_nested)
+    disabled, single = pairs.by_link(robot, reasons)
+    is_active = ~sampled.never & ~sampled.always & ~is_nested
+    active, d1 = pairs.with_pairs(robot, is_active), safety_distances(sampled)[is_active]
+
     progress("looking for a home pose")
     home = find_home(active, home_candidates(active, semantics), bare.end_effectors, d1, options.home, options.seed)
     progress("comparing with the geometry")
-    shares = shares_of_contact(robot, sampled)
-    links_unchecked = measure_unchecked(active, pieces, disabled, shares)
-    notes += [note for entry in links_unchecked if (note := entry.note()) is not None]
+    unchecked = pairs.measure_unchecked(active, pieces, disabled, pairs.shares_of_contact(robot, sampled))
+    notes += [note for entry in unchecked for note in entry.notes()]
     notes += _notes_of_home(active, home, options)
     if not bare.end_effectors:
         remedy = "list the frames of your tools under `end_effectors`"
         notes.append(Note(NoteKind.FRAME, (), "no end effector was recognised", remedy))
-    counts = {kind: list(reasons.values()).count(kind) for kind in get_args(Reason)}
+    counts = {kind: list(reasons.values()).count(kind) for kind in get_args(pairs.Reason)}
     pair_count = robot.bodies.ngeoms * (robot.bodies.ngeoms - 1) // 2
-    margins = own_margins(active, d1)
+    of_srdf = {pair: why for pair, why in semantics.disabled.items() if all(map(model.existFrame, pair))}
+    decided = {
+        "disabled_pairs": single,
+        "pair_margins": pairs.own_margins(active, d1),
+        "limits": JointLimits(velocity=_assumed_speeds(model, active.model)),
+        "home": joint_values(active.model, home.q),
+    }
     return Description(
-        config=bare.model_copy(
-            update={
-                **bodies,
-                "disabled_pairs": single,
-                "pair_margins": margins,
-                "limits": JointLimits(velocity=_assumed_speeds(model, active.model)),
-                "home": joint_values(active.model, home.q),
-            }
-        ),
+        config=bare.model_copy(update={**bodies, **decided}),
         robot=replace(active, home=home.q),
-        urdf=urdf,
         options=options,
         pieces=pieces,
         honoured=honoured,
-        disabled={
-            **{pair: srdf_reason(why) for pair, why in disabled.items()},
-            **{pair: why for pair, why in semantics.disabled.items() if _known(pair, model)},
-        },
+        disabled={**{pair: pairs.SRDF_REASONS[why] for pair, why in disabled.items()}, **of_srdf},
         links=links,
         counts={"all": pair_count, **counts, "active": pair_count - sum(counts.values())},
         near=sampled.near,
-        unchecked=links_unchecked,
+        unchecked=unchecked,
         home=home,
         notes=tuple(dict.fromkeys(merge_notes([*robot.notes, *notes]))),
     )
@@ -219,14 +198,8 @@ def _semantics(srdf: Path | None, model: Any, options: DescribeOptions) -> Seman
     return replace(semantics, states={"--home": options.home, **semantics.states}) if options.home else semantics
 
 
-def _known(pair: frozenset[str], model: Any) -> bool:
-    return all(model.existFrame(link) for link in pair)
-
-
 def _assumed_speeds(model: Any, robot_model: Any) -> dict[str, float | list[float]]:
-    """List the largest speeds that the robot has and its file does not give.
-
-    They are written out, so that a user sees them and can change them.
+    """List the largest speeds that the robot has and its file does not give, so that a user can change them.
 
     Args:
         model: as the file has it.
@@ -235,15 +208,11 @@ def _assumed_speeds(model: Any, robot_model: Any) -> dict[str, float | list[floa
     speeds_by_joint: dict[str, float | list[float]] = {}
     for name, joint in zip(list(robot_model.names)[1:], list(robot_model.joints)[1:], strict=True):
         of_file = model.joints[model.getJointId(name)]
-        config_with_srdf = np.array(model.velocityLimit[of_file.idx_v : of_file.idx_v + of_file.nv])
+        given = np.array(model.velocityLimit[of_file.idx_v : of_file.idx_v + of_file.nv])
         speeds = np.array(robot_model.velocityLimit[joint.idx_v : joint.idx_v + joint.nv])
-        if joint.shortname() != MIMIC and np.any((config_with_srdf != speeds) & np.isfinite(speeds)):
+        if joint.shortname() != MIMIC and np.any((given != speeds) & np.isfinite(speeds)):
             speeds_by_joint[name] = float(speeds[0]) if joint.nv == 1 else speeds.tolist()
     return speeds_by_joint
-
-
-def _wheels(model: Any, pieces: Sequence[Piece], options: DescribeOptions) -> list[str]:
-    return [] if options.root == "fixed" else wheel_joints(model, pieces)
 
 
 def _notes_of_home(robot: Robot, home: Home, options: DescribeOptions) -> Iterator[Note]:
@@ -309,13 +278,9 @@ def _links(
     if exact_links := [link for link in links if links[link] != initial[link]]:
         clause = "exact bodies, because capsules would be too near at home or everywhere"
         notes.append(Note(NoteKind.SHAPE, tuple(exact_links), clause))
-    gross = {
-        link: link_bodies
-        for link, link_bodies in links.items()
-        if link_bodies.volume > MAX_VOLUME_RATIO * link_bodies.inside > 0.0
-    }
-    if worst := sorted(gross, key=lambda link: -gross[link].volume):
-        first = gross[worst[0]]
+    gross = [link for link, made in links.items() if made.volume > MAX_VOLUME_RATIO * made.inside > 0.0]
+    if worst := sorted(gross, key=lambda link: -links[link].volume):
+        first = links[worst[0]]
         clause = (
             f"bodies of more than {MAX_VOLUME_RATIO:g} times what their geometry encloses, {1e3 * first.volume:.3g} l "
             f"around {1e3 * first.inside:.3g} l of the first: concave, or no closed surface"
@@ -328,17 +293,8 @@ def _oversized(robot: Robot, home: Array, seed: int) -> set[str]:
     """Find the links of pairs that are too near at home, or in each of a few random poses."""
     names = [body.name for body in robot.bodies.geometryObjects]
     near = [names[i] for pair in pairs_always_near(robot, _POSES, seed) for i in pair]
-    near += [body for pair in robot.always_touching for body in pair[:2]]
-    near += [
-        body
-        for a, b, _ in touching(robot, home, min(_HOME_NEAR * robot_size(robot), HOME_CLEARANCE * D1))
-        for body in (a, b)
-    ]
-    link = {body.name: robot.model.frames[body.parentFrame].name for body in robot.bodies.geometryObjects}
+    too_near = min(_HOME_NEAR * robot_size(robot), HOME_CLEARANCE * D1)
+    for a, b, _ in [*robot.always_touching, *touching(robot, home, too_near)]:
+        near += [a, b]
+    link = pairs.links_of_bodies(robot)
     return {link[body] for body in near}
-
-
-_HOME_NEAR = 0.04
-"""Distance at the preferred home pose, as a share of the robot's size, within which capsules are oversized [-]."""
-_POSES = 200
-"""Random poses in which oversized capsules show."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
@@ -18,12 +20,14 @@ from qpavoid.model.notes import Note
 from qpavoid.run.report import to_json
 from qpavoid.run.terminal import ERR, OUT
 from qpavoid.setup.add import DescribeOptions, Description, Root, describe
-from qpavoid.setup.check import check_robot
-from qpavoid.setup.findings import Joint, Report
+from qpavoid.setup.check import Report, check_robot
 from qpavoid.setup.fit import Bodies
+from qpavoid.setup.joint_report import Joint
 from qpavoid.setup.sampling import SAMPLES, SEED
-from qpavoid.setup.texts import description_files, home_line, note_lines, pairs_line, volume_line
-from qpavoid.setup.written import write_files
+from qpavoid.setup.texts import description_files, note_lines, summary, write_files
+
+_PATIENCE = 2.0
+"""Least time between two lines of progress [s]."""
 
 app = typer.Typer(no_args_is_help=True, help="Look a robot over, or describe one for the first time.")
 
@@ -90,19 +94,18 @@ def _check_lines(report: Report) -> Iterator[str]:
 def _table(notes: Sequence[Note]) -> Iterator[str]:
     """Yield the lines of the table of notes, coloured by severity."""
     colours = {"error": "red", "warning": "yellow", "note": "dim"}
-    for line in note_lines(notes):
+    for line in map(escape, note_lines(notes)):
         severity = line.partition(" ")[0]
         colour = colours.get(severity)
-        yield f"[{colour}]{severity}[/]{escape(line.removeprefix(severity))}" if colour else escape(line)
+        yield line.replace(severity, f"[{colour}]{severity}[/]", 1) if colour else line
 
 
 def _joint_text(joint: Joint) -> str:
     words = joint.name + (f" mimics {joint.mimics}" if joint.mimics else "") + (" locked" if joint.locked else "")
     if joint.lower is None and joint.upper is None:
         return words
-    lower, upper = ("-∞" if joint.lower is None else f"{joint.lower:.3g}"), (
-        "∞" if joint.upper is None else f"{joint.upper:.3g}")  # fmt: skip
-    return f"{words} [{lower}, {upper}]"
+    lower, upper = ("∞" if limit is None else f"{limit:.3g}" for limit in (joint.lower, joint.upper))
+    return f"{words} [{'-' if joint.lower is None else ''}{lower}, {upper}]"
 
 
 @app.command()
@@ -125,15 +128,14 @@ def add(
     srdf: Annotated[Path | None, typer.Option(help="SRDF to honour; one beside the URDF if left out.")] = None,
     samples: Annotated[int, typer.Option(min=1, max=1_000_000, help="Configurations drawn to judge pairs.")] = SAMPLES,
     seed: Annotated[int, typer.Option(min=0, help="Of the draw.")] = SEED,
-    picture: Annotated[bool, typer.Option("--picture/--no-picture", help="Draw the bodies.")] = True,
-    force: Annotated[bool, typer.Option("--force", help="Overwrite files that were edited.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite files that hold something else.")] = False,
     json: Json = False,
 ) -> None:
     """Write a robot.yaml with collision bodies, pairs, a home pose and end effectors."""
     begin = time.perf_counter()
-    kind, by_link = _kinds(bodies or [])
+    kinds = _kinds(bodies or [])
     options = DescribeOptions(
-        name=name, bodies=kind, bodies_of=by_link, root=_one_of(root, Root, "--root"), lock=tuple(lock or ()),
+        name=name, bodies=kinds.pop(""), bodies_of=kinds, root=_one_of(root, Root, "--root"), lock=tuple(lock or ()),
         home=_values(home or []), package_dirs=_entries(package_dir, package),
         allow_missing_meshes=allow_missing_meshes, srdf=srdf, samples=samples, seed=seed,
     )  # fmt: skip
@@ -142,10 +144,8 @@ def add(
         raise ConfigError(f"{path}: is described already; give a URDF or MJCF")
     description = describe(urdf, options, Progress())
     folder = out or Path(description.config.name)
-    files = description_files(description, folder)
-    if picture and (picture_bytes := _picture(description)) is not None:
-        files[folder / "bodies.png"] = picture_bytes
-    outcome = write_files(files, force)
+    command = shlex.join(["qpavoid", *(word for word in sys.argv[1:] if word not in ("--force", "--json"))])
+    outcome = write_files(description_files(description, folder, command), force)
     seconds = time.perf_counter() - begin
     if json:
         print(to_json(_document(description, outcome, seconds)))
@@ -153,28 +153,25 @@ def add(
         _report(description, outcome, seconds)
 
 
-def _kinds(texts: list[str]) -> tuple[Bodies, dict[str, Bodies]]:
-    kind: Bodies = "auto"
-    by_link: dict[str, Bodies] = {}
+def _kinds(texts: list[str]) -> dict[str, Bodies]:
+    """Parse `KIND` and `LINK=KIND`: kinds by link, that of all others under no name."""
+    kinds: dict[str, Bodies] = {"": "auto"}
     for text in texts:
-        link, equals, value = text.rpartition("=")
-        chosen = _one_of(value, Bodies, f"--bodies {text}")
-        if equals:
-            by_link[link] = chosen
-        else:
-            kind = chosen
-    return kind, by_link
+        link, _, kind = text.rpartition("=")
+        kinds[link] = _one_of(kind, Bodies, f"--bodies {text}")
+    return kinds
 
 
 def _values(texts: list[str]) -> dict[str, float]:
     values = {}
     for text in texts:
-        joint, equals, value = text.rpartition("=")
         try:
+            joint, value = text.rsplit("=", 1)
             values[joint] = float(value)
+            is_sane = abs(values[joint]) <= LARGEST  # NaN is not
         except ValueError:
-            equals = ""
-        if not equals or not abs(values[joint]) <= LARGEST:  # NaN as well
+            is_sane = False
+        if not is_sane:
             raise ConfigError(f"--home {text}: expected JOINT=VALUE, as in elbow=1.57")
     return values
 
@@ -196,35 +193,21 @@ def _one_of(value: str, kind: Any, option: str) -> Any:
     return value
 
 
-def _picture(description: Description) -> bytes | None:
-    try:
-        from qpavoid.setup.picture import bodies_picture
-    except ModuleNotFoundError as missing:
-        if missing.name is None or missing.name.split(".")[0] not in ("matplotlib", "mpl_toolkits"):
-            raise
-        ERR.print("no picture: matplotlib is missing; pip install 'qpavoid\\[plots]'", highlight=False)
-        return None
-    return bodies_picture(description)
-
-
 def _document(description: Description, outcome: dict[Path, str], seconds: float) -> dict[str, Any]:
-    links, home = description.links.values(), description.home
+    links, home, config, options = description.links.values(), description.home, description.config, description.options
     return {
-        "name": description.config.name,
+        "name": config.name,
         "files": {str(path): what for path, what in outcome.items()},
-        "bodies": len(description.robot.bodies.geometryObjects),
+        "bodies": len(config.bodies),
         "bodies_volume": sum(link.volume for link in links),
         "hulls_volume": sum(link.hulls for link in links),
         "geometry_volume": sum(link.inside for link in links),
         "pairs": dict(description.counts),
-        "pair_margins": [own.model_dump() for own in description.config.pair_margins],
         "left_out": [asdict(entry) for entry in description.unchecked],
-        "samples": description.options.samples,
-        "seed": description.options.seed,
+        "samples": options.samples,
+        "seed": options.seed,
         "srdf": None if description.honoured is None else str(description.honoured),
-        "end_effectors": list(description.config.end_effectors),
-        "home": dict(description.config.home),
-        "lock": dict(description.config.lock),
+        **config.model_dump(include={"pair_margins", "end_effectors", "home", "lock"}),
         "clearance": home.clearance,
         "nearest": home.nearest,
         "conditioning": {frame: asdict(limb) for frame, limb in home.conditioning.items()},
@@ -234,13 +217,10 @@ def _document(description: Description, outcome: dict[Path, str], seconds: float
 
 
 def _report(description: Description, outcome: dict[Path, str], seconds: float) -> None:
-    for line in (
-        f"bodies         {volume_line(description)}",
-        f"pairs          {pairs_line(description)}",
-        f"end effectors  {', '.join(description.config.end_effectors) or 'none recognised'}",
-        f"home           {home_line(description)}",
-    ):
-        OUT.print(line, highlight=False, markup=False, soft_wrap=True)
+    facts = dict(summary(description))
+    ends = ", ".join(description.config.end_effectors) or "none recognised"
+    for name, line in {"bodies": "", "pairs": "", "end effectors": ends, **facts}.items():
+        OUT.print(f"{name:<14} {line}", highlight=False, markup=False, soft_wrap=True)
     for line in _table(description.notes):
         OUT.print(line, highlight=False, soft_wrap=True)
     for line in (
@@ -261,7 +241,3 @@ class Progress:
         if time.perf_counter() >= self._next:
             ERR.print(f"{what} …", style="dim", highlight=False, markup=False, soft_wrap=True)
             self._next = time.perf_counter() + _PATIENCE
-
-
-_PATIENCE = 2.0
-"""Least time between two lines of progress [s]."""

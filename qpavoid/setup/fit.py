@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, Literal
 
 import coal
@@ -11,9 +10,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from qpavoid.geometry.bodies import enclosing_capsule, hull_points
 from qpavoid.geometry.capsules import CapsuleFit, extreme_points, fit_capsule
-from qpavoid.geometry.segments import point_segment_distance
 from qpavoid.problem import Array
-from qpavoid.setup.volume import solid_volume
 
 Bodies = Literal["auto", "capsule", "capsules", "convex"]
 """`auto`: the leanest of the others for each piece; `capsule`: one each; `capsules`: up to `MAX_CAPSULES`, while each
@@ -26,16 +23,17 @@ MAX_VOLUME_RATIO = 2.0
 twenty times what a capsule costs. A capsule around a cylinder takes 1.3 to 2, around a cube 2.7."""
 MIN_CONCAVITY = 1.5
 """Volume of a mesh's hull, in units of what the mesh encloses, from which `auto` compares several capsules [-]."""
-_FINE = 4000
-"""Triangles from which cuts are chosen on a coarser surface; what is cut, and enclosed, is the surface itself."""
-_GRID = 32
-"""Cells of the coarser surface along its longest side."""
 MIN_SAVING = 0.15
 """Part of the volume that a further capsule must save."""
+_CLOSED = 1e-3
+"""Sum of a closed surface's area vectors, as a share of its area, that is rounding [-]."""
 _CUTS = np.linspace(0.2, 0.8, 7)
 """Where cuts are tried along each principal axis, in parts of the extent."""
 _COARSE = 24
 """Directions that are tried for each capsule while cuts are compared."""
+_FINE, _GRID = 4000, 32
+"""Triangles from which cuts are chosen on a coarser surface, and cells of that along its longest side; what is cut,
+and enclosed, is the surface itself."""
 
 
 def fit_piece(geometry: Any, how: Bodies, inside: float | None = None) -> tuple[CapsuleFit, ...]:
@@ -56,22 +54,21 @@ def fit_piece(geometry: Any, how: Bodies, inside: float | None = None) -> tuple[
     if how == "convex":
         return ()
     one = enclosing_capsule(geometry)
-    gross = MAX_VOLUME_RATIO * hull_volume(geometry)
-    is_mesh = isinstance(geometry, coal.BVHModelBase)
-    lean = how == "capsule" or (how == "auto" and one.volume <= gross)
-    if how == "auto" and is_mesh:
-        inside = inside_volume(geometry) if inside is None else inside
-        hull = hull_volume(geometry)
-        if hull > MIN_CONCAVITY * inside:  # several capsules may follow a bend that the hull spans
-            several = decompose(triangles(geometry), one)
-            if sum(fit.volume for fit in several) < min(hull, one.volume):
-                return several
-    if lean:
+    if how == "capsule":
         return (one,)
-    if how == "auto" and not (is_mesh or isinstance(geometry, coal.ConvexBase)):
-        return ()  # boxes and cylinders are exact as they are
-    several = decompose(triangles(geometry), one)
-    return () if how == "auto" and sum(fit.volume for fit in several) > gross else several
+    if how == "capsules":
+        return decompose(triangles(geometry), one)
+    hull, is_mesh = hull_volume(geometry), isinstance(geometry, coal.BVHModelBase)
+    is_gross = one.volume > MAX_VOLUME_RATIO * hull
+    is_concave = is_mesh and hull > MIN_CONCAVITY * (inside_volume(geometry) if inside is None else inside)
+    if is_concave or (is_gross and (is_mesh or isinstance(geometry, coal.ConvexBase))):
+        several = decompose(triangles(geometry), one)
+        volume = sum(fit.volume for fit in several)
+        if is_concave and volume < min(hull, one.volume):  # they may follow a bend that the hull spans
+            return several
+        if is_gross and volume <= MAX_VOLUME_RATIO * hull:
+            return several
+    return () if is_gross else (one,)  # boxes and cylinders are exact as they are
 
 
 def decompose(surface: Array, whole: CapsuleFit, most: int = MAX_CAPSULES) -> tuple[CapsuleFit, ...]:
@@ -99,41 +96,16 @@ def decompose(surface: Array, whole: CapsuleFit, most: int = MAX_CAPSULES) -> tu
 
 
 def _halves(surface: Array) -> list[tuple[Array, CapsuleFit]]:
-    """Cut a surface into the two halves with the least volume, each with its capsule.
-
-    The whole where it cannot be cut.
-    """
+    """Cut a surface into the two halves with the least volume, each with its capsule; the whole if it cannot be."""
     plane = _best_cut(_coarse(surface))
-    halves = [] if plane is None else [cut(surface, *plane, side) for side in (-1.0, 1.0)]
-    if not halves or not all(len(half) for half in halves):
-        return [(surface, _fit(surface))]
-    return [(half, _fit(half)) for half in halves]
-
-
-def _fit(surface: Array) -> CapsuleFit:
-    """Fit a small capsule around a surface.
-
-    Of many corners, around the extreme ones, then widened by what sticks out.
-    """
-    points = _corners(surface)
-    if len(points) <= _MANY:
-        return fit_capsule(points)
-    fit = fit_capsule(extreme_points(points))
-    half = 0.5 * fit.length * fit.rotation[:, 2]
-    sticks_out = float(point_segment_distance(points, fit.center - half, fit.center + half).max()) - fit.radius
-    wider = replace(fit, radius=fit.radius + max(sticks_out, 0.0))
-    return wider if wider.volume <= _WIDER * fit.volume else fit_capsule(points)
-
-
-_MANY, _WIDER = 500, 1.05
-"""Corners from which the outermost are fitted first, and the volume that this may cost, in units of theirs [-]."""
+    halves = [surface] if plane is None else [cut(surface, *plane, side) for side in (-1.0, 1.0)]
+    if not all(len(half) for half in halves):
+        halves = [surface]
+    return [(half, fit_capsule(_corners(half))) for half in halves]
 
 
 def _best_cut(surface: Array) -> tuple[Array, float] | None:
-    """Find normal (3,) and height [m] of the plane whose halves have the least volume.
-
-    None where no plane cuts.
-    """
+    """Find normal (3,) and height [m] of the plane whose halves have the least volume; None where no plane cuts."""
     points = _corners(surface)
     axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
     candidates = []
@@ -148,20 +120,16 @@ def _best_cut(surface: Array) -> tuple[Array, float] | None:
 
 
 def _coarse(surface: Array) -> Array:
-    """Coarsen a surface of many triangles: corners on a grid.
-
-    Triangles that vanish or coincide are left out.
-    """
+    """Coarsen a surface of many triangles: corners on a grid, without triangles that vanish or coincide."""
     if len(surface) <= _FINE:
         return surface
-    cell = float(np.ptp(surface.reshape(-1, 3), axis=0).max()) / _GRID
+    low, cell = surface.min(axis=(0, 1)), float(np.ptp(surface.reshape(-1, 3), axis=0).max()) / _GRID
     index = np.round(surface / cell).astype(np.int64)
     index -= index.min(axis=(0, 1))
-    number = index @ [1, 1024, 1024 * 1024]
-    a, b, c = number.T
-    parts = index[(a != b) & (b != c) & (a != c)]
-    same = np.unique(np.sort(parts @ [1, 1024, 1024 * 1024], axis=1), axis=0, return_index=True)[1]
-    return np.asarray(cell * parts[np.sort(same)] + surface.min(axis=(0, 1))) if len(same) else surface[:_FINE]
+    corners = np.sort(index @ [1, 1024, 1024 * 1024], axis=1)
+    is_solid = (np.diff(corners, axis=1) > 0).all(axis=1)
+    first = np.unique(corners[is_solid], axis=0, return_index=True)[1]
+    return np.asarray(low + cell * index[is_solid][np.sort(first)]) if len(first) else surface[:_FINE]
 
 
 def cut(surface: Array, normal: Array, height: float, side: float) -> Array:
@@ -176,13 +144,11 @@ def cut(surface: Array, normal: Array, height: float, side: float) -> Array:
         side: 1 keeps what is above, -1 what is below.
     """
     above = side * (surface @ normal - height)
-    parts = [surface[(above >= 0.0).all(axis=1)]]
     is_cut = (above > 0.0).any(axis=1) & (above < 0.0).any(axis=1)
-    corners, heights = surface[is_cut], above[is_cut]
-    for turn in range(3):  # each corner in turn is looked at as the one that is alone on its side
-        order = [turn, (turn + 1) % 3, (turn + 2) % 3]
-        a, b, c = (corners[:, k] for k in order)
-        h_a, h_b, h_c = (heights[:, k] for k in order)
+    parts = [surface[(above >= 0.0).all(axis=1)]]
+    for turn in range(3):  # each corner in turn as the one that is alone on its side
+        a, b, c = np.moveaxis(np.roll(surface[is_cut], turn, axis=1), 1, 0)
+        h_a, h_b, h_c = np.roll(above[is_cut], turn, axis=1).T
         is_single = (h_a > 0.0) & (h_b <= 0.0) & (h_c <= 0.0)
         is_double = (h_a < 0.0) & (h_b > 0.0) & (h_c > 0.0)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -194,10 +160,7 @@ def cut(surface: Array, normal: Array, height: float, side: float) -> Array:
 
 
 def triangles(geometry: Any) -> Array:
-    """Return the triangles of a coal geometry's surface (t, 3, 3) [m].
-
-    Those of its hull where it is no mesh.
-    """
+    """Return the triangles of a coal geometry's surface (t, 3, 3) [m]; those of its hull where it is no mesh."""
     if isinstance(geometry, coal.BVHModelBase):
         corners, index = np.array(geometry.vertices()), map(geometry.tri_indices, range(geometry.num_tris))
         return corners[np.array([(t[0], t[1], t[2]) for t in index], dtype=np.intp)]
@@ -218,18 +181,22 @@ def hull_volume(geometry: Any) -> float:
 def inside_volume(geometry: Any) -> float:
     """Compute the volume that a coal geometry encloses [m³].
 
-    Of a mesh its own, not that of its hull.
+    Of a mesh its own, by the divergence theorem about the middle of its corners. A surface with holes, or whose
+    triangles are not all turned outwards, counts as seen from there: as if each triangle bounded a full cone. Never
+    more than the volume of its hull.
     """
-    if isinstance(geometry, coal.BVHModelBase):
-        return min(solid_volume(triangles(geometry)), hull_volume(geometry))
-    return hull_volume(geometry)
+    hull = hull_volume(geometry)
+    if not isinstance(geometry, coal.BVHModelBase):
+        return hull
+    surface = triangles(geometry)
+    a, b, c = np.moveaxis(surface - surface.mean(axis=(0, 1)), 1, 0)
+    cones, areas = np.einsum("ti,ti->t", a, np.cross(b, c)) / 6.0, np.cross(b - a, c - a)
+    is_closed = np.linalg.norm(areas.sum(axis=0)) < _CLOSED * np.linalg.norm(areas, axis=1).sum()
+    return min(float(abs(cones.sum()) if is_closed else np.abs(cones).sum()), hull)
 
 
 def _corners(surface: Array) -> Array:
-    """Return the corners of the hull of a surface (n, 3).
-
-    All of its points where it is flat.
-    """
+    """Return the corners of the hull of a surface (n, 3); all of its points where it is flat."""
     points = surface.reshape(-1, 3)
     try:
         return np.asarray(points[ConvexHull(points).vertices])

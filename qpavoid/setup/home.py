@@ -24,6 +24,8 @@ _MAX_TRIES = 3000
 """Trials of all repairs together: some seconds."""
 _DIGITS = 2
 """Decimals of positions that were drawn [rad or m]."""
+_CONTACT_FAULT = 10.0
+"""Additional fault of a pair in collision: larger than all faults of pairs that are merely near [-]."""
 
 
 @dataclass(frozen=True)
@@ -62,13 +64,10 @@ class Limbs:
         self.names: list[str] = []
         self.columns: list[BoolArray] = []
         """Which coordinates (nv,) move each limb's end relative to the root."""
-        self._frames: list[tuple[int, int, int]] = []
-        self._typical: list[float] = []
+        self._limbs: list[tuple[int, int, int, float]] = []  # frame, rows, rank, typical value
         space = Space(robot)
         draws = space.draw(np.random.default_rng(seed), _DRAWS)
-        for name in frames:
-            if not robot.model.existFrame(name):
-                continue
+        for name in filter(robot.model.existFrame, frames):
             frame = frame_index(robot.model, name)
             moved = np.any([self._jacobian(frame, q) != 0.0 for q in draws[:5]], axis=(0, 1)) & space.moving
             rows = 6 if moved.sum() >= 6 else 3
@@ -77,28 +76,24 @@ class Limbs:
             if rank:
                 self.names.append(name)
                 self.columns.append(moved)
-                self._frames.append((frame, rows, rank))
-                self._typical.append(float(values[rank - 1]))
+                self._limbs.append((frame, rows, rank, float(values[rank - 1])))
 
     def at(self, q: Array) -> list[Conditioning]:
         """Compute the conditioning of each limb in a configuration (nq,)."""
-        result = []
-        for (frame, rows, rank), moved, typical in zip(self._frames, self.columns, self._typical, strict=True):
-            result.append(Conditioning(float(self._values(frame, rows, moved, q)[rank - 1]), typical))
-        return result
+        return [
+            Conditioning(float(self._values(frame, rows, moved, q)[rank - 1]), typical)
+            for (frame, rows, rank, typical), moved in zip(self._limbs, self.columns, strict=True)
+        ]
 
     def _jacobian(self, frame: int, q: Array) -> Array:
-        """Compute the Jacobian (6, nv) of a frame's origin, along the world axes.
-
-        Columns of joints that mimic others are added to theirs.
-        """
+        """Compute the Jacobian (6, nv) of a frame's origin; columns of joints that mimic others are added to theirs."""
         pin.computeJointJacobians(self._model, self._data, q)
         pose = pin.updateFramePlacement(self._model, self._data, frame)
         J = self._data.J.reshape(6, -1, order="F") * self._masks[self._model.frames[frame].parentJoint]
         J[:3] += np.cross(J[3:], pose.translation, axisa=0, axisc=0)
-        result_jacobian = np.zeros((6, self._model.nv))
-        np.add.at(result_jacobian.T, self._columns, J.T)
-        return result_jacobian
+        folded = np.zeros((6, self._model.nv))
+        np.add.at(folded.T, self._columns, J.T)
+        return folded
 
     def _values(self, frame: int, rows: int, moved: BoolArray, q: Array) -> Array:
         return np.asarray(np.linalg.svd(self._jacobian(frame, q)[:rows, moved], compute_uv=False))
@@ -135,10 +130,7 @@ class _PoseCriteria:
         self.need = HOME_CLEARANCE * d1
 
     def faults(self, q: Array) -> Array:
-        """Compute what each pair (m,) lacks of its distance, then each limb of its conditioning.
-
-        As a share of what is needed [-].
-        """
+        """Compute what each pair (m,) lacks of its distance, then each limb of its conditioning, as shares [-]."""
         deficit = np.maximum(1.0 - self.distances.all(q) / self.need, 0.0) if len(self.need) else np.zeros(0)
         deficit += _CONTACT_FAULT * (deficit > 1.0)
         return np.concatenate((deficit, [max(1.0 - limb.ratio / MIN_CONDITIONING, 0.0) for limb in self.limbs.at(q)]))
@@ -148,9 +140,15 @@ class _PoseCriteria:
         pairs = len(self.need)
         return self.distances.moved_by(fault) if fault < pairs else self.limbs.columns[fault - pairs]
 
-
-_CONTACT_FAULT = 10.0
-"""Additional fault of a pair in collision: larger than all faults of pairs that are merely near [-]."""
+    def home(self, q: Array, preference: int | None) -> Home:
+        """Describe a pose as a home."""
+        d, nearest = self.distances.all(q), None
+        if len(d):
+            a, b = self.distances.pairs[int(np.argmin(d))]
+            nearest = self.distances.names[a], self.distances.names[b]
+        conditioning = dict(zip(self.limbs.names, self.limbs.at(q), strict=True))
+        deficit = float(np.max(self.need - d, initial=0.0))
+        return Home(q, float(np.min(d, initial=np.inf)), nearest, deficit, conditioning, preference)
 
 
 def find_home(
@@ -178,20 +176,21 @@ def find_home(
     criteria, space, poses = _PoseCriteria(robot, frames, d1), Space(robot), [np.asarray(q) for q in preferences]
     is_pinned = np.array([name.partition(".")[0] in set(pinned) for name in robot.coordinate_names], dtype=bool)
     faults = [float(criteria.faults(q).sum()) for q in (poses[:1] if is_pinned.any() else poses)]
-    is_faultless = [fault == 0.0 for fault in faults]
-    best = (
-        is_faultless.index(True) if any(is_faultless) else int(np.argmin(np.floor(np.array(faults) / _CONTACT_FAULT)))
-    )
-    q = (
-        poses[best]
-        if is_faultless[best]
-        else _repair(robot, criteria, space, poses[best], ~is_pinned & space.moving, seed)
-    )
-    return _home_of(robot, criteria, q, best if np.array_equal(q, poses[best]) else None)
+    if 0.0 in faults:
+        best = faults.index(0.0)
+        return criteria.home(poses[best], best)
+    best = int(np.argmin(np.floor(np.array(faults) / _CONTACT_FAULT)))
+    q = _repair(robot, criteria, space, poses[best], ~is_pinned & space.moving, seed)
+    return criteria.home(q, best if np.array_equal(q, poses[best]) else None)
 
 
 def _repair(robot: Robot, criteria: _PoseCriteria, space: Space, start: Array, free: BoolArray, seed: int) -> Array:
     """Find a pose near `start` with fewer faults; only free coordinates (nv,) differ."""
+
+    def rounded(q: Array, part: float = 1.0) -> Array:
+        """Return the pose on the way from the start to q, with few digits."""
+        return space.move(start, np.round(part * np.asarray(pin.difference(robot.model, start, q)), _DIGITS))
+
     random, q, evaluations = np.random.default_rng(seed), start, 0
     faults, is_unfixable = criteria.faults(q), np.zeros(len(criteria.faults(q)), dtype=bool)
     while evaluations < _MAX_TRIES and np.any(faults[~is_unfixable] > 0.0):
@@ -199,9 +198,7 @@ def _repair(robot: Robot, criteria: _PoseCriteria, space: Space, start: Array, f
         mask, best_pose = criteria.movers(worst) & free, q
         for i, target in enumerate(space.draw(random, _DRAWS if mask.any() else 0)):
             step = (i + 1) / _DRAWS * np.asarray(pin.difference(robot.model, q, target))
-            candidate = space.move(
-                start, np.round(pin.difference(robot.model, start, space.move(q, step * mask)), _DIGITS)
-            )
+            candidate = rounded(space.move(q, step * mask))
             candidate_faults, evaluations = criteria.faults(candidate), evaluations + 1
             if candidate_faults.sum() < faults.sum() - 1e-9:
                 best_pose, faults = candidate, candidate_faults
@@ -209,38 +206,14 @@ def _repair(robot: Robot, criteria: _PoseCriteria, space: Space, start: Array, f
                     break
         is_unfixable[worst] = best_pose is q
         q = best_pose
-    return _restore_joints(robot, criteria, _move_back(robot, criteria, space, q, start), start)
-
-
-def _move_back(robot: Robot, criteria: _PoseCriteria, space: Space, q: Array, start: Array) -> Array:
-    """Move back towards `start` on the straight line as long as no fault is added."""
-    step, total = np.asarray(pin.difference(robot.model, start, q)), criteria.faults(q).sum()
-    for part in np.linspace(0.05, 0.95, 19):
-        candidate = space.move(start, np.round(part * step, _DIGITS))
-        if criteria.faults(candidate).sum() <= total:
-            return candidate
-    return q
-
-
-def _restore_joints(robot: Robot, criteria: _PoseCriteria, q: Array, start: Array) -> Array:
-    """Restore every joint of `start` whose move was not needed."""
     total = criteria.faults(q).sum()
-    for joint in list(robot.model.joints)[1:]:
+    nearer = (rounded(q, part) for part in np.linspace(0.05, 0.95, 19))
+    q = next((candidate for candidate in nearer if criteria.faults(candidate).sum() <= total), q)
+    total = criteria.faults(q).sum()
+    for joint in list(robot.model.joints)[1:]:  # whose move was not needed after all
         part = slice(joint.idx_q, joint.idx_q + joint.nq)
         candidate = q.copy()
         candidate[part] = start[part]
         if not np.array_equal(candidate, q) and criteria.faults(candidate).sum() <= total:
             q = candidate
     return q
-
-
-def _home_of(robot: Robot, criteria: _PoseCriteria, q: Array, preference: int | None) -> Home:
-    d = criteria.distances.all(q)
-    names = [body.name for body in robot.bodies.geometryObjects]
-    nearest = None
-    if len(d):
-        a, b = criteria.distances.pairs[int(np.argmin(d))]
-        nearest = names[a], names[b]
-    conditioning = dict(zip(criteria.limbs.names, criteria.limbs.at(q), strict=True))
-    deficit = float(np.max(criteria.need - d, initial=0.0))
-    return Home(q, float(np.min(d, initial=np.inf)), nearest, deficit, conditioning, preference)

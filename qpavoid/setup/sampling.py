@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -35,14 +34,12 @@ _DOUBT = 0.1
 """Share of samples by which a pair's contact may differ from `ALWAYS_TOUCHING` and still come to attain it [-]."""
 _STEPS = 60
 """Steps of a descent, at most."""
-_UNBOUNDED = np.pi
-"""Half the range of coordinates without limits: continuous joints, and a root, whose pose does not matter here."""
+_CLOSE = 4.0 / 3.0
+"""Typical distance of a pair, in units of the default safety distance, below which it gets one of its own [-]."""
 
 
 def robot_size(robot: Robot) -> float:
-    """Estimate the size of a robot [m], never 0.
-
-    Half the diagonal of the largest box that the bodies fill in some configurations.
+    """Estimate the size of a robot [m], never 0: half the diagonal of the largest box that it fills in some poses.
 
     About the maximal extension of an arm, the height of a humanoid: the scale of distances on this robot.
     """
@@ -55,8 +52,7 @@ def robot_size(robot: Robot) -> float:
     for q in [robot.home, *Space(robot).draw(np.random.default_rng(SEED), 20)]:
         pin.updateGeometryPlacements(robot.model, data, robot.bodies, geometry, q)
         at = np.array([pose.act(center) for pose, center in zip(geometry.oMg, centers, strict=True)])
-        low, high = (at - radius).min(axis=0), (at + radius).max(axis=0)
-        diagonal = max(diagonal, float(np.linalg.norm(high - low)))
+        diagonal = max(diagonal, float(np.linalg.norm((at + radius).max(axis=0) - (at - radius).min(axis=0))))
     return max(0.5 * diagonal, 1e-3)
 
 
@@ -68,25 +64,23 @@ class PairDistances:
         self._bodies = pin.GeometryModel(robot.bodies)
         self._geometry = self._bodies.createData()
         self.pairs = pair_array(self._bodies)
+        self.names = [body.name for body in robot.bodies.geometryObjects]
         joints = np.array([body.parentJoint for body in self._bodies.geometryObjects], dtype=np.intp)
         masks = support_masks(robot.model)
         self._support = masks[joints[self.pairs[:, 1]]] - masks[joints[self.pairs[:, 0]]]
         self._columns = columns(robot.model)
-        self.all(robot.home)  # so that there is something to compare the view with
-        view = view_results(self._geometry.distanceResults)
-        self._view = view
+        self._compute(robot.home)  # so that there is something to compare the view with
+        self._view = view_results(self._geometry.distanceResults)
 
-    def all(self, q: Array) -> Array:
-        """Compute the distances (m,) of the active pairs [m].
-
-        Others keep the value of the last call in which they were active.
-        """
+    def _compute(self, q: Array) -> None:
         pin.updateGeometryPlacements(self.model, self.data, self._bodies, self._geometry, q)
         pin.computeDistances(self._bodies, self._geometry)
-        results = getattr(self, "_view", None)
-        if results is None:
-            results = read_results(self._geometry.distanceResults)
-        return np.array(results[:, 0]) if len(results) else np.zeros(0)
+
+    def all(self, q: Array) -> Array:
+        """Compute the distances (m,) of the active pairs [m]; others keep the value from when they were active."""
+        self._compute(q)
+        results = read_results(self._geometry.distanceResults) if self._view is None else self._view
+        return np.array(results[:, 0])
 
     def deactivate(self, pairs: Iterable[int]) -> None:
         """Deactivate pairs from now on."""
@@ -111,24 +105,25 @@ class Space:
     """The configurations of a robot, its root left where it is."""
 
     def __init__(self, robot: Robot) -> None:
-        bounds = robot.bounds()
-        self.model = robot.model
+        bounds, model = robot.bounds(), robot.model
+        self.model = model
         self._q, self._v = bounds.q_index, bounds.v_index
         finite = np.isfinite(bounds.lower) & np.isfinite(bounds.upper)  # a range without end is no range to draw from
-        self._lower = np.where(finite, bounds.lower, -_UNBOUNDED)
-        self._upper = np.where(finite, bounds.upper, _UNBOUNDED)
-        free = np.ones(robot.model.nv, dtype=bool)
-        free[self._v] = False
-        free[_points(robot.model)] = False
-        self.free = free & np.array([n not in _root_names(robot) for n in robot.coordinate_names])
-        """(nv,) coordinates without limits."""
+        self._lower, self._upper = np.where(finite, bounds.lower, -np.pi), np.where(finite, bounds.upper, np.pi)
+        self.free = np.ones(model.nv, dtype=bool)
+        """(nv,) coordinates without limits: continuous joints; not a root, whose pose does not matter here."""
+        self.free[self._v] = False
+        for name, joint in zip(list(model.names)[1:], list(model.joints)[1:], strict=True):
+            low, high = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
+            if name == "root_joint" or (joint.nq == joint.nv == 1 and low == high):
+                self.free[joint.idx_v : joint.idx_v + joint.nv] = False
         self.moving = self.free.copy()
         """(nv,) coordinates that configurations differ in."""
         self.moving[self._v] = True
 
     def draw(self, random: np.random.Generator, count: int) -> Array:
         """Draw configurations (count, nq), uniform over the joints' ranges."""
-        turns = random.uniform(-_UNBOUNDED, _UNBOUNDED, (count, self.model.nv)) * self.free
+        turns = random.uniform(-np.pi, np.pi, (count, self.model.nv)) * self.free
         neutral = pin.neutral(self.model)
         q = np.array([pin.integrate(self.model, neutral, turn) for turn in turns]).reshape(count, self.model.nq)
         q[:, self._q] = random.uniform(self._lower, self._upper, (count, len(self._q)))
@@ -139,27 +134,6 @@ class Space:
         moved = np.asarray(pin.integrate(self.model, q, step))
         moved[self._q] = np.clip(moved[self._q], self._lower, self._upper)
         return moved
-
-    def towards(self, q: Array, target: Array, part: float) -> Array:
-        """Interpolate from q to another configuration."""
-        return self.move(q, part * np.asarray(pin.difference(self.model, q, target)))
-
-
-def _points(model: Any) -> IntArray:
-    """Find the coordinates in v of the joints whose range is a single point."""
-    indices = [
-        joint.idx_v
-        for joint in list(model.joints)[1:]
-        if joint.nq == joint.nv == 1 and model.lowerPositionLimit[joint.idx_q] == model.upperPositionLimit[joint.idx_q]
-    ]
-    return np.array(indices, dtype=np.intp)
-
-
-def _root_names(robot: Robot) -> set[str]:
-    model = robot.model
-    if model.njoints > 1 and model.names[1] == "root_joint":
-        return set(robot.coordinate_names[: model.joints[1].nv])
-    return set()
 
 
 @dataclass(frozen=True)
@@ -220,8 +194,8 @@ def sample_pairs(robot: Robot, samples: int = SAMPLES, seed: int = SEED) -> Pair
     for index in np.flatnonzero(closest >= near):
         closest[index] = min(closest[index], _descend(distances, space, int(index), at[index], near))
     contact = contact_counts / sample_counts
-    free = np.where(touching, np.nan, first)
-    typical = np.array([np.nanmedian(d) if not np.isnan(d).all() else np.inf for d in free.T]).reshape(count)
+    gaps = np.where(touching, np.nan, first).T
+    typical = np.array([np.nanmedian(d) if not np.isnan(d).all() else np.inf for d in gaps]).reshape(count)
     return PairSamples(contact, contact >= ALWAYS_TOUCHING, closest >= near, closest, typical, poses, touching, near)
 
 
@@ -236,10 +210,7 @@ def pairs_always_near(robot: Robot, samples: int, seed: int = SEED) -> IntArray:
 
 
 def _descend(distances: PairDistances, space: Space, index: int, q: Array, near: float) -> float:
-    """Descend along a pair's gradient; return the least distance [m].
-
-    Steps shrink where they lead up.
-    """
+    """Descend along a pair's gradient, by steps that shrink where they lead up; return the least distance [m]."""
     (least, slope), step = distances.gradient(index, q), 0.3
     for _ in range(_STEPS):
         size = float(np.linalg.norm(slope))
@@ -255,9 +226,7 @@ def _descend(distances: PairDistances, space: Space, index: int, q: Array, near:
 
 
 def safety_distances(sampled: PairSamples) -> Array:
-    """Choose the safety distance (m,) of each pair [m].
-
-    The default one, less where the design leaves less clearance.
+    """Choose the safety distance (m,) of each pair [m]: the default one, less where the design leaves less clearance.
 
     A pair whose bodies are near each other nearly all along their joints' ranges could not keep the default distance
     in most of them. Half of what it typically has leaves it as much to move in as to keep.
@@ -266,17 +235,9 @@ def safety_distances(sampled: PairSamples) -> Array:
     return np.where(sampled.typical < _CLOSE * D1, np.minimum(own, D1), D1)
 
 
-_CLOSE = 4.0 / 3.0
-"""Typical distance of a pair, in units of the default safety distance, below which it gets one of its own [-]."""
-
-
 def touching(robot: Robot, q: Array, within: float = 0.0) -> list[tuple[str, str, float]]:
-    """List the pairs of a robot's own bodies nearer than a distance, the nearest first.
-
-    With their distance [m].
-    """
-    names = [body.name for body in robot.bodies.geometryObjects]
+    """List the pairs of a robot's own bodies nearer than a distance [m], the nearest first, with theirs [m]."""
     distances = PairDistances(robot)
-    d = distances.all(q)
-    order: Any = np.argsort(d, kind="stable")
-    return [(names[a], names[b], float(d[i])) for i in order if d[i] <= within for a, b in [distances.pairs[i]]]
+    names, d = distances.names, distances.all(q)
+    order = [int(i) for i in np.argsort(d, kind="stable") if d[i] <= within]
+    return [(names[a], names[b], float(d[i])) for i in order for a, b in [distances.pairs[i]]]

@@ -17,8 +17,10 @@ from qpavoid.config import Body, Box, Capsule, Cylinder, Hull, Sphere
 from qpavoid.errors import UnknownName, nearest
 from qpavoid.geometry.bodies import hull_points
 from qpavoid.geometry.capsules import CapsuleFit, fit_capsule
-from qpavoid.problem import Array
 from qpavoid.setup.fit import MAX_VOLUME_RATIO, Bodies, fit_piece, hull_volume, inside_volume
+
+_DIGITS = 5
+"""Decimals of lengths [m] and angles [rad] in files: 0.01 mm."""
 
 
 @dataclass(frozen=True)
@@ -87,24 +89,22 @@ def bodies_of_link(pieces: Sequence[Piece], link: str, kind: Bodies) -> LinkBodi
     `auto`, where it is not too large.
     """
     pieces = [piece for piece in pieces if piece.link == link]
-    fits = [fit_piece(piece.geometry, kind, piece.inside) for piece in pieces]
     hulls = [hull_volume(piece.geometry) for piece in pieces]
-    volume = sum(sum(c.volume for c in fit) if fit else hull for fit, hull in zip(fits, hulls, strict=True))
-    shapes = []
-    for piece, fit in zip(pieces, fits, strict=True):
+    shapes, volume = list[dict[str, Any]](), 0.0
+    for piece, hull in zip(pieces, hulls, strict=True):
+        fit = fit_piece(piece.geometry, kind, piece.inside)
         shapes += [capsule_fields(capsule, piece.placement) for capsule in fit] or [_exact_fields(piece)]
+        volume += sum(capsule.volume for capsule in fit) if fit else hull
     if len(shapes) > 1 and kind != "convex":
-        points = [_moved(hull_points(piece.geometry), piece.placement) for piece in pieces]
+        points = [
+            hull_points(piece.geometry) @ piece.placement.rotation.T + piece.placement.translation for piece in pieces
+        ]
         whole = fit_capsule(np.concatenate(points))
         if whole.volume <= max(volume, MAX_VOLUME_RATIO * sum(hulls) if kind == "auto" else 0.0):
             shapes, volume = [capsule_fields(whole, pin.SE3.Identity())], whole.volume
     names = [link] if len(shapes) == 1 else [f"{link}_{index}" for index in range(len(shapes))]
     bodies = [Body(name=name, frame=link, **shape) for name, shape in zip(names, shapes, strict=True)]
     return LinkBodies(tuple(bodies), volume, sum(hulls), sum(piece.inside for piece in pieces))
-
-
-def _moved(points: Array, placement: Any) -> Array:
-    return np.asarray(points @ placement.rotation.T + placement.translation)
 
 
 def capsule_fields(fit: CapsuleFit, placement: Any) -> dict[str, Any]:
@@ -119,8 +119,8 @@ def capsule_fields(fit: CapsuleFit, placement: Any) -> dict[str, Any]:
     axis = placement.rotation @ fit.rotation[:, 2]
     center = placement.act(np.asarray(fit.center))
     position = np.round(center, _DIGITS) + 0.0  # no -0.0
-    pitch, yaw = round(math.acos(np.clip(axis[2], -1.0, 1.0)), _DIGITS), round(math.atan2(axis[1], axis[0]), _DIGITS)
     length = round(fit.length, _DIGITS)
+    pitch, yaw = round(math.acos(np.clip(axis[2], -1.0, 1.0)), _DIGITS), round(math.atan2(axis[1], axis[0]), _DIGITS)
     if length == 0.0:
         pitch = yaw = 0.0
     axis_rounded = np.array([math.cos(yaw) * math.sin(pitch), math.sin(yaw) * math.sin(pitch), math.cos(pitch)])
@@ -130,13 +130,9 @@ def capsule_fields(fit: CapsuleFit, placement: Any) -> dict[str, Any]:
     return {"shape": shape, "position": tuple(position.tolist()), "rpy": (0.0, pitch, yaw)}
 
 
-_DIGITS = 5
-"""Decimals of lengths [m] and angles [rad] in files: 0.01 mm."""
-
-
 def _exact_fields(piece: Piece) -> dict[str, Any]:
     """Return the fields of a `Body` that is a primitive, or the hull of a mesh."""
-    geometry, placement = piece.geometry, piece.placement
+    geometry = piece.geometry
     if isinstance(geometry, coal.Box):
         x, y, z = (_up(2.0 * half) for half in geometry.halfSide)
         shape: Any = Box(size=(x, y, z))
@@ -144,8 +140,8 @@ def _exact_fields(piece: Piece) -> dict[str, Any]:
         shape = Cylinder(radius=_up(geometry.radius), length=_up(2.0 * geometry.halfLength))
     else:
         return {"shape": Hull(geometry=piece.name)}
-    rpy = np.round(pin.rpy.matrixToRpy(placement.rotation), 2 * _DIGITS) + 0.0  # no -0.0
-    position = np.round(placement.translation, 2 * _DIGITS) + 0.0
+    angles, origin = pin.rpy.matrixToRpy(piece.placement.rotation), piece.placement.translation
+    position, rpy = (np.round(numbers, 2 * _DIGITS) + 0.0 for numbers in (origin, angles))  # no -0.0
     return {"shape": shape, "position": tuple(position.tolist()), "rpy": tuple(rpy.tolist())}
 
 

@@ -10,6 +10,10 @@ from xml.sax.saxutils import quoteattr
 
 from qpavoid.model.xml_file import read_robot_xml
 
+MADE_BY = "written by `qpavoid robot add`"
+_HOMES = ("home", "ready", "default", "standing", "half_sitting", "neutral")
+"""Names of poses to start from, the likeliest first."""
+
 
 @dataclass(frozen=True)
 class Semantics:
@@ -23,25 +27,18 @@ class Semantics:
     """Links that carry tools or feet, in the order of the file."""
 
 
-MADE_BY = "written by `qpavoid robot add`"
-_HOMES = ("home", "ready", "default", "standing", "half_sitting", "neutral")
-"""Names of poses to start from, the likeliest first."""
-
-
 def find_srdf(urdf: Path) -> Path | None:
-    """Find the SRDF beside a URDF, or in `srdf/` beside its folder.
-
-    That whose name has most in common with the URDF's.
+    """Find the SRDF beside a URDF, or in `srdf/` beside its folder, whose name has most in common with the URDF's.
 
     Those that `robot add` wrote are left out: they hold its own results.
     """
     folders = (urdf.parent, urdf.parent / "srdf", urdf.parent.parent / "srdf")
-    found = [path for folder in folders for path in sorted(folder.glob("*.srdf")) if not _ours(path)]
+    found = [path for folder in folders for path in sorted(folder.glob("*.srdf")) if not _is_own(path)]
     same = [path for path in found if path.stem.startswith(urdf.stem) or urdf.stem.startswith(path.stem)]
     return max(same, key=lambda path: (path.stem == urdf.stem, min(len(path.stem), len(urdf.stem))), default=None)
 
 
-def _ours(path: Path) -> bool:
+def _is_own(path: Path) -> bool:
     with suppress(OSError):
         return MADE_BY.encode() in path.read_bytes()[:500]
     return False
@@ -58,14 +55,10 @@ def read_srdf(path: Path) -> Semantics:
         frozenset((pair.get("link1", ""), pair.get("link2", ""))): pair.get("reason", "User")
         for pair in root.iter("disable_collisions")
     }
-    states = {
-        state.get("name", ""): {
-            joint.get("name", ""): value
-            for joint in state.iter("joint")
-            if (value := _number(joint.get("value", ""))) is not None
-        }
-        for state in root.iter("group_state")
-    }
+    states = {}
+    for state in root.iter("group_state"):
+        values = {joint.get("name", ""): _number(joint.get("value", "")) for joint in state.iter("joint")}
+        states[state.get("name", "")] = {name: value for name, value in values.items() if value is not None}
     names = sorted(states, key=lambda name: (_HOMES.index(name) if name in _HOMES else len(_HOMES), name))
     ends = [end.get("parent_link", "") for end in root.iter("end_effector")]
     return Semantics(disabled, {name: states[name] for name in names}, tuple(dict.fromkeys(ends)))
@@ -91,7 +84,6 @@ def srdf_text(robot: str, comment: str, disabled: Mapping[frozenset[str], str], 
     lines = ['<?xml version="1.0"?>', f"<!-- {comment.replace('--', '- -')} -->", f"<robot name={quoteattr(robot)}>"]
     lines += [f"  <end_effector name={name} parent_link={name} group={name}/>" for name in map(quoteattr, ends)]
     for pair in sorted(sorted(links) for links in disabled):
-        a, b = pair[0], pair[-1]
-        reason = quoteattr(disabled[frozenset(pair)])
-        lines.append(f"  <disable_collisions link1={quoteattr(a)} link2={quoteattr(b)} reason={reason}/>")
+        a, b, why = map(quoteattr, (pair[0], pair[-1], disabled[frozenset(pair)]))
+        lines.append(f"  <disable_collisions link1={a} link2={b} reason={why}/>")
     return "\n".join([*lines, "</robot>", ""])

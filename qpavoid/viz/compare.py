@@ -11,9 +11,22 @@ from matplotlib.patches import Patch, Polygon
 from scipy.spatial import ConvexHull
 
 from qpavoid.problem import Array
-from qpavoid.run.log import Log, path_deviation
-from qpavoid.viz.motion import AT_REST_COLOUR, OBSTACLE_COLOUR, capsule_faces, is_endless, moving_bodies, obstacle_faces
-from qpavoid.viz.style import COLOURS, D2, DASHES, add_grid, add_legend, draw_levels, is_qp, label_distances, units
+from qpavoid.run.log import Log
+from qpavoid.run.metrics import path_deviation
+from qpavoid.viz.style import (
+    AT_REST,
+    COLOURS,
+    D2,
+    DASHES,
+    OBSTACLE,
+    add_grid,
+    add_legend,
+    draw_levels,
+    is_qp,
+    label_distances,
+    units,
+)
+from qpavoid.viz.surfaces import capsule_faces, is_endless, moving_bodies, obstacle_faces
 
 SOLVER_STYLES: dict[str, tuple[str, Any]] = {
     "tracking": ("#333333", DASHES[2]),
@@ -35,25 +48,21 @@ def solver_styles(logs: Sequence[Log]) -> list[dict[str, Any]]:
     No two of up to seven runs share a colour or a dash, and dashed lines lie over solid ones: runs that are alike, as
     of one law with two back ends, show both their lines.
     """
-    solvers = [log.meta["solver"] for log in logs]
-    used = [SOLVER_STYLES[solver] for solver in dict.fromkeys(solvers) if solver in SOLVER_STYLES]
-    free_styles = [(colour, dash) for dash in DASHES[::-1] for colour in COLOURS[::-1]]  # wide gaps first
-    solvers_drawn: list[str] = []
+    solvers: list[str] = [log.meta["solver"] for log in logs]
+    chosen = [SOLVER_STYLES.get(solver) if solver not in solvers[:i] else None for i, solver in enumerate(solvers)]
+    used: list[tuple[str, Any]] = [style for style in chosen if style is not None]
+    free = [(colour, dash) for dash in DASHES[::-1] for colour in COLOURS[::-1]]  # wide gaps first
     styles = []
-    for solver in solvers:
-        if solver in SOLVER_STYLES and solver not in solvers_drawn:
-            colour, dash = SOLVER_STYLES[solver]
-        else:
-            colours, dashes = [c for c, _ in used], [d for _, d in used]
-            colour, dash = min(free_styles, key=lambda s: (s in used, colours.count(s[0]), dashes.count(s[1])))
-            used.append((colour, dash))
-        label = f"{solver} ({solvers_drawn.count(solver) + 1})" if solver in solvers_drawn else solver
-        solvers_drawn.append(solver)
+    for i, solver in enumerate(solvers):
+        style = chosen[i]
+        if style is None:
+            colours, dashes = zip(*used, strict=True) if used else ((), ())
+            style = min(free, key=lambda s: (s in used, colours.count(s[0]), dashes.count(s[1])))
+            used.append(style)
+        colour, dash = style
+        label = f"{solver} ({solvers[:i].count(solver)})" if solver in solvers[:i] else solver
         styles.append({"label": label, "color": colour, "linestyle": dash, "zorder": 3.0 if dash == "-" else 3.5})
     return styles
-
-
-# --- over time ----------------------------------------------------------------------------------------------
 
 
 def compare_time_figure(logs: Sequence[Log]) -> Figure:
@@ -87,11 +96,8 @@ def compare_time_figure(logs: Sequence[Log]) -> Figure:
     return figure
 
 
-# --- tool paths ---------------------------------------------------------------------------------------------
-
-
 def path_figure(logs: Sequence[Log], styles: Sequence[dict[str, Any]]) -> Figure:
-    """Draw tool paths in two views, with the planned path and the obstacles.
+    """Draw tool paths in two views at one scale, with the planned path and the obstacles.
 
     Args:
         logs: runs of one scenario.
@@ -105,47 +111,33 @@ def path_figure(logs: Sequence[Log], styles: Sequence[dict[str, Any]]) -> Figure
     pad = 0.04 * max(float(np.max(upper - lower)), 0.1)
     lower, upper = lower - pad, upper + pad
     horizontal = int(np.argmax(np.ptp(paths, axis=0))) if len(paths) else 0
-    vertical_axes = [axis for axis in (2, 1, 0) if axis != horizontal]
-    # Laid out by hand [in]: both views at one scale, one above the other.
-    extent = (upper - lower) * min(6.0 / (upper - lower)[horizontal], 7.0 / np.sum((upper - lower)[vertical_axes]))
-    width, height = extent[horizontal] + 2.7, float(np.sum(extent[vertical_axes])) + 1.4
-    figure = Figure(figsize=(width, height))
-    for vertical, bottom in zip(vertical_axes, (0.85 + extent[vertical_axes[1]], 0.6), strict=True):
-        box = (0.75 / width, bottom / height, extent[horizontal] / width, extent[vertical] / height)
-        ax = figure.add_axes(box, xlim=(lower[horizontal], upper[horizontal]), ylim=(lower[vertical], upper[vertical]))
+    verticals = [axis for axis in (2, 1, 0) if axis != horizontal]
+    extent = (upper - lower) * min(6.0 / (upper - lower)[horizontal], 7.0 / np.sum((upper - lower)[verticals]))
+    size = extent[horizontal] + 2.8, float(np.sum(extent[verticals])) + 1.4
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(2, 1, sharex=True, height_ratios=extent[verticals])
+    for ax, vertical in zip(axes, verticals, strict=True):
         for faces, colour, alpha in outlines:
             flat = faces.reshape(-1, 3)[:, [horizontal, vertical]]
             hull = flat[ConvexHull(flat, qhull_options="QJ").vertices]
             ax.add_patch(Polygon(hull, facecolor=(colour, alpha), edgecolor=colour, linewidth=0.8, zorder=1))
         for k in range(longest.tool.shape[1]):
-            path = longest.target[:, k]
-            ax.plot(
-                path[:, horizontal],
-                path[:, vertical],
-                color=PLANNED_COLOUR,
-                linewidth=4.0,
-                zorder=2,
-                label="planned path",
-            )
-            ax.plot(path[-1:, horizontal], path[-1:, vertical], "k*", markersize=9, zorder=4, label="goal")
+            x, y = longest.target[:, k, horizontal], longest.target[:, k, vertical]
+            ax.plot(x, y, color=PLANNED_COLOUR, linewidth=4.0, zorder=2, label="planned path")
+            ax.plot(x[-1:], y[-1:], "k*", markersize=9, zorder=4, label="goal")
             for log, style in zip(logs, styles, strict=True):
                 ax.plot(log.tool[:, k, horizontal], log.tool[:, k, vertical], linewidth=1.7, **style)
         add_grid(ax)
+        ax.set(xlim=(lower[horizontal], upper[horizontal]), ylim=(lower[vertical], upper[vertical]), aspect="equal")
         ax.set_ylabel(f"{'xyz'[vertical]} [m]")
-        if vertical == vertical_axes[0]:
-            ax.tick_params(labelbottom=False)
-            lines: dict[str, Any] = {str(line.get_label()): line for line in ax.get_lines()}
-    ax.set_xlabel(f"{'xyz'[horizontal]} [m]")
-    colours_drawn = {colour for _, colour, _ in outlines}
+    axes[1].set_xlabel(f"{'xyz'[horizontal]} [m]")
+    handles: dict[str, Any] = {str(line.get_label()): line for line in axes[0].get_lines()}
     suffix = " (paler: earlier)" if len({alpha for _, _, alpha in outlines}) > 1 else ""
-    for colour, name in ((OBSTACLE_COLOUR, f"obstacle{suffix}"), (AT_REST_COLOUR, "robot body at rest")):
-        if colour in colours_drawn:
-            lines[name] = Patch(facecolor=(colour, 0.5), edgecolor=colour, label=name)
-    corner = ((0.85 + extent[horizontal]) / width, 1.0 - 0.5 / height)
-    figure.legend(handles=list(lines.values()), loc="upper left", bbox_to_anchor=corner, fontsize=8, frameon=False)
-    figure.suptitle(
-        f"{longest.meta['title'] or longest.meta['scenario']}  —  tool path", fontsize=11, y=1 - 0.12 / height
-    )
+    for colour, name in ((OBSTACLE, f"obstacle{suffix}"), (AT_REST, "robot body at rest")):
+        if any(colour == drawn for _, drawn, _ in outlines):
+            handles[name] = Patch(facecolor=(colour, 0.5), edgecolor=colour, label=name)
+    add_legend(axes[0], list(handles.values()))
+    figure.suptitle(f"{longest.meta['title'] or longest.meta['scenario']}  —  tool path", fontsize=11)
     return figure
 
 
@@ -159,20 +151,14 @@ def _outlines(logs: Sequence[Log], log: Log) -> list[tuple[Array, str, float]]:
         if is_endless(log, i):
             continue
         travel = np.cumsum(np.r_[0.0, np.linalg.norm(np.diff(log.obstacle_position[:, i], axis=0), axis=1)])
-        ticks = (
-            np.unique(np.searchsorted(travel, np.linspace(0.0, travel[-1], 4)))
-            if travel[-1] > 1e-3
-            else np.zeros(1, int)
-        )
-        for rank, tick in enumerate(ticks.tolist()):
-            outlines.append((obstacle_faces(log, i, tick), OBSTACLE_COLOUR, 0.5 * (rank + 1) / len(ticks)))
+        steps = np.unique(np.searchsorted(travel, np.linspace(0.0, travel[-1], 4))) if travel[-1] > 1e-3 else [0]
+        for rank, step in enumerate(steps):
+            outlines.append((obstacle_faces(log, i, int(step)), OBSTACLE, 0.5 * (rank + 1) / len(steps)))
     close_bodies: set[str] = set()
     for run in logs:
         avoidance = run.meta["config"]["avoidance"]
         is_close = run.min_distance + avoidance["offset"] < avoidance["d2"]
         close_bodies |= {name for pair in set(run.closest_pair[is_close].tolist()) for name in run.meta["pairs"][pair]}
     bodies_at_rest = [i for i in np.flatnonzero(~moving_bodies(log)).tolist() if log.meta["bodies"][i] in close_bodies]
-    outlines += [
-        (capsule_faces(log.body_ends[0, i], log.meta["body_radii"][i]), AT_REST_COLOUR, 0.5) for i in bodies_at_rest
-    ]
+    outlines += [(capsule_faces(log.body_ends[0, i], log.meta["body_radii"][i]), AT_REST, 0.5) for i in bodies_at_rest]
     return outlines

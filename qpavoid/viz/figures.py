@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from qpavoid.problem import Status
+from qpavoid.problem import Array, Status
 from qpavoid.run.log import STATUSES, Log
 from qpavoid.viz.compare import compare_time_figure, path_figure, solver_styles
 from qpavoid.viz.motion import motion_figure
@@ -86,30 +86,22 @@ def _title(log: Log) -> str:
     return title if log.meta["completed"] else f"{title}\n(ended early: {log.meta['stopped_by'] or 'part of a run'})"
 
 
-# --- one run ------------------------------------------------------------------------------------------------
-
-
 def position_names(log: Log) -> list[str]:
     """Name each of the nq coordinates of q.
 
-    Where nq > nv, joints with several velocities are taken to have one coordinate more (a quaternion, or the sine and
-    cosine of a planar joint), and, if the count asks for it, joints without limits to be cosine and sine; whatever
-    does not add up is numbered.
+    Where nq > nv, joints with several velocities are taken to have one coordinate more (a quaternion), and, if the
+    count asks for it, joints without limits to have two (cosine and sine); whatever does not add up is numbered.
     """
     names: list[str] = log.meta["coordinates"]
-    if len(names) == log.q.shape[1]:
+    limited, count = {name for name, _, _ in log.meta["position_limits"]}, log.q.shape[1]
+    if len(names) == count:
         return names
-    limited = {name for name, _, _ in log.meta["position_limits"]}
-    counts = Counter(name if name in limited else name.rpartition(".")[0] or name for name in names)
-    for circle in (("",), (".cos", ".sin")):
-        parts = {1: circle, 6: (".x", ".y", ".z", ".qx", ".qy", ".qz", ".qw")}
-        names_found = []
-        for joint, count in counts.items():
-            suffixes = parts.get(count, tuple(f".{i}" for i in range(count + 1)))
-            names_found += [joint] if joint in limited else [joint + part for part in suffixes]
-        if len(names_found) == log.q.shape[1]:
-            return names_found
-    return [f"q[{i}]" for i in range(log.q.shape[1])]
+    joints = Counter(name if name in limited else name.rpartition(".")[0] or name for name in names)
+    for endless in (1, 2):
+        sizes = {joint: 1 if joint in limited else n + 1 if n > 1 else endless for joint, n in joints.items()}
+        if sum(sizes.values()) == count:
+            return [f"{joint}.{i}" if size > 1 else joint for joint, size in sizes.items() for i in range(size)]
+    return [f"q[{i}]" for i in range(count)]
 
 
 def joints_figure(log: Log) -> Figure:
@@ -125,49 +117,61 @@ def joints_figure(log: Log) -> Figure:
         ax.set_title(name, fontsize=9)
         ax.tick_params(labelsize=8)
         add_grid(ax)
-        if name in limits:
-            for limit in filter(np.isfinite, limits[name]):
-                ax.axhline(limit, color=COLLISION, linewidth=0.8)
-            bottom, top = ax.get_ylim()
-            ax.set_ylim(bottom, top)
-            for limit, outer in zip(limits[name], (bottom, top), strict=True):
-                if np.isfinite(limit):
-                    ax.axhspan(limit, outer, color=COLLISION, alpha=0.15, linewidth=0)
+        finite = [limit for limit in limits.get(name, ()) if np.isfinite(limit)]
+        for limit in finite:
+            ax.axhline(limit, color=COLLISION, linewidth=0.8)
+        bottom, top = ax.get_ylim()
+        for limit in finite:
+            outer = bottom if limit == limits[name][0] else top
+            ax.axhspan(limit, outer, color=COLLISION, alpha=0.15, linewidth=0)
+        ax.set_ylim(bottom, top)
         if i + columns >= len(names):
             ax.set_xlabel("time [s]", fontsize=9)
     figure.supylabel(f"joint position [{units(log)}]", fontsize=10)
-    handles = [
-        Line2D([], [], color=COLOURS[0], label="position"),
-        Patch(color=COLLISION, alpha=0.3, label="beyond limits"),
-    ]
+    beyond = Patch(color=COLLISION, alpha=0.3, label="beyond limits")
+    handles = [Line2D([], [], color=COLOURS[0], label="position"), beyond]
     figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=9, frameon=False)
     return figure
 
 
+def _draw_lines(ax: Any, t: Array, values: Array, names: Sequence[str], shown: Any, rest: str, width: Any) -> list[Any]:
+    """Draw lines over time: some with a name, the others in grey; return legend entries.
+
+    Args:
+        ax: the panel.
+        t: times (n,) [s].
+        values: (n, m).
+        names: of all m lines.
+        shown: indices of those that have a name.
+        rest: what the others are.
+        width: of each line with a name.
+    """
+    others = [i for i in range(len(names)) if i not in shown and np.isfinite(values[:, i]).any()]
+    for i in others:
+        ax.plot(t, values[:, i], color=_GREY, linewidth=0.7, zorder=1)
+    for rank, (i, linewidth) in enumerate(zip(shown, width, strict=True)):
+        style = {"color": COLOURS[rank % len(COLOURS)], "linestyle": DASHES[rank // len(COLOURS) % len(DASHES)]}
+        ax.plot(t, values[:, i], label=names[i], linewidth=linewidth, zorder=3, **style)
+    handles: list[Any] = ax.get_legend_handles_labels()[0]
+    return handles + [Line2D([], [], color=_GREY, linewidth=0.7, label=f"{len(others)} {rest}")] * bool(others)
+
+
 def distances_figure(log: Log) -> Figure:
     """Draw body distances, d1, d2, α and β over time (Figs. 8, 11, 13 of the paper)."""
-    avoidance = log.meta["config"]["avoidance"]
+    avoidance, distance = log.meta["config"]["avoidance"], log.body_distance
     upper_distance = round(1.5 * (avoidance["d2"] - avoidance["offset"]), 9)
-    distance = log.body_distance
     figure = Figure(figsize=(9.5, 7.0), layout="constrained")
     ax, gains = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
     drawn = np.flatnonzero(np.isfinite(distance).any(axis=0))
     nearest = np.min(distance, axis=0, initial=np.inf)
     near = drawn if len(drawn) <= len(COLOURS) else drawn[nearest[drawn] < upper_distance]
-    rest = f"never within {upper_distance:g} m"
+    rest = f"bodies never within {upper_distance:g} m"
     if len(near) > _MAX_NAMED_LINES:
-        near, rest = np.sort(near[np.argsort(nearest[near], kind="stable")[:_MAX_NAMED_LINES]]), "farther away"
-    far = [i for i in drawn if i not in near]
-    for i in far:
-        ax.plot(log.t, distance[:, i], color=_GREY, linewidth=0.7, zorder=1)
+        near, rest = np.sort(near[np.argsort(nearest[near], kind="stable")[:_MAX_NAMED_LINES]]), "bodies farther away"
     # Thinner and thinner: the two bodies of a pair share their distance, and neither line may hide the other.
-    for rank, (i, width) in enumerate(zip(near, np.linspace(3.0, 1.2, len(near)), strict=True)):
-        ax.plot(log.t, distance[:, i], label=log.meta["bodies"][i], linewidth=width, zorder=3, **_style(rank))
-    handles = ax.get_legend_handles_labels()[0]
-    if far:
-        handles.append(Line2D([], [], color=_GREY, linewidth=0.7, label=f"{len(far)} bodies {rest}"))
-    handles += draw_levels(ax, log, qp=is_qp(log))
-    handles += _shade_status(ax, log)
+    widths = np.linspace(3.0, 1.2, len(near))
+    handles = _draw_lines(ax, log.t, distance, log.meta["bodies"], near, rest, widths)
+    handles += draw_levels(ax, log, qp=is_qp(log)) + _shade_status(ax, log)
     _plot_gains(gains, log)
     label_distances(ax, distance[:, near])
     add_legend(ax, handles)
@@ -180,8 +184,8 @@ def _plot_gains(ax: Any, log: Log) -> None:
     ax.plot(log.t, log.beta, color="#8A8A8A", linestyle=DASHES[1], label="β of the closest pair (eq. 12)")
     ax.set_yscale("symlog", linthresh=1.0)
     top = next(top for top in (1.0, 10.0, ALPHA_SHOWN) if np.nanmax(alpha, initial=0.0) <= top)
-    ticks = [tick for tick in (0.0, 0.5, 1.0, 10.0, ALPHA_SHOWN) if tick <= top]
     ax.set_ylim(-0.1, 1.15 * top)
+    ticks = [tick for tick in (0.0, 0.5, 1.0, 10.0, ALPHA_SHOWN) if tick <= top]
     ax.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
     ax.set_yticks([], minor=True)
     ax.set_ylabel(f"gains [-]\n(α up to {ALPHA_SHOWN:g})" if np.any(log.alpha > ALPHA_SHOWN) else "gains [-]")
@@ -200,14 +204,7 @@ def speeds_figure(log: Log) -> Figure:
     fastest = np.sort(np.argsort(-peak)[:_MAX_NAMED_LINES])
     figure = Figure(figsize=(9.5, 4.5), layout="constrained")
     ax = figure.add_subplot()
-    rest = [i for i in range(len(names)) if i not in fastest]
-    for i in rest:
-        ax.plot(log.t, log.v[:, i], color=_GREY, linewidth=0.7, zorder=1)
-    for rank, i in enumerate(fastest):
-        ax.plot(log.t, log.v[:, i], label=names[i], linewidth=1.4, zorder=3, **_style(rank))
-    handles = ax.get_legend_handles_labels()[0]
-    if rest:
-        handles.append(Line2D([], [], color=_GREY, linewidth=0.7, label=f"{len(rest)} slower joints"))
+    handles = _draw_lines(ax, log.t, log.v, names, fastest, "slower joints", np.full(len(fastest), 1.4))
     at_limit = [i for i in fastest if limits[i] is not None and peak[i] > 0.8 * limits[i]]
     for limit in sorted({limits[i] for i in at_limit}):
         style = {"color": COLLISION, "linewidth": 1.0, "linestyle": DASHES[3]}
@@ -223,10 +220,6 @@ def speeds_figure(log: Log) -> Figure:
     return figure
 
 
-def _style(rank: int) -> dict[str, Any]:
-    return {"color": COLOURS[rank % len(COLOURS)], "linestyle": DASHES[rank // len(COLOURS) % len(DASHES)]}
-
-
 def _shade_status(ax: Any, log: Log) -> list[Any]:
     """Shade steps that were relaxed or stopped; return their legend entries."""
     handles = []
@@ -238,5 +231,5 @@ def _shade_status(ax: Any, log: Log) -> list[Any]:
             ax.axvspan(log.t[start], log.t[end - 1] + dt, color=colour, alpha=0.35, linewidth=0, zorder=0)
         if len(starts):
             count = int(bad.sum())
-            handles.append(Patch(color=colour, alpha=0.35, label=f"{status.value}: {count} tick{'s' * (count > 1)}"))
+            handles.append(Patch(color=colour, alpha=0.35, label=f"{status.value}: {count} step{'s' * (count > 1)}"))
     return handles

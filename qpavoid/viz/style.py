@@ -22,6 +22,7 @@ DASHES: tuple[Any, ...] = (
     (0, (2, 2)),
 )
 COLLISION, D1, D2, D_SAFE = "#C62F2F", "#7A4B9A", "#8A8A8A", "#00695C"
+MOVING, AT_REST, OBSTACLE, GROUND, TOOL_PATH = "#6BA3D6", "#C4C4C4", "#E69F00", "#EFE3C8", "#007A56"
 
 
 def units(log: Log, per: str = "") -> str:

@@ -1,4 +1,4 @@
-"""Command line: `qpavoid bench run | smoke | report | show | list`.
+"""Command line: `qpavoid bench run | smoke | report | show | list | tick | solvers | endurance | robots`.
 
 Dependencies of a command are imported when it runs.
 """
@@ -17,6 +17,10 @@ from qpavoid.config.shipped import family_names, suite_names
 from qpavoid.errors import ConfigError
 from qpavoid.run.report import to_json
 from qpavoid.run.terminal import ERR, OUT, names_of, progress, terminate_like_interrupt
+from qpavoid_bench.endurance.command import endurance
+from qpavoid_bench.solvers.command import solvers
+from qpavoid_bench.survey import robots
+from qpavoid_bench.tick.command import tick
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -32,6 +36,13 @@ app = typer.Typer(
     help="Compare solvers on families of scenarios: the arena.",
 )
 
+app.command()(tick)
+app.command()(solvers)
+app.command()(endurance)
+app.command()(robots)
+_MEASURES = ("tick", "solvers", "endurance", "robots")
+"""Commands that need none of the packages below."""
+
 _PACKAGES = ("distributed", "mujoco", "pandas", "statsmodels", "matplotlib")
 
 Name = Annotated[str, typer.Argument(metavar="SUITE", help="Shipped name or path of a YAML file.")]
@@ -41,8 +52,10 @@ Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and 
 
 
 @app.callback()
-def arena() -> None:
-    """Compare solvers on families of scenarios."""
+def arena(context: typer.Context) -> None:
+    """Compare solvers on families of scenarios; time control steps, back ends and long runs."""
+    if context.invoked_subcommand in _MEASURES:
+        return
     missing = [package for package in _PACKAGES if find_spec(package) is None]
     if missing:
         raise ConfigError(f"qpavoid bench needs {', '.join(missing)}: pip install 'qpavoid[arena]'")

@@ -34,7 +34,7 @@ COMPARISON_LIMITS = (
     "them one period ahead, as a task of this library would have it; of obstacles they know where these are, not how "
     "they move.",
     "Times are those of whole ticks, from state to velocity, on the machine above, with that many processes at once. "
-    "Ratios of less than 1.5 mean little; `bench/tick` is where libraries are timed side by side.",
+    "Ratios of less than 1.5 mean little; `qpavoid bench tick` is where libraries are timed side by side.",
     "Distances, contacts and limit violations are MuJoCo's, which runs the commanded velocities again with kinematics "
     "and distances of its own, at the ticks and between them.",
     "Not measured: drives, dynamics and forces; sensors, beyond the delay and noise of a family that says so; memory, "
@@ -246,7 +246,8 @@ def _worst_runs(results: Results, facts: Mapping[str, Any], folder: Path) -> lis
 def _fault(run: Mapping[Any, Any]) -> str:
     """Describe how a run failed."""
     if run["collided"]:
-        return f"{run['contacts']} contacts, {max(0.0, -1e3 * run['min_distance']):.1f} mm deep"
+        verdict = f"; {run['verdict']}" if run["verdict"] else ""
+        return f"{run['contacts']} contacts, {max(0.0, -1e3 * run['min_distance']):.1f} mm deep{verdict}"
     if run["reachable"]:
         return f"{1e3 * run['final_error']:.0f} mm short of its goal{', stuck' if run['stuck'] else ''}"
     return "not at rest at the end"

@@ -10,7 +10,7 @@ import numpy as np
 
 from qpavoid.config import ScenarioConfig
 from qpavoid.problem import Array, Status
-from qpavoid.run.log import STATUSES, path_deviation
+from qpavoid.run.metrics import path_deviation
 from qpavoid_bench.arena.case import Case
 from qpavoid_bench.arena.checker import Findings
 from qpavoid_bench.arena.rollout import Rollout
@@ -46,6 +46,10 @@ class Score:
     """No contact, and all goals reached; where they cannot be, at rest at the end."""
     collided: bool
     """At least one pair touched."""
+    avoidable: bool
+    """A contact that could have been avoided: any where a solution is proved to exist, else by `arena.verdict`."""
+    verdict: str
+    """Proof of that, of a contact in a case without proved solution; else empty."""
     contacts: int
     """Number of pairs that touched."""
     min_distance: float
@@ -141,6 +145,8 @@ def score(
         reachable=case.reachable,
         success=not findings.contacts and (arrived if case.reachable else rests),
         collided=bool(findings.contacts),
+        avoidable=bool(findings.contacts),
+        verdict="",
         contacts=len(findings.contacts),
         min_distance=findings.distance,
         d1=surface_safety_distance(scenario),

@@ -11,6 +11,7 @@ import numpy as np
 from qpavoid.problem import Array
 from qpavoid_bench.arena.results import Results
 from qpavoid_bench.arena.statistics import Interval, mean, median, rate
+from qpavoid_bench.tables import table
 
 
 class Column(NamedTuple):
@@ -31,6 +32,7 @@ class Column(NamedTuple):
 COLUMNS = (
     Column("success", "success [%]", 100.0, 0, "rate", "no contact, and every goal reached; at rest where none can be"),
     Column("collided", "contact [%]", 100.0, 0, "rate", "runs in which something touched"),
+    Column("avoidable", "avoidable contact [%]", 100.0, 0, "rate", "runs with one that the robot could have avoided"),
     Column(
         "min_distance", "nearest, worst 5 % [mm]", 1e3, 1, "low", "smallest distance of the run that 95 % are above"
     ),
@@ -96,12 +98,8 @@ def _shown(value: float, digits: int) -> str:
 
 def markdown_table(headings: Sequence[str], rows: Iterable[Sequence[Any]]) -> list[str]:
     """Return the lines of a Markdown table, whose cells are Markdown already; none without rows."""
-    body = [_row(row) for row in rows]
-    return [_row(headings), _row(["---"] * len(headings)), *body, ""] if body else []
-
-
-def _row(cells: Sequence[Any]) -> str:
-    return f"| {' | '.join(map(str, cells))} |"
+    body = list(rows)
+    return [*table(headings, body, text_columns=len(headings)).split("\n"), ""] if body else []
 
 
 def escape(text: str) -> str:

@@ -15,6 +15,7 @@ from qpavoid_bench.arena.entrants import Entrant
 from qpavoid_bench.arena.mujoco_model import build
 from qpavoid_bench.arena.rollout import Pilot, roll_out
 from qpavoid_bench.arena.scores import Score, score, surface_safety_distance
+from qpavoid_bench.arena.verdict import decisive, judge
 from qpavoid_bench.arena.world import World, build_world
 
 MAX_TIME_RATIO = 20.0
@@ -39,7 +40,13 @@ def run_trial(case: Case, entrant: Entrant) -> Score:
     rollout = roll_out(case, pilot, world, MAX_TIME_RATIO * scenario.duration)
     model, d1 = build(world.scene, world.q0), surface_safety_distance(scenario)
     findings = check_run(model, rollout.t, rollout.v, scenario.limits, d1)
-    return score(case, world, entrant.name, entrant.digest, rollout, findings, perf_counter() - begin)
+    verdict = None
+    if not case.solved_by:  # of the others it is known that all contacts are avoidable
+        verdict = decisive(judge(model, scenario, rollout.t, rollout.v, findings))
+    result = score(case, world, entrant.name, entrant.digest, rollout, findings, perf_counter() - begin)
+    if verdict is None:
+        return result
+    return replace(result, avoidable=verdict.avoidable, verdict=verdict.describe(model))
 
 
 def failing_entrant(entrant: Entrant, failure: str) -> Entrant:

@@ -17,7 +17,7 @@ from qpavoid.config.shipped import find_family, find_robot, find_setup, setup_na
 from qpavoid.config.text import read_text
 from qpavoid.errors import ConfigError, UnknownName, located, nearest
 from qpavoid.model.robot import Robot
-from qpavoid_bench.arena.families import moving, statics, two_arms
+from qpavoid_bench.arena.families import adversarial, moving, statics, two_arms
 from qpavoid_bench.arena.families.parameters import Draw, Parameter
 from qpavoid_bench.arena.python_file import MAX_FILE_SIZE, load_attribute
 
@@ -36,6 +36,7 @@ GENERATORS: dict[str, Generator] = {
     "passing": two_arms.passing,
     **{name: partial(moving.movers, motion) for name, motion in moving.MOTIONS.items()},
     "random_walk": partial(moving.movers, moving.wander),
+    "adversarial": adversarial.adversarial,
 }
 """Generators that ship."""
 
@@ -63,6 +64,8 @@ class FamilyConfig(Block):
     """Delay and noise of measured obstacle states: fields of `qpavoid_bench.arena.case.Sensor`, "$name" as above."""
     reachable: bool = True
     """Whether the goals can be reached; it is checked, whichever it is."""
+    proved: bool = True
+    """Whether a solution is proved to exist; where not, each contact is judged avoidable or not (`arena.verdict`)."""
 
     @model_validator(mode="after")
     def _check_robots(self) -> FamilyConfig:

@@ -44,8 +44,9 @@ def make_case(family: Family, seed: int) -> Case:
         draw = Draw(family.config.parameters, seed, number, family.in_template)
         try:
             scenario = _scenario(family, template, draw, seed)
-            world = build_world(scenario)
-            how = solved_by(scenario, world, family.config.reachable, np.random.default_rng([seed, number]))
+            world, config = build_world(scenario), family.config
+            random = np.random.default_rng([seed, number])
+            how = solved_by(scenario, world, config.reachable if config.proved else None, random)
         except Redraw as reason:
             causes.append(str(reason))
             continue

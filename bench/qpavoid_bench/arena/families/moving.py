@@ -30,13 +30,17 @@ def movers(motion: MotionGenerator, draw: Draw, robot: Robot) -> dict[str, Any]:
 
 
 def draw_shape(draw: Draw) -> dict[str, Any]:
-    """Draw a ball, or a capsule or cube of about its size."""
+    """Draw a ball, or a capsule, cylinder, cube or plate of about its size."""
     radius = draw("radius")
     match draw("shape"):
         case "capsule":
             return {"type": "capsule", "radius": radius, "length": 2.0 * radius}
+        case "cylinder":
+            return {"type": "cylinder", "radius": radius, "length": 2.0 * radius}
         case "box":
             return {"type": "box", "size": [1.6 * radius] * 3}
+        case "plate":
+            return {"type": "box", "size": [4.0 * radius, 4.0 * radius, 0.1 * radius]}
         case _:
             return {"type": "sphere", "radius": radius}
 

@@ -26,13 +26,13 @@ _SPEED_FRACTION, _MAX_SPEED = 0.5, 1.5
 """Fraction of the joints' speed limits that plans use [-], and their largest speed [rad/s or m/s]."""
 
 
-def solved_by(scenario: ScenarioConfig, world: World, reachable: bool, random: np.random.Generator) -> str:
+def solved_by(scenario: ScenarioConfig, world: World, reachable: bool | None, random: np.random.Generator) -> str:
     """Describe the proof that a scenario is as intended.
 
     Args:
         scenario: what is run.
         world: of the same.
-        reachable: whether its goals are meant to be reached.
+        reachable: whether its goals are meant to be reached; None: that is not to be proved, and the answer is empty.
         random: where samples come from.
 
     Raises:
@@ -46,6 +46,8 @@ def solved_by(scenario: ScenarioConfig, world: World, reachable: bool, random: n
         raise Redraw("the start is too near to something")
     if not clearance.immovable_pairs_are_clear(world.q0):
         raise Redraw("an obstacle comes too near to what cannot move")
+    if reachable is None:
+        return ""
     if reachable:
         motion, d1 = find_plan(scenario, world, clearance, random), surface_safety_distance(scenario)
         return (

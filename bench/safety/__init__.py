@@ -1,1 +1,0 @@
-"""Safety campaign: another simulator runs what the solvers command, in random scenes, and detects contacts."""

@@ -1,0 +1,29 @@
+"""How far a tool is off the path that was planned for it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from qpavoid.geometry.segments import point_segment_distance
+from qpavoid.problem import Array
+
+
+def path_deviation(tool: Array, target: Array, corners: int = 500) -> Array:
+    """Compute the distance of each tool from the path that its target draws, at whatever time.
+
+    Args:
+        tool: (N, k, 3) positions of the tools [m].
+        target: (N, k, 3) positions of their targets [m].
+        corners: the path is taken as a polyline with at most so many corners.
+
+    Returns:
+        (N, k) [m].
+    """
+    count, tasks = tool.shape[:2]
+    deviation = np.full((count, tasks), np.inf)
+    every = np.unique(np.linspace(0, max(count - 1, 0), min(count, corners)).astype(int))
+    for task in range(tasks):
+        path = target[every, task]
+        for start, end in zip(path, np.concatenate((path[1:], path[-1:])), strict=True):
+            deviation[:, task] = np.minimum(deviation[:, task], point_segment_distance(tool[:, task], start, end))
+    return deviation
