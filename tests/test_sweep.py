@@ -490,9 +490,12 @@ def test_bench_run_show_and_resume(cli, folder, monkeypatch):
     document = json.loads(first.stdout)
     assert document["runs"] == document["new"] == 4 and document["failed"] == 0
     assert [entry["entrant"] for entry in document["entrants"]] == ["tracking", "wide"]
+    with Store(Path("out/bench/mine")) as store:  # of an earlier sweep, which asked for more
+        store.fail({"family": "shelf", "seed": 0, "entrant": None, "failure": "no plan"})
     with monkeypatch.context() as patch:
         patch.setattr("qpavoid.run.pool.Workers", None)  # no process is started for it
         rerun = cli("bench", "run", "mine.yaml")
+    assert not rerun.lines
     assert rerun.status == 0 and "4 runs, 0 of them new" in rerun.stdout and "tracking" in rerun.stdout
     out = Path("out/bench/mine")
     shown = cli(

@@ -201,6 +201,7 @@ def _run_sweep(suite: Suite, folder: Path, cluster: str | None, jobs: int | None
 
         todo = plan(suite, store)
         if not (todo.cases or todo.runs):
+            store.drop_failures()
             return Tally("runs", 0, 0, 0, 0)
         try:
             with Workers(jobs) if cluster is None else ClusterWorkers(cluster) as workers:

@@ -77,12 +77,16 @@ class Store:
         """Record what could not be made or run: family, seed, entrant (None: the case could not be made), failure."""
         self.add("failures", failure)
 
+    def drop_failures(self) -> None:
+        """Drop what an earlier sweep could not make or run."""
+        self._database.execute("DELETE FROM failures")
+
     def begin(self, facts: Mapping[str, Any]) -> None:
         """Begin a sweep: write its facts, to whose `entrants` those of earlier sweeps are added; drop its failures."""
         earlier = self._database.execute("SELECT json FROM facts WHERE name = 'sweep'").fetchone()
         entrants = {**(json.loads(earlier[0])["entrants"] if earlier else {}), **facts["entrants"]}
         text = json.dumps({**facts, "entrants": entrants}, default=str)
-        self._database.execute("DELETE FROM failures")
+        self.drop_failures()
         self._database.execute("INSERT OR REPLACE INTO facts VALUES ('sweep', ?)", [text])
 
     def cases(self) -> dict[tuple[str, int, str], tuple[str, str]]:
