@@ -10,6 +10,7 @@ import numpy as np
 
 from qpavoid.config import ScenarioConfig
 from qpavoid.problem import Array, Status
+from qpavoid.run.log import STATUSES
 from qpavoid.run.metrics import path_deviation
 from qpavoid_bench.arena.case import Case
 from qpavoid_bench.arena.checker import Findings
