@@ -8,8 +8,6 @@ import pytest
 TESTS = Path(__file__).parent
 NAMED_TUPLES = {"_asdict", "_fields", "_make", "_replace"}
 """Public members of named tuples, whose underscore keeps them apart from fields."""
-TO_DO: set[str] = set()  # fmt: skip
-"""Files that still read private members; a file is taken off once it reads none."""
 
 
 def is_private(name: object) -> bool:
@@ -37,8 +35,6 @@ def private_accesses(source: str) -> list[str]:
 @pytest.mark.parametrize("path", sorted(TESTS.glob("*.py")), ids=lambda path: path.name)
 def test_file_uses_public_names_alone(path):
     found = private_accesses(path.read_text(encoding="utf-8"))
-    if found and path.name in TO_DO:
-        pytest.skip(f"to do: {', '.join(found)}")
     assert found == []
 
 

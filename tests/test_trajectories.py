@@ -78,7 +78,6 @@ def test_a_controller_follows_motions_of_other_classes(panda):
         controller.step(panda.home, t)
         found = controller.obstacle_pose("it")
         np.testing.assert_array_equal(found.position, Pendulum().sample(t).position)
-        np.testing.assert_array_equal(controller._builder.tracker.current.states[0, 12:15], Pendulum().sample(t).linear)
 
 
 def test_a_motion_that_gives_nonsense_is_named_and_moves_nothing(panda):
