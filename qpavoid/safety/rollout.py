@@ -285,10 +285,10 @@ class BackupRollouts:
     def _policy_velocity(self, near: Near, policy: BackupPolicy) -> Array:
         """Compute the velocity (nv,) of a policy for the next period; that of a stop where its QP fails."""
         x, (h, bias) = self._layout, policy
-        v = np.zeros_like(bias)
+        v: Array | float = 0.0
         if h:
             farthest, converged = kernels.max_clearance_velocity(
                 h, *near, PREFERRED_DISTANCE, _MAX_DEPTH, _EFFORT_WEIGHT, bias, x.lower, x.upper
             )
             v = farthest if converged else v
-        return np.minimum(np.maximum(v, x.lower), x.upper)
+        return np.asarray(np.minimum(np.maximum(v, x.lower), x.upper))
