@@ -197,7 +197,7 @@ def test_a_telescope_may_be_drawn_in(tmp_path):
     assert described.counts["drawn in"] == 1
     note = notes_of(described, NoteKind.PAIR)["s0", "s2"]
     # s0 and s2 overlap while t1 + t2 < 0.46, of two even ranges of 0.4
-    assert note.share == pytest.approx(1.0 - 0.5 * ((0.8 - 0.46) / 0.4) ** 2, abs=0.1)
+    assert note.fraction == pytest.approx(1.0 - 0.5 * ((0.8 - 0.46) / 0.4) ** 2, abs=0.1)
     home = described.robot.home
     bounds = described.robot.bounds()
     assert np.all(home[bounds.q_index] >= bounds.lower) and np.all(home[bounds.q_index] <= bounds.upper)
@@ -262,9 +262,9 @@ def test_one_table_holds_all_that_was_left_out(cli, tmp_path):
     assert any(line.split()[:2] == ["warning", "joint"] and "held" in line for line in added.stdout.splitlines())
     document = json.loads(cli("robot", "add", "telescope.urdf", "--json").stdout)
     (note,) = [note for note in document["notes"] if note["subject"] == ["s0", "s2"]]
-    assert note["kind"] == "pair" and note["share"] == pytest.approx(int(share) / 100, abs=0.006)
+    assert note["kind"] == "pair" and note["fraction"] == pytest.approx(int(share) / 100, abs=0.006)
     entry = next(entry for entry in document["left_out"] if entry["links"] == ["s0", "s2"])
-    assert entry["reason"] == "drawn in" and entry["geometry"] == note["share"]
+    assert entry["reason"] == "drawn in" and entry["geometry"] == note["fraction"]
     assert {tuple(entry["links"]) for entry in document["left_out"]} >= {("base", "s0"), ("s0", "s1"), ("base", "s2")}
 
 

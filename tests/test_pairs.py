@@ -77,7 +77,7 @@ def test_pairs_that_always_touch_are_dropped_and_noted(tmp_path, radius):
     robot = Robot.from_urdf(write_chain(tmp_path), bodies=bodies, home=folded)
     assert pairs_of(robot) == {frozenset(("b0", "b3"))}
     pairs = [note for note in robot.notes if note.kind is NoteKind.PAIR]
-    assert [(note.subject, note.share) for note in pairs] == [(("b0", "b2"), 1.0), (("b1", "b3"), 1.0)]
+    assert [(note.subject, note.fraction) for note in pairs] == [(("b0", "b2"), 1.0), (("b1", "b3"), 1.0)]
     assert look(build_scene(robot), robot.home).distance[0] < 0.0
 
 

@@ -192,7 +192,7 @@ def test_approach_check_is_conservative(tmp_path_factory, lines, t, v):
     for k, away in enumerate((0.0, 0.01, 0.1, 0.3)):  # a cached clearance counts for configurations near by
         home, at = robot.home + away, t + 0.02 * k
         moving = [o for o in obstacles if o.motion.sample(at).linear.any()]  # those at rest do not count
-        if not check.stays_far(home, v, at):
+        if not check.is_far(home, v, at):
             continue
         for later in np.linspace(0.0, 1.5, 76):
             braking = np.minimum(later, np.abs(v) / 2.0)
@@ -213,7 +213,7 @@ def test_approach_check_of_external_obstacles_is_conservative(tmp_path_factory, 
     samples = [Sample.at(ball[:3], linear=[*ball[3:], 0.0]) for ball in balls]
     tracker.advance(tracker.read(0.0, {f"o{i}": sample for i, sample in enumerate(samples)}))
     check, v = ApproachCheck(shared, rollouts, tracker), np.array(v)
-    if not check.stays_far(robot.home, v, 0.0):
+    if not check.is_far(robot.home, v, 0.0):
         return
     assert check.max_speed == pytest.approx(max(np.linalg.norm(sample.linear) for sample in samples), abs=1e-12)
     for later in np.linspace(0.0, 1.5, 76):

@@ -38,8 +38,8 @@ class RowAssembler:
         contacts: ContactRows | None = None,
     ) -> None:
         """Lay the memory out; see `Controller` for the arguments."""
-        frames, others = in_order(tasks)
-        frame_ids = [i for task in (*frames, *others) for i in task.frame_ids]
+        frames, row_tasks = in_order(tasks)
+        frame_ids = [i for task in (*frames, *row_tasks) for i in task.frame_ids]
         frame_ids += contacts.frame_ids if contacts else ()
         self._forward = ForwardKinematics(scene.robot.model, frame_ids)
         self.query = DistanceQuery(scene)
@@ -48,7 +48,7 @@ class RowAssembler:
         """Surface distance below which a pair gets a row [m]."""
         self.query.set_influence_distance(self.influence_distance)
         x = self._layout = lay_out(
-            scene, frames, others, bounds, self._forward, self.query, avoidance, limits, damping, dt
+            scene, frames, row_tasks, bounds, self._forward, self.query, avoidance, limits, damping, dt
         )
         self._hard = (x.hard_lower, x.hard_upper) if limits.relax_acceleration else (x.lower, x.upper)
         self._packed, self._contacts = kernels.pack(x), contacts
@@ -59,13 +59,13 @@ class RowAssembler:
         self._stops = JerkStops(x, self._packed) if x.jerk_limited else None
         self.targets = x.targets
         """(f, 18) states that the frame tasks are to reach, see `trajectories`; to be written before `compute`."""
-        self._tracking, self._levels = Tracking(x.A, x.b, damping), task_levels(frames, others)
+        self._tracking, self._levels = Tracking(x.A, x.b, damping), task_levels(frames, row_tasks)
         self._views: dict[int, tuple[Proximity, AvoidanceRows]] = {}
-        self._task_rows = TaskRows(others, x.A, x.b)
+        self._task_rows = TaskRows(row_tasks, x.A, x.b)
         self.task_errors = self._task_rows.errors
         """How far each of the tasks that are not frames was from its target in the last step, in its unit."""
         self._eye = np.eye(len(x.v_tracking))
-        self._is_compiled = self._forward.is_compiled and self.query.is_compiled and not others and contacts is None
+        self._is_compiled = self._forward.is_compiled and self.query.is_compiled and not row_tasks and contacts is None
         self._q = scene.robot.home.copy()
         self._step = self._compile()
         self.kinematics = Kinematics(x.J_world, x.poses)

@@ -115,9 +115,9 @@ class Attachments:
 
     def update(self) -> None:
         """Let pairs that touched get rows again, once they are apart in the distances of this step."""
-        apart = self._query.distances_of(self._touching) > self._safety_distance
-        if apart.any():
-            self._touching = self._touching[~apart]
+        is_separated = self._query.distances_of(self._touching) > self._safety_distance
+        if is_separated.any():
+            self._touching = self._touching[~is_separated]
             self._update()
 
     def _change(self, index: int, joint: int, placement: Array) -> None:

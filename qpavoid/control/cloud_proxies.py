@@ -49,19 +49,19 @@ class CloudProxies:
         self._spacing = np.maximum([fit.length / _PLACES for fit in fits], 2.0 * resolution)
         self._planes = {i: _planes(body) for i, body in enumerate(bodies) if not _is_capsule(body)}
         self._slots = np.full((count, nearest), -1, dtype=np.intp)
-        self._kept = np.full((count, nearest), -1, dtype=np.intp)
+        self._previous = np.full((count, nearest), -1, dtype=np.intp)
         self._first = np.zeros(count + 1, dtype=np.intp)
-        self._room = -1
+        self._capacity = -1
         self.fill_with(voxels)
 
     def fill_with(self, voxels: Voxels) -> None:
         """Takes other voxels, in place of all that there were."""
         self.voxels = voxels
-        room = len(self._bodies) * len(voxels.centers)
-        if room > self._room:
-            self._room = room
-            self._point = np.zeros(room, dtype=np.intp)
-            self._distance, self._place = np.zeros(room), np.zeros((room, 4))
+        capacity = len(self._bodies) * len(voxels.centers)
+        if capacity > self._capacity:
+            self._capacity = capacity
+            self._point = np.zeros(capacity, dtype=np.intp)
+            self._distance, self._place = np.zeros(capacity), np.zeros((capacity, 4))
 
     @property
     def radius(self) -> float:
@@ -69,28 +69,30 @@ class CloudProxies:
         farthest = np.sqrt(np.square(self.voxels.centers).sum(axis=1).max(initial=0.0))
         return float(farthest) + self._ball
 
-    def places(self, poses: Array, off: Any, pose: Sample, reach: float) -> Array:
+    def places(self, poses: Array, off: Any, pose: Sample, influence_distance: float) -> Array:
         """World positions (b, nearest, 3) of the balls [m]; far away where they stand for no voxel.
 
         Args:
             poses: world poses of the bodies, rotation by columns and translation (b, 12).
             off: bodies that do not move with the robot now (k,).
             pose: of the cloud.
-            reach: surface distance up to which voxels are looked for [m].
+            influence_distance: surface distance up to which voxels are looked for [m].
         """
         rotation, voxels = pose.rotation, self.voxels
         turned = np.matmul(self._ends, poses[:, :9].reshape(-1, 3, 3)) + poses[:, None, 9:]
         axes = ((turned - pose.position) @ rotation).reshape(-1, 6)
         axes[off] = np.nan
-        found = self._first, self._point, self._distance, self._place
-        kernels.voxels_within(axes, self._radii, reach, voxels.centers, voxels.blocks, voxels.starts, *found)
+        candidates = self._first, self._point, self._distance, self._place
+        kernels.voxels_within(
+            axes, self._radii, influence_distance, voxels.centers, voxels.blocks, voxels.starts, *candidates
+        )
         for body in self._planes:
             if self._first[body] < self._first[body + 1]:
                 self._refine(body, poses[body], pose)
-        kernels.select_voxels(*found, self._spacing, voxels.keys, self._slots, self._kept)
+        kernels.select_voxels(*candidates, self._spacing, voxels.keys, self._slots, self._previous)
         places = np.full((*self._slots.shape, 3), PARKING_DISTANCE)
-        taken = self._slots >= 0
-        places[taken] = voxels.centers[self._slots[taken]] @ rotation.T + pose.position
+        is_placed = self._slots >= 0
+        places[is_placed] = voxels.centers[self._slots[is_placed]] @ rotation.T + pose.position
         return places
 
     def _refine(self, body: int, placement: Array, pose: Sample) -> None:
@@ -109,10 +111,10 @@ class CloudProxies:
         if isinstance(self._bodies[body], coal.Cylinder):
             ball = coal.Capsule(self._ball, 0.0)
         where = coal.Transform3s(rotation.T.copy(), placement[9:].copy())
-        wanted = (self._slots.shape[1] + 1) // 2
+        count_exact = (self._slots.shape[1] + 1) // 2
         exact: list[float] = []
         for i in np.argsort(bound, kind="stable").tolist():
-            if len(exact) >= wanted and bound[i] >= sorted(exact)[wanted - 1]:
+            if len(exact) >= count_exact and bound[i] >= sorted(exact)[count_exact - 1]:
                 break
             result.clear()
             there = coal.Transform3s(np.eye(3), centers[i])

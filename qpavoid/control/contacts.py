@@ -92,11 +92,11 @@ def solve_contacts(J: Array, b: Array) -> Contacts:
     Q = np.zeros((nv, nv), order="F")
     Q[:, : min(c, nv)] = packed[:, :nv]
     Q, _, _ = dorgqr(Q, tau)
-    rest = np.zeros(nv)
+    v_particular = np.zeros(nv)
     if b.any():
         y, _ = dtrtrs(packed[:rank, :rank], b[order[:rank] - 1], trans=1)
-        rest = Q[:, :rank] @ y
-    return Contacts(np.ascontiguousarray(Q[:, rank:]), rest, J, b)
+        v_particular = Q[:, :rank] @ y
+    return Contacts(np.ascontiguousarray(Q[:, rank:]), v_particular, J, b)
 
 
 def tracking_within(contacts: Contacts, A: Array, b: Array, damping: float) -> Array:
@@ -108,12 +108,12 @@ def tracking_within(contacts: Contacts, A: Array, b: Array, damping: float) -> A
         b: their right-hand sides (r,).
         damping: λ of the damped inverse [-].
     """
-    reduced, asked = A @ contacts.Z, b - A @ contacts.v_particular
+    reduced, desired = A @ contacts.Z, b - A @ contacts.v_particular
     if damping == 0.0:
-        known = np.isfinite(asked).all() and np.isfinite(reduced).all()
-        w = np.linalg.pinv(reduced, rcond=1e-10) @ asked if known else np.full(reduced.shape[1], np.nan)
+        known = np.isfinite(desired).all() and np.isfinite(reduced).all()
+        w = np.linalg.pinv(reduced, rcond=1e-10) @ desired if known else np.full(reduced.shape[1], np.nan)
     else:
         gram = reduced.T @ reduced
         gram.ravel()[:: len(gram) + 1] += damping**2
-        w = np.linalg.solve(gram, reduced.T @ asked)
+        w = np.linalg.solve(gram, reduced.T @ desired)
     return np.asarray(contacts.v_particular + contacts.Z @ w)

@@ -99,7 +99,7 @@ class MeasuredStates:
 
 
 def prediction_error_bound(
-    now: ObstacleEstimates | None, before: ObstacleEstimates | None, span: float, reach: Array
+    now: ObstacleEstimates | None, before: ObstacleEstimates | None, span: float, radii: Array
 ) -> float:
     """Bound how far any point of an obstacle is from its prediction, now and for some time [m].
 
@@ -110,7 +110,7 @@ def prediction_error_bound(
         now: current estimates.
         before: estimates that the prediction was made of.
         span: for how long it counts [s].
-        reach: distance from each obstacle's origin to its farthest point (o,) [m].
+        radii: distance from each obstacle's origin to its farthest point (o,) [m].
 
     Returns:
         The bound; infinite where the two are not of the same obstacles.
@@ -124,5 +124,5 @@ def prediction_error_bound(
         return 0.0
     p, v, R, w = (np.linalg.norm(off[:, part], axis=1) for part in (_POSITION, _LINEAR, _ROTATION, _ANGULAR))
     turned = R + span * w
-    radii = np.where(turned > 0.0, reach[list(now.which)], 0.0)  # half-spaces have no end
+    radii = np.where(turned > 0.0, radii[list(now.which)], 0.0)  # half-spaces have no end
     return float(np.max(p + span * v + radii * turned))

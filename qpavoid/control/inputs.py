@@ -179,15 +179,15 @@ class Configurations:
             return (Reason.of(ReasonKind.IMPLAUSIBLE, name, detail=not_finite(q)),)
         here = q[self._index]
         beyond = np.maximum(here - self._upper, self._lower - here)
-        found = [
+        reasons = [
             Reason.of(
                 ReasonKind.IMPLAUSIBLE, name, self._names[i], amount=float(beyond[i]) + _BEYOND, unit=self._units[i],
                 detail="beyond its limits; is it in degrees?" if self._units[i] == "rad" else "beyond its limits",
             )
             for i in np.flatnonzero(beyond > 0.0).tolist()
         ]  # fmt: skip
-        far = np.flatnonzero(np.abs(q) > FARTHEST).tolist() if not found else []
-        return (*found, *[Reason.of(ReasonKind.IMPLAUSIBLE, name, self._owners[k], detail="too large") for k in far])
+        far = np.flatnonzero(np.abs(q) > FARTHEST).tolist() if not reasons else []
+        return (*reasons, *[Reason.of(ReasonKind.IMPLAUSIBLE, name, self._owners[k], detail="too large") for k in far])
 
 
 def _unit_parts(model: Any) -> list[tuple[slice, str]]:

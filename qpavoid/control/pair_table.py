@@ -123,8 +123,8 @@ class PairTable:
             free[second], of[second], np.where(free[first], obstacles + 1 + of[first], obstacles)
         )
         self.enabled[:] = ~(free[first] & free[second])
-        carried = np.where(free, 0, joints)
-        self.support[:] = self._masks[carried[second]] - self._masks[carried[first]]
+        attached_joints = np.where(free, 0, joints)
+        self.support[:] = self._masks[attached_joints[second]] - self._masks[attached_joints[first]]
         self.joint_radius[:] = 0.0
         for joint, pose, (*center, radius) in zip(
             self.joints.tolist(), self.placements, self.spheres.tolist(), strict=False

@@ -20,7 +20,7 @@ from qpavoid.model.scene import Scene
 def lay_out(
     scene: Scene,
     frames: Sequence[FrameTask],
-    others: Sequence[RowTask],
+    row_tasks: Sequence[RowTask],
     bounds: JointBounds,
     kinematics: ForwardKinematics,
     query: DistanceQuery,
@@ -35,7 +35,7 @@ def lay_out(
     Args:
         scene: robot and obstacles.
         frames: frames that follow motions, those with a position first.
-        others: all other tasks.
+        row_tasks: all other tasks.
         bounds: limits of the joints.
         kinematics: whose memory is looked into.
         query: distances of the scene.
@@ -55,7 +55,7 @@ def lay_out(
         has_mimics=model.nvExtended > model.nv,
         unfolded_row=np.zeros(model.nvExtended),
         frame_poses=kinematics.frame_poses,
-        **task_layout(frames, others, model),
+        **task_layout(frames, row_tasks, model),
         results=x.results,
         support=table.support,
         twists=x.twists,

@@ -105,14 +105,14 @@ class UpdateReader:
             NumericalError: an entry of the wrong shape, or not made of numbers.
         """
         names, samples = list(updates), list(updates.values())
-        kept = self._selection
+        selection = self._selection
         types = set(map(type, samples))
-        if kept is None or kept.names != names or types != {kept.type}:
+        if selection is None or selection.names != names or types != {selection.type}:
             numbers = [self.index(name) for name in names]
             plain = len(types) == 1 and types <= {Sample, Pose} and self.attached.isdisjoint(numbers)
-            self._selection = kept = self._select(names, next(iter(types)), numbers) if plain else None
-        if kept is not None:
-            return self._check(t, shift, _Batch(names, samples, kept.which, kept.kind), kept)
+            self._selection = selection = self._select(names, next(iter(types)), numbers) if plain else None
+        if selection is not None:
+            return self._check(t, shift, _Batch(names, samples, selection.which, selection.kind), selection)
         return self._read_each(t, shift, updates)
 
     def _select(self, names: list[str], kind: type, numbers: list[int]) -> _Selection:
@@ -159,7 +159,7 @@ class UpdateReader:
             estimated=tuple([self._estimated[i] for i in update.which[update.kind == POSE].tolist()]),
         )
 
-    def _check(self, t: float, shift: float, batch: _Batch, kept: _Selection) -> Update:
+    def _check(self, t: float, shift: float, batch: _Batch, selection: _Selection) -> Update:
         """Check samples or bare poses, all at once; `kept` has arrays for them."""
         names, samples, which, kind = batch
         if not samples:
@@ -184,21 +184,23 @@ class UpdateReader:
                         unusable.append(int(which[k]))
                 which, kind, stamps = which[~late], kind[~late], stamps[~late]
                 rows = rows[~late]
-                kept = self._select([names[k] for k in np.flatnonzero(~late).tolist()], kept.type, which.tolist())
+                selection = self._select(
+                    [names[k] for k in np.flatnonzero(~late).tolist()], selection.type, which.tolist()
+                )
         states = self._measured.updates
-        if kernels.write_rows(states, which, rows, kind, FARTHEST, FASTEST, kept.codes, kept.off):
-            bad = kept.codes > NORMALISED
-            for k in np.flatnonzero(kept.codes != FINE).tolist():
-                name, code = self._obstacles[which[k]].name, int(kept.codes[k])
+        if kernels.write_rows(states, which, rows, kind, FARTHEST, FASTEST, selection.codes, selection.off):
+            bad = selection.codes > NORMALISED
+            for k in np.flatnonzero(selection.codes != FINE).tolist():
+                name, code = self._obstacles[which[k]].name, int(selection.codes[k])
                 if bad[k]:
                     notes.append(unlikely(name, FAULTS[code]))
                     unusable.append(int(which[k]))
                 else:
-                    off = float(kept.off[k])
+                    off = float(selection.off[k])
                     notes.append(Reason.of(ReasonKind.NORMALISED, name, amount=off, unit="-"))
             which, kind, stamps = which[~bad], kind[~bad], stamps[~bad]
-        estimated = kept.estimated
-        if estimated and (kind is not kept.kind or len(which) < len(estimated)):
+        estimated = selection.estimated
+        if estimated and (kind is not selection.kind or len(which) < len(estimated)):
             estimated = tuple([self._estimated[i] for i in which[kind == POSE].tolist()])
         return Update(which, kind, stamps, {}, tuple(unusable), tuple(notes), estimated)
 

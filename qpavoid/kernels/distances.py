@@ -19,7 +19,13 @@ _PARALLEL = 1e-14
 
 @compiled
 def closed_forms(
-    poses: Array, cores: Array, bodies: IntArray, has_closed_form: Mask, pairs: IntArray, results: Array, met: IntArray
+    poses: Array,
+    cores: Array,
+    bodies: IntArray,
+    has_closed_form: Mask,
+    pairs: IntArray,
+    results: Array,
+    meeting: IntArray,
 ) -> int:
     """Update the results of pairs that have a closed form.
 
@@ -33,7 +39,7 @@ def closed_forms(
         has_closed_form: whether each pair has one (m,).
         pairs: numbers of the pairs to update (c,).
         results: [distance, normal, point a, point b] (m, 10), in place.
-        met: out (m,), the first entries: the pairs whose cores meet, and whose results are not updated.
+        meeting: out (m,), the first entries: the pairs whose cores meet, and whose results are not updated.
 
     Returns:
         Number of pairs whose cores meet.
@@ -56,7 +62,7 @@ def closed_forms(
             square += separation[c] * separation[c]
         distance = np.sqrt(square)
         if not distance > MIN_CORE_DISTANCE:  # NaN, too
-            met[count] = k
+            meeting[count] = k
             count += 1
             continue
         r, s = cores[i, 0], cores[j, 0]

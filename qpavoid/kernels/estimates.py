@@ -89,16 +89,16 @@ def update_estimates(
     Returns:
         How many were not taken over, as their poses are too far apart; their stamps stay as they were.
     """
-    before = stamps[which]
+    previous_stamps = stamps[which]
     fine = update_measured_states(which, kind, times, updates, stamps, last, states, shortest, max_speed)
     rejected = 0
     for k in range(len(which)):
-        i, elapsed = which[k], times[k] - before[k]
+        i, elapsed = which[k], times[k] - previous_stamps[k]
         if not fine[k]:
             rejected += 1
             continue
         at_rest[i] = kind[k] == REST
-        if kind[k] == POSE and before[k] != before[k]:  # no twist is known of a first pose
+        if kind[k] == POSE and previous_stamps[k] != previous_stamps[k]:  # no twist is known of a first pose
             continue
         counts[i] += 1.0
         gain = 1.0 / counts[i]

@@ -170,10 +170,10 @@ def minimize(P: Array, x: Array, G: Array, h: Array, lower: Array, upper: Array,
     S, R = np.zeros((capacity + 1, capacity + 1)), np.zeros((capacity + 1, capacity + 1))
     active, u = np.empty(capacity + 1, np.intp), np.zeros(capacity + 1)
     r, z, bound = np.empty(capacity + 1), np.empty(n), h.copy()
-    met = np.zeros(2 * n + m, np.bool_)  # the active ones, up to round-off
+    is_satisfied = np.zeros(2 * n + m, np.bool_)  # the active ones, up to round-off
     count = 0
     for _ in range(10 * (n + m)):
-        p, violation = _most_violated(x, G, bound, lower, upper, met)
+        p, violation = _most_violated(x, G, bound, lower, upper, is_satisfied)
         if violation <= _TOLERANCE:
             residual = 0.0
             for j in range(count):
@@ -215,10 +215,10 @@ def minimize(P: Array, x: Array, G: Array, h: Array, lower: Array, upper: Array,
             if reachable and step == violation / curvature:
                 S[count, count] = square
                 extend_factor(S, R, count)
-                active[count], met[p] = p, True
+                active[count], is_satisfied[p] = p, True
                 count += 1
                 break
-            met[active[leaving]] = False
+            is_satisfied[active[leaving]] = False
             _update_soft_row(active[leaving], 0.0, bound, h, soft, n)
             _drop(N, W, S, R, active, u, leaving, count)
             count -= 1
@@ -311,7 +311,7 @@ def _slack(p: int, x: Array, G: Array, h: Array, lower: Array, upper: Array) -> 
 
 @compiled
 def _most_violated(
-    x: Array, G: Array, h: Array, lower: Array, upper: Array, met: npt.NDArray[np.bool_]
+    x: Array, G: Array, h: Array, lower: Array, upper: Array, is_satisfied: npt.NDArray[np.bool_]
 ) -> tuple[int, float]:
     """Find the most violated constraint at x, and its violation; NaN in a row is returned.
 
@@ -321,7 +321,7 @@ def _most_violated(
         h: right-hand sides (m,).
         lower: lower bounds (n,).
         upper: upper bounds (n,).
-        met: constraints that are not considered (2 n + m,).
+        is_satisfied: constraints that are not considered (2 n + m,).
 
     Returns:
         Number of the constraint, and its violation, negative inside.
@@ -329,12 +329,12 @@ def _most_violated(
     n = len(x)
     worst, violation = -1, -np.inf
     for i in range(n):
-        if not (lower[i] - x[i] <= violation or met[i]):
+        if not (lower[i] - x[i] <= violation or is_satisfied[i]):
             worst, violation = i, lower[i] - x[i]
-        if not (x[i] - upper[i] <= violation or met[n + i]):
+        if not (x[i] - upper[i] <= violation or is_satisfied[n + i]):
             worst, violation = n + i, x[i] - upper[i]
     for k in range(len(h)):
-        if met[2 * n + k]:
+        if is_satisfied[2 * n + k]:
             continue
         outside = h[k]
         for i in range(n):

@@ -196,8 +196,8 @@ def remove_joints(
             ids.append(joint)
         elif joint in ids and leader not in ids:
             raise ConfigError(f"{where}: {_follows(model, model.names[joint])}; lock that one")
-    kept = [range(joint.idx_q, joint.idx_q + joint.nq) for joint in model.joints[1:] if joint.id not in ids]
-    index = np.array([i for coordinates in kept for i in coordinates], dtype=np.intp)
+    coordinates_left = [range(joint.idx_q, joint.idx_q + joint.nq) for joint in model.joints[1:] if joint.id not in ids]
+    index = np.array([i for coordinates in coordinates_left for i in coordinates], dtype=np.intp)
     model, bodies = pin.buildReducedModel(model, bodies, ids, q)
     joints = [body.parentJoint for body in bodies.geometryObjects]
     for a, b in pair_array(bodies).tolist():

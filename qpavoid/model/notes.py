@@ -47,7 +47,7 @@ class Note:
     """What a user can do about it; empty where nothing is needed."""
     severity: Literal["note", "warning", "error"] = "note"
     """`warning`: motion may differ from what the file's author meant; `error`: the robot cannot be used as it is."""
-    share: float | None = None
+    fraction: float | None = None
     """Of a pair: share of random configurations in which it touches [-]; None where that was not looked at."""
 
     def __str__(self) -> str:

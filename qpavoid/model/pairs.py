@@ -55,13 +55,13 @@ class TouchingPair(NamedTuple):
 
     a: str
     b: str
-    share: float
+    fraction: float
     """Share of random configurations in which they touch [-]."""
 
     def note(self) -> Note:
         """Return a note that the pair is not checked."""
-        clause = f"not checked: its bodies touch in {100.0 * self.share:.0f} % of random configurations"
-        return Note(NoteKind.PAIR, (self.a, self.b), clause, share=self.share)
+        clause = f"not checked: its bodies touch in {100.0 * self.fraction:.0f} % of random configurations"
+        return Note(NoteKind.PAIR, (self.a, self.b), clause, fraction=self.fraction)
 
 
 def drop_always_touching(model: Any, bodies: Any, joints: JointBounds, samples: int = 200) -> list[TouchingPair]:
@@ -85,12 +85,12 @@ def drop_always_touching(model: Any, bodies: Any, joints: JointBounds, samples: 
         q = pin.integrate(model, neutral, random.uniform(-np.pi, np.pi, model.nv))
         q[joints.q_index[finite]] = random.uniform(joints.lower[finite], joints.upper[finite])
         poses.append(q)
-    share = find_contacts(model, bodies, poses, ALWAYS_TOUCHING).mean(axis=0)
-    indices = np.flatnonzero(share >= ALWAYS_TOUCHING).tolist()
+    fraction = find_contacts(model, bodies, poses, ALWAYS_TOUCHING).mean(axis=0)
+    indices = np.flatnonzero(fraction >= ALWAYS_TOUCHING).tolist()
     pairs, names = pair_array(bodies).tolist(), [body.name for body in bodies.geometryObjects]
     for index in indices:
         bodies.removeCollisionPair(pin.CollisionPair(*pairs[index]))
-    return [TouchingPair(names[pairs[i][0]], names[pairs[i][1]], float(share[i])) for i in indices]
+    return [TouchingPair(names[pairs[i][0]], names[pairs[i][1]], float(fraction[i])) for i in indices]
 
 
 def find_contacts(model: Any, bodies: Any, poses: Sequence[Array], at_least: float = 0.0) -> Mask:
@@ -109,10 +109,10 @@ def find_contacts(model: Any, bodies: Any, poses: Sequence[Array], at_least: flo
         pin.computeCollisions(bodies, data, False)
         touches[number, active] = [data.collisionResults[int(i)].isCollision() for i in active]
         separations = number + 1 - touches[: number + 1, active].sum(axis=0)
-        below_share = separations > (1.0 - at_least) * len(poses)
-        for i in active[below_share].tolist():
+        below_fraction = separations > (1.0 - at_least) * len(poses)
+        for i in active[below_fraction].tolist():
             data.deactivateCollisionPair(i)
-        active = active[~below_share]
+        active = active[~below_fraction]
         if not len(active):
             break
     return touches

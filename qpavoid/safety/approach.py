@@ -59,7 +59,7 @@ class ApproachCheck:
         """Largest speed of any point of an obstacle [m/s]."""
         return max(self._max_external_speed, 0.0 if self._paths is None else self._paths.max_speed)
 
-    def stays_far(self, q: Array, v: Array, t: float) -> bool:
+    def is_far(self, q: Array, v: Array, t: float) -> bool:
         """Return whether moving obstacles certainly stay away from a robot that moves at v once more, and brakes.
 
         Args:
@@ -67,9 +67,9 @@ class ApproachCheck:
             v: velocity (nv,) of this control step.
             t: time [s].
         """
-        return self._external_stay_far(q, v) and self._trajectories_stay_far(q, v, t)
+        return self._external_are_far(q, v) and self._trajectories_are_far(q, v, t)
 
-    def _external_stay_far(self, q: Array, v: Array) -> bool:
+    def _external_are_far(self, q: Array, v: Array) -> bool:
         """Return whether external obstacles stay away that go on at their mean twists."""
         rollouts, obstacles, self._max_external_speed = self._rollouts, self._obstacles, 0.0
         if not len(obstacles.external):
@@ -80,7 +80,7 @@ class ApproachCheck:
         )  # fmt: skip
         return bool(rollouts.lever_arm * travel < clearance - PREFERRED_DISTANCE)
 
-    def _trajectories_stay_far(self, q: Array, v: Array, t: float) -> bool:
+    def _trajectories_are_far(self, q: Array, v: Array, t: float) -> bool:
         """Return whether obstacles on trajectories stay away.
 
         Between their sampled positions, obstacles are taken to be no faster than at these. A clearance counts until the

@@ -82,7 +82,7 @@ class BackupPlanner:
         if not len(self._obstacles.moving):
             self._backup = None
             return None
-        if self._approach.stays_far(q, v, t):
+        if self._approach.is_far(q, v, t):
             self._backup = None
             return None
         enabled = self._enabled

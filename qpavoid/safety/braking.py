@@ -187,27 +187,27 @@ class BrakingCheck:
             # the end of the control period is always evaluated, and the last of all poses is the end
             last = path.period_end if len(points) == 1 else end
             points.append(self._evaluate(path, points[-1], last if count <= 1 else min(t + step, last)))
-        found = points[1:]
+        evaluated = points[1:]
         if self._has_jerks:
-            found = [*found, self._evaluate(path, points[-2], 0.5 * (points[-2].t + points[-1].t))]
-            for before, here, after in zip(points[:-2], points[1:-1], points[2:], strict=True):
-                if before.margin >= here.margin <= after.margin and here.margin < _REFINE_BELOW:
-                    found += self._refine(path, before, here, after)
-        least = found[int(np.argmin([point.margin for point in found]))]  # the first NaN, where there is one
-        return least._replace(distance=min(point.distance for point in found))
+            evaluated = [*evaluated, self._evaluate(path, points[-2], 0.5 * (points[-2].t + points[-1].t))]
+            for previous, here, after in zip(points[:-2], points[1:-1], points[2:], strict=True):
+                if previous.margin >= here.margin <= after.margin and here.margin < _REFINE_BELOW:
+                    evaluated += self._refine(path, previous, here, after)
+        least = evaluated[int(np.argmin([point.margin for point in evaluated]))]  # the first NaN, where there is one
+        return least._replace(distance=min(point.distance for point in evaluated))
 
-    def _refine(self, path: _Path, before: _PathPoint, here: _PathPoint, after: _PathPoint) -> list[_PathPoint]:
+    def _refine(self, path: _Path, previous: _PathPoint, here: _PathPoint, after: _PathPoint) -> list[_PathPoint]:
         """Return points around the least margin between two points."""
-        found = []
+        evaluated = []
         for _ in range(_REFINEMENTS):
-            is_first_longer = here.t - before.t > after.t - here.t
-            between = self._evaluate(path, here, 0.5 * (here.t + (before.t if is_first_longer else after.t)))
-            found.append(between)
+            is_first_longer = here.t - previous.t > after.t - here.t
+            between = self._evaluate(path, here, 0.5 * (here.t + (previous.t if is_first_longer else after.t)))
+            evaluated.append(between)
             if between.margin < here.margin:
-                before, here, after = (before, between, here) if is_first_longer else (here, between, after)
+                previous, here, after = (previous, between, here) if is_first_longer else (here, between, after)
             else:
-                before, after = (between, after) if is_first_longer else (before, between)
-        return found
+                previous, after = (between, after) if is_first_longer else (previous, between)
+        return evaluated
 
     def _path(self, q: Array, v: Array) -> _Path:
         """Return the path of v (nv,) and its stop: curved under jerk limits, else straight up to position limits."""
@@ -250,9 +250,9 @@ class BrakingCheck:
         """Return the time that the stop from v takes [s]."""
         return float((np.abs(v) / self._bounds.acceleration).max()) if self._has_accelerations else 0.0
 
-    def _evaluate(self, path: _Path, before: _PathPoint, t: float) -> _PathPoint:
+    def _evaluate(self, path: _Path, previous: _PathPoint, t: float) -> _PathPoint:
         """Evaluate the pose at time t, integrated from that of another point; pair -1 if none is near."""
-        q = pin.integrate(self._model, before.q, path.displacement(t) - path.displacement(before.t))
+        q = pin.integrate(self._model, previous.q, path.displacement(t) - path.displacement(previous.t))
         self._kinematics.compute(q)
         query, now = self._query, self._now
         query.compute(self._kinematics.joint_poses, self._safety_distance + _MAX_MARGIN)

@@ -53,10 +53,10 @@ class ProgressMonitor:
         if self._step % _CHECK_STEPS and not self.stalled:
             return ()
         steps = 1 if self.stalled else _CHECK_STEPS
-        wanted, achieved = A @ problem.v_tracking, A @ solution.v
-        size = float(wanted @ wanted)
+        desired, achieved = A @ problem.v_tracking, A @ solution.v
+        size = float(desired @ desired)
         is_at_rest = float(achieved @ achieved) < _MAX_SPEED_AT_REST**2
-        is_stuck = is_at_rest and size > _MIN_TASK_SPEED**2 and float(achieved @ wanted) < _MIN_PROGRESS * size
+        is_stuck = is_at_rest and size > _MIN_TASK_SPEED**2 and float(achieved @ desired) < _MIN_PROGRESS * size
         stalled_steps = self._stalled_steps + (steps if is_stuck else -steps)
         self._stalled_steps = min(max(stalled_steps, 0), _MAX_STALL * self._limit + _CHECK_STEPS)
         if not self.stalled:

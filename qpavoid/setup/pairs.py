@@ -203,7 +203,7 @@ def geometry_contacts(
 def shares_of_contact(robot: Robot, pair_samples: PairSamples) -> dict[frozenset[str], float]:
     """Return the share of configurations in which each pair touches [-]; only of pairs that were sampled."""
     shares = dict(zip(named_pairs(robot), pair_samples.contact.tolist(), strict=True))
-    return {**shares, **{frozenset((pair.a, pair.b)): pair.share for pair in robot.always_touching}}
+    return {**shares, **{frozenset((pair.a, pair.b)): pair.fraction for pair in robot.always_touching}}
 
 
 def own_margins(robot: Robot, d1: Array) -> list[PairMargin]:

@@ -165,7 +165,7 @@ def note_lines(notes: Sequence[Note]) -> list[str]:
     order = {"error": 0, "warning": 1, "note": 2}
     lines = []
     for note in sorted(notes, key=lambda note: order[note.severity]):
-        share = "" if note.share is None else f"{100.0 * note.share:.0f} %"
+        share = "" if note.fraction is None else f"{100.0 * note.fraction:.0f} %"
         names = " - ".join(note.subject) if note.kind is NoteKind.PAIR else abbreviate(note.subject)
         lines.append(f"{note.severity:<8} {note.kind.value:<6} {share:>5}  {names}{': ' if names else ''}{note.what}")
         if note.remedy:

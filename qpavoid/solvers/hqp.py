@@ -76,19 +76,19 @@ class Hqp(Qp):
             Velocity (nv,), None where the first level has no solution; reasons for the levels without one.
         """
         J, (Z, v), regularization = problem.avoidance.J, _start(problem), self.config.regularization
-        met, unsolved = False, list[Reason]()
+        is_satisfied, unsolved = False, list[Reason]()
         for level, (A, rate) in enumerate((*levels, (np.eye(len(v)), unconstrained))):
             P = A.T @ A
             P.ravel()[:: len(P) + 1] += regularization
             q = -(A.T @ rate + regularization * unconstrained)
             limits = b, lower, upper
-            if met:  # v itself is a solution, in spite of round-off
+            if is_satisfied:  # v itself is a solution, in spite of round-off
                 limits = np.minimum(b, J @ v), np.minimum(lower, v), np.maximum(upper, v)
             answers = (verified(within(backend, Z, v), P, q, J, *limits) for backend in self._backends)
             better = next((answer for answer in answers if answer is not None), None)
             if better is not None:
-                v, met = better, True
-            elif not met:
+                v, is_satisfied = better, True
+            elif not is_satisfied:
                 return None, ()
             elif level < len(levels):
                 unsolved.append(Reason.of(ReasonKind.PRIORITY_UNSOLVED, f"priority level {level + 1}"))

@@ -134,7 +134,9 @@ def joints_figure(log: Log) -> Figure:
     return figure
 
 
-def _draw_lines(ax: Any, t: Array, values: Array, names: Sequence[str], shown: Any, rest: str, width: Any) -> list[Any]:
+def _draw_lines(
+    ax: Any, t: Array, values: Array, names: Sequence[str], shown: Any, remaining: str, width: Any
+) -> list[Any]:
     """Draw lines over time: some with a name, the others in grey; return legend entries.
 
     Args:
@@ -143,7 +145,7 @@ def _draw_lines(ax: Any, t: Array, values: Array, names: Sequence[str], shown: A
         values: (n, m).
         names: of all m lines.
         shown: indices of those that have a name.
-        rest: what the others are.
+        remaining: what the others are.
         width: of each line with a name.
     """
     others = [i for i in range(len(names)) if i not in shown and np.isfinite(values[:, i]).any()]
@@ -153,7 +155,7 @@ def _draw_lines(ax: Any, t: Array, values: Array, names: Sequence[str], shown: A
         style = {"color": COLOURS[rank % len(COLOURS)], "linestyle": DASHES[rank // len(COLOURS) % len(DASHES)]}
         ax.plot(t, values[:, i], label=names[i], linewidth=linewidth, zorder=3, **style)
     handles: list[Any] = ax.get_legend_handles_labels()[0]
-    return handles + [Line2D([], [], color=_GREY, linewidth=0.7, label=f"{len(others)} {rest}")] * bool(others)
+    return handles + [Line2D([], [], color=_GREY, linewidth=0.7, label=f"{len(others)} {remaining}")] * bool(others)
 
 
 def distances_figure(log: Log) -> Figure:
@@ -165,12 +167,15 @@ def distances_figure(log: Log) -> Figure:
     drawn = np.flatnonzero(np.isfinite(distance).any(axis=0))
     nearest = np.min(distance, axis=0, initial=np.inf)
     near = drawn if len(drawn) <= len(COLOURS) else drawn[nearest[drawn] < upper_distance]
-    rest = f"bodies never within {upper_distance:g} m"
+    remaining = f"bodies never within {upper_distance:g} m"
     if len(near) > _MAX_NAMED_LINES:
-        near, rest = np.sort(near[np.argsort(nearest[near], kind="stable")[:_MAX_NAMED_LINES]]), "bodies farther away"
+        near, remaining = (
+            np.sort(near[np.argsort(nearest[near], kind="stable")[:_MAX_NAMED_LINES]]),
+            "bodies farther away",
+        )
     # Thinner and thinner: the two bodies of a pair share their distance, and neither line may hide the other.
     widths = np.linspace(3.0, 1.2, len(near))
-    handles = _draw_lines(ax, log.t, distance, log.meta["bodies"], near, rest, widths)
+    handles = _draw_lines(ax, log.t, distance, log.meta["bodies"], near, remaining, widths)
     handles += draw_levels(ax, log, qp=is_qp(log)) + _shade_status(ax, log)
     _plot_gains(gains, log)
     label_distances(ax, distance[:, near])

@@ -46,17 +46,17 @@ class Axis(RowTask):
         (frame_id,) = self.frame_ids
         x, R = frame_pose(kinematics, frame_id)
         J = frame_jacobian(self._model, kinematics, frame_id)
-        way = target.position - x if self._looks else target
-        distance = max(length(way), 1e-6)
-        d, a = way / distance, R @ self._axis
+        direction = target.position - x if self._looks else target
+        distance = max(length(direction), 1e-6)
+        d, a = direction / distance, R @ self._axis
         across = _across(a, d)
         angle = atan2(length(np.cross(a, d)), np.dot(a, d))
         rates = np.cross(across, d) @ J[3:]  # -τ·(ω × d) = ω·(τ × d)
-        wanted = np.array([self._gain * angle, 0.0])
+        desired = np.array([self._gain * angle, 0.0])
         if self._looks:
             rates -= across @ J[:3] / distance
-            wanted -= across @ target.linear / distance
-        self._scale_into(A, b, rates, wanted)
+            desired -= across @ target.linear / distance
+        self._scale_into(A, b, rates, desired)
         return angle
 
     def as_target(self, value: Any) -> Any:

@@ -70,9 +70,9 @@ class RowTask:
         """
         raise NotImplementedError
 
-    def _scale_into(self, A: Array, b: Array, J: Array, wanted: Array) -> None:
+    def _scale_into(self, A: Array, b: Array, J: Array, desired: Array) -> None:
         np.multiply(J, self.scale[:, None], out=A)
-        np.multiply(wanted, self.scale, out=b)
+        np.multiply(desired, self.scale, out=b)
 
     def as_target(self, value: Any) -> Any:
         """Check a target that was given at run time: here, a `Sample` or a `Pose` that rests.

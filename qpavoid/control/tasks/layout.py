@@ -16,11 +16,11 @@ from qpavoid.problem import Array, IntArray
 def in_order(tasks: Sequence[RowTask]) -> tuple[list[FrameTask], list[RowTask]]:
     """Frames, those with a position first, and all other tasks: the order of their rows."""
     frames = [task for task in tasks if isinstance(task, FrameTask)]
-    others = [task for task in tasks if not isinstance(task, FrameTask)]
-    return sorted(frames, key=lambda task: not task.moves), others
+    row_tasks = [task for task in tasks if not isinstance(task, FrameTask)]
+    return sorted(frames, key=lambda task: not task.moves), row_tasks
 
 
-def task_layout(frames: Sequence[FrameTask], others: Sequence[RowTask], model: Any) -> dict[str, Any]:
+def task_layout(frames: Sequence[FrameTask], row_tasks: Sequence[RowTask], model: Any) -> dict[str, Any]:
     """Arrays of the rows A v = b of the tasks, as `RowLayout` has them.
 
     Rows are in world axes, scaled with the roots of their weights; the orientation error is the rotation vector of
@@ -28,7 +28,7 @@ def task_layout(frames: Sequence[FrameTask], others: Sequence[RowTask], model: A
 
     Args:
         frames: frames that follow motions, those with a position first.
-        others: all other tasks.
+        row_tasks: all other tasks.
         model: pinocchio model.
     """
     turns = np.array([i for i, task in enumerate(frames) if task.turns], dtype=np.intp)
@@ -38,7 +38,7 @@ def task_layout(frames: Sequence[FrameTask], others: Sequence[RowTask], model: A
     weights = [task.settings.weight for task in moving] + [task.settings.orientation_weight for task in turning]
     caps = [task.settings.max_speed for task in moving] + [task.settings.max_turn_rate for task in turning]
     scale = np.sqrt(np.repeat(np.array(weights), 3))
-    rows = len(scale) + sum(task.rows for task in others)
+    rows = len(scale) + sum(task.rows for task in row_tasks)
     return {
         "frame_ids": np.array([task.frame_id for task in frames], dtype=np.intp),
         "targets": np.zeros((len(frames), 18)),
@@ -54,10 +54,10 @@ def task_layout(frames: Sequence[FrameTask], others: Sequence[RowTask], model: A
     }
 
 
-def task_levels(frames: Sequence[FrameTask], others: Sequence[RowTask]) -> tuple[IntArray, ...]:
+def task_levels(frames: Sequence[FrameTask], row_tasks: Sequence[RowTask]) -> tuple[IntArray, ...]:
     """Which rows belong to each priority, the first one first."""
-    ordered = *(task for task in frames if task.moves), *(task for task in frames if task.turns), *others
-    owners = [task.settings.priority for task in ordered for _ in range(task.rows if task in others else 3)]
+    ordered = *(task for task in frames if task.moves), *(task for task in frames if task.turns), *row_tasks
+    owners = [task.settings.priority for task in ordered for _ in range(task.rows if task in row_tasks else 3)]
     priorities = np.array(owners, dtype=np.intp)
     return tuple(np.flatnonzero(priorities == level) for level in np.unique(priorities))
 

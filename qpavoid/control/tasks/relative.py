@@ -37,6 +37,6 @@ class Relative(RowTask):
         J[:3] += pin.skew(x_b - x_a) @ J_a[3:]  # -ω × r = r × ω
         missing = target.rotation @ (R_a.T @ R_b).T
         error = np.concatenate((target.position - R_a.T @ (x_b - x_a), rotation_vector(missing.tolist())))
-        wanted = np.concatenate((target.linear, target.angular)) + self._gain * error
-        self._scale_into(A, b, (R_a.T @ J.reshape(2, 3, -1)).reshape(6, -1)[self._part], wanted[self._part])
+        desired = np.concatenate((target.linear, target.angular)) + self._gain * error
+        self._scale_into(A, b, (R_a.T @ J.reshape(2, 3, -1)).reshape(6, -1)[self._part], desired[self._part])
         return length(error[:3] if self.unit == "m" else error[3:])
