@@ -219,5 +219,5 @@ def test_approach_check_of_external_obstacles_is_conservative(tmp_path_factory, 
     for later in np.linspace(0.0, 1.5, 76):
         braking = np.clip(later - 0.01, 0.0, np.abs(v) / 2.0)
         place = robot.home + min(later, 0.01) * v + np.sign(v) * (np.abs(v) * braking - braking**2)
-        centers = [sample.position + later * sample.linear for sample in samples if sample.linear.any()]
+        centers = [s.position + later * s.linear for s in samples if np.abs(s.linear).max() > 1e-100]
         assert min((np.linalg.norm([*place, 0.0] - center) for center in centers), default=1.0) - 0.15 > 0.1
