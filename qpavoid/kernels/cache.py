@@ -152,7 +152,7 @@ class FirstUse:
         """Print that kernels are compiled, at the first one that is missing in an incomplete folder."""
         if not self._begin and not (self._folder / _COMPLETE).exists():
             self._begin = perf_counter()
-            _print("compiling kernels, once on this machine: about 20 s ...")
+            _print("compiling kernels, once on this machine: about 45 s ...")
 
     def end(self) -> None:
         """Print how long the compilation took, if `begin` printed, and mark the folder as complete."""
