@@ -15,6 +15,7 @@ from qpavoid.control.contacts import ContactRows
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.inputs import LARGEST_VELOCITY, check_velocity
 from qpavoid.control.scenario import build_parts
+from qpavoid.control.settings import ControlSettings
 from qpavoid.control.tasks import RowTask, in_order
 from qpavoid.control.tick import Tick, copied
 from qpavoid.errors import ConfigError, NumericalError, UnknownName, located, nearest
@@ -24,7 +25,6 @@ from qpavoid.model.scene import Scene
 from qpavoid.problem import Array, Solution, State, as_vector, require_finite
 from qpavoid.reason import Reason, ReasonKind
 from qpavoid.safety.arbiter import Arbiter
-from qpavoid.safety.settings import SafetySettings
 from qpavoid.solvers import Solver, check_solver, make_solver
 
 _MAX_DT = 1.0
@@ -84,10 +84,9 @@ class Controller:
             self.avoidance = self.avoidance.model_copy(update={"backup": False})
             self._no_backup = (_NO_BACKUP_WITH_CONTACTS,)
         bounds = scene.robot.bounds().within(self.limits)
-        self._builder = ProblemBuilder(
-            scene, self.tasks, bounds, self.avoidance, self.limits, sensing or Sensing(), tracking_damping, dt, contacts
-        )
-        settings = SafetySettings(scene, bounds, self.avoidance, self.limits, progress or Progress(), dt)
+        blocks = sensing or Sensing(), progress or Progress()
+        settings = ControlSettings(scene, bounds, self.avoidance, self.limits, dt, tracking_damping, *blocks)
+        self._builder = ProblemBuilder(settings, self.tasks, contacts)
         self._arbiter = Arbiter(settings, law, self._builder.rows, self._builder.tracker)
         self._builder.rows.look_ahead(law.bounded and self.avoidance.look_ahead)
         self._warm_up()

@@ -16,6 +16,7 @@ from qpavoid.control.assembler import RowAssembler
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.obstacles import ObstacleStates
 from qpavoid.control.row_layout import lay_out
+from qpavoid.control.settings import ControlSettings
 from qpavoid.control.tasks import in_order
 from qpavoid.kernels.cache import FOLDER
 from qpavoid.model.kinematics import ForwardKinematics
@@ -120,10 +121,11 @@ class Bench:
 
     def __init__(self, scene, tasks=(), avoidance=None, position_gain=0.5, damping=0.0, dt=0.01):
         self.scene, self.robot, self.tasks = scene, scene.robot, tuple(tasks)
-        self.assembler = RowAssembler(
-            scene, tasks, scene.robot.bounds(), avoidance or config.Avoidance(),
-            config.Limits(position_gain=position_gain), damping, dt,
-        )  # fmt: skip
+        limits = config.Limits(position_gain=position_gain)
+        settings = ControlSettings(
+            scene, scene.robot.bounds(), avoidance or config.Avoidance(), limits, dt, tracking_damping=damping
+        )
+        self.assembler = RowAssembler(settings, tasks)
         self.query = self.assembler.query
 
     def place(self, samples):
@@ -172,7 +174,8 @@ def lay_out_step(scene, avoidance=None):
     """Memory of a control step, as a controller lays it out, and the kinematics and distances that it looks into."""
     kinematics, query, limits = ForwardKinematics(scene.robot.model, []), DistanceQuery(scene), config.Limits()
     bounds, avoidance = scene.robot.bounds().within(limits), avoidance or config.Avoidance()
-    return lay_out(scene, [], [], bounds, kinematics, query, avoidance, limits, 0.0, 0.01), kinematics, query
+    settings = ControlSettings(scene, bounds, avoidance, limits, 0.01, tracking_damping=0.0)
+    return lay_out(settings, [], [], kinematics, query), kinematics, query
 
 
 def make_layout(nv, pairs=0, obstacles=0, **fields):

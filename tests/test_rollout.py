@@ -9,14 +9,14 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 
 from qpavoid import Avoidance, Limits, Obstacle, Sample, build_scene, kernels
-from qpavoid.config import Box, Line, Progress, Sensing, Sphere
+from qpavoid.config import Box, Line, Sensing, Sphere
 from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.control.pair_table import PairTable
 from qpavoid.control.scenario import build_parts
+from qpavoid.control.settings import ControlSettings
 from qpavoid.model.trajectory import build_motion
 from qpavoid.safety.approach import ApproachCheck
 from qpavoid.safety.rollout import BackupPolicy, BackupRollouts, Start
-from qpavoid.safety.settings import SafetySettings
 from qpavoid.solvers.backends import solve_daqp
 
 
@@ -24,7 +24,7 @@ def rollouts_of(scene, limits=None, dt=0.01):
     """Rollouts of a scene, its settings and its obstacles."""
     limits = limits or Limits()
     bounds = scene.robot.bounds().within(limits)
-    shared = SafetySettings(scene, bounds, Avoidance(d1=0.03, d2=0.1), limits, Progress(), dt)
+    shared = ControlSettings(scene, bounds, Avoidance(d1=0.03, d2=0.1), limits, dt)
     tracker = ObstacleTracker(scene.obstacles, Sensing(), dt)
     return BackupRollouts(shared, PairTable(scene), tracker), shared, tracker
 

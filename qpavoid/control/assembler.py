@@ -8,17 +8,15 @@ from typing import Any
 import numpy as np
 
 from qpavoid import kernels
-from qpavoid.config import Avoidance, Limits
 from qpavoid.control.contacts import ContactRows, tracking_within
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.jerk_stops import JerkStop, JerkStops
 from qpavoid.control.previous_velocity import PreviousVelocity
 from qpavoid.control.row_layout import lay_out
+from qpavoid.control.settings import ControlSettings
 from qpavoid.control.tasks import RowTask, in_order
 from qpavoid.control.tasks.layout import TaskRows, task_levels
 from qpavoid.model.kinematics import ForwardKinematics, Kinematics
-from qpavoid.model.limits import JointBounds
-from qpavoid.model.scene import Scene
 from qpavoid.problem import Array, AvoidanceRows, Contacts, Problem, Proximity, Tracking
 from qpavoid.solvers.analytic import pseudo_inverse
 
@@ -27,29 +25,26 @@ class RowAssembler:
     """Rows and bounds of a control step. What it returns looks into memory that the next step overwrites."""
 
     def __init__(
-        self,
-        scene: Scene,
-        tasks: Sequence[RowTask],
-        bounds: JointBounds,
-        avoidance: Avoidance,
-        limits: Limits,
-        damping: float,
-        dt: float,
-        contacts: ContactRows | None = None,
+        self, settings: ControlSettings, tasks: Sequence[RowTask], contacts: ContactRows | None = None
     ) -> None:
-        """Lay the memory out; see `Controller` for the arguments."""
+        """Lay the memory out.
+
+        Args:
+            settings: of the controller.
+            tasks: what to follow.
+            contacts: frames that rest; none if left out.
+        """
+        scene, limits = settings.scene, settings.limits
         frames, row_tasks = in_order(tasks)
         frame_ids = [i for task in (*frames, *row_tasks) for i in task.frame_ids]
         frame_ids += contacts.frame_ids if contacts else ()
         self._forward = ForwardKinematics(scene.robot.model, frame_ids)
         self.query = DistanceQuery(scene)
         """Distances of the control step."""
-        self.influence_distance = float(avoidance.d2 - avoidance.offset)
+        self.influence_distance = settings.influence_distance
         """Surface distance below which a pair gets a row [m]."""
         self.query.set_influence_distance(self.influence_distance)
-        x = self._layout = lay_out(
-            scene, frames, row_tasks, bounds, self._forward, self.query, avoidance, limits, damping, dt
-        )
+        x = self._layout = lay_out(settings, frames, row_tasks, self._forward, self.query)
         self._hard = (x.hard_lower, x.hard_upper) if limits.relax_acceleration else (x.lower, x.upper)
         self._packed, self._contacts = kernels.pack(x), contacts
         self._pair_names = scene.pair_names
@@ -59,7 +54,7 @@ class RowAssembler:
         self._stops = JerkStops(x, self._packed) if x.jerk_limited else None
         self.targets = x.targets
         """(f, 18) states that the frame tasks are to reach, see `trajectories`; to be written before `compute`."""
-        self._tracking, self._levels = Tracking(x.A, x.b, damping), task_levels(frames, row_tasks)
+        self._tracking, self._levels = Tracking(x.A, x.b, x.damping), task_levels(frames, row_tasks)
         self._views: dict[int, tuple[Proximity, AvoidanceRows]] = {}
         self._task_rows = TaskRows(row_tasks, x.A, x.b)
         self.task_errors = self._task_rows.errors

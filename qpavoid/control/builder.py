@@ -8,18 +8,17 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from qpavoid.config import Avoidance, Limits, Sensing
 from qpavoid.control.arguments import ArgumentReader, Arguments
 from qpavoid.control.assembler import RowAssembler
 from qpavoid.control.attach import Attachments
 from qpavoid.control.contacts import ContactRows
 from qpavoid.control.inputs import Clock, Configurations
 from qpavoid.control.obstacles import ObstacleTracker
+from qpavoid.control.settings import ControlSettings
 from qpavoid.control.targets import TargetReader
 from qpavoid.control.tasks import RowTask
-from qpavoid.model.limits import OUTSIDE, JointBounds
+from qpavoid.model.limits import OUTSIDE
 from qpavoid.model.sample import Sample
-from qpavoid.model.scene import Scene
 from qpavoid.problem import Array, Problem, Proximity
 from qpavoid.reason import Reason
 
@@ -45,24 +44,14 @@ class StepProblem(NamedTuple):
 class ProblemBuilder:
     """Builds the problem of each control step of one controller."""
 
-    def __init__(
-        self,
-        scene: Scene,
-        tasks: Sequence[RowTask],
-        bounds: JointBounds,
-        avoidance: Avoidance,
-        limits: Limits,
-        sensing: Sensing,
-        damping: float,
-        dt: float,
-        contacts: ContactRows | None,
-    ) -> None:
-        """Lay the memory out; see `Controller` for the arguments."""
+    def __init__(self, settings: ControlSettings, tasks: Sequence[RowTask], contacts: ContactRows | None) -> None:
+        """Lay the memory out; see `RowAssembler` for the arguments."""
+        scene, bounds, dt = settings.scene, settings.bounds, settings.dt
         model, names = scene.robot.model, scene.robot.coordinate_units
         self._model, self._bounds, self._dt, self._q_last = model, bounds, dt, scene.robot.home.copy()
-        self.rows = RowAssembler(scene, tasks, bounds, avoidance, limits, damping, dt, contacts)
-        self.tracker = ObstacleTracker(scene.obstacles, sensing, dt)
-        self.attachments = Attachments(scene, self.rows.query, avoidance.safety_distance - avoidance.offset)
+        self.rows = RowAssembler(settings, tasks, contacts)
+        self.tracker = ObstacleTracker(scene.obstacles, settings.sensing, dt)
+        self.attachments = Attachments(scene, self.rows.query, settings.safety_distance)
         self._clock = Clock(dt)
         units = [names[j] for j in bounds.v_index.tolist()]
         self._configurations = Configurations(model, bounds.q_index, bounds.lower, bounds.upper, units)

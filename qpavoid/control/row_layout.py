@@ -6,45 +6,33 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from qpavoid.config import Avoidance, Limits
 from qpavoid.control.avoidance import row_form
 from qpavoid.control.distances import DistanceQuery
+from qpavoid.control.settings import ControlSettings
 from qpavoid.control.tasks import FrameTask, RowTask
 from qpavoid.control.tasks.layout import task_layout
 from qpavoid.kernels.layout import RowLayout
 from qpavoid.model.kinematics import ForwardKinematics, chains, columns, max_lever_arm
-from qpavoid.model.limits import JointBounds, limit_layout
-from qpavoid.model.scene import Scene
+from qpavoid.model.limits import limit_layout
 
 
 def lay_out(
-    scene: Scene,
+    settings: ControlSettings,
     frames: Sequence[FrameTask],
     row_tasks: Sequence[RowTask],
-    bounds: JointBounds,
     kinematics: ForwardKinematics,
     query: DistanceQuery,
-    avoidance: Avoidance,
-    limits: Limits,
-    damping: float,
-    dt: float,
-    looks_ahead: bool = False,
 ) -> RowLayout:
     """Lay out memory of a controller, or of backup trajectories; see `RowLayout`.
 
     Args:
-        scene: robot and obstacles.
+        settings: of the controller.
         frames: frames that follow motions, those with a position first.
         row_tasks: all other tasks.
-        bounds: limits of the joints.
         kinematics: whose memory is looked into.
         query: distances of the scene.
-        avoidance: distances and rows.
-        limits: use of the joint limits.
-        damping: λ of the tracking law [-].
-        dt: length of a tick [s].
-        looks_ahead: see `RowLayout`.
     """
+    scene, avoidance = settings.scene, settings.avoidance
     model, pairs, table, x = scene.robot.model, len(scene.pairs), query.table, query.arrays
     turning, sliding = chains(model)
     return RowLayout(
@@ -61,7 +49,7 @@ def lay_out(
         twists=x.twists,
         twist_row=table.twist_row,
         margin=x.margin,
-        distance_allowance=scene.distance_allowance(avoidance.safety_distance - avoidance.offset),
+        distance_allowance=scene.distance_allowance(settings.safety_distance),
         joint_poses=kinematics.joint_poses,
         parents=kinematics.arrays.parents,
         column_joints=kinematics.arrays.column_joints,
@@ -82,10 +70,10 @@ def lay_out(
         d=np.zeros(pairs),
         rhs=np.zeros(pairs),
         rhs_contact=np.zeros(pairs),
-        **limit_layout(bounds, limits.position_gain, dt),
+        **limit_layout(settings.bounds, settings.limits.position_gain, settings.dt),
         v_tracking=np.zeros(model.nv),
         lever_arm=max_lever_arm(model, table.max_extension()),
-        damping=damping,
-        looks_ahead=looks_ahead,
+        damping=settings.tracking_damping,
+        looks_ahead=False,
         **row_form(avoidance),
     )

@@ -9,9 +9,9 @@ import pinocchio as pin
 
 from qpavoid import kernels
 from qpavoid.control.obstacles import ObstacleTracker
+from qpavoid.control.settings import ControlSettings
 from qpavoid.problem import Array, IntArray
 from qpavoid.safety.rollout import HORIZON, PREFERRED_DISTANCE, BackupRollouts
-from qpavoid.safety.settings import SafetySettings
 
 _PERIOD = 0.1
 """Time between two positions of the bounding spheres of moving obstacles [s]."""
@@ -35,7 +35,7 @@ class _Paths(NamedTuple):
 class ApproachCheck:
     """Keeps one sample of obstacle paths, and the clearance from them of a robot that rests."""
 
-    def __init__(self, settings: SafetySettings, rollouts: BackupRollouts, obstacles: ObstacleTracker) -> None:
+    def __init__(self, settings: ControlSettings, rollouts: BackupRollouts, obstacles: ObstacleTracker) -> None:
         """Use the kinematics and distances of the rollouts."""
         self._model, self._period = settings.scene.robot.model, settings.dt
         self._braking = 0.5 / settings.bounds.acceleration

@@ -11,6 +11,7 @@ import numpy as np
 
 from qpavoid.control.assembler import RowAssembler
 from qpavoid.control.obstacles import ObstacleTracker
+from qpavoid.control.settings import ControlSettings
 from qpavoid.errors import NumericalError
 from qpavoid.kernels import TOLERANCE
 from qpavoid.model.limits import saturate
@@ -19,7 +20,6 @@ from qpavoid.reason import Reason, ReasonKind, Severity
 from qpavoid.safety.backup import BackupPlanner
 from qpavoid.safety.braking import BrakingCheck
 from qpavoid.safety.progress import ProgressMonitor
-from qpavoid.safety.settings import SafetySettings
 from qpavoid.solvers import Solver
 
 _LIMIT_TOLERANCE = 2e-6
@@ -30,7 +30,7 @@ class Arbiter:
     """Solves the problem of a control step, and decides what is commanded."""
 
     def __init__(
-        self, settings: SafetySettings, solver: Solver, rows: RowAssembler, obstacles: ObstacleTracker
+        self, settings: ControlSettings, solver: Solver, rows: RowAssembler, obstacles: ObstacleTracker
     ) -> None:
         """Build the checks, each with memory of its own.
 

@@ -23,10 +23,10 @@ import pinocchio as pin
 
 from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.control.pair_table import PairTable
+from qpavoid.control.settings import ControlSettings
 from qpavoid.problem import Array, Proximity
 from qpavoid.safety.approach import ApproachCheck
 from qpavoid.safety.rollout import TOUCH, BackupPolicy, BackupRollouts, BackupScore, BackupTrajectory, Start
-from qpavoid.safety.settings import SafetySettings
 
 _HORIZONS = (0.2, 0.05, 0.5)
 """h of backup policies [s]: the most successful first."""
@@ -45,7 +45,7 @@ _DISTANCE_TOLERANCE = 1e-6
 class BackupPlanner:
     """Decides between the velocity of the solver and the first one of a backup trajectory."""
 
-    def __init__(self, settings: SafetySettings, table: PairTable, obstacles: ObstacleTracker) -> None:
+    def __init__(self, settings: ControlSettings, table: PairTable, obstacles: ObstacleTracker) -> None:
         """Begin without a backup trajectory; see `BackupRollouts` for the arguments."""
         self._model, self._obstacles, self._dt = settings.scene.robot.model, obstacles, settings.dt
         self._rollouts = BackupRollouts(settings, table, obstacles)

@@ -24,10 +24,10 @@ import pinocchio as pin
 from qpavoid.control.assembler import RowAssembler
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.obstacles import ObstacleTracker
+from qpavoid.control.settings import ControlSettings
 from qpavoid.kernels import TOLERANCE, speed_to_stop
 from qpavoid.model.kinematics import ForwardKinematics
 from qpavoid.problem import Array, Problem, Solution
-from qpavoid.safety.settings import SafetySettings
 
 _MAX_APPROACH_IN_VIOLATION = 1e-5
 """Approach per control step that a pair below its safety distance may make [m]: round-off of the row that parts it."""
@@ -105,7 +105,7 @@ class _PathPoint(NamedTuple):
 class BrakingCheck:
     """Checks velocities ahead in time, on kinematics and distances of its own."""
 
-    def __init__(self, settings: SafetySettings, rows: RowAssembler, obstacles: ObstacleTracker) -> None:
+    def __init__(self, settings: ControlSettings, rows: RowAssembler, obstacles: ObstacleTracker) -> None:
         """Allocate all memory.
 
         Args:

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from qpavoid.control.settings import ControlSettings
 from qpavoid.problem import Array, Problem, Solution
 from qpavoid.reason import Reason, ReasonKind
-from qpavoid.safety.settings import SafetySettings
 
 _MIN_PROGRESS = 0.1
 """Fraction of the task velocity below which there is no progress [-]."""
@@ -29,7 +29,7 @@ _MAX_STALL = 1.1
 class ProgressMonitor:
     """Follows the progress of a controller's tasks from control step to control step."""
 
-    def __init__(self, settings: SafetySettings) -> None:
+    def __init__(self, settings: ControlSettings) -> None:
         self._names = settings.scene.pair_names
         self._limit = settings.progress.stalled_after / settings.dt  # control steps
         self.reset()

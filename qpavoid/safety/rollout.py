@@ -23,10 +23,10 @@ from qpavoid.control.estimates import ObstacleEstimates, prediction_error_bound
 from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.control.pair_table import PairTable
 from qpavoid.control.row_layout import lay_out
+from qpavoid.control.settings import ControlSettings
 from qpavoid.model.kinematics import ForwardKinematics, max_lever_arm
 from qpavoid.problem import Array, Mask
 from qpavoid.safety.jerk import Ramps
-from qpavoid.safety.settings import SafetySettings
 
 HORIZON = 1.5
 """Time for which a backup trajectory has to stay clear [s]: longer than an arm needs to stop or to step aside."""
@@ -129,7 +129,7 @@ class _Contacts:
 class BackupRollouts:
     """Computes backup trajectories, on kinematics and distances of its own."""
 
-    def __init__(self, settings: SafetySettings, table: PairTable, obstacles: ObstacleTracker) -> None:
+    def __init__(self, settings: ControlSettings, table: PairTable, obstacles: ObstacleTracker) -> None:
         """Allocate all memory, and compile all kernels.
 
         Args:
@@ -145,9 +145,8 @@ class BackupRollouts:
         self.kinematics, self.query = ForwardKinematics(model), DistanceQuery(scene, table)
         # a velocity may be asked for that is farther away than jerk limits allow in a period
         free = replace(settings.bounds, jerk=np.full(model.nv, np.inf))
-        self._layout = lay_out(
-            scene, (), (), free, self.kinematics, self.query, settings.avoidance, settings.limits, 0.01, self.period
-        )
+        relaxed = replace(settings, bounds=free, dt=self.period)
+        self._layout = lay_out(relaxed, (), (), self.kinematics, self.query)
         self.packed, self._views = kernels.pack(self._layout), dict[int, Near]()
         self._is_vector_space = all(joint.nv <= 1 for joint in list(model.joints)[1:])
         """Whether configurations add up: joints of one coordinate at most."""
