@@ -1,14 +1,19 @@
 """The vocabulary of docs/glossary.md: words that it replaces occur nowhere else."""
 
+import ast
 import re
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-WORDS = [
-    line.strip()
-    for line in (ROOT / "tests" / "banned_words.txt").read_text(encoding="utf-8").splitlines()
-    if line.strip() and not line.startswith("#")
-]
+
+
+def lists():
+    """Words that occur nowhere, and words that are no names in code: two lists, each after a line that says so."""
+    texts = re.split(r"^# Names:.*$", (ROOT / "tests" / "banned_words.txt").read_text(encoding="utf-8"), flags=re.M)
+    return [[line.strip() for line in text.splitlines() if line.strip() and line[0] != "#"] for text in texts]
+
+
+WORDS, NAMES = lists()
 PATTERN = re.compile(
     r"\b(" + "|".join(re.escape(word).replace(r"\ ", r"\s+") for word in WORDS) + r")\b", re.IGNORECASE
 )
@@ -41,3 +46,25 @@ def test_banned_words_are_in_the_glossary():
     page = (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8").lower()
     stems = {word: word.split()[0][:3] for word in WORDS}
     assert [word for word, stem in stems.items() if stem not in page] == []
+
+
+def names_in(tree):
+    """Line and name of all that a module gives a name."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Name | ast.Attribute) and isinstance(node.ctx, ast.Store):
+            yield node.lineno, node.id if isinstance(node, ast.Name) else node.attr
+        elif isinstance(node, ast.arg):
+            yield node.lineno, node.arg
+        elif isinstance(node, ast.FunctionDef | ast.ClassDef):
+            yield node.lineno, node.name
+
+
+def test_banned_names_are_no_names():
+    files = [path for folder in ("qpavoid", "bench") for path in (ROOT / folder).rglob("*.py")]
+    found = [
+        f"{path.relative_to(ROOT)}:{line}: {name}"
+        for path in files
+        for line, name in names_in(ast.parse(path.read_text(encoding="utf-8")))
+        if name.strip("_").lower() in NAMES
+    ]
+    assert len(NAMES) > 10 and not found, "\n".join(found)

@@ -32,8 +32,8 @@ def number(value: float) -> str:
 def describe_machine(*packages: str) -> str:
     """Return processor, cores, system, interpreter and installed packages in one line."""
     python = f"Python {platform.python_version()}"
-    found = (f"{name} {number}" for name, number in versions(packages).items())
-    return ", ".join((cpu(), f"{os.cpu_count()} CPUs", platform.system(), python, *found)) + "; one thread"
+    result = (f"{name} {number}" for name, number in versions(packages).items())
+    return ", ".join((cpu(), f"{os.cpu_count()} CPUs", platform.system(), python, *result)) + "; one thread"
 
 
 def write(folder: Path, name: str, sections: Iterable[str], rows: Sequence[Mapping[str, Any]] = ()) -> str:

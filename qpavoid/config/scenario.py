@@ -36,7 +36,7 @@ class ObstacleConfig(Block):
     where it is taken to be at first."""
 
     @model_validator(mode="after")
-    def _can_be_carried(self) -> ObstacleConfig:
+    def _is_graspable(self) -> ObstacleConfig:
         if self.source == "external" and not isinstance(self.motion, Fixed):
             raise ValueError(f"an external obstacle has no motion of type {self.motion.type}; give `type: fixed`")
         whole = not isinstance(self.shape, HalfSpace | PointCloud)

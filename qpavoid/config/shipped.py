@@ -71,10 +71,10 @@ def example_robot_data() -> Path:
         ConfigError: the package is not installed.
     """
     try:
-        share = distribution("example-robot-data").locate_file("cmeel.prefix/share")
+        folder = distribution("example-robot-data").locate_file("cmeel.prefix/share")
     except PackageNotFoundError:
         raise ConfigError("example-robot-data is not installed: pip install example-robot-data") from None
-    return Path(str(share))
+    return Path(str(folder))
 
 
 def example_robot(name: str) -> Path:

@@ -99,7 +99,7 @@ class MeasuredStates:
 
 
 def prediction_error_bound(
-    now: ObstacleEstimates | None, before: ObstacleEstimates | None, span: float, radii: Array
+    now: ObstacleEstimates | None, earlier: ObstacleEstimates | None, span: float, radii: Array
 ) -> float:
     """Bound how far any point of an obstacle is from its prediction, now and for some time [m].
 
@@ -108,17 +108,17 @@ def prediction_error_bound(
 
     Args:
         now: current estimates.
-        before: estimates that the prediction was made of.
+        earlier: estimates that the prediction was made of.
         span: for how long it counts [s].
         radii: distance from each obstacle's origin to its farthest point (o,) [m].
 
     Returns:
         The bound; infinite where the two are not of the same obstacles.
     """
-    if now is None or before is None or now.which != before.which:
-        return 0.0 if now is before else np.inf
-    expected = before.states.copy()
-    extrapolate(expected, now.t - before.t)
+    if now is None or earlier is None or now.which != earlier.which:
+        return 0.0 if now is earlier else np.inf
+    expected = earlier.states.copy()
+    extrapolate(expected, now.t - earlier.t)
     off = np.abs(now.states - expected)
     if not off.any():
         return 0.0

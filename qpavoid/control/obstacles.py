@@ -248,10 +248,10 @@ class ObstacleTracker:
             given = NO_UPDATE
         else:
             return None
-        sampled = self._sample_others(t, given.which.tolist()) if self._trajectories.others else ()
+        sampled = self._sample_custom(t, given.which.tolist()) if self._trajectories.others else ()
         return StepUpdate(t, shift, given, sampled)
 
-    def _sample_others(self, t: float, given: Sequence[int]) -> list[tuple[int, Sample]]:
+    def _sample_custom(self, t: float, given: Sequence[int]) -> list[tuple[int, Sample]]:
         """Sample the trajectories of other classes at t [s], but for obstacles that are given.
 
         Raises:

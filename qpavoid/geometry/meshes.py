@@ -101,8 +101,8 @@ def cut(triangles: Array, heights: Array) -> tuple[Array, Array]:
         np.take_along_axis(h, order, 1),
     )
     with np.errstate(divide="ignore", invalid="ignore"):
-        share = np.clip(h[:, :1] / (h[:, :1] - h[:, 1:]), 0.0, 1.0)
-    ab, ac = a + share[:, :1] * (b - a), a + share[:, 1:] * (c - a)
+        fraction = np.clip(h[:, :1] / (h[:, :1] - h[:, 1:]), 0.0, 1.0)
+    ab, ac = a + fraction[:, :1] * (b - a), a + fraction[:, 1:] * (c - a)
     tip, low = np.stack((a, ab, ac), axis=1), h[:, 0] < 0.0
     base = np.stack((ab, b, c, ab, c, ac), axis=1)
     sides = [

@@ -38,7 +38,7 @@ def backup_rows(
     """
     velocity_bounds(x, q)
     k = distance_rows(x, pairs, influence_distance, moving)
-    n, touching, nearest, nearest_apart = 0, 0, influence_distance, influence_distance
+    n, touching, nearest, nearest_separable = 0, 0, influence_distance, influence_distance
     for i in range(k):
         if not enabled[x.near_pairs[i]]:
             continue
@@ -48,7 +48,7 @@ def backup_rows(
             enabled[x.near_pairs[i]] = False
             touching += 1
             continue
-        nearest_apart = min(nearest_apart, distance + slack)
+        nearest_separable = min(nearest_separable, distance + slack)
         if n < i:
             x.near_pairs[n], x.feedforward[n] = x.near_pairs[i], x.feedforward[i]
             for c in range(10):
@@ -56,7 +56,7 @@ def backup_rows(
             for c in range(x.J.shape[1]):
                 x.J[n, c] = x.J[i, c]
         n += 1
-    return n, touching, nearest, nearest_apart
+    return n, touching, nearest, nearest_separable
 
 
 @compiled

@@ -10,7 +10,7 @@ from qpavoid.kernels.bounds import _change_to_stop
 from qpavoid.kernels.packing import compiled
 from qpavoid.problem import Array, IntArray
 
-BRAKING_SHARE = 0.5
+BRAKING_FRACTION = 0.5
 """Share of the joints' accelerations that one pair may use for braking [-]: other pairs need some at the same time."""
 OWN_ALPHA_CAP = 1.0
 """Largest α of a pair of two bodies of the robot [-]: beyond 1 it asks for separation, which may be impossible."""
@@ -114,7 +114,7 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
                 if x.J[i, c] != 0.0:
                     braking += abs(x.J[i, c]) * x.v_step[c]
             if braking < np.inf:
-                braking *= 0.5 * BRAKING_SHARE
+                braking *= 0.5 * BRAKING_FRACTION
                 clearance = max(d - x.safety_distance, 0.0) / x.dt
                 rate = max(rate, braking - np.sqrt(braking * braking + 4.0 * braking * clearance))
                 if x.jerk_limited:
@@ -218,9 +218,9 @@ def _jerk_limited_closing(x: Any, i: int, rate: float, step: float, clearance: f
             speed -= x.J[i, c] * x.v_prev[c]
             change -= x.J[i, c] * x.dv_prev[c]
             unit += abs(x.J[i, c]) * x.dv_step[c]
-    unit *= BRAKING_SHARE
+    unit *= BRAKING_FRACTION
     if not 0.0 < unit < np.inf:
         return -np.inf
-    high = min((-rate - speed) / unit, change / unit + 1.0 / BRAKING_SHARE)
+    high = min((-rate - speed) / unit, change / unit + 1.0 / BRAKING_FRACTION)
     change = _change_to_stop(speed / unit, high, -np.inf, step / unit, clearance / unit)
     return -speed - unit * change

@@ -12,7 +12,7 @@ from qpavoid.config.shipped import example_robot_data
 _ENTRY = re.compile(r"(?P<name>[A-Za-z][\w.-]*)=(?P<folder>.+)", re.DOTALL)
 """`NAME=FOLDER`; a folder that has such a name itself is taken as a folder."""
 _MANIFEST = "package.xml"
-_MOST_BESIDE = 1000
+_MAX_SIBLINGS = 1000
 """Folders that are looked into for a package.xml, beside one another; workspaces have 300."""
 _NAME = re.compile(r"<name>\s*([\w.-]+)\s*</name>")
 _HEAD = 100_000
@@ -99,7 +99,7 @@ def _split(entry: str, folder: Path = Path()) -> tuple[str, str]:
 def _with_manifest(holder: str) -> Iterator[str]:
     """Yield a folder and those in it that have a package.xml."""
     try:
-        inside = sorted(os.listdir(holder))[:_MOST_BESIDE]
+        inside = sorted(os.listdir(holder))[:_MAX_SIBLINGS]
     except OSError:
         return
     for folder in (holder, *(os.path.join(holder, name) for name in inside)):

@@ -82,8 +82,8 @@ def _find_blocking_pairs(problem: Problem, v: Array) -> list[tuple[int, float]]:
     if not active.any():  # a solver without rows: the nearest of the pairs that the task would have close
         active = (rows.J @ problem.v_tracking < -_ACTIVE_TOLERANCE) & (rows.d < rows.d2)
         active &= rows.d <= np.min(rows.d, where=active, initial=np.inf)
-    found = np.flatnonzero(active)
-    order = found[np.argsort(-violation[found], kind="stable")]
+    indices = np.flatnonzero(active)
+    order = indices[np.argsort(-violation[indices], kind="stable")]
     return list(zip(rows.pair[order].tolist(), violation[order].tolist(), strict=True))
 
 

@@ -113,7 +113,7 @@ class _Contacts:
         self.enabled, self.time, self.clearance = start.enabled.copy(), np.inf, np.inf
         self.lost_time, self._clearance_before, self._deadline = 0.0, np.inf, start.t + HORIZON
 
-    def add(self, count: int, nearest: float, nearest_apart: float, t: float, span: float) -> None:
+    def add(self, count: int, nearest: float, nearest_separable: float, t: float, span: float) -> None:
         """Add a pose at t [s], `span` after the one before; contacts are dated by interpolation between the two.
 
         There, `count` pairs come into contact; the least distance with these, and without, is given [m].
@@ -123,7 +123,7 @@ class _Contacts:
             time = t - span * (TOUCH - nearest) / closing if 0.0 < closing < np.inf else t
             self.time = min(self.time, time)
             self.lost_time += count * max(self._deadline - time, 0.0)
-        self.clearance, self._clearance_before = min(self.clearance, nearest_apart), nearest_apart
+        self.clearance, self._clearance_before = min(self.clearance, nearest_separable), nearest_separable
 
 
 class BackupRollouts:
@@ -272,10 +272,10 @@ class BackupRollouts:
         self.kinematics.compute(q)
         query.compute(self.kinematics.joint_poses, _INFLUENCE_DISTANCE)
         self._layout.v_prev[:] = v
-        k, touching, nearest, nearest_apart = kernels.backup_rows(
+        k, touching, nearest, nearest_separable = kernels.backup_rows(
             self.packed, q, query.pairs, _INFLUENCE_DISTANCE, query.is_moving, contacts.enabled, TOUCH
         )
-        contacts.add(touching, nearest, nearest_apart, t, span)
+        contacts.add(touching, nearest, nearest_separable, t, span)
         if k not in self._views:
             x = self._layout
             self._views[k] = x.closest[:k], x.J[:k], x.feedforward[:k]

@@ -46,22 +46,22 @@ class UncheckedLinks:
 
     def notes(self) -> list[Note]:
         """Return a note of what may matter; none of pairs that never touch, or always do as neighbours do."""
-        share, severity = self.geometry, "note"
-        if self.reason == "always" and share < ALWAYS_TOUCHING:
+        fraction, severity = self.geometry, "note"
+        if self.reason == "always" and fraction < ALWAYS_TOUCHING:
             bodies, severity = 100.0 * (self.bodies or 0.0), "warning"
             clause = f"not checked: their bodies touch in {bodies:.0f} % of configurations, their geometry more seldom"
             remedy = f"leaner bodies: --bodies {self.links[0]}=convex, or of your own"
         elif self.reason in ("always", "drawn in"):
             design = "overlap" if self.reason == "always" else "slide into each other"
             clause, remedy = f"not checked: they {design} by design", ""
-        elif not 0.0 < share < ALWAYS_TOUCHING:
+        elif not 0.0 < fraction < ALWAYS_TOUCHING:
             return []
         elif self.reason == "srdf":
             clause = "not checked (disabled by hand), but can touch"
             remedy = "take them out of the SRDF or `disabled_pairs`"
         else:
             clause, remedy = "not checked (one joint apart), but can touch", "limit that joint so that they cannot"
-        return [Note(NoteKind.PAIR, self.links, clause, remedy, severity, share)]  # type: ignore[arg-type]
+        return [Note(NoteKind.PAIR, self.links, clause, remedy, severity, fraction)]  # type: ignore[arg-type]
 
 
 def named_pairs(robot: Robot) -> list[frozenset[str]]:
@@ -147,9 +147,9 @@ def measure_unchecked(
     of_geometry = geometry_contacts(robot, pieces, [links for links, reason in disabled.items() if reason != "never"])
     link = links_of_bodies(robot)
     of_bodies: dict[frozenset[str], float] = {}
-    for pair, share in shares.items():
+    for pair, fraction in shares.items():
         links = frozenset(link[body] for body in pair)
-        of_bodies[links] = max(of_bodies.get(links, 0.0), share)
+        of_bodies[links] = max(of_bodies.get(links, 0.0), fraction)
     return [
         UncheckedLinks((min(links), max(links)), reason, of_bodies.get(links), of_geometry.get(links, 0.0))
         for links, reason in sorted(disabled.items(), key=lambda item: sorted(item[0]))

@@ -33,8 +33,8 @@ def find_srdf(urdf: Path) -> Path | None:
     Those that `robot add` wrote are left out: they hold its own results.
     """
     folders = (urdf.parent, urdf.parent / "srdf", urdf.parent.parent / "srdf")
-    found = [path for folder in folders for path in sorted(folder.glob("*.srdf")) if not _is_own(path)]
-    same = [path for path in found if path.stem.startswith(urdf.stem) or urdf.stem.startswith(path.stem)]
+    paths = [path for folder in folders for path in sorted(folder.glob("*.srdf")) if not _is_own(path)]
+    same = [path for path in paths if path.stem.startswith(urdf.stem) or urdf.stem.startswith(path.stem)]
     return max(same, key=lambda path: (path.stem == urdf.stem, min(len(path.stem), len(urdf.stem))), default=None)
 
 

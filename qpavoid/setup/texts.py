@@ -53,11 +53,11 @@ def write_files(contents: Mapping[Path, str], force: bool = False) -> dict[Path,
     outcome = {}
     try:
         for path, content in contents.items():
-            before = path.read_bytes() if path.exists() else None
-            outcome[path] = "written" if before is None else "updated"
-            if before == content.encode():
+            old = path.read_bytes() if path.exists() else None
+            outcome[path] = "written" if old is None else "updated"
+            if old == content.encode():
                 outcome[path] = "unchanged"
-            elif before is not None and not force:
+            elif old is not None and not force:
                 raise ConfigError(
                     f"{path}: is there already, with something else in it: left as it is; --force overwrites it, "
                     "--out DIR writes elsewhere"
@@ -165,9 +165,11 @@ def note_lines(notes: Sequence[Note]) -> list[str]:
     order = {"error": 0, "warning": 1, "note": 2}
     lines = []
     for note in sorted(notes, key=lambda note: order[note.severity]):
-        share = "" if note.fraction is None else f"{100.0 * note.fraction:.0f} %"
+        percentage = "" if note.fraction is None else f"{100.0 * note.fraction:.0f} %"
         names = " - ".join(note.subject) if note.kind is NoteKind.PAIR else abbreviate(note.subject)
-        lines.append(f"{note.severity:<8} {note.kind.value:<6} {share:>5}  {names}{': ' if names else ''}{note.what}")
+        lines.append(
+            f"{note.severity:<8} {note.kind.value:<6} {percentage:>5}  {names}{': ' if names else ''}{note.what}"
+        )
         if note.remedy:
             lines.append(f"{'':24}→ {note.remedy}")
     return lines

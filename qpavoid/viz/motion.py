@@ -99,9 +99,9 @@ def view_angles(log: Log) -> tuple[float, float]:
     scores = []
     for elevation, azimuth in _VIEWS:
         towards = _view_axes(elevation, azimuth)[2]
-        seen = np.linalg.norm(spread - np.outer(spread @ towards, towards)) / np.linalg.norm(spread + 1e-12)
+        named = np.linalg.norm(spread - np.outer(spread @ towards, towards)) / np.linalg.norm(spread + 1e-12)
         in_front = float(np.clip(np.max(offsets @ towards, initial=0.0), 0.0, 1.0))
-        scores.append(seen * (1.0 - 0.5 * in_front) * (1.0 - 5e-4 * abs(azimuth)))  # rather from before the robot
+        scores.append(named * (1.0 - 0.5 * in_front) * (1.0 - 5e-4 * abs(azimuth)))  # rather from before the robot
     return _VIEWS[int(np.argmax(scores))]
 
 

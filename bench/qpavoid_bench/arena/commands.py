@@ -221,10 +221,10 @@ def _runs_of(suite: Suite, folder: Path) -> tuple[pd.DataFrame, list[Case]]:
     from qpavoid_bench.arena.sweep import plan
 
     with Store(folder) as store:
-        wanted = plan(suite, store)
+        planned = plan(suite, store)
     runs = read_runs(folder)
     keys = zip(*(runs[name] for name in KEY), strict=True)
-    return runs[[key in wanted.keys for key in keys]], [Case.from_json(text) for text in wanted.texts]
+    return runs[[key in planned.keys for key in keys]], [Case.from_json(text) for text in planned.texts]
 
 
 def _failures(folder: Path) -> list[str]:

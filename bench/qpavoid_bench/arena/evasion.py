@@ -142,11 +142,11 @@ def evade(
         box, begin, q_begin, v_begin = limits.box(q, v, steps * dt), t, q, v
         stop = np.clip(np.zeros(len(q)), *box)
         rows = near_rows(model, q, t, pairs, INFLUENCE_DISTANCE) if policy.horizon else None
-        wanted = stop if rows is None else policy_velocity(rows, box, policy)
+        chosen = stop if rows is None else policy_velocity(rows, box, policy)
         # while the velocity stays, several control steps are as good as one
         count = steps if np.isfinite(limits.acceleration).any() else 1
         for _ in range(count):
-            v = v + np.clip(wanted - v, *(sign * limits.acceleration * dt for sign in (-1.0, 1.0)))
+            v = v + np.clip(chosen - v, *(sign * limits.acceleration * dt for sign in (-1.0, 1.0)))
             q = monitor.follow(q, v, t, steps * dt / count)
             if monitor.contacts:
                 return Evasion(monitor.contacts[0].pair, begin, q_begin, v_begin, monitor.distance)
@@ -162,17 +162,17 @@ def near_rows(model: MujocoModel, q: Array, t: float, pairs: Any, max_distance: 
     first, second = scene.pairs.T
     centers, radius = model.poses()[0], mujoco_model.geom_rbound[model.geoms]
     gap = np.linalg.norm(centers[first] - centers[second], axis=1) - radius[first] - radius[second]
-    found: list[tuple[int, float]] = []
+    near: list[tuple[int, float]] = []
     points = np.empty((len(gap), 6))
     for candidate in np.flatnonzero(pairs & (gap < max_distance)).tolist():
-        distance = model.distance(candidate, points[len(found)])
+        distance = model.distance(candidate, points[len(near)])
         if 0.0 < distance < max_distance:
-            found.append((candidate, distance))
-    pair, d = np.array([p for p, _ in found], dtype=np.intp), np.array([distance for _, distance in found])
-    ends = points[: len(found)].reshape(-1, 2, 3)
+            near.append((candidate, distance))
+    pair, d = np.array([p for p, _ in near], dtype=np.intp), np.array([distance for _, distance in near])
+    ends = points[: len(near)].reshape(-1, 2, 3)
     normal = (ends[:, 1] - ends[:, 0]) / d[:, None]
-    jacobian = np.zeros((len(found), 2, 3, mujoco_model.nv))
-    velocity = np.zeros((len(found), 3))
+    jacobian = np.zeros((len(near), 2, 3, mujoco_model.nv))
+    velocity = np.zeros((len(near), 3))
     for i, sides in enumerate(scene.pairs[pair].tolist()):
         for side, geometry in enumerate(sides):
             if geometry < model.bodies:

@@ -45,15 +45,15 @@ def success_by_family(results: Results) -> Figure:
     """Draw the rate of runs that succeed by entrant, best first, and family."""
     families, entrants = results.families, list(results.ranking())
     runs = results.common.assign(success=100.0 * results.common["success"])
-    share = runs.pivot_table("success", "entrant", "family").reindex(index=entrants, columns=families).to_numpy()
+    success = runs.pivot_table("success", "entrant", "family").reindex(index=entrants, columns=families).to_numpy()
     figure = Figure(figsize=(1.8 + 0.62 * len(families), 1.6 + 0.34 * len(entrants)), layout="constrained")
     ax = figure.subplots()
-    image = ax.imshow(share, cmap="viridis", vmin=0.0, vmax=100.0, aspect="auto")
+    image = ax.imshow(success, cmap="viridis", vmin=0.0, vmax=100.0, aspect="auto")
     ax.set_xticks(range(len(families)), families, rotation=45, ha="right", fontsize=8, parse_math=False)
     ax.set_yticks(range(len(entrants)), entrants, fontsize=8, parse_math=False)
-    for i, j in np.argwhere(np.isfinite(share)):
-        colour = "black" if share[i, j] > 60.0 else "white"
-        ax.text(j, i, f"{share[i, j]:.0f}", ha="center", va="center", fontsize=7, color=colour)
+    for i, j in np.argwhere(np.isfinite(success)):
+        colour = "black" if success[i, j] > 60.0 else "white"
+        ax.text(j, i, f"{success[i, j]:.0f}", ha="center", va="center", fontsize=7, color=colour)
     figure.colorbar(image, ax=ax, label="runs that succeed [%]", fraction=0.04)
     return figure
 

@@ -73,12 +73,12 @@ def results_of(runs: pd.DataFrame, order: Sequence[str] = ()) -> Results:
         runs: columns as in `scores.COLUMNS`, at least one row, in the order in which they were done.
         order: entrants that come first, in this order; the others follow by name.
     """
-    kept = _latest_rows(runs, ["entrant"], ["settings", "version"])
-    kept = _latest_rows(kept, ["family", "seed"], ["case"]).copy()
-    bounded = sum(_replace_non_finite(kept, name) for name, kind in COLUMNS.items() if kind == "float")
-    names = set(kept["entrant"])
+    selected = _latest_rows(runs, ["entrant"], ["settings", "version"])
+    selected = _latest_rows(selected, ["family", "seed"], ["case"]).copy()
+    bounded = sum(_replace_non_finite(selected, name) for name, kind in COLUMNS.items() if kind == "float")
+    names = set(selected["entrant"])
     entrants = [name for name in order if name in names] + sorted(names.difference(order))
-    return Results(kept, entrants, len(runs) - len(kept), bounded)
+    return Results(selected, entrants, len(runs) - len(selected), bounded)
 
 
 def _latest_rows(runs: pd.DataFrame, key: list[str], columns: list[str]) -> pd.DataFrame:

@@ -163,8 +163,8 @@ def score(
         jitter=float(np.abs(change).sum()) / scenario.duration,
         peak_velocity=float(np.max(np.abs(rollout.v) / limit, initial=0.0)),
         violations=float(np.mean(_violates_limits(world, scenario, rollout, findings))),
-        relaxed=_status_share(rollout, Status.RELAXED),
-        stopped=_status_share(rollout, Status.STOPPED),
+        relaxed=_status_fraction(rollout, Status.RELAXED),
+        stopped=_status_fraction(rollout, Status.STOPPED),
         failed=float(np.mean(rollout.failed)),
         failure=rollout.failure,
         tick_p50=1e6 * float(np.median(rollout.tick)),
@@ -181,7 +181,7 @@ def surface_safety_distance(scenario: ScenarioConfig) -> float:
     return scenario.avoidance.d1 - scenario.avoidance.offset
 
 
-def _status_share(rollout: Rollout, status: Status) -> float:
+def _status_fraction(rollout: Rollout, status: Status) -> float:
     """Return the fraction of steps with a status."""
     return float(np.mean(rollout.status == STATUSES.index(status)))
 

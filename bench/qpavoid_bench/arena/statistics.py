@@ -101,13 +101,13 @@ def ranks(success: Flags, error: Array, names: Sequence[str]) -> dict[str, int]:
     """
     won, missed = success.sum(axis=0), error.mean(axis=0)
     order = sorted(range(len(names)), key=lambda i: (-won[i], round(float(missed[i]), 4)))
-    found: dict[str, int] = {}
+    result: dict[str, int] = {}
     leader, rank = order[0] if order else 0, 1
     for place, i in enumerate(order, 1):
         if duel(success[:, leader], success[:, i]).decided:
             leader, rank = i, place
-        found[names[i]] = rank
-    return found
+        result[names[i]] = rank
+    return result
 
 
 def pareto(x: Array, y: Array) -> Flags:

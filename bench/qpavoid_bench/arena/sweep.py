@@ -63,15 +63,15 @@ class Plan(NamedTuple):
 def plan(suite: Suite, store: Store) -> Plan:
     """Compare what a suite asks for with what is in a store."""
     made, done, here = store.cases(), store.run_keys(), version("qpavoid")
-    wanted = [(family.name, seed, of) for family, of in _origins(suite) for seed in suite.seeds]
-    cases = [made[key] for key in wanted if key in made]
+    chosen = [(family.name, seed, of) for family, of in _origins(suite) for seed in suite.seeds]
+    cases = [made[key] for key in chosen if key in made]
     runs = [
         (text, entrant, (case, entrant.name, entrant.digest, here))
         for case, text in cases
         for entrant in suite.entrants
     ]
     return Plan(
-        cases=[key for key in wanted if key not in made],
+        cases=[key for key in chosen if key not in made],
         runs=[(text, entrant) for text, entrant, key in runs if key not in done],
         keys=frozenset(key for *_, key in runs),
         texts=[text for _, text in cases],

@@ -60,19 +60,19 @@ def _sections(steps: int, timed: int, runs: int, states: int, cases: tuple[str, 
     head = ["loop", "", "p50", "p99", "p99.9", "worst", "p99/p50"]
     rows, notes = [], []
     for loop in LOOPS:
-        found = _measure("latency", loop, timed)
+        result = _measure("latency", loop, timed)
         for name in ("steps", "work", "machine"):
-            p50, p99, *rare = found[name]
+            p50, p99, *rare = result[name]
             rows.append([loop, name, *map(number, (p50, p99, *rare)), f"{p99 / p50:.2f}"])
         notes.append(
-            f"{loop}: {100 * found['slow']:.2f} % of the steps slower than twice the median, the core taken away "
-            f"{found['preempted']:.1f} times in 1000 steps."
+            f"{loop}: {100 * result['slow']:.2f} % of the steps slower than twice the median, the core taken away "
+            f"{result['preempted']:.1f} times in 1000 steps."
         )
     yield table(head, rows, text_columns=2)
     yield " ".join(notes)
     yield f"## Memory over {steps:,} steps"
-    found = _measure("memory", LOOPS[0], steps)
-    cells = [*(f"{x:.1f}" for x in found["resident"]), f"{found['slope']:.3f}", found["growth"], found["peak"]]
+    result = _measure("memory", LOOPS[0], steps)
+    cells = [*(f"{x:.1f}" for x in result["resident"]), f"{result['slope']:.3f}", result["growth"], result["peak"]]
     start, half, end = "RSS at the start [MB]", "half way", "at the end"
     slope, growth = "growth in the second half [bytes/step]", f"growth over {steps // 10:,} more, by Python [bytes]"
     yield table(["loop", start, half, end, slope, growth, "peak above that [bytes]"], [[LOOPS[0], *cells]])
@@ -81,8 +81,8 @@ def _sections(steps: int, timed: int, runs: int, states: int, cases: tuple[str, 
     with TemporaryDirectory() as empty:
         caches = dict.fromkeys(("NUMBA_CACHE_DIR", "QPAVOID_CACHE"), empty) if len(cases) > 1 else {}
         for case in cases:
-            found = _measure("start", "panda", **caches)
-            rows.append([case, *(f"{found[part]:.2f}" for part in ("import", "scene", "controller"))])
+            result = _measure("start", "panda", **caches)
+            rows.append([case, *(f"{result[part]:.2f}" for part in ("import", "scene", "controller"))])
     yield table(["Panda", "import", "robot and scene", "controller, which warms up"], rows)
     yield "## The first step after that [µs]"
     yield (
@@ -91,8 +91,8 @@ def _sections(steps: int, timed: int, runs: int, states: int, cases: tuple[str, 
     )
     rows = []
     for loop in FIRST_USES:
-        found = _measure("first_use", loop, FIRST)
-        rows.append([loop, *(number(found[part]) for part in ("first", "worst", "median"))])
+        result = _measure("first_use", loop, FIRST)
+        rows.append([loop, *(number(result[part]) for part in ("first", "worst", "median"))])
     yield table(["loop", "first", "slowest other", "median"], rows)
     yield "## Control steps a second"
     yield (
@@ -104,8 +104,8 @@ def _sections(steps: int, timed: int, runs: int, states: int, cases: tuple[str, 
     for scenario in SCENARIOS:
         base: dict[str, float] = {}
         for processes in (0, 1, *sorted({2, os.cpu_count() or 1} - {1})):
-            found = _measure("throughput", scenario, runs, states, processes)
-            base = base or found
-            cells = [f"{found[part]:,.0f} ({found[part] / base[part]:.2f})" for part in ("sweep", "states")]
+            result = _measure("throughput", scenario, runs, states, processes)
+            base = base or result
+            cells = [f"{result[part]:,.0f} ({result[part] / base[part]:.2f})" for part in ("sweep", "states")]
             rows.append([scenario, str(processes) if processes else "a loop in this process", *cells])
     yield table(["scenario", "processes", "sweep", "states"], rows)

@@ -57,12 +57,12 @@ def memory(workload: str, count: int) -> dict[str, Any]:
     tracemalloc.start()
     _run(loop, count // 100)
     gc.collect()
-    before = tracemalloc.get_traced_memory()[0]
+    previous = tracemalloc.get_traced_memory()[0]
     _run(loop, count // 10)
     gc.collect()
     after, peak = tracemalloc.get_traced_memory()
     megabytes = [resident[0], resident[half], resident[-1]]
-    return {"resident": megabytes, "slope": 1e6 * slope, "growth": after - before, "peak": peak - after}
+    return {"resident": megabytes, "slope": 1e6 * slope, "growth": after - previous, "peak": peak - after}
 
 
 def start(robot: str) -> dict[str, float]:

@@ -53,7 +53,7 @@ def solvers(
     truths = [[find_truth(qp) for qp in run.qps] for run in recorded]
     cells = [replay(run, known, makers, rounds, budget) for run, known in zip(recorded, truths, strict=True)]
     rows = [
-        _record(run, name, cell) for run, found in zip(recorded, cells, strict=True) for name, cell in found.items()
+        _record(run, name, cell) for run, result in zip(recorded, cells, strict=True) for name, cell in result.items()
     ]
     print(write(out, "solvers-quick" if quick else "solvers", _sections(recorded, truths, cells, rounds), rows))
 
@@ -61,7 +61,7 @@ def solvers(
 def _sections(runs: list[Run], truths: list[list[Truth]], cells: list[dict[str, Cell]], rounds: int) -> Iterator[str]:
     from qpavoid_bench.solvers.truth import DISTANCE, EDGE, VIOLATION
 
-    total = {name: _joined([found[name] for found in cells]) for name in cells[0]}
+    total = {name: _joined([result[name] for result in cells]) for name in cells[0]}
     names = sorted(total, key=lambda name: _median(total[name]))
     yield "# QP back ends on recorded problems"
     yield (
@@ -91,7 +91,7 @@ def _sections(runs: list[Run], truths: list[list[Truth]], cells: list[dict[str, 
     )
     yield "## Run by run: median / p99 [µs], and the share that is right where that is not all"
     shown = [name for name in total if "defaults" not in name]
-    rows = ([run.name, *(_brief(found[name]) for name in shown)] for run, found in zip(runs, cells, strict=True))
+    rows = ([run.name, *(_brief(result[name]) for name in shown)] for run, result in zip(runs, cells, strict=True))
     yield table(["run", *shown], rows)
     yield "## The runs"
     head = ["run", "steps", "QPs", "n", "rows m", "contradicting", "open", "reference stationary to"]
@@ -101,12 +101,12 @@ def _sections(runs: list[Run], truths: list[list[Truth]], cells: list[dict[str, 
 
 
 def _choice(names: list[str], total: dict[str, Cell]) -> str:
-    shares = {name: _share(total[name].judged, "right") for name in names}
+    shares = {name: _right_fraction(total[name].judged, "right") for name in names}
     right = [name for name in names if shares[name] == 1.0]
     if not right:
         return "**No back end is right on every problem.**"
     ratios = [f"{name} {_median(total[name]) / _median(total[right[0]]):.1f}x" for name in right[1:]]
-    wrong = [f"{name} ({_percent(share)})" for name, share in shares.items() if share < 1.0]
+    wrong = [f"{name} ({_percent(fraction)})" for name, fraction in shares.items() if fraction < 1.0]
     return (
         f"**Choose `{right[0]}`**: right on every problem, and the quickest of those that are. Time of the others that "
         f"are always right, by medians: {', '.join(ratios) or 'none'}. Not always right: {', '.join(wrong) or 'none'}."
@@ -120,14 +120,14 @@ def _joined(cells: list[Cell]) -> Cell:
 
 
 def _row(cell: Cell) -> list[str]:
-    shares = [_percent(_share(cell.judged, field)) for field in ("solved", "right")]
+    shares = [_percent(_right_fraction(cell.judged, field)) for field in ("solved", "right")]
     times = [number(float(np.percentile(cell.us, percent))) for percent in (50, 99)]
     return [*shares, *times, *(f"{_worst(cell.judged, field):.0e}" for field in ("violation", "distance"))]
 
 
 def _brief(cell: Cell) -> str:
     times = " / ".join(number(float(np.percentile(cell.us, percent))) for percent in (50, 99))
-    right = _share(cell.judged, "right")
+    right = _right_fraction(cell.judged, "right")
     return times if right == 1.0 else f"{times} ({_percent(right)})"
 
 
@@ -150,7 +150,7 @@ def _median(cell: Cell) -> float:
     return float(np.median(cell.us))
 
 
-def _share(judged: list[Judgement], field: str) -> float:
+def _right_fraction(judged: list[Judgement], field: str) -> float:
     return float(np.mean([getattr(judgement, field) for judgement in judged])) if judged else 1.0
 
 
@@ -159,5 +159,5 @@ def _worst(judged: list[Judgement], field: str) -> float:
     return float(np.nanmax(values)) if np.isfinite(values).any() else float("nan")
 
 
-def _percent(share: float) -> str:
-    return "100 %" if share == 1.0 else f"{min(100.0 * share, 99.99):.2f} %"
+def _percent(fraction: float) -> str:
+    return "100 %" if fraction == 1.0 else f"{min(100.0 * fraction, 99.99):.2f} %"

@@ -113,11 +113,11 @@ def _pass(solve: Solve, qps: list[QP]) -> tuple[list[Array | None], list[int]]:
 def _quiet() -> Iterator[None]:
     """Keep what C code prints off the terminal: osqp says on stdout when there was nothing to polish."""
     sys.stdout.flush()
-    kept = os.dup(1)
+    selected = os.dup(1)
     with open(os.devnull, "w") as nowhere:
         os.dup2(nowhere.fileno(), 1)
     try:
         yield
     finally:
-        os.dup2(kept, 1)
-        os.close(kept)
+        os.dup2(selected, 1)
+        os.close(selected)

@@ -45,10 +45,10 @@ def tick(
     default = QUICK if quick else known
     chosen = []
     for pattern in workloads.split(",") if workloads else default:
-        found = [each for each in known if fnmatchcase(each, pattern)] or [pattern] * is_recorded(pattern)
-        if not found:
+        result = [each for each in known if fnmatchcase(each, pattern)] or [pattern] * is_recorded(pattern)
+        if not result:
             raise ConfigError(f"no workload {pattern!r}; there are {', '.join(known)}")
-        chosen += found
+        chosen += result
     if libs is None:
         libraries = list(LIBRARIES.values()) if not against else [LIBRARIES["qpavoid"]]
     else:

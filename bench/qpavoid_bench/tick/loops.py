@@ -27,7 +27,7 @@ from qpavoid import (
 )
 from qpavoid.config import PointCloud, Task
 from qpavoid_bench.tick.build import close_pairs
-from qpavoid_bench.tick.robots import ROBOTS, SHARE
+from qpavoid_bench.tick.robots import ROBOTS, ROBOTS_FOLDER
 from qpavoid_bench.tick.workloads import Array
 
 PANDA, TCP = ROBOTS["panda"], "panda_hand_tcp"
@@ -194,9 +194,9 @@ def _bodies(kind: str) -> Loop:
         "lock": {"panda_finger_joint1": 0.0, "panda_finger_joint2": 0.0},
         "home": PANDA.home,
     }
-    robot = Robot.from_urdf(SHARE / PANDA.urdf, **fields)
+    robot = Robot.from_urdf(ROBOTS_FOLDER / PANDA.urdf, **fields)
     touching = close_pairs(robot, robot.home[None])
-    return _swing(Robot.from_urdf(SHARE / PANDA.urdf, disabled_pairs=touching, **fields), [])
+    return _swing(Robot.from_urdf(ROBOTS_FOLDER / PANDA.urdf, disabled_pairs=touching, **fields), [])
 
 
 def _cloud(count: int) -> Loop:

@@ -15,7 +15,9 @@ from qpavoid import Robot
 from qpavoid.config import Body
 
 FITTED = Path(__file__).parent / "capsules"
-SHARE = Path(str(distribution("example-robot-data").locate_file("cmeel.prefix/share/example-robot-data/robots")))
+ROBOTS_FOLDER = Path(
+    str(distribution("example-robot-data").locate_file("cmeel.prefix/share/example-robot-data/robots"))
+)
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,7 @@ def load(spec: RobotSpec, disabled_pairs: Iterable[tuple[str, str]] = ()) -> Rob
     """The robot with its fitted capsules, one body a link."""
     bodies = [Body(**body) for body in json.loads((FITTED / f"{spec.name}.json").read_text())]
     return Robot.from_urdf(
-        SHARE / spec.urdf,
+        ROBOTS_FOLDER / spec.urdf,
         name=spec.name,
         root_joint=spec.root_joint,
         bodies=bodies,

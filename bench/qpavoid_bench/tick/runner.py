@@ -147,7 +147,7 @@ def run(workloads: Sequence[str], libraries: Sequence[Library], rounds: int, tic
         budget: seconds that a round of one library may take: slow ones make fewer steps, spread over the same ticks.
     """
     results = Results(libraries, rounds, ticks, budget)
-    before = os.getloadavg()[0]
+    previous = os.getloadavg()[0]
     processes: dict[str, Process] = {}
     try:
         for library in libraries:
@@ -166,7 +166,7 @@ def run(workloads: Sequence[str], libraries: Sequence[Library], rounds: int, tic
     finally:
         for process in processes.values():
             process.close()
-    results.load = (before, os.getloadavg()[0])
+    results.load = (previous, os.getloadavg()[0])
     return results
 
 

@@ -52,16 +52,16 @@ def arms(robot: Robot) -> list[Arm]:
     pin.framesForwardKinematics(model, data, robot.home)
     frames = {tool: robot.frame_id(tool, "end_effectors") for tool in robot.end_effectors}
     chains = {tool: list(model.supports[model.frames[frame].parentJoint]) for tool, frame in frames.items()}
-    arms_found = []
+    arm_count = []
     for tool, own in chains.items():
         shared = {joint for other, joints in chains.items() if other != tool for joint in joints}
         places = [place for place, joint in enumerate(own) if joint > 0 and joint not in shared]
         if places:
             length = chain(robot, frames[tool], places[0])[1]
-            arms_found.append(Arm(tool, np.array(data.oMf[frames[tool]].translation), length))
-    if not arms_found:
+            arm_count.append(Arm(tool, np.array(data.oMf[frames[tool]].translation), length))
+    if not arm_count:
         raise ConfigError(f"{robot.name} has no tool that moves; give `end_effectors` in its robot.yaml")
-    return sorted(arms_found, key=lambda one: -one.home[1])
+    return sorted(arm_count, key=lambda one: -one.home[1])
 
 
 def posture(robot: Robot, places: Mapping[str, ArrayLike], q_near: Array | None = None) -> Array:

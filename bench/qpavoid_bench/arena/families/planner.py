@@ -129,9 +129,12 @@ def plan(
         met = other.connect(tree.q[new], float(tree.t[new])) if new >= 0 else -1
         if met >= 0:
             one, two = (met, new) if round_index % 2 else (new, met)
-            to_meeting, onward = start_tree.trace(one)[::-1], goal_tree.trace(two)[1:]  # both have where the trees met
-            q_path = np.concatenate((start_tree.q[to_meeting], goal_tree.q[onward]))
-            t_path = np.concatenate((start_tree.t[to_meeting], goal_tree.t[onward]))
+            to_meeting, continuation = (
+                start_tree.trace(one)[::-1],
+                goal_tree.trace(two)[1:],
+            )  # both have where the trees met
+            q_path = np.concatenate((start_tree.q[to_meeting], goal_tree.q[continuation]))
+            t_path = np.concatenate((start_tree.t[to_meeting], goal_tree.t[continuation]))
             q_path, t_path = _shorten(clearance, q_path, t_path, random)
             if not clearance.depends_on_time:
                 times = (np.abs(np.diff(q_path, axis=0)) / speed).max(axis=1)

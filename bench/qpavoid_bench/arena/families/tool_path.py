@@ -54,9 +54,9 @@ def crossing(path: ToolPath, fraction: float, direction: Array, offset: Array, s
     return line_motion(point - speed * path.time(fraction) * direction, point + OVERSHOOT * direction, speed)
 
 
-def head_on(path: ToolPath, distance_ahead: float, offset: Array, speed: float) -> dict[str, Any]:
+def head_on(path: ToolPath, distance_forward: float, offset: Array, speed: float) -> dict[str, Any]:
     """Return a line motion along the path against the tool's direction, from beyond its goal."""
-    start = path.goal + distance_ahead * path.direction + offset
+    start = path.goal + distance_forward * path.direction + offset
     return line_motion(start, path.start - OVERSHOOT * path.direction + offset, speed)
 
 

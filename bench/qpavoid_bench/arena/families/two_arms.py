@@ -35,10 +35,10 @@ def passing(draw: Draw, robot: Robot) -> dict[str, Any]:
 
 
 def _two_arms(robot: Robot) -> tuple[Arm, Arm]:
-    arms_found = arms(robot)
-    if len(arms_found) != 2:
-        raise ConfigError(f"{robot.name} has {len(arms_found)} arms that move; two are needed")
-    return arms_found[0], arms_found[1]
+    arm_count = arms(robot)
+    if len(arm_count) != 2:
+        raise ConfigError(f"{robot.name} has {len(arm_count)} arms that move; two are needed")
+    return arm_count[0], arm_count[1]
 
 
 def _start_and_goals(draw: Draw, left: Arm, right: Arm) -> list[tuple[Array, Array]]:

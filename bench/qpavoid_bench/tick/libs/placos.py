@@ -85,5 +85,5 @@ class Placo:
     def distances(self, tick: int) -> Array:
         """By placo, matched by its pairs of bodies."""
         self._place(tick)
-        found = {(d.objA, d.objB): d.min_distance for d in self.robot.distances()}
-        return np.array([found[a, b] for a, b in self.workload.pairs.tolist()])
+        result = {(d.objA, d.objB): d.min_distance for d in self.robot.distances()}
+        return np.array([result[a, b] for a, b in self.workload.pairs.tolist()])
