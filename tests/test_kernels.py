@@ -5,6 +5,7 @@ import subprocess
 import sys
 
 import numpy as np
+import oracle_kernels as oracle
 import pinocchio as pin
 import pytest
 from conftest import BOX, CAPSULE, CYLINDER, SPHERE, lay_out_step, make_layout, random_q, random_scene
@@ -134,10 +135,9 @@ def test_distance_rows_are_rates_of_the_witness_points(robot, seed):
         near = pairs[x.results[pairs, 0] < distance]
         np.testing.assert_array_equal(x.near_pairs[:k], near)
         np.testing.assert_array_equal(x.closest[:k], x.results[near])
-        n, p = x.results[near, 1:4], x.results[near, 4:7]
-        wrenches = np.hstack((n, np.cross(p, n)))
-        np.testing.assert_allclose(x.J[:k], wrenches @ x.J_world * x.support[near], rtol=1e-12, atol=1e-12)
-        rates = np.sum(wrenches * x.twists[x.twist_row[near]], axis=1)
+        among, J, rates = oracle.distance_rows(x, pairs, distance)
+        np.testing.assert_array_equal(among, near)
+        np.testing.assert_allclose(x.J[:k], J, rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(x.feedforward[:k], rates, rtol=1e-12, atol=1e-12)
     run("distance_rows", x, step.pairs, np.inf, False)
     assert not x.feedforward.any()
@@ -289,6 +289,23 @@ def test_joint_speeds_bound_the_speed_of_every_point(robot, seed):
         assert fastest - 1e-12 <= speed <= 1.01 * np.sqrt(2.0) * fastest + 1e-12
 
 
+@pytest.mark.parametrize("near", [0, 1, 30])
+@pytest.mark.parametrize("jerks", [False, True])
+def test_clearance_lower_bound_by_its_definition(robot, near, jerks):
+    """From far below to far above nothing, at speeds at which the paths of points curve."""
+    bounds = []
+    for seed in range(10):
+        step = Step(robot, seed)
+        step.x = x = step.x._replace(jerk_limited=jerks)
+        near = min(near, step.rows())
+        x.d[:] = x.safety_distance + step.rng.uniform(0.05 * (seed % 2 - 0.5), 0.5, len(x.d))
+        v, horizon = step.rng.uniform(-1.0, 1.0, robot.model.nv), 10.0 ** step.rng.uniform(-3.0, 0.0)
+        bounds.append(run("clearance_lower_bound", x, v, near, 0.8, horizon))
+        expected = oracle.clearance_lower_bound(x, v, near, 0.8, horizon)
+        assert bounds[-1] == pytest.approx(expected, rel=1e-9, abs=1e-10)
+    assert min(bounds) < 0.0 < max(bounds) or near < 30
+
+
 def test_clearance_lower_bound_preserves_nan(paper):
     step = Step(paper, 0)
     x, v = step.x, np.zeros(14)
@@ -396,7 +413,12 @@ def test_velocity_bounds_are_nested_from_any_state(seed, jerks):
         x, q = make_layout(nv, **random_limits(rng, nv, jerks)), rng.uniform(-3, 3, nv + 1)
         at = q[x.q_index]
         margin = np.minimum(at - x.q_lower, x.q_upper - at).min(initial=np.inf)
-        assert run("velocity_bounds", x, q) == pytest.approx(margin)
+        *expected, least = oracle.velocity_bounds(x, q)
+        assert run("velocity_bounds", x, q) == pytest.approx(margin) == pytest.approx(least)
+        if not x.acceleration_limited:
+            expected[:2] = expected[2:]
+        bounds = x.hard_lower, x.hard_upper, x.lower, x.upper
+        np.testing.assert_allclose(bounds, expected, rtol=1e-9, atol=1e-9)
         assert (x.hard_lower <= x.lower).all() and (x.lower <= x.upper).all() and (x.upper <= x.hard_upper).all()
         assert (np.maximum(np.abs(x.lower), np.abs(x.upper)) <= x.v_max).all()
         free = np.ones(nv, dtype=bool)
