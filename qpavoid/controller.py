@@ -270,7 +270,6 @@ class Controller:
             raise UnknownName(f"attach: no frame {frame!r:.60}; give its name")
         index, frame_id = self._builder.tracker.index(obstacle), self.scene.robot.frame_id(frame, "attach")
         self._builder.attach(index, frame_id, q)
-        self._arbiter.invalidate()
 
     def release(self, obstacle: str, q: Array | None = None) -> Sample:
         """Release an attached obstacle: it rests where it is, until it is given to `step` again.
@@ -289,9 +288,7 @@ class Controller:
             ConfigError: it is not carried.
             NumericalError: q cannot be true.
         """
-        sample = self._builder.release(self._builder.tracker.index(obstacle), q)
-        self._arbiter.invalidate()
-        return sample
+        return self._builder.release(self._builder.tracker.index(obstacle), q)
 
     def allow_contact(self, obstacle: str, others: Sequence[str], allowed: bool = True) -> None:
         """Let an obstacle and some bodies or other obstacles touch, as before a grasp.
@@ -314,7 +311,6 @@ class Controller:
             if not isinstance(name, str) or name not in known:
                 raise UnknownName(f"allow_contact: no body or obstacle {name!r:.60}{nearest(str(name), known)}")
         self._builder.attachments.allow(index, set(names), allowed)
-        self._arbiter.invalidate()
 
     def obstacle_pose(self, obstacle: str, q: Array | None = None) -> Sample:
         """Return the world pose of an obstacle in the last step, attached or not; see `release`."""

@@ -74,6 +74,8 @@ class PairTable:
         self._masks = support_masks(scene.robot.model)
         self.support: Array = np.zeros((count, self._masks.shape[1]))
         """(m, e) support of the second body minus that of the first, see `support_masks`."""
+        self.separable: Mask = np.zeros(count, dtype=bool)
+        """(m,) pairs whose distance depends on a joint."""
         self._update()
 
     def attach(self, index: int, joint: int, placement: Array) -> None:
@@ -125,6 +127,7 @@ class PairTable:
         self.enabled[:] = ~(free[first] & free[second])
         attached_joints = np.where(free, 0, joints)
         self.support[:] = self._masks[attached_joints[second]] - self._masks[attached_joints[first]]
+        self.separable[:] = np.any(self.support != 0.0, axis=1)
         self.joint_radius[:] = 0.0
         for joint, pose, (*center, radius) in zip(
             self.joints.tolist(), self.placements, self.spheres.tolist(), strict=False

@@ -47,11 +47,6 @@ class Arbiter:
         has_backup = settings.avoidance.backup and len(settings.scene.obstacles) > 0
         self.backup = BackupPlanner(settings, rows.query.table, obstacles) if has_backup else None
 
-    def invalidate(self) -> None:
-        """Take in that attached objects, or the disabled pairs, have changed."""
-        if self.backup is not None:
-            self.backup.invalidate()
-
     def reset(self) -> None:
         """Drop all that is known of earlier control steps."""
         self.progress.reset()

@@ -58,15 +58,7 @@ class BackupPlanner:
         """Drop the backup trajectory, and restart the random sequence."""
         self._backup: BackupTrajectory | None = None
         self._wait, self._sampled, self._random = 0, 0, np.random.default_rng(0)
-        self._enabled = self._rollouts.enabled
         self._approach.reset()
-
-    def invalidate(self) -> None:
-        """Take in that attached objects or disabled pairs have changed, and require a new verification."""
-        self._enabled = self._rollouts.enabled
-        self._approach.reset()
-        if self._backup is not None:
-            self._backup = self._backup._replace(contact_time=-np.inf)
 
     def check(self, q: Array, v: Array, t: float, v_prev: Array, dv_prev: Array, proximity: Proximity) -> Array | None:
         """Return None if v may be commanded, else the velocity (nv,) to command instead.
@@ -85,7 +77,7 @@ class BackupPlanner:
         if self._approach.is_far(q, v, t):
             self._backup = None
             return None
-        enabled = self._enabled
+        enabled = self._rollouts.enabled
         next_state = Start(pin.integrate(self._model, q, self._dt * v), v, v - v_prev, t + self._dt, enabled)
         touching = proximity.pair[proximity.distance < TOUCH]
         if len(touching):

@@ -166,8 +166,8 @@ class BackupRollouts:
 
     @property
     def enabled(self) -> Mask:
-        """(m,) pairs whose distance depends on a joint."""
-        return np.asarray(np.any(self._layout.support != 0.0, axis=1))
+        """(m,) pairs whose distance depends on a joint, and that may not come into contact."""
+        return np.asarray(self.query.table.separable & ~self.query.table.ignored)
 
     def advance(self, trajectory: BackupTrajectory) -> BackupTrajectory:
         """Return a trajectory without its first control step."""
