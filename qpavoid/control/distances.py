@@ -102,8 +102,9 @@ class DistanceQuery:
         self._by_coal = np.flatnonzero(~table.has_closed_form)
         for pair in range(pairs):
             self._data.deactivateCollisionPair(pair)
-        self._active = np.zeros(pairs, dtype=bool)
+        self._active, self._last_near = np.zeros(pairs, dtype=bool), b""
         self._surfaces = table.is_mesh[scene.pairs].any(axis=1) & ~table.is_plane[scene.pairs].any(axis=1)
+        self._has_surfaces = bool(self._surfaces.any())
         self.is_compiled = not (len(self._by_coal) or self._clouds) and self._has_views
         """Whether kernels compute everything, but for pairs whose cores meet."""
 
@@ -176,21 +177,23 @@ class DistanceQuery:
 
     def _compute_by_coal(self) -> None:
         """Compute the near pairs that have no closed form in one call of coal."""
-        x, active = self.arrays, np.zeros(len(self._active), dtype=bool)
-        active[self._near] = True
-        active &= ~x.has_closed_form
-        changed = np.flatnonzero(active != self._active)
-        for pair, on in zip(changed.tolist(), active[changed].tolist(), strict=True):
-            (self._data.activateCollisionPair if on else self._data.deactivateCollisionPair)(pair)
-        self._active = active
+        x, near = self.arrays, self._near.tobytes()
+        if near != self._last_near:
+            active = np.zeros(len(self._active), dtype=bool)
+            active[self._near] = True
+            active &= ~x.has_closed_form
+            changed = np.flatnonzero(active != self._active)
+            for pair, on in zip(changed.tolist(), active[changed].tolist(), strict=True):
+                (self._data.activateCollisionPair if on else self._data.deactivateCollisionPair)(pair)
+            self._active, self._last_near = active, near
         if not self._has_views:
             for i, pose in enumerate(x.poses):
                 self._data.oMg[i] = pin.SE3(pose[:9].reshape(3, 3).T, pose[9:])
         pin.computeDistances(self._scene.geometry, self._data)
         if not self._has_views:
-            x.results[active] = read_results(self._data.distanceResults)[active]
-        meshes = np.flatnonzero(active & self._surfaces)
-        if len(meshes):
+            x.results[self._active] = read_results(self._data.distanceResults)[self._active]
+        if self._has_surfaces:
+            meshes = np.flatnonzero(self._active & self._surfaces)
             x.results[meshes] = _with_normals(x.results[meshes])
 
     def _compute_one(self, pair: int) -> None:
