@@ -63,6 +63,8 @@ class RowAssembler:
         self._is_compiled = self._forward.is_compiled and self.query.is_compiled and not row_tasks and contacts is None
         self._q = scene.robot.home.copy()
         self._step = self._compile()
+        self._finds_pairs = self._forward.is_compiled and not self.query.has_clouds
+        self._find = kernels.direct(kernels.find_near_pairs, self._packed, self._q)
         self.kinematics = Kinematics(x.J_world, x.poses)
         """World Jacobian and poses of the tracked frames in this step."""
 
@@ -99,8 +101,12 @@ class RowAssembler:
             if meeting:
                 k, violation, clear, margin = self._assemble(q)
         else:
-            self._forward.compute(q)
-            query.compute(self._forward.joint_poses, self.influence_distance)
+            if self._finds_pairs:
+                self._q[:] = q
+                query.finish(*self._find(self._packed, self._q))
+            else:
+                self._forward.compute(q)
+                query.compute(self._forward.joint_poses, self.influence_distance)
             if self.task_errors.size:
                 self._task_rows.write(q, self._forward, targets[len(self.targets) :])
             if self._contacts is not None:

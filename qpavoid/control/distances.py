@@ -107,6 +107,8 @@ class DistanceQuery:
         self._has_surfaces = bool(self._surfaces.any())
         self.is_compiled = not (len(self._by_coal) or self._clouds) and self._has_views
         """Whether kernels compute everything, but for pairs whose cores meet."""
+        self.has_clouds = bool(self._clouds)
+        """Whether there are proxies to place between the bodies and the distances of a step."""
 
     def place(self, obstacles: ObstacleStates) -> None:
         """Move obstacles to other states.

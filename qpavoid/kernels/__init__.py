@@ -27,7 +27,7 @@ from qpavoid.kernels.obstacles import Pieces, check_states, sample_pieces, updat
 from qpavoid.kernels.qp import max_clearance_velocity, minimize, project, project_soft
 from qpavoid.kernels.rotation import rotation_vector
 from qpavoid.kernels.rows import alpha, beta, distance_rows, row_bounds
-from qpavoid.kernels.step import assemble, control_step, tracking_violation, violation
+from qpavoid.kernels.step import assemble, control_step, find_near_pairs, tracking_violation, violation
 from qpavoid.kernels.structures import direct, pack
 from qpavoid.kernels.tasks import damped_solution, frame_rows, projection_cost
 from qpavoid.kernels.voxels import select_voxels, voxels_within
@@ -54,6 +54,7 @@ __all__ = [
     "distance_rows",
     "extrapolate_estimates",
     "extrapolate_states",
+    "find_near_pairs",
     "first_use",
     "frame_rows",
     "is_tracking_clear",

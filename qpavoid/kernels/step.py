@@ -18,6 +18,22 @@ from qpavoid.problem import Array, IntArray
 
 
 @compiled
+def find_near_pairs(x: Any, q: Array) -> tuple[int, int, int]:
+    """Compute kinematics and the distances of the near pairs that have a closed form.
+
+    Args:
+        x: memory of the step; see `RowLayout`.
+        q: configuration (nq,).
+
+    Returns:
+        What `near_pairs` returns.
+    """
+    update_kinematics(x.kinematics, q)
+    place_bodies(x.distances, x.joint_poses)
+    return near_pairs(x.distances)
+
+
+@compiled
 def control_step(
     x: Any, q: Array, influence_distance: float, moving: bool
 ) -> tuple[int, int, int, int, float, bool, float]:
@@ -32,9 +48,7 @@ def control_step(
     Returns:
         What `near_pairs` returns, then what `assemble` does.
     """
-    update_kinematics(x.kinematics, q)
-    place_bodies(x.distances, x.joint_poses)
-    near, rows, meeting = near_pairs(x.distances)
+    near, rows, meeting = find_near_pairs(x, q)
     k, worst, clear, margin = assemble(x, q, x.distances.rows[:rows], influence_distance, moving)
     return near, rows, meeting, k, worst, clear, margin
 
