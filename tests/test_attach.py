@@ -21,8 +21,9 @@ from qpavoid import (
     build_scene,
     build_tasks,
 )
-from qpavoid.config import Box, Capsule, Cylinder, HalfSpace, PointCloud, Sphere, Task
+from qpavoid.config import Box, Capsule, Cylinder, HalfSpace, Line, PointCloud, Sphere, Task
 from qpavoid.geometry.bodies import make_shape
+from qpavoid.model.trajectory import build_motion
 
 TCP = "panda_hand_tcp"
 TCP_BODY = "panda_hand_0"
@@ -368,3 +369,21 @@ def test_graspable_changes_nothing_before_it_is_attached(panda):
         controller = Controller(build_scene(panda, [box, *others]), [], "qp")
         commands.append(controller.filter(panda.home, np.full(7, 0.1)).v)
     np.testing.assert_array_equal(*commands)
+
+
+def test_an_object_released_from_a_trajectory_stays_where_it_is(tmp_path):
+    """Also among others that go on along theirs."""
+    lines = [Line(start=(x, 0.0, 0.0), displacement=(0.0, 5.0, 0.0), speed=0.5) for x in (0.3, 9.0)]
+    ball, far = (
+        Obstacle(name, Sphere(radius=0.05), build_motion(line), moves=True, graspable=name == "ball")
+        for name, line in zip(("ball", "far"), lines, strict=True)
+    )
+    controller, q = make_controller(cartesian(tmp_path), [ball, far], "z"), np.zeros(3)
+    controller.step(q, 0.0)
+    controller.attach("ball", "z", q)
+    controller.step(q, 0.01)
+    placed = controller.release("ball", q).position
+    for k in range(2, 5):
+        controller.step(q, 0.01 * k)
+        np.testing.assert_array_equal(controller.obstacle_pose("ball").position, placed)
+    np.testing.assert_allclose(controller.obstacle_pose("far").position, [9.0, 0.02, 0.0], atol=1e-12)

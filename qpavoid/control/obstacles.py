@@ -175,8 +175,10 @@ class ObstacleTracker:
         return self._current._replace(states=states)
 
     def after(self, duration: float) -> ObstacleStates:
-        """Return the states some time after the last step [s]; see `at`."""
-        return self.at(self._now + duration)
+        """Return the states some time after the last step [s], at the twists that obstacles have in it."""
+        states = self._current.states.copy()
+        extrapolate(states, duration)
+        return self._current._replace(states=states)
 
     def _sample_trajectories(self, t: float, states: Array) -> None:
         """Bring the states (o, 18) of those that follow a trajectory to time t [s]."""
@@ -186,7 +188,10 @@ class ObstacleTracker:
 
     def attach(self, index: int) -> None:
         """Take an obstacle as attached to the robot: updates of it are ignored."""
-        self._moving = [i for i in self._moving if i != index]
+        if index in self._moving:  # it leaves its trajectory for good
+            self._moving = [i for i in self._moving if i != index]
+            self._trajectories = TrajectoryBatch({i: self._obstacles[i].motion for i in self._moving})
+            self._sampled.clear()
         self._measured.forget(index)
         self._awaited.discard(index)
         self._placed.add(index)
