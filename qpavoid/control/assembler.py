@@ -92,7 +92,7 @@ class RowAssembler:
             targets: what each task should reach now, in the order of `in_order`.
         """
         x, query, contacts = self._layout, self.query, None
-        if self._is_compiled:
+        if self._is_compiled:  # one call in place of two: a microsecond less
             self._q[:] = q  # the code takes q as it is: in one piece, and writeable
             near, rows, meeting, k, violation, clear, margin = self._step(
                 self._packed, self._q, self.influence_distance, query.is_moving

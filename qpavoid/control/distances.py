@@ -53,11 +53,8 @@ class DistanceQuery:
         )
         """(o,) distance from each obstacle's origin to its farthest point; infinite of a half-space [m]."""
         self._planes = np.flatnonzero(np.isinf(self.obstacle_radii)).tolist()
-        bodies, pairs, rows = (
-            len(table.spheres),
-            len(scene.pairs),
-            obstacles + 1 + scene.movable - len(scene.body_names),
-        )
+        bodies, pairs = len(table.spheres), len(scene.pairs)
+        rows = obstacles + 1 + scene.movable - len(scene.body_names)
         self.arrays = kernels.DistanceArrays(
             joints=table.joints,
             placements=table.placements,

@@ -91,13 +91,14 @@ class ObstacleTracker:
         self._moving = [i for i, obstacle in enumerate(obstacles) if obstacle.moves]
         self._trajectories = TrajectoryBatch({i: obstacles[i].motion for i in self._moving})
         self._now, count = 0.0, len(obstacles)
-        self._current = ObstacleStates(np.array(self._moving, np.intp), np.zeros((count, STATE)), np.zeros(count), {})
-        for state, obstacle in zip(self._current.states, obstacles, strict=True):
+        self.current = ObstacleStates(np.array(self._moving, np.intp), np.zeros((count, STATE)), np.zeros(count), {})
+        """States in the last step; the next one overwrites them."""
+        for state, obstacle in zip(self.current.states, obstacles, strict=True):
             state[:] = obstacle.motion.sample(0.0).row
         self._placed: set[int] = set()  # numbers of those that are, or were, attached to the robot
-        self.moving: IntArray = self._current.which
+        self.moving: IntArray = self.current.which
         """(k,) numbers of those on a trajectory or external; no attached object is among them."""
-        self.on_trajectories: IntArray = self._current.which
+        self.on_trajectories: IntArray = self.current.which
         """(k,) numbers of those on a trajectory that are not external."""
         self._measured = MeasuredStates(count, dt)
         self._reader = UpdateReader(obstacles, self._measured, dt)
@@ -113,7 +114,7 @@ class ObstacleTracker:
     def warm_up(self) -> None:
         """Run the kernels once on nothing, so that no step waits for the compiler."""
         none, no_stamps = NO_UPDATE.which, NO_UPDATE.stamps
-        states, now = self._measured.updates, self._current
+        states, now = self._measured.updates, self.current
         kernels.check_states(states, none, none, FARTHEST, FASTEST)
         kernels.write_rows(states, none, states[:0], none, FARTHEST, FASTEST, none, no_stamps)
         self._measured.update(none, none, no_stamps, now.states)
@@ -125,7 +126,7 @@ class ObstacleTracker:
         """States of external obstacles in the last step, with mean twists; None where there are none."""
         if self._estimates is None and self._measured.known:
             which = list(self._measured.known)
-            states = self._current.states[which]
+            states = self.current.states[which]
             states[:, 12:] = self._measured.twists[which]
             self._estimates = ObstacleEstimates(tuple(which), states, self._now)
         return self._estimates
@@ -150,14 +151,9 @@ class ObstacleTracker:
 
     def _sample(self, t: float) -> tuple[Array, Array]:
         """Sample positions (o, 3) and rates (o, 2) of those that follow a trajectory."""
-        states = np.zeros_like(self._current.states)
+        states = np.zeros_like(self.current.states)
         self._sample_trajectories(t, states)
-        return states[:, 9:12], _rates(states)
-
-    @property
-    def current(self) -> ObstacleStates:
-        """States in the last step; the next one overwrites them."""
-        return self._current
+        return states[:, 9:12], np.linalg.norm(states[:, 12:].reshape(-1, 2, 3), axis=-1)
 
     def at(self, t: float) -> ObstacleStates:
         """Return the states at t [s]: on trajectories, or at constant mean twists; of the last step, as observed.
@@ -165,20 +161,20 @@ class ObstacleTracker:
         Those of the last step are overwritten by the next one.
         """
         if t == self._now or not len(self.moving):
-            return self._current
-        states, estimates = self._current.states.copy(), self.estimates
+            return self.current
+        states, estimates = self.current.states.copy(), self.estimates
         self._sample_trajectories(t, states)
         if estimates is not None:
             later = estimates.states.copy()
             extrapolate(later, t - estimates.t)
             states[list(estimates.which)] = later
-        return self._current._replace(states=states)
+        return self.current._replace(states=states)
 
     def after(self, duration: float) -> ObstacleStates:
         """Return the states some time after the last step [s], at the twists that obstacles have in it."""
-        states = self._current.states.copy()
+        states = self.current.states.copy()
         extrapolate(states, duration)
-        return self._current._replace(states=states)
+        return self.current._replace(states=states)
 
     def _sample_trajectories(self, t: float, states: Array) -> None:
         """Bring the states (o, 18) of those that follow a trajectory to time t [s]."""
@@ -196,18 +192,18 @@ class ObstacleTracker:
         self._awaited.discard(index)
         self._placed.add(index)
         self._reader.attach(index, True)
-        self._current.states[index, 12:], self._current.margin[index] = 0.0, 0.0
+        self.current.states[index, 12:], self.current.margin[index] = 0.0, 0.0
         self._renew()
 
     def release(self, index: int, sample: Sample) -> None:
         """Take an attached obstacle as at rest at a sample, until it is given again."""
         self._reader.attach(index, False)
-        self._current.states[index] = sample.row
+        self.current.states[index] = sample.row
         self._renew()
 
     def pose(self, index: int) -> Sample:
         """Return the world pose of an obstacle in the last step; of an attached one, where it was attached."""
-        sample = Sample.of_row(self._current.states[index])
+        sample = Sample.of_row(self.current.states[index])
         return Sample.at(sample.position, sample.rotation)
 
     def reset(self) -> None:
@@ -225,7 +221,7 @@ class ObstacleTracker:
         self.on_trajectories = np.array([i for i in self._moving if i not in self._measured.known], dtype=np.intp)
         moving = {*self._moving, *self._measured.known}
         self.moving = np.array(sorted(moving), dtype=np.intp)
-        self._current = self._current._replace(which=np.array(sorted(moving | self._placed), dtype=np.intp))
+        self.current = self.current._replace(which=np.array(sorted(moving | self._placed), dtype=np.intp))
 
     def read(
         self, t: float, updates: Mapping[str, Sample | Pose | Points] | None, shift: float = 0.0
@@ -279,7 +275,7 @@ class ObstacleTracker:
         if update is None:
             return _NOTHING
         t, shift, given, sampled = update
-        self._now, self._estimates, current = t, None, self._current
+        self._now, self._estimates, current = t, None, self.current
         if shift:
             self._measured.stamps += shift
             self._sampled.clear()
@@ -291,7 +287,7 @@ class ObstacleTracker:
         notes, stop = given.notes, tuple[Reason, ...]()
         if len(given.which):
             notes += self._take_over(given)
-            self._current.voxels.update(given.voxels)
+            self.current.voxels.update(given.voxels)
         if len(self.external):
             current.margin.fill(0.0)
             stale = self._measured.extrapolate(self.external, t, self._stale_after, current.states, current.margin)
@@ -303,7 +299,7 @@ class ObstacleTracker:
     def _take_over(self, update: Update) -> tuple[Reason, ...]:
         """Take over the usable updates; return what there is to say of them."""
         which, measured = update.which, self._measured
-        rejected = measured.update(which, update.kind, update.stamps, self._current.states)
+        rejected = measured.update(which, update.kind, update.stamps, self.current.states)
         if which is not self._known:
             fresh = which[measured.stamps[which] == update.stamps].tolist()
             self._awaited.difference_update(fresh)
@@ -336,7 +332,7 @@ class ObstacleTracker:
         age = t - self._measured.stamps[self.external]
         stale = (age > self._stale_after) & ~self._measured.at_rest[self.external]
         for index, old in zip(self.external[stale].tolist(), age[stale].tolist(), strict=True):
-            name, margin = self._obstacles[index].name, self._current.margin[index]
+            name, margin = self._obstacles[index].name, self.current.margin[index]
             kind = ReasonKind.NEVER_UPDATED if index in self._awaited else ReasonKind.STALE
             if kind is ReasonKind.STALE:
                 detail = f"margin {1e3 * margin:.0f} mm"
@@ -344,8 +340,3 @@ class ObstacleTracker:
             if old > self._stop_after:
                 stop.append(Reason.of(kind, name, amount=old, unit="s", severity=Severity.ALARM))
         return tuple(assumptions), tuple(stop)
-
-
-def _rates(states: Array) -> Array:
-    """Return speeds and rates of turning (..., 2) of states (..., 18) [m/s, rad/s]."""
-    return np.asarray(np.linalg.norm(states[..., 12:].reshape(*states.shape[:-1], 2, 3), axis=-1))

@@ -1,6 +1,14 @@
 """Array work of a control step: loops that numba compiles at their first use, and stores on disk (`kernels.cache`)."""
 
-from qpavoid.kernels.backup import ROUND_OFF, backup_rows, closes_below, line_clearance, min_sphere_distance, rate_limit
+from qpavoid.kernels.backup import (
+    ROUND_OFF,
+    backup_rows,
+    braking_travel,
+    closes_below,
+    line_clearance,
+    min_sphere_distance,
+    rate_limit,
+)
 from qpavoid.kernels.bounds import velocity_bounds
 from qpavoid.kernels.braking_bounds import speed_to_stop
 from qpavoid.kernels.braking_trajectory import jerk_limited_stop, roll_out_stop, stop_velocity
@@ -44,6 +52,7 @@ __all__ = [
     "assemble",
     "backup_rows",
     "beta",
+    "braking_travel",
     "candidates",
     "check_states",
     "clearance_lower_bound",

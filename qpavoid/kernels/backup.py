@@ -106,18 +106,29 @@ def rate_limit(v: Array, targets: Array, v_step: Array, stop_when_met: bool) -> 
 
 
 @compiled
+def braking_travel(v: Array, dt: float, braking: Array) -> float:
+    """Compute the sum of the ways of all coordinates in a control period and in braking after it [rad, m].
+
+    Args:
+        v: velocity (n,) [rad/s or m/s].
+        dt: control period [s].
+        braking: way on which each coordinate brakes, over the square of its speed (n,) [s²/rad or s²/m].
+    """
+    travel = 0.0
+    for i in range(len(v)):
+        travel += dt * abs(v[i]) + braking[i] * v[i] * v[i]
+    return travel
+
+
+@compiled
 def line_clearance(
-    x: Any, q: Array, v: Array, dt: float, braking: Array, spheres: Array, numbers: IntArray, states: Array,
-    twists: Array, radii: Array, horizon: float,
-) -> tuple[float, float, float]:  # fmt: skip
+    x: Any, q: Array, spheres: Array, numbers: IntArray, states: Array, twists: Array, radii: Array, horizon: float
+) -> tuple[float, float]:
     """Compute the least distance between bounding spheres of the robot at rest and of obstacles on straight lines.
 
     Args:
         x: memory of a control step, in which joints and the bodies that they move are placed.
         q: configuration (nq,).
-        v: velocity of the robot (n,) [rad/s or m/s].
-        dt: control period [s].
-        braking: way on which each coordinate brakes, over the square of its speed (n,) [s²/rad or s²/m].
         spheres: bounding sphere of each body in its frame, centre and radius (g, 4) [m].
         numbers: of the obstacles (k,); those that do not move do not count.
         states: of all obstacles (o, 18).
@@ -126,15 +137,12 @@ def line_clearance(
         horizon: time for which they go on [s].
 
     Returns:
-        The distance, infinite without any [m]; sum of the ways of all coordinates in the control period and in braking
-        after it [rad, m]; largest speed of any point of an obstacle [m/s].
+        The distance, infinite without any [m]; largest speed of any point of an obstacle [m/s].
     """
     update_kinematics(x.kinematics, q)
     place_bodies(x.distances, x.joint_poses)
     joints, poses = x.distances.joints, x.distances.poses
-    travel, least, fastest, center = 0.0, np.inf, 0.0, np.empty(3)
-    for i in range(len(v)):
-        travel += dt * abs(v[i]) + braking[i] * v[i] * v[i]
+    least, fastest, center = np.inf, 0.0, np.empty(3)
     for i in numbers:
         p, u, w, r = states[i, 9:12], twists[i, :3], twists[i, 3:], radii[i]
         square, turning = u[0] ** 2 + u[1] ** 2 + u[2] ** 2, np.sqrt(w[0] ** 2 + w[1] ** 2 + w[2] ** 2)
@@ -153,7 +161,7 @@ def line_clearance(
             for c in range(3):
                 distance += (p[c] + t * u[c] - center[c]) ** 2
             least = np.minimum(least, np.sqrt(distance) - r - sphere[3])
-    return least, travel, fastest
+    return least, fastest
 
 
 @compiled

@@ -40,11 +40,8 @@ class ApproachCheck:
         self._model, self._period = settings.scene.robot.model, settings.dt
         self._braking = 0.5 / settings.bounds.acceleration
         self._rollouts, self._obstacles = rollouts, obstacles
-        zero = np.zeros(settings.scene.robot.model.nv)
-        kernels.line_clearance(
-            rollouts.packed, settings.scene.robot.home, zero, self._period, self._braking, rollouts.query.table.spheres,
-            obstacles.external, obstacles.current.states, obstacles.mean_twists, rollouts.query.obstacle_radii, HORIZON,
-        )  # fmt: skip
+        self._external_are_far(settings.scene.robot.home, 0.0)  # so that no step waits for the compiler
+        kernels.braking_travel(self._braking, self._period, self._braking)
         kernels.min_sphere_distance(np.zeros((1, 1, 3)), np.zeros((1, 3)), np.zeros((1, 1)))
         self.reset()
 
@@ -67,43 +64,43 @@ class ApproachCheck:
             v: velocity (nv,) of this control step.
             t: time [s].
         """
-        return self._external_are_far(q, v) and self._trajectories_are_far(q, v, t)
+        travel = kernels.braking_travel(v, self._period, self._braking)
+        motion = self._rollouts.lever_arm * travel if travel else 0.0  # a lever arm may be infinite
+        self._max_external_speed = 0.0
+        if len(self._obstacles.external) and not self._external_are_far(q, motion):
+            return False
+        return not len(self._obstacles.on_trajectories) or self._trajectories_are_far(q, motion, t)
 
-    def _external_are_far(self, q: Array, v: Array) -> bool:
-        """Return whether external obstacles stay away that go on at their mean twists."""
-        rollouts, obstacles, self._max_external_speed = self._rollouts, self._obstacles, 0.0
-        if not len(obstacles.external):
-            return True
-        clearance, travel, self._max_external_speed = kernels.line_clearance(
-            rollouts.packed, q, v, self._period, self._braking, rollouts.query.table.spheres, obstacles.external,
-            obstacles.current.states, obstacles.mean_twists, rollouts.query.obstacle_radii, HORIZON,
+    def _external_are_far(self, q: Array, motion: float) -> bool:
+        """Return whether external obstacles that go on at their mean twists stay away from points that move so far."""
+        query, obstacles = self._rollouts.query, self._obstacles
+        clearance, self._max_external_speed = kernels.line_clearance(
+            self._rollouts.packed, q, query.table.spheres, obstacles.external, obstacles.current.states,
+            obstacles.mean_twists, query.obstacle_radii, HORIZON,
         )  # fmt: skip
-        return bool(rollouts.lever_arm * travel < clearance - PREFERRED_DISTANCE)
+        return bool(motion < clearance - PREFERRED_DISTANCE)
 
-    def _trajectories_are_far(self, q: Array, v: Array, t: float) -> bool:
-        """Return whether obstacles on trajectories stay away.
+    def _trajectories_are_far(self, q: Array, motion: float, t: float) -> bool:
+        """Return whether obstacles on trajectories stay away from points that move so far [m].
 
         Between their sampled positions, obstacles are taken to be no faster than at these. A clearance counts until the
         next sample, less the motion of the robot since.
         """
-        if not len(self._obstacles.on_trajectories):
-            return True
         paths = self._sample(int(np.floor(t / _PERIOD)))
         if not len(paths.moving):
             return True
         lever_arm, query = self._rollouts.lever_arm, self._rollouts.query
-        travel = float((self._period * np.abs(v) + self._braking * np.square(v)).sum())
         if self._clearance is not None:
             then, clearance = self._clearance
             moved = float(np.abs(pin.difference(self._model, then, q)).sum())
-            if lever_arm * (moved + travel) < clearance:
+            if lever_arm * moved + motion < clearance:
                 return True
         self._rollouts.kinematics.compute(q)
         centers, radii = query.body_spheres(self._rollouts.kinematics.joint_poses)
         obstacle_radii = query.obstacle_radii[paths.moving] + paths.max_deviation + PREFERRED_DISTANCE
         clearance = kernels.min_sphere_distance(paths.positions, centers, obstacle_radii[:, None] + radii)
         self._clearance = q.copy(), clearance
-        return lever_arm * travel < clearance
+        return bool(motion < clearance)
 
     def _sample(self, first: int) -> _Paths:
         """Sample the positions of moving obstacles from a multiple of `_PERIOD` until the horizon."""
