@@ -26,6 +26,8 @@ class ObstacleConfig(Block):
     shape: ObstacleShape
     motion: Motion
     """Where its origin is; what a task could take from its frame must be given here."""
+    uncertainty: NonNegative = 0.0
+    """How far it may be from where it is said to be [m]: that much is taken off its distances."""
     graspable: bool = False
     """Whether it may be attached to a frame of the robot for a while; costs pairs with the other obstacles."""
     attached_to: str | None = None

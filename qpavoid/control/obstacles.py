@@ -93,6 +93,8 @@ class ObstacleTracker:
         self._now, count = 0.0, len(obstacles)
         self.current = ObstacleStates(np.array(self._moving, np.intp), np.zeros((count, STATE)), np.zeros(count), {})
         """States in the last step; the next one overwrites them."""
+        self._uncertainty = np.array([obstacle.uncertainty for obstacle in obstacles])
+        self.current.margin[:] = self._uncertainty
         for state, obstacle in zip(self.current.states, obstacles, strict=True):
             state[:] = obstacle.motion.sample(0.0).row
         self._placed: set[int] = set()  # numbers of those that are, or were, attached to the robot
@@ -192,7 +194,7 @@ class ObstacleTracker:
         self._awaited.discard(index)
         self._placed.add(index)
         self._reader.attach(index, True)
-        self.current.states[index, 12:], self.current.margin[index] = 0.0, 0.0
+        self.current.states[index, 12:], self.current.margin[index] = 0.0, self._uncertainty[index]
         self._renew()
 
     def release(self, index: int, sample: Sample) -> None:
@@ -289,7 +291,7 @@ class ObstacleTracker:
             notes += self._take_over(given)
             self.current.voxels.update(given.voxels)
         if len(self.external):
-            current.margin.fill(0.0)
+            current.margin[:] = self._uncertainty
             stale = self._measured.extrapolate(self.external, t, self._stale_after, current.states, current.margin)
             if stale or self._awaited:
                 assumptions, stop = self._overdue(t)

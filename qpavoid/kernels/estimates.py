@@ -129,7 +129,7 @@ def extrapolate_estimates(
         states: out: rows `which` (o, 18).
         stale_after: age from which one is stale [s].
         at_rest: those that are never stale (o,).
-        margin: out: of the stale ones (o,) [m].
+        margin: what stale ones get is added (o,) [m].
 
     Returns:
         How many are stale.
@@ -143,7 +143,7 @@ def extrapolate_estimates(
             continue
         if age > stale_after and not at_rest[i]:
             stale += 1
-            margin[i] = MARGIN_GROWTH * (age - stale_after)
+            margin[i] += MARGIN_GROWTH * (age - stale_after)
         _extrapolate(x, min(age, longest))
     return stale
 
