@@ -10,11 +10,15 @@ from qpavoid.config.base import Block, NonNegative, Positive
 
 
 class Beta(Block):
-    """Velocity damper weighted with eq. 12: ḋ >= -(1 - β(d)) ξ (d - d1); below d1 it backs away."""
+    """Velocity damper weighted with eq. 12 far from d1: ḋ >= -max((1 - β(d)) ξ h, min(ξ h, near_speed)), h = d - d1; below
+    d1 it backs away.
+    """
 
     type: Literal["beta"] = "beta"
     gain: Positive = 5.0
     """ξ [1/s]."""
+    near_speed: NonNegative = 0.02
+    """Speed at which a pair may close near d1, where 1 - β lets it creep [m/s]; 0: it creeps."""
 
 
 class TaskSwitching(Block):

@@ -155,6 +155,8 @@ class RowLayout(NamedTuple):
     """Cap on the speed of separation that a row asks for [m/s]."""
     beta: bool
     """Whether rows are weighted with 1 - β."""
+    near_speed: float
+    """Closing speed up to which they are not [m/s]."""
     task_switching: bool
     """Whether rows have the rate of eq. 10, which depends on `v_tracking`."""
     retreat_speed: float

@@ -82,8 +82,9 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
     """Write the right-hand sides of the first k avoidance rows; see `qpavoid.control.avoidance`.
 
     The row is ḋ = J v + ḋ_obs >= ξ (d_s - d), with the safety distance d_s; below d_s, at most `recovery_speed`. With
-    `beta` the right-hand side is weighted with 1 - β(d) above d_s; with `task_switching` it is that of eq. 10. The row
-    without a margin, of d_s = 0, is ξ (offset - d) - ḋ_obs, or rhs where that is less.
+    `beta` the right-hand side is weighted with 1 - β(d) above d_s, as far as it then still allows `near_speed`; with
+    `task_switching` it is that of eq. 10. The row without a margin, of d_s = 0, is ξ (offset - d) - ḋ_obs, or rhs where
+    that is less.
 
     With acceleration limits, a pair closes no faster than the speed from which a share of its joints' accelerations,
     all at work on it, brings it to rest within the distance h = d - d_s: ½ a dt - √((½ a dt)² + 2 a h).
@@ -105,7 +106,7 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
         rate = x.row_gain * (x.safety_distance - d)
         separating = rate > 0.0
         if x.beta and not separating:
-            rate *= 1.0 - beta(d, x.d1, x.d2)
+            rate = min((1.0 - beta(d, x.d1, x.d2)) * rate, max(rate, -x.near_speed))
         elif x.task_switching:
             rate = max(_rate_of_eq10(x, i, d), rate if separating else (x.safety_distance - d) / x.dt)
         if x.acceleration_limited and rate < 0.0:
