@@ -15,7 +15,7 @@ _max_stopping_distance = compiled(max_stopping_distance)
 
 
 RECOVERY_SHARE = 0.1
-"""Share of its velocity limit at which a joint recovers [-]: from beyond a limit, or to part a pair that is too near."""
+"""Share of its velocity limit at which a joint recovers [-]: from beyond a limit, or to part a pair."""
 MAX_RECOVERY_SPEED = 0.2
 """Speed at which it does so at most [rad/s or m/s]."""
 
@@ -33,9 +33,9 @@ def velocity_bounds(x: Any, q: Array) -> float:
     Position and velocity limits make hard_lower and hard_upper: ±v_max, and towards a position limit at most the speed
     from which the coordinate can still brake, `speed_to_stop`; without an acceleration limit, `position_rate` times the
     distance. Outside a position limit, the speed back is `position_rate` times the excess, at most `recovery_speed`, as
-    far as the limits allow it, and low enough to brake before the opposite limit. Acceleration and jerk limits narrow these to lower and upper:
-    v_prev ± v_step, and `_jerk_limited_bounds`. No bound ever crosses another one; where limits contradict, the hard
-    bounds hold. See `qpavoid.model.limits`.
+    far as the limits allow it, and low enough to brake before the opposite limit. Acceleration and jerk limits narrow
+    these to lower and upper: v_prev ± v_step, and `_jerk_limited_bounds`. No bound ever crosses another one; where
+    limits contradict, the hard bounds hold. See `qpavoid.model.limits`.
 
     Args:
         x: reads the limits, v_prev and dv_prev; writes hard_lower, hard_upper, lower and upper (n,) [rad/s or m/s].
