@@ -16,6 +16,7 @@ import numpy as np
 import pinocchio as pin
 
 import qpavoid
+from qpavoid.config import Beta
 from qpavoid_bench.tick import build
 from qpavoid_bench.tick.libs import Library
 from qpavoid_bench.tick.workloads import Array, Workload
