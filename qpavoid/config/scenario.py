@@ -14,6 +14,8 @@ from qpavoid.config.shapes import HalfSpace, Mesh, ObstacleShape, PointCloud
 from qpavoid.config.solver import QpSolver, SolverConfig
 from qpavoid.config.tasks import AnyTask, Contact
 
+MAX_LATENCY = 0.5
+"""Longest time after which actuators may follow a command [s]: a longer one is in milliseconds."""
 _MAX_STEPS = 1_000_000
 """Control steps of a run, at most: their log takes a gigabyte or two of memory; at 10 ms they are 2.8 hours."""
 
@@ -78,6 +80,8 @@ class ScenarioConfig(Block):
     """A name (`eq10`, `qp:osqp`) or a mapping with that solver's settings."""
     dt: Annotated[float, Field(gt=0, le=0.1)] = 0.01
     """Control period [s]."""
+    latency: Annotated[float, Field(ge=0, le=MAX_LATENCY)] = 0.0
+    """Time after which the actuators follow a command [s]: states are predicted by so much."""
     duration: Positive
     """Length of the run [s]."""
     goal_tolerance: Positive = 0.005

@@ -23,6 +23,8 @@ class ControlSettings:
     """Control period [s]."""
     tracking_damping: float = 0.01
     """λ of the damped J⁺ [-]."""
+    latency: float = 0.0
+    """Time after which the actuators follow a command [s]."""
     sensing: Sensing = field(default_factory=Sensing)
     progress: Progress = field(default_factory=Progress)
 
