@@ -22,7 +22,6 @@ from qpavoid.viz.style import (
     add_grid,
     add_legend,
     draw_levels,
-    is_qp,
     label_distances,
     units,
 )
@@ -78,7 +77,7 @@ def compare_time_figure(logs: Sequence[Log]) -> Figure:
         error.plot(log.t, np.max(to_target, axis=1, initial=1e-3 * ERROR_FLOOR), **line)
         speed.plot(log.t, np.max(np.abs(log.v), axis=1, initial=0.0), **line)
     solvers = distance.get_legend_handles_labels()[0]
-    levels = draw_levels(distance, logs[0], qp=any(map(is_qp, logs)))
+    levels = draw_levels(distance, logs[0])
     label_distances(distance, *(log.min_distance for log in logs), name="smallest distance\n")
     deviation.set_ylabel("deviation from the\nplanned path [m]")
     error.set_yscale("log")
