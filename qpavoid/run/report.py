@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import is_dataclass
 from typing import Any
 
 from rich import box
@@ -145,16 +146,18 @@ def failed(run: dict[str, Any]) -> bool:
 
 
 def to_json(document: Any) -> str:
-    """Serialize strictly: NaN and infinity, for which JSON has no notation, become null."""
-    return json.dumps(_without_nan(document), indent=2, allow_nan=False)
+    """Serialize strictly: dataclasses and named tuples as objects, NaN and infinity, unknown to JSON, as null."""
+    return json.dumps(_plain(document), indent=2, allow_nan=False)
 
 
-def _without_nan(value: Any) -> Any:
-    """Return a document with None in place of NaN and infinity."""
+def _plain(value: Any) -> Any:
+    """Return a document of dicts, lists and what JSON knows."""
+    if is_dataclass(value):
+        value = vars(value)
+    elif isinstance(value, tuple) and hasattr(value, "_asdict"):
+        value = value._asdict()
     if isinstance(value, dict):
-        return {key: _without_nan(item) for key, item in value.items()}
+        return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_without_nan(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -23,7 +23,7 @@ from qpavoid.problem import Array
 from qpavoid.setup import pairs
 from qpavoid.setup.fit import MAX_VOLUME_RATIO, Bodies
 from qpavoid.setup.home import HOME_CLEARANCE, Home, find_home
-from qpavoid.setup.joints import home_candidates, joint_locks, joint_values, wheel_joints
+from qpavoid.setup.joints import home_candidates, joint_locks, joint_values
 from qpavoid.setup.sampling import (
     D1,
     SAMPLES,
@@ -128,19 +128,17 @@ def _describe(urdf: Path, options: DescribeOptions, progress: Callable[[str], No
     notes: list[Note] = []
     packages = absolute_entries([str(entry) for entry in options.package_dirs], Path.cwd())
     pieces = _pieces(urdf, model, packages, options, notes)
-    wheels = [] if options.root == "fixed" else wheel_joints(model, pieces)
     bare = RobotConfig(
         name=options.name or urdf.stem,
         urdf=str(urdf),
         root_joint=options.root,
         package_dirs=packages,
         allow_missing_meshes=options.allow_missing_meshes,
-        lock=joint_locks(urdf, model, options.lock, semantics, notes, wheels),
+        lock=joint_locks(urdf, model, options.lock, semantics, notes, options.root != "fixed"),
         end_effectors=end_effectors(model, semantics.end_effectors),
     )
     with_srdf = bare.model_copy(update={"srdf": None if honoured is None else str(honoured.resolve())})
     links, robot = _links(pieces, with_srdf, semantics, options, notes, progress)
-    bodies = {"bodies": [body for link in links.values() for body in link.bodies]}
 
     progress(f"sampling {len(robot.bodies.collisionPairs)} pairs")
     sampled = sample_pairs(robot, options.samples, options.seed)
@@ -153,9 +151,8 @@ def _describe(urdf: Path, options: DescribeOptions, progress: Callable[[str], No
     progress("looking for a home pose")
     home = find_home(active, home_candidates(active, semantics), bare.end_effectors, d1, options.home, options.seed)
     progress("comparing with the geometry")
-    unchecked = pairs.measure_unchecked(active, pieces, disabled, pairs.shares_of_contact(robot, sampled))
-    notes += [note for entry in unchecked for note in entry.notes()]
-    notes += _notes_of_home(active, home, options)
+    unchecked = pairs.measure_unchecked(active, pieces, disabled)
+    notes += [*(note for entry in unchecked for note in entry.notes()), *_notes_of_home(active, home, options)]
     if not bare.end_effectors:
         remedy = "list the frames of your tools under `end_effectors`"
         notes.append(Note(NoteKind.FRAME, (), "no end effector was recognised", remedy))
@@ -163,13 +160,14 @@ def _describe(urdf: Path, options: DescribeOptions, progress: Callable[[str], No
     pair_count = robot.bodies.ngeoms * (robot.bodies.ngeoms - 1) // 2
     of_srdf = {pair: why for pair, why in semantics.disabled.items() if all(map(model.existFrame, pair))}
     decided = {
+        "bodies": [body for link in links.values() for body in link.bodies],
         "disabled_pairs": single,
         "pair_margins": pairs.own_margins(active, d1),
         "limits": JointLimits(velocity=_assumed_speeds(model, active.model)),
         "home": joint_values(active.model, home.q),
     }
     return Description(
-        config=bare.model_copy(update={**bodies, **decided}),
+        config=bare.model_copy(update=decided),
         robot=replace(active, home=home.q),
         options=options,
         pieces=pieces,
@@ -199,12 +197,7 @@ def _semantics(srdf: Path | None, model: Any, options: DescribeOptions) -> Seman
 
 
 def _assumed_speeds(model: Any, robot_model: Any) -> dict[str, float | list[float]]:
-    """List the largest speeds that the robot has and its file does not give, so that a user can change them.
-
-    Args:
-        model: as the file has it.
-        robot_model: the robot's.
-    """
+    """List the largest speeds that the robot has and the model of its file does not, so that a user can change them."""
     speeds_by_joint: dict[str, float | list[float]] = {}
     for name, joint in zip(list(robot_model.names)[1:], list(robot_model.joints)[1:], strict=True):
         of_file = model.joints[model.getJointId(name)]

@@ -26,11 +26,12 @@ from qpavoid.model.notes import Note, NoteKind, RobotWarning, abbreviate
 from qpavoid.model.packages import absolute_entries, find_mesh, mesh_folders
 from qpavoid.model.robot import Robot
 from qpavoid.model.scene import build_scene
+from qpavoid.model.space import Space
 from qpavoid.model.urdf import find_resource, is_mjcf, mesh_names, read_model, read_pieces
 from qpavoid.setup.home import MIN_CONDITIONING, Conditioning, Limbs
-from qpavoid.setup.joint_report import Joint, joint_notes, list_joints
+from qpavoid.setup.joints import Joint, joint_notes, list_joints
 from qpavoid.setup.pairs import find_unchecked
-from qpavoid.setup.sampling import D1, Space, touching
+from qpavoid.setup.sampling import D1, touching
 from qpavoid.setup.shapes import Piece, pieces_of
 
 _MAX_STEPS, _MAX_SECONDS = 300, 5.0
@@ -246,8 +247,7 @@ def _check_home(report: Report, robot: Robot) -> None:
         if d < robot.safety_distance(a, b, D1):
             clause = f"{1e3 * d:.1f} mm apart at the home pose, less than the default safety distance"
             report.add("note", NoteKind.PAIR, (a, b), clause, remedy)
-    limbs = Limbs(robot, report.end_effectors)
-    report.conditioning = dict(zip(limbs.names, limbs.at(robot.home), strict=True))
+    report.conditioning = Limbs(robot, report.end_effectors).at(robot.home)
     if singular := [name for name, limb in report.conditioning.items() if limb.ratio < MIN_CONDITIONING]:
         clause = "the home pose is singular or nearly so: they cannot move well in every direction there"
         remedy = "start scenarios elsewhere (`q0`), or give a `home` with bent joints"
@@ -259,7 +259,7 @@ def _step_time(robot: Robot, frames: Sequence[str]) -> float:
     known = [frame for frame in frames if robot.model.existFrame(frame)]
     tasks = build_tasks([Task(frame=frame) for frame in known], robot, robot.home)
     controller = Controller(build_scene(robot), tasks)
-    space, random = Space(robot), np.random.default_rng(0)
+    space, random = Space(robot.model, robot.bounds()), np.random.default_rng(0)
     times: list[float] = []
     while len(times) < _MAX_STEPS and sum(times) <= _MAX_SECONDS:
         q = space.move(robot.home, random.normal(0.0, 0.05, robot.model.nv))

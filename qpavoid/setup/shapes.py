@@ -63,12 +63,7 @@ class LinkBodies:
 
 
 def kinds_of_links(pieces: Sequence[Piece], kind: Bodies, by_pattern: Mapping[str, Bodies]) -> dict[str, Bodies]:
-    """Choose the kind of bodies of each link with geometry.
-
-    Args:
-        pieces: of all links.
-        kind: of links that no pattern matches.
-        by_pattern: link (with `*` and `?`): its kind; of several, the last one holds.
+    """Choose the kind of bodies of each link with geometry; of several patterns that match one, the last one holds.
 
     Raises:
         UnknownName: a pattern without a link.
