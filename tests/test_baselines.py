@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 
 from qpavoid import build_scene, load_scenario, make_solver
 from qpavoid.config import Avoidance, GradientProjectionSolver, PotentialFieldSolver, Sphere
-from qpavoid.config.shipped import scenario_names
+from qpavoid.config.shipped import shipped_names
 from qpavoid.problem import AvoidanceRows, Tracking, make_problem
 from qpavoid.run.simulate import simulate
 from qpavoid.solvers.analytic import tracking_velocity
@@ -226,7 +226,7 @@ def test_gradient_projection_clears_obstacles_with_its_links():
     assert exact["max_deviation"] < 0.3 * ours["max_deviation"]  # what is left is the step of 10 ms
 
 
-FREE = [name for name in scenario_names() if not load_scenario(name).contacts]
+FREE = [name for name in shipped_names("scenario") if not load_scenario(name).contacts]
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ import yaml
 from conftest import Result
 
 from qpavoid import Controller, Log
-from qpavoid.config.shipped import data_folder, robot_names, scenario_names
+from qpavoid.config.shipped import data_folder, shipped_names
 from qpavoid.solvers import SOLVERS
 
 METRICS = {
@@ -41,14 +41,14 @@ def test_list_names_all_that_ships(cli):
     result = cli("list")
     assert result.status == 0
     words = result.stdout.split()
-    assert {*robot_names(), *scenario_names(), *SOLVERS, "qp:daqp"} <= set(words)
+    assert {*shipped_names("robot"), *shipped_names("scenario"), *SOLVERS, "qp:daqp"} <= set(words)
     assert SITUATION["title"] in next(line for line in result.stdout.splitlines() if "situation1" in line)
     assert all(len(line) <= 80 for line in result.stdout.splitlines())
 
 
 def test_list_of_one_kind_is_a_name_a_line(cli):
-    assert cli("list", "robots").stdout.splitlines() == robot_names()
-    assert cli("list", "scenarios").stdout.splitlines() == scenario_names()
+    assert cli("list", "robots").stdout.splitlines() == shipped_names("robot")
+    assert cli("list", "scenarios").stdout.splitlines() == shipped_names("scenario")
     assert {"eq10", "qp", "qp:proxqp"} <= set(cli("list", "solvers").stdout.splitlines())
 
 

@@ -280,10 +280,10 @@ def test_pose_is_continuous_at_the_corners(positions, rpys, profile):
     [
         (["t,x,y", "0,0,0", "1,0,0"], ["header", "t,x,y,z,qx,qy,qz,qw"]),
         (["0,0,0,0", "1,0,0,0"], ["header", "first line"]),
-        (["t,x,y,z"], ["0 row", "two"]),
-        (["t,x,y,z", "0,0,0,0", "", "1,0,abc,0"], ["line 4", "y", "abc"]),
-        (["t,x,y,z", "0,0,0,0", "-1,0,0,0"], ["line 3", "increase"]),
-        ([POSES, "0,0,0,0,0,0,0,1", "1,0,0,0,0,0,0,0"], ["line 3", "quaternion", "zero"]),
+        (["t,x,y,z"], ["0 rows", "give 2"]),
+        (["t,x,y,z", "0,0,0,0", "", "1,0,abc,0"], ["abc", "row 1", "column 3"]),
+        (["t,x,y,z", "0,0,0,0", "-1,0,0,0"], ["row 2", "increase"]),
+        ([POSES, "0,0,0,0,0,0,0,1", "1,0,0,0,0,0,0,0"], ["row 2", "quaternion", "zero"]),
     ],
 )
 def test_bad_csv(tmp_path, lines, words):

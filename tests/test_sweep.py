@@ -23,7 +23,7 @@ from in_process import InProcess
 pytest.importorskip("distributed")
 pytest.importorskip("mujoco")
 
-from qpavoid.config.shipped import family_names, suite_names
+from qpavoid.config.shipped import shipped_names
 from qpavoid.errors import ConfigError
 from qpavoid.run.pool import ClusterLost, ClusterWorkers, Workers
 from qpavoid_bench.arena import commands, sweep
@@ -256,9 +256,9 @@ def test_digest_changes_with_settings_and_families(folder):
 
 
 def test_suites_that_ship():
-    assert all(load_suite(name).seeds for name in suite_names())
+    assert all(load_suite(name).seeds for name in shipped_names("suite"))
     full = load_suite("full")
-    proved = [name for name in family_names() if load_family(name).config.proved]
+    proved = [name for name in shipped_names("family") if load_family(name).config.proved]
     assert sorted(family.name for family in full.families) == proved
     assert {entrant.name for entrant in full.entrants + full.absent} == set(ENTRANTS)
 
@@ -515,7 +515,7 @@ def test_bench_run_show_and_resume(cli, folder, monkeypatch):
 
 def test_list_names_everything(cli):
     document = json.loads(cli("bench", "list", "--json").stdout)
-    assert document["entrants"].keys() == ENTRANTS.keys() and set(suite_names()) == document["suites"].keys()
+    assert document["entrants"].keys() == ENTRANTS.keys() and set(shipped_names("suite")) == document["suites"].keys()
     words = cli("bench", "list").stdout
     assert all(name in words for heading in document.values() for name in heading)
 

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ValidationError
 
 from qpavoid.config import ScenarioConfig, expand_solver
 from qpavoid.config.explain import explain
-from qpavoid.config.shipped import find_scenario
+from qpavoid.config.shipped import find_shipped
 from qpavoid.config.text import read_text
 from qpavoid.config.yaml_file import parse_yaml
 from qpavoid.errors import ConfigError
@@ -33,7 +33,7 @@ def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), solve
     Raises:
         ConfigError, UnknownName: naming file, field and remedy.
     """
-    path = find_scenario(name_or_path)
+    path = find_shipped("scenario", name_or_path)
     return read_config(path, ScenarioConfig, overrides, solver).with_source(path)
 
 

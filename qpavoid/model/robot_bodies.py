@@ -15,7 +15,7 @@ from qpavoid.geometry.bodies import convert_bodies, hull, make_shape, triangle_m
 from qpavoid.model.joints import frame_index
 from qpavoid.model.notes import Note, NoteKind
 from qpavoid.model.packages import absolute_entries
-from qpavoid.model.plausibility import note_implausible_sizes
+from qpavoid.model.shape_checks import note_implausible_sizes
 from qpavoid.model.trajectory import rpy_to_matrix
 from qpavoid.model.urdf import read_pieces
 

@@ -24,8 +24,7 @@ class Space:
         """(nv,) coordinates without limits: continuous joints; not a root, whose pose does not matter here."""
         self.free[self._v] = False
         for name, joint in zip(list(model.names)[1:], list(model.joints)[1:], strict=True):
-            low, high = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
-            if name == "root_joint" or (joint.nq == joint.nv == 1 and low == high):
+            if name == "root_joint":
                 self.free[joint.idx_v : joint.idx_v + joint.nv] = False
         self.moving = self.free.copy()
         """(nv,) coordinates that configurations differ in."""

@@ -15,10 +15,10 @@ import pinocchio as pin
 
 from qpavoid.config.shipped import EXAMPLES, example_robot
 from qpavoid.errors import ConfigError
-from qpavoid.model.enclosed_shapes import remove_enclosed
 from qpavoid.model.mjcf import check_mjcf, read_geoms, read_mjcf
 from qpavoid.model.notes import Note, NoteKind
 from qpavoid.model.packages import mesh_folders
+from qpavoid.model.shape_checks import remove_enclosed
 from qpavoid.model.urdf_shapes import MISSING, ShapeReader
 from qpavoid.model.urdf_tree import tree_xml
 from qpavoid.model.xml_file import read_robot_xml, undeclared_prefixes

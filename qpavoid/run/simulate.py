@@ -205,6 +205,7 @@ class Recorder:
             "events": self._events,
             "robot": robot.name,
             "notes": [str(note) for note in robot.notes],
+            "positions": robot.position_names,
             "coordinates": robot.coordinate_names,
             "units": robot.coordinate_units,
             "velocity_limit": [v if np.isfinite(v) else None for v in bounds.velocity],

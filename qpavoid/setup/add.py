@@ -16,8 +16,8 @@ from qpavoid.model.end_effectors import end_effectors
 from qpavoid.model.kinematics import MIMIC
 from qpavoid.model.notes import Note, NoteKind, RobotWarning, merge_notes
 from qpavoid.model.packages import absolute_entries
-from qpavoid.model.plausibility import note_implausible_sizes
 from qpavoid.model.robot import Robot
+from qpavoid.model.shape_checks import note_implausible_sizes
 from qpavoid.model.urdf import read_model, read_pieces
 from qpavoid.problem import Array
 from qpavoid.setup import pairs
@@ -28,7 +28,6 @@ from qpavoid.setup.sampling import (
     D1,
     SAMPLES,
     SEED,
-    pairs_always_near,
     robot_size,
     safety_distances,
     sample_pairs,
@@ -40,8 +39,6 @@ from qpavoid.setup.srdf import Semantics, find_srdf, read_srdf
 Root = Literal["fixed", "planar", "free_flyer"]
 _HOME_NEAR = 0.04
 """Distance at the preferred home pose, as a share of the robot's size, within which capsules are oversized [-]."""
-_POSES = 200
-"""Random poses in which oversized capsules show."""
 
 
 @dataclass(frozen=True)
@@ -255,22 +252,23 @@ def _links(
     `auto` takes exact ones where capsules would be too near at home or everywhere.
     """
     kinds = kinds_of_links(pieces, options.bodies, options.bodies_of)
-    initial = {}
+    links = {}
     for number, (link, kind) in enumerate(kinds.items(), start=1):
         progress(f"fitting bodies to link {number} of {len(kinds)}: {link}")
-        initial[link] = bodies_of_link(pieces, link, kind)
-    links = dict(initial)
+        links[link] = bodies_of_link(pieces, link, kind)
+    exact_links: list[str] = []
     while True:
         listed = [body for link in links.values() for body in link.bodies]
         robot = Robot.from_config(config.model_copy(update={"bodies": listed}), Path(config.urdf))
-        oversized = _oversized(robot, home_candidates(robot, semantics)[0], options.seed)
-        replacements = {link: bodies_of_link(pieces, link, "convex") for link in oversized if kinds[link] == "auto"}
-        if all(links[link] == bodies for link, bodies in replacements.items()):
+        oversized = _oversized(robot, home_candidates(robot, semantics)[0])
+        exact = {link: bodies_of_link(pieces, link, "convex") for link in oversized if kinds[link] == "auto"}
+        if not (changed := [link for link, bodies in exact.items() if links[link] != bodies]):
             break
-        links.update(replacements)
-    if exact_links := [link for link in links if links[link] != initial[link]]:
+        links.update(exact)
+        exact_links += changed
+    if exact_links:
         clause = "exact bodies, because capsules would be too near at home or everywhere"
-        notes.append(Note(NoteKind.SHAPE, tuple(exact_links), clause))
+        notes.append(Note(NoteKind.SHAPE, tuple(sorted(exact_links, key=list(links).index)), clause))
     gross = [link for link, made in links.items() if made.volume > MAX_VOLUME_RATIO * made.inside > 0.0]
     if worst := sorted(gross, key=lambda link: -links[link].volume):
         first = links[worst[0]]
@@ -282,12 +280,9 @@ def _links(
     return links, robot
 
 
-def _oversized(robot: Robot, home: Array, seed: int) -> set[str]:
-    """Find the links of pairs that are too near at home, or in each of a few random poses."""
-    names = [body.name for body in robot.bodies.geometryObjects]
-    near = [names[i] for pair in pairs_always_near(robot, _POSES, seed) for i in pair]
+def _oversized(robot: Robot, home: Array) -> set[str]:
+    """Find the links of pairs that are too near at home, or touch in nearly every pose."""
     too_near = min(_HOME_NEAR * robot_size(robot), HOME_CLEARANCE * D1)
-    for a, b, _ in [*robot.always_touching, *touching(robot, home, too_near)]:
-        near += [a, b]
     link = pairs.links_of_bodies(robot)
-    return {link[body] for body in near}
+    near_pairs = [*robot.always_touching, *touching(robot, home, too_near)]
+    return {link[body] for a, b, _ in near_pairs for body in (a, b)}

@@ -15,14 +15,12 @@ from qpavoid.model.pairs import ALWAYS_TOUCHING, pair_array
 from qpavoid.model.robot import Robot
 from qpavoid.model.space import Space
 from qpavoid.model.views import read_results, view_results
-from qpavoid.problem import Array, IntArray, Mask
+from qpavoid.problem import Array, Mask
 
 SAMPLES, SEED = 5000, 0
 NEVER_NEAR = 0.02
 """Distance, as a share of the robot's size, that a pair must keep in every sample, and where descent from the nearest
 of them ends, to count as never colliding [-]: 20 mm of an arm with a maximal extension of 1 m."""
-ALWAYS_NEAR = 0.03
-"""Distance, as a share of the robot's size, within which two capsules are in every sample if they are oversized [-]."""
 D1 = Avoidance().d1
 """Safety distance of the pairs that have none of their own [m]."""
 _FIRST = 500
@@ -155,16 +153,6 @@ def sample_pairs(robot: Robot, samples: int = SAMPLES, seed: int = SEED) -> Pair
     gaps = np.where(touching, np.nan, first).T
     typical = np.array([np.nanmedian(d) if not np.isnan(d).all() else np.inf for d in gaps]).reshape(count)
     return PairSamples(contact >= ALWAYS_TOUCHING, closest >= near, closest, typical, poses, touching, near)
-
-
-def pairs_always_near(robot: Robot, samples: int, seed: int = SEED) -> IntArray:
-    """Find the pairs of bodies (k, 2) within `ALWAYS_NEAR` of each other in every sample."""
-    distances, limit = PairDistances(robot), ALWAYS_NEAR * robot_size(robot)
-    near = np.ones(len(distances.pairs), dtype=bool)
-    for q in draw_poses(robot, samples if near.any() else 0, seed):
-        near &= distances.all(q) < limit
-        distances.deactivate(np.flatnonzero(~near))
-    return distances.pairs[near]
 
 
 def _descend(distances: PairDistances, space: Space, index: int, q: Array, near: float) -> float:

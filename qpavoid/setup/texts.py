@@ -11,7 +11,7 @@ import yaml
 
 from qpavoid.config.shipped import EXAMPLES, example_robot
 from qpavoid.errors import ConfigError
-from qpavoid.model.notes import Note, NoteKind, abbreviate
+from qpavoid.model.notes import SEVERITIES, Note, NoteKind, abbreviate
 from qpavoid.setup.add import Description
 from qpavoid.setup.srdf import MADE_BY, srdf_text
 
@@ -134,9 +134,8 @@ def summary(description: Description) -> Iterator[tuple[str, str]]:
 
 def note_lines(notes: Sequence[Note]) -> list[str]:
     """Write the table of notes: a line each, and another for the remedy."""
-    order = {"error": 0, "warning": 1, "note": 2}
     lines = []
-    for note in sorted(notes, key=lambda note: order[note.severity]):
+    for note in sorted(notes, key=lambda note: SEVERITIES.index(note.severity)):
         percentage = "" if note.fraction is None else f"{100.0 * note.fraction:.0f} %"
         names = " - ".join(note.subject) if note.kind is NoteKind.PAIR else abbreviate(note.subject)
         lines.append(
