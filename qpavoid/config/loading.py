@@ -55,12 +55,7 @@ def read_config(path: Path, model: type[Config], overrides: Sequence[str] = (), 
 
 
 def validate(data: dict[str, Any], model: type[Config], path: Path) -> Config:
-    """Validate fields as a configuration.
-
-    Args:
-        data: fields of a file, or what stands for one.
-        model: the configuration.
-        path: file to name in errors.
+    """Validate the fields of a file as a configuration.
 
     Raises:
         ConfigError: unknown key (with the nearest valid one) or bad value.

@@ -33,12 +33,9 @@ def make_shape(shape: Shape) -> Any:
 
 
 def convert_bodies(bodies: Any, kind: str) -> Any:
-    """Replace the triangle meshes of a geometry model.
+    """Replace the triangle meshes of a Pinocchio geometry model.
 
-    Args:
-        bodies: pinocchio geometry model as read from a URDF.
-        kind: `convex`: hull of each mesh, primitives as they are; `capsule`: one capsule around each piece;
-            `mesh`: everything as it is.
+    `convex`: by their hulls, primitives as they are; `capsule`: one capsule around each piece; `mesh`: all as it is.
     """
     converted = pin.GeometryModel()
     for body in bodies.geometryObjects:

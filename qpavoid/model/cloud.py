@@ -105,12 +105,8 @@ def voxel_radius(resolution: float) -> float:
 def read_points(path: Path, where: str) -> Array:
     """Read points (n, 3) [m] from a file: `.npy` with an array (n, 3), or `.csv` with the header `x,y,z`.
 
-    Args:
-        path: the file.
-        where: file and field to name in errors.
-
     Raises:
-        ConfigError: cannot be read, or not points.
+        ConfigError: cannot be read, or not points; naming the field in `where`.
     """
     if path.suffix == ".csv":
         points: Any = read_table(read_text(path, _LARGEST, where), ("x,y,z",), f"{where}: {path}")

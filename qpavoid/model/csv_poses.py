@@ -18,15 +18,10 @@ _LARGEST_CSV, _MOST_ROWS = 20_000_000, 100_000
 
 
 def read_table(text: str, headers: tuple[str, ...], where: str) -> Array:
-    """Read the numbers (n, columns) below the header of a CSV text.
-
-    Args:
-        text: of the file.
-        headers: those that it may have.
-        where: file to name in errors.
+    """Read the numbers (n, columns) below one of some headers of a CSV text.
 
     Raises:
-        ConfigError: another header, or a row that is not of as many numbers; naming row and column.
+        ConfigError: another header, or a row that is not of as many numbers; naming file, row and column.
     """
     header, *lines = text.splitlines() or [""]
     if header.replace(" ", "") not in headers:
@@ -52,11 +47,12 @@ def read_poses(path: Path, initial: Array) -> tuple[list[float], list[Array], li
     table = read_table(read_text(path, _LARGEST_CSV, f"{path}: motion.path"), CSV_HEADERS, str(path))
     if not 2 <= len(table) <= _MOST_ROWS:
         raise ConfigError(f"{path}: {len(table)} rows of poses; give 2 to {_MOST_ROWS}, or use `type: fixed`")
-    norms = np.linalg.norm(table[:, 4:], axis=1) if table.shape[1] > 4 else np.ones(len(table))  # numbers are rounded
+    is_sane = (np.abs(table) <= 10.0 * LARGEST).all(axis=1)  # False for NaN too; seconds of the calendar are 1.7e9
+    norms = np.linalg.norm(np.where(is_sane[:, None], table[:, 4:], 1.0), axis=1)  # need not be 1: they are rounded
     for clause, is_bad in (
-        ("not finite numbers of sane size", ~(np.abs(table) <= 10.0 * LARGEST).all(axis=1)),  # the calendar has 1.7e9 s
+        ("not finite numbers of sane size", ~is_sane),
         ("times must increase", np.diff(table[:, 0], prepend=-np.inf) <= 0.0),
-        ("the quaternion is zero; no turn is 0,0,0,1", norms < 1e-6),
+        ("the quaternion is zero; no turn is 0,0,0,1", (norms < 1e-6) & (table.shape[1] > 4)),
     ):
         if is_bad.any():
             raise ConfigError(f"{path}: row {int(np.argmax(is_bad)) + 1} of poses: {clause}; correct it")

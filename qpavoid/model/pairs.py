@@ -18,16 +18,10 @@ from qpavoid.problem import Array, IntArray, Mask
 
 
 def add_self_pairs(model: Any, bodies: Any, disabled: Iterable[tuple[str, str]], origin: str) -> None:
-    """Add every pair of bodies that is not rigidly connected, adjacent or disabled.
-
-    Args:
-        model: pinocchio model.
-        bodies: its collision bodies, changed in place.
-        disabled: pairs of name patterns, in either order.
-        origin: file to name in errors.
+    """Add every pair of bodies that is not rigidly connected, adjacent or disabled by name patterns, in either order.
 
     Raises:
-        UnknownName: a pattern that matches no body.
+        UnknownName: a pattern that matches no body; naming the `origin`, a file.
     """
     names = [body.name for body in bodies.geometryObjects]
     joints = [body.parentJoint for body in bodies.geometryObjects]
@@ -66,15 +60,9 @@ class TouchingPair(NamedTuple):
 
 
 def drop_always_touching(model: Any, bodies: Any, bounds: JointBounds, samples: int = 200) -> list[TouchingPair]:
-    """Remove the pairs that touch in nearly every one of many random configurations, and return them.
+    """Remove, and return, the pairs that touch in nearly every one of many random configurations, always the same.
 
     Those are neighbours whose shapes overlap at the joint by design.
-
-    Args:
-        model: pinocchio model.
-        bodies: its collision bodies with their pairs, changed in place.
-        bounds: its limits.
-        samples: how many configurations are drawn, always the same ones.
     """
     poses = Space(model, bounds).draw(np.random.default_rng(0), samples)
     fraction = find_contacts(model, bodies, poses, ALWAYS_TOUCHING).mean(axis=0)

@@ -23,12 +23,7 @@ from qpavoid.model.urdf import read_pieces
 def robot_bodies(config: RobotConfig, urdf: Path, model: Any, path: Path, notes: list[Note]) -> Any:
     """Make the geometry model of the collision bodies that a robot.yaml asks for.
 
-    Args:
-        config: fields of the robot.yaml.
-        urdf: its URDF or MJCF.
-        model: Pinocchio model of that.
-        path: the robot.yaml, to name in errors.
-        notes: what was left out or replaced is added to them.
+    What was left out or replaced is added to the notes.
 
     Raises:
         ConfigError, UnknownName: a shape that cannot be read, a frame or a piece of geometry that does not exist.

@@ -195,7 +195,7 @@ class Log:
         if not os.path.isfile(path):  # reading a pipe or a device may never end
             raise ConfigError(f"{path}: no such file; give a log written by `qpavoid run`")
         try:
-            with np.load(path, allow_pickle=False) as file:
+            with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
                 meta = json.loads(str(file["meta"]))
                 if meta.pop("format") != _FORMAT:
                     raise ConfigError(f"{path}: written by another version of qpavoid; run the scenario again")

@@ -37,17 +37,9 @@ _FINE = 4000
 
 
 def fit_piece(geometry: Any, how: Bodies, inside: float | None = None) -> tuple[CapsuleFit, ...]:
-    """Fit capsules that enclose a coal geometry entirely.
+    """Fit capsules that enclose a coal geometry entirely, in its own frame; `inside` is its `inside_volume` [m³].
 
     None where its hull, or the primitive itself, is to stand for it.
-
-    Args:
-        geometry: as read from a URDF.
-        how: which kind of shapes.
-        inside: `inside_volume` of the geometry, where it is known [m³].
-
-    Returns:
-        Capsules in the geometry's own frame.
     """
     if isinstance(geometry, coal.Sphere | coal.Capsule):
         return (enclosing_capsule(geometry),)

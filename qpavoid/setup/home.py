@@ -53,13 +53,7 @@ class Limbs:
     """Conditioning of the limbs that end at some frames."""
 
     def __init__(self, robot: Robot, frames: Sequence[str], seed: int = SEED) -> None:
-        """Find the directions that each limb moves in, and its typical conditioning.
-
-        Args:
-            robot: the robot.
-            frames: ends of its limbs; those that do not exist or do not move are left out.
-            seed: of the random configurations.
-        """
+        """Find the directions that each limb moves in, and its typical conditioning; leave out frames that rest."""
         self._model, self._data = robot.model, robot.model.createData()
         self._masks, self._columns = support_masks(robot.model), columns(robot.model)
         self.columns: dict[str, Mask] = {}

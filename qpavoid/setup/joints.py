@@ -55,11 +55,7 @@ class Joint:
 def list_joints(urdf: Path, model: Any, config: RobotConfig, whole: Any) -> list[Joint]:
     """List all joints: those that move, with the limits in force, locked and fixed ones.
 
-    Args:
-        urdf: the file.
-        model: pinocchio model of the robot as it loads.
-        config: its configuration.
-        whole: model of the file.
+    `model` is that of the robot as it loads, `whole` that of the file.
     """
     leaders = {name: leader for name, (leader, _, _) in _mimics(urdf).items()}
     elements = [] if is_mjcf(urdf) else read_robot_xml(urdf, "URDF").findall("joint")

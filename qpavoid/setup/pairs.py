@@ -75,10 +75,8 @@ def pair_reasons(
 ) -> dict[frozenset[str], Reason]:
     """Explain why each pair of bodies that is not checked is not.
 
-    Args:
-        robot: with its pairs.
-        sampled: what became of its m pairs in random configurations; None: all of them are checked.
-        is_nested: which of them slide into each other (m,).
+    Of the robot's own m pairs, what became of them in random configurations counts, and which slide into each other
+    (m,).
     """
     parents = robot.model.parents
     touching = {frozenset(pair[:2]) for pair in robot.always_touching}
@@ -123,13 +121,7 @@ def by_link(
 def measure_unchecked(
     robot: Robot, pieces: Sequence[Piece], disabled: Mapping[frozenset[str], Reason]
 ) -> list[UncheckedLinks]:
-    """Sample how often the geometry of links that are not checked touches.
-
-    Args:
-        robot: with its pairs.
-        pieces: geometry as the file has it.
-        disabled: two links that are not checked, and why.
-    """
+    """Sample how often the geometry of links that are not checked touches, meshes as the file has them."""
     # bodies enclose the geometry: where they never come near, it does not touch
     shares = _contact_shares(robot, pieces, [links for links, reason in disabled.items() if reason != "never"])
     return [
@@ -139,12 +131,7 @@ def measure_unchecked(
 
 
 def find_unchecked(robot: Robot, pieces: Sequence[Piece]) -> list[UncheckedLinks]:
-    """Find the links of a robot of which no pair of bodies is checked, and how often their geometry touches.
-
-    Args:
-        robot: with its pairs.
-        pieces: geometry as the file has it.
-    """
+    """Find the links of a robot of which no pair of bodies is checked, and how often their geometry touches."""
     disabled, _ = by_link(robot, pair_reasons(robot))
     # those that always touch are notes of the robot's own
     return measure_unchecked(robot, pieces, {links: why for links, why in disabled.items() if why != "always"})
@@ -196,10 +183,6 @@ def nested_pairs(robot: Robot, pair_samples: PairSamples) -> Mask:
     but prismatic joints with a common axis moves it; and its place along that line alone decides whether they touch:
     always on one side of a threshold, never on the other. A pair that meets an obstacle of the robot's own, such as two
     carriages on one rail, touches in the middle of its range or only near an end, and stays.
-
-    Args:
-        robot: with its pairs.
-        pair_samples: of these pairs.
     """
     touching = pair_samples.touching
     is_nested = np.zeros(touching.shape[1], dtype=bool)

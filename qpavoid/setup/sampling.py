@@ -126,11 +126,6 @@ def sample_pairs(robot: Robot, samples: int = SAMPLES, seed: int = SEED) -> Pair
     Random configurations first; each pair that stayed apart in all of them then descends along its gradient from where
     it came closest, so that "never" does not depend on the samples alone. It is still no proof: samples are finite,
     descents local.
-
-    Args:
-        robot: with its pairs.
-        samples: configurations drawn.
-        seed: of the draw.
     """
     distances, space = PairDistances(robot), Space(robot.model, robot.bounds())
     near, count = NEVER_NEAR * robot_size(robot), len(distances.pairs)

@@ -103,13 +103,9 @@ def bodies_of_link(pieces: Sequence[Piece], link: str, kind: Bodies) -> LinkBodi
 
 
 def capsule_fields(fit: CapsuleFit, placement: Any) -> dict[str, Any]:
-    """Return the fields of a `Body` that encloses a capsule, with five decimals.
+    """Return the fields of a `Body` that encloses a capsule in a placed frame, with five decimals.
 
     The radius makes up for the rounding of everything else, so that what was enclosed stays so.
-
-    Args:
-        fit: the capsule.
-        placement: of its frame in the body's.
     """
     axis = placement.rotation @ fit.rotation[:, 2]
     center = placement.act(np.asarray(fit.center))

@@ -20,12 +20,9 @@ _WIDTH = 120
 
 
 def description_files(description: Description, folder: Path, command: str = "") -> dict[Path, str]:
-    """Write the files of a description.
+    """Write the files of a description that are to stand in a folder, and name the command that makes them again.
 
-    Args:
-        description: what they say.
-        folder: where they are to stand; paths in them are relative to it.
-        command: that makes them again.
+    Paths in them are relative to that folder.
     """
     srdf, head = folder / f"{description.config.name}.srdf", f"{description.config.name}: {MADE_BY}"
     comments = [head, *(f"{what.capitalize()}: {line}." for what, line in summary(description))]
@@ -39,11 +36,7 @@ def description_files(description: Description, folder: Path, command: str = "")
 
 
 def write_files(contents: Mapping[Path, str], force: bool = False) -> dict[Path, str]:
-    """Write all files, or none.
-
-    Args:
-        contents: what each is to hold.
-        force: overwrites files that hold something else.
+    """Write all files, or none; `force` overwrites those that hold something else.
 
     Returns:
         For each file `written`, `unchanged` or `updated`.

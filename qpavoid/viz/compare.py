@@ -96,12 +96,7 @@ def compare_time_figure(logs: Sequence[Log]) -> Figure:
 
 
 def path_figure(logs: Sequence[Log], styles: Sequence[dict[str, Any]]) -> Figure:
-    """Draw tool paths in two views at one scale, with the planned path, the obstacles and the bodies at rest.
-
-    Args:
-        logs: runs of one scenario.
-        styles: label, colour and line style of each.
-    """
+    """Draw tool paths in two views at one scale, with the planned path, the obstacles and the bodies at rest."""
     longest = max(logs, key=lambda log: len(log.t))
     outlines = _outlines(longest) if len(longest.t) else []
     paths = longest.target.reshape(-1, 3)
