@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from time import perf_counter
 from typing import Any, NoReturn
 
 import numpy as np
 
 from qpavoid import kernels
-from qpavoid.config import Avoidance, Limits, Progress, ScenarioConfig, Sensing
+from qpavoid.config import Avoidance, Limits, Progress, ScenarioConfig, Sensing, Sphere
 from qpavoid.config.scenario import MAX_LATENCY
 from qpavoid.control.builder import ProblemBuilder, StepProblem
 from qpavoid.control.contacts import ContactRows
@@ -22,7 +23,7 @@ from qpavoid.control.tick import Tick, copied
 from qpavoid.errors import ConfigError, NumericalError, UnknownName, located, nearest
 from qpavoid.model.cloud import Points
 from qpavoid.model.sample import Pose, Sample
-from qpavoid.model.scene import Scene
+from qpavoid.model.scene import Obstacle, Scene
 from qpavoid.problem import Array, Solution, State, as_vector, require_finite
 from qpavoid.reason import Reason, ReasonKind
 from qpavoid.safety.arbiter import Arbiter
@@ -34,6 +35,9 @@ _NO_BACKUP_WITH_CONTACTS = Reason.of(
     ReasonKind.NO_BACKUP, "contacts", detail="backup trajectories do not hold contacts: avoidance.backup"
 )
 """Assumption where obstacles move and the robot stands on something."""
+
+
+_WARM_UP = "a passing obstacle, to warm up"
 
 
 class Controller:
@@ -78,7 +82,9 @@ class Controller:
         if not 0.0 <= latency <= MAX_LATENCY:
             raise ConfigError(f"latency: {latency} s, expected 0 to {MAX_LATENCY}; it is in seconds")
         frames, others = in_order(tasks)
-        self.scene, self.dt = scene, dt
+        self.scene = scene = scene.own_copy() if scene.spare else scene
+        """Robot and obstacles, those that were added among them."""
+        self.dt = dt
         self.tasks: tuple[RowTask, ...] = (*frames, *others)
         """Frames with a position to follow, then with an orientation alone, then all other tasks."""
         law, self._has_contacts = make_solver(solver) if isinstance(solver, str) else solver, contacts is not None
@@ -118,7 +124,7 @@ class Controller:
     def attached(self) -> Mapping[str, int]:
         """Joint that each attached object is attached to, by name of the object."""
         table = self._builder.rows.query.table
-        return {self.scene.obstacles[index].name: joint for index, joint in table.attached.items()}
+        return {self.scene.slots[index].name: joint for index, joint in table.attached.items()}
 
     def _warm_up(self) -> None:
         """Run the first steps, with a law that ships: one of the user's own may remember what it is asked."""
@@ -130,6 +136,13 @@ class Controller:
         self._builder.rows.leaves_position_limits(q, v, self.dt)
         self._builder.tracker.warm_up()
         kernels.projection_cost(np.zeros((0, len(v))), 1.0, v)
+        if self.scene.spare:
+            passing = replace(Obstacle.at(_WARM_UP, Sphere(radius=0.05), [2.0, 0.0, 0.0]), moves=True)
+            self.add_obstacle(passing)
+            self.tick(q)
+            self.remove_obstacle(_WARM_UP)
+        for query in self._builder.rows.query.table.queries:
+            query.forget_guesses()
         self._arbiter.solver = law
         self.reset()
 
@@ -256,6 +269,34 @@ class Controller:
             assumptions += self._no_backup
         solution = solution._replace(assumptions=assumptions) if assumptions else solution
         return solution.with_times(middle - begin, perf_counter() - middle)
+
+    def add_obstacle(self, obstacle: Obstacle) -> None:
+        """Add an obstacle, which takes one of the scene's spare slots until it is removed: no memory is laid out anew.
+
+        From the next step on it is one like all others: updates, `attach` if it is graspable, `allow_contact`, reasons
+        and `scene` know it by its name. Where it appears near the robot, the pair parts as one that came near by
+        itself, within the acceleration limits.
+
+        Args:
+            obstacle: of `Obstacle.at`: a primitive, or a mesh with `method: convex`.
+
+        Raises:
+            ConfigError: no slot is empty, its name is taken, it has another shape, its pose cannot be true. Nothing is
+                changed.
+        """
+        self._builder.slots.add(obstacle)
+
+    def remove_obstacle(self, obstacle: str) -> None:
+        """Remove an obstacle that was added; its slot is empty again.
+
+        Args:
+            obstacle: its name.
+
+        Raises:
+            UnknownName: there is none of that name.
+            ConfigError: it is attached to the robot, or was built into the scene.
+        """
+        self._builder.slots.remove(self._builder.tracker.index(obstacle))
 
     def attach(self, obstacle: str, frame: str, q: Array | None = None) -> None:
         """Attach an obstacle to a frame of the robot; it stays where it is relative to the frame.

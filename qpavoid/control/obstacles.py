@@ -124,6 +124,11 @@ class ObstacleTracker:
         extrapolate(states[:0], 0.0)
 
     @property
+    def now(self) -> float:
+        """Time of the states in the last step [s]."""
+        return self._now
+
+    @property
     def estimates(self) -> ObstacleEstimates | None:
         """States of external obstacles in the last step, with mean twists; None where there are none."""
         if self._estimates is None and self._measured.known:
@@ -184,12 +189,34 @@ class ObstacleTracker:
         for index, motion in self._trajectories.others.items():
             states[index] = motion.sample(t).row
 
+    def put(self, index: int, name: str, present: bool) -> None:
+        """Take over what the scene has in a spare slot now.
+
+        Args:
+            index: number of the slot.
+            name: of what was there before, if anything was.
+            present: whether there is an obstacle now.
+        """
+        obstacle = self._obstacles[index]
+        self._reader.rename(index, name, obstacle.name)
+        self._measured.forget(index)
+        self._measured.states[index] = self.current.states[index] = obstacle.motion.sample(self._now).row
+        self._uncertainty[index] = self.current.margin[index] = obstacle.uncertainty
+        for numbers, member in ((self._placed, present), (self._awaited, obstacle.external)):
+            (numbers.add if member else numbers.discard)(index)
+        self._follow([i for i in self._moving if i != index] + [index] * obstacle.moves)
+        self._renew()
+
+    def _follow(self, numbers: list[int]) -> None:
+        """Let some obstacles follow their trajectories, and no others."""
+        if numbers != self._moving:
+            self._moving = numbers
+            self._trajectories = TrajectoryBatch({i: self._obstacles[i].motion for i in numbers})
+            self._sampled.clear()
+
     def attach(self, index: int) -> None:
         """Take an obstacle as attached to the robot: updates of it are ignored."""
-        if index in self._moving:  # it leaves its trajectory for good
-            self._moving = [i for i in self._moving if i != index]
-            self._trajectories = TrajectoryBatch({i: self._obstacles[i].motion for i in self._moving})
-            self._sampled.clear()
+        self._follow([i for i in self._moving if i != index])  # it leaves its trajectory for good
         self._measured.forget(index)
         self._awaited.discard(index)
         self._placed.add(index)
