@@ -8,21 +8,26 @@ import numpy as np
 
 from qpavoid.problem import Array
 
+_MEMORY = 8.0
+"""Age from which a command has been followed, in latencies [-]: all but 2e-6 of it."""
+
 
 class CommandsUnderWay:
-    """The commands of the last `latency` seconds, in a ring laid out once.
+    """The commands of late, in a ring laid out once, and how much of each the robot has not followed yet.
 
-    An actuator that follows every command `latency` later has all of them still to do. One that lags, as a position
-    servo does, has done a part of the later ones and not all of those before; at constant velocity that is the same.
+    A critically damped servo follows a setpoint that moves at constant velocity by T = `latency` late. Of a step of it,
+    the part (1 + s) exp(-s) is left after the time ½ s T; of a command v that was held from ½ s₁ T to ½ s₀ T ago, the
+    displacement ½ T v [(2 + s₀) exp(-s₀) - (2 + s₁) exp(-s₁)], for s₀ < s₁: of the newest ones almost all. Drives that
+    are late by a delay, or that lag exponentially, leave the same at constant velocity, else a little more or less.
     """
 
     def __init__(self, nv: int, latency: float, dt: float) -> None:
         """Begin at rest; `latency` and the control period dt are in seconds."""
-        count = ceil(latency / dt - 1e-9)
+        count = ceil(_MEMORY * latency / dt)
         self._commands, self._next = np.zeros((count, nv)), 0
-        durations = np.full(count, dt)  # of the newest command first: the oldest one is followed in part
-        durations[count - 1 :] = latency - (count - 1) * dt
-        self._durations = np.tile(durations[::-1], 2)
+        s = 2.0 * dt / (latency or 1.0) * np.arange(count)
+        left = np.append(0.5 * latency * (2.0 + s) * np.exp(-s), 0.0)
+        self._durations = np.tile((left[:-1] - left[1:])[::-1], 2)  # of the newest command last
         self._displacement = np.zeros(nv)
 
     @property

@@ -1,8 +1,8 @@
 """Tracks the obstacles: on their trajectories, or by the poses and twists that a program gives, step by step or late.
 
 An obstacle is external from the time on at which a program gives it, or from the start if the scene says so. What is
-given has a time stamp, that of the control step if it brings none. A bare pose gets a twist from the difference of two
-poses over that of their stamps. An external obstacle that is not updated keeps its last twist; after `stale_after`
+given has a time stamp, that of the control step if it brings none. A bare pose gets a twist from a line through the
+poses of late, over their stamps. An external obstacle that is not updated keeps its last twist; after `stale_after`
 its distances shrink by a margin that grows, and after `stop_after` the robot stops, unless it was given `at_rest`. Each
 assumption is named in `Solution.assumptions`.
 """
