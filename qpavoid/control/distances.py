@@ -13,20 +13,20 @@ import pinocchio as pin
 from qpavoid import kernels
 from qpavoid.config import PointCloud
 from qpavoid.control.cloud_proxies import CloudProxies
-from qpavoid.control.obstacles import ObstacleStates
+from qpavoid.control.obstacle_states import ObstacleStates
 from qpavoid.control.pair_table import PairTable
 from qpavoid.errors import NumericalError
-from qpavoid.geometry.bodies import among_cylinders
-from qpavoid.kernels.distances import BY_COAL, CLOSED_FORM, ONE_BY_ONE
+from qpavoid.kernels.distances import BY_COAL, CLOSED_FORM
 from qpavoid.model.sample import STATE, Sample
 from qpavoid.model.scene import Scene
 from qpavoid.model.views import read_poses, read_results, view_poses, view_results
-from qpavoid.problem import Array, IntArray, Mask
+from qpavoid.problem import Array, IntArray
 
 _TOLERANCE = 1e-10
 """At which coal stops; its default, 1e-6, leaves errors of 7e-3 in normals of boxes and hulls."""
-_FIRST_GUESS = np.array([1.0, 0.0, 0.0]), np.zeros(2, dtype=np.int32)
-"""Direction [m] and vertices from which a search of coal starts at first."""
+_FIRST_GUESS = coal.DistanceResult()
+"""Where a search of coal starts at first."""
+_FIRST_GUESS.cached_gjk_guess, _FIRST_GUESS.cached_support_func_guess = np.eye(3)[0], np.zeros(2, dtype=np.int32)
 _MAX_STOP = 1.0
 """How far the robot may go before it stands, where a half-space that turns is concerned [m]."""
 
@@ -107,6 +107,7 @@ class DistanceQuery:
         for pair in range(pairs):
             self._data.deactivateCollisionPair(pair)
         self._active, self._last_near = np.zeros(pairs, dtype=bool), b""
+        self._outdated = np.zeros(pairs, dtype=bool)  # pairs of spare slots for which coal was made for other shapes
         self._surfaces = table.is_mesh[scene.pairs].any(axis=1) & ~table.is_plane[scene.pairs].any(axis=1)
         self._has_surfaces = bool(self._surfaces.any())
         self.is_compiled = not (len(self._by_coal) or self._clouds) and self._has_views
@@ -152,16 +153,10 @@ class DistanceQuery:
         exists = (table.pair_of[rows, columns] >= 0) & ~(empty[movable][rows, None] | empty[columns])
         self.arrays.max_square[rows, columns] = np.where(exists, touching**2 * (1.0 + 1e-9), -1.0)
 
-    def forget_guesses(self, pairs: Mask | None = None) -> None:
-        """Let the search of coal start anew for some pairs, not where it ended before; of curved shapes, that shows.
-
-        Args:
-            pairs: which ones (m,); all, if left out.
-        """
-        by_coal = self.arrays.method != CLOSED_FORM
-        for pair in np.flatnonzero(by_coal if pairs is None else by_coal & pairs).tolist():
-            request = self._data.distanceRequests[pair]
-            request.cached_gjk_guess, request.cached_support_func_guess = _FIRST_GUESS
+    def forget_guesses(self) -> None:
+        """Let the searches of coal start anew, not where they ended before: of curved shapes, that shows."""
+        for pair in self._by_coal.tolist():
+            self._data.distanceRequests[pair].updateGuess(_FIRST_GUESS)
 
     def update_slot(self, index: int) -> None:
         """Take over what the scene and the table have in a spare slot now; it is where it is at time 0."""
@@ -171,7 +166,8 @@ class DistanceQuery:
         self._uncertainty[index] = obstacle.uncertainty
         self._set_max_square(slice(body, body + 1), slice(None))
         self._set_max_square(slice(None), slice(body, body + 1))
-        self.forget_guesses(self.table.pairs_of(index))
+        self._outdated |= self.table.pairs_of(index)
+        self._last_near = b""
         x.states[index] = obstacle.motion.sample(0.0).row
         kernels.place_obstacles(self.packed, np.array([index]), x.states, self._uncertainty)
         for cloud in self._clouds.values():
@@ -196,13 +192,13 @@ class DistanceQuery:
         Args:
             near: number of near pairs.
             rows: number of those that get rows.
-            meeting: number of those that are computed one by one.
+            meeting: number of those that coal has to compute all the same.
         """
-        self._near_count, self._row_count = near, rows
-        if len(self._by_coal):
+        self._near_count, self._row_count, x = near, rows, self.arrays
+        if len(self._by_coal) or meeting:
             self._compute_by_coal()
-        if meeting:
-            for pair in self.arrays.meeting[:meeting].tolist():
+        for pair in x.meeting[:meeting].tolist():
+            if x.method[pair] == CLOSED_FORM:
                 self._compute_one(pair)
 
     @property
@@ -221,7 +217,12 @@ class DistanceQuery:
         if near != self._last_near:
             active = np.zeros(len(self._active), dtype=bool)
             active[self._near] = True
-            active &= x.method == BY_COAL
+            active &= x.method != CLOSED_FORM
+            for pair in np.flatnonzero(active & self._outdated).tolist():
+                a, b = (self._scene.geometry.geometryObjects[i] for i in x.pairs[pair].tolist())
+                self._data.distance_functors[pair] = pin.ComputeDistance(a, b)
+                self._data.distanceRequests[pair].updateGuess(_FIRST_GUESS)
+                self._outdated[pair] = False
             changed = np.flatnonzero(active != self._active)
             for pair, on in zip(changed.tolist(), active[changed].tolist(), strict=True):
                 (self._data.activateCollisionPair if on else self._data.deactivateCollisionPair)(pair)
@@ -238,14 +239,12 @@ class DistanceQuery:
 
     def _compute_one(self, pair: int) -> None:
         bodies, poses = self._scene.geometry.geometryObjects, self.arrays.poses
-        i, j = self.arrays.pairs[pair].tolist()
-        a, b = among_cylinders(bodies[i].geometry, bodies[j].geometry)
-        places = [coal.Transform3s(poses[k, :9].reshape(3, 3).T.copy(), poses[k, 9:].copy()) for k in (i, j)]
-        result, keeps_guess = coal.DistanceResult(), self.table.method[pair] == ONE_BY_ONE
-        request = self._data.distanceRequests[pair] if keeps_guess else self._request
-        coal.distance(a, places[0], b, places[1], request, result)
-        if keeps_guess:  # as Pinocchio does: the next search starts where this one ends
-            request.updateGuess(result)
+        a, b = (
+            (bodies[i].geometry, coal.Transform3s(poses[i, :9].reshape(3, 3).T.copy(), poses[i, 9:].copy()))
+            for i in self.arrays.pairs[pair].tolist()
+        )
+        result = coal.DistanceResult()
+        coal.distance(*a, *b, self._request, result)
         self.arrays.results[pair] = read_results([result])[0]
 
     def body_spheres(self, joint_poses: Array) -> tuple[Array, Array]:

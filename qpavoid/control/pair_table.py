@@ -14,7 +14,7 @@ import numpy as np
 
 from qpavoid.geometry.bodies import bounding_box, bounding_sphere
 from qpavoid.geometry.cores import cores, has_closed_form
-from qpavoid.kernels.distances import CLOSED_FORM, ONE_BY_ONE
+from qpavoid.kernels.distances import CLOSED_FORM, SPARE_BY_COAL
 from qpavoid.model.kinematics import support_masks
 from qpavoid.model.scene import Scene
 from qpavoid.model.views import read_poses
@@ -60,7 +60,7 @@ class PairTable:
 
         self.is_empty: Mask = np.isin(scene.obstacle_of, scene.spare)
         """(g,) spare slots for obstacles that no obstacle has taken."""
-        self.method[self.is_empty[scene.pairs].any(axis=1) & (self.method != CLOSED_FORM)] = ONE_BY_ONE
+        self.method[self.is_empty[scene.pairs].any(axis=1) & (self.method != CLOSED_FORM)] = SPARE_BY_COAL
         self.attached: dict[int, int] = {}
         """Joint that each attached obstacle is attached to, by number of the obstacle."""
         joints = [body.parentJoint for body in bodies[:robot]] if robot else []
@@ -79,7 +79,7 @@ class PairTable:
         self.joint_radius: Array = np.zeros(scene.robot.model.njoints)
         """(njoints,) distance from each joint's origin to the farthest point of a body that it moves [m]."""
         self.queries: WeakSet[Any] = WeakSet()
-        """Distances that look into this table, which are told of other obstacles in spare slots."""
+        """Distances that look into this table, which have to take over what is in a spare slot."""
         self._masks = support_masks(scene.robot.model)
         self.support: Array = np.zeros((count, self._masks.shape[1]))
         """(m, e) support of the second body minus that of the first, see `support_masks`."""
@@ -116,7 +116,7 @@ class PairTable:
         self.boxes[body] = np.concatenate(bounding_box(solid))
         self.cores[body] = cores([solid])[0]
         closed = has_closed_form(self.cores, self._scene.pairs[pairs])
-        self.method[pairs] = np.where(closed, CLOSED_FORM, ONE_BY_ONE)
+        self.method[pairs] = np.where(closed, CLOSED_FORM, SPARE_BY_COAL)
         self._enable()
         for query in self.queries:
             query.update_slot(index)

@@ -1,8 +1,7 @@
 """Obstacles that come and go at run time, in spare slots of the scene whose memory is laid out from the start.
 
 A slot is one body, with pairs to all others; those of an empty one are disabled. What is in it changes numbers in
-arrays, and no shape of an array, so that nothing is compiled. Shapes without a closed form are computed pair by pair
-where they are near.
+arrays, and no shape of an array, so that nothing is compiled.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from qpavoid.control.inputs import FARTHEST, FASTEST, FAULTS
 from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.errors import ConfigError, NumericalError
 from qpavoid.kernels.obstacles import NORMALISED, SAMPLE
-from qpavoid.model.scene import Obstacle, Scene, check_name, is_one_solid, spare_solid
+from qpavoid.model.scene import Obstacle, Scene, check_name, is_one_solid, spare_solid, without_sphere
 from qpavoid.model.solids import make_solids
 
 
@@ -85,7 +84,7 @@ def _solid(obstacle: Obstacle) -> Any:
             f"{where}: a {obstacle.shape.type} cannot be added at run time; give it to `build_scene`, or give a "
             "primitive or a mesh with `method: convex`"
         )
-    return solids[0]
+    return without_sphere(solids[0])
 
 
 def _check_state(obstacle: Obstacle, t: float) -> None:

@@ -54,19 +54,6 @@ def convert_bodies(bodies: Any, kind: str) -> Any:
     return converted
 
 
-def among_cylinders(a: Any, b: Any) -> tuple[Any, Any]:
-    """Return two coal shapes, a sphere as a capsule of no length where the other one is a cylinder.
-
-    coal 3.0 has a formula of its own for spheres and cylinders, which is wrong by centimetres once the centre of the
-    sphere is inside; for capsules it iterates.
-    """
-    if isinstance(a, coal.Sphere) and isinstance(b, coal.Cylinder):
-        return coal.Capsule(a.radius, 0.0), b
-    if isinstance(b, coal.Sphere) and isinstance(a, coal.Cylinder):
-        return a, coal.Capsule(b.radius, 0.0)
-    return a, b
-
-
 def hull(geometry: Any) -> Any:
     """Return the convex hull of a mesh; primitives as they are."""
     return convex_hull(np.array(geometry.vertices())) if isinstance(geometry, coal.BVHModelBase) else geometry

@@ -11,8 +11,8 @@ import numpy as np
 from qpavoid.kernels.packing import compiled
 from qpavoid.problem import Array, IntArray
 
-BY_COAL, CLOSED_FORM, ONE_BY_ONE = range(3)
-"""How the distance of a pair is computed: by coal, all such pairs in one call; here; by coal in a call of its own."""
+BY_COAL, CLOSED_FORM, SPARE_BY_COAL = range(3)
+"""How the distance of a pair is computed: by coal; here; by coal, as what has come into a spare slot asks for it."""
 MIN_CORE_DISTANCE = 1e-6
 """Distance of cores below which coal computes the pair [m]: the direction between them is lost to round-off."""
 _PARALLEL = 1e-14
@@ -38,11 +38,11 @@ def closed_forms(
         poses: world poses of all bodies, rotation by columns and translation (g, 12).
         cores: radius, and half-sizes of the core along the axes of each body (g, 4), see `geometry.cores` [m].
         bodies: the two bodies of each pair (m, 2).
-        method: BY_COAL, CLOSED_FORM or ONE_BY_ONE, of each pair (m,).
+        method: BY_COAL, CLOSED_FORM or SPARE_BY_COAL, of each pair (m,).
         pairs: numbers of the pairs to update (c,).
         results: [distance, normal, point a, point b] (m, 10), in place.
-        meeting: out (m,), the first entries: the pairs that are to be computed one by one, and those whose cores meet;
-            their results are not updated.
+        meeting: out (m,), the first entries: the pairs whose results are not updated, though scenes with such pairs may
+            expect that: those whose cores meet, and those of spare slots that coal has to compute.
 
     Returns:
         Number of these.
@@ -51,7 +51,7 @@ def closed_forms(
     count = 0
     for k in pairs:
         if method[k] != CLOSED_FORM:
-            if method[k] == ONE_BY_ONE:
+            if method[k] == SPARE_BY_COAL:
                 meeting[count] = k
                 count += 1
             continue

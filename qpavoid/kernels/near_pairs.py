@@ -71,7 +71,7 @@ class DistanceArrays(NamedTuple):
     rows: IntArray
     """(m,) out, the first entries: those of them that are not ignored."""
     meeting: IntArray
-    """(m,) out, the first entries: pairs that coal has to compute one by one, and those whose cores meet."""
+    """(m,) out, the first entries: pairs whose cores meet, and those of spare slots that coal has to compute."""
     results: Array
     """(m, 10) out: distance, normal, point a, point b of the near pairs."""
 
@@ -97,7 +97,7 @@ def near_pairs(x: DistanceArrays) -> tuple[int, int, int]:
         x: reads poses; writes centers of movable bodies, near, rows, meeting and results.
 
     Returns:
-        Number of near pairs; of those that get rows; of those that coal has to compute one by one.
+        Number of near pairs; of those that get rows; of those that coal has to compute all the same.
     """
     bodies = len(x.joints)
     while bodies > 0 and x.joints[bodies - 1] < 0:  # from there on, both bodies of each pair are obstacles

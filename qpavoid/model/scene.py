@@ -209,7 +209,9 @@ def build_scene(robot: Robot, obstacles: Sequence[Obstacle] = (), spare_obstacle
                 fixed = partner < bodies and geometry.geometryObjects[partner].parentJoint == 0
                 if not (fixed and isinstance(shape, config.HalfSpace)):
                     geometry.addCollisionPair(pin.CollisionPair(partner, index))
-    _without_cylinders_among_spheres(geometry)
+    if spare or any(isinstance(body.geometry, coal.Cylinder) for body in geometry.geometryObjects):
+        for body in geometry.geometryObjects:
+            body.geometry = without_sphere(body.geometry)
     pairs = pair_array(geometry)
     pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]  # in the order in which bounding spheres are compared
     geometry.removeAllCollisionPairs()
@@ -239,7 +241,7 @@ def _spare(number: int) -> Obstacle:
 
 def spare_solid() -> Any:
     """Return the coal geometry that stands for an empty slot."""
-    return coal.Sphere(_SPARE_RADIUS)
+    return without_sphere(coal.Sphere(_SPARE_RADIUS))
 
 
 def check_name(obstacle: Obstacle, names: Sequence[str], robot: str) -> None:
@@ -262,13 +264,13 @@ def is_one_solid(shape: config.ObstacleShape, solids: Sequence[Any]) -> bool:
     return convex and len(solids) == 1
 
 
-def _without_cylinders_among_spheres(geometry: Any) -> None:
-    """Replace spheres by capsules of no length where there are cylinders, see `among_cylinders`."""
-    bodies = geometry.geometryObjects
-    if any(isinstance(body.geometry, coal.Cylinder) for body in bodies):
-        for body in bodies:
-            if isinstance(body.geometry, coal.Sphere):
-                body.geometry = coal.Capsule(body.geometry.radius, 0.0)
+def without_sphere(solid: Any) -> Any:
+    """Return a capsule of no length in place of a sphere, as where there are cylinders, or may come to be.
+
+    coal 3.0 has a formula of its own for spheres and cylinders, which is wrong by centimetres once the centre of the
+    sphere is inside; for capsules it iterates.
+    """
+    return coal.Capsule(solid.radius, 0.0) if isinstance(solid, coal.Sphere) else solid
 
 
 def _points(shape: config.PointCloud, folder: Path, where: str) -> Voxels:
