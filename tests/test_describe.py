@@ -15,7 +15,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial import ConvexHull
 
 from qpavoid import ConfigError, Robot, UnknownName
-from qpavoid.config import Box, Capsule, Hull
+from qpavoid.config import Capsule, Hull
 from qpavoid.geometry.bodies import hull_points, surface_triangles
 from qpavoid.geometry.capsules import CapsuleFit, fit_capsule
 from qpavoid.geometry.meshes import cut
@@ -173,13 +173,6 @@ def test_bodies_enclose_every_vertex(panda_described, kind):
         for corner in corners[:: max(1, len(corners) // 60)]:
             place = pin.SE3(np.eye(3), piece.placement.act(corner))
             assert min(signed_distance(point, place, shape, at) for shape, at in bodies[piece.link]) < 1e-6
-
-
-def test_more_faithful_bodies_take_less_room(panda_described):
-    volumes = {kind: sum(link.volume for link in d.links.values()) for kind, d in panda_described.items()}
-    hulls = sum(link.hulls for link in panda_described["auto"].links.values())
-    assert volumes["convex"] == pytest.approx(hulls)
-    assert hulls < volumes["auto"] <= volumes["capsules"] <= volumes["capsule"] < 2.0 * hulls
 
 
 def signed_distance(point, place, shape, at):
@@ -436,18 +429,6 @@ def test_capsules_too_fat_for_the_home_pose_become_exact(tmp_path):
     shapes = {body.name: body.shape.type for body in described.config.bodies}
     assert shapes["link0"] == shapes["link2"] == "cylinder"
     assert any("exact bodies" in note.what and {"link0", "link2"} <= {*note.subject} for note in described.notes)
-
-
-def test_bodies_are_fitted_to_what_is_seen_where_there_is_nothing_else(tmp_path):
-    urdf = write_chain(tmp_path, shape='<box size="0.1 0.1 0.2"/>')
-    urdf.write_text(urdf.read_text().replace("collision>", "visual>"))
-    described = describe(urdf, DescribeOptions(samples=50))
-    assert {type(body.shape) for body in described.config.bodies} <= {Box, Capsule}
-    assert any("no collision shape" in note.what for note in described.notes)
-    urdf.write_text(urdf.read_text().replace("visual>", "nothing>"))
-    described = describe(urdf, DescribeOptions(samples=50))
-    assert described.config.bodies == [] and any("no geometry at all" in note.what for note in described.notes)
-    assert Robot.from_config(described.config, urdf).bodies.ngeoms == 0
 
 
 def test_hulls_of_a_robot_yaml(panda_convex):

@@ -11,7 +11,7 @@ import pytest
 from conftest import BOX, CAPSULE, CYLINDER, SPHERE, lay_out_step, make_layout, random_q, random_scene
 
 from qpavoid import kernels
-from qpavoid.control.obstacles import ObstacleStates
+from qpavoid.control.obstacle_states import ObstacleStates
 from qpavoid.kernels.packing import compiled
 
 SEEDS = range(8)

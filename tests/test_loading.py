@@ -390,14 +390,6 @@ def test_package_by_name(checkout, tmp_path, how):
     assert load(path, **fields)[0].bodies.ngeoms == 3
 
 
-def test_folder_whose_name_has_an_equals_sign(checkout, tmp_path):
-    folder = tmp_path / "a=b"
-    folder.mkdir()
-    checkout.parents[1].rename(folder / "my_description")
-    path = write(tmp_path, (folder / "my_description" / "urdf" / "m.urdf").read_text())
-    assert load(path, package_dirs=["a=b"])[0].bodies.ngeoms == 3
-
-
 def test_missing_mesh_may_be_left_out(tmp_path):
     missing = '<collision><geometry><mesh filename="package://no/hand.stl"/></geometry></collision>'
     path = write(tmp_path, arm(b=missing))
@@ -515,12 +507,6 @@ def test_meshes_as_bodies_warn_with_cost_and_remedy(tmp_path):
 @pytest.mark.parametrize("name", shipped_names("robot"))
 def test_shipped_robots_do_not_warn(name):
     assert load(name)[1] == []
-
-
-def test_notes_of_the_same_are_one(tmp_path):
-    robot, (message,) = load(write(tmp_path, arm(b=SEEN_ROD, forearm=SEEN_ROD)))
-    assert "link forearm, b: no collision shape" in message
-    assert len({note.what for note in robot.notes}) == len(robot.notes)
 
 
 # --- many files ----------------------------------------------------------------------------------------------------

@@ -47,7 +47,7 @@ def read_poses(path: Path, initial: Array) -> tuple[list[float], list[Array], li
     table = read_table(read_text(path, _LARGEST_CSV, f"{path}: motion.path"), CSV_HEADERS, str(path))
     if not 2 <= len(table) <= _MOST_ROWS:
         raise ConfigError(f"{path}: {len(table)} rows of poses; give 2 to {_MOST_ROWS}, or use `type: fixed`")
-    is_sane = (np.abs(table) <= 10.0 * LARGEST).all(axis=1)  # False for NaN too; seconds of the calendar are 1.7e9
+    is_sane = np.all(np.abs(table) <= 10.0 * LARGEST, axis=1)  # False for NaN too; seconds of the calendar are 1.7e9
     norms = np.linalg.norm(np.where(is_sane[:, None], table[:, 4:], 1.0), axis=1)  # need not be 1: they are rounded
     for clause, is_bad in (
         ("not finite numbers of sane size", ~is_sane),

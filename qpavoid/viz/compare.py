@@ -133,8 +133,11 @@ def _outlines(log: Log) -> list[tuple[Array, str, float]]:
     resting = np.flatnonzero(~moving_bodies(log)).tolist()
     outlines = [(capsule_faces(log.body_ends[0, i], log.meta["body_radii"][i]), AT_REST, 0.5) for i in resting]
     for i in range(len(log.meta["obstacles"])):
-        travel = np.cumsum(np.r_[0.0, np.linalg.norm(np.diff(log.obstacle_position[:, i], axis=0), axis=1)])
+        present = np.flatnonzero(np.isfinite(log.obstacle_position[:, i]).all(axis=1))
+        if is_endless(log, i) or not len(present):
+            continue
+        travel = np.cumsum(np.r_[0.0, np.linalg.norm(np.diff(log.obstacle_position[present, i], axis=0), axis=1)])
         steps = np.unique(np.searchsorted(travel, np.linspace(0.0, travel[-1], 4))) if travel[-1] > 1e-3 else [0]
-        for rank, step in enumerate(steps if not is_endless(log, i) else ()):
-            outlines.append((obstacle_faces(log, i, int(step)), OBSTACLE, 0.5 * (rank + 1) / len(steps)))
+        for rank, step in enumerate(steps):
+            outlines.append((obstacle_faces(log, i, int(present[step])), OBSTACLE, 0.5 * (rank + 1) / len(steps)))
     return outlines

@@ -65,7 +65,8 @@ def instants(log: Log) -> IntArray:
     """
     if not len(log.t):
         return np.zeros(0, dtype=np.intp)
-    moved = np.abs(np.diff(log.q, axis=0)).sum(axis=1) + np.abs(np.diff(log.obstacle_position, axis=0)).sum((1, 2))
+    moved = np.abs(np.diff(log.q, axis=0)).sum(axis=1)
+    moved += np.nansum(np.abs(np.diff(log.obstacle_position, axis=0)), axis=(1, 2))
     # Half time, half motion: neither a long rest at the end nor a quick dodge takes all the panels.
     progress = np.cumsum(np.r_[0.0, moved / max(moved.sum(), 1e-12) + 1.0 / max(len(moved), 1)])
     steps = np.searchsorted(progress, np.linspace(0.0, progress[-1], PANELS) - 1e-9)
