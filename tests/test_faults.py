@@ -6,7 +6,7 @@ import pytest
 from closed_loop import Ruler, cartesian, drive, make_controller
 
 from qpavoid import Avoidance, NumericalError, Obstacle, ReasonKind, Sample, Severity, Status, UnknownName
-from qpavoid.config import Box, Damper, Sensing, Sphere
+from qpavoid.config import Beta, Box, Sensing, Sphere
 from qpavoid.model.sample import Pose
 
 NAN, INF = float("nan"), float("inf")
@@ -274,7 +274,7 @@ def test_nan_from_an_obstacle_counts_as_no_update(tmp_path):
 def test_jitter_of_the_period_costs_no_more_than_a_step(panda, seed):
     rng = np.random.default_rng(seed)
     wall = Obstacle.at("wall", Box(size=(0.02, 1.0, 1.0)), [0.50, 0.0, 0.5])
-    tight = Avoidance(d1=0.02, d2=0.1, row=Damper(gain=20.0))
+    tight = Avoidance(d1=0.02, d2=0.1, row=Beta(gain=20.0, near_speed=10.0))
     controller = make_controller(panda, [wall], TOOL, avoidance=tight)
     ruler, bounds = Ruler(controller.scene), panda.bounds()
     least, fastest = np.inf, 0.0

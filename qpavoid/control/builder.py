@@ -16,6 +16,7 @@ from qpavoid.control.inputs import Clock, Configurations
 from qpavoid.control.latency import CommandsUnderWay
 from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.control.settings import ControlSettings
+from qpavoid.control.slots import ObstacleSlots
 from qpavoid.control.targets import TargetReader
 from qpavoid.control.tasks import RowTask
 from qpavoid.model.limits import OUTSIDE
@@ -53,8 +54,9 @@ class ProblemBuilder:
         self._q_last, self._q_predicted = scene.robot.home.copy(), scene.robot.home.copy()
         self._under_way = CommandsUnderWay(model.nv, settings.latency, dt)
         self.rows = RowAssembler(settings, tasks, contacts)
-        self.tracker = ObstacleTracker(scene.obstacles, settings.sensing, dt, settings.latency)
+        self.tracker = ObstacleTracker(scene.slots, settings.sensing, dt, settings.latency)
         self.attachments = Attachments(scene, self.rows.query, settings.safety_distance)
+        self.slots = ObstacleSlots(scene, self.rows.query, self.tracker, self.attachments)
         self._clock = Clock(dt)
         units = [names[j] for j in bounds.v_index.tolist()]
         self._configurations = Configurations(model, bounds.q_index, bounds.lower, bounds.upper, units)

@@ -71,7 +71,7 @@ class UpdateReader:
     def __init__(self, obstacles: Sequence[Obstacle], measured: MeasuredStates, dt: float) -> None:
         """Read updates into `measured.updates`; dt is the control period [s]."""
         self._obstacles, self._measured, self._dt = obstacles, measured, dt
-        self._index = {obstacle.name: i for i, obstacle in enumerate(obstacles)}
+        self._index = {obstacle.name: i for i, obstacle in enumerate(obstacles) if obstacle.name}
         self.attached: set[int] = set()
         """Numbers of the obstacles that the robot carries, whose updates are ignored."""
         self._estimated = [Reason.of(ReasonKind.ESTIMATED, obstacle.name) for obstacle in obstacles]
@@ -86,6 +86,14 @@ class UpdateReader:
         if not isinstance(name, str) or name not in self._index:
             raise UnknownName(f"no obstacle {name!r:.60}{nearest(str(name), self._index)}")
         return self._index[name]
+
+    def rename(self, index: int, name: str, new_name: str) -> None:
+        """Know obstacle number `index` by another name, or by none where that is empty."""
+        self._index.pop(name, None)
+        if new_name:
+            self._index[new_name] = index
+        self._estimated[index] = Reason.of(ReasonKind.ESTIMATED, new_name)
+        self._selection = None
 
     def attach(self, index: int, attached: bool) -> None:
         """Ignore updates of obstacle number `index`, or read them again."""

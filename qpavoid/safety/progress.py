@@ -30,7 +30,6 @@ class ProgressMonitor:
     """Follows the progress of a controller's tasks from control step to control step."""
 
     def __init__(self, settings: ControlSettings) -> None:
-        self._names = settings.scene.pair_names
         self._limit = settings.progress.stalled_after / settings.dt  # control steps
         self.reset()
 
@@ -62,7 +61,7 @@ class ProgressMonitor:
         if not self.stalled:
             return ()
         pairs = [
-            Reason.of(ReasonKind.STALLED, *self._names[pair], amount=amount, unit="m/s")
+            Reason.of(ReasonKind.STALLED, *problem.pair_names[pair], amount=amount, unit="m/s")
             for pair, amount in _find_blocking_pairs(problem, solution.v)
         ]
         several = Reason.of(ReasonKind.STALLED, detail="several rows together")
