@@ -87,7 +87,7 @@ def test_servos_follow_a_steady_setpoint_by_their_lag(panda, joint, lag):
 
 def test_plant_measures_distances_to_obstacles_on_the_way(panda):
     ball = Obstacle.at("ball", Sphere(radius=0.05), tool_position(panda, panda.home) + np.array([0.3, 0.0, 0.0]))
-    scene = build_scene(panda, [ball])
+    scene = build_scene(panda, [ball], spare_obstacles=2)
     plant, ruler = Plant(scene, panda.home, 0.02), Ruler(scene)
     for v in (np.zeros(7), 0.2 * np.eye(7)[1], 0.2 * np.eye(7)[1]):  # it bends forwards, nearer and nearer
         expected = plant.follow(v, 0.5)
