@@ -46,7 +46,6 @@ class Controller:
         dt: float = 0.01,
         avoidance: Avoidance | None = None,
         limits: Limits | None = None,
-        tracking_damping: float = 0.01,
         sensing: Sensing | None = None,
         progress: Progress | None = None,
         contacts: ContactRows | None = None,
@@ -60,7 +59,6 @@ class Controller:
             dt: control period [s]: each velocity is meant to be held that long.
             avoidance: distances and rows; the defaults of a scenario if left out.
             limits: use of the joint limits; the defaults of a scenario if left out.
-            tracking_damping: λ of the damped J⁺ [-].
             sensing: assumptions about obstacles without updates; the defaults of a scenario if left out.
             progress: when a task counts as stalled; the defaults of a scenario if left out.
             contacts: frames that rest, see `build_contacts`; none if left out.
@@ -85,7 +83,7 @@ class Controller:
             self._no_backup = (_NO_BACKUP_WITH_CONTACTS,)
         bounds = scene.robot.bounds().within(self.limits)
         blocks = sensing or Sensing(), progress or Progress()
-        settings = ControlSettings(scene, bounds, self.avoidance, self.limits, dt, tracking_damping, *blocks)
+        settings = ControlSettings(scene, bounds, self.avoidance, self.limits, dt, *blocks)
         self._builder = ProblemBuilder(settings, self.tasks, contacts)
         self._arbiter = Arbiter(settings, law, self._builder.rows, self._builder.tracker)
         self._builder.rows.look_ahead(law.bounded and self.avoidance.look_ahead)
@@ -139,7 +137,7 @@ class Controller:
         with located(str(source)):
             controller = cls(
                 parts.scene, parts.tasks, parts.solver, scenario.dt, scenario.avoidance, scenario.limits,
-                scenario.tracking_damping, scenario.sensing, scenario.progress, parts.contacts,
+                scenario.sensing, scenario.progress, parts.contacts,
             )  # fmt: skip
         for c in scenario.obstacles:
             if c.attached_to is not None:

@@ -119,7 +119,7 @@ def test_pink_equals_tracking_with_barrier_damping():
     pytest.importorskip("pink")
     from pink.barriers import SelfCollisionBarrier
 
-    from qpavoid_bench.arena.libraries.settings import PINK
+    from qpavoid_bench.arena.libraries.settings import DAMPING, PINK
 
     case, world, pilot = start("pink", "ur5_pole", "obstacles=[]")
     (task,), targets = world.tasks, targets_at(world, 1.0)
@@ -132,7 +132,7 @@ def test_pink_equals_tracking_with_barrier_damping():
     e = pin.log6(here.actInv(there)).linear
     rows = SelfCollisionBarrier(min(PINK["n_collision_pairs"], len(movable_pairs(world.scene))))
     scale = PINK["cost"] * np.linalg.norm(rows.compute_jacobian(pilot.configuration))
-    damping = case.scenario.tracking_damping**2 + PINK["safe_displacement_gain"] / scale**2
+    damping = DAMPING**2 + PINK["safe_displacement_gain"] / scale**2
     damped = J.T @ J + damping * np.eye(model.nv)
     assert v == pytest.approx(np.linalg.solve(damped, J.T @ e) / dt, abs=1e-6)
     tracking = ENTRANTS["tracking"].start(case, world).step(world.q0, 1.0, targets, {}).v

@@ -160,7 +160,7 @@ def squeezed(gap: float) -> Problem:
     b = np.array([0.1, -0.1 + gap])
     rows = AvoidanceRows(np.arange(2), d, J, b, 0.02, 0.1, b - 1.0)
     names = [("body0", "obstacle0"), ("body1", "obstacle1")]
-    return make_problem(Tracking(np.eye(2), np.ones(2), 0.01), rows, -np.ones(2), np.ones(2), names)
+    return make_problem(Tracking(np.eye(2), np.ones(2), np.ones(2)), rows, -np.ones(2), np.ones(2), names)
 
 
 @pytest.mark.parametrize("solver", ["qp", "qp:daqp", "hqp"])

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, PrivateAttr, model_validator
 
-from qpavoid.config.base import Block, NonNegative, Number, Positive
+from qpavoid.config.base import Block, Number, Positive
 from qpavoid.config.control import Avoidance, Limits, Progress, Sensing
 from qpavoid.config.motion import Circle, Fixed, Line, Motion
 from qpavoid.config.shapes import HalfSpace, Mesh, ObstacleShape, PointCloud
@@ -66,8 +66,6 @@ class ScenarioConfig(Block):
     contacts: list[Contact] = []
     """Frames that stay where they are at q0, such as feet; for `qp` and `hqp`."""
     obstacles: list[ObstacleConfig] = []
-    tracking_damping: NonNegative = 0.01
-    """λ of the damped J⁺ of the tracking task, the same for every solver [-]; 0 gives the plain pseudo-inverse."""
     avoidance: Avoidance = Avoidance()
     limits: Limits = Limits()
     sensing: Sensing = Sensing()

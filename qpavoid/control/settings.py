@@ -21,8 +21,6 @@ class ControlSettings:
     limits: Limits
     dt: float
     """Control period [s]."""
-    tracking_damping: float = 0.01
-    """λ of the damped J⁺ [-]."""
     sensing: Sensing = field(default_factory=Sensing)
     progress: Progress = field(default_factory=Progress)
 

@@ -78,8 +78,8 @@ class Arbiter:
         """Return the solution within the limits, after the stop look-ahead."""
         try:
             if from_tasks:
-                if problem.levels and self.solver.prioritised:  # v_tracking is not a cascade's
-                    problem = self._rows.prioritised(problem, self.solver.tracked)
+                if problem.levels and self.solver.prioritised:
+                    problem = self._rows.prioritised(problem)
                 elif problem.jerk_limited:
                     problem = self._rows.within_jerks(problem)
             solution = self.solver.solve(problem)

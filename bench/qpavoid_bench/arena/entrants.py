@@ -85,7 +85,7 @@ def _start_solver(solver: SolverConfig, changes: Mapping[str, Mapping[str, Any]]
     for block, fields in changes.items():
         scenario[block] = {**scenario[block], **fields}
     x = ScenarioConfig.model_validate({**scenario, "solver": solver.model_dump()})
-    blocks = x.avoidance, x.limits, x.tracking_damping, x.sensing, x.progress
+    blocks = x.avoidance, x.limits, x.sensing, x.progress
     return Controller(world.scene, world.tasks, make_solver(x.solver), x.dt, *blocks)
 
 

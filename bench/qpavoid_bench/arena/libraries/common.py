@@ -27,7 +27,7 @@ class Adapter:
             ConfigError: the case has something that it cannot be given.
         """
         scenario, self.scene = case.scenario, world.scene
-        self.dt, self.tracking_damping, self.source = scenario.dt, scenario.tracking_damping, str(scenario.source)
+        self.dt, self.source = scenario.dt, str(scenario.source)
         self.frame_tasks = frame_tasks(case, world, library)
         self.pairs = movable_pairs(world.scene)
         self.d1, self.d2 = (d - scenario.avoidance.offset for d in (scenario.avoidance.d1, scenario.avoidance.d2))

@@ -13,7 +13,7 @@ from qpavoid.model.sample import Sample
 from qpavoid.problem import Array, Solution
 from qpavoid_bench.arena.case import Case
 from qpavoid_bench.arena.libraries.common import Adapter, task_costs
-from qpavoid_bench.arena.libraries.settings import MINK
+from qpavoid_bench.arena.libraries.settings import DAMPING, MINK
 from qpavoid_bench.arena.mujoco_model import MAX_DISTANCE, build, place_mocap
 from qpavoid_bench.arena.world import World
 
@@ -73,7 +73,7 @@ class Pilot(Adapter):
             self._tasks,
             self.dt,
             solver=MINK["solver"],
-            damping=self.tracking_damping**2,
+            damping=DAMPING**2,
             limits=self._limits,
         )
         return Solution(np.asarray(v)[model.v_index])

@@ -16,7 +16,7 @@ from qpavoid.model.sample import Sample
 from qpavoid.problem import Array, Solution
 from qpavoid_bench.arena.case import Case
 from qpavoid_bench.arena.libraries.common import Adapter, task_costs
-from qpavoid_bench.arena.libraries.settings import PINK
+from qpavoid_bench.arena.libraries.settings import DAMPING, PINK
 from qpavoid_bench.arena.world import World
 
 
@@ -36,7 +36,7 @@ class Pilot(Adapter):
             ConfigError: the case has something that it cannot be given.
         """
         super().__init__(case, world, "Pink")
-        self._damping = (PINK["cost"] * self.tracking_damping) ** 2
+        self._damping = (PINK["cost"] * DAMPING) ** 2
         model, geometry = world.scene.robot.model.copy(), pin.GeometryModel(world.scene.geometry)
         geometry.removeAllCollisionPairs()
         for a, b in self.pairs.tolist():

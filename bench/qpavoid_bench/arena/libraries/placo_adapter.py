@@ -23,7 +23,7 @@ from qpavoid.model.sample import Sample
 from qpavoid.problem import Array, Solution
 from qpavoid_bench.arena.case import Case
 from qpavoid_bench.arena.libraries.common import Adapter
-from qpavoid_bench.arena.libraries.settings import PLACO, PLACO_PYTHON
+from qpavoid_bench.arena.libraries.settings import DAMPING, PLACO, PLACO_PYTHON
 from qpavoid_bench.arena.mujoco_model import hinge_or_slide
 from qpavoid_bench.arena.world import World
 
@@ -62,7 +62,7 @@ class Pilot(Adapter):
                 for task in self.frame_tasks
             ],
             "dt": self.dt,
-            "regularization": self.tracking_damping**2,
+            "regularization": DAMPING**2,
             "margin": self.d1,
             "trigger": self.d2,
             "priority": PLACO["priority"],

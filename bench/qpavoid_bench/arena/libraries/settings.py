@@ -7,9 +7,12 @@ from __future__ import annotations
 
 from typing import Any
 
+DAMPING = 0.05
+"""λ of the damped inverse of every library [-]: all of them need one, and its square is what they are given."""
+
 _SHARED = {
     "targets": "one period ahead along the task's own law",
-    "damping": "tracking_damping squared",
+    "damping": f"{DAMPING} squared",
 }
 
 PINK: dict[str, Any] = {
