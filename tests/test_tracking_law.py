@@ -100,20 +100,22 @@ def law_by_definition(rows, v_max):
     """The formulas of the module's docstring for one task of weight 1, by numpy's singular values."""
     x, b, f = rows.x, rows.x.b, rows.x.feedback
     U, s, Vt = np.linalg.svd(x.A, full_matrices=False)
-    weak = 0.01 * s[0] ** 2
-    plain = np.abs(Vt.T @ (s / np.maximum(s**2, weak) * (U.T @ b))) / v_max
+    weak = 0.01 * np.linalg.norm(x.A @ x.A.T)
     limited = np.minimum(v_max, 10.0)
+    plain = np.abs(Vt.T @ (s / np.maximum(s**2, weak) * (U.T @ b))) / limited
     W = x.A * limited
     gram = W @ W.T
     least = np.abs(W.T @ np.linalg.solve(gram + 0.01 * np.linalg.norm(gram) * np.eye(len(b)), b))
-    g = max(1.0, min(plain.max(), least[np.isfinite(v_max)].max(initial=0.0)))
+    g = max(1.0, min(plain.max(), least.max()))
+    rate = np.max(np.abs(Vt.T @ (U.T @ b / np.where(s > 1e-12 * s[0], s, np.inf))) / g / limited)
     y, w = U.T @ b / g, (2.0 * DT * b + f / 20.0) / g
     G, size, v = rows.curvature(w), np.linalg.norm(w), np.zeros(len(v_max))
     for i in range(len(s)):
         turn = G @ Vt[i]
         c = max(0.0, 1.0 - s[i] ** 2 / (4.0 * size)) * max(0.0, -Vt[i] @ turn)
-        weakness = max(0.0, 1.0 - s[i] ** 2 / weak)
-        step = s[i] * y[i] / max(s[i] ** 2, c, weakness * (size - 50.0 * np.linalg.norm(turn)), 1e-12 * s[0] ** 2)
+        lacking = max(0.0, 1.0 - 100.0 * s[i] ** 2 / weak) * (size - 50.0 * np.linalg.norm(turn))
+        step = s[i] * y[i] / max(s[i] ** 2, c, lacking, 1e-12 * s[0] ** 2)
+        weakness = max(0.0, 1.0 - s[i] ** 2 / weak) * np.clip(5.0 * (rate / 0.3 - 1.0), 0.0, 1.0)
         if weakness > 0.0:
             fastest = 0.3 / weakness * np.min(limited / np.maximum(np.abs(Vt[i]), 1e-12))
             step = np.clip(step, -fastest, fastest)

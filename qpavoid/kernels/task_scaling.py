@@ -11,7 +11,8 @@ from qpavoid.kernels.packing import compiled
 from qpavoid.problem import Array
 
 WEAK = 0.1
-"""Share of the largest singular value below which a direction is weak [-]: ten times the joint motion for the same."""
+"""Singular value below which a direction is weak, over the size of its tasks [-]: ten times the joint motion for the
+same."""
 UNLIMITED_SPEED = 10.0
 """Speed by which coordinates without a limit are measured where a finite one is needed [rad/s, m/s]."""
 
@@ -33,7 +34,7 @@ def scale_down(x: Any, B: Array, U: Array, squares: Array, weak: Array, b: Array
         g: out (c,).
     """
     count, nv = B.shape
-    if _excess(x, B, U, squares, weak, b) <= 1.0:
+    if joint_rate(x, B, U, squares, weak, b) <= 1.0:
         return
     gram, L, z = np.empty((count, count)), np.zeros((count, count)), np.empty(count)
     W = np.empty((count, nv))  # rows in the joints' speeds
@@ -53,12 +54,12 @@ def scale_down(x: Any, B: Array, U: Array, squares: Array, weak: Array, b: Array
     for i in range(count):
         gram[i, i] += WEAK * WEAK * np.sqrt(square)
     factorise(gram, L, count)
-    together = min(_excess(x, B, U, squares, weak, b), _weighted_excess(x, W, L, b, z))
+    together = min(joint_rate(x, B, U, squares, weak, b), _weighted_rate(W, L, b, z))
     part = np.empty(count)
     for task in range(x.row_tasks.max() + 1):
         for k in range(count):
             part[k] = b[k] if x.row_tasks[x.bending_rows[k]] == task else 0.0
-        alone = min(_excess(x, B, U, squares, weak, part), _weighted_excess(x, W, L, part, z))
+        alone = min(joint_rate(x, B, U, squares, weak, part), _weighted_rate(W, L, part, z))
         for k in range(count):
             if x.row_tasks[x.bending_rows[k]] == task:
                 g[k] = max(1.0, min(together, alone))
@@ -67,7 +68,7 @@ def scale_down(x: Any, B: Array, U: Array, squares: Array, weak: Array, b: Array
 
 
 @compiled
-def _excess(x: Any, B: Array, U: Array, squares: Array, weak: Array, b: Array) -> float:
+def joint_rate(x: Any, B: Array, U: Array, squares: Array, weak: Array, b: Array) -> float:
     """Compute max_j |u_j|/v_max_j of u = Σ v_i σ_i y_i / max(σ_i², l_i²) [-]."""
     u, worst = np.zeros(B.shape[1]), 0.0
     for i in range(len(b)):
@@ -79,13 +80,13 @@ def _excess(x: Any, B: Array, U: Array, squares: Array, weak: Array, b: Array) -
             for c in range(len(u)):
                 u[c] += B[i, c] * y
     for c in range(len(u)):
-        if x.v_max[c] > 0.0:
-            worst = max(worst, abs(u[c]) / x.v_max[c])
+        if u[c] != 0.0:
+            worst = max(worst, abs(u[c]) / min(x.v_max[c], UNLIMITED_SPEED))
     return worst
 
 
 @compiled
-def _weighted_excess(x: Any, W: Array, L: Array, b: Array, z: Array) -> float:
+def _weighted_rate(W: Array, L: Array, b: Array, z: Array) -> float:
     """Compute the same of the least joint velocities in the joints' speeds, damped: u/v_max = Wᵀ (W Wᵀ + λ²)⁻¹ b."""
     worst = 0.0
     solve_factored(L, b, z, len(b))
@@ -93,6 +94,5 @@ def _weighted_excess(x: Any, W: Array, L: Array, b: Array, z: Array) -> float:
         ratio = 0.0
         for k in range(len(b)):
             ratio += W[k, c] * z[k]
-        if x.v_max[c] < np.inf:
-            worst = max(worst, abs(ratio))
+        worst = max(worst, abs(ratio))
     return worst
