@@ -10,6 +10,7 @@ import numpy as np
 
 from qpavoid import kernels
 from qpavoid.config import Avoidance, Limits, Progress, ScenarioConfig, Sensing
+from qpavoid.config.scenario import MAX_LATENCY
 from qpavoid.control.builder import ProblemBuilder, StepProblem
 from qpavoid.control.contacts import ContactRows
 from qpavoid.control.distances import DistanceQuery
@@ -49,6 +50,7 @@ class Controller:
         sensing: Sensing | None = None,
         progress: Progress | None = None,
         contacts: ContactRows | None = None,
+        latency: float = 0.0,
     ) -> None:
         """Lay out the memory of a control step.
 
@@ -62,14 +64,17 @@ class Controller:
             sensing: assumptions about obstacles without updates; the defaults of a scenario if left out.
             progress: when a task counts as stalled; the defaults of a scenario if left out.
             contacts: frames that rest, see `build_contacts`; none if left out.
+            latency: time after which the actuators follow a command [s], see `step`.
 
         Raises:
             UnknownName, SolverNotInstalled: of the solver.
-            ConfigError: dt is no period; there are contacts, and the solver is one that does not hold them.
+            ConfigError: dt or latency cannot be meant; contacts with a solver that does not hold them.
         """
         begin = perf_counter()
         if not 0.0 < dt <= _MAX_DT:
             raise ConfigError(f"dt: {dt} s, expected more than 0 and at most {_MAX_DT}; it is in seconds")
+        if not 0.0 <= latency <= MAX_LATENCY:
+            raise ConfigError(f"latency: {latency} s, expected 0 to {MAX_LATENCY}; it is in seconds")
         frames, others = in_order(tasks)
         self.scene, self.dt = scene, dt
         self.tasks: tuple[RowTask, ...] = (*frames, *others)
@@ -83,7 +88,7 @@ class Controller:
             self._no_backup = (_NO_BACKUP_WITH_CONTACTS,)
         bounds = scene.robot.bounds().within(self.limits)
         blocks = sensing or Sensing(), progress or Progress()
-        settings = ControlSettings(scene, bounds, self.avoidance, self.limits, dt, *blocks)
+        settings = ControlSettings(scene, bounds, self.avoidance, self.limits, dt, latency, *blocks)
         self._builder = ProblemBuilder(settings, self.tasks, contacts)
         self._arbiter = Arbiter(settings, law, self._builder.rows, self._builder.tracker)
         self._builder.rows.look_ahead(law.bounded and self.avoidance.look_ahead)
@@ -137,7 +142,7 @@ class Controller:
         with located(str(source)):
             controller = cls(
                 parts.scene, parts.tasks, parts.solver, scenario.dt, scenario.avoidance, scenario.limits,
-                scenario.sensing, scenario.progress, parts.contacts,
+                scenario.sensing, scenario.progress, parts.contacts, scenario.latency,
             )  # fmt: skip
         for c in scenario.obstacles:
             if c.attached_to is not None:
@@ -163,6 +168,9 @@ class Controller:
         where the last velocity has led it.
         Rotations and quaternions that are less than 1e-3 off are normalised, with a reason of kind NORMALISED.
 
+        With a `latency`, the step is that of t + latency, when the robot follows the command: q is predicted with the
+        commands under way, motions are evaluated then, targets and obstacles are moved on at their velocities.
+
         Args:
             q: configuration (nq,) as measured.
             t: time [s], at which motions are evaluated and from which ages of obstacles count; one dt after the last
@@ -176,7 +184,8 @@ class Controller:
             obstacles: where obstacles are, and how they move if that is known, by name, in place of their motion. From
                 then on they have to be updated, see `Sensing`, unless they are given `at_rest`. Each may have a time
                 stamp of its own.
-            v: velocity (nv,) as measured, from which acceleration limits count; the last command if left out.
+            v: velocity (nv,) as measured, from which acceleration limits count in the first step, after a gap and after
+                `reset`. In all other steps they count from the last command, as those of servos that lag have to.
 
         Raises:
             NumericalError: an argument of the wrong shape, or not made of numbers.
@@ -239,7 +248,7 @@ class Controller:
             solution = arbiter.stop(step.problem, step.faults)
         else:
             solution = arbiter.decide(step.q, step.t, step.problem, step.proximity, from_tasks)
-        builder.rows.previous.remember(solution.v)
+        builder.remember(solution.v)
         assumptions = step.assumptions
         if self._no_backup and len(builder.tracker.moving):
             assumptions += self._no_backup

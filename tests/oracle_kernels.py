@@ -15,7 +15,7 @@ def distance_rows(x, pairs, influence_distance):
 
     A row is (n, p × n) J_world at the world's origin; columns that one coordinate moves are added up.
     """
-    near = pairs[~(x.results[pairs, 0] >= influence_distance)]  # a NaN is near, not hidden
+    near = pairs[~(x.results[pairs, 0] - x.margin[x.twist_row[pairs]] >= influence_distance)]  # a NaN is near
     n, p = x.results[near, 1:4], x.results[near, 4:7]
     row_wrenches = np.hstack((n, np.cross(p, n)))
     fold = np.eye(len(x.v_max))[x.columns]

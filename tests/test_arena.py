@@ -7,11 +7,11 @@ import pytest
 
 from qpavoid import Solution, load_scenario
 from qpavoid.errors import ConfigError, UnknownName
+from qpavoid.run.mujoco import build
 from qpavoid.run.simulate import simulate
 from qpavoid_bench.arena.case import Case, Sensor, SensorModel
 from qpavoid_bench.arena.checker import Contact, Findings, check_run
 from qpavoid_bench.arena.entrants import ENTRANTS, find_entrant
-from qpavoid_bench.arena.mujoco_model import build
 from qpavoid_bench.arena.rollout import Rollout, roll_out
 from qpavoid_bench.arena.scores import COLUMNS, score
 from qpavoid_bench.arena.trial import run_trial

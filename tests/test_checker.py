@@ -11,15 +11,16 @@ import pytest
 from conftest import BOX, CAPSULE, CYLINDER, SPHERE, obstacle, random_q, random_scene, write_chain
 
 from qpavoid import Limits, Robot, ScenarioConfig, build_scene, load_scenario
+from qpavoid.control.scenario import build_parts
 from qpavoid.run.simulate import simulate
 
 pytest.importorskip("mujoco")
 
+from qpavoid.run.mujoco import build
 from qpavoid_bench.arena.checker import STEP, DistanceMonitor, check_run
 from qpavoid_bench.arena.evasion import JointLimits, Start, evade, policies
 from qpavoid_bench.arena.families import load_family
 from qpavoid_bench.arena.families.make import make_case
-from qpavoid_bench.arena.mujoco_model import build, load_model
 from qpavoid_bench.arena.verdict import decisive, judge
 
 ROBOTS = ("panda", "paper-dual-arm", "ur5")
@@ -35,6 +36,11 @@ def robot(name):
 def situation(solver):
     scenario = load_scenario("situation1")
     return load_model(scenario), simulate(scenario, solver)
+
+
+def load_model(scenario):
+    parts = build_parts(scenario)
+    return build(parts.scene, parts.q0)
 
 
 def scene_of(robot_path, tasks, obstacles, **fields):

@@ -16,7 +16,7 @@ from qpavoid.model.cloud import voxel_radius
 
 pytest.importorskip("mujoco")
 
-from qpavoid_bench.arena.mujoco_model import build
+from qpavoid.run.mujoco import build
 
 TCP, HOLD = "panda_hand_tcp", 0.02
 

@@ -61,7 +61,7 @@ def test_targets_replace_the_motion(controller, panda):
     np.testing.assert_allclose(bare.v, solution.v, rtol=0, atol=1e-14)
 
 
-def test_accelerations_count_from_the_last_or_the_measured_velocity(controller, panda):
+def test_accelerations_count_from_the_last_command_and_at_first_from_the_measured_velocity(controller, panda):
     bound = panda.bounds().acceleration * controller.dt
     here = controller.tick(panda.home).kinematics.position[0]
     far = {"panda_hand_tcp": Sample.at(here + np.array([0.0, 0.4, 0.0]))}
@@ -71,7 +71,10 @@ def test_accelerations_count_from_the_last_or_the_measured_velocity(controller, 
     assert (changes <= bound + 1e-9).all() and np.isclose(changes, bound).any()
     measured = np.full(7, 0.3)
     v = controller.step(panda.home, targets=far, v=measured).v
-    assert (np.abs(v - measured) <= bound + 1e-9).all() and (np.abs(v - commands[-1]) > bound + 1e-3).any()
+    assert (np.abs(v - commands[-1]) <= bound + 1e-9).all() and (np.abs(v - measured) > bound + 1e-3).any()
+    controller.reset()
+    v = controller.step(panda.home, targets=far, v=measured).v
+    assert (np.abs(v - measured) <= bound + 1e-9).all() and (np.abs(v - commands[1]) > bound + 1e-3).any()
 
 
 def test_solver_may_be_exchanged(controller, panda):

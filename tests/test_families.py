@@ -77,8 +77,8 @@ def test_cases_are_the_same_in_another_process():
 def test_plan_is_clear_in_mujoco(name, monkeypatch):
     """Mujoco finds the plan clear."""
     pytest.importorskip("mujoco")
+    from qpavoid.run.mujoco import build
     from qpavoid_bench.arena.checker import DistanceMonitor
-    from qpavoid_bench.arena.mujoco_model import build
 
     plans = []
     monkeypatch.setattr(

@@ -132,7 +132,7 @@ def test_distance_rows_are_rates_of_the_witness_points(robot, seed):
     x, some = step.x, np.flatnonzero(step.rng.random(len(step.pairs)) < 0.7)
     for pairs, distance in ((some, 0.3), (step.pairs, np.inf), (step.pairs, 0.0), (some[:0], 1.0)):
         k = run("distance_rows", x, pairs, distance, True)
-        near = pairs[x.results[pairs, 0] < distance]
+        near = pairs[x.results[pairs, 0] - x.margin[x.twist_row[pairs]] < distance]
         np.testing.assert_array_equal(x.near_pairs[:k], near)
         np.testing.assert_array_equal(x.closest[:k], x.results[near])
         among, J, rates = oracle.distance_rows(x, pairs, distance)
@@ -533,7 +533,8 @@ def test_backup_rows_are_those_of_enabled_pairs_without_contact(paper, seed):
     x, rng = step.x, step.rng
     pairs = np.flatnonzero(rng.random(len(step.pairs)) < 0.7)
     enabled = rng.random(len(step.pairs)) < 0.7
-    before, distance = enabled.copy(), x.results[:, 0].copy()
+    before, margin = enabled.copy(), x.margin[x.twist_row]
+    distance = x.results[:, 0] - margin
     contact, influence = np.quantile(distance[pairs], [0.2, 0.8])
     near = [i for i in pairs.tolist() if distance[i] < influence and before[i]]
     kept = [i for i in near if distance[i] >= contact]
@@ -545,6 +546,7 @@ def test_backup_rows_are_those_of_enabled_pairs_without_contact(paper, seed):
     found = [array.copy() for array in (x.closest[:k], x.J[:k], x.feedforward[:k], x.lower, x.upper)]
     run("distance_rows", x, np.array(kept), np.inf, True)
     run("velocity_bounds", x, step.q)
+    x.closest[:k, 0] -= margin[kept]
     for a, b in zip(found, (x.closest[:k], x.J[:k], x.feedforward[:k], x.lower, x.upper), strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-14)
 

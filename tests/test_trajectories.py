@@ -228,43 +228,6 @@ def test_check_states_normalises_what_is_nearly_a_rotation(data):
         np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-15)
 
 
-def random_news(rng, count=9):
-    """Arguments of `update_measured_states`: samples; bare poses, some first or of the same time; one at rest."""
-    which = rng.permutation(count)[:7]
-    news, last = random_states(rng, count, True), random_states(rng, count, True)
-    kind = np.array([SAMPLE, POSE, POSE, POSE, REST, SAMPLE, POSE])
-    times, stamps = rng.uniform(1.0, 2.0, 7), rng.uniform(0.0, 0.9, count)
-    stamps[which[1]], stamps[which[2]], stamps[which[0]] = np.nan, times[2] - 1e-6, np.nan
-    news[which[6], 9] += 1e4  # faster than anything
-    return [which, kind, times, news, stamps, last, random_states(rng, count, True), 1e-5, 1e3]
-
-
-@pytest.mark.parametrize("seed", range(10))
-def test_take_in_gives_bare_poses_the_twist_that_has_led_to_them(seed):
-    rng = np.random.default_rng(seed)
-    which, kind, times, news, stamps, last, states, _, _ = args = random_news(rng)
-    given, known, before, were = news.copy(), stamps.copy(), last.copy(), states.copy()
-    fine = kernels.update_measured_states(*args)
-    assert fine.tolist() == [True] * 6 + [False]
-    for k, i in enumerate(which[:6]):
-        expected = given[i].copy()
-        if kind[k] != SAMPLE:
-            expected[12:] = 0.0
-        if k == 2:
-            expected[12:] = before[i, 12:]
-        elif k == 3:
-            elapsed = times[k] - known[i]
-            R, R0 = (state[i, :9].reshape(3, 3).T for state in (given, before))
-            expected[12:15] = (given[i, 9:12] - before[i, 9:12]) / elapsed
-            expected[15:] = pin.log3(R @ R0.T) / elapsed
-        np.testing.assert_allclose(states[i], expected, rtol=1e-9, atol=1e-9)
-        np.testing.assert_array_equal(last[i], states[i])
-        assert stamps[i] == times[k]
-    others = np.setdiff1d(np.arange(9), which[:6])
-    for now, was in ((stamps, known), (last, before), (states, were)):
-        np.testing.assert_array_equal(now[others], was[others])
-
-
 # --- in the tick -------------------------------------------------------------------------------------------------
 
 

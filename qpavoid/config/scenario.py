@@ -7,13 +7,15 @@ from typing import Annotated, Literal
 
 from pydantic import Field, PrivateAttr, model_validator
 
-from qpavoid.config.base import Block, Number, Positive
+from qpavoid.config.base import Block, NonNegative, Number, Positive
 from qpavoid.config.control import Avoidance, Limits, Progress, Sensing
 from qpavoid.config.motion import Circle, Fixed, Line, Motion
 from qpavoid.config.shapes import HalfSpace, Mesh, ObstacleShape, PointCloud
 from qpavoid.config.solver import QpSolver, SolverConfig
 from qpavoid.config.tasks import AnyTask, Contact
 
+MAX_LATENCY = 0.5
+"""Longest time after which actuators may follow a command [s]: a longer one is in milliseconds."""
 _MAX_STEPS = 1_000_000
 """Control steps of a run, at most: their log takes a gigabyte or two of memory; at 10 ms they are 2.8 hours."""
 
@@ -26,6 +28,8 @@ class ObstacleConfig(Block):
     shape: ObstacleShape
     motion: Motion
     """Where its origin is; what a task could take from its frame must be given here."""
+    uncertainty: NonNegative = 0.0
+    """How far it may be from where it is said to be [m]: that much is taken off its distances."""
     graspable: bool = False
     """Whether it may be attached to a frame of the robot for a while; costs pairs with the other obstacles."""
     attached_to: str | None = None
@@ -74,6 +78,8 @@ class ScenarioConfig(Block):
     """A name (`eq10`, `qp:osqp`) or a mapping with that solver's settings."""
     dt: Annotated[float, Field(gt=0, le=0.1)] = 0.01
     """Control period [s]."""
+    latency: Annotated[float, Field(ge=0, le=MAX_LATENCY)] = 0.0
+    """Time after which the actuators follow a command [s]: states are predicted by so much."""
     duration: Positive
     """Length of the run [s]."""
     goal_tolerance: Positive = 0.005

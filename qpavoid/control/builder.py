@@ -13,6 +13,7 @@ from qpavoid.control.assembler import RowAssembler
 from qpavoid.control.attach import Attachments
 from qpavoid.control.contacts import ContactRows
 from qpavoid.control.inputs import Clock, Configurations
+from qpavoid.control.latency import CommandsUnderWay
 from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.control.settings import ControlSettings
 from qpavoid.control.targets import TargetReader
@@ -27,9 +28,9 @@ class StepProblem(NamedTuple):
     """Problem of a control step, with what it was made of."""
 
     q: Array
-    """(nq,)."""
+    """(nq,) where the robot is when it follows the command."""
     t: float
-    """[s]."""
+    """When that is [s]."""
     resumed: bool
     """Whether the step begins anew: after a gap, or because the clock was set back."""
     targets: Sequence[Any]
@@ -48,14 +49,16 @@ class ProblemBuilder:
         """Lay the memory out; see `RowAssembler` for the arguments."""
         scene, bounds, dt = settings.scene, settings.bounds, settings.dt
         model, names = scene.robot.model, scene.robot.coordinate_units
-        self._model, self._bounds, self._dt, self._q_last = model, bounds, dt, scene.robot.home.copy()
+        self._model, self._bounds, self._dt, self._latency = model, bounds, dt, settings.latency
+        self._q_last, self._q_predicted = scene.robot.home.copy(), scene.robot.home.copy()
+        self._under_way = CommandsUnderWay(model.nv, settings.latency, dt)
         self.rows = RowAssembler(settings, tasks, contacts)
-        self.tracker = ObstacleTracker(scene.obstacles, settings.sensing, dt)
+        self.tracker = ObstacleTracker(scene.obstacles, settings.sensing, dt, settings.latency)
         self.attachments = Attachments(scene, self.rows.query, settings.safety_distance)
         self._clock = Clock(dt)
         units = [names[j] for j in bounds.v_index.tolist()]
         self._configurations = Configurations(model, bounds.q_index, bounds.lower, bounds.upper, units)
-        targets = TargetReader(tasks, self.rows.targets)
+        targets = TargetReader(tasks, self.rows.targets, settings.latency)
         shapes = (model.nq,), (model.nv,)
         self._reader = ArgumentReader(shapes, self._clock, self._configurations, targets, self.tracker)
 
@@ -67,17 +70,15 @@ class ProblemBuilder:
         """Take over the arguments of a step, and build its problem."""
         times, q, v, v_desired, targets, update, faults, assumptions = arguments
         rows, query = self.rows, self.rows.query
-        if times.resumed:
-            rows.previous.restart(np.zeros(self._model.nv))
-        if v is not None:
-            rows.previous.measure(v)
-        if q is None:  # where the robot is if it moved as commanded
-            q = np.asarray(pin.integrate(self._model, self._q_last, self._dt * rows.previous.v))
-        self._q_last[:] = q
+        if times.resumed or (v is not None and self._clock.is_first):
+            self._restart(np.zeros(self._model.nv) if v is None else v)
+        elif times.periods > 1:
+            self._under_way.add(rows.previous.v, times.periods - 1)
+        q = self._predict(q)
         self._clock.set(times.t)
         if update is not None:
             observed = self.tracker.advance(update)
-            query.place(self.tracker.at(times.t))
+            query.place(self.tracker.current)
             faults, assumptions = faults + observed.stop, assumptions + observed.assumptions
         proximity, problem = rows.compute(q, targets)
         if self.attachments.is_watching:
@@ -86,7 +87,32 @@ class ProblemBuilder:
             problem = rows.follow(v_desired, problem)
         if problem.position_margin < -OUTSIDE:
             assumptions += self._bounds.outside(q, problem.joint_names, problem.joint_units)
-        return StepProblem(q, times.t, times.resumed, targets, proximity, problem, faults, assumptions)
+        t = times.t + self._latency
+        return StepProblem(q, t, times.resumed, targets, proximity, problem, faults, assumptions)
+
+    def _predict(self, q: Array | None) -> Array:
+        """Return where the robot is when it follows this step's command, if it follows those under way until then.
+
+        Args:
+            q: as measured (nq,); None where it is unknown: it moved as commanded.
+        """
+        if q is None:
+            predicted = np.asarray(pin.integrate(self._model, self._q_predicted, self._dt * self.rows.previous.v))
+            q = pin.integrate(self._model, predicted, -self._under_way.displacement) if self._latency else predicted
+        else:
+            predicted = pin.integrate(self._model, q, self._under_way.displacement) if self._latency else q
+        self._q_last[:], self._q_predicted[:] = q, predicted
+        return predicted
+
+    def remember(self, v: Array) -> None:
+        """Take v (nv,) as what is commanded from this step to the next one."""
+        self.rows.previous.remember(v)
+        self._under_way.add(v)
+
+    def _restart(self, v: Array) -> None:
+        """Take the robot to have been moving at v (nv,), as commanded."""
+        self.rows.previous.restart(v)
+        self._under_way.fill(v)
 
     def attach(self, index: int, frame_id: int, q: Array | None) -> None:
         """Attach an obstacle to a frame; see `Controller.attach`."""
@@ -120,6 +146,6 @@ class ProblemBuilder:
 
     def reset(self, v: Array) -> None:
         """Forget the steps before; the robot moves at v (nv,). Attached objects stay attached."""
-        self.rows.previous.restart(v)
+        self._restart(v)
         self._clock.reset()
         self.tracker.reset()

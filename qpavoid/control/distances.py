@@ -82,6 +82,9 @@ class DistanceQuery:
             results=read_results(self._data.distanceResults) if results is None else results,
         )
         """Memory of the distances, see `DistanceArrays`; the results are those of `pairs`."""
+        self._uncertainty = np.array([obstacle.uncertainty for obstacle in scene.obstacles])
+        self.arrays.margin[:obstacles] = self._uncertainty
+        self.arrays.margin[obstacles + 1 :] = self._uncertainty[: rows - obstacles - 1]
         self.packed = kernels.pack(self.arrays)
         self.is_moving = False
         """Whether any obstacle has a velocity or a margin."""
@@ -131,7 +134,9 @@ class DistanceQuery:
     def set_influence_distance(self, influence_distance: float) -> None:
         """Choose the surface distance below which a pair is near [m]."""
         if influence_distance != self.influence_distance:
-            radius, pair_of = self.table.spheres[:, 3], self.table.pair_of
+            radius, pair_of = self.table.spheres[:, 3].copy(), self.table.pair_of
+            for index, uncertainty in enumerate(self._uncertainty.tolist()):
+                radius[self.table.first[index] : self.table.first[index + 1]] += uncertainty
             touching = radius[: len(pair_of), None] + radius + influence_distance
             self.arrays.max_square[:] = np.where(pair_of >= 0, touching**2 * (1.0 + 1e-9), -1.0)
             self.influence_distance = influence_distance
@@ -251,7 +256,8 @@ class DistanceQuery:
         """Move the proxies of a cloud to the voxels that are nearest to each body."""
         x, unattached = self.arrays, np.flatnonzero(self.table.joints < 0)
         poses, sample = x.poses[: len(self.table.joints)], Sample.of_row(x.states[index])
-        positions = cloud.places(poses, unattached, sample, self.influence_distance).reshape(-1, 3)
+        influence_distance = self.influence_distance + self._uncertainty[index]
+        positions = cloud.places(poses, unattached, sample, influence_distance).reshape(-1, 3)
         proxies = cloud.geometries.ravel()
         x.poses[proxies, 9:] = x.centers[proxies, :3] = positions
         x.centers[proxies, 4] = -np.einsum("ij,ij->i", positions, positions)

@@ -10,6 +10,7 @@ import numpy as np
 from qpavoid import kernels
 from qpavoid.control.inputs import FASTEST
 from qpavoid.control.trajectories import extrapolate
+from qpavoid.kernels.estimates import FIT
 from qpavoid.model.sample import STATE, Sample
 from qpavoid.problem import Array, IntArray
 
@@ -50,6 +51,7 @@ class MeasuredStates:
         """(o,) whether these were at rest."""
         self.states = np.zeros((count, STATE))
         """(o, 18) the last updates, at their time stamps."""
+        self._fits = np.zeros((count, FIT))
         self.updates = np.zeros((count, STATE))
         """(o, 18) what the step is given, before it is taken over."""
         self.known: dict[int, None] = {}
@@ -59,7 +61,7 @@ class MeasuredStates:
         """Drop what is known of obstacle number `index`."""
         self.known.pop(index, None)
         self.stamps[index], self.at_rest[index] = nan, False
-        self._counts[index], self.twists[index] = 0.0, 0.0
+        self._counts[index], self.twists[index], self._fits[index] = 0.0, 0.0, 0.0
 
     def begin(self, index: int, t: float, sample: Sample) -> None:
         """Take a sample as what is known of obstacle number `index` at t [s]."""
@@ -81,7 +83,7 @@ class MeasuredStates:
         return int(
             kernels.update_estimates(
                 which, kind, stamps, self.updates, self.stamps, self.states, states,
-                self._shortest, FASTEST, _STEADY, self.twists, self._counts, self.at_rest,
+                self._fits, self._shortest, FASTEST, _STEADY, self.twists, self._counts, self.at_rest,
             )
         )  # fmt: skip
 

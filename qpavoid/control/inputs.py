@@ -53,6 +53,8 @@ class Times(NamedTuple):
     """By how much the clock was set back, as far as is known [s]; never positive."""
     resumed: bool = False
     """Whether the step begins anew: after a gap, or because the clock was set back."""
+    periods: int = 1
+    """Control periods since the last step."""
     faults: tuple[Reason, ...] = ()
     notes: tuple[Reason, ...] = ()
 
@@ -64,6 +66,11 @@ class Clock:
         self._dt, self._now = dt, -inf
         self._gap = max(_GAP[0] * dt, _GAP[1])
         self._fine = 2.0 ** (52 + floor(log2(_RESOLUTION * dt)))  # below it, the resolution of a time is fine enough
+
+    @property
+    def is_first(self) -> bool:
+        """Whether the next step is the first one."""
+        return self._now == -inf
 
     def reset(self) -> None:
         """Let the next step be the first one."""
@@ -99,7 +106,8 @@ class Clock:
         back = step < 0.0
         detail = "the clock was set back" if back else ""
         note = Reason.of(ReasonKind.TIMING, "t", amount=off, unit="s", severity=severity, detail=detail)
-        return Times(t, off if back else 0.0, back or step > self._gap, notes=(note,))
+        periods = max(1, round(step / self._dt))
+        return Times(t, off if back else 0.0, back or step > self._gap, periods, notes=(note,))
 
 
 def as_time(name: str, t: Any) -> float:

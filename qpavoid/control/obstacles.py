@@ -1,8 +1,8 @@
 """Tracks the obstacles: on their trajectories, or by the poses and twists that a program gives, step by step or late.
 
 An obstacle is external from the time on at which a program gives it, or from the start if the scene says so. What is
-given has a time stamp, that of the control step if it brings none. A bare pose gets a twist from the difference of two
-poses over that of their stamps. An external obstacle that is not updated keeps its last twist; after `stale_after`
+given has a time stamp, that of the control step if it brings none. A bare pose gets a twist from a line through the
+poses of late, over their stamps. An external obstacle that is not updated keeps its last twist; after `stale_after`
 its distances shrink by a margin that grows, and after `stop_after` the robot stops, unless it was given `at_rest`. Each
 assumption is named in `Solution.assumptions`.
 """
@@ -82,9 +82,9 @@ class StepUpdate(NamedTuple):
 class ObstacleTracker:
     """Keeps the states of the obstacles of a scene."""
 
-    def __init__(self, obstacles: Sequence[Obstacle], config: Sensing, dt: float) -> None:
-        """Lay out memory for some obstacles; dt is the control period [s]."""
-        self._obstacles = obstacles
+    def __init__(self, obstacles: Sequence[Obstacle], config: Sensing, dt: float, latency: float = 0.0) -> None:
+        """Lay out memory; dt is the control period, a step needs the states of `latency` after its time [s]."""
+        self._obstacles, self._latency = obstacles, latency
         least, (stale, stop) = _LEAST_PERIODS * dt + _ROUND_OFF, (config.stale_after, config.stop_after)
         self._stale_after = np.inf if stale is None else max(stale + _ROUND_OFF, least)
         self._stop_after = np.inf if stop is None else max(stop + _ROUND_OFF, least)
@@ -92,7 +92,9 @@ class ObstacleTracker:
         self._trajectories = TrajectoryBatch({i: obstacles[i].motion for i in self._moving})
         self._now, count = 0.0, len(obstacles)
         self.current = ObstacleStates(np.array(self._moving, np.intp), np.zeros((count, STATE)), np.zeros(count), {})
-        """States in the last step; the next one overwrites them."""
+        """States in the last step, `latency` after it; the next one overwrites them."""
+        self._uncertainty = np.array([obstacle.uncertainty for obstacle in obstacles])
+        self.current.margin[:] = self._uncertainty
         for state, obstacle in zip(self.current.states, obstacles, strict=True):
             state[:] = obstacle.motion.sample(0.0).row
         self._placed: set[int] = set()  # numbers of those that are, or were, attached to the robot
@@ -192,7 +194,7 @@ class ObstacleTracker:
         self._awaited.discard(index)
         self._placed.add(index)
         self._reader.attach(index, True)
-        self.current.states[index, 12:], self.current.margin[index] = 0.0, 0.0
+        self.current.states[index, 12:], self.current.margin[index] = 0.0, self._uncertainty[index]
         self._renew()
 
     def release(self, index: int, sample: Sample) -> None:
@@ -261,7 +263,7 @@ class ObstacleTracker:
         sampled = []
         for index, motion in self._trajectories.others.items():
             if index in self._moving and index not in self._measured.known and index not in given:
-                sample = motion.sample(t)
+                sample = motion.sample(t + self._latency)
                 state = sample.row[None].copy()
                 code = int(kernels.check_states(state, _FIRST, _SAMPLED, FARTHEST, FASTEST)[0][0])
                 if code > NORMALISED:
@@ -275,11 +277,11 @@ class ObstacleTracker:
         if update is None:
             return _NOTHING
         t, shift, given, sampled = update
-        self._now, self._estimates, current = t, None, self.current
+        self._now, self._estimates, current = t + self._latency, None, self.current
         if shift:
             self._measured.stamps += shift
             self._sampled.clear()
-        self._trajectories.sample(t, current.states)
+        self._trajectories.sample(self._now, current.states)
         for index, sample in sampled:
             current.states[index] = sample.row
         if given.unusable or self._awaited:
@@ -289,8 +291,9 @@ class ObstacleTracker:
             notes += self._take_over(given)
             self.current.voxels.update(given.voxels)
         if len(self.external):
-            current.margin.fill(0.0)
-            stale = self._measured.extrapolate(self.external, t, self._stale_after, current.states, current.margin)
+            current.margin[:] = self._uncertainty
+            stale_after = self._stale_after + self._latency
+            stale = self._measured.extrapolate(self.external, self._now, stale_after, current.states, current.margin)
             if stale or self._awaited:
                 assumptions, stop = self._overdue(t)
                 notes += assumptions

@@ -1,4 +1,4 @@
-"""The velocity at which the robot moves when a control step begins, from which accelerations and jerks count."""
+"""The velocity that was commanded when a control step begins, from which accelerations and jerks count."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from qpavoid.problem import Array
 
 
 class PreviousVelocity:
-    """Velocity of the previous step and its change, in the memory of the kernels: what was commanded, or measured.
+    """Velocity of the previous step and its change, in the memory of the kernels: what was commanded.
 
     Where contacts are held, the kernels count from the nearest velocity that holds them, as they have turned a little
     since; what was really commanded is kept beside it.
@@ -39,10 +39,6 @@ class PreviousVelocity:
             self._commanded[:] = v
             np.clip(self._change, -self._x.v_step, self._x.v_step, out=self._x.dv_prev)
         self._x.v_prev[:] = v
-
-    def measure(self, v: Array) -> None:
-        """Take v (nv,) as the velocity at which the robot moves until this step; accelerations stay as commanded."""
-        self._x.v_prev[:], self._commanded[:] = v, v
 
     def restart(self, v: Array) -> None:
         """Take v (nv,) as the velocity at which the robot has been moving, without any acceleration."""

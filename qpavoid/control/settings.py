@@ -21,6 +21,8 @@ class ControlSettings:
     limits: Limits
     dt: float
     """Control period [s]."""
+    latency: float = 0.0
+    """Time after which the actuators follow a command [s]."""
     sensing: Sensing = field(default_factory=Sensing)
     progress: Progress = field(default_factory=Progress)
 

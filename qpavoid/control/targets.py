@@ -10,6 +10,7 @@ import numpy as np
 from qpavoid import kernels
 from qpavoid.control.inputs import FARTHEST, FASTEST, FAULTS
 from qpavoid.control.tasks import RowTask
+from qpavoid.control.trajectories import extrapolate
 from qpavoid.errors import ConfigError, NumericalError, UnknownName, nearest
 from qpavoid.kernels.obstacles import FINE, NORMALISED, SAMPLE
 from qpavoid.model.sample import Sample
@@ -34,12 +35,13 @@ class Targets(NamedTuple):
 class TargetReader:
     """Reads the targets of a step into the memory of the frame tasks."""
 
-    def __init__(self, tasks: Sequence[RowTask], frames: Array) -> None:
+    def __init__(self, tasks: Sequence[RowTask], frames: Array, latency: float = 0.0) -> None:
         """Lay out memory for some tasks.
 
         Args:
             tasks: frame tasks, then all others.
             frames: (f, 18) states that the rows of the frame tasks are made of; every `read` overwrites them.
+            latency: time from a step to that for which it needs the targets [s].
 
         Raises:
             ConfigError: two tasks have the same name.
@@ -47,7 +49,7 @@ class TargetReader:
         self._tasks = {task.settings.label: task for task in tasks}
         if len(self._tasks) < len(tasks):
             raise ConfigError(f"tasks: two have the same name among {', '.join(self._tasks)}; give one a `name`")
-        self._names, self._frames = list(self._tasks), frames
+        self._names, self._frames, self._latency = list(self._tasks), frames, latency
         self._motions: list[Any] = [task.motion for task in tasks]
         self._is_still = all(type(motion) is Trajectory and motion.is_still for motion in self._motions[: len(frames)])
         self._is_written = False  # whether the frames are the poses of motions that never change
@@ -68,14 +70,15 @@ class TargetReader:
         if targets is not None and type(targets) is not dict and not isinstance(targets, Mapping):
             raise NumericalError(f"targets: give a mapping of names to targets, not {targets!r:.60}")
         if not targets:
-            samples = [motion.sample(t) for motion in self._motions]
+            samples = [motion.sample(t + self._latency) for motion in self._motions]
             if not (self._is_still and self._is_written):
                 self._write(samples)
                 self._is_written = True
             return Targets(samples)
         self._is_written = False
         samples = [targets.get(name) for name in self._names]
-        if len(targets) == len(samples) == len(self._frames) and set(map(type, samples)) == {Sample}:
+        plain = not self._latency and len(targets) == len(samples) == len(self._frames)
+        if plain and set(map(type, samples)) == {Sample}:
             self._write(samples)
             if kernels.are_fine(self._frames, FARTHEST, FASTEST):
                 return Targets(samples)
@@ -99,7 +102,11 @@ class TargetReader:
                 sample, reason = _checked(name, task, sample)
                 if reason is not None:
                     (normalised if reason.kind is ReasonKind.NORMALISED else faults).append(reason)
-            samples.append(task.motion.sample(t) if sample is None else sample)
+                if self._latency and isinstance(sample, Sample):
+                    state = sample.row[None].copy()
+                    extrapolate(state, self._latency)
+                    sample = Sample.of_row(state[0])
+            samples.append(task.motion.sample(t + self._latency) if sample is None else sample)
         if unknown := [name for name in targets if name not in self._tasks]:
             raise UnknownName(f"no target {unknown[0]!r:.60}{nearest(str(unknown[0]), self._tasks)}")
         self._write(samples)

@@ -31,7 +31,7 @@ from qpavoid.kernels.estimates import (
 from qpavoid.kernels.kinematics import KinematicsArrays, update_kinematics
 from qpavoid.kernels.layout import RowLayout
 from qpavoid.kernels.near_pairs import DistanceArrays, near_pairs, place_bodies, place_obstacles
-from qpavoid.kernels.obstacles import Pieces, check_states, sample_pieces, update_measured_states
+from qpavoid.kernels.obstacles import Pieces, check_states, sample_pieces
 from qpavoid.kernels.qp import max_clearance_velocity, minimize, project, project_soft
 from qpavoid.kernels.rotation import rotation_vector
 from qpavoid.kernels.rows import alpha, beta, distance_rows, row_bounds
@@ -96,7 +96,6 @@ __all__ = [
     "tracking_violation",
     "update_estimates",
     "update_kinematics",
-    "update_measured_states",
     "velocity_bounds",
     "violation",
     "voxels_within",

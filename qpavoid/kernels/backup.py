@@ -21,7 +21,7 @@ ROUND_OFF = 1e-12
 def backup_rows(
     x: Any, q: Array, pairs: IntArray, influence_distance: float, moving: bool, enabled: Mask, touch: float
 ) -> tuple[int, int, float, float]:
-    """Write velocity bounds, and the rows of the enabled pairs that are near and not in contact.
+    """Write velocity bounds, and the rows of the enabled pairs that are near and not in contact, less their margins.
 
     Args:
         x: see `velocity_bounds` and `distance_rows`.
@@ -42,6 +42,7 @@ def backup_rows(
     for i in range(k):
         if not enabled[x.near_pairs[i]]:
             continue
+        x.closest[i, 0] -= x.margin[x.twist_row[x.near_pairs[i]]]
         distance, slack = x.closest[i, 0], x.distance_allowance[x.near_pairs[i]]
         nearest = np.minimum(nearest, distance + slack)  # keeps NaN, unlike min
         if not distance >= touch:

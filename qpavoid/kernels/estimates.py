@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from qpavoid.kernels.obstacles import FINE, POSE, REST, SAMPLE, check_states, update_measured_states
+from qpavoid.kernels.obstacles import FINE, POSE, REST, SAMPLE, check_states
 from qpavoid.kernels.packing import compiled
+from qpavoid.kernels.tasks import _rotation_vector
 from qpavoid.problem import Array, IntArray
 
 
@@ -61,12 +62,85 @@ def write_rows(
     return count
 
 
+FIT = 27
+"""Numbers in the fit of an obstacle's poses: its last pose; the weighted sums of 1, x, x², y and x y over all poses,
+with times x and displacements y (6,) from the last one, rotations as vectors."""
+POSE_WEIGHT = 0.6
+"""Weight of a pose in the fit, to that of the next one [-]: errors are those of a line through 7 poses of equal weight;
+a change of velocity takes 3 poses."""
+_JUMP = 0.03, 0.3
+"""Distance [m] and angle [rad] from the fit at which a pose starts it anew: several times the noise of a camera."""
+
+
+@compiled
+def fit_pose(x: Array, fit: Array, interval: float, max_speed: float) -> bool:
+    """Put a pose on the line through it and those before, and estimate its twist as the slope of that line.
+
+    The line of least weighted squares, a + b x with times x from now and displacements from this pose: the pose is
+    moved by a, and gets the twist b. Two poses give the difference over the interval, one gives a twist of zero.
+
+    Args:
+        x: state (18,) with a pose; overwritten.
+        fit: (FIT,) of the poses before; overwritten.
+        interval: time since the pose before [s].
+        max_speed: largest component of a twist between two poses [m/s, rad/s].
+
+    Returns:
+        False where the pose is too far from the one before for that; nothing is changed then.
+    """
+    y, R, pose = np.zeros(6), np.empty((3, 3)), x[:12].copy()
+    if fit[12] > 0.0:
+        for r in range(3):
+            y[r] = x[9 + r] - fit[9 + r]
+            for c in range(3):
+                R[r, c] = x[r] * fit[c] + x[3 + r] * fit[3 + c] + x[6 + r] * fit[6 + c]
+        y[3], y[4], y[5] = _rotation_vector(R)
+        for c in range(6):
+            if not abs(y[c]) <= max_speed * interval:
+                return False
+        displacement, slope = _line(fit)
+        off = y - displacement - interval * slope
+        if np.sqrt(np.sum(off[:3] ** 2)) > _JUMP[0] or np.sqrt(np.sum(off[3:] ** 2)) > _JUMP[1]:
+            start_fit(fit, fit[:12].copy())
+    s, sx, sxx, T = fit[12], fit[13], fit[14], interval
+    for c in range(6):
+        sy, sxy = fit[15 + c], fit[21 + c]
+        fit[15 + c] = POSE_WEIGHT * (sy - y[c] * s)
+        fit[21 + c] = POSE_WEIGHT * (sxy - y[c] * sx - T * sy + T * y[c] * s)
+    fit[12], fit[13] = 1.0 + POSE_WEIGHT * s, POSE_WEIGHT * (sx - T * s)
+    fit[14] = POSE_WEIGHT * (sxx - 2.0 * T * sx + T * T * s)
+    fit[:12] = pose
+    displacement, slope = _line(fit)
+    x[12:] = displacement
+    _extrapolate(x, 1.0)
+    x[12:] = slope
+    return True
+
+
+@compiled
+def start_fit(fit: Array, pose: Array) -> None:
+    """Let the fit (FIT,) begin with one pose (12,)."""
+    fit[:12] = pose
+    fit[12] = 1.0
+    fit[13:] = 0.0
+
+
+@compiled
+def _line(fit: Array) -> tuple[Array, Array]:
+    """Compute displacement (6,) and slope (6,) of the line of a fit at its last pose; zero of less than two poses."""
+    s, sx, sxx = fit[12], fit[13], fit[14]
+    det = s * sxx - sx * sx
+    if not det > 0.0:
+        return np.zeros(6), np.zeros(6)
+    return (sxx * fit[15:21] - sx * fit[21:27]) / det, (s * fit[21:27] - sx * fit[15:21]) / det
+
+
 @compiled
 def update_estimates(
     which: IntArray, kind: IntArray, times: Array, updates: Array, stamps: Array, last: Array, states: Array,
-    shortest: float, max_speed: float, steady: float, means: Array, counts: Array, at_rest: Array,
+    fits: Array, shortest: float, max_speed: float, steady: float, means: Array, counts: Array, at_rest: Array,
 ) -> int:  # fmt: skip
-    """Take over checked states, see `update_measured_states`, and their twists into the means of these.
+    """Take over checked states, and their twists into the means of these; those of bare poses from `fit_pose`.
 
     A mean is of all twists at first, then of those within about `steady`: m += λ (ν - m) with λ the larger of 1/n and
     T / (steady + T), T since the update before.
@@ -75,10 +149,11 @@ def update_estimates(
         which: numbers of the obstacles (k,).
         kind: how each is given (k,): SAMPLE, POSE or REST.
         times: their time stamps (k,) [s].
-        updates: what is given, read where `which` says (o, 18); the twists of bare poses are overwritten.
+        updates: what is given, read where `which` says (o, 18); bare poses are overwritten.
         stamps: time stamps of the last update, NaN where there was none (o,) [s]; overwritten.
         last: the last update, with its twist (o, 18); overwritten.
         states: (o, 18) overwritten as well.
+        fits: of bare poses (o, FIT); overwritten.
         shortest: time between two poses below which no twist is estimated [s].
         max_speed: largest component of a twist that is estimated [m/s, rad/s].
         steady: time over which twists are averaged [s].
@@ -89,16 +164,22 @@ def update_estimates(
     Returns:
         How many were not taken over, as their poses are too far apart; their stamps stay as they were.
     """
-    previous_stamps = stamps[which]
-    fine = update_measured_states(which, kind, times, updates, stamps, last, states, shortest, max_speed)
     rejected = 0
     for k in range(len(which)):
-        i, elapsed = which[k], times[k] - previous_stamps[k]
-        if not fine[k]:
-            rejected += 1
-            continue
-        at_rest[i] = kind[k] == REST
-        if kind[k] == POSE and previous_stamps[k] != previous_stamps[k]:  # no twist is known of a first pose
+        i, elapsed = which[k], times[k] - stamps[which[k]]
+        x, is_first = updates[i], fits[i, 12] == 0.0
+        if kind[k] != POSE:
+            start_fit(fits[i], x[:12])
+            if kind[k] == REST:
+                x[12:] = 0.0
+        elif is_first or elapsed > shortest:
+            if not fit_pose(x, fits[i], 0.0 if is_first else elapsed, max_speed):
+                rejected += 1
+                continue
+        else:
+            x[12:] = last[i, 12:]
+        last[i], states[i], stamps[i], at_rest[i] = x, x, times[k], kind[k] == REST
+        if kind[k] == POSE and is_first:  # no twist is known of a first pose
             continue
         counts[i] += 1.0
         gain = 1.0 / counts[i]
@@ -129,7 +210,7 @@ def extrapolate_estimates(
         states: out: rows `which` (o, 18).
         stale_after: age from which one is stale [s].
         at_rest: those that are never stale (o,).
-        margin: out: of the stale ones (o,) [m].
+        margin: what stale ones get is added (o,) [m].
 
     Returns:
         How many are stale.
@@ -143,7 +224,7 @@ def extrapolate_estimates(
             continue
         if age > stale_after and not at_rest[i]:
             stale += 1
-            margin[i] = MARGIN_GROWTH * (age - stale_after)
+            margin[i] += MARGIN_GROWTH * (age - stale_after)
         _extrapolate(x, min(age, longest))
     return stale
 

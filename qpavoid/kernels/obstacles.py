@@ -10,8 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from qpavoid.kernels.packing import compiled
-from qpavoid.kernels.tasks import _rotation_vector
-from qpavoid.problem import Array, IntArray, Mask
+from qpavoid.problem import Array, IntArray
 
 FINE, NORMALISED, NOT_FINITE, FAR, FAST, NO_ROTATION, LEFT_HANDED = range(7)
 """Codes of `check_states`."""
@@ -146,52 +145,3 @@ def _gram(x: Array, gram: Array) -> None:
     for r in range(3):
         for c in range(3):
             gram[r, c] = x[3 * r] * x[3 * c] + x[3 * r + 1] * x[3 * c + 1] + x[3 * r + 2] * x[3 * c + 2]
-
-
-@compiled
-def update_measured_states(
-    numbers: IntArray, kind: IntArray, times: Array, updates: Array, stamps: Array, last: Array, states: Array,
-    min_interval: float, max_twist: float,
-) -> Mask:  # fmt: skip
-    """Take over checked updates of obstacles; estimate the twist of a bare pose from the pose before it.
-
-    The estimate is the difference of the last two poses over the interval between their time stamps; the first pose
-    counts as at rest, and without an interval between them the twist stays as it was.
-
-    Args:
-        numbers: of the obstacles (k,).
-        kind: of each update (k,): SAMPLE, POSE or REST.
-        times: time stamps of the updates (k,) [s].
-        updates: their states (o, 18), rows `numbers` are read; the twists of bare poses are overwritten.
-        stamps: time stamp of the last update of each obstacle (o,), NaN before the first one [s]; overwritten.
-        last: its state, with its twist (o, 18); overwritten.
-        states: out (o, 18): rows of the accepted updates.
-        min_interval: interval between two poses below which no twist is estimated [s].
-        max_twist: largest component of a twist that is estimated [m/s, rad/s].
-
-    Returns:
-        Whether each update is accepted (k,): not where its pose is too far from the last one for `max_twist`.
-    """
-    accepted, rotation = np.ones(len(numbers), np.bool_), np.empty((3, 3))
-    for k in range(len(numbers)):
-        i = numbers[k]
-        new, old, interval = updates[i], last[i], times[k] - stamps[i]
-        if kind[k] != SAMPLE:
-            new[12:] = 0.0
-        if kind[k] == POSE and interval > min_interval:
-            for r in range(3):
-                new[12 + r] = (new[9 + r] - old[9 + r]) / interval
-                for c in range(3):
-                    rotation[r, c] = new[r] * old[c] + new[3 + r] * old[3 + c] + new[6 + r] * old[6 + c]
-            angles = _rotation_vector(rotation)
-            for r in range(3):
-                new[15 + r] = angles[r] / interval
-            for c in range(12, 18):
-                accepted[k] = accepted[k] and abs(new[c]) <= max_twist
-        elif kind[k] == POSE and stamps[i] == stamps[i]:
-            new[12:] = old[12:]
-        if accepted[k]:
-            old[:] = new
-            states[i] = new
-            stamps[i] = times[k]
-    return accepted

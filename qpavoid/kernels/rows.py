@@ -42,9 +42,9 @@ def distance_rows(x: Any, pairs: IntArray, influence_distance: float, moving: bo
     world's origin.
 
     Args:
-        x: reads results, J_world, support, twists, twist_row; writes near_pairs, closest, J, feedforward.
+        x: reads results, J_world, support, twists, twist_row, margin; writes near_pairs, closest, J, feedforward.
         pairs: numbers of the pairs that are considered (c,), increasing.
-        influence_distance: surface distance below which a pair is near [m].
+        influence_distance: surface distance, less the margin, below which a pair is near [m].
         moving: whether any of the twists is not zero.
 
     Returns:
@@ -55,7 +55,7 @@ def distance_rows(x: Any, pairs: IntArray, influence_distance: float, moving: bo
     columns = J_world.shape[1]
     k = 0
     for i in pairs:
-        if not results[i, 0] >= influence_distance:
+        if not results[i, 0] - x.margin[x.twist_row[i]] >= influence_distance:
             x.near_pairs[k] = i
             for c in range(10):
                 closest[k, c] = results[i, c]

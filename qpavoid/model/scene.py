@@ -43,6 +43,8 @@ class Obstacle:
     """Whether its pose comes from the program that steps the controller, and has to be updated from the start."""
     source: Path = Path("obstacle")
     """File to name in errors, from whose folder the paths of meshes and points start."""
+    uncertainty: float = 0.0
+    """How far it may be from where it is said to be [m]: that much is taken off its distances."""
 
     @classmethod
     def at(
@@ -53,6 +55,7 @@ class Obstacle:
         rotation: ArrayLike | None = None,
         graspable: bool = False,
         external: bool = False,
+        uncertainty: float = 0.0,
     ) -> Obstacle:
         """Make an obstacle at a pose.
 
@@ -66,9 +69,10 @@ class Obstacle:
             graspable: whether it may be attached to the robot.
             external: whether its pose has to be updated by `Controller.step(obstacles=…)` from the start: the robot
                 stops where it is not. An obstacle that is given in `step` is external from then on.
+            uncertainty: how far it may be from where it is said to be [m]; the robot keeps d1 and that much away.
 
         Raises:
-            ConfigError: wrong shape, NaN or infinity, no rotation.
+            ConfigError: wrong shape, NaN or infinity, no rotation, an uncertainty that is negative.
         """
         try:
             sample = Sample.at(position, rotation)
@@ -78,7 +82,11 @@ class Obstacle:
         if off > NEARLY or np.linalg.det(sample.rotation) < 0.0:
             clause = "left-handed" if np.linalg.det(sample.rotation) < 0.0 else f"|RᵀR - I| is {off:.2g}"
             raise ConfigError(f"obstacle {name!r}: rotation: {clause}; give a rotation (3, 3)")
-        return cls(name, shape, still(sample), moves=False, graspable=graspable, external=external)
+        if not 0.0 <= uncertainty < np.inf:
+            raise ConfigError(f"obstacle {name!r}: uncertainty: {uncertainty} m, expected 0 or more")
+        return cls(
+            name, shape, still(sample), moves=False, graspable=graspable, external=external, uncertainty=uncertainty
+        )
 
 
 @dataclass(frozen=True)
@@ -236,6 +244,7 @@ def build_obstacles(configs: Sequence[config.ObstacleConfig], source: Path) -> l
                 graspable=c.graspable or c.attached_to is not None,
                 external=c.source == "external",
                 source=source,
+                uncertainty=c.uncertainty,
             )
         )
     return obstacles

@@ -13,6 +13,7 @@ import pinocchio as pin
 from qpavoid import kernels
 from qpavoid.config import Mesh, PointCloud, ScenarioConfig
 from qpavoid.config.loading import load_scenario
+from qpavoid.control.latency import CommandsUnderWay
 from qpavoid.control.obstacles import ObstacleStates
 from qpavoid.control.tasks import in_order
 from qpavoid.control.tick import Tick
@@ -40,7 +41,7 @@ def simulate(
     solver: str | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Log:
-    """Run a scenario with velocities that are followed exactly: q ⊕ v dt.
+    """Run a scenario with velocities that are followed exactly, q ⊕ v dt, after its `latency`.
 
     A run that is interrupted from the keyboard, or in which the loop itself fails, gives the log of what it did;
     `meta["completed"]` is then false and `meta["stopped_by"]` says why.
@@ -60,7 +61,8 @@ def simulate(
         scenario = scenario.model_copy(update={"solver": settings})
     controller, q = Controller.from_scenario(scenario)
     _check_start(controller, q, scenario)
-    model, ticks = controller.scene.robot.model, round(scenario.duration / scenario.dt) + 1
+    model, dt, ticks = controller.scene.robot.model, scenario.dt, round(scenario.duration / scenario.dt) + 1
+    under_way, q_commanded = CommandsUnderWay(model.nv, scenario.latency, dt), q
     try:
         recorder = Recorder(controller, scenario, ticks)
     except MemoryError:
@@ -70,9 +72,12 @@ def simulate(
     stopped_by = None
     try:
         for k in range(ticks):
-            tick = controller.tick(q, k * scenario.dt)
+            tick = controller.tick(q, k * dt)
             recorder.add(tick)
-            q = pin.integrate(model, q, tick.solution.v * scenario.dt)
+            under_way.add(tick.solution.v)
+            q = q_commanded = pin.integrate(model, q_commanded, tick.solution.v * dt)
+            if scenario.latency:
+                q = pin.integrate(model, q_commanded, -under_way.displacement)
             if progress is not None:
                 progress(k + 1, ticks)
     except KeyboardInterrupt:

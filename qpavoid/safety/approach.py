@@ -76,7 +76,7 @@ class ApproachCheck:
         query, obstacles = self._rollouts.query, self._obstacles
         clearance, self._max_external_speed = kernels.line_clearance(
             self._rollouts.packed, q, query.table.spheres, obstacles.external, obstacles.current.states,
-            obstacles.mean_twists, query.obstacle_radii, HORIZON,
+            obstacles.mean_twists, query.obstacle_radii + obstacles.current.margin, HORIZON,
         )  # fmt: skip
         return bool(motion < clearance - PREFERRED_DISTANCE)
 
@@ -97,7 +97,8 @@ class ApproachCheck:
                 return True
         self._rollouts.kinematics.compute(q)
         centers, radii = query.body_spheres(self._rollouts.kinematics.joint_poses)
-        obstacle_radii = query.obstacle_radii[paths.moving] + paths.max_deviation + PREFERRED_DISTANCE
+        obstacle_radii = query.obstacle_radii[paths.moving] + self._obstacles.current.margin[paths.moving]
+        obstacle_radii += paths.max_deviation + PREFERRED_DISTANCE
         clearance = kernels.min_sphere_distance(paths.positions, centers, obstacle_radii[:, None] + radii)
         self._clearance = q.copy(), clearance
         return bool(motion < clearance)

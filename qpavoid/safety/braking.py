@@ -178,6 +178,7 @@ class BrakingCheck:
         """
         path, now, speed = self._path(q, v), self._now, max(float(self._now.arrays.speeds.max()), _MIN_SPEED)
         nearest = float(np.min(now.distances_of(now.pairs), initial=self._rows.influence_distance))
+        nearest -= float(np.max(now.arrays.margin, initial=0.0))
         points = [_PathPoint(0.0, q, nearest - self._safety_distance, -1, np.inf)]
         end = float(path.times[-1])
         while (t := points[-1].t) < end and (len(points) == 1 or not isnan(points[-1].margin)):

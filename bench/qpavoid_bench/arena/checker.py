@@ -12,7 +12,7 @@ import numpy as np
 
 from qpavoid import Limits
 from qpavoid.problem import Array
-from qpavoid_bench.arena.mujoco_model import MujocoModel
+from qpavoid.run.mujoco import MujocoModel
 
 STEP = 0.002
 """Largest travel of any point between two instants that are checked [m]: two bodies that touch and part in between

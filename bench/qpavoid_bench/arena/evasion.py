@@ -11,8 +11,8 @@ from scipy.optimize import linprog
 
 from qpavoid import Limits
 from qpavoid.problem import Array
+from qpavoid.run.mujoco import MujocoModel
 from qpavoid_bench.arena.checker import DistanceMonitor
-from qpavoid_bench.arena.mujoco_model import MujocoModel
 
 PERIOD = 0.02
 """Time between two decisions of an evasion, in whole control steps [s]."""

@@ -17,11 +17,11 @@ from typing import Any, NamedTuple
 
 from qpavoid.errors import ConfigError
 from qpavoid.run.machine import machine, versions
+from qpavoid.run.mujoco import build
 from qpavoid.run.pool import WorkerDied, Workers
 from qpavoid_bench.arena.case import Case
 from qpavoid_bench.arena.entrants import Entrant
 from qpavoid_bench.arena.families import Family, load_family, make_case
-from qpavoid_bench.arena.mujoco_model import build
 from qpavoid_bench.arena.store import Store
 from qpavoid_bench.arena.suite import Suite, describe_entrants, origin
 from qpavoid_bench.arena.trial import failing_entrant, run_trial

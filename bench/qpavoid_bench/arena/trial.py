@@ -9,10 +9,10 @@ from time import perf_counter
 
 from qpavoid.model.sample import Sample
 from qpavoid.problem import Array, Solution
+from qpavoid.run.mujoco import build
 from qpavoid_bench.arena.case import Case
 from qpavoid_bench.arena.checker import check_run
 from qpavoid_bench.arena.entrants import Entrant
-from qpavoid_bench.arena.mujoco_model import build
 from qpavoid_bench.arena.rollout import Pilot, roll_out
 from qpavoid_bench.arena.scores import Score, score, surface_safety_distance
 from qpavoid_bench.arena.verdict import decisive, judge

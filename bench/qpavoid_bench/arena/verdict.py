@@ -24,6 +24,7 @@ import numpy as np
 
 from qpavoid import ScenarioConfig
 from qpavoid.problem import Array
+from qpavoid.run.mujoco import MujocoModel
 from qpavoid_bench.arena.checker import Contact, Findings
 from qpavoid_bench.arena.evasion import (
     INFLUENCE_DISTANCE,
@@ -35,7 +36,6 @@ from qpavoid_bench.arena.evasion import (
     near_rows,
     policies,
 )
-from qpavoid_bench.arena.mujoco_model import MujocoModel
 
 AFTER = 0.5
 """Time after the contact in question for which evasions must stay clear [s]."""

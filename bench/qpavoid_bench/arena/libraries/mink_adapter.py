@@ -11,10 +11,10 @@ import numpy as np
 from qpavoid.errors import ConfigError
 from qpavoid.model.sample import Sample
 from qpavoid.problem import Array, Solution
+from qpavoid.run.mujoco import MAX_DISTANCE, build, place_mocap
 from qpavoid_bench.arena.case import Case
 from qpavoid_bench.arena.libraries.common import Adapter, task_costs
 from qpavoid_bench.arena.libraries.settings import DAMPING, MINK
-from qpavoid_bench.arena.mujoco_model import MAX_DISTANCE, build, place_mocap
 from qpavoid_bench.arena.world import World
 
 

@@ -21,10 +21,10 @@ import pinocchio as pin
 from qpavoid.errors import ConfigError
 from qpavoid.model.sample import Sample
 from qpavoid.problem import Array, Solution
+from qpavoid.run.mujoco import hinge_or_slide
 from qpavoid_bench.arena.case import Case
 from qpavoid_bench.arena.libraries.common import Adapter
 from qpavoid_bench.arena.libraries.settings import DAMPING, PLACO, PLACO_PYTHON
-from qpavoid_bench.arena.mujoco_model import hinge_or_slide
 from qpavoid_bench.arena.world import World
 
 WORKER = Path(__file__).with_name("placo_worker.py")

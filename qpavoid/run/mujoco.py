@@ -1,6 +1,6 @@
-"""MuJoCo model of a scene: the same joints, bodies and obstacles.
+"""MuJoCo model of a scene: the same joints, bodies and obstacles, with kinematics, distances and dynamics of its own.
 
-Kinematics and distances are MuJoCo's own.
+Importing this raises a ConfigError where MuJoCo is not installed; nothing of the package imports it by itself.
 """
 
 from __future__ import annotations
@@ -10,14 +10,18 @@ from dataclasses import dataclass
 from typing import Any
 
 import coal
-import mujoco
 import numpy as np
 import pinocchio as pin
 
-from qpavoid import Sample, ScenarioConfig, Scene, build_scene
-from qpavoid.model.scene import build_obstacles
+from qpavoid.errors import ConfigError
+from qpavoid.model.sample import Sample
+from qpavoid.model.scene import Scene
 from qpavoid.problem import Array, IntArray
-from qpavoid_bench.arena.world import load_robot
+
+try:
+    import mujoco
+except ImportError:
+    raise ConfigError("MuJoCo is not installed: pip install mujoco") from None
 
 MAX_DISTANCE = 100.0
 """Largest distance that MuJoCo looks for [m]: beyond any scene."""
@@ -82,19 +86,14 @@ def place_mocap(data: Any, index: int, sample: Sample) -> None:
     mujoco.mju_mat2Quat(data.mocap_quat[index], np.ascontiguousarray(sample.rotation).ravel())
 
 
-def load_model(scenario: ScenarioConfig) -> MujocoModel:
-    """Build the MuJoCo model of a scenario."""
-    robot, q0 = load_robot(scenario.robot, scenario.q0, scenario.lock, scenario.source)
-    return build(build_scene(robot, build_obstacles(scenario.obstacles, scenario.source)), q0)
-
-
-def build(scene: Scene, q0: Array, frames: Sequence[int] = ()) -> MujocoModel:
+def build(scene: Scene, q0: Array, frames: Sequence[int] = (), has_servos: bool = False) -> MujocoModel:
     """Build the MuJoCo model of a scene: one body a joint, one mocap body an obstacle.
 
     Args:
         scene: what is written.
         q0: where the robot starts (nq,).
         frames: of the robot's model, by their indices; these become sites `frame 0`, `frame 1` and so on.
+        has_servos: whether bodies have the masses of the robot's model, and each joint a motor, without any gain yet.
 
     Raises:
         ValueError: a joint that is neither a hinge nor a slide, or a shape that MuJoCo does not know.
@@ -111,13 +110,16 @@ def build(scene: Scene, q0: Array, frames: Sequence[int] = ()) -> MujocoModel:
         placement = robot.jointPlacements[i]
         body = bodies[robot.parents[i]].add_body(
             name=robot.names[i], pos=placement.translation, quat=_quaternion(placement.rotation),
-            explicitinertial=True, mass=1.0, inertia=[1.0, 1.0, 1.0],
+            explicitinertial=True, **_inertia(robot.inertias[i] if has_servos else pin.Inertia.Zero()),
         )  # fmt: skip
         slides, axis = hinge_or_slide(robot, i)
         kind = mujoco.mjtJoint.mjJNT_SLIDE if slides else mujoco.mjtJoint.mjJNT_HINGE
         joint = body.add_joint(name=robot.names[i], type=kind, axis=axis)
         if robot.joints[i].idx_q in ranges:  # neither kinematics nor integration heed them; who reads the model may
             joint.limited, joint.range = True, ranges[robot.joints[i].idx_q]
+        if has_servos:
+            motor = spec.add_actuator(name=robot.names[i], target=robot.names[i], trntype=mujoco.mjtTrn.mjTRN_JOINT)
+            motor.biastype = mujoco.mjtBias.mjBIAS_AFFINE
         bodies.append(body)
     for i, frame in enumerate(robot.frames[index] for index in frames):
         place = frame.placement
@@ -160,6 +162,15 @@ def hinge_or_slide(model: Any, index: int) -> tuple[bool, Array]:
     pin.computeJointJacobians(model, data, pin.neutral(model))
     screw = np.asarray(data.joints[index].S).ravel()
     return (True, screw[:3]) if np.any(screw[:3]) else (False, screw[3:])
+
+
+def _inertia(inertia: Any) -> dict[str, Any]:
+    """Return mass and inertia of a body; units where the model gives none, which kinematics do not heed."""
+    moments, axes = np.linalg.eigh(inertia.inertia)
+    if not (inertia.mass > 0.0 and moments[0] > 0.0):
+        return {"mass": 1.0, "inertia": [1.0, 1.0, 1.0]}
+    axes[:, 0] *= np.linalg.det(axes)
+    return {"mass": inertia.mass, "ipos": inertia.lever, "inertia": moments, "iquat": _quaternion(axes)}
 
 
 def _add_geom(spec: Any, body: Any, geometry: Any, placement: Any) -> None:
