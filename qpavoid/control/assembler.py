@@ -59,6 +59,10 @@ class RowAssembler:
         self._task_rows = TaskRows(row_tasks, x.A, x.b)
         self.task_errors = self._task_rows.errors
         """How far each of the tasks that are not frames was from its target in the last step, in its unit."""
+        self.frame_errors, self.row_scale, self.row_tasks = x.errors, x.scale, x.row_tasks
+        """What frames lack to their targets; root of the weight and number of the task of each row: see `RowLayout`."""
+        self.frame_tasks, self.frame_count, self.tasks = tuple(frames), len(frames), (*frames, *row_tasks)
+        """Tasks in the order of `in_order`; the first `frame_count` are frames."""
         self._eye = np.eye(len(x.v_tracking))
         self._is_compiled = self._forward.is_compiled and self.query.is_compiled and not row_tasks and contacts is None
         self._q = scene.robot.home.copy()
@@ -154,6 +158,13 @@ class RowAssembler:
         if self._layout.task_switching:
             kernels.row_bounds(self._packed, k, self.query.is_moving)
         return float(kernels.tracking_violation(self._packed, k))
+
+    def curvature(self, w: Array) -> Array:
+        """Return Σ w_r ∂²x_r/∂q² (nv, nv) of the rows of all frames; see `kernels.add_curvature`."""
+        G = np.zeros_like(self._eye)
+        for part in range(len(w) // 3):
+            kernels.add_curvature(self._packed, part, w[3 * part : 3 * part + 3], G)
+        return G
 
     def follow(self, v: Array, problem: Problem) -> Problem:
         """Return the problem of this step with the velocity v (nv,) to follow in place of the tasks."""

@@ -96,3 +96,26 @@ def _weighted_rate(W: Array, L: Array, b: Array, z: Array) -> float:
             ratio += W[k, c] * z[k]
         worst = max(worst, abs(ratio))
     return worst
+
+
+@compiled
+def task_parts(x: Any, u: Array, parts: Array) -> None:
+    """Write the part of each task in a direction u (c,) of the rows that bend; their sum is 1."""
+    parts[:] = 0.0
+    for k in range(len(u)):
+        parts[x.row_tasks[x.bending_rows[k]]] += u[k] * u[k]
+
+
+@compiled
+def task_sizes(x: Any, U: Array, squares: Array) -> Array:
+    """Compute ‖J Jᵀ‖ of the rows J of each task that bend, from A Aᵀ = Σ σ_i² u_i u_iᵀ."""
+    sizes = np.zeros(x.row_tasks.max() + 1)
+    for k in range(len(U)):
+        task = x.row_tasks[x.bending_rows[k]]
+        for j in range(len(U)):
+            if x.row_tasks[x.bending_rows[j]] == task:
+                product = 0.0
+                for i in range(len(U)):
+                    product += squares[i] * U[i, k] * U[i, j]
+                sizes[task] += product * product
+    return np.sqrt(sizes)

@@ -23,7 +23,7 @@ from qpavoid.kernels.packing import compiled
 from qpavoid.kernels.singular_values import orthogonalise
 from qpavoid.kernels.straight_rows import scale_straight, solve_together
 from qpavoid.kernels.task_curvature import add_curvature
-from qpavoid.kernels.task_scaling import UNLIMITED_SPEED, WEAK, joint_rate, scale_down
+from qpavoid.kernels.task_scaling import UNLIMITED_SPEED, WEAK, joint_rate, scale_down, task_parts, task_sizes
 from qpavoid.problem import Array
 
 _APPROACH_RATE = 20.0
@@ -272,11 +272,11 @@ def _follow_bending(x: Any, B: Array, b: Array, v: Array, damping: Array) -> Non
     largest = squares.max() if count else 0.0
     if largest == 0.0:
         return
-    sizes, shares = _task_sizes(x, U, squares), np.empty(x.row_tasks.max() + 1)
+    sizes, parts = task_sizes(x, U, squares), np.empty(x.row_tasks.max() + 1)
     for i in range(count):
-        _task_shares(x, U[i], shares)
-        for task in range(len(shares)):
-            weak[i] += WEAK * WEAK * shares[task] * sizes[task]
+        task_parts(x, U[i], parts)
+        for task in range(len(parts)):
+            weak[i] += WEAK * WEAK * parts[task] * sizes[task]
     g = np.ones(count)
     scale_down(x, B, U, squares, weak, b, g)
     rate = joint_rate(x, B, U, squares, np.zeros(count), b)
@@ -289,14 +289,14 @@ def _follow_bending(x: Any, B: Array, b: Array, v: Array, damping: Array) -> Non
         if squares[i] == 0.0:
             continue
         y, size, curvature = 0.0, 0.0, 0.0
-        _task_shares(x, U[i], shares)
-        shares /= shares.max()
+        task_parts(x, U[i], parts)
+        parts /= parts.max()
         for k in range(count):
-            share = shares[x.row_tasks[x.bending_rows[k]]] * w[k]
+            pull = parts[x.row_tasks[x.bending_rows[k]]] * w[k]
             y += U[i, k] * b[k]
-            size += share * share
+            size += pull * pull
             if x.bending_rows[k] >= framed:
-                curvature += abs(share)
+                curvature += abs(pull)
         size = np.sqrt(size)
         m = max(squares[i], _TINY * largest)
         fastest = np.inf
@@ -326,26 +326,3 @@ def _follow_bending(x: Any, B: Array, b: Array, v: Array, damping: Array) -> Non
         damping[i] = max(m - squares[i], 0.0)
         for c in range(nv):
             v[c] += B[i, c] * y / m
-
-
-@compiled
-def _task_shares(x: Any, u: Array, shares: Array) -> None:
-    """Write the part of each task in a direction u (c,) of the rows that bend; their sum is 1."""
-    shares[:] = 0.0
-    for k in range(len(u)):
-        shares[x.row_tasks[x.bending_rows[k]]] += u[k] * u[k]
-
-
-@compiled
-def _task_sizes(x: Any, U: Array, squares: Array) -> Array:
-    """Compute ‖J Jᵀ‖ of the rows J of each task that bend, from A Aᵀ = Σ σ_i² u_i u_iᵀ."""
-    sizes = np.zeros(x.row_tasks.max() + 1)
-    for k in range(len(U)):
-        task = x.row_tasks[x.bending_rows[k]]
-        for j in range(len(U)):
-            if x.row_tasks[x.bending_rows[j]] == task:
-                product = 0.0
-                for i in range(len(U)):
-                    product += squares[i] * U[i, k] * U[i, j]
-                sizes[task] += product * product
-    return np.sqrt(sizes)

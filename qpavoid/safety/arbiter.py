@@ -43,7 +43,7 @@ class Arbiter:
         self._settings, self.solver, self._rows = settings, solver, rows
         self._v_shape = (settings.scene.robot.model.nv,)
         self._braking = BrakingCheck(settings, rows, obstacles)
-        self.progress = ProgressMonitor(settings)
+        self.progress = ProgressMonitor(settings, rows)
         has_backup = settings.avoidance.backup and len(settings.scene.obstacles) > 0
         self.backup = BackupPlanner(settings, rows.query.table, obstacles) if has_backup else None
 
