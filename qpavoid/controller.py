@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from time import perf_counter
 from typing import Any, NoReturn
 
 import numpy as np
 
 from qpavoid import kernels
-from qpavoid.config import Avoidance, Limits, Progress, ScenarioConfig, Sensing
+from qpavoid.config import Avoidance, Limits, Progress, ScenarioConfig, Sensing, Sphere
 from qpavoid.config.scenario import MAX_LATENCY
 from qpavoid.control.builder import ProblemBuilder, StepProblem
 from qpavoid.control.contacts import ContactRows
-from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.inputs import LARGEST_VELOCITY, check_velocity
 from qpavoid.control.scenario import build_parts
+from qpavoid.control.scene_changes import SceneChanges
 from qpavoid.control.settings import ControlSettings
 from qpavoid.control.tasks import RowTask, in_order
 from qpavoid.control.tick import Tick, copied
-from qpavoid.errors import ConfigError, NumericalError, UnknownName, located, nearest
-from qpavoid.model.cloud import Points
-from qpavoid.model.sample import Pose, Sample
-from qpavoid.model.scene import Scene
+from qpavoid.errors import ConfigError, NumericalError, located
+from qpavoid.model.scene import Obstacle, Scene
 from qpavoid.problem import Array, Solution, State, as_vector, require_finite
 from qpavoid.reason import Reason, ReasonKind
 from qpavoid.safety.arbiter import Arbiter
@@ -36,7 +35,10 @@ _NO_BACKUP_WITH_CONTACTS = Reason.of(
 """Assumption where obstacles move and the robot stands on something."""
 
 
-class Controller:
+_WARM_UP = "a passing obstacle, to warm up"
+
+
+class Controller(SceneChanges):
     """Follows its tasks and keeps clear of everything in its scene."""
 
     def __init__(
@@ -76,7 +78,9 @@ class Controller:
         if not 0.0 <= latency <= MAX_LATENCY:
             raise ConfigError(f"latency: {latency} s, expected 0 to {MAX_LATENCY}; it is in seconds")
         frames, others = in_order(tasks)
-        self.scene, self.dt = scene, dt
+        self.scene = scene = scene.own_copy() if scene.spare else scene
+        """Robot and obstacles, those that were added among them."""
+        self.dt = dt
         self.tasks: tuple[RowTask, ...] = (*frames, *others)
         """Frames with a position to follow, then with an orientation alone, then all other tasks."""
         law, self._has_contacts = make_solver(solver) if isinstance(solver, str) else solver, contacts is not None
@@ -112,12 +116,6 @@ class Controller:
         self._arbiter.solver = law
         self._builder.rows.look_ahead(law.bounded and self.avoidance.look_ahead)
 
-    @property
-    def attached(self) -> Mapping[str, int]:
-        """Joint that each attached object is attached to, by name of the object."""
-        table = self._builder.rows.query.table
-        return {self.scene.obstacles[index].name: joint for index, joint in table.attached.items()}
-
     def _warm_up(self) -> None:
         """Run the first steps, with a law that ships: one of the user's own may remember what it is asked."""
         q, v, law = self.scene.robot.home, np.zeros(self._v_shape), self._arbiter.solver
@@ -128,6 +126,13 @@ class Controller:
         self._builder.rows.leaves_position_limits(q, v, self.dt)
         self._builder.tracker.warm_up()
         kernels.projection_cost(np.zeros((0, len(v))), 1.0, v)
+        if self.scene.spare:
+            passing = replace(Obstacle.at(_WARM_UP, Sphere(radius=0.05), [2.0, 0.0, 0.0]), moves=True)
+            self.add_obstacle(passing)
+            self.tick(q)
+            self.remove_obstacle(_WARM_UP)
+        for query in self._builder.rows.query.table.queries:
+            query.forget_guesses()
         self._arbiter.solver = law
         self.reset()
 
@@ -155,7 +160,7 @@ class Controller:
         q: Array,
         t: float | None = None,
         targets: Mapping[str, Any] | None = None,
-        obstacles: Mapping[str, Sample | Pose | Points] | None = None,
+        obstacles: Mapping[str, Any] | None = None,
         v: Array | None = None,
     ) -> Solution:
         """Velocity for the next dt.
@@ -177,13 +182,15 @@ class Controller:
                 step if left out. Where it goes on by less than dt/2 or more than 3 dt/2, a reason of kind TIMING says
                 so; after a gap of more than 10 dt and 0.1 s, or where it goes back, the robot counts as standing still
                 unless v is given, and plans are dropped. Where it goes back, ages go on as if dt had passed.
-            targets: what tasks should reach now, by their names, in place of their motion: a `Sample`, or a `Pose` that
-                rests, for what is somewhere (frames, a relative pose, the centre of mass, a point to look at), a
-                configuration (nq,) for a posture, a direction (3,) for an axis. A frame's task has the frame's name
-                unless it was given one.
-            obstacles: where obstacles are, and how they move if that is known, by name, in place of their motion. From
-                then on they have to be updated, see `Sensing`, unless they are given `at_rest`. Each may have a time
-                stamp of its own.
+            targets: what tasks should reach now, by their names, in place of their motion: a `Sample`, or to rest at, a
+                `Pose`, `pin.SE3`, 4×4 matrix or position (3,), for what is somewhere (frames, a relative pose, the
+                centre of mass, a point to look at), a configuration (nq,) for a posture, a direction (3,) for an axis.
+                A position alone leaves the target's orientation as in the step before. A frame's task has the frame's
+                name unless it was given one.
+            obstacles: where obstacles are, by name, in place of their motion: a `Sample`, or if no velocity is known, a
+                `Pose`, `pin.SE3`, 4×4 matrix or position, which leaves the orientation as it was; `Points` for a cloud.
+                From then on they have to be updated, see `Sensing`, unless they are given `at_rest`. Each may have a
+                time stamp of its own.
             v: velocity (nv,) as measured, from which acceleration limits count in the first step, after a gap and after
                 `reset`. In all other steps they count from the last command, as those of servos that lag have to.
 
@@ -199,7 +206,7 @@ class Controller:
         q: Array,
         t: float | None = None,
         targets: Mapping[str, Any] | None = None,
-        obstacles: Mapping[str, Sample | Pose | Points] | None = None,
+        obstacles: Mapping[str, Any] | None = None,
         v: Array | None = None,
     ) -> Tick:
         """Like `step`, with everything that led to the velocity."""
@@ -217,7 +224,7 @@ class Controller:
         q: Array,
         v_desired: Array,
         t: float | None = None,
-        obstacles: Mapping[str, Sample | Pose | Points] | None = None,
+        obstacles: Mapping[str, Any] | None = None,
         v: Array | None = None,
     ) -> Solution:
         """The safe velocity that is closest to any command: of a teleoperator, a policy, another controller.
@@ -254,78 +261,6 @@ class Controller:
             assumptions += self._no_backup
         solution = solution._replace(assumptions=assumptions) if assumptions else solution
         return solution.with_times(middle - begin, perf_counter() - middle)
-
-    def attach(self, obstacle: str, frame: str, q: Array | None = None) -> None:
-        """Attach an obstacle to a frame of the robot; it stays where it is relative to the frame.
-
-        Until it is released it is a body of the robot: it keeps clear of the other obstacles and of the robot, except
-        of what it touches now, until the two have once been apart, and of the link that carries it and all beyond it.
-        What is given of it in `step` is not read meanwhile.
-
-        Args:
-            obstacle: name of one that is `graspable`.
-            frame: name of the frame.
-            q: configuration (nq,) at which it is grasped; that of the last step if left out, the home pose before the
-                first one.
-
-        Raises:
-            UnknownName: no such obstacle or frame.
-            ConfigError: it cannot be carried, or not by this frame.
-            NumericalError: q cannot be true.
-        """
-        if not isinstance(frame, str):
-            raise UnknownName(f"attach: no frame {frame!r:.60}; give its name")
-        index, frame_id = self._builder.tracker.index(obstacle), self.scene.robot.frame_id(frame, "attach")
-        self._builder.attach(index, frame_id, q)
-
-    def release(self, obstacle: str, q: Array | None = None) -> Sample:
-        """Release an attached obstacle: it rests where it is, until it is given to `step` again.
-
-        Pairs of it that touch now get rows once they have been farther apart than the safety distance.
-
-        Args:
-            obstacle: its name.
-            q: configuration (nq,) at which it is released; see `attach`.
-
-        Returns:
-            Its world pose.
-
-        Raises:
-            UnknownName: no such obstacle.
-            ConfigError: it is not carried.
-            NumericalError: q cannot be true.
-        """
-        return self._builder.release(self._builder.tracker.index(obstacle), q)
-
-    def allow_contact(self, obstacle: str, others: Sequence[str], allowed: bool = True) -> None:
-        """Let an obstacle and some bodies or other obstacles touch, as before a grasp.
-
-        Args:
-            obstacle: its name.
-            others: names of bodies or obstacles.
-            allowed: False takes it back.
-
-        Raises:
-            UnknownName: no such obstacle or body.
-            ConfigError: none of the others has a pair with it.
-        """
-        index, known = self._builder.tracker.index(obstacle), {*self.scene.body_names, *self.scene.obstacle_names}
-        try:
-            names = [others] if isinstance(others, str) else list(others)
-        except TypeError:
-            raise UnknownName(f"allow_contact: {others!r:.60}; give a list of names") from None
-        for name in names:
-            if not isinstance(name, str) or name not in known:
-                raise UnknownName(f"allow_contact: no body or obstacle {name!r:.60}{nearest(str(name), known)}")
-        self._builder.attachments.allow(index, set(names), allowed)
-
-    def obstacle_pose(self, obstacle: str, q: Array | None = None) -> Sample:
-        """Return the world pose of an obstacle in the last step, attached or not; see `release`."""
-        return self._builder.pose(self._builder.tracker.index(obstacle), q)
-
-    def distances(self) -> DistanceQuery:
-        """Return distances of the scene in memory of their own, which know what is attached to the robot."""
-        return DistanceQuery(self.scene, self._builder.rows.query.table)
 
     def reset(self, v: Array | None = None) -> None:
         """Forget the steps before; the robot moves at v (nv,), or stands still. Attached objects stay attached.

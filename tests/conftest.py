@@ -14,7 +14,7 @@ from qpavoid.cli import main
 from qpavoid.config.shipped import example_robot_data
 from qpavoid.control.assembler import RowAssembler
 from qpavoid.control.distances import DistanceQuery
-from qpavoid.control.obstacles import ObstacleStates
+from qpavoid.control.obstacle_states import ObstacleStates
 from qpavoid.control.row_layout import lay_out
 from qpavoid.control.settings import ControlSettings
 from qpavoid.control.tasks import in_order

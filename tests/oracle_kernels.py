@@ -36,8 +36,9 @@ def velocity_bounds(x, q):
     limited = np.isfinite(x.v_step)
     step = np.where(limited, x.v_step, 1.0)
     stop = speed_to_stop(np.maximum(margin, 0.0), step, x.dt)
-    slowed = np.maximum(x.position_rate * margin, sign * x.v_prev - np.minimum(step, x.dv_step - sign * x.dv_prev))
-    speed = np.where(limited, np.where(margin > 0.0, stop, slowed), x.position_rate * margin)
+    given = np.maximum(x.position_rate * margin, -np.minimum(0.1 * x.v_max, 0.2))
+    slowed = np.maximum(given, sign * x.v_prev - np.minimum(step, x.dv_step - sign * x.dv_prev))
+    speed = np.where(limited, np.where(margin > 0.0, stop, slowed), given)
     # on the way back from outside one limit, a coordinate can still brake for the other
     speed = np.where(limited & (margin < 0.0), np.maximum(speed, -speed[::-1]), speed)
     hard = np.clip(speed, -x.v_max, x.v_max)
@@ -98,9 +99,9 @@ def clearance_lower_bound(x, v, k, influence_distance, horizon):
     omega = np.concatenate((twists[:, 3:], x.twists[:, 3:]))
     turning, sliding = ((chains @ np.abs(v)).max() for chains in (x.chain_rotation, x.chain_translation))
     bend = horizon**2 * turning * (turning * x.lever_arm + 2.0 * sliding)
-    far = influence_distance + x.offset - x.safety_distance - (by_joints.max() + speeds.max()) * horizon - bend
+    far = influence_distance + x.offset - x.d1 - (by_joints.max() + speeds.max()) * horizon - bend
     near = x.near_pairs[:k]
-    margin = x.d[:k] - x.safety_distance
+    margin = x.d[:k] - x.d1
     fastest = margin - horizon * speeds[x.moved_by[near]].sum(axis=1) - bend
     approach = x.J[:k] @ v
     closing = (np.abs(approach) if x.jerk_limited else np.maximum(-approach, 0.0)) + np.maximum(-x.feedforward[:k], 0.0)

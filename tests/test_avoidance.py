@@ -19,12 +19,12 @@ def beta(d, d1, d2):
 
 
 D1, D2, XI = 0.12, 0.24, 5.0
-TINY = 1e-9
+NEAR_SPEEDS = 0.0, 0.02, 10.0
 
 
 def bound(d, cap=0.2, **row):
     """Right-hand sides of rows at distances d, for a robot without limits among obstacles at rest."""
-    settings = Avoidance(d1=D1, d2=D2, recovery_speed=cap, row={"gain": XI, **row})
+    settings = Avoidance(d1=D1, d2=D2, recovery_speed=cap, row={"type": "beta", "gain": XI, **row})
     closest = np.zeros((len(d), 10))
     closest[:, 0] = d
     free = np.full(2, np.inf)
@@ -64,40 +64,41 @@ def test_beta_by_hand():
 
 def test_beta_row_by_hand():
     """-(1 - β) ξ (d - d1) outside d1: at 0.18 half of -0.3, at 0.16 a quarter of -0.2; inside it ξ (d1 - d)."""
-    found = bound([0.24, 0.18, 0.16, 0.12, 0.11, 0.09], type="beta")
+    found = bound([0.24, 0.18, 0.16, 0.12, 0.11, 0.09])
     np.testing.assert_allclose(found, [-0.6, -0.15, -0.05, 0.0, 0.05, 0.15], atol=1e-12)
 
 
-def test_damper_row_by_hand():
-    np.testing.assert_allclose(bound([0.24, 0.18, 0.12, 0.09], type="damper"), [-0.6, -0.3, 0.0, 0.15], atol=1e-12)
-    held = bound([0.24, 0.18, 0.15, 0.13], type="damper", d_safe=0.15)
-    np.testing.assert_allclose(held, [-0.45, -0.15, 0.0, 0.1], atol=1e-12)
+def test_beta_row_lets_a_pair_close_at_the_near_speed():
+    """At 0.14 1 - β is 0.067: of ξ h = 0.1 m/s it leaves 6.7 mm/s, the near speed 20, and at 0.121 all of 5 mm/s."""
+    np.testing.assert_allclose(bound([0.14, 0.121], near_speed=0.02), [-0.02, -0.005], atol=1e-12)
+    np.testing.assert_allclose(bound([0.14, 0.121], near_speed=0.0), [-6.6987e-3, -8.567e-7], rtol=1e-4)
+    np.testing.assert_allclose(bound([0.24, 0.18, 0.12, 0.09], near_speed=10.0), [-0.6, -0.3, 0.0, 0.15], atol=1e-12)
 
 
-@pytest.mark.parametrize("kind", ["beta", "damper"])
-def test_row_caps_the_recovery_speed(kind):
+@pytest.mark.parametrize("near_speed", NEAR_SPEEDS)
+def test_row_caps_the_recovery_speed(near_speed):
     """5 · (0.12 - d) reaches the cap of 0.2 m/s at d = 0.08, deep in penetration it is still 0.2."""
-    np.testing.assert_allclose(bound([0.08, 0.05, -1.0], type=kind), [0.2] * 3, atol=1e-12)
-    np.testing.assert_allclose(bound([0.08, 0.05, -1.0], cap=None, type=kind), [0.2, 0.35, 5.6], atol=1e-12)
+    np.testing.assert_allclose(bound([0.08, 0.05, -1.0], near_speed=near_speed), [0.2] * 3, atol=1e-12)
+    np.testing.assert_allclose(bound([0.08, 0.05, -1.0], cap=None, near_speed=near_speed), [0.2, 0.35, 5.6], atol=1e-12)
 
 
-@pytest.mark.parametrize("kind", ["beta", "damper"])
-def test_row_is_continuous_and_falls_with_the_distance(kind):
+@pytest.mark.parametrize("near_speed", NEAR_SPEEDS)
+def test_row_is_continuous_and_falls_with_the_distance(near_speed):
     d = np.linspace(-0.1, D2, 34001)  # steps of 1e-5 m
-    found = bound(d, type=kind)
+    found = bound(d, near_speed=near_speed)
     steps = np.diff(found)
     assert (steps <= 0.0).all()
-    slope = XI * (1.0 + np.pi) if kind == "beta" else XI  # of (1 - β) ξ h at most ξ + ξ π h / 2 (d2 - d1)
+    slope = XI * (1.0 + np.pi)  # of (1 - β) ξ h at most ξ + ξ π h / 2 (d2 - d1)
     assert steps.min() >= -slope * 1e-5 - 1e-12
 
 
 def test_row_met_exactly_settles_at_the_safety_distance():
     """ḋ = bound from either side: the distance settles at d1 and is not crossed."""
     dt = 0.01
-    for kind in ("beta", "damper"):
+    for near_speed in NEAR_SPEEDS:
         d = np.array([0.23, 0.05])
         for _ in range(600):
-            d = d + dt * bound(d, type=kind)
+            d = d + dt * bound(d, near_speed=near_speed)
             assert d[0] >= D1 - 1e-12 and d[1] <= D1 + 1e-12
         assert d[1] == pytest.approx(D1, abs=1e-9)
 
@@ -119,7 +120,8 @@ def test_rows_include_offset_and_feedforward(panda):
     np.testing.assert_array_equal(rows.pair, near)
     np.testing.assert_allclose(rows.d, distance[near] + 0.1, rtol=0, atol=1e-12)
     h = rows.d - D1
-    expected = np.where(h < 0.0, np.minimum(-XI * h, settings.recovery_speed), -(1.0 - beta(rows.d, D1, D2)) * XI * h)
+    closing = np.maximum((1.0 - beta(rows.d, D1, D2)) * XI * h, np.minimum(XI * h, settings.row.near_speed))
+    expected = np.where(h < 0.0, np.minimum(-XI * h, settings.recovery_speed), -closing)
     most = np.maximum(rows.J * problem.lower, rows.J * problem.upper).sum(axis=1)  # the fastest that the arm can part
     most = np.where(rate[near] < 0.0, np.maximum(most, -rate[near]), most)
     expected = np.where(h < 0.0, np.minimum(expected - rate[near], most), expected - rate[near])
@@ -129,7 +131,7 @@ def test_rows_include_offset_and_feedforward(panda):
     np.testing.assert_array_equal(proximity.feedforward, rate[near])
 
 
-@pytest.mark.parametrize("kind", ["beta", "task-switching", "damper"])
+@pytest.mark.parametrize("kind", ["beta", "task-switching"])
 def test_rows_of_no_pair_are_none(kind, panda):
     bench = Bench(build_scene(panda), avoidance=Avoidance(row={"type": kind}))
     rows = bench.compute(panda.home, reach=-1.0)[1].avoidance

@@ -11,7 +11,7 @@ from oracle import support
 
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.geometry.cores import cores, has_closed_form
-from qpavoid.kernels.distances import MIN_CORE_DISTANCE, closed_forms
+from qpavoid.kernels.distances import CLOSED_FORM, MIN_CORE_DISTANCE, closed_forms
 from qpavoid.model.kinematics import ForwardKinematics
 
 AT_ORIGIN = pin.SE3.Identity()
@@ -23,7 +23,7 @@ def found(a, b, at_a=AT_ORIGIN, at_b=AT_ORIGIN):
     table, bodies, results = cores([a, b]), np.array([[0, 1]]), np.full((1, 10), np.nan)
     known, left = has_closed_form(table, bodies), np.zeros(1, dtype=np.intp)
     assert known.all()
-    count = closed_forms(poses, table, bodies, known, np.array([0]), results, left)
+    count = closed_forms(poses, table, bodies, known.astype(np.intp), np.array([0]), results, left)
     return None if count else results[0]
 
 
@@ -126,7 +126,7 @@ def test_distance_query_agrees_with_coal(panda, monkeypatch, copies):
     scene = random_scene(panda, rng, [SPHERE, CAPSULE, BOX, CYLINDER] * 2)
     model = scene.robot.model
     query, kinematics, deep = DistanceQuery(scene), ForwardKinematics(model), 0
-    closed = query.table.has_closed_form
+    closed = query.table.method == CLOSED_FORM
     assert 0 < closed.sum() < len(scene.pairs)
     alone, geometry_data = scene.geometry, scene.geometry.createData()
     for request in geometry_data.distanceRequests:

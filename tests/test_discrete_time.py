@@ -6,7 +6,7 @@ from closed_loop import Ruler, cartesian, drive, make_controller, scenario
 from conftest import Bench, moved
 
 from qpavoid import Avoidance, Controller, Obstacle, ReasonKind, Sample, Severity, Status, build_scene
-from qpavoid.config import Box, Damper, Sphere
+from qpavoid.config import Beta, Box, Sphere
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.run.simulate import simulate
 from qpavoid.safety.braking import TOLERANCE
@@ -14,6 +14,11 @@ from qpavoid.safety.braking import TOLERANCE
 PLATE = {"type": "box", "size": [0.004, 0.6, 0.6]}
 BALL = {"type": "sphere", "radius": 0.06}
 BOX = {"type": "box", "size": [0.2, 0.2, 0.2]}
+ROWS = {
+    "beta": {"type": "beta"},
+    "damper": {"type": "beta", "near_speed": 10.0},
+    "task-switching": {"type": "task-switching"},
+}
 SAFE = 0.02
 
 
@@ -23,7 +28,7 @@ def min_distance(log, controller, steps=10):
     return min(ruler.least_between(q, v, dt, t, steps) for q, v, t in zip(log.q, log.v, log.t, strict=True))
 
 
-@pytest.mark.parametrize("row", ["beta", "task-switching", "damper"])
+@pytest.mark.parametrize("row", ROWS)
 @pytest.mark.parametrize("shape", [PLATE, BALL, BOX], ids=["plate", "ball", "box"])
 @pytest.mark.parametrize(
     ("dt", "duration"), [(0.01, 2.0), (0.05, 3.0), pytest.param(0.001, 0.8, marks=pytest.mark.slow)]
@@ -36,7 +41,7 @@ def test_safety_distance_is_kept_at_any_period_and_speed(row, shape, dt, duratio
         [{"name": "it", "shape": shape, "motion": {"type": "fixed", "position": [0.55, 0.0, 0.45]}}],
         dt=dt,
         duration=duration,
-        avoidance={"d1": SAFE, "d2": 0.10, "row": {"type": row}},
+        avoidance={"d1": SAFE, "d2": 0.10, "row": ROWS[row]},
     )
     log = simulate(run)
     controller, _ = Controller.from_scenario(run)
@@ -99,7 +104,9 @@ def test_braking_check_is_safe_by_brute_force(panda):
     for _ in range(6):
         places = rng.uniform([0.3, -0.4, 0.2], [0.7, 0.4, 0.9], (3, 3))
         boxes = [Obstacle.at(f"box{i}", Box(size=(0.25, 0.25, 0.01)), place) for i, place in enumerate(places)]
-        controller = make_controller(panda, boxes, avoidance=Avoidance(d1=SAFE, d2=0.1, row=Damper(gain=50.0)))
+        controller = make_controller(
+            panda, boxes, avoidance=Avoidance(d1=SAFE, d2=0.1, row=Beta(gain=50.0, near_speed=10))
+        )
         ruler, q = Ruler(controller.scene), panda.home + rng.uniform(-0.5, 0.5, 7)
         while ruler.distances(q).min() < SAFE:
             q = panda.home + rng.uniform(-1.0, 1.0, 7)
@@ -137,7 +144,7 @@ def test_stop_at_any_step_is_clear_also_at_the_limits(panda):
     for _ in range(6):
         places = rng.uniform([0.3, -0.4, 0.2], [0.7, 0.4, 0.9], (3, 3))
         boxes = [Obstacle.at(f"box{i}", Box(size=(0.25, 0.25, 0.01)), place) for i, place in enumerate(places)]
-        settings = Avoidance(d1=SAFE, d2=0.1, row=Damper(gain=50.0))
+        settings = Avoidance(d1=SAFE, d2=0.1, row=Beta(gain=50.0, near_speed=10))
         driver, stopper = (make_controller(panda, boxes, avoidance=settings) for _ in range(2))
         ruler, q = Ruler(driver.scene), panda.home + rng.uniform(-0.5, 0.5, 7)
         while ruler.distances(q).min() < SAFE:
@@ -173,7 +180,7 @@ def test_command_scale_is_below_one_where_the_linearisation_fails(shape, speed, 
             avoidance={
                 "d1": SAFE,
                 "d2": 0.10,
-                "row": {"type": "damper", "gain": 20.0},
+                "row": {"type": "beta", "gain": 20.0, "near_speed": 10.0},
                 "look_ahead": look_ahead,
             },
         )
@@ -193,7 +200,7 @@ def test_braking_begins_before_rows_are_in_range(tmp_path):
         robot,
         [wall],
         "z",
-        avoidance=Avoidance(d1=SAFE, d2=0.03, row=Damper(gain=20.0)),
+        avoidance=Avoidance(d1=SAFE, d2=0.03, row=Beta(gain=20.0, near_speed=10)),
         task={"gain": 50.0},
     )
     distances, v_prev = [], np.zeros(3)

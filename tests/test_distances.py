@@ -110,7 +110,7 @@ def test_clearance_lower_bound_holds_on_straight_paths(name, request):
     robot = request.getfixturevalue(name)
     rng = np.random.default_rng(19)
     scene = random_scene(robot, rng, [SPHERE, CAPSULE, BOX, CYLINDER])
-    bench, hold = Bench(scene), Avoidance().safety_distance
+    bench, hold = Bench(scene), Avoidance().d1
     for trial in range(15):
         q, v = random_q(robot, rng), 0.1 ** (trial % 3) * rng.uniform(-1.0, 1.0, robot.model.nv)
         samples = {}
@@ -325,7 +325,7 @@ def balls(rng, count, radius):
 CASES = {
     # (distance of the obstacles, avoidance, way that the tool has to go)
     "far": (50.0, Avoidance(), 0.0),
-    "near, solving": (2.0, Avoidance(d1=1e-3, d2=5.0, row={"type": "damper", "gain": 0.02}), 0.3),
+    "near, solving": (2.0, Avoidance(d1=1e-3, d2=5.0, row={"type": "beta", "gain": 0.02, "near_speed": 1.0}), 0.3),
 }
 
 

@@ -6,7 +6,7 @@ import pytest
 from closed_loop import Ruler, cartesian, drive, make_controller
 
 from qpavoid import Avoidance, NumericalError, Obstacle, ReasonKind, Sample, Severity, Status, UnknownName
-from qpavoid.config import Box, Damper, Sensing, Sphere
+from qpavoid.config import Beta, Box, Sensing, Sphere
 from qpavoid.model.sample import Pose
 
 NAN, INF = float("nan"), float("inf")
@@ -129,7 +129,8 @@ def test_stop_without_q_ends_inside_the_joint_limits(panda):
         ({"obstacles": "ball"}, "obstacles: give a mapping"),
         ({"obstacles": {"ball": Sample.at([1, 0, 0], t="now")}}, "obstacle 'ball': t: not a number"),
         ({"obstacles": {"ball": Sample.at([1, 0, 0], linear=[1, 0, 0], at_rest=True)}}, "obstacle 'ball': at_rest"),
-        ({"targets": {TOOL: np.eye(4)}}, f"target '{TOOL}': neither"),
+        ({"targets": {TOOL: np.eye(3)}}, f"target '{TOOL}': neither"),
+        ({"targets": {TOOL: np.triu(np.ones((4, 4))).T}}, f"target '{TOOL}': a 4x4 matrix whose last row"),
         ({"obstacles": {"ball": "there"}}, "obstacle 'ball': neither"),
     ],
 )
@@ -274,7 +275,7 @@ def test_nan_from_an_obstacle_counts_as_no_update(tmp_path):
 def test_jitter_of_the_period_costs_no_more_than_a_step(panda, seed):
     rng = np.random.default_rng(seed)
     wall = Obstacle.at("wall", Box(size=(0.02, 1.0, 1.0)), [0.50, 0.0, 0.5])
-    tight = Avoidance(d1=0.02, d2=0.1, row=Damper(gain=20.0))
+    tight = Avoidance(d1=0.02, d2=0.1, row=Beta(gain=20.0, near_speed=10.0))
     controller = make_controller(panda, [wall], TOOL, avoidance=tight)
     ruler, bounds = Ruler(controller.scene), panda.bounds()
     least, fastest = np.inf, 0.0

@@ -11,7 +11,7 @@ if not BENCH.is_dir():  # in a wheel it stands beside the package
     BENCH = Path(qpavoid.__file__).parents[1] / "qpavoid_bench"
 FOR_BENCHMARKS = {
     "qpavoid.errors": "error classes, and how messages name a place and the nearest name",
-    "qpavoid.control.obstacles": "ObstacleStates: where the planner puts the obstacles for that",
+    "qpavoid.control.obstacle_states": "ObstacleStates: where the planner puts the obstacles for that",
     "qpavoid.control.distances": "DistanceQuery: the planner that proves a case solvable checks distances",
     "qpavoid.control.tasks": "FrameTask: which goals the scores and other libraries follow",
     "qpavoid.solvers": "parse_solver: entrants are named as in scenarios",

@@ -172,7 +172,7 @@ def test_bounds_return_a_joint_into_its_limits_within_its_jerk(side):
     v, w = np.zeros(300), np.zeros(300)
     axes, choice, back = Axes(joints, 0.5, dt), rng.random(300), np.zeros(300, dtype=bool)
     unit = np.where(np.isinf(joints.jerk), np.inf, joints.jerk * dt**2)
-    for _ in range(3000):
+    for _ in range(10000):
         lower, upper = bounds_after(axes, q, v, w)
         assert (lower <= upper).all()
         v_next = lower + choice * (upper - lower)
@@ -281,7 +281,7 @@ def test_rows_stop_a_pair_at_its_distance_with_half_of_the_limits():
         closest[:, 0] = d
         x = make_layout(2, pairs=1, closest=closest, near_pairs=np.arange(1), feedforward=np.zeros(1), J=J, v_step=step,
             dv_step=unit, v_prev=v, dv_prev=w, acceleration_limited=True, jerk_limited=True,
-            v_stop=np.array([0.0, -1e3]), beta=False, row_gain=100.0, lower=-np.ones(2), upper=np.ones(2),
+            v_stop=np.array([0.0, -1e3]), near_speed=np.inf, row_gain=100.0, lower=-np.ones(2), upper=np.ones(2),
         )  # fmt: skip
         kernels.row_bounds(kernels.pack(x), 1, False)
         # the velocity along J that closes fastest, within the row and within what half of the limits allow

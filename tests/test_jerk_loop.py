@@ -12,6 +12,11 @@ from qpavoid.config import Box, Sphere
 from qpavoid.run.simulate import simulate
 from qpavoid.solvers.relaxation import relaxed_solution
 
+ROWS = {
+    "beta": {"type": "beta"},
+    "damper": {"type": "beta", "near_speed": 10.0},
+    "task-switching": {"type": "task-switching"},
+}
 SAFE = 0.02
 
 
@@ -26,7 +31,7 @@ def within_limits(controller, vs, slack=1e-9):
     return np.max(np.abs(jumps) / (b.jerk * dt**2))
 
 
-@pytest.mark.parametrize("row", ["beta", "task-switching", "damper"])
+@pytest.mark.parametrize("row", ROWS)
 @pytest.mark.parametrize("size", [[0.004, 0.6, 0.6], [0.2, 0.2, 0.2]], ids=["plate", "box"])
 @pytest.mark.parametrize(
     ("dt", "duration"), [(0.01, 1.5), (0.05, 3.0), pytest.param(0.002, 0.8, marks=pytest.mark.slow)]
@@ -39,7 +44,7 @@ def test_safety_distance_is_kept_at_any_period_and_speed(row, size, dt, duration
         [{"name": "it", "shape": {"type": "box", "size": size},
           "motion": {"type": "fixed", "position": [0.55, 0.0, 0.45]}}],
         dt=dt, duration=duration, limits={"jerk": 100.0},
-        avoidance={"d1": SAFE, "d2": 0.10, "row": {"type": row}},
+        avoidance={"d1": SAFE, "d2": 0.10, "row": ROWS[row]},
     )  # fmt: skip
     log = simulate(run)
     controller, _ = Controller.from_scenario(run)

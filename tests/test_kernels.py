@@ -11,7 +11,7 @@ import pytest
 from conftest import BOX, CAPSULE, CYLINDER, SPHERE, lay_out_step, make_layout, random_q, random_scene
 
 from qpavoid import kernels
-from qpavoid.control.obstacles import ObstacleStates
+from qpavoid.control.obstacle_states import ObstacleStates
 from qpavoid.kernels.packing import compiled
 
 SEEDS = range(8)
@@ -167,16 +167,17 @@ def rows_at(d, **fields):
     return make_layout(7, len(d), obstacles=2, **{"closest": closest, **bounds, **fields})
 
 
-@pytest.mark.parametrize("weighted", [True, False])
-def test_row_bounds_by_hand(weighted):
-    """-(1 - β) ξ (d - d1) outside d1, ξ (d1 - d) up to the cap inside it; d = d1 and d = d2 exactly as well."""
+@pytest.mark.parametrize("near_speed", [0.0, 0.1, np.inf])
+def test_row_bounds_by_hand(near_speed):
+    """-(1 - β) ξ (d - d1) outside d1, or the near speed up to ξ (d - d1); ξ (d1 - d) up to the cap inside it."""
     d1, d2, gain = 0.1, 0.3, 5.0
     d = np.array([-1.0, 0.05, 0.08, d1, 0.15, 0.2, d2, 0.5])
     beta = np.array([1.0, 1.0, 1.0, 1.0, 0.5 + 0.25 * np.sqrt(2.0), 0.5, 0.0, 0.0])
     for cap in (0.2, np.inf):
         raw = gain * (d1 - d)
-        expected = np.minimum(np.where(raw > 0.0, raw, (1.0 - beta) * raw) if weighted else raw, cap)
-        x = rows_at(d, row_gain=gain, recovery_speed=cap, beta=weighted)
+        closing = np.minimum((1.0 - beta) * raw, np.maximum(raw, -near_speed))
+        expected = np.minimum(np.where(raw > 0.0, raw, closing), cap)
+        x = rows_at(d, row_gain=gain, recovery_speed=cap, near_speed=near_speed)
         run("row_bounds", x, len(d), False)
         np.testing.assert_allclose(x.rhs, expected, rtol=0, atol=1e-14)
         np.testing.assert_array_equal(x.d, d)
@@ -192,7 +193,7 @@ def test_row_bounds_with_offset_margin_and_feedforward():
     d[:4], feedforward[:4] = [0.20, 0.20, 0.20, 0.02], [0.1, -0.2, 0.0, 0.3]
     x = rows_at(
         d, near_pairs=np.append(near, [-1, -1]), offset=0.05, margin=np.array([0.01, 0.04, 0.0]), twist_row=of,
-        feedforward=feedforward, beta=False,
+        feedforward=feedforward, near_speed=np.inf,
     )  # fmt: skip
     run("row_bounds", x, 4, True)
     np.testing.assert_allclose(x.d[:4], [0.24, 0.21, 0.25, 0.03], rtol=0, atol=1e-15)
@@ -202,7 +203,7 @@ def test_row_bounds_with_offset_margin_and_feedforward():
 def test_distance_allowance_moves_the_safety_distance_of_a_pair():
     """A pair with an allowance s has the row of one that is s farther away, but touches where it touches."""
     d, allowance = np.array([0.02, 0.06, 0.2]), np.array([0.09, 0.0, 0.05])
-    fields = {"offset": 0.01, "beta": False, "row_gain": 5.0, "safety_distance": 0.1}
+    fields = {"offset": 0.01, "near_speed": np.inf, "row_gain": 5.0, "d1": 0.1}
     x, y = rows_at(d, distance_allowance=allowance, **fields), rows_at(d + allowance, **fields)
     for layout in (x, y):
         run("row_bounds", layout, 3, False)
@@ -222,7 +223,7 @@ def test_row_bounds_within_accelerations(paper, seed):
 
     Rows are feasible: to part at most as fast as the bounds allow; not to close no sooner than a stop would end it.
     """
-    x = Step(paper, seed, beta=True, offset=0.03, d1=0.1, d2=0.3, safety_distance=0.1).x
+    x = Step(paper, seed, near_speed=0.2, offset=0.03, d1=0.1, d2=0.3).x
     rng, n = np.random.default_rng(seed), 30
     x = x._replace(v_step=rng.uniform(0.01, 0.5, 14))
     run("velocity_bounds", x, np.zeros(14))
@@ -230,7 +231,7 @@ def test_row_bounds_within_accelerations(paper, seed):
     x.closest[:n, 0], x.J[:n] = rng.uniform(-0.1, 0.5, n), rng.normal(size=(n, 14)) * rng.integers(0, 2, (n, 14))
     x.feedforward[:n], x.near_pairs[:n] = rng.normal(size=n), np.arange(n)
     run("row_bounds", x, n, True)
-    raw = x.row_gain * (x.safety_distance - x.d)
+    raw = x.row_gain * (x.d1 - x.d)
     weight = 0.5 - 0.5 * np.cos(np.pi * np.clip((x.d - x.d1) / (x.d2 - x.d1), 0.0, 1.0))
     for i in range(n):
         J, feedforward = x.J[i], x.feedforward[i]
@@ -240,8 +241,8 @@ def test_row_bounds_within_accelerations(paper, seed):
             expected = min(min(raw[i], x.recovery_speed) - feedforward, most)
         else:
             half = 0.25 * np.abs(J) @ x.v_step
-            brake = half - np.sqrt(half**2 + 4.0 * half * (x.d[i] - x.safety_distance) / x.dt)
-            expected = max(weight[i] * raw[i], brake) - feedforward
+            brake = half - np.sqrt(half**2 + 4.0 * half * (x.d[i] - x.d1) / x.dt)
+            expected = max(min(weight[i] * raw[i], max(raw[i], -0.2)), brake) - feedforward
             expected = expected if feedforward < 0.0 else min(expected, J @ x.v_stop)
         contact = min(x.row_gain * (x.offset - x.d[i]) - feedforward, expected)
         assert x.rhs[i] == pytest.approx(expected, rel=1e-12, abs=1e-13)
@@ -256,7 +257,7 @@ def test_row_bounds_brake_a_pair_at_the_safety_distance():
     for _ in range(400):
         x = rows_at(
             d, J=np.array([[0.5, -1.0]]), v_step=step, acceleration_limited=True, v_stop=np.array([0.0, -1e3]),
-            beta=False, row_gain=100.0, lower=-np.ones(2), upper=np.ones(2),
+            near_speed=np.inf, row_gain=100.0, lower=-np.ones(2), upper=np.ones(2),
         )  # fmt: skip
         run("row_bounds", x, 1, False)
         change, v = x.rhs[0] - v, x.rhs[0]
@@ -265,7 +266,7 @@ def test_row_bounds_brake_a_pair_at_the_safety_distance():
     distances, changes = np.array(trace[1:]).T
     half = 0.5 * (0.05 + 0.2)
     assert (changes[:-1] <= 1.25 * half).all() and np.isclose(changes, half).sum() > 25
-    assert distances.min() >= x.safety_distance - 1e-9 and distances[-1] == pytest.approx(x.safety_distance, abs=1e-3)
+    assert distances.min() >= x.d1 - 1e-9 and distances[-1] == pytest.approx(x.d1, abs=1e-3)
 
 
 # --- clearance ---------------------------------------------------------------------------------------------------
@@ -298,7 +299,7 @@ def test_clearance_lower_bound_by_its_definition(robot, near, jerks):
         step = Step(robot, seed)
         step.x = x = step.x._replace(jerk_limited=jerks)
         near = min(near, step.rows())
-        x.d[:] = x.safety_distance + step.rng.uniform(0.05 * (seed % 2 - 0.5), 0.5, len(x.d))
+        x.d[:] = x.d1 + step.rng.uniform(0.05 * (seed % 2 - 0.5), 0.5, len(x.d))
         v, horizon = step.rng.uniform(-1.0, 1.0, robot.model.nv), 10.0 ** step.rng.uniform(-3.0, 0.0)
         bounds.append(run("clearance_lower_bound", x, v, near, 0.8, horizon))
         expected = oracle.clearance_lower_bound(x, v, near, 0.8, horizon)
@@ -372,7 +373,7 @@ def test_velocity_bounds_by_hand():
     """dt = 0.01 s and half of what is left: 50 (q_lim - q), but not beyond v_max = 2, 3, 4, ∞, ∞ and 5.
 
     In turn: a margin on both sides; 0.01 rad below the upper limit; 0.02 rad beyond it; no position limit; no speed
-    limit; far below the lower limit, which returns at full speed.
+    limit; far below the lower limit. From outside, a tenth of the largest speed is asked for, at most 0.2 rad/s.
     """
     inf = np.inf
     q = np.array([9.0, 0.0, 0.99, 1.02, 9.0, 9.0, 0.3, -4.0])  # q[0], q[4] and q[5] have no limits in this chart
@@ -382,8 +383,8 @@ def test_velocity_bounds_by_hand():
         v_max=np.array([2.0, 3.0, 4.0, inf, inf, 5.0]), position_rate=50.0,
     )  # fmt: skip
     assert run("velocity_bounds", x, q) == -3.0
-    np.testing.assert_allclose(x.lower, [-2.0, -3.0, -4.0, -inf, -inf, 5.0])
-    np.testing.assert_allclose(x.upper, [2.0, 0.5, -1.0, inf, 35.0, 5.0])
+    np.testing.assert_allclose(x.lower, [-2.0, -3.0, -4.0, -inf, -inf, 0.2])
+    np.testing.assert_allclose(x.upper, [2.0, 0.5, -0.2, inf, 35.0, 5.0])
 
 
 def random_limits(rng, nv, jerks):

@@ -20,18 +20,18 @@ COURSES = {
 }
 """Start, end and speed of a sphere that meets the arm, relative to the tool's start."""
 SAFE = 0.020
-"""Safety distance of the damper rows between surfaces: 0.12 m between axes."""
+"""Safety distance between surfaces: 0.12 m between axes."""
 
 
 def situation(course, row=None, **avoidance):
     """Situation 1 with the sphere on a course, with rows of a damper that hold 20 mm unless it is said otherwise."""
     start, end, speed = COURSES[course]
     line = {"type": "line", "start": (TOOL + start).tolist(), "end": (TOOL + end).tolist(), "speed": speed}
-    row = row or {"type": "damper", "d_safe": 0.12, "gain": 5}
+    d1, row = (0.18, row) if row else (0.12, {"type": "beta", "near_speed": 10.0})
     return changed(
         "situation1",
         obstacles=[{"name": "fist", "shape": {"type": "sphere", "radius": 0.05}, "motion": line}],
-        avoidance={"d1": 0.18, "d2": 0.36, "offset": 0.1, "row": row, **avoidance},
+        avoidance={"d1": d1, "d2": 0.36, "offset": 0.1, "row": row, **avoidance},
     )
 
 
@@ -144,7 +144,7 @@ def crossing(left, right):
         "robot": "paper-dual-arm",
         "q0": [*LEFT.tolist(), *RIGHT.tolist()],
         "tasks": [{"frame": f, "motion": m} for f, m in zip(("left_tool", "right_tool"), lines, strict=True)],
-        "avoidance": {"d1": 0.02, "d2": 0.15, "row": {"type": "damper", "gain": 5}},
+        "avoidance": {"d1": 0.02, "d2": 0.15, "row": {"type": "beta", "near_speed": 10.0}},
         "duration": 10.0,
     }
     scenario = ScenarioConfig.model_validate(fields).with_source(SHIPPED)

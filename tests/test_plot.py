@@ -42,16 +42,14 @@ def entries(ax):
 
 
 def test_distances_are_those_of_the_log_between_levels_of_surfaces(sphere):
-    """The offset of 0.1 m of the paper is taken off d1, d2 and d_safe."""
-    config = {**sphere[2].meta["config"]}
-    config["avoidance"] = {**config["avoidance"], "row": {"type": "damper", "d_safe": 0.12}}
-    log = replace(sphere[2], meta={**sphere[2].meta, "config": config})
+    """The offset of 0.1 m of the paper is taken off d1 and d2."""
+    log = sphere[2]
     ax, gains = distances_figure(log).axes
     drawn = lines(ax)
     for i, body in enumerate(log.meta["bodies"]):
         assert_allclose(drawn[body].get_ydata(), log.body_distance[:, i], atol=1e-15)
     levels = [line.get_ydata()[0] for name, line in drawn.items() if "$" in name or "collision" in name]
-    assert sorted(levels) == pytest.approx([0.0, 0.02, 0.08, 0.26])
+    assert sorted(levels) == pytest.approx([0.0, 0.08, 0.26])
     bottom, top = ax.get_ylim()
     assert all(bottom <= np.min(line.get_ydata()) and np.max(line.get_ydata()) <= top for line in ax.get_lines())
     alpha, beta = (line.get_ydata() for line in gains.get_lines())

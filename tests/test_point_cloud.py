@@ -320,7 +320,7 @@ def test_clearance_lower_bound_includes_voxels_without_pairs(panda, tmp_path):
     rng = np.random.default_rng(9)
     points = scattered(rng, 300, 0.7)
     scene = cloud_scene(panda, points, tmp=tmp_path)
-    bench, hold, ruler = Bench(scene), Avoidance().safety_distance, Ruler(scene)
+    bench, hold, ruler = Bench(scene), Avoidance().d1, Ruler(scene)
     for _ in range(15):
         q, v = random_q(panda, rng), rng.uniform(-1.0, 1.0, 7)
         near = len(bench.compute(q, reach=0.3)[0].pair)

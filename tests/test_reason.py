@@ -20,7 +20,7 @@ from qpavoid import (
     Status,
     make_solver,
 )
-from qpavoid.config import Box, Damper, Sphere
+from qpavoid.config import Beta, Box, Sphere
 from qpavoid.problem import AvoidanceRows, Tracking, make_problem
 
 INFORMING = {"NO_BACKUP", "ESTIMATED", "IGNORED", "POINTS_DROPPED", "NORMALISED", "TIMING"}
@@ -73,7 +73,7 @@ def test_severity_of_a_solution_is_the_worst_of_its_reasons(field):
 
 def test_reasons_of_a_run_are_the_same_in_json_and_log(cli):
     """In Situation 1 with damper rows the sphere keeps the tool from its target for a while."""
-    rows = "avoidance.row={type: damper, d_safe: 0.12, gain: 5}"
+    rows = "avoidance={d1: 0.12, d2: 0.36, offset: 0.1, row: {type: beta, near_speed: 10}}"
     result = cli("run", "situation1", "--set", "duration=4", "--set", rows, "--json", "--no-figures")
     document = json.loads(result.stdout)
     log = Log.load(document["files"][0])
@@ -105,7 +105,7 @@ def test_relaxed_row_warns_and_contact_alarms(tmp_path):
     """A tool of 50 mm between walls that ask for 60 mm, and then with a ball that comes on too fast to be left."""
     robot = cartesian(tmp_path, acceleration=None)
     walls = [Obstacle.at(n, Box(size=(0.1, 1, 1)), [x, 0, 0]) for n, x in (("left", -0.15), ("right", 0.15))]
-    avoidance = Avoidance(d1=0.06, d2=0.1, row=Damper(gain=5.0))
+    avoidance = Avoidance(d1=0.06, d2=0.1, row=Beta(gain=5.0, near_speed=10.0))
     between = make_controller(robot, walls, "z", avoidance=avoidance).step([0.004, 0.0, 0.0])
     assert between.status is Status.RELAXED and between.severity is Severity.WARNING
     hit = make_controller(robot, [Obstacle.at("ball", BALL, [9.0, 0, 0])], "z").step(

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 
 from qpavoid import Avoidance, Obstacle, ReasonKind, Severity, Status, make_solver
-from qpavoid.config import Box, Damper
+from qpavoid.config import Beta, Box
 from qpavoid.problem import AvoidanceRows, Tracking, make_problem
 
 NV, PAIRS, SAFE, GAIN = 5, 4, 0.05, 5.0
@@ -111,7 +111,9 @@ def test_relaxation_between_two_walls_favours_the_nearer(tmp_path, off):
     """Walls 50 mm from a tool that wants 60 mm on both sides; 4 mm off the middle."""
     robot = cartesian(tmp_path, acceleration=None)
     walls = [Obstacle.at(n, Box(size=(0.1, 1, 1)), [x, 0, 0]) for n, x in (("left", -0.15), ("right", 0.15))]
-    controller = make_controller(robot, walls, "z", avoidance=Avoidance(d1=0.06, d2=0.1, row=Damper(gain=5.0)))
+    controller = make_controller(
+        robot, walls, "z", avoidance=Avoidance(d1=0.06, d2=0.1, row=Beta(gain=5.0, near_speed=10))
+    )
     s = controller.step([off, 0.0, 0.0])
     assert s.status is Status.RELAXED
     far = "left" if off > 0.0 else "right"

@@ -227,7 +227,7 @@ def test_what_passes_close_by_is_known_not_to_come_nearer(panda, shape):
         )  # fmt: skip
         bench.place({0: sample})
         proximity = bench.compute(q, reach=0.1)[0]
-        gap = proximity.distance.min(initial=np.inf) - Avoidance().safety_distance
+        gap = proximity.distance.min(initial=np.inf) - Avoidance().d1
         if not 0.0 < gap < 0.01:
             continue
         close += 1
@@ -235,7 +235,7 @@ def test_what_passes_close_by_is_known_not_to_come_nearer(panda, shape):
         warned += least > 0.0
         for t in (0.005, 0.01, 0.02):
             found = look(scene, pin.integrate(panda.model, q, t * v), {0: moved(sample, t)}, 0.1)
-            assert found.distance.min(initial=0.1) - Avoidance().safety_distance >= least - 1e-9
+            assert found.distance.min(initial=0.1) - Avoidance().d1 >= least - 1e-9
     assert close > 10 and warned > 0.1 * close
 
 
@@ -243,7 +243,7 @@ def test_what_passes_close_by_is_known_not_to_come_nearer(panda, shape):
 def test_the_closest_call_holds_for_half_spaces_that_move_and_turn(panda, turning):
     rng = np.random.default_rng(9)
     scene = build_scene(panda, [obstacle("wall", FLOOR, (0, 0, -0.3))])
-    bench, hold = Bench(scene), Avoidance().safety_distance
+    bench, hold = Bench(scene), Avoidance().d1
     for _ in range(20):
         q, v = random_q(panda, rng), rng.uniform(-1, 1, 7)
         bench.compute(q, reach=0.3)

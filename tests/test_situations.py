@@ -69,12 +69,12 @@ def test_qp_with_the_gains_of_eq10_keeps_d1(scenario, closest):
     assert metrics["status_counts"]["RELAXED"] == metrics["status_counts"]["STOPPED"] == 0
 
 
-DAMPER = "avoidance.row={type: damper, d_safe: 0.12, gain: 5}"
+DAMPER = "avoidance.d1=0.12", "avoidance.row={type: beta, near_speed: 10, gain: 5}"
 
 
 @pytest.mark.parametrize("scenario", ["situation1", "situation2"])
 def test_qp_with_damper_rows_keeps_its_safety_distance(scenario):
-    log = run(scenario, "qp", DAMPER)
+    log = run(scenario, "qp", *DAMPER)
     assert axis_distance(log).min() == pytest.approx(0.120, abs=5e-4)
     assert log.metrics()["final_error"] < 1e-4
     assert set(log.metrics()["status_counts"].items()) >= {("RELAXED", 0), ("STOPPED", 0)}

@@ -9,12 +9,12 @@ import pytest
 from closed_loop import accelerations, cartesian, changed, drive, make_controller
 
 from qpavoid import Avoidance, Obstacle, Robot, Sample, load_scenario
-from qpavoid.config import Box, Capsule, Damper, Sphere
+from qpavoid.config import Beta, Box, Capsule, Sphere
 from qpavoid.run.simulate import simulate
 
 ROWS = {
     "beta": Avoidance(d1=0.02, d2=0.1),
-    "damper": Avoidance(d1=0.02, d2=0.1, row=Damper(gain=5.0)),
+    "damper": Avoidance(d1=0.02, d2=0.1, row=Beta(gain=5.0, near_speed=10.0)),
 }
 
 
@@ -27,7 +27,7 @@ def run(name, solver, acceleration=None):
 @cache
 def damped(name):
     """The QP with damper rows for 20 mm."""
-    avoidance = load_scenario(name).avoidance.model_dump() | {"row": {"type": "damper", "d_safe": 0.12}}
+    avoidance = load_scenario(name).avoidance.model_dump() | {"d1": 0.12, "row": {"type": "beta", "near_speed": 10.0}}
     return simulate(changed(name, avoidance=avoidance), "qp")
 
 

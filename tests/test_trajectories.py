@@ -13,7 +13,7 @@ from pydantic import TypeAdapter
 
 from qpavoid import Obstacle, ReasonKind, Sample, Status, build_scene, config, kernels
 from qpavoid.control.distances import DistanceQuery
-from qpavoid.control.obstacles import ObstacleStates
+from qpavoid.control.obstacle_states import ObstacleStates
 from qpavoid.control.trajectories import TrajectoryBatch, extrapolate
 from qpavoid.errors import NumericalError
 from qpavoid.kernels.obstacles import (

@@ -8,7 +8,6 @@ from qpavoid.config.base import Block
 from qpavoid.config.control import (
     Avoidance,
     Beta,
-    Damper,
     Limits,
     Progress,
     Sensing,
@@ -56,7 +55,7 @@ from qpavoid.config.tasks import (
 
 __all__ = [
     "AlignTask", "AnyTask", "Avoidance", "Beta", "Block", "Body", "Box", "Capsule", "Circle", "ComTask",
-    "Cone", "Contact", "Csv", "Cylinder", "Damper", "DampingTask", "Ellipsoid", "Eq10Solver", "Fixed",
+    "Cone", "Contact", "Csv", "Cylinder", "DampingTask", "Ellipsoid", "Eq10Solver", "Fixed",
     "GradientProjectionSolver", "HalfSpace", "HqpSolver", "Hull", "JointLimits", "Limits", "Line", "LookAtTask",
     "ManipulabilityTask", "Mesh", "Motion", "ObstacleConfig", "ObstacleShape", "PairMargin", "PointCloud",
     "PostureTask", "PotentialFieldSolver", "Progress", "QpSolver", "RelativeTask", "RobotConfig", "ScenarioConfig",

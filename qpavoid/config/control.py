@@ -10,11 +10,16 @@ from qpavoid.config.base import Block, NonNegative, Positive
 
 
 class Beta(Block):
-    """Velocity damper weighted with eq. 12: ḋ >= -(1 - β(d)) ξ (d - d1); below d1 it backs away."""
+    """Velocity damper weighted with eq. 12 far from d1: ḋ >= -max((1 - β(d)) ξ h, min(ξ h, near_speed)), h = d - d1;
+    below d1 it backs away.
+    """
 
     type: Literal["beta"] = "beta"
     gain: Positive = 5.0
     """ξ [1/s]."""
+    near_speed: NonNegative = 0.02
+    """Speed at which a pair may close near d1, where 1 - β lets it creep [m/s]; 0: it creeps; 10, or any beyond
+    ξ (d2 - d1): a plain velocity damper."""
 
 
 class TaskSwitching(Block):
@@ -31,19 +36,7 @@ class TaskSwitching(Block):
     """Largest α; eq. 11 grows without bound as d goes to 0 [-]. At most 1 counts between two bodies of the robot."""
 
 
-class Damper(Block):
-    """Velocity damper: ḋ >= -ξ (d - d_safe); below d_safe it backs away, at most at `recovery_speed`. Without that cap,
-    it is a control barrier function d - d_safe with a linear class-K function.
-    """
-
-    type: Literal["damper"] = "damper"
-    gain: Positive = 5.0
-    """ξ [1/s]."""
-    d_safe: Positive | None = None
-    """Safety distance [m], measured as d1 is; left out: d1."""
-
-
-AvoidanceRow = Annotated[Beta | TaskSwitching | Damper, Field(discriminator="type")]
+AvoidanceRow = Annotated[Beta | TaskSwitching, Field(discriminator="type")]
 
 
 class Avoidance(Block):
@@ -54,7 +47,7 @@ class Avoidance(Block):
     d2: float = 0.10
     """Influence distance: farther pairs are ignored (eqs. 11, 12) [m]."""
     offset: NonNegative = 0.0
-    """Added to the distance between surfaces before d1, d2 and d_safe are compared with it [m]. The paper measures
+    """Added to the distance between surfaces before d1 and d2 are compared with it [m]. The paper measures
     between axes: its figures want the sum of the two radii here."""
     row: AvoidanceRow = Beta()
     """Form of the QP's avoidance rows."""
@@ -68,19 +61,12 @@ class Avoidance(Block):
     """Whether tasks are followed only while a backup trajectory stays clear of moving obstacles, see
     `qpavoid.safety.backup`. Takes time where these come near; not with contacts, nor for laws that keep no limits."""
 
-    @property
-    def safety_distance(self) -> float:
-        """Distance below which no row lets a pair come [m]."""
-        return self.row.d_safe if isinstance(self.row, Damper) and self.row.d_safe is not None else self.d1
-
     @model_validator(mode="after")
     def _ordered(self) -> Avoidance:
         if not 0 < self.d1 < self.d2:
             raise ValueError(f"needs 0 < d1 < d2, got d1 = {self.d1}, d2 = {self.d2}")
         if self.d1 <= self.offset:
             raise ValueError(f"d1 = {self.d1} must exceed offset = {self.offset}, else it lies inside the bodies")
-        if not self.offset <= self.safety_distance < self.d2:
-            raise ValueError(f"needs offset <= row.d_safe < d2, got {self.offset}, {self.safety_distance}, {self.d2}")
         return self
 
 

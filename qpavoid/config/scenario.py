@@ -14,6 +14,8 @@ from qpavoid.config.shapes import HalfSpace, Mesh, ObstacleShape, PointCloud
 from qpavoid.config.solver import QpSolver, SolverConfig
 from qpavoid.config.tasks import AnyTask, Contact
 
+MAX_SPARE = 100
+"""Most obstacles that may come at run time: each of them has pairs with all others."""
 MAX_LATENCY = 0.5
 """Longest time after which actuators may follow a command [s]: a longer one is in milliseconds."""
 _MAX_STEPS = 1_000_000
@@ -70,6 +72,8 @@ class ScenarioConfig(Block):
     contacts: list[Contact] = []
     """Frames that stay where they are at q0, such as feet; for `qp` and `hqp`."""
     obstacles: list[ObstacleConfig] = []
+    spare_obstacles: Annotated[int, Field(ge=0, le=MAX_SPARE)] = 0
+    """How many more a program may add by `Controller.add_obstacle`, at the same time [-]."""
     avoidance: Avoidance = Avoidance()
     limits: Limits = Limits()
     sensing: Sensing = Sensing()

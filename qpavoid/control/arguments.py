@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from qpavoid.control.inputs import LARGEST_COMMAND, LARGEST_VELOCITY, Clock, Configurations, Times, check_velocity
-from qpavoid.control.obstacles import ObstacleTracker, StepUpdate
+from qpavoid.control.obstacle_states import StepUpdate
+from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.control.targets import TargetReader
 from qpavoid.problem import Array, as_vector
 from qpavoid.reason import Reason

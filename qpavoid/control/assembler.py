@@ -47,7 +47,7 @@ class RowAssembler:
         x = self._layout = lay_out(settings, frames, row_tasks, self._forward, self.query)
         self._hard = (x.hard_lower, x.hard_upper) if limits.relax_acceleration else (x.lower, x.upper)
         self._packed, self._contacts = kernels.pack(x), contacts
-        self._pair_names = scene.pair_names
+        self._scene = scene
         self._joint_names, self._joint_units = tuple(scene.robot.coordinate_names), tuple(scene.robot.coordinate_units)
         self.previous = PreviousVelocity(x, contacts is not None)
         """Velocity at which the robot moves when a step begins."""
@@ -121,8 +121,8 @@ class RowAssembler:
         if contacts is not None:
             bent, violation = self._track_within(contacts, k)
         return proximity, Problem(
-            self._tracking, avoidance, x.lower, x.upper, *self._hard, x.v_stop, self._pair_names, self._joint_names,
-            self._joint_units, x.v_tracking, violation,
+            self._tracking, avoidance, x.lower, x.upper, *self._hard, x.v_stop, self._scene.pair_names,
+            self._joint_names, self._joint_units, x.v_tracking, violation,
             contacts, self._levels if len(self._levels) > 1 else (), None, bent, x.jerk_limited, clear, margin,
         )  # fmt: skip
 

@@ -50,7 +50,7 @@ class Attachments:
         Raises:
             ConfigError: the obstacle was not declared graspable, the frame is fixed to the world, or far from it.
         """
-        obstacle, frame = self._scene.obstacles[index], self._scene.robot.model.frames[frame_id]
+        obstacle, frame = self._scene.slots[index], self._scene.robot.model.frames[frame_id]
         if not obstacle.graspable:
             raise ConfigError(f"attach: {obstacle.name!r} cannot be carried: declare it with `graspable: true`")
         joint = int(frame.parentJoint)
@@ -72,7 +72,7 @@ class Attachments:
             ConfigError: it is not attached.
         """
         if index not in self._table.attached:
-            raise ConfigError(f"release: {self._scene.obstacles[index].name!r} is not carried")
+            raise ConfigError(f"release: {self._scene.slots[index].name!r} is not carried")
         sample = self.pose(index, q)
         self._change(index, 0, np.zeros(12))
         return sample
@@ -101,11 +101,17 @@ class Attachments:
         Raises:
             ConfigError: there is no such pair.
         """
-        name = self._scene.obstacles[index].name
+        name = self._scene.slots[index].name
         chosen = np.array([name in pair and bool(names & set(pair) - {name}) for pair in self._scene.pair_names])
         if not chosen.any():
             raise ConfigError(f"allow_contact: no pair of {name!r} with any of {', '.join(sorted(names))}")
         self._allowed[chosen] = allowed
+        self._update()
+
+    def forget(self, index: int) -> None:
+        """Forget what touched an obstacle, or was allowed to."""
+        own = self._table.pairs_of(index)
+        self._touching, self._allowed[own] = self._touching[~own[self._touching]], False
         self._update()
 
     @property

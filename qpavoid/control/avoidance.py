@@ -1,13 +1,14 @@
 """Avoidance rows: how fast each near pair may close, as a function of its distance.
 
-With h = d - d_s and gain ξ (d_s is d_safe for damper, d1 for the others), ḋ = J v + ḋ_obs stays above
+With h = d - d1 and gain ξ, ḋ = J v + ḋ_obs stays above
 
-- beta: -(1 - β) ξ h, and for h < 0 min(-ξ h, recovery_speed);
+- beta: -max((1 - β) ξ h, min(ξ h, near_speed)), and for h < 0 min(-ξ h, recovery_speed): far off it is slowed down by
+  β of eq. 12, and near d1, where that would let it creep, it goes on at a walking speed. A large near_speed leaves
+  -ξ h, the velocity damper (Faverjon and Tournassoud 1987, in its linear form), which without the cap is the control
+  barrier function of Ames et al. 2019 with a linear class-K function;
 - task-switching: (1 - β)(1 - α) min(u, ẋ0) + β ẋ0, at least -ξ h for h < 0 and at most recovery_speed. That is the rate
   of eq. 10 with the consistent bracket. u = J v0 + ḋ_obs is the rate that tracking alone would give; α, capped, counts
-  for u < 0 only. No more of h than there is may be used in a tick: ḋ >= -h / dt;
-- damper: -ξ h, capped in the same way (Faverjon and Tournassoud 1987, in its linear form); without the cap, the control
-  barrier function of Ames et al. 2019 with a linear class-K function.
+  for u < 0 only. No more of h than there is may be used in a tick: ḋ >= -h / dt.
 """
 
 from __future__ import annotations
@@ -24,10 +25,9 @@ def row_form(config: Avoidance) -> dict[str, Any]:
     row = config.row
     return {
         "offset": config.offset,
-        "safety_distance": config.safety_distance,
         "row_gain": row.gain,
         "recovery_speed": np.inf if config.recovery_speed is None else config.recovery_speed,
-        "beta": isinstance(row, Beta),
+        "near_speed": row.near_speed if isinstance(row, Beta) else 0.0,
         "task_switching": isinstance(row, TaskSwitching),
         "retreat_speed": row.retreat_speed if isinstance(row, TaskSwitching) else 0.0,
         "alpha_cap": row.alpha_cap if isinstance(row, TaskSwitching) else 0.0,

@@ -40,19 +40,27 @@ class CloudProxies:
         """
         count = len(bodies)
         self.geometries = geometries.reshape(count, nearest)
-        self._ball = voxel_radius(resolution)
-        self._bodies = bodies
-        fits = [enclosing_capsule(body) for body in bodies]
-        half = [0.5 * fit.length * fit.rotation[:, 2] for fit in fits]
-        self._ends = np.array([[fit.center - h, fit.center + h] for fit, h in zip(fits, half, strict=True)])
-        self._radii = np.array([fit.radius for fit in fits]) + self._ball
-        self._spacing = np.maximum([fit.length / _PLACES for fit in fits], 2.0 * resolution)
-        self._planes = {i: _planes(body) for i, body in enumerate(bodies) if not _is_capsule(body)}
+        self._ball, self._resolution = voxel_radius(resolution), resolution
+        self._bodies, self._planes = list[Any](bodies), dict[int, tuple[Array, Array]]()
+        self._ends, self._radii, self._spacing = np.zeros((count, 2, 3)), np.zeros(count), np.zeros(count)
+        for number, body in enumerate(bodies):
+            self.set_body(number, body)
         self._slots = np.full((count, nearest), -1, dtype=np.intp)
         self._previous = np.full((count, nearest), -1, dtype=np.intp)
         self._first = np.zeros(count + 1, dtype=np.intp)
         self._capacity = -1
         self.fill_with(voxels)
+
+    def set_body(self, number: int, body: Any) -> None:
+        """Take another coal geometry for body `number`."""
+        fit = enclosing_capsule(body)
+        half = 0.5 * fit.length * fit.rotation[:, 2]
+        self._bodies[number], self._ends[number] = body, (fit.center - half, fit.center + half)
+        self._radii[number] = fit.radius + self._ball
+        self._spacing[number] = max(fit.length / _PLACES, 2.0 * self._resolution)
+        self._planes.pop(number, None)
+        if not _is_capsule(body):
+            self._planes[number] = _planes(body)
 
     def fill_with(self, voxels: Voxels) -> None:
         """Takes other voxels, in place of all that there were."""

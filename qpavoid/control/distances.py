@@ -13,9 +13,10 @@ import pinocchio as pin
 from qpavoid import kernels
 from qpavoid.config import PointCloud
 from qpavoid.control.cloud_proxies import CloudProxies
-from qpavoid.control.obstacles import ObstacleStates
+from qpavoid.control.obstacle_states import ObstacleStates
 from qpavoid.control.pair_table import PairTable
 from qpavoid.errors import NumericalError
+from qpavoid.kernels.distances import BY_COAL, CLOSED_FORM
 from qpavoid.model.sample import STATE, Sample
 from qpavoid.model.scene import Scene
 from qpavoid.model.views import read_poses, read_results, view_poses, view_results
@@ -23,6 +24,9 @@ from qpavoid.problem import Array, IntArray
 
 _TOLERANCE = 1e-10
 """At which coal stops; its default, 1e-6, leaves errors of 7e-3 in normals of boxes and hulls."""
+_FIRST_GUESS = coal.DistanceResult()
+"""Where a search of coal starts at first."""
+_FIRST_GUESS.cached_gjk_guess, _FIRST_GUESS.cached_support_func_guess = np.eye(3)[0], np.zeros(2, dtype=np.int32)
 _MAX_STOP = 1.0
 """How far the robot may go before it stands, where a half-space that turns is concerned [m]."""
 
@@ -42,7 +46,7 @@ class DistanceQuery:
         self._request = coal.DistanceRequest()
         for request in (*self._data.distanceRequests, self._request):
             request.gjk_tolerance = _TOLERANCE
-        model, obstacles = scene.robot.model, len(scene.obstacles)
+        model, obstacles = scene.robot.model, len(scene.slots)
         pin.updateGeometryPlacements(model, model.createData(), scene.geometry, self._data, pin.neutral(model))
         pin.computeDistances(scene.geometry, self._data)  # so that there is something to compare the view with
         results, poses = view_results(self._data.distanceResults), view_poses(self._data.oMg, writeable=True)
@@ -65,7 +69,7 @@ class DistanceQuery:
             pair_of=table.pair_of,
             local=table.spheres[:, :3].copy(),
             cores=table.cores,
-            has_closed_form=table.has_closed_form,
+            method=table.method,
             first=table.first,
             is_cloud=np.array([i in scene.clouds for i in range(obstacles)], dtype=bool),
             bounding_radius=np.nan_to_num(self.obstacle_radii, posinf=0.0),
@@ -82,7 +86,7 @@ class DistanceQuery:
             results=read_results(self._data.distanceResults) if results is None else results,
         )
         """Memory of the distances, see `DistanceArrays`; the results are those of `pairs`."""
-        self._uncertainty = np.array([obstacle.uncertainty for obstacle in scene.obstacles])
+        self._uncertainty = np.array([obstacle.uncertainty for obstacle in scene.slots])
         self.arrays.margin[:obstacles] = self._uncertainty
         self.arrays.margin[obstacles + 1 :] = self._uncertainty[: rows - obstacles - 1]
         self.packed = kernels.pack(self.arrays)
@@ -91,7 +95,7 @@ class DistanceQuery:
         self._near_count, self._row_count = 0, 0
         self.influence_distance = np.nan
         """Surface distance below which a pair is near [m]; set it by `set_influence_distance`."""
-        for state, obstacle in zip(self.arrays.states, scene.obstacles, strict=True):
+        for state, obstacle in zip(self.arrays.states, scene.slots, strict=True):
             state[:] = obstacle.motion.sample(0.0).row
         self._clouds = {i: self._make_proxies(i) for i in scene.clouds}
         for i in self._clouds:
@@ -99,16 +103,18 @@ class DistanceQuery:
         for center, pose, sphere in zip(self.arrays.centers, self.arrays.poses, table.spheres, strict=True):
             center[:3] = sphere[:3] @ pose[:9].reshape(3, 3) + pose[9:]
             center[4] = -(center[:3] @ center[:3])
-        self._by_coal = np.flatnonzero(~table.has_closed_form)
+        self._by_coal = np.flatnonzero(table.method == BY_COAL)
         for pair in range(pairs):
             self._data.deactivateCollisionPair(pair)
         self._active, self._last_near = np.zeros(pairs, dtype=bool), b""
+        self._outdated = np.zeros(pairs, dtype=bool)  # pairs of spare slots for which coal was made for other shapes
         self._surfaces = table.is_mesh[scene.pairs].any(axis=1) & ~table.is_plane[scene.pairs].any(axis=1)
         self._has_surfaces = bool(self._surfaces.any())
         self.is_compiled = not (len(self._by_coal) or self._clouds) and self._has_views
         """Whether kernels compute everything, but for pairs whose cores meet."""
         self.has_clouds = bool(self._clouds)
         """Whether there are proxies to place between the bodies and the distances of a step."""
+        table.queries.add(self)
 
     def place(self, obstacles: ObstacleStates) -> None:
         """Move obstacles to other states.
@@ -129,17 +135,43 @@ class DistanceQuery:
             x.bounding_radius[index] = self._extent_on_plane(state) if state[15:].any() else 0.0
         bad, self.is_moving = kernels.place_obstacles(self.packed, obstacles.which, obstacles.states, obstacles.margin)
         if bad >= 0:
-            raise NumericalError(f"obstacle {self._scene.obstacles[bad].name!r}: NaN or infinity in its pose or twist")
+            raise NumericalError(f"obstacle {self._scene.slots[bad].name!r}: NaN or infinity in its pose or twist")
 
     def set_influence_distance(self, influence_distance: float) -> None:
         """Choose the surface distance below which a pair is near [m]."""
         if influence_distance != self.influence_distance:
-            radius, pair_of = self.table.spheres[:, 3].copy(), self.table.pair_of
-            for index, uncertainty in enumerate(self._uncertainty.tolist()):
-                radius[self.table.first[index] : self.table.first[index + 1]] += uncertainty
-            touching = radius[: len(pair_of), None] + radius + influence_distance
-            self.arrays.max_square[:] = np.where(pair_of >= 0, touching**2 * (1.0 + 1e-9), -1.0)
             self.influence_distance = influence_distance
+            self._set_max_square(slice(None), slice(None))
+
+    def _set_max_square(self, rows: slice, columns: slice) -> None:
+        """Write the squared distance of centres up to which some bodies, the first movable, are near each other."""
+        table, first = self.table, self.table.first
+        radius, empty = table.spheres[:, 3].copy(), table.is_empty
+        radius[first[0] :] += np.repeat(self._uncertainty, np.diff(first))
+        movable = slice(len(table.pair_of))
+        touching = radius[movable][rows, None] + radius[columns] + self.influence_distance
+        exists = (table.pair_of[rows, columns] >= 0) & ~(empty[movable][rows, None] | empty[columns])
+        self.arrays.max_square[rows, columns] = np.where(exists, touching**2 * (1.0 + 1e-9), -1.0)
+
+    def forget_guesses(self) -> None:
+        """Let the searches of coal start anew, not where they ended before: of curved shapes, that shows."""
+        for pair in self._by_coal.tolist():
+            self._data.distanceRequests[pair].updateGuess(_FIRST_GUESS)
+
+    def update_slot(self, index: int) -> None:
+        """Take over what the scene and the table have in a spare slot now; it is where it is at time 0."""
+        x, body, obstacle = self.arrays, int(self.table.first[index]), self._scene.slots[index]
+        x.local[body], radius = self.table.spheres[body, :3], self.table.spheres[body, 3]
+        self.obstacle_radii[index] = x.bounding_radius[index] = np.linalg.norm(x.local[body]) + radius
+        self._uncertainty[index] = obstacle.uncertainty
+        self._set_max_square(slice(body, body + 1), slice(None))
+        self._set_max_square(slice(None), slice(body, body + 1))
+        self._outdated |= self.table.pairs_of(index)
+        self._last_near = b""
+        x.states[index] = obstacle.motion.sample(0.0).row
+        kernels.place_obstacles(self.packed, np.array([index]), x.states, self._uncertainty)
+        for cloud in self._clouds.values():
+            cloud.set_body(body, self._scene.geometry.geometryObjects[body].geometry)
 
     def compute(self, joint_poses: Array, influence_distance: float) -> None:
         """Compute the distance of every pair that is nearer than `influence_distance`; `pairs` says which.
@@ -160,13 +192,13 @@ class DistanceQuery:
         Args:
             near: number of near pairs.
             rows: number of those that get rows.
-            meeting: number of those whose cores meet.
+            meeting: number of those that coal has to compute all the same.
         """
-        self._near_count, self._row_count = near, rows
-        if len(self._by_coal):
+        self._near_count, self._row_count, x = near, rows, self.arrays
+        if len(self._by_coal) or meeting:
             self._compute_by_coal()
-        if meeting:
-            for pair in self.arrays.meeting[:meeting].tolist():
+        for pair in x.meeting[:meeting].tolist():
+            if x.method[pair] == CLOSED_FORM:
                 self._compute_one(pair)
 
     @property
@@ -185,7 +217,12 @@ class DistanceQuery:
         if near != self._last_near:
             active = np.zeros(len(self._active), dtype=bool)
             active[self._near] = True
-            active &= ~x.has_closed_form
+            active &= x.method != CLOSED_FORM
+            for pair in np.flatnonzero(active & self._outdated).tolist():
+                a, b = (self._scene.geometry.geometryObjects[i] for i in x.pairs[pair].tolist())
+                self._data.distance_functors[pair] = pin.ComputeDistance(a, b)
+                self._data.distanceRequests[pair].updateGuess(_FIRST_GUESS)
+                self._outdated[pair] = False
             changed = np.flatnonzero(active != self._active)
             for pair, on in zip(changed.tolist(), active[changed].tolist(), strict=True):
                 (self._data.activateCollisionPair if on else self._data.deactivateCollisionPair)(pair)
@@ -243,7 +280,7 @@ class DistanceQuery:
         return largest[self.table.group]
 
     def _make_proxies(self, index: int) -> CloudProxies:
-        shape, bodies = self._scene.obstacles[index].shape, self._scene.geometry.geometryObjects
+        shape, bodies = self._scene.slots[index].shape, self._scene.geometry.geometryObjects
         assert isinstance(shape, PointCloud)
         proxies = np.arange(self.table.first[index], self.table.first[index + 1])
         geometries = [bodies[i].geometry for i in range(len(self.table.joints))]

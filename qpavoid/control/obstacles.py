@@ -10,7 +10,7 @@ assumption is named in `Solution.assumptions`.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -18,12 +18,12 @@ from qpavoid import kernels
 from qpavoid.config import Sensing
 from qpavoid.control.estimates import MeasuredStates, ObstacleEstimates
 from qpavoid.control.inputs import FARTHEST, FASTEST, FAULTS
+from qpavoid.control.obstacle_states import NOTHING, Observation, ObstacleStates, StepUpdate
 from qpavoid.control.trajectories import TrajectoryBatch, extrapolate
 from qpavoid.control.updates import NO_UPDATE, Update, UpdateReader, unlikely
 from qpavoid.errors import NumericalError
 from qpavoid.kernels.obstacles import FAST, NORMALISED, NOT_FINITE, SAMPLE
-from qpavoid.model.cloud import Points, Voxels
-from qpavoid.model.sample import STATE, Pose, Sample
+from qpavoid.model.sample import STATE, Sample
 from qpavoid.model.scene import Obstacle
 from qpavoid.problem import Array, IntArray
 from qpavoid.reason import Reason, ReasonKind, Severity
@@ -34,49 +34,6 @@ and one late."""
 _ROUND_OFF = 1e-9
 """Difference of two times that counts as none [s]."""
 _FIRST, _SAMPLED = np.array([0]), np.array([SAMPLE])
-
-
-class ObstacleStates(NamedTuple):
-    """States of the obstacles at one time."""
-
-    which: IntArray
-    """(k,) numbers of those that may have another state than at time 0."""
-    states: Array
-    """(o, 18) of all obstacles, see `trajectories`; of an attached one, where it was when it was attached."""
-    margin: Array
-    """(o,) to be taken off the distances to each [m]."""
-    voxels: dict[int, Voxels]
-    """Of point clouds that were updated, by number: what is in them."""
-
-    @classmethod
-    def of(cls, samples: Sequence[Sample], margin: float = 0.0) -> ObstacleStates:
-        """Return the states of all obstacles at some samples, with a margin of each [m]."""
-        states = np.array([sample.row for sample in samples]).reshape(-1, STATE)
-        return cls(np.arange(len(samples)), states, np.full(len(samples), margin), {})
-
-
-class Observation(NamedTuple):
-    """What a control step has to say of the obstacles."""
-
-    assumptions: tuple[Reason, ...] = ()
-    """What was not measured but taken for granted."""
-    stop: tuple[Reason, ...] = ()
-    """Why the robot has to stop; empty if it has not."""
-
-
-_NOTHING = Observation()
-
-
-class StepUpdate(NamedTuple):
-    """Arguments of a step that concern obstacles, checked; none of them is taken over yet."""
-
-    t: float
-    """Time of the step [s]."""
-    shift: float
-    """By how much the clock was set back [s]."""
-    given: Update
-    sampled: Sequence[tuple[int, Sample]]
-    """Obstacles on a trajectory of another class, sampled."""
 
 
 class ObstacleTracker:
@@ -122,6 +79,11 @@ class ObstacleTracker:
         self._measured.update(none, none, no_stamps, now.states)
         self._measured.extrapolate(none, 0.0, 0.0, now.states, now.margin)
         extrapolate(states[:0], 0.0)
+
+    @property
+    def now(self) -> float:
+        """Time of the states in the last step [s]."""
+        return self._now
 
     @property
     def estimates(self) -> ObstacleEstimates | None:
@@ -184,12 +146,34 @@ class ObstacleTracker:
         for index, motion in self._trajectories.others.items():
             states[index] = motion.sample(t).row
 
+    def put(self, index: int, name: str, present: bool) -> None:
+        """Take over what the scene has in a spare slot now.
+
+        Args:
+            index: number of the slot.
+            name: of what was there before, if anything was.
+            present: whether there is an obstacle now.
+        """
+        obstacle = self._obstacles[index]
+        self._reader.rename(index, name, obstacle.name)
+        self._measured.forget(index)
+        self._measured.states[index] = self.current.states[index] = obstacle.motion.sample(self._now).row
+        self._uncertainty[index] = self.current.margin[index] = obstacle.uncertainty
+        for numbers, member in ((self._placed, present), (self._awaited, obstacle.external)):
+            (numbers.add if member else numbers.discard)(index)
+        self._follow([i for i in self._moving if i != index] + [index] * obstacle.moves)
+        self._renew()
+
+    def _follow(self, numbers: list[int]) -> None:
+        """Let some obstacles follow their trajectories, and no others."""
+        if numbers != self._moving:
+            self._moving = numbers
+            self._trajectories = TrajectoryBatch({i: self._obstacles[i].motion for i in numbers})
+            self._sampled.clear()
+
     def attach(self, index: int) -> None:
         """Take an obstacle as attached to the robot: updates of it are ignored."""
-        if index in self._moving:  # it leaves its trajectory for good
-            self._moving = [i for i in self._moving if i != index]
-            self._trajectories = TrajectoryBatch({i: self._obstacles[i].motion for i in self._moving})
-            self._sampled.clear()
+        self._follow([i for i in self._moving if i != index])  # it leaves its trajectory for good
         self._measured.forget(index)
         self._awaited.discard(index)
         self._placed.add(index)
@@ -225,9 +209,7 @@ class ObstacleTracker:
         self.moving = np.array(sorted(moving), dtype=np.intp)
         self.current = self.current._replace(which=np.array(sorted(moving | self._placed), dtype=np.intp))
 
-    def read(
-        self, t: float, updates: Mapping[str, Sample | Pose | Points] | None, shift: float = 0.0
-    ) -> StepUpdate | None:
+    def read(self, t: float, updates: Mapping[str, Any] | None, shift: float = 0.0) -> StepUpdate | None:
         """Check what a step is given; estimates stay as they are.
 
         Args:
@@ -275,7 +257,7 @@ class ObstacleTracker:
     def advance(self, update: StepUpdate | None) -> Observation:
         """Take over what a step is given; return what there is to say of all obstacles."""
         if update is None:
-            return _NOTHING
+            return NOTHING
         t, shift, given, sampled = update
         self._now, self._estimates, current = t + self._latency, None, self.current
         if shift:

@@ -6,11 +6,15 @@ that no change has to be passed on.
 
 from __future__ import annotations
 
+from typing import Any
+from weakref import WeakSet
+
 import coal
 import numpy as np
 
 from qpavoid.geometry.bodies import bounding_box, bounding_sphere
 from qpavoid.geometry.cores import cores, has_closed_form
+from qpavoid.kernels.distances import CLOSED_FORM, SPARE_BY_COAL
 from qpavoid.model.kinematics import support_masks
 from qpavoid.model.scene import Scene
 from qpavoid.model.views import read_poses
@@ -27,15 +31,15 @@ class PairTable:
         """Read all constants off a scene; no obstacle is attached."""
         self._scene, bodies = scene, scene.geometry.geometryObjects
         geometries, count = [body.geometry for body in bodies], len(scene.pairs)
-        robot, movable = len(scene.body_names), scene.movable
+        robot, movable, obstacles = len(scene.body_names), scene.movable, len(scene.slots)
         self.spheres: Array = np.array([(*c, r) for c, r in map(bounding_sphere, geometries)]).reshape(-1, 4)
         """(g, 4) bounding sphere of each body in its frame: centre and radius [m]; infinite of a half-space."""
         self.boxes: Array = np.array([np.concatenate(bounding_box(body)) for body in geometries]).reshape(-1, 6)
         """(g, 6) box around each body in its frame: centre and half its sizes [m]."""
         self.cores: Array = cores(geometries)
         """(g, 4) see `qpavoid.geometry.cores` [m]."""
-        self.has_closed_form: Mask = has_closed_form(self.cores, scene.pairs)
-        """(m,) pairs that coal need not compute."""
+        self.method: IntArray = CLOSED_FORM * has_closed_form(self.cores, scene.pairs).astype(np.intp)
+        """(m,) how the distance of each pair is computed, see `kernels.distances`."""
         self.is_mesh: Mask = np.array([isinstance(body, coal.BVHModelBase) for body in geometries], dtype=bool)
         """(g,) bodies that are triangle meshes."""
         self.is_plane: Mask = np.array([isinstance(body, coal.Halfspace) for body in geometries], dtype=bool)
@@ -43,7 +47,7 @@ class PairTable:
         self.pair_of: IntArray = np.full((movable, len(bodies)), -1, dtype=np.intp)
         """(b, g) number of the pair of two bodies, -1 where there is none."""
         self.pair_of[scene.pairs[:, 0], scene.pairs[:, 1]] = np.arange(count)
-        self.first: IntArray = robot + np.searchsorted(scene.obstacle_of[robot:], np.arange(len(scene.obstacles) + 1))
+        self.first: IntArray = robot + np.searchsorted(scene.obstacle_of[robot:], np.arange(obstacles + 1))
         """(o + 1,) first body of each obstacle, which has those up to the next one's."""
         self.group: IntArray = np.arange(count)
         """(m,) first of the pairs of the same body and point cloud; of other pairs, their own number."""
@@ -54,6 +58,9 @@ class PairTable:
             partners = scene.pairs[pairs, 0]
             self.group[pairs] = pairs[np.searchsorted(partners, partners)]
 
+        self.is_empty: Mask = np.isin(scene.obstacle_of, scene.spare)
+        """(g,) spare slots for obstacles that no obstacle has taken."""
+        self.method[self.is_empty[scene.pairs].any(axis=1) & (self.method != CLOSED_FORM)] = SPARE_BY_COAL
         self.attached: dict[int, int] = {}
         """Joint that each attached obstacle is attached to, by number of the obstacle."""
         joints = [body.parentJoint for body in bodies[:robot]] if robot else []
@@ -71,6 +78,8 @@ class PairTable:
         """(m, 2) what moves the two bodies of each pair: number of a joint, or njoints plus that of an obstacle."""
         self.joint_radius: Array = np.zeros(scene.robot.model.njoints)
         """(njoints,) distance from each joint's origin to the farthest point of a body that it moves [m]."""
+        self.queries: WeakSet[Any] = WeakSet()
+        """Distances that look into this table, which have to take over what is in a spare slot."""
         self._masks = support_masks(scene.robot.model)
         self.support: Array = np.zeros((count, self._masks.shape[1]))
         """(m, e) support of the second body minus that of the first, see `support_masks`."""
@@ -93,6 +102,25 @@ class PairTable:
             self.placements[body], self.attached[index] = placement, joint
         self._update()
 
+    def put(self, index: int, solid: Any, is_empty: bool) -> None:
+        """Put the geometry of another obstacle into a spare slot, or of none.
+
+        Args:
+            index: number of the slot.
+            solid: coal geometry.
+            is_empty: whether it stands for none.
+        """
+        body, pairs = self.first[index], self.pairs_of(index)
+        self.is_empty[body] = is_empty
+        self.spheres[body] = np.append(*bounding_sphere(solid))
+        self.boxes[body] = np.concatenate(bounding_box(solid))
+        self.cores[body] = cores([solid])[0]
+        closed = has_closed_form(self.cores, self._scene.pairs[pairs])
+        self.method[pairs] = np.where(closed, CLOSED_FORM, SPARE_BY_COAL)
+        self._enable()
+        for query in self.queries:
+            query.update_slot(index)
+
     def rigid_pairs(self) -> Mask:
         """Return the pairs (m,) of an attached object with what moves along with it or hangs below it."""
         (first, second), rigid = self._scene.pairs.T, np.zeros(len(self.group), dtype=bool)
@@ -114,9 +142,15 @@ class PairTable:
             return np.array(self.joint_radius)
         return np.full_like(self.joint_radius, self.joint_radius.max() + 2.0 * radii.max() + _MAX_GRASP)
 
+    def _enable(self) -> None:
+        """Enable the pairs of bodies of which one at least is the robot's, and none is an empty slot."""
+        free, empty, (first, second) = self._free, self.is_empty, self._scene.pairs.T
+        self.enabled[:] = ~(free[first] & free[second] | empty[first] | empty[second])
+        self.separable[:] = self.enabled & self._is_moved
+
     def _update(self) -> None:
         """Write everything that depends on which obstacles are attached, in place."""
-        scene, of, obstacles = self._scene, self._scene.obstacle_of, len(self._scene.obstacles)
+        scene, of, obstacles = self._scene, self._scene.obstacle_of, len(self._scene.slots)
         first, second = scene.pairs.T
         free = (of >= 0) & ~np.isin(of, list(self.attached))
         joints = np.array([*self.joints, *[0] * (len(of) - len(self.joints))], dtype=np.intp)
@@ -124,10 +158,10 @@ class PairTable:
         self.twist_row[:] = np.where(
             free[second], of[second], np.where(free[first], obstacles + 1 + of[first], obstacles)
         )
-        self.enabled[:] = ~(free[first] & free[second])
         attached_joints = np.where(free, 0, joints)
         self.support[:] = self._masks[attached_joints[second]] - self._masks[attached_joints[first]]
-        self.separable[:] = np.any(self.support != 0.0, axis=1)
+        self._free, self._is_moved = free, np.any(self.support != 0.0, axis=1)
+        self._enable()
         self.joint_radius[:] = 0.0
         for joint, pose, (*center, radius) in zip(
             self.joints.tolist(), self.placements, self.spheres.tolist(), strict=False

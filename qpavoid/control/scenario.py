@@ -39,7 +39,7 @@ def build_parts(scenario: ScenarioConfig) -> Parts:
     robot, q0 = robot.lock(scenario.lock, q0, f"{source}: lock")
     obstacles = build_obstacles(scenario.obstacles, source)
     with located(str(source)):
-        scene = build_scene(robot, obstacles)
+        scene = build_scene(robot, obstacles, scenario.spare_obstacles)
     tasks = build_tasks(scenario.tasks, robot, q0, source)
     contacts = build_contacts(scenario.contacts, robot, q0, source)
     return Parts(scene, tasks, solver, contacts, q0)

@@ -29,7 +29,7 @@ class ControlSettings:
     @property
     def safety_distance(self) -> float:
         """Between surfaces [m]."""
-        return self.avoidance.safety_distance - self.avoidance.offset
+        return self.avoidance.d1 - self.avoidance.offset
 
     @property
     def influence_distance(self) -> float:

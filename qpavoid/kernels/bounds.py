@@ -14,16 +14,28 @@ _speed_to_stop, _stopping_distance = compiled(speed_to_stop), compiled(stopping_
 _max_stopping_distance = compiled(max_stopping_distance)
 
 
+RECOVERY_SHARE = 0.1
+"""Share of its velocity limit at which a joint recovers [-]: from beyond a limit, or to part a pair."""
+MAX_RECOVERY_SPEED = 0.2
+"""Speed at which it does so at most [rad/s or m/s]."""
+
+
+@compiled
+def recovery_speed(v_max: float) -> float:
+    """Compute the speed at which a joint recovers, from its largest one [rad/s or m/s]."""
+    return min(RECOVERY_SHARE * v_max, MAX_RECOVERY_SPEED)
+
+
 @compiled
 def velocity_bounds(x: Any, q: Array) -> float:
     """Write the bounds on v from the joint limits; return the distance to the nearest one.
 
     Position and velocity limits make hard_lower and hard_upper: ±v_max, and towards a position limit at most the speed
     from which the coordinate can still brake, `speed_to_stop`; without an acceleration limit, `position_rate` times the
-    distance. Outside a position limit, the speed back is `position_rate` times the excess, as far as the limits allow
-    it, and low enough to brake before the opposite limit. Acceleration and jerk limits narrow these to lower and upper:
-    v_prev ± v_step, and `_jerk_limited_bounds`. No bound ever crosses another one; where limits contradict, the hard
-    bounds hold. See `qpavoid.model.limits`.
+    distance. Outside a position limit, the speed back is `position_rate` times the excess, at most `recovery_speed`, as
+    far as the limits allow it, and low enough to brake before the opposite limit. Acceleration and jerk limits narrow
+    these to lower and upper: v_prev ± v_step, and `_jerk_limited_bounds`. No bound ever crosses another one; where
+    limits contradict, the hard bounds hold. See `qpavoid.model.limits`.
 
     Args:
         x: reads the limits, v_prev and dv_prev; writes hard_lower, hard_upper, lower and upper (n,) [rad/s or m/s].
@@ -38,18 +50,20 @@ def velocity_bounds(x: Any, q: Array) -> float:
     for i in range(len(x.q_index)):
         j, position = x.v_index[i], q[x.q_index[i]]
         fastest, step, v_prev = x.v_max[j], x.v_step[j], x.v_prev[j]
+        slowest = -recovery_speed(fastest)
         below, above = position - x.q_lower[i], x.q_upper[i] - position
         margin = min(margin, below, above)
         if step < np.inf:
             faster, slower = min(step, x.dv_step[j] + x.dv_prev[j]), min(step, x.dv_step[j] - x.dv_prev[j])
-            down = _speed_to_stop(below, step, x.dt) if below > 0.0 else max(x.position_rate * below, -v_prev - faster)
-            up = _speed_to_stop(above, step, x.dt) if above > 0.0 else max(x.position_rate * above, v_prev - slower)
+            back_up, back_down = max(x.position_rate * below, slowest), max(x.position_rate * above, slowest)
+            down = _speed_to_stop(below, step, x.dt) if below > 0.0 else max(back_up, -v_prev - faster)
+            up = _speed_to_stop(above, step, x.dt) if above > 0.0 else max(back_down, v_prev - slower)
             if below < 0.0:
                 down = max(down, -up)  # while it returns from outside one limit it can still brake for the other
             elif above < 0.0:
                 up = max(up, -down)
         else:
-            down, up = x.position_rate * below, x.position_rate * above
+            down, up = max(x.position_rate * below, slowest), max(x.position_rate * above, slowest)
         lower[j] = max(min(-down, fastest), -fastest)
         upper[j] = max(min(up, fastest), -fastest)
     if x.jerk_limited:

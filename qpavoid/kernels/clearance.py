@@ -51,11 +51,11 @@ def clearance_lower_bound(x: Any, v: Array, k: int, influence_distance: float, h
             translation += x.chain_translation[chain, c] * abs(v[c])
         omega, linear = max(omega, rotation), max(linear, translation)
     curvature = horizon * horizon * omega * (omega * x.lever_arm + 2.0 * linear)
-    bound = influence_distance + x.offset - x.safety_distance - (fastest + any_fastest) * horizon - curvature
+    bound = influence_distance + x.offset - x.d1 - (fastest + any_fastest) * horizon - curvature
     for i in range(k):
         pair = x.near_pairs[i]
         closing = speeds[x.moved_by[pair, 0]] + speeds[x.moved_by[pair, 1]]
-        clearance = x.d[i] - x.safety_distance - closing * horizon - curvature
+        clearance = x.d[i] - x.d1 - closing * horizon - curvature
         if clearance <= 0.0:
             clearance = max(clearance, _clearance_along_normal(x, v, i, horizon, curvature))
         bound = np.minimum(bound, clearance)
@@ -113,7 +113,7 @@ def _clearance_along_normal(x: Any, v: Array, i: int, horizon: float, curvature:
             deviation += 0.5 * horizon * horizon * acceleration
         else:
             deviation += 0.5 * curvature
-    return x.d[i] - x.safety_distance - horizon * closing - deviation
+    return x.d[i] - x.d1 - horizon * closing - deviation
 
 
 @compiled

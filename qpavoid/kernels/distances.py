@@ -9,8 +9,10 @@ from __future__ import annotations
 import numpy as np
 
 from qpavoid.kernels.packing import compiled
-from qpavoid.problem import Array, IntArray, Mask
+from qpavoid.problem import Array, IntArray
 
+BY_COAL, CLOSED_FORM, SPARE_BY_COAL = range(3)
+"""How the distance of a pair is computed: by coal; here; by coal, as what has come into a spare slot asks for it."""
 MIN_CORE_DISTANCE = 1e-6
 """Distance of cores below which coal computes the pair [m]: the direction between them is lost to round-off."""
 _PARALLEL = 1e-14
@@ -22,7 +24,7 @@ def closed_forms(
     poses: Array,
     cores: Array,
     bodies: IntArray,
-    has_closed_form: Mask,
+    method: IntArray,
     pairs: IntArray,
     results: Array,
     meeting: IntArray,
@@ -36,18 +38,22 @@ def closed_forms(
         poses: world poses of all bodies, rotation by columns and translation (g, 12).
         cores: radius, and half-sizes of the core along the axes of each body (g, 4), see `geometry.cores` [m].
         bodies: the two bodies of each pair (m, 2).
-        has_closed_form: whether each pair has one (m,).
+        method: BY_COAL, CLOSED_FORM or SPARE_BY_COAL, of each pair (m,).
         pairs: numbers of the pairs to update (c,).
         results: [distance, normal, point a, point b] (m, 10), in place.
-        meeting: out (m,), the first entries: the pairs whose cores meet, and whose results are not updated.
+        meeting: out (m,), the first entries: the pairs whose results are not updated, though scenes with such pairs may
+            expect that: those whose cores meet, and those of spare slots that coal has to compute.
 
     Returns:
-        Number of pairs whose cores meet.
+        Number of these.
     """
     a, b, separation = np.empty(3), np.empty(3), np.empty(3)
     count = 0
     for k in pairs:
-        if not has_closed_form[k]:
+        if method[k] != CLOSED_FORM:
+            if method[k] == SPARE_BY_COAL:
+                meeting[count] = k
+                count += 1
             continue
         i, j = bodies[k, 0], bodies[k, 1]
         if _is_box(cores[i]):

@@ -81,7 +81,7 @@ class RowLayout(NamedTuple):
     margin: Array
     """(o + 1,) taken off the distances to each obstacle, for its uncertainty [m]; the last one stays zero."""
     distance_allowance: Array
-    """(m,) added to the distance of a pair whose own safety distance is below `safety_distance`: the difference [m]."""
+    """(m,) added to the distance of a pair whose own safety distance is below d1: the difference [m]."""
     joint_poses: Array
     """(J, 12) world poses of all joints: rotation by columns, then origin [m]; row 0 is the world."""
     parents: IntArray
@@ -159,14 +159,12 @@ class RowLayout(NamedTuple):
     # --- numbers
     offset: float
     """Added to surface distances [m]."""
-    safety_distance: float
-    """Distance at which a row allows no more closing [m]."""
     row_gain: float
     """ξ [1/s]."""
     recovery_speed: float
     """Cap on the speed of separation that a row asks for [m/s]."""
-    beta: bool
-    """Whether rows are weighted with 1 - β."""
+    near_speed: float
+    """Closing speed up to which rows are not weighted with 1 - β [m/s]."""
     task_switching: bool
     """Whether rows have the rate of eq. 10, which depends on `v_tracking`."""
     retreat_speed: float
@@ -174,7 +172,7 @@ class RowLayout(NamedTuple):
     alpha_cap: float
     """Largest α of such rows [-]."""
     d1: float
-    """Distance below which β is 1 [m]."""
+    """Safety distance, at which a row allows no more closing: below it β is 1 [m]."""
     d2: float
     """Influence distance [m]."""
     position_rate: float

@@ -42,8 +42,8 @@ class DistanceArrays(NamedTuple):
     """(g, 3) centre of each body's bounding sphere in its frame [m]."""
     cores: Array
     """(g, 4) radius and half-sizes of each body's core, see `qpavoid.geometry.cores` [m]."""
-    has_closed_form: Mask
-    """(m,) pairs that coal need not compute."""
+    method: IntArray
+    """(m,) how the distance of each pair is computed, see `kernels.distances`."""
     first: IntArray
     """(o + 1,) first body of each obstacle, which has those up to the next one's."""
     is_cloud: Mask
@@ -71,7 +71,7 @@ class DistanceArrays(NamedTuple):
     rows: IntArray
     """(m,) out, the first entries: those of them that are not ignored."""
     meeting: IntArray
-    """(m,) out, the first entries: pairs whose cores meet, which coal has to compute."""
+    """(m,) out, the first entries: pairs whose cores meet, and those of spare slots that coal has to compute."""
     results: Array
     """(m, 10) out: distance, normal, point a, point b of the near pairs."""
 
@@ -97,10 +97,13 @@ def near_pairs(x: DistanceArrays) -> tuple[int, int, int]:
         x: reads poses; writes centers of movable bodies, near, rows, meeting and results.
 
     Returns:
-        Number of near pairs; of those that get rows; of those whose cores meet.
+        Number of near pairs; of those that get rows; of those that coal has to compute all the same.
     """
-    near = candidates(x.poses, x.local, x.centers, x.max_square, x.pair_of, x.enabled, x.near)
-    meeting = closed_forms(x.poses, x.cores, x.pairs, x.has_closed_form, x.near[:near], x.results, x.meeting)
+    bodies = len(x.joints)
+    while bodies > 0 and x.joints[bodies - 1] < 0:  # from there on, both bodies of each pair are obstacles
+        bodies -= 1
+    near = candidates(x.poses, x.local, x.centers, x.max_square[:bodies], x.pair_of[:bodies], x.enabled, x.near)
+    meeting = closed_forms(x.poses, x.cores, x.pairs, x.method, x.near[:near], x.results, x.meeting)
     rows = 0
     for k in x.near[:near]:
         if not x.ignored[k]:

@@ -81,12 +81,12 @@ def distance_rows(x: Any, pairs: IntArray, influence_distance: float, moving: bo
 def row_bounds(x: Any, k: int, moving: bool) -> None:
     """Write the right-hand sides of the first k avoidance rows; see `qpavoid.control.avoidance`.
 
-    The row is ḋ = J v + ḋ_obs >= ξ (d_s - d), with the safety distance d_s; below d_s, at most `recovery_speed`. With
-    `beta` the right-hand side is weighted with 1 - β(d) above d_s; with `task_switching` it is that of eq. 10. The row
-    without a margin, of d_s = 0, is ξ (offset - d) - ḋ_obs, or rhs where that is less.
+    The row is ḋ = J v + ḋ_obs >= ξ (d1 - d); below d1, at most `recovery_speed`. Above d1 the right-hand side is
+    weighted with 1 - β(d), as far as it then still allows `near_speed`; with `task_switching` it is that of eq. 10. The
+    row without a margin, of d1 = 0, is ξ (offset - d) - ḋ_obs, or rhs where that is less.
 
     With acceleration limits, a pair closes no faster than the speed from which a share of its joints' accelerations,
-    all at work on it, brings it to rest within the distance h = d - d_s: ½ a dt - √((½ a dt)² + 2 a h).
+    all at work on it, brings it to rest within the distance h = d - d1: ½ a dt - √((½ a dt)² + 2 a h).
 
     A row never asks for more than is possible: of a pair that may still close, and whose obstacle does not come nearer,
     no more than a stop gives, so that the stop meets all such rows at once; of one that has to separate, no more speed
@@ -102,12 +102,12 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
     for i in range(k):
         slack = x.distance_allowance[x.near_pairs[i]]
         d = x.closest[i, 0] + x.offset - x.margin[x.twist_row[x.near_pairs[i]]] + slack
-        rate = x.row_gain * (x.safety_distance - d)
+        rate = x.row_gain * (x.d1 - d)
         separating = rate > 0.0
-        if x.beta and not separating:
-            rate *= 1.0 - beta(d, x.d1, x.d2)
-        elif x.task_switching:
-            rate = max(_rate_of_eq10(x, i, d), rate if separating else (x.safety_distance - d) / x.dt)
+        if x.task_switching:
+            rate = max(_rate_of_eq10(x, i, d), rate if separating else (x.d1 - d) / x.dt)
+        elif not separating:
+            rate = min((1.0 - beta(d, x.d1, x.d2)) * rate, max(rate, -x.near_speed))
         if x.acceleration_limited and rate < 0.0:
             braking = 0.0
             for c in range(len(x.v_step)):
@@ -115,7 +115,7 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
                     braking += abs(x.J[i, c]) * x.v_step[c]
             if braking < np.inf:
                 braking *= 0.5 * BRAKING_FRACTION
-                clearance = max(d - x.safety_distance, 0.0) / x.dt
+                clearance = max(d - x.d1, 0.0) / x.dt
                 rate = max(rate, braking - np.sqrt(braking * braking + 4.0 * braking * clearance))
                 if x.jerk_limited:
                     rate = max(rate, _jerk_limited_closing(x, i, rate, 2.0 * braking, clearance))
@@ -129,7 +129,7 @@ def row_bounds(x: Any, k: int, moving: bool) -> None:
                 elif x.J[i, c] < 0.0:
                     possible += x.J[i, c] * x.lower[c]
             if switching:
-                possible = max(possible, x.row_gain * (x.safety_distance - d) - x.feedforward[i])
+                possible = max(possible, x.row_gain * (x.d1 - d) - x.feedforward[i])
             elif x.feedforward[i] < 0.0:
                 possible = max(possible, -x.feedforward[i])
             rhs = min(rhs, possible)

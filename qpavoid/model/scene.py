@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from qpavoid import config
+from qpavoid.config.scenario import MAX_SPARE
 from qpavoid.errors import ConfigError, NumericalError, located
 from qpavoid.kernels.obstacles import NEARLY
 from qpavoid.model.cloud import Voxels, read_points
@@ -26,6 +27,8 @@ from qpavoid.problem import Array, IntArray
 
 PARKING_DISTANCE = 1e4
 """Position of the proxy spheres of a cloud that stand for no voxel: beyond any influence distance [m]."""
+_SPARE_RADIUS = 1e-3
+"""Radius of the sphere that stands for an empty slot [m]."""
 
 
 @dataclass(frozen=True)
@@ -89,25 +92,54 @@ class Obstacle:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class Scene:
-    """Bodies of the robot, then obstacles, in one geometry model, and the layout of the pairs among them."""
+    """Bodies of the robot, then obstacles, in one geometry model, and the layout of the pairs among them.
+
+    What comes and goes at run time takes one of its spare slots, which is an obstacle without a name while it is empty.
+    A controller has a copy of its own of a scene with spare slots.
+    """
 
     robot: Robot
-    obstacles: tuple[Obstacle, ...]
-    """Those that can be attached first."""
+    slots: list[Obstacle]
+    """Obstacle of each number: those that can be attached first, then spare slots, then all others."""
     geometry: Any
     """pinocchio geometry model: the robot's bodies, then the pieces of the obstacles in their order."""
     pairs: IntArray
     """(m, 2) geometry indices; the first of a pair belongs to the robot, or may be attached to it."""
     pair_names: tuple[tuple[str, str], ...]
-    """Names of the bodies of each pair."""
+    """Names of the bodies of each pair; another tuple once an obstacle is added or removed."""
     support: Array
     """(m, nv) support of the second body minus that of the first: which coordinates change the distance."""
     obstacle_of: IntArray
     """(g,) number of the obstacle that each geometry is a piece of; -1 for the robot's bodies."""
+    movable: int
+    """Number of geometries, the first ones, that joints move or may come to move."""
+    spare: range
+    """Numbers of the spare slots."""
     clouds: dict[int, Voxels] = field(default_factory=dict)
     """What is in the point clouds at first, by number of the obstacle."""
+
+    @property
+    def obstacles(self) -> tuple[Obstacle, ...]:
+        """All obstacles, in the order of their numbers."""
+        return tuple(obstacle for obstacle in self.slots if obstacle.name)
+
+    def own_copy(self) -> Scene:
+        """Return the same scene with slots of its own."""
+        return replace(self, slots=list(self.slots), geometry=pin.GeometryModel(self.geometry))
+
+    def put(self, number: int, obstacle: Obstacle | None, solid: Any) -> None:
+        """Put an obstacle with a coal geometry into a spare slot, or none."""
+        geometry = int(np.flatnonzero(self.obstacle_of == number)[0])
+        self.slots[number] = obstacle = obstacle or _spare(number - self.spare.start)
+        body, start = self.geometry.geometryObjects[geometry], obstacle.motion.sample(0.0)
+        body.geometry, body.placement = solid, pin.SE3(start.rotation, start.position)
+        names = list(self.pair_names)
+        for pair in np.flatnonzero((self.pairs == geometry).any(axis=1)).tolist():
+            a, b = names[pair]
+            names[pair] = (obstacle.name, b) if self.pairs[pair, 0] == geometry else (a, obstacle.name)
+        self.pair_names = tuple(names)
 
     @property
     def body_names(self) -> list[str]:
@@ -128,37 +160,37 @@ class Scene:
         distances = [self.robot.safety_distance(a, b, safety_distance) for a, b in self.pair_names]
         return safety_distance - np.array(distances, dtype=np.float64)
 
-    @property
-    def movable(self) -> int:
-        """Number of geometries, the first ones, that joints move or may come to move."""
-        return len(self.robot.bodies.geometryObjects) + sum(obstacle.graspable for obstacle in self.obstacles)
 
-
-def build_scene(robot: Robot, obstacles: Sequence[Obstacle] = ()) -> Scene:
+def build_scene(robot: Robot, obstacles: Sequence[Obstacle] = (), spare_obstacles: int = 0) -> Scene:
     """Lay out the pairs of a robot with itself and with every obstacle.
 
     Args:
         robot: the robot with its own pairs.
         obstacles: the obstacles; each is paired with every body of the robot, and with those that may be attached.
             Half-spaces have no pair with bodies that no joint moves: a base stands on the ground.
+        spare_obstacles: how many more `Controller.add_obstacle` may add at the same time.
 
     Raises:
-        ConfigError: an obstacle that has the name of a body or that cannot be attached, a mesh or points that cannot be
-            read.
+        ConfigError: an obstacle without a name, with that of a body or that cannot be attached, a mesh or points that
+            cannot be read, a number of spare obstacles that cannot be meant.
     """
+    if type(spare_obstacles) is not int or not 0 <= spare_obstacles <= MAX_SPARE:
+        raise ConfigError(f"spare_obstacles: {spare_obstacles!r:.20}, expected 0 to {MAX_SPARE}")
+    graspable = sum(obstacle.graspable for obstacle in obstacles)
     obstacles = sorted(obstacles, key=lambda obstacle: not obstacle.graspable)
+    obstacles[graspable:graspable] = map(_spare, range(spare_obstacles))
     geometry, bodies = pin.GeometryModel(robot.bodies), robot.bodies.ngeoms
-    movable = bodies + sum(obstacle.graspable for obstacle in obstacles)
+    movable, spare = bodies + graspable + spare_obstacles, range(graspable, graspable + spare_obstacles)
     names, obstacle_of = [body.name for body in robot.bodies.geometryObjects], [-1] * bodies
     clouds: dict[int, Voxels] = {}
     for number, obstacle in enumerate(obstacles):
-        if obstacle.name in names:
-            raise ConfigError(f"obstacles: {obstacle.name!r} is the name of a body of {robot.name}: rename it")
+        if number not in spare:
+            check_name(obstacle, names, robot.name)
         start, shape = obstacle.motion.sample(0.0), obstacle.shape
         placement = pin.SE3(start.rotation, start.position)
         where, folder = f"obstacles: {obstacle.name!r}: shape", obstacle.source.parent
         solids = make_solids(shape, folder, where)
-        if obstacle.graspable and (len(solids) > 1 or isinstance(shape, config.HalfSpace | config.PointCloud)):
+        if obstacle.graspable and not is_one_solid(shape, solids):
             raise ConfigError(
                 f"obstacles: {obstacle.name!r}: a {shape.type} cannot be carried; give a primitive, or a mesh with "
                 "`method: convex`"
@@ -177,7 +209,9 @@ def build_scene(robot: Robot, obstacles: Sequence[Obstacle] = ()) -> Scene:
                 fixed = partner < bodies and geometry.geometryObjects[partner].parentJoint == 0
                 if not (fixed and isinstance(shape, config.HalfSpace)):
                     geometry.addCollisionPair(pin.CollisionPair(partner, index))
-    _without_cylinders_among_spheres(geometry)
+    if spare or any(isinstance(body.geometry, coal.Cylinder) for body in geometry.geometryObjects):
+        for body in geometry.geometryObjects:
+            body.geometry = without_sphere(body.geometry)
     pairs = pair_array(geometry)
     pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]  # in the order in which bounding spheres are compared
     geometry.removeAllCollisionPairs()
@@ -187,27 +221,56 @@ def build_scene(robot: Robot, obstacles: Sequence[Obstacle] = ()) -> Scene:
     masks = support_masks(robot.model)
     return Scene(
         robot=robot,
-        obstacles=tuple(obstacles),
+        slots=obstacles,
         geometry=geometry,
         pairs=pairs,
         pair_names=tuple((names[a], names[b]) for a, b in pairs),
         support=masks[joints[pairs[:, 1]]] - masks[joints[pairs[:, 0]]],
         obstacle_of=np.array(obstacle_of, dtype=np.intp),
+        movable=movable,
+        spare=spare,
         clouds=clouds,
     )
 
 
-def _without_cylinders_among_spheres(geometry: Any) -> None:
-    """Replace spheres by capsules of no length where there are cylinders.
+def _spare(number: int) -> Obstacle:
+    """Return what stands for an empty slot: no two of them touch, and nothing comes near."""
+    place = still(Sample.at([PARKING_DISTANCE, float(number), 0.0]))
+    return Obstacle("", config.Sphere(radius=_SPARE_RADIUS), place, moves=False, graspable=True)
+
+
+def spare_solid() -> Any:
+    """Return the coal geometry that stands for an empty slot."""
+    return without_sphere(coal.Sphere(_SPARE_RADIUS))
+
+
+def check_name(obstacle: Obstacle, names: Sequence[str], robot: str) -> None:
+    """Check that an obstacle has a name that no body has.
+
+    Raises:
+        ConfigError: it has none, or one of `names`, of the bodies of the robot and of other obstacles.
+    """
+    if not isinstance(obstacle.name, str) or not obstacle.name:
+        raise ConfigError(f"obstacles: {obstacle.name!r:.60}: give it a name")
+    if obstacle.name in names:
+        raise ConfigError(f"obstacles: {obstacle.name!r} is the name of a body of {robot}: rename it")
+
+
+def is_one_solid(shape: config.ObstacleShape, solids: Sequence[Any]) -> bool:
+    """Return whether a shape is one convex body of limited size, given its coal geometries."""
+    convex = not isinstance(shape, config.HalfSpace | config.PointCloud) and not isinstance(
+        solids[0], coal.BVHModelBase
+    )
+    return convex and len(solids) == 1
+
+
+def without_sphere(solid: Any) -> Any:
+    """Return a capsule of no length in place of a sphere, as where there are cylinders, or may come to be.
 
     coal 3.0 has a formula of its own for spheres and cylinders, which is wrong by centimetres once the centre of the
     sphere is inside; for capsules it iterates.
     """
-    bodies = geometry.geometryObjects
-    if any(isinstance(body.geometry, coal.Cylinder) for body in bodies):
-        for body in bodies:
-            if isinstance(body.geometry, coal.Sphere):
-                body.geometry = coal.Capsule(body.geometry.radius, 0.0)
+    return coal.Capsule(solid.radius, 0.0) if isinstance(solid, coal.Sphere) else solid
 
 
 def _points(shape: config.PointCloud, folder: Path, where: str) -> Voxels:

@@ -14,7 +14,7 @@ from qpavoid import kernels
 from qpavoid.config import Mesh, PointCloud, ScenarioConfig
 from qpavoid.config.loading import load_scenario
 from qpavoid.control.latency import CommandsUnderWay
-from qpavoid.control.obstacles import ObstacleStates
+from qpavoid.control.obstacle_states import ObstacleStates
 from qpavoid.control.tasks import in_order
 from qpavoid.control.tick import Tick
 from qpavoid.controller import Controller
@@ -22,7 +22,7 @@ from qpavoid.errors import ConfigError, NumericalError
 from qpavoid.geometry.bodies import enclosing_capsule
 from qpavoid.geometry.meshes import surface_triangles
 from qpavoid.model.kinematics import ForwardKinematics
-from qpavoid.model.scene import PARKING_DISTANCE, Scene
+from qpavoid.model.scene import PARKING_DISTANCE, Obstacle, Scene
 from qpavoid.problem import Array, Solution, Status
 from qpavoid.run.log import STATUSES, Log
 from qpavoid.run.machine import versions
@@ -119,8 +119,13 @@ class Recorder:
         self._kinematics, self._query = ForwardKinematics(model), controller.distances()  # of all pairs, near or not
         self._ends, self._radii = _drawing_axes(scene.robot.bodies)
         sizes = {"N": ticks, "nq": model.nq, "nv": model.nv, "k": len(self._frames), "s": len(self._other_tasks)}
-        self._arrays = Log.allocate({**sizes, "b": len(scene.body_names), "o": len(scene.obstacles)})
+        self._arrays = Log.allocate({**sizes, "b": len(scene.body_names), "o": 0})
         self._arrays["closest_pair"].fill(-1)
+        self._obstacles: list[Obstacle] = []
+        self._descriptions: list[dict[str, Any]] = []
+        self._names, self._pairs = scene.pair_names, [list(pair) for pair in scene.pair_names]
+        self._pair_numbers = np.arange(len(self._pairs))  # of the scene's pairs in that list
+        self._notice_obstacles()
         self._events: list[list[Any]] = []
         self._keys: tuple[object, ...] = ()
         self._count = 0
@@ -155,21 +160,41 @@ class Recorder:
             self._events.append([t, solution.status.value, [reason.as_dict() for reason in reasons]])
         self._keys = keys
 
+    def _notice_obstacles(self) -> None:
+        """Lay out columns for obstacles that are new, and number pairs with other names anew."""
+        scene, known, x = self._scene, set(map(id, self._obstacles)), self._arrays
+        new = [i for i, obstacle in enumerate(scene.slots) if obstacle.name and id(obstacle) not in known]
+        self._obstacles += [scene.slots[i] for i in new]
+        self._descriptions += [_describe_obstacle(scene, i) for i in new]
+        for name in ("obstacle_position", "obstacle_rotation"):
+            count, _, *shape = x[name].shape
+            x[name] = np.concatenate((x[name], np.full((count, len(new), *shape), np.nan)), axis=1)
+        for i, (old, pair) in enumerate(zip(self._names, scene.pair_names, strict=True)):
+            if old != pair:
+                self._pair_numbers[i] = len(self._pairs)
+                self._pairs.append(list(pair))
+        self._names = scene.pair_names
+
     def _write_bodies(self, tick: Tick) -> None:
-        """Store the distances of all pairs, and the poses of bodies and obstacles."""
+        """Store the distances of all pairs, and the poses of bodies and obstacles, NaN of those that are not there."""
         scene, n, x = self._scene, self._count, self._arrays
+        if scene.pair_names is not self._names:
+            self._notice_obstacles()
+        columns = {id(obstacle): column for column, obstacle in enumerate(self._obstacles)}
         self._kinematics.compute(tick.state.q)
         samples, attached = [], self._controller.attached
         counted_body = np.arange(len(scene.geometry.geometryObjects))
-        for i, obstacle in enumerate(scene.obstacles):
-            is_attached = obstacle.name in attached
+        for i, obstacle in enumerate(scene.slots):
+            is_placed = obstacle.name and not obstacle.moves
             sample = (
                 self._controller.obstacle_pose(obstacle.name, tick.state.q)
-                if is_attached
+                if is_placed or obstacle.name in attached
                 else obstacle.motion.sample(tick.state.t)
             )
-            x["obstacle_position"][n, i], x["obstacle_rotation"][n, i] = sample.position, sample.rotation
-            if is_attached:
+            if obstacle.name:
+                column = columns[id(obstacle)]
+                x["obstacle_position"][n, column], x["obstacle_rotation"][n, column] = sample.position, sample.rotation
+            if obstacle.name in attached:
                 counted_body[np.flatnonzero(scene.obstacle_of == i)] = _attachment_body(scene, attached[obstacle.name])
             samples.append(sample)
         self._query.place(ObstacleStates.of(samples))
@@ -178,7 +203,7 @@ class Recorder:
         distance[pairs] = self._query.arrays.results[pairs, 0]
         distance[distance > 0.5 * PARKING_DISTANCE] = np.inf
         if np.isfinite(distance).any():
-            x["closest_pair"][n] = np.argmin(distance)
+            x["closest_pair"][n] = self._pair_numbers[np.argmin(distance)]
         nearest = np.full(len(scene.geometry.geometryObjects), np.inf)
         np.minimum.at(nearest, counted_body[scene.pairs[:, 0]], distance)
         np.minimum.at(nearest, counted_body[scene.pairs[:, 1]], distance)
@@ -217,8 +242,8 @@ class Recorder:
             "tasks": [[task.settings.label, task.unit] for task in self._other_tasks],
             "bodies": scene.body_names,
             "body_radii": self._radii,
-            "obstacles": [_describe_obstacle(scene, i) for i in range(len(scene.obstacles))],
-            "pairs": [list(pair) for pair in scene.pair_names],
+            "obstacles": self._descriptions,
+            "pairs": self._pairs,
             "versions": {"python": platform.python_version(), "machine": platform.machine(), **versions()},
         }
         arrays = {name: array[: self._count].copy() for name, array in self._arrays.items()}
@@ -242,7 +267,7 @@ _MAX_FACES = 2000
 
 def _describe_obstacle(scene: Scene, index: int) -> dict[str, Any]:
     """Return name and shape of an obstacle, and triangles or voxels that come from files."""
-    obstacle = scene.obstacles[index]
+    obstacle = scene.slots[index]
     described: dict[str, Any] = {"name": obstacle.name, "shape": obstacle.shape.model_dump(mode="json")}
     if isinstance(obstacle.shape, Mesh):
         solids = [scene.geometry.geometryObjects[int(g)].geometry for g in np.flatnonzero(scene.obstacle_of == index)]

@@ -44,7 +44,7 @@ class Arbiter:
         self._v_shape = (settings.scene.robot.model.nv,)
         self._braking = BrakingCheck(settings, rows, obstacles)
         self.progress = ProgressMonitor(settings, rows)
-        has_backup = settings.avoidance.backup and len(settings.scene.obstacles) > 0
+        has_backup = settings.avoidance.backup and len(settings.scene.slots) > 0
         self.backup = BackupPlanner(settings, rows.query.table, obstacles) if has_backup else None
 
     def reset(self) -> None:

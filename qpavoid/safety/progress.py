@@ -55,7 +55,7 @@ class ProgressMonitor:
     """Follows the progress of a controller's tasks from control step to control step."""
 
     def __init__(self, settings: ControlSettings, rows: RowAssembler) -> None:
-        self._rows, self._pair_names = rows, settings.scene.pair_names
+        self._rows = rows
         self._interval = max(1, round(settings.progress.stalled_after / (_CHECKS * settings.dt)))
         self._limit = settings.progress.stalled_after / settings.dt - 0.5
         self._parts = _parts(rows)
@@ -119,8 +119,8 @@ class ProgressMonitor:
         size = float(np.linalg.norm(b))
         if np.linalg.norm(pull) < _FREE * np.linalg.norm(A, 2) * size and np.isfinite(pull).all():
             return tuple(self._at_rest(problem, stuck))
-        walls = _Walls(problem, v, self._pair_names, tracking.A[earlier] if problem.cascade is not None else A[:0])
-        return walls.holding(pull) or _nearest(problem, self._pair_names)
+        walls = _Walls(problem, v, tracking.A[earlier] if problem.cascade is not None else A[:0])
+        return walls.holding(pull) or _nearest(problem)
 
     def _of_priority(self, problem: Problem, stuck: Sequence[int]) -> IntArray:
         """Return the rows down to the first priority of which a part is stuck; all without priorities."""
@@ -163,13 +163,13 @@ def _parts(rows: RowAssembler) -> list[_Part]:
 class _Walls:
     """Rows, position limits and tasks of earlier priorities that keep a velocity, with the forces they exert."""
 
-    def __init__(self, problem: Problem, v: Array, pair_names: Sequence[tuple[str, str]], earlier: Array) -> None:
+    def __init__(self, problem: Problem, v: Array, earlier: Array) -> None:
         rows, names, units = problem.avoidance, problem.joint_names, problem.joint_units
         self.forces, self.reasons = list[Array](), list[Reason | None]()
         excess = rows.b - rows.J @ problem.v_tracking
         for i in np.flatnonzero(rows.J @ v - rows.b < _ACTIVE_TOLERANCE).tolist():
             self.forces.append(-rows.J[i])
-            pair = pair_names[rows.pair[i]]
+            pair = problem.pair_names[rows.pair[i]]
             self.reasons.append(Reason.of(ReasonKind.STALLED, *pair, amount=float(excess[i]), unit="m/s"))
         lower, upper, eye = problem.hard_lower, problem.hard_upper, np.eye(len(v))
         fastest = np.maximum(upper, -lower)
@@ -203,7 +203,7 @@ class _Walls:
         return tuple(culprits)
 
 
-def _nearest(problem: Problem, pair_names: Sequence[tuple[str, str]]) -> tuple[Reason, ...]:
+def _nearest(problem: Problem) -> tuple[Reason, ...]:
     """Return the nearest pair that the tasks would have close, for solvers without rows and for the look-ahead."""
     rows = problem.avoidance
     closing = rows.J @ problem.v_tracking
@@ -212,4 +212,4 @@ def _nearest(problem: Problem, pair_names: Sequence[tuple[str, str]]) -> tuple[R
         return (Reason.of(ReasonKind.STALLED, detail="several rows together"),)
     i = int(candidates[np.argmin(rows.d[candidates])])
     amount = float(rows.b[i] - closing[i])
-    return (Reason.of(ReasonKind.STALLED, *pair_names[rows.pair[i]], amount=amount, unit="m/s"),)
+    return (Reason.of(ReasonKind.STALLED, *problem.pair_names[rows.pair[i]], amount=amount, unit="m/s"),)

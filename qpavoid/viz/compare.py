@@ -22,7 +22,6 @@ from qpavoid.viz.style import (
     add_grid,
     add_legend,
     draw_levels,
-    is_qp,
     label_distances,
     units,
 )
@@ -78,7 +77,7 @@ def compare_time_figure(logs: Sequence[Log]) -> Figure:
         error.plot(log.t, np.max(to_target, axis=1, initial=1e-3 * ERROR_FLOOR), **line)
         speed.plot(log.t, np.max(np.abs(log.v), axis=1, initial=0.0), **line)
     solvers = distance.get_legend_handles_labels()[0]
-    levels = draw_levels(distance, logs[0], qp=any(map(is_qp, logs)))
+    levels = draw_levels(distance, logs[0])
     label_distances(distance, *(log.min_distance for log in logs), name="smallest distance\n")
     deviation.set_ylabel("deviation from the\nplanned path [m]")
     error.set_yscale("log")
@@ -150,10 +149,11 @@ def _outlines(logs: Sequence[Log], log: Log) -> list[tuple[Array, str, float]]:
     for i in range(len(log.meta["obstacles"]) if len(log.t) else 0):
         if is_endless(log, i):
             continue
-        travel = np.cumsum(np.r_[0.0, np.linalg.norm(np.diff(log.obstacle_position[:, i], axis=0), axis=1)])
+        present = np.flatnonzero(np.isfinite(log.obstacle_position[:, i]).all(axis=1))
+        travel = np.cumsum(np.r_[0.0, np.linalg.norm(np.diff(log.obstacle_position[present, i], axis=0), axis=1)])
         steps = np.unique(np.searchsorted(travel, np.linspace(0.0, travel[-1], 4))) if travel[-1] > 1e-3 else [0]
-        for rank, step in enumerate(steps):
-            outlines.append((obstacle_faces(log, i, int(step)), OBSTACLE, 0.5 * (rank + 1) / len(steps)))
+        for rank, step in enumerate(steps if len(present) else []):
+            outlines.append((obstacle_faces(log, i, int(present[step])), OBSTACLE, 0.5 * (rank + 1) / len(steps)))
     close_bodies: set[str] = set()
     for run in logs:
         avoidance = run.meta["config"]["avoidance"]

@@ -27,7 +27,6 @@ from qpavoid.viz.style import (
     add_grid,
     add_legend,
     draw_levels,
-    is_qp,
     label_distances,
     units,
 )
@@ -176,7 +175,7 @@ def distances_figure(log: Log) -> Figure:
     # Thinner and thinner: the two bodies of a pair share their distance, and neither line may hide the other.
     widths = np.linspace(3.0, 1.2, len(near))
     handles = _draw_lines(ax, log.t, distance, log.meta["bodies"], near, remaining, widths)
-    handles += draw_levels(ax, log, qp=is_qp(log)) + _shade_status(ax, log)
+    handles += draw_levels(ax, log) + _shade_status(ax, log)
     _plot_gains(gains, log)
     label_distances(ax, distance[:, near])
     add_legend(ax, handles)

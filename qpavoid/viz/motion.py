@@ -72,7 +72,8 @@ def instants(log: Log) -> IntArray:
     """
     if not len(log.t):
         return np.zeros(0, dtype=np.intp)
-    moved = np.abs(np.diff(log.q, axis=0)).sum(axis=1) + np.abs(np.diff(log.obstacle_position, axis=0)).sum((1, 2))
+    moved = np.abs(np.diff(log.q, axis=0)).sum(axis=1)
+    moved += np.nansum(np.abs(np.diff(log.obstacle_position, axis=0)), axis=(1, 2))
     # Half time, half motion: neither a long rest at the end nor a quick dodge takes all the panels.
     progress = np.cumsum(np.r_[0.0, moved / max(moved.sum(), 1e-12) + 1.0 / max(len(moved), 1)])
     steps = np.searchsorted(progress, np.linspace(0.0, progress[-1], PANELS) - 1e-9)
@@ -95,7 +96,7 @@ def view_angles(log: Log) -> tuple[float, float]:
     spread = path - path.mean(axis=0)
     size = max(float(np.linalg.norm(spread, axis=1).max()), 1e-9)
     sized = [i for i in range(len(log.meta["obstacles"])) if not is_endless(log, i)]
-    offsets = (log.obstacle_position[:, sized] - path.mean(axis=0)).mean(axis=0) / size
+    offsets = np.nanmean(log.obstacle_position[:, sized] - path.mean(axis=0), axis=0) / size
     scores = []
     for elevation, azimuth in _VIEWS:
         towards = _view_axes(elevation, azimuth)[2]

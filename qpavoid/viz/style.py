@@ -21,7 +21,7 @@ DASHES: tuple[Any, ...] = (
     (0, (10, 3)),
     (0, (2, 2)),
 )
-COLLISION, D1, D2, D_SAFE = "#C62F2F", "#7A4B9A", "#8A8A8A", "#00695C"
+COLLISION, D1, D2 = "#C62F2F", "#7A4B9A", "#8A8A8A"
 MOVING, AT_REST, OBSTACLE, GROUND, TOOL_PATH = "#6BA3D6", "#C4C4C4", "#E69F00", "#EFE3C8", "#007A56"
 
 
@@ -33,11 +33,6 @@ def units(log: Log, per: str = "") -> str:
         per: put behind each unit, such as `/s`.
     """
     return " or ".join(unit + per for unit in ("rad", "m") if unit in log.meta["units"])
-
-
-def is_qp(log: Log) -> bool:
-    """Return True if the solver has constraint rows of its own that keep a distance."""
-    return str(log.meta["solver"]).partition(":")[0] in ("qp", "hqp")
 
 
 def add_grid(ax: Any) -> None:
@@ -53,19 +48,19 @@ def add_legend(ax: Any, handles: Sequence[Any]) -> None:
     ax.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.01, 1.0), **style)
 
 
-def draw_levels(ax: Any, log: Log, qp: bool) -> list[Any]:
-    """Draw d2, d1, collision and the distance that QP rows keep, all between surfaces.
+def draw_levels(ax: Any, log: Log) -> list[Any]:
+    """Draw d2, d1 and collision, all between surfaces.
 
     Returns:
         The lines, for a legend.
     """
     avoidance = log.meta["config"]["avoidance"]
     offset = avoidance["offset"]
-    levels = [("$d_2$ = {:g} m", avoidance["d2"], D2, DASHES[1]), ("$d_1$ = {:g} m", avoidance["d1"], D1, DASHES[3])]
-    d_safe = avoidance["row"].get("d_safe")
-    if qp and d_safe is not None:
-        levels.append(("$d_{{safe}}$ = {:g} m (QP rows)", d_safe, D_SAFE, DASHES[2]))
-    levels.append(("collision", offset, COLLISION, DASHES[0]))
+    levels = (
+        ("$d_2$ = {:g} m", avoidance["d2"], D2, DASHES[1]),
+        ("$d_1$ = {:g} m", avoidance["d1"], D1, DASHES[3]),
+        ("collision", offset, COLLISION, DASHES[0]),
+    )
     return [
         ax.axhline(
             d - offset, color=colour, linestyle=dash, linewidth=1.1, zorder=2, label=label.format(round(d - offset, 9))

@@ -83,9 +83,10 @@ def local_faces(obstacle: dict[str, Any]) -> Array:
 
 
 def obstacle_faces(log: Log, index: int, step: int) -> Array:
-    """Return outward quadrilaterals (m, 4, 3) of an obstacle at a step, in world axes [m]."""
-    faces = local_faces(log.meta["obstacles"][index])
-    return np.asarray(faces @ log.obstacle_rotation[step, index].T + log.obstacle_position[step, index])
+    """Return outward quadrilaterals (m, 4, 3) of an obstacle at a step, in world axes [m]; none while it is away."""
+    faces, position = local_faces(log.meta["obstacles"][index]), log.obstacle_position[step, index]
+    faces = faces[: len(faces) if np.isfinite(position).all() else 0]
+    return np.asarray(faces @ log.obstacle_rotation[step, index].T + position)
 
 
 def is_endless(log: Log, index: int) -> bool:

@@ -72,7 +72,7 @@ def solver_entrant(
         description: what it is, in a line.
         solver: as in `eq10` or `qp:proxqp`, or with its settings.
         packages: what its back end needs.
-        changes: blocks of the scenario that it has its own way, as in `avoidance={"row": {"type": "damper"}}`; what is
+        changes: blocks of the scenario that it has its own way, as in `avoidance={"row": {"gain": 2.0}}`; what is
             not named of a block stays as it is.
     """
     config = parse_solver(solver) if isinstance(solver, str) else solver
@@ -114,7 +114,6 @@ ENTRANTS = {
         solver_entrant("qp", "QP as each scenario has it, with a backup trajectory", "qp"),
         _qp_without_backup("qp-task-switching", "the gains of eq. 10 in its rows", "task-switching"),
         _qp_without_backup("qp-no-backup", "beta rows", "beta"),
-        _qp_without_backup("qp-damper", "velocity damper rows", "damper"),
         solver_entrant("qp:native", "QP, compiled active-set method", "qp:native"),
         solver_entrant("qp:daqp", "QP, back end daqp", "qp:daqp"),
         solver_entrant("qp:proxqp", "QP, back end ProxQP", "qp:proxqp"),

@@ -16,6 +16,7 @@ import numpy as np
 import pinocchio as pin
 
 import qpavoid
+from qpavoid.config import Beta
 from qpavoid_bench.tick import build
 from qpavoid_bench.tick.libs import Library
 from qpavoid_bench.tick.workloads import Array, Workload
@@ -241,13 +242,14 @@ class _Check:
             self._check_rows(answer["velocities"], closing_gain)
 
     def _check_rows(self, velocities: Array, gain: float) -> None:
-        """Compare with the rows ḋ >= -(1 - β(d)) ξ (d - d_min): ḋ by a difference, β by eq. 12 of the paper."""
+        """Compare with the rows `beta` for d_min: ḋ by a difference, β by eq. 12 of the paper."""
         workload, model, step = self.workload, self.scene.robot.model, 1e-5
         moved = [pin.integrate(model, workload.q[i], v * step) for i, v in zip(CHECK_TICKS, velocities, strict=True)]
         after = build.reference(self.scene, replace(workload, q=np.array(moved)), range(len(moved)))[1]
         margin = self.distances - workload.d_min
         beta = 0.5 + 0.5 * np.cos(np.pi * np.clip(margin / (workload.influence - workload.d_min), 0.0, 1.0))
-        violation = -(1.0 - beta) * gain * margin - (after - self.distances) / step
+        closing = np.maximum((1.0 - beta) * gain * margin, np.minimum(gain * margin, Beta().near_speed))
+        violation = -closing - (after - self.distances) / step
         worst = float(np.max(violation, initial=-np.inf, where=self.distances < workload.influence))
         if worst > RATE_TOLERANCE:
             raise LibraryError(f"a pair in range closes {1e3 * worst:.1f} mm/s too fast")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from qpavoid.control.distances import DistanceQuery
-from qpavoid.control.obstacles import ObstacleStates
+from qpavoid.control.obstacle_states import ObstacleStates
 from qpavoid.model.kinematics import ForwardKinematics
 from qpavoid.problem import Array
 from qpavoid_bench.arena.families.inverse_kinematics import JointRanges
