@@ -87,7 +87,7 @@ def list_(kind: Annotated[Kind | None, typer.Argument(help="Only these.")] = Non
     titles = [f"{name:16} {load_scenario(name).title}" for name in names[Kind.scenarios]]
     for heading, entries in names.items():
         OUT.print(f"[bold]{heading.value}[/]")
-        for line in titles if heading is Kind.scenarios else wrap("  ".join(entries), 76):
+        for line in titles if heading is Kind.scenarios else wrap("  ".join(entries), 76, break_on_hyphens=False):
             OUT.print(f"  {line}", highlight=False, soft_wrap=True, markup=False)
 
 
