@@ -118,6 +118,7 @@ ENTRANTS = {
         solver_entrant(
             "potential-field", "tracking pulls, near pairs push: FIRAS at velocity level", "potential-field"
         ),
+        solver_entrant("step-search", "the best collision-free step of a grid, one step ahead", "step-search"),
         solver_entrant("qp", "QP as each scenario has it, with a backup trajectory", "qp"),
         _qp_without_backup("qp-task-switching", "the gains of eq. 10 in its rows", "task-switching"),
         _qp_without_backup("qp-no-backup", "beta rows", "beta"),
