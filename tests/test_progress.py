@@ -126,7 +126,7 @@ def test_straight_arm_that_has_to_bend_is_singular(tmp_path):
 
 
 def test_moving_target_is_followed_without_alarm(panda):
-    """A lag is no stall: the target goes round at 0.2 m/s and nobody says how fast."""
+    """A lag is no stall: the target goes round at 0.2 m/s without a twist given."""
     (pose,) = frames(panda, ["panda_hand_tcp"], panda.home)
 
     def target(t):
