@@ -216,7 +216,7 @@ class Controller(SceneChanges):
         solution = self._decide(step, begin)
         return Tick(
             state, tuple(step.targets), rows.task_errors.copy(), copied(rows.kinematics), copied(step.proximity),
-            copied(step.problem), solution,
+            copied(step.problem), solution, self._builder.obstacle_poses(step.q),
         )  # fmt: skip
 
     def filter(

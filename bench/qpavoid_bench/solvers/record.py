@@ -14,8 +14,8 @@ from qpavoid.config import QpSolver
 from qpavoid.config.shipped import scenario_names
 from qpavoid.problem import Array, Problem
 from qpavoid_bench.tick.build import build
-from qpavoid_bench.tick.libs.ours import Recorded
 from qpavoid_bench.tick.loops import circling
+from qpavoid_bench.tick.ours import Recorded
 
 REGULARIZATION = QpSolver().regularization
 
