@@ -38,7 +38,7 @@ class StepSearch(NamedSolver):
 
     def solve(self, problem: Problem) -> Solution:
         """Return the best candidate; see `Solver.solve`."""
-        rows, primary, config = problem.avoidance, problem.v_tracking.copy(), self.config
+        rows, primary, config = problem.avoidance, problem.v_tracking, self.config
         A, b = problem.tracking.A, problem.tracking.b
         grid = neighbourhood(len(primary), config.candidates)
         steps = np.concatenate([primary[None], *[length * config.speed * grid for length in LENGTHS]])
