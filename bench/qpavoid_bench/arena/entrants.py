@@ -15,7 +15,7 @@ from qpavoid.config import ScenarioConfig, SolverConfig
 from qpavoid.errors import ConfigError, UnknownName, nearest
 from qpavoid.solvers import make_solver, parse_solver
 from qpavoid_bench.arena.case import Case
-from qpavoid_bench.arena.library_pilot import LibraryPilot
+from qpavoid_bench.arena.library_pilot import DAMPING, LibraryPilot
 from qpavoid_bench.arena.rollout import Pilot
 from qpavoid_bench.arena.world import World
 from qpavoid_bench.libraries import LIBRARIES, Library
@@ -86,7 +86,7 @@ def _start_solver(solver: SolverConfig, changes: Mapping[str, Mapping[str, Any]]
     for block, fields in changes.items():
         scenario[block] = {**scenario[block], **fields}
     x = ScenarioConfig.model_validate({**scenario, "solver": solver.model_dump()})
-    blocks = x.avoidance, x.limits, x.tracking_damping, x.sensing, x.progress
+    blocks = x.avoidance, x.limits, x.sensing, x.progress
     return Controller(world.scene, world.tasks, make_solver(x.solver), x.dt, *blocks)
 
 
@@ -95,7 +95,7 @@ def _library_entrant(library: Library) -> Entrant:
     settings = {
         "given": library.settings,
         "targets": "one period ahead along the task's own law",
-        "damping": "tracking_damping squared, where it takes any",
+        "damping": f"{DAMPING} squared, where it takes any",
         **library.options,
     }
     start = partial(LibraryPilot, library)
@@ -118,6 +118,7 @@ ENTRANTS = {
         solver_entrant(
             "potential-field", "tracking pulls, near pairs push: FIRAS at velocity level", "potential-field"
         ),
+        solver_entrant("step-search", "the best collision-free step of a grid, one step ahead", "step-search"),
         solver_entrant("qp", "QP as each scenario has it, with a backup trajectory", "qp"),
         _qp_without_backup("qp-task-switching", "the gains of eq. 10 in its rows", "task-switching"),
         _qp_without_backup("qp-no-backup", "beta rows", "beta"),

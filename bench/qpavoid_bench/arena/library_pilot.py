@@ -19,6 +19,9 @@ from qpavoid_bench.libraries import Library
 from qpavoid_bench.libraries.process import STEP_TIMEOUT, LibraryError, Process
 from qpavoid_bench.libraries.setup import describe
 
+DAMPING = 0.05
+"""λ of the damped inverse of every library that is given one [-]: its square is what it takes."""
+
 
 class LibraryPilot:
     """A library in a process of its own."""
@@ -48,7 +51,7 @@ class LibraryPilot:
                 scenario.dt,
                 (avoidance.d1 - avoidance.offset, avoidance.d2 - avoidance.offset),
                 world.scene.robot.bounds().within(scenario.limits),
-                scenario.tracking_damping**2,
+                DAMPING**2,
                 library.options,
             )
             self.process.ask("setup", scene)
