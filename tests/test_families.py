@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
 from qpavoid import ScenarioConfig
+from qpavoid.config.shipped import shipped_names
 from qpavoid.errors import ConfigError, UnknownName
 from qpavoid_bench.arena.case import Case
-from qpavoid_bench.arena.families import Draw, Redraw, family_names, load_family, make_case
+from qpavoid_bench.arena.families import Draw, Redraw, load_family, make_case
 from qpavoid_bench.arena.families.clearance import MIN_ADVANCE, Clearance
 from qpavoid_bench.arena.families.inverse_kinematics import FrameGoal, JointRanges, solve_inverse_kinematics
 from qpavoid_bench.arena.families.parameters import Parameter
@@ -23,7 +24,7 @@ from qpavoid_bench.arena.families.planner import plan
 from qpavoid_bench.arena.families.solvable import find_plan
 from qpavoid_bench.arena.world import build_world, surface_safety_distance
 
-FAMILIES = family_names()
+FAMILIES = shipped_names("family")
 TIMED = {"chasing", "crossing", "head_on", "noisy_sensor", "random_walk"}
 
 _cases: dict[tuple[str, int], Case] = {}
