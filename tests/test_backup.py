@@ -171,17 +171,6 @@ def test_an_attached_object_is_moved_out_of_the_way_too(tmp_path):
 # --- bounded work --------------------------------------------------------------------------------------------------
 
 
-def test_clock_jitter_costs_no_rollouts(tmp_path, evaluations):
-    counts = {}
-    for jitter in (0.0, 1e-3):
-        rng, controller = np.random.default_rng(0), controller_of(tmp_path, closing_balls(speed=0.12))
-        evaluations.clear()
-        for _ in loop(controller, 180, 300, lambda k, r=rng, j=jitter: k * DT + j * r.uniform(-1.0, 1.0)):
-            pass
-        counts[jitter] = len(evaluations)
-    assert counts[0.0] > 200 and counts[1e-3] < 2 * counts[0.0]
-
-
 def test_work_of_a_step_is_bounded(tmp_path, evaluations):
     """Three candidates of the kept kind, one of the present state, and three samples: 41 to 82 poses each."""
     controller, most = controller_of(tmp_path, press(), speed=0.4), 0
