@@ -82,15 +82,6 @@ def test_voxels_contain_every_point(resolution):
     assert nearest.max() <= voxel_radius(resolution)
 
 
-def test_voxel_keys_are_independent_of_the_other_points():
-    rng = np.random.default_rng(2)
-    points = scattered(rng)
-    first, second = Voxels.of(points, 0.02), Voxels.of(np.concatenate((scattered(rng), points[::-1])), 0.02)
-    where = np.searchsorted(second.keys, first.keys)
-    np.testing.assert_array_equal(second.keys[where], first.keys)
-    np.testing.assert_array_equal(second.centers[where], first.centers)
-
-
 def test_voxels_drop_points_that_are_no_numbers():
     points = scattered(np.random.default_rng(3), 20)
     points[3], points[7, 1], points[9, 2] = np.nan, np.inf, 1e6
@@ -100,14 +91,6 @@ def test_voxels_drop_points_that_are_no_numbers():
     for bad in (np.zeros(3), np.zeros((4, 2)), "points", None):
         with pytest.raises(NumericalError):
             Voxels.of(bad, 0.02)
-
-
-def test_voxels_of_a_coal_octree():
-    points = scattered(np.random.default_rng(4), 300)
-    tree = coal.makeOctree(points, 0.04)
-    voxels, finer = Voxels.of_octree(tree), Voxels.of_octree(tree, 0.02)
-    np.testing.assert_array_equal(voxels.keys, Voxels.of(points, 0.04).keys)
-    assert len(finer.centers) == 8 * len(voxels.centers)
 
 
 # --- nearest voxels by brute force -------------------------------------------------------------------------------
