@@ -29,7 +29,7 @@ def random_problem(seed, n=3, pairs=2, asked=0.0):
     )  # fmt: skip
     names = [("link", f"ball{i}") for i in range(pairs)]
     lower, upper = -rng.uniform(0.0, 0.6, n), rng.uniform(0.0, 0.6, n)
-    return make_problem(Tracking(A, A @ v, 0.01), rows, lower, upper, names)
+    return make_problem(Tracking(A, A @ v, A @ v), rows, lower, upper, names)
 
 
 def candidates(problem):
@@ -74,7 +74,7 @@ def test_without_a_pair_in_range_it_tracks(seed):
 
 def test_nan_stays_nan():
     problem = random_problem(0)
-    unknown = problem._replace(tracking=problem.tracking._replace(b=np.full(2, np.nan)))
+    unknown = problem._replace(tracking=problem.tracking._replace(b=np.full(2, np.nan), b_feasible=np.full(2, np.nan)))
     assert np.isnan(LAW.solve(unknown).v).all()
 
 
