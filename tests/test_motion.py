@@ -166,13 +166,6 @@ def test_waypoints_pass_through_their_poses_and_turn_at_a_constant_rate():
     assert_rests(path, 4.0, positions[2], rpy_to_matrix(rpys[2]))
 
 
-def test_orientation_that_stays_is_exactly_constant():
-    rpy = (0.123, 1.1, -2.2)
-    path = build(type="waypoints", times=[0, 1], positions=[(0, 0, 0), (1, 0, 0)], rpys=[rpy, rpy])
-    assert not path.sample(0.5).angular.any()
-    np.testing.assert_array_equal(path.sample(0.5).rotation, rpy_to_matrix(rpy))
-
-
 def test_two_roundings_of_one_orientation_are_no_turn(tmp_path):
     for k in range(1, 20):
         q = np.array([0.1 * k, 0.2, -0.3, 0.7])
@@ -244,14 +237,6 @@ def test_twist_of_waypoints(positions, rpys, profile, s, piece):
     times = [0.5, 1.5, 4.0]
     motion = build(type="waypoints", times=times, positions=positions, rpys=rpys, profile=profile)
     assert_twist_is_rate_of_pose(motion, times[piece] + s * (times[piece + 1] - times[piece]))
-
-
-@given(normal=direction, radius=st.floats(0.01, 1), period=st.floats(1, 20), turns=st.floats(0.01, 0.99))
-def test_twist_of_a_circle(normal, radius, period, turns):
-    if np.linalg.norm(normal[1:]) < 1e-3:
-        return
-    motion = build(type="circle", center=(0, 0, 1), radius=radius, normal=normal, period=period, turns=1)
-    assert_twist_is_rate_of_pose(motion, turns * period)
 
 
 @given(

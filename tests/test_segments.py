@@ -34,28 +34,6 @@ def test_point_beyond_an_end():
     np.testing.assert_allclose(point_segment_distance(p, a, a), np.linalg.norm(p, axis=1), atol=TOL)
 
 
-KNOWN = {
-    "crossing above": (vec(-1, 0, 0), vec(1, 0, 0), vec(0, -1, 2), vec(0, 1, 2), 2.0),
-    "T: end above interior": (vec(-1, 0, 0), vec(1, 0, 0), vec(0.5, 3, 0), vec(0.5, 9, 0), 3.0),
-    "end to end": (vec(0, 0, 0), vec(1, 0, 0), vec(4, 4, 0), vec(4, 9, 1), 5.0),
-    "clamping one by one would be wrong": (vec(0, 0, 0), vec(1, 0, 0), vec(0, -3, 0), vec(6, 3, 0), np.sqrt(2)),
-    "parallel side by side": (vec(0, 0, 0), vec(2, 0, 0), vec(1, 1, 0), vec(5, 1, 0), 1.0),
-    "parallel past each other": (vec(0, 0, 0), vec(1, 0, 0), vec(4, 4, 0), vec(7, 4, 0), 5.0),
-    "collinear apart": (vec(0, 0, 0), vec(1, 1, 1), vec(2, 2, 2), vec(3, 3, 3), np.sqrt(3)),
-    "collinear overlapping": (vec(0, 0, 0), vec(2, 2, 2), vec(1, 1, 1), vec(3, 3, 3), 0.0),
-    "point and segment": (vec(0.5, 2, 0), vec(0.5, 2, 0), vec(0, 0, 0), vec(1, 0, 0), 2.0),
-    "two points": (vec(0, 0, 0), vec(0, 0, 0), vec(2, 3, 6), vec(2, 3, 6), 7.0),
-}
-
-
-@pytest.mark.parametrize(("a", "b", "c", "d", "distance"), KNOWN.values(), ids=KNOWN.keys())
-def test_known_segments(a, b, c, d, distance):
-    for ab in ((a, b), (b, a)):
-        for cd in ((c, d), (d, c)):
-            assert segment_segment_distance(*ab, *cd) == pytest.approx(distance, abs=TOL)
-            assert segment_segment_distance(*cd, *ab) == pytest.approx(distance, abs=TOL)
-
-
 @given(st.tuples(point, point, point, point))
 def test_it_is_the_minimum(points):
     assert segment_segment_distance(*points) == pytest.approx(bounded_least_squares(*points), abs=TOL)
