@@ -139,9 +139,9 @@ def test_further_contacts_are_avoided_after_an_unavoidable_one(tmp_path):
     """A slide along y cannot avoid a wall that comes along x, but it can avoid the ball behind it."""
     wall = on_line("wall", Box(size=(0.02, 4.0, 0.4)), (0.6, 0, 0), (-1.0, 0, 0), 0.5)
     ball = on_line("ball", Sphere(radius=0.15), (-1.2, 0.02, 0), (1.0, 0.02, 0), 0.6)
-    controller, walls, balls = controller_of(tmp_path, [wall, ball], axes="y", acceleration=4.0, dt=2 * DT), [], []
-    for k, (q, _) in enumerate(loop(controller, 140, clock=lambda k: 2 * DT * k)):
-        x = [o.motion.sample(2 * DT * k).position[0] for o in (wall, ball)]
+    controller, walls, balls = controller_of(tmp_path, [wall, ball], axes="y", acceleration=4.0), [], []
+    for k, (q, _) in enumerate(loop(controller, 280)):
+        x = [o.motion.sample(k * DT).position[0] for o in (wall, ball)]
         walls.append(abs(x[0]) - 0.01 - 0.05)
         balls.append(np.hypot(x[1], q[0] - 0.02) - 0.15 - 0.05)
     assert min(walls) < 0.0 < 0.5 * KEPT < min(balls)
