@@ -60,9 +60,9 @@ class ProblemBuilder:
         self._clock = Clock(dt)
         units = [names[j] for j in bounds.v_index.tolist()]
         self._configurations = Configurations(model, bounds.q_index, bounds.lower, bounds.upper, units)
-        targets = TargetReader(tasks, self.rows.targets, settings.latency)
+        self._targets = TargetReader(tasks, self.rows.targets, settings.latency)
         shapes = (model.nq,), (model.nv,)
-        self._reader = ArgumentReader(shapes, self._clock, self._configurations, targets, self.tracker)
+        self._reader = ArgumentReader(shapes, self._clock, self._configurations, self._targets, self.tracker)
 
     def read(self, q: Any, t: Any, targets: Any, obstacles: Any, v: Any, v_desired: Any = None) -> Arguments:
         """Check the arguments of a step, see `Controller.step`: whatever raises does so here, and changes nothing."""
@@ -71,6 +71,7 @@ class ProblemBuilder:
     def build(self, arguments: Arguments) -> StepProblem:
         """Take over the arguments of a step, and build its problem."""
         times, q, v, v_desired, targets, update, faults, assumptions = arguments
+        self._targets.last = targets
         rows, query = self.rows, self.rows.query
         if times.resumed or (v is not None and self._clock.is_first):
             self._restart(np.zeros(self._model.nv) if v is None else v)
@@ -150,4 +151,5 @@ class ProblemBuilder:
         """Forget the steps before; the robot moves at v (nv,). Attached objects stay attached."""
         self._restart(v)
         self._clock.reset()
+        self._targets.last = ()
         self.tracker.reset()

@@ -56,7 +56,7 @@ class MujocoModel:
     def place(self, q: Array, t: float) -> None:
         """Put the robot to q (nv,) and the obstacles to their poses at t [s]."""
         self.data.qpos[self.q_index] = q
-        for i, obstacle in enumerate(self.scene.obstacles):
+        for i, obstacle in enumerate(self.scene.slots):
             if obstacle.moves:
                 place_mocap(self.data, i, obstacle.motion.sample(t))
         mujoco.mj_kinematics(self.model, self.data)
@@ -125,12 +125,12 @@ def build(scene: Scene, q0: Array, frames: Sequence[int] = (), has_servos: bool 
         place = frame.placement
         bodies[frame.parentJoint].add_site(name=f"frame {i}", pos=place.translation, quat=_quaternion(place.rotation))
     first = len(scene.body_names)
-    obstacles = [spec.worldbody.add_body(name=f"obstacle {i}", mocap=True) for i in range(len(scene.obstacles))]
+    obstacles = [spec.worldbody.add_body(name=f"obstacle {i}", mocap=True) for i in range(len(scene.slots))]
     for i, geometry in enumerate(scene.geometry.geometryObjects):
         if i < first:
-            _add_geom(spec, bodies[geometry.parentJoint], geometry, geometry.placement)
+            _add_geom(spec, bodies[geometry.parentJoint], geometry, f"geometry {i}", geometry.placement)
         else:
-            _add_geom(spec, obstacles[scene.obstacle_of[i]], geometry, pin.SE3.Identity())
+            _add_geom(spec, obstacles[scene.obstacle_of[i]], geometry, f"geometry {i}", pin.SE3.Identity())
     model = spec.compile()
     joints = [model.joint(name) for name in list(robot.names)[1:]]
     mujoco_model = MujocoModel(
@@ -138,12 +138,12 @@ def build(scene: Scene, q0: Array, frames: Sequence[int] = (), has_servos: bool 
         q0=np.array(q0),
         model=model,
         data=mujoco.MjData(model),
-        geoms=np.array([model.geom(geometry.name).id for geometry in scene.geometry.geometryObjects], dtype=np.intp),
+        geoms=np.array([model.geom(f"geometry {i}").id for i in range(scene.geometry.ngeoms)], dtype=np.intp),
         q_index=np.array([joint.qposadr[0] for joint in joints], dtype=np.intp),
         v_index=np.array([joint.dofadr[0] for joint in joints], dtype=np.intp),
         bodies=first,
     )
-    for i, obstacle in enumerate(scene.obstacles):
+    for i, obstacle in enumerate(scene.slots):
         place_mocap(mujoco_model.data, i, obstacle.motion.sample(0.0))
     mujoco_model.place(mujoco_model.q0, 0.0)
     return mujoco_model
@@ -173,10 +173,10 @@ def _inertia(inertia: Any) -> dict[str, Any]:
     return {"mass": inertia.mass, "ipos": inertia.lever, "inertia": moments, "iquat": _quaternion(axes)}
 
 
-def _add_geom(spec: Any, body: Any, geometry: Any, placement: Any) -> None:
-    """Add a geometry to a body of the MuJoCo model."""
+def _add_geom(spec: Any, body: Any, geometry: Any, name: str, placement: Any) -> None:
+    """Add a geometry by a name to a body of the MuJoCo model."""
     kinds, shape = mujoco.mjtGeom, geometry.geometry
-    place = {"name": geometry.name, "pos": placement.translation, "quat": _quaternion(placement.rotation)}
+    place = {"name": name, "pos": placement.translation, "quat": _quaternion(placement.rotation)}
     match shape:
         case coal.Sphere():
             body.add_geom(type=kinds.mjGEOM_SPHERE, size=_three(shape.radius), **place)
@@ -197,9 +197,9 @@ def _add_geom(spec: Any, body: Any, geometry: Any, placement: Any) -> None:
                 **_below_plane(place),
             )
         case coal.ConvexBase():
-            mesh = spec.add_mesh(name=geometry.name, uservert=np.array(shape.points()).ravel())
+            mesh = spec.add_mesh(name=name, uservert=np.array(shape.points()).ravel())
             mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
-            body.add_geom(type=kinds.mjGEOM_MESH, meshname=geometry.name, **place)
+            body.add_geom(type=kinds.mjGEOM_MESH, meshname=name, **place)
         case _:
             raise ValueError(f"body {geometry.name!r}: {type(shape).__name__} has no counterpart")
 
