@@ -1,4 +1,4 @@
-"""Command line: `qpavoid list | run | compare | fields | robot | bench`.
+"""Command line: `qpavoid list | run | compare | view | render | fields | robot | bench`.
 
 Exit status: 0 done, 1 a run ended in a defined failure (collision, safe stop, broken off), 2 bad input.
 """
@@ -31,6 +31,7 @@ from qpavoid.run.simulate import simulate
 from qpavoid.run.terminal import ERR, OUT, names_of, progress, terminate_like_interrupt
 from qpavoid.setup import commands as robot_commands
 from qpavoid.solvers import SOLVERS, backend_names
+from qpavoid.viz import commands as view_commands
 
 app = typer.Typer(
     add_completion=False,
@@ -39,6 +40,7 @@ app = typer.Typer(
     help="Follow a planned motion and stay clear of obstacles, other arms and yourself.",
 )
 app.add_typer(robot_commands.app, name="robot")
+app.command("view")(view_commands.view)
 
 Sets = Annotated[
     list[str] | None, typer.Option("--set", metavar="PATH=VALUE", help="Override a field: avoidance.d2=0.30")
@@ -87,7 +89,7 @@ def list_(kind: Annotated[Kind | None, typer.Argument(help="Only these.")] = Non
     titles = [f"{name:16} {load_scenario(name).title}" for name in names[Kind.scenarios]]
     for heading, entries in names.items():
         OUT.print(f"[bold]{heading.value}[/]")
-        for line in titles if heading is Kind.scenarios else wrap("  ".join(entries), 76):
+        for line in titles if heading is Kind.scenarios else wrap("  ".join(entries), 76, break_on_hyphens=False):
             OUT.print(f"  {line}", highlight=False, soft_wrap=True, markup=False)
 
 

@@ -21,8 +21,7 @@ from qpavoid_bench.arena.families.inverse_kinematics import FrameGoal, JointRang
 from qpavoid_bench.arena.families.parameters import Parameter
 from qpavoid_bench.arena.families.planner import plan
 from qpavoid_bench.arena.families.solvable import find_plan
-from qpavoid_bench.arena.scores import surface_safety_distance
-from qpavoid_bench.arena.world import build_world
+from qpavoid_bench.arena.world import build_world, surface_safety_distance
 
 FAMILIES = family_names()
 TIMED = {"chasing", "crossing", "head_on", "noisy_sensor", "random_walk"}

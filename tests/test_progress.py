@@ -41,11 +41,11 @@ def test_stalled_names_the_obstacle_exactly_head_on(tmp_path, solver, shape):
     q, reported, _ = run_to(head_on(tmp_path, solver, shape), 1500)
     assert np.linalg.norm(q[-1] - GOAL) > 0.11 and np.abs(q[-1] - q[-300]).max() < 2e-3
     first = next(k for k, reasons in enumerate(reported) if reasons)
-    assert 100 <= first < 400  # a second without progress
+    assert 50 <= first < 350  # half a second without progress
     for (reason,) in reported[first:]:
         assert (reason.kind, reason.subject, reason.unit) == (ReasonKind.STALLED, ("tool", shape), "m/s")
         # v_tracking has the task's full speed; the row is zero at d1, where qp rests, and allows 50 mm/s farther out
-        assert reason.amount == pytest.approx(0.3, abs=5e-3) or (solver == "eq10" and 0.25 < reason.amount < 0.3)
+        assert reason.amount == pytest.approx(0.3, abs=0.02) or (solver == "eq10" and 0.25 < reason.amount < 0.3)
         assert reason.severity is Severity.WARNING
 
 
@@ -78,7 +78,7 @@ def test_stalled_ends_once_the_obstacle_has_left(tmp_path):
     assert not any(reported[505:]) and np.linalg.norm(q[-1] - GOAL) < 1e-4
 
 
-@pytest.mark.parametrize(("scenario", "longest"), [("situation1", 2.0), ("situation2", 0.0), ("panda_line", 0.0)])
+@pytest.mark.parametrize(("scenario", "longest"), [("situation1", 4.0), ("situation2", 0.0), ("panda_line", 0.0)])
 def test_stalled_raises_no_false_alarm(scenario, longest):
     """Slowed down or pushed aside is not stalled; in Situation 1 the tool waits for its target to return."""
     metrics = simulate(scenario).metrics()

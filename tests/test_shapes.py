@@ -4,7 +4,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from closed_loop import cartesian, drive, make_controller
-from conftest import BOX, CAPSULE, SPHERE, Bench, differences, look, moved, obstacle, random_q, write_chain
+from conftest import BOX, SPHERE, Bench, differences, look, moved, obstacle, random_q, write_chain
 from oracle import signed_distance, support
 
 from qpavoid import (

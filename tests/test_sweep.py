@@ -59,20 +59,19 @@ import os, time
 from dataclasses import dataclass
 import numpy as np
 from qpavoid import Solution
-from qpavoid.solvers.analytic import tracking_velocity
 
 @dataclass
 class Halved:
     """A class with solve."""
     share: float = 0.5
     def solve(self, problem):
-        return Solution(self.share * tracking_velocity(problem))
+        return Solution(self.share * problem.v_tracking)
 
 def solution(problem):
-    return Solution(tracking_velocity(problem))
+    return Solution(problem.v_tracking)
 
 def velocity(problem, scale=1.0):
-    return scale * tracking_velocity(problem)
+    return scale * problem.v_tracking
 
 class Still:
     def __init__(self, case, world):

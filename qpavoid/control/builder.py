@@ -20,7 +20,7 @@ from qpavoid.control.slots import ObstacleSlots
 from qpavoid.control.targets import TargetReader
 from qpavoid.control.tasks import RowTask
 from qpavoid.model.limits import OUTSIDE
-from qpavoid.model.sample import Sample
+from qpavoid.model.sample import POSE, Sample
 from qpavoid.problem import Array, Problem, Proximity
 from qpavoid.reason import Reason
 
@@ -139,6 +139,13 @@ class ProblemBuilder:
     def pose(self, index: int, q: Array | None) -> Sample:
         """Return the world pose of an obstacle in the last step, attached or not."""
         return self._pose(index, self._given_or_last(q))
+
+    def obstacle_poses(self, q: Array) -> Array:
+        """Return the world poses (o, 12) of all obstacles in the last step, at q (nq,)."""
+        poses: Array = self.tracker.current.states[:, :POSE].copy()
+        for index in self.rows.query.table.attached:
+            poses[index] = self.attachments.pose(index, q).row[:POSE]
+        return poses
 
     def _pose(self, index: int, q: Array) -> Sample:
         is_attached = index in self.rows.query.table.attached

@@ -133,6 +133,21 @@ def find_joint(model: Any, name: str, where: str) -> Any:
     return model.joints[model.getJointId(name)]
 
 
+def hinge_or_slide(model: Any, index: int) -> tuple[bool, Array]:
+    """Return True for a slide, False for a hinge, and the joint's axis (3,) in its own frame.
+
+    Raises:
+        ValueError: it is neither a hinge nor a slide.
+    """
+    joint = model.joints[index]
+    if joint.nq != 1 or joint.nv != 1:
+        raise ValueError(f"joint {model.names[index]!r}: {joint.shortname()} is neither a hinge nor a slide")
+    data = model.createData()
+    pin.computeJointJacobians(model, data, pin.neutral(model))
+    screw = np.asarray(data.joints[index].S).ravel()
+    return (True, screw[:3]) if np.any(screw[:3]) else (False, screw[3:])
+
+
 def middle_configuration(model: Any) -> Array:
     """Return the neutral configuration (nq,), moved into the joint limits.
 

@@ -28,6 +28,7 @@ from qpavoid.model.joints import (
 from qpavoid.model.kinematics import TRANSLATIONS
 from qpavoid.model.limits import JointBounds
 from qpavoid.model.notes import Note, NoteKind, issue_warning, merge_notes
+from qpavoid.model.packages import absolute_entries
 from qpavoid.model.pairs import TouchingPair, add_self_pairs, drop_always_touching
 from qpavoid.model.robot_bodies import pair_margins, robot_bodies
 from qpavoid.model.urdf import apply_srdf, find_resource, is_mjcf, read_model
@@ -61,6 +62,10 @@ class Robot:
     """Joint: largest jerk [rad/s³ or m/s³]; joints left out have no such limit."""
     notes: tuple[Note, ...] = ()
     """What was left out, mended, replaced or assumed at loading."""
+    urdf: Path = Path()
+    """URDF or MJCF of the model, for what is meant to be seen of it."""
+    package_dirs: tuple[str, ...] = ()
+    """Folders of its packages, absolute, and `NAME=FOLDER`; see `mesh_folders`."""
 
     @classmethod
     def load(
@@ -165,6 +170,8 @@ class Robot:
             acceleration=config.limits.acceleration,
             jerk=config.limits.jerk,
             notes=tuple(notes),
+            urdf=urdf,
+            package_dirs=tuple(absolute_entries(config.package_dirs, path.parent)),
         )
 
     @property

@@ -46,6 +46,8 @@ class ShapeReader:
     """Whether a shape whose mesh is missing is left out, with a warning, and not refused."""
     allow_faults: bool = False
     """Whether a shape that cannot be read for whatever reason is left out, with a warning, and not refused."""
+    load: Callable[[str, Any], Any] = load_mesh
+    """Loads a mesh, given its file and scale, into a coal geometry."""
 
     def read(self, root: ET.Element, tag: str, skipped: Collection[int] = ()) -> Any:
         """Read the shapes into a geometry model.
@@ -135,7 +137,7 @@ class ShapeReader:
             self.notes.append(Note(NoteKind.MESH, (name,), clause, _PACKAGES, "warning"))
             return None
         try:
-            return load_mesh(path, scale), path, scale
+            return self.load(path, scale), path, scale
         except ValueError as fault:
             raise ValueError(f"{where}: mesh {path}: {fault}") from None
 

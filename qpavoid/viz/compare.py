@@ -33,6 +33,7 @@ SOLVER_STYLES: dict[str, tuple[str, Any]] = {
     "eq10": ("#D55E00", DASHES[1]),
     "gradient-projection": ("#CC79A7", DASHES[4]),
     "potential-field": ("#56B4E9", DASHES[6]),
+    "step-search": ("#999999", DASHES[7]),
     "hqp": ("#009E73", DASHES[5]),
     "qp": ("#0072B2", DASHES[0]),
 }

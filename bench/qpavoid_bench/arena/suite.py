@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
@@ -77,6 +77,18 @@ class Suite:
     absent: tuple[Entrant, ...]
     """Entrants of the file that cannot take part, because their packages are not installed."""
 
+    def prepare(self) -> tuple[Suite, dict[str, str]]:
+        """Make the environments of libraries that are absent for want of one.
+
+        Returns:
+            The suite with them, and why others are absent, by their names.
+        """
+        reasons = {entrant.name: entrant.prepare() for entrant in self.absent}
+        ready = tuple(entrant for entrant in self.absent if not reasons[entrant.name])
+        absent = tuple(entrant for entrant in self.absent if reasons[entrant.name])
+        suite = replace(self, entrants=(*self.entrants, *ready), absent=absent)
+        return suite, {name: reason for name, reason in reasons.items() if reason}
+
 
 def load_suite(
     name_or_path: str | Path, solvers: Sequence[str] = (), more: Sequence[str] = (), seeds: int | None = None
@@ -115,7 +127,7 @@ def load_suite(
     with located("--entrant"):
         for name in more:
             _add_entrant(chosen, find_any(name))
-    if not chosen:
+    if not chosen and not any(entrant.library for entrant in absent):
         missing = ", ".join(f"{entrant.name} needs {', '.join(entrant.missing)}" for entrant in absent)
         raise ConfigError(f"{path}: entrants: none can take part: {missing}")
     names = [family.name for family in families]

@@ -17,7 +17,7 @@ from qpavoid.config.shipped import find_family, find_robot, find_setup, setup_na
 from qpavoid.config.text import read_text
 from qpavoid.errors import ConfigError, UnknownName, located, nearest
 from qpavoid.model.robot import Robot
-from qpavoid_bench.arena.families import adversarial, moving, statics, two_arms
+from qpavoid_bench.arena.families import adversarial, moving, statics, teleoperation, two_arms
 from qpavoid_bench.arena.families.parameters import Draw, Parameter
 from qpavoid_bench.arena.python_file import MAX_FILE_SIZE, load_attribute
 
@@ -37,6 +37,12 @@ GENERATORS: dict[str, Generator] = {
     **{name: partial(moving.movers, motion) for name, motion in moving.MOTIONS.items()},
     "random_walk": partial(moving.movers, moving.wander),
     "adversarial": adversarial.adversarial,
+    "jumps": teleoperation.jumps,
+    "leaving_reach": teleoperation.leaving_reach,
+    "singular": teleoperation.singular,
+    "behind": teleoperation.behind,
+    "edge": teleoperation.edge,
+    "bad_start": teleoperation.bad_start,
 }
 """Generators that ship."""
 
@@ -66,6 +72,10 @@ class FamilyConfig(Block):
     """Whether the goals can be reached; it is checked, whichever it is."""
     proved: bool = True
     """Whether a solution is proved to exist; where not, each contact is judged avoidable or not (`arena.verdict`)."""
+    static: bool = False
+    """Whether nothing moves but the target, so that standing still avoids every contact; no solution is looked for."""
+    starts_clear: bool = True
+    """Whether everything is farther apart than d1 at the start."""
 
     @model_validator(mode="after")
     def _check_robots(self) -> FamilyConfig:
