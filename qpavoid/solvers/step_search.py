@@ -9,7 +9,6 @@ from math import comb
 import numpy as np
 
 from qpavoid.problem import Array, Problem, Solution
-from qpavoid.solvers.analytic import tracking_velocity
 from qpavoid.solvers.solver import NamedSolver
 
 LENGTHS = (1.0, 0.25, 0.0625)
@@ -39,7 +38,7 @@ class StepSearch(NamedSolver):
 
     def solve(self, problem: Problem) -> Solution:
         """Return the best candidate; see `Solver.solve`."""
-        rows, primary, config = problem.avoidance, tracking_velocity(problem), self.config
+        rows, primary, config = problem.avoidance, problem.v_tracking, self.config
         A, b = problem.tracking.A, problem.tracking.b
         grid = neighbourhood(len(primary), config.candidates)
         steps = np.concatenate([primary[None], *[length * config.speed * grid for length in LENGTHS]])
