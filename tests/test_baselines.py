@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 
 from qpavoid import build_scene, load_scenario, make_solver
 from qpavoid.config import Avoidance, GradientProjectionSolver, PotentialFieldSolver, Sphere
-from qpavoid.config.shipped import scenario_names
+from qpavoid.config.shipped import shipped_names
 from qpavoid.problem import AvoidanceRows, Tracking, make_problem
 from qpavoid.run.simulate import simulate
 from qpavoid.solvers.baselines import clearance_slope, repulsion, step_fraction
@@ -219,7 +219,7 @@ def test_gradient_projection_clears_obstacles_with_its_links():
     assert ours["max_deviation"] < 3e-3 and ours["arrived"]
 
 
-FREE = [name for name in scenario_names() if not load_scenario(name).contacts]
+FREE = [name for name in shipped_names("scenario") if not load_scenario(name).contacts]
 
 
 @pytest.mark.slow

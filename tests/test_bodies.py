@@ -17,8 +17,8 @@ from qpavoid import Robot
 from qpavoid.config import Cone, Ellipsoid
 from qpavoid.geometry.bodies import convert_bodies, enclosing_capsule, make_shape
 from qpavoid.geometry.capsules import fit_capsule
-from qpavoid.geometry.segments import point_segment_distance
 from qpavoid.model.urdf import read_model, read_pieces
+from qpavoid.run.metrics import point_segment_distance
 
 PANDA = EXAMPLES / "panda_description/urdf/panda.urdf"
 STL_FACET = "facet normal 0 0 1\nouter loop\nvertex {}\nvertex {}\nvertex {}\nendloop\nendfacet\n"

@@ -54,11 +54,6 @@ def run_checked(scenario, steps):
     return limited, least, np.array(vs), q
 
 
-def limited_situation(course, acceleration, jerk):
-    fields = {**situation(course).model_dump(mode="json"), "limits": {"acceleration": acceleration, "jerk": jerk}}
-    return run_checked(changed("situation1", **fields), 1300)
-
-
 # --- moving obstacles --------------------------------------------------------------------------------------------
 
 
@@ -80,18 +75,6 @@ def test_distance_to_an_approaching_sphere_is_kept_to_2_mm(course, jerk):
     assert len(limited.relaxed) < 100
     assert all(s.status is Status.RELAXED and any("fist" in r.subject for r in s.reasons) for s in limited.relaxed)
     assert np.abs(vs).max() > 0.1
-
-
-@pytest.mark.parametrize("course", ["front 0.2", "head-on 0.4", "chase 0.3"])
-def test_distance_is_kept_under_tight_limits_with_relaxed_rows_reported(course):
-    """At 2 rad/s² and 10 rad/s³, where it takes 0.4 s until a joint brakes fully."""
-    fields = situation(course).model_dump(mode="json")
-    limited, least, _, _ = run_checked(
-        changed("situation1", **{**fields, "limits": {"acceleration": 2.0, "jerk": 10.0}}), 1300
-    )
-    assert least > SAFE - 2e-3
-    reasons = [reason for s in limited.relaxed for reason in s.reasons if "fist" in reason.subject]
-    assert any(reason.kind is ReasonKind.ROW_RELAXED for reason in reasons)
 
 
 @pytest.mark.parametrize("solver", ["qp", "hqp"])
@@ -177,13 +160,6 @@ def test_limits_hold_for_a_humanoid_over_its_contacts(solver):
         places.append([data.oMf[foot].translation.copy() for foot in feet])
     assert np.abs(np.diff(places, axis=0)).max() < 1e-3
     assert len(limited.relaxed) < (20 if solver == "hqp" else 1) and limited.most < 1.5
-
-
-@pytest.mark.parametrize("limits", [{"acceleration": 2.0, "jerk": 20.0}])
-def test_limits_hold_for_a_mobile_base(limits):
-    limited, least, vs, _ = run_checked(changed("tiago_column", limits=limits), 1200)
-    assert least > 0.012 - 1e-3 and np.abs(vs[:, :2]).max() > 0.05
-    assert not limited.relaxed and limited.most == pytest.approx(1.0, abs=1e-3)
 
 
 @pytest.mark.parametrize("solver", ["qp", pytest.param("hqp", marks=pytest.mark.slow)])

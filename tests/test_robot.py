@@ -36,17 +36,6 @@ def frame_pose(robot, name, q):
 # --- where robots come from ----------------------------------------------------------------------------------------
 
 
-def test_bare_urdf_and_robot_yaml_give_the_same(tmp_path):
-    urdf = write_chain(tmp_path)
-    (tmp_path / "robot.yaml").write_text("name: chain\nurdf: chain.urdf\n")
-    bare, described = Robot.load(str(urdf)), Robot.load(str(tmp_path / "robot.yaml"))
-    assert bare.name == described.name == "chain" and bare.model == described.model
-    assert bare.bodies.collisionPairs.tolist() == described.bodies.collisionPairs.tolist()
-    np.testing.assert_array_equal(bare.home, described.home)
-    poses, others = (body_poses(robot, np.array([0.3, -0.4, 0.5])) for robot in (bare, described))
-    np.testing.assert_equal(poses, others)
-
-
 def test_robot_of_ones_own_in_a_scenario(tmp_path):
     folder = tmp_path / "mine"
     folder.mkdir()

@@ -27,12 +27,7 @@ MOVING, AT_REST, OBSTACLE, GROUND, TOOL_PATH = "#6BA3D6", "#C4C4C4", "#E69F00", 
 
 
 def units(log: Log, per: str = "") -> str:
-    """Return the unit of the coordinates: `rad`, `m`, or `rad or m` where a robot has both.
-
-    Args:
-        log: the run.
-        per: put behind each unit, such as `/s`.
-    """
+    """Return the unit of the coordinates, `rad`, `m`, or `rad or m` where a robot has both, `per` behind each."""
     return " or ".join(unit + per for unit in ("rad", "m") if unit in log.meta["units"])
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from qpavoid.config.shipped import family_names, suite_names
+from qpavoid.config.shipped import shipped_names
 from qpavoid.errors import ConfigError
 from qpavoid.run.report import to_json
 from qpavoid.run.terminal import ERR, OUT, names_of, progress, terminate_like_interrupt
@@ -160,13 +160,13 @@ def show(
 def list_(json: Json = False) -> None:
     """List suites, families and entrants, and what entrants lack."""
     from qpavoid.config.loading import read_config
-    from qpavoid.config.shipped import find_suite
+    from qpavoid.config.shipped import find_shipped
     from qpavoid_bench.arena.entrants import ENTRANTS
     from qpavoid_bench.arena.families import load_family
     from qpavoid_bench.arena.suite import SuiteConfig
 
-    suites = {name: read_config(find_suite(name), SuiteConfig).title for name in suite_names()}
-    families = {name: load_family(name).config.title for name in family_names()}
+    suites = {name: read_config(find_shipped("suite", name), SuiteConfig).title for name in shipped_names("suite")}
+    families = {name: load_family(name).config.title for name in shipped_names("family")}
     if json:
         entrants = {e.name: {"says": e.description, "missing": list(e.missing)} for e in ENTRANTS.values()}
         print(to_json({"suites": suites, "families": families, "entrants": entrants}))

@@ -15,7 +15,7 @@ from pydantic import Field
 from qpavoid.config import Avoidance, Limits, Progress, Sensing, SolverConfig
 from qpavoid.config.base import Block
 from qpavoid.config.loading import read_config
-from qpavoid.config.shipped import find_suite
+from qpavoid.config.shipped import find_shipped
 from qpavoid.errors import ConfigError, located
 from qpavoid_bench.arena.entrant_file import entrant_from_file
 from qpavoid_bench.arena.entrants import ENTRANTS, Entrant, find_entrant, solver_entrant
@@ -104,7 +104,7 @@ def load_suite(
     Raises:
         ConfigError, UnknownName: naming file, field and remedy.
     """
-    path = find_suite(name_or_path)
+    path = find_shipped("suite", name_or_path)
     config = read_config(path, SuiteConfig)
     families = []
     for i, family in enumerate(config.families):

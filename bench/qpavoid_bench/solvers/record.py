@@ -11,7 +11,7 @@ import pinocchio as pin
 
 from qpavoid import Controller, ScenarioConfig, load_scenario
 from qpavoid.config import QpSolver
-from qpavoid.config.shipped import scenario_names
+from qpavoid.config.shipped import shipped_names
 from qpavoid.problem import Array, Problem
 from qpavoid_bench.tick.build import build
 from qpavoid_bench.tick.loops import circling
@@ -58,7 +58,7 @@ def runs(every: int = 1) -> list[Run]:
     Args:
         every: keep the QPs of every so many control steps only; warm starts get older with it.
     """
-    shipped = [load_scenario(name) for name in scenario_names()]
+    shipped = [load_scenario(name) for name in shipped_names("scenario")]
     scenarios = {each.source.stem: each for each in shipped if each.solver.name == "qp"}
     scenarios["circling"] = circling(backup=None)
     scenarios["squeezed"] = load_scenario(str(Path(__file__).with_name("squeezed.yaml")))

@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 
 from qpavoid.config.base import Block
 from qpavoid.config.loading import read_config, read_mapping
-from qpavoid.config.shipped import find_family, find_robot, find_setup, setup_names
+from qpavoid.config.shipped import find_robot, find_shipped, shipped_names
 from qpavoid.config.text import read_text
 from qpavoid.errors import ConfigError, UnknownName, located, nearest
 from qpavoid.model.robot import Robot
@@ -121,7 +121,7 @@ def load_family(name_or_path: str | Path) -> Family:
     Raises:
         ConfigError, UnknownName: naming file, field and remedy.
     """
-    path = find_family(name_or_path)
+    path = find_shipped("family", name_or_path)
     config = read_config(path, FamilyConfig)
     layers = {"scenario": config.scenario, "robots": config.robots, "sensor": config.sensor}
     locations = {name: location for key, layer in layers.items() for name, location in _names(layer, key)}
@@ -154,14 +154,14 @@ def _names(template: Any, location: str) -> Iterator[tuple[str, str]]:
 
 def _template(entry: str | dict[str, Any], config: FamilyConfig, path: Path, location: str) -> dict[str, Any]:
     """Return fields of a scenario for a robot."""
-    if isinstance(entry, str) and entry in setup_names():
-        return {**read_mapping(find_setup(entry)), **config.scenario}
+    if isinstance(entry, str) and entry in shipped_names("setup"):
+        return {**read_mapping(find_shipped("setup", entry)), **config.scenario}
     fields = {"robot": entry} if isinstance(entry, str) else entry
     try:
         if not fields["robot"].startswith("$"):
             find_robot(fields["robot"], path.parent)
     except UnknownName as error:
-        raise UnknownName(f"{location}: {error}; or a setup: {', '.join(setup_names())}") from None
+        raise UnknownName(f"{location}: {error}; or a setup: {', '.join(shipped_names('setup'))}") from None
     except ConfigError as error:
         raise ConfigError(f"{location}: {error}") from None
     return {**config.scenario, **fields}
