@@ -204,22 +204,6 @@ def test_no_rollout_while_moving_obstacles_stay_far(tmp_path, evaluations):
     assert near - 0.015 - 0.03 < 0.1 < near - 0.015 + 0.03
 
 
-def test_external_obstacles_as_predicted_need_no_new_rollouts(tmp_path, evaluations):
-    """The prediction error bounds the error of a trajectory: none is computed for what cannot bring it into contact."""
-    counts = {}
-    for noise in (0.0, 1e-4, 0.05):
-        rng = np.random.default_rng(0)
-        controller = controller_of(tmp_path, [Obstacle.at("ball", Sphere(radius=0.1), [0.5, 0.0, 0.0])])
-        evaluations.clear()
-        q = np.zeros(2)
-        for k in range(60):
-            at = [0.3 - 0.05 * DT * k, 0.0, 0.0] + noise * rng.normal(size=3)
-            update = {"ball": Sample.at(at, linear=[-0.05, 0.0, 0.0])}
-            q = q + DT * controller.step(q, k * DT, TARGET, update).v
-        counts[noise] = len(evaluations)
-    assert 0 < counts[0.0] <= counts[1e-4] < 10 * 82 < counts[0.05]
-
-
 # --- where there is none -------------------------------------------------------------------------------------------
 
 
