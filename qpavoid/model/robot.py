@@ -25,7 +25,7 @@ from qpavoid.model.joints import (
     set_joints,
     set_limits,
 )
-from qpavoid.model.kinematics import TRANSLATIONS
+from qpavoid.model.kinematics import turning_columns
 from qpavoid.model.limits import JointBounds
 from qpavoid.model.notes import Note, NoteKind, issue_warning, merge_notes
 from qpavoid.model.packages import absolute_entries
@@ -146,10 +146,6 @@ class Robot:
                 f"{path}: no joint of {urdf.name} moves; give at least one that is neither fixed nor locked"
             )
         assume_speeds(model, notes)
-        if bodies.ngeoms > _MAX_BODIES:
-            raise ConfigError(
-                f"{path}: {bodies.ngeoms} bodies; at most {_MAX_BODIES} are read: list fewer under `bodies`"
-            )
         add_self_pairs(model, bodies, config.disabled_pairs, str(path))
         if config.srdf is not None:
             apply_srdf(model, bodies, find_resource(config.srdf, path.parent, f"{path}: srdf"))
@@ -194,11 +190,9 @@ class Robot:
     @property
     def coordinate_units(self) -> list[str]:
         """What each of the nv velocity coordinates changes per second: `m` or `rad`."""
-        units = []
-        for _, joint in self._joints():
-            metres = TRANSLATIONS.get(joint.shortname(), 0)
-            units += ["m"] * metres + ["rad"] * (joint.nv - metres)
-        return units
+        turns = turning_columns(self.model)
+        own = [turns[joint.idx_vExtended : joint.idx_vExtended + joint.nv] for _, joint in self._joints()]
+        return ["rad" if turning else "m" for turning in np.concatenate(own)]
 
     def safety_distance(self, a: str, b: str, d1: float) -> float:
         """Return the safety distance of two of its bodies [m].
@@ -290,10 +284,6 @@ class Robot:
 
 def _numbered(name: str, count: int) -> list[str]:
     return [name] if count == 1 else [f"{name}.{i}" for i in range(count)]
-
-
-_MAX_BODIES = 300
-"""Bodies of a robot, at most: the 45 000 pairs of 300 bodies take ten seconds to load. Humanoids have 112."""
 
 
 def _end_effectors(model: Any, frames_of_config: Sequence[str], path: Path, notes: list[Note]) -> tuple[str, ...]:
