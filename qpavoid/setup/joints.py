@@ -15,7 +15,7 @@ import pinocchio as pin
 
 from qpavoid.config import RobotConfig
 from qpavoid.errors import ConfigError, UnknownName, nearest
-from qpavoid.model.joints import middle_configuration
+from qpavoid.model.joints import middle_configuration, set_joints
 from qpavoid.model.kinematics import MIMIC
 from qpavoid.model.notes import Note, NoteKind
 from qpavoid.model.robot import Robot
@@ -125,16 +125,10 @@ def home_candidates(robot: Robot, semantics: Semantics) -> list[Array]:
 
 
 def _posed(model: Any, q: Array, state: Mapping[str, float]) -> Array:
-    values = {**joint_values(model, q), **{name: value for name, value in state.items() if model.existJointName(name)}}
-    q = q.copy()
-    for name, value in values.items():
-        joint = model.joints[model.getJointId(name)]
-        if joint.nq == 1:
-            low, high = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
-            q[joint.idx_q] = np.clip(round(value, 4), low, high) if low < high else round(value, 4)
-        elif joint.nq == 2:
-            q[joint.idx_q : joint.idx_q + 2] = math.cos(round(value, 4)), math.sin(round(value, 4))
-    return q
+    """Return q (nq,) with other positions of some joints, rounded and within the limits."""
+    q = set_joints(model, q, {name: round(state.get(name, x), 4) for name, x in joint_values(model, q).items()}, "home")
+    lower, upper = np.array(model.lowerPositionLimit), np.array(model.upperPositionLimit)
+    return np.where(lower < upper, np.clip(q, lower, upper), q)
 
 
 def joint_values(model: Any, q: Array) -> dict[str, float]:
