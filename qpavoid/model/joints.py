@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid.config import JointLimits
-from qpavoid.errors import ConfigError, UnknownName, nearest
+from qpavoid.errors import ConfigError, require_known
 from qpavoid.model.kinematics import MIMIC, turning_columns
 from qpavoid.model.limits import JointBounds
 from qpavoid.model.notes import Note, NoteKind
@@ -123,9 +123,7 @@ def find_joint(model: Any, name: str, where: str) -> Any:
     Raises:
         UnknownName: there is none; with the nearest one.
     """
-    if not model.existJointName(name):
-        names = model.names[1:]
-        raise UnknownName(f"{where}: no joint {name!r}{nearest(name, names)}")
+    require_known(name, list(model.names)[1:], f"{where}: no joint")
     return model.joints[model.getJointId(name)]
 
 

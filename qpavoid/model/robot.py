@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ import pinocchio as pin
 from qpavoid.config import RobotConfig
 from qpavoid.config.loading import read_mapping, validate
 from qpavoid.config.shipped import find_robot
-from qpavoid.errors import ConfigError, UnknownName, nearest
+from qpavoid.errors import ConfigError, matching, require_known
 from qpavoid.model.end_effectors import end_effectors
 from qpavoid.model.joints import (
     assume_speeds,
@@ -239,7 +238,7 @@ class Robot:
         """
         if not self.model.existFrame(name):
             frames = [f.name for f in self.model.frames if f.type in (pin.BODY, pin.OP_FRAME)]
-            raise UnknownName(f"{where}: {self.name} has no frame {name!r}{nearest(name, frames)}")
+            require_known(name, frames, f"{where}: {self.name} has no frame")
         return frame_index(self.model, name)
 
     def lock(self, patterns: Sequence[str], q: Array, where: str) -> tuple[Robot, Array]:
@@ -270,13 +269,7 @@ class Robot:
         Raises:
             UnknownName: a pattern without a joint.
         """
-        matched = []
-        for pattern in patterns:
-            matches = [name for name in self.joint_names if fnmatchcase(name, pattern)]
-            if not matches:
-                raise UnknownName(f"{where}: {self.name} has no joint {pattern!r}{nearest(pattern, self.joint_names)}")
-            matched += [name for name in matches if name not in matched]
-        return matched
+        return matching(patterns, self.joint_names, f"{where}: {self.name} has no joint")
 
     def _joints(self) -> Iterator[tuple[str, Any]]:
         return zip(self.joint_names, list(self.model.joints)[1:], strict=True)
@@ -289,9 +282,7 @@ def _numbered(name: str, count: int) -> list[str]:
 def _end_effectors(model: Any, frames_of_config: Sequence[str], path: Path, notes: list[Note]) -> tuple[str, ...]:
     """Return the listed end effectors, or those at the ends of the limbs."""
     for name in frames_of_config:
-        if not model.existFrame(name):
-            frames = [f.name for f in model.frames]
-            raise UnknownName(f"{path}: end_effectors: no frame {name!r}{nearest(name, frames)}")
+        require_known(name, [frame.name for frame in model.frames], f"{path}: end_effectors: no frame")
     ends = tuple(frames_of_config or end_effectors(model))
     if ends and not frames_of_config:
         clause = "taken as end effectors, since limbs end there"

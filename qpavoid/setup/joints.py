@@ -6,7 +6,6 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid.config import RobotConfig
-from qpavoid.errors import ConfigError, UnknownName, nearest
+from qpavoid.errors import ConfigError, matching
 from qpavoid.model.joints import middle_configuration, set_joints
 from qpavoid.model.kinematics import MIMIC
 from qpavoid.model.notes import Note, NoteKind
@@ -152,12 +151,7 @@ def joint_locks(
     read the two so, they would move on their own, which they cannot, and both are locked.
     """
     names = list(model.names)[1:]
-    locks: list[str] = []
-    for pattern in patterns:
-        matches = [name for name in names if fnmatchcase(name, pattern)]
-        if not matches:
-            raise UnknownName(f"--lock: no joint {pattern!r}{nearest(pattern, names)}")
-        locks += matches
+    locks = matching(patterns, names, "--lock: no joint")
     if wheels := [name for name in (_wheels(model) if has_base else ()) if name not in locks]:
         clause = "locked: wheels of a mobile base, whose own coordinates move it"
         notes.append(Note(NoteKind.JOINT, tuple(wheels), clause, "take them out of `lock` to drive them"))
