@@ -89,8 +89,8 @@ class LogStage:
         points = log.tool[np.unique(np.linspace(first, step, 60).astype(int))]
         return [
             Segment(begin, end, _PATH_RADIUS, _PATH_COLOUR)
-            for before, after in pairwise(points)
-            for begin, end in zip(before, after, strict=True)
+            for old, new in pairwise(points)
+            for begin, end in zip(old, new, strict=True)
             if np.linalg.norm(end - begin) > 1e-4
         ]
 
