@@ -22,11 +22,11 @@ from rich.progress import Progress, TaskID
 from qpavoid.config import RobotConfig, ScenarioConfig
 from qpavoid.config.fields import page, schema_of
 from qpavoid.config.loading import load_scenario
-from qpavoid.config.shipped import robot_names, scenario_names
+from qpavoid.config.shipped import shipped_names
 from qpavoid.controller import Controller
 from qpavoid.errors import ConfigError, QpavoidError
 from qpavoid.run.log import Log
-from qpavoid.run.report import events, failed, metrics_table, ratios_table, to_json
+from qpavoid.run.report import events, failed, metrics_table, to_json
 from qpavoid.run.simulate import simulate
 from qpavoid.run.terminal import ERR, OUT, names_of, progress, terminate_like_interrupt
 from qpavoid.setup import commands as robot_commands
@@ -79,8 +79,8 @@ def options(
 def list_(kind: Annotated[Kind | None, typer.Argument(help="Only these.")] = None) -> None:
     """List what ships: robots, scenarios with their titles, solvers."""
     names = {
-        Kind.robots: robot_names(),
-        Kind.scenarios: scenario_names(),
+        Kind.robots: shipped_names("robot"),
+        Kind.scenarios: shipped_names("scenario"),
         Kind.solvers: [*SOLVERS, "qp:native", *(f"qp:{name}" for name in backend_names())],
     }
     if kind is not None:
@@ -90,7 +90,7 @@ def list_(kind: Annotated[Kind | None, typer.Argument(help="Only these.")] = Non
     titles = [f"{name:16} {load_scenario(name).title}" for name in names[Kind.scenarios]]
     for heading, entries in names.items():
         OUT.print(f"[bold]{heading.value}[/]")
-        for line in titles if heading is Kind.scenarios else wrap("  ".join(entries), 76):
+        for line in titles if heading is Kind.scenarios else wrap("  ".join(entries), 76, break_on_hyphens=False):
             OUT.print(f"  {line}", highlight=False, soft_wrap=True, markup=False)
 
 
@@ -126,7 +126,7 @@ def compare(
     figures: Figures = True,
     verbose: Verbose = False,
 ) -> None:
-    """Run scenarios with several solvers, side by side; the last but one is set against the last, as ratios.
+    """Run scenarios with several solvers, side by side.
 
     A collision is a result here, not a failure: the exit status is 1 only when a run was broken off.
     """
@@ -140,8 +140,6 @@ def compare(
         print(to_json({"runs": metrics, "files": [str(f) for f in files]}))
     else:
         _print(metrics, files, out, verbose)
-        if len(names) > 1:
-            OUT.print(ratios_table(metrics, names[-2], names[-1]))
     raise typer.Exit(0 if all(run["completed"] for run in metrics) and len(logs) == len(configs) else 1)
 
 

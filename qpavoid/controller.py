@@ -49,7 +49,6 @@ class Controller(SceneChanges):
         dt: float = 0.01,
         avoidance: Avoidance | None = None,
         limits: Limits | None = None,
-        tracking_damping: float = 0.01,
         sensing: Sensing | None = None,
         progress: Progress | None = None,
         contacts: ContactRows | None = None,
@@ -64,7 +63,6 @@ class Controller(SceneChanges):
             dt: control period [s]: each velocity is meant to be held that long.
             avoidance: distances and rows; the defaults of a scenario if left out.
             limits: use of the joint limits; the defaults of a scenario if left out.
-            tracking_damping: λ of the damped J⁺ [-].
             sensing: assumptions about obstacles without updates; the defaults of a scenario if left out.
             progress: when a task counts as stalled; the defaults of a scenario if left out.
             contacts: frames that rest, see `build_contacts`; none if left out.
@@ -94,7 +92,7 @@ class Controller(SceneChanges):
             self._no_backup = (_NO_BACKUP_WITH_CONTACTS,)
         bounds = scene.robot.bounds().within(self.limits)
         blocks = sensing or Sensing(), progress or Progress()
-        settings = ControlSettings(scene, bounds, self.avoidance, self.limits, dt, tracking_damping, latency, *blocks)
+        settings = ControlSettings(scene, bounds, self.avoidance, self.limits, dt, latency, *blocks)
         self._builder = ProblemBuilder(settings, self.tasks, contacts)
         self._arbiter = Arbiter(settings, law, self._builder.rows, self._builder.tracker)
         self._builder.rows.look_ahead(law.bounded and self.avoidance.look_ahead)
@@ -149,7 +147,7 @@ class Controller(SceneChanges):
         with located(str(source)):
             controller = cls(
                 parts.scene, parts.tasks, parts.solver, scenario.dt, scenario.avoidance, scenario.limits,
-                scenario.tracking_damping, scenario.sensing, scenario.progress, parts.contacts, scenario.latency,
+                scenario.sensing, scenario.progress, parts.contacts, scenario.latency,
             )  # fmt: skip
         for c in scenario.obstacles:
             if c.attached_to is not None:

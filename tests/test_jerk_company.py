@@ -6,8 +6,7 @@ Always: a step that is SOLVED keeps acceleration and jerk limits, and one that d
 import numpy as np
 import pinocchio as pin
 import pytest
-from closed_loop import Ruler, cartesian, changed, drive, make_controller
-from test_joint_types import load
+from closed_loop import cartesian, changed, drive, make_controller
 from test_moving_obstacles import COURSES, SAFE, situation
 from test_point_cloud import BALL, CLOUD, wall
 
@@ -55,18 +54,13 @@ def run_checked(scenario, steps):
     return limited, least, np.array(vs), q
 
 
-def limited_situation(course, acceleration, jerk):
-    fields = {**situation(course).model_dump(mode="json"), "limits": {"acceleration": acceleration, "jerk": jerk}}
-    return run_checked(changed("situation1", **fields), 1300)
-
-
 # --- moving obstacles --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("course", "jerk"),
     [
-        pytest.param(course, 50.0 * 4.0 ** (k % 2), marks=[pytest.mark.slow] if k % 3 else [])
+        pytest.param(course, 50.0 * 4.0 ** (k % 2), marks=[] if k in (3, 6) else [pytest.mark.slow])
         for k, course in enumerate(COURSES)
     ],
 )
@@ -81,18 +75,6 @@ def test_distance_to_an_approaching_sphere_is_kept_to_2_mm(course, jerk):
     assert len(limited.relaxed) < 100
     assert all(s.status is Status.RELAXED and any("fist" in r.subject for r in s.reasons) for s in limited.relaxed)
     assert np.abs(vs).max() > 0.1
-
-
-@pytest.mark.parametrize("course", ["front 0.2", "head-on 0.4", "chase 0.3"])
-def test_distance_is_kept_under_tight_limits_with_relaxed_rows_reported(course):
-    """At 2 rad/s² and 10 rad/s³, where it takes 0.4 s until a joint brakes fully."""
-    fields = situation(course).model_dump(mode="json")
-    limited, least, _, _ = run_checked(
-        changed("situation1", **{**fields, "limits": {"acceleration": 2.0, "jerk": 10.0}}), 1300
-    )
-    assert least > SAFE - 2e-3
-    reasons = [reason for s in limited.relaxed for reason in s.reasons if "fist" in reason.subject]
-    assert any(reason.kind is ReasonKind.ROW_RELAXED for reason in reasons)
 
 
 @pytest.mark.parametrize("solver", ["qp", "hqp"])
@@ -180,53 +162,9 @@ def test_limits_hold_for_a_humanoid_over_its_contacts(solver):
     assert len(limited.relaxed) < (20 if solver == "hqp" else 1) and limited.most < 1.5
 
 
-@pytest.mark.parametrize("limits", [{"acceleration": 2.0, "jerk": 20.0}])
-def test_limits_hold_for_a_mobile_base(limits):
-    limited, least, vs, _ = run_checked(changed("tiago_column", limits=limits), 1200)
-    assert least > 0.012 - 1e-3 and np.abs(vs[:, :2]).max() > 0.05
-    assert not limited.relaxed and limited.most == pytest.approx(1.0, abs=1e-3)
-
-
-def test_limits_hold_for_a_floating_base_past_a_ball():
-    """A trunk with six coordinates of its own, whose velocities are in its own axes; the ball is on its path."""
-    robot = load("floating")
-    ball = Obstacle.at("ball", Sphere(radius=0.1), [0.5, 0.02, 0.0])
-    controller = make_controller(
-        robot, [ball], "base_link", limits=Limits(acceleration=3.0, jerk=60.0), task={"max_speed": 0.5}
-    )
-    ruler, limited, least, vs = Ruler(controller.scene), Limited(controller), np.inf, []
-    q = robot.home.copy()
-    for k in range(500):
-        s = limited.check(controller.step(q, 0.01 * k, {"base_link": Sample.at([1.0, 0.0, 0.0])}))
-        least = min(least, ruler.least_between(q, s.v, 0.01, 0.0, 2))
-        q = pin.integrate(robot.model, q, 0.01 * s.v)
-        vs.append(s.v)
-    assert 0.02 - 1e-3 < least < 0.05
-    assert np.abs(np.array(vs)[:, :3]).max() > 0.2 and not limited.relaxed
-
-
 @pytest.mark.parametrize("solver", ["qp", pytest.param("hqp", marks=pytest.mark.slow)])
 def test_limits_hold_with_an_attached_box_past_a_pole(solver):
     limits = {"acceleration": 5.0, "jerk": 100.0}
     limited, least, vs, _ = run_checked(changed("carried_box", solver=solver, limits=limits), 500)
     assert least > 0.02 - 1e-3 and np.abs(vs).max() > 0.1
     assert not limited.relaxed and limited.most == pytest.approx(1.0, abs=1e-3)
-
-
-def test_limits_hold_for_a_mimic_joint():
-    """Fingers that follow each other, one coordinate for both, closing on a ball."""
-    robot = load("mimic")
-    tool = robot.frame_id("l_gripper_r_finger_tip", "test")
-    data = robot.model.createData()
-    pin.framesForwardKinematics(robot.model, data, robot.home)
-    start = np.array(data.oMf[tool].translation)
-    ball = Obstacle.at("ball", Sphere(radius=0.06), start - [0.0, 0.15, 0.0])
-    controller = make_controller(
-        robot, [ball], "l_gripper_r_finger_tip", limits=Limits(acceleration=4.0, jerk=80.0), task={"max_speed": 0.4}
-    )
-    limited, ruler, least, q = Limited(controller), Ruler(controller.scene), np.inf, robot.home.copy()
-    for k in range(300):
-        s = limited.check(controller.step(q, 0.01 * k, {"l_gripper_r_finger_tip": Sample.at(start - [0.0, 0.3, 0.0])}))
-        q = pin.integrate(robot.model, q, 0.01 * s.v)
-        least = min(least, ruler.distances(q).min())
-    assert 0.02 - 1e-3 < least < 0.05 and not limited.relaxed

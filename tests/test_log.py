@@ -1,6 +1,5 @@
 """Records of runs: what is written, read back, cut short and run again."""
 
-import json
 from dataclasses import fields
 
 import numpy as np
@@ -24,20 +23,6 @@ def assert_equal(a: Log, b: Log) -> None:
     for name in ARRAYS:
         assert np.array_equal(getattr(a, name), getattr(b, name)), name
         assert getattr(a, name).dtype == getattr(b, name).dtype, name
-
-
-def test_arrays_have_the_documented_shapes(log):
-    n, tasks, bodies, obstacles = 21, 1, len(log.meta["bodies"]), 2
-    assert np.allclose(log.t, 0.01 * np.arange(n))
-    assert log.q.shape == (n, 7)
-    assert log.v.shape == (n, 7)
-    assert log.target.shape == log.tool.shape == (n, tasks, 3)
-    assert log.tool_rotation.shape == (n, tasks, 3, 3)
-    assert log.body_distance.shape == (n, bodies)
-    assert log.body_ends.shape == (n, bodies, 2, 3)
-    assert log.obstacle_position.shape == (n, obstacles, 3)
-    assert log.obstacle_rotation.shape == (n, obstacles, 3, 3)
-    assert all(len(getattr(log, name)) == n for name in ARRAYS)
 
 
 def test_log_steps_integrate_velocities(log):
@@ -120,21 +105,6 @@ def test_interrupt_keeps_what_was_done(log, tmp_path):
     assert "keyboard" in partial.meta["stopped_by"]
 
 
-def test_interrupt_before_the_first_tick_is_over(monkeypatch, tmp_path):
-    tick, calls = Controller.tick, []
-
-    def interrupted(self, *args):
-        calls.append(args)
-        if len(calls) == 3:  # the first two warm up and check the start
-            raise KeyboardInterrupt
-        return tick(self, *args)
-
-    monkeypatch.setattr(Controller, "tick", interrupted)
-    log = simulate(load_scenario("situation1", SHORT))
-    assert len(log.t) == 0
-    assert Log.load(log.save(tmp_path / "none")).metrics()["completed"] is False
-
-
 def said(log: Log) -> list[tuple]:
     """Kind, subject and severity of all reasons in its events."""
     reasons = [reason for *_, reasons in log.meta["events"] for reason in reasons]
@@ -172,24 +142,3 @@ def test_log_that_was_cut_off_while_copied(log, tmp_path, kept):
     path.write_bytes(content[: int(kept * len(content))])
     with pytest.raises(ConfigError, match=r"run\.npz"):
         Log.load(path)
-
-
-@pytest.mark.parametrize(
-    "write",
-    [
-        lambda path: path.write_text("not a log"),
-        lambda path: path.write_bytes(b""),
-        lambda path: np.savez(path, a=np.zeros(3)),
-        lambda path: np.savez(path, meta=np.array(json.dumps({"format": 0}))),
-        lambda path: np.savez(path, meta=np.array("[1, 2]")),
-        lambda path: np.savez(path, meta=np.array("{")),
-        lambda path: None,
-    ],
-    ids=["text", "nothing", "other archive", "other format", "list as meta", "broken meta", "missing"],
-)
-def test_file_that_is_no_log_is_refused_in_one_line(tmp_path, write):
-    path = tmp_path / "run.npz"
-    write(path)
-    with pytest.raises(ConfigError) as error:
-        Log.load(path)
-    assert str(error.value).startswith(f"{path}: ") and "\n" not in str(error.value)

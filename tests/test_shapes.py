@@ -1,12 +1,10 @@
 """Shapes of obstacles against support functions and closed forms: apart, in penetration, at ties; files of meshes."""
 
-import coal
 import numpy as np
 import pinocchio as pin
 import pytest
 from closed_loop import cartesian, drive, make_controller
-from conftest import BOX, CAPSULE, SPHERE, Bench, differences, look, moved, obstacle, random_q, write_chain
-from hypothesis import given, strategies
+from conftest import BOX, SPHERE, Bench, differences, look, moved, obstacle, random_q, write_chain
 from oracle import signed_distance, support
 
 from qpavoid import (
@@ -24,7 +22,6 @@ from qpavoid import (
     load_scenario,
 )
 from qpavoid.config import Cone, Ellipsoid, HalfSpace, Mesh
-from qpavoid.geometry.bodies import enclosing_capsule, make_shape
 from qpavoid.geometry.meshes import MeshWarning
 from qpavoid.model.kinematics import ForwardKinematics
 from qpavoid.run.simulate import simulate
@@ -123,40 +120,6 @@ def test_half_spaces_have_a_closed_form(tmp_path, body):
             np.testing.assert_allclose(found.J[0], up, atol=1e-12)
 
 
-def test_half_spaces_and_convex_hulls(panda_convex):
-    rng = np.random.default_rng(5)
-    scene = build_scene(panda_convex, [obstacle("floor", FLOOR, (0, 0, 0.2))])
-    mine = np.flatnonzero(scene.pairs[:, 1] == len(scene.body_names))
-    for _ in range(5):
-        q = random_q(panda_convex, rng)
-        found, places = look(scene, q), placed(scene, q)
-        for pair in mine.tolist():
-            a = int(scene.pairs[pair, 0])
-            lowest = -support(scene.geometry.geometryObjects[a].geometry, places[a])(np.array([[0, 0, -1.0]]))[0]
-            assert found.distance[pair] == pytest.approx(lowest - 0.2, abs=1e-9)
-
-
-@given(strategies.floats(-0.9, 0.9), strategies.floats(0.0, np.pi / 2))
-def test_a_capsule_flat_on_a_plane_is_a_tie_without_a_wrong_side(panda, height, tilt):
-    """Level, every point along the axis is nearest: any may be returned, and distance and normal are the same."""
-    capsule, floor = coal.Capsule(0.05, 0.3), coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0)
-    rotation = pin.rpy.rpyToMatrix(tilt, 0.0, 0.0)
-    result = coal.DistanceResult()
-    there = coal.Transform3s(rotation, np.array([0.0, 0.0, height]))
-    d = coal.distance(capsule, there, floor, coal.Transform3s(), coal.DistanceRequest(), result)
-    assert d == pytest.approx(height - 0.05 - 0.15 * np.cos(tilt), abs=1e-12)
-    np.testing.assert_allclose(result.normal, [0, 0, -1], atol=1e-12)
-
-
-def test_spheres_deep_inside_cylinders(tmp_path):
-    """coal's own formula is wrong there by centimetres."""
-    robot = tool(tmp_path, BODIES["sphere"])
-    scene = build_scene(robot, [obstacle("can", CYLINDER, (0, 0, 0))])
-    for x, z in ((0.01, 0.0), (0.03, 0.02), (0.0, 0.11), (0.06, 0.1)):
-        depth = min(0.07 - x, 0.125 - z) + 0.06
-        assert look(scene, np.array([x, 0.0, z])).distance[0] == pytest.approx(-depth, abs=1e-4)
-
-
 @pytest.mark.parametrize("body", ["sphere", "capsule", "box"])
 def test_large_boxes_are_as_good_as_half_spaces(tmp_path, body):
     rng, robot = np.random.default_rng(6), cartesian(tmp_path, shape=BODIES[body], reach=20.0)
@@ -182,17 +145,6 @@ def test_rows_by_finite_differences(panda, shape, tolerance):
         np.testing.assert_allclose(found.J[smooth], expected[smooth], atol=tolerance)
 
 
-@pytest.mark.parametrize("shape", [CONE, ELLIPSOID])
-def test_enclosing_capsules_enclose(shape):
-    geometry = make_shape(shape)
-    fit = enclosing_capsule(geometry)
-    rng = np.random.default_rng(0)
-    n = rng.normal(size=(2000, 3))
-    n /= np.linalg.norm(n, axis=1, keepdims=True)
-    capsule = support(coal.Capsule(fit.radius, fit.length), pin.SE3(fit.rotation, fit.center))(n)
-    assert (capsule >= support(geometry, pin.SE3.Identity())(n) - 1e-9).all()
-
-
 # --- bounding spheres without end ---------------------------------------------------------------------------------
 
 
@@ -213,13 +165,13 @@ def test_half_spaces_are_near_wherever_they_are(panda):
     assert "floor" in {scene.pair_names[pair][1] for pair in found.pair}
 
 
-@pytest.mark.parametrize("shape", [SPHERE, CAPSULE, BOX, CYLINDER, CONE, ELLIPSOID, FLOOR])
+@pytest.mark.parametrize("shape", [SPHERE, BOX, CONE, FLOOR])
 def test_what_passes_close_by_is_known_not_to_come_nearer(panda, shape):
     """Along the normals the bound is close enough to tell, where the fastest points of the bodies would not be."""
     rng = np.random.default_rng(20)
     scene = build_scene(panda, [obstacle("it", shape, (9.0, 0.0, 0.0))])
     bench, warned, close = Bench(scene), 0, 0
-    for _ in range(3000):
+    for _ in range(1500):
         q, v = random_q(panda, rng), rng.uniform(-0.5, 0.5, 7)
         sample = Sample.at(
             rng.uniform([-0.5, -0.5, 0.0], [0.5, 0.5, 0.9]), pin.exp3(rng.uniform(-2, 2, 3)),
@@ -237,31 +189,6 @@ def test_what_passes_close_by_is_known_not_to_come_nearer(panda, shape):
             found = look(scene, pin.integrate(panda.model, q, t * v), {0: moved(sample, t)}, 0.1)
             assert found.distance.min(initial=0.1) - Avoidance().d1 >= least - 1e-9
     assert close > 10 and warned > 0.1 * close
-
-
-@pytest.mark.parametrize("turning", [0.0, 0.8])
-def test_the_closest_call_holds_for_half_spaces_that_move_and_turn(panda, turning):
-    rng = np.random.default_rng(9)
-    scene = build_scene(panda, [obstacle("wall", FLOOR, (0, 0, -0.3))])
-    bench, hold = Bench(scene), Avoidance().d1
-    for _ in range(20):
-        q, v = random_q(panda, rng), rng.uniform(-1, 1, 7)
-        bench.compute(q, reach=0.3)
-        sample = Sample.at(
-            [0, 0, -0.3], pin.rpy.rpyToMatrix(*rng.uniform(-0.4, 0.4, 3)), rng.uniform(-0.3, 0.3, 3),
-            turning * rng.uniform(-1, 1, 3),
-        )  # fmt: skip
-        bench.place({0: sample})
-        assert np.isfinite(bench.query.arrays.speeds).all()
-        near = len(bench.compute(q, reach=0.3)[0].pair)
-        for horizon in (0.01, 0.1, 0.3):
-            least = bench.assembler.clearance_lower_bound(v, near, horizon)
-            later = sample._replace(
-                position=sample.position + horizon * sample.linear,
-                rotation=pin.exp3(horizon * sample.angular) @ sample.rotation,
-            )
-            found = look(scene, pin.integrate(panda.model, q, horizon * v), {0: later})
-            assert np.isfinite(least) and found.distance.min() - hold >= least - 1e-9
 
 
 @pytest.mark.parametrize("angular", [None, [0.0, 0.3, 0.0]])

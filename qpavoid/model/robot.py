@@ -180,12 +180,14 @@ class Robot:
         return list(self.model.names)[1:]
 
     @property
+    def position_names(self) -> list[str]:
+        """Name of each of the nq coordinates of q: the joint's, numbered where it has several."""
+        return [name for joint, x in self._joints() for name in _numbered(joint, x.nq)]
+
+    @property
     def coordinate_names(self) -> list[str]:
         """Name of each of the nv velocity coordinates: the joint's, numbered where it has several."""
-        names = []
-        for name, joint in self._joints():
-            names += [name] if joint.nv == 1 else [f"{name}.{i}" for i in range(joint.nv)]
-        return names
+        return [name for joint, x in self._joints() for name in _numbered(joint, x.nv)]
 
     @property
     def coordinate_units(self) -> list[str]:
@@ -282,6 +284,10 @@ class Robot:
 
     def _joints(self) -> Iterator[tuple[str, Any]]:
         return zip(self.joint_names, list(self.model.joints)[1:], strict=True)
+
+
+def _numbered(name: str, count: int) -> list[str]:
+    return [name] if count == 1 else [f"{name}.{i}" for i in range(count)]
 
 
 _MAX_BODIES = 300

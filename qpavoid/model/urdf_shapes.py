@@ -50,15 +50,10 @@ class ShapeReader:
     """Loads a mesh, given its file and scale, into a coal geometry."""
 
     def read(self, root: ET.Element, tag: str, skipped: Collection[int] = ()) -> Any:
-        """Read the shapes into a geometry model.
+        """Read the `collision` or `visual` shapes into a geometry model, but for links whose frames are to be skipped.
 
         A shape is called by its link and its index in it, as in `hand_0`; where one element has several, further ones
         have a second index.
-
-        Args:
-            root: of the file.
-            tag: `collision` or `visual`.
-            skipped: frames of the links whose shapes are not read.
 
         Raises:
             ConfigError: a shape that cannot be read, or whose mesh is missing, naming link and element.

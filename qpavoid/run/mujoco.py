@@ -14,6 +14,7 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid.errors import ConfigError
+from qpavoid.model.joints import hinge_or_slide
 from qpavoid.model.sample import Sample
 from qpavoid.model.scene import Scene
 from qpavoid.problem import Array, IntArray
@@ -86,13 +87,12 @@ def place_mocap(data: Any, index: int, sample: Sample) -> None:
     mujoco.mju_mat2Quat(data.mocap_quat[index], np.ascontiguousarray(sample.rotation).ravel())
 
 
-def build(scene: Scene, q0: Array, frames: Sequence[int] = (), has_servos: bool = False) -> MujocoModel:
+def build(scene: Scene, q0: Array, has_servos: bool = False) -> MujocoModel:
     """Build the MuJoCo model of a scene: one body a joint, one mocap body an obstacle.
 
     Args:
         scene: what is written.
         q0: where the robot starts (nq,).
-        frames: of the robot's model, by their indices; these become sites `frame 0`, `frame 1` and so on.
         has_servos: whether bodies have the masses of the robot's model, and each joint a motor, without any gain yet.
 
     Raises:
@@ -121,9 +121,6 @@ def build(scene: Scene, q0: Array, frames: Sequence[int] = (), has_servos: bool 
             motor = spec.add_actuator(name=robot.names[i], target=robot.names[i], trntype=mujoco.mjtTrn.mjTRN_JOINT)
             motor.biastype = mujoco.mjtBias.mjBIAS_AFFINE
         bodies.append(body)
-    for i, frame in enumerate(robot.frames[index] for index in frames):
-        place = frame.placement
-        bodies[frame.parentJoint].add_site(name=f"frame {i}", pos=place.translation, quat=_quaternion(place.rotation))
     first = len(scene.body_names)
     obstacles = [spec.worldbody.add_body(name=f"obstacle {i}", mocap=True) for i in range(len(scene.slots))]
     for i, geometry in enumerate(scene.geometry.geometryObjects):
@@ -147,21 +144,6 @@ def build(scene: Scene, q0: Array, frames: Sequence[int] = (), has_servos: bool 
         place_mocap(mujoco_model.data, i, obstacle.motion.sample(0.0))
     mujoco_model.place(mujoco_model.q0, 0.0)
     return mujoco_model
-
-
-def hinge_or_slide(model: Any, index: int) -> tuple[bool, Array]:
-    """Return True for a slide, False for a hinge, and the joint's axis (3,) in its own frame.
-
-    Raises:
-        ValueError: it is neither a hinge nor a slide.
-    """
-    joint = model.joints[index]
-    if joint.nq != 1 or joint.nv != 1:
-        raise ValueError(f"joint {model.names[index]!r}: {joint.shortname()} is neither a hinge nor a slide")
-    data = model.createData()
-    pin.computeJointJacobians(model, data, pin.neutral(model))
-    screw = np.asarray(data.joints[index].S).ravel()
-    return (True, screw[:3]) if np.any(screw[:3]) else (False, screw[3:])
 
 
 def _inertia(inertia: Any) -> dict[str, Any]:

@@ -166,11 +166,11 @@ class Stage:
             mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), colour)
             mujoco.mjv_connector(geom, kind, segment.radius, segment.begin, segment.end)
             scene.ngeom += 1
-        picture: npt.NDArray[np.uint8] = np.empty((height, width, 3), np.uint8)
+        picture = np.empty((height, width, 3), np.uint8)
         rectangle = mujoco.MjrRect(0, 0, width, height)
         mujoco.mjr_render(rectangle, scene, self._context)
         mujoco.mjr_readPixels(picture, None, rectangle, self._context)
-        return picture[::-1].copy()
+        return np.flipud(picture)
 
     def close(self) -> None:
         """Free the renderer."""

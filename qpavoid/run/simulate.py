@@ -19,8 +19,7 @@ from qpavoid.control.tasks import in_order
 from qpavoid.control.tick import Tick
 from qpavoid.controller import Controller
 from qpavoid.errors import ConfigError, NumericalError
-from qpavoid.geometry.bodies import enclosing_capsule
-from qpavoid.geometry.meshes import surface_triangles
+from qpavoid.geometry.bodies import enclosing_capsule, surface_triangles
 from qpavoid.model.kinematics import ForwardKinematics
 from qpavoid.model.scene import PARKING_DISTANCE, Obstacle, Scene
 from qpavoid.problem import Array, Solution, Status
@@ -246,6 +245,7 @@ class Recorder:
             "events": self._events,
             "robot": robot.name,
             "notes": [str(note) for note in robot.notes],
+            "positions": robot.position_names,
             "coordinates": robot.coordinate_names,
             "units": robot.coordinate_units,
             "velocity_limit": [v if np.isfinite(v) else None for v in bounds.velocity],

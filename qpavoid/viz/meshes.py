@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from qpavoid.errors import ConfigError
-from qpavoid.geometry.meshes import surface_triangles
+from qpavoid.geometry.bodies import surface_triangles
 from qpavoid.model.visuals import GREY, Visual
 from qpavoid.problem import Array
 from qpavoid.viz.surfaces import local_faces, shape_faces
