@@ -8,7 +8,7 @@ import numpy as np
 
 from qpavoid.config import ScenarioConfig
 from qpavoid.config.loading import validate
-from qpavoid.config.shipped import find_scenario
+from qpavoid.config.shipped import find_shipped
 from qpavoid.control.obstacle_states import ObstacleStates
 from qpavoid.controller import Controller
 from qpavoid.errors import QpavoidError
@@ -95,6 +95,6 @@ def scenario_of(log: Log) -> ScenarioConfig:
     name = Path(str(log.meta.get("source") or "scenario.yaml"))
     config = validate(log.meta["config"], ScenarioConfig, name)
     try:
-        return config.with_source(name if name.is_file() else find_scenario(str(log.meta["scenario"])))
+        return config.with_source(name if name.is_file() else find_shipped("scenario", str(log.meta["scenario"])))
     except QpavoidError:
         return config.with_source(name)
