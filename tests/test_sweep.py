@@ -246,8 +246,7 @@ def test_suites_that_ship():
     large = [load_suite(name) for name in ("full", "teleoperation")]
     proved = {name for name in shipped_names("family") if load_family(name).config.proved}
     assert {family.name for suite in large for family in suite.families} == proved
-    entrants = {entrant.name for suite in large for entrant in suite.entrants + suite.absent}
-    assert entrants == set(ENTRANTS) - {"step-search"}  # which no suite has yet
+    assert {entrant.name for suite in large for entrant in suite.entrants + suite.absent} == set(ENTRANTS)
 
 
 def test_suite_selects_entrants(folder, monkeypatch):
