@@ -90,13 +90,13 @@ def test_adapter_frames_and_distances_equal_scene(library, name):
     pilot.step(q, t, targets_at(world, 0.0), moved)
     data = model.createData()
     pin.framesForwardKinematics(model, data, q)
-    frames, seen = pilot.seen(q)
+    frames, reported = pilot.observe(q)
     assert frames == pytest.approx(np.array([data.oMf[task.frame_id].homogeneous for task in world.tasks]), abs=1e-6)
-    truth, told = true_distances(world, q, moved), ~np.isnan(seen)
-    assert told.all() or library in NO_HULLS  # these do not tell of all pairs, or of none
-    apart = told & (truth > 0.0)  # relative: cylinders and hulls are iterated on, to such a tolerance
-    assert apart.sum() >= 0.9 * told.sum()
-    assert seen[apart] == pytest.approx(truth[apart], rel=4e-6, abs=3e-5 if library == "drake" else 2e-6)
+    truth, known = true_distances(world, q, moved), ~np.isnan(reported)
+    assert known.all() or library in NO_HULLS  # these do not tell of all pairs, or of none
+    apart = known & (truth > 0.0)  # relative: cylinders and hulls are iterated on, to such a tolerance
+    assert apart.sum() >= 0.9 * known.sum()
+    assert reported[apart] == pytest.approx(truth[apart], rel=4e-6, abs=3e-5 if library == "drake" else 2e-6)
 
 
 @pytest.mark.parametrize("kind", ["position", "pose"])

@@ -84,9 +84,9 @@ class LibraryPilot:
         self.seconds = prepared + solved
         return Solution(np.asarray(v))
 
-    def seen(self, q: Array) -> tuple[Array, Array]:
+    def observe(self, q: Array) -> tuple[Array, Array]:
         """Return the frames (f, 4, 4) and distances of `pairs` (k,) by the library, obstacles where they were last."""
-        frames, distances = self.process.ask("seen", q)
+        frames, distances = self.process.ask("observe", q)
         return np.asarray(frames), np.asarray(distances)
 
 

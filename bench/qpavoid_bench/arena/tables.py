@@ -102,18 +102,18 @@ def better_than(results: Results, name: str) -> list[str]:
     columns = [c for c in (*COLUMNS, *MORE) if c.name in _COMPARED and not results.runs[c.name].isna().all()]
     for column in columns:
         sign = -1.0 if column.name in _HIGHER_IS_BETTER else 1.0
-        ahead = []
+        better = []
         for family in results.families:
             values = _summaries(results, column, family)
             best = int(np.argmin(sign * values))
             if sign * (values[own] - values[best]) > 10.0**-column.digits:
                 best_text, own_text = (_shown(value, column.digits) for value in (values[best], values[own]))
-                ahead.append(f"{family}: {results.entrants[best]} {best_text}, {own_text} here")
+                better.append(f"{family}: {results.entrants[best]} {best_text}, {own_text} here")
         values = _summaries(results, column, None)
         order = np.argsort(sign * values, kind="stable")
         first = ", ".join(f"{escape(results.entrants[i])} {_shown(values[i], column.digits)}" for i in order[:3])
         rows.append(
-            (escape(column.heading), first, _shown(values[own], column.digits), escape("; ".join(ahead) or "-"))
+            (escape(column.heading), first, _shown(values[own], column.digits), escape("; ".join(better) or "-"))
         )
     return markdown_table(
         ("figure", "best three over all", name, f"families in which others are ahead of {name}"), rows

@@ -179,8 +179,8 @@ class _Check:
         workload, distances, box = self.workload, self.distances, self.workload.boxes
         cell.velocities = answer["velocities"]
         cell.frame_error = float(np.abs(answer["frames"] - self.frames).max())
-        seen = np.where(np.isnan(answer["distances"]), distances, answer["distances"])  # it does not tell
-        error = np.abs(seen - distances)
+        reported = np.where(np.isnan(answer["distances"]), distances, answer["distances"])  # it does not tell
+        error = np.abs(reported - distances)
         # far pairs do not count: iterative algorithms stop early on them
         relevant = distances < 2.0 * workload.influence
         cell.distance_error = float(np.max(error[:, ~box], initial=0.0))
@@ -191,7 +191,7 @@ class _Check:
         if not (cell.distance_error <= DISTANCE_TOLERANCE and cell.box_error <= BOX_TOLERANCE):
             raise LibraryError(f"its distances differ by {max(cell.distance_error, cell.box_error):.1e} m")
         undecided = np.abs(distances - workload.influence) < BOX_TOLERANCE
-        different = ((seen < workload.influence) != (distances < workload.influence)) & ~undecided
+        different = ((reported < workload.influence) != (distances < workload.influence)) & ~undecided
         if different.any():
             raise LibraryError(f"{int(different.sum())} pairs are in range for one and not for the other")
         if not np.isfinite(answer["velocities"]).all():

@@ -50,8 +50,8 @@ def make_case(family: Family, seed: int) -> Case:
             random = np.random.default_rng([seed, number])
             how = "it starts below d1, and is to get out" if not config.starts_clear else ""
             if config.starts_clear:
-                wanted = config.reachable if config.proved and not config.static else None
-                how = solved_by(scenario, world, wanted, random) or _STAY * config.static
+                provable = config.reachable if config.proved and not config.static else None
+                how = solved_by(scenario, world, provable, random) or _STAY * config.static
         except Redraw as reason:
             causes.append(str(reason))
             continue

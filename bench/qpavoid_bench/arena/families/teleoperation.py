@@ -36,9 +36,9 @@ def jumps(draw: Draw, robot: Robot) -> dict[str, Any]:
     arm = arms(robot)[0]
     places = [arm.home, *(_near_home(draw, robot, arm) for _ in range(draw("count")))]
     times, points, t = [0.0], [places[0]], 0.505
-    for before, after in pairwise(places):
+    for previous, following in pairwise(places):
         times += [t, t + _INSTANT]
-        points += [before, after]
+        points += [previous, following]
         t += draw("hold")
     return _scenario(robot, arm, robot.home, points, times)
 
@@ -74,17 +74,17 @@ def behind(draw: Draw, robot: Robot) -> dict[str, Any]:
     """End behind a plate that stands across the straight way: the target is in reach, the way to it leads round."""
     arm = arms(robot)[0]
     goal = _near_home(draw, robot, arm)
-    way = goal - arm.home
-    if np.linalg.norm(way) < 0.25 * arm.length:
+    chord = goal - arm.home
+    if np.linalg.norm(chord) < 0.25 * arm.length:
         raise Redraw("the goal is too near")
-    yaw, half = float(np.arctan2(way[1], way[0])), draw("size")
-    center = arm.home + draw("share") * way
+    yaw, half = float(np.arctan2(chord[1], chord[0])), draw("size")
+    center = arm.home + draw("share") * chord
     plate = {
         "name": "plate",
         "shape": {"type": "box", "size": [0.02, 2.0 * half, 2.0 * half]},
         "motion": {"type": "fixed", "position": center, "rpy": [0.0, 0.0, yaw]},
     }
-    t = float(np.linalg.norm(way)) / draw("speed")
+    t = float(np.linalg.norm(chord)) / draw("speed")
     return _scenario(robot, arm, robot.home, [arm.home, goal], [0.5, 0.5 + t], [plate])
 
 
@@ -109,7 +109,7 @@ def bad_start(draw: Draw, robot: Robot) -> dict[str, Any]:
     link = robot.model.frames[robot.frame_id(arm.tool, "tool")].parentJoint
     bodies = placed_bodies(robot, robot.home)
     own, others = ([(s, p) for joint, s, p in bodies if (joint == link) == mine] for mine in (True, False))
-    direction, wanted = np.array(draw("aside")), draw("d1") - draw("depth")
+    direction, required = np.array(draw("aside")), draw("d1") - draw("depth")
 
     def clearance(distance: float, solids: Any) -> float:
         place = coal.Transform3s(np.eye(3), arm.home + distance * direction)
@@ -118,9 +118,9 @@ def bad_start(draw: Draw, robot: Robot) -> dict[str, Any]:
     low, high = 0.0, 0.5
     for _ in range(40):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if clearance(middle, own) < wanted else (low, middle)
+        low, high = (middle, high) if clearance(middle, own) < required else (low, middle)
     center = arm.home + high * direction
-    if abs(clearance(high, own) - wanted) > 1e-3 or clearance(high, others) < draw("d1"):
+    if abs(clearance(high, own) - required) > 1e-3 or clearance(high, others) < draw("d1"):
         raise Redraw("the ball is not where it is to be")
     if np.linalg.norm(goal - center) < radius + 0.15:
         raise Redraw("the target is too near to the ball")

@@ -64,7 +64,7 @@ class Adapter:
 def urdf_with_bodies(setup: SimpleNamespace, bodies: Any) -> str:
     """Return the URDF with some bodies, each a link of its own: `body 3` is the link `body_3` with geometry `body_3_0`.
 
-    Capsules are cylinders that Pinocchio is told to take for capsules.
+    Capsules are cylinders that Pinocchio is made to take for capsules.
 
     Raises:
         ValueError: a shape that URDF does not know.

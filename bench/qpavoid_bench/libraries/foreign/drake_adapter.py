@@ -97,10 +97,10 @@ class Library(Adapter):
 
     def _filter_pairs(self) -> None:
         """Take out all pairs of robot bodies, and of these with obstacles, that the setup has not."""
-        wanted = {frozenset(pair) for pair in self.setup.pairs.tolist()}
+        required = {frozenset(pair) for pair in self.setup.pairs.tolist()}
         for b in range(len(self._bodies)):
             for a in range(min(b, self.setup.robot_bodies)):
-                skip = frozenset((a, b)) not in wanted
+                skip = frozenset((a, b)) not in required
                 if self.checker.IsCollisionFilteredBetween(self._bodies[a], self._bodies[b]) != skip:
                     self.checker.SetCollisionFilteredBetween(self._bodies[a], self._bodies[b], skip)
 
@@ -139,5 +139,5 @@ class Library(Adapter):
         clearance = self.checker.CalcRobotClearance(q, 100.0)
         numbers = {index: number for number, index in enumerate(self._bodies)}
         pairs = zip(clearance.robot_indices(), clearance.other_indices(), clearance.distances(), strict=True)
-        found = {frozenset((numbers.get(a), numbers.get(b))): distance for a, b, distance in pairs}
-        return np.array([found.get(frozenset(pair), np.nan) for pair in self.setup.pairs.tolist()])
+        by_pair = {frozenset((numbers.get(a), numbers.get(b))): distance for a, b, distance in pairs}
+        return np.array([by_pair.get(frozenset(pair), np.nan) for pair in self.setup.pairs.tolist()])

@@ -81,9 +81,9 @@ class Library(Adapter):
         """Return its distances, of the pairs that it has."""
         self.robot.update_configuration(q)
         names, distances = self.robot.get_collision_pair_names(), self.robot.compute_collision_distances()
-        found = {frozenset(pair): distance for pair, distance in zip(names, distances, strict=True)}
+        by_pair = {frozenset(pair): distance for pair, distance in zip(names, distances, strict=True)}
         pairs = (frozenset((f"body_{a}_0", f"body_{b}_0")) for a, b in self.setup.pairs.tolist())
-        return np.array([found.get(pair, np.nan) for pair in pairs])
+        return np.array([by_pair.get(pair, np.nan) for pair in pairs])
 
 
 def _load(urdf: str, floating: bool) -> Any:

@@ -76,5 +76,5 @@ class Library(Adapter):
     def distances(self, q: Any) -> Any:
         """Return its distances, matched by its pairs of bodies."""
         self._place(q)
-        found = {(near.objA, near.objB): near.min_distance for near in self.robot.distances()}
-        return np.array([found[a, b] for a, b in self.setup.pairs.tolist()])
+        by_pair = {(near.objA, near.objB): near.min_distance for near in self.robot.distances()}
+        return np.array([by_pair[a, b] for a, b in self.setup.pairs.tolist()])

@@ -64,10 +64,10 @@ class Library(Adapter):
 
     def _select_pairs(self) -> None:
         """Allow contact of all pairs but those of the setup."""
-        wanted = {tuple(pair) for pair in self.setup.pairs.tolist()}
+        required = {tuple(pair) for pair in self.setup.pairs.tolist()}
         every = [(a, b) for b in range(len(self.setup.bodies)) for a in range(min(b, self.setup.robot_bodies))]
         for enable in (False, True):
-            chosen = [pair for pair in every if (pair in wanted) == enable]
+            chosen = [pair for pair in every if (pair in required) == enable]
             self.scene.setCollisions([(f"body_{a}", f"body_{b}") for a, b in chosen], enable)
 
     def targets(self, poses: Any) -> Any:

@@ -47,7 +47,7 @@ class Worker:
             library.move(moved)
         return library.velocity(library.step(library.configuration(q), library.targets(poses)))
 
-    def seen(self, q: Any) -> Any:
+    def observe(self, q: Any) -> Any:
         """Return frames (f, 4, 4) and distances (m,) at a configuration."""
         q = self.library.configuration(q)
         return self.library.frames(q), self.library.distances(q)
