@@ -29,7 +29,7 @@ def random_problem(seed, n=3, pairs=2, asked=0.0):
     )  # fmt: skip
     names = [("link", f"ball{i}") for i in range(pairs)]
     lower, upper = -rng.uniform(0.0, 0.6, n), rng.uniform(0.0, 0.6, n)
-    return make_problem(Tracking(A, A @ v, 0.01), rows, lower, upper, names)
+    return make_problem(Tracking(A, A @ v, A @ v), rows, lower, upper, names)
 
 
 def candidates(problem):

@@ -3,6 +3,7 @@
 import numpy as np
 import pinocchio as pin
 import pytest
+from closed_loop import planar
 from conftest import EXAMPLES, differences, frames, random_q
 
 from qpavoid import Avoidance, Controller, Limits, Obstacle, Robot, Sample, build_scene, build_tasks, config
@@ -189,24 +190,6 @@ def test_posture_rows_are_solved_together_with_the_tool(panda):
 
 
 # --- rest beyond reach --------------------------------------------------------------------------------------------
-
-
-def planar(folder):
-    """Three links of 0.4, 0.4 and 0.3 m in a plane."""
-    parts = ['<link name="l0"/>']
-    for i, x in enumerate((0.0, 0.4, 0.4)):
-        parts.append(
-            f'<link name="l{i + 1}"/><joint name="j{i + 1}" type="revolute"><parent link="l{i}"/>'
-            f'<child link="l{i + 1}"/><origin xyz="{x} 0 0"/><axis xyz="0 0 1"/>'
-            '<limit lower="-6" upper="6" velocity="2" effort="1"/></joint>'
-        )
-    parts.append(
-        '<link name="tip"/><joint name="end" type="fixed"><parent link="l3"/><child link="tip"/>'
-        '<origin xyz="0.3 0 0"/></joint>'
-    )
-    path = folder / "planar.urdf"
-    path.write_text(f'<robot name="planar">{"".join(parts)}</robot>')
-    return Robot.from_urdf(path, bodies=[], home={"j1": 0.3, "j2": 0.5, "j3": 0.4})
 
 
 def mimicking(folder):

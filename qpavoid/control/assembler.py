@@ -61,7 +61,7 @@ class RowAssembler:
         """How far each of the tasks that are not frames was from its target in the last step, in its unit."""
         self.frame_errors, self.row_scale, self.row_tasks = x.errors, x.scale, x.row_tasks
         """What frames lack to their targets; root of the weight and number of the task of each row: see `RowLayout`."""
-        self.frame_tasks, self.frame_count, self.tasks = tuple(frames), len(frames), (*frames, *row_tasks)
+        self.frame_count, self.tasks = len(frames), (*frames, *row_tasks)
         """Tasks in the order of `in_order`; the first `frame_count` are frames."""
         self._eye = np.eye(len(x.v_tracking))
         self._is_compiled = self._forward.is_compiled and self.query.is_compiled and not row_tasks and contacts is None

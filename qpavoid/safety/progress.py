@@ -43,12 +43,11 @@ _EXPLAINED = 0.9
 """Share of the task's pull that the named pairs and limits have to balance [-]."""
 
 
-class _Part(NamedTuple):
-    """Rows of a task with one error."""
+class _Goal(NamedTuple):
+    """A task that has somewhere to go, and its rows."""
 
     task: int
     rows: IntArray
-    unit: str
 
 
 class ProgressMonitor:
@@ -58,17 +57,15 @@ class ProgressMonitor:
         self._rows = rows
         self._interval = max(1, round(settings.progress.stalled_after / (_CHECKS * settings.dt)))
         self._limit = settings.progress.stalled_after / settings.dt - 0.5
-        self._parts = _parts(rows)
-        count = len(rows.frame_errors) // 3
-        self._others = np.array(
-            [part.task - rows.frame_count for part in self._parts[count:]], dtype=np.intp
-        )  # among the row tasks
+        self._goals = _goals(rows)
+        others = [goal.task - rows.frame_count for goal in self._goals[rows.frame_count :]]
+        self._others = np.array(others, dtype=np.intp)  # among the tasks that are no frames
         self.reset()
 
     def reset(self) -> None:
         """Drop all counts."""
         self._step, self._stalled = 0, tuple[Reason, ...]()
-        self._history, self._since = deque[Array](maxlen=_CHECKS + 1), np.zeros(len(self._parts))
+        self._history, self._since = deque[Array](maxlen=_CHECKS + 1), np.zeros(len(self._goals))
 
     def update(self, problem: Problem, solution: Solution) -> tuple[Reason, ...]:
         """Return what keeps the tasks from their targets, after long enough without progress.
@@ -90,9 +87,10 @@ class ProgressMonitor:
         return self._stalled
 
     def _stuck(self, problem: Problem, solution: Solution) -> list[int]:
-        """Return the numbers of the parts that have made no progress for long enough."""
-        frames = self._rows.frame_errors.reshape(-1, 3)
-        e = np.concatenate((np.sqrt((frames * frames).sum(axis=1)), self._rows.task_errors[self._others]))
+        """Return the numbers of the tasks that have made no progress for long enough."""
+        x, count = self._rows, len(self._rows.frame_errors)
+        squares = np.bincount(x.row_tasks[:count], x.frame_errors * x.frame_errors, x.frame_count)
+        e: Array = np.concatenate((np.sqrt(squares), x.task_errors[self._others]))
         if not self._history:
             self._since[:] = self._step
         else:
@@ -103,14 +101,14 @@ class ProgressMonitor:
         A, b = problem.tracking.A, problem.tracking.b_feasible
         stuck = []
         for i in np.flatnonzero(is_stuck).tolist():
-            rows = self._parts[i].rows
+            rows = self._goals[i].rows
             asked, achieved = b[rows], A[rows] @ solution.v
             if float(achieved @ asked) < _MIN_PROGRESS * float(asked @ asked):
                 stuck.append(i)
         return stuck
 
     def _reasons(self, problem: Problem, v: Array, stuck: Sequence[int]) -> tuple[Reason, ...]:
-        """Return why the parts are stuck: at rest by themselves, or by what balances them."""
+        """Return why the tasks are stuck: at rest by themselves, or by what balances them."""
         rows, tracking = self._of_priority(problem, stuck), problem.tracking
         A, b = tracking.A[rows], tracking.b_feasible[rows]
         pull, earlier = A.T @ (b - A @ v), np.setdiff1d(np.arange(len(tracking.b)), rows)
@@ -123,11 +121,11 @@ class ProgressMonitor:
         return walls.holding(pull) or _nearest(problem)
 
     def _of_priority(self, problem: Problem, stuck: Sequence[int]) -> IntArray:
-        """Return the rows down to the first priority of which a part is stuck; all without priorities."""
+        """Return the rows down to the first priority of which a task is stuck; all without priorities."""
         everything = np.arange(len(problem.tracking.b))
         if problem.cascade is None:
             return everything
-        first = self._parts[stuck[0]].rows
+        first = self._goals[stuck[0]].rows
         return next((level for level in problem.levels if np.isin(first, level).any()), everything)
 
     def _at_rest(self, problem: Problem, stuck: Sequence[int]) -> list[Reason]:
@@ -140,24 +138,34 @@ class ProgressMonitor:
         size = float(np.linalg.norm(w))
         saddle = size > 0.0 and np.linalg.eigvalsh(A.T @ A - x.curvature(w))[0] < -_SADDLE * size
         kind = ReasonKind.SINGULAR if saddle else ReasonKind.OUT_OF_REACH
-        named: dict[int, Reason] = {}
+        reasons = []
         for i in stuck:
-            part = self._parts[i]
-            label = x.tasks[part.task].settings.label
-            named.setdefault(part.task, Reason.of(kind, label, amount=float(self._history[-1][i]), unit=part.unit))
-        return list(named.values())
+            label, amount, unit = self._missing(i)
+            reasons.append(Reason.of(kind, label, amount=amount, unit=unit))
+        return reasons
+
+    def _missing(self, i: int) -> tuple[str, float, str]:
+        """Return the name of a task and what it lacks: its position, or its orientation where that is there."""
+        x, goal = self._rows, self._goals[i]
+        task = x.tasks[goal.task]
+        amount, unit = float(self._history[-1][i]), task.unit
+        if goal.task < x.frame_count:
+            parts = [float(np.linalg.norm(part)) for part in x.frame_errors[goal.rows].reshape(-1, 3)]
+            if task.moves and (len(parts) == 1 or parts[0] >= _TOLERANCE):
+                amount = parts[0]
+            else:
+                amount, unit = parts[-1], "rad"
+        return task.settings.label, amount, unit
 
 
-def _parts(rows: RowAssembler) -> list[_Part]:
-    """Return positions, orientations, then the other tasks that have somewhere to go."""
-    parts, half = [], sum(task.moves for task in rows.frame_tasks)
-    for part in range(len(rows.frame_errors) // 3):
-        index = np.arange(3 * part, 3 * part + 3)
-        parts.append(_Part(int(rows.row_tasks[3 * part]), index, "m" if part < half else "rad"))
-    for number, task in enumerate(rows.tasks[rows.frame_count :], start=rows.frame_count):
-        if task.bends and not isinstance(task, Manipulability):
-            parts.append(_Part(number, np.flatnonzero(rows.row_tasks == number), task.unit))
-    return parts
+def _goals(rows: RowAssembler) -> list[_Goal]:
+    """Return the frames, then the other tasks that have somewhere to go."""
+    numbers = [
+        number
+        for number, task in enumerate(rows.tasks)
+        if number < rows.frame_count or (task.bends and not isinstance(task, Manipulability))
+    ]
+    return [_Goal(number, np.flatnonzero(rows.row_tasks == number)) for number in numbers]
 
 
 class _Walls:
