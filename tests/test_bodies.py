@@ -2,17 +2,20 @@
 
 import coal
 import numpy as np
+import pinocchio as pin
 import pytest
-from conftest import EXAMPLES, write_chain
+from conftest import BOX, CYLINDER, EXAMPLES, write_chain
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from oracle import DIRECTIONS, support
 from scipy.optimize import minimize
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from qpavoid import Robot
-from qpavoid.geometry.bodies import convert_bodies, enclosing_capsule
+from qpavoid.config import Cone, Ellipsoid
+from qpavoid.geometry.bodies import convert_bodies, enclosing_capsule, make_shape
 from qpavoid.geometry.capsules import fit_capsule
 from qpavoid.model.urdf import read_model, read_pieces
 from qpavoid.run.metrics import point_segment_distance
@@ -99,6 +102,15 @@ def test_points_on_a_capsule_give_it_back(radius, length):
 
 
 # --- whole shapes ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", [BOX, CYLINDER, Cone(radius=0.09, length=0.25), Ellipsoid(radii=(0.1, 0.16, 0.07))])
+def test_shapes_are_enclosed(shape):
+    """In every direction the capsule reaches as far as the shape."""
+    geometry = make_shape(shape)
+    fit = enclosing_capsule(geometry)
+    capsule = support(coal.Capsule(fit.radius, fit.length), pin.SE3(fit.rotation, fit.center))
+    assert (capsule(DIRECTIONS) >= support(geometry, pin.SE3.Identity())(DIRECTIONS) - 1e-9).all()
 
 
 @pytest.mark.parametrize(("radius", "length"), [(0.03, 0.2), (0.1, 0.1)])

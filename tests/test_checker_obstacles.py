@@ -108,23 +108,3 @@ def _with_body(robot: Robot, name, shape, inside):
         pin.GeometryObject(name, frame.parentJoint, 0, frame.placement * inside, make_shape(shape))
     )
     return replace(robot, bodies=bodies)
-
-
-def test_decomposed_mesh_equals_its_boards(panda, tmp_path):
-    """The checker has five boxes."""
-    tool = tool_at(panda).translation
-    place = tool + np.array([0.28, 0.0, -0.35])
-    turn = pin.rpy.rpyToMatrix(0, 0, np.pi / 2)
-    mesh = Mesh(path=str(write_stl(tmp_path / "shelf.stl", boards(*SHELF))))
-    controller = make_controller(
-        panda, [Obstacle.at("shelf", mesh, place, turn)], TCP, avoidance=Avoidance(d1=HOLD, d2=0.1)
-    )
-    pieces = [
-        Obstacle.at(f"b{i}", Box(size=size), place + turn @ np.array(c), turn) for i, (c, size) in enumerate(SHELF)
-    ]
-    checked = build(build_scene(panda, pieces), panda.home)
-    of_boards = checked.scene.pairs[:, 1] >= checked.bodies
-    least = smallest_distances(
-        controller, checked, 120, lambda t: tool + np.array([min(0.3 * t, 0.2), 0.0, 0.2 * np.sin(3.0 * t)])
-    )
-    assert HOLD - 1e-3 < least[of_boards].min() < 0.05

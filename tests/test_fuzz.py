@@ -156,7 +156,7 @@ def laughs(depth: int = 8) -> str:
         (YAML, "a: &a [*a]", "more than 50000 values"),
         (YAML, "a: " + "[" * 100_000, "nested too deep"),
         (YAML, "a: " + "x" * 2_000_000, "2000003 bytes; at most 1000000 are read"),
-        (YAML, "".join(f"k{i}: 1\n" for i in range(20_000)), r"k0: unknown key.*; and \d+ more$"),
+        (YAML, "".join(f"k{i}: 1\n" for i in range(2_000)), r"k0: unknown key.*; and \d+ more$"),
         (YAML, "a: 0x" + "f" * 100_000, "a number of 100002 characters"),
         (YAML, "a: !!timestamp x", "does not fit its !!tag"),
         (YAML, "a: !!python/object:os.system x", "not valid YAML"),
@@ -177,6 +177,7 @@ def laughs(depth: int = 8) -> str:
         ((*YAML, *XML, "path.csv"), bytes(range(256)), "cannot be read: .*give a UTF-8 text file"),
         ((*YAML, *XML, "path.csv"), "a\0b", "holds NUL characters; give a text file"),
         (("run.npz",), bytes(range(256)), "not a qpavoid log: .*; give one written by `qpavoid run`"),
+        (("run.npz",), b"", "not a qpavoid log"),
     ],
 )
 def test_file_is_refused(names, content, expected, tmp_path):

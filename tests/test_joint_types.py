@@ -4,7 +4,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import yaml
-from conftest import EXAMPLES, SPHERE, Bench, differences, look, obstacle, random_q
+from conftest import EXAMPLES, SPHERE, differences, look, obstacle, random_q
 
 from qpavoid import ConfigError, Controller, Log, Robot, Sample, build_scene, build_tasks, config, load_scenario
 from qpavoid.model.kinematics import chains, max_lever_arm
@@ -76,22 +76,6 @@ def test_bounds_of_looking_ahead_hold(named):
         assert np.linalg.norm(velocities[:, 3:], axis=1).max() <= max(turning @ np.abs(v)) + 1e-9
         reach = max(turning @ np.abs(v)) * lever_arm + max(sliding @ np.abs(v))
         assert np.linalg.norm(velocities[:, :3], axis=1).max() <= reach + 1e-9
-
-
-def test_speeds_of_all_joints(named):
-    """Those that Pinocchio's forward kinematics gives, whatever the joints are."""
-    _, robot = named
-    model, rng, bench = robot.model, np.random.default_rng(3), Bench(build_scene(robot, []))
-    data = model.createData()
-    for _ in range(20):
-        q, v = random_q(robot, rng), rng.normal(size=model.nv)
-        bench.compute(q)
-        bench.assembler.clearance_lower_bound(v, 0, 0.01)
-        pin.forwardKinematics(model, data, q, v)
-        velocities = np.array([motion.vector for motion in data.v])
-        expected = np.linalg.norm(velocities[:, :3], axis=1)
-        expected += np.linalg.norm(velocities[:, 3:], axis=1) * bench.query.table.joint_radius
-        np.testing.assert_allclose(bench.query.arrays.speeds[: model.njoints], expected, atol=1e-12)
 
 
 def test_a_run_from_file_to_log(named, tmp_path):

@@ -1,11 +1,10 @@
 """Shapes of obstacles against support functions and closed forms: apart, in penetration, at ties; files of meshes."""
 
-import coal
 import numpy as np
 import pinocchio as pin
 import pytest
 from closed_loop import cartesian, drive, make_controller
-from conftest import BOX, CAPSULE, SPHERE, Bench, differences, look, moved, obstacle, random_q, write_chain
+from conftest import BOX, SPHERE, Bench, differences, look, moved, obstacle, random_q, write_chain
 from oracle import signed_distance, support
 
 from qpavoid import (
@@ -23,7 +22,6 @@ from qpavoid import (
     load_scenario,
 )
 from qpavoid.config import Cone, Ellipsoid, HalfSpace, Mesh
-from qpavoid.geometry.bodies import enclosing_capsule, make_shape
 from qpavoid.geometry.meshes import MeshWarning
 from qpavoid.model.kinematics import ForwardKinematics
 from qpavoid.run.simulate import simulate
@@ -122,13 +120,16 @@ def test_half_spaces_have_a_closed_form(tmp_path, body):
             np.testing.assert_allclose(found.J[0], up, atol=1e-12)
 
 
-def test_spheres_deep_inside_cylinders(tmp_path):
-    """coal's own formula is wrong there by centimetres."""
-    robot = tool(tmp_path, BODIES["sphere"])
-    scene = build_scene(robot, [obstacle("can", CYLINDER, (0, 0, 0))])
-    for x, z in ((0.01, 0.0), (0.03, 0.02), (0.0, 0.11), (0.06, 0.1)):
-        depth = min(0.07 - x, 0.125 - z) + 0.06
-        assert look(scene, np.array([x, 0.0, z])).distance[0] == pytest.approx(-depth, abs=1e-4)
+@pytest.mark.parametrize("body", ["sphere", "capsule", "box"])
+def test_large_boxes_are_as_good_as_half_spaces(tmp_path, body):
+    rng, robot = np.random.default_rng(6), cartesian(tmp_path, shape=BODIES[body], reach=20.0)
+    hall = build_scene(robot, [obstacle("hall", config.Box(size=(60.0, 60.0, 2.0)), (0, 0, -1))])
+    plane = build_scene(robot, [obstacle("hall", FLOOR, (0, 0, 0))])
+    for _ in range(20):
+        q = np.array([*rng.uniform(-20, 20, 2), rng.uniform(-0.2, 0.5)])
+        found, expected = look(hall, q), look(plane, q)
+        assert found.distance[0] == pytest.approx(expected.distance[0], abs=1e-9)
+        np.testing.assert_allclose(found.normal, expected.normal, atol=1e-9)
 
 
 @pytest.mark.parametrize(("shape", "tolerance"), [(CONE, 1e-4), (ELLIPSOID, 1e-4), (FLOOR, 1e-6)])
@@ -142,17 +143,6 @@ def test_rows_by_finite_differences(panda, shape, tolerance):
         expected = differences(lambda q: look(scene, q).distance, panda, q, step=1e-5)
         smooth = mine & (np.abs(found.distance) > 1e-3)
         np.testing.assert_allclose(found.J[smooth], expected[smooth], atol=tolerance)
-
-
-@pytest.mark.parametrize("shape", [CONE, ELLIPSOID])
-def test_enclosing_capsules_enclose(shape):
-    geometry = make_shape(shape)
-    fit = enclosing_capsule(geometry)
-    rng = np.random.default_rng(0)
-    n = rng.normal(size=(2000, 3))
-    n /= np.linalg.norm(n, axis=1, keepdims=True)
-    capsule = support(coal.Capsule(fit.radius, fit.length), pin.SE3(fit.rotation, fit.center))(n)
-    assert (capsule >= support(geometry, pin.SE3.Identity())(n) - 1e-9).all()
 
 
 # --- bounding spheres without end ---------------------------------------------------------------------------------
@@ -175,13 +165,13 @@ def test_half_spaces_are_near_wherever_they_are(panda):
     assert "floor" in {scene.pair_names[pair][1] for pair in found.pair}
 
 
-@pytest.mark.parametrize("shape", [SPHERE, CAPSULE, BOX, CYLINDER, CONE, ELLIPSOID, FLOOR])
+@pytest.mark.parametrize("shape", [SPHERE, BOX, CONE, FLOOR])
 def test_what_passes_close_by_is_known_not_to_come_nearer(panda, shape):
     """Along the normals the bound is close enough to tell, where the fastest points of the bodies would not be."""
     rng = np.random.default_rng(20)
     scene = build_scene(panda, [obstacle("it", shape, (9.0, 0.0, 0.0))])
     bench, warned, close = Bench(scene), 0, 0
-    for _ in range(3000):
+    for _ in range(1500):
         q, v = random_q(panda, rng), rng.uniform(-0.5, 0.5, 7)
         sample = Sample.at(
             rng.uniform([-0.5, -0.5, 0.0], [0.5, 0.5, 0.9]), pin.exp3(rng.uniform(-2, 2, 3)),
@@ -199,31 +189,6 @@ def test_what_passes_close_by_is_known_not_to_come_nearer(panda, shape):
             found = look(scene, pin.integrate(panda.model, q, t * v), {0: moved(sample, t)}, 0.1)
             assert found.distance.min(initial=0.1) - Avoidance().d1 >= least - 1e-9
     assert close > 10 and warned > 0.1 * close
-
-
-@pytest.mark.parametrize("turning", [0.0, 0.8])
-def test_the_closest_call_holds_for_half_spaces_that_move_and_turn(panda, turning):
-    rng = np.random.default_rng(9)
-    scene = build_scene(panda, [obstacle("wall", FLOOR, (0, 0, -0.3))])
-    bench, hold = Bench(scene), Avoidance().d1
-    for _ in range(20):
-        q, v = random_q(panda, rng), rng.uniform(-1, 1, 7)
-        bench.compute(q, reach=0.3)
-        sample = Sample.at(
-            [0, 0, -0.3], pin.rpy.rpyToMatrix(*rng.uniform(-0.4, 0.4, 3)), rng.uniform(-0.3, 0.3, 3),
-            turning * rng.uniform(-1, 1, 3),
-        )  # fmt: skip
-        bench.place({0: sample})
-        assert np.isfinite(bench.query.arrays.speeds).all()
-        near = len(bench.compute(q, reach=0.3)[0].pair)
-        for horizon in (0.01, 0.1, 0.3):
-            least = bench.assembler.clearance_lower_bound(v, near, horizon)
-            later = sample._replace(
-                position=sample.position + horizon * sample.linear,
-                rotation=pin.exp3(horizon * sample.angular) @ sample.rotation,
-            )
-            found = look(scene, pin.integrate(panda.model, q, horizon * v), {0: later})
-            assert np.isfinite(least) and found.distance.min() - hold >= least - 1e-9
 
 
 @pytest.mark.parametrize("angular", [None, [0.0, 0.3, 0.0]])
