@@ -12,6 +12,7 @@ from oracle import DIRECTIONS, support
 from scipy.optimize import minimize
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
+from urdfs import TETRAHEDRON, write_stl
 
 from qpavoid import Robot
 from qpavoid.config import Cone, Ellipsoid
@@ -21,7 +22,6 @@ from qpavoid.model.urdf import read_model, read_pieces
 from qpavoid.run.metrics import point_segment_distance
 
 PANDA = EXAMPLES / "panda_description/urdf/panda.urdf"
-STL_FACET = "facet normal 0 0 1\nouter loop\nvertex {}\nvertex {}\nvertex {}\nendloop\nendfacet\n"
 
 
 @pytest.fixture(scope="module")
@@ -167,9 +167,7 @@ def test_hulls_and_capsules_sit_around_the_meshes_in_the_link_frame(meshes):
 @pytest.mark.filterwarnings("ignore::qpavoid.model.notes.RobotWarning")
 def test_scaled_mesh_of_a_urdf_keeps_its_size(tmp_path):
     """A tetrahedron in mm with a scale of 0.001."""
-    o, x, y, z = "0 0 0", "100 0 0", "0 100 0", "0 0 100"
-    facets = "".join(STL_FACET.format(*f) for f in ((o, y, x), (o, x, z), (o, z, y), (x, y, z)))
-    (tmp_path / "part.stl").write_text(f"solid a\n{facets}endsolid a\n")
+    write_stl(tmp_path / "part.stl", 1000.0 * TETRAHEDRON)
     urdf = write_chain(tmp_path, shape='<mesh filename="part.stl" scale="0.001 0.001 0.001"/>')
     for kind in ("convex", "mesh"):
         geometry = Robot.from_urdf(urdf, bodies=kind).bodies.geometryObjects[0].geometry
@@ -181,9 +179,8 @@ def test_scaled_mesh_of_a_urdf_keeps_its_size(tmp_path):
 
 def test_flat_mesh_does_not_take_the_process_down(tmp_path):
     """A plate without thickness has no hull of its own, and qhull ends the process over it."""
-    o, x, y, z = "0 0 0", "1 0 0", "0 1 0", "1 1 0"
-    facets = "".join(STL_FACET.format(*f) for f in ((o, x, y), (x, z, y)))
-    (tmp_path / "plate.stl").write_text(f"solid a\n{facets}endsolid a\n")
+    square = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
+    write_stl(tmp_path / "plate.stl", square[[[0, 1, 2], [1, 3, 2]]])
     urdf = write_chain(tmp_path, shape='<mesh filename="plate.stl"/>')
     hull, capsule = (Robot.from_urdf(urdf, bodies=kind).bodies.geometryObjects[0] for kind in ("convex", "capsule"))
     assert ConvexHull(hull.geometry.points()).volume == pytest.approx(1e-4, rel=1e-6)  # 0.1 mm thick

@@ -7,7 +7,8 @@ import pinocchio as pin
 import pytest
 from closed_loop import drive, make_controller
 from conftest import random_q
-from test_shapes import SHELF, boards, write_stl
+from test_shapes import SHELF, boards
+from urdfs import write_stl
 
 from qpavoid import Avoidance, Obstacle, Points, Robot, Status, Voxels, build_scene
 from qpavoid.config import Box, Capsule, Ellipsoid, HalfSpace, Mesh, PointCloud, Sphere

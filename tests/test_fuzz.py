@@ -15,7 +15,7 @@ import pytest
 from conftest import write_chain
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from urdfs import arm
+from urdfs import TETRAHEDRON, arm
 
 from qpavoid import ConfigError, Controller, Log, Robot, Sample, load_scenario
 from qpavoid.config import Csv, RobotConfig
@@ -243,22 +243,20 @@ def stl(*triangles, count=None) -> bytes:
     return bytes(80) + struct.pack("<I", len(triangles) if count is None else count) + body
 
 
-CORNERS = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
-FACES = [CORNERS[[0, 2, 1]], CORNERS[[0, 1, 3]], CORNERS[[0, 3, 2]], CORNERS[[1, 2, 3]]]
 NOT_A_NUMBER, READER = "a corner is NaN, infinite or beyond 1e.09 m", "; export it again"
 MESHES = {
-    "good.stl": (stl(*FACES), None),
-    "one.stl": (stl(FACES[0]), None),
+    "good.stl": (stl(*TETRAHEDRON), None),
+    "one.stl": (stl(TETRAHEDRON[0]), None),
     "line.stl": (stl([[0, 0, 0], [0, 0, 1], [0, 0, 2]]), None),
     "quads.obj": (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3 4\n", None),
     "point.stl": (stl(*[np.ones((3, 3))] * 4), READER),
-    "nan.stl": (stl(np.diag([np.nan, 1, 1]), *FACES), NOT_A_NUMBER),
-    "huge.stl": (stl(np.diag([3e38, 3e38, 3e38]), *FACES), NOT_A_NUMBER),
+    "nan.stl": (stl(np.diag([np.nan, 1, 1]), *TETRAHEDRON), NOT_A_NUMBER),
+    "huge.stl": (stl(np.diag([3e38, 3e38, 3e38]), *TETRAHEDRON), NOT_A_NUMBER),
     "all_nan.stl": (stl(np.full((3, 3), np.nan)), "has no triangle|a corner is NaN"),
     "empty.stl": (b"", READER),
     "garbage.stl": (bytes(range(256)) * 20, READER),
-    "count.stl": (stl(*FACES, count=2**32 - 1), READER),
-    "cut.stl": (stl(*FACES)[:-30], READER),
+    "count.stl": (stl(*TETRAHEDRON, count=2**32 - 1), READER),
+    "cut.stl": (stl(*TETRAHEDRON)[:-30], READER),
     "index.obj": (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 99999999\n", READER),
     "deep.dae": (b"<COLLADA>" + b"<node>" * 20_000, READER),
     "x.unknown": (b"zz", READER),

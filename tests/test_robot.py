@@ -4,20 +4,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from conftest import EXAMPLES, random_q, write_chain
+from urdfs import write_stl
 
 from qpavoid import ConfigError, Controller, Robot, UnknownName, load_scenario
-
-STL = "solid a\n{}endsolid a\n".format(
-    "".join(
-        f"facet normal 0 0 0\nouter loop\nvertex {a}\nvertex {b}\nvertex {c}\nendloop\nendfacet\n"
-        for a, b, c in (
-            ("0 0 0", "0 .1 0", ".1 0 0"),
-            ("0 0 0", ".1 0 0", "0 0 .1"),
-            ("0 0 0", "0 0 .1", "0 .1 0"),
-            (".1 0 0", "0 .1 0", "0 0 .1"),
-        )
-    )
-)
 
 
 def body_poses(robot, q):
@@ -62,7 +51,7 @@ def test_mesh_is_found_in_package_dirs_and_along_ros_package_path(tmp_path, monk
     folder, mesh = tmp_path / "robot", tmp_path / "packages" / "parts" / "meshes" / "a.stl"
     mesh.parent.mkdir(parents=True)
     folder.mkdir()
-    mesh.write_text(STL)
+    write_stl(mesh)
     urdf = write_chain(folder, shape='<mesh filename="package://parts/meshes/a.stl"/>')
     with pytest.raises(ConfigError):
         Robot.from_urdf(urdf)

@@ -6,6 +6,7 @@ import pytest
 from closed_loop import cartesian, drive, make_controller
 from conftest import BOX, SPHERE, Bench, differences, look, moved, obstacle, random_q, write_chain
 from oracle import signed_distance, support
+from urdfs import write_stl
 
 from qpavoid import (
     Avoidance,
@@ -38,17 +39,6 @@ BODIES = {
 }  # fmt: skip
 CURVED = 1.5e-4
 """coal iterates to curved surfaces; its default tolerance on them is 1e-6 of the squared distance."""
-
-
-def write_stl(path, triangles):
-    facets = "".join(
-        "facet normal 0 0 0\nouter loop\n"
-        + "".join(f"vertex {x:.9g} {y:.9g} {z:.9g}\n" for x, y, z in t)
-        + "endloop\nendfacet\n"
-        for t in triangles
-    )
-    path.write_text(f"solid a\n{facets}endsolid a\n")
-    return path
 
 
 def boards(*boxes):
@@ -118,18 +108,6 @@ def test_half_spaces_have_a_closed_form(tmp_path, body):
             assert found.distance[0] == pytest.approx(lowest - up @ at, abs=1e-9)
             np.testing.assert_allclose(found.normal[0], -up, atol=1e-12)
             np.testing.assert_allclose(found.J[0], up, atol=1e-12)
-
-
-@pytest.mark.parametrize("body", ["sphere", "capsule", "box"])
-def test_large_boxes_are_as_good_as_half_spaces(tmp_path, body):
-    rng, robot = np.random.default_rng(6), cartesian(tmp_path, shape=BODIES[body], reach=20.0)
-    hall = build_scene(robot, [obstacle("hall", config.Box(size=(60.0, 60.0, 2.0)), (0, 0, -1))])
-    plane = build_scene(robot, [obstacle("hall", FLOOR, (0, 0, 0))])
-    for _ in range(20):
-        q = np.array([*rng.uniform(-20, 20, 2), rng.uniform(-0.2, 0.5)])
-        found, expected = look(hall, q), look(plane, q)
-        assert found.distance[0] == pytest.approx(expected.distance[0], abs=1e-9)
-        np.testing.assert_allclose(found.normal, expected.normal, atol=1e-9)
 
 
 @pytest.mark.parametrize(("shape", "tolerance"), [(CONE, 1e-4), (ELLIPSOID, 1e-4), (FLOOR, 1e-6)])
