@@ -55,16 +55,6 @@ def moving(draw):
 many = settings(max_examples=400, deadline=None)
 
 
-def test_way_to_stop_agrees_with_examples_by_hand():
-    """From 3 with no change yet: 3, 2, then by 1.5 to 0.5, from which 0.5 leads to 0. From 1 with 2: 1, 2, 2, 1, 0."""
-    assert stop_speeds(3.0, 0.0, 10.0) == pytest.approx([3.0, 2.0, 0.5, 0.0])
-    assert stopping_distance(3.0, 0.0, 10.0)[0] == pytest.approx(5.5)
-    assert stop_speeds(1.0, 2.0, 10.0) == pytest.approx([1.0, 2.0, 2.0, 1.0, 0.0])
-    assert stopping_distance(1.0, 2.0, 10.0)[0] == pytest.approx(6.0)
-    assert stopping_distance(10.0, 0.0, 0.5)[0] == pytest.approx(sum(np.arange(10.0, 0.0, -0.5)))
-    assert stopping_distance(-5.0, 1.0, 4.0) == (0.0, 0.0)
-
-
 @many
 @given(moving())
 def test_way_to_stop_agrees_with_the_stop_step_by_step(state):
