@@ -251,7 +251,7 @@ def test_report_is_well_formed_markdown_with_pictures(written):
             assert lines[i - 1] == "" and lines[i + 1].count("---") == count - 1
             expected = count
         assert line.endswith(" |") and count == expected
-    assert tables == 2 + 2 + 1 + 2 * 2 + 1 + 1  # who, how; overall; beside; two families; worst; failures
+    assert tables == 2 + 2 + 1 + 2 * 2 + 1 + 1 + 1  # who, how; overall; beside; two families; worst; failures; others
 
 
 def test_the_command_writes_the_same_report_again(cli, written):
