@@ -93,6 +93,14 @@ def test_voxels_drop_points_that_are_no_numbers():
             Voxels.of(bad, 0.02)
 
 
+def test_voxels_of_a_coal_octree():
+    points = scattered(np.random.default_rng(4), 300)
+    tree = coal.makeOctree(points, 0.04)
+    voxels, finer = Voxels.of_octree(tree), Voxels.of_octree(tree, 0.02)
+    np.testing.assert_array_equal(voxels.keys, Voxels.of(points, 0.04).keys)
+    assert len(finer.centers) == 8 * len(voxels.centers)
+
+
 # --- nearest voxels by brute force -------------------------------------------------------------------------------
 
 

@@ -74,7 +74,7 @@ def test_without_a_pair_in_range_it_tracks(seed):
 
 def test_nan_stays_nan():
     problem = random_problem(0)
-    unknown = problem._replace(tracking=problem.tracking._replace(b=np.full(2, np.nan)))
+    unknown = problem._replace(tracking=problem.tracking._replace(b=np.full(2, np.nan), b_feasible=np.full(2, np.nan)))
     assert np.isnan(LAW.solve(unknown).v).all()
 
 

@@ -96,6 +96,20 @@ class Voxels:
             resolution, centers, keys, blocks, np.append(starts, len(keys)), len(array) - len(finite), len(array)
         )
 
+    @classmethod
+    def of_octree(cls, tree: Any, resolution: float | None = None) -> Voxels:
+        """Make voxels of the occupied leaves of a coal octree (`coal.OcTree`), large ones cut up.
+
+        The edge of a voxel is the cloud's resolution [m], the tree's own if left out.
+        """
+        edge = tree.getResolution() if resolution is None else resolution
+        points = [np.zeros((0, 3))]
+        for x, y, z, size, occupancy, threshold in map(np.asarray, tree.toBoxes()):
+            steps = (np.arange(max(round(size / edge), 1)) + 0.5) * edge - 0.5 * size if size > edge else np.zeros(1)
+            if occupancy >= threshold:
+                points.append(np.array([x, y, z]) + np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3))
+        return cls.of(np.concatenate(points), edge)
+
 
 def voxel_radius(resolution: float) -> float:
     """Return the radius of a voxel's circumscribed sphere [m]."""

@@ -37,11 +37,11 @@ def remove_enclosed(pieces: Any, notes: list[Note]) -> Any:
             outer = next((piece for piece in outers if _encloses(piece, inner)), None)
             if outer is not None:
                 enclosing[inner.name] = outer.name
-        kept = [piece for piece in members if piece.name not in enclosing]
-        if len({isinstance(piece.geometry, coal.BVHModelBase) for piece in kept}) > 1:
+        counted = [piece for piece in members if piece.name not in enclosing]
+        if len({isinstance(piece.geometry, coal.BVHModelBase) for piece in counted}) > 1:
             clause = "meshes and simple shapes of one link, none inside another: all count"
             remedy = "list `bodies` where one set is meant to replace the other"
-            notes.append(Note(NoteKind.SHAPE, tuple(piece.name for piece in kept), clause, remedy))
+            notes.append(Note(NoteKind.SHAPE, tuple(piece.name for piece in counted), clause, remedy))
     result = pin.GeometryModel()
     for piece in pieces.geometryObjects:
         if piece.name in enclosing:

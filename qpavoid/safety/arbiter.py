@@ -32,14 +32,7 @@ class Arbiter:
     def __init__(
         self, settings: ControlSettings, solver: Solver, rows: RowAssembler, obstacles: ObstacleTracker
     ) -> None:
-        """Build the checks, each with memory of its own.
-
-        Args:
-            settings: of the controller.
-            solver: the control law.
-            rows: of the problems.
-            obstacles: states of the obstacles.
-        """
+        """Build the checks, each with memory of its own."""
         self._settings, self.solver, self._rows = settings, solver, rows
         self._v_shape = (settings.scene.robot.model.nv,)
         self._braking = BrakingCheck(settings, rows, obstacles)

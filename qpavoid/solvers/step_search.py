@@ -27,7 +27,7 @@ class StepSearch(NamedSolver):
     joints; of 14 joints, two. Collision-free are those that keep every avoidance row, d_i to first order with the
     obstacles' own motion. Of these, the step is taken that minimises
 
-        ‖A v - ẋ‖² + μ ‖v‖²,
+        ‖A v - ẋ‖² + μ ‖v‖²,  ẋ scaled to what the speeds of the joints allow,
 
     and without any, the one that violates the rows least. With nothing in the way that is J⁺ẋ, or what the grid has of
     less motion.
@@ -39,7 +39,7 @@ class StepSearch(NamedSolver):
     def solve(self, problem: Problem) -> Solution:
         """Return the best candidate; see `Solver.solve`."""
         rows, primary, config = problem.avoidance, problem.v_tracking, self.config
-        A, b = problem.tracking.A, problem.tracking.b
+        A, b = problem.tracking.A, problem.tracking.b_feasible
         grid = neighbourhood(len(primary), config.candidates)
         steps = np.concatenate([primary[None], *[length * config.speed * grid for length in LENGTHS]])
         v = np.minimum(np.maximum(steps, problem.lower), problem.upper)

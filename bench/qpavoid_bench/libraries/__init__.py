@@ -30,6 +30,9 @@ class Library:
     environment: str = ""
     """Name of its environment, and of its adapter; its own name if empty."""
 
+    distance_tolerance: float = 1e-6
+    """How far its distances of spheres and capsules may be off, which most libraries compute in closed form [m]."""
+
     @property
     def module(self) -> str:
         """Return the module of its adapter."""
@@ -105,7 +108,8 @@ LIBRARIES = {
             "Drake's DifferentialInverseKinematicsSystem, with its collision constraint",
             ("drake==1.51.1",),
             "LeastSquaresCost (weight 100), JointCenteringCost; CollisionConstraint (safety distance d1, influence "
-            "distance d2); JointVelocityLimitConstraint; K_VX 1",
+            "distance d2); JointVelocityLimitConstraint; K_VX 1; its distances are iterated on, to 0.1 mm",
+            distance_tolerance=1e-4,
         ),
     )
 }

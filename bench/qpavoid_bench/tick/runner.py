@@ -141,7 +141,7 @@ def _measure(
             process.ask("record", *((workload.q, workload.targets) if workload else ((), ())))
             if check:
                 gain = library.closing_gain if isinstance(library, Ours) else None
-                check.apply(cells[library.name], process.ask("check", CHECK_TICKS), gain)
+                check.apply(cells[library.name], process.ask("check", CHECK_TICKS), gain, _tolerance(library))
             pace[library.name] = 1e-9 * float(np.median(process.ask("round", [0, 1, 2, 3, 4], 1)))
         except (LibraryError, ValueError) as error:
             cells[library.name].refused = str(error)
@@ -162,6 +162,10 @@ def _measure(
     return Row(name, workload, check.in_range if check else np.nan, cells)
 
 
+def _tolerance(library: Library) -> float:
+    return DISTANCE_TOLERANCE if isinstance(library, Ours) else library.distance_tolerance
+
+
 class _Check:
     """Compares libraries with Pinocchio and coal on one workload."""
 
@@ -170,7 +174,7 @@ class _Check:
         self.frames, self.distances = build.reference(self.scene, workload, workload.q[CHECK_TICKS])
         self.in_range = float((self.distances < workload.influence).sum(axis=1).mean())
 
-    def apply(self, cell: Cell, answer: dict[str, Any], closing_gain: float | None) -> None:
+    def apply(self, cell: Cell, answer: dict[str, Any], closing_gain: float | None, tolerance: float) -> None:
         """Record how far a library is off.
 
         Raises:
@@ -188,9 +192,9 @@ class _Check:
         cell.tracking_error = self._tracking_error(answer["velocities"])
         if not cell.frame_error <= FRAME_TOLERANCE:
             raise LibraryError(f"its frames differ by {cell.frame_error:.1e}")
-        if not (cell.distance_error <= DISTANCE_TOLERANCE and cell.box_error <= BOX_TOLERANCE):
+        if not (cell.distance_error <= tolerance and cell.box_error <= max(tolerance, BOX_TOLERANCE)):
             raise LibraryError(f"its distances differ by {max(cell.distance_error, cell.box_error):.1e} m")
-        undecided = np.abs(distances - workload.influence) < BOX_TOLERANCE
+        undecided = np.abs(distances - workload.influence) < max(tolerance, BOX_TOLERANCE)
         different = ((reported < workload.influence) != (distances < workload.influence)) & ~undecided
         if different.any():
             raise LibraryError(f"{int(different.sum())} pairs are in range for one and not for the other")
