@@ -81,20 +81,22 @@ def find_back_end() -> str:
 class Stage:
     """Bodies on a floor, which are placed by hand and rendered."""
 
-    def __init__(self, parts: Sequence[Part], width: int, height: int, has_shadows: bool = True) -> None:
+    def __init__(
+        self, parts: Sequence[Part], width: int, height: int, floor: float = 0.0, has_shadows: bool = True
+    ) -> None:
         """Build the model and its renderer.
 
         Args:
             parts: bodies, which `place` is given the poses of.
             width: of a picture [pixels].
             height: of a picture [pixels].
-            has_shadows: whether bodies cast shadows, which takes as long again.
+            floor: its height [m].
         """
         back_end = find_back_end()
         import mujoco
 
-        self._mujoco, self._has_shadows = mujoco, has_shadows
-        spec = self._spec(width, height)
+        self._mujoco = mujoco
+        spec = self._spec(width, height, floor)
         for number, part in enumerate(parts):
             body = spec.worldbody.add_body(name=f"part {number}", mocap=True)
             for index, (vertices, faces, colour) in enumerate(part.meshes):
@@ -117,7 +119,7 @@ class Stage:
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
         self._size = width, height
 
-    def _spec(self, width: int, height: int) -> Any:
+    def _spec(self, width: int, height: int, floor: float) -> Any:
         """Return sky, floor and lights."""
         mujoco = self._mujoco
         spec = mujoco.MjSpec()
@@ -135,9 +137,11 @@ class Stage:
         material = spec.add_material(name="floor")
         material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "floor"
         material.texrepeat, material.reflectance = [12, 12], 0.0  # reflections double the time
-        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[3.0, 3.0, 0.1], material="floor")
+        spec.worldbody.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_PLANE, pos=[0.0, 0.0, floor], size=[3.0, 3.0, 0.1], material="floor"
+        )
         spec.worldbody.add_light(
-            pos=[1.0, -1.5, 3.5], dir=[-0.28, 0.42, -1.0], castshadow=self._has_shadows, diffuse=[0.65] * 3
+            pos=[1.0, -1.5, 3.5], dir=[-0.28, 0.42, -1.0], castshadow=True, diffuse=[0.65] * 3
         )  # fmt: skip
         return spec
 
@@ -157,7 +161,7 @@ class Stage:
         mujoco.mjv_updateScene(
             self._model, self._data, mujoco.MjvOption(), None, view, mujoco.mjtCatBit.mjCAT_ALL.value, scene
         )  # fmt: skip
-        scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = self._has_shadows
+        scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = True
         for segment in segments:
             if scene.ngeom == scene.maxgeom:
                 break

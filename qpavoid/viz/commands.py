@@ -75,8 +75,9 @@ def render(
     elif len(sources) > 1:
         raise ConfigError(f"{len(sources)} scenarios: give one, or logs of runs")
     else:
-        label = load_scenario(sources[0], set_ or ()).solver.label
-        names = names_of("--solvers", f"tracking,{label}" if solvers is None else solvers)
+        config = load_scenario(sources[0], set_ or ())
+        beside = "" if config.contacts else "tracking,"  # which holds no contacts
+        names = names_of("--solvers", f"{beside}{config.solver.label}" if solvers is None else solvers)
         logs = [simulate(load_scenario(sources[0], set_ or (), name)) for name in dict.fromkeys(names)]
     if len(logs) > _MAX_LOGS:
         raise ConfigError(f"{len(logs)} runs: at most {_MAX_LOGS} are shown side by side")

@@ -29,6 +29,10 @@ _WITNESS_RADIUS, _PATH_RADIUS = 0.004, 0.004
 _MAX_SEGMENTS = 8
 """Pairs whose witness points are joined, the closest ones."""
 _PATH_COLOUR = (0.0, 0.48, 0.34)
+_BASE = 0.2
+"""Depth of bodies below z = 0 up to which these are parts of a base that stands there [m]."""
+_BELOW = 0.004
+"""How much lower the floor is than the ground, if that is an obstacle, which would flicker [m]."""
 _ASPECT = 0.85
 """Height of a run's picture, in widths."""
 _COLOURS = 96
@@ -56,7 +60,8 @@ class LogStage:
         self._places = [(joint, placement) for joint, placement, _ in places]
         obstacles = [[of_obstacle(described, i)] for i, described in enumerate(log.meta["obstacles"])]
         parts = [Part(meshes) for meshes in [*(meshes for *_, meshes in places), *obstacles]]
-        self._stage = Stage(parts, width, height)
+        lowest = log.body_ends[..., 2].min(axis=(0, 2), initial=0.0) - np.array(log.meta["body_radii"])
+        self._stage = Stage(parts, width, height, min(0.0, float(lowest[lowest < -_BASE].min(initial=0.0))) - _BELOW)
 
     def steps(self, rate: float) -> list[int]:
         """Return the steps that a film of some pictures a second shows."""
