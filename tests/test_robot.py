@@ -47,6 +47,7 @@ def test_bare_urdf_and_robot_yaml_give_the_same(tmp_path):
     np.testing.assert_equal(poses, others)
 
 
+@pytest.mark.filterwarnings("ignore::qpavoid.model.notes.RobotWarning")  # hips that are near at home
 def test_prefix_of_example_robot_data(tmp_path):
     path = tmp_path / "robot.yaml"
     path.write_text(
