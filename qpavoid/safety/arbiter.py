@@ -109,8 +109,8 @@ class Arbiter:
                 return solution
         else:
             solution = _clipped(problem, solution)
-        if solution.status is not Status.STOPPED:
-            solution = slow_recovery(q, problem, proximity.feedforward, solution, self._settings.bounds)
+            if solution.status is not Status.STOPPED:
+                solution = slow_recovery(q, problem, proximity.feedforward, solution, self._settings.bounds)
         return self._check_braking(q, problem, solution) if self._settings.avoidance.look_ahead else solution
 
     def _check_braking(self, q: Array, problem: Problem, solution: Solution) -> Solution:

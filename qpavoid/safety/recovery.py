@@ -6,6 +6,7 @@ expects a robot that should rest to move so fast, so that the whole velocity is 
 joint exceeds its recovery speed: the robot goes the same way, in more time.
 
 An obstacle that moves may be coming, and is evaded as fast as it can be: while anything near moves, nothing is slowed.
+Neither is a task that leaves by itself, at a velocity that meets all rows and bounds.
 """
 
 from __future__ import annotations
