@@ -4,12 +4,13 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid import Avoidance, Controller, Obstacle, Robot, Sample, build_scene, build_tasks
-from qpavoid.config import Sphere, Task
+from qpavoid.config import PostureTask, Sphere, Task
 
 robot = Robot.load("panda")
 q = robot.home.copy()
 scene = build_scene(robot, [Obstacle.at("ball", Sphere(radius=0.08), [0.75, 0.0, 0.5])])
-tasks = build_tasks([Task(frame="panda_hand_tcp")], robot, q)
+# the light posture holds the elbow, which a tool alone leaves free to drift
+tasks = build_tasks([Task(frame="panda_hand_tcp"), PostureTask(weight=1e-3)], robot, q)
 controller = Controller(scene, tasks, "qp", dt=0.005, avoidance=Avoidance(d1=0.03, d2=0.15))
 
 start = np.array([0.307, 0.0, 0.487])

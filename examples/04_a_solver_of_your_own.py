@@ -4,7 +4,6 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid import Controller, Problem, Solution, Solver, load_scenario
-from qpavoid.solvers.analytic import tracking_velocity
 
 
 class SlowDown(Solver):
@@ -14,8 +13,7 @@ class SlowDown(Solver):
 
     def solve(self, problem: Problem) -> Solution:
         """J⁺ẋ, scaled."""
-        v = tracking_velocity(problem)
-        d = problem.avoidance.d
+        v, d = problem.v_tracking, problem.avoidance.d
         return Solution(v * np.clip((d.min() - 0.12) / 0.12, 0.0, 1.0) if d.size else v)
 
 

@@ -4,13 +4,13 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid import Avoidance, Controller, Obstacle, Points, Robot, Sample, build_scene, build_tasks
-from qpavoid.config import HalfSpace, PointCloud, Task
+from qpavoid.config import HalfSpace, PointCloud, PostureTask, Task
 
 robot = Robot.load("panda")
 q = robot.home.copy()
 cloud = Obstacle.at("camera", PointCloud(resolution=0.02), [0, 0, 0])  # points are in world axes here
 ground = Obstacle.at("ground", HalfSpace(), [0, 0, 0])
-tasks = build_tasks([Task(frame="panda_hand_tcp")], robot, q)
+tasks = build_tasks([Task(frame="panda_hand_tcp"), PostureTask(weight=1e-3)], robot, q)
 controller = Controller(build_scene(robot, [cloud, ground]), tasks, dt=0.005, avoidance=Avoidance(d1=0.02, d2=0.12))
 
 

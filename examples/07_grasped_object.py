@@ -4,7 +4,7 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid import Avoidance, Controller, Obstacle, Robot, Sample, build_scene, build_tasks
-from qpavoid.config import Box, Capsule, Task
+from qpavoid.config import Box, Capsule, PostureTask, Task
 
 TCP = "panda_hand_tcp"
 robot = Robot.load("panda")
@@ -24,7 +24,7 @@ box = Obstacle.at("box", Box(size=(0.06, 0.06, 0.24)), held.translation, held.ro
 pole = Obstacle.at("pole", Capsule(radius=0.025, length=0.16), start + np.array([0.02, 0.2, -0.16]))
 controller = Controller(
     build_scene(robot, [box, pole]),
-    build_tasks([Task(frame=TCP)], robot, q),
+    build_tasks([Task(frame=TCP), PostureTask(weight=1e-3)], robot, q),
     dt=0.01,
     avoidance=Avoidance(d1=0.02, d2=0.12),
 )

@@ -1,4 +1,4 @@
-"""Command line: `qpavoid list | run | compare | fields | robot | bench`.
+"""Command line: `qpavoid list | run | compare | view | render | fields | robot | bench`.
 
 Exit status: 0 done, 1 a run ended in a defined failure (collision, safe stop, broken off), 2 bad input.
 """
@@ -22,15 +22,16 @@ from rich.progress import Progress, TaskID
 from qpavoid.config import RobotConfig, ScenarioConfig
 from qpavoid.config.fields import page, schema_of
 from qpavoid.config.loading import load_scenario
-from qpavoid.config.shipped import robot_names, scenario_names
+from qpavoid.config.shipped import shipped_names
 from qpavoid.controller import Controller
 from qpavoid.errors import ConfigError, QpavoidError
 from qpavoid.run.log import Log
-from qpavoid.run.report import events, failed, metrics_table, ratios_table, to_json
+from qpavoid.run.report import events, failed, metrics_table, to_json
 from qpavoid.run.simulate import simulate
 from qpavoid.run.terminal import ERR, OUT, names_of, progress, terminate_like_interrupt
 from qpavoid.setup import commands as robot_commands
 from qpavoid.solvers import SOLVERS, backend_names
+from qpavoid.viz import commands as view_commands
 
 app = typer.Typer(
     add_completion=False,
@@ -39,6 +40,7 @@ app = typer.Typer(
     help="Follow a planned motion and stay clear of obstacles, other arms and yourself.",
 )
 app.add_typer(robot_commands.app, name="robot")
+app.command("view")(view_commands.view)
 
 Sets = Annotated[
     list[str] | None, typer.Option("--set", metavar="PATH=VALUE", help="Override a field: avoidance.d2=0.30")
@@ -76,8 +78,8 @@ def options(
 def list_(kind: Annotated[Kind | None, typer.Argument(help="Only these.")] = None) -> None:
     """List what ships: robots, scenarios with their titles, solvers."""
     names = {
-        Kind.robots: robot_names(),
-        Kind.scenarios: scenario_names(),
+        Kind.robots: shipped_names("robot"),
+        Kind.scenarios: shipped_names("scenario"),
         Kind.solvers: [*SOLVERS, "qp:native", *(f"qp:{name}" for name in backend_names())],
     }
     if kind is not None:
@@ -87,7 +89,7 @@ def list_(kind: Annotated[Kind | None, typer.Argument(help="Only these.")] = Non
     titles = [f"{name:16} {load_scenario(name).title}" for name in names[Kind.scenarios]]
     for heading, entries in names.items():
         OUT.print(f"[bold]{heading.value}[/]")
-        for line in titles if heading is Kind.scenarios else wrap("  ".join(entries), 76):
+        for line in titles if heading is Kind.scenarios else wrap("  ".join(entries), 76, break_on_hyphens=False):
             OUT.print(f"  {line}", highlight=False, soft_wrap=True, markup=False)
 
 
@@ -123,7 +125,7 @@ def compare(
     figures: Figures = True,
     verbose: Verbose = False,
 ) -> None:
-    """Run scenarios with several solvers, side by side; the last but one is set against the last, as ratios.
+    """Run scenarios with several solvers, side by side.
 
     A collision is a result here, not a failure: the exit status is 1 only when a run was broken off.
     """
@@ -137,8 +139,6 @@ def compare(
         print(to_json({"runs": metrics, "files": [str(f) for f in files]}))
     else:
         _print(metrics, files, out, verbose)
-        if len(names) > 1:
-            OUT.print(ratios_table(metrics, names[-2], names[-1]))
     raise typer.Exit(0 if all(run["completed"] for run in metrics) and len(logs) == len(configs) else 1)
 
 

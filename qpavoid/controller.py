@@ -21,8 +21,6 @@ from qpavoid.control.settings import ControlSettings
 from qpavoid.control.tasks import RowTask, in_order
 from qpavoid.control.tick import Tick, copied
 from qpavoid.errors import ConfigError, NumericalError, located
-from qpavoid.model.cloud import Points
-from qpavoid.model.sample import Pose, Sample
 from qpavoid.model.scene import Obstacle, Scene
 from qpavoid.problem import Array, Solution, State, as_vector, require_finite
 from qpavoid.reason import Reason, ReasonKind
@@ -51,7 +49,6 @@ class Controller(SceneChanges):
         dt: float = 0.01,
         avoidance: Avoidance | None = None,
         limits: Limits | None = None,
-        tracking_damping: float = 0.01,
         sensing: Sensing | None = None,
         progress: Progress | None = None,
         contacts: ContactRows | None = None,
@@ -66,7 +63,6 @@ class Controller(SceneChanges):
             dt: control period [s]: each velocity is meant to be held that long.
             avoidance: distances and rows; the defaults of a scenario if left out.
             limits: use of the joint limits; the defaults of a scenario if left out.
-            tracking_damping: λ of the damped J⁺ [-].
             sensing: assumptions about obstacles without updates; the defaults of a scenario if left out.
             progress: when a task counts as stalled; the defaults of a scenario if left out.
             contacts: frames that rest, see `build_contacts`; none if left out.
@@ -96,7 +92,7 @@ class Controller(SceneChanges):
             self._no_backup = (_NO_BACKUP_WITH_CONTACTS,)
         bounds = scene.robot.bounds().within(self.limits)
         blocks = sensing or Sensing(), progress or Progress()
-        settings = ControlSettings(scene, bounds, self.avoidance, self.limits, dt, tracking_damping, latency, *blocks)
+        settings = ControlSettings(scene, bounds, self.avoidance, self.limits, dt, latency, *blocks)
         self._builder = ProblemBuilder(settings, self.tasks, contacts)
         self._arbiter = Arbiter(settings, law, self._builder.rows, self._builder.tracker)
         self._builder.rows.look_ahead(law.bounded and self.avoidance.look_ahead)
@@ -151,7 +147,7 @@ class Controller(SceneChanges):
         with located(str(source)):
             controller = cls(
                 parts.scene, parts.tasks, parts.solver, scenario.dt, scenario.avoidance, scenario.limits,
-                scenario.tracking_damping, scenario.sensing, scenario.progress, parts.contacts, scenario.latency,
+                scenario.sensing, scenario.progress, parts.contacts, scenario.latency,
             )  # fmt: skip
         for c in scenario.obstacles:
             if c.attached_to is not None:
@@ -164,7 +160,7 @@ class Controller(SceneChanges):
         q: Array,
         t: float | None = None,
         targets: Mapping[str, Any] | None = None,
-        obstacles: Mapping[str, Sample | Pose | Points] | None = None,
+        obstacles: Mapping[str, Any] | None = None,
         v: Array | None = None,
     ) -> Solution:
         """Velocity for the next dt.
@@ -186,13 +182,15 @@ class Controller(SceneChanges):
                 step if left out. Where it goes on by less than dt/2 or more than 3 dt/2, a reason of kind TIMING says
                 so; after a gap of more than 10 dt and 0.1 s, or where it goes back, the robot counts as standing still
                 unless v is given, and plans are dropped. Where it goes back, ages go on as if dt had passed.
-            targets: what tasks should reach now, by their names, in place of their motion: a `Sample`, or a `Pose` that
-                rests, for what is somewhere (frames, a relative pose, the centre of mass, a point to look at), a
-                configuration (nq,) for a posture, a direction (3,) for an axis. A frame's task has the frame's name
-                unless it was given one.
-            obstacles: where obstacles are, and how they move if that is known, by name, in place of their motion. From
-                then on they have to be updated, see `Sensing`, unless they are given `at_rest`. Each may have a time
-                stamp of its own.
+            targets: what tasks should reach now, by their names, in place of their motion: a `Sample`, or to rest at, a
+                `Pose`, `pin.SE3`, 4×4 matrix or position (3,), for what is somewhere (frames, a relative pose, the
+                centre of mass, a point to look at), a configuration (nq,) for a posture, a direction (3,) for an axis.
+                A position alone leaves the target's orientation as in the step before. A frame's task has the frame's
+                name unless it was given one.
+            obstacles: where obstacles are, by name, in place of their motion: a `Sample`, or if no velocity is known, a
+                `Pose`, `pin.SE3`, 4×4 matrix or position, which leaves the orientation as it was; `Points` for a cloud.
+                From then on they have to be updated, see `Sensing`, unless they are given `at_rest`. Each may have a
+                time stamp of its own.
             v: velocity (nv,) as measured, from which acceleration limits count in the first step, after a gap and after
                 `reset`. In all other steps they count from the last command, as those of servos that lag have to.
 
@@ -208,7 +206,7 @@ class Controller(SceneChanges):
         q: Array,
         t: float | None = None,
         targets: Mapping[str, Any] | None = None,
-        obstacles: Mapping[str, Sample | Pose | Points] | None = None,
+        obstacles: Mapping[str, Any] | None = None,
         v: Array | None = None,
     ) -> Tick:
         """Like `step`, with everything that led to the velocity."""
@@ -218,7 +216,7 @@ class Controller(SceneChanges):
         solution = self._decide(step, begin)
         return Tick(
             state, tuple(step.targets), rows.task_errors.copy(), copied(rows.kinematics), copied(step.proximity),
-            copied(step.problem), solution,
+            copied(step.problem), solution, self._builder.obstacle_poses(step.q),
         )  # fmt: skip
 
     def filter(
@@ -226,7 +224,7 @@ class Controller(SceneChanges):
         q: Array,
         v_desired: Array,
         t: float | None = None,
-        obstacles: Mapping[str, Sample | Pose | Points] | None = None,
+        obstacles: Mapping[str, Any] | None = None,
         v: Array | None = None,
     ) -> Solution:
         """The safe velocity that is closest to any command: of a teleoperator, a policy, another controller.

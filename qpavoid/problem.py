@@ -88,8 +88,8 @@ class Tracking(NamedTuple):
     """(r, nv) task Jacobian W½ J."""
     b: Array
     """(r,) task velocity W½ ẋ: feed-forward plus feedback [m/s, rad/s]."""
-    damping: float
-    """λ of the damped J⁺, the same for every solver [-]."""
+    b_feasible: Array
+    """(r,) `b`, of each task scaled down to what the speeds of the joints allow, its direction kept."""
 
 
 class Contacts(NamedTuple):
@@ -165,13 +165,17 @@ class Problem(NamedTuple):
     joint_units: Sequence[str]
     """Unit of each of the nv coordinates: rad or m."""
     v_tracking: Array
-    """(nv,) J⁺ẋ, the tracking law's velocity; NaN where λ is 0 and rows repeat each other."""
+    """(nv,) J⁺ẋ, the tracking law's velocity; NaN where a task row has one."""
     violation: float
     """Largest violation of a row or bound by v_tracking [m/s, rad/s]; not positive where it is safe, NaN with it."""
     contacts: Contacts | None = None
     """Contacts of the robot, None without any; v_tracking meets them."""
     levels: tuple[IntArray, ...] = ()
     """Indices of the rows of `tracking` of each priority, the first one first; empty where all have the same."""
+    cascade: Array | None = None
+    """(levels, nv) velocity of the tasks down to each of these priorities; None where it was not asked for."""
+    bent: float = 0.0
+    """How far the task rows bend within the control step: the least λ with which a QP that tracks is calm [-]."""
     jerk_limited: bool = False
     """Whether `lower` and `upper` contain jerk limits, too."""
     tracking_is_clear: bool = False
@@ -191,7 +195,7 @@ def make_problem(
 ) -> Problem:
     """Make a problem by hand, or from changed rows.
 
-    v_tracking and its violation are computed by their definitions.
+    v_tracking is J⁺ẋ of the feasible task velocity, with the Moore-Penrose inverse.
 
     Args:
         tracking: task rows.
@@ -202,12 +206,7 @@ def make_problem(
         hard: bounds (nv,), (nv,) without acceleration and jerk limits; `lower` and `upper` if left out.
         v_stop: next velocity of a stop (nv,); the least that the bounds allow if left out.
     """
-    A, b, damping = tracking
-    gram = A @ A.T + damping**2 * np.eye(len(b))
-    if not np.isfinite(gram).all() or (damping == 0.0 and len(b) and np.linalg.cond(gram) > 1e6):
-        v_tracking = np.full(len(lower), np.nan)
-    else:
-        v_tracking = np.linalg.solve(gram, b) @ A
+    v_tracking = least_squares(tracking.A, tracking.b_feasible)
     outside = np.concatenate((v_tracking - upper, lower - v_tracking, avoidance.b - avoidance.J @ v_tracking))
     stop = np.clip(0.0, lower, upper) if v_stop is None else v_stop
     names = [f"joint{i + 1}" for i in range(len(lower))]
@@ -215,6 +214,18 @@ def make_problem(
         tracking, avoidance, lower, upper, *(hard or (lower, upper)), stop, pair_names, names, ["rad"] * len(names),
         v_tracking, float(outside.max()),
     )  # fmt: skip
+
+
+def least_squares(A: Array, b: Array) -> Array:
+    """Compute the least velocity (nv,) of least ‖A v - b‖; NaN where A or b has one.
+
+    Args:
+        A: rows (r, nv).
+        b: right-hand sides (r,).
+    """
+    if not (np.isfinite(A).all() and np.isfinite(b).all()):
+        return np.full(A.shape[1], np.nan)
+    return np.asarray(np.linalg.pinv(A, rcond=1e-10) @ b)
 
 
 class Solution(NamedTuple):

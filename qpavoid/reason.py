@@ -46,6 +46,10 @@ class ReasonKind(str, Enum):
     STALLED = "STALLED"
     """The tasks make no progress: the pair that blocks them, the violation of its row by their velocity [m/s]; no pair
     where several rows block them together."""
+    OUT_OF_REACH = "OUT_OF_REACH"
+    """A task makes no progress, and nothing is in the way: no nearer from here; the task, its error [m or rad]."""
+    SINGULAR = "SINGULAR"
+    """The same in a singularity, from which there is a way on: the task, its error [m or rad]."""
     BACKUP = "BACKUP"
     """The backup trajectory replaces the tasks: from their velocity, none would stay clear of moving obstacles."""
     NO_BACKUP = "NO_BACKUP"
@@ -98,6 +102,8 @@ _TEXTS: dict[str, str] = {
     "AT_UPPER_LIMIT": "at its upper limit, velocity bound",
     "AT_VELOCITY_LIMIT": "at its velocity limit,",
     "STALLED": "no progress, row violated by",
+    "OUT_OF_REACH": "out of reach by",
+    "SINGULAR": "in a singularity, short of its target by",
     "BACKUP": "backup trajectory instead of the tasks",
     "NO_BACKUP": "no backup trajectory",
     "STALE": "not updated for",

@@ -31,6 +31,24 @@ def cartesian(folder, axes="xyz", speed=1.0, acceleration=4.0, reach=5.0, shape=
     return Robot.from_urdf(path, bodies=[body], limits=limits)
 
 
+def planar(folder, home=(0.3, 0.5, 0.4)):
+    """An arm of links of 0.4, 0.4 and 0.3 m in a plane, with the tool `tip`."""
+    parts = ['<link name="l0"/>']
+    for i, x in enumerate((0.0, 0.4, 0.4)):
+        parts.append(
+            f'<link name="l{i + 1}"/><joint name="j{i + 1}" type="revolute"><parent link="l{i}"/>'
+            f'<child link="l{i + 1}"/><origin xyz="{x} 0 0"/><axis xyz="0 0 1"/>'
+            '<limit lower="-6" upper="6" velocity="2" effort="1"/></joint>'
+        )
+    parts.append(
+        '<link name="tip"/><joint name="end" type="fixed"><parent link="l3"/><child link="tip"/>'
+        '<origin xyz="0.3 0 0"/></joint>'
+    )
+    path = folder / "planar.urdf"
+    path.write_text(f'<robot name="planar">{"".join(parts)}</robot>')
+    return Robot.from_urdf(path, bodies=[], home=dict(zip(("j1", "j2", "j3"), home, strict=True)))
+
+
 def make_controller(robot, obstacles=(), frame=None, solver="qp", dt=0.01, **fields):
     """A controller with one position task for `frame`, if one is named, and avoidance from 0.02 to 0.1 m."""
     task = {"gain": 2.0, **fields.pop("task", {})}
@@ -112,5 +130,5 @@ def accelerations(vs, dt, before=None):
 
 __all__ = [
     "SHIPPED", "Limits", "Progress", "Ruler", "Sensing", "accelerations", "cartesian", "changed", "drive",
-    "make_controller", "scenario",
+    "make_controller", "planar", "scenario",
 ]  # fmt: skip

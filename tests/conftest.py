@@ -121,12 +121,10 @@ def random_scene(robot, rng, shapes):
 class Bench:
     """Tasks, rows and limits of a scene, without a solver."""
 
-    def __init__(self, scene, tasks=(), avoidance=None, position_gain=0.5, damping=0.0, dt=0.01):
+    def __init__(self, scene, tasks=(), avoidance=None, position_gain=0.5, dt=0.01):
         self.scene, self.robot, self.tasks = scene, scene.robot, tuple(tasks)
         limits = config.Limits(position_gain=position_gain)
-        settings = ControlSettings(
-            scene, scene.robot.bounds(), avoidance or config.Avoidance(), limits, dt, tracking_damping=damping
-        )
+        settings = ControlSettings(scene, scene.robot.bounds(), avoidance or config.Avoidance(), limits, dt)
         self.assembler = RowAssembler(settings, tasks)
         self.query = self.assembler.query
 
@@ -176,7 +174,7 @@ def lay_out_step(scene, avoidance=None):
     """Memory of a control step, as a controller lays it out, and the kinematics and distances that it looks into."""
     kinematics, query, limits = ForwardKinematics(scene.robot.model, []), DistanceQuery(scene), config.Limits()
     bounds, avoidance = scene.robot.bounds().within(limits), avoidance or config.Avoidance()
-    settings = ControlSettings(scene, bounds, avoidance, limits, 0.01, tracking_damping=0.0)
+    settings = ControlSettings(scene, bounds, avoidance, limits, 0.01)
     return lay_out(settings, [], [], kinematics, query), kinematics, query
 
 

@@ -149,6 +149,25 @@ def test_added_object_is_grasped_carried_and_released(panda, shape):
     assert np.abs(runs[0][3] - hand.translation).max() > 0.05
 
 
+def test_obstacle_that_is_added_has_rows_with_attached_objects(panda):
+    """Both in slots, either one first; not while both are free."""
+    place = tool(panda, panda.home).translation + np.array([0.0, 0.0, -0.1])
+    for first, second in (("cup", "wall"), ("wall", "cup")):
+        controller, shapes = controller_of(panda, spare=3), {"cup": SHAPES["capsule"], "wall": SHAPES["cylinder"]}
+        shift = {"cup": np.zeros(3), "wall": np.array([0.15, 0.0, 0.0])}
+        for name in (first, second):
+            controller.add_obstacle(Obstacle.at(name, shapes[name], place + shift[name], graspable=name == "cup"))
+        pairs = []
+        for _ in range(2):
+            tick = controller.tick(panda.home)
+            pairs.append({frozenset(tick.problem.pair_names[i]): i for i in tick.proximity.pair})
+            controller.attach("cup", TCP, panda.home)
+        both = frozenset(("cup", "wall"))
+        assert both not in pairs[0] and both in pairs[1]
+        row = tick.proximity.pair.tolist().index(pairs[1][both])
+        assert tick.proximity.distance[row] == pytest.approx(0.15 - 0.04 - 0.05, abs=1e-5)
+
+
 def test_added_object_has_rows_with_points(panda):
     """The spheres of a cloud are selected for what is in a slot, too."""
     hand = tool(panda, panda.home) * pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.08]))
@@ -309,6 +328,15 @@ def test_full_pool_and_attached_objects_are_refused_with_the_remedy(panda):
     for wrong in (-1, 1000, 2.0, True):
         with pytest.raises(ConfigError, match=r"^spare_obstacles"):
             build_scene(panda, spare_obstacles=wrong)
+
+
+def test_scenario_may_have_spare_slots():
+    scenario = load_scenario("panda_line").model_copy(update={"spare_obstacles": 1})
+    controller, q = Controller.from_scenario(scenario)
+    names = controller.scene.obstacle_names
+    controller.add_obstacle(Obstacle.at("late", Sphere(radius=0.05), [0.0, 0.0, 2.0]))
+    assert sorted(controller.scene.obstacle_names) == sorted([*names, "late"])
+    assert controller.step(q).status is Status.SOLVED
 
 
 def test_controllers_of_one_scene_have_slots_of_their_own(panda):

@@ -88,10 +88,6 @@ def test_dead_process_takes_one_scenario_with_it(workers):
     assert [log is None for log in error.value.logs] == [False, True, False, False, True, False]
 
 
-def test_no_scenarios(workers):
-    assert simulate_many([], workers) == []
-
-
 # --- steps -----------------------------------------------------------------------------------------------------
 
 

@@ -11,7 +11,7 @@ import qpavoid
 from qpavoid_bench.arena.commands import app
 from qpavoid_bench.solvers.record import QP
 from qpavoid_bench.solvers.truth import find_truth, judge
-from qpavoid_bench.tick.libs import LIBRARIES
+from qpavoid_bench.tick.libraries import LIBRARIES
 from qpavoid_bench.tick.loops import loop_names
 from qpavoid_bench.tick.report import write_report
 from qpavoid_bench.tick.runner import run

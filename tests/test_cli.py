@@ -13,7 +13,7 @@ import yaml
 from conftest import Result
 
 from qpavoid import Controller, Log
-from qpavoid.config.shipped import data_folder, robot_names, scenario_names
+from qpavoid.config.shipped import data_folder, shipped_names
 from qpavoid.solvers import SOLVERS
 
 METRICS = {
@@ -41,15 +41,9 @@ def test_list_names_all_that_ships(cli):
     result = cli("list")
     assert result.status == 0
     words = result.stdout.split()
-    assert {*robot_names(), *scenario_names(), *SOLVERS, "qp:daqp"} <= set(words)
+    assert {*shipped_names("robot"), *shipped_names("scenario"), *SOLVERS, "qp:daqp"} <= set(words)
     assert SITUATION["title"] in next(line for line in result.stdout.splitlines() if "situation1" in line)
     assert all(len(line) <= 80 for line in result.stdout.splitlines())
-
-
-def test_list_of_one_kind_is_a_name_a_line(cli):
-    assert cli("list", "robots").stdout.splitlines() == robot_names()
-    assert cli("list", "scenarios").stdout.splitlines() == scenario_names()
-    assert {"eq10", "qp", "qp:proxqp"} <= set(cli("list", "solvers").stdout.splitlines())
 
 
 def test_run_with_a_collision_is_exit_status_1(cli):
@@ -178,18 +172,6 @@ def test_run_that_cannot_be_logged_is_refused(cli, scene, tmp_path):
         assert line.startswith("error: ") and word in line
 
 
-def test_mesh_that_cannot_be_found_is_refused(cli, scene, tmp_path):
-    mesh = '<mesh filename="package://nowhere_description/meshes/hand.stl"/>'
-    (tmp_path / "arm.urdf").write_text(
-        f'<robot name="arm"><link name="base"><collision><geometry>{mesh}</geometry></collision></link></robot>',
-        encoding="utf-8",
-    )
-    result = cli("run", scene(robot="arm.urdf"), "--no-figures")
-    assert_refused(result, "nowhere_description/meshes/hand.stl", "package_dirs", "ROS_PACKAGE_PATH")
-    (tmp_path / "arm.urdf").write_text("<robot", encoding="utf-8")
-    assert_refused(cli("run", scene(robot="arm.urdf"), "--no-figures"), "arm.urdf: not a usable URDF")
-
-
 def test_start_in_collision_or_outside_the_limits_is_a_warning(cli, scene):
     fist = {**SITUATION["obstacles"][0], "motion": {"type": "fixed", "position": [0.396, 0.65, 0.747]}}
     result = cli("run", scene(obstacles=[fist]), "--no-figures", "--json")
@@ -213,13 +195,6 @@ def test_usage_error_is_exit_status_2(cli, args):
     assert result.stdout == ""
     assert "Usage" in result.stderr
     assert "Traceback" not in result.stderr
-
-
-@pytest.mark.parametrize("args", [["--help"], ["run", "--help"], ["compare", "--help"]])
-def test_help_shows_the_usage(cli, args):
-    result = cli(*args)
-    assert result.status == 0
-    assert "Usage" in result.stdout
 
 
 def test_module_runs_as_a_process(tmp_path):

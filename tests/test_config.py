@@ -12,7 +12,7 @@ from pydantic import BaseModel
 from qpavoid import ConfigError, Robot, UnknownName, config, load_scenario
 from qpavoid.config import Block, RobotConfig
 from qpavoid.config.loading import read_config
-from qpavoid.config.shipped import data_folder, robot_names, scenario_names
+from qpavoid.config.shipped import data_folder, shipped_names
 from qpavoid.errors import nearest
 from qpavoid.run.simulate import simulate
 from qpavoid.solvers import SOLVERS, parse_solver
@@ -63,11 +63,11 @@ def load(tmp_path):
 
 
 def test_everything_that_ships_is_listed_and_loads():
-    assert {"situation1", "situation2", "panda_line"} <= set(scenario_names())
-    for name in scenario_names():
+    assert {"situation1", "situation2", "panda_line"} <= set(shipped_names("scenario"))
+    for name in shipped_names("scenario"):
         scenario = load_scenario(name)
-        assert scenario.source.name == f"{name}.yaml" and scenario.robot in robot_names() and scenario.title
-    for name in robot_names():
+        assert scenario.source.name == f"{name}.yaml" and scenario.robot in shipped_names("robot") and scenario.title
+    for name in shipped_names("robot"):
         robot = Robot.load(name)
         assert len(robot.bodies.geometryObjects) > 0 and robot.home.shape == (robot.model.nq,)
 

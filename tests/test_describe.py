@@ -15,22 +15,22 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial import ConvexHull
 
 from qpavoid import ConfigError, Robot, UnknownName
-from qpavoid.config import Box, Capsule, Hull
-from qpavoid.geometry.bodies import hull_points
+from qpavoid.config import Capsule, Hull
+from qpavoid.geometry.bodies import hull_points, surface_triangles
 from qpavoid.geometry.capsules import CapsuleFit, fit_capsule
-from qpavoid.geometry.segments import point_segment_distance
+from qpavoid.geometry.meshes import cut
 from qpavoid.model.end_effectors import end_effectors
 from qpavoid.model.trajectory import rpy_to_matrix
 from qpavoid.model.urdf import read_model
+from qpavoid.run.metrics import point_segment_distance
 from qpavoid.setup.add import DescribeOptions, describe
-from qpavoid.setup.fit import cut, decompose, fit_piece, hull_volume, inside_volume, triangles
+from qpavoid.setup.fit import decompose, fit_piece, hull_volume, inside_volume
 from qpavoid.setup.home import HOME_CLEARANCE, MIN_CONDITIONING, Limbs, find_home
 from qpavoid.setup.sampling import (
     D1,
     NEVER_NEAR,
     PairDistances,
-    Space,
-    pairs_always_near,
+    draw_poses,
     robot_size,
     safety_distances,
     sample_pairs,
@@ -85,7 +85,7 @@ def test_a_cut_surface_is_the_same_surface(surface, normal, height):
         )
 
     normal = normal / np.linalg.norm(normal)
-    above, below = cut(surface, normal, height, 1.0), cut(surface, normal, height, -1.0)
+    below, above = cut(surface, surface @ normal - height)
     in_plane = np.all(surface @ normal - height == 0.0, axis=1)  # such triangles belong to both
     assert area(above) + area(below) == pytest.approx(area(surface) + area(surface[in_plane]), abs=1e-9)
     assert np.all(above @ normal >= height - 1e-9) and np.all(below @ normal <= height + 1e-9)
@@ -168,18 +168,11 @@ def test_bodies_enclose_every_vertex(panda_described, kind):
         bodies.setdefault(body.frame, []).append((live.geometry, in_link))
     point = coal.Sphere(1e-9)
     for piece in described.pieces:
-        corners = triangles(piece.geometry).reshape(-1, 3)
+        corners = surface_triangles(piece.geometry).reshape(-1, 3)
         corners = corners[np.unique(ConvexHull(corners).vertices)] if kind == "convex" else np.unique(corners, axis=0)
         for corner in corners[:: max(1, len(corners) // 60)]:
             place = pin.SE3(np.eye(3), piece.placement.act(corner))
             assert min(signed_distance(point, place, shape, at) for shape, at in bodies[piece.link]) < 1e-6
-
-
-def test_more_faithful_bodies_take_less_room(panda_described):
-    volumes = {kind: sum(link.volume for link in d.links.values()) for kind, d in panda_described.items()}
-    hulls = sum(link.hulls for link in panda_described["auto"].links.values())
-    assert volumes["convex"] == pytest.approx(hulls)
-    assert hulls < volumes["auto"] <= volumes["capsules"] <= volumes["capsule"] < 2.0 * hulls
 
 
 def signed_distance(point, place, shape, at):
@@ -224,7 +217,7 @@ def test_descent_finds_what_samples_miss(tmp_path):
     tip = reach + 0.25 * np.array([0.0, -math.sin(1.2 - 0.9), math.cos(1.2 - 0.9)])
     robot = chain(tmp_path, [ball("base", "link0", tip, 0.01), ball("tip", "link2", [0, 0, 0.25], 0.01)])
     assert touching(robot, np.array([1.2, -0.9]))
-    distances, draws = PairDistances(robot), Space(robot).draw(np.random.default_rng(0), 10)
+    distances, draws = PairDistances(robot), draw_poses(robot, 10)
     assert min(distances.all(q)[0] for q in draws) > NEVER_NEAR * robot_size(robot)
     assert not sample_pairs(robot, samples=10).never[0]
 
@@ -239,13 +232,12 @@ def test_pairs_are_judged_by_samples_and_a_descent(tmp_path):
     sampled, distances = sample_pairs(robot, samples=300), PairDistances(robot)
     far, side = [[distances.names[a] for a, _ in distances.pairs].index(name) for name in ("far", "tip")]
     assert sampled.never.tolist()[far] and not sampled.never[side] and not sampled.always.any()
-    draws = Space(robot).draw(np.random.default_rng(1), 3000)  # the descent comes as near as ten times the samples
+    draws = draw_poses(robot, 3000, 1)  # the descent comes as near as ten times the samples
     assert sampled.closest[far] <= min(distances.all(q)[far] for q in draws) + 1e-6
-    assert len(pairs_always_near(robot, 50)) == 0
     held = chain(tmp_path, [ball("a", "link0", [0.0, 0.0, 0.26], 0.01), ball("b", "link2", [0, 0, -0.3], 0.01)],
                  limits={"position": {"joint1": (-0.01, 0.01), "joint2": (-0.01, 0.01)}})  # fmt: skip
     sampled = sample_pairs(held, 300)  # near all along its range, but never in touch: it is kept
-    assert not sampled.always.any() and sampled.contact[0] == 0.0
+    assert not sampled.always.any() and not sampled.touching.any()
     gap = np.median([touching(held, q, np.inf)[0][2] for q in sampled.poses])
     assert safety_distances(sampled)[0] == pytest.approx(0.5 * gap, abs=1e-4) and gap < D1
 
@@ -278,11 +270,11 @@ def test_home_is_bent(tmp_path):
     limbs = Limbs(robot, ["link2"])
     for bend in (0.0, 0.7, -1.2):
         J = np.array([[0.3 + 0.0 * bend, 0.0], [0.0, 0.0]])  # of the frame of link2, 0.3 m from joint1 and on joint2
-        (limb,) = limbs.at(np.array([0.2, bend]))
+        limb = limbs.at(np.array([0.2, bend]))["link2"]
         assert limb.value == pytest.approx(np.linalg.svd(J, compute_uv=False)[0], abs=1e-9)
     tool = chain(tmp_path, [ball("base", "link0", [0, 0, 0.0])], 3)
     q = np.array([0.3, 0.8, 0.1])
-    (limb,) = Limbs(tool, ["link3"]).at(q)
+    limb = Limbs(tool, ["link3"]).at(q)["link3"]
     angles = np.cumsum(q)
     along = 0.3 * np.array([[-np.cos(a), -np.sin(a)] for a in angles])
     columns = np.array([along[0] + along[1], along[1], [0.0, 0.0]]).T
@@ -302,7 +294,7 @@ def test_home_is_bent(tmp_path):
 def test_samples_keep_to_the_limits_and_the_root_stays():
     robot = Robot.from_urdf(EXAMPLES / "kinova_description/robots/kinova.urdf", root_joint="free_flyer")
     bounds = robot.bounds()
-    draws = Space(robot).draw(np.random.default_rng(0), 50)
+    draws = draw_poses(robot, 50)
     np.testing.assert_allclose(draws[:, :7], np.tile(pin.neutral(robot.model)[:7], (50, 1)), atol=1e-12)
     assert all(np.allclose(pin.normalize(robot.model, q), q) for q in draws)
     assert np.all(draws[:, bounds.q_index] >= bounds.lower) and np.all(draws[:, bounds.q_index] <= bounds.upper)
@@ -439,18 +431,6 @@ def test_capsules_too_fat_for_the_home_pose_become_exact(tmp_path):
     shapes = {body.name: body.shape.type for body in described.config.bodies}
     assert shapes["link0"] == shapes["link2"] == "cylinder"
     assert any("exact bodies" in note.what and {"link0", "link2"} <= {*note.subject} for note in described.notes)
-
-
-def test_bodies_are_fitted_to_what_is_seen_where_there_is_nothing_else(tmp_path):
-    urdf = write_chain(tmp_path, shape='<box size="0.1 0.1 0.2"/>')
-    urdf.write_text(urdf.read_text().replace("collision>", "visual>"))
-    described = describe(urdf, DescribeOptions(samples=50))
-    assert {type(body.shape) for body in described.config.bodies} <= {Box, Capsule}
-    assert any("no collision shape" in note.what for note in described.notes)
-    urdf.write_text(urdf.read_text().replace("visual>", "nothing>"))
-    described = describe(urdf, DescribeOptions(samples=50))
-    assert described.config.bodies == [] and any("no geometry at all" in note.what for note in described.notes)
-    assert Robot.from_config(described.config, urdf).bodies.ngeoms == 0
 
 
 def test_hulls_of_a_robot_yaml(panda_convex):

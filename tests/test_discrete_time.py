@@ -167,7 +167,7 @@ def test_stop_at_any_step_is_clear_also_at_the_limits(panda):
     assert stops > 100 and at_limits > 10
 
 
-@pytest.mark.parametrize(("shape", "speed", "alone"), [(PLATE, 2.0, 0.0), (BALL, 0.5, 0.002), (BOX, 2.0, 0.015)])
+@pytest.mark.parametrize(("shape", "speed", "alone"), [(PLATE, 2.0, 0.002), (BALL, 0.5, 0.002), (BOX, 2.0, 0.015)])
 def test_command_scale_is_below_one_where_the_linearisation_fails(shape, speed, alone):
     """Steps of 50 ms and a row that may use its whole margin in one: alone, it leads into the plate."""
     least, scales = {}, {}

@@ -27,7 +27,6 @@ from qpavoid.control import distances
 from qpavoid.model import kinematics
 from qpavoid.model import views as memory
 from qpavoid.problem import Proximity
-from qpavoid.solvers.analytic import tracking_velocity
 
 CONFIGURATIONS = 4
 ROUND = 5e-5
@@ -345,7 +344,7 @@ def test_python_work_of_a_step_does_not_grow_with_the_number_of_pairs(panda, cas
         tick = controller.tick(panda.home)
         assert len(tick.proximity.pair) == (len(scene.pairs) if radius < 5.0 else len(tick.problem.avoidance.d))
         assert tick.solution.status == "SOLVED"
-        unconstrained = tracking_velocity(tick.problem)
+        unconstrained = tick.problem.v_tracking
         assert np.allclose(tick.solution.v, unconstrained, atol=1e-6) == (way == 0.0)
         work.append(instructions(lambda controller=controller: controller.step(panda.home)))
     assert 0 < work[0] == work[1] < 4000

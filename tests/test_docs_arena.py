@@ -10,7 +10,7 @@ from in_process import InProcess
 pytest.importorskip("distributed")
 pytest.importorskip("mujoco")
 
-from qpavoid.config.shipped import suite_names
+from qpavoid.config.shipped import shipped_names
 from qpavoid_bench.arena.store import read_runs
 
 DOCS = Path(__file__).parent.parent / "docs"
@@ -58,6 +58,6 @@ def test_every_command_option_and_suite_of_the_page_exists(cli):
     for line in re.findall(r"^\$ qpavoid bench (.*?)(?: +#.*)?$", PAGE, re.M):
         command, *words = line.split()
         assert all(word in shown[command] for word in words if word.startswith("--")), line
-        assert command != "run" or words[0] in [*suite_names(), "suite.yaml"]
+        assert command != "run" or words[0] in [*shipped_names("suite"), "suite.yaml"]
     table = re.findall(r"^\| `(--[a-z]+)", PAGE, re.M)
     assert set(table) == set(re.findall(r"--[a-z]+", shown["run"])) - {"--help"}

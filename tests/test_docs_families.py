@@ -5,8 +5,9 @@ from pathlib import Path
 
 import pytest
 
+from qpavoid.config.shipped import shipped_names
 from qpavoid.model.robot import Robot
-from qpavoid_bench.arena.families import family_names, load_family, make_case
+from qpavoid_bench.arena.families import load_family, make_case
 from qpavoid_bench.arena.families.arms import arms
 
 PAGE = (Path(__file__).parent.parent / "docs" / "arena_families.md").read_text(encoding="utf-8")
@@ -16,7 +17,7 @@ SNIPPETS = re.findall(r"```python\n(.*?)```", PAGE, re.S)
 
 def test_the_table_lists_what_ships():
     names = re.findall(r"^\| `(\w+)` \|", PAGE.split("## How a case")[0], re.M)
-    assert sorted(names) == family_names()
+    assert sorted(names) == shipped_names("family")
 
 
 @pytest.mark.parametrize("number", range(2))
@@ -32,7 +33,7 @@ def test_families_of_the_page_make_cases(number, tmp_path):
 def test_page_snippet_output(capsys):
     """The snippet prints what solved it."""
     exec(compile(SNIPPETS[0], "docs/arena_families.md", "exec"), {})
-    assert re.match(rf"{len(family_names())} ur5 RRT-Connect", capsys.readouterr().out)
+    assert re.match(rf"{len(shipped_names('family'))} ur5 RRT-Connect", capsys.readouterr().out)
 
 
 @pytest.mark.parametrize(("name", "said"), [("panda", "Panda"), ("ur5", "UR5"), ("paper-dual-arm", "the paper's arm")])

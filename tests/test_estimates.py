@@ -120,3 +120,16 @@ def test_a_pose_that_is_too_far_away_changes_nothing():
     np.testing.assert_array_equal(seen.measured.states, known)
     state, taken = seen.update(stamp + PERIOD, (stamp + PERIOD, 0.0, 0.0))
     assert taken and state[12] == pytest.approx(before[12], abs=1e-9)
+
+
+@pytest.mark.parametrize("age", [0.05, 0.1, 0.15, 0.2])
+def test_prediction_errors_are_those_of_the_rule_for_d1(age):
+    """Noise σ becomes σ (0.7 + 0.17 h/T) when it is moved on by h, an acceleration a at most ½ a (h + 3 T)²."""
+    rng, errors, end = np.random.default_rng(1), [], 29 * PERIOD
+    for _ in range(300):
+        state = Seen().after(lambda t: 0.003 * rng.normal(size=3), 1.0)
+        errors.append(state[9:12] + age * state[12:15])
+    assert np.std(errors) == pytest.approx(0.003 * (0.7 + 0.17 * age / PERIOD), rel=0.1)
+    state = Seen().after(lambda t: np.array([0.5 * t * t, 0.0, 0.0]), 1.0)
+    off = 0.5 * (end + age) ** 2 - state[9] - age * state[12]
+    assert 0.8 < off / (0.5 * (age + 3.0 * PERIOD) ** 2) <= 1.02

@@ -129,7 +129,8 @@ def test_stop_without_q_ends_inside_the_joint_limits(panda):
         ({"obstacles": "ball"}, "obstacles: give a mapping"),
         ({"obstacles": {"ball": Sample.at([1, 0, 0], t="now")}}, "obstacle 'ball': t: not a number"),
         ({"obstacles": {"ball": Sample.at([1, 0, 0], linear=[1, 0, 0], at_rest=True)}}, "obstacle 'ball': at_rest"),
-        ({"targets": {TOOL: np.eye(4)}}, f"target '{TOOL}': neither"),
+        ({"targets": {TOOL: np.eye(3)}}, f"target '{TOOL}': neither"),
+        ({"targets": {TOOL: np.triu(np.ones((4, 4))).T}}, f"target '{TOOL}': a 4x4 matrix whose last row"),
         ({"obstacles": {"ball": "there"}}, "obstacle 'ball': neither"),
     ],
 )

@@ -7,7 +7,6 @@ import signal
 import struct
 import subprocess
 import sys
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -167,10 +166,14 @@ def laughs(depth: int = 8) -> str:
         (XML, '<!DOCTYPE r [<!ENTITY b "b">]><robot name="&b;"/>', "."),
         (XML, "<robot name='x'>" + "<a>" * 10_000 + "</a>" * 10_000 + "</robot>", "."),
         (XML, "<robot><!--" + "x" * 11_000_000 + "--></robot>", "at most 10000000 are read"),
-        (("path.csv",), "t,x,y,z\n0,0,0,0\n1,0,0\n", "line 3: 3 cells; give 4"),
-        (("path.csv",), "t,x,y,z\n0,0,0,0\ninf,1,0,0\n", "line 3, t: `inf` is not a finite number"),
+        (("path.csv",), "t,x,y,z\n0,0,0,0\n1,0,0\n", "columns changed from 4 to 3 at row 2"),
+        (("path.csv",), "t,x,y,z\n0,0,0,0\ninf,1,0,0\n", "row 2 of poses: not finite numbers"),
         (("path.csv",), "t,x,y,z\n0,0,0,0\n1e-320,1,0,0\n", r"faster than 1e\+09 m/s; give it time"),
-        (("path.csv",), "t,x,y,z\n" + "".join(f"{i},0,0,0\n" for i in range(1_000_000)), "more than 100000 rows"),
+        (
+            ("path.csv",),
+            "t,x,y,z\n" + "".join(f"{i},0,0,0\n" for i in range(1_000_000)),
+            "1000000 rows of poses; give",
+        ),
         ((*YAML, *XML, "path.csv"), bytes(range(256)), "cannot be read: .*give a UTF-8 text file"),
         ((*YAML, *XML, "path.csv"), "a\0b", "holds NUL characters; give a text file"),
         (("run.npz",), bytes(range(256)), "not a qpavoid log: .*; give one written by `qpavoid run`"),
@@ -219,26 +222,19 @@ def test_absurd_scenario_is_refused(override, expected):
     assert str(error.value).isprintable()
 
 
-def test_log_whose_parts_do_not_belong_together_is_refused(tmp_path):
+def test_log_of_another_version_or_that_would_run_code_is_refused(tmp_path):
     path = simulate(load_scenario("situation1", ["duration=0.05"])).save(tmp_path / "whole")
     with np.load(path) as file:
         arrays = {name: file[name] for name in file.files}
     meta = json.loads(str(arrays["meta"]))
-    faults = [
-        ({name: array.reshape(-1, 1, 1, 1, 1)}, f"{name} has") for name, array in arrays.items() if name != "meta"
-    ]
-    faults += [({"slack": np.array([None])}, "allow_pickle=False"), ({"meta": np.array("[" * 100_000)}, "recursion")]
-    faults += [({"closest_pair": np.full(6, 999)}, r"closest_pair points past the \d+ that there are")]
-    for fields, expected in (({"pairs": None}, "pairs is missing"), ({"format": [1]}, "written by another version")):
-        faults.append(({"meta": np.array(json.dumps({**meta, **fields}))}, expected))
-    for changes, expected in faults:
+    for changes, expected in (
+        ({"slack": np.array([None])}, "allow_pickle=False"),
+        ({"meta": np.array("[" * 100_000)}, "recursion"),
+        ({"meta": np.array(json.dumps({**meta, "format": [1]}))}, "written by another version"),
+        ({"q": arrays["q"][:-1]}, r"q has shape .* must be \(N nq\)"),
+    ):
         np.savez(tmp_path / "run.npz", **{**arrays, **changes})
         assert re.search(expected, refusal("run.npz", tmp_path))
-    for header in (b"(" * 3000, b"{'descr': '<f8', 'fortran_order': False, 'shape': (10000000000000000,), }\n"):
-        np.savez(tmp_path / "run.npz", **{name: array for name, array in arrays.items() if name != "t"})
-        with zipfile.ZipFile(tmp_path / "run.npz", "a") as archive:
-            archive.writestr("t.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header)
-        assert "not a qpavoid log" in refusal("run.npz", tmp_path)
 
 
 def stl(*triangles, count=None) -> bytes:

@@ -18,7 +18,7 @@ SMALL = 1e-7
 BACKENDS = ["auto", *[name for name in ("daqp", "proxqp", "quadprog") if name in backend_names()]]
 
 
-def random_problem(seed, sizes=(3, 3, 4), bound=10.0, k=0, low=-0.5, damping=0.0, touch=-5.0):
+def random_problem(seed, sizes=(3, 3, 4), bound=10.0, k=0, low=-0.5, touch=-5.0):
     """Levels of random rows; the second one repeats a row of the first, at another right-hand side."""
     rng = np.random.default_rng(seed)
     A, b = rng.normal(size=(sum(sizes), NV)), rng.normal(size=sum(sizes))
@@ -30,7 +30,7 @@ def random_problem(seed, sizes=(3, 3, 4), bound=10.0, k=0, low=-0.5, damping=0.0
     ends = np.cumsum(sizes)
     levels = tuple(np.arange(end - size, end) for size, end in zip(sizes, ends, strict=True))
     limits = np.full(NV, bound)
-    problem = make_problem(Tracking(A, b, damping), rows, -limits, limits, [(f"a{i}", f"b{i}") for i in range(k)])
+    problem = make_problem(Tracking(A, b, b), rows, -limits, limits, [(f"a{i}", f"b{i}") for i in range(k)])
     return problem._replace(levels=levels)
 
 
@@ -160,7 +160,7 @@ def test_hqp_stops_at_nan():
 
 
 def test_one_safe_level_is_the_tracking_velocity_bit_for_bit():
-    problem = random_problem(1, damping=0.05)._replace(levels=())
+    problem = random_problem(1, bound=100.0)._replace(levels=())
     solution = make_solver("hqp").solve(problem)
     np.testing.assert_array_equal(solution.v, problem.v_tracking)
 
@@ -179,7 +179,7 @@ def panda_controller(panda, solver, tool=1, posture=2, **settings):
 
 @pytest.mark.parametrize("order", [(1, 2), (2, 1)])
 def test_the_order_of_priorities_is_that_of_the_file(panda, order):
-    controller = panda_controller(panda, "hqp", *order, tracking_damping=0.0)
+    controller = panda_controller(panda, "hqp", *order)
     q = pin.integrate(panda.model, panda.home, 0.1 * np.ones(7))
     problem = controller.tick(q).problem
     assert [len(rows) for rows in problem.levels] == ([3, 7] if order == (1, 2) else [7, 3])

@@ -15,7 +15,6 @@ FOR_BENCHMARKS = {
     "qpavoid.control.distances": "DistanceQuery: the planner that proves a case solvable checks distances",
     "qpavoid.control.tasks": "FrameTask: which goals the scores and other libraries follow",
     "qpavoid.solvers": "parse_solver: entrants are named as in scenarios",
-    "qpavoid.solvers.analytic": "tracking_velocity: the cost of a recorded QP",
     "qpavoid.solvers.backends": "the back ends that are compared",
     "qpavoid.kernels": "project: the compiled QP, which is compared with them",
     "qpavoid.geometry.bodies": "make_shape: free places for random obstacles",

@@ -55,11 +55,6 @@ def run_checked(scenario, steps):
     return limited, least, np.array(vs), q
 
 
-def limited_situation(course, acceleration, jerk):
-    fields = {**situation(course).model_dump(mode="json"), "limits": {"acceleration": acceleration, "jerk": jerk}}
-    return run_checked(changed("situation1", **fields), 1300)
-
-
 # --- moving obstacles --------------------------------------------------------------------------------------------
 
 
@@ -81,18 +76,6 @@ def test_distance_to_an_approaching_sphere_is_kept_to_2_mm(course, jerk):
     assert len(limited.relaxed) < 100
     assert all(s.status is Status.RELAXED and any("fist" in r.subject for r in s.reasons) for s in limited.relaxed)
     assert np.abs(vs).max() > 0.1
-
-
-@pytest.mark.parametrize("course", ["front 0.2", "head-on 0.4", "chase 0.3"])
-def test_distance_is_kept_under_tight_limits_with_relaxed_rows_reported(course):
-    """At 2 rad/s² and 10 rad/s³, where it takes 0.4 s until a joint brakes fully."""
-    fields = situation(course).model_dump(mode="json")
-    limited, least, _, _ = run_checked(
-        changed("situation1", **{**fields, "limits": {"acceleration": 2.0, "jerk": 10.0}}), 1300
-    )
-    assert least > SAFE - 2e-3
-    reasons = [reason for s in limited.relaxed for reason in s.reasons if "fist" in reason.subject]
-    assert any(reason.kind is ReasonKind.ROW_RELAXED for reason in reasons)
 
 
 @pytest.mark.parametrize("solver", ["qp", "hqp"])
@@ -180,13 +163,6 @@ def test_limits_hold_for_a_humanoid_over_its_contacts(solver):
     assert len(limited.relaxed) < (20 if solver == "hqp" else 1) and limited.most < 1.5
 
 
-@pytest.mark.parametrize("limits", [{"acceleration": 2.0, "jerk": 20.0}])
-def test_limits_hold_for_a_mobile_base(limits):
-    limited, least, vs, _ = run_checked(changed("tiago_column", limits=limits), 1200)
-    assert least > 0.012 - 1e-3 and np.abs(vs[:, :2]).max() > 0.05
-    assert not limited.relaxed and limited.most == pytest.approx(1.0, abs=1e-3)
-
-
 def test_limits_hold_for_a_floating_base_past_a_ball():
     """A trunk with six coordinates of its own, whose velocities are in its own axes; the ball is on its path."""
     robot = load("floating")
@@ -203,30 +179,3 @@ def test_limits_hold_for_a_floating_base_past_a_ball():
         vs.append(s.v)
     assert 0.02 - 1e-3 < least < 0.05
     assert np.abs(np.array(vs)[:, :3]).max() > 0.2 and not limited.relaxed
-
-
-@pytest.mark.parametrize("solver", ["qp", pytest.param("hqp", marks=pytest.mark.slow)])
-def test_limits_hold_with_an_attached_box_past_a_pole(solver):
-    limits = {"acceleration": 5.0, "jerk": 100.0}
-    limited, least, vs, _ = run_checked(changed("carried_box", solver=solver, limits=limits), 500)
-    assert least > 0.02 - 1e-3 and np.abs(vs).max() > 0.1
-    assert not limited.relaxed and limited.most == pytest.approx(1.0, abs=1e-3)
-
-
-def test_limits_hold_for_a_mimic_joint():
-    """Fingers that follow each other, one coordinate for both, closing on a ball."""
-    robot = load("mimic")
-    tool = robot.frame_id("l_gripper_r_finger_tip", "test")
-    data = robot.model.createData()
-    pin.framesForwardKinematics(robot.model, data, robot.home)
-    start = np.array(data.oMf[tool].translation)
-    ball = Obstacle.at("ball", Sphere(radius=0.06), start - [0.0, 0.15, 0.0])
-    controller = make_controller(
-        robot, [ball], "l_gripper_r_finger_tip", limits=Limits(acceleration=4.0, jerk=80.0), task={"max_speed": 0.4}
-    )
-    limited, ruler, least, q = Limited(controller), Ruler(controller.scene), np.inf, robot.home.copy()
-    for k in range(300):
-        s = limited.check(controller.step(q, 0.01 * k, {"l_gripper_r_finger_tip": Sample.at(start - [0.0, 0.3, 0.0])}))
-        q = pin.integrate(robot.model, q, 0.01 * s.v)
-        least = min(least, ruler.distances(q).min())
-    assert 0.02 - 1e-3 < least < 0.05 and not limited.relaxed

@@ -99,10 +99,10 @@ FINGERS = urdf(
 )  # fmt: skip
 ROVER = urdf(
     "rover",
-    {"chassis": (box(0.6, 0.4, 0.1), 0.1), "one": (cylinder(0.1, 0.05), 0), "two": (cylinder(0.1, 0.05), 0),
+    {"chassis": (box(0.6, 0.4, 0.1), 0.1), "wheel_one": (cylinder(0.1, 0.05), 0), "two": (cylinder(0.1, 0.05), 0),
      "pivot": None, "ball": ('<sphere radius="0.05"/>', 0), "arm": (cylinder(0.04, 0.3), 0.2),
      "fore": (cylinder(0.03, 0.3), 0.2), "crank": (cylinder(0.02, 0.1), 0.1)},
-    [("drive_a", "continuous", "chassis", "one", "0.2 0.25 0", "0 0 1", TURNS),
+    [("drive_a", "continuous", "chassis", "wheel_one", "0.2 0.25 0", "0 0 1", TURNS),
      ("left_wheel", "continuous", "chassis", "two", "0.2 -0.25 0", "0 1 0", TURNS),
      ("caster_swivel", "continuous", "chassis", "pivot", "-0.25 0 0", "0 0 1", TURNS),
      ("caster_roll", "continuous", "pivot", "ball", "-0.02 0 -0.05", "0 1 0", TURNS),
@@ -244,7 +244,7 @@ def test_mimic_drivers_are_free_in_check_and_add(tmp_path):
 
 @pytest.mark.parametrize(("root", "wheels"), [("planar", True), ("free_flyer", True), ("fixed", False)])
 def test_wheels_of_a_mobile_base_are_locked_and_named(tmp_path, root, wheels):
-    """By name, or as round shapes on the ground that turn about a horizontal axis; a shoulder or a crank is neither."""
+    """By their names or those of their links; a shoulder or a crank is none."""
     _, described = made(tmp_path, "rover", root=root)
     locked = {"drive_a", "left_wheel", "caster_swivel", "caster_roll"} if wheels else set()
     assert set(described.config.lock) == locked

@@ -26,20 +26,6 @@ def assert_equal(a: Log, b: Log) -> None:
         assert getattr(a, name).dtype == getattr(b, name).dtype, name
 
 
-def test_arrays_have_the_documented_shapes(log):
-    n, tasks, bodies, obstacles = 21, 1, len(log.meta["bodies"]), 2
-    assert np.allclose(log.t, 0.01 * np.arange(n))
-    assert log.q.shape == (n, 7)
-    assert log.v.shape == (n, 7)
-    assert log.target.shape == log.tool.shape == (n, tasks, 3)
-    assert log.tool_rotation.shape == (n, tasks, 3, 3)
-    assert log.body_distance.shape == (n, bodies)
-    assert log.body_ends.shape == (n, bodies, 2, 3)
-    assert log.obstacle_position.shape == (n, obstacles, 3)
-    assert log.obstacle_rotation.shape == (n, obstacles, 3, 3)
-    assert all(len(getattr(log, name)) == n for name in ARRAYS)
-
-
 def test_log_steps_integrate_velocities(log):
     """Each tick follows from the one before."""
     assert np.allclose(np.diff(log.q, axis=0), 0.01 * log.v[:-1], atol=1e-12)
@@ -118,21 +104,6 @@ def test_interrupt_keeps_what_was_done(log, tmp_path):
     partial = simulate(load_scenario("panda_line", SHORT), progress=interrupt)
     assert_partial(partial, 7, log, tmp_path)
     assert "keyboard" in partial.meta["stopped_by"]
-
-
-def test_interrupt_before_the_first_tick_is_over(monkeypatch, tmp_path):
-    tick, calls = Controller.tick, []
-
-    def interrupted(self, *args):
-        calls.append(args)
-        if len(calls) == 3:  # the first two warm up and check the start
-            raise KeyboardInterrupt
-        return tick(self, *args)
-
-    monkeypatch.setattr(Controller, "tick", interrupted)
-    log = simulate(load_scenario("situation1", SHORT))
-    assert len(log.t) == 0
-    assert Log.load(log.save(tmp_path / "none")).metrics()["completed"] is False
 
 
 def said(log: Log) -> list[tuple]:

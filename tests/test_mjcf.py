@@ -2,7 +2,6 @@
 
 from collections import Counter
 
-import numpy as np
 import pytest
 from test_loading import load
 from urdfs import write
@@ -88,10 +87,3 @@ def test_geom_that_would_be_lost_is_refused(tmp_path, geoms, message):
     with pytest.raises(ConfigError) as error:
         load(write(tmp_path, mjcf(second=geoms), "m.xml"), limits=speeds())
     assert "m.xml" in str(error.value) and message in str(error.value)
-
-
-def test_speeds_that_no_mjcf_gives_are_assumed(tmp_path):
-    robot, (message,) = load(write(tmp_path, mjcf(), "m.xml"))
-    assert "limit j1, j2: no velocity limit is given: 1 rad/s is assumed" in message
-    np.testing.assert_array_equal(robot.bounds().velocity, [1.0, 1.0])
-    assert robot.end_effectors == ("two",)

@@ -145,7 +145,6 @@ def crossing(left, right):
         "q0": [*LEFT.tolist(), *RIGHT.tolist()],
         "tasks": [{"frame": f, "motion": m} for f, m in zip(("left_tool", "right_tool"), lines, strict=True)],
         "avoidance": {"d1": 0.02, "d2": 0.15, "row": {"type": "beta", "near_speed": 10.0}},
-        "tracking_damping": 0.05,
         "duration": 10.0,
     }
     scenario = ScenarioConfig.model_validate(fields).with_source(SHIPPED)

@@ -82,15 +82,6 @@ def test_voxels_contain_every_point(resolution):
     assert nearest.max() <= voxel_radius(resolution)
 
 
-def test_voxel_keys_are_independent_of_the_other_points():
-    rng = np.random.default_rng(2)
-    points = scattered(rng)
-    first, second = Voxels.of(points, 0.02), Voxels.of(np.concatenate((scattered(rng), points[::-1])), 0.02)
-    where = np.searchsorted(second.keys, first.keys)
-    np.testing.assert_array_equal(second.keys[where], first.keys)
-    np.testing.assert_array_equal(second.centers[where], first.centers)
-
-
 def test_voxels_drop_points_that_are_no_numbers():
     points = scattered(np.random.default_rng(3), 20)
     points[3], points[7, 1], points[9, 2] = np.nan, np.inf, 1e6

@@ -1,11 +1,13 @@
 """A stalled task is reported, with what is in the way."""
 
 import numpy as np
+import pinocchio as pin
 import pytest
-from closed_loop import cartesian, drive, make_controller
+from closed_loop import cartesian, drive, make_controller, planar
+from conftest import frames
 
-from qpavoid import Avoidance, Obstacle, ReasonKind, Sample, Severity
-from qpavoid.config import Box, Capsule, Sphere
+from qpavoid import Avoidance, Controller, Obstacle, ReasonKind, Sample, Severity, build_scene, build_tasks
+from qpavoid.config import Box, Capsule, Sphere, Task
 from qpavoid.run.simulate import simulate
 
 D1, GOAL = 0.03, np.array([0.6, 0.0, 0.0])
@@ -41,11 +43,11 @@ def test_stalled_names_the_obstacle_exactly_head_on(tmp_path, solver, shape):
     q, reported, _ = run_to(head_on(tmp_path, solver, shape), 1500)
     assert np.linalg.norm(q[-1] - GOAL) > 0.11 and np.abs(q[-1] - q[-300]).max() < 2e-3
     first = next(k for k, reasons in enumerate(reported) if reasons)
-    assert 100 <= first < 400  # a second without progress
+    assert 50 <= first < 350  # half a second without progress
     for (reason,) in reported[first:]:
         assert (reason.kind, reason.subject, reason.unit) == (ReasonKind.STALLED, ("tool", shape), "m/s")
         # v_tracking has the task's full speed; the row is zero at d1, where qp rests, and allows 50 mm/s farther out
-        assert reason.amount == pytest.approx(0.3, abs=5e-3) or (solver == "eq10" and 0.25 < reason.amount < 0.3)
+        assert reason.amount == pytest.approx(0.3, abs=0.02) or (solver == "eq10" and 0.25 < reason.amount < 0.3)
         assert reason.severity is Severity.WARNING
 
 
@@ -78,8 +80,102 @@ def test_stalled_ends_once_the_obstacle_has_left(tmp_path):
     assert not any(reported[505:]) and np.linalg.norm(q[-1] - GOAL) < 1e-4
 
 
-@pytest.mark.parametrize(("scenario", "longest"), [("situation1", 2.0), ("situation2", 0.0), ("panda_line", 0.0)])
+@pytest.mark.parametrize(("scenario", "longest"), [("situation1", 4.0), ("situation2", 0.0), ("panda_line", 0.0)])
 def test_stalled_raises_no_false_alarm(scenario, longest):
     """Slowed down or pushed aside is not stalled; in Situation 1 the tool waits for its target to return."""
     metrics = simulate(scenario).metrics()
     assert metrics["time_blocked"] <= longest and metrics["arrived"]
+
+
+# --- out of reach, singular ---------------------------------------------------------------------------------------
+
+
+def rest_time(ticks, dt=0.01, speed=5e-3):
+    """Time from which on no joint is faster than so much [s]."""
+    moving = [k for k, tick in enumerate(ticks) if np.abs(tick.solution.v).max() > speed]
+    return dt * (moving[-1] + 1 if moving else 0)
+
+
+def test_target_beyond_reach_is_named_within_a_second_and_no_longer_once_it_comes_back(tmp_path):
+    """Named with what is missing, after the arm has come to rest; a target within reach ends it at once."""
+    robot, last = planar(tmp_path), np.array([0.5, 0.6, 0.0])
+
+    def target(t):
+        return last if t >= 6.0 else 1.4 * np.array([0.6, 0.8, 0.0])
+
+    ticks = list(drive(make_controller(robot, frame="tip"), robot.home, 900, target=target))
+    first = next(k for k, tick in enumerate(ticks) if tick.solution.stalled)
+    assert 0.01 * first <= rest_time(ticks[:600]) + 1.0
+    for tick in ticks[first:600]:
+        (reason,) = tick.solution.stalled
+        assert (reason.kind, reason.subject, reason.unit) == (ReasonKind.OUT_OF_REACH, ("tip",), "m")
+    assert reason.amount == pytest.approx(0.3, abs=5e-3) and "out of reach by 300" in str(reason)
+    assert not any(tick.solution.stalled for tick in ticks[620:])
+    (end,) = frames(robot, ["tip"], ticks[-1].state.q)
+    assert np.linalg.norm(end.translation - last) < 2e-3
+
+
+def test_straight_arm_that_has_to_bend_is_singular(tmp_path):
+    """Exactly along the arm, no joint brings the tool nearer at first order: it rests there, and says so."""
+    robot = planar(tmp_path, home=(0.0, 0.0, 0.0))
+    ticks = list(drive(make_controller(robot, frame="tip"), robot.home, 120, target=[0.6, 0.0, 0.0]))
+    assert np.abs([tick.solution.v for tick in ticks]).max() < 1e-6
+    (reason,) = ticks[100].solution.stalled
+    assert (reason.kind, reason.subject, reason.unit) == (ReasonKind.SINGULAR, ("tip",), "m")
+    assert reason.amount == pytest.approx(0.5, abs=1e-6)
+
+
+def test_moving_target_is_followed_without_alarm(panda):
+    """A lag is no stall: the target goes round at 0.2 m/s without a twist given."""
+    (pose,) = frames(panda, ["panda_hand_tcp"], panda.home)
+
+    def target(t):
+        return pose.translation + 0.1 * np.array([0.0, np.sin(2.0 * t), np.cos(2.0 * t) - 1.0])
+
+    ticks = list(drive(make_controller(panda, frame="panda_hand_tcp"), panda.home, 500, target=target))
+    assert not any(tick.solution.stalled for tick in ticks)
+
+
+def play_goal(panda, number, rng):
+    """Errors and reasons of 8 s towards a random goal: within reach, beyond it, or behind a ball."""
+    tool, bounds = "panda_hand_tcp", panda.bounds()
+    kind, task = ("within", "beyond", "behind")[number % 3], "position" if number % 2 else "pose"
+    (start,) = frames(panda, [tool], panda.home)
+    while True:
+        (goal,) = frames(panda, [tool], rng.uniform(bounds.lower, bounds.upper))
+        if goal.translation[2] > 0.1 and np.linalg.norm(goal.translation[:2]) > 0.25:
+            break
+    place, obstacles = goal.translation.copy(), []
+    if kind == "beyond":
+        direction = np.abs(rng.normal(size=3)) * [rng.choice([-1.0, 1.0]), rng.choice([-1.0, 1.0]), 1.0]
+        reach = 0.87 + rng.choice([0.02, 0.1, 0.4])
+        place = np.array([0.0, 0.0, 0.333]) + reach * direction / np.linalg.norm(direction)
+    if kind == "behind":
+        ball = start.translation + 0.6 * (place - start.translation) if rng.random() < 0.5 else place + 0.02
+        if np.linalg.norm(ball - start.translation) > 0.2:
+            obstacles = [Obstacle.at("ball", Sphere(radius=0.07), ball)]
+    tasks = build_tasks([Task(frame=tool, type=task)], panda, panda.home)
+    controller, q = Controller(build_scene(panda, obstacles), tasks, dt=0.02), panda.home
+    errors, said, target = [], [], {tool: Sample.at(place, goal.rotation)}
+    for k in range(400):
+        tick = controller.tick(q, 0.02 * k, target)
+        errors.append(np.linalg.norm(tick.problem.tracking.b) / 2.0)
+        said.append(tick.solution.stalled)
+        q = pin.integrate(panda.model, q, 0.02 * tick.solution.v)
+    return np.array(errors), said
+
+
+@pytest.mark.parametrize("count", [24, pytest.param(201, marks=pytest.mark.slow)])
+def test_goals_that_are_not_reached_are_named(panda, count):
+    """Random goals of a Panda: at most 3 % of those where the arm rests short of them go without a reason, and none
+    that is reached within 2.5 mm was ever named more than 5 mm off it.
+    """
+    rng, short, missed, false = np.random.default_rng(5), 0, 0, 0
+    for number in range(count):
+        e, said = play_goal(panda, number, rng)
+        if e[-1] < 2.5e-3:
+            false += any(reasons and error > 5e-3 for reasons, error in zip(said, e, strict=True))
+        elif abs(e[-40] - e[-1]) < max(0.5e-3, 0.01 * e[-1]):
+            short += 1
+            missed += not said[-1]
+    assert short > count / 4 and missed <= 0.03 * short and false == 0

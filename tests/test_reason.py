@@ -146,8 +146,7 @@ def test_noise_at_twice_the_safety_distance_informs(tmp_path, given, sigma, seed
 
     ticks = list(drive(controller, np.zeros(3), 500, target=target, obstacles=seen))
     near = sum(0.035 < tick.proximity.distance.min(initial=1.0) < 0.045 for tick in ticks)
-    relaxed = sum(tick.solution.status is Status.RELAXED for tick in ticks)
-    assert near > 40 and relaxed > 0  # noise pushes the tool off, and has rows relaxed
+    assert near > 40
     assert {tick.solution.severity for tick in ticks} <= {None, Severity.INFO}
 
 
@@ -160,7 +159,7 @@ def squeezed(gap: float) -> Problem:
     b = np.array([0.1, -0.1 + gap])
     rows = AvoidanceRows(np.arange(2), d, J, b, 0.02, 0.1, b - 1.0)
     names = [("body0", "obstacle0"), ("body1", "obstacle1")]
-    return make_problem(Tracking(np.eye(2), np.ones(2), 0.01), rows, -np.ones(2), np.ones(2), names)
+    return make_problem(Tracking(np.eye(2), np.ones(2), np.ones(2)), rows, -np.ones(2), np.ones(2), names)
 
 
 @pytest.mark.parametrize("solver", ["qp", "qp:daqp", "hqp"])

@@ -131,7 +131,7 @@ def test_what_comes_is_evaded_at_full_speed(panda):
 @pytest.mark.parametrize(("name", "dt"), [("panda", 0.01), ("ur5", 0.01), ("ur5", 0.002)])
 @pytest.mark.parametrize("side", [-1, 1])
 def test_a_joint_outside_its_limit_comes_back_slowly(name, dt, side):
-    """3° outside, told to hold the tool: while it is 2 mrad outside or more, no joint exceeds 0.2 rad/s."""
+    """3° outside, with a task that holds the tool: while it is 2 mrad outside or more, no joint exceeds 0.2 rad/s."""
     robot = Robot.load(name)
     bounds, q = robot.bounds(), robot.home.copy()
     joint, edge = bounds.q_index[0], (bounds.upper if side > 0 else bounds.lower)[0]

@@ -29,7 +29,8 @@ def random_problem(seed):
     hard = rng.uniform(-1.0, 0.0, NV), rng.uniform(0.0, 1.0, NV)
     last, step = rng.uniform(*hard), rng.uniform(0.03, 0.4, NV)
     soft = np.maximum(hard[0], last - step), np.minimum(hard[1], last + step)
-    tracking = Tracking(rng.normal(size=(3, NV)), rng.normal(size=3), 0.01)
+    A, task = rng.normal(size=(3, NV)), rng.normal(size=3)
+    tracking = Tracking(A, task, task)
     names = [(f"body{i}", f"obstacle{i}") for i in range(PAIRS)]
     return make_problem(tracking, rows, *soft, names, hard, np.clip(0.9 * last, *soft))
 

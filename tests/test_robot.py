@@ -36,29 +36,6 @@ def frame_pose(robot, name, q):
 # --- where robots come from ----------------------------------------------------------------------------------------
 
 
-def test_bare_urdf_and_robot_yaml_give_the_same(tmp_path):
-    urdf = write_chain(tmp_path)
-    (tmp_path / "robot.yaml").write_text("name: chain\nurdf: chain.urdf\n")
-    bare, described = Robot.load(str(urdf)), Robot.load(str(tmp_path / "robot.yaml"))
-    assert bare.name == described.name == "chain" and bare.model == described.model
-    assert bare.bodies.collisionPairs.tolist() == described.bodies.collisionPairs.tolist()
-    np.testing.assert_array_equal(bare.home, described.home)
-    poses, others = (body_poses(robot, np.array([0.3, -0.4, 0.5])) for robot in (bare, described))
-    np.testing.assert_equal(poses, others)
-
-
-@pytest.mark.filterwarnings("ignore::qpavoid.model.notes.RobotWarning")  # hips that are near at home
-def test_prefix_of_example_robot_data(tmp_path):
-    path = tmp_path / "robot.yaml"
-    path.write_text(
-        "name: dog\nurdf: example-robot-data:go2_description/urdf/go2.urdf\nroot_joint: free_flyer\n"
-        "visuals: false\nlimits: {velocity: {root_joint: [1, 1, 1, 2, 2, 2]}}\n"
-    )
-    robot = Robot.load(str(path))
-    assert (robot.model.nq, robot.model.nv) == (19, 18)
-    assert robot.coordinate_names[5:7] == ["root_joint.5", robot.joint_names[1]]
-
-
 def test_robot_of_ones_own_in_a_scenario(tmp_path):
     folder = tmp_path / "mine"
     folder.mkdir()
@@ -251,13 +228,6 @@ def test_broken_urdf_is_one_line_and_nothing_else(tmp_path, capfd, text):
     with pytest.raises(ConfigError, match=r"broken\.urdf: not a usable URDF: \w+") as error:
         Robot.from_urdf(path)
     assert "\n" not in str(error.value)
-    assert capfd.readouterr() == ("", "")
-
-
-def test_unreadable_mesh(tmp_path, capfd):
-    (tmp_path / "part.stl").write_text("no mesh")
-    with pytest.raises(ConfigError, match=r"chain\.urdf.*part\.stl"):
-        Robot.from_urdf(write_chain(tmp_path, shape='<mesh filename="part.stl"/>'))
     assert capfd.readouterr() == ("", "")
 
 

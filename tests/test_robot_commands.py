@@ -6,7 +6,6 @@ import re
 import shlex
 
 import numpy as np
-import pinocchio as pin
 import pytest
 import yaml
 from conftest import EXAMPLES, write_chain
@@ -247,33 +246,6 @@ def test_added_base_has_the_speed_limit_that_was_assumed(cli, tmp_path, root, si
     added = Robot.load(path)
     np.testing.assert_array_equal(added.bounds().velocity, bare.bounds().velocity)
     assert not any("root_joint" in note.subject for note in added.notes)
-
-
-def test_an_added_robot_runs_at_once(cli, tmp_path):
-    """From a URDF to a run that stays clear, in two commands and a scenario."""
-    urdf = EXAMPLES / "ur_description/urdf/ur10_robot.urdf"
-    home = [
-        word for j in ("shoulder_lift_joint=-1.57", "elbow_joint=1.57", "wrist_2_joint=-1.57") for word in ("--home", j)
-    ]
-    assert cli("robot", "add", urdf, "--name", "mine", *home, "--samples", "200").status == 0
-    scenario = {
-        "robot": "mine/robot.yaml",
-        "tasks": [{"frame": "tool0", "type": "position", "motion": {"type": "line", "displacement": [0, 0.3, 0],
-                   "speed": 0.15}}],
-        "obstacles": [{"name": "ball", "shape": {"type": "sphere", "radius": 0.05}, "motion": {"type": "fixed",
-                       "position": None}}],
-        "avoidance": {"d1": 0.02, "d2": 0.1}, "duration": 4.0,
-    }  # fmt: skip
-    robot = Robot.load("mine/robot.yaml")
-    data = robot.model.createData()
-    pin.framesForwardKinematics(robot.model, data, robot.home)
-    tool = data.oMf[robot.frame_id("tool0", "test")].translation
-    scenario["obstacles"][0]["motion"]["position"] = (tool + np.array([0.0, 0.17, -0.02])).tolist()
-    (tmp_path / "scene.yaml").write_text(yaml.safe_dump(scenario))
-    assert simulate(load_scenario("scene.yaml", solver="tracking")).metrics()["collided"]
-    result = json.loads(cli("run", "scene.yaml", "--no-figures", "--json").stdout)
-    at_home = touching(robot, robot.home, 0.02)  # pairs that are nearer than the margin from the start
-    assert not result["collided"] and result["min_distance"] > min([0.02, *(d for _, _, d in at_home)]) - 1e-3
 
 
 # --- robots that ship -----------------------------------------------------------------------------------------

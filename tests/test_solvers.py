@@ -11,7 +11,6 @@ from qpavoid.config import Eq10Solver
 from qpavoid.errors import SolverNotInstalled
 from qpavoid.problem import AvoidanceRows, Tracking, make_problem
 from qpavoid.solvers import qp
-from qpavoid.solvers.analytic import tracking_velocity
 from qpavoid.solvers.backends import make_backend
 
 
@@ -29,12 +28,13 @@ EXACT = ("daqp", "quadprog", "native")
 BACKENDS = (*EXACT, "proxqp", "osqp")
 
 
-def random_problem(seed: int, pairs: int = 3, damping: float = 0.0, rows: int = 3, limit: float = 2.0) -> Problem:
+def random_problem(seed: int, pairs: int = 3, rows: int = 3, limit: float = 2.0) -> Problem:
     rng = np.random.default_rng(seed)
     d = rng.uniform(0.12, D2, pairs)
     b = -5.0 * (d - 0.12) * rng.uniform(0, 1, pairs) + 0.05 * rng.normal(size=pairs)
     avoidance = AvoidanceRows(np.arange(pairs), d, rng.normal(size=(pairs, NV)), b, D1, D2, b - 10.0)
-    tracking = Tracking(rng.normal(size=(rows, NV)), 0.3 * rng.normal(size=rows), damping)
+    A, task = rng.normal(size=(rows, NV)), 0.3 * rng.normal(size=rows)
+    tracking = Tracking(A, task, task)
     names = [(f"body{i}", f"obstacle{i}") for i in range(pairs)]
     return make_problem(tracking, avoidance, np.full(NV, -limit), np.full(NV, limit), names)
 
@@ -59,7 +59,7 @@ def test_literal_law_takes_the_primary_motion_away_twice(seed):
     """J_d q̇ = (1 - α) u + β (ẋ0 - u), u = J_d J⁺ẋ, for an undamped (J_d N)⁺."""
     problem = random_problem(seed)
     J_d, a, b = closest_row(problem)
-    u = J_d @ tracking_velocity(problem)
+    u = J_d @ problem.v_tracking
     v = make_solver(Eq10Solver(name="eq10-literal", damping=0.0)).solve(problem).v
     assert J_d @ v == pytest.approx((1 - a) * u + b * (0.1 - u), abs=1e-10)
 
@@ -69,7 +69,7 @@ def test_consistent_law_blends_what_is_left_of_the_primary_motion_with_retreat(s
     """J_d q̇ = (1 - β)(1 - α) u + β ẋ0, with α only while u < 0."""
     problem = random_problem(seed)
     J_d, a, b = closest_row(problem)
-    u = J_d @ tracking_velocity(problem)
+    u = J_d @ problem.v_tracking
     a = a if u < 0 else 0.0
     v = make_solver(Eq10Solver(name="eq10", damping=0.0)).solve(problem).v
     assert J_d @ v == pytest.approx((1 - b) * (1 - a) * u + b * 0.1, abs=1e-10)
@@ -80,7 +80,7 @@ def test_only_alpha_moves_the_tool_off_its_path(seed, name, damping):
     """J (J_d N)⁺ = 0: whatever β does, A q̇ = b - α u A J_d⁺."""
     problem = random_problem(seed)
     J_d, a, _ = closest_row(problem)
-    u = J_d @ tracking_velocity(problem)
+    u = J_d @ problem.v_tracking
     a = a if u < 0 or name == "eq10-literal" else 0.0
     v = make_solver(Eq10Solver(name=name, damping=damping)).solve(problem).v
     expected = problem.tracking.b - a * u * (problem.tracking.A @ J_d) / (J_d @ J_d)
@@ -93,7 +93,7 @@ def test_key_point_at_the_tool_leaves_no_null_space_motion(seed):
     problem = random_problem(seed, pairs=1)
     n = np.array([0.6, 0.0, 0.8])
     problem = with_rows(problem, J=(n @ problem.tracking.A)[None])
-    primary = tracking_velocity(problem)
+    primary = problem.v_tracking
     J_d, a, _ = closest_row(problem)
     a = a if J_d @ primary < 0 else 0.0
     v = make_solver(Eq10Solver(name="eq10", damping=0.0)).solve(problem).v
@@ -110,19 +110,10 @@ def test_alpha_is_capped_in_contact():
 # --- tracking -------------------------------------------------------------------------------------------------
 
 
-@given(seeds, st.floats(0.001, 0.5))
-def test_tracking_minimises_the_damped_cost(seed, damping):
-    """The gradient of ‖A v - b‖² + λ²‖v‖² vanishes."""
-    problem = random_problem(seed, damping=damping, rows=6)
-    tracking, v = problem.tracking, tracking_velocity(problem)
-    gradient = tracking.A.T @ (tracking.A @ v - tracking.b) + damping**2 * v
-    np.testing.assert_allclose(gradient, 0.0, atol=1e-10)
-
-
 @given(seeds)
-def test_undamped_tracking_is_the_shortest_exact_velocity(seed):
+def test_tracking_is_the_shortest_exact_velocity(seed):
     problem = random_problem(seed)
-    tracking, v = problem.tracking, tracking_velocity(problem)
+    tracking, v = problem.tracking, problem.v_tracking
     np.testing.assert_allclose(tracking.A @ v, tracking.b, atol=1e-10)
     np.testing.assert_allclose(v, np.linalg.lstsq(tracking.A, tracking.b, rcond=None)[0], atol=1e-10)
 
@@ -134,7 +125,7 @@ def test_undamped_tracking_is_the_shortest_exact_velocity(seed):
 @given(seeds, st.sampled_from(BACKENDS), st.integers(0, 8))
 def test_qp_meets_rows_and_bounds_and_is_optimal(seed, backend, pairs):
     """KKT by projection: no feasible direction towards v0 in the metric P is left."""
-    problem = random_problem(seed, pairs=pairs, damping=0.01)
+    problem = random_problem(seed, pairs=pairs)
     solution = make_solver(f"qp:{backend}").solve(problem)
     rows = problem.avoidance
     if solution.status is not Status.SOLVED:
@@ -142,7 +133,7 @@ def test_qp_meets_rows_and_bounds_and_is_optimal(seed, backend, pairs):
     slackness = rows.J @ solution.v - rows.b
     assert np.all(slackness > -1e-6)
     assert np.all((solution.v >= problem.lower) & (solution.v <= problem.upper))
-    v_tracking, tracking = tracking_velocity(problem), problem.tracking
+    v_tracking, tracking = problem.v_tracking, problem.tracking
     P = tracking.A.T @ tracking.A + 1e-3 * np.eye(NV)
     reference = qpsolvers.solve_qp(
         P, -P @ v_tracking, -rows.J if pairs else None, -rows.b if pairs else None,
@@ -153,9 +144,9 @@ def test_qp_meets_rows_and_bounds_and_is_optimal(seed, backend, pairs):
 
 @given(seeds)
 def test_qp_returns_the_tracking_velocity_bit_for_bit_when_that_is_safe(seed):
-    problem = random_problem(seed, damping=0.01, limit=np.inf)
+    problem = random_problem(seed, limit=np.inf)
     rows = problem.avoidance
-    v_tracking = tracking_velocity(problem)
+    v_tracking = problem.v_tracking
     problem = with_rows(problem, b=rows.J @ v_tracking - 1e-9)
     assert np.array_equal(make_solver("qp").solve(problem).v, v_tracking)
 
@@ -167,7 +158,7 @@ def threatened(J: np.ndarray, d: np.ndarray, feedforward: float = 0.0, free: flo
     """Damper rows at distances d, with accelerations that leave `free` of a speed limit of 2."""
     b = np.minimum(XI * (D1 - d), 0.2) - feedforward
     rows = AvoidanceRows(np.arange(len(d)), d, J, b, D1, D2, np.minimum(-XI * d - feedforward, b))
-    base = random_problem(5, pairs=len(d), damping=0.01)
+    base = random_problem(5, pairs=len(d))
     bounds = np.full(NV, -free), np.full(NV, free)
     return make_problem(base.tracking, rows, *bounds, base.pair_names, (base.lower, base.upper))
 
@@ -228,9 +219,9 @@ ANSWERS = [lambda *_: None, lambda *_: np.full(NV, np.nan), lambda *_: np.full(N
 
 @pytest.mark.parametrize("answer", ANSWERS)
 def test_a_failing_or_wrong_back_end_is_replaced_then_stops(answer, monkeypatch):
-    problem = random_problem(7, pairs=2, damping=0.01)
+    problem = random_problem(7, pairs=2)
     rows = problem.avoidance
-    problem = with_rows(problem, b=rows.J @ tracking_velocity(problem) + 1.0)._replace(v_stop=np.full(NV, 0.05))
+    problem = with_rows(problem, b=rows.J @ problem.v_tracking + 1.0)._replace(v_stop=np.full(NV, 0.05))
     for relaxed in (problem, squeezed((0.145, 0.175))._replace(v_stop=problem.v_stop)):
         expected = make_solver("qp:daqp").solve(relaxed)
         with monkeypatch.context() as patch:

@@ -23,7 +23,7 @@ from in_process import InProcess
 pytest.importorskip("distributed")
 pytest.importorskip("mujoco")
 
-from qpavoid.config.shipped import family_names, suite_names
+from qpavoid.config.shipped import shipped_names
 from qpavoid.errors import ConfigError
 from qpavoid.run.pool import ClusterLost, ClusterWorkers, Workers
 from qpavoid_bench.arena import commands, sweep
@@ -59,20 +59,19 @@ import os, time
 from dataclasses import dataclass
 import numpy as np
 from qpavoid import Solution
-from qpavoid.solvers.analytic import tracking_velocity
 
 @dataclass
 class Halved:
     """A class with solve."""
     share: float = 0.5
     def solve(self, problem):
-        return Solution(self.share * tracking_velocity(problem))
+        return Solution(self.share * problem.v_tracking)
 
 def solution(problem):
-    return Solution(tracking_velocity(problem))
+    return Solution(problem.v_tracking)
 
 def velocity(problem, scale=1.0):
-    return scale * tracking_velocity(problem)
+    return scale * problem.v_tracking
 
 class Still:
     def __init__(self, case, world):
@@ -186,19 +185,6 @@ def test_store_keeps_rows_of_a_killed_writer(tmp_path):
     assert read_runs(tmp_path)["case"].to_list() == [*map(str, range(20)), "ours"]
 
 
-def test_store_errors_name_file_and_remedy(tmp_path):
-    with pytest.raises(ConfigError, match="no results here"):
-        read_runs(tmp_path)
-    (tmp_path / FILE).write_text("not a database, though long enough to be one" * 100)
-    with pytest.raises(ConfigError, match=rf"{FILE}.*move the damaged file away"):
-        read_runs(tmp_path)
-    with pytest.raises(ConfigError, match=rf"give a folder that can be written, with no damaged {FILE} in it"):
-        Store(tmp_path)
-    (tmp_path / "file").write_text("")
-    with pytest.raises(ConfigError, match=r"file: .*give a folder that can be written"):
-        Store(tmp_path / "file")
-
-
 # --- what is missing ---------------------------------------------------------------------------------------------
 
 
@@ -256,9 +242,9 @@ def test_digest_changes_with_settings_and_families(folder):
 
 
 def test_suites_that_ship():
-    assert all(load_suite(name).seeds for name in suite_names())
+    assert all(load_suite(name).seeds for name in shipped_names("suite"))
     full = load_suite("full")
-    proved = [name for name in family_names() if load_family(name).config.proved]
+    proved = [name for name in shipped_names("family") if load_family(name).config.proved]
     assert sorted(family.name for family in full.families) == proved
     assert {entrant.name for entrant in full.entrants + full.absent} == set(ENTRANTS)
 
@@ -301,17 +287,6 @@ def test_suite_selects_entrants(folder, monkeypatch):
 def test_suite_errors_are_one_line(folder, fields, options, said):
     with pytest.raises(ConfigError, match=said):
         load_suite(write_suite(folder, **fields), **options)
-
-
-def test_entrant_from_file_digest_depends_on_text_only(folder):
-    """The digest of an own entrant follows its text and not its place."""
-    first = entrant_from_file(folder / "laws.py", "Halved")
-    (folder / "elsewhere").mkdir()
-    (folder / "elsewhere" / "laws.py").write_text(LAWS)
-    assert entrant_from_file(folder / "elsewhere" / "laws.py", "Halved").digest == first.digest
-    (folder / "laws.py").write_text(LAWS.replace("0.5", "0.4"))
-    assert entrant_from_file(folder / "laws.py", "Halved").digest != first.digest
-    assert first.description == "A class with solve."
 
 
 @pytest.mark.parametrize(
@@ -511,13 +486,6 @@ def test_bench_run_show_and_resume(cli, folder, monkeypatch):
     assert cli("bench", "show", out, "--family", "post", "--seed", 7, "--json").lines == [
         f"error: {out}: post has no seed 7; there are 2 from 0 to 1"
     ]
-
-
-def test_list_names_everything(cli):
-    document = json.loads(cli("bench", "list", "--json").stdout)
-    assert document["entrants"].keys() == ENTRANTS.keys() and set(suite_names()) == document["suites"].keys()
-    words = cli("bench", "list").stdout
-    assert all(name in words for heading in document.values() for name in heading)
 
 
 @pytest.mark.parametrize(

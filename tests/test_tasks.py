@@ -122,7 +122,7 @@ def test_align_task_reaches_any_direction(panda):
 
 def test_manipulability_task_keeps_the_tool(panda):
     tasks = config.Task(frame=TIP, gain=5.0), config.ManipulabilityTask(frame=TIP, gain=20.0, weight=1e-3)
-    controller = controller_of(panda, *tasks, tracking_damping=1e-3)
+    controller = controller_of(panda, *tasks)
     q0 = panda.configuration({"panda_joint2": -0.3, "panda_joint4": -2.9, "panda_joint6": 2.6}, "q0")
     before, target = controller.tick(q0).errors[0], sample(panda, TIP, q0)
     q = settle(controller, q0, targets={TIP: target})
@@ -133,7 +133,7 @@ def test_manipulability_task_keeps_the_tool(panda):
 def test_posture_task_acts_in_the_null_space_of_a_tool(panda):
     """A light posture draws the elbow to where it was; the tool stays where the tool's task has it."""
     tasks = config.Task(frame=TIP, type="pose"), config.PostureTask(weight=1e-3)
-    controller = controller_of(panda, *tasks, tracking_damping=1e-3)
+    controller = controller_of(panda, *tasks)
     q = settle(controller, pin.integrate(panda.model, panda.home, 0.3 * np.ones(7)), seconds=12.0)
     np.testing.assert_allclose(q, panda.home, atol=2e-3)
 
@@ -159,7 +159,7 @@ def test_relative_task_keeps_two_hands_on_an_object():
         config.RelativeTask(frame=names[1], relative_to=names[0], weight=100.0, orientation_weight=100.0, gain=5.0),
         config.DampingTask(weight=1e-6),
     ]
-    controller = controller_of(robot, *tasks, tracking_damping=1e-3)
+    controller = controller_of(robot, *tasks)
     a, b = frames(robot, names, robot.home)
     start, q = a.actInv(b), robot.home
     for tick in range(350):
@@ -204,7 +204,7 @@ def test_targets_of_the_wrong_kind_are_named(panda):
         ("posture", np.zeros(3), r"target 'posture': q: shape \(3,\), expected \(7,\)"),
         ("posture", Sample.at([0, 0, 0]), "target 'posture'"),
         ("damping", np.zeros(7), "target 'damping': a task of type damping takes none"),
-        (TIP, np.zeros(3), r"target 'panda_hand_tcp': neither .*; give Sample.at\(position"),
+        (TIP, np.zeros(7), r"target 'panda_hand_tcp': neither .*shape \(7,\).*; give a Sample, a Pose, a pin.SE3"),
     ]:
         with pytest.raises(NumericalError, match=message):
             controller.step(panda.home, targets={name: target})

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from qpavoid.config.shipped import family_names, robot_names, scenario_names, setup_names
+from qpavoid.config.shipped import shipped_names
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parent.parent
@@ -71,10 +71,10 @@ def test_wheel_holds_the_package_its_robots_and_scenarios(built):
     package = {name for name in names if ".dist-info/" not in name}
     assert {name for name in package if name.endswith(".py") and "_data/" not in name} == modules(Path())
     assert "qpavoid/py.typed" in package
-    assert {f"qpavoid/_data/robots/{name}/robot.yaml" for name in robot_names()} <= package
-    assert {f"qpavoid/_data/tasks/{name}.yaml" for name in scenario_names()} <= package
-    assert {f"qpavoid/_data/tasks/families/{name}.yaml" for name in family_names()} <= package
-    assert {f"qpavoid/_data/tasks/families/setups/{name}.yaml" for name in setup_names()} <= package
+    assert {f"qpavoid/_data/robots/{name}/robot.yaml" for name in shipped_names("robot")} <= package
+    assert {f"qpavoid/_data/tasks/{name}.yaml" for name in shipped_names("scenario")} <= package
+    assert {f"qpavoid/_data/tasks/families/{name}.yaml" for name in shipped_names("family")} <= package
+    assert {f"qpavoid/_data/tasks/families/setups/{name}.yaml" for name in shipped_names("setup")} <= package
     assert "qpavoid/_data/robots/paper-dual-arm/paper_dual_arm.urdf" in package
     assert {name.split("/")[0] for name in package} == {"qpavoid", "qpavoid_bench"}
     assert not any("__pycache__" in name or name.endswith((".npz", ".png")) for name in names)
@@ -100,7 +100,7 @@ def test_installed_wheel_runs_away_from_the_checkout(built, python, tmp_path):
     where = call(python, "-c", "import qpavoid; print(qpavoid.__file__)", cwd=tmp_path)
     assert ROOT not in Path(where.strip()).parents
     command = python.with_name("qpavoid.exe" if os.name == "nt" else "qpavoid")
-    assert call(command, "list", "scenarios", cwd=tmp_path).split() == scenario_names()
+    assert call(command, "list", "scenarios", cwd=tmp_path).split() == shipped_names("scenario")
     assert "qpavoid[arena]" in call(python, "-c", BENCH, cwd=tmp_path)  # the package is there, its dependencies are not
     arguments = ("--solver", "qp", "--set", "duration=0.5", "--no-figures", "--json")
     for scenario in ("situation1", "panda_line"):  # a robot that ships, and one from example-robot-data

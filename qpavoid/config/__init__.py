@@ -36,6 +36,7 @@ from qpavoid.config.solver import (
     PotentialFieldSolver,
     QpSolver,
     SolverConfig,
+    StepSearchSolver,
     TrackingSolver,
     expand_solver,
 )
@@ -54,11 +55,11 @@ from qpavoid.config.tasks import (
 )
 
 __all__ = [
-    "AlignTask", "AnyTask", "Avoidance", "Beta", "Block", "Body", "Box", "Capsule", "Circle", "ComTask",
-    "Cone", "Contact", "Csv", "Cylinder", "DampingTask", "Ellipsoid", "Eq10Solver", "Fixed",
-    "GradientProjectionSolver", "HalfSpace", "HqpSolver", "Hull", "JointLimits", "Limits", "Line", "LookAtTask",
-    "ManipulabilityTask", "Mesh", "Motion", "ObstacleConfig", "ObstacleShape", "PairMargin", "PointCloud",
-    "PostureTask", "PotentialFieldSolver", "Progress", "QpSolver", "RelativeTask", "RobotConfig", "ScenarioConfig",
-    "Sensing", "Shape", "SolverConfig", "Sphere", "Task", "TaskBlock", "TaskSwitching", "TrackingSolver", "Waypoints",
+    "AlignTask", "AnyTask", "Avoidance", "Beta", "Block", "Body", "Box", "Capsule", "Circle", "ComTask", "Cone",
+    "Contact", "Csv", "Cylinder", "DampingTask", "Ellipsoid", "Eq10Solver", "Fixed", "GradientProjectionSolver",
+    "HalfSpace", "HqpSolver", "Hull", "JointLimits", "Limits", "Line", "LookAtTask", "ManipulabilityTask", "Mesh",
+    "Motion", "ObstacleConfig", "ObstacleShape", "PairMargin", "PointCloud", "PostureTask", "PotentialFieldSolver",
+    "Progress", "QpSolver", "RelativeTask", "RobotConfig", "ScenarioConfig", "Sensing", "Shape", "SolverConfig",
+    "Sphere", "StepSearchSolver", "Task", "TaskBlock", "TaskSwitching", "TrackingSolver", "Waypoints",
     "expand_solver",
 ]  # fmt: skip

@@ -124,5 +124,5 @@ _LONG = 1e8
 class Progress(Block):
     """When a task counts as stalled."""
 
-    stalled_after: Positive = 1.0
+    stalled_after: Positive = 0.5
     """Time without progress after which a task counts as stalled [s]."""

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ValidationError
 
 from qpavoid.config import ScenarioConfig, expand_solver
 from qpavoid.config.explain import explain
-from qpavoid.config.shipped import find_scenario
+from qpavoid.config.shipped import find_shipped
 from qpavoid.config.text import read_text
 from qpavoid.config.yaml_file import parse_yaml
 from qpavoid.errors import ConfigError
@@ -33,7 +33,7 @@ def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), solve
     Raises:
         ConfigError, UnknownName: naming file, field and remedy.
     """
-    path = find_scenario(name_or_path)
+    path = find_shipped("scenario", name_or_path)
     return read_config(path, ScenarioConfig, overrides, solver).with_source(path)
 
 
@@ -55,12 +55,7 @@ def read_config(path: Path, model: type[Config], overrides: Sequence[str] = (), 
 
 
 def validate(data: dict[str, Any], model: type[Config], path: Path) -> Config:
-    """Validate fields as a configuration.
-
-    Args:
-        data: fields of a file, or what stands for one.
-        model: the configuration.
-        path: file to name in errors.
+    """Validate the fields of a file as a configuration.
 
     Raises:
         ConfigError: unknown key (with the nearest valid one) or bad value.

@@ -74,8 +74,6 @@ class ScenarioConfig(Block):
     obstacles: list[ObstacleConfig] = []
     spare_obstacles: Annotated[int, Field(ge=0, le=MAX_SPARE)] = 0
     """How many more a program may add by `Controller.add_obstacle`, at the same time [-]."""
-    tracking_damping: NonNegative = 0.01
-    """λ of the damped J⁺ of the tracking task, the same for every solver [-]; 0 gives the plain pseudo-inverse."""
     avoidance: Avoidance = Avoidance()
     limits: Limits = Limits()
     sensing: Sensing = Sensing()

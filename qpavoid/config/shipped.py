@@ -39,29 +39,9 @@ def _shipped(kind: str) -> dict[str, Path]:
     return dict(sorted((path.parent.name if "*/" in pattern else path.stem, path) for path in files))
 
 
-def robot_names() -> list[str]:
-    """List the names of the robots that ship."""
-    return list(_shipped("robot"))
-
-
-def scenario_names() -> list[str]:
-    """List the names of the scenarios that ship."""
-    return list(_shipped("scenario"))
-
-
-def family_names() -> list[str]:
-    """List the names of the families of scenarios that ship."""
-    return list(_shipped("family"))
-
-
-def suite_names() -> list[str]:
-    """List the names of the suites of the arena that ship."""
-    return list(_shipped("suite"))
-
-
-def setup_names() -> list[str]:
-    """List the robots that are set up for families: a posture, and locked joints."""
-    return list(_shipped("setup"))
+def shipped_names(kind: str) -> list[str]:
+    """List the names of what ships of a kind: `robot`, `scenario`, `family`, `suite`, or `setup` of a family."""
+    return list(_shipped(kind))
 
 
 def example_robot_data() -> Path:
@@ -86,30 +66,6 @@ def example_robot(name: str) -> Path:
     return example_robot_data() / "example-robot-data" / "robots" / name.removeprefix(EXAMPLES)
 
 
-def find_scenario(name_or_path: str | Path) -> Path:
-    """Find the path of a scenario file, given by shipped name or by path.
-
-    Raises:
-        ConfigError, UnknownName: there is none.
-    """
-    return _find("scenario", str(name_or_path))
-
-
-def find_family(name_or_path: str | Path) -> Path:
-    """Find the path of the file of a family of scenarios; as `find_scenario`."""
-    return _find("family", str(name_or_path))
-
-
-def find_suite(name_or_path: str | Path) -> Path:
-    """Find the path of the file of a suite of the arena; as `find_scenario`."""
-    return _find("suite", str(name_or_path))
-
-
-def find_setup(name: str) -> Path:
-    """Find the path of a shipped setup; as `find_scenario`."""
-    return _find("setup", name)
-
-
 def find_robot(name_or_path: str, folder: Path | None = None) -> Path:
     """Find a robot.yaml, URDF, xacro or MJCF, by shipped name or by path.
 
@@ -121,18 +77,23 @@ def find_robot(name_or_path: str, folder: Path | None = None) -> Path:
         ConfigError, UnknownName: there is none.
     """
     if name_or_path.startswith(EXAMPLES):
-        return _find("robot", str(example_robot(name_or_path)))
+        return find_shipped("robot", example_robot(name_or_path))
     if folder is not None and _looks_like_path(name_or_path) and os.path.isfile(folder / name_or_path):
         return folder / name_or_path
-    return _find("robot", name_or_path)
+    return find_shipped("robot", name_or_path)
 
 
 def _looks_like_path(name: str) -> bool:
     return "/" in name or "\\" in name or name.endswith((".yaml", ".yml", ".urdf", ".xml", ".xacro"))
 
 
-def _find(kind: str, name: str) -> Path:
-    shipped = _shipped(kind)
+def find_shipped(kind: str, name_or_path: str | Path) -> Path:
+    """Find the path of a file of a kind, given by shipped name or by path.
+
+    Raises:
+        ConfigError, UnknownName: there is none.
+    """
+    shipped, name = _shipped(kind), str(name_or_path)
     if name in shipped:
         return shipped[name]
     if _looks_like_path(name):

@@ -57,6 +57,18 @@ class PotentialFieldSolver(SolverBlock):
     """Largest push of a pair, contact and penetration included [rad²/(m s)]."""
 
 
+class StepSearchSolver(SolverBlock):
+    """Step-wise search: of a grid of next joint steps, the collision-free one with the least error and motion."""
+
+    name: Literal["step-search"] = "step-search"
+    speed: Positive = 0.5
+    """Longest step of a joint, as a velocity; a quarter and a sixteenth of it are tried, too [rad/s or m/s]."""
+    motion_cost: NonNegative = 1e-3
+    """μ: cost of the motion beside that of the task's error [(rad/s)⁻²]."""
+    candidates: Annotated[int, Field(ge=1, le=100_000)] = 2000
+    """Most steps that are compared [-]: with so many, as many joints as possible may move at the same time."""
+
+
 class QpSolver(SolverBlock):
     """QP: tracking as cost, avoidance rows as inequalities, joint limits as bounds."""
 
@@ -89,7 +101,13 @@ def expand_solver(value: Any) -> Any:
 
 
 _Solver = Annotated[
-    TrackingSolver | Eq10Solver | GradientProjectionSolver | PotentialFieldSolver | QpSolver | HqpSolver,
+    TrackingSolver
+    | Eq10Solver
+    | GradientProjectionSolver
+    | PotentialFieldSolver
+    | StepSearchSolver
+    | QpSolver
+    | HqpSolver,
     Field(discriminator="name"),
 ]
 SolverConfig = Annotated[_Solver, BeforeValidator(expand_solver, json_schema_input_type=str | _Solver)]

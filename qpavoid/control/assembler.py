@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from qpavoid import kernels
-from qpavoid.control.contacts import ContactRows, tracking_within
+from qpavoid.control.contacts import ContactRows
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.jerk_stops import JerkStop, JerkStops
 from qpavoid.control.previous_velocity import PreviousVelocity
@@ -18,7 +18,7 @@ from qpavoid.control.tasks import RowTask, in_order
 from qpavoid.control.tasks.layout import TaskRows, task_levels
 from qpavoid.model.kinematics import ForwardKinematics, Kinematics
 from qpavoid.problem import Array, AvoidanceRows, Contacts, Problem, Proximity, Tracking
-from qpavoid.solvers.analytic import pseudo_inverse
+from qpavoid.solvers.hqp import cascade
 
 
 class RowAssembler:
@@ -54,11 +54,15 @@ class RowAssembler:
         self._stops = JerkStops(x, self._packed) if x.jerk_limited else None
         self.targets = x.targets
         """(f, 18) states that the frame tasks are to reach, see `trajectories`; to be written before `compute`."""
-        self._tracking, self._levels = Tracking(x.A, x.b, x.damping), task_levels(frames, row_tasks)
+        self._tracking, self._levels = Tracking(x.A, x.b, x.b_feasible), task_levels(frames, row_tasks)
         self._views: dict[int, tuple[Proximity, AvoidanceRows]] = {}
         self._task_rows = TaskRows(row_tasks, x.A, x.b)
         self.task_errors = self._task_rows.errors
         """How far each of the tasks that are not frames was from its target in the last step, in its unit."""
+        self.frame_errors, self.row_scale, self.row_tasks = x.errors, x.scale, x.row_tasks
+        """What frames lack to their targets; root of the weight and number of the task of each row: see `RowLayout`."""
+        self.frame_count, self.tasks = len(frames), (*frames, *row_tasks)
+        """Tasks in the order of `in_order`; the first `frame_count` are frames."""
         self._eye = np.eye(len(x.v_tracking))
         self._is_compiled = self._forward.is_compiled and self.query.is_compiled and not row_tasks and contacts is None
         self._q = scene.robot.home.copy()
@@ -79,7 +83,7 @@ class RowAssembler:
             self._packed = kernels.pack(self._layout)
             self._step = self._compile()
 
-    def _compile(self) -> Callable[..., tuple[int, int, int, int, float, bool, float]]:
+    def _compile(self) -> Callable[..., tuple[int, int, int, int, float, bool, float, float]]:
         """Return the code of `kernels.control_step` for this memory."""
         arguments = self._packed, self._q, self.influence_distance, False
         return kernels.direct(kernels.control_step, *arguments) if self._is_compiled else kernels.control_step
@@ -94,12 +98,12 @@ class RowAssembler:
         x, query, contacts = self._layout, self.query, None
         if self._is_compiled:  # one call in place of two: a microsecond less
             self._q[:] = q  # the code takes q as it is: in one piece, and writeable
-            near, rows, meeting, k, violation, clear, margin = self._step(
+            near, rows, meeting, k, violation, clear, margin, bent = self._step(
                 self._packed, self._q, self.influence_distance, query.is_moving
             )
             query.finish(near, rows, meeting)
             if meeting:
-                k, violation, clear, margin = self._assemble(q)
+                k, violation, clear, margin, bent = self._assemble(q)
         else:
             if self._finds_pairs:
                 self._q[:] = q
@@ -112,37 +116,42 @@ class RowAssembler:
             if self._contacts is not None:
                 contacts = self._contacts.update(self._forward)
                 x.v_prev[:] = contacts.project(x.v_prev)
-            k, violation, clear, margin = self._assemble(q)
+            k, violation, clear, margin, bent = self._assemble(q)
         proximity, avoidance = self._views.get(k) or self._view(k)
-        if x.task_switching and x.v_tracking[0] != x.v_tracking[0] and np.isfinite(x.A).all():
-            avoidance = self._follow_minimum_norm(avoidance)
         if contacts is not None:
-            violation = self._track_within(contacts, k)
+            bent, violation = self._track_within(contacts, k)
         return proximity, Problem(
             self._tracking, avoidance, x.lower, x.upper, *self._hard, x.v_stop, self._scene.pair_names,
             self._joint_names, self._joint_units, x.v_tracking, violation,
-            contacts, self._levels if len(self._levels) > 1 else (), x.jerk_limited, clear, margin,
+            contacts, self._levels if len(self._levels) > 1 else (), None, bent, x.jerk_limited, clear, margin,
         )  # fmt: skip
 
-    def _assemble(self, q: Array) -> tuple[int, float, bool, float]:
+    def _assemble(self, q: Array) -> tuple[int, float, bool, float, float]:
         """Write all rows and bounds, with kinematics and distances up to date; see `kernels.assemble`."""
-        summary: tuple[int, float, bool, float] = kernels.assemble(
+        summary: tuple[int, float, bool, float, float] = kernels.assemble(
             self._packed, q, self.query.pairs, self.influence_distance, self.query.is_moving
         )
         return summary
 
-    def _follow_minimum_norm(self, avoidance: AvoidanceRows) -> AvoidanceRows:
-        """Return the rows for the velocity of least norm, where task rows repeat each other."""
-        rows = self._tracking_rows(avoidance, pseudo_inverse(self._layout.A, 0.0) @ self._layout.b)
-        avoidance.b[:], avoidance.b_contact[:] = rows.b, rows.b_contact
-        return avoidance
-
-    def _track_within(self, contacts: Contacts, k: int) -> float:
-        """Let the tracking law hold the contacts, and return its largest violation."""
-        x = self._layout
-        x.v_tracking[:] = tracking_within(contacts, x.A, x.b, x.damping)
+    def _track_within(self, contacts: Contacts, k: int) -> tuple[float, float]:
+        """Let the tracking law hold the contacts; return how far the task rows bend, and its largest violation."""
+        x, v_particular = self._layout, contacts.v_particular
+        missing = x.b - x.A @ v_particular
+        A = x.A @ contacts.Z @ contacts.Z.T
+        bent = float(kernels.tracking_law(self._packed, A, missing, x.v_tracking, x.b_feasible))
+        x.v_tracking[:] += v_particular
+        x.b_feasible[:] += x.A @ v_particular
         self.previous.tighten_bounds()
-        return self._violation(k)
+        return bent, self._violation(k)
+
+    def _velocity(self, A: Array, b: Array) -> Array:
+        """Return the velocity (nv,) of the tracking law for rows A (r, nv) and b (r,), zero but for some tasks."""
+        x, feedback = self._layout, self._layout.feedback.copy()
+        x.feedback[~A[: len(feedback)].any(axis=1)] = 0.0
+        v, b_feasible = np.empty(A.shape[1]), np.empty(len(b))
+        kernels.tracking_law(self._packed, A, b, v, b_feasible)
+        x.feedback[:] = feedback
+        return v
 
     def _violation(self, k: int) -> float:
         """Return the largest violation by v_tracking, of which task-switching rows are made anew."""
@@ -150,13 +159,20 @@ class RowAssembler:
             kernels.row_bounds(self._packed, k, self.query.is_moving)
         return float(kernels.tracking_violation(self._packed, k))
 
+    def curvature(self, w: Array) -> Array:
+        """Return Σ w_r ∂²x_r/∂q² (nv, nv) of the rows of all frames; see `kernels.add_curvature`."""
+        G = np.zeros_like(self._eye)
+        for part in range(len(w) // 3):
+            kernels.add_curvature(self._packed, part, w[3 * part : 3 * part + 3], G)
+        return G
+
     def follow(self, v: Array, problem: Problem) -> Problem:
         """Return the problem of this step with the velocity v (nv,) to follow in place of the tasks."""
         x = self._layout
         x.v_tracking[:] = v if problem.contacts is None else problem.contacts.project(v)
         violation = self._violation(len(problem.avoidance.d))
-        tracking = Tracking(self._eye, x.v_tracking, 0.0)
-        return problem._replace(tracking=tracking, violation=violation, levels=(), tracking_is_clear=False)
+        tracking = Tracking(self._eye, x.v_tracking, x.v_tracking)
+        return problem._replace(tracking=tracking, violation=violation, levels=(), bent=0.0, tracking_is_clear=False)
 
     def within_jerks(self, problem: Problem) -> Problem:
         """Return the problem of this step with a tracking velocity that jerks allow, see `JerkStops.reachable`."""
@@ -166,22 +182,24 @@ class RowAssembler:
         reachable = self._stops.reachable(v_tracking)
         if problem.contacts is not None:
             reachable = problem.contacts.project(reachable)
-        tracking = problem.tracking._replace(b=problem.tracking.b + problem.tracking.A @ (reachable - v_tracking))
+        change = problem.tracking.A @ (reachable - v_tracking)
+        tracking = problem.tracking._replace(b=problem.tracking.b + change)
         rows = self._tracking_rows(problem.avoidance, reachable)
         violation = float(kernels.violation(reachable, rows.J, rows.b, problem.lower, problem.upper))
         return problem._replace(tracking=tracking, avoidance=rows, v_tracking=reachable, violation=violation)
 
-    def prioritised(self, problem: Problem, tracked: Callable[[Problem], Array]) -> Problem:
-        """Return the problem of this step with rows for what a cascade tracks, which is not v_tracking.
+    def prioritised(self, problem: Problem) -> Problem:
+        """Return the problem of this step with the velocities of its priorities, and rows for the last one.
 
         Args:
-            problem: as `compute` gave it.
-            tracked: gives that velocity (nv,).
+            problem: of several levels, as `compute` gave it.
         """
-        if not self._layout.task_switching:
-            return problem
-        rows = self._tracking_rows(problem.avoidance, tracked(problem))
-        return problem._replace(avoidance=rows, tracking_is_clear=False)
+        velocities = cascade(problem, self._velocity)
+        v, rows = velocities[-1], self._tracking_rows(problem.avoidance, velocities[-1])
+        violation = float(kernels.violation(v, rows.J, rows.b, problem.lower, problem.upper))
+        return problem._replace(
+            avoidance=rows, v_tracking=v, violation=violation, cascade=velocities, tracking_is_clear=False
+        )
 
     def _tracking_rows(self, rows: AvoidanceRows, v: Array) -> AvoidanceRows:
         """Return the rows for another tracked velocity (nv,); the same ones if they do not depend on it."""

@@ -20,7 +20,7 @@ from qpavoid.control.slots import ObstacleSlots
 from qpavoid.control.targets import TargetReader
 from qpavoid.control.tasks import RowTask
 from qpavoid.model.limits import OUTSIDE
-from qpavoid.model.sample import Sample
+from qpavoid.model.sample import POSE, Sample
 from qpavoid.problem import Array, Problem, Proximity
 from qpavoid.reason import Reason
 
@@ -60,9 +60,9 @@ class ProblemBuilder:
         self._clock = Clock(dt)
         units = [names[j] for j in bounds.v_index.tolist()]
         self._configurations = Configurations(model, bounds.q_index, bounds.lower, bounds.upper, units)
-        targets = TargetReader(tasks, self.rows.targets, settings.latency)
+        self._targets = TargetReader(tasks, self.rows.targets, settings.latency)
         shapes = (model.nq,), (model.nv,)
-        self._reader = ArgumentReader(shapes, self._clock, self._configurations, targets, self.tracker)
+        self._reader = ArgumentReader(shapes, self._clock, self._configurations, self._targets, self.tracker)
 
     def read(self, q: Any, t: Any, targets: Any, obstacles: Any, v: Any, v_desired: Any = None) -> Arguments:
         """Check the arguments of a step, see `Controller.step`: whatever raises does so here, and changes nothing."""
@@ -71,6 +71,7 @@ class ProblemBuilder:
     def build(self, arguments: Arguments) -> StepProblem:
         """Take over the arguments of a step, and build its problem."""
         times, q, v, v_desired, targets, update, faults, assumptions = arguments
+        self._targets.last = targets
         rows, query = self.rows, self.rows.query
         if times.resumed or (v is not None and self._clock.is_first):
             self._restart(np.zeros(self._model.nv) if v is None else v)
@@ -139,6 +140,13 @@ class ProblemBuilder:
         """Return the world pose of an obstacle in the last step, attached or not."""
         return self._pose(index, self._given_or_last(q))
 
+    def obstacle_poses(self, q: Array) -> Array:
+        """Return the world poses (o, 12) of all obstacles in the last step, at q (nq,)."""
+        poses: Array = self.tracker.current.states[:, :POSE].copy()
+        for index in self.rows.query.table.attached:
+            poses[index] = self.attachments.pose(index, q).row[:POSE]
+        return poses
+
     def _pose(self, index: int, q: Array) -> Sample:
         is_attached = index in self.rows.query.table.attached
         return self.attachments.pose(index, q) if is_attached else self.tracker.pose(index)
@@ -150,4 +158,5 @@ class ProblemBuilder:
         """Forget the steps before; the robot moves at v (nv,). Attached objects stay attached."""
         self._restart(v)
         self._clock.reset()
+        self._targets.last = ()
         self.tracker.reset()

@@ -97,23 +97,3 @@ def solve_contacts(J: Array, b: Array) -> Contacts:
         y, _ = dtrtrs(packed[:rank, :rank], b[order[:rank] - 1], trans=1)
         v_particular = Q[:, :rank] @ y
     return Contacts(np.ascontiguousarray(Q[:, rank:]), v_particular, J, b)
-
-
-def tracking_within(contacts: Contacts, A: Array, b: Array, damping: float) -> Array:
-    """Velocity (nv,) of the tracking law that holds the contacts: rest + Z (A Z)⁺ (b - A rest).
-
-    Args:
-        contacts: solved.
-        A: task rows (r, nv).
-        b: their right-hand sides (r,).
-        damping: λ of the damped inverse [-].
-    """
-    reduced, desired = A @ contacts.Z, b - A @ contacts.v_particular
-    if damping == 0.0:
-        known = np.isfinite(desired).all() and np.isfinite(reduced).all()
-        w = np.linalg.pinv(reduced, rcond=1e-10) @ desired if known else np.full(reduced.shape[1], np.nan)
-    else:
-        gram = reduced.T @ reduced
-        gram.ravel()[:: len(gram) + 1] += damping**2
-        w = np.linalg.solve(gram, reduced.T @ desired)
-    return np.asarray(contacts.v_particular + contacts.Z @ w)

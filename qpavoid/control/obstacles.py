@@ -10,6 +10,7 @@ assumption is named in `Solution.assumptions`.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -22,8 +23,7 @@ from qpavoid.control.trajectories import TrajectoryBatch, extrapolate
 from qpavoid.control.updates import NO_UPDATE, Update, UpdateReader, unlikely
 from qpavoid.errors import NumericalError
 from qpavoid.kernels.obstacles import FAST, NORMALISED, NOT_FINITE, SAMPLE
-from qpavoid.model.cloud import Points
-from qpavoid.model.sample import STATE, Pose, Sample
+from qpavoid.model.sample import STATE, Sample
 from qpavoid.model.scene import Obstacle
 from qpavoid.problem import Array, IntArray
 from qpavoid.reason import Reason, ReasonKind, Severity
@@ -209,9 +209,7 @@ class ObstacleTracker:
         self.moving = np.array(sorted(moving), dtype=np.intp)
         self.current = self.current._replace(which=np.array(sorted(moving | self._placed), dtype=np.intp))
 
-    def read(
-        self, t: float, updates: Mapping[str, Sample | Pose | Points] | None, shift: float = 0.0
-    ) -> StepUpdate | None:
+    def read(self, t: float, updates: Mapping[str, Any] | None, shift: float = 0.0) -> StepUpdate | None:
         """Check what a step is given; estimates stay as they are.
 
         Args:

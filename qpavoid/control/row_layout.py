@@ -43,7 +43,7 @@ def lay_out(
         has_mimics=model.nvExtended > model.nv,
         unfolded_row=np.zeros(model.nvExtended),
         frame_poses=kinematics.frame_poses,
-        **task_layout(frames, row_tasks, model),
+        **task_layout(frames, row_tasks, model, settings.dt),
         results=x.results,
         support=table.support,
         twists=x.twists,
@@ -73,7 +73,6 @@ def lay_out(
         **limit_layout(settings.bounds, settings.limits.position_gain, settings.dt),
         v_tracking=np.zeros(model.nv),
         lever_arm=max_lever_arm(model, table.max_extension()),
-        damping=settings.tracking_damping,
         looks_ahead=False,
         **row_form(avoidance),
     )

@@ -21,8 +21,6 @@ class ControlSettings:
     limits: Limits
     dt: float
     """Control period [s]."""
-    tracking_damping: float = 0.01
-    """λ of the damped J⁺ [-]."""
     latency: float = 0.0
     """Time after which the actuators follow a command [s]."""
     sensing: Sensing = field(default_factory=Sensing)

@@ -13,7 +13,7 @@ from qpavoid.control.tasks import RowTask
 from qpavoid.control.trajectories import extrapolate
 from qpavoid.errors import ConfigError, NumericalError, UnknownName, nearest
 from qpavoid.kernels.obstacles import FINE, NORMALISED, SAMPLE
-from qpavoid.model.sample import Sample
+from qpavoid.model.sample import Sample, as_sample
 from qpavoid.model.trajectory import Trajectory
 from qpavoid.problem import Array
 from qpavoid.reason import Reason, ReasonKind
@@ -52,6 +52,8 @@ class TargetReader:
         self._names, self._frames, self._latency = list(self._tasks), frames, latency
         self._motions: list[Any] = [task.motion for task in tasks]
         self._is_still = all(type(motion) is Trajectory and motion.is_still for motion in self._motions[: len(frames)])
+        self.last: Sequence[Any] = ()
+        """Targets of all tasks in the step before; none before the first one."""
         self._is_written = False  # whether the frames are the poses of motions that never change
         self.read(0.0, None)
         kernels.are_fine(frames, FARTHEST, FASTEST)
@@ -84,6 +86,17 @@ class TargetReader:
                 return Targets(samples)
         return self._read_each(t, targets)
 
+    def _placed(self, task: RowTask, value: Any) -> Any:
+        """Return a target as it is, or the pose that it stands for, of a task whose target is somewhere.
+
+        A position alone leaves the orientation as it was in the step before, at first as the motion has it.
+        """
+        index = self._names.index(task.settings.label)
+        last = self.last[index] if len(self.last) else self._motions[index].sample(0.0)
+        if not isinstance(last, Sample):
+            return value
+        return as_sample(value, last.rotation if task.moves else None)
+
     def _write(self, samples: Sequence[Any]) -> None:
         """Write the states of the frame tasks."""
         for row in range(len(self._frames)):
@@ -96,7 +109,7 @@ class TargetReader:
             sample = None
             if name in targets:
                 try:
-                    sample = task.as_target(targets[name])
+                    sample = task.as_target(self._placed(task, targets[name]))
                 except NumericalError as error:
                     raise NumericalError(f"target {name!r}: {error}") from None
                 sample, reason = _checked(name, task, sample)

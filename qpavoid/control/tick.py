@@ -22,6 +22,8 @@ class Tick(NamedTuple):
     proximity: Proximity
     problem: Problem
     solution: Solution
+    obstacles: Array
+    """(o, 12) where the step took the obstacles to be, by their numbers: rotation by columns, then position [m]."""
 
 
 def copied(value: Any) -> Any:

@@ -21,6 +21,7 @@ from qpavoid.problem import Array, IntArray
 from qpavoid.reason import Reason, ReasonKind, Severity
 
 _FLAGS = {bool, np.bool_}
+_KNOWN = {Sample, Pose, Points}
 
 
 class Update(NamedTuple):
@@ -100,7 +101,7 @@ class UpdateReader:
         (self.attached.add if attached else self.attached.discard)(index)
         self._selection = None
 
-    def read(self, t: float, updates: Mapping[str, Sample | Pose | Points], shift: float) -> Update:
+    def read(self, t: float, updates: Mapping[str, Any], shift: float) -> Update:
         """Check the updates of a step.
 
         Args:
@@ -115,6 +116,9 @@ class UpdateReader:
         names, samples = list(updates), list(updates.values())
         selection = self._selection
         types = set(map(type, samples))
+        if not types <= _KNOWN:
+            samples = [self._placed(name, value, t) for name, value in updates.items()]
+            types, updates = set(map(type, samples)), dict(zip(names, samples, strict=True))
         if selection is None or selection.names != names or types != {selection.type}:
             numbers = [self.index(name) for name in names]
             plain = len(types) == 1 and types <= {Sample, Pose} and self.attached.isdisjoint(numbers)
@@ -122,6 +126,21 @@ class UpdateReader:
         if selection is not None:
             return self._check(t, shift, _Batch(names, samples, selection.which, selection.kind), selection)
         return self._read_each(t, shift, updates)
+
+    def _placed(self, name: str, value: Any, t: float) -> Any:
+        """Return points, a sample or a pose as it is, else the pose that it stands for.
+
+        A position alone leaves the orientation as it was given last, or as the scene has it.
+        """
+        if isinstance(value, Points):
+            return value
+        index = self.index(name)
+        known, motion = index in self._measured.known, self._obstacles[index].motion
+        last = Sample.of_row(self._measured.states[index]) if known else motion.sample(t)
+        try:
+            return as_sample(value, last.rotation)
+        except NumericalError as error:
+            raise NumericalError(f"obstacle {name!r}: {error}") from None
 
     def _select(self, names: list[str], kind: type, numbers: list[int]) -> _Selection:
         count, which = len(names), np.array(numbers, dtype=np.intp)
@@ -141,7 +160,7 @@ class UpdateReader:
             if isinstance(value, Points):
                 cloud, sample = self._cloud(index, value, notes), self._pose_of(index, value, t, shift)
             else:
-                cloud, sample = None, _checked(name, value)
+                cloud, sample = None, value
             bare = isinstance(sample, Pose)
             sample = sample.as_sample() if bare else sample
             if isinstance(value, Points) and cloud is None:
@@ -233,7 +252,7 @@ class UpdateReader:
                 state[0] = self._obstacles[index].motion.sample(t).row
             sample = Sample.of_row(state[0])
         else:
-            sample = _checked(self._obstacles[index].name, cloud.pose)
+            sample = self._placed(self._obstacles[index].name, cloud.pose, t)
         return sample.stamped(sample.t if cloud.t is None else cloud.t, cloud.at_rest or sample.at_rest)
 
     def _cloud(self, index: int, cloud: Points, notes: list[Reason]) -> Voxels | None:
@@ -290,10 +309,3 @@ def _flags(names: Sequence[str], samples: Sequence[Any]) -> list[bool]:
 
 def _stamp(name: str, sample: Any, t: float) -> float:
     return t if sample.t is None else as_time(f"obstacle {name!r}: t", sample.t)
-
-
-def _checked(obstacle: str, value: Any) -> Any:
-    try:
-        return as_sample(value)
-    except NumericalError as error:
-        raise NumericalError(f"obstacle {obstacle!r}: {error}") from None

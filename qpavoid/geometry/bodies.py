@@ -7,10 +7,11 @@ from typing import Any
 import coal
 import numpy as np
 import pinocchio as pin
+from scipy.spatial import ConvexHull
 
 from qpavoid.config import Box, Capsule, Cone, Cylinder, Ellipsoid, Shape, Sphere
 from qpavoid.geometry.capsules import CapsuleFit, fit_capsule, half_sphere
-from qpavoid.geometry.meshes import convex_hull
+from qpavoid.geometry.meshes import convex_hull, corners, normals
 from qpavoid.problem import Array
 
 
@@ -32,12 +33,9 @@ def make_shape(shape: Shape) -> Any:
 
 
 def convert_bodies(bodies: Any, kind: str) -> Any:
-    """Replace the triangle meshes of a geometry model.
+    """Replace the triangle meshes of a Pinocchio geometry model.
 
-    Args:
-        bodies: pinocchio geometry model as read from a URDF.
-        kind: `convex`: hull of each mesh, primitives as they are; `capsule`: one capsule around each piece;
-            `mesh`: everything as it is.
+    `convex`: by their hulls, primitives as they are; `capsule`: one capsule around each piece; `mesh`: all as it is.
     """
     converted = pin.GeometryModel()
     for body in bodies.geometryObjects:
@@ -130,6 +128,18 @@ def hull_points(geometry: Any) -> Array:
             return np.asarray(_AROUND_SPHERE * np.asarray(geometry.radii))
     center, half = bounding_box(geometry)
     return np.asarray(center + half * [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+
+
+def surface_triangles(geometry: Any) -> Array:
+    """Return the triangles (t, 3, 3) [m] of a mesh; those of the hull of another shape, which face outwards."""
+    if isinstance(geometry, coal.BVHModelBase):
+        vertices, triangles = corners(geometry)
+        return np.asarray(vertices[triangles])
+    points = hull_points(geometry)
+    faces = points[ConvexHull(points).simplices]
+    inwards = np.einsum("ij,ij->i", normals(faces), faces[:, 0] - points.mean(axis=0)) < 0.0
+    faces[inwards] = faces[inwards][:, ::-1]
+    return np.asarray(faces)
 
 
 def rim(radius: float, z: float) -> Array:

@@ -18,7 +18,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
-from qpavoid.geometry.meshes import cut, normals
+from qpavoid.geometry.meshes import cut, hull_corners, normals
 from qpavoid.problem import Array, IntArray
 
 _CUTS = 8
@@ -136,16 +136,9 @@ def _merge(pieces: list[Array], volume: Callable[[Array], float], max_pieces: in
         if len(parts) <= max_pieces and added + max(cost[i, j], 0.0) > allowance:
             break
         added += max(cost[i, j], 0.0)
-        new, points = max(parts) + 1, _hull_corners(np.concatenate((parts.pop(i), parts.pop(j))))
+        new, points = max(parts) + 1, hull_corners(np.concatenate((parts.pop(i), parts.pop(j))))
         cost = {pair: price for pair, price in cost.items() if not {i, j} & set(pair)}
         parts[new], own[new] = points, volume(points)
         for neighbour in list(parts)[:-1]:
             consider(neighbour, new)
     return list(parts.values())
-
-
-def _hull_corners(points: Array) -> Array:
-    try:
-        return np.asarray(points[ConvexHull(points).vertices])
-    except (QhullError, ValueError):
-        return points

@@ -7,7 +7,7 @@ from typing import Any
 
 import coal
 import numpy as np
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, QhullError
 
 from qpavoid.config.base import LARGEST
 from qpavoid.problem import Array, IntArray
@@ -66,16 +66,12 @@ def corners(mesh: Any) -> tuple[Array, IntArray]:
     return np.array(mesh.vertices()), np.array(triangles, dtype=np.intp)
 
 
-def surface_triangles(geometry: Any) -> Array:
-    """Return the triangles (t, 3, 3) [m] of a mesh or a hull; those of a hull face outwards."""
-    if isinstance(geometry, coal.BVHModelBase):
-        vertices, triangles = corners(geometry)
-        return np.asarray(vertices[triangles])
-    points = np.array(geometry.points())
-    faces = points[ConvexHull(points).simplices]
-    inwards = np.einsum("ij,ij->i", normals(faces), faces[:, 0] - points.mean(axis=0)) < 0.0
-    faces[inwards] = faces[inwards][:, ::-1]
-    return np.asarray(faces)
+def hull_corners(points: Array) -> Array:
+    """Return those of points (n, 3) that are corners of their hull; all where they are flat or few."""
+    try:
+        return np.asarray(points[ConvexHull(points).vertices])
+    except (QhullError, ValueError):
+        return points
 
 
 def normals(triangles: Array) -> Array:

@@ -37,7 +37,9 @@ from qpavoid.kernels.rotation import rotation_vector
 from qpavoid.kernels.rows import alpha, beta, distance_rows, row_bounds
 from qpavoid.kernels.step import assemble, control_step, find_near_pairs, tracking_violation, violation
 from qpavoid.kernels.structures import direct, pack
-from qpavoid.kernels.tasks import damped_solution, frame_rows, projection_cost
+from qpavoid.kernels.task_curvature import add_curvature
+from qpavoid.kernels.tasks import frame_rows, projection_cost
+from qpavoid.kernels.tracking_law import tracking_law
 from qpavoid.kernels.voxels import select_voxels, voxels_within
 
 __all__ = [
@@ -47,6 +49,7 @@ __all__ = [
     "KinematicsArrays",
     "Pieces",
     "RowLayout",
+    "add_curvature",
     "alpha",
     "are_fine",
     "assemble",
@@ -58,7 +61,6 @@ __all__ = [
     "clearance_lower_bound",
     "closes_below",
     "control_step",
-    "damped_solution",
     "direct",
     "distance_rows",
     "extrapolate_estimates",
@@ -90,6 +92,7 @@ __all__ = [
     "sorted_setxor",
     "speed_to_stop",
     "stop_velocity",
+    "tracking_law",
     "tracking_violation",
     "update_estimates",
     "update_kinematics",

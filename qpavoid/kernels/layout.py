@@ -44,17 +44,31 @@ class RowLayout(NamedTuple):
     cap: Array
     """(p + t,) largest commanded linear, then angular speed; infinite where there is none [m/s, rad/s]."""
     scale: Array
-    """(3 (p + t),) root of each row's weight."""
+    """(r,) root of each row's weight."""
+    row_tasks: IntArray
+    """(r,) number of each row's task: that of a frame, then the other tasks."""
+    bending_rows: IntArray
+    """Rows that turn as the robot moves, those of the frames first."""
+    straight_rows: IntArray
+    """All others: A is constant, as of a posture."""
+    gain_shares: Array
+    """(r,) how much of an error a control step takes back at most: min(1, 5 K dt) of each row's gain K [-]."""
     task_support: Array
     """(3 (p + t), e) scale of the columns that move each row's frame, 0 for the others."""
     row_wrenches: Array
     """(3 (p + t), 6) directions of the rows; the moments of the linear ones are filled in by every step."""
     poses: Array
     """(f, 12) out: poses of the tracked frames."""
+    errors: Array
+    """(3 (p + t),) out: what each frame lacks to its target, not scaled [m, rad]."""
+    feedback: Array
+    """(3 (p + t),) out: the part of `b` that is gain times error, capped and scaled [m/s, rad/s]."""
     A: Array
     """(r, n) task rows; out: those of the frames, which come first."""
     b: Array
     """(r,) right-hand sides of `A`; out: those of the frames, which come first."""
+    b_feasible: Array
+    """(r,) out: `b`, of each task scaled down to what the joints can do."""
     # --- pairs
     results: Array
     """(m, 10) [distance, normal, point a, point b] of all pairs."""
@@ -143,10 +157,8 @@ class RowLayout(NamedTuple):
     """(n,) out: the next velocity of a stop: all coordinates slowed by one factor, as fast as their limits allow."""
     # --- answer of the tracking law
     v_tracking: Array
-    """(n,) out: J⁺ẋ."""
+    """(n,) out: J⁺ẋ, see `kernels.tracking_law`."""
     # --- numbers
-    damping: float
-    """λ of the damped J⁺ [-]."""
     offset: float
     """Added to surface distances [m]."""
     row_gain: float

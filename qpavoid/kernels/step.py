@@ -13,7 +13,8 @@ from qpavoid.kernels.kinematics import update_kinematics
 from qpavoid.kernels.near_pairs import near_pairs, place_bodies
 from qpavoid.kernels.packing import compiled
 from qpavoid.kernels.rows import distance_rows, row_bounds
-from qpavoid.kernels.tasks import damped_solution, frame_rows
+from qpavoid.kernels.tasks import frame_rows
+from qpavoid.kernels.tracking_law import tracking_law
 from qpavoid.problem import Array, IntArray
 
 
@@ -36,7 +37,7 @@ def find_near_pairs(x: Any, q: Array) -> tuple[int, int, int]:
 @compiled
 def control_step(
     x: Any, q: Array, influence_distance: float, moving: bool
-) -> tuple[int, int, int, int, float, bool, float]:
+) -> tuple[int, int, int, int, float, bool, float, float]:
     """Compute kinematics, distances and all rows and bounds of a control step.
 
     Args:
@@ -49,14 +50,14 @@ def control_step(
         What `near_pairs` returns, then what `assemble` does.
     """
     near, rows, meeting = find_near_pairs(x, q)
-    k, worst, clear, margin = assemble(x, q, x.distances.rows[:rows], influence_distance, moving)
-    return near, rows, meeting, k, worst, clear, margin
+    k, worst, clear, margin, bent = assemble(x, q, x.distances.rows[:rows], influence_distance, moving)
+    return near, rows, meeting, k, worst, clear, margin, bent
 
 
 @compiled
 def assemble(
     x: Any, q: Array, pairs: IntArray, influence_distance: float, moving: bool
-) -> tuple[int, float, bool, float]:
+) -> tuple[int, float, bool, float, float]:
     """Write all rows and bounds of a control step, and the tracking law's velocity.
 
     Args:
@@ -69,17 +70,18 @@ def assemble(
     Returns:
         Number k of near pairs; largest violation of rows and bounds by the tracking law's velocity [m/s, rad/s]
         (negative inside, NaN where there is one); whether that velocity is safe, its clearance is bounded
-        (`looks_ahead`) and the bound suffices; distance to the nearest position limit [rad, m].
+        (`looks_ahead`) and the bound suffices; distance to the nearest position limit [rad, m]; how far the task rows
+        bend within the step, see `tracking_law`.
     """
     frame_rows(x)
     margin = velocity_bounds(x, q)
     stop_velocity(x)
-    damped_solution(x, x.v_tracking)
+    bent = tracking_law(x, x.A, x.b, x.v_tracking, x.b_feasible)
     k = distance_rows(x, pairs, influence_distance, moving)
     row_bounds(x, k, moving)
     worst = tracking_violation(x, k)
     clear = x.looks_ahead and worst <= 0.0 and is_tracking_clear(x, q, k, influence_distance)
-    return k, worst, clear, margin
+    return k, worst, clear, margin, bent
 
 
 @compiled

@@ -1,4 +1,4 @@
-"""Rows of the frames that follow targets, and the velocity that the tracking law makes of all task rows."""
+"""Rows of the frames that follow targets, and the cost of a QP that tracks."""
 
 from __future__ import annotations
 
@@ -10,10 +10,6 @@ from qpavoid.kernels.packing import compiled
 from qpavoid.kernels.rotation import rotation_vector
 from qpavoid.kernels.rows import _fold
 from qpavoid.problem import Array
-
-MIN_PIVOT_RATIO = 1e-6
-"""Ratio of the smallest to the largest pivot of J Jᵀ down to which J⁺ is taken from it without damping [-]: half of the
-digits of a double are left."""
 
 _rotation_vector = compiled(rotation_vector)
 
@@ -31,9 +27,11 @@ def frame_rows(x: Any) -> None:
 
     Args:
         x: reads J_world, frame_poses, frame_ids, targets, oriented, gain, cap, scale and task_support; writes poses
-            (f, 12), the moments of row_wrenches, and the first rows of A (r, n) and b (r,) [m/s, rad/s].
+            (f, 12), the moments of row_wrenches, errors and feedback (3 (p + t),), and the first rows of A (r, n) and b
+            (r,) [m/s, rad/s].
     """
     poses, targets, row_wrenches, support, A, b = x.poses, x.targets, x.row_wrenches, x.task_support, x.A, x.b
+    errors, feedback = x.errors, x.feedback
     J_world = np.ascontiguousarray(x.J_world)  # rows in one piece become vector instructions
     rows, columns = len(row_wrenches), J_world.shape[1]
     positioned = rows // 3 - len(x.oriented)
@@ -46,7 +44,9 @@ def frame_rows(x: Any) -> None:
         row_wrenches[r + 1, 3], row_wrenches[r + 1, 5] = -pz, px
         row_wrenches[r + 2, 3], row_wrenches[r + 2, 4] = py, -px
         for i in range(3):
-            b[r + i] = targets[f, 12 + i] + x.gain[f] * (targets[f, 9 + i] - poses[f, 9 + i])
+            errors[r + i] = targets[f, 9 + i] - poses[f, 9 + i]
+            feedback[r + i] = x.gain[f] * errors[r + i]
+            b[r + i] = targets[f, 12 + i] + feedback[r + i]
     R_error = np.empty((3, 3))
     for n in range(len(x.oriented)):
         f = x.oriented[n]
@@ -55,17 +55,21 @@ def frame_rows(x: Any) -> None:
                 R_error[i, j] = 0.0
                 for c in range(3):
                     R_error[i, j] += targets[f, 3 * c + i] * poses[f, 3 * c + j]
-        errors = _rotation_vector(R_error)
+        turn, r = _rotation_vector(R_error), 3 * (positioned + n)
         for i in range(3):
-            b[3 * (positioned + n) + i] = targets[f, 15 + i] + x.gain[f] * errors[i]
+            errors[r + i] = turn[i]
+            feedback[r + i] = x.gain[f] * turn[i]
+            b[r + i] = targets[f, 15 + i] + feedback[r + i]
     for part in range(len(x.cap)):
         r = 3 * part
         speed = np.sqrt(b[r] * b[r] + b[r + 1] * b[r + 1] + b[r + 2] * b[r + 2])
         if speed > x.cap[part]:
             for i in range(3):
                 b[r + i] *= x.cap[part] / speed
+                feedback[r + i] *= x.cap[part] / speed
     for r in range(rows):
         b[r] *= x.scale[r]
+        feedback[r] *= x.scale[r]
         row = x.unfolded_row if x.has_mimics else A[r]
         lx, ly, lz, ax, ay, az = (
             row_wrenches[r, 0],
@@ -81,53 +85,6 @@ def frame_rows(x: Any) -> None:
             row[c] = (linear + angular) * support[r, c]
         if x.has_mimics:
             _fold(row, x.columns, A[r])
-
-
-@compiled
-def damped_solution(x: Any, v: Array) -> None:
-    """Write v = A⁺b with the damped inverse A⁺ = Aᵀ (A Aᵀ + λ²)⁻¹.
-
-    By a Cholesky factorisation of the Gram matrix, row by row: L Lᵀ = A Aᵀ + λ² I; L y = b is solved as the rows of L
-    are made, then Lᵀ z = y backwards, and v = Aᵀ z.
-
-    Args:
-        x: reads A (r, n), b (r,) and the damping λ.
-        v: out (n,); 0 where there are no rows, NaN where there is no damping and A Aᵀ is close to singular
-            [rad/s or m/s].
-    """
-    A, b, damping = x.A, x.b, x.damping
-    rows, nv = A.shape
-    L = np.empty((rows, rows))
-    y, inverse = np.empty(rows), np.empty(rows)
-    smallest, largest = np.inf, 0.0
-    for i in range(rows):
-        for j in range(i + 1):
-            dot = 0.0
-            for c in range(nv):
-                dot += A[i, c] * A[j, c]
-            if i == j:
-                dot += damping * damping
-            for c in range(j):
-                dot -= L[i, c] * L[j, c]
-            if i == j:
-                smallest, largest = min(smallest, dot), max(largest, dot)
-                if not dot > 0.0 or (damping == 0.0 and smallest < MIN_PIVOT_RATIO * largest):
-                    v[:] = np.nan
-                    return
-                inverse[i] = 1.0 / np.sqrt(dot)
-            else:
-                L[i, j] = dot * inverse[j]
-        total = b[i]
-        for c in range(i):
-            total -= L[i, c] * y[c]
-        y[i] = total * inverse[i]
-    v[:] = 0.0
-    for i in range(rows - 1, -1, -1):
-        y[i] *= inverse[i]
-        for c in range(i):
-            y[c] -= L[i, c] * y[i]
-        for c in range(nv):
-            v[c] += A[i, c] * y[i]
 
 
 @compiled

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from qpavoid.config.text import read_text
 from qpavoid.errors import ConfigError, NumericalError
+from qpavoid.model.csv_poses import read_table
 from qpavoid.model.sample import Sample
 from qpavoid.problem import Array, IntArray, as_numbers
 
@@ -97,18 +98,16 @@ class Voxels:
 
     @classmethod
     def of_octree(cls, tree: Any, resolution: float | None = None) -> Voxels:
-        """Make voxels of the occupied leaves of a coal octree, large ones cut up.
+        """Make voxels of the occupied leaves of a coal octree (`coal.OcTree`), large ones cut up.
 
-        Args:
-            tree: `coal.OcTree`, such as `coal.makeOctree` or `coal.MeshLoader().loadOctree` gives.
-            resolution: edge of a voxel [m], the cloud's; the tree's own if left out.
+        The edge of a voxel is the cloud's resolution [m], the tree's own if left out.
         """
         edge = tree.getResolution() if resolution is None else resolution
-        leaves = [box for box in map(np.asarray, tree.toBoxes()) if box[4] >= box[5]]
         points = [np.zeros((0, 3))]
-        for x, y, z, size, *_ in leaves:
+        for x, y, z, size, occupancy, threshold in map(np.asarray, tree.toBoxes()):
             steps = (np.arange(max(round(size / edge), 1)) + 0.5) * edge - 0.5 * size if size > edge else np.zeros(1)
-            points.append(np.array([x, y, z]) + np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3))
+            if occupancy >= threshold:
+                points.append(np.array([x, y, z]) + np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3))
         return cls.of(np.concatenate(points), edge)
 
 
@@ -118,33 +117,22 @@ def voxel_radius(resolution: float) -> float:
 
 
 def read_points(path: Path, where: str) -> Array:
-    """Read points (n, 3) [m] from a file.
-
-    Args:
-        path: `.npy` with an array (n, 3), or `.csv` with the header `x,y,z`.
-        where: file and field to name in errors.
+    """Read points (n, 3) [m] from a file: `.npy` with an array (n, 3), or `.csv` with the header `x,y,z`.
 
     Raises:
-        ConfigError: cannot be read, or not points.
+        ConfigError: cannot be read, or not points; naming the field in `where`.
     """
-    if not path.is_file():
-        raise ConfigError(f"{where}: {path}: no such file; give an .npy or .csv")
-    if path.stat().st_size > _LARGEST:
-        raise ConfigError(f"{where}: {path}: {path.stat().st_size} bytes; at most {_LARGEST} are read")
-    try:
-        if path.suffix == ".npy":
-            points = np.load(path, allow_pickle=False)
-        elif path.suffix == ".csv":
-            header, _, rows = read_text(path, _LARGEST, where).partition("\n")
-            if header.replace(" ", "").strip() != "x,y,z":
-                raise ValueError(f"header is `{header.strip():.40}`, and not `x,y,z`")
-            points = np.loadtxt(rows.splitlines(), delimiter=",", ndmin=2, dtype=np.float64)
-        else:
-            raise ValueError("neither .npy nor .csv")
-        if getattr(points, "ndim", 0) != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
-            raise ValueError(f"an array of shape {getattr(points, 'shape', ())}")
-    except (ValueError, EOFError, OSError) as error:
-        raise ConfigError(f"{where}: {path}: {error}; give an array (n, 3) of numbers") from None
+    if path.suffix == ".csv":
+        points: Any = read_table(read_text(path, _LARGEST, where), ("x,y,z",), f"{where}: {path}")
+    else:
+        try:
+            size = path.stat().st_size if path.is_file() else _LARGEST + 1
+            points = np.load(path, allow_pickle=False) if size <= _LARGEST else None
+        except (ValueError, EOFError, OSError) as error:
+            raise ConfigError(f"{where}: {path}: {error}; give an .npy or .csv with an array (n, 3)") from None
+    if getattr(points, "ndim", 0) != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
+        shape = getattr(points, "shape", "none")
+        raise ConfigError(f"{where}: {path}: no array (n, 3) of numbers in a file below {_LARGEST} bytes: {shape}")
     if len(points) > _MOST_POINTS:
         raise ConfigError(f"{where}: {path}: {len(points)} points; at most {_MOST_POINTS} are read: thin them out")
     return np.asarray(points, dtype=np.float64)

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
-import math
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -21,52 +17,47 @@ _LARGEST_CSV, _MOST_ROWS = 20_000_000, 100_000
 """Size of a CSV file [bytes] and number of its rows, at most; each row becomes a piece of a kilobyte."""
 
 
+def read_table(text: str, headers: tuple[str, ...], where: str) -> Array:
+    """Read the numbers (n, columns) below one of some headers of a CSV text.
+
+    Raises:
+        ConfigError: another header, or a row that is not of as many numbers; naming file, row and column.
+    """
+    header, *lines = text.splitlines() or [""]
+    if header.replace(" ", "") not in headers:
+        raise ConfigError(f"{where}: header is `{header:.40}`; the first line must be `{'` or `'.join(headers)}`")
+    lines = [line for line in lines if line.strip()]
+    columns = header.count(",") + 1
+    if not lines:
+        return np.zeros((0, columns))
+    try:
+        return np.loadtxt(lines, delimiter=",", comments=None, ndmin=2).reshape(len(lines), columns)
+    except ValueError as error:
+        raise ConfigError(f"{where}: {error}; give {columns} numbers a row, as the header `{header}`") from None
+
+
 def read_poses(path: Path, initial: Array) -> tuple[list[float], list[Array], list[Array]]:
     """Read times [s], positions (3,) [m] and rotations (3, 3) of a file.
 
     Without quaternions, each rotation is `initial`.
 
     Raises:
-        ConfigError: naming file, line and column.
+        ConfigError: naming file and row.
     """
-    reader = csv.reader(io.StringIO(read_text(path, _LARGEST_CSV, f"{path}: motion.path")))
-    cells_of_lines = ((reader.line_num, [cell.strip() for cell in row]) for row in reader if row)
-    try:
-        rows = list(islice(cells_of_lines, _MOST_ROWS + 2))
-    except csv.Error as error:
-        raise ConfigError(f"{path}, line {reader.line_num}: {error}; correct the cell") from None
-    if len(rows) > _MOST_ROWS + 1:
-        raise ConfigError(f"{path}: more than {_MOST_ROWS} rows; give fewer poses, it is linear in between")
-    header = ",".join(rows[0][1]) if rows else ""
-    if header not in CSV_HEADERS:
-        expected = "` or `".join(CSV_HEADERS)
-        raise ConfigError(f"{path}: header is `{header}`; the first line must be `{expected}`")
-    if len(rows) < 3:
-        raise ConfigError(f"{path}: {len(rows) - 1} row(s) of poses; give at least two, or use `type: fixed`")
-    columns = header.split(",")
-    times, positions, rotations = list[float](), list[Array](), list[Array]()
-    for line, cells in rows[1:]:
-        where = f"{path}, line {line}"
-        if len(cells) != len(columns):
-            raise ConfigError(f"{where}: {len(cells)} cells; give {len(columns)}, as the header `{header}`")
-        values = [_number(cell, f"{where}, {column}") for cell, column in zip(cells, columns, strict=True)]
-        t, position, quaternion = values[0], np.array(values[1:4]), np.array(values[4:])
-        if times and t <= times[-1]:
-            raise ConfigError(f"{where}, t: {t} comes after {times[-1]}; times must increase")
-        norm = np.linalg.norm(quaternion)  # need not be 1: files hold rounded numbers
-        if len(quaternion) and norm < 1e-6:
-            raise ConfigError(f"{where}, qx,qy,qz,qw: the quaternion is zero; no turn is 0,0,0,1")
-        times.append(t)
-        positions.append(position)
-        rotations.append(pin.Quaternion(quaternion / norm).toRotationMatrix() if len(quaternion) else initial)
-    return times, positions, rotations
-
-
-def _number(cell: str, where: str) -> float:
-    try:
-        value = float(cell)
-    except ValueError:
-        value = math.nan
-    if not abs(value) <= LARGEST * 10.0:  # seconds of the calendar are 1.7e9
-        raise ConfigError(f"{where}: `{cell}` is not a finite number of sane size; correct the cell")
-    return value
+    table = read_table(read_text(path, _LARGEST_CSV, f"{path}: motion.path"), CSV_HEADERS, str(path))
+    if not 2 <= len(table) <= _MOST_ROWS:
+        raise ConfigError(f"{path}: {len(table)} rows of poses; give 2 to {_MOST_ROWS}, or use `type: fixed`")
+    is_sane = np.all(np.abs(table) <= 10.0 * LARGEST, axis=1)  # False for NaN too; seconds of the calendar are 1.7e9
+    norms = np.linalg.norm(np.where(is_sane[:, None], table[:, 4:], 1.0), axis=1)  # need not be 1: they are rounded
+    for clause, is_bad in (
+        ("not finite numbers of sane size", ~is_sane),
+        ("times must increase", np.diff(table[:, 0], prepend=-np.inf) <= 0.0),
+        ("the quaternion is zero; no turn is 0,0,0,1", (norms < 1e-6) & (table.shape[1] > 4)),
+    ):
+        if is_bad.any():
+            raise ConfigError(f"{path}: row {int(np.argmax(is_bad)) + 1} of poses: {clause}; correct it")
+    if table.shape[1] == 4:
+        rotations = [initial] * len(table)
+    else:
+        rotations = [pin.Quaternion(row).toRotationMatrix() for row in table[:, 4:] / norms[:, None]]
+    return table[:, 0].tolist(), list(table[:, 1:4]), rotations

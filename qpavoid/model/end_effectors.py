@@ -25,16 +25,10 @@ _NO_TOOLS = re.compile(r"head|eye|camera|neck|wheel|caster|laser|imu|lidar|senso
 
 
 def end_effectors(model: Any, srdf_ends: Sequence[str] = ()) -> list[str]:
-    """Find the frames at the ends of a robot's limbs.
-
-    First those that an SRDF names, then others in the order of the joints.
+    """Find the frames at the ends of a robot's limbs: first those that an SRDF names, then others in the joints' order.
 
     A limb is a chain of at least three joints since the last branch; where it branches into fingers, its hand is the
     end. Where no limb is that long, every end counts.
-
-    Args:
-        model: pinocchio model.
-        srdf_ends: frames that an SRDF calls end effectors; those that do not exist are left out.
     """
     frames = {f.name: f.parentJoint for f in model.frames if f.type in _LINKS}
     ends = [_tool(model, frames[name], name) or name for name in srdf_ends if name in frames]
@@ -50,10 +44,7 @@ def end_effectors(model: Any, srdf_ends: Sequence[str] = ()) -> list[str]:
 
 
 def _ends(model: Any, joint: int, above: int, least: int) -> list[int]:
-    """Find the joints that carry the ends of the tree below `joint`.
-
-    There are `above` joints in a row above it.
-    """
+    """Find the joints that carry the ends of the tree below a joint, with `above` joints in a row above it."""
     children = list(model.children[joint])
     if not children:
         return [joint] if above >= least else []

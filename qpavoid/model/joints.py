@@ -97,13 +97,9 @@ ASSUMED_SPEED = 1.0
 
 
 def assume_speeds(model: Any, notes: list[Note]) -> None:
-    """Give a largest speed to every coordinate without one.
+    """Give a largest speed to every coordinate of a model without one, and name the joints in the notes.
 
     Bases that float or roll have none, nor have joints of which the file says 0.
-
-    Args:
-        model: Pinocchio model, changed in place.
-        notes: the joints are named in them.
     """
     velocity = np.array(model.velocityLimit)
     has_limit = _is_speed(velocity)
@@ -133,6 +129,21 @@ def find_joint(model: Any, name: str, where: str) -> Any:
     return model.joints[model.getJointId(name)]
 
 
+def hinge_or_slide(model: Any, index: int) -> tuple[bool, Array]:
+    """Return True for a slide, False for a hinge, and the joint's axis (3,) in its own frame.
+
+    Raises:
+        ValueError: it is neither a hinge nor a slide.
+    """
+    joint = model.joints[index]
+    if joint.nq != 1 or joint.nv != 1:
+        raise ValueError(f"joint {model.names[index]!r}: {joint.shortname()} is neither a hinge nor a slide")
+    data = model.createData()
+    pin.computeJointJacobians(model, data, pin.neutral(model))
+    screw = np.asarray(data.joints[index].S).ravel()
+    return (True, screw[:3]) if np.any(screw[:3]) else (False, screw[3:])
+
+
 def middle_configuration(model: Any) -> Array:
     """Return the neutral configuration (nq,), moved into the joint limits.
 
@@ -147,16 +158,11 @@ def middle_configuration(model: Any) -> Array:
 
 
 def set_joints(model: Any, q: Array, values: Mapping[str, float], where: str) -> Array:
-    """Return the configuration q (nq,) with other values of some joints.
-
-    Args:
-        model: pinocchio model.
-        q: configuration (nq,).
-        values: joint: value [rad or m]; a joint that mimics another one has to be where that takes it.
-        where: file and field to name in errors.
+    """Return the configuration q (nq,) with other values of some joints, by name [rad or m].
 
     Raises:
-        ConfigError, UnknownName: a joint with more than one angle, in conflict with another one, or unknown.
+        ConfigError, UnknownName: a joint with more than one angle, one that mimics another and is not where that takes
+            it, or an unknown one.
     """
     q = q.copy()
     mimics = [name for name in values if find_joint(model, name, where).shortname() == MIMIC]

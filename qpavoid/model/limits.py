@@ -48,7 +48,7 @@ class JointBounds:
     def recovery(self) -> Array:
         """Return the speeds (nv,) at which joints return into their limits, and part what is too near [rad/s or m/s].
 
-        These are demands that no task makes: nobody expects the robot to move fast for them.
+        These are demands that no task makes: a robot must not start fast for them.
         """
         return np.minimum(_RECOVERY_SHARE * self.velocity, _MAX_RECOVERY_SPEED)
 

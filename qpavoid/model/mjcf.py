@@ -45,29 +45,17 @@ def check_mjcf(root: ET.Element) -> None:
 
 
 def read_mjcf(mjcf: Path, root_joint: Any) -> Any:
-    """Read the Pinocchio model of an MJCF.
-
-    Args:
-        mjcf: the file.
-        root_joint: joint between the world and the root body, or None.
-    """
+    """Read the Pinocchio model of an MJCF, with a joint between the world and the root body unless that is None."""
     if root_joint is None:
         return pin.buildModelFromMJCF(str(mjcf))
     return pin.buildModelFromMJCF(str(mjcf), root_joint, "root_joint")[0]
 
 
 def read_geoms(mjcf: Path, root: ET.Element, model: Any, visual: bool) -> Any:
-    """Read the geoms that collide, or the visual ones, into a geometry model.
+    """Read the geoms of an MJCF that collide, or the visual ones, into a geometry model.
 
-    A geom collides if its contype or conaffinity is not 0.
-
-    What the file fixes to its world (a floor) is no part of the robot and left out.
-
-    Args:
-        mjcf: the file.
-        root: its XML.
-        model: its Pinocchio model.
-        visual: what is meant to be seen instead.
+    A geom collides if its contype or conaffinity is not 0. What the file fixes to its world (a floor) is no part of the
+    robot and left out.
 
     Raises:
         ConfigError: a geom that Pinocchio does not read, or a plane that would move, naming the body.

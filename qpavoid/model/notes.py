@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -33,6 +32,10 @@ class NoteKind(str, Enum):
     """The file as a whole: prefixes of other tools, xacro."""
 
 
+SEVERITIES = ("error", "warning", "note")
+"""The most serious first."""
+
+
 @dataclass(frozen=True)
 class Note:
     """One thing that was left out, mended, replaced or assumed."""
@@ -61,10 +64,6 @@ class RobotWarning(UserWarning):
     """A robot was loaded, and something of it left out, mended, replaced or assumed; see `Robot.notes`."""
 
 
-_PACKAGE = __name__.partition(".")[0]
-"""Name of the package, whose own lines a warning must not be attributed to."""
-
-
 def abbreviate(names: Sequence[str], most: int = 6) -> str:
     """Join the first names of a list, with the number of further ones."""
     suffix = f" and {len(names) - most} more" if len(names) > most else ""
@@ -84,22 +83,7 @@ def merge_notes(notes: Iterable[Note]) -> list[Note]:
 
 
 def issue_warning(notes: Iterable[Note], where: str) -> None:
-    """Issue one `RobotWarning` that names the notes which are warnings; none where there are none.
-
-    It is attributed to the line outside this package that asked for the robot.
-
-    Args:
-        notes: of one robot.
-        where: file to name.
-    """
+    """Issue one `RobotWarning` that names the notes of a file which are warnings; none where there are none."""
     serious = [str(note) for note in notes if note.severity == "warning"]
     if serious:
-        warnings.warn(f"{where}: " + " | ".join(serious), RobotWarning, stacklevel=_levels_to_caller())
-
-
-def _levels_to_caller() -> int:
-    """Count the frames from `issue_warning` up to the first one outside this package."""
-    frame, levels = sys._getframe(1), 1
-    while frame.f_back is not None and str(frame.f_globals.get("__name__", "")).partition(".")[0] == _PACKAGE:
-        frame, levels = frame.f_back, levels + 1
-    return levels
+        warnings.warn(f"{where}: " + " | ".join(serious), RobotWarning, stacklevel=4)

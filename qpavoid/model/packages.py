@@ -20,27 +20,17 @@ _HEAD = 100_000
 
 
 def absolute_entries(entries: Iterable[str], folder: Path) -> list[str]:
-    """Make the folders of `package_dirs` absolute.
-
-    Args:
-        entries: folders that hold packages, or `NAME=FOLDER`.
-        folder: of the file that names them, from which relative ones are counted.
-    """
+    """Make the folders of `package_dirs` (`FOLDER` or `NAME=FOLDER`) absolute, seen from a folder."""
     parts = [_split(entry, folder) for entry in entries]
     return [f"{name}={folder / place}" if name else str(folder / place) for name, place in parts]
 
 
 def mesh_folders(urdf: Path, entries: Iterable[str]) -> list[str]:
-    """List the folders in which `package://` is looked up, in order.
+    """List the folders in which a file's `package://` is looked up, in order.
 
-    The given ones, those above the file, example-robot-data, and ROS_PACKAGE_PATH.
-
-    Packages whose package.xml has another name than their folder stand there as `NAME=FOLDER`: the one that the file
-    is in, those beside it, and those in the given folders and along ROS_PACKAGE_PATH.
-
-    Args:
-        urdf: the file that refers to packages.
-        entries: absolute folders that hold packages, or `NAME=FOLDER`.
+    The given ones, those above the file, example-robot-data, and ROS_PACKAGE_PATH. Packages whose package.xml has
+    another name than their folder stand there as `NAME=FOLDER`: the one that the file is in, those beside it, and
+    those in the given folders and along ROS_PACKAGE_PATH.
     """
     entries = list(entries)
     ros = [folder for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if folder]
@@ -57,11 +47,9 @@ def mesh_folders(urdf: Path, entries: Iterable[str]) -> list[str]:
 
 
 def find_mesh(name: str, entries: Iterable[str]) -> str | None:
-    """Find the file of a mesh name; None if it is absent.
+    """Find the file of a mesh name in `mesh_folders`; None if it is absent.
 
-    Args:
-        name: as a URDF has it, such as `package://NAME/meshes/a.stl`, `file:///a.stl` or `meshes/a.stl`.
-        entries: see `mesh_folders`.
+    A name as a URDF has it: `package://NAME/meshes/a.stl`, `file:///a.stl` or `meshes/a.stl`.
     """
     name = re.sub(r"^(package|model):///*|^file://", "", name)  # some write three slashes
     package, _, inside = name.partition("/")
@@ -74,12 +62,7 @@ def find_mesh(name: str, entries: Iterable[str]) -> str | None:
 
 
 def find_package(name: str, entries: Iterable[str]) -> str | None:
-    """Find the folder of a package; None if it is absent.
-
-    Args:
-        name: of the package.
-        entries: see `mesh_folders`.
-    """
+    """Find the folder of a package in `mesh_folders`; None if it is absent."""
     for entry in entries:
         mapped, folder = _split(entry)
         result = folder if mapped else os.path.join(folder, name)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from fnmatch import fnmatchcase
 from itertools import combinations
 from typing import Any, NamedTuple
@@ -13,20 +13,15 @@ import pinocchio as pin
 from qpavoid.errors import UnknownName, nearest
 from qpavoid.model.limits import JointBounds
 from qpavoid.model.notes import Note, NoteKind
+from qpavoid.model.space import Space
 from qpavoid.problem import Array, IntArray, Mask
 
 
 def add_self_pairs(model: Any, bodies: Any, disabled: Iterable[tuple[str, str]], origin: str) -> None:
-    """Add every pair of bodies that is not rigidly connected, adjacent or disabled.
-
-    Args:
-        model: pinocchio model.
-        bodies: its collision bodies, changed in place.
-        disabled: pairs of name patterns, in either order.
-        origin: file to name in errors.
+    """Add every pair of bodies that is not rigidly connected, adjacent or disabled by name patterns, in either order.
 
     Raises:
-        UnknownName: a pattern that matches no body.
+        UnknownName: a pattern that matches no body; naming the `origin`, a file.
     """
     names = [body.name for body in bodies.geometryObjects]
     joints = [body.parentJoint for body in bodies.geometryObjects]
@@ -64,42 +59,29 @@ class TouchingPair(NamedTuple):
         return Note(NoteKind.PAIR, (self.a, self.b), clause, fraction=self.fraction)
 
 
-def drop_always_touching(model: Any, bodies: Any, joints: JointBounds, samples: int = 200) -> list[TouchingPair]:
-    """Remove the pairs that touch in nearly every one of many random configurations.
+def drop_always_touching(model: Any, bodies: Any, bounds: JointBounds, samples: int = 200) -> list[TouchingPair]:
+    """Remove, and return, the pairs that touch in nearly every one of many random configurations, always the same.
 
     Those are neighbours whose shapes overlap at the joint by design.
-
-    Args:
-        model: pinocchio model.
-        bodies: its collision bodies with their pairs, changed in place.
-        joints: position limits, within which configurations are drawn; joints without are drawn over a full turn.
-        samples: how many configurations are drawn, always the same ones.
-
-    Returns:
-        The pairs that were removed.
     """
-    random, neutral = np.random.default_rng(0), pin.neutral(model)
-    finite = np.isfinite(joints.lower) & np.isfinite(joints.upper)
-    poses = []
-    for _ in range(samples):
-        q = pin.integrate(model, neutral, random.uniform(-np.pi, np.pi, model.nv))
-        q[joints.q_index[finite]] = random.uniform(joints.lower[finite], joints.upper[finite])
-        poses.append(q)
+    poses = Space(model, bounds).draw(np.random.default_rng(0), samples)
     fraction = find_contacts(model, bodies, poses, ALWAYS_TOUCHING).mean(axis=0)
-    indices = np.flatnonzero(fraction >= ALWAYS_TOUCHING).tolist()
     pairs, names = pair_array(bodies).tolist(), [body.name for body in bodies.geometryObjects]
-    for index in indices:
-        bodies.removeCollisionPair(pin.CollisionPair(*pairs[index]))
-    return [TouchingPair(names[pairs[i][0]], names[pairs[i][1]], float(fraction[i])) for i in indices]
+    dropped = []
+    for index in np.flatnonzero(fraction >= ALWAYS_TOUCHING).tolist():
+        a, b = pairs[index]
+        bodies.removeCollisionPair(pin.CollisionPair(a, b))
+        dropped.append(TouchingPair(names[a], names[b], float(fraction[index])))
+    return dropped
 
 
-def find_contacts(model: Any, bodies: Any, poses: Sequence[Array], at_least: float = 0.0) -> Mask:
+def find_contacts(model: Any, bodies: Any, poses: Array, at_least: float = 0.0) -> Mask:
     """Find the configurations in which the bodies of each pair touch (k, m).
 
     Args:
         model: pinocchio model.
         bodies: collision bodies with their m pairs.
-        poses: k configurations (nq,).
+        poses: configurations (k, nq).
         at_least: share of the configurations; a pair that can no longer attain it is not computed further.
     """
     model_data, data, count = model.createData(), bodies.createData(), len(bodies.collisionPairs)
@@ -108,11 +90,10 @@ def find_contacts(model: Any, bodies: Any, poses: Sequence[Array], at_least: flo
         pin.updateGeometryPlacements(model, model_data, bodies, data, q)
         pin.computeCollisions(bodies, data, False)
         touches[number, active] = [data.collisionResults[int(i)].isCollision() for i in active]
-        separations = number + 1 - touches[: number + 1, active].sum(axis=0)
-        below_fraction = separations > (1.0 - at_least) * len(poses)
-        for i in active[below_fraction].tolist():
+        is_out = (~touches[: number + 1, active]).sum(axis=0) > (1.0 - at_least) * len(poses)
+        for i in active[is_out].tolist():
             data.deactivateCollisionPair(i)
-        active = active[~below_fraction]
+        active = active[~is_out]
         if not len(active):
             break
     return touches

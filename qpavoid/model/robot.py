@@ -29,6 +29,7 @@ from qpavoid.model.joints import (
 from qpavoid.model.kinematics import TRANSLATIONS
 from qpavoid.model.limits import JointBounds
 from qpavoid.model.notes import Note, NoteKind, issue_warning, merge_notes
+from qpavoid.model.packages import absolute_entries
 from qpavoid.model.pairs import TouchingPair, add_self_pairs, drop_always_touching, pair_array
 from qpavoid.model.robot_bodies import pair_margins, robot_bodies
 from qpavoid.model.urdf import apply_srdf, find_resource, is_mjcf, read_model
@@ -62,6 +63,10 @@ class Robot:
     """Joint: largest jerk [rad/s³ or m/s³]; joints left out have no such limit."""
     notes: tuple[Note, ...] = ()
     """What was left out, mended, replaced or assumed at loading."""
+    urdf: Path = Path()
+    """URDF or MJCF of the model, for what is meant to be seen of it."""
+    package_dirs: tuple[str, ...] = ()
+    """Folders of its packages, absolute, and `NAME=FOLDER`; see `mesh_folders`."""
 
     @classmethod
     def load(
@@ -163,6 +168,8 @@ class Robot:
             margins=pair_margins(config, bodies, path),
             acceleration=config.limits.acceleration,
             jerk=config.limits.jerk,
+            urdf=urdf,
+            package_dirs=tuple(absolute_entries(config.package_dirs, path.parent)),
         )
         notes += [*(pair.note() for pair in always_touching), *robot.notes_of_home(is_given=bool(config.home))]
         notes = merge_notes(notes)
@@ -175,12 +182,14 @@ class Robot:
         return list(self.model.names)[1:]
 
     @property
+    def position_names(self) -> list[str]:
+        """Name of each of the nq coordinates of q: the joint's, numbered where it has several."""
+        return [name for joint, x in self._joints() for name in _numbered(joint, x.nq)]
+
+    @property
     def coordinate_names(self) -> list[str]:
         """Name of each of the nv velocity coordinates: the joint's, numbered where it has several."""
-        names = []
-        for name, joint in self._joints():
-            names += [name] if joint.nv == 1 else [f"{name}.{i}" for i in range(joint.nv)]
-        return names
+        return [name for joint, x in self._joints() for name in _numbered(joint, x.nv)]
 
     @property
     def coordinate_units(self) -> list[str]:
@@ -232,13 +241,14 @@ class Robot:
         Args:
             is_given: whether somebody chose the home pose, so that they are meant to be that near.
         """
-        near = [(f"{a} - {b} ({1e3 * d:.1f} mm)", d > 0.0) for a, b, d in self.near_at_home(Avoidance().d1)]
-        apart, touching = ([name for name, is_apart in near if is_apart is wanted] for wanted in (True, False))
+        near = self.near_at_home(Avoidance().d1)
+        clear = [f"{a} - {b} ({1e3 * d:.1f} mm)" for a, b, d in near if d > 0.0]
+        touching = [f"{a} - {b} ({1e3 * d:.1f} mm)" for a, b, d in near if d <= 0.0]
         remedy = "give a `home` with bent joints, or `pair_margins`; `qpavoid robot add` writes both"
         notes = []
-        if apart:
+        if clear:
             clause = f"nearer than the default d1, {1e3 * Avoidance().d1:g} mm, kept as far apart as there, less 1 mm"
-            notes.append(Note(NoteKind.HOME, tuple(apart), clause, remedy, "note" if is_given else "warning"))
+            notes.append(Note(NoteKind.HOME, tuple(clear), clause, remedy, "note" if is_given else "warning"))
         if touching:
             clause = "touch there: the robot moves to part them, at no more than 0.2 rad/s"
             notes.append(Note(NoteKind.HOME, tuple(touching), clause, remedy, "warning"))
@@ -323,6 +333,10 @@ class Robot:
 
     def _joints(self) -> Iterator[tuple[str, Any]]:
         return zip(self.joint_names, list(self.model.joints)[1:], strict=True)
+
+
+def _numbered(name: str, count: int) -> list[str]:
+    return [name] if count == 1 else [f"{name}.{i}" for i in range(count)]
 
 
 _HOME_MARGIN = 1e-3

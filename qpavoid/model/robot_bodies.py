@@ -15,7 +15,7 @@ from qpavoid.geometry.bodies import convert_bodies, hull, make_shape, triangle_m
 from qpavoid.model.joints import frame_index
 from qpavoid.model.notes import Note, NoteKind
 from qpavoid.model.packages import absolute_entries
-from qpavoid.model.plausibility import note_implausible_sizes
+from qpavoid.model.shape_checks import note_implausible_sizes
 from qpavoid.model.trajectory import rpy_to_matrix
 from qpavoid.model.urdf import read_pieces
 
@@ -23,12 +23,7 @@ from qpavoid.model.urdf import read_pieces
 def robot_bodies(config: RobotConfig, urdf: Path, model: Any, path: Path, notes: list[Note]) -> Any:
     """Make the geometry model of the collision bodies that a robot.yaml asks for.
 
-    Args:
-        config: fields of the robot.yaml.
-        urdf: its URDF or MJCF.
-        model: Pinocchio model of that.
-        path: the robot.yaml, to name in errors.
-        notes: what was left out or replaced is added to them.
+    What was left out or replaced is added to the notes.
 
     Raises:
         ConfigError, UnknownName: a shape that cannot be read, a frame or a piece of geometry that does not exist.

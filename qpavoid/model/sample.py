@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from qpavoid.errors import NumericalError
-from qpavoid.problem import Array, as_vector, require_finite
+from qpavoid.problem import Array, as_numbers, as_vector, require_finite
 
 STATE = 18
 """Numbers in the state of a body: rotation by columns, position, linear and angular velocity, in world axes."""
@@ -162,23 +163,49 @@ def _require_finite_parts(placed: _Placed, *names: str) -> None:
             require_finite(name, getattr(placed, name), getattr(placed, name).shape)
 
 
-def as_sample(what: Any) -> Any:
-    """Return a sample or pose as it is.
+_REMEDY = "give a Sample, a Pose, a pin.SE3, a 4x4 matrix or a position"
+_LAST, _NEARLY = [0.0, 0.0, 0.0, 1.0], 1e-3
+"""Last row of a 4×4 matrix, and by how much an entry may differ from it for rounding [-]."""
+
+
+def as_sample(what: Any, rotation: Array | None = None) -> Any:
+    """Return a sample or pose as it is, and the pose that a `pin.SE3`, a 4×4 matrix or a position stands for.
+
+    Args:
+        what: that is given.
+        rotation: (3, 3) orientation where a position is given; without it, a position alone is refused.
 
     Raises:
-        NumericalError: it is neither.
+        NumericalError: it is none of these.
     """
     if type(what) is Sample or isinstance(what, Sample | Pose):
         return what
-    remedy = "give Sample.at(position, rotation, linear, angular), all but the first optional"
-    raise NumericalError(f"neither a Sample nor a Pose: {' '.join(repr(what).split()):.60}; {remedy}")
+    if isinstance(what, pin.SE3):
+        return Pose(what.translation, what.rotation)
+    try:
+        array = as_numbers("pose", what)
+    except NumericalError:
+        array = np.zeros(0)
+    if array.shape == (4, 4):
+        last = array[3].tolist()
+        if last != _LAST and np.abs(np.subtract(last, _LAST)).max() > _NEARLY:
+            raise NumericalError(f"a 4x4 matrix whose last row is {array[3]}, not [0 0 0 1]: is it transposed?")
+        known = np.nan if sum(last) != sum(last) else 1.0
+        return Pose(known * array[:3, 3], array[:3, :3])
+    if array.shape == (3,):
+        if rotation is None:
+            raise NumericalError("a position, but only the orientation counts; give a Pose, a pin.SE3 or a 4x4 matrix")
+        return Pose(array, rotation)
+    given = " ".join(repr(what).split())
+    shape = f" of shape {array.shape}" if array.size else ""
+    raise NumericalError(f"neither a Sample nor a Pose{shape}: {given:.60}; {_REMEDY}")
 
 
 def as_goal(what: Any) -> Sample:
-    """Return the sample that a task should reach: a bare `Pose` is one at rest.
+    """Return the sample that a task should reach: a bare `Pose` is one at rest; see `as_sample`.
 
     Raises:
-        NumericalError: neither a sample nor a pose.
+        NumericalError: no sample, and nothing that stands for a pose.
     """
     sample = as_sample(what)
     return sample if isinstance(sample, Sample) else sample.as_sample()

@@ -22,15 +22,10 @@ _MOST_TRIANGLES = 200_000
 
 
 def make_solids(shape: ObstacleShape, folder: Path, where: str) -> list[Any]:
-    """Make the coal geometries of an obstacle, all in the obstacle's own frame.
-
-    Args:
-        shape: of a point cloud, the sphere that stands for one of its voxels.
-        folder: where relative paths start.
-        where: the obstacle's `shape`, to name in errors.
+    """Make the coal geometries of an obstacle, all in its own frame; of a point cloud, the sphere around one voxel.
 
     Raises:
-        ConfigError: a mesh that cannot be found, read or used.
+        ConfigError: a mesh that cannot be found from the folder, read or used; naming the obstacle's `shape`.
     """
     if isinstance(shape, HalfSpace):
         return [coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0)]

@@ -15,10 +15,10 @@ import pinocchio as pin
 
 from qpavoid.config.shipped import EXAMPLES, example_robot
 from qpavoid.errors import ConfigError
-from qpavoid.model.enclosed_shapes import remove_enclosed
 from qpavoid.model.mjcf import check_mjcf, read_geoms, read_mjcf
 from qpavoid.model.notes import Note, NoteKind
 from qpavoid.model.packages import mesh_folders
+from qpavoid.model.shape_checks import remove_enclosed
 from qpavoid.model.urdf_shapes import MISSING, ShapeReader
 from qpavoid.model.urdf_tree import tree_xml
 from qpavoid.model.xml_file import read_robot_xml, undeclared_prefixes
@@ -31,15 +31,10 @@ _ROOT_JOINTS = {
 
 
 def find_resource(value: str, folder: Path, where: str) -> Path:
-    """Find a URDF, SRDF or mesh that a file names.
-
-    Args:
-        value: path relative to the file, or `example-robot-data:PATH`.
-        folder: that of the file.
-        where: file and field, for messages.
+    """Find a URDF, SRDF or mesh that a file names: by a path relative to its folder, or `example-robot-data:PATH`.
 
     Raises:
-        ConfigError: there is no such file.
+        ConfigError: there is no such file; naming file and field.
     """
     result = example_robot(value) if value.startswith(EXAMPLES) else folder / value
     if not os.path.isfile(result):  # False where the name is one that no file can have; Path.is_file may raise
@@ -58,15 +53,11 @@ def _root(path: Path) -> ET.Element:
 
 
 def read_model(urdf: Path, root_joint: str, notes: list[Note] | None = None) -> Any:
-    """Read the Pinocchio model of a URDF (also in xacro) or MJCF.
+    """Read the Pinocchio model of a URDF (also in xacro) or MJCF on a `fixed`, `planar` or `free_flyer` root joint.
 
     Joints that mimic another one have no coordinate of their own. Where Pinocchio cannot read them so (they come before
-    the other one in the tree, or are continuous where that has limits), they move on their own.
-
-    Args:
-        urdf: the file.
-        root_joint: `fixed`, `planar` or `free_flyer`.
-        notes: what was mended or left out is added to them.
+    the other one in the tree, or are continuous where that has limits), they move on their own. What was mended or left
+    out is added to the notes.
 
     Raises:
         ConfigError: not a usable file, with the parser's own reason, or one that it passes over.
@@ -195,24 +186,14 @@ def read_pieces(
 
 
 def mesh_names(urdf: Path, tag: str = "") -> list[str]:
-    """List the mesh files of a URDF or MJCF, each once.
-
-    Args:
-        urdf: the file.
-        tag: `collision` or `visual` for those of a URDF alone.
-    """
+    """List the mesh files of a URDF (of its `collision` or `visual` elements alone) or MJCF, each once."""
     meshes = _root(urdf).iterfind(f".//{tag}//mesh" if tag and not is_mjcf(urdf) else ".//mesh")
     names = (mesh.get("file" if is_mjcf(urdf) else "filename", "") for mesh in meshes)
     return list(dict.fromkeys(name for name in names if name))
 
 
 def apply_srdf(model: Any, bodies: Any, srdf: Path) -> None:
-    """Remove the pairs that an SRDF disables.
-
-    Args:
-        model: pinocchio model.
-        bodies: its collision bodies with their pairs, changed in place.
-        srdf: the file.
+    """Remove the pairs of bodies that an SRDF disables.
 
     Raises:
         ConfigError: not a usable SRDF.

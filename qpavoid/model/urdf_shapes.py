@@ -46,17 +46,14 @@ class ShapeReader:
     """Whether a shape whose mesh is missing is left out, with a warning, and not refused."""
     allow_faults: bool = False
     """Whether a shape that cannot be read for whatever reason is left out, with a warning, and not refused."""
+    load: Callable[[str, Any], Any] = load_mesh
+    """Loads a mesh, given its file and scale, into a coal geometry."""
 
     def read(self, root: ET.Element, tag: str, skipped: Collection[int] = ()) -> Any:
-        """Read the shapes into a geometry model.
+        """Read the `collision` or `visual` shapes into a geometry model, but for links whose frames are to be skipped.
 
         A shape is called by its link and its index in it, as in `hand_0`; where one element has several, further ones
         have a second index.
-
-        Args:
-            root: of the file.
-            tag: `collision` or `visual`.
-            skipped: frames of the links whose shapes are not read.
 
         Raises:
             ConfigError: a shape that cannot be read, or whose mesh is missing, naming link and element.
@@ -135,7 +132,7 @@ class ShapeReader:
             self.notes.append(Note(NoteKind.MESH, (name,), clause, _PACKAGES, "warning"))
             return None
         try:
-            return load_mesh(path, scale), path, scale
+            return self.load(path, scale), path, scale
         except ValueError as fault:
             raise ValueError(f"{where}: mesh {path}: {fault}") from None
 

@@ -25,14 +25,10 @@ _INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 def tree_xml(root: ET.Element, notes: list[Note]) -> str:
-    """Write a URDF without shapes, materials and elements of other tools.
+    """Write a URDF without shapes, materials and elements of other tools; what was mended is added to the notes.
 
     The parser behind Pinocchio leaves a link at its first fault, whatever comes after it in the link: of an inertial, a
     visual, a collision. Shapes are therefore read apart from it (`ShapeReader`).
-
-    Args:
-        root: of the file.
-        notes: what was mended is added to them.
 
     Raises:
         ValueError: no tree of links, or an origin, axis or limit that is none, naming link or joint, element and
@@ -51,11 +47,7 @@ def tree_xml(root: ET.Element, notes: list[Note]) -> str:
 
 
 def check_counts(links: int, moving: int, shapes: int) -> None:
-    """Check that a file has no more links, joints that move and collision shapes than can be worked with.
-
-    Raises:
-        ValueError: it has, with the numbers.
-    """
+    """Raise ValueError where a file has more links, joints that move or collision shapes than can be worked with."""
     counts = {"links": links, "joints that move": moving, "collision shapes": shapes}
     for noun, count in counts.items():
         if count > _MOST[noun]:
@@ -90,18 +82,10 @@ def vector(
     default: Sequence[float] | None = None,
     largest: float = LARGEST,
 ) -> list[float]:
-    """Read the numbers of an attribute.
-
-    Args:
-        element: that has it.
-        attribute: its name.
-        size: how many numbers there must be.
-        where: what to name in errors.
-        default: numbers where the attribute is left out; None where it must not be.
-        largest: amount that none may exceed.
+    """Read the numbers of an attribute: `size` of them, none above `largest`; the default where it is left out.
 
     Raises:
-        ValueError: missing, not finite numbers, too large, or another number of them.
+        ValueError: missing without a default, not finite numbers, too large, or another number of them.
     """
     text = element.get(attribute)
     if text is None:
@@ -116,11 +100,7 @@ def vector(
 
 
 def numbers_of(text: str, where: str, largest: float = LARGEST) -> list[float]:
-    """Read the numbers of a text.
-
-    Raises:
-        ValueError: one that is no finite number, or too large.
-    """
+    """Read the numbers of a text; ValueError where one is no finite number, or too large."""
     numbers = []
     for word in text.split():
         try:
@@ -138,11 +118,7 @@ def joints_fixed_by_limits(root: ET.Element, notes: list[Note]) -> dict[str, flo
     """Find the joints whose lower limit is their upper one, with that value [rad or m].
 
     Where every range of a file goes from 0 to 0, as some exporters write it unless asked for another one, it says
-    nothing, and no joint is fixed; nor is one that mimics another.
-
-    Args:
-        root: of the file.
-        notes: ranges that say nothing are named in them.
+    nothing, which is noted, and no joint is fixed; nor is one that mimics another.
     """
     ranges = {
         joint.get("name", ""): _range(_limit_values(limit, ""))
@@ -191,43 +167,38 @@ def _check_tree(links: dict[str, ET.Element], joints: dict[str, ET.Element]) -> 
         raise ValueError("it has no link")
     if len(roots) > 1:
         raise ValueError(f"links {roots[0]!r} and {roots[1]!r} hang from no joint; join them, a robot is one tree")
-    for start in links:
-        name, steps = start, 0
-        while name in above:
-            name, steps = above[name], steps + 1
-            if steps > len(links):
-                raise ValueError(f"link {start!r} hangs from a cycle of joints; a robot is a tree")
+    reached = set(roots)
+    while below := {child for child, parent in above.items() if parent in reached and child not in reached}:
+        reached |= below
+    if lost := [name for name in links if name not in reached]:
+        raise ValueError(f"link {lost[0]!r} hangs from a cycle of joints; a robot is a tree")
 
 
 def _add_link(robot: ET.Element, link: ET.Element, notes: list[Note]) -> None:
-    """Add a link with its inertial; what cannot be read of that is left out and named."""
+    """Add a link with its inertial; what is missing of that, or cannot be read, is left out and named."""
     name, inertial = link.get("name", ""), link.find("inertial")
     element = ET.SubElement(robot, "link", name=name)
     if inertial is None:
         return
-    clause, moments = "its inertial is left out", [0.0] * len(_INERTIA)
+    mass, inertia, moments = inertial.find("mass"), inertial.find("inertia"), [0.0] * len(_INERTIA)
+    clause, severity = "its inertial is left out", "note"
     try:
-        placement = origin(inertial, "inertial")
-        mass = vector(_child(inertial, "mass"), "value", 1, "inertial")[0]
-        clause = "its mass counts as a point's"
-        inertia = _child(inertial, "inertia")
-        moments = [vector(inertia, moment, 1, "inertial")[0] for moment in _INERTIA]
+        if mass is not None:
+            part = ET.Element("inertial")
+            _add_origin(part, inertial, origin(inertial, "inertial"))
+            ET.SubElement(part, "mass", value=repr(vector(mass, "value", 1, "inertial")[0]))
+            element.append(part)
+            clause = "its mass counts as a point's"
+            if inertia is not None and set(_INERTIA) <= set(inertia.keys()):
+                moments = [vector(inertia, moment, 1, "inertial")[0] for moment in _INERTIA]
+                clause = ""
     except ValueError as fault:
-        clause += f": {str(fault).removeprefix('inertial: ')}"
-        notes.append(Note(NoteKind.LINK, (name,), clause, "none is needed unless torques are asked for"))
-        if clause.startswith("its inertial"):
-            return
-    part = ET.SubElement(element, "inertial")
-    _add_origin(part, inertial, placement)
-    ET.SubElement(part, "mass", value=repr(mass))
-    ET.SubElement(part, "inertia", dict(zip(_INERTIA, map(repr, moments), strict=True)))
-
-
-def _child(element: ET.Element, tag: str) -> ET.Element:
-    child = element.find(tag)
-    if child is None:
-        raise ValueError(f"{tag} is missing")
-    return child
+        clause, severity = f"{clause}: {str(fault).removeprefix('inertial: ')}", "warning"
+    if clause:
+        remedy = "none is needed unless torques are asked for"
+        notes.append(Note(NoteKind.LINK, (name,), clause, remedy, severity))  # type: ignore[arg-type]
+    for part in element:
+        ET.SubElement(part, "inertia", dict(zip(_INERTIA, map(repr, moments), strict=True)))
 
 
 def _add_joint(robot: ET.Element, joint: ET.Element, notes: list[Note]) -> None:
@@ -235,7 +206,7 @@ def _add_joint(robot: ET.Element, joint: ET.Element, notes: list[Note]) -> None:
     where = f"joint {name!r}"
     element = ET.SubElement(robot, "joint", name=name, type=kind)
     for tag in ("parent", "child"):
-        ET.SubElement(element, tag, link=_child(joint, tag).get("link", ""))
+        ET.SubElement(element, tag, link=joint.find(tag).get("link"))  # type: ignore[union-attr, arg-type]
     _add_origin(element, joint, origin(joint, where))
     for axis in joint.findall("axis")[:1] if kind in _WITH_AXIS else ():
         direction = vector(axis, "xyz", 3, where)

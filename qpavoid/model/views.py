@@ -19,15 +19,10 @@ RESULT = 10
 
 
 def _view(firsts: list[Array], offset: int, writeable: bool, expected: Array) -> Array | None:
-    """View memory as rows of doubles (n, fields), None where it is not as expected.
+    """View memory as rows of doubles (n, fields), each `offset` bytes before an array; None if it is not as expected.
 
-    The view is valid as long as the C++ vector that it looks into lives and is not resized.
-
-    Args:
-        firsts: arrays that begin `offset` bytes after each row.
-        offset: see there.
-        writeable: whether the view may be written to.
-        expected: the rows, read through the accessors; memory that nothing was written to yet may hold NaN.
+    The view is valid as long as the C++ vector that it looks into lives and is not resized. Memory that nothing was
+    written to yet may hold NaN.
     """
     addresses = [int(array.__array_interface__["data"][0]) - offset for array in firsts]
     strides, fields = np.diff(addresses), expected.shape[1]

@@ -23,13 +23,9 @@ _DEEPEST = 50
 
 
 def read_robot_xml(path: Path, kind: str) -> ET.Element:
-    """Read the root of a URDF, SRDF or MJCF; a xacro file is expanded first.
+    """Read the root of a `URDF`, `SRDF` or `MJCF`; a xacro file is expanded first.
 
     Names keep the prefix that they are written with (`drake:capsule`), whether the file declares it or not.
-
-    Args:
-        path: the file.
-        kind: `URDF`, `SRDF` or `MJCF`.
 
     Raises:
         ConfigError: unreadable, not XML, another root than <robot> (<mujoco>), a DOCTYPE, or nested too deep.

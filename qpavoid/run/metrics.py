@@ -4,8 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from qpavoid.geometry.segments import point_segment_distance
 from qpavoid.problem import Array
+
+
+def point_segment_distance(p: Array, a: Array, b: Array) -> Array:
+    """Compute the distances (...) of points p from segments ab [m]; the last axis of each holds the coordinates.
+
+    Eq. 2 of the paper with the projection clamped to the segment, so that the axial part beyond an end counts, which
+    eq. 2 leaves out. A segment of zero length is the point a.
+    """
+    u = b - a
+    square = np.sum(u * u, axis=-1)
+    t = np.divide(np.sum((p - a) * u, axis=-1), square, out=np.zeros(np.broadcast(p, u).shape[:-1]), where=square > 0.0)
+    return np.asarray(np.linalg.norm(p - a - np.clip(t, 0.0, 1.0)[..., None] * u, axis=-1))
 
 
 def path_deviation(tool: Array, target: Array, corners: int = 500) -> Array:

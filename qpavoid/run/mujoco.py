@@ -14,6 +14,7 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid.errors import ConfigError
+from qpavoid.model.joints import hinge_or_slide
 from qpavoid.model.sample import Sample
 from qpavoid.model.scene import Scene
 from qpavoid.problem import Array, IntArray
@@ -56,7 +57,7 @@ class MujocoModel:
     def place(self, q: Array, t: float) -> None:
         """Put the robot to q (nv,) and the obstacles to their poses at t [s]."""
         self.data.qpos[self.q_index] = q
-        for i, obstacle in enumerate(self.scene.obstacles):
+        for i, obstacle in enumerate(self.scene.slots):
             if obstacle.moves:
                 place_mocap(self.data, i, obstacle.motion.sample(t))
         mujoco.mj_kinematics(self.model, self.data)
@@ -86,13 +87,12 @@ def place_mocap(data: Any, index: int, sample: Sample) -> None:
     mujoco.mju_mat2Quat(data.mocap_quat[index], np.ascontiguousarray(sample.rotation).ravel())
 
 
-def build(scene: Scene, q0: Array, frames: Sequence[int] = (), has_servos: bool = False) -> MujocoModel:
+def build(scene: Scene, q0: Array, has_servos: bool = False) -> MujocoModel:
     """Build the MuJoCo model of a scene: one body a joint, one mocap body an obstacle.
 
     Args:
         scene: what is written.
         q0: where the robot starts (nq,).
-        frames: of the robot's model, by their indices; these become sites `frame 0`, `frame 1` and so on.
         has_servos: whether bodies have the masses of the robot's model, and each joint a motor, without any gain yet.
 
     Raises:
@@ -121,16 +121,13 @@ def build(scene: Scene, q0: Array, frames: Sequence[int] = (), has_servos: bool 
             motor = spec.add_actuator(name=robot.names[i], target=robot.names[i], trntype=mujoco.mjtTrn.mjTRN_JOINT)
             motor.biastype = mujoco.mjtBias.mjBIAS_AFFINE
         bodies.append(body)
-    for i, frame in enumerate(robot.frames[index] for index in frames):
-        place = frame.placement
-        bodies[frame.parentJoint].add_site(name=f"frame {i}", pos=place.translation, quat=_quaternion(place.rotation))
     first = len(scene.body_names)
-    obstacles = [spec.worldbody.add_body(name=f"obstacle {i}", mocap=True) for i in range(len(scene.obstacles))]
+    obstacles = [spec.worldbody.add_body(name=f"obstacle {i}", mocap=True) for i in range(len(scene.slots))]
     for i, geometry in enumerate(scene.geometry.geometryObjects):
         if i < first:
-            _add_geom(spec, bodies[geometry.parentJoint], geometry, geometry.placement)
+            _add_geom(spec, bodies[geometry.parentJoint], geometry, f"geometry {i}", geometry.placement)
         else:
-            _add_geom(spec, obstacles[scene.obstacle_of[i]], geometry, pin.SE3.Identity())
+            _add_geom(spec, obstacles[scene.obstacle_of[i]], geometry, f"geometry {i}", pin.SE3.Identity())
     model = spec.compile()
     joints = [model.joint(name) for name in list(robot.names)[1:]]
     mujoco_model = MujocoModel(
@@ -138,30 +135,15 @@ def build(scene: Scene, q0: Array, frames: Sequence[int] = (), has_servos: bool 
         q0=np.array(q0),
         model=model,
         data=mujoco.MjData(model),
-        geoms=np.array([model.geom(geometry.name).id for geometry in scene.geometry.geometryObjects], dtype=np.intp),
+        geoms=np.array([model.geom(f"geometry {i}").id for i in range(scene.geometry.ngeoms)], dtype=np.intp),
         q_index=np.array([joint.qposadr[0] for joint in joints], dtype=np.intp),
         v_index=np.array([joint.dofadr[0] for joint in joints], dtype=np.intp),
         bodies=first,
     )
-    for i, obstacle in enumerate(scene.obstacles):
+    for i, obstacle in enumerate(scene.slots):
         place_mocap(mujoco_model.data, i, obstacle.motion.sample(0.0))
     mujoco_model.place(mujoco_model.q0, 0.0)
     return mujoco_model
-
-
-def hinge_or_slide(model: Any, index: int) -> tuple[bool, Array]:
-    """Return True for a slide, False for a hinge, and the joint's axis (3,) in its own frame.
-
-    Raises:
-        ValueError: it is neither a hinge nor a slide.
-    """
-    joint = model.joints[index]
-    if joint.nq != 1 or joint.nv != 1:
-        raise ValueError(f"joint {model.names[index]!r}: {joint.shortname()} is neither a hinge nor a slide")
-    data = model.createData()
-    pin.computeJointJacobians(model, data, pin.neutral(model))
-    screw = np.asarray(data.joints[index].S).ravel()
-    return (True, screw[:3]) if np.any(screw[:3]) else (False, screw[3:])
 
 
 def _inertia(inertia: Any) -> dict[str, Any]:
@@ -173,10 +155,10 @@ def _inertia(inertia: Any) -> dict[str, Any]:
     return {"mass": inertia.mass, "ipos": inertia.lever, "inertia": moments, "iquat": _quaternion(axes)}
 
 
-def _add_geom(spec: Any, body: Any, geometry: Any, placement: Any) -> None:
-    """Add a geometry to a body of the MuJoCo model."""
+def _add_geom(spec: Any, body: Any, geometry: Any, name: str, placement: Any) -> None:
+    """Add a geometry by a name to a body of the MuJoCo model."""
     kinds, shape = mujoco.mjtGeom, geometry.geometry
-    place = {"name": geometry.name, "pos": placement.translation, "quat": _quaternion(placement.rotation)}
+    place = {"name": name, "pos": placement.translation, "quat": _quaternion(placement.rotation)}
     match shape:
         case coal.Sphere():
             body.add_geom(type=kinds.mjGEOM_SPHERE, size=_three(shape.radius), **place)
@@ -197,9 +179,9 @@ def _add_geom(spec: Any, body: Any, geometry: Any, placement: Any) -> None:
                 **_below_plane(place),
             )
         case coal.ConvexBase():
-            mesh = spec.add_mesh(name=geometry.name, uservert=np.array(shape.points()).ravel())
+            mesh = spec.add_mesh(name=name, uservert=np.array(shape.points()).ravel())
             mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
-            body.add_geom(type=kinds.mjGEOM_MESH, meshname=geometry.name, **place)
+            body.add_geom(type=kinds.mjGEOM_MESH, meshname=name, **place)
         case _:
             raise ValueError(f"body {geometry.name!r}: {type(shape).__name__} has no counterpart")
 

@@ -65,9 +65,9 @@ class Plant:
         scene, count, least = self.scene, int(np.ceil(dt / _STEP - 1e-9)), np.inf
         scene.model.opt.timestep = dt / count
         for _ in range(count):
-            self._setpoint += v * (dt / count)
             scene.data.ctrl[:] = self._setpoint
             mujoco.mj_step(scene.model, scene.data)
+            self._setpoint += v * (dt / count)
             self.t += dt / count
             scene.place(scene.data.qpos[scene.q_index], self.t)
             least = min(least, min(map(scene.distance, self._pairs), default=np.inf))

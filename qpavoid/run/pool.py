@@ -13,11 +13,11 @@ import os
 import signal
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
-from contextlib import contextmanager
 from importlib.metadata import version
 from itertools import islice
 from threading import Thread
 from typing import Any, TypeVar
+from unittest.mock import patch
 
 from qpavoid.errors import ConfigError, QpavoidError
 
@@ -157,7 +157,7 @@ class Workers:
     def _submit(self, function: Callable[..., Any], call: tuple[Any, ...]) -> Future[Any]:
         if not self._count:
             raise ValueError("these workers are closed")
-        with _environment(_SINGLE_THREADED):  # processes, which start here, load their libraries with it
+        with patch.dict(os.environ, _SINGLE_THREADED):  # processes, which start here, load their libraries with it
             if self._executor is not None:
                 try:
                     return self._executor.submit(function, *call)
@@ -248,21 +248,5 @@ def _check_versions(client: Any, address: str) -> None:
         raise ConfigError(f"--cluster {address}: no worker there; start some with `dask worker {address}`") from None
     ours = version("qpavoid")
     for worker, theirs in client.run(version, "qpavoid", on_error="return").items():
-        if theirs != ours:
-            has = f"qpavoid {theirs}" if isinstance(theirs, str) else f"no qpavoid ({type(theirs).__name__}: {theirs})"
-            raise ConfigError(f"--cluster {address}: worker {worker} has {has}, here it is {ours}; install the same")
-
-
-@contextmanager
-def _environment(variables: dict[str, str]) -> Iterator[None]:
-    """Set environment variables for a while."""
-    previous = {name: os.environ.get(name) for name in variables}
-    os.environ.update(variables)
-    try:
-        yield
-    finally:
-        for name, value in previous.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+        if theirs != ours:  # or what it raised
+            raise ConfigError(f"--cluster {address}: worker {worker} has qpavoid {theirs!r}, here it is {ours!r}")

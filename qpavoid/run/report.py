@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import is_dataclass
 from typing import Any
 
 from rich import box
@@ -42,7 +43,8 @@ def metrics_table(runs: Sequence[dict[str, Any]], width: int = 80) -> Table:
         count_shown += 1
     hidden = len(_COLUMNS) - count_shown
     more = f"; {hidden} more column{'s' * (hidden > 1)} in a wider terminal" if hidden else ""
-    table = _table(f"[bold]{escape(runs[0]['scenario'])}[/] (distances between surfaces{more})")
+    title = f"[bold]{escape(runs[0]['scenario'])}[/] (distances between surfaces{more})"
+    table = Table(title=title, title_justify="left", title_style="", box=box.SIMPLE_HEAD, pad_edge=False, padding=0)
     table.add_column("solver", no_wrap=True)
     for heading, _ in _COLUMNS[:count_shown]:
         table.add_column(escape(heading), justify="right", no_wrap=True)
@@ -50,59 +52,6 @@ def metrics_table(runs: Sequence[dict[str, Any]], width: int = 80) -> Table:
     for run, row in zip(runs, cells, strict=True):
         table.add_row(run["solver"], *row[:count_shown], outcome(run))
     return table
-
-
-_RATIOS = (
-    ("min dist\n[mm]", "min_distance", 1e3, ".1f"), ("in coll\n[s]", "time_in_collision", 1.0, ".2f"),
-    ("rms err\n[mm]", "tracking_rmse", 1e3, ".1f"), ("end err\n[mm]", "final_error", 1e3, ".2f"),
-    ("dev\n[mm]", "max_deviation", 1e3, ".1f"), ("peak q̇\n[rad/s]", "peak_velocity", 1.0, ".2f"),
-    ("Σ|Δq̇|\n[rad/s]", "jitter", 1.0, ".1f"),
-)  # fmt: skip
-"""Heading, name, unit and format of the figures of which the ratios table shows ratios."""
-_MIN_RATIO_VALUE = 0.05
-"""Figures no larger than this, in their unit, have no ratio: they are round-off or nearly nothing."""
-
-
-def ratios_table(runs: Sequence[dict[str, Any]], numerator: str, denominator: str) -> Table:
-    """Lay out figures of two solvers and the ratios of the first to the second.
-
-    Args:
-        runs: results of `Log.metrics` of all scenarios.
-        numerator: solver whose figures stand above the line.
-        denominator: the other one.
-    """
-    table = _table(f"[bold]{escape(numerator)} / {escape(denominator)}[/]")
-    table.add_column("scenario", no_wrap=True)
-    table.add_column("", no_wrap=True)
-    for heading, *_ in _RATIOS:
-        table.add_column(escape(heading), justify="right", no_wrap=True)
-    run_of = {(run["scenario"], run["solver"]): run for run in runs}
-    for scenario in dict.fromkeys(run["scenario"] for run in runs):
-        if (scenario, numerator) not in run_of or (scenario, denominator) not in run_of:
-            continue
-        values = [
-            [None if run[name] is None else unit * run[name] for _, name, unit, _ in _RATIOS]
-            for run in (run_of[scenario, numerator], run_of[scenario, denominator])
-        ]
-        for first, solver, figures in zip((scenario, ""), (numerator, denominator), values, strict=True):
-            cells = (
-                "-" if value is None else f"{value:{form}}" for value, (*_, form) in zip(figures, _RATIOS, strict=True)
-            )
-            table.add_row(first, solver, *cells)
-        table.add_row(
-            "", "ratio", *(f"[bold]{_ratio(a, b)}[/]" for a, b in zip(*values, strict=True)), end_section=True
-        )
-    return table
-
-
-def _ratio(a: float | None, b: float | None) -> str:
-    """Format a / b; empty where one of them is nearly zero, or a depth of penetration."""
-    return f"{a / b:.2f}" if a is not None and b is not None and min(a, b) > _MIN_RATIO_VALUE else ""
-
-
-def _table(title: str) -> Table:
-    """Make a table whose columns are a blank apart."""
-    return Table(title=title, title_justify="left", title_style="", box=box.SIMPLE_HEAD, pad_edge=False, padding=0)
 
 
 def outcome(run: dict[str, Any]) -> str:
@@ -145,16 +94,18 @@ def failed(run: dict[str, Any]) -> bool:
 
 
 def to_json(document: Any) -> str:
-    """Serialize strictly: NaN and infinity, for which JSON has no notation, become null."""
-    return json.dumps(_without_nan(document), indent=2, allow_nan=False)
+    """Serialize strictly: dataclasses and named tuples as objects, NaN and infinity, unknown to JSON, as null."""
+    return json.dumps(_plain(document), indent=2, allow_nan=False)
 
 
-def _without_nan(value: Any) -> Any:
-    """Return a document with None in place of NaN and infinity."""
+def _plain(value: Any) -> Any:
+    """Return a document of dicts, lists and what JSON knows."""
+    if is_dataclass(value):
+        value = vars(value)
+    elif isinstance(value, tuple) and hasattr(value, "_asdict"):
+        value = value._asdict()
     if isinstance(value, dict):
-        return {key: _without_nan(item) for key, item in value.items()}
+        return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_without_nan(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

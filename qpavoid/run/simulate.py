@@ -19,8 +19,7 @@ from qpavoid.control.tasks import in_order
 from qpavoid.control.tick import Tick
 from qpavoid.controller import Controller
 from qpavoid.errors import ConfigError, NumericalError
-from qpavoid.geometry.bodies import enclosing_capsule
-from qpavoid.geometry.meshes import surface_triangles
+from qpavoid.geometry.bodies import enclosing_capsule, surface_triangles
 from qpavoid.model.kinematics import ForwardKinematics
 from qpavoid.model.scene import PARKING_DISTANCE, Obstacle, Scene
 from qpavoid.problem import Array, Solution, Status
@@ -61,8 +60,8 @@ def simulate(
         scenario = scenario.model_copy(update={"solver": settings})
     controller, q = Controller.from_scenario(scenario)
     _check_start(controller, q, scenario)
-    model, dt, ticks = controller.scene.robot.model, scenario.dt, round(scenario.duration / scenario.dt) + 1
-    under_way, q_commanded = CommandsUnderWay(model.nv, scenario.latency, dt), q
+    dt, ticks = scenario.dt, round(scenario.duration / scenario.dt) + 1
+    follower = Follower(controller.scene.robot.model, q, scenario.latency, dt)
     try:
         recorder = Recorder(controller, scenario, ticks)
     except MemoryError:
@@ -72,12 +71,9 @@ def simulate(
     stopped_by = None
     try:
         for k in range(ticks):
-            tick = controller.tick(q, k * dt)
+            tick = controller.tick(follower.q, k * dt)
             recorder.add(tick)
-            under_way.add(tick.solution.v)
-            q = q_commanded = pin.integrate(model, q_commanded, tick.solution.v * dt)
-            if scenario.latency:
-                q = pin.integrate(model, q_commanded, -under_way.displacement)
+            follower.follow(tick.solution.v)
             if progress is not None:
                 progress(k + 1, ticks)
     except KeyboardInterrupt:
@@ -85,6 +81,24 @@ def simulate(
     except NumericalError as error:
         stopped_by = str(error)
     return recorder.log(stopped_by)
+
+
+class Follower:
+    """A robot that follows its commands exactly, q ⊕ v dt, after a latency."""
+
+    def __init__(self, model: Any, q: Array, latency: float, dt: float) -> None:
+        """Begin at rest at q (nq,); `latency` and the control period dt are in seconds."""
+        self._model, self._dt, self._q_commanded = model, dt, q
+        self._under_way = CommandsUnderWay(model.nv, latency, dt) if latency else None
+        self.q = q
+        """(nq,) configuration, as measured."""
+
+    def follow(self, v: Array) -> None:
+        """Hold a commanded velocity (nv,) for one control period."""
+        self.q = self._q_commanded = pin.integrate(self._model, self._q_commanded, v * self._dt)
+        if self._under_way is not None:
+            self._under_way.add(v)
+            self.q = pin.integrate(self._model, self._q_commanded, -self._under_way.displacement)
 
 
 def _check_start(controller: Controller, q: Array, scenario: ScenarioConfig) -> None:
@@ -165,7 +179,7 @@ class Recorder:
         scene, known, x = self._scene, set(map(id, self._obstacles)), self._arrays
         new = [i for i, obstacle in enumerate(scene.slots) if obstacle.name and id(obstacle) not in known]
         self._obstacles += [scene.slots[i] for i in new]
-        self._descriptions += [_describe_obstacle(scene, i) for i in new]
+        self._descriptions += [describe_obstacle(scene, i) for i in new]
         for name in ("obstacle_position", "obstacle_rotation"):
             count, _, *shape = x[name].shape
             x[name] = np.concatenate((x[name], np.full((count, len(new), *shape), np.nan)), axis=1)
@@ -231,6 +245,7 @@ class Recorder:
             "events": self._events,
             "robot": robot.name,
             "notes": [str(note) for note in robot.notes],
+            "positions": robot.position_names,
             "coordinates": robot.coordinate_names,
             "units": robot.coordinate_units,
             "velocity_limit": [v if np.isfinite(v) else None for v in bounds.velocity],
@@ -265,7 +280,7 @@ _MAX_FACES = 2000
 """Triangles or voxels of an obstacle that a log keeps for its figures: a panel shows no more."""
 
 
-def _describe_obstacle(scene: Scene, index: int) -> dict[str, Any]:
+def describe_obstacle(scene: Scene, index: int) -> dict[str, Any]:
     """Return name and shape of an obstacle, and triangles or voxels that come from files."""
     obstacle = scene.slots[index]
     described: dict[str, Any] = {"name": obstacle.name, "shape": obstacle.shape.model_dump(mode="json")}

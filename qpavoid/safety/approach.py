@@ -57,12 +57,9 @@ class ApproachCheck:
         return max(self._max_external_speed, 0.0 if self._paths is None else self._paths.max_speed)
 
     def is_far(self, q: Array, v: Array, t: float) -> bool:
-        """Return whether moving obstacles certainly stay away from a robot that moves at v once more, and brakes.
+        """Return whether moving obstacles certainly stay away from a robot that moves at v (nv,) once more, and brakes.
 
-        Args:
-            q: configuration (nq,).
-            v: velocity (nv,) of this control step.
-            t: time [s].
+        It is at q (nq,) at time t [s].
         """
         travel = kernels.braking_travel(v, self._period, self._braking)
         motion = self._rollouts.lever_arm * travel if travel else 0.0  # a lever arm may be infinite

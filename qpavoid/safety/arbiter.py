@@ -33,18 +33,11 @@ class Arbiter:
     def __init__(
         self, settings: ControlSettings, solver: Solver, rows: RowAssembler, obstacles: ObstacleTracker
     ) -> None:
-        """Build the checks, each with memory of its own.
-
-        Args:
-            settings: of the controller.
-            solver: the control law.
-            rows: of the problems.
-            obstacles: states of the obstacles.
-        """
+        """Build the checks, each with memory of its own."""
         self._settings, self.solver, self._rows = settings, solver, rows
         self._v_shape = (settings.scene.robot.model.nv,)
         self._braking = BrakingCheck(settings, rows, obstacles)
-        self.progress = ProgressMonitor(settings)
+        self.progress = ProgressMonitor(settings, rows)
         has_backup = settings.avoidance.backup and len(settings.scene.slots) > 0
         self.backup = BackupPlanner(settings, rows.query.table, obstacles) if has_backup else None
 
@@ -79,8 +72,8 @@ class Arbiter:
         """Return the solution within the limits, after the stop look-ahead."""
         try:
             if from_tasks:
-                if problem.levels and self.solver.prioritised:  # v_tracking is not a cascade's
-                    problem = self._rows.prioritised(problem, self.solver.tracked)
+                if problem.levels and self.solver.prioritised:
+                    problem = self._rows.prioritised(problem)
                 elif problem.jerk_limited:
                     problem = self._rows.within_jerks(problem)
             solution = self.solver.solve(problem)

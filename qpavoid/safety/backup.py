@@ -97,9 +97,8 @@ class BackupPlanner:
     def _decide(self, next_state: Start, state: Start) -> Array | None:
         """Compare trajectories from the next state with those from the present one.
 
-        Returns:
-            None if one from the next state is sufficient, or not worse than any from the present one; else the first
-            velocity (nv,) of the best from the present one.
+        None if one from the next state is sufficient, or not worse than any from the present one; else the first
+        velocity (nv,) of the best from the present one.
         """
         v, sufficient = next_state.v, self._rollouts.sufficient_score
         best = self._best(next_state, self._candidates(v))

@@ -53,9 +53,6 @@ that approaches come nearer."""
 _SCALES = (0.75, 0.5, 0.25, 0.0)
 """Scales of the velocity that are tried where it leads too near [-]; the rest is the stop."""
 
-LowEffort = Callable[[Problem, "Array | None"], "Array | None"]
-"""(problem, slack) -> velocity; see `Solver.low_effort`."""
-
 
 class BrakingResult(NamedTuple):
     """A velocity that was checked."""
@@ -106,13 +103,7 @@ class BrakingCheck:
     """Checks velocities ahead in time, on kinematics and distances of its own."""
 
     def __init__(self, settings: ControlSettings, rows: RowAssembler, obstacles: ObstacleTracker) -> None:
-        """Allocate all memory.
-
-        Args:
-            settings: of the controller.
-            rows: kinematics, distances and rows of the control step.
-            obstacles: states of the obstacles.
-        """
+        """Allocate all memory."""
         scene = settings.scene
         self._model, self._bounds, self._dt = scene.robot.model, settings.bounds, settings.dt
         self._safety_distance, self._rate = settings.safety_distance, settings.limits.position_gain / settings.dt

@@ -1,102 +1,223 @@
-"""Detects tasks that make no progress because of avoidance, and names what is in the way.
+"""Detects tasks that make no progress towards what they ask for, and names what is in the way.
 
-A robot that is pushed back exactly against its task velocity rests there: the projections of eq. 10 and of the QP both
-end in such points. A task counts as stalled by the fraction of its velocity that is left.
+A speed shows nothing: an arm that is pressed on something goes on by self-motion, and one that crosses a singularity
+hardly moves. So progress is measured in the errors of the tasks, and in the part of the task velocity that is left.
 """
 
 from __future__ import annotations
 
-import numpy as np
+from collections import deque
+from collections.abc import Sequence
+from typing import NamedTuple
 
+import numpy as np
+from scipy.optimize import nnls
+
+from qpavoid.control.assembler import RowAssembler
 from qpavoid.control.settings import ControlSettings
-from qpavoid.problem import Array, Problem, Solution
+from qpavoid.control.tasks import Manipulability
+from qpavoid.problem import Array, IntArray, Problem, Solution
 from qpavoid.reason import Reason, ReasonKind
 
+_TOLERANCE = 2e-3
+"""Error below which a task is at its target [m, rad]."""
+_MIN_GAIN = 0.5e-3, 0.01
+"""Least decrease of an error that is progress [m, rad], and over that error [-]."""
+_JUMP = 0.05
+"""Increase of an error between two checks that a new target makes, over that error [-]."""
 _MIN_PROGRESS = 0.1
 """Fraction of the task velocity below which there is no progress [-]."""
-_MIN_TASK_SPEED = 2e-3
-"""Task velocity below which no progress is needed [m/s, rad/s]: the task is at its target."""
-_MAX_SPEED_AT_REST = 0.01
-"""Speed below which a task without progress rests, and is not passing an obstacle either [m/s, rad/s]."""
+_CHECKS = 10
+"""Checks in the time after which a task counts as stalled: they cost some µs each."""
+_FREE = 0.05
+"""‖Aᵀr‖ of what a task lacks, r, over σ_1 ‖b‖, below which nothing but the task itself keeps it [-]."""
+_SADDLE = 0.02
+"""Negative curvature of the task error, over its size, from which the robot could go on from a singularity [-]."""
 _ACTIVE_TOLERANCE = 1e-3
 """Excess over its bound below which a row counts as active [m/s]."""
-_CHECK_STEPS = 5
-"""Control steps between two checks of the progress, while the tasks are not stalled: a check costs some µs."""
-_MAX_STALL = 1.1
-"""Cap on the time without progress, in `stalled_after` [-], so that a task that moves again is soon not stalled."""
+_AT_LIMIT = 0.1
+"""Bound on the speed of a coordinate, over its speed limit, below which a position limit makes it [-]."""
+_CULPRIT = 0.1
+"""Share of the forces in the way from which a pair or limit is named [-]."""
+_EXPLAINED = 0.9
+"""Share of the task's pull that the named pairs and limits have to balance [-]."""
+
+
+class _Goal(NamedTuple):
+    """A task that has somewhere to go, and its rows."""
+
+    task: int
+    rows: IntArray
 
 
 class ProgressMonitor:
     """Follows the progress of a controller's tasks from control step to control step."""
 
-    def __init__(self, settings: ControlSettings) -> None:
-        self._limit = settings.progress.stalled_after / settings.dt  # control steps
+    def __init__(self, settings: ControlSettings, rows: RowAssembler) -> None:
+        self._rows = rows
+        self._interval = max(1, round(settings.progress.stalled_after / (_CHECKS * settings.dt)))
+        self._limit = settings.progress.stalled_after / settings.dt - 0.5
+        self._goals = _goals(rows)
+        others = [goal.task - rows.frame_count for goal in self._goals[rows.frame_count :]]
+        self._others = np.array(others, dtype=np.intp)  # among the tasks that are no frames
         self.reset()
 
     def reset(self) -> None:
         """Drop all counts."""
-        self._step, self._stalled_steps = 0, 0.0
+        self._step, self._stalled = 0, tuple[Reason, ...]()
+        self._history, self._since = deque[Array](maxlen=_CHECKS + 1), np.zeros(len(self._goals))
 
     def update(self, problem: Problem, solution: Solution) -> tuple[Reason, ...]:
-        """Return what stalls the tasks, after long enough without progress.
+        """Return what keeps the tasks from their targets, after long enough without progress.
 
         Args:
             problem: of the tasks.
             solution: what is commanded.
         """
-        A = problem.tracking.A
-        if not len(A) or (problem.violation <= 0.0 and solution.command_scale == 1.0):
-            self._stalled_steps = 0.0
-            return ()
         self._step += 1
-        if self._step % _CHECK_STEPS and not self.stalled:
+        if self._step % self._interval:
+            return self._stalled
+        errors = self._rows.frame_errors
+        if float(errors @ errors) < _TOLERANCE**2 and not len(self._others):
+            if self._history:
+                self.reset()
             return ()
-        steps = 1 if self.stalled else _CHECK_STEPS
-        desired, achieved = A @ problem.v_tracking, A @ solution.v
-        size = float(desired @ desired)
-        is_at_rest = float(achieved @ achieved) < _MAX_SPEED_AT_REST**2
-        is_stuck = is_at_rest and size > _MIN_TASK_SPEED**2 and float(achieved @ desired) < _MIN_PROGRESS * size
-        stalled_steps = self._stalled_steps + (steps if is_stuck else -steps)
-        self._stalled_steps = min(max(stalled_steps, 0), _MAX_STALL * self._limit + _CHECK_STEPS)
-        if not self.stalled:
-            return ()
-        pairs = [
-            Reason.of(ReasonKind.STALLED, *problem.pair_names[pair], amount=amount, unit="m/s")
-            for pair, amount in _find_blocking_pairs(problem, solution.v)
-        ]
-        several = Reason.of(ReasonKind.STALLED, detail="several rows together")
-        return (*pairs, *_blocking_limits(problem, solution.v)) or (several,)
+        stuck = self._stuck(problem, solution)
+        self._stalled = self._reasons(problem, solution.v, stuck) if stuck else ()
+        return self._stalled
 
-    @property
-    def stalled(self) -> bool:
-        """Whether there was no progress for long enough."""
-        return self._stalled_steps >= self._limit
+    def _stuck(self, problem: Problem, solution: Solution) -> list[int]:
+        """Return the numbers of the tasks that have made no progress for long enough."""
+        x, count = self._rows, len(self._rows.frame_errors)
+        squares = np.bincount(x.row_tasks[:count], x.frame_errors * x.frame_errors, x.frame_count)
+        e: Array = np.concatenate((np.sqrt(squares), x.task_errors[self._others]))
+        if not self._history:
+            self._since[:] = self._step
+        else:
+            self._since[(e < _TOLERANCE) | (e - self._history[-1] > _JUMP * e + _TOLERANCE)] = self._step
+        self._history.append(e)
+        is_stuck = self._history[0] - e < np.maximum(_MIN_GAIN[0], _MIN_GAIN[1] * e)
+        is_stuck &= self._step - self._since >= self._limit
+        A, b = problem.tracking.A, problem.tracking.b_feasible
+        stuck = []
+        for i in np.flatnonzero(is_stuck).tolist():
+            rows = self._goals[i].rows
+            asked, achieved = b[rows], A[rows] @ solution.v
+            if float(achieved @ asked) < _MIN_PROGRESS * float(asked @ asked):
+                stuck.append(i)
+        return stuck
+
+    def _reasons(self, problem: Problem, v: Array, stuck: Sequence[int]) -> tuple[Reason, ...]:
+        """Return why the tasks are stuck: at rest by themselves, or by what balances them."""
+        rows, tracking = self._of_priority(problem, stuck), problem.tracking
+        A, b = tracking.A[rows], tracking.b_feasible[rows]
+        pull, earlier = A.T @ (b - A @ v), np.setdiff1d(np.arange(len(tracking.b)), rows)
+        if problem.contacts is not None:
+            pull = problem.contacts.Z @ (problem.contacts.Z.T @ pull)
+        size = float(np.linalg.norm(b))
+        if np.linalg.norm(pull) < _FREE * np.linalg.norm(A, 2) * size and np.isfinite(pull).all():
+            return tuple(self._at_rest(problem, stuck))
+        walls = _Walls(problem, v, tracking.A[earlier] if problem.cascade is not None else A[:0])
+        return walls.holding(pull) or _nearest(problem)
+
+    def _of_priority(self, problem: Problem, stuck: Sequence[int]) -> IntArray:
+        """Return the rows down to the first priority of which a task is stuck; all without priorities."""
+        everything = np.arange(len(problem.tracking.b))
+        if problem.cascade is None:
+            return everything
+        first = self._goals[stuck[0]].rows
+        return next((level for level in problem.levels if np.isin(first, level).any()), everything)
+
+    def _at_rest(self, problem: Problem, stuck: Sequence[int]) -> list[Reason]:
+        """Return a reason for each task that is stuck though nothing is in the way, with its error."""
+        x, A = self._rows, problem.tracking.A
+        count, g = len(x.frame_errors), np.ones(len(x.frame_errors))
+        b, feasible = problem.tracking.b[:count], problem.tracking.b_feasible[:count]
+        np.divide(b, feasible, out=g, where=feasible != 0.0)
+        w = x.row_scale[:count] ** 2 * x.frame_errors / g
+        size = float(np.linalg.norm(w))
+        saddle = size > 0.0 and np.linalg.eigvalsh(A.T @ A - x.curvature(w))[0] < -_SADDLE * size
+        kind = ReasonKind.SINGULAR if saddle else ReasonKind.OUT_OF_REACH
+        reasons = []
+        for i in stuck:
+            label, amount, unit = self._missing(i)
+            reasons.append(Reason.of(kind, label, amount=amount, unit=unit))
+        return reasons
+
+    def _missing(self, i: int) -> tuple[str, float, str]:
+        """Return the name of a task and what it lacks: its position, or its orientation where that is there."""
+        x, goal = self._rows, self._goals[i]
+        task = x.tasks[goal.task]
+        amount, unit = float(self._history[-1][i]), task.unit
+        if goal.task < x.frame_count:
+            parts = [float(np.linalg.norm(part)) for part in x.frame_errors[goal.rows].reshape(-1, 3)]
+            if task.moves and (len(parts) == 1 or parts[0] >= _TOLERANCE):
+                amount = parts[0]
+            else:
+                amount, unit = parts[-1], "rad"
+        return task.settings.label, amount, unit
 
 
-def _find_blocking_pairs(problem: Problem, v: Array) -> list[tuple[int, float]]:
-    """Return the pairs whose rows are active and oppose v_tracking, with its violation of them [m/s], largest first."""
-    rows = problem.avoidance
-    violation = rows.b - rows.J @ problem.v_tracking
-    active = (rows.J @ v - rows.b < _ACTIVE_TOLERANCE) & (violation > 0.0)
-    if not active.any():  # a solver without rows: the nearest of the pairs that the task would have close
-        active = (rows.J @ problem.v_tracking < -_ACTIVE_TOLERANCE) & (rows.d < rows.d2)
-        active &= rows.d <= np.min(rows.d, where=active, initial=np.inf)
-    indices = np.flatnonzero(active)
-    order = indices[np.argsort(-violation[indices], kind="stable")]
-    return list(zip(rows.pair[order].tolist(), violation[order].tolist(), strict=True))
-
-
-def _blocking_limits(problem: Problem, v: Array) -> list[Reason]:
-    """Return the joints at a position limit that v_tracking goes against."""
-    high = (v >= problem.hard_upper - 1e-9) & (problem.v_tracking > problem.hard_upper)
-    low = (v <= problem.hard_lower + 1e-9) & (problem.v_tracking < problem.hard_lower)
-    names, units = problem.joint_names, problem.joint_units
-    full = np.maximum(problem.hard_upper, -problem.hard_lower)
-    return [
-        Reason.of(kind, names[j], amount=float(bound[j]) + 0.0, unit=f"{units[j]}/s")
-        for kind, bound, at_limit in (
-            (ReasonKind.AT_UPPER_LIMIT, problem.hard_upper, high & (problem.hard_upper < full)),
-            (ReasonKind.AT_LOWER_LIMIT, problem.hard_lower, low & (-problem.hard_lower < full)),
-        )
-        for j in np.flatnonzero(at_limit).tolist()
+def _goals(rows: RowAssembler) -> list[_Goal]:
+    """Return the frames, then the other tasks that have somewhere to go."""
+    numbers = [
+        number
+        for number, task in enumerate(rows.tasks)
+        if number < rows.frame_count or (task.bends and not isinstance(task, Manipulability))
     ]
+    return [_Goal(number, np.flatnonzero(rows.row_tasks == number)) for number in numbers]
+
+
+class _Walls:
+    """Rows, position limits and tasks of earlier priorities that keep a velocity, with the forces they exert."""
+
+    def __init__(self, problem: Problem, v: Array, earlier: Array) -> None:
+        rows, names, units = problem.avoidance, problem.joint_names, problem.joint_units
+        self.forces, self.reasons = list[Array](), list[Reason | None]()
+        excess = rows.b - rows.J @ problem.v_tracking
+        for i in np.flatnonzero(rows.J @ v - rows.b < _ACTIVE_TOLERANCE).tolist():
+            self.forces.append(-rows.J[i])
+            pair = problem.pair_names[rows.pair[i]]
+            self.reasons.append(Reason.of(ReasonKind.STALLED, *pair, amount=float(excess[i]), unit="m/s"))
+        lower, upper, eye = problem.hard_lower, problem.hard_upper, np.eye(len(v))
+        fastest = np.maximum(upper, -lower)
+        high = (v >= upper - 1e-6) & (upper < _AT_LIMIT * fastest)
+        low = (v <= lower + 1e-6) & (-lower < _AT_LIMIT * fastest)
+        for kind, bound, side, at_limit in (
+            (ReasonKind.AT_UPPER_LIMIT, upper, 1.0, high),
+            (ReasonKind.AT_LOWER_LIMIT, lower, -1.0, low),
+        ):
+            for j in np.flatnonzero(at_limit).tolist():
+                self.forces.append(side * eye[j])
+                self.reasons.append(Reason.of(kind, names[j], amount=float(bound[j]) + 0.0, unit=f"{units[j]}/s"))
+        for row in (*earlier, *-earlier):
+            self.forces.append(row)
+            self.reasons.append(None)
+
+    def holding(self, pull: Array) -> tuple[Reason, ...]:
+        """Return those that balance the pull (nv,) of the tasks, the strongest first; none where nothing does."""
+        if not self.forces or not np.isfinite(pull).all():
+            return ()
+        columns = np.array(self.forces).T
+        weights, missing = nnls(columns, pull)
+        shares = weights * np.linalg.norm(columns, axis=0)
+        order = np.argsort(-shares, kind="stable")
+        named = [self.reasons[i] for i in order.tolist() if shares[i] > _CULPRIT * shares.sum()]
+        culprits = [reason for reason in named if reason is not None]
+        if named and len(culprits) < len(named):
+            culprits.append(Reason.of(ReasonKind.STALLED, detail="tasks of an earlier priority"))
+        elif culprits and missing > (1.0 - _EXPLAINED) * np.linalg.norm(pull):
+            culprits.append(Reason.of(ReasonKind.STALLED, detail="and others"))
+        return tuple(culprits)
+
+
+def _nearest(problem: Problem) -> tuple[Reason, ...]:
+    """Return the nearest pair that the tasks would have close, for solvers without rows and for the look-ahead."""
+    rows = problem.avoidance
+    closing = rows.J @ problem.v_tracking
+    candidates = np.flatnonzero((closing < -_ACTIVE_TOLERANCE) & (rows.d < rows.d2))
+    if not len(candidates):
+        return (Reason.of(ReasonKind.STALLED, detail="several rows together"),)
+    i = int(candidates[np.argmin(rows.d[candidates])])
+    amount = float(rows.b[i] - closing[i])
+    return (Reason.of(ReasonKind.STALLED, *problem.pair_names[rows.pair[i]], amount=amount, unit="m/s"),)

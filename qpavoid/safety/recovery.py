@@ -1,9 +1,9 @@
 """Recovery: slow, where nothing but the robot itself is the cause.
 
 Rows ask pairs below d1 to part, and bounds ask joints beyond a limit to come back. What joint speeds that takes is up
-to Jacobians and tasks: several rad/s for neighbouring links, or where other joints hold the tool meanwhile. Nobody
-expects a robot that should rest to move so fast, so that the whole velocity is slowed down towards a stop, until no
-joint exceeds its recovery speed: the robot goes the same way, in more time.
+to Jacobians and tasks: several rad/s for neighbouring links, or where other joints hold the tool meanwhile. A robot
+that should rest must not start like that, so that the whole velocity is slowed down towards a stop, until no joint
+exceeds its recovery speed: the robot goes the same way, in more time.
 
 An obstacle that moves may be coming, and is evaded as fast as it can be: while anything near moves, nothing is slowed.
 Neither is a task that leaves by itself, at a velocity that meets all rows and bounds.
@@ -42,8 +42,8 @@ def slow_recovery(q: Array, problem: Problem, feedforward: Array, solution: Solu
     fastest, v_stop = bounds.recovery / min(degree, 1.0), problem.v_stop
     change = solution.v - v_stop
     limit = np.where(change > 0.0, np.maximum(fastest, v_stop), np.minimum(-fastest, v_stop))
-    room = (limit - v_stop) / np.where(change == 0.0, np.inf, change)
-    scale = float(np.min(room, where=change != 0.0, initial=1.0))
+    shares = (limit - v_stop) / np.where(change == 0.0, np.inf, change)
+    scale = float(np.min(shares, where=change != 0.0, initial=1.0))
     if scale == 1.0:
         return solution
     v = v_stop + scale * change

@@ -130,13 +130,7 @@ class BackupRollouts:
     """Computes backup trajectories, on kinematics and distances of its own."""
 
     def __init__(self, settings: ControlSettings, table: PairTable, obstacles: ObstacleTracker) -> None:
-        """Allocate all memory, and compile all kernels.
-
-        Args:
-            settings: of the controller.
-            table: bodies and pairs of its scene, with what is attached to the robot.
-            obstacles: states of the obstacles.
-        """
+        """Allocate all memory, and compile all kernels."""
         scene, self._dt = settings.scene, settings.dt
         model = self._model = scene.robot.model
         self._obstacles, self._period_steps = obstacles, max(1, int(np.ceil(_PERIOD / self._dt - 1e-9)))

@@ -16,19 +16,18 @@ from qpavoid.model.end_effectors import end_effectors
 from qpavoid.model.kinematics import MIMIC
 from qpavoid.model.notes import Note, NoteKind, RobotWarning, merge_notes
 from qpavoid.model.packages import absolute_entries
-from qpavoid.model.plausibility import note_implausible_sizes
 from qpavoid.model.robot import Robot
+from qpavoid.model.shape_checks import note_implausible_sizes
 from qpavoid.model.urdf import read_model, read_pieces
 from qpavoid.problem import Array
 from qpavoid.setup import pairs
 from qpavoid.setup.fit import MAX_VOLUME_RATIO, Bodies
 from qpavoid.setup.home import HOME_CLEARANCE, Home, find_home
-from qpavoid.setup.joints import home_candidates, joint_locks, joint_values, wheel_joints
+from qpavoid.setup.joints import home_candidates, joint_locks, joint_values
 from qpavoid.setup.sampling import (
     D1,
     SAMPLES,
     SEED,
-    pairs_always_near,
     robot_size,
     safety_distances,
     sample_pairs,
@@ -40,8 +39,6 @@ from qpavoid.setup.srdf import Semantics, find_srdf, read_srdf
 Root = Literal["fixed", "planar", "free_flyer"]
 _HOME_NEAR = 0.04
 """Distance at the preferred home pose, as a share of the robot's size, within which capsules are oversized [-]."""
-_POSES = 200
-"""Random poses in which oversized capsules show."""
 
 
 @dataclass(frozen=True)
@@ -128,19 +125,17 @@ def _describe(urdf: Path, options: DescribeOptions, progress: Callable[[str], No
     notes: list[Note] = []
     packages = absolute_entries([str(entry) for entry in options.package_dirs], Path.cwd())
     pieces = _pieces(urdf, model, packages, options, notes)
-    wheels = [] if options.root == "fixed" else wheel_joints(model, pieces)
     bare = RobotConfig(
         name=options.name or urdf.stem,
         urdf=str(urdf),
         root_joint=options.root,
         package_dirs=packages,
         allow_missing_meshes=options.allow_missing_meshes,
-        lock=joint_locks(urdf, model, options.lock, semantics, notes, wheels),
+        lock=joint_locks(urdf, model, options.lock, semantics, notes, options.root != "fixed"),
         end_effectors=end_effectors(model, semantics.end_effectors),
     )
     with_srdf = bare.model_copy(update={"srdf": None if honoured is None else str(honoured.resolve())})
     links, robot = _links(pieces, with_srdf, semantics, options, notes, progress)
-    bodies = {"bodies": [body for link in links.values() for body in link.bodies]}
 
     progress(f"sampling {len(robot.bodies.collisionPairs)} pairs")
     sampled = sample_pairs(robot, options.samples, options.seed)
@@ -153,9 +148,8 @@ def _describe(urdf: Path, options: DescribeOptions, progress: Callable[[str], No
     progress("looking for a home pose")
     home = find_home(active, home_candidates(active, semantics), bare.end_effectors, d1, options.home, options.seed)
     progress("comparing with the geometry")
-    unchecked = pairs.measure_unchecked(active, pieces, disabled, pairs.shares_of_contact(robot, sampled))
-    notes += [note for entry in unchecked for note in entry.notes()]
-    notes += _notes_of_home(active, home, options)
+    unchecked = pairs.measure_unchecked(active, pieces, disabled)
+    notes += [*(note for entry in unchecked for note in entry.notes()), *_notes_of_home(active, home, options)]
     if not bare.end_effectors:
         remedy = "list the frames of your tools under `end_effectors`"
         notes.append(Note(NoteKind.FRAME, (), "no end effector was recognised", remedy))
@@ -163,6 +157,7 @@ def _describe(urdf: Path, options: DescribeOptions, progress: Callable[[str], No
     pair_count = robot.bodies.ngeoms * (robot.bodies.ngeoms - 1) // 2
     of_srdf = {pair: why for pair, why in semantics.disabled.items() if all(map(model.existFrame, pair))}
     decided = {
+        "bodies": [body for link in links.values() for body in link.bodies],
         "disabled_pairs": single,
         "pair_margins": pairs.own_margins(active, d1),
         "limits": JointLimits(velocity=_assumed_speeds(model, active.model)),
@@ -170,7 +165,7 @@ def _describe(urdf: Path, options: DescribeOptions, progress: Callable[[str], No
     }
     of_file = [note for note in robot.notes if note.kind is not NoteKind.HOME]  # it has another home now
     return Description(
-        config=bare.model_copy(update={**bodies, **decided}),
+        config=bare.model_copy(update=decided),
         robot=replace(active, home=home.q),
         options=options,
         pieces=pieces,
@@ -200,12 +195,7 @@ def _semantics(srdf: Path | None, model: Any, options: DescribeOptions) -> Seman
 
 
 def _assumed_speeds(model: Any, robot_model: Any) -> dict[str, float | list[float]]:
-    """List the largest speeds that the robot has and its file does not give, so that a user can change them.
-
-    Args:
-        model: as the file has it.
-        robot_model: the robot's.
-    """
+    """List the largest speeds that the robot has and the model of its file does not, so that a user can change them."""
     speeds_by_joint: dict[str, float | list[float]] = {}
     for name, joint in zip(list(robot_model.names)[1:], list(robot_model.joints)[1:], strict=True):
         of_file = model.joints[model.getJointId(name)]
@@ -263,22 +253,23 @@ def _links(
     `auto` takes exact ones where capsules would be too near at home or everywhere.
     """
     kinds = kinds_of_links(pieces, options.bodies, options.bodies_of)
-    initial = {}
+    links = {}
     for number, (link, kind) in enumerate(kinds.items(), start=1):
         progress(f"fitting bodies to link {number} of {len(kinds)}: {link}")
-        initial[link] = bodies_of_link(pieces, link, kind)
-    links = dict(initial)
+        links[link] = bodies_of_link(pieces, link, kind)
+    exact_links: list[str] = []
     while True:
         listed = [body for link in links.values() for body in link.bodies]
         robot = Robot.from_config(config.model_copy(update={"bodies": listed}), Path(config.urdf))
-        oversized = _oversized(robot, home_candidates(robot, semantics)[0], options.seed)
-        replacements = {link: bodies_of_link(pieces, link, "convex") for link in oversized if kinds[link] == "auto"}
-        if all(links[link] == bodies for link, bodies in replacements.items()):
+        oversized = _oversized(robot, home_candidates(robot, semantics)[0])
+        exact = {link: bodies_of_link(pieces, link, "convex") for link in oversized if kinds[link] == "auto"}
+        if not (changed := [link for link, bodies in exact.items() if links[link] != bodies]):
             break
-        links.update(replacements)
-    if exact_links := [link for link in links if links[link] != initial[link]]:
+        links.update(exact)
+        exact_links += changed
+    if exact_links:
         clause = "exact bodies, because capsules would be too near at home or everywhere"
-        notes.append(Note(NoteKind.SHAPE, tuple(exact_links), clause))
+        notes.append(Note(NoteKind.SHAPE, tuple(sorted(exact_links, key=list(links).index)), clause))
     gross = [link for link, made in links.items() if made.volume > MAX_VOLUME_RATIO * made.inside > 0.0]
     if worst := sorted(gross, key=lambda link: -links[link].volume):
         first = links[worst[0]]
@@ -290,12 +281,9 @@ def _links(
     return links, robot
 
 
-def _oversized(robot: Robot, home: Array, seed: int) -> set[str]:
-    """Find the links of pairs that are too near at home, or in each of a few random poses."""
-    names = [body.name for body in robot.bodies.geometryObjects]
-    near = [names[i] for pair in pairs_always_near(robot, _POSES, seed) for i in pair]
+def _oversized(robot: Robot, home: Array) -> set[str]:
+    """Find the links of pairs that are too near at home, or touch in nearly every pose."""
     too_near = min(_HOME_NEAR * robot_size(robot), HOME_CLEARANCE * D1)
-    for a, b, _ in [*robot.always_touching, *touching(robot, home, too_near)]:
-        near += [a, b]
     link = pairs.links_of_bodies(robot)
-    return {link[body] for body in near}
+    near_pairs = [*robot.always_touching, *touching(robot, home, too_near)]
+    return {link[body] for a, b, _ in near_pairs for body in (a, b)}

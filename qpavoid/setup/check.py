@@ -22,15 +22,16 @@ from qpavoid.controller import Controller
 from qpavoid.errors import ConfigError, QpavoidError
 from qpavoid.geometry.bodies import convert_bodies, triangle_meshes
 from qpavoid.model.end_effectors import end_effectors
-from qpavoid.model.notes import Note, NoteKind, RobotWarning, abbreviate
+from qpavoid.model.notes import SEVERITIES, Note, NoteKind, RobotWarning, abbreviate
 from qpavoid.model.packages import absolute_entries, find_mesh, mesh_folders
 from qpavoid.model.robot import Robot
 from qpavoid.model.scene import build_scene
+from qpavoid.model.space import Space
 from qpavoid.model.urdf import find_resource, is_mjcf, mesh_names, read_model, read_pieces
 from qpavoid.setup.home import MIN_CONDITIONING, Conditioning, Limbs
-from qpavoid.setup.joint_report import Joint, joint_notes, list_joints
+from qpavoid.setup.joints import Joint, joint_notes, list_joints
 from qpavoid.setup.pairs import find_unchecked
-from qpavoid.setup.sampling import Space, touching
+from qpavoid.setup.sampling import touching
 from qpavoid.setup.shapes import Piece, pieces_of
 
 _MAX_STEPS, _MAX_SECONDS = 300, 5.0
@@ -53,11 +54,6 @@ class Report:
     """Pieces of collision geometry by type."""
     triangles: int = 0
     """Of all collision meshes."""
-    missing_meshes: list[str] = field(default_factory=list)
-    searched: list[str] = field(default_factory=list)
-    """Folders in which meshes were looked for."""
-    without_mass: int = 0
-    """Links that move and have none."""
     bodies: int = 0
     pairs: int = 0
     home_collisions: list[tuple[str, str, float]] = field(default_factory=list)
@@ -122,7 +118,6 @@ def _report(config: RobotConfig, path: Path, progress: Callable[[str], None]) ->
     report = Report(config.name, str(path), model.nq, model.nv)
     report.frames = [f.name for f in model.frames if f.type in (pin.BODY, pin.OP_FRAME)]
     report.end_effectors = list(config.end_effectors) or end_effectors(model)
-    report.without_mass = sum(inertia.mass <= 0.0 for inertia in list(model.inertias)[1:])
     pieces = _check_geometry(report, config, path, urdf, model)
     robot = None
     if report.usable:
@@ -138,11 +133,10 @@ def _report(config: RobotConfig, path: Path, progress: Callable[[str], None]) ->
     if robot is not None:
         report.notes += robot.notes
         _check_built_robot(report, _with_hulls(robot), pieces, progress)
-    if report.without_mass:
-        clause = f"{report.without_mass} moving links have no mass"
-        report.add("note", NoteKind.LINK, (), clause, "none is needed: inertias are not used")
-    order = {"error": 0, "warning": 1, "note": 2}
-    report.notes.sort(key=lambda note: order[note.severity])
+    if massless := sum(inertia.mass <= 0.0 for inertia in list(model.inertias)[1:]):
+        clause = f"{massless} moving links have no mass"
+        report.add("note", NoteKind.LINK, (), clause, "none is needed unless torques are asked for")
+    report.notes.sort(key=lambda note: SEVERITIES.index(note.severity))
     return report
 
 
@@ -156,21 +150,16 @@ def _with_hulls(robot: Robot) -> Robot:
     return replace(robot, bodies=bodies)
 
 
-# --- geometry -----------------------------------------------------------------------------------------------
-
-
 def _check_geometry(report: Report, config: RobotConfig, path: Path, urdf: Path, model: Any) -> list[Piece]:
+    """Read the collision geometry; return its pieces, none where a mesh is missing or cannot be read."""
     packages = absolute_entries(config.package_dirs, path.parent)
-    report.searched = mesh_folders(urdf, packages)
-    absent = {}
-    for tag in ("collision", "visual"):
-        names = [] if is_mjcf(urdf) else mesh_names(urdf, tag)  # an MJCF finds its meshes by its own rules
-        absent[tag] = [name for name in names if find_mesh(name, report.searched) is None]
-    report.missing_meshes = absent["collision"]
-    if report.missing_meshes and not config.allow_missing_meshes:
+    folders = mesh_folders(urdf, packages)
+    names = [] if is_mjcf(urdf) else mesh_names(urdf, "collision")  # an MJCF finds its meshes by its own rules
+    missing = [name for name in names if find_mesh(name, folders) is None]
+    if missing and not config.allow_missing_meshes:
         clause = (
-            f"{len(report.missing_meshes)} collision meshes are missing, such as {report.missing_meshes[0]!r}; "
-            f"looked for in {abbreviate(report.searched, 8)}"
+            f"{len(missing)} collision meshes are missing, such as {missing[0]!r}; looked for in "
+            f"{abbreviate(folders, 8)}"
         )
         remedy = (
             "name the folder that holds the package with --package-dir or --package NAME=FOLDER (`package_dirs` of a "
@@ -178,9 +167,6 @@ def _check_geometry(report: Report, config: RobotConfig, path: Path, urdf: Path,
         )
         report.add("error", NoteKind.MESH, (), clause, remedy)
         return []
-    if absent["visual"]:
-        clause = f"{len(absent['visual'])} visual meshes are missing"
-        report.add("note", NoteKind.MESH, (), clause, "none is needed where there are collision shapes")
     try:
         geometry = read_pieces(
             urdf, model, packages, path, visuals=config.visuals, allow_missing=config.allow_missing_meshes
@@ -198,9 +184,6 @@ def _shape_name(geometry: Any) -> str:
     if isinstance(geometry, coal.BVHModelBase):
         return "mesh"
     return "convex mesh" if isinstance(geometry, coal.ConvexBase) else type(geometry).__name__.lower()
-
-
-# --- the robot as it loads ----------------------------------------------------------------------------------
 
 
 def _check_built_robot(report: Report, robot: Robot, pieces: Sequence[Piece], progress: Callable[[str], None]) -> None:
@@ -241,8 +224,7 @@ def _check_home(report: Report, robot: Robot) -> None:
     )
     for a, b, d in report.home_collisions:
         report.add("warning", NoteKind.PAIR, (a, b), f"touch at the home pose ({1e3 * d:.1f} mm)", remedy)
-    limbs = Limbs(robot, report.end_effectors)
-    report.conditioning = dict(zip(limbs.names, limbs.at(robot.home), strict=True))
+    report.conditioning = Limbs(robot, report.end_effectors).at(robot.home)
     if singular := [name for name, limb in report.conditioning.items() if limb.ratio < MIN_CONDITIONING]:
         clause = "the home pose is singular or nearly so: they cannot move well in every direction there"
         remedy = "start scenarios elsewhere (`q0`), or give a `home` with bent joints"
@@ -254,7 +236,7 @@ def _step_time(robot: Robot, frames: Sequence[str]) -> float:
     known = [frame for frame in frames if robot.model.existFrame(frame)]
     tasks = build_tasks([Task(frame=frame) for frame in known], robot, robot.home)
     controller = Controller(build_scene(robot), tasks)
-    space, random = Space(robot), np.random.default_rng(0)
+    space, random = Space(robot.model, robot.bounds()), np.random.default_rng(0)
     times: list[float] = []
     while len(times) < _MAX_STEPS and sum(times) <= _MAX_SECONDS:
         q = space.move(robot.home, random.normal(0.0, 0.05, robot.model.nv))

@@ -6,7 +6,6 @@ import shlex
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, get_args
 
@@ -22,7 +21,7 @@ from qpavoid.run.terminal import ERR, OUT
 from qpavoid.setup.add import DescribeOptions, Description, Root, describe
 from qpavoid.setup.check import Report, check_robot
 from qpavoid.setup.fit import Bodies
-from qpavoid.setup.joint_report import Joint
+from qpavoid.setup.joints import Joint
 from qpavoid.setup.sampling import SAMPLES, SEED
 from qpavoid.setup.texts import description_files, note_lines, summary, write_files
 
@@ -61,7 +60,7 @@ def check(
         robot, _one_of(root, Root, "--root"), _entries(package_dir, package), allow_missing_meshes, Progress()
     )
     if json:
-        print(to_json({**asdict(report), "usable": report.usable}))
+        print(to_json({**vars(report), "usable": report.usable}))
     else:
         for line in _check_lines(report):
             OUT.print(line, highlight=False, soft_wrap=True)
@@ -203,15 +202,15 @@ def _document(description: Description, outcome: dict[Path, str], seconds: float
         "hulls_volume": sum(link.hulls for link in links),
         "geometry_volume": sum(link.inside for link in links),
         "pairs": dict(description.counts),
-        "left_out": [asdict(entry) for entry in description.unchecked],
+        "left_out": description.unchecked,
         "samples": options.samples,
         "seed": options.seed,
         "srdf": None if description.honoured is None else str(description.honoured),
         **config.model_dump(include={"pair_margins", "end_effectors", "home", "lock"}),
         "clearance": home.clearance,
         "nearest": home.nearest,
-        "conditioning": {frame: asdict(limb) for frame, limb in home.conditioning.items()},
-        "notes": [asdict(note) for note in description.notes],
+        "conditioning": home.conditioning,
+        "notes": description.notes,
         "seconds": seconds,
     }
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -11,8 +12,9 @@ import pinocchio as pin
 from qpavoid.model.joints import frame_index
 from qpavoid.model.kinematics import columns, support_masks
 from qpavoid.model.robot import Robot
-from qpavoid.problem import Array
-from qpavoid.setup.sampling import SEED, BoolArray, PairDistances, Space
+from qpavoid.model.space import Space
+from qpavoid.problem import Array, Mask
+from qpavoid.setup.sampling import SEED, PairDistances, draw_poses
 
 HOME_CLEARANCE = 4.0 / 3.0
 """Distance of a pair at home, in units of its safety distance: 40 mm where 30 mm are to be kept [-]."""
@@ -28,8 +30,7 @@ _CONTACT_FAULT = 10.0
 """Additional fault of a pair in collision: larger than all faults of pairs that are merely near [-]."""
 
 
-@dataclass(frozen=True)
-class Conditioning:
+class Conditioning(NamedTuple):
     """How well a limb can move its end in every direction."""
 
     value: float
@@ -52,38 +53,28 @@ class Limbs:
     """Conditioning of the limbs that end at some frames."""
 
     def __init__(self, robot: Robot, frames: Sequence[str], seed: int = SEED) -> None:
-        """Find the directions that each limb moves in, and its typical conditioning.
-
-        Args:
-            robot: the robot.
-            frames: ends of its limbs; those that do not exist or do not move are left out.
-            seed: of the random configurations.
-        """
+        """Find the directions that each limb moves in, and its typical conditioning; leave out frames that rest."""
         self._model, self._data = robot.model, robot.model.createData()
         self._masks, self._columns = support_masks(robot.model), columns(robot.model)
-        self.names: list[str] = []
-        self.columns: list[BoolArray] = []
-        """Which coordinates (nv,) move each limb's end relative to the root."""
-        self._limbs: list[tuple[int, int, int, float]] = []  # frame, rows, rank, typical value
-        space = Space(robot)
-        draws = space.draw(np.random.default_rng(seed), _DRAWS)
+        self.columns: dict[str, Mask] = {}
+        """End of each limb: which coordinates (nv,) move it relative to the root."""
+        self._limbs: dict[str, tuple[int, int, int, float]] = {}  # frame, rows, rank, typical value
+        draws, moving = draw_poses(robot, _DRAWS, seed), Space(robot.model, robot.bounds()).moving
         for name in filter(robot.model.existFrame, frames):
             frame = frame_index(robot.model, name)
-            moved = np.any([self._jacobian(frame, q) != 0.0 for q in draws[:5]], axis=(0, 1)) & space.moving
+            moved = np.any([self._jacobian(frame, q) != 0.0 for q in draws[:5]], axis=(0, 1)) & moving
             rows = 6 if moved.sum() >= 6 else 3
             values = np.median([self._values(frame, rows, moved, q) for q in draws], axis=0)
             rank = int(np.sum(values > 1e-6 * max(values.max(initial=0.0), 1e-9)))
             if rank:
-                self.names.append(name)
-                self.columns.append(moved)
-                self._limbs.append((frame, rows, rank, float(values[rank - 1])))
+                self.columns[name], self._limbs[name] = moved, (frame, rows, rank, float(values[rank - 1]))
 
-    def at(self, q: Array) -> list[Conditioning]:
-        """Compute the conditioning of each limb in a configuration (nq,)."""
-        return [
-            Conditioning(float(self._values(frame, rows, moved, q)[rank - 1]), typical)
-            for (frame, rows, rank, typical), moved in zip(self._limbs, self.columns, strict=True)
-        ]
+    def at(self, q: Array) -> dict[str, Conditioning]:
+        """Compute the conditioning of each limb, by its end, in a configuration (nq,)."""
+        return {
+            name: Conditioning(float(self._values(frame, rows, self.columns[name], q)[rank - 1]), typical)
+            for name, (frame, rows, rank, typical) in self._limbs.items()
+        }
 
     def _jacobian(self, frame: int, q: Array) -> Array:
         """Compute the Jacobian (6, nv) of a frame's origin; columns of joints that mimic others are added to theirs."""
@@ -95,7 +86,7 @@ class Limbs:
         np.add.at(folded.T, self._columns, J.T)
         return folded
 
-    def _values(self, frame: int, rows: int, moved: BoolArray, q: Array) -> Array:
+    def _values(self, frame: int, rows: int, moved: Mask, q: Array) -> Array:
         return np.asarray(np.linalg.svd(self._jacobian(frame, q)[:rows, moved], compute_uv=False))
 
 
@@ -133,12 +124,13 @@ class _PoseCriteria:
         """Compute what each pair (m,) lacks of its distance, then each limb of its conditioning, as shares [-]."""
         deficit = np.maximum(1.0 - self.distances.all(q) / self.need, 0.0) if len(self.need) else np.zeros(0)
         deficit += _CONTACT_FAULT * (deficit > 1.0)
-        return np.concatenate((deficit, [max(1.0 - limb.ratio / MIN_CONDITIONING, 0.0) for limb in self.limbs.at(q)]))
+        limbs = [max(1.0 - limb.ratio / MIN_CONDITIONING, 0.0) for limb in self.limbs.at(q).values()]
+        return np.concatenate((deficit, limbs))
 
-    def movers(self, fault: int) -> BoolArray:
+    def movers(self, fault: int) -> Mask:
         """Return the coordinates (nv,) that can mend a fault."""
         pairs = len(self.need)
-        return self.distances.moved_by(fault) if fault < pairs else self.limbs.columns[fault - pairs]
+        return self.distances.moved_by(fault) if fault < pairs else list(self.limbs.columns.values())[fault - pairs]
 
     def home(self, q: Array, preference: int | None) -> Home:
         """Describe a pose as a home."""
@@ -146,9 +138,8 @@ class _PoseCriteria:
         if len(d):
             a, b = self.distances.pairs[int(np.argmin(d))]
             nearest = self.distances.names[a], self.distances.names[b]
-        conditioning = dict(zip(self.limbs.names, self.limbs.at(q), strict=True))
         deficit = float(np.max(self.need - d, initial=0.0))
-        return Home(q, float(np.min(d, initial=np.inf)), nearest, deficit, conditioning, preference)
+        return Home(q, float(np.min(d, initial=np.inf)), nearest, deficit, self.limbs.at(q), preference)
 
 
 def find_home(
@@ -173,31 +164,32 @@ def find_home(
         pinned: joints that stay where the first preferred pose has them.
         seed: of the draw.
     """
-    criteria, space, poses = _PoseCriteria(robot, frames, d1), Space(robot), [np.asarray(q) for q in preferences]
+    criteria, poses = _PoseCriteria(robot, frames, d1), [np.asarray(q) for q in preferences]
     is_pinned = np.array([name.partition(".")[0] in set(pinned) for name in robot.coordinate_names], dtype=bool)
     faults = [float(criteria.faults(q).sum()) for q in (poses[:1] if is_pinned.any() else poses)]
     if 0.0 in faults:
         best = faults.index(0.0)
         return criteria.home(poses[best], best)
     best = int(np.argmin(np.floor(np.array(faults) / _CONTACT_FAULT)))
-    q = _repair(robot, criteria, space, poses[best], ~is_pinned & space.moving, seed)
+    q = _repair(robot, criteria, poses[best], ~is_pinned, seed)
     return criteria.home(q, best if np.array_equal(q, poses[best]) else None)
 
 
-def _repair(robot: Robot, criteria: _PoseCriteria, space: Space, start: Array, free: BoolArray, seed: int) -> Array:
+def _repair(robot: Robot, criteria: _PoseCriteria, start: Array, free: Mask, seed: int) -> Array:
     """Find a pose near `start` with fewer faults; only free coordinates (nv,) differ."""
+    space, model = Space(robot.model, robot.bounds()), robot.model
 
     def rounded(q: Array, part: float = 1.0) -> Array:
         """Return the pose on the way from the start to q, with few digits."""
-        return space.move(start, np.round(part * np.asarray(pin.difference(robot.model, start, q)), _DIGITS))
+        return space.move(start, np.round(part * np.asarray(pin.difference(model, start, q)), _DIGITS))
 
-    random, q, evaluations = np.random.default_rng(seed), start, 0
-    faults, is_unfixable = criteria.faults(q), np.zeros(len(criteria.faults(q)), dtype=bool)
+    random, q, evaluations, faults = np.random.default_rng(seed), start, 0, criteria.faults(start)
+    is_unfixable = np.zeros(len(faults), dtype=bool)
     while evaluations < _MAX_TRIES and np.any(faults[~is_unfixable] > 0.0):
         worst = int(np.argmax(np.where(is_unfixable, -1.0, faults)))
-        mask, best_pose = criteria.movers(worst) & free, q
+        mask, best_pose = criteria.movers(worst) & free & space.moving, q
         for i, target in enumerate(space.draw(random, _DRAWS if mask.any() else 0)):
-            step = (i + 1) / _DRAWS * np.asarray(pin.difference(robot.model, q, target))
+            step = (i + 1) / _DRAWS * np.asarray(pin.difference(model, q, target))
             candidate = rounded(space.move(q, step * mask))
             candidate_faults, evaluations = criteria.faults(candidate), evaluations + 1
             if candidate_faults.sum() < faults.sum() - 1e-9:
@@ -210,7 +202,7 @@ def _repair(robot: Robot, criteria: _PoseCriteria, space: Space, start: Array, f
     nearer = (rounded(q, part) for part in np.linspace(0.05, 0.95, 19))
     q = next((candidate for candidate in nearer if criteria.faults(candidate).sum() <= total), q)
     total = criteria.faults(q).sum()
-    for joint in list(robot.model.joints)[1:]:  # whose move was not needed after all
+    for joint in list(model.joints)[1:]:  # whose move was not needed after all
         part = slice(joint.idx_q, joint.idx_q + joint.nq)
         candidate = q.copy()
         candidate[part] = start[part]

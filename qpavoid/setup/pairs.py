@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import replace
+from itertools import combinations
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 import pinocchio as pin
@@ -14,15 +15,14 @@ from qpavoid.model.joints import frame_index
 from qpavoid.model.notes import Note, NoteKind
 from qpavoid.model.pairs import ALWAYS_TOUCHING, find_contacts, pair_array
 from qpavoid.model.robot import Robot
-from qpavoid.problem import Array
-from qpavoid.setup.sampling import D1, SEED, BoolArray, PairSamples, Space
+from qpavoid.problem import Array, Mask
+from qpavoid.setup.sampling import D1, PairSamples, draw_poses
 from qpavoid.setup.shapes import Piece
 
-Reason = Literal["adjacent", "srdf", "always", "drawn in", "never"]
+Reason = Literal["drawn in", "always", "srdf", "adjacent", "never"]
+"""Why a pair is not checked; of two links with several bodies, the first of these that one of their pairs has."""
 SRDF_REASONS = {"adjacent": "Adjacent", "always": "Default", "never": "Never", "drawn in": "Default", "srdf": "User"}
 """Reasons as an SRDF gives them."""
-_ORDER = ("drawn in", "always", "srdf", "adjacent", "never")
-"""Reasons that two links have for several pairs of their bodies: the first one of these is given."""
 _POSES = 200
 """Random configurations in which contacts of the geometry of unchecked links are counted."""
 _LEAST = 0.1
@@ -33,27 +33,23 @@ _STRAIGHT = 1e-6
 """Departure of a path from a straight line, as a share of its length, that is rounding [-]."""
 
 
-@dataclass(frozen=True)
-class UncheckedLinks:
+class UncheckedLinks(NamedTuple):
     """Two links of which no pair of bodies is checked."""
 
     links: tuple[str, str]
     reason: Reason
-    bodies: float | None
-    """Share of random configurations in which their bodies touch, the pair that does so most [-]; None: not sampled."""
     geometry: float
-    """The same of the file's own geometry, meshes as they are [-]."""
+    """Share of random configurations in which the file's own geometry touches, meshes as they are [-]."""
 
     def notes(self) -> list[Note]:
         """Return a note of what may matter; none of pairs that never touch, or always do as neighbours do."""
-        fraction, severity = self.geometry, "note"
+        fraction, severity, remedy = self.geometry, "note", ""
         if self.reason == "always" and fraction < ALWAYS_TOUCHING:
-            bodies, severity = 100.0 * (self.bodies or 0.0), "warning"
-            clause = f"not checked: their bodies touch in {bodies:.0f} % of configurations, their geometry more seldom"
+            clause, severity = "not checked: their bodies nearly always touch, their geometry more seldom", "warning"
             remedy = f"leaner bodies: --bodies {self.links[0]}=convex, or of your own"
         elif self.reason in ("always", "drawn in"):
             design = "overlap" if self.reason == "always" else "slide into each other"
-            clause, remedy = f"not checked: they {design} by design", ""
+            clause = f"not checked: they {design} by design"
         elif not 0.0 < fraction < ALWAYS_TOUCHING:
             return []
         elif self.reason == "srdf":
@@ -64,8 +60,7 @@ class UncheckedLinks:
         return [Note(NoteKind.PAIR, self.links, clause, remedy, severity, fraction)]  # type: ignore[arg-type]
 
 
-def named_pairs(robot: Robot) -> list[frozenset[str]]:
-    """Return the names of the bodies of each pair."""
+def _named_pairs(robot: Robot) -> list[frozenset[str]]:
     names = [body.name for body in robot.bodies.geometryObjects]
     return [frozenset((names[pair.first], names[pair.second])) for pair in robot.bodies.collisionPairs]
 
@@ -76,34 +71,30 @@ def links_of_bodies(robot: Robot) -> dict[str, str]:
 
 
 def pair_reasons(
-    robot: Robot, sampled: PairSamples | None = None, is_nested: BoolArray | None = None
+    robot: Robot, sampled: PairSamples | None = None, is_nested: Mask | None = None
 ) -> dict[frozenset[str], Reason]:
     """Explain why each pair of bodies that is not checked is not.
 
-    Args:
-        robot: with its pairs.
-        sampled: what became of its m pairs in random configurations; None: all of them are checked.
-        is_nested: which of them slide into each other (m,).
+    Of the robot's own m pairs, what became of them in random configurations counts, and which slide into each other
+    (m,).
     """
-    bodies, parents = robot.bodies.geometryObjects, robot.model.parents
+    parents = robot.model.parents
     touching = {frozenset(pair[:2]) for pair in robot.always_touching}
-    numbers = {pair: i for i, pair in enumerate(named_pairs(robot))}
+    numbers = {pair: i for i, pair in enumerate(_named_pairs(robot))}
     reasons: dict[frozenset[str], Reason] = {}
-    for i, body in enumerate(bodies):
-        for other in bodies[:i]:
-            pair, a, b = frozenset((body.name, other.name)), body.parentJoint, other.parentJoint
-            number = numbers.get(pair)
-            if pair in touching:
-                reasons[pair] = "always"
-            elif number is None:
-                is_adjacent = a == b or parents[a] == b or parents[b] == a
-                reasons[pair] = "adjacent" if is_adjacent else "srdf"
-            elif sampled is not None and sampled.always[number]:
-                reasons[pair] = "always"
-            elif is_nested is not None and is_nested[number]:
-                reasons[pair] = "drawn in"
-            elif sampled is not None and sampled.never[number]:
-                reasons[pair] = "never"
+    for body, other in combinations(robot.bodies.geometryObjects, 2):
+        pair, a, b = frozenset((body.name, other.name)), body.parentJoint, other.parentJoint
+        number = numbers.get(pair)
+        if pair in touching:
+            reasons[pair] = "always"
+        elif number is None:
+            reasons[pair] = "adjacent" if a == b or parents[a] == b or parents[b] == a else "srdf"
+        elif sampled is not None and sampled.always[number]:
+            reasons[pair] = "always"
+        elif is_nested is not None and is_nested[number]:
+            reasons[pair] = "drawn in"
+        elif sampled is not None and sampled.never[number]:
+            reasons[pair] = "never"
     return reasons
 
 
@@ -111,15 +102,13 @@ def by_link(
     robot: Robot, reasons: Mapping[frozenset[str], Reason]
 ) -> tuple[dict[frozenset[str], Reason], list[tuple[str, str]]]:
     """Sort unchecked pairs: by links where that describes them, else by bodies."""
-    link = links_of_bodies(robot)
+    link, order = links_of_bodies(robot), get_args(Reason)
     pairs: dict[frozenset[str], list[Reason | None]] = {}
-    names = list(link)
-    for i, a in enumerate(names):
-        for b in names[:i]:
-            if link[a] != link[b]:
-                pairs.setdefault(frozenset((link[a], link[b])), []).append(reasons.get(frozenset((a, b))))
+    for a, b in combinations(link, 2):
+        if link[a] != link[b]:
+            pairs.setdefault(frozenset((link[a], link[b])), []).append(reasons.get(frozenset((a, b))))
     disabled = {
-        links: min((why for why in whys if why), key=_ORDER.index) for links, whys in pairs.items() if None not in whys
+        links: min((why for why in whys if why), key=order.index) for links, whys in pairs.items() if None not in whys
     }
     single = [
         (min(pair), max(pair))
@@ -130,56 +119,28 @@ def by_link(
 
 
 def measure_unchecked(
-    robot: Robot,
-    pieces: Sequence[Piece],
-    disabled: Mapping[frozenset[str], Reason],
-    shares: Mapping[frozenset[str], float],
+    robot: Robot, pieces: Sequence[Piece], disabled: Mapping[frozenset[str], Reason]
 ) -> list[UncheckedLinks]:
-    """Sample how often the geometry of links that are not checked touches.
-
-    Args:
-        robot: with its pairs.
-        pieces: geometry as the file has it.
-        disabled: two links that are not checked, and why.
-        shares: two bodies: share of configurations in which they touch [-].
-    """
+    """Sample how often the geometry of links that are not checked touches, meshes as the file has them."""
     # bodies enclose the geometry: where they never come near, it does not touch
-    of_geometry = geometry_contacts(robot, pieces, [links for links, reason in disabled.items() if reason != "never"])
-    link = links_of_bodies(robot)
-    of_bodies: dict[frozenset[str], float] = {}
-    for pair, fraction in shares.items():
-        links = frozenset(link[body] for body in pair)
-        of_bodies[links] = max(of_bodies.get(links, 0.0), fraction)
+    shares = _contact_shares(robot, pieces, [links for links, reason in disabled.items() if reason != "never"])
     return [
-        UncheckedLinks((min(links), max(links)), reason, of_bodies.get(links), of_geometry.get(links, 0.0))
+        UncheckedLinks((min(links), max(links)), reason, shares.get(links, 0.0))
         for links, reason in sorted(disabled.items(), key=lambda item: sorted(item[0]))
     ]
 
 
 def find_unchecked(robot: Robot, pieces: Sequence[Piece]) -> list[UncheckedLinks]:
-    """Find the links of a robot of which no pair of bodies is checked, and how often their geometry touches.
-
-    Args:
-        robot: with its pairs.
-        pieces: geometry as the file has it.
-    """
+    """Find the links of a robot of which no pair of bodies is checked, and how often their geometry touches."""
     disabled, _ = by_link(robot, pair_reasons(robot))
-    disabled = {links: why for links, why in disabled.items() if why != "always"}  # those are notes of the robot's own
-    return measure_unchecked(robot, pieces, disabled, {})
+    # those that always touch are notes of the robot's own
+    return measure_unchecked(robot, pieces, {links: why for links, why in disabled.items() if why != "always"})
 
 
-def geometry_contacts(
+def _contact_shares(
     robot: Robot, pieces: Sequence[Piece], links: Iterable[frozenset[str]]
 ) -> dict[frozenset[str], float]:
-    """Sample how often the geometry of two links touches, as a share [-].
-
-    Pairs that never move relative to each other are left out.
-
-    Args:
-        robot: whose model moves the links.
-        pieces: geometry as the file has it.
-        links: pairs of links.
-    """
+    """Sample how often the geometry of two links touches [-]; pairs that never move relative to each other are out."""
     geometry, owners = pin.GeometryModel(), dict[str, list[int]]()
     for number, piece in enumerate(pieces):
         frame_id = frame_index(robot.model, piece.link)
@@ -193,26 +154,20 @@ def geometry_contacts(
         for i, j in [(i, j) for i in owners.get(a, []) for j in owners.get(b, []) if joints[i] != joints[j]]:
             geometry.addCollisionPair(pin.CollisionPair(min(i, j), max(i, j)))
             pair_links.append(pair)
-    touching = find_contacts(robot.model, geometry, list(Space(robot).draw(np.random.default_rng(SEED), _POSES)))
-    touches: dict[frozenset[str], BoolArray] = {}
+    touching = find_contacts(robot.model, geometry, draw_poses(robot, _POSES))
+    touches: dict[frozenset[str], Mask] = {}
     for pair, column in zip(pair_links, touching.T, strict=True):
-        touches[pair] = touches.get(pair, np.zeros(len(column), dtype=bool)) | column
+        touches[pair] = touches.get(pair, False) | column
     return {pair: float(column.mean()) for pair, column in touches.items()}
-
-
-def shares_of_contact(robot: Robot, pair_samples: PairSamples) -> dict[frozenset[str], float]:
-    """Return the share of configurations in which each pair touches [-]; only of pairs that were sampled."""
-    shares = dict(zip(named_pairs(robot), pair_samples.contact.tolist(), strict=True))
-    return {**shares, **{frozenset((pair.a, pair.b)): pair.fraction for pair in robot.always_touching}}
 
 
 def own_margins(robot: Robot, d1: Array) -> list[PairMargin]:
     """Return the pairs with a safety distance of their own, from that of each pair (m,)."""
-    bodies = [sorted(pair) for pair in named_pairs(robot)]
+    bodies = [sorted(pair) for pair in _named_pairs(robot)]
     return [PairMargin(bodies=(a, b), d1=float(own)) for (a, b), own in zip(bodies, d1, strict=True) if own < D1]
 
 
-def with_pairs(robot: Robot, mask: BoolArray) -> Robot:
+def with_pairs(robot: Robot, mask: Mask) -> Robot:
     """Return the robot with some of its pairs only."""
     bodies = pin.GeometryModel(robot.bodies)
     for pair, is_kept in zip(list(robot.bodies.collisionPairs), mask, strict=True):
@@ -221,29 +176,27 @@ def with_pairs(robot: Robot, mask: BoolArray) -> Robot:
     return replace(robot, bodies=bodies)
 
 
-def nested_pairs(robot: Robot, pair_samples: PairSamples) -> BoolArray:
+def nested_pairs(robot: Robot, pair_samples: PairSamples) -> Mask:
     """Find the pairs (m,) that overlap when a telescope is drawn in, as a finger in its guide.
 
     Two conditions. The origin of one body's joint moves along a straight line as seen from the other's, so that nothing
     but prismatic joints with a common axis moves it; and its place along that line alone decides whether they touch:
     always on one side of a threshold, never on the other. A pair that meets an obstacle of the robot's own, such as two
     carriages on one rail, touches in the middle of its range or only near an end, and stays.
-
-    Args:
-        robot: with its pairs.
-        pair_samples: of these pairs.
     """
-    is_nested = np.zeros(len(pair_samples.contact), dtype=bool)
-    candidates = np.flatnonzero((pair_samples.touching.mean(axis=0) >= _LEAST) & ~pair_samples.always).tolist()
+    touching = pair_samples.touching
+    is_nested = np.zeros(touching.shape[1], dtype=bool)
+    candidates = np.flatnonzero((touching.mean(axis=0) >= _LEAST) & ~pair_samples.always).tolist()
     data, poses = robot.model.createData(), list[list[Array]]()
     for q in pair_samples.poses if candidates else ():
         pin.forwardKinematics(robot.model, data, q)
         poses.append([pose.homogeneous for pose in data.oMi])
-    joints, pairs, joint_poses = [b.parentJoint for b in robot.bodies.geometryObjects], pair_array(robot.bodies), poses
+    joints, pairs = [body.parentJoint for body in robot.bodies.geometryObjects], pair_array(robot.bodies)
     for index in candidates:
-        a, b = (np.array([pose[joints[int(i)]] for pose in joint_poses]) for i in pairs[index])
-        touching = pair_samples.touching[:, index]
-        is_nested[index] = any(_decides(_along_line(*frames), touching) for frames in ((a, b), (b, a)))
+        a, b = (np.array([pose[joints[i]] for pose in poses]) for i in pairs[index].tolist())
+        is_nested[index] = _decides(_along_line(a, b), touching[:, index]) or _decides(
+            _along_line(b, a), touching[:, index]
+        )
     return is_nested
 
 
@@ -255,7 +208,7 @@ def _along_line(frames: Array, origins: Array) -> Array | None:
     return None if sizes[0] < 1e-6 or sizes[1] > _STRAIGHT * sizes[0] else np.asarray(centred @ axes[0])
 
 
-def _decides(extension: Array | None, touching: BoolArray) -> bool:
+def _decides(extension: Array | None, touching: Mask) -> bool:
     """Return True if a threshold of the extension (k,) separates touching samples (k,)."""
     if extension is None:
         return False

@@ -3,39 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from qpavoid.config import Avoidance
 from qpavoid.geometry.bodies import bounding_sphere
 from qpavoid.model.kinematics import columns, support_masks
 from qpavoid.model.pairs import ALWAYS_TOUCHING, pair_array
 from qpavoid.model.robot import Robot
+from qpavoid.model.space import Space
 from qpavoid.model.views import read_results, view_results
-from qpavoid.problem import Array, IntArray
+from qpavoid.problem import Array, Mask
 
-BoolArray = NDArray[np.bool_]
 SAMPLES, SEED = 5000, 0
 NEVER_NEAR = 0.02
 """Distance, as a share of the robot's size, that a pair must keep in every sample, and where descent from the nearest
 of them ends, to count as never colliding [-]: 20 mm of an arm with a maximal extension of 1 m."""
-ALWAYS_NEAR = 0.03
-"""Distance, as a share of the robot's size, within which two capsules are in every sample if they are oversized [-]."""
 D1 = Avoidance().d1
 """Safety distance of the pairs that have none of their own [m]."""
 _FIRST = 500
 """Samples in which all pairs are computed; later ones only compute pairs that may always or never touch."""
-_SETTLE = 250
-"""Samples between two selections of these pairs."""
 _DOUBT = 0.1
 """Share of samples by which a pair's contact may differ from `ALWAYS_TOUCHING` and still come to attain it [-]."""
 _STEPS = 60
 """Steps of a descent, at most."""
 _CLOSE = 4.0 / 3.0
 """Typical distance of a pair, in units of the default safety distance, below which it gets one of its own [-]."""
+
+
+def draw_poses(robot: Robot, count: int, seed: int = SEED) -> Array:
+    """Draw configurations (count, nq) of a robot, the same ones each time."""
+    return Space(robot.model, robot.bounds()).draw(np.random.default_rng(seed), count)
 
 
 def robot_size(robot: Robot) -> float:
@@ -49,7 +49,7 @@ def robot_size(robot: Robot) -> float:
     centers, radii = zip(*(bounding_sphere(body.geometry) for body in bodies), strict=True)
     radius = np.array(radii)[:, None]
     data, geometry, diagonal = robot.model.createData(), robot.bodies.createData(), 0.0
-    for q in [robot.home, *Space(robot).draw(np.random.default_rng(SEED), 20)]:
+    for q in [robot.home, *draw_poses(robot, 20)]:
         pin.updateGeometryPlacements(robot.model, data, robot.bodies, geometry, q)
         at = np.array([pose.act(center) for pose, center in zip(geometry.oMg, centers, strict=True)])
         diagonal = max(diagonal, float(np.linalg.norm((at + radius).max(axis=0) - (at - radius).min(axis=0))))
@@ -96,55 +96,17 @@ class PairDistances:
         row = (np.concatenate((normal, np.cross(point, normal))) @ self.data.J) * self._support[index]
         return float(result.min_distance), np.bincount(self._columns, row, self.model.nv).astype(np.float64)
 
-    def moved_by(self, index: int) -> BoolArray:
+    def moved_by(self, index: int) -> Mask:
         """Return the coordinates (nv,) that change the distance of one pair."""
         return np.bincount(self._columns, np.abs(self._support[index]), self.model.nv) > 0.0
 
 
-class Space:
-    """The configurations of a robot, its root left where it is."""
-
-    def __init__(self, robot: Robot) -> None:
-        bounds, model = robot.bounds(), robot.model
-        self.model = model
-        self._q, self._v = bounds.q_index, bounds.v_index
-        finite = np.isfinite(bounds.lower) & np.isfinite(bounds.upper)  # a range without end is no range to draw from
-        self._lower, self._upper = np.where(finite, bounds.lower, -np.pi), np.where(finite, bounds.upper, np.pi)
-        self.free = np.ones(model.nv, dtype=bool)
-        """(nv,) coordinates without limits: continuous joints; not a root, whose pose does not matter here."""
-        self.free[self._v] = False
-        for name, joint in zip(list(model.names)[1:], list(model.joints)[1:], strict=True):
-            low, high = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
-            if name == "root_joint" or (joint.nq == joint.nv == 1 and low == high):
-                self.free[joint.idx_v : joint.idx_v + joint.nv] = False
-        self.moving = self.free.copy()
-        """(nv,) coordinates that configurations differ in."""
-        self.moving[self._v] = True
-
-    def draw(self, random: np.random.Generator, count: int) -> Array:
-        """Draw configurations (count, nq), uniform over the joints' ranges."""
-        turns = random.uniform(-np.pi, np.pi, (count, self.model.nv)) * self.free
-        neutral = pin.neutral(self.model)
-        q = np.array([pin.integrate(self.model, neutral, turn) for turn in turns]).reshape(count, self.model.nq)
-        q[:, self._q] = random.uniform(self._lower, self._upper, (count, len(self._q)))
-        return q
-
-    def move(self, q: Array, step: Array) -> Array:
-        """Return q ⊕ step, clipped to the limits."""
-        moved = np.asarray(pin.integrate(self.model, q, step))
-        moved[self._q] = np.clip(moved[self._q], self._lower, self._upper)
-        return moved
-
-
-@dataclass(frozen=True)
-class PairSamples:
+class PairSamples(NamedTuple):
     """Statistics of each of a robot's m pairs over random configurations."""
 
-    contact: Array
-    """(m,) share of the samples in which it touches [-]."""
-    always: BoolArray
+    always: Mask
     """(m,) touches in at least `ALWAYS_TOUCHING` of them."""
-    never: BoolArray
+    never: Mask
     """(m,) keeps away in every sample and in a descent from the nearest one."""
     closest: Array
     """(m,) least distance found [m]; of pairs that were settled early, up to then."""
@@ -152,7 +114,7 @@ class PairSamples:
     """(m,) median of its distances where it does not touch [m]; infinite where it always does."""
     poses: Array
     """(k, nq) the first samples."""
-    touching: BoolArray
+    touching: Mask
     """(k, m) which pairs touch in them."""
     near: float
     """Distance that counts as away [m]."""
@@ -164,49 +126,28 @@ def sample_pairs(robot: Robot, samples: int = SAMPLES, seed: int = SEED) -> Pair
     Random configurations first; each pair that stayed apart in all of them then descends along its gradient from where
     it came closest, so that "never" does not depend on the samples alone. It is still no proof: samples are finite,
     descents local.
-
-    Args:
-        robot: with its pairs.
-        samples: configurations drawn.
-        seed: of the draw.
     """
-    distances, space, random = PairDistances(robot), Space(robot), np.random.default_rng(seed)
+    distances, space = PairDistances(robot), Space(robot.model, robot.bounds())
     near, count = NEVER_NEAR * robot_size(robot), len(distances.pairs)
-    poses = space.draw(random, min(_FIRST, samples))
+    draws = space.draw(np.random.default_rng(seed), samples)
+    poses = draws[:_FIRST]
     first = np.array([distances.all(q) for q in poses]).reshape(len(poses), count)
-    touching, done = first <= 0.0, len(poses)
-    closest, at = np.min(first, axis=0, initial=np.inf), poses[np.argmin(first, axis=0)]
-    contact_counts, sample_counts = touching.sum(axis=0), np.full(count, done)
-    is_open = np.ones(count, dtype=bool)
-    while done < samples:
-        is_settled = is_open & (closest < near) & (contact_counts < (ALWAYS_TOUCHING - _DOUBT) * sample_counts)
-        distances.deactivate(np.flatnonzero(is_settled))
-        is_open &= ~is_settled
-        if not is_open.any():
-            break
-        for q in space.draw(random, min(_SETTLE, samples - done)):
-            d = distances.all(q)
-            nearer = is_open & (d < closest)
-            closest[nearer], at[nearer] = d[nearer], q
-            contact_counts += is_open & (d <= 0.0)
-            sample_counts += is_open
-        done += min(_SETTLE, samples - done)
+    touching = first <= 0.0
+    closest, at, contact = np.min(first, axis=0), poses[np.argmin(first, axis=0)], touching.mean(axis=0)
+    is_open = (closest >= near) | (contact >= ALWAYS_TOUCHING - _DOUBT)
+    distances.deactivate(np.flatnonzero(~is_open))
+    later_contacts = np.zeros(count)
+    for q in draws[len(poses) :] if is_open.any() else ():
+        d = distances.all(q)
+        nearer = is_open & (d < closest)
+        closest[nearer], at[nearer] = d[nearer], q
+        later_contacts += d <= 0.0
+    contact[is_open] = (touching.sum(axis=0) + later_contacts)[is_open] / samples
     for index in np.flatnonzero(closest >= near):
         closest[index] = min(closest[index], _descend(distances, space, int(index), at[index], near))
-    contact = contact_counts / sample_counts
     gaps = np.where(touching, np.nan, first).T
     typical = np.array([np.nanmedian(d) if not np.isnan(d).all() else np.inf for d in gaps]).reshape(count)
-    return PairSamples(contact, contact >= ALWAYS_TOUCHING, closest >= near, closest, typical, poses, touching, near)
-
-
-def pairs_always_near(robot: Robot, samples: int, seed: int = SEED) -> IntArray:
-    """Find the pairs of bodies (k, 2) within `ALWAYS_NEAR` of each other in every sample."""
-    distances, limit = PairDistances(robot), ALWAYS_NEAR * robot_size(robot)
-    near = np.ones(len(distances.pairs), dtype=bool)
-    for q in Space(robot).draw(np.random.default_rng(seed), samples if near.any() else 0):
-        near &= distances.all(q) < limit
-        distances.deactivate(np.flatnonzero(~near))
-    return distances.pairs[near]
+    return PairSamples(contact >= ALWAYS_TOUCHING, closest >= near, closest, typical, poses, touching, near)
 
 
 def _descend(distances: PairDistances, space: Space, index: int, q: Array, near: float) -> float:

@@ -63,12 +63,7 @@ class LinkBodies:
 
 
 def kinds_of_links(pieces: Sequence[Piece], kind: Bodies, by_pattern: Mapping[str, Bodies]) -> dict[str, Bodies]:
-    """Choose the kind of bodies of each link with geometry.
-
-    Args:
-        pieces: of all links.
-        kind: of links that no pattern matches.
-        by_pattern: link (with `*` and `?`): its kind; of several, the last one holds.
+    """Choose the kind of bodies of each link with geometry; of several patterns that match one, the last one holds.
 
     Raises:
         UnknownName: a pattern without a link.
@@ -108,13 +103,9 @@ def bodies_of_link(pieces: Sequence[Piece], link: str, kind: Bodies) -> LinkBodi
 
 
 def capsule_fields(fit: CapsuleFit, placement: Any) -> dict[str, Any]:
-    """Return the fields of a `Body` that encloses a capsule, with five decimals.
+    """Return the fields of a `Body` that encloses a capsule in a placed frame, with five decimals.
 
     The radius makes up for the rounding of everything else, so that what was enclosed stays so.
-
-    Args:
-        fit: the capsule.
-        placement: of its frame in the body's.
     """
     axis = placement.rotation @ fit.rotation[:, 2]
     center = placement.act(np.asarray(fit.center))

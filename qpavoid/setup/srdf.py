@@ -73,14 +73,7 @@ def _number(text: str) -> float | None:
 
 
 def srdf_text(robot: str, comment: str, disabled: Mapping[frozenset[str], str], ends: Sequence[str]) -> str:
-    """Write an SRDF.
-
-    Args:
-        robot: its name, as in its URDF.
-        comment: what it says at the top.
-        disabled: links that are not to be checked, and why.
-        ends: links that carry tools.
-    """
+    """Write an SRDF of a robot: a comment, disabled pairs of links with their reasons, links that carry tools."""
     lines = ['<?xml version="1.0"?>', f"<!-- {comment.replace('--', '- -')} -->", f"<robot name={quoteattr(robot)}>"]
     lines += [f"  <end_effector name={name} parent_link={name} group={name}/>" for name in map(quoteattr, ends)]
     for pair in sorted(sorted(links) for links in disabled):

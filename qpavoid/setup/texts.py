@@ -6,43 +6,37 @@ import os.path
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import yaml
 
-from qpavoid.config import Body
 from qpavoid.config.shipped import EXAMPLES, example_robot
 from qpavoid.errors import ConfigError
-from qpavoid.model.notes import Note, NoteKind, abbreviate
+from qpavoid.model.notes import SEVERITIES, Note, NoteKind, abbreviate
 from qpavoid.setup.add import Description
 from qpavoid.setup.srdf import MADE_BY, srdf_text
 
+_WIDTH = 120
+"""Of the lines of a robot.yaml [characters]."""
+
 
 def description_files(description: Description, folder: Path, command: str = "") -> dict[Path, str]:
-    """Write the files of a description.
+    """Write the files of a description that are to stand in a folder, and name the command that makes them again.
 
-    Args:
-        description: what they say.
-        folder: where they are to stand; paths in them are relative to it.
-        command: that makes them again.
+    Paths in them are relative to that folder.
     """
     srdf, head = folder / f"{description.config.name}.srdf", f"{description.config.name}: {MADE_BY}"
     comments = [head, *(f"{what.capitalize()}: {line}." for what, line in summary(description))]
     comments += [*note_lines(description.notes), *([f"Again: {command}"] if command else [])]
-    lines = [*(f"# {line}" for line in comments), *_robot_yaml(description, folder, srdf.name), ""]
+    text = "".join(f"# {line}\n" for line in comments) + _robot_yaml(description, folder, srdf.name)
     ends = description.config.end_effectors
     return {
-        folder / "robot.yaml": "\n".join(lines),
+        folder / "robot.yaml": text,
         srdf: srdf_text(description.robot.model.name, head, description.disabled, ends),
     }
 
 
 def write_files(contents: Mapping[Path, str], force: bool = False) -> dict[Path, str]:
-    """Write all files, or none.
-
-    Args:
-        contents: what each is to hold.
-        force: overwrites files that hold something else.
+    """Write all files, or none; `force` overwrites those that hold something else.
 
     Returns:
         For each file `written`, `unchanged` or `updated`.
@@ -70,49 +64,20 @@ def write_files(contents: Mapping[Path, str], force: bool = False) -> dict[Path,
     return outcome
 
 
-def _robot_yaml(description: Description, folder: Path, srdf: str) -> Iterator[str]:
-    config = description.config
-    yield f"name: {_flow(config.name)}"
-    yield f"urdf: {_flow(_reference(Path(config.urdf), folder))}"
-    yield f"srdf: {_flow(srdf)}"
+def _robot_yaml(description: Description, folder: Path, srdf: str) -> str:
+    """Write the fields of a robot.yaml that are not as they would be without it."""
+    config, given = description.config, description.config.model_dump(mode="json", exclude_defaults=True)
+    fields = {"name": config.name, "urdf": "", "srdf": srdf, **given}
+    fields["urdf"] = _reference(Path(config.urdf), folder)
     if config.package_dirs:
-        yield f"package_dirs: {_flow([_entry(entry, folder) for entry in config.package_dirs])}"
-    if config.allow_missing_meshes:
-        yield "allow_missing_meshes: true"
-    if config.root_joint != "fixed":
-        yield f"root_joint: {config.root_joint}"
-    yield f"end_effectors: {_flow(list(config.end_effectors))}"
+        fields["package_dirs"] = [_entry(entry, folder) for entry in config.package_dirs]
     assert not isinstance(config.bodies, str)
-    yield "bodies:" if config.bodies else "bodies: []"
-    yield from _body_lines(config.bodies, description)
-    if config.disabled_pairs:
-        yield "disabled_pairs:   # of links that have other pairs which are checked; the rest is in the SRDF"
-        yield from (f"  - {_flow(list(pair))}" for pair in config.disabled_pairs)
-    if config.pair_margins:
-        yield "pair_margins:   # of bodies that are near each other by design"
-        yield from (f"  - {_flow({'bodies': list(own.bodies), 'd1': own.d1})}" for own in config.pair_margins)
-    if config.limits.velocity:
-        yield "limits:   # assumed: the file gives no speed of these"
-        yield f"  velocity: {_flow(dict(config.limits.velocity))}"
-    for field, values in (("home", config.home), ("lock", config.lock)):
-        if values:
-            yield from (f"{field}:", *(f"  {_flow(joint)}: {value:g}" for joint, value in values.items()))
-
-
-def _body_lines(bodies: Sequence[Body], description: Description) -> Iterator[str]:
-    last = ""
-    for body in bodies:
-        fields: dict[str, Any] = body.model_dump(mode="json", include={"name", "frame", "shape"})
-        fields |= {key: list(value) for key in ("position", "rpy") if any(value := getattr(body, key))}
-        link = description.links[body.frame]
-        comment = f"   # {link.volume / link.inside:.2f} of it" if link.inside > 0.0 and body.frame != last else ""
-        yield f"  - {_flow(fields)}{comment}"
-        last = body.frame
-
-
-def _flow(value: Any) -> str:
-    text = str(yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=10**6))
-    return text.strip().removesuffix("\n...")
+    fields["bodies"] = []
+    for body in config.bodies:
+        pose = {key: list(value) for key in ("position", "rpy") if any(value := getattr(body, key))}
+        shape = body.shape.model_dump(mode="json")
+        fields["bodies"].append({"name": body.name, "frame": body.frame, "shape": shape, **pose})
+    return str(yaml.safe_dump(fields, default_flow_style=None, sort_keys=False, width=_WIDTH))
 
 
 def _reference(urdf: Path, folder: Path) -> str:
@@ -162,9 +127,8 @@ def summary(description: Description) -> Iterator[tuple[str, str]]:
 
 def note_lines(notes: Sequence[Note]) -> list[str]:
     """Write the table of notes: a line each, and another for the remedy."""
-    order = {"error": 0, "warning": 1, "note": 2}
     lines = []
-    for note in sorted(notes, key=lambda note: order[note.severity]):
+    for note in sorted(notes, key=lambda note: SEVERITIES.index(note.severity)):
         percentage = "" if note.fraction is None else f"{100.0 * note.fraction:.0f} %"
         names = " - ".join(note.subject) if note.kind is NoteKind.PAIR else abbreviate(note.subject)
         lines.append(

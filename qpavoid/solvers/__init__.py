@@ -18,6 +18,7 @@ from qpavoid.solvers.baselines import GradientProjection, PotentialField
 from qpavoid.solvers.hqp import Hqp
 from qpavoid.solvers.qp import Qp
 from qpavoid.solvers.solver import Solver, check_solver
+from qpavoid.solvers.step_search import StepSearch
 
 SOLVERS: dict[str, Callable[[Any], Solver]] = {
     "tracking": TrackingOnly,
@@ -25,6 +26,7 @@ SOLVERS: dict[str, Callable[[Any], Solver]] = {
     "eq10-literal": Eq10,
     "gradient-projection": GradientProjection,
     "potential-field": PotentialField,
+    "step-search": StepSearch,
     "qp": Qp,
     "hqp": Hqp,
 }

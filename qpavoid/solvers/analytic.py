@@ -12,38 +12,8 @@ from qpavoid.solvers.solver import NamedSolver
 _MIN_SQUARE = 1e-12
 """Squared length below which a projected row counts as zero [m²/rad²]: an absolute cut-off, since a relative one
 inverts round-off (J_d N is zero exactly when the tool tip is the key point of a 3-D task)."""
-
-
-def pseudo_inverse(A: Array, damping: float) -> Array:
-    """Compute the damped right inverse Aᵀ (A Aᵀ + λ²)⁻¹; for λ = 0 the Moore-Penrose inverse.
-
-    Args:
-        A: matrix (r, nv).
-        damping: λ [-].
-
-    Returns:
-        (nv, r).
-    """
-    if damping == 0.0:
-        return np.asarray(np.linalg.pinv(A, rcond=1e-10))
-    gram = A @ A.T
-    gram[np.diag_indices_from(gram)] += damping**2
-    return np.asarray(np.linalg.solve(gram, A).T)
-
-
-def tracking_velocity(problem: Problem) -> Array:
-    """Return the velocity (nv,) of the tracking law alone, J⁺ẋ of the weighted rows [rad/s or m/s].
-
-    Args:
-        problem: whose v_tracking it is; computed here where that is NaN for want of damping.
-    """
-    v_tracking, tracking = problem.v_tracking, problem.tracking
-    if v_tracking[0] == v_tracking[0]:
-        return np.array(v_tracking)
-    # rows repeat each other and no damping was asked for; NaN in `tracking` stays NaN
-    if not np.isfinite(tracking.A).all():
-        return np.full(tracking.A.shape[1], np.nan)
-    return np.asarray(pseudo_inverse(tracking.A, 0.0) @ tracking.b)
+_RANK_TOLERANCE = 1e-10
+"""Share of the largest singular value of J below which one is round-off [-]."""
 
 
 def null_space_part(row: Array, tracking: Tracking) -> Array:
@@ -51,24 +21,21 @@ def null_space_part(row: Array, tracking: Tracking) -> Array:
 
     Args:
         row: (nv,).
-        tracking: task rows; with damping λ, J N = λ² (J Jᵀ + λ²)⁻¹ J is small instead of zero.
+        tracking: task rows.
 
     Returns:
         (nv,).
     """
     J = tracking.A
-    return np.asarray(row - (row @ pseudo_inverse(J, tracking.damping)) @ J)
+    return np.asarray(row - (row @ np.linalg.pinv(J, rcond=_RANK_TOLERANCE)) @ J)
 
 
 class TrackingOnly(NamedSolver):
-    """q̇ = J⁺ẋ, damped least squares: the baseline, without avoidance.
-
-    Nakamura and Hanafusa 1986; Wampler 1986.
-    """
+    """q̇ = J⁺ẋ of `kernels.tracking_law`: the baseline, without avoidance."""
 
     def solve(self, problem: Problem) -> Solution:
         """Return J⁺ẋ; see `Solver.solve`."""
-        return Solution(tracking_velocity(problem))
+        return Solution(problem.v_tracking.copy())
 
 
 class Eq10(NamedSolver):
@@ -87,7 +54,7 @@ class Eq10(NamedSolver):
 
     def solve(self, problem: Problem) -> Solution:
         """Return the velocity of eq. 10, or J⁺ẋ without a pair in range; see `Solver.solve`."""
-        rows, primary = problem.avoidance, tracking_velocity(problem)
+        rows, primary = problem.avoidance, problem.v_tracking.copy()
         if rows.d.size == 0:
             return Solution(primary)
         closest = int(np.argmin(rows.d))

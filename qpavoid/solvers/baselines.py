@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from qpavoid.problem import Array, Problem, Solution
-from qpavoid.solvers.analytic import null_space_part, tracking_velocity
+from qpavoid.solvers.analytic import null_space_part
 from qpavoid.solvers.solver import NamedSolver
 
 
@@ -28,7 +28,7 @@ class GradientProjection(NamedSolver):
 
     def solve(self, problem: Problem) -> Solution:
         """Return J⁺ẋ plus the self-motion that adds clearance; see `Solver.solve`."""
-        rows, primary = problem.avoidance, tracking_velocity(problem)
+        rows, primary = problem.avoidance, problem.v_tracking.copy()
         if rows.d.size == 0:
             return Solution(primary)
         gradient = clearance_slope(rows.d, rows.d1, rows.d2) @ rows.J
@@ -84,7 +84,7 @@ class PotentialField(NamedSolver):
 
     def solve(self, problem: Problem) -> Solution:
         """Return attraction plus repulsion; the attraction itself without a pair in range; see `Solver.solve`."""
-        rows, primary = problem.avoidance, tracking_velocity(problem)
+        rows, primary = problem.avoidance, problem.v_tracking.copy()
         if rows.d.size == 0:
             return Solution(primary)
         f = repulsion(rows.d, rows.d1, rows.d2, self.config.gain, self.config.cap)

@@ -8,10 +8,12 @@ fast online humanoid-robot motion generation").
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from qpavoid import kernels
-from qpavoid.problem import Array, IntArray, Problem, Solution
+from qpavoid.problem import Array, Problem, Solution, least_squares
 from qpavoid.reason import Reason, ReasonKind
 from qpavoid.solvers.backends import verified, within
 from qpavoid.solvers.qp import Qp
@@ -31,8 +33,9 @@ class Hqp(Qp):
         min ‖A_p v - b_p‖² + λ ‖v - v̂‖²  s.t.  J v >= b,  lower <= v <= upper.
 
     v̂ is the same cascade without the inequalities, v̂ += Z (A_p Z)⁺ (b_p - A_p v̂) with a basis Z of the null space of
-    the levels before (Siciliano and Slotine 1991), each inverse damped as J⁺ is: the answer wherever it is safe. In the
-    null space of the last level, v is as near to v̂ as possible. Contacts are met by the basis of the first level.
+    the levels before (Siciliano and Slotine 1991), each inverse that of the tracking law: the answer wherever it is
+    safe. A level's b_p is A_p v̂ once it is met. In the null space of the last level, v is as near to v̂ as possible.
+    Contacts are met by the basis of the first level.
 
     Where no velocity meets the inequalities, they are relaxed as those of `qp` are, and the cascade is solved within
     the relaxed ones. A level whose QP neither the back end nor daqp solves keeps the velocity of the levels before it,
@@ -43,16 +46,20 @@ class Hqp(Qp):
 
     def solve(self, problem: Problem) -> Solution:
         """Return the lexicographic optimum; relaxed without one; a stop where that fails too."""
-        if problem.violation <= 0.0 and not problem.levels:
-            return Solution(problem.v_tracking.copy())
         levels = problem.levels or (np.arange(len(problem.tracking.b)),)
+        velocities = problem.cascade
+        if velocities is None:
+            velocities = cascade(problem, least_squares) if problem.levels else problem.v_tracking[None]
+        unconstrained = velocities[-1].copy()
         rows, lower, upper = problem.avoidance, problem.lower, problem.upper
-        unconstrained, damped = _cascade(problem, levels)
         if kernels.violation(unconstrained, rows.J, rows.b, lower, upper) <= 0.0:
             return Solution(unconstrained)
-        if not np.isfinite(unconstrained).all():
+        if not np.isfinite(velocities).all():
             unconstrained = np.zeros_like(unconstrained)
-        v, unsolved = self._levels(problem, damped, unconstrained, rows.b, lower, upper)
+            velocities = np.zeros_like(velocities)
+        A = problem.tracking.A
+        reduced = [(A[index], A[index] @ v) for index, v in zip(levels, velocities, strict=True)]
+        v, unsolved = self._levels(problem, reduced, unconstrained, rows.b, lower, upper)
         if v is not None:
             return Solution(v).with_reasons(*unsolved) if unsolved else Solution(v)
         relaxed = self._relax(problem)
@@ -60,12 +67,8 @@ class Hqp(Qp):
             return relaxed
         slack = np.maximum(rows.b - rows.J @ relaxed, 0.0)
         lower, upper = np.minimum(lower, relaxed), np.maximum(upper, relaxed)
-        v, unsolved = self._levels(problem, damped, unconstrained, rows.b - slack, lower, upper)
+        v, unsolved = self._levels(problem, reduced, unconstrained, rows.b - slack, lower, upper)
         return relaxed_solution(relaxed if v is None else v, problem, *unsolved)
-
-    def tracked(self, problem: Problem) -> Array:
-        """Return the velocity (nv,) of the cascade without inequalities, v̂ [rad/s or m/s]."""
-        return _cascade(problem, problem.levels or (np.arange(len(problem.tracking.b)),))[0]
 
     def _levels(
         self, problem: Problem, levels: Levels, unconstrained: Array, b: Array, lower: Array, upper: Array
@@ -75,7 +78,7 @@ class Hqp(Qp):
         Returns:
             Velocity (nv,), None where the first level has no solution; reasons for the levels without one.
         """
-        J, (Z, v), regularization = problem.avoidance.J, _start(problem), self.config.regularization
+        J, (Z, v), regularization = problem.avoidance.J, _start(problem), self._regularization(problem)
         is_satisfied, unsolved = False, list[Reason]()
         for level, (A, rate) in enumerate((*levels, (np.eye(len(v)), unconstrained))):
             P = A.T @ A
@@ -104,33 +107,28 @@ def _start(problem: Problem) -> tuple[Array, Array]:
     return (np.eye(nv), np.zeros(nv)) if contacts is None else (contacts.Z, contacts.v_particular)
 
 
-def _cascade(problem: Problem, levels: tuple[IntArray, ...]) -> tuple[Array, Levels]:
-    """Compute the velocity v̂ of the tasks alone, and the levels of which it is the optimum.
+def cascade(problem: Problem, inverse: Callable[[Array, Array], Array]) -> Array:
+    """Compute the velocities v̂ of the tasks down to each priority, without inequalities (levels, nv).
 
-    With the singular values s of A_p Z, these have the right-hand sides that damping leaves of the tasks: their part
-    along each left singular vector is scaled with s² / (s² + λ²). So nothing jumps where an inequality begins to bind.
-
-    Returns:
-        v̂ (nv,), NaN where a row has NaN; rows and right-hand sides of each level.
+    Args:
+        problem: of several levels.
+        inverse: gives the velocity (nv,) of the rows A (r, nv) with b (r,), zero but for one level and the null space
+            of the levels before.
     """
-    tracking = problem.tracking
-    damped = [(tracking.A[rows], tracking.b[rows]) for rows in levels]
+    A, b = problem.tracking.A, problem.tracking.b
+    velocities = np.empty((len(problem.levels), A.shape[1]))
     Z, v = _start(problem)
-    for level, (A, b) in enumerate(damped):
-        reduced, missing = A @ Z, b - A @ v
-        if not (np.isfinite(reduced).all() and np.isfinite(missing).all()):
-            return np.full_like(v, np.nan), damped[:level]
-        U, s, V = np.linalg.svd(reduced, full_matrices=True)
-        in_range = s > _RANK_TOLERANCE * max(float(s[0]), _MIN_SINGULAR_VALUE)
-        s, count = s[in_range], int(in_range.sum())
-        components = U[:, :count].T @ missing
-        step = s / (s**2 + tracking.damping**2) * components
-        v = v + Z @ (V[:count].T @ step)
-        damped[level] = (A, b - U[:, :count] @ (components - s * step))
-        Z = Z @ V[count:].T
+    for level, rows in enumerate(problem.levels):
+        reduced, missing = np.zeros_like(A), np.zeros_like(b)
+        reduced[rows], missing[rows] = A[rows] @ Z @ Z.T, b[rows] - A[rows] @ v
+        v = velocities[level] = v + inverse(reduced, missing)
+        if not np.isfinite(reduced).all():
+            return np.full_like(velocities, np.nan)
+        Z = Z @ _null_space(A[rows] @ Z)
         if not Z.shape[1]:
+            velocities[level:] = v
             break
-    return v, damped
+    return velocities
 
 
 def _null_space(A: Array) -> Array:

@@ -8,7 +8,6 @@ from qpavoid import kernels
 from qpavoid.config import HqpSolver, QpSolver
 from qpavoid.problem import Array, Problem, Solution, Status
 from qpavoid.reason import Reason, ReasonKind
-from qpavoid.solvers.analytic import tracking_velocity
 from qpavoid.solvers.backends import make_backend, solve_daqp, verified, within
 from qpavoid.solvers.relaxation import project, relax, relaxed_solution
 from qpavoid.solvers.solver import NamedSolver
@@ -22,7 +21,9 @@ class Qp(NamedSolver):
 
     v_t = J⁺ẋ is `v_tracking`, so the answer is the safe velocity closest to it, and v_t itself whenever that is safe.
     As A v_t = b wherever the task can be met, the first term is the tracking cost ‖A v - b‖²; that λ counts from v_t,
-    not from 0, leaves tracking without bias.
+    not from 0, leaves tracking without bias. λ is `regularization`, or what the task rows bend within a control step,
+    `Problem.bent`, where that is more: the cost does not contain the curvature of the tasks, and where rows keep the
+    robot from a target that is far, a flat optimum of it would jump from vertex to vertex.
 
     Where no velocity meets all constraints, margins are relaxed, then acceleration limits, then contact of pairs, as
     little as possible and the deepest pair least (`solvers.relaxation`). An answer of a back end counts only if it
@@ -48,11 +49,7 @@ class Qp(NamedSolver):
         if problem.violation <= 0.0:
             return Solution(problem.v_tracking.copy())
         A, rows, lower, upper = problem.tracking.A, problem.avoidance, problem.lower, problem.upper
-        regularization, v_tracking, contacts = self.config.regularization, problem.v_tracking, problem.contacts
-        if v_tracking[0] != v_tracking[0]:
-            v_tracking = tracking_velocity(problem)
-            if contacts is None and kernels.violation(v_tracking, rows.J, rows.b, lower, upper) <= 0.0:
-                return Solution(v_tracking)
+        regularization, v_tracking, contacts = self._regularization(problem), problem.v_tracking, problem.contacts
         if self._native and contacts is None:
             v, solved = kernels.project(A, regularization, v_tracking, rows.J, rows.b, lower, upper)
             if solved:
@@ -66,6 +63,10 @@ class Qp(NamedSolver):
                 return Solution(answer)
         relaxed = self._relax(problem)
         return relaxed if isinstance(relaxed, Solution) else relaxed_solution(relaxed, problem)
+
+    def _regularization(self, problem: Problem) -> float:
+        """Return λ of this control step."""
+        return max(float(self.config.regularization), problem.bent)
 
     def low_effort(self, problem: Problem, slack: Array | None) -> Array | None:
         """Compute a solution with the same slacks and bounds that weighs joint speeds as much as the task's.
@@ -84,7 +85,7 @@ class Qp(NamedSolver):
             pairs = [problem.pair_names[rows.pair[i]] for i in unknown.tolist()]
             reasons = tuple([Reason.of(ReasonKind.UNKNOWN_DISTANCE, *pair) for pair in pairs])
             return Solution(problem.v_stop.copy(), Status.STOPPED, reasons)
-        v = relax(problem, self.config.regularization)
+        v = relax(problem, self._regularization(problem))
         if v is not None:
             return v
         reason = Reason.of(ReasonKind.SOLVER_FAILED, detail="the QP back end returned no usable velocity")

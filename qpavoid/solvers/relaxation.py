@@ -19,7 +19,6 @@ import numpy as np
 from qpavoid import kernels
 from qpavoid.problem import Array, AvoidanceRows, IntArray, Problem, Solution, Status
 from qpavoid.reason import Reason, ReasonKind, Severity
-from qpavoid.solvers.analytic import tracking_velocity
 from qpavoid.solvers.backends import TOLERANCE, reduced_rows
 
 _LEVEL_WIDTH = 2e-3
@@ -83,7 +82,7 @@ def project(
     Returns:
         None where there is none.
     """
-    v_tracking, contacts = tracking_velocity(problem), problem.contacts
+    v_tracking, contacts = problem.v_tracking, problem.contacts
     soft = np.zeros(len(b)) if soft is None else soft
     if contacts is None:
         v, solved = kernels.project_soft(A, regularization, v_tracking, J, b, lower, upper, soft)

@@ -20,8 +20,8 @@ class Solver:
     holds_contacts: bool = False
     """Whether its velocity meets `Problem.contacts`; only such a law may drive a robot with contacts."""
     prioritised: bool = False
-    """Whether it tracks `Problem.levels` in their order, so that rows that depend on the tracked velocity are made for
-    `tracked` in place of v_tracking."""
+    """Whether it tracks `Problem.levels` in their order, so that `Problem.cascade` is there, and v_tracking is the last
+    velocity of it."""
 
     def solve(self, problem: Problem) -> Solution:
         """Return the velocity of one control step; never raise on a well-formed problem.
@@ -30,10 +30,6 @@ class Solver:
             problem: rows, bounds and tracking velocity of the step.
         """
         raise NotImplementedError(f"{type(self).__name__} has no `solve`")
-
-    def tracked(self, problem: Problem) -> Array:
-        """Return the velocity (nv,) that the law would have if nothing were in the way [rad/s or m/s]."""
-        return problem.v_tracking
 
     def low_effort(self, problem: Problem, slack: Array | None) -> Array | None:
         """Return a solution (nv,) of less joint motion for the stop look-ahead to try; None without any.
@@ -69,7 +65,7 @@ def check_solver(solver: Solver, contacts: bool) -> None:
         ConfigError: it lacks something of `Solver`, or does not hold contacts.
     """
     try:
-        _ = solver.solve, solver.bounded, solver.prioritised, solver.tracked, solver.low_effort
+        _ = solver.solve, solver.bounded, solver.prioritised, solver.low_effort
         cannot_hold = contacts and not solver.holds_contacts
     except AttributeError as error:
         name = type(solver).__name__

@@ -33,6 +33,7 @@ SOLVER_STYLES: dict[str, tuple[str, Any]] = {
     "eq10": ("#D55E00", DASHES[1]),
     "gradient-projection": ("#CC79A7", DASHES[4]),
     "potential-field": ("#56B4E9", DASHES[6]),
+    "step-search": ("#999999", DASHES[7]),
     "hqp": ("#009E73", DASHES[5]),
     "qp": ("#0072B2", DASHES[0]),
 }
@@ -96,26 +97,14 @@ def compare_time_figure(logs: Sequence[Log]) -> Figure:
 
 
 def path_figure(logs: Sequence[Log], styles: Sequence[dict[str, Any]]) -> Figure:
-    """Draw tool paths in two views at one scale, with the planned path and the obstacles.
-
-    Args:
-        logs: runs of one scenario.
-        styles: label, colour and line style of each.
-    """
+    """Draw tool paths in two views at one scale, with the planned path, the obstacles and the bodies at rest."""
     longest = max(logs, key=lambda log: len(log.t))
-    outlines = _outlines(logs, longest)
-    paths = np.concatenate([longest.target.reshape(-1, 3), *(log.tool.reshape(-1, 3) for log in logs)])
-    points = np.concatenate([paths, *(faces.reshape(-1, 3) for faces, _, _ in outlines)])
-    lower, upper = (points.min(axis=0), points.max(axis=0)) if len(points) else (-np.ones(3), np.ones(3))
-    pad = 0.04 * max(float(np.max(upper - lower)), 0.1)
-    lower, upper = lower - pad, upper + pad
+    outlines = _outlines(longest) if len(longest.t) else []
+    paths = longest.target.reshape(-1, 3)
     horizontal = int(np.argmax(np.ptp(paths, axis=0))) if len(paths) else 0
-    verticals = [axis for axis in (2, 1, 0) if axis != horizontal]
-    extent = (upper - lower) * min(6.0 / (upper - lower)[horizontal], 7.0 / np.sum((upper - lower)[verticals]))
-    size = extent[horizontal] + 2.8, float(np.sum(extent[verticals])) + 1.4
-    figure = Figure(figsize=size, layout="constrained")
-    axes = figure.subplots(2, 1, sharex=True, height_ratios=extent[verticals])
-    for ax, vertical in zip(axes, verticals, strict=True):
+    figure = Figure(figsize=(8.5, 8.0), layout="constrained")
+    axes = figure.subplots(2, 1, sharex=True)
+    for ax, vertical in zip(axes, [axis for axis in (2, 1, 0) if axis != horizontal], strict=True):
         for faces, colour, alpha in outlines:
             flat = faces.reshape(-1, 3)[:, [horizontal, vertical]]
             hull = flat[ConvexHull(flat, qhull_options="QJ").vertices]
@@ -126,13 +115,13 @@ def path_figure(logs: Sequence[Log], styles: Sequence[dict[str, Any]]) -> Figure
             ax.plot(x[-1:], y[-1:], "k*", markersize=9, zorder=4, label="goal")
             for log, style in zip(logs, styles, strict=True):
                 ax.plot(log.tool[:, k, horizontal], log.tool[:, k, vertical], linewidth=1.7, **style)
+        ax.autoscale_view()
         add_grid(ax)
-        ax.set(xlim=(lower[horizontal], upper[horizontal]), ylim=(lower[vertical], upper[vertical]), aspect="equal")
+        ax.set_aspect("equal", adjustable="datalim")
         ax.set_ylabel(f"{'xyz'[vertical]} [m]")
     axes[1].set_xlabel(f"{'xyz'[horizontal]} [m]")
     handles: dict[str, Any] = {str(line.get_label()): line for line in axes[0].get_lines()}
-    suffix = " (paler: earlier)" if len({alpha for _, _, alpha in outlines}) > 1 else ""
-    for colour, name in ((OBSTACLE, f"obstacle{suffix}"), (AT_REST, "robot body at rest")):
+    for colour, name in ((OBSTACLE, "obstacle (paler: earlier)"), (AT_REST, "robot body at rest")):
         if any(colour == drawn for _, drawn, _ in outlines):
             handles[name] = Patch(facecolor=(colour, 0.5), edgecolor=colour, label=name)
     add_legend(axes[0], list(handles.values()))
@@ -140,25 +129,16 @@ def path_figure(logs: Sequence[Log], styles: Sequence[dict[str, Any]]) -> Figure
     return figure
 
 
-def _outlines(logs: Sequence[Log], log: Log) -> list[tuple[Array, str, float]]:
-    """Return faces, colour and opacity of obstacles and of static bodies that came near.
-
-    An obstacle that moves is drawn at up to four places.
-    """
-    outlines = []
-    for i in range(len(log.meta["obstacles"]) if len(log.t) else 0):
-        if is_endless(log, i):
-            continue
+def _outlines(log: Log) -> list[tuple[Array, str, float]]:
+    """Return faces, colour and opacity of bodies at rest, and of obstacles at up to four places of their paths."""
+    resting = np.flatnonzero(~moving_bodies(log)).tolist()
+    outlines = [(capsule_faces(log.body_ends[0, i], log.meta["body_radii"][i]), AT_REST, 0.5) for i in resting]
+    for i in range(len(log.meta["obstacles"])):
         present = np.flatnonzero(np.isfinite(log.obstacle_position[:, i]).all(axis=1))
+        if is_endless(log, i) or not len(present):
+            continue
         travel = np.cumsum(np.r_[0.0, np.linalg.norm(np.diff(log.obstacle_position[present, i], axis=0), axis=1)])
         steps = np.unique(np.searchsorted(travel, np.linspace(0.0, travel[-1], 4))) if travel[-1] > 1e-3 else [0]
-        for rank, step in enumerate(steps if len(present) else []):
+        for rank, step in enumerate(steps):
             outlines.append((obstacle_faces(log, i, int(present[step])), OBSTACLE, 0.5 * (rank + 1) / len(steps)))
-    close_bodies: set[str] = set()
-    for run in logs:
-        avoidance = run.meta["config"]["avoidance"]
-        is_close = run.min_distance + avoidance["offset"] < avoidance["d2"]
-        close_bodies |= {name for pair in set(run.closest_pair[is_close].tolist()) for name in run.meta["pairs"][pair]}
-    bodies_at_rest = [i for i in np.flatnonzero(~moving_bodies(log)).tolist() if log.meta["bodies"][i] in close_bodies]
-    outlines += [(capsule_faces(log.body_ends[0, i], log.meta["body_radii"][i]), AT_REST, 0.5) for i in bodies_at_rest]
     return outlines

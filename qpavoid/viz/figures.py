@@ -6,7 +6,6 @@ they work headless and in threads.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -85,27 +84,9 @@ def _title(log: Log) -> str:
     return title if log.meta["completed"] else f"{title}\n(ended early: {log.meta['stopped_by'] or 'part of a run'})"
 
 
-def position_names(log: Log) -> list[str]:
-    """Name each of the nq coordinates of q.
-
-    Where nq > nv, joints with several velocities are taken to have one coordinate more (a quaternion), and, if the
-    count asks for it, joints without limits to have two (cosine and sine); whatever does not add up is numbered.
-    """
-    names: list[str] = log.meta["coordinates"]
-    limited, count = {name for name, _, _ in log.meta["position_limits"]}, log.q.shape[1]
-    if len(names) == count:
-        return names
-    joints = Counter(name if name in limited else name.rpartition(".")[0] or name for name in names)
-    for endless in (1, 2):
-        sizes = {joint: 1 if joint in limited else n + 1 if n > 1 else endless for joint, n in joints.items()}
-        if sum(sizes.values()) == count:
-            return [f"{joint}.{i}" if size > 1 else joint for joint, size in sizes.items() for i in range(size)]
-    return [f"q[{i}]" for i in range(count)]
-
-
 def joints_figure(log: Log) -> Figure:
     """Draw q over time, a panel each, with position limits (Figs. 7, 14 of the paper)."""
-    names = position_names(log)
+    names = log.meta["positions"]
     limits = {name: (lower, upper) for name, lower, upper in log.meta["position_limits"]}
     columns = 4 if len(names) <= 16 else 6
     rows = max(-(-len(names) // columns), 1)

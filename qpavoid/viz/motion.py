@@ -18,8 +18,8 @@ from qpavoid.viz.style import AT_REST, COLLISION, GROUND, MOVING, OBSTACLE, TOOL
 from qpavoid.viz.surfaces import capsule_faces, is_endless, moving_bodies, obstacle_faces
 
 PANELS = 6
-_VIEWS = [(25.0, azimuth) for azimuth in (-25.0, 25.0, -45.0, 45.0, -65.0, 65.0, -135.0, 135.0)]
-"""Elevation and azimuth [deg]; none looks straight along an axis, which would take the depth away."""
+_ELEVATION, _AZIMUTH = 25.0, -45.0
+"""View [deg]; it looks along no axis, which would take the depth away, and is the same for all solvers."""
 
 
 def motion_figure(log: Log) -> Figure:
@@ -34,26 +34,19 @@ def motion_figure(log: Log) -> Figure:
         return figure
     closest = int(np.argmin(log.min_distance)) if np.isfinite(log.min_distance).any() else -1
     lower, upper = _limits(log, steps)
-    elevation, azimuth = view_angles(log)
     columns = min(len(steps), 3)
     rows = -(-len(steps) // columns)
-    right, up, _ = _view_axes(elevation, azimuth)
-    slenderness = float(np.clip(np.abs(right) @ (upper - lower) / (np.abs(up) @ (upper - lower)), 0.7, 1.0))
-    figure = Figure(figsize=(max(3.7 * slenderness * columns, 7.5), 3.9 * rows + 0.9))
+    figure = Figure(figsize=(max(3.7 * columns, 7.5), 3.9 * rows + 0.9))
     figure.subplots_adjust(left=0.04, right=0.96, top=1.0 - 0.75 / figure.get_figheight(), bottom=0.06, hspace=0.12)
     for i, step in enumerate(steps):
         ax: Any = figure.add_subplot(rows, columns, i + 1, projection="3d", proj_type="ortho", computed_zorder=False)
         ax.patch.set_visible(False)
-        ax.view_init(elevation, azimuth)
+        ax.view_init(_ELEVATION, _AZIMUTH)
         _draw(ax, log, int(step), lower, upper)
         ax.set(xlim=(lower[0], upper[0]), ylim=(lower[1], upper[1]), zlim=(lower[2], upper[2]))
-        ax.set_box_aspect(upper - lower, zoom=1.0 / slenderness)
-        ax.set_title(
-            f"t = {log.t[step]:.2f} s" + (" (closest)" if step == closest else ""),
-            fontsize=10,
-            pad=0,
-            y=0.5 + 0.5 / slenderness,
-        )
+        ax.set_box_aspect(upper - lower)
+        closest_mark = " (closest)" if step == closest else ""
+        ax.set_title(f"t = {log.t[step]:.2f} s{closest_mark}", fontsize=10, pad=0)
         for axis, name, size in zip((ax.xaxis, ax.yaxis, ax.zaxis), "xyz", upper - lower, strict=True):
             axis.set_major_locator(MaxNLocator(1 + int(2.5 * size / np.max(upper - lower)), steps=[1, 2, 5, 10]))
             axis.set_tick_params(labelsize=7, pad=-1)
@@ -82,36 +75,6 @@ def instants(log: Log) -> IntArray:
     if np.isfinite(log.min_distance[closest]) and closest not in steps:
         steps[1 + np.argmin(np.abs(steps[1:-1] - closest))] = closest
     return np.unique(steps).astype(np.intp)
-
-
-def view_angles(log: Log) -> tuple[float, float]:
-    """Choose elevation and azimuth [deg] that foreshorten the path least, with the obstacles behind it or beside it.
-
-    Only what all solvers share goes in (the plan and the obstacles), so that their figures have one view. Paths are
-    drawn over all else: whatever the view, none of them is hidden.
-    """
-    path = log.target.reshape(-1, 3)
-    if not len(path):
-        return _VIEWS[2]
-    spread = path - path.mean(axis=0)
-    size = max(float(np.linalg.norm(spread, axis=1).max()), 1e-9)
-    sized = [i for i in range(len(log.meta["obstacles"])) if not is_endless(log, i)]
-    offsets = np.nanmean(log.obstacle_position[:, sized] - path.mean(axis=0), axis=0) / size
-    scores = []
-    for elevation, azimuth in _VIEWS:
-        towards = _view_axes(elevation, azimuth)[2]
-        named = np.linalg.norm(spread - np.outer(spread @ towards, towards)) / np.linalg.norm(spread + 1e-12)
-        in_front = float(np.clip(np.max(offsets @ towards, initial=0.0), 0.0, 1.0))
-        scores.append(named * (1.0 - 0.5 * in_front) * (1.0 - 5e-4 * abs(azimuth)))  # rather from before the robot
-    return _VIEWS[int(np.argmax(scores))]
-
-
-def _view_axes(elevation: float, azimuth: float) -> tuple[Array, Array, Array]:
-    """Return unit vectors (3,): to the right, up, and from the scene to the viewer; angles in degrees."""
-    e, a = np.radians([elevation, azimuth])
-    towards = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
-    right = np.array([-np.sin(a), np.cos(a), 0.0])
-    return right, np.cross(towards, right), towards
 
 
 def _limits(log: Log, steps: IntArray) -> tuple[Array, Array]:

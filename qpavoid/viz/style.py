@@ -20,18 +20,14 @@ DASHES: tuple[Any, ...] = (
     (0, (3, 1, 1, 1, 1, 1)),
     (0, (10, 3)),
     (0, (2, 2)),
+    (0, (1, 3)),
 )
 COLLISION, D1, D2 = "#C62F2F", "#7A4B9A", "#8A8A8A"
 MOVING, AT_REST, OBSTACLE, GROUND, TOOL_PATH = "#6BA3D6", "#C4C4C4", "#E69F00", "#EFE3C8", "#007A56"
 
 
 def units(log: Log, per: str = "") -> str:
-    """Return the unit of the coordinates: `rad`, `m`, or `rad or m` where a robot has both.
-
-    Args:
-        log: the run.
-        per: put behind each unit, such as `/s`.
-    """
+    """Return the unit of the coordinates, `rad`, `m`, or `rad or m` where a robot has both, `per` behind each."""
     return " or ".join(unit + per for unit in ("rad", "m") if unit in log.meta["units"])
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from qpavoid.config.shipped import family_names, suite_names
+from qpavoid.config.shipped import shipped_names
 from qpavoid.errors import ConfigError
 from qpavoid.run.report import to_json
 from qpavoid.run.terminal import ERR, OUT, names_of, progress, terminate_like_interrupt
@@ -85,7 +85,9 @@ def run(
     if cluster is not None and jobs is not None:
         raise ConfigError("--jobs: the cluster has its own; leave one of --jobs and --cluster out")
     names = [] if solvers is None else names_of("--solvers", solvers)
-    chosen = load_suite(suite, names, entrant or (), seeds)
+    chosen, absent = load_suite(suite, names, entrant or (), seeds).prepare()
+    for name, reason in absent.items():
+        _print_error(f"{name} does not take part: {reason}")
     folder = out or Path("out") / "bench" / chosen.name
     tally = _run_sweep(chosen, folder, cluster, jobs)
     for failure in _failures(folder):
@@ -105,6 +107,8 @@ def smoke(
     from qpavoid_bench.arena.summary import find_faults
 
     chosen = load_suite("smoke")
+    for entrant in chosen.absent:
+        _print_error(f"{entrant.name} does not take part: it needs {', '.join(entrant.missing)}")
     with ExitStack() as stack:
         folder = out or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="qpavoid-smoke-")))
         tally = _run_sweep(chosen, folder, None, jobs)
@@ -156,13 +160,13 @@ def show(
 def list_(json: Json = False) -> None:
     """List suites, families and entrants, and what entrants lack."""
     from qpavoid.config.loading import read_config
-    from qpavoid.config.shipped import find_suite
+    from qpavoid.config.shipped import find_shipped
     from qpavoid_bench.arena.entrants import ENTRANTS
     from qpavoid_bench.arena.families import load_family
     from qpavoid_bench.arena.suite import SuiteConfig
 
-    suites = {name: read_config(find_suite(name), SuiteConfig).title for name in suite_names()}
-    families = {name: load_family(name).config.title for name in family_names()}
+    suites = {name: read_config(find_shipped("suite", name), SuiteConfig).title for name in shipped_names("suite")}
+    families = {name: load_family(name).config.title for name in shipped_names("family")}
     if json:
         entrants = {e.name: {"says": e.description, "missing": list(e.missing)} for e in ENTRANTS.values()}
         print(to_json({"suites": suites, "families": families, "entrants": entrants}))
@@ -186,8 +190,6 @@ def _run_sweep(suite: Suite, folder: Path, cluster: str | None, jobs: int | None
     from qpavoid_bench.arena.store import Store
     from qpavoid_bench.arena.sweep import Tally, plan, sweep
 
-    for entrant in suite.absent:
-        _print_error(f"{entrant.name} does not take part: it needs {', '.join(entrant.missing)}")
     last: Tally | None = None
     with terminate_like_interrupt(), Store(folder) as store, progress() as bar:
         bars = {stage: bar.add_task(stage, total=None, visible=False) for stage in ("cases", "runs")}

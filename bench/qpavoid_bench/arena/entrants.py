@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from importlib import import_module
 from importlib.metadata import PackageNotFoundError, distribution
 from typing import Any
 
@@ -17,9 +15,10 @@ from qpavoid.config import ScenarioConfig, SolverConfig
 from qpavoid.errors import ConfigError, UnknownName, nearest
 from qpavoid.solvers import make_solver, parse_solver
 from qpavoid_bench.arena.case import Case
-from qpavoid_bench.arena.libraries.settings import MINK, PINK, PLACO, PLACO_PYTHON
+from qpavoid_bench.arena.library_pilot import DAMPING, LibraryPilot
 from qpavoid_bench.arena.rollout import Pilot
 from qpavoid_bench.arena.world import World
+from qpavoid_bench.libraries import LIBRARIES, Library
 
 
 @dataclass(frozen=True)
@@ -35,8 +34,8 @@ class Entrant:
     """Settings that distinguish it from others of its kind; changes of them make results of their own."""
     packages: tuple[str, ...] = ()
     """Packages that it needs, as `pip install` knows them; where one is not installed, it does not take part."""
-    interpreter_variable: str = ""
-    """Environment variable that may name another Python interpreter that has its packages."""
+    library: Library | None = None
+    """Library that it is, which has an environment of its own."""
 
     @property
     def digest(self) -> str:
@@ -46,20 +45,22 @@ class Entrant:
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Return those of its packages that are not installed."""
-        if self.interpreter_variable and os.environ.get(self.interpreter_variable):
-            return ()
+        """Return those of its packages that are not installed; of a library, all until its environment is made."""
+        if self.library:
+            return () if self.library.is_installed else self.library.requirements
         return tuple(package for package in self.packages if not _installed(package))
 
-    @property
-    def remedy(self) -> str:
-        """Return the command that installs what is missing."""
-        instead = (
-            f", or set {self.interpreter_variable} to the Python interpreter that has it"
-            if self.interpreter_variable
-            else ""
-        )
-        return f"pip install {' '.join(self.missing)}{instead}"
+    def prepare(self) -> str:
+        """Make the environment of a library if need be; return why it cannot take part, or nothing.
+
+        Other packages are for the user to install.
+        """
+        try:
+            if self.library:
+                self.library.interpreter()
+        except ConfigError as error:
+            return str(error)
+        return f"it needs {', '.join(self.missing)}: pip install {' '.join(self.missing)}" if self.missing else ""
 
 
 def solver_entrant(
@@ -85,14 +86,20 @@ def _start_solver(solver: SolverConfig, changes: Mapping[str, Mapping[str, Any]]
     for block, fields in changes.items():
         scenario[block] = {**scenario[block], **fields}
     x = ScenarioConfig.model_validate({**scenario, "solver": solver.model_dump()})
-    blocks = x.avoidance, x.limits, x.tracking_damping, x.sensing, x.progress
+    blocks = x.avoidance, x.limits, x.sensing, x.progress
     return Controller(world.scene, world.tasks, make_solver(x.solver), x.dt, *blocks)
 
 
-def _start_library(module: str, case: Case, world: World) -> Pilot:
-    """Set up another library through its adapter, a module of `libraries`, which is imported here."""
-    pilot: Pilot = import_module(f"qpavoid_bench.arena.libraries.{module}").Pilot(case, world)
-    return pilot
+def _library_entrant(library: Library) -> Entrant:
+    """Return the entrant that a library is."""
+    settings = {
+        "given": library.settings,
+        "targets": "one period ahead along the task's own law",
+        "damping": f"{DAMPING} squared, where it takes any",
+        **library.options,
+    }
+    start = partial(LibraryPilot, library)
+    return Entrant(library.name, library.description, start, settings, library.packages, library)
 
 
 def _qp_without_backup(name: str, description: str, row: str) -> Entrant:
@@ -111,6 +118,7 @@ ENTRANTS = {
         solver_entrant(
             "potential-field", "tracking pulls, near pairs push: FIRAS at velocity level", "potential-field"
         ),
+        solver_entrant("step-search", "the best collision-free step of a grid, one step ahead", "step-search"),
         solver_entrant("qp", "QP as each scenario has it, with a backup trajectory", "qp"),
         _qp_without_backup("qp-task-switching", "the gains of eq. 10 in its rows", "task-switching"),
         _qp_without_backup("qp-no-backup", "beta rows", "beta"),
@@ -120,28 +128,7 @@ ENTRANTS = {
         solver_entrant("qp:osqp", "QP, back end OSQP", "qp:osqp"),
         solver_entrant("qp:quadprog", "QP, back end quadprog", "qp:quadprog", ("quadprog",)),
         solver_entrant("hqp", "strict priorities, a cascade of QPs, with a backup trajectory", "hqp"),
-        Entrant(
-            "pink",
-            "Pink, with its barrier between collision bodies",
-            partial(_start_library, "pink_adapter"),
-            PINK,
-            ("pin-pink",),
-        ),
-        Entrant(
-            "mink",
-            "mink, with its limit on collisions",
-            partial(_start_library, "mink_adapter"),
-            MINK,
-            ("mink", "mujoco"),
-        ),
-        Entrant(
-            "placo",
-            "placo, with its constraint on self-collisions",
-            partial(_start_library, "placo_adapter"),
-            PLACO,
-            ("placo",),
-            PLACO_PYTHON,
-        ),
+        *(_library_entrant(library) for library in LIBRARIES.values()),
     )
 }
 """Those that ship, in the order of the report. One with the name of a solver is that solver in each scenario as it
@@ -149,7 +136,7 @@ is, safety options included; variants have names of their own."""
 
 
 def find_entrant(name: str) -> Entrant:
-    """Return a shipped entrant that is installed.
+    """Return a shipped entrant that is ready; an environment of its own is made if need be.
 
     Raises:
         UnknownName: there is none of that name.
@@ -158,8 +145,8 @@ def find_entrant(name: str) -> Entrant:
     if name not in ENTRANTS:
         raise UnknownName(f"unknown entrant {name!r}{nearest(name, ENTRANTS)}")
     entrant = ENTRANTS[name]
-    if entrant.missing:
-        raise ConfigError(f"entrant {name!r} needs {', '.join(entrant.missing)}: {entrant.remedy}")
+    if reason := entrant.prepare():
+        raise ConfigError(f"entrant {name!r} cannot take part: {reason}")
     return entrant
 
 

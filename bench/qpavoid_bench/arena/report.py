@@ -20,7 +20,16 @@ from qpavoid_bench.arena.results import Results, results_of
 from qpavoid_bench.arena.statistics import CONFIDENCE, duel, mean
 from qpavoid_bench.arena.store import read_facts, read_failures, read_runs
 from qpavoid_bench.arena.suite import describe_entrants
-from qpavoid_bench.arena.tables import COLUMNS, MORE, code, escape, interval_text, markdown_table, score_tables
+from qpavoid_bench.arena.tables import (
+    COLUMNS,
+    MORE,
+    better_than,
+    code,
+    escape,
+    interval_text,
+    markdown_table,
+    score_tables,
+)
 
 COMPARISON_LIMITS = (
     "Velocities are followed exactly: no delay, no tracking error of a drive, no dynamics. What a real arm adds is the "
@@ -106,6 +115,7 @@ def report_lines(results: Results, facts: Mapping[str, Any], folder: Path = Path
         "How it is scored": _definitions(),
         "Overall": [*(f"![{caption}](report-{name}.png)\n" for _, name, caption in _FIGURES), *score_tables(results)],
         "Beside the best": _beside_the_best(results),
+        **({"Where others are better than qp": better_than(results, "qp")} if "qp" in results.entrants else {}),
         **{f"Family: {name}": _family(results, name) for name in results.families},
         "Worst runs": _worst_runs(results, facts, folder) or ["None."],
         "Failures": _failures(results) or ["None."],

@@ -89,6 +89,8 @@ def _latest_rows(runs: pd.DataFrame, key: list[str], columns: list[str]) -> pd.D
 def _replace_non_finite(runs: pd.DataFrame, name: str) -> int:
     """Replace non-finite figures of a column by the worst finite one; return their number."""
     values = runs[name].to_numpy()
+    if np.isnan(values).all():  # a figure that these runs do not have
+        return 0
     if name == "min_distance":  # the one of which less is worse; infinite where there is nothing to touch
         is_invalid, worst = ~(values > -np.inf), np.min
     else:

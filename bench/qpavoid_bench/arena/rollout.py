@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from time import perf_counter
+from time import perf_counter, process_time
 from typing import Protocol
 
 import numpy as np
@@ -58,7 +58,8 @@ class Rollout:
     failed: Array
     """(N,) 1 where the entrant raised or gave no finite velocity, else 0."""
     tick: Array
-    """(N,) computation time of the step [s]; of a pilot in another process, as that process measured it."""
+    """(N,) computation time of the step, without what else the machine does meanwhile [s]; of a pilot in another
+    process, as that process measured it."""
     failure: str
     """Message of the first failure; empty without one."""
 
@@ -78,7 +79,7 @@ def roll_out(case: Case, pilot: Pilot, world: World, time_budget: float = np.inf
     shapes = {"q": (model.nq,), "v": (model.nv,), "tool": (len(tools), 3), "target": (len(tools), 3)}
     out = {name: np.zeros((count, *shape)) for name, shape in shapes.items()}
     failed, tick, status, failure = np.zeros(count), np.zeros(count), np.zeros(count, dtype=np.intp), ""
-    q = world.q0
+    q, spent = world.q0, 0.0
     for k in range(count):
         pin.framesForwardKinematics(model, data, q)
         targets = {task.settings.label: task.motion.sample(k * dt) for task in world.tasks}
@@ -86,11 +87,11 @@ def roll_out(case: Case, pilot: Pilot, world: World, time_budget: float = np.inf
         out["tool"][k] = [data.oMf[task.frame_id].translation for task in tools]
         out["target"][k] = [targets[task.settings.label].position for task in tools]
         measured = sensor.measure(k * dt)
-        begin = perf_counter()
-        in_time = tick.sum() < time_budget
+        begin, computed = perf_counter(), process_time()
+        in_time = spent < time_budget
         solution, message = _ask_pilot(pilot, q, k * dt, targets, measured) if in_time else (None, "out of time")
-        elapsed = perf_counter() - begin
-        tick[k] = getattr(pilot, "seconds", elapsed) if in_time else elapsed
+        spent, computed = spent + perf_counter() - begin, process_time() - computed
+        tick[k] = getattr(pilot, "seconds", computed) if in_time else computed
         if solution is None:
             failed[k], failure = 1.0, failure or message
         else:

@@ -14,13 +14,18 @@ from qpavoid.run.log import STATUSES
 from qpavoid.run.metrics import path_deviation
 from qpavoid_bench.arena.case import Case
 from qpavoid_bench.arena.checker import Findings
+from qpavoid_bench.arena.families.reach import is_reachable
 from qpavoid_bench.arena.rollout import Rollout
-from qpavoid_bench.arena.world import World
+from qpavoid_bench.arena.world import World, surface_safety_distance
 
 REST_SPEED = 1e-3
 """Speed of a tool below which it is at rest [m/s]."""
 REST_DURATION = 1.0
 """Time for which tools are at rest at the end of a run that is stuck [s]."""
+CHATTER_TIME = 0.5
+"""Time at the end of a run in which chatter is looked for [s]."""
+_REACH_PERIOD = 0.1
+"""Time between two targets of which it is found out whether they are in reach [s]."""
 _ROUND_OFF = 1e-6
 
 
@@ -77,6 +82,12 @@ class Score:
     """Root mean square of the joints' jerk [rad/s³ or m/s³]."""
     jitter: float
     """Σ|Δq̇| over joints and ticks, per second [rad/s² or m/s²]."""
+    frozen: float
+    """Fraction of the time with all tools at rest and a target away that is in reach, whatever is in the way [-]."""
+    lurch: float
+    """Largest Σ|Δq̇| of a step over joints, from rest [rad/s or m/s]."""
+    chatter: float
+    """Mean Σ|Δq̇| of a step over joints, in the last half second [rad/s or m/s]."""
     peak_velocity: float
     """Largest velocity of a joint, over its limit [-]."""
     violations: float
@@ -93,6 +104,8 @@ class Score:
     """Median computation time of a step [µs]."""
     tick_p99: float
     """99th percentile of the computation time of a step [µs]."""
+    tick_max: float
+    """Longest computation time of a step [µs]."""
     ticks: int
     dt: float
     """Control period [s]."""
@@ -161,6 +174,9 @@ def score(
         stuck=case.reachable and not arrived and not findings.contacts and rests,
         jerk=float(np.sqrt(np.mean(np.square(np.diff(change, axis=0))))) / scenario.dt**2,
         jitter=float(np.abs(change).sum()) / scenario.duration,
+        frozen=_frozen_fraction(case, world, rollout),
+        lurch=float(np.abs(np.diff(rollout.v, axis=0, prepend=0.0)).sum(axis=1).max(initial=0.0)),
+        chatter=float(np.abs(change[-round(CHATTER_TIME / scenario.dt) :]).sum(axis=1).mean()) if ticks > 1 else 0.0,
         peak_velocity=float(np.max(np.abs(rollout.v) / limit, initial=0.0)),
         violations=float(np.mean(_violates_limits(world, scenario, rollout, findings))),
         relaxed=_status_fraction(rollout, Status.RELAXED),
@@ -169,6 +185,7 @@ def score(
         failure=rollout.failure,
         tick_p50=1e6 * float(np.median(rollout.tick)),
         tick_p99=1e6 * float(np.quantile(rollout.tick, 0.99)),
+        tick_max=1e6 * float(rollout.tick.max()),
         ticks=ticks,
         dt=scenario.dt,
         duration=scenario.duration,
@@ -176,9 +193,21 @@ def score(
     )
 
 
-def surface_safety_distance(scenario: ScenarioConfig) -> float:
-    """Return d1 between surfaces, below which avoidance has taken over entirely [m]."""
-    return scenario.avoidance.d1 - scenario.avoidance.offset
+def _frozen_fraction(case: Case, world: World, rollout: Rollout) -> float:
+    """Return the fraction of the time with all tools at rest, and one away from a target in reach."""
+    dt = case.scenario.dt
+    speed = np.linalg.norm(np.diff(rollout.tool, axis=0), axis=2).max(axis=1, initial=0.0) / dt
+    away = np.linalg.norm(rollout.target - rollout.tool, axis=2) > case.scenario.goal_tolerance
+    at_rest = np.append(speed < REST_SPEED, False)
+    if not (at_rest[:, None] & away).any():
+        return 0.0
+    every, robot = max(1, round(_REACH_PERIOD / dt)), world.scene.robot
+    points = np.round(rollout.target[::every], 3)
+    in_reach = np.ones(points.shape[:2], dtype=bool)
+    for tool, task in enumerate(world.tools):
+        known = {p: is_reachable(robot, task.settings.frame, np.array(p)) for p in set(map(tuple, points[:, tool]))}
+        in_reach[:, tool] = [known[p] for p in map(tuple, points[:, tool])]
+    return float(np.mean(at_rest & (away & np.repeat(in_reach, every, axis=0)[: len(away)]).any(axis=1)))
 
 
 def _status_fraction(rollout: Rollout, status: Status) -> float:

@@ -55,6 +55,8 @@ class Store:
                 fields = [f'"{column}" {_SQL_TYPES[kind]}' for column, kind in columns.items()]
                 fields += [f"PRIMARY KEY ({_quoted(key)})"] * bool(key)
                 self._database.execute(f"CREATE TABLE IF NOT EXISTS {name} ({', '.join(fields)})")
+                for column in set(columns) - _columns(self._database, name):
+                    self._database.execute(f'ALTER TABLE {name} ADD COLUMN "{column}" {_SQL_TYPES[columns[column]]}')
         except (OSError, sqlite3.Error) as error:
             reason = getattr(error, "strerror", None) or error
             raise ConfigError(
@@ -141,11 +143,17 @@ def _read(folder: Path, table: str, columns: Iterable[str]) -> pd.DataFrame:
         with closing(sqlite3.connect(folder / FILE, timeout=_WAIT)) as database:
             if not database.execute("SELECT 1 FROM sqlite_master WHERE name = ?", [table]).fetchone():
                 raise nothing  # a sweep that begins has just made the file
-            cursor = database.execute(f"SELECT {_quoted(columns)} FROM {table} ORDER BY rowid")
+            known = _columns(database, table)  # older files lack some figures
+            chosen = ", ".join(f'"{name}"' if name in known else "NULL" for name in columns)
+            cursor = database.execute(f"SELECT {chosen} FROM {table} ORDER BY rowid")
             return pd.DataFrame(cursor.fetchall(), columns=list(columns))
     except sqlite3.Error as error:
         remedy = "move the damaged file away, and its rows are made again by the same sweep"
         raise ConfigError(f"{folder / FILE}: {error}; {remedy}") from None
+
+
+def _columns(database: sqlite3.Connection, table: str) -> set[str]:
+    return {row[1] for row in database.execute(f"PRAGMA table_info({table})")}
 
 
 def _records(table: pd.DataFrame) -> list[dict[str, Any]]:

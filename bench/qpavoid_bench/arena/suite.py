@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,7 +15,7 @@ from pydantic import Field
 from qpavoid.config import Avoidance, Limits, Progress, Sensing, SolverConfig
 from qpavoid.config.base import Block
 from qpavoid.config.loading import read_config
-from qpavoid.config.shipped import find_suite
+from qpavoid.config.shipped import find_shipped
 from qpavoid.errors import ConfigError, located
 from qpavoid_bench.arena.entrant_file import entrant_from_file
 from qpavoid_bench.arena.entrants import ENTRANTS, Entrant, find_entrant, solver_entrant
@@ -77,6 +77,18 @@ class Suite:
     absent: tuple[Entrant, ...]
     """Entrants of the file that cannot take part, because their packages are not installed."""
 
+    def prepare(self) -> tuple[Suite, dict[str, str]]:
+        """Make the environments of libraries that are absent for want of one.
+
+        Returns:
+            The suite with them, and why others are absent, by their names.
+        """
+        reasons = {entrant.name: entrant.prepare() for entrant in self.absent}
+        ready = tuple(entrant for entrant in self.absent if not reasons[entrant.name])
+        absent = tuple(entrant for entrant in self.absent if reasons[entrant.name])
+        suite = replace(self, entrants=(*self.entrants, *ready), absent=absent)
+        return suite, {name: reason for name, reason in reasons.items() if reason}
+
 
 def load_suite(
     name_or_path: str | Path, solvers: Sequence[str] = (), more: Sequence[str] = (), seeds: int | None = None
@@ -92,7 +104,7 @@ def load_suite(
     Raises:
         ConfigError, UnknownName: naming file, field and remedy.
     """
-    path = find_suite(name_or_path)
+    path = find_shipped("suite", name_or_path)
     config = read_config(path, SuiteConfig)
     families = []
     for i, family in enumerate(config.families):
@@ -115,7 +127,7 @@ def load_suite(
     with located("--entrant"):
         for name in more:
             _add_entrant(chosen, find_any(name))
-    if not chosen:
+    if not chosen and not any(entrant.library for entrant in absent):
         missing = ", ".join(f"{entrant.name} needs {', '.join(entrant.missing)}" for entrant in absent)
         raise ConfigError(f"{path}: entrants: none can take part: {missing}")
     names = [family.name for family in families]

@@ -158,8 +158,8 @@ def _run_case(case: str, entrant: Entrant, of: str) -> dict[str, Any]:
     """Run a case: a row of `runs`; runs in a worker."""
     if version("qpavoid") != of:
         raise ConfigError(f"this worker has qpavoid {version('qpavoid')} in place of {of}; install the same")
-    if entrant.missing:
-        raise ConfigError(f"entrant {entrant.name!r} needs {', '.join(entrant.missing)}, which this worker has not")
+    if reason := entrant.prepare():
+        raise ConfigError(f"entrant {entrant.name!r} cannot take part here: {reason}")
     with _time_limit():
         return run_trial(Case.from_json(case), entrant).row()
 

@@ -42,9 +42,15 @@ COLUMNS = (
         "time_to_goal", "time to goal [%]", 100.0, 0, "mean", "share of the duration until it stays there; 100 if never"
     ),
     Column("stuck", "stuck [%]", 100.0, 0, "mean", "not arrived, no contact, at rest"),
+    Column(
+        "frozen", "frozen [%]", 100.0, 1, "mean", "time at rest, away from a target in reach, whatever is in between"
+    ),
+    Column("lurch", "lurch [rad/s]", 1.0, 2, "mean", "largest Σ|Δq̇| of a tick"),
+    Column("chatter", "chatter [rad/s]", 1.0, 4, "mean", "mean Σ|Δq̇| of a tick, in the last half second"),
     Column("jitter", "jitter [rad/s²]", 1.0, 2, "median", "Σ|Δq̇| over joints and ticks, per second"),
     Column("tick_p50", "tick [µs]", 1.0, 0, "median", "median time of a tick, median over runs"),
     Column("tick_p99", "p99 [µs]", 1.0, 0, "median", "99th percentile of a run, median over runs"),
+    Column("tick_max", "worst [µs]", 1.0, 0, "median", "longest tick of a run, median over runs"),
 )
 MORE = (
     Column("final_error", "final error [mm]", 1e3, 1, "mean", "of the worst tool from its goal"),
@@ -69,7 +75,8 @@ def score_tables(results: Results, family: str | None = None) -> list[str]:
     """
     place = results.ranking(family)
     lines = []
-    for columns in (COLUMNS, MORE):
+    for group in (COLUMNS, MORE):
+        columns = [column for column in group if not results.runs[column.name].isna().all()]
         tables = [results.table(column.name, family) for column in columns]
         rows = []
         for name, rank in place.items():
@@ -77,6 +84,49 @@ def score_tables(results: Results, family: str | None = None) -> list[str]:
             rows.append((rank, escape(name), *(_cell(t[:, i], c) for t, c in zip(tables, columns, strict=True))))
         lines += markdown_table(("rank", "entrant", *(column.heading for column in columns)), rows)
     return lines
+
+
+_HIGHER_IS_BETTER = ("success", "min_distance")
+_COMPARED = (
+    "success", "collided", "min_distance", "below_d1", "tracking_error", "time_to_goal", "final_error", "frozen",
+    "lurch", "chatter", "jitter", "violations", "failed", "tick_p50", "tick_p99", "tick_max",
+)  # fmt: skip
+
+
+def better_than(results: Results, name: str) -> list[str]:
+    """Tabulate for each figure the best entrant, and in which families others are ahead of one entrant by how much.
+
+    A family counts where the best of the others is ahead by more than a unit of the last digit.
+    """
+    own, rows = results.entrants.index(name), []
+    columns = [c for c in (*COLUMNS, *MORE) if c.name in _COMPARED and not results.runs[c.name].isna().all()]
+    for column in columns:
+        sign = -1.0 if column.name in _HIGHER_IS_BETTER else 1.0
+        better = []
+        for family in results.families:
+            values = _summaries(results, column, family)
+            best = int(np.argmin(sign * values))
+            if sign * (values[own] - values[best]) > 10.0**-column.digits:
+                best_text, own_text = (_shown(value, column.digits) for value in (values[best], values[own]))
+                better.append(f"{family}: {results.entrants[best]} {best_text}, {own_text} here")
+        values = _summaries(results, column, None)
+        order = np.argsort(sign * values, kind="stable")
+        first = ", ".join(f"{escape(results.entrants[i])} {_shown(values[i], column.digits)}" for i in order[:3])
+        rows.append(
+            (escape(column.heading), first, _shown(values[own], column.digits), escape("; ".join(better) or "-"))
+        )
+    return markdown_table(
+        ("figure", "best three over all", name, f"families in which others are ahead of {name}"), rows
+    )
+
+
+def _summaries(results: Results, column: Column, family: str | None) -> Array:
+    """Return a figure of each entrant (k,) over the common cases, in the table's unit."""
+    if column.kind == "low":
+        values = np.quantile(results.table(column.name, family), 0.05, axis=0, method="inverted_cdf")
+    else:
+        values = (np.median if column.kind == "median" else np.mean)(results.table(column.name, family), axis=0)
+    return np.asarray(column.scale * values)
 
 
 def _cell(values: Array, column: Column) -> str:

@@ -14,9 +14,9 @@ from qpavoid_bench.arena.case import Case
 from qpavoid_bench.arena.checker import check_run
 from qpavoid_bench.arena.entrants import Entrant
 from qpavoid_bench.arena.rollout import Pilot, roll_out
-from qpavoid_bench.arena.scores import Score, score, surface_safety_distance
+from qpavoid_bench.arena.scores import Score, score
 from qpavoid_bench.arena.verdict import decisive, judge
-from qpavoid_bench.arena.world import World, build_world
+from qpavoid_bench.arena.world import World, build_world, surface_safety_distance
 
 MAX_TIME_RATIO = 20.0
 """Largest computation time of an entrant over the duration of a case, all steps together [-]."""

@@ -66,3 +66,8 @@ def build_world(scenario: ScenarioConfig) -> World:
     with located(str(source)):
         scene = build_scene(robot, obstacles)
     return World(scene, tuple(build_tasks(scenario.tasks, robot, q0, source)), q0)
+
+
+def surface_safety_distance(scenario: ScenarioConfig) -> float:
+    """Return d1 between surfaces, below which avoidance has taken over entirely [m]."""
+    return scenario.avoidance.d1 - scenario.avoidance.offset

@@ -29,7 +29,7 @@ def latency(workload: str, count: int) -> dict[str, Any]:
     switches = _switches()
     for k in range(count):
         begin = perf_counter_ns()
-        v = loop.step(k)
+        v = loop.step(None, None)
         ns[k] = perf_counter_ns() - begin
         loop.advance(v)
     switches = _switches() - switches
@@ -84,9 +84,9 @@ def first_use(workload: str, count: int) -> dict[str, float]:
     from qpavoid_bench.tick.loops import make_loop
 
     loop, ns = make_loop(workload), []
-    for k in range(count):
+    for _ in range(count):
         begin = perf_counter_ns()
-        v = loop.step(k)
+        v = loop.step(None, None)
         ns.append(perf_counter_ns() - begin)
         loop.advance(v)
     return {"first": 1e-3 * ns[0], "worst": 1e-3 * max(ns[1:]), "median": 1e-3 * float(np.median(ns))}
@@ -126,8 +126,8 @@ def _warm(workload: str) -> Any:
 
 
 def _run(loop: Any, count: int) -> None:
-    for k in range(count):
-        loop.advance(loop.step(k))
+    for _ in range(count):
+        loop.advance(loop.step(None, None))
 
 
 def _seconds(work: Callable[[], Any]) -> float:

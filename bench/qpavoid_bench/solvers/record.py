@@ -11,12 +11,11 @@ import pinocchio as pin
 
 from qpavoid import Controller, ScenarioConfig, load_scenario
 from qpavoid.config import QpSolver
-from qpavoid.config.shipped import scenario_names
+from qpavoid.config.shipped import shipped_names
 from qpavoid.problem import Array, Problem
-from qpavoid.solvers.analytic import tracking_velocity
 from qpavoid_bench.tick.build import build
-from qpavoid_bench.tick.libs.ours import Recorded
 from qpavoid_bench.tick.loops import circling
+from qpavoid_bench.tick.ours import Recorded
 
 REGULARIZATION = QpSolver().regularization
 
@@ -59,7 +58,7 @@ def runs(every: int = 1) -> list[Run]:
     Args:
         every: keep the QPs of every so many control steps only; warm starts get older with it.
     """
-    shipped = [load_scenario(name) for name in scenario_names()]
+    shipped = [load_scenario(name) for name in shipped_names("scenario")]
     scenarios = {each.source.stem: each for each in shipped if each.solver.name == "qp"}
     scenarios["circling"] = circling(backup=None)
     scenarios["squeezed"] = load_scenario(str(Path(__file__).with_name("squeezed.yaml")))
@@ -88,7 +87,7 @@ def _humanoid(every: int) -> Run:
 
 
 def _qp(problem: Problem) -> QP:
-    A, rows, v = np.array(problem.tracking.A), problem.avoidance, np.array(tracking_velocity(problem))
+    A, rows, v = np.array(problem.tracking.A), problem.avoidance, np.array(problem.v_tracking)
     P = A.T @ A + REGULARIZATION * np.eye(A.shape[1])
     h, lower, upper = (np.array(side) for side in (rows.b, problem.lower, problem.upper))
     return QP(P, -P @ v, np.array(rows.J, order="C"), h, lower, upper, A, v)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -12,8 +13,9 @@ import pinocchio as pin
 
 from qpavoid import Obstacle, Robot, Scene, build_scene
 from qpavoid.config import Box, Sphere
+from qpavoid_bench.libraries import setup
 from qpavoid_bench.tick.robots import ROBOTS, RobotSpec, load
-from qpavoid_bench.tick.workloads import Array, Body, Joint, Workload
+from qpavoid_bench.tick.workloads import Array, Body, Workload
 
 DT = 0.01
 TICKS = 1000
@@ -56,19 +58,17 @@ def build(name: str) -> Workload:
 def make_scene(workload: Workload) -> Scene:
     """The live scene of a workload."""
     robot = load(ROBOTS[workload.robot], workload.disabled_pairs)
-    return build_scene(
-        robot, [_obstacle(body) for body in workload.bodies[len(workload.bodies) - workload.obstacles :]]
-    )
+    return build_scene(robot, [_obstacle(body) for body in workload.obstacles])
 
 
-def reference(scene: Scene, workload: Workload, ticks: Any) -> tuple[Array, Array]:
-    """Frames (k, f, 4, 4) and distances (k, m) at some ticks, by Pinocchio and coal."""
+def reference(scene: Scene, workload: Workload, q: Array) -> tuple[Array, Array]:
+    """Frames (k, f, 4, 4) and distances (k, m) at configurations (k, nq), by Pinocchio and coal."""
     model, geometry = scene.robot.model, scene.geometry
     data, bodies = model.createData(), geometry.createData()
-    ids = [model.getFrameId(name) for name, _, _ in workload.frames]
+    ids = [model.getFrameId(name) for name in workload.frames]
     frames, distances = [], []
-    for tick in ticks:
-        pin.updateGeometryPlacements(model, data, geometry, bodies, workload.q[tick])
+    for configuration in q:
+        pin.updateGeometryPlacements(model, data, geometry, bodies, configuration)
         pin.updateFramePlacements(model, data)
         frames.append([data.oMf[i].homogeneous for i in ids])
         pin.computeDistances(geometry, bodies)
@@ -85,33 +85,24 @@ def _build(name: str, count: int) -> Workload:
     robot = load(spec, disabled)
     obstacles = _scatter(robot, spec, q, count)
     scene = build_scene(robot, [_obstacle(body) for body in obstacles])
-    model = robot.model
-    links = _links(model)
-    ids = [model.getFrameId(name) for name in spec.frames]
-    frames = [(model.frames[i].name, links[model.frames[i].parentJoint], model.frames[i].placement) for i in ids]
+    pairs, first = np.array(scene.pairs), len(scene.body_names)
+    is_box = np.array([False] * first + [body.shape == "box" for body in obstacles])
     workload = Workload(
         name="",
         robot=name,
         influence=0.0,
         d_min=D_MIN,
         dt=DT,
-        nv=model.nv,
-        urdf=_urdf(model, links, frames),
-        floating=links[1] if spec.root_joint == "free_flyer" else "",
-        joints=tuple(
-            Joint(model.names[i], joint.idx_q, joint.idx_v, float(model.velocityLimit[joint.idx_v]))
-            for i, joint in enumerate(model.joints)
-            if i > 0 and joint.nv == 1
-        ),
-        bodies=(*(_body(body, links) for body in robot.bodies.geometryObjects), *obstacles),
-        obstacles=count,
-        pairs=np.array(scene.pairs),
+        nv=robot.model.nv,
+        obstacles=tuple(obstacles),
+        pairs=pairs,
+        boxes=is_box[pairs].any(axis=1),
         disabled_pairs=disabled,
-        frames=tuple((frame, link, placement.homogeneous) for frame, link, placement in frames),
+        frames=spec.frames,
         q=q,
         targets=np.empty(0),
     )
-    poses, distances = reference(scene, workload, range(TICKS))
+    poses, distances = reference(scene, workload, q)
     if distances.size and distances.min() < D_MIN:
         raise AssertionError(f"{name}-{count}: the swing comes to {distances.min():.3f} m")
     return replace(workload, targets=np.roll(poses, -1, axis=0))
@@ -175,7 +166,7 @@ def _scatter(robot: Robot, spec: RobotSpec, q: Array, count: int) -> list[Body]:
         local = np.abs((points - place) @ pose[:3, :3])
         gap = np.linalg.norm(np.maximum(local - half, 0.0), axis=1) - inflate - radius
         if gap.min() >= CLEARANCE and (not near or gap[tools].min() <= NEAR):
-            bodies.append(Body(f"obstacle{len(bodies)}", "world", shape, size, pose))
+            bodies.append(Body(f"obstacle{len(bodies)}", shape, size, pose))
     return bodies
 
 
@@ -205,44 +196,16 @@ def _obstacle(body: Body) -> Obstacle:
     return Obstacle.at(body.name, shape, body.placement[:3, 3], body.placement[:3, :3])
 
 
-def _body(body: Any, links: list[str]) -> Body:
-    half, radius = getattr(body.geometry, "halfLength", None), float(body.geometry.radius)
-    kind, size = ("sphere", (radius,)) if half is None else ("capsule", (radius, 2.0 * half))
-    return Body(body.name, links[body.parentJoint], kind, size, body.placement.homogeneous)
-
-
-def _links(model: Any) -> list[str]:
-    """Return the name of the link that each joint moves."""
-    return ["world", *(f"link_{name}" for name in list(model.names)[1:])]
-
-
-def _urdf(model: Any, links: list[str], frames: list[tuple[str, str, Any]]) -> str:
-    """Return a URDF of a model's joints, and a fixed link for each frame; a floating base's link is the root."""
-    data = model.createData()
-    pin.computeJointJacobians(model, data, pin.neutral(model))
-    elements = []
-    for i in range(1, model.njoints):
-        joint = model.joints[i]
-        if joint.nv == 6:
-            links = [links[i], *links[1:]]  # of what is fixed to the world there is nothing
-            continue
-        screw = np.asarray(data.joints[i].S).reshape(6)
-        kind, axis = ("prismatic", screw[:3]) if np.any(screw[:3]) else ("revolute", screw[3:])
-        low, high = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
-        limit = f'<limit lower="{low}" upper="{high}" velocity="{model.velocityLimit[joint.idx_v]}" effort="1e6"/>'
-        axes = f'<axis xyz="{_numbers(axis)}"/>{limit}'
-        elements.append(_joint(model.names[i], kind, links[model.parents[i]], links[i], model.jointPlacements[i], axes))
-    for name, link, placement in frames:
-        elements.append(_joint(f"to_{name}", "fixed", link, name, placement, ""))
-    names = dict.fromkeys([*links, *(name for name, _, _ in frames)])
-    return "\n".join(['<robot name="workload">', *(f'<link name="{name}"/>' for name in names), *elements, "</robot>"])
-
-
-def _joint(name: str, kind: str, parent: str, child: str, placement: Any, inner: str) -> str:
-    xyz, rpy = _numbers(placement.translation), _numbers(pin.rpy.matrixToRpy(placement.rotation))
-    links = f'<parent link="{parent}"/><child link="{child}"/>'
-    return f'<joint name="{name}" type="{kind}">{links}<origin xyz="{xyz}" rpy="{rpy}"/>{inner}</joint>'
-
-
-def _numbers(values: Any) -> str:
-    return " ".join(repr(float(value)) for value in values)
+def describe(scene: Scene, workload: Workload, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a workload's scene as other libraries take it."""
+    robot = scene.robot
+    return setup.describe(
+        scene,
+        workload.q[0],
+        [(robot.model.getFrameId(name), 1.0, 1.0) for name in workload.frames],
+        workload.pairs,
+        workload.dt,
+        (workload.d_min, workload.influence),
+        robot.bounds(),
+        options=options,
+    )

@@ -33,7 +33,7 @@ def tick(
 ) -> None:
     """Time one control step of qpavoid and of its peers on identical work."""
     from qpavoid_bench.tick.build import is_recorded, recorded_names, variant_names
-    from qpavoid_bench.tick.libs import LIBRARIES
+    from qpavoid_bench.tick.libraries import LIBRARIES, Ours
     from qpavoid_bench.tick.loops import loop_names
     from qpavoid_bench.tick.report import write_report
     from qpavoid_bench.tick.runner import run
@@ -60,7 +60,9 @@ def tick(
         if not (folder / "qpavoid" / "__init__.py").is_file():
             raise ConfigError(f"{folder}: has no qpavoid in it")
         label = f"qpavoid {_revision(folder)}"
-        libraries.append(replace(LIBRARIES["qpavoid"], name=label, path=str(folder.resolve())))
+        ours = LIBRARIES["qpavoid"]
+        assert isinstance(ours, Ours)
+        libraries.append(replace(ours, name=label, path=str(folder.resolve())))
     if quick:
         rounds, ticks, budget = rounds or 3, min(ticks, 100), min(budget, 0.1)
     results = run(chosen, libraries, rounds or (40 if against else 10), ticks, budget)

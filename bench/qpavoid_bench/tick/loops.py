@@ -61,8 +61,8 @@ class Loop:
         self._targets, self._obstacles, self._every = targets, obstacles, every
         self._inputs = 0.0, targets(0.0), obstacles
 
-    def step(self, tick: int) -> Array:
-        """One control step from where the robot is; `tick` does not matter."""
+    def step(self, q: Any, targets: Any) -> Array:
+        """Compute the velocity of a control step from where the robot is; the arguments do not matter."""
         return self.controller.step(self.q, *self._inputs).v
 
     def advance(self, v: Array) -> None:

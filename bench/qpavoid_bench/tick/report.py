@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from qpavoid_bench.tables import describe_machine, number, table, write
+from qpavoid_bench.tick.libraries import Ours
 from qpavoid_bench.tick.runner import Cell, Results, Row
 
 OURS = "qpavoid"
-TARGETS = {"pink-20": 38.0, "mink": 8.0, "placo": 5.0}
+TARGETS = {"pink": 38.0, "mink": 12.0, "placo": 5.0, "roboplan": 1.5}
 """How many times faster than a peer it is meant to be; than placo, from PLACO_FROM pairs on."""
 PLACO_FROM = 80
 
@@ -75,7 +76,7 @@ def _sections(results: Results) -> Iterator[str]:
         "regularisation hold it back, not how good it is."
     )
     yield _table(results, timed, _agreement, only_recorded=True)
-    same = [library.name for library in results.libraries if library.path and library.name in timed]
+    same = [each.name for each in results.libraries if isinstance(each, Ours) and each.path and each.name in timed]
     if same and OURS in timed:
         yield f"Largest difference of a velocity from that of this {OURS} [rad/s, m/s]:"
         rows = [[row.name, *(_difference(row, name) for name in same)] for row in results.rows if row.workload]

@@ -3,28 +3,21 @@
 from __future__ import annotations
 
 import os
-import pickle
-import subprocess
 import sys
-import tempfile
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
-import qpavoid
 from qpavoid.config import Beta
+from qpavoid.errors import ConfigError
+from qpavoid_bench.libraries.process import LibraryError, Process
 from qpavoid_bench.tick import build
-from qpavoid_bench.tick.libs import Library
+from qpavoid_bench.tick.libraries import Library, Ours, start
 from qpavoid_bench.tick.workloads import Array, Workload
 
-PACKAGE = Path(__file__).resolve().parents[1]
-ONE_THREAD = dict.fromkeys(
-    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
-)
 CHECK_TICKS = list(range(0, build.TICKS, 50))
 WARM_UP = 20
 """Steps before each round that are not timed."""
@@ -35,48 +28,6 @@ BOX_TOLERANCE = 1e-5
 """For pairs with a box, which the libraries compute by different iterative algorithms [m]."""
 RATE_TOLERANCE = 2e-3
 """How much faster than its row allows a pair may close: what a difference of distances can tell [m/s]."""
-
-
-class LibraryError(Exception):
-    """What a library could not do."""
-
-
-class Process:
-    """A worker and the pipe to it."""
-
-    def __init__(self, library: Library) -> None:
-        python = os.environ.get(library.interpreter_variable, sys.executable)
-        own = [library.path or str(Path(qpavoid.__file__).parents[1])] * (python == sys.executable)
-        path = os.pathsep.join([*own, str(PACKAGE.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
-        self._process = subprocess.Popen(
-            [python, "-m", "qpavoid_bench.tick.worker", library.adapter],
-            cwd=tempfile.gettempdir(),
-            env={**os.environ, **ONE_THREAD, "PYTHONPATH": path},
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-        )
-
-    def ask(self, command: str, **arguments: Any) -> Any:
-        """Make one request, and return its answer.
-
-        Raises:
-            LibraryError: the library raised, or its process ended.
-        """
-        assert self._process.stdin is not None and self._process.stdout is not None
-        try:
-            pickle.dump({"command": command, **arguments}, self._process.stdin)
-            self._process.stdin.flush()
-            answer: dict[str, Any] = pickle.load(self._process.stdout)
-        except (EOFError, BrokenPipeError):
-            raise LibraryError(f"its process ended with status {self._process.wait()}") from None
-        if "error" in answer:
-            raise LibraryError(answer["error"])
-        return answer["answer"]
-
-    def close(self) -> None:
-        """End the process."""
-        self._process.communicate()
 
 
 @dataclass
@@ -153,9 +104,9 @@ def run(workloads: Sequence[str], libraries: Sequence[Library], rounds: int, tic
     try:
         for library in libraries:
             try:
-                processes[library.name] = process = Process(library)
-                results.versions[library.name] = process.ask("hello", packages=library.packages)
-            except (LibraryError, OSError, subprocess.CalledProcessError) as error:
+                processes[library.name] = process = start(library)
+                results.versions[library.name] = process.ask("versions", library.packages)
+            except (LibraryError, ConfigError) as error:
                 results.missing[library.name] = str(error)
                 if library.name in processes:
                     processes.pop(library.name).close()
@@ -176,17 +127,23 @@ def _measure(
 ) -> Row:
     workload = build.build(name) if build.is_recorded(name) else None
     is_ours = workload is None or bool(workload.variant)
-    libraries = [library for library in libraries if not is_ours or library.adapter.startswith("ours:")]
+    libraries = [library for library in libraries if not is_ours or isinstance(library, Ours)]
     cells, pace = {library.name: Cell() for library in libraries}, dict[str, float]()
     check = _Check(workload) if workload else None
     for library in libraries:
         process = processes[library.name]
         try:
-            process.ask("setup", workload=workload or name)
+            if isinstance(library, Ours):
+                process.ask("setup", workload or name)
+            else:
+                assert workload is not None and check is not None
+                process.ask("setup", build.describe(check.scene, workload, library.options))
+            process.ask("record", *((workload.q, workload.targets) if workload else ((), ())))
             if check:
-                check.apply(cells[library.name], process.ask("check", ticks=CHECK_TICKS), library.closing_gain)
-            pace[library.name] = 1e-9 * float(np.median(process.ask("round", ticks=[0, 1, 2, 3, 4], warmup=1)))
-        except LibraryError as error:
+                gain = library.closing_gain if isinstance(library, Ours) else None
+                check.apply(cells[library.name], process.ask("check", CHECK_TICKS), gain, _tolerance(library))
+            pace[library.name] = 1e-9 * float(np.median(process.ask("round", [0, 1, 2, 3, 4], 1)))
+        except (LibraryError, ValueError) as error:
             cells[library.name].refused = str(error)
     for number in range(rounds):
         window = [(number * ticks + i) % build.TICKS for i in range(-WARM_UP, ticks)]
@@ -195,7 +152,7 @@ def _measure(
             chosen = window[:WARM_UP] + window[WARM_UP :: -(-ticks // count)]
             warm_up = min(WARM_UP, count // 3)
             try:
-                times = processes[timed].ask("round", ticks=chosen[WARM_UP - warm_up :], warmup=warm_up)
+                times = processes[timed].ask("round", chosen[WARM_UP - warm_up :], warm_up)
             except LibraryError as error:
                 cells[timed] = Cell(refused=f"in round {number}: {error}")
                 del pace[timed]
@@ -205,15 +162,19 @@ def _measure(
     return Row(name, workload, check.in_range if check else np.nan, cells)
 
 
+def _tolerance(library: Library) -> float:
+    return DISTANCE_TOLERANCE if isinstance(library, Ours) else library.distance_tolerance
+
+
 class _Check:
     """Compares libraries with Pinocchio and coal on one workload."""
 
     def __init__(self, workload: Workload) -> None:
         self.workload, self.scene = workload, build.make_scene(workload)
-        self.frames, self.distances = build.reference(self.scene, workload, CHECK_TICKS)
+        self.frames, self.distances = build.reference(self.scene, workload, workload.q[CHECK_TICKS])
         self.in_range = float((self.distances < workload.influence).sum(axis=1).mean())
 
-    def apply(self, cell: Cell, answer: dict[str, Any], closing_gain: float | None) -> None:
+    def apply(self, cell: Cell, answer: dict[str, Any], closing_gain: float | None, tolerance: float) -> None:
         """Record how far a library is off.
 
         Raises:
@@ -222,7 +183,8 @@ class _Check:
         workload, distances, box = self.workload, self.distances, self.workload.boxes
         cell.velocities = answer["velocities"]
         cell.frame_error = float(np.abs(answer["frames"] - self.frames).max())
-        error = np.abs(answer["distances"] - distances)
+        reported = np.where(np.isnan(answer["distances"]), distances, answer["distances"])  # it does not tell
+        error = np.abs(reported - distances)
         # far pairs do not count: iterative algorithms stop early on them
         relevant = distances < 2.0 * workload.influence
         cell.distance_error = float(np.max(error[:, ~box], initial=0.0))
@@ -230,10 +192,10 @@ class _Check:
         cell.tracking_error = self._tracking_error(answer["velocities"])
         if not cell.frame_error <= FRAME_TOLERANCE:
             raise LibraryError(f"its frames differ by {cell.frame_error:.1e}")
-        if not (cell.distance_error <= DISTANCE_TOLERANCE and cell.box_error <= BOX_TOLERANCE):
+        if not (cell.distance_error <= tolerance and cell.box_error <= max(tolerance, BOX_TOLERANCE)):
             raise LibraryError(f"its distances differ by {max(cell.distance_error, cell.box_error):.1e} m")
-        undecided = np.abs(distances - workload.influence) < BOX_TOLERANCE
-        different = ((answer["distances"] < workload.influence) != (distances < workload.influence)) & ~undecided
+        undecided = np.abs(distances - workload.influence) < max(tolerance, BOX_TOLERANCE)
+        different = ((reported < workload.influence) != (distances < workload.influence)) & ~undecided
         if different.any():
             raise LibraryError(f"{int(different.sum())} pairs are in range for one and not for the other")
         if not np.isfinite(answer["velocities"]).all():
@@ -245,7 +207,7 @@ class _Check:
         """Compare with the rows `beta` for d_min: ḋ by a difference, β by eq. 12 of the paper."""
         workload, model, step = self.workload, self.scene.robot.model, 1e-5
         moved = [pin.integrate(model, workload.q[i], v * step) for i, v in zip(CHECK_TICKS, velocities, strict=True)]
-        after = build.reference(self.scene, replace(workload, q=np.array(moved)), range(len(moved)))[1]
+        after = build.reference(self.scene, workload, np.array(moved))[1]
         margin = self.distances - workload.d_min
         beta = 0.5 + 0.5 * np.cos(np.pi * np.clip(margin / (workload.influence - workload.d_min), 0.0, 1.0))
         closing = np.maximum((1.0 - beta) * gain * margin, np.minimum(gain * margin, Beta().near_speed))
@@ -260,6 +222,6 @@ class _Check:
         data, errors = model.createData(), []
         for tick, v in zip(CHECK_TICKS, velocities, strict=True):
             pin.framesForwardKinematics(model, data, pin.integrate(model, workload.q[tick], v * workload.dt))
-            for (name, _, _), target in zip(workload.frames, workload.targets[tick], strict=True):
+            for name, target in zip(workload.frames, workload.targets[tick], strict=True):
                 errors.append(np.linalg.norm(data.oMf[model.getFrameId(name)].translation - target[:3, 3]))
         return float(np.median(errors))

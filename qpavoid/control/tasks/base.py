@@ -41,6 +41,10 @@ class RowTask:
 
     unit = "m"
     """Of its error; `m` counts for the goal of a scenario."""
+    bends = True
+    """Whether its rows A turn as the robot moves."""
+    moves = True
+    """Whether a position counts, of a task whose target is somewhere."""
 
     def __init__(self, settings: config.TaskBlock, motion: Target, rows: int, frame_ids: tuple[int, ...] = ()) -> None:
         """Take over what is known beforehand.

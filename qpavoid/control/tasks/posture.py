@@ -20,6 +20,7 @@ class Damping(RowTask):
     """Rest of some coordinates: v = 0."""
 
     unit = "rad"
+    bends = False
 
     def __init__(self, settings: config.DampingTask | config.PostureTask, start: Start) -> None:
         """Choose the coordinates; a posture has those of joints with several of them only where these are named."""

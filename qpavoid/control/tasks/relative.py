@@ -26,7 +26,8 @@ class Relative(RowTask):
         motion = start.motion(settings.motion, start.data.oMf[a].actInv(start.data.oMf[b]))
         scale = np.sqrt(np.repeat([settings.weight, settings.orientation_weight], 3))[PARTS[settings.rows]]
         super().__init__(settings, motion, len(scale), (a, b))
-        self.scale, self.unit = scale, "rad" if settings.rows == "orientation" else "m"
+        self.moves = settings.rows != "orientation"
+        self.scale, self.unit = scale, "m" if self.moves else "rad"
         self._model, self._part, self._gain = start.robot.model, PARTS[settings.rows], settings.gain
 
     def write_rows(self, q: Array, kinematics: ForwardKinematics, target: Any, A: Array, b: Array) -> float:

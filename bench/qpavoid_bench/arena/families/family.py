@@ -13,11 +13,11 @@ from pydantic import Field, model_validator
 
 from qpavoid.config.base import Block
 from qpavoid.config.loading import read_config, read_mapping
-from qpavoid.config.shipped import find_family, find_robot, find_setup, setup_names
+from qpavoid.config.shipped import find_robot, find_shipped, shipped_names
 from qpavoid.config.text import read_text
 from qpavoid.errors import ConfigError, UnknownName, located, nearest
 from qpavoid.model.robot import Robot
-from qpavoid_bench.arena.families import adversarial, moving, statics, two_arms
+from qpavoid_bench.arena.families import adversarial, moving, statics, teleoperation, two_arms
 from qpavoid_bench.arena.families.parameters import Draw, Parameter
 from qpavoid_bench.arena.python_file import MAX_FILE_SIZE, load_attribute
 
@@ -37,6 +37,12 @@ GENERATORS: dict[str, Generator] = {
     **{name: partial(moving.movers, motion) for name, motion in moving.MOTIONS.items()},
     "random_walk": partial(moving.movers, moving.wander),
     "adversarial": adversarial.adversarial,
+    "jumps": teleoperation.jumps,
+    "leaving_reach": teleoperation.leaving_reach,
+    "singular": teleoperation.singular,
+    "behind": teleoperation.behind,
+    "edge": teleoperation.edge,
+    "bad_start": teleoperation.bad_start,
 }
 """Generators that ship."""
 
@@ -66,6 +72,10 @@ class FamilyConfig(Block):
     """Whether the goals can be reached; it is checked, whichever it is."""
     proved: bool = True
     """Whether a solution is proved to exist; where not, each contact is judged avoidable or not (`arena.verdict`)."""
+    static: bool = False
+    """Whether nothing moves but the target, so that standing still avoids every contact; no solution is looked for."""
+    starts_clear: bool = True
+    """Whether everything is farther apart than d1 at the start."""
 
     @model_validator(mode="after")
     def _check_robots(self) -> FamilyConfig:
@@ -111,7 +121,7 @@ def load_family(name_or_path: str | Path) -> Family:
     Raises:
         ConfigError, UnknownName: naming file, field and remedy.
     """
-    path = find_family(name_or_path)
+    path = find_shipped("family", name_or_path)
     config = read_config(path, FamilyConfig)
     layers = {"scenario": config.scenario, "robots": config.robots, "sensor": config.sensor}
     locations = {name: location for key, layer in layers.items() for name, location in _names(layer, key)}
@@ -144,14 +154,14 @@ def _names(template: Any, location: str) -> Iterator[tuple[str, str]]:
 
 def _template(entry: str | dict[str, Any], config: FamilyConfig, path: Path, location: str) -> dict[str, Any]:
     """Return fields of a scenario for a robot."""
-    if isinstance(entry, str) and entry in setup_names():
-        return {**read_mapping(find_setup(entry)), **config.scenario}
+    if isinstance(entry, str) and entry in shipped_names("setup"):
+        return {**read_mapping(find_shipped("setup", entry)), **config.scenario}
     fields = {"robot": entry} if isinstance(entry, str) else entry
     try:
         if not fields["robot"].startswith("$"):
             find_robot(fields["robot"], path.parent)
     except UnknownName as error:
-        raise UnknownName(f"{location}: {error}; or a setup: {', '.join(setup_names())}") from None
+        raise UnknownName(f"{location}: {error}; or a setup: {', '.join(shipped_names('setup'))}") from None
     except ConfigError as error:
         raise ConfigError(f"{location}: {error}") from None
     return {**config.scenario, **fields}

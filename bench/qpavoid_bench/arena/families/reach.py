@@ -13,6 +13,7 @@ from qpavoid.control.tasks import FrameTask
 from qpavoid.model.kinematics import MIMIC, TRANSLATIONS
 from qpavoid.model.robot import Robot
 from qpavoid.problem import Array
+from qpavoid_bench.arena.families.inverse_kinematics import FrameGoal, JointRanges, solve_inverse_kinematics
 from qpavoid_bench.arena.world import World
 
 _POINT = coal.Sphere(1e-6)
@@ -66,6 +67,14 @@ def out_of_reach(world: World, task: FrameTask, t: float, tolerance: float) -> s
             if depth > enough:
                 return f"{frame}: its goal is {1e3 * depth:.0f} mm inside {world.scene.obstacle_names[number]!r}"
     return ""
+
+
+def is_reachable(robot: Robot, tool: str, position: Array, tolerance: float = 1e-3) -> bool:
+    """Return whether a search finds a configuration with a tool's frame at a position (3,), whatever stands there."""
+    ranges, random = JointRanges.of(robot), np.random.default_rng(0)
+    goals = [FrameGoal(robot.frame_id(tool, "tool"), np.asarray(position))]
+    starts = [robot.home, *random.uniform(ranges.lower, ranges.upper, (2, len(robot.home)))]
+    return any(solve_inverse_kinematics(robot, goals, q, ranges, tolerance) is not None for q in starts)
 
 
 def _shell(robot: Robot, frame_id: int) -> float:

@@ -13,8 +13,7 @@ from qpavoid_bench.arena.families.inverse_kinematics import FrameGoal, JointRang
 from qpavoid_bench.arena.families.parameters import Redraw
 from qpavoid_bench.arena.families.planner import Plan, plan
 from qpavoid_bench.arena.families.reach import out_of_reach
-from qpavoid_bench.arena.scores import surface_safety_distance
-from qpavoid_bench.arena.world import World
+from qpavoid_bench.arena.world import World, surface_safety_distance
 
 _MAX_GOALS, MAX_TRIES = 6, 40
 """Configurations that attain the goal: largest number, and number of searches."""

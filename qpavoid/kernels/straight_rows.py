@@ -1,0 +1,76 @@
+"""Task rows that do not bend, as those of a posture: A is constant, and only b changes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from qpavoid.kernels.cholesky import factorise, solve_factored
+from qpavoid.kernels.packing import compiled
+from qpavoid.problem import Array
+
+_SHIFT = 1e-11
+"""Shift of the normal equations of all rows, over their largest diagonal [-]; two refinements take its effect away."""
+
+
+@compiled
+def scale_straight(x: Any, A: Array, b: Array) -> None:
+    """Divide the velocity b (r,) of each task of constant rows by how far it exceeds the speeds of the joints."""
+    excess = np.ones(x.row_tasks.max() + 1)
+    for r in x.straight_rows:
+        for c in range(A.shape[1]):
+            if x.v_max[c] > 0.0 and A[r, c] != 0.0:
+                rate = abs(A[r, c] * b[r]) / (x.scale[r] * x.scale[r] * x.v_max[c])
+                excess[x.row_tasks[r]] = max(excess[x.row_tasks[r]], rate)
+    for r in x.straight_rows:
+        b[r] /= excess[x.row_tasks[r]]
+
+
+@compiled
+def solve_together(A: Array, b: Array, B: Array, damping: Array, v: Array) -> None:
+    """Write the least velocity of least ‖A v - b‖² + Σ damping_i (v_iᵀ v)².
+
+    By normal equations with a small shift, refined twice: a direction without rows stays at rest.
+
+    Args:
+        A: (r, n).
+        b: (r,).
+        B: σ_i v_iᵀ (c, n); not read where `damping` is zero.
+        damping: (c,).
+        v: out (n,).
+    """
+    nv = len(v)
+    M, L, missing, step = np.zeros((nv, nv)), np.zeros((nv, nv)), np.empty(nv), np.empty(nv)
+    for r in range(len(A)):
+        for i in range(nv):
+            if A[r, i] != 0.0:
+                for j in range(nv):
+                    M[i, j] += A[r, i] * A[r, j]
+    for k in range(len(damping)):
+        if damping[k] > 0.0:
+            square = 0.0
+            for c in range(nv):
+                square += B[k, c] * B[k, c]
+            for i in range(nv):
+                for j in range(nv):
+                    M[i, j] += damping[k] / square * B[k, i] * B[k, j]
+    largest = 0.0
+    for i in range(nv):
+        largest = max(largest, M[i, i])
+    shifted = M.copy()
+    for i in range(nv):
+        shifted[i, i] += max(_SHIFT * largest, 1e-300)
+    factorise(shifted, L, nv)
+    v[:] = 0.0
+    for _ in range(3):
+        for i in range(nv):
+            missing[i] = 0.0
+            for j in range(nv):
+                missing[i] -= M[i, j] * v[j]
+        for r in range(len(A)):
+            for i in range(nv):
+                missing[i] += A[r, i] * b[r]
+        solve_factored(L, missing, step, nv)
+        for i in range(nv):
+            v[i] += step[i]

@@ -1,0 +1,196 @@
+"""Scene of the live view: robot, obstacles, targets, witness segments and paths as nodes of viser."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from qpavoid.model.visuals import read_visuals
+from qpavoid.problem import Array
+from qpavoid.viz.meshes import Mesh, decimated, of_visual
+from qpavoid.viz.view_link import Frame, PageSetup
+
+Post = Callable[..., None]
+"""Sends an event to the loop."""
+CAMERA, LOOK_AT = (1.5, -1.0, 1.05), (0.2, 0.0, 0.42)
+"""Where the page is looked at from at first, and the point in its middle [m]."""
+SAME = 1e-6
+"""Change of a pose that is not sent [m, -]."""
+TRACE_FRAMES = 300
+"""Frames whose tool positions stay visible."""
+_TRACE_PERIOD = 6
+"""Frames between two updates of the tools' paths, which are sent as a whole."""
+_COARSE = 0.012
+"""Size of details that are left out where the quality is low [m]."""
+
+
+class Page:
+    """The nodes of a page."""
+
+    def __init__(self, server: Any, setup: PageSetup, post: Post) -> None:
+        """Add all nodes to a viser server."""
+        self.server, self._setup, self._post = server, setup, post
+        self._model, self._data = setup.model, setup.model.createData()
+        scene = server.scene
+        scene.set_up_direction("+z")
+        scene.add_grid("/grid", 6.0, 6.0, cell_size=0.25)
+        server.initial_camera.position, server.initial_camera.look_at = CAMERA, LOOK_AT
+        if setup.quality == "low":
+            scene.configure_default_lights(True, cast_shadow=False)
+            scene.configure_environment_map(None)
+            scene.add_light_ambient("/ambient", intensity=0.9)
+        self._nodes: list[tuple[Any, int, Any]] = []
+        visuals = read_visuals(setup.model, setup.urdf, setup.package_dirs)
+        for visual in visuals:
+            self._add_part(f"/robot/{visual.name}", visual.joint, visual.placement, of_visual(visual))
+        self._bodies = scene.add_frame("/bodies", show_axes=False, visible=not visuals)
+        for number, (joint, placement, mesh) in enumerate(setup.bodies):
+            self._add_part(f"/bodies/{number}", joint, placement, [mesh])
+        self._obstacles = [self._add_obstacle(name, mesh) for name, mesh in setup.obstacles]
+        self._grips: dict[str, Array] = {}  # from the point where an obstacle is held to its origin
+        self._targets: list[Any] = []
+        self._pulled: set[str] = set()  # targets that follow the mouse and no longer the loop
+        no_segment = np.zeros((1, 2, 3), np.float32)
+        self._witnesses = scene.add_line_segments(
+            "/witnesses", no_segment, np.zeros((1, 2, 3), np.uint8), line_width=4.0, visible=False
+        )
+        self._trace = scene.add_line_segments("/paths", no_segment, (0, 122, 86), line_width=2.5, visible=False)
+        self._tools: deque[Array] = deque(maxlen=TRACE_FRAMES)
+        self._count, self._t = 0, -np.inf
+        self._place_robot(pin.neutral(setup.model))
+
+    def show(self, frame: Frame) -> None:
+        """Show a frame; what is where it was is not sent again."""
+        self._place_robot(frame.q)
+        for node, pose in zip(self._obstacles, frame.obstacles, strict=False):
+            _place(node, pose[:9].reshape(3, 3).T, pose[9:])
+        self._place_targets(frame.targets)
+        self._show_witnesses(frame.witnesses, frame.levels)
+        if frame.t < self._t:
+            self._tools.clear()
+        self._t = frame.t
+        self._tools.append(frame.tools)
+        self._count += 1
+        if self._count % _TRACE_PERIOD == 0:
+            self._show_paths()
+
+    def show_bodies(self, visible: bool) -> None:
+        """Show the collision bodies, or hide them."""
+        self._bodies.visible = visible
+
+    def let_go(self) -> None:
+        """Let all targets follow the loop again."""
+        self._pulled.clear()
+        self._tools.clear()
+
+    def _add_part(self, name: str, joint: int, placement: Any, meshes: list[Mesh]) -> None:
+        node = self.server.scene.add_frame(name, show_axes=False)
+        for index, mesh in enumerate(meshes):
+            self._add_mesh(f"{name}/{index}", mesh)
+        self._nodes.append((node, joint, placement))
+
+    def _add_mesh(self, name: str, mesh: Mesh) -> Any:
+        if self._setup.quality == "low":
+            mesh = decimated(mesh, _COARSE)
+        red, green, blue, opacity = mesh.colour
+        return self.server.scene.add_mesh_simple(
+            name, mesh.vertices, mesh.faces, color=(round(255 * red), round(255 * green), round(255 * blue)),
+            opacity=opacity if opacity < 1.0 else None, side="double",
+        )  # fmt: skip
+
+    def _add_obstacle(self, name: str, mesh: Mesh) -> Any:
+        node = self.server.scene.add_frame(f"/obstacles/{name or 'none'}", show_axes=False)
+        if not len(mesh.faces):
+            return node
+        shape = self._add_mesh(f"/obstacles/{name}/shape", mesh)
+
+        async def drag(event: Any) -> None:
+            if event.phase == "start":
+                self._grips[name] = np.array(node.position) - event.start_position
+            elif name in self._grips:
+                position = self._grips[name] + event.end_position
+                self._post(
+                    type="obstacle", name=name, position=position.tolist(), rotation=_rotation(node.wxyz).tolist()
+                )
+
+        shape.on_drag(drag)
+        return node
+
+    def _add_target(self, name: str, can_turn: bool) -> Any:
+        gizmo = self.server.scene.add_transform_controls(
+            f"/targets/{name}", scale=0.2, depth_test=False, disable_rotations=not can_turn
+        )
+
+        async def pull(event: Any) -> None:
+            self._pulled.add(name)
+            rotation = _rotation(event.target.wxyz)
+            self._post(
+                type="target", name=name, position=list(map(float, event.target.position)), rotation=rotation.tolist()
+            )
+
+        gizmo.on_update(pull)
+        return gizmo
+
+    def _place_robot(self, q: Array) -> None:
+        pin.forwardKinematics(self._model, self._data, q)
+        for node, joint, placement in self._nodes:
+            pose = self._data.oMi[joint] * placement
+            _place(node, pose.rotation, pose.translation)
+
+    def _place_targets(self, targets: Array) -> None:
+        pullable = self._setup.targets
+        while len(self._targets) < len(targets):
+            index = len(self._targets)
+            marker = (
+                self._add_target(*pullable[index])
+                if index < len(pullable)
+                else self.server.scene.add_frame(f"/targets/{index}", axes_length=0.08, axes_radius=0.004)
+            )
+            self._targets.append(marker)
+        for index, (node, pose) in enumerate(zip(self._targets, targets, strict=True)):
+            name, can_turn = pullable[index] if index < len(pullable) else ("", True)
+            if name not in self._pulled:
+                _place(node, pose[:9].reshape(3, 3).T if can_turn else np.eye(3), pose[9:])
+
+    def _show_witnesses(self, witnesses: Array, levels: Array) -> None:
+        is_visible = len(witnesses) > 0
+        if is_visible:
+            self._witnesses.points = witnesses[:, 1:].reshape(-1, 2, 3).astype(np.float32)
+            colours = 255.0 * distance_colours(witnesses[:, 0], *levels)
+            self._witnesses.colors = np.repeat(colours.astype(np.uint8)[:, None], 2, axis=1)
+        if self._witnesses.visible != is_visible:
+            self._witnesses.visible = is_visible
+
+    def _show_paths(self) -> None:
+        points = np.array([tools for tools in self._tools if len(tools) == len(self._tools[-1])], np.float32)
+        segments = np.stack((points[:-1], points[1:]), axis=2).reshape(-1, 2, 3)
+        is_visible = len(segments) > 0
+        if is_visible:
+            self._trace.points = segments
+        if self._trace.visible != is_visible:
+            self._trace.visible = is_visible
+
+
+def distance_colours(d: Array, d1: float, d2: float) -> Array:
+    """Return colours (k, 3), 0 to 1, of distances (k,) [m]: green at d2, red at d1 and below."""
+    red = np.clip((d2 - d) / max(d2 - d1, 1e-9), 0.0, 1.0)
+    return np.stack((0.85 * red, 0.65 * (1.0 - red), np.full_like(red, 0.15)), axis=1)
+
+
+def _place(node: Any, rotation: Array, position: Array) -> None:
+    """Put a node to a pose, unless it is there."""
+    quaternion = pin.Quaternion(np.asarray(rotation))
+    wxyz = np.array([quaternion.w, quaternion.x, quaternion.y, quaternion.z])
+    if np.abs(np.asarray(node.position) - position).max() > SAME:
+        node.position = position
+    if abs(np.dot(node.wxyz, wxyz)) < 1.0 - SAME**2 and np.abs(node.wxyz - wxyz).max() > SAME:
+        node.wxyz = wxyz
+
+
+def _rotation(wxyz: Any) -> Array:
+    w, x, y, z = wxyz
+    return np.asarray(pin.Quaternion(float(w), float(x), float(y), float(z)).normalized().matrix())

@@ -1,0 +1,174 @@
+"""The live view in a real browser: it loads, plays, is dragged about and changes the solver, and the loop does it."""
+
+import os
+import shutil
+import threading
+import time
+from io import BytesIO
+
+import numpy as np
+import pytest
+
+from qpavoid.viz.view_page import CAMERA, LOOK_AT
+from qpavoid.viz.view_session import Session
+
+REQUIRED = bool(os.environ.get("QPAVOID_REQUIRE_BROWSER"))
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+if not REQUIRED:
+    for module in ("viser", "trimesh", "collada", "playwright", "PIL"):
+        pytest.importorskip(module)
+    if CHROMIUM is None:
+        pytest.skip("no chromium; QPAVOID_REQUIRE_BROWSER=1 makes that a failure", allow_module_level=True)
+
+WIDTH, HEIGHT, FIELD_OF_VIEW = 960, 640, np.radians(75.0)
+PATIENCE = 60.0
+"""Longest wait for the page or the loop [s]: a machine without a graphics processor may be busy with other tests."""
+SCENARIO = """\
+robot: panda
+tasks:
+  - frame: panda_hand_tcp
+    type: position
+    max_speed: 0.5
+    motion: {type: fixed, position: [0.45, 0.0, 0.55]}
+obstacles:
+  - name: ball
+    shape: {type: sphere, radius: 0.12}
+    motion: {type: fixed, position: [0.3, -0.75, 0.5]}
+avoidance: {d1: 0.03, d2: 0.12}
+solver: qp
+dt: 0.02
+duration: 10
+"""
+
+
+def wait_for(condition, what):
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end, f"waited in vain for {what}"
+        time.sleep(0.05)
+
+
+def pixel(point, box):
+    """Where the page shows a point (3,) at first: x, y on the screen."""
+    forward = np.subtract(LOOK_AT, CAMERA)
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    offset, scale = np.subtract(point, CAMERA), 0.5 * box["height"] / np.tan(0.5 * FIELD_OF_VIEW)
+    x, y = (scale * (offset @ axis) / (offset @ forward) for axis in (right, np.cross(right, forward)))
+    return box["x"] + 0.5 * box["width"] + x, box["y"] + 0.5 * box["height"] - y
+
+
+def drag(page, begin, shift):
+    """Drag from one pixel by a number of pixels (2,)."""
+    page.mouse.move(*begin)
+    page.mouse.down()
+    for part in np.linspace(0.1, 1.0, 12):
+        page.mouse.move(begin[0] + part * shift[0], begin[1] + part * shift[1])
+        time.sleep(0.04)
+    page.mouse.up()
+
+
+def picture(page):
+    """What the canvas shows, but for messages in its upper part and the panel."""
+    from PIL import Image
+
+    image = Image.open(BytesIO(page.screenshot(timeout=1e3 * PATIENCE))).convert("RGB")
+    return np.asarray(image, dtype=float)[160:, : WIDTH - 330]
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    file = tmp_path_factory.mktemp("view") / "pull.yaml"
+    file.write_text(SCENARIO)
+    session = Session(str(file), port=0, quality="low")
+    is_done = threading.Event()
+    loop = threading.Thread(target=session.run, args=(is_done.is_set,))
+    loop.start()
+    yield session
+    is_done.set()
+    loop.join(PATIENCE)
+    assert not session.view.is_alive
+
+
+@pytest.fixture(scope="module")
+def page():
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        arguments = ["--no-sandbox", "--enable-unsafe-swiftshader"]
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=arguments)
+        page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
+        page.set_default_timeout(1e3 * PATIENCE)
+        yield page
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def empty_picture(page):
+    """A page with nothing on it but the ground, from the same camera."""
+    import viser
+
+    server = viser.ViserServer(port=0, verbose=False)
+    server.initial_camera.position, server.initial_camera.look_at = CAMERA, LOOK_AT
+    server.scene.set_up_direction("+z")
+    server.scene.add_grid("/grid", 6.0, 6.0, cell_size=0.25)
+    page.goto(f"http://127.0.0.1:{server.get_port()}")
+    page.wait_for_selector("canvas")
+    time.sleep(2.0)
+    empty = picture(page)
+    server.stop()
+    return empty
+
+
+@pytest.mark.xdist_group("browser")
+def test_page_shows_and_steers_a_run(session, page, empty_picture):
+    errors = []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    wait_for(lambda: session.view.url, "the page's address")
+    page.goto(session.view.url)
+    page.wait_for_selector("canvas")
+    page.get_by_text("rows").first.wait_for()
+    wait_for(lambda: session.t > 0.1, "the first steps: a run begins with the first browser")
+    tool = session.tick.kinematics.position[0]
+
+    # the page is not empty: robot and ball cover a good part of what the ground alone shows
+    changed = 0.0
+    end = time.monotonic() + PATIENCE
+    while changed < 0.03 and time.monotonic() < end:
+        changed = np.mean(np.abs(picture(page) - empty_picture).max(axis=2) > 24.0)
+    assert changed > 0.03
+
+    # pause and play
+    page.get_by_role("button", name="pause").click()
+    wait_for(lambda: not session.clock.is_playing, "the pause")
+    steps = session.t
+    page.get_by_role("button", name="step", exact=True).click()
+    wait_for(lambda: session.t > steps, "a single step")
+    page.get_by_role("button", name="play", exact=True).click()
+    wait_for(lambda: session.t > steps + 0.1, "the run to go on")
+
+    # another solver, built aside
+    page.locator("input[value='qp']").first.click()
+    page.get_by_role("option", name="eq10", exact=True).click()
+    wait_for(lambda: session.config.solver.label == "eq10", "the other solver")
+    assert session.t > steps
+
+    # the target, by its arrow that points up; the robot follows
+    wait_for(lambda: np.linalg.norm(tool_error(session)) < 0.01, "the robot at its target")
+    box, target = page.locator("canvas").first.bounding_box(), session.tick.targets[0].position.copy()
+    drag(page, pixel(target + np.array([0.0, 0.0, 0.14]), box), (0.0, -50.0))
+    wait_for(lambda: session.tick.targets[0].position[2] > target[2] + 0.03, "the target")
+    wait_for(lambda: np.linalg.norm(tool_error(session)) < 0.01, "the robot at the pulled target")
+    tool = session.tick.kinematics.position[0]
+    assert tool[2] > target[2] + 0.03
+
+    # the ball itself
+    ball = session.tick.obstacles[0, 9:].copy()
+    drag(page, pixel(ball, box), (60.0, 0.0))
+    wait_for(lambda: np.linalg.norm(session.tick.obstacles[0, 9:] - ball) > 0.05, "the ball")
+    assert not errors
+
+
+def tool_error(session):
+    return session.tick.kinematics.position[0] - session.tick.targets[0].position
