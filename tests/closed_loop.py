@@ -97,6 +97,27 @@ def drive(controller, q, ticks, *, target=None, obstacles=None, start=0, hold=No
         t += held
 
 
+ROWS = {
+    "beta": {"type": "beta"},
+    "damper": {"type": "beta", "near_speed": 10.0},
+    "task-switching": {"type": "task-switching"},
+}
+"""Forms of rows as scenarios give them."""
+
+
+def through_an_obstacle(shape, row, dt, duration, speed=2.0, **fields):
+    """A target that leaves the Panda's tool at some speed and leads through a body 20 mm from which it has to stay."""
+    return scenario(
+        "panda",
+        {"type": "line", "displacement": [0.4, 0.05, -0.1], "speed": speed},
+        [{"name": "it", "shape": shape, "motion": {"type": "fixed", "position": [0.55, 0.0, 0.45]}}],
+        avoidance={"d1": 0.02, "d2": 0.10, **row},
+        dt=dt,
+        duration=duration,
+        **fields,
+    )
+
+
 class Ruler:
     """Distances of all pairs of a scene, with memory of its own."""
 
@@ -129,6 +150,6 @@ def accelerations(vs, dt, before=None):
 
 
 __all__ = [
-    "SHIPPED", "Limits", "Progress", "Ruler", "Sensing", "accelerations", "cartesian", "changed", "drive",
-    "make_controller", "planar", "scenario",
+    "ROWS", "SHIPPED", "Limits", "Progress", "Ruler", "Sensing", "accelerations", "cartesian", "changed", "drive",
+    "make_controller", "planar", "scenario", "through_an_obstacle",
 ]  # fmt: skip

@@ -69,12 +69,6 @@ def test_minimize_fails_only_on_infeasible_problems(seed):
         assert programme.status == 2
 
 
-def test_minimize_keeps_a_feasible_minimiser():
-    x = np.array([0.1, -0.2])
-    assert minimize(np.eye(2), x, np.ones((1, 2)), np.array([-5.0]), -np.ones(2), np.ones(2), np.zeros(1))
-    np.testing.assert_array_equal(x, [0.1, -0.2])
-
-
 @pytest.mark.parametrize("place", ["A", "v_tracking", "J", "b"])
 def test_project_rejects_nan(place):
     arguments = {

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 pytest.importorskip("matplotlib")
@@ -15,11 +15,10 @@ pytest.importorskip("mujoco")
 pytest.importorskip("statsmodels")
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.text import Text
 from scipy.stats import binomtest
 
 from qpavoid.errors import ConfigError
-from qpavoid_bench.arena.figures import safety_against_tracking, success_against_time
+from qpavoid_bench.arena.figures import success_against_time
 from qpavoid_bench.arena.report import comparable_results, report_lines, rerun_line, write_report
 from qpavoid_bench.arena.results import results_of
 from qpavoid_bench.arena.scores import COLUMNS
@@ -99,20 +98,6 @@ def test_intervals_hold_the_truth_of_exponential_values(estimate, truth, count):
     assert (0.9 if estimate is median else 0.82) <= np.mean(held) <= 1.0
 
 
-def test_the_mean_of_many_is_that_of_resamples():
-    values = np.random.default_rng(1).normal(size=3000)
-    assert mean(values)[1:] == pytest.approx(mean(values[:-1])[1:], abs=0.004)
-
-
-@given(st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=40))
-def test_estimates_lie_within_their_intervals(values):
-    values = np.array(values)
-    for estimate in (mean, median):
-        middle, low, high = estimate(values)
-        assert values.min() - 1e-9 <= low <= middle <= high <= values.max() + 1e-9
-        assert estimate(values) == (middle, low, high)
-
-
 @given(flags, st.randoms())
 def test_duel_equals_binomial_test(first, random):
     """A duel is fair and that of the binomial test."""
@@ -153,6 +138,7 @@ def test_pareto_front_equals_brute_force(points):
 # --- nothing is dropped, nothing is mixed ---------------------------------------------------------------------------
 
 
+@settings(max_examples=20)
 @given(st.randoms(use_true_random=False))
 def test_results_are_values_by_case_and_entrant_whatever_the_order_of_rows(random):
     rows = grid(["a", "b", "c"], cases=5)
@@ -227,12 +213,6 @@ def test_report_without_common_case_names_remedy(tmp_path):
         write_report(tmp_path)
 
 
-def test_one_run_makes_a_report():
-    found = sections([row()])
-    assert cells(found["Overall"])[0][:3] == ["1", "qp", "100 (21 – 100)"]
-    assert not cells(found["Beside the best"]) and found["Worst runs"][1] == "None."
-
-
 # --- what is written ------------------------------------------------------------------------------------------------
 
 NASTY = "<b>a|b</b> $x$ & `c` __d__"
@@ -271,7 +251,7 @@ def test_report_is_well_formed_markdown_with_pictures(written):
             assert lines[i - 1] == "" and lines[i + 1].count("---") == count - 1
             expected = count
         assert line.endswith(" |") and count == expected
-    assert tables == 2 + 2 + 1 + 2 * 2 + 1 + 1  # who, how; overall; beside; two families; worst; failures
+    assert tables == 2 + 2 + 1 + 2 * 2 + 1 + 1 + 1  # who, how; overall; beside; two families; worst; failures; others
 
 
 def test_the_command_writes_the_same_report_again(cli, written):
@@ -355,17 +335,3 @@ def test_an_axis_of_times_has_numbers_to_read_it_by(times):
     assert low < min(times) and max(times) < high and 3 <= len(shown) <= 12
     boxes = [tick.label1.get_window_extent() for tick in shown]
     assert not any(a.overlaps(b) for a, b in pairwise(boxes))
-
-
-def test_lines_to_names_do_not_cross_names_out():
-    """In the picture of many that are good and some that are not, lines come down steeply."""
-    rows = []
-    for i, entrant in enumerate(f"entrant {k}" for k in range(17)):
-        rows += [row(entrant, f"case {k}", collided=k < max(0, i - 12), tracking_error=0.01 * i) for k in range(20)]
-    figure = safety_against_tracking(results_of(table(rows)))
-    FigureCanvasAgg(figure).draw()
-    names = figure.axes[0].texts
-    assert len(names) == 17
-    for name in names:
-        text, line = Text.get_window_extent(name), name.arrow_patch.get_window_extent()
-        assert line.x1 <= text.x0 + 1.0

@@ -63,12 +63,18 @@ def assert_minimum(name: str, answer: np.ndarray | None, qp: QP, reference: np.n
 def test_back_ends_find_the_minimum_after_any_size(name):
     """proxqp finds no solution of one in 800, which `Qp` then gives to daqp."""
     random, solve, unsolved = np.random.default_rng(1), make_backend(name), 0
+    kept, copy = np.zeros(0), np.zeros(0)
     for _ in range(150):
         qp = make_qp(random, int(random.choice([7, 14, 35])), int(random.integers(0, 31)))
+        given = QP(*map(np.copy, qp))
         answer = solve(*qp)
         unsolved += answer is None
         if answer is not None or name != "proxqp":
             assert_minimum(name, answer, qp)
+        for array, before in zip((*qp, kept), (*given, copy), strict=True):
+            np.testing.assert_array_equal(array, before)  # neither the problem nor the answer before it is written to
+        if answer is not None:
+            kept, copy = answer, answer.copy()
     assert unsolved <= 1
 
 
@@ -96,13 +102,6 @@ def test_back_ends_return_none_for_an_infeasible_problem(name):
         assert solve(*bad) is None
         again = make_qp(random, 7, 6)
         assert_minimum(name, solve(*again), again)
-
-
-@pytest.mark.parametrize("name", BACKENDS)
-def test_a_row_beyond_the_bounds_is_infeasible(name):
-    qp = make_qp(np.random.default_rng(5), 7, 1)
-    beyond = np.abs(qp.G[0]) @ np.maximum(-qp.lower, qp.upper)  # no x within the bounds reaches more
-    assert make_backend(name)(*qp._replace(h=np.array([beyond + 0.1]))) is None
 
 
 @pytest.mark.parametrize("name", BACKENDS)
@@ -145,32 +144,9 @@ def test_back_ends_reject_and_forget_nan(name, field):
             assert name == "daqp"
 
 
-def test_answers_are_not_memory_of_the_solver():
-    """An answer that was kept must not change when the next problem is solved."""
-    random = np.random.default_rng(9)
-    for name in BACKENDS:
-        solve = make_backend(name)
-        first = solve(*make_qp(random, 7, 4))
-        kept = first.copy()
-        solve(*make_qp(random, 7, 4))
-        np.testing.assert_array_equal(first, kept)
-
-
-def test_problems_are_not_changed():
-    random = np.random.default_rng(10)
-    for name in BACKENDS:
-        solve = make_backend(name)
-        for _ in range(2):
-            qp = make_qp(random, 7, 4)
-            copy = QP(*(array.copy() for array in qp))
-            solve(*qp)
-            for array, before in zip(qp, copy, strict=True):
-                np.testing.assert_array_equal(array, before)
-
-
 @pytest.mark.parametrize("name", BACKENDS)
 @pytest.mark.parametrize("m", [0, 4])
-@pytest.mark.parametrize("slack", [1.0, 1e-3, 1e-8, 0.0, -1e-8, -1e-7, -1e-3])
+@pytest.mark.parametrize("slack", [1.0, 0.0, -1e-8, -1e-3])
 def test_nothing_is_printed(name, m, slack, capfd):
     """Not even from C, and not where no row is active, or hardly: `run --json` owns the process's output."""
     random, solve = np.random.default_rng(15), make_backend(name)

@@ -2,23 +2,26 @@
 
 import coal
 import numpy as np
+import pinocchio as pin
 import pytest
-from conftest import EXAMPLES, write_chain
+from conftest import BOX, CYLINDER, EXAMPLES, write_chain
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from oracle import DIRECTIONS, support
 from scipy.optimize import minimize
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
+from urdfs import TETRAHEDRON, write_stl
 
 from qpavoid import Robot
-from qpavoid.geometry.bodies import convert_bodies, enclosing_capsule
+from qpavoid.config import Cone, Ellipsoid
+from qpavoid.geometry.bodies import convert_bodies, enclosing_capsule, make_shape
 from qpavoid.geometry.capsules import fit_capsule
 from qpavoid.model.urdf import read_model, read_pieces
 from qpavoid.run.metrics import point_segment_distance
 
 PANDA = EXAMPLES / "panda_description/urdf/panda.urdf"
-STL_FACET = "facet normal 0 0 1\nouter loop\nvertex {}\nvertex {}\nvertex {}\nendloop\nendfacet\n"
 
 
 @pytest.fixture(scope="module")
@@ -101,6 +104,15 @@ def test_points_on_a_capsule_give_it_back(radius, length):
 # --- whole shapes ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("shape", [BOX, CYLINDER, Cone(radius=0.09, length=0.25), Ellipsoid(radii=(0.1, 0.16, 0.07))])
+def test_shapes_are_enclosed(shape):
+    """In every direction the capsule reaches as far as the shape."""
+    geometry = make_shape(shape)
+    fit = enclosing_capsule(geometry)
+    capsule = support(coal.Capsule(fit.radius, fit.length), pin.SE3(fit.rotation, fit.center))
+    assert (capsule(DIRECTIONS) >= support(geometry, pin.SE3.Identity())(DIRECTIONS) - 1e-9).all()
+
+
 @pytest.mark.parametrize(("radius", "length"), [(0.03, 0.2), (0.1, 0.1)])
 def test_cylinder_is_enclosed_tightly(radius, length):
     angle = np.linspace(0.0, 2.0 * np.pi, 360)
@@ -155,9 +167,7 @@ def test_hulls_and_capsules_sit_around_the_meshes_in_the_link_frame(meshes):
 @pytest.mark.filterwarnings("ignore::qpavoid.model.notes.RobotWarning")
 def test_scaled_mesh_of_a_urdf_keeps_its_size(tmp_path):
     """A tetrahedron in mm with a scale of 0.001."""
-    o, x, y, z = "0 0 0", "100 0 0", "0 100 0", "0 0 100"
-    facets = "".join(STL_FACET.format(*f) for f in ((o, y, x), (o, x, z), (o, z, y), (x, y, z)))
-    (tmp_path / "part.stl").write_text(f"solid a\n{facets}endsolid a\n")
+    write_stl(tmp_path / "part.stl", 1000.0 * TETRAHEDRON)
     urdf = write_chain(tmp_path, shape='<mesh filename="part.stl" scale="0.001 0.001 0.001"/>')
     for kind in ("convex", "mesh"):
         geometry = Robot.from_urdf(urdf, bodies=kind).bodies.geometryObjects[0].geometry
@@ -170,9 +180,8 @@ def test_scaled_mesh_of_a_urdf_keeps_its_size(tmp_path):
 @pytest.mark.filterwarnings("ignore::qpavoid.model.notes.RobotWarning")
 def test_flat_mesh_does_not_take_the_process_down(tmp_path):
     """A plate without thickness has no hull of its own, and qhull ends the process over it."""
-    o, x, y, z = "0 0 0", "1 0 0", "0 1 0", "1 1 0"
-    facets = "".join(STL_FACET.format(*f) for f in ((o, x, y), (x, z, y)))
-    (tmp_path / "plate.stl").write_text(f"solid a\n{facets}endsolid a\n")
+    square = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
+    write_stl(tmp_path / "plate.stl", square[[[0, 1, 2], [1, 3, 2]]])
     urdf = write_chain(tmp_path, shape='<mesh filename="plate.stl"/>')
     hull, capsule = (Robot.from_urdf(urdf, bodies=kind).bodies.geometryObjects[0] for kind in ("convex", "capsule"))
     assert ConvexHull(hull.geometry.points()).volume == pytest.approx(1e-4, rel=1e-6)  # 0.1 mm thick

@@ -7,12 +7,12 @@ import pinocchio as pin
 import pytest
 from closed_loop import drive, make_controller
 from conftest import random_q
-from test_shapes import SHELF, boards, write_stl
+from test_shapes import SHELF, boards
+from urdfs import write_stl
 
-from qpavoid import Avoidance, Obstacle, Points, Robot, Status, Voxels, build_scene
-from qpavoid.config import Box, Capsule, Ellipsoid, HalfSpace, Mesh, PointCloud, Sphere
+from qpavoid import Avoidance, Obstacle, Robot, Status, build_scene
+from qpavoid.config import Box, Capsule, Ellipsoid, HalfSpace, Mesh
 from qpavoid.geometry.bodies import make_shape
-from qpavoid.model.cloud import voxel_radius
 
 pytest.importorskip("mujoco")
 
@@ -56,28 +56,6 @@ def test_distances_to_the_new_shapes(panda, tmp_path):
     assert count > 150
 
 
-def test_cloud_distance_equals_all_voxels(panda):
-    """The checker has a sphere for every voxel, and no proxy spheres."""
-    rng, tool = np.random.default_rng(1), tool_at(panda).translation
-    points = tool + np.array([0.0, 0.28, 0.0]) + rng.uniform(-1, 1, (400, 3)) * [0.15, 0.004, 0.15]
-    shape = PointCloud(resolution=0.03)
-    controller = make_controller(
-        panda, [Obstacle.at("camera", shape, [0, 0, 0])], TCP, avoidance=Avoidance(d1=HOLD, d2=0.1)
-    )
-    centers, ball = Voxels.of(points, shape.resolution).centers, Sphere(radius=voxel_radius(shape.resolution))
-    checked = build(build_scene(panda, [Obstacle.at(f"v{i}", ball, c) for i, c in enumerate(centers)]), panda.home)
-    of_voxels = checked.scene.pairs[:, 1] >= checked.bodies
-    assert len(centers) > 60
-    least = smallest_distances(
-        controller,
-        checked,
-        90,
-        lambda t: tool + np.array([0.0, 0.5 * t, 0.0]),
-        lambda t: {"camera": Points(points)},
-    )
-    assert HOLD - 1e-3 < least[of_voxels].min() < 0.08
-
-
 def test_attached_object_equals_body_of_robot(panda):
     """The checker's robot has the box welded to its hand, by its own description."""
     tool = tool_at(panda)
@@ -108,23 +86,3 @@ def _with_body(robot: Robot, name, shape, inside):
         pin.GeometryObject(name, frame.parentJoint, 0, frame.placement * inside, make_shape(shape))
     )
     return replace(robot, bodies=bodies)
-
-
-def test_decomposed_mesh_equals_its_boards(panda, tmp_path):
-    """The checker has five boxes."""
-    tool = tool_at(panda).translation
-    place = tool + np.array([0.28, 0.0, -0.35])
-    turn = pin.rpy.rpyToMatrix(0, 0, np.pi / 2)
-    mesh = Mesh(path=str(write_stl(tmp_path / "shelf.stl", boards(*SHELF))))
-    controller = make_controller(
-        panda, [Obstacle.at("shelf", mesh, place, turn)], TCP, avoidance=Avoidance(d1=HOLD, d2=0.1)
-    )
-    pieces = [
-        Obstacle.at(f"b{i}", Box(size=size), place + turn @ np.array(c), turn) for i, (c, size) in enumerate(SHELF)
-    ]
-    checked = build(build_scene(panda, pieces), panda.home)
-    of_boards = checked.scene.pairs[:, 1] >= checked.bodies
-    least = smallest_distances(
-        controller, checked, 120, lambda t: tool + np.array([min(0.3 * t, 0.2), 0.0, 0.2 * np.sin(3.0 * t)])
-    )
-    assert HOLD - 1e-3 < least[of_boards].min() < 0.05

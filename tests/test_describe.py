@@ -390,7 +390,7 @@ def test_the_written_robot_is_the_one_that_was_worked_out(panda_described, kind,
     np.testing.assert_allclose(robot.home, described.robot.home, atol=1e-5)
     assert robot.end_effectors == ("panda_hand_tcp",)
     assert not touching(robot, robot.home, D1)
-    assert robot.always_touching == () and robot.margins == described.robot.margins
+    assert robot.always_touching == [] and robot.margins == described.robot.margins
     for mine, theirs in zip(robot.bodies.geometryObjects, described.robot.bodies.geometryObjects, strict=True):
         assert mine.name == theirs.name
         np.testing.assert_allclose(mine.placement.homogeneous, theirs.placement.homogeneous, atol=1e-12)

@@ -2,23 +2,17 @@
 
 import numpy as np
 import pytest
-from closed_loop import Ruler, cartesian, drive, make_controller, scenario
-from conftest import Bench, moved
+from closed_loop import ROWS, Ruler, cartesian, drive, make_controller, through_an_obstacle
+from conftest import moved
 
-from qpavoid import Avoidance, Controller, Obstacle, ReasonKind, Sample, Severity, Status, build_scene
-from qpavoid.config import Beta, Box, Sphere
-from qpavoid.control.distances import DistanceQuery
+from qpavoid import Avoidance, Controller, Obstacle, ReasonKind, Sample, Severity, Status
+from qpavoid.config import Beta, Box
 from qpavoid.run.simulate import simulate
 from qpavoid.safety.braking import TOLERANCE
 
 PLATE = {"type": "box", "size": [0.004, 0.6, 0.6]}
 BALL = {"type": "sphere", "radius": 0.06}
 BOX = {"type": "box", "size": [0.2, 0.2, 0.2]}
-ROWS = {
-    "beta": {"type": "beta"},
-    "damper": {"type": "beta", "near_speed": 10.0},
-    "task-switching": {"type": "task-switching"},
-}
 SAFE = 0.02
 
 
@@ -35,14 +29,7 @@ def min_distance(log, controller, steps=10):
 )
 def test_safety_distance_is_kept_at_any_period_and_speed(row, shape, dt, duration):
     """A target that leaves at 2 m/s leads through the obstacle: the Panda comes at its joints' full speed."""
-    run = scenario(
-        "panda",
-        {"type": "line", "displacement": [0.4, 0.05, -0.1], "speed": 2.0},
-        [{"name": "it", "shape": shape, "motion": {"type": "fixed", "position": [0.55, 0.0, 0.45]}}],
-        dt=dt,
-        duration=duration,
-        avoidance={"d1": SAFE, "d2": 0.10, "row": ROWS[row]},
-    )
+    run = through_an_obstacle(shape, {"row": ROWS[row]}, dt, duration)
     log = simulate(run)
     controller, _ = Controller.from_scenario(run)
     assert min_distance(log, controller, 10 if dt > 0.001 else 2) > SAFE - 1e-3
@@ -69,77 +56,8 @@ def test_plate_is_never_tunnelled_through(tmp_path, dt, speed):
     assert after > 0.8
 
 
-def test_clearance_lower_bound_holds_with_moving_obstacles(panda):
-    rng, bounds = np.random.default_rng(0), panda.bounds()
-    scene = build_scene(panda, [Obstacle.at(f"ball{i}", Sphere(radius=0.08), [9.0, 0.0, 0.0]) for i in range(4)])
-    bench, ruler, close = Bench(scene, avoidance=Avoidance(d1=SAFE, d2=0.1)), Ruler(scene), 0
-    for _ in range(150):
-        q, v = rng.uniform(bounds.lower, bounds.upper), rng.uniform(-1.0, 1.0, 7) * bounds.velocity
-        horizon, found = rng.uniform(0.005, 0.3), []
-        places = [Sample.at(rng.uniform(-0.8, 0.8, 3), linear=rng.uniform(-0.5, 0.5, 3)) for _ in range(4)]
-        bench.place(dict(enumerate(places)))
-        near = len(bench.compute(q, reach=0.1)[0].pair)
-        bound = bench.assembler.clearance_lower_bound(v, near, horizon)
-        for s in np.linspace(0.0, horizon, 12):
-            there = {i: x._replace(position=x.position + s * x.linear) for i, x in enumerate(places)}
-            found.append(ruler.distances(q + s * v, there).min())
-        assert min(found) - SAFE >= bound - 1e-9
-        close += bound > 0.0
-    assert close > 1
-
-
-def braking(q, v, step, dt):
-    """Poses along a control period and the stop after it, all joints slowed by one factor; five per period."""
-    poses = []
-    while v.any():
-        poses += [q + s * dt * v for s in (0.2, 0.4, 0.6, 0.8, 1.0)]
-        q, v = poses[-1], (1.0 - 1.0 / max(np.max(np.abs(v) / step), 1.0)) * v
-    return poses
-
-
-def test_braking_check_is_safe_by_brute_force(panda):
-    """Random commands among plates: along every step and the stop after it, no pair comes 0.6 mm too near."""
-    rng, bounds = np.random.default_rng(0), panda.bounds()
-    step, evaluated, scaled = 0.01 * bounds.acceleration, 0, 0
-    for _ in range(6):
-        places = rng.uniform([0.3, -0.4, 0.2], [0.7, 0.4, 0.9], (3, 3))
-        boxes = [Obstacle.at(f"box{i}", Box(size=(0.25, 0.25, 0.01)), place) for i, place in enumerate(places)]
-        controller = make_controller(
-            panda, boxes, avoidance=Avoidance(d1=SAFE, d2=0.1, row=Beta(gain=50.0, near_speed=10))
-        )
-        ruler, q = Ruler(controller.scene), panda.home + rng.uniform(-0.5, 0.5, 7)
-        while ruler.distances(q).min() < SAFE:
-            q = panda.home + rng.uniform(-1.0, 1.0, 7)
-        for k in range(150):
-            if k % 30 == 0:
-                command = rng.uniform(-1.0, 1.0, 7) * bounds.velocity
-            s = controller.filter(q, command)
-            scaled += s.command_scale < 1.0
-            path = braking(q, s.v, step, 0.01) if k % 4 == 0 else []
-            if path and (bounds.lower < path[-1]).all() and (path[-1] < bounds.upper).all():
-                evaluated += 1
-                assert min(ruler.distances(pose).min() for pose in path) > SAFE - 6e-4
-            q = q + 0.01 * s.v
-    assert evaluated > 100 and scaled > 20
-
-
-def test_braking_check_evaluates_curved_paths_at_any_distance(panda, monkeypatch):
-    """A joint fast near its limit brakes harder than others: the bound for straight paths does not apply."""
-    controller, bounds, calls = make_controller(panda), panda.bounds(), []
-    compute = DistanceQuery.compute
-    monkeypatch.setattr(DistanceQuery, "compute", lambda *args: calls.append(1) or compute(*args))
-    q, v = panda.home.copy(), np.zeros(7)
-    v[0] = 0.5 * bounds.velocity[0]
-    for distance, evaluates in ((0.5, False), (0.02, True)):
-        calls.clear()
-        q[0] = bounds.upper[0] - distance
-        controller.reset(v)
-        commanded = controller.filter(q, v).v
-        assert commanded[0] > 0.0 and bool(calls) == evaluates
-
-
 def test_stop_at_any_step_is_clear_also_at_the_limits(panda):
-    """The same with stops as they are commanded, in which joints near their limits brake harder than others."""
+    """Stops as they are commanded, in which joints near their limits brake harder than others."""
     rng, bounds, stops, at_limits = np.random.default_rng(1), panda.bounds(), 0, 0
     for _ in range(6):
         places = rng.uniform([0.3, -0.4, 0.2], [0.7, 0.4, 0.9], (3, 3))
@@ -172,18 +90,8 @@ def test_command_scale_is_below_one_where_the_linearisation_fails(shape, speed, 
     """Steps of 50 ms and a row that may use its whole margin in one: alone, it leads into the plate."""
     least, scales = {}, {}
     for look_ahead in (False, True):
-        run = scenario(
-            "panda",
-            {"type": "line", "displacement": [0.4, 0.05, -0.1], "speed": speed},
-            [{"name": "it", "shape": shape, "motion": {"type": "fixed", "position": [0.55, 0.0, 0.45]}}],
-            dt=0.05,
-            avoidance={
-                "d1": SAFE,
-                "d2": 0.10,
-                "row": {"type": "beta", "gain": 20.0, "near_speed": 10.0},
-                "look_ahead": look_ahead,
-            },
-        )
+        row = {"row": {"type": "beta", "gain": 20.0, "near_speed": 10.0}, "look_ahead": look_ahead}
+        run = through_an_obstacle(shape, row, 0.05, 3.0, speed)
         log = simulate(run)
         least[look_ahead] = min_distance(log, Controller.from_scenario(run)[0])
         scales[look_ahead] = log.command_scale

@@ -93,16 +93,6 @@ def test_hqp_with_active_rows_and_bounds_is_the_lexicographic_optimum(backend):
     assert binding >= 3 and later >= 6
 
 
-def test_later_levels_keep_the_optimum_of_earlier_ones():
-    for seed in range(10):
-        problem = random_problem(seed, bound=0.6, k=3)
-        alone = problem._replace(levels=problem.levels[:1])
-        solver = Hqp(HqpSolver(regularization=SMALL))
-        whole, first = solver.solve(problem), solver.solve(alone)
-        if whole.status is Status.SOLVED:
-            assert costs(problem, whole.v)[0] == pytest.approx(costs(problem, first.v)[0], abs=1e-5)
-
-
 def _rows(solution):
     """Its reasons about pairs."""
     kinds = ReasonKind.ROW_RELAXED, ReasonKind.BELOW_SAFETY_DISTANCE

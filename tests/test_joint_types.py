@@ -4,7 +4,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import yaml
-from conftest import EXAMPLES, SPHERE, Bench, differences, look, obstacle, random_q
+from conftest import EXAMPLES, SPHERE, differences, look, obstacle, random_q
 
 from qpavoid import ConfigError, Controller, Log, Robot, Sample, build_scene, build_tasks, config, load_scenario
 from qpavoid.model.kinematics import chains, max_lever_arm
@@ -78,22 +78,6 @@ def test_bounds_of_looking_ahead_hold(named):
         assert np.linalg.norm(velocities[:, :3], axis=1).max() <= reach + 1e-9
 
 
-def test_speeds_of_all_joints(named):
-    """Those that Pinocchio's forward kinematics gives, whatever the joints are."""
-    _, robot = named
-    model, rng, bench = robot.model, np.random.default_rng(3), Bench(build_scene(robot, []))
-    data = model.createData()
-    for _ in range(20):
-        q, v = random_q(robot, rng), rng.normal(size=model.nv)
-        bench.compute(q)
-        bench.assembler.clearance_lower_bound(v, 0, 0.01)
-        pin.forwardKinematics(model, data, q, v)
-        velocities = np.array([motion.vector for motion in data.v])
-        expected = np.linalg.norm(velocities[:, :3], axis=1)
-        expected += np.linalg.norm(velocities[:, 3:], axis=1) * bench.query.table.joint_radius
-        np.testing.assert_allclose(bench.query.arrays.speeds[: model.njoints], expected, atol=1e-12)
-
-
 def test_a_run_from_file_to_log(named, tmp_path):
     name, robot = named
     q0 = robot.home
@@ -128,28 +112,6 @@ def test_a_run_from_file_to_log(named, tmp_path):
     controller, q = Controller.from_scenario(load_scenario(str(tmp_path / "run.yaml")))
     wish = 1e-3 * np.arange(robot.model.nv)
     np.testing.assert_array_equal(controller.filter(q, wish).v, wish)
-
-
-def test_a_locked_part_of_each(named):
-    """Locking keeps tools where they are, and rows are those of the coordinates that are left."""
-    name, robot = named
-    q = random_q(robot, np.random.default_rng(3), 0.3)
-    pattern = {"mimic": "l_gripper_l_*", "continuous": "*joint_1", "planar": "root_joint", "floating": "root_joint"}[
-        name
-    ]
-    locked, q_left = robot.lock([pattern], q, "test")
-    assert locked.model.nv < robot.model.nv
-    places = []
-    for part, at in ((robot, q), (locked, q_left)):
-        data = part.model.createData()
-        pin.framesForwardKinematics(part.model, data, at)
-        places.append(data.oMf[part.model.getFrameId(TOOLS[name])])
-    np.testing.assert_allclose(places[0].homogeneous, places[1].homogeneous, atol=1e-12)
-    tasks = build_tasks([config.Task(frame=TOOLS[name])], locked, q_left)
-    solution = Controller(build_scene(locked), tasks).step(
-        q_left, targets={TOOLS[name]: Sample.at(places[0].translation + 0.01)}
-    )
-    assert solution.status.value != "STOPPED" and solution.v.shape == (locked.model.nv,)
 
 
 # Joints that follow others

@@ -15,8 +15,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from conftest import EXAMPLES
-from test_robot import STL
-from urdfs import BASE, HEAD, LIMITS, ROD, SEEN_ROD, arm, write
+from urdfs import BASE, HEAD, LIMITS, ROD, SEEN_ROD, arm, write, write_stl
 
 from qpavoid import ConfigError, Robot
 from qpavoid.config.shipped import shipped_names
@@ -364,7 +363,7 @@ def checkout(tmp_path):
     folder = tmp_path / "checkout_of_my_robot"
     for name in ("urdf", "meshes"):
         (folder / name).mkdir(parents=True)
-    (folder / "meshes" / "box.stl").write_text(STL)
+    write_stl(folder / "meshes" / "box.stl")
     mesh = '<collision><geometry><mesh filename="package://my_description/meshes/box.stl"/></geometry></collision>'
     return write(folder / "urdf", arm(forearm=mesh, b=mesh))
 
@@ -414,7 +413,7 @@ def test_pointer_of_git_lfs_is_called_one(tmp_path):
 
 @pytest.mark.parametrize(("scale", "message"), [(1000, "is 100 m across"), (0.001, "is 0.1 mm across")])
 def test_mesh_of_implausible_size_is_named(tmp_path, scale, message):
-    (tmp_path / "part.stl").write_text(STL)
+    write_stl(tmp_path / "part.stl")
     mesh = f'<collision><geometry><mesh filename="part.stl" scale="{scale} {scale} {scale}"/></geometry></collision>'
     _, (line,) = load(write(tmp_path, arm(b=mesh)))
     assert f"mesh b_0: {message}" in line and "scale" in line
@@ -438,7 +437,7 @@ OUTER = {
 @pytest.mark.parametrize(("inner", "first"), [("mesh", True), ("box", False)])
 def test_shape_inside_another_of_its_link_is_left_out(tmp_path, outer, inner, first):
     """And only that: moved out of it, both count."""
-    (tmp_path / "part.stl").write_text(STL)
+    write_stl(tmp_path / "part.stl")
     shape = '<mesh filename="part.stl"/>' if inner == "mesh" else '<box size=".1 .1 .1"/>'
     small = '<collision><origin xyz="0 0 {}"/><geometry>' + shape + "</geometry></collision>"
     large = f"<collision><geometry>{OUTER[outer]}</geometry></collision>"
@@ -453,7 +452,7 @@ def test_shape_inside_another_of_its_link_is_left_out(tmp_path, outer, inner, fi
 
 
 def test_same_shape_twice_is_kept_once_and_a_mixture_is_named(tmp_path):
-    (tmp_path / "part.stl").write_text(STL)
+    write_stl(tmp_path / "part.stl")
     mesh = '<collision><geometry><mesh filename="part.stl"/></geometry></collision>'
     robot, _ = load(write(tmp_path, arm(forearm=ROD * 3, b=mesh * 2)))
     assert shapes(robot) == {"base": ["Box"], "forearm": ["Cylinder"], "b": ["Convex"]}
@@ -464,7 +463,7 @@ def test_same_shape_twice_is_kept_once_and_a_mixture_is_named(tmp_path):
 
 
 def test_hull_of_a_listed_body_may_lie_inside_another_shape(tmp_path):
-    (tmp_path / "part.stl").write_text(STL)
+    write_stl(tmp_path / "part.stl")
     mesh = '<collision><geometry><mesh filename="part.stl"/></geometry></collision>'
     large = '<collision><geometry><box size="1 1 1"/></geometry></collision>'
     body = {"name": "hand", "frame": "b", "shape": {"type": "hull", "geometry": "b_1"}}
@@ -495,7 +494,7 @@ def test_fields_replace_those_of_a_robot_file(tmp_path):
 
 
 def test_meshes_as_bodies_warn_with_cost_and_remedy(tmp_path):
-    (tmp_path / "part.stl").write_text(STL)
+    write_stl(tmp_path / "part.stl")
     mesh = '<collision><geometry><mesh filename="part.stl"/></geometry></collision>'
     path = write(tmp_path, arm(forearm=mesh, b=mesh))
     robot, (message,) = load(path, bodies="mesh")

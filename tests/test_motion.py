@@ -238,14 +238,6 @@ def test_twist_of_waypoints(positions, rpys, profile, s, piece):
     assert_twist_is_rate_of_pose(motion, times[piece] + s * (times[piece + 1] - times[piece]))
 
 
-@given(normal=direction, radius=st.floats(0.01, 1), period=st.floats(1, 20), turns=st.floats(0.01, 0.99))
-def test_twist_of_a_circle(normal, radius, period, turns):
-    if np.linalg.norm(normal[1:]) < 1e-3:
-        return
-    motion = build(type="circle", center=(0, 0, 1), radius=radius, normal=normal, period=period, turns=1)
-    assert_twist_is_rate_of_pose(motion, turns * period)
-
-
 @given(
     positions=st.lists(point, min_size=4, max_size=4),
     rpys=st.lists(point, min_size=4, max_size=4),

@@ -97,17 +97,6 @@ def test_joint_order_and_limits(model: Any) -> None:
     np.testing.assert_array_equal(model.upperEffortLimit, 100.0)
 
 
-def test_frames_at_zero_are_parallel_to_the_world_and_sit_in_the_joint_centres(model: Any) -> None:
-    shoulder, elbow, wrist, tool = L0, L0 - L2, L0 - L2 - L3, L0 - L2 - L3 - L4
-    heights = dict(enumerate([shoulder] * 3 + [elbow] * 2 + [wrist] * 2, start=1))
-    for side, y in (("left", L1), ("right", -L1)):
-        frames = {f"{side}_link{i}": height for i, height in heights.items()} | {f"{side}_tool": tool}
-        for frame, height in frames.items():
-            expected = np.eye(4)
-            expected[:3, 3] = [0.0, y, height]
-            np.testing.assert_allclose(frame_pose(model, frame, np.zeros(14)), expected, rtol=0, atol=ATOL)
-
-
 @pytest.mark.parametrize("side", SIDES)
 def test_tool_pose_and_jacobian_are_those_of_the_product_of_exponentials(model: Any, side: str) -> None:
     arm = slice(0, 7) if side == "left" else slice(7, 14)

@@ -20,10 +20,8 @@ from qpavoid import (
     Status,
     Voxels,
     build_scene,
-    kernels,
 )
 from qpavoid.config import PointCloud
-from qpavoid.kernels.voxels import SAME_DIRECTION
 from qpavoid.model.cloud import read_points, voxel_radius
 
 CLOUD = PointCloud()
@@ -163,62 +161,6 @@ def test_voxel_rows_agree_with_finite_differences(panda, tmp_path):
             assert found.feedforward[row] == pytest.approx(rate[body], abs=1e-4)
             checked += 1
     assert checked > 5
-
-
-def by_definition(point, distance, place, size, spacing):
-    """Numbers of the voxels that get slots."""
-    order, chosen = np.argsort(distance, kind="stable"), []
-
-    def alike(i, j):
-        return abs(place[i, 0] - place[j, 0]) < spacing and np.linalg.norm(place[i, 1:] - place[j, 1:]) < SAME_DIRECTION
-
-    for i in order:
-        if len(chosen) < (size + 1) // 2 and all(abs(place[i, 0] - place[j, 0]) >= spacing for j in chosen):
-            chosen.append(i)
-    for i in order:
-        if len(chosen) < size and i not in chosen and not any(alike(i, j) for j in chosen):
-            chosen.append(i)
-    return point[chosen].tolist()
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_nearest_voxels_of_bodies_by_their_definition(seed):
-    rng = np.random.default_rng(seed)
-    voxels = Voxels.of(scattered(rng, 1 if seed == 0 else 600), 0.03)
-    axes, radii = rng.uniform(-0.5, 0.5, (5, 6)), rng.uniform(0.05, 0.1, 5)
-    axes[1, 3:], axes[3] = axes[1, :3], np.nan  # a sphere, and a body that is not looked at
-    kept0 = np.full((5, 6), -1)
-    if len(voxels.keys) > 10:
-        kept0[:, 2:4] = rng.choice(voxels.keys, (5, 2))
-    room = 5 * len(voxels.centers)
-    first, point = np.zeros(6, dtype=np.intp), np.zeros(room, dtype=np.intp)
-    distance, place = np.zeros(room), np.zeros((room, 4))
-    reach = 0.2 if seed else np.inf
-    kernels.voxels_within(
-        axes, radii, reach, voxels.centers, voxels.blocks, voxels.starts, first, point, distance, place
-    )
-    count, kept, slots = first[-1], kept0.copy(), np.zeros((5, 6), dtype=np.intp)
-    for body in range(5):  # by definition
-        a, b = axes[body, :3], axes[body, 3:]
-        mine = point[first[body] : first[body + 1]]
-        if np.isnan(a).any():
-            assert not len(mine)
-            continue
-        share = np.clip((voxels.centers - a) @ (b - a) / max((b - a) @ (b - a), 1e-300), 0.0, 1.0)
-        away = voxels.centers - a - share[:, None] * (b - a)
-        gap = np.linalg.norm(away, axis=1) - radii[body]
-        np.testing.assert_array_equal(np.sort(mine), np.flatnonzero(gap < reach))
-        np.testing.assert_allclose(distance[first[body] : first[body + 1]], gap[mine], atol=1e-12)
-        places = np.column_stack((share * np.linalg.norm(b - a), away / np.linalg.norm(away, axis=1)[:, None]))
-        np.testing.assert_allclose(place[first[body] : first[body + 1]], places[mine], atol=1e-12)
-    before = point[:count].copy(), distance[:count].copy(), place[:count].copy()
-    kernels.select_voxels(first, point, distance, place, np.full(5, 0.2), voxels.keys, slots, kept)
-    for body in range(5):
-        rows = slice(first[body], first[body + 1])
-        assert set(slots[body]) - {-1} == set(by_definition(*(x[rows] for x in before), 6, 0.2))
-        for slot in range(6):
-            if slots[body, slot] >= 0 and voxels.keys[slots[body, slot]] in kept0[body]:
-                assert kept0[body, slot] == kept[body, slot]
 
 
 # --- in the loop -------------------------------------------------------------------------------------------------

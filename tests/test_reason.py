@@ -88,16 +88,6 @@ def test_reasons_of_a_run_are_the_same_in_json_and_log(cli):
     assert (log.severity[log.stalled] >= Severity.WARNING).all()
 
 
-def test_log_with_an_unknown_severity_is_refused(cli, tmp_path):
-    document = json.loads(cli("run", "situation1", "--set", "duration=0.05", "--json", "--no-figures").stdout)
-    with np.load(document["files"][0]) as file:
-        arrays = dict(file)
-    arrays["severity"][:] = len(Severity) + 1
-    np.savez(tmp_path / "bad.npz", **arrays)
-    with pytest.raises(Exception, match="severity points past the 4 that there are"):
-        Log.load(tmp_path / "bad.npz")
-
-
 # --- what each severity means ------------------------------------------------------------------------------------
 
 
@@ -172,10 +162,3 @@ def test_slack_within_the_tolerance_of_the_qp_is_no_relaxation(solver):
         assert solution.status is Status.RELAXED
         rows = [reason for reason in solution.reasons if reason.kind is ReasonKind.ROW_RELAXED]
         assert sum(reason.amount for reason in rows) == pytest.approx(gap, abs=5e-6)
-
-
-def test_solution_with_times_changes_the_two_times_alone():
-    """Whatever fields a solution has: they are passed by position."""
-    solution = Solution(*[object() for _ in Solution._fields])
-    timed = solution.with_times(1.0, 2.0)
-    assert timed == solution._replace(build_time=1.0, solve_time=2.0)

@@ -4,20 +4,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from conftest import EXAMPLES, random_q, write_chain
+from urdfs import write_stl
 
 from qpavoid import ConfigError, Controller, Robot, UnknownName, load_scenario
-
-STL = "solid a\n{}endsolid a\n".format(
-    "".join(
-        f"facet normal 0 0 0\nouter loop\nvertex {a}\nvertex {b}\nvertex {c}\nendloop\nendfacet\n"
-        for a, b, c in (
-            ("0 0 0", "0 .1 0", ".1 0 0"),
-            ("0 0 0", ".1 0 0", "0 0 .1"),
-            ("0 0 0", "0 0 .1", "0 .1 0"),
-            (".1 0 0", "0 .1 0", "0 0 .1"),
-        )
-    )
-)
 
 
 def body_poses(robot, q):
@@ -62,7 +51,7 @@ def test_mesh_is_found_in_package_dirs_and_along_ros_package_path(tmp_path, monk
     folder, mesh = tmp_path / "robot", tmp_path / "packages" / "parts" / "meshes" / "a.stl"
     mesh.parent.mkdir(parents=True)
     folder.mkdir()
-    mesh.write_text(STL)
+    write_stl(mesh)
     urdf = write_chain(folder, shape='<mesh filename="package://parts/meshes/a.stl"/>')
     with pytest.raises(ConfigError):
         Robot.from_urdf(urdf)
@@ -144,16 +133,6 @@ def test_lock_leaves_every_pose_where_it_is(name, request):
         np.testing.assert_allclose(pose, expected[body], atol=1e-12)
 
 
-def test_locked_robot_keeps_home_and_limits_of_what_is_left(panda):
-    locked, q = panda.lock(["panda_joint[24]"], panda.home, "lock")
-    left = [0, 2, 4, 5, 6]
-    np.testing.assert_array_equal(locked.home, panda.home[left])
-    np.testing.assert_array_equal(q, panda.home[left])
-    np.testing.assert_array_equal(locked.bounds().upper, panda.bounds().upper[left])
-    np.testing.assert_array_equal(locked.bounds().velocity, panda.bounds().velocity[left])
-    assert panda.model.nq == 7  # the robot itself has not changed
-
-
 def test_patterns_of_a_lock(paper):
     locked, _ = paper.lock(["right_joint1", "right_*", "*_joint[12]"], paper.home, "lock")
     assert locked.joint_names == [f"left_joint{i}" for i in range(3, 8)]
@@ -203,12 +182,6 @@ def test_unknown_names_at_run_time(panda):
         Robot.load("pandaa")
 
 
-def test_two_bodies_of_one_name(tmp_path):
-    body = {"name": "a", "frame": "link1", "shape": {"type": "sphere", "radius": 0.1}}
-    with pytest.raises(ConfigError, match=r"bodies\.1\.name: 'a' is given twice: names must differ"):
-        Robot.from_urdf(write_chain(tmp_path), bodies=[body, body])
-
-
 def test_missing_urdf(tmp_path):
     (tmp_path / "robot.yaml").write_text("name: x\nurdf: none.urdf\n")
     with pytest.raises(
@@ -229,24 +202,6 @@ def test_broken_urdf_is_one_line_and_nothing_else(tmp_path, capfd, text):
         Robot.from_urdf(path)
     assert "\n" not in str(error.value)
     assert capfd.readouterr() == ("", "")
-
-
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ("bodie: capsule", r"bodie: unknown key; did you mean 'bodies'\?"),
-        (
-            "limits: {position: {joint1: [1, -1]}}",
-            r"limits: position of 'joint1': needs lower < upper, got 1\.0, -1\.0",
-        ),
-        ("limits: {position: {joint1: [0.3, 0.3]}}", r"needs lower < upper, got 0\.3, 0\.3; see `lock`"),
-    ],
-)
-def test_robot_file_names_file_and_field(tmp_path, line, message):
-    path = tmp_path / "robot.yaml"
-    path.write_text(f"name: x\nurdf: chain.urdf\n{line}\n")
-    with pytest.raises(ConfigError, match=rf"robot\.yaml: .*{message}"):
-        Robot.load(str(path))
 
 
 def test_position_limits_of_a_joint_that_cannot_have_them(tmp_path):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from conftest import EXAMPLES, write_chain
-from test_robot import STL
+from urdfs import write_stl
 
 from qpavoid import Robot, load_scenario
 from qpavoid.config import RobotConfig
@@ -75,7 +75,7 @@ def test_missing_meshes_are_named_with_where_they_were_looked_for(cli, tmp_path)
     assert "collision meshes are missing, such as 'package://arm/hand.stl'; looked for in" in result.stdout
     assert str(tmp_path) in result.stdout and "--package-dir" in result.stdout
     (tmp_path / "elsewhere" / "arm").mkdir(parents=True)
-    (tmp_path / "elsewhere" / "arm" / "hand.stl").write_text(STL)
+    write_stl(tmp_path / "elsewhere" / "arm" / "hand.stl")
     assert cli("robot", "check", urdf, "--package-dir", tmp_path / "elsewhere").status == 0
     assert cli("robot", "check", urdf, "--package", f"arm={tmp_path}/elsewhere/arm").status == 0
     assert "left out" in cli("robot", "check", urdf, "--allow-missing-meshes").stdout
@@ -255,7 +255,7 @@ def test_added_base_has_the_speed_limit_that_was_assumed(cli, tmp_path, root, si
 def test_shipped_robots_are_as_they_were_written_and_ready(name):
     robot = Robot.load(name)
     assert not touching(robot, robot.home, 0.005)
-    assert robot.end_effectors and robot.always_touching == ()
+    assert robot.end_effectors and robot.always_touching == []
     report = check_robot(name)
     warned = [note for note in report.notes if note.severity == "warning"]
     assert report.usable and all("a control step takes" in note.what for note in warned)  # that depends on the machine

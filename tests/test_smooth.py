@@ -8,7 +8,7 @@ import pinocchio as pin
 import pytest
 from closed_loop import accelerations, cartesian, changed, drive, make_controller
 
-from qpavoid import Avoidance, Obstacle, Robot, Sample, load_scenario
+from qpavoid import Avoidance, Obstacle, Robot, Sample
 from qpavoid.config import Beta, Box, Capsule, Sphere
 from qpavoid.run.simulate import simulate
 
@@ -24,13 +24,6 @@ def run(name, solver, acceleration=None):
     return simulate(changed(name, limits=limits) if acceleration else name, solver)
 
 
-@cache
-def damped(name):
-    """The QP with damper rows for 20 mm."""
-    avoidance = load_scenario(name).avoidance.model_dump() | {"d1": 0.12, "row": {"type": "beta", "near_speed": 10.0}}
-    return simulate(changed(name, avoidance=avoidance), "qp")
-
-
 @pytest.mark.parametrize("acceleration", [2.0, 10.0])
 @pytest.mark.parametrize("name", ["situation1", "situation2"])
 def test_qp_keeps_accelerations_in_the_papers_situations(name, acceleration):
@@ -39,17 +32,6 @@ def test_qp_keeps_accelerations_in_the_papers_situations(name, acceleration):
     assert accelerations(log.v, 0.01).max() <= acceleration + 1e-6
     assert log.metrics()["status_counts"]["RELAXED"] == log.metrics()["status_counts"]["STOPPED"] == 0
     assert log.metrics()["min_distance"] > 0.02 - 5e-4
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "ratio"), [("situation1", 1.0), ("situation2", 1.5)])
-def test_qp_jitter_is_of_the_order_of_eq10(name, ratio):
-    """Σ|Δq̇| of damper rows against eq. 10: 9.7 to 11.1 in the first situation, 9.4 to 6.4 in the second. Rows with the
-    gains of eq. 10, which keep four times the distance and more, make it 13.5 and 11.7.
-    """
-    of_eq10 = run(name, "eq10").metrics()["jitter"]
-    assert damped(name).metrics()["jitter"] <= ratio * of_eq10
-    assert run(name, "qp").metrics()["jitter"] <= (ratio + 0.4) * of_eq10
 
 
 def witnesses(ticks):
@@ -89,7 +71,7 @@ def test_accelerations_are_kept_when_witness_points_jump(tmp_path, case, row):
     robot = Robot.from_urdf(tmp_path / "cartesian.urdf", bodies=[body], limits=limits)
     slab, at = rocking(Box(size=(1.0, 1.0, 0.1)))
     controller = make_controller(robot, [slab], "z", avoidance=ROWS[row])
-    ticks = list(drive(controller, np.array([0.0, 0.0, 0.05]), 600, target=[0.0, 0.0, -0.1], obstacles=at))
+    ticks = list(drive(controller, np.array([0.0, 0.0, 0.05]), 350, target=[0.0, 0.0, -0.1], obstacles=at))
     assert accelerations([tick.solution.v for tick in ticks], 0.01).max() <= 4.0 + 1e-6
     assert min(tick.proximity.distance.min(initial=np.inf) for tick in ticks) > 0.02 - 1e-3
     assert witnesses(ticks) > jump

@@ -10,7 +10,6 @@ from qpavoid import Problem, ReasonKind, Severity, Status, UnknownName, kernels,
 from qpavoid.config import Eq10Solver
 from qpavoid.errors import SolverNotInstalled
 from qpavoid.problem import AvoidanceRows, Tracking, make_problem
-from qpavoid.solvers import qp
 from qpavoid.solvers.backends import make_backend
 
 
@@ -208,33 +207,6 @@ def test_acceleration_limits_relax_before_contact_and_other_limits_never(backend
     assert solution.severity is (Severity.ALARM if contact else Severity.WARNING)
     assert np.all(np.abs(solution.v) <= 2.0)
     assert solution.slack[0] == pytest.approx(0.2 - feedforward - v, abs=1e-4)
-
-
-def fail(*_):
-    raise RuntimeError("no licence")
-
-
-ANSWERS = [lambda *_: None, lambda *_: np.full(NV, np.nan), lambda *_: np.full(NV, 1e3), lambda *_: np.zeros(2), fail]
-
-
-@pytest.mark.parametrize("answer", ANSWERS)
-def test_a_failing_or_wrong_back_end_is_replaced_then_stops(answer, monkeypatch):
-    problem = random_problem(7, pairs=2)
-    rows = problem.avoidance
-    problem = with_rows(problem, b=rows.J @ problem.v_tracking + 1.0)._replace(v_stop=np.full(NV, 0.05))
-    for relaxed in (problem, squeezed((0.145, 0.175))._replace(v_stop=problem.v_stop)):
-        expected = make_solver("qp:daqp").solve(relaxed)
-        with monkeypatch.context() as patch:
-            patch.setattr(qp, "make_backend", lambda name: answer)
-            solution = make_solver("qp:quadprog").solve(relaxed)
-            assert (solution.status, solution.reasons) == (expected.status, expected.reasons)
-            np.testing.assert_allclose(solution.v, expected.v, atol=1e-9)
-            patch.setattr(qp, "solve_daqp", answer)
-            patch.setattr(kernels, "project_soft", lambda *_: (np.zeros(NV), False))
-            solution = make_solver("qp:quadprog").solve(relaxed)
-        assert solution.status is Status.STOPPED
-        assert [reason.kind for reason in solution.reasons] == [ReasonKind.SOLVER_FAILED]
-        np.testing.assert_array_equal(solution.v, 0.05)
 
 
 def test_unknown_and_missing_solvers_are_named():

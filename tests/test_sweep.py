@@ -164,25 +164,24 @@ def test_store_row_round_trip(tmp_path):
         store.add("runs", row)
         assert read_runs(tmp_path).to_dict("records") == [row]
         store.add("runs", {**row, "jerk": 7.0})
-        store.add("runs", {**row, "case": "other", "jerk": float("nan")})
+        with Store(tmp_path) as second:  # another process may write meanwhile
+            second.add("runs", {**row, "case": "other", "jerk": float("nan")})
     runs = read_runs(tmp_path)
     assert runs.iloc[:1].to_dict("records") == [row] and np.isnan(runs["jerk"][1]) and len(runs) == 2
     assert list((tmp_path).iterdir()) == [tmp_path / FILE]
 
 
-def test_store_keeps_rows_of_a_killed_writer(tmp_path):
-    """Rows are there the moment that `add` returns; two writers may add at a time."""
-    writer = (
-        "import os, signal, sys; from pathlib import Path; from qpavoid_bench.arena.store import Store\n"
-        "store, row = Store(Path(sys.argv[1])), eval(sys.argv[2])\n"
-        "for n in range(20): store.add('runs', {**row, 'case': str(n)})\n"
-        "os.kill(os.getpid(), signal.SIGKILL)"
-    )
-    with Store(tmp_path) as store:
-        command = [sys.executable, "-c", writer, str(tmp_path), repr(row_of())]
-        assert subprocess.run(command, env=ENVIRONMENT, check=False).returncode == -signal.SIGKILL
-        store.add("runs", row_of(case="ours"))
-    assert read_runs(tmp_path)["case"].to_list() == [*map(str, range(20)), "ours"]
+def test_store_errors_name_file_and_remedy(tmp_path):
+    with pytest.raises(ConfigError, match="no results here"):
+        read_runs(tmp_path)
+    (tmp_path / FILE).write_text("not a database, though long enough to be one" * 100)
+    with pytest.raises(ConfigError, match=rf"{FILE}.*move the damaged file away"):
+        read_runs(tmp_path)
+    with pytest.raises(ConfigError, match=rf"give a folder that can be written, with no damaged {FILE} in it"):
+        Store(tmp_path)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match=r"file: .*give a folder that can be written"):
+        Store(tmp_path / "file")
 
 
 # --- what is missing ---------------------------------------------------------------------------------------------
@@ -242,11 +241,12 @@ def test_digest_changes_with_settings_and_families(folder):
 
 
 def test_suites_that_ship():
+    """The two large ones together have all families with a proof, and all entrants."""
     assert all(load_suite(name).seeds for name in shipped_names("suite"))
-    full = load_suite("full")
-    proved = [name for name in shipped_names("family") if load_family(name).config.proved]
-    assert sorted(family.name for family in full.families) == proved
-    assert {entrant.name for entrant in full.entrants + full.absent} == set(ENTRANTS)
+    large = [load_suite(name) for name in ("full", "teleoperation")]
+    proved = {name for name in shipped_names("family") if load_family(name).config.proved}
+    assert {family.name for suite in large for family in suite.families} == proved
+    assert {entrant.name for suite in large for entrant in suite.entrants + suite.absent} == set(ENTRANTS)
 
 
 def test_suite_selects_entrants(folder, monkeypatch):
@@ -263,9 +263,9 @@ def test_suite_selects_entrants(folder, monkeypatch):
     case = make_case(load_family(folder / "post.yaml"), 0)
     controller = chosen.entrants[0].start(case, build_world(case.scenario))
     assert controller.avoidance == case.scenario.avoidance.model_copy(update={"d2": 0.3})  # and nothing else
-    with pytest.raises(ConfigError, match="--solvers: entrant 'absent' needs no_such_package"):
+    with pytest.raises(ConfigError, match=r"--solvers: entrant 'absent' .*needs no_such_package"):
         load_suite(path, ["absent"])
-    with pytest.raises(ConfigError, match="none can take part: absent needs no_such_package"):
+    with pytest.raises(ConfigError, match=r"none can take part: absent .*no_such_package"):
         load_suite(write_suite(folder, ["absent"]))
 
 
@@ -335,7 +335,7 @@ def test_sweep_in_processes(folder):
         assert swept(suite, folder / "out", workers)[1:] == (8, 8, 0, 0)
     assert not plan_of(suite, folder / "out").runs
     runs = {row["entrant"]: row for row in rows_in(folder)}
-    timed = {"tick_p50", "tick_p99", "seconds"}
+    timed = {"tick_p50", "tick_p99", "tick_max", "seconds"}
     case = make_case(load_family(folder / "post.yaml"), 0)
     for entrant in suite.entrants[:6]:
         alone, row = run_trial(case, entrant).row(), runs[entrant.name]
@@ -513,15 +513,6 @@ def test_bench_without_extra_names_remedy(cli, monkeypatch):
     result = cli("bench", "list")
     assert result.status == 2
     assert result.lines == ["error: qpavoid bench needs distributed, pandas: pip install 'qpavoid[arena]'"]
-
-
-def test_cli_does_not_import_arena_dependencies():
-    """The rest of the command line brings nothing of the arena in."""
-    code = (
-        "import sys, qpavoid.cli; names = {'distributed', 'pandas', 'mujoco', 'matplotlib', 'qpavoid_bench'}; "
-        "sys.exit(bool(names & sys.modules.keys()))"
-    )
-    assert subprocess.run([sys.executable, "-c", code], check=False, timeout=300).returncode == 0
 
 
 # --- what must hold of any results -------------------------------------------------------------------------------

@@ -74,12 +74,6 @@ def test_task_switching_row_uses_up_no_more_than_the_distance_in_a_step():
     assert found == pytest.approx(-(0.32 - D1) / 0.01)
 
 
-def test_task_switching_row_includes_the_velocity_of_the_obstacle():
-    """ḋ = J v + drift: a sphere that comes at 0.3 m/s on a robot at rest is an approach of 0.3 m/s."""
-    x = rows(np.array([0.24]), np.ones((1, 1)), [0.0], feedforward=-0.3)
-    assert x.rhs[0] == pytest.approx(formula(0.24, -0.3) + 0.3)
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_task_switching_row_by_its_formula(seed):
     rng = np.random.default_rng(seed)

@@ -1,4 +1,19 @@
-"""URDFs of a small arm, with faults: base, forearm and b in a row, turned by j1 and j2 about y."""
+"""URDFs of a small arm, with faults: base, forearm and b in a row, turned by j1 and j2 about y; and STL files."""
+
+import numpy as np
+
+CORNERS = np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
+TETRAHEDRON = CORNERS[[[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]]
+"""Triangles (4, 3, 3) [m]."""
+
+
+def write_stl(path, triangles=TETRAHEDRON):
+    """A file of triangles (t, 3, 3), and its path."""
+    facets = ("".join(f"vertex {x:.9g} {y:.9g} {z:.9g}\n" for x, y, z in triangle) for triangle in triangles)
+    text = "".join(f"facet normal 0 0 0\nouter loop\n{vertices}endloop\nendfacet\n" for vertices in facets)
+    path.write_text(f"solid a\n{text}endsolid a\n")
+    return path
+
 
 BASE = '<collision><geometry><box size=".2 .2 .1"/></geometry></collision>'
 ROD = '<collision><origin xyz="0 0 .2"/><geometry><cylinder radius=".04" length=".3"/></geometry></collision>'

@@ -10,9 +10,8 @@ from pydantic import BaseModel, ValidationError
 
 from qpavoid.config import ScenarioConfig, expand_solver
 from qpavoid.config.explain import explain
+from qpavoid.config.files import parse_yaml, read_text
 from qpavoid.config.shipped import find_shipped
-from qpavoid.config.text import read_text
-from qpavoid.config.yaml_file import parse_yaml
 from qpavoid.errors import ConfigError
 
 Config = TypeVar("Config", bound=BaseModel)

@@ -69,6 +69,7 @@ class RowAssembler:
         self._step = self._compile()
         self._finds_pairs = self._forward.is_compiled and not self.query.has_clouds
         self._find = kernels.direct(kernels.find_near_pairs, self._packed, self._q)
+        self._assemble(self._q)  # compiled now, not in the first step in which coal has to compute a pair
         self.kinematics = Kinematics(x.J_world, x.poses)
         """World Jacobian and poses of the tracked frames in this step."""
 

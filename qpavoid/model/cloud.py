@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from qpavoid.config.text import read_text
+from qpavoid.config.files import read_text
 from qpavoid.errors import ConfigError, NumericalError
 from qpavoid.model.csv_poses import read_table
 from qpavoid.model.sample import Sample

@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid.config.base import LARGEST
-from qpavoid.config.text import read_text
+from qpavoid.config.files import read_text
 from qpavoid.errors import ConfigError
 from qpavoid.problem import Array
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from fnmatch import fnmatchcase
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -45,34 +45,19 @@ ALWAYS_TOUCHING = 0.95
 nearly every configuration protects nothing. The remaining 5 % leave out configurations with a joint at its limits."""
 
 
-class TouchingPair(NamedTuple):
-    """Two bodies that touch in nearly every configuration."""
-
-    a: str
-    b: str
-    fraction: float
-    """Share of random configurations in which they touch [-]."""
-
-    def note(self) -> Note:
-        """Return a note that the pair is not checked."""
-        clause = f"not checked: its bodies touch in {100.0 * self.fraction:.0f} % of random configurations"
-        return Note(NoteKind.PAIR, (self.a, self.b), clause, fraction=self.fraction)
-
-
-def drop_always_touching(model: Any, bodies: Any, bounds: JointBounds, samples: int = 200) -> list[TouchingPair]:
-    """Remove, and return, the pairs that touch in nearly every one of many random configurations, always the same.
+def drop_always_touching(model: Any, bodies: Any, bounds: JointBounds, notes: list[Note], samples: int = 200) -> None:
+    """Remove the pairs that touch in nearly every one of many random configurations, always the same; note each.
 
     Those are neighbours whose shapes overlap at the joint by design.
     """
     poses = Space(model, bounds).draw(np.random.default_rng(0), samples)
     fraction = find_contacts(model, bodies, poses, ALWAYS_TOUCHING).mean(axis=0)
     pairs, names = pair_array(bodies).tolist(), [body.name for body in bodies.geometryObjects]
-    dropped = []
     for index in np.flatnonzero(fraction >= ALWAYS_TOUCHING).tolist():
         a, b = pairs[index]
         bodies.removeCollisionPair(pin.CollisionPair(a, b))
-        dropped.append(TouchingPair(names[a], names[b], float(fraction[index])))
-    return dropped
+        clause = f"not checked: its bodies touch in {100.0 * fraction[index]:.0f} % of random configurations"
+        notes.append(Note(NoteKind.PAIR, (names[a], names[b]), clause, fraction=float(fraction[index])))
 
 
 def find_contacts(model: Any, bodies: Any, poses: Array, at_least: float = 0.0) -> Mask:

@@ -30,7 +30,7 @@ from qpavoid.model.kinematics import TRANSLATIONS
 from qpavoid.model.limits import JointBounds
 from qpavoid.model.notes import Note, NoteKind, issue_warning, merge_notes
 from qpavoid.model.packages import absolute_entries
-from qpavoid.model.pairs import TouchingPair, add_self_pairs, drop_always_touching, pair_array
+from qpavoid.model.pairs import add_self_pairs, drop_always_touching, pair_array
 from qpavoid.model.robot_bodies import pair_margins, robot_bodies
 from qpavoid.model.urdf import apply_srdf, find_resource, is_mjcf, read_model
 from qpavoid.model.urdf_tree import joints_fixed_by_limits
@@ -53,8 +53,6 @@ class Robot:
     """Frames that are meant as tools."""
     source: str
     """File that it was read from, for messages."""
-    always_touching: tuple[TouchingPair, ...] = ()
-    """Pairs of bodies that were disabled at loading, because they touch in nearly every configuration."""
     margins: Mapping[frozenset[str], float] = field(default_factory=dict)
     """Two bodies: safety distance of their own, where it is less than the scenario's [m]."""
     acceleration: Mapping[str, float] = field(default_factory=dict)
@@ -156,7 +154,7 @@ class Robot:
         add_self_pairs(model, bodies, config.disabled_pairs, str(path))
         if config.srdf is not None:
             apply_srdf(model, bodies, find_resource(config.srdf, path.parent, f"{path}: srdf"))
-        always_touching = drop_always_touching(model, bodies, joint_bounds(model))
+        drop_always_touching(model, bodies, joint_bounds(model), notes)
         robot = cls(
             name=config.name,
             model=model,
@@ -164,17 +162,20 @@ class Robot:
             home=home,
             end_effectors=ends,
             source=str(path),
-            always_touching=tuple(always_touching),
             margins=pair_margins(config, bodies, path),
             acceleration=config.limits.acceleration,
             jerk=config.limits.jerk,
             urdf=urdf,
             package_dirs=tuple(absolute_entries(config.package_dirs, path.parent)),
         )
-        notes += [*(pair.note() for pair in always_touching), *robot.notes_of_home(is_given=bool(config.home))]
-        notes = merge_notes(notes)
+        notes = merge_notes([*notes, *robot.notes_of_home(is_given=bool(config.home))])
         issue_warning(notes, str(path))
         return replace(robot, notes=tuple(notes))
+
+    @property
+    def always_touching(self) -> list[tuple[str, ...]]:
+        """Pairs of bodies that were disabled at loading, because they touch in nearly every configuration."""
+        return [note.subject for note in self.notes if note.kind is NoteKind.PAIR]
 
     @property
     def joint_names(self) -> list[str]:

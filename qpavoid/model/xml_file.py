@@ -12,9 +12,9 @@ from xml.sax.xmlreader import AttributesImpl, InputSource
 import defusedxml.sax
 from defusedxml import DefusedXmlException
 
-from qpavoid.config.text import read_text
+from qpavoid.config.files import read_text
 from qpavoid.errors import ConfigError
-from qpavoid.model.xacro import expand_xacro, is_xacro
+from qpavoid.model.packages import find_package, mesh_folders
 
 _LARGEST = 10_000_000
 """Size of a file [bytes]; humanoids take 200 000."""
@@ -34,8 +34,8 @@ def read_robot_xml(path: Path, kind: str) -> ET.Element:
     where = f"{path}: not a usable {kind}"
     try:
         root = _parse(text)
-        if is_xacro(path, text):
-            root = _parse(expand_xacro(path))
+        if path.suffix == ".xacro" or "<xacro:" in text:
+            root = _parse(_expand_xacro(path))
     except DefusedXmlException:
         raise ConfigError(f"{where}: it has a <!DOCTYPE>; take it out, entities are not read") from None
     except SAXParseException as error:
@@ -87,3 +87,41 @@ class _Builder(ContentHandler):
 
     def characters(self, content: str) -> None:
         self.tree.data(content)
+
+
+def _expand_xacro(path: Path) -> str:
+    """Expand a file in xacro, the macro language of ROS, to a URDF, with the default of every argument.
+
+    `$(find NAME)` is looked up as `package://NAME` is, then by ROS where that is installed.
+
+    Raises:
+        ConfigError: the package `xacro` is not installed, or what it says is wrong with the file.
+    """
+    command = f"`xacro {path.name} > {path.name.partition('.')[0]}.urdf`"
+    try:
+        import xacro
+        from xacro import substitution_args
+    except ImportError:
+        raise ConfigError(
+            f"{path}: it is written in xacro: pip install xacro, or run {command} where ROS is installed"
+        ) from None
+    original, entries = substitution_args._eval_find, mesh_folders(path, [])
+
+    def find(name: str) -> str:
+        if (folder := find_package(name, entries)) is not None:
+            return folder
+        try:
+            return str(original(name))
+        except ImportError:
+            raise LookupError(f"no package {name!r} beside the file or along ROS_PACKAGE_PATH") from None
+
+    substitution_args._eval_find = find  # by itself, xacro asks only its own index of installed packages
+    try:
+        return str(xacro.process_file(str(path)).toxml())
+    except (Exception, SystemExit) as error:  # it evaluates Python, which may raise anything
+        reason = " ".join(f"{error}".split()) or type(error).__name__
+        raise ConfigError(
+            f"{path}: xacro: {reason}; mend it, or run {command} with the arguments that it needs and give the URDF"
+        ) from None
+    finally:
+        substitution_args._eval_find = original

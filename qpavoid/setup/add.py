@@ -285,5 +285,5 @@ def _oversized(robot: Robot, home: Array) -> set[str]:
     """Find the links of pairs that are too near at home, or touch in nearly every pose."""
     too_near = min(_HOME_NEAR * robot_size(robot), HOME_CLEARANCE * D1)
     link = pairs.links_of_bodies(robot)
-    near_pairs = [*robot.always_touching, *touching(robot, home, too_near)]
-    return {link[body] for a, b, _ in near_pairs for body in (a, b)}
+    near_pairs = [*robot.always_touching, *(pair[:2] for pair in touching(robot, home, too_near))]
+    return {link[body] for pair in near_pairs for body in pair}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -20,7 +20,6 @@ from qpavoid.config.shipped import find_robot
 from qpavoid.control.tasks import build_tasks
 from qpavoid.controller import Controller
 from qpavoid.errors import ConfigError, QpavoidError
-from qpavoid.geometry.bodies import convert_bodies, triangle_meshes
 from qpavoid.model.end_effectors import end_effectors
 from qpavoid.model.notes import SEVERITIES, Note, NoteKind, RobotWarning, abbreviate
 from qpavoid.model.packages import absolute_entries, find_mesh, mesh_folders
@@ -132,22 +131,12 @@ def _report(config: RobotConfig, path: Path, progress: Callable[[str], None]) ->
     report.notes += joint_notes(report.joints, config)
     if robot is not None:
         report.notes += robot.notes
-        _check_built_robot(report, _with_hulls(robot), pieces, progress)
+        _check_built_robot(report, robot, pieces, progress)
     if massless := sum(inertia.mass <= 0.0 for inertia in list(model.inertias)[1:]):
         clause = f"{massless} moving links have no mass"
         report.add("note", NoteKind.LINK, (), clause, "none is needed unless torques are asked for")
     report.notes.sort(key=lambda note: SEVERITIES.index(note.severity))
     return report
-
-
-def _with_hulls(robot: Robot) -> Robot:
-    """Replace each triangle mesh by its convex hull: meshes cost up to ms a pair; few robots are run with them."""
-    if not triangle_meshes(robot.bodies):
-        return robot
-    bodies = convert_bodies(robot.bodies, "convex")
-    for pair in robot.bodies.collisionPairs:
-        bodies.addCollisionPair(pair)
-    return replace(robot, bodies=bodies)
 
 
 def _check_geometry(report: Report, config: RobotConfig, path: Path, urdf: Path, model: Any) -> list[Piece]:

@@ -79,7 +79,7 @@ def pair_reasons(
     (m,).
     """
     parents = robot.model.parents
-    touching = {frozenset(pair[:2]) for pair in robot.always_touching}
+    touching = set(map(frozenset, robot.always_touching))
     numbers = {pair: i for i, pair in enumerate(_named_pairs(robot))}
     reasons: dict[frozenset[str], Reason] = {}
     for body, other in combinations(robot.bodies.geometryObjects, 2):

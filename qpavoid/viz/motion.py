@@ -44,7 +44,7 @@ def motion_figure(log: Log) -> Figure:
         ax.view_init(_ELEVATION, _AZIMUTH)
         _draw(ax, log, int(step), lower, upper)
         ax.set(xlim=(lower[0], upper[0]), ylim=(lower[1], upper[1]), zlim=(lower[2], upper[2]))
-        ax.set_box_aspect(upper - lower)
+        ax.set_box_aspect(upper - lower, zoom=1.2)
         closest_mark = " (closest)" if step == closest else ""
         ax.set_title(f"t = {log.t[step]:.2f} s{closest_mark}", fontsize=10, pad=0)
         for axis, name, size in zip((ax.xaxis, ax.yaxis, ax.zaxis), "xyz", upper - lower, strict=True):

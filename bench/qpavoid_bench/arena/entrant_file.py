@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from qpavoid import Controller, Solver
-from qpavoid.config.text import read_text
+from qpavoid.config.files import read_text
 from qpavoid.errors import ConfigError
 from qpavoid.model.sample import Sample
 from qpavoid.problem import Array, Problem, Solution, require_finite

@@ -12,9 +12,9 @@ from typing import Annotated, Any
 from pydantic import Field, model_validator
 
 from qpavoid.config.base import Block
+from qpavoid.config.files import read_text
 from qpavoid.config.loading import read_config, read_mapping
 from qpavoid.config.shipped import find_robot, find_shipped, shipped_names
-from qpavoid.config.text import read_text
 from qpavoid.errors import ConfigError, UnknownName, located, nearest
 from qpavoid.model.robot import Robot
 from qpavoid_bench.arena.families import adversarial, moving, statics, teleoperation, two_arms

@@ -1,16 +1,53 @@
-"""YAML in which a key given twice, and what would fill the memory, is a fault with its line and column."""
+"""Text and YAML of files that may be anything: a folder, a pipe, a device, an image of a disk, ten lines of aliases.
+
+In YAML, a key given twice, and what would fill the memory, is a fault with its line and column.
+"""
 
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import yaml
+
+from qpavoid.errors import ConfigError
 
 _MOST = 50_000
 """Values in all, those that aliases stand for counted each time: ten lines of aliases can stand for a billion."""
 _DIGITS = 300
 """Characters of a whole number: Python refuses to print numbers of thousands of digits, also in messages."""
+
+
+def read_text(path: Path, largest: int, where: str = "") -> str:
+    """Read a UTF-8 file, with or without a byte order mark.
+
+    Args:
+        path: the file.
+        largest: size up to which it is read [bytes]; what comes after would hang or fill the memory.
+        where: file and field to name in errors; the file if left out.
+
+    Raises:
+        ConfigError: no ordinary file, too large, or not text.
+    """
+    try:
+        size = path.stat().st_size
+        if path.is_dir():
+            reason = "is a folder; give a file"
+        elif not path.is_file():  # reading a pipe or a device may never end
+            reason = "not an ordinary file; give one"
+        elif size > largest:
+            reason = f"{size} bytes; at most {largest} are read, make it smaller"
+        else:
+            text = path.read_text(encoding="utf-8-sig")
+            if "\0" not in text:
+                return text
+            reason = "it holds NUL characters; give a text file"
+    except OSError as error:
+        reason = f"{error.strerror or error}; give another file"
+    except ValueError as error:  # bytes that are no UTF-8, or a name that no file can have
+        reason = f"{error}; give a UTF-8 text file"
+    raise ConfigError(f"{where or path}: cannot be read: {reason}")
 
 
 def parse_yaml(text: str) -> Any:
