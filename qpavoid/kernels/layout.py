@@ -131,6 +131,8 @@ class RowLayout(NamedTuple):
     """(l,) upper position limit [rad or m]."""
     v_max: Array
     """(n,) largest speed, infinite where there is none [rad/s or m/s]."""
+    v_recovery: Array
+    """(n,) largest speed at which a coordinate is made to come back from outside a position limit [rad/s or m/s]."""
     v_step: Array
     """(n,) largest change of v in a step; infinite where the acceleration has no limit [rad/s or m/s]."""
     v_prev: Array
