@@ -81,9 +81,7 @@ def find_back_end() -> str:
 class Stage:
     """Bodies on a floor, which are placed by hand and rendered."""
 
-    def __init__(
-        self, parts: Sequence[Part], width: int, height: int, floor: float = 0.0, has_shadows: bool = True
-    ) -> None:
+    def __init__(self, parts: Sequence[Part], width: int, height: int, floor: float = 0.0) -> None:
         """Build the model and its renderer.
 
         Args:
