@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: run figures test campaign smoke lint types clean
+.PHONY: run figures film test campaign smoke lint types clean
 
 run: .venv/run
 	$(BIN)/qpavoid compare situation1 situation2 chasing_sphere five_spheres stall \
@@ -10,6 +10,9 @@ run: .venv/run
 
 figures: run
 	cp out/situation1_compare_path.png out/situation1_qp_motion.png out/five_spheres_compare_time.png docs/figures/
+
+film: .venv/dev
+	$(BIN)/qpavoid render panda_ball --gif docs/figures/panda_ball.gif
 
 test: .venv/dev
 	$(BIN)/pytest -n auto --dist loadfile

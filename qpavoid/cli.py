@@ -41,6 +41,7 @@ app = typer.Typer(
 )
 app.add_typer(robot_commands.app, name="robot")
 app.command("view")(view_commands.view)
+app.command("render")(view_commands.render)
 
 Sets = Annotated[
     list[str] | None, typer.Option("--set", metavar="PATH=VALUE", help="Override a field: avoidance.d2=0.30")

@@ -239,7 +239,8 @@ class Solution(NamedTuple):
     slack: Array | None = None
     """(k,) violation of each avoidance row [m/s]; None where there is none."""
     command_scale: float = 1.0
-    """Share of the solver's velocity in the command after the stop look-ahead; the remainder is that of a stop [-]."""
+    """Share of the solver's velocity in the command after slow recovery and stop look-ahead; the remainder is that of a
+    stop [-]."""
     stalled: tuple[Reason, ...] = ()
     """Why the tasks make no progress, once they have made none for a while."""
     assumptions: tuple[Reason, ...] = ()

@@ -36,7 +36,7 @@ def velocity_bounds(x, q):
     limited = np.isfinite(x.v_step)
     step = np.where(limited, x.v_step, 1.0)
     stop = speed_to_stop(np.maximum(margin, 0.0), step, x.dt)
-    given = np.maximum(x.position_rate * margin, -np.minimum(0.1 * x.v_max, 0.2))
+    given = np.maximum(x.position_rate * margin, -x.v_recovery)
     slowed = np.maximum(given, sign * x.v_prev - np.minimum(step, x.dv_step - sign * x.dv_prev))
     speed = np.where(limited, np.where(margin > 0.0, stop, slowed), given)
     # on the way back from outside one limit, a coordinate can still brake for the other

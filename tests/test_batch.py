@@ -1,7 +1,6 @@
 """What comes out of many processes is what comes out of one, in order, whatever happens to some of them."""
 
 import os
-import pickle
 import signal
 import subprocess
 import sys
@@ -37,14 +36,6 @@ class Deadly:
 
 
 # --- simulate_many ---------------------------------------------------------------------------------------------
-
-
-def test_scenario_survives_pickling_with_its_source():
-    """The source is a private attribute, and relative paths start from it."""
-    scenario = situation()
-    copy = pickle.loads(pickle.dumps(scenario))
-    assert copy == scenario
-    assert copy.source == scenario.source != type(scenario).model_validate(scenario.model_dump()).source
 
 
 def test_logs_are_those_of_single_runs_in_order(workers):
@@ -128,20 +119,6 @@ def test_answers_and_errors_come_in_order(workers):
     answers = workers.map(eval, [("1 + 1",), (DIE,), ("1 / 0",), ("'three'",), (DIE,), ("4",)])
     assert [type(a) for a in answers] == [int, WorkerDied, ZeroDivisionError, str, WorkerDied, int]
     assert (answers[0], answers[3], answers[5]) == (2, "three", 4)
-
-
-def test_calls_are_read_no_faster_than_they_can_begin(workers):
-    begun = []
-
-    def calls():
-        for i in range(100):
-            begun.append(i)
-            yield (i,)
-
-    answers = workers.as_completed(abs, calls())
-    assert [next(answers)[0] for _ in range(4)]
-    assert len(begun) <= 4 + len(workers)
-    answers.close()
 
 
 def test_killed_while_idle(workers):

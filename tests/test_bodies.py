@@ -177,6 +177,7 @@ def test_scaled_mesh_of_a_urdf_keeps_its_size(tmp_path):
     assert 0.05 < capsule.radius < 0.1
 
 
+@pytest.mark.filterwarnings("ignore::qpavoid.model.notes.RobotWarning")
 def test_flat_mesh_does_not_take_the_process_down(tmp_path):
     """A plate without thickness has no hull of its own, and qhull ends the process over it."""
     square = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])

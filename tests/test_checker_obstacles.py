@@ -10,10 +10,9 @@ from conftest import random_q
 from test_shapes import SHELF, boards
 from urdfs import write_stl
 
-from qpavoid import Avoidance, Obstacle, Points, Robot, Status, Voxels, build_scene
-from qpavoid.config import Box, Capsule, Ellipsoid, HalfSpace, Mesh, PointCloud, Sphere
+from qpavoid import Avoidance, Obstacle, Robot, Status, build_scene
+from qpavoid.config import Box, Capsule, Ellipsoid, HalfSpace, Mesh
 from qpavoid.geometry.bodies import make_shape
-from qpavoid.model.cloud import voxel_radius
 
 pytest.importorskip("mujoco")
 
@@ -55,28 +54,6 @@ def test_distances_to_the_new_shapes(panda, tmp_path):
                 assert checked.distance(pair) == pytest.approx(result.min_distance, abs=2e-4), scene.pair_names[pair]
                 count += 1
     assert count > 150
-
-
-def test_cloud_distance_equals_all_voxels(panda):
-    """The checker has a sphere for every voxel, and no proxy spheres."""
-    rng, tool = np.random.default_rng(1), tool_at(panda).translation
-    points = tool + np.array([0.0, 0.28, 0.0]) + rng.uniform(-1, 1, (400, 3)) * [0.15, 0.004, 0.15]
-    shape = PointCloud(resolution=0.03)
-    controller = make_controller(
-        panda, [Obstacle.at("camera", shape, [0, 0, 0])], TCP, avoidance=Avoidance(d1=HOLD, d2=0.1)
-    )
-    centers, ball = Voxels.of(points, shape.resolution).centers, Sphere(radius=voxel_radius(shape.resolution))
-    checked = build(build_scene(panda, [Obstacle.at(f"v{i}", ball, c) for i, c in enumerate(centers)]), panda.home)
-    of_voxels = checked.scene.pairs[:, 1] >= checked.bodies
-    assert len(centers) > 60
-    least = smallest_distances(
-        controller,
-        checked,
-        90,
-        lambda t: tool + np.array([0.0, 0.5 * t, 0.0]),
-        lambda t: {"camera": Points(points)},
-    )
-    assert HOLD - 1e-3 < least[of_voxels].min() < 0.08
 
 
 def test_attached_object_equals_body_of_robot(panda):

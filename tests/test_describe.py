@@ -222,6 +222,7 @@ def test_descent_finds_what_samples_miss(tmp_path):
     assert not sample_pairs(robot, samples=10).never[0]
 
 
+@pytest.mark.filterwarnings("ignore::qpavoid.model.notes.RobotWarning")
 def test_pairs_are_judged_by_samples_and_a_descent(tmp_path):
     """Of a ball out of reach, one that is struck now and then, and two that never part by design."""
     bodies = [
@@ -241,6 +242,7 @@ def test_pairs_are_judged_by_samples_and_a_descent(tmp_path):
     assert safety_distances(sampled)[0] == pytest.approx(0.5 * gap, abs=1e-4) and gap < D1
 
 
+@pytest.mark.filterwarnings("ignore::qpavoid.model.notes.RobotWarning")
 def test_home_is_the_wish_or_near_it(tmp_path):
     """Clear by 4/3 of the safety distance, or of the pair's own, and hardly farther from the wish than that takes."""
     robot = chain(tmp_path, [ball("base", "link0", [0, 0, 0.85]), ball("tip", "link2", [0, 0, 0.25])])

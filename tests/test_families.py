@@ -22,9 +22,11 @@ from qpavoid_bench.arena.families.inverse_kinematics import FrameGoal, JointRang
 from qpavoid_bench.arena.families.parameters import Parameter
 from qpavoid_bench.arena.families.planner import plan
 from qpavoid_bench.arena.families.solvable import find_plan
+from qpavoid_bench.arena.suite import load_suite
 from qpavoid_bench.arena.world import build_world, surface_safety_distance
 
 FAMILIES = shipped_names("family")
+TELEOPERATION = {family.name for family in load_suite("teleoperation").families}
 TIMED = {"chasing", "crossing", "head_on", "noisy_sensor", "random_walk"}
 
 _cases: dict[tuple[str, int], Case] = {}
@@ -79,7 +81,9 @@ def test_cases_are_the_same_in_another_process():
     assert len({case("sphere_field", s).key for s in (1, 5)}) == 2
 
 
-@pytest.mark.parametrize("name", [name for name in FAMILIES if name not in ("adversarial", "unreachable")])
+@pytest.mark.parametrize(
+    "name", [name for name in FAMILIES if name not in ("adversarial", "unreachable", *TELEOPERATION)]
+)
 def test_plan_is_clear_in_mujoco(name, monkeypatch):
     """Mujoco finds the plan clear."""
     pytest.importorskip("mujoco")

@@ -55,16 +55,6 @@ def moving(draw):
 many = settings(max_examples=400, deadline=None)
 
 
-def test_way_to_stop_agrees_with_examples_by_hand():
-    """From 3 with no change yet: 3, 2, then by 1.5 to 0.5, from which 0.5 leads to 0. From 1 with 2: 1, 2, 2, 1, 0."""
-    assert stop_speeds(3.0, 0.0, 10.0) == pytest.approx([3.0, 2.0, 0.5, 0.0])
-    assert stopping_distance(3.0, 0.0, 10.0)[0] == pytest.approx(5.5)
-    assert stop_speeds(1.0, 2.0, 10.0) == pytest.approx([1.0, 2.0, 2.0, 1.0, 0.0])
-    assert stopping_distance(1.0, 2.0, 10.0)[0] == pytest.approx(6.0)
-    assert stopping_distance(10.0, 0.0, 0.5)[0] == pytest.approx(sum(np.arange(10.0, 0.0, -0.5)))
-    assert stopping_distance(-5.0, 1.0, 4.0) == (0.0, 0.0)
-
-
 @many
 @given(moving())
 def test_way_to_stop_agrees_with_the_stop_step_by_step(state):
@@ -266,3 +256,36 @@ def test_stop_way_agrees_with_the_stop_step_by_step(seed, place):
     size = min(count, len(expected))
     np.testing.assert_allclose(path[:size], expected[:size], rtol=1e-9, atol=1e-9)
     assert (np.ptp(expected[: size // 2] / v, axis=1) > 1e-6).any()  # not all coordinates alike
+
+
+# --- rows --------------------------------------------------------------------------------------------------------
+
+
+def test_rows_stop_a_pair_at_its_distance_with_half_of_the_limits():
+    """A pair that closes as fast as its row allows, and as its joints can follow, never comes nearer than it may."""
+    step, unit, J, dt = np.array([0.1, 0.2]), np.array([0.01, 0.02]), np.array([[0.5, -1.0]]), 0.01
+    d, v, w = np.array([0.9]), np.zeros(2), np.zeros(2)
+    distances, changes = [], []
+    for _ in range(400):
+        closest = np.zeros((1, 10))
+        closest[:, 0] = d
+        x = make_layout(2, pairs=1, closest=closest, near_pairs=np.arange(1), feedforward=np.zeros(1), J=J, v_step=step,
+            dv_step=unit, v_prev=v, dv_prev=w, acceleration_limited=True, jerk_limited=True,
+            v_stop=np.array([0.0, -1e3]), near_speed=np.inf, row_gain=100.0, lower=-np.ones(2), upper=np.ones(2),
+        )  # fmt: skip
+        kernels.row_bounds(kernels.pack(x), 1, False)
+        # the velocity along J that closes fastest, within the row and within what half of the limits allow
+        per_speed = np.array([-1.0, 1.0]) / (J[0] @ [-1.0, 1.0]) * np.array([1.0, 1.0])
+        least = max(x.rhs[0], J[0] @ (v + np.maximum(w + unit * [-1.0, 1.0], 0.0) * [1.0, 1.0]) - 9.0)
+        v_next = per_speed * max(
+            least, J[0] @ v + max(J[0] @ w - 0.5 * np.abs(J[0]) @ unit, -0.5 * np.abs(J[0]) @ step)
+        )
+        w, v = v_next - v, v_next
+        changes.append(J[0] @ w)
+        d = d + dt * (J @ v)
+        distances.append(d[0])
+    changes = np.array(changes)
+    half = 0.5 * np.abs(J[0])
+    assert min(distances) >= 0.1 - 1e-9 and distances[-1] == pytest.approx(0.1, abs=1e-3)
+    assert (np.abs(np.diff(changes[:-60])) <= 1.25 * half @ unit).all()
+    assert np.abs(changes).max() <= 1.01 * half @ step

@@ -114,28 +114,6 @@ def test_a_run_from_file_to_log(named, tmp_path):
     np.testing.assert_array_equal(controller.filter(q, wish).v, wish)
 
 
-def test_a_locked_part_of_each(named):
-    """Locking keeps tools where they are, and rows are those of the coordinates that are left."""
-    name, robot = named
-    q = random_q(robot, np.random.default_rng(3), 0.3)
-    pattern = {"mimic": "l_gripper_l_*", "continuous": "*joint_1", "planar": "root_joint", "floating": "root_joint"}[
-        name
-    ]
-    locked, q_left = robot.lock([pattern], q, "test")
-    assert locked.model.nv < robot.model.nv
-    places = []
-    for part, at in ((robot, q), (locked, q_left)):
-        data = part.model.createData()
-        pin.framesForwardKinematics(part.model, data, at)
-        places.append(data.oMf[part.model.getFrameId(TOOLS[name])])
-    np.testing.assert_allclose(places[0].homogeneous, places[1].homogeneous, atol=1e-12)
-    tasks = build_tasks([config.Task(frame=TOOLS[name])], locked, q_left)
-    solution = Controller(build_scene(locked), tasks).step(
-        q_left, targets={TOOLS[name]: Sample.at(places[0].translation + 0.01)}
-    )
-    assert solution.status.value == "SOLVED" and solution.v.shape == (locked.model.nv,)
-
-
 # Joints that follow others
 
 

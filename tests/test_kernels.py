@@ -373,14 +373,14 @@ def test_velocity_bounds_by_hand():
     """dt = 0.01 s and half of what is left: 50 (q_lim - q), but not beyond v_max = 2, 3, 4, ∞, ∞ and 5.
 
     In turn: a margin on both sides; 0.01 rad below the upper limit; 0.02 rad beyond it; no position limit; no speed
-    limit; far below the lower limit. From outside, a tenth of the largest speed is asked for, at most 0.2 rad/s.
+    limit; far below the lower limit. From outside, `v_recovery` is asked for.
     """
     inf = np.inf
     q = np.array([9.0, 0.0, 0.99, 1.02, 9.0, 9.0, 0.3, -4.0])  # q[0], q[4] and q[5] have no limits in this chart
     x = make_layout(
         6, q_index=np.array([1, 2, 3, 6, 7]), v_index=np.array([0, 1, 2, 4, 5]),
         q_lower=np.array([-1.0, -1, -1, -inf, -1]), q_upper=np.array([1.0, 1, 1, 1, 1]),
-        v_max=np.array([2.0, 3.0, 4.0, inf, inf, 5.0]), position_rate=50.0,
+        v_max=np.array([2.0, 3.0, 4.0, inf, inf, 5.0]), v_recovery=np.full(6, 0.2), position_rate=50.0,
     )  # fmt: skip
     assert run("velocity_bounds", x, q) == -3.0
     np.testing.assert_allclose(x.lower, [-2.0, -3.0, -4.0, -inf, -inf, 0.2])

@@ -6,7 +6,7 @@ import pytest
 from conftest import EXAMPLES, look, obstacle, write_chain
 
 from qpavoid import ConfigError, Robot, build_scene, config
-from qpavoid.model.notes import NoteKind
+from qpavoid.model.notes import NoteKind, RobotWarning
 
 SPHERE = {"type": "sphere", "radius": 0.02}
 
@@ -69,7 +69,8 @@ def test_pairs_that_always_touch_are_dropped_and_noted(tmp_path, radius):
         for i in range(4)
     ]
     folded = {f"joint{i}": 2.0 for i in (1, 2, 3)}
-    robot = Robot.from_urdf(write_chain(tmp_path), bodies=bodies, home=folded)
+    with pytest.warns(RobotWarning, match=r"home b0 - b3 \(-.* mm\): touch there"):
+        robot = Robot.from_urdf(write_chain(tmp_path), bodies=bodies, home=folded)
     assert pairs_of(robot) == {frozenset(("b0", "b3"))}
     pairs = [note for note in robot.notes if note.kind is NoteKind.PAIR]
     assert [(note.subject, note.fraction) for note in pairs] == [(("b0", "b2"), 1.0), (("b1", "b3"), 1.0)]

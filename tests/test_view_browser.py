@@ -9,7 +9,9 @@ from io import BytesIO
 import numpy as np
 import pytest
 
+from qpavoid import load_scenario, simulate
 from qpavoid.viz.view_page import CAMERA, LOOK_AT
+from qpavoid.viz.view_replay import Replay
 from qpavoid.viz.view_session import Session
 
 REQUIRED = bool(os.environ.get("QPAVOID_REQUIRE_BROWSER"))
@@ -77,9 +79,9 @@ def picture(page):
     return np.asarray(image, dtype=float)[160:, : WIDTH - 330]
 
 
-@pytest.fixture(scope="module")
-def session(tmp_path_factory):
-    file = tmp_path_factory.mktemp("view") / "pull.yaml"
+@pytest.fixture
+def session(tmp_path):
+    file = tmp_path / "pull.yaml"
     file.write_text(SCENARIO)
     session = Session(str(file), port=0, quality="low")
     is_done = threading.Event()
@@ -91,7 +93,7 @@ def session(tmp_path_factory):
     assert not session.view.is_alive
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def page():
     from playwright.sync_api import sync_playwright
 
@@ -104,7 +106,7 @@ def page():
         browser.close()
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def empty_picture(page):
     """A page with nothing on it but the ground, from the same camera."""
     import viser
@@ -168,6 +170,28 @@ def test_page_shows_and_steers_a_run(session, page, empty_picture):
     drag(page, pixel(ball, box), (60.0, 0.0))
     wait_for(lambda: np.linalg.norm(session.tick.obstacles[0, 9:] - ball) > 0.05, "the ball")
     assert not errors
+
+
+@pytest.mark.xdist_group("browser")
+def test_page_plays_logs(page):
+    logs = [simulate(load_scenario("panda_ball", ["duration=2.4", "dt=0.02"], name)) for name in ("tracking", "qp")]
+    replay, is_done = Replay(logs, port=0, quality="low"), threading.Event()
+    loop = threading.Thread(target=replay.run, args=(is_done.is_set,))
+    loop.start()
+    try:
+        wait_for(lambda: replay.view.url, "the page's address")
+        page.goto(replay.view.url)
+        page.wait_for_selector("canvas")
+        wait_for(lambda: replay.step > 2, "the first steps")
+        page.locator("input[value='panda_ball tracking']").first.click()
+        page.get_by_role("option", name="panda_ball qp", exact=True).click()
+        wait_for(lambda: replay.frames.log is logs[1], "the other run")
+        page.get_by_role("button", name="pause").click()
+        wait_for(lambda: not replay.clock.is_playing, "the pause")
+        page.get_by_text("at 0.00 s").or_(page.get_by_text("closest:")).first.wait_for()
+    finally:
+        is_done.set()
+        loop.join(PATIENCE)
 
 
 def tool_error(session):

@@ -14,25 +14,13 @@ _speed_to_stop, _stopping_distance = compiled(speed_to_stop), compiled(stopping_
 _max_stopping_distance = compiled(max_stopping_distance)
 
 
-RECOVERY_SHARE = 0.1
-"""Share of its velocity limit at which a joint recovers [-]: from beyond a limit, or to part a pair."""
-MAX_RECOVERY_SPEED = 0.2
-"""Speed at which it does so at most [rad/s or m/s]."""
-
-
-@compiled
-def recovery_speed(v_max: float) -> float:
-    """Compute the speed at which a joint recovers, from its largest one [rad/s or m/s]."""
-    return min(RECOVERY_SHARE * v_max, MAX_RECOVERY_SPEED)
-
-
 @compiled
 def velocity_bounds(x: Any, q: Array) -> float:
     """Write the bounds on v from the joint limits; return the distance to the nearest one.
 
     Position and velocity limits make hard_lower and hard_upper: ±v_max, and towards a position limit at most the speed
     from which the coordinate can still brake, `speed_to_stop`; without an acceleration limit, `position_rate` times the
-    distance. Outside a position limit, the speed back is `position_rate` times the excess, at most `recovery_speed`, as
+    distance. Outside a position limit, the speed back is `position_rate` times the excess, at most `v_recovery`, as
     far as the limits allow it, and low enough to brake before the opposite limit. Acceleration and jerk limits narrow
     these to lower and upper: v_prev ± v_step, and `_jerk_limited_bounds`. No bound ever crosses another one; where
     limits contradict, the hard bounds hold. See `qpavoid.model.limits`.
@@ -50,7 +38,7 @@ def velocity_bounds(x: Any, q: Array) -> float:
     for i in range(len(x.q_index)):
         j, position = x.v_index[i], q[x.q_index[i]]
         fastest, step, v_prev = x.v_max[j], x.v_step[j], x.v_prev[j]
-        slowest = -recovery_speed(fastest)
+        slowest = -x.v_recovery[j]
         below, above = position - x.q_lower[i], x.q_upper[i] - position
         margin = min(margin, below, above)
         if step < np.inf:

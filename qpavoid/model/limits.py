@@ -19,6 +19,12 @@ _TURN = 2.0 * np.pi
 """Excess above which q is probably in degrees: a turn, which no joint exceeds its limit by [rad]."""
 
 
+_RECOVERY_SHARE = 0.1
+"""Share of its speed limit at which a coordinate recovers [-]."""
+_MAX_RECOVERY_SPEED = 0.2
+"""Speed at which it recovers at most [rad/s or m/s]."""
+
+
 @dataclass(frozen=True, slots=True)
 class JointBounds:
     """Limits of a robot in tangent space; joints without a position limit have none listed."""
@@ -37,6 +43,14 @@ class JointBounds:
     """(nv,) largest acceleration [rad/s² or m/s²], infinite where there is none."""
     jerk: Array
     """(nv,) largest jerk [rad/s³ or m/s³], infinite where there is none."""
+
+    @property
+    def recovery(self) -> Array:
+        """Return the speeds (nv,) at which joints return into their limits, and part what is too near [rad/s or m/s].
+
+        These are demands that no task makes: a robot must not start fast for them.
+        """
+        return np.minimum(_RECOVERY_SHARE * self.velocity, _MAX_RECOVERY_SPEED)
 
     def within(self, config: Limits) -> JointBounds:
         """Return the part of the limits that a scenario allows to be used.
@@ -86,7 +100,7 @@ def limit_layout(joints: JointBounds, position_gain: float, dt: float) -> dict[s
     from which it can still brake (`kernels.speed_to_stop`), so that position, velocity and acceleration
     limits never contradict each other once they are met; where its jerk has a limit, too, it keeps to the velocities
     from which a stop within all of these ends in time (`kernels.braking_bounds`). A joint outside its limits moves
-    back, at no more than its largest speed. Bounds never cross: from a state that no braking can save, the jerk
+    back, at no more than its `recovery` speed. Bounds never cross: from a state that no braking can save, the jerk
     limit is relaxed, then that of the acceleration.
 
     Args:
@@ -103,6 +117,7 @@ def limit_layout(joints: JointBounds, position_gain: float, dt: float) -> dict[s
         "q_lower": joints.lower,
         "q_upper": joints.upper,
         "v_max": joints.velocity,
+        "v_recovery": joints.recovery,
         "v_step": joints.acceleration * dt,
         "v_prev": np.zeros(nv),
         "dv_step": joints.jerk * dt**2,

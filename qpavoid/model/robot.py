@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
-from qpavoid.config import RobotConfig
+from qpavoid.config import Avoidance, RobotConfig
 from qpavoid.config.loading import read_mapping, validate
 from qpavoid.config.shipped import find_robot
 from qpavoid.errors import ConfigError, matching, require_known
@@ -28,7 +29,7 @@ from qpavoid.model.kinematics import turning_columns
 from qpavoid.model.limits import JointBounds
 from qpavoid.model.notes import Note, NoteKind, issue_warning, merge_notes
 from qpavoid.model.packages import absolute_entries
-from qpavoid.model.pairs import add_self_pairs, drop_always_touching
+from qpavoid.model.pairs import add_self_pairs, drop_always_touching, pair_array
 from qpavoid.model.robot_bodies import pair_margins, robot_bodies
 from qpavoid.model.urdf import apply_srdf, find_resource, is_mjcf, read_model
 from qpavoid.model.urdf_tree import joints_fixed_by_limits
@@ -149,9 +150,7 @@ class Robot:
         if config.srdf is not None:
             apply_srdf(model, bodies, find_resource(config.srdf, path.parent, f"{path}: srdf"))
         drop_always_touching(model, bodies, joint_bounds(model), notes)
-        notes = merge_notes(notes)
-        issue_warning(notes, str(path))
-        return cls(
+        robot = cls(
             name=config.name,
             model=model,
             bodies=bodies,
@@ -161,10 +160,12 @@ class Robot:
             margins=pair_margins(config, bodies, path),
             acceleration=config.limits.acceleration,
             jerk=config.limits.jerk,
-            notes=tuple(notes),
             urdf=urdf,
             package_dirs=tuple(absolute_entries(config.package_dirs, path.parent)),
         )
+        notes = merge_notes([*notes, *robot.notes_of_home(is_given=bool(config.home))])
+        issue_warning(notes, str(path))
+        return replace(robot, notes=tuple(notes))
 
     @property
     def always_touching(self) -> list[tuple[str, ...]]:
@@ -193,12 +194,56 @@ class Robot:
         own = [turns[joint.idx_vExtended : joint.idx_vExtended + joint.nv] for _, joint in self._joints()]
         return ["rad" if turning else "m" for turning in np.concatenate(own)]
 
+    @cached_property
+    def home_distances(self) -> Mapping[frozenset[str], float]:
+        """Return the distance of each pair of its bodies at home [m], negative in penetration."""
+        data, bodies = self.model.createData(), self.bodies.createData()
+        pin.computeDistances(self.model, data, self.bodies, bodies, self.home)
+        names = [body.name for body in self.bodies.geometryObjects]
+        pairs = zip(pair_array(self.bodies).tolist(), bodies.distanceResults, strict=True)
+        return {frozenset((names[a], names[b])): float(result.min_distance) for (a, b), result in pairs}
+
     def safety_distance(self, a: str, b: str, d1: float) -> float:
         """Return the safety distance of two of its bodies [m].
 
-        It is d1, the scenario's, unless the pair has a smaller one.
+        It is d1, the scenario's, unless the pair has a smaller one, or is nearer at home: then it is a millimetre less
+        than there, so that the robot may rest at home, but no less than contact.
         """
-        return min(d1, self.margins.get(frozenset((a, b)), d1))
+        pair = frozenset((a, b))
+        at_home = max(self.home_distances.get(pair, np.inf) - _HOME_MARGIN, 0.0)
+        return min(d1, self.margins.get(pair, d1), at_home)
+
+    def near_at_home(self, d1: float) -> list[tuple[str, str, float]]:
+        """List the pairs of bodies whose safety distance is less than d1 [m] since they are near at home.
+
+        Returns:
+            Two names and the distance at home [m], negative in penetration; the nearest first.
+        """
+        near = [
+            (min(pair), max(pair), distance)
+            for pair, distance in self.home_distances.items()
+            if distance - _HOME_MARGIN < min(d1, self.margins.get(pair, d1))
+        ]
+        return sorted(near, key=lambda entry: entry[2])
+
+    def notes_of_home(self, is_given: bool) -> list[Note]:
+        """Name the pairs that are nearer than the default d1 at home.
+
+        Args:
+            is_given: whether somebody chose the home pose, so that they are meant to be that near.
+        """
+        d1 = Avoidance().d1
+        near = self.near_at_home(d1)
+        remedy = "give a `home` with bent joints, or `pair_margins`; `qpavoid robot add` writes both"
+        clear = f"nearer than the default d1, {1e3 * d1:g} mm, kept as far apart as there, less 1 mm"
+        touching = "touch there: the robot moves to part them, at no more than 0.2 rad/s"
+        notes = []
+        for is_touching, clause in ((False, clear), (True, touching)):
+            names = tuple(f"{a} - {b} ({1e3 * d:.1f} mm)" for a, b, d in near if (d <= 0.0) is is_touching)
+            if names:
+                severity: Any = "note" if is_given and not is_touching else "warning"
+                notes.append(Note(NoteKind.HOME, names, clause, remedy, severity))
+        return notes
 
     def bounds(self) -> JointBounds:
         """Return the joint limits in tangent space; see `joint_bounds`."""
@@ -209,14 +254,11 @@ class Robot:
         return replace(joint_bounds(self.model), acceleration=acceleration, jerk=jerk)
 
     def configuration(self, values: Sequence[float] | Mapping[str, float], where: str) -> Array:
-        """Return the full configuration of a scenario's `q0`.
+        """Return the full configuration (nq,) of a scenario's `q0`.
 
         Args:
             values: all nq numbers, or joint: value over the home pose.
             where: file and field to name in errors.
-
-        Returns:
-            (nq,).
 
         Raises:
             ConfigError, UnknownName: wrong number of values, unknown joint.
@@ -277,6 +319,10 @@ class Robot:
 
 def _numbered(name: str, count: int) -> list[str]:
     return [name] if count == 1 else [f"{name}.{i}" for i in range(count)]
+
+
+_HOME_MARGIN = 1e-3
+"""Distance from home at which a pair that is near there may still come nearer [m]."""
 
 
 def _end_effectors(model: Any, frames_of_config: Sequence[str], path: Path, notes: list[Note]) -> tuple[str, ...]:

@@ -20,6 +20,7 @@ from qpavoid.reason import Reason, ReasonKind, Severity
 from qpavoid.safety.backup import BackupPlanner
 from qpavoid.safety.braking import BrakingCheck
 from qpavoid.safety.progress import ProgressMonitor
+from qpavoid.safety.recovery import slow_recovery
 from qpavoid.solvers import Solver
 
 _LIMIT_TOLERANCE = 2e-6
@@ -56,7 +57,7 @@ class Arbiter:
             proximity: distances of this control step.
             from_tasks: whether the problem is of the tasks, whose progress is monitored; else of a given velocity.
         """
-        solution = self._solve(q, problem, from_tasks)
+        solution = self._solve(q, problem, proximity, from_tasks)
         if from_tasks and (stalled := self.progress.update(problem, solution)):
             solution = solution._replace(stalled=stalled)
         if self.backup is not None and self.solver.bounded:
@@ -67,7 +68,7 @@ class Arbiter:
         """Return the stop of this control step, with its reasons."""
         return self._report_limits(problem, _stop(problem, reasons))
 
-    def _solve(self, q: Array, problem: Problem, from_tasks: bool) -> Solution:
+    def _solve(self, q: Array, problem: Problem, proximity: Proximity, from_tasks: bool) -> Solution:
         """Return the solution within the limits, after the stop look-ahead."""
         try:
             if from_tasks:
@@ -101,6 +102,8 @@ class Arbiter:
                 return solution
         else:
             solution = _clipped(problem, solution)
+            if solution.status is not Status.STOPPED:
+                solution = slow_recovery(q, problem, proximity.feedforward, solution, self._settings.bounds)
         return self._check_braking(q, problem, solution) if self._settings.avoidance.look_ahead else solution
 
     def _check_braking(self, q: Array, problem: Problem, solution: Solution) -> Solution:
@@ -110,13 +113,13 @@ class Arbiter:
             return solution
         v, scale, violation, pair, distance = result
         if violation <= TOLERANCE:
-            return solution._replace(v=v, command_scale=scale)
+            return solution._replace(v=v, command_scale=scale * solution.command_scale)
         names = self._settings.scene.pair_names[pair]
         if violation != violation:  # NaN
             return _stop(problem, (*solution.reasons, Reason.of(ReasonKind.UNKNOWN_DISTANCE, *names)))
         severity = Severity.ALARM if distance < 0.0 else Severity.WARNING
         reason = Reason.of(ReasonKind.PREDICTED_TOO_NEAR, *names, amount=violation, unit="m", severity=severity)
-        return solution._replace(v=v, command_scale=scale).with_reasons(reason)
+        return solution._replace(v=v, command_scale=scale * solution.command_scale).with_reasons(reason)
 
     def _ensure_backup(
         self, backup: BackupPlanner, q: Array, t: float, proximity: Proximity, problem: Problem, solution: Solution

@@ -164,6 +164,7 @@ def _describe(urdf: Path, options: DescribeOptions, progress: Callable[[str], No
         "limits": JointLimits(velocity=_assumed_speeds(model, active.model)),
         "home": joint_values(active.model, home.q),
     }
+    of_file = [note for note in robot.notes if note.kind is not NoteKind.HOME]  # it has another home now
     return Description(
         config=bare.model_copy(update=decided),
         robot=replace(active, home=home.q),
@@ -176,7 +177,7 @@ def _describe(urdf: Path, options: DescribeOptions, progress: Callable[[str], No
         near=sampled.near,
         unchecked=unchecked,
         home=home,
-        notes=tuple(dict.fromkeys(merge_notes([*robot.notes, *notes]))),
+        notes=tuple(dict.fromkeys(merge_notes([*of_file, *notes]))),
     )
 
 

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import tempfile
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -126,10 +126,10 @@ class View:
         if self._is_due():
             self.show(frame_of(tick, f"{status_text(tick)}  \n{note}" if note else status_text(tick)))
 
-    def update_frame(self, frame: Frame) -> None:
-        """Show a frame, unless the last one was shown a moment ago."""
+    def update_frame(self, make_frame: Callable[[], Frame]) -> None:
+        """Show the frame that is made, unless the last one was shown a moment ago."""
         if self._is_due():
-            self.show(frame)
+            self.show(make_frame())
 
     def _is_due(self) -> bool:
         now = perf_counter()

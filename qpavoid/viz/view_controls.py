@@ -51,7 +51,7 @@ class Controls:
 
     def _add_run_controls(self) -> None:
         gui, values = self._gui, self._setup.controls
-        gui_buttons = gui.add_button_group("run", ("play", "pause", "step", "reset"))
+        gui_buttons = gui.add_button_group("time", ("play", "pause", "step", "reset"))
 
         @gui_buttons.on_click  # type: ignore[untyped-decorator]
         async def _(_: Any) -> None:
@@ -69,8 +69,10 @@ class Controls:
                 self._post(type="toggle" if label.startswith("play") else label)
 
         self._add("speed", gui.add_dropdown("speed", values["speeds"], initial_value="1x"))
-        if "duration" in values:
-            self._add("time", gui.add_slider("time [s]", 0.0, values["duration"], values["dt"], 0.0))
+        if "runs" in values:
+            if len(values["runs"]) > 1:
+                self._add("run", gui.add_dropdown("run", values["runs"], initial_value=values["runs"][0]))
+            self._add("time", gui.add_slider("go to [s]", 0.0, values["duration"], values["dt"], 0.0))
         if "solvers" in values:
             self._add("solver", gui.add_dropdown("solver", values["solvers"], initial_value=values["solver"]))
             self._add("row", gui.add_dropdown("rows", values["rows"], initial_value=values["row"]))
