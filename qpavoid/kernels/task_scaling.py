@@ -13,6 +13,8 @@ from qpavoid.problem import Array
 WEAK = 0.1
 """Singular value below which a direction is weak, over the size of its tasks [-]: ten times the joint motion for the
 same."""
+APPROACH_RATE = 20.0
+"""κ: how fast a singular direction is approached at most [1/s]; finite, so that acceleration limits can follow."""
 UNLIMITED_SPEED = 10.0
 """Speed by which coordinates without a limit are measured where a finite one is needed [rad/s, m/s]."""
 

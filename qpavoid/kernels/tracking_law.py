@@ -23,11 +23,17 @@ from qpavoid.kernels.packing import compiled
 from qpavoid.kernels.singular_values import orthogonalise
 from qpavoid.kernels.straight_rows import scale_straight, solve_together
 from qpavoid.kernels.task_curvature import add_curvature
-from qpavoid.kernels.task_scaling import UNLIMITED_SPEED, WEAK, joint_rate, scale_down, task_parts, task_sizes
+from qpavoid.kernels.task_scaling import (
+    APPROACH_RATE,
+    UNLIMITED_SPEED,
+    WEAK,
+    joint_rate,
+    scale_down,
+    task_parts,
+    task_sizes,
+)
 from qpavoid.problem import Array
 
-_APPROACH_RATE = 20.0
-"""κ: how fast a singular direction is approached at most [1/s]; finite, so that acceleration limits can follow."""
 _WEAK_SPEED = 0.3
 """Share of the joints' speeds that a weak direction may use [-]; it counts fully where a fifth more would be needed."""
 _MISSING_SIZE = 0.01
@@ -50,8 +56,8 @@ def tracking_law(x: Any, A: Array, b: Array, v: Array, b_feasible: Array) -> flo
     curvature that 1 m or 1 rad makes, |w|. In a direction that several tasks share, |w| counts each by its part in u_i.
 
     Args:
-        x: reads feedback, scale, row_tasks, bending_rows, straight_rows, gain_shares, v_max, dt, and what
-            `add_curvature` does.
+        x: reads feedback, scale, row_tasks, bending_rows, straight_rows, v_max, dt, and what `add_curvature`
+            does.
         A: (r, n).
         b: (r,).
         v: out (n,), NaN where A or b has one [rad/s or m/s].
@@ -74,8 +80,8 @@ def tracking_law(x: Any, A: Array, b: Array, v: Array, b_feasible: Array) -> flo
     B, rates = (A, b) if not len(straight) else (A[bending], b[bending])
     damping = np.zeros(len(B))
     if not _follow_well_conditioned(x, B, rates, v):
-        B, rates = B.copy(), rates.copy()
-        _follow_bending(x, B, rates, v, damping)
+        rates = rates.copy()
+        B = _follow_bending(x, B, rates, v, damping)
         for k in range(len(bending)):
             b_feasible[bending[k]] = rates[k]
     if len(straight):
@@ -83,7 +89,7 @@ def tracking_law(x: Any, A: Array, b: Array, v: Array, b_feasible: Array) -> flo
         solve_together(A, b_feasible, B, damping, v)
     bent = 0.0
     for r in bending:
-        part = x.gain_shares[r] * x.scale[r] * b_feasible[r]
+        part = x.scale[r] * b_feasible[r]
         bent += part * part
     return x.dt * np.sqrt(bent)
 
@@ -138,7 +144,7 @@ def _follow_well_conditioned(x: Any, A: Array, b: Array, v: Array) -> bool:
     largest = np.sqrt(sizes.max()) if rows else 0.0
     if not _is_limited_by_nothing(x, v, largest, inverse_size, size):
         return False
-    return 4.0 * size * inverse_size <= 1.0 or _bends_little(x, A, L, inverse, w)
+    return 4.0 * size * inverse_size <= 1.0 or _bends_little(x, A, L, inverse, w, inverse_size)
 
 
 @compiled
@@ -199,10 +205,11 @@ def _weakness(ratio: float, rate: float) -> float:
 
 
 @compiled
-def _bends_little(x: Any, A: Array, L: Array, inverse: Array, w: Array) -> bool:
+def _bends_little(x: Any, A: Array, L: Array, inverse: Array, w: Array, inverse_size: float) -> bool:
     """Return whether AᵀA + G(w) is positive on all that the rows move, so that no curvature c_i exceeds σ_i².
 
-    With the basis Q = Aᵀ L⁻ᵀ of that space it is Qᵀ G Q + Lᵀ L, whose Cholesky factor is made where it stands.
+    So it is where ‖G‖ is below σ_min², at least 1/`inverse_size`. Else, with the basis Q = Aᵀ L⁻ᵀ of that space, it is
+    Qᵀ G Q + Lᵀ L, whose Cholesky factor is made where it stands.
     """
     rows, nv = A.shape
     framed, others = len(x.feedback), 0.0
@@ -211,6 +218,12 @@ def _bends_little(x: Any, A: Array, L: Array, inverse: Array, w: Array) -> bool:
     G, Q, turned = np.zeros((nv, nv)), np.empty((rows, nv)), np.empty(nv)
     for part in range(framed // 3):
         add_curvature(x, part, w[3 * part : 3 * part + 3], G)
+    square = 0.0
+    for a in range(nv):
+        for c in range(nv):
+            square += G[a, c] * G[a, c]
+    if (np.sqrt(square) + others) * inverse_size <= 1.0:
+        return True
     H = np.empty((rows, rows))
     for i in range(rows):
         for c in range(nv):
@@ -247,31 +260,33 @@ def _curvature_weights(x: Any, b: Array, g: Array) -> Array:
     for k in range(len(b)):
         r = x.bending_rows[k]
         feedback = x.feedback[r] / g[k] if r < len(x.feedback) else b[k]
-        w[k] = x.scale[r] * (2.0 * x.dt * b[k] + feedback / _APPROACH_RATE)
+        w[k] = x.scale[r] * (2.0 * x.dt * b[k] + feedback / APPROACH_RATE)
     return w
 
 
 @compiled
-def _follow_bending(x: Any, B: Array, b: Array, v: Array, damping: Array) -> None:
-    """Write the velocity of the law for the rows that bend, by their singular values.
+def _follow_bending(x: Any, A: Array, b: Array, v: Array, damping: Array) -> Array:
+    """Write the velocity of the law for the rows that bend, by their singular values; return σ_i v_iᵀ (c, n).
 
     Args:
         x: see `tracking_law`.
-        B: in the rows (c, n), out σ_i v_iᵀ.
+        A: the rows (c, n).
         b: in their velocity (c,), out b/g.
         v: out (n,).
         damping: out m_i - σ_i² (c,).
     """
-    count, nv = B.shape
+    count, nv = A.shape
     v[:] = 0.0
-    U, squares, weak = np.empty((count, count)), np.zeros(count), np.zeros(count)
-    orthogonalise(B, U)
-    for i in range(count):
-        for c in range(nv):
-            squares[i] += B[i, c] * B[i, c]
+    B, U, squares, weak = A.copy(), np.zeros((count, count)), np.zeros(count), np.zeros(count)
+    orthogonalise(B, squares)
     largest = squares.max() if count else 0.0
     if largest == 0.0:
-        return
+        return B
+    for i in range(count):
+        for k in range(count):  # u_i = A v_i / σ_i
+            for c in range(nv):
+                U[i, k] += A[k, c] * B[i, c]
+            U[i, k] = U[i, k] / squares[i] if squares[i] > 0.0 else 0.0
     sizes, parts = task_sizes(x, U, squares), np.empty(x.row_tasks.max() + 1)
     for i in range(count):
         task_parts(x, U[i], parts)
@@ -326,3 +341,4 @@ def _follow_bending(x: Any, B: Array, b: Array, v: Array, damping: Array) -> Non
         damping[i] = max(m - squares[i], 0.0)
         for c in range(nv):
             v[c] += B[i, c] * y / m
+    return B

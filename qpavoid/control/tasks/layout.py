@@ -20,7 +20,7 @@ def in_order(tasks: Sequence[RowTask]) -> tuple[list[FrameTask], list[RowTask]]:
     return sorted(frames, key=lambda task: not task.moves), row_tasks
 
 
-def task_layout(frames: Sequence[FrameTask], row_tasks: Sequence[RowTask], model: Any, dt: float) -> dict[str, Any]:
+def task_layout(frames: Sequence[FrameTask], row_tasks: Sequence[RowTask], model: Any) -> dict[str, Any]:
     """Arrays of the rows A v = b of the tasks, as `RowLayout` has them.
 
     Rows are in world axes, scaled with the roots of their weights; the orientation error is the rotation vector of
@@ -30,7 +30,6 @@ def task_layout(frames: Sequence[FrameTask], row_tasks: Sequence[RowTask], model
         frames: frames that follow motions, those with a position first.
         row_tasks: all other tasks.
         model: pinocchio model.
-        dt: control period [s].
     """
     turns = np.array([i for i, task in enumerate(frames) if task.turns], dtype=np.intp)
     moving, turning = [task for task in frames if task.moves], [frames[i] for i in turns]
@@ -40,7 +39,6 @@ def task_layout(frames: Sequence[FrameTask], row_tasks: Sequence[RowTask], model
     numbers = {id(task): i for i, task in enumerate((*frames, *row_tasks))}
     sizes = np.array([task.rows if task in row_tasks else 3 for task in tasks], dtype=np.intp)
     bends = np.repeat(np.array([task.bends for task in tasks], dtype=bool), sizes)
-    gains = np.array([getattr(task.settings, "gain", 1.0) for task in tasks])
     weights = [task.settings.weight for task in moving] + [task.settings.orientation_weight for task in turning]
     caps = [task.settings.max_speed for task in moving] + [task.settings.max_turn_rate for task in turning]
     scale = np.sqrt(np.repeat(np.array(weights), 3))
@@ -55,7 +53,6 @@ def task_layout(frames: Sequence[FrameTask], row_tasks: Sequence[RowTask], model
         "row_tasks": np.repeat(np.array([numbers[id(task)] for task in tasks], dtype=np.intp), sizes),
         "bending_rows": np.flatnonzero(bends),
         "straight_rows": np.flatnonzero(~bends),
-        "gain_shares": np.repeat(np.minimum(1.0, 5.0 * dt * gains), sizes),
         "task_support": np.repeat(support_masks(model)[joints], 3, axis=0) * scale[:, None],
         "row_wrenches": np.kron(linear_or_angular, np.eye(3)),
         "poses": np.zeros((len(frames), 12)),
