@@ -77,7 +77,7 @@ def test_stalled_ends_once_the_obstacle_has_left(tmp_path):
 
     q, reported, _ = run_to(head_on(tmp_path), 1200, obstacles=updates)
     assert [(reason.kind, reason.subject) for reason in reported[499]] == [(ReasonKind.STALLED, ("tool", "ball"))]
-    assert not any(reported[505:]) and np.linalg.norm(q[-1] - GOAL) < 1e-4
+    assert not any(reported[520:]) and np.linalg.norm(q[-1] - GOAL) < 1e-4
 
 
 @pytest.mark.parametrize(("scenario", "longest"), [("situation1", 4.0), ("situation2", 0.0), ("panda_line", 0.0)])

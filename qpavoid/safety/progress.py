@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +28,7 @@ _JUMP = 0.05
 """Increase of an error between two checks that a new target makes, over that error [-]."""
 _MIN_PROGRESS = 0.1
 """Fraction of the task velocity below which there is no progress [-]."""
-_CHECKS = 10
+_CHECKS = 5
 """Checks in the time after which a task counts as stalled: they cost some µs each."""
 _FREE = 0.05
 """‖Aᵀr‖ of what a task lacks, r, over σ_1 ‖b‖, below which nothing but the task itself keeps it [-]."""
@@ -58,14 +59,14 @@ class ProgressMonitor:
         self._interval = max(1, round(settings.progress.stalled_after / (_CHECKS * settings.dt)))
         self._limit = settings.progress.stalled_after / settings.dt - 0.5
         self._goals = _goals(rows)
-        others = [goal.task - rows.frame_count for goal in self._goals[rows.frame_count :]]
-        self._others = np.array(others, dtype=np.intp)  # among the tasks that are no frames
+        self._owners = rows.row_tasks[: len(rows.frame_errors)].tolist()
+        self._others = [goal.task - rows.frame_count for goal in self._goals[rows.frame_count :]]
         self.reset()
 
     def reset(self) -> None:
         """Drop all counts."""
         self._step, self._stalled = 0, tuple[Reason, ...]()
-        self._history, self._since = deque[Array](maxlen=_CHECKS + 1), np.zeros(len(self._goals))
+        self._history, self._since = deque[list[float]](maxlen=_CHECKS + 1), [0] * len(self._goals)
 
     def update(self, problem: Problem, solution: Solution) -> tuple[Reason, ...]:
         """Return what keeps the tasks from their targets, after long enough without progress.
@@ -77,35 +78,34 @@ class ProgressMonitor:
         self._step += 1
         if self._step % self._interval:
             return self._stalled
-        errors = self._rows.frame_errors
-        if float(errors @ errors) < _TOLERANCE**2 and not len(self._others):
-            if self._history:
-                self.reset()
-            return ()
         stuck = self._stuck(problem, solution)
         self._stalled = self._reasons(problem, solution.v, stuck) if stuck else ()
         return self._stalled
 
     def _stuck(self, problem: Problem, solution: Solution) -> list[int]:
         """Return the numbers of the tasks that have made no progress for long enough."""
-        x, count = self._rows, len(self._rows.frame_errors)
-        squares = np.bincount(x.row_tasks[:count], x.frame_errors * x.frame_errors, x.frame_count)
-        e: Array = np.concatenate((np.sqrt(squares), x.task_errors[self._others]))
-        if not self._history:
-            self._since[:] = self._step
-        else:
-            self._since[(e < _TOLERANCE) | (e - self._history[-1] > _JUMP * e + _TOLERANCE)] = self._step
+        e = self._errors()
+        last = self._history[-1] if self._history else [-np.inf] * len(e)
+        for i, (error, before) in enumerate(zip(e, last, strict=True)):
+            if error < _TOLERANCE or error - before > _JUMP * error + _TOLERANCE:
+                self._since[i] = self._step
         self._history.append(e)
-        is_stuck = self._history[0] - e < np.maximum(_MIN_GAIN[0], _MIN_GAIN[1] * e)
-        is_stuck &= self._step - self._since >= self._limit
-        A, b = problem.tracking.A, problem.tracking.b_feasible
         stuck = []
-        for i in np.flatnonzero(is_stuck).tolist():
+        for i, (error, first) in enumerate(zip(e, self._history[0], strict=True)):
+            if self._step - self._since[i] < self._limit or first - error >= max(_MIN_GAIN[0], _MIN_GAIN[1] * error):
+                continue
             rows = self._goals[i].rows
-            asked, achieved = b[rows], A[rows] @ solution.v
+            asked, achieved = problem.tracking.b_feasible[rows], problem.tracking.A[rows] @ solution.v
             if float(achieved @ asked) < _MIN_PROGRESS * float(asked @ asked):
                 stuck.append(i)
         return stuck
+
+    def _errors(self) -> list[float]:
+        """Return how far each task is from its target [m, rad]."""
+        squares = [0.0] * self._rows.frame_count
+        for owner, error in zip(self._owners, self._rows.frame_errors.tolist(), strict=True):
+            squares[owner] += error * error
+        return [*map(sqrt, squares), *(float(self._rows.task_errors[i]) for i in self._others)]
 
     def _reasons(self, problem: Problem, v: Array, stuck: Sequence[int]) -> tuple[Reason, ...]:
         """Return why the tasks are stuck: at rest by themselves, or by what balances them."""
@@ -148,7 +148,7 @@ class ProgressMonitor:
         """Return the name of a task and what it lacks: its position, or its orientation where that is there."""
         x, goal = self._rows, self._goals[i]
         task = x.tasks[goal.task]
-        amount, unit = float(self._history[-1][i]), task.unit
+        amount, unit = self._history[-1][i], task.unit
         if goal.task < x.frame_count:
             parts = [float(np.linalg.norm(part)) for part in x.frame_errors[goal.rows].reshape(-1, 3)]
             if task.moves and (len(parts) == 1 or parts[0] >= _TOLERANCE):
