@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from fnmatch import fnmatchcase
-from itertools import combinations
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
-from qpavoid.errors import UnknownName, nearest
+from qpavoid.errors import matching
 from qpavoid.model.limits import JointBounds
 from qpavoid.model.notes import Note, NoteKind
 from qpavoid.model.space import Space
@@ -24,19 +23,16 @@ def add_self_pairs(model: Any, bodies: Any, disabled: Iterable[tuple[str, str]],
         UnknownName: a pattern that matches no body; naming the `origin`, a file.
     """
     names = [body.name for body in bodies.geometryObjects]
-    joints = [body.parentJoint for body in bodies.geometryObjects]
-
-    def matching(pattern: str) -> list[int]:
-        matches = [i for i, name in enumerate(names) if fnmatchcase(name, pattern)]
-        if not matches:
-            raise UnknownName(f"{origin}: disabled_pairs: no body {pattern!r}{nearest(pattern, names)}")
-        return matches
-
-    disabled_pairs = {frozenset((i, j)) for a, b in disabled for i in matching(a) for j in matching(b)}
+    joints, what = [body.parentJoint for body in bodies.geometryObjects], f"{origin}: disabled_pairs: no body"
+    disabled_pairs = {
+        frozenset((first, second))
+        for pair in disabled
+        for first, second in product(*(matching([pattern], names, what) for pattern in pair))
+    }
     for i, j in combinations(range(len(names)), 2):
         a, b = joints[i], joints[j]
         adjacent = a == b or model.parents[a] == b or model.parents[b] == a
-        if not adjacent and frozenset((i, j)) not in disabled_pairs:
+        if not adjacent and frozenset((names[i], names[j])) not in disabled_pairs:
             bodies.addCollisionPair(pin.CollisionPair(i, j))
 
 
