@@ -117,16 +117,10 @@ def joints_figure(log: Log) -> Figure:
 def _draw_lines(
     ax: Any, t: Array, values: Array, names: Sequence[str], shown: Any, remaining: str, width: Any
 ) -> list[Any]:
-    """Draw lines over time: some with a name, the others in grey; return legend entries.
+    """Draw m lines (n, m) over times (n,), those `shown` with a name and a width, the others in grey.
 
-    Args:
-        ax: the panel.
-        t: times (n,) [s].
-        values: (n, m).
-        names: of all m lines.
-        shown: indices of those that have a name.
-        remaining: what the others are.
-        width: of each line with a name.
+    Returns:
+        Legend entries; the others have one.
     """
     others = [i for i in range(len(names)) if i not in shown and np.isfinite(values[:, i]).any()]
     for i in others:
@@ -144,15 +138,10 @@ def distances_figure(log: Log) -> Figure:
     upper_distance = round(1.5 * (avoidance["d2"] - avoidance["offset"]), 9)
     figure = Figure(figsize=(9.5, 7.0), layout="constrained")
     ax, gains = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
-    drawn = np.flatnonzero(np.isfinite(distance).any(axis=0))
     nearest = np.min(distance, axis=0, initial=np.inf)
-    near = drawn if len(drawn) <= len(COLOURS) else drawn[nearest[drawn] < upper_distance]
-    remaining = f"bodies never within {upper_distance:g} m"
-    if len(near) > _MAX_NAMED_LINES:
-        near, remaining = (
-            np.sort(near[np.argsort(nearest[near], kind="stable")[:_MAX_NAMED_LINES]]),
-            "bodies farther away",
-        )
+    order = np.argsort(nearest, kind="stable")[:_MAX_NAMED_LINES]
+    near = np.sort(order[nearest[order] < (np.inf if distance.shape[1] <= len(COLOURS) else upper_distance)])
+    remaining = "bodies farther away"
     # Thinner and thinner: the two bodies of a pair share their distance, and neither line may hide the other.
     widths = np.linspace(3.0, 1.2, len(near))
     handles = _draw_lines(ax, log.t, distance, log.meta["bodies"], near, remaining, widths)
