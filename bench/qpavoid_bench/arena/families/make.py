@@ -55,8 +55,9 @@ def make_case(family: Family, seed: int) -> Case:
         except Redraw as reason:
             causes.append(str(reason))
             continue
-        sensor = validate(_rounded(family.fill(family.config.sensor, draw)), Sensor, family.path)
-        return Case(family.name, seed, scenario, sensor, family.config.reachable, how)
+        sensor = validate(_rounded(family.fill(config.sensor, draw)), Sensor, family.path)
+        scenario = _with_uncertainty(scenario, config.uncertainty * sensor.position_noise)
+        return Case(family.name, seed, scenario, sensor, config.reachable, how)
     worst = max(set(causes), key=causes.count)
     raise ConfigError(
         f"{family.path}: seed {seed}: {MAX_DRAWS} draws and no case, most often: {worst}; widen or shift the ranges"
@@ -76,6 +77,14 @@ def _scenario(family: Family, template: dict[str, Any], draw: Draw, seed: int) -
         if "q0" in generated and isinstance(template_fields.get("q0"), dict):
             fields["q0"] = {**template_fields["q0"], **generated["q0"]}
     return validate(_rounded(fields), ScenarioConfig, family.path).with_source(family.path)
+
+
+def _with_uncertainty(scenario: ScenarioConfig, uncertainty: float) -> ScenarioConfig:
+    """Return a scenario whose obstacles have an uncertainty [m]; the same one where it is 0."""
+    if not uncertainty:
+        return scenario
+    changes = {"uncertainty": _rounded(uncertainty)}
+    return scenario.model_copy(update={"obstacles": [o.model_copy(update=changes) for o in scenario.obstacles]})
 
 
 def _generate(family: Family, template_fields: dict[str, Any], draw: Draw) -> dict[str, Any]:
