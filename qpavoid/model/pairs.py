@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from fnmatch import fnmatchcase
 from itertools import combinations
 from typing import Any
@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from qpavoid.config import Avoidance
 from qpavoid.errors import UnknownName, nearest
 from qpavoid.model.limits import JointBounds
 from qpavoid.model.notes import Note, NoteKind
@@ -82,6 +83,30 @@ def find_contacts(model: Any, bodies: Any, poses: Array, at_least: float = 0.0) 
         if not len(active):
             break
     return touches
+
+
+D1 = Avoidance().d1
+"""Safety distance of scenarios that give none [m]."""
+
+
+def notes_of_home(near: Sequence[tuple[str, str, float]], is_given: bool) -> list[Note]:
+    """Name the pairs that are nearer than the default d1 at home.
+
+    Args:
+        near: of `Robot.near_at_home`.
+        is_given: whether the home pose was chosen, so that they are meant to be that near.
+    """
+    clear = [f"{a} - {b} ({1e3 * d:.1f} mm)" for a, b, d in near if d > 0.0]
+    touching = [f"{a} - {b} ({1e3 * d:.1f} mm)" for a, b, d in near if d <= 0.0]
+    remedy = "give a `home` with bent joints, or `pair_margins`; `qpavoid robot add` writes both"
+    notes = []
+    if clear:
+        clause = f"nearer than the default d1, {1e3 * D1:g} mm, kept as far apart as there, less 1 mm"
+        notes.append(Note(NoteKind.HOME, tuple(clear), clause, remedy, "note" if is_given else "warning"))
+    if touching:
+        clause = "touch there: the robot moves to part them, at no more than 0.2 rad/s"
+        notes.append(Note(NoteKind.HOME, tuple(touching), clause, remedy, "warning"))
+    return notes
 
 
 def pair_array(bodies: Any) -> IntArray:
