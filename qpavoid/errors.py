@@ -6,6 +6,7 @@ An infeasible tick is not an error (it is a `Solution` with a status); these are
 import difflib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from fnmatch import fnmatchcase
 
 
 class QpavoidError(Exception):
@@ -55,3 +56,25 @@ def nearest(name: str, valid: Iterable[str]) -> str:
     if close:
         return f"; did you mean {close[0]!r}?"
     return f"; valid are {', '.join(names)}" if names else ""
+
+
+def require_known(name: str, valid: Iterable[str], what: str) -> None:
+    """Raise `UnknownName` with place, field and kind of a name (`what`), and the nearest one, unless it is valid."""
+    names = list(valid)
+    if name not in names:
+        raise UnknownName(f"{what} {name!r}{nearest(name, names)}")
+
+
+def matching(patterns: Iterable[str], valid: Iterable[str], what: str) -> list[str]:
+    """List the valid names that match some patterns, each once; `*` and `?` match as in file names.
+
+    Raises:
+        UnknownName: a pattern that matches none, as `require_known` says it.
+    """
+    names, matched = list(valid), dict[str, None]()
+    for pattern in patterns:
+        matches = [name for name in names if fnmatchcase(name, pattern)]
+        if not matches:
+            raise UnknownName(f"{what} {pattern!r}{nearest(pattern, names)}")
+        matched |= dict.fromkeys(matches)
+    return list(matched)

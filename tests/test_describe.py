@@ -187,7 +187,7 @@ def test_single_links_may_be_another_kind():
     shapes = {body.name: type(body.shape) for body in described.config.bodies}
     assert shapes["panda_link0"] is shapes["panda_link2"] is Hull
     assert shapes["panda_link1"] is Capsule
-    with pytest.raises(UnknownName, match=r"--bodies: no link 'panda_lnk0' with geometry; did you mean 'panda_link"):
+    with pytest.raises(UnknownName, match=r"--bodies: no link with geometry 'panda_lnk0'; did you mean 'panda_link"):
         describe(PANDA, DescribeOptions(bodies_of={"panda_lnk0": "convex"}))
 
 

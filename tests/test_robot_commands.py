@@ -183,7 +183,7 @@ def test_bad_mjcf_is_refused_in_one_line(cli, tmp_path, text, message):
         (["check", "panda", "--root", "wheels"], ["--root: 'wheels' is none of fixed, planar, free_flyer"]),
         (["add", "panda"], ["panda: is described already; give a URDF or MJCF"]),
         (["add", "chain.urdf", "--bodies", "box"], ["--bodies box: 'box' is none of auto, capsule, capsules, convex"]),
-        (["add", "chain.urdf", "--bodies", "arm=auto"], ["--bodies: no link 'arm' with geometry"]),
+        (["add", "chain.urdf", "--bodies", "arm=auto"], ["--bodies: no link with geometry 'arm'"]),
         (["add", "chain.urdf", "--lock", "joint9"], ["--lock: no joint 'joint9'; did you mean 'joint"]),
         (["add", "chain.urdf", "--home", "joint1"], ["--home joint1: expected JOINT=VALUE"]),
         (["add", "chain.urdf", "--home", "joint1=nan"], ["--home joint1=nan: expected JOINT=VALUE"]),

@@ -91,7 +91,7 @@ def _row(urdf: Path, robots: Path, folder: Path) -> list[str]:
     """Return a robot's row of the table."""
     name = urdf.relative_to(robots).as_posix()
     bare, error_of_check = _run("check", str(urdf))
-    added, error_of_add = _run("add", str(urdf), "--out", str(folder / name), "--no-picture")
+    added, error_of_add = _run("add", str(urdf), "--out", str(folder / name))
     last, error_of_result = _run("check", str(folder / name / "robot.yaml")) if added else ({}, "")
     errors = (error_of_check, error_of_add, error_of_result)
     problems = list(dict.fromkeys(text.replace(f"{urdf}: ", "") for text in errors if text))

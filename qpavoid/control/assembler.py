@@ -121,6 +121,8 @@ class RowAssembler:
         proximity, avoidance = self._views.get(k) or self._view(k)
         if contacts is not None:
             bent, violation = self._track_within(contacts, k)
+        if x.task_switching:  # they are compared with eq. 10 at a λ that is the same in every step
+            bent = 0.0
         return proximity, Problem(
             self._tracking, avoidance, x.lower, x.upper, *self._hard, x.v_stop, self._scene.pair_names,
             self._joint_names, self._joint_units, x.v_tracking, violation,

@@ -10,8 +10,8 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid.config import JointLimits
-from qpavoid.errors import ConfigError, UnknownName, nearest
-from qpavoid.model.kinematics import MIMIC, TRANSLATIONS
+from qpavoid.errors import ConfigError, require_known
+from qpavoid.model.kinematics import MIMIC, turning_columns
 from qpavoid.model.limits import JointBounds
 from qpavoid.model.notes import Note, NoteKind
 from qpavoid.model.pairs import pair_array
@@ -102,13 +102,13 @@ def assume_speeds(model: Any, notes: list[Note]) -> None:
     Bases that float or roll have none, nor have joints of which the file says 0.
     """
     velocity = np.array(model.velocityLimit)
-    has_limit = _is_speed(velocity)
+    has_limit, turns = _is_speed(velocity), turning_columns(model)
     names: dict[str, list[str]] = {}
     for name, joint in zip(model.names[1:], model.joints[1:], strict=True):
         part = slice(joint.idx_v, joint.idx_v + joint.nv)
         if joint.shortname() != MIMIC and not has_limit[part].all():
-            metres = TRANSLATIONS.get(joint.shortname(), 0)
-            units = ["m/s"] * bool(metres) + ["rad/s"] * (joint.nv > metres)
+            kinds = set(turns[joint.idx_vExtended : joint.idx_vExtended + joint.nv].tolist())
+            units = ["rad/s" if turning else "m/s" for turning in sorted(kinds)]
             names.setdefault(" and ".join(f"{ASSUMED_SPEED:g} {unit}" for unit in units), []).append(name)
     velocity[~has_limit] = ASSUMED_SPEED
     _set_speeds(model, velocity)
@@ -123,9 +123,7 @@ def find_joint(model: Any, name: str, where: str) -> Any:
     Raises:
         UnknownName: there is none; with the nearest one.
     """
-    if not model.existJointName(name):
-        names = model.names[1:]
-        raise UnknownName(f"{where}: no joint {name!r}{nearest(name, names)}")
+    require_known(name, list(model.names)[1:], f"{where}: no joint")
     return model.joints[model.getJointId(name)]
 
 

@@ -12,18 +12,8 @@ import pinocchio as pin
 from qpavoid import kernels
 from qpavoid.kernels.kinematics import FREE, PLANAR, PRISMATIC, REVOLUTE, SPHERICAL, TRANSLATION, UNBOUNDED
 from qpavoid.model.views import read_poses, view_poses
-from qpavoid.problem import Array, IntArray
+from qpavoid.problem import Array, IntArray, Mask
 
-TRANSLATIONS = {
-    "JointModelPX": 1,
-    "JointModelPY": 1,
-    "JointModelPZ": 1,
-    "JointModelPrismaticUnaligned": 1,
-    "JointModelPlanar": 2,
-    "JointModelTranslation": 3,
-    "JointModelFreeFlyer": 3,
-}
-"""Joint type: number of its velocity coordinates that are lengths; they precede its angles."""
 MIMIC = "JointModelMimic"
 """A joint that another joint's coordinate moves, at a constant ratio; it has none of its own."""
 
@@ -176,6 +166,13 @@ def column_joints(model: Any) -> IntArray:
     return np.repeat(np.arange(1, model.njoints), widths)
 
 
+def turning_columns(model: Any) -> Mask:
+    """Return which columns of the world Jacobian (e,) turn; the coordinates of the others are lengths."""
+    data = model.createData()
+    pin.computeJointJacobians(model, data, pin.neutral(model))
+    return np.asarray(data.J.reshape(6, -1, order="F")[3:].any(axis=0))
+
+
 def chains(model: Any) -> tuple[Array, Array]:
     """Return the rotation and the translation of each chain's end: twice (chains, nv).
 
@@ -183,26 +180,14 @@ def chains(model: Any) -> tuple[Array, Array]:
 
     One angle or length of a chain for each coordinate, as a rule; more where a joint mimics another one.
     """
-    turns, rates = np.ones(model.nvExtended), np.ones(model.nvExtended)
-    for i, joint in enumerate(list(model.joints)[1:], start=1):
-        start = joint.idx_vExtended
-        turns[start : start + translation_count(model, i)] = 0.0
+    turns, rates = turning_columns(model), np.ones(model.nvExtended)
+    for joint in list(model.joints)[1:]:
         if joint.shortname() == MIMIC:
-            rates[start] = abs(joint.extract().scaling)
+            rates[joint.idx_vExtended] = abs(joint.extract().scaling)
     ends = np.setdiff1d(np.arange(1, model.njoints), list(model.parents))
     fold = rates[:, None] * np.eye(model.nv)[columns(model)]
     support = support_masks(model)[ends]
-    return (support * turns) @ fold, (support * (1.0 - turns)) @ fold
-
-
-def translation_count(model: Any, joint: int) -> int:
-    """Count the velocity coordinates of a joint that are lengths; they precede its angles."""
-    name = model.joints[joint].shortname()
-    if name != MIMIC:
-        return TRANSLATIONS.get(name, 0)
-    data = model.createData()
-    pin.computeJointJacobians(model, data, pin.neutral(model))
-    return int(not data.J.reshape(6, -1, order="F")[3:, model.joints[joint].idx_vExtended].any())
+    return (support * turns) @ fold, (support * ~turns) @ fold
 
 
 def max_lever_arm(model: Any, joint_radius: Array) -> float:
@@ -218,15 +203,17 @@ def max_lever_arm(model: Any, joint_radius: Array) -> float:
     lever_arm = np.zeros(model.njoints)  # from the first joint that turns to the origin of each one
     turns_below = np.zeros(model.njoints, dtype=bool)
     lower, upper = np.abs(model.lowerPositionLimit), np.abs(model.upperPositionLimit)
+    turns = turning_columns(model)
     for i, joint in enumerate(list(model.joints)[1:], start=1):
-        parent, slides = model.parents[i], translation_count(model, i)
+        own_turns = turns[joint.idx_vExtended : joint.idx_vExtended + joint.nvExtended]
+        parent, slides = model.parents[i], int((~own_turns).sum())  # lengths precede angles
         if turns_below[parent]:
             coordinates = slice(joint.idx_q, joint.idx_q + slides)
             slide = float(np.maximum(lower[coordinates], upper[coordinates]).sum())
             if slides and joint.shortname() == MIMIC:
                 slide = abs(joint.extract().scaling) * slide + abs(joint.extract().offset)
             lever_arm[i] = lever_arm[parent] + float(np.linalg.norm(model.jointPlacements[i].translation)) + slide
-        turns_below[i] = turns_below[parent] or joint.nvExtended > slides
+        turns_below[i] = turns_below[parent] or own_turns.any()
     return float(np.max((lever_arm + joint_radius)[turns_below], initial=0.0))
 
 

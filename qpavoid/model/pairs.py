@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from fnmatch import fnmatchcase
-from itertools import combinations
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
 from qpavoid.config import Avoidance
-from qpavoid.errors import UnknownName, nearest
+from qpavoid.errors import matching
 from qpavoid.model.limits import JointBounds
 from qpavoid.model.notes import Note, NoteKind
 from qpavoid.model.space import Space
@@ -25,19 +24,16 @@ def add_self_pairs(model: Any, bodies: Any, disabled: Iterable[tuple[str, str]],
         UnknownName: a pattern that matches no body; naming the `origin`, a file.
     """
     names = [body.name for body in bodies.geometryObjects]
-    joints = [body.parentJoint for body in bodies.geometryObjects]
-
-    def matching(pattern: str) -> list[int]:
-        matches = [i for i, name in enumerate(names) if fnmatchcase(name, pattern)]
-        if not matches:
-            raise UnknownName(f"{origin}: disabled_pairs: no body {pattern!r}{nearest(pattern, names)}")
-        return matches
-
-    disabled_pairs = {frozenset((i, j)) for a, b in disabled for i in matching(a) for j in matching(b)}
+    joints, what = [body.parentJoint for body in bodies.geometryObjects], f"{origin}: disabled_pairs: no body"
+    disabled_pairs = {
+        frozenset((first, second))
+        for pair in disabled
+        for first, second in product(*(matching([pattern], names, what) for pattern in pair))
+    }
     for i, j in combinations(range(len(names)), 2):
         a, b = joints[i], joints[j]
         adjacent = a == b or model.parents[a] == b or model.parents[b] == a
-        if not adjacent and frozenset((i, j)) not in disabled_pairs:
+        if not adjacent and frozenset((names[i], names[j])) not in disabled_pairs:
             bodies.addCollisionPair(pin.CollisionPair(i, j))
 
 
@@ -96,16 +92,15 @@ def notes_of_home(near: Sequence[tuple[str, str, float]], is_given: bool) -> lis
         near: of `Robot.near_at_home`.
         is_given: whether the home pose was chosen, so that they are meant to be that near.
     """
-    clear = [f"{a} - {b} ({1e3 * d:.1f} mm)" for a, b, d in near if d > 0.0]
-    touching = [f"{a} - {b} ({1e3 * d:.1f} mm)" for a, b, d in near if d <= 0.0]
     remedy = "give a `home` with bent joints, or `pair_margins`; `qpavoid robot add` writes both"
+    clear = f"nearer than the default d1, {1e3 * D1:g} mm, kept as far apart as there, less 1 mm"
+    touching = "touch there: the robot moves to part them, at no more than 0.2 rad/s"
     notes = []
-    if clear:
-        clause = f"nearer than the default d1, {1e3 * D1:g} mm, kept as far apart as there, less 1 mm"
-        notes.append(Note(NoteKind.HOME, tuple(clear), clause, remedy, "note" if is_given else "warning"))
-    if touching:
-        clause = "touch there: the robot moves to part them, at no more than 0.2 rad/s"
-        notes.append(Note(NoteKind.HOME, tuple(touching), clause, remedy, "warning"))
+    for is_touching, clause in ((False, clear), (True, touching)):
+        names = tuple(f"{a} - {b} ({1e3 * d:.1f} mm)" for a, b, d in near if (d <= 0.0) is is_touching)
+        if names:
+            severity: Any = "note" if is_given and not is_touching else "warning"
+            notes.append(Note(NoteKind.HOME, names, clause, remedy, severity))
     return notes
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from fnmatch import fnmatchcase
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ import pinocchio as pin
 from qpavoid.config import RobotConfig
 from qpavoid.config.loading import read_mapping, validate
 from qpavoid.config.shipped import find_robot
-from qpavoid.errors import ConfigError, UnknownName, nearest
+from qpavoid.errors import ConfigError, matching, require_known
 from qpavoid.model.end_effectors import end_effectors
 from qpavoid.model.joints import (
     assume_speeds,
@@ -26,7 +25,7 @@ from qpavoid.model.joints import (
     set_joints,
     set_limits,
 )
-from qpavoid.model.kinematics import TRANSLATIONS
+from qpavoid.model.kinematics import turning_columns
 from qpavoid.model.limits import JointBounds
 from qpavoid.model.notes import Note, NoteKind, issue_warning, merge_notes
 from qpavoid.model.packages import absolute_entries
@@ -147,10 +146,6 @@ class Robot:
                 f"{path}: no joint of {urdf.name} moves; give at least one that is neither fixed nor locked"
             )
         assume_speeds(model, notes)
-        if bodies.ngeoms > _MAX_BODIES:
-            raise ConfigError(
-                f"{path}: {bodies.ngeoms} bodies; at most {_MAX_BODIES} are read: list fewer under `bodies`"
-            )
         add_self_pairs(model, bodies, config.disabled_pairs, str(path))
         if config.srdf is not None:
             apply_srdf(model, bodies, find_resource(config.srdf, path.parent, f"{path}: srdf"))
@@ -195,11 +190,9 @@ class Robot:
     @property
     def coordinate_units(self) -> list[str]:
         """What each of the nv velocity coordinates changes per second: `m` or `rad`."""
-        units = []
-        for _, joint in self._joints():
-            metres = TRANSLATIONS.get(joint.shortname(), 0)
-            units += ["m"] * metres + ["rad"] * (joint.nv - metres)
-        return units
+        turns = turning_columns(self.model)
+        own = [turns[joint.idx_vExtended : joint.idx_vExtended + joint.nv] for _, joint in self._joints()]
+        return ["rad" if turning else "m" for turning in np.concatenate(own)]
 
     @cached_property
     def home_distances(self) -> Mapping[frozenset[str], float]:
@@ -221,19 +214,16 @@ class Robot:
         return min(d1, self.margins.get(pair, d1), at_home)
 
     def near_at_home(self, d1: float) -> list[tuple[str, str, float]]:
-        """List the pairs of bodies whose safety distance is less than d1 since they are near at home.
-
-        Args:
-            d1: the scenario's, between surfaces [m].
+        """List the pairs of bodies whose safety distance is less than d1 [m] since they are near at home.
 
         Returns:
             Two names and the distance at home [m], negative in penetration; the nearest first.
         """
-        near = []
-        for pair, distance in self.home_distances.items():
-            if distance - _HOME_MARGIN < min(d1, self.margins.get(pair, d1)):
-                a, b = sorted(pair)
-                near.append((a, b, distance))
+        near = [
+            (min(pair), max(pair), distance)
+            for pair, distance in self.home_distances.items()
+            if distance - _HOME_MARGIN < min(d1, self.margins.get(pair, d1))
+        ]
         return sorted(near, key=lambda entry: entry[2])
 
     def bounds(self) -> JointBounds:
@@ -245,14 +235,11 @@ class Robot:
         return replace(joint_bounds(self.model), acceleration=acceleration, jerk=jerk)
 
     def configuration(self, values: Sequence[float] | Mapping[str, float], where: str) -> Array:
-        """Return the full configuration of a scenario's `q0`.
+        """Return the full configuration (nq,) of a scenario's `q0`.
 
         Args:
             values: all nq numbers, or joint: value over the home pose.
             where: file and field to name in errors.
-
-        Returns:
-            (nq,).
 
         Raises:
             ConfigError, UnknownName: wrong number of values, unknown joint.
@@ -274,7 +261,7 @@ class Robot:
         """
         if not self.model.existFrame(name):
             frames = [f.name for f in self.model.frames if f.type in (pin.BODY, pin.OP_FRAME)]
-            raise UnknownName(f"{where}: {self.name} has no frame {name!r}{nearest(name, frames)}")
+            require_known(name, frames, f"{where}: {self.name} has no frame")
         return frame_index(self.model, name)
 
     def lock(self, patterns: Sequence[str], q: Array, where: str) -> tuple[Robot, Array]:
@@ -305,13 +292,7 @@ class Robot:
         Raises:
             UnknownName: a pattern without a joint.
         """
-        matched = []
-        for pattern in patterns:
-            matches = [name for name in self.joint_names if fnmatchcase(name, pattern)]
-            if not matches:
-                raise UnknownName(f"{where}: {self.name} has no joint {pattern!r}{nearest(pattern, self.joint_names)}")
-            matched += [name for name in matches if name not in matched]
-        return matched
+        return matching(patterns, self.joint_names, f"{where}: {self.name} has no joint")
 
     def _joints(self) -> Iterator[tuple[str, Any]]:
         return zip(self.joint_names, list(self.model.joints)[1:], strict=True)
@@ -323,16 +304,12 @@ def _numbered(name: str, count: int) -> list[str]:
 
 _HOME_MARGIN = 1e-3
 """Distance from home at which a pair that is near there may still come nearer [m]."""
-_MAX_BODIES = 300
-"""Bodies of a robot, at most: the 45 000 pairs of 300 bodies take ten seconds to load. Humanoids have 112."""
 
 
 def _end_effectors(model: Any, frames_of_config: Sequence[str], path: Path, notes: list[Note]) -> tuple[str, ...]:
     """Return the listed end effectors, or those at the ends of the limbs."""
     for name in frames_of_config:
-        if not model.existFrame(name):
-            frames = [f.name for f in model.frames]
-            raise UnknownName(f"{path}: end_effectors: no frame {name!r}{nearest(name, frames)}")
+        require_known(name, [frame.name for frame in model.frames], f"{path}: end_effectors: no frame")
     ends = tuple(frames_of_config or end_effectors(model))
     if ends and not frames_of_config:
         clause = "taken as end effectors, since limbs end there"

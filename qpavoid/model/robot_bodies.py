@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid.config import Body, Hull, RobotConfig
-from qpavoid.errors import ConfigError, UnknownName, nearest
+from qpavoid.errors import ConfigError, require_known
 from qpavoid.geometry.bodies import convert_bodies, hull, make_shape, triangle_meshes
 from qpavoid.model.joints import frame_index
 from qpavoid.model.notes import Note, NoteKind
@@ -60,8 +60,8 @@ def _listed_bodies(configs: Sequence[Body], model: Any, pieces: Sequence[Any], p
     for index, body in enumerate(configs):
         where = f"{path}: bodies.{index}"
         if not model.existFrame(body.frame):
-            frames = [f.name for f in model.frames if f.type == pin.BODY]
-            raise UnknownName(f"{where}.frame: no frame {body.frame!r}{nearest(body.frame, frames)}")
+            links = [frame.name for frame in model.frames if frame.type == pin.BODY]
+            require_known(body.frame, links, f"{where}.frame: no frame")
         if bodies.existGeometryName(body.name):
             raise ConfigError(f"{where}.name: {body.name!r} is given twice: names must differ")
         frame_id = frame_index(model, body.frame)
@@ -69,8 +69,7 @@ def _listed_bodies(configs: Sequence[Body], model: Any, pieces: Sequence[Any], p
         placement = frame.placement * pin.SE3(rpy_to_matrix(body.rpy), np.array(body.position))
         if isinstance(body.shape, Hull):
             name = body.shape.geometry
-            if name not in named:
-                raise UnknownName(f"{where}.shape.geometry: no collision geometry {name!r}{nearest(name, named)}")
+            require_known(name, named, f"{where}.shape.geometry: no collision geometry")
             geometry = hull(named[name].geometry)
             placement = placement * model.frames[named[name].parentFrame].placement.actInv(named[name].placement)
         else:
@@ -84,7 +83,5 @@ def pair_margins(config: RobotConfig, bodies: Any, path: Path) -> dict[frozenset
     names = [body.name for body in bodies.geometryObjects]
     for index, own in enumerate(config.pair_margins):
         for name in own.bodies:
-            if name not in names:
-                where = f"{path}: pair_margins.{index}.bodies"
-                raise UnknownName(f"{where}: no body {name!r}{nearest(name, names)}")
+            require_known(name, names, f"{path}: pair_margins.{index}.bodies: no body")
     return {frozenset(own.bodies): own.d1 for own in config.pair_margins}

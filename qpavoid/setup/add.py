@@ -11,8 +11,9 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from qpavoid.config import JointLimits, RobotConfig
-from qpavoid.errors import ConfigError, UnknownName, nearest
+from qpavoid.errors import ConfigError
 from qpavoid.model.end_effectors import end_effectors
+from qpavoid.model.joints import find_joint
 from qpavoid.model.kinematics import MIMIC
 from qpavoid.model.notes import Note, NoteKind, RobotWarning, merge_notes
 from qpavoid.model.packages import absolute_entries
@@ -184,9 +185,7 @@ def _semantics(srdf: Path | None, model: Any, options: DescribeOptions) -> Seman
     """Read an SRDF, with the home pose that the user prefers as its first one."""
     semantics = Semantics() if srdf is None else read_srdf(srdf)
     for name, value in options.home.items():
-        if not model.existJointName(name):
-            raise UnknownName(f"--home: no joint {name!r}{nearest(name, list(model.names)[1:])}")
-        joint = model.joints[model.getJointId(name)]
+        joint = find_joint(model, name, "--home")
         if joint.nq == 1:
             low, high = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
             if low < high and not low <= value <= high:

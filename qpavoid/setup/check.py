@@ -30,7 +30,6 @@ from qpavoid.model.urdf import find_resource, is_mjcf, mesh_names, read_model, r
 from qpavoid.setup.home import MIN_CONDITIONING, Conditioning, Limbs
 from qpavoid.setup.joints import Joint, joint_notes, list_joints
 from qpavoid.setup.pairs import find_unchecked
-from qpavoid.setup.sampling import touching
 from qpavoid.setup.shapes import Piece, pieces_of
 
 _MAX_STEPS, _MAX_SECONDS = 300, 5.0
@@ -204,15 +203,9 @@ def _check_built_robot(report: Report, robot: Robot, pieces: Sequence[Piece], pr
 
 
 def _check_home(report: Report, robot: Robot) -> None:
-    pairs_at_home = touching(robot, robot.home, np.inf)
-    report.clearance = pairs_at_home[0][2] if pairs_at_home else None
-    report.home_collisions = [pair for pair in pairs_at_home if pair[2] <= 0.0]
-    remedy = (
-        "`qpavoid robot add` looks for a clear pose and leaner bodies; or set `home`, or `disabled_pairs` for shapes "
-        "that overlap by design"
-    )
-    for a, b, d in report.home_collisions:
-        report.add("warning", NoteKind.PAIR, (a, b), f"touch at the home pose ({1e3 * d:.1f} mm)", remedy)
+    """Describe the home pose; pairs that are near there are notes of the robot's own."""
+    report.clearance = min(robot.home_distances.values(), default=None)
+    report.home_collisions = [pair for pair in robot.near_at_home(0.0) if pair[2] <= 0.0]
     report.conditioning = Limbs(robot, report.end_effectors).at(robot.home)
     if singular := [name for name, limb in report.conditioning.items() if limb.ratio < MIN_CONDITIONING]:
         clause = "the home pose is singular or nearly so: they cannot move well in every direction there"

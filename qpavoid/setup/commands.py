@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, get_args
 
@@ -62,41 +62,43 @@ def check(
     if json:
         print(to_json({**vars(report), "usable": report.usable}))
     else:
-        for line in _check_lines(report):
-            OUT.print(line, highlight=False, soft_wrap=True)
+        OUT.print(f"[bold]{escape(report.name)}[/]  {escape(report.source)}", highlight=False, soft_wrap=True)
+        _print(_facts(report), report.notes)
+        if not report.notes:
+            OUT.print("no problem found", highlight=False)
     raise typer.Exit(0 if report.usable else 1)
 
 
-def _check_lines(report: Report) -> Iterator[str]:
-    yield f"[bold]{escape(report.name)}[/]  {escape(report.source)}"
-    yield f"coordinates    {report.nq} in q, {report.nv} in v"
+def _facts(report: Report) -> Iterator[tuple[str, str]]:
+    """Yield what a robot has, each with its name."""
+    yield "coordinates", f"{report.nq} in q, {report.nv} in v"
     for kind in dict.fromkeys(joint.kind for joint in report.joints):
-        of_kind = [joint for joint in report.joints if joint.kind == kind]
-        yield f"{kind:<14} {len(of_kind)}: {escape(', '.join(_joint_text(joint) for joint in of_kind))}"
-    yield f"frames         {len(report.frames)}"
+        of_kind = [_joint_text(joint) for joint in report.joints if joint.kind == kind]
+        yield kind, f"{len(of_kind)}: {', '.join(of_kind)}"
+    yield "frames", f"{len(report.frames)}"
     shapes = ", ".join(f"{count} {shape}" for shape, count in report.shapes.items()) or "none"
-    yield f"geometry       {shapes}; {report.triangles} triangles"
+    yield "geometry", f"{shapes}; {report.triangles} triangles"
     if report.load_seconds is not None:
-        yield f"bodies, pairs  {report.bodies}, {report.pairs}; loaded in {report.load_seconds:.2f} s"
-    yield f"end effectors  {escape(', '.join(report.end_effectors) or 'none recognised')}"
+        yield "bodies, pairs", f"{report.bodies}, {report.pairs}; loaded in {report.load_seconds:.2f} s"
+    yield "end effectors", ", ".join(report.end_effectors) or "none recognised"
     if report.tick_us is not None:
-        yield f"control step   {report.tick_us:.0f} µs (median, tracks the end effectors, no obstacles)"
+        yield "control step", f"{report.tick_us:.0f} µs (median, tracks the end effectors, no obstacles)"
     if report.clearance is not None:
-        yield f"home           least distance {1e3 * report.clearance:.1f} mm"
+        yield "home", f"least distance {1e3 * report.clearance:.1f} mm"
     for frame, limb in report.conditioning.items():
-        yield f"{'':14} {escape(frame)}: {limb}"
-    yield from _table(report.notes)
-    if not report.notes:
-        yield "no problem found"
+        yield "", f"{frame}: {limb}"
 
 
-def _table(notes: Sequence[Note]) -> Iterator[str]:
-    """Yield the lines of the table of notes, coloured by severity."""
+def _print(facts: Iterable[tuple[str, str]], notes: Sequence[Note] = ()) -> None:
+    """Print facts with their names, then the table of notes, coloured by severity."""
+    for name, text in facts:
+        OUT.print(f"{name:<14} {text}", highlight=False, markup=False, soft_wrap=True)
     colours = {"error": "red", "warning": "yellow", "note": "dim"}
     for line in map(escape, note_lines(notes)):
         severity = line.partition(" ")[0]
         colour = colours.get(severity)
-        yield line.replace(severity, f"[{colour}]{severity}[/]", 1) if colour else line
+        styled = line.replace(severity, f"[{colour}]{severity}[/]", 1) if colour else line
+        OUT.print(styled, highlight=False, soft_wrap=True)
 
 
 def _joint_text(joint: Joint) -> str:
@@ -218,15 +220,9 @@ def _document(description: Description, outcome: dict[Path, str], seconds: float
 def _report(description: Description, outcome: dict[Path, str], seconds: float) -> None:
     facts = dict(summary(description))
     ends = ", ".join(description.config.end_effectors) or "none recognised"
-    for name, line in {"bodies": "", "pairs": "", "end effectors": ends, **facts}.items():
-        OUT.print(f"{name:<14} {line}", highlight=False, markup=False, soft_wrap=True)
-    for line in _table(description.notes):
-        OUT.print(line, highlight=False, soft_wrap=True)
-    for line in (
-        *(f"{what:<14} {path}" for path, what in outcome.items()),
-        f"               in {seconds:.1f} s; in a scenario: `robot: {next(iter(outcome))}`",
-    ):
-        OUT.print(line, highlight=False, markup=False, soft_wrap=True)
+    _print({"bodies": "", "pairs": "", "end effectors": ends, **facts}.items(), description.notes)
+    where = f"in {seconds:.1f} s; in a scenario: `robot: {next(iter(outcome))}`"
+    _print([*((what, str(path)) for path, what in outcome.items()), ("", where)])
 
 
 class Progress:

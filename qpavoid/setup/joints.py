@@ -6,7 +6,6 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +13,8 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid.config import RobotConfig
-from qpavoid.errors import ConfigError, UnknownName, nearest
-from qpavoid.model.joints import middle_configuration
+from qpavoid.errors import ConfigError, matching
+from qpavoid.model.joints import middle_configuration, set_joints
 from qpavoid.model.kinematics import MIMIC
 from qpavoid.model.notes import Note, NoteKind
 from qpavoid.model.robot import Robot
@@ -125,16 +124,10 @@ def home_candidates(robot: Robot, semantics: Semantics) -> list[Array]:
 
 
 def _posed(model: Any, q: Array, state: Mapping[str, float]) -> Array:
-    values = {**joint_values(model, q), **{name: value for name, value in state.items() if model.existJointName(name)}}
-    q = q.copy()
-    for name, value in values.items():
-        joint = model.joints[model.getJointId(name)]
-        if joint.nq == 1:
-            low, high = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
-            q[joint.idx_q] = np.clip(round(value, 4), low, high) if low < high else round(value, 4)
-        elif joint.nq == 2:
-            q[joint.idx_q : joint.idx_q + 2] = math.cos(round(value, 4)), math.sin(round(value, 4))
-    return q
+    """Return q (nq,) with other positions of some joints, rounded and within the limits."""
+    q = set_joints(model, q, {name: round(state.get(name, x), 4) for name, x in joint_values(model, q).items()}, "home")
+    lower, upper = np.array(model.lowerPositionLimit), np.array(model.upperPositionLimit)
+    return np.where(lower < upper, np.clip(q, lower, upper), q)
 
 
 def joint_values(model: Any, q: Array) -> dict[str, float]:
@@ -158,12 +151,7 @@ def joint_locks(
     read the two so, they would move on their own, which they cannot, and both are locked.
     """
     names = list(model.names)[1:]
-    locks: list[str] = []
-    for pattern in patterns:
-        matches = [name for name in names if fnmatchcase(name, pattern)]
-        if not matches:
-            raise UnknownName(f"--lock: no joint {pattern!r}{nearest(pattern, names)}")
-        locks += matches
+    locks = matching(patterns, names, "--lock: no joint")
     if wheels := [name for name in (_wheels(model) if has_base else ()) if name not in locks]:
         clause = "locked: wheels of a mobile base, whose own coordinates move it"
         notes.append(Note(NoteKind.JOINT, tuple(wheels), clause, "take them out of `lock` to drive them"))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from functools import cached_property
 from typing import Any
 
@@ -14,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid.config import Body, Box, Capsule, Cylinder, Hull, Sphere
-from qpavoid.errors import UnknownName, nearest
+from qpavoid.errors import matching
 from qpavoid.geometry.bodies import hull_points
 from qpavoid.geometry.capsules import CapsuleFit, fit_capsule
 from qpavoid.setup.fit import MAX_VOLUME_RATIO, Bodies, fit_piece, hull_volume, inside_volume
@@ -70,10 +69,7 @@ def kinds_of_links(pieces: Sequence[Piece], kind: Bodies, by_pattern: Mapping[st
     """
     kinds = {piece.link: kind for piece in pieces}
     for pattern, chosen in by_pattern.items():
-        result = [link for link in kinds if fnmatchcase(link, pattern)]
-        if not result:
-            raise UnknownName(f"--bodies: no link {pattern!r} with geometry{nearest(pattern, kinds)}")
-        kinds.update(dict.fromkeys(result, chosen))
+        kinds.update(dict.fromkeys(matching([pattern], kinds, "--bodies: no link with geometry"), chosen))
     return kinds
 
 

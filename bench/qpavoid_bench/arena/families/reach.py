@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid.control.tasks import FrameTask
-from qpavoid.model.kinematics import MIMIC, TRANSLATIONS
+from qpavoid.model.kinematics import MIMIC, turning_columns
 from qpavoid.model.robot import Robot
 from qpavoid.problem import Array
 from qpavoid_bench.arena.families.inverse_kinematics import FrameGoal, JointRanges, solve_inverse_kinematics
@@ -33,11 +33,12 @@ def chain(robot: Robot, frame_id: int, first: int = 1) -> tuple[Array, float]:
     if not joints:
         return np.array(frame.placement.translation), 0.0
     pin.forwardKinematics(model, data, robot.home)
-    length = float(np.linalg.norm(frame.placement.translation))
+    length, turns = float(np.linalg.norm(frame.placement.translation)), turning_columns(model)
     for place, i in enumerate(joints):
         joint = model.joints[i]
         length += float(np.linalg.norm(model.jointPlacements[i].translation)) if place else 0.0
-        translations = TRANSLATIONS.get(joint.shortname(), 0)
+        own = slice(joint.idx_vExtended, joint.idx_vExtended + joint.nvExtended)
+        translations = int((~turns[own]).sum())
         if translations > 1 or joint.shortname() == MIMIC:
             length = np.inf
         elif translations:
