@@ -20,6 +20,7 @@ from qpavoid.geometry.bodies import hull_points, surface_triangles
 from qpavoid.geometry.capsules import CapsuleFit, fit_capsule
 from qpavoid.geometry.meshes import cut
 from qpavoid.model.end_effectors import end_effectors
+from qpavoid.model.pairs import D1
 from qpavoid.model.trajectory import rpy_to_matrix
 from qpavoid.model.urdf import read_model
 from qpavoid.run.metrics import point_segment_distance
@@ -27,7 +28,6 @@ from qpavoid.setup.add import DescribeOptions, describe
 from qpavoid.setup.fit import decompose, fit_piece, hull_volume, inside_volume
 from qpavoid.setup.home import HOME_CLEARANCE, MIN_CONDITIONING, Limbs, find_home
 from qpavoid.setup.sampling import (
-    D1,
     NEVER_NEAR,
     PairDistances,
     draw_poses,

@@ -27,7 +27,7 @@ from qpavoid_bench.arena.world import build_world, surface_safety_distance
 
 FAMILIES = shipped_names("family")
 TELEOPERATION = {family.name for family in load_suite("teleoperation").families}
-TIMED = {"chasing", "crossing", "head_on", "noisy_sensor", "random_walk"}
+TIMED = {"chasing", "crossing", "head_on", "noisy_sensor", "random_walk", "stated_noise"}
 
 _cases: dict[tuple[str, int], Case] = {}
 

@@ -42,7 +42,7 @@ def test_safety_distance_is_kept_at_any_period_and_speed(row, size, dt, duration
     assert log.metrics()["status_counts"]["SOLVED"] >= len(log.t) - 3  # at the margin, rows may lack a mm/s
     assert log.slack.max() < 2e-3
     assert within_limits(controller, log.v) > 0.95  # and jerks go up to their limit
-    assert log.metrics()["peak_velocity"] > 1.0
+    assert log.metrics()["peak_velocity"] > 0.9
 
 
 @pytest.mark.parametrize("solver", ["qp", "hqp"])

@@ -11,10 +11,11 @@ from conftest import EXAMPLES
 from qpavoid import Controller, Robot, Sample, build_scene, build_tasks
 from qpavoid.config import Task
 from qpavoid.model.notes import NoteKind
+from qpavoid.model.pairs import D1
 from qpavoid.setup.add import DescribeOptions, describe
 from qpavoid.setup.check import check_robot
 from qpavoid.setup.home import HOME_CLEARANCE, MIN_CONDITIONING
-from qpavoid.setup.sampling import D1, touching
+from qpavoid.setup.sampling import touching
 from qpavoid.setup.texts import description_files, write_files
 
 LIMIT = 'velocity="1" effort="1"'

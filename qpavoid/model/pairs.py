@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from itertools import combinations, product
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
+from qpavoid.config import Avoidance
 from qpavoid.errors import matching
 from qpavoid.model.limits import JointBounds
 from qpavoid.model.notes import Note, NoteKind
@@ -78,6 +79,29 @@ def find_contacts(model: Any, bodies: Any, poses: Array, at_least: float = 0.0) 
         if not len(active):
             break
     return touches
+
+
+D1 = Avoidance().d1
+"""Safety distance of scenarios that give none [m]."""
+
+
+def notes_of_home(near: Sequence[tuple[str, str, float]], is_given: bool) -> list[Note]:
+    """Name the pairs that are nearer than the default d1 at home.
+
+    Args:
+        near: of `Robot.near_at_home`.
+        is_given: whether the home pose was chosen, so that they are meant to be that near.
+    """
+    remedy = "give a `home` with bent joints, or `pair_margins`; `qpavoid robot add` writes both"
+    clear = f"nearer than the default d1, {1e3 * D1:g} mm, kept as far apart as there, less 1 mm"
+    touching = "touch there: the robot moves to part them, at no more than 0.2 rad/s"
+    notes = []
+    for is_touching, clause in ((False, clear), (True, touching)):
+        names = tuple(f"{a} - {b} ({1e3 * d:.1f} mm)" for a, b, d in near if (d <= 0.0) is is_touching)
+        if names:
+            severity: Any = "note" if is_given and not is_touching else "warning"
+            notes.append(Note(NoteKind.HOME, names, clause, remedy, severity))
+    return notes
 
 
 def pair_array(bodies: Any) -> IntArray:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from qpavoid.config import Avoidance, RobotConfig
+from qpavoid.config import RobotConfig
 from qpavoid.config.loading import read_mapping, validate
 from qpavoid.config.shipped import find_robot
 from qpavoid.errors import ConfigError, matching, require_known
@@ -29,7 +29,7 @@ from qpavoid.model.kinematics import turning_columns
 from qpavoid.model.limits import JointBounds
 from qpavoid.model.notes import Note, NoteKind, issue_warning, merge_notes
 from qpavoid.model.packages import absolute_entries
-from qpavoid.model.pairs import add_self_pairs, drop_always_touching, pair_array
+from qpavoid.model.pairs import D1, add_self_pairs, drop_always_touching, notes_of_home, pair_array
 from qpavoid.model.robot_bodies import pair_margins, robot_bodies
 from qpavoid.model.urdf import apply_srdf, find_resource, is_mjcf, read_model
 from qpavoid.model.urdf_tree import joints_fixed_by_limits
@@ -163,7 +163,7 @@ class Robot:
             urdf=urdf,
             package_dirs=tuple(absolute_entries(config.package_dirs, path.parent)),
         )
-        notes = merge_notes([*notes, *robot.notes_of_home(is_given=bool(config.home))])
+        notes = merge_notes([*notes, *notes_of_home(robot.near_at_home(D1), is_given=bool(config.home))])
         issue_warning(notes, str(path))
         return replace(robot, notes=tuple(notes))
 
@@ -225,25 +225,6 @@ class Robot:
             if distance - _HOME_MARGIN < min(d1, self.margins.get(pair, d1))
         ]
         return sorted(near, key=lambda entry: entry[2])
-
-    def notes_of_home(self, is_given: bool) -> list[Note]:
-        """Name the pairs that are nearer than the default d1 at home.
-
-        Args:
-            is_given: whether somebody chose the home pose, so that they are meant to be that near.
-        """
-        d1 = Avoidance().d1
-        near = self.near_at_home(d1)
-        remedy = "give a `home` with bent joints, or `pair_margins`; `qpavoid robot add` writes both"
-        clear = f"nearer than the default d1, {1e3 * d1:g} mm, kept as far apart as there, less 1 mm"
-        touching = "touch there: the robot moves to part them, at no more than 0.2 rad/s"
-        notes = []
-        for is_touching, clause in ((False, clear), (True, touching)):
-            names = tuple(f"{a} - {b} ({1e3 * d:.1f} mm)" for a, b, d in near if (d <= 0.0) is is_touching)
-            if names:
-                severity: Any = "note" if is_given and not is_touching else "warning"
-                notes.append(Note(NoteKind.HOME, names, clause, remedy, severity))
-        return notes
 
     def bounds(self) -> JointBounds:
         """Return the joint limits in tangent space; see `joint_bounds`."""

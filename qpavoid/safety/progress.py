@@ -86,8 +86,8 @@ class ProgressMonitor:
         """Return the numbers of the tasks that have made no progress for long enough."""
         e = self._errors()
         last = self._history[-1] if self._history else [-np.inf] * len(e)
-        for i, (error, before) in enumerate(zip(e, last, strict=True)):
-            if error < _TOLERANCE or error - before > _JUMP * error + _TOLERANCE:
+        for i, (error, error_last) in enumerate(zip(e, last, strict=True)):
+            if error < _TOLERANCE or error - error_last > _JUMP * error + _TOLERANCE:
                 self._since[i] = self._step
         self._history.append(e)
         stuck = []

@@ -17,6 +17,7 @@ from qpavoid.model.joints import find_joint
 from qpavoid.model.kinematics import MIMIC
 from qpavoid.model.notes import Note, NoteKind, RobotWarning, merge_notes
 from qpavoid.model.packages import absolute_entries
+from qpavoid.model.pairs import D1
 from qpavoid.model.robot import Robot
 from qpavoid.model.shape_checks import note_implausible_sizes
 from qpavoid.model.urdf import read_model, read_pieces
@@ -26,7 +27,6 @@ from qpavoid.setup.fit import MAX_VOLUME_RATIO, Bodies
 from qpavoid.setup.home import HOME_CLEARANCE, Home, find_home
 from qpavoid.setup.joints import home_candidates, joint_locks, joint_values
 from qpavoid.setup.sampling import (
-    D1,
     SAMPLES,
     SEED,
     robot_size,

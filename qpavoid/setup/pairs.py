@@ -13,10 +13,10 @@ import pinocchio as pin
 from qpavoid.config import PairMargin
 from qpavoid.model.joints import frame_index
 from qpavoid.model.notes import Note, NoteKind
-from qpavoid.model.pairs import ALWAYS_TOUCHING, find_contacts, pair_array
+from qpavoid.model.pairs import ALWAYS_TOUCHING, D1, find_contacts, pair_array
 from qpavoid.model.robot import Robot
 from qpavoid.problem import Array, Mask
-from qpavoid.setup.sampling import D1, PairSamples, draw_poses
+from qpavoid.setup.sampling import PairSamples, draw_poses
 from qpavoid.setup.shapes import Piece
 
 Reason = Literal["drawn in", "always", "srdf", "adjacent", "never"]

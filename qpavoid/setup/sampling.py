@@ -8,10 +8,9 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from qpavoid.config import Avoidance
 from qpavoid.geometry.bodies import bounding_sphere
 from qpavoid.model.kinematics import columns, support_masks
-from qpavoid.model.pairs import ALWAYS_TOUCHING, pair_array
+from qpavoid.model.pairs import ALWAYS_TOUCHING, D1, pair_array
 from qpavoid.model.robot import Robot
 from qpavoid.model.space import Space
 from qpavoid.model.views import read_results, view_results
@@ -21,8 +20,6 @@ SAMPLES, SEED = 5000, 0
 NEVER_NEAR = 0.02
 """Distance, as a share of the robot's size, that a pair must keep in every sample, and where descent from the nearest
 of them ends, to count as never colliding [-]: 20 mm of an arm with a maximal extension of 1 m."""
-D1 = Avoidance().d1
-"""Safety distance of the pairs that have none of their own [m]."""
 _FIRST = 500
 """Samples in which all pairs are computed; later ones only compute pairs that may always or never touch."""
 _DOUBT = 0.1

@@ -68,6 +68,9 @@ class FamilyConfig(Block):
     """Function that computes the missing fields: one that ships, or `file.py:function` beside this file."""
     sensor: dict[str, Any] = Field(default_factory=dict)
     """Delay and noise of measured obstacle states: fields of `qpavoid_bench.arena.case.Sensor`, "$name" as above."""
+    deviations: Annotated[float, Field(ge=0)] | None = None
+    """Number of standard deviations of a position that obstacles are given as `uncertainty`, beside what they move by
+    within the delay; left out: they are given none [-]."""
     reachable: bool = True
     """Whether the goals can be reached; it is checked, whichever it is."""
     proved: bool = True

@@ -14,7 +14,7 @@ from qpavoid_bench.arena.case import Case, Sensor
 from qpavoid_bench.arena.families.family import Family
 from qpavoid_bench.arena.families.parameters import Draw, Redraw
 from qpavoid_bench.arena.families.solvable import solved_by
-from qpavoid_bench.arena.world import build_world, load_robot
+from qpavoid_bench.arena.world import World, build_world, load_robot
 
 MAX_DRAWS = 100
 """Largest number of draws of a seed before the family is refused."""
@@ -55,8 +55,10 @@ def make_case(family: Family, seed: int) -> Case:
         except Redraw as reason:
             causes.append(str(reason))
             continue
-        sensor = validate(_rounded(family.fill(family.config.sensor, draw)), Sensor, family.path)
-        return Case(family.name, seed, scenario, sensor, family.config.reachable, how)
+        sensor = validate(_rounded(family.fill(config.sensor, draw)), Sensor, family.path)
+        if config.deviations is not None:
+            scenario = _with_uncertainty(scenario, world, sensor, config.deviations)
+        return Case(family.name, seed, scenario, sensor, config.reachable, how)
     worst = max(set(causes), key=causes.count)
     raise ConfigError(
         f"{family.path}: seed {seed}: {MAX_DRAWS} draws and no case, most often: {worst}; widen or shift the ranges"
@@ -76,6 +78,17 @@ def _scenario(family: Family, template: dict[str, Any], draw: Draw, seed: int) -
         if "q0" in generated and isinstance(template_fields.get("q0"), dict):
             fields["q0"] = {**template_fields["q0"], **generated["q0"]}
     return validate(_rounded(fields), ScenarioConfig, family.path).with_source(family.path)
+
+
+def _with_uncertainty(scenario: ScenarioConfig, world: World, sensor: Sensor, deviations: float) -> ScenarioConfig:
+    """Return a scenario whose obstacles have an `uncertainty`: of noise, and of what they move by within the delay."""
+    times, motions = np.linspace(0.0, scenario.duration, 50), {o.name: o.motion for o in world.scene.obstacles}
+    obstacles = []
+    for obstacle in scenario.obstacles:
+        speeds = [np.linalg.norm(motions[obstacle.name].sample(t).linear) for t in times.tolist()]
+        uncertainty = _rounded(deviations * sensor.position_noise + sensor.delay * max(speeds))
+        obstacles.append(obstacle.model_copy(update={"uncertainty": uncertainty}))
+    return scenario.model_copy(update={"obstacles": obstacles})
 
 
 def _generate(family: Family, template_fields: dict[str, Any], draw: Draw) -> dict[str, Any]:
