@@ -16,7 +16,6 @@ from scipy.optimize import nnls
 
 from qpavoid.control.assembler import RowAssembler
 from qpavoid.control.settings import ControlSettings
-from qpavoid.control.tasks import Manipulability
 from qpavoid.problem import Array, IntArray, Problem, Solution
 from qpavoid.reason import Reason, ReasonKind
 
@@ -160,11 +159,7 @@ class ProgressMonitor:
 
 def _goals(rows: RowAssembler) -> list[_Goal]:
     """Return the frames, then the other tasks that have somewhere to go."""
-    numbers = [
-        number
-        for number, task in enumerate(rows.tasks)
-        if number < rows.frame_count or (task.bends and not isinstance(task, Manipulability))
-    ]
+    numbers = [number for number, task in enumerate(rows.tasks) if task.has_goal]
     return [_Goal(number, np.flatnonzero(rows.row_tasks == number)) for number in numbers]
 
 

@@ -27,6 +27,7 @@ from qpavoid.model.scene import Scene
 from qpavoid.problem import Solution
 from qpavoid.run.simulate import describe_obstacle
 from qpavoid.viz.meshes import Mesh, of_geometry, of_obstacle
+from qpavoid.viz.view_clock import PlayClock
 from qpavoid.viz.view_link import Frame, PageSetup, frame_of, make_link, pack, received, send
 
 _BODY = (0.31, 0.63, 0.94, 0.35)
@@ -161,10 +162,10 @@ class View:
                 case "failed":
                     self.fault = event["reason"]
                 case "target":
-                    self.dragged_targets[event["name"]] = _pose(event)
+                    self.dragged_targets[event["name"]] = pose_of(event)
                     self._events.append(event)
                 case "obstacle":
-                    self.dragged_obstacles[event["name"]] = _pose(event)
+                    self.dragged_obstacles[event["name"]] = pose_of(event)
                     self._events.append(event)
                 case _:
                     self._events.append(event)
@@ -191,7 +192,39 @@ class View:
         self.close()
 
 
-def _pose(event: dict[str, Any]) -> Pose:
+def run_page(
+    view: View,
+    clock: PlayClock,
+    apply: Callable[[dict[str, Any]], None],
+    advance: Callable[[], None],
+    is_done: Callable[[], bool],
+) -> None:
+    """Run what a page shows until `is_done`, the page fails, or the keyboard interrupts, and close the view.
+
+    Args:
+        view: of the page.
+        clock: begins to play at the first browser.
+        apply: does what an event of the page asks for.
+        advance: takes a step if one is due, and shows it.
+        is_done: whether to end.
+    """
+    has_begun = False
+    try:
+        while not is_done() and view.is_alive:
+            for event in view.events():
+                apply(event)
+            if view.clients and not has_begun:
+                has_begun = True
+                clock.play()
+            advance()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        view.close()
+
+
+def pose_of(event: dict[str, Any]) -> Pose:
+    """Return the pose to which an event of the page drags something."""
     return Pose.at(event["position"], np.array(event["rotation"]))
 
 

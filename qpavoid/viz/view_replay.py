@@ -10,7 +10,7 @@ import numpy as np
 from qpavoid.errors import ConfigError
 from qpavoid.run.log import Log
 from qpavoid.viz.log_frames import LogFrames
-from qpavoid.viz.view import View, page_setup
+from qpavoid.viz.view import View, page_setup, run_page
 from qpavoid.viz.view_clock import SPEEDS, PlayClock
 
 
@@ -58,22 +58,12 @@ class Replay:
 
     def run(self, is_done: Callable[[], bool] = lambda: False) -> None:
         """Play until `is_done`, the page fails, or the keyboard interrupts; it begins at the first browser."""
-        has_begun = False
-        try:
-            while not is_done() and self.view.is_alive:
-                for event in self.view.events():
-                    self._apply(event)
-                if self.view.clients and not has_begun:
-                    has_begun = True
-                    self.clock.play()
-                if self.clock.wait():
-                    self.step = (self.step + 1) % len(self.frames)
-                if self.view.clients:
-                    self.view.update_frame(lambda: self.frames.frame(self.step))
-        except KeyboardInterrupt:
-            pass
-        finally:
-            self.view.close()
+        run_page(self.view, self.clock, self._apply, self._advance, is_done)
+
+    def _advance(self) -> None:
+        if self.clock.wait():
+            self.step = (self.step + 1) % len(self.frames)
+        self.view.update_frame(lambda: self.frames.frame(self.step))
 
     def _apply(self, event: dict[str, Any]) -> None:
         self.clock.apply(event)

@@ -14,11 +14,10 @@ from qpavoid.control.tasks import in_order
 from qpavoid.control.tick import Tick
 from qpavoid.controller import Controller
 from qpavoid.errors import QpavoidError
-from qpavoid.model.sample import Pose
 from qpavoid.problem import Array
 from qpavoid.run.simulate import Follower, describe_obstacle
 from qpavoid.solvers import SOLVERS
-from qpavoid.viz.view import View, page_setup
+from qpavoid.viz.view import View, page_setup, pose_of, run_page
 from qpavoid.viz.view_clock import SPEEDS, PlayClock
 from qpavoid.viz.view_drag import Pulled
 
@@ -84,22 +83,13 @@ class Session:
 
     def run(self, is_done: Callable[[], bool] = lambda: False) -> None:
         """Run until `is_done`, the page fails, or the keyboard interrupts; it begins to play at the first browser."""
-        has_begun = False
-        try:
-            while not is_done() and self.view.is_alive:
-                for event in self.view.events():
-                    self._apply(event)
-                if self.view.clients and not has_begun:
-                    has_begun = True
-                    self.clock.play()
-                self._swap()
-                if self.clock.wait():
-                    self._step()
-                self.view.update(self.tick, self._note)
-        except KeyboardInterrupt:
-            pass
-        finally:
-            self.view.close()
+        run_page(self.view, self.clock, self._apply, self._advance, is_done)
+
+    def _advance(self) -> None:
+        self._swap()
+        if self.clock.wait():
+            self._step()
+        self.view.update(self.tick, self._note)
 
     def _apply(self, event: dict[str, Any]) -> None:
         """Do what a control of the page asks for."""
@@ -110,7 +100,7 @@ class Session:
         elif kind in ("target", "obstacle"):
             pulled = self._pulled(kind, event["name"])
             if pulled is not None:
-                pulled.pull(Pose.at(event["position"], np.array(event["rotation"])))
+                pulled.pull(pose_of(event))
         elif kind == "solver":
             self._solver = event["value"]
             self._start_build()

@@ -4,6 +4,5 @@ from qpavoid.control.tasks.base import Constant, RowTask
 from qpavoid.control.tasks.build import build_tasks
 from qpavoid.control.tasks.frame import FrameTask
 from qpavoid.control.tasks.layout import in_order
-from qpavoid.control.tasks.manipulability import Manipulability
 
-__all__ = ["Constant", "FrameTask", "Manipulability", "RowTask", "build_tasks", "in_order"]
+__all__ = ["Constant", "FrameTask", "RowTask", "build_tasks", "in_order"]

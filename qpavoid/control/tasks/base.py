@@ -43,6 +43,8 @@ class RowTask:
     """Of its error; `m` counts for the goal of a scenario."""
     bends = True
     """Whether its rows A turn as the robot moves."""
+    has_goal = True
+    """Whether it has somewhere to go, so that a lack of progress is reported."""
     moves = True
     """Whether a position counts, of a task whose target is somewhere."""
 

@@ -22,6 +22,7 @@ class Manipulability(RowTask):
     """
 
     unit = "w"
+    has_goal = False
 
     def __init__(self, settings: config.ManipulabilityTask, start: Start) -> None:
         model, frame_id = start.robot.model, start.frame_id(settings.frame)

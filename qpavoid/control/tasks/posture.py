@@ -21,6 +21,7 @@ class Damping(RowTask):
 
     unit = "rad"
     bends = False
+    has_goal = False
 
     def __init__(self, settings: config.DampingTask | config.PostureTask, start: Start) -> None:
         """Choose the coordinates; a posture has those of joints with several of them only where these are named."""
