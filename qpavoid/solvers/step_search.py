@@ -29,8 +29,8 @@ class StepSearch(NamedSolver):
 
         ‖A v - ẋ‖² + μ ‖v‖²,  ẋ scaled to what the speeds of the joints allow,
 
-    and without any, the one that violates the rows least. With nothing in the way that is J⁺ẋ, or what the grid has of
-    less motion.
+    and without any, the one that violates the rows least. Where no pair is in range and the bounds allow it, that is
+    J⁺ẋ without a search.
 
     It looks one step ahead, at a grid. So it rests where every step of the grid is worse than none, in front of an
     obstacle that a longer way would lead around; and where it moves, it jumps between the steps of the grid.
