@@ -7,7 +7,7 @@ from closed_loop import cartesian, drive, make_controller, planar
 from conftest import frames
 
 from qpavoid import Avoidance, Controller, Obstacle, ReasonKind, Sample, Severity, build_scene, build_tasks
-from qpavoid.config import Box, Capsule, Sphere, Task
+from qpavoid.config import Box, Capsule, ManipulabilityTask, PostureTask, Sphere, Task
 from qpavoid.run.simulate import simulate
 
 D1, GOAL = 0.03, np.array([0.6, 0.0, 0.0])
@@ -123,6 +123,22 @@ def test_straight_arm_that_has_to_bend_is_singular(tmp_path):
     (reason,) = ticks[100].solution.stalled
     assert (reason.kind, reason.subject, reason.unit) == (ReasonKind.SINGULAR, ("tip",), "m")
     assert reason.amount == pytest.approx(0.5, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "side",
+    [
+        PostureTask(q={"panda_joint1": 1.0, "panda_joint4": -1.0}, weight=1e-6),
+        ManipulabilityTask(frame="panda_hand_tcp", rows="pose", weight=1e-3),
+    ],
+    ids=["posture", "manipulability"],
+)
+def test_side_task_without_a_goal_is_not_stalled(panda, side):
+    """The hand stays where it is; a posture or manipulability that it leaves no way to is no reason to complain."""
+    tasks = build_tasks([Task(frame="panda_hand_tcp", type="pose"), side], panda, panda.home)
+    ticks = list(drive(Controller(build_scene(panda), tasks), panda.home, 400))
+    assert np.abs(ticks[-1].solution.v).max() < 0.05
+    assert not any(tick.solution.stalled for tick in ticks)
 
 
 def test_moving_target_is_followed_without_alarm(panda):
