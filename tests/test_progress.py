@@ -45,10 +45,10 @@ def test_stalled_names_the_obstacle_exactly_head_on(tmp_path, solver, shape):
     first = next(k for k, reasons in enumerate(reported) if reasons)
     assert 50 <= first < 350  # half a second without progress
     for (reason,) in reported[first:]:
-        assert (reason.kind, reason.subject, reason.unit) == (ReasonKind.STALLED, ("tool", shape), "m/s")
-        # v_tracking has the task's full speed; the row is zero at d1, where qp rests, and allows 50 mm/s farther out
-        assert reason.amount == pytest.approx(0.3, abs=0.02) or (solver == "eq10" and 0.25 < reason.amount < 0.3)
+        assert (reason.kind, reason.subject) == (ReasonKind.STALLED, ("tool", shape))
         assert reason.severity is Severity.WARNING
+        if solver == "qp":  # nothing else holds it; eq10 has no rows whose forces could be compared
+            assert reason.unit == "%" and reason.amount == pytest.approx(100.0)
 
 
 def test_stalled_names_panda_bodies_and_obstacle(panda):
@@ -67,8 +67,8 @@ def test_stalled_names_a_joint_limit(tmp_path):
     q, reported, _ = run_to(controller, 600, np.array([0.0, 0.5, 0.0]))
     assert q[-1][1] == pytest.approx(0.2, abs=1e-3)
     (reason,) = reported[-1]
-    assert (reason.kind, reason.subject, reason.unit) == (ReasonKind.AT_UPPER_LIMIT, ("joint_y",), "m/s")
-    assert reason.amount == pytest.approx(0.0, abs=1e-3)  # at the limit
+    assert (reason.kind, reason.subject, reason.unit) == (ReasonKind.AT_UPPER_LIMIT, ("joint_y",), "%")
+    assert reason.amount == pytest.approx(100.0)
 
 
 def test_stalled_ends_once_the_obstacle_has_left(tmp_path):
