@@ -24,6 +24,8 @@ control periods lead that far."""
 _COMING = 0.05
 """Speed of an obstacle towards a body from which nothing is slowed down [m/s]: beyond what noise makes of a rest."""
 
+_NO_LEVER = 1e-6
+"""Entry of a distance Jacobian up to which a joint does not move the pair: round-off of axes in files [m/rad or 1]."""
 _NO_LIMIT = 1e9
 """Change of v within a change of its change that is no limit [rad/s or m/s]: `speed_to_stop` takes finite ones."""
 
@@ -102,4 +104,4 @@ def _depths(problem: Problem) -> Array:
     """Return how much nearer than d1 each pair is (k,) [m]; 0 for a base that stands on something, without a way."""
     rows = problem.avoidance
     depth = rows.d1 - rows.d
-    return np.where(rows.J.any(axis=1), depth, 0.0) if depth.max(initial=0.0) > 0.0 else depth
+    return np.where(np.abs(rows.J).max(axis=1) > _NO_LEVER, depth, 0.0) if depth.max(initial=0.0) > 0.0 else depth
