@@ -6,7 +6,7 @@ import pytest
 from closed_loop import cartesian, drive, make_controller, planar
 from conftest import frames
 
-from qpavoid import Avoidance, Controller, Obstacle, ReasonKind, Sample, Severity, build_scene, build_tasks
+from qpavoid import Avoidance, Controller, Obstacle, ReasonKind, Robot, Sample, Severity, build_scene, build_tasks
 from qpavoid.config import Box, Capsule, ManipulabilityTask, PostureTask, Sphere, Task
 from qpavoid.run.simulate import simulate
 
@@ -150,6 +150,43 @@ def test_moving_target_is_followed_without_alarm(panda):
 
     ticks = list(drive(make_controller(panda, frame="panda_hand_tcp"), panda.home, 500, target=target))
     assert not any(tick.solution.stalled for tick in ticks)
+
+
+@pytest.mark.parametrize("name", ["panda", "ur5", "baxter"])
+def test_whatever_holds_a_task_is_named_in_time(name):
+    """Random targets beyond reach or in a box: from 1 s after the error is within 2 mm of its last value on, there are
+    reasons, shares of pairs and limits among 0 to 100 %; 0.2 s after the target has come back, there are none.
+    """
+    robot, rng, named = Robot.load(name), np.random.default_rng(8), 0
+    frame = robot.end_effectors[0]
+    (start,) = frames(robot, [frame], robot.home)
+    for number in range(4):
+        direction = rng.normal(size=3) * [1.0, 1.0, 0.3]
+        direction /= np.linalg.norm(direction)
+        box = Obstacle.at("box", Box(size=(0.2, 0.2, 0.2)), start.translation + 0.3 * direction)
+        goal, obstacles = [(1.3, []), (0.3, [box])][number % 2]
+        targets = start.translation + goal * direction, start.translation
+        controller, q, e, said = make_controller(robot, obstacles, frame), robot.home, [], []
+        for k in range(630):
+            target = targets[k >= 600]
+            solution = controller.step(q, targets={frame: Sample.at(target)})
+            (pose,) = frames(robot, [frame], q)
+            e.append(np.linalg.norm(pose.translation - target))
+            said.append(solution.stalled)
+            q = pin.integrate(robot.model, q, 0.01 * solution.v)
+        moving = np.flatnonzero(np.abs(np.array(e[:600]) - e[599]) > 2e-3)
+        at_rest = moving[-1] + 1 if len(moving) else 0
+        assert not any(said[620:])
+        if e[599] < 2e-3:  # on the other side of the base, and in reach
+            assert not any(said)
+            continue
+        assert all(said[at_rest + 100 : 600])
+        for reasons in said[at_rest + 100 : 600]:
+            shares = [reason.amount for reason in reasons if reason.unit == "%"]
+            assert all(0.0 < share <= 100.0 + 1e-9 for share in shares) and sum(shares) <= 100.0 + 1e-9
+            assert shares or reasons[0].kind in (ReasonKind.OUT_OF_REACH, ReasonKind.SINGULAR)
+            named += 1
+    assert named > 300
 
 
 def play_goal(panda, number, rng):
