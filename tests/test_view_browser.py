@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from qpavoid import load_scenario, simulate
-from qpavoid.viz.view_page import CAMERA, LOOK_AT
 from qpavoid.viz.view_replay import Replay
 from qpavoid.viz.view_session import Session
 
@@ -22,6 +21,7 @@ if not REQUIRED:
     if CHROMIUM is None:
         pytest.skip("no chromium; QPAVOID_REQUIRE_BROWSER=1 makes that a failure", allow_module_level=True)
 
+CAMERA, LOOK_AT = (1.2, -0.8, 0.9), (0.2, 0.0, 0.42)
 WIDTH, HEIGHT, FIELD_OF_VIEW = 960, 640, np.radians(75.0)
 PATIENCE = 60.0
 """Longest wait for the page or the loop [s]: a machine without a graphics processor may be busy with other tests."""
