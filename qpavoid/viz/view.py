@@ -96,6 +96,8 @@ class View:
         return view
 
     def _start(self, setup: PageSetup, scene: Scene | None) -> None:
+        self.camera, self.look_at = setup.camera
+        """Where the page is looked at from at first, and the point in its middle (3,) [m]."""
         self.scene = scene
         """Robot and obstacles that are shown; that of another controller of the same robot may take its place."""
         self._slots: list[Obstacle] = []  # as the page knows them

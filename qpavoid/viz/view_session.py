@@ -73,6 +73,8 @@ class Session:
         self.clock = PlayClock(self.config.dt)
         self._build: Build | None = None
         self._note, self._restarts, self._back = "", False, 0.0
+        self.shown_time = 0.0
+        """Time of what the page shows, which is in the past while it looks back [s]."""
         self._history: deque[Frame] = deque(maxlen=round(LOOK_BACK * _RATE))
         self._restart()
         frames = in_order(self.controller.tasks)[0]
@@ -121,7 +123,9 @@ class Session:
         if self.clock.wait():
             self._step()
         if self.view.is_due():
-            self.view.show(self._past_frame() if self._back else self._frame())
+            frame = self._past_frame() if self._back else self._frame()
+            self.shown_time = frame.t
+            self.view.show(frame)
 
     def _step(self) -> None:
         for pulled in (*self._targets.values(), *self._obstacles.values()):
