@@ -48,8 +48,8 @@ def build_runs(name: str, sets: Sequence[str], solvers: Sequence[str | None], re
     configs, controllers, q0 = [], [], np.zeros(0)
     for solver in solvers:
         config = load_scenario(name, sets, solver)
-        kept = [obstacle for obstacle in config.obstacles if obstacle.name not in removed]
-        changes = {"obstacles": kept, "spare_obstacles": max(config.spare_obstacles, _SPARE)}
+        present = [obstacle for obstacle in config.obstacles if obstacle.name not in removed]
+        changes = {"obstacles": present, "spare_obstacles": max(config.spare_obstacles, _SPARE)}
         configs.append(config.model_copy(update=changes).with_source(config.source))
         controller, q0 = Controller.from_scenario(configs[-1])
         controllers.append(controller)

@@ -260,19 +260,19 @@ class Session:
         self.view.scene = self.controller.scene
 
     def _take(self, runs: Runs) -> None:
-        kept, self.loops = self.loops, []
+        loops_now, self.loops = self.loops, []
         self.config, self._q0 = runs.config, runs.q0
         for number, controller in enumerate(runs.controllers):
             for name, obstacle in self._added.items():
                 place = self._obstacles[name].sample if name in self._obstacles else obstacle.motion.sample(0.0)
                 controller.add_obstacle(Obstacle.at(name, obstacle.shape, place.position, place.rotation))
-            if number < len(kept):
-                kept[number].swap(controller)
-                self.loops.append(kept[number])
+            if number < len(loops_now):
+                loops_now[number].swap(controller)
+                self.loops.append(loops_now[number])
             else:
-                self.loops.append(Loop(controller, kept[0].q if kept else self._q0, runs.config))
-                controller.reset(kept[0].v if kept else None)
-                self.loops[number].tick = kept[0].tick if kept else None
+                self.loops.append(Loop(controller, loops_now[0].q if loops_now else self._q0, runs.config))
+                controller.reset(loops_now[0].v if loops_now else None)
+                self.loops[number].tick = loops_now[0].tick if loops_now else None
 
 
 def _controls(config: ScenarioConfig, beside: str) -> dict[str, Any]:
