@@ -80,9 +80,11 @@ def test_stalled_ends_once_the_obstacle_has_left(tmp_path):
     assert not any(reported[520:]) and np.linalg.norm(q[-1] - GOAL) < 1e-4
 
 
-@pytest.mark.parametrize(("scenario", "longest"), [("situation1", 4.0), ("situation2", 0.0), ("panda_line", 0.0)])
+@pytest.mark.parametrize(("scenario", "longest"), [("situation1", 2.5), ("situation2", 0.0), ("panda_line", 0.0)])
 def test_stalled_raises_no_false_alarm(scenario, longest):
-    """Slowed down or pushed aside is not stalled; in Situation 1 the tool waits for its target to return."""
+    """Slowed down or pushed aside is not stalled; in Situation 1 the tool waits 2.4 s for its target to return: errors
+    show that from half a second on, where the velocity that was left showed it later.
+    """
     metrics = simulate(scenario).metrics()
     assert metrics["time_blocked"] <= longest and metrics["arrived"]
 

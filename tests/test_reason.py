@@ -136,7 +136,8 @@ def test_noise_at_twice_the_safety_distance_informs(tmp_path, given, sigma, seed
 
     ticks = list(drive(controller, np.zeros(3), 500, target=target, obstacles=seen))
     near = sum(0.035 < tick.proximity.distance.min(initial=1.0) < 0.045 for tick in ticks)
-    assert near > 40
+    relaxed = sum(tick.solution.status is Status.RELAXED for tick in ticks)
+    assert near > 40 and (20 < relaxed < 60 if given == "sample" else relaxed <= 5)  # bare poses are smoothed
     assert {tick.solution.severity for tick in ticks} <= {None, Severity.INFO}
 
 
