@@ -13,7 +13,7 @@ from qpavoid.problem import Array, IntArray
 from qpavoid.run.log import Log
 from qpavoid.viz.raster import Canvas, Projection
 from qpavoid.viz.robot_pictures import RobotPictures
-from qpavoid.viz.style import COLLISION, D1, GROUND, OBSTACLES, TOOL_PATH, rgb
+from qpavoid.viz.style import COLLISION, GROUND, OBSTACLES, TOOL_PATH, rgb
 from qpavoid.viz.surfaces import inflated_outline, is_endless, obstacle_faces, obstacle_path, triangulated
 
 PANELS = 6
@@ -212,7 +212,9 @@ def _obstacle_label(log: Log, index: int) -> str:
 
 def _legend(log: Log, steps: IntArray) -> list[Any]:
     obstacles = [(True, Patch(color=OBSTACLES[i % len(OBSTACLES)], label=_obstacle_label(log, i))) for i in _sized(log)]
-    around = Line2D([], [], color=D1, linestyle=(0, (3, 2)), linewidth=1.0, label=f"d1 = {_safety_distance(log):.3g} m")
+    around = Line2D(
+        [], [], color="#555555", linestyle=(0, (3, 2)), linewidth=1.0, label=f"d1 = {_safety_distance(log):.3g} m"
+    )
     entries = [
         *obstacles[:8],
         (bool(obstacles), around),
