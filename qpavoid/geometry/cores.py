@@ -1,4 +1,4 @@
-"""Bodies as cores with a radius around them, of which distances have a closed form."""
+"""Coal geometries as the convex shapes of kernels, and how the distance of each pair of them is computed."""
 
 from __future__ import annotations
 
@@ -8,33 +8,67 @@ from typing import Any
 import coal
 import numpy as np
 
-from qpavoid.problem import Array, IntArray, Mask
+from qpavoid.kernels.distances import BY_COAL, BY_GJK, CLOSED_FORM, TO_HALF_SPACE
+from qpavoid.kernels.support import (
+    BOX,
+    CONE,
+    CYLINDER,
+    ELLIPSOID,
+    HALF_SPACE,
+    HULL,
+    OTHER,
+    POINT,
+    SEGMENT,
+    Shapes,
+)
+from qpavoid.problem import IntArray
 
 
-def cores(geometries: Sequence[Any]) -> Array:
-    """Return the radius and the core's half sizes along the axes of each geometry (g, 4) [m].
+def convex_shapes(geometries: Sequence[Any]) -> Shapes:
+    """Return g geometries as arrays; triangle meshes, and what else is not convex, as OTHER."""
+    count, points, edges = len(geometries), [np.zeros((0, 3))], list[IntArray]()
+    kind, core, span = np.zeros(count, dtype=np.intp), np.zeros((count, 4)), np.zeros((count, 2), dtype=np.intp)
+    total = 0
+    for i, geometry in enumerate(geometries):
+        kind[i], core[i] = core_of(geometry)
+        if kind[i] == HULL:
+            corners = np.array(geometry.points())
+            points.append(corners)
+            edges += [total + np.array(geometry.neighbors(k), dtype=np.intp) for k in range(len(corners))]
+            span[i] = total, total + len(corners)
+            total += len(corners)
+    first = np.cumsum([0, *map(len, edges)]).astype(np.intp)
+    return Shapes(kind, core, span, np.concatenate(points), first, np.concatenate([np.zeros(0, dtype=np.intp), *edges]))
 
-    A sphere is a point, and a capsule a segment along z, with a radius around it; a box is a core without one. Rows of
-    all other shapes are NaN.
-    """
-    return np.array([_core(geometry) for geometry in geometries]).reshape(-1, 4)
 
-
-def _core(geometry: Any) -> tuple[float, ...]:
+def core_of(geometry: Any) -> tuple[int, tuple[float, ...]]:
+    """Return the kind of a geometry's core; radius around it, and half sizes, see `Shapes.core` [m]."""
+    none = (0.0, 0.0, 0.0, 0.0)
     match geometry:
         case coal.Sphere():
-            return (geometry.radius, 0.0, 0.0, 0.0)
+            return POINT, (geometry.radius, 0.0, 0.0, 0.0)
         case coal.Capsule():
-            return (geometry.radius, 0.0, 0.0, geometry.halfLength)
+            return SEGMENT, (geometry.radius, 0.0, 0.0, geometry.halfLength)
         case coal.Box() if (geometry.halfSide > 0.0).all():
-            return (0.0, *geometry.halfSide)
-    return (np.nan,) * 4
+            return BOX, (0.0, *geometry.halfSide)
+        case coal.Cylinder():
+            return CYLINDER, (0.0, geometry.radius, geometry.radius, geometry.halfLength)
+        case coal.Cone():
+            return CONE, (0.0, geometry.radius, geometry.radius, geometry.halfLength)
+        case coal.Ellipsoid() if (np.asarray(geometry.radii) > 0.0).all():
+            return ELLIPSOID, (0.0, *geometry.radii)
+        case coal.ConvexBase():
+            return HULL, none
+        case coal.Halfspace() if geometry.d == 0.0 and np.array_equal(geometry.n, [0.0, 0.0, 1.0]):
+            return HALF_SPACE, none
+    return OTHER, none
 
 
-def has_closed_form(table: Array, bodies: IntArray) -> Mask:
-    """Find the pairs (m,) of bodies (m, 2) whose distance has a closed form.
-
-    Both have a core, and one at most is a box.
-    """
-    known, box = ~np.isnan(table[:, 0]), table[:, 1] > 0.0
-    return np.asarray(known[bodies].all(axis=1) & ~box[bodies].all(axis=1))
+def pair_methods(shapes: Shapes, pairs: IntArray) -> IntArray:
+    """Choose how the distance of each pair (m, 2) of bodies is computed (m,), see `kernels.distances`."""
+    low, high = np.sort(shapes.kind[pairs], axis=1).T
+    return np.select(
+        [(low <= SEGMENT) & (high <= BOX), high <= HULL, (low <= HULL) & (high == HALF_SPACE)],
+        [CLOSED_FORM, BY_GJK, TO_HALF_SPACE],
+        BY_COAL,
+    ).astype(np.intp)
