@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from oracle import support
 
 from qpavoid.control.distances import DistanceQuery
-from qpavoid.geometry.cores import convex_shapes, pair_methods
 from qpavoid.kernels.distances import BY_COAL, CLOSED_FORM, compute_distances
 from qpavoid.kernels.gjk import GUESS, MIN_CORE_DISTANCE
+from qpavoid.model.convex_shapes import convex_shapes, pair_methods
 from qpavoid.model.kinematics import ForwardKinematics
 
 AT_ORIGIN = pin.SE3.Identity()

@@ -7,10 +7,10 @@ import pytest
 from oracle import support
 from test_closed_forms import by_coal, certify, somewhere
 
-from qpavoid.geometry.cores import convex_shapes, pair_methods
 from qpavoid.geometry.meshes import convex_hull
 from qpavoid.kernels.distances import BY_GJK, TO_HALF_SPACE, compute_distances
 from qpavoid.kernels.gjk import GUESS
+from qpavoid.model.convex_shapes import convex_shapes, pair_methods
 
 LARGEST_SEARCH = 60
 """Iterations of a search, at most."""

@@ -13,9 +13,9 @@ import coal
 import numpy as np
 
 from qpavoid.geometry.bodies import bounding_box, bounding_sphere
-from qpavoid.geometry.cores import convex_shapes, core_of, pair_methods
 from qpavoid.kernels.distances import BY_COAL, SPARE_BY_COAL
 from qpavoid.kernels.support import HULL, OTHER, Shapes
+from qpavoid.model.convex_shapes import convex_shapes, core_of, pair_methods
 from qpavoid.model.kinematics import support_masks
 from qpavoid.model.scene import Scene
 from qpavoid.model.views import read_poses

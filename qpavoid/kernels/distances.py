@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from qpavoid.kernels.gjk import MIN_CORE_DISTANCE, core_distance
-from qpavoid.kernels.packing import compiled
+from qpavoid.kernels.packing import compiled, inlined
 from qpavoid.kernels.support import BOX, HALF_SPACE, Shapes, support
 from qpavoid.problem import Array, IntArray
 
@@ -71,7 +71,7 @@ def compute_distances(
     return count
 
 
-@compiled
+@inlined
 def _add_radii(r: float, s: float, result: Array) -> None:
     """Turn the result of two cores into that of the bodies with these radii around them."""
     result[0] -= r + s
@@ -80,7 +80,7 @@ def _add_radii(r: float, s: float, result: Array) -> None:
         result[7 + c] -= s * result[1 + c]
 
 
-@compiled
+@inlined
 def _closed_form(shapes: Shapes, poses: Array, i: int, j: int, result: Array) -> bool:
     """Write the result of two cores, points, segments or one of them a box; return False where they meet."""
     a, b = result[4:7], result[7:10]
@@ -99,7 +99,7 @@ def _closed_form(shapes: Shapes, poses: Array, i: int, j: int, result: Array) ->
     return True
 
 
-@compiled
+@inlined
 def _to_half_space(shapes: Shapes, poses: Array, i: int, j: int, guess: Array, result: Array) -> bool:
     """Write the result of a core and a half-space below the plane z = 0 of its pose; return False at NaN.
 

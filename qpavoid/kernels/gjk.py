@@ -218,21 +218,18 @@ def _closest(s: Array, count: int) -> float:
     if count == 2:
         square, s[0, 9], s[1, 9] = _segment(s, 0, 1)
         return square
-    if count == 3:
-        square, s[0, 9], s[1, 9], s[2, 9] = _triangle(s, 0, 1, 2)
-        return square
-    best = np.inf
-    s[0, 9], s[1, 9], s[2, 9], s[3, 9] = 0.0, 0.0, 0.0, 0.0
-    for other in range(3):
+    best, last = np.inf, count - 1
+    s[0, 9], s[1, 9], s[2, 9], s[last, 9] = 0.0, 0.0, 0.0, 0.0
+    for other in range(0 if count == 4 else 2, 3):  # of a triangle, i and j are 0 and 1
         i, j = (other + 1) % 3, (other + 2) % 3
-        if _is_beyond(s, i, j, 3, other):
-            square, a, b, c = _triangle(s, i, j, 3)
+        if count == 3 or _is_beyond(s, i, j, last, other):
+            square, a, b, c = _triangle(s, i, j, last)
             if square < best:
-                best, s[other, 9], s[i, 9], s[j, 9], s[3, 9] = square, 0.0, a, b, c
+                best, s[other, 9], s[i, 9], s[j, 9], s[last, 9] = square, 0.0, a, b, c
     return best if best < np.inf else 0.0
 
 
-@compiled
+@inlined
 def _is_beyond(s: Array, i: int, j: int, k: int, other: int) -> bool:
     """Return whether the origin is not on the side of a face on which the fourth point is."""
     ux, uy, uz = s[j, 0] - s[i, 0], s[j, 1] - s[i, 1], s[j, 2] - s[i, 2]
@@ -243,59 +240,43 @@ def _is_beyond(s: Array, i: int, j: int, k: int, other: int) -> bool:
     return not origin * there > 0.0
 
 
-@compiled
+@inlined
 def _segment(s: Array, i: int, j: int) -> tuple[float, float, float]:
     """Return the squared distance of a segment from the origin, and the weights of its ends."""
     ux, uy, uz = s[j, 0] - s[i, 0], s[j, 1] - s[i, 1], s[j, 2] - s[i, 2]
     square = ux * ux + uy * uy + uz * uz
     along = -(s[i, 0] * ux + s[i, 1] * uy + s[i, 2] * uz)
-    t = min(max(_ratio(along, square), 0.0), 1.0)
+    t = min(max(along / square, 0.0), 1.0) if square > 0.0 else 0.0
     x, y, z = s[i, 0] + t * ux, s[i, 1] + t * uy, s[i, 2] + t * uz
     return x * x + y * y + z * z, 1.0 - t, t
 
 
-@compiled
+@inlined
 def _triangle(s: Array, i: int, j: int, k: int) -> tuple[float, float, float, float]:
     """Return the squared distance of a triangle from the origin, and the weights of its corners.
 
-    The closest point is on a corner, an edge or the inside, which signs of barycentric coordinates tell (Ericson 2005,
-    "Real-Time Collision Detection", 5.1.5).
+    Those of the point in its plane are (a, b, c)/n²; where some are not positive, the closest point is on the edge
+    across from one of these.
     """
     ux, uy, uz = s[j, 0] - s[i, 0], s[j, 1] - s[i, 1], s[j, 2] - s[i, 2]
     vx, vy, vz = s[k, 0] - s[i, 0], s[k, 1] - s[i, 1], s[k, 2] - s[i, 2]
-    d1, d2 = -(ux * s[i, 0] + uy * s[i, 1] + uz * s[i, 2]), -(vx * s[i, 0] + vy * s[i, 1] + vz * s[i, 2])
-    d3, d4 = -(ux * s[j, 0] + uy * s[j, 1] + uz * s[j, 2]), -(vx * s[j, 0] + vy * s[j, 1] + vz * s[j, 2])
-    d5, d6 = -(ux * s[k, 0] + uy * s[k, 1] + uz * s[k, 2]), -(vx * s[k, 0] + vy * s[k, 1] + vz * s[k, 2])
-    a, b, c = 1.0, 0.0, 0.0
     nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-    ax, ay, az = s[i, 0], s[i, 1], s[i, 2]
-    vb = ax * (ny * vz - nz * vy) + ay * (nz * vx - nx * vz) + az * (nx * vy - ny * vx)
-    vc = ax * (uy * nz - uz * ny) + ay * (uz * nx - ux * nz) + az * (ux * ny - uy * nx)
-    total = nx * nx + ny * ny + nz * nz
-    va = total - vb - vc
-    if d1 <= 0.0 and d2 <= 0.0:
-        pass
-    elif d3 >= 0.0 and d4 <= d3:
-        a, b = 0.0, 1.0
-    elif vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
-        b = _ratio(d1, d1 - d3)
-        a = 1.0 - b
-    elif d6 >= 0.0 and d5 <= d6:
-        a, c = 0.0, 1.0
-    elif vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
-        c = _ratio(d2, d2 - d6)
-        a = 1.0 - c
-    elif va <= 0.0 and d4 >= d3 and d5 >= d6:
-        c = _ratio(d4 - d3, (d4 - d3) + (d5 - d6))
-        a, b = 0.0, 1.0 - c
-    else:
-        b, c = _ratio(vb, total), _ratio(vc, total)
-        a = 1.0 - b - c
-    x, y, z = s[i, 0] + b * ux + c * vx, s[i, 1] + b * uy + c * vy, s[i, 2] + b * uz + c * vz
-    return x * x + y * y + z * z, a, b, c
-
-
-@compiled
-def _ratio(part: float, whole: float) -> float:
-    """Return a quotient; 0 of a simplex without extension."""
-    return part / whole if whole > 0.0 else 0.0
+    square = nx * nx + ny * ny + nz * nz
+    b = s[i, 0] * (ny * vz - nz * vy) + s[i, 1] * (nz * vx - nx * vz) + s[i, 2] * (nx * vy - ny * vx)
+    c = s[i, 0] * (uy * nz - uz * ny) + s[i, 1] * (uz * nx - ux * nz) + s[i, 2] * (ux * ny - uy * nx)
+    a = square - b - c
+    if a > 0.0 and b > 0.0 and c > 0.0:
+        height = nx * s[i, 0] + ny * s[i, 1] + nz * s[i, 2]
+        return height * height / square, a / square, b / square, c / square
+    best, wa, wb, wc = np.inf, 0.0, 0.0, 0.0
+    if not a > 0.0:
+        best, wb, wc = _segment(s, j, k)
+    if not b > 0.0:
+        distance, one, two = _segment(s, i, k)
+        if distance < best:
+            best, wa, wb, wc = distance, one, 0.0, two
+    if not c > 0.0:
+        distance, one, two = _segment(s, i, j)
+        if distance < best:
+            best, wa, wb, wc = distance, one, two, 0.0
+    return best, wa, wb, wc

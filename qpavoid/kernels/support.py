@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from qpavoid.kernels.packing import compiled, inlined
+from qpavoid.kernels.packing import inlined
 from qpavoid.problem import Array, IntArray
 
 POINT, SEGMENT, BOX, CYLINDER, CONE, ELLIPSOID, HULL, HALF_SPACE, OTHER = range(9)
@@ -45,7 +45,7 @@ def support(shapes: Shapes, i: int, start: int, x: float, y: float, z: float) ->
         shapes: with the core.
         i: number of the body.
         start: vertex of a large hull to climb from.
-        x: of the unit direction, in the body's frame; y and z likewise.
+        x: of the unit direction, in the body's frame.
         y: see x.
         z: see x.
 
@@ -73,7 +73,7 @@ def support(shapes: Shapes, i: int, start: int, x: float, y: float, z: float) ->
     return start, a * x / radial, a * y / radial, height
 
 
-@compiled
+@inlined
 def any_point(shapes: Shapes, i: int) -> tuple[float, float, float]:
     """Return a point of a core: its centre, but a corner of a hull, which may be anywhere in its frame [m]."""
     if shapes.kind[i] != HULL:
@@ -105,7 +105,7 @@ def farthest_vertex(shapes: Shapes, low: int, high: int, start: int, x: float, y
     return at
 
 
-@compiled
+@inlined
 def _side(x: float) -> float:
     """Return the sign of a component of a unit direction; 0 where it counts as none."""
     return 1.0 if x > _TIE else (-1.0 if x < -_TIE else 0.0)
