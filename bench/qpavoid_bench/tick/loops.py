@@ -65,6 +65,10 @@ class Loop:
         """Compute the velocity of a control step from where the robot is; the arguments do not matter."""
         return self.controller.step(self.q, *self._inputs).v
 
+    def tick(self) -> Any:
+        """Take a control step, with everything that led to its velocity."""
+        return self.controller.tick(self.q, *self._inputs)
+
     def advance(self, v: Array) -> None:
         """Integrate the command, and make the next step's target."""
         dt = self.controller.dt
@@ -101,7 +105,7 @@ def make_loop(name: str) -> Loop:
         return _bodies(detail, int(variant or 0))
     if kind == "cloud":
         return _cloud(int(detail))
-    return _from(circling(**({"backup": None} if variant else {})))
+    return _from(circling(**({"backup": False} if variant else {})))
 
 
 def circling(**avoidance: Any) -> ScenarioConfig:
