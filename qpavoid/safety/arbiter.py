@@ -21,7 +21,7 @@ from qpavoid.safety.backup import BackupPlanner
 from qpavoid.safety.braking import BrakingCheck
 from qpavoid.safety.progress import ProgressMonitor
 from qpavoid.safety.recovery import slow_recovery
-from qpavoid.safety.stall_damping import StallDamping
+from qpavoid.safety.shake_damping import ShakeDamping
 from qpavoid.solvers import Solver
 
 _LIMIT_TOLERANCE = 2e-6
@@ -38,14 +38,14 @@ class Arbiter:
         self._settings, self.solver, self._rows = settings, solver, rows
         self._v_shape = (settings.scene.robot.model.nv,)
         self._braking = BrakingCheck(settings, rows, obstacles)
-        self.progress, self._stall_damping = ProgressMonitor(settings, rows), StallDamping(settings.dt)
+        self.progress, self._shake_damping = ProgressMonitor(settings, rows), ShakeDamping(settings.dt)
         has_backup = settings.avoidance.backup and len(settings.scene.slots) > 0
         self.backup = BackupPlanner(settings, rows.query.table, obstacles) if has_backup else None
 
     def reset(self) -> None:
         """Drop all that is known of earlier control steps."""
         self.progress.reset()
-        self._stall_damping.reset()
+        self._shake_damping.reset()
         if self.backup is not None:
             self.backup.reset()
 
@@ -60,11 +60,11 @@ class Arbiter:
             from_tasks: whether the problem is of the tasks, whose progress is monitored; else of a given velocity.
         """
         if from_tasks:
-            problem = self._stall_damping.apply(problem)
+            problem = self._shake_damping.apply(problem)
         solution = self._solve(q, problem, proximity, from_tasks)
         if from_tasks:
             stalled = self.progress.update(problem, solution)
-            self._stall_damping.update(solution.v, bool(stalled))
+            self._shake_damping.update(problem, solution.v, proximity.feedforward, bool(stalled))
             solution = solution._replace(stalled=stalled) if stalled else solution
         if self.backup is not None and self.solver.bounded:
             solution = self._ensure_backup(self.backup, q, t, proximity, problem, solution)
