@@ -30,6 +30,9 @@ class Mesh(NamedTuple):
     """Red, green, blue, opacity, 0 to 1."""
 
 
+EMPTY = Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint32), (0.0, 0.0, 0.0, 1.0))
+
+
 def of_quadrilaterals(quadrilaterals: Array, colour: tuple[float, ...]) -> Mesh:
     """Return quadrilaterals (m, 4, 3) [m] as a mesh; corners at the same place become one."""
     corners = np.round(np.asarray(quadrilaterals, dtype=np.float32).reshape(-1, 3), 6)
