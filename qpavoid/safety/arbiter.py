@@ -69,7 +69,7 @@ class Arbiter:
         solution = self._solve(q, problem, proximity, from_tasks)
         if from_tasks:
             stalled = self.progress.update(problem, solution)
-            self._shake_damping.update(problem, solution.v, proximity.feedforward, bool(stalled))
+            self._shake_damping.update(solution.v, proximity.feedforward, bool(stalled))
             solution = solution._replace(stalled=stalled) if stalled else solution
         if self.backup is not None and self.solver.bounded:
             solution = self._ensure_backup(self.backup, q, t, proximity, problem, solution)

@@ -1,9 +1,10 @@
-"""More regularization for a robot that shakes at something that rests.
+"""More regularization for a robot that is stalled at something that rests, and shakes.
 
 Where rows keep a robot from its target, the cost of the QP is flat in some direction, and the rows turn as the robot
 moves in it: at an edge by more than the tasks bend, whatever their velocity. The optimum then jumps from bound to
-bound. So λ grows as long as commands go to and fro, and falls again some time after they have ceased to. Among
-obstacles that move, which robots have to dodge, λ stays as it is.
+bound. So λ grows as long as commands of a stalled robot go to and fro, and falls again some time after it has moved on.
+Where there is progress, λ stays as it is: more of it costs ways around obstacles; and so among obstacles that move,
+which robots have to dodge.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ _INTERVAL = 0.1
 _SHAKING = 0.015
 """Mean of a control step's Σ_j |Δv_j| from which on a robot shakes, less what changes v for good [rad/s, m/s]."""
 _CALM = 5
-"""Intervals without shaking after which λ falls [-]."""
+"""Intervals after which λ of a robot that is not stalled falls [-]."""
 _MAX_FACTOR = 64.0
 """Largest factor on λ [-]."""
 _MAX_BENT = 4.0
@@ -25,7 +26,7 @@ _MAX_BENT = 4.0
 
 
 class ShakeDamping:
-    """The factor on `Problem.bent` of a controller whose robot shakes."""
+    """The factor on `Problem.bent` of a controller whose robot is stalled and shakes."""
 
     def __init__(self, dt: float) -> None:
         self._dt, self._interval = dt, max(1, round(_INTERVAL / dt))
@@ -50,16 +51,15 @@ class ShakeDamping:
         most = _MAX_BENT * self._dt * float(np.linalg.norm(problem.tracking.b_feasible))
         return problem._replace(bent=max(problem.bent, min(self._factor * problem.bent, most)))
 
-    def update(self, problem: Problem, v: Array, feedforward: Array, stalled: bool) -> None:
+    def update(self, v: Array, feedforward: Array, stalled: bool) -> None:
         """Take in what is commanded.
 
         Args:
-            problem: of the tasks.
             v: the command (nv,).
             feedforward: rate of each near distance due to the obstacles (k,) [m/s].
             stalled: whether any task is.
         """
-        if problem.violation <= 0.0 and self._factor == 1.0:
+        if not stalled and self._factor == 1.0:
             self._is_open = False
             return
         if feedforward.any():
@@ -76,9 +76,9 @@ class ShakeDamping:
             self._begin(command)
 
     def _adapt(self, shakes: bool, stalled: bool) -> None:
-        """Change the factor at the end of an interval; while a task is stalled, it does not fall."""
-        self._calm = 0 if shakes or stalled else self._calm + 1
-        if shakes:
+        """Change the factor at the end of an interval."""
+        self._calm = 0 if stalled else self._calm + 1
+        if stalled and shakes:
             self._factor = min(2.0 * self._factor, _MAX_FACTOR)
         elif self._calm == _CALM:
             self._factor, self._calm = max(0.5 * self._factor, 1.0), 0
