@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from qpavoid.problem import Array
-from qpavoid.viz.meshes import OBSTACLES
-from qpavoid.viz.style import COLOURS
+from qpavoid.viz.style import COLOURS, OBSTACLES
 from qpavoid.viz.view_ghosts import COLOURS as GHOSTS
 from qpavoid.viz.view_link import BACKUP, Frame, PageSetup
 
