@@ -5,9 +5,10 @@ import pinocchio as pin
 import pytest
 from closed_loop import SHIPPED, Ruler, cartesian, changed, make_controller
 
-from qpavoid import Avoidance, Controller, Limits, Obstacle, ReasonKind, Sample, Status, kernels, load_scenario
+from qpavoid import Avoidance, Controller, Limits, Obstacle, ReasonKind, Sample, Status, load_scenario
 from qpavoid.config import Box, Line, Sphere
 from qpavoid.model.trajectory import build_motion
+from qpavoid.safety.rollout import BackupRollouts
 
 DT = 0.01
 GAP = 0.5
@@ -56,8 +57,14 @@ def gaps(controller, states):
 @pytest.fixture
 def evaluations(monkeypatch):
     """Poses of rollouts that are evaluated, a one each."""
-    calls, rows = [], kernels.backup_rows
-    monkeypatch.setattr(kernels, "backup_rows", lambda *args: calls.append(1) or rows(*args))
+    calls, resume = [], BackupRollouts.resume
+
+    def counted(rollouts, poses):
+        code = resume(rollouts, poses)
+        calls.extend([1] * (poses - rollouts.poses_left))
+        return code
+
+    monkeypatch.setattr(BackupRollouts, "resume", counted)
     return calls
 
 

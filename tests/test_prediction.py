@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 
 from qpavoid import Obstacle, Pose, Sample
 from qpavoid.config import Line, Sensing, Sphere
-from qpavoid.control.estimates import prediction_error_bound
 from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.control.trajectories import extrapolate
+from qpavoid.kernels import prediction_error_bound
 from qpavoid.model.trajectory import build_motion
 
 
@@ -43,7 +43,7 @@ def test_prediction_uses_the_mean_twist():
         at = np.array([0.2 * t, 0.0, 0.0])
         observe(obstacles, t, {"ball": Pose.at(at + 0.005 * rng.normal(size=3))})
         if k == 1:
-            first = obstacles.estimates.states[0, 12:15]
+            first = obstacles.prediction.twists[0, :3]
             np.testing.assert_array_equal(first, obstacles.current.states[0, 12:15])  # of one twist, that is the mean
         if k > 50:
             off.append(obstacles.at(t + 1.0).states[0, 9:12] - at - [0.2, 0.0, 0.0])
@@ -62,7 +62,7 @@ def test_prediction_error_bound_covers_every_point(seed, size):
 
     first = {name: [rng.normal(size=3) for _ in range(4)] for name in names}
     observe(obstacles, 0.0, {name: sample(*parts) for name, parts in first.items()})
-    before, radii = obstacles.estimates, np.array([0.2, 0.3])
+    before, radii = obstacles.prediction, np.array([0.2, 0.3])
     then = {name: obstacles.at(dt).states[i] for i, name in enumerate(names)}
     now = {}
     for name, state in then.items():
@@ -71,16 +71,18 @@ def test_prediction_error_bound_covers_every_point(seed, size):
             *(state[9:12] + size * rng.normal(size=3), R), *(state[12:].reshape(2, 3) + size * rng.normal(size=(2, 3)))
         )
     observe(obstacles, dt, now)
-    bound = prediction_error_bound(obstacles.estimates, before, 1.0, radii)
+    bound = prediction_error_bound(obstacles.prediction, before, 1.0, radii)
     for i, name in enumerate(names):
         for t in np.linspace(0.0, 1.0, 11):
             points = rng.normal(size=(50, 3))
             points *= radii[i] / np.linalg.norm(points, axis=1, keepdims=True)
-            states = np.array([then[name], obstacles.estimates.states[i]])
+            states = np.array(
+                [then[name], np.append(obstacles.prediction.states[i, :12], obstacles.prediction.twists[i])]
+            )
             extrapolate(states, t)
             places = [points @ state[:9].reshape(3, 3) + state[9:12] for state in states]
             assert np.linalg.norm(places[0] - places[1], axis=1).max() <= bound + 1e-9
-    assert prediction_error_bound(obstacles.estimates, before, 1.0, np.array([np.inf, 0.3])) == np.inf or size < 1e-9
+    assert prediction_error_bound(obstacles.prediction, before, 1.0, np.array([np.inf, 0.3])) == np.inf or size < 1e-9
     assert bound > 0.0 or size < 1e-9
     obstacles.reset()
-    assert prediction_error_bound(obstacles.estimates, before, 1.0, radii) == np.inf
+    assert prediction_error_bound(obstacles.prediction, before, 1.0, radii) == np.inf

@@ -1,13 +1,12 @@
 """Array work of a control step: loops that numba compiles at their first use, and stores on disk (`kernels.cache`)."""
 
 from qpavoid.kernels.backup import (
-    ROUND_OFF,
     backup_rows,
     braking_travel,
     closes_below,
     line_clearance,
+    max_offset,
     min_sphere_distance,
-    rate_limit,
 )
 from qpavoid.kernels.bounds import velocity_bounds
 from qpavoid.kernels.braking_bounds import speed_to_stop
@@ -32,7 +31,10 @@ from qpavoid.kernels.kinematics import KinematicsArrays, update_kinematics
 from qpavoid.kernels.layout import RowLayout
 from qpavoid.kernels.near_pairs import DistanceArrays, near_pairs, place_bodies, place_obstacles
 from qpavoid.kernels.obstacles import Pieces, check_states, sample_pieces
+from qpavoid.kernels.prediction import Prediction, predict, prediction_error_bound
 from qpavoid.kernels.qp import max_clearance_velocity, minimize, project, project_soft
+from qpavoid.kernels.ramps import RampLimits, follow_ramp
+from qpavoid.kernels.rollout import RolloutArrays, advance_rollout, begin_rollout
 from qpavoid.kernels.rotation import rotation_vector
 from qpavoid.kernels.rows import alpha, beta, distance_rows, row_bounds
 from qpavoid.kernels.step import assemble, control_step, find_near_pairs, tracking_violation, violation
@@ -43,17 +45,21 @@ from qpavoid.kernels.tracking_law import tracking_law
 from qpavoid.kernels.voxels import select_voxels, voxels_within
 
 __all__ = [
-    "ROUND_OFF",
     "TOLERANCE",
     "DistanceArrays",
     "KinematicsArrays",
     "Pieces",
+    "Prediction",
+    "RampLimits",
+    "RolloutArrays",
     "RowLayout",
     "add_curvature",
+    "advance_rollout",
     "alpha",
     "are_fine",
     "assemble",
     "backup_rows",
+    "begin_rollout",
     "beta",
     "braking_travel",
     "candidates",
@@ -67,6 +73,7 @@ __all__ = [
     "extrapolate_states",
     "find_near_pairs",
     "first_use",
+    "follow_ramp",
     "frame_rows",
     "is_tracking_clear",
     "jerk_limited_stop",
@@ -74,16 +81,18 @@ __all__ = [
     "leaves_position_limits",
     "line_clearance",
     "max_clearance_velocity",
+    "max_offset",
     "min_sphere_distance",
     "minimize",
     "near_pairs",
     "pack",
     "place_bodies",
     "place_obstacles",
+    "predict",
+    "prediction_error_bound",
     "project",
     "project_soft",
     "projection_cost",
-    "rate_limit",
     "roll_out_stop",
     "rotation_vector",
     "row_bounds",

@@ -1,4 +1,4 @@
-"""Kernels of backup trajectories: rows of near pairs, velocity ramps, clearance of paths."""
+"""Kernels of backup trajectories: rows of near pairs, clearance of paths."""
 
 from __future__ import annotations
 
@@ -12,9 +12,6 @@ from qpavoid.kernels.near_pairs import place_bodies
 from qpavoid.kernels.packing import compiled
 from qpavoid.kernels.rows import distance_rows
 from qpavoid.problem import Array, IntArray, Mask
-
-ROUND_OFF = 1e-12
-"""Difference of velocities that counts as none [rad/s, m/s]."""
 
 
 @compiled
@@ -82,28 +79,23 @@ def closes_below(closest: Array, J: Array, feedforward: Array, v: Array, span: f
 
 
 @compiled
-def rate_limit(v: Array, targets: Array, v_step: Array, stop_when_met: bool) -> Array:
-    """Compute velocities of successive control steps, each as close to its target as the largest change allows.
+def max_offset(offset: Array, ramp: Array, targets: Array, dt: float) -> float:
+    """Compute the largest sum over the joints of how far they are from a trajectory, on the way back to it [rad, m].
 
     Args:
-        v: velocity (n,) before the first.
-        targets: velocities (k, n).
-        v_step: largest change of v in a control step (n,), infinite without a limit.
-        stop_when_met: whether to end at the first target that is met.
-
-    Returns:
-        Velocities until then (<= k, n).
+        offset: of the configuration now (n,) [rad or m].
+        ramp: velocities (k, n) of successive control steps.
+        targets: velocities (>= k, n) of the trajectory.
+        dt: control period [s].
     """
-    ramp, v_prev = np.empty(targets.shape), v
-    for k in range(len(targets)):
-        error = 0.0
-        for c in range(len(v)):
-            ramp[k, c] = v_prev[c] + min(max(targets[k, c] - v_prev[c], -v_step[c]), v_step[c])
-            error = max(error, abs(ramp[k, c] - targets[k, c]))
-        if stop_when_met and error < ROUND_OFF:
-            return ramp[: k + 1]
-        v_prev = ramp[k]
-    return ramp
+    sums, largest = offset.copy(), np.sum(np.abs(offset))
+    for i in range(len(ramp)):
+        total = 0.0
+        for j in range(len(sums)):
+            sums[j] += dt * (ramp[i, j] - targets[i, j])
+            total += abs(sums[j])
+        largest = max(largest, total)
+    return largest
 
 
 @compiled

@@ -10,8 +10,9 @@ import pinocchio as pin
 from qpavoid import kernels
 from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.control.settings import ControlSettings
+from qpavoid.kernels.rollout import HORIZON, PREFERRED_DISTANCE
 from qpavoid.problem import Array, IntArray
-from qpavoid.safety.rollout import HORIZON, PREFERRED_DISTANCE, BackupRollouts
+from qpavoid.safety.rollout import BackupRollouts
 
 _PERIOD = 0.1
 """Time between two positions of the bounding spheres of moving obstacles [s]."""

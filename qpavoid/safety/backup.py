@@ -24,9 +24,10 @@ import pinocchio as pin
 from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.control.pair_table import PairTable
 from qpavoid.control.settings import ControlSettings
+from qpavoid.kernels.rollout import TOUCH
 from qpavoid.problem import Array, Proximity
 from qpavoid.safety.approach import ApproachCheck
-from qpavoid.safety.rollout import TOUCH, BackupPolicy, BackupRollouts, BackupScore, BackupTrajectory, Start
+from qpavoid.safety.rollout import BackupPolicy, BackupRollouts, BackupScore, BackupTrajectory, Start
 
 _HORIZONS = (0.2, 0.05, 0.5)
 """h of backup policies [s]: the most successful first."""
