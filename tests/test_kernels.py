@@ -590,14 +590,3 @@ def test_ramp_keeps_to_the_largest_change():
         expected = [[min(0.1 * (i + 1), 0.35), -0.1, 5.0] for i in range(4 if meets else 6)]
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-15)
         assert len(follow(np.zeros(3), constant[:0], np.ones(3), meets)) == 0
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_min_sphere_distance_by_its_definition(seed):
-    rng = np.random.default_rng(seed)
-    paths, centers, sizes = rng.normal(size=(7, seed, 3)), rng.normal(size=(4, 3)), rng.uniform(0.0, 1.0, (seed, 4))
-    distances = np.linalg.norm(paths[:, :, None] - centers, axis=-1) - sizes
-    assert kernels.min_sphere_distance(paths, centers, sizes) == pytest.approx(distances.min(initial=np.inf))
-    if seed:
-        paths[3, 0, 1] = np.nan
-        assert not kernels.min_sphere_distance(paths, centers, sizes) > -np.inf

@@ -6,32 +6,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from qpavoid import Obstacle, Pose, Sample
-from qpavoid.config import Line, Sensing, Sphere
+from qpavoid.config import Sensing, Sphere
 from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.control.trajectories import extrapolate
 from qpavoid.kernels import prediction_error_bound
-from qpavoid.model.trajectory import build_motion
 
 
 def observe(tracker, t, updates):
     """Take over what a step at t is given."""
     tracker.advance(tracker.read(t, updates))
-
-
-def test_paths_are_those_of_obstacles_on_trajectories():
-    times, update = np.array([0.3, 0.4, 1.9]), {"b": Sample.at([0, 1, 0], linear=[0.1, 0, 0.2], angular=[0, 0, 3.0])}
-    line = build_motion(Line(start=(0.0, 0.6, 0.0), end=(0.0, -2.0, 0.0), speed=0.5))
-    obstacles = [Obstacle.at(name, Sphere(radius=0.1), [9.0, 0.0, 0.0]) for name in ("still", "b")]
-    obstacles.insert(1, Obstacle("a", Sphere(radius=0.1), line, True))
-    tracker = ObstacleTracker(obstacles, Sensing(), 0.1)
-    for k in range(4):
-        observe(tracker, 0.1 * k, update if k % 2 else None)
-        places, rates = tracker.paths(times)
-        assert tracker.on_trajectories.tolist() == [1] and tracker.external.tolist() == [2] * (k > 0)
-        for t, row in zip(times, places, strict=True):
-            np.testing.assert_allclose(row, tracker.at(t).states[[1], 9:12], rtol=0, atol=1e-12)
-        np.testing.assert_allclose(rates, [[0.5, 0.0]], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(tracker.mean_twists, [[0] * 6, [0] * 6, [0.1, 0, 0.2, 0, 0, 3.0]], atol=1e-12)
 
 
 def test_prediction_uses_the_mean_twist():

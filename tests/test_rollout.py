@@ -17,7 +17,7 @@ from qpavoid.control.settings import ControlSettings
 from qpavoid.kernels.rollout import PAUSED
 from qpavoid.model.trajectory import Trajectory, build_motion
 from qpavoid.safety.approach import ApproachCheck
-from qpavoid.safety.rollout import BackupPolicy, BackupRollouts, Start
+from qpavoid.safety.rollout import LEAST_SCORE, BackupPolicy, BackupRollouts, Start
 from qpavoid.solvers.backends import solve_daqp
 
 
@@ -109,7 +109,7 @@ def test_a_rollout_that_pauses_is_that_in_one_go_bit_for_bit(among_balls):
     start, rng = start_of(rollouts, q, 0.13), np.random.default_rng(4)
     for policy in random_policies(rollouts, 4, seed=4):
         whole = rollouts.rollout(start, policy, np.full((3, len(q)), 0.1), None)
-        rollouts.begin(start, policy, np.full((3, len(q)), 0.1), None)
+        rollouts.begin(start, policy, np.full((3, len(q)), 0.1), LEAST_SCORE)
         while rollouts.resume(int(rng.integers(0, 9))) == PAUSED:
             rollouts.kinematics.compute(0.5 * q)  # others use the same memory meanwhile
         paused = rollouts.result()

@@ -26,6 +26,7 @@ from qpavoid.kernels import Prediction
 from qpavoid.kernels.obstacles import FAST, NORMALISED, NOT_FINITE, SAMPLE
 from qpavoid.model.sample import STATE, Sample
 from qpavoid.model.scene import Obstacle
+from qpavoid.model.trajectory import Motion
 from qpavoid.problem import Array, IntArray
 from qpavoid.reason import Reason, ReasonKind, Severity
 
@@ -63,7 +64,6 @@ class ObstacleTracker:
         self._measured = MeasuredStates(count, dt)
         self._reader = UpdateReader(obstacles, self._measured, dt)
         self._prediction: Prediction | None = None
-        self._sampled: dict[float, tuple[Array, Array]] = {}  # of those on trajectories, by time: see `paths`
         self.external: IntArray = np.zeros(0, dtype=np.intp)
         """(k,) numbers of those that a program gives."""
         self._awaited = {i for i, obstacle in enumerate(obstacles) if obstacle.external}  # external, never given
@@ -87,9 +87,9 @@ class ObstacleTracker:
         return self._now
 
     @property
-    def has_custom_trajectories(self) -> bool:
-        """Whether any obstacle follows a trajectory of another class, which kernels cannot sample."""
-        return bool(self._trajectories.others)
+    def custom_trajectories(self) -> Mapping[int, Motion]:
+        """Trajectories of other classes, which kernels cannot sample, by number of the obstacle."""
+        return self._trajectories.others
 
     @property
     def prediction(self) -> Prediction:
@@ -107,25 +107,6 @@ class ObstacleTracker:
     def mean_twists(self) -> Array:
         """(o, 6) mean twists of external obstacles, with which they are predicted; zero of all others."""
         return self._measured.twists
-
-    def paths(self, times: Array) -> tuple[Array, Array]:
-        """Predict the obstacles `on_trajectories`.
-
-        Args:
-            times: (t,) [s].
-
-        Returns:
-            Positions (t, k, 3) [m]; their largest speeds and rates of turning at these times (k, 2) [m/s, rad/s].
-        """
-        self._sampled = {t: self._sampled.get(t) or self._sample(t) for t in times.tolist()}
-        positions, rates = [np.array(parts) for parts in zip(*self._sampled.values(), strict=True)]
-        return positions[:, self.on_trajectories], rates[:, self.on_trajectories].max(axis=0)
-
-    def _sample(self, t: float) -> tuple[Array, Array]:
-        """Sample positions (o, 3) and rates (o, 2) of those that follow a trajectory."""
-        states = np.zeros_like(self.current.states)
-        self._sample_trajectories(t, states)
-        return states[:, 9:12], np.linalg.norm(states[:, 12:].reshape(-1, 2, 3), axis=-1)
 
     def at(self, t: float, prediction: Prediction | None = None) -> ObstacleStates:
         """Return the states at t [s]: on trajectories, or at constant mean twists; of the last step, as observed.
@@ -152,12 +133,6 @@ class ObstacleTracker:
         extrapolate(states, duration)
         return self.current._replace(states=states)
 
-    def _sample_trajectories(self, t: float, states: Array) -> None:
-        """Bring the states (o, 18) of those that follow a trajectory to time t [s]."""
-        self._trajectories.sample(t, states)
-        for index, motion in self._trajectories.others.items():
-            states[index] = motion.sample(t).row
-
     def put(self, index: int, name: str, present: bool) -> None:
         """Take over what the scene has in a spare slot now.
 
@@ -181,7 +156,6 @@ class ObstacleTracker:
         if numbers != self._moving:
             self._moving = numbers
             self._trajectories = TrajectoryBatch({i: self._obstacles[i].motion for i in numbers})
-            self._sampled.clear()
 
     def attach(self, index: int) -> None:
         """Take an obstacle as attached to the robot: updates of it are ignored."""
@@ -274,7 +248,6 @@ class ObstacleTracker:
         self._now, self._prediction, current = t + self._latency, None, self.current
         if shift:
             self._measured.stamps += shift
-            self._sampled.clear()
         self._trajectories.sample(self._now, current.states)
         for index, sample in sampled:
             current.states[index] = sample.row

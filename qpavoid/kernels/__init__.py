@@ -1,12 +1,10 @@
 """Array work of a control step: loops that numba compiles at their first use, and stores on disk (`kernels.cache`)."""
 
+from qpavoid.kernels.approach import Paths, comes_near, extend_paths, write_path_point
 from qpavoid.kernels.backup import (
     backup_rows,
-    braking_travel,
     closes_below,
-    line_clearance,
     max_offset,
-    min_sphere_distance,
 )
 from qpavoid.kernels.bounds import velocity_bounds
 from qpavoid.kernels.braking_bounds import speed_to_stop
@@ -34,7 +32,7 @@ from qpavoid.kernels.obstacles import Pieces, check_states, sample_pieces
 from qpavoid.kernels.prediction import Prediction, predict, prediction_error_bound
 from qpavoid.kernels.qp import max_clearance_velocity, minimize, project, project_soft
 from qpavoid.kernels.ramps import RampLimits, follow_ramp
-from qpavoid.kernels.rollout import RolloutArrays, advance_rollout, begin_rollout
+from qpavoid.kernels.rollout import RolloutArrays, advance_rollout, begin_rollout, rollout_outcome
 from qpavoid.kernels.rotation import rotation_vector
 from qpavoid.kernels.rows import alpha, beta, distance_rows, row_bounds
 from qpavoid.kernels.step import assemble, control_step, find_near_pairs, tracking_violation, violation
@@ -48,6 +46,7 @@ __all__ = [
     "TOLERANCE",
     "DistanceArrays",
     "KinematicsArrays",
+    "Paths",
     "Pieces",
     "Prediction",
     "RampLimits",
@@ -61,14 +60,15 @@ __all__ = [
     "backup_rows",
     "begin_rollout",
     "beta",
-    "braking_travel",
     "candidates",
     "check_states",
     "clearance_lower_bound",
     "closes_below",
+    "comes_near",
     "control_step",
     "direct",
     "distance_rows",
+    "extend_paths",
     "extrapolate_estimates",
     "extrapolate_states",
     "find_near_pairs",
@@ -79,10 +79,8 @@ __all__ = [
     "jerk_limited_stop",
     "joint_speeds",
     "leaves_position_limits",
-    "line_clearance",
     "max_clearance_velocity",
     "max_offset",
-    "min_sphere_distance",
     "minimize",
     "near_pairs",
     "pack",
@@ -94,6 +92,7 @@ __all__ = [
     "project_soft",
     "projection_cost",
     "roll_out_stop",
+    "rollout_outcome",
     "rotation_vector",
     "row_bounds",
     "sample_pieces",
@@ -108,5 +107,6 @@ __all__ = [
     "velocity_bounds",
     "violation",
     "voxels_within",
+    "write_path_point",
     "write_rows",
 ]

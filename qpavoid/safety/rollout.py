@@ -11,7 +11,9 @@ beforehand (see `qpavoid.safety.backup`).
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
+from math import ceil, inf
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +25,7 @@ from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.control.pair_table import PairTable
 from qpavoid.control.row_layout import lay_out
 from qpavoid.control.settings import ControlSettings
+from qpavoid.errors import NumericalError
 from qpavoid.kernels.prediction import Prediction
 from qpavoid.kernels.ramps import RampLimits
 from qpavoid.kernels.rollout import (
@@ -88,6 +91,10 @@ class BackupScore(NamedTuple):
     """Least distance of the pairs without contact, capped at the one that suffices [m]."""
 
 
+LEAST_SCORE = BackupScore(-inf, -inf)
+"""Score that every trajectory exceeds."""
+
+
 class BackupTrajectory(NamedTuple):
     """Velocities of successive control steps, and what is known of where they lead."""
 
@@ -129,12 +136,19 @@ class BackupRollouts:
         self.sufficient_score = BackupScore(HORIZON, _DISTANCE_SCALE * settings.safety_distance)
         """Score from which on a backup trajectory need not be improved."""
         zero = np.zeros(model.nv)
+        self.usual_poses = ceil((HORIZON + BEYOND) / self.period) + 3
+        """Poses of a trajectory without any midway [-]: of its start, every period, and where its prefix ends."""
         self.stop_policy = BackupPolicy(0.0, zero)
         """Braking to a standstill."""
         self._memory = self._lay_out(period_steps)
         self._packed_memory, self._progress = kernels.pack(self._memory), self._memory.progress[0]
+        self._poses: Array = self._memory.progress.view(np.ndarray)["poses"]
+        self._has_kernels = self.kinematics.is_compiled and not self.query.has_clouds
         # every kernel once, so that no control step waits for the compiler
-        self.rollout(Start(scene.robot.home, zero, zero, 0.0, self.enabled), BackupPolicy(0.1, zero), None, None)
+        self.begin(Start(scene.robot.home, zero, zero, 0.0, self.enabled), BackupPolicy(0.1, zero), None, LEAST_SCORE)
+        with suppress(NumericalError):  # of a trajectory that gives nonsense: the steps say so
+            self.resume(2)
+        self.result()
         ramp = kernels.follow_ramp(self._ramp_limits, zero, zero, zero[None], False, True)
         kernels.max_offset(zero, ramp, zero[None], self._dt)
         kernels.prediction_error_bound(obstacles.prediction, obstacles.prediction, 0.0, self.query.obstacle_radii)
@@ -168,11 +182,16 @@ class BackupRollouts:
         """(m,) pairs whose distance depends on a joint, and that may not come into contact."""
         return np.asarray(self.query.table.separable & ~self.query.table.ignored)
 
-    def advance(self, trajectory: BackupTrajectory) -> BackupTrajectory:
-        """Return a trajectory without its first control step."""
-        (_, v_prev, _, t, enabled), v = trajectory.start, trajectory.v[0]
-        start = Start(trajectory.q[0], v, v - v_prev, t + self._dt, enabled)
-        return trajectory._replace(start=start, v=trajectory.v[1:], q=trajectory.q[1:])
+    def advance(self, trajectory: BackupTrajectory, steps: int = 1) -> BackupTrajectory:
+        """Return a trajectory without its first control steps, which are as many as it has at the most."""
+        if steps == 0:
+            return trajectory
+        start, score, v, last = trajectory.start, trajectory.score, trajectory.v, steps - 1
+        v_prev = start.v if last == 0 else v[last - 1]
+        start = Start(trajectory.q[last], v[last], v[last] - v_prev, start.t + steps * self._dt, start.enabled)
+        if score.time_to_contact < HORIZON:
+            score = score._replace(time_to_contact=score.time_to_contact - steps * self._dt)
+        return trajectory._replace(start=start, v=v[steps:], q=trajectory.q[steps:], score=score)
 
     def is_valid_from(self, trajectory: BackupTrajectory, start: Start, max_obstacle_speed: float = 0.0) -> bool:
         """Return whether a sufficient trajectory is certainly so from a start close to its own, without a rollout.
@@ -185,7 +204,7 @@ class BackupRollouts:
         if trajectory.contact_time < start.t + HORIZON - 1e-9:
             return False
         delay = abs(start.t - trajectory.start.t)
-        if delay > self._dt or not np.array_equal(trajectory.start.enabled, start.enabled):
+        if delay > self._dt or not _is_equal(trajectory.start.enabled, start.enabled):
             return False
         offset, ramp = pin.difference(self._model, trajectory.start.q, start.q), trajectory.v[:0]
         if self._is_accelerated:
@@ -202,17 +221,16 @@ class BackupRollouts:
     def rollout(
         self, start: Start, policy: BackupPolicy, prefix: Array | None, must_beat: BackupTrajectory | None
     ) -> BackupTrajectory | None:
-        """Compute a backup trajectory in one go; see `begin`.
+        """Compute a backup trajectory in one go, which has to be better than another one; see `begin`.
 
         Returns:
             The trajectory; None if it is no better than the other one.
         """
-        self.begin(start, policy, prefix, must_beat)
+        least = LEAST_SCORE if must_beat is None else must_beat.score
+        self.begin(start, policy, prefix, least)
         return self.result() if self.resume(_ALL_POSES) == FINISHED else None
 
-    def begin(
-        self, start: Start, policy: BackupPolicy, prefix: Array | None, must_beat: BackupTrajectory | None
-    ) -> None:
+    def begin(self, start: Start, policy: BackupPolicy, prefix: Array | None, least_score: BackupScore) -> None:
         """Begin a backup trajectory, with a decision in every period until the horizon.
 
         Distances are evaluated as often, and midway where a pair may come too near and part again before that. All
@@ -223,19 +241,16 @@ class BackupRollouts:
             start: where it begins.
             policy: how it keeps away.
             prefix: velocities (k, nv) of the first control steps, before the policy decides.
-            must_beat: a trajectory; the rollout ends as soon as its score is no better.
+            least_score: that it has to exceed; the rollout ends as soon as it does not.
         """
         self._start, self._policy, self._prediction = start, policy, self._obstacles.prediction
-        self._progress.measures_outside = (
-            not self.kinematics.is_compiled or self.query.has_clouds or self._obstacles.has_custom_trajectories
-        )
         r, count = self._memory, 0 if prefix is None else min(len(prefix), len(self._memory.prefix))
         if prefix is not None:
             r.prefix[:count] = prefix[:count]
         r.q[0], r.v[0], r.dv[:], r.bias_velocity[:] = start.q, start.v, start.dv, policy.bias_velocity
         r.enabled[:] = start.enabled
-        least = (-np.inf, -np.inf) if must_beat is None else must_beat.score
-        kernels.begin_rollout(self._packed_memory, start.t, policy.horizon, count, *least)
+        in_python = not self._has_kernels or bool(self._obstacles.custom_trajectories)
+        kernels.begin_rollout(self._packed_memory, start.t, policy.horizon, count, *least_score, in_python)
 
     def resume(self, poses: int) -> int:
         """Go on with the rollout until it is FINISHED or DROPPED, or PAUSED after evaluating some poses.
@@ -243,7 +258,7 @@ class BackupRollouts:
         Raises:
             NumericalError: NaN or infinity in the state of an obstacle, as predicted; names it.
         """
-        self._progress.poses = poses
+        self._poses[0] = poses
         while True:
             code, *counts = kernels.advance_rollout(self._packed_memory, self.packed, self._prediction)
             if code == TO_MEASURE:
@@ -258,15 +273,14 @@ class BackupRollouts:
     @property
     def poses_left(self) -> int:
         """Poses that were not evaluated of those that `resume` was to evaluate."""
-        return int(self._progress.poses)
+        return int(self._poses[0])
 
     def result(self) -> BackupTrajectory:
         """Return the trajectory that is finished."""
-        s, r = self._progress, self._memory
-        score = BackupScore(HORIZON - s.lost_time, min(s.clearance, s.sufficient))
-        v, q = r.v[1 : s.steps + 1].copy(), r.q[1 : s.steps + 1].copy()
-        time = min(s.contact_time, s.t)
-        return BackupTrajectory(self._start, v, q, self._policy, score, time, s.clearance, self._prediction)
+        steps, time_to_contact, contact_time, clearance = kernels.rollout_outcome(self._packed_memory)
+        score = BackupScore(time_to_contact, min(clearance, self.sufficient_score.clearance))
+        v, q = self._memory.v[1 : steps + 1].copy(), self._memory.q[1 : steps + 1].copy()
+        return BackupTrajectory(self._start, v, q, self._policy, score, contact_time, clearance, self._prediction)
 
     def decision_before(self, start: Start, k: int) -> int:
         """Return the last decision, as a control step, of a trajectory from `start` before step k; 0 without any."""
@@ -290,6 +304,10 @@ class BackupRollouts:
         for i in range(first, last):
             r.q[i + 1] = pin.integrate(self._model, r.q[i], self._dt * r.v[i + 1])
         r.q_middle[:] = pin.interpolate(self._model, r.q[first], r.q[last], 0.5)
+
+
+def _is_equal(a: Mask, b: Mask) -> bool:
+    return a is b or np.array_equal(a, b)
 
 
 def _ramp_limits(bounds: JointBounds, dt: float) -> RampLimits:
