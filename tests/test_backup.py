@@ -182,6 +182,7 @@ def test_an_attached_object_is_moved_out_of_the_way_too(tmp_path):
 def test_work_of_a_step_is_bounded(tmp_path, evaluations, dt):
     """A hundred poses every 10 ms, whatever is searched for; a trajectory takes 41 to 82."""
     controller, most = controller_of(tmp_path, press(), speed=0.4, dt=dt), 0
+    evaluations.clear()
     for _ in loop(controller, round(2.0 / dt), clock=lambda k: dt * k):
         most, _ = max(most, len(evaluations)), evaluations.clear()
     assert most == round(1e4 * dt)
@@ -191,6 +192,7 @@ def test_an_obstacle_that_appears_near_is_evaded_within_the_same_bound(tmp_path,
     """A ball is given for the first time 1 m off, at 1 m/s; there is 0.85 s to go aside by 0.17 m, at 0.25 m/s."""
     dt, ball = 0.002, Obstacle.at("ball", Sphere(radius=0.1), [9.0, 0.0, 0.0])
     controller, q, least = controller_of(tmp_path, [ball], dt=dt), np.zeros(2), np.inf
+    evaluations.clear()
     for k in range(900):
         center = np.array([1.0 - dt * (k - 100), 0.01, 0.0])
         updates = {"ball": Sample.at(center, linear=[-1.0, 0.0, 0.0])} if k >= 100 else None
@@ -207,6 +209,7 @@ def test_a_search_over_several_steps_leaves_in_time(tmp_path, evaluations):
     """A candidate takes five control steps of a millisecond; the robot stays at its task while that is safe."""
     controller = controller_of(tmp_path, closing_balls(), acceleration=2.0, dt=0.001)
     states, q = {}, np.array([0.0, 0.0])
+    evaluations.clear()
     for k in range(2800):
         states[k] = q
         q = q + 0.001 * controller.step(q, k * 0.001, TARGET).v

@@ -22,8 +22,6 @@ HORIZON = 1.5
 """Time for which a backup trajectory has to stay clear [s]: longer than an arm needs to stop or to step aside."""
 BEYOND = 0.1
 """Time by which a rollout exceeds the horizon [s], so that it stays valid for some control steps."""
-INFLUENCE_DISTANCE = 0.2
-"""Distance below which a pair counts [m]: twice the preferred one; 0.3 takes twice as long and finds no more."""
 PREFERRED_DISTANCE = 0.1
 """c: distance from which on a pair is not parted any farther [m]: the default influence distance of the rows."""
 TOUCH = 1e-3
@@ -47,7 +45,7 @@ _START, _MIDWAY, _END = range(3)
 PROGRESS = np.dtype(
     [
         # constant
-        ("dt", float), ("period_steps", np.intp), ("sufficient", float),
+        ("dt", float), ("period_steps", np.intp), ("influence_distance", float), ("sufficient", float),
         ("measures_outside", bool), ("completes_outside", bool), ("moves_outside", bool),
         # given at its start
         ("end", float), ("deadline", float), ("horizon", float), ("prefix_steps", np.intp),
@@ -64,8 +62,8 @@ PROGRESS = np.dtype(
 )  # fmt: skip
 """Numbers of a rollout.
 
-dt: control period [s]; period_steps: control steps between two decisions; sufficient: clearance from which on a
-trajectory need not be improved [m]; measures_outside: the caller computes all distances; completes_outside: those that
+dt: control period [s]; period_steps: control steps between two decisions; influence_distance: below which a pair counts
+[m]; sufficient: clearance from which on a trajectory need not be improved [m]; measures_outside: the caller computes all distances; completes_outside: those that
 kernels do not; moves_outside: configurations. end: time at which it ends; deadline: at which contacts are forgiven [s];
 horizon: of the policy, 0 of a stop [s]; prefix_steps: control steps before the policy decides. stage, pose: what comes
 next; poses: that may still be evaluated; t: time of the last pose [s]; steps: control steps until then; count: to the
@@ -260,7 +258,9 @@ def _evaluate(r: Any, x: Any) -> bool:
     s = r.progress[0]
     x.v_prev[:] = r.v_pose
     pairs = x.distances.rows[: s.rows]
-    k, touching, nearest, separable = backup_rows(x, r.q_pose, pairs, INFLUENCE_DISTANCE, s.is_moving, r.enabled, TOUCH)
+    k, touching, nearest, separable = backup_rows(
+        x, r.q_pose, pairs, s.influence_distance, s.is_moving, r.enabled, TOUCH
+    )
     s.near, s.t = k, s.t_pose
     if touching > 0:
         closing, time = s.clearance_before - nearest, s.t
