@@ -9,7 +9,7 @@ run: .venv/run
 	  --solvers tracking,eq10-literal,eq10,qp --out out
 
 figures: run
-	cp out/situation1_compare_path.png out/situation1_qp_motion.png out/five_spheres_compare_time.png docs/figures/
+	cp out/five_spheres_compare_time.png out/five_spheres_qp_motion.png docs/figures/
 
 film: .venv/dev
 	$(BIN)/qpavoid render panda_ball --gif docs/figures/panda_ball.gif

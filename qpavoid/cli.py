@@ -107,7 +107,7 @@ def run(
     """Run one scenario; write its log and figures."""
     logs, files = _run_all([load_scenario(scenario, set_ or (), solver)], out)
     if figures:
-        files += _draw(logs, out, compare=False)
+        files += _draw(logs, out)
     metrics = [log.metrics() for log in logs]
     if json:
         print(to_json({**metrics[0], "files": [str(f) for f in files]}))
@@ -134,7 +134,7 @@ def compare(
     configs = [load_scenario(scenario, set_ or (), name) for scenario in scenarios for name in names]
     logs, files = _run_all(configs, out)
     if figures:
-        files += _draw(logs, out, compare=True)
+        files += _draw(logs, out)
     metrics = [log.metrics() for log in logs]
     if json:
         print(to_json({"runs": metrics, "files": [str(f) for f in files]}))
@@ -207,10 +207,11 @@ def _update(bar: Progress, job: TaskID, count_done: int, total: int) -> None:
     bar.update(job, completed=count_done, total=total)
 
 
-def _draw(logs: list[Log], out: Path, compare: bool) -> list[Path]:
-    """Write the figures of runs; without matplotlib, print how to install it and write none."""
+def _draw(logs: list[Log], out: Path) -> list[Path]:
+    """Write the figures of runs and the page that shows them; without matplotlib, print how to install it."""
     try:
         from qpavoid.viz import figures as plot
+        from qpavoid.viz.index_page import write_index
     except ModuleNotFoundError as missing:
         if missing.name is None or missing.name.split(".")[0] != "matplotlib":
             raise
@@ -219,13 +220,15 @@ def _draw(logs: list[Log], out: Path, compare: bool) -> list[Path]:
     with progress() as bar:
         job = bar.add_task("figures", total=len(logs))
         files = []
-        for log in logs:
-            files += plot.plot_run(log, out)
-            bar.advance(job)
-        if compare:
-            for scenario in dict.fromkeys(log.meta["scenario"] for log in logs):
-                files += plot.plot_compare([log for log in logs if log.meta["scenario"] == scenario], out)
-    return files
+        for scenario in dict.fromkeys(log.meta["scenario"] for log in logs):
+            runs = [log for log in logs if log.meta["scenario"] == scenario]
+            sight = plot.sight_of(runs[-1]) if len(runs[-1].t) else None
+            for log in runs:
+                files += plot.plot_run(log, out, sight)
+                bar.advance(job)
+            if len(runs) > 1:
+                files += plot.plot_compare(runs, out)
+    return [*files, write_index(logs, files, out)]
 
 
 def _print(metrics: list[dict[str, Any]], files: list[Path], out: Path, verbose: bool) -> None:
@@ -236,13 +239,16 @@ def _print(metrics: list[dict[str, Any]], files: list[Path], out: Path, verbose:
         for run in runs:
             for line in events(run):
                 OUT.print(f"{run['solver']}: {line}", highlight=False, soft_wrap=True, markup=False)
-    logs = sum(file.suffix == ".npz" for file in files)
-    kinds = (logs, "log"), (len(files) - logs, "figure")
+    suffixes = [file.suffix for file in files]
+    kinds = (suffixes.count(".npz"), "log"), (suffixes.count(".png"), "figure")
     counts = [f"{count} {kind}{'s' * (count > 1)}" for count, kind in kinds if count]
     remedy = "" if verbose else " (--verbose lists them)"
     OUT.print(f"{' and '.join(counts)} in {out}{remedy}", highlight=False, soft_wrap=True)
     for file in files if verbose else ():
         OUT.print(str(file), highlight=False, soft_wrap=True)
+    for file in files:
+        if file.suffix == ".html":
+            OUT.print(f"all of it on one page: {file}", highlight=False, soft_wrap=True)
 
 
 def _show_warning(message: Warning | str, *_: Any) -> None:

@@ -217,6 +217,7 @@ class Controller(SceneChanges):
         return Tick(
             state, tuple(step.targets), rows.task_errors.copy(), copied(rows.kinematics), copied(step.proximity),
             copied(step.problem), solution, self._builder.obstacle_poses(step.q),
+            self.dt * self._arbiter.backup_velocities,
         )  # fmt: skip
 
     def filter(

@@ -22,7 +22,8 @@ def make_log(ticks: int, meta: dict | None = None, **arrays) -> Log:
     """A log of two joints, one task and two bodies in which everything that is not given rests at zero, far away."""
     shapes = {
         "q": (2,), "v": (2,), "target": (1, 3), "tool": (1, 3), "tool_rotation": (1, 3, 3), "turn_error": (1,),
-        "body_distance": (2,), "body_ends": (2, 2, 3), "obstacle_position": (1, 3), "obstacle_rotation": (1, 3, 3),
+        "body_distance": (2,), "body_pair": (2,), "body_ends": (2, 2, 3), "obstacle_position": (1, 3),
+        "obstacle_rotation": (1, 3, 3),
     }  # fmt: skip
     rows = {f.name: np.zeros((ticks, *shapes.get(f.name, ()))) for f in fields(Log) if f.name != "meta"}
     rows |= {"t": DT * np.arange(ticks), "body_distance": np.full((ticks, 2), np.inf)}

@@ -1,5 +1,6 @@
 """Figures carry the data of the log, and every kind of log can be drawn."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -14,8 +15,14 @@ pytest.importorskip("matplotlib")
 
 from qpavoid.viz.compare import compare_time_figure, path_figure, solver_styles
 from qpavoid.viz.figures import distances_figure, joints_figure, plot_compare, plot_run, speeds_figure
-from qpavoid.viz.motion import instants, motion_figure
-from qpavoid.viz.surfaces import capsule_faces, obstacle_faces, shape_faces
+from qpavoid.viz.index_page import write_index
+from qpavoid.viz.motion import instants, motion_figure, sight_of
+from qpavoid.viz.raster import Canvas, Projection
+from qpavoid.viz.robot_pictures import RobotPictures
+from qpavoid.viz.surfaces import inflated_outline, shape_faces
+
+LIMITS = ((2.175, 4), (2.61, 3))
+"""Speed limits of a Panda [rad/s], and of how many joints."""
 
 
 def run(scenario: str, solver: str) -> Log:
@@ -46,7 +53,12 @@ def test_distances_are_those_of_the_log_between_levels_of_surfaces(sphere):
     ax, gains = distances_figure(log).axes
     drawn = lines(ax)
     for i, body in enumerate(log.meta["bodies"]):
-        assert_allclose(drawn[body].get_ydata(), log.body_distance[:, i], atol=1e-15)
+        named = [line for name, line in drawn.items() if body in name.split(" – ")[0]]
+        named += [line for name, line in drawn.items() if body in name]  # the line of its partner, if it is the same
+        assert any(np.allclose(line.get_ydata(), log.body_distance[:, i], atol=1e-15) for line in named)
+        for distance, pair in zip(log.body_distance[:, i], log.body_pair[:, i], strict=True):
+            assert body in log.meta["pairs"][pair] and distance >= 0.0
+    assert "left_hand – fist" in drawn
     levels = [line.get_ydata()[0] for name, line in drawn.items() if "$" in name or "collision" in name]
     assert sorted(levels) == pytest.approx([0.0, 0.08, 0.26])
     bottom, top = ax.get_ylim()
@@ -67,16 +79,36 @@ def test_joint_panels_hold_q_and_its_limits(panda):
         assert [line.get_ydata()[0] for line in bounds] == [x for x in limits[ax.get_title()] if np.isfinite(x)]
 
 
-def test_speeds_show_limits_that_are_near_and_steps_that_are_not_solved(panda):
+@pytest.mark.parametrize(
+    ("solver", "row", "gains"),
+    [
+        ("eq10", "beta", ["α", "β"]),
+        ("qp", "beta", ["β"]),
+        ("qp", "task-switching", ["α", "β"]),
+        ("tracking", "beta", []),
+        ("potential-field", "task-switching", []),
+    ],
+)
+def test_gains_are_those_of_the_law(panda, solver, row, gains):
+    config = panda.meta["config"]
+    config = {**config, "solver": {"name": solver}, "avoidance": {**config["avoidance"], "row": {"type": row}}}
+    figure = distances_figure(replace(panda, meta={**panda.meta, "config": config}))
+    assert len(figure.axes) == 1 + bool(gains)
+    assert [line.get_label()[0] for line in figure.axes[-1].get_lines()] == gains or not gains
+
+
+def test_speeds_show_limits_and_steps_that_are_not_solved(panda):
     limits, v, status = panda.meta["velocity_limit"], np.zeros_like(panda.v), panda.status.copy()
     status[:] = STATUSES.index(Status.SOLVED)
     ax = speeds_figure(replace(panda, v=v, status=status)).axes[0]
-    assert not any("limit" in name for name in lines(ax)) and not ax.patches
+    assert {name for name in entries(ax) if "limit" in name} == {f"limit ±{x:g} of {k} joints" for x, k in LIMITS}
+    assert not ax.patches
+    assert max(limits) < ax.get_ylim()[1]
     v[:, 6] = -0.9 * limits[6]
     status[[4, 5, 6, 20]] = STATUSES.index(Status.RELAXED)
     ax = speeds_figure(replace(panda, v=v, status=status)).axes[0]
     assert_allclose(lines(ax)["panda_joint7"].get_ydata(), v[:, 6])
-    assert f"limit ±{limits[6]:g} of panda_joint7" in entries(ax) and "RELAXED: 4 steps" in entries(ax)
+    assert "RELAXED: 4 steps" in entries(ax)
     spans = sorted((patch.get_x(), patch.get_x() + patch.get_width()) for patch in ax.patches)
     assert_allclose(spans, [(0.04, 0.07), (0.20, 0.21)])
 
@@ -97,21 +129,61 @@ def test_surfaces_are_closed_outward_and_of_the_right_size(shape, exact):
     assert 0.94 * exact < volume <= exact * (1 + 1e-12)
 
 
-def test_motion_panels_share_one_view_and_hold_everything(sphere, panda):
+def test_motion_panels_share_one_view_that_shows_tool_and_paths(sphere, panda):
     for log in (sphere[0], sphere[2], panda):
         distance = log.body_distance.copy()
         distance[17] = -0.01
         log = replace(log, body_distance=distance)
-        steps, axes = instants(log), motion_figure(log).axes
+        steps, sight = instants(log), sight_of(log)
         assert {0, 17, len(log.t) - 1} <= set(steps.tolist()) and np.all(np.diff(steps) > 0)
-        assert len({(ax.elev, ax.azim, *ax.get_w_lims()) for ax in axes}) == 1
-        lower, upper = np.array(axes[0].get_w_lims()).reshape(3, 2).T
+        axes = motion_figure(log, sight).axes
+        assert len({(*ax.get_xlim(), *ax.get_ylim()) for ax in axes}) == 1
+        assert np.linalg.norm(sight.projection.forward) == pytest.approx(1.0)
         for step, ax in zip(steps, axes, strict=True):
-            assert ax.get_title().startswith(f"t = {log.t[step]:.2f} s")
-            bodies = [capsule_faces(e, r) for e, r in zip(log.body_ends[step], log.meta["body_radii"], strict=True)]
-            bodies += [obstacle_faces(log, i, step) for i in range(len(log.meta["obstacles"]))]
-            points = np.concatenate(bodies).reshape(-1, 3)
-            assert np.all(points >= lower) and np.all(points <= upper)
+            title = ax.get_title()
+            assert title.startswith(f"t = {log.t[step]:.2f} s")
+            assert " – ".join(log.meta["pairs"][log.closest_pair[step]]) in title
+            tools = sight.projection.flat(log.tool[step])
+            assert np.all((tools > sight.lower) & (tools < sight.upper))
+
+
+def test_robot_fills_its_panel_in_its_own_colours_and_red_where_it_touches(panda):
+    sight, step = sight_of(panda), len(panda.t) - 1
+    for distance, is_red in ((0.1, False), (-0.01, True)):
+        log = replace(panda, body_distance=np.full_like(panda.body_distance, distance))
+        canvas = Canvas(*sight, 160)
+        canvas.draw(RobotPictures.of(log).surfaces(log, step))
+        picture = canvas.picture().astype(float)
+        inside = picture[..., 3] > 250.0
+        assert inside.mean() > 0.12
+        red = inside & (picture[..., 0] > 2.0 * picture[..., 1])
+        assert (red.sum() > 0.3 * inside.sum()) == is_red
+        if not is_red:  # white, with black joints
+            assert (picture[inside, :3].min(axis=1) > 120.0).mean() > 0.4
+
+
+def test_what_is_nearer_hides_what_is_farther():
+    """In any order; a pixel has the colour of the surface that a ray through it meets first."""
+    square = np.array([[0.0, -1.0, -1.0], [0.0, 1.0, -1.0], [0.0, 1.0, 1.0], [0.0, -1.0, 1.0]])
+    faces, projection = np.array([[0, 1, 2], [0, 2, 3]]), Projection.looking(0.0, 0.0)  # from +x
+    near, far = (square * 0.5 + [1.0, 0.0, 0.0], faces, (1.0, 0.0, 0.0)), (square, faces, (0.0, 0.0, 1.0))
+    for surfaces in ([near, far], [far, near]):
+        canvas = Canvas(projection, np.array([-2.0, -2.0]), np.array([2.0, 2.0]), 40)
+        canvas.draw(surfaces)
+        picture = canvas.picture()
+        assert picture.shape == (40, 40, 4)
+        areas = [np.mean((picture[..., i] > 60) & (picture[..., 3] == 255)) for i in (0, 2)]
+        assert areas == pytest.approx([1.0 / 16.0, 4.0 / 16.0 - 1.0 / 16.0], abs=0.02)
+        assert canvas.is_visible(np.array([[1.1, 0.0, 0.0], [0.5, 0.0, 0.0], [0.1, 0.8, 0.0]]), 0.0).tolist() == [
+            True, False, True,
+        ]  # fmt: skip
+
+
+def test_outline_around_a_sphere_is_a_circle_of_its_radius_and_d1(sphere):
+    log, projection = sphere[0], Projection.looking(30.0, 20.0)
+    outline = inflated_outline(log, 0, 0, projection.flat, 0.08)
+    radius = np.linalg.norm(outline - projection.flat(log.obstacle_position[0, 0]), axis=1)
+    assert_allclose(radius, 0.05 + 0.08, rtol=0.02)
 
 
 def test_styles_of_runs_differ(sphere):
@@ -166,8 +238,25 @@ def test_logs_without_steps_obstacles_or_bodies_can_be_drawn(sphere, steps, tmp_
     else:
         assert len(path_figure([log], solver_styles([log])).axes[0].patches) > 0
         none, count = {"bodies": [], "body_radii": [], "pairs": [], "completed": False}, len(log.t)
-        bare = {"body_distance": np.zeros((count, 0)), "body_ends": np.zeros((count, 0, 2, 3))}
+        bare = {
+            "body_distance": np.zeros((count, 0)),
+            "body_pair": np.zeros((count, 0), int),
+            "body_ends": np.zeros((count, 0, 2, 3)),
+        }
         log = replace(log, closest_pair=np.full_like(log.closest_pair, -1), meta={**log.meta, **none}, **bare)
     assert all(path.stat().st_size > 1000 for path in plot_run(log, tmp_path) + plot_compare([log], tmp_path))
     empty = sphere[2].until(0.0)
     assert len(empty.t) == 0 and len(plot_run(empty, tmp_path)) == 4
+
+
+def test_page_shows_every_figure_the_table_and_the_settings(sphere, panda, tmp_path):
+    """It refers to nothing but the pictures beside it."""
+    logs = [*sphere[:3], panda]
+    files = [path for log in logs for path in plot_run(log, tmp_path)] + plot_compare(sphere[:3], tmp_path)
+    text = write_index(logs, files, tmp_path).read_text(encoding="utf-8")
+    assert set(re.findall(r'<img src="([^"]*)"', text)) == {path.name for path in files}
+    assert "http" not in re.sub(r"<pre>.*?</pre>", "", text, flags=re.DOTALL)
+    for log in logs:
+        assert f"<td>{log.meta['solver']}</td>" in text
+        assert f"d1: {log.meta['config']['avoidance']['d1']}" in text
+    assert f"<td>{1e3 * panda.metrics()['min_distance']:.1f}</td>" in text

@@ -69,7 +69,7 @@ def test_frames_of_a_log_have_its_distances(tracking):
         assert distance == pytest.approx(log.min_distance[step], abs=1e-6) or (
             distance == np.inf and log.min_distance[step] > frames.levels[1]
         )
-        ends = np.linalg.norm(frame.witnesses[:, 1:4] - frame.witnesses[:, 4:], axis=1)
+        ends = np.linalg.norm(frame.witnesses[:, 1:4] - frame.witnesses[:, 4:7], axis=1)
         np.testing.assert_allclose(ends, np.abs(frame.witnesses[:, 0]), atol=1e-6)
     assert log.min_distance[-1] < 0.0
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from qpavoid import load_scenario, simulate
-from qpavoid.viz.view_page import CAMERA, LOOK_AT
 from qpavoid.viz.view_replay import Replay
 from qpavoid.viz.view_session import Session
 
@@ -35,7 +34,7 @@ tasks:
 obstacles:
   - name: ball
     shape: {type: sphere, radius: 0.12}
-    motion: {type: fixed, position: [0.3, -0.75, 0.5]}
+    motion: {type: fixed, position: [0.3, 0.45, 0.35]}
 avoidance: {d1: 0.03, d2: 0.12}
 solver: qp
 dt: 0.02
@@ -50,13 +49,13 @@ def wait_for(condition, what):
         time.sleep(0.05)
 
 
-def pixel(point, box):
+def pixel(view, point, box):
     """Where the page shows a point (3,) at first: x, y on the screen."""
-    forward = np.subtract(LOOK_AT, CAMERA)
+    forward = view.look_at - view.camera
     forward = forward / np.linalg.norm(forward)
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
-    offset, scale = np.subtract(point, CAMERA), 0.5 * box["height"] / np.tan(0.5 * FIELD_OF_VIEW)
+    offset, scale = point - view.camera, 0.5 * box["height"] / np.tan(0.5 * FIELD_OF_VIEW)
     x, y = (scale * (offset @ axis) / (offset @ forward) for axis in (right, np.cross(right, forward)))
     return box["x"] + 0.5 * box["width"] + x, box["y"] + 0.5 * box["height"] - y
 
@@ -69,6 +68,12 @@ def drag(page, begin, shift):
         page.mouse.move(begin[0] + part * shift[0], begin[1] + part * shift[1])
         time.sleep(0.04)
     page.mouse.up()
+
+
+def choose(page, old, new):
+    """Choose another entry in the first list that shows one."""
+    page.locator(f"input[value='{old}']").first.click()
+    page.get_by_role("option", name=new, exact=True).first.click()
 
 
 def picture(page):
@@ -107,12 +112,12 @@ def page():
 
 
 @pytest.fixture
-def empty_picture(page):
+def empty_picture(page, session):
     """A page with nothing on it but the ground, from the same camera."""
     import viser
 
     server = viser.ViserServer(port=0, verbose=False)
-    server.initial_camera.position, server.initial_camera.look_at = CAMERA, LOOK_AT
+    server.initial_camera.position, server.initial_camera.look_at = session.view.camera, session.view.look_at
     server.scene.set_up_direction("+z")
     server.scene.add_grid("/grid", 6.0, 6.0, cell_size=0.25)
     page.goto(f"http://127.0.0.1:{server.get_port()}")
@@ -137,9 +142,9 @@ def test_page_shows_and_steers_a_run(session, page, empty_picture):
     # the page is not empty: robot and ball cover a good part of what the ground alone shows
     changed = 0.0
     end = time.monotonic() + PATIENCE
-    while changed < 0.03 and time.monotonic() < end:
+    while changed < 0.05 and time.monotonic() < end:
         changed = np.mean(np.abs(picture(page) - empty_picture).max(axis=2) > 24.0)
-    assert changed > 0.03
+    assert changed > 0.05
 
     # pause and play
     page.get_by_role("button", name="pause").click()
@@ -150,25 +155,57 @@ def test_page_shows_and_steers_a_run(session, page, empty_picture):
     page.get_by_role("button", name="play", exact=True).click()
     wait_for(lambda: session.t > steps + 0.1, "the run to go on")
 
-    # another solver, built aside
-    page.locator("input[value='qp']").first.click()
-    page.get_by_role("option", name="eq10", exact=True).click()
+    # another solver, built aside, and a second robot
+    choose(page, "qp", "eq10")
     wait_for(lambda: session.config.solver.label == "eq10", "the other solver")
     assert session.t > steps
+    choose(page, "none", "tracking")
+    wait_for(lambda: len(session.loops) == 2, "the robot beside")
+    choose(page, "eq10", "qp")
+    wait_for(lambda: session.config.solver.label == "qp", "the first solver")
 
     # the target, by its arrow that points up; the robot follows
     wait_for(lambda: np.linalg.norm(tool_error(session)) < 0.01, "the robot at its target")
     box, target = page.locator("canvas").first.bounding_box(), session.tick.targets[0].position.copy()
-    drag(page, pixel(target + np.array([0.0, 0.0, 0.14]), box), (0.0, -50.0))
+    drag(page, pixel(session.view, target + np.array([0.0, 0.0, 0.14]), box), (0.0, -50.0))
     wait_for(lambda: session.tick.targets[0].position[2] > target[2] + 0.03, "the target")
     wait_for(lambda: np.linalg.norm(tool_error(session)) < 0.01, "the robot at the pulled target")
     tool = session.tick.kinematics.position[0]
     assert tool[2] > target[2] + 0.03
 
     # the ball itself
-    ball = session.tick.obstacles[0, 9:].copy()
-    drag(page, pixel(ball, box), (60.0, 0.0))
-    wait_for(lambda: np.linalg.norm(session.tick.obstacles[0, 9:] - ball) > 0.05, "the ball")
+    ball = ball_position(session)
+    drag(page, pixel(session.view, ball, box), (60.0, 0.0))
+    wait_for(lambda: np.linalg.norm(ball_position(session) - ball) > 0.05, "the ball")
+
+    # an obstacle is added, and another one removed
+    page.get_by_role("button", name="add", exact=True).click()
+    wait_for(lambda: "ball 1" in session.controller.scene.obstacle_names, "the new obstacle")
+    assert "ball 1" in session.loops[1].controller.scene.obstacle_names
+    page.get_by_role("button", name="remove", exact=True).click()
+    wait_for(lambda: len(session.controller.scene.obstacle_names) == 1, "one obstacle less")
+
+    # what was, and on from there
+    now = session.t
+    page.get_by_role("button", name="pause").click()
+    wait_for(lambda: not session.clock.is_playing, "the pause")
+    page.get_by_label("look back [s]").or_(page.get_by_role("slider").first).first.focus()
+    page.keyboard.press("End")
+    wait_for(lambda: session.shown_time < now - 0.5, "the past")
+    page.get_by_role("button", name="play", exact=True).click()
+    wait_for(lambda: session.shown_time > now, "the present")
+
+    # a second browser, one that is closed, and one that loads the page again
+    other = page.context.browser.new_page()
+    other.goto(session.view.url)
+    wait_for(lambda: session.view.clients == 2, "the second browser")
+    other.close()
+    wait_for(lambda: session.view.clients == 1, "one browser less")
+    page.reload()
+    page.wait_for_selector("canvas")
+    wait_for(lambda: session.view.clients == 1, "the page, once more")
+    steps = session.t
+    wait_for(lambda: session.t > steps + 0.1, "the run to go on")
     assert not errors
 
 
@@ -183,12 +220,12 @@ def test_page_plays_logs(page):
         page.goto(replay.view.url)
         page.wait_for_selector("canvas")
         wait_for(lambda: replay.step > 2, "the first steps")
-        page.locator("input[value='panda_ball tracking']").first.click()
-        page.get_by_role("option", name="panda_ball qp", exact=True).click()
+        choose(page, "panda_ball tracking", "panda_ball qp")
         wait_for(lambda: replay.frames.log is logs[1], "the other run")
-        page.get_by_role("button", name="pause").click()
-        wait_for(lambda: not replay.clock.is_playing, "the pause")
-        page.get_by_text("at 0.00 s").or_(page.get_by_text("closest:")).first.wait_for()
+        page.get_by_role("button", name="closest", exact=True).click()
+        wait_for(lambda: not replay.clock.is_playing, "the closest moment")
+        assert replay.step == np.argmin(logs[1].min_distance)
+        page.get_by_text(f"at {logs[1].t[replay.step]:.2f} s").first.wait_for()
     finally:
         is_done.set()
         loop.join(PATIENCE)
@@ -196,3 +233,8 @@ def test_page_plays_logs(page):
 
 def tool_error(session):
     return session.tick.kinematics.position[0] - session.tick.targets[0].position
+
+
+def ball_position(session):
+    number = [obstacle.name for obstacle in session.controller.scene.slots].index("ball")
+    return session.tick.obstacles[number, 9:].copy()

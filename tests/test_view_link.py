@@ -9,16 +9,47 @@ import pytest
 
 from qpavoid import Controller, Sample, load_scenario
 from qpavoid.errors import ConfigError
+from qpavoid.run.simulate import Follower
 from qpavoid.viz import view as view_module
-from qpavoid.viz.view import View, status_text
+from qpavoid.viz.meshes import of_obstacle
+from qpavoid.viz.view import View
 from qpavoid.viz.view_drag import Pulled
-from qpavoid.viz.view_link import frame_of, make_link, pack, received, send, send_event, unpack
+from qpavoid.viz.view_link import (
+    BACKUP,
+    SlotChange,
+    bodies_in_contact,
+    frame_of,
+    make_link,
+    obstacles_of_pairs,
+    pack,
+    pack_change,
+    received,
+    send,
+    send_event,
+    unpack,
+)
+from qpavoid.viz.view_status import status_html
 
 
 @pytest.fixture(scope="module")
-def tick():
-    controller, q = Controller.from_scenario(load_scenario("panda_line", ["avoidance.d2=0.3"]))
+def controller_and_q():
+    return Controller.from_scenario(load_scenario("panda_line", ["avoidance.d2=0.3"]))
+
+
+@pytest.fixture(scope="module")
+def scene(controller_and_q):
+    return controller_and_q[0].scene
+
+
+@pytest.fixture(scope="module")
+def tick(controller_and_q):
+    controller, q = controller_and_q
     return controller.tick(q, 2.5)
+
+
+@pytest.fixture(scope="module")
+def frame(tick, scene):
+    return frame_of(tick, scene.robot, obstacles_of_pairs(scene), "<b>SOLVED</b> µm")
 
 
 @pytest.fixture
@@ -29,8 +60,7 @@ def link():
         end.close()
 
 
-def test_frame_survives_the_link(tick, link):
-    frame = frame_of(tick, "**SOLVED** µm")
+def test_frame_survives_the_link(frame, link):
     ours, other = link
     assert send(ours, pack(frame))
     (datagram,) = received(other)
@@ -38,16 +68,53 @@ def test_frame_survives_the_link(tick, link):
         np.testing.assert_array_equal(part, copy)
 
 
-def test_frame_says_what_the_step_computed(tick):
-    frame = frame_of(tick)
+def test_large_mesh_of_a_new_obstacle_fits_into_the_link(link):
+    corners = np.random.default_rng(0).uniform(-0.3, 0.3, (20_000, 3, 3))
+    mesh = of_obstacle({"name": "rock", "shape": {"type": "mesh"}, "triangles": corners.reshape(-1).tolist()}, 0)
+    ours, other = link
+    assert send(ours, pack_change(SlotChange(3, "rock", mesh)))
+    (datagram,) = received(other)
+    change = unpack(datagram)
+    assert (change.slot, change.name) == (3, "rock")
+    assert 0 < len(change.mesh.faces) < len(mesh.faces)
+    np.testing.assert_allclose(np.abs(change.mesh.vertices).max(), 0.3, atol=0.05)
+
+
+def test_frame_says_what_the_step_computed(tick, frame, scene):
     np.testing.assert_array_equal(frame.witnesses[:, 0], tick.proximity.distance)
-    segments = frame.witnesses[:, 1:4] - frame.witnesses[:, 4:]
+    segments = frame.witnesses[:, 1:4] - frame.witnesses[:, 4:7]
     np.testing.assert_allclose(np.linalg.norm(segments, axis=1), np.abs(frame.witnesses[:, 0]), atol=1e-9)
     np.testing.assert_allclose(frame.levels, (0.02, 0.3))  # of the scenario, which has no offset
     names = load_scenario("panda_line").obstacles
     ball = [obstacle.name for obstacle in names].index("ball")
     assert frame.obstacles[ball, 9] < 0.85  # it has been on its way for half a second
     np.testing.assert_allclose(frame.obstacles[ball, 10:], (-0.12, 0.24))
+    for pair, number in zip(tick.proximity.pair, frame.witnesses[:, 7].astype(int), strict=True):
+        body = scene.slots[number].name if number >= 0 else scene.pair_names[pair][1]
+        assert body in scene.pair_names[pair]
+        assert (number >= 0) == bool({"ball", *scene.obstacle_names} & {*scene.pair_names[pair]})
+
+
+def test_bodies_that_touch_are_those_of_pairs_in_contact(scene):
+    pair = 5
+    numbers = bodies_in_contact(scene, np.array([pair]), np.array([-1e-3]))
+    names = {scene.body_names[int(number)] for number in numbers}
+    assert names == {*scene.pair_names[pair]} & {*scene.body_names}
+    assert not len(bodies_in_contact(scene, np.array([pair]), np.array([1e-3])))
+
+
+def test_ghosts_end_where_the_backup_trajectory_ends():
+    controller, q = Controller.from_scenario(load_scenario("panda_ball"))
+    follower, ghosts = Follower(controller.scene.robot.model, q, 0.0, controller.dt), []
+    for k in range(220):  # the ball is near
+        tick = controller.tick(follower.q, k * controller.dt)
+        if len(tick.backup):
+            ghosts = frame_of(tick, controller.scene.robot, obstacles_of_pairs(controller.scene)).ghosts
+            end = follower.q + tick.backup.sum(axis=0)
+            np.testing.assert_allclose(ghosts[-1, 2:], end, atol=1e-12)
+            assert np.all(ghosts[:, 0] == BACKUP)
+        follower.follow(tick.solution.v)
+    assert len(ghosts)
 
 
 def test_full_queue_drops_frames(link):
@@ -68,10 +135,11 @@ def test_dead_page_drops_frames(link):
 
 
 def test_status_names_the_closest_pair(tick):
-    text = status_text(tick)
+    text = status_html(tick, [1e-4, 3e-4])
     nearest = tick.problem.pair_names[tick.proximity.pair[np.argmin(tick.proximity.distance)]]
     assert all(name in text for name in nearest)
-    assert text.startswith("**SOLVED**")
+    assert "SOLVED" in text
+    assert "step 0.2 ms" in text
 
 
 def test_missing_viser_is_one_line_with_a_remedy(monkeypatch, panda):

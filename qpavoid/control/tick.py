@@ -24,6 +24,9 @@ class Tick(NamedTuple):
     solution: Solution
     obstacles: Array
     """(o, 12) where the step took the obstacles to be, by their numbers: rotation by columns, then position [m]."""
+    backup: Array
+    """(k, nv) displacement in each control step of the backup trajectory that begins where this step leads [rad or m];
+    none where no obstacle moves near."""
 
 
 def copied(value: Any) -> Any:

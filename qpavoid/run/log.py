@@ -18,18 +18,18 @@ from qpavoid.run.metrics import path_deviation
 
 STATUSES = tuple(Status)
 """Status of each code in `Log.status`."""
-_FORMAT = 6
+_FORMAT = 7
 _SHAPES = {
     "t": "N", "q": "N nq", "v": "N nv",
     "target": "N k 3", "tool": "N k 3", "tool_rotation": "N k 3 3", "turn_error": "N k",
     "task_error": "N s",
-    "body_distance": "N b", "closest_pair": "N", "alpha": "N", "beta": "N", "status": "N",
+    "body_distance": "N b", "body_pair": "N b", "closest_pair": "N", "alpha": "N", "beta": "N", "status": "N",
     "slack": "N", "saturation": "N", "build_time": "N", "solve_time": "N", "command_scale": "N", "stalled": "N",
     "severity": "N",
     "body_ends": "N b 2 3", "obstacle_position": "N o 3", "obstacle_rotation": "N o 3 3",
 }  # fmt: skip
 """Shape of each array; a letter is the same number wherever it stands."""
-_TYPES = {"closest_pair": np.intp, "status": np.int8, "stalled": np.bool_, "severity": np.int8}
+_TYPES = {"closest_pair": np.intp, "body_pair": np.intp, "status": np.int8, "stalled": np.bool_, "severity": np.int8}
 """Type of an array's numbers, where they are not floating point."""
 _MAX_EVENTS = 20
 """Number of changes of reasons that are among the figures of a run: what a reader of JSON can take in."""
@@ -62,6 +62,8 @@ class Log:
     """(N, s) error of each other task, in its unit; see `meta["tasks"]`."""
     body_distance: Array
     """(N, b) smallest distance of each body over the pairs that it is in [m]; inf where there is none."""
+    body_pair: IntArray
+    """(N, b) index in `meta["pairs"]` of the pair with that distance; -1 where there is none."""
     closest_pair: IntArray
     """(N,) index of the closest pair in `meta["pairs"]`; -1 where there are none."""
     alpha: Array

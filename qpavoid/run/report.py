@@ -12,6 +12,7 @@ from rich import box
 from rich.cells import cell_len
 from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 _COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
     ("min\ndist\n[mm]", lambda run: "-" if run["min_distance"] is None else f"{1e3 * run['min_distance']:.1f}"),
@@ -25,6 +26,16 @@ _COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
 """Heading and cell of each column between solver and outcome, the most important first."""
 _OUTCOME_WIDTH = 13
 """Width of the outcome below which columns are left out [characters]: `short of goal` on one line."""
+
+
+def rows(runs: Sequence[dict[str, Any]]) -> tuple[list[str], list[list[str]]]:
+    """Return the headings of the figures of runs, and their cells, a row for each run; solver first, outcome last."""
+    headings = ["solver", *(heading.replace("\n", " ") for heading, _ in _COLUMNS), "outcome"]
+    return headings, [[run["solver"], *(cell(run) for _, cell in _COLUMNS), _plain_text(outcome(run))] for run in runs]
+
+
+def _plain_text(markup: str) -> str:
+    return Text.from_markup(markup).plain
 
 
 def metrics_table(runs: Sequence[dict[str, Any]], width: int = 80) -> Table:

@@ -218,10 +218,12 @@ class Recorder:
         distance[distance > 0.5 * PARKING_DISTANCE] = np.inf
         if np.isfinite(distance).any():
             x["closest_pair"][n] = self._pair_numbers[np.argmin(distance)]
-        nearest = np.full(len(scene.geometry.geometryObjects), np.inf)
-        np.minimum.at(nearest, counted_body[scene.pairs[:, 0]], distance)
-        np.minimum.at(nearest, counted_body[scene.pairs[:, 1]], distance)
-        x["body_distance"][n] = nearest[: len(scene.body_names)]
+        order = np.argsort(-distance, kind="stable")  # of the pairs of a body, the closest one is written last
+        order = order[np.isfinite(distance[order])]
+        nearest, pair = np.full(len(counted_body), np.inf), np.full(len(counted_body), -1)
+        bodies = counted_body[scene.pairs[order]].ravel()
+        nearest[bodies], pair[bodies] = np.repeat(distance[order], 2), np.repeat(self._pair_numbers[order], 2)
+        x["body_distance"][n], x["body_pair"][n] = nearest[: len(scene.body_names)], pair[: len(scene.body_names)]
         for i, body in enumerate(scene.robot.bodies.geometryObjects):
             joint = self._kinematics.data.oMi[body.parentJoint]
             x["body_ends"][n, i] = self._ends[i] @ joint.rotation.T + joint.translation

@@ -47,6 +47,11 @@ class Arbiter:
         if self.backup is not None:
             self.backup.reset()
 
+    @property
+    def backup_velocities(self) -> Array:
+        """Return the velocities (k, nv) of the control steps of the backup trajectory; none without one."""
+        return np.zeros((0, *self._v_shape)) if self.backup is None else self.backup.velocities
+
     def decide(self, q: Array, t: float, problem: Problem, proximity: Proximity, from_tasks: bool) -> Solution:
         """Return the solution that is commanded.
 

@@ -105,6 +105,11 @@ class BackupPlanner:
         self._tried, self._sampled, self._untried = [0, 0], 0, _FIRST_CANDIDATES
         self._moving = self._obstacles.moving
 
+    @property
+    def velocities(self) -> Array:
+        """Return the velocities (k, nv) of the control steps of the backup trajectory; none without one."""
+        return np.zeros((0, self._model.nv)) if self._backup is None else self._backup.v
+
     def check(self, q: Array, v: Array, t: float, v_prev: Array, dv_prev: Array, proximity: Proximity) -> Array | None:
         """Return None if v may be commanded, else the velocity (nv,) to command instead.
 

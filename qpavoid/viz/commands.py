@@ -29,6 +29,7 @@ def view(
     ],
     solver: Annotated[str | None, typer.Option(help="Such as eq10 or qp:proxqp; as in the file if left out.")] = None,
     set_: Sets = None,
+    beside: Annotated[str | None, typer.Option(help="Solver of a second robot in the same scene, translucent.")] = None,
     port: Annotated[int, typer.Option(help="Of the page; the next free one if it is taken.")] = 8080,
     host: Annotated[str, typer.Option(help="Address that serves the page; 0.0.0.0: every machine can see it.")] = (
         "127.0.0.1"
@@ -40,14 +41,14 @@ def view(
     if _are_logs(sources):
         from qpavoid.viz.view_replay import Replay
 
-        _refuse_options(solver, set_)
+        _refuse_options(solver or beside, set_)
         Replay([Log.load(source) for source in sources], port=port, host=host, quality=quality).run()
     elif len(sources) > 1:
         raise ConfigError(f"{len(sources)} scenarios: give one, or logs of runs")
     else:
         from qpavoid.viz.view_session import Session
 
-        Session(sources[0], set_ or (), solver, port=port, host=host, quality=quality).run()
+        Session(sources[0], set_ or (), solver, beside=beside, port=port, host=host, quality=quality).run()
 
 
 def render(

@@ -18,14 +18,14 @@ from qpavoid.viz.style import (
     COLOURS,
     D2,
     DASHES,
-    OBSTACLE,
+    OBSTACLES,
     add_grid,
     add_legend,
     draw_levels,
     label_distances,
     units,
 )
-from qpavoid.viz.surfaces import capsule_faces, is_endless, moving_bodies, obstacle_faces
+from qpavoid.viz.surfaces import capsule_faces, is_endless, moving_bodies, obstacle_faces, obstacle_path
 
 SOLVER_STYLES: dict[str, tuple[str, Any]] = {
     "tracking": ("#333333", DASHES[2]),
@@ -121,18 +121,30 @@ def path_figure(logs: Sequence[Log], styles: Sequence[dict[str, Any]]) -> Figure
         ax.set_ylabel(f"{'xyz'[vertical]} [m]")
     axes[1].set_xlabel(f"{'xyz'[horizontal]} [m]")
     handles: dict[str, Any] = {str(line.get_label()): line for line in axes[0].get_lines()}
-    for colour, name in ((OBSTACLE, "obstacle (paler: earlier)"), (AT_REST, "robot body at rest")):
-        if any(colour == drawn for _, drawn, _ in outlines):
-            handles[name] = Patch(facecolor=(colour, 0.5), edgecolor=colour, label=name)
+    for i, described in enumerate(longest.meta["obstacles"]):
+        path, colour = obstacle_path(longest, i), _colour(i)
+        if is_endless(longest, i) or not len(path):
+            continue
+        name = described["name"] + " (paler: earlier)" * (len(path) > 1)
+        handles[name] = Patch(facecolor=(colour, 0.5), edgecolor=colour, label=name)
+    if any(colour == AT_REST for _, colour, _ in outlines):
+        name = "robot body at rest"
+        handles[name] = Patch(facecolor=(AT_REST, 0.5), edgecolor=AT_REST, label=name)
     add_legend(axes[0], list(handles.values()))
     figure.suptitle(f"{longest.meta['title'] or longest.meta['scenario']}  —  tool path", fontsize=11)
     return figure
 
 
-def _outlines(log: Log) -> list[tuple[Array, str, float]]:
+def _colour(obstacle: int) -> tuple[float, ...]:
+    return OBSTACLES[obstacle % len(OBSTACLES)]
+
+
+def _outlines(log: Log) -> list[tuple[Array, Any, float]]:
     """Return faces, colour and opacity of bodies at rest, and of obstacles at up to four places of their paths."""
     resting = np.flatnonzero(~moving_bodies(log)).tolist()
-    outlines = [(capsule_faces(log.body_ends[0, i], log.meta["body_radii"][i]), AT_REST, 0.5) for i in resting]
+    outlines: list[tuple[Array, Any, float]] = [
+        (capsule_faces(log.body_ends[0, i], log.meta["body_radii"][i]), AT_REST, 0.5) for i in resting
+    ]
     for i in range(len(log.meta["obstacles"])):
         present = np.flatnonzero(np.isfinite(log.obstacle_position[:, i]).all(axis=1))
         if is_endless(log, i) or not len(present):
@@ -140,5 +152,5 @@ def _outlines(log: Log) -> list[tuple[Array, str, float]]:
         travel = np.cumsum(np.r_[0.0, np.linalg.norm(np.diff(log.obstacle_position[present, i], axis=0), axis=1)])
         steps = np.unique(np.searchsorted(travel, np.linspace(0.0, travel[-1], 4))) if travel[-1] > 1e-3 else [0]
         for rank, step in enumerate(steps):
-            outlines.append((obstacle_faces(log, i, int(present[step])), OBSTACLE, 0.5 * (rank + 1) / len(steps)))
+            outlines.append((obstacle_faces(log, i, int(present[step])), _colour(i), 0.5 * (rank + 1) / len(steps)))
     return outlines

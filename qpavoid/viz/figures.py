@@ -18,7 +18,7 @@ from matplotlib.patches import Patch
 from qpavoid.problem import Array, Status
 from qpavoid.run.log import STATUSES, Log
 from qpavoid.viz.compare import compare_time_figure, path_figure, solver_styles
-from qpavoid.viz.motion import motion_figure
+from qpavoid.viz.motion import Sight, motion_figure, sight_of
 from qpavoid.viz.style import (
     COLLISION,
     COLOURS,
@@ -30,23 +30,31 @@ from qpavoid.viz.style import (
     units,
 )
 
+__all__ = ["plot_compare", "plot_run", "sight_of"]
 DPI = 130
 ALPHA_SHOWN = 100.0
 """Upper end of the axis of α, which grows without bound as the distance goes to 0."""
 _STATUS_COLOUR = {Status.RELAXED: "#F5C242", Status.STOPPED: "#C62F2F"}
 _GREY = "#B8B8B8"
+_MAX_PARTNERS = 2
+"""Bodies that are named beside the one whose distance a line shows."""
 _MAX_NAMED_LINES = 2 * len(COLOURS)
 """Lines of a panel that have a colour and a name; the legend of more would run out of the panel."""
 
 
-def plot_run(log: Log, folder: str | Path) -> list[Path]:
+def plot_run(log: Log, folder: str | Path, sight: Sight | None = None) -> list[Path]:
     """Write the figures of one run: motion, joints, distances, speeds.
+
+    Args:
+        log: the run.
+        folder: of the files.
+        sight: what the pictures of the motion show; chosen for this run if left out.
 
     Returns:
         The files, `<scenario>_<solver>_<figure>.png`, in that order.
     """
-    draw = {"motion": motion_figure, "joints": joints_figure, "distances": distances_figure, "speeds": speeds_figure}
-    figures = {name: make(log) for name, make in draw.items()}
+    draw = {"joints": joints_figure, "distances": distances_figure, "speeds": speeds_figure}
+    figures = {"motion": motion_figure(log, sight), **{name: make(log) for name, make in draw.items()}}
     for figure in figures.values():
         figure.suptitle(_title(log), fontsize=11)
     return _save(figures, folder, f"{log.meta['scenario']}_{log.meta['solver'].replace(':', '-')}")
@@ -133,58 +141,91 @@ def _draw_lines(
 
 
 def distances_figure(log: Log) -> Figure:
-    """Draw body distances, d1, d2, α and β over time (Figs. 8, 11, 13 of the paper)."""
-    avoidance, distance = log.meta["config"]["avoidance"], log.body_distance
+    """Draw distances of bodies, each with those that it comes near to, with d1 and d2 (Figs. 8, 11, 13 of the paper).
+
+    Below them are α and β of the closest pair, where the law has them.
+    """
+    avoidance, distance, gains = log.meta["config"]["avoidance"], log.body_distance, gains_of(log)
     upper_distance = round(1.5 * (avoidance["d2"] - avoidance["offset"]), 9)
-    figure = Figure(figsize=(9.5, 7.0), layout="constrained")
-    ax, gains = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
+    figure = Figure(figsize=(10.5, 7.0 if gains else 5.2), layout="constrained")
+    panels = figure.subplots(1 + bool(gains), 1, sharex=True, squeeze=False, height_ratios=(3, 1)[: 1 + bool(gains)])
+    ax = panels[0, 0]
     nearest = np.min(distance, axis=0, initial=np.inf)
     order = np.argsort(nearest, kind="stable")[:_MAX_NAMED_LINES]
     near = np.sort(order[nearest[order] < (np.inf if distance.shape[1] <= len(COLOURS) else upper_distance)])
-    remaining = "bodies farther away"
-    # Thinner and thinner: the two bodies of a pair share their distance, and neither line may hide the other.
-    widths = np.linspace(3.0, 1.2, len(near))
-    handles = _draw_lines(ax, log.t, distance, log.meta["bodies"], near, remaining, widths)
+    # the two bodies of a pair may share their distance all the time: one line is enough
+    near = np.array(
+        [i for k, i in enumerate(near) if not any(np.array_equal(distance[:, i], distance[:, j]) for j in near[:k])],
+        dtype=np.intp,
+    )
+    names = [_with_partners(log, i) if i in near else body for i, body in enumerate(log.meta["bodies"])]
+    # thinner and thinner, as lines may coincide for a while
+    handles = _draw_lines(ax, log.t, distance, names, near, "bodies farther away", np.linspace(3.0, 1.2, len(near)))
     handles += draw_levels(ax, log) + _shade_status(ax, log)
-    _plot_gains(gains, log)
     label_distances(ax, distance[:, near])
     add_legend(ax, handles)
+    if gains:
+        _plot_gains(panels[1, 0], log, gains)
+    panels[-1, 0].set_xlabel("time [s]")
     return figure
 
 
-def _plot_gains(ax: Any, log: Log) -> None:
-    alpha = np.minimum(log.alpha, ALPHA_SHOWN)
-    ax.plot(log.t, alpha, color="#333333", label="α of the closest pair (eq. 11)")
-    ax.plot(log.t, log.beta, color="#8A8A8A", linestyle=DASHES[1], label="β of the closest pair (eq. 12)")
+def _with_partners(log: Log, body: int) -> str:
+    """Return the name of a body and of those that it is closest to, at its closest moment first."""
+    distance, pairs, name = log.body_distance[:, body], log.body_pair[:, body], log.meta["bodies"][body]
+    partners: list[str] = []
+    for pair in pairs[np.argsort(distance, kind="stable")].tolist():
+        a, b = log.meta["pairs"][pair] if pair >= 0 else (name, name)
+        partner = a if b == name else b
+        if partner != name and partner not in partners:
+            partners.append(partner)
+    more = f" and {len(partners) - _MAX_PARTNERS} more" if len(partners) > _MAX_PARTNERS else ""
+    return f"{name} – {', '.join(partners[:_MAX_PARTNERS])}{more}" if partners else name
+
+
+def gains_of(log: Log) -> tuple[str, ...]:
+    """Return which of `alpha` and `beta` the law of a run has: eq. 10 both, a QP those of the form of its rows."""
+    config = log.meta["config"]
+    match config["solver"]["name"]:
+        case "eq10" | "eq10-literal":
+            return "alpha", "beta"
+        case "qp" | "hqp":
+            return ("beta",) if config["avoidance"]["row"]["type"] == "beta" else ("alpha", "beta")
+        case _:
+            return ()
+
+
+def _plot_gains(ax: Any, log: Log, gains: tuple[str, ...]) -> None:
+    alpha = np.minimum(log.alpha, ALPHA_SHOWN) if "alpha" in gains else np.zeros(0)
+    if "alpha" in gains:
+        ax.plot(log.t, alpha, color="#333333", label="α of the closest pair (eq. 11)")
+    if "beta" in gains:
+        ax.plot(log.t, log.beta, color="#8A8A8A", linestyle=DASHES[1], label="β of the closest pair (eq. 12)")
     ax.set_yscale("symlog", linthresh=1.0)
     top = next(top for top in (1.0, 10.0, ALPHA_SHOWN) if np.nanmax(alpha, initial=0.0) <= top)
     ax.set_ylim(-0.1, 1.15 * top)
     ticks = [tick for tick in (0.0, 0.5, 1.0, 10.0, ALPHA_SHOWN) if tick <= top]
     ax.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
     ax.set_yticks([], minor=True)
-    ax.set_ylabel(f"gains [-]\n(α up to {ALPHA_SHOWN:g})" if np.any(log.alpha > ALPHA_SHOWN) else "gains [-]")
-    ax.set_xlabel("time [s]")
+    is_cut = "alpha" in gains and np.any(log.alpha > ALPHA_SHOWN)
+    ax.set_ylabel(f"gains [-]\n(α up to {ALPHA_SHOWN:g})" if is_cut else "gains [-]")
     add_grid(ax)
     add_legend(ax, ax.get_lines())
 
 
 def speeds_figure(log: Log) -> Figure:
-    """Draw joint velocities over time; shade steps that are not SOLVED.
-
-    Limits are drawn of joints that use more than 80 % of theirs.
-    """
+    """Draw joint velocities over time, with the limits of the joints drawn; shade steps that are not SOLVED."""
     names, limits = log.meta["coordinates"], log.meta["velocity_limit"]
     peak = np.max(np.abs(log.v), axis=0, initial=0.0)
     fastest = np.sort(np.argsort(-peak)[:_MAX_NAMED_LINES])
     figure = Figure(figsize=(9.5, 4.5), layout="constrained")
     ax = figure.add_subplot()
     handles = _draw_lines(ax, log.t, log.v, names, fastest, "slower joints", np.full(len(fastest), 1.4))
-    at_limit = [i for i in fastest if limits[i] is not None and peak[i] > 0.8 * limits[i]]
-    for limit in sorted({limits[i] for i in at_limit}):
+    for limit in sorted({limits[i] for i in fastest if limits[i] is not None}):
         style = {"color": COLLISION, "linewidth": 1.0, "linestyle": DASHES[3]}
         ax.axhline(-limit, **style)
-        whose = [names[i] for i in at_limit if limits[i] == limit]
-        of = whose[0] if len(whose) == 1 else f"{len(whose)} joints near it"
+        whose = [names[i] for i in fastest if limits[i] == limit]
+        of = whose[0] if len(whose) == 1 else "all joints" if len(whose) == len(names) else f"{len(whose)} joints"
         handles.append(ax.axhline(limit, label=f"limit ±{limit:g} of {of}", **style))
     handles += _shade_status(ax, log)
     ax.set_xlabel("time [s]")

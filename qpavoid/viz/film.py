@@ -84,7 +84,7 @@ class LogStage:
         witnesses = frame.witnesses[order]
         colours = distance_colours(witnesses[:, 0], *self.frames.levels)
         return [
-            Segment(row[1:4], row[4:], _WITNESS_RADIUS, tuple(colour))
+            Segment(row[1:4], row[4:7], _WITNESS_RADIUS, tuple(colour))
             for row, colour in zip(witnesses, colours, strict=True)
         ]
 

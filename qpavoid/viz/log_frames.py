@@ -15,8 +15,10 @@ from qpavoid.errors import QpavoidError
 from qpavoid.model.kinematics import ForwardKinematics
 from qpavoid.model.sample import Sample
 from qpavoid.problem import Array
+from qpavoid.reason import Severity
 from qpavoid.run.log import STATUSES, Log
-from qpavoid.viz.view_link import Frame
+from qpavoid.viz.view_link import Frame, obstacles_of_pairs
+from qpavoid.viz.view_status import closest_html, page_html
 
 
 class LogFrames:
@@ -38,11 +40,17 @@ class LogFrames:
         """(2,) d1 and d2, between surfaces [m]."""
         columns = {described["name"]: i for i, described in enumerate(log.meta["obstacles"])}
         self._columns = [columns.get(slot.name, -1) for slot in slots]
-        self._joint_poses: Array = np.zeros((0, 12))
+        slots_of_pairs = obstacles_of_pairs(self._controller.scene)
+        self._obstacle_columns = np.array([-1, *self._columns])[1 + slots_of_pairs]
 
     def __len__(self) -> int:
         """Return the number of steps."""
         return len(self.log.t)
+
+    @property
+    def closest_step(self) -> int:
+        """Return the step of the least distance."""
+        return int(np.argmin(self.log.min_distance))
 
     def frame(self, step: int) -> Frame:
         """Return what is shown of a step."""
@@ -53,19 +61,21 @@ class LogFrames:
         obstacles = np.nan_to_num(np.concatenate((rotation, log.obstacle_position[step]), axis=1))
         return Frame(
             float(log.t[step]), log.q[step], log.v[step], self._witnesses(step), log.tool[step], targets, obstacles,
-            self.levels, self._text(step),
+            self.levels, np.zeros((0, 2 + log.q.shape[1])), np.flatnonzero(log.body_distance[step] < 0.0).astype(float),
+            self._text(step),
         )  # fmt: skip
 
     def _witnesses(self, step: int) -> Array:
-        """Return distance and witness points (k, 7) of the pairs within the influence distance."""
+        """Return distance, witness points and obstacle (k, 8) of the pairs within the influence distance."""
         self._kinematics.compute(self.log.q[step])
         samples = [self._sample(number, step) for number in range(len(self._columns))]
         if samples:
             self._query.place(ObstacleStates.of(samples))
         self._query.compute(self._kinematics.joint_poses, float(self.levels[1]))
-        results = self._query.arrays.results[self._query.pairs]
-        results = results[results[:, 0] < self.levels[1]]
-        return np.asarray(results[:, [0, 4, 5, 6, 7, 8, 9]])
+        pairs = np.asarray(self._query.pairs)
+        results = self._query.arrays.results[pairs]
+        columns = np.column_stack((results[:, [0, 4, 5, 6, 7, 8, 9]], self._obstacle_columns[pairs]))
+        return np.asarray(columns[results[:, 0] < self.levels[1]])
 
     def _sample(self, number: int, step: int) -> Sample:
         column, obstacle = self._columns[number], self._controller.scene.slots[number]
@@ -75,15 +85,16 @@ class LogFrames:
         return Sample.at(position, rotation) if np.isfinite(position).all() else obstacle.motion.sample(0.0)
 
     def _text(self, step: int) -> str:
-        log = self.log
-        lines = [f"**{STATUSES[log.status[step]].value}** at {log.t[step]:.2f} s"]
+        log, closest = self.log, ""
         if log.closest_pair[step] >= 0:
             a, b = log.meta["pairs"][log.closest_pair[step]]
-            lines.append(f"closest: {a}, {b}: {1e3 * log.min_distance[step]:.0f} mm")
+            closest = closest_html(a, b, float(log.min_distance[step]), float(self.levels[0]))
         events = [event for event in log.meta["events"] if event[0] <= log.t[step] + 1e-9]
-        if events and log.severity[step]:
-            lines += [reason["text"] for reason in events[-1][2][:6]]
-        return "  \n".join(lines)
+        reasons = [
+            (reason["text"], Severity[reason["severity"]])
+            for reason in (events[-1][2] if events and log.severity[step] else ())
+        ]
+        return page_html(STATUSES[log.status[step]], float(log.t[step]), closest, reasons)
 
 
 def scenario_of(log: Log) -> ScenarioConfig:

@@ -12,10 +12,9 @@ from qpavoid.errors import ConfigError
 from qpavoid.geometry.bodies import surface_triangles
 from qpavoid.model.visuals import GREY, Visual
 from qpavoid.problem import Array
+from qpavoid.viz.style import OBSTACLES
 from qpavoid.viz.surfaces import local_faces, shape_faces
 
-OBSTACLES = ((0.90, 0.42, 0.25), (0.90, 0.62, 0.10), (0.70, 0.45, 0.75), (0.35, 0.62, 0.45), (0.55, 0.55, 0.60))
-"""Colours of obstacles, in turn."""
 _GROUND = (0.93, 0.90, 0.84)
 
 
@@ -28,6 +27,9 @@ class Mesh(NamedTuple):
     """(t, 3) corners of each triangle, counter-clockwise from outside."""
     colour: tuple[float, ...]
     """Red, green, blue, opacity, 0 to 1."""
+
+
+EMPTY = Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint32), (0.0, 0.0, 0.0, 1.0))
 
 
 def of_quadrilaterals(quadrilaterals: Array, colour: tuple[float, ...]) -> Mesh:

@@ -23,7 +23,14 @@ DASHES: tuple[Any, ...] = (
     (0, (1, 3)),
 )
 COLLISION, D1, D2 = "#C62F2F", "#7A4B9A", "#8A8A8A"
-MOVING, AT_REST, OBSTACLE, GROUND, TOOL_PATH = "#6BA3D6", "#C4C4C4", "#E69F00", "#EFE3C8", "#007A56"
+OBSTACLES = ((0.90, 0.42, 0.25), (0.90, 0.62, 0.10), (0.70, 0.45, 0.75), (0.35, 0.62, 0.45), (0.55, 0.55, 0.60))
+"""Colours of obstacles, in turn."""
+MOVING, AT_REST, GROUND, TOOL_PATH = "#6BA3D6", "#C4C4C4", "#EFE3C8", "#007A56"
+
+
+def rgb(colour: str) -> tuple[float, ...]:
+    """Return red, green and blue, 0 to 1, of a colour such as `#0072B2`."""
+    return tuple(int(colour[i : i + 2], 16) / 255.0 for i in (1, 3, 5))
 
 
 def units(log: Log, per: str = "") -> str:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from qpavoid.problem import Array
 from qpavoid.run.log import Log
@@ -87,6 +89,43 @@ def obstacle_faces(log: Log, index: int, step: int) -> Array:
     faces, position = local_faces(log.meta["obstacles"][index]), log.obstacle_position[step, index]
     faces = faces[: len(faces) if np.isfinite(position).all() else 0]
     return np.asarray(faces @ log.obstacle_rotation[step, index].T + position)
+
+
+def triangulated(quadrilaterals: Array) -> tuple[Array, Any]:
+    """Return vertices (n, 3) and triangles (t, 3) of quadrilaterals (m, 4, 3)."""
+    corners = np.arange(4 * len(quadrilaterals)).reshape(-1, 4)
+    return quadrilaterals.reshape(-1, 3), np.concatenate((corners[:, :3], corners[:, [0, 2, 3]]))
+
+
+def inflated_outline(log: Log, index: int, step: int, flat: Callable[[Any], Array], distance: float) -> Array | None:
+    """Return the outline (n, 2) [m] of all that is nearer than a distance [m] to an obstacle, in a parallel projection.
+
+    None where there is nothing, or no single convex body.
+
+    Args:
+        log: the run.
+        index: number of the obstacle.
+        step: number of the step.
+        flat: projects points (n, 3) into the plane of the picture (n, 2).
+        distance: from the obstacle's surface [m].
+    """
+    described = log.meta["obstacles"][index]
+    if is_endless(log, index) or "voxels" in described or "triangles" in described:
+        return None
+    corners = flat(obstacle_faces(log, index, step).reshape(-1, 3))
+    if not len(corners):
+        return None
+    corners = corners[ConvexHull(corners, qhull_options="QJ").vertices]
+    angle = np.linspace(0.0, 2.0 * np.pi, 48, endpoint=False)
+    around = (corners[:, None] + distance * np.column_stack((np.cos(angle), np.sin(angle)))).reshape(-1, 2)
+    return np.asarray(around[ConvexHull(around).vertices])
+
+
+def obstacle_path(log: Log, index: int) -> Array:
+    """Return the path (n, 3) of an obstacle's origin [m]: one point where it rests, none where it never was."""
+    path = log.obstacle_position[:, index]
+    path = path[np.isfinite(path).all(axis=1)]
+    return path[:1] if len(path) and np.ptp(path, axis=0).max() < 1e-3 else path
 
 
 def is_endless(log: Log, index: int) -> bool:

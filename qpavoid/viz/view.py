@@ -12,25 +12,42 @@ import sys
 import tempfile
 from collections import deque
 from collections.abc import Callable, Sequence
+from operator import is_
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 
 import qpavoid
 from qpavoid.control.tick import Tick
 from qpavoid.errors import ConfigError
 from qpavoid.model.robot import Robot
 from qpavoid.model.sample import Pose
-from qpavoid.model.scene import Scene
-from qpavoid.problem import Solution
+from qpavoid.model.scene import Obstacle, Scene
+from qpavoid.problem import Array
 from qpavoid.run.simulate import describe_obstacle
-from qpavoid.viz.meshes import Mesh, of_geometry, of_obstacle
+from qpavoid.viz.meshes import EMPTY, of_geometry, of_obstacle
 from qpavoid.viz.view_clock import PlayClock
-from qpavoid.viz.view_link import Frame, PageSetup, frame_of, make_link, pack, received, send
+from qpavoid.viz.view_link import (
+    Frame,
+    PageSetup,
+    SlotChange,
+    bodies_in_contact,
+    frame_of,
+    make_link,
+    obstacles_of_pairs,
+    pack,
+    pack_change,
+    received,
+    send,
+)
+from qpavoid.viz.view_status import status_html
 
 _BODY = (0.31, 0.63, 0.94, 0.35)
+_TIMED = 500
+"""Control steps whose time is shown."""
 _MAX_EVENTS = 1000
 """Events that wait for a loop that does not ask for them."""
 
@@ -67,19 +84,25 @@ class View:
         Raises:
             ConfigError: viser is not installed, or the system has no local sockets.
         """
-        obstacles = [describe_obstacle(scene, i) for i, obstacle in enumerate(scene.slots)]
-        setup = page_setup(scene.robot, obstacles, [(name, True) for name in targets], title)
+        setup = page_setup(scene.robot, [], [(name, True) for name in targets], title)
         setup.port, setup.host, setup.rate, setup.quality = port, host, rate, quality
-        self._start(setup)
+        self._start(setup, scene)
 
     @classmethod
-    def of_setup(cls, setup: PageSetup) -> View:
-        """Start a view of a setup."""
+    def of_setup(cls, setup: PageSetup, scene: Scene | None = None) -> View:
+        """Start a view of a setup, and of a scene whose obstacles may come and go."""
         view = cls.__new__(cls)
-        view._start(setup)
+        view._start(setup, scene)
         return view
 
-    def _start(self, setup: PageSetup) -> None:
+    def _start(self, setup: PageSetup, scene: Scene | None) -> None:
+        self.camera, self.look_at = setup.camera
+        """Where the page is looked at from at first, and the point in its middle (3,) [m]."""
+        self.scene = scene
+        """Robot and obstacles that are shown; that of another controller of the same robot may take its place."""
+        self._slots: list[Obstacle] = []  # as the page knows them
+        self._changes: deque[bytes] = deque()
+        self._step_times: deque[float] = deque(maxlen=_TIMED)
         for module in ("viser", "trimesh"):
             if importlib.util.find_spec(module) is None:
                 raise ConfigError(f"the live view needs {module}: pip install 'qpavoid[view]'")
@@ -118,21 +141,31 @@ class View:
         return self._process.poll() is None
 
     def update(self, tick: Tick, note: str = "") -> None:
-        """Show a control step, unless the last one was shown a moment ago; costs a microsecond then, 40 µs otherwise.
+        """Show a control step, unless the last one was shown a moment ago; costs a microsecond then, 80 µs otherwise.
 
         Args:
             tick: what `Controller.tick` gave.
-            note: more to say in the status, in Markdown.
+            note: more to say in the status.
         """
-        if self._is_due():
-            self.show(frame_of(tick, f"{status_text(tick)}  \n{note}" if note else status_text(tick)))
+        self.count_time(tick)
+        if self.is_due():
+            self.show(self.frame(tick, note))
 
-    def update_frame(self, make_frame: Callable[[], Frame]) -> None:
-        """Show the frame that is made, unless the last one was shown a moment ago."""
-        if self._is_due():
-            self.show(make_frame())
+    def count_time(self, tick: Tick) -> None:
+        """Take the time that a control step took into the status."""
+        self._step_times.append(tick.solution.build_time + tick.solution.solve_time)
 
-    def _is_due(self) -> bool:
+    def frame(self, tick: Tick, note: str = "") -> Frame:
+        """Return what is shown of a control step; see `update`."""
+        assert self.scene is not None
+        pairs = obstacles_of_pairs(self.scene)
+        frame = frame_of(tick, self.scene.robot, pairs, status_html(tick, self._step_times, note))
+        return frame._replace(
+            touching=bodies_in_contact(self.scene, tick.proximity.pair, tick.proximity.distance)
+        )  # fmt: skip
+
+    def is_due(self) -> bool:
+        """Return whether a browser is connected, and the last frame was shown long enough ago."""
         now = perf_counter()
         if now < self._next:
             return False
@@ -141,8 +174,27 @@ class View:
         return self.clients > 0
 
     def show(self, frame: Frame) -> None:
-        """Send a frame, whenever the last one was sent."""
+        """Send a frame, whenever the last one was sent; first obstacles that have come or gone."""
+        if self.scene is not None:
+            self._notice_obstacles(self.scene)
+        while self._changes and send(self._link, self._changes[0]):
+            self._changes.popleft()
         send(self._link, pack(frame))
+
+    def _notice_obstacles(self, scene: Scene) -> None:
+        known, slots = self._slots, scene.slots
+        if len(known) == len(slots) and all(map(is_, known, slots)):
+            return
+        for index in range(max(len(known), len(slots))):
+            new = slots[index] if index < len(slots) else None
+            old = known[index] if index < len(known) else None
+            if new is None or not new.name:
+                if old is not None and old.name:
+                    self._changes.append(pack_change(SlotChange(index, "", EMPTY)))
+            elif old is None or (old.name, old.shape) != (new.name, new.shape):
+                mesh = of_obstacle(describe_obstacle(scene, index), index)
+                self._changes.append(pack_change(SlotChange(index, new.name, mesh)))
+        self._slots = list(slots)
 
     def events(self) -> list[dict[str, Any]]:
         """Return what was done on the page since the last call: its `type`, and what belongs to it."""
@@ -229,18 +281,24 @@ def pose_of(event: dict[str, Any]) -> Pose:
 
 
 def page_setup(
-    robot: Robot, obstacles: Sequence[dict[str, Any]], targets: Sequence[tuple[str, bool]], title: str
+    robot: Robot,
+    obstacles: Sequence[dict[str, Any]],
+    targets: Sequence[tuple[str, bool]],
+    title: str,
+    q: Array | None = None,
+    planned: Sequence[Array] = (),
 ) -> PageSetup:
     """Return the setup of a page.
 
     Args:
         robot: the robot.
-        obstacles: of each slot of its scene, as `describe_obstacle` gives it.
+        obstacles: those that never change, as `describe_obstacle` gives them.
         targets: names of the frame tasks, and whether their targets may be turned.
         title: shown above the controls.
+        q: configuration (nq,) in which the camera sees the whole robot; the home pose if left out.
+        planned: paths (n, 3) of the tools [m].
     """
-    empty = Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint32), (0.0, 0.0, 0.0, 1.0))
-    meshes = [of_obstacle(described, i) if described["name"] else empty for i, described in enumerate(obstacles)]
+    meshes = [of_obstacle(described, i) for i, described in enumerate(obstacles)]
     return PageSetup(
         title=title or robot.name,
         model=robot.model,
@@ -252,23 +310,22 @@ def page_setup(
         ],
         obstacles=[(described["name"], mesh) for described, mesh in zip(obstacles, meshes, strict=True)],
         targets=list(targets),
+        camera=_camera(robot, robot.home if q is None else q, planned),
+        planned=list(planned),
         joint_names=robot.coordinate_names,
         speed_limits=np.array(robot.bounds().velocity),
     )
 
 
-def status_text(tick: Tick) -> str:
-    """Return what a control step decided and why, in Markdown."""
-    solution, proximity, names = tick.solution, tick.proximity, tick.problem.pair_names
-    lines = [f"**{solution.status.value}** at {tick.state.t:.2f} s"]
-    if len(proximity.pair):
-        nearest = int(np.argmin(proximity.distance))
-        a, b = names[proximity.pair[nearest]]
-        lines.append(f"closest: {a}, {b}: {1e3 * proximity.distance[nearest]:.0f} mm")
-    return "  \n".join([*lines, *reason_lines(solution)])
-
-
-def reason_lines(solution: Solution) -> list[str]:
-    """Return the first reasons of a solution, each in a line."""
-    reasons = [str(reason) for reason in (*solution.reasons, *solution.stalled, *solution.assumptions)]
-    return reasons[:6] + ([f"and {len(reasons) - 6} more"] if len(reasons) > 6 else [])
+def _camera(robot: Robot, q: Array, planned: Sequence[Array]) -> tuple[Array, Array]:
+    """Return where to look at a robot and its paths from, and the point in the middle of the picture (3,) [m]."""
+    model, data = robot.model, robot.model.createData()
+    pin.forwardKinematics(model, data, q)
+    points = [data.oMi[body.parentJoint].act(body.placement.translation) for body in robot.bodies.geometryObjects] or [
+        np.zeros(3)
+    ]
+    points += [point for path in planned for point in path]
+    lower, upper = np.min(points, axis=0), np.max(points, axis=0)
+    size = max(float(np.linalg.norm(upper - lower)), 0.3)
+    look_at = 0.5 * (lower + upper)
+    return look_at + 1.25 * size * np.array([0.80, -0.53, 0.35]), look_at

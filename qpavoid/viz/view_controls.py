@@ -1,22 +1,17 @@
-"""Controls, status and plots beside the scene of the live view."""
+"""Controls and status beside the scene of the live view."""
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-
-from qpavoid.viz.style import COLOURS
+from qpavoid.viz.view_ghosts import COLOURS
 from qpavoid.viz.view_link import Frame, PageSetup
+from qpavoid.viz.view_plots import Plots
+from qpavoid.viz.view_status import legend_html, text_html
 
-_PLOTTED = 300
-"""Frames that the plots show."""
-_PLOT_PERIOD = 6
+_PERIOD = 6
 """Frames between two updates of plots and status."""
-_MAX_LINES = 8
-"""Joints with a line of their own; of more, the fastest one alone is drawn."""
 
 
 class Controls:
@@ -27,15 +22,28 @@ class Controls:
         self._gui, self._setup, self._post = server.gui, setup, post
         server.gui.configure_theme(dark_mode=False, control_layout="collapsible", show_share_button=False)
         server.gui.set_panel_label(setup.title)
-        self._status = server.gui.add_markdown("waiting for the loop")
+        self._status = server.gui.add_html(text_html("waiting for the loop"))
         self._resets: list[Callable[[], None]] = []
-        if setup.controls:
-            self._add_run_controls()
-        self._bodies = server.gui.add_checkbox("collision bodies", False)
-        self._plots = self._add_plots()
-        self._times: deque[float] = deque(maxlen=_PLOTTED)
-        self._distances: deque[list[float]] = deque(maxlen=_PLOTTED)
-        self._speeds: deque[Any] = deque(maxlen=_PLOTTED)
+        self._time: Any = None
+        self._removable: Any = None
+        values = setup.controls
+        if "speeds" in values:
+            self._add_time(values)
+        if "solvers" in values:
+            self._add_laws(values)
+        if "joints" in values:
+            self._add_joints(values["joints"])
+        if setup.others:
+            server.gui.add_html(legend_html(setup.others, COLOURS[1 : 1 + len(setup.others)]))
+        self._plots = Plots(server.gui, setup) if "joints" not in values else None
+        if "shapes" in values:
+            self._add_obstacles(values["shapes"])
+        if "weights" in values:
+            self._add_weights(values["weights"])
+        self._bodies = server.gui.add_checkbox("collision bodies", bool(values.get("shows bodies")))
+        for title, text in values.get("texts", ()):
+            with server.gui.add_folder(title, expand_by_default=False):
+                server.gui.add_html(text)
         self._count = 0
 
     def on_body_toggle(self, show: Callable[[bool], None]) -> None:
@@ -49,86 +57,107 @@ class Controls:
         """Call something when the run is to begin anew."""
         self._resets.append(reset)
 
-    def _add_run_controls(self) -> None:
-        gui, values = self._gui, self._setup.controls
-        gui_buttons = gui.add_button_group("time", ("play", "pause", "step", "reset"))
+    def name_obstacles(self, names: list[tuple[int, str]]) -> None:
+        """Offer these obstacles, of their slots, for removal, and plot their distances."""
+        if self._removable is not None:
+            self._removable.options = tuple(name for _, name in names) or ("none",)
+        if self._plots is not None:
+            self._plots.name_obstacles(names)
 
-        @gui_buttons.on_click  # type: ignore[untyped-decorator]
+    def _add_time(self, values: dict[str, Any]) -> None:
+        gui = self._gui
+        words = ("play", "pause", "step", "reset") + (("closest",) if "runs" in values else ())
+        buttons = gui.add_button_group("time", words)
+
+        @buttons.on_click  # type: ignore[untyped-decorator]
         async def _(_: Any) -> None:
-            if gui_buttons.value == "reset":
-                self._clear()
-                for reset in self._resets:
-                    reset()
-            self._post(type=gui_buttons.value)
+            self._press(buttons.value)
 
         for label, key in (("play or pause", "space"), ("step", "arrowright")):
             command = gui.add_command(label, hotkey=key)
 
             @command.on_trigger  # type: ignore[untyped-decorator]
             async def _(_: Any, label: str = label) -> None:
-                self._post(type="toggle" if label.startswith("play") else label)
+                self._press("toggle" if label.startswith("play") else label)
 
         self._add("speed", gui.add_dropdown("speed", values["speeds"], initial_value="1x"))
         if "runs" in values:
             if len(values["runs"]) > 1:
                 self._add("run", gui.add_dropdown("run", values["runs"], initial_value=values["runs"][0]))
-            self._add("time", gui.add_slider("go to [s]", 0.0, values["duration"], values["dt"], 0.0))
-        if "solvers" in values:
+            self._time = gui.add_slider("time [s]", 0.0, values["duration"], values["dt"], 0.0)
+            self._add("time", self._time)
+        else:
+            self._back = gui.add_slider("look back [s]", 0.0, values["look back"], 0.1, 0.0)
+            self._add("back", self._back)
+
+    def _press(self, word: str) -> None:
+        """Do what a button of the time does."""
+        if word == "reset":
+            if self._plots is not None:
+                self._plots.clear()
+            for reset in self._resets:
+                reset()
+        if "runs" not in self._setup.controls and word != "pause":
+            self._back.value = 0.0
+        self._post(type=word)
+
+    def _add_laws(self, values: dict[str, Any]) -> None:
+        gui = self._gui
+        with gui.add_folder("control"):
             self._add("solver", gui.add_dropdown("solver", values["solvers"], initial_value=values["solver"]))
+            self._add("beside", gui.add_dropdown("beside", values["besides"], initial_value=values["beside"]))
             self._add("row", gui.add_dropdown("rows", values["rows"], initial_value=values["row"]))
             d1, d2 = (round(1e3 * values[name], 1) for name in ("d1", "d2"))
             self._add("d1", gui.add_number("d1 [mm]", d1, min=1.0, step=1.0))
             self._add("d2", gui.add_number("d2 [mm]", d2, min=2.0, step=1.0))
-            gui.add_markdown("Drag obstacles with the mouse, targets by their arrows.")
 
-    def _add(self, kind: str, control: Any) -> None:
+    def _add_weights(self, weights: list[tuple[str, float]]) -> None:
+        with self._gui.add_folder("weights", expand_by_default=False):
+            for name, weight in weights:
+                self._add("weight", self._gui.add_number(name, weight, min=1e-9, step=1e-6), name=name)
+
+    def _add_joints(self, joints: list[tuple[str, float, float, float]]) -> None:
+        for index, (name, lower, upper, value) in enumerate(joints):
+            slider = self._gui.add_slider(name, lower, upper, 1e-3 * (upper - lower), value)
+            self._add("joint", slider, index=index)
+
+    def _add_obstacles(self, shapes: tuple[str, ...]) -> None:
+        gui = self._gui
+        with gui.add_folder("obstacles"):
+            gui.add_html(text_html("Drag them with the mouse, and targets by their arrows."))
+            shape = gui.add_dropdown("shape", shapes, initial_value=shapes[0])
+            size = gui.add_slider("size [mm]", 20.0, 400.0, 10.0, 120.0)
+            add = gui.add_button("add")
+            self._removable = gui.add_dropdown("name", ("none",), initial_value="none")
+            remove = gui.add_button("remove")
+
+        @add.on_click  # type: ignore[untyped-decorator]
+        async def _(_: Any) -> None:
+            self._post(type="add", shape=shape.value, size=size.value)
+
+        @remove.on_click  # type: ignore[untyped-decorator]
+        async def _(_: Any) -> None:
+            if self._removable.value != "none":
+                self._post(type="remove", name=self._removable.value)
+
+    def _add(self, kind: str, control: Any, **more: Any) -> None:
         """Send each change of a control that a user makes."""
 
         @control.on_update  # type: ignore[untyped-decorator]
         async def _(event: Any) -> None:
             if event.client is not None:
-                self._post(type=kind, value=control.value)
-
-    def _add_plots(self) -> tuple[Any, Any]:
-        from viser import uplot
-
-        def line(label: str, stroke: str, width: float = 1.5) -> Any:
-            return uplot.Series(label=label, stroke=stroke, width=width)
-
-        def plot(title: str, lines: list[Any]) -> Any:
-            data = tuple(np.zeros(2) for _ in range(len(lines) + 1))
-            scales = {"x": uplot.Scale(time=False)}
-            series = (uplot.Series(label="t [s]"), *lines)
-            return self._gui.add_uplot(data, series, title=title, scales=scales, aspect=1.7)
-
-        distance = [line("distance", "#C62F2F", 2.0), line("d1", "#7A4B9A"), line("d2", "#8A8A8A")]
-        names = self._setup.joint_names if len(self._setup.joint_names) <= _MAX_LINES else ["fastest joint"]
-        speeds = [line(name, COLOURS[i % len(COLOURS)]) for i, name in enumerate(names)]
-        return plot("distance of the closest pair [mm]", distance), plot("joint speed / limit [%]", speeds)
+                self._post(type=kind, value=control.value, **more)
 
     def show(self, frame: Frame) -> None:
         """Take a frame into the plots, and show status and plots now and then."""
-        if self._times and frame.t < self._times[-1]:
-            self._clear()
+        if self._plots is not None:
+            self._plots.take(frame)
         self._count += 1
-        if not self._times or frame.t > self._times[-1]:
-            self._append(frame)
-        if self._count % _PLOT_PERIOD == 0:
-            if self._status.content != frame.text:
-                self._status.content = frame.text
-            if len(self._times) > 1:
-                t = np.array(self._times)
-                for plot, history in zip(self._plots, (self._distances, self._speeds), strict=True):
-                    if not np.array_equal(plot.data[0], t):
-                        plot.data = (t, *np.array(history, dtype=np.float64).T)
-
-    def _append(self, frame: Frame) -> None:
-        nearest = np.min(frame.witnesses[:, 0]) if len(frame.witnesses) else np.nan
-        self._times.append(frame.t)
-        self._distances.append([1e3 * float(distance) for distance in (nearest, *frame.levels)])
-        percent = 100.0 * np.abs(frame.v) / self._setup.speed_limits
-        self._speeds.append(percent if len(percent) <= _MAX_LINES else [percent.max()])
-
-    def _clear(self) -> None:
-        for history in (self._times, self._distances, self._speeds):
-            history.clear()
+        if self._count % _PERIOD:
+            return
+        if self._status.content != frame.text:
+            self._status.content = frame.text
+        if self._time is not None and abs(self._time.value - frame.t) > 1e-9:
+            self._time.value = min(max(frame.t, 0.0), self._setup.controls["duration"])
+        if self._plots is not None:
+            self._plots.draw()

@@ -3,25 +3,34 @@
 from __future__ import annotations
 
 import json
+import pickle
 import socket
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import pinocchio as pin
 
 from qpavoid.control.tick import Tick
 from qpavoid.errors import ConfigError
-from qpavoid.problem import Array
-from qpavoid.viz.meshes import Mesh
+from qpavoid.model.robot import Robot
+from qpavoid.model.scene import Scene
+from qpavoid.problem import Array, IntArray
+from qpavoid.viz.meshes import Mesh, decimated
 
 MAX_WITNESSES = 64
 """Pairs within the influence distance whose witness points are sent: the closest ones."""
 _QUEUE = 1 << 18
 """Memory of the link in each direction [bytes]; a datagram takes 1 to 20 kB."""
-_HEADER = 7
-"""Numbers at the start of a datagram: time, and how many there are of each part."""
+_HEADER = 10
+"""Numbers at the start of a frame: time, and how many there are of each part."""
+MAX_GHOSTS = 4
+"""Poses of the backup trajectory that are shown."""
+BACKUP = 0
+"""Number of the ghosts of a backup trajectory; those of the other runs begin at 1."""
 
 
 class Frame(NamedTuple):
@@ -34,7 +43,8 @@ class Frame(NamedTuple):
     v: Array
     """(nv,) commanded velocity [rad/s or m/s]."""
     witnesses: Array
-    """(k, 7) of each pair in range: distance between surfaces, two witness points [m]."""
+    """(k, 8) of each pair in range: distance between surfaces, two witness points [m], number of the obstacle, -1
+    between two bodies of the robot."""
     tools: Array
     """(f, 3) positions of the frames with tasks [m]."""
     targets: Array
@@ -43,8 +53,13 @@ class Frame(NamedTuple):
     """(o, 12) poses of the obstacles, as those of the targets."""
     levels: Array
     """(2,) d1 and d2, between surfaces [m]."""
+    ghosts: Array
+    """(g, 2 + nq) robots that are shown translucent: BACKUP or number of the run, its least distance [m],
+    configuration."""
+    touching: Array
+    """(b,) numbers of the robot's bodies that touch something."""
     text: str = ""
-    """Status, in Markdown."""
+    """Status, in HTML."""
 
 
 @dataclass
@@ -64,6 +79,12 @@ class PageSetup:
     joint_names: list[str]
     speed_limits: Array
     """(nv,) [rad/s or m/s]."""
+    camera: tuple[Array, Array]
+    """Where the page is looked at from at first, and the point in its middle (3,) [m]."""
+    planned: list[Array] = field(default_factory=list)
+    """Paths (n, 3) that the tools are to follow [m]."""
+    others: list[str] = field(default_factory=list)
+    """Names of the other runs that are shown as ghosts."""
     controls: dict[str, Any] = field(default_factory=dict)
     """Choices and values of the controls of a run; none where empty."""
     host: str = "127.0.0.1"
@@ -74,6 +95,15 @@ class PageSetup:
     """`high`, or `low` for machines without a graphics processor."""
     parent: int = 0
     """Process whose end ends the page."""
+
+
+class SlotChange(NamedTuple):
+    """An obstacle that came, or went."""
+
+    slot: int
+    name: str
+    """Empty of an empty slot."""
+    mesh: Mesh
 
 
 def make_link() -> tuple[socket.socket, socket.socket]:
@@ -115,38 +145,78 @@ def send_event(link: socket.socket, **event: Any) -> bool:
     return send(link, json.dumps(event).encode())
 
 
-def frame_of(tick: Tick, text: str = "") -> Frame:
-    """Return what is shown of a control step."""
+def frame_of(tick: Tick, robot: Robot, obstacle_of_pair: IntArray, text: str = "") -> Frame:
+    """Return what is shown of a control step.
+
+    Args:
+        tick: the step.
+        robot: whose model moves the ghosts.
+        obstacle_of_pair: see `obstacles_of_pairs`.
+        text: status, in HTML.
+    """
     near, closest = tick.problem.avoidance, tick.proximity.closest
     # the gains take distances with an offset, the same of all pairs but for those with a safety distance of their own
     offset = float(np.median(near.d - closest[:, 0])) if 0 < len(near.d) == len(closest) else 0.0
-    witnesses = closest[:, [0, 4, 5, 6, 7, 8, 9]]
+    witnesses: Array = np.column_stack((closest[:, [0, 4, 5, 6, 7, 8, 9]], obstacle_of_pair[tick.proximity.pair]))
     if len(witnesses) > MAX_WITNESSES:
         witnesses = witnesses[np.argsort(witnesses[:, 0])[:MAX_WITNESSES]]
     tools = tick.kinematics.position
     targets = np.array([target.row[:12] for target in tick.targets[: len(tools)]]).reshape(-1, 12)
     levels = np.array([near.d1 - offset, near.d2 - offset])
+    ghosts, q = np.empty((0, 2 + len(tick.state.q))), tick.state.q
+    if len(tick.backup):
+        configurations = []
+        for part in np.array_split(tick.backup, MAX_GHOSTS):
+            q = pin.integrate(robot.model, q, part.sum(axis=0))
+            configurations.append((BACKUP, np.nan, *q))
+        ghosts = np.array(configurations)
     return Frame(
-        tick.state.t, tick.state.q, tick.solution.v, witnesses, tools, targets, tick.obstacles, levels, text
+        tick.state.t, tick.state.q, tick.solution.v, witnesses, tools, targets, tick.obstacles, levels, ghosts,
+        _NONE, text,
     )  # fmt: skip
+
+
+_NONE = np.zeros(0)
+
+
+def obstacles_of_pairs(scene: Scene) -> IntArray:
+    """Return the number of the obstacle of each pair (m,), -1 between two bodies of the robot."""
+    return np.asarray(scene.obstacle_of[scene.pairs].max(axis=1, initial=-1))
+
+
+def bodies_in_contact(scene: Scene, pairs: IntArray, distances: Array) -> Array:
+    """Return the numbers of the robot's bodies (b,) in pairs (k,) whose distances (k,) [m] are negative."""
+    touching = np.unique(scene.pairs[pairs[distances < 0.0]])
+    return touching[touching < len(scene.body_names)].astype(np.float64)
+
+
+_FRAME, _CHANGE = b"f", b"c"
 
 
 def pack(frame: Frame) -> bytes:
     """Return a frame as a datagram."""
-    counts = [len(part) for part in frame[1:7]]
-    numbers = np.concatenate([(frame.t, *counts), *(np.ravel(part) for part in frame[1:8])])
-    return bytes(numbers.tobytes() + frame.text.encode())
+    parts = [np.ravel(part) for part in frame[1:10]]
+    numbers = np.concatenate([(frame.t, *map(len, parts)), *parts])
+    return _FRAME + bytes(numbers.tobytes()) + frame.text.encode()
 
 
-def unpack(datagram: bytes) -> Frame:
-    """Return the frame of a datagram."""
-    t, *counts = np.frombuffer(datagram, count=_HEADER).tolist()
-    nq, nv, k, f, g, o = map(int, counts)
-    parts: list[Any] = []
-    place = _HEADER
-    for shape in ((nq,), (nv,), (k, 7), (f, 3), (g, 12), (o, 12), (2,)):
-        size = int(np.prod(shape))
-        parts.append(np.frombuffer(datagram, count=size, offset=8 * place).reshape(shape))
-        place += size
-    q, v, witnesses, tools, targets, obstacles, levels = parts
-    return Frame(t, q, v, witnesses, tools, targets, obstacles, levels, datagram[8 * place :].decode())
+def pack_change(change: SlotChange) -> bytes:
+    """Return a change of the scene as a datagram; a large mesh loses details until it fits."""
+    mesh, cell = change.mesh, 0.005
+    while len(datagram := _CHANGE + pickle.dumps(change._replace(mesh=mesh))) > _QUEUE // 4:
+        mesh, cell = decimated(mesh, cell), 2.0 * cell
+    return datagram
+
+
+def unpack(datagram: bytes) -> Frame | SlotChange:
+    """Return the frame or change of a datagram."""
+    if datagram[:1] == _CHANGE:
+        change: SlotChange = pickle.loads(datagram[1:])  # by this process's own parent
+        return change
+    t, *counts = np.frombuffer(datagram, count=_HEADER, offset=1).tolist()
+    ends = np.cumsum([_HEADER, *counts]).astype(int)
+    numbers = np.frombuffer(datagram, count=ends[-1], offset=1)
+    q, v, *parts = [numbers[begin:end] for begin, end in pairwise(ends)]
+    widths = (8, 3, 12, 12, 0, 2 + len(q), 0)
+    shaped = (part.reshape(-1, width) if width else part for part, width in zip(parts, widths, strict=True))
+    return Frame._make((t, q, v, *shaped, datagram[1 + 8 * ends[-1] :].decode()))

@@ -12,18 +12,23 @@ import pinocchio as pin
 from qpavoid.model.visuals import read_visuals
 from qpavoid.problem import Array
 from qpavoid.viz.meshes import Mesh, decimated, of_visual
-from qpavoid.viz.view_link import Frame, PageSetup
+from qpavoid.viz.view_ghosts import Ghosts
+from qpavoid.viz.view_link import Frame, PageSetup, SlotChange
 
 Post = Callable[..., None]
 """Sends an event to the loop."""
-CAMERA, LOOK_AT = (1.5, -1.0, 1.05), (0.2, 0.0, 0.42)
-"""Where the page is looked at from at first, and the point in its middle [m]."""
 SAME = 1e-6
 """Change of a pose that is not sent [m, -]."""
 TRACE_FRAMES = 300
 """Frames whose tool positions stay visible."""
 _TRACE_PERIOD = 6
 """Frames between two updates of the tools' paths, which are sent as a whole."""
+_GAP = 1.0
+"""Time between two frames from which the tools' paths begin anew [s]."""
+_STILL = 1e-3
+"""Extent of a planned path that is not drawn [m]."""
+_PLANNED, _TOUCHING = (120, 90, 170), (220, 30, 30)
+_FEW_FACES = 1500
 _COARSE = 0.012
 """Size of details that are left out where the quality is low [m]."""
 
@@ -38,19 +43,34 @@ class Page:
         scene = server.scene
         scene.set_up_direction("+z")
         scene.add_grid("/grid", 6.0, 6.0, cell_size=0.25)
-        server.initial_camera.position, server.initial_camera.look_at = CAMERA, LOOK_AT
+        server.initial_camera.position, server.initial_camera.look_at = setup.camera
         if setup.quality == "low":
             scene.configure_default_lights(True, cast_shadow=False)
             scene.configure_environment_map(None)
             scene.add_light_ambient("/ambient", intensity=0.9)
         self._nodes: list[tuple[Any, int, Any]] = []
-        visuals = read_visuals(setup.model, setup.urdf, setup.package_dirs)
-        for visual in visuals:
-            self._add_part(f"/robot/{visual.name}", visual.joint, visual.placement, of_visual(visual))
+        visuals = [
+            (visual.name, visual.joint, visual.placement, of_visual(visual))
+            for visual in read_visuals(setup.model, setup.urdf, setup.package_dirs)
+        ]
+        for name, joint, placement, meshes in visuals:
+            self._add_part(f"/robot/{name}", joint, placement, meshes)
         self._bodies = scene.add_frame("/bodies", show_axes=False, visible=not visuals)
-        for number, (joint, placement, mesh) in enumerate(setup.bodies):
-            self._add_part(f"/bodies/{number}", joint, placement, [mesh])
-        self._obstacles = [self._add_obstacle(name, mesh) for name, mesh in setup.obstacles]
+        self._body_meshes = [
+            self._add_part(f"/bodies/{number}", joint, placement, [mesh])[0]
+            for number, (joint, placement, mesh) in enumerate(setup.bodies)
+        ]
+        self._touching: set[int] = set()
+        parts = [part[1:] for part in visuals] or [(joint, at, [mesh]) for joint, at, mesh in setup.bodies]
+        self._ghosts = Ghosts(scene, parts, len(setup.others))
+        self._ghost_data = setup.model.createData()
+        self._obstacles: list[tuple[str, Any]] = []
+        for index, (name, mesh) in enumerate(setup.obstacles):
+            self.change(SlotChange(index, name, mesh))
+        for number, path in enumerate(setup.planned):
+            if np.ptp(path, axis=0).max() > _STILL:
+                segments = np.stack((path[:-1], path[1:]), axis=1).astype(np.float32)
+                scene.add_line_segments(f"/planned/{number}", segments, _PLANNED, line_width=2.0)
         self._grips: dict[str, Array] = {}  # from the point where an obstacle is held to its origin
         self._targets: list[Any] = []
         self._pulled: set[str] = set()  # targets that follow the mouse and no longer the loop
@@ -66,11 +86,13 @@ class Page:
     def show(self, frame: Frame) -> None:
         """Show a frame; what is where it was is not sent again."""
         self._place_robot(frame.q)
-        for node, pose in zip(self._obstacles, frame.obstacles, strict=False):
+        for (_, node), pose in zip(self._obstacles, frame.obstacles, strict=False):
             _place(node, pose[:9].reshape(3, 3).T, pose[9:])
+        self._colour_bodies({int(number) for number in frame.touching})
+        self._ghosts.show(self._model, self._ghost_data, frame.ghosts)
         self._place_targets(frame.targets)
         self._show_witnesses(frame.witnesses, frame.levels)
-        if frame.t < self._t:
+        if not self._t <= frame.t < self._t + _GAP:
             self._tools.clear()
         self._t = frame.t
         self._tools.append(frame.tools)
@@ -87,26 +109,46 @@ class Page:
         self._pulled.clear()
         self._tools.clear()
 
-    def _add_part(self, name: str, joint: int, placement: Any, meshes: list[Mesh]) -> None:
+    def change(self, change: SlotChange) -> None:
+        """Show another obstacle in a slot, or none."""
+        while len(self._obstacles) <= change.slot:
+            node = self.server.scene.add_frame(f"/obstacles/{len(self._obstacles)}", show_axes=False)
+            self._obstacles.append(("", node))
+        node = self._obstacles[change.slot][1]
+        if self._obstacles[change.slot][0]:
+            self.server.scene.remove_by_name(f"/obstacles/{change.slot}/shape")
+        self._obstacles[change.slot] = change.name, node
+        if change.name and len(change.mesh.faces):
+            self._add_obstacle(change.slot, change.name, change.mesh)
+
+    @property
+    def obstacle_names(self) -> list[tuple[int, str]]:
+        """Return slot and name of each obstacle."""
+        return [(index, name) for index, (name, _) in enumerate(self._obstacles) if name]
+
+    def _add_part(self, name: str, joint: int, placement: Any, meshes: list[Mesh]) -> list[Any]:
         node = self.server.scene.add_frame(name, show_axes=False)
-        for index, mesh in enumerate(meshes):
-            self._add_mesh(f"{name}/{index}", mesh)
         self._nodes.append((node, joint, placement))
+        return [self._add_mesh(f"{name}/{index}", mesh) for index, mesh in enumerate(meshes)]
+
+    def _colour_bodies(self, touching: set[int]) -> None:
+        """Draw the bodies that touch something in red."""
+        for number in touching ^ self._touching:
+            mesh, node = self._setup.bodies[number][2], self._body_meshes[number]
+            node.color = _TOUCHING if number in touching else _bytes(mesh.colour)
+        self._touching = touching
 
     def _add_mesh(self, name: str, mesh: Mesh) -> Any:
-        if self._setup.quality == "low":
+        if self._setup.quality == "low" and len(mesh.faces) > _FEW_FACES:
             mesh = decimated(mesh, _COARSE)
-        red, green, blue, opacity = mesh.colour
+        opacity = mesh.colour[3]
         return self.server.scene.add_mesh_simple(
-            name, mesh.vertices, mesh.faces, color=(round(255 * red), round(255 * green), round(255 * blue)),
-            opacity=opacity if opacity < 1.0 else None, side="double",
+            name, mesh.vertices, mesh.faces, color=_bytes(mesh.colour), opacity=opacity if opacity < 1.0 else None,
+            side="double",
         )  # fmt: skip
 
-    def _add_obstacle(self, name: str, mesh: Mesh) -> Any:
-        node = self.server.scene.add_frame(f"/obstacles/{name or 'none'}", show_axes=False)
-        if not len(mesh.faces):
-            return node
-        shape = self._add_mesh(f"/obstacles/{name}/shape", mesh)
+    def _add_obstacle(self, index: int, name: str, mesh: Mesh) -> None:
+        node, shape = self._obstacles[index][1], self._add_mesh(f"/obstacles/{index}/shape", mesh)
 
         async def drag(event: Any) -> None:
             if event.phase == "start":
@@ -118,7 +160,6 @@ class Page:
                 )
 
         shape.on_drag(drag)
-        return node
 
     def _add_target(self, name: str, can_turn: bool) -> Any:
         gizmo = self.server.scene.add_transform_controls(
@@ -159,7 +200,7 @@ class Page:
     def _show_witnesses(self, witnesses: Array, levels: Array) -> None:
         is_visible = len(witnesses) > 0
         if is_visible:
-            self._witnesses.points = witnesses[:, 1:].reshape(-1, 2, 3).astype(np.float32)
+            self._witnesses.points = witnesses[:, 1:7].reshape(-1, 2, 3).astype(np.float32)
             colours = 255.0 * distance_colours(witnesses[:, 0], *levels)
             self._witnesses.colors = np.repeat(colours.astype(np.uint8)[:, None], 2, axis=1)
         if self._witnesses.visible != is_visible:
@@ -173,6 +214,11 @@ class Page:
             self._trace.points = segments
         if self._trace.visible != is_visible:
             self._trace.visible = is_visible
+
+
+def _bytes(colour: tuple[float, ...]) -> tuple[int, int, int]:
+    red, green, blue = (round(255 * part) for part in colour[:3])
+    return red, green, blue
 
 
 def distance_colours(d: Array, d1: float, d2: float) -> Array:

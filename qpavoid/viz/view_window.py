@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 from qpavoid.viz.view_controls import Controls
-from qpavoid.viz.view_link import PageSetup, received, send_event, unpack
+from qpavoid.viz.view_link import PageSetup, SlotChange, received, send_event, unpack
 from qpavoid.viz.view_page import Page
 
 _NICE = 5
@@ -58,7 +58,10 @@ def build(setup: PageSetup, link: socket.socket) -> tuple[Page, Controls, str]:
     server = viser.ViserServer(host=setup.host, port=setup.port, verbose=False)
     page, controls = Page(server, setup, post), Controls(server, setup, post)
     controls.on_body_toggle(page.show_bodies)
+    if setup.controls.get("shows bodies"):
+        page.show_bodies(True)
     controls.on_reset(page.let_go)
+    controls.name_obstacles(page.obstacle_names)
     if setup.port and server.get_port() != setup.port:
         print(f"view: port {setup.port} is taken", file=sys.stderr)
     return page, controls, f"http://{setup.host}:{server.get_port()}"
@@ -71,15 +74,18 @@ def serve(setup: PageSetup, link: socket.socket, page: Page, controls: Controls)
         select.select([link], [], [], _PATIENCE)
         begin, newest = time.perf_counter(), None
         for datagram in received(link):
-            newest = datagram
+            if isinstance(item := unpack(datagram), SlotChange):
+                page.change(item)
+                controls.name_obstacles(page.obstacle_names)
+            else:
+                newest = item
         count = len(page.server.get_clients())
         if count != clients and send_event(link, type="clients", count=count):
             clients = count
         if newest is not None:
-            frame = unpack(newest)
             with page.server.atomic():
-                page.show(frame)
-                controls.show(frame)
+                page.show(newest)
+                controls.show(newest)
         time.sleep(max(0.0, 1.0 / setup.rate - (time.perf_counter() - begin)))
 
 
