@@ -185,7 +185,7 @@ def test_work_of_a_step_is_bounded(tmp_path, evaluations, dt):
     evaluations.clear()
     for _ in loop(controller, round(2.0 / dt), clock=lambda k: dt * k):
         most, _ = max(most, len(evaluations)), evaluations.clear()
-    assert most == round(1e4 * dt)
+    assert 0.4 * 1e4 * dt < most <= 1e4 * dt
 
 
 def test_an_obstacle_that_appears_near_is_evaded_within_the_same_bound(tmp_path, evaluations):

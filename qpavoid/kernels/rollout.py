@@ -62,13 +62,14 @@ PROGRESS = np.dtype(
 )  # fmt: skip
 """Numbers of a rollout.
 
-dt: control period [s]; period_steps: control steps between two decisions; influence_distance: below which a pair counts
-[m]; sufficient: clearance from which on a trajectory need not be improved [m]; measures_outside: the caller computes all distances; completes_outside: those that
-kernels do not; moves_outside: configurations. end: time at which it ends; deadline: at which contacts are forgiven [s];
-horizon: of the policy, 0 of a stop [s]; prefix_steps: control steps before the policy decides. stage, pose: what comes
-next; poses: that may still be evaluated; t: time of the last pose [s]; steps: control steps until then; count: to the
-next decision; t_pose: time of the pose that is evaluated, `span` after the one before [s]; rows: pairs that get rows;
-near: rows of the last pose; is_moving: whether any obstacle moves. See `BackupScore` for what came of it.
+dt: control period [s]; period_steps: control steps between two decisions; influence_distance: below which a pair
+counts [m]; sufficient: clearance from which on a trajectory need not be improved [m]; measures_outside: the caller
+computes all distances; completes_outside: those that kernels do not; moves_outside: configurations. end: time at
+which it ends; deadline: at which contacts are forgiven [s]; horizon: of the policy, 0 of a stop [s]; prefix_steps:
+control steps before the policy decides. stage, pose: what comes next; poses: that may still be evaluated; t: time of
+the last pose [s]; steps: control steps until then; count: to the next decision; t_pose: time of the pose that is
+evaluated, `span` after the one before [s]; rows: pairs that get rows; near: rows of the last pose; is_moving: whether
+any obstacle moves. See `BackupScore` for what came of it.
 """
 
 

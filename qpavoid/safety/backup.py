@@ -40,10 +40,9 @@ _UNBIASED_FRACTION = 0.25
 """Fraction of the sampled policies without a bias velocity [-]."""
 _BIAS_SPEEDS = (2.0, 30.0)
 """Range of ‖v̂‖ of the others, log-uniform [rad/s, m/s]: from a tie-break to full speed."""
-_HOLD_CANDIDATES = 3
-"""Candidates that can be computed while one still holds the velocity of the solver [-]: as many may fail."""
-_RENEW_CANDIDATES = 3
-"""Candidates that can be computed before the kept trajectory is no longer valid [-]."""
+_CANDIDATES_AHEAD = 3
+"""Candidates that can be computed before the kept trajectory is no longer valid [-]: as many may fail. It holds the
+velocity of the solver as long, and the next one is begun so early."""
 _FIRST_CANDIDATES = 7
 """Candidates that are tried near an obstacle before one is followed that does not suffice [-]."""
 _URGENT = 0.5
@@ -83,10 +82,8 @@ class BackupPlanner:
         self._approach = ApproachCheck(settings, self._rollouts, obstacles)
         self._poses = max(1, round(_POSE_RATE * settings.dt))
         """Poses that are evaluated in a control step."""
-        self._hold_steps = ceil(_HOLD_CANDIDATES * self._rollouts.usual_poses / self._poses) - 1
-        """Control steps for which a candidate holds the velocity of the solver once it is known."""
-        self._renew_steps = ceil(_RENEW_CANDIDATES * self._rollouts.usual_poses / self._poses)
-        """Control steps before the kept trajectory is no longer valid in which the next one is begun."""
+        self._steps_ahead = ceil(_CANDIDATES_AHEAD * self._rollouts.usual_poses / self._poses)
+        """Control steps in which that many candidates are computed."""
         self._last_enabled = self._rollouts.enabled
         self.reset()
 
@@ -144,10 +141,8 @@ class BackupPlanner:
         enabled = self._rollouts.enabled
         enabled[proximity.pair[proximity.distance < TOUCH]] = False
         if not np.array_equal(enabled, self._last_enabled):
-            self._renew_steps = ceil(_RENEW_CANDIDATES * self._rollouts.usual_poses / self._poses)
-        """Control steps before the kept trajectory is no longer valid in which the next one is begun."""
-        self._last_enabled = enabled
-        return self._last_enabled
+            self._last_enabled = enabled
+        return self._last_enabled  # the same array, so that it need not be compared again
 
     def _after(self, state: Start, v: Array) -> Start:
         """Return the state after a control step at v (nv,)."""
@@ -202,7 +197,7 @@ class BackupPlanner:
 
     def _lasts(self, command: _Command) -> bool:
         """Return whether the kept trajectory will be valid until others are known, if the same is commanded."""
-        start, backup, steps = command.after, self._backup, self._renew_steps
+        start, backup, steps = command.after, self._backup, self._steps_ahead
         if backup is None or not command.is_task or len(backup.v) <= steps:
             return False
         q = pin.integrate(self._model, start.q, steps * self._dt * start.v)
@@ -230,20 +225,25 @@ class BackupPlanner:
 
     def _begin_with_task(self, command: _Command, number: int, steps: int) -> None:
         """Begin a candidate that goes on with the velocity of the solver, in so many control steps."""
-        backup, rollouts, v = self._backup, self._rollouts, command.after_task.v
-        start, prefix, policy, least = command.after_task, np.tile(v, (steps + self._hold_steps, 1)), None, LEAST_SCORE
+        backup, v = self._backup, command.after_task.v
+        start, prefix = command.after_task, np.tile(v, (steps + self._steps_ahead - 1, 1))
         if backup is not None and not command.is_task and steps:
             start, prefix = command.after, np.concatenate((backup.v[: steps - 1], prefix[steps - 1 :]))
-        if backup is not None:
-            sufficient, policy = rollouts.sufficient_score, backup.policy
-            least = BackupScore(backup.score.time_to_contact - (steps + 1) * self._dt, -inf)
-            if backup.score >= sufficient:
-                least = sufficient._replace(clearance=sufficient.clearance - _DISTANCE_TOLERANCE)
-            if number == 1:
-                prefix = np.concatenate((prefix, backup.v[len(prefix) :]))
-        if policy is None or number > 1:
-            policy = rollouts.stop_policy if number == 2 else self._sample_policy()
-        rollouts.begin(start, policy, prefix, least)
+        if backup is not None and number < 2:
+            policy = backup.policy
+            prefix = np.concatenate((prefix, backup.v[len(prefix) :])) if number == 1 else prefix
+        else:
+            policy = self._rollouts.stop_policy if number == 2 else self._sample_policy()
+        self._rollouts.begin(start, policy, prefix, self._least_score(steps + 1))
+
+    def _least_score(self, steps: int) -> BackupScore:
+        """Return what a candidate has to exceed that goes on with the velocity of the solver some steps later."""
+        backup, sufficient = self._backup, self._rollouts.sufficient_score
+        if backup is None:
+            return LEAST_SCORE
+        if backup.score >= sufficient:
+            return sufficient._replace(clearance=sufficient.clearance - _DISTANCE_TOLERANCE)
+        return BackupScore(backup.score.time_to_contact - steps * self._dt, -inf)
 
     def _begin_alone(self, command: _Command, number: int, steps: int) -> None:
         """Begin a candidate with the beginning of the kept trajectory, or with all of it: then it replaces that."""
