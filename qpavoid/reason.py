@@ -38,14 +38,14 @@ class ReasonKind(str, Enum):
     """A joint is outside its position limits and returns: the joint, the excess [rad or m], negative below."""
     AT_LOWER_LIMIT = "AT_LOWER_LIMIT"
     """A joint is kept from passing its lower position limit by a row or task: the joint, the bound on its velocity
-    [rad/s or m/s]."""
+    [rad/s or m/s]; of stalled tasks, its share of what holds them, as in STALLED [%]."""
     AT_UPPER_LIMIT = "AT_UPPER_LIMIT"
     """The same of its upper position limit."""
     AT_VELOCITY_LIMIT = "AT_VELOCITY_LIMIT"
     """A joint moves at its velocity limit where a row demands more: the joint, its velocity [rad/s or m/s]."""
     STALLED = "STALLED"
-    """The tasks make no progress: the pair that blocks them, the violation of its row by their velocity [m/s]; no pair
-    where several rows block them together."""
+    """The tasks make no progress: a pair that holds them, its share of the forces that balance their pull on the joints
+    [%], more than 10; no share of laws without rows, no pair where several hold them together."""
     OUT_OF_REACH = "OUT_OF_REACH"
     """A task makes no progress, and nothing is in the way: no nearer from here; the task, its error [m or rad]."""
     SINGULAR = "SINGULAR"
@@ -101,7 +101,7 @@ _TEXTS: dict[str, str] = {
     "AT_LOWER_LIMIT": "at its lower limit, velocity bound",
     "AT_UPPER_LIMIT": "at its upper limit, velocity bound",
     "AT_VELOCITY_LIMIT": "at its velocity limit,",
-    "STALLED": "no progress, row violated by",
+    "STALLED": "no progress",
     "OUT_OF_REACH": "out of reach by",
     "SINGULAR": "in a singularity, short of its target by",
     "BACKUP": "backup trajectory instead of the tasks",
@@ -129,7 +129,7 @@ class Reason(NamedTuple):
     amount: float | None = None
     """Amount in `unit`, where the kind has one."""
     unit: str = ""
-    """Unit of `amount`: m, m/s, rad, rad/s, s or - ."""
+    """Unit of `amount`: m, m/s, rad, rad/s, s, % or - ."""
     severity: Severity = Severity.WARNING
     detail: str = ""
     """More for people, not for programs."""
@@ -150,7 +150,9 @@ class Reason(NamedTuple):
     def __str__(self) -> str:
         """Return one line for people: subject, kind, amount, detail."""
         parts = [_TEXTS[self.kind.value]]
-        if self.amount is not None:
+        if self.unit == "%":
+            parts = [f"{parts[0].partition(',')[0]}, {self.amount:.0f} % of what holds the tasks"]
+        elif self.amount is not None:
             parts.append(_quantity(self.amount, self.unit))
         if self.detail:
             parts.append(f"({self.detail})")

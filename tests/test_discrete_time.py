@@ -85,9 +85,9 @@ def test_stop_at_any_step_is_clear_also_at_the_limits(panda):
     assert stops > 100 and at_limits > 10
 
 
-@pytest.mark.parametrize(("shape", "speed"), [(PLATE, 2.0), (BALL, 0.5), (BOX, 2.0)])
-def test_command_scale_is_below_one_where_the_linearisation_fails(shape, speed):
-    """Steps of 50 ms and a row that may use its whole margin in one: alone, it leads 5 mm and more below d1."""
+@pytest.mark.parametrize(("shape", "speed", "alone"), [(PLATE, 2.0, 0.003), (BALL, 0.5, 0.010), (BOX, 2.0, 0.0)])
+def test_command_scale_is_below_one_where_the_linearisation_fails(shape, speed, alone):
+    """Steps of 50 ms and a row that may use its whole margin in one: alone, it leads 10 to 20 mm below d1."""
     least, scales = {}, {}
     for look_ahead in (False, True):
         row = {"row": {"type": "beta", "gain": 20.0, "near_speed": 10.0}, "look_ahead": look_ahead}
@@ -96,7 +96,7 @@ def test_command_scale_is_below_one_where_the_linearisation_fails(shape, speed):
         least[look_ahead] = min_distance(log, Controller.from_scenario(run)[0])
         scales[look_ahead] = log.command_scale
         assert log.metrics()["shortened_ticks"] == np.sum(log.command_scale < 1.0)
-    assert least[False] < SAFE - 5e-3 and least[True] > SAFE - 5e-4
+    assert least[False] < alone and least[True] > SAFE - 5e-4
     assert scales[True].min() < 1.0
 
 

@@ -6,7 +6,7 @@ import pytest
 import qpsolvers
 from conftest import SPHERE, obstacle
 
-from qpavoid import Controller, ReasonKind, Severity, build_scene, build_tasks, config
+from qpavoid import Controller, ReasonKind, Robot, Severity, build_scene, build_tasks, config
 from qpavoid.config import HqpSolver
 from qpavoid.problem import AvoidanceRows, Status, Tracking, make_problem
 from qpavoid.solvers import backend_names, make_solver
@@ -178,3 +178,23 @@ def test_the_order_of_priorities_is_that_of_the_file(panda, order):
     A, b, _ = problem.tracking
     first = problem.levels[0]
     np.testing.assert_allclose(A[first] @ v, b[first], atol=1e-6)
+
+
+@pytest.mark.parametrize("dt", [0.002, 0.01])
+@pytest.mark.parametrize("gain", [2.0, None], ids=["gain 2", "gain 1/dt"])
+@pytest.mark.parametrize(("name", "frame"), [("panda", "panda_hand_tcp"), ("ur5", "tool0")])
+def test_a_posture_after_a_tool_that_is_out_of_reach_rests(name, frame, gain, dt):
+    """The posture would bend the arm, which the first priority has stretched out: it neither moves nor chatters, and
+    what the tool lacks is named.
+    """
+    robot = Robot.load(name)
+    goal = pin.SE3(np.eye(3), np.array([1.3, 0.2, 0.4]))
+    tool = config.Task(frame=frame, gain=gain or 1.0 / dt, priority=1)
+    tasks = build_tasks([tool, config.PostureTask(priority=2)], robot, robot.home)
+    controller, q, vs = Controller(build_scene(robot), tasks, "hqp", dt), robot.home, []
+    for _ in range(round(5.0 / dt)):
+        solution = controller.step(q, targets={frame: goal})
+        vs.append(solution.v)
+        q = pin.integrate(robot.model, q, dt * solution.v)
+    assert np.abs(np.diff(vs[-round(0.5 / dt) :], axis=0)).sum(axis=1).mean() <= 0.05
+    assert [(reason.kind, reason.subject) for reason in solution.stalled] == [(ReasonKind.OUT_OF_REACH, (frame,))]

@@ -39,10 +39,10 @@ def test_safety_distance_is_kept_at_any_period_and_speed(row, size, dt, duration
     ruler = Ruler(controller.scene)
     least = min(ruler.least_between(q, v, dt, t, 4) for q, v, t in zip(log.q, log.v, log.t, strict=True))
     assert least > SAFE - 1e-3
-    assert log.metrics()["status_counts"]["SOLVED"] >= len(log.t) - 3  # at the margin, rows may lack a mm/s
-    assert log.slack.max() < 2e-3
+    solved = log.metrics()["status_counts"]["SOLVED"] / len(log.t)
+    assert solved == 1.0 or (dt < 0.01 and solved > 0.97 and log.slack.max() < 2e-4)  # by 0.1 mm/s, at the margin
     assert within_limits(controller, log.v) > 0.95  # and jerks go up to their limit
-    assert log.metrics()["peak_velocity"] > 0.9
+    assert log.metrics()["peak_velocity"] > 0.95  # 1.0 to 2.6: near a body it goes round, no longer as fast as it can
 
 
 @pytest.mark.parametrize("solver", ["qp", "hqp"])

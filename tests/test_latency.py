@@ -92,13 +92,15 @@ def test_a_measured_velocity_of_lagging_servos_changes_no_command(panda):
 @pytest.mark.parametrize("gain", [5.0, 50.0, 1.0 / DT])
 @pytest.mark.parametrize(("lag", "delay"), [(0.02, 0), (0.05, 0), (0.03, 2), (0.0, 5)])
 def test_latency_makes_up_for_lag_and_delay_at_any_gain(panda, lag, delay, gain):
-    """On a circle at 0.2 m/s. Without it the tool is late at small gains, and behind a delay swings at large ones."""
+    """On a circle at 0.2 m/s. Without it the tool is late at small gains, and behind a delay swings at large ones: by
+    80 mm at a gain of 50, 137 at 100, less than twice its radius since tasks are scaled to what joints can do.
+    """
     latency = lag + delay * DT
     errors = tool_errors(circling(panda, latency, gain=gain), Lagging(panda, lag, delay), 500)[0][200:].max()
     assert errors < 1e-3
     if gain < 10.0 or delay == 5:
         late = tool_errors(circling(panda, gain=gain), Lagging(panda, lag, delay), 500)[0][200:].max()
-        assert late > (0.05 if gain > 10.0 else max(1.5e-3, 2.0 * errors))
+        assert late > (0.075 if gain > 10.0 else max(1.5e-3, 2.0 * errors))
 
 
 @settings(max_examples=6, deadline=None)

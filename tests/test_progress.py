@@ -6,7 +6,7 @@ import pytest
 from closed_loop import cartesian, drive, make_controller, planar
 from conftest import frames
 
-from qpavoid import Avoidance, Controller, Obstacle, ReasonKind, Sample, Severity, build_scene, build_tasks
+from qpavoid import Avoidance, Controller, Obstacle, ReasonKind, Robot, Sample, Severity, build_scene, build_tasks
 from qpavoid.config import Box, Capsule, ManipulabilityTask, PostureTask, Sphere, Task
 from qpavoid.run.simulate import simulate
 
@@ -45,10 +45,10 @@ def test_stalled_names_the_obstacle_exactly_head_on(tmp_path, solver, shape):
     first = next(k for k, reasons in enumerate(reported) if reasons)
     assert 50 <= first < 350  # half a second without progress
     for (reason,) in reported[first:]:
-        assert (reason.kind, reason.subject, reason.unit) == (ReasonKind.STALLED, ("tool", shape), "m/s")
-        # v_tracking has the task's full speed; the row is zero at d1, where qp rests, and allows 50 mm/s farther out
-        assert reason.amount == pytest.approx(0.3, abs=0.02) or (solver == "eq10" and 0.25 < reason.amount < 0.3)
+        assert (reason.kind, reason.subject) == (ReasonKind.STALLED, ("tool", shape))
         assert reason.severity is Severity.WARNING
+        if solver == "qp":  # nothing else holds it; eq10 has no rows whose forces could be compared
+            assert reason.unit == "%" and reason.amount == pytest.approx(100.0)
 
 
 def test_stalled_names_panda_bodies_and_obstacle(panda):
@@ -67,8 +67,8 @@ def test_stalled_names_a_joint_limit(tmp_path):
     q, reported, _ = run_to(controller, 600, np.array([0.0, 0.5, 0.0]))
     assert q[-1][1] == pytest.approx(0.2, abs=1e-3)
     (reason,) = reported[-1]
-    assert (reason.kind, reason.subject, reason.unit) == (ReasonKind.AT_UPPER_LIMIT, ("joint_y",), "m/s")
-    assert reason.amount == pytest.approx(0.0, abs=1e-3)  # at the limit
+    assert (reason.kind, reason.subject, reason.unit) == (ReasonKind.AT_UPPER_LIMIT, ("joint_y",), "%")
+    assert reason.amount == pytest.approx(100.0)
 
 
 def test_stalled_ends_once_the_obstacle_has_left(tmp_path):
@@ -80,9 +80,11 @@ def test_stalled_ends_once_the_obstacle_has_left(tmp_path):
     assert not any(reported[520:]) and np.linalg.norm(q[-1] - GOAL) < 1e-4
 
 
-@pytest.mark.parametrize(("scenario", "longest"), [("situation1", 4.0), ("situation2", 0.0), ("panda_line", 0.0)])
+@pytest.mark.parametrize(("scenario", "longest"), [("situation1", 2.5), ("situation2", 0.0), ("panda_line", 0.0)])
 def test_stalled_raises_no_false_alarm(scenario, longest):
-    """Slowed down or pushed aside is not stalled; in Situation 1 the tool waits for its target to return."""
+    """Slowed down or pushed aside is not stalled; in Situation 1 the tool waits 2.4 s for its target to return: errors
+    show that from half a second on, where the velocity that was left showed it later.
+    """
     metrics = simulate(scenario).metrics()
     assert metrics["time_blocked"] <= longest and metrics["arrived"]
 
@@ -150,6 +152,43 @@ def test_moving_target_is_followed_without_alarm(panda):
 
     ticks = list(drive(make_controller(panda, frame="panda_hand_tcp"), panda.home, 500, target=target))
     assert not any(tick.solution.stalled for tick in ticks)
+
+
+@pytest.mark.parametrize("name", ["panda", "ur5", "baxter"])
+def test_whatever_holds_a_task_is_named_in_time(name):
+    """Random targets beyond reach or in a box: from 1 s after the error is within 2 mm of its last value on, there are
+    reasons, shares of pairs and limits among 0 to 100 %; 0.2 s after the target has come back, there are none.
+    """
+    robot, rng, named = Robot.load(name), np.random.default_rng(8), 0
+    frame = robot.end_effectors[0]
+    (start,) = frames(robot, [frame], robot.home)
+    for number in range(4):
+        direction = rng.normal(size=3) * [1.0, 1.0, 0.3]
+        direction /= np.linalg.norm(direction)
+        box = Obstacle.at("box", Box(size=(0.2, 0.2, 0.2)), start.translation + 0.3 * direction)
+        goal, obstacles = [(1.3, []), (0.3, [box])][number % 2]
+        targets = start.translation + goal * direction, start.translation
+        controller, q, e, said = make_controller(robot, obstacles, frame), robot.home, [], []
+        for k in range(630):
+            target = targets[k >= 600]
+            solution = controller.step(q, targets={frame: Sample.at(target)})
+            (pose,) = frames(robot, [frame], q)
+            e.append(np.linalg.norm(pose.translation - target))
+            said.append(solution.stalled)
+            q = pin.integrate(robot.model, q, 0.01 * solution.v)
+        moving = np.flatnonzero(np.abs(np.array(e[:600]) - e[599]) > 2e-3)
+        at_rest = moving[-1] + 1 if len(moving) else 0
+        assert not any(said[620:])
+        if e[599] < 2e-3:  # on the other side of the base, and in reach
+            assert not any(said)
+            continue
+        assert all(said[at_rest + 100 : 600])
+        for reasons in said[at_rest + 100 : 600]:
+            shares = [reason.amount for reason in reasons if reason.unit == "%"]
+            assert all(0.0 < share <= 100.0 + 1e-9 for share in shares) and sum(shares) <= 100.0 + 1e-9
+            assert shares or reasons[0].kind in (ReasonKind.OUT_OF_REACH, ReasonKind.SINGULAR)
+            named += 1
+    assert named > 300
 
 
 def play_goal(panda, number, rng):

@@ -81,7 +81,7 @@ def test_reasons_of_a_run_are_the_same_in_json_and_log(cli):
     reasons = [read(entry) for *_, entries in document["events"] for entry in entries]
     stalled = [reason for reason in reasons if reason.kind is ReasonKind.STALLED]
     assert stalled and all(reason.subject == ("left_hand", "fist") for reason in stalled)
-    assert all(reason.unit == "m/s" and reason.amount > 0.0 for reason in stalled)
+    assert all(reason.unit == "%" and 10.0 < reason.amount <= 100.0 for reason in stalled)
     counts = {level.name: int(np.sum(log.severity == level)) for level in Severity}
     assert document["severity_counts"] == counts and counts["WARNING"] > 0
     assert document["time_blocked"] == pytest.approx(0.01 * np.sum(log.stalled)) and log.stalled.any()
@@ -136,7 +136,8 @@ def test_noise_at_twice_the_safety_distance_informs(tmp_path, given, sigma, seed
 
     ticks = list(drive(controller, np.zeros(3), 500, target=target, obstacles=seen))
     near = sum(0.035 < tick.proximity.distance.min(initial=1.0) < 0.045 for tick in ticks)
-    assert near > 40
+    relaxed = sum(tick.solution.status is Status.RELAXED for tick in ticks)
+    assert near > 40 and (20 < relaxed < 60 if given == "sample" else relaxed <= 5)  # bare poses are smoothed
     assert {tick.solution.severity for tick in ticks} <= {None, Severity.INFO}
 
 

@@ -3,11 +3,23 @@
 import numpy as np
 import pinocchio as pin
 import pytest
-from closed_loop import accelerations, make_controller
+from closed_loop import accelerations, cartesian, drive, make_controller
 from conftest import EXAMPLES
 
-from qpavoid import Obstacle, ReasonKind, Robot, Sample, Status
-from qpavoid.config import Sphere
+from qpavoid import (
+    Avoidance,
+    Controller,
+    Limits,
+    Obstacle,
+    Pose,
+    ReasonKind,
+    Robot,
+    Sample,
+    Status,
+    build_scene,
+    build_tasks,
+)
+from qpavoid.config import Box, HalfSpace, Sphere, Task
 from qpavoid.model.notes import NoteKind, RobotWarning
 
 SHIPPED = ["panda", "ur5", "baxter", "g1", "tiago", "paper-dual-arm"]
@@ -47,6 +59,19 @@ def tool(robot, frame, q):
     data = robot.model.createData()
     pin.framesForwardKinematics(robot.model, data, q)
     return data.oMf[robot.model.getFrameId(frame)].translation.copy()
+
+
+def is_said(solution):
+    """Whether a step is RELAXED, with what the robot recovers from as a reason."""
+    kinds = {reason.kind for reason in solution.reasons}
+    return solution.status is Status.RELAXED and bool(
+        kinds & {ReasonKind.BELOW_SAFETY_DISTANCE, ReasonKind.LIMIT_RECOVERY}
+    )
+
+
+def chatter(solutions, steps):
+    """Mean of Σ|Δv| over the last steps [rad/s]."""
+    return np.abs(np.diff([solution.v for solution in solutions[-steps - 1 :]], axis=0)).sum(axis=1).mean()
 
 
 def speeds(solutions):
@@ -147,3 +172,110 @@ def test_a_joint_outside_its_limit_comes_back_slowly(name, dt, side):
     assert side * (q_end[joint] - edge) <= 1e-6
     recovering = [s for s, is_outside in zip(solutions, outside, strict=True) if is_outside]
     assert all(s.command_scale == 1.0 or s.status is Status.RELAXED for s in recovering)
+
+
+# --- whatever is wrong at the start -------------------------------------------------------------------------------
+
+
+def bad_start(robot, rng):
+    """A configuration in self-penetration or with a joint outside its limits, and a ball or box in the tool, or not."""
+    bounds, q = robot.bounds(), robot.home.copy()
+    kind = rng.choice(["itself", "limit", "obstacle", "limit and obstacle"])
+    if kind == "itself":
+        data, bodies = robot.model.createData(), robot.bodies.createData()
+        low, high = np.maximum(bounds.lower, -2.5), np.minimum(bounds.upper, 2.5)
+        while True:
+            q[bounds.q_index] = rng.uniform(low, high)
+            pin.computeDistances(robot.model, data, robot.bodies, bodies, q)
+            if -0.02 < min(result.min_distance for result in bodies.distanceResults) < 0.0:
+                return q, []
+    if "limit" in kind:
+        joint = rng.choice([0, len(bounds.q_index) - 1])
+        side = rng.choice([-1, 1])
+        edge = (bounds.upper if side > 0 else bounds.lower)[joint]
+        q[bounds.q_index[joint]] = edge + side * 10.0 ** rng.uniform(-2.5, -0.7)
+    if "obstacle" not in kind:
+        return q, []
+    shape = [Sphere(radius=0.06), Box(size=(0.1, 0.3, 0.1))][rng.integers(2)]
+    way = tool(robot, robot.end_effectors[0], q) * [1.0, 1.0, 0.0]
+    place = tool(robot, robot.end_effectors[0], q) + 0.07 * way / np.linalg.norm(way) + np.array([0.0, 0.0, -0.02])
+    return q, [Obstacle.at("it", shape, place)]
+
+
+@pytest.mark.parametrize("name", ["panda", "ur5"])
+@pytest.mark.parametrize(
+    "limits",
+    [Limits(), Limits(acceleration=5.0), Limits(acceleration=5.0, jerk=50.0)],
+    ids=["speed", "acceleration", "jerk"],
+)
+def test_bad_starts_are_left_slowly_and_it_is_said(name, limits):
+    """While a pair is nearer than 2 mm below d1 or a joint 2 mrad outside: no joint is faster than 0.2 rad/s, and each
+    step says it. After that the robot is clear and at rest, by steps of its accelerations.
+    """
+    robot, rng = Robot.load(name), np.random.default_rng(3)
+    for _ in range(5):
+        q, obstacles = bad_start(robot, rng)
+        solutions, _, d = stay(robot, q, 600, obstacles, avoidance=Avoidance(d1=D1, d2=0.1), limits=limits)
+        outside = [
+            any(r.kind is ReasonKind.LIMIT_RECOVERY and abs(r.amount) > 2e-3 for r in (*s.reasons, *s.assumptions))
+            for s in solutions
+        ]
+        bad = (d < D1 - 2e-3) | np.array(outside)
+        assert bad[0] and not bad[-100:].any()
+        assert speeds(solutions)[bad].max() <= (0.2 + 1e-9 if limits.jerk is None else 0.205)
+        assert all(is_said(solution) for solution, is_bad in zip(solutions, bad, strict=True) if is_bad)
+        assert solutions[-1].status is Status.SOLVED and chatter(solutions, 50) <= 0.05
+
+
+@pytest.mark.parametrize("how", ["added", "first seen"])
+@pytest.mark.parametrize("name", ["panda", "ur5"])
+def test_obstacle_that_turns_up_too_near_is_left_slowly(name, how):
+    """An obstacle comes out of nowhere, 16 mm from the tool or in it: the robot does not lurch, and says why."""
+    robot, dt = Robot.load(name), 0.01
+    frame = robot.end_effectors[0]
+    tasks = build_tasks([Task(frame=frame)], robot, robot.home)
+    place = tool(robot, frame, robot.home) + np.array([0.07, 0.0, -0.03])
+    unseen = [] if how == "added" else [Obstacle.at("ball", BALL, [5.0, 0.0, 0.0])]
+    controller, q, solutions = Controller(build_scene(robot, unseen, spare_obstacles=1), tasks, dt=dt), robot.home, []
+    for k in range(500):
+        if k == 20 and how == "added":
+            controller.add_obstacle(Obstacle.at("ball", BALL, place))
+        update = {"ball": Pose.at(place)} if k >= 20 and how == "first seen" else None
+        tick = controller.tick(q, k * dt, obstacles=update)
+        if k == 20:
+            assert tick.proximity.distance.min() < 0.016
+        if k >= 20 and tick.proximity.distance.min() < 0.03 - 2e-3:
+            assert is_said(tick.solution) and np.abs(tick.solution.v).max() <= 0.2 + 1e-9
+        solutions.append(tick.solution)
+        q = pin.integrate(robot.model, q, dt * tick.solution.v)
+    assert tick.proximity.distance.min() > 0.03 - 1e-3 and solutions[-1].status is Status.SOLVED
+    assert chatter(solutions, 50) <= 0.05
+
+
+def test_ball_that_jitters_is_left_slowly_too():
+    """Poses of a ball at rest with 1 mm of noise, at 30 Hz, are no motion that has to be evaded at full speed."""
+    robot, rng, dt = Robot.load("ur5"), np.random.default_rng(5), 0.01
+    place = tool(robot, "tool0", robot.home) + np.array([0.05, 0.0, -0.03])
+    controller, q, worst = make_controller(robot, [Obstacle.at("ball", BALL, place)], "tool0"), robot.home, 0.0
+    for k in range(300):
+        seen = int(30 * k * dt + 1e-9) > int(30 * (k - 1) * dt + 1e-9) or k == 0
+        update = {"ball": Pose.at(place + 1e-3 * rng.normal(size=3))} if seen else None
+        tick = controller.tick(q, k * dt, obstacles=update)
+        if tick.proximity.distance.min() < D1 - 2e-3:
+            worst = max(worst, np.abs(tick.solution.v).max())
+        q = pin.integrate(robot.model, q, dt * tick.solution.v)
+    assert 0.1 < worst < 0.6 and tick.proximity.distance.min() > D1 - 5e-3
+
+
+def test_floor_that_no_joint_leaves_slows_nothing_down(tmp_path):
+    """A tool on rails 10 mm above a table: round a ball it is as fast as without it, and has nothing to say."""
+    robot, runs = cartesian(tmp_path, axes="xy"), []
+    ball = Obstacle.at("ball", BALL, [0.3, 0.02, 0.0])
+    table = Obstacle.at("table", HalfSpace(), [0.0, 0.0, -0.06])
+    for obstacles in ([ball], [ball, table]):
+        controller = make_controller(robot, obstacles, "y", avoidance=Avoidance(d1=D1, d2=0.1))
+        ticks = list(drive(controller, robot.home, 300, target=[0.6, -0.1, 0.0]))
+        assert {tick.solution.status for tick in ticks} == {Status.SOLVED}
+        runs.append([tick.solution.v for tick in ticks])
+    assert ticks[-1].proximity.distance.min() < D1 - 5e-3 and np.abs(runs[0]).max() > 0.4
+    np.testing.assert_allclose(runs[1], runs[0], atol=1e-6)

@@ -119,7 +119,8 @@ def test_relaxation_between_two_walls_favours_the_nearer(tmp_path, off):
     far = "left" if off > 0.0 else "right"
     # 46 mm and 54 mm: the nearer asks for 5 1/s times 14 mm = 70 mm/s and gets it, the other for 30 and loses 100
     np.testing.assert_allclose(s.v, [-np.sign(off) * 0.07, 0.0, 0.0], atol=1e-5)
-    row, distance = s.reasons
+    row, distance, nearer = s.reasons
+    assert (nearer.kind, nearer.amount) == (ReasonKind.BELOW_SAFETY_DISTANCE, pytest.approx(0.014, abs=1e-9))
     assert (row.kind, row.subject, row.unit) == (ReasonKind.ROW_RELAXED, ("tool", far), "m/s")
     assert row.amount == pytest.approx(0.1, abs=1e-5) and s.slack.max() == pytest.approx(0.1, abs=1e-5)
     assert (distance.kind, distance.subject, distance.unit) == (ReasonKind.BELOW_SAFETY_DISTANCE, ("tool", far), "m")

@@ -123,9 +123,10 @@ def test_task_switching_rows_of_own_pairs_are_feasible(name, frame):
     """Neighbouring links at random configurations, within 0.3 m of each other: ten of them are asked at once."""
     robot = Robot.load(name)
     controller = make_controller(robot, (), frame, avoidance=Avoidance(**SETTINGS))
-    rng, close = np.random.default_rng(0), 0
+    rng, close, bounds = np.random.default_rng(0), 0, robot.bounds()
     for _ in range(300):
         q = pin.integrate(robot.model, robot.home, rng.uniform(-0.8, 0.8, robot.model.nv))
+        q[bounds.q_index] = np.clip(q[bounds.q_index], bounds.lower, bounds.upper)
         controller.reset()
         tick = controller.tick(q, 0.0, {frame: Sample.at(rng.uniform(-0.8, 0.8, 3))})
         if tick.proximity.distance.min(initial=np.inf) > 0.02:

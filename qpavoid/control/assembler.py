@@ -17,8 +17,11 @@ from qpavoid.control.settings import ControlSettings
 from qpavoid.control.tasks import RowTask, in_order
 from qpavoid.control.tasks.layout import TaskRows, task_levels
 from qpavoid.model.kinematics import ForwardKinematics, Kinematics
-from qpavoid.problem import Array, AvoidanceRows, Contacts, Problem, Proximity, Tracking
+from qpavoid.problem import Array, AvoidanceRows, Contacts, IntArray, Problem, Proximity, Tracking
 from qpavoid.solvers.hqp import cascade
+
+_LACKING = 1e-6
+"""Share of a task's velocity up to which it lacks nothing [-]: round-off of the tracking law."""
 
 
 class RowAssembler:
@@ -63,7 +66,7 @@ class RowAssembler:
         """What frames lack to their targets; root of the weight and number of the task of each row: see `RowLayout`."""
         self.frame_count, self.tasks = len(frames), (*frames, *row_tasks)
         """Tasks in the order of `in_order`; the first `frame_count` are frames."""
-        self._eye = np.eye(len(x.v_tracking))
+        self._eye, self._b_feasible = np.eye(len(x.v_tracking)), np.zeros(len(x.b))
         self._is_compiled = self._forward.is_compiled and self.query.is_compiled and not row_tasks and contacts is None
         self._q = scene.robot.home.copy()
         self._step = self._compile()
@@ -151,10 +154,19 @@ class RowAssembler:
         """Return the velocity (nv,) of the tracking law for rows A (r, nv) and b (r,), zero but for some tasks."""
         x, feedback = self._layout, self._layout.feedback.copy()
         x.feedback[~A[: len(feedback)].any(axis=1)] = 0.0
-        v, b_feasible = np.empty(A.shape[1]), np.empty(len(b))
-        kernels.tracking_law(self._packed, A, b, v, b_feasible)
+        v = np.empty(A.shape[1])
+        kernels.tracking_law(self._packed, A, b, v, self._b_feasible)
         x.feedback[:] = feedback
         return v
+
+    def _bending(self, rows: IntArray, v: Array) -> Array:
+        """Return -dt G(r) / ‖A‖² (nv, nv): what motion costs the task rows at second order, with r what v lacks."""
+        x, frames = self._layout, rows[rows < len(self.frame_errors)]
+        lacking, asked = np.zeros_like(self.frame_errors), self._b_feasible[frames]
+        lacking[frames] = self.row_scale[frames] * (asked - x.A[frames] @ v)
+        if not np.linalg.norm(lacking) > _LACKING * np.linalg.norm(asked):
+            return np.zeros_like(self._eye)
+        return -x.dt / float(np.linalg.norm(x.A[rows], 2)) ** 2 * self.curvature(lacking)
 
     def _violation(self, k: int) -> float:
         """Return the largest violation by v_tracking, of which task-switching rows are made anew."""
@@ -197,7 +209,7 @@ class RowAssembler:
         Args:
             problem: of several levels, as `compute` gave it.
         """
-        velocities = cascade(problem, self._velocity)
+        velocities = cascade(problem, self._velocity, self._bending)
         v, rows = velocities[-1], self._tracking_rows(problem.avoidance, velocities[-1])
         violation = float(kernels.violation(v, rows.J, rows.b, problem.lower, problem.upper))
         return problem._replace(

@@ -72,7 +72,7 @@ def _jerk_limited_bounds(x: Any, q: Array) -> None:
     From velocities between them, the stops of `kernels.braking_bounds` end within the position and velocity limits.
     They never cross, as the stop's own next velocity is between them from any state. Of a coordinate outside its
     position limits, the hard bounds that demand its return are relaxed to what it needs to stop before the opposite
-    limit; once it returns, it does not turn round again.
+    limit, and to come to the speed of its return without overshoot; once it returns, it does not turn round again.
 
     Args:
         x: reads the limits, v_prev and dv_prev; writes lower, upper (n,), and the hard bounds of coordinates outside
@@ -98,9 +98,13 @@ def _jerk_limited_bounds(x: Any, q: Array) -> None:
         down = _change_to_stop(-speed, max_down, -stop, w_max, max(below[j], 0.0) / (x.dt * unit))
         x.lower[j], x.upper[j] = x.v_prev[j] - unit * down, x.v_prev[j] + unit * up
         if above[j] < 0.0:
-            x.hard_upper[j] = max(x.hard_upper[j], min(x.lower[j], x.v_max[j]))
+            return_fall = _speed_to_stop(max(x.v_prev[j] - x.hard_upper[j], 0.0) / unit, 1.0, 1.0)
+            soonest = max(x.lower[j], x.v_prev[j] - unit * return_fall)
+            x.hard_upper[j] = max(x.hard_upper[j], min(soonest, x.v_max[j]))
         elif below[j] < 0.0:
-            x.hard_lower[j] = min(x.hard_lower[j], max(x.upper[j], -x.v_max[j]))
+            return_rise = _speed_to_stop(max(x.hard_lower[j] - x.v_prev[j], 0.0) / unit, 1.0, 1.0)
+            soonest = min(x.upper[j], x.v_prev[j] + unit * return_rise)
+            x.hard_lower[j] = min(x.hard_lower[j], max(soonest, -x.v_max[j]))
 
 
 @compiled

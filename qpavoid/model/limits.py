@@ -75,17 +75,20 @@ class JointBounds:
             jerk=jerk,
         )
 
-    def outside(self, q: Array, names: Sequence[str], units: Sequence[str]) -> tuple[Reason, ...]:
+    def outside(
+        self, q: Array, names: Sequence[str], units: Sequence[str], tolerance: float = OUTSIDE
+    ) -> tuple[Reason, ...]:
         """List the coordinates outside their position limits; the amount is negative below the lower one.
 
         Args:
             q: configuration (nq,).
             names: of all nv coordinates.
             units: their units, rad or m.
+            tolerance: excess from which they are listed [rad or m].
         """
         below, above = self.lower - q[self.q_index], q[self.q_index] - self.upper
         reasons = []
-        for i in np.flatnonzero(np.maximum(below, above) > OUTSIDE).tolist():
+        for i in np.flatnonzero(np.maximum(below, above) > tolerance).tolist():
             amount, j = float(-below[i] if below[i] > 0.0 else above[i]), int(self.v_index[i])
             hint = "is it in degrees?" if abs(amount) > _TURN else ""
             reasons.append(Reason.of(ReasonKind.LIMIT_RECOVERY, names[j], amount=amount, unit=units[j], detail=hint))

@@ -20,7 +20,7 @@ from qpavoid.reason import Reason, ReasonKind, Severity
 from qpavoid.safety.backup import BackupPlanner
 from qpavoid.safety.braking import BrakingCheck
 from qpavoid.safety.progress import ProgressMonitor
-from qpavoid.safety.recovery import slow_recovery
+from qpavoid.safety.recovery import recovery_limits, slow_recovery, slowed
 from qpavoid.solvers import Solver
 
 _LIMIT_TOLERANCE = 2e-6
@@ -62,6 +62,8 @@ class Arbiter:
             proximity: distances of this control step.
             from_tasks: whether the problem is of the tasks, whose progress is monitored; else of a given velocity.
         """
+        if from_tasks and problem.levels and self.solver.prioritised:
+            problem = self._rows.prioritised(problem)
         solution = self._solve(q, problem, proximity, from_tasks)
         if from_tasks and (stalled := self.progress.update(problem, solution)):
             solution = solution._replace(stalled=stalled)
@@ -76,11 +78,8 @@ class Arbiter:
     def _solve(self, q: Array, problem: Problem, proximity: Proximity, from_tasks: bool) -> Solution:
         """Return the solution within the limits, after the stop look-ahead."""
         try:
-            if from_tasks:
-                if problem.levels and self.solver.prioritised:
-                    problem = self._rows.prioritised(problem)
-                elif problem.jerk_limited:
-                    problem = self._rows.within_jerks(problem)
+            if from_tasks and problem.jerk_limited and problem.cascade is None:
+                problem = self._rows.within_jerks(problem)
             solution = self.solver.solve(problem)
             v = solution.v
             usable = (
@@ -102,18 +101,30 @@ class Arbiter:
                 return solution
             v, change = saturate(v, problem.lower, problem.upper, self._settings.bounds.velocity)
             return solution._replace(v=v, saturation=change)
-        if problem.violation <= 0.0 and v.tobytes() == problem.v_tracking.tobytes():
-            if problem.tracking_is_clear:
-                return solution
-        else:
-            solution = _clipped(problem, solution)
-            if solution.status is not Status.STOPPED:
-                solution = slow_recovery(q, problem, proximity.feedforward, solution, self._settings.bounds)
-        return self._check_braking(q, problem, solution) if self._settings.avoidance.look_ahead else solution
+        is_own = problem.violation <= 0.0 and v.tobytes() == problem.v_tracking.tobytes()
+        if is_own and problem.tracking_is_clear:
+            return solution
+        solution = solution if is_own else _clipped(problem, solution)
+        limits = None if solution.status is Status.STOPPED else self._recovery_limits(problem, proximity)
+        if limits is not None:
+            solution = slow_recovery(q, problem, solution, None if is_own else limits, self._settings.bounds)
+        return self._check_braking(q, problem, solution, limits) if self._settings.avoidance.look_ahead else solution
 
-    def _check_braking(self, q: Array, problem: Problem, solution: Solution) -> Solution:
-        """Scale the velocity towards the stop, where its path leads too near."""
-        result = self._braking.check(q, solution, problem, self.solver.low_effort)
+    def _recovery_limits(self, problem: Problem, proximity: Proximity) -> tuple[Array, Array] | None:
+        """Return the bounds on a velocity in recovery, see `recovery_limits`."""
+        x = self._settings
+        return recovery_limits(problem, proximity.feedforward, x.bounds, self._rows.previous.v, x.dt)
+
+    def _check_braking(
+        self, q: Array, problem: Problem, solution: Solution, limits: tuple[Array, Array] | None
+    ) -> Solution:
+        """Scale the velocity towards the stop, where its path leads too near, or another one within recovery limits."""
+
+        def low_effort(problem: Problem, slack: Array | None) -> Array | None:
+            v = self.solver.low_effort(problem, slack)
+            return v if v is None or limits is None else slowed(v, problem.v_stop, limits)[0]
+
+        result = self._braking.check(q, solution, problem, low_effort)
         if result is None:
             return solution
         v, scale, violation, pair, distance = result
@@ -137,6 +148,8 @@ class Arbiter:
             return solution.with_reasons(Reason.of(ReasonKind.NO_BACKUP, severity=Severity.WARNING, detail=why))
         if v is None:
             return solution
+        if (limits := self._recovery_limits(problem, proximity)) is not None:
+            v, _ = slowed(v, problem.v_stop, limits)
         return solution._replace(v=np.clip(v, problem.lower, problem.upper)).with_reasons(Reason.of(ReasonKind.BACKUP))
 
     def _report_limits(self, problem: Problem, solution: Solution) -> Solution:

@@ -7,12 +7,11 @@ hardly moves. So progress is measured in the errors of the tasks, and in the par
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import nnls
 
 from qpavoid.control.assembler import RowAssembler
 from qpavoid.control.settings import ControlSettings
@@ -39,6 +38,8 @@ _AT_LIMIT = 0.1
 """Bound on the speed of a coordinate, over its speed limit, below which a position limit makes it [-]."""
 _CULPRIT = 0.1
 """Share of the forces in the way from which a pair or limit is named [-]."""
+_WEAKEST = 1e-9
+"""Sum of the forces in the way below which none is named [m/s]."""
 _EXPLAINED = 0.9
 """Share of the task's pull that the named pairs and limits have to balance [-]."""
 
@@ -54,7 +55,7 @@ class ProgressMonitor:
     """Follows the progress of a controller's tasks from control step to control step."""
 
     def __init__(self, settings: ControlSettings, rows: RowAssembler) -> None:
-        self._rows = rows
+        self._rows, self._nnls = rows, _import_nnls()
         self._interval = max(1, round(settings.progress.stalled_after / (_CHECKS * settings.dt)))
         self._limit = settings.progress.stalled_after / settings.dt - 0.5
         self._goals = _goals(rows)
@@ -108,24 +109,25 @@ class ProgressMonitor:
 
     def _reasons(self, problem: Problem, v: Array, stuck: Sequence[int]) -> tuple[Reason, ...]:
         """Return why the tasks are stuck: at rest by themselves, or by what balances them."""
-        rows, tracking = self._of_priority(problem, stuck), problem.tracking
+        (rows, earlier), tracking = self._of_priority(problem, stuck), problem.tracking
         A, b = tracking.A[rows], tracking.b_feasible[rows]
-        pull, earlier = A.T @ (b - A @ v), np.setdiff1d(np.arange(len(tracking.b)), rows)
+        pull = A.T @ (b - A @ v)
         if problem.contacts is not None:
             pull = problem.contacts.Z @ (problem.contacts.Z.T @ pull)
         size = float(np.linalg.norm(b))
         if np.linalg.norm(pull) < _FREE * np.linalg.norm(A, 2) * size and np.isfinite(pull).all():
             return tuple(self._at_rest(problem, stuck))
-        walls = _Walls(problem, v, tracking.A[earlier] if problem.cascade is not None else A[:0])
-        return walls.holding(pull) or _nearest(problem)
+        walls = _Walls(problem, v, tracking.A[earlier])
+        return walls.holding(pull, self._nnls) or _nearest(problem)
 
-    def _of_priority(self, problem: Problem, stuck: Sequence[int]) -> IntArray:
-        """Return the rows down to the first priority of which a task is stuck; all without priorities."""
+    def _of_priority(self, problem: Problem, stuck: Sequence[int]) -> tuple[IntArray, IntArray]:
+        """Return the rows of the first priority that has a stuck task, and of earlier ones; all without priorities."""
         everything = np.arange(len(problem.tracking.b))
         if problem.cascade is None:
-            return everything
-        first = self._goals[stuck[0]].rows
-        return next((level for level in problem.levels if np.isin(first, level).any()), everything)
+            return everything, everything[:0]
+        stuck_rows = np.concatenate([self._goals[i].rows for i in stuck])
+        number = next(k for k, level in enumerate(problem.levels) if np.isin(stuck_rows, level).any())
+        return problem.levels[number], np.concatenate((everything[:0], *problem.levels[:number]))
 
     def _at_rest(self, problem: Problem, stuck: Sequence[int]) -> list[Reason]:
         """Return a reason for each task that is stuck though nothing is in the way, with its error."""
@@ -167,52 +169,56 @@ class _Walls:
     """Rows, position limits and tasks of earlier priorities that keep a velocity, with the forces they exert."""
 
     def __init__(self, problem: Problem, v: Array, earlier: Array) -> None:
-        rows, names, units = problem.avoidance, problem.joint_names, problem.joint_units
-        self.forces, self.reasons = list[Array](), list[Reason | None]()
-        excess = rows.b - rows.J @ problem.v_tracking
+        rows, names = problem.avoidance, problem.joint_names
+        self.forces, self.culprits = list[Array](), list[tuple[ReasonKind, tuple[str, ...]] | None]()
         for i in np.flatnonzero(rows.J @ v - rows.b < _ACTIVE_TOLERANCE).tolist():
             self.forces.append(-rows.J[i])
-            pair = problem.pair_names[rows.pair[i]]
-            self.reasons.append(Reason.of(ReasonKind.STALLED, *pair, amount=float(excess[i]), unit="m/s"))
+            self.culprits.append((ReasonKind.STALLED, problem.pair_names[rows.pair[i]]))
         lower, upper, eye = problem.hard_lower, problem.hard_upper, np.eye(len(v))
         fastest = np.maximum(upper, -lower)
         high = (v >= upper - 1e-6) & (upper < _AT_LIMIT * fastest)
         low = (v <= lower + 1e-6) & (-lower < _AT_LIMIT * fastest)
-        for kind, bound, side, at_limit in (
-            (ReasonKind.AT_UPPER_LIMIT, upper, 1.0, high),
-            (ReasonKind.AT_LOWER_LIMIT, lower, -1.0, low),
-        ):
+        for kind, side, at_limit in ((ReasonKind.AT_UPPER_LIMIT, 1.0, high), (ReasonKind.AT_LOWER_LIMIT, -1.0, low)):
             for j in np.flatnonzero(at_limit).tolist():
                 self.forces.append(side * eye[j])
-                self.reasons.append(Reason.of(kind, names[j], amount=float(bound[j]) + 0.0, unit=f"{units[j]}/s"))
+                self.culprits.append((kind, (names[j],)))
         for row in (*earlier, *-earlier):
             self.forces.append(row)
-            self.reasons.append(None)
+            self.culprits.append(None)
 
-    def holding(self, pull: Array) -> tuple[Reason, ...]:
+    def holding(self, pull: Array, nnls: Callable[[Array, Array], tuple[Array, float]]) -> tuple[Reason, ...]:
         """Return those that balance the pull (nv,) of the tasks, the strongest first; none where nothing does."""
         if not self.forces or not np.isfinite(pull).all():
             return ()
         columns = np.array(self.forces).T
         weights, missing = nnls(columns, pull)
-        shares = weights * np.linalg.norm(columns, axis=0)
-        order = np.argsort(-shares, kind="stable")
-        named = [self.reasons[i] for i in order.tolist() if shares[i] > _CULPRIT * shares.sum()]
-        culprits = [reason for reason in named if reason is not None]
-        if named and len(culprits) < len(named):
-            culprits.append(Reason.of(ReasonKind.STALLED, detail="tasks of an earlier priority"))
-        elif culprits and missing > (1.0 - _EXPLAINED) * np.linalg.norm(pull):
-            culprits.append(Reason.of(ReasonKind.STALLED, detail="and others"))
-        return tuple(culprits)
+        strengths = weights * np.linalg.norm(columns, axis=0)
+        shares = strengths / max(float(strengths.sum()), _WEAKEST)
+        named = [i for i in np.argsort(-shares, kind="stable").tolist() if shares[i] > _CULPRIT]
+        reasons = [
+            Reason.of(culprit[0], *culprit[1], amount=100.0 * float(shares[i]), unit="%")
+            for i in named
+            if (culprit := self.culprits[i]) is not None
+        ]
+        if len(reasons) < len(named):
+            reasons.append(Reason.of(ReasonKind.STALLED, detail="tasks of an earlier priority"))
+        elif reasons and missing > (1.0 - _EXPLAINED) * np.linalg.norm(pull):
+            reasons.append(Reason.of(ReasonKind.STALLED, detail="and others"))
+        return tuple(reasons)
+
+
+def _import_nnls() -> Callable[[Array, Array], tuple[Array, float]]:
+    """Import scipy's non-negative least squares, which takes 60 ms, with the first controller, not with qpavoid."""
+    from scipy.optimize import nnls
+
+    return nnls  # type: ignore[no-any-return]
 
 
 def _nearest(problem: Problem) -> tuple[Reason, ...]:
     """Return the nearest pair that the tasks would have close, for solvers without rows and for the look-ahead."""
     rows = problem.avoidance
-    closing = rows.J @ problem.v_tracking
-    candidates = np.flatnonzero((closing < -_ACTIVE_TOLERANCE) & (rows.d < rows.d2))
+    candidates = np.flatnonzero((rows.J @ problem.v_tracking < -_ACTIVE_TOLERANCE) & (rows.d < rows.d2))
     if not len(candidates):
         return (Reason.of(ReasonKind.STALLED, detail="several rows together"),)
     i = int(candidates[np.argmin(rows.d[candidates])])
-    amount = float(rows.b[i] - closing[i])
-    return (Reason.of(ReasonKind.STALLED, *problem.pair_names[rows.pair[i]], amount=amount, unit="m/s"),)
+    return (Reason.of(ReasonKind.STALLED, *problem.pair_names[rows.pair[i]]),)

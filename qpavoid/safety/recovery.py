@@ -5,14 +5,15 @@ to Jacobians and tasks: several rad/s for neighbouring links, or where other joi
 that should rest must not start like that, so that the whole velocity is slowed down towards a stop, until no joint
 exceeds its recovery speed: the robot goes the same way, in more time.
 
-An obstacle that moves may be coming, and is evaded as fast as it can be: while anything near moves, nothing is slowed.
-Neither is a task that leaves by itself, at a velocity that meets all rows and bounds.
+An obstacle that comes is evaded as fast as it can be: the faster one near approaches, the less is slowed. Neither is a
+task that leaves by itself, at a velocity that meets all rows and bounds.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from qpavoid.kernels import speed_to_stop
 from qpavoid.model.limits import JointBounds
 from qpavoid.problem import Array, Problem, Solution
 from qpavoid.reason import Reason, ReasonKind
@@ -20,38 +21,87 @@ from qpavoid.reason import Reason, ReasonKind
 _TOLERATED = 1e-3
 """Depth below the safety distance [m], or excess over a position limit [rad or m], that slows nothing down: noise and
 control periods lead that far."""
+_COMING = 0.05
+"""Speed of an obstacle towards a body from which nothing is slowed down [m/s]: beyond what noise makes of a rest."""
+
+_NO_LEVER = 1e-6
+"""Entry of a distance Jacobian up to which a joint does not move the pair: round-off of axes in files [m/rad or 1]."""
+_NO_LIMIT = 1e9
+"""Change of v within a change of its change that is no limit [rad/s or m/s]: `speed_to_stop` takes finite ones."""
 
 
-def slow_recovery(q: Array, problem: Problem, feedforward: Array, solution: Solution, bounds: JointBounds) -> Solution:
-    """Return the solution, slowed down where the robot recovers, as RELAXED, with what it recovers from as reasons.
+def recovery_limits(
+    problem: Problem, feedforward: Array, bounds: JointBounds, v_prev: Array, dt: float
+) -> tuple[Array, Array] | None:
+    """Return the least and largest velocities (nv,), (nv,) in recovery; None where the robot does not recover.
 
-    From the tolerated depth or excess to twice of it, the largest speeds fall to those of recovery.
+    They come down to `JointBounds.recovery` between the tolerated depth or excess and twice of it, and grow without
+    bound with the speed at which an obstacle comes. A joint with a jerk limit comes to them without overshoot.
+
+    Args:
+        problem: of this control step.
+        feedforward: rate of the distances of its pairs due to the obstacles (k,) [m/s].
+        bounds: limits of the joints.
+        v_prev: velocity (nv,) of the control step before.
+        dt: control period [s].
+    """
+    degree = max(float(_depths(problem).max(initial=0.0)), -problem.position_margin) / _TOLERATED - 1.0
+    rest = 1.0 + float(feedforward.min(initial=0.0)) / _COMING
+    if not (degree > 0.0 and rest > 0.0):
+        return None
+    fastest = bounds.recovery / (min(degree, 1.0) * rest)
+    lower, upper = -fastest, fastest
+    if problem.jerk_limited:
+        change = np.minimum(bounds.jerk * dt**2, _NO_LIMIT)
+        fall, rise = (speed_to_stop(np.maximum(fastest - v, 0.0), change, 1.0) for v in (-v_prev, v_prev))
+        lower, upper = np.maximum(lower, v_prev - fall), np.minimum(upper, v_prev + rise)
+    return lower, upper
+
+
+def slowed(v: Array, v_stop: Array, limits: tuple[Array, Array]) -> tuple[Array, float]:
+    """Return v (nv,) slowed down towards the stop until it is within limits, and its share [-].
+
+    Args:
+        v: velocity (nv,).
+        v_stop: that of a stop (nv,), which is allowed anyway.
+        limits: of `recovery_limits`.
+    """
+    change = v - v_stop
+    limit = np.where(change > 0.0, np.maximum(limits[1], v_stop), np.minimum(limits[0], v_stop))
+    shares = (limit - v_stop) / np.where(change == 0.0, np.inf, change)
+    scale = float(np.min(shares, where=change != 0.0, initial=1.0))
+    return (v, 1.0) if scale == 1.0 else (v_stop + scale * change, scale)
+
+
+def slow_recovery(
+    q: Array, problem: Problem, solution: Solution, limits: tuple[Array, Array] | None, bounds: JointBounds
+) -> Solution:
+    """Return the solution, slowed down, as RELAXED, with what the robot recovers from as reasons.
 
     Args:
         q: configuration (nq,).
         problem: of this control step.
-        feedforward: rate of the distances of its pairs due to the obstacles (k,) [m/s].
         solution: of the problem.
+        limits: of `recovery_limits`; None to slow nothing down.
         bounds: limits of the joints.
     """
-    rows = problem.avoidance
-    depth = rows.d1 - rows.d
-    degree = max(float(depth.max(initial=0.0)), -problem.position_margin) / _TOLERATED - 1.0
-    if not degree > 0.0 or feedforward.any():
-        return solution
-    fastest, v_stop = bounds.recovery / min(degree, 1.0), problem.v_stop
-    change = solution.v - v_stop
-    limit = np.where(change > 0.0, np.maximum(fastest, v_stop), np.minimum(-fastest, v_stop))
-    shares = (limit - v_stop) / np.where(change == 0.0, np.inf, change)
-    scale = float(np.min(shares, where=change != 0.0, initial=1.0))
-    if scale == 1.0:
-        return solution
-    v = v_stop + scale * change
+    rows, depth = problem.avoidance, _depths(problem)
     named = {reason.subject for reason in solution.reasons if reason.kind is ReasonKind.BELOW_SAFETY_DISTANCE}
-    reasons = list(bounds.outside(q, problem.joint_names, problem.joint_units))
+    reasons = list(bounds.outside(q, problem.joint_names, problem.joint_units, _TOLERATED))
     for i in np.flatnonzero(depth > _TOLERATED).tolist():
         pair = problem.pair_names[rows.pair[i]]
         if pair not in named:
             reasons.append(Reason.of(ReasonKind.BELOW_SAFETY_DISTANCE, *pair, amount=float(depth[i]), unit="m"))
-    slack = np.maximum(rows.b - rows.J @ v, 0.0)
-    return solution._replace(v=v, slack=slack, command_scale=scale).with_reasons(*reasons)
+    if limits is not None:
+        v, scale = slowed(solution.v, problem.v_stop, limits)
+        if scale < 1.0:
+            slack = np.maximum(rows.b - rows.J @ v, 0.0)
+            solution = solution._replace(v=v, slack=slack, command_scale=scale)
+    return solution.with_reasons(*reasons)
+
+
+def _depths(problem: Problem) -> Array:
+    """Return how much nearer than d1 each pair is (k,) [m]; 0 for a base that stands on something, without a way."""
+    rows = problem.avoidance
+    depth = rows.d1 - rows.d
+    return np.where(np.abs(rows.J).max(axis=1) > _NO_LEVER, depth, 0.0) if depth.max(initial=0.0) > 0.0 else depth

@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 
 from qpavoid import kernels
-from qpavoid.problem import Array, Problem, Solution, least_squares
+from qpavoid.problem import Array, IntArray, Problem, Solution, least_squares
 from qpavoid.reason import Reason, ReasonKind
 from qpavoid.solvers.backends import verified, within
 from qpavoid.solvers.qp import Qp
@@ -23,6 +23,8 @@ Levels = list[tuple[Array, Array]]
 """Rows A (r, nv) and right-hand sides b (r,) of each priority, the first one first."""
 _RANK_TOLERANCE = 1e-8
 """Share of a level's largest singular value below which a direction is in its null space [-]: root of round-off."""
+_BENDING_TOLERANCE = 1e-6
+"""Second-order cost c of a level, over ‖A‖², from which motion of later ones is slowed down [-]."""
 _MIN_SINGULAR_VALUE = 1e-12
 """Largest singular value below which a level has rank 0."""
 
@@ -107,23 +109,41 @@ def _start(problem: Problem) -> tuple[Array, Array]:
     return (np.eye(nv), np.zeros(nv)) if contacts is None else (contacts.Z, contacts.v_particular)
 
 
-def cascade(problem: Problem, inverse: Callable[[Array, Array], Array]) -> Array:
+def cascade(
+    problem: Problem,
+    inverse: Callable[[Array, Array], Array],
+    bending: Callable[[IntArray, Array], Array] | None = None,
+) -> Array:
     """Compute the velocities v̂ of the tasks down to each priority, without inequalities (levels, nv).
+
+    Where a level is left short of its target, as beyond reach, the null space of its rows turns as fast as the arm
+    moves in it, and motion there costs the level at second order. So a later level moves only by the share
+    1 / (1 + c / ε) along null directions in which the levels before bend by c.
 
     Args:
         problem: of several levels.
         inverse: gives the velocity (nv,) of the rows A (r, nv) with b (r,), zero but for one level and the null space
             of the levels before.
+        bending: gives the second-order cost (nv, nv) of motion from the velocity (nv,) of a level with some rows, over
+            ‖A‖² of these; none if left out.
     """
     A, b = problem.tracking.A, problem.tracking.b
     velocities = np.empty((len(problem.levels), A.shape[1]))
-    Z, v = _start(problem)
+    (Z, v), bent, is_bent = _start(problem), np.zeros((A.shape[1], A.shape[1])), False
     for level, rows in enumerate(problem.levels):
         reduced, missing = np.zeros_like(A), np.zeros_like(b)
         reduced[rows], missing[rows] = A[rows] @ Z @ Z.T, b[rows] - A[rows] @ v
-        v = velocities[level] = v + inverse(reduced, missing)
+        change = inverse(reduced, missing)
         if not np.isfinite(reduced).all():
             return np.full_like(velocities, np.nan)
+        if is_bent:
+            costs, directions = np.linalg.eigh(Z.T @ bent @ Z)
+            shares = 1.0 / (1.0 + np.maximum(costs, 0.0) / _BENDING_TOLERANCE)
+            change = Z @ (directions @ (shares * (directions.T @ (Z.T @ change))))
+        v = velocities[level] = v + change
+        if bending is not None and level + 1 < len(problem.levels):
+            bent += bending(rows, change)
+            is_bent = bool(bent.any())
         Z = Z @ _null_space(A[rows] @ Z)
         if not Z.shape[1]:
             velocities[level:] = v
