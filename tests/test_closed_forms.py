@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from oracle import support
 
 from qpavoid.control.distances import DistanceQuery
-from qpavoid.geometry.cores import cores, has_closed_form
-from qpavoid.kernels.distances import CLOSED_FORM, MIN_CORE_DISTANCE, closed_forms
+from qpavoid.kernels.distances import BY_COAL, CLOSED_FORM, compute_distances
+from qpavoid.kernels.gjk import GUESS, MIN_CORE_DISTANCE
+from qpavoid.model.convex_shapes import convex_shapes, pair_methods
 from qpavoid.model.kinematics import ForwardKinematics
 
 AT_ORIGIN = pin.SE3.Identity()
@@ -20,10 +21,10 @@ AT_ORIGIN = pin.SE3.Identity()
 def found(a, b, at_a=AT_ORIGIN, at_b=AT_ORIGIN):
     """[distance, normal, point a, point b] of two bodies; None where their cores meet."""
     poses = np.array([np.concatenate((at.rotation.ravel(order="F"), at.translation)) for at in (at_a, at_b)])
-    table, bodies, results = cores([a, b]), np.array([[0, 1]]), np.full((1, 10), np.nan)
-    known, left = has_closed_form(table, bodies), np.zeros(1, dtype=np.intp)
-    assert known.all()
-    count = closed_forms(poses, table, bodies, known.astype(np.intp), np.array([0]), results, left)
+    shapes, bodies, results = convex_shapes([a, b]), np.array([[0, 1]]), np.full((1, 10), np.nan)
+    method, left, guesses = pair_methods(shapes, bodies), np.zeros(1, dtype=np.intp), np.zeros((1, GUESS))
+    assert method[0] == CLOSED_FORM
+    count = compute_distances(shapes, poses, bodies, method, np.array([0]), guesses, results, left)
     return None if count else results[0]
 
 
@@ -114,7 +115,7 @@ def test_distance_query_agrees_with_coal(panda):
     model = scene.robot.model
     query, kinematics, deep = DistanceQuery(scene), ForwardKinematics(model), 0
     closed = query.table.method == CLOSED_FORM
-    assert 0 < closed.sum() < len(scene.pairs)
+    assert 0 < closed.sum() < len(scene.pairs) and not (query.table.method == BY_COAL).any()
     alone, geometry_data = scene.geometry, scene.geometry.createData()
     for request in geometry_data.distanceRequests:
         request.gjk_tolerance = 1e-10

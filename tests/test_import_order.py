@@ -19,6 +19,7 @@ FOR_BENCHMARKS = {
     "qpavoid.kernels": "project: the compiled QP, which is compared with them",
     "qpavoid.geometry.bodies": "make_shape: free places for random obstacles",
     "qpavoid.viz.style": "colours and grid: figures look alike",
+    "qpavoid.viz.view": "View: what a live view costs a loop",
 }
 """What the benchmarks import beside public names and `qpavoid.{config,problem,model,run}`, and for what."""
 

@@ -9,8 +9,10 @@ from io import BytesIO
 import numpy as np
 import pytest
 
-from qpavoid import load_scenario, simulate
+from qpavoid import Robot, load_scenario, simulate
+from qpavoid.setup.pairs import pair_reasons, reasons_in_words
 from qpavoid.viz.view_replay import Replay
+from qpavoid.viz.view_robot import RobotPage
 from qpavoid.viz.view_session import Session
 
 REQUIRED = bool(os.environ.get("QPAVOID_REQUIRE_BROWSER"))
@@ -226,6 +228,34 @@ def test_page_plays_logs(page):
         wait_for(lambda: not replay.clock.is_playing, "the closest moment")
         assert replay.step == np.argmin(logs[1].min_distance)
         page.get_by_text(f"at {logs[1].t[replay.step]:.2f} s").first.wait_for()
+    finally:
+        is_done.set()
+        loop.join(PATIENCE)
+
+
+@pytest.mark.xdist_group("browser")
+def test_page_moves_a_robot_by_hand(page):
+    robot = Robot.load("panda")
+    shown, is_done = RobotPage(robot, reasons_in_words(pair_reasons(robot)), port=0, quality="low"), threading.Event()
+    loop = threading.Thread(target=shown.run, args=(is_done.is_set,))
+    loop.start()
+    try:
+        wait_for(lambda: shown.view.url, "the page's address")
+        page.goto(shown.view.url)
+        page.wait_for_selector("canvas")
+        page.get_by_text(f"{len(robot.bodies.collisionPairs)} active pairs").first.wait_for()
+        page.get_by_text("pairs left out: one joint apart").first.wait_for()
+        assert not shown.touching
+        page.get_by_role("slider").nth(1).focus()
+        page.keyboard.press("End")  # bent over, into its base
+        wait_for(lambda: {"panda_link0_0", "panda_link5_0"} <= shown.touching, "bodies in contact")
+        assert shown.q[1] == pytest.approx(robot.bounds().upper[1], abs=1e-2)
+        red = 0.0
+        end = time.monotonic() + PATIENCE
+        while red < 0.005 and time.monotonic() < end:
+            pixels = picture(page)
+            red = np.mean((pixels[..., 0] > 1.4 * pixels[..., 1]) & (pixels[..., 0] > 1.4 * pixels[..., 2]))
+        assert red > 0.005
     finally:
         is_done.set()
         loop.join(PATIENCE)

@@ -1,7 +1,7 @@
 """Closest points of the pairs within the influence distance; without a Python loop.
 
-Bounding spheres tell which pairs can be near at all. Spheres, capsules and boxes have closed forms; one call of coal
-does the rest, with all other pairs switched off, and its results are viewed as one array.
+Bounding spheres tell which pairs can be near at all. Kernels compute convex bodies that are apart, and half-spaces; one
+call of coal does the rest, with all other pairs switched off, and its results are viewed as one array.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from qpavoid.control.cloud_proxies import CloudProxies
 from qpavoid.control.obstacle_states import ObstacleStates
 from qpavoid.control.pair_table import PairTable
 from qpavoid.errors import NumericalError
-from qpavoid.kernels.distances import BY_COAL, CLOSED_FORM
+from qpavoid.kernels.distances import BY_COAL, SPARE_BY_COAL
+from qpavoid.kernels.gjk import GUESS
 from qpavoid.model.sample import STATE, Sample
 from qpavoid.model.scene import Scene
 from qpavoid.model.views import read_poses, read_results, view_poses, view_results
@@ -68,7 +69,7 @@ class DistanceQuery:
             pairs=np.ascontiguousarray(scene.pairs, dtype=np.intp),
             pair_of=table.pair_of,
             local=table.spheres[:, :3].copy(),
-            cores=table.cores,
+            shapes=table.shapes,
             method=table.method,
             first=table.first,
             is_cloud=np.array([i in scene.clouds for i in range(obstacles)], dtype=bool),
@@ -80,6 +81,7 @@ class DistanceQuery:
             speeds=np.zeros(model.njoints + obstacles),
             poses=read_poses(self._data.oMg) if poses is None else poses,
             centers=np.ones((bodies, 5)),
+            guesses=np.zeros((pairs, GUESS)),
             near=np.zeros(pairs, dtype=np.intp),
             rows=np.zeros(pairs, dtype=np.intp),
             meeting=np.zeros(pairs, dtype=np.intp),
@@ -154,7 +156,8 @@ class DistanceQuery:
         self.arrays.max_square[rows, columns] = np.where(exists, touching**2 * (1.0 + 1e-9), -1.0)
 
     def forget_guesses(self) -> None:
-        """Let the searches of coal start anew, not where they ended before: of curved shapes, that shows."""
+        """Let all searches start anew, not where they ended before: of curved shapes, that shows."""
+        self.arrays.guesses[:] = 0.0
         for pair in self._by_coal.tolist():
             self._data.distanceRequests[pair].updateGuess(_FIRST_GUESS)
 
@@ -166,7 +169,9 @@ class DistanceQuery:
         self._uncertainty[index] = obstacle.uncertainty
         self._set_max_square(slice(body, body + 1), slice(None))
         self._set_max_square(slice(None), slice(body, body + 1))
-        self._outdated |= self.table.pairs_of(index)
+        pairs = self.table.pairs_of(index)
+        self._outdated |= pairs
+        x.guesses[pairs] = 0.0
         self._last_near = b""
         x.states[index] = obstacle.motion.sample(0.0).row
         kernels.place_obstacles(self.packed, np.array([index]), x.states, self._uncertainty)
@@ -195,11 +200,12 @@ class DistanceQuery:
             meeting: number of those that coal has to compute all the same.
         """
         self._near_count, self._row_count, x = near, rows, self.arrays
-        if len(self._by_coal) or meeting:
+        left = x.meeting[:meeting].tolist()
+        meet = [pair for pair in left if x.method[pair] != SPARE_BY_COAL]
+        if len(self._by_coal) or len(meet) < len(left):
             self._compute_by_coal()
-        for pair in x.meeting[:meeting].tolist():
-            if x.method[pair] == CLOSED_FORM:
-                self._compute_one(pair)
+        for pair in meet:
+            self._compute_one(pair)
 
     @property
     def pairs(self) -> IntArray:
@@ -212,12 +218,12 @@ class DistanceQuery:
         return self.arrays.near[: self._near_count]
 
     def _compute_by_coal(self) -> None:
-        """Compute the near pairs that have no closed form in one call of coal."""
+        """Compute the near pairs that kernels cannot in one call of coal."""
         x, near = self.arrays, self._near.tobytes()
         if near != self._last_near:
             active = np.zeros(len(self._active), dtype=bool)
             active[self._near] = True
-            active &= x.method != CLOSED_FORM
+            active &= x.method <= SPARE_BY_COAL
             for pair in np.flatnonzero(active & self._outdated).tolist():
                 a, b = (self._scene.geometry.geometryObjects[i] for i in x.pairs[pair].tolist())
                 self._data.distance_functors[pair] = pin.ComputeDistance(a, b)

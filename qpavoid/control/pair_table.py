@@ -13,8 +13,9 @@ import coal
 import numpy as np
 
 from qpavoid.geometry.bodies import bounding_box, bounding_sphere
-from qpavoid.geometry.cores import cores, has_closed_form
-from qpavoid.kernels.distances import CLOSED_FORM, SPARE_BY_COAL
+from qpavoid.kernels.distances import BY_COAL, SPARE_BY_COAL
+from qpavoid.kernels.support import HULL, OTHER, Shapes
+from qpavoid.model.convex_shapes import convex_shapes, core_of, pair_methods
 from qpavoid.model.kinematics import support_masks
 from qpavoid.model.scene import Scene
 from qpavoid.model.views import read_poses
@@ -36,9 +37,9 @@ class PairTable:
         """(g, 4) bounding sphere of each body in its frame: centre and radius [m]; infinite of a half-space."""
         self.boxes: Array = np.array([np.concatenate(bounding_box(body)) for body in geometries]).reshape(-1, 6)
         """(g, 6) box around each body in its frame: centre and half its sizes [m]."""
-        self.cores: Array = cores(geometries)
-        """(g, 4) see `qpavoid.geometry.cores` [m]."""
-        self.method: IntArray = CLOSED_FORM * has_closed_form(self.cores, scene.pairs).astype(np.intp)
+        self.shapes: Shapes = convex_shapes(geometries)
+        """Shapes of all bodies."""
+        self.method: IntArray = pair_methods(self.shapes, scene.pairs)
         """(m,) how the distance of each pair is computed, see `kernels.distances`."""
         self.is_mesh: Mask = np.array([isinstance(body, coal.BVHModelBase) for body in geometries], dtype=bool)
         """(g,) bodies that are triangle meshes."""
@@ -60,7 +61,7 @@ class PairTable:
 
         self.is_empty: Mask = np.isin(scene.obstacle_of, scene.spare)
         """(g,) spare slots for obstacles that no obstacle has taken."""
-        self.method[self.is_empty[scene.pairs].any(axis=1) & (self.method != CLOSED_FORM)] = SPARE_BY_COAL
+        self.method[self.is_empty[scene.pairs].any(axis=1) & (self.method == BY_COAL)] = SPARE_BY_COAL
         self.attached: dict[int, int] = {}
         """Joint that each attached obstacle is attached to, by number of the obstacle."""
         joints = [body.parentJoint for body in bodies[:robot]] if robot else []
@@ -114,9 +115,10 @@ class PairTable:
         self.is_empty[body] = is_empty
         self.spheres[body] = np.append(*bounding_sphere(solid))
         self.boxes[body] = np.concatenate(bounding_box(solid))
-        self.cores[body] = cores([solid])[0]
-        closed = has_closed_form(self.cores, self._scene.pairs[pairs])
-        self.method[pairs] = np.where(closed, CLOSED_FORM, SPARE_BY_COAL)
+        kind, self.shapes.core[body] = core_of(solid)
+        self.shapes.kind[body] = OTHER if kind == HULL else kind  # there is no memory for its vertices
+        method = pair_methods(self.shapes, self._scene.pairs[pairs])
+        self.method[pairs] = np.where(method == BY_COAL, SPARE_BY_COAL, method)
         self._enable()
         for query in self.queries:
             query.update_slot(index)

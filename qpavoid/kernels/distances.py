@@ -1,45 +1,48 @@
-"""Distances of spheres, capsules and boxes in closed form: exact, and several times as fast as an iteration.
+"""Distances of convex bodies: closed forms of spheres, capsules and boxes, GJK for all others, and half-spaces.
 
-Bodies are cores with a radius around them: points and segments, or boxes. Of disjoint cores, the witness points are at
-the minimum of a convex function on a segment; where cores meet, and for all other shapes, coal computes them.
+Bodies are cores with a radius around them. Closed forms are exact, and several times as fast as an iteration: witness
+points of disjoint cores are at the minimum of a convex function on a segment. Where cores meet, and for meshes, coal
+computes them.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from qpavoid.kernels.packing import compiled
+from qpavoid.kernels.gjk import MIN_CORE_DISTANCE, core_distance
+from qpavoid.kernels.packing import compiled, inlined
+from qpavoid.kernels.support import BOX, HALF_SPACE, Shapes, support
 from qpavoid.problem import Array, IntArray
 
-BY_COAL, CLOSED_FORM, SPARE_BY_COAL = range(3)
-"""How the distance of a pair is computed: by coal; here; by coal, as what has come into a spare slot asks for it."""
-MIN_CORE_DISTANCE = 1e-6
-"""Distance of cores below which coal computes the pair [m]: the direction between them is lost to round-off."""
+BY_COAL, SPARE_BY_COAL, CLOSED_FORM, BY_GJK, TO_HALF_SPACE = range(5)
+"""How the distance of a pair is computed: by coal; by coal, as what has come into a spare slot asks for it; here."""
 _PARALLEL = 1e-14
 """1 - cos² of the angle below which segments count as parallel [-]: the round-off of a cosine, with some to spare."""
 
 
 @compiled
-def closed_forms(
+def compute_distances(
+    shapes: Shapes,
     poses: Array,
-    cores: Array,
     bodies: IntArray,
     method: IntArray,
     pairs: IntArray,
+    guesses: Array,
     results: Array,
     meeting: IntArray,
 ) -> int:
-    """Update the results of pairs that have a closed form.
+    """Update the results of pairs that are computed here.
 
     With witness points a and b of the cores, radii r and s, and the unit vector n from a to b, the distance is
     |b - a| - r - s, the witness points of the bodies are a + r n and b - s n: in penetration, too.
 
     Args:
-        poses: world poses of all bodies, rotation by columns and translation (g, 12).
-        cores: radius, and half-sizes of the core along the axes of each body (g, 4), see `geometry.cores` [m].
+        shapes: of all bodies.
+        poses: their world poses, rotation by columns and translation (g, 12).
         bodies: the two bodies of each pair (m, 2).
-        method: BY_COAL, CLOSED_FORM or SPARE_BY_COAL, of each pair (m,).
+        method: of each pair (m,).
         pairs: numbers of the pairs to update (c,).
+        guesses: where the search of each pair starts (m, GUESS), in and out, see `kernels.gjk`.
         results: [distance, normal, point a, point b] (m, 10), in place.
         meeting: out (m,), the first entries: the pairs whose results are not updated, though scenes with such pairs may
             expect that: those whose cores meet, and those of spare slots that coal has to compute.
@@ -47,43 +50,80 @@ def closed_forms(
     Returns:
         Number of these.
     """
-    a, b, separation = np.empty(3), np.empty(3), np.empty(3)
+    simplex, between = np.empty((4, 10)), np.empty(12)
     count = 0
     for k in pairs:
-        if method[k] != CLOSED_FORM:
-            if method[k] == SPARE_BY_COAL:
-                meeting[count] = k
-                count += 1
+        how = method[k]
+        if how == BY_COAL:
             continue
-        i, j = bodies[k, 0], bodies[k, 1]
-        if _is_box(cores[i]):
-            _segment_and_box(poses[j], cores[j, 3], poses[i], cores[i], b, a)
-        elif _is_box(cores[j]):
-            _segment_and_box(poses[i], cores[i, 3], poses[j], cores[j], a, b)
+        i, j, is_apart = bodies[k, 0], bodies[k, 1], False
+        if how == CLOSED_FORM:
+            is_apart = _closed_form(shapes, poses, i, j, results[k])
+        elif how == BY_GJK:
+            is_apart = core_distance(shapes, poses, i, j, guesses[k], simplex, between, results[k])
+        elif how == TO_HALF_SPACE:
+            is_apart = _to_half_space(shapes, poses, i, j, guesses[k], results[k])
+        if is_apart:
+            _add_radii(shapes.core[i, 0], shapes.core[j, 0], results[k])
         else:
-            _two_segments(poses[i], cores[i, 3], poses[j], cores[j, 3], a, b)
-        square = 0.0
-        for c in range(3):
-            separation[c] = b[c] - a[c]
-            square += separation[c] * separation[c]
-        distance = np.sqrt(square)
-        if not distance > MIN_CORE_DISTANCE:  # NaN, too
             meeting[count] = k
             count += 1
-            continue
-        r, s = cores[i, 0], cores[j, 0]
-        result = results[k]
-        result[0] = distance - (r + s)
-        for c in range(3):
-            n = separation[c] / distance
-            result[1 + c], result[4 + c], result[7 + c] = n, a[c] + r * n, b[c] - s * n
     return count
 
 
-@compiled
-def _is_box(core: Array) -> bool:
-    """Return True if a core [radius, half-sizes] (4,) is a box, not a point or a segment along z."""
-    return core[1] > 0.0
+@inlined
+def _add_radii(r: float, s: float, result: Array) -> None:
+    """Turn the result of two cores into that of the bodies with these radii around them."""
+    result[0] -= r + s
+    for c in range(3):
+        result[4 + c] += r * result[1 + c]
+        result[7 + c] -= s * result[1 + c]
+
+
+@inlined
+def _closed_form(shapes: Shapes, poses: Array, i: int, j: int, result: Array) -> bool:
+    """Write the result of two cores, points, segments or one of them a box; return False where they meet."""
+    a, b = result[4:7], result[7:10]
+    core = shapes.core
+    if shapes.kind[i] == BOX:
+        _segment_and_box(poses[j], core[j, 3], poses[i], core[i], b, a)
+    elif shapes.kind[j] == BOX:
+        _segment_and_box(poses[i], core[i, 3], poses[j], core[j], a, b)
+    else:
+        _two_segments(poses[i], core[i, 3], poses[j], core[j, 3], a, b)
+    x, y, z = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    distance = np.sqrt(x * x + y * y + z * z)
+    if not distance > MIN_CORE_DISTANCE:  # NaN, too
+        return False
+    result[0], result[1], result[2], result[3] = distance, x / distance, y / distance, z / distance
+    return True
+
+
+@inlined
+def _to_half_space(shapes: Shapes, poses: Array, i: int, j: int, guess: Array, result: Array) -> bool:
+    """Write the result of a core and a half-space below the plane z = 0 of its pose; return False at NaN.
+
+    The witness points are the core's deepest point, or the middle of its deepest edge or face, and its foot.
+    """
+    plane, body = (i, j) if shapes.kind[i] == HALF_SPACE else (j, i)
+    side = 1.0 if plane == i else -1.0
+    nx, ny, nz = poses[plane, 6], poses[plane, 7], poses[plane, 8]
+    x = -(nx * poses[body, 0] + ny * poses[body, 1] + nz * poses[body, 2])
+    y = -(nx * poses[body, 3] + ny * poses[body, 4] + nz * poses[body, 5])
+    z = -(nx * poses[body, 6] + ny * poses[body, 7] + nz * poses[body, 8])
+    vertex, x, y, z = support(shapes, body, int(guess[1]), x, y, z)
+    guess[1] = vertex
+    at, foot = (7, 4) if plane == i else (4, 7)
+    distance = 0.0
+    for c in range(3):
+        point = poses[body, 9 + c] + poses[body, c] * x + poses[body, 3 + c] * y + poses[body, 6 + c] * z
+        distance += poses[plane, 6 + c] * (point - poses[plane, 9 + c])
+        result[at + c] = point
+    for c in range(3):
+        result[1 + c] = side * poses[plane, 6 + c]
+        result[foot + c] = result[at + c] - distance * poses[plane, 6 + c]
+    result[0] = distance
+    return bool(abs(distance) < np.inf)
 
 
 @compiled

@@ -1,4 +1,4 @@
-"""Distances of the pairs that are near: poses of bodies and obstacles, bounding spheres, then closed forms.
+"""Distances of the pairs that are near: poses of bodies and obstacles, bounding spheres, then witness points.
 
 A *state* of an obstacle is a row of 18, see `qpavoid.kernels.obstacles`.
 """
@@ -10,9 +10,10 @@ from typing import NamedTuple
 import numpy as np
 
 from qpavoid.kernels.broadphase import candidates
-from qpavoid.kernels.distances import closed_forms
+from qpavoid.kernels.distances import compute_distances
 from qpavoid.kernels.kinematics import compose
 from qpavoid.kernels.packing import compiled
+from qpavoid.kernels.support import Shapes
 from qpavoid.problem import Array, IntArray, Mask
 
 
@@ -40,8 +41,8 @@ class DistanceArrays(NamedTuple):
     """(b + c, g) number of the pair of two bodies, -1 where there is none; increasing along the rows."""
     local: Array
     """(g, 3) centre of each body's bounding sphere in its frame [m]."""
-    cores: Array
-    """(g, 4) radius and half-sizes of each body's core, see `qpavoid.geometry.cores` [m]."""
+    shapes: Shapes
+    """Shape of each body, see `kernels.support`."""
     method: IntArray
     """(m,) how the distance of each pair is computed, see `kernels.distances`."""
     first: IntArray
@@ -66,6 +67,8 @@ class DistanceArrays(NamedTuple):
     """(g, 12) pose of each body in the world."""
     centers: Array
     """(g, 5) centres of the bounding spheres in the world, as rows [c, 1, -|c|²] [m]."""
+    guesses: Array
+    """(m, GUESS) where the search for the witness points of each pair starts, see `kernels.gjk`."""
     near: IntArray
     """(m,) out, the first entries: pairs whose bounding spheres are near, increasing."""
     rows: IntArray
@@ -91,7 +94,7 @@ def place_bodies(x: DistanceArrays, joint_poses: Array) -> None:
 
 @compiled
 def near_pairs(x: DistanceArrays) -> tuple[int, int, int]:
-    """Find the near pairs, and write the distances of those that have a closed form.
+    """Find the near pairs, and write the distances of those that coal is not needed for.
 
     Args:
         x: reads poses; writes centers of movable bodies, near, rows, meeting and results.
@@ -103,7 +106,7 @@ def near_pairs(x: DistanceArrays) -> tuple[int, int, int]:
     while bodies > 0 and x.joints[bodies - 1] < 0:  # from there on, both bodies of each pair are obstacles
         bodies -= 1
     near = candidates(x.poses, x.local, x.centers, x.max_square[:bodies], x.pair_of[:bodies], x.enabled, x.near)
-    meeting = closed_forms(x.poses, x.cores, x.pairs, x.method, x.near[:near], x.results, x.meeting)
+    meeting = compute_distances(x.shapes, x.poses, x.pairs, x.method, x.near[:near], x.guesses, x.results, x.meeting)
     rows = 0
     for k in x.near[:near]:
         if not x.ignored[k]:

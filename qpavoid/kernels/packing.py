@@ -28,3 +28,8 @@ def compiled(function: _F) -> _F:
     if not config.DISABLE_JIT:
         kernel._cache = KernelCache(function)  # what `cache=True` does, with another place on disk
     return kernel
+
+
+def inlined(function: _F) -> _F:
+    """Compile a part of a kernel into each of its callers: for parts whose arguments cost as much as their work."""
+    return njit(fastmath={"reassoc", "contract", "nsz"}, forceinline=True)(function)

@@ -88,6 +88,8 @@ class Description:
     """Two links that are not checked, and why: to be written as an SRDF."""
     links: Mapping[str, LinkBodies]
     """Link: its bodies and their volumes."""
+    reasons: Mapping[frozenset[str], pairs.Reason]
+    """Two bodies that are not checked, and why."""
     counts: Mapping[str, int]
     """Pairs: all, adjacent, srdf, always, drawn in, never, active."""
     near: float
@@ -173,6 +175,7 @@ def _describe(urdf: Path, options: DescribeOptions, progress: Callable[[str], No
         honoured=honoured,
         disabled={**{pair: pairs.SRDF_REASONS[why] for pair, why in disabled.items()}, **of_srdf},
         links=links,
+        reasons=reasons,
         counts={"all": pair_count, **counts, "active": pair_count - sum(counts.values())},
         near=sampled.near,
         unchecked=unchecked,

@@ -66,6 +66,8 @@ class Report:
     """Of the limb that ends at each end effector, at the home pose."""
     notes: list[Note] = field(default_factory=list)
     """What was left out, mended, replaced or assumed, and what is wrong; errors first."""
+    robot: Robot | None = field(default=None, repr=False)
+    """The robot itself, where it can be made."""
 
     @property
     def usable(self) -> bool:
@@ -125,7 +127,7 @@ def _report(config: RobotConfig, path: Path, progress: Callable[[str], None]) ->
             robot = Robot.from_config(config, path)
         except ConfigError as error:
             report.add("error", NoteKind.FILE, (), str(error), "mend what it names")
-        report.load_seconds = perf_counter() - begin
+        report.load_seconds, report.robot = perf_counter() - begin, robot
     report.joints = list_joints(urdf, model if robot is None else robot.model, config, model)
     report.notes += joint_notes(report.joints, config)
     if robot is not None:

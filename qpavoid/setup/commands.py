@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, get_args
 
@@ -16,12 +16,14 @@ from qpavoid.config.base import LARGEST
 from qpavoid.config.shipped import find_robot
 from qpavoid.errors import ConfigError
 from qpavoid.model.notes import Note
+from qpavoid.model.robot import Robot
 from qpavoid.run.report import to_json
 from qpavoid.run.terminal import ERR, OUT
 from qpavoid.setup.add import DescribeOptions, Description, Root, describe
 from qpavoid.setup.check import Report, check_robot
 from qpavoid.setup.fit import Bodies
 from qpavoid.setup.joints import Joint
+from qpavoid.setup.pairs import pair_reasons, reasons_in_words
 from qpavoid.setup.sampling import SAMPLES, SEED
 from qpavoid.setup.texts import description_files, note_lines, summary, write_files
 
@@ -30,6 +32,10 @@ _PATIENCE = 2.0
 
 app = typer.Typer(no_args_is_help=True, help="Look a robot over, or describe one for the first time.")
 
+ViewIt = Annotated[
+    bool, typer.Option("--view", help="Show it in a browser: bodies over meshes, a slider a joint, its pairs.")
+]
+Port = Annotated[int, typer.Option(help="Of that page; the next free one if it is taken.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else on stdout.")]
 PackageDirs = Annotated[
     list[Path] | None, typer.Option("--package-dir", help="Folder in which package:// meshes are looked up.")
@@ -51,6 +57,8 @@ def check(
     package: Packages = None,
     allow_missing_meshes: MissingMeshes = False,
     json: Json = False,
+    view: ViewIt = False,
+    port: Port = 8080,
 ) -> None:
     """Look a robot over: joints, limits, geometry, pairs, home pose, time of a step; each problem with its remedy.
 
@@ -60,12 +68,15 @@ def check(
         robot, _one_of(root, Root, "--root"), _entries(package_dir, package), allow_missing_meshes, Progress()
     )
     if json:
-        print(to_json({**vars(report), "usable": report.usable}))
+        shown = {name: value for name, value in vars(report).items() if name != "robot"}
+        print(to_json({**shown, "usable": report.usable}))
     else:
         OUT.print(f"[bold]{escape(report.name)}[/]  {escape(report.source)}", highlight=False, soft_wrap=True)
         _print(_facts(report), report.notes)
         if not report.notes:
             OUT.print("no problem found", highlight=False)
+    if view and report.robot is not None:
+        _view(report.robot, pair_reasons(report.robot), report.notes, port)
     raise typer.Exit(0 if report.usable else 1)
 
 
@@ -131,6 +142,8 @@ def add(
     seed: Annotated[int, typer.Option(min=0, help="Of the draw.")] = SEED,
     force: Annotated[bool, typer.Option("--force", help="Overwrite files that hold something else.")] = False,
     json: Json = False,
+    view: ViewIt = False,
+    port: Port = 8080,
 ) -> None:
     """Write a robot.yaml with collision bodies, pairs, a home pose and end effectors."""
     begin = time.perf_counter()
@@ -152,6 +165,14 @@ def add(
         print(to_json(_document(description, outcome, seconds)))
     else:
         _report(description, outcome, seconds)
+    if view:
+        _view(description.robot, description.reasons, description.notes, port)
+
+
+def _view(robot: Robot, reasons: Mapping[frozenset[str], Any], notes: Sequence[Note], port: int) -> None:
+    from qpavoid.viz.view_robot import RobotPage
+
+    RobotPage(robot, reasons_in_words(reasons), [str(note) for note in notes], port=port).run()
 
 
 def _kinds(texts: list[str]) -> dict[str, Bodies]:

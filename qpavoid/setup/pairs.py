@@ -98,6 +98,23 @@ def pair_reasons(
     return reasons
 
 
+_WORDS: dict[Reason, str] = {
+    "adjacent": "one joint apart",
+    "always": "touch in nearly every configuration",
+    "drawn in": "slide into each other by design",
+    "never": "never came near in random configurations",
+    "srdf": "disabled by an SRDF or `disabled_pairs`",
+}
+
+
+def reasons_in_words(reasons: Mapping[frozenset[str], Reason]) -> dict[str, list[str]]:
+    """Return the pairs that are not checked, by the reason."""
+    by_reason: dict[str, list[str]] = {}
+    for pair, reason in sorted(reasons.items(), key=lambda item: sorted(item[0])):
+        by_reason.setdefault(_WORDS[reason], []).append(" – ".join(sorted(pair)))
+    return by_reason
+
+
 def by_link(
     robot: Robot, reasons: Mapping[frozenset[str], Reason]
 ) -> tuple[dict[frozenset[str], Reason], list[tuple[str, str]]]:

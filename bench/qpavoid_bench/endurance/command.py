@@ -70,6 +70,16 @@ def _sections(steps: int, timed: int, runs: int, states: int, cases: tuple[str, 
         )
     yield table(head, rows, text_columns=2)
     yield " ".join(notes)
+    yield "## Beside a live view [µs]"
+    count = max(timed // 5, 1000)
+    yield (
+        f"{count:,} steps of {LOOPS[0]} at 200 Hz with `View.update` after each, whose page a client reads without "
+        f"drawing it, and as many without a view, in turn. Late: how long after its time a step begins. "
+        "A browser that draws by software on the same cores takes these from the loop: not measured here."
+    )
+    result = _measure("view", LOOPS[0], count)
+    names = [f"{name} {which}" for name in ("step", "late") for which in ("without", "with")] + ["update with"]
+    yield table(["", "p50", "p99", "p99.9", "worst"], [[name, *map(number, result[name])] for name in names])
     yield f"## Memory over {steps:,} steps"
     result = _measure("memory", LOOPS[0], steps)
     cells = [*(f"{x:.1f}" for x in result["resident"]), f"{result['slope']:.3f}", result["growth"], result["peak"]]

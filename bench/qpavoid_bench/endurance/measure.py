@@ -10,7 +10,7 @@ import sys
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
-from time import perf_counter, perf_counter_ns
+from time import perf_counter, perf_counter_ns, sleep
 from typing import Any
 
 import numpy as np
@@ -42,6 +42,59 @@ def latency(workload: str, count: int) -> dict[str, Any]:
         "slow": float(np.mean(ns > 2.0 * np.median(ns))),
         "preempted": 1e3 * switches / count,
     }
+
+
+def view(workload: str, count: int) -> dict[str, Any]:
+    """Time steps of a closed loop of 200 Hz without a live view and with one that is read, in turn.
+
+    Returns:
+        Quantiles of the steps, of `View.update`, and of how late steps begin; of both loops.
+    """
+    from contextlib import ExitStack
+
+    from qpavoid.viz.view import View
+    from qpavoid_bench.endurance.reader import reader
+
+    loop, parts = _warm(workload), 10
+    times: dict[bool, list[npt.NDArray[np.int64]]] = {False: [], True: []}
+    for part in range(2 * parts):
+        with ExitStack() as stack:
+            page = stack.enter_context(View(loop.controller.scene, port=0)) if part % 2 else None
+            if page is not None:
+                while not page.url:
+                    page.events()
+                stack.enter_context(reader(int(page.url.rsplit(":", 1)[1])))
+                while not page.clients:
+                    page.events()
+            times[page is not None].append(_paced(loop, page, count // parts))
+    names = ("step", "update", "late")
+    return {
+        f"{name} {'with' if is_shown else 'without'}": _quantiles(np.concatenate(blocks, axis=1)[row])
+        for is_shown, blocks in times.items()
+        for row, name in enumerate(names)
+    }
+
+
+_PERIOD = 5_000_000
+"""Period of the loop beside a view [ns]."""
+
+
+def _paced(loop: Any, page: Any, count: int) -> npt.NDArray[np.int64]:
+    """Return the times (3, count) of steps, of the view's updates, and how late steps began [ns]."""
+    ns, due = np.zeros((3, count), dtype=np.int64), perf_counter_ns()
+    for k in range(count):
+        due += _PERIOD
+        sleep(max(0.0, 1e-9 * (due - perf_counter_ns())))
+        begin = perf_counter_ns()
+        tick = loop.tick()
+        middle = perf_counter_ns()
+        if page is not None:
+            page.update(tick)
+        ns[:, k] = middle - begin, perf_counter_ns() - middle, begin - due
+        if ns[2, k] > 20 * _PERIOD:
+            due = perf_counter_ns()
+        loop.advance(tick.solution.v)
+    return ns
 
 
 def memory(workload: str, count: int) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from qpavoid import (
     build_scene,
     build_tasks,
 )
-from qpavoid.config import PointCloud, Task
+from qpavoid.config import Box, Cone, Cylinder, PointCloud, Task
 from qpavoid_bench.tick.build import close_pairs
 from qpavoid_bench.tick.robots import ROBOTS, ROBOTS_FOLDER
 from qpavoid_bench.tick.workloads import Array
@@ -65,6 +65,10 @@ class Loop:
         """Compute the velocity of a control step from where the robot is; the arguments do not matter."""
         return self.controller.step(self.q, *self._inputs).v
 
+    def tick(self) -> Any:
+        """Take a control step, with everything that led to its velocity."""
+        return self.controller.tick(self.q, *self._inputs)
+
     def advance(self, v: Array) -> None:
         """Integrate the command, and make the next step's target."""
         dt = self.controller.dt
@@ -81,6 +85,7 @@ def loop_names() -> list[str]:
         *(f"far-50+{kind}{count}" for kind in ("move", "sample", "pose") for count in (1, 10, 50)),
         *(f"shape-{shape}" for shape in _SHAPES),
         *(f"bodies-{kind}" for kind in ("capsule", "convex", "mesh")),
+        *(f"bodies-{kind}+{count}" for kind in ("capsule", "convex") for count in (5, 50)),
         *(f"cloud-{count}" for count in _CLOUDS),
         "circling",
         "circling+alone",
@@ -97,10 +102,10 @@ def make_loop(name: str) -> Loop:
     if kind == "shape":
         return _from(_scenario(_scattered(detail), {"type": "fixed"}))
     if kind == "bodies":
-        return _bodies(detail)
+        return _bodies(detail, int(variant or 0))
     if kind == "cloud":
         return _cloud(int(detail))
-    return _from(circling(**({"backup": None} if variant else {})))
+    return _from(circling(**({"backup": False} if variant else {})))
 
 
 def circling(**avoidance: Any) -> ScenarioConfig:
@@ -187,8 +192,8 @@ def _swing(robot: Robot, obstacles: list[Obstacle], updates: Any = None, every: 
     return Loop(controller, robot.home.copy(), targets, updates, every)
 
 
-def _bodies(kind: str) -> Loop:
-    """Return a Panda with capsules around its meshes, their hulls, or the triangle meshes themselves."""
+def _bodies(kind: str, count: int) -> Loop:
+    """Return a Panda with capsules around its meshes, their hulls, or the triangle meshes, among some obstacles."""
     fields: dict[str, Any] = {
         "bodies": kind,
         "lock": {"panda_finger_joint1": 0.0, "panda_finger_joint2": 0.0},
@@ -196,7 +201,19 @@ def _bodies(kind: str) -> Loop:
     }
     robot = Robot.from_urdf(ROBOTS_FOLDER / PANDA.urdf, **fields)
     touching = close_pairs(robot, robot.home[None])
-    return _swing(Robot.from_urdf(ROBOTS_FOLDER / PANDA.urdf, disabled_pairs=touching, **fields), [])
+    return _swing(Robot.from_urdf(ROBOTS_FOLDER / PANDA.urdf, disabled_pairs=touching, **fields), _around(count))
+
+
+def _around(count: int) -> list[Obstacle]:
+    """Return cylinders, boxes and cones by turns around a Panda, 0.5 to 0.9 m off its axis."""
+    random, obstacles = np.random.default_rng(4), list[Obstacle]()
+    shapes = (Cylinder(radius=0.05, length=0.1), Box(size=(0.1, 0.08, 0.06)), Cone(radius=0.05, length=0.1))
+    for i in range(count):
+        angle, distance, height = random.uniform(-np.pi, np.pi), random.uniform(0.5, 0.9), random.uniform(0.05, 0.9)
+        place = [distance * np.cos(angle), distance * np.sin(angle), height]
+        turned = pin.exp3(random.uniform(-2.0, 2.0, 3))
+        obstacles.append(Obstacle.at(f"o{i}", shapes[i % 3], place, turned))
+    return obstacles
 
 
 def _cloud(count: int) -> Loop:
