@@ -175,7 +175,7 @@ class Problem(NamedTuple):
     cascade: Array | None = None
     """(levels, nv) velocity of the tasks down to each of these priorities; None where it was not asked for."""
     bent: float = 0.0
-    """How far the task rows bend within the control step: the least λ with which a QP that tracks is calm [-]."""
+    """How far the task rows bend within the control step: the least λ of a QP that tracks [-]."""
     jerk_limited: bool = False
     """Whether `lower` and `upper` contain jerk limits, too."""
     tracking_is_clear: bool = False

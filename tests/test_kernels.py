@@ -571,26 +571,22 @@ def test_closes_below_by_its_definition(seed):
         assert kernels.closes_below(closest, J, feedforward, v, 0.3, safe) == closes
 
 
-def test_rate_limit_keeps_to_the_largest_change():
+def test_ramp_keeps_to_the_largest_change():
     rng = np.random.default_rng(0)
+
+    def follow(v, targets, step, stop_when_met):
+        none = np.full(len(step), 1e9)
+        return kernels.follow_ramp(
+            kernels.RampLimits(step, none, none, False), v, 0.0 * v, targets, False, stop_when_met
+        )
+
     v, wanted, step = rng.normal(size=5), rng.normal(size=(9, 5)), rng.uniform(0.1, 2.0, 5)
-    for found, target in zip(kernels.rate_limit(v, wanted, step, False), wanted, strict=True):
+    for found, target in zip(follow(v, wanted, step, False), wanted, strict=True):
         v = np.clip(target, v - step, v + step)
         np.testing.assert_allclose(found, v, rtol=0, atol=1e-14)
     constant, step = np.array([[0.35, -0.1, 5.0]] * 6), np.array([0.1, 0.1, np.inf])
     for meets in (False, True):  # or ends where the wanted velocity is met
-        found = kernels.rate_limit(np.zeros(3), constant, step, meets)
+        found = follow(np.zeros(3), constant, step, meets)
         expected = [[min(0.1 * (i + 1), 0.35), -0.1, 5.0] for i in range(4 if meets else 6)]
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-15)
-        assert len(kernels.rate_limit(np.zeros(3), constant[:0], np.ones(3), meets)) == 0
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_min_sphere_distance_by_its_definition(seed):
-    rng = np.random.default_rng(seed)
-    paths, centers, sizes = rng.normal(size=(7, seed, 3)), rng.normal(size=(4, 3)), rng.uniform(0.0, 1.0, (seed, 4))
-    distances = np.linalg.norm(paths[:, :, None] - centers, axis=-1) - sizes
-    assert kernels.min_sphere_distance(paths, centers, sizes) == pytest.approx(distances.min(initial=np.inf))
-    if seed:
-        paths[3, 0, 1] = np.nan
-        assert not kernels.min_sphere_distance(paths, centers, sizes) > -np.inf
+        assert len(follow(np.zeros(3), constant[:0], np.ones(3), meets)) == 0

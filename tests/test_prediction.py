@@ -6,32 +6,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from qpavoid import Obstacle, Pose, Sample
-from qpavoid.config import Line, Sensing, Sphere
-from qpavoid.control.estimates import prediction_error_bound
+from qpavoid.config import Sensing, Sphere
 from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.control.trajectories import extrapolate
-from qpavoid.model.trajectory import build_motion
+from qpavoid.kernels import prediction_error_bound
 
 
 def observe(tracker, t, updates):
     """Take over what a step at t is given."""
     tracker.advance(tracker.read(t, updates))
-
-
-def test_paths_are_those_of_obstacles_on_trajectories():
-    times, update = np.array([0.3, 0.4, 1.9]), {"b": Sample.at([0, 1, 0], linear=[0.1, 0, 0.2], angular=[0, 0, 3.0])}
-    line = build_motion(Line(start=(0.0, 0.6, 0.0), end=(0.0, -2.0, 0.0), speed=0.5))
-    obstacles = [Obstacle.at(name, Sphere(radius=0.1), [9.0, 0.0, 0.0]) for name in ("still", "b")]
-    obstacles.insert(1, Obstacle("a", Sphere(radius=0.1), line, True))
-    tracker = ObstacleTracker(obstacles, Sensing(), 0.1)
-    for k in range(4):
-        observe(tracker, 0.1 * k, update if k % 2 else None)
-        places, rates = tracker.paths(times)
-        assert tracker.on_trajectories.tolist() == [1] and tracker.external.tolist() == [2] * (k > 0)
-        for t, row in zip(times, places, strict=True):
-            np.testing.assert_allclose(row, tracker.at(t).states[[1], 9:12], rtol=0, atol=1e-12)
-        np.testing.assert_allclose(rates, [[0.5, 0.0]], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(tracker.mean_twists, [[0] * 6, [0] * 6, [0.1, 0, 0.2, 0, 0, 3.0]], atol=1e-12)
 
 
 def test_prediction_uses_the_mean_twist():
@@ -43,7 +26,7 @@ def test_prediction_uses_the_mean_twist():
         at = np.array([0.2 * t, 0.0, 0.0])
         observe(obstacles, t, {"ball": Pose.at(at + 0.005 * rng.normal(size=3))})
         if k == 1:
-            first = obstacles.estimates.states[0, 12:15]
+            first = obstacles.prediction.twists[0, :3]
             np.testing.assert_array_equal(first, obstacles.current.states[0, 12:15])  # of one twist, that is the mean
         if k > 50:
             off.append(obstacles.at(t + 1.0).states[0, 9:12] - at - [0.2, 0.0, 0.0])
@@ -62,7 +45,7 @@ def test_prediction_error_bound_covers_every_point(seed, size):
 
     first = {name: [rng.normal(size=3) for _ in range(4)] for name in names}
     observe(obstacles, 0.0, {name: sample(*parts) for name, parts in first.items()})
-    before, radii = obstacles.estimates, np.array([0.2, 0.3])
+    before, radii = obstacles.prediction, np.array([0.2, 0.3])
     then = {name: obstacles.at(dt).states[i] for i, name in enumerate(names)}
     now = {}
     for name, state in then.items():
@@ -71,16 +54,18 @@ def test_prediction_error_bound_covers_every_point(seed, size):
             *(state[9:12] + size * rng.normal(size=3), R), *(state[12:].reshape(2, 3) + size * rng.normal(size=(2, 3)))
         )
     observe(obstacles, dt, now)
-    bound = prediction_error_bound(obstacles.estimates, before, 1.0, radii)
+    bound = prediction_error_bound(obstacles.prediction, before, 1.0, radii)
     for i, name in enumerate(names):
         for t in np.linspace(0.0, 1.0, 11):
             points = rng.normal(size=(50, 3))
             points *= radii[i] / np.linalg.norm(points, axis=1, keepdims=True)
-            states = np.array([then[name], obstacles.estimates.states[i]])
+            states = np.array(
+                [then[name], np.append(obstacles.prediction.states[i, :12], obstacles.prediction.twists[i])]
+            )
             extrapolate(states, t)
             places = [points @ state[:9].reshape(3, 3) + state[9:12] for state in states]
             assert np.linalg.norm(places[0] - places[1], axis=1).max() <= bound + 1e-9
-    assert prediction_error_bound(obstacles.estimates, before, 1.0, np.array([np.inf, 0.3])) == np.inf or size < 1e-9
+    assert prediction_error_bound(obstacles.prediction, before, 1.0, np.array([np.inf, 0.3])) == np.inf or size < 1e-9
     assert bound > 0.0 or size < 1e-9
     obstacles.reset()
-    assert prediction_error_bound(obstacles.estimates, before, 1.0, radii) == np.inf
+    assert prediction_error_bound(obstacles.prediction, before, 1.0, radii) == np.inf

@@ -8,15 +8,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from qpavoid import Avoidance, Limits, Obstacle, Sample, build_scene, kernels
-from qpavoid.config import Box, Line, Sensing, Sphere
+from qpavoid import Avoidance, Limits, Obstacle, Robot, Sample, build_scene, kernels
+from qpavoid.config import Box, Cone, Line, Sensing, Sphere
 from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.control.pair_table import PairTable
 from qpavoid.control.scenario import build_parts
 from qpavoid.control.settings import ControlSettings
-from qpavoid.model.trajectory import build_motion
+from qpavoid.kernels.rollout import PAUSED
+from qpavoid.model.trajectory import Trajectory, build_motion
 from qpavoid.safety.approach import ApproachCheck
-from qpavoid.safety.rollout import BackupPolicy, BackupRollouts, Start
+from qpavoid.safety.rollout import LEAST_SCORE, BackupPolicy, BackupRollouts, Start
 from qpavoid.solvers.backends import solve_daqp
 
 
@@ -101,6 +102,51 @@ def test_rollout_ends_early_exactly_when_it_does_not_beat_another(among_balls):
             counts[beats] += 1
             best = found or best
     assert min(counts.values()) > 1
+
+
+def test_a_rollout_that_pauses_is_that_in_one_go_bit_for_bit(among_balls):
+    rollouts, _, q = among_balls
+    start, rng = start_of(rollouts, q, 0.13), np.random.default_rng(4)
+    for policy in random_policies(rollouts, 4, seed=4):
+        whole = rollouts.rollout(start, policy, np.full((3, len(q)), 0.1), None)
+        rollouts.begin(start, policy, np.full((3, len(q)), 0.1), LEAST_SCORE)
+        while rollouts.resume(int(rng.integers(0, 9))) == PAUSED:
+            rollouts.kinematics.compute(0.5 * q)  # others use the same memory meanwhile
+        paused = rollouts.result()
+        assert paused.v.tobytes() == whole.v.tobytes() and paused.q.tobytes() == whole.q.tobytes()
+        assert paused[4:7] == whole[4:7]
+
+
+class OfAnotherClass(Trajectory):
+    """A trajectory that compiled code does not know."""
+
+
+@pytest.mark.parametrize("robot", ["panda", "baxter"])
+@pytest.mark.parametrize("limits", LIMITS.values(), ids=LIMITS)
+def test_what_compiled_code_leaves_to_python_changes_nothing(robot, limits):
+    """Neither a shape for coal, far away, nor a trajectory of another class, nor both in one scene."""
+    rng, robot = np.random.default_rng(7), Robot.load(robot)
+    lines = [Line(start=tuple(rng.uniform(-1, 1, 3)), end=tuple(rng.uniform(-1, 1, 3)), speed=0.4) for _ in range(6)]
+    expected, ball, cone = None, Sphere(radius=0.1), Cone(radius=0.1, length=0.1)
+    for custom, shape in ((False, ball), (False, cone), (True, ball)):
+        rng, far, found = np.random.default_rng(8), Obstacle.at("far", shape, [9.0, 0.0, 0.0]), []
+        motions = [build_motion(line) for line in lines]
+        if custom:
+            motions = [OfAnotherClass(motion.pieces, motion.initial) for motion in motions]
+        balls = [Obstacle(f"ball{i}", Sphere(radius=0.07), motion, True) for i, motion in enumerate(motions)]
+        rollouts, _, tracker = rollouts_of(build_scene(robot, [*balls, far]), Limits(**limits))
+        for k in range(4):
+            t, v = 0.37 * k, rng.uniform(-0.3, 0.3, robot.model.nv)
+            sample = Sample.at([9.0, 0.1 * k, 0.0], linear=[0.0, 0.1, 0.0])
+            tracker.advance(tracker.read(t, {"far": sample}))
+            q = pin.integrate(robot.model, robot.home, rng.uniform(-0.5, 0.5, robot.model.nv))
+            policy = BackupPolicy((0.0, 0.05, 0.2, 0.5)[k], rng.normal(size=len(v)))
+            found.append(rollouts.rollout(start_of(rollouts, q, t, v), policy, np.tile(v, (5, 1)), None))
+        expected = expected or found
+        for one, other in zip(found, expected, strict=True):
+            np.testing.assert_allclose(one.v, other.v, rtol=0, atol=1e-9)
+            np.testing.assert_allclose(one.q, other.q, rtol=0, atol=1e-9)
+            assert [*one.score, one.clearance] == pytest.approx([*other.score, other.clearance], abs=1e-9)
 
 
 def test_validity_from_a_nearby_start_is_conservative(among_balls):

@@ -253,18 +253,6 @@ class DistanceQuery:
         coal.distance(*a, *b, self._request, result)
         self.arrays.results[pair] = read_results([result])[0]
 
-    def body_spheres(self, joint_poses: Array) -> tuple[Array, Array]:
-        """Return world centres (b, 3) and radii (b,) of the spheres around the bodies that joints move [m].
-
-        Args:
-            joint_poses: world poses of all joints (njoints, 12).
-        """
-        kernels.place_bodies(self.packed, joint_poses)
-        moved = np.flatnonzero(self.table.joints >= 0)
-        poses, spheres = self.arrays.poses[moved], self.table.spheres[moved]
-        turned = (spheres[:, None, :3] @ poses[:, :9].reshape(-1, 3, 3))[:, 0]
-        return turned + poses[:, 9:], spheres[:, 3]
-
     def distances_of(self, pairs: IntArray) -> Array:
         """Return distances (k,) of some pairs at the last call; infinite for those that were not near [m].
 

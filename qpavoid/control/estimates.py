@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from math import nan
-from typing import NamedTuple
 
 import numpy as np
 
 from qpavoid import kernels
 from qpavoid.control.inputs import FASTEST
-from qpavoid.control.trajectories import extrapolate
 from qpavoid.kernels.estimates import FIT
 from qpavoid.model.sample import STATE, Sample
 from qpavoid.problem import Array, IntArray
@@ -20,19 +18,6 @@ _SHORTEST = 1e-3
 """Part of a control period below which two poses count as of the same time, so that no twist follows from them."""
 _LONGEST = 1e3
 """Time for which an obstacle keeps its last twist at the most [s]: by then it is out of every scene."""
-_ROTATION, _POSITION, _LINEAR, _ANGULAR = slice(9), slice(9, 12), slice(12, 15), slice(15, 18)
-"""Where the parts of a state are."""
-
-
-class ObstacleEstimates(NamedTuple):
-    """What is known of some obstacles."""
-
-    which: tuple[int, ...]
-    """Their numbers."""
-    states: Array
-    """(k, 18) see `courses`; with mean twists."""
-    t: float
-    """When [s]."""
 
 
 class MeasuredStates:
@@ -98,33 +83,3 @@ class MeasuredStates:
                 which, t, _LONGEST, self.stamps, self.states, states, stale_after, self.at_rest, margin
             )
         )
-
-
-def prediction_error_bound(
-    now: ObstacleEstimates | None, earlier: ObstacleEstimates | None, span: float, radii: Array
-) -> float:
-    """Bound how far any point of an obstacle is from its prediction, now and for some time [m].
-
-    Positions and rotations that are off by δp and δR, and twists by δv and δω, leave a point that is r from the
-    origin no farther off than |δp| + t |δv| + r (‖δR‖ + t |δω|) after t.
-
-    Args:
-        now: current estimates.
-        earlier: estimates that the prediction was made of.
-        span: for how long it counts [s].
-        radii: distance from each obstacle's origin to its farthest point (o,) [m].
-
-    Returns:
-        The bound; infinite where the two are not of the same obstacles.
-    """
-    if now is None or earlier is None or now.which != earlier.which:
-        return 0.0 if now is earlier else np.inf
-    expected = earlier.states.copy()
-    extrapolate(expected, now.t - earlier.t)
-    off = np.abs(now.states - expected)
-    if not off.any():
-        return 0.0
-    p, v, R, w = (np.linalg.norm(off[:, part], axis=1) for part in (_POSITION, _LINEAR, _ROTATION, _ANGULAR))
-    turned = R + span * w
-    radii = np.where(turned > 0.0, radii[list(now.which)], 0.0)  # half-spaces have no end
-    return float(np.max(p + span * v + radii * turned))

@@ -16,15 +16,17 @@ import numpy as np
 
 from qpavoid import kernels
 from qpavoid.config import Sensing
-from qpavoid.control.estimates import MeasuredStates, ObstacleEstimates
+from qpavoid.control.estimates import MeasuredStates
 from qpavoid.control.inputs import FARTHEST, FASTEST, FAULTS
 from qpavoid.control.obstacle_states import NOTHING, Observation, ObstacleStates, StepUpdate
 from qpavoid.control.trajectories import TrajectoryBatch, extrapolate
 from qpavoid.control.updates import NO_UPDATE, Update, UpdateReader, unlikely
 from qpavoid.errors import NumericalError
+from qpavoid.kernels import Prediction
 from qpavoid.kernels.obstacles import FAST, NORMALISED, NOT_FINITE, SAMPLE
 from qpavoid.model.sample import STATE, Sample
 from qpavoid.model.scene import Obstacle
+from qpavoid.model.trajectory import Motion
 from qpavoid.problem import Array, IntArray
 from qpavoid.reason import Reason, ReasonKind, Severity
 
@@ -61,8 +63,7 @@ class ObstacleTracker:
         """(k,) numbers of those on a trajectory that are not external."""
         self._measured = MeasuredStates(count, dt)
         self._reader = UpdateReader(obstacles, self._measured, dt)
-        self._estimates: ObstacleEstimates | None = None
-        self._sampled: dict[float, tuple[Array, Array]] = {}  # of those on trajectories, by time: see `paths`
+        self._prediction: Prediction | None = None
         self.external: IntArray = np.zeros(0, dtype=np.intp)
         """(k,) numbers of those that a program gives."""
         self._awaited = {i for i, obstacle in enumerate(obstacles) if obstacle.external}  # external, never given
@@ -86,65 +87,51 @@ class ObstacleTracker:
         return self._now
 
     @property
-    def estimates(self) -> ObstacleEstimates | None:
-        """States of external obstacles in the last step, with mean twists; None where there are none."""
-        if self._estimates is None and self._measured.known:
-            which = list(self._measured.known)
-            states = self.current.states[which]
-            states[:, 12:] = self._measured.twists[which]
-            self._estimates = ObstacleEstimates(tuple(which), states, self._now)
-        return self._estimates
+    def custom_trajectories(self) -> Mapping[int, Motion]:
+        """Trajectories of other classes, which kernels cannot sample, by number of the obstacle."""
+        return self._trajectories.others
+
+    @property
+    def prediction(self) -> Prediction:
+        """What is known of the obstacles in the last step, as far as the future follows from it; nothing changes it."""
+        if self._prediction is None:
+            now, external = self.current, self.external
+            twists = self._measured.twists.copy() if len(external) else self._measured.twists
+            states, margin = now.states.copy(), now.margin.copy()
+            self._prediction = Prediction(
+                self._trajectories.pieces, now.which, states, margin, external, twists, self._now
+            )
+        return self._prediction
 
     @property
     def mean_twists(self) -> Array:
         """(o, 6) mean twists of external obstacles, with which they are predicted; zero of all others."""
         return self._measured.twists
 
-    def paths(self, times: Array) -> tuple[Array, Array]:
-        """Predict the obstacles `on_trajectories`.
-
-        Args:
-            times: (t,) [s].
-
-        Returns:
-            Positions (t, k, 3) [m]; their largest speeds and rates of turning at these times (k, 2) [m/s, rad/s].
-        """
-        self._sampled = {t: self._sampled.get(t) or self._sample(t) for t in times.tolist()}
-        positions, rates = [np.array(parts) for parts in zip(*self._sampled.values(), strict=True)]
-        return positions[:, self.on_trajectories], rates[:, self.on_trajectories].max(axis=0)
-
-    def _sample(self, t: float) -> tuple[Array, Array]:
-        """Sample positions (o, 3) and rates (o, 2) of those that follow a trajectory."""
-        states = np.zeros_like(self.current.states)
-        self._sample_trajectories(t, states)
-        return states[:, 9:12], np.linalg.norm(states[:, 12:].reshape(-1, 2, 3), axis=-1)
-
-    def at(self, t: float) -> ObstacleStates:
+    def at(self, t: float, prediction: Prediction | None = None) -> ObstacleStates:
         """Return the states at t [s]: on trajectories, or at constant mean twists; of the last step, as observed.
 
         Those of the last step are overwritten by the next one.
+
+        Args:
+            t: time [s].
+            prediction: of an earlier step; of the last one if left out.
         """
-        if t == self._now or not len(self.moving):
+        if prediction is None and (t == self._now or not len(self.moving)):
             return self.current
-        states, estimates = self.current.states.copy(), self.estimates
-        self._sample_trajectories(t, states)
-        if estimates is not None:
-            later = estimates.states.copy()
-            extrapolate(later, t - estimates.t)
-            states[list(estimates.which)] = later
-        return self.current._replace(states=states)
+        known = prediction or self.prediction
+        states = np.empty_like(known.states)
+        kernels.predict(known, t, states)
+        for index, motion in self._trajectories.others.items():
+            if index not in known.external:
+                states[index] = motion.sample(t).row
+        return ObstacleStates(known.which, states, known.margin, self.current.voxels)
 
     def after(self, duration: float) -> ObstacleStates:
         """Return the states some time after the last step [s], at the twists that obstacles have in it."""
         states = self.current.states.copy()
         extrapolate(states, duration)
         return self.current._replace(states=states)
-
-    def _sample_trajectories(self, t: float, states: Array) -> None:
-        """Bring the states (o, 18) of those that follow a trajectory to time t [s]."""
-        self._trajectories.sample(t, states)
-        for index, motion in self._trajectories.others.items():
-            states[index] = motion.sample(t).row
 
     def put(self, index: int, name: str, present: bool) -> None:
         """Take over what the scene has in a spare slot now.
@@ -169,7 +156,6 @@ class ObstacleTracker:
         if numbers != self._moving:
             self._moving = numbers
             self._trajectories = TrajectoryBatch({i: self._obstacles[i].motion for i in numbers})
-            self._sampled.clear()
 
     def attach(self, index: int) -> None:
         """Take an obstacle as attached to the robot: updates of it are ignored."""
@@ -202,7 +188,7 @@ class ObstacleTracker:
 
     def _renew(self) -> None:
         """Lay out the numbers of the obstacles that move."""
-        self._estimates, self._known = None, None
+        self._prediction, self._known = None, None
         self.external = np.array(list(self._measured.known), dtype=np.intp)
         self.on_trajectories = np.array([i for i in self._moving if i not in self._measured.known], dtype=np.intp)
         moving = {*self._moving, *self._measured.known}
@@ -259,10 +245,9 @@ class ObstacleTracker:
         if update is None:
             return NOTHING
         t, shift, given, sampled = update
-        self._now, self._estimates, current = t + self._latency, None, self.current
+        self._now, self._prediction, current = t + self._latency, None, self.current
         if shift:
             self._measured.stamps += shift
-            self._sampled.clear()
         self._trajectories.sample(self._now, current.states)
         for index, sample in sampled:
             current.states[index] = sample.row

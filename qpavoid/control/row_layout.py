@@ -43,7 +43,7 @@ def lay_out(
         has_mimics=model.nvExtended > model.nv,
         unfolded_row=np.zeros(model.nvExtended),
         frame_poses=kinematics.frame_poses,
-        **task_layout(frames, row_tasks, model),
+        **task_layout(frames, row_tasks, model, settings.dt),
         results=x.results,
         support=table.support,
         twists=x.twists,

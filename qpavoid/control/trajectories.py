@@ -11,8 +11,12 @@ import numpy as np
 
 from qpavoid import kernels
 from qpavoid.kernels import Pieces
-from qpavoid.model.trajectory import END_TOLERANCE, Motion, Trajectory
+from qpavoid.model.sample import STATE
+from qpavoid.model.trajectory import Motion, Trajectory
 from qpavoid.problem import Array
+
+_NONE = Pieces(np.zeros(0, np.intp), np.zeros(1, np.intp), np.zeros(0), np.zeros((0, 4)), np.zeros((0, 7, STATE)))
+"""Trajectories of no bodies."""
 
 
 def extrapolate(states: Array, t: float | Array) -> None:
@@ -37,18 +41,17 @@ class TrajectoryBatch:
         known = {body: motion.pieces for body, motion in motions.items() if type(motion) is Trajectory}
         self.others = {body: motion for body, motion in motions.items() if body not in known}
         """Those of other classes, even if derived, which have to be sampled one by one."""
-        self._pieces = None
-        if known:
-            counts = [len(pieces.starts) for pieces in known.values()]
-            self._pieces = Pieces(
-                bodies=np.array(list(known), dtype=np.intp),
-                first=np.concatenate(([0], np.cumsum(counts))).astype(np.intp),
-                starts=np.concatenate([pieces.starts for pieces in known.values()]),
-                clock=np.concatenate([pieces.clock for pieces in known.values()]),
-                terms=np.concatenate([pieces.terms for pieces in known.values()]),
-            )
+        pieces = [_NONE, *known.values()]
+        counts = [len(each.starts) for each in known.values()]
+        self.pieces = Pieces(
+            bodies=np.array(list(known), dtype=np.intp),
+            first=np.concatenate(([0], np.cumsum(counts))).astype(np.intp),
+            starts=np.concatenate([each.starts for each in pieces]),
+            clock=np.concatenate([each.clock for each in pieces]),
+            terms=np.concatenate([each.terms for each in pieces]),
+        )
+        """Those of all bodies but the `others`."""
 
     def sample(self, t: float, states: Array) -> None:
         """Brings the states (o, 18) of all bodies but the `others` to a finite time t [s]; see `Motion.sample`."""
-        if self._pieces is not None:
-            kernels.sample_pieces(self._pieces, t, END_TOLERANCE, states)
+        kernels.sample_pieces(self.pieces, t, states)

@@ -1,13 +1,10 @@
 """Array work of a control step: loops that numba compiles at their first use, and stores on disk (`kernels.cache`)."""
 
+from qpavoid.kernels.approach import Paths, comes_near, extend_paths, write_path_point
 from qpavoid.kernels.backup import (
-    ROUND_OFF,
     backup_rows,
-    braking_travel,
     closes_below,
-    line_clearance,
-    min_sphere_distance,
-    rate_limit,
+    max_offset,
 )
 from qpavoid.kernels.bounds import velocity_bounds
 from qpavoid.kernels.braking_bounds import speed_to_stop
@@ -32,7 +29,10 @@ from qpavoid.kernels.kinematics import KinematicsArrays, update_kinematics
 from qpavoid.kernels.layout import RowLayout
 from qpavoid.kernels.near_pairs import DistanceArrays, near_pairs, place_bodies, place_obstacles
 from qpavoid.kernels.obstacles import Pieces, check_states, sample_pieces
+from qpavoid.kernels.prediction import Prediction, predict, prediction_error_bound
 from qpavoid.kernels.qp import max_clearance_velocity, minimize, project, project_soft
+from qpavoid.kernels.ramps import RampLimits, follow_ramp
+from qpavoid.kernels.rollout import RolloutArrays, advance_rollout, begin_rollout, rollout_outcome
 from qpavoid.kernels.rotation import rotation_vector
 from qpavoid.kernels.rows import alpha, beta, distance_rows, row_bounds
 from qpavoid.kernels.step import assemble, control_step, find_near_pairs, tracking_violation, violation
@@ -43,48 +43,56 @@ from qpavoid.kernels.tracking_law import tracking_law
 from qpavoid.kernels.voxels import select_voxels, voxels_within
 
 __all__ = [
-    "ROUND_OFF",
     "TOLERANCE",
     "DistanceArrays",
     "KinematicsArrays",
+    "Paths",
     "Pieces",
+    "Prediction",
+    "RampLimits",
+    "RolloutArrays",
     "RowLayout",
     "add_curvature",
+    "advance_rollout",
     "alpha",
     "are_fine",
     "assemble",
     "backup_rows",
+    "begin_rollout",
     "beta",
-    "braking_travel",
     "candidates",
     "check_states",
     "clearance_lower_bound",
     "closes_below",
+    "comes_near",
     "control_step",
     "direct",
     "distance_rows",
+    "extend_paths",
     "extrapolate_estimates",
     "extrapolate_states",
     "find_near_pairs",
     "first_use",
+    "follow_ramp",
     "frame_rows",
     "is_tracking_clear",
     "jerk_limited_stop",
     "joint_speeds",
     "leaves_position_limits",
-    "line_clearance",
     "max_clearance_velocity",
-    "min_sphere_distance",
+    "max_offset",
     "minimize",
     "near_pairs",
     "pack",
     "place_bodies",
     "place_obstacles",
+    "predict",
+    "prediction_error_bound",
     "project",
     "project_soft",
     "projection_cost",
-    "rate_limit",
     "roll_out_stop",
+    "rollout_outcome",
     "rotation_vector",
     "row_bounds",
     "sample_pieces",
@@ -99,5 +107,6 @@ __all__ = [
     "velocity_bounds",
     "violation",
     "voxels_within",
+    "write_path_point",
     "write_rows",
 ]

@@ -1,4 +1,4 @@
-"""Kernels of backup trajectories: rows of near pairs, velocity ramps, clearance of paths."""
+"""Kernels of backup trajectories: rows of near pairs, clearance of paths."""
 
 from __future__ import annotations
 
@@ -7,14 +7,9 @@ from typing import Any
 import numpy as np
 
 from qpavoid.kernels.bounds import velocity_bounds
-from qpavoid.kernels.kinematics import update_kinematics
-from qpavoid.kernels.near_pairs import place_bodies
 from qpavoid.kernels.packing import compiled
 from qpavoid.kernels.rows import distance_rows
 from qpavoid.problem import Array, IntArray, Mask
-
-ROUND_OFF = 1e-12
-"""Difference of velocities that counts as none [rad/s, m/s]."""
 
 
 @compiled
@@ -82,104 +77,20 @@ def closes_below(closest: Array, J: Array, feedforward: Array, v: Array, span: f
 
 
 @compiled
-def rate_limit(v: Array, targets: Array, v_step: Array, stop_when_met: bool) -> Array:
-    """Compute velocities of successive control steps, each as close to its target as the largest change allows.
+def max_offset(offset: Array, ramp: Array, targets: Array, dt: float) -> float:
+    """Compute the largest sum over the joints of how far they are from a trajectory, on the way back to it [rad, m].
 
     Args:
-        v: velocity (n,) before the first.
-        targets: velocities (k, n).
-        v_step: largest change of v in a control step (n,), infinite without a limit.
-        stop_when_met: whether to end at the first target that is met.
-
-    Returns:
-        Velocities until then (<= k, n).
-    """
-    ramp, v_prev = np.empty(targets.shape), v
-    for k in range(len(targets)):
-        error = 0.0
-        for c in range(len(v)):
-            ramp[k, c] = v_prev[c] + min(max(targets[k, c] - v_prev[c], -v_step[c]), v_step[c])
-            error = max(error, abs(ramp[k, c] - targets[k, c]))
-        if stop_when_met and error < ROUND_OFF:
-            return ramp[: k + 1]
-        v_prev = ramp[k]
-    return ramp
-
-
-@compiled
-def braking_travel(v: Array, dt: float, braking: Array) -> float:
-    """Compute the sum of the ways of all coordinates in a control period and in braking after it [rad, m].
-
-    Args:
-        v: velocity (n,) [rad/s or m/s].
+        offset: of the configuration now (n,) [rad or m].
+        ramp: velocities (k, n) of successive control steps.
+        targets: velocities (>= k, n) of the trajectory.
         dt: control period [s].
-        braking: way on which each coordinate brakes, over the square of its speed (n,) [s²/rad or s²/m].
     """
-    travel = 0.0
-    for i in range(len(v)):
-        travel += dt * abs(v[i]) + braking[i] * v[i] * v[i]
-    return travel
-
-
-@compiled
-def line_clearance(
-    x: Any, q: Array, spheres: Array, numbers: IntArray, states: Array, twists: Array, radii: Array, horizon: float
-) -> tuple[float, float]:
-    """Compute the least distance between bounding spheres of the robot at rest and of obstacles on straight lines.
-
-    Args:
-        x: memory of a control step, in which joints and the bodies that they move are placed.
-        q: configuration (nq,).
-        spheres: bounding sphere of each body in its frame, centre and radius (g, 4) [m].
-        numbers: of the obstacles (k,); those that do not move do not count.
-        states: of all obstacles (o, 18).
-        twists: velocities that they keep (o, 6) [m/s, rad/s].
-        radii: of their bounding spheres (o,) [m].
-        horizon: time for which they go on [s].
-
-    Returns:
-        The distance, infinite without any [m]; largest speed of any point of an obstacle [m/s].
-    """
-    update_kinematics(x.kinematics, q)
-    place_bodies(x.distances, x.joint_poses)
-    joints, poses = x.distances.joints, x.distances.poses
-    least, fastest, center = np.inf, 0.0, np.empty(3)
-    for i in numbers:
-        p, u, w, r = states[i, 9:12], twists[i, :3], twists[i, 3:], radii[i]
-        square, turning = u[0] ** 2 + u[1] ** 2 + u[2] ** 2, np.sqrt(w[0] ** 2 + w[1] ** 2 + w[2] ** 2)
-        if not (square > 0.0 or turning > 0.0):
-            continue
-        fastest = max(fastest, np.sqrt(square) + (turning * r if turning > 0.0 else 0.0))
-        for b in range(len(joints)):
-            if joints[b] < 0:
-                continue
-            pose, sphere, toward = poses[b], spheres[b], 0.0
-            for c in range(3):
-                center[c] = pose[c] * sphere[0] + pose[3 + c] * sphere[1] + pose[6 + c] * sphere[2] + pose[9 + c]
-                toward += (center[c] - p[c]) * u[c]
-            t = min(max(toward / square, 0.0), horizon) if square > 0.0 else 0.0
-            distance = 0.0
-            for c in range(3):
-                distance += (p[c] + t * u[c] - center[c]) ** 2
-            least = np.minimum(least, np.sqrt(distance) - r - sphere[3])
-    return least, fastest
-
-
-@compiled
-def min_sphere_distance(paths: Array, centers: Array, radii: Array) -> float:
-    """Compute the least distance between spheres along paths and spheres at rest [m]; infinite without any.
-
-    Args:
-        paths: sampled centers of the moving ones (t, o, 3) [m].
-        centers: of those at rest (b, 3) [m].
-        radii: sum of the two radii of each combination (o, b) [m].
-    """
-    least = np.inf
-    for o in range(paths.shape[1]):
-        for b in range(len(centers)):
-            nearest = np.inf
-            for t in range(len(paths)):
-                x, y, z = paths[t, o, 0] - centers[b, 0], paths[t, o, 1] - centers[b, 1], paths[t, o, 2] - centers[b, 2]
-                nearest = np.minimum(nearest, x * x + y * y + z * z)  # keeps NaN, unlike min
-            least = np.minimum(least, np.sqrt(nearest) - radii[o, b])
-    return least
+    sums, largest = offset.copy(), np.sum(np.abs(offset))
+    for i in range(len(ramp)):
+        total = 0.0
+        for j in range(len(sums)):
+            sums[j] += dt * (ramp[i, j] - targets[i, j])
+            total += abs(sums[j])
+        largest = max(largest, total)
+    return largest

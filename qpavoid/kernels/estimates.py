@@ -112,7 +112,7 @@ def fit_pose(x: Array, fit: Array, interval: float, max_speed: float) -> bool:
     fit[:12] = pose
     displacement, slope = _line(fit)
     x[12:] = displacement
-    _extrapolate(x, 1.0)
+    extrapolate(x, 1.0)
     x[12:] = slope
     return True
 
@@ -225,7 +225,7 @@ def extrapolate_estimates(
         if age > stale_after and not at_rest[i]:
             stale += 1
             margin[i] += MARGIN_GROWTH * (age - stale_after)
-        _extrapolate(x, min(age, longest))
+        extrapolate(x, min(age, longest))
     return stale
 
 
@@ -238,11 +238,11 @@ def extrapolate_states(states: Array, times: Array) -> None:
         times: (k,) [s].
     """
     for k in range(len(states)):
-        _extrapolate(states[k], times[k])
+        extrapolate(states[k], times[k])
 
 
 @compiled
-def _extrapolate(x: Array, t: float) -> None:
+def extrapolate(x: Array, t: float) -> None:
     """Bring one body (18,) to where it is after t [s]: p + t v, and R + sin φ [a] R + (1 - cos φ) [a]² R.
 
     The angle is φ = t |ω|, about the axis a = ω / |ω| (Rodrigues).

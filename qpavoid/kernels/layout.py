@@ -45,6 +45,8 @@ class RowLayout(NamedTuple):
     """(p + t,) largest commanded linear, then angular speed; infinite where there is none [m/s, rad/s]."""
     scale: Array
     """(r,) root of each row's weight."""
+    dead_beat: Array
+    """(r,) how near the gain of each row's task is to one that removes the error in a step, at most 1 [-]."""
     row_tasks: IntArray
     """(r,) number of each row's task: that of a frame, then the other tasks."""
     bending_rows: IntArray

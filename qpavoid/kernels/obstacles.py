@@ -17,6 +17,8 @@ FINE, NORMALISED, NOT_FINITE, FAR, FAST, NO_ROTATION, LEFT_HANDED = range(7)
 EXACT, NEARLY = 1e-6, 1e-3
 """|RᵀR - I| up to which a matrix is taken for a rotation as it is (rotations in single precision are 1e-7 off), and up
 to which it is replaced by the nearest rotation (the rounding of a matrix that was typed with three digits) [-]."""
+_EARLY = 1e-9
+"""Time before its start from which a piece counts [s]: k·dt may be rounded to less than the time it stands for."""
 SAMPLE, POSE, REST = range(3)
 """Kind of an update: with a twist, without one, at rest."""
 
@@ -43,13 +45,12 @@ class Pieces(NamedTuple):
 
 
 @compiled
-def sample_pieces(x: Pieces, t: float, tolerance: float, states: Array) -> None:
+def sample_pieces(x: Pieces, t: float, states: Array) -> None:
     """Write the states of the bodies of `x` at time t.
 
     Args:
         x: their motions.
         t: time [s].
-        tolerance: time before its start from which a piece counts [s]: t may be a sum that is rounded down.
         states: out (o, 18): rows `x.bodies`; the others are not changed.
     """
     weights = np.empty(7)
@@ -57,7 +58,7 @@ def sample_pieces(x: Pieces, t: float, tolerance: float, states: Array) -> None:
         low, high = x.first[k], x.first[k + 1]
         while high - low > 1:  # the piece lies in [low, high)
             middle = (low + high) // 2
-            if x.starts[middle] <= t + tolerance:
+            if x.starts[middle] <= t + _EARLY:
                 low = middle
             else:
                 high = middle

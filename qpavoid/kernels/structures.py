@@ -12,6 +12,7 @@ from qpavoid.kernels.kinematics import KinematicsArrays
 from qpavoid.kernels.layout import RowLayout
 from qpavoid.kernels.near_pairs import DistanceArrays
 from qpavoid.kernels.packing import compiled
+from qpavoid.kernels.rollout import RolloutArrays
 
 
 class _Structure(types.StructRef):  # type: ignore[misc]
@@ -34,6 +35,10 @@ class PackedRows(structref.StructRefProxy):  # type: ignore[misc]
     """A `RowLayout` in compiled code."""
 
 
+class PackedRollout(structref.StructRefProxy):  # type: ignore[misc]
+    """`RolloutArrays` in compiled code."""
+
+
 @structref.register
 class PackedKinematicsType(_Structure):
     """Type of `PackedKinematics`."""
@@ -49,10 +54,16 @@ class PackedRowsType(_Structure):
     """Type of `PackedRows`."""
 
 
+@structref.register
+class PackedRolloutType(_Structure):
+    """Type of `PackedRollout`."""
+
+
 for proxy, kind, fields in (
     (PackedKinematics, PackedKinematicsType, KinematicsArrays._fields),
     (PackedDistances, PackedDistancesType, DistanceArrays._fields),
     (PackedRows, PackedRowsType, RowLayout._fields),
+    (PackedRollout, PackedRolloutType, RolloutArrays._fields),
 ):
     structref.define_boxing(kind, proxy)
     structref.define_constructor(proxy, kind, list(fields))
@@ -76,10 +87,21 @@ def _pack_rows(fields: Any) -> Any:
     return PackedRows(*fields)
 
 
-_PACK = {KinematicsArrays: _pack_kinematics, DistanceArrays: _pack_distances, RowLayout: _pack_rows}
+@compiled
+def _pack_rollout(fields: Any) -> Any:
+    """Return a structure of `RolloutArrays`."""
+    return PackedRollout(*fields)
 
 
-def pack(layout: KinematicsArrays | DistanceArrays | RowLayout) -> Any:
+_PACK = {
+    KinematicsArrays: _pack_kinematics,
+    DistanceArrays: _pack_distances,
+    RowLayout: _pack_rows,
+    RolloutArrays: _pack_rollout,
+}
+
+
+def pack(layout: KinematicsArrays | DistanceArrays | RowLayout | RolloutArrays) -> Any:
     """Return memory in the form that the kernels take; both look into the same arrays.
 
     With `NUMBA_DISABLE_JIT=1` that is the named tuple itself.

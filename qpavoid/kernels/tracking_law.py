@@ -56,7 +56,7 @@ def tracking_law(x: Any, A: Array, b: Array, v: Array, b_feasible: Array) -> flo
     curvature that 1 m or 1 rad makes, |w|. In a direction that several tasks share, |w| counts each by its part in u_i.
 
     Args:
-        x: reads feedback, scale, row_tasks, bending_rows, straight_rows, v_max, dt, and what `add_curvature`
+        x: reads feedback, scale, dead_beat, row_tasks, bending_rows, straight_rows, v_max, dt, and what `add_curvature`
             does.
         A: (r, n).
         b: (r,).
@@ -64,7 +64,8 @@ def tracking_law(x: Any, A: Array, b: Array, v: Array, b_feasible: Array) -> flo
         b_feasible: out b/g (r,).
 
     Returns:
-        How far the rows bend within a control step, dt ‖b/g‖: the regularization that keeps a QP calm [-].
+        How far the rows bend within a control step, dt ‖b/g‖, of each as far as its gain nears 1/dt: the
+        regularization that keeps a QP calm [-].
     """
     bending, straight = x.bending_rows, x.straight_rows
     size = 0.0
@@ -89,7 +90,7 @@ def tracking_law(x: Any, A: Array, b: Array, v: Array, b_feasible: Array) -> flo
         solve_together(A, b_feasible, B, damping, v)
     bent = 0.0
     for r in bending:
-        part = x.scale[r] * b_feasible[r]
+        part = x.scale[r] * x.dead_beat[r] * b_feasible[r]
         bent += part * part
     return x.dt * np.sqrt(bent)
 

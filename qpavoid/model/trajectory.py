@@ -26,9 +26,6 @@ from qpavoid.model.csv_poses import read_poses
 from qpavoid.model.sample import POSE, STATE, Sample
 from qpavoid.problem import Array
 
-END_TOLERANCE = 1e-9
-"""Time before its end at which a piece ends [s]: k·dt may be a rounding error less than the time it stands for."""
-
 
 class Motion(Protocol):
     """A trajectory that is known beforehand."""
@@ -58,7 +55,7 @@ class Trajectory:
         if not math.isfinite(t):
             raise NumericalError(f"the time at which a motion is sampled is {t}")
         states = np.empty((1, STATE))
-        kernels.sample_pieces(self.pieces, t, END_TOLERANCE, states)
+        kernels.sample_pieces(self.pieces, t, states)
         return Sample.of_row(states[0])
 
 

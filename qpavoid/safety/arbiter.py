@@ -21,6 +21,7 @@ from qpavoid.safety.backup import BackupPlanner
 from qpavoid.safety.braking import BrakingCheck
 from qpavoid.safety.progress import ProgressMonitor
 from qpavoid.safety.recovery import recovery_limits, slow_recovery, slowed
+from qpavoid.safety.shake_damping import ShakeDamping
 from qpavoid.solvers import Solver
 
 _LIMIT_TOLERANCE = 2e-6
@@ -37,13 +38,14 @@ class Arbiter:
         self._settings, self.solver, self._rows = settings, solver, rows
         self._v_shape = (settings.scene.robot.model.nv,)
         self._braking = BrakingCheck(settings, rows, obstacles)
-        self.progress = ProgressMonitor(settings, rows)
+        self.progress, self._shake_damping = ProgressMonitor(settings, rows), ShakeDamping(settings.dt)
         has_backup = settings.avoidance.backup and len(settings.scene.slots) > 0
         self.backup = BackupPlanner(settings, rows.query.table, obstacles) if has_backup else None
 
     def reset(self) -> None:
         """Drop all that is known of earlier control steps."""
         self.progress.reset()
+        self._shake_damping.reset()
         if self.backup is not None:
             self.backup.reset()
 
@@ -62,11 +64,15 @@ class Arbiter:
             proximity: distances of this control step.
             from_tasks: whether the problem is of the tasks, whose progress is monitored; else of a given velocity.
         """
-        if from_tasks and problem.levels and self.solver.prioritised:
-            problem = self._rows.prioritised(problem)
+        if from_tasks:
+            problem = self._shake_damping.apply(problem)
+            if problem.levels and self.solver.prioritised:
+                problem = self._rows.prioritised(problem)
         solution = self._solve(q, problem, proximity, from_tasks)
-        if from_tasks and (stalled := self.progress.update(problem, solution)):
-            solution = solution._replace(stalled=stalled)
+        if from_tasks:
+            stalled = self.progress.update(problem, solution)
+            self._shake_damping.update(solution.v, proximity.feedforward, bool(stalled))
+            solution = solution._replace(stalled=stalled) if stalled else solution
         if self.backup is not None and self.solver.bounded:
             solution = self._ensure_backup(self.backup, q, t, proximity, problem, solution)
         return self._report_limits(problem, solution)

@@ -8,15 +8,17 @@ If none does, the kept trajectory is followed instead: it was verified, and stay
 predicted. This is the scheme of Agrawal, Chen and Panagou 2023, "gatekeeper: Online safety verification and control for
 nonlinear systems in dynamic environments", with rollouts of `qpavoid.safety.rollout` as its backup.
 
-Which policy stays clear is not known beforehand. So many are sampled, a few in every control step, as long as none is
-good enough: from the present state, and from states along the kept trajectory, whose beginning may be right though its
-end is not. The best trajectory of one control step is computed again in the next one, one step farther, from the state
-that the robot has then and with the obstacle states of then.
+Which policy stays clear is not known beforehand, and a rollout takes longer than a control step may. So candidates are
+computed one after the other, a fixed number of poses in every control step. Each begins in the state after the present
+command, with the velocities that will be commanded until it is known, and is cut by the control steps that have passed
+when it is. Meanwhile the kept trajectory counts. While none is known, as in the first control steps near an obstacle,
+the velocity of the solver is commanded, whose stop was looked ahead.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from math import ceil, inf
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -24,22 +26,50 @@ import pinocchio as pin
 from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.control.pair_table import PairTable
 from qpavoid.control.settings import ControlSettings
-from qpavoid.problem import Array, Proximity
+from qpavoid.errors import NumericalError
+from qpavoid.kernels.rollout import FINISHED, HORIZON, PAUSED, TOUCH
+from qpavoid.problem import Array, Mask, Proximity
 from qpavoid.safety.approach import ApproachCheck
-from qpavoid.safety.rollout import TOUCH, BackupPolicy, BackupRollouts, BackupScore, BackupTrajectory, Start
+from qpavoid.safety.rollout import LEAST_SCORE, BackupPolicy, BackupRollouts, BackupScore, BackupTrajectory, Start
 
+_POSE_RATE = 10_000.0
+"""Poses of candidates that are evaluated per time [1/s]: at 10 to 20 µs each, a tenth to a fifth of it."""
 _HORIZONS = (0.2, 0.05, 0.5)
 """h of backup policies [s]: the most successful first."""
-_CANDIDATES = 3
-"""Sampled trajectories that a control step may try [-]: more find a clear one sooner, at half a millisecond each."""
 _UNBIASED_FRACTION = 0.25
 """Fraction of the sampled policies without a bias velocity [-]."""
 _BIAS_SPEEDS = (2.0, 30.0)
 """Range of ‖v̂‖ of the others, log-uniform [rad/s, m/s]: from a tie-break to full speed."""
-_DECISION_TIME = 0.01
-"""Least time for which a decision holds [s]: rollouts take longer than a control step of a millisecond."""
+_CANDIDATES_AHEAD = 3
+"""Candidates that can be computed before the kept trajectory is no longer valid [-]: as many may fail. It holds the
+velocity of the solver as long, and the next one is begun so early."""
+_FIRST_CANDIDATES = 7
+"""Candidates that are tried near an obstacle before one is followed that does not suffice [-]."""
+_URGENT = 0.5
+"""Time before a contact in which the best candidate is followed all the same [s]."""
 _DISTANCE_TOLERANCE = 1e-6
 """Difference of two clearances that counts as none [m]."""
+_WITH_TASK, _ALONE = range(2)
+"""Kinds of candidates: with the velocity of the solver first; with that of the kept trajectory alone."""
+_CYCLE = 8, 4
+"""Candidates of each kind after which those that are not sampled are tried again."""
+
+
+class _Command(NamedTuple):
+    """What is commanded in a control step, as far as it is decided."""
+
+    v: Array
+    """(nv,)."""
+    after: Start
+    """State that it leads to."""
+    after_task: Start
+    """State that the velocity of the solver leads to."""
+    is_task: bool
+    """Whether it is the velocity of the solver."""
+
+    def to_task(self) -> _Command:
+        """Return the velocity of the solver as the command."""
+        return _Command(self.after_task.v, self.after_task, self.after_task, True)
 
 
 class BackupPlanner:
@@ -50,15 +80,27 @@ class BackupPlanner:
         self._model, self._obstacles, self._dt = settings.scene.robot.model, obstacles, settings.dt
         self._rollouts = BackupRollouts(settings, table, obstacles)
         self._approach = ApproachCheck(settings, self._rollouts, obstacles)
-        self._hold_steps = int(np.ceil(_DECISION_TIME / settings.dt - 1e-9)) - 1
-        """Control steps for which a decision holds after its own."""
+        self._poses = max(1, round(_POSE_RATE * settings.dt))
+        """Poses that are evaluated in a control step."""
+        self._steps_ahead = ceil(_CANDIDATES_AHEAD * self._rollouts.usual_poses / self._poses)
+        """Control steps in which that many candidates are computed."""
+        self._last_enabled = self._rollouts.enabled
         self.reset()
 
     def reset(self) -> None:
         """Drop the backup trajectory, and restart the random sequence."""
-        self._backup: BackupTrajectory | None = None
-        self._wait, self._sampled, self._random = 0, 0, np.random.default_rng(0)
+        self._random = np.random.default_rng(0)
         self._approach.reset()
+        self._forget()
+
+    def _forget(self) -> None:
+        """Drop the kept trajectory and the candidate."""
+        self._backup: BackupTrajectory | None = None
+        """Kept, from the present state on."""
+        self._kind, self._age = -1, 0
+        """Of the candidate, -1 without one; control steps since it began."""
+        self._tried, self._sampled, self._untried = [0, 0], 0, _FIRST_CANDIDATES
+        self._moving = self._obstacles.moving
 
     @property
     def velocities(self) -> Array:
@@ -76,75 +118,148 @@ class BackupPlanner:
             dv_prev: change of velocity (nv,) in that step.
             proximity: distances of this control step; pairs in contact do not count.
         """
-        if not len(self._obstacles.moving):
-            self._backup = None
+        is_same_scene = self._moving is self._obstacles.moving
+        is_near = len(self._obstacles.moving) > 0 and not self._approach.is_far(q, v, t)
+        if not (is_near and is_same_scene):
+            self._forget()
+        if not is_near:
             return None
-        if self._approach.is_far(q, v, t):
-            self._backup = None
-            return None
-        enabled = self._rollouts.enabled
-        next_state = Start(pin.integrate(self._model, q, self._dt * v), v, v - v_prev, t + self._dt, enabled)
-        touching = proximity.pair[proximity.distance < TOUCH]
-        if len(touching):
-            enabled = enabled.copy()
-            enabled[touching] = False
-            next_state = next_state._replace(enabled=enabled)
-        backup = self._backup
+        state = Start(q, v_prev.copy(), dv_prev.copy(), t, self._enabled(proximity))
+        backup, after_task = self._backup, self._after(state, v)
+        command = _Command(v, after_task, after_task, True)
         if backup is not None and len(backup.v):
-            remainder = self._rollouts.advance(backup)
-            is_valid = self._rollouts.is_valid_from(remainder, next_state, self._approach.max_speed)
-            if is_valid or (self._wait and abs(backup.start.t - t) <= self._dt):
-                self._backup, self._wait = remainder, max(self._wait - 1, 0)
-                return None if is_valid else _unless_equal(backup.v[0], v)
-        self._wait = self._hold_steps
-        return self._decide(next_state, Start(q, v_prev.copy(), dv_prev.copy(), t, enabled))
+            self._backup = self._rollouts.advance(backup)
+            if not (self._is_valid(self._backup, after_task) or self._may_wait(self._backup)):
+                command = _Command(backup.v[0], self._after(state, backup.v[0]), after_task, False)
+        else:
+            self._backup = None
+        command = self._search(command, command.is_task or self._is_valid(backup, state))
+        return None if command.is_task else _unless_equal(command.v, v)
 
-    def _decide(self, next_state: Start, state: Start) -> Array | None:
-        """Compare trajectories from the next state with those from the present one.
+    def _enabled(self, proximity: Proximity) -> Mask:
+        """Return the enabled pairs (m,), without those in contact."""
+        enabled = self._rollouts.enabled
+        enabled[proximity.pair[proximity.distance < TOUCH]] = False
+        if not np.array_equal(enabled, self._last_enabled):
+            self._last_enabled = enabled
+        return self._last_enabled  # the same array, so that it need not be compared again
 
-        None if one from the next state is sufficient, or not worse than any from the present one; else the first
-        velocity (nv,) of the best from the present one.
+    def _after(self, state: Start, v: Array) -> Start:
+        """Return the state after a control step at v (nv,)."""
+        q = pin.integrate(self._model, state.q, self._dt * v)
+        return Start(q, v, v - state.v, state.t + self._dt, state.enabled)
+
+    def _is_valid(self, trajectory: BackupTrajectory | None, start: Start) -> bool:
+        """Return whether a trajectory is certainly sufficient from a start close to its own."""
+        return trajectory is not None and self._rollouts.is_valid_from(trajectory, start, self._approach.max_speed)
+
+    def _may_wait(self, backup: BackupTrajectory) -> bool:
+        """Return whether the search has just begun, and the best trajectory so far leads to no contact soon."""
+        return self._untried > 0 and backup.score.time_to_contact > _URGENT
+
+    def _search(self, command: _Command, is_valid: bool) -> _Command:
+        """Evaluate the poses of this control step; return what is commanded with what they show.
+
+        Args:
+            command: of this control step, with the kept trajectory.
+            is_valid: whether that is certainly sufficient.
         """
-        v, sufficient = next_state.v, self._rollouts.sufficient_score
-        best = self._best(next_state, self._candidates(v))
-        if best.score < sufficient:
-            backup, trials = self._current_backup(state)
-            best = self._best(next_state, ((self._sample_policy(), self._hold(v)) for _ in range(trials)), best)
-            if not self._not_worse(best.score, backup.score) and len(backup.v):
-                self._backup = self._rollouts.advance(backup)
-                return _unless_equal(backup.v[0], v)
-        self._backup = best
-        if best.score >= sufficient:
-            self._sampled = 0
-        return None
-
-    def _candidates(self, v: Array) -> Iterator[tuple[BackupPolicy, Array]]:
-        """Yield policies and velocity prefixes: those of the backup trajectory, and a stop."""
-        prefix = self._hold(v)
-        if self._backup is not None and len(self._backup.v):
-            policy, remainder = self._backup.policy, self._backup.v[1:]
-            yield policy, prefix
-            yield policy, np.concatenate((prefix, remainder[len(prefix) :]))
-        yield self._rollouts.stop_policy, prefix
-
-    def _hold(self, v: Array) -> Array:
-        """Repeat v (nv,) for the control steps (k, nv) until the next decision."""
-        return np.tile(v, (self._hold_steps, 1))
-
-    def _best(
-        self,
-        start: Start,
-        candidates: Iterable[tuple[BackupPolicy, Array | None]],
-        best: BackupTrajectory | None = None,
-    ) -> BackupTrajectory:
-        """Return the first sufficient trajectory, or the best of all; candidates after it are not computed."""
-        if best is None or best.score < self._rollouts.sufficient_score:
-            for policy, prefix in candidates:
-                best = self._rollouts.rollout(start, policy, prefix, best) or best
-                if best is not None and best.score >= self._rollouts.sufficient_score:
+        poses, rollouts, self._age = self._poses, self._rollouts, self._age + 1
+        if command.is_task and self._kind == _ALONE:
+            self._kind = -1
+        while True:
+            if self._kind < 0:
+                if self._steps_needed(poses) > self._steps_needed(self._poses) or self._lasts(command):
                     break
-        assert best is not None
-        return best
+                self._begin(command, is_valid, poses)
+            try:
+                code = rollouts.resume(poses)
+            except NumericalError:  # of a predicted state
+                self._kind = -1
+                raise
+            poses = rollouts.poses_left
+            if code == PAUSED:
+                break
+            kind, self._kind = self._kind, -1
+            candidate = rollouts.result() if code == FINISHED else None
+            if candidate is None or len(candidate.v) <= self._age:
+                continue
+            candidate = rollouts.advance(candidate, self._age)
+            if kind == _ALONE:
+                self._backup = candidate
+            elif self._is_acceptable(candidate, command.after_task):
+                self._backup, command = candidate, command.to_task()
+                if candidate.score >= rollouts.sufficient_score:
+                    self._tried, self._sampled, self._untried, is_valid = [0, 0], 0, 0, True
+                    if self._age == 0:
+                        break
+        return command
+
+    def _lasts(self, command: _Command) -> bool:
+        """Return whether the kept trajectory will be valid until others are known, if the same is commanded."""
+        start, backup, steps = command.after, self._backup, self._steps_ahead
+        if backup is None or not command.is_task or len(backup.v) <= steps:
+            return False
+        q = pin.integrate(self._model, start.q, steps * self._dt * start.v)
+        later = Start(q, start.v, np.zeros_like(start.v), start.t + steps * self._dt, start.enabled)
+        return self._is_valid(self._rollouts.advance(backup, steps), later)
+
+    def _is_acceptable(self, candidate: BackupTrajectory, after_task: Start) -> bool:
+        """Return whether the velocity of the solver may be commanded with a candidate that begins with it."""
+        backup, sufficient = self._backup, self._rollouts.sufficient_score
+        if backup is None or self._is_valid(candidate, after_task):
+            return True
+        return backup.score < sufficient and self._not_worse(candidate.score, backup.score)
+
+    def _begin(self, command: _Command, is_valid: bool, poses: int) -> None:
+        """Begin the next candidate, of which some poses can be evaluated in this control step."""
+        self._kind = _WITH_TASK if is_valid or self._backup is None or sum(self._tried) % 2 else _ALONE
+        if self._backup is None:
+            self._tried[_WITH_TASK] = max(self._tried[_WITH_TASK], 2)
+        number, self._age = self._tried[self._kind] % _CYCLE[self._kind], 0
+        self._tried[self._kind] += 1
+        self._untried -= 1
+        steps = self._steps_needed(poses)
+        begin = self._begin_with_task if self._kind == _WITH_TASK else self._begin_alone
+        begin(command, number, steps)
+
+    def _begin_with_task(self, command: _Command, number: int, steps: int) -> None:
+        """Begin a candidate that goes on with the velocity of the solver, in so many control steps."""
+        backup, v = self._backup, command.after_task.v
+        start, prefix = command.after_task, np.tile(v, (steps + self._steps_ahead - 1, 1))
+        if backup is not None and not command.is_task and steps:
+            start, prefix = command.after, np.concatenate((backup.v[: steps - 1], prefix[steps - 1 :]))
+        if backup is not None and number < 2:
+            policy = backup.policy
+            prefix = np.concatenate((prefix, backup.v[len(prefix) :])) if number == 1 else prefix
+        else:
+            policy = self._rollouts.stop_policy if number == 2 else self._sample_policy()
+        self._rollouts.begin(start, policy, prefix, self._least_score(steps + 1))
+
+    def _least_score(self, steps: int) -> BackupScore:
+        """Return what a candidate has to exceed that goes on with the velocity of the solver some steps later."""
+        backup, sufficient = self._backup, self._rollouts.sufficient_score
+        if backup is None:
+            return LEAST_SCORE
+        if backup.score >= sufficient:
+            return sufficient._replace(clearance=sufficient.clearance - _DISTANCE_TOLERANCE)
+        return BackupScore(backup.score.time_to_contact - steps * self._dt, -inf)
+
+    def _begin_alone(self, command: _Command, number: int, steps: int) -> None:
+        """Begin a candidate with the beginning of the kept trajectory, or with all of it: then it replaces that."""
+        backup, rollouts = self._backup, self._rollouts
+        assert backup is not None
+        if number == 0:
+            rollouts.begin(command.after, backup.policy, backup.v, LEAST_SCORE)
+            return
+        k = rollouts.decision_before(command.after, int(self._random.integers(len(backup.v) + 1))) if number % 2 else 0
+        time, clearance = backup.score
+        least = BackupScore(time - steps * self._dt if time < HORIZON else time, clearance)
+        rollouts.begin(command.after, self._sample_policy(), backup.v[: max(k, steps)], least)
+
+    def _steps_needed(self, poses: int) -> int:
+        """Return the control steps after this one that a trajectory takes with so many poses in this one."""
+        return max(0, ceil((self._rollouts.usual_poses - poses) / self._poses))
 
     def _not_worse(self, later: BackupScore, now: BackupScore) -> bool:
         """Return whether a trajectory that begins in the next control step is not worse than one that begins now.
@@ -157,18 +272,6 @@ class BackupPlanner:
             later.time_to_contact + self._dt >= now.time_to_contact
             and later.clearance >= now.clearance - _DISTANCE_TOLERANCE
         )
-
-    def _current_backup(self, start: Start) -> tuple[BackupTrajectory, int]:
-        """Return the backup trajectory, verified from `start`, or a better one; and the number of unused trials."""
-        backup, trials, rollouts = self._backup, _CANDIDATES, self._rollouts
-        if backup is not None and rollouts.is_valid_from(backup, start, self._approach.max_speed):
-            return backup._replace(start=start), trials
-        best = self._best(start, [(rollouts.stop_policy, None) if backup is None else (backup.policy, backup.v)])
-        while trials and best.score < rollouts.sufficient_score:
-            trials -= 1
-            k = rollouts.decision_before(start, int(self._random.integers(len(best.v) + 1))) if trials % 2 else 0
-            best = rollouts.rollout(start, self._sample_policy(), best.v[:k], best) or best
-        return best, trials
 
     def _sample_policy(self) -> BackupPolicy:
         """Sample a policy: each unbiased horizon once, then random ones."""

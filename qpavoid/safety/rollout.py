@@ -11,7 +11,9 @@ beforehand (see `qpavoid.safety.backup`).
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
+from math import ceil, inf
 from typing import NamedTuple
 
 import numpy as np
@@ -19,39 +21,41 @@ import pinocchio as pin
 
 from qpavoid import kernels
 from qpavoid.control.distances import DistanceQuery
-from qpavoid.control.estimates import ObstacleEstimates, prediction_error_bound
 from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.control.pair_table import PairTable
 from qpavoid.control.row_layout import lay_out
 from qpavoid.control.settings import ControlSettings
+from qpavoid.errors import NumericalError
+from qpavoid.kernels.prediction import Prediction
+from qpavoid.kernels.ramps import RampLimits
+from qpavoid.kernels.rollout import (
+    BEYOND,
+    FINISHED,
+    HORIZON,
+    NOT_FINITE,
+    PROGRESS,
+    TO_MEASURE,
+    TO_MOVE,
+    RolloutArrays,
+)
 from qpavoid.model.kinematics import ForwardKinematics, max_lever_arm
+from qpavoid.model.limits import JointBounds
 from qpavoid.problem import Array, Mask
-from qpavoid.safety.jerk import Ramps
 
-HORIZON = 1.5
-"""Time for which a backup trajectory has to stay clear [s]: longer than an arm needs to stop or to step aside."""
 _PERIOD = 0.04
 """Time between two decisions of a backup trajectory, about [s]: at 1 m/s, less than half of the preferred distance."""
-_INFLUENCE_DISTANCE = 0.3
-"""Distance below which a pair counts [m]: what closes in at 1 m/s within the longest policy horizon is seen before."""
-PREFERRED_DISTANCE = 0.1
-"""c: distance from which on a pair is not parted any farther [m]: the default influence distance of the rows."""
+_INFLUENCE_DISTANCE = 0.2
+"""Distance below which a pair counts [m]: twice the preferred one; 0.3 takes twice as long, and finds no more."""
+_INFLUENCE_DISTANCE_OF_SLOW = 0.3
+"""The same of robots with jerk limits, which have to begin earlier [m]."""
 _DISTANCE_SCALE = 0.5
 """Fraction of the safety distance that has to be kept [-]: predictions may be wrong by the other half."""
-TOUCH = 1e-3
-"""Distance below which a pair counts as in contact [m]: above the error of any distance algorithm in use."""
-_EFFORT_WEIGHT = 1e-4
-"""ε: weight of the square of a joint speed beside that of a distance [m²/(rad/s)²]; only breaks ties."""
-_MAX_DEPTH = 10.0
-"""Lower bound of s in the QP [m]: deeper than any penetration."""
 _ROUND_OFF = 1e-6
 """Difference of two times that counts as none [s]."""
-_BEYOND = 0.1
-"""Time by which a rollout exceeds the horizon [s], so that it stays valid for some control steps."""
-
-Near = tuple[Array, Array, Array]
-"""Witness points (k, 10), distances first, Jacobians (k, nv) and feed-forward (k,) of the enabled pairs within the
-influence distance; in memory that the next evaluation overwrites."""
+_UNLIMITED = 1e9
+"""Stands for no limit of a speed, or of the change of its change [rad/s, m/s]: finite, so that 0 times it is 0."""
+_ALL_POSES = 10**9
+"""More poses than any rollout evaluates [-]."""
 
 
 class BackupPolicy(NamedTuple):
@@ -90,40 +94,26 @@ class BackupScore(NamedTuple):
     """Least distance of the pairs without contact, capped at the one that suffices [m]."""
 
 
+LEAST_SCORE = BackupScore(-inf, -inf)
+"""Score that every trajectory exceeds."""
+
+
 class BackupTrajectory(NamedTuple):
     """Velocities of successive control steps, and what is known of where they lead."""
 
     start: Start
     v: Array
     """(k, nv) of each control step."""
+    q: Array
+    """(k, nq) where each leads."""
     policy: BackupPolicy
     score: BackupScore
     contact_time: float
     """Time of the first contact; without one, the end [s]."""
     clearance: float
     """Least distance of the pairs without contact, at most the influence distance [m]."""
-    estimates: ObstacleEstimates | None
-    """Of the external obstacles, as the trajectory was computed."""
-
-
-class _Contacts:
-    """Contacts along a backup trajectory, summed up as it is computed."""
-
-    def __init__(self, start: Start) -> None:
-        self.enabled, self.time, self.clearance = start.enabled.copy(), np.inf, np.inf
-        self.lost_time, self._clearance_before, self._deadline = 0.0, np.inf, start.t + HORIZON
-
-    def add(self, count: int, nearest: float, nearest_separable: float, t: float, span: float) -> None:
-        """Add a pose at t [s], `span` after the one before; contacts are dated by interpolation between the two.
-
-        There, `count` pairs come into contact; the least distance with these, and without, is given [m].
-        """
-        if count:
-            closing = self._clearance_before - nearest
-            time = t - span * (TOUCH - nearest) / closing if 0.0 < closing < np.inf else t
-            self.time = min(self.time, time)
-            self.lost_time += count * max(self._deadline - time, 0.0)
-        self.clearance, self._clearance_before = min(self.clearance, nearest_separable), nearest_separable
+    prediction: Prediction
+    """Of the obstacles, that the trajectory was computed with."""
 
 
 class BackupRollouts:
@@ -133,41 +123,81 @@ class BackupRollouts:
         """Allocate all memory, and compile all kernels."""
         scene, self._dt = settings.scene, settings.dt
         model = self._model = scene.robot.model
-        self._obstacles, self._period_steps = obstacles, max(1, int(np.ceil(_PERIOD / self._dt - 1e-9)))
-        self.period = self._period_steps * self._dt
+        self._obstacles, period_steps = obstacles, max(1, int(np.ceil(_PERIOD / self._dt - 1e-9)))
+        self.period = period_steps * self._dt
         """Time between two decisions [s]."""
         self.kinematics, self.query = ForwardKinematics(model), DistanceQuery(scene, table)
+        is_slow = bool(np.isfinite(settings.bounds.jerk).any())
+        self._influence_distance = _INFLUENCE_DISTANCE_OF_SLOW if is_slow else _INFLUENCE_DISTANCE
+        self.query.set_influence_distance(self._influence_distance)
         # a velocity may be asked for that is farther away than jerk limits allow in a period
         free = replace(settings.bounds, jerk=np.full(model.nv, np.inf))
         relaxed = replace(settings, bounds=free, dt=self.period)
-        self._layout = lay_out(relaxed, (), (), self.kinematics, self.query)
-        self.packed, self._views = kernels.pack(self._layout), dict[int, Near]()
-        self._is_vector_space = all(joint.nv <= 1 for joint in list(model.joints)[1:])
-        """Whether configurations add up: joints of one coordinate at most."""
-        self.ramps = Ramps(settings.bounds, self._dt)
-        """Velocity ramps within the limits."""
+        self.packed = kernels.pack(lay_out(relaxed, (), (), self.kinematics, self.query))
+        self._ramp_limits = _ramp_limits(settings.bounds, self._dt)
+        self._is_accelerated = bool(np.isfinite(settings.bounds.acceleration).any())
         self.lever_arm = max(1.0, max_lever_arm(model, table.max_extension()))
         """Bound on the distance that a point of the robot moves when a joint moves by 1 [m/rad, 1]."""
         self.sufficient_score = BackupScore(HORIZON, _DISTANCE_SCALE * settings.safety_distance)
         """Score from which on a backup trajectory need not be improved."""
         zero = np.zeros(model.nv)
+        self.usual_poses = ceil((HORIZON + BEYOND) / self.period) + 3
+        """Poses of a trajectory without any midway [-]: of its start, every period, and where its prefix ends."""
         self.stop_policy = BackupPolicy(0.0, zero)
         """Braking to a standstill."""
+        self._memory = self._lay_out(period_steps)
+        self._packed_memory, self._progress = kernels.pack(self._memory), self._memory.progress[0]
+        self._poses: Array = self._memory.progress.view(np.ndarray)["poses"]
+        self._has_kernels = self.kinematics.is_compiled and not self.query.has_clouds
         # every kernel once, so that no control step waits for the compiler
-        near = self._evaluate(scene.robot.home, 0.0, zero, _Contacts(Start(zero, zero, zero, 0.0, self.enabled)), 0.0)
-        kernels.closes_below(*near, zero, 1.0, 0.0)
-        self.ramps.follow(zero, zero, self._policy_velocity(near, BackupPolicy(0.1, zero))[None])
+        self.begin(Start(scene.robot.home, zero, zero, 0.0, self.enabled), BackupPolicy(0.1, zero), None, LEAST_SCORE)
+        with suppress(NumericalError):  # of a trajectory that gives nonsense: the steps say so
+            self.resume(2)
+        self.result()
+        ramp = kernels.follow_ramp(self._ramp_limits, zero, zero, zero[None], False, True)
+        kernels.max_offset(zero, ramp, zero[None], self._dt)
+        kernels.prediction_error_bound(obstacles.prediction, obstacles.prediction, 0.0, self.query.obstacle_radii)
+
+    def _lay_out(self, period_steps: int) -> RolloutArrays:
+        """Lay out the memory of one rollout."""
+        model, count = self._model, int((HORIZON + BEYOND) / self._dt) + 2 + period_steps
+        progress = np.zeros(1, PROGRESS).view(np.recarray)
+        s = progress[0]
+        s.influence_distance = self._influence_distance
+        s.dt, s.period_steps, s.sufficient = self._dt, period_steps, self.sufficient_score.clearance
+        s.completes_outside = not self.query.is_compiled
+        s.moves_outside = model.nq != model.nv
+        return RolloutArrays(
+            progress=progress,
+            q=np.zeros((count + 1, model.nq)),
+            v=np.zeros((count + 1, model.nv)),
+            dv=np.zeros(model.nv),
+            prefix=np.zeros((count, model.nv)),
+            bias_velocity=np.zeros(model.nv),
+            targets=np.zeros((period_steps, model.nv)),
+            ramp_limits=self._ramp_limits,
+            q_middle=np.zeros(model.nq),
+            q_pose=np.zeros(model.nq),
+            v_pose=np.zeros(model.nv),
+            enabled=self.enabled,
+            states=self._obstacles.current.states.copy(),
+        )
 
     @property
     def enabled(self) -> Mask:
         """(m,) pairs whose distance depends on a joint, and that may not come into contact."""
         return np.asarray(self.query.table.separable & ~self.query.table.ignored)
 
-    def advance(self, trajectory: BackupTrajectory) -> BackupTrajectory:
-        """Return a trajectory without its first control step."""
-        (q, v_prev, _, t, enabled), v = trajectory.start, trajectory.v[0]
-        start = Start(pin.integrate(self._model, q, self._dt * v), v, v - v_prev, t + self._dt, enabled)
-        return trajectory._replace(start=start, v=trajectory.v[1:])
+    def advance(self, trajectory: BackupTrajectory, steps: int = 1) -> BackupTrajectory:
+        """Return a trajectory without its first control steps, which are as many as it has at the most."""
+        if steps == 0:
+            return trajectory
+        start, score, v, last = trajectory.start, trajectory.score, trajectory.v, steps - 1
+        v_prev = start.v if last == 0 else v[last - 1]
+        start = Start(trajectory.q[last], v[last], v[last] - v_prev, start.t + steps * self._dt, start.enabled)
+        if score.time_to_contact < HORIZON:
+            score = score._replace(time_to_contact=score.time_to_contact - steps * self._dt)
+        return trajectory._replace(start=start, v=v[steps:], q=trajectory.q[steps:], score=score)
 
     def is_valid_from(self, trajectory: BackupTrajectory, start: Start, max_obstacle_speed: float = 0.0) -> bool:
         """Return whether a sufficient trajectory is certainly so from a start close to its own, without a rollout.
@@ -180,108 +210,113 @@ class BackupRollouts:
         if trajectory.contact_time < start.t + HORIZON - 1e-9:
             return False
         delay = abs(start.t - trajectory.start.t)
-        if delay > self._dt or not np.array_equal(trajectory.start.enabled, start.enabled):
+        if delay > self._dt or not _is_equal(trajectory.start.enabled, start.enabled):
             return False
-        offset = pin.difference(self._model, trajectory.start.q, start.q)
-        max_offset = float(np.abs(offset).sum())
-        if self.ramps.has_acceleration_limits:
-            ramp = self.ramps.follow(start.v, start.dv, trajectory.v, stop_when_met=True)
-            offset = offset + self._dt * np.cumsum(ramp - trajectory.v[: len(ramp)], axis=0)
-            max_offset = max(max_offset, float(np.abs(offset).sum(axis=1).max(initial=0.0)))
-        obstacle_offset = (delay * max_obstacle_speed if delay > _ROUND_OFF else 0.0) + prediction_error_bound(
-            self._obstacles.estimates, trajectory.estimates, HORIZON + _BEYOND, self.query.obstacle_radii
-        )
+        offset, ramp = pin.difference(self._model, trajectory.start.q, start.q), trajectory.v[:0]
+        if self._is_accelerated:
+            ramp = kernels.follow_ramp(self._ramp_limits, start.v, start.dv, trajectory.v, False, True)
+        max_offset = kernels.max_offset(offset, ramp, trajectory.v, self._dt)
+        obstacle_offset = delay * max_obstacle_speed if delay > _ROUND_OFF else 0.0
+        now, then = self._obstacles.prediction, trajectory.prediction
+        if now is not then and (len(now.external) or len(then.external)):
+            radii = self.query.obstacle_radii
+            obstacle_offset += kernels.prediction_error_bound(now, then, HORIZON + BEYOND, radii)
         clearance = trajectory.clearance - self.lever_arm * max_offset - obstacle_offset
         return bool(clearance >= self.sufficient_score.clearance)
 
     def rollout(
         self, start: Start, policy: BackupPolicy, prefix: Array | None, must_beat: BackupTrajectory | None
     ) -> BackupTrajectory | None:
-        """Compute a backup trajectory, with a decision in every period until the horizon.
+        """Compute a backup trajectory in one go, which has to be better than another one; see `begin`.
 
-        Distances are evaluated as often, and midway where a pair may come too near and part again before that. A pair
-        that has been in contact does not count any more. All trajectories decide and evaluate at the same times,
-        multiples of the period, so that their scores can be compared; and at the end of the prefix.
+        Returns:
+            The trajectory; None if it is no better than the other one.
+        """
+        least = LEAST_SCORE if must_beat is None else must_beat.score
+        self.begin(start, policy, prefix, least)
+        return self.result() if self.resume(_ALL_POSES) == FINISHED else None
+
+    def begin(self, start: Start, policy: BackupPolicy, prefix: Array | None, least_score: BackupScore) -> None:
+        """Begin a backup trajectory, with a decision in every period until the horizon.
+
+        Distances are evaluated as often, and midway where a pair may come too near and part again before that. All
+        trajectories decide and evaluate at the same times, multiples of the period, so that their scores can be
+        compared; and at the end of the prefix.
 
         Args:
             start: where it begins.
             policy: how it keeps away.
             prefix: velocities (k, nv) of the first control steps, before the policy decides.
-            must_beat: a trajectory; the rollout ends as soon as its score is no better.
-
-        Returns:
-            The trajectory; None if it is no better than the other one.
+            least_score: that it has to exceed; the rollout ends as soon as it does not.
         """
-        q, v, dv, t, _ = start
-        end, velocities, contacts = t + HORIZON + _BEYOND, list[Array](), _Contacts(start)
-        sufficient = self.sufficient_score.clearance
-        near = self._evaluate(q, t, v, contacts, 0.0)
-        remaining = np.zeros((0, len(v))) if prefix is None else prefix
-        for _ in range(int((HORIZON + _BEYOND) / self._dt) + 2):
-            if t >= end - 1e-9:
-                break
-            count = self._period_steps - round(t / self._dt) % self._period_steps
-            targets, remaining = remaining[:count], remaining[count:]
-            decides = not len(targets)
-            if decides:
-                targets = self._policy_velocity(near, policy)[None].repeat(count, axis=0)
-            count = len(targets)
-            ramp = self.ramps.follow(v, dv, targets, decides)
-            q_next, span = self._integrate(q, ramp), count * self._dt
-            if kernels.closes_below(*near, ramp[count // 2], span, sufficient):
-                span *= 0.5
-                t += span
-                self._evaluate(pin.interpolate(self._model, q, q_next, 0.5), t, v, contacts, span)
-            t += span
-            near = self._evaluate(q_next, t, ramp[-1], contacts, span)
-            score = BackupScore(HORIZON - contacts.lost_time, min(contacts.clearance, sufficient))
-            if must_beat is not None and score <= must_beat.score:
-                return None
-            velocities.append(ramp)
-            dv = ramp[-1] - (ramp[-2] if count > 1 else v)
-            q, v = q_next, ramp[-1]
-        contact_time, estimates = min(contacts.time, t), self._obstacles.estimates
-        v_all = np.concatenate(velocities)
-        return BackupTrajectory(start, v_all, policy, score, contact_time, contacts.clearance, estimates)
+        self._start, self._policy, self._prediction = start, policy, self._obstacles.prediction
+        r, count = self._memory, 0 if prefix is None else min(len(prefix), len(self._memory.prefix))
+        if prefix is not None:
+            r.prefix[:count] = prefix[:count]
+        r.q[0], r.v[0], r.dv[:], r.bias_velocity[:] = start.q, start.v, start.dv, policy.bias_velocity
+        r.enabled[:] = start.enabled
+        in_python = not self._has_kernels or bool(self._obstacles.custom_trajectories)
+        kernels.begin_rollout(self._packed_memory, start.t, policy.horizon, count, *least_score, in_python)
+
+    def resume(self, poses: int) -> int:
+        """Go on with the rollout until it is FINISHED or DROPPED, or PAUSED after evaluating some poses.
+
+        Raises:
+            NumericalError: NaN or infinity in the state of an obstacle, as predicted; names it.
+        """
+        self._poses[0] = poses
+        while True:
+            code, *counts = kernels.advance_rollout(self._packed_memory, self.packed, self._prediction)
+            if code == TO_MEASURE:
+                self._measure(*counts)
+            elif code == TO_MOVE:
+                self._move()
+            elif code == NOT_FINITE:
+                self.query.place(self._obstacles.at(self._progress.t_pose, self._prediction))  # raises
+            else:
+                return int(code)
+
+    @property
+    def poses_left(self) -> int:
+        """Poses that were not evaluated of those that `resume` was to evaluate."""
+        return int(self._poses[0])
+
+    def result(self) -> BackupTrajectory:
+        """Return the trajectory that is finished."""
+        steps, time_to_contact, contact_time, clearance = kernels.rollout_outcome(self._packed_memory)
+        score = BackupScore(time_to_contact, min(clearance, self.sufficient_score.clearance))
+        v, q = self._memory.v[1 : steps + 1].copy(), self._memory.q[1 : steps + 1].copy()
+        return BackupTrajectory(self._start, v, q, self._policy, score, contact_time, clearance, self._prediction)
 
     def decision_before(self, start: Start, k: int) -> int:
         """Return the last decision, as a control step, of a trajectory from `start` before step k; 0 without any."""
-        return max(k - (round(start.t / self._dt) + k) % self._period_steps, 0)
+        return max(k - (round(start.t / self._dt) + k) % len(self._memory.targets), 0)
 
-    def _integrate(self, q: Array, velocities: Array) -> Array:
-        """Integrate the velocities (k, nv) of successive control steps from q (nq,)."""
-        if self._is_vector_space:
-            return np.asarray(pin.integrate(self._model, q, self._dt * np.add.reduce(velocities)))
-        for v in velocities:
-            q = pin.integrate(self._model, q, self._dt * v)
-        return q
+    def _measure(self, near: int, rows: int, meeting: int) -> None:
+        """Compute the distances of a pose, as far as the kernels did not."""
+        if not self._progress.measures_outside:
+            self.query.finish(near, rows, meeting)
+            return
+        query, s = self.query, self._progress
+        query.place(self._obstacles.at(s.t_pose, self._prediction))
+        self.kinematics.compute(self._memory.q_pose)
+        query.compute(self.kinematics.joint_poses, self._influence_distance)
+        s.rows, s.is_moving = len(query.pairs), query.is_moving
 
-    def _evaluate(self, q: Array, t: float, v: Array, contacts: _Contacts, span: float) -> Near:
-        """Evaluate the rows of near pairs, and the contacts, at q (nq,) and t [s], `span` after the pose before.
+    def _move(self) -> None:
+        """Write configurations up to the next decision."""
+        r, s = self._memory, self._progress
+        first, last = s.steps, s.steps + s.count
+        for i in range(first, last):
+            r.q[i + 1] = pin.integrate(self._model, r.q[i], self._dt * r.v[i + 1])
+        r.q_middle[:] = pin.interpolate(self._model, r.q[first], r.q[last], 0.5)
 
-        v (nv,) is the velocity of the control step before.
-        """
-        query = self.query
-        query.place(self._obstacles.at(t))
-        self.kinematics.compute(q)
-        query.compute(self.kinematics.joint_poses, _INFLUENCE_DISTANCE)
-        self._layout.v_prev[:] = v
-        k, touching, nearest, nearest_separable = kernels.backup_rows(
-            self.packed, q, query.pairs, _INFLUENCE_DISTANCE, query.is_moving, contacts.enabled, TOUCH
-        )
-        contacts.add(touching, nearest, nearest_separable, t, span)
-        if k not in self._views:
-            x = self._layout
-            self._views[k] = x.closest[:k], x.J[:k], x.feedforward[:k]
-        return self._views[k]
 
-    def _policy_velocity(self, near: Near, policy: BackupPolicy) -> Array:
-        """Compute the velocity (nv,) of a policy for the next period; that of a stop where its QP fails."""
-        x, (h, bias) = self._layout, policy
-        v: Array | float = 0.0
-        if h:
-            farthest, converged = kernels.max_clearance_velocity(
-                h, *near, PREFERRED_DISTANCE, _MAX_DEPTH, _EFFORT_WEIGHT, bias, x.lower, x.upper
-            )
-            v = farthest if converged else v
-        return np.asarray(np.minimum(np.maximum(v, x.lower), x.upper))
+def _is_equal(a: Mask, b: Mask) -> bool:
+    return a is b or np.array_equal(a, b)
+
+
+def _ramp_limits(bounds: JointBounds, dt: float) -> RampLimits:
+    """Return what the limits of the joints allow in control steps of dt [s]."""
+    dv_step, max_speed = np.minimum(bounds.jerk * dt * dt, _UNLIMITED), np.minimum(bounds.velocity, _UNLIMITED)
+    return RampLimits(bounds.acceleration * dt, dv_step, max_speed, bool(np.isfinite(bounds.jerk).any()))

@@ -23,7 +23,8 @@ class Qp(NamedSolver):
     As A v_t = b wherever the task can be met, the first term is the tracking cost ‖A v - b‖²; that λ counts from v_t,
     not from 0, leaves tracking without bias. λ is `regularization`, or what the task rows bend within a control step,
     `Problem.bent`, where that is more: the cost does not contain the curvature of the tasks, and where rows keep the
-    robot from a target that is far, a flat optimum of it would jump from vertex to vertex.
+    robot from a target that is far, a flat optimum of it would jump from vertex to vertex. `safety.shake_damping` makes
+    it more while a stalled robot shakes.
 
     Where no velocity meets all constraints, margins are relaxed, then acceleration limits, then contact of pairs, as
     little as possible and the deepest pair least (`solvers.relaxation`). An answer of a back end counts only if it

@@ -20,7 +20,11 @@ def in_order(tasks: Sequence[RowTask]) -> tuple[list[FrameTask], list[RowTask]]:
     return sorted(frames, key=lambda task: not task.moves), row_tasks
 
 
-def task_layout(frames: Sequence[FrameTask], row_tasks: Sequence[RowTask], model: Any) -> dict[str, Any]:
+_DEAD_BEAT = 0.2
+"""Share of 1/dt from which on a gain counts as one that removes the error in a step [-]."""
+
+
+def task_layout(frames: Sequence[FrameTask], row_tasks: Sequence[RowTask], model: Any, dt: float) -> dict[str, Any]:
     """Arrays of the rows A v = b of the tasks, as `RowLayout` has them.
 
     Rows are in world axes, scaled with the roots of their weights; the orientation error is the rotation vector of
@@ -30,6 +34,7 @@ def task_layout(frames: Sequence[FrameTask], row_tasks: Sequence[RowTask], model
         frames: frames that follow motions, those with a position first.
         row_tasks: all other tasks.
         model: pinocchio model.
+        dt: control period [s].
     """
     turns = np.array([i for i, task in enumerate(frames) if task.turns], dtype=np.intp)
     moving, turning = [task for task in frames if task.moves], [frames[i] for i in turns]
@@ -42,6 +47,7 @@ def task_layout(frames: Sequence[FrameTask], row_tasks: Sequence[RowTask], model
     weights = [task.settings.weight for task in moving] + [task.settings.orientation_weight for task in turning]
     caps = [task.settings.max_speed for task in moving] + [task.settings.max_turn_rate for task in turning]
     scale = np.sqrt(np.repeat(np.array(weights), 3))
+    gains = np.array([getattr(task.settings, "gain", np.inf) for task in tasks])  # a user's task may have none
     rows = int(sizes.sum())
     return {
         "frame_ids": np.array([task.frame_id for task in frames], dtype=np.intp),
@@ -50,6 +56,7 @@ def task_layout(frames: Sequence[FrameTask], row_tasks: Sequence[RowTask], model
         "gain": np.array([task.settings.gain for task in frames]),
         "cap": np.array([np.inf if cap is None else cap for cap in caps]),
         "scale": np.concatenate((scale, *(task.scale for task in row_tasks))),
+        "dead_beat": np.repeat(np.minimum(gains * dt / _DEAD_BEAT, 1.0), sizes),
         "row_tasks": np.repeat(np.array([numbers[id(task)] for task in tasks], dtype=np.intp), sizes),
         "bending_rows": np.flatnonzero(bends),
         "straight_rows": np.flatnonzero(~bends),
