@@ -34,13 +34,13 @@ def convex_shapes(geometries: Sequence[Any], spare: Collection[int] = ()) -> Sha
         geometries: of coal.
         spare: numbers of those that others may be written over by `write_shape`.
     """
-    count, room = len(geometries), np.zeros((len(geometries), 2), dtype=np.intp)
+    count, capacity = len(geometries), np.zeros((len(geometries), 2), dtype=np.intp)
     for i, geometry in enumerate(geometries):
         if i in spare:
-            room[i] = _SPARE_CORNERS + 1, _SPARE_EDGES
+            capacity[i] = _SPARE_CORNERS + 1, _SPARE_EDGES
         elif core_of(geometry)[0] == HULL:
-            room[i] = geometry.num_points + 1, sum(map(len, _edges(geometry)))
-    corners, edges = np.cumsum(np.vstack(([0, 0], room)), axis=0).T
+            capacity[i] = geometry.num_points + 1, sum(map(len, _edges(geometry)))
+    corners, edges = np.cumsum(np.vstack(([0, 0], capacity)), axis=0).T
     first = np.zeros(corners[-1] + 1, dtype=np.intp)
     first[corners] = edges
     shapes = Shapes(
