@@ -141,7 +141,7 @@ class View:
         return self._process.poll() is None
 
     def update(self, tick: Tick, note: str = "") -> None:
-        """Show a control step, unless the last one was shown a moment ago; costs a microsecond then, about 0.1 ms otherwise.
+        """Show a control step, unless the last one was shown a moment ago; costs 1 µs then, about 0.1 ms otherwise.
 
         Args:
             tick: what `Controller.tick` gave.
