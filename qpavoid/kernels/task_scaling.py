@@ -15,6 +15,10 @@ WEAK = 0.1
 same."""
 APPROACH_RATE = 20.0
 """κ: how fast a singular direction is approached at most [1/s]; finite, so that acceleration limits can follow."""
+WEAK_SPEED = 0.3
+"""Share of the joints' speeds that a weak direction may use [-]; it counts fully where a fifth more would be needed."""
+MISSING_SIZE = 0.01
+"""σ_i²/l_i² from which a direction is not missing for good, whatever its curvature [-]."""
 UNLIMITED_SPEED = 10.0
 """Speed by which coordinates without a limit are measured where a finite one is needed [rad/s, m/s]."""
 
@@ -109,15 +113,40 @@ def task_parts(x: Any, u: Array, parts: Array) -> None:
 
 
 @compiled
-def task_sizes(x: Any, U: Array, squares: Array) -> Array:
-    """Compute ‖J Jᵀ‖ of the rows J of each task that bend, from A Aᵀ = Σ σ_i² u_i u_iᵀ."""
-    sizes = np.zeros(x.row_tasks.max() + 1)
-    for k in range(len(U)):
+def weak_sizes(x: Any, U: Array, squares: Array) -> Array:
+    """Compute l_i² (c,) of all directions: that of each task, by its part in u_i.
+
+    Of a task it is a hundredth of ‖J Jᵀ‖ of its rows J that bend, from A Aᵀ = Σ σ_i² u_i u_iᵀ.
+
+    Args:
+        x: reads row_tasks and bending_rows.
+        U: u_iᵀ (c, c).
+        squares: σ_i² (c,).
+    """
+    count, sizes = len(U), np.zeros(x.row_tasks.max() + 1)
+    for k in range(count):
         task = x.row_tasks[x.bending_rows[k]]
-        for j in range(len(U)):
+        for j in range(count):
             if x.row_tasks[x.bending_rows[j]] == task:
                 product = 0.0
-                for i in range(len(U)):
+                for i in range(count):
                     product += squares[i] * U[i, k] * U[i, j]
                 sizes[task] += product * product
-    return np.sqrt(sizes)
+    weak, parts = np.zeros(count), np.empty(len(sizes))
+    for i in range(count):
+        task_parts(x, U[i], parts)
+        for task in range(len(parts)):
+            weak[i] += WEAK * WEAK * parts[task] * np.sqrt(sizes[task])
+    return weak
+
+
+@compiled
+def weakness(ratio: float, rate: float) -> float:
+    """Compute how much the speed of a direction is limited: 0 for none, to 1.
+
+    Args:
+        ratio: σ_i²/l_i² [-].
+        rate: of A⁺b, largest joint speed over its limit [-].
+    """
+    fast = min(max(5.0 * (rate / WEAK_SPEED - 1.0), 0.0), 1.0)
+    return max(1.0 - ratio, 0.0) * fast

@@ -62,8 +62,8 @@ def render(
     set_: Sets = None,
     width: Annotated[int, typer.Option(min=64, max=3840, help="Of the film [pixels].")] = 720,
     fps: Annotated[float, typer.Option(min=1.0, max=60.0, help="Pictures a second.")] = 15.0,
-    azimuth: Annotated[float, typer.Option(help="Direction in which the camera looks, about z [deg].")] = 140.0,
-    elevation: Annotated[float, typer.Option(help="Angle above the horizon in which it looks [deg].")] = -18.0,
+    azimuth: Annotated[float | None, typer.Option(help="Direction in which it looks, about z [deg].")] = None,
+    elevation: Annotated[float | None, typer.Option(help="Angle above the horizon in which it looks [deg].")] = None,
 ) -> None:
     """Write a film of runs, side by side, without a display."""
     from qpavoid.viz import film
@@ -88,20 +88,18 @@ def render(
     for path in filter(None, (gif, mp4, png)):
         if not path.absolute().parent.is_dir():
             raise ConfigError(f"{path}: no such folder; make it first")
-    camera = film.camera_of(logs, azimuth, elevation)
+    sight = film.film_sight(logs, azimuth, elevation)
     stages = film.stages_of(logs, width)
     if png is not None:
-        film.write_png(film.render_moment(stages, camera), png)
+        film.write_png(film.render_moment(stages, sight), png)
     if gif is not None or mp4 is not None:
         with progress() as bar:
             update = partial(_update, bar, bar.add_task("pictures", total=None))
-            pictures = film.render_film(stages, fps, camera, update)
+            pictures = film.render_film(stages, fps, sight, update)
         if gif is not None:
             film.write_gif(pictures, gif, fps)
         if mp4 is not None:
             film.write_mp4(pictures, mp4, fps)
-    for stage in stages:
-        stage.close()
     for path in filter(None, (gif, mp4, png)):
         OUT.print(f"{path}: {path.stat().st_size // 1000} kB", highlight=False, soft_wrap=True, markup=False)
 

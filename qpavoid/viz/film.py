@@ -1,4 +1,4 @@
-"""Films of runs without a display: the robot with its visual meshes, by MuJoCo, runs side by side."""
+"""Films of runs without a display: the robot with its visual meshes, runs side by side."""
 
 from __future__ import annotations
 
@@ -9,129 +9,159 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import pinocchio as pin
 
 from qpavoid.errors import ConfigError
-from qpavoid.model.visuals import GREY, read_visuals
+from qpavoid.problem import Array
 from qpavoid.run.log import Log
-from qpavoid.run.mujoco_stage import Camera, Part, Segment, Stage
 from qpavoid.viz.log_frames import LogFrames
-from qpavoid.viz.meshes import of_geometry, of_obstacle, of_visual
-from qpavoid.viz.view_link import Frame
-from qpavoid.viz.view_page import distance_colours
+from qpavoid.viz.motion import Sight, instants, points_of_interest, sight_of
+from qpavoid.viz.raster import Canvas, Projection, Surface
+from qpavoid.viz.robot_pictures import RobotPictures
+from qpavoid.viz.style import GROUND, OBSTACLES, TOOL_PATH, distance_colours, rgb
+from qpavoid.viz.surfaces import capsule_faces, is_endless, obstacle_faces, triangulated
 
 Picture = npt.NDArray[np.uint8]
 
 _PATH_TIME = 2.0
 """Length of the tools' paths that stays visible [s]."""
-_WITNESS_RADIUS, _PATH_RADIUS = 0.004, 0.004
+_THICKNESS = 0.003
 """Half the thickness of segments between witness points and of paths [m]."""
 _MAX_SEGMENTS = 8
 """Pairs whose witness points are joined, the closest ones."""
-_PATH_COLOUR = (0.0, 0.48, 0.34)
 _BASE = 0.2
 """Depth of bodies below z = 0 up to which these are parts of a base that stands there [m]."""
 _BELOW = 0.004
 """How much lower the floor is than the ground, if that is an obstacle, which would flicker [m]."""
+_TILE, _TILES = 0.25, 12
+"""Side of a tile of the floor [m], and how many there are in each direction from the middle."""
+_FLOOR, _SHADOW = ((1.0, 1.0, 1.0), (0.95, 0.955, 0.965)), (0.78, 0.79, 0.82)
+_LIGHT = np.array([-0.35, 0.25, -1.0])
+"""Direction of the light that casts shadows."""
+_SKY = (np.array([236.0, 242.0, 248.0]), np.array([252.0, 253.0, 254.0]))
+"""Colours at the top of a picture and at its bottom."""
 _ASPECT = 0.85
 """Height of a run's picture, in widths."""
-_COLOURS = 96
+_MARGIN = 0.06
+"""Margin around what fills a picture, as a share of its size."""
+_COLOURS = 128
 """Colours of a GIF: more make it larger, fewer show in the sky."""
 _CONTACT, _CLEAR, _CAPTION = (198, 47, 47), (0, 105, 92), (40, 40, 40)
 
 
 class LogStage:
-    """A run on a stage."""
+    """A run that can be drawn at any of its steps."""
 
-    def __init__(self, log: Log, width: int, height: int) -> None:
-        """Build the stage; a picture has `width` by `height` pixels.
+    def __init__(self, log: Log, height: int) -> None:
+        """Build what its pictures show.
+
+        Args:
+            log: the run.
+            height: of a picture [pixels].
 
         Raises:
-            ConfigError: MuJoCo is missing or renders nothing, or a file of the robot is missing.
+            ConfigError: a file of the robot or scenario is missing.
         """
-        self.frames, self._caption = LogFrames(log), str(log.meta["solver"])
-        robot = self.frames.robot
-        self._model, self._data = robot.model, robot.model.createData()
-        visuals = read_visuals(robot.model, robot.urdf, robot.package_dirs)
-        places = [(visual.joint, visual.placement, of_visual(visual)) for visual in visuals]
-        if not places:
-            bodies = robot.bodies.geometryObjects
-            places = [(body.parentJoint, body.placement, [of_geometry(body.geometry, GREY)]) for body in bodies]
-        self._places = [(joint, placement) for joint, placement, _ in places]
-        obstacles = [[of_obstacle(described, i)] for i, described in enumerate(log.meta["obstacles"])]
-        parts = [Part(meshes) for meshes in [*(meshes for *_, meshes in places), *obstacles]]
+        self.frames, self._robot, self._height = LogFrames(log), RobotPictures.of(log), height
         lowest = log.body_ends[..., 2].min(axis=(0, 2), initial=0.0) - np.array(log.meta["body_radii"])
-        self._stage = Stage(parts, width, height, min(0.0, float(lowest[lowest < -_BASE].min(initial=0.0))) - _BELOW)
+        self._floor = min(0.0, float(lowest[lowest < -_BASE].min(initial=0.0))) - _BELOW
 
     def steps(self, rate: float) -> list[int]:
         """Return the steps that a film of some pictures a second shows."""
         t = self.frames.log.t
         return [int(np.searchsorted(t, time - 1e-9)) for time in np.arange(t[0], t[-1] + 1e-9, 1.0 / rate)]
 
-    def picture(self, step: int, camera: Camera) -> Picture:
+    def picture(self, step: int, sight: Sight) -> Picture:
         """Return the picture of a step, with solver and distance in words."""
-        frame, log = self.frames.frame(step), self.frames.log
-        pin.forwardKinematics(self._model, self._data, frame.q)
-        poses = [self._data.oMi[joint] * placement for joint, placement in self._places]
-        placed = [(pose.rotation, pose.translation) for pose in poses]
-        placed += [(pose[:9].reshape(3, 3).T, pose[9:]) for pose in frame.obstacles]
-        self._stage.place(placed)
-        picture = self._stage.render(camera, [*self._witnesses(frame), *self._paths(step)])
-        return _with_caption(picture, self._caption, float(log.min_distance[step]))
+        log = self.frames.log
+        canvas = Canvas(*sight, self._height)
+        canvas.draw(_floor(self._floor))
+        solid = self._robot.surfaces(log, step)
+        for i in range(len(log.meta["obstacles"])):
+            surface: Surface = (*triangulated(obstacle_faces(log, i, step)), OBSTACLES[i % len(OBSTACLES)])
+            if is_endless(log, i):
+                canvas.draw([(*surface[:2], rgb(GROUND))])
+            else:
+                solid.append(surface)
+        canvas.draw([_shadow(surface, self._floor + 2.0 * _BELOW) for surface in solid])
+        canvas.draw([*solid, *self._witnesses(step), *self._paths(step)])
+        pixels = canvas.picture().astype(np.float64)
+        downwards = np.linspace(0.0, 1.0, len(pixels))[:, None, None]
+        sky, opacity = _SKY[0] + downwards * (_SKY[1] - _SKY[0]), pixels[..., 3:] / 255.0
+        picture = (opacity * pixels[..., :3] + (1.0 - opacity) * sky).astype(np.uint8)
+        return _with_caption(picture, str(log.meta["solver"]), float(log.min_distance[step]))
 
-    def _witnesses(self, frame: Frame) -> list[Segment]:
-        order = np.argsort(frame.witnesses[:, 0])[:_MAX_SEGMENTS]
-        witnesses = frame.witnesses[order]
+    def _witnesses(self, step: int) -> list[Surface]:
+        witnesses = self.frames.frame(step).witnesses
+        witnesses = witnesses[np.argsort(witnesses[:, 0])[:_MAX_SEGMENTS]]
         colours = distance_colours(witnesses[:, 0], *self.frames.levels)
-        return [
-            Segment(row[1:4], row[4:7], _WITNESS_RADIUS, tuple(colour))
-            for row, colour in zip(witnesses, colours, strict=True)
-        ]
+        return [_segment(row[1:4], row[4:7], tuple(colour)) for row, colour in zip(witnesses, colours, strict=True)]
 
-    def _paths(self, step: int) -> list[Segment]:
+    def _paths(self, step: int) -> list[Surface]:
         log = self.frames.log
         first = int(np.searchsorted(log.t, log.t[step] - _PATH_TIME))
         points = log.tool[np.unique(np.linspace(first, step, 60).astype(int))]
         return [
-            Segment(begin, end, _PATH_RADIUS, _PATH_COLOUR)
+            _segment(begin, end, rgb(TOOL_PATH))
             for old, new in pairwise(points)
             for begin, end in zip(old, new, strict=True)
             if np.linalg.norm(end - begin) > 1e-4
         ]
 
-    def close(self) -> None:
-        """Free the renderer."""
-        self._stage.close()
+
+def _segment(begin: Array, end: Array, colour: tuple[float, ...]) -> Surface:
+    return (*triangulated(capsule_faces(np.array([begin, end]), _THICKNESS)), colour)
 
 
-def camera_of(logs: Sequence[Log], azimuth: float, elevation: float) -> Camera:
-    """Return a camera that sees the robots at all times, from some direction [deg]; see `Camera`."""
-    ends = np.concatenate([log.body_ends.reshape(-1, 3) for log in logs])
-    lower, upper = ends.min(axis=0), ends.max(axis=0)
-    middle = 0.5 * (lower + upper)
-    return Camera(
-        look_at=(float(middle[0]), float(middle[1]), float(middle[2])),
-        distance=1.3 * float(np.linalg.norm(upper - lower)),
-        azimuth=azimuth,
-        elevation=elevation,
-    )
+def _floor(height: float) -> list[Surface]:
+    """Return the tiles of a floor of some height [m], those of each colour."""
+    corners = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    tiles = np.array([(i, j) for i in range(-_TILES, _TILES) for j in range(-_TILES, _TILES)])
+    faces = np.full((len(tiles), 4, 3), height)
+    faces[..., :2] = _TILE * (tiles[:, None] + corners)
+    return [(*triangulated(faces[tiles.sum(axis=1) % 2 == k]), colour) for k, colour in enumerate(_FLOOR)]
+
+
+def _shadow(surface: Surface, height: float) -> Surface:
+    """Return the shadow of a surface on the floor, of some height [m]."""
+    vertices = np.asarray(surface[0], dtype=np.float64)
+    fallen = vertices + (height - vertices[:, 2:]) / _LIGHT[2] * _LIGHT
+    return fallen, surface[1], _SHADOW
+
+
+def film_sight(logs: Sequence[Log], azimuth: float | None, elevation: float | None) -> Sight:
+    """Return a sight in which the robots fill the pictures at all times.
+
+    Args:
+        logs: the runs.
+        azimuth: direction in which the camera looks, about z [deg]; None: the one that sees most of the tools.
+        elevation: angle above the horizon in which it looks [deg]; None: the same.
+    """
+    projection = sight_of(logs[-1]).projection
+    if azimuth is not None or elevation is not None:
+        forward = projection.forward
+        heading = float(np.degrees(np.arctan2(forward[1], forward[0]))) if azimuth is None else azimuth
+        pitch = float(np.degrees(np.arcsin(forward[2]))) if elevation is None else elevation
+        projection = Projection.looking(heading + 180.0, -pitch)
+    flat = projection.flat(np.concatenate([points_of_interest(log, instants(log)) for log in logs]))
+    middle, half = 0.5 * (flat.min(axis=0) + flat.max(axis=0)), 0.5 * np.ptp(flat, axis=0)
+    width = (1.0 + 2.0 * _MARGIN) * max(float(half[0]), float(half[1]) / _ASPECT)
+    return Sight(projection, middle - width * np.array([1.0, _ASPECT]), middle + width * np.array([1.0, _ASPECT]))
 
 
 def stages_of(logs: Sequence[Log], width: int) -> list[LogStage]:
     """Return stages of runs that are shown side by side, `width` pixels in all; see `LogStage`."""
-    panel = width // len(logs) // 2 * 2
-    return [LogStage(log, panel, int(_ASPECT * panel) // 2 * 2) for log in logs]
+    return [LogStage(log, int(_ASPECT * width / len(logs)) // 2 * 2) for log in logs]
 
 
 def render_film(
-    stages: Sequence[LogStage], rate: float, camera: Camera, progress: Callable[[int, int], None] | None = None
+    stages: Sequence[LogStage], rate: float, sight: Sight, progress: Callable[[int, int], None] | None = None
 ) -> list[Picture]:
     """Return the pictures of a film of runs, side by side.
 
     Args:
         stages: the runs; a run that has ended stands still.
         rate: pictures a second of the run.
-        camera: that of all of them.
+        sight: that of all of them.
         progress: called with the number of pictures done, and in all.
     """
     steps = [stage.steps(rate) for stage in stages]
@@ -139,7 +169,7 @@ def render_film(
     for stage, shown in zip(stages, steps, strict=True):
         pictures = []
         for step in shown:
-            pictures.append(stage.picture(step, camera))
+            pictures.append(stage.picture(step, sight))
             done += 1
             if progress is not None:
                 progress(done, total)
@@ -147,13 +177,13 @@ def render_film(
     return [np.concatenate(row, axis=1) for row in zip(*columns, strict=True)]
 
 
-def render_moment(stages: Sequence[LogStage], camera: Camera) -> Picture:
+def render_moment(stages: Sequence[LogStage], sight: Sight) -> Picture:
     """Return one picture of runs side by side, at the time when the first one is closest to anything."""
     first, row = stages[0].frames.log, []
     t = first.t[int(np.argmin(first.min_distance))]
     for stage in stages:
         log = stage.frames.log
-        row.append(stage.picture(min(int(np.searchsorted(log.t, t)), len(log.t) - 1), camera))
+        row.append(stage.picture(min(int(np.searchsorted(log.t, t)), len(log.t) - 1), sight))
     return np.concatenate(row, axis=1)
 
 
@@ -180,7 +210,7 @@ def write_gif(pictures: Sequence[Picture], path: Path, rate: float) -> None:
     """Write a GIF that repeats for ever, with one palette for all pictures."""
     image_module = _pillow()[0]
     images = [image_module.fromarray(picture) for picture in pictures]
-    sample = image_module.fromarray(np.concatenate(pictures[:: max(1, len(pictures) // 6)], axis=0))
+    sample = image_module.fromarray(np.concatenate(pictures[:: max(1, len(pictures) // 16)], axis=0))
     palette = sample.quantize(_COLOURS, method=image_module.Quantize.MEDIANCUT)
     images = [image.quantize(palette=palette, dither=image_module.Dither.NONE) for image in images]
     images[0].save(

@@ -104,7 +104,7 @@ def instants(log: Log) -> IntArray:
 def sight_of(log: Log, robot: RobotPictures | None = None) -> Sight:
     """Choose the view in which most of the tools are seen and least of the paths is lost, and what fills a panel."""
     robot, steps = robot or RobotPictures.of(log), instants(log)
-    points = _points_of_interest(log, steps)
+    points = points_of_interest(log, steps)
     sights = []
     for azimuth in _AZIMUTHS:
         for elevation in _ELEVATIONS:
@@ -134,7 +134,7 @@ def _sees_tools(log: Log, robot: RobotPictures, step: int, sight: Sight) -> Any:
     return canvas.is_visible(log.tool[step], _BEHIND)
 
 
-def _points_of_interest(log: Log, steps: IntArray) -> Array:
+def points_of_interest(log: Log, steps: IntArray) -> Array:
     """Return points (n, 3) that a panel has to show: moving bodies, paths of tools, and obstacles that come near."""
     radii = np.array(log.meta["body_radii"]).reshape(-1, 1, 1)
     moves = np.any(np.ptp(log.body_ends, axis=0) > 1e-3, axis=(1, 2)) if len(radii) else np.zeros(0, bool)

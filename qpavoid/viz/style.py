@@ -33,6 +33,12 @@ def rgb(colour: str) -> tuple[float, ...]:
     return tuple(int(colour[i : i + 2], 16) / 255.0 for i in (1, 3, 5))
 
 
+def distance_colours(d: Array, d1: float, d2: float) -> Array:
+    """Return colours (k, 3), 0 to 1, of distances (k,) [m]: green at d2, red at d1 and below."""
+    red = np.clip((d2 - d) / max(d2 - d1, 1e-9), 0.0, 1.0)
+    return np.stack((0.85 * red, 0.65 * (1.0 - red), np.full_like(red, 0.15)), axis=1)
+
+
 def units(log: Log, per: str = "") -> str:
     """Return the unit of the coordinates, `rad`, `m`, or `rad or m` where a robot has both, `per` behind each."""
     return " or ".join(unit + per for unit in ("rad", "m") if unit in log.meta["units"])

@@ -12,6 +12,7 @@ import pinocchio as pin
 from qpavoid.model.visuals import read_visuals
 from qpavoid.problem import Array
 from qpavoid.viz.meshes import Mesh, decimated, of_visual
+from qpavoid.viz.style import distance_colours
 from qpavoid.viz.view_ghosts import Ghosts
 from qpavoid.viz.view_link import Frame, PageSetup, SlotChange
 
@@ -219,12 +220,6 @@ class Page:
 def _bytes(colour: tuple[float, ...]) -> tuple[int, int, int]:
     red, green, blue = (round(255 * part) for part in colour[:3])
     return red, green, blue
-
-
-def distance_colours(d: Array, d1: float, d2: float) -> Array:
-    """Return colours (k, 3), 0 to 1, of distances (k,) [m]: green at d2, red at d1 and below."""
-    red = np.clip((d2 - d) / max(d2 - d1, 1e-9), 0.0, 1.0)
-    return np.stack((0.85 * red, 0.65 * (1.0 - red), np.full_like(red, 0.15)), axis=1)
 
 
 def _place(node: Any, rotation: Array, position: Array) -> None:

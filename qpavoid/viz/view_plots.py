@@ -17,6 +17,8 @@ PLOTTED = 300
 _MAX_LINES = 8
 """Joints, and obstacles, with a line of their own; of more joints, the fastest one alone is drawn."""
 _DISTANCES = "distances up to d2 [mm]"
+_GONE = -2
+"""Slot of an obstacle that has gone."""
 _ITSELF, _D1, _D2, _LIMIT = "#333333", "#7A4B9A", "#8A8A8A", "#C62F2F"
 
 
@@ -49,13 +51,22 @@ class Plots:
     def _distance_lines(self) -> list[tuple[str, str]]:
         others = [(name, _hex(GHOSTS[(1 + i) % len(GHOSTS)])) for i, name in enumerate(self._setup.others)]
         obstacles = [
-            (name, _hex(255.0 * np.array(OBSTACLES[i % len(OBSTACLES)]))) for i, name in self._obstacles
+            (name, _hex(255.0 * np.array(OBSTACLES[slot % len(OBSTACLES)]))) for slot, name in self._obstacles
         ]  # fmt: skip
         return [("d1", _D1), ("d2", _D2), ("itself", _ITSELF), *others, *obstacles]
 
     def name_obstacles(self, names: list[tuple[int, str]]) -> None:
-        """Draw a line for each of the first obstacles: their slots and names."""
-        self._obstacles = names[:_MAX_LINES]
+        """Draw a line for each obstacle, of a slot and a name: of the first ones that there were.
+
+        Those that have gone keep their lines: viser never forgets a plot that was removed, so that there is a new one
+        only for a name that is new.
+        """
+        slots = {name: slot for slot, name in names}
+        lines = [(slots.pop(name, _GONE), name) for _, name in self._obstacles]
+        new = [(slot, name) for name, slot in slots.items()][: _MAX_LINES - len(lines)]
+        self._obstacles = [*lines, *new]
+        if not new:
+            return
         self.clear()
         order = self._plots[0].order
         self._plots[0].remove()  # the browser does not take other lines into a plot that it has
