@@ -197,6 +197,17 @@ def test_page_shows_and_steers_a_run(session, page, empty_picture):
     page.get_by_role("button", name="play", exact=True).click()
     wait_for(lambda: session.shown_time > now, "the present")
 
+    # what is pulled while time stands still is there when it goes on
+    page.get_by_role("button", name="pause").click()
+    wait_for(lambda: not session.clock.is_playing, "the pause")
+    now, index = session.t, [o.name for o in session.controller.scene.slots].index("ball 1")
+    place = session.tick.obstacles[index, 9:].copy()
+    drag(page, pixel(session.view, place, box), (0.0, 50.0))
+    time.sleep(1.0)
+    assert session.t == now
+    page.get_by_role("button", name="play", exact=True).click()
+    wait_for(lambda: np.linalg.norm(session.tick.obstacles[index, 9:] - place) > 0.02, "the pulled obstacle")
+
     # a second browser, one that is closed, and one that loads the page again
     other = page.context.browser.new_page()
     other.goto(session.view.url)

@@ -135,7 +135,7 @@ def test_dead_page_drops_frames(link):
 
 
 def test_status_names_the_closest_pair(tick):
-    text = status_html(tick, [1e-4, 3e-4])
+    text = status_html(tick, [1e-4, 3e-4, 2e-4])
     nearest = tick.problem.pair_names[tick.proximity.pair[np.argmin(tick.proximity.distance)]]
     assert all(name in text for name in nearest)
     assert "SOLVED" in text

@@ -156,7 +156,7 @@ def frame_of(tick: Tick, robot: Robot, obstacle_of_pair: IntArray, text: str = "
     """
     near, closest = tick.problem.avoidance, tick.proximity.closest
     # the gains take distances with an offset, the same of all pairs but for those with a safety distance of their own
-    offset = float(np.median(near.d - closest[:, 0])) if 0 < len(near.d) == len(closest) else 0.0
+    offset = float(np.sort(near.d - closest[:, 0])[len(closest) // 2]) if 0 < len(near.d) == len(closest) else 0.0
     witnesses: Array = np.column_stack((closest[:, [0, 4, 5, 6, 7, 8, 9]], obstacle_of_pair[tick.proximity.pair]))
     if len(witnesses) > MAX_WITNESSES:
         witnesses = witnesses[np.argsort(witnesses[:, 0])[:MAX_WITNESSES]]
@@ -186,6 +186,8 @@ def obstacles_of_pairs(scene: Scene) -> IntArray:
 
 def bodies_in_contact(scene: Scene, pairs: IntArray, distances: Array) -> Array:
     """Return the numbers of the robot's bodies (b,) in pairs (k,) whose distances (k,) [m] are negative."""
+    if not (distances < 0.0).any():
+        return _NONE
     touching = np.unique(scene.pairs[pairs[distances < 0.0]])
     return touching[touching < len(scene.body_names)].astype(np.float64)
 

@@ -123,6 +123,9 @@ class Session:
         if self.clock.wait():
             self._step()
         if self.view.is_due():
+            if not self.clock.is_playing:  # what is pulled while time stands still is there when it goes on
+                for pulled in (*self._targets.values(), *self._obstacles.values()):
+                    pulled.advance(1.0 / _RATE)
             frame = self._past_frame() if self._back else self._frame()
             self.shown_time = frame.t
             self.view.show(frame)
@@ -140,6 +143,14 @@ class Session:
 
     def _frame(self) -> Frame:
         frame = self.view.frame(self.tick, self._note)
+        if not self.clock.is_playing:
+            frame = frame._replace(obstacles=frame.obstacles.copy(), targets=frame.targets.copy())
+            slots = [obstacle.name for obstacle in self.controller.scene.slots]
+            for rows, names, all_pulled in (
+                (frame.obstacles, slots, self._obstacles), (frame.targets, self._labels, self._targets),
+            ):  # fmt: skip
+                for name, pulled in all_pulled.items():
+                    rows[names.index(name)] = pulled.sample.row[:12]
         if len(self.loops) > 1 and (tick := self.loops[1].tick) is not None:
             nearest = min(tick.proximity.distance, default=np.inf)
             frame = frame._replace(ghosts=np.vstack((frame.ghosts, (1.0, nearest, *tick.state.q))))
