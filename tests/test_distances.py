@@ -2,6 +2,7 @@
 
 import gc
 import tracemalloc
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -22,7 +23,7 @@ from conftest import (
     random_scene,
 )
 
-from qpavoid import Avoidance, Controller, Obstacle, Sample, build_scene, build_tasks, config, load_scenario
+from qpavoid import Avoidance, Controller, Obstacle, Robot, Sample, build_scene, build_tasks, config, load_scenario
 from qpavoid.config import HalfSpace
 from qpavoid.control import distances
 from qpavoid.model import kinematics
@@ -319,3 +320,24 @@ def test_memory_of_steps_does_not_grow():
     finally:
         tracemalloc.stop()
     assert used[1] - used[0] < 100_000  # numba fills a pool; an object that is lost takes 16 bytes at the least, a step
+
+
+def test_hulls_and_curved_bodies_that_are_apart_need_no_coal(monkeypatch):
+    """Nor does a half-space, or a hull that comes in at run time."""
+    robot = Robot.load("g1")
+    hull = config.Mesh(path=str(Path(__file__).parents[1] / "tasks" / "shelf.stl"), method="convex")
+    shapes = [CYLINDER, config.Cone(radius=0.1, length=0.2), config.Ellipsoid(radii=(0.1, 0.2, 0.1)), BOX]
+    obstacles = [obstacle(f"o{i}", shape, (0.5, 0.25 * i - 0.375, 0.1)) for i, shape in enumerate(shapes)]
+    floor = obstacle("floor", HalfSpace(), (0.0, 0.0, -1.2))
+    controller = Controller(build_scene(robot, [*obstacles, floor], spare_obstacles=1), [], avoidance=Avoidance(d2=0.5))
+    controller.add_obstacle(obstacle("hull", hull, (-0.8, 0.0, 0.0)))
+
+    def fail(*_):
+        raise AssertionError("coal was called")
+
+    for module, name in ((pin, "computeDistances"), (distances.coal, "distance")):
+        monkeypatch.setattr(module, name, fail)
+    for t in (0.01, 0.02, 0.03):
+        tick = controller.tick(robot.home, t, obstacles={"hull": [-0.8 - t, 0.0, 0.0]})
+        names = {name for pair in tick.proximity.pair for name in controller.scene.pair_names[pair]}
+        assert {"o0", "o1", "o2", "o3", "floor", "hull"} < names and tick.proximity.distance.min() > 0.0

@@ -8,9 +8,9 @@ from oracle import support
 from test_closed_forms import by_coal, certify, somewhere
 
 from qpavoid.geometry.meshes import convex_hull
-from qpavoid.kernels.distances import BY_GJK, TO_HALF_SPACE, compute_distances
+from qpavoid.kernels.distances import BY_COAL, BY_GJK, TO_HALF_SPACE, compute_distances
 from qpavoid.kernels.gjk import GUESS
-from qpavoid.model.convex_shapes import convex_shapes, pair_methods
+from qpavoid.model.convex_shapes import convex_shapes, pair_methods, write_shape
 
 LARGEST_SEARCH = 60
 """Iterations of a search, at most."""
@@ -243,3 +243,23 @@ def test_half_space_is_as_coal_has_it(bodies, first):
             assert up @ point == pytest.approx(deepest, abs=1e-11)
             if not turned and kind in ("box", "cylinder", "capsule"):
                 np.testing.assert_allclose(point[:2], at.translation[:2], atol=1e-12)
+
+
+def test_shapes_of_spare_slots_are_as_if_they_had_been_there(bodies):
+    """A hull that there is no room for is for coal."""
+    rng, wall, other = np.random.default_rng(90), coal.Box(0.2, 1.0, 1.0), bodies["hull", 1.0][0]
+    spare, many = Pair(coal.Capsule(0.05, 0.0), wall), convex_hull(sphere_points(rng, 600))
+    spare.shapes = convex_shapes([coal.Capsule(0.05, 0.0), wall, other], spare=[0])
+    for kind in [*MAKE, *reversed(MAKE)]:
+        body, at = bodies[kind, 1.0][rng.integers(20)], (somewhere(rng), somewhere(rng))
+        write_shape(spare.shapes, 0, body)
+        spare.method, spare.guesses[:] = pair_methods(spare.shapes, spare.bodies), 0.0
+        result, expected = spare.search(*at), Pair(body, wall).search(*at)
+        assert (result is None) == (expected is None)
+        if result is not None:
+            np.testing.assert_array_equal(result, expected)
+        np.testing.assert_array_equal(
+            spare.shapes.vertices[spare.shapes.span[2, 0] : spare.shapes.span[2, 1]], other.points()
+        )
+    write_shape(spare.shapes, 0, many)
+    assert pair_methods(spare.shapes, np.array([[0, 1], [2, 1]])).tolist() == [BY_COAL, BY_GJK]

@@ -14,8 +14,8 @@ import numpy as np
 
 from qpavoid.geometry.bodies import bounding_box, bounding_sphere
 from qpavoid.kernels.distances import BY_COAL, SPARE_BY_COAL
-from qpavoid.kernels.support import HULL, OTHER, Shapes
-from qpavoid.model.convex_shapes import convex_shapes, core_of, pair_methods
+from qpavoid.kernels.support import Shapes
+from qpavoid.model.convex_shapes import convex_shapes, pair_methods, write_shape
 from qpavoid.model.kinematics import support_masks
 from qpavoid.model.scene import Scene
 from qpavoid.model.views import read_poses
@@ -37,7 +37,8 @@ class PairTable:
         """(g, 4) bounding sphere of each body in its frame: centre and radius [m]; infinite of a half-space."""
         self.boxes: Array = np.array([np.concatenate(bounding_box(body)) for body in geometries]).reshape(-1, 6)
         """(g, 6) box around each body in its frame: centre and half its sizes [m]."""
-        self.shapes: Shapes = convex_shapes(geometries)
+        spare = np.flatnonzero(np.isin(scene.obstacle_of, scene.spare)).tolist()
+        self.shapes: Shapes = convex_shapes(geometries, spare)
         """Shapes of all bodies."""
         self.method: IntArray = pair_methods(self.shapes, scene.pairs)
         """(m,) how the distance of each pair is computed, see `kernels.distances`."""
@@ -115,8 +116,7 @@ class PairTable:
         self.is_empty[body] = is_empty
         self.spheres[body] = np.append(*bounding_sphere(solid))
         self.boxes[body] = np.concatenate(bounding_box(solid))
-        kind, self.shapes.core[body] = core_of(solid)
-        self.shapes.kind[body] = OTHER if kind == HULL else kind  # there is no memory for its vertices
+        write_shape(self.shapes, body, solid)
         method = pair_methods(self.shapes, self._scene.pairs[pairs])
         self.method[pairs] = np.where(method == BY_COAL, SPARE_BY_COAL, method)
         self._enable()

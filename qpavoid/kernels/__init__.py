@@ -1,6 +1,6 @@
 """Array work of a control step: loops that numba compiles at their first use, and stores on disk (`kernels.cache`)."""
 
-from qpavoid.kernels.approach import Paths, comes_near, extend_paths, write_path_point
+from qpavoid.kernels.approach import ApproachArrays, comes_near, extend_paths, write_path_point
 from qpavoid.kernels.backup import (
     backup_rows,
     closes_below,
@@ -44,9 +44,9 @@ from qpavoid.kernels.voxels import select_voxels, voxels_within
 
 __all__ = [
     "TOLERANCE",
+    "ApproachArrays",
     "DistanceArrays",
     "KinematicsArrays",
-    "Paths",
     "Pieces",
     "Prediction",
     "RampLimits",

@@ -16,42 +16,44 @@ from qpavoid.problem import Array, IntArray
 PATH_PERIOD = 0.1
 """Time between two positions on the path of an obstacle [s]."""
 PATH_POINTS = 17
-"""Positions until the horizon, with one before and one after it [-]."""
+"""Positions until the horizon, with one before and one after it [-]: as many as there are rows."""
 
 
-class Paths(NamedTuple):
-    """Positions of o obstacles at the multiples of `PATH_PERIOD` until the horizon; number s is in row s % r."""
+class ApproachArrays(NamedTuple):
+    """What is read of o obstacles and the g bodies; paths at the multiples of `PATH_PERIOD`, number s in row s % r."""
 
+    braking: Array
+    """(n,) way on which each coordinate brakes, over the square of its speed [s²/rad or s²/m]."""
+    spheres: Array
+    """(g, 4) bounding sphere of each body in its frame, centre and radius [m]."""
+    radii: Array
+    """(o,) of the bounding spheres of the obstacles [m]."""
+    margin: Array
+    """(o,) taken off the distances to each [m]."""
+    states: Array
+    """(o, 18) of the obstacles."""
+    twists: Array
+    """(o, 6) velocities that external ones keep [m/s, rad/s]."""
     numbers: IntArray
-    """(r,) number of each row, r >= `PATH_POINTS`."""
+    """(r,) number of each row, r = `PATH_POINTS`."""
     positions: Array
-    """(r, o, 3) [m]."""
+    """(r, o, 3) on the paths [m]."""
     rates: Array
     """(r, o, 2) speeds there, linear and angular [m/s, rad/s]."""
+    spans: Array
+    """(o, 4) ball around each path, until the horizon: centre and radius, negative of one that does not move [m]."""
+    peaks: Array
+    """(o, 2) largest of the speeds until the horizon."""
+    scratch: Array
+    """(o, 18)."""
+    lever_arm: float
+    """Bound on the distance that a point of the robot moves when a joint moves by 1 [m/rad, 1]."""
+    dt: float
+    """Control period [s]."""
 
 
 @compiled
-def extend_paths(x: Paths, pieces: Pieces, first: int, states: Array) -> None:
-    """Sample the paths at numbers `first` to `first + PATH_POINTS - 1`, where that is not done yet.
-
-    Args:
-        x: rows of the bodies of `pieces` are overwritten.
-        pieces: trajectories.
-        first: number of the first position.
-        states: scratch (o, 18).
-    """
-    for s in range(first, first + PATH_POINTS):
-        row = s % len(x.numbers)
-        if x.numbers[row] == s:
-            continue
-        x.numbers[row] = s
-        sample_pieces(pieces, s * PATH_PERIOD, states)
-        for i in pieces.bodies:
-            write_path_point(x, row, i, states[i])
-
-
-@compiled
-def write_path_point(x: Paths, row: int, i: int, state: Array) -> None:
+def write_path_point(x: Any, row: int, i: int, state: Array) -> None:
     """Write position and speeds of obstacle i in a state (18,)."""
     linear, angular = 0.0, 0.0
     for c in range(3):
@@ -62,61 +64,85 @@ def write_path_point(x: Paths, row: int, i: int, state: Array) -> None:
 
 
 @compiled
-def comes_near(
-    x: Any, q: Array, v: Array, braking: Array, lever_arm: float, dt: float, spheres: Array, radii: Array,
-    margin: Array, external: IntArray, states: Array, twists: Array, on_paths: IntArray, paths: Paths, first: int,
-) -> tuple[bool, float]:  # fmt: skip
+def extend_paths(x: Any, pieces: Pieces, on_paths: IntArray, first: int) -> None:
+    """Sample the paths from number `first` until the horizon, where that is not done yet, and bound them.
+
+    Args:
+        x: see `ApproachArrays`; rows of obstacles on trajectories of another class are written already.
+        pieces: trajectories.
+        on_paths: numbers of the obstacles on paths (l,).
+        first: number of the first position.
+    """
+    rows = len(x.numbers)
+    for s in range(first, first + PATH_POINTS):
+        if x.numbers[s % rows] != s:
+            x.numbers[s % rows] = s
+            sample_pieces(pieces, s * PATH_PERIOD, x.scratch)
+            for i in pieces.bodies:
+                write_path_point(x, s % rows, i, x.scratch[i])
+    for i in on_paths:
+        span, peak, begin, moves = x.spans[i], x.peaks[i], x.positions[first % rows, i], False
+        span[:], peak[:] = 0.0, 0.0
+        for s in range(first, first + PATH_POINTS):
+            for c in range(3):
+                span[c] += x.positions[s % rows, i, c] / PATH_POINTS
+                moves = moves or x.positions[s % rows, i, c] != begin[c]
+            for c in range(2):
+                peak[c] = max(peak[c], x.rates[s % rows, i, c])
+        for s in range(first, first + PATH_POINTS):
+            span[3] = max(span[3], _distance(x.positions[s % rows, i], span))
+        if not (moves or peak[0] > 0.0 or peak[1] > 0.0):
+            span[3] = -1.0
+
+
+@compiled
+def comes_near(x: Any, rows: Any, q: Array, v: Array, external: IntArray, on_paths: IntArray) -> tuple[bool, float]:
     """Find out whether a moving obstacle may come within the preferred distance until the horizon.
 
     The robot moves at v once more, and brakes. External obstacles go on straight; between the positions on their paths,
     others are no faster than at these.
 
     Args:
-        x: memory of rows and distances, in which joints and the bodies that they move are placed.
+        x: see `ApproachArrays`.
+        rows: memory of rows and distances, in which joints and the bodies that they move are placed.
         q: configuration (nq,).
         v: velocity (n,) [rad/s or m/s].
-        braking: way on which each coordinate brakes, over the square of its speed (n,) [s²/rad or s²/m].
-        lever_arm: bound on the distance that a point of the robot moves when a joint moves by 1 [m/rad, 1].
-        dt: control period [s].
-        spheres: bounding sphere of each body in its frame, centre and radius (g, 4) [m].
-        radii: of the bounding spheres of the obstacles (o,) [m].
-        margin: taken off the distances to each (o,) [m].
-        external: numbers of those that go on straight (k,).
-        states: of all obstacles (o, 18).
-        twists: velocities that they keep (o, 6) [m/s, rad/s].
+        external: numbers of the obstacles that go on straight (k,).
         on_paths: numbers of those on paths (l,).
-        paths: sampled from number `first` on.
-        first: number of the first position.
 
     Returns:
         Whether one may; largest speed of any point of an obstacle that moves [m/s].
     """
-    bodies, center, radius = _place_spheres(x, q, spheres)
+    bodies, center, radius = _place_spheres(rows, q, x.spheres)
     travel, fastest, near = 0.0, 0.0, False
     for j in range(len(v)):
-        travel += dt * abs(v[j]) + braking[j] * v[j] * v[j]
-    distance = PREFERRED_DISTANCE + (lever_arm * travel if travel > 0.0 else 0.0)  # a lever arm may be infinite
+        travel += x.dt * abs(v[j]) + x.braking[j] * v[j] * v[j]
+    distance = PREFERRED_DISTANCE + (x.lever_arm * travel if travel > 0.0 else 0.0)  # a lever arm may be infinite
     for i in external:
-        u, w = twists[i, :3], twists[i, 3:]
+        u, w = x.twists[i, :3], x.twists[i, 3:]
         speed, turning = np.sqrt(u[0] ** 2 + u[1] ** 2 + u[2] ** 2), np.sqrt(w[0] ** 2 + w[1] ** 2 + w[2] ** 2)
         if speed > 0.0 or turning > 0.0:
-            fastest = max(fastest, speed + (turning * radii[i] if turning > 0.0 else 0.0))
-            keep = radii[i] + margin[i] + distance
-            near = near or _passes(states[i, 9:12], u, speed, keep, bodies, center, radius)
+            fastest = max(fastest, speed + (turning * x.radii[i] if turning > 0.0 else 0.0))
+            keep = x.radii[i] + x.margin[i] + distance
+            near = near or _passes(x.states[i, 9:12], u, speed, keep, bodies, center, radius)
     for i in on_paths:
-        speed, turning, moves = 0.0, 0.0, False
-        for s in range(first, first + PATH_POINTS):
-            row = s % len(paths.numbers)
-            speed, turning = max(speed, paths.rates[row, i, 0]), max(turning, paths.rates[row, i, 1])
-            for c in range(3):
-                moves = moves or paths.positions[row, i, c] != paths.positions[first % len(paths.numbers), i, c]
-        if moves or speed > 0.0 or turning > 0.0:
-            fastest = max(fastest, speed + (turning * radii[i] if turning > 0.0 else 0.0))
-            keep = radii[i] + margin[i] + distance + 0.5 * PATH_PERIOD * speed
-            for s in range(first, first + PATH_POINTS):
-                p = paths.positions[s % len(paths.numbers), i]
-                near = near or _passes(p, p, 0.0, keep, bodies, center, radius)
+        if x.spans[i, 3] < 0.0:
+            continue
+        speed, turning = x.peaks[i, 0], x.peaks[i, 1]
+        fastest = max(fastest, speed + (turning * x.radii[i] if turning > 0.0 else 0.0))
+        keep = x.radii[i] + x.margin[i] + distance + 0.5 * PATH_PERIOD * speed
+        if near or _distance(x.spans[i], center) > keep + radius + x.spans[i, 3]:
+            continue
+        for s in range(PATH_POINTS):
+            p = x.positions[s, i]
+            near = near or _passes(p, p, 0.0, keep, bodies, center, radius)
     return near, fastest
+
+
+@compiled
+def _distance(a: Array, b: Array) -> float:
+    """Compute the distance of two points, the first three entries each [m]."""
+    return np.sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)
 
 
 @compiled

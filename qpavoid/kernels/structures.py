@@ -8,6 +8,7 @@ from typing import Any, cast
 from numba import config, typeof, types
 from numba.experimental import structref
 
+from qpavoid.kernels.approach import ApproachArrays
 from qpavoid.kernels.kinematics import KinematicsArrays
 from qpavoid.kernels.layout import RowLayout
 from qpavoid.kernels.near_pairs import DistanceArrays
@@ -54,6 +55,15 @@ class PackedRowsType(_Structure):
     """Type of `PackedRows`."""
 
 
+class PackedApproach(structref.StructRefProxy):  # type: ignore[misc]
+    """`ApproachArrays` in compiled code."""
+
+
+@structref.register
+class PackedApproachType(_Structure):
+    """Type of `PackedApproach`."""
+
+
 @structref.register
 class PackedRolloutType(_Structure):
     """Type of `PackedRollout`."""
@@ -64,6 +74,7 @@ for proxy, kind, fields in (
     (PackedDistances, PackedDistancesType, DistanceArrays._fields),
     (PackedRows, PackedRowsType, RowLayout._fields),
     (PackedRollout, PackedRolloutType, RolloutArrays._fields),
+    (PackedApproach, PackedApproachType, ApproachArrays._fields),
 ):
     structref.define_boxing(kind, proxy)
     structref.define_constructor(proxy, kind, list(fields))
@@ -93,15 +104,22 @@ def _pack_rollout(fields: Any) -> Any:
     return PackedRollout(*fields)
 
 
+@compiled
+def _pack_approach(fields: Any) -> Any:
+    """Return a structure of `ApproachArrays`."""
+    return PackedApproach(*fields)
+
+
 _PACK = {
     KinematicsArrays: _pack_kinematics,
     DistanceArrays: _pack_distances,
     RowLayout: _pack_rows,
     RolloutArrays: _pack_rollout,
+    ApproachArrays: _pack_approach,
 }
 
 
-def pack(layout: KinematicsArrays | DistanceArrays | RowLayout | RolloutArrays) -> Any:
+def pack(layout: KinematicsArrays | DistanceArrays | RowLayout | RolloutArrays | ApproachArrays) -> Any:
     """Return memory in the form that the kernels take; both look into the same arrays.
 
     With `NUMBA_DISABLE_JIT=1` that is the named tuple itself.

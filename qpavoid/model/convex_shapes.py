@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import coal
@@ -23,22 +23,59 @@ from qpavoid.kernels.support import (
 )
 from qpavoid.problem import IntArray
 
+_SPARE_CORNERS, _SPARE_EDGES = 256, 1536
+"""Room for the hull that may come into a spare slot [-]; of triangles, six edges begin at a corner on average."""
 
-def convex_shapes(geometries: Sequence[Any]) -> Shapes:
-    """Return g geometries as arrays; triangle meshes, and what else is not convex, as OTHER."""
-    count, points, edges = len(geometries), [np.zeros((0, 3))], list[IntArray]()
-    kind, core, span = np.zeros(count, dtype=np.intp), np.zeros((count, 4)), np.zeros((count, 2), dtype=np.intp)
-    total = 0
+
+def convex_shapes(geometries: Sequence[Any], spare: Collection[int] = ()) -> Shapes:
+    """Return g geometries as arrays; triangle meshes, and what else is not convex, as OTHER.
+
+    Args:
+        geometries: of coal.
+        spare: numbers of those that others may be written over by `write_shape`.
+    """
+    count, capacity = len(geometries), np.zeros((len(geometries), 2), dtype=np.intp)
     for i, geometry in enumerate(geometries):
-        kind[i], core[i] = core_of(geometry)
-        if kind[i] == HULL:
-            corners = np.array(geometry.points())
-            points.append(corners)
-            edges += [total + np.array(geometry.neighbors(k), dtype=np.intp) for k in range(len(corners))]
-            span[i] = total, total + len(corners)
-            total += len(corners)
-    first = np.cumsum([0, *map(len, edges)]).astype(np.intp)
-    return Shapes(kind, core, span, np.concatenate(points), first, np.concatenate([np.zeros(0, dtype=np.intp), *edges]))
+        if i in spare:
+            capacity[i] = _SPARE_CORNERS + 1, _SPARE_EDGES
+        elif core_of(geometry)[0] == HULL:
+            capacity[i] = geometry.num_points + 1, sum(map(len, _edges(geometry)))
+    corners, edges = np.cumsum(np.vstack(([0, 0], capacity)), axis=0).T
+    first = np.zeros(corners[-1] + 1, dtype=np.intp)
+    first[corners] = edges
+    shapes = Shapes(
+        kind=np.zeros(count, dtype=np.intp),
+        core=np.zeros((count, 4)),
+        span=np.column_stack((corners[:-1], corners[:-1])),
+        vertices=np.zeros((corners[-1], 3)),
+        first=first,
+        neighbours=np.zeros(edges[-1], dtype=np.intp),
+    )
+    for i, geometry in enumerate(geometries):
+        write_shape(shapes, i, geometry)
+    return shapes
+
+
+def write_shape(shapes: Shapes, i: int, geometry: Any) -> None:
+    """Write another geometry over that of body i; a hull that there is no room for as OTHER."""
+    kind, core = core_of(geometry)
+    if kind == HULL:
+        points, edges, low = np.array(geometry.points()), _edges(geometry), shapes.span[i, 0]
+        high = shapes.span[i + 1, 0] if i + 1 < len(shapes.span) else len(shapes.vertices)
+        first = shapes.first[low] + np.cumsum([0, *map(len, edges)])
+        if low + len(points) < high and first[-1] <= shapes.first[high]:
+            shapes.vertices[low : low + len(points)] = points
+            shapes.first[low : low + len(first)] = first
+            shapes.neighbours[first[0] : first[-1]] = low + np.concatenate(edges)
+            shapes.span[i, 1] = low + len(points)
+        else:
+            kind = OTHER
+    shapes.kind[i], shapes.core[i] = kind, core
+
+
+def _edges(hull: Any) -> list[IntArray]:
+    """Return the corners that edges lead to from each corner of a hull."""
+    return [np.array(hull.neighbors(k), dtype=np.intp) for k in range(hull.num_points)]
 
 
 def core_of(geometry: Any) -> tuple[int, tuple[float, ...]]:

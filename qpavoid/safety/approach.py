@@ -19,11 +19,25 @@ class ApproachCheck:
 
     def __init__(self, settings: ControlSettings, rollouts: BackupRollouts, obstacles: ObstacleTracker) -> None:
         """Use the kinematics and distances of the rollouts."""
-        self._dt, self._braking = settings.dt, 0.5 / settings.bounds.acceleration
-        self._rollouts, self._obstacles, count = rollouts, obstacles, len(obstacles.current.states)
-        positions, rates = np.zeros((PATH_POINTS, count, 3)), np.zeros((PATH_POINTS, count, 2))
-        self._paths = kernels.Paths(np.zeros(PATH_POINTS, np.intp), positions, rates)
-        self._scratch = np.zeros_like(obstacles.current.states)
+        self._rollouts, self._obstacles, now = rollouts, obstacles, obstacles.current
+        count = len(now.states)
+        self._memory = kernels.ApproachArrays(
+            braking=0.5 / settings.bounds.acceleration,
+            spheres=rollouts.query.table.spheres,
+            radii=rollouts.query.obstacle_radii,
+            margin=now.margin,
+            states=now.states,
+            twists=obstacles.mean_twists,
+            numbers=np.zeros(PATH_POINTS, np.intp),
+            positions=np.zeros((PATH_POINTS, count, 3)),
+            rates=np.zeros((PATH_POINTS, count, 2)),
+            spans=np.zeros((count, 4)),
+            peaks=np.zeros((count, 2)),
+            scratch=np.zeros_like(now.states),
+            lever_arm=rollouts.lever_arm,
+            dt=settings.dt,
+        )
+        self._packed = kernels.pack(self._memory)
         self.max_speed = 0.0
         """Largest speed of any point of an obstacle, at the last call [m/s]."""
         self.reset()
@@ -32,7 +46,7 @@ class ApproachCheck:
 
     def reset(self) -> None:
         """Drop the paths."""
-        self._paths.numbers.fill(np.iinfo(np.intp).min)
+        self._memory.numbers.fill(np.iinfo(np.intp).min)
         self._first, self._moving = -1, self._obstacles.moving
 
     def is_far(self, q: Array, v: Array, t: float) -> bool:
@@ -40,25 +54,21 @@ class ApproachCheck:
 
         It is at q (nq,) at time t [s].
         """
-        first, obstacles, rollouts = floor(t / PATH_PERIOD), self._obstacles, self._rollouts
+        first, obstacles = floor(t / PATH_PERIOD), self._obstacles
         if obstacles.moving is not self._moving:
             self.reset()
         if first != self._first:
             self._extend(first)
-        now, query = obstacles.current, rollouts.query
         near, self.max_speed = kernels.comes_near(
-            rollouts.packed, q, v, self._braking, rollouts.lever_arm, self._dt, query.table.spheres,
-            query.obstacle_radii, now.margin, obstacles.external, now.states, obstacles.mean_twists,
-            obstacles.on_trajectories, self._paths, first,
-        )  # fmt: skip
+            self._packed, self._rollouts.packed, q, v, obstacles.external, obstacles.on_trajectories
+        )
         return not near
 
     def _extend(self, first: int) -> None:
         """Sample the paths from a multiple of their period until the horizon."""
-        self._first, paths = first, self._paths
-        numbers = range(first, first + PATH_POINTS)
-        missing = [s for s in numbers if paths.numbers[s % PATH_POINTS] != s]
-        for index, motion in self._obstacles.custom_trajectories.items():
+        self._first, x, obstacles = first, self._memory, self._obstacles
+        missing = [s for s in range(first, first + PATH_POINTS) if x.numbers[s % PATH_POINTS] != s]
+        for index, motion in obstacles.custom_trajectories.items():
             for s in missing:
-                kernels.write_path_point(paths, s % PATH_POINTS, index, motion.sample(s * PATH_PERIOD).row)
-        kernels.extend_paths(paths, self._obstacles.prediction.pieces, first, self._scratch)
+                kernels.write_path_point(self._packed, s % PATH_POINTS, index, motion.sample(s * PATH_PERIOD).row)
+        kernels.extend_paths(self._packed, obstacles.prediction.pieces, obstacles.on_trajectories, first)

@@ -205,14 +205,16 @@ def _bodies(kind: str, count: int) -> Loop:
 
 
 def _around(count: int) -> list[Obstacle]:
-    """Return cylinders, boxes and cones by turns around a Panda, 0.5 to 0.9 m off its axis."""
+    """Return cylinders, boxes and cones by turns in front of a Panda, 15 to 50 cm off where its tool swings."""
     random, obstacles = np.random.default_rng(4), list[Obstacle]()
     shapes = (Cylinder(radius=0.05, length=0.1), Box(size=(0.1, 0.08, 0.06)), Cone(radius=0.05, length=0.1))
-    for i in range(count):
-        angle, distance, height = random.uniform(-np.pi, np.pi), random.uniform(0.5, 0.9), random.uniform(0.05, 0.9)
-        place = [distance * np.cos(angle), distance * np.sin(angle), height]
-        turned = pin.exp3(random.uniform(-2.0, 2.0, 3))
-        obstacles.append(Obstacle.at(f"o{i}", shapes[i % 3], place, turned))
+    while len(obstacles) < count:
+        direction = random.normal(size=3)
+        offset = random.uniform(0.2, 0.5) * direction / np.linalg.norm(direction)
+        if offset[0] < 0.1:
+            continue  # not into the arm
+        place, turned = np.array([0.45, 0.0, 0.5]) + offset, pin.exp3(random.uniform(-2.0, 2.0, 3))
+        obstacles.append(Obstacle.at(f"o{len(obstacles)}", shapes[len(obstacles) % 3], place, turned))
     return obstacles
 
 
