@@ -103,6 +103,8 @@ class View:
         self._slots: list[Obstacle] = []  # as the page knows them
         self._changes: deque[bytes] = deque()
         self._step_times: deque[float] = deque(maxlen=_TIMED)
+        if scene is not None:
+            self._notice_obstacles(scene)  # their meshes take milliseconds each: not in the loop
         for module in ("viser", "trimesh"):
             if importlib.util.find_spec(module) is None:
                 raise ConfigError(f"the live view needs {module}: pip install 'qpavoid[view]'")
