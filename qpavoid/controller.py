@@ -125,6 +125,7 @@ class Controller(SceneChanges):
         self._builder.rows.clearance_lower_bound(v, 0, self.dt)
         self._builder.rows.leaves_position_limits(q, v, self.dt)
         self._builder.tracker.warm_up()
+        self._builder.rows.query.place(self._builder.tracker.current)
         kernels.projection_cost(np.zeros((0, len(v))), 1.0, v)
         if self.scene.spare:
             passing = replace(Obstacle.at(_WARM_UP, Sphere(radius=0.05), [2.0, 0.0, 0.0]), moves=True)
