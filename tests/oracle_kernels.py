@@ -45,9 +45,11 @@ def velocity_bounds(x, q):
     inner = np.full((2, len(x.v_max)), np.inf)
     if x.jerk_limited:
         inner = _within_jerk(x, margin, sign)
-        lower, upper = -inner[0], inner[1]
-        hard[1] = np.where(margin[1] < 0.0, np.maximum(hard[1], np.minimum(lower, x.v_max)), hard[1])
-        hard[0] = np.where(margin[0] < 0.0, np.maximum(hard[0], np.minimum(-upper, x.v_max)), hard[0])
+        jerky = np.isfinite(x.dv_step)
+        unit = np.where(jerky, x.dv_step, 1.0)
+        fall = unit * speed_to_stop(np.maximum(sign * x.v_prev - hard, 0.0) / unit, 1.0, 1.0)
+        soonest = np.maximum(-inner[::-1], sign * x.v_prev - fall)  # at the speed of the return, without overshoot
+        hard = np.where(jerky & (margin < 0.0), np.maximum(hard, np.minimum(soonest, x.v_max)), hard)
     hard_lower, hard_upper = -hard[0], hard[1]
     lower, upper = (np.clip(x.v_prev + s * x.v_step, hard_lower, hard_upper) for s in (-1.0, 1.0))
     bounds = np.clip(-inner[0], lower, upper), np.clip(inner[1], lower, upper)

@@ -114,11 +114,13 @@ def test_added_external_obstacle_is_one_from_the_start(panda):
 
 
 def test_added_obstacle_on_a_trajectory_is_one_from_the_start(panda):
+    """Without the search for backup trajectories, which begins earlier where a slot leaves room for what is held."""
     place = tool(panda, panda.home).translation
     start = tuple(place + np.array([0.0, 0.7, 0.0]))
     line = build_motion(Line(start=start, displacement=(0.0, -0.4, 0.0), speed=0.3), None, None)
     ball = Obstacle("ball", Sphere(radius=0.06), line)
-    built, grown = controller_of(panda, [ball]), controller_of(panda, spare=1)
+    fields = {"avoidance": Avoidance(d1=0.02, d2=0.12, backup=False)}
+    built, grown = controller_of(panda, [ball], **fields), controller_of(panda, spare=1, **fields)
     grown.add_obstacle(ball)
     (expected, said, _), (vs, also_said, _) = (loop(panda, c, 170) for c in (built, grown))
     np.testing.assert_allclose(vs, expected, atol=1e-12)
