@@ -80,6 +80,7 @@ class ObstacleTracker:
         self._measured.update(none, none, no_stamps, now.states)
         self._measured.extrapolate(none, 0.0, 0.0, now.states, now.margin)
         extrapolate(states[:0], 0.0)
+        self._trajectories.sample(0.0, states.copy())
 
     @property
     def now(self) -> float:
