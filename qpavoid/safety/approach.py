@@ -41,6 +41,8 @@ class ApproachCheck:
         self.max_speed = 0.0
         """Largest speed of any point of an obstacle, at the last call [m/s]."""
         self.reset()
+        if count:
+            kernels.write_path_point(self._packed, 0, 0, now.states[0])
         self.is_far(settings.scene.robot.home, np.zeros(settings.scene.robot.model.nv), 0.0)  # compiled before any step
         self.reset()
 

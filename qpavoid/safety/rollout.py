@@ -150,6 +150,7 @@ class BackupRollouts:
         self._poses: Array = self._memory.progress.view(np.ndarray)["poses"]
         self._has_kernels = self.kinematics.is_compiled and not self.query.has_clouds
         # every kernel once, so that no control step waits for the compiler
+        self.query.place(obstacles.current)
         self.begin(Start(scene.robot.home, zero, zero, 0.0, self.enabled), BackupPolicy(0.1, zero), None, LEAST_SCORE)
         with suppress(NumericalError):  # of a trajectory that gives nonsense: the steps say so
             self.resume(2)
