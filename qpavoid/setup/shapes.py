@@ -20,8 +20,6 @@ from qpavoid.setup.fit import MAX_VOLUME_RATIO, Bodies, fit_piece, hull_volume, 
 
 _DIGITS = 5
 """Decimals of lengths [m] and angles [rad] in files: 0.01 mm."""
-_SMALL = 0.01
-"""Radius up to which a box becomes the sphere around it [m]: its nearest corner would jump as a robot rests on it."""
 
 
 @dataclass(frozen=True)
@@ -124,8 +122,7 @@ def _exact_fields(piece: Piece) -> dict[str, Any]:
     geometry = piece.geometry
     if isinstance(geometry, coal.Box):
         x, y, z = (_up(2.0 * half) for half in geometry.halfSide)
-        radius = _up(float(np.linalg.norm(geometry.halfSide)))
-        shape: Any = Sphere(radius=radius) if radius <= _SMALL else Box(size=(x, y, z))
+        shape: Any = Box(size=(x, y, z))
     elif isinstance(geometry, coal.Cylinder):
         shape = Cylinder(radius=_up(geometry.radius), length=_up(2.0 * geometry.halfLength))
     else:
