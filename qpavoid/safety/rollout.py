@@ -44,10 +44,9 @@ from qpavoid.problem import Array, Mask
 
 _PERIOD = 0.04
 """Time between two decisions of a backup trajectory, about [s]: at 1 m/s, less than half of the preferred distance."""
-_INFLUENCE_DISTANCE = 0.2
-"""Distance below which a pair counts [m]: twice the preferred one; 0.3 takes twice as long, and finds no more."""
-_INFLUENCE_DISTANCE_OF_SLOW = 0.3
-"""The same of robots with jerk limits, which have to begin earlier [m]."""
+_INFLUENCE_DISTANCE = 0.25
+"""Distance below which a pair counts [m]: what closes in at 0.5 m/s within the longest policy horizon is seen before.
+At 0.2, two obstacles in 236 random scenes touch the robot that are evaded at 0.25 and 0.3, which take longer."""
 _DISTANCE_SCALE = 0.5
 """Fraction of the safety distance that has to be kept [-]: predictions may be wrong by the other half."""
 _ROUND_OFF = 1e-6
@@ -127,9 +126,7 @@ class BackupRollouts:
         self.period = period_steps * self._dt
         """Time between two decisions [s]."""
         self.kinematics, self.query = ForwardKinematics(model), DistanceQuery(scene, table)
-        is_slow = bool(np.isfinite(settings.bounds.jerk).any())
-        self._influence_distance = _INFLUENCE_DISTANCE_OF_SLOW if is_slow else _INFLUENCE_DISTANCE
-        self.query.set_influence_distance(self._influence_distance)
+        self.query.set_influence_distance(_INFLUENCE_DISTANCE)
         # a velocity may be asked for that is farther away than jerk limits allow in a period
         free = replace(settings.bounds, jerk=np.full(model.nv, np.inf))
         relaxed = replace(settings, bounds=free, dt=self.period)
@@ -164,7 +161,7 @@ class BackupRollouts:
         model, count = self._model, int((HORIZON + BEYOND) / self._dt) + 2 + period_steps
         progress = np.zeros(1, PROGRESS).view(np.recarray)
         s = progress[0]
-        s.influence_distance = self._influence_distance
+        s.influence_distance = _INFLUENCE_DISTANCE
         s.dt, s.period_steps, s.sufficient = self._dt, period_steps, self.sufficient_score.clearance
         s.completes_outside = not self.query.is_compiled
         s.moves_outside = model.nq != model.nv
@@ -301,7 +298,7 @@ class BackupRollouts:
         query, s = self.query, self._progress
         query.place(self._obstacles.at(s.t_pose, self._prediction))
         self.kinematics.compute(self._memory.q_pose)
-        query.compute(self.kinematics.joint_poses, self._influence_distance)
+        query.compute(self.kinematics.joint_poses, _INFLUENCE_DISTANCE)
         s.rows, s.is_moving = len(query.pairs), query.is_moving
 
     def _move(self) -> None:
