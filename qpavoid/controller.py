@@ -124,6 +124,7 @@ class Controller(SceneChanges):
         self.filter(q, v)
         self._builder.rows.clearance_lower_bound(v, 0, self.dt)
         self._builder.rows.leaves_position_limits(q, v, self.dt)
+        self._arbiter.warm_up(q)
         self._builder.tracker.warm_up()
         self._builder.rows.query.place(self._builder.tracker.current)
         kernels.projection_cost(np.zeros((0, len(v))), 1.0, v)

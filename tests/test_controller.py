@@ -1,5 +1,8 @@
 """The embeddable tick: what it accepts, and that bad input is named and leaves it usable."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -89,6 +92,37 @@ def test_solver_may_be_exchanged(controller, panda):
     np.testing.assert_array_equal(controller.step(panda.home).v, 0.01)
     controller.solver = before
     assert not np.isclose(controller.step(panda.home).v, 0.01).any()
+
+
+FIRST_USE = """
+import sys
+import numpy as np
+import pinocchio as pin
+from qpavoid import Controller, Robot, Sample, build_scene, build_tasks
+from qpavoid.config import Task
+
+robot = Robot.load("panda")
+controller = Controller(build_scene(robot), build_tasks([Task(frame="panda_hand_tcp", type="pose")], robot, robot.home))
+
+def loaded():
+    modules = [module for name, module in sys.modules.items() if name.startswith("qpavoid")]
+    kernels = {id(f): f for module in modules for f in vars(module).values() if hasattr(f, "signatures")}
+    return {f.__name__: len(f.signatures) for f in kernels.values()}
+
+before, q = loaded(), robot.home
+for k in range(700):
+    target = Sample.at([-0.1, 0.1, 0.3] if k < 120 else [1.5, 0.0, 0.3])
+    solution = controller.step(q, targets={"panda_hand_tcp": target})
+    q = pin.integrate(robot.model, q, 0.01 * solution.v)
+assert solution.stalled, "a reason was to be named"
+print(sorted(name for name, count in loaded().items() if count != before.get(name)))
+"""
+"""Runs a Panda without obstacles into itself, then beyond its reach; prints the kernels that steps had to load."""
+
+
+def test_no_step_loads_a_kernel_of_a_scene_without_obstacles():
+    run = subprocess.run([sys.executable, "-c", FIRST_USE], capture_output=True, text=True, check=True, timeout=300)
+    assert run.stdout.strip() == "[]"
 
 
 def test_controller_compiles_nothing_after_construction(controller, panda):

@@ -4,6 +4,7 @@ import os
 import shutil
 import threading
 import time
+from contextlib import contextmanager
 from io import BytesIO
 
 import numpy as np
@@ -86,18 +87,32 @@ def picture(page):
     return np.asarray(image, dtype=float)[160:, : WIDTH - 330]
 
 
+@contextmanager
+def running(shown):
+    """Run what a page shows in a thread of its own, and see it end."""
+    is_done = threading.Event()
+    loop = threading.Thread(target=shown.run, args=(is_done.is_set,))
+    loop.start()
+    try:
+        yield shown
+    finally:
+        is_done.set()
+        loop.join(PATIENCE)
+        assert not shown.view.is_alive
+
+
+def visit(page, shown):
+    wait_for(lambda: shown.view.url, "the page's address")
+    page.goto(shown.view.url)
+    page.wait_for_selector("canvas")
+
+
 @pytest.fixture
 def session(tmp_path):
     file = tmp_path / "pull.yaml"
     file.write_text(SCENARIO)
-    session = Session(str(file), port=0, quality="low")
-    is_done = threading.Event()
-    loop = threading.Thread(target=session.run, args=(is_done.is_set,))
-    loop.start()
-    yield session
-    is_done.set()
-    loop.join(PATIENCE)
-    assert not session.view.is_alive
+    with running(Session(str(file), port=0, quality="low")) as session:
+        yield session
 
 
 @pytest.fixture
@@ -134,9 +149,7 @@ def empty_picture(page, session):
 def test_page_shows_and_steers_a_run(session, page, empty_picture):
     errors = []
     page.on("pageerror", lambda error: errors.append(str(error)))
-    wait_for(lambda: session.view.url, "the page's address")
-    page.goto(session.view.url)
-    page.wait_for_selector("canvas")
+    visit(page, session)
     page.get_by_text("rows").first.wait_for()
     wait_for(lambda: session.t > 0.1, "the first steps: a run begins with the first browser")
     tool = session.tick.kinematics.position[0]
@@ -225,13 +238,8 @@ def test_page_shows_and_steers_a_run(session, page, empty_picture):
 @pytest.mark.xdist_group("browser")
 def test_page_plays_logs(page):
     logs = [simulate(load_scenario("panda_ball", ["duration=2.4", "dt=0.02"], name)) for name in ("tracking", "qp")]
-    replay, is_done = Replay(logs, port=0, quality="low"), threading.Event()
-    loop = threading.Thread(target=replay.run, args=(is_done.is_set,))
-    loop.start()
-    try:
-        wait_for(lambda: replay.view.url, "the page's address")
-        page.goto(replay.view.url)
-        page.wait_for_selector("canvas")
+    with running(Replay(logs, port=0, quality="low")) as replay:
+        visit(page, replay)
         wait_for(lambda: replay.step > 2, "the first steps")
         choose(page, "panda_ball tracking", "panda_ball qp")
         wait_for(lambda: replay.frames.log is logs[1], "the other run")
@@ -239,21 +247,13 @@ def test_page_plays_logs(page):
         wait_for(lambda: not replay.clock.is_playing, "the closest moment")
         assert replay.step == np.argmin(logs[1].min_distance)
         page.get_by_text(f"at {logs[1].t[replay.step]:.2f} s").first.wait_for()
-    finally:
-        is_done.set()
-        loop.join(PATIENCE)
 
 
 @pytest.mark.xdist_group("browser")
 def test_page_moves_a_robot_by_hand(page):
     robot = Robot.load("panda")
-    shown, is_done = RobotPage(robot, reasons_in_words(pair_reasons(robot)), port=0, quality="low"), threading.Event()
-    loop = threading.Thread(target=shown.run, args=(is_done.is_set,))
-    loop.start()
-    try:
-        wait_for(lambda: shown.view.url, "the page's address")
-        page.goto(shown.view.url)
-        page.wait_for_selector("canvas")
+    with running(RobotPage(robot, reasons_in_words(pair_reasons(robot)), port=0, quality="low")) as shown:
+        visit(page, shown)
         page.get_by_text(f"{len(robot.bodies.collisionPairs)} active pairs").first.wait_for()
         page.get_by_text("pairs left out: one joint apart").first.wait_for()
         assert not shown.touching
@@ -267,9 +267,6 @@ def test_page_moves_a_robot_by_hand(page):
             pixels = picture(page)
             red = np.mean((pixels[..., 0] > 1.4 * pixels[..., 1]) & (pixels[..., 0] > 1.4 * pixels[..., 2]))
         assert red > 0.005
-    finally:
-        is_done.set()
-        loop.join(PATIENCE)
 
 
 def tool_error(session):

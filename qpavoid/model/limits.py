@@ -23,6 +23,8 @@ _RECOVERY_SHARE = 0.1
 """Share of its speed limit at which a coordinate recovers [-]."""
 _MAX_RECOVERY_SPEED = 0.2
 """Speed at which it recovers at most [rad/s or m/s]."""
+_NO_LIMIT = 1e9
+"""Stands for a change of velocity without a limit [rad/s or m/s]: finite, so that 0 times it is 0."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +53,13 @@ class JointBounds:
         These are demands that no task makes: a robot must not start fast for them.
         """
         return np.minimum(_RECOVERY_SHARE * self.velocity, _MAX_RECOVERY_SPEED)
+
+    def finite_dv_step(self, dt: float) -> Array:
+        """Return the largest change (nv,) of the changes of v in two successive control steps of dt [s] [rad/s or m/s].
+
+        Where there is no limit, it is very large, but finite, as `kernels.speed_to_stop` takes it.
+        """
+        return np.minimum(self.jerk * dt**2, _NO_LIMIT)
 
     def within(self, config: Limits) -> JointBounds:
         """Return the part of the limits that a scenario allows to be used.

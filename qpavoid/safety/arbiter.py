@@ -49,6 +49,11 @@ class Arbiter:
         if self.backup is not None:
             self.backup.reset()
 
+    def warm_up(self, q: Array) -> None:
+        """Run all checks once at q (nq,), where a control step has been."""
+        self._braking.warm_up(q)
+        self.progress.warm_up()
+
     @property
     def backup_velocities(self) -> Array:
         """Return the velocities (k, nv) of the control steps of the backup trajectory; none without one."""

@@ -114,6 +114,10 @@ class BrakingCheck:
         self._allowance = np.zeros(len(scene.pairs))
         self._distance_allowance = scene.distance_allowance(self._safety_distance)
 
+    def warm_up(self, q: Array) -> None:
+        """Evaluate a standstill at q (nq,), where a control step has been: no later one waits for the kernels."""
+        self._least(q, np.zeros(self._model.nv))
+
     def check(
         self,
         q: Array,

@@ -68,6 +68,10 @@ class ProgressMonitor:
         self._step, self._stalled = 0, tuple[Reason, ...]()
         self._history, self._since = deque[list[float]](maxlen=_CHECKS + 1), [0] * len(self._goals)
 
+    def warm_up(self) -> None:
+        """Call what names reasons once: no control step waits for the kernels."""
+        self._rows.curvature(np.zeros_like(self._rows.frame_errors))
+
     def update(self, problem: Problem, solution: Solution) -> tuple[Reason, ...]:
         """Return what keeps the tasks from their targets, after long enough without progress.
 

@@ -26,8 +26,6 @@ _COMING = 0.05
 
 _NO_LEVER = 1e-6
 """Entry of a distance Jacobian up to which a joint does not move the pair: round-off of axes in files [m/rad or 1]."""
-_NO_LIMIT = 1e9
-"""Change of v within a change of its change that is no limit [rad/s or m/s]: `speed_to_stop` takes finite ones."""
 
 
 def recovery_limits(
@@ -52,7 +50,7 @@ def recovery_limits(
     fastest = bounds.recovery / (min(degree, 1.0) * rest)
     lower, upper = -fastest, fastest
     if problem.jerk_limited:
-        change = np.minimum(bounds.jerk * dt**2, _NO_LIMIT)
+        change = bounds.finite_dv_step(dt)
         fall, rise = (speed_to_stop(np.maximum(fastest - v, 0.0), change, 1.0) for v in (-v_prev, v_prev))
         lower, upper = np.maximum(lower, v_prev - fall), np.minimum(upper, v_prev + rise)
     return lower, upper

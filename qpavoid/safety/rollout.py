@@ -52,7 +52,7 @@ _DISTANCE_SCALE = 0.5
 _ROUND_OFF = 1e-6
 """Difference of two times that counts as none [s]."""
 _UNLIMITED = 1e9
-"""Stands for no limit of a speed, or of the change of its change [rad/s, m/s]: finite, so that 0 times it is 0."""
+"""Stands for no limit of a speed [rad/s, m/s]: finite, so that 0 times it is 0."""
 _ALL_POSES = 10**9
 """More poses than any rollout evaluates [-]."""
 
@@ -316,5 +316,5 @@ def _is_equal(a: Mask, b: Mask) -> bool:
 
 def _ramp_limits(bounds: JointBounds, dt: float) -> RampLimits:
     """Return what the limits of the joints allow in control steps of dt [s]."""
-    dv_step, max_speed = np.minimum(bounds.jerk * dt * dt, _UNLIMITED), np.minimum(bounds.velocity, _UNLIMITED)
+    dv_step, max_speed = bounds.finite_dv_step(dt), np.minimum(bounds.velocity, _UNLIMITED)
     return RampLimits(bounds.acceleration * dt, dv_step, max_speed, bool(np.isfinite(bounds.jerk).any()))

@@ -30,7 +30,6 @@ class ShakeDamping:
 
     def __init__(self, dt: float) -> None:
         self._dt, self._interval = dt, max(1, round(_INTERVAL / dt))
-        self._v_first = self._v_last = list[float]()
         self.reset()
 
     def reset(self) -> None:
@@ -40,9 +39,8 @@ class ShakeDamping:
 
     def _begin(self, v: list[float] | None) -> None:
         """Begin an interval after a command v, or none."""
-        self._steps, self._change, self._is_open = 0, 0.0, v is not None
-        if v is not None:
-            self._v_first = self._v_last = v
+        self._steps, self._change = 0, 0.0
+        self._v_first = self._v_last = v
 
     def apply(self, problem: Problem) -> Problem:
         """Return the problem with more regularization, if the robot has been shaking."""
@@ -60,13 +58,13 @@ class ShakeDamping:
             stalled: whether any task is.
         """
         if not stalled and self._factor == 1.0:
-            self._is_open = False
+            self._begin(None)
             return
         if feedforward.any():
             self.reset()
             return
         command = v.tolist()
-        if not self._is_open:
+        if self._v_first is None or self._v_last is None:
             self._begin(command)
             return
         self._change += _difference(command, self._v_last)
