@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from qpavoid.control.builder import ProblemBuilder
 from qpavoid.control.distances import DistanceQuery
+from qpavoid.control.obstacle_states import ObstacleStates
 from qpavoid.errors import UnknownName, nearest
 from qpavoid.model.sample import Sample
 from qpavoid.model.scene import Obstacle, Scene
@@ -120,6 +121,11 @@ class SceneChanges:
     def obstacle_pose(self, obstacle: str, q: Array | None = None) -> Sample:
         """Return the world pose of an obstacle in the last step, attached or not; see `release`."""
         return self._builder.pose(self._builder.tracker.index(obstacle), q)
+
+    @property
+    def obstacle_states(self) -> ObstacleStates:
+        """States of all obstacles in the last step; the next one overwrites them."""
+        return self._builder.tracker.current
 
     def distances(self) -> DistanceQuery:
         """Return distances of the scene in memory of their own, which know what is attached to the robot."""

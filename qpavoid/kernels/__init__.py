@@ -30,7 +30,6 @@ from qpavoid.kernels.layout import RowLayout
 from qpavoid.kernels.near_pairs import DistanceArrays, near_pairs, place_bodies, place_obstacles
 from qpavoid.kernels.obstacles import Pieces, check_states, sample_pieces
 from qpavoid.kernels.planning import PlanningArrays, pair_clearances
-from qpavoid.kernels.planning import clearance as planned_clearance
 from qpavoid.kernels.planning_goals import FrameTargets
 from qpavoid.kernels.planning_search import search
 from qpavoid.kernels.prediction import Prediction, predict, prediction_error_bound
@@ -93,7 +92,6 @@ __all__ = [
     "pair_clearances",
     "place_bodies",
     "place_obstacles",
-    "planned_clearance",
     "predict",
     "prediction_error_bound",
     "project",
