@@ -10,4 +10,5 @@ def test_loop_of_the_page_runs():
     (snippet,) = re.findall(r"```python\n(.*?)```", PAGE, re.S)
     names = {}
     exec(compile(snippet, "camera.md", "exec"), names)
-    assert names["timing"].submitted == 10 and names["timing"].refused <= 1
+    timing = names["timing"]
+    assert (timing.submitted, timing.refused) == (9, 1)  # the first one was taken before the loop began

@@ -15,7 +15,7 @@ from qpavoid.problem import Array, IntArray, Mask
 
 
 class OwnBodies(NamedTuple):
-    """Collision bodies of a robot, as points are told apart from them.
+    """Collision bodies of a robot, as points are compared with them.
 
     A body is a box with a radius around it (sphere: a point, capsule: a segment), or the inside of some planes.
     """

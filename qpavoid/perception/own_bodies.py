@@ -41,7 +41,7 @@ class OwnBodiesAt:
         self._joints = [body.parentJoint for body in geometries] + [0] * _MAX_HELD
         nowhere = pin.SE3(np.eye(3), np.full(3, _FAR))
         self._placements = [body.placement for body in geometries] + [nowhere] * _MAX_HELD
-        self._held: dict[str, int] = {}
+        self._objects: dict[str, int] = {}
         count, planes, core, spheres, span = len(self._joints), list[Array](), list[Any](), list[Any](), list[Any]()
         for body in geometries:
             kind, numbers = core_of(body.geometry)
@@ -67,15 +67,15 @@ class OwnBodiesAt:
             ConfigError: too many, or a name twice.
             UnknownName: no such frame.
         """
-        if name in self._held or len(self._held) == _MAX_HELD:
+        if name in self._objects or len(self._objects) == _MAX_HELD:
             raise ConfigError(f"hold: {name!r}: held already, or {_MAX_HELD} others are")
         number = self._robot.frame_id(frame, "hold")
         geometry, placement = make_shape(shape), pin.SE3(np.asarray(rotation, float), np.asarray(position, float))
         if core_of(geometry)[0] > BOX:
             fit = enclosing_capsule(geometry)
             geometry, placement = coal.Capsule(fit.radius, fit.length), placement * pin.SE3(fit.rotation, fit.center)
-        free = set(range(len(self._joints) - _MAX_HELD, len(self._joints))) - set(self._held.values())
-        self._held[name] = i = min(free)
+        free = set(range(len(self._joints) - _MAX_HELD, len(self._joints))) - set(self._objects.values())
+        self._objects[name] = i = min(free)
         frames = self._robot.model.frames
         self._joints[i], self._placements[i] = frames[number].parentJoint, frames[number].placement * placement
         self.arrays.core[i], self.arrays.sphere[i] = core_of(geometry)[1], _sphere(geometry)
@@ -86,9 +86,9 @@ class OwnBodiesAt:
         Raises:
             UnknownName: it is not held.
         """
-        if name not in self._held:
+        if name not in self._objects:
             raise UnknownName(f"release: {name!r} is not held")
-        i = self._held.pop(name)
+        i = self._objects.pop(name)
         self._joints[i], self._placements[i] = 0, pin.SE3(np.eye(3), np.full(3, _FAR))
 
     def place(self, q: Array) -> Array:
