@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import replace
+from functools import partial
 from time import perf_counter
 from typing import Any, NoReturn
 
@@ -80,7 +81,10 @@ class Controller(SceneChanges, SplitStep):
             raise ConfigError(f"dt: {dt} s, expected more than 0 and at most {_MAX_DT}; it is in seconds")
         if not 0.0 <= latency <= MAX_LATENCY:
             raise ConfigError(f"latency: {latency} s, expected 0 to {MAX_LATENCY}; it is in seconds")
-        self._given = tasks, dt, avoidance, limits, sensing, progress, contacts, latency
+        self._another = partial(
+            type(self), tasks=tasks, dt=dt, avoidance=avoidance, limits=limits, sensing=sensing, progress=progress,
+            contacts=contacts, latency=latency,
+        )  # fmt: skip
         frames, others = in_order(tasks)
         self.scene = scene = scene.own_copy() if scene.spare else scene
         """Robot and obstacles, those that were added among them."""
@@ -290,9 +294,9 @@ class Controller(SceneChanges, SplitStep):
         It has the scene, with what was added and is attached, and all settings; it is as after `reset`. Tasks are
         shared, since they remember nothing; a law of your own is deep-copied.
         """
-        law, (tasks, dt, *settings) = self.solver, self._given
+        law = self.solver
         own = make_solver(law.config) if isinstance(law, NamedSolver) else deepcopy(law)
-        controller = type(self)(self.scene.emptied(), tasks, own, dt, *settings)
+        controller = self._another(self.scene.emptied(), solver=own)
         controller._take_over(self)
         return controller
 

@@ -69,7 +69,5 @@ class SplitStep:
             raise ConfigError("command: no step has begun; call `rows` before it")
         if faults := check_velocity("v_desired", v_desired, LARGEST_COMMAND):
             v_desired = np.zeros(nv)
-        step = step._replace(
-            problem=self._builder.rows.follow(v_desired, step.problem), faults=step.faults + faults
-        )
+        step = step._replace(problem=self._builder.rows.follow(v_desired, step.problem), faults=step.faults + faults)
         return self._decide(step, begin, from_tasks=False)
