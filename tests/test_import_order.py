@@ -12,7 +12,7 @@ if not BENCH.is_dir():  # in a wheel it stands beside the package
 FOR_BENCHMARKS = {
     "qpavoid.errors": "error classes, and how messages name a place and the nearest name",
     "qpavoid.control.obstacle_states": "ObstacleStates: where the planner puts the obstacles for that",
-    "qpavoid.control.distances": "DistanceQuery: the planner that proves a case solvable checks distances",
+    "qpavoid.control.distances": "DistanceQuery: the planner that proves a case solvable checks distances, grasps too",
     "qpavoid.control.tasks": "FrameTask: which goals the scores and other libraries follow",
     "qpavoid.solvers": "parse_solver: entrants are named as in scenarios",
     "qpavoid.solvers.backends": "the back ends that are compared",
