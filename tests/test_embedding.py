@@ -12,7 +12,7 @@ from closed_loop import Ruler
 from qpavoid import Avoidance, ConfigError, Controller, Obstacle, Pose, Solver, UnknownName, build_scene, build_tasks
 from qpavoid.adapters.handover import Handover
 from qpavoid.adapters.timing import Rate, Watchdog
-from qpavoid.config import Box, PostureTask, Sphere, Task
+from qpavoid.config import Box, Line, Planning, PostureTask, Sphere, Task
 from qpavoid.solvers import make_solver
 
 TOOL, DT = "panda_hand_tcp", 0.01
@@ -105,6 +105,26 @@ def test_a_clone_has_what_was_added_attached_and_allowed(panda):
     twin.release("ball")
     twin.remove_obstacle("shelf")
     assert "shelf" in controller.scene.obstacle_names and "ball" in controller.attached
+
+
+def test_a_clone_plans_like_its_original(panda):
+    """Its forecasts know what was added: both begin the same plan at the same time, bit for bit."""
+    tasks = [Task(frame=TOOL, motion=Line(displacement=(0.0, 0.3, 0.0), speed=0.3))]
+    scene = build_scene(panda, spare_obstacles=2)
+    avoidance = Avoidance(d1=0.02, d2=0.12)
+    controller = Controller(
+        scene, build_tasks(tasks, panda, panda.home), dt=DT, avoidance=avoidance, planning=Planning(settle=1.0)
+    )
+    controller.add_obstacle(Obstacle.at("ball", Sphere(radius=0.05), [0.35, 0.2, 0.45]))
+    runs = []
+    for one in (controller.clone(), controller):
+        q, out = panda.home, []
+        for _ in range(100):
+            solution = one.step(q)
+            out.append((solution.v.tobytes(), solution.plan))
+            q = q + DT * solution.v
+        runs.append(out)
+    assert runs[0] == runs[1]
 
 
 def test_a_clone_has_a_law_of_its_own(panda):

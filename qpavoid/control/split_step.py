@@ -20,6 +20,7 @@ class SplitStep:
 
     scene: Scene
     _builder: ProblemBuilder
+    _planning: Any
 
     def _decide(self, step: StepProblem, begin: float, from_tasks: bool = True) -> Solution:
         raise NotImplementedError
@@ -49,7 +50,10 @@ class SplitStep:
         Raises:
             NumericalError, UnknownName: as `step`.
         """
-        return self._builder.build(self._builder.read(q, t, None, obstacles, v)).problem
+        arguments = self._builder.read(q, t, None, obstacles, v)
+        if self._planning is not None:
+            self._planning.drop()
+        return self._builder.build(arguments).problem
 
     def command(self, v_desired: Array) -> Solution:
         """End the step that `rows` began: return the safe velocity that is closest to a command.
