@@ -18,6 +18,7 @@ from qpavoid.kernels.clearance import (
     joint_speeds,
     leaves_position_limits,
 )
+from qpavoid.kernels.depth import CellGrid, OwnBodies, fill_cells, mark_own_pixels, recall_cells
 from qpavoid.kernels.estimates import (
     are_fine,
     extrapolate_estimates,
@@ -48,9 +49,11 @@ from qpavoid.kernels.voxels import select_voxels, voxels_within
 __all__ = [
     "TOLERANCE",
     "ApproachArrays",
+    "CellGrid",
     "DistanceArrays",
     "FrameTargets",
     "KinematicsArrays",
+    "OwnBodies",
     "Pieces",
     "PlanningArrays",
     "Prediction",
@@ -76,6 +79,7 @@ __all__ = [
     "extend_paths",
     "extrapolate_estimates",
     "extrapolate_states",
+    "fill_cells",
     "find_near_pairs",
     "first_use",
     "follow_ramp",
@@ -84,6 +88,7 @@ __all__ = [
     "jerk_limited_stop",
     "joint_speeds",
     "leaves_position_limits",
+    "mark_own_pixels",
     "max_clearance_velocity",
     "max_offset",
     "minimize",
@@ -97,6 +102,7 @@ __all__ = [
     "project",
     "project_soft",
     "projection_cost",
+    "recall_cells",
     "roll_out_stop",
     "rollout_outcome",
     "rotation_vector",

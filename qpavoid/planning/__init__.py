@@ -1,1 +1,1 @@
-"""Collision-free paths from a configuration to goals, planned with the bodies and pairs of a scene."""
+"""What the law will lead to, and other ways to drive its QP where that does not arrive."""
