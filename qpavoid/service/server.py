@@ -167,7 +167,7 @@ class Service:
             except zmq.Again:
                 break
             arrived, client = time.monotonic(), frames[0]
-            envelope = 2 if frames[1:2] == [b""] else 1  # of a REQ socket, an empty frame comes first
+            envelope = 2 if len(frames) > 2 and not frames[1] else 1  # of a REQ socket, an empty frame comes first
             try:
                 request: Request | Refusal = messages.read_request(frames[envelope:])
             except Refusal as refusal:

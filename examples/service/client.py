@@ -5,10 +5,9 @@ import sys
 import msgpack
 import zmq
 
-ADDRESS = sys.argv[1] if len(sys.argv) > 1 else "tcp://127.0.0.1:5570"
 socket = zmq.Context().socket(zmq.REQ)
 socket.setsockopt(zmq.RCVTIMEO, 1000)  # no answer in a second: raises zmq.Again, and your robot has to stop by itself
-socket.connect(ADDRESS)
+socket.connect(sys.argv[1] if len(sys.argv) > 1 else "tcp://127.0.0.1:5570")
 
 
 def ask(kind, **fields):
@@ -22,10 +21,10 @@ def ask(kind, **fields):
 
 hello = ask("hello")
 ask("reset")
-q, dt, start = list(hello["q0"]), hello["dt"], [0.31, 0.0, 0.49]
+q, dt = hello["q0"], hello["dt"]
 for k in range(300):
-    ball = {"position": [0.6 - 0.1 * k * dt, 0.0, 0.5], "linear": [-0.1, 0.0, 0.0]}
-    target = {"position": [start[0], start[1] + min(0.1 * k * dt, 0.2), start[2]]}
-    command = ask("step", seq=k, q=q, t=k * dt, targets={hello["targets"][0]: target}, obstacles={"ball": ball})
+    target = {hello["targets"][0]: {"position": [0.31, 0.0006 * k, 0.49]}}
+    ball = {"ball": {"position": [0.6 - 0.1 * k * dt, 0.0, 0.5], "linear": [-0.1, 0.0, 0.0]}}
+    command = ask("step", seq=k, q=q, t=k * dt, targets=target, obstacles=ball)
     q = [angle + dt * v for angle, v in zip(q, command["v"], strict=True)]  # your robot goes here
-print(f"{hello['robot']}: {command['status']} at {[round(angle, 2) for angle in q]}")
+print(f"{hello['robot']}: {command['status']}")
