@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("msgpack")
 
-from qpavoid.service.messages import MAX_CLOUDS, MAX_MESSAGE, MAX_POINTS, REQUESTS, VERSION, Fault, Target, Update  # noqa: E402
+from qpavoid.service.messages import MAX_CLOUDS, MAX_MESSAGE, MAX_POINTS, REQUESTS, VERSION, Fault, Target, Update
 
 PAGE = (Path(__file__).parent.parent / "docs" / "service.md").read_text(encoding="utf-8")
 

@@ -90,10 +90,10 @@ def serve(scenario):
 
 def listener(service, client):
     """A subscriber of the commands."""
-    heard = client(zmq.SUB)
-    heard.socket.setsockopt(zmq.SUBSCRIBE, b"")
-    heard.socket.connect(service.commands_endpoint)
-    return heard
+    commands_in = client(zmq.SUB)
+    commands_in.socket.setsockopt(zmq.SUBSCRIBE, b"")
+    commands_in.socket.connect(service.commands_endpoint)
+    return commands_in
 
 
 def test_answers_are_the_controllers_own(serve, scenario):
@@ -277,8 +277,8 @@ def test_lost_heartbeat_is_a_stop_within_the_limits(serve, scenario):
     controller, q = Controller.from_scenario(scenario)
     limits, model = controller.scene.robot.bounds().acceleration, controller.scene.robot.model
     service, client = serve(heartbeat=0.05)
-    robot, heard = client(), listener(service, client)
-    while not heard.socket.poll(20):  # until the subscription is known, steps from rest begin anew
+    robot, commands_in = client(), listener(service, client)
+    while not commands_in.socket.poll(20):  # until the subscription is known, steps from rest begin anew
         robot.ask("reset", v=[0.0] * 7)
         robot.ask("step", q=q.tolist())
     robot.ask("reset", v=[0.0] * 7)
@@ -289,19 +289,19 @@ def test_lost_heartbeat_is_a_stop_within_the_limits(serve, scenario):
             robot.ask("reset", v=[0.0] * 7)
             continue
         q = pin.integrate(model, q, DT * np.array(last["v"]))
-    command = msgpack.unpackb(heard.socket.recv())
+    command = msgpack.unpackb(commands_in.socket.recv())
     while not (command["reasons"] and command["reasons"][0]["kind"] == "HEARTBEAT_LOST"):
-        v, command = np.array(command["v"]), msgpack.unpackb(heard.socket.recv())
+        v, command = np.array(command["v"]), msgpack.unpackb(commands_in.socket.recv())
     speeds = [np.abs(v).max()]
     while np.abs(command["v"]).max() > 0.0:
         assert command["status"] == "STOPPED" and command["seq"] is None
         now = np.array(command["v"])
         assert (np.abs(now - v) <= limits * DT + 1e-6).all()
         speeds.append(np.abs(now).max())
-        v, command = now, msgpack.unpackb(heard.socket.recv())
+        v, command = now, msgpack.unpackb(commands_in.socket.recv())
     assert (np.diff(speeds) < 0.0).all() and len(speeds) < 100
     for _ in range(3):
-        assert not np.abs(msgpack.unpackb(heard.socket.recv())["v"]).any()
+        assert not np.abs(msgpack.unpackb(commands_in.socket.recv())["v"]).any()
     refused = robot.ask("step", q=q.tolist())
     assert refused["error"] == "HALTED" and "reset" in refused["text"]
     assert robot.ask("reset")["type"] == "done"

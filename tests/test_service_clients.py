@@ -61,9 +61,9 @@ def test_server_stops_the_robot_before_it_ends(server):
     """Ctrl-C while it moves: the last commands brake to zero."""
     process, requests, commands = server
     context = zmq.Context()
-    ask, heard = context.socket(zmq.REQ), context.socket(zmq.SUB)
-    heard.setsockopt(zmq.SUBSCRIBE, b"")
-    heard.connect(commands)
+    ask, stream = context.socket(zmq.REQ), context.socket(zmq.SUB)
+    stream.setsockopt(zmq.SUBSCRIBE, b"")
+    stream.connect(commands)
     ask.connect(requests)
 
     def answer(**fields):
@@ -77,8 +77,8 @@ def test_server_stops_the_robot_before_it_ends(server):
     process.send_signal(signal.SIGINT)
     assert process.wait(60) == 0
     received = []
-    while heard.poll(500):
-        received.append(msgpack.unpackb(heard.recv()))
+    while stream.poll(500):
+        received.append(msgpack.unpackb(stream.recv()))
     context.destroy(0)
     speeds = [np.abs(command["v"]).max() for command in received]
     assert max(speeds) > 0.1 and speeds[-1] == 0.0

@@ -55,7 +55,7 @@ class Service:
 
         Args:
             controller: that answers.
-            q0: configuration (nq,) that clients are told to begin at.
+            q0: configuration (nq,) that clients get to begin at.
             heartbeat: time without a step after which the robot is stopped [s].
             host: address of this machine to be reached at.
             port: of requests; that of commands is the next one. 0: any that are free.
