@@ -42,13 +42,13 @@ def started(spec, robot):
     return model, data
 
 
-def least_distance(panda, solver="qp", compensated=True, seed=0):
+def least_distance(panda, solver="qp", seed=0):
     """Least distance to a ball that flies at the arm, and a board that a camera sees [m], of a loop at 500 Hz.
 
     Servos lag, encoders are noisy and two periods late, a camera at 30 Hz is 60 ms late and noisy.
     """
     rng, dt, late, spec = np.random.default_rng(seed), 0.002, 0.06, panda_spec(panda)
-    ball = spec.worldbody.add_body(name="ball", mocap=True, pos=[1.2, 0.0, 0.5])
+    ball = spec.worldbody.add_body(name="ball", mocap=True, pos=[0.9, 0.0, 0.5])
     ball.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.06, 0.0, 0.0])
     board = spec.worldbody.add_body(name="board", pos=[0.45, -0.35, 0.4])
     board.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.2, 0.01, 0.2])
@@ -57,7 +57,7 @@ def least_distance(panda, solver="qp", compensated=True, seed=0):
     balls = obstacles_of(model, data, ["ball"], uncertainty=0.005)
     cloud = Obstacle.at("eye", PointCloud(resolution=0.02), [0.0, 0.0, 0.0])
     tasks = build_tasks([Task(frame=TOOL, type="pose"), PostureTask(weight=1e-3)], panda, panda.home)
-    latency = LAG + 2 * dt if compensated else 0.0
+    latency = LAG + 2 * dt
     avoidance = Avoidance(d1=0.03, d2=0.12)
     controller = Controller(
         build_scene(panda, [*balls, cloud]), tasks, solver, dt, avoidance=avoidance, latency=latency
@@ -65,18 +65,17 @@ def least_distance(panda, solver="qp", compensated=True, seed=0):
     plug, encoders, pictures, least = MujocoRobot(controller, model, ["ball"]), deque(maxlen=3), deque(), np.inf
     ruler = Ruler(build_scene(panda, obstacles_of(model, data, ["ball", "board"])))
     to_obstacles = ruler.scene.obstacle_of[ruler.scene.pairs[:, 1]] >= 0
-    for k in range(1000):
+    for k in range(1250):
         t = k * dt
         encoders.append(plug.q(data) + 1e-4 * rng.normal(size=7))
         if k % 16 == 0:
-            stamp = t if compensated else None
-            seen = {"ball": Pose.at(data.mocap_pos[0] + 0.002 * rng.normal(size=3), t=stamp)}
-            seen["eye"] = Points(camera_points(model, data, "eye", ["ball"]), t=stamp)
+            seen = {"ball": Pose.at(data.mocap_pos[0] + 0.002 * rng.normal(size=3), t=t)}
+            seen["eye"] = Points(camera_points(model, data, "eye", ["ball"]), t=t)
             pictures.append((t + late, seen))
         news = pictures.popleft()[1] if pictures and pictures[0][0] <= t else None
-        target = {TOOL: [0.4, -0.3 * np.sin(2.0 * t), 0.45]}  # it leads into the board
+        target = {TOOL: [0.4, -0.3 * np.sin(t), 0.45]}  # it leads into the board
         plug.command(data, controller.step(encoders[0], t, target, news).v)
-        data.mocap_pos[0] = [1.2 - 0.6 * t, 0.0, 0.5]
+        data.mocap_pos[0] = [max(0.9 - 0.3 * t, 0.3), 0.0, 0.5]  # it comes to rest where the tool was
         mujoco.mj_step(model, data, 2)
         if k % 10 == 0:
             distances = ruler.distances(plug.q(data), {0: Sample.at(data.mocap_pos[0])})

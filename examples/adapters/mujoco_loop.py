@@ -51,7 +51,7 @@ for k in range(1500):
     news = pictures.popleft()[1] if pictures and pictures[0][0] <= t else None
     target = [0.4, -0.3 * np.sin(t), 0.45]  # it leads into the board
     plug.command(data, controller.step(encoders[0], t, {"panda_hand_tcp": target}, news).v)
-    data.mocap_pos[0] = [1.2 - 0.4 * t, 0.0, 0.5]
+    data.mocap_pos[0] = [max(1.2 - 0.6 * t, 0.3), 0.0, 0.5]
     mujoco.mj_step(model, data, 2)
     for other in (model.ngeom - 1, model.ngeom - 2) if k % 5 == 0 else ():
         closest = min(closest, *(mujoco.mj_geomDistance(model, data, g, other, 1.0, ends) for g in geoms))
