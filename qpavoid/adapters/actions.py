@@ -23,6 +23,10 @@ class Chunk(NamedTuple):
     """Number of the first one that had to be changed; None where none was."""
 
 
+_FAST = 1e6
+"""Change of velocity in a control period of a joint without a limit on it [rad/s or m/s]."""
+
+
 class ActionFilter:
     """The safety filter of a controller, for a program that sends positions; robots of hinges and slides alone.
 
@@ -42,8 +46,9 @@ class ActionFilter:
         if model.nq != model.nv:
             raise ConfigError(f"{controller.scene.robot.name}: a joint has no limits, or several coordinates; lock it")
         self.controller, self._ahead = controller, controller.clone()
-        self._speed, self._acceleration = bounds.velocity, bounds.acceleration
+        self._speed, self._step = bounds.velocity, np.minimum(bounds.acceleration * controller.dt, _FAST)
         self._setpoint: Array | None = None
+        self._last: Array | None = None
         self._v = np.zeros(model.nv)
         self.solution: Solution | None = None
         """What the last action led to, and why."""
@@ -59,9 +64,11 @@ class ActionFilter:
             t: time [s]; see `Controller.step`.
             obstacles: where obstacles are now; see `Controller.step`.
         """
+        action = np.array(action, dtype=np.float64)
         start = np.array(q, dtype=np.float64) if self._setpoint is None else self._setpoint
-        self.solution = self.controller.filter(q, self._towards(start, action, self._v), t, obstacles)
-        self._v = self.solution.v
+        v_desired = self._towards(start, action, action if self._last is None else self._last, self._v)
+        self.solution = self.controller.filter(q, v_desired, t, obstacles)
+        self._v, self._last = self.solution.v, action
         setpoint: Array = start + self.controller.dt * self._v
         self._setpoint = setpoint
         return np.array(setpoint)
@@ -78,12 +85,12 @@ class ActionFilter:
         """
         dt, out, changed = self.controller.dt, np.array(actions, dtype=np.float64), None
         x = np.array(q, dtype=np.float64) if self._setpoint is None else self._setpoint
-        v = self._v
+        v, last = self._v, out[0] if self._last is None else self._last
         self._ahead.reset(v)
-        for k, action in enumerate(np.asarray(actions, dtype=np.float64)):
+        for k, action in enumerate(out.copy()):
             now = {name: _later(value, k * dt) for name, value in (obstacles or {}).items()}
-            v = self._ahead.filter(x, self._towards(x, action, v), k * dt, now).v
-            x = x + dt * v
+            v = self._ahead.filter(x, self._towards(x, action, last, v), k * dt, now).v
+            x, last = x + dt * v, action
             out[k] = x
             if changed is None and np.abs(x - action).max() > self.tolerance:
                 changed = k
@@ -91,20 +98,26 @@ class ActionFilter:
 
     def reset(self) -> None:
         """Begin where the robot is, as before an episode."""
-        self._setpoint, self._v = None, np.zeros_like(self._v)
+        self._setpoint, self._last, self._v = None, None, np.zeros_like(self._v)
         self.controller.reset()
 
-    def _towards(self, start: Array, action: Array, v_last: Array) -> Array:
-        """Return the velocity (nv,) straight to an action, within speeds and accelerations, and able to stop there."""
-        dt, missing = self.controller.dt, np.asarray(action, dtype=np.float64) - start
-        step, distance = self._acceleration * dt, np.abs(missing)
-        with np.errstate(invalid="ignore"):  # of joints without a limit
-            stopping = kernels.speed_to_stop(distance, step, dt)
-        fastest = np.minimum(self._speed, np.maximum(np.sign(missing) * v_last, 0.0) + step)
-        fastest = np.fmin(fastest, np.where(np.isfinite(step), stopping, np.inf))
-        speed = distance / dt
-        excess = np.max(speed[speed > 0.0] / fastest[speed > 0.0], initial=1.0)
-        return np.asarray(missing / dt / excess)
+    def _towards(self, start: Array, action: Array, last: Array, v_last: Array) -> Array:
+        """Return the velocity (nv,) straight to an action, within what can be stopped there, or goes on like actions.
+
+        Args:
+            start: positions (nq,) that were sent last.
+            action: positions (nq,).
+            last: the action before (nq,).
+            v_last: velocity (nv,) that led to `start`.
+        """
+        dt, step = self.controller.dt, self._step
+        v = (action - start) / dt
+        speed, usual = np.abs(v), np.maximum(np.abs(action - last) / dt, step)
+        if (speed <= np.minimum(usual, self._speed)).all() and (np.abs(v - v_last) <= step).all():
+            return np.asarray(v)
+        fastest = np.maximum(kernels.speed_to_stop(speed * dt, step, dt), usual)
+        fastest = np.minimum(np.minimum(fastest, self._speed), np.maximum(np.sign(v) * v_last, 0.0) + step)
+        return np.asarray(v / np.max(speed / fastest, initial=1.0))
 
 
 def _later(value: Any, duration: float) -> Any:
