@@ -135,7 +135,7 @@ def test_step_of_a_lerobot_pipeline(panda, scenario):
         return {**keys, "gripper.pos": 40.0}
 
     for k in range(0, 200):
-        step.seen.put("ball", Pose.at(PLACE))
+        step.obstacles.put("ball", Pose.at(PLACE))
         action = pipeline((as_keys(swing(panda, 0.3 * k)), as_keys(q)))
         assert action.keys() == as_keys(q).keys() and action["gripper.pos"] == 40.0
         q = np.deg2rad([action[f"{name}.pos"] for name in panda.joint_names])

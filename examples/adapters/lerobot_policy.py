@@ -49,7 +49,7 @@ else:
         steps=[step], to_transition=robot_action_observation_to_transition, to_output=transition_to_robot_action
     )
     for k in range(200):
-        step.seen.put("ball", ball["ball"])
+        step.obstacles.put("ball", ball["ball"])
         both = policy(k)[0], q
         action, observation = ({f"{n}.pos": float(v) for n, v in zip(names, np.rad2deg(x), strict=True)} for x in both)
         sent = pipeline((action, observation))

@@ -30,7 +30,7 @@ _FAST = 1e6
 class ActionFilter:
     """The safety filter of a controller, for a program that sends positions; robots of hinges and slides alone.
 
-    What is sent adds up from where the robot was at first: servos that lag are not sent back to where they are.
+    What is sent adds up from where the robot was at first: servos that lag are not made to return to where they are.
     """
 
     tolerance = 1e-6
@@ -45,7 +45,7 @@ class ActionFilter:
         model, bounds = controller.scene.robot.model, controller.scene.robot.bounds()
         if model.nq != model.nv:
             raise ConfigError(f"{controller.scene.robot.name}: a joint has no limits, or several coordinates; lock it")
-        self.controller, self._ahead = controller, controller.clone()
+        self.controller, self._clone = controller, controller.clone()
         self._speed, self._step = bounds.velocity, np.minimum(bounds.acceleration * controller.dt, _FAST)
         self._setpoint: Array | None = None
         self._last: Array | None = None
@@ -86,10 +86,10 @@ class ActionFilter:
         dt, out, changed = self.controller.dt, np.array(actions, dtype=np.float64), None
         x = np.array(q, dtype=np.float64) if self._setpoint is None else self._setpoint
         v, last = self._v, out[0] if self._last is None else self._last
-        self._ahead.reset(v)
+        self._clone.reset(v)
         for k, action in enumerate(out.copy()):
             now = {name: _later(value, k * dt) for name, value in (obstacles or {}).items()}
-            v = self._ahead.filter(x, self._towards(x, action, last, v), k * dt, now).v
+            v = self._clone.filter(x, self._towards(x, action, last, v), k * dt, now).v
             x, last = x + dt * v, action
             out[k] = x
             if changed is None and np.abs(x - action).max() > self.tolerance:

@@ -45,13 +45,13 @@ class SafetyFilterStep(RobotActionProcessorStep):  # type: ignore[misc]
         self._unit = np.where(turns & self.degrees, np.pi / 180.0, 1.0)
         self.filter = ActionFilter(controller)
         """What makes actions safe; `filter.solution` says why the last one was changed."""
-        self.seen = Handover()
-        """Where obstacles are: `seen.put(name, pose)`, from any thread."""
+        self.obstacles = Handover()
+        """Where obstacles are: `obstacles.put(name, pose)`, from any thread."""
 
     def action(self, action: dict[str, Any]) -> dict[str, Any]:
         """Return the action with safe positions."""
         observation = self.transition[TransitionKey.OBSERVATION]
-        positions = self.filter(self._read(observation), self._read(action), obstacles=self.seen.take())
+        positions = self.filter(self._read(observation), self._read(action), obstacles=self.obstacles.take())
         return {**action, **dict(zip(self._keys, (positions / self._unit).tolist(), strict=True))}
 
     def chunk(self, observation: Mapping[str, Any], actions: Any, obstacles: Mapping[str, Any] | None = None) -> Array:

@@ -64,16 +64,16 @@ class MujocoRobot:
             data: after `mj_forward` or `mj_step`.
             t: their time stamp [s]; the time of the control step if left out.
         """
-        seen: dict[str, Pose | Sample] = {}
+        poses: dict[str, Pose | Sample] = {}
         for name, geom in self._geoms:
             position, rotation = data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3)
             if self._model.body_mocapid[self._model.body_rootid[self._model.geom_bodyid[geom]]] >= 0:
-                seen[name] = Pose(position, rotation, t)
+                poses[name] = Pose(position, rotation, t)
             else:
                 twist = np.zeros(6)
                 mujoco.mj_objectVelocity(self._model, data, mujoco.mjtObj.mjOBJ_GEOM, geom, twist, 0)
-                seen[name] = Sample(position, rotation, twist[3:], twist[:3], t)
-        return seen
+                poses[name] = Sample(position, rotation, twist[3:], twist[:3], t)
+        return poses
 
     def command(self, data: Any, v: Array) -> None:
         """Send a velocity (nv,): as it is to velocity servos, added up to the position servos' setpoints."""
