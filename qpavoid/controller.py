@@ -12,6 +12,7 @@ import numpy as np
 from qpavoid import kernels
 from qpavoid.config import Avoidance, Limits, Progress, ScenarioConfig, Sensing, Sphere
 from qpavoid.config.scenario import MAX_LATENCY
+from qpavoid.control.arguments import Obstacles
 from qpavoid.control.builder import ProblemBuilder, StepProblem
 from qpavoid.control.contacts import ContactRows
 from qpavoid.control.inputs import LARGEST_VELOCITY, check_velocity
@@ -162,7 +163,7 @@ class Controller(SceneChanges):
         q: Array,
         t: float | None = None,
         targets: Mapping[str, Any] | None = None,
-        obstacles: Mapping[str, Any] | None = None,
+        obstacles: Obstacles = None,
         v: Array | None = None,
     ) -> Solution:
         """Velocity for the next dt.
@@ -192,7 +193,9 @@ class Controller(SceneChanges):
             obstacles: where obstacles are, by name, in place of their motion: a `Sample`, or if no velocity is known, a
                 `Pose`, `pin.SE3`, 4×4 matrix or position, which leaves the orientation as it was; `Points` for a cloud.
                 From then on they have to be updated, see `Sensing`, unless they are given `at_rest`. Each may have a
-                time stamp of its own.
+                time stamp of its own. Many at a time cost least as one array, with a row of each of `obstacle_names`:
+                (k, 18) as `Sample.row`, or (k, 7), position and quaternion x y z w, if no velocity is known; of some
+                obstacles, as {(name, ...): array}.
             v: velocity (nv,) as measured, from which acceleration limits count in the first step, after a gap and after
                 `reset`. In all other steps they count from the last command, as those of servos that lag have to.
 
@@ -208,7 +211,7 @@ class Controller(SceneChanges):
         q: Array,
         t: float | None = None,
         targets: Mapping[str, Any] | None = None,
-        obstacles: Mapping[str, Any] | None = None,
+        obstacles: Obstacles = None,
         v: Array | None = None,
     ) -> Tick:
         """Like `step`, with everything that led to the velocity."""
@@ -227,7 +230,7 @@ class Controller(SceneChanges):
         q: Array,
         v_desired: Array,
         t: float | None = None,
-        obstacles: Mapping[str, Any] | None = None,
+        obstacles: Obstacles = None,
         v: Array | None = None,
     ) -> Solution:
         """The safe velocity that is closest to any command: of a teleoperator, a policy, another controller.

@@ -18,17 +18,12 @@ from qpavoid.kernels.clearance import (
     joint_speeds,
     leaves_position_limits,
 )
-from qpavoid.kernels.estimates import (
-    are_fine,
-    extrapolate_estimates,
-    extrapolate_states,
-    update_estimates,
-    write_rows,
-)
+from qpavoid.kernels.estimates import ObstacleArrays, are_fine, check_updates, observe
 from qpavoid.kernels.kinematics import KinematicsArrays, update_kinematics
 from qpavoid.kernels.layout import RowLayout
 from qpavoid.kernels.near_pairs import DistanceArrays, near_pairs, place_bodies, place_obstacles
 from qpavoid.kernels.obstacles import Pieces, check_states, sample_pieces
+from qpavoid.kernels.pose_fit import extrapolate_states
 from qpavoid.kernels.prediction import Prediction, predict, prediction_error_bound
 from qpavoid.kernels.qp import max_clearance_velocity, minimize, project, project_soft
 from qpavoid.kernels.ramps import RampLimits, follow_ramp
@@ -47,6 +42,7 @@ __all__ = [
     "ApproachArrays",
     "DistanceArrays",
     "KinematicsArrays",
+    "ObstacleArrays",
     "Pieces",
     "Prediction",
     "RampLimits",
@@ -62,6 +58,7 @@ __all__ = [
     "beta",
     "candidates",
     "check_states",
+    "check_updates",
     "clearance_lower_bound",
     "closes_below",
     "comes_near",
@@ -69,7 +66,6 @@ __all__ = [
     "direct",
     "distance_rows",
     "extend_paths",
-    "extrapolate_estimates",
     "extrapolate_states",
     "find_near_pairs",
     "first_use",
@@ -83,6 +79,7 @@ __all__ = [
     "max_offset",
     "minimize",
     "near_pairs",
+    "observe",
     "pack",
     "place_bodies",
     "place_obstacles",
@@ -102,11 +99,9 @@ __all__ = [
     "stop_velocity",
     "tracking_law",
     "tracking_violation",
-    "update_estimates",
     "update_kinematics",
     "velocity_bounds",
     "violation",
     "voxels_within",
     "write_path_point",
-    "write_rows",
 ]

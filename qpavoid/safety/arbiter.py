@@ -40,7 +40,7 @@ class Arbiter:
         self._braking = BrakingCheck(settings, rows, obstacles)
         self.progress, self._shake_damping = ProgressMonitor(settings, rows), ShakeDamping(settings.dt)
         has_backup = settings.avoidance.backup and len(settings.scene.slots) > 0
-        self.backup = BackupPlanner(settings, rows.query.table, obstacles) if has_backup else None
+        self.backup = BackupPlanner(settings, rows.query, obstacles) if has_backup else None
 
     def reset(self) -> None:
         """Drop all that is known of earlier control steps."""

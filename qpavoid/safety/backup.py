@@ -23,8 +23,8 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
+from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.obstacles import ObstacleTracker
-from qpavoid.control.pair_table import PairTable
 from qpavoid.control.settings import ControlSettings
 from qpavoid.errors import NumericalError
 from qpavoid.kernels.rollout import FINISHED, HORIZON, PAUSED, TOUCH
@@ -75,11 +75,11 @@ class _Command(NamedTuple):
 class BackupPlanner:
     """Decides between the velocity of the solver and the first one of a backup trajectory."""
 
-    def __init__(self, settings: ControlSettings, table: PairTable, obstacles: ObstacleTracker) -> None:
-        """Begin without a backup trajectory; see `BackupRollouts` for the arguments."""
+    def __init__(self, settings: ControlSettings, query: DistanceQuery, obstacles: ObstacleTracker) -> None:
+        """Begin without a backup trajectory; `query` has the distances of the control step."""
         self._model, self._obstacles, self._dt = settings.scene.robot.model, obstacles, settings.dt
-        self._rollouts = BackupRollouts(settings, table, obstacles)
-        self._approach = ApproachCheck(settings, self._rollouts, obstacles)
+        self._rollouts = BackupRollouts(settings, query.table, obstacles)
+        self._approach = ApproachCheck(settings, query, self._rollouts.lever_arm, obstacles)
         self._poses = max(1, round(_POSE_RATE * settings.dt))
         """Poses that are evaluated in a control step."""
         self._steps_ahead = ceil(_CANDIDATES_AHEAD * self._rollouts.usual_poses / self._poses)
@@ -119,7 +119,7 @@ class BackupPlanner:
             proximity: distances of this control step; pairs in contact do not count.
         """
         is_same_scene = self._moving is self._obstacles.moving
-        is_near = len(self._obstacles.moving) > 0 and not self._approach.is_far(q, v, t)
+        is_near = len(self._obstacles.moving) > 0 and not self._approach.is_far(v, t)
         if not (is_near and is_same_scene):
             self._forget()
         if not is_near:
