@@ -18,6 +18,7 @@ from qpavoid.kernels.clearance import (
     joint_speeds,
     leaves_position_limits,
 )
+from qpavoid.kernels.depth import CellGrid, OwnBodies, fill_cells, mark_own_pixels, recall_cells
 from qpavoid.kernels.estimates import ObstacleArrays, are_fine, check_updates, observe
 from qpavoid.kernels.kinematics import KinematicsArrays, update_kinematics
 from qpavoid.kernels.layout import RowLayout
@@ -40,9 +41,11 @@ from qpavoid.kernels.voxels import select_voxels, voxels_within
 __all__ = [
     "TOLERANCE",
     "ApproachArrays",
+    "CellGrid",
     "DistanceArrays",
     "KinematicsArrays",
     "ObstacleArrays",
+    "OwnBodies",
     "Pieces",
     "Prediction",
     "RampLimits",
@@ -67,6 +70,7 @@ __all__ = [
     "distance_rows",
     "extend_paths",
     "extrapolate_states",
+    "fill_cells",
     "find_near_pairs",
     "first_use",
     "follow_ramp",
@@ -75,6 +79,7 @@ __all__ = [
     "jerk_limited_stop",
     "joint_speeds",
     "leaves_position_limits",
+    "mark_own_pixels",
     "max_clearance_velocity",
     "max_offset",
     "minimize",
@@ -88,6 +93,7 @@ __all__ = [
     "project",
     "project_soft",
     "projection_cost",
+    "recall_cells",
     "roll_out_stop",
     "rollout_outcome",
     "rotation_vector",

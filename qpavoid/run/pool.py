@@ -221,14 +221,14 @@ class ClusterWorkers(Workers):
 @contextmanager
 def _environment(variables: Mapping[str, str]) -> Iterator[None]:
     """Set some variables of the environment for a while."""
-    before = dict(os.environ)
+    saved = dict(os.environ)
     os.environ.update(variables)
     try:
         yield
     finally:
         for name in variables:
             del os.environ[name]
-        os.environ.update(before)
+        os.environ.update(saved)
 
 
 def _begin_process() -> None:
