@@ -12,6 +12,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from qpavoid import kernels
+from qpavoid.budget import UNLIMITED, Budget
 from qpavoid.config import Avoidance, Limits, Planning, Progress, ScenarioConfig, Sensing, Sphere
 from qpavoid.config.scenario import MAX_LATENCY
 from qpavoid.control.arguments import Obstacles
@@ -60,6 +61,7 @@ class Controller(SceneChanges, SplitStep):
         contacts: ContactRows | None = None,
         latency: float = 0.0,
         planning: Planning | None = None,
+        budget: float | Budget | None = None,
     ) -> None:
         """Lay out the memory of a control step.
 
@@ -75,6 +77,9 @@ class Controller(SceneChanges, SplitStep):
             contacts: frames that rest, see `build_contacts`; none if left out.
             latency: time after which the actuators follow a command [s], see `step`.
             planning: forecasts and plans; none if left out.
+            budget: time after which a step leaves out what is left of relaxation, stop look-ahead and backup search
+                [s], and brakes or follows its backup trajectory instead, with a reason of kind BUDGET_SPENT; runs are
+                then not reproducible. As long as it takes if left out.
 
         Raises:
             UnknownName, SolverNotInstalled: of the solver.
@@ -87,7 +92,7 @@ class Controller(SceneChanges, SplitStep):
             raise ConfigError(f"latency: {latency} s, expected 0 to {MAX_LATENCY}; it is in seconds")
         self._another = partial(
             type(self), tasks=tasks, dt=dt, avoidance=avoidance, limits=limits, sensing=sensing, progress=progress,
-            contacts=contacts, latency=latency, planning=planning,
+            contacts=contacts, latency=latency, planning=planning, budget=budget,
         )  # fmt: skip
         frames, others = in_order(tasks)
         self.scene = scene = scene.own_copy() if scene.spare else scene
@@ -104,7 +109,8 @@ class Controller(SceneChanges, SplitStep):
             self._no_backup = (_NO_BACKUP_WITH_CONTACTS,)
         bounds = scene.robot.bounds().within(self.limits)
         blocks = sensing or Sensing(), progress or Progress()
-        settings = ControlSettings(scene, bounds, self.avoidance, self.limits, dt, latency, *blocks)
+        limit = budget if isinstance(budget, Budget) else UNLIMITED if budget is None else Budget(budget)
+        settings = ControlSettings(scene, bounds, self.avoidance, self.limits, dt, latency, *blocks, limit)
         self._builder = ProblemBuilder(settings, self.tasks, contacts)
         self._arbiter = Arbiter(settings, law, self._builder.rows, self._builder.tracker)
         self._builder.rows.look_ahead(law.bounded and self.avoidance.look_ahead)
