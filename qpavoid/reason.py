@@ -102,7 +102,7 @@ _SEVERITIES = {
         ),
         Severity.ALARM,
     ),
-}
+}  # fmt: skip
 _TEXTS: dict[str, str] = {
     "ROW_RELAXED": "row relaxed by",
     "BELOW_SAFETY_DISTANCE": "below the safety distance by",
