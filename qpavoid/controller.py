@@ -83,7 +83,7 @@ class Controller(SceneChanges, SplitStep):
 
         Raises:
             UnknownName, SolverNotInstalled: of the solver.
-            ConfigError: dt or latency cannot be meant; contacts with a solver that does not hold them.
+            ConfigError: dt, latency or budget cannot be meant; contacts with a solver that does not hold them.
         """
         begin = perf_counter()
         if not 0.0 < dt <= _MAX_DT:
@@ -109,8 +109,13 @@ class Controller(SceneChanges, SplitStep):
             self._no_backup = (_NO_BACKUP_WITH_CONTACTS,)
         bounds = scene.robot.bounds().within(self.limits)
         blocks = sensing or Sensing(), progress or Progress()
-        limit = budget if isinstance(budget, Budget) else UNLIMITED if budget is None else Budget(budget)
-        settings = ControlSettings(scene, bounds, self.avoidance, self.limits, dt, latency, *blocks, limit)
+        if budget is not None and not isinstance(budget, Budget):
+            if not budget > 0.0:
+                raise ConfigError(f"budget: {budget} s, expected more than 0; it is in seconds")
+            budget = Budget(budget)
+        settings = ControlSettings(
+            scene, bounds, self.avoidance, self.limits, dt, latency, *blocks, budget or UNLIMITED
+        )
         self._builder = ProblemBuilder(settings, self.tasks, contacts)
         self._arbiter = Arbiter(settings, law, self._builder.rows, self._builder.tracker)
         self._builder.rows.look_ahead(law.bounded and self.avoidance.look_ahead)

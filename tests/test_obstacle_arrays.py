@@ -200,4 +200,5 @@ def test_updates_leave_nothing_for_the_garbage_collector(panda, form):
     before = [generation["collections"] for generation in gc.get_stats()]
     for k in range(5, 305):
         controller.step(panda.home, 0.01 * k, obstacles=updates)
-    assert [generation["collections"] for generation in gc.get_stats()] == before
+    young, *old = [g["collections"] - count for g, count in zip(gc.get_stats(), before, strict=True)]
+    assert young <= 1 and not any(old)  # 700 new containers each: 50 a step would be 21
