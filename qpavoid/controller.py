@@ -121,10 +121,8 @@ class Controller(SceneChanges, SplitStep):
         self._arbiter = Arbiter(settings, law, self._builder.rows, self._builder.tracker)
         self._builder.rows.look_ahead(law.bounded and self.avoidance.look_ahead)
         self._planning: Replanning | None = None
-        limit, is_limited = settings.budget, settings.budget.is_limited
-        limit.is_limited = False  # loading kernels takes as long as it takes
-        self._warm_up()
-        limit.is_limited = is_limited
+        with settings.budget.suspended():  # loading kernels takes as long as it takes
+            self._warm_up()
         if planning is not None:
             self._planning = Replanning(settings, self.tasks, contacts, self._builder, self._arbiter, planning)
         kernels.first_use.end()
