@@ -28,6 +28,7 @@ from qpavoid.kernels.estimates import (
 )
 from qpavoid.kernels.kinematics import KinematicsArrays, update_kinematics
 from qpavoid.kernels.layout import RowLayout
+from qpavoid.kernels.margins import distances_of, least_margin
 from qpavoid.kernels.near_pairs import DistanceArrays, near_pairs, place_bodies, place_obstacles
 from qpavoid.kernels.obstacles import Pieces, check_states, sample_pieces
 from qpavoid.kernels.prediction import Prediction, predict, prediction_error_bound
@@ -71,6 +72,7 @@ __all__ = [
     "control_step",
     "direct",
     "distance_rows",
+    "distances_of",
     "extend_paths",
     "extrapolate_estimates",
     "extrapolate_states",
@@ -82,6 +84,7 @@ __all__ = [
     "is_tracking_clear",
     "jerk_limited_stop",
     "joint_speeds",
+    "least_margin",
     "leaves_position_limits",
     "mark_own_pixels",
     "max_clearance_velocity",
