@@ -19,18 +19,13 @@ from qpavoid.kernels.clearance import (
     leaves_position_limits,
 )
 from qpavoid.kernels.depth import CellGrid, OwnBodies, fill_cells, mark_own_pixels, recall_cells
-from qpavoid.kernels.estimates import (
-    are_fine,
-    extrapolate_estimates,
-    extrapolate_states,
-    update_estimates,
-    write_rows,
-)
+from qpavoid.kernels.estimates import ObstacleArrays, are_fine, check_updates, observe
 from qpavoid.kernels.kinematics import KinematicsArrays, update_kinematics
 from qpavoid.kernels.layout import RowLayout
 from qpavoid.kernels.margins import distances_of, least_margin
 from qpavoid.kernels.near_pairs import DistanceArrays, near_pairs, place_bodies, place_obstacles
 from qpavoid.kernels.obstacles import Pieces, check_states, sample_pieces
+from qpavoid.kernels.pose_fit import extrapolate_states
 from qpavoid.kernels.prediction import Prediction, predict, prediction_error_bound
 from qpavoid.kernels.qp import max_clearance_velocity, minimize, project, project_soft
 from qpavoid.kernels.ramps import RampLimits, follow_ramp
@@ -50,6 +45,7 @@ __all__ = [
     "CellGrid",
     "DistanceArrays",
     "KinematicsArrays",
+    "ObstacleArrays",
     "OwnBodies",
     "Pieces",
     "Prediction",
@@ -66,6 +62,7 @@ __all__ = [
     "beta",
     "candidates",
     "check_states",
+    "check_updates",
     "clearance_lower_bound",
     "closes_below",
     "comes_near",
@@ -74,7 +71,6 @@ __all__ = [
     "distance_rows",
     "distances_of",
     "extend_paths",
-    "extrapolate_estimates",
     "extrapolate_states",
     "fill_cells",
     "find_near_pairs",
@@ -91,6 +87,7 @@ __all__ = [
     "max_offset",
     "minimize",
     "near_pairs",
+    "observe",
     "pack",
     "place_bodies",
     "place_obstacles",
@@ -111,11 +108,9 @@ __all__ = [
     "stop_velocity",
     "tracking_law",
     "tracking_violation",
-    "update_estimates",
     "update_kinematics",
     "velocity_bounds",
     "violation",
     "voxels_within",
     "write_path_point",
-    "write_rows",
 ]
