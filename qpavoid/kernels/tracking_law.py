@@ -131,15 +131,15 @@ def _follow_bending(x: Any, A: Array, b: Array, v: Array, damping: Array) -> Arr
             )
             damping[i] = m - squares[i]
             if squares[i] < min(weak[i], curvature):
-                share = (1.0 - squares[i] / curvature) * (1.0 - squares[i] / weak[i])
-                y *= _turn_round(x, B[i], y, squares[i], share)
+                nearness = (1.0 - squares[i] / curvature) * (1.0 - squares[i] / weak[i])
+                y *= _turn_round(x, B[i], y, squares[i], nearness)
             for c in range(nv):
                 v[c] += B[i, c] * y / m
     return B
 
 
 @compiled
-def _turn_round(x: Any, row: Array, y: float, square: float, share: float) -> float:
+def _turn_round(x: Any, row: Array, y: float, square: float, nearness: float) -> float:
     """Compute the factor on the speed along v_i near full reach: 1 towards the middle of the joints' ranges, -1 away.
 
     Args:
@@ -147,13 +147,13 @@ def _turn_round(x: Any, row: Array, y: float, square: float, share: float) -> fl
         row: σ_i v_i (n,).
         y: y_i.
         square: σ_i².
-        share: how near full reach is, (1 - σ_i²/v_iᵀ G(w) v_i) (1 - σ_i²/l_i²).
+        nearness: how near full reach is, (1 - σ_i²/v_iᵀ G(w) v_i) (1 - σ_i²/l_i²).
     """
     centering = 0.0
     for c in range(len(row)):
         centering += row[c] * x.centering[c]
     centering *= np.copysign(1.0, y) / np.sqrt(square)
-    return 1.0 - 2.0 * share * min(max(-centering / _CENTERING, 0.0), 1.0)
+    return 1.0 - 2.0 * nearness * min(max(-centering / _CENTERING, 0.0), 1.0)
 
 
 @compiled
