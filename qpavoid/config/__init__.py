@@ -14,7 +14,7 @@ from qpavoid.config.control import (
     TaskSwitching,
 )
 from qpavoid.config.motion import Circle, Csv, Fixed, Line, Motion, Waypoints
-from qpavoid.config.robot import Body, Hull, JointLimits, PairMargin, RobotConfig
+from qpavoid.config.robot import Body, Hull, JointLimits, PairMargin, Polytope, RobotConfig
 from qpavoid.config.scenario import ObstacleConfig, ScenarioConfig
 from qpavoid.config.shapes import (
     Box,
@@ -58,8 +58,8 @@ __all__ = [
     "AlignTask", "AnyTask", "Avoidance", "Beta", "Block", "Body", "Box", "Capsule", "Circle", "ComTask", "Cone",
     "Contact", "Csv", "Cylinder", "DampingTask", "Ellipsoid", "Eq10Solver", "Fixed", "GradientProjectionSolver",
     "HalfSpace", "HqpSolver", "Hull", "JointLimits", "Limits", "Line", "LookAtTask", "ManipulabilityTask", "Mesh",
-    "Motion", "ObstacleConfig", "ObstacleShape", "PairMargin", "PointCloud", "PostureTask", "PotentialFieldSolver",
-    "Progress", "QpSolver", "RelativeTask", "RobotConfig", "ScenarioConfig", "Sensing", "Shape", "SolverConfig",
-    "Sphere", "StepSearchSolver", "Task", "TaskBlock", "TaskSwitching", "TrackingSolver", "Waypoints",
+    "Motion", "ObstacleConfig", "ObstacleShape", "PairMargin", "PointCloud", "Polytope", "PostureTask",
+    "PotentialFieldSolver", "Progress", "QpSolver", "RelativeTask", "RobotConfig", "ScenarioConfig", "Sensing", "Shape",
+    "SolverConfig", "Sphere", "StepSearchSolver", "Task", "TaskBlock", "TaskSwitching", "TrackingSolver", "Waypoints",
     "expand_solver",
 ]  # fmt: skip

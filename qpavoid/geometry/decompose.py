@@ -52,6 +52,12 @@ def decompose(vertices: Array, triangles: IntArray, max_pieces: int, tolerance: 
     return _merge(pieces, volume, max_pieces, tolerance * volume(vertices))
 
 
+def merge(pieces: list[Array], max_pieces: int) -> list[Array]:
+    """Merge convex pieces (n_i, 3) until there are no more than so many, with the least volume that can be added."""
+    size = float(np.ptp(np.concatenate(pieces), axis=0).max())
+    return _merge(pieces, partial(_volume, thin=_THIN * size), max_pieces, 0.0)
+
+
 def _volume(points: Array, thin: float) -> float:
     """Compute the volume of a hull [m³]; of what is flat, its area times next to nothing."""
     try:
