@@ -28,6 +28,8 @@ _MAX_SAMPLES = 40_000
 """Of the geometry of a link, about: their distances grow beyond the above where it is large."""
 _FIRST = 16
 """Every so many samples of a body are looked at first: most bodies that stand out too far are found so."""
+_ORIENTED = 4000
+"""Points that stand for a surface where it is asked whether it winds around something."""
 _CHUNK = 100
 """Samples of which it is found at a time whether they are inside."""
 _NEXT_TO_NOTHING = 1e-6
@@ -50,8 +52,10 @@ class Surface:
         self.spacing = max(bound / SAMPLES_IN_BOUND, float(np.sqrt(area / _MAX_SAMPLES)))
         """Distance of samples of both surfaces [m]."""
         self._tree = cKDTree(np.concatenate([_placed(piece, self.spacing)[0] for piece in pieces]))
-        self._triangles = np.concatenate(
-            [surface_triangles(geometry) @ place.rotation.T + place.translation for geometry, place in pieces]
+        self._points, self._areas = _oriented_areas(
+            np.concatenate(
+                [surface_triangles(geometry) @ place.rotation.T + place.translation for geometry, place in pieces]
+            )
         )
 
     def holds(self, bodies: Sequence[Placed]) -> bool:
@@ -76,17 +80,15 @@ class Surface:
         return 0.0
 
     def _encloses(self, points: Array) -> Array:
-        """Tell which points (n, 3) are inside the geometry (n,): its surface winds around them.
+        """Tell which points (n, 3), not too close to the surface, are inside the geometry (n,): it winds around them.
 
-        Of a surface with holes, more than half of all directions have to meet it. Van Oosterom and Strackee 1983, "The
-        solid angle of a plane triangle".
+        Of a surface with holes, more than half of all directions have to meet it.
         """
-        a, b, c = (corner[None] - points[:, None] for corner in np.moveaxis(self._triangles, 1, 0))
-        la, lb, lc = (np.linalg.norm(corner, axis=2) for corner in (a, b, c))
-        volume = np.einsum("nti,nti->nt", a, np.cross(b, c))
-        ab, bc, ca = (np.einsum("nti,nti->nt", u, v) for u, v in ((a, b), (b, c), (c, a)))
-        angles = 2.0 * np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb)
-        return np.asarray(np.abs(angles.sum(axis=1)) > 2.0 * np.pi)
+        offsets = self._points - points[:, None]
+        solid_angles = (
+            np.einsum("nki,ki->nk", offsets, self._areas) / np.maximum(np.linalg.norm(offsets, axis=2), 1e-9) ** 3
+        )
+        return np.asarray(np.abs(solid_angles.sum(axis=1)) > 2.0 * np.pi)
 
     def _samples(self, bodies: Sequence[Placed]) -> Array:
         """Sample the surface of the union of some bodies (n, 3)."""
@@ -100,6 +102,19 @@ class Surface:
                     points, above = points[is_free], above[is_free]
             parts.append(points)
         return np.concatenate(parts)
+
+
+def _oriented_areas(triangles: Array) -> tuple[Array, Array]:
+    """Spread points evenly over triangles (t, 3, 3): points (k, 3) [m], and area vectors that they stand for [m²]."""
+    vectors = 0.5 * normals(triangles)
+    areas = np.linalg.norm(vectors, axis=1)
+    total, k = np.cumsum(areas), np.arange(_ORIENTED)
+    chosen = np.minimum(np.searchsorted(total, (k + 0.5) / _ORIENTED * total[-1]), len(areas) - 1)
+    u, v = (0.5 + 0.754877666 * k) % 1.0, (0.5 + 0.569840291 * k) % 1.0  # Roberts' sequence, which leaves no gaps
+    u, v = np.where(u + v > 1.0, (1.0 - u, 1.0 - v), (u, v))
+    a, b, c = np.moveaxis(triangles[chosen], 1, 0)
+    scale = total[-1] / _ORIENTED / np.maximum(areas[chosen], 1e-300)
+    return a + u[:, None] * (b - a) + v[:, None] * (c - a), vectors[chosen] * scale[:, None]
 
 
 def _in_chunks(items: Any) -> Iterator[Any]:

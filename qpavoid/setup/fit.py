@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any, Literal
 
 import coal
@@ -29,6 +30,8 @@ MAX_CAPSULES = 4
 MAX_VOLUME_RATIO = 2.0
 """Volume of one body, in units of the hull's, from which `auto` takes another one although it stands out little: on
 small links, bounds in millimetres say nothing. A capsule around a cylinder takes 1.3 to 2, around a cube 2.7."""
+_HARDLY_MORE = 1.1
+"""Protrusion with which fewer bodies are taken where none is within the bound, in units of the least [-]."""
 MIN_SAVING = 0.15
 """Part of the volume that a further capsule must save."""
 _HULLS = 2, 4, 8, 16
@@ -69,9 +72,10 @@ def capsule_part(fit: CapsuleFit, place: Any) -> Part:
 def fit_piece(geometry: Any, place: Any, how: Bodies, surface: Surface) -> tuple[Part, ...]:
     """Choose bodies that enclose a coal geometry entirely.
 
-    `auto` takes the first of these, in the order of what a pair costs, that is within the bound: a capsule, a box, a
-    cylinder, the hull, several capsules, several hulls; the last of them if none is. A pair of capsules takes some
-    0.05 µs, one of hulls 0.4 µs, and every further body has pairs with all others.
+    `auto` takes the first of these, in the order of what they cost, that is within the bound: a capsule, a box, a
+    cylinder, the hull, several capsules, several hulls. Capsules and boxes have closed forms with capsules, the others
+    a search, and every further body has pairs with all others. Where none is within the bound, the first that stands
+    out hardly more than the tightest of hull and several: hollows that no hull can follow are not worth more bodies.
 
     Args:
         geometry: the piece, in its own frame.
@@ -90,13 +94,16 @@ def fit_piece(geometry: Any, place: Any, how: Bodies, surface: Surface) -> tuple
     single = single_part(hull_points(geometry), place, surface, hull_volume(geometry), not is_primitive)
     if single is not None:
         return (single,)
-    if isinstance(geometry, coal.ShapeBase) or surface.holds([exact.placed]):
+    if isinstance(geometry, coal.ShapeBase):
         return (exact,)
-    several: tuple[Part, ...] = ()
-    for several in _several(geometry, place):
-        if surface.holds([part.placed for part in several]):
-            break
-    return several
+    tried = list[tuple[float, tuple[Part, ...]]]()
+    for parts in chain([(exact,)], _several(geometry, place)):
+        placed = [part.placed for part in parts]
+        if surface.holds(placed):
+            return parts
+        tried.append((surface.protrusion(placed), parts))
+    least = min(protrusion for protrusion, _ in tried)
+    return next(parts for protrusion, parts in tried if protrusion <= _HARDLY_MORE * least)
 
 
 def single_part(points: Array, place: Any, surface: Surface, hulls: float, every_kind: bool) -> Part | None:
