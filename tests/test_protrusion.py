@@ -4,15 +4,17 @@ import coal
 import numpy as np
 import pinocchio as pin
 import pytest
-from conftest import EXAMPLES
+from conftest import EXAMPLES, write_chain
 from scipy.spatial import ConvexHull
 
+from qpavoid import ConfigError, Robot
 from qpavoid.geometry.bodies import hull_points
 from qpavoid.geometry.meshes import convex_hull
 from qpavoid.geometry.primitives import fit_box, fit_cylinder
 from qpavoid.geometry.protrusion import Surface, surface_samples
 from qpavoid.model.end_effectors import end_effectors
-from qpavoid.model.urdf import read_model
+from qpavoid.model.urdf import read_model, read_pieces
+from qpavoid.setup.shapes import pieces_of
 from qpavoid.setup.wrist import wrist_links
 
 ORIGIN = pin.SE3.Identity()
@@ -118,3 +120,33 @@ def test_wrists_begin_where_joints_follow_each_other_closely(path, first, before
     model = read_model(EXAMPLES / path, "fixed")
     links = wrist_links(model, end_effectors(model))
     assert links >= set(first) and not links & set(before)
+
+
+@pytest.mark.parametrize(("name", "chosen_by_hand"), [("panda", set()), ("baxter", {"torso", "pedestal"})])
+def test_shipped_robots_stand_out_no_farther_than_they_should(name, chosen_by_hand):
+    robot, notes = Robot.load(name), []
+    model = read_model(robot.urdf, "fixed")
+    pieces = pieces_of(read_pieces(robot.urdf, model, robot.package_dirs, robot.urdf, notes).geometryObjects, model)
+    wrist, frames = wrist_links(model, robot.end_effectors), robot.model.frames
+    links = dict.fromkeys(frames[body.parentFrame].name for body in robot.bodies.geometryObjects)
+    for link in [link for link in links if link not in chosen_by_hand]:
+        bodies = [
+            (body.geometry, frames[body.parentFrame].placement.actInv(body.placement))
+            for body in robot.bodies.geometryObjects
+            if frames[body.parentFrame].name == link
+        ]
+        shapes = [(piece.geometry, piece.placement) for piece in pieces if piece.link == link]
+        assert Surface(shapes, 0.005 if link in wrist else 0.02).holds(bodies), link
+
+
+def test_polytope_is_the_hull_of_its_corners(tmp_path):
+    corners = (hull_points(coal.Box(0.1, 0.2, 0.3)) + np.array([0.0, 0.1, 0.0])).tolist()
+    shape = {"type": "polytope", "corners": corners}
+    body = {"name": "box", "frame": "link1", "shape": shape, "position": [0.0, 0.0, 0.2]}
+    robot = Robot.from_urdf(write_chain(tmp_path), bodies=[body])
+    (made,) = robot.bodies.geometryObjects
+    found, wanted = (np.unique(np.round(points, 9), axis=0) for points in (np.array(made.geometry.points()), corners))
+    np.testing.assert_allclose(found, wanted)
+    np.testing.assert_allclose(made.placement.translation, [0.0, 0.0, 0.2], atol=1e-12)
+    with pytest.raises(ConfigError, match="corners"):
+        Robot.from_urdf(write_chain(tmp_path), bodies=[{**body, "shape": {**shape, "corners": corners[:3]}}])

@@ -293,7 +293,7 @@ def _links(
         notes.append(Note(NoteKind.SHAPE, tuple(sorted(tighter_links, key=list(links).index)), clause))
     if loose := [link for link, made in links.items() if kinds[link] == "auto" and made.protrusion > made.limit]:
         farthest = max(links[link].protrusion for link in loose)
-        clause = f"bodies that stand out farther than they should, up to {1e3 * farthest:.0f} mm"
+        clause = f"bodies that stand out farther than they should, up to {1e3 * farthest:.0f} mm: hollow, or bent"
         notes.append(Note(NoteKind.SHAPE, tuple(loose), clause, "bodies of your own, or a mesh in convex pieces"))
     gross = [link for link, made in links.items() if made.volume > MAX_VOLUME_RATIO * made.inside > 0.0]
     if worst := sorted(gross, key=lambda link: -links[link].volume):

@@ -36,6 +36,9 @@ MIN_SAVING = 0.15
 """Part of the volume that a further capsule must save."""
 _HULLS = 2, 4, 8, 16
 """Numbers of hulls that are tried."""
+_DECOMPOSED, _SLABS = 2000, 4
+"""Triangles of a mesh that several hulls are tried for, at most, and slabs that it is cut into along each axis: a
+robot has dozens of meshes, and each takes a second."""
 _CLOSED = 1e-3
 """Sum of a closed surface's area vectors, as a share of its area, that is rounding [-]."""
 _CUTS = np.linspace(0.2, 0.8, 7)
@@ -132,7 +135,9 @@ def single_part(points: Array, place: Any, surface: Surface, hulls: float, every
 def _several(mesh: Any, place: Any) -> Iterator[tuple[Part, ...]]:
     """Yield several capsules, then more and more hulls, around a mesh whose own hull stands out too far."""
     yield _capsules(mesh, place)
-    pieces = convex_pieces(*corners(mesh), _HULLS[-1], 0.0)
+    if mesh.num_tris > _DECOMPOSED:
+        return
+    pieces = convex_pieces(*corners(mesh), _HULLS[-1], 0.0, _SLABS)
     for count in _HULLS:
         yield tuple(Part(convex_hull(points), place) for points in merge(pieces, count))
 
