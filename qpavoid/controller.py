@@ -3,29 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from dataclasses import replace
+from functools import partial
 from time import perf_counter
 from typing import Any, NoReturn
 
 import numpy as np
 
 from qpavoid import kernels
-from qpavoid.config import Avoidance, Limits, Progress, ScenarioConfig, Sensing, Sphere
+from qpavoid.budget import UNLIMITED, Budget
+from qpavoid.config import Avoidance, Limits, Planning, Progress, ScenarioConfig, Sensing, Sphere
 from qpavoid.config.scenario import MAX_LATENCY
+from qpavoid.control.arguments import Obstacles
 from qpavoid.control.builder import ProblemBuilder, StepProblem
 from qpavoid.control.contacts import ContactRows
 from qpavoid.control.inputs import LARGEST_VELOCITY, check_velocity
 from qpavoid.control.scenario import build_parts
 from qpavoid.control.scene_changes import SceneChanges
 from qpavoid.control.settings import ControlSettings
+from qpavoid.control.split_step import SplitStep
 from qpavoid.control.tasks import RowTask, in_order
 from qpavoid.control.tick import Tick, copied
 from qpavoid.errors import ConfigError, NumericalError, located
 from qpavoid.model.scene import Obstacle, Scene
+from qpavoid.planning.replanning import Replanning
 from qpavoid.problem import Array, Solution, State, as_vector, require_finite
 from qpavoid.reason import Reason, ReasonKind
 from qpavoid.safety.arbiter import Arbiter
 from qpavoid.solvers import Solver, check_solver, make_solver
+from qpavoid.solvers.solver import NamedSolver
 
 _MAX_DT = 1.0
 """Largest control period that is accepted [s]: a longer one is in milliseconds."""
@@ -38,7 +45,7 @@ _NO_BACKUP_WITH_CONTACTS = Reason.of(
 _WARM_UP = "a passing obstacle, to warm up"
 
 
-class Controller(SceneChanges):
+class Controller(SceneChanges, SplitStep):
     """Follows its tasks and keeps clear of everything in its scene."""
 
     def __init__(
@@ -53,6 +60,8 @@ class Controller(SceneChanges):
         progress: Progress | None = None,
         contacts: ContactRows | None = None,
         latency: float = 0.0,
+        planning: Planning | None = None,
+        budget: float | Budget | None = None,
     ) -> None:
         """Lay out the memory of a control step.
 
@@ -67,16 +76,24 @@ class Controller(SceneChanges):
             progress: when a task counts as stalled; the defaults of a scenario if left out.
             contacts: frames that rest, see `build_contacts`; none if left out.
             latency: time after which the actuators follow a command [s], see `step`.
+            planning: forecasts and plans; none if left out.
+            budget: time after which a step leaves out what is left of relaxation, stop look-ahead and backup search
+                [s], and brakes or follows its backup trajectory instead, with a reason of kind BUDGET_SPENT; runs are
+                then not reproducible. As long as it takes if left out.
 
         Raises:
             UnknownName, SolverNotInstalled: of the solver.
-            ConfigError: dt or latency cannot be meant; contacts with a solver that does not hold them.
+            ConfigError: dt, latency or budget cannot be meant; contacts with a solver that does not hold them.
         """
         begin = perf_counter()
         if not 0.0 < dt <= _MAX_DT:
             raise ConfigError(f"dt: {dt} s, expected more than 0 and at most {_MAX_DT}; it is in seconds")
         if not 0.0 <= latency <= MAX_LATENCY:
             raise ConfigError(f"latency: {latency} s, expected 0 to {MAX_LATENCY}; it is in seconds")
+        self._another = partial(
+            type(self), tasks=tasks, dt=dt, avoidance=avoidance, limits=limits, sensing=sensing, progress=progress,
+            contacts=contacts, latency=latency, planning=planning, budget=budget,
+        )  # fmt: skip
         frames, others = in_order(tasks)
         self.scene = scene = scene.own_copy() if scene.spare else scene
         """Robot and obstacles, those that were added among them."""
@@ -92,11 +109,20 @@ class Controller(SceneChanges):
             self._no_backup = (_NO_BACKUP_WITH_CONTACTS,)
         bounds = scene.robot.bounds().within(self.limits)
         blocks = sensing or Sensing(), progress or Progress()
-        settings = ControlSettings(scene, bounds, self.avoidance, self.limits, dt, latency, *blocks)
+        if budget is not None and not isinstance(budget, Budget):
+            if not budget > 0.0:
+                raise ConfigError(f"budget: {budget} s, expected more than 0; it is in seconds")
+            budget = Budget(budget)
+        settings = ControlSettings(
+            scene, bounds, self.avoidance, self.limits, dt, latency, *blocks, budget or UNLIMITED
+        )
         self._builder = ProblemBuilder(settings, self.tasks, contacts)
         self._arbiter = Arbiter(settings, law, self._builder.rows, self._builder.tracker)
         self._builder.rows.look_ahead(law.bounded and self.avoidance.look_ahead)
+        self._planning: Replanning | None = None
         self._warm_up()
+        if planning is not None:
+            self._planning = Replanning(settings, self.tasks, contacts, self._builder, self._arbiter, planning)
         kernels.first_use.end()
         self.warm_up_time = perf_counter() - begin
         """Time to lay out memory and run the first steps, compilation included [s]; no later step compiles."""
@@ -115,6 +141,8 @@ class Controller(SceneChanges):
         check_solver(law, self._has_contacts)
         self._arbiter.solver = law
         self._builder.rows.look_ahead(law.bounded and self.avoidance.look_ahead)
+        if self._planning is not None:
+            self._planning.change_law(law)
 
     def _warm_up(self) -> None:
         """Run the first steps, with a law that ships: one of the user's own may remember what it is asked."""
@@ -122,6 +150,9 @@ class Controller(SceneChanges):
         self._arbiter.solver = make_solver("qp")
         self.tick(q)
         self.filter(q, v)
+        self.rows(q)
+        self.rows(q)
+        self.command(v)
         self._builder.rows.clearance_lower_bound(v, 0, self.dt)
         self._builder.rows.leaves_position_limits(q, v, self.dt)
         self._arbiter.warm_up(q)
@@ -149,7 +180,7 @@ class Controller(SceneChanges):
         with located(str(source)):
             controller = cls(
                 parts.scene, parts.tasks, parts.solver, scenario.dt, scenario.avoidance, scenario.limits,
-                scenario.sensing, scenario.progress, parts.contacts, scenario.latency,
+                scenario.sensing, scenario.progress, parts.contacts, scenario.latency, scenario.planning,
             )  # fmt: skip
         for c in scenario.obstacles:
             if c.attached_to is not None:
@@ -162,7 +193,7 @@ class Controller(SceneChanges):
         q: Array,
         t: float | None = None,
         targets: Mapping[str, Any] | None = None,
-        obstacles: Mapping[str, Any] | None = None,
+        obstacles: Obstacles = None,
         v: Array | None = None,
     ) -> Solution:
         """Velocity for the next dt.
@@ -192,7 +223,9 @@ class Controller(SceneChanges):
             obstacles: where obstacles are, by name, in place of their motion: a `Sample`, or if no velocity is known, a
                 `Pose`, `pin.SE3`, 4×4 matrix or position, which leaves the orientation as it was; `Points` for a cloud.
                 From then on they have to be updated, see `Sensing`, unless they are given `at_rest`. Each may have a
-                time stamp of its own.
+                time stamp of its own. Many at a time cost least as one array, with a row of each of `obstacle_names`:
+                (k, 18) as `Sample.row`, or (k, 7), position and quaternion x y z w, if no velocity is known; of some
+                obstacles, as {(name, ...): array}.
             v: velocity (nv,) as measured, from which acceleration limits count in the first step, after a gap and after
                 `reset`. In all other steps they count from the last command, as those of servos that lag have to.
 
@@ -208,7 +241,7 @@ class Controller(SceneChanges):
         q: Array,
         t: float | None = None,
         targets: Mapping[str, Any] | None = None,
-        obstacles: Mapping[str, Any] | None = None,
+        obstacles: Obstacles = None,
         v: Array | None = None,
     ) -> Tick:
         """Like `step`, with everything that led to the velocity."""
@@ -227,7 +260,7 @@ class Controller(SceneChanges):
         q: Array,
         v_desired: Array,
         t: float | None = None,
-        obstacles: Mapping[str, Any] | None = None,
+        obstacles: Obstacles = None,
         v: Array | None = None,
     ) -> Solution:
         """The safe velocity that is closest to any command: of a teleoperator, a policy, another controller.
@@ -246,16 +279,23 @@ class Controller(SceneChanges):
         """
         begin = perf_counter()
         v_desired = as_vector("v_desired", v_desired, self._v_shape)
+        if self._planning is not None:
+            self._planning.drop()
         step = self._builder.build(self._builder.read(q, t, None, obstacles, v, v_desired))
         return self._decide(step, begin, from_tasks=False)
 
     def _decide(self, step: StepProblem, begin: float, from_tasks: bool = True) -> Solution:
         """Decide what is commanded; the step began at `begin` [s]."""
         middle, arbiter, builder = perf_counter(), self._arbiter, self._builder
+        planning = self._planning if from_tasks else None
         if step.resumed:
             arbiter.reset()
+            if planning is not None:
+                planning.reset()
         if step.faults:
             solution = arbiter.stop(step.problem, step.faults)
+        elif planning is not None:
+            solution = planning.decide(step)
         else:
             solution = arbiter.decide(step.q, step.t, step.problem, step.proximity, from_tasks)
         builder.remember(solution.v)
@@ -276,6 +316,25 @@ class Controller(SceneChanges):
             raise NumericalError(str(faults[0]))
         self._builder.reset(v)
         self._arbiter.reset()
+        if self._planning is not None:
+            self._planning.reset()
+
+    def _scene_changed(self, method: str, *arguments: Any) -> None:
+        """Let forecasts know of a change of the scene."""
+        if self._planning is not None:
+            self._planning.change_scene(method, *arguments)
+
+    def clone(self) -> Controller:
+        """Return another controller that does the same, in memory of its own: for another thread, or to look ahead.
+
+        It has the scene, with what was added and is attached, and all settings; it is as after `reset`. Tasks are
+        shared, since they remember nothing; a law of your own is deep-copied.
+        """
+        law = self.solver
+        own = make_solver(law.config) if isinstance(law, NamedSolver) else deepcopy(law)
+        controller = self._another(self.scene.emptied(), solver=own)
+        controller.take_over(self)
+        return controller
 
     def __reduce_ex__(self, protocol: Any) -> NoReturn:
         """Refuse to be copied or pickled: a copy would share memory that coal and compiled code look into.
@@ -283,4 +342,7 @@ class Controller(SceneChanges):
         Raises:
             TypeError: always.
         """
-        raise TypeError("a Controller is neither copied nor pickled; build another one of its scene and tasks")
+        raise TypeError(
+            "a Controller is neither copied nor pickled; `clone()` gives another one, and in another process build "
+            "another one of its scenario, or of its scene and tasks"
+        )

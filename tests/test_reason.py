@@ -23,8 +23,10 @@ from qpavoid import (
 from qpavoid.config import Beta, Box, Sphere
 from qpavoid.problem import AvoidanceRows, Tracking, make_problem
 
-INFORMING = {"NO_BACKUP", "ESTIMATED", "IGNORED", "POINTS_DROPPED", "NORMALISED", "TIMING"}
-ALARMING = {"PREDICTED_TOO_NEAR", "UNKNOWN_DISTANCE", "IMPLAUSIBLE", "SOLVER_FAILED", "CONTACTS_INFEASIBLE"}
+INFORMING = {"NO_BACKUP", "NO_PLAN", "ESTIMATED", "IGNORED", "POINTS_DROPPED", "NORMALISED", "TIMING"}
+ALARMING = {
+    "PREDICTED_TOO_NEAR", "UNKNOWN_DISTANCE", "BUDGET_SPENT", "IMPLAUSIBLE", "SOLVER_FAILED", "CONTACTS_INFEASIBLE",
+}  # fmt: skip
 BALL = Sphere(radius=0.1)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,13 +15,22 @@ from qpavoid.control.previous_velocity import PreviousVelocity
 from qpavoid.control.row_layout import lay_out
 from qpavoid.control.settings import ControlSettings
 from qpavoid.control.tasks import RowTask, in_order
-from qpavoid.control.tasks.layout import TaskRows, task_levels
+from qpavoid.control.tasks.layout import TaskRows, dead_beat, task_levels
+from qpavoid.kernels.layout import RowLayout
 from qpavoid.model.kinematics import ForwardKinematics, Kinematics
 from qpavoid.problem import Array, AvoidanceRows, Contacts, IntArray, Problem, Proximity, Tracking
 from qpavoid.solvers.hqp import cascade
 
 _LACKING = 1e-6
 """Share of a task's velocity up to which it lacks nothing [-]: round-off of the tracking law."""
+
+
+class _Form(NamedTuple):
+    """Rows in one form: memory that all forms share, but for some numbers and gains."""
+
+    layout: RowLayout
+    packed: Any
+    step: Callable[..., tuple[int, int, int, int, float, bool, float, float]]
 
 
 class RowAssembler:
@@ -69,7 +78,8 @@ class RowAssembler:
         self._eye, self._b_feasible = np.eye(len(x.v_tracking)), np.zeros(len(x.b))
         self._is_compiled = self._forward.is_compiled and self.query.is_compiled and not row_tasks and contacts is None
         self._q = scene.robot.home.copy()
-        self._step = self._compile()
+        self._step = self._compile(self._packed)
+        self._forms = [_Form(x, self._packed, self._step)]
         self._finds_pairs = self._forward.is_compiled and not self.query.has_clouds
         self._find = kernels.direct(kernels.find_near_pairs, self._packed, self._q)
         self._assemble(self._q)  # compiled now, not in the first step in which coal has to compute a pair
@@ -83,13 +93,39 @@ class RowAssembler:
         """
         looks_ahead = looks_ahead and self._contacts is None and not self._layout.jerk_limited
         if looks_ahead != self._layout.looks_ahead:
-            self._layout = self._layout._replace(looks_ahead=looks_ahead)
-            self._packed = kernels.pack(self._layout)
-            self._step = self._compile()
+            self._forms = [self._make_form(form.layout._replace(looks_ahead=looks_ahead)) for form in self._forms]
+            self.use_form(0)
 
-    def _compile(self) -> Callable[..., tuple[int, int, int, int, float, bool, float, float]]:
+    def add_dampers(self, row_gain: float, margin: float, gain: float = 0.0) -> int:
+        """Lay out velocity dampers as another form of the rows, in the same memory; return its number for `use_form`.
+
+        Args:
+            row_gain: ξ [1/s].
+            margin: added to the safety distance [m].
+            gain: least feedback gain of the frames [1/s].
+        """
+        x = self._layout
+        gains, of_frames = np.maximum(x.gain, gain), x.row_tasks < self.frame_count
+        near_one = x.dead_beat.copy()
+        near_one[of_frames] = dead_beat(gains, x.dt)[x.row_tasks[of_frames]]
+        dampers = x._replace(
+            row_gain=row_gain, near_speed=np.inf, task_switching=False, d1=x.d1 + margin, gain=gains, dead_beat=near_one
+        )
+        self._forms.append(self._make_form(dampers))
+        return len(self._forms) - 1
+
+    def use_form(self, number: int) -> None:
+        """Choose the form of the rows of the next steps; 0 is that of the settings."""
+        self._layout, self._packed, self._step = self._forms[number]
+
+    def _make_form(self, layout: RowLayout) -> _Form:
+        """Pack a layout, for which kernels are compiled already."""
+        packed = kernels.pack(layout)
+        return _Form(layout, packed, self._compile(packed))
+
+    def _compile(self, packed: Any) -> Callable[..., tuple[int, int, int, int, float, bool, float, float]]:
         """Return the code of `kernels.control_step` for this memory."""
-        arguments = self._packed, self._q, self.influence_distance, False
+        arguments = packed, self._q, self.influence_distance, False
         return kernels.direct(kernels.control_step, *arguments) if self._is_compiled else kernels.control_step
 
     def compute(self, q: Array, targets: Sequence[Any]) -> tuple[Proximity, Problem]:

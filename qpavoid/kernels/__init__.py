@@ -18,17 +18,13 @@ from qpavoid.kernels.clearance import (
     joint_speeds,
     leaves_position_limits,
 )
-from qpavoid.kernels.estimates import (
-    are_fine,
-    extrapolate_estimates,
-    extrapolate_states,
-    update_estimates,
-    write_rows,
-)
+from qpavoid.kernels.depth import CellGrid, OwnBodies, fill_cells, mark_own_pixels, recall_cells
+from qpavoid.kernels.estimates import ObstacleArrays, are_fine, check_updates, observe
 from qpavoid.kernels.kinematics import KinematicsArrays, update_kinematics
 from qpavoid.kernels.layout import RowLayout
 from qpavoid.kernels.near_pairs import DistanceArrays, near_pairs, place_bodies, place_obstacles
 from qpavoid.kernels.obstacles import Pieces, check_states, sample_pieces
+from qpavoid.kernels.pose_fit import extrapolate_states
 from qpavoid.kernels.prediction import Prediction, predict, prediction_error_bound
 from qpavoid.kernels.qp import max_clearance_velocity, minimize, project, project_soft
 from qpavoid.kernels.ramps import RampLimits, follow_ramp
@@ -45,8 +41,11 @@ from qpavoid.kernels.voxels import select_voxels, voxels_within
 __all__ = [
     "TOLERANCE",
     "ApproachArrays",
+    "CellGrid",
     "DistanceArrays",
     "KinematicsArrays",
+    "ObstacleArrays",
+    "OwnBodies",
     "Pieces",
     "Prediction",
     "RampLimits",
@@ -62,6 +61,7 @@ __all__ = [
     "beta",
     "candidates",
     "check_states",
+    "check_updates",
     "clearance_lower_bound",
     "closes_below",
     "comes_near",
@@ -69,8 +69,8 @@ __all__ = [
     "direct",
     "distance_rows",
     "extend_paths",
-    "extrapolate_estimates",
     "extrapolate_states",
+    "fill_cells",
     "find_near_pairs",
     "first_use",
     "follow_ramp",
@@ -79,10 +79,12 @@ __all__ = [
     "jerk_limited_stop",
     "joint_speeds",
     "leaves_position_limits",
+    "mark_own_pixels",
     "max_clearance_velocity",
     "max_offset",
     "minimize",
     "near_pairs",
+    "observe",
     "pack",
     "place_bodies",
     "place_obstacles",
@@ -91,6 +93,7 @@ __all__ = [
     "project",
     "project_soft",
     "projection_cost",
+    "recall_cells",
     "roll_out_stop",
     "rollout_outcome",
     "rotation_vector",
@@ -102,11 +105,9 @@ __all__ = [
     "stop_velocity",
     "tracking_law",
     "tracking_violation",
-    "update_estimates",
     "update_kinematics",
     "velocity_bounds",
     "violation",
     "voxels_within",
     "write_path_point",
-    "write_rows",
 ]
