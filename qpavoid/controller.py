@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from copy import deepcopy
+from copy import copy, deepcopy
 from dataclasses import replace
 from functools import partial
 from time import perf_counter
@@ -26,6 +26,7 @@ from qpavoid.control.split_step import SplitStep
 from qpavoid.control.tasks import RowTask, in_order
 from qpavoid.control.tick import Tick, copied
 from qpavoid.errors import ConfigError, NumericalError, located
+from qpavoid.model.robot import Robot
 from qpavoid.model.scene import Obstacle, Scene
 from qpavoid.planning.replanning import Replanning
 from qpavoid.problem import Array, Solution, State, as_vector, require_finite
@@ -120,7 +121,8 @@ class Controller(SceneChanges, SplitStep):
         self._arbiter = Arbiter(settings, law, self._builder.rows, self._builder.tracker)
         self._builder.rows.look_ahead(law.bounded and self.avoidance.look_ahead)
         self._planning: Replanning | None = None
-        self._warm_up()
+        with settings.budget.suspended():  # loading kernels takes as long as it takes
+            self._warm_up()
         if planning is not None:
             self._planning = Replanning(settings, self.tasks, contacts, self._builder, self._arbiter, planning)
         kernels.first_use.end()
@@ -170,13 +172,13 @@ class Controller(SceneChanges, SplitStep):
         self.reset()
 
     @classmethod
-    def from_scenario(cls, scenario: ScenarioConfig) -> tuple[Controller, Array]:
-        """Controller and initial configuration of a scenario.
+    def from_scenario(cls, scenario: ScenarioConfig, robot: Robot | None = None) -> tuple[Controller, Array]:
+        """Controller and initial configuration of a scenario; `robot` is that of the scenario, if it is loaded already.
 
         Raises:
             ConfigError, UnknownName, SolverNotInstalled: naming file, field and remedy.
         """
-        source, parts = scenario.source, build_parts(scenario)
+        source, parts = scenario.source, build_parts(scenario, robot)
         with located(str(source)):
             controller = cls(
                 parts.scene, parts.tasks, parts.solver, scenario.dt, scenario.avoidance, scenario.limits,
@@ -332,7 +334,7 @@ class Controller(SceneChanges, SplitStep):
         """
         law = self.solver
         own = make_solver(law.config) if isinstance(law, NamedSolver) else deepcopy(law)
-        controller = self._another(self.scene.emptied(), solver=own)
+        controller = self._another(self.scene.emptied(), solver=own, budget=copy(self._another.keywords["budget"]))
         controller.take_over(self)
         return controller
 
