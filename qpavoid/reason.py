@@ -78,6 +78,17 @@ class ReasonKind(str, Enum):
     """No velocity within the joint limits meets the contacts: `contacts`."""
     PRIORITY_UNSOLVED = "PRIORITY_UNSOLVED"
     """No back end could solve the QP of a priority level: the level."""
+    NOT_PLANNED = "NOT_PLANNED"
+    """No path is planned: why, in `detail`."""
+    START_TOO_NEAR = "START_TOO_NEAR"
+    """A path would begin in contact: the pair, its distance [m]."""
+    GOAL_TOO_NEAR = "GOAL_TOO_NEAR"
+    """No goal of a path is clear: the pair that is nearest at the first of them, its distance [m]; no pair where goals
+    follow from targets."""
+    NOT_ATTAINED = "NOT_ATTAINED"
+    """No configuration that attains the targets of a path was found."""
+    NO_PATH = "NO_PATH"
+    """No path was found within its budget: configurations that were checked [-]."""
 
     @property
     def severity(self) -> Severity:
@@ -122,6 +133,11 @@ _TEXTS: dict[str, str] = {
     "SOLVER_FAILED": "no usable velocity",
     "CONTACTS_INFEASIBLE": "joint limits leave no velocity that holds them",
     "PRIORITY_UNSOLVED": "no back end could solve its QP",
+    "NOT_PLANNED": "no path is planned",
+    "START_TOO_NEAR": "a path would begin in contact, distance",
+    "GOAL_TOO_NEAR": "no goal of the path is clear, distance",
+    "NOT_ATTAINED": "no configuration attains the targets",
+    "NO_PATH": "no path was found, checked configurations:",
 }
 
 

@@ -29,6 +29,10 @@ from qpavoid.kernels.kinematics import KinematicsArrays, update_kinematics
 from qpavoid.kernels.layout import RowLayout
 from qpavoid.kernels.near_pairs import DistanceArrays, near_pairs, place_bodies, place_obstacles
 from qpavoid.kernels.obstacles import Pieces, check_states, sample_pieces
+from qpavoid.kernels.planning import PlanningArrays, pair_clearances
+from qpavoid.kernels.planning import clearance as planned_clearance
+from qpavoid.kernels.planning_goals import FrameTargets
+from qpavoid.kernels.planning_search import search
 from qpavoid.kernels.prediction import Prediction, predict, prediction_error_bound
 from qpavoid.kernels.qp import max_clearance_velocity, minimize, project, project_soft
 from qpavoid.kernels.ramps import RampLimits, follow_ramp
@@ -46,8 +50,10 @@ __all__ = [
     "TOLERANCE",
     "ApproachArrays",
     "DistanceArrays",
+    "FrameTargets",
     "KinematicsArrays",
     "Pieces",
+    "PlanningArrays",
     "Prediction",
     "RampLimits",
     "RolloutArrays",
@@ -84,8 +90,10 @@ __all__ = [
     "minimize",
     "near_pairs",
     "pack",
+    "pair_clearances",
     "place_bodies",
     "place_obstacles",
+    "planned_clearance",
     "predict",
     "prediction_error_bound",
     "project",
@@ -96,6 +104,7 @@ __all__ = [
     "rotation_vector",
     "row_bounds",
     "sample_pieces",
+    "search",
     "select_voxels",
     "sorted_setxor",
     "speed_to_stop",

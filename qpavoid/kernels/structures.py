@@ -13,6 +13,7 @@ from qpavoid.kernels.kinematics import KinematicsArrays
 from qpavoid.kernels.layout import RowLayout
 from qpavoid.kernels.near_pairs import DistanceArrays
 from qpavoid.kernels.packing import compiled
+from qpavoid.kernels.planning import PlanningArrays
 from qpavoid.kernels.rollout import RolloutArrays
 
 
@@ -55,6 +56,15 @@ class PackedRowsType(_Structure):
     """Type of `PackedRows`."""
 
 
+class PackedPlanning(structref.StructRefProxy):  # type: ignore[misc]
+    """`PlanningArrays` in compiled code."""
+
+
+@structref.register
+class PackedPlanningType(_Structure):
+    """Type of `PackedPlanning`."""
+
+
 class PackedApproach(structref.StructRefProxy):  # type: ignore[misc]
     """`ApproachArrays` in compiled code."""
 
@@ -75,6 +85,7 @@ for proxy, kind, fields in (
     (PackedRows, PackedRowsType, RowLayout._fields),
     (PackedRollout, PackedRolloutType, RolloutArrays._fields),
     (PackedApproach, PackedApproachType, ApproachArrays._fields),
+    (PackedPlanning, PackedPlanningType, PlanningArrays._fields),
 ):
     structref.define_boxing(kind, proxy)
     structref.define_constructor(proxy, kind, list(fields))
@@ -110,16 +121,25 @@ def _pack_approach(fields: Any) -> Any:
     return PackedApproach(*fields)
 
 
+@compiled
+def _pack_planning(fields: Any) -> Any:
+    """Return a structure of `PlanningArrays`."""
+    return PackedPlanning(*fields)
+
+
 _PACK = {
     KinematicsArrays: _pack_kinematics,
     DistanceArrays: _pack_distances,
     RowLayout: _pack_rows,
     RolloutArrays: _pack_rollout,
     ApproachArrays: _pack_approach,
+    PlanningArrays: _pack_planning,
 }
 
 
-def pack(layout: KinematicsArrays | DistanceArrays | RowLayout | RolloutArrays | ApproachArrays) -> Any:
+def pack(
+    layout: KinematicsArrays | DistanceArrays | RowLayout | RolloutArrays | ApproachArrays | PlanningArrays,
+) -> Any:
     """Return memory in the form that the kernels take; both look into the same arrays.
 
     With `NUMBA_DISABLE_JIT=1` that is the named tuple itself.
