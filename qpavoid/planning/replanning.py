@@ -12,10 +12,12 @@ from qpavoid.control.builder import ProblemBuilder, StepProblem
 from qpavoid.control.contacts import ContactRows
 from qpavoid.control.settings import ControlSettings
 from qpavoid.control.tasks import FrameTask, RowTask
+from qpavoid.errors import ConfigError
 from qpavoid.model.sample import Sample
 from qpavoid.planning.candidates import Candidates, Decision
 from qpavoid.planning.drive import TRACK, Driver
 from qpavoid.planning.forecast import Forecast, Forecaster, Snapshot, largest_error
+from qpavoid.planning.planner import Planner, PlannerSettings
 from qpavoid.problem import Array, Solution
 from qpavoid.reason import Reason, ReasonKind
 from qpavoid.safety.arbiter import Arbiter
@@ -62,13 +64,14 @@ class Replanning:
             config: what is planned, and how.
         """
         self._builder, self._config, self._settings, self._tasks = builder, config, settings, tasks
-        self._driver = Driver(builder.rows, arbiter, config)
+        self._driver = Driver(builder.rows, arbiter, config, settings.scene.robot.model, settings.dt)
         self._forecaster: Forecaster | None = None
         law = arbiter.solver
         self._no_plan = _exclusion(tasks, law)
         if self._no_plan is None and isinstance(law, NamedSolver):
             self._forecaster = Forecaster(settings, tasks, contacts, law, config)
-            self._candidates = Candidates(self._forecaster, config)
+            planner = _make_planner(self._forecaster, settings, config) if contacts is None else None
+            self._candidates = Candidates(self._forecaster, planner, config)
         self.reset()
 
     def reset(self) -> None:
@@ -78,6 +81,7 @@ class Replanning:
         self._expected: Forecast | None = None
         self._last_obstacles = dict[str, Array]()  # states of obstacles in the last look
         self._last_look, self._next_look, self._wait = -np.inf, -np.inf, self._config.period
+        self._looks = 0
         self._last_states: Array | None = None
         self._noise, self._measured = 0.0, 0  # mean square [m²], number of differences
 
@@ -111,9 +115,12 @@ class Replanning:
             self._measure_noise()
         if self._pending is None and self._is_due(step):
             self._look(step)
+        drive = self._driver.drive
         solution = self._driver.decide(step)
-        if self._driver.drive.reason:
-            solution = solution._replace(plan=self._driver.drive.reason)
+        if drive.reason:
+            solution = solution._replace(plan=drive.reason)
+        if drive.mode is not self._driver.drive.mode:  # a path has ended
+            self._next_look = step.t
         if solution.stalled and self._pending is None:
             self._next_look = min(self._next_look, self._last_look + self._wait)
         if self._pending is not None and step.t + self._settings.dt >= self._pending.t - _ROUND_OFF:
@@ -168,7 +175,8 @@ class Replanning:
         q, v, dv = step.q.copy(), previous.v.copy(), previous.dv.copy()
         start = Snapshot(step.t, q, v, dv, self._driver.drive, self._last_obstacles, self._given_targets(step))
         is_noisy = is_moving and (self._measured < _MEASURED or self._noise > _NOISE**2)
-        outcome = self._candidates.look(start, not is_noisy)
+        outcome = self._candidates.look(start, not is_noisy, is_moving, self._looks)
+        self._looks += 1
         self._last_look, self._expected, self._pending = step.t, outcome.forecast, outcome.decision
         if outcome.arrives:
             self._next_look, self._wait = step.t + (period if is_moving else np.inf), period
@@ -196,3 +204,14 @@ def _exclusion(tasks: Sequence[RowTask], law: Solver) -> Reason | None:
     if isinstance(law, NamedSolver) and law.bounded:
         return None
     return Reason.of(ReasonKind.NO_PLAN, "solver", detail=f"{law.label} is neither qp nor hqp")
+
+
+def _make_planner(forecaster: Forecaster, settings: ControlSettings, config: Planning) -> Planner | None:
+    """Return a planner in the scene of forecasts; None where there are no paths of the robot, or none are wanted."""
+    if not config.clearances:
+        return None
+    plans = PlannerSettings(settings.safety_distance, config.clearances, velocity_scale=config.speed)
+    try:
+        return Planner(forecaster.scene, plans, forecaster.distances())
+    except ConfigError:
+        return None
