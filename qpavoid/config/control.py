@@ -158,3 +158,6 @@ class Planning(Block):
     """Share of the joints' speed limits that paths use [-], no more than 1.8 rad/s or m/s."""
     stalled_after: Positive = 0.3
     """Time at rest after which a path is followed no longer [s]."""
+    worker: Literal["inline", "process"] = "inline"
+    """Where forecasts and plans are computed: `inline`, in the step that asks for them, which takes tenths of a second,
+    reproducibly; `process`, in a process of their own, which no step waits for."""

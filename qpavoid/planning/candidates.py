@@ -7,7 +7,7 @@ it begins. What is tried is limited by counts, not by time: the same state has t
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -63,6 +63,21 @@ class Outcome(NamedTuple):
     """Another drive, if one is better."""
 
 
+def is_sound(outcome: Outcome, model: Any) -> bool:
+    """Return whether an outcome has finite numbers of the right shapes for a model, and could be followed."""
+    decision = outcome.decision
+    forecasts = [outcome.forecast] if decision is None else [outcome.forecast, decision.forecast]
+    path = None if decision is None else decision.drive.path
+    parts: list[tuple[Array, tuple[int, ...]]] = []
+    for x in forecasts:
+        count = max(len(x.t), 1)
+        parts += [(x.t, (count,)), (x.q, (count, model.nq)), (x.errors, (count,))]
+    if path is not None:
+        count = max(len(path.t), 2)
+        parts += [(path.t, (count,)), (path.q, (count, model.nq)), (path.coordinates, (count, model.nv))]
+    return all(array.shape == shape and bool(np.isfinite(array).all()) for array, shape in parts)
+
+
 class _Candidate(NamedTuple):
     """Drive that was rolled out."""
 
@@ -80,23 +95,25 @@ class Candidates:
     def __init__(self, forecaster: Forecaster, planner: Planner | None, config: Planning) -> None:
         self._forecaster, self._planner, self._config = forecaster, planner, config
 
-    def look(self, start: Snapshot, may_hurry: bool, is_moving: bool, seed: int) -> Outcome:
+    def look(self, start: Snapshot, is_moving: bool, is_noisy: bool, seed: int) -> Outcome:
         """Return what the present drive leads to, and a better one.
 
         Args:
             start: state of the controller.
-            may_hurry: whether a fast finish may be tried.
             is_moving: whether obstacles move whose motion is not known.
+            is_noisy: whether what is known of them is too noisy for anything but the law.
             seed: of the planner.
         """
         end = self._forecaster.end_of(start)
         present = self._forecaster.run(start, end)
         if self._arrives(present):
             return Outcome(True, present)
+        if is_noisy and start.drive.mode is Mode.TRACK:
+            return Outcome(False, present)
         search = _Search(start, end, present, is_moving, seed, _STEP_TIME * len(present.t))
-        better = [*self._faster(search, may_hurry)]
+        better = [*self._faster(search)]
         hurried = [one for one in better if one.arrives and one.cost < 1.1 * present.rms_error]
-        if self._planner is not None and not (hurried and is_moving):
+        if self._planner is not None and not is_noisy and not (hurried and is_moving):
             better += self._paths(search, self._planner)
         ready = [one for one in better if one.t >= start.t + min(search.effort, self._config.lead) - 1e-9]
         if not ready:
@@ -105,12 +122,12 @@ class Candidates:
         drive = best.drive._replace(reason=self._reason(best, search)) if best.drive.mode is not Mode.TRACK else TRACK
         return Outcome(False, present, Decision(best.t, drive, best.forecast))
 
-    def _faster(self, search: _Search, may_hurry: bool) -> Iterator[_Candidate]:
+    def _faster(self, search: _Search) -> Iterator[_Candidate]:
         """Roll out the other of tasks with the rows of the law, and of a fast finish."""
         mode, step = search.start.drive.mode, search.present.step_at(search.start.t + self._config.lead)
         if mode is Mode.FOLLOW or step >= len(search.present.t) - 1:
             return
-        hurries = mode is Mode.TRACK and may_hurry and self._config.fast is not None
+        hurries = mode is Mode.TRACK and self._config.fast is not None
         if hurries or mode is Mode.FAST:
             yield from self._try(search, step, TRACK if mode is Mode.FAST else Drive(Mode.FAST), _WORTH_HURRY)
 

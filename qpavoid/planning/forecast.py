@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from qpavoid.config import Planning, Sensing
+from qpavoid.config import Planning, Sensing, SolverConfig
 from qpavoid.control.builder import ProblemBuilder
 from qpavoid.control.contacts import ContactRows
 from qpavoid.control.obstacle_states import ObstacleStates
@@ -25,7 +25,6 @@ from qpavoid.problem import Array, AvoidanceRows
 from qpavoid.reason import Reason
 from qpavoid.safety.arbiter import Arbiter
 from qpavoid.solvers import make_solver
-from qpavoid.solvers.solver import NamedSolver
 
 _PRESENT = 1e-3
 """How much nearer than it is now a pair may come that is too near [m]."""
@@ -97,7 +96,7 @@ class Forecaster(SceneChanges):
         settings: ControlSettings,
         tasks: Sequence[RowTask],
         contacts: ContactRows | None,
-        law: NamedSolver,
+        law: SolverConfig,
         config: Planning,
     ) -> None:
         """Lay the memory out.
@@ -106,7 +105,7 @@ class Forecaster(SceneChanges):
             settings: of the controller.
             tasks: of the controller, frames first.
             contacts: frames that rest.
-            law: of the controller, one that scenarios name.
+            law: of the controller.
             config: what is planned, and how.
         """
         scene = settings.scene.own_copy() if settings.scene.spare else settings.scene
@@ -115,7 +114,7 @@ class Forecaster(SceneChanges):
         self.scene, self._tasks, self._config = scene, tasks, config
         self._builder = ProblemBuilder(self._settings, tasks, contacts)
         rows, tracker = self._builder.rows, self._builder.tracker
-        self._arbiter = Arbiter(self._settings, make_solver(law.config), rows, tracker)
+        self._arbiter = Arbiter(self._settings, make_solver(law), rows, tracker)
         self._driver = Driver(rows, self._arbiter, config, scene.robot.model, settings.dt)
         rows.look_ahead(settings.avoidance.look_ahead)
         ends = [task.motion.end_time if isinstance(task.motion, Trajectory) else np.inf for task in tasks]
@@ -124,9 +123,9 @@ class Forecaster(SceneChanges):
         self._least = np.zeros(len(scene.pairs))
         """(m,) distance that each pair has to keep [m]."""
 
-    def change_law(self, law: NamedSolver) -> None:
+    def change_law(self, law: SolverConfig) -> None:
         """Forecast another law from now on."""
-        self._arbiter.solver = make_solver(law.config)
+        self._arbiter.solver = make_solver(law)
 
     def end_of(self, start: Snapshot) -> float:
         """Return the time at which a forecast ends [s]."""

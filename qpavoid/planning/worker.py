@@ -1,0 +1,195 @@
+"""Where looks ahead are computed: in the step that asks for one, or in a process of their own, which no step waits for.
+
+Not in a thread: it would share the interpreter with the control loop, whose slowest steps then take twenty times as
+long. Threads only wait here, on the pipes of the process.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import subprocess
+import sys
+from collections.abc import Sequence
+from queue import SimpleQueue
+from threading import Thread
+from typing import Any, BinaryIO, NamedTuple, Protocol
+
+from qpavoid.config import Planning, SolverConfig
+from qpavoid.control.contacts import ContactRows
+from qpavoid.control.settings import ControlSettings
+from qpavoid.control.tasks import RowTask
+from qpavoid.errors import ConfigError
+from qpavoid.planning.candidates import Candidates, Outcome
+from qpavoid.planning.forecast import Forecaster, Snapshot
+from qpavoid.planning.planner import Planner, PlannerSettings
+
+_SERVE = "from qpavoid.planning.worker import serve; serve()"
+"""What the process runs."""
+
+
+class Parts(NamedTuple):
+    """What a controller is made of, as far as forecasts need it."""
+
+    settings: ControlSettings
+    tasks: Sequence[RowTask]
+    """Frames first."""
+    contacts: ContactRows | None
+    law: SolverConfig
+    config: Planning
+
+
+class Question(NamedTuple):
+    """A look ahead that is asked for."""
+
+    number: int
+    start: Snapshot
+    is_moving: bool
+    """Whether obstacles move whose motion is not known."""
+    is_noisy: bool
+    """Whether what is known of them is too noisy for anything but the law."""
+    seed: int
+    """Of the planner: the number of looks since everything was reset."""
+
+
+class Answer(NamedTuple):
+    """What became of it."""
+
+    number: int
+    """Of the question."""
+    outcome: Outcome | None
+    """None where it failed."""
+    failure: str = ""
+    """Why."""
+
+
+class Worker(Protocol):
+    """Who computes looks ahead."""
+
+    def ask(self, question: Question) -> None:
+        """Ask for a look ahead; one at a time."""
+
+    def poll(self) -> Answer | None:
+        """Return an answer, if there is one; never wait."""
+
+    def change(self, method: str, *arguments: Any) -> None:
+        """Call a method of the forecaster: the scene or the law has changed."""
+
+
+class InlineWorker:
+    """Computes a look ahead when it is asked for: runs are reproducible, and that step takes as long as it takes."""
+
+    def __init__(self, parts: Parts) -> None:
+        """Lay the memory out."""
+        settings, config = parts.settings, parts.config
+        self._forecaster = Forecaster(settings, parts.tasks, parts.contacts, parts.law, config)
+        planner = _make_planner(self._forecaster, settings, config) if parts.contacts is None else None
+        self._candidates = Candidates(self._forecaster, planner, config)
+        self._answer: Answer | None = None
+
+    def ask(self, question: Question) -> None:
+        """See `Worker`."""
+        try:
+            outcome = self._candidates.look(*question[1:])
+        except Exception as error:  # whatever a plan may run into costs no more than the plan
+            self._answer = Answer(question.number, None, f"{type(error).__name__}: {error}")
+        else:
+            self._answer = Answer(question.number, outcome)
+
+    def poll(self) -> Answer | None:
+        """See `Worker`."""
+        answer, self._answer = self._answer, None
+        return answer
+
+    def change(self, method: str, *arguments: Any) -> None:
+        """See `Worker`."""
+        getattr(self._forecaster, method)(*arguments)
+
+
+class ProcessWorker:
+    """Has looks ahead computed in another process, which ends with this object."""
+
+    def __init__(self, parts: Parts) -> None:
+        """Start the process, and wait until it is ready, or has failed."""
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+        self.process = subprocess.Popen([sys.executable, "-c", _SERVE], **pipes)  # type: ignore[call-overload]
+        self._messages, self._answers = SimpleQueue[Any](), SimpleQueue[Answer]()
+        Thread(target=_write, args=(self.process.stdin, self._messages), daemon=True).start()
+        Thread(target=_read, args=(self.process.stdout, self._answers), daemon=True).start()
+        self._messages.put(parts)
+        first = self._answers.get()
+        if first.number < 0:
+            self._answers.put(first)
+
+    def ask(self, question: Question) -> None:
+        """See `Worker`."""
+        self._messages.put(question)
+
+    def poll(self) -> Answer | None:
+        """See `Worker`."""
+        return None if self._answers.empty() else self._answers.get()
+
+    def change(self, method: str, *arguments: Any) -> None:
+        """See `Worker`."""
+        self._messages.put((method, arguments))
+
+    def __del__(self) -> None:
+        self._messages.put(None)  # closes the pipe, at whose end the process ends
+
+
+def make_worker(parts: Parts) -> Worker:
+    """Return the worker that is configured."""
+    return ProcessWorker(parts) if parts.config.worker == "process" else InlineWorker(parts)
+
+
+def serve() -> None:
+    """Answer questions from standard input on standard output until the end of it: what the process runs."""
+    source, answers = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # what else is printed must not get between the answers
+    worker = InlineWorker(pickle.load(source))
+    answer: Answer | None = Answer(0, None)  # it is ready
+    while True:
+        if answer is not None:
+            pickle.dump(answer, answers)
+            answers.flush()
+        try:
+            message = pickle.load(source)
+        except EOFError:
+            return
+        if isinstance(message, Question):
+            worker.ask(message)
+        else:
+            worker.change(message[0], *message[1])
+        answer = worker.poll()
+
+
+def _write(pipe: BinaryIO, messages: SimpleQueue[Any]) -> None:
+    """Write messages to a process until one is None, or it is no more."""
+    try:
+        with pipe:
+            while (message := messages.get()) is not None:
+                pickle.dump(message, pipe)
+                pipe.flush()
+    except OSError:
+        pass  # the reader says so
+
+
+def _read(pipe: BinaryIO, answers: SimpleQueue[Answer]) -> None:
+    """Read answers of a process until it is no more."""
+    try:
+        with pipe:
+            while True:
+                answers.put(pickle.load(pipe))
+    except Exception as error:  # a process that ends in the middle of an answer leaves anything
+        answers.put(Answer(-1, None, f"the process has ended: {type(error).__name__}"))
+
+
+def _make_planner(forecaster: Forecaster, settings: ControlSettings, config: Planning) -> Planner | None:
+    """Return a planner in the scene of forecasts; None where there are no paths of the robot, or none are wanted."""
+    if not config.clearances:
+        return None
+    plans = PlannerSettings(settings.safety_distance, config.clearances, velocity_scale=config.speed)
+    try:
+        return Planner(forecaster.scene, plans, forecaster.distances())
+    except ConfigError:
+        return None
