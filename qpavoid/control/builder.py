@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from threading import get_ident
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -63,14 +64,27 @@ class ProblemBuilder:
         self._targets = TargetReader(tasks, self.rows.targets, settings.latency)
         shapes = (model.nq,), (model.nv,)
         self._reader = ArgumentReader(shapes, self._clock, self._configurations, self._targets, self.tracker)
+        self._thread: int | None = None
+        self.begun: StepProblem | None = None
+        """Step whose command is not known yet."""
 
     def read(self, q: Any, t: Any, targets: Any, obstacles: Any, v: Any, v_desired: Any = None) -> Arguments:
         """Check the arguments of a step, see `Controller.step`: whatever raises does so here, and changes nothing."""
         return self._reader.read(q, t, targets, obstacles, v, v_desired)
 
     def build(self, arguments: Arguments) -> StepProblem:
-        """Take over the arguments of a step, and build its problem."""
+        """Take over the arguments of a step, and build its problem.
+
+        Raises:
+            RuntimeError: another thread is in the middle of a step.
+        """
+        if self._thread not in (None, thread := get_ident()):
+            raise RuntimeError("a Controller is used by two threads at once; give each one of its own: `clone()`")
+        self._thread = thread
         times, q, v, v_desired, targets, update, faults, assumptions = arguments
+        if self.begun is not None and q is not None:  # nothing is known of what was commanded then
+            self.rows.previous.remember(pin.difference(self._model, self._q_last, q) / (times.periods * self._dt))
+            self._under_way.add(self.rows.previous.v)
         self._targets.last = targets
         rows, query = self.rows, self.rows.query
         if times.resumed or (v is not None and self._clock.is_first):
@@ -91,7 +105,8 @@ class ProblemBuilder:
         if problem.position_margin < -OUTSIDE:
             assumptions += self._bounds.outside(q, problem.joint_names, problem.joint_units)
         t = times.t + self._latency
-        return StepProblem(q, t, times.resumed, targets, proximity, problem, faults, assumptions)
+        self.begun = StepProblem(q, t, times.resumed, targets, proximity, problem, faults, assumptions)
+        return self.begun
 
     def _predict(self, q: Array | None) -> Array:
         """Return where the robot is when it follows this step's command, if it follows those under way until then.
@@ -111,16 +126,17 @@ class ProblemBuilder:
         """Take v (nv,) as what is commanded from this step to the next one."""
         self.rows.previous.remember(v)
         self._under_way.add(v)
+        self.begun, self._thread = None, None
 
     def _restart(self, v: Array) -> None:
         """Take the robot to have been moving at v (nv,), as commanded."""
         self.rows.previous.restart(v)
         self._under_way.fill(v)
 
-    def attach(self, index: int, frame_id: int, q: Array | None) -> Array:
-        """Attach an obstacle to a frame, and return q; see `Controller.attach`."""
+    def attach(self, index: int, frame_id: int, q: Array | None, pose: Sample | None = None) -> Array:
+        """Attach an obstacle to a frame, at its pose unless one is given, and return q; see `Controller.attach`."""
         q = self._given_or_last(q)
-        self.attachments.attach(index, frame_id, q, self._pose(index, q))
+        self.attachments.attach(index, frame_id, q, pose or self._pose(index, q))
         self.tracker.attach(index)
         self._place_attachment(index, q)
         return q
@@ -158,6 +174,7 @@ class ProblemBuilder:
     def reset(self, v: Array) -> None:
         """Forget the steps before; the robot moves at v (nv,). Attached objects stay attached."""
         self._restart(v)
+        self.begun, self._thread = None, None
         self._clock.reset()
         self._targets.last = ()
         self.tracker.reset()

@@ -7,6 +7,7 @@ from typing import Any
 
 from qpavoid.control.builder import ProblemBuilder
 from qpavoid.control.distances import DistanceQuery
+from qpavoid.control.obstacle_states import ObstacleStates
 from qpavoid.errors import UnknownName, nearest
 from qpavoid.model.sample import Sample
 from qpavoid.model.scene import Obstacle, Scene
@@ -130,6 +131,21 @@ class SceneChanges:
     def obstacle_pose(self, obstacle: str, q: Array | None = None) -> Sample:
         """Return the world pose of an obstacle in the last step, attached or not; see `release`."""
         return self._builder.pose(self._builder.tracker.index(obstacle), q)
+
+    @property
+    def obstacle_states(self) -> ObstacleStates:
+        """States of all obstacles in the last step; the next one overwrites them."""
+        return self._builder.tracker.current
+
+    def take_over(self, other: SceneChanges) -> None:
+        """Add, attach and allow what another controller of the same scene has; see `clone`."""
+        self._builder.slots.take_over(other.scene)
+        home, model = self.scene.robot.home, self.scene.robot.model
+        for name, joint in other.attached.items():
+            frame_id = model.getFrameId(model.names[joint])
+            self._builder.attach(other._builder.tracker.index(name), frame_id, home, other.obstacle_pose(name, home))
+        self._builder.attachments.take_over(other._builder.attachments)
+        self._scene_changed("take_over", other)
 
     def distances(self) -> DistanceQuery:
         """Return distances of the scene in memory of their own, which know what is attached to the robot."""

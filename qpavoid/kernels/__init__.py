@@ -18,6 +18,7 @@ from qpavoid.kernels.clearance import (
     joint_speeds,
     leaves_position_limits,
 )
+from qpavoid.kernels.depth import CellGrid, OwnBodies, fill_cells, mark_own_pixels, recall_cells
 from qpavoid.kernels.estimates import (
     are_fine,
     extrapolate_estimates,
@@ -30,7 +31,6 @@ from qpavoid.kernels.layout import RowLayout
 from qpavoid.kernels.near_pairs import DistanceArrays, near_pairs, place_bodies, place_obstacles
 from qpavoid.kernels.obstacles import Pieces, check_states, sample_pieces
 from qpavoid.kernels.planning import PlanningArrays, pair_clearances
-from qpavoid.kernels.planning import clearance as planned_clearance
 from qpavoid.kernels.planning_goals import FrameTargets
 from qpavoid.kernels.planning_search import search
 from qpavoid.kernels.prediction import Prediction, predict, prediction_error_bound
@@ -49,9 +49,11 @@ from qpavoid.kernels.voxels import select_voxels, voxels_within
 __all__ = [
     "TOLERANCE",
     "ApproachArrays",
+    "CellGrid",
     "DistanceArrays",
     "FrameTargets",
     "KinematicsArrays",
+    "OwnBodies",
     "Pieces",
     "PlanningArrays",
     "Prediction",
@@ -77,6 +79,7 @@ __all__ = [
     "extend_paths",
     "extrapolate_estimates",
     "extrapolate_states",
+    "fill_cells",
     "find_near_pairs",
     "first_use",
     "follow_ramp",
@@ -85,6 +88,7 @@ __all__ = [
     "jerk_limited_stop",
     "joint_speeds",
     "leaves_position_limits",
+    "mark_own_pixels",
     "max_clearance_velocity",
     "max_offset",
     "minimize",
@@ -93,12 +97,12 @@ __all__ = [
     "pair_clearances",
     "place_bodies",
     "place_obstacles",
-    "planned_clearance",
     "predict",
     "prediction_error_bound",
     "project",
     "project_soft",
     "projection_cost",
+    "recall_cells",
     "roll_out_stop",
     "rollout_outcome",
     "rotation_vector",

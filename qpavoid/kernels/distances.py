@@ -54,9 +54,7 @@ def compute_distances(
     count = 0
     for k in pairs:
         how, i, j = method[k], bodies[k, 0], bodies[k, 1]
-        if how != BY_COAL and not pair_distance(
-            shapes, poses, i, j, how, guesses[k], simplex, between, results[k]
-        ):
+        if how != BY_COAL and not pair_distance(shapes, poses, i, j, how, guesses[k], simplex, between, results[k]):
             meeting[count] = k
             count += 1
     return count

@@ -17,13 +17,11 @@ from qpavoid.kernels.distances import TO_HALF_SPACE, pair_distance
 from qpavoid.kernels.estimates import extrapolate
 from qpavoid.kernels.kinematics import update_kinematics
 from qpavoid.kernels.near_pairs import place_bodies, place_body
-from qpavoid.kernels.packing import compiled
+from qpavoid.kernels.packing import compiled, inlined
 from qpavoid.problem import Array, IntArray
 
 FINE = 5e-4
 """Distance beyond what it needs that each pair has at every sample [m]: bounds the number of samples near contact."""
-FAR = 0.1
-"""Distance beyond what it needs from which on a pair counts as this far [m]."""
 _STACK = 64
 """Stretches of a motion that wait to be covered: each is less than half as long as the one before it, so that a few
 would do."""
@@ -57,6 +55,12 @@ class PlanningArrays(NamedTuple):
     """(g, 6) box around each body in its frame: centre and half sizes [m]."""
     pairs: IntArray
     """(k,) number of each pair; of a body and a cloud, that of the body and its first proxy sphere."""
+    first: IntArray
+    """(k,) number of its first body."""
+    second: IntArray
+    """(k,) number of its second body."""
+    radii: Array
+    """(k,) sum of the radii of their bounding spheres [m]; infinite of half-spaces and clouds."""
     cloud: IntArray
     """(k,) number of the pair's cloud, -1 of other pairs."""
     row: IntArray
@@ -91,8 +95,10 @@ class PlanningArrays(NamedTuple):
     """(10,) distance, normal and witness points of the pair that was computed last."""
     state: Array
     """(18,) scratch: an obstacle at some time."""
+    row_rates: Array
+    """(r,) scratch: bound on the change of distances along the motion that is checked, by rows of `lever` [m]."""
     rates: Array
-    """(r,) scratch: bound on the change of distances along the motion that is checked [m]."""
+    """(k,) scratch: the same of each pair, with the motion of its obstacle [m]."""
     stretches: Array
     """(_STACK, 2) scratch: stretches of a motion that are not covered yet."""
     q: Array
@@ -107,11 +113,12 @@ def place(x: Any, q: Array, t: float) -> None:
     d = x.distances
     update_kinematics(x.kinematics, q)
     place_bodies(d, x.joint_poses)
-    for i in range(len(d.joints)):
-        if d.joints[i] >= 0:
+    joints, poses, local, centers = d.joints, d.poses, d.local, d.centers
+    for i in range(len(joints)):
+        if joints[i] >= 0:
             for r in range(3):
-                rotated = d.poses[i, r] * d.local[i, 0] + d.poses[i, 3 + r] * d.local[i, 1]
-                d.centers[i, r] = rotated + d.poses[i, 6 + r] * d.local[i, 2] + d.poses[i, 9 + r]
+                rotated = poses[i, r] * local[i, 0] + poses[i, 3 + r] * local[i, 1] + poses[i, 6 + r] * local[i, 2]
+                centers[i, r] = rotated + poses[i, 9 + r]
     for o in x.moving:
         for c in range(18):
             x.state[c] = x.states[o, c]
@@ -126,57 +133,56 @@ def distance_below(x: Any, k: int, limit: float) -> float:
 
     -∞ where the cores of the bodies meet, which are the bodies themselves without the radius of spheres and capsules.
     """
-    d, pair = x.distances, x.pairs[k]
-    i, j = d.pairs[pair, 0], d.pairs[pair, 1]
+    d, pair, i, j = x.distances, x.pairs[k], x.first[k], x.second[k]
     if x.cloud[k] < 0:
-        return _bodies_below(x, pair, i, j, limit)
-    best, size = limit, d.shapes.core[j, 0]
+        return _bodies_below(x, d, pair, i, j, limit)
+    best, size, centers, blocks, voxels = limit, d.shapes.core[j, 0], d.centers, x.blocks, x.voxels
     for block in range(x.cloud_start[x.cloud[k]], x.cloud_start[x.cloud[k] + 1]):
-        span = best + x.radius[i] + size + x.blocks[block, 3]
-        if span <= 0.0 or _square(d.centers[i], x.blocks[block]) >= span * span:
+        span = best + x.radius[i] + size + blocks[block, 3]
+        if span <= 0.0 or _square(centers, i, blocks, block) >= span * span:
             continue
         for voxel in range(x.block_start[block], x.block_start[block + 1]):
-            for r in range(3):
-                d.poses[j, 9 + r] = x.voxels[voxel, r]
-                d.centers[j, r] = x.voxels[voxel, r]
-            best = _bodies_below(x, pair, i, j, best)
+            span = best + x.radius[i] + size
+            if span > 0.0 and _square(centers, i, voxels, voxel) < span * span:
+                for r in range(3):
+                    d.poses[j, 9 + r] = voxels[voxel, r]
+                    centers[j, r] = voxels[voxel, r]
+                best = _bodies_below(x, d, pair, i, j, best)
     return best
 
 
 @compiled
-def _bodies_below(x: Any, pair: int, i: int, j: int, limit: float) -> float:
+def _bodies_below(x: Any, d: Any, pair: int, i: int, j: int, limit: float) -> float:
     """Compute the distance of bodies i and j if it is below a limit; see `distance_below`."""
-    d = x.distances
     if d.method[pair] != TO_HALF_SPACE:
-        span = limit + x.radius[i] + x.radius[j]
-        if span <= 0.0 or _square(d.centers[i], d.centers[j]) >= span * span:
-            return limit
+        centers, poses, boxes = d.centers, d.poses, x.boxes
         span = limit + x.radius[i]
-        if span <= 0.0 or _square_to_box(d.centers[i], d.poses[j], x.boxes[j]) >= span * span:
+        if span <= 0.0 or _square_to_box(centers, i, poses, boxes, j) >= span * span:
             return limit
         span = limit + x.radius[j]
-        if span <= 0.0 or _square_to_box(d.centers[j], d.poses[i], x.boxes[i]) >= span * span:
+        if span <= 0.0 or _square_to_box(centers, j, poses, boxes, i) >= span * span:
             return limit
-    is_apart = pair_distance(
+    is_separate = pair_distance(
         d.shapes, d.poses, i, j, d.method[pair], d.guesses[pair], x.simplex, x.between, x.result
     )
-    return min(x.result[0], limit) if is_apart else -np.inf
+    return min(x.result[0], limit) if is_separate else -np.inf
 
 
-@compiled
-def _square(a: Array, b: Array) -> float:
-    """Compute the squared distance of two points, the first three entries of a and b [m²]."""
-    dx, dy, dz = a[0] - b[0], a[1] - b[1], a[2] - b[2]
+@inlined
+def _square(a: Array, i: int, b: Array, j: int) -> float:
+    """Compute the squared distance of the points in row i of a and row j of b, their first three entries [m²]."""
+    dx, dy, dz = a[i, 0] - b[j, 0], a[i, 1] - b[j, 1], a[i, 2] - b[j, 2]
     return dx * dx + dy * dy + dz * dz
 
 
-@compiled
-def _square_to_box(point: Array, pose: Array, box: Array) -> float:
-    """Compute the squared distance of a point (3,) from a box (6,) in the frame of a pose (12,) [m²]."""
-    dx, dy, dz, square = point[0] - pose[9], point[1] - pose[10], point[2] - pose[11], 0.0
+@inlined
+def _square_to_box(centers: Array, i: int, poses: Array, boxes: Array, j: int) -> float:
+    """Compute the squared distance of the centre of body i's sphere from the box of body j [m²]."""
+    dx, dy, dz = centers[i, 0] - poses[j, 9], centers[i, 1] - poses[j, 10], centers[i, 2] - poses[j, 11]
+    square = 0.0
     for r in range(3):
-        along = pose[3 * r] * dx + pose[3 * r + 1] * dy + pose[3 * r + 2] * dz - box[r]
-        outside = max(abs(along) - box[3 + r], 0.0)
+        along = poses[j, 3 * r] * dx + poses[j, 3 * r + 1] * dy + poses[j, 3 * r + 2] * dz - boxes[j, r]
+        outside = max(abs(along) - boxes[j, 3 + r], 0.0)
         square += outside * outside
     return square
 
@@ -190,28 +196,13 @@ def pair_clearances(x: Any, q: Array, t: float, limit: float, out: Array) -> Non
 
 
 @compiled
-def clearance(x: Any, q: Array, t: float, need: Array, limit: float) -> float:
-    """Compute the least distance of any pair beyond what it needs (k,), at most `limit` [m]."""
-    place(x, q, t)
-    x.checks[0] += 1
-    for k in range(len(need)):
-        limit = min(limit, distance_below(x, k, need[k] + limit) - need[k])
-    return limit
-
-
-@compiled
 def is_clear(x: Any, q: Array, t: float, need: Array) -> bool:
     """Return True if every pair has the distance that a sample needs: need (k,) and `FINE` more."""
-    place(x, q, t)
-    x.checks[0] += 1
-    for k in range(len(need)):
-        if distance_below(x, k, need[k] + FINE) < need[k] + FINE:
-            return False
-    return True
+    return _covered(x, q, t, need, 0.0) >= 0.0
 
 
 @compiled
-def _covered(x: Any, q: Array, t: float, need: Array, duration: float, most: float) -> float:
+def _covered(x: Any, q: Array, t: float, need: Array, most: float) -> float:
     """Return the fraction of the motion, at most `most`, that a sample covers on each side; -1 where it is not clear.
 
     Args:
@@ -219,19 +210,20 @@ def _covered(x: Any, q: Array, t: float, need: Array, duration: float, most: flo
         q: sample (n,).
         t: its time [s].
         need: distance that each pair needs (k,) [m].
-        duration: of the motion, in which obstacles move [s].
         most: fraction of the motion.
     """
     place(x, q, t)
     x.checks[0] += 1
+    centers, first, second, radii, rates = x.distances.centers, x.first, x.second, x.radii, x.rates
     for k in range(len(need)):
-        rate = x.rates[x.row[k]] + duration * x.point_speed[x.obstacle[k]]
-        limit = need[k] + max(rate * most, FINE)
-        distance = distance_below(x, k, limit)
-        if distance < limit:
-            if distance < need[k] + FINE:
-                return -1.0
-            most = min(most, (distance - need[k]) / rate)
+        limit = need[k] + max(rates[k] * most, FINE)
+        span = limit + radii[k]
+        if span > 0.0 and _square(centers, first[k], centers, second[k]) < span * span:
+            distance = distance_below(x, k, limit)
+            if distance < limit:
+                if distance < need[k] + FINE:
+                    return -1.0
+                most = min(most, (distance - need[k]) / rates[k])
     return most
 
 
@@ -241,13 +233,9 @@ def is_clear_between(x: Any, a: Array, ta: float, b: Array, tb: float, need: Arr
 
     Conservative: a motion on which some pair has less than `FINE` beyond what it needs (k,) may count as not clear.
     """
-    n, dt, stretches, q = len(a), abs(tb - ta), x.stretches, x.q
-    for r in range(len(x.lever)):
-        rate = 0.0
-        for i in range(n):
-            rate += x.lever[r, i] * abs(b[i] - a[i])
-        x.rates[r] = rate
-    end = _covered(x, b, tb, need, dt, 1.0)
+    n, stretches, q = len(a), x.stretches, x.q
+    _write_rates(x, a, b, abs(tb - ta))
+    end = _covered(x, b, tb, need, 1.0)
     if end < 0.0:
         return False
     count = 1
@@ -260,7 +248,7 @@ def is_clear_between(x: Any, a: Array, ta: float, b: Array, tb: float, need: Arr
         s = 0.5 * (low + high)
         for i in range(n):
             q[i] = a[i] + s * (b[i] - a[i])
-        covered = _covered(x, q, ta + s * (tb - ta), need, dt, s - low)
+        covered = _covered(x, q, ta + s * (tb - ta), need, s - low)
         if covered < 0.0 or count + 2 > _STACK:
             return False
         if covered < s - low:
@@ -270,19 +258,34 @@ def is_clear_between(x: Any, a: Array, ta: float, b: Array, tb: float, need: Arr
     return True
 
 
-def scratch(n: int, rows: int) -> dict[str, Any]:
+@compiled
+def _write_rates(x: Any, a: Array, b: Array, duration: float) -> None:
+    """Write the rates of the straight motion from a to b (n,) in some time [s]."""
+    lever, row_rates, rates, row, obstacle, speed = x.lever, x.row_rates, x.rates, x.row, x.obstacle, x.point_speed
+    for r in range(len(lever)):
+        rate = 0.0
+        for i in range(len(a)):
+            rate += lever[r, i] * abs(b[i] - a[i])
+        row_rates[r] = rate
+    for k in range(len(rates)):
+        rates[k] = row_rates[row[k]] + duration * speed[obstacle[k]]
+
+
+def scratch(n: int, rows: int, pairs: int) -> dict[str, Any]:
     """Return the memory of `PlanningArrays` that nothing is read from before it is written.
 
     Args:
         n: number of coordinates.
         rows: number of rows of `lever`.
+        pairs: number of pairs that count.
     """
     return {
         "simplex": np.empty((4, 10)),
         "between": np.empty(12),
         "result": np.empty(10),
         "state": np.empty(18),
-        "rates": np.zeros(rows),
+        "row_rates": np.zeros(rows),
+        "rates": np.zeros(pairs),
         "stretches": np.empty((_STACK, 2)),
         "q": np.empty(n),
         "checks": np.zeros(1, dtype=np.intp),

@@ -118,7 +118,7 @@ def attain(x: Any, targets: FrameTargets, tolerance: float, q: Array) -> bool:
             square += errors[r] ** 2
         damping = _DAMPING * min(square, 1.0) + _LEAST_DAMPING
         is_free[:] = True
-        for attempt in range(3):
+        for _ in range(3):
             for r in range(rows):
                 for c in range(r + 1):
                     total = damping if r == c else 0.0
@@ -150,7 +150,15 @@ def attain(x: Any, targets: FrameTargets, tolerance: float, q: Array) -> bool:
 
 @compiled
 def clear_goals(
-    x: Any, targets: FrameTargets, near: Array, t: float, need: Array, tolerance: float, tries: int, most: int, seed: int
+    x: Any,
+    targets: FrameTargets,
+    near: Array,
+    t: float,
+    need: Array,
+    tolerance: float,
+    tries: int,
+    most: int,
+    seed: int,
 ) -> tuple[Array, int]:
     """Find configurations that attain some targets and are clear.
 

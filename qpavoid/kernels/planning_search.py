@@ -17,7 +17,7 @@ DONE, NOT_ATTAINED, NO_CLEAR_GOAL, NO_PATH = range(4)
 BACK_OFF = 1e-3
 """What a pair may lose of the distance that it begins or ends with, where that is less than it should have [m]."""
 _FIRST_NODES = 300
-"""Nodes of the first trees: one with less clearance is tried before a long search with more."""
+"""Nodes of the first trees: a long search is made with the least clearance alone."""
 _ENOUGH = 0.1
 """Distance beyond what a goal needs at least up to which its distances are of interest [m]."""
 
@@ -68,9 +68,9 @@ def search(
     ends, counts = np.zeros((levels, capacity, n + 1)), np.full(levels, -1)
     root = np.zeros(n + 1)
     root[:n] = start
-    for attempt in range(2 * levels):
-        level, size = attempt % levels, max_nodes if attempt >= levels else min(max_nodes, _FIRST_NODES)
-        if (attempt >= levels and max_nodes <= _FIRST_NODES) or x.checks[0] >= max_checks:
+    for attempt in range(levels + 1):
+        level, size = min(attempt, levels - 1), max_nodes if attempt == levels else min(max_nodes, _FIRST_NODES)
+        if (attempt == levels and max_nodes <= _FIRST_NODES) or x.checks[0] >= max_checks:
             break
         need = needs[level]
         if counts[level] < 0:

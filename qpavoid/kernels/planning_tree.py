@@ -65,9 +65,7 @@ def _nearest(x: Any, nodes: Array, count: int, node: Array, is_timed: bool, dire
     best, nearest, n = np.inf, -1, len(x.travel)
     for k in range(count):
         travel = _travel(x, nodes[k], node)
-        if travel < best and (
-            not is_timed or shortest_time(x, nodes[k], node) <= direction * (node[n] - nodes[k, n])
-        ):
+        if travel < best and (not is_timed or shortest_time(x, nodes[k], node) <= direction * (node[n] - nodes[k, n])):
             best, nearest = travel, k
     return nearest
 
@@ -152,9 +150,7 @@ def connect(
         near = _nearest(x, nodes[b], size[b], nodes[a, new], is_timed, -direction)
         is_reached = False
         while near >= 0 and not is_reached and size[b] < nodes.shape[1]:
-            is_clear, is_reached = _extend(
-                x, nodes[b], size[b], near, nodes[a, new], need, is_timed, -direction
-            )
+            is_clear, is_reached = _extend(x, nodes[b], size[b], near, nodes[a, new], need, is_timed, -direction)
             if not is_clear:
                 near, is_reached = -1, False
             else:

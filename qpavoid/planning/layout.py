@@ -62,12 +62,12 @@ class PlanLayout:
         self._lower, self._upper = self._ranges()
         self._lengths, self._levers = self._lever_bounds()
         self._known: tuple[bytes, ...] = ()
+        self._allowance: tuple[float, Array] | None = None
         self._empty = np.zeros(0, dtype=np.intp)
         bare = self._arrays._replace(
             column_joints=self._empty, motions=np.zeros((0, 6)), frame_ids=self._empty, frame_joints=self._empty
         )
         self._bare = kernels.pack(bare)
-        self.frames: list[int] = []
 
     # --- coordinates
 
@@ -89,7 +89,10 @@ class PlanLayout:
         q = np.zeros((len(x), self._model.nq))
         values, circle = x[:, self._x_index], self._is_circle
         q[:, self._q_index[~circle]] = values[:, ~circle]
-        q[:, self._q_index[circle]], q[:, self._q_index[circle] + 1] = np.cos(values[:, circle]), np.sin(values[:, circle])
+        q[:, self._q_index[circle]], q[:, self._q_index[circle] + 1] = (
+            np.cos(values[:, circle]),
+            np.sin(values[:, circle]),
+        )
         return q
 
     def _ranges(self) -> tuple[Array, Array]:
@@ -183,11 +186,11 @@ class PlanLayout:
         )  # fmt: skip
         if known == self._known:
             return
-        self._known, scene = known, self.scene
+        self._known, self._allowance, scene = known, None, self.scene
         selected = table.separable & ~table.ignored & (table.group == np.arange(len(table.group)))
         self.pairs: IntArray = np.flatnonzero(selected)
         """(k,) numbers of the pairs that count."""
-        first, second = scene.pairs[self.pairs].T
+        first, second = self.first, self.second = np.ascontiguousarray(scene.pairs[self.pairs].T, dtype=np.intp)
         levers = self._body_levers()
         rows = np.abs(table.support[self.pairs]) * (levers[first] + levers[second])
         folded = np.zeros((len(rows), self._model.nv))
@@ -199,6 +202,8 @@ class PlanLayout:
         self.obstacle = np.where(of[second] >= 0, of[second], of[first])
         clouds = {number: k for k, number in enumerate(scene.clouds)}
         self.cloud = np.array([clouds.get(i, -1) for i in of[second].tolist()], dtype=np.intp)
+        radius = table.spheres[:, 3]
+        self.radii = np.where(self.cloud < 0, radius[first] + radius[second], np.inf)
         self._lay_out_shapes()
 
     def _lay_out_shapes(self) -> None:
@@ -219,7 +224,9 @@ class PlanLayout:
 
     def needs(self, safety_distance: float) -> Array:
         """Return the safety distance (k,) of each pair, with the uncertainty of its obstacle [m]."""
-        own = safety_distance - self.scene.distance_allowance(safety_distance)[self.pairs]
+        if self._allowance is None or self._allowance[0] != safety_distance:
+            self._allowance = safety_distance, self.scene.distance_allowance(safety_distance)
+        own = safety_distance - self._allowance[1][self.pairs]
         margin = np.append(self.distances.arrays.margin[: len(self.scene.slots)], 0.0)
         return np.asarray(own + margin[self.obstacle])
 
@@ -259,6 +266,9 @@ class PlanLayout:
             radius=self.distances.table.spheres[:, 3],
             boxes=self.distances.table.boxes,
             pairs=self.pairs,
+            first=self.first,
+            second=self.second,
+            radii=self.radii,
             cloud=self.cloud,
             row=self.row,
             lever=self.lever,
@@ -272,7 +282,7 @@ class PlanLayout:
             cloud_start=cloud_start,
             columns=self._columns,
             frame_support=support,
-            **scratch(self._model.nv, len(self.lever)),
+            **scratch(self._model.nv, len(self.lever), len(self.pairs)),
         )
 
     def _voxels(self, states: Array) -> tuple[Array, Array, IntArray, IntArray]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from qpavoid.model.scene import Scene
 from qpavoid.problem import Array
 from qpavoid.reason import Reason
 
@@ -44,3 +45,9 @@ class Path:
     def at(self, t: float) -> Array:
         """Return the coordinates (nv,) at a time [s]; those of an end beyond it."""
         return np.array([np.interp(t, self.t, column) for column in self.coordinates.T])
+
+
+def no_path(scene: Scene, reason: Reason, checks: int = 0, nodes: int = 0, goals: int = 0) -> Path:
+    """Return no path of a scene, with its reason."""
+    nq, nv = scene.robot.model.nq, scene.robot.model.nv
+    return Path(np.zeros((0, nq)), np.zeros(0), np.zeros((0, nv)), np.nan, checks, nodes, goals, reason)

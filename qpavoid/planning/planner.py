@@ -1,8 +1,8 @@
 """Plan from a configuration to goals: RRT-Connect on the bodies and pairs that the controller looks at.
 
-Distances that are kept are tried in turn, the largest first: a path with more clearance is easier to follow. A pair that
-begins nearer than that keeps what it has, less 1 mm, so that a start next to something can be left. Budgets are counts,
-never times: the same arguments give the same path.
+Clearances are tried in turn, the largest first: a path with more is easier to follow. A pair that begins nearer than
+that needs what it has, less 1 mm, so that a start next to something can be left. Budgets are counts, never times: the
+same arguments give the same path.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from qpavoid.kernels.planning_search import BACK_OFF, DONE, NO_CLEAR_GOAL, NOT_A
 from qpavoid.model.scene import Scene
 from qpavoid.planning.goals import NO_TARGETS, Frame, read_goals, read_targets
 from qpavoid.planning.layout import PlanLayout, describe
-from qpavoid.planning.path import Path
+from qpavoid.planning.path import Path, no_path
 from qpavoid.problem import Array, require_finite
 from qpavoid.reason import Reason, ReasonKind
 
@@ -117,9 +117,9 @@ class Planner:
         q = require_finite("q", q, (self.scene.robot.model.nq,))
         start = layout.coordinates(q)
         points = [start] if near is None else [start, layout.coordinates(require_finite("near", near, q.shape), start)]
-        frames, wanted = list[int](), None
+        frames, poses = list[int](), None
         if targets is not None:
-            wanted, frames = read_targets(self.scene.robot, targets)
+            poses, frames = read_targets(self.scene.robot, targets)
         given = read_goals(goals, len(q)) if targets is None else np.zeros((0, len(q)))
         ends = np.array([layout.coordinates(goal, start) for goal in given]).reshape(-1, len(start))
         layout.update()
@@ -128,7 +128,7 @@ class Planner:
             return no_path(self.scene, Reason.of(ReasonKind.NOT_PLANNED, detail=refusal))
         x = layout.arrays(states, np.vstack((*points, *ends)), self._speed, frames)
         return self._search(
-            x, start, ends, wanted or NO_TARGETS, points[-1], tuple(arrivals) or (0.0,), seed & _SEED,
+            x, start, ends, poses or NO_TARGETS, points[-1], tuple(arrivals) or (0.0,), seed & _SEED,
             tuple(s.clearances if clearances is None else clearances), max_nodes or s.max_nodes,
         )  # fmt: skip
 
@@ -174,7 +174,9 @@ class Planner:
         layout.update()
         start = layout.coordinates(require_finite("q", q, (self.scene.robot.model.nq,)))
         x = layout.arrays(self._distances.arrays.states.copy(), start[None], self._speed, [])
-        return float(kernels.planned_clearance(kernels.pack(x), start, 0.0, np.zeros(len(x.pairs)), 1e3))
+        distances = np.empty(len(x.pairs))
+        kernels.pair_clearances(kernels.pack(x), start, 0.0, np.inf, distances)
+        return float(distances.min(initial=np.inf))
 
     def _refuse_times(self, states: Array) -> str:
         """Return why obstacles cannot be followed in time, empty if they can."""
@@ -188,9 +190,3 @@ class Planner:
         worst = int(np.argmin(distances - needed))
         pair = describe(self.scene, int(self._layout.pairs[worst]), self._layout.hulls)
         return no_path(self.scene, Reason.of(kind, *pair, amount=float(distances[worst]), unit="m"))
-
-
-def no_path(scene: Scene, reason: Reason, checks: int = 0, nodes: int = 0, goals: int = 0) -> Path:
-    """Return no path of a scene, with its reason."""
-    nq, nv = scene.robot.model.nq, scene.robot.model.nv
-    return Path(np.zeros((0, nq)), np.zeros(0), np.zeros((0, nv)), np.nan, checks, nodes, goals, reason)
