@@ -1,4 +1,4 @@
-"""Where the law gets stuck, a planned path is followed through its rows; a faulty worker costs no more than the plan."""
+"""Where the law is stuck, a planned path is followed through its rows; a faulty worker costs no more than the plan."""
 
 from pathlib import Path
 
@@ -61,6 +61,8 @@ def test_path_is_followed_where_the_law_is_stuck():
     assert error(law) > 0.05
     assert error(planned) < 1e-3
     assert planned.body_distance.min() > 0.02 - 1e-4
+    (event,) = [event for _, _, reasons in planned.meta["events"] for event in reasons if event["kind"] == "PLAN"]
+    assert event["text"].startswith("plan followed (path from ")
     assert (planned.status == list(Status).index(Status.SOLVED)).all()
 
 

@@ -127,6 +127,10 @@ class Forecaster(SceneChanges):
         """Forecast another law from now on."""
         self._arbiter.solver = make_solver(law)
 
+    def attach_at(self, index: int, frame_id: int, q: Array, pose: Sample) -> None:
+        """Attach an obstacle as it is attached to the robot; see `ProblemBuilder.attach`."""
+        self._builder.attach(index, frame_id, q, pose)
+
     def end_of(self, start: Snapshot) -> float:
         """Return the time at which a forecast ends [s]."""
         config = self._config

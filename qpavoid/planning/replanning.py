@@ -36,8 +36,6 @@ _FORGETTING = 0.05
 """Weight of the newest difference in that mean [-]."""
 _MEASURED = 20
 """Differences after which the mean counts; before that, obstacles that move may be noisy [-]."""
-_NO_PATHS = Reason.of(ReasonKind.NO_PLAN, "contacts", detail="no paths; forecasts and a fast finish alone")
-"""Assumption where frames of the robot rest."""
 _ROUND_OFF = 1e-9
 """Difference of two times that counts as none [s]."""
 
@@ -68,7 +66,7 @@ class Replanning:
         self._driver = Driver(builder.rows, arbiter, config, settings.scene.robot.model, settings.dt)
         self._number, law = 0, arbiter.solver
         self._no_plan = _exclusion(tasks, law)
-        self._notes = () if contacts is None else (_NO_PATHS,)
+        self._notes = tuple[Reason, ...]()  # what of plans is excluded
         self._worker: Worker | None = None
         if self._no_plan is None and isinstance(law, NamedSolver):
             self._worker = make_worker(Parts(settings, tasks, contacts, law.config, config))
@@ -187,6 +185,8 @@ class Replanning:
     def _take(self, answer: Answer, t: float) -> None:
         """Take over an answer at a time [s], and decide when to look again."""
         question, outcome, period = self._question, answer.outcome, self._config.period
+        if answer.no_paths:
+            self._notes = (Reason.of(ReasonKind.NO_PLAN, "paths", detail=answer.no_paths),)
         if answer.number < 0:
             self._no_plan = Reason.of(ReasonKind.NO_PLAN, "worker", detail=answer.failure)
         if question is None or answer.number != question.number:

@@ -61,6 +61,8 @@ class Answer(NamedTuple):
     """None where it failed."""
     failure: str = ""
     """Why."""
+    no_paths: str = ""
+    """Why no paths are planned, if they are wanted and there are none of this robot."""
 
 
 class Worker(Protocol):
@@ -81,9 +83,9 @@ class InlineWorker:
 
     def __init__(self, parts: Parts) -> None:
         """Lay the memory out."""
-        settings, config = parts.settings, parts.config
-        self._forecaster = Forecaster(settings, parts.tasks, parts.contacts, parts.law, config)
-        planner = _make_planner(self._forecaster, settings, config) if parts.contacts is None else None
+        config = parts.config
+        self._forecaster = Forecaster(parts.settings, parts.tasks, parts.contacts, parts.law, config)
+        planner, self._no_paths = _make_planner(self._forecaster, parts)
         self._candidates = Candidates(self._forecaster, planner, config)
         self._answer: Answer | None = None
 
@@ -94,7 +96,7 @@ class InlineWorker:
         except Exception as error:  # whatever a plan may run into costs no more than the plan
             self._answer = Answer(question.number, None, f"{type(error).__name__}: {error}")
         else:
-            self._answer = Answer(question.number, outcome)
+            self._answer = Answer(question.number, outcome, no_paths=self._no_paths)
 
     def poll(self) -> Answer | None:
         """See `Worker`."""
@@ -113,17 +115,17 @@ class ProcessWorker:
         """Start the process, and wait until it is ready, or has failed."""
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
         self.process = subprocess.Popen([sys.executable, "-c", _SERVE], **pipes)  # type: ignore[call-overload]
-        self._messages, self._answers = SimpleQueue[Any](), SimpleQueue[Answer]()
+        self._messages, self._answers = SimpleQueue[bytes](), SimpleQueue[Answer]()
         Thread(target=_write, args=(self.process.stdin, self._messages), daemon=True).start()
-        Thread(target=_read, args=(self.process.stdout, self._answers), daemon=True).start()
-        self._messages.put(parts)
+        Thread(target=_read, args=(self.process, self._answers), daemon=True).start()
+        self._send(parts)
         first = self._answers.get()
         if first.number < 0:
             self._answers.put(first)
 
     def ask(self, question: Question) -> None:
         """See `Worker`."""
-        self._messages.put(question)
+        self._send(question)
 
     def poll(self) -> Answer | None:
         """See `Worker`."""
@@ -131,10 +133,17 @@ class ProcessWorker:
 
     def change(self, method: str, *arguments: Any) -> None:
         """See `Worker`."""
-        self._messages.put((method, arguments))
+        self._send((method, arguments))
+
+    def _send(self, message: Any) -> None:
+        """Leave a message to the thread that waits for the process to take it."""
+        try:
+            self._messages.put(pickle.dumps(message))
+        except Exception as error:  # a task of the user's own may not be pickled
+            self._answers.put(Answer(-1, None, f"it cannot be sent: {type(error).__name__}: {error}"))
 
     def __del__(self) -> None:
-        self._messages.put(None)  # closes the pipe, at whose end the process ends
+        self._messages.put(b"")  # closes the pipe, at whose end the process ends
 
 
 def make_worker(parts: Parts) -> Worker:
@@ -163,33 +172,40 @@ def serve() -> None:
         answer = worker.poll()
 
 
-def _write(pipe: BinaryIO, messages: SimpleQueue[Any]) -> None:
-    """Write messages to a process until one is None, or it is no more."""
+def _write(pipe: BinaryIO, messages: SimpleQueue[bytes]) -> None:
+    """Write messages to a process until one is empty, or it is no more."""
     try:
         with pipe:
-            while (message := messages.get()) is not None:
-                pickle.dump(message, pipe)
+            while message := messages.get():
+                pipe.write(message)
                 pipe.flush()
     except OSError:
         pass  # the reader says so
 
 
-def _read(pipe: BinaryIO, answers: SimpleQueue[Answer]) -> None:
+def _read(process: subprocess.Popen[bytes], answers: SimpleQueue[Answer]) -> None:
     """Read answers of a process until it is no more."""
+    assert process.stdout is not None
     try:
-        with pipe:
+        with process.stdout as pipe:
             while True:
                 answers.put(pickle.load(pipe))
     except Exception as error:  # a process that ends in the middle of an answer leaves anything
         answers.put(Answer(-1, None, f"the process has ended: {type(error).__name__}"))
+    process.wait()
 
 
-def _make_planner(forecaster: Forecaster, settings: ControlSettings, config: Planning) -> Planner | None:
-    """Return a planner in the scene of forecasts; None where there are no paths of the robot, or none are wanted."""
+def _make_planner(forecaster: Forecaster, parts: Parts) -> tuple[Planner | None, str]:
+    """Return a planner in the scene of forecasts; None where none is wanted, or there are no paths, and why."""
+    config = parts.config
     if not config.clearances:
-        return None
-    plans = PlannerSettings(settings.safety_distance, config.clearances, velocity_scale=config.speed)
+        return None, ""
+    if parts.contacts is not None:
+        return None, "paths do not hold contacts"
+    settings = PlannerSettings(parts.settings.safety_distance, config.clearances, velocity_scale=config.speed)
     try:
-        return Planner(forecaster.scene, plans, forecaster.distances())
-    except ConfigError:
-        return None
+        planner, home = Planner(forecaster.scene, settings, forecaster.distances()), forecaster.scene.robot.home
+        planner.plan(home, home, max_nodes=2)  # it is compiled now
+    except ConfigError as error:
+        return None, str(error)
+    return planner, ""
