@@ -1,27 +1,23 @@
 """Where the law is stuck, a planned path is followed through its rows; a faulty worker costs no more than the plan."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from qpavoid import Controller, ScenarioConfig, Status, simulate
 from qpavoid.planning import worker
 from qpavoid.reason import ReasonKind
-from qpavoid_bench.arena.case import Case
 from qpavoid_bench.arena.entrants import find_entrant
-from qpavoid_bench.arena.store import read_cases
+from qpavoid_bench.arena.families import load_family, make_case
 from qpavoid_bench.arena.trial import run_trial
 
 HOME = {
     "shoulder_pan_joint": -0.505, "shoulder_lift_joint": -1.543, "elbow_joint": 1.783, "wrist_1_joint": -1.504,
     "wrist_2_joint": -1.667, "wrist_3_joint": 0.0,
 }  # fmt: skip
-RESULTS = Path(__file__).parent.parent / "bench" / "results" / "arena"
 STUCK = {
     "box": (0, 1, 2, 3, 8, 11), "shelf": (0, 1, 5, 6, 7, 9, 10, 11), "narrow_gap": (1, 7), "sphere_field": (2, 4, 9),
 }  # fmt: skip
-"""Static cases of the reference suite in which `qp` does not arrive."""
+"""Static cases of the suite `full` in which `qp` does not arrive."""
 
 
 def gap(**planning) -> ScenarioConfig:
@@ -193,9 +189,7 @@ def test_obstacle_put_into_the_path_is_kept_clear_of():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("family", "seed"), [(family, seed) for family, seeds in STUCK.items() for seed in seeds])
-def test_stuck_case_of_the_reference_suite_arrives(family, seed):
-    rows = read_cases(RESULTS)
-    (text,) = rows.loc[(rows["family"] == family) & (rows["seed"] == seed), "json"]
-    result = run_trial(Case.from_json(text), find_entrant("qp-planning"))
+def test_stuck_case_of_the_arena_arrives(family, seed):
+    result = run_trial(make_case(load_family(family), seed), find_entrant("qp-planning"))
     assert result.success
     assert result.violations == 0.0

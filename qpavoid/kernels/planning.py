@@ -48,7 +48,9 @@ class PlanningArrays(NamedTuple):
     speed: Array
     """(n,) speed at which a coordinate moves at most [rad/s or m/s]."""
     travel: Array
-    """(n,) the largest lever arm of each coordinate [m/rad or 1]: the metric of the trees."""
+    """(n,) the largest lever arm of each coordinate [m/rad or 1]: weights of the metric of the trees."""
+    longest: float
+    """Length of an edge of the trees at most, by that metric [m]."""
     radius: Array
     """(g,) radius of each body's bounding sphere [m]."""
     boxes: Array

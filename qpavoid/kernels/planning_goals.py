@@ -10,7 +10,7 @@ from qpavoid.kernels.cholesky import factorise, solve_factored
 from qpavoid.kernels.kinematics import compose, update_kinematics
 from qpavoid.kernels.packing import compiled
 from qpavoid.kernels.planning import is_clear
-from qpavoid.kernels.planning_tree import draw
+from qpavoid.kernels.planning_tree import draw, travel_between
 from qpavoid.kernels.rotation import rotation_vector
 from qpavoid.problem import Array, IntArray, Mask
 
@@ -22,7 +22,7 @@ _MAX_STEP = 0.4
 _DAMPING, _LEAST_DAMPING = 0.05, 1e-6
 """Damping of a step: relative to the squared error, so that the last steps converge quadratically, and the least."""
 _SAME = 0.05
-"""Travel below which two configurations count as one goal, as the metric bounds it [m]."""
+"""Travel below which two configurations count as one goal, by the metric of the trees [m]."""
 
 
 class FrameTargets(NamedTuple):
@@ -190,16 +190,11 @@ def clear_goals(
         attained += 1
         if not is_clear(x, q, t, need):
             continue
-        total, is_new = 0.0, True
-        for i in range(n):
-            total += x.travel[i] * abs(q[i] - near[i])
+        is_new = True
         for k in range(count):
-            difference = 0.0
-            for i in range(n):
-                difference += x.travel[i] * abs(q[i] - goals[k, i])
-            is_new = is_new and difference > _SAME
+            is_new = is_new and travel_between(x, q, goals[k]) > _SAME
         if is_new:
-            goals[count], travel[count] = q, total
+            goals[count], travel[count] = q, travel_between(x, q, near)
             count += 1
             if count == most:
                 break

@@ -15,8 +15,8 @@ from qpavoid.kernels.packing import compiled
 from qpavoid.kernels.planning import is_clear_between
 from qpavoid.problem import Array, IntArray
 
-_LONGEST = 0.6
-"""Travel of an edge at most, as the metric bounds it [m]: longer ones are rarely clear, shorter ones need more."""
+_SHORTER = 1.0 / 3.0
+"""Fraction of an edge that is tried where the edge is not clear [-]."""
 _LONGEST_TIME = 0.5
 """Duration of an edge at most [s], in space and time."""
 _WIDTH = 0.3
@@ -42,12 +42,12 @@ def draw(seed: int, number: int) -> float:
 
 
 @compiled
-def _travel(x: Any, a: Array, b: Array) -> float:
-    """Bound the travel of any point of the robot between two nodes [m]: the metric of the trees."""
-    travel = 0.0
-    for i in range(len(x.travel)):
-        travel += x.travel[i] * abs(b[i] - a[i])
-    return travel
+def travel_between(x: Any, a: Array, b: Array) -> float:
+    """Compute the metric of the trees [m]: the root of the sum of squares of the coordinates' travels."""
+    square, weights = 0.0, x.travel
+    for i in range(len(weights)):
+        square += (weights[i] * (b[i] - a[i])) ** 2
+    return np.sqrt(square)
 
 
 @compiled
@@ -62,11 +62,14 @@ def shortest_time(x: Any, a: Array, b: Array) -> float:
 @compiled
 def _nearest(x: Any, nodes: Array, count: int, node: Array, is_timed: bool, direction: float) -> int:
     """Find the nearest node of a tree from which a node can be attained in time; -1 where there is none."""
-    best, nearest, n = np.inf, -1, len(x.travel)
+    best, nearest, weights, n = np.inf, -1, x.travel, len(node) - 1
     for k in range(count):
-        travel = _travel(x, nodes[k], node)
-        if travel < best and (not is_timed or shortest_time(x, nodes[k], node) <= direction * (node[n] - nodes[k, n])):
-            best, nearest = travel, k
+        square = 0.0
+        for i in range(n):
+            difference = weights[i] * (nodes[k, i] - node[i])
+            square += difference * difference
+        if square < best and (not is_timed or shortest_time(x, nodes[k], node) <= direction * (node[n] - nodes[k, n])):
+            best, nearest = square, k
     return nearest
 
 
@@ -80,22 +83,25 @@ def _extend(
         Whether the step is clear, so that it was appended; whether it ends at the node.
     """
     n, start, new = len(x.travel), nodes[near], nodes[count]
-    fraction = min(1.0, _LONGEST / max(_travel(x, start, node), 1e-12))
+    fraction = min(1.0, x.longest / max(travel_between(x, start, node), 1e-12))
     if is_timed:
         fraction = min(fraction, _LONGEST_TIME / max(abs(node[n] - start[n]), 1e-12))
-    for i in range(n + 1):
-        new[i] = start[i] + fraction * (node[i] - start[i])
-    if direction > 0.0:
-        is_clear = is_clear_between(x, start[:n], start[n], new[:n], new[n], need)
-    else:
-        is_clear = is_clear_between(x, new[:n], new[n], start[:n], start[n], need)
-    return is_clear, fraction == 1.0
+    for _ in range(2):
+        for i in range(n + 1):
+            new[i] = start[i] + fraction * (node[i] - start[i])
+        first, second = (start, new) if direction > 0.0 else (new, start)
+        if is_clear_between(x, first[:n], first[n], second[:n], second[n], need):
+            return True, fraction == 1.0
+        fraction *= _SHORTER
+    return False, False
 
 
 @compiled
 def _sample(x: Any, start: Array, goals: Array, turn: int, seed: int, is_timed: bool, node: Array) -> None:
-    """Write sample `turn`: first a goal, then by turns from everywhere, from a band around a goal's motion, wider."""
-    n, number = len(x.travel), turn * (len(x.travel) + 3)
+    """Write sample `turn`: first a goal, then by turns from everywhere, from a band around the motion to a goal, and
+    from a wider band in which half of the coordinates are on that motion.
+    """
+    n, number = len(x.travel), turn * (2 * len(x.travel) + 3)
     goal = goals[int(draw(seed, number) * len(goals))]
     s, kind = draw(seed, number + 1), turn % 3
     node[n] = start[n] + (goal[n] - start[n]) * draw(seed, number + 2) if is_timed else start[n]
@@ -105,8 +111,10 @@ def _sample(x: Any, start: Array, goals: Array, turn: int, seed: int, is_timed: 
         if kind == 0:
             node[i] = x.lower[i] + u * (x.upper[i] - x.lower[i])
         else:
-            middle = start[i] + s * (goal[i] - start[i]) + width * (2.0 * u - 1.0)
-            node[i] = min(max(middle, x.lower[i]), x.upper[i])
+            value = start[i] + s * (goal[i] - start[i])
+            if kind == 1 or draw(seed, number + 3 + n + i) < 0.5:
+                value += width * (2.0 * u - 1.0)
+            node[i] = min(max(value, x.lower[i]), x.upper[i])
     if turn == 0:
         node[:] = goals[0]
 

@@ -230,13 +230,16 @@ class PlanLayout:
         margin = np.append(self.distances.arrays.margin[: len(self.scene.slots)], 0.0)
         return np.asarray(own + margin[self.obstacle])
 
-    def arrays(self, states: Array, points: Array, speed: Array, frame_ids: list[int]) -> PlanningArrays:
+    def arrays(
+        self, states: Array, points: Array, speed: Array, longest: float, frame_ids: list[int]
+    ) -> PlanningArrays:
         """Lay out the memory of one plan.
 
         Args:
             states: of the obstacles at its time 0 (o, 18).
             points: coordinates (k, n) of its start and goals.
             speed: of each coordinate at most (n,) [rad/s or m/s].
+            longest: length of an edge at most, see `PlanningArrays`.
             frame_ids: frames of its targets.
         """
         scene, frames = self.scene, [self._model.frames[i] for i in frame_ids]
@@ -263,6 +266,7 @@ class PlanLayout:
             upper=upper,
             speed=speed,
             travel=self.travel,
+            longest=longest,
             radius=self.distances.table.spheres[:, 3],
             boxes=self.distances.table.boxes,
             pairs=self.pairs,

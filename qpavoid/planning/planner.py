@@ -42,6 +42,8 @@ class PlannerSettings:
     """Fraction of the joints' speed limits that the times of a path use [-]."""
     max_speed: float = 1.8
     """Speed that they use at most [rad/s or m/s]."""
+    longest: float = 1.0
+    """Length of an edge of the search trees at most [m]: roughly the travel of the fastest point of the robot."""
     max_nodes: int = 3000
     """Of the trees of a search."""
     max_checks: int = 200_000
@@ -123,10 +125,11 @@ class Planner:
         given = read_goals(goals, len(q)) if targets is None else np.zeros((0, len(q)))
         ends = np.array([layout.coordinates(goal, start) for goal in given]).reshape(-1, len(start))
         layout.update()
+        self._distances.arrays.guesses[:] = 0.0  # so that nothing depends on earlier plans
         states = self._distances.arrays.states.copy()
         if arrivals and (refusal := self._refuse_times(states)):
             return no_path(self.scene, Reason.of(ReasonKind.NOT_PLANNED, detail=refusal))
-        x = layout.arrays(states, np.vstack((*points, *ends)), self._speed, frames)
+        x = layout.arrays(states, np.vstack((*points, *ends)), self._speed, s.longest, frames)
         return self._search(
             x, start, ends, poses or NO_TARGETS, points[-1], tuple(arrivals) or (0.0,), seed & _SEED,
             tuple(s.clearances if clearances is None else clearances), max_nodes or s.max_nodes,
@@ -173,7 +176,7 @@ class Planner:
         layout = self._layout
         layout.update()
         start = layout.coordinates(require_finite("q", q, (self.scene.robot.model.nq,)))
-        x = layout.arrays(self._distances.arrays.states.copy(), start[None], self._speed, [])
+        x = layout.arrays(self._distances.arrays.states.copy(), start[None], self._speed, 1.0, [])
         distances = np.empty(len(x.pairs))
         kernels.pair_clearances(kernels.pack(x), start, 0.0, np.inf, distances)
         return float(distances.min(initial=np.inf))
