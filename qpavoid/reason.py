@@ -58,6 +58,8 @@ class ReasonKind(str, Enum):
     """Of logs: a plan is followed in place of the tasks alone; `detail` says since when, and why."""
     NO_PLAN = "NO_PLAN"
     """Nothing is forecast or planned, or not all that is configured: what excludes it."""
+    BUDGET_SPENT = "BUDGET_SPENT"
+    """The robot brakes, or follows its backup trajectory, as the budget of the control step was spent: before what."""
     STALE = "STALE"
     """An obstacle was not updated in time: the obstacle, the age of its last update [s]."""
     NEVER_UPDATED = "NEVER_UPDATED"
@@ -104,10 +106,17 @@ _SEVERITIES = {
         Severity.INFO,
     ),
     **dict.fromkeys(
-        ("PREDICTED_TOO_NEAR", "UNKNOWN_DISTANCE", "IMPLAUSIBLE", "SOLVER_FAILED", "CONTACTS_INFEASIBLE"),
+        (
+            "PREDICTED_TOO_NEAR",
+            "UNKNOWN_DISTANCE",
+            "BUDGET_SPENT",
+            "IMPLAUSIBLE",
+            "SOLVER_FAILED",
+            "CONTACTS_INFEASIBLE",
+        ),
         Severity.ALARM,
     ),
-}
+}  # fmt: skip
 _TEXTS: dict[str, str] = {
     "ROW_RELAXED": "row relaxed by",
     "BELOW_SAFETY_DISTANCE": "below the safety distance by",
@@ -126,6 +135,7 @@ _TEXTS: dict[str, str] = {
     "NO_BACKUP": "no backup trajectory",
     "PLAN": "plan followed",
     "NO_PLAN": "no plan",
+    "BUDGET_SPENT": "left out, as the budget of the control step is spent",
     "STALE": "not updated for",
     "NEVER_UPDATED": "external, not given yet after",
     "ESTIMATED": "twist estimated from its poses",

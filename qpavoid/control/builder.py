@@ -58,7 +58,7 @@ class ProblemBuilder:
         self.tracker = ObstacleTracker(scene.slots, settings.sensing, dt, settings.latency)
         self.attachments = Attachments(scene, self.rows.query, settings.safety_distance)
         self.slots = ObstacleSlots(scene, self.rows.query, self.tracker, self.attachments)
-        self._clock = Clock(dt)
+        self._clock, self._budget = Clock(dt), settings.budget
         units = [names[j] for j in bounds.v_index.tolist()]
         self._configurations = Configurations(model, bounds.q_index, bounds.lower, bounds.upper, units)
         self._targets = TargetReader(tasks, self.rows.targets, settings.latency)
@@ -70,6 +70,7 @@ class ProblemBuilder:
 
     def read(self, q: Any, t: Any, targets: Any, obstacles: Any, v: Any, v_desired: Any = None) -> Arguments:
         """Check the arguments of a step, see `Controller.step`: whatever raises does so here, and changes nothing."""
+        self._budget.begin()
         return self._reader.read(q, t, targets, obstacles, v, v_desired)
 
     def build(self, arguments: Arguments) -> StepProblem:

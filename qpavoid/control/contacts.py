@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.linalg.lapack import dgeqp3, dorgqr, dtrtrs
 
 from qpavoid import config
 from qpavoid.control.tasks.base import frame_jacobian, frame_pose
@@ -85,6 +84,8 @@ def solve_contacts(J: Array, b: Array) -> Contacts:
         J: (c, nv) contact Jacobian.
         b: (c,) what has to be put right [m/s, rad/s].
     """
+    from scipy.linalg.lapack import dgeqp3, dorgqr, dtrtrs  # scipy is slow to import, and few robots have contacts
+
     c, nv = J.shape
     packed, order, tau, _, _ = dgeqp3(J.T)
     pivots = np.abs(packed.diagonal())

@@ -19,13 +19,7 @@ from qpavoid.kernels.clearance import (
     leaves_position_limits,
 )
 from qpavoid.kernels.depth import CellGrid, OwnBodies, fill_cells, mark_own_pixels, recall_cells
-from qpavoid.kernels.estimates import (
-    are_fine,
-    extrapolate_estimates,
-    extrapolate_states,
-    update_estimates,
-    write_rows,
-)
+from qpavoid.kernels.estimates import ObstacleArrays, are_fine, check_updates, observe
 from qpavoid.kernels.kinematics import KinematicsArrays, update_kinematics
 from qpavoid.kernels.layout import RowLayout
 from qpavoid.kernels.near_pairs import DistanceArrays, near_pairs, place_bodies, place_obstacles
@@ -33,6 +27,7 @@ from qpavoid.kernels.obstacles import Pieces, check_states, sample_pieces
 from qpavoid.kernels.planning import PlanningArrays, pair_clearances
 from qpavoid.kernels.planning_goals import FrameTargets
 from qpavoid.kernels.planning_search import search
+from qpavoid.kernels.pose_fit import extrapolate_states
 from qpavoid.kernels.prediction import Prediction, predict, prediction_error_bound
 from qpavoid.kernels.qp import max_clearance_velocity, minimize, project, project_soft
 from qpavoid.kernels.ramps import RampLimits, follow_ramp
@@ -53,6 +48,7 @@ __all__ = [
     "DistanceArrays",
     "FrameTargets",
     "KinematicsArrays",
+    "ObstacleArrays",
     "OwnBodies",
     "Pieces",
     "PlanningArrays",
@@ -70,6 +66,7 @@ __all__ = [
     "beta",
     "candidates",
     "check_states",
+    "check_updates",
     "clearance_lower_bound",
     "closes_below",
     "comes_near",
@@ -77,7 +74,6 @@ __all__ = [
     "direct",
     "distance_rows",
     "extend_paths",
-    "extrapolate_estimates",
     "extrapolate_states",
     "fill_cells",
     "find_near_pairs",
@@ -93,6 +89,7 @@ __all__ = [
     "max_offset",
     "minimize",
     "near_pairs",
+    "observe",
     "pack",
     "pair_clearances",
     "place_bodies",
@@ -115,11 +112,9 @@ __all__ = [
     "stop_velocity",
     "tracking_law",
     "tracking_violation",
-    "update_estimates",
     "update_kinematics",
     "velocity_bounds",
     "violation",
     "voxels_within",
     "write_path_point",
-    "write_rows",
 ]

@@ -9,6 +9,7 @@ from numba import config, typeof, types
 from numba.experimental import structref
 
 from qpavoid.kernels.approach import ApproachArrays
+from qpavoid.kernels.estimates import ObstacleArrays
 from qpavoid.kernels.kinematics import KinematicsArrays
 from qpavoid.kernels.layout import RowLayout
 from qpavoid.kernels.near_pairs import DistanceArrays
@@ -39,6 +40,15 @@ class PackedRows(structref.StructRefProxy):  # type: ignore[misc]
 
 class PackedRollout(structref.StructRefProxy):  # type: ignore[misc]
     """`RolloutArrays` in compiled code."""
+
+
+class PackedObstacles(structref.StructRefProxy):  # type: ignore[misc]
+    """`ObstacleArrays` in compiled code."""
+
+
+@structref.register
+class PackedObstaclesType(_Structure):
+    """Type of `PackedObstacles`."""
 
 
 @structref.register
@@ -86,6 +96,7 @@ for proxy, kind, fields in (
     (PackedRollout, PackedRolloutType, RolloutArrays._fields),
     (PackedApproach, PackedApproachType, ApproachArrays._fields),
     (PackedPlanning, PackedPlanningType, PlanningArrays._fields),
+    (PackedObstacles, PackedObstaclesType, ObstacleArrays._fields),
 ):
     structref.define_boxing(kind, proxy)
     structref.define_constructor(proxy, kind, list(fields))
@@ -127,6 +138,12 @@ def _pack_planning(fields: Any) -> Any:
     return PackedPlanning(*fields)
 
 
+@compiled
+def _pack_obstacles(fields: Any) -> Any:
+    """Return a structure of `ObstacleArrays`."""
+    return PackedObstacles(*fields)
+
+
 _PACK = {
     KinematicsArrays: _pack_kinematics,
     DistanceArrays: _pack_distances,
@@ -134,11 +151,18 @@ _PACK = {
     RolloutArrays: _pack_rollout,
     ApproachArrays: _pack_approach,
     PlanningArrays: _pack_planning,
+    ObstacleArrays: _pack_obstacles,
 }
 
 
 def pack(
-    layout: KinematicsArrays | DistanceArrays | RowLayout | RolloutArrays | ApproachArrays | PlanningArrays,
+    layout: KinematicsArrays
+    | DistanceArrays
+    | RowLayout
+    | RolloutArrays
+    | ApproachArrays
+    | ObstacleArrays
+    | PlanningArrays,
 ) -> Any:
     """Return memory in the form that the kernels take; both look into the same arrays.
 
