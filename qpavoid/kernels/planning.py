@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from qpavoid.kernels.distances import TO_HALF_SPACE, pair_distance
-from qpavoid.kernels.estimates import extrapolate
 from qpavoid.kernels.kinematics import update_kinematics
 from qpavoid.kernels.near_pairs import place_bodies, place_body
 from qpavoid.kernels.packing import compiled, inlined
+from qpavoid.kernels.pose_fit import extrapolate
 from qpavoid.problem import Array, IntArray
 
 FINE = 5e-4
