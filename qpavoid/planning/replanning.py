@@ -96,7 +96,7 @@ class Replanning:
         """Drop what is followed: the next step is of a given velocity."""
         if self._driver.drive is not TRACK:
             self.reset()
-        self._pending = None
+        self._pending = self._question = None
 
     def change_scene(self, method: str, *arguments: Any) -> None:
         """Change the scene of forecasts like that of the controller; what was planned in it is dropped."""
@@ -107,6 +107,8 @@ class Replanning:
     def decide(self, step: StepProblem) -> Solution:
         """Return the solution of a step, and look ahead from it where that is due."""
         drive, worker, dt = self._driver.drive, self._worker, self._settings.dt
+        if self._pending is not None and step.t > self._pending.t + dt:  # steps were left out, or stops
+            self._pending, self._next_look = None, step.t
         if self._no_plan is None and worker is not None:
             if len(self._builder.tracker.external):
                 self._measure_noise()
