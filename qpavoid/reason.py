@@ -54,6 +54,8 @@ class ReasonKind(str, Enum):
     """The backup trajectory replaces the tasks: from their velocity, none would stay clear of moving obstacles."""
     NO_BACKUP = "NO_BACKUP"
     """No backup trajectory is looked for: what excludes it."""
+    PLAN = "PLAN"
+    """Of logs: a plan is followed in place of the tasks alone; `detail` says since when, and why."""
     NO_PLAN = "NO_PLAN"
     """Nothing is forecast or planned, or not all that is configured: what excludes it."""
     BUDGET_SPENT = "BUDGET_SPENT"
@@ -100,7 +102,8 @@ class ReasonKind(str, Enum):
 
 _SEVERITIES = {
     **dict.fromkeys(
-        ("NO_BACKUP", "NO_PLAN", "ESTIMATED", "IGNORED", "POINTS_DROPPED", "NORMALISED", "TIMING"), Severity.INFO
+        ("NO_BACKUP", "PLAN", "NO_PLAN", "ESTIMATED", "IGNORED", "POINTS_DROPPED", "NORMALISED", "TIMING"),
+        Severity.INFO,
     ),
     **dict.fromkeys(
         (
@@ -130,6 +133,7 @@ _TEXTS: dict[str, str] = {
     "SINGULAR": "in a singularity, short of its target by",
     "BACKUP": "backup trajectory instead of the tasks",
     "NO_BACKUP": "no backup trajectory",
+    "PLAN": "plan followed",
     "NO_PLAN": "no plan",
     "BUDGET_SPENT": "left out, as the budget of the control step is spent",
     "STALE": "not updated for",

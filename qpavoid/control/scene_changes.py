@@ -87,7 +87,7 @@ class SceneChanges:
             raise UnknownName(f"attach: no frame {frame!r:.60}; give its name")
         index, frame_id = self._builder.tracker.index(obstacle), self.scene.robot.frame_id(frame, "attach")
         q = self._builder.attach(index, frame_id, q)
-        self._scene_changed("attach", obstacle, frame, q)
+        self._scene_changed("attach_at", index, frame_id, q, self._builder.pose(index, q))
 
     def release(self, obstacle: str, q: Array | None = None) -> Sample:
         """Release an attached obstacle: it rests where it is, until it is given to `step` again.
