@@ -95,7 +95,7 @@ class Controller(SceneChanges):
         settings = ControlSettings(scene, bounds, self.avoidance, self.limits, dt, latency, *blocks)
         self._builder = ProblemBuilder(settings, self.tasks, contacts)
         self._arbiter = Arbiter(settings, law, self._builder.rows, self._builder.tracker)
-        self._builder.rows.look_ahead(law.bounded and self.avoidance.look_ahead)
+        self._builder.rows.adapt(law, self.avoidance.look_ahead)
         self._warm_up()
         kernels.first_use.end()
         self.warm_up_time = perf_counter() - begin
@@ -114,7 +114,7 @@ class Controller(SceneChanges):
     def solver(self, law: Solver) -> None:
         check_solver(law, self._has_contacts)
         self._arbiter.solver = law
-        self._builder.rows.look_ahead(law.bounded and self.avoidance.look_ahead)
+        self._builder.rows.adapt(law, self.avoidance.look_ahead)
 
     def _warm_up(self) -> None:
         """Run the first steps, with a law that ships: one of the user's own may remember what it is asked."""
@@ -214,11 +214,11 @@ class Controller(SceneChanges):
         """Like `step`, with everything that led to the velocity."""
         begin = perf_counter()
         rows, step = self._builder.rows, self._builder.build(self._builder.read(q, t, targets, obstacles, v))
-        state = State(step.q.copy(), rows.previous.v.copy(), step.t)
+        state, problem = State(step.q.copy(), rows.previous.v.copy(), step.t), rows.problem()
         solution = self._decide(step, begin)
         return Tick(
-            state, tuple(step.targets), rows.task_errors.copy(), copied(rows.kinematics), copied(step.proximity),
-            copied(step.problem), solution, self._builder.obstacle_poses(step.q),
+            state, tuple(step.targets), rows.task_errors.copy(), copied(rows.kinematics), copied(rows.proximity()),
+            copied(problem), solution, self._builder.obstacle_poses(step.q),
             self.dt * self._arbiter.backup_velocities,
         )  # fmt: skip
 
@@ -255,9 +255,9 @@ class Controller(SceneChanges):
         if step.resumed:
             arbiter.reset()
         if step.faults:
-            solution = arbiter.stop(step.problem, step.faults)
+            solution = arbiter.stop(step.faults)
         else:
-            solution = arbiter.decide(step.q, step.t, step.problem, step.proximity, from_tasks)
+            solution = arbiter.decide(step.q, step.t, step.is_settled, from_tasks)
         builder.remember(solution.v)
         assumptions = step.assumptions
         if self._no_backup and len(builder.tracker.moving):

@@ -19,14 +19,14 @@ from qpavoid.control.settings import ControlSettings
 from qpavoid.control.slots import ObstacleSlots
 from qpavoid.control.targets import TargetReader
 from qpavoid.control.tasks import RowTask
-from qpavoid.model.limits import OUTSIDE
+from qpavoid.kernels.bounds import OUTSIDE
 from qpavoid.model.sample import POSE, Sample
-from qpavoid.problem import Array, Problem, Proximity
+from qpavoid.problem import Array
 from qpavoid.reason import Reason
 
 
 class StepProblem(NamedTuple):
-    """Problem of a control step, with what it was made of."""
+    """What a control step was made of, and how far it came; its problem is that of `RowAssembler`."""
 
     q: Array
     """(nq,) where the robot is when it follows the command."""
@@ -36,8 +36,8 @@ class StepProblem(NamedTuple):
     """Whether the step begins anew: after a gap, or because the clock was set back."""
     targets: Sequence[Any]
     """Of all tasks."""
-    proximity: Proximity
-    problem: Problem
+    is_settled: bool
+    """Whether the velocity of `RowAssembler.v` may be commanded, see `RowAssembler.compute`."""
     faults: tuple[Reason, ...]
     """Why the robot has to stop."""
     assumptions: tuple[Reason, ...]
@@ -83,15 +83,13 @@ class ProblemBuilder:
             observed = self.tracker.advance(update)
             query.place(self.tracker.current)
             faults, assumptions = faults + observed.stop, assumptions + observed.assumptions
-        proximity, problem = rows.compute(q, targets)
+        is_settled = rows.compute(q, targets, v_desired)
         if self.attachments.is_watching:
             self.attachments.update()
-        if v_desired is not None:
-            problem = rows.follow(v_desired, problem)
-        if problem.position_margin < -OUTSIDE:
-            assumptions += self._bounds.outside(q, problem.joint_names, problem.joint_units)
+        if not is_settled and rows.position_margin < -OUTSIDE:
+            assumptions += self._bounds.outside(q, rows.joint_names, rows.joint_units)
         t = times.t + self._latency
-        return StepProblem(q, t, times.resumed, targets, proximity, problem, faults, assumptions)
+        return StepProblem(q, t, times.resumed, targets, is_settled, faults, assumptions)
 
     def _predict(self, q: Array | None) -> Array:
         """Return where the robot is when it follows this step's command, if it follows those under way until then.

@@ -225,8 +225,8 @@ class Recorder:
         nearest[bodies], pair[bodies] = np.repeat(distance[order], 2), np.repeat(self._pair_numbers[order], 2)
         x["body_distance"][n], x["body_pair"][n] = nearest[: len(scene.body_names)], pair[: len(scene.body_names)]
         for i, body in enumerate(scene.robot.bodies.geometryObjects):
-            joint = self._kinematics.data.oMi[body.parentJoint]
-            x["body_ends"][n, i] = self._ends[i] @ joint.rotation.T + joint.translation
+            pose = self._kinematics.joint_poses[body.parentJoint]
+            x["body_ends"][n, i] = self._ends[i] @ pose[:9].reshape(3, 3) + pose[9:]
 
     def log(self, stopped_by: str | None = None) -> Log:
         """Return the steps stored so far as a log.

@@ -59,32 +59,40 @@ class Arbiter:
         """Return the velocities (k, nv) of the control steps of the backup trajectory; none without one."""
         return np.zeros((0, *self._v_shape)) if self.backup is None else self.backup.velocities
 
-    def decide(self, q: Array, t: float, problem: Problem, proximity: Proximity, from_tasks: bool) -> Solution:
+    def decide(self, q: Array, t: float, is_settled: bool, from_tasks: bool) -> Solution:
         """Return the solution that is commanded.
 
         Args:
             q: configuration (nq,).
             t: time [s].
-            problem: of this control step.
-            proximity: distances of this control step.
-            from_tasks: whether the problem is of the tasks, whose progress is monitored; else of a given velocity.
+            is_settled: whether it is the velocity that the rows have come to, see `RowAssembler.compute`.
+            from_tasks: whether the step is of the tasks, whose progress is monitored; else of a given velocity.
         """
-        if from_tasks:
-            problem = self._shake_damping.apply(problem)
-            if problem.levels and self.solver.prioritised:
-                problem = self._rows.prioritised(problem)
-        solution = self._solve(q, problem, proximity, from_tasks)
+        rows, problem, damping = self._rows, None, self._shake_damping
+        if is_settled and not damping.is_active:
+            solution = Solution(rows.v.copy())
+        else:
+            problem = rows.problem()
+            if from_tasks:
+                problem = damping.apply(problem)
+                if problem.levels and self.solver.prioritised:
+                    problem = rows.prioritised(problem)
+            solution = self._solve(q, problem, rows.proximity(), from_tasks)
         if from_tasks:
             stalled = self.progress.update(problem, solution)
-            self._shake_damping.update(solution.v, proximity.feedforward, bool(stalled))
-            solution = solution._replace(stalled=stalled) if stalled else solution
+            if stalled:
+                solution = solution._replace(stalled=stalled)
+            if stalled or damping.is_active:
+                damping.update(solution.v, rows.proximity().feedforward, bool(stalled))
+            else:
+                damping.pause()
         if self.backup is not None and self.solver.bounded:
-            solution = self._ensure_backup(self.backup, q, t, proximity, problem, solution)
-        return self._report_limits(problem, solution)
+            solution = self._ensure_backup(self.backup, q, t, solution)
+        return self._report_limits(solution)
 
-    def stop(self, problem: Problem, reasons: tuple[Reason, ...]) -> Solution:
+    def stop(self, reasons: tuple[Reason, ...]) -> Solution:
         """Return the stop of this control step, with its reasons."""
-        return self._report_limits(problem, _stop(problem, reasons))
+        return self._report_limits(_stop(self._rows.problem(), reasons))
 
     def _solve(self, q: Array, problem: Problem, proximity: Proximity, from_tasks: bool) -> Solution:
         """Return the solution within the limits, after the stop look-ahead."""
@@ -148,35 +156,36 @@ class Arbiter:
         reason = Reason.of(ReasonKind.PREDICTED_TOO_NEAR, *names, amount=violation, unit="m", severity=severity)
         return solution._replace(v=v, command_scale=scale * solution.command_scale).with_reasons(reason)
 
-    def _ensure_backup(
-        self, backup: BackupPlanner, q: Array, t: float, proximity: Proximity, problem: Problem, solution: Solution
-    ) -> Solution:
+    def _ensure_backup(self, backup: BackupPlanner, q: Array, t: float, solution: Solution) -> Solution:
         """Replace the velocity by that of the backup trajectory, where none would be left after it."""
+        rows = self._rows
         try:
-            v = backup.check(q, solution.v, t, self._rows.previous.v, self._rows.previous.dv, proximity)
+            v = backup.check(q, solution.v, t, rows.previous.v, rows.previous.dv, rows.proximity())
         except NumericalError as error:  # of a predicted state; raised by `step` once it is the present one
             why = f"prediction of an {error}"
             return solution.with_reasons(Reason.of(ReasonKind.NO_BACKUP, severity=Severity.WARNING, detail=why))
         if v is None:
             return solution
-        if (limits := self._recovery_limits(problem, proximity)) is not None:
+        problem = rows.problem()
+        if (limits := self._recovery_limits(problem, rows.proximity())) is not None:
             v, _ = slowed(v, problem.v_stop, limits)
         return solution._replace(v=np.clip(v, problem.lower, problem.upper)).with_reasons(Reason.of(ReasonKind.BACKUP))
 
-    def _report_limits(self, problem: Problem, solution: Solution) -> Solution:
+    def _report_limits(self, solution: Solution) -> Solution:
         """Name the accelerations and jerks beyond their limits, where bounds had to allow them.
 
         They do after a relaxed control step, before a position or velocity limit, and to hold contacts.
         """
         if not (self._rows.previous.needs_report and self.solver.bounded):
             return solution
+        names, units = self._rows.joint_names, self._rows.joint_units
         kinds = (ReasonKind.ACCELERATION_RELAXED, ReasonKind.JERK_RELAXED)
         named = {reason.subject for reason in solution.reasons if reason.kind in kinds}
         excesses = [
-            Reason.of(kind, problem.joint_names[j], amount=float(excess[j]), unit=f"{problem.joint_units[j]}/s")
+            Reason.of(kind, names[j], amount=float(excess[j]), unit=f"{units[j]}/s")
             for kind, excess in zip(kinds, self._rows.previous.excess(solution.v), strict=True)
             for j in np.flatnonzero(excess > _LIMIT_TOLERANCE).tolist()
-            if (problem.joint_names[j],) not in named
+            if (names[j],) not in named
         ]
         return solution.with_reasons(*excesses) if excesses else solution
 

@@ -32,6 +32,11 @@ class ShakeDamping:
         self._dt, self._interval = dt, max(1, round(_INTERVAL / dt))
         self.reset()
 
+    @property
+    def is_active(self) -> bool:
+        """Whether λ is larger than it was."""
+        return self._factor != 1.0
+
     def reset(self) -> None:
         """Drop what is known of earlier control steps."""
         self._factor, self._calm = 1.0, 0
@@ -41,6 +46,10 @@ class ShakeDamping:
         """Begin an interval after a command v, or none."""
         self._steps, self._change = 0, 0.0
         self._v_first = self._v_last = v
+
+    def pause(self) -> None:
+        """Begin anew with the next command that is taken in."""
+        self._begin(None)
 
     def apply(self, problem: Problem) -> Problem:
         """Return the problem with more regularization, if the robot has been shaking."""
@@ -58,7 +67,7 @@ class ShakeDamping:
             stalled: whether any task is.
         """
         if not stalled and self._factor == 1.0:
-            self._begin(None)
+            self.pause()
             return
         if feedforward.any():
             self.reset()
