@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from qpavoid import kernels
-from qpavoid.config import Avoidance, Limits, Progress, ScenarioConfig, Sensing, Sphere
+from qpavoid.config import Avoidance, Limits, Planning, Progress, ScenarioConfig, Sensing, Sphere
 from qpavoid.config.scenario import MAX_LATENCY
 from qpavoid.control.builder import ProblemBuilder, StepProblem
 from qpavoid.control.contacts import ContactRows
@@ -22,6 +22,7 @@ from qpavoid.control.tasks import RowTask, in_order
 from qpavoid.control.tick import Tick, copied
 from qpavoid.errors import ConfigError, NumericalError, located
 from qpavoid.model.scene import Obstacle, Scene
+from qpavoid.planning.replanning import Replanning
 from qpavoid.problem import Array, Solution, State, as_vector, require_finite
 from qpavoid.reason import Reason, ReasonKind
 from qpavoid.safety.arbiter import Arbiter
@@ -53,6 +54,7 @@ class Controller(SceneChanges):
         progress: Progress | None = None,
         contacts: ContactRows | None = None,
         latency: float = 0.0,
+        planning: Planning | None = None,
     ) -> None:
         """Lay out the memory of a control step.
 
@@ -67,6 +69,7 @@ class Controller(SceneChanges):
             progress: when a task counts as stalled; the defaults of a scenario if left out.
             contacts: frames that rest, see `build_contacts`; none if left out.
             latency: time after which the actuators follow a command [s], see `step`.
+            planning: forecasts and plans; none if left out.
 
         Raises:
             UnknownName, SolverNotInstalled: of the solver.
@@ -96,7 +99,10 @@ class Controller(SceneChanges):
         self._builder = ProblemBuilder(settings, self.tasks, contacts)
         self._arbiter = Arbiter(settings, law, self._builder.rows, self._builder.tracker)
         self._builder.rows.adapt(law, self.avoidance.look_ahead)
+        self._planning: Replanning | None = None
         self._warm_up()
+        if planning is not None:
+            self._planning = Replanning(settings, self.tasks, contacts, self._builder, self._arbiter, planning)
         kernels.first_use.end()
         self.warm_up_time = perf_counter() - begin
         """Time to lay out memory and run the first steps, compilation included [s]; no later step compiles."""
@@ -115,6 +121,8 @@ class Controller(SceneChanges):
         check_solver(law, self._has_contacts)
         self._arbiter.solver = law
         self._builder.rows.adapt(law, self.avoidance.look_ahead)
+        if self._planning is not None:
+            self._planning.change_law(law)
 
     def _warm_up(self) -> None:
         """Run the first steps, with a law that ships: one of the user's own may remember what it is asked."""
@@ -149,7 +157,7 @@ class Controller(SceneChanges):
         with located(str(source)):
             controller = cls(
                 parts.scene, parts.tasks, parts.solver, scenario.dt, scenario.avoidance, scenario.limits,
-                scenario.sensing, scenario.progress, parts.contacts, scenario.latency,
+                scenario.sensing, scenario.progress, parts.contacts, scenario.latency, scenario.planning,
             )  # fmt: skip
         for c in scenario.obstacles:
             if c.attached_to is not None:
@@ -246,16 +254,23 @@ class Controller(SceneChanges):
         """
         begin = perf_counter()
         v_desired = as_vector("v_desired", v_desired, self._v_shape)
+        if self._planning is not None:
+            self._planning.drop()
         step = self._builder.build(self._builder.read(q, t, None, obstacles, v, v_desired))
         return self._decide(step, begin, from_tasks=False)
 
     def _decide(self, step: StepProblem, begin: float, from_tasks: bool = True) -> Solution:
         """Decide what is commanded; the step began at `begin` [s]."""
         middle, arbiter, builder = perf_counter(), self._arbiter, self._builder
+        planning = self._planning if from_tasks else None
         if step.resumed:
             arbiter.reset()
+            if planning is not None:
+                planning.reset()
         if step.faults:
             solution = arbiter.stop(step.faults)
+        elif planning is not None:
+            solution = planning.decide(step)
         else:
             solution = arbiter.decide(step.q, step.t, step.is_settled, from_tasks)
         builder.remember(solution.v)
@@ -276,6 +291,13 @@ class Controller(SceneChanges):
             raise NumericalError(str(faults[0]))
         self._builder.reset(v)
         self._arbiter.reset()
+        if self._planning is not None:
+            self._planning.reset()
+
+    def _scene_changed(self, method: str, *arguments: Any) -> None:
+        """Let forecasts know of a change of the scene."""
+        if self._planning is not None:
+            self._planning.change_scene(method, *arguments)
 
     def __reduce_ex__(self, protocol: Any) -> NoReturn:
         """Refuse to be copied or pickled: a copy would share memory that coal and compiled code look into.

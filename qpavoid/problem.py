@@ -247,6 +247,8 @@ class Solution(NamedTuple):
     """Assumptions of the step, such as the estimated twist of an obstacle that was given without one."""
     saturation: float = 0.0
     """Largest change of the solver's raw velocity by the limits [rad/s or m/s]; 0 of a `bounded` solver."""
+    plan: str = ""
+    """Plan that is followed in place of the tasks alone, and why, in a sentence; empty without one."""
     build_time: float = 0.0
     """Time to read the state and set up the problem [s]."""
     solve_time: float = 0.0

@@ -54,6 +54,8 @@ class ReasonKind(str, Enum):
     """The backup trajectory replaces the tasks: from their velocity, none would stay clear of moving obstacles."""
     NO_BACKUP = "NO_BACKUP"
     """No backup trajectory is looked for: what excludes it."""
+    NO_PLAN = "NO_PLAN"
+    """Nothing is forecast or planned, or not all that is configured: what excludes it."""
     STALE = "STALE"
     """An obstacle was not updated in time: the obstacle, the age of its last update [s]."""
     NEVER_UPDATED = "NEVER_UPDATED"
@@ -84,7 +86,9 @@ class ReasonKind(str, Enum):
 
 
 _SEVERITIES = {
-    **dict.fromkeys(("NO_BACKUP", "ESTIMATED", "IGNORED", "POINTS_DROPPED", "NORMALISED", "TIMING"), Severity.INFO),
+    **dict.fromkeys(
+        ("NO_BACKUP", "NO_PLAN", "ESTIMATED", "IGNORED", "POINTS_DROPPED", "NORMALISED", "TIMING"), Severity.INFO
+    ),
     **dict.fromkeys(
         ("PREDICTED_TOO_NEAR", "UNKNOWN_DISTANCE", "IMPLAUSIBLE", "SOLVER_FAILED", "CONTACTS_INFEASIBLE"),
         Severity.ALARM,
@@ -106,6 +110,7 @@ _TEXTS: dict[str, str] = {
     "SINGULAR": "in a singularity, short of its target by",
     "BACKUP": "backup trajectory instead of the tasks",
     "NO_BACKUP": "no backup trajectory",
+    "NO_PLAN": "no plan",
     "STALE": "not updated for",
     "NEVER_UPDATED": "external, not given yet after",
     "ESTIMATED": "twist estimated from its poses",

@@ -8,7 +8,9 @@ from qpavoid.config.base import Block
 from qpavoid.config.control import (
     Avoidance,
     Beta,
+    FastFinish,
     Limits,
+    Planning,
     Progress,
     Sensing,
     TaskSwitching,
@@ -56,10 +58,10 @@ from qpavoid.config.tasks import (
 
 __all__ = [
     "AlignTask", "AnyTask", "Avoidance", "Beta", "Block", "Body", "Box", "Capsule", "Circle", "ComTask", "Cone",
-    "Contact", "Csv", "Cylinder", "DampingTask", "Ellipsoid", "Eq10Solver", "Fixed", "GradientProjectionSolver",
-    "HalfSpace", "HqpSolver", "Hull", "JointLimits", "Limits", "Line", "LookAtTask", "ManipulabilityTask", "Mesh",
-    "Motion", "ObstacleConfig", "ObstacleShape", "PairMargin", "PointCloud", "PostureTask", "PotentialFieldSolver",
-    "Progress", "QpSolver", "RelativeTask", "RobotConfig", "ScenarioConfig", "Sensing", "Shape", "SolverConfig",
-    "Sphere", "StepSearchSolver", "Task", "TaskBlock", "TaskSwitching", "TrackingSolver", "Waypoints",
-    "expand_solver",
+    "Contact", "Csv", "Cylinder", "DampingTask", "Ellipsoid", "Eq10Solver", "FastFinish", "Fixed",
+    "GradientProjectionSolver", "HalfSpace", "HqpSolver", "Hull", "JointLimits", "Limits", "Line", "LookAtTask",
+    "ManipulabilityTask", "Mesh", "Motion", "ObstacleConfig", "ObstacleShape", "PairMargin", "Planning", "PointCloud",
+    "PostureTask", "PotentialFieldSolver", "Progress", "QpSolver", "RelativeTask", "RobotConfig", "ScenarioConfig",
+    "Sensing", "Shape", "SolverConfig", "Sphere", "StepSearchSolver", "Task", "TaskBlock", "TaskSwitching",
+    "TrackingSolver", "Waypoints", "expand_solver",
 ]  # fmt: skip

@@ -126,3 +126,29 @@ class Progress(Block):
 
     stalled_after: Positive = 0.5
     """Time without progress after which a task counts as stalled [s]."""
+
+
+class FastFinish(Block):
+    """How targets are approached where the law would come too late: plain velocity dampers, more feedback."""
+
+    gain: Positive = 5.0
+    """Least feedback gain K of frames that follow motions [1/s]."""
+    row_gain: Positive = 10.0
+    """ξ of the rows [1/s]."""
+
+
+class Planning(Block):
+    """Forecast of the law, and other ways to drive its QP where the forecast does not arrive."""
+
+    horizon: Positive = 20.0
+    """Longest time that a forecast looks ahead [s]."""
+    settle: Positive = 3.0
+    """Time after the end of the motions within which their targets are to be reached [s]."""
+    period: Positive = 0.4
+    """Time between two forecasts where obstacles move [s]."""
+    lead: Positive = 0.3
+    """Time after a forecast at which another drive begins [s]; what is not ready by then is dropped."""
+    goal_tolerance: Positive = 0.005
+    """Error of every frame below which a forecast has arrived [m, rad]."""
+    fast: FastFinish | None = FastFinish()
+    """Drive that is tried first; `null`: never."""

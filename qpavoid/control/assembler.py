@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,8 +15,9 @@ from qpavoid.control.previous_velocity import PreviousVelocity
 from qpavoid.control.row_layout import lay_out
 from qpavoid.control.settings import ControlSettings
 from qpavoid.control.tasks import RowTask, in_order
-from qpavoid.control.tasks.layout import TaskRows, task_levels
+from qpavoid.control.tasks.layout import TaskRows, dead_beat, task_levels
 from qpavoid.kernels import SETTLED, TO_MEASURE
+from qpavoid.kernels.layout import RowLayout
 from qpavoid.model.kinematics import ForwardKinematics, Kinematics
 from qpavoid.problem import Array, AvoidanceRows, Contacts, IntArray, Problem, Proximity, Tracking
 from qpavoid.solvers.hqp import cascade
@@ -24,6 +25,17 @@ from qpavoid.solvers.solver import Solver
 
 _LACKING = 1e-6
 """Share of a task's velocity up to which it lacks nothing [-]: round-off of the tracking law."""
+
+
+class _Form(NamedTuple):
+    """Rows in one form: memory that all forms share, but for some numbers and gains."""
+
+    layout: RowLayout
+    packed: Any
+    step: Callable[..., int]
+    """Code of `kernels.control_step` for this memory."""
+    views: dict[int, tuple[Proximity, AvoidanceRows]]
+    """What there is of k near pairs, by k."""
 
 
 class RowAssembler:
@@ -51,7 +63,8 @@ class RowAssembler:
         self.query.set_influence_distance(self.influence_distance)
         x = self._layout = lay_out(settings, frames, row_tasks, self._forward, self.query)
         self._hard = (x.hard_lower, x.hard_upper) if limits.relax_acceleration else (x.lower, x.upper)
-        self._packed, self._contacts = kernels.pack(x), contacts
+        self._packed: Any = kernels.pack(x)
+        self._contacts = contacts
         self._scene = scene
         self.joint_names, self.joint_units = tuple(scene.robot.coordinate_names), tuple(scene.robot.coordinate_units)
         """Name and unit of each coordinate."""
@@ -63,7 +76,6 @@ class RowAssembler:
         self._tracking, levels = Tracking(x.A, x.b, x.b_feasible), task_levels(frames, row_tasks)
         self._following = Tracking(x.identity, x.v_tracking, x.v_tracking)
         self._levels = levels if len(levels) > 1 else ()
-        self._views: dict[int, tuple[Proximity, AvoidanceRows]] = {}
         self._task_rows = TaskRows(row_tasks, x.A, x.b)
         self.task_errors = self._task_rows.errors
         """How far each of the tasks that are not frames was from its target in the last step, in its unit."""
@@ -79,7 +91,8 @@ class RowAssembler:
         self._follows_tasks = True
         self._contact_rows: Contacts | None = None
         self._find = kernels.direct(kernels.find_near_pairs, self._packed, self.q)
-        self._step = self._compile()
+        self._forms = [self._make_form(x)]
+        self.use_form(0)
         self.kinematics = Kinematics(x.J_world, x.poses)
         """World Jacobian and poses of the tracked frames in this step."""
 
@@ -94,15 +107,38 @@ class RowAssembler:
             looks_ahead: whether a step looks ahead, of a bounded law.
         """
         looks_ahead = looks_ahead and law.bounded and self._contacts is None and not self._layout.jerk_limited
-        layout = self._layout._replace(looks_ahead=looks_ahead, regularization=law.compiled_regularization)
-        if (layout.looks_ahead, layout.regularization) != (self._layout.looks_ahead, self._layout.regularization):
-            self._layout, self._packed = layout, kernels.pack(layout)
-            self._step = self._compile()
+        numbers: dict[str, Any] = {"looks_ahead": looks_ahead, "regularization": law.compiled_regularization}
+        if numbers != {name: getattr(self._layout, name) for name in numbers}:
+            self._forms = [self._make_form(form.layout._replace(**numbers)) for form in self._forms]
+            self.use_form(0)
 
-    def _compile(self) -> Callable[..., int]:
-        """Return the code of `kernels.control_step` for this memory."""
-        arguments = self._packed, self.q, self.influence_distance, False, True, False
-        return kernels.direct(kernels.control_step, *arguments)
+    def add_dampers(self, row_gain: float, margin: float, gain: float = 0.0) -> int:
+        """Lay out velocity dampers as another form of the rows, in the same memory; return its number for `use_form`.
+
+        Args:
+            row_gain: ξ [1/s].
+            margin: added to the safety distance [m].
+            gain: least feedback gain of the frames [1/s].
+        """
+        x = self._layout
+        gains, of_frames = np.maximum(x.gain, gain), x.row_tasks < self.frame_count
+        near_one = x.dead_beat.copy()
+        near_one[of_frames] = dead_beat(gains, x.dt)[x.row_tasks[of_frames]]
+        dampers = x._replace(
+            row_gain=row_gain, near_speed=np.inf, task_switching=False, d1=x.d1 + margin, gain=gains, dead_beat=near_one
+        )
+        self._forms.append(self._make_form(dampers))
+        return len(self._forms) - 1
+
+    def use_form(self, number: int) -> None:
+        """Choose the form of the rows of the next steps; 0 is that of the settings."""
+        self._layout, self._packed, self._step, self._views = self._forms[number]
+
+    def _make_form(self, layout: RowLayout) -> _Form:
+        """Pack a layout."""
+        packed = kernels.pack(layout)
+        arguments = packed, self.q, self.influence_distance, False, True, False
+        return _Form(layout, packed, kernels.direct(kernels.control_step, *arguments), {})
 
     def compute(self, q: Array, targets: Sequence[Any], v_desired: Array | None = None) -> bool:
         """Compute distances, rows and bounds at a configuration, with the obstacles as placed.

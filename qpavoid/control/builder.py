@@ -115,20 +115,21 @@ class ProblemBuilder:
         self.rows.previous.restart(v)
         self._under_way.fill(v)
 
-    def attach(self, index: int, frame_id: int, q: Array | None) -> None:
-        """Attach an obstacle to a frame; see `Controller.attach`."""
+    def attach(self, index: int, frame_id: int, q: Array | None) -> Array:
+        """Attach an obstacle to a frame, and return q; see `Controller.attach`."""
         q = self._given_or_last(q)
         self.attachments.attach(index, frame_id, q, self._pose(index, q))
         self.tracker.attach(index)
         self._place_attachment(index, q)
+        return q
 
-    def release(self, index: int, q: Array | None) -> Sample:
-        """Release an attached object, and return its world pose; see `Controller.release`."""
+    def release(self, index: int, q: Array | None) -> tuple[Sample, Array]:
+        """Release an attached object, and return its world pose, and q; see `Controller.release`."""
         q = self._given_or_last(q)
         sample = self.attachments.release(index, q)
         self.tracker.release(index, sample)
         self._place_attachment(index, q)
-        return sample
+        return sample, q
 
     def _place_attachment(self, index: int, q: Array) -> None:
         self.rows.query.place(self.tracker.current)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from qpavoid.control.builder import ProblemBuilder
 from qpavoid.control.distances import DistanceQuery
@@ -18,6 +19,9 @@ class SceneChanges:
     scene: Scene
     """Robot and obstacles, those that were added among them."""
     _builder: ProblemBuilder
+
+    def _scene_changed(self, method: str, *arguments: Any) -> None:
+        """Take note of a change that one of the methods below has made."""
 
     @property
     def attached(self) -> Mapping[str, int]:
@@ -40,6 +44,7 @@ class SceneChanges:
                 changed.
         """
         self._builder.slots.add(obstacle)
+        self._scene_changed("add_obstacle", obstacle)
 
     def remove_obstacle(self, obstacle: str) -> None:
         """Remove an obstacle that was added; its slot is empty again.
@@ -52,6 +57,7 @@ class SceneChanges:
             ConfigError: it is attached to the robot, or was built into the scene.
         """
         self._builder.slots.remove(self._builder.tracker.index(obstacle))
+        self._scene_changed("remove_obstacle", obstacle)
 
     def attach(self, obstacle: str, frame: str, q: Array | None = None) -> None:
         """Attach an obstacle to a frame of the robot; it stays where it is relative to the frame.
@@ -74,7 +80,8 @@ class SceneChanges:
         if not isinstance(frame, str):
             raise UnknownName(f"attach: no frame {frame!r:.60}; give its name")
         index, frame_id = self._builder.tracker.index(obstacle), self.scene.robot.frame_id(frame, "attach")
-        self._builder.attach(index, frame_id, q)
+        q = self._builder.attach(index, frame_id, q)
+        self._scene_changed("attach", obstacle, frame, q)
 
     def release(self, obstacle: str, q: Array | None = None) -> Sample:
         """Release an attached obstacle: it rests where it is, until it is given to `step` again.
@@ -93,7 +100,9 @@ class SceneChanges:
             ConfigError: it is not carried.
             NumericalError: q cannot be true.
         """
-        return self._builder.release(self._builder.tracker.index(obstacle), q)
+        sample, q = self._builder.release(self._builder.tracker.index(obstacle), q)
+        self._scene_changed("release", obstacle, q)
+        return sample
 
     def allow_contact(self, obstacle: str, others: Sequence[str], allowed: bool = True) -> None:
         """Let an obstacle and some bodies or other obstacles touch, as before a grasp.
@@ -116,6 +125,7 @@ class SceneChanges:
             if not isinstance(name, str) or name not in known:
                 raise UnknownName(f"allow_contact: no body or obstacle {name!r:.60}{nearest(str(name), known)}")
         self._builder.attachments.allow(index, set(names), allowed)
+        self._scene_changed("allow_contact", obstacle, names, allowed)
 
     def obstacle_pose(self, obstacle: str, q: Array | None = None) -> Sample:
         """Return the world pose of an obstacle in the last step, attached or not; see `release`."""

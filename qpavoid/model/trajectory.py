@@ -48,6 +48,11 @@ class Trajectory:
         """True if the pose never changes."""
         return len(self.pieces.starts) == 1
 
+    @property
+    def end_time(self) -> float:
+        """Time from which on the pose does not change [s]; -∞ where it never does, ∞ where it does forever."""
+        return float(self.pieces.starts[-1]) if math.isinf(self.pieces.clock[-1, 1]) else math.inf
+
     def sample(self, t: float) -> Sample:
         """See `Motion.sample`."""
         if self.is_still:

@@ -1,4 +1,4 @@
-"""Command line: `qpavoid bench run | smoke | report | show | list | tick | solvers | endurance | robots`.
+"""Command line: `qpavoid bench run | smoke | report | show | list | tick | solvers | endurance | robots | grasps`.
 
 Dependencies of a command are imported when it runs.
 """
@@ -18,6 +18,7 @@ from qpavoid.errors import ConfigError
 from qpavoid.run.report import to_json
 from qpavoid.run.terminal import ERR, OUT, names_of, progress, terminate_like_interrupt
 from qpavoid_bench.endurance.command import endurance
+from qpavoid_bench.grasps.command import grasps
 from qpavoid_bench.solvers.command import solvers
 from qpavoid_bench.survey import robots
 from qpavoid_bench.tick.command import tick
@@ -40,7 +41,8 @@ app.command()(tick)
 app.command()(solvers)
 app.command()(endurance)
 app.command()(robots)
-_MEASURES = ("tick", "solvers", "endurance", "robots")
+app.command()(grasps)
+_MEASURES = ("tick", "solvers", "endurance", "robots", "grasps")
 """Commands that need none of the packages below."""
 
 _PACKAGES = ("distributed", "mujoco", "pandas", "statsmodels", "matplotlib")

@@ -84,10 +84,10 @@ def solver_entrant(
 def _start_solver(solver: SolverConfig, changes: Mapping[str, Mapping[str, Any]], case: Case, world: World) -> Pilot:
     scenario = case.scenario.model_dump()
     for block, fields in changes.items():
-        scenario[block] = {**scenario[block], **fields}
+        scenario[block] = {**(scenario[block] or {}), **fields}
     x = ScenarioConfig.model_validate({**scenario, "solver": solver.model_dump()})
     blocks = x.avoidance, x.limits, x.sensing, x.progress
-    return Controller(world.scene, world.tasks, make_solver(x.solver), x.dt, *blocks)
+    return Controller(world.scene, world.tasks, make_solver(x.solver), x.dt, *blocks, planning=x.planning)
 
 
 def _library_entrant(library: Library) -> Entrant:
@@ -122,6 +122,7 @@ ENTRANTS = {
         solver_entrant("qp", "QP as each scenario has it, with a backup trajectory", "qp"),
         _qp_without_backup("qp-task-switching", "the gains of eq. 10 in its rows", "task-switching"),
         _qp_without_backup("qp-no-backup", "beta rows", "beta"),
+        solver_entrant("qp-planning", "qp with forecasts, and what is driven where they fail", "qp", planning={}),
         solver_entrant("qp:native", "QP, compiled active-set method", "qp:native"),
         solver_entrant("qp:daqp", "QP, back end daqp", "qp:daqp"),
         solver_entrant("qp:proxqp", "QP, back end ProxQP", "qp:proxqp"),

@@ -56,7 +56,7 @@ def task_layout(frames: Sequence[FrameTask], row_tasks: Sequence[RowTask], model
         "gain": np.array([task.settings.gain for task in frames]),
         "cap": np.array([np.inf if cap is None else cap for cap in caps]),
         "scale": np.concatenate((scale, *(task.scale for task in row_tasks))),
-        "dead_beat": np.repeat(np.minimum(gains * dt / _DEAD_BEAT, 1.0), sizes),
+        "dead_beat": np.repeat(dead_beat(gains, dt), sizes),
         "row_tasks": np.repeat(np.array([numbers[id(task)] for task in tasks], dtype=np.intp), sizes),
         "bending_rows": np.flatnonzero(bends),
         "straight_rows": np.flatnonzero(~bends),
@@ -69,6 +69,11 @@ def task_layout(frames: Sequence[FrameTask], row_tasks: Sequence[RowTask], model
         "b": np.zeros(rows),
         "b_feasible": np.zeros(rows),
     }
+
+
+def dead_beat(gains: Array, dt: float) -> Array:
+    """Return how near each gain [1/s] is to one that removes the error in a step, at most 1 [-]."""
+    return np.minimum(gains * dt / _DEAD_BEAT, 1.0)
 
 
 def task_levels(frames: Sequence[FrameTask], row_tasks: Sequence[RowTask]) -> tuple[IntArray, ...]:

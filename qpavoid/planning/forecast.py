@@ -1,0 +1,184 @@
+"""Forecasts: the law, or another drive of its QP, rolled out ahead in memory of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from math import isfinite
+from typing import Any, NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from qpavoid.config import Planning, Sensing
+from qpavoid.control.builder import ProblemBuilder
+from qpavoid.control.contacts import ContactRows
+from qpavoid.control.scene_changes import SceneChanges
+from qpavoid.control.settings import ControlSettings
+from qpavoid.control.tasks import RowTask
+from qpavoid.control.trajectories import extrapolate
+from qpavoid.model.sample import Sample
+from qpavoid.model.trajectory import Trajectory
+from qpavoid.planning.drive import Drive, Driver
+from qpavoid.problem import Array, AvoidanceRows
+from qpavoid.safety.arbiter import Arbiter
+from qpavoid.solvers import make_solver
+from qpavoid.solvers.solver import NamedSolver
+
+_PRESENT = 1e-3
+"""How much nearer than it is now a pair may come that is too near [m]."""
+
+
+class Snapshot(NamedTuple):
+    """State of a controller in which a control step begins."""
+
+    t: float
+    """[s]."""
+    q: Array
+    """(nq,)."""
+    v: Array
+    """(nv,) velocity commanded in the step before."""
+    dv: Array
+    """(nv,) change of velocity in that step."""
+    drive: Drive
+    """What it follows."""
+    obstacles: Mapping[str, Array]
+    """(18,) states of those that a program gives, by name."""
+    targets: Mapping[str, Any]
+    """Targets that a program gives, by name of the task; they are taken to stay where they are."""
+
+
+class Forecast(NamedTuple):
+    """What drives lead to; row i is of the control step i, and the last one is the end."""
+
+    t: Array
+    """(n + 1,) [s]."""
+    q: Array
+    """(n + 1, nq)."""
+    v: Array
+    """(n + 1, nv) velocity at which the step begins."""
+    dv: Array
+    """(n + 1, nv) change of velocity in the step before."""
+    errors: Array
+    """(n + 1,) largest error of a frame [m, rad]."""
+    clearance: Array
+    """(n + 1,) least distance beyond the one that has to be kept [m]."""
+
+    def step_at(self, t: float) -> int:
+        """Return the control step at a time [s], at most the last one."""
+        steps = len(self.t) - 1
+        return min(max(round(float((t - self.t[0]) / (self.t[-1] - self.t[0]) * steps)), 0), steps) if steps else 0
+
+    @property
+    def final_error(self) -> float:
+        """Largest error of a frame at the end [m, rad]."""
+        return float(self.errors[-1])
+
+
+def largest_error(parts: Array) -> float:
+    """Return the largest error of frames, of their positions and orientations (3 (p + t),) [m, rad]."""
+    return float(np.linalg.norm(parts.reshape(-1, 3), axis=1).max())
+
+
+class Forecaster(SceneChanges):
+    """A second controller of the same robot, tasks and scene, which is run ahead."""
+
+    def __init__(
+        self,
+        settings: ControlSettings,
+        tasks: Sequence[RowTask],
+        contacts: ContactRows | None,
+        law: NamedSolver,
+        config: Planning,
+    ) -> None:
+        """Lay the memory out.
+
+        Args:
+            settings: of the controller.
+            tasks: of the controller, frames first.
+            contacts: frames that rest.
+            law: of the controller, one that scenarios name.
+            config: what is planned, and how.
+        """
+        scene = settings.scene.own_copy() if settings.scene.spare else settings.scene
+        unlimited = Sensing(stale_after=None, stop_after=None)
+        self._settings = replace(settings, scene=scene, sensing=unlimited, latency=0.0)
+        self.scene, self._tasks, self._config = scene, tasks, config
+        self._builder = ProblemBuilder(self._settings, tasks, contacts)
+        rows, tracker = self._builder.rows, self._builder.tracker
+        self._arbiter = Arbiter(self._settings, make_solver(law.config), rows, tracker)
+        self._driver = Driver(rows, self._arbiter, config)
+        rows.adapt(self._arbiter.solver, settings.avoidance.look_ahead)
+        ends = [task.motion.end_time if isinstance(task.motion, Trajectory) else np.inf for task in tasks]
+        self._deadline = max(ends[: rows.frame_count]) + config.settle
+        """Time until which all targets are to be reached [s]."""
+        self._least = np.zeros(len(scene.pairs))
+        """(m,) distance that each pair has to keep [m]."""
+
+    def change_law(self, law: NamedSolver) -> None:
+        """Forecast another law from now on."""
+        self._arbiter.solver = make_solver(law.config)
+        self._builder.rows.adapt(self._arbiter.solver, self._settings.avoidance.look_ahead)
+
+    def end_of(self, start: Snapshot) -> float:
+        """Return the time at which a forecast ends [s]."""
+        config = self._config
+        deadline = start.t + config.settle if start.targets else self._deadline
+        if deadline <= start.t:
+            deadline = start.t + config.settle
+        return min(deadline, start.t + config.horizon) if isfinite(deadline) else start.t + config.horizon
+
+    def run(self, start: Snapshot, end: float) -> Forecast:
+        """Roll a drive out.
+
+        Args:
+            start: where it begins.
+            end: when it ends [s].
+        """
+        builder, rows, dt, model = self._builder, self._builder.rows, self._settings.dt, self.scene.robot.model
+        count = max(1, round((end - start.t) / dt))
+        q, v, dv = (np.zeros((count + 1, n)) for n in (model.nq, model.nv, model.nv))
+        errors, clearance = np.zeros((count + 1, len(rows.frame_errors))), np.full(count + 1, np.inf)
+        q[0], v[0], dv[0] = start.q, start.v, start.dv
+        self._restart(start)
+        obstacles = {name: Sample.of_row(row) for name, row in start.obstacles.items()} or None
+        for k in range(count + 1):
+            updates = obstacles if k == 0 else None
+            step = builder.build(builder.read(q[k], start.t + k * dt, start.targets or None, updates, None))
+            distances = rows.problem().avoidance
+            if k == 0:
+                self._write_least(distances)
+            errors[k] = rows.frame_errors
+            clearance[k] = np.min(distances.d - self._least[distances.pair], initial=np.inf)
+            if k == count or step.faults:
+                break
+            solution = self._driver.decide(step)
+            builder.remember(solution.v)
+            v[k + 1], dv[k + 1] = solution.v, rows.previous.dv
+            q[k + 1] = pin.integrate(model, q[k], solution.v * dt)
+        n = k + 1
+        t = start.t + dt * np.arange(n, dtype=np.float64)
+        errors = np.linalg.norm(errors[:n].reshape(n, -1, 3), axis=2).max(axis=1)
+        return Forecast(t, q[:n], v[:n], dv[:n], errors, clearance[:n])
+
+    def later(self, start: Snapshot, forecast: Forecast, step: int) -> Snapshot:
+        """Return the state of a forecast that began at `start`, when one of its steps begins."""
+        states = {name: Sample.of_row(row).row.copy() for name, row in start.obstacles.items()}
+        t = float(forecast.t[step])
+        for row in states.values():
+            extrapolate(row[None], t - start.t)
+        return start._replace(t=t, q=forecast.q[step], v=forecast.v[step], dv=forecast.dv[step], obstacles=states)
+
+    def _restart(self, start: Snapshot) -> None:
+        """Bring the controller into a state."""
+        self._builder.reset(start.v)
+        self._builder.rows.previous.dv[:] = start.dv
+        self._arbiter.reset()
+        self._driver.begin(start.drive)
+
+    def _write_least(self, distances: AvoidanceRows) -> None:
+        """Write the distances that pairs have to keep: the safety distance, or nearly what they have at the start."""
+        is_movable = (self._builder.rows.query.table.support != 0.0).any(axis=1)
+        self._least[:] = np.where(is_movable, distances.d1, -np.inf)
+        pairs = distances.pair
+        self._least[pairs] = np.minimum(self._least[pairs], distances.d - _PRESENT)

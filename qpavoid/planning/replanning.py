@@ -1,0 +1,198 @@
+"""When a look ahead is due, and what becomes of its result; the part of a controller that plans."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from qpavoid.config import Planning
+from qpavoid.control.builder import ProblemBuilder, StepProblem
+from qpavoid.control.contacts import ContactRows
+from qpavoid.control.settings import ControlSettings
+from qpavoid.control.tasks import FrameTask, RowTask
+from qpavoid.model.sample import Sample
+from qpavoid.planning.candidates import Candidates, Decision
+from qpavoid.planning.drive import TRACK, Driver
+from qpavoid.planning.forecast import Forecast, Forecaster, Snapshot, largest_error
+from qpavoid.problem import Array, Solution
+from qpavoid.reason import Reason, ReasonKind
+from qpavoid.safety.arbiter import Arbiter
+from qpavoid.solvers import Solver
+from qpavoid.solvers.solver import NamedSolver
+
+_LONGEST_WAIT = 4.0
+"""Longest time between two looks that find nothing [s]."""
+_CHANGED = 0.02
+"""Difference of a task's error, or of an obstacle's position, from the forecast, after which it does not count [m]."""
+_TURNED = 0.1
+"""The same of a joint, or of an obstacle's orientation [rad]."""
+_NOISE = 1e-3
+"""Root mean square of what an obstacle's position differs from that of a step before and its twist, from which on
+twists are too noisy for a fast finish [m]: at 10 m/s², it is half as much."""
+_FORGETTING = 0.05
+"""Weight of the newest difference in that mean [-]."""
+_MEASURED = 20
+"""Differences after which the mean counts; before that, obstacles that move may be noisy [-]."""
+_ROUND_OFF = 1e-9
+"""Difference of two times that counts as none [s]."""
+
+
+class Replanning:
+    """Looks ahead when it is due, and lets another drive begin where that arrives and the present one does not."""
+
+    def __init__(
+        self,
+        settings: ControlSettings,
+        tasks: Sequence[RowTask],
+        contacts: ContactRows | None,
+        builder: ProblemBuilder,
+        arbiter: Arbiter,
+        config: Planning,
+    ) -> None:
+        """Begin with the tasks alone.
+
+        Args:
+            settings: of the controller.
+            tasks: of the controller.
+            contacts: frames that rest.
+            builder: of the controller.
+            arbiter: of the controller.
+            config: what is planned, and how.
+        """
+        self._builder, self._config, self._settings, self._tasks = builder, config, settings, tasks
+        self._driver = Driver(builder.rows, arbiter, config)
+        self._forecaster: Forecaster | None = None
+        law = arbiter.solver
+        self._no_plan = _exclusion(tasks, law)
+        if self._no_plan is None and isinstance(law, NamedSolver):
+            self._forecaster = Forecaster(settings, tasks, contacts, law, config)
+            self._candidates = Candidates(self._forecaster, config)
+        self.reset()
+
+    def reset(self) -> None:
+        """Drop all plans; the next step looks ahead."""
+        self._driver.begin(TRACK)
+        self._pending: Decision | None = None
+        self._expected: Forecast | None = None
+        self._last_obstacles = dict[str, Array]()  # states of obstacles in the last look
+        self._last_look, self._next_look, self._wait = -np.inf, -np.inf, self._config.period
+        self._last_states: Array | None = None
+        self._noise, self._measured = 0.0, 0  # mean square [m²], number of differences
+
+    def change_law(self, law: Solver) -> None:
+        """Forecast another law from now on; nothing is forecast if the first one could not be."""
+        self.reset()
+        if self._forecaster is not None:
+            self._no_plan = _exclusion(self._tasks, law)
+            if self._no_plan is None and isinstance(law, NamedSolver):
+                self._forecaster.change_law(law)
+
+    def drop(self) -> None:
+        """Drop what is followed: the next step is of a given velocity."""
+        if self._driver.drive is not TRACK:
+            self.reset()
+        self._pending = None
+
+    def change_scene(self, method: str, *arguments: Any) -> None:
+        """Change the scene of forecasts like that of the controller; what was planned in it is dropped."""
+        if self._forecaster is not None:
+            getattr(self._forecaster, method)(*arguments)
+        self.reset()
+
+    def decide(self, step: StepProblem) -> Solution:
+        """Return the solution of a step, and look ahead from it where that is due."""
+        if self._no_plan is not None:
+            solution = self._driver.decide(step)
+            return solution._replace(assumptions=(*solution.assumptions, self._no_plan))
+        config, external = self._config, self._builder.tracker.external
+        if len(external):
+            self._measure_noise()
+        if self._pending is None and self._is_due(step):
+            self._look(step)
+        solution = self._driver.decide(step)
+        if self._driver.drive.reason:
+            solution = solution._replace(plan=self._driver.drive.reason)
+        if solution.stalled and self._pending is None:
+            self._next_look = min(self._next_look, self._last_look + self._wait)
+        if self._pending is not None and step.t + self._settings.dt >= self._pending.t - _ROUND_OFF:
+            self._driver.begin(self._pending.drive)
+            self._expected, self._pending, self._next_look = self._pending.forecast, None, step.t + config.period
+        return solution
+
+    def _is_due(self, step: StepProblem) -> bool:
+        """Return whether to look ahead: time has come, or what was forecast does not come true."""
+        if step.t >= self._next_look - _ROUND_OFF:
+            return True
+        return step.t >= self._last_look + self._config.period - _ROUND_OFF and self._has_changed(step)
+
+    def _has_changed(self, step: StepProblem) -> bool:
+        """Return whether robot, targets or obstacles are elsewhere than in the forecast."""
+        expected, tracker = self._expected, self._builder.tracker
+        assert expected is not None
+        k = expected.step_at(step.t)
+        error = largest_error(self._builder.rows.frame_errors)
+        if abs(error - expected.errors[k]) > _CHANGED or np.abs(step.q - expected.q[k]).max() > _TURNED:
+            return True
+        if len(tracker.external) != len(self._last_obstacles):
+            return True
+        states = tracker.current.states[tracker.external]
+        if not len(states) or self._moves(states):
+            return False  # then looks are periodic
+        change = np.abs(states - np.array(list(self._last_obstacles.values())))
+        return bool((change[:, 9:12] > _CHANGED).any() or (change[:, :9] > _TURNED).any())
+
+    @staticmethod
+    def _moves(states: Array) -> bool:
+        """Return whether any obstacle whose future is not known moves."""
+        return bool(states[:, 12:].any())
+
+    def _measure_noise(self) -> None:
+        """Compare positions of obstacles with those that the twists of the step before lead to."""
+        tracker = self._builder.tracker
+        states, last = tracker.current.states[tracker.external], self._last_states
+        if last is not None and len(last) == len(states):
+            difference = states[:, 9:12] - last[:, 9:12] - self._settings.dt * last[:, 12:15]
+            worst = float((difference * difference).sum(axis=1).max())
+            self._measured += 1
+            self._noise += max(_FORGETTING, 1.0 / self._measured) * (worst - self._noise)
+        self._last_states = states
+
+    def _look(self, step: StepProblem) -> None:
+        """Look ahead from a step, and decide when to look again."""
+        tracker, previous, period = self._builder.tracker, self._builder.rows.previous, self._config.period
+        slots, states = self._settings.scene.slots, tracker.current.states
+        self._last_obstacles = {slots[i].name: states[i].copy() for i in tracker.external.tolist()}
+        is_moving = self._moves(states[tracker.external])
+        q, v, dv = step.q.copy(), previous.v.copy(), previous.dv.copy()
+        start = Snapshot(step.t, q, v, dv, self._driver.drive, self._last_obstacles, self._given_targets(step))
+        is_noisy = is_moving and (self._measured < _MEASURED or self._noise > _NOISE**2)
+        outcome = self._candidates.look(start, not is_noisy)
+        self._last_look, self._expected, self._pending = step.t, outcome.forecast, outcome.decision
+        if outcome.arrives:
+            self._next_look, self._wait = step.t + (period if is_moving else np.inf), period
+        elif outcome.decision is None:
+            self._next_look = step.t + self._wait
+            self._wait = period if is_moving else min(2.0 * self._wait, _LONGEST_WAIT)
+        else:
+            self._wait = period
+
+    def _given_targets(self, step: StepProblem) -> dict[str, Any]:
+        """Return targets that are not those of the tasks' motions, by name."""
+        given = {}
+        for task, target in zip(self._tasks, step.targets, strict=True):
+            planned = task.motion.sample(step.t)
+            a, b = (x.row if isinstance(x, Sample) else x for x in (planned, target))
+            if not np.array_equal(a, b):
+                given[task.settings.label] = target
+        return given
+
+
+def _exclusion(tasks: Sequence[RowTask], law: Solver) -> Reason | None:
+    """Return what excludes forecasts, if anything does."""
+    if not any(isinstance(task, FrameTask) for task in tasks):
+        return Reason.of(ReasonKind.NO_PLAN, "tasks", detail="no frame follows a motion")
+    if isinstance(law, NamedSolver) and law.bounded:
+        return None
+    return Reason.of(ReasonKind.NO_PLAN, "solver", detail=f"{law.label} is neither qp nor hqp")

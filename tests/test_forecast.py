@@ -1,0 +1,148 @@
+"""Forecasts are what the law then does, and change nothing where it arrives; where it does not, a faster drive does."""
+
+import numpy as np
+import pytest
+
+from qpavoid import (
+    Controller,
+    Limits,
+    Obstacle,
+    Sample,
+    Status,
+    build_scene,
+    build_tasks,
+    config,
+    load_scenario,
+    simulate,
+)
+from qpavoid.config import Planning
+from qpavoid.config.control import FastFinish
+from qpavoid.control.scenario import build_parts
+from qpavoid.control.settings import ControlSettings
+from qpavoid.planning.drive import TRACK
+from qpavoid.planning.forecast import Forecaster, Snapshot
+from qpavoid.reason import ReasonKind
+
+TOO_FAR = (0.0, 0.3, 0.0)
+"""Displacement of a target that appears at once [m]: with K = 2/s, 300 exp(-2) = 41 mm are left after a second, with
+5/s, 2 mm."""
+
+
+def forecast(scenario):
+    """Forecast of a scenario from its start, until its end."""
+    parts = build_parts(scenario)
+    bounds = parts.scene.robot.bounds().within(scenario.limits)
+    avoidance = scenario.avoidance.model_copy(update={"backup": not scenario.contacts})
+    settings = ControlSettings(parts.scene, bounds, avoidance, scenario.limits, scenario.dt)
+    forecaster = Forecaster(settings, parts.tasks, parts.contacts, parts.solver, Planning())
+    zero = np.zeros(parts.scene.robot.model.nv)
+    return forecaster.run(Snapshot(0.0, parts.q0, zero, zero, TRACK, {}, {}), scenario.duration)
+
+
+@pytest.mark.parametrize(
+    ("name", "limits"),
+    [
+        ("situation1", Limits()),
+        ("panda_ball", Limits()),
+        ("panda_line", Limits(acceleration=10.0, jerk=500.0)),
+        ("humanoid_reach", Limits()),
+    ],
+)
+def test_forecast_is_what_the_law_does(name, limits):
+    """Bit for bit, with obstacles on known trajectories, jerk limits and contacts."""
+    scenario = load_scenario(name).model_copy(update={"duration": 0.8, "limits": limits})
+    log, ahead = simulate(scenario), forecast(scenario)
+    assert ahead.q.tobytes() == log.q.tobytes()
+    assert ahead.v[1:].tobytes() == log.v[:-1].tobytes()
+
+
+def reaching(panda, **changes):
+    """A controller whose target is 0.3 m away from the start on, with a ball beside it, to be reached in 1.2 s."""
+    motion = config.Line(displacement=TOO_FAR, speed=1e3)
+    task = config.Task(frame="panda_hand_tcp", motion=motion)
+    planning = Planning(**{"settle": 1.2, "lead": 0.1, **changes})
+    scene = build_scene(panda, [Obstacle.at("ball", config.Sphere(radius=0.05), [0.307, 0.4, 0.487])])
+    limits = Limits(acceleration=10.0)
+    return Controller(scene, build_tasks([task], panda, panda.home), limits=limits, planning=planning)
+
+
+def run(controller, q, duration, **arguments):
+    """Positions of the tool (N, 3) and solutions of a loop."""
+    tool, solutions = [], []
+    for k in range(round(duration / controller.dt)):
+        tick = controller.tick(q, k * controller.dt, **arguments)
+        tool.append(tick.kinematics.position[0].copy())
+        solutions.append(tick.solution)
+        q = q + controller.dt * tick.solution.v
+    return np.array(tool), solutions
+
+
+def test_late_law_is_hurried(panda):
+    """The drive begins after its lead, says why, and the tool is there in time."""
+    tool, solutions = run(reaching(panda), panda.home, 1.2)
+    assert np.linalg.norm(tool[0] + TOO_FAR - tool[-1]) < 0.005
+    plans = [solution.plan for solution in solutions]
+    assert not any(plans[:10]) and all(plans[10:])
+    assert plans[10].startswith("fast finish since 0.10 s: the tasks alone would end ")
+    assert all(solution.status is Status.SOLVED for solution in solutions)
+
+
+def test_fast_finish_keeps_limits_and_safety_distance(panda):
+    """Dampers let the tool close faster, and no nearer to the ball than the safety distance."""
+    controller = reaching(panda)
+    nearest, v, q = np.inf, [np.zeros(7)], panda.home
+    for k in range(150):
+        tick = controller.tick(q, k * controller.dt)
+        nearest = min(nearest, tick.problem.avoidance.d.min(initial=np.inf))
+        v.append(tick.solution.v)
+        q = q + controller.dt * tick.solution.v
+    bounds = panda.bounds().within(controller.limits)
+    assert 0.0 < nearest - controller.avoidance.d1 < 1e-3
+    assert (np.abs(np.diff(v, axis=0)) <= bounds.acceleration * controller.dt + 1e-9).all()
+
+
+def test_without_fast_finish_nothing_is_followed(panda):
+    tool, solutions = run(reaching(panda, fast=None), panda.home, 1.2)
+    assert not any(solution.plan for solution in solutions)
+    assert np.linalg.norm(tool[0] + TOO_FAR - tool[-1]) > 0.02
+
+
+def test_where_the_law_arrives_commands_are_those_of_the_law(panda):
+    """Bit for bit: what is forecast changes nothing."""
+    planned, alone = reaching(panda, settle=4.0), reaching(panda, fast=None)
+    _, solutions = run(planned, panda.home, 4.0)
+    _, of_law = run(alone, panda.home, 4.0)
+    assert [solution.v.tobytes() for solution in solutions] == [solution.v.tobytes() for solution in of_law]
+
+
+def test_target_that_jumps_is_looked_at_anew(panda):
+    """A program gives another target: what was forecast is not what comes."""
+    task = config.Task(frame="panda_hand_tcp")
+    controller = Controller(
+        build_scene(panda), build_tasks([task], panda, panda.home), planning=Planning(settle=1.2, lead=0.1)
+    )
+    start = controller.tick(panda.home, 0.0).kinematics.position[0].copy()
+    _, before = run(controller, panda.home, 1.0)
+    goal = Sample.at(start + TOO_FAR, np.diag([1.0, -1.0, -1.0]))
+    solutions = [controller.step(panda.home, 1.0 + 0.01 * k, {"panda_hand_tcp": goal}) for k in range(60)]
+    assert not any(solution.plan for solution in before)
+    assert solutions[-1].plan
+
+
+def test_reset_and_filter_drop_the_plan(panda):
+    controller = reaching(panda)
+    run(controller, panda.home, 0.2)
+    assert controller.step(panda.home, 0.2).plan
+    assert not controller.filter(panda.home, np.zeros(7), 0.21).plan
+    assert not controller.step(panda.home, 0.22).plan
+    controller.reset()
+    assert not controller.step(panda.home, 0.0).plan
+
+
+def test_excluded_laws_are_named(panda):
+    tasks = build_tasks([config.Task(frame="panda_hand_tcp")], panda, panda.home)
+    controller = Controller(build_scene(panda), tasks, "eq10", planning=Planning())
+    (reason,) = controller.step(panda.home).assumptions
+    assert (reason.kind, reason.subject) == (ReasonKind.NO_PLAN, ("solver",))
+    controller = Controller(build_scene(panda), (), "qp", planning=Planning(fast=FastFinish(gain=3.0)))
+    assert controller.step(panda.home).assumptions[0].subject == ("tasks",)
