@@ -271,7 +271,7 @@ class Solution(NamedTuple):
 
     def with_times(self, build_time: float, solve_time: float) -> Solution:
         """Return the solution with its times [s]; see the fields."""
-        return Solution(*self[:-2], build_time, solve_time)  # a third of the time of `_replace`
+        return tuple.__new__(Solution, (*self[:-2], build_time, solve_time))  # a fifth of the time of `_replace`
 
 
 def as_numbers(name: str, value: Any) -> Array:

@@ -88,6 +88,8 @@ class RowAssembler:
         self._finds_pairs = self._forward.is_compiled and not self.query.has_clouds
         self.q: Array = scene.robot.home.copy()
         """Configuration (nq,) of the last step."""
+        self.v = x.v
+        """Velocity (nv,) that may be commanded, where `compute` says so; the next step overwrites it."""
         self._follows_tasks = True
         self._contact_rows: Contacts | None = None
         self._find = kernels.direct(kernels.find_near_pairs, self._packed, self.q)
@@ -151,24 +153,34 @@ class RowAssembler:
         Returns:
             Whether `v` is what the law and the stop look-ahead lead to; else they have to see `problem`.
         """
-        x, query, from_tasks, self._follows_tasks = self._layout, self.query, v_desired is None, v_desired is None
+        x, from_tasks, self._follows_tasks = self._layout, v_desired is None, v_desired is None
         self.q[:] = q  # the code takes q as it is: in one piece, and writeable
         if v_desired is not None:
             x.v_tracking[:] = v_desired
-        code, moving = TO_MEASURE, query.is_moving
         if self._is_compiled:
+            moving = self.query.is_moving
             code = self._step(self._packed, self.q, self.influence_distance, moving, from_tasks, False)
             if code != TO_MEASURE:
                 return code == SETTLED
-            query.finish()
-        else:
-            self._measure()
-            if from_tasks and self.task_errors.size:
-                self._task_rows.write(q, self._forward, targets[len(self.targets) :])
-            if self._contacts is not None:
-                self._contact_rows = held = self._contacts.update(self._forward)
-                x.v_prev[:] = held.project(x.v_prev)
-        code = self._step(self._packed, self.q, self.influence_distance, moving, from_tasks, True)
+            self.query.finish()
+            return self._finish()
+        self._measure()
+        if from_tasks and self.task_errors.size:
+            self._task_rows.write(q, self._forward, targets[len(self.targets) :])
+        if self._contacts is not None:
+            self._contact_rows = held = self._contacts.update(self._forward)
+            x.v_prev[:] = held.project(x.v_prev)
+        return self._finish()
+
+    def follow(self, v_desired: Array) -> bool:
+        """Follow a velocity (nv,) in place of the tasks in the last step after all; return what `compute` does."""
+        self._follows_tasks, self._layout.v_tracking[:] = False, v_desired
+        return self._finish()
+
+    def _finish(self) -> bool:
+        """Compute a step whose kinematics and distances are up to date."""
+        arguments = self.query.is_moving, self._follows_tasks, True
+        code = self._step(self._packed, self.q, self.influence_distance, *arguments)
         if self._contact_rows is not None:
             self._hold(self._contact_rows)
         return code == SETTLED
@@ -181,11 +193,6 @@ class RowAssembler:
         else:
             self._forward.compute(self.q)
             self.query.compute(self._forward.joint_poses, self.influence_distance)
-
-    @property
-    def v(self) -> Array:
-        """Velocity (nv,) that may be commanded, where `compute` says so; the next step overwrites it."""
-        return self._layout.v
 
     @property
     def position_margin(self) -> float:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -25,8 +26,9 @@ from qpavoid.problem import Array
 from qpavoid.reason import Reason
 
 
-class StepProblem(NamedTuple):
-    """What a control step was made of, and how far it came; its problem is that of `RowAssembler`."""
+@dataclass(slots=True)
+class StepProblem:
+    """What a control step was made of, and how far it came, until the next one; its problem is in `RowAssembler`."""
 
     q: Array
     """(nq,) where the robot is when it follows the command."""
@@ -51,9 +53,10 @@ class ProblemBuilder:
         scene, bounds, dt = settings.scene, settings.bounds, settings.dt
         model, names = scene.robot.model, scene.robot.coordinate_units
         self._model, self._bounds, self._dt, self._latency = model, bounds, dt, settings.latency
-        self._q_last, self._q_predicted = scene.robot.home.copy(), scene.robot.home.copy()
         self._under_way = CommandsUnderWay(model.nv, settings.latency, dt)
         self.rows = RowAssembler(settings, tasks, contacts)
+        self._q_last = self.rows.q.copy() if settings.latency else self.rows.q
+        self._step = StepProblem(self.rows.q, 0.0, False, (), False, (), ())
         self.tracker = ObstacleTracker(scene.slots, settings.sensing, dt, settings.latency)
         self.attachments = Attachments(scene, self.rows.query, settings.safety_distance)
         self.slots = ObstacleSlots(scene, self.rows.query, self.tracker, self.attachments)
@@ -77,7 +80,8 @@ class ProblemBuilder:
             self._restart(np.zeros(self._model.nv) if v is None else v)
         elif times.periods > 1:
             self._under_way.add(rows.previous.v, times.periods - 1)
-        q = self._predict(q)
+        if q is None or self._latency:
+            q = self._predict(q)
         self._clock.set(times.t)
         if update is not None:
             observed = self.tracker.advance(update)
@@ -88,8 +92,10 @@ class ProblemBuilder:
             self.attachments.update()
         if not is_settled and rows.position_margin < -OUTSIDE:
             assumptions += self._bounds.outside(q, rows.joint_names, rows.joint_units)
-        t = times.t + self._latency
-        return StepProblem(q, t, times.resumed, targets, is_settled, faults, assumptions)
+        step = self._step
+        step.q, step.t, step.resumed, step.targets = rows.q, times.t + self._latency, times.resumed, targets
+        step.is_settled, step.faults, step.assumptions = is_settled, faults, assumptions
+        return step
 
     def _predict(self, q: Array | None) -> Array:
         """Return where the robot is when it follows this step's command, if it follows those under way until then.
@@ -97,18 +103,20 @@ class ProblemBuilder:
         Args:
             q: as measured (nq,); None where it is unknown: it moved as commanded.
         """
+        model, latency, displacement = self._model, self._latency, self._under_way.displacement
         if q is None:
-            predicted = np.asarray(pin.integrate(self._model, self._q_predicted, self._dt * self.rows.previous.v))
-            q = pin.integrate(self._model, predicted, -self._under_way.displacement) if self._latency else predicted
+            predicted = np.asarray(pin.integrate(model, self.rows.q, self._dt * self.rows.previous.v))
+            q = pin.integrate(model, predicted, -displacement) if latency else predicted
         else:
-            predicted = pin.integrate(self._model, q, self._under_way.displacement) if self._latency else q
-        self._q_last[:], self._q_predicted[:] = q, predicted
+            predicted = pin.integrate(model, q, displacement) if latency else q
+        self._q_last[:] = q
         return predicted
 
     def remember(self, v: Array) -> None:
         """Take v (nv,) as what is commanded from this step to the next one."""
         self.rows.previous.remember(v)
-        self._under_way.add(v)
+        if self._latency:
+            self._under_way.add(v)
 
     def _restart(self, v: Array) -> None:
         """Take the robot to have been moving at v (nv,), as commanded."""

@@ -35,7 +35,8 @@ class Arbiter:
         self, settings: ControlSettings, solver: Solver, rows: RowAssembler, obstacles: ObstacleTracker
     ) -> None:
         """Build the checks, each with memory of its own."""
-        self._settings, self.solver, self._rows = settings, solver, rows
+        self._settings, self.solver, self._rows, self._obstacles = settings, solver, rows, obstacles
+        self._reports_limits = rows.previous.needs_report
         self._v_shape = (settings.scene.robot.model.nv,)
         self._braking = BrakingCheck(settings, rows, obstacles)
         self.progress, self._shake_damping = ProgressMonitor(settings, rows), ShakeDamping(settings.dt)
@@ -69,7 +70,7 @@ class Arbiter:
             from_tasks: whether the step is of the tasks, whose progress is monitored; else of a given velocity.
         """
         rows, problem, damping = self._rows, None, self._shake_damping
-        if is_settled and not damping.is_active:
+        if is_settled and damping.factor == 1.0:
             solution = Solution(rows.v.copy())
         else:
             problem = rows.problem()
@@ -80,19 +81,18 @@ class Arbiter:
             solution = self._solve(q, problem, rows.proximity(), from_tasks)
         if from_tasks:
             stalled = self.progress.update(problem, solution)
-            if stalled:
-                solution = solution._replace(stalled=stalled)
-            if stalled or damping.is_active:
+            if stalled or not damping.is_idle:
                 damping.update(solution.v, rows.proximity().feedforward, bool(stalled))
-            else:
-                damping.pause()
-        if self.backup is not None and self.solver.bounded:
-            solution = self._ensure_backup(self.backup, q, t, solution)
-        return self._report_limits(solution)
+            solution = solution._replace(stalled=stalled) if stalled else solution
+        backup = self.backup
+        if backup is not None and self.solver.bounded and (backup.is_active or len(self._obstacles.moving)):
+            solution = self._ensure_backup(backup, q, t, solution)
+        return self._report_limits(solution) if self._reports_limits else solution
 
     def stop(self, reasons: tuple[Reason, ...]) -> Solution:
         """Return the stop of this control step, with its reasons."""
-        return self._report_limits(_stop(self._rows.problem(), reasons))
+        solution = _stop(self._rows.problem(), reasons)
+        return self._report_limits(solution) if self._reports_limits else solution
 
     def _solve(self, q: Array, problem: Problem, proximity: Proximity, from_tasks: bool) -> Solution:
         """Return the solution within the limits, after the stop look-ahead."""
@@ -176,7 +176,7 @@ class Arbiter:
 
         They do after a relaxed control step, before a position or velocity limit, and to hold contacts.
         """
-        if not (self._rows.previous.needs_report and self.solver.bounded):
+        if not self.solver.bounded:
             return solution
         names, units = self._rows.joint_names, self._rows.joint_units
         kinds = (ReasonKind.ACCELERATION_RELAXED, ReasonKind.JERK_RELAXED)
