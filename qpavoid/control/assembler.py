@@ -168,8 +168,8 @@ class RowAssembler:
         if from_tasks and self.task_errors.size:
             self._task_rows.write(q, self._forward, targets[len(self.targets) :])
         if self._contacts is not None:
-            self._contact_rows = held = self._contacts.update(self._forward)
-            x.v_prev[:] = held.project(x.v_prev)
+            self._contact_rows = resting = self._contacts.update(self._forward)
+            x.v_prev[:] = resting.project(x.v_prev)
         return self._finish()
 
     def follow(self, v_desired: Array) -> bool:

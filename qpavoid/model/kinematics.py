@@ -115,9 +115,11 @@ class ForwardKinematics:
 
     @cached_property
     def _masses(self) -> tuple[Array, Array]:
-        """(njoints,) masses, and (njoints, 3) their centres in their joints [kg, m]."""
+        """(njoints,) masses, 0 of what is fixed to the world, and (njoints, 3) their centres in their joints [kg, m]."""
         inertias = list(self._model.inertias)
-        return np.array([body.mass for body in inertias]), np.array([body.lever for body in inertias])
+        masses = np.array([body.mass for body in inertias])
+        masses[0] = 0.0
+        return masses, np.array([body.lever for body in inertias])
 
     def center_of_mass(self) -> tuple[Array, Array]:
         """Return the centre of mass (3,), world [m], and its Jacobian (3, nv).
