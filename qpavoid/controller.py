@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from dataclasses import replace
+from functools import partial
 from time import perf_counter
 from typing import Any, NoReturn
 
@@ -18,6 +20,7 @@ from qpavoid.control.inputs import LARGEST_VELOCITY, check_velocity
 from qpavoid.control.scenario import build_parts
 from qpavoid.control.scene_changes import SceneChanges
 from qpavoid.control.settings import ControlSettings
+from qpavoid.control.split_step import SplitStep
 from qpavoid.control.tasks import RowTask, in_order
 from qpavoid.control.tick import Tick, copied
 from qpavoid.errors import ConfigError, NumericalError, located
@@ -27,6 +30,7 @@ from qpavoid.problem import Array, Solution, State, as_vector, require_finite
 from qpavoid.reason import Reason, ReasonKind
 from qpavoid.safety.arbiter import Arbiter
 from qpavoid.solvers import Solver, check_solver, make_solver
+from qpavoid.solvers.solver import NamedSolver
 
 _MAX_DT = 1.0
 """Largest control period that is accepted [s]: a longer one is in milliseconds."""
@@ -39,7 +43,7 @@ _NO_BACKUP_WITH_CONTACTS = Reason.of(
 _WARM_UP = "a passing obstacle, to warm up"
 
 
-class Controller(SceneChanges):
+class Controller(SceneChanges, SplitStep):
     """Follows its tasks and keeps clear of everything in its scene."""
 
     def __init__(
@@ -80,6 +84,10 @@ class Controller(SceneChanges):
             raise ConfigError(f"dt: {dt} s, expected more than 0 and at most {_MAX_DT}; it is in seconds")
         if not 0.0 <= latency <= MAX_LATENCY:
             raise ConfigError(f"latency: {latency} s, expected 0 to {MAX_LATENCY}; it is in seconds")
+        self._another = partial(
+            type(self), tasks=tasks, dt=dt, avoidance=avoidance, limits=limits, sensing=sensing, progress=progress,
+            contacts=contacts, latency=latency, planning=planning,
+        )  # fmt: skip
         frames, others = in_order(tasks)
         self.scene = scene = scene.own_copy() if scene.spare else scene
         """Robot and obstacles, those that were added among them."""
@@ -130,6 +138,9 @@ class Controller(SceneChanges):
         self._arbiter.solver = make_solver("qp")
         self.tick(q)
         self.filter(q, v)
+        self.rows(q)
+        self.rows(q)
+        self.command(v)
         self._builder.rows.clearance_lower_bound(v, 0, self.dt)
         self._builder.rows.leaves_position_limits(q, v, self.dt)
         self._arbiter.warm_up(q)
@@ -299,10 +310,25 @@ class Controller(SceneChanges):
         if self._planning is not None:
             self._planning.change_scene(method, *arguments)
 
+    def clone(self) -> Controller:
+        """Return another controller that does the same, in memory of its own: for another thread, or to look ahead.
+
+        It has the scene, with what was added and is attached, and all settings; it is as after `reset`. Tasks are
+        shared, since they remember nothing; a law of your own is deep-copied.
+        """
+        law = self.solver
+        own = make_solver(law.config) if isinstance(law, NamedSolver) else deepcopy(law)
+        controller = self._another(self.scene.emptied(), solver=own)
+        controller.take_over(self)
+        return controller
+
     def __reduce_ex__(self, protocol: Any) -> NoReturn:
         """Refuse to be copied or pickled: a copy would share memory that coal and compiled code look into.
 
         Raises:
             TypeError: always.
         """
-        raise TypeError("a Controller is neither copied nor pickled; build another one of its scene and tasks")
+        raise TypeError(
+            "a Controller is neither copied nor pickled; `clone()` gives another one, and in another process build "
+            "another one of its scenario, or of its scene and tasks"
+        )

@@ -1,6 +1,8 @@
 """Robots, random scenes and finite differences shared by the tests."""
 
+import ctypes.util
 import functools
+import os
 import sys
 import warnings
 
@@ -25,6 +27,8 @@ from qpavoid.model.notes import RobotWarning
 from qpavoid.model.trajectory import build_motion
 from qpavoid.problem import Proximity
 
+# MuJoCo reads it when it is imported; pictures need no display
+os.environ.setdefault("MUJOCO_GL", "osmesa" if ctypes.util.find_library("OSMesa") else "egl")
 settings.register_profile("patient", deadline=None)  # the first call of a compiled function may wait for the compiler
 settings.load_profile("patient")
 

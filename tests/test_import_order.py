@@ -25,7 +25,8 @@ FOR_BENCHMARKS = {
 
 LEVELS = (
     ("errors", "reason"), ("config", "problem"), ("kernels", "geometry"), ("solvers", "model"), ("control",),
-    ("safety",), ("planning",), ("controller",), ("run",), ("viz",), ("setup",), ("cli",), ("__main__",),
+    ("safety",), ("planning",), ("controller",), ("run",), ("viz", "perception"), ("setup", "adapters"),
+    ("cli",), ("__main__",),
 )  # fmt: skip
 """Rooms (folders, and modules beside them) from the bottom up; those of one level do not know each other."""
 LEVEL = {room: level for level, rooms in enumerate(LEVELS) for room in rooms}

@@ -437,7 +437,7 @@ def test_solver_answer_of_the_wrong_kind_is_a_stop(panda, answer):
 def test_controller_is_neither_copied_nor_pickled(panda):
     controller = make_controller(panda, [BALL], TOOL)
     for way in (copy.copy, copy.deepcopy, pickle.dumps):
-        with pytest.raises(TypeError, match="build another one"):
+        with pytest.raises(TypeError, match=r"`clone\(\)` gives another one"):
             way(controller)
 
 

@@ -108,6 +108,11 @@ class Attachments:
         self._allowed[chosen] = allowed
         self._update()
 
+    def take_over(self, other: Attachments) -> None:
+        """Ignore the pairs that touch or may touch in another controller of the same scene."""
+        self._touching, self._allowed = other._touching.copy(), other._allowed.copy()
+        self._update()
+
     def forget(self, index: int) -> None:
         """Forget what touched an obstacle, or was allowed to."""
         own = self._table.pairs_of(index)

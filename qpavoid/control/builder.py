@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from threading import get_ident
 from typing import Any
 
 import numpy as np
@@ -66,14 +67,27 @@ class ProblemBuilder:
         self._targets = TargetReader(tasks, self.rows.targets, settings.latency)
         shapes = (model.nq,), (model.nv,)
         self._reader = ArgumentReader(shapes, self._clock, self._configurations, self._targets, self.tracker)
+        self._thread: int | None = None
+        self.begun: StepProblem | None = None
+        """Step whose command is not known yet."""
 
     def read(self, q: Any, t: Any, targets: Any, obstacles: Any, v: Any, v_desired: Any = None) -> Arguments:
         """Check the arguments of a step, see `Controller.step`: whatever raises does so here, and changes nothing."""
         return self._reader.read(q, t, targets, obstacles, v, v_desired)
 
     def build(self, arguments: Arguments) -> StepProblem:
-        """Take over the arguments of a step, and build its problem."""
+        """Take over the arguments of a step, and build its problem.
+
+        Raises:
+            RuntimeError: another thread is in the middle of a step.
+        """
+        if self._thread not in (None, thread := get_ident()):
+            raise RuntimeError("a Controller is used by two threads at once; give each one of its own: `clone()`")
+        self._thread = thread
         times, q, v, v_desired, targets, update, faults, assumptions = arguments
+        if self.begun is not None and q is not None:  # nothing is known of what was commanded then
+            self.rows.previous.remember(pin.difference(self._model, self._q_last, q) / (times.periods * self._dt))
+            self._under_way.add(self.rows.previous.v)
         self._targets.last = targets
         rows, query = self.rows, self.rows.query
         if times.resumed or (v is not None and self._clock.is_first):
@@ -92,7 +106,7 @@ class ProblemBuilder:
             self.attachments.update()
         if not is_settled and rows.position_margin < -OUTSIDE:
             assumptions += self._bounds.outside(q, rows.joint_names, rows.joint_units)
-        step = self._step
+        step = self.begun = self._step
         step.q, step.t, step.resumed, step.targets = rows.q, times.t + self._latency, times.resumed, targets
         step.is_settled, step.faults, step.assumptions = is_settled, faults, assumptions
         return step
@@ -117,16 +131,17 @@ class ProblemBuilder:
         self.rows.previous.remember(v)
         if self._latency:
             self._under_way.add(v)
+        self.begun, self._thread = None, None
 
     def _restart(self, v: Array) -> None:
         """Take the robot to have been moving at v (nv,), as commanded."""
         self.rows.previous.restart(v)
         self._under_way.fill(v)
 
-    def attach(self, index: int, frame_id: int, q: Array | None) -> Array:
-        """Attach an obstacle to a frame, and return q; see `Controller.attach`."""
+    def attach(self, index: int, frame_id: int, q: Array | None, pose: Sample | None = None) -> Array:
+        """Attach an obstacle to a frame, at its pose unless one is given, and return q; see `Controller.attach`."""
         q = self._given_or_last(q)
-        self.attachments.attach(index, frame_id, q, self._pose(index, q))
+        self.attachments.attach(index, frame_id, q, pose or self._pose(index, q))
         self.tracker.attach(index)
         self._place_attachment(index, q)
         return q
@@ -164,6 +179,7 @@ class ProblemBuilder:
     def reset(self, v: Array) -> None:
         """Forget the steps before; the robot moves at v (nv,). Attached objects stay attached."""
         self._restart(v)
+        self.begun, self._thread = None, None
         self._clock.reset()
         self._targets.last = ()
         self.tracker.reset()

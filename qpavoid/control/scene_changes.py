@@ -131,6 +131,16 @@ class SceneChanges:
         """Return the world pose of an obstacle in the last step, attached or not; see `release`."""
         return self._builder.pose(self._builder.tracker.index(obstacle), q)
 
+    def take_over(self, other: SceneChanges) -> None:
+        """Add, attach and allow what another controller of the same scene has; see `clone`."""
+        self._builder.slots.take_over(other.scene)
+        home, model = self.scene.robot.home, self.scene.robot.model
+        for name, joint in other.attached.items():
+            frame_id = model.getFrameId(model.names[joint])
+            self._builder.attach(other._builder.tracker.index(name), frame_id, home, other.obstacle_pose(name, home))
+        self._builder.attachments.take_over(other._builder.attachments)
+        self._scene_changed("take_over", other)
+
     def distances(self) -> DistanceQuery:
         """Return distances of the scene in memory of their own, which know what is attached to the robot."""
         return DistanceQuery(self.scene, self._builder.rows.query.table)

@@ -59,6 +59,12 @@ class ObstacleSlots:
             raise ConfigError(f"remove_obstacle: {name!r} is attached to the robot; release it first")
         self._put(index, None, spare_solid())
 
+    def take_over(self, scene: Scene) -> None:
+        """Put what is in the slots of another scene into the same slots, which are empty."""
+        for index in scene.spare:
+            if scene.slots[index].name:
+                self._put(index, scene.slots[index], _solid(scene.slots[index]))
+
     def _put(self, index: int, obstacle: Obstacle | None, solid: Any) -> None:
         """Change what is in a slot, everywhere."""
         name = self._scene.slots[index].name

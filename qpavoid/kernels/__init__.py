@@ -18,6 +18,7 @@ from qpavoid.kernels.clearance import (
     joint_speeds,
     leaves_position_limits,
 )
+from qpavoid.kernels.depth import CellGrid, OwnBodies, fill_cells, mark_own_pixels, recall_cells
 from qpavoid.kernels.estimates import (
     are_fine,
     extrapolate_estimates,
@@ -56,8 +57,10 @@ __all__ = [
     "TOLERANCE",
     "TO_MEASURE",
     "ApproachArrays",
+    "CellGrid",
     "DistanceArrays",
     "KinematicsArrays",
+    "OwnBodies",
     "Pieces",
     "Prediction",
     "RampLimits",
@@ -82,6 +85,7 @@ __all__ = [
     "extend_paths",
     "extrapolate_estimates",
     "extrapolate_states",
+    "fill_cells",
     "find_near_pairs",
     "first_use",
     "follow_ramp",
@@ -90,6 +94,7 @@ __all__ = [
     "jerk_limited_stop",
     "joint_speeds",
     "leaves_position_limits",
+    "mark_own_pixels",
     "max_clearance_velocity",
     "max_offset",
     "minimize",
@@ -102,6 +107,7 @@ __all__ = [
     "project",
     "project_soft",
     "projection_cost",
+    "recall_cells",
     "roll_out_stop",
     "rollout_outcome",
     "rotation_vector",

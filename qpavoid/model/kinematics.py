@@ -115,7 +115,7 @@ class ForwardKinematics:
 
     @cached_property
     def _masses(self) -> tuple[Array, Array]:
-        """(njoints,) masses, 0 of what is fixed to the world, and (njoints, 3) their centres in their joints [kg, m]."""
+        """(njoints,) masses, 0 of what never moves, and (njoints, 3) their centres in their joints [kg, m]."""
         inertias = list(self._model.inertias)
         masses = np.array([body.mass for body in inertias])
         masses[0] = 0.0

@@ -234,7 +234,7 @@ class Robot:
         )
         return replace(joint_bounds(self.model), acceleration=acceleration, jerk=jerk)
 
-    def configuration(self, values: Sequence[float] | Mapping[str, float], where: str) -> Array:
+    def configuration(self, values: Sequence[float] | Mapping[str, float], where: str = "q") -> Array:
         """Return the full configuration (nq,) of a scenario's `q0`.
 
         Args:

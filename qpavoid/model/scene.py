@@ -129,6 +129,14 @@ class Scene:
         """Return the same scene with slots of its own."""
         return replace(self, slots=list(self.slots), geometry=pin.GeometryModel(self.geometry))
 
+    def emptied(self) -> Scene:
+        """Return the same scene with nothing in its spare slots."""
+        scene = self.own_copy()
+        for number in scene.spare:
+            if scene.slots[number].name:
+                scene.put(number, None, spare_solid())
+        return scene
+
     def put(self, number: int, obstacle: Obstacle | None, solid: Any) -> None:
         """Put an obstacle with a coal geometry into a spare slot, or none."""
         geometry = int(np.flatnonzero(self.obstacle_of == number)[0])
