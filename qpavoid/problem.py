@@ -269,9 +269,17 @@ class Solution(NamedTuple):
         status = self.status if self.status is Status.STOPPED else Status.RELAXED
         return self._replace(status=status, reasons=(*self.reasons, *reasons))
 
+    @classmethod
+    def solved(cls, v: Array) -> Solution:
+        """Return `Solution(v)`, in half of the time."""
+        return tuple.__new__(cls, (v, *_DEFAULTS))
+
     def with_times(self, build_time: float, solve_time: float) -> Solution:
         """Return the solution with its times [s]; see the fields."""
         return tuple.__new__(Solution, (*self[:-2], build_time, solve_time))  # a fifth of the time of `_replace`
+
+
+_DEFAULTS = Solution(np.zeros(0))[1:]
 
 
 def as_numbers(name: str, value: Any) -> Array:

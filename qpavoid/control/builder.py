@@ -66,14 +66,12 @@ class ProblemBuilder:
         self._configurations = Configurations(model, bounds.q_index, bounds.lower, bounds.upper, units)
         self._targets = TargetReader(tasks, self.rows.targets, settings.latency)
         shapes = (model.nq,), (model.nv,)
-        self._reader = ArgumentReader(shapes, self._clock, self._configurations, self._targets, self.tracker)
+        reader = ArgumentReader(shapes, self._clock, self._configurations, self._targets, self.tracker)
+        self.read = reader.read
+        """Check the arguments of a step, see `Controller.step`: whatever raises does so here, and changes nothing."""
         self._thread: int | None = None
         self.begun: StepProblem | None = None
         """Step whose command is not known yet."""
-
-    def read(self, q: Any, t: Any, targets: Any, obstacles: Any, v: Any, v_desired: Any = None) -> Arguments:
-        """Check the arguments of a step, see `Controller.step`: whatever raises does so here, and changes nothing."""
-        return self._reader.read(q, t, targets, obstacles, v, v_desired)
 
     def build(self, arguments: Arguments) -> StepProblem:
         """Take over the arguments of a step, and build its problem.

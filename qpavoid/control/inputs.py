@@ -159,6 +159,8 @@ class Configurations:
             q: configuration (nq,).
         """
         size = hypot(*q.tolist())
+        if size <= self._small and not self._units_of_length_1:
+            return q, (), ()
         faults = () if size <= self._small else self._faults(name, q, size)
         notes: tuple[Reason, ...] = ()
         if not faults:

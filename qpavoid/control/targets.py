@@ -43,7 +43,7 @@ class TargetReader:
         if len(self._tasks) < len(tasks):
             raise ConfigError(f"tasks: two have the same name among {', '.join(self._tasks)}; give one a `name`")
         self._names, self._frames, self._latency = list(self._tasks), frames, latency
-        self._rows = list(frames)
+        self._named_rows = list(zip(self._names, frames, strict=False))
         self._motions: list[Any] = [task.motion for task in tasks]
         self._is_still = all(type(motion) is Trajectory and motion.is_still for motion in self._motions[: len(frames)])
         self.last: Sequence[Any] = ()
@@ -75,12 +75,14 @@ class TargetReader:
             return samples, (), ()
         self._is_written = False
         if self._takes_samples and len(targets) == len(self._names):
-            samples = [targets.get(name) for name in self._names]
-            for sample in samples:
+            samples = []
+            for name, row in self._named_rows:
+                sample = targets.get(name)
                 if type(sample) is not Sample:
                     break
+                row[:] = sample.row
+                samples.append(sample)
             else:
-                self._write(samples)
                 if self._are_fine(self._frames, FARTHEST, FASTEST):
                     return samples, (), ()
         return self._read_each(t, targets)
@@ -98,7 +100,7 @@ class TargetReader:
 
     def _write(self, samples: Sequence[Any]) -> None:
         """Write the states of the frame tasks."""
-        for row, sample in zip(self._rows, samples, strict=False):
+        for (_, row), sample in zip(self._named_rows, samples, strict=False):
             row[:] = sample.row
 
     def _read_each(self, t: float, targets: Mapping[str, Any]) -> Targets:

@@ -71,7 +71,7 @@ class Arbiter:
         """
         rows, problem, damping = self._rows, None, self._shake_damping
         if is_settled and damping.factor == 1.0:
-            solution = Solution(rows.v.copy())
+            solution = Solution.solved(rows.v.copy())
         else:
             problem = rows.problem()
             if from_tasks:
