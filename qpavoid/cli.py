@@ -1,4 +1,4 @@
-"""Command line: `qpavoid list | run | compare | view | render | fields | robot | bench`.
+"""Command line: `qpavoid list | run | compare | view | render | serve | fields | robot | bench`.
 
 Exit status: 0 done, 1 a run ended in a defined failure (collision, safe stop, broken off), 2 bad input.
 """
@@ -29,6 +29,7 @@ from qpavoid.run.log import Log
 from qpavoid.run.report import events, failed, metrics_table, to_json
 from qpavoid.run.simulate import simulate
 from qpavoid.run.terminal import ERR, OUT, names_of, progress, terminate_like_interrupt
+from qpavoid.service import commands as service_commands
 from qpavoid.setup import commands as robot_commands
 from qpavoid.solvers import SOLVERS, backend_names
 from qpavoid.viz import commands as view_commands
@@ -42,6 +43,7 @@ app = typer.Typer(
 app.add_typer(robot_commands.app, name="robot")
 app.command("view")(view_commands.view)
 app.command("render")(view_commands.render)
+app.command("serve")(service_commands.serve)
 
 Sets = Annotated[
     list[str] | None, typer.Option("--set", metavar="PATH=VALUE", help="Override a field: avoidance.d2=0.30")

@@ -25,7 +25,7 @@ FOR_BENCHMARKS = {
 
 LEVELS = (
     ("errors", "reason"), ("config", "problem"), ("kernels", "geometry"), ("solvers", "model"), ("control",),
-    ("safety",), ("planning",), ("controller",), ("run",), ("viz", "perception"), ("setup", "adapters"),
+    ("safety",), ("planning",), ("controller",), ("run",), ("viz", "perception", "service"), ("setup", "adapters"),
     ("cli",), ("__main__",),
 )  # fmt: skip
 """Rooms (folders, and modules beside them) from the bottom up; those of one level do not know each other."""

@@ -1,4 +1,4 @@
-"""Command line: `qpavoid bench run | smoke | report | show | list | tick | solvers | endurance | robots | grasps`.
+"""`qpavoid bench run | smoke | report | show | list | tick | solvers | endurance | robots | grasps | serve`.
 
 Dependencies of a command are imported when it runs.
 """
@@ -19,6 +19,7 @@ from qpavoid.run.report import to_json
 from qpavoid.run.terminal import ERR, OUT, names_of, progress, terminate_like_interrupt
 from qpavoid_bench.endurance.command import endurance
 from qpavoid_bench.grasps.command import grasps
+from qpavoid_bench.serve import serve
 from qpavoid_bench.solvers.command import solvers
 from qpavoid_bench.survey import robots
 from qpavoid_bench.tick.command import tick
@@ -41,8 +42,9 @@ app.command()(tick)
 app.command()(solvers)
 app.command()(endurance)
 app.command()(robots)
+app.command()(serve)
 app.command()(grasps)
-_MEASURES = ("tick", "solvers", "endurance", "robots", "grasps")
+_MEASURES = ("tick", "solvers", "endurance", "robots", "grasps", "serve")
 """Commands that need none of the packages below."""
 
 _PACKAGES = ("distributed", "mujoco", "pandas", "statsmodels", "matplotlib")

@@ -1,0 +1,1 @@
+"""The controller as a service, for programs in other processes and languages."""

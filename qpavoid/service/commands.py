@@ -1,0 +1,45 @@
+"""The command `qpavoid serve`."""
+
+from __future__ import annotations
+
+import gc
+from typing import Annotated
+
+import typer
+
+from qpavoid.config.loading import load_scenario
+from qpavoid.controller import Controller
+from qpavoid.errors import ConfigError
+from qpavoid.run.terminal import ERR, OUT, terminate_like_interrupt
+
+_LOOPBACK = ("127.", "localhost", "[::1]")
+
+
+def serve(
+    scenario: Annotated[str, typer.Argument(help="Shipped name or path of a YAML file.")],
+    solver: Annotated[str | None, typer.Option(help="Such as eq10 or qp:proxqp; as in the file if left out.")] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", metavar="PATH=VALUE", help="Override a field: avoidance.d2=0.30")
+    ] = None,
+    heartbeat: Annotated[float, typer.Option(help="Time without a step after which the robot is stopped [s].")] = 0.1,
+    port: Annotated[int, typer.Option(min=0, max=65534, help="Of requests; the next one has the commands.")] = 5570,
+    host: Annotated[str, typer.Option(help="Address to be reached at; who reaches it moves the robot.")] = "127.0.0.1",
+) -> None:
+    """Answer control steps of other programs, over ZeroMQ and msgpack. Ctrl-C stops the robot and ends it."""
+    try:
+        from qpavoid.service.server import Service
+    except ModuleNotFoundError as missing:
+        if missing.name not in ("zmq", "msgpack"):
+            raise
+        raise ConfigError("qpavoid serve needs pyzmq and msgpack: pip install 'qpavoid[serve]'") from None
+    controller, q0 = Controller.from_scenario(load_scenario(scenario, set_ or (), solver))
+    service = Service(controller, q0, heartbeat, host, port)
+    if not host.startswith(_LOOPBACK):
+        ERR.print(f"{host}: there is no password: who reaches this port moves the robot", highlight=False)
+    gc.collect()
+    gc.freeze()  # what was imported is not walked through in the middle of the loop
+    addresses = f"steps: {service.endpoint}, commands: {service.commands_endpoint}"
+    OUT.print(f"serving {scenario}: {addresses}", highlight=False, soft_wrap=True, markup=False)
+    with terminate_like_interrupt():
+        service.run()
+    service.close()
