@@ -250,9 +250,9 @@ class Solution(NamedTuple):
     plan: str = ""
     """Plan that is followed in place of the tasks alone, and why, in a sentence; empty without one."""
     build_time: float = 0.0
-    """Time to read the state and set up the problem [s]."""
+    """Time to read the state and set up the problem [s]; of `qp` with the QP, where both are one compiled call."""
     solve_time: float = 0.0
-    """Time to solve it, look-ahead included [s]."""
+    """Time to solve it, look-ahead included, as far as it was not done yet [s]."""
 
     @property
     def severity(self) -> Severity | None:
