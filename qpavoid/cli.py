@@ -1,4 +1,4 @@
-"""Command line: `qpavoid list | run | compare | view | render | serve | fields | robot | bench`.
+"""Command line: `qpavoid list | run | compare | view | render | serve | warmup | fields | robot | bench`.
 
 Exit status: 0 done, 1 a run ended in a defined failure (collision, safe stop, broken off), 2 bad input.
 """
@@ -13,6 +13,7 @@ from importlib.metadata import version
 from json import dumps
 from pathlib import Path
 from textwrap import wrap
+from time import perf_counter
 from typing import Annotated, Any
 
 import typer
@@ -25,6 +26,7 @@ from qpavoid.config.loading import load_scenario
 from qpavoid.config.shipped import shipped_names
 from qpavoid.controller import Controller
 from qpavoid.errors import ConfigError, QpavoidError
+from qpavoid.kernels.cache import FOLDER
 from qpavoid.run.log import Log
 from qpavoid.run.report import events, failed, metrics_table, to_json
 from qpavoid.run.simulate import simulate
@@ -177,6 +179,25 @@ def fields_(
     else:
         root = ScenarioConfig if schema is Schema.scenario else RobotConfig
         print(dumps(schema_of(root), indent=2))
+
+
+@app.command()
+def warmup(
+    scenarios: Annotated[
+        list[str] | None, typer.Argument(help="Shipped names or paths of YAML files; all that ship if left out.")
+    ] = None,
+) -> None:
+    """Compile what steps of some scenarios need, for an image, or before a test: no later start on it compiles."""
+    begin, configs = perf_counter(), [load_scenario(name) for name in scenarios or shipped_names("scenario")]
+    with progress() as bar:
+        task = bar.add_task("warmup", total=len(configs))
+        for config in configs:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # a run of the scenario warns
+                Controller.from_scenario(config)
+            bar.advance(task)
+    size = sum(path.stat().st_size for path in FOLDER.glob("*.code"))
+    print(f"{len(configs)} scenarios, {perf_counter() - begin:.0f} s; {1e-6 * size:.0f} MB of code in {FOLDER}")
 
 
 def _run_all(configs: list[ScenarioConfig], out: Path) -> tuple[list[Log], list[Path]]:

@@ -12,8 +12,10 @@ from typing import Any, NoReturn
 import numpy as np
 
 from qpavoid import kernels
+from qpavoid.budget import UNLIMITED, Budget
 from qpavoid.config import Avoidance, Limits, Planning, Progress, ScenarioConfig, Sensing, Sphere
 from qpavoid.config.scenario import MAX_LATENCY
+from qpavoid.control.arguments import Obstacles
 from qpavoid.control.builder import ProblemBuilder, StepProblem
 from qpavoid.control.contacts import ContactRows
 from qpavoid.control.inputs import LARGEST_VELOCITY, check_velocity
@@ -59,6 +61,7 @@ class Controller(SceneChanges, SplitStep):
         contacts: ContactRows | None = None,
         latency: float = 0.0,
         planning: Planning | None = None,
+        budget: float | Budget | None = None,
     ) -> None:
         """Lay out the memory of a control step.
 
@@ -74,10 +77,13 @@ class Controller(SceneChanges, SplitStep):
             contacts: frames that rest, see `build_contacts`; none if left out.
             latency: time after which the actuators follow a command [s], see `step`.
             planning: forecasts and plans; none if left out.
+            budget: time after which a step leaves out what is left of relaxation, stop look-ahead and backup search
+                [s], and brakes or follows its backup trajectory instead, with a reason of kind BUDGET_SPENT; runs are
+                then not reproducible. As long as it takes if left out.
 
         Raises:
             UnknownName, SolverNotInstalled: of the solver.
-            ConfigError: dt or latency cannot be meant; contacts with a solver that does not hold them.
+            ConfigError: dt, latency or budget cannot be meant; contacts with a solver that does not hold them.
         """
         begin = perf_counter()
         if not 0.0 < dt <= _MAX_DT:
@@ -86,7 +92,7 @@ class Controller(SceneChanges, SplitStep):
             raise ConfigError(f"latency: {latency} s, expected 0 to {MAX_LATENCY}; it is in seconds")
         self._another = partial(
             type(self), tasks=tasks, dt=dt, avoidance=avoidance, limits=limits, sensing=sensing, progress=progress,
-            contacts=contacts, latency=latency, planning=planning,
+            contacts=contacts, latency=latency, planning=planning, budget=budget,
         )  # fmt: skip
         frames, others = in_order(tasks)
         self.scene = scene = scene.own_copy() if scene.spare else scene
@@ -103,7 +109,13 @@ class Controller(SceneChanges, SplitStep):
             self._no_backup = (_NO_BACKUP_WITH_CONTACTS,)
         bounds = scene.robot.bounds().within(self.limits)
         blocks = sensing or Sensing(), progress or Progress()
-        settings = ControlSettings(scene, bounds, self.avoidance, self.limits, dt, latency, *blocks)
+        if budget is not None and not isinstance(budget, Budget):
+            if not budget > 0.0:
+                raise ConfigError(f"budget: {budget} s, expected more than 0; it is in seconds")
+            budget = Budget(budget)
+        settings = ControlSettings(
+            scene, bounds, self.avoidance, self.limits, dt, latency, *blocks, budget or UNLIMITED
+        )
         self._builder = ProblemBuilder(settings, self.tasks, contacts)
         self._arbiter = Arbiter(settings, law, self._builder.rows, self._builder.tracker)
         self._builder.rows.adapt(law, self.avoidance.look_ahead)
@@ -181,7 +193,7 @@ class Controller(SceneChanges, SplitStep):
         q: Array,
         t: float | None = None,
         targets: Mapping[str, Any] | None = None,
-        obstacles: Mapping[str, Any] | None = None,
+        obstacles: Obstacles = None,
         v: Array | None = None,
     ) -> Solution:
         """Velocity for the next dt.
@@ -211,7 +223,9 @@ class Controller(SceneChanges, SplitStep):
             obstacles: where obstacles are, by name, in place of their motion: a `Sample`, or if no velocity is known, a
                 `Pose`, `pin.SE3`, 4×4 matrix or position, which leaves the orientation as it was; `Points` for a cloud.
                 From then on they have to be updated, see `Sensing`, unless they are given `at_rest`. Each may have a
-                time stamp of its own.
+                time stamp of its own. Many at a time cost least as one array, with a row of each of `obstacle_names`:
+                (k, 18) as `Sample.row`, or (k, 7), position and quaternion x y z w, if no velocity is known; of some
+                obstacles, as {(name, ...): array}.
             v: velocity (nv,) as measured, from which acceleration limits count in the first step, after a gap and after
                 `reset`. In all other steps they count from the last command, as those of servos that lag have to.
 
@@ -227,7 +241,7 @@ class Controller(SceneChanges, SplitStep):
         q: Array,
         t: float | None = None,
         targets: Mapping[str, Any] | None = None,
-        obstacles: Mapping[str, Any] | None = None,
+        obstacles: Obstacles = None,
         v: Array | None = None,
     ) -> Tick:
         """Like `step`, with everything that led to the velocity."""
@@ -246,7 +260,7 @@ class Controller(SceneChanges, SplitStep):
         q: Array,
         v_desired: Array,
         t: float | None = None,
-        obstacles: Mapping[str, Any] | None = None,
+        obstacles: Obstacles = None,
         v: Array | None = None,
     ) -> Solution:
         """The safe velocity that is closest to any command: of a teleoperator, a policy, another controller.

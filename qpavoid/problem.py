@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from qpavoid.budget import UNLIMITED, Budget
 from qpavoid.errors import NumericalError
 from qpavoid.reason import Reason, Severity
 
@@ -182,6 +183,8 @@ class Problem(NamedTuple):
     """Whether v_tracking is safe, and a bound shows that no pair comes too near along it and a stop from it."""
     position_margin: float = np.inf
     """Distance to the nearest position limit [rad, m]; negative where a coordinate is outside."""
+    budget: Budget = UNLIMITED
+    """Time that is left of the control step: a law that takes longer may `check` it, which ends the step."""
 
 
 def make_problem(

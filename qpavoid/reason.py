@@ -56,6 +56,8 @@ class ReasonKind(str, Enum):
     """No backup trajectory is looked for: what excludes it."""
     NO_PLAN = "NO_PLAN"
     """Nothing is forecast or planned, or not all that is configured: what excludes it."""
+    BUDGET_SPENT = "BUDGET_SPENT"
+    """The robot brakes, or follows its backup trajectory, as the budget of the control step was spent: before what."""
     STALE = "STALE"
     """An obstacle was not updated in time: the obstacle, the age of its last update [s]."""
     NEVER_UPDATED = "NEVER_UPDATED"
@@ -90,10 +92,17 @@ _SEVERITIES = {
         ("NO_BACKUP", "NO_PLAN", "ESTIMATED", "IGNORED", "POINTS_DROPPED", "NORMALISED", "TIMING"), Severity.INFO
     ),
     **dict.fromkeys(
-        ("PREDICTED_TOO_NEAR", "UNKNOWN_DISTANCE", "IMPLAUSIBLE", "SOLVER_FAILED", "CONTACTS_INFEASIBLE"),
+        (
+            "PREDICTED_TOO_NEAR",
+            "UNKNOWN_DISTANCE",
+            "BUDGET_SPENT",
+            "IMPLAUSIBLE",
+            "SOLVER_FAILED",
+            "CONTACTS_INFEASIBLE",
+        ),
         Severity.ALARM,
     ),
-}
+}  # fmt: skip
 _TEXTS: dict[str, str] = {
     "ROW_RELAXED": "row relaxed by",
     "BELOW_SAFETY_DISTANCE": "below the safety distance by",
@@ -111,6 +120,7 @@ _TEXTS: dict[str, str] = {
     "BACKUP": "backup trajectory instead of the tasks",
     "NO_BACKUP": "no backup trajectory",
     "NO_PLAN": "no plan",
+    "BUDGET_SPENT": "left out, as the budget of the control step is spent",
     "STALE": "not updated for",
     "NEVER_UPDATED": "external, not given yet after",
     "ESTIMATED": "twist estimated from its poses",

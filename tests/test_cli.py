@@ -70,6 +70,15 @@ def test_run_prints_a_table(cli, scene):
     assert verbose[-2:] == ["1 log in out", os.path.join("out", "scene_qp.npz")]
 
 
+def test_warmup_leaves_the_code_of_a_scenario_on_disk(cli):
+    result = cli("warmup", "panda_line")
+    assert result.status == 0 and "1 scenarios" in result.stdout
+    folder = Path(result.stdout.split(" in ")[-1].strip())
+    assert {"complete"} < {path.name for path in folder.iterdir()}
+    refused = cli("warmup", "panda_lin")
+    assert refused.status == 2 and "panda_line" in refused.stderr and refused.stderr.count("\n") == 1
+
+
 def test_version_is_printed(cli):
     result = cli("--version")
     assert (result.status, result.stdout) == (0, f"qpavoid {version('qpavoid')}\n")

@@ -7,10 +7,12 @@ import pinocchio as pin
 import pytest
 
 from qpavoid.control.estimates import MeasuredStates
-from qpavoid.kernels.estimates import POSE_WEIGHT
+from qpavoid.control.trajectories import TrajectoryBatch
 from qpavoid.kernels.obstacles import POSE, REST, SAMPLE
+from qpavoid.kernels.pose_fit import POSE_WEIGHT
 from qpavoid.model.sample import Sample
 
+NO_PIECES = TrajectoryBatch({}).pieces
 DT, PERIOD = 0.01, 1.0 / 30.0
 
 
@@ -18,13 +20,14 @@ class Seen:
     """One obstacle, updated at times."""
 
     def __init__(self):
-        self.measured, self.states = MeasuredStates(1, DT), np.zeros((1, 18))
+        self.measured = MeasuredStates(NO_PIECES, 1, DT)
 
     def update(self, t, position, rotation=None, kind=POSE, **velocity):
         """The state (18,) that is taken, and whether it is."""
-        self.measured.updates[0] = Sample.at(position, rotation, **velocity).row
-        rejected = self.measured.update(np.array([0]), np.array([kind]), np.array([t]), self.states)
-        return self.states[0].copy(), not rejected
+        rows, numbers, kinds = Sample.at(position, rotation, **velocity).row[None], np.array([0]), np.array([kind])
+        assert self.measured.check(numbers, rows[:, : 12 if kind == POSE else 18].copy(), kinds) == 0
+        rejected, _ = self.measured.observe(t, numbers, kinds, np.array([t]), numbers)
+        return self.measured.arrays.states[0].copy(), not rejected
 
     def after(self, position, t, **velocity):
         """Updates at 30 Hz up to t, noise and all as `position` gives them; the last state."""
@@ -41,7 +44,7 @@ def test_samples_are_taken_as_they_are_and_what_rests_rests():
     np.testing.assert_array_equal(state[9:], [1, 2, 3, 0.1, 0.2, 0.3, 1, 0, 0])
     state, _ = seen.update(1.1, (1.0, 2.0, 3.0), kind=REST, **velocity)
     np.testing.assert_array_equal(state[12:], 0.0)
-    assert seen.measured.at_rest[0] and seen.measured.stamps[0] == 1.1
+    assert seen.measured.arrays.at_rest[0] and seen.measured.arrays.stamps[0] == 1.1
 
 
 @pytest.mark.parametrize("before", [POSE, SAMPLE, REST])
@@ -114,10 +117,10 @@ def test_a_pose_that_is_too_far_away_changes_nothing():
     """Faster than 1000 m/s: what comes then is compared with the pose before."""
     seen = Seen()
     before = seen.after(lambda t: np.array([t, 0.0, 0.0]), 0.5)
-    stamp, known = seen.measured.stamps[0], seen.measured.states.copy()
+    stamp, known = seen.measured.arrays.stamps[0], seen.measured.arrays.last.copy()
     _, taken = seen.update(stamp + 0.01, (1e3, 0.0, 0.0))
-    assert not taken and seen.measured.stamps[0] == stamp
-    np.testing.assert_array_equal(seen.measured.states, known)
+    assert not taken and seen.measured.arrays.stamps[0] == stamp
+    np.testing.assert_array_equal(seen.measured.arrays.last, known)
     state, taken = seen.update(stamp + PERIOD, (stamp + PERIOD, 0.0, 0.0))
     assert taken and state[12] == pytest.approx(before[12], abs=1e-9)
 

@@ -39,6 +39,34 @@ def test_import_check_detects_robot_libraries():
     assert "pinocchio" in done.stderr
 
 
+SLOW = {
+    "scipy",
+    "qpsolvers",
+    "osqp",
+    "proxsuite",
+    "typer",
+    "rich",
+    "matplotlib",
+    "mujoco",
+    "xacro",
+    "trimesh",
+    "asyncio",
+}
+"""What takes as long to import as all that a step needs, and is used by few programs."""
+MOST_MODULES = 190
+"""Modules of this package in one import, with a reserve of a fifth: a bound on work that no clock disturbs."""
+
+
+def test_import_brings_in_what_a_step_needs():
+    """scipy itself is looked for by numba, without its parts."""
+    count = "import sys, qpavoid; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", count], capture_output=True, text=True, timeout=600, check=True)
+    modules = done.stdout.split()
+    slow = {name for name in modules if name.split(".")[0] in SLOW - {"scipy"} or name.startswith("scipy.s")}
+    assert not slow
+    assert 50 < len([name for name in modules if name.split(".")[0] == "qpavoid"]) <= MOST_MODULES
+
+
 def test_public_names_exist():
     assert sorted(qpavoid.__all__) == sorted(set(qpavoid.__all__))
     for name in qpavoid.__all__:

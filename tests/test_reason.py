@@ -24,7 +24,9 @@ from qpavoid.config import Beta, Box, Sphere
 from qpavoid.problem import AvoidanceRows, Tracking, make_problem
 
 INFORMING = {"NO_BACKUP", "NO_PLAN", "ESTIMATED", "IGNORED", "POINTS_DROPPED", "NORMALISED", "TIMING"}
-ALARMING = {"PREDICTED_TOO_NEAR", "UNKNOWN_DISTANCE", "IMPLAUSIBLE", "SOLVER_FAILED", "CONTACTS_INFEASIBLE"}
+ALARMING = {
+    "PREDICTED_TOO_NEAR", "UNKNOWN_DISTANCE", "BUDGET_SPENT", "IMPLAUSIBLE", "SOLVER_FAILED", "CONTACTS_INFEASIBLE",
+}  # fmt: skip
 BALL = Sphere(radius=0.1)
 
 

@@ -30,6 +30,13 @@ def rollouts_of(scene, limits=None, dt=0.01):
     return BackupRollouts(shared, PairTable(scene), tracker), shared, tracker
 
 
+def is_far(check, rollouts, q, v, t):
+    """Whether obstacles stay away from a robot at q (nq,), at which the distances are those of a control step."""
+    rollouts.kinematics.compute(q)
+    rollouts.query.compute(rollouts.kinematics.joint_poses, 0.1)
+    return check.is_far(v, t)
+
+
 LIMITS = {"speeds": {}, "accelerations": {"acceleration": 3.0}, "jerks": {"acceleration": 3.0, "jerk": 60.0}}
 
 
@@ -234,11 +241,11 @@ def test_approach_check_is_conservative(tmp_path_factory, lines, t, v):
     if not obstacles:
         return
     rollouts, shared, tracker = rollouts_of(build_scene(robot, obstacles))
-    check, v = ApproachCheck(shared, rollouts, tracker), np.array(v)
+    check, v = ApproachCheck(shared, rollouts.query, rollouts.lever_arm, tracker), np.array(v)
     for k, away in enumerate((0.0, 0.01, 0.1, 0.3)):  # a cached clearance counts for configurations near by
         home, at = robot.home + away, t + 0.02 * k
         moving = [o for o in obstacles if o.motion.sample(at).linear.any()]  # those at rest do not count
-        if not check.is_far(home, v, at):
+        if not is_far(check, rollouts, home, v, at):
             continue
         for later in np.linspace(0.0, 1.5, 76):
             braking = np.minimum(later, np.abs(v) / 2.0)
@@ -258,8 +265,8 @@ def test_approach_check_of_external_obstacles_is_conservative(tmp_path_factory, 
     rollouts, shared, tracker = rollouts_of(build_scene(robot, obstacles))
     samples = [Sample.at(ball[:3], linear=[*ball[3:], 0.0]) for ball in balls]
     tracker.advance(tracker.read(0.0, {f"o{i}": sample for i, sample in enumerate(samples)}))
-    check, v = ApproachCheck(shared, rollouts, tracker), np.array(v)
-    if not check.is_far(robot.home, v, 0.0):
+    check, v = ApproachCheck(shared, rollouts.query, rollouts.lever_arm, tracker), np.array(v)
+    if not is_far(check, rollouts, robot.home, v, 0.0):
         return
     assert check.max_speed == pytest.approx(max(np.linalg.norm(sample.linear) for sample in samples), abs=1e-12)
     for later in np.linspace(0.0, 1.5, 76):

@@ -14,6 +14,8 @@ from qpavoid.control.targets import TargetReader
 from qpavoid.problem import Array, as_vector
 from qpavoid.reason import Reason
 
+Obstacles = Mapping[str, Any] | Mapping[tuple[str, ...], Array] | Array | None
+"""What a step is given of obstacles, see `Controller.step`."""
 Arguments = tuple[
     Times,
     Array | None,
@@ -45,7 +47,7 @@ class ArgumentReader:
         self._clock, self._configurations, self._targets, self._obstacles = clock, configurations, targets, obstacles
 
     def read(
-        self, q: Any, t: Any, targets: Mapping[str, Any] | None, obstacles: Mapping[str, Any] | None, v: Any,
+        self, q: Any, t: Any, targets: Mapping[str, Any] | None, obstacles: Obstacles, v: Any,
         v_desired: Any = None,
     ) -> Arguments:  # fmt: skip
         """Check the arguments of a step, see `Controller.step`: whatever raises does so here."""

@@ -61,17 +61,22 @@ class ProblemBuilder:
         self.tracker = ObstacleTracker(scene.slots, settings.sensing, dt, settings.latency)
         self.attachments = Attachments(scene, self.rows.query, settings.safety_distance)
         self.slots = ObstacleSlots(scene, self.rows.query, self.tracker, self.attachments)
-        self._clock = Clock(dt)
+        self._clock, self._budget = Clock(dt), settings.budget
         units = [names[j] for j in bounds.v_index.tolist()]
         self._configurations = Configurations(model, bounds.q_index, bounds.lower, bounds.upper, units)
         self._targets = TargetReader(tasks, self.rows.targets, settings.latency)
         shapes = (model.nq,), (model.nv,)
         reader = ArgumentReader(shapes, self._clock, self._configurations, self._targets, self.tracker)
-        self.read = reader.read
-        """Check the arguments of a step, see `Controller.step`: whatever raises does so here, and changes nothing."""
+        self._read = reader.read
         self._thread: int | None = None
         self.begun: StepProblem | None = None
         """Step whose command is not known yet."""
+
+    def read(self, q: Any, t: Any, targets: Any, obstacles: Any, v: Any, v_desired: Any = None) -> Arguments:
+        """Check the arguments of a step, see `Controller.step`: whatever raises does so here, and changes nothing."""
+        if self._budget.is_limited:
+            self._budget.begin()
+        return self._read(q, t, targets, obstacles, v, v_desired)
 
     def build(self, arguments: Arguments) -> StepProblem:
         """Take over the arguments of a step, and build its problem.

@@ -10,7 +10,6 @@ from typing import Any
 
 import coal
 import numpy as np
-from scipy.spatial import ConvexHull
 
 from qpavoid import kernels
 from qpavoid.geometry.bodies import enclosing_capsule, hull_points
@@ -137,5 +136,7 @@ def _is_capsule(body: Any) -> bool:
 
 def _planes(body: Any) -> tuple[Array, Array]:
     """Outward normals (f, 3) and offsets (f,) of the faces of a polytope that encloses a body."""
+    from scipy.spatial import ConvexHull  # slow to import
+
     equations = ConvexHull(hull_points(body)).equations
     return equations[:, :3].copy(), equations[:, 3].copy()

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy.linalg.lapack import dgeqp3, dorgqr, dtrtrs
 
 from qpavoid import config
 from qpavoid.control.tasks.base import frame_pose
@@ -84,6 +83,8 @@ def solve_contacts(J: Array, b: Array) -> Contacts:
         J: (c, nv) contact Jacobian.
         b: (c,) what has to be put right [m/s, rad/s].
     """
+    from scipy.linalg.lapack import dgeqp3, dorgqr, dtrtrs  # scipy is slow to import, and few robots have contacts
+
     c, nv = J.shape
     packed, order, tau, _, _ = dgeqp3(J.T)
     pivots = np.abs(packed.diagonal())

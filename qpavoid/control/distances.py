@@ -93,6 +93,8 @@ class DistanceQuery:
         self.arrays.margin[:obstacles] = self._uncertainty
         self.arrays.margin[obstacles + 1 :] = self._uncertainty[: rows - obstacles - 1]
         self.packed = kernels.pack(self.arrays)
+        none, margin = np.zeros(0, dtype=np.intp), np.zeros(obstacles)
+        self._place = kernels.direct(kernels.place_obstacles, self.packed, none, self.arrays.states, margin)
         self.is_moving = False
         """Whether any obstacle has a velocity or a margin."""
         self.influence_distance = np.nan
@@ -135,7 +137,7 @@ class DistanceQuery:
         for index in self._planes:
             state = obstacles.states[index]
             x.bounding_radius[index] = self._extent_on_plane(state) if state[15:].any() else 0.0
-        bad, self.is_moving = kernels.place_obstacles(self.packed, obstacles.which, obstacles.states, obstacles.margin)
+        bad, self.is_moving = self._place(self.packed, obstacles.which, obstacles.states, obstacles.margin)
         if bad >= 0:
             raise NumericalError(f"obstacle {self._scene.slots[bad].name!r}: NaN or infinity in its pose or twist")
 

@@ -1,85 +1,107 @@
-"""What a program tells of obstacles, as far as the future follows from it."""
+"""Where obstacles are at the time of a step, as far as arrays tell: memory of the tracker."""
 
 from __future__ import annotations
 
-from math import nan
+from math import inf, nan
 
 import numpy as np
 
 from qpavoid import kernels
-from qpavoid.control.inputs import FASTEST
-from qpavoid.kernels.estimates import FIT
-from qpavoid.model.sample import STATE, Sample
+from qpavoid.control.inputs import FARTHEST, FASTEST
+from qpavoid.kernels import Pieces
+from qpavoid.kernels.estimates import QUATERNION
+from qpavoid.kernels.pose_fit import FIT
+from qpavoid.model.sample import POSE, STATE, Sample
 from qpavoid.problem import Array, IntArray
 
-_STEADY = 0.2
-"""Time over which twists are averaged [s]."""
 _SHORTEST = 1e-3
 """Part of a control period below which two poses count as of the same time, so that no twist follows from them."""
-_LONGEST = 1e3
-"""Time for which an obstacle keeps its last twist at the most [s]: by then it is out of every scene."""
+_NONE, _NO_STAMPS = np.zeros(0, dtype=np.intp), np.zeros(0)
 
 
 class MeasuredStates:
-    """The last update of every obstacle that a program gives, and the mean of its twists: memory of the tracker.
+    """States of all obstacles, the last updates of those that a program gives, and the means of their twists.
 
     The twist of a single measurement is no base for what an obstacle does in a second; the mean is.
     """
 
-    def __init__(self, count: int, dt: float) -> None:
-        """Lay out memory for `count` obstacles; dt is the control period [s]."""
-        self._shortest = _SHORTEST * dt
-        self.twists, self._counts = np.zeros((count, 6)), np.zeros(count)
-        self.stamps = np.full(count, nan)
-        """(o,) time stamps of the last updates [s], NaN where there is none."""
-        self.at_rest = np.zeros(count, dtype=bool)
-        """(o,) whether these were at rest."""
-        self.states = np.zeros((count, STATE))
-        """(o, 18) the last updates, at their time stamps."""
-        self._fits = np.zeros((count, FIT))
-        self.updates = np.zeros((count, STATE))
-        """(o, 18) what the step is given, before it is taken over."""
+    def __init__(self, pieces: Pieces, count: int, dt: float, stale_after: float = inf) -> None:
+        """Lay out memory, and load all kernels.
+
+        Args:
+            pieces: trajectories of those of `count` obstacles that follow one.
+            count: number of obstacles.
+            dt: control period [s].
+            stale_after: age from which one is stale [s].
+        """
+        self.arrays = kernels.ObstacleArrays(
+            pieces=pieces,
+            uncertainty=np.zeros(count),
+            margin=np.zeros(count),
+            states=np.zeros((count, STATE)),
+            updates=np.zeros((count, STATE)),
+            codes=np.zeros(count, dtype=np.intp),
+            deviation=np.zeros(count),
+            stamps=np.full(count, nan),
+            last=np.zeros((count, STATE)),
+            at_rest=np.zeros(count, dtype=bool),
+            twists=np.zeros((count, 6)),
+            counts=np.zeros(count),
+            fits=np.zeros((count, FIT)),
+            displacement=np.zeros(6),
+            line=np.zeros((2, 6)),
+            shortest=_SHORTEST * dt,
+            stale_after=stale_after,
+            max_position=FARTHEST,
+            max_speed=FASTEST,
+        )
+        self._packed = kernels.pack(self.arrays)
         self.known: dict[int, None] = {}
         """Numbers of the obstacles that are given, in the order in which they first were."""
+        for columns in (STATE, POSE, QUATERNION):  # the same code
+            rows = np.zeros((0, columns))
+            self._check = kernels.direct(kernels.check_updates, self._packed, _NONE, rows, _NONE)
+        self._observe = kernels.direct(kernels.observe, self._packed, 0.0, _NONE, _NONE, _NO_STAMPS, _NONE)
+
+    def follow(self, pieces: Pieces) -> None:
+        """Let obstacles follow other trajectories."""
+        self.arrays = self.arrays._replace(pieces=pieces)
+        self._packed = kernels.pack(self.arrays)
 
     def forget(self, index: int) -> None:
         """Drop what is known of obstacle number `index`."""
+        x = self.arrays
         self.known.pop(index, None)
-        self.stamps[index], self.at_rest[index] = nan, False
-        self._counts[index], self.twists[index], self._fits[index] = 0.0, 0.0, 0.0
+        x.stamps[index], x.at_rest[index] = nan, False
+        x.counts[index], x.twists[index], x.fits[index] = 0.0, 0.0, 0.0
 
     def begin(self, index: int, t: float, sample: Sample) -> None:
         """Take a sample as what is known of obstacle number `index` at t [s]."""
-        self.states[index] = sample.row
-        self.known[index], self.stamps[index] = None, t
+        self.arrays.last[index] = sample.row
+        self.known[index], self.arrays.stamps[index] = None, t
 
-    def update(self, which: IntArray, kind: IntArray, stamps: Array, states: Array) -> int:
-        """Take over `updates` of some obstacles; see `kernels.update_estimates`.
+    def check(self, which: IntArray, rows: Array, kind: IntArray) -> int:
+        """Write what a step is given into `updates`, and check it; see `kernels.check_updates`.
 
         Args:
-            which: their numbers (k,).
+            which: numbers of the obstacles (k,).
+            rows: (k, 18), (k, 12) or (k, 7), in one piece.
+            kind: SAMPLE, POSE or REST (k,).
+        """
+        return int(self._check(self._packed, which, rows, kind))
+
+    def observe(self, t: float, which: IntArray, kind: IntArray, stamps: Array, external: IntArray) -> tuple[int, int]:
+        """Take over `updates` of some obstacles, and bring all to t [s]; see `kernels.observe`.
+
+        Args:
+            t: time [s].
+            which: numbers of those that are updated (k,).
             kind: SAMPLE, POSE or REST (k,).
             stamps: their time stamps (k,) [s].
-            states: out: rows `which` (o, 18).
+            external: numbers of all that are known (e,).
 
         Returns:
-            How many were not taken over.
+            How many updates were not taken over; how many obstacles are stale.
         """
-        return int(
-            kernels.update_estimates(
-                which, kind, stamps, self.updates, self.stamps, self.states, states,
-                self._fits, self._shortest, FASTEST, _STEADY, self.twists, self._counts, self.at_rest,
-            )
-        )  # fmt: skip
-
-    def extrapolate(self, which: IntArray, t: float, stale_after: float, states: Array, margin: Array) -> int:
-        """Write where some obstacles are at t [s], and margins of stale ones; see `kernels.extrapolate_estimates`.
-
-        Returns:
-            How many are stale.
-        """
-        return int(
-            kernels.extrapolate_estimates(
-                which, t, _LONGEST, self.stamps, self.states, states, stale_after, self.at_rest, margin
-            )
-        )
+        counts: tuple[int, int] = self._observe(self._packed, t, which, kind, stamps, external)
+        return counts

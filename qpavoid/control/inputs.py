@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from qpavoid.errors import NumericalError
-from qpavoid.kernels.obstacles import EXACT, FAR, FAST, LEFT_HANDED, NEARLY, NO_ROTATION, NOT_FINITE
+from qpavoid.kernels.obstacles import EXACT, FAR, FAST, LEFT_HANDED, NEARLY, NO_QUATERNION, NO_ROTATION, NOT_FINITE
 from qpavoid.problem import Array, as_vector, not_finite
 from qpavoid.reason import Reason, ReasonKind, Severity
 
@@ -41,6 +41,7 @@ FAULTS = {
     FAST: f"faster than {FASTEST:g} m/s or rad/s",
     NO_ROTATION: "no rotation",
     LEFT_HANDED: "left-handed, no rotation",
+    NO_QUATERNION: "quaternion not of length 1; give x y z w",
 }
 """What `kernels.check_states` finds, in words."""
 

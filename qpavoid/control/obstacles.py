@@ -20,11 +20,12 @@ from qpavoid.control.estimates import MeasuredStates
 from qpavoid.control.inputs import FARTHEST, FASTEST, FAULTS
 from qpavoid.control.obstacle_states import NOTHING, Observation, ObstacleStates, StepUpdate
 from qpavoid.control.trajectories import TrajectoryBatch, extrapolate
-from qpavoid.control.updates import NO_UPDATE, Update, UpdateReader, unlikely
+from qpavoid.control.update_parts import unlikely
+from qpavoid.control.updates import NO_UPDATE, Update, UpdateReader
 from qpavoid.errors import NumericalError
 from qpavoid.kernels import Prediction
 from qpavoid.kernels.obstacles import FAST, NORMALISED, NOT_FINITE, SAMPLE
-from qpavoid.model.sample import STATE, Sample
+from qpavoid.model.sample import Sample
 from qpavoid.model.scene import Obstacle
 from qpavoid.model.trajectory import Motion
 from qpavoid.problem import Array, IntArray
@@ -49,11 +50,13 @@ class ObstacleTracker:
         self._stop_after = np.inf if stop is None else max(stop + _ROUND_OFF, least)
         self._moving = [i for i, obstacle in enumerate(obstacles) if obstacle.moves]
         self._trajectories = TrajectoryBatch({i: obstacles[i].motion for i in self._moving})
-        self._now, count = 0.0, len(obstacles)
-        self.current = ObstacleStates(np.array(self._moving, np.intp), np.zeros((count, STATE)), np.zeros(count), {})
+        self._now, pieces = 0.0, self._trajectories.pieces
+        self._measured = MeasuredStates(pieces, len(obstacles), dt, self._stale_after + latency)
+        x = self._measured.arrays
+        self.current = ObstacleStates(np.array(self._moving, np.intp), x.states, x.margin, {})
         """States in the last step, `latency` after it; the next one overwrites them."""
-        self._uncertainty = np.array([obstacle.uncertainty for obstacle in obstacles])
-        self.current.margin[:] = self._uncertainty
+        self._uncertainty = x.uncertainty
+        self._uncertainty[:] = x.margin[:] = [obstacle.uncertainty for obstacle in obstacles]
         for state, obstacle in zip(self.current.states, obstacles, strict=True):
             state[:] = obstacle.motion.sample(0.0).row
         self._placed: set[int] = set()  # numbers of those that are, or were, attached to the robot
@@ -61,7 +64,6 @@ class ObstacleTracker:
         """(k,) numbers of those on a trajectory or external; no attached object is among them."""
         self.on_trajectories: IntArray = self.current.which
         """(k,) numbers of those on a trajectory that are not external."""
-        self._measured = MeasuredStates(count, dt)
         self._reader = UpdateReader(obstacles, self._measured, dt)
         self._prediction: Prediction | None = None
         self.external: IntArray = np.zeros(0, dtype=np.intp)
@@ -72,15 +74,16 @@ class ObstacleTracker:
         """Number of an obstacle by name; raises UnknownName."""
 
     def warm_up(self) -> None:
-        """Run the kernels once on nothing, so that no step waits for the compiler."""
-        none, no_stamps = NO_UPDATE.which, NO_UPDATE.stamps
-        states, now = self._measured.updates, self.current
-        kernels.check_states(states, none, none, FARTHEST, FASTEST)
-        kernels.write_rows(states, none, states[:0], none, FARTHEST, FASTEST, none, no_stamps)
-        self._measured.update(none, none, no_stamps, now.states)
-        self._measured.extrapolate(none, 0.0, 0.0, now.states, now.margin)
-        extrapolate(states[:0], 0.0)
-        self._trajectories.sample(self._now, now.states.copy())
+        """Load the kernels that few steps need."""
+        none = NO_UPDATE.which
+        kernels.check_states(self.current.states, none, none, FARTHEST, FASTEST)
+        extrapolate(self.current.states[:0], 0.0)
+        self._trajectories.sample(self._now, self.current.states.copy())
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the obstacles, in the order of the scene."""
+        return self._reader.names
 
     @property
     def now(self) -> float:
@@ -97,7 +100,7 @@ class ObstacleTracker:
         """What is known of the obstacles in the last step, as far as the future follows from it; nothing changes it."""
         if self._prediction is None:
             now, external = self.current, self.external
-            twists = self._measured.twists.copy() if len(external) else self._measured.twists
+            twists = self.mean_twists.copy() if len(external) else self.mean_twists
             states, margin = now.states.copy(), now.margin.copy()
             self._prediction = Prediction(
                 self._trajectories.pieces, now.which, states, margin, external, twists, self._now
@@ -107,7 +110,7 @@ class ObstacleTracker:
     @property
     def mean_twists(self) -> Array:
         """(o, 6) mean twists of external obstacles, with which they are predicted; zero of all others."""
-        return self._measured.twists
+        return self._measured.arrays.twists
 
     def at(self, t: float, prediction: Prediction | None = None) -> ObstacleStates:
         """Return the states at t [s]: on trajectories, or at constant mean twists; of the last step, as observed.
@@ -145,7 +148,7 @@ class ObstacleTracker:
         obstacle = self._obstacles[index]
         self._reader.rename(index, name, obstacle.name)
         self._measured.forget(index)
-        self._measured.states[index] = self.current.states[index] = obstacle.motion.sample(self._now).row
+        self._measured.arrays.last[index] = self.current.states[index] = obstacle.motion.sample(self._now).row
         self._uncertainty[index] = self.current.margin[index] = obstacle.uncertainty
         for numbers, member in ((self._placed, present), (self._awaited, obstacle.external)):
             (numbers.add if member else numbers.discard)(index)
@@ -157,6 +160,7 @@ class ObstacleTracker:
         if numbers != self._moving:
             self._moving = numbers
             self._trajectories = TrajectoryBatch({i: self._obstacles[i].motion for i in numbers})
+            self._measured.follow(self._trajectories.pieces)
 
     def attach(self, index: int) -> None:
         """Take an obstacle as attached to the robot: updates of it are ignored."""
@@ -196,12 +200,12 @@ class ObstacleTracker:
         self.moving = np.array(sorted(moving), dtype=np.intp)
         self.current = self.current._replace(which=np.array(sorted(moving | self._placed), dtype=np.intp))
 
-    def read(self, t: float, updates: Mapping[str, Any] | None, shift: float = 0.0) -> StepUpdate | None:
+    def read(self, t: float, updates: Any, shift: float = 0.0) -> StepUpdate | None:
         """Check what a step is given; estimates stay as they are.
 
         Args:
             t: time of the step [s].
-            updates: what the program gives, by name. What cannot be true counts as not given.
+            updates: what the program gives, by name, or as one array. What cannot be true counts as not given.
             shift: by how much the clock was set back [s].
 
         Returns:
@@ -213,8 +217,8 @@ class ObstacleTracker:
                 what cannot be true.
         """
         if updates is not None and type(updates) is not dict and not isinstance(updates, Mapping):
-            raise NumericalError(f"obstacles: give a mapping of names to samples, not {updates!r:.60}")
-        if updates:
+            given = self._reader.read_array(t, self.names, updates)
+        elif updates:
             given = self._reader.read(t, updates, shift)
         elif self._moving or self._measured.known or self._awaited:
             given = NO_UPDATE
@@ -246,42 +250,34 @@ class ObstacleTracker:
         if update is None:
             return NOTHING
         t, shift, given, sampled = update
-        self._now, self._prediction, current = t + self._latency, None, self.current
+        self._now, self._prediction, measured, which = t + self._latency, None, self._measured, given.which
         if shift:
-            self._measured.stamps += shift
-        self._trajectories.sample(self._now, current.states)
+            measured.arrays.stamps[:] += shift
         for index, sample in sampled:
-            current.states[index] = sample.row
+            self.current.states[index] = sample.row
         if given.unusable or self._awaited:
-            self._begin([i for i in (*given.unusable, *self._awaited) if i not in self._measured.known], t)
-        notes, stop = given.notes, tuple[Reason, ...]()
-        if len(given.which):
-            notes += self._take_over(given)
-            self.current.voxels.update(given.voxels)
-        if len(self.external):
-            current.margin[:] = self._uncertainty
-            stale_after = self._stale_after + self._latency
-            stale = self._measured.extrapolate(self.external, self._now, stale_after, current.states, current.margin)
-            if stale or self._awaited:
-                assumptions, stop = self._overdue(t)
-                notes += assumptions
-        return Observation(notes, stop)
-
-    def _take_over(self, update: Update) -> tuple[Reason, ...]:
-        """Take over the usable updates; return what there is to say of them."""
-        which, measured = update.which, self._measured
-        rejected = measured.update(which, update.kind, update.stamps, self.current.states)
-        if which is not self._known:
-            fresh = which[measured.stamps[which] == update.stamps].tolist()
-            self._awaited.difference_update(fresh)
-            if not measured.known.keys() >= set(fresh):
-                measured.known |= dict.fromkeys(fresh)
+            self._begin([i for i in (*given.unusable, *self._awaited) if i not in measured.known], t)
+        if which is not self._known and len(which):
+            self._awaited.difference_update(which.tolist())
+            if not measured.known.keys() >= set(which.tolist()):
+                measured.known |= dict.fromkeys(which.tolist())
                 self._renew()
-            self._known = which if len(fresh) == len(which) else None
-        if not rejected:
-            return update.estimated
+            self._known = which
+        rejected, stale = measured.observe(self._now, which, given.kind, given.stamps, self.external)
+        notes, stop = given.notes + given.estimated, tuple[Reason, ...]()
+        if rejected:
+            notes = given.notes + self._reject(given)
+        if given.voxels:
+            self.current.voxels.update(given.voxels)
+        if stale or self._awaited:
+            assumptions, stop = self._overdue(t)
+            notes += assumptions
+        return Observation(notes, stop) if notes or stop else NOTHING
+
+    def _reject(self, update: Update) -> tuple[Reason, ...]:
+        """Say which updates were not taken over; return what there is to say of all."""
         notes, names = [], set()
-        for index in which[measured.stamps[which] != update.stamps].tolist():
+        for index in update.which[self._measured.arrays.stamps[update.which] != update.stamps].tolist():
             names.add(self._obstacles[index].name)
             notes.append(unlikely(self._obstacles[index].name, f"its poses are too far apart: {FAULTS[FAST]}"))
             update.voxels.pop(index, None)
@@ -298,10 +294,10 @@ class ObstacleTracker:
         """Return assumptions of obstacles that are not updated, and why the robot has to stop for them."""
         assumptions, stop = [], []
         for index in self._awaited:
-            since = float(t - self._measured.stamps[index])
+            since = float(t - self._measured.arrays.stamps[index])
             assumptions.append(Reason.of(ReasonKind.NEVER_UPDATED, self._obstacles[index].name, amount=since, unit="s"))
-        age = t - self._measured.stamps[self.external]
-        stale = (age > self._stale_after) & ~self._measured.at_rest[self.external]
+        age = t - self._measured.arrays.stamps[self.external]
+        stale = (age > self._stale_after) & ~self._measured.arrays.at_rest[self.external]
         for index, old in zip(self.external[stale].tolist(), age[stale].tolist(), strict=True):
             name, margin = self._obstacles[index].name, self.current.margin[index]
             kind = ReasonKind.NEVER_UPDATED if index in self._awaited else ReasonKind.STALE

@@ -29,6 +29,11 @@ class SceneChanges:
         table = self._builder.rows.query.table
         return {self.scene.slots[index].name: joint for index, joint in table.attached.items()}
 
+    @property
+    def obstacle_names(self) -> tuple[str, ...]:
+        """Names of the obstacles in the order of the scene, which is that of the rows of an array for `step`."""
+        return self._builder.tracker.names
+
     def add_obstacle(self, obstacle: Obstacle) -> None:
         """Add an obstacle, which takes one of the scene's spare slots until it is removed: no memory is laid out anew.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from qpavoid.budget import UNLIMITED, Budget
 from qpavoid.config import Avoidance, Limits, Progress, Sensing
 from qpavoid.model.limits import JointBounds
 from qpavoid.model.scene import Scene
@@ -25,6 +26,7 @@ class ControlSettings:
     """Time after which the actuators follow a command [s]."""
     sensing: Sensing = field(default_factory=Sensing)
     progress: Progress = field(default_factory=Progress)
+    budget: Budget = UNLIMITED
 
     @property
     def safety_distance(self) -> float:

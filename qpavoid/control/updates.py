@@ -7,21 +7,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from qpavoid import kernels
-from qpavoid.config import PointCloud
 from qpavoid.control.estimates import MeasuredStates
-from qpavoid.control.inputs import FARTHEST, FASTEST, FAULTS, as_time
+from qpavoid.control.inputs import FAULTS
 from qpavoid.control.trajectories import extrapolate
+from qpavoid.control.update_parts import ignored, read_voxels, rest_flags, time_stamp, unlikely
 from qpavoid.errors import NumericalError, UnknownName, nearest
+from qpavoid.kernels.estimates import QUATERNION
 from qpavoid.kernels.obstacles import FINE, NORMALISED, POSE, REST, SAMPLE
 from qpavoid.model.cloud import Points, Voxels
-from qpavoid.model.sample import Pose, Sample, as_sample
+from qpavoid.model.sample import POSE as POSE_SIZE
+from qpavoid.model.sample import STATE, Pose, Sample, as_sample
 from qpavoid.model.scene import Obstacle
-from qpavoid.problem import Array, IntArray
-from qpavoid.reason import Reason, ReasonKind, Severity
-
-_FLAGS = {bool, np.bool_}
-_KNOWN = {Sample, Pose, Points}
+from qpavoid.problem import Array, IntArray, as_numbers
+from qpavoid.reason import Reason, ReasonKind
 
 
 class Update(NamedTuple):
@@ -46,24 +44,15 @@ NO_UPDATE = Update(np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp), np.ze
 
 
 class _Selection(NamedTuple):
-    """Arrays for updates of the same k obstacles, all samples or all bare poses."""
-
-    names: list[str]
-    type: type
-    which: IntArray
-    kind: IntArray
-    estimated: tuple[Reason, ...]
-    codes: IntArray
-    off: Array
-
-
-class _Batch(NamedTuple):
-    """Samples, or bare poses, of k obstacles, as a step is given them."""
+    """What is the same in updates of the same k obstacles, all samples, all bare poses or all rows of an array."""
 
     names: Sequence[str]
-    samples: Sequence[Any]
-    which: IntArray
-    kind: IntArray
+    form: type | int
+    """Class of the samples, or number of columns of the array."""
+    rows: IntArray | None
+    """Rows of the array that count: an attached obstacle has none; None where all do."""
+    update: Update
+    """If all can be used, and are of the time of the step; its stamps are overwritten."""
 
 
 class UpdateReader:
@@ -77,6 +66,14 @@ class UpdateReader:
         """Numbers of the obstacles that the robot carries, whose updates are ignored."""
         self._estimated = [Reason.of(ReasonKind.ESTIMATED, obstacle.name) for obstacle in obstacles]
         self._selection: _Selection | None = None
+        self._names: tuple[str, ...] | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the obstacles, in the order of the scene: one for each row of an array."""
+        if self._names is None:
+            self._names = tuple([obstacle.name for obstacle in self._obstacles if obstacle.name])
+        return self._names
 
     def index(self, name: str) -> int:
         """Return the number of an obstacle.
@@ -94,14 +91,14 @@ class UpdateReader:
         if new_name:
             self._index[new_name] = index
         self._estimated[index] = Reason.of(ReasonKind.ESTIMATED, new_name)
-        self._selection = None
+        self._selection = self._names = None
 
     def attach(self, index: int, attached: bool) -> None:
         """Ignore updates of obstacle number `index`, or read them again."""
         (self.attached.add if attached else self.attached.discard)(index)
         self._selection = None
 
-    def read(self, t: float, updates: Mapping[str, Any], shift: float) -> Update:
+    def read(self, t: float, updates: Mapping[Any, Any], shift: float) -> Update:
         """Check the updates of a step.
 
         Args:
@@ -113,40 +110,96 @@ class UpdateReader:
             UnknownName: there is no such obstacle.
             NumericalError: an entry of the wrong shape, or not made of numbers.
         """
-        names, samples = list(updates), list(updates.values())
-        selection = self._selection
-        types = set(map(type, samples))
-        if not types <= _KNOWN:
-            samples = [self._placed(name, value, t) for name, value in updates.items()]
-            types, updates = set(map(type, samples)), dict(zip(names, samples, strict=True))
-        if selection is None or selection.names != names or types != {selection.type}:
+        names = list(updates)
+        if self._selection is not None and self._selection.names == names:
+            update = self._read_selected(t, shift, self._selection, list(updates.values()))
+            if update is not None:
+                return update
+        if any(type(name) is tuple for name in names):
+            if len(names) > 1:
+                raise NumericalError("obstacles: an array among others; give all in one array, or one by one")
+            return self.read_array(t, names[0], updates[names[0]])
+        numbers = [self.index(name) for name in names]
+        placed = {name: self._placed(name, value, t) for name, value in updates.items()}
+        forms = set(map(type, placed.values()))
+        if len(forms) == 1 and forms <= {Sample, Pose} and self.attached.isdisjoint(numbers):
+            self._selection = self._select(names, forms.pop(), numbers)
+            update = self._read_selected(t, shift, self._selection, list(placed.values()))
+            if update is not None:
+                return update
+        self._selection = None
+        return self._read_each(t, shift, placed)
+
+    def _read_selected(self, t: float, shift: float, selection: _Selection, samples: Sequence[Any]) -> Update | None:
+        """Check samples or bare poses of the same obstacles as last time; None where these are of another form."""
+        try:  # in one piece, which takes half the time of np.array
+            rows = np.frombuffer(b"".join([sample.row for sample in samples]))
+            are_current = [sample.t is None and sample.at_rest is False for sample in samples]
+        except (AttributeError, TypeError, ValueError, BufferError):
+            return None
+        columns = STATE if selection.form is Sample else POSE_SIZE
+        if len(rows) != columns * len(samples):
+            return None
+        rows, update = rows.reshape(-1, columns), selection.update
+        if all(are_current):
+            update.stamps.fill(t)
+            return self._check(rows, update)
+        return self._check(*self._timely(t, shift, selection.names, samples, rows, update))
+
+    def read_array(self, t: float, names: Sequence[str], value: Any) -> Update:
+        """Check an array with a row for each of some obstacles, of the time t of the step [s].
+
+        Raises:
+            UnknownName: there is no such obstacle.
+            NumericalError: the array has the wrong shape, or is not made of numbers; an obstacle is named twice.
+        """
+        is_plain = type(value) is np.ndarray and value.dtype == np.float64 and value.flags.c_contiguous
+        rows = value if is_plain else np.ascontiguousarray(as_numbers("obstacles", value))
+        if rows.ndim != 2 or len(rows) != len(names) or rows.shape[1] not in (STATE, QUATERNION):
+            raise NumericalError(
+                f"obstacles: an array of shape {rows.shape}; give a row of {STATE} numbers, as `Sample.row`, or of "
+                f"{QUATERNION}, position and quaternion x y z w, for each of these {len(names)}: {', '.join(names):.60}"
+            )
+        selection, columns = self._selection, rows.shape[1]
+        if selection is None or selection.form != columns or selection.names != names:
             numbers = [self.index(name) for name in names]
-            plain = len(types) == 1 and types <= {Sample, Pose} and self.attached.isdisjoint(numbers)
-            self._selection = selection = self._select(names, next(iter(types)), numbers) if plain else None
-        if selection is not None:
-            return self._check(t, shift, _Batch(names, samples, selection.which, selection.kind), selection)
-        return self._read_each(t, shift, updates)
+            if len(set(numbers)) < len(numbers):
+                raise NumericalError("obstacles: an obstacle is named twice; give one row for each")
+            self._selection = selection = self._select(names, columns, numbers)
+        if selection.rows is not None:
+            rows = rows[selection.rows]
+        selection.update.stamps.fill(t)
+        return self._check(rows, selection.update)
 
     def _placed(self, name: str, value: Any, t: float) -> Any:
         """Return points, a sample or a pose as it is, else the pose that it stands for.
 
         A position alone leaves the orientation as it was given last, or as the scene has it.
         """
-        if isinstance(value, Points):
+        if isinstance(value, Points | Sample | Pose):
             return value
         index = self.index(name)
         known, motion = index in self._measured.known, self._obstacles[index].motion
-        last = Sample.of_row(self._measured.states[index]) if known else motion.sample(t)
+        last = Sample.of_row(self._measured.arrays.last[index]) if known else motion.sample(t)
         try:
             return as_sample(value, last.rotation)
         except NumericalError as error:
             raise NumericalError(f"obstacle {name!r}: {error}") from None
 
-    def _select(self, names: list[str], kind: type, numbers: list[int]) -> _Selection:
-        count, which = len(names), np.array(numbers, dtype=np.intp)
-        estimated = tuple([self._estimated[i] for i in numbers]) if kind is Pose else ()
-        kinds = np.full(count, POSE if kind is Pose else SAMPLE)
-        return _Selection(names, kind, which, kinds, estimated, np.zeros(count, dtype=np.intp), np.zeros(count))
+    def _select(self, names: Sequence[str], form: type | int, numbers: list[int]) -> _Selection:
+        """Lay out what is the same in all updates of these obstacles in that form."""
+        rows = [k for k, i in enumerate(numbers) if i not in self.attached]
+        which, is_bare = np.array([numbers[k] for k in rows], dtype=np.intp), form in (Pose, QUATERNION)
+        notes = [ignored(name) for name, i in zip(names, numbers, strict=True) if i in self.attached]
+        update = Update(
+            which, np.full(len(rows), POSE if is_bare else SAMPLE), np.zeros(len(rows)), {}, (), tuple(notes),
+            self._twists_estimated(which) if is_bare else (),
+        )  # fmt: skip
+        return _Selection(names, form, np.array(rows, dtype=np.intp) if notes else None, update)
+
+    def _twists_estimated(self, which: IntArray) -> tuple[Reason, ...]:
+        """Return the reasons why twists are estimated, of bare poses of some obstacles (k,)."""
+        return tuple([self._estimated[i] for i in which.tolist()])
 
     def _read_each(self, t: float, shift: float, updates: Mapping[str, Any]) -> Update:
         """Check updates of several kinds one by one: point clouds, bare poses among samples, attached obstacles."""
@@ -155,17 +208,20 @@ class UpdateReader:
         for name, value in updates.items():
             index = self.index(name)
             if index in self.attached:
-                notes.append(Reason.of(ReasonKind.IGNORED, name, detail="attached to the robot"))
+                notes.append(ignored(name))
                 continue
             if isinstance(value, Points):
-                cloud, sample = self._cloud(index, value, notes), self._pose_of(index, value, t, shift)
+                cloud, sample = (
+                    read_voxels(name, self._obstacles[index].shape, value, notes),
+                    self._pose_of(index, value, t, shift),
+                )
             else:
                 cloud, sample = None, value
             bare = isinstance(sample, Pose)
             sample = sample.as_sample() if bare else sample
             if isinstance(value, Points) and cloud is None:
-                _flags([name], [sample])
-                wrong = self._wrong_stamp(index, _stamp(name, sample, t), t, shift)
+                rest_flags([name], [sample])
+                wrong = self._wrong_stamp(index, time_stamp(name, sample, t), t, shift)
                 notes += [wrong] if wrong else []
                 if wrong is None or wrong.kind is not ReasonKind.IGNORED:
                     unusable.append(index)
@@ -175,61 +231,56 @@ class UpdateReader:
             names.append(name)
             samples.append(sample)
             kinds.append(POSE if bare else SAMPLE)
-        which = np.array([self._index[name] for name in names], dtype=np.intp)
-        batch = _Batch(names, samples, which, np.array(kinds, dtype=np.intp))
-        update = self._check(t, shift, batch, self._select(names, Sample, which.tolist()))
+        if samples:
+            which = np.array([self._index[name] for name in names], dtype=np.intp)
+            update = NO_UPDATE._replace(which=which, kind=np.array(kinds, dtype=np.intp), stamps=np.zeros(len(names)))
+            rows = np.array([sample.row for sample in samples])
+            update = self._check(*self._timely(t, shift, names, samples, rows, update))
+        else:
+            update = NO_UPDATE
         fit = set(update.which.tolist())
         return update._replace(
             voxels={index: cloud for index, cloud in voxels.items() if index in fit},
             unusable=(*unusable, *update.unusable),
             notes=(*notes, *update.notes),
-            estimated=tuple([self._estimated[i] for i in update.which[update.kind == POSE].tolist()]),
         )
 
-    def _check(self, t: float, shift: float, batch: _Batch, selection: _Selection) -> Update:
-        """Check samples or bare poses, all at once; `kept` has arrays for them."""
-        names, samples, which, kind = batch
-        if not samples:
-            return NO_UPDATE
-        rows, times = np.array([sample.row for sample in samples]), [sample.t for sample in samples]
-        rests = [sample.at_rest for sample in samples]
+    def _timely(
+        self, t: float, shift: float, names: Sequence[str], samples: Sequence[Any], rows: Array, update: Update
+    ) -> tuple[Array, Update]:
+        """Return the rows and the update without the samples whose time stamps cannot be; and which of them rest."""
+        kind = np.where(rest_flags(names, samples), REST, update.kind)
+        stamps = np.array([time_stamp(name, sample, t) for name, sample in zip(names, samples, strict=True)])
         unusable, notes = list[int](), list[Reason]()
-        flags = set(map(type, rests))
-        if flags != {bool} or True in rests:
-            kind = np.where(_flags(names, samples), REST, kind)
-        if all(time is None for time in times):
-            stamps = np.full(len(times), t)
-        else:
-            stamps = np.array([_stamp(name, sample, t) for name, sample in zip(names, samples, strict=True)])
-            late = ~((stamps <= t + self._dt) & ~(stamps <= self._measured.stamps[which] + shift)) & (stamps != t)
-            if late.any():
-                for k in np.flatnonzero(late).tolist():
-                    wrong = self._wrong_stamp(int(which[k]), float(stamps[k]), t, shift)
-                    assert wrong is not None
-                    notes.append(wrong)
-                    if wrong.kind is not ReasonKind.IGNORED:
-                        unusable.append(int(which[k]))
-                which, kind, stamps = which[~late], kind[~late], stamps[~late]
-                rows = rows[~late]
-                selection = self._select(
-                    [names[k] for k in np.flatnonzero(~late).tolist()], selection.type, which.tolist()
-                )
-        states = self._measured.updates
-        if kernels.write_rows(states, which, rows, kind, FARTHEST, FASTEST, selection.codes, selection.off):
-            bad = selection.codes > NORMALISED
-            for k in np.flatnonzero(selection.codes != FINE).tolist():
-                name, code = self._obstacles[which[k]].name, int(selection.codes[k])
-                if bad[k]:
-                    notes.append(unlikely(name, FAULTS[code]))
-                    unusable.append(int(which[k]))
-                else:
-                    off = float(selection.off[k])
-                    notes.append(Reason.of(ReasonKind.NORMALISED, name, amount=off, unit="-"))
-            which, kind, stamps = which[~bad], kind[~bad], stamps[~bad]
-        estimated = selection.estimated
-        if estimated and (kind is not selection.kind or len(which) < len(estimated)):
-            estimated = tuple([self._estimated[i] for i in which[kind == POSE].tolist()])
-        return Update(which, kind, stamps, {}, tuple(unusable), tuple(notes), estimated)
+        timely = np.ones(len(stamps), dtype=bool)
+        for k, (index, stamp) in enumerate(zip(update.which.tolist(), stamps.tolist(), strict=True)):
+            if wrong := self._wrong_stamp(index, stamp, t, shift):
+                timely[k] = False
+                notes.append(wrong)
+                if wrong.kind is not ReasonKind.IGNORED:
+                    unusable.append(index)
+        which, kind = update.which[timely], kind[timely]
+        estimated = self._twists_estimated(which[kind == POSE])
+        update = Update(which, kind, stamps[timely], {}, tuple(unusable), tuple(notes), estimated)
+        return np.ascontiguousarray(rows[timely]), update
+
+    def _check(self, rows: Array, update: Update) -> Update:
+        """Check the rows (k, 18), (k, 12) or (k, 7) of an update; return it without those that cannot be true."""
+        if not self._measured.check(update.which, rows, update.kind):
+            return update
+        x, which, unusable, notes = self._measured.arrays, update.which, list(update.unusable), list(update.notes)
+        codes = x.codes[: len(which)]
+        for k in np.flatnonzero(codes != FINE).tolist():
+            name, code = self._obstacles[which[k]].name, int(codes[k])
+            if code > NORMALISED:
+                notes.append(unlikely(name, FAULTS[code]))
+                unusable.append(int(which[k]))
+            else:
+                notes.append(Reason.of(ReasonKind.NORMALISED, name, amount=float(x.deviation[k]), unit="-"))
+        usable = codes <= NORMALISED
+        which, kind = which[usable], update.kind[usable]
+        estimated = self._twists_estimated(which[kind == POSE])
+        return Update(which, kind, update.stamps[usable], {}, tuple(unusable), tuple(notes), estimated)
 
     def _wrong_stamp(self, index: int, stamp: float, t: float, shift: float) -> Reason | None:
         """Return why an update with that time stamp [s] is not used; None where it is."""
@@ -238,74 +289,19 @@ class UpdateReader:
             return None
         if not stamp <= t + self._dt:  # neither is NaN
             return unlikely(name, f"stamped {stamp:g} s, later than the control step")
-        if stamp <= self._measured.stamps[index] + shift:
+        if stamp <= self._measured.arrays.stamps[index] + shift:
             return Reason.of(ReasonKind.IGNORED, name, detail=f"stamped {stamp:g} s, not later than the one before")
         return None
 
     def _pose_of(self, index: int, cloud: Points, t: float, shift: float) -> Any:
         """Return the sample of a cloud's frame: as given with it, or where it is by what is known."""
         if cloud.pose is None:
-            state = self._measured.states[index : index + 1].copy()
+            state = self._measured.arrays.last[index : index + 1].copy()
             if index in self._measured.known:
-                extrapolate(state, t - shift - self._measured.stamps[index])
+                extrapolate(state, t - shift - self._measured.arrays.stamps[index])
             else:
                 state[0] = self._obstacles[index].motion.sample(t).row
             sample = Sample.of_row(state[0])
         else:
             sample = self._placed(self._obstacles[index].name, cloud.pose, t)
         return sample.stamped(sample.t if cloud.t is None else cloud.t, cloud.at_rest or sample.at_rest)
-
-    def _cloud(self, index: int, cloud: Points, notes: list[Reason]) -> Voxels | None:
-        """Return the voxels of a point cloud; None where none of its points can be used."""
-        name, shape = self._obstacles[index].name, self._obstacles[index].shape
-        if not isinstance(shape, PointCloud):
-            raise NumericalError(f"obstacle {name!r}: points of a {shape.type}; give a Sample or a Pose")
-        if isinstance(cloud.points, Voxels):
-            voxels = cloud.points
-            if voxels.resolution != shape.resolution:
-                raise NumericalError(
-                    f"obstacle {name!r}: voxels of {voxels.resolution} m, but its resolution is {shape.resolution}"
-                )
-        else:
-            try:
-                voxels = Voxels.of(cloud.points, shape.resolution)
-            except NumericalError as error:
-                raise NumericalError(f"obstacle {name!r}: {error}") from None
-        if voxels.dropped:
-            everything = voxels.dropped == voxels.given
-            notes.append(
-                Reason.of(
-                    ReasonKind.POINTS_DROPPED,
-                    name,
-                    amount=voxels.dropped,
-                    unit="-",
-                    severity=Severity.WARNING if everything else None,
-                    detail=f"of {voxels.given}: NaN, infinite or more than 100 m away",
-                )
-            )
-            if everything:
-                return None
-        return voxels
-
-
-def unlikely(name: str, detail: str) -> Reason:
-    """Return the reason why an update of an obstacle is not used."""
-    return Reason.of(ReasonKind.IMPLAUSIBLE, name, severity=Severity.WARNING, detail=detail)
-
-
-def _flags(names: Sequence[str], samples: Sequence[Any]) -> list[bool]:
-    """Return which of some samples or bare poses are at rest.
-
-    Raises:
-        NumericalError: that is neither true nor false, or one at rest has a velocity; names the obstacle.
-    """
-    for name, sample in zip(names, samples, strict=True):
-        if type(sample.at_rest) not in _FLAGS:
-            raise NumericalError(f"obstacle {name!r}: at_rest: {sample.at_rest!r:.60}; give true or false")
-        if sample.at_rest and isinstance(sample, Sample) and (np.any(sample.linear) or np.any(sample.angular)):
-            raise NumericalError(f"obstacle {name!r}: at_rest, but it has a velocity; leave one of them out")
-    return [bool(sample.at_rest) for sample in samples]
-
-
-def _stamp(name: str, sample: Any, t: float) -> float:
-    return t if sample.t is None else as_time(f"obstacle {name!r}: t", sample.t)

@@ -7,7 +7,6 @@ from typing import Any
 import coal
 import numpy as np
 import pinocchio as pin
-from scipy.spatial import ConvexHull
 
 from qpavoid.config import Box, Capsule, Cone, Cylinder, Ellipsoid, Shape, Sphere
 from qpavoid.geometry.capsules import CapsuleFit, fit_capsule, half_sphere
@@ -135,6 +134,8 @@ def surface_triangles(geometry: Any) -> Array:
     if isinstance(geometry, coal.BVHModelBase):
         vertices, triangles = corners(geometry)
         return np.asarray(vertices[triangles])
+    from scipy.spatial import ConvexHull  # slow to import
+
     points = hull_points(geometry)
     faces = points[ConvexHull(points).simplices]
     inwards = np.einsum("ij,ij->i", normals(faces), faces[:, 0] - points.mean(axis=0)) < 0.0

@@ -7,7 +7,6 @@ from typing import Any
 
 import coal
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
 
 from qpavoid.config.base import LARGEST
 from qpavoid.problem import Array, IntArray
@@ -68,6 +67,8 @@ def corners(mesh: Any) -> tuple[Array, IntArray]:
 
 def hull_corners(points: Array) -> Array:
     """Return those of points (n, 3) that are corners of their hull; all where they are flat or few."""
+    from scipy.spatial import ConvexHull, QhullError  # slow to import, and few robots have meshes
+
     try:
         return np.asarray(points[ConvexHull(points).vertices])
     except (QhullError, ValueError):

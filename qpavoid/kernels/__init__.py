@@ -19,17 +19,12 @@ from qpavoid.kernels.clearance import (
     leaves_position_limits,
 )
 from qpavoid.kernels.depth import CellGrid, OwnBodies, fill_cells, mark_own_pixels, recall_cells
-from qpavoid.kernels.estimates import (
-    are_fine,
-    extrapolate_estimates,
-    extrapolate_states,
-    update_estimates,
-    write_rows,
-)
+from qpavoid.kernels.estimates import ObstacleArrays, are_fine, check_updates, observe
 from qpavoid.kernels.kinematics import KinematicsArrays, update_kinematics
 from qpavoid.kernels.layout import SUMMARY, RowLayout
 from qpavoid.kernels.near_pairs import DistanceArrays, near_pairs, place_bodies, place_obstacles
 from qpavoid.kernels.obstacles import Pieces, check_states, sample_pieces
+from qpavoid.kernels.pose_fit import extrapolate_states
 from qpavoid.kernels.prediction import Prediction, predict, prediction_error_bound
 from qpavoid.kernels.qp import max_clearance_velocity, minimize, project, project_soft
 from qpavoid.kernels.ramps import RampLimits, follow_ramp
@@ -60,6 +55,7 @@ __all__ = [
     "CellGrid",
     "DistanceArrays",
     "KinematicsArrays",
+    "ObstacleArrays",
     "OwnBodies",
     "Pieces",
     "Prediction",
@@ -76,6 +72,7 @@ __all__ = [
     "beta",
     "candidates",
     "check_states",
+    "check_updates",
     "clearance_lower_bound",
     "closes_below",
     "comes_near",
@@ -83,7 +80,6 @@ __all__ = [
     "direct",
     "distance_rows",
     "extend_paths",
-    "extrapolate_estimates",
     "extrapolate_states",
     "fill_cells",
     "find_near_pairs",
@@ -99,6 +95,7 @@ __all__ = [
     "max_offset",
     "minimize",
     "near_pairs",
+    "observe",
     "pack",
     "place_bodies",
     "place_obstacles",
@@ -119,11 +116,9 @@ __all__ = [
     "stop_velocity",
     "tracking_law",
     "tracking_violation",
-    "update_estimates",
     "update_kinematics",
     "velocity_bounds",
     "violation",
     "voxels_within",
     "write_path_point",
-    "write_rows",
 ]

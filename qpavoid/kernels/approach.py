@@ -6,8 +6,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from qpavoid.kernels.kinematics import update_kinematics
-from qpavoid.kernels.near_pairs import place_bodies
 from qpavoid.kernels.obstacles import Pieces, sample_pieces
 from qpavoid.kernels.packing import compiled
 from qpavoid.kernels.rollout import HORIZON, PREFERRED_DISTANCE
@@ -96,7 +94,7 @@ def extend_paths(x: Any, pieces: Pieces, on_paths: IntArray, first: int) -> None
 
 
 @compiled
-def comes_near(x: Any, rows: Any, q: Array, v: Array, external: IntArray, on_paths: IntArray) -> tuple[bool, float]:
+def comes_near(x: Any, distances: Any, v: Array, external: IntArray, on_paths: IntArray) -> tuple[bool, float]:
     """Find out whether a moving obstacle may come within the preferred distance until the horizon.
 
     The robot moves at v once more, and brakes. External obstacles go on straight; between the positions on their paths,
@@ -104,8 +102,7 @@ def comes_near(x: Any, rows: Any, q: Array, v: Array, external: IntArray, on_pat
 
     Args:
         x: see `ApproachArrays`.
-        rows: memory of rows and distances, in which joints and the bodies that they move are placed.
-        q: configuration (nq,).
+        distances: of this step; reads joints and centers, see `DistanceArrays`.
         v: velocity (n,) [rad/s or m/s].
         external: numbers of the obstacles that go on straight (k,).
         on_paths: numbers of those on paths (l,).
@@ -113,7 +110,7 @@ def comes_near(x: Any, rows: Any, q: Array, v: Array, external: IntArray, on_pat
     Returns:
         Whether one may; largest speed of any point of an obstacle that moves [m/s].
     """
-    bodies, center, radius = _place_spheres(rows, q, x.spheres)
+    center, radius = _surround(x, distances)
     travel, fastest, near = 0.0, 0.0, False
     for j in range(len(v)):
         travel += x.dt * abs(v[j]) + x.braking[j] * v[j] * v[j]
@@ -123,8 +120,9 @@ def comes_near(x: Any, rows: Any, q: Array, v: Array, external: IntArray, on_pat
         speed, turning = np.sqrt(u[0] ** 2 + u[1] ** 2 + u[2] ** 2), np.sqrt(w[0] ** 2 + w[1] ** 2 + w[2] ** 2)
         if speed > 0.0 or turning > 0.0:
             fastest = max(fastest, speed + (turning * x.radii[i] if turning > 0.0 else 0.0))
-            keep = x.radii[i] + x.margin[i] + distance
-            near = near or _passes(x.states[i, 9:12], u, speed, keep, bodies, center, radius)
+            keep, p = x.radii[i] + x.margin[i] + distance, x.states[i, 9:12]
+            if not (near or _line_distance(p, u, speed, center) > keep + radius):
+                near = _passes(x, distances, p, u, speed, keep)
     for i in on_paths:
         if x.spans[i, 3] < 0.0:
             continue
@@ -135,7 +133,8 @@ def comes_near(x: Any, rows: Any, q: Array, v: Array, external: IntArray, on_pat
             continue
         for s in range(PATH_POINTS):
             p = x.positions[s, i]
-            near = near or _passes(p, p, 0.0, keep, bodies, center, radius)
+            if not (near or _distance(p, center) > keep + radius):
+                near = _passes(x, distances, p, p, 0.0, keep)
     return near, fastest
 
 
@@ -146,38 +145,31 @@ def _distance(a: Array, b: Array) -> float:
 
 
 @compiled
-def _place_spheres(x: Any, q: Array, spheres: Array) -> tuple[Array, Array, float]:
-    """Return the bounding spheres (b, 4) of the bodies that joints move, centre (3,) and radius of one around all."""
-    update_kinematics(x.kinematics, q)
-    place_bodies(x.distances, x.joint_poses)
-    joints, poses = x.distances.joints, x.distances.poses
-    bodies, center, radius, count = np.empty((len(joints), 4)), np.zeros(3), 0.0, 0
+def _surround(x: Any, distances: Any) -> tuple[Array, float]:
+    """Return centre (3,) and radius of a sphere around all bodies that joints move."""
+    joints, centers, center, radius, count = distances.joints, distances.centers, np.zeros(3), 0.0, 0
     for b in range(len(joints)):
-        if joints[b] < 0:
-            continue
-        pose, sphere = poses[b], spheres[b]
-        for c in range(3):
-            bodies[count, c] = pose[c] * sphere[0] + pose[3 + c] * sphere[1] + pose[6 + c] * sphere[2] + pose[9 + c]
-            center[c] += bodies[count, c]
-        bodies[count, 3] = sphere[3]
-        count += 1
-    center /= max(count, 1)
-    for b in range(count):
-        offset = bodies[b, :3] - center
-        radius = np.maximum(radius, np.sqrt(np.sum(offset * offset)) + bodies[b, 3])  # keeps NaN, unlike max
-    return bodies[:count], center, radius
+        if joints[b] >= 0:
+            count += 1
+            for c in range(3):
+                center[c] += centers[b, c]
+    for c in range(3):
+        center[c] /= max(count, 1)
+    for b in range(len(joints)):
+        if joints[b] >= 0:
+            radius = np.maximum(radius, _distance(centers[b], center) + x.spheres[b, 3])  # keeps NaN, unlike max
+    return center, radius
 
 
 @compiled
-def _passes(p: Array, u: Array, speed: float, keep: float, bodies: Array, center: Array, radius: float) -> bool:
-    """Return whether a point at p (3,) that goes on at u (3,) until the horizon comes within `keep` of a sphere.
+def _passes(x: Any, distances: Any, p: Array, u: Array, speed: float, keep: float) -> bool:
+    """Return whether a point at p (3,) that goes on at u (3,) until the horizon comes within `keep` of a body.
 
-    The sphere around all is looked at first. NaN counts as near.
+    NaN counts as near.
     """
-    if _line_distance(p, u, speed, center) > keep + radius:
-        return False
-    for b in range(len(bodies)):  # noqa: SIM110 (numba knows no generators)
-        if not _line_distance(p, u, speed, bodies[b]) > keep + bodies[b, 3]:
+    for b in range(len(distances.joints)):
+        far = _line_distance(p, u, speed, distances.centers[b]) > keep + x.spheres[b, 3]
+        if distances.joints[b] >= 0 and not far:
             return True
     return False
 

@@ -12,8 +12,8 @@ import numpy as np
 from qpavoid.kernels.packing import compiled
 from qpavoid.problem import Array, IntArray
 
-FINE, NORMALISED, NOT_FINITE, FAR, FAST, NO_ROTATION, LEFT_HANDED = range(7)
-"""Codes of `check_states`."""
+FINE, NORMALISED, NOT_FINITE, FAR, FAST, NO_ROTATION, LEFT_HANDED, NO_QUATERNION = range(8)
+"""Codes of `check_states`; the last one of `check_updates` alone: a quaternion that is not of length 1."""
 EXACT, NEARLY = 1e-6, 1e-3
 """|RᵀR - I| up to which a matrix is taken for a rotation as it is (rotations in single precision are 1e-7 off), and up
 to which it is replaced by the nearest rotation (the rounding of a matrix that was typed with three digits) [-]."""
@@ -97,52 +97,57 @@ def check_states(
     Returns:
         (k,) FINE, NORMALISED, or the code of the first fault; (k,) largest entry of |RᵀR - I|.
     """
-    codes, deviation, gram, new = np.zeros(len(numbers), np.intp), np.zeros(len(numbers)), np.empty((3, 3)), np.empty(9)
+    codes, deviation = np.zeros(len(numbers), np.intp), np.zeros(len(numbers))
     for k in range(len(numbers)):
-        x, count = states[numbers[k]], 18 if kind[k] == SAMPLE else 12
-        total, far, fast = 0.0, 0.0, 0.0
-        for c in range(count):
-            total += abs(x[c])
-        if not total < np.inf:  # isfinite does not survive the reordering of sums
-            codes[k] = NOT_FINITE
-            continue
-        for c in range(9, 12):
-            far = max(far, abs(x[c]))
-        for c in range(12, count):
-            fast = max(fast, abs(x[c]))
-        if far > max_position or fast > max_twist:
-            codes[k] = FAR if far > max_position else FAST
-            continue
-        _gram(x, gram)
-        for r in range(3):
-            for c in range(3):
-                deviation[k] = max(deviation[k], abs(gram[r, c] - (1.0 if r == c else 0.0)))
-        normal = x[1] * x[5] - x[2] * x[4], x[2] * x[3] - x[0] * x[5], x[0] * x[4] - x[1] * x[3]
-        if normal[0] * x[6] + normal[1] * x[7] + normal[2] * x[8] < 0.0:
-            codes[k] = LEFT_HANDED
-        elif not deviation[k] <= NEARLY:
-            codes[k] = NO_ROTATION
-        elif deviation[k] > EXACT:
-            codes[k] = NORMALISED
-            for _ in range(4):
-                _gram(x, gram)
-                for c in range(3):
-                    for r in range(3):
-                        new[3 * c + r] = 1.5 * x[3 * c + r]
-                        for i in range(3):
-                            new[3 * c + r] -= 0.5 * x[3 * i + r] * gram[i, c]
-                x[:9] = new
+        codes[k], deviation[k] = check_state(states[numbers[k]], kind[k], max_position, max_twist)
     return codes, deviation
 
 
 @compiled
-def _gram(x: Array, gram: Array) -> None:
-    """Write RᵀR (3, 3) of a rotation by columns (9,).
+def check_state(x: Array, kind: int, max_position: float, max_twist: float) -> tuple[int, float]:
+    """Check one state (18,) of a kind, and normalise it in place; see `check_states`.
 
-    Args:
-        x: rotation by columns, the first nine entries.
-        gram: out (3, 3).
+    Returns:
+        Its code; largest entry of |RᵀR - I|.
     """
+    count, total, far, fast = 18 if kind == SAMPLE else 12, 0.0, 0.0, 0.0
+    for c in range(count):
+        total += abs(x[c])
+    if not total < np.inf:  # isfinite does not survive the reordering of sums
+        return NOT_FINITE, 0.0
+    for c in range(9, 12):
+        far = max(far, abs(x[c]))
+    for c in range(12, count):
+        fast = max(fast, abs(x[c]))
+    if far > max_position or fast > max_twist:
+        return FAR if far > max_position else FAST, 0.0
+    deviation = 0.0
     for r in range(3):
+        for c in range(r + 1):
+            product = x[3 * r] * x[3 * c] + x[3 * r + 1] * x[3 * c + 1] + x[3 * r + 2] * x[3 * c + 2]
+            deviation = max(deviation, abs(product - (1.0 if r == c else 0.0)))
+    normal = x[1] * x[5] - x[2] * x[4], x[2] * x[3] - x[0] * x[5], x[0] * x[4] - x[1] * x[3]
+    if normal[0] * x[6] + normal[1] * x[7] + normal[2] * x[8] < 0.0:
+        return LEFT_HANDED, deviation
+    if not deviation <= NEARLY:
+        return NO_ROTATION, deviation
+    if deviation > EXACT:
+        _normalise(x)
+        return NORMALISED, deviation
+    return FINE, deviation
+
+
+@compiled
+def _normalise(x: Array) -> None:
+    """Replace a rotation by columns, the first nine entries, by the nearest one; see `check_states`."""
+    gram, new = np.empty((3, 3)), np.empty(9)
+    for _ in range(4):
+        for r in range(3):
+            for c in range(3):
+                gram[r, c] = x[3 * r] * x[3 * c] + x[3 * r + 1] * x[3 * c + 1] + x[3 * r + 2] * x[3 * c + 2]
         for c in range(3):
-            gram[r, c] = x[3 * r] * x[3 * c] + x[3 * r + 1] * x[3 * c + 1] + x[3 * r + 2] * x[3 * c + 2]
+            for r in range(3):
+                new[3 * c + r] = 1.5 * x[3 * c + r]
+                for i in range(3):
+                    new[3 * c + r] -= 0.5 * x[3 * i + r] * gram[i, c]
+        x[:9] = new

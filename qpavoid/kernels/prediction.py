@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from qpavoid.kernels.estimates import extrapolate
 from qpavoid.kernels.obstacles import Pieces, sample_pieces
 from qpavoid.kernels.packing import compiled
+from qpavoid.kernels.pose_fit import extrapolate
 from qpavoid.problem import Array, IntArray
 
 

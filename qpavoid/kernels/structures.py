@@ -9,6 +9,7 @@ from numba import config, typeof, types
 from numba.experimental import structref
 
 from qpavoid.kernels.approach import ApproachArrays
+from qpavoid.kernels.estimates import ObstacleArrays
 from qpavoid.kernels.kinematics import KinematicsArrays
 from qpavoid.kernels.layout import RowLayout
 from qpavoid.kernels.near_pairs import DistanceArrays
@@ -38,6 +39,15 @@ class PackedRows(structref.StructRefProxy):  # type: ignore[misc]
 
 class PackedRollout(structref.StructRefProxy):  # type: ignore[misc]
     """`RolloutArrays` in compiled code."""
+
+
+class PackedObstacles(structref.StructRefProxy):  # type: ignore[misc]
+    """`ObstacleArrays` in compiled code."""
+
+
+@structref.register
+class PackedObstaclesType(_Structure):
+    """Type of `PackedObstacles`."""
 
 
 @structref.register
@@ -75,6 +85,7 @@ for proxy, kind, fields in (
     (PackedRows, PackedRowsType, RowLayout._fields),
     (PackedRollout, PackedRolloutType, RolloutArrays._fields),
     (PackedApproach, PackedApproachType, ApproachArrays._fields),
+    (PackedObstacles, PackedObstaclesType, ObstacleArrays._fields),
 ):
     structref.define_boxing(kind, proxy)
     structref.define_constructor(proxy, kind, list(fields))
@@ -110,16 +121,25 @@ def _pack_approach(fields: Any) -> Any:
     return PackedApproach(*fields)
 
 
+@compiled
+def _pack_obstacles(fields: Any) -> Any:
+    """Return a structure of `ObstacleArrays`."""
+    return PackedObstacles(*fields)
+
+
 _PACK = {
     KinematicsArrays: _pack_kinematics,
     DistanceArrays: _pack_distances,
     RowLayout: _pack_rows,
     RolloutArrays: _pack_rollout,
     ApproachArrays: _pack_approach,
+    ObstacleArrays: _pack_obstacles,
 }
 
 
-def pack(layout: KinematicsArrays | DistanceArrays | RowLayout | RolloutArrays | ApproachArrays) -> Any:
+def pack(
+    layout: KinematicsArrays | DistanceArrays | RowLayout | RolloutArrays | ApproachArrays | ObstacleArrays,
+) -> Any:
     """Return memory in the form that the kernels take; both look into the same arrays.
 
     With `NUMBA_DISABLE_JIT=1` that is the named tuple itself.

@@ -12,7 +12,6 @@ import numpy as np
 from qpavoid.config import HalfSpace, Mesh, ObstacleShape, PointCloud
 from qpavoid.errors import ConfigError
 from qpavoid.geometry.bodies import make_shape
-from qpavoid.geometry.decompose import decompose
 from qpavoid.geometry.meshes import MeshWarning, convex_hull, corners, load_mesh
 from qpavoid.model.cloud import voxel_radius
 from qpavoid.model.urdf import find_resource
@@ -54,4 +53,6 @@ def make_solids(shape: ObstacleShape, folder: Path, where: str) -> list[Any]:
             f"{where}.path: {len(triangles)} triangles; at most {_MOST_TRIANGLES} are decomposed: make it "
             "coarser, or set `method: convex`"
         )
+    from qpavoid.geometry.decompose import decompose  # needs scipy, which is slow to import
+
     return [convex_hull(piece) for piece in decompose(vertices, triangles, shape.max_pieces, shape.tolerance)]

@@ -11,13 +11,13 @@ import logging
 import multiprocessing
 import os
 import signal
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
+from contextlib import contextmanager
 from importlib.metadata import version
 from itertools import islice
 from threading import Thread
 from typing import Any, TypeVar
-from unittest.mock import patch
 
 from qpavoid.errors import ConfigError, QpavoidError
 
@@ -157,7 +157,7 @@ class Workers:
     def _submit(self, function: Callable[..., Any], call: tuple[Any, ...]) -> Future[Any]:
         if not self._count:
             raise ValueError("these workers are closed")
-        with patch.dict(os.environ, _SINGLE_THREADED):  # processes, which start here, load their libraries with it
+        with _environment(_SINGLE_THREADED):  # processes, which start here, load their libraries with it
             if self._executor is not None:
                 try:
                     return self._executor.submit(function, *call)
@@ -216,6 +216,19 @@ class ClusterWorkers(Workers):
     def _submit(self, function: Callable[..., Any], call: tuple[Any, ...]) -> Future[Any]:
         future: Future[Any] = self._remote.submit(function, *call)
         return future
+
+
+@contextmanager
+def _environment(variables: Mapping[str, str]) -> Iterator[None]:
+    """Set some variables of the environment for a while."""
+    saved = dict(os.environ)
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name in variables:
+            del os.environ[name]
+        os.environ.update(saved)
 
 
 def _begin_process() -> None:

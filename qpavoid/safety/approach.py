@@ -7,24 +7,26 @@ from math import floor
 import numpy as np
 
 from qpavoid import kernels
+from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.control.settings import ControlSettings
 from qpavoid.kernels.approach import PATH_PERIOD, PATH_POINTS
 from qpavoid.problem import Array
-from qpavoid.safety.rollout import BackupRollouts
 
 
 class ApproachCheck:
     """Keeps the sampled paths of obstacles."""
 
-    def __init__(self, settings: ControlSettings, rollouts: BackupRollouts, obstacles: ObstacleTracker) -> None:
-        """Use the kinematics and distances of the rollouts."""
-        self._rollouts, self._obstacles, now = rollouts, obstacles, obstacles.current
+    def __init__(
+        self, settings: ControlSettings, query: DistanceQuery, lever_arm: float, obstacles: ObstacleTracker
+    ) -> None:
+        """Use the distances of the control step; `lever_arm` is that of the robot, see `ApproachArrays`."""
+        self._distances, self._obstacles, now = query.packed, obstacles, obstacles.current
         count = len(now.states)
         self._memory = kernels.ApproachArrays(
             braking=0.5 / settings.bounds.acceleration,
-            spheres=rollouts.query.table.spheres,
-            radii=rollouts.query.obstacle_radii,
+            spheres=query.table.spheres,
+            radii=query.obstacle_radii,
             margin=now.margin,
             states=now.states,
             twists=obstacles.mean_twists,
@@ -34,7 +36,7 @@ class ApproachCheck:
             spans=np.zeros((count, 4)),
             peaks=np.zeros((count, 2)),
             scratch=np.zeros_like(now.states),
-            lever_arm=rollouts.lever_arm,
+            lever_arm=lever_arm,
             dt=settings.dt,
         )
         self._packed = kernels.pack(self._memory)
@@ -43,7 +45,11 @@ class ApproachCheck:
         self.reset()
         if count:
             kernels.write_path_point(self._packed, 0, 0, now.states[0])
-        self.is_far(settings.scene.robot.home, np.zeros(settings.scene.robot.model.nv), 0.0)  # compiled before any step
+        self._v = np.zeros(settings.scene.robot.model.nv)
+        self._comes_near = kernels.direct(
+            kernels.comes_near, self._packed, self._distances, self._v, obstacles.external, obstacles.on_trajectories
+        )
+        self.is_far(self._v, 0.0)  # compiled before any step
         self.reset()
 
     def reset(self) -> None:
@@ -51,18 +57,19 @@ class ApproachCheck:
         self._memory.numbers.fill(np.iinfo(np.intp).min)
         self._first, self._moving = -1, self._obstacles.moving
 
-    def is_far(self, q: Array, v: Array, t: float) -> bool:
+    def is_far(self, v: Array, t: float) -> bool:
         """Return whether moving obstacles certainly stay away from a robot that moves at v (nv,) once more, and brakes.
 
-        It is at q (nq,) at time t [s].
+        It is where the distances of the control step have it, at time t [s].
         """
         first, obstacles = floor(t / PATH_PERIOD), self._obstacles
         if obstacles.moving is not self._moving:
             self.reset()
         if first != self._first:
             self._extend(first)
-        near, self.max_speed = kernels.comes_near(
-            self._packed, self._rollouts.packed, q, v, obstacles.external, obstacles.on_trajectories
+        self._v[:] = v  # the code takes v as it is: in one piece
+        near, self.max_speed = self._comes_near(
+            self._packed, self._distances, self._v, obstacles.external, obstacles.on_trajectories
         )
         return not near
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from qpavoid.budget import BudgetSpent
 from qpavoid.control.assembler import RowAssembler
 from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.control.settings import ControlSettings
@@ -41,7 +42,7 @@ class Arbiter:
         self._braking = BrakingCheck(settings, rows, obstacles)
         self.progress, self._shake_damping = ProgressMonitor(settings, rows), ShakeDamping(settings.dt)
         has_backup = settings.avoidance.backup and len(settings.scene.slots) > 0
-        self.backup = BackupPlanner(settings, rows.query.table, obstacles) if has_backup else None
+        self.backup = BackupPlanner(settings, rows.query, obstacles) if has_backup else None
 
     def reset(self) -> None:
         """Drop all that is known of earlier control steps."""
@@ -78,7 +79,12 @@ class Arbiter:
                 problem = damping.apply(problem)
                 if problem.levels and self.solver.prioritised:
                     problem = rows.prioritised(problem)
-            solution = self._solve(q, problem, rows.proximity(), from_tasks)
+            if self._settings.budget.is_limited:
+                problem = problem._replace(budget=self._settings.budget)
+            try:
+                solution = self._solve(q, problem, rows.proximity(), from_tasks)
+            except BudgetSpent as error:
+                solution = _stop(problem, (Reason.of(ReasonKind.BUDGET_SPENT, str(error)),))
         if from_tasks:
             stalled = self.progress.update(problem, solution)
             if stalled or not damping.is_idle:
@@ -107,6 +113,8 @@ class Arbiter:
                 and is_finite_and_bounded(v)
                 and _well_formed(problem, solution)
             )
+        except BudgetSpent:
+            raise
         except Exception as error:  # a user's solver may raise anything; the robot must get a velocity
             raised = Reason.of(ReasonKind.SOLVER_FAILED, detail=f"it raised {type(error).__name__}: {error}")
             return _stop(problem, (raised,))
@@ -164,6 +172,8 @@ class Arbiter:
         except NumericalError as error:  # of a predicted state; raised by `step` once it is the present one
             why = f"prediction of an {error}"
             return solution.with_reasons(Reason.of(ReasonKind.NO_BACKUP, severity=Severity.WARNING, detail=why))
+        if v is None and backup.is_cut:
+            return _stop(rows.problem(), (*solution.reasons, Reason.of(ReasonKind.BUDGET_SPENT, "backup search")))
         if v is None:
             return solution
         problem = rows.problem()

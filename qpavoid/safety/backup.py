@@ -23,8 +23,8 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
+from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.obstacles import ObstacleTracker
-from qpavoid.control.pair_table import PairTable
 from qpavoid.control.settings import ControlSettings
 from qpavoid.errors import NumericalError
 from qpavoid.kernels.rollout import FINISHED, HORIZON, PAUSED, TOUCH
@@ -47,6 +47,9 @@ _FIRST_CANDIDATES = 7
 """Candidates that are tried near an obstacle before one is followed that does not suffice [-]."""
 _URGENT = 0.5
 """Time before a contact in which the best candidate is followed all the same [s]."""
+_PORTION = 4
+"""Poses that are evaluated, at 10 to 20 µs each, before a clock is read, where there is a budget [-]; of each control
+step, these at least."""
 _DISTANCE_TOLERANCE = 1e-6
 """Difference of two clearances that counts as none [m]."""
 _WITH_TASK, _ALONE = range(2)
@@ -75,15 +78,18 @@ class _Command(NamedTuple):
 class BackupPlanner:
     """Decides between the velocity of the solver and the first one of a backup trajectory."""
 
-    def __init__(self, settings: ControlSettings, table: PairTable, obstacles: ObstacleTracker) -> None:
-        """Begin without a backup trajectory; see `BackupRollouts` for the arguments."""
+    def __init__(self, settings: ControlSettings, query: DistanceQuery, obstacles: ObstacleTracker) -> None:
+        """Begin without a backup trajectory; `query` has the distances of the control step."""
         self._model, self._obstacles, self._dt = settings.scene.robot.model, obstacles, settings.dt
-        self._rollouts = BackupRollouts(settings, table, obstacles)
-        self._approach = ApproachCheck(settings, self._rollouts, obstacles)
+        self._rollouts = BackupRollouts(settings, query.table, obstacles)
+        self._approach = ApproachCheck(settings, query, self._rollouts.lever_arm, obstacles)
         self._poses = max(1, round(_POSE_RATE * settings.dt))
         """Poses that are evaluated in a control step."""
         self._steps_ahead = ceil(_CANDIDATES_AHEAD * self._rollouts.usual_poses / self._poses)
         """Control steps in which that many candidates are computed."""
+        self._budget = settings.budget
+        self.is_cut = False
+        """Whether the search of this control step was cut by the budget while no backup trajectory is known."""
         self._last_enabled = self._rollouts.enabled
         self.reset()
 
@@ -123,8 +129,9 @@ class BackupPlanner:
             dv_prev: change of velocity (nv,) in that step.
             proximity: distances of this control step; pairs in contact do not count.
         """
+        self.is_cut = False
         is_same_scene = self._moving is self._obstacles.moving
-        is_near = len(self._obstacles.moving) > 0 and not self._approach.is_far(q, v, t)
+        is_near = len(self._obstacles.moving) > 0 and not self._approach.is_far(v, t)
         if not (is_near and is_same_scene):
             self._forget()
         if not is_near:
@@ -139,6 +146,7 @@ class BackupPlanner:
         else:
             self._backup = None
         command = self._search(command, command.is_task or self._is_valid(backup, state))
+        self.is_cut = self._backup is None and self._budget.is_spent
         return None if command.is_task else _unless_equal(command.v, v)
 
     def _enabled(self, proximity: Proximity) -> Mask:
@@ -177,13 +185,16 @@ class BackupPlanner:
                 if self._steps_needed(poses) > self._steps_needed(self._poses) or self._lasts(command):
                     break
                 self._begin(command, is_valid, poses)
+            portion = min(poses, _PORTION) if self._budget.is_limited else poses
             try:
-                code = rollouts.resume(poses)
+                code = rollouts.resume(portion)
             except NumericalError:  # of a predicted state
                 self._kind = -1
                 raise
-            poses = rollouts.poses_left
+            poses -= portion - rollouts.poses_left
             if code == PAUSED:
+                if poses > 0 and not self._budget.is_spent:
+                    continue
                 break
             kind, self._kind = self._kind, -1
             candidate = rollouts.result() if code == FINISHED else None

@@ -109,6 +109,7 @@ class BrakingCheck:
         self._safety_distance, self._rate = settings.safety_distance, settings.limits.position_gain / settings.dt
         self._rows, self._now, self._obstacles = rows, rows.query, obstacles
         self._kinematics, self._query = ForwardKinematics(self._model), DistanceQuery(scene, rows.query.table)
+        self._budget = settings.budget
         self._has_accelerations = bool(np.isfinite(settings.bounds.acceleration).any())
         self._has_jerks = bool(np.isfinite(settings.bounds.jerk).any())
         self._allowance = np.zeros(len(scene.pairs))
@@ -248,6 +249,7 @@ class BrakingCheck:
 
     def _evaluate(self, path: _Path, previous: _PathPoint, t: float) -> _PathPoint:
         """Evaluate the pose at time t, integrated from that of another point; pair -1 if none is near."""
+        self._budget.check("stop look-ahead")
         q = pin.integrate(self._model, previous.q, path.displacement(t) - path.displacement(previous.t))
         self._kinematics.compute(q)
         query, now = self._query, self._now

@@ -1,7 +1,8 @@
 """QP back ends behind one call: min ½ xᵀP x + qᵀx subject to G x >= h, lower <= x <= upper.
 
 daqp is called without a wrapper, every other one through qpsolvers. All have tight tolerances: the result is a
-velocity, and an error of 1e-2 rad/s is a fault even where the back end reports success.
+velocity, and an error of 1e-2 rad/s is a fault even where the back end reports success. qpsolvers imports every back
+end that is installed, which takes as long as all else: so it is imported where it is used.
 """
 
 from __future__ import annotations
@@ -14,8 +15,6 @@ from typing import Any
 
 import daqp
 import numpy as np
-import qpsolvers
-from scipy.sparse import csc_matrix
 
 from qpavoid import kernels
 from qpavoid.errors import SolverNotInstalled, UnknownName
@@ -54,6 +53,8 @@ clarabel was right on nearly all recorded problems and failed on easy random one
 
 def backend_names() -> list[str]:
     """Return the names of the installed back ends, daqp first."""
+    import qpsolvers
+
     return ["daqp", *sorted({*qpsolvers.available_solvers} - {"daqp"})]
 
 
@@ -69,6 +70,8 @@ def make_backend(name: str) -> Backend:
     """
     if name == "daqp":
         return Daqp()
+    import qpsolvers
+
     if name in qpsolvers.available_solvers:
         return through_qpsolvers(name)
     usable = ", ".join(backend_names())
@@ -117,6 +120,9 @@ def through_qpsolvers(name: str, options: dict[str, Any] | None = None) -> Backe
         name: as in `qpsolvers.available_solvers`.
         options: arguments of the back end; tight tolerances if left out.
     """
+    import qpsolvers
+    from scipy.sparse import csc_matrix
+
     options = _TIGHT.get(name, {}) if options is None else options
     is_sparse = name in qpsolvers.sparse_solvers and name not in qpsolvers.dense_solvers
     convert = csc_matrix if is_sparse else np.asarray

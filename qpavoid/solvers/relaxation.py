@@ -102,6 +102,7 @@ def _closest(
     A row of softness c > 0 may be violated by s at the cost of ½ s² / c. With such rows, the other cost is
     ½ ‖v - v_tracking‖²: the tracking cost, flat in many directions, would leave too few digits.
     """
+    problem.budget.check("relaxation")
     if soft is None:
         return project(problem, problem.tracking.A, regularization, J, b, lower, upper)
     return project(problem, np.zeros((0, len(lower))), 1.0, J, b, lower, upper, soft)

@@ -82,7 +82,7 @@ def loop_names() -> list[str]:
     """Return the names of all closed loops."""
     return [
         "far-50",
-        *(f"far-50+{kind}{count}" for kind in ("move", "sample", "pose") for count in (1, 10, 50)),
+        *(f"far-50+{kind}{count}" for kind in ("move", "sample", "pose", "array") for count in (1, 10, 50)),
         *(f"shape-{shape}" for shape in _SHAPES),
         *(f"bodies-{kind}" for kind in ("capsule", "convex", "mesh")),
         *(f"bodies-{kind}+{count}" for kind in ("capsule", "convex") for count in (5, 50)),
@@ -160,8 +160,10 @@ def _far(kind: str, count: str) -> Loop:
     scenario = _scenario(obstacles, {"type": "fixed"})
     if kind in ("", "move"):
         return _from(scenario)
-    update = Sample if kind == "sample" else Pose
-    return _from(scenario, {f"o{i}": update.at([2.0 + 0.1 * i, 0.0, 1.0]) for i in range(number)})
+    update = Pose if kind == "pose" else Sample
+    updates = {f"o{i}": update.at([2.0 + 0.1 * i, 0.0, 1.0]) for i in range(number)}
+    rows = np.array([sample.row for sample in updates.values()])
+    return _from(scenario, {tuple(updates): rows} if kind == "array" else updates)
 
 
 def _scattered(shape: str) -> list[dict[str, Any]]:
