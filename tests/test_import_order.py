@@ -18,6 +18,10 @@ FOR_BENCHMARKS = {
     "qpavoid.solvers.backends": "the back ends that are compared",
     "qpavoid.kernels": "project: the compiled QP, which is compared with them",
     "qpavoid.geometry.bodies": "make_shape: free places for random obstacles",
+    "qpavoid.perception.depth_voxels": "DepthVoxels, OwnBodiesAt, Perception, RenderedCamera: what an image costs",
+    "qpavoid.perception.own_bodies": "see there",
+    "qpavoid.perception.process": "see there",
+    "qpavoid.perception.rendering": "see there",
     "qpavoid.viz.style": "colours and grid: figures look alike",
     "qpavoid.viz.view": "View: what a live view costs a loop",
 }

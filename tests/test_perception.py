@@ -254,10 +254,10 @@ from qpavoid.perception.camera import Camera
 from qpavoid.perception.depth_voxels import DepthVoxels
 from qpavoid.perception.own_bodies import OwnBodiesAt
 robot = Robot.load("panda")
-camera = Camera.at([1.5, 0, 0.5], [[0, 0, -1], [1, 0, 0], [0, -1, 0]], (10.0, 10.0, 5.5, 3.5), (12, 8))
+camera = Camera.at([1.503, 0.0012, 0.5071], [[0, 0, -1], [1, 0, 0], [0, -1, 0]], (10.0, 10.0, 5.5, 3.5), (12, 8))
 own, sorter = OwnBodiesAt(robot, camera), DepthVoxels(camera)
 pose = own.place(robot.home)
-for depth in (np.linspace(0.3, 2.0, 96), np.full(96, 0.2)):
+for depth in (np.linspace(0.3, 2.0, 96), np.full(96, 0.211)):
     found = sorter.voxels(depth.reshape(8, 12).astype(np.float32), own.arrays, pose, 0.0)
 print(len(found.centers), found.keys.sum())
 """

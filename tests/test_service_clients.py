@@ -93,3 +93,11 @@ def test_bench_serve_prints_percentiles(tmp_path):
     for row in rows:
         p50, p99, worst = map(float, row.split("|")[3:6])
         assert 0.0 < p50 <= p99 <= worst
+
+
+def test_serve_without_its_packages_says_what_to_install(cli, monkeypatch):
+    monkeypatch.setitem(sys.modules, "qpavoid.service.server", None)
+    monkeypatch.setitem(sys.modules, "zmq", None)
+    monkeypatch.delitem(sys.modules, "qpavoid.service.server")
+    result = cli("serve", "panda_ball")
+    assert result.status == 2 and "pip install 'qpavoid[serve]'" in result.stderr

@@ -112,10 +112,9 @@ class JointMap:
             out[self._v_from[:3]] = self._R @ v[:3]
         return out
 
-    def columns(self, J: Array) -> Array:
-        """Return rows (k, nv) on the robot's velocity as rows on that of the other program."""
-        out = np.zeros((len(J), self.nv))
+    def write_columns(self, J: Array, out: Array) -> None:
+        """Write rows J (k, nv) on the robot's velocity as rows (k, `nv`) on that of the other program."""
+        out[:] = 0.0
         out[:, self._v_from] = J
         if self._has_base:
             out[:, self._v_from[:3]] = J[:, :3] @ self._R.T
-        return out

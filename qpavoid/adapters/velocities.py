@@ -12,6 +12,9 @@ from qpavoid.controller import Controller
 from qpavoid.errors import ConfigError
 from qpavoid.problem import Array, Problem, Solution
 
+_NO_BOUND = 1e6
+"""Bound of a coordinate that has none [rad/s or m/s]: not every QP takes infinity."""
+
 
 class VelocityFilter:
     """The safety filter of a controller, for velocities in the order of another program."""
@@ -33,6 +36,8 @@ class RowLimit:
 
     def __init__(self, controller: Controller, joints: JointMap) -> None:
         self.controller, self.joints = controller, joints
+        signs = np.eye(controller.scene.robot.model.nv)
+        self._signs = np.concatenate((signs, -signs))
         self.obstacles: Mapping[str, Any] | None = None
         """Where obstacles are now, for the next step; see `Controller.step`."""
         self.t: float | None = None
@@ -49,10 +54,16 @@ class RowLimit:
         if abs(dt - self.controller.dt) > 1e-9:
             raise ConfigError(f"dt: {dt} s, but the controller has {self.controller.dt} s")
         problem: Problem = self.controller.rows(self.joints.q(q), self.t, self.obstacles)
-        self.obstacles, rows, eye = None, problem.avoidance, np.eye(len(problem.lower))
-        h = np.concatenate((-rows.b, problem.upper, -problem.lower))
-        is_finite = h < np.inf
-        return self.joints.columns(np.concatenate((-rows.J, eye, -eye))[is_finite]), dt * h[is_finite]
+        self.obstacles, rows, sides = None, problem.avoidance, len(self._signs)
+        G, h = np.empty((sides + len(rows.b), self.joints.nv)), np.empty(sides + len(rows.b))
+        self.joints.write_columns(self._signs, G[:sides])
+        self.joints.write_columns(rows.J, G[sides:])
+        np.negative(G[sides:], out=G[sides:])
+        h[: sides // 2], h[sides // 2 : sides], h[sides:] = problem.upper, problem.lower, rows.b
+        np.negative(h[sides // 2 :], out=h[sides // 2 :])
+        np.minimum(h, _NO_BOUND, out=h)
+        h *= dt
+        return G, h
 
     def command(self, v: Any) -> Array:
         """End the step: return the velocity to command, which is v wherever that is safe."""
