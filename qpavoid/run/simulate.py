@@ -21,6 +21,7 @@ from qpavoid.controller import Controller
 from qpavoid.errors import ConfigError, NumericalError
 from qpavoid.geometry.bodies import enclosing_capsule, surface_triangles
 from qpavoid.model.kinematics import ForwardKinematics
+from qpavoid.model.sample import STATE
 from qpavoid.model.scene import PARKING_DISTANCE, Obstacle, Scene
 from qpavoid.problem import Array, Solution, Status
 from qpavoid.run.log import STATUSES, Log
@@ -138,8 +139,14 @@ class Recorder:
         self._obstacles: list[Obstacle] = []
         self._descriptions: list[dict[str, Any]] = []
         self._names, self._pairs = scene.pair_names, [list(pair) for pair in scene.pair_names]
-        self._pair_numbers = np.arange(len(self._pairs))  # of the scene's pairs in that list
+        self._pair_numbers = np.append(np.arange(len(self._pairs)), -1)  # of the scene's pairs in that list; of none
+        count = len(scene.slots)
+        self._states, self._margin, self._numbers = np.zeros((count, STATE)), np.zeros(count), np.arange(count)
+        self._moving = [i for i, obstacle in enumerate(scene.slots) if obstacle.moves]
+        self._bodies = np.arange(len(self._ends))
+        self._joints = np.array([body.parentJoint for body in scene.robot.bodies.geometryObjects], dtype=np.intp)
         self._notice_obstacles()
+        self._count_pairs()
         self._events: list[list[Any]] = []
         self._keys: tuple[object, ...] = ()
         self._count = 0
@@ -188,45 +195,54 @@ class Recorder:
                 self._pair_numbers[i] = len(self._pairs)
                 self._pairs.append(list(pair))
         self._names = scene.pair_names
+        columns = {id(obstacle): column for column, obstacle in enumerate(self._obstacles)}
+        self._present = np.array([i for i, obstacle in enumerate(scene.slots) if obstacle.name], dtype=np.intp)
+        self._columns = np.array([columns[id(scene.slots[i])] for i in self._present.tolist()], dtype=np.intp)
+
+    def _count_pairs(self) -> None:
+        """List the pairs of each body, those of attached objects for the bodies that these count for."""
+        scene, attached = self._scene, self._controller.attached
+        counted_body = np.arange(len(scene.geometry.geometryObjects))
+        for i, obstacle in enumerate(scene.slots):
+            if obstacle.name in attached:
+                counted_body[np.flatnonzero(scene.obstacle_of == i)] = _attachment_body(scene, attached[obstacle.name])
+        bodies, count = counted_body[scene.pairs], len(scene.pairs)
+        lists = [np.flatnonzero((bodies == body).any(axis=1)) for body in range(len(self._ends))]
+        self._pairs_of = np.full((len(lists), max(map(len, lists), default=0) + 1), count)  # one that is infinitely far
+        for row, pairs in zip(self._pairs_of, lists, strict=True):
+            row[: len(pairs)] = pairs
+        self._attached = attached
 
     def _write_bodies(self, tick: Tick) -> None:
         """Store the distances of all pairs, and the poses of bodies and obstacles, NaN of those that are not there."""
         scene, n, x = self._scene, self._count, self._arrays
         if scene.pair_names is not self._names:
             self._notice_obstacles()
-        columns = {id(obstacle): column for column, obstacle in enumerate(self._obstacles)}
+        if self._controller.attached != self._attached:
+            self._count_pairs()
         self._kinematics.compute(tick.state.q)
-        samples, attached = [], self._controller.attached
-        counted_body = np.arange(len(scene.geometry.geometryObjects))
-        for i, obstacle in enumerate(scene.slots):
-            is_placed = obstacle.name and not obstacle.moves
-            sample = (
-                self._controller.obstacle_pose(obstacle.name, tick.state.q)
-                if is_placed or obstacle.name in attached
-                else obstacle.motion.sample(tick.state.t)
-            )
-            if obstacle.name:
-                column = columns[id(obstacle)]
-                x["obstacle_position"][n, column], x["obstacle_rotation"][n, column] = sample.position, sample.rotation
-            if obstacle.name in attached:
-                counted_body[np.flatnonzero(scene.obstacle_of == i)] = _attachment_body(scene, attached[obstacle.name])
-            samples.append(sample)
-        self._query.place(ObstacleStates.of(samples))
+        states = self._states
+        states[:, :12] = tick.obstacles
+        for i in self._moving if self._scenario.latency else ():  # the step takes them to be where they are later
+            if scene.slots[i].name not in self._attached:
+                states[i, :12] = scene.slots[i].motion.sample(tick.state.t).row[:12]
+        x["obstacle_position"][n, self._columns] = states[self._present, 9:12]
+        x["obstacle_rotation"][n, self._columns] = states[self._present, :9].reshape(-1, 3, 3).transpose(0, 2, 1)
+        self._query.place(ObstacleStates(self._numbers, states, self._margin, {}))
         self._query.compute(self._kinematics.joint_poses, np.inf)
-        distance, pairs = np.full(len(scene.pairs), np.inf), self._query.pairs
+        distance, pairs = np.full(len(scene.pairs) + 1, np.inf), self._query.pairs
         distance[pairs] = self._query.arrays.results[pairs, 0]
         distance[distance > 0.5 * PARKING_DISTANCE] = np.inf
-        if np.isfinite(distance).any():
-            x["closest_pair"][n] = self._pair_numbers[np.argmin(distance)]
-        order = np.argsort(-distance, kind="stable")  # of the pairs of a body, the closest one is written last
-        order = order[np.isfinite(distance[order])]
-        nearest, pair = np.full(len(counted_body), np.inf), np.full(len(counted_body), -1)
-        bodies = counted_body[scene.pairs[order]].ravel()
-        nearest[bodies], pair[bodies] = np.repeat(distance[order], 2), np.repeat(self._pair_numbers[order], 2)
-        x["body_distance"][n], x["body_pair"][n] = nearest[: len(scene.body_names)], pair[: len(scene.body_names)]
-        for i, body in enumerate(scene.robot.bodies.geometryObjects):
-            pose = self._kinematics.joint_poses[body.parentJoint]
-            x["body_ends"][n, i] = self._ends[i] @ pose[:9].reshape(3, 3) + pose[9:]
+        least = int(np.argmin(distance))
+        if distance[least] < np.inf:
+            x["closest_pair"][n] = self._pair_numbers[least]
+        near = distance[self._pairs_of]
+        nearest = near.argmin(axis=1)
+        x["body_distance"][n] = near[self._bodies, nearest]
+        x["body_pair"][n] = self._pair_numbers[self._pairs_of[self._bodies, nearest]]
+        poses = self._kinematics.joint_poses[self._joints]
+        R, p = poses[:, :9].reshape(-1, 3, 3), poses[:, None, 9:]  # by columns: that is Rᵀ
+        x["body_ends"][n] = self._ends @ R + p
 
     def log(self, stopped_by: str | None = None) -> Log:
         """Return the steps stored so far as a log.
