@@ -26,6 +26,7 @@ from qpavoid.control.split_step import SplitStep
 from qpavoid.control.tasks import RowTask, in_order
 from qpavoid.control.tick import Tick, copied
 from qpavoid.errors import ConfigError, NumericalError, located
+from qpavoid.model.robot import Robot
 from qpavoid.model.scene import Obstacle, Scene
 from qpavoid.planning.replanning import Replanning
 from qpavoid.problem import Array, Solution, State, as_vector, require_finite
@@ -170,13 +171,13 @@ class Controller(SceneChanges, SplitStep):
         self.reset()
 
     @classmethod
-    def from_scenario(cls, scenario: ScenarioConfig) -> tuple[Controller, Array]:
-        """Controller and initial configuration of a scenario.
+    def from_scenario(cls, scenario: ScenarioConfig, robot: Robot | None = None) -> tuple[Controller, Array]:
+        """Controller and initial configuration of a scenario; `robot` is that of the scenario, if it is loaded already.
 
         Raises:
             ConfigError, UnknownName, SolverNotInstalled: naming file, field and remedy.
         """
-        source, parts = scenario.source, build_parts(scenario)
+        source, parts = scenario.source, build_parts(scenario, robot)
         with located(str(source)):
             controller = cls(
                 parts.scene, parts.tasks, parts.solver, scenario.dt, scenario.avoidance, scenario.limits,

@@ -120,6 +120,9 @@ def law_by_definition(rows, v_max):
         if weakness > 0.0:
             fastest = 0.3 / weakness * np.min(limited / np.maximum(np.abs(Vt[i]), 1e-12))
             step = np.clip(step, -fastest, fastest)
+        near = (1.0 - s[i] ** 2 / max(Vt[i] @ turn, s[i] ** 2)) * max(0.0, 1.0 - s[i] ** 2 / weak)
+        if near > 0.0:
+            step *= 1.0 - 2.0 * near * np.clip(-10.0 * np.sign(y[i]) * (Vt[i] @ x.centering), 0.0, 1.0)
         v += step * Vt[i]
     return v, b / g, s, size
 
@@ -137,6 +140,7 @@ def test_law_by_definition(request, name, kind):
         q = random_q(robot, rng, 0.8)
         if k % 4 == 0:
             q[4 if name == "ur5" else 3] = rng.choice([0.0, 1e-3, 0.05])
+        rows.x.centering[:] = rng.uniform(-1.0, 1.0, len(rows.x.centering))
         A, _ = rows.write(q, far_targets(robot, q, [tool], rng, 10.0 ** rng.uniform(-4.0, 0.5)))
         expected, feasible, s, size = law_by_definition(rows, rows.x.v_max)
         v, b_feasible, _ = rows.law()
@@ -255,6 +259,26 @@ def test_arm_rests_beyond_reach(request, tmp_path, seed, acceleration):
     if kind == "position" and arm != "mimicking":
         (end,) = frames(robot, [tool], q)
         assert np.linalg.norm(end.translation - target.position) < beyond + 0.12
+
+
+@pytest.mark.parametrize(
+    "seed", [3, 6, 9, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (0, 1, 2, 4, 5, 7, 8, 10, 11))]
+)
+def test_arm_follows_a_target_that_comes_back_into_reach(panda, seed):
+    """Stretched out, an arm can fold to two sides; the wrong one ends at the limits of the joints."""
+    rng = np.random.default_rng(seed)
+    turn, rise, beyond = rng.uniform([-0.8, -0.1, 0.05], [0.8, 0.8, 0.3])
+    (pose,) = frames(panda, [TOOLS["panda"]], panda.home)
+    shoulder = np.array([0.0, 0.0, 0.333])
+    out = np.array([np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)])
+    away = shoulder + (0.95 + beyond) * out
+    tasks = build_tasks([Task(frame=TOOLS["panda"], gain=10.0)], panda, panda.home)
+    controller, q = Controller(build_scene(panda), tasks, dt=0.01), panda.home
+    for share in np.concatenate([np.linspace(0.0, 1.0, 200), np.ones(150), np.linspace(1.0, 0.0, 200), np.zeros(150)]):
+        target = Sample.at(pose.translation + share * (away - pose.translation), pose.rotation)
+        q = pin.integrate(panda.model, q, 0.01 * controller.step(q, targets={TOOLS["panda"]: target}).v)
+    (end,) = frames(panda, [TOOLS["panda"]], q)
+    assert np.linalg.norm(end.translation - pose.translation) < 1e-3
 
 
 TURNS = [turn for axis in np.eye(3) for turn in (0.3 * axis, -0.3 * axis)]

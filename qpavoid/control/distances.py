@@ -254,14 +254,14 @@ class DistanceQuery:
         self.arrays.results[pair] = read_results([result])[0]
 
     def distances_of(self, pairs: IntArray) -> Array:
-        """Return distances (k,) of some pairs at the last call; infinite for those that were not near [m].
+        """Return distances (k,) of some pairs, increasing, at the last call; infinite for those that were not near [m].
 
         Of a point cloud, that of its nearest voxel to each body: the identity of that voxel may change between calls.
         """
-        distance, results = np.full(len(self.table.group), np.inf), self.arrays.results
+        results = self.arrays.results
         if not self._clouds:
-            distance[self._near] = results[self._near, 0]
-            return distance[pairs]
+            return np.asarray(kernels.distances_of(self._near, results, pairs))
+        distance = np.full(len(self.table.group), np.inf)
         np.minimum.at(distance, self.table.group[self._near], results[self._near, 0])
         return np.asarray(distance[self.table.group[pairs]])
 

@@ -24,15 +24,20 @@ class Parts(NamedTuple):
     q0: Array
 
 
-def build_parts(scenario: ScenarioConfig) -> Parts:
+def build_parts(scenario: ScenarioConfig, robot: Robot | None = None) -> Parts:
     """Build the parts of a scenario's controller.
+
+    Args:
+        scenario: configuration.
+        robot: that of the scenario; loaded if left out.
 
     Raises:
         ConfigError, UnknownName, SolverNotInstalled: naming file, field and remedy.
     """
     source = scenario.source
-    with located(f"{source}: robot"):
-        robot = Robot.load(scenario.robot, source.parent)
+    if robot is None:
+        with located(f"{source}: robot"):
+            robot = Robot.load(scenario.robot, source.parent)
     with located(f"{source}: solver"):
         solver = make_solver(scenario.solver)
     q0 = robot.configuration(scenario.q0, f"{source}: q0")

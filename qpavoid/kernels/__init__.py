@@ -22,6 +22,7 @@ from qpavoid.kernels.depth import CellGrid, OwnBodies, fill_cells, mark_own_pixe
 from qpavoid.kernels.estimates import ObstacleArrays, are_fine, check_updates, observe
 from qpavoid.kernels.kinematics import KinematicsArrays, update_kinematics
 from qpavoid.kernels.layout import SUMMARY, RowLayout
+from qpavoid.kernels.margins import distances_of, least_margin
 from qpavoid.kernels.near_pairs import DistanceArrays, near_pairs, place_bodies, place_obstacles
 from qpavoid.kernels.obstacles import Pieces, check_states, sample_pieces
 from qpavoid.kernels.pose_fit import extrapolate_states
@@ -79,6 +80,7 @@ __all__ = [
     "control_step",
     "direct",
     "distance_rows",
+    "distances_of",
     "extend_paths",
     "extrapolate_states",
     "fill_cells",
@@ -89,6 +91,7 @@ __all__ = [
     "is_clear",
     "jerk_limited_stop",
     "joint_speeds",
+    "least_margin",
     "leaves_position_limits",
     "mark_own_pixels",
     "max_clearance_velocity",

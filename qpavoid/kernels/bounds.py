@@ -28,7 +28,8 @@ def velocity_bounds(x: Any, q: Array) -> float:
     limits contradict, the hard bounds hold. See `qpavoid.model.limits`.
 
     Args:
-        x: reads the limits, v_prev and dv_prev; writes hard_lower, hard_upper, lower and upper (n,) [rad/s or m/s].
+        x: reads the limits, v_prev and dv_prev; writes hard_lower, hard_upper, lower and upper (n,) [rad/s or m/s], and
+            centering.
         q: configuration (nq,).
 
     Returns:
@@ -43,6 +44,7 @@ def velocity_bounds(x: Any, q: Array) -> float:
         slowest = -x.v_recovery[j]
         below, above = position - x.q_lower[i], x.q_upper[i] - position
         margin = min(margin, below, above)
+        x.centering[j] = min(max((above - below) / (x.q_upper[i] - x.q_lower[i]), -1.0), 1.0)
         if step < np.inf:
             faster, slower = min(step, x.dv_step[j] + x.dv_prev[j]), min(step, x.dv_step[j] - x.dv_prev[j])
             back_up, back_down = max(x.position_rate * below, slowest), max(x.position_rate * above, slowest)

@@ -169,6 +169,8 @@ class RowLayout(NamedTuple):
     """(n,) out: lower bound on v from all limits, acceleration and jerk included."""
     upper: Array
     """(n,) out: upper bound from the same."""
+    centering: Array
+    """(n,) out: towards the middle of each coordinate's range, over half of it; zero without position limits [-]."""
     v_stop: Array
     """(n,) out: the next velocity of a stop: all coordinates slowed by one factor, as fast as their limits allow."""
     # --- answer of the tracking law

@@ -103,14 +103,13 @@ def assemble(
     Returns:
         The numbers of `SUMMARY`.
     """
-    bent = 0.0
+    margin, bent = velocity_bounds(x, q), 0.0
+    stop_velocity(x)
     if from_tasks:
         frame_rows(x)
         bent = tracking_law(x, x.A, x.b, x.v_tracking, x.b_feasible)
         if x.task_switching:  # rows are compared with eq. 10 at a λ that is the same in every step
             bent = 0.0
-    margin = velocity_bounds(x, q)
-    stop_velocity(x)
     k = distance_rows(x, pairs, influence_distance, moving)
     row_bounds(x, k, moving)
     worst = tracking_violation(x, k)

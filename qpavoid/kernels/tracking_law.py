@@ -11,6 +11,10 @@ c_i is what a Newton step divides by; z_i keeps off directions that the robot la
 size of its tasks, √‖J Jᵀ‖ in the Frobenius norm, v_i is weak: where A⁺b/g needs more than 0.3 of the speed limits of
 the joints, m_i is so large that no joint of v_i is faster than that over 1 - σ_i²/l_i². The law is J⁺b/g, exactly,
 where σ_i >= l_i and σ_i² >= 4|w|, and there is nothing to choose.
+
+From full reach, a target that comes back is followed by folding to either side, and one of them ends at the limits of
+the joints. Where v_i is weak and v_iᵀ G(w) v_i > σ_i², with y_i v_i away from the middle of the joints' ranges, the
+speed along v_i is turned round: the arm goes back over full reach, and folds to the other side.
 """
 
 from __future__ import annotations
@@ -38,6 +42,8 @@ from qpavoid.problem import Array
 
 _MISSING = 0.02
 """Curvature along a direction, over |w|, below which the robot lacks the direction for good [m/m]."""
+_CENTERING = 0.1
+"""Motion of v_i away from the middle of the joints' ranges, over half of them, that turns it round [1/rad, 1/m]."""
 _TINY = 1e-12
 """Least divisor, over σ_1² [-]."""
 
@@ -51,8 +57,8 @@ def tracking_law(x: Any, A: Array, b: Array, v: Array, b_feasible: Array) -> flo
     curvature that 1 m or 1 rad makes, |w|. In a direction that several tasks share, |w| counts each by its part in u_i.
 
     Args:
-        x: reads feedback, scale, dead_beat, row_tasks, bending_rows, straight_rows, v_max, dt, and what `add_curvature`
-            does.
+        x: reads feedback, scale, dead_beat, row_tasks, bending_rows, straight_rows, v_max, centering, dt, and what
+            `add_curvature` does.
         A: (r, n).
         b: (r,).
         v: out (n,), NaN where A or b has one [rad/s or m/s].
@@ -118,14 +124,36 @@ def _follow_bending(x: Any, A: Array, b: Array, v: Array, damping: Array) -> Arr
     for i in range(count):
         if squares[i] > 0.0:
             y, size, others = _pull(x, U[i], b, w)
-            m = max(_divisor(B[i], squares[i], weak[i], G, size, others), _TINY * largest)
+            m, curvature = _divisor(B[i], squares[i], weak[i], G, size, others)
+            m = max(m, _TINY * largest)
             m = max(
                 m, np.sqrt(squares[i]) * abs(y) / _fastest(x, B[i], squares[i], weakness(squares[i] / weak[i], rate))
             )
             damping[i] = m - squares[i]
+            if squares[i] < min(weak[i], curvature):
+                nearness = (1.0 - squares[i] / curvature) * (1.0 - squares[i] / weak[i])
+                y *= _turn_round(x, B[i], y, squares[i], nearness)
             for c in range(nv):
                 v[c] += B[i, c] * y / m
     return B
+
+
+@compiled
+def _turn_round(x: Any, row: Array, y: float, square: float, nearness: float) -> float:
+    """Compute the factor on the speed along v_i near full reach: 1 towards the middle of the joints' ranges, -1 away.
+
+    Args:
+        x: reads centering.
+        row: σ_i v_i (n,).
+        y: y_i.
+        square: σ_i².
+        nearness: how near full reach is, (1 - σ_i²/v_iᵀ G(w) v_i) (1 - σ_i²/l_i²).
+    """
+    centering = 0.0
+    for c in range(len(row)):
+        centering += row[c] * x.centering[c]
+    centering *= np.copysign(1.0, y) / np.sqrt(square)
+    return 1.0 - 2.0 * nearness * min(max(-centering / _CENTERING, 0.0), 1.0)
 
 
 @compiled
@@ -162,8 +190,8 @@ def _pull(x: Any, u: Array, b: Array, w: Array) -> tuple[float, float, float]:
 
 
 @compiled
-def _divisor(row: Array, square: float, weak: float, G: Array, size: float, others: float) -> float:
-    """Compute max(σ_i², c_i, z_i).
+def _divisor(row: Array, square: float, weak: float, G: Array, size: float, others: float) -> tuple[float, float]:
+    """Compute max(σ_i², c_i, z_i), and v_iᵀ G(w) v_i.
 
     Args:
         row: σ_i v_i (n,).
@@ -174,7 +202,7 @@ def _divisor(row: Array, square: float, weak: float, G: Array, size: float, othe
         others: curvature of the other tasks.
     """
     if square >= max(4.0 * size, weak):
-        return square
+        return square, 0.0
     nv, curvature, bent = len(row), 0.0, 0.0
     for a in range(nv):
         turn = 0.0
@@ -184,7 +212,7 @@ def _divisor(row: Array, square: float, weak: float, G: Array, size: float, othe
         bent += turn * turn
     curvature, bent = curvature / square + others, bent / square
     m = max(square, max(0.0, 1.0 - square / weak / MISSING_SIZE) * (size - np.sqrt(bent) / _MISSING))
-    return max(m, max(0.0, 1.0 - square / (4.0 * size)) * curvature) if size > 0.0 else m
+    return max(m, max(0.0, 1.0 - square / (4.0 * size)) * curvature) if size > 0.0 else m, -curvature
 
 
 @compiled

@@ -133,6 +133,7 @@ def limit_layout(joints: JointBounds, position_gain: float, dt: float) -> dict[s
         "v_prev": np.zeros(nv),
         "dv_step": joints.jerk * dt**2,
         "dv_prev": np.zeros(nv),
+        "centering": np.zeros(nv),
         "v_stop": np.zeros(nv),
         "hard_lower": np.zeros(nv) if acceleration_limited else lower,
         "hard_upper": np.zeros(nv) if acceleration_limited else upper,

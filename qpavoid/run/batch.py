@@ -6,6 +6,7 @@ import pickle
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, nullcontext
 from functools import lru_cache
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -13,12 +14,14 @@ import numpy.typing as npt
 
 from qpavoid.config import ScenarioConfig
 from qpavoid.config.loading import load_scenario
+from qpavoid.config.shipped import find_robot
 from qpavoid.controller import Controller
-from qpavoid.errors import QpavoidError
+from qpavoid.errors import QpavoidError, located
+from qpavoid.model.robot import Robot
 from qpavoid.problem import Array, require_finite
 from qpavoid.run.log import STATUSES, Log
 from qpavoid.run.pool import Workers, cores
-from qpavoid.run.simulate import simulate
+from qpavoid.run.simulate import run
 
 
 class BatchError(QpavoidError):
@@ -63,10 +66,25 @@ def simulate_many(
     """
     calls = [(scenario,) for scenario in scenarios]
     with _workers(jobs, len(calls)) as workers:
-        answers = workers.map(simulate, calls, progress)
+        answers = workers.map(_simulate, calls, progress)
     if errors := {i: answer for i, answer in enumerate(answers) if isinstance(answer, Exception)}:
         raise BatchError([None if i in errors else answer for i, answer in enumerate(answers)], errors)
     return answers
+
+
+def _simulate(scenario: ScenarioConfig | str) -> Log:
+    """Run a scenario, with the robot of an earlier one where it is the same: loading takes as long as 500 steps."""
+    scenario = load_scenario(scenario) if isinstance(scenario, str) else scenario
+    with located(f"{scenario.source}: robot"):
+        file = find_robot(scenario.robot, scenario.source.parent)
+        robot = _robot(file, file.stat().st_mtime_ns)
+    return run(scenario, robot)
+
+
+@lru_cache(maxsize=4)
+def _robot(file: Path, changed: int) -> Robot:
+    """Load the robot of a file that was changed at some time; those that it names count as part of it."""
+    return Robot.load(file)
 
 
 def steps(scenario: ScenarioConfig | str, q: Array, t: float | Array = 0.0, jobs: int | Workers | None = None) -> Steps:

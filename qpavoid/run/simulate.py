@@ -21,6 +21,7 @@ from qpavoid.controller import Controller
 from qpavoid.errors import ConfigError, NumericalError
 from qpavoid.geometry.bodies import enclosing_capsule, surface_triangles
 from qpavoid.model.kinematics import ForwardKinematics
+from qpavoid.model.robot import Robot
 from qpavoid.model.sample import STATE
 from qpavoid.model.scene import PARKING_DISTANCE, Obstacle, Scene
 from qpavoid.problem import Array, Solution, Status
@@ -59,7 +60,12 @@ def simulate(
     elif solver is not None:
         settings = parse_solver(solver, scenario.solver)
         scenario = scenario.model_copy(update={"solver": settings})
-    controller, q = Controller.from_scenario(scenario)
+    return run(scenario, None, progress)
+
+
+def run(scenario: ScenarioConfig, robot: Robot | None, progress: Callable[[int, int], None] | None = None) -> Log:
+    """Run a scenario, see `simulate`, with its robot if that is loaded already."""
+    controller, q = Controller.from_scenario(scenario, robot)
     _check_start(controller, q, scenario)
     dt, ticks = scenario.dt, round(scenario.duration / scenario.dt) + 1
     follower = Follower(controller.scene.robot.model, q, scenario.latency, dt)

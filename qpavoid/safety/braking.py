@@ -25,7 +25,7 @@ from qpavoid.control.assembler import RowAssembler
 from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.obstacles import ObstacleTracker
 from qpavoid.control.settings import ControlSettings
-from qpavoid.kernels import TOLERANCE, speed_to_stop
+from qpavoid.kernels import TOLERANCE, least_margin, speed_to_stop
 from qpavoid.model.kinematics import ForwardKinematics
 from qpavoid.problem import Array, Problem, Solution
 
@@ -92,6 +92,8 @@ class _PathPoint(NamedTuple):
     t: float
     q: Array
     """(nq,)."""
+    travel: Array
+    """(nv,) displacement from the start of the path."""
     margin: float
     """Least of distance - required distance [m]."""
     pair: int
@@ -175,7 +177,7 @@ class BrakingCheck:
         path, now, speed = self._path(q, v), self._now, max(float(self._now.arrays.speeds.max()), _MIN_SPEED)
         nearest = float(np.min(now.distances_of(now.pairs), initial=self._rows.influence_distance))
         nearest -= float(np.max(now.arrays.margin, initial=0.0))
-        points = [_PathPoint(0.0, q, nearest - self._safety_distance, -1, np.inf)]
+        points = [_PathPoint(0.0, q, path.travel[0], nearest - self._safety_distance, -1, np.inf)]
         end = float(path.times[-1])
         while (t := points[-1].t) < end and (len(points) == 1 or not isnan(points[-1].margin)):
             count = _MAX_POSES - len(points)
@@ -250,23 +252,17 @@ class BrakingCheck:
     def _evaluate(self, path: _Path, previous: _PathPoint, t: float) -> _PathPoint:
         """Evaluate the pose at time t, integrated from that of another point; pair -1 if none is near."""
         self._budget.check("stop look-ahead")
-        q = pin.integrate(self._model, previous.q, path.displacement(t) - path.displacement(previous.t))
+        travel = path.displacement(t)
+        q = pin.integrate(self._model, previous.q, travel - previous.travel)
         self._kinematics.compute(q)
         query, now = self._query, self._now
         query.compute(self._kinematics.joint_poses, self._safety_distance + _MAX_MARGIN)
         pairs = query.pairs
-        if not len(pairs):
-            return _PathPoint(t, q, _MAX_MARGIN, -1, np.inf)
-        allowance = self._distance_allowance[pairs]
-        later, present = query.distances_of(pairs) + allowance, now.distances_of(pairs) + allowance
-        margins = query.arrays.margin
-        if margins.any():
-            stale = margins[query.table.twist_row[pairs]]
-            later, present = later - stale, present - stale
-        required = np.minimum(self._safety_distance - TOLERANCE, present - _MAX_APPROACH_IN_VIOLATION)
-        margin = later - required + self._allowance[pairs]
-        least = int(margin.argmin())  # the first NaN, where there is one
-        return _PathPoint(t, q, float(margin[least]), int(pairs[least]), float(later.min()))
+        margin, pair, distance = least_margin(
+            pairs, query.distances_of(pairs), now.distances_of(pairs), self._distance_allowance, self._allowance,
+            query.table.twist_row, query.arrays.margin, self._safety_distance - TOLERANCE, _MAX_APPROACH_IN_VIOLATION,
+        )  # fmt: skip
+        return _PathPoint(t, q, travel, margin if pair >= 0 else _MAX_MARGIN, pair, distance)
 
 
 def _joined(durations: Array, steps: Array, period_end: float) -> _Path:

@@ -24,6 +24,8 @@ _DROPPED = 4 * 2**20
 """Frames from which on a client is disconnected without an answer [bytes]."""
 _BATCH = 64
 """Requests that are read before any is answered: of more steps of a client, the last one counts."""
+_TIMED = 1000
+"""Answers whose times are remembered [-]."""
 _IDLE = 0.2
 """Time after which the loop looks whether it has to end [s]."""
 _STANDSTILL = 1e-9
@@ -81,8 +83,21 @@ class Service:
         self._client = b""
         self._last, self._next, self._published = 0.0, 0.0, 0
         self._v = np.zeros(controller.scene.robot.model.nv)  # commanded last
-        self._counts, self._times = Counter[str](), deque[float](maxlen=10_000)
+        self._counts, self._times = Counter[str](), deque[float](maxlen=_TIMED)
         self._is_ended = False
+        robot = controller.scene.robot
+        self._description: dict[str, Any] = {
+            "qpavoid": version("qpavoid"),
+            "robot": robot.name,
+            "dt": controller.dt,
+            "heartbeat": heartbeat,
+            "q0": q0.tolist(),
+            "positions": list(robot.position_names),
+            "velocities": list(robot.coordinate_names),
+            "units": list(robot.coordinate_units),
+            "targets": [task.settings.label for task in controller.tasks],
+            "commands": self.commands_endpoint,
+        }
 
     def _bind(self, socket: Any, host: str, port: int) -> str:
         try:
@@ -197,7 +212,7 @@ class Service:
         """
         self._counts[request.type] += 1
         if isinstance(request, messages.Hello | messages.Status):
-            fields = self._description() if isinstance(request, messages.Hello) else self._statistics()
+            fields = self._introduction() if isinstance(request, messages.Hello) else self._statistics()
             return messages.pack(request.type, request.seq, **fields)
         if self.state is _State.RUNNING and client != self._client:
             raise Refusal(Fault.BUSY, "another client is in control", request.seq)
@@ -252,23 +267,10 @@ class Service:
             case messages.Release():
                 controller.release(request.name)
 
-    def _description(self) -> dict[str, Any]:
+    def _introduction(self) -> dict[str, Any]:
         """Return what a client has to know."""
-        controller, robot = self._controller, self._controller.scene.robot
-        return {
-            "qpavoid": version("qpavoid"),
-            "robot": robot.name,
-            "dt": controller.dt,
-            "heartbeat": self._heartbeat,
-            "q0": self._q0.tolist(),
-            "positions": list(robot.position_names),
-            "velocities": list(robot.coordinate_names),
-            "units": list(robot.coordinate_units),
-            "targets": [task.settings.label for task in controller.tasks],
-            "obstacles": list(controller.scene.obstacle_names),
-            "commands": self.commands_endpoint,
-            "state": self.state.value,
-        }
+        obstacles = list(self._controller.scene.obstacle_names)
+        return {**self._description, "obstacles": obstacles, "state": self.state.value}
 
     def _statistics(self) -> dict[str, Any]:
         """Return counts of requests and refusals, and the time from a request to its answer [s]."""
