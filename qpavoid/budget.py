@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from math import inf
 from time import perf_counter
 
@@ -22,6 +23,15 @@ class Budget:
         """Begin a control step."""
         if self.is_limited:
             self._end = self._clock() + self._seconds
+
+    @contextmanager
+    def suspended(self) -> Iterator[None]:
+        """Let what is done within take as long as it takes."""
+        is_limited, self.is_limited = self.is_limited, False
+        try:
+            yield
+        finally:
+            self.is_limited = is_limited
 
     @property
     def is_spent(self) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from copy import deepcopy
+from copy import copy, deepcopy
 from dataclasses import replace
 from functools import partial
 from time import perf_counter
@@ -121,7 +121,8 @@ class Controller(SceneChanges, SplitStep):
         self._arbiter = Arbiter(settings, law, self._builder.rows, self._builder.tracker)
         self._builder.rows.adapt(law, self.avoidance.look_ahead)
         self._planning: Replanning | None = None
-        self._warm_up()
+        with settings.budget.suspended():  # loading kernels takes as long as it takes
+            self._warm_up()
         if planning is not None:
             self._planning = Replanning(settings, self.tasks, contacts, self._builder, self._arbiter, planning)
         kernels.first_use.end()
@@ -333,7 +334,7 @@ class Controller(SceneChanges, SplitStep):
         """
         law = self.solver
         own = make_solver(law.config) if isinstance(law, NamedSolver) else deepcopy(law)
-        controller = self._another(self.scene.emptied(), solver=own)
+        controller = self._another(self.scene.emptied(), solver=own, budget=copy(self._another.keywords["budget"]))
         controller.take_over(self)
         return controller
 

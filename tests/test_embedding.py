@@ -9,7 +9,18 @@ import pinocchio as pin
 import pytest
 from closed_loop import Ruler
 
-from qpavoid import Avoidance, ConfigError, Controller, Obstacle, Pose, Solver, UnknownName, build_scene, build_tasks
+from qpavoid import (
+    Avoidance,
+    ConfigError,
+    Controller,
+    Obstacle,
+    Pose,
+    Sample,
+    Solver,
+    UnknownName,
+    build_scene,
+    build_tasks,
+)
 from qpavoid.adapters.handover import Handover
 from qpavoid.adapters.timing import Rate, Watchdog
 from qpavoid.config import Box, Line, Planning, PostureTask, Sphere, Task
@@ -142,6 +153,23 @@ def test_a_clone_has_a_law_of_its_own(panda):
     assert isinstance(twin.solver, Counter) and (controller.solver.calls, twin.solver.calls) == (0, 1)
     eq10 = make_controller(panda, "eq10").clone()
     assert eq10.solver.label == "eq10"
+
+
+def test_a_clone_has_the_budget_of_its_original(panda):
+    """None at all: both leave out work, in the same steps."""
+
+    def spent(controller):
+        q, kinds = panda.home, []
+        for k in range(60):
+            ball = {"ball": Sample.at([0.7 - 0.008 * k, 0.0, 0.5], linear=[-0.8, 0.0, 0.0])}
+            solution = controller.step(q, targets={TOOL: [0.5, 0.0, 0.45]}, obstacles=ball)
+            kinds.append("BUDGET_SPENT" in {reason.kind.name for reason in solution.reasons})
+            q = q + DT * solution.v
+        return kinds
+
+    controller = make_controller(panda, budget=1e-9)
+    twin = controller.clone()
+    assert spent(twin) == spent(controller) and any(spent(controller.clone()))
 
 
 # --- threads ------------------------------------------------------------------------------------------------------
