@@ -12,6 +12,9 @@ from qpavoid.model.notes import Note, NoteKind, RobotWarning
 from qpavoid.model.robot import Robot
 from qpavoid.model.sample import Pose, Sample
 from qpavoid.model.scene import Obstacle, Scene, build_scene
+from qpavoid.planning.path import Path
+from qpavoid.planning.plan_to import make_planner, plan_to
+from qpavoid.planning.planner import Planner, PlannerSettings
 from qpavoid.problem import Problem, Solution, Status
 from qpavoid.reason import Reason, ReasonKind, Severity
 from qpavoid.run.batch import BatchError, Steps, simulate_many, steps
@@ -32,6 +35,9 @@ __all__ = [
     "NoteKind",
     "NumericalError",
     "Obstacle",
+    "Path",
+    "Planner",
+    "PlannerSettings",
     "Points",
     "Pose",
     "Problem",
@@ -60,7 +66,9 @@ __all__ = [
     "build_scene",
     "build_tasks",
     "load_scenario",
+    "make_planner",
     "make_solver",
+    "plan_to",
     "simulate",
     "simulate_many",
     "steps",

@@ -130,6 +130,11 @@ class Controller(SceneChanges, SplitStep):
         """Time to lay out memory and run the first steps, compilation included [s]; no later step compiles."""
 
     @property
+    def has_contacts(self) -> bool:
+        """Whether the robot stands on contacts that its velocities hold."""
+        return self._has_contacts
+
+    @property
     def solver(self) -> Solver:
         """The law, which may be exchanged between steps.
 

@@ -54,6 +54,8 @@ class ReasonKind(str, Enum):
     """The backup trajectory replaces the tasks: from their velocity, none would stay clear of moving obstacles."""
     NO_BACKUP = "NO_BACKUP"
     """No backup trajectory is looked for: what excludes it."""
+    PLAN = "PLAN"
+    """Of logs: a plan is followed in place of the tasks alone; `detail` says since when, and why."""
     NO_PLAN = "NO_PLAN"
     """Nothing is forecast or planned, or not all that is configured: what excludes it."""
     BUDGET_SPENT = "BUDGET_SPENT"
@@ -80,6 +82,17 @@ class ReasonKind(str, Enum):
     """No velocity within the joint limits meets the contacts: `contacts`."""
     PRIORITY_UNSOLVED = "PRIORITY_UNSOLVED"
     """No back end could solve the QP of a priority level: the level."""
+    NOT_PLANNED = "NOT_PLANNED"
+    """No path is planned: why, in `detail`."""
+    START_TOO_NEAR = "START_TOO_NEAR"
+    """A path would begin in contact: the pair, its distance [m]."""
+    GOAL_TOO_NEAR = "GOAL_TOO_NEAR"
+    """No goal of a path is clear: the pair that is nearest at the first of them, its distance [m]; no pair where goals
+    follow from targets."""
+    NOT_ATTAINED = "NOT_ATTAINED"
+    """No configuration that attains the targets of a path was found."""
+    NO_PATH = "NO_PATH"
+    """No path was found within its budget: configurations that were checked [-]."""
 
     @property
     def severity(self) -> Severity:
@@ -89,7 +102,8 @@ class ReasonKind(str, Enum):
 
 _SEVERITIES = {
     **dict.fromkeys(
-        ("NO_BACKUP", "NO_PLAN", "ESTIMATED", "IGNORED", "POINTS_DROPPED", "NORMALISED", "TIMING"), Severity.INFO
+        ("NO_BACKUP", "PLAN", "NO_PLAN", "ESTIMATED", "IGNORED", "POINTS_DROPPED", "NORMALISED", "TIMING"),
+        Severity.INFO,
     ),
     **dict.fromkeys(
         (
@@ -119,6 +133,7 @@ _TEXTS: dict[str, str] = {
     "SINGULAR": "in a singularity, short of its target by",
     "BACKUP": "backup trajectory instead of the tasks",
     "NO_BACKUP": "no backup trajectory",
+    "PLAN": "plan followed",
     "NO_PLAN": "no plan",
     "BUDGET_SPENT": "left out, as the budget of the control step is spent",
     "STALE": "not updated for",
@@ -132,6 +147,11 @@ _TEXTS: dict[str, str] = {
     "SOLVER_FAILED": "no usable velocity",
     "CONTACTS_INFEASIBLE": "joint limits leave no velocity that holds them",
     "PRIORITY_UNSOLVED": "no back end could solve its QP",
+    "NOT_PLANNED": "no path is planned",
+    "START_TOO_NEAR": "a path would begin in contact, distance",
+    "GOAL_TOO_NEAR": "no goal of the path is clear, distance",
+    "NOT_ATTAINED": "no configuration attains the targets",
+    "NO_PATH": "no path was found, checked configurations:",
 }
 
 

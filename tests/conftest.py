@@ -81,7 +81,8 @@ def paper():
 
 @pytest.fixture(scope="session")
 def panda():
-    return Robot.load("panda")
+    """The Panda with capsules: pairs have closed forms, and cost little."""
+    return Robot.load("panda-capsules")
 
 
 @pytest.fixture(scope="session")

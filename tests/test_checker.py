@@ -23,7 +23,7 @@ from qpavoid_bench.arena.families import load_family
 from qpavoid_bench.arena.families.make import make_case
 from qpavoid_bench.arena.verdict import decisive, judge
 
-ROBOTS = ("panda", "paper-dual-arm", "ur5")
+ROBOTS = ("panda-capsules", "paper-dual-arm", "ur5")
 PLATE = BOX.model_copy(update={"size": (0.3, 0.2, 0.006)})
 
 

@@ -19,13 +19,14 @@ from qpavoid.config import Capsule, Hull
 from qpavoid.geometry.bodies import hull_points, surface_triangles
 from qpavoid.geometry.capsules import CapsuleFit, fit_capsule
 from qpavoid.geometry.meshes import cut
+from qpavoid.geometry.protrusion import Surface
 from qpavoid.model.end_effectors import end_effectors
 from qpavoid.model.pairs import D1
 from qpavoid.model.trajectory import rpy_to_matrix
 from qpavoid.model.urdf import read_model
 from qpavoid.run.metrics import point_segment_distance
 from qpavoid.setup.add import DescribeOptions, describe
-from qpavoid.setup.fit import decompose, fit_piece, hull_volume, inside_volume
+from qpavoid.setup.fit import decompose, fit_piece, inside_volume
 from qpavoid.setup.home import HOME_CLEARANCE, MIN_CONDITIONING, Limbs, find_home
 from qpavoid.setup.sampling import (
     NEVER_NEAR,
@@ -41,6 +42,7 @@ from qpavoid.setup.srdf import MADE_BY, Semantics, find_srdf, read_srdf, srdf_te
 from qpavoid.setup.texts import description_files, write_files
 
 PANDA = EXAMPLES / "panda_description/urdf/panda.urdf"
+PLACE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -0.5, 1.0), np.array([0.1, -0.2, 0.3]))
 
 
 def box_surface(low, high):
@@ -112,21 +114,54 @@ def test_volume_inside_a_mesh_does_not_depend_on_how_its_triangles_are_turned(fl
     assert inside_volume(box) == pytest.approx(0.04)
 
 
+def kinds_of(shape, how="auto", bound=0.02, place=PLACE):
+    parts = fit_piece(shape, place, how, Surface([(shape, place)], bound))
+    return [type(part.geometry) for part in parts]
+
+
 @pytest.mark.parametrize(
-    ("shape", "expected"),
+    ("shape", "bound", "expected"),
     [
-        (coal.Sphere(0.1), 1),
-        (coal.Capsule(0.05, 0.3), 1),
-        (coal.Cylinder(0.05, 0.4), 1),  # 1.3 times its volume
-        (coal.Box(0.2, 0.2, 0.2), 0),  # 2.7 times
-        (coal.Cylinder(0.2, 0.02), 0),  # a disc
+        (coal.Sphere(0.1), 0.0, coal.Sphere),
+        (coal.Capsule(0.05, 0.3), 0.0, coal.Capsule),
+        (
+            coal.Cylinder(0.02, 0.4),
+            0.03,
+            coal.Capsule,
+        ),  # its caps stand out by 20 mm
+        (coal.Cylinder(0.02, 0.4), 0.01, coal.Cylinder),
+        (coal.Cylinder(0.02, 0.002), 0.03, coal.Cylinder),  # a disc: the capsule is gross
+        (coal.Box(0.02, 0.02, 0.02), 0.03, coal.Box),  # 2.7 times its volume
     ],
 )
-def test_auto_takes_a_capsule_only_where_it_is_not_gross(shape, expected):
-    capsules = fit_piece(shape, "auto")
-    assert len(capsules) == expected
-    assert sum(fit.volume for fit in capsules) <= 2.0 * hull_volume(shape)
-    assert fit_piece(shape, "capsule")
+def test_auto_takes_a_capsule_where_it_is_within_the_bound_and_not_gross(shape, bound, expected):
+    assert kinds_of(shape, "auto", bound) == [expected]
+    assert kinds_of(shape, "capsule", bound) in ([coal.Capsule], [coal.Sphere])
+
+
+def mesh(surface):
+    result = coal.BVHModelOBBRSS()
+    result.beginModel(len(surface), 3 * len(surface))
+    for corners in surface:
+        result.addTriangle(*corners)
+    result.endModel()
+    return result
+
+
+def test_auto_takes_the_cheapest_body_that_is_within_the_bound():
+    """Of a bar a box; of a wedge its hull; of two bars at an angle two hulls."""
+    assert kinds_of(mesh(box_surface([0, 0, 0], [0.5, 0.1, 0.2])), bound=0.005) == [coal.Box]
+    wedge = np.array([[0, 0, 0], [0.3, 0, 0], [0, 0.3, 0], [0, 0, 0.2], [0.3, 0, 0.2], [0, 0.3, 0.2]])
+    (kind,) = kinds_of(mesh(wedge[ConvexHull(wedge).simplices]), bound=0.01)
+    assert issubclass(kind, coal.ConvexBase)
+    bars = [(coal.Box(0.5, 0.05, 0.05), [0.25, 0.025, 0.025]), (coal.Box(0.05, 0.05, 0.35), [0.025, 0.025, 0.225])]
+    angle = np.concatenate([surface_triangles(box) + np.array(center) for box, center in bars])
+    surface = Surface([(mesh(angle), PLACE)], 0.005)
+    parts = fit_piece(mesh(angle), PLACE, "auto", surface)
+    assert len(parts) == 2 and surface.holds([part.placed for part in parts])
+    for point in on_surface(angle, 200, np.random.default_rng(0)):
+        at = pin.SE3(np.eye(3), PLACE.act(point))
+        assert min(signed_distance(coal.Sphere(1e-9), at, part.geometry, part.place) for part in parts) < 1e-6
 
 
 directions = arrays(np.float64, 3, elements=st.floats(-1.0, 1.0)).filter(lambda v: np.linalg.norm(v) > 0.1)
@@ -141,7 +176,7 @@ def test_what_is_written_encloses_what_was_fitted(axis, center, radius, length, 
     x /= np.linalg.norm(x)
     fit = CapsuleFit(center, np.column_stack([x, np.cross(z, x), z]), radius, length)
     placement = pin.SE3(pin.exp3(turn), np.array([0.3, -0.2, 0.1]))
-    fields = capsule_fields(fit, placement)
+    fields = capsule_fields(CapsuleFit(placement.act(fit.center), placement.rotation @ fit.rotation, radius, length))
     shape = fields["shape"]
     written = 0.5 * getattr(shape, "length", 0.0) * rpy_to_matrix(fields["rpy"])[:, 2]
     for side in (-1.0, 1.0):
@@ -420,17 +455,17 @@ def test_home_and_locks_may_be_wished():
         describe(urdf, DescribeOptions(lock=["wrist_9"]))
 
 
-def test_capsules_too_fat_for_the_home_pose_become_exact(tmp_path):
+def test_capsules_too_fat_for_the_home_pose_become_tighter(tmp_path):
     """Two discs, 8 cm apart: the capsules around them are 20 cm thick."""
     urdf = write_chain(tmp_path, 2, shape='<cylinder radius="0.1" length="0.12"/>')
-    described = describe(urdf, DescribeOptions(samples=50))
+    described = describe(urdf, DescribeOptions(samples=50, protrusion=0.1, wrist_protrusion=0.1))
     assert all(isinstance(body.shape, Capsule) for body in described.config.bodies)
     close = urdf.read_text().replace('xyz="0 0 0.3"', 'xyz="0 0 0.08"')
     urdf.write_text(close.replace('length="0.12"', 'length="0.12"'))
-    described = describe(urdf, DescribeOptions(samples=50))
+    described = describe(urdf, DescribeOptions(samples=50, protrusion=0.1, wrist_protrusion=0.1))
     shapes = {body.name: body.shape.type for body in described.config.bodies}
     assert shapes["link0"] == shapes["link2"] == "cylinder"
-    assert any("exact bodies" in note.what and {"link0", "link2"} <= {*note.subject} for note in described.notes)
+    assert any("tighter bodies" in note.what and {"link0", "link2"} <= {*note.subject} for note in described.notes)
 
 
 def test_hulls_of_a_robot_yaml(panda_convex):

@@ -34,7 +34,7 @@ def forecast(scenario):
     bounds = parts.scene.robot.bounds().within(scenario.limits)
     avoidance = scenario.avoidance.model_copy(update={"backup": not scenario.contacts})
     settings = ControlSettings(parts.scene, bounds, avoidance, scenario.limits, scenario.dt)
-    forecaster = Forecaster(settings, parts.tasks, parts.contacts, parts.solver, Planning())
+    forecaster = Forecaster(settings, parts.tasks, parts.contacts, scenario.solver, Planning())
     zero = np.zeros(parts.scene.robot.model.nv)
     return forecaster.run(Snapshot(0.0, parts.q0, zero, zero, TRACK, {}, {}), scenario.duration)
 
@@ -45,7 +45,7 @@ def forecast(scenario):
         ("situation1", Limits()),
         ("panda_ball", Limits()),
         ("panda_line", Limits(acceleration=10.0, jerk=500.0)),
-        ("humanoid_reach", Limits()),
+        pytest.param("humanoid_reach", Limits(), marks=pytest.mark.slow),
     ],
 )
 def test_forecast_is_what_the_law_does(name, limits):
@@ -60,7 +60,7 @@ def reaching(panda, **changes):
     """A controller whose target is 0.3 m away from the start on, with a ball beside it, to be reached in 1.2 s."""
     motion = config.Line(displacement=TOO_FAR, speed=1e3)
     task = config.Task(frame="panda_hand_tcp", motion=motion)
-    planning = Planning(**{"settle": 1.2, "lead": 0.1, **changes})
+    planning = Planning(**{"settle": 1.2, "lead": 0.1, "clearances": [], **changes})
     scene = build_scene(panda, [Obstacle.at("ball", config.Sphere(radius=0.05), [0.307, 0.4, 0.487])])
     limits = Limits(acceleration=10.0)
     return Controller(scene, build_tasks([task], panda, panda.home), limits=limits, planning=planning)
@@ -83,7 +83,7 @@ def test_late_law_is_hurried(panda):
     assert np.linalg.norm(tool[0] + TOO_FAR - tool[-1]) < 0.005
     plans = [solution.plan for solution in solutions]
     assert not any(plans[:10]) and all(plans[10:])
-    assert plans[10].startswith("fast finish since 0.10 s: the tasks alone would end ")
+    assert plans[10].startswith("fast finish since 0.10 s: the present drive would end ")
     assert all(solution.status is Status.SOLVED for solution in solutions)
 
 

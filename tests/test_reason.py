@@ -23,7 +23,7 @@ from qpavoid import (
 from qpavoid.config import Beta, Box, Sphere
 from qpavoid.problem import AvoidanceRows, Tracking, make_problem
 
-INFORMING = {"NO_BACKUP", "NO_PLAN", "ESTIMATED", "IGNORED", "POINTS_DROPPED", "NORMALISED", "TIMING"}
+INFORMING = {"NO_BACKUP", "PLAN", "NO_PLAN", "ESTIMATED", "IGNORED", "POINTS_DROPPED", "NORMALISED", "TIMING"}
 ALARMING = {
     "PREDICTED_TOO_NEAR", "UNKNOWN_DISTANCE", "BUDGET_SPENT", "IMPLAUSIBLE", "SOLVER_FAILED", "CONTACTS_INFEASIBLE",
 }  # fmt: skip

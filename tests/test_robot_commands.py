@@ -169,7 +169,9 @@ def test_bad_mjcf_is_refused_in_one_line(cli, tmp_path, text, message):
     for command in ("check", "add"):
         result = cli("robot", command, "arm.xml")
         assert result.status == 2 and result.stdout == ""
-        (line,) = result.stderr.splitlines()
+        (line,) = [
+            line for line in result.stderr.splitlines() if not line.endswith("…")
+        ]  # what a busy machine waits for
         assert line.startswith("error: ") and "arm.xml" in line
         assert re.search(message, line)
 
@@ -198,7 +200,7 @@ def test_bad_arguments_are_refused_in_one_line(cli, tmp_path, arguments, words):
     write_chain(tmp_path)
     result = cli("robot", *arguments)
     assert result.status == 2 and result.stdout == ""
-    (line,) = result.stderr.splitlines()
+    (line,) = [line for line in result.stderr.splitlines() if not line.endswith("…")]  # what a busy machine waits for
     assert line.startswith("error: ") and all(word in line for word in words)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["chain.urdf"]
 
@@ -268,7 +270,10 @@ def test_a_shipped_robot_comes_out_the_same_again():
     """
     shipped = read_config(find_robot("ur5"), RobotConfig)
     home = {name: value for name, value in shipped.home.items() if value}
-    made = describe(EXAMPLES / "ur_description/urdf/ur5_robot.urdf", DescribeOptions(name="ur5", home=home)).config
+    options = DescribeOptions(
+        name="ur5", home=home, bodies_of={"base_link": "convex"}, protrusion=0.06, wrist_protrusion=0.03
+    )
+    made = describe(EXAMPLES / "ur_description/urdf/ur5_robot.urdf", options).config
     assert made.home == shipped.home and made.end_effectors == shipped.end_effectors
     assert made.disabled_pairs == shipped.disabled_pairs
     for mine, theirs in zip(made.bodies, shipped.bodies, strict=True):

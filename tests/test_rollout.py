@@ -53,7 +53,7 @@ def among_balls(request):
         {"name": f"ball{i}", "shape": shape, "motion": {"type": "line", "start": start, "end": end, "speed": 0.3}}
         for i, (start, end) in enumerate(ends)
     ]
-    parts = build_parts(changed("panda_line", obstacles=balls))
+    parts = build_parts(changed("panda_line", robot="panda-capsules", obstacles=balls))  # searches among hulls remember
     rollouts, shared, _ = rollouts_of(parts.scene, Limits(**request.param))
     return rollouts, shared, parts.q0
 

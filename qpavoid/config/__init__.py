@@ -16,7 +16,7 @@ from qpavoid.config.control import (
     TaskSwitching,
 )
 from qpavoid.config.motion import Circle, Csv, Fixed, Line, Motion, Waypoints
-from qpavoid.config.robot import Body, Hull, JointLimits, PairMargin, RobotConfig
+from qpavoid.config.robot import Body, Hull, JointLimits, PairMargin, Polytope, RobotConfig
 from qpavoid.config.scenario import ObstacleConfig, ScenarioConfig
 from qpavoid.config.shapes import (
     Box,
@@ -61,7 +61,7 @@ __all__ = [
     "Contact", "Csv", "Cylinder", "DampingTask", "Ellipsoid", "Eq10Solver", "FastFinish", "Fixed",
     "GradientProjectionSolver", "HalfSpace", "HqpSolver", "Hull", "JointLimits", "Limits", "Line", "LookAtTask",
     "ManipulabilityTask", "Mesh", "Motion", "ObstacleConfig", "ObstacleShape", "PairMargin", "Planning", "PointCloud",
-    "PostureTask", "PotentialFieldSolver", "Progress", "QpSolver", "RelativeTask", "RobotConfig", "ScenarioConfig",
-    "Sensing", "Shape", "SolverConfig", "Sphere", "StepSearchSolver", "Task", "TaskBlock", "TaskSwitching",
-    "TrackingSolver", "Waypoints", "expand_solver",
+    "Polytope", "PostureTask", "PotentialFieldSolver", "Progress", "QpSolver", "RelativeTask", "RobotConfig",
+    "ScenarioConfig", "Sensing", "Shape", "SolverConfig", "Sphere", "StepSearchSolver", "Task", "TaskBlock",
+    "TaskSwitching", "TrackingSolver", "Waypoints", "expand_solver",
 ]  # fmt: skip

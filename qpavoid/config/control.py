@@ -152,3 +152,12 @@ class Planning(Block):
     """Error of every frame below which a forecast has arrived [m, rad]."""
     fast: FastFinish | None = FastFinish()
     """Drive that is tried first; `null`: never."""
+    clearances: list[NonNegative] = [0.03, 0.015, 0.006, 0.0015]
+    """Distances beyond d1 that paths keep, tried in turn [m]; none: nothing is planned."""
+    speed: Annotated[float, Field(gt=0, le=1)] = 0.6
+    """Share of the joints' speed limits that paths use [-], no more than 1.8 rad/s or m/s."""
+    stalled_after: Positive = 0.3
+    """Time at rest after which a path is followed no longer [s]."""
+    worker: Literal["inline", "process"] = "inline"
+    """Where forecasts and plans are computed: `inline`, in the step that asks for them, which takes tenths of a second,
+    reproducibly; `process`, in a process of their own, which no step waits for."""

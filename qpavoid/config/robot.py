@@ -21,7 +21,15 @@ class Hull(Block):
     """Name of the piece: that of its link, with `_0`, `_1`, … in the order of the file."""
 
 
-BodyShape = Annotated[Shape | Hull, Field(discriminator="type")]
+class Polytope(Block):
+    """Convex hull of some points: a piece of a link that is not convex itself."""
+
+    type: Literal["polytope"] = "polytope"
+    corners: Annotated[list[Vec3], Field(min_length=4, max_length=1000)]
+    """The points [m]."""
+
+
+BodyShape = Annotated[Shape | Hull | Polytope, Field(discriminator="type")]
 
 
 class Body(Block):

@@ -18,6 +18,7 @@ from qpavoid.control.pair_table import PairTable
 from qpavoid.errors import NumericalError
 from qpavoid.kernels.distances import BY_COAL, SPARE_BY_COAL
 from qpavoid.kernels.gjk import GUESS
+from qpavoid.model.cloud import Voxels
 from qpavoid.model.sample import STATE, Sample
 from qpavoid.model.scene import Scene
 from qpavoid.model.views import read_poses, read_results, view_poses, view_results
@@ -264,6 +265,10 @@ class DistanceQuery:
         distance = np.full(len(self.table.group), np.inf)
         np.minimum.at(distance, self.table.group[self._near], results[self._near, 0])
         return np.asarray(distance[self.table.group[pairs]])
+
+    def voxels(self, index: int) -> Voxels:
+        """Return what is in a point cloud, by number of the obstacle."""
+        return self._clouds[index].voxels
 
     def max_over_group(self, values: Array) -> Array:
         """Return the largest of some values (m,) among the pairs of the same body and point cloud (m,)."""

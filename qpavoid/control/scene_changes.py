@@ -7,6 +7,7 @@ from typing import Any
 
 from qpavoid.control.builder import ProblemBuilder
 from qpavoid.control.distances import DistanceQuery
+from qpavoid.control.obstacle_states import ObstacleStates
 from qpavoid.errors import UnknownName, nearest
 from qpavoid.model.sample import Sample
 from qpavoid.model.scene import Obstacle, Scene
@@ -86,7 +87,7 @@ class SceneChanges:
             raise UnknownName(f"attach: no frame {frame!r:.60}; give its name")
         index, frame_id = self._builder.tracker.index(obstacle), self.scene.robot.frame_id(frame, "attach")
         q = self._builder.attach(index, frame_id, q)
-        self._scene_changed("attach", obstacle, frame, q)
+        self._scene_changed("attach_at", index, frame_id, q, self._builder.pose(index, q))
 
     def release(self, obstacle: str, q: Array | None = None) -> Sample:
         """Release an attached obstacle: it rests where it is, until it is given to `step` again.
@@ -135,6 +136,11 @@ class SceneChanges:
     def obstacle_pose(self, obstacle: str, q: Array | None = None) -> Sample:
         """Return the world pose of an obstacle in the last step, attached or not; see `release`."""
         return self._builder.pose(self._builder.tracker.index(obstacle), q)
+
+    @property
+    def obstacle_states(self) -> ObstacleStates:
+        """States of all obstacles in the last step; the next one overwrites them."""
+        return self._builder.tracker.current
 
     def take_over(self, other: SceneChanges) -> None:
         """Add, attach and allow what another controller of the same scene has; see `clone`."""

@@ -154,7 +154,11 @@ class UpdateReader:
             NumericalError: the array has the wrong shape, or is not made of numbers; an obstacle is named twice.
         """
         is_plain = type(value) is np.ndarray and value.dtype == np.float64 and value.flags.c_contiguous
-        rows = value if is_plain else np.ascontiguousarray(as_numbers("obstacles", value))
+        try:
+            rows = value if is_plain else np.ascontiguousarray(as_numbers("obstacles", value))
+        except NumericalError:
+            message = f"obstacles: give a mapping of names to samples, or an array of numbers, not {value!r:.60}"
+            raise NumericalError(message) from None
         if rows.ndim != 2 or len(rows) != len(names) or rows.shape[1] not in (STATE, QUATERNION):
             raise NumericalError(
                 f"obstacles: an array of shape {rows.shape}; give a row of {STATE} numbers, as `Sample.row`, or of "

@@ -49,7 +49,7 @@ def fit_capsule(points: Array, directions: int = 250) -> CapsuleFit:
     """
     points = np.unique(np.asarray(points, dtype=np.float64), axis=0)
     principal = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
-    rotations = _rotations_to(np.concatenate((principal, half_sphere(directions))))
+    rotations = rotations_to(np.concatenate((principal, half_sphere(directions))))
     if len(points) > _MANY:  # the outermost points tell which axes are worth trying with all of them
         best = np.argsort(_tried_along(extreme_points(points), rotations)[0].min(axis=0))
         rotations = rotations[best[:_PROMISING]]
@@ -64,7 +64,7 @@ def fit_capsule(points: Array, directions: int = 250) -> CapsuleFit:
 def _tried_along(points: Array, rotations: Array) -> tuple[Array, Array, Array]:
     """Fit capsules along k axes, of w radii each: volumes (w, k), fits (w, k, 3) and the axes' centres (k, 2)."""
     local = points @ rotations
-    center, narrowest = _enclosing_circles(local[..., :2])
+    center, narrowest = enclosing_circles(local[..., :2])
     off_axis = np.sum((local[..., :2] - center[:, None]) ** 2, axis=2)
     # wider than needed is worth it where it lets flat ends sink into the caps
     fits = np.stack([_fit_along(local[..., 2], off_axis, narrowest * wider) for wider in _WIDER])
@@ -99,14 +99,14 @@ def half_sphere(count: int) -> Array:
 _ROUND = np.concatenate([side * half_sphere(60) for side in (1.0, -1.0)])
 
 
-def _rotations_to(axes: Array) -> Array:
+def rotations_to(axes: Array) -> Array:
     """Return rotations (k, 3, 3) whose z columns are the unit vectors `axes` (k, 3)."""
     x = np.cross(np.eye(3)[np.argmin(np.abs(axes), axis=1)], axes)
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     return np.stack((x, np.cross(axes, x), axes), axis=2)
 
 
-def _enclosing_circles(points: Array) -> tuple[Array, Array]:
+def enclosing_circles(points: Array) -> tuple[Array, Array]:
     """Find a nearly smallest circle around each set of 2-D points (k, n, 2): centres (k, 2) and radii (k,).
 
     Badoiu and Clarkson's iteration for the centre; the radius is then exact for that centre.

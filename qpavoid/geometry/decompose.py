@@ -21,7 +21,7 @@ from scipy.spatial import ConvexHull, QhullError
 from qpavoid.geometry.meshes import cut, hull_corners, normals
 from qpavoid.problem import Array, IntArray
 
-_CUTS = 8
+CUTS = 8
 """Slabs along each axis, at most: their third power bounds the cells that are merged."""
 _CLOSE = 1e-3
 """Share of a part's extent below which coordinates count as the same."""
@@ -30,7 +30,9 @@ _THIN = 1e-6
 _CUBE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 
 
-def decompose(vertices: Array, triangles: IntArray, max_pieces: int, tolerance: float) -> list[Array]:
+def decompose(
+    vertices: Array, triangles: IntArray, max_pieces: int, tolerance: float, slabs: int = CUTS
+) -> list[Array]:
     """Cover a mesh with convex pieces whose union encloses every triangle of it.
 
     Args:
@@ -38,6 +40,7 @@ def decompose(vertices: Array, triangles: IntArray, max_pieces: int, tolerance: 
         triangles: (t, 3) indices.
         max_pieces: most pieces; with few, they enclose more than the tolerance allows.
         tolerance: volume that a merge may add, all merges together, as a share of the volume of the mesh's hull.
+        slabs: along each axis, at most.
 
     Returns:
         Corners (n_i, 3) of each piece.
@@ -46,10 +49,16 @@ def decompose(vertices: Array, triangles: IntArray, max_pieces: int, tolerance: 
     pieces = [
         np.unique(cell.reshape(-1, 3), axis=0)
         for part in _parts(vertices, triangles, 1e-9 * size)
-        for cell in _cells(part)
+        for cell in _cells(part, slabs)
     ]
     volume = partial(_volume, thin=_THIN * size)
     return _merge(pieces, volume, max_pieces, tolerance * volume(vertices))
+
+
+def merge(pieces: list[Array], max_pieces: int) -> list[Array]:
+    """Merge convex pieces (n_i, 3) until there are no more than so many, with the least volume that can be added."""
+    size = float(np.ptp(np.concatenate(pieces), axis=0).max())
+    return _merge(pieces, partial(_volume, thin=_THIN * size), max_pieces, 0.0)
 
 
 def _volume(points: Array, thin: float) -> float:
@@ -74,7 +83,7 @@ def _parts(vertices: Array, triangles: IntArray, weld_distance: float) -> list[A
     return [part if volume >= 0.0 else part[:, ::-1] for part, volume in zip(parts, volumes, strict=True)]
 
 
-def _cells(triangles: Array) -> list[Array]:
+def _cells(triangles: Array, count: int) -> list[Array]:
     """Cut the triangles (t, 3, 3) of a part along all three axes."""
     cells = [triangles]
     for axis in range(3):
@@ -83,7 +92,7 @@ def _cells(triangles: Array) -> list[Array]:
         slabs = []
         for cell in cells:
             remainder = cell
-            for plane in _planes(coordinates, close):
+            for plane in _planes(coordinates, close, count):
                 below, remainder = _split(remainder, axis, plane, close)
                 slabs.append(below)
             slabs.append(remainder)
@@ -91,11 +100,11 @@ def _cells(triangles: Array) -> list[Array]:
     return cells
 
 
-def _planes(coordinates: Array, close: float) -> list[float]:
+def _planes(coordinates: Array, close: float, count: int) -> list[float]:
     """Choose the planes of the cuts along an axis: at the corners' own sorted coordinates where few, else evenly."""
     distinct = coordinates[np.diff(coordinates, prepend=-np.inf) > close].tolist()
-    if len(distinct) > _CUTS + 1:
-        distinct = np.linspace(coordinates[0], coordinates[-1], _CUTS + 1).tolist()
+    if len(distinct) > count + 1:
+        distinct = np.linspace(coordinates[0], coordinates[-1], count + 1).tolist()
     return [float(x) for x in distinct if coordinates[0] + close < x < coordinates[-1] - close]
 
 

@@ -25,6 +25,9 @@ from qpavoid.kernels.layout import SUMMARY, RowLayout
 from qpavoid.kernels.margins import distances_of, least_margin
 from qpavoid.kernels.near_pairs import DistanceArrays, near_pairs, place_bodies, place_obstacles
 from qpavoid.kernels.obstacles import Pieces, check_states, sample_pieces
+from qpavoid.kernels.planning import PlanningArrays, pair_clearances
+from qpavoid.kernels.planning_goals import FrameTargets
+from qpavoid.kernels.planning_search import search
 from qpavoid.kernels.pose_fit import extrapolate_states
 from qpavoid.kernels.prediction import Prediction, predict, prediction_error_bound
 from qpavoid.kernels.qp import max_clearance_velocity, minimize, project, project_soft
@@ -55,10 +58,12 @@ __all__ = [
     "ApproachArrays",
     "CellGrid",
     "DistanceArrays",
+    "FrameTargets",
     "KinematicsArrays",
     "ObstacleArrays",
     "OwnBodies",
     "Pieces",
+    "PlanningArrays",
     "Prediction",
     "RampLimits",
     "RolloutArrays",
@@ -100,6 +105,7 @@ __all__ = [
     "near_pairs",
     "observe",
     "pack",
+    "pair_clearances",
     "place_bodies",
     "place_obstacles",
     "predict",
@@ -113,6 +119,7 @@ __all__ = [
     "rotation_vector",
     "row_bounds",
     "sample_pieces",
+    "search",
     "select_voxels",
     "sorted_setxor",
     "speed_to_stop",

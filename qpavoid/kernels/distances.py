@@ -53,22 +53,36 @@ def compute_distances(
     simplex, between = np.empty((4, 10)), np.empty(12)
     count = 0
     for k in pairs:
-        how = method[k]
-        if how == BY_COAL:
-            continue
-        i, j, is_apart = bodies[k, 0], bodies[k, 1], False
-        if how == CLOSED_FORM:
-            is_apart = _closed_form(shapes, poses, i, j, results[k])
-        elif how == BY_GJK:
-            is_apart = core_distance(shapes, poses, i, j, guesses[k], simplex, between, results[k])
-        elif how == TO_HALF_SPACE:
-            is_apart = _to_half_space(shapes, poses, i, j, guesses[k], results[k])
-        if is_apart:
-            _add_radii(shapes.core[i, 0], shapes.core[j, 0], results[k])
-        else:
+        how, i, j = method[k], bodies[k, 0], bodies[k, 1]
+        if how != BY_COAL and not pair_distance(shapes, poses, i, j, how, guesses[k], simplex, between, results[k]):
             meeting[count] = k
             count += 1
     return count
+
+
+@inlined
+def pair_distance(
+    shapes: Shapes,
+    poses: Array,
+    i: int,
+    j: int,
+    how: int,
+    guess: Array,
+    simplex: Array,
+    between: Array,
+    result: Array,
+) -> bool:
+    """Update the result of one pair, see `compute_distances`; return False where cores meet, or coal has to do it."""
+    is_apart = False
+    if how == CLOSED_FORM:
+        is_apart = _closed_form(shapes, poses, i, j, result)
+    elif how == BY_GJK:
+        is_apart = core_distance(shapes, poses, i, j, guess, simplex, between, result)
+    elif how == TO_HALF_SPACE:
+        is_apart = _to_half_space(shapes, poses, i, j, guess, result)
+    if is_apart:
+        _add_radii(shapes.core[i, 0], shapes.core[j, 0], result)
+    return is_apart
 
 
 @inlined

@@ -160,12 +160,12 @@ def place_obstacles(x: DistanceArrays, numbers: IntArray, states: Array, margin:
         moving = moving or speed > 0.0 or turning > 0.0 or margin[i] != 0.0
         if not x.is_cloud[i]:
             for g in range(x.first[i], x.first[i + 1]):
-                _place_body(x, g, state)
+                place_body(x, g, state)
     return -1, moving
 
 
 @compiled
-def _place_body(x: DistanceArrays, g: int, state: Array) -> None:
+def place_body(x: DistanceArrays, g: int, state: Array) -> None:
     """Write pose and sphere centre of a body whose frame is that of an obstacle's state."""
     length = 0.0
     for c in range(12):

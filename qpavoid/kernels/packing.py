@@ -15,7 +15,16 @@ from qpavoid.kernels.cache import KernelCache
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 
-def compiled(function: _F) -> _F:
+def released(function: _F) -> _F:
+    """Compile a kernel that releases Python's lock while it runs, as those that take milliseconds should.
+
+    Args:
+        function: see `compiled`.
+    """
+    return compiled(function, nogil=True)
+
+
+def compiled(function: _F, nogil: bool = False) -> _F:
     """Compile a kernel at its first call with arguments of some types, or load its code from disk.
 
     Sums may be taken in any order, so that they become vector instructions. NaN and infinities are preserved, but the
@@ -23,8 +32,9 @@ def compiled(function: _F) -> _F:
 
     Args:
         function: the loops; every function that they call is compiled as well.
+        nogil: whether other threads may run meanwhile.
     """
-    kernel = njit(fastmath={"reassoc", "contract", "nsz"})(function)
+    kernel = njit(fastmath={"reassoc", "contract", "nsz"}, nogil=nogil)(function)
     if not config.DISABLE_JIT:
         kernel._cache = KernelCache(function)  # what `cache=True` does, with another place on disk
     return kernel

@@ -14,6 +14,7 @@ from qpavoid.kernels.kinematics import KinematicsArrays
 from qpavoid.kernels.layout import RowLayout
 from qpavoid.kernels.near_pairs import DistanceArrays
 from qpavoid.kernels.packing import compiled
+from qpavoid.kernels.planning import PlanningArrays
 from qpavoid.kernels.rollout import RolloutArrays
 
 
@@ -65,6 +66,15 @@ class PackedRowsType(_Structure):
     """Type of `PackedRows`."""
 
 
+class PackedPlanning(structref.StructRefProxy):  # type: ignore[misc]
+    """`PlanningArrays` in compiled code."""
+
+
+@structref.register
+class PackedPlanningType(_Structure):
+    """Type of `PackedPlanning`."""
+
+
 class PackedApproach(structref.StructRefProxy):  # type: ignore[misc]
     """`ApproachArrays` in compiled code."""
 
@@ -85,6 +95,7 @@ for proxy, kind, fields in (
     (PackedRows, PackedRowsType, RowLayout._fields),
     (PackedRollout, PackedRolloutType, RolloutArrays._fields),
     (PackedApproach, PackedApproachType, ApproachArrays._fields),
+    (PackedPlanning, PackedPlanningType, PlanningArrays._fields),
     (PackedObstacles, PackedObstaclesType, ObstacleArrays._fields),
 ):
     structref.define_boxing(kind, proxy)
@@ -122,6 +133,12 @@ def _pack_approach(fields: Any) -> Any:
 
 
 @compiled
+def _pack_planning(fields: Any) -> Any:
+    """Return a structure of `PlanningArrays`."""
+    return PackedPlanning(*fields)
+
+
+@compiled
 def _pack_obstacles(fields: Any) -> Any:
     """Return a structure of `ObstacleArrays`."""
     return PackedObstacles(*fields)
@@ -133,12 +150,19 @@ _PACK = {
     RowLayout: _pack_rows,
     RolloutArrays: _pack_rollout,
     ApproachArrays: _pack_approach,
+    PlanningArrays: _pack_planning,
     ObstacleArrays: _pack_obstacles,
 }
 
 
 def pack(
-    layout: KinematicsArrays | DistanceArrays | RowLayout | RolloutArrays | ApproachArrays | ObstacleArrays,
+    layout: KinematicsArrays
+    | DistanceArrays
+    | RowLayout
+    | RolloutArrays
+    | ApproachArrays
+    | ObstacleArrays
+    | PlanningArrays,
 ) -> Any:
     """Return memory in the form that the kernels take; both look into the same arrays.
 

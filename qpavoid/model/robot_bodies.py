@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from qpavoid.config import Body, Hull, RobotConfig
+from qpavoid.config import Body, Hull, Polytope, RobotConfig
 from qpavoid.errors import ConfigError, require_known
 from qpavoid.geometry.bodies import convert_bodies, hull, make_shape, triangle_meshes
+from qpavoid.geometry.meshes import convex_hull
 from qpavoid.model.joints import frame_index
 from qpavoid.model.notes import Note, NoteKind
 from qpavoid.model.packages import absolute_entries
@@ -72,6 +73,8 @@ def _listed_bodies(configs: Sequence[Body], model: Any, pieces: Sequence[Any], p
             require_known(name, named, f"{where}.shape.geometry: no collision geometry")
             geometry = hull(named[name].geometry)
             placement = placement * model.frames[named[name].parentFrame].placement.actInv(named[name].placement)
+        elif isinstance(body.shape, Polytope):
+            geometry = convex_hull(np.array(body.shape.corners))
         else:
             geometry = make_shape(body.shape)
         bodies.addGeometryObject(pin.GeometryObject(body.name, frame.parentJoint, frame_id, placement, geometry))

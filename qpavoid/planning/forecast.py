@@ -10,20 +10,21 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from qpavoid.config import Planning, Sensing
+from qpavoid.config import Planning, Sensing, SolverConfig
 from qpavoid.control.builder import ProblemBuilder
 from qpavoid.control.contacts import ContactRows
+from qpavoid.control.obstacle_states import ObstacleStates
 from qpavoid.control.scene_changes import SceneChanges
 from qpavoid.control.settings import ControlSettings
-from qpavoid.control.tasks import RowTask
+from qpavoid.control.tasks import FrameTask, RowTask
 from qpavoid.control.trajectories import extrapolate
 from qpavoid.model.sample import Sample
 from qpavoid.model.trajectory import Trajectory
 from qpavoid.planning.drive import Drive, Driver
 from qpavoid.problem import Array, AvoidanceRows
+from qpavoid.reason import Reason
 from qpavoid.safety.arbiter import Arbiter
 from qpavoid.solvers import make_solver
-from qpavoid.solvers.solver import NamedSolver
 
 _PRESENT = 1e-3
 """How much nearer than it is now a pair may come that is too near [m]."""
@@ -63,11 +64,18 @@ class Forecast(NamedTuple):
     """(n + 1,) largest error of a frame [m, rad]."""
     clearance: Array
     """(n + 1,) least distance beyond the one that has to be kept [m]."""
+    stalled_at: str = ""
+    """What the tasks are stalled at in the end, if they are."""
 
     def step_at(self, t: float) -> int:
         """Return the control step at a time [s], at most the last one."""
         steps = len(self.t) - 1
         return min(max(round(float((t - self.t[0]) / (self.t[-1] - self.t[0]) * steps)), 0), steps) if steps else 0
+
+    @property
+    def rms_error(self) -> float:
+        """Root mean square of the errors [m, rad]."""
+        return float(np.sqrt(np.mean(self.errors**2)))
 
     @property
     def final_error(self) -> float:
@@ -88,7 +96,7 @@ class Forecaster(SceneChanges):
         settings: ControlSettings,
         tasks: Sequence[RowTask],
         contacts: ContactRows | None,
-        law: NamedSolver,
+        law: SolverConfig,
         config: Planning,
     ) -> None:
         """Lay the memory out.
@@ -97,7 +105,7 @@ class Forecaster(SceneChanges):
             settings: of the controller.
             tasks: of the controller, frames first.
             contacts: frames that rest.
-            law: of the controller, one that scenarios name.
+            law: of the controller.
             config: what is planned, and how.
         """
         scene = settings.scene.own_copy() if settings.scene.spare else settings.scene
@@ -106,8 +114,8 @@ class Forecaster(SceneChanges):
         self.scene, self._tasks, self._config = scene, tasks, config
         self._builder = ProblemBuilder(self._settings, tasks, contacts)
         rows, tracker = self._builder.rows, self._builder.tracker
-        self._arbiter = Arbiter(self._settings, make_solver(law.config), rows, tracker)
-        self._driver = Driver(rows, self._arbiter, config)
+        self._arbiter = Arbiter(self._settings, make_solver(law), rows, tracker)
+        self._driver = Driver(rows, self._arbiter, config, scene.robot.model, settings.dt)
         rows.adapt(self._arbiter.solver, settings.avoidance.look_ahead)
         ends = [task.motion.end_time if isinstance(task.motion, Trajectory) else np.inf for task in tasks]
         self._deadline = max(ends[: rows.frame_count]) + config.settle
@@ -115,10 +123,14 @@ class Forecaster(SceneChanges):
         self._least = np.zeros(len(scene.pairs))
         """(m,) distance that each pair has to keep [m]."""
 
-    def change_law(self, law: NamedSolver) -> None:
+    def change_law(self, law: SolverConfig) -> None:
         """Forecast another law from now on."""
-        self._arbiter.solver = make_solver(law.config)
+        self._arbiter.solver = make_solver(law)
         self._builder.rows.adapt(self._arbiter.solver, self._settings.avoidance.look_ahead)
+
+    def attach_at(self, index: int, frame_id: int, q: Array, pose: Sample) -> None:
+        """Attach an obstacle as it is attached to the robot; see `ProblemBuilder.attach`."""
+        self._builder.attach(index, frame_id, q, pose)
 
     def end_of(self, start: Snapshot) -> float:
         """Return the time at which a forecast ends [s]."""
@@ -142,6 +154,7 @@ class Forecaster(SceneChanges):
         q[0], v[0], dv[0] = start.q, start.v, start.dv
         self._restart(start)
         obstacles = {name: Sample.of_row(row) for name, row in start.obstacles.items()} or None
+        stalled: tuple[Reason, ...] = ()
         for k in range(count + 1):
             updates = obstacles if k == 0 else None
             step = builder.build(builder.read(q[k], start.t + k * dt, start.targets or None, updates, None))
@@ -153,13 +166,14 @@ class Forecaster(SceneChanges):
             if k == count or step.faults:
                 break
             solution = self._driver.decide(step)
+            stalled = solution.stalled
             builder.remember(solution.v)
             v[k + 1], dv[k + 1] = solution.v, rows.previous.dv
             q[k + 1] = pin.integrate(model, q[k], solution.v * dt)
         n = k + 1
         t = start.t + dt * np.arange(n, dtype=np.float64)
         errors = np.linalg.norm(errors[:n].reshape(n, -1, 3), axis=2).max(axis=1)
-        return Forecast(t, q[:n], v[:n], dv[:n], errors, clearance[:n])
+        return Forecast(t, q[:n], v[:n], dv[:n], errors, clearance[:n], _pair_of(stalled))
 
     def later(self, start: Snapshot, forecast: Forecast, step: int) -> Snapshot:
         """Return the state of a forecast that began at `start`, when one of its steps begins."""
@@ -168,6 +182,26 @@ class Forecaster(SceneChanges):
         for row in states.values():
             extrapolate(row[None], t - start.t)
         return start._replace(t=t, q=forecast.q[step], v=forecast.v[step], dv=forecast.dv[step], obstacles=states)
+
+    def obstacles_at(self, start: Snapshot, t: float) -> ObstacleStates:
+        """Return where obstacles are at a time [s], as known in the state in which a forecast begins."""
+        tracker = self._builder.tracker
+        states = tracker.at(t).states.copy()
+        for name, row in start.obstacles.items():
+            index = tracker.index(name)
+            states[index] = row
+            extrapolate(states[index : index + 1], t - start.t)
+        return tracker.current._replace(states=states)
+
+    def targets_at(self, start: Snapshot, t: float) -> dict[str | tuple[str, str], Any]:
+        """Return targets of the frames at a time [s]: poses, or positions or orientations alone."""
+        targets: dict[str | tuple[str, str], Any] = {}
+        for task in self._tasks:
+            if isinstance(task, FrameTask):
+                target = start.targets.get(task.settings.label) or task.motion.sample(t)
+                only = target.position if task.moves else target.rotation
+                targets[task.settings.frame] = target if task.moves and task.turns else only
+        return targets
 
     def _restart(self, start: Snapshot) -> None:
         """Bring the controller into a state."""
@@ -182,3 +216,8 @@ class Forecaster(SceneChanges):
         self._least[:] = np.where(is_movable, distances.d1, -np.inf)
         pairs = distances.pair
         self._least[pairs] = np.minimum(self._least[pairs], distances.d - _PRESENT)
+
+
+def _pair_of(stalled: tuple[Reason, ...]) -> str:
+    """Return the subject of the strongest reason for which tasks are stalled; empty without one."""
+    return " - ".join(stalled[0].subject) if stalled else ""

@@ -13,9 +13,10 @@ from qpavoid.control.contacts import ContactRows
 from qpavoid.control.settings import ControlSettings
 from qpavoid.control.tasks import FrameTask, RowTask
 from qpavoid.model.sample import Sample
-from qpavoid.planning.candidates import Candidates, Decision
+from qpavoid.planning.candidates import Decision, is_sound
 from qpavoid.planning.drive import TRACK, Driver
-from qpavoid.planning.forecast import Forecast, Forecaster, Snapshot, largest_error
+from qpavoid.planning.forecast import Forecast, Snapshot, largest_error
+from qpavoid.planning.worker import Answer, Parts, Question, Worker, make_worker
 from qpavoid.problem import Array, Solution
 from qpavoid.reason import Reason, ReasonKind
 from qpavoid.safety.arbiter import Arbiter
@@ -30,7 +31,7 @@ _TURNED = 0.1
 """The same of a joint, or of an obstacle's orientation [rad]."""
 _NOISE = 1e-3
 """Root mean square of what an obstacle's position differs from that of a step before and its twist, from which on
-twists are too noisy for a fast finish [m]: at 10 m/s², it is half as much."""
+twists are too noisy to plan with [m]: at 10 m/s², it is half as much."""
 _FORGETTING = 0.05
 """Weight of the newest difference in that mean [-]."""
 _MEASURED = 20
@@ -62,13 +63,13 @@ class Replanning:
             config: what is planned, and how.
         """
         self._builder, self._config, self._settings, self._tasks = builder, config, settings, tasks
-        self._driver = Driver(builder.rows, arbiter, config)
-        self._forecaster: Forecaster | None = None
-        law = arbiter.solver
+        self._driver = Driver(builder.rows, arbiter, config, settings.scene.robot.model, settings.dt)
+        self._number, law = 0, arbiter.solver
         self._no_plan = _exclusion(tasks, law)
+        self._notes = tuple[Reason, ...]()  # what of plans is excluded
+        self._worker: Worker | None = None
         if self._no_plan is None and isinstance(law, NamedSolver):
-            self._forecaster = Forecaster(settings, tasks, contacts, law, config)
-            self._candidates = Candidates(self._forecaster, config)
+            self._worker = make_worker(Parts(settings, tasks, contacts, law.config, config))
         self.reset()
 
     def reset(self) -> None:
@@ -76,49 +77,57 @@ class Replanning:
         self._driver.begin(TRACK)
         self._pending: Decision | None = None
         self._expected: Forecast | None = None
-        self._last_obstacles = dict[str, Array]()  # states of obstacles in the last look
+        self._question: Question | None = None
+        self._last_obstacles = dict[str, Array]()  # states in the last look
         self._last_look, self._next_look, self._wait = -np.inf, -np.inf, self._config.period
+        self._looks = 0
         self._last_states: Array | None = None
         self._noise, self._measured = 0.0, 0  # mean square [m²], number of differences
 
     def change_law(self, law: Solver) -> None:
         """Forecast another law from now on; nothing is forecast if the first one could not be."""
         self.reset()
-        if self._forecaster is not None:
+        if self._worker is not None:
             self._no_plan = _exclusion(self._tasks, law)
             if self._no_plan is None and isinstance(law, NamedSolver):
-                self._forecaster.change_law(law)
+                self._worker.change("change_law", law.config)
 
     def drop(self) -> None:
         """Drop what is followed: the next step is of a given velocity."""
         if self._driver.drive is not TRACK:
             self.reset()
-        self._pending = None
+        self._pending = self._question = None
 
     def change_scene(self, method: str, *arguments: Any) -> None:
         """Change the scene of forecasts like that of the controller; what was planned in it is dropped."""
-        if self._forecaster is not None:
-            getattr(self._forecaster, method)(*arguments)
+        if self._worker is not None:
+            self._worker.change(method, *arguments)
         self.reset()
 
     def decide(self, step: StepProblem) -> Solution:
         """Return the solution of a step, and look ahead from it where that is due."""
-        if self._no_plan is not None:
-            solution = self._driver.decide(step)
-            return solution._replace(assumptions=(*solution.assumptions, self._no_plan))
-        config, external = self._config, self._builder.tracker.external
-        if len(external):
-            self._measure_noise()
-        if self._pending is None and self._is_due(step):
-            self._look(step)
+        drive, worker, dt = self._driver.drive, self._worker, self._settings.dt
+        if self._pending is not None and step.t > self._pending.t + dt:  # steps were left out, or stops
+            self._pending, self._next_look = None, step.t
+        if self._no_plan is None and worker is not None:
+            if len(self._builder.tracker.external):
+                self._measure_noise()
+            if self._pending is None and self._question is None and self._is_due(step):
+                self._ask(step, worker)
+            if (answer := worker.poll()) is not None:
+                self._take(answer, step.t)
         solution = self._driver.decide(step)
-        if self._driver.drive.reason:
-            solution = solution._replace(plan=self._driver.drive.reason)
+        if self._driver.drive.mode is not drive.mode:  # a path has ended
+            self._next_look = step.t
         if solution.stalled and self._pending is None:
             self._next_look = min(self._next_look, self._last_look + self._wait)
-        if self._pending is not None and step.t + self._settings.dt >= self._pending.t - _ROUND_OFF:
+        if self._pending is not None and step.t + dt >= self._pending.t - _ROUND_OFF:
             self._driver.begin(self._pending.drive)
-            self._expected, self._pending, self._next_look = self._pending.forecast, None, step.t + config.period
+            self._expected, self._next_look = self._pending.forecast, step.t + self._config.period
+            self._pending = None
+        notes = self._notes if self._no_plan is None else (self._no_plan,)
+        if drive.reason or notes:
+            return solution._replace(plan=drive.reason, assumptions=(*solution.assumptions, *notes))
         return solution
 
     def _is_due(self, step: StepProblem) -> bool:
@@ -130,7 +139,8 @@ class Replanning:
     def _has_changed(self, step: StepProblem) -> bool:
         """Return whether robot, targets or obstacles are elsewhere than in the forecast."""
         expected, tracker = self._expected, self._builder.tracker
-        assert expected is not None
+        if expected is None:
+            return True
         k = expected.step_at(step.t)
         error = largest_error(self._builder.rows.frame_errors)
         if abs(error - expected.errors[k]) > _CHANGED or np.abs(step.q - expected.q[k]).max() > _TURNED:
@@ -159,24 +169,45 @@ class Replanning:
             self._noise += max(_FORGETTING, 1.0 / self._measured) * (worst - self._noise)
         self._last_states = states
 
-    def _look(self, step: StepProblem) -> None:
-        """Look ahead from a step, and decide when to look again."""
-        tracker, previous, period = self._builder.tracker, self._builder.rows.previous, self._config.period
+    def _ask(self, step: StepProblem, worker: Worker) -> None:
+        """Ask for a look ahead from a step."""
+        tracker, previous = self._builder.tracker, self._builder.rows.previous
         slots, states = self._settings.scene.slots, tracker.current.states
         self._last_obstacles = {slots[i].name: states[i].copy() for i in tracker.external.tolist()}
         is_moving = self._moves(states[tracker.external])
+        is_noisy = is_moving and (self._measured < _MEASURED or self._noise > _NOISE**2)
         q, v, dv = step.q.copy(), previous.v.copy(), previous.dv.copy()
         start = Snapshot(step.t, q, v, dv, self._driver.drive, self._last_obstacles, self._given_targets(step))
-        is_noisy = is_moving and (self._measured < _MEASURED or self._noise > _NOISE**2)
-        outcome = self._candidates.look(start, not is_noisy)
-        self._last_look, self._expected, self._pending = step.t, outcome.forecast, outcome.decision
+        self._number += 1
+        self._question = Question(self._number, start, is_moving, is_noisy, self._looks)
+        self._looks += 1
+        self._last_look = step.t
+        worker.ask(self._question)
+
+    def _take(self, answer: Answer, t: float) -> None:
+        """Take over an answer at a time [s], and decide when to look again."""
+        question, outcome, period = self._question, answer.outcome, self._config.period
+        if answer.no_paths:
+            self._notes = (Reason.of(ReasonKind.NO_PLAN, "paths", detail=answer.no_paths),)
+        if answer.number < 0:
+            self._no_plan = Reason.of(ReasonKind.NO_PLAN, "worker", detail=answer.failure)
+        if question is None or answer.number != question.number:
+            return
+        self._question = None
+        if outcome is None or not is_sound(outcome, self._settings.scene.robot.model):
+            detail = answer.failure or "what it answers has the wrong shape, or is not finite"
+            self._no_plan = Reason.of(ReasonKind.NO_PLAN, "worker", detail=detail)
+            return
+        self._expected = outcome.forecast
         if outcome.arrives:
-            self._next_look, self._wait = step.t + (period if is_moving else np.inf), period
+            self._next_look, self._wait = t + (period if question.is_moving else np.inf), period
         elif outcome.decision is None:
-            self._next_look = step.t + self._wait
-            self._wait = period if is_moving else min(2.0 * self._wait, _LONGEST_WAIT)
+            self._next_look = t + self._wait
+            self._wait = period if question.is_moving else min(2.0 * self._wait, _LONGEST_WAIT)
         else:
-            self._wait = period
+            self._next_look, self._wait = t + period, period
+            if outcome.decision.t >= t - _ROUND_OFF:  # else it comes too late
+                self._pending = outcome.decision
 
     def _given_targets(self, step: StepProblem) -> dict[str, Any]:
         """Return targets that are not those of the tasks' motions, by name."""

@@ -25,6 +25,7 @@ from qpavoid.model.robot import Robot
 from qpavoid.model.sample import STATE
 from qpavoid.model.scene import PARKING_DISTANCE, Obstacle, Scene
 from qpavoid.problem import Array, Solution, Status
+from qpavoid.reason import Reason, ReasonKind
 from qpavoid.run.log import STATUSES, Log
 from qpavoid.run.machine import versions
 from qpavoid.solvers import parse_solver
@@ -181,6 +182,8 @@ class Recorder:
     def _record_events(self, t: float, solution: Solution) -> None:
         """Store status and reasons where they differ from the previous ones in kind."""
         reasons = (*solution.reasons, *solution.stalled, *solution.assumptions)
+        if solution.plan:
+            reasons += (Reason.of(ReasonKind.PLAN, detail=solution.plan),)
         keys = (solution.status, *[(*reason.key, reason.severity) for reason in reasons])
         eventful = solution.status is not Status.SOLVED or reasons
         if keys != self._keys and eventful and len(self._events) < _MAX_EVENTS:

@@ -11,7 +11,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from qpavoid.config import JointLimits, RobotConfig
-from qpavoid.errors import ConfigError
+from qpavoid.errors import ConfigError, matching
 from qpavoid.model.end_effectors import end_effectors
 from qpavoid.model.joints import find_joint
 from qpavoid.model.kinematics import MIMIC
@@ -36,8 +36,14 @@ from qpavoid.setup.sampling import (
 )
 from qpavoid.setup.shapes import LinkBodies, Piece, bodies_of_link, kinds_of_links, pieces_of
 from qpavoid.setup.srdf import Semantics, find_srdf, read_srdf
+from qpavoid.setup.wrist import wrist_links
 
 Root = Literal["fixed", "planar", "free_flyer"]
+PROTRUSION, WRIST_PROTRUSION = 0.02, 0.005
+"""How far bodies may stand out of the geometry, and from the wrist on [m]: grasps bring a hand and the links before it
+within 5 to 10 mm of what stands around, and nothing else of an arm."""
+_TIGHTER = 0.25
+"""Part of the bound that remains for links whose bodies are too near at home or everywhere [-]."""
 _HOME_NEAR = 0.04
 """Distance at the preferred home pose, as a share of the robot's size, within which capsules are oversized [-]."""
 
@@ -52,6 +58,12 @@ class DescribeOptions:
     """Kind of collision bodies."""
     bodies_of: Mapping[str, Bodies] = field(default_factory=dict)
     """Link (with `*` and `?`): another kind."""
+    protrusion: float = PROTRUSION
+    """How far bodies of `auto` may stand out of the geometry [m]."""
+    wrist_protrusion: float = WRIST_PROTRUSION
+    """The same from the wrist on: of what comes close to what is grasped [m]."""
+    wrist: Sequence[str] | None = None
+    """Links (with `*` and `?`) that count as from the wrist on; found by `wrist_links` if left out."""
     root: Root = "fixed"
     """How the root link is attached to the world."""
     lock: Sequence[str] = ()
@@ -138,7 +150,8 @@ def _describe(urdf: Path, options: DescribeOptions, progress: Callable[[str], No
         end_effectors=end_effectors(model, semantics.end_effectors),
     )
     with_srdf = bare.model_copy(update={"srdf": None if honoured is None else str(honoured.resolve())})
-    links, robot = _links(pieces, with_srdf, semantics, options, notes, progress)
+    wrist = _wrist(model, bare.end_effectors, pieces, options)
+    links, robot = _links(pieces, with_srdf, wrist, semantics, options, notes, progress)
 
     progress(f"sampling {len(robot.bodies.collisionPairs)} pairs")
     sampled = sample_pairs(robot, options.samples, options.seed)
@@ -245,6 +258,7 @@ def _pieces(
 def _links(
     pieces: Sequence[Piece],
     config: RobotConfig,
+    wrist: set[str],
     semantics: Semantics,
     options: DescribeOptions,
     notes: list[Note],
@@ -252,26 +266,35 @@ def _links(
 ) -> tuple[dict[str, LinkBodies], Robot]:
     """Fit the bodies of every link, and build the robot with them.
 
-    `auto` takes exact ones where capsules would be too near at home or everywhere.
+    `auto` takes tighter ones where they would be too near at home or everywhere.
     """
     kinds = kinds_of_links(pieces, options.bodies, options.bodies_of)
     links = {}
     for number, (link, kind) in enumerate(kinds.items(), start=1):
         progress(f"fitting bodies to link {number} of {len(kinds)}: {link}")
-        links[link] = bodies_of_link(pieces, link, kind)
-    exact_links: list[str] = []
+        bound = options.wrist_protrusion if link in wrist else options.protrusion
+        links[link] = bodies_of_link(pieces, link, kind, bound)
+    tighter_links: list[str] = []
     while True:
         listed = [body for link in links.values() for body in link.bodies]
         robot = Robot.from_config(config.model_copy(update={"bodies": listed}), Path(config.urdf))
         oversized = _oversized(robot, home_candidates(robot, semantics)[0])
-        exact = {link: bodies_of_link(pieces, link, "convex") for link in oversized if kinds[link] == "auto"}
-        if not (changed := [link for link, bodies in exact.items() if links[link] != bodies]):
+        tighter = {
+            link: bodies_of_link(pieces, link, "auto", _TIGHTER * links[link].bound)
+            for link in oversized
+            if kinds[link] == "auto" and link not in tighter_links
+        }
+        if all(links[link].bodies == made.bodies for link, made in tighter.items()):
             break
-        links.update(exact)
-        exact_links += changed
-    if exact_links:
-        clause = "exact bodies, because capsules would be too near at home or everywhere"
-        notes.append(Note(NoteKind.SHAPE, tuple(sorted(exact_links, key=list(links).index)), clause))
+        links.update(tighter)
+        tighter_links += tighter
+    if tighter_links:
+        clause = "tighter bodies, because others would be too near at home or everywhere"
+        notes.append(Note(NoteKind.SHAPE, tuple(sorted(tighter_links, key=list(links).index)), clause))
+    if loose := [link for link, made in links.items() if kinds[link] == "auto" and made.protrusion > made.limit]:
+        farthest = max(links[link].protrusion for link in loose)
+        clause = f"bodies that stand out farther than they should, up to {1e3 * farthest:.0f} mm: hollow, or bent"
+        notes.append(Note(NoteKind.SHAPE, tuple(loose), clause, "bodies of your own, or a mesh in convex pieces"))
     gross = [link for link, made in links.items() if made.volume > MAX_VOLUME_RATIO * made.inside > 0.0]
     if worst := sorted(gross, key=lambda link: -links[link].volume):
         first = links[worst[0]]
@@ -281,6 +304,13 @@ def _links(
         )
         notes.append(Note(NoteKind.SHAPE, tuple(worst), clause, f"--bodies {worst[0]}=capsules, or bodies of your own"))
     return links, robot
+
+
+def _wrist(model: Any, ends: Sequence[str], pieces: Sequence[Piece], options: DescribeOptions) -> set[str]:
+    """Return the links that are from the wrist on."""
+    if options.wrist is None:
+        return wrist_links(model, ends)
+    return set(matching(options.wrist, [piece.link for piece in pieces], "--wrist: no link with geometry"))
 
 
 def _oversized(robot: Robot, home: Array) -> set[str]:

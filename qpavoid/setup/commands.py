@@ -19,7 +19,7 @@ from qpavoid.model.notes import Note
 from qpavoid.model.robot import Robot
 from qpavoid.run.report import to_json
 from qpavoid.run.terminal import ERR, OUT
-from qpavoid.setup.add import DescribeOptions, Description, Root, describe
+from qpavoid.setup.add import PROTRUSION, WRIST_PROTRUSION, DescribeOptions, Description, Root, describe
 from qpavoid.setup.check import Report, check_robot
 from qpavoid.setup.fit import Bodies
 from qpavoid.setup.joints import Joint
@@ -129,6 +129,15 @@ def add(
         list[str] | None,
         typer.Option(metavar="KIND|LINK=KIND", help=f"Bodies: {', '.join(get_args(Bodies))}; also for single links."),
     ] = None,
+    protrusion: Annotated[
+        float, typer.Option(min=1e-4, max=1.0, help="How far bodies may stand out of the geometry [m].")
+    ] = PROTRUSION,
+    wrist_protrusion: Annotated[
+        float, typer.Option(min=1e-4, max=1.0, help="The same from the wrist on, of what comes close to a grasp [m].")
+    ] = WRIST_PROTRUSION,
+    wrist: Annotated[
+        list[str] | None, typer.Option(help="Link that counts as from the wrist on; * and ? match; found if left out.")
+    ] = None,
     root: RootJoint = "fixed",
     lock: Annotated[list[str] | None, typer.Option(help="Joint to hold at home for good; * and ? match.")] = None,
     home: Annotated[
@@ -149,7 +158,8 @@ def add(
     begin = time.perf_counter()
     kinds = _kinds(bodies or [])
     options = DescribeOptions(
-        name=name, bodies=kinds.pop(""), bodies_of=kinds, root=_one_of(root, Root, "--root"), lock=tuple(lock or ()),
+        name=name, bodies=kinds.pop(""), bodies_of=kinds, protrusion=protrusion, wrist_protrusion=wrist_protrusion,
+        wrist=wrist, root=_one_of(root, Root, "--root"), lock=tuple(lock or ()),
         home=_values(home or []), package_dirs=_entries(package_dir, package),
         allow_missing_meshes=allow_missing_meshes, srdf=srdf, samples=samples, seed=seed,
     )  # fmt: skip
@@ -223,6 +233,7 @@ def _document(description: Description, outcome: dict[Path, str], seconds: float
         "bodies": len(config.bodies),
         "bodies_volume": sum(link.volume for link in links),
         "hulls_volume": sum(link.hulls for link in links),
+        "protrusion": {name: link.protrusion for name, link in description.links.items()},
         "geometry_volume": sum(link.inside for link in links),
         "pairs": dict(description.counts),
         "left_out": description.unchecked,
@@ -241,7 +252,7 @@ def _document(description: Description, outcome: dict[Path, str], seconds: float
 def _report(description: Description, outcome: dict[Path, str], seconds: float) -> None:
     facts = dict(summary(description))
     ends = ", ".join(description.config.end_effectors) or "none recognised"
-    _print({"bodies": "", "pairs": "", "end effectors": ends, **facts}.items(), description.notes)
+    _print({"bodies": "", "protrusion": "", "pairs": "", "end effectors": ends, **facts}.items(), description.notes)
     where = f"in {seconds:.1f} s; in a scenario: `robot: {next(iter(outcome))}`"
     _print([*((what, str(path)) for path, what in outcome.items()), ("", where)])
 

@@ -1,31 +1,44 @@
-"""Which shapes stand for a piece of collision geometry: one capsule, several, or its convex hull."""
+"""Which shapes stand for a piece of collision geometry: the cheapest that stand out of it no farther than a bound."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import chain
 from typing import Any, Literal
 
 import coal
 import numpy as np
+import pinocchio as pin
 from scipy.spatial import ConvexHull, QhullError
 
-from qpavoid.geometry.bodies import enclosing_capsule, hull_points, surface_triangles
+from qpavoid.geometry.bodies import enclosing_capsule, hull, hull_points, surface_triangles
 from qpavoid.geometry.capsules import CapsuleFit, extreme_points, fit_capsule
-from qpavoid.geometry.meshes import cut, hull_corners
+from qpavoid.geometry.decompose import decompose as convex_pieces
+from qpavoid.geometry.decompose import merge
+from qpavoid.geometry.meshes import convex_hull, corners, cut, hull_corners
+from qpavoid.geometry.primitives import fit_box, fit_cylinder
+from qpavoid.geometry.protrusion import Surface
 from qpavoid.problem import Array
 
 Bodies = Literal["auto", "capsule", "capsules", "convex"]
-"""`auto`: the leanest of the others for each piece; `capsule`: one each; `capsules`: up to `MAX_CAPSULES`, while each
+"""`auto`: the cheapest of the others for each piece; `capsule`: one each; `capsules`: up to `MAX_CAPSULES`, while each
 further one saves enough; `convex`: hulls of meshes, primitives as they are."""
 
 MAX_CAPSULES = 4
 """Capsules that one piece is cut into at most."""
 MAX_VOLUME_RATIO = 2.0
-"""Volume of capsules, in units of the hull's, from which `auto` takes the hull instead, although a hull costs a pair
-twenty times what a capsule costs. A capsule around a cylinder takes 1.3 to 2, around a cube 2.7."""
-MIN_CONCAVITY = 1.5
-"""Volume of a mesh's hull, in units of what the mesh encloses, from which `auto` compares several capsules [-]."""
+"""Volume of one body, in units of the hull's, from which `auto` takes another one although it stands out little: on
+small links, bounds in millimetres say nothing. A capsule around a cylinder takes 1.3 to 2, around a cube 2.7."""
+_HARDLY_MORE = 1.1
+"""Protrusion with which fewer bodies are taken where none is within the bound, in units of the least [-]."""
 MIN_SAVING = 0.15
 """Part of the volume that a further capsule must save."""
+_HULLS = 2, 4, 8, 16
+"""Numbers of hulls that are tried."""
+_DECOMPOSED, _SLABS = 2000, 4
+"""Triangles of a mesh that several hulls are tried for, at most, and slabs that it is cut into along each axis: a
+robot has dozens of meshes, and each takes a second."""
 _CLOSED = 1e-3
 """Sum of a closed surface's area vectors, as a share of its area, that is rounding [-]."""
 _CUTS = np.linspace(0.2, 0.8, 7)
@@ -36,31 +49,102 @@ _FINE = 4000
 """Triangles of a surface beyond which some stand for all while cuts are compared; what is cut, and enclosed, is all."""
 
 
-def fit_piece(geometry: Any, how: Bodies, inside: float | None = None) -> tuple[CapsuleFit, ...]:
-    """Fit capsules that enclose a coal geometry entirely, in its own frame; `inside` is its `inside_volume` [m³].
+@dataclass(frozen=True)
+class Part:
+    """A body, or one of several, that stands for a piece of geometry."""
 
-    None where its hull, or the primitive itself, is to stand for it.
+    geometry: Any
+    """coal geometry."""
+    place: Any
+    """Where it is: a pinocchio SE3."""
+    is_exact: bool = False
+    """Whether it is the piece itself, or the hull of its mesh."""
+
+    @property
+    def placed(self) -> tuple[Any, Any]:
+        """As `Surface` takes it."""
+        return self.geometry, self.place
+
+
+def capsule_part(fit: CapsuleFit, place: Any) -> Part:
+    """Return a capsule, or a sphere, that was fitted in a placed frame."""
+    geometry = coal.Capsule(fit.radius, fit.length) if fit.length > 0.0 else coal.Sphere(fit.radius)
+    return Part(geometry, place * pin.SE3(fit.rotation, np.asarray(fit.center)))
+
+
+def fit_piece(geometry: Any, place: Any, how: Bodies, surface: Surface) -> tuple[Part, ...]:
+    """Choose bodies that enclose a coal geometry entirely.
+
+    `auto` takes the first of these, in the order of what they cost, that is within the bound: a capsule, a box, a
+    cylinder, the hull, several capsules, several hulls. Capsules and boxes have closed forms with capsules, the others
+    a search, and every further body has pairs with all others. Where none is within the bound, the first that stands
+    out hardly more than the tightest of hull and several: hollows that no hull can follow are not worth more bodies.
+
+    Args:
+        geometry: the piece, in its own frame.
+        place: where that is, a pinocchio SE3.
+        how: which kind of bodies.
+        surface: of the piece where it is, with the bound of `auto`.
     """
-    if isinstance(geometry, coal.Sphere | coal.Capsule):
-        return (enclosing_capsule(geometry),)
-    if how == "convex":
-        return ()
-    one = enclosing_capsule(geometry)
+    exact = Part(hull(geometry), place, is_exact=True)
+    if isinstance(geometry, coal.Sphere | coal.Capsule) or how == "convex":
+        return (exact,)
     if how == "capsule":
-        return (one,)
+        return (capsule_part(enclosing_capsule(geometry), place),)
     if how == "capsules":
-        return decompose(surface_triangles(geometry), one)
-    hull, is_mesh = hull_volume(geometry), isinstance(geometry, coal.BVHModelBase)
-    is_gross = one.volume > MAX_VOLUME_RATIO * hull
-    is_concave = is_mesh and hull > MIN_CONCAVITY * (inside_volume(geometry) if inside is None else inside)
-    if is_concave or (is_gross and (is_mesh or isinstance(geometry, coal.ConvexBase))):
-        several = decompose(surface_triangles(geometry), one)
-        volume = sum(fit.volume for fit in several)
-        if is_concave and volume < min(hull, one.volume):  # they may follow a bend that the hull spans
-            return several
-        if is_gross and volume <= MAX_VOLUME_RATIO * hull:
-            return several
-    return () if is_gross else (one,)  # boxes and cylinders are exact as they are
+        return _capsules(geometry, place)
+    is_primitive = isinstance(geometry, coal.ShapeBase) and not isinstance(geometry, coal.ConvexBase)
+    single = single_part(hull_points(geometry), place, surface, hull_volume(geometry), not is_primitive)
+    if single is not None:
+        return (single,)
+    if isinstance(geometry, coal.ShapeBase):
+        return (exact,)
+    tried = list[tuple[float, tuple[Part, ...]]]()
+    for parts in chain([(exact,)], _several(geometry, place)):
+        placed = [part.placed for part in parts]
+        if surface.holds(placed):
+            return parts
+        tried.append((surface.protrusion(placed), parts))
+    least = min(protrusion for protrusion, _ in tried)
+    return next(parts for protrusion, parts in tried if protrusion <= _HARDLY_MORE * least)
+
+
+def single_part(points: Array, place: Any, surface: Surface, hulls: float, every_kind: bool) -> Part | None:
+    """Return the cheapest single body around points (n, 3) that is within the bound, and not gross; None if none is.
+
+    Args:
+        points: in their frame [m].
+        place: where that is, a pinocchio SE3.
+        surface: of the geometry, with the bound.
+        hulls: volume of the hulls of the geometry's pieces [m³].
+        every_kind: whether boxes and cylinders are tried too.
+    """
+
+    def fits() -> Iterator[Part]:
+        yield capsule_part(fit_capsule(points), place)
+        for fit in (fit_box, fit_cylinder) if every_kind else ():
+            geometry, own = fit(points)
+            yield Part(geometry, place * own)
+
+    for part in fits():
+        if hull_volume(part.geometry) <= MAX_VOLUME_RATIO * hulls and surface.holds([part.placed]):
+            return part
+    return None
+
+
+def _several(mesh: Any, place: Any) -> Iterator[tuple[Part, ...]]:
+    """Yield several capsules, then more and more hulls, around a mesh whose own hull stands out too far."""
+    yield _capsules(mesh, place)
+    if mesh.num_tris > _DECOMPOSED:
+        return
+    pieces = convex_pieces(*corners(mesh), _HULLS[-1], 0.0, _SLABS)
+    for count in _HULLS:
+        yield tuple(Part(convex_hull(points), place) for points in merge(pieces, count))
+
+
+def _capsules(geometry: Any, place: Any) -> tuple[Part, ...]:
+    capsules = decompose(surface_triangles(geometry), enclosing_capsule(geometry))
+    return tuple(capsule_part(fit, place) for fit in capsules)
 
 
 def decompose(surface: Array, whole: CapsuleFit, most: int = MAX_CAPSULES) -> tuple[CapsuleFit, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -12,11 +12,13 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from qpavoid.config import Body, Box, Capsule, Cylinder, Hull, Sphere
+from qpavoid.config import Body, Box, Capsule, Cylinder, Hull, Polytope, Sphere
 from qpavoid.errors import matching
 from qpavoid.geometry.bodies import hull_points
 from qpavoid.geometry.capsules import CapsuleFit, fit_capsule
-from qpavoid.setup.fit import MAX_VOLUME_RATIO, Bodies, fit_piece, hull_volume, inside_volume
+from qpavoid.geometry.protrusion import Surface
+from qpavoid.problem import Array
+from qpavoid.setup.fit import Bodies, Part, capsule_part, fit_piece, hull_volume, inside_volume, single_part
 
 _DIGITS = 5
 """Decimals of lengths [m] and angles [rad] in files: 0.01 mm."""
@@ -59,6 +61,17 @@ class LinkBodies:
     """Of the convex hulls of the link's pieces [m³]."""
     inside: float
     """Of what the link's pieces enclose, meshes as they are [m³]."""
+    protrusion: float
+    """How far they stand out of the link's pieces [m]."""
+    spacing: float
+    """Distance of the samples by which that was found [m]."""
+    bound: float
+    """How far they may, in `auto` [m]."""
+
+    @property
+    def limit(self) -> float:
+        """That bound, or what samples can tell where it is less [m]."""
+        return max(self.bound, self.spacing)
 
 
 def kinds_of_links(pieces: Sequence[Piece], kind: Bodies, by_pattern: Mapping[str, Bodies]) -> dict[str, Bodies]:
@@ -73,38 +86,84 @@ def kinds_of_links(pieces: Sequence[Piece], kind: Bodies, by_pattern: Mapping[st
     return kinds
 
 
-def bodies_of_link(pieces: Sequence[Piece], link: str, kind: Bodies) -> LinkBodies:
+def bodies_of_link(pieces: Sequence[Piece], link: str, kind: Bodies, bound: float) -> LinkBodies:
     """Fit bodies that enclose all pieces of a link.
 
-    One capsule around all pieces takes the place of several shapes where it has no more volume than they have, or, in
-    `auto`, where it is not too large.
+    One body around all pieces takes the place of several where it has no more volume than they have, or, in `auto`,
+    where it is within the bound and not gross.
+
+    Args:
+        pieces: of the robot.
+        link: name of the link.
+        kind: kind of bodies.
+        bound: how far bodies of `auto` may stand out of the pieces [m].
     """
     pieces = [piece for piece in pieces if piece.link == link]
-    hulls = [hull_volume(piece.geometry) for piece in pieces]
-    shapes, volume = list[dict[str, Any]](), 0.0
-    for piece, hull in zip(pieces, hulls, strict=True):
-        fit = fit_piece(piece.geometry, kind, piece.inside)
-        shapes += [capsule_fields(capsule, piece.placement) for capsule in fit] or [_exact_fields(piece)]
-        volume += sum(capsule.volume for capsule in fit) if fit else hull
-    if len(shapes) > 1 and kind != "convex":
+    surface = Surface([(piece.geometry, piece.placement) for piece in pieces], bound)
+    hulls = sum(hull_volume(piece.geometry) for piece in pieces)
+    chosen = list[tuple[Piece, Part]]()
+    for piece in pieces:
+        own = surface if len(pieces) == 1 else Surface([(piece.geometry, piece.placement)], bound)
+        chosen += [(piece, part) for part in fit_piece(piece.geometry, piece.placement, kind, own)]
+    if len(chosen) > 1 and kind != "convex":
         points = [
             hull_points(piece.geometry) @ piece.placement.rotation.T + piece.placement.translation for piece in pieces
         ]
-        whole = fit_capsule(np.concatenate(points))
-        if whole.volume <= max(volume, MAX_VOLUME_RATIO * sum(hulls) if kind == "auto" else 0.0):
-            shapes, volume = [capsule_fields(whole, pin.SE3.Identity())], whole.volume
-    names = [link] if len(shapes) == 1 else [f"{link}_{index}" for index in range(len(shapes))]
-    bodies = [Body(name=name, frame=link, **shape) for name, shape in zip(names, shapes, strict=True)]
-    return LinkBodies(tuple(bodies), volume, sum(hulls), sum(piece.inside for piece in pieces))
+        whole = _whole(np.concatenate(points), kind, surface, hulls, _volume(part for _, part in chosen))
+        chosen = chosen if whole is None else [(pieces[0], whole)]
+    parts = [part for _, part in chosen]
+    names = [link] if len(parts) == 1 else [f"{link}_{index}" for index in range(len(parts))]
+    bodies = [
+        Body(name=name, frame=link, **_fields(part, piece)) for name, (piece, part) in zip(names, chosen, strict=True)
+    ]
+    return LinkBodies(
+        tuple(bodies), _volume(parts), hulls, sum(piece.inside for piece in pieces),
+        surface.protrusion([part.placed for part in parts]), surface.spacing, bound,
+    )  # fmt: skip
 
 
-def capsule_fields(fit: CapsuleFit, placement: Any) -> dict[str, Any]:
-    """Return the fields of a `Body` that encloses a capsule in a placed frame, with five decimals.
+def _whole(points: Array, kind: Bodies, surface: Surface, hulls: float, volume: float) -> Part | None:
+    """Return the one body that may take the place of several, which have a volume [m³]."""
+    if kind == "auto":
+        return single_part(points, pin.SE3.Identity(), surface, hulls, every_kind=True)
+    capsule = capsule_part(fit_capsule(points), pin.SE3.Identity())
+    return capsule if hull_volume(capsule.geometry) <= volume else None
+
+
+def _volume(parts: Iterable[Part]) -> float:
+    return sum(hull_volume(part.geometry) for part in parts)
+
+
+def _fields(part: Part, piece: Piece) -> dict[str, Any]:
+    """Return the fields of a `Body`, in the frame of the link."""
+    geometry, place = part.geometry, part.place
+    match geometry:
+        case coal.Sphere():
+            return capsule_fields(CapsuleFit(place.translation, place.rotation, geometry.radius, 0.0))
+        case coal.Capsule():
+            length = 2.0 * geometry.halfLength
+            return capsule_fields(CapsuleFit(place.translation, place.rotation, geometry.radius, length))
+        case coal.Box():
+            x, y, z = (_up(2.0 * half) for half in geometry.halfSide)
+            shape: Any = Box(size=(x, y, z))
+        case coal.Cylinder():
+            shape = Cylinder(radius=_up(geometry.radius), length=_up(2.0 * geometry.halfLength))
+        case coal.ConvexBase() if not part.is_exact:
+            corners = np.array(geometry.points()) @ place.rotation.T + place.translation
+            return {"shape": Polytope(corners=(np.round(corners, _DIGITS + 1) + 0.0).tolist())}
+        case _:
+            return {"shape": Hull(geometry=piece.name)}
+    angles, origin = pin.rpy.matrixToRpy(place.rotation), place.translation
+    position, rpy = (np.round(numbers, 2 * _DIGITS) + 0.0 for numbers in (origin, angles))  # no -0.0
+    return {"shape": shape, "position": tuple(position.tolist()), "rpy": tuple(rpy.tolist())}
+
+
+def capsule_fields(fit: CapsuleFit) -> dict[str, Any]:
+    """Return the fields of a `Body` that encloses a capsule, with five decimals.
 
     The radius makes up for the rounding of everything else, so that what was enclosed stays so.
     """
-    axis = placement.rotation @ fit.rotation[:, 2]
-    center = placement.act(np.asarray(fit.center))
+    axis, center = fit.rotation[:, 2], np.asarray(fit.center)
     position = np.round(center, _DIGITS) + 0.0  # no -0.0
     length = round(fit.length, _DIGITS)
     pitch, yaw = round(math.acos(np.clip(axis[2], -1.0, 1.0)), _DIGITS), round(math.atan2(axis[1], axis[0]), _DIGITS)
@@ -115,21 +174,6 @@ def capsule_fields(fit: CapsuleFit, placement: Any) -> dict[str, Any]:
     radius = math.ceil((fit.radius + float(shift)) * 10**_DIGITS) / 10**_DIGITS
     shape = Capsule(radius=radius, length=length) if length > 0.0 else Sphere(radius=radius)
     return {"shape": shape, "position": tuple(position.tolist()), "rpy": (0.0, pitch, yaw)}
-
-
-def _exact_fields(piece: Piece) -> dict[str, Any]:
-    """Return the fields of a `Body` that is a primitive, or the hull of a mesh."""
-    geometry = piece.geometry
-    if isinstance(geometry, coal.Box):
-        x, y, z = (_up(2.0 * half) for half in geometry.halfSide)
-        shape: Any = Box(size=(x, y, z))
-    elif isinstance(geometry, coal.Cylinder):
-        shape = Cylinder(radius=_up(geometry.radius), length=_up(2.0 * geometry.halfLength))
-    else:
-        return {"shape": Hull(geometry=piece.name)}
-    angles, origin = pin.rpy.matrixToRpy(piece.placement.rotation), piece.placement.translation
-    position, rpy = (np.round(numbers, 2 * _DIGITS) + 0.0 for numbers in (origin, angles))  # no -0.0
-    return {"shape": shape, "position": tuple(position.tolist()), "rpy": tuple(rpy.tolist())}
 
 
 def _up(size: float) -> float:

@@ -111,6 +111,7 @@ def summary(description: Description) -> Iterator[tuple[str, str]]:
     if inside > 0.0:
         over = f", {volume / inside:.2f} times the {1e3 * inside:.2f} l of the geometry (hulls: {hulls / inside:.2f})"
     yield "bodies", f"{len(description.config.bodies)}, {1e3 * volume:.2f} l{over}"
+    yield "protrusion", _protrusions(description)
     srdf_of_file = "no SRDF came with it" if description.honoured is None else f"in {description.honoured.name}"
     yield (
         "pairs",
@@ -123,6 +124,17 @@ def summary(description: Description) -> Iterator[tuple[str, str]]:
     if home.nearest is not None:
         clear = f"least distance {1000 * home.clearance:.1f} mm ({' - '.join(home.nearest)})"
     yield "home", "; ".join([clear, *(f"{frame}: {limb}" for frame, limb in home.conditioning.items())])
+
+
+def _protrusions(description: Description) -> str:
+    """Say how far the bodies of each link stand out of its geometry, by the bound that they have."""
+    links, parts = description.links, list[str]()
+    for bound in sorted({made.bound for made in links.values()}, reverse=True):
+        those = {link: made for link, made in links.items() if made.bound == bound}
+        figures = ", ".join(f"{link} {1e3 * made.protrusion:.1f}" for link, made in those.items())
+        spacing = max(made.spacing for made in those.values())
+        parts.append(f"of {1e3 * bound:g} mm (samples up to {1e3 * spacing:.1f} mm apart): {figures}")
+    return "; ".join(parts) or "no body"
 
 
 def note_lines(notes: Sequence[Note]) -> list[str]:

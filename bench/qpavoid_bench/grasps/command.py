@@ -6,15 +6,17 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 
 from qpavoid.errors import ConfigError
 from qpavoid_bench.grasps.clearance import REQUIRED, Clearance, measure
+from qpavoid_bench.grasps.plans import Plan, plan
 from qpavoid_bench.grasps.problems import FOLDER, Problem, load_problems
-from qpavoid_bench.tables import RESULTS, describe_machine, table, write
+from qpavoid_bench.tables import RESULTS, describe_machine, number, table, write
 
-Measured = tuple[Problem, Clearance, Clearance]
-"""A problem, with the clearance of its start and of its goal."""
+Measured = tuple[Problem, Clearance, Clearance, Plan]
+"""A problem, with the clearance of its start and of its goal, and a plan from one to the other."""
 
 
 def grasps(
@@ -28,7 +30,10 @@ def grasps(
     robots = dict(text.partition("=")[::2] for text in robot or ())
     if not all(robots.values()):
         raise ConfigError("--robot: expected NAME=ROBOT, as in panda=my/robot.yaml")
-    measured = [(problem, *measure(problem)) for problem in load_problems(data, robots)]
+    problems = load_problems(data, robots)
+    for problem in problems[:1]:
+        plan(problem)  # compiles the planner
+    measured = [(problem, *measure(problem), plan(problem)) for problem in problems]
     print(write(out, "grasps", _sections(measured)))
 
 
@@ -50,13 +55,41 @@ def _sections(measured: Sequence[Measured]) -> Iterator[str]:
     families = dict.fromkeys(problem.family for problem, *_ in measured)
     rows = [_row(family, [entry for entry in measured if entry[0].family == family]) for family in families]
     yield table(head, [*rows, _row("all", measured)])
-    if tight := [f"{problem.name} ({_nearest(goal)})" for problem, _, goal in measured if not goal.is_clear]:
+    if tight := [f"{problem.name} ({_nearest(goal)})" for problem, _, goal, _ in measured if not goal.is_clear]:
         yield f"Goals that are not clear: {', '.join(tight)}."
+    yield "## Paths"
+    yield (
+        f"`plan_to` from the start to the goal configuration, {1e3 * REQUIRED:g} mm from everything. Times are of the "
+        "processor, on one thread, for the plan alone; `of clear`: of the problems with a clear start and goal."
+    )
+    head = ["family", "problems", "paths", "of clear", "p50 [ms]", "p90 [ms]", "max [ms]", "more than required [mm]"]
+    paths = [_paths(family, [entry for entry in measured if entry[0].family == family]) for family in families]
+    yield table(head, [*paths, _paths("all", measured)])
+    without = [
+        f"{problem.name} ({path.reason})"
+        for problem, start, goal, path in measured
+        if start.is_clear and goal.is_clear and not path.is_complete
+    ]
+    if without:
+        yield f"Without a path, though start and goal are clear: {', '.join(without)}."
+
+
+def _paths(name: str, measured: Sequence[Measured]) -> list[object]:
+    plans = [path for *_, path in measured]
+    clear = [path for _, start, goal, path in measured if start.is_clear and goal.is_clear]
+    times = 1e3 * np.array([path.time for path in clear] or [np.nan])
+    clearances = [1e3 * path.clearance for path in plans if path.is_complete]
+    return [
+        name, len(measured), sum(path.is_complete for path in plans),
+        f"{sum(path.is_complete for path in clear)}/{len(clear)}",
+        *(number(float(np.quantile(times, fraction))) for fraction in (0.5, 0.9, 1.0)),
+        number(float(np.median(clearances)) if clearances else np.nan),
+    ]  # fmt: skip
 
 
 def _row(name: str, measured: Sequence[Measured]) -> list[object]:
     cells: list[object] = [name, len(measured)]
-    for clearances in ([start for _, start, _ in measured], [goal for *_, goal in measured]):
+    for clearances in ([start for _, start, *_ in measured], [goal for _, _, goal, _ in measured]):
         nearest = min(clearances, key=lambda clearance: (clearance.is_clear, clearance.distance))
         cells += [sum(clearance.is_clear for clearance in clearances), f"{1e3 * nearest.distance:.1f}"]
     return [*cells, " - ".join(nearest.pair)]

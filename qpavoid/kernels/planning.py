@@ -1,0 +1,294 @@
+"""Clearance of configurations, and of straight motions between them: what a planner asks thousands of times.
+
+A motion is *clear* if no pair of bodies comes nearer than the distance that it needs. That is certain, not sampled: no
+distance changes faster along a motion than the travel of the two bodies' fastest points, which lever arms bound. A
+sample whose distances exceed what is needed covers a stretch of the motion on both sides of it. Each next sample is in
+the middle of a stretch that is not covered yet (conservative advancement, in both directions), and looks at a pair only
+where its bounding sphere, then its box, might come so near that the whole stretch is not covered.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from qpavoid.kernels.distances import TO_HALF_SPACE, pair_distance
+from qpavoid.kernels.kinematics import update_kinematics
+from qpavoid.kernels.near_pairs import place_bodies, place_body
+from qpavoid.kernels.packing import compiled, inlined
+from qpavoid.kernels.pose_fit import extrapolate
+from qpavoid.problem import Array, IntArray
+
+FINE = 5e-4
+"""Distance beyond what it needs that each pair has at every sample [m]: bounds the number of samples near contact."""
+_STACK = 64
+"""Stretches of a motion that wait to be covered: each is less than half as long as the one before it, so that a few
+would do."""
+
+
+class PlanningArrays(NamedTuple):
+    """Memory of a plan: n coordinates, k pairs that count, among g bodies, b of which joints move or may come to.
+
+    A coordinate is an angle or a length of one joint. A pair of a body and a point cloud is one here.
+    """
+
+    kinematics: Any
+    """Packed `KinematicsArrays` of these coordinates, without Jacobian and frames."""
+    frames: Any
+    """The same with the Jacobian and the f frames of the targets."""
+    distances: Any
+    """Packed `DistanceArrays`."""
+    joint_poses: Array
+    """(J, 12) what both kinematics write."""
+    lower: Array
+    """(n,) lower ends of the ranges that are planned in [rad or m]."""
+    upper: Array
+    """(n,) upper ends."""
+    speed: Array
+    """(n,) speed at which a coordinate moves at most [rad/s or m/s]."""
+    travel: Array
+    """(n,) the largest lever arm of each coordinate [m/rad or 1]: weights of the metric of the trees."""
+    longest: float
+    """Length of an edge of the trees at most, by that metric [m]."""
+    radius: Array
+    """(g,) radius of each body's bounding sphere [m]."""
+    boxes: Array
+    """(g, 6) box around each body in its frame: centre and half sizes [m]."""
+    pairs: IntArray
+    """(k,) number of each pair; of a body and a cloud, that of the body and its first proxy sphere."""
+    first: IntArray
+    """(k,) number of its first body."""
+    second: IntArray
+    """(k,) number of its second body."""
+    radii: Array
+    """(k,) sum of the radii of their bounding spheres [m]; infinite of half-spaces and clouds."""
+    cloud: IntArray
+    """(k,) number of the pair's cloud, -1 of other pairs."""
+    row: IntArray
+    """(k,) row of `lever`."""
+    lever: Array
+    """(r, n) bound on the change of a distance per unit of each coordinate [m/rad or 1]."""
+    obstacle: IntArray
+    """(k,) number of the obstacle in the pair, that is not attached; -1 for none."""
+    point_speed: Array
+    """(o + 1,) largest speed of any point of each obstacle [m/s]; 0 in the last row."""
+    moving: IntArray
+    """Numbers of the obstacles with a twist."""
+    states: Array
+    """(o, 18) states of the obstacles at the time 0 of the plan."""
+    voxels: Array
+    """(v, 3) centres of the voxels of all clouds in the world [m]."""
+    blocks: Array
+    """(w, 4) spheres around the centres of blocks of them: centre and radius [m]."""
+    block_start: IntArray
+    """(w + 1,) first voxel of each block, those of a cloud one after the other."""
+    cloud_start: IntArray
+    """(clouds + 1,) first block of each cloud."""
+    columns: IntArray
+    """(e,) coordinate that moves each column of the Jacobian."""
+    frame_support: Array
+    """(f + 1, e) 1 for the columns that move each frame; of the last row, the world, all 0."""
+    simplex: Array
+    """(4, 10) scratch of `kernels.gjk`."""
+    between: Array
+    """(12,) scratch of the same."""
+    result: Array
+    """(10,) distance, normal and witness points of the pair that was computed last."""
+    state: Array
+    """(18,) scratch: an obstacle at some time."""
+    row_rates: Array
+    """(r,) scratch: bound on the change of distances along the motion that is checked, by rows of `lever` [m]."""
+    rates: Array
+    """(k,) scratch: the same of each pair, with the motion of its obstacle [m]."""
+    stretches: Array
+    """(_STACK, 2) scratch: stretches of a motion that are not covered yet."""
+    q: Array
+    """(n,) scratch: a sample of the motion."""
+    checks: IntArray
+    """(1,) configurations that were checked, counted."""
+
+
+@compiled
+def place(x: Any, q: Array, t: float) -> None:
+    """Write the poses of all bodies at coordinates q (n,), and of moving obstacles at t [s]."""
+    d = x.distances
+    update_kinematics(x.kinematics, q)
+    place_bodies(d, x.joint_poses)
+    joints, poses, local, centers = d.joints, d.poses, d.local, d.centers
+    for i in range(len(joints)):
+        if joints[i] >= 0:
+            for r in range(3):
+                rotated = poses[i, r] * local[i, 0] + poses[i, 3 + r] * local[i, 1] + poses[i, 6 + r] * local[i, 2]
+                centers[i, r] = rotated + poses[i, 9 + r]
+    for o in x.moving:
+        for c in range(18):
+            x.state[c] = x.states[o, c]
+        extrapolate(x.state, t)
+        for g in range(d.first[o], d.first[o + 1]):
+            place_body(d, g, x.state)
+
+
+@compiled
+def distance_below(x: Any, k: int, limit: float) -> float:
+    """Compute the distance of pair k if it is below a limit; otherwise, return the limit [m].
+
+    -∞ where the cores of the bodies meet, which are the bodies themselves without the radius of spheres and capsules.
+    """
+    d, pair, i, j = x.distances, x.pairs[k], x.first[k], x.second[k]
+    if x.cloud[k] < 0:
+        return _bodies_below(x, d, pair, i, j, limit)
+    best, size, centers, blocks, voxels = limit, d.shapes.core[j, 0], d.centers, x.blocks, x.voxels
+    for block in range(x.cloud_start[x.cloud[k]], x.cloud_start[x.cloud[k] + 1]):
+        span = best + x.radius[i] + size + blocks[block, 3]
+        if span <= 0.0 or _square(centers, i, blocks, block) >= span * span:
+            continue
+        for voxel in range(x.block_start[block], x.block_start[block + 1]):
+            span = best + x.radius[i] + size
+            if span > 0.0 and _square(centers, i, voxels, voxel) < span * span:
+                for r in range(3):
+                    d.poses[j, 9 + r] = voxels[voxel, r]
+                    centers[j, r] = voxels[voxel, r]
+                best = _bodies_below(x, d, pair, i, j, best)
+    return best
+
+
+@compiled
+def _bodies_below(x: Any, d: Any, pair: int, i: int, j: int, limit: float) -> float:
+    """Compute the distance of bodies i and j if it is below a limit; see `distance_below`."""
+    if d.method[pair] != TO_HALF_SPACE:
+        centers, poses, boxes = d.centers, d.poses, x.boxes
+        span = limit + x.radius[i]
+        if span <= 0.0 or _square_to_box(centers, i, poses, boxes, j) >= span * span:
+            return limit
+        span = limit + x.radius[j]
+        if span <= 0.0 or _square_to_box(centers, j, poses, boxes, i) >= span * span:
+            return limit
+    is_separate = pair_distance(
+        d.shapes, d.poses, i, j, d.method[pair], d.guesses[pair], x.simplex, x.between, x.result
+    )
+    return min(x.result[0], limit) if is_separate else -np.inf
+
+
+@inlined
+def _square(a: Array, i: int, b: Array, j: int) -> float:
+    """Compute the squared distance of the points in row i of a and row j of b, their first three entries [m²]."""
+    dx, dy, dz = a[i, 0] - b[j, 0], a[i, 1] - b[j, 1], a[i, 2] - b[j, 2]
+    return dx * dx + dy * dy + dz * dz
+
+
+@inlined
+def _square_to_box(centers: Array, i: int, poses: Array, boxes: Array, j: int) -> float:
+    """Compute the squared distance of the centre of body i's sphere from the box of body j [m²]."""
+    dx, dy, dz = centers[i, 0] - poses[j, 9], centers[i, 1] - poses[j, 10], centers[i, 2] - poses[j, 11]
+    square = 0.0
+    for r in range(3):
+        along = poses[j, 3 * r] * dx + poses[j, 3 * r + 1] * dy + poses[j, 3 * r + 2] * dz - boxes[j, r]
+        outside = max(abs(along) - boxes[j, 3 + r], 0.0)
+        square += outside * outside
+    return square
+
+
+@compiled
+def pair_clearances(x: Any, q: Array, t: float, limit: float, out: Array) -> None:
+    """Write the distances (k,) of all pairs at coordinates q (n,) and time t [s], at most `limit` [m]."""
+    place(x, q, t)
+    for k in range(len(out)):
+        out[k] = distance_below(x, k, limit)
+
+
+@compiled
+def is_clear(x: Any, q: Array, t: float, need: Array) -> bool:
+    """Return True if every pair has the distance that a sample needs: need (k,) and `FINE` more."""
+    return _covered(x, q, t, need, 0.0) >= 0.0
+
+
+@compiled
+def _covered(x: Any, q: Array, t: float, need: Array, most: float) -> float:
+    """Return the fraction of the motion, at most `most`, that a sample covers on each side; -1 where it is not clear.
+
+    Args:
+        x: reads the rates of the motion.
+        q: sample (n,).
+        t: its time [s].
+        need: distance that each pair needs (k,) [m].
+        most: fraction of the motion.
+    """
+    place(x, q, t)
+    x.checks[0] += 1
+    centers, first, second, radii, rates = x.distances.centers, x.first, x.second, x.radii, x.rates
+    for k in range(len(need)):
+        limit = need[k] + max(rates[k] * most, FINE)
+        span = limit + radii[k]
+        if span > 0.0 and _square(centers, first[k], centers, second[k]) < span * span:
+            distance = distance_below(x, k, limit)
+            if distance < limit:
+                if distance < need[k] + FINE:
+                    return -1.0
+                most = min(most, (distance - need[k]) / rates[k])
+    return most
+
+
+@compiled
+def is_clear_between(x: Any, a: Array, ta: float, b: Array, tb: float, need: Array) -> bool:
+    """Return True if the straight motion from a to b (n,), from time ta to tb [s], is clear all along.
+
+    Conservative: a motion on which some pair has less than `FINE` beyond what it needs (k,) may count as not clear.
+    """
+    n, stretches, q = len(a), x.stretches, x.q
+    _write_rates(x, a, b, abs(tb - ta))
+    end = _covered(x, b, tb, need, 1.0)
+    if end < 0.0:
+        return False
+    count = 1
+    stretches[0, 0], stretches[0, 1] = 0.0, 1.0 - end
+    while count > 0:
+        count -= 1
+        low, high = stretches[count, 0], stretches[count, 1]
+        if high <= low:
+            continue
+        s = 0.5 * (low + high)
+        for i in range(n):
+            q[i] = a[i] + s * (b[i] - a[i])
+        covered = _covered(x, q, ta + s * (tb - ta), need, s - low)
+        if covered < 0.0 or count + 2 > _STACK:
+            return False
+        if covered < s - low:
+            stretches[count, 0], stretches[count, 1] = low, s - covered
+            stretches[count + 1, 0], stretches[count + 1, 1] = s + covered, high
+            count += 2
+    return True
+
+
+@compiled
+def _write_rates(x: Any, a: Array, b: Array, duration: float) -> None:
+    """Write the rates of the straight motion from a to b (n,) in some time [s]."""
+    lever, row_rates, rates, row, obstacle, speed = x.lever, x.row_rates, x.rates, x.row, x.obstacle, x.point_speed
+    for r in range(len(lever)):
+        rate = 0.0
+        for i in range(len(a)):
+            rate += lever[r, i] * abs(b[i] - a[i])
+        row_rates[r] = rate
+    for k in range(len(rates)):
+        rates[k] = row_rates[row[k]] + duration * speed[obstacle[k]]
+
+
+def scratch(n: int, rows: int, pairs: int) -> dict[str, Any]:
+    """Return the memory of `PlanningArrays` that nothing is read from before it is written.
+
+    Args:
+        n: number of coordinates.
+        rows: number of rows of `lever`.
+        pairs: number of pairs that count.
+    """
+    return {
+        "simplex": np.empty((4, 10)),
+        "between": np.empty(12),
+        "result": np.empty(10),
+        "state": np.empty(18),
+        "row_rates": np.zeros(rows),
+        "rates": np.zeros(pairs),
+        "stretches": np.empty((_STACK, 2)),
+        "q": np.empty(n),
+        "checks": np.zeros(1, dtype=np.intp),
+    }
