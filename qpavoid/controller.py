@@ -119,7 +119,7 @@ class Controller(SceneChanges, SplitStep):
         )
         self._builder = ProblemBuilder(settings, self.tasks, contacts)
         self._arbiter = Arbiter(settings, law, self._builder.rows, self._builder.tracker)
-        self._builder.rows.look_ahead(law.bounded and self.avoidance.look_ahead)
+        self._builder.rows.adapt(law, self.avoidance.look_ahead)
         self._planning: Replanning | None = None
         with settings.budget.suspended():  # loading kernels takes as long as it takes
             self._warm_up()
@@ -142,7 +142,7 @@ class Controller(SceneChanges, SplitStep):
     def solver(self, law: Solver) -> None:
         check_solver(law, self.has_contacts)
         self._arbiter.solver = law
-        self._builder.rows.look_ahead(law.bounded and self.avoidance.look_ahead)
+        self._builder.rows.adapt(law, self.avoidance.look_ahead)
         if self._planning is not None:
             self._planning.change_law(law)
 
@@ -249,11 +249,11 @@ class Controller(SceneChanges, SplitStep):
         """Like `step`, with everything that led to the velocity."""
         begin = perf_counter()
         rows, step = self._builder.rows, self._builder.build(self._builder.read(q, t, targets, obstacles, v))
-        state = State(step.q.copy(), rows.previous.v.copy(), step.t)
+        state, problem = State(step.q.copy(), rows.previous.v.copy(), step.t), rows.problem()
         solution = self._decide(step, begin)
         return Tick(
-            state, tuple(step.targets), rows.task_errors.copy(), copied(rows.kinematics), copied(step.proximity),
-            copied(step.problem), solution, self._builder.obstacle_poses(step.q),
+            state, tuple(step.targets), rows.task_errors.copy(), copied(rows.kinematics), copied(rows.proximity()),
+            copied(problem), solution, self._builder.obstacle_poses(step.q),
             self.dt * self._arbiter.backup_velocities,
         )  # fmt: skip
 
@@ -295,11 +295,11 @@ class Controller(SceneChanges, SplitStep):
             if planning is not None:
                 planning.reset()
         if step.faults:
-            solution = arbiter.stop(step.problem, step.faults)
+            solution = arbiter.stop(step.faults)
         elif planning is not None:
             solution = planning.decide(step)
         else:
-            solution = arbiter.decide(step.q, step.t, step.problem, step.proximity, from_tasks)
+            solution = arbiter.decide(step.q, step.t, step.is_settled, from_tasks)
         builder.remember(solution.v)
         assumptions = step.assumptions
         if self._no_backup and len(builder.tracker.moving):

@@ -253,9 +253,9 @@ class Solution(NamedTuple):
     plan: str = ""
     """Plan that is followed in place of the tasks alone, and why, in a sentence; empty without one."""
     build_time: float = 0.0
-    """Time to read the state and set up the problem [s]."""
+    """Time to read the state and set up the problem [s]; of `qp` with the QP, where both are one compiled call."""
     solve_time: float = 0.0
-    """Time to solve it, look-ahead included [s]."""
+    """Time to solve it, look-ahead included, as far as it was not done yet [s]."""
 
     @property
     def severity(self) -> Severity | None:
@@ -272,9 +272,17 @@ class Solution(NamedTuple):
         status = self.status if self.status is Status.STOPPED else Status.RELAXED
         return self._replace(status=status, reasons=(*self.reasons, *reasons))
 
+    @classmethod
+    def solved(cls, v: Array) -> Solution:
+        """Return `Solution(v)`, in half of the time."""
+        return tuple.__new__(cls, (v, *_DEFAULTS))
+
     def with_times(self, build_time: float, solve_time: float) -> Solution:
         """Return the solution with its times [s]; see the fields."""
-        return Solution(*self[:-2], build_time, solve_time)  # a third of the time of `_replace`
+        return tuple.__new__(Solution, (*self[:-2], build_time, solve_time))  # a fifth of the time of `_replace`
+
+
+_DEFAULTS = Solution(np.zeros(0))[1:]
 
 
 def as_numbers(name: str, value: Any) -> Array:

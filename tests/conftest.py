@@ -137,14 +137,15 @@ class Bench:
         """Obstacles at other samples, by number; all others where they are at time 0."""
         place(self.query, self.scene, samples)
 
-    def compute(self, q, targets=None, reach=np.inf):
-        """Proximity and problem at q, as they are until the next call."""
+    def compute(self, q, targets=None, reach=np.inf, v_desired=None):
+        """Proximity and problem at q, of the tasks or of a velocity, as they are until the next call."""
         self.assembler.influence_distance = float(reach)
         self.query.set_influence_distance(float(reach))
         targets = targets or [task.motion.sample(0.0) for part in in_order(self.tasks) for task in part]
         for row, target in zip(self.assembler.targets, targets, strict=False):
             row[:] = target.row
-        return self.assembler.compute(np.asarray(q), targets)
+        self.assembler.compute(np.asarray(q), targets, v_desired)
+        return self.assembler.proximity(), self.assembler.problem()
 
     def rows(self, q, targets=None):
         """A and b of the tasks at q, copied."""

@@ -116,14 +116,14 @@ def test_distance_query_agrees_with_coal(panda):
     query, kinematics, deep = DistanceQuery(scene), ForwardKinematics(model), 0
     closed = query.table.method == CLOSED_FORM
     assert 0 < closed.sum() < len(scene.pairs) and not (query.table.method == BY_COAL).any()
-    alone, geometry_data = scene.geometry, scene.geometry.createData()
+    alone, geometry_data, data = scene.geometry, scene.geometry.createData(), model.createData()
     for request in geometry_data.distanceRequests:
         request.gjk_tolerance = 1e-10
     for _ in range(40):
         q = random_q(panda, rng, spread=1.5)
         kinematics.compute(q)
         query.compute(kinematics.joint_poses, 0.2)
-        pin.updateGeometryPlacements(model, kinematics.data, alone, geometry_data)
+        pin.updateGeometryPlacements(model, data, alone, geometry_data, q)
         pin.computeDistances(alone, geometry_data)
         exact = np.array([result.min_distance for result in geometry_data.distanceResults])
         np.testing.assert_allclose(query.arrays.results[query.pairs, 0], exact[query.pairs], rtol=0, atol=1e-7)

@@ -109,7 +109,7 @@ def test_cache_compiles_anew_where_a_callee_in_another_file_changed(site, used):
 
 def test_cache_is_complete_once_a_controller_is_built():
     """All that its construction compiles is on disk, in the user's cache or where NUMBA_CACHE_DIR says."""
-    assert (FOLDER / "complete").exists() and any(FOLDER.glob("step.assemble-*.code"))
+    assert (FOLDER / "complete").exists() and any(FOLDER.glob("step.control_step-*.code"))
 
 
 def test_cache_that_is_unwritable_is_named_and_optional(site, tmp_path):

@@ -152,7 +152,7 @@ def test_distance_rows_include_a_nan_distance(panda):
     pairs = np.arange(4)
     assert run("distance_rows", x, pairs, 0.5, True) == 3
     assert x.near_pairs[:3].tolist() == [1, 2, 3]
-    k, worst, clear, *_ = run("assemble", x, step.q, pairs, 0.5, True)
+    k, worst, clear, *_ = run("assemble", x, step.q, pairs, 0.5, True, True)
     assert np.isnan(x.rhs[:k]).tolist() == [False, True, False] and np.isnan(worst) and not clear
 
 
@@ -330,7 +330,7 @@ def test_leaves_position_limits_by_hand():
 
 
 @pytest.mark.parametrize("accelerations", [True, False])
-def test_is_tracking_clear_by_the_clearance_bound_until_its_stop(paper, accelerations):
+def test_is_clear_by_the_clearance_bound_until_its_stop(paper, accelerations):
     clear = 0
     for seed in range(40):
         step = Step(paper, seed)
@@ -338,12 +338,12 @@ def test_is_tracking_clear_by_the_clearance_bound_until_its_stop(paper, accelera
             step.x = step.x._replace(v_step=np.full(14, np.inf), acceleration_limited=False)
         x = step.x
         step.rows()
-        x.v_tracking[:] = 10.0 ** (1 - seed % 4) * step.rng.normal(size=14)
+        v = 10.0 ** (1 - seed % 4) * step.rng.normal(size=14)
         x.d[:] = step.rng.uniform(0.1, 0.5, len(x.d))
-        horizon = x.dt * (1.0 + 0.5 * np.max(np.abs(x.v_tracking) / x.v_step))
-        expected = run("clearance_lower_bound", x, x.v_tracking, 30, 0.5, horizon) > -kernels.TOLERANCE
-        expected &= not (accelerations and run("leaves_position_limits", x, step.q, x.v_tracking, horizon))
-        assert run("is_tracking_clear", x, step.q, 30, 0.5) == expected
+        horizon = x.dt * (1.0 + 0.5 * np.max(np.abs(v) / x.v_step))
+        expected = run("clearance_lower_bound", x, v, 30, 0.5, horizon) > -kernels.TOLERANCE
+        expected &= not (accelerations and run("leaves_position_limits", x, step.q, v, horizon))
+        assert run("is_clear", x, step.q, v, 30, 0.5) == expected
         clear += expected
     assert 0 < clear < 40
 

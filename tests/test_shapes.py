@@ -24,7 +24,6 @@ from qpavoid import (
 )
 from qpavoid.config import Cone, Ellipsoid, HalfSpace, Mesh
 from qpavoid.geometry.meshes import MeshWarning
-from qpavoid.model.kinematics import ForwardKinematics
 from qpavoid.run.simulate import simulate
 
 CONE = Cone(radius=0.09, length=0.25)
@@ -129,12 +128,11 @@ def test_rows_by_finite_differences(panda, shape, tolerance):
 def test_half_spaces_are_near_wherever_they_are(panda):
     rng = np.random.default_rng(8)
     scene = build_scene(panda, [obstacle("floor", FLOOR, (0, 0, -0.1)), obstacle("ball", SPHERE, (0.6, 0, 0.3))])
-    bench, kinematics, placed = Bench(scene), ForwardKinematics(panda.model), scene.geometry.createData()
+    bench, data, placed = Bench(scene), panda.model.createData(), scene.geometry.createData()
     for reach in (0.1, 0.5, np.inf):
         for _ in range(5):
             q = random_q(panda, rng)
-            kinematics.compute(q)
-            pin.updateGeometryPlacements(panda.model, kinematics.data, scene.geometry, placed)
+            pin.updateGeometryPlacements(panda.model, data, scene.geometry, placed, q)
             pin.computeDistances(scene.geometry, placed)
             expected = np.array([result.min_distance for result in placed.distanceResults])
             found = look(scene, q, reach=reach, bench=bench)

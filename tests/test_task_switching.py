@@ -196,7 +196,7 @@ def test_task_switching_rows_follow_the_tracked_velocity(panda, change):
     if change == "eased":
         changed = bench.assembler.within_jerks(problem)
     elif change == "followed":
-        changed = bench.assembler.follow(0.1 * rng.normal(size=7), problem)
+        _, changed = bench.compute(robot.home, targets, reach=0.3, v_desired=0.1 * rng.normal(size=7))
     else:
         changed = bench.assembler.prioritised(problem)
         np.testing.assert_array_equal(changed.v_tracking, changed.cascade[-1])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -16,24 +16,19 @@ from qpavoid.reason import Reason
 
 Obstacles = Mapping[str, Any] | Mapping[tuple[str, ...], Array] | Array | None
 """What a step is given of obstacles, see `Controller.step`."""
-
-
-class Arguments(NamedTuple):
-    """Arguments of a step, checked; nothing has been changed by them yet."""
-
-    times: Times
-    q: Array | None
-    """(nq,); None where it cannot be true."""
-    v: Array | None
-    """(nv,) as measured; None where it is not given, or cannot be true."""
-    v_desired: Array | None
-    """(nv,) velocity to follow in place of the tasks; zero where it cannot be true."""
-    targets: Sequence[Any]
-    """Of all tasks."""
-    update: StepUpdate | None
-    faults: tuple[Reason, ...]
-    """Why the robot has to stop."""
-    notes: tuple[Reason, ...]
+Arguments = tuple[
+    Times,
+    Array | None,
+    Array | None,
+    Array | None,
+    Sequence[Any],
+    StepUpdate | None,
+    tuple[Reason, ...],
+    tuple[Reason, ...],
+]
+"""Arguments of a step, checked; nothing has been changed by them yet: times; q (nq,), None where it cannot be true; v
+(nv,) as measured, None where it is not given, or cannot be true; velocity (nv,) to follow in place of the tasks, zero
+where it cannot be true; targets of all tasks; update of obstacles; why the robot has to stop; notes."""
 
 
 class ArgumentReader:
@@ -69,13 +64,4 @@ class ArgumentReader:
             v_desired, faults = np.zeros(self._v_shape), faults + wrong
         samples, missing, normalised = self._targets.read(times.t, targets)
         update = self._obstacles.read(times.t, obstacles, times.shift)
-        return Arguments(
-            times,
-            q,
-            v,
-            v_desired,
-            samples,
-            update,
-            faults + missing,
-            times.notes + notes + normalised,
-        )
+        return times, q, v, v_desired, samples, update, faults + missing, times.notes + notes + normalised

@@ -16,10 +16,12 @@ from qpavoid.control.row_layout import lay_out
 from qpavoid.control.settings import ControlSettings
 from qpavoid.control.tasks import RowTask, in_order
 from qpavoid.control.tasks.layout import TaskRows, dead_beat, task_levels
+from qpavoid.kernels import SETTLED, TO_MEASURE
 from qpavoid.kernels.layout import RowLayout
 from qpavoid.model.kinematics import ForwardKinematics, Kinematics
 from qpavoid.problem import Array, AvoidanceRows, Contacts, IntArray, Problem, Proximity, Tracking
 from qpavoid.solvers.hqp import cascade
+from qpavoid.solvers.solver import Solver
 
 _LACKING = 1e-6
 """Share of a task's velocity up to which it lacks nothing [-]: round-off of the tracking law."""
@@ -30,7 +32,10 @@ class _Form(NamedTuple):
 
     layout: RowLayout
     packed: Any
-    step: Callable[..., tuple[int, int, int, int, float, bool, float, float]]
+    step: Callable[..., int]
+    """Code of `kernels.control_step` for this memory."""
+    views: dict[int, tuple[Proximity, AvoidanceRows]]
+    """What there is of k near pairs, by k."""
 
 
 class RowAssembler:
@@ -58,16 +63,19 @@ class RowAssembler:
         self.query.set_influence_distance(self.influence_distance)
         x = self._layout = lay_out(settings, frames, row_tasks, self._forward, self.query)
         self._hard = (x.hard_lower, x.hard_upper) if limits.relax_acceleration else (x.lower, x.upper)
-        self._packed, self._contacts = kernels.pack(x), contacts
+        self._packed: Any = kernels.pack(x)
+        self._contacts = contacts
         self._scene = scene
-        self._joint_names, self._joint_units = tuple(scene.robot.coordinate_names), tuple(scene.robot.coordinate_units)
+        self.joint_names, self.joint_units = tuple(scene.robot.coordinate_names), tuple(scene.robot.coordinate_units)
+        """Name and unit of each coordinate."""
         self.previous = PreviousVelocity(x, contacts is not None)
         """Velocity at which the robot moves when a step begins."""
         self._stops = JerkStops(x, self._packed) if x.jerk_limited else None
         self.targets = x.targets
         """(f, 18) states that the frame tasks are to reach, see `trajectories`; to be written before `compute`."""
-        self._tracking, self._levels = Tracking(x.A, x.b, x.b_feasible), task_levels(frames, row_tasks)
-        self._views: dict[int, tuple[Proximity, AvoidanceRows]] = {}
+        self._tracking, levels = Tracking(x.A, x.b, x.b_feasible), task_levels(frames, row_tasks)
+        self._following = Tracking(x.identity, x.v_tracking, x.v_tracking)
+        self._levels = levels if len(levels) > 1 else ()
         self._task_rows = TaskRows(row_tasks, x.A, x.b)
         self.task_errors = self._task_rows.errors
         """How far each of the tasks that are not frames was from its target in the last step, in its unit."""
@@ -75,25 +83,35 @@ class RowAssembler:
         """What frames lack to their targets; root of the weight and number of the task of each row: see `RowLayout`."""
         self.frame_count, self.tasks = len(frames), (*frames, *row_tasks)
         """Tasks in the order of `in_order`; the first `frame_count` are frames."""
-        self._eye, self._b_feasible = np.eye(len(x.v_tracking)), np.zeros(len(x.b))
+        self._b_feasible = np.zeros(len(x.b))
         self._is_compiled = self._forward.is_compiled and self.query.is_compiled and not row_tasks and contacts is None
-        self._q = scene.robot.home.copy()
-        self._step = self._compile(self._packed)
-        self._forms = [_Form(x, self._packed, self._step)]
         self._finds_pairs = self._forward.is_compiled and not self.query.has_clouds
-        self._find = kernels.direct(kernels.find_near_pairs, self._packed, self._q)
-        self._assemble(self._q)  # compiled now, not in the first step in which coal has to compute a pair
+        self.q: Array = scene.robot.home.copy()
+        """Configuration (nq,) of the last step."""
+        self.v = x.v
+        """Velocity (nv,) that may be commanded, where `compute` says so; the next step overwrites it."""
+        self._follows_tasks = True
+        self._contact_rows: Contacts | None = None
+        self._find = kernels.direct(kernels.find_near_pairs, self._packed, self.q)
+        self._forms = [self._make_form(x)]
+        self.use_form(0)
         self.kinematics = Kinematics(x.J_world, x.poses)
         """World Jacobian and poses of the tracked frames in this step."""
 
-    def look_ahead(self, looks_ahead: bool) -> None:
-        """Choose whether kernels look for velocities that lead nowhere near anything, see `RowLayout.looks_ahead`.
+    def adapt(self, law: Solver, looks_ahead: bool) -> None:
+        """Let control steps do as much of a law as compiled code can.
 
-        They do not with contacts or jerk limits, with which v_tracking or the stop are not what kernels take them for.
+        They look ahead neither with contacts nor jerk limits, with which v_tracking or the stop are not what kernels
+        take them for.
+
+        Args:
+            law: that decides in the next steps.
+            looks_ahead: whether a step looks ahead, of a bounded law.
         """
-        looks_ahead = looks_ahead and self._contacts is None and not self._layout.jerk_limited
-        if looks_ahead != self._layout.looks_ahead:
-            self._forms = [self._make_form(form.layout._replace(looks_ahead=looks_ahead)) for form in self._forms]
+        looks_ahead = looks_ahead and law.bounded and self._contacts is None and not self._layout.jerk_limited
+        numbers: dict[str, Any] = {"looks_ahead": looks_ahead, "regularization": law.compiled_regularization}
+        if numbers != {name: getattr(self._layout, name) for name in numbers}:
+            self._forms = [self._make_form(form.layout._replace(**numbers)) for form in self._forms]
             self.use_form(0)
 
     def add_dampers(self, row_gain: float, margin: float, gain: float = 0.0) -> int:
@@ -116,75 +134,107 @@ class RowAssembler:
 
     def use_form(self, number: int) -> None:
         """Choose the form of the rows of the next steps; 0 is that of the settings."""
-        self._layout, self._packed, self._step = self._forms[number]
+        self._layout, self._packed, self._step, self._views = self._forms[number]
 
     def _make_form(self, layout: RowLayout) -> _Form:
-        """Pack a layout, for which kernels are compiled already."""
+        """Pack a layout."""
         packed = kernels.pack(layout)
-        return _Form(layout, packed, self._compile(packed))
+        arguments = packed, self.q, self.influence_distance, False, True, False
+        return _Form(layout, packed, kernels.direct(kernels.control_step, *arguments), {})
 
-    def _compile(self, packed: Any) -> Callable[..., tuple[int, int, int, int, float, bool, float, float]]:
-        """Return the code of `kernels.control_step` for this memory."""
-        arguments = packed, self._q, self.influence_distance, False
-        return kernels.direct(kernels.control_step, *arguments) if self._is_compiled else kernels.control_step
-
-    def compute(self, q: Array, targets: Sequence[Any]) -> tuple[Proximity, Problem]:
+    def compute(self, q: Array, targets: Sequence[Any], v_desired: Array | None = None) -> bool:
         """Compute distances, rows and bounds at a configuration, with the obstacles as placed.
 
         Args:
             q: configuration (nq,).
             targets: what each task should reach now, in the order of `in_order`.
+            v_desired: velocity (nv,) to follow in place of the tasks.
+
+        Returns:
+            Whether `v` is what the law and the stop look-ahead lead to; else they have to see `problem`.
         """
-        x, query, contacts = self._layout, self.query, None
-        if self._is_compiled:  # one call in place of two: a microsecond less
-            self._q[:] = q  # the code takes q as it is: in one piece, and writeable
-            near, rows, meeting, k, violation, clear, margin, bent = self._step(
-                self._packed, self._q, self.influence_distance, query.is_moving
-            )
-            query.finish(near, rows, meeting)
-            if meeting:
-                k, violation, clear, margin, bent = self._assemble(q)
+        x, from_tasks, self._follows_tasks = self._layout, v_desired is None, v_desired is None
+        self.q[:] = q  # the code takes q as it is: in one piece, and writeable
+        if v_desired is not None:
+            x.v_tracking[:] = v_desired
+        if self._is_compiled:
+            moving = self.query.is_moving
+            code = self._step(self._packed, self.q, self.influence_distance, moving, from_tasks, False)
+            if code != TO_MEASURE:
+                return code == SETTLED
+            self.query.finish()
+            return self._finish()
+        self._measure()
+        if from_tasks and self.task_errors.size:
+            self._task_rows.write(q, self._forward, targets[len(self.targets) :])
+        if self._contacts is not None:
+            self._contact_rows = resting = self._contacts.update(self._forward)
+            x.v_prev[:] = resting.project(x.v_prev)
+        return self._finish()
+
+    def follow(self, v_desired: Array) -> bool:
+        """Follow a velocity (nv,) in place of the tasks in the last step after all; return what `compute` does."""
+        self._follows_tasks, self._layout.v_tracking[:] = False, v_desired
+        return self._finish()
+
+    def _finish(self) -> bool:
+        """Compute a step whose kinematics and distances are up to date."""
+        arguments = self.query.is_moving, self._follows_tasks, True
+        code = self._step(self._packed, self.q, self.influence_distance, *arguments)
+        if self._contact_rows is not None:
+            self._hold(self._contact_rows)
+        return code == SETTLED
+
+    def _measure(self) -> None:
+        """Compute kinematics and distances."""
+        if self._finds_pairs:
+            self._find(self._packed, self.q)
+            self.query.finish()
         else:
-            if self._finds_pairs:
-                self._q[:] = q
-                query.finish(*self._find(self._packed, self._q))
-            else:
-                self._forward.compute(q)
-                query.compute(self._forward.joint_poses, self.influence_distance)
-            if self.task_errors.size:
-                self._task_rows.write(q, self._forward, targets[len(self.targets) :])
-            if self._contacts is not None:
-                contacts = self._contacts.update(self._forward)
-                x.v_prev[:] = contacts.project(x.v_prev)
-            k, violation, clear, margin, bent = self._assemble(q)
-        proximity, avoidance = self._views.get(k) or self._view(k)
-        if contacts is not None:
-            bent, violation = self._track_within(contacts, k)
-        if x.task_switching:  # they are compared with eq. 10 at a λ that is the same in every step
-            bent = 0.0
-        return proximity, Problem(
-            self._tracking, avoidance, x.lower, x.upper, *self._hard, x.v_stop, self._scene.pair_names,
-            self._joint_names, self._joint_units, x.v_tracking, violation,
-            contacts, self._levels if len(self._levels) > 1 else (), None, bent, x.jerk_limited, clear, margin,
+            self._forward.compute(self.q)
+            self.query.compute(self._forward.joint_poses, self.influence_distance)
+
+    @property
+    def position_margin(self) -> float:
+        """Distance to the nearest position limit in the last step [rad, m]; negative outside."""
+        return float(self._layout.summary["position_margin"][0])
+
+    def proximity(self) -> Proximity:
+        """Return the distances of the last step."""
+        return self._view()[0]
+
+    def problem(self) -> Problem:
+        """Return the problem of the last step."""
+        x, (_, violation, is_clear, position_margin, bent) = self._layout, self._layout.summary.item()
+        tracking, levels = (self._tracking, self._levels) if self._follows_tasks else (self._following, ())
+        return Problem(
+            tracking, self._view()[1], x.lower, x.upper, *self._hard, x.v_stop, self._scene.pair_names,
+            self.joint_names, self.joint_units, x.v_tracking, violation, self._contact_rows, levels, None, bent,
+            x.jerk_limited, is_clear, position_margin,
         )  # fmt: skip
 
-    def _assemble(self, q: Array) -> tuple[int, float, bool, float, float]:
-        """Write all rows and bounds, with kinematics and distances up to date; see `kernels.assemble`."""
-        summary: tuple[int, float, bool, float, float] = kernels.assemble(
-            self._packed, q, self.query.pairs, self.influence_distance, self.query.is_moving
-        )
-        return summary
+    def _hold(self, contacts: Contacts) -> None:
+        """Let the velocity that is tracked hold the contacts."""
+        x, summary = self._layout, self._layout.summary[0]
+        if self._follows_tasks:
+            summary.bent = self._track_within(contacts)
+        else:
+            x.v_tracking[:] = contacts.project(x.v_tracking)
+        self.previous.tighten_bounds()
+        if x.task_switching:
+            summary.bent = 0.0
+            kernels.row_bounds(self._packed, summary.rows, self.query.is_moving)
+        summary.violation = kernels.tracking_violation(self._packed, summary.rows)
 
-    def _track_within(self, contacts: Contacts, k: int) -> tuple[float, float]:
-        """Let the tracking law hold the contacts; return how far the task rows bend, and its largest violation."""
+    def _track_within(self, contacts: Contacts) -> float:
+        """Let the tracking law hold the contacts; return how far the task rows bend."""
         x, v_particular = self._layout, contacts.v_particular
         missing = x.b - x.A @ v_particular
         A = x.A @ contacts.Z @ contacts.Z.T
         bent = float(kernels.tracking_law(self._packed, A, missing, x.v_tracking, x.b_feasible))
         x.v_tracking[:] += v_particular
         x.b_feasible[:] += x.A @ v_particular
-        self.previous.tighten_bounds()
-        return bent, self._violation(k)
+        return bent
 
     def _velocity(self, A: Array, b: Array) -> Array:
         """Return the velocity (nv,) of the tracking law for rows A (r, nv) and b (r,), zero but for some tasks."""
@@ -201,29 +251,15 @@ class RowAssembler:
         lacking, asked = np.zeros_like(self.frame_errors), self._b_feasible[frames]
         lacking[frames] = self.row_scale[frames] * (asked - x.A[frames] @ v)
         if not np.linalg.norm(lacking) > _LACKING * np.linalg.norm(asked):
-            return np.zeros_like(self._eye)
+            return np.zeros_like(self._layout.identity)
         return -x.dt / float(np.linalg.norm(x.A[rows], 2)) ** 2 * self.curvature(lacking)
-
-    def _violation(self, k: int) -> float:
-        """Return the largest violation by v_tracking, of which task-switching rows are made anew."""
-        if self._layout.task_switching:
-            kernels.row_bounds(self._packed, k, self.query.is_moving)
-        return float(kernels.tracking_violation(self._packed, k))
 
     def curvature(self, w: Array) -> Array:
         """Return Σ w_r ∂²x_r/∂q² (nv, nv) of the rows of all frames; see `kernels.add_curvature`."""
-        G = np.zeros_like(self._eye)
+        G = np.zeros_like(self._layout.identity)
         for part in range(len(w) // 3):
             kernels.add_curvature(self._packed, part, w[3 * part : 3 * part + 3], G)
         return G
-
-    def follow(self, v: Array, problem: Problem) -> Problem:
-        """Return the problem of this step with the velocity v (nv,) to follow in place of the tasks."""
-        x = self._layout
-        x.v_tracking[:] = v if problem.contacts is None else problem.contacts.project(v)
-        violation = self._violation(len(problem.avoidance.d))
-        tracking = Tracking(self._eye, x.v_tracking, x.v_tracking)
-        return problem._replace(tracking=tracking, violation=violation, levels=(), bent=0.0, tracking_is_clear=False)
 
     def within_jerks(self, problem: Problem) -> Problem:
         """Return the problem of this step with a tracking velocity that jerks allow, see `JerkStops.reachable`."""
@@ -296,9 +332,11 @@ class RowAssembler:
         """
         return bool(kernels.leaves_position_limits(self._packed, q, v, horizon))
 
-    def _view(self, k: int) -> tuple[Proximity, AvoidanceRows]:
-        x = self._layout
-        near = x.near_pairs[:k]
-        proximity = Proximity(near, x.closest[:k], x.J[:k], x.feedforward[:k])
-        self._views[k] = proximity, AvoidanceRows(near, x.d[:k], x.J[:k], x.rhs[:k], x.d1, x.d2, x.rhs_contact[:k])
+    def _view(self) -> tuple[Proximity, AvoidanceRows]:
+        """Return what there is of the near pairs of the last step."""
+        x, k = self._layout, int(self._layout.summary["rows"][0])
+        if k not in self._views:
+            near = x.near_pairs[:k]
+            proximity = Proximity(near, x.closest[:k], x.J[:k], x.feedforward[:k])
+            self._views[k] = proximity, AvoidanceRows(near, x.d[:k], x.J[:k], x.rhs[:k], x.d1, x.d2, x.rhs_contact[:k])
         return self._views[k]

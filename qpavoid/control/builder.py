@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from threading import get_ident
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -20,14 +21,15 @@ from qpavoid.control.settings import ControlSettings
 from qpavoid.control.slots import ObstacleSlots
 from qpavoid.control.targets import TargetReader
 from qpavoid.control.tasks import RowTask
-from qpavoid.model.limits import OUTSIDE
+from qpavoid.kernels.bounds import OUTSIDE
 from qpavoid.model.sample import POSE, Sample
-from qpavoid.problem import Array, Problem, Proximity
+from qpavoid.problem import Array
 from qpavoid.reason import Reason
 
 
-class StepProblem(NamedTuple):
-    """Problem of a control step, with what it was made of."""
+@dataclass(slots=True)
+class StepProblem:
+    """What a control step was made of, and how far it came, until the next one; its problem is in `RowAssembler`."""
 
     q: Array
     """(nq,) where the robot is when it follows the command."""
@@ -37,8 +39,8 @@ class StepProblem(NamedTuple):
     """Whether the step begins anew: after a gap, or because the clock was set back."""
     targets: Sequence[Any]
     """Of all tasks."""
-    proximity: Proximity
-    problem: Problem
+    is_settled: bool
+    """Whether the velocity of `RowAssembler.v` may be commanded, see `RowAssembler.compute`."""
     faults: tuple[Reason, ...]
     """Why the robot has to stop."""
     assumptions: tuple[Reason, ...]
@@ -52,9 +54,10 @@ class ProblemBuilder:
         scene, bounds, dt = settings.scene, settings.bounds, settings.dt
         model, names = scene.robot.model, scene.robot.coordinate_units
         self._model, self._bounds, self._dt, self._latency = model, bounds, dt, settings.latency
-        self._q_last, self._q_predicted = scene.robot.home.copy(), scene.robot.home.copy()
         self._under_way = CommandsUnderWay(model.nv, settings.latency, dt)
         self.rows = RowAssembler(settings, tasks, contacts)
+        self._q_last = self.rows.q.copy() if settings.latency else self.rows.q
+        self._step = StepProblem(self.rows.q, 0.0, False, (), False, (), ())
         self.tracker = ObstacleTracker(scene.slots, settings.sensing, dt, settings.latency)
         self.attachments = Attachments(scene, self.rows.query, settings.safety_distance)
         self.slots = ObstacleSlots(scene, self.rows.query, self.tracker, self.attachments)
@@ -63,15 +66,17 @@ class ProblemBuilder:
         self._configurations = Configurations(model, bounds.q_index, bounds.lower, bounds.upper, units)
         self._targets = TargetReader(tasks, self.rows.targets, settings.latency)
         shapes = (model.nq,), (model.nv,)
-        self._reader = ArgumentReader(shapes, self._clock, self._configurations, self._targets, self.tracker)
+        reader = ArgumentReader(shapes, self._clock, self._configurations, self._targets, self.tracker)
+        self._read = reader.read
         self._thread: int | None = None
         self.begun: StepProblem | None = None
         """Step whose command is not known yet."""
 
     def read(self, q: Any, t: Any, targets: Any, obstacles: Any, v: Any, v_desired: Any = None) -> Arguments:
         """Check the arguments of a step, see `Controller.step`: whatever raises does so here, and changes nothing."""
-        self._budget.begin()
-        return self._reader.read(q, t, targets, obstacles, v, v_desired)
+        if self._budget.is_limited:
+            self._budget.begin()
+        return self._read(q, t, targets, obstacles, v, v_desired)
 
     def build(self, arguments: Arguments) -> StepProblem:
         """Take over the arguments of a step, and build its problem.
@@ -92,22 +97,22 @@ class ProblemBuilder:
             self._restart(np.zeros(self._model.nv) if v is None else v)
         elif times.periods > 1:
             self._under_way.add(rows.previous.v, times.periods - 1)
-        q = self._predict(q)
+        if q is None or self._latency:
+            q = self._predict(q)
         self._clock.set(times.t)
         if update is not None:
             observed = self.tracker.advance(update)
             query.place(self.tracker.current)
             faults, assumptions = faults + observed.stop, assumptions + observed.assumptions
-        proximity, problem = rows.compute(q, targets)
+        is_settled = rows.compute(q, targets, v_desired)
         if self.attachments.is_watching:
             self.attachments.update()
-        if v_desired is not None:
-            problem = rows.follow(v_desired, problem)
-        if problem.position_margin < -OUTSIDE:
-            assumptions += self._bounds.outside(q, problem.joint_names, problem.joint_units)
-        t = times.t + self._latency
-        self.begun = StepProblem(q, t, times.resumed, targets, proximity, problem, faults, assumptions)
-        return self.begun
+        if not is_settled and rows.position_margin < -OUTSIDE:
+            assumptions += self._bounds.outside(q, rows.joint_names, rows.joint_units)
+        step = self.begun = self._step
+        step.q, step.t, step.resumed, step.targets = rows.q, times.t + self._latency, times.resumed, targets
+        step.is_settled, step.faults, step.assumptions = is_settled, faults, assumptions
+        return step
 
     def _predict(self, q: Array | None) -> Array:
         """Return where the robot is when it follows this step's command, if it follows those under way until then.
@@ -115,18 +120,20 @@ class ProblemBuilder:
         Args:
             q: as measured (nq,); None where it is unknown: it moved as commanded.
         """
+        model, latency, displacement = self._model, self._latency, self._under_way.displacement
         if q is None:
-            predicted = np.asarray(pin.integrate(self._model, self._q_predicted, self._dt * self.rows.previous.v))
-            q = pin.integrate(self._model, predicted, -self._under_way.displacement) if self._latency else predicted
+            predicted = np.asarray(pin.integrate(model, self.rows.q, self._dt * self.rows.previous.v))
+            q = pin.integrate(model, predicted, -displacement) if latency else predicted
         else:
-            predicted = pin.integrate(self._model, q, self._under_way.displacement) if self._latency else q
-        self._q_last[:], self._q_predicted[:] = q, predicted
+            predicted = pin.integrate(model, q, displacement) if latency else q
+        self._q_last[:] = q
         return predicted
 
     def remember(self, v: Array) -> None:
         """Take v (nv,) as what is commanded from this step to the next one."""
         self.rows.previous.remember(v)
-        self._under_way.add(v)
+        if self._latency:
+            self._under_way.add(v)
         self.begun, self._thread = None, None
 
     def _restart(self, v: Array) -> None:

@@ -9,12 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from qpavoid import config
-from qpavoid.control.tasks.base import frame_jacobian, frame_pose
+from qpavoid.control.tasks.base import frame_pose
 from qpavoid.errors import ConfigError
 from qpavoid.kernels.rotation import rotation_vector
 from qpavoid.model.kinematics import ForwardKinematics
@@ -31,17 +30,17 @@ class ContactRows:
     """The contacts of a robot, and where they rest."""
 
     def __init__(
-        self, settings: Sequence[config.Contact], frame_ids: Sequence[int], model: Any, kinematics: ForwardKinematics
+        self, settings: Sequence[config.Contact], frame_ids: Sequence[int], kinematics: ForwardKinematics
     ) -> None:
         """Let the frames rest where the kinematics have them; see `build_contacts`."""
-        self.frame_ids, self._model = tuple(frame_ids), model
+        self.frame_ids = tuple(frame_ids)
         self._anchors = [tuple(part.copy() for part in frame_pose(kinematics, i)) for i in frame_ids]
         self._gains = np.repeat([contact.gain for contact in settings], 6)
         self._rows = np.repeat([(True, contact.type == "surface") for contact in settings], 3)
 
     def update(self, kinematics: ForwardKinematics) -> Contacts:
         """Their rows at the configuration for which the kinematics are up to date, solved."""
-        J = np.concatenate([frame_jacobian(self._model, kinematics, i) for i in self.frame_ids])
+        J = np.concatenate([kinematics.frame_jacobian(i) for i in self.frame_ids])
         missing = []
         for frame_id, (position, rotation) in zip(self.frame_ids, self._anchors, strict=True):
             x, R = frame_pose(kinematics, frame_id)
@@ -71,7 +70,7 @@ def build_contacts(
     ids = [robot.frame_id(c.frame, f"{source}: contacts.{index}.frame") for index, c in enumerate(configs)]
     kinematics = ForwardKinematics(robot.model, ids)
     kinematics.compute(q0)
-    rows = ContactRows(configs, ids, robot.model, kinematics)
+    rows = ContactRows(configs, ids, kinematics)
     if not rows.update(kinematics).Z.shape[1]:
         raise ConfigError(f"{source}: contacts leave {robot.name} no way to move; leave some out, or make them points")
     return rows

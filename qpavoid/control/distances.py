@@ -1,7 +1,7 @@
 """Closest points of the pairs within the influence distance; without a Python loop.
 
 Bounding spheres tell which pairs can be near at all. Kernels compute convex bodies that are apart, and half-spaces; one
-call of coal does the rest, with all other pairs switched off, and its results are viewed as one array.
+call of coal does the rest, with all other pairs switched off; its poses and results are copied through views.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ class DistanceQuery:
         model, obstacles = scene.robot.model, len(scene.slots)
         pin.updateGeometryPlacements(model, model.createData(), scene.geometry, self._data, pin.neutral(model))
         pin.computeDistances(scene.geometry, self._data)  # so that there is something to compare the view with
-        results, poses = view_results(self._data.distanceResults), view_poses(self._data.oMg, writeable=True)
-        self._has_views = results is not None and poses is not None
+        self._results_of_coal = view_results(self._data.distanceResults)
+        self._poses_of_coal = view_poses(self._data.oMg, writeable=True)
         radii = np.linalg.norm(table.spheres[:, :3], axis=1) + table.spheres[:, 3]
         self.obstacle_radii: Array = np.array(
             [radii[i:j].max(initial=0.0) for i, j in zip(table.first[:-1], table.first[1:], strict=True)]
@@ -80,13 +80,14 @@ class DistanceQuery:
             twists=np.zeros((rows, 6)),
             margin=np.zeros(rows),
             speeds=np.zeros(model.njoints + obstacles),
-            poses=read_poses(self._data.oMg) if poses is None else poses,
+            poses=read_poses(self._data.oMg),
             centers=np.ones((bodies, 5)),
             guesses=np.zeros((pairs, GUESS)),
             near=np.zeros(pairs, dtype=np.intp),
             rows=np.zeros(pairs, dtype=np.intp),
             meeting=np.zeros(pairs, dtype=np.intp),
-            results=read_results(self._data.distanceResults) if results is None else results,
+            counts=np.zeros(3, dtype=np.intp),
+            results=read_results(self._data.distanceResults),
         )
         """Memory of the distances, see `DistanceArrays`; the results are those of `pairs`."""
         self._uncertainty = np.array([obstacle.uncertainty for obstacle in scene.slots])
@@ -97,7 +98,6 @@ class DistanceQuery:
         self._place = kernels.direct(kernels.place_obstacles, self.packed, none, self.arrays.states, margin)
         self.is_moving = False
         """Whether any obstacle has a velocity or a margin."""
-        self._near_count, self._row_count = 0, 0
         self.influence_distance = np.nan
         """Surface distance below which a pair is near [m]; set it by `set_influence_distance`."""
         for state, obstacle in zip(self.arrays.states, scene.slots, strict=True):
@@ -115,7 +115,7 @@ class DistanceQuery:
         self._outdated = np.zeros(pairs, dtype=bool)  # pairs of spare slots for which coal was made for other shapes
         self._surfaces = table.is_mesh[scene.pairs].any(axis=1) & ~table.is_plane[scene.pairs].any(axis=1)
         self._has_surfaces = bool(self._surfaces.any())
-        self.is_compiled = not (len(self._by_coal) or self._clouds) and self._has_views
+        self.is_compiled = not (len(self._by_coal) or self._clouds)
         """Whether kernels compute everything, but for pairs whose cores meet."""
         self.has_clouds = bool(self._clouds)
         """Whether there are proxies to place between the bodies and the distances of a step."""
@@ -192,18 +192,13 @@ class DistanceQuery:
         kernels.place_bodies(self.packed, joint_poses)
         for index, cloud in self._clouds.items():
             self._place_proxies(index, cloud)
-        self.finish(*kernels.near_pairs(self.packed))
+        kernels.near_pairs(self.packed)
+        self.finish()
 
-    def finish(self, near: int, rows: int, meeting: int) -> None:
-        """Compute what kernels cannot, by coal.
-
-        Args:
-            near: number of near pairs.
-            rows: number of those that get rows.
-            meeting: number of those that coal has to compute all the same.
-        """
-        self._near_count, self._row_count, x = near, rows, self.arrays
-        left = x.meeting[:meeting].tolist()
+    def finish(self) -> None:
+        """Compute what kernels cannot, by coal."""
+        x = self.arrays
+        left = x.meeting[: x.counts[2]].tolist()
         meet = [pair for pair in left if x.method[pair] != SPARE_BY_COAL]
         if len(self._by_coal) or len(meet) < len(left):
             self._compute_by_coal()
@@ -213,12 +208,12 @@ class DistanceQuery:
     @property
     def pairs(self) -> IntArray:
         """(c,) pairs that were computed and are to get rows, increasing."""
-        return self.arrays.rows[: self._row_count]
+        return self.arrays.rows[: self.arrays.counts[1]]
 
     @property
     def _near(self) -> IntArray:
         """(c,) pairs that were computed, increasing."""
-        return self.arrays.near[: self._near_count]
+        return self.arrays.near[: self.arrays.counts[0]]
 
     def _compute_by_coal(self) -> None:
         """Compute the near pairs that kernels cannot in one call of coal."""
@@ -236,12 +231,15 @@ class DistanceQuery:
             for pair, on in zip(changed.tolist(), active[changed].tolist(), strict=True):
                 (self._data.activateCollisionPair if on else self._data.deactivateCollisionPair)(pair)
             self._active, self._last_near = active, near
-        if not self._has_views:
+        if self._poses_of_coal is None:
             for i, pose in enumerate(x.poses):
                 self._data.oMg[i] = pin.SE3(pose[:9].reshape(3, 3).T, pose[9:])
+        else:
+            self._poses_of_coal[:] = x.poses
         pin.computeDistances(self._scene.geometry, self._data)
-        if not self._has_views:
-            x.results[self._active] = read_results(self._data.distanceResults)[self._active]
+        results = self._results_of_coal
+        results = read_results(self._data.distanceResults) if results is None else results
+        x.results[self._active] = results[self._active]
         if self._has_surfaces:
             meshes = np.flatnonzero(self._active & self._surfaces)
             x.results[meshes] = _with_normals(x.results[meshes])

@@ -6,8 +6,9 @@ are wide of anything that a robot does, and narrow enough that no arithmetic of 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from math import floor, hypot, inf, isfinite, log2, ulp
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -45,7 +46,8 @@ FAULTS = {
 """What `kernels.check_states` finds, in words."""
 
 
-class Times(NamedTuple):
+@dataclass(slots=True)
+class Times:
     """Time of a step, as `Clock.read` takes it."""
 
     t: float
@@ -65,6 +67,7 @@ class Clock:
 
     def __init__(self, dt: float) -> None:
         self._dt, self._now = dt, -inf
+        self._regular = Times(0.0)
         self._gap = max(_GAP[0] * dt, _GAP[1])
         self._fine = 2.0 ** (52 + floor(log2(_RESOLUTION * dt)))  # below it, the resolution of a time is fine enough
 
@@ -82,7 +85,7 @@ class Clock:
         self._now = t
 
     def read(self, t: Any) -> Times:
-        """Return the time of the next step; nothing is changed.
+        """Return the time of the next step, until the next call; nothing is changed.
 
         Args:
             t: as given [s]; None for a control period after the last step.
@@ -91,10 +94,10 @@ class Clock:
             NumericalError: t is no number.
         """
         expected = self._now + self._dt if self._now > -inf else 0.0
-        if t is None:
-            return Times(expected)
-        if type(t) is float and abs(t) < self._fine and (abs(t - expected) <= _OFF * self._dt or self._now == -inf):
-            return Times(t)
+        is_on_time = self._now == -inf or t is None or (type(t) is float and abs(t - expected) <= _OFF * self._dt)
+        if t is None or (is_on_time and type(t) is float and abs(t) < self._fine):
+            self._regular.t = expected if t is None else t  # one object for all: to make one takes longer
+            return self._regular
         t = as_time("t", t)
         if not ulp(t) <= _RESOLUTION * self._dt:  # neither for NaN and infinity
             rough = f"{t:g}: its resolution is coarser than {_RESOLUTION:g} control periods; is it in seconds?"
@@ -157,6 +160,8 @@ class Configurations:
             q: configuration (nq,).
         """
         size = hypot(*q.tolist())
+        if size <= self._small and not self._units_of_length_1:
+            return q, (), ()
         faults = () if size <= self._small else self._faults(name, q, size)
         notes: tuple[Reason, ...] = ()
         if not faults:

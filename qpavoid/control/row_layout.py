@@ -11,7 +11,7 @@ from qpavoid.control.distances import DistanceQuery
 from qpavoid.control.settings import ControlSettings
 from qpavoid.control.tasks import FrameTask, RowTask
 from qpavoid.control.tasks.layout import task_layout
-from qpavoid.kernels.layout import RowLayout
+from qpavoid.kernels import SUMMARY, RowLayout
 from qpavoid.model.kinematics import ForwardKinematics, chains, columns, max_lever_arm
 from qpavoid.model.limits import limit_layout
 
@@ -72,7 +72,11 @@ def lay_out(
         rhs_contact=np.zeros(pairs),
         **limit_layout(settings.bounds, settings.limits.position_gain, settings.dt),
         v_tracking=np.zeros(model.nv),
+        v=np.zeros(model.nv),
+        summary=np.zeros(1, SUMMARY).view(np.recarray),
+        identity=np.eye(model.nv),
         lever_arm=max_lever_arm(model, table.max_extension()),
         looks_ahead=False,
+        regularization=0.0,
         **row_form(avoidance),
     )

@@ -53,7 +53,8 @@ class SplitStep:
         arguments = self._builder.read(q, t, None, obstacles, v)
         if self._planning is not None:
             self._planning.drop()
-        return self._builder.build(arguments).problem
+        self._builder.build(arguments)
+        return self._builder.rows.problem()
 
     def command(self, v_desired: Array) -> Solution:
         """End the step that `rows` began: return the safe velocity that is closest to a command.
@@ -73,5 +74,5 @@ class SplitStep:
             raise ConfigError("command: no step has begun; call `rows` before it")
         if faults := check_velocity("v_desired", v_desired, LARGEST_COMMAND):
             v_desired = np.zeros(nv)
-        step = step._replace(problem=self._builder.rows.follow(v_desired, step.problem), faults=step.faults + faults)
+        step.is_settled, step.faults = self._builder.rows.follow(v_desired), step.faults + faults
         return self._decide(step, begin, from_tasks=False)

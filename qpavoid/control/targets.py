@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -21,15 +21,8 @@ from qpavoid.reason import Reason, ReasonKind
 _ONE, _AS_SAMPLE = np.zeros(1, dtype=np.intp), np.full(1, SAMPLE)
 
 
-class Targets(NamedTuple):
-    """Targets of a step, checked."""
-
-    samples: Sequence[Any]
-    """What each task should reach, in the order of the tasks."""
-    faults: tuple[Reason, ...] = ()
-    """What is wrong with those that are given."""
-    normalised: tuple[Reason, ...] = ()
-    """What was normalised in them."""
+Targets = tuple[Sequence[Any], tuple[Reason, ...], tuple[Reason, ...]]
+"""What each task should reach, in the order of the tasks; what is wrong with what is given, and what was normalised."""
 
 
 class TargetReader:
@@ -50,13 +43,16 @@ class TargetReader:
         if len(self._tasks) < len(tasks):
             raise ConfigError(f"tasks: two have the same name among {', '.join(self._tasks)}; give one a `name`")
         self._names, self._frames, self._latency = list(self._tasks), frames, latency
+        self._named_rows = list(zip(self._names, frames, strict=False))
         self._motions: list[Any] = [task.motion for task in tasks]
         self._is_still = all(type(motion) is Trajectory and motion.is_still for motion in self._motions[: len(frames)])
         self.last: Sequence[Any] = ()
         """Targets of all tasks in the step before; none before the first one."""
         self._is_written = False  # whether the frames are the poses of motions that never change
         self.read(0.0, None)
-        kernels.are_fine(frames, FARTHEST, FASTEST)
+        self._takes_samples = not latency and len(tasks) == len(frames)
+        """Whether there are only frames, whose samples count as they are given."""
+        self._are_fine = kernels.direct(kernels.are_fine, frames, FARTHEST, FASTEST)
 
     def read(self, t: float, targets: Mapping[str, Any] | None) -> Targets:
         """Return the targets of all tasks.
@@ -76,14 +72,19 @@ class TargetReader:
             if not (self._is_still and self._is_written):
                 self._write(samples)
                 self._is_written = True
-            return Targets(samples)
+            return samples, (), ()
         self._is_written = False
-        samples = [targets.get(name) for name in self._names]
-        plain = not self._latency and len(targets) == len(samples) == len(self._frames)
-        if plain and set(map(type, samples)) == {Sample}:
-            self._write(samples)
-            if kernels.are_fine(self._frames, FARTHEST, FASTEST):
-                return Targets(samples)
+        if self._takes_samples and len(targets) == len(self._names):
+            samples = []
+            for name, row in self._named_rows:
+                sample = targets.get(name)
+                if type(sample) is not Sample:
+                    break
+                row[:] = sample.row
+                samples.append(sample)
+            else:
+                if self._are_fine(self._frames, FARTHEST, FASTEST):
+                    return samples, (), ()
         return self._read_each(t, targets)
 
     def _placed(self, task: RowTask, value: Any) -> Any:
@@ -99,8 +100,8 @@ class TargetReader:
 
     def _write(self, samples: Sequence[Any]) -> None:
         """Write the states of the frame tasks."""
-        for row in range(len(self._frames)):
-            self._frames[row] = samples[row].row
+        for (_, row), sample in zip(self._named_rows, samples, strict=False):
+            row[:] = sample.row
 
     def _read_each(self, t: float, targets: Mapping[str, Any]) -> Targets:
         """Check targets one by one: of several kinds, not of all tasks, or with numbers that cannot be true."""
@@ -123,7 +124,7 @@ class TargetReader:
         if unknown := [name for name in targets if name not in self._tasks]:
             raise UnknownName(f"no target {unknown[0]!r:.60}{nearest(str(unknown[0]), self._tasks)}")
         self._write(samples)
-        return Targets(samples, tuple(faults), tuple(normalised))
+        return samples, tuple(faults), tuple(normalised)
 
 
 def _checked(name: str, task: RowTask, target: Any) -> tuple[Any, Reason | None]:

@@ -14,14 +14,14 @@ from qpavoid.kernels.cache import first_use
 from qpavoid.kernels.clearance import (
     TOLERANCE,
     clearance_lower_bound,
-    is_tracking_clear,
+    is_clear,
     joint_speeds,
     leaves_position_limits,
 )
 from qpavoid.kernels.depth import CellGrid, OwnBodies, fill_cells, mark_own_pixels, recall_cells
 from qpavoid.kernels.estimates import ObstacleArrays, are_fine, check_updates, observe
 from qpavoid.kernels.kinematics import KinematicsArrays, update_kinematics
-from qpavoid.kernels.layout import RowLayout
+from qpavoid.kernels.layout import SUMMARY, RowLayout
 from qpavoid.kernels.margins import distances_of, least_margin
 from qpavoid.kernels.near_pairs import DistanceArrays, near_pairs, place_bodies, place_obstacles
 from qpavoid.kernels.obstacles import Pieces, check_states, sample_pieces
@@ -35,7 +35,15 @@ from qpavoid.kernels.ramps import RampLimits, follow_ramp
 from qpavoid.kernels.rollout import RolloutArrays, advance_rollout, begin_rollout, rollout_outcome
 from qpavoid.kernels.rotation import rotation_vector
 from qpavoid.kernels.rows import alpha, beta, distance_rows, row_bounds
-from qpavoid.kernels.step import assemble, control_step, find_near_pairs, tracking_violation, violation
+from qpavoid.kernels.step import (
+    SETTLED,
+    TO_MEASURE,
+    assemble,
+    control_step,
+    find_near_pairs,
+    tracking_violation,
+    violation,
+)
 from qpavoid.kernels.structures import direct, pack
 from qpavoid.kernels.task_curvature import add_curvature
 from qpavoid.kernels.tasks import frame_rows, projection_cost
@@ -43,7 +51,10 @@ from qpavoid.kernels.tracking_law import tracking_law
 from qpavoid.kernels.voxels import select_voxels, voxels_within
 
 __all__ = [
+    "SETTLED",
+    "SUMMARY",
     "TOLERANCE",
+    "TO_MEASURE",
     "ApproachArrays",
     "CellGrid",
     "DistanceArrays",
@@ -82,7 +93,7 @@ __all__ = [
     "first_use",
     "follow_ramp",
     "frame_rows",
-    "is_tracking_clear",
+    "is_clear",
     "jerk_limited_stop",
     "joint_speeds",
     "least_margin",

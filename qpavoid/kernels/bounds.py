@@ -10,6 +10,8 @@ from qpavoid.kernels.braking_bounds import MAX_NEWTON_STEPS, max_stopping_distan
 from qpavoid.kernels.packing import compiled
 from qpavoid.problem import Array
 
+OUTSIDE = 1e-6
+"""Excess over a position limit from which a coordinate counts as outside it: above rounding errors [rad or m]."""
 _speed_to_stop, _stopping_distance = compiled(speed_to_stop), compiled(stopping_distance)
 _max_stopping_distance = compiled(max_stopping_distance)
 

@@ -165,23 +165,24 @@ def joint_speeds(x: Any, v: Array) -> None:
 
 
 @compiled
-def is_tracking_clear(x: Any, q: Array, k: int, influence_distance: float) -> bool:
-    """Return True if bounds show that v_tracking and a stop from it are clear.
+def is_clear(x: Any, q: Array, v: Array, k: int, influence_distance: float) -> bool:
+    """Return True if bounds show that a velocity and a stop from it are clear.
 
     Clear is what keeps the safety distance of every pair, up to `TOLERANCE`. A stop takes s = max |v_j| / v_step_j
     steps, in which the robot moves ½ s dt times v at most: one step of v and that make the horizon of
     `clearance_lower_bound`. False says nothing: the distances themselves have to be computed.
 
     Args:
-        x: reads the results of the step, v_tracking included.
+        x: reads the results of the step.
         q: configuration (nq,).
+        v: velocity (n,) [rad/s or m/s].
         k: number of near pairs.
         influence_distance: surface distance below which a pair is near [m].
     """
     steps = 0.0
-    for j in range(len(x.v_tracking)):
-        steps = max(steps, abs(x.v_tracking[j]) / x.v_step[j])
+    for j in range(len(v)):
+        steps = max(steps, abs(v[j]) / x.v_step[j])
     horizon = x.dt * (1.0 + 0.5 * steps)
-    if steps > 0.0 and leaves_position_limits(x, q, x.v_tracking, horizon):
+    if steps > 0.0 and leaves_position_limits(x, q, v, horizon):
         return False
-    return clearance_lower_bound(x, x.v_tracking, k, influence_distance, horizon) > -TOLERANCE
+    return clearance_lower_bound(x, v, k, influence_distance, horizon) > -TOLERANCE

@@ -1,4 +1,4 @@
-"""Forward kinematics: poses of joints and frames, and the world Jacobian, written where Pinocchio keeps its own.
+"""Forward kinematics: poses of joints and frames, and the world Jacobian.
 
 A pose is a row of 12: rotation by columns, then position [-, m].
 """
@@ -68,7 +68,7 @@ def update_kinematics(x: KinematicsArrays, q: Array) -> None:
         _local_pose(x, i, q, x.local_poses[i])
         compose(x.joint_poses[x.parents[i]], x.local_poses[i], x.joint_poses[i])
     for c in range(len(x.column_joints)):
-        _column(x.joint_poses[x.column_joints[c]], x.motions[c], x.J[:, c])
+        _write_column(x.joint_poses[x.column_joints[c]], x.motions[c], x.J, c)
     for f in range(len(x.frame_ids)):
         compose(x.joint_poses[x.frame_joints[f]], x.frame_placements[f], x.frame_poses[x.frame_ids[f]])
 
@@ -91,14 +91,23 @@ def compose(a: Array, b: Array, product: Array) -> None:
 
 
 @compiled
-def _column(pose: Array, motion: Array, column: Array) -> None:
-    """Write the twist (6,) at the world's origin [R v + p × R w; R w] of a motion [v; w] in the axes of a pose."""
-    for r in range(3):
-        column[r] = pose[r] * motion[0] + pose[3 + r] * motion[1] + pose[6 + r] * motion[2]
-        column[3 + r] = pose[r] * motion[3] + pose[3 + r] * motion[4] + pose[6 + r] * motion[5]
-    column[0] += pose[10] * column[5] - pose[11] * column[4]
-    column[1] += pose[11] * column[3] - pose[9] * column[5]
-    column[2] += pose[9] * column[4] - pose[10] * column[3]
+def _write_column(pose: Array, motion: Array, J: Array, c: int) -> None:
+    """Write the twist at the world's origin [R v + p × R w; R w] of a motion [v; w] in the axes of a pose."""
+    px, py, pz = pose[9], pose[10], pose[11]
+    vx, vy, vz = _rotated(pose, motion[0], motion[1], motion[2])
+    wx, wy, wz = _rotated(pose, motion[3], motion[4], motion[5])
+    J[0, c], J[1, c], J[2, c] = vx + py * wz - pz * wy, vy + pz * wx - px * wz, vz + px * wy - py * wx
+    J[3, c], J[4, c], J[5, c] = wx, wy, wz
+
+
+@compiled
+def _rotated(pose: Array, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Compute a vector in world axes that is x, y, z in those of a pose."""
+    return (
+        pose[0] * x + pose[3] * y + pose[6] * z,
+        pose[1] * x + pose[4] * y + pose[7] * z,
+        pose[2] * x + pose[5] * y + pose[8] * z,
+    )
 
 
 @compiled

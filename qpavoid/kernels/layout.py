@@ -1,13 +1,29 @@
 """Memory of a control step: what the kernels read and write, laid out once when a controller is made.
 
-Arrays that look into the memory of Pinocchio and coal are views; outputs are overwritten by every step.
+Outputs are overwritten by every step.
 """
 
 from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from qpavoid.problem import Array, IntArray, Mask
+
+SUMMARY = np.dtype(
+    [
+        ("rows", np.intp), ("violation", float), ("is_clear", bool), ("position_margin", float), ("bent", float)
+    ],
+    align=True,
+)  # fmt: skip
+"""Numbers of a control step.
+
+rows: number k of near pairs; violation: largest one of rows and bounds by `v_tracking` [m/s, rad/s], negative inside,
+NaN where there is one; is_clear: whether v_tracking is safe, its clearance is bounded (`looks_ahead`) and the bound
+suffices; position_margin: distance to the nearest position limit [rad, m]; bent: how far the task rows bend within the
+step, see `tracking_law`.
+"""
 
 
 class RowLayout(NamedTuple):
@@ -159,7 +175,14 @@ class RowLayout(NamedTuple):
     """(n,) out: the next velocity of a stop: all coordinates slowed by one factor, as fast as their limits allow."""
     # --- answer of the tracking law
     v_tracking: Array
-    """(n,) out: J⁺ẋ, see `kernels.tracking_law`."""
+    """(n,) out: J⁺ẋ, see `kernels.tracking_law`; a velocity to follow in place of the tasks, where one is given."""
+    # --- answer of the step
+    v: Array
+    """(n,) out: velocity that may be commanded, where `control_step` returns SETTLED [rad/s or m/s]."""
+    summary: Any
+    """(1,) out: numbers of the type `SUMMARY`."""
+    identity: Array
+    """(n, n) rows of a step without tasks."""
     # --- numbers
     offset: float
     """Added to surface distances [m]."""
@@ -190,4 +213,6 @@ class RowLayout(NamedTuple):
     jerk_limited: bool
     """Whether any jerk has one."""
     looks_ahead: bool
-    """Whether a step bounds the clearance along `v_tracking`, where that velocity meets all rows and bounds."""
+    """Whether a step bounds the clearance along a velocity that meets all rows and bounds."""
+    regularization: float
+    """λ of the QP that a step solves where `v_tracking` violates a row or bound; 0 where another law does."""

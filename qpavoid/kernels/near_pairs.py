@@ -75,6 +75,8 @@ class DistanceArrays(NamedTuple):
     """(m,) out, the first entries: those of them that are not ignored."""
     meeting: IntArray
     """(m,) out, the first entries: pairs whose cores meet, and those of spare slots that coal has to compute."""
+    counts: IntArray
+    """(3,) out: how many entries of near, rows and meeting count."""
     results: Array
     """(m, 10) out: distance, normal, point a, point b of the near pairs."""
 
@@ -97,10 +99,10 @@ def near_pairs(x: DistanceArrays) -> tuple[int, int, int]:
     """Find the near pairs, and write the distances of those that coal is not needed for.
 
     Args:
-        x: reads poses; writes centers of movable bodies, near, rows, meeting and results.
+        x: reads poses; writes centers of movable bodies, near, rows, meeting, counts and results.
 
     Returns:
-        Number of near pairs; of those that get rows; of those that coal has to compute all the same.
+        `counts`.
     """
     bodies = len(x.joints)
     while bodies > 0 and x.joints[bodies - 1] < 0:  # from there on, both bodies of each pair are obstacles
@@ -112,6 +114,7 @@ def near_pairs(x: DistanceArrays) -> tuple[int, int, int]:
         if not x.ignored[k]:
             x.rows[rows] = k
             rows += 1
+    x.counts[0], x.counts[1], x.counts[2] = near, rows, meeting
     return near, rows, meeting
 
 

@@ -50,8 +50,7 @@ def distance_rows(x: Any, pairs: IntArray, influence_distance: float, moving: bo
     Returns:
         Number k of near pairs.
     """
-    results, closest, J, support = x.results, x.closest, x.J, x.support
-    J_world = np.ascontiguousarray(x.J_world)  # rows in one piece become vector instructions
+    results, closest, J, J_world, support = x.results, x.closest, x.J, x.J_world, x.support
     columns = J_world.shape[1]
     k = 0
     for i in pairs:

@@ -1,4 +1,4 @@
-"""All rows and bounds of a control step in one call, and the violation of them by the tracking law."""
+"""A control step in one call: from a configuration to a velocity that may be commanded, where that is simple."""
 
 from __future__ import annotations
 
@@ -6,16 +6,23 @@ from typing import Any
 
 import numpy as np
 
-from qpavoid.kernels.bounds import velocity_bounds
+from qpavoid.kernels.bounds import OUTSIDE, velocity_bounds
 from qpavoid.kernels.braking_trajectory import stop_velocity
-from qpavoid.kernels.clearance import is_tracking_clear
+from qpavoid.kernels.clearance import is_clear
 from qpavoid.kernels.kinematics import update_kinematics
 from qpavoid.kernels.near_pairs import near_pairs, place_bodies
 from qpavoid.kernels.packing import compiled
+from qpavoid.kernels.qp import project
 from qpavoid.kernels.rows import distance_rows, row_bounds
 from qpavoid.kernels.tasks import frame_rows
 from qpavoid.kernels.tracking_law import tracking_law
 from qpavoid.problem import Array, IntArray
+
+TOLERATED_DEPTH = 1e-3
+"""Depth below the safety distance [m], or excess over a position limit [rad or m], that slows nothing down: noise and
+control periods lead that far."""
+SETTLED, UNSETTLED, TO_MEASURE = range(3)
+"""What `control_step` returns."""
 
 
 @compiled
@@ -35,28 +42,53 @@ def find_near_pairs(x: Any, q: Array) -> tuple[int, int, int]:
 
 
 @compiled
-def control_step(
-    x: Any, q: Array, influence_distance: float, moving: bool
-) -> tuple[int, int, int, int, float, bool, float, float]:
-    """Compute kinematics, distances and all rows and bounds of a control step.
+def control_step(x: Any, q: Array, influence_distance: float, moving: bool, from_tasks: bool, is_measured: bool) -> int:
+    """Compute a control step: kinematics, distances, rows and bounds, and the QP with its stop look-ahead.
 
     Args:
-        x: memory of the step; see `RowLayout`.
+        x: memory of the step; its outputs are overwritten, see `RowLayout`.
         q: configuration (nq,).
         influence_distance: surface distance below which a pair is near [m].
         moving: whether any obstacle moves.
+        from_tasks: whether the tasks are followed, or v_tracking as it is.
+        is_measured: whether kinematics and distances are up to date.
 
     Returns:
-        What `near_pairs` returns, then what `assemble` does.
+        SETTLED where `v` may be commanded as it is; UNSETTLED where other laws and checks decide; TO_MEASURE where the
+        distances of some near pairs have to be computed by other means first.
     """
-    near, rows, meeting = find_near_pairs(x, q)
-    k, worst, clear, margin, bent = assemble(x, q, x.distances.rows[:rows], influence_distance, moving)
-    return near, rows, meeting, k, worst, clear, margin, bent
+    if not is_measured:
+        _, _, meeting = find_near_pairs(x, q)
+        if meeting > 0:
+            return TO_MEASURE
+    pairs, s = x.distances.rows[: x.distances.counts[1]], x.summary[0]
+    k, worst, is_tracking_clear, margin, bent = assemble(x, q, pairs, influence_distance, moving, from_tasks)
+    s.rows, s.violation, s.is_clear, s.position_margin, s.bent = k, worst, is_tracking_clear, margin, bent
+    if x.regularization == 0.0 or not x.looks_ahead or margin < -OUTSIDE:
+        return UNSETTLED
+    if worst <= 0.0:
+        x.v[:] = x.v_tracking
+        return SETTLED if is_tracking_clear else UNSETTLED
+    if _is_too_near(x, k):
+        return UNSETTLED
+    A = x.A if from_tasks else x.identity
+    v, is_solved = project(A, max(x.regularization, bent), x.v_tracking, x.J[:k], x.rhs[:k], x.lower, x.upper)
+    x.v[:] = v
+    return SETTLED if is_solved and is_clear(x, q, v, k, influence_distance) else UNSETTLED
+
+
+@compiled
+def _is_too_near(x: Any, k: int) -> bool:
+    """Return True if any of the first k pairs is so near that the robot has to recover, or if that is unknown."""
+    nearest = np.inf
+    for i in range(k):
+        nearest = np.minimum(nearest, x.d[i])  # keeps NaN, unlike min
+    return not nearest >= x.d1 - TOLERATED_DEPTH
 
 
 @compiled
 def assemble(
-    x: Any, q: Array, pairs: IntArray, influence_distance: float, moving: bool
+    x: Any, q: Array, pairs: IntArray, influence_distance: float, moving: bool, from_tasks: bool
 ) -> tuple[int, float, bool, float, float]:
     """Write all rows and bounds of a control step, and the tracking law's velocity.
 
@@ -66,21 +98,22 @@ def assemble(
         pairs: those whose results are of this step (c,), increasing.
         influence_distance: surface distance below which a pair is near [m].
         moving: whether any obstacle moves.
+        from_tasks: whether the tasks are followed, or v_tracking as it is.
 
     Returns:
-        Number k of near pairs; largest violation of rows and bounds by the tracking law's velocity [m/s, rad/s]
-        (negative inside, NaN where there is one); whether that velocity is safe, its clearance is bounded
-        (`looks_ahead`) and the bound suffices; distance to the nearest position limit [rad, m]; how far the task rows
-        bend within the step, see `tracking_law`.
+        The numbers of `SUMMARY`.
     """
-    frame_rows(x)
-    margin = velocity_bounds(x, q)
+    margin, bent = velocity_bounds(x, q), 0.0
     stop_velocity(x)
-    bent = tracking_law(x, x.A, x.b, x.v_tracking, x.b_feasible)
+    if from_tasks:
+        frame_rows(x)
+        bent = tracking_law(x, x.A, x.b, x.v_tracking, x.b_feasible)
+        if x.task_switching:  # rows are compared with eq. 10 at a λ that is the same in every step
+            bent = 0.0
     k = distance_rows(x, pairs, influence_distance, moving)
     row_bounds(x, k, moving)
     worst = tracking_violation(x, k)
-    clear = x.looks_ahead and worst <= 0.0 and is_tracking_clear(x, q, k, influence_distance)
+    clear = x.looks_ahead and worst <= 0.0 and is_clear(x, q, x.v_tracking, k, influence_distance)
     return k, worst, clear, margin, bent
 
 

@@ -31,8 +31,7 @@ def frame_rows(x: Any) -> None:
             (r,) [m/s, rad/s].
     """
     poses, targets, row_wrenches, support, A, b = x.poses, x.targets, x.row_wrenches, x.task_support, x.A, x.b
-    errors, feedback = x.errors, x.feedback
-    J_world = np.ascontiguousarray(x.J_world)  # rows in one piece become vector instructions
+    errors, feedback, J_world = x.errors, x.feedback, x.J_world
     rows, columns = len(row_wrenches), J_world.shape[1]
     positioned = rows // 3 - len(x.oriented)
     for f in range(len(poses)):

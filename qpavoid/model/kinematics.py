@@ -1,9 +1,10 @@
-"""Forward kinematics and Jacobians of one configuration, by Pinocchio."""
+"""Forward kinematics and Jacobians of one configuration."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +12,7 @@ import pinocchio as pin
 
 from qpavoid import kernels
 from qpavoid.kernels.kinematics import FREE, PLANAR, PRISMATIC, REVOLUTE, SPHERICAL, TRANSLATION, UNBOUNDED
-from qpavoid.model.views import read_poses, view_poses
+from qpavoid.model.views import read_poses
 from qpavoid.problem import Array, IntArray, Mask
 
 MIMIC = "JointModelMimic"
@@ -51,10 +52,9 @@ class Kinematics(NamedTuple):
 
 
 class ForwardKinematics:
-    """Joint placements, world Jacobian and the poses of some frames, in data that every call overwrites.
+    """Joint placements, world Jacobian and the poses of some frames, in memory that every call overwrites.
 
-    A kernel writes them where Pinocchio's own algorithms look for them; of joints that it does not know (helical,
-    universal, composite), Pinocchio computes them.
+    A kernel computes them; of joints that it does not know (helical, universal, composite), Pinocchio does.
     """
 
     def __init__(self, model: Any, frame_ids: Sequence[int] = ()) -> None:
@@ -64,45 +64,81 @@ class ForwardKinematics:
             model: pinocchio model.
             frame_ids: the f frames to keep up to date.
         """
-        self.data = model.createData()
+        self._data = data = model.createData()
         self._model, self._ids = model, list(frame_ids)
-        self._poses = self.data.oMi, self.data.oMf, self.data.liMi
-        pin.framesForwardKinematics(model, self.data, pin.neutral(model))
-        pin.computeJointJacobians(model, self.data, pin.neutral(model))
-        views = [view_poses(poses, writeable=True) for poses in self._poses]
-        arrays = [read_poses(poses) if view is None else view for view, poses in zip(views, self._poses, strict=True)]
-        self.J: Array = self.data.J.reshape(6, model.nvExtended, order="F")  # of one joint, it comes as a vector
+        pin.framesForwardKinematics(model, data, pin.neutral(model))
+        pin.computeJointJacobians(model, data, pin.neutral(model))
+        self.J: Array = np.array(data.J.reshape(6, model.nvExtended, order="F"), order="C")  # a vector for one joint
         """(6, e) see `Kinematics.J`."""
-        self.joint_poses, self.frame_poses, self._local_poses = arrays
-        """(njoints, 12), (frames, 12) world poses of all joints and frames; only the frames `frame_ids` are kept up to
-        date."""
-        kinds = [_joint_kind(model, self.data, i) for i in range(model.njoints)]
+        self.joint_poses: Array = read_poses(data.oMi)
+        """(njoints, 12) world poses of all joints."""
+        self.frame_poses: Array = read_poses(data.oMf)
+        """(frames, 12) world poses of all frames; only the frames `frame_ids` are kept up to date."""
+        kinds = [_joint_kind(model, data, i) for i in range(model.njoints)]
         self.arrays = self._lay_out(kinds)
         """The same memory, as kernels see it."""
         self.packed = kernels.pack(self.arrays)
-        self.is_compiled = min(kinds) >= 0 and all(view is not None for view in views)
+        self.is_compiled = min(kinds) >= 0
         """Whether the kernel computes everything."""
 
     def compute(self, q: Array) -> None:
-        """Compute everything at a configuration q (nq,).
-
-        `data` then holds the joint placements.
-        """
+        """Compute everything at a configuration q (nq,)."""
         if self.is_compiled:
             kernels.update_kinematics(self.packed, q)
             return
-        model, data = self._model, self.data
+        model, data = self._model, self._data
         pin.computeJointJacobians(model, data, q)
         for frame_id in self._ids:
             pin.updateFramePlacement(model, data, frame_id)
+        self.J[:] = data.J.reshape(6, -1, order="F")
         self.joint_poses[:], self.frame_poses[:] = read_poses(data.oMi), read_poses(data.oMf)
 
+    @cached_property
+    def _support(self) -> Array:
+        """(njoints, e) see `support_masks`."""
+        return support_masks(self._model)
+
+    @cached_property
+    def _fold(self) -> Array:
+        """(e, nv) adds up the columns that the same coordinate moves."""
+        return np.eye(self._model.nv)[columns(self._model)]
+
+    def frame_jacobian(self, frame_id: int) -> Array:
+        """Return the Jacobian (6, nv) of a frame: velocity of its origin and its angular velocity, in world axes.
+
+        Args:
+            frame_id: of a frame that is kept up to date.
+        """
+        linear, angular = (self.J * self._support[self._model.frames[frame_id].parentJoint]).reshape(2, 3, -1)
+        x = self.frame_poses[frame_id, 9:]
+        return np.asarray(np.concatenate((linear - pin.skew(x) @ angular, angular)) @ self._fold)
+
+    @cached_property
+    def _masses(self) -> tuple[Array, Array]:
+        """(njoints,) masses, 0 of what never moves, and (njoints, 3) their centres in their joints [kg, m]."""
+        inertias = list(self._model.inertias)
+        masses = np.array([body.mass for body in inertias])
+        masses[0] = 0.0
+        return masses, np.array([body.lever for body in inertias])
+
+    def center_of_mass(self) -> tuple[Array, Array]:
+        """Return the centre of mass (3,), world [m], and its Jacobian (3, nv).
+
+        Of each column, with the twist [v; ω] at the world's origin, the bodies that it moves count with v + ω × c.
+        """
+        masses, levers = self._masses
+        rotations = self.joint_poses[:, :9].reshape(-1, 3, 3)  # transposed
+        moments = masses[:, None] * (self.joint_poses[:, 9:] + np.einsum("jki,jk->ji", rotations, levers))
+        moved, total = moments.T @ self._support, masses.sum()
+        J = self.J[:3] * (masses @ self._support) + np.cross(self.J[3:], moved, axis=0)
+        return moments.sum(axis=0) / total, J @ self._fold / total
+
     def _lay_out(self, kinds: Sequence[int]) -> kernels.KinematicsArrays:
-        model, joints = self._model, list(self._model.joints)
+        model, data, joints = self._model, self._data, list(self._model.joints)
         owners, frames = column_joints(model), [model.frames[i] for i in self._ids]
         scaling = [_mimicry(joint)[0] for joint in joints]
         motions = np.array(
-            [self.data.oMi[j].actInv(pin.Motion(self.J[:, c])).vector for c, j in enumerate(owners.tolist())]
+            [data.oMi[j].actInv(pin.Motion(self.J[:, c])).vector for c, j in enumerate(owners.tolist())]
         ).reshape(-1, 6)
         placements, turns = read_poses(model.jointPlacements), np.zeros((model.njoints, 2, 9))
         slides = np.zeros((model.njoints, 3))
@@ -125,7 +161,7 @@ class ForwardKinematics:
             frame_ids=np.array(self._ids, dtype=np.intp),
             frame_joints=np.array([frame.parentJoint for frame in frames], dtype=np.intp),
             frame_placements=read_poses([frame.placement for frame in frames]),
-            local_poses=self._local_poses,
+            local_poses=read_poses(data.liMi),
             joint_poses=self.joint_poses,
             frame_poses=self.frame_poses,
             J=self.J,

@@ -10,11 +10,10 @@ import numpy as np
 
 from qpavoid.config import Limits
 from qpavoid.errors import ConfigError
+from qpavoid.kernels.bounds import OUTSIDE
 from qpavoid.problem import Array, IntArray
 from qpavoid.reason import Reason, ReasonKind
 
-OUTSIDE = 1e-6
-"""Excess over a position limit from which a coordinate counts as outside it: above rounding errors [rad or m]."""
 _TURN = 2.0 * np.pi
 """Excess above which q is probably in degrees: a turn, which no joint exceeds its limit by [rad]."""
 

@@ -94,11 +94,11 @@ class OwnBodiesAt:
     def place(self, q: Array) -> Array:
         """Put the bodies to a configuration (nq,); return the world pose of the camera (12,)."""
         self._kinematics.compute(q)
-        data = self._kinematics.data
+        poses = self._kinematics.joint_poses
         camera = _se3(self._camera.pose)
         if self._frame is not None:
-            camera = data.oMf[self._frame] * camera
-        inverse, joints = camera.inverse(), {j: data.oMi[j] for j in set(self._joints)}
+            camera = _se3(self._kinematics.frame_poses[self._frame]) * camera
+        inverse, joints = camera.inverse(), {j: _se3(poses[j]) for j in set(self._joints)}
         for row, j, placement in zip(self.arrays.poses, self._joints, self._placements, strict=True):
             pose = inverse * joints[j] * placement
             row[:9], row[9:] = pose.rotation.T.ravel(), pose.translation

@@ -88,12 +88,12 @@ class Driver:
         """Return the solution of a step that was built since the drive began."""
         path = self.drive.path
         if path is None:
-            return self._arbiter.decide(step.q, step.t, step.problem, step.proximity, True)
+            return self._arbiter.decide(step.q, step.t, step.is_settled, True)
         error, velocity = self._lag(path, step.q)
         largest = float(np.abs(error).max())
         pace = 1.0 if self.drive.is_timed else min(max(_FULL_PACE * (1.0 - largest / _MAX_ERROR), 0.0), 1.0)
-        problem = self._rows.follow(pace * velocity + _GAIN * error, step.problem)
-        solution = self._arbiter.decide(step.q, step.t, problem, step.proximity, False)
+        is_settled = self._rows.follow(pace * velocity + _GAIN * error)
+        solution = self._arbiter.decide(step.q, step.t, is_settled, False)
         self._advance(path, pace, solution.v, step.q)
         return solution
 

@@ -116,7 +116,7 @@ class Forecaster(SceneChanges):
         rows, tracker = self._builder.rows, self._builder.tracker
         self._arbiter = Arbiter(self._settings, make_solver(law), rows, tracker)
         self._driver = Driver(rows, self._arbiter, config, scene.robot.model, settings.dt)
-        rows.look_ahead(settings.avoidance.look_ahead)
+        rows.adapt(self._arbiter.solver, settings.avoidance.look_ahead)
         ends = [task.motion.end_time if isinstance(task.motion, Trajectory) else np.inf for task in tasks]
         self._deadline = max(ends[: rows.frame_count]) + config.settle
         """Time until which all targets are to be reached [s]."""
@@ -126,6 +126,7 @@ class Forecaster(SceneChanges):
     def change_law(self, law: SolverConfig) -> None:
         """Forecast another law from now on."""
         self._arbiter.solver = make_solver(law)
+        self._builder.rows.adapt(self._arbiter.solver, self._settings.avoidance.look_ahead)
 
     def attach_at(self, index: int, frame_id: int, q: Array, pose: Sample) -> None:
         """Attach an obstacle as it is attached to the robot; see `ProblemBuilder.attach`."""
@@ -157,7 +158,7 @@ class Forecaster(SceneChanges):
         for k in range(count + 1):
             updates = obstacles if k == 0 else None
             step = builder.build(builder.read(q[k], start.t + k * dt, start.targets or None, updates, None))
-            distances = step.problem.avoidance
+            distances = rows.problem().avoidance
             if k == 0:
                 self._write_least(distances)
             errors[k] = rows.frame_errors

@@ -36,7 +36,8 @@ class Arbiter:
         self, settings: ControlSettings, solver: Solver, rows: RowAssembler, obstacles: ObstacleTracker
     ) -> None:
         """Build the checks, each with memory of its own."""
-        self._settings, self.solver, self._rows = settings, solver, rows
+        self._settings, self.solver, self._rows, self._obstacles = settings, solver, rows, obstacles
+        self._reports_limits = rows.previous.needs_report
         self._v_shape = (settings.scene.robot.model.nv,)
         self._braking = BrakingCheck(settings, rows, obstacles)
         self.progress, self._shake_damping = ProgressMonitor(settings, rows), ShakeDamping(settings.dt)
@@ -60,37 +61,44 @@ class Arbiter:
         """Return the velocities (k, nv) of the control steps of the backup trajectory; none without one."""
         return np.zeros((0, *self._v_shape)) if self.backup is None else self.backup.velocities
 
-    def decide(self, q: Array, t: float, problem: Problem, proximity: Proximity, from_tasks: bool) -> Solution:
+    def decide(self, q: Array, t: float, is_settled: bool, from_tasks: bool) -> Solution:
         """Return the solution that is commanded.
 
         Args:
             q: configuration (nq,).
             t: time [s].
-            problem: of this control step.
-            proximity: distances of this control step.
-            from_tasks: whether the problem is of the tasks, whose progress is monitored; else of a given velocity.
+            is_settled: whether it is the velocity that the rows have come to, see `RowAssembler.compute`.
+            from_tasks: whether the step is of the tasks, whose progress is monitored; else of a given velocity.
         """
-        if from_tasks:
-            problem = self._shake_damping.apply(problem)
-            if problem.levels and self.solver.prioritised:
-                problem = self._rows.prioritised(problem)
-        if self._settings.budget.is_limited:
-            problem = problem._replace(budget=self._settings.budget)
-        try:
-            solution = self._solve(q, problem, proximity, from_tasks)
-        except BudgetSpent as error:
-            solution = _stop(problem, (Reason.of(ReasonKind.BUDGET_SPENT, str(error)),))
+        rows, problem, damping = self._rows, None, self._shake_damping
+        if is_settled and damping.factor == 1.0:
+            solution = Solution.solved(rows.v.copy())
+        else:
+            problem = rows.problem()
+            if from_tasks:
+                problem = damping.apply(problem)
+                if problem.levels and self.solver.prioritised:
+                    problem = rows.prioritised(problem)
+            if self._settings.budget.is_limited:
+                problem = problem._replace(budget=self._settings.budget)
+            try:
+                solution = self._solve(q, problem, rows.proximity(), from_tasks)
+            except BudgetSpent as error:
+                solution = _stop(problem, (Reason.of(ReasonKind.BUDGET_SPENT, str(error)),))
         if from_tasks:
             stalled = self.progress.update(problem, solution)
-            self._shake_damping.update(solution.v, proximity.feedforward, bool(stalled))
+            if stalled or not damping.is_idle:
+                damping.update(solution.v, rows.proximity().feedforward, bool(stalled))
             solution = solution._replace(stalled=stalled) if stalled else solution
-        if self.backup is not None and self.solver.bounded:
-            solution = self._ensure_backup(self.backup, q, t, proximity, problem, solution)
-        return self._report_limits(problem, solution)
+        backup = self.backup
+        if backup is not None and self.solver.bounded and (backup.is_active or len(self._obstacles.moving)):
+            solution = self._ensure_backup(backup, q, t, solution)
+        return self._report_limits(solution) if self._reports_limits else solution
 
-    def stop(self, problem: Problem, reasons: tuple[Reason, ...]) -> Solution:
+    def stop(self, reasons: tuple[Reason, ...]) -> Solution:
         """Return the stop of this control step, with its reasons."""
-        return self._report_limits(problem, _stop(problem, reasons))
+        solution = _stop(self._rows.problem(), reasons)
+        return self._report_limits(solution) if self._reports_limits else solution
 
     def _solve(self, q: Array, problem: Problem, proximity: Proximity, from_tasks: bool) -> Solution:
         """Return the solution within the limits, after the stop look-ahead."""
@@ -156,37 +164,38 @@ class Arbiter:
         reason = Reason.of(ReasonKind.PREDICTED_TOO_NEAR, *names, amount=violation, unit="m", severity=severity)
         return solution._replace(v=v, command_scale=scale * solution.command_scale).with_reasons(reason)
 
-    def _ensure_backup(
-        self, backup: BackupPlanner, q: Array, t: float, proximity: Proximity, problem: Problem, solution: Solution
-    ) -> Solution:
+    def _ensure_backup(self, backup: BackupPlanner, q: Array, t: float, solution: Solution) -> Solution:
         """Replace the velocity by that of the backup trajectory, where none would be left after it."""
+        rows = self._rows
         try:
-            v = backup.check(q, solution.v, t, self._rows.previous.v, self._rows.previous.dv, proximity)
+            v = backup.check(q, solution.v, t, rows.previous.v, rows.previous.dv, rows.proximity())
         except NumericalError as error:  # of a predicted state; raised by `step` once it is the present one
             why = f"prediction of an {error}"
             return solution.with_reasons(Reason.of(ReasonKind.NO_BACKUP, severity=Severity.WARNING, detail=why))
         if v is None and backup.is_cut:
-            return _stop(problem, (*solution.reasons, Reason.of(ReasonKind.BUDGET_SPENT, "backup search")))
+            return _stop(rows.problem(), (*solution.reasons, Reason.of(ReasonKind.BUDGET_SPENT, "backup search")))
         if v is None:
             return solution
-        if (limits := self._recovery_limits(problem, proximity)) is not None:
+        problem = rows.problem()
+        if (limits := self._recovery_limits(problem, rows.proximity())) is not None:
             v, _ = slowed(v, problem.v_stop, limits)
         return solution._replace(v=np.clip(v, problem.lower, problem.upper)).with_reasons(Reason.of(ReasonKind.BACKUP))
 
-    def _report_limits(self, problem: Problem, solution: Solution) -> Solution:
+    def _report_limits(self, solution: Solution) -> Solution:
         """Name the accelerations and jerks beyond their limits, where bounds had to allow them.
 
         They do after a relaxed control step, before a position or velocity limit, and to hold contacts.
         """
-        if not (self._rows.previous.needs_report and self.solver.bounded):
+        if not self.solver.bounded:
             return solution
+        names, units = self._rows.joint_names, self._rows.joint_units
         kinds = (ReasonKind.ACCELERATION_RELAXED, ReasonKind.JERK_RELAXED)
         named = {reason.subject for reason in solution.reasons if reason.kind in kinds}
         excesses = [
-            Reason.of(kind, problem.joint_names[j], amount=float(excess[j]), unit=f"{problem.joint_units[j]}/s")
+            Reason.of(kind, names[j], amount=float(excess[j]), unit=f"{units[j]}/s")
             for kind, excess in zip(kinds, self._rows.previous.excess(solution.v), strict=True)
             for j in np.flatnonzero(excess > _LIMIT_TOLERANCE).tolist()
-            if (problem.joint_names[j],) not in named
+            if (names[j],) not in named
         ]
         return solution.with_reasons(*excesses) if excesses else solution
 

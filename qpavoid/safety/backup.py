@@ -113,6 +113,11 @@ class BackupPlanner:
         """Return the velocities (k, nv) of the control steps of the backup trajectory; none without one."""
         return np.zeros((0, self._model.nv)) if self._backup is None else self._backup.v
 
+    @property
+    def is_active(self) -> bool:
+        """Whether there is a backup trajectory or a candidate: while nothing moves, `check` would only drop it."""
+        return self._backup is not None or self._kind >= 0
+
     def check(self, q: Array, v: Array, t: float, v_prev: Array, dv_prev: Array, proximity: Proximity) -> Array | None:
         """Return None if v may be commanded, else the velocity (nv,) to command instead.
 

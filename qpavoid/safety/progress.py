@@ -72,16 +72,17 @@ class ProgressMonitor:
         """Call what names reasons once: no control step waits for the kernels."""
         self._rows.curvature(np.zeros_like(self._rows.frame_errors))
 
-    def update(self, problem: Problem, solution: Solution) -> tuple[Reason, ...]:
+    def update(self, problem: Problem | None, solution: Solution) -> tuple[Reason, ...]:
         """Return what keeps the tasks from their targets, after long enough without progress.
 
         Args:
-            problem: of the tasks.
+            problem: of the tasks; None for that of the last step.
             solution: what is commanded.
         """
         self._step += 1
         if self._step % self._interval:
             return self._stalled
+        problem = self._rows.problem() if problem is None else problem
         stuck = self._stuck(problem, solution)
         self._stalled = self._reasons(problem, solution.v, stuck) if stuck else ()
         return self._stalled

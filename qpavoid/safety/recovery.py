@@ -14,13 +14,11 @@ from __future__ import annotations
 import numpy as np
 
 from qpavoid.kernels import speed_to_stop
+from qpavoid.kernels.step import TOLERATED_DEPTH
 from qpavoid.model.limits import JointBounds
 from qpavoid.problem import Array, Problem, Solution
 from qpavoid.reason import Reason, ReasonKind
 
-_TOLERATED = 1e-3
-"""Depth below the safety distance [m], or excess over a position limit [rad or m], that slows nothing down: noise and
-control periods lead that far."""
 _COMING = 0.05
 """Speed of an obstacle towards a body from which nothing is slowed down [m/s]: beyond what noise makes of a rest."""
 
@@ -43,7 +41,7 @@ def recovery_limits(
         v_prev: velocity (nv,) of the control step before.
         dt: control period [s].
     """
-    degree = max(float(_depths(problem).max(initial=0.0)), -problem.position_margin) / _TOLERATED - 1.0
+    degree = max(float(_depths(problem).max(initial=0.0)), -problem.position_margin) / TOLERATED_DEPTH - 1.0
     rest = 1.0 + float(feedforward.min(initial=0.0)) / _COMING
     if not (degree > 0.0 and rest > 0.0):
         return None
@@ -85,8 +83,8 @@ def slow_recovery(
     """
     rows, depth = problem.avoidance, _depths(problem)
     named = {reason.subject for reason in solution.reasons if reason.kind is ReasonKind.BELOW_SAFETY_DISTANCE}
-    reasons = list(bounds.outside(q, problem.joint_names, problem.joint_units, _TOLERATED))
-    for i in np.flatnonzero(depth > _TOLERATED).tolist():
+    reasons = list(bounds.outside(q, problem.joint_names, problem.joint_units, TOLERATED_DEPTH))
+    for i in np.flatnonzero(depth > TOLERATED_DEPTH).tolist():
         pair = problem.pair_names[rows.pair[i]]
         if pair not in named:
             reasons.append(Reason.of(ReasonKind.BELOW_SAFETY_DISTANCE, *pair, amount=float(depth[i]), unit="m"))

@@ -264,9 +264,9 @@ class BackupRollouts:
         """
         self._poses[0] = poses
         while True:
-            code, *counts = kernels.advance_rollout(self._packed_memory, self.packed, self._prediction)
+            code, *_ = kernels.advance_rollout(self._packed_memory, self.packed, self._prediction)
             if code == TO_MEASURE:
-                self._measure(*counts)
+                self._measure()
             elif code == TO_MOVE:
                 self._move()
             elif code == NOT_FINITE:
@@ -290,10 +290,10 @@ class BackupRollouts:
         """Return the last decision, as a control step, of a trajectory from `start` before step k; 0 without any."""
         return max(k - (round(start.t / self._dt) + k) % len(self._memory.targets), 0)
 
-    def _measure(self, near: int, rows: int, meeting: int) -> None:
+    def _measure(self) -> None:
         """Compute the distances of a pose, as far as the kernels did not."""
         if not self._progress.measures_outside:
-            self.query.finish(near, rows, meeting)
+            self.query.finish()
             return
         query, s = self.query, self._progress
         query.place(self._obstacles.at(s.t_pose, self._prediction))

@@ -34,20 +34,22 @@ class ShakeDamping:
 
     def reset(self) -> None:
         """Drop what is known of earlier control steps."""
-        self._factor, self._calm = 1.0, 0
+        self.factor, self._calm = 1.0, 0
+        """Factor on λ [-]."""
         self._begin(None)
 
     def _begin(self, v: list[float] | None) -> None:
         """Begin an interval after a command v, or none."""
-        self._steps, self._change = 0, 0.0
+        self.is_idle, self._steps, self._change = v is None, 0, 0.0
+        """Whether no command has been taken in: nothing is lost while `update` is not called and no task is stalled."""
         self._v_first = self._v_last = v
 
     def apply(self, problem: Problem) -> Problem:
         """Return the problem with more regularization, if the robot has been shaking."""
-        if self._factor == 1.0 or problem.bent == 0.0:
+        if self.factor == 1.0 or problem.bent == 0.0:
             return problem
         most = _MAX_BENT * self._dt * float(np.linalg.norm(problem.tracking.b_feasible))
-        return problem._replace(bent=max(problem.bent, min(self._factor * problem.bent, most)))
+        return problem._replace(bent=max(problem.bent, min(self.factor * problem.bent, most)))
 
     def update(self, v: Array, feedforward: Array, stalled: bool) -> None:
         """Take in what is commanded.
@@ -57,7 +59,7 @@ class ShakeDamping:
             feedforward: rate of each near distance due to the obstacles (k,) [m/s].
             stalled: whether any task is.
         """
-        if not stalled and self._factor == 1.0:
+        if not stalled and self.factor == 1.0:
             self._begin(None)
             return
         if feedforward.any():
@@ -77,9 +79,9 @@ class ShakeDamping:
         """Change the factor at the end of an interval."""
         self._calm = 0 if stalled else self._calm + 1
         if stalled and shakes:
-            self._factor = min(2.0 * self._factor, _MAX_FACTOR)
+            self.factor = min(2.0 * self.factor, _MAX_FACTOR)
         elif self._calm == _CALM:
-            self._factor, self._calm = max(0.5 * self._factor, 1.0), 0
+            self.factor, self._calm = max(0.5 * self.factor, 1.0), 0
 
 
 def _difference(v: list[float], other: list[float]) -> float:

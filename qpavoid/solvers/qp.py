@@ -45,6 +45,11 @@ class Qp(NamedSolver):
         if self._native:
             _warm_up()
 
+    @property
+    def compiled_regularization(self) -> float:  # type: ignore[override]
+        """λ, unless the QP is left to a back end, or a class of this one has another `solve`."""
+        return float(self.config.regularization) if self._native and type(self).solve is Qp.solve else 0.0
+
     def solve(self, problem: Problem) -> Solution:
         """Return the closest safe velocity; relaxed where there is none; a stop where that fails too."""
         if problem.violation <= 0.0:

@@ -23,6 +23,11 @@ class Solver:
     """Whether it tracks `Problem.levels` in their order, so that `Problem.cascade` is there, and v_tracking is the last
     velocity of it."""
 
+    compiled_regularization: float = 0.0
+    """λ of a law that is v_tracking where `Problem.violation` is not positive, and else the QP of `kernels.project`: a
+    control step then solves it by itself, and calls `solve` where that QP is infeasible or a check fails; 0 of all
+    others."""
+
     def solve(self, problem: Problem) -> Solution:
         """Return the velocity of one control step; never raise on a well-formed problem.
 
@@ -65,7 +70,7 @@ def check_solver(solver: Solver, contacts: bool) -> None:
         ConfigError: it lacks something of `Solver`, or does not hold contacts.
     """
     try:
-        _ = solver.solve, solver.bounded, solver.prioritised, solver.low_effort
+        _ = solver.solve, solver.bounded, solver.prioritised, solver.low_effort, solver.compiled_regularization
         cannot_hold = contacts and not solver.holds_contacts
     except AttributeError as error:
         name = type(solver).__name__

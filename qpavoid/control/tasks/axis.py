@@ -9,7 +9,7 @@ import numpy as np
 
 from qpavoid import config
 from qpavoid.control.inputs import FARTHEST
-from qpavoid.control.tasks.base import Constant, RowTask, Target, frame_jacobian, frame_pose, length
+from qpavoid.control.tasks.base import Constant, RowTask, Target, frame_pose, length
 from qpavoid.control.tasks.start import Start
 from qpavoid.errors import ConfigError
 from qpavoid.model.kinematics import ForwardKinematics
@@ -38,14 +38,14 @@ class Axis(RowTask):
         else:
             motion = Constant(_unit(settings.direction, f"{start.where}.direction"))
         super().__init__(settings, motion, 2, (start.frame_id(settings.frame),))
-        self._model, self._gain = start.robot.model, settings.gain
+        self._gain = settings.gain
         self._axis = _unit(settings.axis, f"{start.where}.axis")
 
     def write_rows(self, q: Array, kinematics: ForwardKinematics, target: Any, A: Array, b: Array) -> float:
         """See `RowTask.write_rows`."""
         (frame_id,) = self.frame_ids
         x, R = frame_pose(kinematics, frame_id)
-        J = frame_jacobian(self._model, kinematics, frame_id)
+        J = kinematics.frame_jacobian(frame_id)
         direction = target.position - x if self._looks else target
         distance = max(length(direction), 1e-6)
         d, a = direction / distance, R @ self._axis

@@ -6,7 +6,6 @@ from math import hypot
 from typing import Any, Protocol
 
 import numpy as np
-import pinocchio as pin
 
 from qpavoid import config
 from qpavoid.errors import NumericalError
@@ -93,11 +92,6 @@ class RowTask:
     def fault(self, target: Any) -> str:
         """Say why a target that is no `Sample` cannot be true; nothing if it can."""
         return ""
-
-
-def frame_jacobian(model: Any, kinematics: ForwardKinematics, frame_id: int) -> Array:
-    """(6, nv) velocity of a frame's origin and its angular velocity, in world axes."""
-    return np.asarray(pin.getFrameJacobian(model, kinematics.data, frame_id, pin.LOCAL_WORLD_ALIGNED))
 
 
 def frame_pose(kinematics: ForwardKinematics, frame_id: int) -> tuple[Array, Array]:

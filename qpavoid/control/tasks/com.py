@@ -19,8 +19,8 @@ class Com(RowTask):
     """Centre of mass of the robot, world."""
 
     def __init__(self, settings: config.ComTask, start: Start) -> None:
-        name, self._model, self._gain = start.robot.name, start.robot.model, settings.gain
-        if not pin.computeTotalMass(self._model) > 0.0:
+        name, self._gain = start.robot.name, settings.gain
+        if not pin.computeTotalMass(start.robot.model) > 0.0:
             raise ConfigError(f"{start.where}: {name} has no mass, so no centre of mass; give its links inertias")
         here = pin.SE3(np.eye(3), start.data.com[0])
         super().__init__(settings, start.motion(settings.motion, here), len(settings.axes))
@@ -28,7 +28,7 @@ class Com(RowTask):
     def write_rows(self, q: Array, kinematics: ForwardKinematics, target: Any, A: Array, b: Array) -> float:
         """See `RowTask.write_rows`."""
         n = self.rows
-        J = pin.jacobianCenterOfMass(self._model, kinematics.data, False)
-        error = (target.position - kinematics.data.com[0])[:n]
+        center, J = kinematics.center_of_mass()
+        error = (target.position - center)[:n]
         self._scale_into(A, b, J[:n], target.linear[:n] + self._gain * error)
         return length(error)

@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from qpavoid import config
-from qpavoid.control.tasks.base import PARTS, RowTask, frame_jacobian, frame_pose, length
+from qpavoid.control.tasks.base import PARTS, RowTask, frame_pose, length
 from qpavoid.control.tasks.start import Start
 from qpavoid.kernels.rotation import rotation_vector
 from qpavoid.model.kinematics import ForwardKinematics
@@ -28,12 +28,12 @@ class Relative(RowTask):
         super().__init__(settings, motion, len(scale), (a, b))
         self.moves = settings.rows != "orientation"
         self.scale, self.unit = scale, "m" if self.moves else "rad"
-        self._model, self._part, self._gain = start.robot.model, PARTS[settings.rows], settings.gain
+        self._part, self._gain = PARTS[settings.rows], settings.gain
 
     def write_rows(self, q: Array, kinematics: ForwardKinematics, target: Any, A: Array, b: Array) -> float:
         """See `RowTask.write_rows`."""
         (x_a, R_a), (x_b, R_b) = (frame_pose(kinematics, i) for i in self.frame_ids)
-        J_a, J = (frame_jacobian(self._model, kinematics, i) for i in self.frame_ids)
+        J_a, J = (kinematics.frame_jacobian(i) for i in self.frame_ids)
         J -= J_a
         J[:3] += pin.skew(x_b - x_a) @ J_a[3:]  # -ω × r = r × ω
         missing = target.rotation @ (R_a.T @ R_b).T
