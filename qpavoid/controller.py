@@ -41,8 +41,6 @@ _NO_BACKUP_WITH_CONTACTS = Reason.of(
     ReasonKind.NO_BACKUP, "contacts", detail="backup trajectories do not hold contacts: avoidance.backup"
 )
 """Assumption where obstacles move and the robot stands on something."""
-
-
 _WARM_UP = "a passing obstacle, to warm up"
 
 
@@ -292,8 +290,6 @@ class Controller(SceneChanges, SplitStep):
         planning = self._planning if from_tasks else None
         if step.resumed:
             arbiter.reset()
-            if planning is not None:
-                planning.reset()
         if step.faults:
             solution = arbiter.stop(step.faults)
         elif planning is not None:
@@ -318,11 +314,10 @@ class Controller(SceneChanges, SplitStep):
             raise NumericalError(str(faults[0]))
         self._builder.reset(v)
         self._arbiter.reset()
-        if self._planning is not None:
-            self._planning.reset()
+        self._scene_changed("")
 
     def _scene_changed(self, method: str, *arguments: Any) -> None:
-        """Let forecasts know of a change of the scene."""
+        """Drop all plans, and let forecasts know of a change of the scene."""
         if self._planning is not None:
             self._planning.change_scene(method, *arguments)
 

@@ -99,13 +99,15 @@ class Replanning:
         self._pending = self._question = None
 
     def change_scene(self, method: str, *arguments: Any) -> None:
-        """Change the scene of forecasts like that of the controller; what was planned in it is dropped."""
-        if self._worker is not None:
+        """Change the scene of forecasts like that of the controller, if at all; what was planned is dropped."""
+        if self._worker is not None and method:
             self._worker.change(method, *arguments)
         self.reset()
 
     def decide(self, step: StepProblem) -> Solution:
         """Return the solution of a step, and look ahead from it where that is due."""
+        if step.resumed:
+            self.reset()
         drive, worker, dt = self._driver.drive, self._worker, self._settings.dt
         if self._pending is not None and step.t > self._pending.t + dt:  # steps were left out, or stops
             self._pending, self._next_look = None, step.t
