@@ -99,8 +99,8 @@ class Controller(SceneChanges, SplitStep):
         self.dt = dt
         self.tasks: tuple[RowTask, ...] = (*frames, *others)
         """Frames with a position to follow, then with an orientation alone, then all other tasks."""
-        law, self._has_contacts = make_solver(solver) if isinstance(solver, str) else solver, contacts is not None
-        check_solver(law, self._has_contacts)
+        law, self.has_contacts = make_solver(solver) if isinstance(solver, str) else solver, contacts is not None
+        check_solver(law, self.has_contacts)
         self.avoidance, self.limits = avoidance or Avoidance(), limits or Limits()
         self._v_shape, self._no_backup = (scene.robot.model.nv,), tuple[Reason, ...]()
         if contacts is not None and self.avoidance.backup:
@@ -128,11 +128,6 @@ class Controller(SceneChanges, SplitStep):
         """Time to lay out memory and run the first steps, compilation included [s]; no later step compiles."""
 
     @property
-    def has_contacts(self) -> bool:
-        """Whether the robot stands on contacts that its velocities hold."""
-        return self._has_contacts
-
-    @property
     def solver(self) -> Solver:
         """The law, which may be exchanged between steps.
 
@@ -143,7 +138,7 @@ class Controller(SceneChanges, SplitStep):
 
     @solver.setter
     def solver(self, law: Solver) -> None:
-        check_solver(law, self._has_contacts)
+        check_solver(law, self.has_contacts)
         self._arbiter.solver = law
         self._builder.rows.adapt(law, self.avoidance.look_ahead)
         if self._planning is not None:

@@ -228,7 +228,7 @@ def test_reasons_say_why_there_is_no_path():
     goal = home + np.array([np.pi / 2, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     path = plan_to(blocked, home, goal, settings=SETTINGS)
     assert not path and path.reason.kind is ReasonKind.GOAL_TOO_NEAR and "block" in path.reason.subject
-    few, far = replace(SETTINGS, max_nodes=2), home + np.array([-0.9 * np.pi, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    few, far = replace(SETTINGS, max_checks=1), home + np.array([-0.9 * np.pi, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     path = plan_to(build_scene(robot, shelf()), home, far, settings=few)
     assert not path and path.reason.kind is ReasonKind.NO_PATH and path.reason.amount == path.checks > 0
 

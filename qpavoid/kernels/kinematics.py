@@ -116,16 +116,16 @@ def _local_pose(x: KinematicsArrays, i: int, q: Array, pose: Array) -> None:
     kind, k, placement = x.kind[i], x.q_index[i], x.placements[i]
     if kind == REVOLUTE:
         angle = x.multiplier[i] * q[k] + x.origin[i]
-        _turn(placement, x.turns[i], np.cos(angle), np.sin(angle), pose)
+        turn(placement, x.turns[i], np.cos(angle), np.sin(angle), pose)
     elif kind == UNBOUNDED:
-        _turn(placement, x.turns[i], q[k], q[k + 1], pose)
+        turn(placement, x.turns[i], q[k], q[k + 1], pose)
     elif kind == PRISMATIC:
         length = x.multiplier[i] * q[k] + x.origin[i]
         pose[:9] = placement[:9]
         for r in range(3):
             pose[9 + r] = placement[9 + r] + length * x.slides[i, r]
     elif kind == PLANAR:
-        _turn(placement, x.turns[i], q[k + 2], q[k + 3], pose)
+        turn(placement, x.turns[i], q[k + 2], q[k + 3], pose)
         _shift(placement, q[k], q[k + 1], 0.0, pose)
     else:
         if kind == TRANSLATION:
@@ -139,7 +139,7 @@ def _local_pose(x: KinematicsArrays, i: int, q: Array, pose: Array) -> None:
 
 
 @compiled
-def _turn(placement: Array, turns: Array, cos: float, sin: float, pose: Array) -> None:
+def turn(placement: Array, turns: Array, cos: float, sin: float, pose: Array) -> None:
     """Write a placement (12,) that is turned about the axis of its joint."""
     for c in range(9):
         pose[c] = placement[c] + sin * turns[0, c] + (1.0 - cos) * turns[1, c]

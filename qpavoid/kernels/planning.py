@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from qpavoid.kernels.distances import TO_HALF_SPACE, pair_distance
-from qpavoid.kernels.kinematics import update_kinematics
-from qpavoid.kernels.near_pairs import place_bodies, place_body
+from qpavoid.kernels.kinematics import REVOLUTE, compose, turn
+from qpavoid.kernels.near_pairs import place_body
 from qpavoid.kernels.packing import compiled, inlined
 from qpavoid.kernels.pose_fit import extrapolate
 from qpavoid.problem import Array, IntArray
@@ -113,11 +113,12 @@ class PlanningArrays(NamedTuple):
 def place(x: Any, q: Array, t: float) -> None:
     """Write the poses of all bodies at coordinates q (n,), and of moving obstacles at t [s]."""
     d = x.distances
-    update_kinematics(x.kinematics, q)
-    place_bodies(d, x.joint_poses)
+    _place_joints(x.kinematics, q)
     joints, poses, local, centers = d.joints, d.poses, d.local, d.centers
+    joint_poses, placements = x.joint_poses, d.placements
     for i in range(len(joints)):
         if joints[i] >= 0:
+            compose(joint_poses[joints[i]], placements[i], poses[i])
             for r in range(3):
                 rotated = poses[i, r] * local[i, 0] + poses[i, 3 + r] * local[i, 1] + poses[i, 6 + r] * local[i, 2]
                 centers[i, r] = rotated + poses[i, 9 + r]
@@ -127,6 +128,24 @@ def place(x: Any, q: Array, t: float) -> None:
         extrapolate(x.state, t)
         for g in range(d.first[o], d.first[o + 1]):
             place_body(d, g, x.state)
+
+
+@compiled
+def _place_joints(kinematics: Any, q: Array) -> None:
+    """Write the poses of all joints, which are angles and lengths: `update_kinematics` of these, twice as fast."""
+    kind, parents, index, slides = kinematics.kind, kinematics.parents, kinematics.q_index, kinematics.slides
+    multiplier, origin, placements = kinematics.multiplier, kinematics.origin, kinematics.placements
+    turns, local_poses, joint_poses = kinematics.turns, kinematics.local_poses, kinematics.joint_poses
+    for i in range(1, len(parents)):
+        value = multiplier[i] * q[index[i]] + origin[i]
+        if kind[i] == REVOLUTE:
+            turn(placements[i], turns[i], np.cos(value), np.sin(value), local_poses[i])
+        else:
+            for c in range(12):
+                local_poses[i, c] = placements[i, c]
+            for r in range(3):
+                local_poses[i, 9 + r] += value * slides[i, r]
+        compose(joint_poses[parents[i]], local_poses[i], joint_poses[i])
 
 
 @compiled

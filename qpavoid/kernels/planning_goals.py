@@ -156,10 +156,11 @@ def clear_goals(
     t: float,
     need: Array,
     tolerance: float,
-    tries: int,
     most: int,
     seed: int,
-) -> tuple[Array, int]:
+    attained: Array,
+    counts: IntArray,
+) -> Array:
     """Find configurations that attain some targets and are clear.
 
     Searches start at a configuration, then at random ones, farther and farther from it.
@@ -171,32 +172,44 @@ def clear_goals(
         t: time of the goals [s].
         need: distance that each pair needs (k,) [m].
         tolerance: see `attain`.
-        tries: number of searches.
         most: number of goals after which no more are looked for.
         seed: of the draws.
+        attained: results of all searches for these targets (s, n), clear or not; s is how many are made.
+        counts: how many searches were made, and how many attained the targets (2,), in and out.
 
     Returns:
-        Goals (g, n), the one with the least travel from `near` first; number of searches that attained the targets.
+        Goals (g, n), the one next to `near` first.
     """
-    n, count, attained = len(near), 0, 0
-    goals, travel, q = np.empty((most, n)), np.empty(most), np.empty(n)
-    for number in range(tries):
-        s = np.sqrt(number / tries)
-        for i in range(n):
-            u = draw(seed, number * n + i)
-            q[i] = near[i] + s * (x.lower[i] + u * (x.upper[i] - x.lower[i]) - near[i])
-        if not attain(x, targets, tolerance, q):
-            continue
-        attained += 1
-        if not is_clear(x, q, t, need):
-            continue
-        is_new = True
+    n, count, number = len(near), 0, 0
+    goals, travel = np.empty((most, n)), np.empty(most)
+    while count < most:
+        if number == counts[1] and not _search_on(x, targets, near, tolerance, seed, attained, counts):
+            break
+        q = attained[number]
+        number += 1
+        is_new = is_clear(x, q, t, need)
         for k in range(count):
             is_new = is_new and travel_between(x, q, goals[k]) > _SAME
         if is_new:
             goals[count], travel[count] = q, travel_between(x, q, near)
             count += 1
-            if count == most:
-                break
     order = np.argsort(travel[:count])
-    return goals[:count][order], attained
+    return goals[:count][order]
+
+
+@compiled
+def _search_on(
+    x: Any, targets: FrameTargets, near: Array, tolerance: float, seed: int, attained: Array, counts: IntArray
+) -> bool:
+    """Append one more configuration that attains the targets; return False once all searches are made."""
+    n, tries = len(near), len(attained)
+    while counts[0] < tries:
+        s, q = np.sqrt(counts[0] / tries), attained[counts[1]]
+        for i in range(n):
+            u = draw(seed, counts[0] * n + i)
+            q[i] = near[i] + s * (x.lower[i] + u * (x.upper[i] - x.lower[i]) - near[i])
+        counts[0] += 1
+        if attain(x, targets, tolerance, q):
+            counts[1] += 1
+            return True
+    return False

@@ -16,8 +16,6 @@ DONE, NOT_ATTAINED, NO_CLEAR_GOAL, NO_PATH = range(4)
 """How a search ends; of several, the last one that applies."""
 BACK_OFF = 1e-3
 """What a pair may lose of the distance that it begins or ends with, where that is less than it should have [m]."""
-_FIRST_NODES = 300
-"""Nodes of the first trees: a long search is made with the least clearance alone."""
 _ENOUGH = 0.1
 """Distance beyond what a goal needs at least up to which its distances are of interest [m]."""
 
@@ -32,6 +30,7 @@ def search(
     arrival: float,
     needs: Array,
     least: Array,
+    first_nodes: int,
     max_nodes: int,
     max_checks: int,
     max_goals: int,
@@ -51,7 +50,9 @@ def search(
         arrival: time of the goals [s]; 0 where obstacles rest.
         needs: distances that the pairs need (c, k), tried in turn [m].
         least: distance that pairs need next to a given goal that has no more (k,) [m].
-        max_nodes: of the trees.
+        first_nodes: of the first trees, with each row of `needs`: a path with less clearance, if it is soon found, is
+            better than a long search.
+        max_nodes: of the last trees, with the last row.
         max_checks: of all configurations.
         max_goals: of targets.
         tries: searches for these.
@@ -64,25 +65,24 @@ def search(
         goals; how it ended.
     """
     n, levels, is_timed, nodes, ending = len(start), len(needs), arrival > 0.0, 0, NOT_ATTAINED
-    capacity = max(max_goals, len(goals))
-    ends, counts = np.zeros((levels, capacity, n + 1)), np.full(levels, -1)
-    root = np.zeros(n + 1)
+    ends, counts = np.zeros((levels, max(max_goals, len(goals)), n + 1)), np.full(levels, -1)
+    attained, searches, root = np.empty((tries, n)), np.zeros(2, np.intp), np.zeros(n + 1)
     root[:n] = start
     for attempt in range(levels + 1):
-        level, size = min(attempt, levels - 1), max_nodes if attempt == levels else min(max_nodes, _FIRST_NODES)
-        if (attempt == levels and max_nodes <= _FIRST_NODES) or x.checks[0] >= max_checks:
+        level, size = min(attempt, levels - 1), max_nodes if attempt == levels else min(max_nodes, first_nodes)
+        if x.checks[0] >= max_checks:
             break
         need = needs[level]
         if counts[level] < 0:
             if targets.rows > 0:
-                some, attained = clear_goals(x, targets, near, arrival, need, tolerance, tries, max_goals, seed)
+                some = clear_goals(x, targets, near, arrival, need, tolerance, max_goals, seed, attained, searches)
+                if searches[1] == 0:
+                    break
                 counts[level] = len(some)
                 ends[level, : len(some), :n] = some
-                if attained > 0:
-                    ending = max(ending, NO_CLEAR_GOAL)
             else:
-                ending = max(ending, NO_CLEAR_GOAL)
                 counts[level] = _given_goals(x, goals, arrival, need, least, ends[level])
+            ending = max(ending, NO_CLEAR_GOAL)
             ends[level, :, n] = arrival
         if counts[level] == 0:
             continue

@@ -44,13 +44,15 @@ class PlannerSettings:
     """Speed that they use at most [rad/s or m/s]."""
     longest: float = 1.0
     """Length of an edge of the search trees at most [m]: roughly the travel of the fastest point of the robot."""
-    max_nodes: int = 3000
-    """Of the trees of a search."""
+    first_nodes: int = 80
+    """Nodes of the first trees, with each clearance: a path with less, soon found, is better than a long search."""
+    max_nodes: int = 10_000
+    """Nodes of the last trees, with the least clearance."""
     max_checks: int = 200_000
     """Configurations that a plan checks before it ends: about half a second."""
     max_goals: int = 8
     """Goal configurations of targets."""
-    tries: int = 100
+    tries: int = 400
     """Searches for them."""
     shortcuts: int = 120
     """Straight motions that are tried in place of parts of a path."""
@@ -152,7 +154,7 @@ class Planner:
         for arrival in arrivals:
             points, level, nodes, count, ending = kernels.search(
                 plan, start, goals, targets, near, arrival, needs.copy(), np.minimum(least, needs.min(axis=0)),
-                max_nodes, s.max_checks, s.max_goals, s.tries, s.shortcuts, s.tolerance, seed,
+                s.first_nodes, max_nodes, s.max_checks, s.max_goals, s.tries, s.shortcuts, s.tolerance, seed,
             )  # fmt: skip
             if ending == DONE:
                 x_path = np.ascontiguousarray(points[:, :-1])
