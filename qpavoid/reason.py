@@ -149,7 +149,7 @@ _TEXTS: dict[str, str] = {
     "PRIORITY_UNSOLVED": "no back end could solve its QP",
     "NOT_PLANNED": "no path is planned",
     "START_TOO_NEAR": "a path would begin in contact, distance",
-    "GOAL_TOO_NEAR": "no goal of the path is clear, distance",
+    "GOAL_TOO_NEAR": "no goal of the path is clear",
     "NOT_ATTAINED": "no configuration attains the targets",
     "NO_PATH": "no path was found, checked configurations:",
 }

@@ -167,7 +167,7 @@ class Planner:
             return self._none(ReasonKind.GOAL_TOO_NEAR, distances, least)
         kind = {NOT_ATTAINED: ReasonKind.NOT_ATTAINED, NO_CLEAR_GOAL: ReasonKind.GOAL_TOO_NEAR}
         checks = int(x.checks[0])
-        reason = Reason.of(kind.get(ending, ReasonKind.NO_PATH), amount=checks, unit="-")
+        reason = Reason.of(kind[ending]) if ending in kind else Reason.of(ReasonKind.NO_PATH, amount=checks, unit="-")
         return no_path(self.scene, reason, checks, nodes, count)
 
     def clearance(self, q: Array) -> float:
