@@ -108,7 +108,7 @@ ROWS = {
 def through_an_obstacle(shape, row, dt, duration, speed=2.0, **fields):
     """A target that leaves the Panda's tool at some speed and leads through a body 20 mm from which it has to stay."""
     return scenario(
-        "panda",
+        "panda-capsules",
         {"type": "line", "displacement": [0.4, 0.05, -0.1], "speed": speed},
         [{"name": "it", "shape": shape, "motion": {"type": "fixed", "position": [0.55, 0.0, 0.45]}}],
         avoidance={"d1": 0.02, "d2": 0.10, **row},

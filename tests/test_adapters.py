@@ -209,7 +209,7 @@ def test_joints_in_another_order_among_others(panda):
     assert not G[:, [0, 8]].any() and len(G) == len(problem.avoidance.b) + 14
     out = VelocityFilter(own, joints)(q, 0.01 * v)
     np.testing.assert_array_equal(out, 0.01 * v)  # it is safe; what is no joint of the robot stays as it is
-    with pytest.raises(UnknownName, match=r"joint 'panda_joint1' of panda is not there"):
+    with pytest.raises(UnknownName, match=r"joint 'panda_joint1' of panda-capsules is not there"):
         JointMap.of_names(panda, ["gripper", "joint7"])
     with pytest.raises(ConfigError, match=r"dt: 0\.02 s, but the controller has 0\.01 s"):
         limit.inequalities(q, 0.02)

@@ -17,7 +17,7 @@ from qpavoid.config import Sphere
 
 ROOT, D1, DT = Path(__file__).parents[1], 0.03, 1.0 / 30.0
 SCENARIO = """
-robot: panda
+robot: panda-capsules
 dt: 0.01
 duration: 1.0
 tasks: [{frame: panda_hand_tcp, name: hand}]

@@ -195,7 +195,7 @@ def test_solver_of_the_user_may_hold_contacts(solo):
 def test_contacts_that_cannot_be_used_are_named(solo, panda):
     with pytest.raises(UnknownName, match=r"contacts: contacts\.0\.frame: .* has no frame 'FOOT'"):
         build_contacts([config.Contact(frame="FOOT")], solo, solo.home)
-    with pytest.raises(ConfigError, match="contacts leave panda no way to move"):
+    with pytest.raises(ConfigError, match="contacts leave panda-capsules no way to move"):
         pair = [config.Contact(frame="panda_hand"), config.Contact(frame="panda_link4", type="point")]
         build_contacts(pair, panda, random_q(panda, np.random.default_rng(0)))
 

@@ -15,6 +15,7 @@ from qpavoid import (
     Controller,
     Obstacle,
     Pose,
+    Robot,
     Sample,
     Solver,
     UnknownName,
@@ -71,12 +72,12 @@ print(hashlib.sha256(drive(make_controller(Robot.load("panda"))).tobytes()).hexd
 """
 
 
-def test_another_process_gives_the_same_commands(panda):
+def test_another_process_gives_the_same_commands():
     import hashlib
 
     arguments = [path for path in sys.path if path]
     done = subprocess.run([sys.executable, "-c", PROGRAM, *arguments], capture_output=True, text=True, check=True)
-    assert done.stdout.split()[-1] == hashlib.sha256(drive(make_controller(panda)).tobytes()).hexdigest()
+    assert done.stdout.split()[-1] == hashlib.sha256(drive(make_controller(Robot.load("panda"))).tobytes()).hexdigest()
 
 
 # --- clones ---------------------------------------------------------------------------------------------------------

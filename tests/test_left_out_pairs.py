@@ -12,7 +12,7 @@ from qpavoid import Controller, Robot, Sample, build_scene, build_tasks
 from qpavoid.config import Task
 from qpavoid.model.notes import NoteKind
 from qpavoid.model.pairs import D1
-from qpavoid.setup.add import DescribeOptions, describe
+from qpavoid.setup.add import PROTRUSION, WRIST_PROTRUSION, DescribeOptions, describe
 from qpavoid.setup.check import check_robot
 from qpavoid.setup.home import HOME_CLEARANCE, MIN_CONDITIONING
 from qpavoid.setup.sampling import touching
@@ -162,8 +162,12 @@ def test_no_collision_is_unseen(tmp_path, name):
 
 @pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
 def test_the_size_of_a_robot_does_not_matter(tmp_path, scale):
-    """What is near by design is judged beside the robot's size: the hand strikes the forearm in a fifth of samples."""
-    path, described = made(tmp_path, "wrist", tiny(WRIST, scale))
+    """What is near by design is judged beside the robot's size, with bodies as tight for it: the hand strikes the
+    forearm in a fifth of samples.
+    """
+    path, described = made(
+        tmp_path, "wrist", tiny(WRIST, scale), protrusion=scale * PROTRUSION, wrist_protrusion=scale * WRIST_PROTRUSION
+    )
     names = [body.name for body in described.robot.bodies.geometryObjects]
     pairs = {frozenset((names[p.first], names[p.second])) for p in described.robot.bodies.collisionPairs}
     assert pairs == {frozenset(("forearm", "hand"))}

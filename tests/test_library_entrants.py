@@ -83,7 +83,7 @@ def test_adapter_frames_and_distances_equal_scene(library, name):
         with pytest.raises(ConfigError, match="a Convex cannot be"):
             start(library, name)
         return
-    _, world, pilot = start(library, name)
+    _, world, pilot = start(library, name, *(["robot=panda-capsules"] if name == "panda_line" else []))
     model, t = world.scene.robot.model, 2.5
     q = pin.integrate(model, world.q0, 0.1 * np.random.default_rng(1).uniform(-1.0, 1.0, model.nv))
     moved = {o.name: o.motion.sample(t) for o in world.scene.obstacles if o.moves and library != "embodik"}

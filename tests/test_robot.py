@@ -173,10 +173,10 @@ def test_unknown_names_at_run_time(panda):
     with pytest.raises(UnknownName, match=r"file: q0: no joint 'panda_jiont3'; did you mean 'panda_joint3'\?"):
         panda.configuration({"panda_jiont3": 0.0}, "file: q0")
     with pytest.raises(
-        UnknownName, match=r"file: lock: panda has no joint 'panda_jo1nt3'; did you mean 'panda_joint3'\?"
+        UnknownName, match=r"file: lock: panda-capsules has no joint 'panda_jo1nt3'; did you mean 'panda_joint3'\?"
     ):
         panda.lock(["panda_jo1nt3"], panda.home, "file: lock")
-    with pytest.raises(UnknownName, match=r"file: frame: panda has no frame 'panda_hnd'; did you mean 'panda_hand'\?"):
+    with pytest.raises(UnknownName, match=r"panda-capsules has no frame 'panda_hnd'; did you mean 'panda_hand'\?"):
         panda.frame_id("panda_hnd", "file: frame")
     with pytest.raises(UnknownName, match=r"unknown robot 'pandaa'; did you mean 'panda'\?"):
         Robot.load("pandaa")

@@ -152,9 +152,15 @@ def test_manipulability_row_is_the_gradient(case, part):
 @pytest.mark.parametrize(
     ("block", "message"),
     [
-        (config.Task(frame="panda_hand_tpc"), "tasks.0.frame: panda has no frame 'panda_hand_tpc'; did you mean"),
-        (config.RelativeTask(frame="panda_hand", relative_to="x"), "tasks.0.relative_to: panda has no frame 'x'"),
-        (config.PostureTask(joints=["elbow"]), "tasks.0.joints: panda has no joint 'elbow'"),
+        (
+            config.Task(frame="panda_hand_tpc"),
+            "tasks.0.frame: panda-capsules has no frame 'panda_hand_tpc'; did you",
+        ),
+        (
+            config.RelativeTask(frame="panda_hand", relative_to="x"),
+            "tasks.0.relative_to: panda-capsules has no frame 'x'",
+        ),
+        (config.PostureTask(joints=["elbow"]), "tasks.0.joints: panda-capsules has no joint 'elbow'"),
         (config.PostureTask(q={"panda_joint9": 1.0}), "tasks.0.q: no joint 'panda_joint9'; did you mean"),
         (config.AlignTask(frame="panda_hand", direction=(0, 0, 0)), "tasks.0.direction has no length"),
         (config.LookAtTask(frame="panda_hand", axis=(0, 0, 0), motion=STILL), "tasks.0.axis has no length"),
