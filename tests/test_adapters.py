@@ -207,6 +207,7 @@ def test_joints_in_another_order_among_others(panda):
     problem = own.rows(panda.home)
     np.testing.assert_allclose(G[14] @ v - h[14] / DT, problem.avoidance.b[0] - problem.avoidance.J[0] @ joints.v(v))
     assert not G[:, [0, 8]].any() and len(G) == len(problem.avoidance.b) + 14
+    assert not joints.merged(np.zeros(7), np.full(9, np.nan)).any()  # a NaN that is not the robot's is rest
     out = VelocityFilter(own, joints)(q, 0.01 * v)
     np.testing.assert_array_equal(out, 0.01 * v)  # it is safe; what is no joint of the robot stays as it is
     with pytest.raises(UnknownName, match=r"joint 'panda_joint1' of panda-capsules is not there"):

@@ -105,8 +105,11 @@ class JointMap:
         return v
 
     def merged(self, v: Array, values: Any) -> Array:
-        """Return velocities of the other program, with those of the robot replaced by v (nv,)."""
-        out = np.array(values, dtype=np.float64)
+        """Return velocities of the other program, with those of the robot replaced by v (nv,).
+
+        Joints that are not the robot's rest where their velocity is NaN or infinite.
+        """
+        out = np.nan_to_num(np.array(values, dtype=np.float64), nan=0.0, posinf=0.0, neginf=0.0)
         out[self._v_from] = v
         if self._has_base:
             out[self._v_from[:3]] = self._R @ v[:3]
