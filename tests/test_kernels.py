@@ -385,6 +385,7 @@ def test_velocity_bounds_by_hand():
     assert run("velocity_bounds", x, q) == -3.0
     np.testing.assert_allclose(x.lower, [-2.0, -3.0, -4.0, -inf, -inf, 0.2])
     np.testing.assert_allclose(x.upper, [2.0, 0.5, -0.2, inf, 35.0, 5.0])
+    np.testing.assert_allclose(x.centering, [0.0, -0.99, -1.0, 0.0, 0.0, 1.0])
 
 
 def random_limits(rng, nv, jerks):

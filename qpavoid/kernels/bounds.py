@@ -44,7 +44,8 @@ def velocity_bounds(x: Any, q: Array) -> float:
         slowest = -x.v_recovery[j]
         below, above = position - x.q_lower[i], x.q_upper[i] - position
         margin = min(margin, below, above)
-        x.centering[j] = min(max((above - below) / (x.q_upper[i] - x.q_lower[i]), -1.0), 1.0)
+        width = x.q_upper[i] - x.q_lower[i]
+        x.centering[j] = min(max((above - below) / width, -1.0), 1.0) if width < np.inf else 0.0
         if step < np.inf:
             faster, slower = min(step, x.dv_step[j] + x.dv_prev[j]), min(step, x.dv_step[j] - x.dv_prev[j])
             back_up, back_down = max(x.position_rate * below, slowest), max(x.position_rate * above, slowest)

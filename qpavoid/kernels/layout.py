@@ -170,7 +170,7 @@ class RowLayout(NamedTuple):
     upper: Array
     """(n,) out: upper bound from the same."""
     centering: Array
-    """(n,) out: towards the middle of each coordinate's range, over half of it; zero without position limits [-]."""
+    """(n,) out: towards the middle of a coordinate's range, over half of it; zero without two position limits [-]."""
     v_stop: Array
     """(n,) out: the next velocity of a stop: all coordinates slowed by one factor, as fast as their limits allow."""
     # --- answer of the tracking law
