@@ -446,7 +446,8 @@ def test_an_srdf_is_honoured_and_its_pairs_are_kept(panda_described, tmp_path):
 
 def test_home_and_locks_may_be_wished():
     urdf = EXAMPLES / "ur_description/urdf/ur5_robot.urdf"
-    options = DescribeOptions(home={"elbow_joint": 1.57, "wrist_3_joint": 0.5}, lock=["wrist_3*"], samples=10)
+    wishes = {"home": {"elbow_joint": 1.57, "wrist_3_joint": 0.5}, "lock": ["wrist_3*"]}
+    options = DescribeOptions(**wishes, samples=10, protrusion=0.1, wrist_protrusion=0.1)
     config = describe(urdf, options).config
     assert config.home["elbow_joint"] == 1.57 and config.lock == {"wrist_3_joint": 0.5}
     with pytest.raises(UnknownName, match=r"--home: no joint 'elbow'; did you mean 'elbow_joint'"):
