@@ -191,7 +191,7 @@ class PlanLayout:
         self.pairs: IntArray = np.flatnonzero(selected)
         """(k,) numbers of the pairs that count."""
         first, second = self.first, self.second = np.ascontiguousarray(scene.pairs[self.pairs].T, dtype=np.intp)
-        levers = self._body_levers()
+        levers = self.body_lever = self._body_levers()
         rows = np.abs(table.support[self.pairs]) * (levers[first] + levers[second])
         folded = np.zeros((len(rows), self._model.nv))
         np.add.at(folded.T, self._columns, rows.T)
@@ -276,6 +276,8 @@ class PlanLayout:
             cloud=self.cloud,
             row=self.row,
             lever=self.lever,
+            body_lever=self.body_lever,
+            factors=self._levers,
             obstacle=self.obstacle,
             point_speed=np.append(np.where(clouds, 0.0, point_speed), 0.0),
             moving=np.flatnonzero((point_speed > 0.0) & ~clouds),
@@ -286,7 +288,7 @@ class PlanLayout:
             cloud_start=cloud_start,
             columns=self._columns,
             frame_support=support,
-            **scratch(self._model.nv, len(self.lever), len(self.pairs)),
+            **scratch(self._model.nv, len(self.lever), len(self.pairs), len(self.body_lever), self._model.njoints),
         )
 
     def _voxels(self, states: Array) -> tuple[Array, Array, IntArray, IntArray]:
