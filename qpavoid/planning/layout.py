@@ -114,10 +114,11 @@ class PlanLayout:
         there and the points; where it has no limits, half a turn to both sides of the first point.
         """
         low, high, turning = points.min(axis=0), points.max(axis=0), np.isinf(self._lower)
-        angle = np.zeros(len(low), dtype=bool)
-        angle[self._columns[self._turns]] = True
-        lower = np.where(angle, np.maximum(self._lower, -np.pi), self._lower)
-        upper = np.where(angle, np.minimum(self._upper, np.pi), self._upper)
+        winding = np.zeros(len(low), dtype=bool)
+        winding[self._columns[self._turns]] = True
+        winding &= self._upper - self._lower > 2.0 * np.pi
+        lower = np.where(winding, np.maximum(self._lower, -np.pi), self._lower)
+        upper = np.where(winding, np.minimum(self._upper, np.pi), self._upper)
         lower[turning], upper[turning] = points[0, turning] - np.pi, points[0, turning] + np.pi
         return np.minimum(lower, low), np.maximum(upper, high)
 

@@ -42,7 +42,7 @@ class PlannerSettings:
     """Fraction of the joints' speed limits that the times of a path use [-]."""
     max_speed: float = 1.8
     """Speed that they use at most [rad/s or m/s]."""
-    longest: float = 1.0
+    longest: float = 0.5
     """Length of an edge of the search trees at most [m]: roughly the travel of the fastest point of the robot."""
     first_nodes: int = 80
     """Nodes of the first trees, with each clearance: a path with less, soon found, is better than a long search."""

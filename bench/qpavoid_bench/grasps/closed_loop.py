@@ -84,7 +84,7 @@ def to_case(problem: Problem) -> Case:
         robot=problem.robot_name,
         q0=problem.q_start.tolist(),
         duration=DURATION,
-        tasks=goals,
+        tasks=[*goals],
         obstacles=obstacles,
         avoidance=Avoidance(d1=REQUIRED),
     )
