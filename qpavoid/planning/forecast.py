@@ -17,6 +17,7 @@ from qpavoid.control.obstacle_states import ObstacleStates
 from qpavoid.control.scene_changes import SceneChanges
 from qpavoid.control.settings import ControlSettings
 from qpavoid.control.tasks import FrameTask, RowTask
+from qpavoid.control.tasks.relative import Relative
 from qpavoid.control.trajectories import extrapolate
 from qpavoid.model.sample import Sample
 from qpavoid.model.trajectory import Trajectory
@@ -194,13 +195,16 @@ class Forecaster(SceneChanges):
         return tracker.current._replace(states=states)
 
     def targets_at(self, start: Snapshot, t: float) -> dict[str | tuple[str, str], Any]:
-        """Return targets of the frames at a time [s]: poses, or positions or orientations alone."""
+        """Return targets of the frames at a time [s], in the axes of the world or of another frame."""
         targets: dict[str | tuple[str, str], Any] = {}
         for task in self._tasks:
-            if isinstance(task, FrameTask):
+            if isinstance(task, FrameTask | Relative):
                 target = start.targets.get(task.settings.label) or task.motion.sample(t)
+                block, is_relative = task.settings, isinstance(task, Relative)
+                turns = block.rows != "position" if is_relative else task.turns
                 only = target.position if task.moves else target.rotation
-                targets[task.settings.frame] = target if task.moves and task.turns else only
+                key = (block.frame, block.relative_to) if is_relative else block.frame
+                targets[key] = target if task.moves and turns else only
         return targets
 
     def _restart(self, start: Snapshot) -> None:

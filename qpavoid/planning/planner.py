@@ -130,7 +130,7 @@ class Planner:
         self._distances.arrays.guesses[:] = 0.0  # so that nothing depends on earlier plans
         states = self._distances.arrays.states.copy()
         if arrivals and (refusal := self._refuse_times(states)):
-            return no_path(self.scene, Reason.of(ReasonKind.NOT_PLANNED, detail=refusal))
+            return no_path(self.scene, Reason.of(ReasonKind.NO_PLAN, detail=refusal))
         x = layout.arrays(states, np.vstack((*points, *ends)), self._speed, s.longest, frames)
         return self._search(
             x, start, ends, poses or NO_TARGETS, points[-1], tuple(arrivals) or (0.0,), seed & _SEED,
