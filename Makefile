@@ -9,7 +9,7 @@ run: .venv/run
 	  --solvers tracking,eq10-literal,eq10,qp --out out
 
 view: .venv/view
-	$(BIN)/qpavoid view panda_ball
+	$(BIN)/qpavoid view panda_drag
 
 figures: run
 	cp out/five_spheres_compare_time.png out/five_spheres_qp_motion.png docs/figures/

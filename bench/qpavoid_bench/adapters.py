@@ -1,4 +1,4 @@
-"""`qpavoid bench adapters`: what each adapter adds to a control step, and how much of that is conversion of messages."""
+"""`qpavoid bench adapters`: what each adapter adds to a control step, and how much of that is conversion."""
 
 from __future__ import annotations
 
@@ -87,16 +87,17 @@ class _Case:
 def _sections(steps: int) -> Iterator[str]:
     yield "# Adapters"
     yield (
-        f"Medians of {steps} steps of each, without the time of the controller's own call in them; a Panda beside a ball "
-        f"that goes up and down. {describe_machine('qpavoid', 'numpy', 'pin-pink', 'mink', 'roboplan', 'mujoco')}; "
+        f"Medians of {steps} steps of each, without the time of the controller's own call in them; a Panda beside a "
+        f"ball that goes up and down. "
+        f"{describe_machine('qpavoid', 'numpy', 'pin-pink', 'mink', 'roboplan', 'mujoco')}; "
         f"load of the machine: {os.getloadavg()[0]:.1f}."
     )
     robot = Robot.load("panda")
     rows = [case.row(steps) for make in _MAKERS for case in make(robot)]
     yield table(["a step of", "adds [µs]", "of which conversion [µs]", "the rest [µs]"], rows)
     yield (
-        "Conversion: configurations, velocities, rows and poses from the form and order of the other program, and back. "
-        "The rest is what the adapter decides and remembers."
+        "Conversion: configurations, velocities, rows and poses from the form and order of the other program, and "
+        "back. The rest is what the adapter decides and remembers."
     )
 
 
@@ -256,7 +257,7 @@ def _ros(robot: Robot) -> Iterator[_Case]:
     def convert(k: int) -> None:
         t = k * _DT
         node.joint_state(robot.joint_names, q, t)
-        node.obstacle("ball", _ball(k).position, (0.0, 0.0, 0.0, 1.0), t)
+        node.obstacle("ball", _ball(k).position.tolist(), (0.0, 0.0, 0.0, 1.0), t)
         node.desired(robot.joint_names, v, t)
 
     def step(k: int) -> None:

@@ -37,6 +37,7 @@ app = typer.Typer(
     add_completion=False,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # which takes units in brackets for markup
     help="Compare solvers on families of scenarios: the arena.",
 )
 
