@@ -38,6 +38,7 @@ from qpavoid.kernels.rollout import (
     TO_MOVE,
     RolloutArrays,
 )
+from qpavoid.kernels.rollout_pairs import PairMemory
 from qpavoid.model.kinematics import ForwardKinematics, max_lever_arm
 from qpavoid.model.limits import JointBounds
 from qpavoid.problem import Array, Mask
@@ -179,6 +180,22 @@ class BackupRollouts:
             v_pose=np.zeros(model.nv),
             enabled=self.enabled,
             states=self._obstacles.current.states.copy(),
+            pairs=self._lay_out_pairs(),
+        )
+
+    def _lay_out_pairs(self) -> PairMemory:
+        """Lay out what a rollout knows of the pairs."""
+        m, g = len(self.query.arrays.pairs), len(self.query.arrays.poses)
+        return PairMemory(
+            radius=self.query.table.spheres[:, 3],
+            centers=np.zeros((g, 3)),
+            rotations=np.zeros((g, 9)),
+            ways=np.zeros(g),
+            computed=np.zeros(m),
+            limits=np.full(m, -np.inf),
+            bounds=np.full(m, np.inf),
+            points=np.zeros((m, 6)),
+            due=np.zeros(m, np.intp),
         )
 
     @property
