@@ -1,7 +1,7 @@
 """Near pairs along a rollout: a distance is computed anew once its bodies have gone far enough for it to matter.
 
 No distance changes by more than the ways that its two bodies go. So a pair that was d apart is beyond the influence
-distance for certain until these ways add up to the difference. And one that is beyond the preferred distance for certain
+distance for certain until these ways add up to the difference. And one that is certainly beyond the preferred distance
 keeps its witness points, as points fixed to the bodies, until the ways add up to a fraction of d: rows of the policy
 take the distance of these points, which is an upper bound; clearances take the lower one, d less the ways.
 """
@@ -17,8 +17,9 @@ from qpavoid.kernels.distances import SPARE_BY_COAL, TO_HALF_SPACE, compute_dist
 from qpavoid.kernels.packing import compiled
 from qpavoid.problem import Array, IntArray
 
-_WAY_FRACTION = 0.25
-"""Ways, over the distance, up to which a pair keeps its witness points [-]: the normal turns by no more than that."""
+_WAY_FRACTION = 0.1
+"""Ways, over the distance, up to which a pair keeps its witness points [-]: the normal turns by no more than that. With
+0.25, a bar between two balls is led 25 mm nearer to them than with 0.1, with which it goes as with exact distances."""
 
 
 class PairMemory(NamedTuple):
@@ -35,7 +36,7 @@ class PairMemory(NamedTuple):
     computed: Array
     """(m,) distance of each pair when it was computed [m]."""
     limits: Array
-    """(m,) the same plus the ways of its bodies until then: less their ways, it bounds the distance; -∞ at first [m]."""
+    """(m,) the same plus the ways of its bodies until then: less the ways, it bounds the distance; -∞ at first [m]."""
     bounds: Array
     """(m,) lower bound on the distance of each pair that was not computed at the last pose, infinite of others [m]."""
     points: Array
@@ -80,19 +81,19 @@ def near_pairs_along(
     due, rows, kept = 0, 0, 0
     for n in range(near):
         k = x.near[n]
-        a, b, margin = x.pairs[k, 0], x.pairs[k, 1], x.margin[x.twist_row[k]]
-        bound, is_due = p.limits[k] - p.ways[a] - p.ways[b], True
-        if bound - margin >= influence_distance:
+        a, b, bound = x.pairs[k, 0], x.pairs[k, 1], -np.inf
+        if x.method[k] != TO_HALF_SPACE:  # whose ways may be endless
+            bound = p.limits[k] - p.ways[a] - p.ways[b]
+        beyond = bound - x.margin[x.twist_row[k]]
+        if beyond >= influence_distance:
             continue
-        if bound - margin >= preferred_distance and p.computed[k] - bound <= _WAY_FRACTION * p.computed[k]:
-            is_due = x.method[k] == TO_HALF_SPACE
-        if is_due:
+        if beyond >= preferred_distance and p.computed[k] - bound <= _WAY_FRACTION * p.computed[k]:
+            p.bounds[k] = bound
+            _follow_points(x.poses[a], x.poses[b], p.points[k], x.results[k])
+        else:
             p.bounds[k] = np.inf
             p.due[due] = k
             due += 1
-        else:
-            p.bounds[k] = bound
-            _follow_points(x.poses[a], x.poses[b], p.points[k], x.results[k])
         x.near[kept] = k
         kept += 1
         if not x.ignored[k]:

@@ -33,12 +33,13 @@ from qpavoid.kernels.rollout import (
     FINISHED,
     HORIZON,
     NOT_FINITE,
+    PREFERRED_DISTANCE,
     PROGRESS,
     TO_MEASURE,
     TO_MOVE,
     RolloutArrays,
 )
-from qpavoid.kernels.rollout_pairs import PairMemory
+from qpavoid.kernels.rollout_pairs import PairMemory, near_pairs_along
 from qpavoid.model.kinematics import ForwardKinematics, max_lever_arm
 from qpavoid.model.limits import JointBounds
 from qpavoid.problem import Array, Mask
@@ -180,22 +181,7 @@ class BackupRollouts:
             v_pose=np.zeros(model.nv),
             enabled=self.enabled,
             states=self._obstacles.current.states.copy(),
-            pairs=self._lay_out_pairs(),
-        )
-
-    def _lay_out_pairs(self) -> PairMemory:
-        """Lay out what a rollout knows of the pairs."""
-        m, g = len(self.query.arrays.pairs), len(self.query.arrays.poses)
-        return PairMemory(
-            radius=self.query.table.spheres[:, 3],
-            centers=np.zeros((g, 3)),
-            rotations=np.zeros((g, 9)),
-            ways=np.zeros(g),
-            computed=np.zeros(m),
-            limits=np.full(m, -np.inf),
-            bounds=np.full(m, np.inf),
-            points=np.zeros((m, 6)),
-            due=np.zeros(m, np.intp),
+            pairs=lay_out_pairs(self.query),
         )
 
     @property
@@ -315,7 +301,13 @@ class BackupRollouts:
         query, s = self.query, self._progress
         query.place(self._obstacles.at(s.t_pose, self._prediction))
         self.kinematics.compute(self._memory.q_pose)
-        query.compute(self.kinematics.joint_poses, _INFLUENCE_DISTANCE)
+        if self._has_kernels:  # only trajectories are of another class
+            kernels.place_bodies(query.packed, self.kinematics.joint_poses)
+            which, is_first = self._prediction.which, s.span == 0.0
+            near_pairs_along(query.packed, self._memory.pairs, which, is_first, _INFLUENCE_DISTANCE, PREFERRED_DISTANCE)
+            query.finish()
+        else:
+            query.compute(self.kinematics.joint_poses, _INFLUENCE_DISTANCE)
         s.rows, s.is_moving = len(query.pairs), query.is_moving
 
     def _move(self) -> None:
@@ -325,6 +317,22 @@ class BackupRollouts:
         for i in range(first, last):
             r.q[i + 1] = pin.integrate(self._model, r.q[i], self._dt * r.v[i + 1])
         r.q_middle[:] = pin.interpolate(self._model, r.q[first], r.q[last], 0.5)
+
+
+def lay_out_pairs(query: DistanceQuery) -> PairMemory:
+    """Lay out what a rollout knows of the pairs of a scene."""
+    m, g = len(query.arrays.pairs), len(query.arrays.poses)
+    return PairMemory(
+        radius=query.table.spheres[:, 3],
+        centers=np.zeros((g, 3)),
+        rotations=np.zeros((g, 9)),
+        ways=np.zeros(g),
+        computed=np.zeros(m),
+        limits=np.full(m, -inf),
+        bounds=np.full(m, inf),
+        points=np.zeros((m, 6)),
+        due=np.zeros(m, np.intp),
+    )
 
 
 def _is_equal(a: Mask, b: Mask) -> bool:
