@@ -21,7 +21,7 @@ class Walk:
 
     def __init__(self, robot, seed, shapes):
         self.rng, count = np.random.default_rng(seed), len(shapes)
-        places = [*self.rng.uniform(-0.8, 0.8, (count, 3)), 0.0, 0.0, 0.5]
+        places = self.rng.uniform(-0.8, 0.8, (count, 3)) + np.array([0.0, 0.0, 0.5])
         obstacles = [
             Obstacle.at(f"o{i}", shape, place) for i, (shape, place) in enumerate(zip(shapes, places, strict=True))
         ]

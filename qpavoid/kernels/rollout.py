@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from qpavoid.kernels.backup import backup_rows, closes_below
+from qpavoid.kernels.backup import backup_rows, closes_below, max_offset
 from qpavoid.kernels.kinematics import update_kinematics
 from qpavoid.kernels.near_pairs import place_bodies, place_obstacles
 from qpavoid.kernels.packing import compiled
@@ -145,6 +145,22 @@ def rollout_outcome(r: Any) -> tuple[int, float, float, float]:
     """
     s = r.progress[0]
     return s.steps, HORIZON - s.lost_time, min(s.contact_time, s.t), s.clearance
+
+
+@compiled
+def offset_of_start(r: Any, offset: Array, v: Array, dv: Array, targets: Array, is_accelerated: bool) -> float:
+    """Compute `max_offset` from a trajectory that is joined from another start.
+
+    Args:
+        r: memory, see `RolloutArrays`; not changed.
+        offset: of the start from that of the trajectory (n,) [rad or m].
+        v: velocity of the control step before (n,).
+        dv: change of velocity in that step (n,).
+        targets: velocities of the trajectory (k, n).
+        is_accelerated: whether any acceleration has a limit; without one, the first target is met at once.
+    """
+    ramp = follow_ramp(r.ramp_limits, v, dv, targets, False, True) if is_accelerated else targets[:0]
+    return max_offset(offset, ramp, targets, r.progress[0].dt)
 
 
 @compiled

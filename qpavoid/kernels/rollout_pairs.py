@@ -14,7 +14,7 @@ import numpy as np
 
 from qpavoid.kernels.broadphase import candidates
 from qpavoid.kernels.distances import SPARE_BY_COAL, TO_HALF_SPACE, compute_distances
-from qpavoid.kernels.packing import compiled
+from qpavoid.kernels.packing import compiled, inlined
 from qpavoid.problem import Array, IntArray
 
 _WAY_FRACTION = 0.1
@@ -78,18 +78,18 @@ def near_pairs_along(
     for i in moved:
         for g in range(x.first[i], x.first[i + 1]):
             _add_way(x, p, g, is_first)
-    due, rows, kept = 0, 0, 0
+    due, rows, kept, poses, results, limits, ways = 0, 0, 0, x.poses, x.results, p.limits, p.ways
     for n in range(near):
         k = x.near[n]
         a, b, bound = x.pairs[k, 0], x.pairs[k, 1], -np.inf
         if x.method[k] != TO_HALF_SPACE:  # whose ways may be endless
-            bound = p.limits[k] - p.ways[a] - p.ways[b]
+            bound = limits[k] - ways[a] - ways[b]
         beyond = bound - x.margin[x.twist_row[k]]
         if beyond >= influence_distance:
             continue
         if beyond >= preferred_distance and p.computed[k] - bound <= _WAY_FRACTION * p.computed[k]:
             p.bounds[k] = bound
-            _follow_points(x.poses[a], x.poses[b], p.points[k], x.results[k])
+            _follow_points(poses[a], poses[b], p.points[k], results[k])
         else:
             p.bounds[k] = np.inf
             p.due[due] = k
@@ -108,7 +108,7 @@ def near_pairs_along(
     return kept, rows, meeting
 
 
-@compiled
+@inlined
 def _add_way(x: Any, p: PairMemory, g: int, is_first: bool) -> None:
     """Add to the way of a body what no point of it exceeds: with ‖δR‖ r for points at r from the centre."""
     square, turned = 0.0, 0.0
@@ -124,7 +124,7 @@ def _add_way(x: Any, p: PairMemory, g: int, is_first: bool) -> None:
             p.ways[g] += np.sqrt(0.5 * turned) * p.radius[g]  # of a rotation, the Frobenius norm is √2 times ‖δR‖
 
 
-@compiled
+@inlined
 def _follow_points(one: Array, two: Array, points: Array, result: Array) -> None:
     """Write the result of a pair from witness points fixed to its bodies, which are at the poses `one` and `two`."""
     square = 0.0
@@ -138,7 +138,7 @@ def _follow_points(one: Array, two: Array, points: Array, result: Array) -> None
         result[1 + c] /= result[0]
 
 
-@compiled
+@inlined
 def _remember(x: Any, p: PairMemory, k: int) -> None:
     """Keep the result of a pair that was computed, but for those that coal computes later."""
     a, b, result = x.pairs[k, 0], x.pairs[k, 1], x.results[k]

@@ -168,7 +168,7 @@ class Arbiter:
         """Replace the velocity by that of the backup trajectory, where none would be left after it."""
         rows = self._rows
         try:
-            v = backup.check(q, solution.v, t, rows.previous.v, rows.previous.dv, rows.proximity())
+            v = backup.check(q, solution.v, t, rows.previous.v, rows.previous.dv, rows.proximity)
         except NumericalError as error:  # of a predicted state; raised by `step` once it is the present one
             why = f"prediction of an {error}"
             return solution.with_reasons(Reason.of(ReasonKind.NO_BACKUP, severity=Severity.WARNING, detail=why))

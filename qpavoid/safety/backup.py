@@ -17,6 +17,7 @@ the velocity of the solver is commanded, whose stop was looked ahead.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import ceil, inf
 from typing import NamedTuple
 
@@ -118,7 +119,9 @@ class BackupPlanner:
         """Whether there is a backup trajectory or a candidate: while nothing moves, `check` would only drop it."""
         return self._backup is not None or self._kind >= 0
 
-    def check(self, q: Array, v: Array, t: float, v_prev: Array, dv_prev: Array, proximity: Proximity) -> Array | None:
+    def check(
+        self, q: Array, v: Array, t: float, v_prev: Array, dv_prev: Array, proximity: Callable[[], Proximity]
+    ) -> Array | None:
         """Return None if v may be commanded, else the velocity (nv,) to command instead.
 
         Args:
@@ -127,7 +130,7 @@ class BackupPlanner:
             t: time [s].
             v_prev: velocity (nv,) commanded in the control step before.
             dv_prev: change of velocity (nv,) in that step.
-            proximity: distances of this control step; pairs in contact do not count.
+            proximity: returns the distances of this control step; pairs in contact do not count.
         """
         self.is_cut = False
         is_same_scene = self._moving is self._obstacles.moving
@@ -136,7 +139,7 @@ class BackupPlanner:
             self._forget()
         if not is_near:
             return None
-        state = Start(q, v_prev.copy(), dv_prev.copy(), t, self._enabled(proximity))
+        state = Start(q, v_prev.copy(), dv_prev.copy(), t, self._enabled(proximity()))
         backup, after_task = self._backup, self._after(state, v)
         command = _Command(v, after_task, after_task, True)
         if backup is not None and len(backup.v):

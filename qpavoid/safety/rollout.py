@@ -154,8 +154,9 @@ class BackupRollouts:
         with suppress(NumericalError):  # of a trajectory that gives nonsense: the steps say so
             self.resume(2)
         self.result()
-        ramp = kernels.follow_ramp(self._ramp_limits, zero, zero, zero[None], False, True)
-        kernels.max_offset(zero, ramp, zero[None], self._dt)
+        self._offset_of_start = kernels.direct(
+            kernels.offset_of_start, self._packed_memory, zero, zero, zero, zero[None], self._is_accelerated
+        )
         kernels.prediction_error_bound(obstacles.prediction, obstacles.prediction, 0.0, self.query.obstacle_radii)
 
     def _lay_out(self, period_steps: int) -> RolloutArrays:
@@ -213,10 +214,9 @@ class BackupRollouts:
         delay = abs(start.t - trajectory.start.t)
         if delay > self._dt or not _is_equal(trajectory.start.enabled, start.enabled):
             return False
-        offset, ramp = pin.difference(self._model, trajectory.start.q, start.q), trajectory.v[:0]
-        if self._is_accelerated:
-            ramp = kernels.follow_ramp(self._ramp_limits, start.v, start.dv, trajectory.v, False, True)
-        max_offset = kernels.max_offset(offset, ramp, trajectory.v, self._dt)
+        offset = pin.difference(self._model, trajectory.start.q, start.q)
+        v, dv = np.ascontiguousarray(start.v), np.ascontiguousarray(start.dv)
+        max_offset = self._offset_of_start(self._packed_memory, offset, v, dv, trajectory.v, self._is_accelerated)
         obstacle_offset = delay * max_obstacle_speed if delay > _ROUND_OFF else 0.0
         now, then = self._obstacles.prediction, trajectory.prediction
         if now is not then and (len(now.external) or len(then.external)):
