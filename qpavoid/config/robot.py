@@ -50,7 +50,7 @@ class JointLimits(Block):
     """Limits that replace those of the URDF, by joint name."""
 
     position: dict[str, tuple[Number, Number]] = {}
-    """Joint: [lower, upper] [rad or m]."""
+    """Joint: from lower to upper [rad or m]."""
     velocity: dict[str, Positive | list[Positive]] = {}
     """Joint: largest speed [rad/s or m/s]; a list for a joint of several coordinates, such as `root_joint`."""
     acceleration: dict[str, Positive] = {}

@@ -27,7 +27,7 @@ from qpavoid.model.robot import Robot
 from qpavoid.model.sample import Pose
 from qpavoid.model.scene import Obstacle, Scene
 from qpavoid.problem import Array
-from qpavoid.run.simulate import describe_obstacle
+from qpavoid.run.recorder import describe_obstacle
 from qpavoid.viz.meshes import EMPTY, of_geometry, of_obstacle
 from qpavoid.viz.view_clock import PlayClock
 from qpavoid.viz.view_link import (
