@@ -33,8 +33,12 @@ from qpavoid.problem import Array, Mask, Proximity
 from qpavoid.safety.approach import ApproachCheck
 from qpavoid.safety.rollout import LEAST_SCORE, BackupPolicy, BackupRollouts, BackupScore, BackupTrajectory, Start
 
-_POSE_RATE = 10_000.0
-"""Poses of candidates that are evaluated per time [1/s]: at 10 to 20 µs each, a tenth to a fifth of it."""
+_PERIOD_FRACTION = 0.128
+"""Fraction of a control period in which candidates are computed [-]."""
+_POSE_TIME, _SEARCH_TIME = 12e-6, 80e-6
+"""Time that a pose of a candidate takes, and that a search takes besides [s]: of a Panda among 50 obstacles."""
+_FEWEST_POSES = 10
+"""Poses that are evaluated in a control step at least [-]: a candidate has about 45, and an obstacle does not wait."""
 _HORIZONS = (0.2, 0.05, 0.5)
 """h of backup policies [s]: the most successful first."""
 _UNBIASED_FRACTION = 0.25
@@ -49,7 +53,7 @@ _FIRST_CANDIDATES = 7
 _URGENT = 0.5
 """Time before a contact in which the best candidate is followed all the same [s]."""
 _PORTION = 4
-"""Poses that are evaluated, at 10 to 20 µs each, before a clock is read, where there is a budget [-]; of each control
+"""Poses that are evaluated, at 10 to 15 µs each, before a clock is read, where there is a budget [-]; of each control
 step, these at least."""
 _DISTANCE_TOLERANCE = 1e-6
 """Difference of two clearances that counts as none [m]."""
@@ -84,8 +88,8 @@ class BackupPlanner:
         self._model, self._obstacles, self._dt = settings.scene.robot.model, obstacles, settings.dt
         self._rollouts = BackupRollouts(settings, query.table, obstacles)
         self._approach = ApproachCheck(settings, query, self._rollouts.lever_arm, obstacles)
-        self._poses = max(1, round(_POSE_RATE * settings.dt))
-        """Poses that are evaluated in a control step."""
+        self._poses = max(_FEWEST_POSES, round((_PERIOD_FRACTION * settings.dt - _SEARCH_TIME) / _POSE_TIME))
+        """Poses of candidates that are evaluated in a control step: 100 at 100 Hz, 15 at 500 Hz."""
         self._steps_ahead = ceil(_CANDIDATES_AHEAD * self._rollouts.usual_poses / self._poses)
         """Control steps in which that many candidates are computed."""
         self._budget = settings.budget
