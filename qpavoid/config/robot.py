@@ -57,6 +57,8 @@ class JointLimits(Block):
     """Joint: largest acceleration [rad/s² or m/s²]; a URDF has no field for it."""
     jerk: dict[str, Positive] = {}
     """Joint: largest jerk [rad/s³ or m/s³]; needs an acceleration limit of the same joint."""
+    torque: dict[str, Positive] = {}
+    """Joint: largest torque or force [Nm or N], for scenarios with `dynamics`."""
 
     @model_validator(mode="after")
     def _ordered(self) -> JointLimits:
