@@ -1,9 +1,9 @@
 """Near pairs along a rollout: a distance is computed anew once its bodies have gone far enough for it to matter.
 
-No distance changes by more than the ways that its two bodies go. So a pair that was d apart is beyond the influence
-distance for certain until these ways add up to the difference. And one that is certainly beyond the preferred distance
-keeps its witness points, as points fixed to the bodies, until the ways add up to a fraction of d: rows of the policy
-take the distance of these points, which is an upper bound; clearances take the lower one, d less the ways.
+No distance changes by more than its two bodies travel. So a pair that was d apart is beyond the influence distance for
+certain until their travels add up to the difference. And one that is certainly beyond the preferred distance keeps its
+witness points, as points fixed to the bodies, until the travels add up to a fraction of d: rows of the policy take the
+distance of these points, which is an upper bound; clearances take the lower one, d less the travels.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from qpavoid.kernels.distances import SPARE_BY_COAL, TO_HALF_SPACE, compute_dist
 from qpavoid.kernels.packing import compiled, inlined
 from qpavoid.problem import Array, IntArray
 
-_WAY_FRACTION = 0.1
-"""Ways, over the distance, up to which a pair keeps its witness points [-]: the normal turns by no more than that. With
-0.25, a bar between two balls is led 25 mm nearer to them than with 0.1, with which it goes as with exact distances."""
+_TRAVEL_FRACTION = 0.1
+"""Travels, over the distance, up to which a pair keeps its witness points [-]: the normal turns by no more than that.
+With 0.25, a bar between two balls is led 25 mm nearer to them than with 0.1, which is as with exact distances."""
 
 
 class PairMemory(NamedTuple):
@@ -31,12 +31,12 @@ class PairMemory(NamedTuple):
     """(g, 3) of the bounding spheres, at the last pose [m]."""
     rotations: Array
     """(g, 9) of the bodies at the last pose, by columns."""
-    ways: Array
-    """(g,) bound on the way that any point of each body has gone [m]."""
+    travels: Array
+    """(g,) bound on the path that any point of each body has travelled [m]."""
     computed: Array
     """(m,) distance of each pair when it was computed [m]."""
     limits: Array
-    """(m,) the same plus the ways of its bodies until then: less the ways, it bounds the distance; -∞ at first [m]."""
+    """(m,) the same plus the travels of its bodies until then, less which it bounds the distance; -∞ at first [m]."""
     bounds: Array
     """(m,) lower bound on the distance of each pair that was not computed at the last pose, infinite of others [m]."""
     points: Array
@@ -48,7 +48,7 @@ class PairMemory(NamedTuple):
 @compiled
 def forget_pairs(p: PairMemory) -> None:
     """Begin a rollout, of which nothing is known."""
-    p.ways[:], p.limits[:], p.bounds[:] = 0.0, -np.inf, np.inf
+    p.travels[:], p.limits[:], p.bounds[:] = 0.0, -np.inf, np.inf
 
 
 @compiled
@@ -74,28 +74,28 @@ def near_pairs_along(
     near = candidates(x.poses, x.local, x.centers, x.max_square[:bodies], x.pair_of[:bodies], x.enabled, x.near)
     for g in range(len(x.joints)):
         if x.joints[g] >= 0:
-            _add_way(x, p, g, is_first)
+            _add_travel(x, p, g, is_first)
     for i in moved:
         for g in range(x.first[i], x.first[i + 1]):
-            _add_way(x, p, g, is_first)
-    due, rows, kept, poses, results, limits, ways = 0, 0, 0, x.poses, x.results, p.limits, p.ways
+            _add_travel(x, p, g, is_first)
+    due, rows, count, poses, results, limits, travels = 0, 0, 0, x.poses, x.results, p.limits, p.travels
     for n in range(near):
         k = x.near[n]
         a, b, bound = x.pairs[k, 0], x.pairs[k, 1], -np.inf
-        if x.method[k] != TO_HALF_SPACE:  # whose ways may be endless
-            bound = limits[k] - ways[a] - ways[b]
+        if x.method[k] != TO_HALF_SPACE:  # whose travels may be endless
+            bound = limits[k] - travels[a] - travels[b]
         beyond = bound - x.margin[x.twist_row[k]]
         if beyond >= influence_distance:
             continue
-        if beyond >= preferred_distance and p.computed[k] - bound <= _WAY_FRACTION * p.computed[k]:
+        if beyond >= preferred_distance and p.computed[k] - bound <= _TRAVEL_FRACTION * p.computed[k]:
             p.bounds[k] = bound
             _follow_points(poses[a], poses[b], p.points[k], results[k])
         else:
             p.bounds[k] = np.inf
             p.due[due] = k
             due += 1
-        x.near[kept] = k
-        kept += 1
+        x.near[count] = k
+        count += 1
         if not x.ignored[k]:
             x.rows[rows] = k
             rows += 1
@@ -104,13 +104,13 @@ def near_pairs_along(
         _remember(x, p, k)
     for k in x.meeting[:meeting]:
         p.limits[k] = -np.inf
-    x.counts[0], x.counts[1], x.counts[2] = kept, rows, meeting
-    return kept, rows, meeting
+    x.counts[0], x.counts[1], x.counts[2] = count, rows, meeting
+    return count, rows, meeting
 
 
 @inlined
-def _add_way(x: Any, p: PairMemory, g: int, is_first: bool) -> None:
-    """Add to the way of a body what no point of it exceeds: with ‖δR‖ r for points at r from the centre."""
+def _add_travel(x: Any, p: PairMemory, g: int, is_first: bool) -> None:
+    """Add to the travel of a body what no point of it exceeds: with ‖δR‖ r for points at r from the centre."""
     square, turned = 0.0, 0.0
     for c in range(3):
         square += (x.centers[g, c] - p.centers[g, c]) ** 2
@@ -119,9 +119,9 @@ def _add_way(x: Any, p: PairMemory, g: int, is_first: bool) -> None:
         turned += (x.poses[g, c] - p.rotations[g, c]) ** 2
         p.rotations[g, c] = x.poses[g, c]
     if not is_first:
-        p.ways[g] += np.sqrt(square)
+        p.travels[g] += np.sqrt(square)
         if turned > 0.0:
-            p.ways[g] += np.sqrt(0.5 * turned) * p.radius[g]  # of a rotation, the Frobenius norm is √2 times ‖δR‖
+            p.travels[g] += np.sqrt(0.5 * turned) * p.radius[g]  # of a rotation, the Frobenius norm is √2 times ‖δR‖
 
 
 @inlined
@@ -144,7 +144,7 @@ def _remember(x: Any, p: PairMemory, k: int) -> None:
     a, b, result = x.pairs[k, 0], x.pairs[k, 1], x.results[k]
     if x.method[k] <= SPARE_BY_COAL:
         return
-    p.computed[k], p.limits[k] = result[0], result[0] + p.ways[a] + p.ways[b]
+    p.computed[k], p.limits[k] = result[0], result[0] + p.travels[a] + p.travels[b]
     for c in range(3):
         p.points[k, c], p.points[k, 3 + c] = 0.0, 0.0
         for r in range(3):

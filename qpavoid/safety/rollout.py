@@ -331,7 +331,7 @@ def lay_out_pairs(query: DistanceQuery) -> PairMemory:
         radius=query.table.spheres[:, 3],
         centers=np.zeros((g, 3)),
         rotations=np.zeros((g, 9)),
-        ways=np.zeros(g),
+        travels=np.zeros(g),
         computed=np.zeros(m),
         limits=np.full(m, -inf),
         bounds=np.full(m, inf),
