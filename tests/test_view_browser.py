@@ -175,10 +175,10 @@ def test_page_shows_and_steers_a_run(session, page, empty_picture):
     choose(page, "qp", "eq10")
     wait_for(lambda: session.config.solver.label == "eq10", "the other solver")
     assert session.t > steps
-    assert not page.get_by_text("beside:").count()  # no curve of a robot that is not there
+    assert not page.locator(".u-label", has_text="beside").count()  # no curve of a robot that is not there
     choose(page, "none", "tracking")
     wait_for(lambda: len(session.loops) == 2, "the robot beside")
-    page.get_by_text("beside:").wait_for()
+    page.locator(".u-label", has_text="beside").wait_for()
     choose(page, "eq10", "qp")
     wait_for(lambda: session.config.solver.label == "qp", "the first solver")
 
