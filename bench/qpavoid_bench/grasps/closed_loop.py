@@ -33,7 +33,7 @@ ENTRANTS = (
 
 
 @dataclass(frozen=True)
-class Reach:
+class GraspRun:
     """What became of one problem in closed loop."""
 
     is_reached: bool
@@ -91,7 +91,7 @@ def to_case(problem: Problem) -> Case:
     return Case(problem.family, problem.index, scenario, Sensor(), True, "a goal configuration of the set")
 
 
-def reach(problem: Problem, entrant: Entrant) -> Reach:
+def run_grasp(problem: Problem, entrant: Entrant) -> GraspRun:
     """Run a problem in closed loop, and check it.
 
     Args:
@@ -106,7 +106,7 @@ def reach(problem: Problem, entrant: Entrant) -> Reach:
     is_there = (distances <= MAX_DISTANCE) & (angles <= MAX_ANGLE)
     late = np.flatnonzero(~is_there)
     first = 0 if not len(late) else int(late[-1]) + 1
-    return Reach(
+    return GraspRun(
         is_reached=bool(is_there[-1]),
         is_clear=not findings.contacts,
         distance=float(distances[-1]),

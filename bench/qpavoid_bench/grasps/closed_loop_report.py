@@ -9,23 +9,23 @@ from typing import Any
 import numpy as np
 
 from qpavoid_bench.grasps.clearance import REQUIRED
-from qpavoid_bench.grasps.closed_loop import DURATION, ENTRANTS, MAX_ANGLE, MAX_DISTANCE, Reach, reach
+from qpavoid_bench.grasps.closed_loop import DURATION, ENTRANTS, MAX_ANGLE, MAX_DISTANCE, GraspRun, run_grasp
 from qpavoid_bench.grasps.problems import Problem
 from qpavoid_bench.tables import number, table
 
 
-def reach_with_all(problem: Problem) -> dict[str, Reach]:
+def run_with_all(problem: Problem) -> dict[str, GraspRun]:
     """Run a problem with each entrant; return what became of it, by its name."""
-    return {entrant.name: reach(problem, entrant) for entrant in ENTRANTS}
+    return {entrant.name: run_grasp(problem, entrant) for entrant in ENTRANTS}
 
 
-def rows_of(problem: Problem, results: Mapping[str, Reach]) -> Iterator[dict[str, Any]]:
+def rows_of(problem: Problem, results: Mapping[str, GraspRun]) -> Iterator[dict[str, Any]]:
     """Yield the rows of a table for programs."""
     for name, result in results.items():
         yield {"problem": problem.name, "entrant": name, **asdict(result)}
 
 
-def closed_loop_sections(reached: Sequence[tuple[Problem, Mapping[str, Reach]]]) -> Iterator[str]:
+def closed_loop_sections(reached: Sequence[tuple[Problem, Mapping[str, GraspRun]]]) -> Iterator[str]:
     """Yield the sections of a report on problems and what became of them, by entrant."""
     yield "## Closed loop"
     yield (
@@ -40,19 +40,19 @@ def closed_loop_sections(reached: Sequence[tuple[Problem, Mapping[str, Reach]]])
         _reached(name.replace("/", ": all") if name.endswith("/") else name, entrant.name, results)
         for name in names
         for entrant in ENTRANTS
-        if (results := [found[entrant.name] for problem, found in reached if problem.family.startswith(name)])
+        if (results := [by_entrant[entrant.name] for problem, by_entrant in reached if problem.family.startswith(name)])
     ]
     yield table(head, rows)
     missed = [
         f"{problem.name} ({1e3 * result.distance:.0f} mm)"
-        for problem, found in reached
-        if not (result := found[ENTRANTS[-1].name]).is_success
+        for problem, by_entrant in reached
+        if not (result := by_entrant[ENTRANTS[-1].name]).is_success
     ]
     if missed:
         yield f"Not reached with planning, or not without contact: {', '.join(missed)}."
 
 
-def _reached(name: str, entrant: str, results: Sequence[Reach]) -> list[object]:
+def _reached(name: str, entrant: str, results: Sequence[GraspRun]) -> list[object]:
     times = np.array([result.time for result in results if result.is_success] or [np.nan])
     return [
         name, len(results), entrant, sum(result.is_success for result in results),

@@ -28,7 +28,7 @@ def grasps(
     out: Annotated[Path, typer.Option(help="Folder of the results.")] = RESULTS,
 ) -> None:
     """Measure bodies, paths and closed loops at the grasps of MotionBenchMaker: clearances, times, goals reached."""
-    from qpavoid_bench.grasps.closed_loop_report import closed_loop_sections, reach_with_all, rows_of
+    from qpavoid_bench.grasps.closed_loop_report import closed_loop_sections, rows_of, run_with_all
 
     robots = dict(text.partition("=")[::2] for text in robot or ())
     if not all(robots.values()):
@@ -37,7 +37,7 @@ def grasps(
     for problem in problems[:1]:
         plan(problem)  # compiles the planner
     measured = [(problem, *measure(problem), plan(problem)) for problem in problems]
-    reached = [(problem, reach_with_all(problem)) for problem in problems[::every]]
+    reached = [(problem, run_with_all(problem)) for problem in problems[::every]]
     sections = (*_sections(measured), *closed_loop_sections(reached))
     print(write(out, "grasps", sections, [row for problem, results in reached for row in rows_of(problem, results)]))
 
