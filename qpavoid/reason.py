@@ -43,6 +43,9 @@ class ReasonKind(str, Enum):
     """The same of its upper position limit."""
     AT_VELOCITY_LIMIT = "AT_VELOCITY_LIMIT"
     """A joint moves at its velocity limit where a row demands more: the joint, its velocity [rad/s or m/s]."""
+    TOUCHED = "TOUCHED"
+    """A torque from outside is beyond its threshold: the joint, that torque [Nm or N]; an alarm where it stops the
+    robot."""
     STALLED = "STALLED"
     """The tasks make no progress: a pair that holds them, its share of the forces that balance their pull on the joints
     [%], more than 10; no share of laws without rows, no pair where several hold them together."""
@@ -128,6 +131,7 @@ _TEXTS: dict[str, str] = {
     "AT_LOWER_LIMIT": "at its lower limit, velocity bound",
     "AT_UPPER_LIMIT": "at its upper limit, velocity bound",
     "AT_VELOCITY_LIMIT": "at its velocity limit,",
+    "TOUCHED": "is touched by",
     "STALLED": "no progress",
     "OUT_OF_REACH": "out of reach by",
     "SINGULAR": "in a singularity, short of its target by",
