@@ -163,8 +163,13 @@ def force_torque_rows(
     """Write the rows of the torque limits in x = (v, s p): M_a v - Jc_aᵀ p within M_a v̄ - dt h_a ± dt τ, over Σ|M_a|.
 
     Args:
-        M, h, v, dt, Jp, scale: see `eliminate_base`.
+        M: (n, n) mass matrix.
+        h: (n,) bias torques [Nm or N].
+        v: (n,) v̄ [rad/s or m/s].
+        dt: control period [s].
+        Jp: (m, n) Jacobian of the contact points.
         limit: (n - 6,) largest torque of each joint [Nm or N].
+        scale: s.
         rows: (2 (n - 6), n + m) out: of each joint of the least torque, then of the greatest.
         rhs: (2 (n - 6),) out.
     """
