@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: run view figures film test campaign smoke lint types clean
+.PHONY: run view figures film test campaign smoke docs lint types clean
 
 run: .venv/run
 	$(BIN)/qpavoid compare situation1 situation2 chasing_sphere five_spheres stall \
@@ -25,6 +25,9 @@ campaign: .venv/dev
 
 smoke: .venv/dev
 	$(BIN)/qpavoid bench smoke
+
+docs: .venv/dev
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 lint: .venv/dev
 	$(BIN)/ruff check .
@@ -52,4 +55,4 @@ types: .venv/dev
 	$(BIN)/python -m pip install --quiet --upgrade pip
 
 clean:
-	rm -rf .venv out dist
+	rm -rf .venv out dist site

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from qpavoid.budget import UNLIMITED, Budget
+from qpavoid.dynamics import StepDynamics
 from qpavoid.errors import NumericalError
 from qpavoid.reason import Reason, Severity
 
@@ -185,6 +186,14 @@ class Problem(NamedTuple):
     """Distance to the nearest position limit [rad, m]; negative where a coordinate is outside."""
     budget: Budget = UNLIMITED
     """Time that is left of the control step: a law that takes longer may `check` it, which ends the step."""
+    dynamics: StepDynamics | None = None
+    """Dynamics of the robot, with rows that a law has to meet beside those of `avoidance`; None at velocity level."""
+
+    @property
+    def inequalities(self) -> tuple[Array, Array]:
+        """Return all rows J (k + m, nv) and b (k + m,) with J v >= b: of the pairs, then of the dynamics."""
+        (_, _, J, b, *_), x = self.avoidance, self.dynamics
+        return (J, b) if x is None else (np.concatenate((J, x.J)), np.concatenate((b, x.b)))
 
 
 def make_problem(
@@ -252,6 +261,10 @@ class Solution(NamedTuple):
     """Largest change of the solver's raw velocity by the limits [rad/s or m/s]; 0 of a `bounded` solver."""
     plan: str = ""
     """Plan that is followed in place of the tasks alone, and why, in a sentence; empty without one."""
+    torque: Array | None = None
+    """(n_actuated,) torques that lead to `v` [Nm or N], within their limits; None at velocity level."""
+    acceleration: Array | None = None
+    """(nv,) acceleration of these torques [rad/s² or m/s²]."""
     build_time: float = 0.0
     """Time to read the state and set up the problem [s]; of `qp` with the QP, where both are one compiled call."""
     solve_time: float = 0.0

@@ -46,6 +46,14 @@ class ReasonKind(str, Enum):
     TOUCHED = "TOUCHED"
     """A torque from outside is beyond its threshold: the joint, that torque [Nm or N]; an alarm where it stops the
     robot."""
+    AT_TORQUE_LIMIT = "AT_TORQUE_LIMIT"
+    """A joint is at its torque limit where a row demands more: the joint, its torque [Nm or N]."""
+    TORQUE_SATURATED = "TORQUE_SATURATED"
+    """The torque of a velocity was cut at its limit, and another velocity follows from it: the joint, the excess
+    [Nm or N]."""
+    HOLDING_RELAXED = "HOLDING_RELAXED"
+    """Gravity takes more of a joint's torque than it should, or soon will: the joint, by how much faster than its row
+    allows, as a share of its limit [1/s]."""
     STALLED = "STALLED"
     """The tasks make no progress: a pair that holds them, its share of the forces that balance their pull on the joints
     [%], more than 10; no share of laws without rows, no pair where several hold them together."""
@@ -132,6 +140,9 @@ _TEXTS: dict[str, str] = {
     "AT_UPPER_LIMIT": "at its upper limit, velocity bound",
     "AT_VELOCITY_LIMIT": "at its velocity limit,",
     "TOUCHED": "is touched by",
+    "AT_TORQUE_LIMIT": "at its torque limit,",
+    "TORQUE_SATURATED": "torque limit cuts",
+    "HOLDING_RELAXED": "gravity takes too much of its torque, row relaxed by",
     "STALLED": "no progress",
     "OUT_OF_REACH": "out of reach by",
     "SINGULAR": "in a singularity, short of its target by",
@@ -168,7 +179,7 @@ class Reason(NamedTuple):
     amount: float | None = None
     """Amount in `unit`, where the kind has one."""
     unit: str = ""
-    """Unit of `amount`: m, m/s, rad, rad/s, s, % or - ."""
+    """Unit of `amount`: m, m/s, rad, rad/s, s, 1/s, Nm, N, % or - ."""
     severity: Severity = Severity.WARNING
     detail: str = ""
     """More for people, not for programs."""

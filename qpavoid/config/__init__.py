@@ -8,6 +8,7 @@ from qpavoid.config.base import Block
 from qpavoid.config.control import (
     Avoidance,
     Beta,
+    Dynamics,
     FastFinish,
     Limits,
     Planning,
@@ -60,7 +61,7 @@ from qpavoid.config.tasks import (
 
 __all__ = [
     "AlignTask", "AnyTask", "Avoidance", "Beta", "Block", "Body", "Box", "Capsule", "Circle", "ComTask", "Cone",
-    "Contact", "Csv", "Cylinder", "DampingTask", "Ellipsoid", "Eq10Solver", "FastFinish", "Fixed",
+    "Contact", "Csv", "Cylinder", "DampingTask", "Dynamics", "Ellipsoid", "Eq10Solver", "FastFinish", "Fixed",
     "GradientProjectionSolver", "HalfSpace", "HqpSolver", "Hull", "JointLimits", "Limits", "Line", "LookAtTask",
     "ManipulabilityTask", "Mesh", "Motion", "Observer", "ObstacleConfig", "ObstacleShape", "PairMargin", "Payload",
     "Planning", "PlantSettings", "PointCloud", "Polytope", "PostureTask", "PotentialFieldSolver", "Progress", "Push",

@@ -19,6 +19,7 @@ from qpavoid.kernels.clearance import (
     leaves_position_limits,
 )
 from qpavoid.kernels.depth import CellGrid, OwnBodies, fill_cells, mark_own_pixels, recall_cells
+from qpavoid.kernels.dynamics import DynamicsArrays, dynamics_step, forward_dynamics, inverse_dynamics, slow_rows
 from qpavoid.kernels.estimates import ObstacleArrays, are_fine, check_updates, observe
 from qpavoid.kernels.kinematics import KinematicsArrays, update_kinematics
 from qpavoid.kernels.layout import SUMMARY, RowLayout
@@ -58,6 +59,7 @@ __all__ = [
     "ApproachArrays",
     "CellGrid",
     "DistanceArrays",
+    "DynamicsArrays",
     "FrameTargets",
     "KinematicsArrays",
     "ObstacleArrays",
@@ -86,13 +88,16 @@ __all__ = [
     "direct",
     "distance_rows",
     "distances_of",
+    "dynamics_step",
     "extend_paths",
     "extrapolate_states",
     "fill_cells",
     "find_near_pairs",
     "first_use",
     "follow_ramp",
+    "forward_dynamics",
     "frame_rows",
+    "inverse_dynamics",
     "is_clear",
     "jerk_limited_stop",
     "joint_speeds",
@@ -121,6 +126,7 @@ __all__ = [
     "sample_pieces",
     "search",
     "select_voxels",
+    "slow_rows",
     "sorted_setxor",
     "speed_to_stop",
     "stop_velocity",

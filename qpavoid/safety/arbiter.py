@@ -124,6 +124,9 @@ class Arbiter:
             given = solution.reasons if _well_formed(problem, solution) else ()
             return _stop(problem, (*given, failed))
         if not self.solver.bounded:
+            if self._rows.dynamics is not None:
+                v = self._rows.dynamics.approach(v, self._rows.previous.v)
+                solution = solution._replace(v=v)
             if not self._settings.limits.saturate:
                 return solution
             v, change = saturate(v, problem.lower, problem.upper, self._settings.bounds.velocity)
@@ -167,6 +170,8 @@ class Arbiter:
     def _ensure_backup(self, backup: BackupPlanner, q: Array, t: float, solution: Solution) -> Solution:
         """Replace the velocity by that of the backup trajectory, where none would be left after it."""
         rows = self._rows
+        if rows.dynamics is not None:
+            backup.brake_with(self._settings.bounds.acceleration)
         try:
             v = backup.check(q, solution.v, t, rows.previous.v, rows.previous.dv, rows.proximity())
         except NumericalError as error:  # of a predicted state; raised by `step` once it is the present one

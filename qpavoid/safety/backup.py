@@ -99,6 +99,11 @@ class BackupPlanner:
         self._approach.reset()
         self._forget()
 
+    def brake_with(self, acceleration: Array) -> None:
+        """Take accelerations (nv,) as those on which braking counts from now on [rad/s² or m/s²]."""
+        self._rollouts.brake_with(acceleration)
+        self._approach.brake_with(acceleration)
+
     def _forget(self) -> None:
         """Drop the kept trajectory and the candidate."""
         self._backup: BackupTrajectory | None = None

@@ -130,7 +130,8 @@ class BackupRollouts:
         # a velocity may be asked for that is farther away than jerk limits allow in a period
         free = replace(settings.bounds, jerk=np.full(model.nv, np.inf))
         relaxed = replace(settings, bounds=free, dt=self.period)
-        self.packed = kernels.pack(lay_out(relaxed, (), (), self.kinematics, self.query))
+        layout = lay_out(relaxed, (), (), self.kinematics, self.query)
+        self.packed, self._v_step = kernels.pack(layout), layout.v_step
         self._ramp_limits = _ramp_limits(settings.bounds, self._dt)
         self._is_accelerated = bool(np.isfinite(settings.bounds.acceleration).any())
         self.lever_arm = max(1.0, max_lever_arm(model, table.max_extension()))
@@ -180,6 +181,10 @@ class BackupRollouts:
             enabled=self.enabled,
             states=self._obstacles.current.states.copy(),
         )
+
+    def brake_with(self, acceleration: Array) -> None:
+        """Take accelerations (nv,) as those on which braking counts from now on [rad/s² or m/s²]."""
+        self._v_step[:], self._ramp_limits.v_step[:] = acceleration * self.period, acceleration * self._dt
 
     @property
     def enabled(self) -> Mask:

@@ -54,17 +54,17 @@ class Qp(NamedSolver):
         """Return the closest safe velocity; relaxed where there is none; a stop where that fails too."""
         if problem.violation <= 0.0:
             return Solution(problem.v_tracking.copy())
-        A, rows, lower, upper = problem.tracking.A, problem.avoidance, problem.lower, problem.upper
+        A, (J, b), lower, upper = problem.tracking.A, problem.inequalities, problem.lower, problem.upper
         regularization, v_tracking, contacts = self._regularization(problem), problem.v_tracking, problem.contacts
         if self._native and contacts is None:
-            v, solved = kernels.project(A, regularization, v_tracking, rows.J, rows.b, lower, upper)
+            v, solved = kernels.project(A, regularization, v_tracking, J, b, lower, upper)
             if solved:
                 return Solution(v)
         P, q = kernels.projection_cost(A, regularization, v_tracking)
         for backend in self._backends:
             if contacts is not None:
                 backend = within(backend, contacts.Z, contacts.v_particular)
-            answer = verified(backend, P, q, rows.J, rows.b, lower, upper)
+            answer = verified(backend, P, q, J, b, lower, upper)
             if answer is not None:
                 return Solution(answer)
         relaxed = self._relax(problem)
