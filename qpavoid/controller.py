@@ -106,6 +106,7 @@ class Controller(SceneChanges, SplitStep):
         check_solver(law, self.has_contacts)
         self.avoidance, self.limits = avoidance or Avoidance(), limits or Limits()
         self._v_shape, self._no_backup = (scene.robot.model.nv,), tuple[Reason, ...]()
+        self._contacts = contacts = None if contacts is None else contacts.own_copy()
         if contacts is not None and self.avoidance.backup:
             self.avoidance = self.avoidance.model_copy(update={"backup": False})
             self._no_backup = (_NO_BACKUP_WITH_CONTACTS,)

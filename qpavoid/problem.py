@@ -114,7 +114,7 @@ class Contacts(NamedTuple):
         Args:
             v: velocity (nv,) [rad/s or m/s].
         """
-        if np.abs(self.J @ v - self.b).max() <= CONTACT_TOLERANCE:
+        if np.abs(self.J @ v - self.b).max(initial=0.0) <= CONTACT_TOLERANCE:
             return v
         return np.asarray(self.v_particular + self.Z @ (self.Z.T @ v))
 

@@ -64,6 +64,7 @@ def test_basis_and_right_inverse(standing):
     np.testing.assert_allclose(Y, np.linalg.pinv(B), atol=1e-12)
     np.testing.assert_allclose(B @ N, 0.0, atol=1e-13)
     np.testing.assert_allclose(N.T @ N, np.eye(18), atol=1e-13)
+    np.testing.assert_allclose(standing["X"].T @ standing["X"], np.eye(41), atol=1e-12)
     np.testing.assert_allclose(standing["J"] @ standing["Z"], 0.0, atol=1e-13)
     np.testing.assert_allclose(standing["J"] @ standing["rest"], standing["b"], atol=1e-13)
 

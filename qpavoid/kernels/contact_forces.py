@@ -7,13 +7,16 @@ solved for p by a right inverse Y of B and a basis N of its null space, so that 
 
     p = Y (M_b (rest - v̄) + dt h_b) + Y M_b Z w + N u
 
-A solver sees x = (v, s p) = start + X (w, u) with `scale` s, since impulses weigh less than velocities.
+A solver sees x = (v, s p) = start + X y with `scale` s, since impulses weigh less than velocities. The columns of X are
+orthonormal: those of N are so, and orthogonal to those of Y; those of (Z, s Y M_b Z) become so by a Cholesky
+factor.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from qpavoid.kernels.cholesky import factorise
 from qpavoid.kernels.orthogonal import factorise_rows
 from qpavoid.kernels.packing import compiled
 from qpavoid.problem import Array, IntArray
@@ -50,7 +53,7 @@ def eliminate_base(
     M: Array, h: Array, v: Array, dt: float, Jp: Array, Z: Array, rest: Array, scale: float,
     X: Array, start: Array, Y: Array, N: Array,
 ) -> bool:  # fmt: skip
-    """Write what meets contacts and base equations: x = (v, s p) = start + X (w, u).
+    """Write what meets contacts and base equations: x = (v, s p) = start + X y.
 
     Args:
         M: (n, n) mass matrix, symmetric.
@@ -61,7 +64,7 @@ def eliminate_base(
         Z: (n, k) basis of the velocities that move no contact.
         rest: (n,) velocity that meets the contacts.
         scale: s.
-        X: (n + m, k + m - 6) out.
+        X: (n + m, k + m - 6) out, its columns orthonormal; the last m - 6 move no coordinate.
         start: (n + m,) out.
         Y: (m, 6) out: right inverse of B.
         N: (m, m - 6) out: orthonormal basis of the forces that do not move the base.
@@ -111,7 +114,27 @@ def eliminate_base(
             for c in range(k):
                 X[n + j, c] += weight * moving[i, c]
         start[n + j] = total
+    _make_orthonormal(X, n, k)
     return True
+
+
+@compiled
+def _make_orthonormal(X: Array, n: int, k: int) -> None:
+    """Make the first k columns of X orthonormal, of which the first n rows are."""
+    G, L = np.zeros((k, k)), np.empty((k, k))
+    for r in range(n, len(X)):
+        for i in range(k):
+            for c in range(i + 1):
+                G[i, c] += X[r, i] * X[r, c]
+    for i in range(k):
+        G[i, i] += 1.0
+    factorise(G, L, k)
+    for r in range(len(X)):
+        for i in range(k):
+            total = X[r, i]
+            for c in range(i):
+                total -= L[i, c] * X[r, c]
+            X[r, i] = total * L[i, i]
 
 
 @compiled
