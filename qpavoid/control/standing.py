@@ -126,7 +126,9 @@ class StandingDynamics(RobotDynamics):
         self._bias[:] = pin.nonLinearEffects(self._model, self._data, q, v)
 
     def stand(self, kinematics: ForwardKinematics, v: Array) -> Contacts:
-        """Take up contacts and base, for a step from the velocity v (nv,); return the contacts, approached.
+        """Take up contacts and base, for a step from the velocity v (nv,); return the contacts, at rest.
+
+        A step approaches them at their rates: J v = (1 - κ_c) J v̄ + κ_c b.
 
         Args:
             kinematics: those of the step; `update` was called for it.
@@ -134,9 +136,13 @@ class StandingDynamics(RobotDynamics):
         """
         contacts, dt = self._contacts, self._dt
         J, b = contacts.rows(kinematics)
+        resting = Contacts(*kernels.solve_rows(J, b), J, b)
         rates = np.array([min(1.0, dt * contact.rate) for contact in contacts.settings]) * contacts.shares
-        b = J @ v + rates[contacts.row_owners()] * (b - J @ v)
-        Z, rest = kernels.solve_rows(J, b)
+        Z, rest, b = resting.Z, resting.v_particular, J @ v + rates[contacts.row_owners()] * (b - J @ v)
+        if len(set(rates[contacts.active])) == 1:
+            rest = v - Z @ (Z.T @ v) + rates[contacts.active[0]] * (rest - v + Z @ (Z.T @ v))
+        else:
+            _, rest = kernels.solve_rows(J, b)
         used = np.flatnonzero(np.isin(self._owners, contacts.active))
         owners, n, m = self._owners[used], len(v), 3 * len(used)
         rotations = np.array([kinematics.frame_poses[i, :9].reshape(3, 3).T for i in contacts.frame_ids])
@@ -147,18 +153,18 @@ class StandingDynamics(RobotDynamics):
         Y, N = np.empty((m, BASE)), np.empty((m, max(m - BASE, 0)))
         self._is_held = bool(kernels.eliminate_base(self._full, self._bias, v, dt, Jp, Z, rest, _SCALE, X, start, Y, N))
         self._v, self._used, self._solved = v.copy(), owners, None
-        self._resting, self._Jp, self._N, self._Y = Contacts(Z, rest, J, b), Jp, N, Y
+        self._approached, self._Jp, self._N, self._Y = Contacts(Z, rest, J, b), Jp, N, Y
         if not self._is_held:
             self._M[:], self._h[:] = 0.0, 0.0
             self._M[BASE:], self._h[BASE:] = self._full[BASE:], self._bias[BASE:]
-            return self._resting
+            return resting
         kernels.standing_dynamics(self._full, self._bias, Jp, Y, Z, self._M, self._h)
         self._contact_set = self._with_base(X, start, J, b)
         normals = np.array([contact.normal for contact in contacts.settings])
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         self._normals = np.einsum("kij,kj->ki", rotations[owners], normals[owners])
         self._hard = self._hard_rows(owners, n, m)
-        return self._resting
+        return resting
 
     def _with_base(self, X: Array, start: Array, J: Array, b: Array) -> Contacts:
         """Return contacts and equations of the base as contacts of x = (v, s p)."""
@@ -202,8 +208,8 @@ class StandingDynamics(RobotDynamics):
         """See `RobotDynamics.approach`; what is returned meets the contacts."""
         approached = super().approach(v, v_measured)
         if v.ndim > 1:
-            return np.array([self._resting.project(row) for row in approached])
-        return np.asarray(self._resting.project(approached))
+            return np.array([self._approached.project(row) for row in approached])
+        return np.asarray(self._approached.project(approached))
 
     def _with_impulses(self, v: Array) -> Array:
         """Return x = (v, s p) of a velocity (nv,) that meets the contacts: with the p nearest to equal shares."""
@@ -254,7 +260,7 @@ class StandingDynamics(RobotDynamics):
         """Return the solution with acceleration, torques and forces.
 
         A velocity that is not the law's, as of a stop, is replaced by the nearest one that torques and cones allow.
-        Where there is none, the joints brake as their torques allow, with gravity held, and the step is a stop that says so.
+        Where there is none, the joints brake as their torques allow, with gravity held, and the step is a stop.
 
         Args:
             solution: what is decided.
@@ -278,7 +284,7 @@ class StandingDynamics(RobotDynamics):
         if not self._is_held:
             return None
         n, hard, (X, start, *_) = len(v), self._hard, self._contact_set
-        target = X.T @ (self._with_impulses(self._resting.project(v)) - start)
+        target = X.T @ (self._with_impulses(self._approached.project(v)) - start)
         free = np.full(X.shape[1], np.inf)
         J, b = np.ascontiguousarray(hard.J @ X), hard.b - hard.J @ start
         y, is_solved = kernels.project(
