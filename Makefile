@@ -12,6 +12,7 @@ view: .venv/view
 	$(BIN)/qpavoid view panda_ball
 
 figures: run
+	$(BIN)/python docs/figures/draw.py
 	cp out/five_spheres_compare_time.png out/five_spheres_qp_motion.png docs/figures/
 
 film: .venv/dev

@@ -52,7 +52,7 @@ class PlantSettings(Block):
     velocity_noise: NonNegative = 0.0
     """Standard deviation of each measured velocity [rad/s or m/s]."""
     seed: Annotated[int, Field(ge=0)] = 0
-    """Of the noise."""
+    """Of the noise [-]."""
     floor_friction: NonNegative = 0.7
     """Friction coefficient between contact points and floor [-]."""
     floor_height: float | None = None

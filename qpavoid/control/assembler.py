@@ -60,7 +60,8 @@ class RowAssembler(TrackedVelocities):
         """Surface distance below which a pair gets a row [m]."""
         self.query.set_influence_distance(self.influence_distance)
         x = self._layout = lay_out(settings, frames, row_tasks, self._forward, self.query)
-        self._hard = (x.hard_lower, x.hard_upper) if limits.relax_acceleration else (x.lower, x.upper)
+        is_hard = limits.relax_acceleration or settings.dynamics is not None
+        self._hard = (x.hard_lower, x.hard_upper) if is_hard else (x.lower, x.upper)
         self._packed: Any = kernels.pack(x)
         self._contacts, self.dynamics = contacts, settings.dynamics
         if self.dynamics is not None:

@@ -107,7 +107,8 @@ class RobotDynamics:
         arrays = kernels.DynamicsArrays(
             M=self._M, h=self._h, gravity=self._gravity, gravity_slope=self._gravity_slope,
             actuated=self.actuated, limit=self.limit, acceleration=self.bounds.acceleration.copy(),
-            acceleration_step=self._acceleration * self._dt, braking=self.bounds.acceleration,
+            acceleration_step=np.full(n, np.inf) if self._has_torques else self._acceleration * self._dt,
+            braking=self.bounds.acceleration,
             rows=np.zeros((count + len(x.rhs), n)), rhs=np.zeros(count + len(x.rhs)),
             torque=np.zeros(a), change=np.zeros(n), factor=np.zeros((n, n)), approaches=self.approaches,
             has_torques=self._has_torques, mirrors=self._mirrors, has_holding=has_holding,

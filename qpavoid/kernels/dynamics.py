@@ -192,43 +192,41 @@ def stopping_factor(x: Any, y: Any) -> float:
 
 @compiled
 def admit_stop(x: Any, y: Any) -> None:
-    """Let the bounds of a step admit the straight stop, (1 - σ) times the measured velocity, and write v_stop.
+    """Let the hard bounds of a step admit the straight stop, (1 - σ) times the measured velocity, and write v_stop.
 
-    Bounds that ask a coordinate to return from outside its position limits are approached at the rate of rows. The step
-    itself is not bounded by the accelerations on which braking counts, but by the torques, and acceleration limits
-    where there are any; with jerk limits, bounds and stop are those of the velocity level.
+    So that there is always something between them and the torque limits; the bounds that a law keeps to where it can
+    are as tight as ever. Those that ask a coordinate to return from outside its position limits are approached at the
+    rate of rows, and no slower than it can brake. The step itself is not bounded by the accelerations on which braking
+    counts, but by the torques; by acceleration limits where torques have none. With jerk limits, bounds and stop are
+    those of the velocity level.
 
     Args:
-        x: reads v_prev; writes hard_lower, hard_upper, lower, upper and v_stop (n,) [rad/s or m/s].
+        x: reads v_prev and v_step; writes hard_lower, hard_upper, lower, upper and v_stop (n,) [rad/s or m/s].
         y: reads M, h, limit, acceleration_step.
     """
-    lower, upper, v = x.hard_lower, x.hard_upper, x.v_prev
-    factor, stop = stopping_factor(x, y), 1.0
+    v, factor, stop = x.v_prev, stopping_factor(x, y), 1.0
     for j in range(len(v)):
-        slowest, least, most = (1.0 - factor) * v[j], lower[j], upper[j]
-        if slowest < 0.0:
-            lower[j] = min(lower[j], slowest)
-        elif slowest > 0.0:
-            upper[j] = max(upper[j], slowest)
-        if lower[j] > 0.0:
-            lower[j] = min(lower[j], v[j] + y.row_factor * (lower[j] - v[j]))
-        if upper[j] < 0.0:
-            upper[j] = max(upper[j], v[j] + y.row_factor * (upper[j] - v[j]))
-        if x.jerk_limited:
-            if lower[j] < least:
-                x.lower[j] = min(x.lower[j], lower[j])
-            if upper[j] > most:
-                x.upper[j] = max(x.upper[j], upper[j])
-        else:
-            low, high = v[j] - y.acceleration_step[j], v[j] + y.acceleration_step[j]
-            x.lower[j], x.upper[j] = min(max(low, lower[j]), upper[j]), max(min(high, upper[j]), lower[j])
+        low, high, step = x.hard_lower[j], x.hard_upper[j], x.v_step[j]
+        if low > 0.0:
+            low = min(low, v[j] + max(y.row_factor * (low - v[j]), min(step, -v[j])))
+            x.lower[j] = min(x.lower[j], low)
+        if high < 0.0:
+            high = max(high, v[j] + min(y.row_factor * (high - v[j]), max(-step, -v[j])))
+            x.upper[j] = max(x.upper[j], high)
+        if not x.jerk_limited:
+            change = y.acceleration_step[j]
+            x.lower[j], x.upper[j] = min(max(v[j] - change, low), high), max(min(v[j] + change, high), low)
+        if y.has_torques:
+            x.hard_lower[j], x.hard_upper[j] = min(low, (1.0 - factor) * v[j]), max(high, (1.0 - factor) * v[j])
         stop = max(stop, abs(v[j]) / y.acceleration_step[j])
     if x.jerk_limited:
         stop_velocity(x)
         return
     factor = min(factor, 1.0 / stop) if x.acceleration_limited else 1.0
     for j in range(len(v)):
-        x.v_stop[j] = min(max((1.0 - factor) * v[j], x.lower[j]), x.upper[j])
+        x.v_stop[j] = (1.0 - factor) * v[j]
+        if not y.has_torques:
+            x.v_stop[j] = min(max(x.v_stop[j], x.lower[j]), x.upper[j])
 
 
 @compiled

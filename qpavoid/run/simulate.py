@@ -82,7 +82,7 @@ def run(
             if motors is not None:
                 recorder.add(_play(controller, motors, k * dt))
             else:
-                tick = controller.tick(follower.q, k * dt)
+                tick = controller.tick(follower.q, k * dt, v=follower.v)
                 recorder.add(tick)
                 follower.follow(tick.solution.v)
             if progress is not None:
@@ -119,11 +119,12 @@ class Follower:
         """Begin at rest at q (nq,); `latency` and the control period dt are in seconds."""
         self._model, self._dt, self._q_commanded = model, dt, q
         self._under_way = CommandsUnderWay(model.nv, latency, dt) if latency else None
-        self.q = q
-        """(nq,) configuration, as measured."""
+        self.q, self.v = q, np.zeros(model.nv)
+        """Configuration (nq,) and velocity (nv,), as measured."""
 
     def follow(self, v: Array) -> None:
         """Hold a commanded velocity (nv,) for one control period."""
+        self.v = v
         self.q = self._q_commanded = pin.integrate(self._model, self._q_commanded, v * self._dt)
         if self._under_way is not None:
             self._under_way.add(v)
@@ -142,7 +143,7 @@ def _check_start(controller: Controller, q: Array, scenario: ScenarioConfig) -> 
             StartWarning,
             stacklevel=3,
         )
-    proximity = controller.tick(q, 0.0).proximity
+    proximity = controller.tick(q, 0.0, v=np.zeros(controller.scene.robot.model.nv)).proximity
     controller.reset()  # that tick was not taken: the run begins at rest
     for i in np.flatnonzero(proximity.distance < 0.0):
         a, b = controller.scene.pair_names[proximity.pair[i]]
